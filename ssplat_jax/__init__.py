@@ -1,0 +1,73 @@
+"""StreamSplat in JAX: a calibrated image stream becomes a 3D Gaussian scene, chunk by chunk.
+
+    import jax, ssplat_jax as ss
+    model, params = ss.StreamSplat(ss.preset("tiny")), ss.load_params("tiny")
+    cache, step = model.init_cache(), jax.jit(model.step, donate_argnums=1)
+    for chunk in ss.open_capture("path/to/capture").chunks(model.config):
+        cache, out = step(params, cache, chunk)
+    gaussians = model.decode(params, cache)
+
+Names are imported on first use, so that `ssplat --help` answers without loading JAX.
+"""
+
+import importlib
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from ssplat_jax.cache import VoxelCache as VoxelCache
+    from ssplat_jax.cache import check as check
+    from ssplat_jax.cache import ensure_room as ensure_room
+    from ssplat_jax.checkpoint.weights import load_params as load_params
+    from ssplat_jax.chunk import Chunk as Chunk
+    from ssplat_jax.config import StreamConfig as StreamConfig
+    from ssplat_jax.config import preset as preset
+    from ssplat_jax.data.capture import open_capture as open_capture
+    from ssplat_jax.errors import CacheError as CacheError
+    from ssplat_jax.errors import InputError as InputError
+    from ssplat_jax.errors import StorageError as StorageError
+    from ssplat_jax.export.ply import load_ply as load_ply
+    from ssplat_jax.export.ply import save_ply as save_ply
+    from ssplat_jax.gaussians import Gaussians as Gaussians
+    from ssplat_jax.geometry.cameras import Camera as Camera
+    from ssplat_jax.render import Effects as Effects
+    from ssplat_jax.render import RenderOutput as RenderOutput
+    from ssplat_jax.render import render as render
+    from ssplat_jax.stream import StreamSplat as StreamSplat
+
+_HOMES = {
+    "Camera": "geometry.cameras",
+    "CacheError": "errors",
+    "Chunk": "chunk",
+    "Effects": "render",
+    "Gaussians": "gaussians",
+    "InputError": "errors",
+    "RenderOutput": "render",
+    "StorageError": "errors",
+    "StreamConfig": "config",
+    "StreamSplat": "stream",
+    "VoxelCache": "cache",
+    "check": "cache",
+    "ensure_room": "cache",
+    "load_params": "checkpoint.weights",
+    "load_ply": "export.ply",
+    "open_capture": "data.capture",
+    "preset": "config",
+    "render": "render",
+    "save_ply": "export.ply",
+}
+__version__ = "0.1.0"
+__all__ = sorted(_HOMES)  # noqa: PLE0605
+
+
+def __getattr__(name: str):
+    if name not in _HOMES:
+        raise AttributeError(f"module 'ssplat_jax' has no attribute {name!r}")
+    home = importlib.import_module(f"ssplat_jax.{_HOMES[name]}")
+    value = getattr(home, name)
+    # Set as an attribute: `render` names a function here and a package below, and the function wins.
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return [*__all__, "__version__"]

@@ -1,0 +1,182 @@
+"""The static facts of a stream: everything whose change should recompile. No JAX here, so `ssplat --help` stays quick.
+
+Numbers are the paper's where it gives them; where it is silent the default and its reason are in docs/decisions.md.
+"""
+
+import dataclasses
+import hashlib
+import json
+from typing import Any, Literal, get_args, get_origin
+
+from ssplat_jax.errors import InputError
+
+
+@dataclasses.dataclass(frozen=True)
+class StreamConfig:
+    """Everything static about the model, its cache and its stream. Hashable; `.replace` checks what it builds."""
+
+    preset: str = "tiny"
+    """Name of the preset this configuration started from."""
+
+    # -- stream ---------------------------------------------------------------------------------------------------
+    chunk_size: int = 4
+    """Views in a chunk."""
+    scene_scale: float | Literal["auto"] = "auto"
+    """Factor from capture units to stream units; `auto` brings the capture's median depth to `median_depth`."""
+    median_depth: float = 2.0
+    """Median depth in stream units that `scene_scale="auto"` aims at."""
+
+    # -- encoder (DepthSplat; ALGORITHM 2.2, 2.3) -----------------------------------------------------------------
+    encoder_widths: tuple[int, int] = (32, 64)
+    """Channels of the CNN at 1/2 and at 1/4 of the image."""
+    encoder_blocks: int = 2
+    """Residual blocks per scale."""
+    attention_blocks: int = 2
+    """Blocks of windowed self- and cross-view attention."""
+    attention_window: int = 8
+    """Side of an attention window in grid cells; images are padded to a multiple of 4 windows' cells."""
+    attention_ffn: int = 2
+    """Width of the attention's feed-forward layer over the feature width."""
+
+    # -- plane sweep and depth (ALGORITHM 2.5 to 2.7) -------------------------------------------------------------
+    num_depths: int = 64
+    """Depth candidates, uniform in log depth between the chunk's near and far."""
+    num_sources: int = 3
+    """Source views per reference view: the nearest other views of the chunk by centre distance."""
+    fine_matching: bool = True
+    """Adds a second correlation, of the 1/2-resolution CNN features, sampled for the same 1/4 grid."""
+    match_width: int = 32
+    """Channels of the features that are correlated."""
+    unet_width: int = 64
+    """Channels of the cost-volume U-Net."""
+    depth_readout: Literal["mean", "window"] = "mean"
+    """Expectation over all candidates (literal) or over those near the peak."""
+    readout_window: int = 4
+    """Candidates to each side of the peak that `depth_readout="window"` keeps."""
+
+    # -- HPDA (Eq. cache_depth_prior, cache_prior_injection) ------------------------------------------------------
+    hpda: bool = True
+    anchor_space: Literal["log", "metric"] = "log"
+    """Space in which sigma is measured: that of the candidates, or scene units (literal)."""
+    anchor_norm: Literal["none", "mass"] = "none"
+    """`mass` scales the anchor to total mass Omega, which makes gamma the odds of history against the matcher."""
+    sigma0: float = 0.1
+    lambda_sigma: float = 0.5
+    gamma_init: float = 0.1
+    """Start of the learnable gamma_d = softplus(raw)."""
+
+    # -- confidence (ALGORITHM 9.18 to 9.22) ----------------------------------------------------------------------
+    confidence: Literal["peak", "window"] = "window"
+    """`peak`: max_k P (the paper). `window`: the best mass of `2 confidence_window + 1` neighbouring candidates."""
+    confidence_window: int = 1
+
+    # -- tokens, CGFI, mixer, head (ReSplat; ALGORITHM 3) ---------------------------------------------------------
+    token_width: int = 64
+    """Channels of a token's feature, as stored in the cache."""
+    cgfi: bool = True
+    cgfi_width: int = 48
+    """Channels inside the aggregation U-Net."""
+    mixer_blocks: int = 2
+    """Pairs of a kNN block and a global block."""
+    mixer_neighbours: int = 8
+    """Neighbours in 3D, the token itself included."""
+    mixer_radius: int = 2
+    """Neighbours are looked for in a (2 r + 1)^2 patch of the token's own view; 0 searches all tokens of the chunk."""
+    mixer_proj: int = 32
+    """Channels of the kNN attention."""
+    sh_degree: int = 0
+    scale_mode: Literal["footprint", "absolute"] = "footprint"
+    """Gaussian scale relative to the token's footprint (depth x cell / focal), or softplus in scene units (literal)."""
+    max_scale: float = 1.0
+    """Upper clamp of a Gaussian's scale in stream units."""
+
+    # -- VACC (Eq. vacc_capacity_update, vacc_pair_selection_and_merge) -------------------------------------------
+    vacc: Literal["voxel", "append"] = "voxel"
+    """`append` keeps every accepted token (the paper's ablation)."""
+    voxel_size: float = 0.04
+    pivots_per_voxel: int = 4
+    min_confidence: float = 0.3
+    """tau_conf: tokens below it never enter the cache."""
+    capacity: int = 1 << 15
+    """Voxels the cache can hold, a power of two; outside jit `grow` doubles it."""
+    overflow: Literal["grow", "drop_new", "evict_lowest", "error"] = "grow"
+    merge_key: Literal["seed", "feature"] = "seed"
+    """Whose cosine selects the closest pair."""
+    merge_weight: Literal["max", "count"] = "max"
+    """`max` is the printed omega* = max; `count` weighs by the number of members, a true running mean."""
+    cluster_ratio: float = 1.15
+    """Depth ratio that holds the front cluster of the projection together; `inf` is the plain mean (literal)."""
+
+    def __post_init__(self) -> None:
+        for name, wanted, good in (
+            ("chunk_size", "at least 1", self.chunk_size >= 1),
+            ("num_depths", "at least 1", self.num_depths >= 1),
+            ("voxel_size", "a positive length", self.voxel_size > 0),
+            ("pivots_per_voxel", "at least 1", self.pivots_per_voxel >= 1),
+            (
+                "capacity",
+                "a power of two of at least 128",
+                self.capacity >= 128 and not self.capacity & (self.capacity - 1),
+            ),
+            ("min_confidence", "in [0, 1]", 0.0 <= self.min_confidence <= 1.0),
+            ("sigma0", "positive", self.sigma0 > 0),
+            ("lambda_sigma", "not negative", self.lambda_sigma >= 0),
+            ("cluster_ratio", "above 1", self.cluster_ratio > 1),
+            ("sh_degree", "0 to 3", 0 <= self.sh_degree <= 3),
+            (
+                "scene_scale",
+                "'auto' or a positive factor",
+                self.scene_scale == "auto" or _is_positive(self.scene_scale),
+            ),
+        ):
+            if not good:
+                raise InputError(f"config: {name} must be {wanted}, got {getattr(self, name)!r}.")
+        for field in dataclasses.fields(self):
+            options = get_args(field.type) if get_origin(field.type) is Literal else ()
+            if options and getattr(self, field.name) not in options:
+                wanted = ", ".join(map(repr, options))
+                raise InputError(f"config: {field.name} must be one of {wanted}, got {getattr(self, field.name)!r}.")
+
+    def replace(self, **changes: Any) -> "StreamConfig":
+        """A copy with `changes`; unknown names and bad values raise `InputError`."""
+        known = {f.name for f in dataclasses.fields(self)}
+        if unknown := sorted(set(changes) - known):
+            raise InputError(f"config: no field {unknown[0]!r}; known fields: {', '.join(sorted(known))}.")
+        return dataclasses.replace(self, **changes)
+
+    @property
+    def size_multiple(self) -> int:
+        """Images are padded inside to a multiple of this: 1/4 grid x (attention window, U-Net depth)."""
+        return 4 * self.attention_window
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain JSON types; `StreamConfig(**d)` after `from_dict` gives it back."""
+        return json.loads(json.dumps(dataclasses.asdict(self)))
+
+    @staticmethod
+    def from_dict(fields: dict[str, Any]) -> "StreamConfig":
+        """Inverse of `to_dict`."""
+        return StreamConfig().replace(**{k: tuple(v) if isinstance(v, list) else v for k, v in fields.items()})
+
+    @property
+    def hash(self) -> str:
+        """Twelve hex digits that name this configuration in results and saved states."""
+        return hashlib.sha256(json.dumps(self.to_dict(), sort_keys=True).encode()).hexdigest()[:12]
+
+
+def _is_positive(value: Any) -> bool:
+    return isinstance(value, int | float) and value > 0
+
+
+PRESETS: dict[str, StreamConfig] = {"tiny": StreamConfig()}
+
+
+def preset(name: str) -> StreamConfig:
+    """The configuration called `name`.
+
+    Raises:
+        InputError: no such preset.
+    """
+    if name not in PRESETS:
+        raise InputError(f"no preset {name!r}; there is {', '.join(sorted(PRESETS))}.")
+    return PRESETS[name]

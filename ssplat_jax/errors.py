@@ -1,0 +1,16 @@
+"""What can go wrong outside jit. The command line turns each into one line and an exit code."""
+
+
+class InputError(ValueError):
+    """Input from outside is unusable: a capture, an image, a camera, an option. Exit code 2.
+
+    The message says which file (and field), what was wanted, what came, and what to do.
+    """
+
+
+class StorageError(OSError):
+    """Reading or writing saved state failed: a full disk, a corrupt checkpoint. Exit code 3."""
+
+
+class CacheError(RuntimeError):
+    """The cache could not hold what it was given; raised by `cache.check`, outside jit, with the remedy."""

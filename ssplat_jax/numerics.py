@@ -1,0 +1,37 @@
+"""Safe primitives. Each states its limits; tests/stability/test_numerics.py holds a test for every line of them."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+
+def safe_normalize(x: Float[Array, "*s n"], eps: float = 1e-12) -> Float[Array, "*s n"]:
+    """Unit vector along `x`.
+
+    Limits:
+        |x| <= eps gives zeros, and a zero (never NaN) gradient.
+        float32: length within 4 ulp of 1 for 1e-10 < max|x| < 1e30 (the vector is scaled before it is squared).
+    """
+    largest = jnp.max(jnp.abs(x), axis=-1, keepdims=True)
+    is_zero = largest <= eps
+    shimmed = jnp.where(is_zero, jnp.ones_like(x), x)
+    scaled = shimmed / jnp.where(is_zero, jnp.ones_like(largest), largest)
+    del shimmed
+    unit = scaled / jnp.sqrt(jnp.sum(scaled * scaled, axis=-1, keepdims=True))
+    return jnp.where(is_zero, jnp.zeros_like(x), unit)
+
+
+def safe_log(x: Float[Array, "*s"], eps: float = 1e-12) -> Float[Array, "*s"]:
+    """Natural logarithm.
+
+    Limits:
+        x <= eps gives log(eps), with a zero gradient.
+    """
+    is_small = x <= eps
+    return jnp.where(is_small, jnp.log(jnp.asarray(eps, x.dtype)), jnp.log(jnp.where(is_small, jnp.ones_like(x), x)))
+
+
+def softplus_inverse(y: float) -> float:
+    """The x with softplus(x) = y, for y > 0, in plain Python (initial values)."""
+    import math
+
+    return y + math.log(-math.expm1(-y))
