@@ -1,0 +1,22 @@
+"""VACC, the Voxel-Aligned Causal Cache: the stream's only memory, its write (`fuse`) and its read (`project`)."""
+
+from ssplat_jax.cache.fuse import Touched, fuse, fuse_touched
+from ssplat_jax.cache.policy import check, ensure_room, grow
+from ssplat_jax.cache.project import ProjectedCache, project
+from ssplat_jax.cache.state import PIVOT_FIELDS, CacheStats, Tokens, VoxelCache, init_cache
+
+__all__ = [
+    "PIVOT_FIELDS",
+    "CacheStats",
+    "ProjectedCache",
+    "Tokens",
+    "Touched",
+    "VoxelCache",
+    "check",
+    "ensure_room",
+    "fuse",
+    "fuse_touched",
+    "grow",
+    "init_cache",
+    "project",
+]

@@ -1,0 +1,330 @@
+"""VACC's write: tokens into voxels (Sec. 3.4, Eq. vacc_capacity_update, vacc_pair_selection_and_merge).
+
+The result is that of inserting the tokens one after another; `reference.fuse` is that loop. Voxels do not depend on
+each other, so here all of them advance together:
+
+    tokens ─ classify ─ group by voxel ─ rows (found, or new in order of first token)
+                                           │
+              rank in voxel + count < K ───┤── append: all at once, one scatter
+                                           └── merge: round r takes the r-th merging token of every voxel that has one
+
+Voxels are ordered by how many tokens they have to merge, so a round is a prefix of them and the work shrinks with the
+rounds. Nothing here grows with the capacity or with what the cache holds. Buffers are written in place when donated.
+"""
+
+import itertools
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Int
+
+from ssplat_jax.cache.policy import evict
+from ssplat_jax.cache.state import PIVOT_FIELDS, CacheStats, Tokens, VoxelCache
+from ssplat_jax.cache.table import build_table, find_rows, group_equal, insert_rows
+from ssplat_jax.config import StreamConfig
+from ssplat_jax.errors import InputError
+from ssplat_jax.geometry.voxels import voxel_indices
+from ssplat_jax.struct import pytree, replace
+
+MERGE_BLOCKS = ((512, 64), (16, 1))
+"""(voxels merged at a time, fewest voxels left in a round for which that pays)."""
+
+SAME_DIRECTION = 1.0 - 1e-6
+"""Signed squared cosines above this are ties: the frame given twice must not let rounding choose the pair."""
+
+
+@pytree
+class Touched:
+    """The rows that a call wrote, each once; padded with -1."""
+
+    rows: Int[Array, " m"]
+    num_rows: Int[Array, ""]
+
+
+@pytree
+class Plan:
+    """Where every token goes, in the order in which they are placed: voxel by voxel, in a voxel by arrival."""
+
+    order: Int[Array, " m"]  # token at each position
+    rows: Int[Array, " m"]  # its row, -1 where it has none
+    slots: Int[Array, " m"]  # pivots that the voxel will have been given before it; merges from K on
+    is_first: Bool[Array, " m"]  # first of its row
+
+
+def fuse(cache: VoxelCache, tokens: Tokens, config: StreamConfig) -> VoxelCache:
+    """`cache` after inserting `tokens` in order; see `fuse_touched`."""
+    return fuse_touched(cache, tokens, config)[0]
+
+
+def fuse_touched(cache: VoxelCache, tokens: Tokens, config: StreamConfig) -> tuple[VoxelCache, Touched]:
+    """`cache` after inserting `tokens` in order, and the rows that were written.
+
+    A voxel with room takes the token as a new pivot. A full one merges the closest pair of its pivots and the token:
+    the merged pivot keeps the lower slot and, if the pair was two old pivots, the token takes the freed one. Tokens
+    below `min_confidence`, not finite, out of range or without room are left out and counted in `stats`. Nothing
+    written has a gradient.
+
+    Limits:
+        Feature norms in [1e-9, 1e9]: beyond, and for zero features, a pair counts as orthogonal.
+        Two members of confidence 0 are averaged with equal weights.
+        A merged mean lies between its members, to the last bit, and so in their voxel.
+
+    Raises:
+        InputError: `vacc="append"` with `overflow="evict_lowest"`: without voxels there is nothing to choose between.
+    """
+    cache, tokens = jax.lax.stop_gradient((cache, tokens))
+    stats, voxels, accepted = _classify(cache.stats, tokens, config)
+    place = {"voxel": _place_in_voxels, "append": _place_at_end}[config.vacc]
+    cache, plan, num_evicted = place(cache, voxels, accepted, config)
+    pivots = {name: getattr(cache, name) for name in PIVOT_FIELDS}
+    new = _new_pivots(tokens, cache)
+    appends = jnp.where(plan.slots < config.pivots_per_voxel, plan.rows, -1)
+    counts = cache.counts.at[_drop_negative(appends, cache.capacity)].max(plan.slots + 1, mode="drop")
+    pivots = _write(pivots, appends, plan.slots, {name: x[plan.order] for name, x in new.items()})
+    if config.vacc == "voxel":
+        pivots = _merge_all(pivots, new, plan, config)
+    num_placed = jnp.sum(plan.rows >= 0, dtype=jnp.int32)
+    stats = replace(
+        stats,
+        num_accepted=stats.num_accepted + num_placed,
+        num_merged=stats.num_merged + num_placed - jnp.sum(appends >= 0, dtype=jnp.int32),
+        num_dropped=stats.num_dropped + jnp.sum(accepted, dtype=jnp.int32) - num_placed,
+        num_evicted=stats.num_evicted + num_evicted,
+    )
+    return replace(cache, counts=counts, stats=stats, **pivots), _touched(plan)
+
+
+def _classify(
+    stats: CacheStats, tokens: Tokens, config: StreamConfig
+) -> tuple[CacheStats, Int[Array, "m 3"], Bool[Array, " m"]]:
+    """Counts the tokens that stay out, each for one reason; voxels and acceptance of all."""
+    voxels, in_range = voxel_indices(tokens.means, config.voxel_size)
+    floats = (tokens.means, tokens.feats, tokens.rgbs, tokens.quats)
+    finite = jnp.isfinite(tokens.confidences) & jnp.isfinite(tokens.footprints)
+    for x in floats:
+        finite &= jnp.all(jnp.isfinite(x), axis=-1)
+    confident = tokens.confidences >= config.min_confidence
+    accepted = tokens.valid & finite & confident & in_range
+    count = lambda mask: jnp.sum(tokens.valid & mask, dtype=jnp.int32)  # noqa: E731
+    stats = replace(
+        stats,
+        num_chunks=stats.num_chunks + jnp.any(tokens.valid).astype(jnp.int32),
+        num_seen=stats.num_seen + count(tokens.valid),
+        num_non_finite=stats.num_non_finite + count(~finite),
+        num_low_confidence=stats.num_low_confidence + count(finite & ~confident),
+        num_out_of_range=stats.num_out_of_range + count(finite & confident & ~in_range),
+    )
+    return stats, voxels, accepted
+
+
+def _place_in_voxels(
+    cache: VoxelCache, voxels: Int[Array, "m 3"], accepted: Bool[Array, " m"], config: StreamConfig
+) -> tuple[VoxelCache, Plan, Int[Array, ""]]:
+    """Finds or makes the row of every token's voxel; also the number of pivots evicted to make room."""
+    tokens = jnp.arange(accepted.shape[0], dtype=jnp.int32)
+    leaders = group_equal(voxels, accepted)
+    is_leader = accepted & (leaders == tokens)
+    rows = find_rows(cache.table, cache.voxels, voxels, is_leader)
+    cache, rows, num_evicted = _add_rows(cache, voxels, rows, is_leader & (rows < 0), config)
+    rows = jnp.where(accepted, rows[leaders], -1)
+    order = _order_by_leader(jnp.where(accepted, leaders, tokens.shape[0]))
+    rows, is_first = rows[order], is_leader[order] & (rows[order] >= 0)
+    ranks = tokens - jax.lax.cummax(jnp.where(is_leader[order], tokens, 0))
+    return cache, Plan(order=order, rows=rows, slots=cache.counts[rows] + ranks, is_first=is_first), num_evicted
+
+
+def _order_by_leader(leaders: Int[Array, " m"]) -> Int[Array, " m"]:
+    """Stable order of tokens by their leader, 0 .. m."""
+    m = leaders.shape[0]
+    tokens = jnp.arange(m, dtype=jnp.uint32)
+    if (m + 1) * m <= 2**32:
+        # Both numbers in one word: XLA's CPU sort of one array is 6 x as fast as that of a pair.
+        return (jnp.sort(leaders.astype(jnp.uint32) * m + tokens) % m).astype(jnp.int32)
+    return jax.lax.sort((leaders, tokens.astype(jnp.int32)), num_keys=2, is_stable=False)[1]
+
+
+def _place_at_end(
+    cache: VoxelCache, voxels: Int[Array, "m 3"], accepted: Bool[Array, " m"], config: StreamConfig
+) -> tuple[VoxelCache, Plan, Int[Array, ""]]:
+    """The ablation: rows are filled one slot after another and voxels play no part."""
+    del voxels
+    if config.overflow == "evict_lowest":
+        raise InputError("config: overflow='evict_lowest' needs vacc='voxel', got vacc='append'; use 'drop_new'.")
+    k = config.pivots_per_voxel
+    last = jnp.maximum(cache.num_voxels - 1, 0)
+    num_pivots = last * k + cache.counts[last]
+    flat = num_pivots + jnp.cumsum(accepted, dtype=jnp.int32) - 1
+    has_room = accepted & (flat < cache.capacity * k)
+    rows, slots = jnp.where(has_room, flat // k, -1), flat % k
+    num_voxels = jnp.maximum(cache.num_voxels, jnp.max(rows, initial=-1) + 1)
+    plan = Plan(
+        order=jnp.arange(accepted.shape[0], dtype=jnp.int32),
+        rows=rows,
+        slots=slots,
+        is_first=has_room & ((slots == 0) | (flat == num_pivots)),
+    )
+    return replace(cache, num_voxels=num_voxels), plan, jnp.zeros((), jnp.int32)
+
+
+def _add_rows(cache, voxels, rows, is_new, config):
+    """Gives a row to each voxel that `is_new`, in order of their first tokens, as far as there is room."""
+    m, capacity = rows.shape[0], cache.capacity
+    new_rows = cache.num_voxels + jnp.cumsum(is_new, dtype=jnp.int32) - 1
+    num_wanted = cache.num_voxels + jnp.sum(is_new, dtype=jnp.int32)
+    num_evicted = jnp.zeros((), jnp.int32)
+    if config.overflow == "evict_lowest":
+        cache, victims, num_evicted = evict(cache, rows, num_wanted - capacity)
+        new_rows = jnp.where(new_rows < capacity, new_rows, victims[jnp.clip(new_rows - capacity, 0, m - 1)])
+    has_row = is_new & (new_rows >= 0) & (new_rows < capacity)
+    cache = replace(
+        cache,
+        voxels=cache.voxels.at[jnp.where(has_row, new_rows, capacity)].set(voxels, mode="drop"),
+        num_voxels=jnp.minimum(num_wanted, capacity),
+    )
+    if config.overflow == "evict_lowest":
+        # Open addressing cannot forget one entry, so a table that loses rows is built anew.
+        rebuild = lambda: build_table(cache.voxels, cache.num_voxels)  # noqa: E731
+        insert = lambda: insert_rows(cache.table, voxels, new_rows, has_row)  # noqa: E731
+        table = jax.lax.cond(num_evicted > 0, rebuild, insert)
+    else:
+        table = insert_rows(cache.table, voxels, new_rows, has_row)
+    return replace(cache, table=table), jnp.where(has_row, new_rows, rows), num_evicted
+
+
+def _new_pivots(tokens: Tokens, cache: VoxelCache) -> dict[str, Array]:
+    """Every token as a pivot of its own."""
+    m = tokens.means.shape[0]
+    fields = {name: getattr(tokens, name) for name in PIVOT_FIELDS if hasattr(tokens, name)}
+    return fields | {
+        "seeds": tokens.feats,
+        "num_members": jnp.ones((m,), jnp.int32),
+        "last_chunks": jnp.broadcast_to(cache.stats.num_chunks, (m,)),
+    }
+
+
+def _merge_all(pivots: dict[str, Array], new: dict[str, Array], plan: Plan, config: StreamConfig) -> dict[str, Array]:
+    """Round r merges the r-th surplus token of every voxel that has one, voxels with most of them first."""
+    m, k = plan.order.shape[0], config.pivots_per_voxel
+    is_surplus = (plan.rows >= 0) & (plan.slots >= k)
+    groups = jnp.cumsum(plan.is_first, dtype=jnp.int32) - 1
+    positions = jnp.arange(m, dtype=jnp.int32)
+    groups = jnp.where(is_surplus, groups, m)
+    sizes = jnp.zeros((m,), jnp.int32).at[groups].add(1, mode="drop")
+    starts = jnp.full((m,), m, jnp.int32).at[groups].min(positions, mode="drop")
+    sizes, _, starts = jax.lax.sort((-sizes, positions, starts), num_keys=2, is_stable=False)
+    largest_block = MERGE_BLOCKS[0][0]
+    sizes = jnp.pad(-sizes, (0, largest_block))
+    starts = jnp.pad(starts, (0, largest_block))
+
+    def merge_block(block, state):
+        pivots, round_idx, first = state
+        sizes_here = jax.lax.dynamic_slice(sizes, (first,), (block,))
+        positions = jnp.minimum(jax.lax.dynamic_slice(starts, (first,), (block,)) + round_idx, m - 1)
+        rows = jnp.where(sizes_here > round_idx, plan.rows[positions], -1)
+        arrivals = {name: x[plan.order[positions]] for name, x in new.items()}
+        pivots = _merge_closest(pivots, arrivals, rows, config)
+        is_over = sizes[first + block] <= round_idx
+        return pivots, round_idx + is_over.astype(jnp.int32), jnp.where(is_over, 0, first + block)
+
+    state = (pivots, jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32))
+    for block, fewest in MERGE_BLOCKS:
+        if fewest <= m:
+            state = jax.lax.while_loop(
+                lambda s, fewest=fewest: (s[2] > 0) | (sizes[fewest - 1] > s[1]),
+                lambda s, block=block: merge_block(block, s),
+                state,
+            )
+    return state[0]
+
+
+def _merge_closest(
+    pivots: dict[str, Array], new: dict[str, Array], rows: Int[Array, " b"], config: StreamConfig
+) -> dict[str, Array]:
+    """MergeClosest for one token of each of the full voxels `rows` (-1: nothing to do)."""
+    k = config.pivots_per_voxel
+    key = {"seed": "seeds", "feature": "feats"}[config.merge_key]
+    first, second = _closest_pair(jnp.concatenate([pivots[key][rows], new[key][:, None]], axis=1))
+    takes_new = second == k
+    slots = jnp.stack([first, jnp.minimum(second, k - 1)], axis=1)
+    pairs = {name: x[rows[:, None], slots] for name, x in pivots.items()}
+    older = {name: x[:, 0] for name, x in pairs.items()}
+    newer = {name: _select(takes_new, new[name], x[:, 1]) for name, x in pairs.items()}
+    merged = _merge_pair(older, newer, config)
+    values = {name: jnp.stack([x, new[name].astype(x.dtype)], axis=1) for name, x in merged.items()}
+    return _write(pivots, jnp.stack([rows, jnp.where(takes_new, -1, rows)], axis=1), slots, values)
+
+
+def _closest_pair(keys: Array) -> tuple[Int[Array, " b"], Int[Array, " b"]]:
+    """Indices i < j of the pair of `keys` `[b, k + 1, c]` with the largest cosine; the lowest pair of equals.
+
+    Pairs are compared by cos |cos| = dot |dot| / (norm^2 norm^2), which has the order of the cosine but no root whose
+    rounding would break ties: where features are small integers, equal cosines compare as equal. Beyond
+    `SAME_DIRECTION` all pairs are equal.
+    """
+    b, num_keys, c = keys.shape
+    lanes = math.gcd(c, 8)
+    # Partial sums in lanes: XLA's CPU backend vectorises a sum over a major axis but not one over the minor.
+    keys = keys.astype(jnp.float32).reshape(b, num_keys, c // lanes, lanes)
+    dot = lambda x, y: jnp.sum(jnp.sum(x * y, axis=-2), axis=-1)  # noqa: E731
+    firsts, seconds = (jnp.array(x, jnp.int32) for x in zip(*itertools.combinations(range(num_keys), 2), strict=True))
+    norms, dots = dot(keys, keys), dot(keys[:, firsts], keys[:, seconds])
+    products = norms[:, firsts] * norms[:, seconds]
+    in_range = (products > np.finfo(np.float32).tiny) & (products < np.inf)
+    scores = jnp.where(in_range, dots * jnp.abs(dots) / jnp.where(in_range, products, 1.0), 0.0)
+    best = jnp.argmax(jnp.where(scores > SAME_DIRECTION, 1.0, scores), axis=-1)
+    return firsts[best], seconds[best]
+
+
+def _merge_pair(older: dict[str, Array], newer: dict[str, Array], config: StreamConfig) -> dict[str, Array]:
+    """The merged pivots of pairs (Eq. vacc_pair_selection_and_merge); `older` are those in the lower slot."""
+    weight_older, weight_newer = older["confidences"], newer["confidences"]
+    newer_is_best = weight_newer > weight_older
+    if config.merge_weight == "count":
+        weight_older = weight_older * older["num_members"].astype(weight_older.dtype)
+        weight_newer = weight_newer * newer["num_members"].astype(weight_newer.dtype)
+    total = weight_older + weight_newer
+    share = jnp.where(total > 0, weight_newer / jnp.where(total > 0, total, 1.0), 0.5)
+
+    def average(name):
+        # From one end towards the other and never past it: rounding cannot take a mean out of its voxel.
+        a, b = older[name].astype(jnp.float32), newer[name].astype(jnp.float32)
+        return jnp.clip(a + share[:, None] * (b - a), jnp.minimum(a, b), jnp.maximum(a, b))
+
+    merged = {name: average(name) for name in ("means", "feats", "rgbs")}
+    best = ("seeds", "confidences", "quats", "footprints")
+    merged |= {name: _select(newer_is_best, newer[name], older[name]) for name in best}
+    return merged | {
+        "num_members": older["num_members"] + newer["num_members"],
+        "last_chunks": jnp.maximum(older["last_chunks"], newer["last_chunks"]),
+    }
+
+
+def _write(
+    pivots: dict[str, Array], rows: Int[Array, "*b"], slots: Int[Array, "*b"], values: dict[str, Array]
+) -> dict[str, Array]:
+    """Sets pivots at distinct places; rows of -1 are left out."""
+    return {
+        name: x.at[_drop_negative(rows, x.shape[0]), slots].set(values[name].astype(x.dtype), mode="drop")
+        for name, x in pivots.items()
+    }
+
+
+def _drop_negative(rows, capacity):
+    """Moves -1, which indexing would wrap, past the end, where `mode="drop"` leaves it out."""
+    return jnp.where(rows < 0, capacity, rows)
+
+
+def _select(condition, x, y):
+    """`where` along the first axis."""
+    return jnp.where(condition.reshape(condition.shape + (1,) * (x.ndim - 1)), x.astype(y.dtype), y)
+
+
+def _touched(plan: Plan) -> Touched:
+    m = plan.rows.shape[0]
+    places = jnp.where(plan.is_first, jnp.cumsum(plan.is_first) - 1, m)
+    return Touched(
+        rows=jnp.full((m,), -1, jnp.int32).at[places].set(plan.rows, mode="drop"),
+        num_rows=jnp.sum(plan.is_first, dtype=jnp.int32),
+    )

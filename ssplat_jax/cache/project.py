@@ -1,0 +1,189 @@
+"""VACC's read: the projection P of the cache into views (Eq. cache_projection).
+
+Per pixel the front cluster in log depth. With ell = ln z, w = confidence and window = ln(cluster_ratio):
+
+    pass 1   L0 = min ell                            over the pivots that fall on the pixel
+    pass 2   mu = sum w ell / sum w                  over ell <= L0 + window
+    pass 3   D, Omega, F from w-weighted sums        over |ell - mu| <= window     (re-centred once)
+
+A plain mean mixes background into a fifth of the pixels; a narrow window about the minimum is biased towards the
+camera, and the bias would feed back through the anchor into the cache (ALGORITHM 10.2). A pivot covers the one pixel
+that its centre falls into.
+
+Cost is proportional to the live pivots: rows are dense, so the passes walk blocks of rows up to `num_voxels`. Features
+are touched only for the pairs (view, pivot) in a cluster. Sums run in the order of rows, so on the CPU the result is
+the same to the last bit every time.
+"""
+
+import math
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from ssplat_jax.cache.state import VoxelCache
+from ssplat_jax.config import StreamConfig
+from ssplat_jax.geometry.cameras import Camera
+from ssplat_jax.struct import pytree
+
+NEAR = 0.01
+"""Pivots at or before this camera z (stream units) are not seen; the renderer's near plane."""
+
+ROWS_PER_BLOCK = 4096
+PAIRS_PER_BLOCK = 4096
+
+
+@pytree
+class ProjectedCache:
+    """What history says about each pixel of the views: zeros and `mask` False where it says nothing."""
+
+    depths: Float[Array, "v hf wf"]  # D_H, camera z
+    confidences: Float[Array, "v hf wf"]  # Omega_H = sum w^2 / sum w
+    feats: Float[Array, "v hf wf c"]  # F_H
+    mask: Bool[Array, "v hf wf"]
+
+
+@pytree
+class _Pairs:
+    """What the pivots of a block of rows are in every view, flattened over views and pivots."""
+
+    pixels: Int[Array, " p"]  # flat over all views; the number of pixels where it is not seen
+    log_depths: Float[Array, " p"]
+    weights: Float[Array, " p"]  # 0 where it is not seen
+
+
+def project(cache: VoxelCache, camera: Camera, config: StreamConfig) -> ProjectedCache:
+    """Depth, confidence and features of `cache` in the pixels of `camera` (a batch of views at grid resolution).
+
+    A constant for differentiation: no gradient flows to the cache or the cameras.
+
+    Limits:
+        Camera z <= 0.01, confidence 0 and centres outside the image are not seen.
+        An empty cache, and a pixel without a pivot, give zeros and a False mask.
+    """
+    cache, camera = jax.lax.stop_gradient((cache, camera))
+    shape = (camera.viewmats.shape[0], camera.height, camera.width)
+    window = math.log(config.cluster_ratio)
+    with jax.named_scope("project"):
+        fronts = _over_blocks(cache, camera, _nearest, jnp.full((math.prod(shape),), jnp.inf))
+        centres = _front_means(cache, camera, fronts, window)
+        weights, squares, offsets, feats = _cluster_sums(cache, camera, fronts, centres, window)
+    mask = weights > 0
+    total = jnp.where(mask, weights, 1.0)
+    log_depths = jnp.where(mask, fronts, 0.0) + offsets / total
+    return ProjectedCache(
+        depths=jnp.where(mask, jnp.exp(log_depths), 0.0).reshape(shape),
+        confidences=(squares / total).reshape(shape),
+        feats=(feats / total[:, None]).reshape(*shape, -1),
+        mask=mask.reshape(shape),
+    )
+
+
+def _over_blocks(cache: VoxelCache, camera: Camera, visit, start):
+    """Folds `visit(state, pairs, first_row)` over the blocks of rows that hold voxels."""
+    num_rows = math.gcd(cache.capacity, ROWS_PER_BLOCK)
+    num_blocks = (cache.num_voxels + num_rows - 1) // num_rows
+
+    def step(i, state):
+        return visit(state, _pairs_of_rows(cache, camera, i * num_rows, num_rows), i * num_rows)
+
+    return jax.lax.fori_loop(0, num_blocks, step, start)
+
+
+def _nearest(fronts, pairs: _Pairs, first_row):
+    del first_row
+    return fronts.at[pairs.pixels].min(pairs.log_depths, mode="drop")
+
+
+def _front_means(cache, camera, fronts, window):
+    """Mean log depth of each pixel's front window, measured from its nearest pivot."""
+
+    def visit(sums, pairs: _Pairs, first_row):
+        del first_row
+        behind = _behind(pairs, fronts)
+        weights = jnp.where(behind <= window, pairs.weights, 0.0)
+        return _add(sums, pairs.pixels, (weights, weights * behind))
+
+    weights, offsets = _over_blocks(cache, camera, visit, (jnp.zeros_like(fronts), jnp.zeros_like(fronts)))
+    return offsets / jnp.where(weights > 0, weights, 1.0)
+
+
+def _cluster_sums(cache, camera, fronts, centres, window):
+    """Sums over each pixel's re-centred cluster: w, w^2, w times log depth from the nearest pivot, w times feature."""
+    flat_feats = cache.feats.reshape(-1, cache.feats.shape[-1])
+    pivots_per_row = cache.feats.shape[1]
+
+    def visit(state, pairs: _Pairs, first_row):
+        scalars, feats = state
+        behind = _behind(pairs, fronts)
+        weights = jnp.where(jnp.abs(behind - centres[pairs.pixels]) <= window, pairs.weights, 0.0)
+        scalars = _add(scalars, pairs.pixels, (weights, weights * weights, weights * behind))
+        return scalars, _add_feats(
+            feats, flat_feats, pairs.pixels, weights, first_row * pivots_per_row, len(camera.viewmats)
+        )
+
+    zeros = jnp.zeros_like(fronts)
+    feats = jnp.zeros((fronts.shape[0], cache.feats.shape[-1]))
+    scalars, feats = _over_blocks(cache, camera, visit, ((zeros, zeros, zeros), feats))
+    return *scalars, feats
+
+
+def _add_feats(sums, flat_feats, pixels, weights, first_pivot, num_views):
+    """Adds w times feature for the pairs that have weight, gathered to the front first: they are a small share."""
+    num_pairs = pixels.shape[0]
+    block = min(num_pairs, PAIRS_PER_BLOCK)
+    has_weight = weights > 0
+    places = jnp.where(has_weight, jnp.cumsum(has_weight) - 1, num_pairs)
+    # Entries beyond the last pair stay at num_pairs; a multiple of the block, so that no slice is moved back.
+    listed = jnp.full((num_pairs + -num_pairs % block,), num_pairs, jnp.int32)
+    listed = listed.at[places].set(jnp.arange(num_pairs, dtype=jnp.int32), mode="drop")
+
+    def add_block(i, sums):
+        pairs = jax.lax.dynamic_slice(listed, (i * block,), (block,))
+        is_pair = pairs < num_pairs
+        pairs = jnp.minimum(pairs, num_pairs - 1)
+        values = (
+            flat_feats[first_pivot + pairs % (num_pairs // num_views)].astype(jnp.float32) * weights[pairs][:, None]
+        )
+        return sums.at[jnp.where(is_pair, pixels[pairs], sums.shape[0])].add(values, mode="drop")
+
+    num_blocks = (jnp.sum(has_weight, dtype=jnp.int32) + block - 1) // block
+    return jax.lax.fori_loop(0, num_blocks, add_block, sums)
+
+
+def _pairs_of_rows(cache: VoxelCache, camera: Camera, first_row, num_rows: int) -> _Pairs:
+    """Projects the pivots of `num_rows` rows into all views."""
+
+    def block(x):
+        return jax.lax.dynamic_slice_in_dim(x, first_row, num_rows).reshape(-1, *x.shape[2:])
+
+    k = cache.means.shape[1]
+    counts = jax.lax.dynamic_slice_in_dim(cache.counts, first_row, num_rows)
+    weights = jnp.where(jnp.arange(k) < counts[:, None], block(cache.confidences).reshape(-1, k), 0.0).reshape(-1)
+    # Written out per coordinate: three rows of products vectorise over the pivots, a 3 x 3 matrix product does not.
+    px, py, pz = jnp.moveaxis(block(cache.means), -1, 0)
+    views = camera.viewmats[:, :3, :, None]
+    x, y, z = (views[:, i, 0] * px + views[:, i, 1] * py + views[:, i, 2] * pz + views[:, i, 3] for i in range(3))
+    in_front = (z > NEAR) & jnp.isfinite(z) & (weights > 0)
+    inverse_z = 1.0 / jnp.where(in_front, z, 1.0)
+    Ks = camera.Ks[:, :, :, None]
+    u = Ks[:, 0, 0] * x * inverse_z + Ks[:, 0, 2]
+    v = Ks[:, 1, 1] * y * inverse_z + Ks[:, 1, 2]
+    is_seen = in_front & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    columns, rows = (jnp.where(is_seen, jnp.floor(c), 0.0).astype(jnp.int32) for c in (u, v))
+    first_pixel = jnp.arange(len(camera.viewmats), dtype=jnp.int32)[:, None] * (camera.height * camera.width)
+    num_pixels = len(camera.viewmats) * camera.height * camera.width
+    return _Pairs(
+        pixels=jnp.where(is_seen, first_pixel + rows * camera.width + columns, num_pixels).reshape(-1),
+        log_depths=jnp.where(is_seen, jnp.log(jnp.where(is_seen, z, 1.0)), 0.0).reshape(-1),
+        weights=jnp.where(is_seen, weights, 0.0).reshape(-1),
+    )
+
+
+def _behind(pairs: _Pairs, fronts):
+    """Log depth behind the nearest pivot of the pixel; 0 where not seen."""
+    return jnp.where(pairs.weights > 0, pairs.log_depths - fronts[pairs.pixels], 0.0)
+
+
+def _add(sums, pixels, values):
+    return tuple(s.at[pixels].add(x, mode="drop") for s, x in zip(sums, values, strict=True))

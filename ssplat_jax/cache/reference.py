@@ -1,0 +1,202 @@
+"""The definition of VACC's write and read as plain NumPy float64 loops: slow, obvious, and sharing nothing with them.
+
+The only float32 step is the voxel index itself, which is a rounding of the stored position.
+"""
+
+import itertools
+import math
+
+import numpy as np
+
+from ssplat_jax.cache.state import PIVOT_FIELDS, VoxelCache
+from ssplat_jax.config import StreamConfig
+
+INDEX_LIMIT = 1 << 20
+NEAR = 0.01
+SAME_DIRECTION = 1.0 - 1e-6
+
+
+def empty(capacity: int) -> dict:
+    """A cache: `rows` is a list of (voxel, list of pivots), a pivot a dict."""
+    names = "chunks seen accepted merged low_confidence non_finite out_of_range dropped evicted"
+    return {"capacity": capacity, "rows": [], "stats": {f"num_{name}": 0 for name in names.split()}}
+
+
+def fuse(cache: dict, tokens: dict, config: StreamConfig) -> dict:
+    """Inserts `tokens` (arrays named as the fields of `Tokens`) one after another, in place."""
+    stats = cache["stats"]
+    chunk = stats["num_chunks"]
+    stats["num_chunks"] += bool(np.any(tokens["valid"]))
+    accepted = []
+    for j in range(len(tokens["valid"])):
+        if not tokens["valid"][j]:
+            continue
+        stats["num_seen"] += 1
+        pivot = {name: np.asarray(x[j], np.float64) for name, x in tokens.items() if name != "valid"}
+        voxel = voxel_of(tokens["means"][j], config.voxel_size)
+        if not all(np.isfinite(x).all() for x in pivot.values()):
+            stats["num_non_finite"] += 1
+        elif pivot["confidences"] < np.float32(config.min_confidence):
+            stats["num_low_confidence"] += 1
+        elif voxel is None:
+            stats["num_out_of_range"] += 1
+        else:
+            accepted.append((voxel, pivot | {"seeds": pivot["feats"], "num_members": 1, "last_chunks": chunk}))
+    if config.vacc == "append":
+        _append_all(cache, accepted, config)
+    else:
+        _insert_all(cache, accepted, config)
+    return cache
+
+
+def from_arrays(cache: VoxelCache) -> dict:
+    """The pivots of a real cache, to compare projections of the very same numbers."""
+    arrays = {name: np.asarray(getattr(cache, name)) for name in PIVOT_FIELDS}
+    counts = np.asarray(cache.counts)
+    pivots = [
+        [{name: x[row, k].astype(np.float64) for name, x in arrays.items()} for k in range(counts[row])]
+        for row in range(int(cache.num_voxels))
+    ]
+    voxels = np.asarray(cache.voxels).tolist()
+    return {"capacity": cache.capacity, "rows": [(tuple(v), p) for v, p in zip(voxels, pivots, strict=False)]}
+
+
+def voxel_of(point: np.ndarray, voxel_size: float) -> tuple[int, int, int] | None:
+    """Index triple of a float32 point; None out of range."""
+    with np.errstate(all="ignore"):
+        cells = np.floor(np.float32(point) * np.float32(1.0 / voxel_size))
+    return tuple(int(c) for c in cells) if np.all(np.abs(cells) < INDEX_LIMIT) else None
+
+
+def _insert_all(cache, accepted, config):
+    rows, stats = cache["rows"], cache["stats"]
+    row_of = {voxel: row for row, (voxel, _) in enumerate(rows) if voxel is not None}
+    victims = _victims(cache, {voxel for voxel, _ in accepted}, config)
+    for voxel, pivot in accepted:
+        if voxel not in row_of:
+            if len(rows) < cache["capacity"]:
+                rows.append((voxel, []))
+                row_of[voxel] = len(rows) - 1
+            elif config.overflow == "evict_lowest" and victims:
+                row = victims.pop(0)
+                stats["num_evicted"] += len(rows[row][1])
+                del row_of[rows[row][0]]
+                rows[row] = (voxel, [])
+                row_of[voxel] = row
+            else:
+                stats["num_dropped"] += 1
+                continue
+        stats["num_accepted"] += 1
+        pivots = rows[row_of[voxel]][1]
+        if len(pivots) < config.pivots_per_voxel:
+            pivots.append(pivot)
+        else:
+            stats["num_merged"] += 1
+            merge_closest(pivots, pivot, config)
+
+
+def _append_all(cache, accepted, config):
+    rows, stats = cache["rows"], cache["stats"]
+    for _, pivot in accepted:
+        if not rows or len(rows[-1][1]) == config.pivots_per_voxel:
+            if len(rows) == cache["capacity"]:
+                stats["num_dropped"] += 1
+                continue
+            rows.append((None, []))
+        stats["num_accepted"] += 1
+        rows[-1][1].append(pivot)
+
+
+def _victims(cache, touched, config):
+    """Rows that may make way for new voxels of this chunk, first to go first."""
+
+    def rank(row):
+        _, pivots = cache["rows"][row]
+        return max(p["confidences"] for p in pivots), max(p["last_chunks"] for p in pivots), row
+
+    if config.overflow != "evict_lowest":
+        return []
+    return sorted((row for row, (voxel, _) in enumerate(cache["rows"]) if voxel not in touched), key=rank)
+
+
+def merge_closest(pivots: list, new: dict, config: StreamConfig) -> None:
+    """Adds `new` to the full list `pivots` and merges the closest pair, in place."""
+    key = {"seed": "seeds", "feature": "feats"}[config.merge_key]
+    candidates = [*pivots, new]
+    best, best_score = None, -math.inf
+    for i, j in itertools.combinations(range(len(candidates)), 2):
+        score = similarity(candidates[i][key], candidates[j][key])
+        if score > best_score:
+            best, best_score = (i, j), score
+    i, j = best
+    merged = merge(candidates[i], candidates[j], config)
+    if j < len(pivots):
+        pivots[j] = new
+    pivots[i] = merged
+
+
+def similarity(a: np.ndarray, b: np.ndarray) -> float:
+    """cos |cos| of two vectors: ordered as the cosine. 0 where a norm is 0, 1 where the directions are the same."""
+    dot, product = float(np.dot(a, b)), float(np.dot(a, a)) * float(np.dot(b, b))
+    score = dot * abs(dot) / product if product > 0 else 0.0
+    return 1.0 if score > SAME_DIRECTION else score
+
+
+def merge(older: dict, newer: dict, config: StreamConfig) -> dict:
+    """The pivot that replaces two."""
+    weights = [float(x["confidences"]) for x in (older, newer)]
+    best = newer if weights[1] > weights[0] else older
+    if config.merge_weight == "count":
+        weights = [w * x["num_members"] for w, x in zip(weights, (older, newer), strict=True)]
+    if sum(weights) == 0:
+        weights = [0.5, 0.5]
+    mean = {
+        name: (weights[0] * older[name] + weights[1] * newer[name]) / sum(weights)
+        for name in ("means", "feats", "rgbs")
+    }
+    kept = {name: best[name] for name in ("seeds", "confidences", "quats", "footprints")}
+    return (
+        mean
+        | kept
+        | {
+            "num_members": older["num_members"] + newer["num_members"],
+            "last_chunks": max(older["last_chunks"], newer["last_chunks"]),
+        }
+    )
+
+
+def project(cache: dict, viewmats, Ks, height: int, width: int, config: StreamConfig) -> tuple:
+    """Depths, confidences, features, mask of each view, and how close any decision in it was (see `margin`)."""
+    pivots = [pivot for _, row in cache["rows"] for pivot in row]
+    width_feats = len(pivots[0]["feats"]) if pivots else config.token_width
+    window = math.log(config.cluster_ratio)
+    shape = (len(viewmats), height, width)
+    depths, confidences, mask = np.zeros(shape), np.zeros(shape), np.zeros(shape, bool)
+    feats, margin = np.zeros((*shape, width_feats)), math.inf
+    for v, (viewmat, K) in enumerate(zip(np.float64(viewmats), np.float64(Ks), strict=True)):
+        on_pixel: dict = {}
+        for pivot in pivots:
+            x, y, z = viewmat[:3, :3] @ pivot["means"] + viewmat[:3, 3]
+            if pivot["confidences"] <= 0:
+                continue
+            margin = min(margin, abs(z - NEAR))
+            if z <= NEAR:
+                continue
+            column, row = K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
+            margin = min(margin, abs(column - round(column)), abs(row - round(row)))
+            if 0 <= column < width and 0 <= row < height:
+                on_pixel.setdefault((math.floor(row), math.floor(column)), []).append((math.log(z), pivot))
+        for pixel, pairs in on_pixel.items():
+            front = min(ell for ell, _ in pairs)
+            members = [(ell, p["confidences"]) for ell, p in pairs if ell <= front + window]
+            centre = sum(w * ell for ell, w in members) / sum(w for _, w in members)
+            for ell, _ in pairs:
+                margin = min(margin, abs(ell - front - window), abs(abs(ell - centre) - window))
+            cluster = [(ell, p) for ell, p in pairs if abs(ell - centre) <= window]
+            total = sum(p["confidences"] for _, p in cluster)
+            at = (v, *pixel)
+            mask[at] = True
+            depths[at] = math.exp(sum(p["confidences"] * ell for ell, p in cluster) / total)
+            confidences[at] = sum(p["confidences"] ** 2 for _, p in cluster) / total
+            feats[at] = sum(p["confidences"] * p["feats"] for _, p in cluster) / total
+    return depths, confidences, feats, mask, margin

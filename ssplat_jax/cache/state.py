@@ -1,0 +1,110 @@
+"""`VoxelCache`: the stream's only memory, a pure pytree of fixed size (Sec. 3.4, VACC)."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from ssplat_jax.cache.table import SLOTS_PER_ROW
+from ssplat_jax.config import StreamConfig
+from ssplat_jax.struct import pytree
+
+
+@pytree
+class CacheStats:
+    """Counters over the whole stream: what only the running program knows. Read them outside jit; `check` does."""
+
+    num_chunks: Int[Array, ""]
+    num_seen: Int[Array, ""]  # tokens of valid views offered to the cache
+    num_accepted: Int[Array, ""]  # appended or merged
+    num_merged: Int[Array, ""]  # merges done (each leaves the number of pivots as it was)
+    num_low_confidence: Int[Array, ""]  # rejected: below tau_conf
+    num_non_finite: Int[Array, ""]  # rejected: NaN or infinite
+    num_out_of_range: Int[Array, ""]  # rejected: voxel index beyond +-2^20
+    num_dropped: Int[Array, ""]  # rejected: no room for a new voxel (overflow)
+    num_evicted: Int[Array, ""]  # pivots lost to overflow="evict_lowest"
+
+
+@pytree
+class VoxelCache:
+    """Up to `capacity` voxels of up to `k` pivots each.
+
+    Rows are dense: voxels 0 .. num_voxels-1 are occupied, in order of their first token; in a row the first
+    `counts` pivots are alive. `table` is an open-addressing hash from voxel index to row, verified against `voxels`.
+    Dead pivots hold zeros.
+    """
+
+    # which voxels there are
+    voxels: Int[Array, "capacity 3"]  # floor(mean / voxel_size)
+    counts: Int[Array, " capacity"]  # alive pivots, 0 .. k
+    num_voxels: Int[Array, ""]
+    table: Int[Array, " slots"]  # row of the voxel hashed here, -1 where empty (table.py)
+    # their pivots
+    means: Float[Array, "capacity k 3"]  # stream frame
+    feats: Float[Array, "capacity k c"]  # the token state f
+    seeds: Float[Array, "capacity k c"]  # feature of the most confident member, for matching
+    confidences: Float[Array, "capacity k"]  # omega, (0, 1]
+    rgbs: Float[Array, "capacity k 3"]  # appearance anchor: mean colour of the token's patch
+    quats: Float[Array, "capacity k 4"]  # camera-to-world orientation of the most confident member, wxyz
+    footprints: Float[Array, "capacity k"]  # size of a grid cell at the most confident member, stream units
+    num_members: Int[Array, "capacity k"]  # tokens merged into the pivot
+    last_chunks: Int[Array, "capacity k"]  # chunk that last wrote it
+    stats: CacheStats
+
+    @property
+    def alive(self) -> Bool[Array, "capacity k"]:
+        """Which pivots exist."""
+        return jnp.arange(self.means.shape[1]) < self.counts[:, None]
+
+    @property
+    def capacity(self) -> int:
+        """Voxels it can hold."""
+        return self.voxels.shape[0]
+
+
+PIVOT_FIELDS = (
+    "means",
+    "feats",
+    "seeds",
+    "confidences",
+    "rgbs",
+    "quats",
+    "footprints",
+    "num_members",
+    "last_chunks",
+)
+"""The fields of `VoxelCache` that hold one entry per pivot, `[capacity, k, ...]`."""
+
+
+@pytree
+class Tokens:
+    """`m` tokens on their way into the cache, in order of insertion (view-major, row-major)."""
+
+    means: Float[Array, "m 3"]
+    feats: Float[Array, "m c"]
+    confidences: Float[Array, " m"]
+    rgbs: Float[Array, "m 3"]
+    quats: Float[Array, "m 4"]  # orientation of the camera that saw the token, camera-to-world, wxyz
+    footprints: Float[Array, " m"]
+    valid: Bool[Array, " m"]  # False: padding; neither used nor counted
+
+
+def init_cache(config: StreamConfig, capacity: int | None = None) -> VoxelCache:
+    """An empty cache of `capacity` voxels (default: the config's)."""
+    capacity = capacity or config.capacity
+    k, c = config.pivots_per_voxel, config.token_width
+    zero = lambda: jnp.zeros((), jnp.int32)  # noqa: E731 - one fresh buffer per counter, so that all can be donated
+    return VoxelCache(
+        voxels=jnp.zeros((capacity, 3), jnp.int32),
+        counts=jnp.zeros((capacity,), jnp.int32),
+        num_voxels=zero(),
+        table=jnp.full((SLOTS_PER_ROW * capacity,), -1, jnp.int32),
+        means=jnp.zeros((capacity, k, 3)),
+        feats=jnp.zeros((capacity, k, c)),
+        seeds=jnp.zeros((capacity, k, c)),
+        confidences=jnp.zeros((capacity, k)),
+        rgbs=jnp.zeros((capacity, k, 3)),
+        quats=jnp.zeros((capacity, k, 4)),
+        footprints=jnp.zeros((capacity, k)),
+        num_members=jnp.zeros((capacity, k), jnp.int32),
+        last_chunks=jnp.zeros((capacity, k), jnp.int32),
+        stats=CacheStats(*(zero() for _ in range(9))),
+    )
