@@ -1,0 +1,5 @@
+"""Differentiable rendering of 3D Gaussians in plain JAX."""
+
+from ssplat_jax.render.api import render as render
+from ssplat_jax.render.effects import Effects as Effects
+from ssplat_jax.render.output import RenderOutput as RenderOutput

@@ -1,0 +1,119 @@
+"""Which Gaussians touch which tile, front to back: sorted (tile, Gaussian) pairs.
+
+Rows are (camera, Gaussian) flattened to `m = b n`; tiles are numbered camera-major, row-major. Gaussians are sorted once
+by (depth, row); a pair's key is then `tile << bits | depth rank`, so that one sort of plain integers puts everything in
+exact order. XLA sorts single integers five times faster than it sorts (key, payload) tuples, hence the packing.
+"""
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Int
+
+from ssplat_jax.render.projection import Splats
+from ssplat_jax.struct import pytree, static
+
+
+@pytree
+class Grid:
+    """The tiles of `b` images of one size."""
+
+    num_images: int = static()
+    height: int = static()
+    width: int = static()
+    tile: int = static()
+
+    @property
+    def rows(self) -> int:
+        """Tiles down an image."""
+        return -(-self.height // self.tile)
+
+    @property
+    def columns(self) -> int:
+        """Tiles across an image."""
+        return -(-self.width // self.tile)
+
+    @property
+    def num_tiles(self) -> int:
+        """Tiles of all images."""
+        return self.num_images * self.rows * self.columns
+
+
+@pytree
+class Pairs:
+    """For each tile the rows that touch it, front to back: `rows[bounds[t] : bounds[t + 1]]`."""
+
+    rows: Int[Array, " p"]
+    bounds: Int[Array, " tiles_and_one"]
+    num_pairs: Int[Array, ""]  # needed; those beyond the capacity `p` (the farthest Gaussians) are missing
+
+
+def tile_boxes(splats: Splats, grid: Grid) -> Int[Array, "m 4"]:
+    """Tile ranges (x from, y from, columns, rows) that each row's box covers; invisible ones cover none."""
+    limit = jnp.array([grid.columns, grid.rows], splats.means2d.dtype)
+    low = jnp.clip(jnp.floor((splats.means2d - splats.extents) / grid.tile), 0, limit)
+    high = jnp.clip(jnp.floor((splats.means2d + splats.extents) / grid.tile) + 1, 0, limit)
+    size = jnp.where(splats.visible[..., None], high - low, 0)
+    return jnp.concatenate([low, size], axis=-1).astype(jnp.int32).reshape(-1, 4)
+
+
+def count_pairs(splats: Splats, grid: Grid) -> Int[Array, ""]:
+    """Pairs that `bin_splats` needs room for."""
+    boxes = tile_boxes(splats, grid)
+    return jnp.sum(boxes[:, 2] * boxes[:, 3])
+
+
+def depth_order(splats: Splats) -> Int[Array, " m"]:
+    """Rows from near to far, ties by row number; invisible rows last (and all alike: row 0).
+
+    One 64-bit integer a row, depth bits above row number, whatever `jax_enable_x64` says: exact and without payload.
+    """
+    depths = splats.depths.reshape(-1).astype(jnp.float32)
+    visible = splats.visible.reshape(-1)
+    with jax.enable_x64(True):
+        bits = lax.bitcast_convert_type(depths, jnp.uint32).astype(jnp.uint64)  # positive floats sort as integers
+        keys = (bits << jnp.uint64(32)) | lax.iota(jnp.uint64, depths.shape[0])
+        keys = lax.sort(jnp.where(visible, keys, jnp.uint64(0xFFFFFFFF00000000)), is_stable=False)
+        return (keys & jnp.uint64(0xFFFFFFFF)).astype(jnp.int32)
+
+
+def bin_splats(splats: Splats, grid: Grid, max_pairs: int) -> Pairs:
+    """The sorted pairs of `splats` and tiles, at most `max_pairs` of them."""
+    order = depth_order(splats)
+    num_rows = order.shape[0]
+    visible_first = jnp.arange(num_rows) < jnp.sum(splats.visible)
+    boxes = jnp.where(visible_first[:, None], tile_boxes(splats, grid)[order], 0)
+    counts = boxes[:, 2] * boxes[:, 3]
+    ends = jnp.cumsum(counts)
+    ranks = _owners(ends, max_pairs)
+    tiles_per_image = grid.rows * grid.columns
+    first_tiles = (order // splats.depths.shape[1]) * tiles_per_image + boxes[:, 1] * grid.columns + boxes[:, 0]
+    table = jnp.stack([ends - counts, first_tiles, jnp.maximum(boxes[:, 2], 1)], axis=-1)[ranks]
+    pair = jnp.arange(max_pairs, dtype=jnp.int32)
+    within = pair - table[:, 0]
+    tiles = table[:, 1] + within // table[:, 2] * grid.columns + within % table[:, 2]
+    sorted_ranks, bounds = _sort_pairs(tiles, ranks, pair < ends[-1], grid.num_tiles, num_rows)
+    return Pairs(rows=order[sorted_ranks], bounds=bounds, num_pairs=ends[-1])
+
+
+def _owners(ends: Int[Array, " m"], max_pairs: int) -> Int[Array, " p"]:
+    """Which of consecutive runs that end (exclusively) at `ends` each position belongs to."""
+    steps = jnp.zeros((max_pairs,), jnp.int32).at[ends].add(1, mode="drop")
+    return jnp.minimum(jnp.cumsum(steps), ends.shape[0] - 1)
+
+
+def _sort_pairs(
+    tiles: Int[Array, " p"], ranks: Int[Array, " p"], exists: Array, num_tiles: int, num_rows: int
+) -> tuple[Int[Array, " p"], Int[Array, " tiles_and_one"]]:
+    """Depth ranks in order of (tile, rank), and where each tile's begin."""
+    bits = max(1, (num_rows - 1).bit_length())
+    fits = num_tiles.bit_length() + bits <= 32
+    with jax.enable_x64(not fits):
+        dtype = jnp.uint32 if fits else jnp.uint64
+        shift = jnp.array(bits, dtype)
+        keys = (tiles.astype(dtype) << shift) | ranks.astype(dtype)
+        keys = lax.sort(jnp.where(exists, keys, ~jnp.array(0, dtype)), is_stable=False)
+        starts = jnp.arange(num_tiles + 1, dtype=dtype) << shift
+        bounds = jnp.searchsorted(keys, starts).astype(jnp.int32)
+        sorted_ranks = (keys & ((jnp.array(1, dtype) << shift) - jnp.array(1, dtype))).astype(jnp.int32)
+    return jnp.minimum(sorted_ranks, num_rows - 1), bounds

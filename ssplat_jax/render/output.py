@@ -1,0 +1,79 @@
+"""What both renderers share around compositing: which channels go in, and what is made of them."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from ssplat_jax.gaussians import Gaussians
+from ssplat_jax.geometry.cameras import Camera
+from ssplat_jax.numerics import safe_normalize
+from ssplat_jax.render.effects import Effects
+from ssplat_jax.render.projection import Splats
+from ssplat_jax.render.sh import sh_colors
+from ssplat_jax.struct import pytree
+
+
+@pytree
+class RenderOutput:
+    """Images of one camera or a batch, and what only the running program knows."""
+
+    color: Float[Array, "*b h w 3"]  # RGB, background included; may exceed 1 (SH), never below 0
+    alpha: Float[Array, "*b h w"]  # 1 - transmittance
+    depth: Float[Array, "*b h w"] | None  # expected camera z, sum(w z) / sum(w); 0 where alpha is 0
+    features: Float[Array, "*b h w c"] | None  # sum(w f), not normalised
+    num_pairs: Int[Array, ""]  # (tile, Gaussian) pairs of all images
+    num_overflow: Int[Array, ""]  # pairs that `max_pairs` had no room for; the image is wrong unless 0
+    num_non_finite: Int[Array, ""]  # rows culled for NaN, infinite or absurd entries
+
+
+def splat_channels(
+    gaussians: Gaussians,
+    splats: Splats,
+    camera: Camera,
+    effects: Effects,
+    features: Float[Array, "n c"] | None,
+) -> Float[Array, "b n c"]:
+    """Per camera and Gaussian: RGB, then depth and features if wanted, then 1 (which composites to alpha)."""
+    degree = gaussians.sh_degree if effects.sh_degree is None else min(effects.sh_degree, gaussians.sh_degree)
+    directions = None
+    if degree > 0:
+        directions = safe_normalize(gaussians.means - camera.centers[:, None, :])
+    shape = splats.depths.shape
+    colors = jnp.broadcast_to(sh_colors(gaussians.sh, directions, degree), (*shape, 3))
+    parts = [colors.astype(splats.depths.dtype)]
+    if "depth" in effects.outputs:
+        parts.append(splats.depths[..., None])
+    if features is not None:
+        usable = jnp.all(jnp.isfinite(features), axis=-1, keepdims=True)
+        features = jnp.where(usable, features, 0).astype(splats.depths.dtype)
+        parts.append(jnp.broadcast_to(features, (*shape, features.shape[-1])))
+    return jnp.concatenate([*parts, jnp.ones((*shape, 1), splats.depths.dtype)], axis=-1)
+
+
+def finish(
+    composited: Float[Array, "b h w c"],
+    camera: Camera,
+    effects: Effects,
+    *,
+    num_pairs: Int[Array, ""],
+    num_overflow: Int[Array, ""],
+    num_non_finite: Int[Array, ""],
+) -> RenderOutput:
+    """The output of composited `splat_channels`, in the camera's batch shape."""
+    images = composited.reshape(*camera.viewmats.shape[:-2], *composited.shape[1:])
+    color, alpha, rest = images[..., :3], images[..., -1], images[..., 3:-1]
+    if effects.background is not None:
+        color = color + (1.0 - alpha)[..., None] * jnp.array(effects.background, color.dtype)
+    depth = None
+    if "depth" in effects.outputs:
+        seen = alpha > 0
+        depth = jnp.where(seen, rest[..., 0] / jnp.where(seen, alpha, 1.0), 0.0)
+        rest = rest[..., 1:]
+    return RenderOutput(
+        color=color,
+        alpha=alpha,
+        depth=depth,
+        features=rest if rest.shape[-1] else None,
+        num_pairs=num_pairs,
+        num_overflow=num_overflow,
+        num_non_finite=num_non_finite,
+    )
