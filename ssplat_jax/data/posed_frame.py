@@ -1,0 +1,123 @@
+"""`Frame`: one posed image of a capture, and the checks that every reader's cameras pass through.
+
+Poses and intrinsics are float64: float32 has a step of 0.5 m at earth-centred coordinates.
+"""
+
+import dataclasses
+import math
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+
+from ssplat_jax.data.refusal import echo, refusal
+
+ROTATION_TOLERANCE = 1e-3  # largest |R^T R - I| that is taken for rounding and projected to a rotation
+ROTATION_ROUNDING = 1e-5  # deviations beyond this are reported
+DISTORTION_TOLERANCE_PX = 0.5  # largest displacement by lens distortion, in pixels, that is ignored
+MIN_FOCAL_PX = 3.0  # smaller focal lengths are intrinsics in units of the image, not in pixels
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Frame:
+    """One posed image as stored, before any change of size."""
+
+    name: str  # as the capture calls it
+    camtoworld: Float64[np.ndarray, "4 4"]  # OpenCV axes, capture frame
+    K: Float64[np.ndarray, "3 3"]  # pixels of the stored image, first pixel's centre at (0.5, 0.5)
+    width: int
+    height: int
+    path: Path | None = None  # None: the image lives in memory
+    depth_path: Path | None = None  # 16-bit PNG of millimetres
+    pose_deviation: float = 0.0  # |R^T R - I| before projection
+    distortion_px: float = 0.0  # largest displacement by the distortion that is ignored
+
+    @property
+    def center(self) -> Float64[np.ndarray, "3"]:
+        """Camera centre in the capture frame."""
+        return self.camtoworld[:3, 3]
+
+
+def check_camtoworld(matrix: object, where: str) -> tuple[Float64[np.ndarray, "4 4"], float]:
+    """A rigid camera-to-world transform from numbers of outside, and how far its rotation was from one.
+
+    Limits:
+        |R^T R - I| <= 1e-3: replaced by the nearest rotation. Beyond: refused.
+        det R < 0 (a mirrored frame): refused.
+    """
+    try:
+        pose = np.array(matrix, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        raise refusal(
+            where, wanted="a 4x4 matrix of numbers", got=echo(matrix), fix="write four rows of four"
+        ) from None
+    if pose.shape == (3, 4):
+        pose = np.vstack([pose, [0.0, 0.0, 0.0, 1.0]])
+    if pose.shape != (4, 4):
+        raise refusal(where, wanted="a 4x4 matrix", got=f"shape {pose.shape}", fix="write four rows of four numbers")
+    if not np.isfinite(pose).all():
+        raise refusal(where, wanted="finite numbers", got="NaN or infinity", fix="drop the frame (tracking was lost)")
+    if not np.array_equal(pose[3], [0.0, 0.0, 0.0, 1.0]):
+        transposed = np.array_equal(pose[:, 3], [0.0, 0.0, 0.0, 1.0])
+        fix = "transpose the matrix" if transposed else "give a rigid camera-to-world transform"
+        raise refusal(where, wanted="a last row of 0 0 0 1", got=echo(pose[3].tolist()), fix=fix)
+    rotation = pose[:3, :3]
+    # Huge entries overflow in the product: an infinite deviation is refused like any other.
+    with np.errstate(over="ignore", invalid="ignore"):
+        deviation = float(np.nan_to_num(np.abs(rotation.T @ rotation - np.eye(3)).max(), nan=np.inf))
+    if deviation > ROTATION_TOLERANCE:
+        got = f"R^T R off the identity by {deviation:.2g}"
+        raise refusal(
+            where, wanted="a rotation (no scale, no shear)", got=got, fix="divide the scale out of the matrix"
+        )
+    if np.linalg.det(rotation) < 0:
+        fix = "flip one axis of the camera or undo the mirroring of the world"
+        raise refusal(where, wanted="a rotation with determinant 1", got="determinant -1 (a reflection)", fix=fix)
+    u, _, vt = np.linalg.svd(rotation)
+    pose[:3, :3] = u @ vt
+    return pose, deviation
+
+
+def check_intrinsics(
+    *, fx: float, fy: float, cx: float, cy: float, width: int, height: int, where: str
+) -> Float64[np.ndarray, "3 3"]:
+    """The 3x3 matrix of plausible pixel intrinsics."""
+    for name, focal in (("fl_x", fx), ("fl_y", fy)):
+        if not (math.isfinite(focal) and focal > 0):
+            fix = "give the focal length in pixels"
+            raise refusal(f"{where}.{name}", wanted="a focal length above 0", got=echo(focal), fix=fix)
+        if focal < MIN_FOCAL_PX:
+            fix = f"multiply it by the image's {'width' if name == 'fl_x' else 'height'} if it is normalised"
+            raise refusal(f"{where}.{name}", wanted="a focal length in pixels", got=echo(focal), fix=fix)
+    for name, center, extent in (("cx", cx, width), ("cy", cy, height)):
+        if not 0 <= center <= extent:  # false for NaN too
+            fix = "give the principal point in pixels of the stored image"
+            raise refusal(f"{where}.{name}", wanted=f"a value in [0, {extent}]", got=echo(center), fix=fix)
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+
+def check_distortion(
+    coefficients: dict[str, float], K: Float64[np.ndarray, "3 3"], width: int, height: int, where: str
+) -> float:
+    """Largest displacement in pixels by Brown's model (k1 k2 k3 k4 radial, p1 p2 tangential), refused if it shows.
+
+    Limits:
+        Up to 0.5 px anywhere on the image's border: ignored, the value returned. Beyond: refused.
+    """
+    get = lambda name: coefficients.get(name, 0.0)  # noqa: E731 - absent means zero
+    t = np.linspace(0.0, 1.0, 9)
+    edge = np.concatenate([np.stack(np.broadcast_arrays(t, s), -1) for s in (0.0, 1.0)])
+    border = np.concatenate([edge, edge[:, ::-1]]) * (width, height)
+    x = (border[:, 0] - K[0, 2]) / K[0, 0]
+    y = (border[:, 1] - K[1, 2]) / K[1, 1]
+    r2 = x * x + y * y
+    with np.errstate(over="ignore", invalid="ignore"):
+        radial = r2 * (get("k1") + r2 * (get("k2") + r2 * (get("k3") + r2 * get("k4"))))
+        dx = x * radial + 2 * get("p1") * x * y + get("p2") * (r2 + 2 * x * x)
+        dy = y * radial + get("p1") * (r2 + 2 * y * y) + 2 * get("p2") * x * y
+        shift = float(np.nan_to_num(np.hypot(K[0, 0] * dx, K[1, 1] * dy).max(), nan=np.inf))
+    if shift > DISTORTION_TOLERANCE_PX:
+        shown = ", ".join(f"{k}={v:.3g}" for k, v in coefficients.items() if v != 0)
+        fix = "undistort first (COLMAP: `colmap image_undistorter`) and set k1..p2 to 0"
+        raise refusal(where, wanted="undistorted images", got=f"{shown}, which moves pixels by {shift:.3g}", fix=fix)
+    return shift

@@ -1,0 +1,219 @@
+"""Camera paths through free space: what a hand that films does, sampled at random but never through a wall.
+
+A path is walked step by step. Each style says which way the next step and the next gaze would like to go; the step is
+turned aside while it would come too close to a surface, and the gaze follows its wish with the inertia of a wrist. Step
+lengths are fractions of the median depth that is seen, because parallax, not distance, is what matching sees.
+"""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float
+
+from ssplat_jax.data.procedural.scene import Scene, clearance
+from ssplat_jax.errors import InputError
+
+UP = np.array([0.0, -1.0, 0.0])
+
+
+@dataclasses.dataclass
+class _Walker:
+    """Where the camera is and what it does next."""
+
+    position: np.ndarray
+    heading: np.ndarray  # unit
+    gaze: np.ndarray  # unit
+    roll: float
+    turn: float  # direction of an orbit or pan, -1 or 1
+
+
+def sample_path(
+    seed: int,
+    scene: Scene,
+    kind: str | None,
+    num_views: int,
+    height: int,
+    width: int,
+    *,
+    step: float | None = None,
+    min_clearance: float = 0.45,
+) -> tuple[Float[np.ndarray, "v 4 4"], Float[np.ndarray, "v 3 3"]]:
+    """Camera-to-world poses (OpenCV axes) and intrinsics of a walk through `scene`, in its units.
+
+    Args:
+        seed: the same seed gives the same path.
+        scene: the world that must not be touched.
+        kind: one of `PATH_KINDS`; None draws one.
+        num_views: poses wanted.
+        height: image rows; with `width` it sets the intrinsics, one camera for all views.
+        width: image columns.
+        step: typical distance between consecutive views; None takes 1 to 10 % of the orbit radius.
+        min_clearance: distance to keep from every surface, as far as the walk finds room.
+
+    Raises:
+        InputError: no such kind.
+    """
+    if kind is not None and kind not in _STYLES:
+        raise InputError(f"procedural path: kind must be one of {', '.join(PATH_KINDS)}, got {kind!r}.")
+    rng = np.random.default_rng([2, seed])
+    drawn = str(rng.choice(PATH_KINDS, p=_SHARES))
+    style = _STYLES[kind or drawn]
+    typical = step if step is not None else float(scene.orbit_radius) * np.exp(rng.uniform(np.log(0.01), np.log(0.1)))
+    walker = _start(rng, scene, kind or drawn, min_clearance)
+    wobble = rng.uniform(0.0, 0.03)
+    poses = []
+    for _ in range(num_views):
+        poses.append(_pose(rng, walker, wobble))
+        _advance(rng, scene, walker, style, typical * rng.uniform(0.6, 1.4), min_clearance)
+    return np.stack(poses).astype(np.float32), _intrinsics(rng, num_views, height, width)
+
+
+def _intrinsics(rng: np.random.Generator, num_views: int, height: int, width: int) -> np.ndarray:
+    """A focal length of 0.6 to 1.3 long sides and a principal point up to 4 % off the centre."""
+    focal = np.exp(rng.uniform(np.log(0.6), np.log(1.3))) * max(height, width)
+    cx, cy = (0.5 + rng.uniform(-0.04, 0.04, 2)) * [width, height]
+    K = np.array([[focal, 0, cx], [0, focal * rng.uniform(0.99, 1.01), cy], [0, 0, 1]], np.float32)
+    return np.tile(K, (num_views, 1, 1))
+
+
+# -- the walk ---------------------------------------------------------------------------------------------------------
+
+
+def _start(rng: np.random.Generator, scene: Scene, kind: str, min_clearance: float) -> _Walker:
+    """A free spot: around the focus for an orbit, near the eye otherwise."""
+    radius, focus = float(scene.orbit_radius), np.asarray(scene.focus, np.float64)
+    heading = _unit(rng.standard_normal(3) * [1, 0.15, 1])
+    if kind in ("orbit", "gazing"):
+        azimuth, elevation = rng.uniform(0, 2 * np.pi, 64), rng.uniform(0.05, 0.9, 64)
+        around = [np.cos(elevation) * np.sin(azimuth), -np.sin(elevation), np.cos(elevation) * np.cos(azimuth)]
+        spots = focus + radius * rng.uniform(0.85, 1.15) * np.stack(around, axis=-1)
+    else:
+        spots = np.asarray(scene.eye, np.float64) + radius * 0.8 * rng.standard_normal((64, 3)) * [1, 0.15, 1]
+    spots = np.concatenate([spots, np.asarray(scene.eye, np.float64)[None]])
+    free = clearance(scene, spots)
+    ok = np.flatnonzero(free > 1.3 * min_clearance)
+    position = spots[ok[0] if len(ok) else int(np.argmax(free))]
+    to_focus = _unit(focus - position)
+    if kind in ("orbit", "gazing"):
+        gaze = to_focus
+    else:
+        # More often than not the gaze starts across the middle of the world, where there is something to see.
+        gaze = _level((to_focus if rng.random() < 0.6 else heading) + rng.normal(0, 0.2, 3))
+    heading = gaze if kind == "forward" else heading
+    return _Walker(position, heading, gaze, rng.normal(0, 0.06), float(rng.choice([-1.0, 1.0])))
+
+
+def _advance(rng, scene: Scene, walker: _Walker, style, distance: float, min_clearance: float) -> None:
+    """One step and one turn of the wrist."""
+    wish, gaze, share, inertia = style(rng, scene, walker)
+    walker.heading = _free_heading(rng, scene, walker, wish, distance * share, min_clearance)
+    walker.position = walker.position + distance * share * walker.heading
+    walker.gaze = _unit(inertia * walker.gaze + (1 - inertia) * gaze)
+    walker.roll = 0.9 * walker.roll + rng.normal(0, 0.01)
+
+
+def _free_heading(rng, scene: Scene, walker: _Walker, wish: np.ndarray, distance: float, min_clearance: float):
+    """The direction nearest to `wish` that keeps clear for this step and a few more."""
+    ahead = distance * np.array([1.0, 3.0])
+    if clearance(scene, walker.position + ahead[:, None] * wish).min() > min_clearance:
+        return wish
+    options = wish + rng.standard_normal((32, 3)) * np.linspace(0.1, 3, 32)[:, None] * [1, 0.3, 1]
+    options /= np.maximum(np.linalg.norm(options, axis=-1, keepdims=True), 1e-9)
+    points = walker.position + ahead[:, None, None] * options
+    free = clearance(scene, points.reshape(-1, 3)).reshape(2, -1).min(axis=0)
+    ok = np.flatnonzero(free > min_clearance)
+    return options[ok[0] if len(ok) else int(np.argmax(free))]
+
+
+def _pose(rng: np.random.Generator, walker: _Walker, wobble: float) -> np.ndarray:
+    """The walker's camera, shaken by `wobble` radians."""
+    forward = _unit(walker.gaze + wobble * rng.standard_normal(3))
+    return look_along(walker.position, forward, walker.roll)
+
+
+def look_along(position: np.ndarray, forward: np.ndarray, roll: float = 0.0) -> Float[np.ndarray, "4 4"]:
+    """Camera-to-world pose at `position` with +z along unit `forward`, level but for `roll`."""
+    right = _unit(np.cross(forward, UP))
+    down = np.cross(forward, right)
+    c, s = np.cos(roll), np.sin(roll)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([c * right + s * down, c * down - s * right, forward], axis=-1)
+    pose[:3, 3] = position
+    return pose
+
+
+def look_at(position: np.ndarray, target: np.ndarray) -> Float[np.ndarray, "4 4"]:
+    """Level camera-to-world pose at `position` that looks at `target`."""
+    return look_along(position, _unit(target - position))
+
+
+def _unit(x: np.ndarray) -> np.ndarray:
+    return x / max(float(np.linalg.norm(x)), 1e-9)
+
+
+def _turned(direction: np.ndarray, angle: float) -> np.ndarray:
+    """`direction` turned about the vertical."""
+    c, s = np.cos(angle), np.sin(angle)
+    x, y, z = direction
+    return np.array([c * x + s * z, y, -s * x + c * z])
+
+
+def _level(direction: np.ndarray) -> np.ndarray:
+    return _unit(direction * [1.0, 0.5, 1.0])
+
+
+# -- styles: (wished heading, wished gaze, share of the step taken, inertia of the gaze) -------------------------------
+
+
+def _forward(rng, scene: Scene, walker: _Walker):
+    """Walks where it looks, swaying."""
+    heading = _level(_turned(walker.heading, rng.normal(0, 0.08)) + rng.normal(0, 0.04) * UP)
+    return heading, _unit(heading + rng.normal(0, 0.15, 3) * [1, 0.5, 1]), 1.0, 0.8
+
+
+def _sideways(rng, scene: Scene, walker: _Walker):
+    """Walks at right angles to the gaze."""
+    heading = _level(_turned(walker.gaze, walker.turn * np.pi / 2) + rng.normal(0, 0.15, 3))
+    return heading, _level(_turned(walker.gaze, rng.normal(0, 0.03))), 1.0, 0.7
+
+
+def _orbit(rng, scene: Scene, walker: _Walker):
+    """Circles the focus, rising and sinking, and looks at it."""
+    to_focus = np.asarray(scene.focus, np.float64) - walker.position
+    tangent = walker.turn * _unit(np.cross(to_focus, UP))
+    drift = (np.linalg.norm(to_focus) / float(scene.orbit_radius) - 1) * _unit(to_focus)
+    climb = 0.8 * walker.heading[1] + rng.normal(0, 0.15)
+    return _unit(tangent + drift + [0, climb, 0]), _unit(to_focus), 1.0, 0.3
+
+
+def _pan(rng, scene: Scene, walker: _Walker):
+    """Turns in place, the hand moving on a short arm."""
+    gaze = _turned(walker.gaze, walker.turn * rng.uniform(0.1, 0.35)) + rng.normal(0, 0.05) * UP
+    wish = _level(_turned(walker.gaze, walker.turn * np.pi / 2) + rng.normal(0, 0.3, 3))
+    return wish, _unit(gaze), 0.8, 0.5
+
+
+def _handheld(rng, scene: Scene, walker: _Walker):
+    """Wanders in three dimensions with a gaze that drifts."""
+    heading = _unit(walker.heading + rng.normal(0, 0.4, 3) * [1, 0.6, 1])
+    return heading, _unit(walker.gaze + rng.normal(0, 0.12, 3) * [1, 0.5, 1]), 1.0, 0.6
+
+
+def _gazing(rng, scene: Scene, walker: _Walker):
+    """Wanders in front of the focus and looks near it."""
+    to_focus = np.asarray(scene.focus, np.float64) - walker.position
+    drift = (np.linalg.norm(to_focus) / float(scene.orbit_radius) - 1) * _unit(to_focus)
+    heading = _unit(walker.heading + drift + rng.normal(0, 0.4, 3) * [1, 0.6, 1])
+    return heading, _unit(_unit(to_focus) + rng.normal(0, 0.15, 3)), 1.0, 0.6
+
+
+_STYLES = {
+    "forward": _forward,
+    "sideways": _sideways,
+    "orbit": _orbit,
+    "gazing": _gazing,
+    "pan": _pan,
+    "handheld": _handheld,
+}
+PATH_KINDS = tuple(_STYLES)
+_SHARES = (0.22, 0.2, 0.15, 0.1, 0.1, 0.23)

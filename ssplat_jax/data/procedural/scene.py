@@ -1,0 +1,88 @@
+"""What a procedural world is: a fixed number of solids inside a closed shell, and the distance to them.
+
+The world has OpenCV's handedness with +y down; the floor is the plane y = 0 and eyes are at negative y. Solids are unit
+shapes (the cube |x|,|y|,|z| <= 1, the unit ball, the cylinder of radius 1 along y) moved by a frame, in that order in
+the arrays; rows that a scene does not need lie far outside its shell. Two rows follow the solids: the shell's box and
+its dome. The world is their intersection seen from inside, so every ray ends.
+"""
+
+import numpy as np
+from jaxtyping import Array, Float, Int, UInt32
+
+from ssplat_jax.struct import pytree, replace
+
+NUM_BOXES, NUM_BALLS, NUM_CYLINDERS = 32, 6, 10
+NUM_SOLIDS = NUM_BOXES + NUM_BALLS + NUM_CYLINDERS
+AWAY = 1e5  # where absent solids lie, in scene units
+
+AnyArray = np.ndarray | Array
+
+
+@pytree
+class Scene:
+    """A procedural world of fixed array shapes. `s` rows: `NUM_SOLIDS` solids, the shell's box, its dome."""
+
+    # -- geometry
+    frames: Float[AnyArray, "s 3 4"]  # world -> unit frame of the solid
+    halves: Float[AnyArray, "s 3"]  # half extents along the solid's axes
+    counts: Int[AnyArray, "3"]  # used rows of boxes, balls, cylinders
+    # -- appearance, for each of the faces -x +x -y +y -z +z
+    faces: Float[AnyArray, "s 6 16"]  # u and v from unit coordinates (4 + 4), tiles per length, gain 3, bias 3, glow
+    face_textures: Int[AnyArray, "s 6"]
+    pyramids: UInt32[AnyArray, "num_textures texels"]  # `textures.TextureLibrary.pyramids`
+    # -- light
+    light: Float[AnyArray, "3"]  # unit vector towards the light
+    ambient: Float[AnyArray, ""]  # share of light that has no direction
+    occlusion: Float[AnyArray, ""]  # darkening at contact, [0, 1)
+    occlusion_reach: Float[AnyArray, ""]  # length over which it fades
+    # -- the sensor that looks at it; used by `training_sample`, never by `raycast`
+    exposure_jitter: Float[AnyArray, ""]  # standard deviation of a view's log gain
+    sensor_noise: Float[AnyArray, ""]  # standard deviation of a pixel's noise
+    # -- where cameras do well
+    focus: Float[AnyArray, "3"]  # what an orbit looks at
+    orbit_radius: Float[AnyArray, ""]  # distance of an orbit from `focus`
+    eye: Float[AnyArray, "3"]  # a free spot to start a walk from
+
+
+def scale_scene(scene: Scene, factor: float) -> Scene:
+    """The same world with all lengths multiplied by `factor`; it looks the same from scaled cameras."""
+    f = np.float32(factor)
+    frames = np.concatenate([scene.frames[..., :3] / f, scene.frames[..., 3:]], axis=-1)
+    faces = np.array(scene.faces)
+    faces[..., 8] /= f
+    return replace(
+        scene,
+        frames=frames,
+        halves=scene.halves * f,
+        faces=faces,
+        occlusion_reach=np.asarray(scene.occlusion_reach * f),
+        focus=scene.focus * f,
+        orbit_radius=np.asarray(scene.orbit_radius * f),
+        eye=scene.eye * f,
+    )
+
+
+def clearance(scene: Scene, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    """Distance from each point to the nearest surface, negative inside a solid or outside the shell.
+
+    Limits:
+        Exact for boxes outside edges and inside the shell; a lower bound for stretched balls.
+    """
+    frames, halves = np.asarray(scene.frames, np.float64), np.asarray(scene.halves, np.float64)
+    local = np.einsum("sij,nj->nsi", frames[..., :3], points) + frames[..., 3]
+    boxes, balls, cylinders, (shell, dome) = np.split(local, np.cumsum([NUM_BOXES, NUM_BALLS, NUM_CYLINDERS]), axis=1)[
+        :3
+    ] + [np.moveaxis(local[:, NUM_SOLIDS:], 1, 0)]
+    box_half, ball_half, cylinder_half = np.split(halves[:NUM_SOLIDS], np.cumsum([NUM_BOXES, NUM_BALLS]))
+
+    def outside(gaps):
+        return np.linalg.norm(np.maximum(gaps, 0), axis=-1) + np.minimum(gaps.max(axis=-1), 0)
+
+    box = outside((np.abs(boxes) - 1) * box_half)
+    ball = (np.linalg.norm(balls, axis=-1) - 1) * ball_half.min(axis=-1)
+    radial = (np.hypot(cylinders[..., 0], cylinders[..., 2]) - 1) * cylinder_half[:, 0]
+    cylinder = outside(np.stack([radial, (np.abs(cylinders[..., 1]) - 1) * cylinder_half[:, 1]], axis=-1))
+    walls = ((1 - np.abs(shell)) * halves[NUM_SOLIDS]).min(axis=-1)
+    sky = (1 - np.linalg.norm(dome, axis=-1)) * halves[NUM_SOLIDS + 1].min()
+    solids = np.concatenate([box, ball, cylinder], axis=1).min(axis=1)
+    return np.minimum(solids, np.minimum(walls, sky))

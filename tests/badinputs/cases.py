@@ -1,0 +1,266 @@
+"""Bad captures, one line each: a name, how a good capture is spoilt, and what the one-line refusal must mention.
+
+A spoiler gets the capture's folder and the contents of its transforms.json, which is written after it has run (unless
+the spoiler wrote that file itself).
+"""
+
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from PIL import Image
+
+WIDTH, HEIGHT, NUM_FRAMES = 64, 48, 4
+
+
+class Case(NamedTuple):
+    name: str
+    spoil: Callable[[Path, dict[str, Any]], Any]
+    mentions: tuple[str, ...]
+
+
+def good_capture(root: Path) -> dict[str, Any]:
+    """Writes the images of a capture that opens, and returns the contents for its transforms.json."""
+    rng = np.random.default_rng(0)
+    (root / "images").mkdir(parents=True)
+    frames = []
+    for i in range(NUM_FRAMES):
+        pixels = rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+        Image.fromarray(pixels).save(root / "images" / f"{i}.jpg", quality=95)
+        pose = np.eye(4)
+        pose[0, 3] = 0.1 * i
+        frames.append({"file_path": f"images/{i}.jpg", "transform_matrix": pose.tolist()})
+    intrinsics = {"fl_x": 50.0, "fl_y": 51.0, "cx": 31.0, "cy": 25.0, "w": WIDTH, "h": HEIGHT}
+    return {"camera_model": "OPENCV", **intrinsics, "frames": frames}
+
+
+def write_capture(root: Path, meta: dict[str, Any]) -> None:
+    """Writes transforms.json unless it is there."""
+    file = root / "transforms.json"
+    if not file.exists():
+        file.write_text(json.dumps(meta))
+
+
+# Spoilers: each returns a function of (root, meta).
+
+
+def top(**fields):
+    """Sets global fields; None removes."""
+    return lambda root, meta: [meta.pop(k, None) if v is None else meta.update({k: v}) for k, v in fields.items()]
+
+
+def frame(i, **fields):
+    """Sets fields of frame `i`; None removes."""
+    return lambda root, meta: [
+        meta["frames"][i].pop(k, None) if v is None else meta["frames"][i].update({k: v}) for k, v in fields.items()
+    ]
+
+
+def pose(change):
+    """Applies `change` to frame 2's matrix, a NumPy array."""
+
+    def spoil(root, meta):
+        meta["frames"][2]["transform_matrix"] = change(np.array(meta["frames"][2]["transform_matrix"])).tolist()
+
+    return spoil
+
+
+def entry(row, column, value):
+    """Sets one entry of frame 2's matrix."""
+    return lambda root, meta: meta["frames"][2]["transform_matrix"][row].__setitem__(column, value)
+
+
+def text(content: str | bytes):
+    """Writes transforms.json as given."""
+    data = content.encode() if isinstance(content, str) else content
+    return lambda root, meta: (root / "transforms.json").write_bytes(data)
+
+
+def truncated(fraction):
+    """Cuts image 2 short."""
+
+    def spoil(root, meta):
+        file = root / "images" / "2.jpg"
+        file.write_bytes(file.read_bytes()[: int(fraction * file.stat().st_size)])
+
+    return spoil
+
+
+def image(data: bytes):
+    """Replaces image 2's bytes."""
+    return lambda root, meta: (root / "images" / "2.jpg").write_bytes(data)
+
+
+def bomb(root, meta):
+    """A small PNG whose header promises 20000 x 20000 pixels."""
+    Image.new("1", (20000, 20000)).save(root / "images" / "2.jpg", format="PNG")
+
+
+def bomb_below_pillows_limit(root, meta):
+    """As above, 80 million pixels: Pillow itself would decode it."""
+    Image.new("1", (10000, 8000)).save(root / "images" / "2.jpg", format="PNG")
+
+
+def without_image(root, meta):
+    (root / "images" / "2.jpg").unlink()
+
+
+def folder_as_image(root, meta):
+    without_image(root, meta)
+    (root / "images" / "2.jpg").mkdir()
+
+
+def other_size(width, height, *, format="JPEG"):
+    """Replaces image 2 by a black one."""
+    return lambda root, meta: Image.new("RGB", (width, height)).save(root / "images" / "2.jpg", format=format)
+
+
+def both(*spoilers):
+    return lambda root, meta: [spoil(root, meta) for spoil in spoilers]
+
+
+def linked_outside(root, meta):
+    outside = root.parent / "outside.jpg"
+    (root / "images" / "2.jpg").rename(outside)
+    (root / "images" / "2.jpg").symlink_to(outside)
+
+
+def link_loop(root, meta):
+    (root / "images" / "2.jpg").unlink()
+    (root / "images" / "2.jpg").symlink_to(root / "images" / "2.jpg")
+
+
+def outside(path):
+    """Names a file that exists outside the capture."""
+
+    def spoil(root, meta):
+        Image.new("RGB", (WIDTH, HEIGHT)).save(root.parent / "secret.jpg")
+        meta["frames"][2]["file_path"] = path.format(parent=root.parent)
+
+    return spoil
+
+
+def depth_file(mode, *, cut=None):
+    """Gives frame 2 a depth image of Pillow mode `mode`, cut to `cut` bytes."""
+
+    def spoil(root, meta):
+        Image.new(mode, (WIDTH, HEIGHT), 1000 if mode.startswith("I") else 100).save(root / "d.png")
+        if cut is not None:
+            (root / "d.png").write_bytes((root / "d.png").read_bytes()[:cut])
+        meta["frames"][2]["depth_file_path"] = "d.png"
+
+    return spoil
+
+
+def rotated(degrees):
+    c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+    return np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])
+
+
+MATRIX, PATH, JSON = "frames[2].transform_matrix", "frames[2].file_path", "transforms.json"
+IMAGE = "2.jpg"
+
+# One line a case, however long.
+CASES = (
+    # images
+    Case("missing image", without_image, (PATH, "images/2.jpg", "does not exist")),
+    Case("empty image", image(b""), (IMAGE, "0 bytes")),
+    Case("garbage image", image(b"not an image at all" * 9), (IMAGE, "no readable image")),
+    Case("image cut to its first byte", truncated(0.0005), (IMAGE, "no readable image")),
+    Case("JPEG cut at 1 %", truncated(0.01), (IMAGE,)),
+    Case("JPEG cut at 50 %", truncated(0.5), (IMAGE, "damaged")),
+    Case("JPEG cut at 90 %", truncated(0.9), (IMAGE, "damaged")),
+    Case("JPEG cut at 99 %", truncated(0.99), (IMAGE, "damaged")),
+    Case("folder in place of an image", folder_as_image, (PATH, "does not exist")),
+    Case("bomb", bomb, (IMAGE, "64,000,000")),
+    Case("bomb below Pillow's limit", bomb_below_pillows_limit, (IMAGE, "10000x8000")),
+    Case("an image of another size", other_size(10, 10), ("frames[2]: w, h", "64x48", "10x10")),
+    Case("an image on its side", other_size(HEIGHT, WIDTH), ("frames[2]: w, h", "48x64", "EXIF")),
+    Case("intrinsics of another size", top(w=128, h=96), ("frames[0]: w, h", "128x96", "64x48", "scale fl_x")),
+    Case("two sizes", both(top(w=None, h=None), other_size(70, 48)), ("64x48", "70x48", "--size")),
+    Case("a format that is not read", other_size(WIDTH, HEIGHT, format="TGA"), (IMAGE, "PNG")),
+    # poses
+    Case("NaN pose", entry(0, 3, float("nan")), (MATRIX, "NaN")),
+    Case("infinite pose", entry(1, 1, float("-inf")), (MATRIX, "infinity")),
+    Case("all zeros", pose(lambda m: 0 * m), (MATRIX, "last row")),
+    Case("zero rotation", pose(lambda m: np.diag([0, 0, 0, 1.0])), (MATRIX, "rotation")),
+    Case("scaled rotation", pose(lambda m: np.diag([2, 2, 2, 1.0])), (MATRIX, "rotation", "scale")),
+    Case("sheared by 2e-3", entry(0, 1, 2e-3), (MATRIX, "0.002")),
+    Case("huge rotation", entry(0, 0, 1e200), (MATRIX, "rotation")),
+    Case("mirrored", pose(lambda m: np.diag([-1, 1, 1, 1.0]) @ m), (MATRIX, "determinant 1")),
+    Case("transposed", pose(lambda m: m.T), (MATRIX, "transpose")),
+    Case("last row wrong", entry(3, 3, 2.0), (MATRIX, "last row")),
+    Case("3x3 pose", pose(lambda m: m[:3, :3]), (MATRIX, "4x4", "(3, 3)")),
+    Case("flat pose", pose(lambda m: m.ravel()), (MATRIX, "4x4", "(16,)")),
+    Case("ragged pose", frame(2, transform_matrix=[[1, 0], [0]]), (MATRIX, "4x4")),
+    Case("pose of words", frame(2, transform_matrix=[["a"] * 4] * 4), (MATRIX, "numbers")),
+    Case("pose of nulls", entry(0, 0, None), (MATRIX,)),
+    Case("integer beyond float64 in a pose", entry(0, 3, 10**400), (MATRIX, "numbers")),
+    Case("pose is an object", frame(2, transform_matrix={"a": 1}), (MATRIX,)),
+    Case("no pose", frame(2, transform_matrix=None), (MATRIX, "nothing")),
+    # intrinsics
+    Case("focal length 0", top(fl_x=0.0), ("frames[0].fl_x", "above 0")),
+    Case("focal length below 0", top(fl_y=-50.0), ("frames[0].fl_y", "above 0")),
+    Case("focal length NaN", top(fl_x=float("nan")), ("frames[0].fl_x", "finite")),
+    Case("focal length in units of the image", top(fl_x=0.8, fl_y=1.1), ("frames[0].fl_x", "pixels", "normalised")),
+    Case("focal length a word", top(fl_x="50"), ("frames[0].fl_x", "number")),
+    Case("focal length true", top(fl_x=True), ("frames[0].fl_x", "number")),
+    Case("focal length of 400 digits", top(fl_x=10**400), ("frames[0].fl_x", "number")),
+    Case("no focal length", top(fl_x=None, fl_y=None), ("frames[0].fl_x", "camera_angle_x")),
+    Case("a focal length missing", both(top(fl_x=None, fl_y=None), frame(0, fl_x=50.0)), ("frames[1].fl_x", "nothing")),
+    Case("angle in degrees", top(fl_x=None, fl_y=None, camera_angle_x=60.0), ("camera_angle_x", "radians")),
+    Case("angle 0", top(fl_x=None, fl_y=None, camera_angle_x=0), ("camera_angle_x", "(0, pi)")),
+    Case("principal point outside", top(cx=65.0), ("frames[0].cx", "[0, 64]")),
+    Case("principal point below 0", frame(2, cy=-0.1), ("frames[2].cy", "[0, 48]")),
+    Case("per-frame focal length bad", frame(2, fl_x=-1), ("frames[2].fl_x",)),
+    Case("fisheye", top(camera_model="OPENCV_FISHEYE"), ("camera_model", "undistort")),
+    Case("fisheye flag", top(is_fisheye=True), ("camera_model", "undistort")),
+    Case("unknown camera model", top(camera_model="EQUIRECTANGULAR"), ("camera_model", "EQUIRECTANGULAR")),
+    Case("camera model a list", top(camera_model=[1]), ("camera_model",)),
+    Case("distorted", top(k1=0.06), ("k1=0.06", "undistort")),
+    Case("tangentially distorted", top(p2=0.1), ("p2=0.1", "undistort")),
+    Case("distortion beyond measure", top(k1=1e308), ("undistort",)),
+    # paths
+    Case("path outside", outside("../secret.jpg"), (PATH, "inside", "copy")),
+    Case("path outside by a detour", outside("images/../../secret.jpg"), (PATH, "inside")),
+    Case("path outside without extension", outside("../secret"), (PATH, "inside")),
+    Case("absolute path outside", outside("{parent}/secret.jpg"), (PATH, "inside")),
+    Case("link outside", linked_outside, (PATH, "inside")),
+    Case("link to itself", link_loop, (PATH, "does not exist")),
+    Case("path of a secret of the system", frame(2, file_path="../../../../../../../../etc/passwd"), (PATH, "inside")),
+    Case("no path", frame(2, file_path=None), (PATH,)),
+    Case("path a number", frame(2, file_path=7), (PATH, "7")),
+    Case("path empty", frame(2, file_path=""), (PATH,)),
+    Case("path with a zero byte", frame(2, file_path="a\0b"), (PATH,)),
+    Case("path with a line break", frame(2, file_path="a\nb"), (PATH, "a\\nb")),
+    Case("path of 10000 characters", frame(2, file_path="a" * 10000), (PATH, "...")),
+    Case("the same image twice", frame(2, file_path="images/1.jpg"), (PATH, "frames[1]", "once")),
+    Case("the same image by another name", frame(2, file_path="./images/../images/1.jpg"), (PATH, "once")),
+    # depth
+    Case("missing depth", frame(2, depth_file_path="nowhere.png"), ("frames[2].depth_file_path", "does not exist")),
+    Case("depth outside", frame(2, depth_file_path="../d.png"), ("frames[2].depth_file_path", "inside")),
+    Case("depth of 8 bits", depth_file("L"), ("d.png", "16 bits")),
+    Case("depth in colour", depth_file("RGB"), ("d.png", "16 bits")),
+    Case("depth cut short", depth_file("I;16", cut=60), ("d.png",)),
+    Case("depth is a JPEG", frame(2, depth_file_path="images/1.jpg"), ("1.jpg", "16 bits")),
+    # the container
+    Case("empty file", text(""), (JSON, "JSON")),
+    Case("garbage", text("\x00\x01{]"), (JSON, "line 1")),
+    Case("cut short", text('{"frames": [{"file_path": "im'), (JSON, "line 1")),
+    Case("UTF-16", text('{"frames": []}'.encode("utf-16")), (JSON, "UTF-8")),
+    Case("nested without end", text("[" * 100_000), (JSON, "nesting")),
+    Case("nested without end in a frame", text('{"frames": ' + '[{"a": ' * 50_000), (JSON, "nesting")),
+    Case("a key twice", text('{"fl_x": 1, "fl_x": 2, "frames": []}'), (JSON, "fl_x", "twice")),
+    Case("a number of 10000 digits", text('{"fl_x": ' + "9" * 10_000 + "}"), (JSON, "numbers")),
+    Case("comma as decimal point", text('{"fl_x": 1,5, "frames": []}'), (JSON, "line 1")),
+    Case("a list", text("[1, 2]"), (JSON, "list")),
+    Case("null", text("null"), (JSON, "object")),
+    Case("no frames", top(frames=None), ("transforms.json: frames", "nothing")),
+    Case("zero frames", top(frames=[]), ("transforms.json: frames", "[]")),
+    Case("frames an object", top(frames={"0": {}}), ("transforms.json: frames", "list")),
+    Case("a frame is null", lambda root, meta: meta["frames"].__setitem__(2, None), ("frames[2]", "object")),
+    Case("transforms.json is a folder", lambda root, meta: (root / "transforms.json").mkdir(), ("no transforms.json",)),
+)  # fmt: skip

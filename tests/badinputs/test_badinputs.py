@@ -1,0 +1,145 @@
+"""Every bad input is refused by one line that names file and field and says what to do, before anything is written."""
+
+import json
+import random
+
+import pytest
+
+from ssplat_jax.data.capture import open_capture
+from ssplat_jax.errors import InputError
+from tests.badinputs.cases import CASES, good_capture, write_capture
+
+NUM_MUTANTS = 125  # of each kind; seeded, so a failure can be repeated
+
+
+def make(tmp_path, spoil):
+    root = tmp_path / "capture"
+    meta = good_capture(root)
+    spoil(root, meta)
+    write_capture(root, meta)
+    return root
+
+
+def listing(root):
+    return sorted(str(p) for p in root.rglob("*"))
+
+
+def test_the_capture_that_the_cases_spoil_is_good(tmp_path):
+    capture = open_capture(make(tmp_path, lambda root, meta: None))
+    capture.verify()
+    assert len(capture) == 4 and capture.notes == ()
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_bad_capture_is_refused_in_one_line(tmp_path, case):
+    root = make(tmp_path, case.spoil)
+    before = listing(tmp_path)
+    with pytest.raises(InputError) as caught:
+        open_capture(root).verify()
+    message = str(caught.value)
+    assert "\n" not in message and message.isascii() and len(message) < 600
+    assert "wanted" in message and "; " in message  # what should be there, and what to do
+    for words in case.mentions:
+        assert words in message, f"{words!r} is not in {message!r}"
+    assert listing(tmp_path) == before
+
+
+@pytest.mark.parametrize(
+    ("path", "words"),
+    [
+        ("nowhere", "nothing of that name"),
+        ("empty", "an empty folder"),
+        ("full", "no transforms.json"),
+        ("file.txt", "no transforms.json"),
+        ("other.json", "frames"),
+    ],
+)
+def test_what_is_no_capture_is_refused(tmp_path, path, words):
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "a.txt").write_text("a")
+    (tmp_path / "file.txt").write_text("a")
+    (tmp_path / "other.json").write_text("{}")
+    with pytest.raises(InputError, match=words):
+        open_capture(tmp_path / path)
+
+
+@pytest.mark.parametrize(
+    ("spec", "words"),
+    [
+        ("procedural:room?frame=3", "frame"),
+        ("procedural:room?frames=0", "frames"),
+        ("procedural:room?frames=3.5", "whole number"),
+        ("procedural:room?frames=-3", "whole number"),
+        ("procedural:room?seed=99999999999999999999", "seed"),
+        ("procedural:room?size=128", "WIDTHxHEIGHT"),
+        ("procedural:room?size=0x96", "size"),
+        ("procedural:nowhere?frames=1", "nowhere"),
+        ("procedural:", "room"),
+    ],
+)
+def test_bad_procedural_spec_is_refused(spec, words):
+    with pytest.raises(InputError, match=words):
+        open_capture(spec)
+
+
+@pytest.mark.parametrize("size", [(0, 10), (10, -1), (10, 10**6)])
+def test_bad_size_is_refused(tmp_path, size):
+    with pytest.raises(InputError, match="size"):
+        open_capture(make(tmp_path, lambda root, meta: None), size=size)
+
+
+def mutant(data: bytes, rng: random.Random) -> bytes:
+    """A few random edits: bytes changed, cut out, doubled."""
+    out = bytearray(data)
+    for _ in range(rng.randint(1, 6)):
+        at = rng.randrange(len(out))
+        kind = rng.randrange(4)
+        if kind == 0:
+            out[at] = rng.randrange(256)
+        elif kind == 1:
+            del out[at : at + rng.randint(1, 30)]
+        elif kind == 2:
+            out[at:at] = out[at : at + rng.randint(1, 30)]
+        else:
+            out[at : at + 1] = rng.choice([b"-", b"1e999", b"null", b"{", b"]", b'"', b"0", b"NaN", b"\xff"])
+        if not out:
+            return b""
+    return bytes(out)
+
+
+@pytest.mark.parametrize("name", ["transforms.json", "images/2.jpg", "images/2.png", "d.png"])
+def test_mutants_are_read_or_refused_and_never_crash(tmp_path, name):
+    def with_other_files(root, meta):
+        from PIL import Image
+
+        with Image.open(root / "images" / "2.jpg") as image:
+            image.save(root / "images" / "2.png")
+        Image.new("I;16", image.size, 900).save(root / "d.png")
+        meta["frames"][2]["depth_file_path"] = "d.png"
+        if name == "images/2.png":
+            meta["frames"][2]["file_path"] = name
+
+    root = make(tmp_path, with_other_files)
+    good = (root / name).read_bytes()
+    rng = random.Random(name)
+    refused = 0
+    for _ in range(NUM_MUTANTS):
+        (root / name).write_bytes(mutant(good, rng))
+        try:
+            capture = open_capture(root)
+            capture.verify()
+            for i in range(len(capture)):
+                capture.image(i), capture.depth(i)
+        except InputError as error:
+            assert "\n" not in str(error)
+            refused += 1
+    assert refused > NUM_MUTANTS // 20  # the mutants do reach the checks
+
+
+def test_message_does_not_carry_control_characters(tmp_path):
+    root = make(tmp_path, lambda root, meta: meta["frames"][2].update(file_path="\x1b[31m\r\n"))
+    with pytest.raises(InputError) as caught:
+        open_capture(root)
+    assert all(c.isprintable() for c in str(caught.value))
+    assert json.loads((root / "transforms.json").read_text())["frames"][2]["file_path"] == "\x1b[31m\r\n"

@@ -1,0 +1,153 @@
+"""What procedural samples promise: determinism, free space, units and parallax."""
+
+import numpy as np
+import pytest
+
+from ssplat_jax.data.procedural import (
+    CAPTURES,
+    PATH_KINDS,
+    SCENE_KINDS,
+    clearance,
+    procedural_capture_arrays,
+    raycast_depths,
+    sample_path,
+    sample_scene,
+    training_sample,
+)
+from ssplat_jax.data.procedural.builder import Finish, SceneBuilder
+from ssplat_jax.data.procedural.textures import texture_library
+from ssplat_jax.errors import InputError
+
+NUM_SEEDS = 30
+MARGIN = 1.02  # a probe an eighth as fine misses the nearest and farthest points by a little
+
+
+@pytest.fixture(scope="module")
+def samples():
+    return [training_sample(seed, 6, 24, 32) for seed in range(NUM_SEEDS)]
+
+
+def relative_baselines(depths, poses):
+    return np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=-1) / np.median(depths)
+
+
+def test_units_of_training_samples(samples):
+    medians = np.array([np.median(depths) for _, depths, _, _ in samples])
+    assert medians.min() > 1.2 / 1.1 and medians.max() < 3.5 * 1.1
+    assert medians.std() > 0.3
+    for _, depths, _, _ in samples:
+        assert depths.min() > 0.3 / MARGIN
+        assert depths.max() < 15.0 * MARGIN
+
+
+def test_parallax_of_training_samples(samples):
+    baselines = np.array([relative_baselines(depths, poses) for _, depths, poses, _ in samples])
+    assert baselines.min() > 0.006 and baselines.max() < 0.18
+    assert np.quantile(baselines, 0.1) < 0.03 and np.quantile(baselines, 0.9) > 0.06
+    assert 0.02 < np.median(baselines) < 0.08
+
+
+def test_images_of_training_samples_are_exposed(samples):
+    for images, _, _, _ in samples:
+        assert images.min() >= 0 and images.max() <= 1 and images.dtype == np.float32
+        assert 0.2 < images.mean() < 0.7
+    assert np.median([images.std() for images, _, _, _ in samples]) > 0.1
+
+
+def test_training_cameras_are_varied_and_rigid(samples):
+    poses = np.concatenate([poses for _, _, poses, _ in samples]).astype(np.float64)
+    gram = np.einsum("vij,vkj->vik", poses[:, :3, :3], poses[:, :3, :3])
+    np.testing.assert_allclose(gram, np.broadcast_to(np.eye(3), gram.shape), atol=1e-6)
+    np.testing.assert_allclose(np.linalg.det(poses[:, :3, :3]), 1.0, atol=1e-6)
+    focals = np.array([Ks[0, 0, 0] for _, _, _, Ks in samples]) / 32
+    assert 0.6 <= focals.min() < 0.8 and 1.05 < focals.max() <= 1.3
+
+
+def test_cameras_stand_upright(samples):
+    """+y of the camera leans to +y of the world, which is down."""
+    for _, _, poses, _ in samples:
+        assert poses[:, 1, 1].min() > 0.2
+
+
+def test_same_seed_same_sample(samples):
+    again = training_sample(7, 6, 24, 32)
+    for a, b in zip(samples[7], again, strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert not np.array_equal(samples[7][1], samples[8][1])
+
+
+@pytest.mark.parametrize("kind", SCENE_KINDS)
+def test_same_seed_same_scene(kind):
+    a, b, other = sample_scene(11, kind), sample_scene(11, kind), sample_scene(12, kind)
+    np.testing.assert_array_equal(a.frames, b.frames)
+    np.testing.assert_array_equal(a.faces, b.faces)
+    assert not np.array_equal(a.frames, other.frames)
+
+
+@pytest.mark.parametrize("kind", SCENE_KINDS)
+@pytest.mark.parametrize("path", PATH_KINDS)
+def test_cameras_stay_in_free_space(kind, path):
+    """All but a few walks: a scene so full that a walk cannot start is thrown away by `training_sample`."""
+    free = []
+    for seed in range(6):
+        scene = sample_scene(seed, kind)
+        poses, _ = sample_path(seed, scene, path, 12, 24, 32, min_clearance=0.3)
+        free.append(clearance(scene, poses[:, :3, 3]).min())
+    assert np.mean(np.array(free) > 0.25) >= 4 / 6
+
+
+def test_clearance_is_the_distance_to_analytic_solids():
+    rng = np.random.default_rng(2)
+    b = SceneBuilder(rng, texture_library())
+    finish = Finish((0,))
+    b.shell([0, 0, 0], [5, 5, 5], finish, finish, finish)
+    b.dome(100.0, finish)
+    b.box([2, 0, 0], [1, 0.5, 0.5], finish)
+    b.add("ball", [-2, 0, 0], 0.7, finish)
+    b.add("cylinder", [0, 0, 3], [0.5, 1, 0.5], finish)
+    scene = b.build(focus=[0, 0, 0], orbit_radius=1.0, eye=[0, 0, 0])
+    points = np.array([[0, 0, 0], [2, -1, 0], [-2, 0, 0.9], [0, 0, 2], [4.9, 4, 4], [2, 0, 0], [0.0, 0, 6]])
+    wanted = [1.0, 0.5, 0.2, 0.5, 0.1, -0.5, -1.0]
+    np.testing.assert_allclose(clearance(scene, points), wanted, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", CAPTURES)
+def test_captures_are_smooth_and_free(name):
+    images, depths, poses, Ks = procedural_capture_arrays(name, 24, 24, 32)
+    assert images.shape == (24, 24, 32, 3) and Ks.shape == (24, 3, 3)
+    assert depths.min() > 0.3
+    turns = np.einsum("vi,vi->v", poses[1:, :3, 2], poses[:-1, :3, 2])
+    assert turns.min() > np.cos(np.radians(25))
+    steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=-1)
+    assert steps.max() < 3 * steps.min()
+    assert np.median(steps) < 0.3 * np.median(depths)
+
+
+def test_bad_names_are_refused():
+    scene = sample_scene(0)
+    with pytest.raises(InputError, match="nowhere"):
+        sample_scene(0, "nowhere")
+    with pytest.raises(InputError, match="teleport"):
+        sample_path(0, scene, "teleport", 2, 24, 32)
+    with pytest.raises(InputError, match="nowhere"):
+        procedural_capture_arrays("nowhere", 2, 24, 32)
+    with pytest.raises(InputError, match="at least 1"):
+        procedural_capture_arrays("room", 0, 24, 32)
+
+
+def test_orbit_keeps_its_object_in_view():
+    scene = sample_scene(5, "objects")
+    poses, Ks = sample_path(5, scene, "orbit", 12, 24, 32)
+    local = np.einsum("vji,vj->vi", poses[:, :3, :3], scene.focus - poses[:, :3, 3])
+    pixels = np.einsum("vij,vj->vi", Ks, local)
+    pixels = pixels[:, :2] / pixels[:, 2:]
+    assert (local[:, 2] > 0).all()
+    assert (np.abs(pixels - [16, 12]) < [12, 10]).all()
+
+
+def test_every_ray_ends():
+    for seed, kind in enumerate(SCENE_KINDS):
+        scene = sample_scene(seed, kind)
+        poses, Ks = sample_path(seed, scene, "pan", 8, 24, 32)
+        depths = np.asarray(raycast_depths(scene, np.linalg.inv(poses), Ks, 24, 32))
+        assert np.isfinite(depths).all() and depths.max() < 100

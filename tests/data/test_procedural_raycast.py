@@ -1,0 +1,208 @@
+"""The ray-caster against analytic rays in float64, and the laws that exact depth obeys between views."""
+
+import numpy as np
+import pytest
+
+from ssplat_jax.data.procedural import raycast, raycast_depths, sample_path, sample_scene, scale_scene
+from ssplat_jax.data.procedural.builder import Finish, SceneBuilder, random_rotation
+from ssplat_jax.data.procedural.paths import look_at
+from ssplat_jax.data.procedural.textures import TextureLibrary, pack_pyramids
+
+HEIGHT, WIDTH = 48, 64
+DEPTH_TOLERANCE = 2e-5  # relative; float32 rounds a slab's distance a few times
+REPROJECTION_TOLERANCE = 0.02  # relative; bilinear depth is off by the curvature within a pixel
+COLOR_TOLERANCE = 1.5 / 255  # texels are 8 bit
+
+
+def inverted(poses):
+    return np.linalg.inv(poses.astype(np.float64)).astype(np.float32)
+
+
+def intrinsics(num_views=1, focal=50.0):
+    return np.tile(np.array([[focal, 0, 30.3], [0, focal * 1.02, 25.1], [0, 0, 1]], np.float32), (num_views, 1, 1))
+
+
+def pixel_rays(pose, K):
+    """Float64 origin and directions (camera z = 1) of all pixels."""
+    y, x = np.mgrid[0:HEIGHT, 0:WIDTH] + 0.5
+    local = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones_like(x)], axis=-1).astype(np.float64)
+    return pose[:3, 3].astype(np.float64), local @ pose[:3, :3].T.astype(np.float64)
+
+
+def grey_library():
+    """One white tile, and one whose left half is dark."""
+    tiles = np.full((2, 256, 256, 3), 255, np.uint8)
+    tiles[1, :, :128] = 51
+    return TextureLibrary(pack_pyramids(tiles), {"wall": np.array([0, 1])})
+
+
+def empty_builder(half=(4.0, 3.0, 5.0)):
+    b = SceneBuilder(np.random.default_rng(0), grey_library())
+    white = Finish((0,), glow=1.0, gain=(0.2, 0.4, 0.6))
+    b.shell([0, 0, 0], half, white, white, white)
+    b.dome(100.0, white)
+    return b
+
+
+def built(b):
+    return b.build(focus=[0, 0, 0], orbit_radius=1.0, eye=[0, 0, 0])
+
+
+def slab_depths(origin, directions, center, half, rotation):
+    """Entry and exit of a turned box."""
+    start, step = (origin - center) @ rotation, directions @ rotation
+    with np.errstate(divide="ignore"):
+        a, b = (-half - start) / step, (half - start) / step
+    return np.minimum(a, b).max(-1), np.maximum(a, b).min(-1)
+
+
+def ball_entry(origin, directions, center, radius):
+    offset = origin - center
+    a, b, c = (directions**2).sum(-1), directions @ offset, offset @ offset - radius**2
+    root = b * b - a * c
+    return np.where(root >= 0, (-b - np.sqrt(np.maximum(root, 0))) / a, np.inf)
+
+
+def cylinder_entry(origin, directions, center, radius, half, rotation):
+    start, step = (origin - center) @ rotation, directions @ rotation
+    a = step[..., 0] ** 2 + step[..., 2] ** 2
+    b = step[..., 0] * start[0] + step[..., 2] * start[2]
+    root = b * b - a * (start[0] ** 2 + start[2] ** 2 - radius**2)
+    entry = np.full(a.shape, np.inf)
+    side = (-b - np.sqrt(np.maximum(root, 0))) / a
+    on_side = (root >= 0) & (np.abs(start[1] + side * step[..., 1]) <= half) & (side > 0)
+    entry[on_side] = side[on_side]
+    for cap in (-half, half):
+        t = (cap - start[1]) / step[..., 1]
+        on_cap = ((start[0] + t * step[..., 0]) ** 2 + (start[2] + t * step[..., 2]) ** 2 <= radius**2) & (t > 0)
+        entry = np.where(on_cap, np.minimum(entry, t), entry)
+    return entry
+
+
+POSE = look_at(np.array([0.3, -0.4, -3.1]), np.array([0.1, 0.1, 0.0])).astype(np.float32)
+
+
+def check_depths(scene, wanted):
+    depths = np.asarray(raycast_depths(scene, inverted(POSE[None]), intrinsics(), HEIGHT, WIDTH))[0]
+    # A ray that grazes a silhouette may fall on either side of it.
+    ok = np.abs(depths - wanted) <= DEPTH_TOLERANCE * wanted
+    assert ok.mean() > 0.998
+    interior = np.abs(np.diff(wanted, axis=1, prepend=wanted[:, :1])) + np.abs(
+        np.diff(wanted, axis=0, prepend=wanted[:1])
+    )
+    assert ok[interior < 0.1].all()
+
+
+def room_exit(origin, directions):
+    return slab_depths(origin, directions, np.zeros(3), np.array([4.0, 3.0, 5.0]), np.eye(3))[1]
+
+
+def test_empty_room_ends_at_its_walls():
+    check_depths(built(empty_builder()), room_exit(*pixel_rays(POSE, intrinsics()[0])))
+
+
+def test_dome_closes_the_world():
+    b = empty_builder(half=(50.0, 50.0, 50.0))
+    b.dome(6.0, Finish((0,)))
+    origin, directions = pixel_rays(POSE, intrinsics()[0])
+    a, half_b = (directions**2).sum(-1), directions @ origin
+    wanted = (-half_b + np.sqrt(half_b**2 - a * (origin @ origin - 36.0))) / a
+    check_depths(built(b), wanted)
+
+
+@pytest.mark.parametrize("shape", ["box", "ball", "cylinder"])
+def test_solid_is_met_where_algebra_says(shape):
+    b = empty_builder()
+    rotation = random_rotation(np.random.default_rng(5))
+    center = np.array([0.2, -0.1, 0.4])
+    half = {"box": np.array([0.9, 0.5, 0.3]), "ball": np.full(3, 0.8), "cylinder": np.array([0.4, 0.9, 0.4])}[shape]
+    b.add(shape, center, half, Finish((0,)), rotation)
+    origin, directions = pixel_rays(POSE, intrinsics()[0])
+    if shape == "box":
+        enter, leave = slab_depths(origin, directions, center, half, rotation)
+        entry = np.where(enter <= leave, enter, np.inf)
+    elif shape == "ball":
+        entry = ball_entry(origin, directions, center, 0.8)
+    else:
+        entry = cylinder_entry(origin, directions, center, 0.4, 0.9, rotation)
+    assert 50 < np.isfinite(entry).sum() < 0.9 * entry.size
+    check_depths(built(b), np.minimum(entry, room_exit(origin, directions)))
+
+
+def test_glowing_face_shows_its_texel_times_gain():
+    """Up and right: the upper half of a +z wall's picture is above, its u = 0 side is at -x."""
+    b = empty_builder()
+    picture = Finish((1,), tile=0.0, glow=1.0, gain=(0.5, 1.0, 0.25))
+    b.box([0, 0, 2.0], [2.0, 2.0, 0.1], picture)
+    pose = look_at(np.array([0.0, 0.0, -1.0]), np.array([0.0, 0.0, 1.0])).astype(np.float32)
+    K = np.array([[[50.0, 0, 32], [0, 50, 24], [0, 0, 1]]], np.float32)
+    image = np.asarray(raycast(built(b), inverted(pose[None]), K, HEIGHT, WIDTH)[0])[0]
+    gain = np.array([0.5, 1.0, 0.25])
+    np.testing.assert_allclose(image[:, 10:26], np.broadcast_to(0.2 * gain, (HEIGHT, 16, 3)), atol=COLOR_TOLERANCE)
+    np.testing.assert_allclose(image[:, 38:54], np.broadcast_to(gain, (HEIGHT, 16, 3)), atol=COLOR_TOLERANCE)
+
+
+def test_down_is_the_bottom_of_the_image():
+    b = empty_builder()
+    b.box([0, 1.0, 0], [0.5, 0.2, 0.5], Finish((0,), glow=1.0))
+    pose = look_at(np.array([0.0, 0.0, -3.0]), np.zeros(3)).astype(np.float32)
+    depths = np.asarray(raycast_depths(built(b), inverted(pose[None]), intrinsics(), HEIGHT, WIDTH))[0]
+    rows = np.nonzero(depths < 4.0)[0]
+    assert rows.min() > HEIGHT / 2
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_point_has_one_depth_in_every_view(seed):
+    """A pixel's point, seen from another view, lies on that view's surface or behind it: never in front."""
+    scene = sample_scene(seed)
+    poses, Ks = sample_path(seed, scene, None, 4, HEIGHT, WIDTH)
+    depths = np.asarray(raycast_depths(scene, inverted(poses), Ks, HEIGHT, WIDTH)).astype(np.float64)
+    origin, directions = pixel_rays(poses[0], Ks[0])
+    points = origin + depths[0][..., None] * directions
+    for view in range(1, 4):
+        local = (points - poses[view, :3, 3]) @ poses[view, :3, :3].astype(np.float64)
+        z = local[..., 2]
+        u = Ks[view, 0, 0] * local[..., 0] / z + Ks[view, 0, 2] - 0.5
+        v = Ks[view, 1, 1] * local[..., 1] / z + Ks[view, 1, 2] - 0.5
+        inside = (z > 0.1) & (u >= 0) & (v >= 0) & (u < WIDTH - 1) & (v < HEIGHT - 1)
+        assert inside.mean() > 0.2
+        x0, y0 = np.floor(u[inside]).astype(int), np.floor(v[inside]).astype(int)
+        fx, fy = u[inside] - x0, v[inside] - y0
+        corners = [depths[view][y0 + j, x0 + i] for j in (0, 1) for i in (0, 1)]
+        weights = [wy * wx for wy in (1 - fy, fy) for wx in (1 - fx, fx)]
+        # On planes it is the inverse of depth that is linear in the image.
+        seen = 1 / sum(w / c for w, c in zip(weights, corners, strict=True))
+        is_smooth = np.max(corners, axis=0) < 1.1 * np.min(corners, axis=0)
+        ratio = (z[inside] / seen)[is_smooth]
+        assert (np.abs(ratio - 1) < REPROJECTION_TOLERANCE).mean() > 0.7
+        assert (ratio < 1 - REPROJECTION_TOLERANCE).mean() < 0.01
+
+
+def test_scaled_scene_looks_the_same_from_scaled_cameras():
+    scene = sample_scene(3)
+    poses, Ks = sample_path(3, scene, None, 1, HEIGHT, WIDTH)
+    images, depths = raycast(scene, inverted(poses), Ks, HEIGHT, WIDTH)
+    poses[:, :3, 3] *= 2.5
+    scaled_images, scaled_depths = raycast(scale_scene(scene, 2.5), inverted(poses), Ks, HEIGHT, WIDTH)
+    close = np.abs(np.asarray(scaled_depths) - 2.5 * np.asarray(depths)) < 1e-4 * np.asarray(scaled_depths)
+    assert close.mean() > 0.998  # the rest are silhouettes
+    assert np.quantile(np.abs(np.asarray(images) - np.asarray(scaled_images)), 0.99) < 0.01
+
+
+def test_supersampling_converges_to_the_mean_of_finer_images():
+    """Two rays a pixel agree with the mean of a four times finer image better than one does."""
+    scene = sample_scene(4)
+    poses, Ks = sample_path(4, scene, None, 1, HEIGHT, WIDTH)
+    fine_K = Ks * np.array([4, 4, 1], np.float32)[:, None]
+    fine = np.asarray(raycast(scene, inverted(poses), fine_K, 4 * HEIGHT, 4 * WIDTH, 1)[0])
+    wanted = fine.reshape(1, HEIGHT, 4, WIDTH, 4, 3).mean(axis=(2, 4))
+    errors = [np.sqrt(np.mean((np.asarray(raycast(scene, inverted(poses), Ks, HEIGHT, WIDTH, n)[0]) - wanted) ** 2))
+              for n in (1, 2)]  # fmt: skip
+    assert errors[1] < 0.9 * errors[0]
+
+
+def test_mip_levels_keep_the_mean_of_a_tile():
+    tile = np.random.default_rng(0).integers(0, 256, (1, 256, 256, 3)).astype(np.uint8)
+    last = int(pack_pyramids(tile)[0, -1])
+    mean = np.array([last & 255, (last >> 8) & 255, (last >> 16) & 255])
+    np.testing.assert_allclose(mean, tile.mean(axis=(0, 1, 2)), atol=0.51)  # rounded once
