@@ -1,0 +1,101 @@
+"""Plane sweep and cost-volume U-Net: P_i(k | u), what the chunk alone says of depth (Sec. 3.3; ALGORITHM 2.5-2.7)."""
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from ssplat_jax.config import StreamConfig
+from ssplat_jax.geometry.cameras import invert_poses, pixel_grid, project_points, transform_points, unproject
+from ssplat_jax.geometry.sampling import bilinear_taps, correlate_warped
+from ssplat_jax.model.convolution import Conv
+from ssplat_jax.model.layers import UNet, average_pool, unit_features
+from ssplat_jax.model.wires import GRID_STRIDE, DepthBelief, Features, Views, nearest_sources
+
+MIN_SOURCE_DEPTH = 1e-3
+"""A candidate nearer than this to the source camera's plane, or behind it, is not seen by it."""
+
+
+def sweep_pixels(views: Views, reference, source) -> tuple[Float[Array, "d n 2"], Bool[Array, "d n"]]:
+    """Where the grid cells of view `reference`, put at every candidate depth, appear in view `source` (pixels)."""
+    hf, wf = views.inside.shape[1:]
+    cells = pixel_grid(hf * GRID_STRIDE, wf * GRID_STRIDE, GRID_STRIDE).reshape(-1, 2)
+    rays = unproject(cells, jnp.ones(cells.shape[0]), views.Ks[reference])
+    points = rays[None] * jnp.exp(views.log_candidates)[:, None, None]
+    source_from_reference = views.viewmats[source] @ invert_poses(views.viewmats[reference])
+    points = transform_points(source_from_reference[None], points)
+    pixels, depths = project_points(points, views.Ks[source][None], MIN_SOURCE_DEPTH)
+    x, y = pixels[..., 0], pixels[..., 1]
+    return pixels, (depths > MIN_SOURCE_DEPTH) & (x >= 0) & (x <= views.width) & (y >= 0) & (y <= views.height)
+
+
+def plane_sweep(features: Features, views: Views, config: StreamConfig) -> Float[Array, "v hf wf dl"]:
+    """Mean cosine of each cell with its source views at every candidate, coarse then (if configured) fine.
+
+    Views outside the image, behind the source camera or padded do not count; a cell that no source sees scores 0.
+    """
+    v, hf, wf = views.inside.shape
+    maps = [(GRID_STRIDE, unit_features(features.grid), unit_features(features.grid))]
+    if config.fine_matching:
+        fine = unit_features(features.fine)
+        # A cell's centre is the corner between 2 x 2 fine pixels: their mean is the bilinear sample there.
+        maps.append((GRID_STRIDE // 2, unit_features(average_pool(features.fine, 2)), fine))
+    sources, source_valid = nearest_sources(views.viewmats, views.valid, config.num_sources)
+
+    def correlate_pair(pair):
+        reference, source, is_valid = pair
+        pixels, seen = sweep_pixels(views, reference, source)
+        seen = seen & is_valid
+        scores = []
+        for stride, reference_map, source_map in maps:
+            height, width = source_map.shape[1:3]
+            taps, weights = bilinear_taps(jax.lax.stop_gradient(pixels / stride - 0.5), height, width)
+            channels = source_map.shape[-1]
+            flat_reference = reference_map[reference].reshape(-1, channels)
+            score = correlate_warped(flat_reference, source_map[source].reshape(-1, channels), taps, weights)
+            scores.append(jnp.where(seen, score, 0.0))
+        return jnp.stack(scores), seen.astype(jnp.float32)
+
+    num_sources = sources.shape[1]
+    pairs = (jnp.repeat(jnp.arange(v), num_sources), sources.reshape(-1), source_valid.reshape(-1))
+    scores, seen = jax.lax.map(correlate_pair, pairs)
+    scores = scores.reshape(v, num_sources, len(maps), config.num_depths, hf, wf).sum(axis=1)
+    counts = seen.reshape(v, num_sources, 1, config.num_depths, hf, wf).sum(axis=1)
+    mean = scores / jnp.maximum(counts, 1.0)
+    return mean.reshape(v, -1, hf, wf).transpose(0, 2, 3, 1)
+
+
+class CostVolume(nn.Module):
+    """U-Net over [cost, context]; the logits start as the scaled cost, so that an untrained network already matches."""
+
+    config: StreamConfig
+
+    def setup(self):
+        width = self.config.unet_width
+        self.enter = Conv(width)
+        self.enter_norm = nn.GroupNorm(8)
+        self.unet = UNet(width)
+        self.leave = Conv(width)
+        self.skip = Conv(width, 1)
+        self.head1 = Conv(width)
+        self.head2 = Conv(self.config.num_depths, kernel_init=nn.initializers.normal(1e-3))
+        levels = 2 if self.config.fine_matching else 1
+        self.log_temperatures = self.param("log_temperatures", nn.initializers.constant(2.0), (levels,))
+
+    def __call__(
+        self, cost: Float[Array, "v hf wf dl"], context: Float[Array, "v hf wf c"], view_valid: Bool[Array, " v"]
+    ) -> DepthBelief:
+        v, hf, wf, _ = cost.shape
+        levels = self.log_temperatures.shape[0]
+        scaled = cost.reshape(v, hf, wf, levels, -1) * jnp.exp(self.log_temperatures)[:, None]
+        x = jnp.concatenate([scaled.reshape(v, hf, wf, -1), context], axis=-1)
+        y = self.unet(nn.gelu(self.enter_norm(self.enter(x))), view_valid)
+        decoder = self.leave(y) + self.skip(x)
+        logits = scaled.sum(axis=3) + self.head2(nn.gelu(self.head1(decoder)))
+        return DepthBelief(probs=jax.nn.softmax(logits, axis=-1), logits=logits, decoder=decoder)
+
+
+def match(params, features: Features, views: Views, config: StreamConfig) -> DepthBelief:
+    """P_i(k | u) by plane sweep, U-Net and softmax."""
+    cost = plane_sweep(features, views, config)
+    return CostVolume(config).apply({"params": params}, cost, features.context, views.valid)  # pyright: ignore[reportReturnType]

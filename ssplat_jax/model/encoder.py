@@ -1,0 +1,119 @@
+"""Image encoder: a CNN and windowed self- and cross-view attention (DepthSplat; ALGORITHM 2.2, 2.3)."""
+
+import flax.linen as nn
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from ssplat_jax.config import StreamConfig
+from ssplat_jax.model.convolution import Conv, HalvingConv
+from ssplat_jax.model.layers import ResidualBlock, attend, instance_norm
+from ssplat_jax.model.wires import Features, Views, nearest_sources
+
+IMAGE_MEAN = (0.485, 0.456, 0.406)  # ImageNet, as DepthSplat
+IMAGE_STD = (0.229, 0.224, 0.225)
+
+
+def sine_positions(side: int, features: int) -> Float[Array, "side side c"]:
+    """Sine position code of a square window: half of the channels for y, half for x (DETR's, normalised to 2 pi)."""
+    steps = (jnp.arange(side, dtype=jnp.float32) + 1) / side * 2 * jnp.pi
+    rates = 10000.0 ** (2 * (jnp.arange(features // 2) // 2).astype(jnp.float32) / (features // 2))
+    phases = steps[:, None] / rates
+    code = jnp.where(jnp.arange(features // 2) % 2 == 0, jnp.sin(phases), jnp.cos(phases))
+    grid_shape = (side, side, features // 2)
+    return jnp.concatenate(
+        [jnp.broadcast_to(code[:, None], grid_shape), jnp.broadcast_to(code[None, :], grid_shape)], axis=-1
+    )
+
+
+def to_windows(x: Float[Array, "v h w c"], side: int) -> Float[Array, "v windows cells c"]:
+    """Cuts a map into `side` x `side` windows."""
+    v, h, w, c = x.shape
+    x = x.reshape(v, h // side, side, w // side, side, c).transpose(0, 1, 3, 2, 4, 5)
+    return x.reshape(v, (h // side) * (w // side), side * side, c)
+
+
+def from_windows(x: Float[Array, "v windows cells c"], side: int, height: int, width: int) -> Float[Array, "v h w c"]:
+    """Inverse of `to_windows`."""
+    v, c = x.shape[0], x.shape[-1]
+    x = x.reshape(v, height // side, width // side, side, side, c).transpose(0, 1, 3, 2, 4, 5)
+    return x.reshape(v, height, width, c)
+
+
+class AttentionLayer(nn.Module):
+    """One-head attention of windows, LayerNorm after the merge; optionally a feed-forward on [source, message]."""
+
+    ffn_ratio: int = 0
+
+    @nn.compact
+    def __call__(self, x, context, context_valid=None):
+        c = x.shape[-1]
+        q = nn.Dense(c, use_bias=False, name="q")(x)
+        k = nn.Dense(c, use_bias=False, name="k")(context)
+        v = nn.Dense(c, use_bias=False, name="v")(context)
+        message = attend(q[..., None, :], k[..., None, :], v[..., None, :], context_valid)[..., 0, :]
+        message = nn.LayerNorm(name="norm1")(nn.Dense(c, use_bias=False, name="merge")(message))
+        if self.ffn_ratio:
+            hidden = nn.Dense(self.ffn_ratio * c, use_bias=False, name="ffn1")(jnp.concatenate([x, message], axis=-1))
+            message = nn.Dense(c, use_bias=False, name="ffn2")(nn.gelu(hidden, approximate=False))
+            message = nn.LayerNorm(name="norm2")(message)
+        return x + message
+
+
+class Encoder(nn.Module):
+    """Images to matching features at 1/2 and 1/4 and context features at 1/4."""
+
+    config: StreamConfig
+
+    def setup(self):
+        fine, grid = self.config.encoder_widths
+        blocks = range(self.config.encoder_blocks)
+        self.stem = HalvingConv(fine, 7, use_bias=False)
+        self.fine_blocks = [ResidualBlock(fine) for _ in blocks]
+        self.grid_blocks = [ResidualBlock(grid, stride=2 if i == 0 else 1) for i in blocks]
+        self.project = Conv(grid, 1)
+        self.self_attention = [AttentionLayer() for _ in range(self.config.attention_blocks)]
+        self.cross_attention = [AttentionLayer(self.config.attention_ffn) for _ in range(self.config.attention_blocks)]
+        self.match_fine = Conv(self.config.match_width, 1)
+        self.match_grid = Conv(self.config.match_width, 1)
+
+    def __call__(
+        self, images: Float[Array, "v h w 3"], sources: Int[Array, "v s"], source_valid: Bool[Array, "v s"]
+    ) -> Features:
+        x = (images - jnp.array(IMAGE_MEAN)) / jnp.array(IMAGE_STD)
+        x = nn.relu(instance_norm(self.stem(x)))
+        for block in self.fine_blocks:
+            x = block(x)
+        fine = x
+        for block in self.grid_blocks:
+            x = block(x)
+        cnn = self.project(x)
+        attended = self.attend_views(cnn, sources, source_valid)
+        return Features(
+            fine=self.match_fine(fine),
+            grid=self.match_grid(attended),
+            context=jnp.concatenate([cnn, attended], axis=-1),
+        )
+
+    def attend_views(self, cnn, sources, source_valid):
+        """Alternates attention inside a view with attention to the same window of the source views (Swin shifts)."""
+        side = self.config.attention_window
+        v, h, w, c = cnn.shape
+        positions = jnp.tile(sine_positions(side, c), (h // side, w // side, 1))
+        x = cnn + positions
+        num_sources = sources.shape[1]
+        for i, (own, cross) in enumerate(zip(self.self_attention, self.cross_attention, strict=True)):
+            shift = side // 2 if i % 2 else 0
+            windows = to_windows(jnp.roll(x, (-shift, -shift), axis=(1, 2)), side)
+            windows = own(windows, windows)
+            context = windows[sources].transpose(0, 2, 1, 3, 4).reshape(v, windows.shape[1], num_sources * side**2, c)
+            context_valid = jnp.repeat(source_valid, side**2, axis=1)[:, None, :]
+            context_valid = jnp.broadcast_to(context_valid, context.shape[:-1])
+            windows = cross(windows, context, context_valid)
+            x = jnp.roll(from_windows(windows, side, h, w), (shift, shift), axis=(1, 2))
+        return x
+
+
+def encode(params, views: Views, config: StreamConfig) -> Features:
+    """Features of every view, informed by its source views."""
+    sources, source_valid = nearest_sources(views.viewmats, views.valid, config.num_sources)
+    return Encoder(config).apply({"params": params}, views.images, sources, source_valid)  # pyright: ignore[reportReturnType]

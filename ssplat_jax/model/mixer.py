@@ -1,0 +1,129 @@
+"""3D token mixer: attention among 3D neighbours, then among all views at 1/16 (ReSplat; ALGORITHM 3.2)."""
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from ssplat_jax.config import StreamConfig
+from ssplat_jax.model.convolution import Conv, pixel_shuffle, pixel_unshuffle
+from ssplat_jax.model.layers import attend
+
+GLOBAL_FACTOR = 4  # the global block works on 4 x 4 cells
+SEARCH_BLOCK = 1024  # queries at a time in the global search: bounds its distance matrix
+
+
+def nearest_tokens(
+    positions: Float[Array, "v hf wf 3"], inside: Bool[Array, "v hf wf"], config: StreamConfig
+) -> Int[Array, "m k"]:
+    """Flat indices of each token's nearest tokens in 3D, itself first.
+
+    Tokens outside the image are chosen last; a neighbourhood with fewer real tokens repeats what it has.
+    """
+    if config.mixer_radius == 0:
+        return _nearest_of_all(positions.reshape(-1, 3), inside.reshape(-1), config.mixer_neighbours)
+    v, hf, wf, _ = positions.shape
+    radius = config.mixer_radius
+    side = 2 * radius + 1
+    flat = jnp.arange(v * hf * wf).reshape(v, hf, wf)
+    rows = jnp.clip(jnp.arange(hf)[:, None] + jnp.arange(side) - radius, 0, hf - 1)
+    columns = jnp.clip(jnp.arange(wf)[:, None] + jnp.arange(side) - radius, 0, wf - 1)
+    candidates = flat[:, rows[:, None, :, None], columns[None, :, None, :]].reshape(v * hf * wf, side * side)
+    points, usable = positions.reshape(-1, 3), inside.reshape(-1)
+    offsets = points[candidates] - points[:, None]
+    distances = jnp.where(usable[candidates], jnp.sum(offsets**2, axis=-1), jnp.inf)
+    distances = jnp.where(candidates == jnp.arange(v * hf * wf)[:, None], -1.0, distances)
+    _, best = jax.lax.top_k(-distances, min(config.mixer_neighbours, side * side))
+    return jnp.take_along_axis(candidates, best, axis=1)
+
+
+def _nearest_of_all(points, usable, k):
+    m = points.shape[0]
+    padded = jnp.pad(points, ((0, -m % SEARCH_BLOCK), (0, 0)))
+    own = jnp.pad(jnp.arange(m), (0, -m % SEARCH_BLOCK), constant_values=-1)
+
+    def search(block):
+        queries, idx = block
+        distances = sum((queries[:, None, i] - points[None, :, i]) ** 2 for i in range(3))
+        distances = jnp.where(usable[None], distances, jnp.inf)
+        distances = jnp.where(idx[:, None] == jnp.arange(m)[None], -1.0, distances)
+        return jax.lax.top_k(-distances, min(k, m))[1]
+
+    blocks = (padded.reshape(-1, SEARCH_BLOCK, 3), own.reshape(-1, SEARCH_BLOCK))
+    return jax.lax.map(search, blocks).reshape(padded.shape[0], -1)[:m]
+
+
+class NeighbourBlock(nn.Module):
+    """Pre-norm attention of each token to its 3D neighbours, then an MLP."""
+
+    config: StreamConfig
+
+    @nn.compact
+    def __call__(self, x, neighbours, usable):
+        c = x.shape[-1]
+        q, k, v = jnp.split(
+            nn.Dense(3 * self.config.mixer_proj, use_bias=False, name="qkv")(nn.LayerNorm(name="norm1")(x)), 3, axis=-1
+        )
+        mixed = attend(q[:, None, None], k[neighbours][:, :, None], v[neighbours][:, :, None], usable[neighbours])
+        x = x + nn.Dense(c, name="project")(mixed[:, 0, 0])
+        hidden = nn.gelu(nn.Dense(2 * c, name="mlp1")(nn.LayerNorm(name="norm2")(x)))
+        return x + nn.Dense(c, name="mlp2")(hidden)
+
+
+class GlobalBlock(nn.Module):
+    """One transformer block over all views' tokens at 1/16 of the image, back to the grid by pixel shuffle."""
+
+    heads: int = 4
+
+    @nn.compact
+    def __call__(self, x, view_valid):
+        v, c = x.shape[0], x.shape[-1]
+        y = nn.LayerNorm(name="norm_in")(nn.Dense(c, name="shrink")(pixel_unshuffle(x, GLOBAL_FACTOR)))
+        tokens = y.reshape(1, -1, c)
+        key_valid = jnp.repeat(view_valid, tokens.shape[1] // v)[None]
+        qkv = nn.Dense(3 * c, use_bias=False, name="qkv")(nn.LayerNorm(name="norm1")(tokens))
+        qkv = qkv.reshape(1, tokens.shape[1], 3, self.heads, -1)
+        mixed = attend(qkv[:, :, 0], qkv[:, :, 1], qkv[:, :, 2], key_valid)
+        tokens = tokens + nn.Dense(c, name="project")(mixed.reshape(tokens.shape))
+        hidden = nn.gelu(nn.Dense(4 * c, name="mlp1")(nn.LayerNorm(name="norm2")(tokens)))
+        tokens = tokens + nn.Dense(c, name="mlp2")(hidden)
+        y = nn.LayerNorm(name="norm_out")(nn.Dense(c * GLOBAL_FACTOR**2, name="grow")(tokens.reshape(y.shape)))
+        return x + Conv(c, kernel_init=nn.initializers.zeros, name="leave")(pixel_shuffle(y, GLOBAL_FACTOR))
+
+
+class Mixer(nn.Module):
+    """[kNN block, global block] repeated; the result is added to the tokens."""
+
+    config: StreamConfig
+
+    def setup(self):
+        self.local_blocks = [NeighbourBlock(self.config) for _ in range(self.config.mixer_blocks)]
+        self.global_blocks = [GlobalBlock() for _ in range(self.config.mixer_blocks)]
+
+    def __call__(
+        self,
+        feats: Float[Array, "v hf wf c"],
+        positions: Float[Array, "v hf wf 3"],
+        inside: Bool[Array, "v hf wf"],
+        view_valid: Bool[Array, " v"],
+    ) -> Float[Array, "v hf wf c"]:
+        if not self.local_blocks:
+            return feats
+        neighbours = nearest_tokens(jax.lax.stop_gradient(positions), inside, self.config)
+        x = feats
+        for local, joint in zip(self.local_blocks, self.global_blocks, strict=True):
+            flat = local(x.reshape(-1, x.shape[-1]), neighbours, inside.reshape(-1))
+            x = joint(flat.reshape(x.shape), view_valid)
+        return x
+
+
+def mix_tokens(
+    params,
+    feats: Float[Array, "v hf wf c"],
+    positions: Float[Array, "v hf wf 3"],
+    inside: Bool[Array, "v hf wf"],
+    view_valid: Bool[Array, " v"],
+    config: StreamConfig,
+) -> Float[Array, "v hf wf c"]:
+    """Context-aggregated token features, ready for the head and for the cache (DESIGN 6.8)."""
+    return Mixer(config).apply({"params": params}, feats, positions, inside, view_valid)  # pyright: ignore[reportReturnType]

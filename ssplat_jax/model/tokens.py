@@ -1,0 +1,54 @@
+"""Token positions and features before the history comes in (Sec. 3.3; ReSplat's regressor, ALGORITHM 3.1)."""
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ssplat_jax.config import StreamConfig
+from ssplat_jax.geometry.cameras import invert_poses, pixel_grid, transform_points, unproject
+from ssplat_jax.model.convolution import Conv, pixel_unshuffle
+from ssplat_jax.model.wires import GRID_STRIDE, AnchoredDepth, DepthBelief, Features, Views
+
+MIN_LOG_RANGE = 1e-3
+"""A sweep narrower than this (a single candidate, near = far) gives a hint near 0, not 0 / 0."""
+
+
+class TokenRegressor(nn.Module):
+    """[patch, depth, match probability, context, decoder features] to f; patch and probability go in a second time."""
+
+    config: StreamConfig
+
+    @nn.compact
+    def __call__(self, patches, relative_depths, match, context, decoder) -> Float[Array, "v hf wf c"]:
+        c = self.config.token_width
+        x = jnp.concatenate([patches, relative_depths, match, context, decoder], axis=-1)
+        x = Conv(c, name="conv2")(nn.gelu(Conv(c, name="conv1")(x)))
+        return nn.Dense(c, name="project")(jnp.concatenate([x, patches, match], axis=-1))
+
+
+def regress_tokens(
+    params, features: Features, belief: DepthBelief, depth: AnchoredDepth, views: Views, config: StreamConfig
+) -> Float[Array, "v hf wf c"]:
+    """f^v(u): what the current views say about each token.
+
+    The depth enters as a constant: it is trained through the positions it gives, not through this hint.
+    """
+    low, high = views.log_candidates[0], views.log_candidates[-1]
+    relative = (jax.lax.stop_gradient(depth.log_depths)[..., None] - low) / jnp.maximum(high - low, MIN_LOG_RANGE)
+    match = jax.lax.stop_gradient(depth.anchored_confidences)[..., None]
+    patches = pixel_unshuffle(views.images - 0.5, GRID_STRIDE)
+    return TokenRegressor(config).apply({"params": params}, patches, relative, match, features.context, belief.decoder)  # pyright: ignore[reportReturnType]
+
+
+def back_project(
+    log_depths: Float[Array, "v hf wf"], views: Views
+) -> tuple[Float[Array, "v hf wf 3"], Float[Array, "v hf wf"]]:
+    """World positions p_j of the cells at their depths, and the cells' footprints (side of a cell at that depth)."""
+    v, hf, wf = log_depths.shape
+    cells = pixel_grid(hf * GRID_STRIDE, wf * GRID_STRIDE, GRID_STRIDE).reshape(-1, 2)
+    depths = jnp.exp(log_depths).reshape(v, -1)
+    points = unproject(jnp.broadcast_to(cells, (v, *cells.shape)), depths, views.Ks)
+    world = transform_points(invert_poses(views.viewmats), points)
+    focal = 0.5 * (views.Ks[:, 0, 0] + views.Ks[:, 1, 1])
+    return world.reshape(v, hf, wf, 3), (depths * GRID_STRIDE / focal[:, None]).reshape(v, hf, wf)

@@ -1,0 +1,100 @@
+"""The few pytrees that pass between the stages of one step."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from ssplat_jax.chunk import Chunk
+from ssplat_jax.config import StreamConfig
+from ssplat_jax.geometry.cameras import Camera, pixel_grid
+from ssplat_jax.struct import pytree, static
+
+GRID_STRIDE = 4
+"""Pixels to a side of a grid cell: one token per 4 x 4 patch (Sec. 3.3, M = N H W / 16)."""
+
+
+@pytree
+class Views:
+    """A chunk padded to a size that the network takes. Padding is at the right and bottom, so `Ks` stay as they are."""
+
+    images: Float[Array, "v hp wp 3"]  # edge-padded
+    viewmats: Float[Array, "v 4 4"]
+    Ks: Float[Array, "v 3 3"]
+    valid: Bool[Array, " v"]
+    inside: Bool[Array, "v hf wf"]  # cells of valid views whose centre lies in the unpadded image
+    log_candidates: Float[Array, " d"]  # ln of the depth candidates, near to far
+    height: int = static()  # of the unpadded image
+    width: int = static()
+
+    @property
+    def grid_camera(self) -> Camera:
+        """The views' cameras at grid resolution: one pixel per cell."""
+        hf, wf = self.inside.shape[1:]
+        scale = jnp.array([1.0 / GRID_STRIDE, 1.0 / GRID_STRIDE, 1.0])
+        return Camera(viewmats=self.viewmats, Ks=self.Ks * scale[:, None], width=wf, height=hf)
+
+
+@pytree
+class Features:
+    """What the encoder sees."""
+
+    fine: Float[Array, "v h2 w2 cm"]  # matching features at 1/2
+    grid: Float[Array, "v hf wf cm"]  # matching features at 1/4, after cross-view attention
+    context: Float[Array, "v hf wf c"]  # everything at 1/4: CNN and multi-view features
+
+
+@pytree
+class DepthBelief:
+    """P_i(k | u), what the current views alone say, and the decoder features it was read from."""
+
+    probs: Float[Array, "v hf wf d"]
+    logits: Float[Array, "v hf wf d"]
+    decoder: Float[Array, "v hf wf c"]
+
+
+@pytree
+class AnchoredDepth:
+    """P^v(k | u) and what is read from it."""
+
+    probs: Float[Array, "v hf wf d"]
+    log_depths: Float[Array, "v hf wf"]
+    matcher_confidences: Float[Array, "v hf wf"]  # peak of P_i, before the anchor: what VACC trusts
+    anchored_confidences: Float[Array, "v hf wf"]  # peak of P^v: what CGFI attenuates by
+
+
+def prepare_views(chunk: Chunk, config: StreamConfig) -> Views:
+    """Pads the images of `chunk` (edge values) to the network's multiple and lays out the candidates."""
+    height, width = chunk.images.shape[1:3]
+    multiple = config.size_multiple
+    pad_h, pad_w = -height % multiple, -width % multiple
+    images = jnp.pad(chunk.images, ((0, 0), (0, pad_h), (0, pad_w), (0, 0)), mode="edge")
+    centres = pixel_grid(height + pad_h, width + pad_w, GRID_STRIDE)
+    in_image = (centres[..., 0] < width) & (centres[..., 1] < height)
+    fractions = jnp.linspace(0.0, 1.0, config.num_depths)
+    log_near, log_far = jnp.log(chunk.near), jnp.log(chunk.far)
+    return Views(
+        images=images,
+        viewmats=chunk.viewmats,
+        Ks=chunk.Ks,
+        valid=chunk.valid,
+        inside=in_image[None] & chunk.valid[:, None, None],
+        log_candidates=log_near + (log_far - log_near) * fractions,
+        height=height,
+        width=width,
+    )
+
+
+def nearest_sources(
+    viewmats: Float[Array, "v 4 4"], valid: Bool[Array, " v"], num_sources: int
+) -> tuple[Int[Array, "v s"], Bool[Array, "v s"]]:
+    """The other views nearest by centre distance, and which of them are valid.
+
+    A view is excluded by its index, never by its distance: two cameras may share a centre (ALGORITHM 2.3).
+    """
+    v = viewmats.shape[0]
+    centers = Camera(viewmats=viewmats, Ks=jnp.zeros((v, 3, 3)), width=1, height=1).centers
+    distances = jnp.sum((centers[:, None] - centers[None]) ** 2, axis=-1)
+    distances = jnp.where(valid[None, :], distances, jnp.inf)
+    distances = jnp.where(jnp.eye(v, dtype=bool), jnp.inf, distances)
+    # Own index last even among invalid views: a stable sort on (distance, is_self).
+    order = jnp.lexsort((jnp.eye(v, dtype=jnp.int32), distances), axis=-1)[:, : min(num_sources, v - 1)]
+    return order, jnp.take_along_axis(jnp.isfinite(distances), order, axis=1)

@@ -1,0 +1,152 @@
+"""`StreamSplat`: the model as pure functions of parameters and cache. `step` is a `lax.scan` body.
+
+chunk (4 images + cameras)          cache H_{t-1}
+  │                                   │ project
+  ▼                                   ▼
+encode ─► match ─► P_i ──────────► anchor_depth (HPDA) ─► depth ─► back_project ─► p
+  │                                   │                                            │
+  └─► regress_tokens ─► f ─► inject_features (CGFI) ─► mix_tokens ─► f             │
+                                                        └──────► fuse (VACC) ◄─────┘ ─► cache H_t ─► decode
+"""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ssplat_jax import model as stages
+from ssplat_jax.cache import Tokens, VoxelCache, fuse, init_cache, project
+from ssplat_jax.chunk import Chunk
+from ssplat_jax.config import StreamConfig
+from ssplat_jax.gaussians import Gaussians, mask_gaussians
+from ssplat_jax.geometry.rotations import matrices_to_quats
+from ssplat_jax.model.wires import Views
+from ssplat_jax.struct import pytree
+
+
+@pytree
+class ChunkOutput:
+    """What one step reports about its chunk, on the 1/4 grid of the padded image."""
+
+    depths: Float[Array, "*t v hf wf"]  # stream units
+    confidences: Float[Array, "*t v hf wf"]  # omega of VACC; 0 outside the image and in padded views
+    history: Float[Array, "*t v hf wf"]  # Omega_H of the cache before this chunk; 0 in its holes
+
+
+@pytree
+class Prediction:
+    """Everything the network computed for a chunk; the training losses look inside, `step` keeps the summary."""
+
+    tokens: Tokens
+    logits: Float[Array, "v hf wf d"]  # of P_i
+    log_depths: Float[Array, "v hf wf"]  # expectation under P^v
+    views: Views
+    output: ChunkOutput
+
+
+@dataclasses.dataclass(frozen=True)
+class StreamSplat:
+    """The model for one configuration. Holds no arrays: parameters and cache are arguments and results.
+
+    Example:
+        >>> model = StreamSplat(ss.preset("tiny"))
+        >>> params, cache = model.init(jax.random.key(0)), model.init_cache()
+        >>> step = jax.jit(model.step, donate_argnums=1)
+        >>> for chunk in chunks:
+        ...     cache, out = step(params, cache, chunk)
+        >>> gaussians = model.decode(params, cache)
+    """
+
+    config: StreamConfig
+
+    def init(self, key: jax.Array) -> dict:
+        """Fresh parameters (a nested dict); `ssplat_jax.load_params` gives trained ones."""
+        return stages.init_params(key, self.config)
+
+    def init_cache(self) -> VoxelCache:
+        """An empty cache of the configuration's capacity."""
+        return init_cache(self.config)
+
+    def predict(self, params: dict, cache: VoxelCache, chunk: Chunk) -> Prediction:
+        """Tokens of a chunk, given what the cache remembers (Eqs. 2-9). The cache is read as a constant."""
+        config = self.config
+        views = stages.prepare_views(chunk, config)
+        with jax.named_scope("project"):
+            history = project(jax.lax.stop_gradient(cache), views.grid_camera, config)
+        with jax.named_scope("encode"):
+            features = stages.encode(params["encoder"], views, config)
+        with jax.named_scope("match"):
+            belief = stages.match(params["cost_volume"], features, views, config)
+        with jax.named_scope("HPDA"):
+            depth = stages.anchor_depth(params["hpda"], belief, history, views, config)
+        with jax.named_scope("tokens"):
+            positions, footprints = stages.back_project(depth.log_depths, views)
+            feats = stages.regress_tokens(params["tokens"], features, belief, depth, views, config)
+        with jax.named_scope("CGFI"):
+            feats = stages.inject_features(params["cgfi"], feats, history, depth.anchored_confidences, views, config)
+        with jax.named_scope("mixer"):
+            feats = stages.mix_tokens(params["mixer"], feats, positions, views.inside, views.valid, config)
+        confidences = jnp.where(views.inside, depth.matcher_confidences, 0.0)
+        return Prediction(
+            tokens=_flatten_tokens(positions, feats, confidences, footprints, views),
+            logits=belief.logits,
+            log_depths=depth.log_depths,
+            views=views,
+            output=ChunkOutput(depths=jnp.exp(depth.log_depths), confidences=confidences, history=history.confidences),
+        )
+
+    def step(self, params: dict, cache: VoxelCache, chunk: Chunk) -> tuple[VoxelCache, ChunkOutput]:
+        """One chunk: predict its tokens, fuse them into the cache (VACC). Carry first, in and out."""
+        prediction = self.predict(params, cache, chunk)
+        with jax.named_scope("VACC"):
+            cache = fuse(cache, jax.lax.stop_gradient(prediction.tokens), self.config)
+        return cache, prediction.output
+
+    def run(self, params: dict, cache: VoxelCache, chunks: Chunk) -> tuple[VoxelCache, ChunkOutput]:
+        """`step` over stacked chunks (leading axis t) as one `lax.scan`."""
+        return jax.lax.scan(functools.partial(self.step, params), cache, chunks)
+
+    def decode(self, params: dict, cache: VoxelCache) -> Gaussians:
+        """The scene so far: one Gaussian per pivot, in the stream frame; dead pivots have opacity 0."""
+        flat = lambda x: x.reshape(-1, *x.shape[2:])  # noqa: E731
+        gaussians = stages.decode_tokens(
+            params["decoder"],
+            means=flat(cache.means),
+            feats=flat(cache.feats),
+            rgbs=flat(cache.rgbs),
+            quats=flat(cache.quats),
+            footprints=flat(cache.footprints),
+            config=self.config,
+        )
+        return mask_gaussians(gaussians, flat(cache.alive))
+
+    def decode_tokens(self, params: dict, tokens: Tokens) -> Gaussians:
+        """Gaussians of tokens that need not be in a cache: what training renders (Sec. 3.7)."""
+        gaussians = stages.decode_tokens(
+            params["decoder"],
+            means=tokens.means,
+            feats=tokens.feats,
+            rgbs=tokens.rgbs,
+            quats=tokens.quats,
+            footprints=tokens.footprints,
+            config=self.config,
+        )
+        return mask_gaussians(gaussians, tokens.valid)
+
+
+def _flatten_tokens(positions, feats, confidences, footprints, views: Views) -> Tokens:
+    """Maps to tokens in order of insertion: view-major, row-major (DESIGN 6.9)."""
+    v, hf, wf, _ = positions.shape
+    rgbs = stages.average_pool(views.images, stages.GRID_STRIDE)
+    quats = matrices_to_quats(jnp.swapaxes(views.viewmats[:, :3, :3], -1, -2))
+    return Tokens(
+        means=positions.reshape(-1, 3),
+        feats=feats.reshape(v * hf * wf, -1),
+        confidences=confidences.reshape(-1),
+        rgbs=rgbs.reshape(-1, 3),
+        quats=jnp.repeat(quats, hf * wf, axis=0),
+        footprints=footprints.reshape(-1),
+        valid=views.inside.reshape(-1),
+    )

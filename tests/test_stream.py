@@ -1,0 +1,165 @@
+"""The stream as a whole: step, scan, session. One narrow model, one procedural capture, shared by the module."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ssplat_jax.config import StreamConfig
+from ssplat_jax.data.capture import open_capture
+from ssplat_jax.session import Session
+from ssplat_jax.stream import StreamSplat
+from ssplat_jax.struct import replace
+
+# Narrow, and without a confidence threshold: untrained distributions are flat and would leave the cache empty.
+NARROW = StreamConfig(
+    encoder_widths=(8, 16),
+    encoder_blocks=1,
+    attention_blocks=1,
+    match_width=8,
+    num_depths=16,
+    unet_width=16,
+    token_width=16,
+    cgfi_width=16,
+    mixer_blocks=1,
+    mixer_proj=8,
+    min_confidence=0.0,
+    capacity=2048,
+)
+
+
+@pytest.fixture(scope="module")
+def model():
+    return StreamSplat(NARROW)
+
+
+@pytest.fixture(scope="module")
+def params(model):
+    # Perturbed, so that zero-initialised layers (CGFI, the head) take part.
+    fresh = model.init(jax.random.key(0))
+    leaves, tree = jax.tree.flatten(fresh)
+    keys = jax.random.split(jax.random.key(1), len(leaves))
+    noisy = [x + 0.05 * jax.random.normal(k, x.shape) for k, x in zip(keys, leaves, strict=True)]
+    return jax.tree.unflatten(tree, noisy)
+
+
+@pytest.fixture(scope="module")
+def chunks(model):
+    return list(open_capture("procedural:room?frames=16&size=64x64").chunks(model.config))
+
+
+@pytest.fixture(scope="module")
+def looped(model, params, chunks):
+    """The cache after a Python loop over the jitted step, and the number of compilations that took."""
+    step = jax.jit(model.step, donate_argnums=1)
+    cache = model.init_cache()
+    outputs = []
+    for chunk in chunks:
+        cache, out = step(params, cache, chunk)
+        outputs.append(out)
+    return cache, outputs, step._cache_size()
+
+
+def leaves_with_names(tree):
+    return [(jax.tree_util.keystr(k), np.asarray(x)) for k, x in jax.tree_util.tree_flatten_with_path(tree)[0]]
+
+
+def test_scan_equals_loop_bit_for_bit(model, params, chunks, looped):
+    stacked = jax.tree.map(lambda *x: jnp.stack(x), *chunks)
+    cache, outputs = jax.jit(model.run)(params, model.init_cache(), stacked)
+    for (name, scanned), (_, stepped) in zip(leaves_with_names(cache), leaves_with_names(looped[0]), strict=True):
+        np.testing.assert_array_equal(scanned, stepped, err_msg=name)
+    depths = np.stack([np.asarray(out.depths) for out in looped[1]])
+    np.testing.assert_array_equal(np.asarray(outputs.depths), depths)
+
+
+def test_one_compilation_for_the_whole_stream(looped):
+    assert looped[2] == 1
+
+
+def test_cache_fills_within_its_bounds(model, chunks, looped):
+    cache = looped[0]
+    config = model.config
+    occupied = int(cache.num_voxels)
+    assert 0 < occupied <= config.capacity
+    assert int(cache.counts.max()) <= config.pivots_per_voxel
+    corners = np.asarray(cache.voxels[:occupied]) * config.voxel_size
+    alive = np.asarray(cache.alive[:occupied])
+    offsets = np.asarray(cache.means[:occupied]) - corners[:, None]
+    # A few ulp of the coordinates: the voxel of a mean is found by one float32 division.
+    slack = 1e-5 * (1 + np.abs(corners).max())
+    assert (offsets[alive] >= -slack).all() and (offsets[alive] <= config.voxel_size + slack).all()
+    assert int(cache.stats.num_chunks) == len(chunks)
+    seen = int(cache.stats.num_seen)
+    rejected = sum(int(getattr(cache.stats, f"num_{why}")) for why in ("low_confidence", "non_finite", "out_of_range"))
+    assert seen == sum(chunk.images.shape[0] for chunk in chunks) * 16 * 16
+    assert int(cache.stats.num_accepted) == seen - rejected - int(cache.stats.num_dropped)
+
+
+def test_future_chunks_do_not_change_the_past(model, params, chunks, looped):
+    step = jax.jit(model.step)
+    altered = [*chunks[:2], replace(chunks[2], images=1.0 - chunks[2].images)]
+    cache = model.init_cache()
+    for chunk, expected in zip(altered[:2], looped[1], strict=False):
+        cache, out = step(params, cache, chunk)
+        np.testing.assert_array_equal(np.asarray(out.depths), np.asarray(expected.depths))
+    _, changed = step(params, cache, altered[2])
+    assert not np.array_equal(np.asarray(changed.depths), np.asarray(looped[1][2].depths))
+
+
+def test_a_chunk_of_padding_leaves_the_cache_as_it_was(model, params, chunks, looped):
+    padding = replace(chunks[0], valid=jnp.zeros(4, bool))
+    cache, _ = jax.jit(model.step)(params, looped[0], padding)
+    for (name, after), (_, before) in zip(leaves_with_names(cache), leaves_with_names(looped[0]), strict=True):
+        if "num_chunks" not in name:
+            np.testing.assert_array_equal(after, before, err_msg=name)
+
+
+def test_pixels_of_a_padded_view_change_nothing(model, params, chunks, looped):
+    valid = jnp.array([True, True, True, False])
+    step = jax.jit(model.step)
+    plain = replace(chunks[0], valid=valid)
+    noisy = replace(plain, images=plain.images.at[3].set(0.7))
+    first, _ = step(params, model.init_cache(), plain)
+    second, _ = step(params, model.init_cache(), noisy)
+    for (name, a), (_, b) in zip(leaves_with_names(first), leaves_with_names(second), strict=True):
+        np.testing.assert_array_equal(a, b, err_msg=name)
+
+
+def test_history_is_seen_from_the_second_chunk_on(looped):
+    histories = [float(out.history.sum()) for out in looped[1]]
+    assert histories[0] == 0.0
+    assert all(h > 0 for h in histories[1:])
+
+
+def test_decoded_dead_pivots_are_absent(model, params, looped):
+    gaussians = model.decode(params, looped[0])
+    alive = np.asarray(looped[0].alive).reshape(-1)
+    opacities = np.asarray(gaussians.opacities)
+    assert (opacities[alive] > 0).all() and (opacities[~alive] == 0).all()
+    np.testing.assert_array_equal(
+        np.asarray(gaussians.means)[alive], np.asarray(looped[0].means).reshape(-1, 3)[alive]
+    )
+
+
+def test_session_compiles_once_and_needs_the_same_memory_throughout(model, params, chunks):
+    session = Session(model, params)
+    memory = []
+    for chunk in chunks:
+        session.feed(chunk)
+        memory.append(session.step_memory_bytes)
+    assert session.num_compilations == 1
+    assert memory[0] is not None and len(set(memory)) == 1
+
+
+def test_odd_and_portrait_sizes_stream(model, params):
+    for size in ("50x70", "71x45"):
+        capture = open_capture(f"procedural:room?frames=5&size={size}")
+        session = Session(model, params)
+        for chunk in capture.chunks(model.config):
+            session.feed(chunk)
+        width, height = map(int, size.split("x"))
+        cells = sum(
+            1 for y in range(2, 4 * (height // 4 + 1), 4) for x in range(2, 4 * (width // 4 + 1), 4) if x < width and y < height
+        )
+        assert int(session.cache.stats.num_seen) == 5 * cells
