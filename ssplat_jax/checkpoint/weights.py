@@ -1,0 +1,67 @@
+"""Weights files: parameters by path, float16 on disk (half of the rounding error of a render's 8 bits), float32 in use."""
+
+from importlib import resources
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ssplat_jax.checkpoint.arrays import load_arrays, save_arrays
+from ssplat_jax.config import PRESETS, StreamConfig, preset
+from ssplat_jax.errors import InputError, StorageError
+from ssplat_jax.model import init_params
+
+
+def save_weights(path: Path, params: dict, config: StreamConfig, provenance: dict) -> None:
+    """Writes the parameters of a model with `config`; `provenance` says how they came to be (steps, data, scores)."""
+    leaves = {"/".join(k.key for k in keys): leaf for keys, leaf in jax.tree_util.tree_flatten_with_path(params)[0]}
+    arrays = {name: np.asarray(leaf, np.float16) for name, leaf in leaves.items()}
+    if bad := [name for name, x in arrays.items() if not np.isfinite(x).all()]:
+        raise StorageError(f"{path}: {bad[0]} has values beyond float16 or not finite; the weights are not saved.")
+    save_arrays(path, arrays, {"kind": "weights", "config": config.to_dict(), "provenance": provenance})
+
+
+def load_weights(path: Path) -> tuple[dict, StreamConfig]:
+    """(params, config) of a weights file.
+
+    Raises:
+        StorageError: missing or corrupt.
+        InputError: the file holds something else, or weights whose shapes its configuration does not give.
+    """
+    arrays, header = load_arrays(path)
+    if header.get("kind") != "weights":
+        raise InputError(f"{path}: wanted weights, got {header.get('kind')!r}; give a file that `ssplat train` wrote.")
+    config = StreamConfig.from_dict(header["config"])
+    return _restore(path, arrays, config), config
+
+
+def load_params(name: str = "tiny") -> dict:
+    """Trained parameters: the shipped ones of a preset, or those of a weights file.
+
+    Raises:
+        InputError: no preset and no file of that name, or weights of other shapes.
+        StorageError: the file is corrupt.
+    """
+    if name not in PRESETS:
+        if not Path(name).is_file():
+            known = ", ".join(sorted(PRESETS))
+            raise InputError(f"weights: wanted a preset with shipped weights ({known}) or a file, got {name!r}.")
+        return load_weights(Path(name))[0]
+    with resources.as_file(resources.files("ssplat_jax") / "weights" / f"{name}.npz") as path:
+        arrays, _ = load_arrays(path)
+        return _restore(path, arrays, preset(name))
+
+
+def _restore(path: Path, arrays: dict[str, np.ndarray], config: StreamConfig) -> dict:
+    """Arrays by path as the tree that `config` wants, every shape checked."""
+    wanted = jax.eval_shape(lambda key: init_params(key, config), jax.random.key(0))
+
+    def leaf(keys, shape):
+        name = "/".join(k.key for k in keys)
+        if name not in arrays or arrays[name].shape != shape.shape:
+            came = arrays[name].shape if name in arrays else "nothing"
+            raise InputError(f"{path}: {name} must be {shape.shape}, got {came}; the weights are of another config.")
+        return jnp.asarray(arrays[name], jnp.float32)
+
+    return jax.tree_util.tree_map_with_path(leaf, wanted)

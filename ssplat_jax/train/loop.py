@@ -1,0 +1,113 @@
+"""The training loop: draws samples ahead, steps, logs JSON lines, saves, resumes, stops cleanly on a signal."""
+
+import dataclasses
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import jax.numpy as jnp
+
+from ssplat_jax.checkpoint.training import TrainingCheckpoints
+from ssplat_jax.config import StreamConfig
+from ssplat_jax.interrupts import Interrupts
+from ssplat_jax.stream import StreamSplat
+from ssplat_jax.train.recipe import Recipe, training_config
+from ssplat_jax.train.samples import prefetched, sample_for_step
+from ssplat_jax.train.step import Trainer, TrainState, init_state, learning_rate
+
+LOG_FILE = "log.jsonl"
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainResult:
+    """Where a run stands when `train` returns."""
+
+    state: TrainState
+    step: int
+    interrupted: int | None  # the signal that stopped it, if one did
+
+
+def train(
+    config: StreamConfig,
+    recipe: Recipe,
+    out: Path,
+    *,
+    params: dict | None = None,
+    save_every: int = 200,
+    log_every: int = 10,
+    report: Callable[[dict], None] = lambda record: None,
+) -> TrainResult:
+    """Trains until the recipe is done, continuing from what `out` holds.
+
+    Args:
+        config: of the model; its cache is replaced by the recipe's.
+        recipe: phases and optimiser.
+        out: directory of `log.jsonl`, `recipe.json` and `checkpoints/`.
+        params: start from these instead of from the recipe's seed (ignored on resume).
+        save_every: steps between checkpoints; SIGINT and SIGTERM save too.
+        log_every: steps between records (means over the steps between).
+        report: called with every record.
+
+    Raises:
+        InputError: `out` holds a run of another recipe or configuration.
+        StorageError: a checkpoint cannot be written or read.
+    """
+    model = StreamSplat(training_config(config, recipe))
+    description = {"config": model.config.to_dict(), "recipe": dataclasses.asdict(recipe)}
+    checkpoints = TrainingCheckpoints(out, description)
+    state, start = init_state(model, recipe, params), 0
+    if (restored := checkpoints.restore_latest(state)) is not None:
+        start, state = restored
+    trainer = Trainer(model, recipe)
+    interrupts = Interrupts()
+    window: list[dict] = []
+    waited, since, step = 0.0, time.perf_counter(), start
+    samples = prefetched(lambda i: sample_for_step(i, recipe, model.config), iter(range(start, recipe.num_steps)))
+    with interrupts:
+        try:
+            before = time.perf_counter()
+            for i, sample in samples:
+                waited += time.perf_counter() - before
+                rate = jnp.asarray(learning_rate(recipe, i), jnp.float32)
+                state, metrics = trainer.step(state, sample, rate, frozen=recipe.phase_at(i)[0].frozen)
+                window.append(metrics)
+                step = i + 1
+                if step % log_every == 0 or step == recipe.num_steps:
+                    record = _record(step, recipe, window, state, waited, time.perf_counter() - since)
+                    _append(out / LOG_FILE, record)
+                    report(record)
+                    window, waited, since = [], 0.0, time.perf_counter()
+                if step % save_every == 0 or interrupts.received:
+                    checkpoints.save(step, state)
+                if interrupts.received:
+                    break
+                before = time.perf_counter()
+            if step > start and not interrupts.received and step % save_every:
+                checkpoints.save(step, state)
+        finally:
+            samples.close()
+            checkpoints.close()
+    return TrainResult(state=state, step=step, interrupted=interrupts.received)
+
+
+def _record(step, recipe, window, state, waited, elapsed) -> dict:
+    """One line of the log: means of the window's metrics and where the time went."""
+    phase, _ = recipe.phase_at(step - 1)
+    means: dict = {}
+    for name in window[-1]:
+        values = [float(m[name]) for m in window if name in m]
+        means[name] = round(sum(values) / len(values), 5)
+    return {
+        "step": step,
+        "phase": phase.name,
+        **means,
+        "skipped": int(state.num_skipped),
+        "seconds_per_step": round(elapsed / len(window), 4),
+        "data_share": round(waited / elapsed, 4),
+    }
+
+
+def _append(path: Path, record: dict) -> None:
+    with path.open("a") as file:
+        file.write(json.dumps(record) + "\n")

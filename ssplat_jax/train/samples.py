@@ -1,0 +1,137 @@
+"""Training samples: procedural views split into a context stream and targets, framed as a capture would be."""
+
+import queue
+import threading
+from collections.abc import Callable, Generator, Iterator
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ssplat_jax.chunk import Chunk
+from ssplat_jax.config import StreamConfig
+from ssplat_jax.data.procedural import training_sample
+from ssplat_jax.geometry.cameras import Camera
+from ssplat_jax.model import GRID_STRIDE
+from ssplat_jax.struct import pytree
+from ssplat_jax.train.recipe import Recipe
+
+NEAR_FACTOR, FAR_FACTOR = 0.55, 1.8  # as data.scale: margins around the 1 % and 99 % quantiles of depth
+JITTER = 0.25  # relative error that the sweep's range and the scene scale are trained to bear
+
+
+@pytree
+class Sample:
+    """`t` chunks of context with their depth, and target views with theirs."""
+
+    chunks: Chunk  # leading axis t
+    log_depths: Float[Array, "t v hf wf"]  # true ln z at the grid's cells
+    target_images: Float[Array, "s h w 3"]
+    target_viewmats: Float[Array, "s 4 4"]
+    target_Ks: Float[Array, "s 3 3"]
+
+    @property
+    def target_camera(self) -> Camera:
+        """The targets' cameras as one batch."""
+        height, width = self.target_images.shape[1:3]
+        return Camera(viewmats=self.target_viewmats, Ks=self.target_Ks, width=width, height=height)
+
+
+def choose_targets(rng: np.random.Generator, num_views: int, num_targets: int) -> np.ndarray:
+    """Positions of the targets among `num_views` ordered views, neither first nor last: all are seen between others."""
+    return np.sort(rng.choice(np.arange(1, num_views - 1), size=num_targets, replace=False))
+
+
+def make_sample(seed: int, *, num_chunks: int, num_targets: int, size: tuple[int, int], config: StreamConfig) -> Sample:
+    """The sample called `seed`: always the same arrays for the same arguments."""
+    rng = np.random.default_rng([seed, 7])
+    height, width = size
+    num_context = num_chunks * config.chunk_size
+    num_views = num_context + num_targets
+    arrays = training_sample(seed, num_views, height, width)
+    images, depths, camtoworlds, Ks = (np.asarray(a) for a in arrays)
+    is_target = np.zeros(num_views, bool)
+    if num_targets:
+        is_target[choose_targets(rng, num_views, num_targets)] = True
+    context = np.flatnonzero(~is_target)
+
+    scale = config.median_depth / np.median(depths[context]) * np.exp(rng.uniform(-JITTER, JITTER))
+    viewmats = _stream_viewmats(camtoworlds.astype(np.float64), context[0], scale)
+    depths = depths * scale
+    low, high = np.quantile(depths[context], [0.01, 0.99])
+    near = NEAR_FACTOR * low * np.exp(rng.uniform(-JITTER, JITTER))
+    far = FAR_FACTOR * high * np.exp(rng.uniform(-JITTER, JITTER))
+
+    chunked = lambda x: x[context].reshape(num_chunks, config.chunk_size, *x.shape[1:])  # noqa: E731
+    cell = GRID_STRIDE // 2
+    return Sample(
+        chunks=Chunk(
+            images=jnp.asarray(chunked(images)),
+            viewmats=jnp.asarray(chunked(viewmats)),
+            Ks=jnp.asarray(chunked(Ks.astype(np.float32))),
+            valid=jnp.ones((num_chunks, config.chunk_size), bool),
+            near=jnp.full(num_chunks, near, jnp.float32),
+            far=jnp.full(num_chunks, far, jnp.float32),
+        ),
+        log_depths=jnp.asarray(np.log(chunked(depths[:, cell::GRID_STRIDE, cell::GRID_STRIDE]).astype(np.float32))),
+        target_images=jnp.asarray(images[is_target]),
+        target_viewmats=jnp.asarray(viewmats[is_target]),
+        target_Ks=jnp.asarray(Ks[is_target].astype(np.float32)),
+    )
+
+
+def _stream_viewmats(camtoworlds, first: int, scale: float):
+    """World-to-camera matrices with view `first` at the origin and lengths scaled, computed in float64."""
+    relative = np.linalg.inv(camtoworlds[first]) @ camtoworlds
+    relative[:, :3, 3] *= scale
+    return np.linalg.inv(relative).astype(np.float32)
+
+
+def prefetched(
+    produce: Callable[[int], Sample], steps: Iterator[int], depth: int = 2
+) -> Generator[tuple[int, Sample], None, None]:
+    """(step, produce(step)) in order, computed ahead on a thread. An error in `produce` is raised here."""
+    ahead: queue.Queue = queue.Queue(maxsize=depth)
+    stop = threading.Event()
+
+    def put(item) -> bool:
+        while not stop.is_set():
+            try:
+                ahead.put(item, timeout=0.1)
+                return True
+            except queue.Full:
+                continue
+        return False
+
+    def work():
+        try:
+            for step in steps:
+                if not put((step, produce(step), None)):
+                    return
+            put(None)
+        except BaseException as error:  # handed to the consumer, which raises it
+            put((None, None, error))
+
+    thread = threading.Thread(target=work, daemon=True)
+    thread.start()
+    try:
+        while (item := ahead.get()) is not None:
+            step, sample, error = item
+            if error is not None:
+                raise error
+            yield step, sample
+    finally:
+        stop.set()
+        thread.join()
+
+
+def sample_for_step(step: int, recipe: Recipe, config: StreamConfig) -> Sample:
+    """The sample that training step `step` uses: a function of the recipe alone, which makes resuming exact."""
+    phase, position = recipe.phase_at(step)
+    return make_sample(
+        recipe.seed * 1_000_003 + step,
+        num_chunks=phase.num_chunks,
+        num_targets=phase.num_targets,
+        size=phase.sizes[position % len(phase.sizes)],
+        config=config,
+    )

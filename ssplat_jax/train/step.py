@@ -1,0 +1,157 @@
+"""One training step as a pure function of (state, sample)."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Float, Int
+
+from ssplat_jax.cache import Tokens, fuse
+from ssplat_jax.gaussians import mask_gaussians
+from ssplat_jax.render import render
+from ssplat_jax.stream import StreamSplat
+from ssplat_jax.struct import pytree
+from ssplat_jax.train.losses import depth_loss, image_gradient_l1
+from ssplat_jax.train.recipe import Recipe
+from ssplat_jax.train.samples import Sample
+
+
+@pytree
+class TrainState:
+    """All that a resumed run needs beside its recipe."""
+
+    params: dict
+    ema: dict  # exponential moving average of params: what is evaluated and shipped
+    opt_state: tuple
+    step: Int[Array, ""]
+    num_skipped: Int[Array, ""]  # steps whose gradient was not finite
+
+
+def optimizer(recipe: Recipe) -> optax.GradientTransformation:
+    """AdamW behind a clip of the global norm; the learning rate is applied by the step, which knows its phase."""
+    return optax.chain(
+        optax.clip_by_global_norm(recipe.clip_norm),
+        optax.scale_by_adam(b1=0.9, b2=0.99),
+        optax.add_decayed_weights(recipe.weight_decay),
+    )
+
+
+def init_state(model: StreamSplat, recipe: Recipe, params: dict | None = None) -> TrainState:
+    """A fresh state, from `params` or from the recipe's seed."""
+    params = model.init(jax.random.key(recipe.seed)) if params is None else params
+    return TrainState(
+        params=params,
+        ema=jax.tree.map(jnp.copy, params),
+        opt_state=optimizer(recipe).init(params),  # pyright: ignore[reportArgumentType]
+        step=jnp.zeros((), jnp.int32),
+        num_skipped=jnp.zeros((), jnp.int32),
+    )
+
+
+def learning_rate(recipe: Recipe, step: int) -> float:
+    """Warm-up at the start of every phase, then cosine to a tenth of its peak."""
+    phase, position = recipe.phase_at(step)
+    warmup = min(1.0, (position + 1) / recipe.warmup_steps)
+    progress = position / phase.steps
+    return phase.learning_rate * warmup * float(0.1 + 0.45 * (1 + jnp.cos(jnp.pi * progress)))
+
+
+def stream_chunks(model: StreamSplat, params: dict, sample: Sample, *, recompute: bool):
+    """Streams the sample's chunks; returns the tokens of all chunks with gradients and the mean depth losses.
+
+    What is written to the cache stops gradients (ALGORITHM 9.35). With `recompute`, each chunk's activations are
+    computed again on the way back, so that memory does not grow with their number.
+    """
+
+    def body(cache, chunk_and_truth):
+        chunk, truth = chunk_and_truth
+        prediction = model.predict(params, cache, chunk)
+        cache = fuse(cache, jax.lax.stop_gradient(prediction.tokens), model.config)
+        losses = depth_loss(
+            prediction.logits,
+            prediction.log_depths,
+            truth,
+            prediction.views.log_candidates,
+            prediction.views.inside,
+        )
+        return cache, (prediction.tokens, losses)
+
+    if recompute:
+        body = jax.checkpoint(body)
+    _, (tokens, losses) = jax.lax.scan(body, model.init_cache(), (sample.chunks, sample.log_depths))
+    flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), tokens)
+    return flat, jax.tree.map(jnp.mean, losses)
+
+
+def render_tokens(model: StreamSplat, params: dict, tokens: Tokens, sample: Sample, recipe: Recipe):
+    """Renders the targets from the tokens that the cache would accept: training sees the scene that inference sees."""
+    gaussians = model.decode_tokens(params, tokens)
+    gaussians = mask_gaussians(gaussians, tokens.valid & (tokens.confidences >= model.config.min_confidence))
+    return render(gaussians, sample.target_camera, max_pairs=recipe.max_pairs)
+
+
+def loss_fn(params: dict, model: StreamSplat, sample: Sample, recipe: Recipe, frozen: tuple[str, ...] = ()):
+    """Loss and the numbers to log. Stages in `frozen` are constants: nothing is computed backward through them."""
+    params = {name: jax.lax.stop_gradient(p) if name in frozen else p for name, p in params.items()}
+    tokens, (entropy, depth_l1) = stream_chunks(model, params, sample, recompute=recipe.recompute)
+    loss = entropy + 2.0 * depth_l1
+    accepted = jnp.mean((tokens.confidences >= model.config.min_confidence).astype(jnp.float32))
+    metrics = {"depth_entropy": entropy, "depth_l1": depth_l1, "accepted": accepted}
+    if sample.target_images.shape[0]:
+        output = render_tokens(model, params, tokens, sample, recipe)
+        mse = jnp.mean((output.color - sample.target_images) ** 2)
+        gradients = image_gradient_l1(output.color, sample.target_images)
+        loss = recipe.depth_weight * loss + 10.0 * (mse + recipe.gradient_weight * gradients)
+        metrics |= {
+            "psnr": -10 * jnp.log10(mse + 1e-10),
+            "alpha": output.alpha.mean(),
+            "overflow": output.num_overflow.astype(jnp.float32),
+        }
+    return loss, metrics | {"loss": loss}
+
+
+def train_step(
+    state: TrainState,
+    sample: Sample,
+    rate: Float[Array, ""],
+    *,
+    model: StreamSplat,
+    recipe: Recipe,
+    frozen: tuple[str, ...] = (),
+) -> tuple[TrainState, dict]:
+    """One update. A step with a non-finite gradient changes nothing but the count of such steps."""
+    gradients, metrics = jax.grad(loss_fn, has_aux=True)(state.params, model, sample, recipe, frozen)
+    norm = optax.global_norm(gradients)
+    is_finite = jnp.isfinite(norm)
+    updates, opt_state = optimizer(recipe).update(gradients, state.opt_state, state.params)
+    # Momentum and weight decay would go on moving what is frozen.
+    updates = {name: jax.tree.map(jnp.zeros_like, u) if name in frozen else u for name, u in updates.items()}
+    params = jax.tree.map(lambda p, u: p - rate * u, state.params, updates)
+    # The average warms up: early on it follows the parameters instead of remembering the random start.
+    decay = jnp.minimum(recipe.ema_decay, (1.0 + state.step) / (10.0 + state.step))
+    ema = jax.tree.map(lambda e, p: decay * e + (1 - decay) * p, state.ema, params)
+    keep = functools.partial(jax.tree.map, lambda new, old: jnp.where(is_finite, new, old))
+    new_state = TrainState(
+        params=keep(params, state.params),
+        ema=keep(ema, state.ema),
+        opt_state=keep(opt_state, state.opt_state),
+        step=state.step + 1,
+        num_skipped=state.num_skipped + (~is_finite).astype(jnp.int32),
+    )
+    return new_state, metrics | {"grad_norm": norm}
+
+
+@dataclasses.dataclass(frozen=True)
+class Trainer:
+    """The jitted step for one model and recipe; recompiles once per sample shape."""
+
+    model: StreamSplat
+    recipe: Recipe
+
+    @functools.cached_property
+    def step(self):
+        """`(state, sample, rate, frozen=()) -> (state, metrics)`, the state donated."""
+        bound = functools.partial(train_step, model=self.model, recipe=self.recipe)
+        return jax.jit(bound, donate_argnums=0, static_argnames="frozen")

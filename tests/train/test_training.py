@@ -1,0 +1,137 @@
+"""Training on the smallest recipe: reproducible, resumable, and it learns."""
+
+import dataclasses
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ssplat_jax.errors import InputError
+from ssplat_jax.stream import StreamSplat
+from ssplat_jax.train import loop
+from ssplat_jax.train.losses import depth_loss, image_gradient_l1, soft_targets
+from ssplat_jax.train.recipe import Phase, smoke_recipe, training_config
+from ssplat_jax.train.samples import make_sample, prefetched, sample_for_step
+from ssplat_jax.train.step import Trainer, init_state, learning_rate
+from tests.test_stream import NARROW
+
+RECIPE = smoke_recipe(4)
+
+
+def flat(tree):
+    return [np.asarray(x) for x in jax.tree.leaves(tree)]
+
+
+def test_sample_is_a_function_of_its_seed():
+    arguments = {"num_chunks": 2, "num_targets": 1, "size": (64, 64), "config": NARROW}
+    for a, b in zip(flat(make_sample(3, **arguments)), flat(make_sample(3, **arguments)), strict=True):
+        np.testing.assert_array_equal(a, b)
+    other = make_sample(4, **arguments)
+    assert not np.array_equal(np.asarray(other.target_images), np.asarray(make_sample(3, **arguments).target_images))
+
+
+def test_sample_depth_lies_in_the_sweep_and_first_camera_is_the_origin():
+    sample = make_sample(5, num_chunks=2, num_targets=2, size=(64, 64), config=NARROW)
+    np.testing.assert_allclose(np.asarray(sample.chunks.viewmats[0, 0]), np.eye(4), atol=1e-6)
+    inside = (sample.log_depths > jnp.log(sample.chunks.near[0])) & (sample.log_depths < jnp.log(sample.chunks.far[0]))
+    assert float(inside.mean()) > 0.97  # the margins leave out at most the tails beyond the 1 % quantiles
+
+
+def test_prefetch_keeps_order_and_passes_errors_on():
+    assert [value for _, value in prefetched(lambda i: i * i, iter(range(5)))] == [0, 1, 4, 9, 16]
+
+    def fail(i):
+        if i == 2:
+            raise ValueError("third")
+        return i
+
+    with pytest.raises(ValueError, match="third"):
+        list(prefetched(fail, iter(range(5))))
+
+
+def test_soft_targets_peak_at_the_truth_and_the_loss_is_least_there():
+    candidates = jnp.linspace(0.0, 2.0, 21)
+    truth = jnp.full((1, 2, 2), 0.7)
+    target = soft_targets(truth, candidates)
+    np.testing.assert_allclose(np.asarray(target.sum(-1)), 1.0, atol=1e-6)
+    assert int(jnp.argmax(target[0, 0, 0])) == 7
+    usable = jnp.ones((1, 2, 2), bool)
+    at = lambda k: float(depth_loss(20.0 * jax.nn.one_hot(jnp.full((1, 2, 2), k), 21), truth, truth, candidates, usable)[0])  # noqa: E731
+    assert at(7) < at(6) < at(5)
+
+
+def test_cells_out_of_range_have_no_part_in_the_depth_loss():
+    candidates = jnp.linspace(0.0, 1.0, 5)
+    truth = jnp.array([[[0.5, 3.0]]])
+    logits = jnp.zeros((1, 1, 2, 5))
+    loss = lambda x: sum(depth_loss(x, truth, truth, candidates, jnp.ones((1, 1, 2), bool)))  # noqa: E731
+    gradient = jax.grad(loss)(logits)
+    assert float(jnp.abs(gradient[0, 0, 0]).max()) > 0
+    assert float(jnp.abs(gradient[0, 0, 1]).max()) == 0
+
+
+def test_image_gradient_l1_ignores_a_constant_and_sees_an_edge():
+    image = jax.random.uniform(jax.random.key(0), (1, 6, 6, 3))
+    assert float(image_gradient_l1(image, image + 0.25)) < 1e-6
+    assert float(image_gradient_l1(image, image.at[:, :, 3:].add(0.5))) > 0.05
+
+
+def test_learning_rate_warms_up_and_decays_in_every_phase():
+    recipe = smoke_recipe(40)
+    rates = [learning_rate(recipe, i) for i in range(recipe.num_steps)]
+    first = recipe.phases[0].steps
+    assert rates[0] < rates[1] and rates[first - 1] < 0.2 * recipe.phases[0].learning_rate
+    assert rates[first] < recipe.phases[1].learning_rate and rates[first + 2] > 0.8 * recipe.phases[1].learning_rate
+
+
+def test_a_step_with_a_non_finite_gradient_changes_nothing_but_its_count():
+    model = StreamSplat(training_config(NARROW, RECIPE))
+    sample = sample_for_step(0, RECIPE, model.config)
+    broken = dataclasses.replace(sample, log_depths=sample.log_depths.at[0, 0, 8, 8].set(jnp.nan))
+    broken = dataclasses.replace(broken, chunks=dataclasses.replace(sample.chunks, images=sample.chunks.images * jnp.inf))
+    state = init_state(model, RECIPE)
+    before = flat(state.params)
+    after, metrics = Trainer(model, RECIPE).step(state, broken, jnp.float32(1e-3))
+    assert not np.isfinite(float(metrics["grad_norm"]))
+    assert int(after.num_skipped) == 1 and int(after.step) == 1
+    for a, b in zip(flat(after.params), before, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_frozen_stages_stay_and_the_others_move():
+    recipe = dataclasses.replace(RECIPE, phases=(Phase("stream", 1, 2, 1, ((64, 64),), 1e-3, frozen=("encoder",)),))
+    model = StreamSplat(training_config(NARROW, recipe))
+    state = init_state(model, recipe)
+    before = jax.tree.map(np.asarray, state.params)
+    sample = sample_for_step(0, recipe, model.config)
+    after, metrics = Trainer(model, recipe).step(state, sample, jnp.float32(1e-3), frozen=("encoder",))
+    assert np.isfinite(float(metrics["psnr"]))
+    for a, b in zip(flat(after.params["encoder"]), flat(before["encoder"]), strict=True):
+        np.testing.assert_array_equal(a, b)
+    for name in ("cost_volume", "tokens", "mixer", "decoder"):
+        assert any(not np.array_equal(a, b) for a, b in zip(flat(after.params[name]), flat(before[name]), strict=True)), name
+
+
+def test_an_interrupted_run_ends_as_an_uninterrupted_one(tmp_path):
+    whole = loop.train(NARROW, RECIPE, tmp_path / "whole", save_every=2)
+    assert whole.step == RECIPE.num_steps
+
+    class Stop(Exception):
+        pass
+
+    def stop_after(record):
+        if record["step"] == 3:
+            raise Stop
+
+    with pytest.raises(Stop):
+        loop.train(NARROW, RECIPE, tmp_path / "parts", save_every=1, log_every=1, report=stop_after)
+    parts = loop.train(NARROW, RECIPE, tmp_path / "parts", save_every=1, log_every=1)
+    for a, b in zip(flat(parts.state), flat(whole.state), strict=True):
+        np.testing.assert_array_equal(a, b)
+    records = [json.loads(line) for line in (tmp_path / "parts" / "log.jsonl").read_text().splitlines()]
+    assert records[-1]["step"] == RECIPE.num_steps and records[-1]["skipped"] == 0
+
+    with pytest.raises(InputError, match="another --out"):
+        loop.train(NARROW, dataclasses.replace(RECIPE, seed=1), tmp_path / "whole")
