@@ -1,0 +1,1 @@
+"""One experiment a file: its docstring holds the command and the numbers to expect."""

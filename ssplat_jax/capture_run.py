@@ -1,0 +1,182 @@
+"""`ssplat run`: a capture into a scene, with the state on disk every few chunks so that a stopped run goes on."""
+
+import dataclasses
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+
+from ssplat_jax.checkpoint.state import load_state, save_state
+from ssplat_jax.config import StreamConfig
+from ssplat_jax.data.capture import Capture, open_capture
+from ssplat_jax.data.frame import StreamFrame
+from ssplat_jax.errors import InputError
+from ssplat_jax.evaluate import cache_facts, save_comparison, score_view
+from ssplat_jax.export.ply import ExportReport, save_ply
+from ssplat_jax.interrupts import Interrupts
+from ssplat_jax.report import Reporter
+from ssplat_jax.session import Session
+from ssplat_jax.stream import StreamSplat
+
+STATE_FILE, SCENE_FILE, METRICS_FILE = "state.npz", "scene.ply", "metrics.json"
+NUM_PICTURES = 8  # views of the stream, evenly spread, rendered from the finished scene
+
+
+@dataclasses.dataclass(frozen=True)
+class RunResult:
+    """Where a run stands when `run_capture` returns."""
+
+    num_views: int
+    num_gaussians: int
+    interrupted: int | None  # the signal that stopped it, if one did
+
+
+def run_capture(
+    model: StreamSplat,
+    params: dict,
+    path: str,
+    out: Path,
+    *,
+    size: tuple[int, int] | None,
+    stride: int,
+    max_views: int | None,
+    save_every: int,
+    overwrite: bool,
+    reporter: Reporter,
+) -> RunResult:
+    """Streams the capture at `path` into `out`, continuing what stands there.
+
+    Raises:
+        InputError: the capture is unusable, or `out` holds a run of another capture or configuration.
+        StorageError: `out` cannot be written or its state is corrupt.
+    """
+    capture = open_capture(path, size=size)
+    indices = list(range(0, len(capture), stride))[:max_views]
+    capture.verify(indices)
+    if overwrite and out.exists():
+        for name in (STATE_FILE, SCENE_FILE, METRICS_FILE):
+            (out / name).unlink(missing_ok=True)
+    session, frame, done = _resume(model, params, capture, indices, out)
+    chunk_size = model.config.chunk_size
+    with Interrupts() as interrupts, reporter.progress("streaming", len(indices)) as advance:
+        advance(done)
+        if done < len(indices):
+            for number, chunk in enumerate(capture.chunks(model.config, indices[done:], frame=frame)):
+                session.feed(chunk)
+                done += int(np.asarray(chunk.valid).sum())
+                advance(done)
+                if interrupts.received or (number + 1) % save_every == 0 or done == len(indices):
+                    _save(session, frame, capture, indices, done, out)
+                if interrupts.received:
+                    break
+    assert done % chunk_size == 0 or done == len(indices)
+    if interrupts.received:
+        return RunResult(done, cache_facts(session)["pivots"], interrupts.received)
+    _finish(session, frame, capture, indices, out)
+    return RunResult(done, cache_facts(session)["pivots"], None)
+
+
+def export_run(run_dir: Path, to: Path, params: dict) -> ExportReport:
+    """Decodes the saved state of a run and writes its scene, in the capture's frame, to `to`.
+
+    Raises:
+        InputError: no run there, or `to` is not a .ply.
+        StorageError: the state is corrupt or `to` cannot be written.
+    """
+    if to.suffix != ".ply":
+        raise InputError(f"--to: wanted a .ply file, got {to.name!r}.")
+    if not (run_dir / STATE_FILE).exists():
+        raise InputError(f"{run_dir}: wanted the folder of an `ssplat run`, found no {STATE_FILE} in it.")
+    cache, header = load_state(run_dir / STATE_FILE)
+    session = Session(StreamSplat(StreamConfig.from_dict(header["config"])), params, cache)
+    return save_ply(to, _frame_from(header["frame"]).gaussians_to_capture(session.gaussians()))
+
+
+def _identity(model: StreamSplat, capture: Capture, indices: list[int]) -> dict:
+    """What must be equal for a run to be continued."""
+    return {
+        "config": model.config.to_dict(),
+        "capture": capture.name,
+        "size": [capture.width, capture.height],
+        "frames": indices,
+    }
+
+
+def _resume(model, params, capture: Capture, indices: list[int], out: Path) -> tuple[Session, StreamFrame, int]:
+    """The session that `out` holds, or a new one."""
+    if not (out / STATE_FILE).exists():
+        return Session(model, params), capture.stream_frame(model.config, indices), 0
+    cache, header = load_state(out / STATE_FILE)
+    wanted = _identity(model, capture, indices)
+    for name, value in wanted.items():
+        if header[name] != value:
+            raise InputError(
+                f"{out}: holds a run with another {name} ({_difference(header[name], value)}); choose another --out,"
+                " repeat the old options, or start anew with --overwrite."
+            )
+    return Session(model, params, cache), _frame_from(header["frame"]), header["done"]
+
+
+def _difference(held, wanted) -> str:
+    """The first difference of two JSON values, readable."""
+    if isinstance(held, dict) and isinstance(wanted, dict):
+        for name in sorted(held.keys() | wanted.keys()):
+            if held.get(name) != wanted.get(name):
+                return f"{name}: {held.get(name)!r} there, {wanted.get(name)!r} now"
+    if isinstance(held, list) and isinstance(wanted, list) and len(held) > 4:
+        return f"{len(held)} there, {len(wanted)} now, from {held[:2]} and {wanted[:2]} on"
+    return f"{held!r} there, {wanted!r} now"
+
+
+def _save(session: Session, frame: StreamFrame, capture, indices, done: int, out: Path) -> None:
+    header = _identity(session.model, capture, indices) | {"frame": _frame_to(frame), "done": done}
+    save_state(out / STATE_FILE, session.cache, header)
+
+
+def _frame_to(frame: StreamFrame) -> dict:
+    return {
+        "rotation": frame.rotation.tolist(),
+        "origin": frame.origin.tolist(),
+        "scale": frame.scale,
+        "near": frame.near,
+        "far": frame.far,
+    }
+
+
+def _frame_from(fields: dict) -> StreamFrame:
+    return StreamFrame(
+        rotation=np.array(fields["rotation"]),
+        origin=np.array(fields["origin"]),
+        scale=fields["scale"],
+        near=fields["near"],
+        far=fields["far"],
+    )
+
+
+def _finish(session: Session, frame: StreamFrame, capture: Capture, indices: list[int], out: Path) -> None:
+    """Scene, pictures and metrics of a finished stream."""
+    gaussians = session.gaussians()
+    report = save_ply(out / SCENE_FILE, frame.gaussians_to_capture(gaussians))
+    pictures = out / "views"
+    shutil.rmtree(pictures, ignore_errors=True)
+    pictures.mkdir(parents=True)
+    shown = sorted({indices[round(i)] for i in np.linspace(0, len(indices) - 1, NUM_PICTURES)})
+    scores = []
+    for i in shown:
+        score, color, depth = score_view(gaussians, capture, i, frame)
+        scores.append(dataclasses.asdict(score))
+        save_comparison(pictures / f"{i:05d}.png", capture.image(i), color, depth, (frame.near, frame.far))
+    metrics = {
+        "capture": capture.name,
+        "size": [capture.width, capture.height],
+        "views": len(indices),
+        "seen_views": scores,  # views of the stream itself: how well the scene explains its input, not a novel-view score
+        "ply": dataclasses.asdict(report),
+        "compile_s": round(session.compile_seconds, 2),
+        "step_memory_bytes": session.step_memory_bytes,
+        "cache": cache_facts(session),
+        "stream_frame": _frame_to(frame),
+        "config_hash": session.model.config.hash,
+    }
+    (out / METRICS_FILE).write_text(json.dumps(metrics, indent=1) + "\n")

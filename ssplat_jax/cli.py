@@ -1,0 +1,361 @@
+"""The `ssplat` command line. A command is a dataclass (its fields are the flags) whose `run` is a few calls.
+
+JAX is imported by the commands, not here: `ssplat --help` answers at once. Exit codes: 0 done, 2 bad input or usage,
+3 storage, 4 out of device memory, 130/143 interrupted after saving.
+"""
+
+import dataclasses
+import json
+import re
+import sys
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from ssplat_jax.config import StreamConfig, preset
+from ssplat_jax.errors import CacheError, InputError, StorageError
+
+EXIT_INPUT, EXIT_STORAGE, EXIT_MEMORY = 2, 3, 4
+
+
+@dataclasses.dataclass(frozen=True)
+class Demo:
+    """Stream an embedded procedural scene with the shipped weights and show what more views give.
+
+    Writes scene.ply, pictures, metrics.json and (with the `plots` extra) a plot.
+    Example: ssplat demo
+    """
+
+    scene: Literal["room", "orbit", "corridor"] = "room"
+    """Which scene."""
+    out: Path = Path("ssplat_demo")
+    """Where the results go."""
+    quiet: bool = False
+    """Print only the closing line."""
+
+    def run(self) -> int:
+        from ssplat_jax.demo import run_demo
+        from ssplat_jax.report import Reporter
+
+        with Reporter(self.quiet) as reporter:
+            run_demo(self.scene, self.out, reporter)
+        print(f"wrote {self.out}/scene.ply, metrics.json and pictures")
+        return 0
+
+
+@dataclasses.dataclass(frozen=True)
+class Inspect:
+    """Say what a capture holds and what a run would make of it: scale, depth range, warnings with remedies.
+
+    Example: ssplat inspect path/to/capture
+    """
+
+    capture: Annotated[str, tyro.conf.Positional]
+    """Folder with a transforms.json, or procedural:NAME."""
+    size: str | None = None
+    """Image size WxH to work at; default the capture's own."""
+    json: bool = False
+    """Print JSON instead of a table."""
+
+    def run(self) -> int:
+        from ssplat_jax.data.capture import open_capture
+        from ssplat_jax.data.inspect import summarize
+        from ssplat_jax.report import print_facts
+
+        facts = summarize(open_capture(self.capture, size=parse_size(self.size)), preset("tiny")).to_dict()
+        print(json_text(facts)) if self.json else print_facts(facts)
+        return 0
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """Stream a capture into a scene: scene.ply in the capture's own frame, pictures, metrics.json. Resumes by itself.
+
+    Example: ssplat run path/to/capture --stride 5 --size 320x240 --out runs/kitchen
+    """
+
+    capture: Annotated[str, tyro.conf.Positional]
+    """Folder with a transforms.json, or procedural:NAME."""
+    out: Path
+    """Where the results go; a run that was stopped there is continued."""
+    stride: int = 1
+    """Take every so many-th frame."""
+    max_views: int | None = None
+    """Stop after so many views."""
+    size: str | None = None
+    """Image size WxH to work at; default the capture's own."""
+    weights: str = "tiny"
+    """Preset with shipped weights, or a weights file."""
+    set: tuple[str, ...] = ()
+    """Changes to the configuration, as field=value."""
+    save_every: int = 8
+    """Chunks between saved states."""
+    overwrite: bool = False
+    """Start anew over what the folder holds."""
+    quiet: bool = False
+    """Print only the closing line."""
+
+    def run(self) -> int:
+        from ssplat_jax.capture_run import run_capture
+        from ssplat_jax.report import Reporter
+
+        model, params = load_model(self.weights, self.set)
+        with Reporter(self.quiet) as reporter:
+            result = run_capture(
+                model,
+                params,
+                self.capture,
+                self.out,
+                size=parse_size(self.size),
+                stride=self.stride,
+                max_views=self.max_views,
+                save_every=self.save_every,
+                overwrite=self.overwrite,
+                reporter=reporter,
+            )
+        if result.interrupted:
+            print(f"stopped after {result.num_views} views; the same command continues", file=sys.stderr)
+            return 128 + result.interrupted
+        print(f"wrote {self.out}/scene.ply ({result.num_gaussians} Gaussians from {result.num_views} views)")
+        return 0
+
+
+@dataclasses.dataclass(frozen=True)
+class Eval:
+    """Score novel views of a capture that the stream never saw: metrics.json and target | render | depth pictures.
+
+    Example: ssplat eval path/to/capture --protocol interleaved --stride 5 --context 64 --size 320x240 --out runs/eval
+    """
+
+    capture: Annotated[str, tyro.conf.Positional]
+    """Folder with a transforms.json, or procedural:NAME."""
+    context: int
+    """Context views to stream."""
+    out: Path
+    """Where the results go."""
+    protocol: Literal["interleaved", "paper"] = "interleaved"
+    """interleaved: every 8th frame from the 5th on is a target. paper: targets uniform over the whole trajectory."""
+    stride: int = 1
+    """Take every so many-th frame."""
+    targets: int | None = None
+    """Number of targets: of the paper's protocol (default 16), or at most so many, evenly spread, of the interleaved."""
+    size: str | None = None
+    """Image size WxH to work at; default the capture's own."""
+    weights: str = "tiny"
+    """Preset with shipped weights, or a weights file."""
+    set: tuple[str, ...] = ()
+    """Changes to the configuration, as field=value."""
+    quiet: bool = False
+    """Print only the closing line."""
+
+    def run(self) -> int:
+        from ssplat_jax.data.capture import open_capture
+        from ssplat_jax.data.protocol import choose_split
+        from ssplat_jax.evaluate import evaluate
+        from ssplat_jax.report import Reporter
+        from ssplat_jax.session import Session
+
+        model, params = load_model(self.weights, self.set)
+        capture = open_capture(self.capture, size=parse_size(self.size))
+        split = choose_split(self.protocol, len(capture), self.stride, self.context, self.targets)
+        with Reporter(self.quiet) as reporter, reporter.progress("streaming", len(split.context)) as advance:
+            metrics = evaluate(Session(model, params), capture, split, self.out, advance)
+        reference = metrics["baselines"]
+        print(
+            f"{capture.name}: PSNR {metrics['psnr']:.2f} dB, SSIM {metrics['ssim']:.3f} over {metrics['target_views']}"
+            f" views (copying the nearest view {reference['nearest_view_psnr']:.2f}, a mean colour"
+            f" {reference['mean_colour_psnr']:.2f}); {metrics['chunk_ms']['median']:.0f} ms a chunk; {self.out}/metrics.json"
+        )
+        return 0
+
+
+@dataclasses.dataclass(frozen=True)
+class Train:
+    """Train the network on procedural scenes. Saves as it goes, on Ctrl-C too, and resumes by itself.
+
+    Example: ssplat train --out runs/tiny
+    """
+
+    out: Path
+    """Log, checkpoints and, at the end, weights.npz."""
+    preset: str = "tiny"
+    """Configuration and recipe."""
+    scale_steps: float = 1.0
+    """Lengthens or shortens every phase of the recipe."""
+    seed: int = 0
+    """Of the initial parameters and of the scenes."""
+    init_weights: Path | None = None
+    """Start from a weights file instead of from random parameters."""
+    save_every: int = 200
+    """Steps between checkpoints."""
+    set: tuple[str, ...] = ()
+    """Changes to the configuration, as field=value."""
+    quiet: bool = False
+    """Print only the closing line."""
+
+    def run(self) -> int:
+        from ssplat_jax.checkpoint.weights import load_weights, save_weights
+        from ssplat_jax.report import Reporter
+        from ssplat_jax.train.loop import train
+        from ssplat_jax.train.recipe import RECIPES
+
+        config = apply_changes(preset(self.preset), self.set)
+        recipe = dataclasses.replace(RECIPES[self.preset].scaled(self.scale_steps), seed=self.seed)
+        params = load_weights(self.init_weights)[0] if self.init_weights else None
+        with Reporter(self.quiet) as reporter, reporter.progress("training", recipe.num_steps) as advance:
+            result = train(
+                config,
+                recipe,
+                self.out,
+                params=params,
+                save_every=self.save_every,
+                report=lambda record: advance(record["step"], describe_record(record)),
+            )
+        if result.interrupted:
+            print(f"stopped at step {result.step}; the same command continues", file=sys.stderr)
+            return 128 + result.interrupted
+        provenance = {"recipe": dataclasses.asdict(recipe), "steps": result.step}
+        save_weights(self.out / "weights.npz", result.state.ema, config, provenance)
+        print(f"wrote {self.out}/weights.npz after {result.step} steps")
+        return 0
+
+
+@dataclasses.dataclass(frozen=True)
+class Export:
+    """Write the scene of a run again, from its saved state.
+
+    Example: ssplat export runs/kitchen --to kitchen.ply
+    """
+
+    run_dir: Annotated[Path, tyro.conf.Positional]
+    """Folder of an `ssplat run`."""
+    to: Path
+    """File to write; .ply."""
+    weights: str = "tiny"
+    """The weights of that run."""
+
+    def run(self) -> int:
+        from ssplat_jax.capture_run import export_run
+        from ssplat_jax.checkpoint.weights import load_params
+
+        report = export_run(self.run_dir, self.to, load_params(self.weights))
+        print(f"wrote {self.to}: {report.num_written} Gaussians ({report.num_dropped} invisible or not finite left out)")
+        return 0
+
+
+# -- what the commands share ------------------------------------------------------------------------------------------
+
+
+def parse_size(text: str | None) -> tuple[int, int] | None:
+    """(width, height) of "WxH".
+
+    Raises:
+        InputError: of another form.
+    """
+    if text is None:
+        return None
+    found = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text)
+    if not found:
+        raise InputError(f"--size: wanted WIDTHxHEIGHT in pixels, got {text!r}; for example --size 320x240.")
+    return int(found[1]), int(found[2])
+
+
+def apply_changes(config: StreamConfig, changes: tuple[str, ...]) -> StreamConfig:
+    """`config` with "field=value" changes; values are JSON, or plain text where that fails.
+
+    Raises:
+        InputError: no such field, or a value that it does not take.
+    """
+    parsed = {}
+    for change in changes:
+        name, equals, value = change.partition("=")
+        if not equals:
+            raise InputError(f"--set: wanted field=value, got {change!r}; for example --set voxel_size=0.02.")
+        held = getattr(config, name, None)
+        try:
+            parsed[name] = json.loads(value)
+        except json.JSONDecodeError:
+            parsed[name] = value
+        is_number = isinstance(held, (int, float)) and not isinstance(held, bool)
+        if (is_number and not isinstance(parsed[name], (int, float))) or isinstance(held, bool) != isinstance(
+            parsed[name], bool
+        ):
+            raise InputError(f"--set {name}: wanted a value like {held!r}, got {value!r}.")
+    return config.replace(**parsed)
+
+
+def load_model(weights: str, changes: tuple[str, ...]):
+    """(model, params) of a preset's shipped weights or of a weights file, with changes to the configuration."""
+    from ssplat_jax.checkpoint.weights import load_params, load_weights
+    from ssplat_jax.config import PRESETS
+    from ssplat_jax.stream import StreamSplat
+
+    if weights in PRESETS:
+        config, params = preset(weights), load_params(weights)
+    elif Path(weights).is_file():
+        params, config = load_weights(Path(weights))
+    else:
+        params, config = load_params(weights), preset("tiny")
+    return StreamSplat(apply_changes(config, changes)), params
+
+
+def describe_record(record: dict) -> str:
+    """The few numbers of a training record that fit beside a progress bar."""
+    shown = {"loss": "loss", "depth_l1": "depth", "psnr": "psnr", "accepted": "accepted"}
+    return "  ".join(f"{label} {record[name]:.3f}" for name, label in shown.items() if name in record)
+
+
+def json_text(facts: dict) -> str:
+    """Indented JSON."""
+    return json.dumps(facts, indent=1)
+
+
+Command = (
+    Annotated[Demo, tyro.conf.subcommand("demo")]
+    | Annotated[Inspect, tyro.conf.subcommand("inspect")]
+    | Annotated[Run, tyro.conf.subcommand("run")]
+    | Annotated[Eval, tyro.conf.subcommand("eval")]
+    | Annotated[Train, tyro.conf.subcommand("train")]
+    | Annotated[Export, tyro.conf.subcommand("export")]
+)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Runs one command and exits with its code."""
+    command = tyro.cli(
+        Command,  # pyright: ignore[reportArgumentType]
+        prog="ssplat",
+        description="StreamSplat in JAX: a calibrated image stream becomes a 3D Gaussian scene, chunk by chunk.",
+        args=arguments,
+        config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
+    )
+    sys.exit(guarded(command.run))
+
+
+def guarded(run) -> int:
+    """`run()`; what users can cause becomes one line on stderr and an exit code."""
+    try:
+        return run()
+    except InputError as error:
+        return _refuse(error, EXIT_INPUT)
+    except (StorageError, OSError) as error:
+        return _refuse(error, EXIT_STORAGE)
+    except CacheError as error:
+        return _refuse(error, EXIT_MEMORY)
+    except KeyboardInterrupt:
+        return 130
+    except Exception as error:
+        # XLA reports an exhausted device as a RuntimeError of its own with this word in front.
+        if "RESOURCE_EXHAUSTED" in str(error):
+            return _refuse("out of device memory; try a smaller --size or capacity.", EXIT_MEMORY)
+        raise
+
+
+def _refuse(message, code: int) -> int:
+    print(f"ssplat: {' '.join(str(message).split())}", file=sys.stderr)
+    return code
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,97 @@
+"""`ssplat demo`: an embedded procedural scene, streamed with the shipped weights; what more views give, in numbers."""
+
+import json
+import time
+from pathlib import Path
+
+import numpy as np
+
+from ssplat_jax.checkpoint.weights import load_params
+from ssplat_jax.config import preset
+from ssplat_jax.data.capture import open_capture
+from ssplat_jax.data.protocol import interleaved
+from ssplat_jax.evaluate import cache_facts, save_comparison, save_image, score_view
+from ssplat_jax.export.ply import save_ply
+from ssplat_jax.report import Reporter
+from ssplat_jax.session import Session
+from ssplat_jax.stream import StreamSplat
+
+STAGES = (4, 8, 16, 32, 64)  # views after which the scene is decoded and scored
+NUM_FRAMES = 73  # 64 context views and the 9 interleaved targets between them
+
+
+def run_demo(scene: str, out: Path, reporter: Reporter) -> dict:
+    """Streams `procedural:scene`, scores the same targets after every stage, writes scene, pictures and metrics."""
+    since = time.perf_counter()
+    model, params = StreamSplat(preset("tiny")), load_params("tiny")
+    capture = open_capture(f"procedural:{scene}?frames={NUM_FRAMES}")
+    split = interleaved(len(capture), stride=1, context=STAGES[-1])
+    frame = capture.stream_frame(model.config, split.context)
+    session = Session(model, params)
+    rows, strip, seen = [], [], 0
+    with reporter.progress("streaming", STAGES[-1]) as advance:
+        for chunk in capture.chunks(model.config, split.context, frame=frame):
+            session.feed(chunk)
+            seen += int(np.asarray(chunk.valid).sum())
+            advance(seen)
+            if seen in STAGES:
+                row, middle = _score_stage(session, capture, split, frame, seen)
+                rows.append(row)
+                strip.append(middle)
+    out.mkdir(parents=True, exist_ok=True)
+    gaussians = session.gaussians()
+    save_ply(out / "scene.ply", frame.gaussians_to_capture(gaussians))
+    for i in split.targets:
+        _, color, depth = score_view(gaussians, capture, i, frame)
+        save_comparison(out / f"view_{i:05d}.png", capture.image(i), color, depth, (frame.near, frame.far))
+    middle_target = capture.image(split.targets[len(split.targets) // 2])
+    save_image(out / "views_4_8_16_32_64_target.png", np.concatenate([*strip, middle_target], axis=1))
+    metrics = {
+        "scene": scene,
+        "size": [capture.width, capture.height],
+        "stages": rows,
+        "cache": cache_facts(session),
+        "compile_s": round(session.compile_seconds, 2),
+        "seconds": round(time.perf_counter() - since, 1),
+        "config_hash": model.config.hash,
+    }
+    (out / "metrics.json").write_text(json.dumps(metrics, indent=1) + "\n")
+    _plot(out / "quality.png", rows)
+    header = ("views", "PSNR dB", "SSIM", "covered", "Gaussians")
+    reporter.table(f"{scene}: quality of unseen views", header, [tuple(row.values()) for row in rows])
+    return metrics
+
+
+def _score_stage(session: Session, capture, split, frame, seen: int):
+    """A row of the table, and the render of the middle target."""
+    gaussians = session.gaussians()
+    scored = [score_view(gaussians, capture, i, frame) for i in split.targets]
+    scores = [score for score, _, _ in scored]
+    row = {
+        "views": seen,
+        "psnr": round(float(np.mean([s.psnr for s in scores])), 2),
+        "ssim": round(float(np.mean([s.ssim for s in scores])), 3),
+        "coverage": round(float(np.mean([s.coverage for s in scores])), 3),
+        "num_gaussians": cache_facts(session)["pivots"],
+    }
+    return row, scored[len(scored) // 2][1]
+
+
+def _plot(path: Path, rows: list[dict]) -> None:
+    """PSNR against views; left out without matplotlib (the `plots` extra)."""
+    try:
+        import matplotlib
+
+        matplotlib.use("Agg")
+        from matplotlib import pyplot
+    except ImportError:
+        return
+    figure, axes = pyplot.subplots(figsize=(5, 3.2), layout="constrained")
+    axes.plot([r["views"] for r in rows], [r["psnr"] for r in rows], marker="o", color="#30507a")
+    axes.set_xscale("log", base=2)
+    axes.set_xticks([r["views"] for r in rows], [str(r["views"]) for r in rows])
+    axes.set_xlabel("views seen")
+    axes.set_ylabel("PSNR of unseen views, dB")
+    axes.spines[["top", "right"]].set_visible(False)
+    figure.savefig(path, dpi=150)
+    pyplot.close(figure)

@@ -1,0 +1,207 @@
+"""Quality and cost on one capture: stream the context, decode the cache, render views that were never shown."""
+
+import dataclasses
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+from PIL import Image
+
+from ssplat_jax.data.capture import Capture
+from ssplat_jax.data.frame import StreamFrame
+from ssplat_jax.data.protocol import Split
+from ssplat_jax.gaussians import Gaussians
+from ssplat_jax.metrics import SSIM_ARGUMENTS, psnr, ssim
+from ssplat_jax.render import render
+from ssplat_jax.session import Session
+
+LATENCY_CHUNKS = 4  # the last chunks are fed again to the full cache, each this often, to time them warm
+LATENCY_REPEATS = 3
+
+Images = Float[np.ndarray, "h w 3"]
+
+
+@dataclasses.dataclass(frozen=True)
+class ViewScore:
+    """One target view."""
+
+    frame: int
+    psnr: float
+    ssim: float
+    coverage: float  # mean alpha: how much of the view the scene covers
+
+
+def stream_context(
+    session: Session, capture: Capture, split: Split, frame: StreamFrame, on_chunk: Callable[[int], None] = lambda n: None
+) -> list:
+    """Feeds the context to `session`; calls `on_chunk(views so far)`. Returns the last few chunks, for timing."""
+    recent: list = []
+    seen = 0
+    for chunk in capture.chunks(session.model.config, split.context, frame=frame):
+        session.feed(chunk)
+        seen += int(np.asarray(chunk.valid).sum())
+        recent = [*recent, chunk][-LATENCY_CHUNKS:]
+        on_chunk(seen)
+    return recent
+
+
+def score_view(
+    gaussians: Gaussians, capture: Capture, i: int, frame: StreamFrame
+) -> tuple[ViewScore, Images, Float[np.ndarray, "h w"]]:
+    """Score, clipped colour and depth (stream units, 0 where nothing is) of frame `i`."""
+    out = render(gaussians, capture.camera(i, frame))
+    color = np.clip(np.asarray(out.color), 0.0, 1.0)
+    target = capture.image(i)
+    score = ViewScore(
+        frame=i, psnr=psnr(color, target), ssim=ssim(color, target), coverage=float(np.asarray(out.alpha).mean())
+    )
+    return score, color, np.asarray(out.depth)
+
+
+def mean_psnr(gaussians: Gaussians, capture: Capture, targets: tuple[int, ...], frame: StreamFrame) -> float:
+    """Mean over targets of the PSNR, in dB."""
+    return float(np.mean([score_view(gaussians, capture, i, frame)[0].psnr for i in targets]))
+
+
+def nearest_context(capture: Capture, target: int, context: tuple[int, ...]) -> int:
+    """The context frame whose pose is nearest: centre distance over the context's span, plus the angle between axes."""
+    poses = capture.camtoworlds
+    centers = poses[list(context), :3, 3]
+    span = max(float(np.linalg.norm(centers.max(axis=0) - centers.min(axis=0))), 1e-12)
+    distances = np.linalg.norm(centers - poses[target, :3, 3], axis=1) / span
+    cosines = np.einsum("vi,i->v", poses[list(context), :3, 2], poses[target, :3, 2])
+    return context[int(np.argmin(distances + np.arccos(np.clip(cosines, -1, 1))))]
+
+
+def baselines(capture: Capture, split: Split) -> dict[str, float]:
+    """What needs no reconstruction: copying the nearest context view, and one mean colour for everything."""
+    mean_colour = np.mean([capture.image(i).mean(axis=(0, 1)) for i in split.context], axis=0)
+    copies, flats = [], []
+    for i in split.targets:
+        target = capture.image(i)
+        copies.append(psnr(capture.image(nearest_context(capture, i, split.context)), target))
+        flats.append(psnr(np.broadcast_to(mean_colour, target.shape).astype(np.float32), target))
+    return {"nearest_view_psnr": round(float(np.mean(copies)), 4), "mean_colour_psnr": round(float(np.mean(flats)), 4)}
+
+
+def measure_latency(session: Session, chunks: list, camera) -> dict:
+    """Chunk in -> one novel view out on the full cache, everything compiled, each result waited for. Milliseconds."""
+    totals, renders = [], []
+    cache = session.cache
+    for chunk in chunks:
+        for repeat in range(LATENCY_REPEATS + 1):
+            session.cache = jax.block_until_ready(jax.tree.map(jnp.copy, cache))
+            since = time.perf_counter()
+            session.feed(chunk)
+            gaussians = jax.block_until_ready(session.gaussians())
+            decoded = time.perf_counter()
+            jax.block_until_ready(render(gaussians, camera).color)
+            done = time.perf_counter()
+            if repeat:  # the first may compile the renderer for this number of pairs
+                totals.append(1e3 * (done - since))
+                renders.append(1e3 * (done - decoded))
+    session.cache = cache
+    return {
+        "chunk_ms": {"median": round(float(np.median(totals)), 1), "p99": round(float(np.quantile(totals, 0.99)), 1)},
+        "render_ms": round(float(np.median(renders)), 1),
+    }
+
+
+def cache_facts(session: Session) -> dict:
+    """Occupancy and counters of the session's cache."""
+    cache = session.cache
+    assert cache is not None
+    stats = {field.name: int(getattr(cache.stats, field.name)) for field in dataclasses.fields(cache.stats)}
+    return {
+        "voxels": int(cache.num_voxels),
+        "pivots": int(cache.counts.sum()),
+        "capacity": cache.capacity,
+        "overflow": stats["num_dropped"],
+        "accepted_fraction": round(stats["num_accepted"] / max(stats["num_seen"], 1), 4),
+        **stats,
+    }
+
+
+def evaluate(
+    session: Session,
+    capture: Capture,
+    split: Split,
+    out: Path,
+    on_chunk: Callable[[int], None] = lambda n: None,
+) -> dict:
+    """Streams, scores and times; writes `metrics.json` and a picture per target (target | render | depth) into `out`.
+
+    Every frame is decoded once before anything is written, so that a damaged one leaves no half of a result.
+
+    Raises:
+        InputError: a frame is damaged.
+        StorageError: `out` cannot be written.
+    """
+    capture.verify((*split.context, *split.targets))
+    frame = capture.stream_frame(session.model.config, split.context)
+    reference = baselines(capture, split)
+    recent = stream_context(session, capture, split, frame, on_chunk)
+    gaussians = session.gaussians()
+    facts = cache_facts(session)
+    out.mkdir(parents=True, exist_ok=True)
+    scores = []
+    for i in split.targets:
+        score, color, depth = score_view(gaussians, capture, i, frame)
+        scores.append(score)
+        save_comparison(out / f"view_{i:05d}.png", capture.image(i), color, depth, (frame.near, frame.far))
+    middle = split.targets[len(split.targets) // 2]
+    latency = measure_latency(session, recent, capture.camera(middle, frame))
+    metrics = {
+        "capture": capture.name,
+        "size": [capture.width, capture.height],
+        "protocol": split.protocol,
+        "split_sha256": split.sha256,
+        "context_views": len(split.context),
+        "target_views": len(split.targets),
+        "psnr": round(float(np.mean([s.psnr for s in scores])), 4),
+        "ssim": round(float(np.mean([s.ssim for s in scores])), 4),
+        "ssim_arguments": SSIM_ARGUMENTS,
+        "lpips": None,
+        **latency,
+        "compile_s": round(session.compile_seconds, 2),
+        "compilations": session.num_compilations,
+        "step_memory_bytes": session.step_memory_bytes,
+        "cache": facts,
+        "num_gaussians": facts["pivots"],
+        "config_hash": session.model.config.hash,
+        "stream_frame": {"scale": frame.scale, "near": frame.near, "far": frame.far},
+        "baselines": reference,
+        "per_view": [dataclasses.asdict(s) for s in scores],
+    }
+    (out / "metrics.json").write_text(json.dumps(metrics, indent=1) + "\n")
+    return metrics
+
+
+# -- pictures ---------------------------------------------------------------------------------------------------------
+
+_DEPTH_COLOURS = np.array(  # near to far, perceptually even, readable in print
+    [(0.99, 0.91, 0.62), (0.97, 0.60, 0.32), (0.80, 0.27, 0.37), (0.47, 0.13, 0.48), (0.13, 0.07, 0.33)], np.float32
+)
+
+
+def colour_depth(depth: Float[np.ndarray, "h w"], near: float, far: float) -> Images:
+    """Log depth as colour, light near and dark far; black where there is none."""
+    position = np.log(np.maximum(depth, 1e-9) / near) / np.log(far / near)
+    stops = np.linspace(0.0, 1.0, len(_DEPTH_COLOURS))
+    channels = [np.interp(position, stops, _DEPTH_COLOURS[:, c]) for c in range(3)]
+    return np.where(depth[..., None] > 0, np.stack(channels, axis=-1), 0.0).astype(np.float32)
+
+
+def save_image(path: Path, image: Images) -> None:
+    """Writes an image in [0, 1] as an 8-bit file."""
+    Image.fromarray((np.clip(image, 0.0, 1.0) * 255 + 0.5).astype(np.uint8)).save(path)
+
+
+def save_comparison(path: Path, target: Images, color: Images, depth, depth_range: tuple[float, float]) -> None:
+    """target | render | depth, side by side."""
+    save_image(path, np.concatenate([target, color, colour_depth(depth, *depth_range)], axis=1))

@@ -1,0 +1,176 @@
+"""The 3DGS PLY file: what every splat viewer opens.
+
+Binary little endian, one row of float32 per Gaussian, in the frame and units of the Gaussians:
+
+    x y z · nx ny nz (zeros) · f_dc_0..2 · f_rest_0..3K-1 · opacity · scale_0..2 · rot_0..3
+
+`opacity` is a logit, `scale` ln of the standard deviation, `rot` a quaternion wxyz, colour = 0.5 + 0.28209 f_dc + ...;
+`f_rest` is channel-major: the K = 0, 3, 8 or 15 coefficients of red, then of green, then of blue. The comment
+`SplatRenderMode: mip` says that the scene is meant for a renderer with the 2D Mip filter, as ours is.
+"""
+
+import dataclasses
+import os
+
+import jax.numpy as jnp
+import numpy as np
+
+from ssplat_jax.errors import InputError
+from ssplat_jax.export.atomic import write_atomic
+from ssplat_jax.export.ply_table import read_vertices
+from ssplat_jax.gaussians import Gaussians
+
+RENDER_MODES = ("default", "mip", "2dgs")
+
+MIN_OPACITY = 1.0 / 255.0
+"""Rows fainter than this draw nothing in any renderer and are not written; absent rows (opacity 0) are among them."""
+
+OPACITY_GUARD = 1e-6
+"""Opacities are written no nearer than this to 0 and 1, where the logit is infinite."""
+
+LOG_SCALE_LIMIT = 20.0
+"""|ln sigma| beyond this is clamped: 2e-9 to 5e8 units, the range of the compressed formats made from such a file."""
+
+REST_TERMS = {0: 0, 9: 1, 24: 2, 45: 3}
+"""Number of f_rest properties to SH degree."""
+
+BASE_PROPERTIES = (
+    *("x", "y", "z"),
+    *("f_dc_0", "f_dc_1", "f_dc_2"),
+    "opacity",
+    *("scale_0", "scale_1", "scale_2"),
+    *("rot_0", "rot_1", "rot_2", "rot_3"),
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class ExportReport:
+    """What became of the rows of a scene."""
+
+    num_written: int
+    num_dropped: int
+    """Non-finite, of negative scale, or fainter than 1/255 (absent rows included)."""
+
+
+def save_ply(path: str | os.PathLike, gaussians: Gaussians, *, render_mode: str = "mip") -> ExportReport:
+    """Writes `gaussians` to `path`, all or nothing; the same Gaussians give the same bytes.
+
+    Args:
+        path: of the file; folders are made.
+        gaussians: in the frame the file should be in (`Capture` scenes: the capture's own).
+        render_mode: the comment `SplatRenderMode`, one of `default`, `mip`, `2dgs`.
+
+    Limits:
+        Rows with an entry that is not finite, a negative scale or an opacity below 1/255 are dropped and counted.
+        Opacities are clamped to [1e-6, 1 - 1e-6], scales to [e^-20, e^20]; a zero quaternion becomes the identity.
+
+    Raises:
+        InputError: no such render mode.
+        StorageError: the file cannot be written.
+    """
+    if render_mode not in RENDER_MODES:
+        raise InputError(f"save_ply: render_mode must be one of {', '.join(RENDER_MODES)}, got {render_mode!r}.")
+    rows = _rows(gaussians)
+    write_atomic(path, _header(len(rows), gaussians.sh_degree, render_mode) + rows.astype("<f4").tobytes())
+    return ExportReport(num_written=len(rows), num_dropped=gaussians.num_gaussians - len(rows))
+
+
+def property_names(sh_degree: int) -> list[str]:
+    """The properties of a row, in the order of the file."""
+    rest = 3 * ((sh_degree + 1) ** 2 - 1)
+    names = ["x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3)), *(f"f_rest_{i}" for i in range(rest))]
+    return [*names, "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
+
+
+def _header(num_rows: int, sh_degree: int, render_mode: str) -> bytes:
+    lines = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"comment SplatRenderMode: {render_mode}",
+        f"comment SH degree: {sh_degree}",
+        f"element vertex {num_rows}",
+        *(f"property float {name}" for name in property_names(sh_degree)),
+        "end_header\n",
+    ]
+    return "\n".join(lines).encode("ascii")
+
+
+def _rows(gaussians: Gaussians) -> np.ndarray:
+    """One row of raw values per Gaussian worth writing, float64 until the last cast."""
+    fields = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
+    means, quats, scales, opacities, sh = (np.asarray(field, np.float64) for field in fields)
+    entries = np.concatenate([means, quats, scales, opacities[:, None], sh.reshape(len(sh), 3 * sh.shape[1])], axis=1)
+    keep = np.isfinite(entries).all(axis=1) & (scales >= 0).all(axis=1) & (opacities >= MIN_OPACITY)
+    means, quats, scales, opacities, sh = (field[keep] for field in (means, quats, scales, opacities, sh))
+    opacities = np.clip(opacities, OPACITY_GUARD, 1 - OPACITY_GUARD)
+    log_scales = np.log(np.clip(scales, np.exp(-LOG_SCALE_LIMIT), np.exp(LOG_SCALE_LIMIT)))
+    rest = sh[:, 1:].transpose(0, 2, 1).reshape(len(sh), 3 * (sh.shape[1] - 1))
+    logits = np.log(opacities) - np.log1p(-opacities)
+    columns = [means, np.zeros_like(means), sh[:, 0], rest, logits[:, None], log_scales, _unit_quats(quats)]
+    return np.concatenate(columns, axis=1)
+
+
+def load_ply(path: str | os.PathLike) -> Gaussians:
+    """The Gaussians of a 3DGS PLY file: ascii or binary of either byte order, properties in any order, others ignored.
+
+    Limits:
+        Opacity logits of +-inf (other writers' unguarded logits) give 0 and 1; any other entry that is not finite in
+        float32 is refused.
+        Scales are clamped to [e^-20, e^20]; quaternions are normalised, a zero one becomes the identity.
+
+    Raises:
+        InputError: the file is no 3DGS PLY, is cut off, or holds entries that are not finite.
+    """
+    columns, _ = read_vertices(path)
+    missing = [name for name in BASE_PROPERTIES if name not in columns]
+    if missing:
+        packed = (
+            " it is compressed; convert it to a plain 3DGS .ply"
+            if "packed_position" in columns
+            else " give a 3DGS .ply"
+        )
+        raise InputError(f"{path}: element vertex: wanted the property {missing[0]!r}, it is missing;{packed}.")
+    num_rest = sum(name.startswith("f_rest_") for name in columns)
+    rest_names = [f"f_rest_{i}" for i in range(num_rest)]
+    if num_rest not in REST_TERMS or not all(name in columns for name in rest_names):
+        raise InputError(
+            f"{path}: element vertex: wanted f_rest_0, f_rest_1, ... of 0, 9, 24 or 45 coefficients, got {num_rest}; "
+            "write the file again with a full SH degree."
+        )
+    means = _stacked(path, columns, ("x", "y", "z"))
+    dc = _stacked(path, columns, ("f_dc_0", "f_dc_1", "f_dc_2"))
+    rest = _stacked(path, columns, rest_names).reshape(len(means), 3, num_rest // 3).transpose(0, 2, 1)
+    logits = _stacked(path, columns, ("opacity",), allow_infinite=True)[:, 0]
+    log_scales = _stacked(path, columns, ("scale_0", "scale_1", "scale_2"))
+    quats = _stacked(path, columns, ("rot_0", "rot_1", "rot_2", "rot_3"))
+    fields = {
+        "means": means,
+        "quats": _unit_quats(quats),
+        "scales": np.exp(np.clip(log_scales, -LOG_SCALE_LIMIT, LOG_SCALE_LIMIT)),
+        "opacities": 0.5 * (1 + np.tanh(0.5 * logits)),  # the sigmoid, without overflow
+        "sh": np.concatenate([dc[:, None], rest], axis=1),
+    }
+    return Gaussians(**{name: jnp.asarray(field, jnp.float32) for name, field in fields.items()})
+
+
+def _stacked(path, columns: dict[str, np.ndarray], names, *, allow_infinite: bool = False) -> np.ndarray:
+    """Columns side by side in float64, checked to be finite once they are float32."""
+    if not names:
+        return np.zeros((len(columns["x"]), 0))
+    stacked = np.stack([columns[name] for name in names], axis=1).astype(np.float64)
+    bad = np.isnan(stacked) | ((np.abs(stacked) > np.finfo(np.float32).max) & (not allow_infinite))
+    if bad.any():
+        (row, column), num_bad = np.argwhere(bad)[0], bad.any(axis=1).sum()
+        raise InputError(
+            f"{path}: vertex {row}: wanted a finite {names[column]}, got {stacked[row, column]} ({num_bad} such rows); "
+            "drop them."
+        )
+    return stacked
+
+
+def _unit_quats(quats: np.ndarray) -> np.ndarray:
+    """Unit quaternions; the identity for those the renderer takes as one (all entries within 1e-12 of 0)."""
+    largest = np.abs(quats).max(axis=1, keepdims=True, initial=0.0)
+    quats = np.where(largest > 1e-12, quats, np.array([1.0, 0.0, 0.0, 0.0]))
+    quats = quats / np.abs(quats).max(axis=1, keepdims=True, initial=0.0)
+    return quats / np.linalg.norm(quats, axis=1, keepdims=True)

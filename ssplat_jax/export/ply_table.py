@@ -1,0 +1,143 @@
+"""Reads the vertex element of a PLY file (ascii, binary of either byte order) into columns by name.
+
+Nothing is allocated on the word of the header: a count is compared with the bytes that are there first.
+"""
+
+import dataclasses
+import os
+from pathlib import Path
+
+import numpy as np
+
+from ssplat_jax.errors import InputError
+
+MAX_HEADER_BYTES = 1 << 16
+
+BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
+
+TYPES = {
+    **{name: "i1" for name in ("char", "int8")},
+    **{name: "u1" for name in ("uchar", "uint8")},
+    **{name: "i2" for name in ("short", "int16")},
+    **{name: "u2" for name in ("ushort", "uint16")},
+    **{name: "i4" for name in ("int", "int32")},
+    **{name: "u4" for name in ("uint", "uint32")},
+    **{name: "f4" for name in ("float", "float32")},
+    **{name: "f8" for name in ("double", "float64")},
+}
+
+
+@dataclasses.dataclass
+class Element:
+    """One `element` of a header: scalar properties in order, or `has_list` where a row's size is not fixed."""
+
+    name: str
+    count: int
+    properties: dict[str, str]  # name -> numpy type code
+    has_list: bool = False
+
+    def dtype(self, order: str) -> np.dtype:
+        """Of one row, packed."""
+        return np.dtype([(name, order + code) for name, code in self.properties.items()])
+
+
+def read_vertices(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], list[str]]:
+    """Columns of the element `vertex` by property name, and the header's comments.
+
+    Raises:
+        InputError: the file cannot be read, is no PLY, or does not hold what its header says.
+    """
+    path = Path(path)
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: wanted a PLY file, it cannot be read ({error.strerror}); check the path.") from error
+    lines, body = _split_header(path, data)
+    file_format, elements, comments = _parse_header(path, lines)
+    before, vertex = _find_vertex(path, elements)
+    if file_format == "ascii":
+        return _ascii_columns(path, body, before, vertex), comments
+    return _binary_columns(path, body, before, vertex, BYTE_ORDERS[file_format]), comments
+
+
+def _split_header(path: Path, data: bytes) -> tuple[list[str], memoryview]:
+    head = data[:MAX_HEADER_BYTES]
+    if not head.startswith(b"ply"):
+        raise InputError(f"{path}: wanted a PLY file, it does not start with 'ply'; give a 3DGS .ply.")
+    end = head.find(b"end_header")
+    newline = head.find(b"\n", end)
+    if end < 0 or newline < 0:
+        raise InputError(
+            f"{path}: header: wanted 'end_header' within {MAX_HEADER_BYTES} bytes, found none; the file is cut off "
+            "or no PLY."
+        )
+    return head[:end].decode("ascii", "replace").splitlines(), memoryview(data)[newline + 1 :]
+
+
+def _parse_header(path: Path, lines: list[str]) -> tuple[str, list[Element], list[str]]:
+    file_format, elements, comments = "", [], []
+    for line in lines[1:]:
+        words = line.split()
+        match words:
+            case [] | ["obj_info", *_]:
+                pass
+            case ["comment", *rest]:
+                comments.append(" ".join(rest))
+            case ["format", name, "1.0"] if name in BYTE_ORDERS:
+                file_format = name
+            case ["element", name, count] if count.isdecimal():
+                elements.append(Element(name, int(count[:20]), {}))
+            case ["property", "list", *_] if elements:
+                elements[-1].has_list = True
+            case ["property", kind, name] if elements and kind in TYPES and name not in elements[-1].properties:
+                elements[-1].properties[name] = TYPES[kind]
+            case _:
+                raise InputError(f"{path}: header: cannot use the line {line[:80]!r}; write the file again as PLY 1.0.")
+    if not file_format:
+        raise InputError(f"{path}: header: wanted a format, one of {', '.join(BYTE_ORDERS)}; there is none.")
+    return file_format, elements, comments
+
+
+def _find_vertex(path: Path, elements: list[Element]) -> tuple[list[Element], Element]:
+    """The element `vertex` and those whose rows come before it."""
+    names = [element.name for element in elements]
+    if "vertex" not in names:
+        raise InputError(
+            f"{path}: wanted an element 'vertex', there is {', '.join(names) or 'none'}; give a 3DGS .ply."
+        )
+    position = names.index("vertex")
+    for element in elements[: position + 1]:
+        if element.has_list or not element.properties:
+            came = "a list" if element.has_list else "none"
+            raise InputError(
+                f"{path}: element {element.name}: wanted scalar properties, it has {came}; give a 3DGS .ply."
+            )
+    return elements[:position], elements[position]
+
+
+def _binary_columns(path: Path, body: memoryview, before: list[Element], vertex: Element, order: str):
+    offset = sum(element.count * element.dtype(order).itemsize for element in before)
+    dtype = vertex.dtype(order)
+    _check_size(path, vertex, offset + vertex.count * dtype.itemsize, len(body), "bytes")
+    rows = np.frombuffer(body, dtype, count=vertex.count, offset=offset) if vertex.count else np.zeros(0, dtype)
+    return {name: rows[name] for name in vertex.properties}
+
+
+def _ascii_columns(path: Path, body: memoryview, before: list[Element], vertex: Element):
+    words = bytes(body).split()
+    offset = sum(element.count * len(element.properties) for element in before)
+    size = vertex.count * len(vertex.properties)
+    _check_size(path, vertex, offset + size, len(words), "numbers")
+    try:
+        numbers = np.array(words[offset : offset + size], dtype=np.float64)
+    except ValueError as error:
+        raise InputError(f"{path}: element vertex: wanted numbers ({error}); write the file again.") from error
+    return dict(zip(vertex.properties, numbers.reshape(vertex.count, -1).T, strict=True))
+
+
+def _check_size(path: Path, vertex: Element, wanted: int, came: int, unit: str) -> None:
+    if wanted > came:
+        raise InputError(
+            f"{path}: element vertex: wanted {wanted} {unit} for {vertex.count} rows, {came} are there; the file is "
+            "cut off or its header wrong."
+        )

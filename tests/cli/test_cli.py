@@ -1,0 +1,164 @@
+"""The command line: help at once, clear refusals, nothing half-written. Heavy commands are run small."""
+
+import json
+import shutil
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from ssplat_jax import cli
+
+COMMANDS = ("demo", "inspect", "run", "eval", "train", "export")
+
+
+def run(*arguments: str) -> int:
+    with pytest.raises(SystemExit) as stopped:
+        cli.main(list(arguments))
+    return int(stopped.value.code or 0)
+
+
+def make_capture(folder, num_frames=6, size=(32, 24)):
+    """A small valid transforms.json capture: a camera sliding along a random wall."""
+    rng = np.random.default_rng(0)
+    (folder / "images").mkdir(parents=True)
+    frames = []
+    for i in range(num_frames):
+        pixels = rng.integers(0, 255, (size[1], size[0], 3), dtype=np.uint8)
+        Image.fromarray(pixels).save(folder / "images" / f"{i}.png")
+        pose = np.eye(4)
+        pose[0, 3] = 0.1 * i
+        frames.append({"file_path": f"images/{i}.png", "transform_matrix": pose.tolist()})
+    facts = {"w": size[0], "h": size[1], "fl_x": 30.0, "fl_y": 30.0, "cx": 16.0, "cy": 12.0, "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(facts))
+    return folder
+
+
+@pytest.mark.parametrize("command", [(), *((c,) for c in COMMANDS)])
+def test_help_does_not_import_jax_and_shows_an_example(command):
+    code = (
+        "import sys\nfrom ssplat_jax.cli import main\n"
+        f"sys.argv = ['ssplat', *{command!r}, '--help']\n"
+        "try:\n    main()\nexcept SystemExit as stop:\n    assert not stop.code\n"
+        "assert 'jax' not in sys.modules, 'help imported jax'\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    if command:
+        assert f"Example: ssplat {command[0]}" in " ".join(done.stdout.split())
+
+
+@pytest.mark.slow
+def test_help_answers_within_a_second():
+    since = time.perf_counter()
+    subprocess.run([sys.executable, "-m", "ssplat_jax.cli", "--help"], capture_output=True, check=True)
+    assert time.perf_counter() - since < 1.0
+
+
+def truncate(capture):
+    path = capture / "images" / "2.png"
+    path.write_bytes(path.read_bytes()[:200])
+
+
+def edit(field, value):
+    def change(capture):
+        facts = json.loads((capture / "transforms.json").read_text())
+        target = facts if field in facts else facts["frames"][1]
+        target[field] = value
+        (capture / "transforms.json").write_text(json.dumps(facts))
+
+    return change
+
+
+SHEARED = [[1, 0.5, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+NAN_POSE = [[1, 0, 0, float("nan")], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+BAD_CAPTURES = {
+    "missing image": (lambda c: (c / "images" / "3.png").unlink(), "3.png"),
+    "truncated image": (truncate, "2.png"),
+    "NaN pose": (edit("transform_matrix", NAN_POSE), "transform_matrix"),
+    "non-rotation pose": (edit("transform_matrix", SHEARED), "transform_matrix"),
+    "focal zero": (edit("fl_x", 0.0), "fl_x"),
+    "size differs": (edit("w", 64), "64"),
+    "empty folder": (lambda c: [shutil.rmtree(c), c.mkdir()], "empty"),
+    "path outside": (edit("file_path", "../../secret.png"), "secret"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_CAPTURES)
+@pytest.mark.parametrize("command", ["eval", "run"])
+def test_bad_capture_is_one_line_exit_2_and_nothing_written(case, command, tmp_path, capsys):
+    capture = make_capture(tmp_path / "capture")
+    spoil, named = BAD_CAPTURES[case]
+    spoil(capture)
+    out = tmp_path / "out"
+    options = ("--context", "5") if command == "eval" else ()
+    # Fresh weights: refusing must not depend on the shipped ones.
+    code = run(command, str(capture), *options, "--out", str(out))
+    captured = capsys.readouterr()
+    assert code == 2
+    lines = [line for line in captured.err.splitlines() if line.strip()]
+    assert len(lines) == 1 and named in lines[0], captured.err
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (("inspect", "no/such/folder"), "no/such/folder"),
+        (("eval", "procedural:room", "--context", "5", "--size", "huge", "--out", "x"), "--size"),
+        (("eval", "procedural:room", "--context", "5000", "--out", "x"), "context"),
+        (("eval", "procedural:room", "--context", "8", "--set", "voxel_size=-1", "--out", "x"), "voxel_size"),
+        (("eval", "procedural:room", "--context", "8", "--set", "no_such=1", "--out", "x"), "no_such"),
+        (("eval", "procedural:room", "--context", "8", "--weights", "no.npz", "--out", "x"), "no.npz"),
+        (("export", "no_run", "--to", "x.ply"), "no_run"),
+        (("inspect", "procedural:castle"), "castle"),
+    ],
+)
+def test_bad_usage_is_one_line_and_exit_2(arguments, named, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert run(*arguments) == 2
+    lines = [line for line in capsys.readouterr().err.splitlines() if line.strip()]
+    assert len(lines) == 1 and named in lines[0]
+    assert not any(tmp_path.iterdir())
+
+
+def test_inspect_prints_json(capsys):
+    assert run("inspect", "procedural:orbit?frames=12&size=64x48", "--json") == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["num_frames"] == 12 and facts["near"] < facts["far"]
+
+
+def test_run_stops_resumes_and_exports(tmp_path, capsys):
+    out = tmp_path / "run"
+    capture = "procedural:room?frames=12&size=64x48"
+    assert run("run", capture, "--out", str(out), "--save-every", "1", "--quiet") == 0
+    assert {"scene.ply", "state.npz", "metrics.json"} <= {p.name for p in out.iterdir()}
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["cache"]["num_chunks"] == 3
+    assert run("export", str(out), "--to", str(tmp_path / "again.ply")) == 0
+    assert (tmp_path / "again.ply").read_bytes() == (out / "scene.ply").read_bytes()
+    # A finished run is not streamed twice; another configuration is refused.
+    assert run("run", capture, "--out", str(out), "--quiet") == 0
+    assert json.loads((out / "metrics.json").read_text())["cache"]["num_chunks"] == 3
+    assert run("run", capture, "--out", str(out), "--set", "voxel_size=0.1", "--quiet") == 2
+    assert "voxel_size" in capsys.readouterr().err
+
+
+def test_eval_writes_every_promised_field(tmp_path):
+    out = tmp_path / "eval"
+    arguments = ("eval", "procedural:room?frames=12&size=64x48", "--context", "8", "--out", str(out), "--quiet")
+    assert run(*arguments) == 0
+    metrics = json.loads((out / "metrics.json").read_text())
+    promised = {
+        "psnr", "ssim", "lpips", "per_view", "context_views", "target_views", "chunk_ms", "render_ms", "compile_s",
+        "step_memory_bytes", "cache", "num_gaussians", "config_hash", "baselines",
+    }  # fmt: skip
+    assert promised <= metrics.keys()
+    assert {"voxels", "pivots", "capacity", "overflow", "accepted_fraction"} <= metrics["cache"].keys()
+    assert {"nearest_view_psnr", "mean_colour_psnr"} <= metrics["baselines"].keys()
+    assert metrics["context_views"] == 8 and metrics["target_views"] == len(metrics["per_view"]) == 1
+    assert metrics["cache"]["pivots"] == metrics["num_gaussians"] > 0
+    with Image.open(out / "view_00004.png") as picture:
+        assert picture.size == (3 * 64, 48)

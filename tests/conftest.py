@@ -1,0 +1,35 @@
+"""What all tests share: shapes and types checked at every call, strict dtypes, and where the real captures are."""
+
+from pathlib import Path
+
+from jaxtyping import install_import_hook
+
+# Before anything of the package is imported: every annotated signature of it is checked at run time.
+install_import_hook("ssplat_jax", "beartype.beartype")
+
+import jax  # noqa: E402
+import pytest  # noqa: E402
+
+# An int32 array that meets a float32 array is an oversight; Python scalars stay welcome.
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+SHARED = Path(__file__).resolve().parents[2] / "shared"
+
+
+def _shared(name: str) -> Path:
+    folder = SHARED / name
+    if not folder.is_dir():
+        pytest.skip(f"no ../shared/{name} beside the repository: real data is not part of it")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def captures() -> Path:
+    """Folder of real captures beside the repository."""
+    return _shared("captures")
+
+
+@pytest.fixture(scope="session")
+def scenes() -> Path:
+    """Folder of real splat scenes beside the repository."""
+    return _shared("scenes")

@@ -1,0 +1,103 @@
+"""Warped correlation against an oracle that warps first, correlates after, in float64; and its gradients."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ssplat_jax.geometry.sampling import bilinear_taps, correlate_warped
+
+FLOAT32 = 2e-5  # sums of a dozen products of unit normals
+HEIGHT, WIDTH, CHANNELS = 5, 7, 6
+
+
+def coordinates(seed: int = 0) -> np.ndarray:
+    """Inside, on samples, on the border and beyond it: `[d n 2]` (x, y)."""
+    rng = np.random.default_rng(seed)
+    coords = rng.uniform([-2, -2], [WIDTH + 1, HEIGHT + 1], (4, 15, 2))
+    coords[0, :3] = [[0, 0], [WIDTH - 1, HEIGHT - 1], [3, 2]]
+    return coords
+
+
+def arrays(seed: int = 0):
+    rng = np.random.default_rng(seed)
+    return rng.normal(size=(15, CHANNELS)), rng.normal(size=(HEIGHT * WIDTH, CHANNELS))
+
+
+def warp_then_correlate(reference, source, coords):
+    """Bilinear interpolation point by point, border held, then dot products."""
+    image = source.reshape(HEIGHT, WIDTH, CHANNELS)
+    out = np.zeros(coords.shape[:2])
+    for d, n in np.ndindex(*out.shape):
+        x, y = np.clip(coords[d, n], 0, [WIDTH - 1, HEIGHT - 1])
+        column, row = min(int(x), WIDTH - 2), min(int(y), HEIGHT - 2)
+        fx, fy = x - column, y - row
+        top = (1 - fx) * image[row, column] + fx * image[row, column + 1]
+        bottom = (1 - fx) * image[row + 1, column] + fx * image[row + 1, column + 1]
+        out[d, n] = ((1 - fy) * top + fy * bottom) @ reference[n]
+    return out
+
+
+def f32(x):
+    return jnp.asarray(x, jnp.float32)
+
+
+def test_correlation_is_that_of_the_warped_map():
+    reference, source = arrays()
+    taps, weights = bilinear_taps(f32(coordinates()), HEIGHT, WIDTH)
+    got = correlate_warped(f32(reference), f32(source), taps, weights)
+    np.testing.assert_allclose(got, warp_then_correlate(reference, source, coordinates()), atol=FLOAT32)
+
+
+def test_gradients_are_those_of_the_plain_sum():
+    reference, source = map(f32, arrays(1))
+    taps, weights = bilinear_taps(f32(coordinates(1)), HEIGHT, WIDTH)
+    cotangent = f32(np.random.default_rng(2).normal(size=(4, 15)))
+
+    def plain(reference, source):
+        return jnp.sum(cotangent * jnp.einsum("dntc,dnt,nc->dn", source[taps], weights, reference))
+
+    def fast(reference, source):
+        return jnp.sum(cotangent * correlate_warped(reference, source, taps, weights))
+
+    wanted, got = jax.grad(plain, (0, 1))(reference, source), jax.jit(jax.grad(fast, (0, 1)))(reference, source)
+    for w, g in zip(wanted, got, strict=True):
+        np.testing.assert_allclose(g, w, atol=FLOAT32)
+
+
+def test_gradient_is_the_finite_difference_of_the_oracle():
+    """The function is bilinear, so a difference quotient of any step is exact: float64, no truncation error."""
+    (reference, source), coords = arrays(3), coordinates(3)
+    taps, weights = bilinear_taps(f32(coords), HEIGHT, WIDTH)
+    total = lambda r, s: jnp.sum(correlate_warped(r, s, taps, weights))  # noqa: E731
+    by_reference, by_source = jax.grad(total, (0, 1))(f32(reference), f32(source))
+    rng = np.random.default_rng(4)
+    step_reference, step_source = rng.normal(size=reference.shape), rng.normal(size=source.shape)
+    oracle = lambda r, s: warp_then_correlate(r, s, coords).sum()  # noqa: E731
+    difference = oracle(reference + step_reference, source) - oracle(reference, source)
+    assert np.sum(np.asarray(by_reference) * step_reference) == pytest.approx(difference, abs=1e-3)
+    difference = oracle(reference, source + step_source) - oracle(reference, source)
+    assert np.sum(np.asarray(by_source) * step_source) == pytest.approx(difference, abs=1e-3)
+
+
+def test_sampling_at_a_sample_reads_that_sample():
+    ys, xs = np.meshgrid(np.arange(HEIGHT), np.arange(WIDTH), indexing="ij")
+    taps, weights = bilinear_taps(f32(np.stack([xs, ys], -1)), HEIGHT, WIDTH)
+    values = jnp.arange(HEIGHT * WIDTH, dtype=jnp.float32)
+    np.testing.assert_array_equal(jnp.sum(values[taps] * weights, -1).reshape(-1), values)
+
+
+def test_beyond_the_border_and_not_a_number_read_the_nearest_border_sample():
+    coords = f32([[-5, 2], [1e30, -1e30], [np.inf, -np.inf], [np.nan, np.nan], [3, 99]])
+    taps, weights = bilinear_taps(coords, HEIGHT, WIDTH)
+    values = jnp.arange(HEIGHT * WIDTH, dtype=jnp.float32)
+    nearest = [2 * WIDTH, WIDTH - 1, WIDTH - 1, 0, (HEIGHT - 1) * WIDTH + 3]
+    np.testing.assert_array_equal(jnp.sum(values[taps] * weights, -1), nearest)
+    assert ((taps >= 0) & (taps < HEIGHT * WIDTH)).all()
+    np.testing.assert_allclose(weights.sum(-1), 1.0, atol=1e-6)
+
+
+def test_a_map_of_one_sample():
+    taps, weights = bilinear_taps(f32([[0, 0], [4, -4]]), 1, 1)
+    assert (taps == 0).all()
+    np.testing.assert_array_equal(weights.sum(-1), 1)

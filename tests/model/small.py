@@ -1,0 +1,112 @@
+"""A narrow network and small views that all tests of the network share, so that each program is compiled once."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ssplat_jax.cache import ProjectedCache
+from ssplat_jax.chunk import Chunk
+from ssplat_jax.config import StreamConfig
+from ssplat_jax.stream import StreamSplat
+from ssplat_jax.struct import replace
+
+CONFIG = StreamConfig().replace(
+    chunk_size=3,
+    encoder_widths=(8, 16),
+    encoder_blocks=1,
+    attention_blocks=2,
+    attention_window=4,
+    num_depths=12,
+    match_width=8,
+    unet_width=8,
+    token_width=16,
+    cgfi_width=8,
+    mixer_blocks=1,
+    mixer_neighbours=4,
+    mixer_proj=8,
+    min_confidence=0.0,
+    capacity=1 << 10,
+)
+MODEL = StreamSplat(CONFIG)
+HEIGHT, WIDTH = 24, 30  # padded to 32 x 32: cells outside the image are part of every test
+
+
+def perturbed(params: dict, seed: int = 0, size: float = 0.1) -> dict:
+    """Parameters away from the start, where zero-initialised layers would hide what they do."""
+    leaves, treedef = jax.tree.flatten(params)
+    rng = np.random.default_rng(seed)
+    return treedef.unflatten([leaf + jnp.asarray(size * rng.normal(size=leaf.shape), jnp.float32) for leaf in leaves])
+
+
+@functools.cache
+def params() -> dict:
+    """Fresh parameters of `CONFIG`, perturbed."""
+    return perturbed(jax.jit(MODEL.init)(jax.random.key(0)))
+
+
+def chunk(seed: int = 0, *, views: int = 3, baseline: float = 0.2, height: int = HEIGHT, width: int = WIDTH) -> Chunk:
+    """Views in a row along x, all looking ahead, with random smooth images."""
+    rng = np.random.default_rng(seed)
+    coarse = rng.uniform(size=(views, height // 3 + 1, width // 3 + 1, 3))
+    images = np.repeat(np.repeat(coarse, 3, axis=1), 3, axis=2)[:, :height, :width]
+    viewmats = np.tile(np.eye(4), (views, 1, 1))
+    viewmats[:, 0, 3] = -baseline * np.arange(views)
+    K = np.array([[28.0, 0, width / 2 + 1], [0, 27.0, height / 2 - 1], [0, 0, 1]])
+    return Chunk(
+        images=jnp.asarray(images, jnp.float32),
+        viewmats=jnp.asarray(viewmats, jnp.float32),
+        Ks=jnp.asarray(np.tile(K, (views, 1, 1)), jnp.float32),
+        valid=jnp.ones(views, bool),
+        near=jnp.float32(1.0),
+        far=jnp.float32(6.0),
+    )
+
+
+@functools.cache
+def step():
+    """The jitted step."""
+    return jax.jit(MODEL.step)
+
+
+@functools.cache
+def warm_cache():
+    """A cache that has seen one chunk: history is there to be projected."""
+    return step()(params(), MODEL.init_cache(), chunk(7))[0]
+
+
+@functools.cache
+def predict():
+    """The jitted prediction: `(params, cache, chunk) -> Prediction`."""
+    return jax.jit(MODEL.predict)
+
+
+@functools.cache
+def gradients():
+    """Jitted gradient of a sum over everything a chunk's tokens become, in parameters, images, poses and intrinsics."""
+
+    def total(params, images, viewmats, Ks, cache, chunk):
+        prediction = MODEL.predict(params, cache, replace(chunk, images=images, viewmats=viewmats, Ks=Ks))
+        scene = MODEL.decode_tokens(params, prediction.tokens)
+        leaves = (scene, prediction.tokens.confidences, prediction.log_depths)
+        return sum(jnp.mean(jnp.sin(x)) for x in jax.tree.leaves(leaves))
+
+    function = jax.jit(jax.value_and_grad(total, argnums=(0, 1, 2, 3)))
+    return lambda cache, chunk: function(params(), chunk.images, chunk.viewmats, chunk.Ks, cache, chunk)
+
+
+def history(depths, confidences, feats=None, mask=None) -> ProjectedCache:
+    """What a cache would say, given by hand; `mask` defaults to where there is a depth."""
+    depths, confidences = jnp.asarray(depths, jnp.float32), jnp.asarray(confidences, jnp.float32)
+    return ProjectedCache(
+        depths=depths,
+        confidences=confidences,
+        feats=jnp.zeros((*depths.shape, CONFIG.token_width)) if feats is None else jnp.asarray(feats, jnp.float32),
+        mask=depths > 0 if mask is None else jnp.asarray(mask),
+    )
+
+
+def finite(tree) -> bool:
+    """Whether every float of the tree is finite."""
+    return all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(tree) if jnp.issubdtype(leaf.dtype, jnp.floating))

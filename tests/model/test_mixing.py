@@ -1,0 +1,153 @@
+"""CGFI and the 3D mixer: when history is heard, and who a token's neighbours are."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ssplat_jax.model import init_params, inject_features, mix_tokens
+from ssplat_jax.model.mixer import nearest_tokens
+from ssplat_jax.model.wires import prepare_views
+from ssplat_jax.struct import replace
+from tests.model.small import CONFIG, chunk, history, params
+
+C = CONFIG.token_width
+GRID = (3, 8, 8)
+
+
+def maps(seed: int, *channels):
+    return jnp.asarray(np.random.default_rng(seed).normal(size=(*GRID, *channels)), jnp.float32)
+
+
+def fresh() -> dict:
+    return init_params(jax.random.key(0), CONFIG)
+
+
+def views():
+    return prepare_views(chunk(), CONFIG)
+
+
+def inject(weights, feats, past, confidences):
+    return inject_features(weights["cgfi"], feats, past, jnp.full(GRID, confidences), views(), CONFIG)
+
+
+def past(seed: int = 1):
+    rng = np.random.default_rng(seed)
+    return history(rng.uniform(1, 5, GRID), np.full(GRID, 0.7), feats=rng.normal(size=(*GRID, C)))
+
+
+def test_cgfi_is_the_identity_before_training():
+    np.testing.assert_array_equal(inject(fresh(), maps(0, C), past(), 0.4), maps(0, C))
+
+
+def test_cgfi_hears_history_only_where_the_current_views_are_unsure():
+    def effect_of_history(confidence):
+        here, other = (inject(params(), maps(0, C), past(seed), confidence) for seed in (1, 2))
+        return float(jnp.abs(here - other).max())
+
+    assert effect_of_history(1.0) == 0.0
+    assert effect_of_history(0.2) > 1e-3
+
+
+def test_cgfi_tells_a_hole_from_a_zero_feature():
+    hole = history(np.zeros(GRID), np.zeros(GRID))
+    zero_feature = history(np.full(GRID, 2.0), np.full(GRID, 0.9))
+    difference = inject(params(), maps(0, C), hole, 0.4) - inject(params(), maps(0, C), zero_feature, 0.4)
+    assert float(jnp.abs(difference).max()) > 1e-3
+
+
+def test_cgfi_switched_off_is_the_identity_whatever_its_parameters():
+    off = inject_features(
+        params()["cgfi"], maps(0, C), past(), jnp.full(GRID, 0.2), views(), CONFIG.replace(cgfi=False)
+    )
+    np.testing.assert_array_equal(off, maps(0, C))
+
+
+def brute_force(points, usable, candidates, k):
+    """Per token: itself, then its nearest usable candidates, as a set of distances (ties may come in any order)."""
+    out = []
+    for i, point in enumerate(points):
+        others = [j for j in candidates(i) if usable[j] and j != i]
+        distances = sorted(float(np.sum((points[j] - point) ** 2)) for j in set(others))
+        out.append([-1.0, *distances][:k])
+    return out
+
+
+@pytest.mark.parametrize("radius", [0, 1, 2])
+def test_neighbours_are_the_nearest_in_space_the_token_itself_first(radius):
+    config = CONFIG.replace(mixer_radius=radius, mixer_neighbours=4)
+    positions = maps(2, 3)
+    inside = jnp.asarray(np.random.default_rng(3).uniform(size=GRID) < 0.8)
+    found = np.asarray(nearest_tokens(positions, inside, config))
+    points, usable = np.asarray(positions, np.float64).reshape(-1, 3), np.asarray(inside).reshape(-1)
+    np.testing.assert_array_equal(found[:, 0], np.arange(len(points)))
+
+    def candidates(i):
+        if radius == 0:
+            return range(len(points))
+        v, y, x = np.unravel_index(i, GRID)
+        ys, xs = (np.arange(max(0, a - radius), min(8, a + radius + 1)) for a in (y, x))
+        return [int(np.ravel_multi_index((v, a, b), GRID)) for a in ys for b in xs]
+
+    for i, wanted in enumerate(brute_force(points, usable, candidates, 4)):
+        distances = [float(np.sum((points[j] - points[i]) ** 2)) for j in found[i, 1:] if usable[j]]
+        # At the border of the grid a neighbour may be listed more than once: its patch is the border repeated.
+        unique = sorted(set(np.round(distances, 9)))
+        assert np.isin(unique, np.round(wanted[1:], 9)).all()
+        if radius == 0 and len(wanted) == 4:
+            np.testing.assert_allclose(sorted(distances), wanted[1:], rtol=1e-6)
+
+
+def mix(feats, positions, inside, valid):
+    return mix_tokens(params()["mixer"], feats, positions, inside, valid, CONFIG)
+
+
+def test_mixing_does_not_depend_on_the_order_of_the_views():
+    feats, positions, inside = maps(4, C), maps(5, 3), jnp.ones(GRID, bool)
+    order = jnp.array([2, 0, 1])
+    straight = mix(feats, positions, inside, jnp.ones(3, bool))
+    shuffled = mix(feats[order], positions[order], inside, jnp.ones(3, bool))
+    np.testing.assert_allclose(shuffled, straight[order], atol=1e-4)
+    assert float(jnp.abs(straight - feats).max()) > 0.1
+
+
+def test_a_valid_token_never_hears_cells_outside_the_image():
+    feats, positions = maps(4, C), maps(5, 3)
+    inside = jnp.ones(GRID, bool).at[:, :, 6:].set(False)
+    neighbours_only = {**params()["mixer"]}
+    neighbours_only["global_blocks_0"] = jax.tree.map(jnp.zeros_like, neighbours_only["global_blocks_0"])
+    loud = jnp.where(inside[..., None], feats, feats + 100.0)
+    out = [
+        mix_tokens(neighbours_only, f, positions, inside, jnp.ones(3, bool), CONFIG)[:, :, :6] for f in (feats, loud)
+    ]
+    np.testing.assert_array_equal(*out)
+
+
+def test_a_mixer_of_no_blocks_is_the_identity():
+    config = CONFIG.replace(mixer_blocks=0)
+    out = mix_tokens({}, maps(4, C), maps(5, 3), jnp.ones(GRID, bool), jnp.ones(3, bool), config)
+    np.testing.assert_array_equal(out, maps(4, C))
+
+
+def test_tokens_at_one_point_are_mixed_finitely():
+    valid = jnp.ones(3, bool)
+    run = lambda f: mix(f, jnp.zeros((*GRID, 3)), jnp.ones(GRID, bool), valid)  # noqa: E731
+    assert np.isfinite(run(maps(4, C))).all()
+    assert np.isfinite(jax.grad(lambda f: jnp.sum(run(f) ** 2))(maps(4, C))).all()
+
+
+def test_padded_views_change_nothing_here_either():
+    valid = jnp.array([True, True, False])
+    inside = jnp.ones(GRID, bool) & valid[:, None, None]
+    feats, positions = maps(4, C), maps(5, 3)
+    loud = feats.at[2].add(50.0)
+    np.testing.assert_array_equal(
+        mix(feats, positions, inside, valid)[:2], mix(loud, positions.at[2].add(3.0), inside, valid)[:2]
+    )
+    changed = replace(past(), feats=past().feats.at[2].add(50.0))
+    view = prepare_views(replace(chunk(), valid=valid), CONFIG)
+    a, b = (
+        inject_features(params()["cgfi"], f, p, jnp.full(GRID, 0.2), view, CONFIG)[:2]
+        for f, p in ((feats, past()), (loud, changed))
+    )
+    np.testing.assert_array_equal(a, b)

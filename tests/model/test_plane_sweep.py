@@ -1,0 +1,90 @@
+"""The plane sweep: an untrained network already finds a textured wall; a cell that no source sees scores nothing."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ssplat_jax.chunk import Chunk
+from ssplat_jax.config import StreamConfig
+from ssplat_jax.model import init_params
+from ssplat_jax.model.cost_volume import plane_sweep, sweep_pixels
+from ssplat_jax.model.encoder import encode
+from ssplat_jax.model.wires import prepare_views
+from ssplat_jax.struct import replace
+
+CONFIG = StreamConfig().replace(
+    encoder_widths=(16, 32), encoder_blocks=1, attention_blocks=1, num_depths=24, match_width=32, unet_width=8
+)
+SIDE, FOCAL, WALL, BASELINE = 64, 64.0, 2.0, 0.25  # the wall is 8 pixels of parallax away
+CELL_SHARE = 0.7
+
+
+def texture(x, y):
+    """A sum of waves of many lengths on the wall, analytic: no image is resampled from another."""
+    rng = np.random.default_rng(0)
+    value = np.zeros((*x.shape, 3))
+    for _ in range(40):
+        direction, length = rng.uniform(0, 2 * np.pi), np.exp(rng.uniform(np.log(0.12), np.log(1.0)))
+        phase = 2 * np.pi * (np.cos(direction) * x + np.sin(direction) * y) / length
+        value += rng.normal(size=3) * np.sin(phase + rng.uniform(0, 2 * np.pi))[..., None]
+    return 1 / (1 + np.exp(-0.4 * value))
+
+
+def wall_chunk() -> Chunk:
+    """Three views of the wall z = WALL, side by side."""
+    centres = BASELINE * np.array([-1.0, 0.0, 1.0])
+    pixel = np.arange(SIDE) + 0.5
+    u, v = np.meshgrid(pixel, pixel)
+    images = [texture((u - SIDE / 2) / FOCAL * WALL + c, (v - SIDE / 2) / FOCAL * WALL) for c in centres]
+    viewmats = np.tile(np.eye(4), (3, 1, 1))
+    viewmats[:, 0, 3] = -centres
+    K = np.array([[FOCAL, 0, SIDE / 2], [0, FOCAL, SIDE / 2], [0, 0, 1]])
+    return Chunk(
+        images=jnp.asarray(np.stack(images), jnp.float32),
+        viewmats=jnp.asarray(viewmats, jnp.float32),
+        Ks=jnp.asarray(np.tile(K, (3, 1, 1)), jnp.float32),
+        valid=jnp.ones(3, bool),
+        near=jnp.float32(1.0),
+        far=jnp.float32(5.0),
+    )
+
+
+@jax.jit
+def cost(params, chunk):
+    views = prepare_views(chunk, CONFIG)
+    return plane_sweep(encode(params["encoder"], views, CONFIG), views, CONFIG)
+
+
+def wall_cost(chunk):
+    params = jax.jit(lambda key: init_params(key, CONFIG))(jax.random.key(0))
+    return np.asarray(cost(params, chunk)).reshape(3, SIDE // 4, SIDE // 4, 2, CONFIG.num_depths)
+
+
+def test_the_cost_of_an_untrained_network_peaks_at_the_wall():
+    both = wall_cost(wall_chunk())
+    assert (np.abs(both) <= 1 + 1e-5).all()  # means of cosines
+    scores = both.sum(axis=3)
+    candidates = np.exp(np.linspace(np.log(1.0), np.log(5.0), CONFIG.num_depths))
+    truth = int(np.argmin(np.abs(np.log(candidates / WALL))))
+    # The middle view's cells that both others see at every candidate behind 1.3.
+    near = np.abs(scores[1, :, 4:-4].argmax(-1) - truth) <= 1
+    assert near.mean() > CELL_SHARE, near.mean()
+
+
+def test_the_sweep_puts_the_wall_where_the_other_camera_sees_it():
+    views = prepare_views(wall_chunk(), CONFIG)
+    pixels, seen = sweep_pixels(views, 1, 2)
+    cells = np.stack(np.meshgrid(np.arange(16) * 4 + 2.0, np.arange(16) * 4 + 2.0), -1).reshape(-1, 2)
+    for d, log_depth in enumerate(np.asarray(views.log_candidates, np.float64)):
+        parallax = FOCAL * BASELINE / np.exp(log_depth)
+        np.testing.assert_allclose(pixels[d], cells - [parallax, 0], atol=1e-3)
+        np.testing.assert_array_equal(seen[d], cells[:, 0] - parallax >= 0)
+
+
+def test_what_no_source_sees_scores_zero():
+    away = np.diag([-1.0, 1.0, -1.0, 1.0])  # looks the other way
+    chunk = wall_chunk()
+    lonely = replace(chunk, viewmats=chunk.viewmats.at[0].set(jnp.asarray(away, jnp.float32)))
+    np.testing.assert_array_equal(wall_cost(lonely)[0], 0)
+    padded = replace(chunk, valid=jnp.array([True, False, False]))
+    np.testing.assert_array_equal(wall_cost(padded)[0], 0)

@@ -1,0 +1,117 @@
+"""The network as a whole: padded views are nothing, and no view is too hard to give finite tokens and gradients."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ssplat_jax.stream import StreamSplat
+from ssplat_jax.struct import replace
+from tests.geometry.test_rotations import rodrigues
+from tests.model.small import CONFIG, MODEL, chunk, finite, gradients, params, perturbed, predict, step, warm_cache
+
+
+def turned(angle_step: float):
+    """Rotations about the vertical through one centre: no parallax at all."""
+    viewmats = np.tile(np.eye(4), (3, 1, 1))
+    for i, matrix in enumerate(viewmats):
+        matrix[:3, :3] = rodrigues([0, 1, 0], angle_step * i)
+    return jnp.asarray(viewmats, jnp.float32)
+
+
+def with_images(value):
+    return lambda c: replace(c, images=jnp.full_like(c.images, value))
+
+
+HARD = {
+    "an ordinary chunk": lambda c: c,
+    "cameras at one place": lambda c: replace(c, viewmats=jnp.broadcast_to(jnp.eye(4), (3, 4, 4))),
+    "a pure rotation": lambda c: replace(c, viewmats=turned(0.2)),
+    "cameras back to back": lambda c: replace(c, viewmats=turned(np.pi)),
+    "steps of a nanometre": lambda c: replace(c, viewmats=c.viewmats.at[:, 0, 3].multiply(1e-8)),
+    "cameras far apart": lambda c: replace(c, viewmats=c.viewmats.at[:, 0, 3].multiply(1e5)),
+    "one camera inside the scene": lambda c: replace(c, viewmats=c.viewmats.at[1, 2, 3].set(-3.0)),
+    "black images": with_images(0.0),
+    "white images": with_images(1.0),
+    "near equals far": lambda c: replace(c, far=c.near),
+    "a huge range": lambda c: replace(c, near=jnp.float32(1e-4), far=jnp.float32(1e5)),
+    "one valid view": lambda c: replace(c, valid=jnp.array([True, False, False])),
+    "no valid view": lambda c: replace(c, valid=jnp.zeros(3, bool)),
+    "a very long lens": lambda c: replace(c, Ks=c.Ks.at[:, 0, 0].set(1e5).at[:, 1, 1].set(1e5)),
+}
+
+
+@pytest.mark.parametrize("name", HARD)
+def test_hard_chunk_gives_finite_tokens_and_gradients(name):
+    hard = HARD[name](chunk())
+    value, gradient = gradients()(warm_cache(), hard)
+    assert finite((value, gradient))
+    prediction = predict()(params(), warm_cache(), hard)
+    assert finite(prediction)
+    np.testing.assert_allclose(jax.nn.softmax(prediction.logits).sum(-1), 1, atol=1e-5)
+    span = np.log([hard.near, hard.far])
+    assert (prediction.log_depths >= span[0] - 1e-4).all() and (prediction.log_depths <= span[1] + 1e-4).all()
+    assert ((prediction.output.confidences >= 0) & (prediction.output.confidences <= 1)).all()
+
+
+def test_every_part_of_the_network_hears_the_gradient():
+    _, (by_params, *_) = gradients()(warm_cache(), chunk())
+    for stage, gradient in by_params.items():
+        assert max(float(jnp.abs(leaf).max()) for leaf in jax.tree.leaves(gradient)) > 0, stage
+
+
+@pytest.mark.parametrize("padded", [0, 1, 2])
+def test_a_padded_view_changes_nothing_in_the_valid_ones(padded):
+    valid = jnp.ones(3, bool).at[padded].set(False)
+    base = replace(chunk(), valid=valid)
+    other = replace(
+        base,
+        images=base.images.at[padded].set(chunk(5).images[0]),
+        viewmats=base.viewmats.at[padded].set(turned(0.3)[1]),
+        Ks=base.Ks.at[padded, 0, 0].set(90.0),
+    )
+    kept = jnp.array([i for i in range(3) if i != padded])
+    a, b = (predict()(params(), warm_cache(), c) for c in (base, other))
+    for name in ("depths", "confidences", "history"):
+        np.testing.assert_array_equal(getattr(a.output, name)[kept], getattr(b.output, name)[kept])
+    rows = np.flatnonzero(a.tokens.valid)
+    assert len(rows) == 2 * 42
+    for name in ("means", "feats", "confidences", "rgbs", "footprints"):
+        np.testing.assert_array_equal(getattr(a.tokens, name)[rows], getattr(b.tokens, name)[rows])
+    # The views do differ where it counts when the view is real.
+    c, d = (predict()(params(), warm_cache(), replace(x, valid=jnp.ones(3, bool))) for x in (base, other))
+    assert float(jnp.abs(c.tokens.feats[rows] - d.tokens.feats[rows]).max()) > 1e-3
+
+
+def test_padded_views_and_cells_outside_the_image_offer_no_token():
+    prediction = predict()(params(), warm_cache(), replace(chunk(), valid=jnp.array([True, True, False])))
+    np.testing.assert_array_equal(prediction.tokens.valid, prediction.views.inside.reshape(-1))
+    np.testing.assert_array_equal(np.asarray(prediction.tokens.confidences)[~np.asarray(prediction.tokens.valid)], 0)
+
+
+def test_a_chunk_of_padding_leaves_the_memory_as_it_was():
+    empty = replace(chunk(3), valid=jnp.zeros(3, bool))
+    after, output = step()(params(), warm_cache(), empty)
+    np.testing.assert_array_equal(output.confidences, 0)
+    for name in ("voxels", "counts", "num_voxels", "means", "feats", "confidences", "num_members"):
+        np.testing.assert_array_equal(getattr(after, name), getattr(warm_cache(), name))
+
+
+def test_the_cache_is_read_and_remembered():
+    assert int(warm_cache().num_voxels) > 0
+    history = predict()(params(), warm_cache(), chunk()).output.history
+    assert float((history > 0).mean()) > 0.05
+    blank = predict()(params(), MODEL.init_cache(), chunk())
+    np.testing.assert_array_equal(blank.output.history, 0)
+
+
+@pytest.mark.parametrize(
+    "changes", [{"num_depths": 1}, {"chunk_size": 1}, {"num_sources": 1, "fine_matching": False}], ids=str
+)
+def test_the_smallest_configurations_run(changes):
+    config = CONFIG.replace(**changes)
+    model = StreamSplat(config)
+    weights = perturbed(jax.jit(model.init)(jax.random.key(1)))
+    cache, output = jax.jit(model.step)(weights, model.init_cache(), chunk(views=config.chunk_size))
+    assert finite((cache, output)) and int(cache.num_voxels) > 0
+    assert finite(model.decode(weights, cache))

@@ -1,0 +1,118 @@
+"""Every line of the `Limits:` blocks of numerics and layers; those of geometry are tested in tests/geometry."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ssplat_jax.model.layers import attend, average_pool, instance_norm, unit_features
+from ssplat_jax.numerics import safe_log, safe_normalize, softplus_inverse
+
+ULP = float(np.finfo(np.float32).eps)
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-30, 1e-13, 1e-12])
+def test_safe_normalize_of_nothing_is_zero_with_a_zero_gradient(size):
+    x = jnp.full((2, 3), size, jnp.float32)
+    np.testing.assert_array_equal(safe_normalize(x), 0)
+    np.testing.assert_array_equal(jax.grad(lambda v: jnp.sum(safe_normalize(v) * jnp.arange(3.0)))(x), 0)
+
+
+@pytest.mark.parametrize("size", [1.1e-10, 1e-5, 1.0, 1e10, 0.9e30])
+@pytest.mark.parametrize("width", [2, 3, 4, 32])
+def test_safe_normalize_length_is_one_within_four_ulp(size, width):
+    rng = np.random.default_rng(width)
+    x = rng.uniform(-1, 1, (500, width))
+    x = x / np.abs(x).max(-1, keepdims=True) * size
+    unit = np.asarray(safe_normalize(jnp.asarray(x, jnp.float32)), np.float64)
+    assert np.abs(np.linalg.norm(unit, axis=-1) - 1).max() < 4 * ULP
+    np.testing.assert_allclose(unit, x / np.linalg.norm(x, axis=-1, keepdims=True), atol=4 * ULP)
+
+
+def test_safe_normalize_gradient_is_the_projection_beside_the_direction():
+    x = np.array([0.3, -0.4, 1.2])
+    unit, length = x / np.linalg.norm(x), np.linalg.norm(x)
+    got = jax.jacobian(safe_normalize)(jnp.asarray(x, jnp.float32))
+    np.testing.assert_allclose(got, (np.eye(3) - np.outer(unit, unit)) / length, atol=1e-6)
+
+
+def test_safe_log_is_the_logarithm_above_its_floor():
+    x = np.array([1.01e-12, 1e-6, 0.5, 1.0, 1e30])
+    np.testing.assert_allclose(safe_log(jnp.asarray(x, jnp.float32)), np.log(x), rtol=1e-5, atol=1e-7)
+    np.testing.assert_allclose(jax.grad(lambda v: safe_log(v).sum())(jnp.asarray(x, jnp.float32)), 1 / x, rtol=1e-5)
+
+
+def test_safe_log_below_its_floor_is_the_floor_with_a_zero_gradient():
+    x = jnp.array([1e-12, 1e-20, 0.0, -1.0, -jnp.inf])
+    np.testing.assert_allclose(safe_log(x), np.log(1e-12), rtol=1e-6)
+    np.testing.assert_array_equal(jax.grad(lambda v: safe_log(v).sum())(x), 0)
+    np.testing.assert_allclose(safe_log(x, eps=0.1), np.log(0.1), rtol=1e-6)
+
+
+@pytest.mark.parametrize("y", [1e-9, 1e-3, 0.1, 1.0, 20.0, 500.0])
+def test_softplus_inverse(y):
+    x = softplus_inverse(y)
+    assert np.logaddexp(0.0, x) == pytest.approx(y, rel=1e-9)
+
+
+def test_instance_norm_of_a_constant_channel_is_zero_with_a_finite_gradient():
+    x = jnp.ones((2, 4, 4, 3)).at[..., 1].set(7e3)
+    np.testing.assert_array_equal(instance_norm(x), 0)
+    assert np.isfinite(jax.grad(lambda v: jnp.sum(instance_norm(v) ** 2 + instance_norm(v)))(x)).all()
+
+
+def test_instance_norm_has_zero_mean_and_unit_biased_variance_per_image_and_channel():
+    x = np.random.default_rng(0).normal(3.0, 5.0, (2, 6, 5, 4))
+    got = np.asarray(instance_norm(jnp.asarray(x, jnp.float32)), np.float64)
+    np.testing.assert_allclose(got.mean((1, 2)), 0, atol=1e-6)
+    np.testing.assert_allclose(got.var((1, 2)), 1, atol=1e-5)
+
+
+def attention_arrays(seed=0):
+    rng = np.random.default_rng(seed)
+    shape = lambda n: jnp.asarray(rng.normal(size=(2, n, 2, 4)), jnp.float32)  # noqa: E731
+    return shape(5), shape(7), shape(7)
+
+
+def test_attention_is_the_softmax_average():
+    q, k, v = (np.asarray(x, np.float64) for x in attention_arrays())
+    scores = np.einsum("bqhc,bkhc->bhqk", q, k) / np.sqrt(4)
+    weights = np.exp(scores) / np.exp(scores).sum(-1, keepdims=True)
+    wanted = np.einsum("bhqk,bkhc->bqhc", weights, v)
+    np.testing.assert_allclose(attend(*attention_arrays()), wanted, atol=1e-6)
+
+
+def test_attention_to_no_valid_key_is_zero_with_a_zero_gradient():
+    q, k, v = attention_arrays()
+    none = jnp.zeros((2, 7), bool)
+    np.testing.assert_array_equal(attend(q, k, v, none), 0)
+    for gradient in jax.grad(lambda *x: jnp.sum(attend(*x, none) ** 2 + attend(*x, none)), (0, 1, 2))(q, k, v):
+        np.testing.assert_array_equal(gradient, 0)
+
+
+def test_attention_never_hears_invalid_keys():
+    q, k, v = attention_arrays()
+    valid = jnp.broadcast_to(jnp.array([True, False, True, True, False, True, False]), (2, 7))
+    loud = jnp.where(valid[..., None, None], 0.0, 1e6)
+    np.testing.assert_array_equal(attend(q, k, v, valid), attend(q, k + loud, v - loud, valid))
+    keep = np.flatnonzero(valid[0])
+    np.testing.assert_allclose(attend(q, k, v, valid), attend(q, k[:, keep], v[:, keep]), atol=1e-6)
+
+
+def test_attention_of_huge_scores_is_finite():
+    q, k, v = attention_arrays()
+    out = attend(1e15 * q, 1e15 * k, v)
+    assert np.isfinite(out).all() and np.abs(out).max() <= np.abs(v).max() * (1 + 1e-6)
+
+
+def test_unit_features_have_cosines_as_dot_products_and_zero_stays_zero():
+    x = jnp.asarray(np.random.default_rng(0).normal(size=(9, 5)) * 1e4, jnp.float32).at[3].set(0.0)
+    unit = unit_features(x)
+    np.testing.assert_array_equal(unit[3], 0)
+    np.testing.assert_allclose(np.delete(np.linalg.norm(unit, axis=-1), 3), 1, atol=1e-6)
+
+
+def test_average_pool_is_the_mean_of_patches():
+    x = np.random.default_rng(0).normal(size=(2, 4, 6, 3)).astype(np.float32)
+    wanted = [[x[:, 2 * i : 2 * i + 2, 2 * j : 2 * j + 2].mean((1, 2)) for j in range(3)] for i in range(2)]
+    np.testing.assert_allclose(average_pool(jnp.asarray(x), 2), np.moveaxis(np.array(wanted), 2, 0), atol=1e-6)

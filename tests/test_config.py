@@ -1,0 +1,115 @@
+"""The configuration: what is refused, what identifies it, and that it needs no JAX."""
+
+import dataclasses
+import subprocess
+import sys
+
+import pytest
+
+from ssplat_jax.config import PRESETS, StreamConfig, preset
+from ssplat_jax.errors import InputError
+
+BAD = [
+    {"chunk_size": 0},
+    {"num_depths": 0},
+    {"voxel_size": 0.0},
+    {"voxel_size": -1.0},
+    {"voxel_size": float("nan")},
+    {"pivots_per_voxel": 0},
+    {"capacity": 64},
+    {"capacity": 1000},
+    {"min_confidence": 1.5},
+    {"min_confidence": float("nan")},
+    {"sigma0": 0.0},
+    {"lambda_sigma": -0.1},
+    {"cluster_ratio": 1.0},
+    {"sh_degree": 4},
+    {"scene_scale": 0.0},
+    {"scene_scale": "big"},
+    {"overflow": "grwo"},
+    {"anchor_space": "linear"},
+    {"depth_readout": ""},
+]
+
+
+@pytest.mark.parametrize("changes", BAD, ids=str)
+def test_bad_value_is_refused_by_name_with_what_came(changes):
+    ((name, value),) = changes.items()
+    # Past the type checks that the tests switch on: users do not have them.
+    config = object.__new__(StreamConfig)
+    for field in dataclasses.fields(StreamConfig):
+        object.__setattr__(config, field.name, changes.get(field.name, field.default))
+    with pytest.raises(InputError, match=rf"config: {name} must be .*got {value!r}"):
+        config.__post_init__()
+
+
+def test_replacing_checks_what_it_builds():
+    with pytest.raises(InputError, match="voxel_size"):
+        StreamConfig().replace(voxel_size=-1.0)
+
+
+def test_unknown_field_is_refused_and_the_known_ones_are_listed():
+    with pytest.raises(InputError, match=r"no field 'voxelsize'.*voxel_size"):
+        StreamConfig().replace(voxelsize=1.0)
+
+
+def test_dictionary_and_back_is_the_same_configuration():
+    config = StreamConfig().replace(encoder_widths=(8, 16), scene_scale=0.5, overflow="error")
+    again = StreamConfig.from_dict(config.to_dict())
+    assert again == config and again.hash == config.hash and hash(again) == hash(config)
+
+
+def test_every_field_changes_the_hash():
+    base = StreamConfig()
+    other = {
+        bool: lambda x: not x,
+        int: lambda x: 2 * x + 1,
+        float: lambda x: 0.5 * x + 0.7,
+        tuple: lambda x: (x[0] + 8, *x[1:]),
+    }
+    chosen = {
+        "preset": "other",
+        "scene_scale": 3.0,
+        "depth_readout": "window",
+        "anchor_space": "metric",
+        "anchor_norm": "mass",
+        "confidence": "window",
+        "scale_mode": "absolute",
+        "vacc": "append",
+        "capacity": 128,
+        "overflow": "error",
+        "merge_key": "feature",
+        "merge_weight": "count",
+    }
+    hashes = {base.hash}
+    for field in dataclasses.fields(base):
+        value = getattr(base, field.name)
+        changed = chosen[field.name] if field.name in chosen else other[type(value)](value)
+        hashes.add(base.replace(**{field.name: changed}).hash)
+    assert len(hashes) == 1 + len(dataclasses.fields(base))
+
+
+def test_presets_carry_their_name_and_unknown_ones_are_refused():
+    for name, config in PRESETS.items():
+        assert preset(name) is config and config.preset == name
+    with pytest.raises(InputError, match=r"no preset 'huge'; there is .*tiny"):
+        preset("huge")
+
+
+def test_help_needs_no_jax():
+    """The package, its configuration, recipes and errors load without JAX: `--help` answers in well under a second."""
+    code = (
+        "import sys, ssplat_jax, ssplat_jax.config, ssplat_jax.errors, ssplat_jax.train.recipe; "
+        "sys.exit('jax' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], timeout=60).returncode == 0
+
+
+def test_the_public_names_are_all_there():
+    import ssplat_jax
+
+    for name in ssplat_jax.__all__:
+        assert getattr(ssplat_jax, name) is not None
+    assert callable(ssplat_jax.render)  # the function, not the package of the same name
+    with pytest.raises(AttributeError, match="no attribute 'renders'"):
+        _ = ssplat_jax.renders
