@@ -11,6 +11,8 @@ Names are imported on first use, so that `ssplat --help` answers without loading
 """
 
 import importlib
+import sys
+import types
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -56,18 +58,31 @@ _HOMES = {
     "save_ply": "export.ply",
 }
 __version__ = "0.1.0"
-__all__ = sorted(_HOMES)  # noqa: PLE0605
+__all__ = sorted(_HOMES)
 
 
 def __getattr__(name: str):
     if name not in _HOMES:
         raise AttributeError(f"module 'ssplat_jax' has no attribute {name!r}")
     home = importlib.import_module(f"ssplat_jax.{_HOMES[name]}")
-    value = getattr(home, name)
-    # Set as an attribute: `render` names a function here and a package below, and the function wins.
-    globals()[name] = value
+    globals()[name] = value = getattr(home, name)
     return value
 
 
 def __dir__() -> list[str]:
     return [*__all__, "__version__"]
+
+
+class _Package(types.ModuleType):
+    """`render` names a function here and a package below; the function wins, whichever was imported first."""
+
+    @property
+    def render(self):
+        return importlib.import_module("ssplat_jax.render.api").render
+
+    @render.setter
+    def render(self, package) -> None:
+        """Where the import system would put the package."""
+
+
+sys.modules[__name__].__class__ = _Package

@@ -38,8 +38,7 @@ class Demo:
         from ssplat_jax.demo import run_demo
         from ssplat_jax.report import Reporter
 
-        with Reporter(self.quiet) as reporter:
-            run_demo(self.scene, self.out, reporter)
+        run_demo(self.scene, self.out, Reporter(self.quiet))
         print(f"wrote {self.out}/scene.ply, metrics.json and pictures")
         return 0
 
@@ -101,19 +100,18 @@ class Run:
         from ssplat_jax.report import Reporter
 
         model, params = load_model(self.weights, self.set)
-        with Reporter(self.quiet) as reporter:
-            result = run_capture(
-                model,
-                params,
-                self.capture,
-                self.out,
-                size=parse_size(self.size),
-                stride=self.stride,
-                max_views=self.max_views,
-                save_every=self.save_every,
-                overwrite=self.overwrite,
-                reporter=reporter,
-            )
+        result = run_capture(
+            model,
+            params,
+            self.capture,
+            self.out,
+            size=parse_size(self.size),
+            stride=self.stride,
+            max_views=self.max_views,
+            save_every=self.save_every,
+            overwrite=self.overwrite,
+            reporter=Reporter(self.quiet),
+        )
         if result.interrupted:
             print(f"stopped after {result.num_views} views; the same command continues", file=sys.stderr)
             return 128 + result.interrupted
@@ -159,8 +157,7 @@ class Eval:
         model, params = load_model(self.weights, self.set)
         capture = open_capture(self.capture, size=parse_size(self.size))
         split = choose_split(self.protocol, len(capture), self.stride, self.context, self.targets)
-        with Reporter(self.quiet) as reporter, reporter.progress("streaming", len(split.context)) as advance:
-            metrics = evaluate(Session(model, params), capture, split, self.out, advance)
+        metrics = evaluate(Session(model, params), capture, split, self.out, Reporter(self.quiet))
         reference = metrics["baselines"]
         print(
             f"{capture.name}: PSNR {metrics['psnr']:.2f} dB, SSIM {metrics['ssim']:.3f} over {metrics['target_views']}"
@@ -203,7 +200,7 @@ class Train:
         config = apply_changes(preset(self.preset), self.set)
         recipe = dataclasses.replace(RECIPES[self.preset].scaled(self.scale_steps), seed=self.seed)
         params = load_weights(self.init_weights)[0] if self.init_weights else None
-        with Reporter(self.quiet) as reporter, reporter.progress("training", recipe.num_steps) as advance:
+        with Reporter(self.quiet).progress("training", recipe.num_steps) as advance:
             result = train(
                 config,
                 recipe,

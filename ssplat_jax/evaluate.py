@@ -18,6 +18,7 @@ from ssplat_jax.data.protocol import Split
 from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.metrics import SSIM_ARGUMENTS, psnr, ssim
 from ssplat_jax.render import render
+from ssplat_jax.report import Reporter
 from ssplat_jax.session import Session
 
 LATENCY_CHUNKS = 4  # the last chunks are fed again to the full cache, each this often, to time them warm
@@ -132,7 +133,7 @@ def evaluate(
     capture: Capture,
     split: Split,
     out: Path,
-    on_chunk: Callable[[int], None] = lambda n: None,
+    reporter: Reporter | None = None,
 ) -> dict:
     """Streams, scores and times; writes `metrics.json` and a picture per target (target | render | depth) into `out`.
 
@@ -145,7 +146,8 @@ def evaluate(
     capture.verify((*split.context, *split.targets))
     frame = capture.stream_frame(session.model.config, split.context)
     reference = baselines(capture, split)
-    recent = stream_context(session, capture, split, frame, on_chunk)
+    with (reporter or Reporter(quiet=True)).progress("streaming", len(split.context)) as advance:
+        recent = stream_context(session, capture, split, frame, advance)
     gaussians = session.gaussians()
     facts = cache_facts(session)
     out.mkdir(parents=True, exist_ok=True)

@@ -42,7 +42,7 @@ def ssim(image: Float[np.ndarray, "_ _ 3"], target: Float[np.ndarray, "_ _ 3"]) 
         InputError: the images differ in size or have a side below 11 pixels, the window's.
     """
     image, target = _comparable(image, target, SSIM_ARGUMENTS["win_size"])
-    return float(structural_similarity(image, target, **SSIM_ARGUMENTS))
+    return float(structural_similarity(image, target, **SSIM_ARGUMENTS))  # pyright: ignore[reportArgumentType]
 
 
 def _comparable(image, target, min_side: int):

@@ -14,12 +14,6 @@ class Reporter:
     def __init__(self, quiet: bool = False) -> None:
         self.console = Console(stderr=True, quiet=quiet)
 
-    def __enter__(self) -> "Reporter":
-        return self
-
-    def __exit__(self, *_) -> None:
-        pass
-
     @contextlib.contextmanager
     def progress(self, name: str, total: int) -> Iterator[Callable[..., None]]:
         """A bar of `total` steps; gives `advance(done, note="")`."""

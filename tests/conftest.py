@@ -1,8 +1,12 @@
 """What all tests share: shapes and types checked at every call, strict dtypes, and where the real captures are."""
 
+import os
 from pathlib import Path
 
 from jaxtyping import install_import_hook
+
+# Laws to the last bit are laws of the CPU backend; set the variable to test another.
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
 
 # Before anything of the package is imported: every annotated signature of it is checked at run time.
 install_import_hook("ssplat_jax", "beartype.beartype")

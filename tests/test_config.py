@@ -3,6 +3,7 @@
 import dataclasses
 import subprocess
 import sys
+from typing import Literal, get_args, get_origin
 
 import pytest
 
@@ -61,30 +62,22 @@ def test_dictionary_and_back_is_the_same_configuration():
 
 def test_every_field_changes_the_hash():
     base = StreamConfig()
-    other = {
+    change = {
         bool: lambda x: not x,
-        int: lambda x: 2 * x + 1,
+        int: lambda x: 2 * x,
         float: lambda x: 0.5 * x + 0.7,
         tuple: lambda x: (x[0] + 8, *x[1:]),
     }
-    chosen = {
-        "preset": "other",
-        "scene_scale": 3.0,
-        "depth_readout": "window",
-        "anchor_space": "metric",
-        "anchor_norm": "mass",
-        "confidence": "window",
-        "scale_mode": "absolute",
-        "vacc": "append",
-        "capacity": 128,
-        "overflow": "error",
-        "merge_key": "feature",
-        "merge_weight": "count",
-    }
+    by_name = {"preset": "other", "scene_scale": 3.0, "sh_degree": 3}
     hashes = {base.hash}
     for field in dataclasses.fields(base):
         value = getattr(base, field.name)
-        changed = chosen[field.name] if field.name in chosen else other[type(value)](value)
+        if field.name in by_name:
+            changed = by_name[field.name]
+        elif get_origin(field.type) is Literal:
+            changed = next(option for option in get_args(field.type) if option != value)
+        else:
+            changed = change[type(value)](value)
         hashes.add(base.replace(**{field.name: changed}).hash)
     assert len(hashes) == 1 + len(dataclasses.fields(base))
 

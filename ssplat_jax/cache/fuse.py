@@ -45,12 +45,17 @@ class Touched:
 
 @pytree
 class Plan:
-    """Where every token goes, in the order in which they are placed: voxel by voxel, in a voxel by arrival."""
+    """Where every token goes."""
 
-    order: Int[Array, " m"]  # token at each position
-    rows: Int[Array, " m"]  # its row, -1 where it has none
-    slots: Int[Array, " m"]  # pivots that the voxel will have been given before it; merges from K on
-    is_first: Bool[Array, " m"]  # first of its row
+    rows: Int[Array, " m"]  # -1 where it has none
+    slots: Int[Array, " m"]  # tokens that its row will have been given before it; from K on it merges
+    leaders: Int[Array, " m"]  # the first token of the same row
+    order: Int[Array, " m"]  # tokens row by row, in a row by arrival
+
+    @property
+    def is_first(self) -> Bool[Array, " m"]:
+        """Which tokens are the first of their row."""
+        return (self.rows >= 0) & (self.leaders == jnp.arange(self.rows.shape[0]))
 
 
 def fuse(cache: VoxelCache, tokens: Tokens, config: StreamConfig) -> VoxelCache:
@@ -82,7 +87,7 @@ def fuse_touched(cache: VoxelCache, tokens: Tokens, config: StreamConfig) -> tup
     new = _new_pivots(tokens, cache)
     appends = jnp.where(plan.slots < config.pivots_per_voxel, plan.rows, -1)
     counts = cache.counts.at[_drop_negative(appends, cache.capacity)].max(plan.slots + 1, mode="drop")
-    pivots = _write(pivots, appends, plan.slots, {name: x[plan.order] for name, x in new.items()})
+    pivots = _write(pivots, appends, plan.slots, new)
     if config.vacc == "voxel":
         pivots = _merge_all(pivots, new, plan, config)
     num_placed = jnp.sum(plan.rows >= 0, dtype=jnp.int32)
@@ -129,20 +134,20 @@ def _place_in_voxels(
     rows = find_rows(cache.table, cache.voxels, voxels, is_leader)
     cache, rows, num_evicted = _add_rows(cache, voxels, rows, is_leader & (rows < 0), config)
     rows = jnp.where(accepted, rows[leaders], -1)
-    order = _order_by_leader(jnp.where(accepted, leaders, tokens.shape[0]))
-    rows, is_first = rows[order], is_leader[order] & (rows[order] >= 0)
+    order = _stable_order(jnp.where(accepted, leaders, tokens.shape[0]))
     ranks = tokens - jax.lax.cummax(jnp.where(is_leader[order], tokens, 0))
-    return cache, Plan(order=order, rows=rows, slots=cache.counts[rows] + ranks, is_first=is_first), num_evicted
+    ranks = jnp.zeros_like(ranks).at[order].set(ranks, unique_indices=True)
+    return cache, Plan(rows=rows, slots=cache.counts[rows] + ranks, leaders=leaders, order=order), num_evicted
 
 
-def _order_by_leader(leaders: Int[Array, " m"]) -> Int[Array, " m"]:
-    """Stable order of tokens by their leader, 0 .. m."""
-    m = leaders.shape[0]
-    tokens = jnp.arange(m, dtype=jnp.uint32)
+def _stable_order(keys: Int[Array, " m"]) -> Int[Array, " m"]:
+    """Stable argsort of `m` keys in 0 .. m."""
+    m = keys.shape[0]
+    indices = jnp.arange(m, dtype=jnp.uint32)
     if (m + 1) * m <= 2**32:
-        # Both numbers in one word: XLA's CPU sort of one array is 6 x as fast as that of a pair.
-        return (jnp.sort(leaders.astype(jnp.uint32) * m + tokens) % m).astype(jnp.int32)
-    return jax.lax.sort((leaders, tokens.astype(jnp.int32)), num_keys=2, is_stable=False)[1]
+        # Key and index in one word: XLA's CPU sort of one array is 6 x as fast as that of a pair.
+        return (jnp.sort(keys.astype(jnp.uint32) * m + indices) % m).astype(jnp.int32)
+    return jax.lax.sort((keys, indices.astype(jnp.int32)), num_keys=2, is_stable=False)[1]
 
 
 def _place_at_end(
@@ -159,12 +164,9 @@ def _place_at_end(
     has_room = accepted & (flat < cache.capacity * k)
     rows, slots = jnp.where(has_room, flat // k, -1), flat % k
     num_voxels = jnp.maximum(cache.num_voxels, jnp.max(rows, initial=-1) + 1)
-    plan = Plan(
-        order=jnp.arange(accepted.shape[0], dtype=jnp.int32),
-        rows=rows,
-        slots=slots,
-        is_first=has_room & ((slots == 0) | (flat == num_pivots)),
-    )
+    tokens = jnp.arange(accepted.shape[0], dtype=jnp.int32)
+    is_first = has_room & ((slots == 0) | (flat == num_pivots))
+    plan = Plan(rows=rows, slots=slots, leaders=jax.lax.cummax(jnp.where(is_first, tokens, 0)), order=tokens)
     return replace(cache, num_voxels=num_voxels), plan, jnp.zeros((), jnp.int32)
 
 
@@ -194,36 +196,33 @@ def _add_rows(cache, voxels, rows, is_new, config):
 
 
 def _new_pivots(tokens: Tokens, cache: VoxelCache) -> dict[str, Array]:
-    """Every token as a pivot of its own."""
+    """Every token as a pivot of its own, in the precision of the cache."""
     m = tokens.means.shape[0]
-    fields = {name: getattr(tokens, name) for name in PIVOT_FIELDS if hasattr(tokens, name)}
-    return fields | {
+    values = {name: getattr(tokens, name) for name in PIVOT_FIELDS if hasattr(tokens, name)} | {
         "seeds": tokens.feats,
         "num_members": jnp.ones((m,), jnp.int32),
         "last_chunks": jnp.broadcast_to(cache.stats.num_chunks, (m,)),
     }
+    return {name: x.astype(getattr(cache, name).dtype) for name, x in values.items()}
 
 
 def _merge_all(pivots: dict[str, Array], new: dict[str, Array], plan: Plan, config: StreamConfig) -> dict[str, Array]:
     """Round r merges the r-th surplus token of every voxel that has one, voxels with most of them first."""
     m, k = plan.order.shape[0], config.pivots_per_voxel
     is_surplus = (plan.rows >= 0) & (plan.slots >= k)
-    groups = jnp.cumsum(plan.is_first, dtype=jnp.int32) - 1
-    positions = jnp.arange(m, dtype=jnp.int32)
-    groups = jnp.where(is_surplus, groups, m)
-    sizes = jnp.zeros((m,), jnp.int32).at[groups].add(1, mode="drop")
-    starts = jnp.full((m,), m, jnp.int32).at[groups].min(positions, mode="drop")
-    sizes, _, starts = jax.lax.sort((-sizes, positions, starts), num_keys=2, is_stable=False)
-    largest_block = MERGE_BLOCKS[0][0]
-    sizes = jnp.pad(-sizes, (0, largest_block))
-    starts = jnp.pad(starts, (0, largest_block))
+    sizes = jnp.zeros((m,), jnp.int32).at[jnp.where(is_surplus, plan.leaders, m)].add(1, mode="drop")
+    places = jnp.zeros((m,), jnp.int32).at[plan.order].set(jnp.arange(m, dtype=jnp.int32), unique_indices=True)
+    starts = places + jnp.maximum(k - plan.slots, 0)  # of leaders: where the surplus of their voxel begins
+    by_size = _stable_order(m - sizes)
+    sizes, starts = (jnp.pad(x[by_size], (0, MERGE_BLOCKS[0][0])) for x in (sizes, starts))
 
     def merge_block(block, state):
         pivots, round_idx, first = state
         sizes_here = jax.lax.dynamic_slice(sizes, (first,), (block,))
-        positions = jnp.minimum(jax.lax.dynamic_slice(starts, (first,), (block,)) + round_idx, m - 1)
-        rows = jnp.where(sizes_here > round_idx, plan.rows[positions], -1)
-        arrivals = {name: x[plan.order[positions]] for name, x in new.items()}
+        positions = jax.lax.dynamic_slice(starts, (first,), (block,)) + round_idx
+        tokens = plan.order[jnp.minimum(positions, m - 1)]
+        rows = jnp.where(sizes_here > round_idx, plan.rows[tokens], -1)
+        arrivals = {name: x[tokens] for name, x in new.items()}
         pivots = _merge_closest(pivots, arrivals, rows, config)
         is_over = sizes[first + block] <= round_idx
         return pivots, round_idx + is_over.astype(jnp.int32), jnp.where(is_over, 0, first + block)

@@ -61,7 +61,7 @@ def from_arrays(cache: VoxelCache) -> dict:
     return {"capacity": cache.capacity, "rows": [(tuple(v), p) for v, p in zip(voxels, pivots, strict=False)]}
 
 
-def voxel_of(point: np.ndarray, voxel_size: float) -> tuple[int, int, int] | None:
+def voxel_of(point: np.ndarray, voxel_size: float) -> tuple[int, ...] | None:
     """Index triple of a float32 point; None out of range."""
     with np.errstate(all="ignore"):
         cells = np.floor(np.float32(point) * np.float32(1.0 / voxel_size))
@@ -123,7 +123,7 @@ def merge_closest(pivots: list, new: dict, config: StreamConfig) -> None:
     """Adds `new` to the full list `pivots` and merges the closest pair, in place."""
     key = {"seed": "seeds", "feature": "feats"}[config.merge_key]
     candidates = [*pivots, new]
-    best, best_score = None, -math.inf
+    best, best_score = (0, 1), -math.inf
     for i, j in itertools.combinations(range(len(candidates)), 2):
         score = similarity(candidates[i][key], candidates[j][key])
         if score > best_score:
@@ -166,37 +166,47 @@ def merge(older: dict, newer: dict, config: StreamConfig) -> dict:
 
 
 def project(cache: dict, viewmats, Ks, height: int, width: int, config: StreamConfig) -> tuple:
-    """Depths, confidences, features, mask of each view, and how close any decision in it was (see `margin`)."""
+    """Depths, confidences, features and mask of each view, and the margin of the closest decision made on the way.
+
+    Where the margin (pixels, log depths) is within rounding of 0, another precision may decide otherwise.
+    """
     pivots = [pivot for _, row in cache["rows"] for pivot in row]
-    width_feats = len(pivots[0]["feats"]) if pivots else config.token_width
-    window = math.log(config.cluster_ratio)
     shape = (len(viewmats), height, width)
     depths, confidences, mask = np.zeros(shape), np.zeros(shape), np.zeros(shape, bool)
-    feats, margin = np.zeros((*shape, width_feats)), math.inf
-    for v, (viewmat, K) in enumerate(zip(np.float64(viewmats), np.float64(Ks), strict=True)):
-        on_pixel: dict = {}
-        for pivot in pivots:
-            x, y, z = viewmat[:3, :3] @ pivot["means"] + viewmat[:3, 3]
-            if pivot["confidences"] <= 0:
-                continue
-            margin = min(margin, abs(z - NEAR))
-            if z <= NEAR:
-                continue
-            column, row = K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
-            margin = min(margin, abs(column - round(column)), abs(row - round(row)))
-            if 0 <= column < width and 0 <= row < height:
-                on_pixel.setdefault((math.floor(row), math.floor(column)), []).append((math.log(z), pivot))
-        for pixel, pairs in on_pixel.items():
-            front = min(ell for ell, _ in pairs)
-            members = [(ell, p["confidences"]) for ell, p in pairs if ell <= front + window]
-            centre = sum(w * ell for ell, w in members) / sum(w for _, w in members)
-            for ell, _ in pairs:
-                margin = min(margin, abs(ell - front - window), abs(abs(ell - centre) - window))
-            cluster = [(ell, p) for ell, p in pairs if abs(ell - centre) <= window]
+    feats, margins = np.zeros((*shape, config.token_width)), [math.inf]
+    for v in range(len(viewmats)):
+        viewmat, K = np.asarray(viewmats[v], np.float64), np.asarray(Ks[v], np.float64)
+        for (row, column), pairs in _on_pixels(pivots, viewmat, K, height, width, margins).items():
+            cluster = _front_cluster(pairs, math.log(config.cluster_ratio), margins)
             total = sum(p["confidences"] for _, p in cluster)
-            at = (v, *pixel)
+            at = (v, row, column)
             mask[at] = True
             depths[at] = math.exp(sum(p["confidences"] * ell for ell, p in cluster) / total)
             confidences[at] = sum(p["confidences"] ** 2 for _, p in cluster) / total
             feats[at] = sum(p["confidences"] * p["feats"] for _, p in cluster) / total
-    return depths, confidences, feats, mask, margin
+    return depths, confidences, feats, mask, min(margins)
+
+
+def _on_pixels(pivots, viewmat, K, height, width, margins) -> dict:
+    """(log depth, pivot) of what is seen, by pixel (row, column)."""
+    pixels: dict = {}
+    for pivot in pivots:
+        x, y, z = viewmat[:3, :3] @ pivot["means"] + viewmat[:3, 3]
+        margins.append(abs(z - NEAR))
+        if z <= NEAR or pivot["confidences"] <= 0:
+            continue
+        column, row = K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
+        margins += [abs(column - round(column)), abs(row - round(row))]
+        if 0 <= column < width and 0 <= row < height:
+            pixels.setdefault((math.floor(row), math.floor(column)), []).append((math.log(z), pivot))
+    return pixels
+
+
+def _front_cluster(pairs, window, margins) -> list:
+    """The front window of the pairs on one pixel, re-centred once."""
+    front = min(ell for ell, _ in pairs)
+    members = [(ell, p["confidences"]) for ell, p in pairs if ell <= front + window]
+    centre = sum(w * ell for ell, w in members) / sum(w for _, w in members)
+    margins += [abs(ell - front - window) for ell, _ in pairs]
+    margins += [abs(abs(ell - centre) - window) for ell, _ in pairs]
+    return [(ell, p) for ell, p in pairs if abs(ell - centre) <= window]

@@ -45,7 +45,8 @@ def save_state(path: Path, cache: VoxelCache, header: dict[str, Any]) -> None:
     partial = path.with_name(path.name + ".partial")
     try:
         with open(partial, "w+b") as file:
-            np.savez(file, header=text, **{name: _as_bits(x) for name, x in leaves.items()})
+            arrays = {"header": text} | {name: _as_bits(x) for name, x in leaves.items()}
+            np.savez(file, **arrays)  # pyright: ignore[reportArgumentType]
             _seal(file)
             os.fsync(file.fileno())
         if path.exists():

@@ -211,17 +211,16 @@ def _procedural(spec: str, size: tuple[int, int] | None) -> Capture:
     from ssplat_jax.data.procedural import procedural_capture_arrays
 
     images, depths, camtoworlds, Ks = procedural_capture_arrays(name, num_frames, height, width, seed=seed)
+    intrinsics = np.stack([Ks[:, 0, 0], Ks[:, 1, 1], Ks[:, 0, 2], Ks[:, 1, 2]], axis=1).astype(np.float64).tolist()
     frames = tuple(
         Frame(
             name=f"{name}/{i:05d}",
             camtoworld=check_camtoworld(camtoworlds[i], f"{spec}: pose {i}")[0],
-            K=check_intrinsics(
-                fx=Ks[i, 0, 0], fy=Ks[i, 1, 1], cx=Ks[i, 0, 2], cy=Ks[i, 1, 2], width=width, height=height, where=spec
-            ),
+            K=check_intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height, where=spec),
             width=width,
             height=height,
         )
-        for i in range(num_frames)
+        for i, (fx, fy, cx, cy) in enumerate(intrinsics)
     )
     pixels = ArrayPixels(images=np.asarray(images, np.float32), depths=np.asarray(depths, np.float32))
     return _capture(Listing(name=f"{PROCEDURAL}-{name}", frames=frames), PROCEDURAL, pixels, size)

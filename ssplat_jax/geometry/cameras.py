@@ -42,8 +42,8 @@ def invert_poses(poses: Float[Array, "*b 4 4"]) -> Float[Array, "*b 4 4"]:
     return jnp.concatenate([jnp.concatenate([rotations, translations[..., None]], axis=-1), bottom], axis=-2)
 
 
-def transform_points(poses: Float[Array, "*b 4 4"], points: Float[Array, "*b n 3"]) -> Float[Array, "*b n 3"]:
-    """Applies rigid transforms to points."""
+def transform_points(poses: Float[Array, "*#b 4 4"], points: Float[Array, "*#b n 3"]) -> Float[Array, "*#b n 3"]:
+    """Applies rigid transforms to points; leading axes broadcast."""
     rotated = jnp.einsum("...ij,...nj->...ni", poses[..., :3, :3], points, precision=jax.lax.Precision.HIGHEST)
     return rotated + poses[..., None, :3, 3]
 
@@ -58,9 +58,9 @@ def unproject(
 
 
 def project_points(
-    points: Float[Array, "*b n 3"], Ks: Float[Array, "*b 3 3"], min_depth: float = 1e-6
-) -> tuple[Float[Array, "*b n 2"], Float[Array, "*b n"]]:
-    """Pixels and z-depths of camera-frame points.
+    points: Float[Array, "*#b n 3"], Ks: Float[Array, "*#b 3 3"], min_depth: float = 1e-6
+) -> tuple[Float[Array, "*#b n 2"], Float[Array, "*#b n"]]:
+    """Pixels and z-depths of camera-frame points; leading axes broadcast.
 
     Limits:
         z <= min_depth is divided as min_depth: callers mask by the returned depth.

@@ -1,4 +1,4 @@
-"""Rotations as unit quaternions, wxyz, and as matrices. Leading axes broadcast; written without vmap (see shapes.py)."""
+"""Rotations as unit quaternions, wxyz, and as matrices. Leading axes broadcast; no vmap (see pyproject.toml)."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -24,7 +24,7 @@ def quats_to_matrices(quats: Float[Array, "*s 4"]) -> Float[Array, "*s 3 3"]:
 
 
 def matrices_to_quats(matrices: Float[Array, "*s 3 3"]) -> Float[Array, "*s 4"]:
-    """Unit quaternions wxyz, w >= 0, of rotation matrices (the largest of four equivalent forms, so none divides by 0)."""
+    """Unit quaternions wxyz, w >= 0, of rotation matrices: the largest of four equal forms, so none divides by 0."""
     m = matrices
     m00, m11, m22 = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
     a, b, c = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]

@@ -36,8 +36,9 @@ def correlate_warped(
     taps: Int[Array, "d n 4"],
     weights: Float[Array, "d n 4"],
 ) -> Float[Array, "d n"]:
-    """Dot products of `reference` with `source` resampled at `taps`: sum_c ref[n, c] sum_t w[d, n, t] src[taps[d, n, t], c].
+    """Dot products of `reference` with `source` resampled at `taps`.
 
+    Entry (d, n) is sum_c reference[n, c] sum_t weights[d, n, t] source[taps[d, n, t], c].
     Differentiable in `reference` and `source`; the sampling positions are constants (ALGORITHM 2.6).
     """
 

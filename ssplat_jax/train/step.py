@@ -127,10 +127,11 @@ def train_step(
     is_finite = jnp.isfinite(norm)
     updates, opt_state = optimizer(recipe).update(gradients, state.opt_state, state.params)
     # Momentum and weight decay would go on moving what is frozen.
-    updates = {name: jax.tree.map(jnp.zeros_like, u) if name in frozen else u for name, u in updates.items()}
+    updates = {name: jax.tree.map(jnp.zeros_like, u) if name in frozen else u for name, u in updates.items()}  # pyright: ignore[reportAttributeAccessIssue]
     params = jax.tree.map(lambda p, u: p - rate * u, state.params, updates)
     # The average warms up: early on it follows the parameters instead of remembering the random start.
-    decay = jnp.minimum(recipe.ema_decay, (1.0 + state.step) / (10.0 + state.step))
+    step = state.step.astype(jnp.float32)
+    decay = jnp.minimum(recipe.ema_decay, (1.0 + step) / (10.0 + step))
     ema = jax.tree.map(lambda e, p: decay * e + (1 - decay) * p, state.ema, params)
     keep = functools.partial(jax.tree.map, lambda new, old: jnp.where(is_finite, new, old))
     new_state = TrainState(

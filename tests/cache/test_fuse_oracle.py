@@ -1,10 +1,13 @@
 """The parallel fuse is the sequential loop: indices, choices and counters exactly, means to float32 rounding."""
 
+import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from tests.cache.streams import CONFIG, recipes, run_both
+from ssplat_jax.cache import init_cache, reference
+from ssplat_jax.cache.fuse import MERGE_BLOCKS
+from tests.cache.streams import CONFIG, WIDTH, assert_equal_to_oracle, fuse, recipes, run_both, to_jax
 
 CONFIGS = {
     "literal": CONFIG,
@@ -23,6 +26,27 @@ FULL = settings(QUICK, max_examples=500)
 @given(streams)
 def test_parallel_fuse_equals_the_loop(name, stream):
     run_both(stream, CONFIGS[name])
+
+
+def test_rounds_of_every_width_equal_the_loop():
+    """More surplus voxels than the largest block, fewer than the smallest, and everything between, in one chunk."""
+    rng = np.random.default_rng(0)
+    repeats = np.concatenate([np.full(3 * MERGE_BLOCKS[0][0] // 2, 6), [7, 9] * 40, [30] * 10, [80]])
+    columns = rng.permutation(np.repeat(np.arange(len(repeats)), repeats))
+    m = len(columns)
+    tokens = {
+        "means": (np.stack([columns, 0 * columns, 0 * columns], axis=-1) + rng.uniform(0.1, 0.9, (m, 3))) / 4,
+        "feats": rng.integers(-2, 3, (m, WIDTH)),
+        "confidences": rng.choice([0.2, 0.5, 0.5, 1.0], m),
+        "rgbs": rng.uniform(size=(m, 3)),
+        "quats": rng.normal(size=(m, 4)),
+        "footprints": rng.uniform(size=m),
+    }
+    tokens = {name: x.astype(np.float32) for name, x in tokens.items()} | {"valid": np.ones(m, bool)}
+    cache, oracle = init_cache(CONFIG, 1024), reference.empty(1024)
+    for _ in range(2):
+        cache, _ = fuse(cache, to_jax(tokens), CONFIG)
+        assert_equal_to_oracle(cache, reference.fuse(oracle, tokens, CONFIG))
 
 
 @pytest.mark.slow

@@ -1,5 +1,7 @@
 """The projection against its NumPy oracle, and ALGORITHM.md section 12, point 6."""
 
+import importlib
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -160,6 +162,19 @@ def test_permuted_pivots_give_the_same_maps():
     np.testing.assert_array_equal(a.mask, b.mask)
     for name in ("depths", "confidences", "feats"):
         np.testing.assert_allclose(getattr(a, name), getattr(b, name), rtol=0, atol=4 * VALUE_RTOL)
+
+
+def test_walking_in_blocks_changes_nothing(monkeypatch):
+    """Blocks so small that rows and pairs take many, the last of them partly empty."""
+    cache, camera = scene(7, CAPACITY - 3, 0.1), cameras(8)
+    whole = jit_project(cache, camera, CONFIG)
+    module = importlib.import_module("ssplat_jax.cache.project")  # the package's `project` is the function
+    monkeypatch.setattr(module, "ROWS_PER_BLOCK", 4)
+    monkeypatch.setattr(module, "PAIRS_PER_BLOCK", 7)
+    blocks = jax.jit(lambda *args: project(*args, CONFIG))(cache, camera)
+    np.testing.assert_array_equal(whole.mask, blocks.mask)
+    for name in ("depths", "confidences", "feats"):
+        np.testing.assert_allclose(getattr(whole, name), getattr(blocks, name), rtol=0, atol=4 * VALUE_RTOL)
 
 
 def test_projection_is_deterministic():

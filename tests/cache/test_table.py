@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ssplat_jax.cache.fuse import _order_by_leader
+from ssplat_jax.cache.fuse import _stable_order
 from ssplat_jax.cache.table import build_table, find_rows, group_equal, insert_rows
 from ssplat_jax.geometry.voxels import INDEX_LIMIT, hash_voxels, voxel_indices
 
@@ -73,7 +73,7 @@ def test_equal_voxels_are_grouped_under_the_first():
 
 
 @pytest.mark.parametrize("num_tokens", [1, 1000, 65535, 65600])
-def test_order_by_leader_is_stable_for_any_number_of_tokens(num_tokens):
-    """65536 is where leader and token no longer fit one 32-bit word together."""
-    leaders = np.minimum(RNG.integers(0, num_tokens + 1, num_tokens) // 7 * 7, num_tokens).astype(np.int32)
-    np.testing.assert_array_equal(_order_by_leader(jnp.asarray(leaders)), np.argsort(leaders, kind="stable"))
+def test_stable_order_holds_for_any_number_of_tokens(num_tokens):
+    """65536 is where key and index no longer fit one 32-bit word together."""
+    keys = np.minimum(RNG.integers(0, num_tokens + 1, num_tokens) // 7 * 7, num_tokens).astype(np.int32)
+    np.testing.assert_array_equal(_stable_order(jnp.asarray(keys)), np.argsort(keys, kind="stable"))

@@ -42,7 +42,7 @@ def test_units_of_training_samples(samples):
 
 def test_parallax_of_training_samples(samples):
     baselines = np.array([relative_baselines(depths, poses) for _, depths, poses, _ in samples])
-    assert baselines.min() > 0.006 and baselines.max() < 0.18
+    assert baselines.min() > 0.006 and baselines.max() < 0.16
     assert np.quantile(baselines, 0.1) < 0.03 and np.quantile(baselines, 0.9) > 0.06
     assert 0.02 < np.median(baselines) < 0.08
 
@@ -111,6 +111,23 @@ def test_clearance_is_the_distance_to_analytic_solids():
     np.testing.assert_allclose(clearance(scene, points), wanted, atol=1e-6)
 
 
+def test_clearance_of_a_stretched_ball_is_a_lower_bound():
+    b = SceneBuilder(np.random.default_rng(0), texture_library())
+    b.shell([0, 0, 0], [9, 9, 9], Finish((0,)), Finish((0,)), Finish((0,)))
+    b.dome(100.0, Finish((0,)))
+    half = np.array([1.0, 0.4, 2.0])
+    b.add("ball", [0, 0, 0], half, Finish((0,)))
+    scene = b.build(focus=[0, 0, 0], orbit_radius=1.0, eye=[0, 0, 0])
+    rng = np.random.default_rng(1)
+    surface = rng.standard_normal((20000, 3))
+    surface = surface / np.linalg.norm(surface, axis=-1, keepdims=True) * half
+    points = rng.uniform(-4, 4, (40, 3))
+    points = points[np.linalg.norm(points / half, axis=-1) > 1]
+    distances = np.linalg.norm(points[:, None] - surface, axis=-1).min(axis=1)
+    free = clearance(scene, points)
+    assert (free > 0).all() and (free <= distances).all()
+
+
 @pytest.mark.parametrize("name", CAPTURES)
 def test_captures_are_smooth_and_free(name):
     images, depths, poses, Ks = procedural_capture_arrays(name, 24, 24, 32)
@@ -120,7 +137,7 @@ def test_captures_are_smooth_and_free(name):
     assert turns.min() > np.cos(np.radians(25))
     steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=-1)
     assert steps.max() < 3 * steps.min()
-    assert np.median(steps) < 0.3 * np.median(depths)
+    assert np.median(steps) < 0.4 * np.median(depths)  # a third of the demo's frames
 
 
 def test_bad_names_are_refused():

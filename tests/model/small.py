@@ -33,17 +33,29 @@ MODEL = StreamSplat(CONFIG)
 HEIGHT, WIDTH = 24, 30  # padded to 32 x 32: cells outside the image are part of every test
 
 
-def perturbed(params: dict, seed: int = 0, size: float = 0.1) -> dict:
-    """Parameters away from the start, where zero-initialised layers would hide what they do."""
-    leaves, treedef = jax.tree.flatten(params)
+def random_params(config: StreamConfig, seed: int = 0) -> dict:
+    """Random parameters: away from the start, where zero-initialised layers would hide what they do.
+
+    Drawn with NumPy for the shapes of `init`: nothing is compiled.
+    """
     rng = np.random.default_rng(seed)
-    return treedef.unflatten([leaf + jnp.asarray(size * rng.normal(size=leaf.shape), jnp.float32) for leaf in leaves])
+
+    def draw(path, leaf):
+        values = rng.normal(size=leaf.shape)
+        if leaf.ndim > 1:  # a kernel: unit gain
+            values /= np.sqrt(np.prod(leaf.shape[:-1]))
+        else:  # a norm's scale about 1, a bias or a scalar about 0
+            values = 0.1 * values + path[-1].key.endswith("scale")
+        return jnp.asarray(values, jnp.float32)
+
+    shapes = jax.eval_shape(StreamSplat(config).init, jax.random.key(0))
+    return jax.tree_util.tree_map_with_path(draw, shapes)
 
 
 @functools.cache
 def params() -> dict:
-    """Fresh parameters of `CONFIG`, perturbed."""
-    return perturbed(jax.jit(MODEL.init)(jax.random.key(0)))
+    """Random parameters of `CONFIG`."""
+    return random_params(CONFIG)
 
 
 def chunk(seed: int = 0, *, views: int = 3, baseline: float = 0.2, height: int = HEIGHT, width: int = WIDTH) -> Chunk:

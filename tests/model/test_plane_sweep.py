@@ -6,11 +6,11 @@ import numpy as np
 
 from ssplat_jax.chunk import Chunk
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.model import init_params
 from ssplat_jax.model.cost_volume import plane_sweep, sweep_pixels
 from ssplat_jax.model.encoder import encode
 from ssplat_jax.model.wires import prepare_views
 from ssplat_jax.struct import replace
+from tests.model.small import random_params
 
 CONFIG = StreamConfig().replace(
     encoder_widths=(16, 32), encoder_blocks=1, attention_blocks=1, num_depths=24, match_width=32, unet_width=8
@@ -56,8 +56,7 @@ def cost(params, chunk):
 
 
 def wall_cost(chunk):
-    params = jax.jit(lambda key: init_params(key, CONFIG))(jax.random.key(0))
-    return np.asarray(cost(params, chunk)).reshape(3, SIDE // 4, SIDE // 4, 2, CONFIG.num_depths)
+    return np.asarray(cost(random_params(CONFIG), chunk)).reshape(3, SIDE // 4, SIDE // 4, 2, CONFIG.num_depths)
 
 
 def test_the_cost_of_an_untrained_network_peaks_at_the_wall():

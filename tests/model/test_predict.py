@@ -8,7 +8,7 @@ import pytest
 from ssplat_jax.stream import StreamSplat
 from ssplat_jax.struct import replace
 from tests.geometry.test_rotations import rodrigues
-from tests.model.small import CONFIG, MODEL, chunk, finite, gradients, params, perturbed, predict, step, warm_cache
+from tests.model.small import CONFIG, MODEL, chunk, finite, gradients, params, predict, random_params, step, warm_cache
 
 
 def turned(angle_step: float):
@@ -111,7 +111,7 @@ def test_the_cache_is_read_and_remembered():
 def test_the_smallest_configurations_run(changes):
     config = CONFIG.replace(**changes)
     model = StreamSplat(config)
-    weights = perturbed(jax.jit(model.init)(jax.random.key(1)))
+    weights = random_params(config)
     cache, output = jax.jit(model.step)(weights, model.init_cache(), chunk(views=config.chunk_size))
     assert finite((cache, output)) and int(cache.num_voxels) > 0
     assert finite(model.decode(weights, cache))

@@ -116,7 +116,8 @@ def decoded(m: int = 10, **changes):
         "quats": f32(rng.normal(size=(m, 4))),
         "footprints": f32(rng.uniform(0.01, 0.3, m)),
     }
-    params = jax.tree.map(jnp.zeros_like, init_params(jax.random.key(0), config)["decoder"])
+    shapes = jax.eval_shape(lambda key: init_params(key, config)["decoder"], jax.random.key(0))
+    params = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape), shapes)
     return decode_tokens(params, **inputs, config=config), inputs
 
 

@@ -15,7 +15,7 @@ Views = tuple[
 
 MIN_DEPTH, MAX_DEPTH = 0.3, 15.0
 MEDIANS = (1.2, 3.5)  # median depth of a training sample
-BASELINES = (0.012, 0.12)  # median step of a training sample over its median depth
+BASELINES = (0.012, 0.105)  # median step of a training sample over its median depth
 MIN_DEPTH_RATIO = 1.4  # between the 95th and the 5th percentile of depth: a sample is not one bare wall
 _FIRST_STEPS = 4
 _PROBE = 8  # the low-resolution depth that scales a sample is this many times coarser
@@ -51,7 +51,7 @@ def _scaled_path(rng, scene: Scene, kinds: tuple[str, ...], num_views: int, heig
     """Scene, poses and intrinsics in sample units; None if the path comes too close to something."""
     kind = kinds[rng.integers(len(kinds))]
     seed = int(rng.integers(2**31))
-    step = np.exp(rng.uniform(np.log(0.018), np.log(0.11)))
+    step = np.exp(rng.uniform(np.log(0.018), np.log(0.1)))
     # A few first steps measure the depth that the steps of the whole walk are fractions of.
     poses, Ks = sample_path(seed, scene, kind, _FIRST_STEPS, height, width, step=step * float(scene.orbit_radius) * 1.5)
     median = float(np.median(_probe(scene, poses, Ks, height, width)))
@@ -59,11 +59,11 @@ def _scaled_path(rng, scene: Scene, kinds: tuple[str, ...], num_views: int, heig
     depths = _probe(scene, poses, Ks, height, width)
     median = float(np.median(depths))
     target = rng.uniform(*MEDIANS)
-    factor = min(max(target / median, MIN_DEPTH / float(depths.min())), 0.9 * MAX_DEPTH / float(depths.max()))
+    factor = min(max(target / median, 1.1 * MIN_DEPTH / float(depths.min())), 0.9 * MAX_DEPTH / float(depths.max()))
     free = factor * clearance(scene, poses[:, :3, 3]).min()
     baselines = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=-1) / median
     is_flat = np.quantile(depths, 0.95) < MIN_DEPTH_RATIO * np.quantile(depths, 0.05)
-    if free < MIN_DEPTH or factor * depths.min() < MIN_DEPTH or not MEDIANS[0] <= factor * median <= MEDIANS[1]:
+    if free < MIN_DEPTH or factor * depths.min() < 1.09 * MIN_DEPTH or not MEDIANS[0] <= factor * median <= MEDIANS[1]:
         return None
     if is_flat or (num_views > 1 and not BASELINES[0] <= np.median(baselines) <= BASELINES[1]):
         return None

@@ -66,13 +66,12 @@ def clearance(scene: Scene, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarra
     """Distance from each point to the nearest surface, negative inside a solid or outside the shell.
 
     Limits:
-        Exact for boxes outside edges and inside the shell; a lower bound for stretched balls.
+        Exact outside boxes, round balls and round cylinders; never more than the distance for stretched balls.
     """
     frames, halves = np.asarray(scene.frames, np.float64), np.asarray(scene.halves, np.float64)
     local = np.einsum("sij,nj->nsi", frames[..., :3], points) + frames[..., 3]
-    boxes, balls, cylinders, (shell, dome) = np.split(local, np.cumsum([NUM_BOXES, NUM_BALLS, NUM_CYLINDERS]), axis=1)[
-        :3
-    ] + [np.moveaxis(local[:, NUM_SOLIDS:], 1, 0)]
+    boxes, balls, cylinders, outer = np.split(local, np.cumsum([NUM_BOXES, NUM_BALLS, NUM_CYLINDERS]), axis=1)
+    shell, dome = outer[:, 0], outer[:, 1]
     box_half, ball_half, cylinder_half = np.split(halves[:NUM_SOLIDS], np.cumsum([NUM_BOXES, NUM_BALLS]))
 
     def outside(gaps):

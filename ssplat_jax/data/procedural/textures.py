@@ -2,7 +2,7 @@
 
 Photographs are cropped from those that scikit-image carries inside its wheel (read from its folder, never fetched); a
 release that carries fewer gives fewer photographs and more noise. Everything else is drawn here. A tile repeats
-mirrored, so it need not be periodic. Tiles are kept as mip pyramids with one packed `uint32` (0x00BBGGRR) per texel: the
+mirrored, so it need not be periodic. Tiles are kept as mip pyramids with a packed `uint32` (0x00BBGGRR) per texel: the
 ray-caster is bound by gathers, and a packed texel is one element instead of three.
 """
 
@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, UInt8, UInt32
+from jaxtyping import UInt8, UInt32
 from PIL import Image
 
 SIZE = 256
@@ -24,8 +24,6 @@ _PHOTOS = (
     "grass.png", "gravel.png", "hubble_deep_field.jpg", "ihc.png", "moon.png", "motorcycle_left.png",
     "motorcycle_right.png", "page.png", "retina.jpg", "rocket.jpg", "text.png",
 )  # fmt: skip
-
-Tile = Float[np.ndarray, "256 256 3"]
 
 
 class TextureLibrary:
@@ -95,7 +93,7 @@ def _photo(rng: np.random.Generator) -> np.ndarray:
     side = int(min(image.size) * rng.uniform(0.3, 1.0))
     left, top = (int(rng.integers(0, extent - side + 1)) for extent in image.size)
     crop = image.resize((SIZE, SIZE), Image.Resampling.LANCZOS, box=(left, top, left + side, top + side))
-    tile = np.rot90(np.asarray(crop, np.float32) / 255.0, rng.integers(4))
+    tile = np.rot90(np.asarray(crop, np.float32) / 255.0, int(rng.integers(4)))
     return _jitter(rng, tile[:, ::-1] if rng.random() < 0.5 else tile)
 
 
