@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from ssplat_jax.checkpoint.state import load_state, save_state
+from ssplat_jax.checkpoint.state import load_newest_state, load_state, previous_path, save_state
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.data.capture import Capture, open_capture
 from ssplat_jax.data.frame import StreamFrame
-from ssplat_jax.errors import InputError
+from ssplat_jax.errors import InputError, StorageError
 from ssplat_jax.evaluate import cache_facts, save_comparison, score_view
 from ssplat_jax.export.ply import ExportReport, save_ply
 from ssplat_jax.interrupts import Interrupts
@@ -55,10 +55,9 @@ def run_capture(
     indices = list(range(0, len(capture), stride))[:max_views]
     capture.verify(indices)
     if overwrite and out.exists():
-        for name in (STATE_FILE, SCENE_FILE, METRICS_FILE):
-            (out / name).unlink(missing_ok=True)
-    session, frame, done = _resume(model, params, capture, indices, out)
-    chunk_size = model.config.chunk_size
+        for stale in (out / STATE_FILE, previous_path(out / STATE_FILE), out / SCENE_FILE, out / METRICS_FILE):
+            stale.unlink(missing_ok=True)
+    session, frame, done = _resume(model, params, capture, indices, out, reporter)
     with Interrupts() as interrupts, reporter.progress("streaming", len(indices)) as advance:
         advance(done)
         if done < len(indices):
@@ -70,7 +69,6 @@ def run_capture(
                     _save(session, frame, capture, indices, done, out)
                 if interrupts.received:
                     break
-    assert done % chunk_size == 0 or done == len(indices)
     if interrupts.received:
         return RunResult(done, cache_facts(session)["pivots"], interrupts.received)
     _finish(session, frame, capture, indices, out)
@@ -103,11 +101,16 @@ def _identity(model: StreamSplat, capture: Capture, indices: list[int]) -> dict:
     }
 
 
-def _resume(model, params, capture: Capture, indices: list[int], out: Path) -> tuple[Session, StreamFrame, int]:
-    """The session that `out` holds, or a new one."""
-    if not (out / STATE_FILE).exists():
+def _resume(
+    model, params, capture: Capture, indices: list[int], out: Path, reporter: Reporter
+) -> tuple[Session, StreamFrame, int]:
+    """The session that `out` holds, or a new one; of a damaged state the one saved before it, which is said."""
+    state = out / STATE_FILE
+    if not state.exists() and not previous_path(state).exists():
         return Session(model, params), capture.stream_frame(model.config, indices), 0
-    cache, header = load_state(out / STATE_FILE)
+    cache, header, damage = load_newest_state(state)
+    if damage is not None:
+        reporter.warn(f"{damage} Continuing from the state saved before it, after {header['done']} views.")
     wanted = _identity(model, capture, indices)
     for name, value in wanted.items():
         if header[name] != value:
@@ -130,7 +133,12 @@ def _difference(held, wanted) -> str:
 
 
 def _save(session: Session, frame: StreamFrame, capture, indices, done: int, out: Path) -> None:
+    assert session.cache is not None
     header = _identity(session.model, capture, indices) | {"frame": _frame_to(frame), "done": done}
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StorageError(f"{out}: cannot be made ({error.strerror}); choose another --out.") from error
     save_state(out / STATE_FILE, session.cache, header)
 
 

@@ -28,6 +28,10 @@ class Reporter:
             task = bar.add_task(name, total=total, note="")
             yield lambda done, note="": bar.update(task, completed=done, note=note)
 
+    def warn(self, message: str) -> None:
+        """One line that is worth stopping at."""
+        self.console.print(f"warning: {message}", style="yellow", highlight=False)
+
     def table(self, title: str, header: tuple[str, ...], rows: list[tuple]) -> None:
         """A table of right-aligned columns."""
         table = Table(title=title)

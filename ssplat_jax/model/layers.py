@@ -51,6 +51,15 @@ def unit_features(x: Float[Array, "*b c"]) -> Float[Array, "*b c"]:
     return safe_normalize(x, eps=1e-6)
 
 
+def rms_normalize(x: Float[Array, "*b c"], eps: float = 1e-6) -> Float[Array, "*b c"]:
+    """Features scaled to a root mean square of 1.
+
+    Limits:
+        Zero gives zeros; below an RMS of about 1e-3 the result shrinks with its input, and gradients stay finite.
+    """
+    return x * jax.lax.rsqrt(jnp.mean(x * x, axis=-1, keepdims=True) + eps)
+
+
 class ResidualBlock(nn.Module):
     """conv - InstanceNorm - ReLU twice, with a projected skip where the shape changes (ALGORITHM 2.2)."""
 

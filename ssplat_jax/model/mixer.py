@@ -7,7 +7,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.model.convolution import Conv, pixel_shuffle, pixel_unshuffle
-from ssplat_jax.model.layers import attend
+from ssplat_jax.model.layers import attend, rms_normalize
 
 GLOBAL_FACTOR = 4  # the global block works on 4 x 4 cells
 SEARCH_BLOCK = 1024  # queries at a time in the global search: bounds its distance matrix
@@ -125,5 +125,10 @@ def mix_tokens(
     view_valid: Bool[Array, " v"],
     config: StreamConfig,
 ) -> Float[Array, "v hf wf c"]:
-    """Context-aggregated token features, ready for the head and for the cache (DESIGN 6.8)."""
-    return Mixer(config).apply({"params": params}, feats, positions, inside, view_valid)  # pyright: ignore[reportReturnType]
+    """Context-aggregated token features, ready for the head and for the cache (DESIGN 6.8).
+
+    They have unit RMS. What is stored comes back through CGFI a chunk later, so without a bound the stream is a loop
+    with gain: trained on four chunks, features grew to 1e18 by the ninth. The head normalises anyway.
+    """
+    mixed = Mixer(config).apply({"params": params}, feats, positions, inside, view_valid)
+    return rms_normalize(mixed)  # pyright: ignore[reportArgumentType]

@@ -4,7 +4,8 @@ import functools
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jax.core import Tracer
+from jaxtyping import Array, Float, Num
 
 from ssplat_jax.errors import InputError
 from ssplat_jax.gaussians import Gaussians
@@ -13,11 +14,24 @@ from ssplat_jax.render.binning import Grid, bin_splats, count_pairs
 from ssplat_jax.render.effects import Effects
 from ssplat_jax.render.output import RenderOutput, finish, splat_channels
 from ssplat_jax.render.projection import Splats, cull_non_finite, project
-from ssplat_jax.render.tiled import composite
-from ssplat_jax.struct import replace
+from ssplat_jax.render.smoothing import filter_3d
+from ssplat_jax.render.tiled import composite, median_rows
+from ssplat_jax.struct import pytree, replace
 
 TILE = 8
 MIN_PAIRS = 1 << 12
+
+
+@pytree
+class Inputs:
+    """The arrays of one call of `render`; what each is stands there."""
+
+    gaussians: Gaussians
+    camera: Camera
+    features: Float[Array, "n c"] | None = None
+    captured: Camera | None = None
+    distortion: Float[Array, "*b 5"] | None = None
+    exposures: Float[Array, "*b 3 4"] | None = None
 
 
 def render(
@@ -26,6 +40,9 @@ def render(
     *,
     effects: Effects | None = None,
     features: Float[Array, "n c"] | None = None,
+    captured: Camera | None = None,
+    distortion: Float[Array, "*b 5"] | None = None,
+    exposures: Float[Array, "*b 3 4"] | None = None,
     max_pairs: int | None = None,
     tile: int = TILE,
 ) -> RenderOutput:
@@ -34,26 +51,29 @@ def render(
     Args:
         gaussians: the scene; rows of opacity 0 are absent.
         camera: poses, intrinsics and the image size (any, not only multiples of a tile).
-        effects: what to simulate and which outputs to give.
+        effects: what to simulate and which outputs to give; `effects_for` finds what a scene needs.
         features: further channels, composited like colours.
+        captured: for `effects.filter_3d`, the cameras that the scene was made from.
+        distortion: for `effects.distortion`, OPENCV coefficients k1, k2, p1, p2, k3.
+        exposures: for `effects.exposure`, an affine colour correction a frame.
         max_pairs: room for (tile, Gaussian) pairs, of all cameras together. Outside jit it is counted (and rounded up
             to a power of two, so that few programs are compiled). Inside jit the default is four pairs a Gaussian and
             camera; look at `num_overflow` there: what does not fit is the farthest Gaussians.
         tile: side of a tile in pixels, 8 or 16: 16 where most Gaussians are larger than 8 pixels.
 
     Raises:
-        InputError: the camera or the features do not have the shapes above.
+        InputError: an array does not have the shape above, or an effect lacks its array.
     """
     effects = effects or Effects()
-    _check(gaussians, camera, features)
-    traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((gaussians, camera, features)))
-    if traced:
-        return _render(gaussians, camera, features, effects, max_pairs or default_max_pairs(gaussians, camera), tile)
+    inputs = Inputs(gaussians, camera, features, captured, distortion, exposures)
+    _check(inputs, effects)
+    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(inputs)):
+        return _render(inputs, effects, max_pairs or default_max_pairs(gaussians, camera), tile)
     if max_pairs is None:
-        max_pairs = round_up(int(_count(gaussians, camera, effects, tile)))
-    out = _render_jit(gaussians, camera, features, effects, max_pairs, tile)
+        max_pairs = round_up(int(_count(inputs, effects, tile)))
+    out = _render_jit(inputs, effects, max_pairs, tile)
     if int(out.num_overflow):
-        out = _render_jit(gaussians, camera, features, effects, round_up(int(out.num_pairs)), tile)
+        out = _render_jit(inputs, effects, round_up(int(out.num_pairs)), tile)
     return out
 
 
@@ -68,25 +88,42 @@ def round_up(num_pairs: int) -> int:
     return max(MIN_PAIRS, 1 << (num_pairs - 1).bit_length()) if num_pairs > 0 else MIN_PAIRS
 
 
-def _check(gaussians: Gaussians, camera: Camera, features) -> None:
-    if camera.viewmats.shape[-2:] != (4, 4) or camera.Ks.shape != (*camera.viewmats.shape[:-2], 3, 3):
+def _check(inputs: Inputs, effects: Effects) -> None:
+    camera, features = inputs.camera, inputs.features
+    batch, rows = camera.viewmats.shape[:-2], inputs.gaussians.num_gaussians
+    if camera.viewmats.shape[-2:] != (4, 4) or camera.Ks.shape != (*batch, 3, 3):
         raise InputError(
-            f"render: camera wants viewmats [*b 4 4] and Ks [*b 3 3], got {camera.viewmats.shape} and {camera.Ks.shape}."
+            "render: camera wants viewmats [*b 4 4] and Ks [*b 3 3], "
+            f"got {list(camera.viewmats.shape)} and {list(camera.Ks.shape)}."
         )
     if camera.width < 1 or camera.height < 1:
         raise InputError(f"render: the image must have at least 1x1 pixels, got {camera.width}x{camera.height}.")
-    if features is not None and (features.ndim != 2 or features.shape[0] != gaussians.num_gaussians):
-        raise InputError(f"render: features must be [{gaussians.num_gaussians} c], got {list(features.shape)}.")
+    if features is not None and (features.ndim != 2 or features.shape[0] != rows):
+        raise InputError(f"render: features must be [{rows} c], got {list(features.shape)}.")
+    if effects.filter_3d and inputs.captured is None:
+        raise InputError("render: effects.filter_3d needs the captured cameras; pass captured=... or turn it off.")
+    for on, name, array, tail in (
+        (effects.distortion, "distortion", inputs.distortion, (5,)),
+        (effects.exposure, "exposures", inputs.exposures, (3, 4)),
+    ):
+        if on and (array is None or array.shape != (*batch, *tail)):
+            came = "nothing" if array is None else list(array.shape)
+            raise InputError(f"render: {name} must be {[*batch, *tail]} while its effect is on, got {came}.")
 
 
-def prepare(gaussians: Gaussians, camera: Camera):
-    """Finite float32 (or wider) Gaussians, a camera of one batch axis, and the number of rows culled."""
-    dtype = jnp.promote_types(gaussians.means.dtype, jnp.float32)
-    gaussians, num_non_finite = cull_non_finite(jax.tree.map(lambda x: x.astype(dtype), gaussians))
+def prepare(inputs: Inputs, effects: Effects):
+    """Finite float32 (or wider) Gaussians, a camera of one batch axis, their splats, and the number of rows culled."""
+    given = inputs.gaussians.means.dtype
+    dtype = given if given == jnp.float64 else jnp.dtype(jnp.float32)
+    gaussians, num_non_finite = cull_non_finite(jax.tree.map(lambda x: x.astype(dtype), inputs.gaussians))
+    if effects.filter_3d and inputs.captured is not None:
+        gaussians = filter_3d(gaussians, inputs.captured)
+    camera = inputs.camera
     camera = replace(
         camera, viewmats=camera.viewmats.reshape(-1, 4, 4).astype(dtype), Ks=camera.Ks.reshape(-1, 3, 3).astype(dtype)
     )
-    return gaussians, camera, num_non_finite
+    distortion = inputs.distortion.reshape(-1, 5).astype(dtype) if effects.distortion else None  # pyright: ignore[reportOptionalMemberAccess]
+    return gaussians, camera, project(gaussians, camera, effects, distortion), num_non_finite
 
 
 def grid_of(camera: Camera, tile: int) -> Grid:
@@ -94,34 +131,39 @@ def grid_of(camera: Camera, tile: int) -> Grid:
     return Grid(num_images=camera.viewmats.shape[0], height=camera.height, width=camera.width, tile=tile)
 
 
-@functools.partial(jax.jit, static_argnums=(2, 3))
-def _count(gaussians: Gaussians, camera: Camera, effects: Effects, tile: int):
-    gaussians, camera, _ = prepare(gaussians, camera)
-    return count_pairs(project(gaussians, camera, effects), grid_of(camera, tile))
+@functools.partial(jax.jit, static_argnums=(1, 2))
+def _count(inputs: Inputs, effects: Effects, tile: int):
+    _, camera, splats, _ = prepare(inputs, effects)
+    return count_pairs(splats, grid_of(camera, tile))
 
 
-def _render(gaussians: Gaussians, camera: Camera, features, effects: Effects, max_pairs: int, tile: int):
-    shape_of_batch = camera
+def _render(inputs: Inputs, effects: Effects, max_pairs: int, tile: int) -> RenderOutput:
     with jax.named_scope("project"):
-        gaussians, camera, num_non_finite = prepare(gaussians, camera)
-        splats = project(gaussians, camera, effects)
-        channels = splat_channels(gaussians, splats, camera, effects, features)
+        gaussians, camera, splats, num_non_finite = prepare(inputs, effects)
+        channels = splat_channels(gaussians, splats, camera, effects, inputs.features)
     grid = grid_of(camera, tile)
     with jax.named_scope("bin"):
         pairs = bin_splats(jax.lax.stop_gradient(splats), grid, max_pairs)
+    median_depth = None
     with jax.named_scope("composite"):
-        tiles = composite(grid, shape_rows(splats), channels.reshape(-1, channels.shape[-1]), pairs)
+        shapes = shape_rows(splats)
+        tiles = composite(grid, shapes, channels.reshape(-1, channels.shape[-1]), pairs)
+        if "median_depth" in effects.outputs:
+            rows = untile(median_rows(grid, jax.lax.stop_gradient(shapes), pairs)[:, None], grid)[..., 0]
+            median_depth = jnp.where(rows >= 0, splats.depths.reshape(-1)[jnp.maximum(rows, 0)], 0.0)
     return finish(
-        untile(tiles, grid),
-        shape_of_batch,
+        untile(tiles, grid),  # pyright: ignore[reportArgumentType] - custom_vjp hides the type
+        inputs.camera,
         effects,
+        exposures=inputs.exposures,
+        median_depth=median_depth,
         num_pairs=pairs.num_pairs,
         num_overflow=jnp.maximum(pairs.num_pairs - max_pairs, 0),
         num_non_finite=num_non_finite,
     )
 
 
-_render_jit = functools.partial(jax.jit, static_argnums=(3, 4, 5))(_render)
+_render_jit = functools.partial(jax.jit, static_argnums=(1, 2, 3))(_render)
 
 
 def shape_rows(splats: Splats) -> Float[Array, "m 6"]:
@@ -129,7 +171,7 @@ def shape_rows(splats: Splats) -> Float[Array, "m 6"]:
     return jnp.concatenate([splats.means2d, splats.conics, splats.opacities[..., None]], axis=-1).reshape(-1, 6)
 
 
-def untile(tiles: Float[Array, "tiles c p"], grid: Grid) -> Float[Array, "b h w c"]:
+def untile(tiles: Num[Array, "tiles c p"], grid: Grid) -> Num[Array, "b h w c"]:
     """Tiles put together to images and cropped to their size."""
     side, channels = grid.tile, tiles.shape[1]
     images = tiles.reshape(grid.num_images, grid.rows, grid.columns, channels, side, side).transpose(0, 1, 4, 2, 5, 3)

@@ -24,10 +24,9 @@ from ssplat_jax.errors import InputError
 from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.render import api, tiled
-from ssplat_jax.render.binning import bin_splats
+from ssplat_jax.render.binning import Grid, bin_splats
 from ssplat_jax.render.effects import Effects
 from ssplat_jax.render.output import splat_channels
-from ssplat_jax.render.projection import project
 
 EFFECTS = Effects(antialias="classic")  # what the prototype does
 SIZES = ((65_536, 256), (262_144, 512))
@@ -56,7 +55,7 @@ def scene(num: int, size: int, pixels: float = 1.0, seed: int = 0) -> tuple[Gaus
 
 @jax.jit
 def floor(table: Float[Array, "p 6"], x: Float[Array, " q"], y: Float[Array, " q"]):
-    """The arithmetic that cannot be avoided: one opacity per pixel and pair. Written in half precision, to time no memory."""
+    """The unavoidable arithmetic: one opacity per pixel and pair. Written in half precision, to time no memory."""
     dx, dy = x - table[:, 0:1], y - table[:, 1:2]
     power = 0.5 * (table[:, 2:3] * dx * dx + table[:, 4:5] * dy * dy) + table[:, 3:4] * dx * dy
     return jnp.minimum(0.99, table[:, 5:6] * jnp.exp(-power)).astype(jnp.bfloat16)
@@ -76,7 +75,7 @@ def alternate(candidates: dict[str, Callable[[], Any]], repetitions: int = 7) ->
 
 def _loss(gaussians: Gaussians, camera: Camera, max_pairs: int):
     out = api.render(gaussians, camera, effects=EFFECTS, max_pairs=max_pairs)
-    return jnp.sum(out.color**2) + jnp.sum(out.alpha) + jnp.sum(out.depth)
+    return jnp.sum(out.color**2) + sum(jnp.sum(x) for x in jax.tree.leaves((out.alpha, out.depth)))
 
 
 def candidates(num: int, size: int, *, stages: bool) -> tuple[dict[str, Callable[[], Any]], dict[str, float]]:
@@ -116,11 +115,10 @@ def _stages(gaussians: Gaussians, camera: Camera, max_pairs: int) -> dict[str, C
 
     @jax.jit
     def projected(gaussians):
-        usable, flat, _ = api.prepare(gaussians, camera)
-        splats = project(usable, flat, EFFECTS)
+        usable, flat, splats, _ = api.prepare(api.Inputs(gaussians, camera), EFFECTS)
         return splats, splat_channels(usable, splats, flat, EFFECTS, None)
 
-    grid = api.grid_of(api.prepare(gaussians, camera)[1], api.TILE)
+    grid = Grid(num_images=1, height=camera.height, width=camera.width, tile=api.TILE)
     binned = jax.jit(lambda splats: bin_splats(splats, grid, max_pairs))
     composited = jax.jit(lambda shapes, channels, pairs: tiled.composite(grid, shapes, channels, pairs))
     splats, channels = projected(gaussians)
@@ -136,7 +134,9 @@ def _prototype(path: Path, num: int, size: int, pairs: int) -> Callable[[], Any]
     """Another rasterizer's forward pass on its own scene of the same statistics (`scene` and `render` of a module)."""
     spec = importlib.util.spec_from_file_location("against", path)
     if spec is None or spec.loader is None or not path.is_file():
-        raise InputError(f"bench render: --against wants a Python file, got {path}; give the path of a rasterizer script.")
+        raise InputError(
+            f"bench render: --against wants a Python file, got {path}; give the path of a rasterizer script."
+        )
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     arrays = module.scene(num, size)

@@ -1,17 +1,20 @@
 """Which Gaussians touch which tile, front to back: sorted (tile, Gaussian) pairs.
 
-Rows are (camera, Gaussian) flattened to `m = b n`; tiles are numbered camera-major, row-major. Gaussians are sorted once
-by (depth, row); a pair's key is then `tile << bits | depth rank`, so that one sort of plain integers puts everything in
-exact order. XLA sorts single integers five times faster than it sorts (key, payload) tuples, hence the packing.
+Rows are (camera, Gaussian) flattened to `m = b n`; tiles are numbered camera-major, row-major. Gaussians are sorted
+once by (depth, row); a pair's key is then `tile << bits | depth rank`, so that one sort of plain integers puts
+everything in exact order. XLA sorts single integers five times faster than (key, payload) tuples, hence the packing.
 """
 
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Int
+from jaxtyping import Array, Float, Int
 
+from ssplat_jax.render import constants
 from ssplat_jax.render.projection import Splats
 from ssplat_jax.struct import pytree, static
+
+KEY_BITS = 32  # keys wider than this are sorted as 64-bit integers
 
 
 @pytree
@@ -44,7 +47,7 @@ class Pairs:
     """For each tile the rows that touch it, front to back: `rows[bounds[t] : bounds[t + 1]]`."""
 
     rows: Int[Array, " p"]
-    bounds: Int[Array, " tiles_and_one"]
+    bounds: Int[Array, " tiles_and_one"]  # pairs whose ellipse misses the tile are left out
     num_pairs: Int[Array, ""]  # needed; those beyond the capacity `p` (the farthest Gaussians) are missing
 
 
@@ -92,8 +95,44 @@ def bin_splats(splats: Splats, grid: Grid, max_pairs: int) -> Pairs:
     pair = jnp.arange(max_pairs, dtype=jnp.int32)
     within = pair - table[:, 0]
     tiles = table[:, 1] + within // table[:, 2] * grid.columns + within % table[:, 2]
-    sorted_ranks, bounds = _sort_pairs(tiles, ranks, pair < ends[-1], grid.num_tiles, num_rows)
+    origins = [origin.astype(splats.depths.dtype) for origin in _tile_origins(tiles, grid)]
+    reached = _reaches(tuple(column[ranks] for column in _outlines(splats, order)), origins, grid.tile)
+    sorted_ranks, bounds = _sort_pairs(tiles, ranks, (pair < ends[-1]) & reached, grid.num_tiles, num_rows)
     return Pairs(rows=order[sorted_ranks], bounds=bounds, num_pairs=ends[-1])
+
+
+def _outlines(splats: Splats, order: Int[Array, " m"]) -> list[Float[Array, " m"]]:
+    """Mean, conic, and the largest exponent at which alpha is still 1/255, in depth order."""
+    bounds = jnp.log(jnp.maximum(splats.opacities / constants.ALPHA_MIN, 1.0))
+    columns = [*jnp.moveaxis(splats.means2d, -1, 0), *jnp.moveaxis(splats.conics, -1, 0), bounds]
+    return [column.reshape(-1)[order] for column in columns]
+
+
+def _tile_origins(tiles: Int[Array, " p"], grid: Grid) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
+    """Centre of the first pixel of each tile, in its image."""
+    within = tiles % (grid.rows * grid.columns)
+    x, y = within % grid.columns * grid.tile, within // grid.columns * grid.tile
+    return x.astype(jnp.float32) + 0.5, y.astype(jnp.float32) + 0.5
+
+
+def _reaches(outline, origins, tile: int):
+    """Whether a Gaussian's ellipse of alpha = 1/255 reaches the pixel centres of a tile: a quarter of a box's do not.
+
+    The least exponent over the tile lies on an edge that faces the mean (or is 0 inside); what float32 may lose of it,
+    for needles, is given back, so that no pair is missed.
+    """
+    x, y, xx, xy, yy, bound = outline
+    low_x, low_y = origins[0] - x, origins[1] - y
+    high_x, high_y = low_x + (tile - 1), low_y + (tile - 1)
+    near_x, near_y = jnp.clip(0.0, low_x, high_x), jnp.clip(0.0, low_y, high_y)
+    along_x = jnp.clip(-xy * near_y / jnp.maximum(xx, 1e-30), low_x, high_x)
+    along_y = jnp.clip(-xy * near_x / jnp.maximum(yy, 1e-30), low_y, high_y)
+
+    def least(dx, dy):
+        squares = 0.5 * (xx * dx * dx + yy * dy * dy)
+        return squares + xy * dx * dy - 1e-6 * squares
+
+    return jnp.minimum(least(near_x, along_y), least(along_x, near_y)) <= bound * 1.0001 + 1e-4
 
 
 def _owners(ends: Int[Array, " m"], max_pairs: int) -> Int[Array, " p"]:
@@ -107,7 +146,7 @@ def _sort_pairs(
 ) -> tuple[Int[Array, " p"], Int[Array, " tiles_and_one"]]:
     """Depth ranks in order of (tile, rank), and where each tile's begin."""
     bits = max(1, (num_rows - 1).bit_length())
-    fits = num_tiles.bit_length() + bits <= 32
+    fits = num_tiles.bit_length() + bits <= KEY_BITS
     with jax.enable_x64(not fits):
         dtype = jnp.uint32 if fits else jnp.uint64
         shift = jnp.array(bits, dtype)

@@ -5,7 +5,7 @@ alpha capped at 0.999 up to 1.5.3. Which one is used where is said beside the co
 """
 
 NEAR = 0.01
-"""Camera z, scene units, at and below which a Gaussian is culled (gsplat; metric scenes have surfaces nearer than 0.2)."""
+"""Camera z, scene units, at and below which a Gaussian is culled (gsplat; metric scenes have surfaces before 0.2)."""
 
 ALPHA_MIN = 1.0 / 255.0
 """Samples fainter than this are skipped (3DGS, Mip-Splatting, gsplat)."""
@@ -16,8 +16,14 @@ ALPHA_MAX = 0.99
 TRANSMITTANCE_STOP = 1e-4
 """A sample that would bring the transmittance below this is not added and ends its pixel (3DGS, gsplat)."""
 
+LARGEST_SCREEN = 1e8
+"""Standard deviation in pixels beyond which a Gaussian is culled: its gradient would leave float32."""
+
+MEDIAN_TRANSMITTANCE = 0.5
+"""The median depth is that of the sample that brings the transmittance below this (2DGS, gsplat)."""
+
 MIP_KERNEL = 0.1
-"""px^2 added to the screen covariance by the 2D Mip filter, opacity compensated (Mip-Splatting; gsplat `antialiased`)."""
+"""px^2 added to the screen covariance by the 2D Mip filter, opacity compensated (Mip-Splatting)."""
 
 CLASSIC_DILATION = 0.3
 """px^2 added to the screen covariance without compensation (3DGS; gsplat `classic`)."""
@@ -33,6 +39,9 @@ FRUSTUM_MARGIN = 0.3
 
 LARGEST = 1e12
 """Entries beyond +-this are treated as infinite: their squares would leave float32 on the way to the screen."""
+
+CAPTURE_MARGIN = 0.15
+"""A captured camera counts for the 3D filter this far outside its image, in image sizes (Mip-Splatting)."""
 
 MIP3D_VARIANCE = 0.2
 """Variance of the 3D smoothing filter in squared sampling intervals (Mip-Splatting)."""

@@ -17,8 +17,9 @@ class RenderOutput:
     """Images of one camera or a batch, and what only the running program knows."""
 
     color: Float[Array, "*b h w 3"]  # RGB, background included; may exceed 1 (SH), never below 0
-    alpha: Float[Array, "*b h w"]  # 1 - transmittance
+    alpha: Float[Array, "*b h w"] | None  # 1 - transmittance
     depth: Float[Array, "*b h w"] | None  # expected camera z, sum(w z) / sum(w); 0 where alpha is 0
+    median_depth: Float[Array, "*b h w"] | None  # camera z where the transmittance falls below 1/2; 0 where it does not
     features: Float[Array, "*b h w c"] | None  # sum(w f), not normalised
     num_pairs: Int[Array, ""]  # (tile, Gaussian) pairs of all images
     num_overflow: Int[Array, ""]  # pairs that `max_pairs` had no room for; the image is wrong unless 0
@@ -31,8 +32,8 @@ def splat_channels(
     camera: Camera,
     effects: Effects,
     features: Float[Array, "n c"] | None,
-) -> Float[Array, "b n c"]:
-    """Per camera and Gaussian: RGB, then depth and features if wanted, then 1 (which composites to alpha)."""
+) -> Float[Array, "b n channels"]:
+    """Per camera and Gaussian: RGB, then depth, features and 1 (which composites to alpha), those that are wanted."""
     degree = gaussians.sh_degree if effects.sh_degree is None else min(effects.sh_degree, gaussians.sh_degree)
     directions = None
     if degree > 0:
@@ -46,7 +47,9 @@ def splat_channels(
         usable = jnp.all(jnp.isfinite(features), axis=-1, keepdims=True)
         features = jnp.where(usable, features, 0).astype(splats.depths.dtype)
         parts.append(jnp.broadcast_to(features, (*shape, features.shape[-1])))
-    return jnp.concatenate([*parts, jnp.ones((*shape, 1), splats.depths.dtype)], axis=-1)
+    if effects.needs_alpha:
+        parts.append(jnp.ones((*shape, 1), splats.depths.dtype))
+    return jnp.concatenate(parts, axis=-1)
 
 
 def finish(
@@ -54,17 +57,23 @@ def finish(
     camera: Camera,
     effects: Effects,
     *,
+    exposures: Float[Array, "*b 3 4"] | None,
+    median_depth: Float[Array, "b h w"] | None,
     num_pairs: Int[Array, ""],
     num_overflow: Int[Array, ""],
     num_non_finite: Int[Array, ""],
 ) -> RenderOutput:
     """The output of composited `splat_channels`, in the camera's batch shape."""
-    images = composited.reshape(*camera.viewmats.shape[:-2], *composited.shape[1:])
-    color, alpha, rest = images[..., :3], images[..., -1], images[..., 3:-1]
-    if effects.background is not None:
+    batch = camera.viewmats.shape[:-2]
+    images = composited.reshape(*batch, *composited.shape[1:])
+    color, rest, alpha, depth = images[..., :3], images[..., 3:], None, None
+    if effects.needs_alpha:
+        rest, alpha = rest[..., :-1], rest[..., -1]
+    if effects.background is not None and alpha is not None:
         color = color + (1.0 - alpha)[..., None] * jnp.array(effects.background, color.dtype)
-    depth = None
-    if "depth" in effects.outputs:
+    if effects.exposure and exposures is not None:
+        color = apply_exposures(color, exposures.astype(color.dtype))
+    if "depth" in effects.outputs and alpha is not None:
         seen = alpha > 0
         depth = jnp.where(seen, rest[..., 0] / jnp.where(seen, alpha, 1.0), 0.0)
         rest = rest[..., 1:]
@@ -72,8 +81,16 @@ def finish(
         color=color,
         alpha=alpha,
         depth=depth,
+        median_depth=None if median_depth is None else median_depth.reshape(*batch, *median_depth.shape[1:]),
         features=rest if rest.shape[-1] else None,
         num_pairs=num_pairs,
         num_overflow=num_overflow,
         num_non_finite=num_non_finite,
     )
+
+
+def apply_exposures(color: Float[Array, "*b h w 3"], exposures: Float[Array, "*b 3 4"]) -> Float[Array, "*b h w 3"]:
+    """Each frame's affine correction of linear RGB, `matrix @ color + offset`, cut at 0."""
+    matrices = exposures[..., None, None, :, :]
+    corrected = sum(matrices[..., i] * color[..., i, None] for i in range(3)) + matrices[..., 3]
+    return jnp.maximum(corrected, 0.0)

@@ -1,8 +1,8 @@
 """EWA projection of 3D Gaussians to the screen, with the camera's full pinhole model.
 
-Everything is elementwise over `[b n]` (cameras x Gaussians): no matmul unit, no vmap, any float dtype. Screen covariances
-are built from their 2x3 square root M (cov = M M^T), so they are positive semi-definite and their determinant,
-|row_0 x row_1|^2, does not cancel.
+Everything is elementwise over `[b n]` (cameras x Gaussians): no matmul unit, no vmap, any float dtype. Screen
+covariances are built from their 2x3 square root M (cov = M M^T), so they are positive semi-definite and their
+determinant, |row_0 x row_1|^2, does not cancel.
 """
 
 import jax
@@ -13,6 +13,7 @@ from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.geometry.rotations import quats_to_matrices
 from ssplat_jax.render import constants
+from ssplat_jax.render.distortion import distort, is_folded
 from ssplat_jax.render.effects import Effects
 from ssplat_jax.struct import pytree, replace
 
@@ -63,29 +64,41 @@ def camera_points(means: Float[Array, "n 3"], viewmats: Float[Array, "b 4 4"]) -
     )
 
 
-def project(gaussians: Gaussians, camera: Camera, effects: Effects) -> Splats:
+def project(
+    gaussians: Gaussians, camera: Camera, effects: Effects, distortion: Float[Array, "b 5"] | None = None
+) -> Splats:
     """The screen-space Gaussians that `camera` (one batch axis) sees of finite `gaussians`.
 
-    Skew, `Ks[0, 1]`, is not modelled.
+    Skew, `Ks[0, 1]`, is not modelled. `distortion` is looked at if `effects.distortion` is on.
 
     Limits:
         z <= 0.01: invisible, zero gradient.
         Outside the image by more than 0.3 half widths (tangent): the Jacobian is that of the clamped direction.
         Scales below about 1e-6 px under the Mip filter are invisible (compensation 0), with a zero gradient.
-        Scales up to 1e12 / focal are finite; quaternions of any length, zero counts as the identity.
+        Larger than 1e8 px on the screen, or that far from it in 1e9 px: invisible, zero gradient.
+        Quaternions of any length; zero counts as the identity.
+        Where the distortion polynomial has folded back: invisible, zero gradient.
     """
     x, y, z = camera_points(gaussians.means, camera.viewmats)
     in_front = z > constants.NEAR
     z = jnp.where(in_front, z, 1.0)
     fx, fy, cx, cy = (camera.Ks[:, i, j, None] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    means2d = jnp.stack([fx * x / z + cx, fy * y / z + cy], axis=-1)
-    roots = _screen_roots(gaussians, camera, (x, y, z))
+    tan_x, tan_y = x / z, y / z
+    if effects.distortion and distortion is not None:
+        in_front &= ~is_folded(distort(tan_x, tan_y, distortion)[1])
+        tan_x, tan_y = (jnp.where(in_front, tan, 0.0) for tan in (tan_x, tan_y))
+        means2d = distort(tan_x, tan_y, distortion)[0]
+    else:
+        distortion, means2d = None, (tan_x, tan_y)
+    means2d = jnp.stack([fx * means2d[0] + cx, fy * means2d[1] + cy], axis=-1)
+    roots = _screen_roots(gaussians, camera, (tan_x, tan_y, z), distortion)
     conics, variances, compensation = _filtered(*roots, effects)
-    opacities = jnp.broadcast_to(gaussians.opacities, z.shape)
-    if compensation is not None:
-        opacities = opacities * compensation
-    visible = in_front & (opacities >= constants.ALPHA_MIN) & jnp.all(jnp.isfinite(means2d), axis=-1)
-    visible &= jnp.all(jnp.isfinite(conics), axis=-1)
+    opacities = gaussians.opacities * compensation
+    visible = (
+        in_front
+        & (opacities >= constants.ALPHA_MIN)
+        & jnp.all(jnp.abs(means2d) <= 10 * constants.LARGEST_SCREEN, axis=-1)
+    )
     opacities = jnp.where(visible, opacities, 0.0)
     # alpha >= 1/255 exactly where the Mahalanobis distance is at most `reach`; the inflation covers its rounding.
     reach = jnp.sqrt(2.0 * jnp.log(jnp.maximum(jax.lax.stop_gradient(opacities) / constants.ALPHA_MIN, 1.0)))
@@ -100,18 +113,22 @@ def project(gaussians: Gaussians, camera: Camera, effects: Effects) -> Splats:
     )
 
 
-def _screen_roots(gaussians: Gaussians, camera: Camera, points: tuple[Float[Array, "b n"], ...]):
-    """Rows of M = J W R S, a square root of the screen covariance; each a triple of `[b n]` arrays."""
-    x, y, z = points
+def _screen_roots(gaussians: Gaussians, camera: Camera, points: tuple[Float[Array, "b n"], ...], distortion):
+    """Rows of M = J W R S, a square root of the screen covariance, at (x / z, y / z, z); each a triple of `[b n]`."""
+    tan_x, tan_y, z = points
     fx, fy, cx, cy = (camera.Ks[:, i, j, None] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
     margin_x = constants.FRUSTUM_MARGIN * 0.5 * camera.width / fx
     margin_y = constants.FRUSTUM_MARGIN * 0.5 * camera.height / fy
-    tan_x = jnp.clip(x / z, -cx / fx - margin_x, (camera.width - cx) / fx + margin_x)
-    tan_y = jnp.clip(y / z, -cy / fy - margin_y, (camera.height - cy) / fy + margin_y)
+    tan_x = jnp.clip(tan_x, -cx / fx - margin_x, (camera.width - cx) / fx + margin_x)
+    tan_y = jnp.clip(tan_y, -cy / fy - margin_y, (camera.height - cy) / fy + margin_y)
     world = camera.viewmats[:, :3, :3, None]  # b 3 3 1
     # Rows of J W: what a world displacement does to the pixel.
-    to_u = [(fx / z) * (world[:, 0, j] - tan_x * world[:, 2, j]) for j in range(3)]
-    to_v = [(fy / z) * (world[:, 1, j] - tan_y * world[:, 2, j]) for j in range(3)]
+    to_u = [(world[:, 0, j] - tan_x * world[:, 2, j]) / z for j in range(3)]
+    to_v = [(world[:, 1, j] - tan_y * world[:, 2, j]) / z for j in range(3)]
+    if distortion is not None:
+        xx, xy, yx, yy = distort(tan_x, tan_y, distortion)[1]
+        to_u, to_v = ([a * u + b * v for u, v in zip(to_u, to_v, strict=True)] for a, b in ((xx, xy), (yx, yy)))
+    to_u, to_v = [fx * u for u in to_u], [fy * v for v in to_v]
     axes = quats_to_matrices(gaussians.quats) * gaussians.scales[:, None, :]  # n 3 3, columns are the scaled axes
     root_u = [sum(to_u[j] * axes[:, j, k] for j in range(3)) for k in range(3)]
     root_v = [sum(to_v[j] * axes[:, j, k] for j in range(3)) for k in range(3)]
@@ -124,17 +141,19 @@ def _filtered(root_u, root_v, effects: Effects):
     kernel = kernels[effects.antialias]
     # In units of the largest entry nothing overflows, whatever the scale; a constant to the gradient.
     largest = sum(jnp.abs(jax.lax.stop_gradient(m)) for m in (*root_u, *root_v))
-    unit = jnp.maximum(largest, 1.0)
-    u, v = [m / unit for m in root_u], [m / unit for m in root_v]
+    sized = largest <= constants.LARGEST_SCREEN
+    unit = jnp.where(sized, jnp.maximum(largest, 1.0), 1.0)
+    u, v = ([jnp.where(sized, m, 0.0) / unit for m in root] for root in (root_u, root_v))
     kernel = kernel / unit / unit
     uu, uv, vv = (sum(a * b for a, b in zip(p, q, strict=True)) for p, q in ((u, u), (u, v), (v, v)))
     cross = (u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0])
     det = sum(c * c for c in cross)
-    det_filtered = det + kernel * (uu + vv + kernel)
-    conics = jnp.stack([vv + kernel, -uv, uu + kernel], axis=-1) / det_filtered[..., None] / (unit * unit)[..., None]
+    # Back in pixels the filtered determinant is at least about the kernel: its inverse square stays in float32.
+    det_filtered = (det + kernel * (uu + vv + kernel)) * unit * unit
+    conics = jnp.stack([vv + kernel, -uv, uu + kernel], axis=-1) / det_filtered[..., None]
     variances = jnp.stack([uu + kernel, vv + kernel], axis=-1) * (unit * unit)[..., None]
     if effects.antialias != "mip":
-        return conics, variances, None
-    ratio = det / det_filtered
-    keep = ratio > constants.COMPENSATION_CUT
+        return conics, variances, jnp.where(sized, 1.0, 0.0).astype(unit.dtype)
+    ratio = det * unit * unit / det_filtered
+    keep = sized & (ratio > constants.COMPENSATION_CUT)
     return conics, variances, jnp.where(keep, jnp.sqrt(jnp.where(keep, ratio, 1.0)), 0.0)

@@ -1,4 +1,4 @@
-"""Colour from real spherical harmonics, degree 0 to 3, in the 3DGS convention (Condon-Shortley sign, order m = -l..l)."""
+"""Colour from real spherical harmonics, degree 0 to 3, as splat files store them (Condon-Shortley, m = -l..l)."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -37,23 +37,23 @@ def sh_basis(directions: Float[Array, "*s 3"], degree: int) -> Float[Array, "*s 
             -_C2[3] * x * z,
             _C2[4] * (xx - yy),
         ]
-    if degree >= 3:
-        terms += [
-            -_C3[0] * y * (3 * xx - yy),
-            _C3[1] * x * y * z,
-            -_C3[2] * y * (4 * zz - xx - yy),
-            _C3[3] * z * (2 * zz - 3 * xx - 3 * yy),
-            -_C3[4] * x * (4 * zz - xx - yy),
-            _C3[5] * z * (xx - yy),
-            -_C3[6] * x * (xx - 3 * yy),
-        ]
+        if degree >= 3:
+            terms += [
+                -_C3[0] * y * (3 * xx - yy),
+                _C3[1] * x * y * z,
+                -_C3[2] * y * (4 * zz - xx - yy),
+                _C3[3] * z * (2 * zz - 3 * xx - 3 * yy),
+                -_C3[4] * x * (4 * zz - xx - yy),
+                _C3[5] * z * (xx - yy),
+                -_C3[6] * x * (xx - 3 * yy),
+            ]
     return jnp.stack(terms, axis=-1)
 
 
 def sh_colors(
     sh: Float[Array, "n k 3"], directions: Float[Array, "*b n 3"] | None, degree: int
 ) -> Float[Array, "*b n 3"]:
-    """Colours max(0.5 + sum, 0) towards unit `directions` (from the camera to the Gaussian), bands above `degree` unused.
+    """Colours max(0.5 + sum, 0) along unit `directions` (camera to Gaussian), bands above `degree` unused.
 
     Degree 0 does not look at `directions`, which may then be None, and gives one colour per Gaussian: `[n 3]`.
 

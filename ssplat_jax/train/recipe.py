@@ -73,13 +73,22 @@ TINY = Recipe(
         Phase("depth", 1800, num_chunks=1, num_targets=0, sizes=((96, 128),), learning_rate=1e-3),
         Phase(
             "stream",
-            900,
+            850,
             num_chunks=4,
             num_targets=4,
             sizes=((96, 128),),
             learning_rate=1e-3,
             # The matcher is done by then; without its backward pass a step costs a third, and rendering teaches it
             # less about depth than depth itself did.
+            frozen=("encoder", "cost_volume"),
+        ),
+        Phase(
+            "settle",
+            200,
+            num_chunks=6,
+            num_targets=4,
+            sizes=((96, 128),),
+            learning_rate=5e-4,
             frozen=("encoder", "cost_volume"),
         ),
     )

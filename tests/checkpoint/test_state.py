@@ -1,5 +1,6 @@
 """State on disk: read back exactly, or refused by name."""
 
+import contextlib
 import json
 import resource
 
@@ -109,20 +110,23 @@ def test_the_previous_state_is_used_when_the_newest_is_corrupt(tmp_path):
         load_newest_state(path)
 
 
-@pytest.fixture
-def full_disk():
-    """Lets no file grow beyond the given size."""
+@contextlib.contextmanager
+def full_disk(size):
+    """Lets no file grow beyond `size`; only around the call, since the test's own log is a file too."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    yield lambda size: resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-    resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 @pytest.mark.parametrize("share", [0.0, 0.01, 0.3, 0.6, 0.9, 0.999])
-def test_a_full_disk_leaves_the_previous_state(tmp_path, full_disk, share):
+def test_a_full_disk_leaves_the_previous_state(tmp_path, share):
     path, old = tmp_path / "state.npz", stream(CHUNKS[:3])
     save_state(path, old, {})
-    full_disk(int(share * path.stat().st_size))
-    with pytest.raises(StorageError, match=r"state\.npz"):
-        save_state(path, stream(CHUNKS), {})
+    new, size = stream(CHUNKS), int(share * path.stat().st_size)
+    with pytest.raises(StorageError, match=r"state\.npz"), full_disk(size):
+        save_state(path, new, {})
     assert [p.name for p in tmp_path.iterdir()] == ["state.npz"]
     assert_identical(load_state(path)[0], old)

@@ -1,0 +1,151 @@
+"""Each effect: right when on, no trace when off, asked for only by scenes that need it."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ssplat_jax.errors import InputError
+from ssplat_jax.geometry.cameras import Camera
+from ssplat_jax.render import Effects, effects_for, filter_3d, render
+from ssplat_jax.render.distortion import distort
+from ssplat_jax.struct import replace
+from tests.render.scenes import cameras, cloud
+
+LENS = np.array([-0.2, 0.05, 0.002, -0.003, 0.01], np.float32)
+EXPOSURE = np.concatenate([np.diag([1.2, 0.9, 1.1]), [[0.01], [0.0], [-0.02]]], axis=1).astype(np.float32)
+OUTPUTS = ("color", "alpha", "depth")
+
+
+def operations(gaussians, camera, effects: Effects, **arrays) -> tuple[int, float]:
+    """Operations in the traced program, calls included, and what XLA says it computes."""
+
+    def count(jaxpr) -> int:
+        is_program = lambda p: hasattr(p, "eqns") or hasattr(p, "jaxpr")  # noqa: E731
+        parts = [p for e in jaxpr.eqns for p in jax.tree.leaves(e.params, is_leaf=is_program)]
+        return len(jaxpr.eqns) + sum(count(getattr(p, "jaxpr", p)) for p in parts if is_program(p))
+
+    def program(gaussians):
+        return render(gaussians, camera, effects=effects, max_pairs=1 << 12, **arrays)
+
+    cost = jax.jit(program).lower(gaussians).cost_analysis() or {}
+    return count(jax.make_jaxpr(program)(gaussians).jaxpr), float(cost.get("flops", 0.0))
+
+
+EFFECTS = {
+    "sh": (Effects(sh_degree=3), Effects(sh_degree=0)),
+    "mip": (Effects(), Effects(antialias="none")),
+    "classic": (Effects(antialias="mip"), Effects(antialias="classic")),
+    "filter_3d": (Effects(filter_3d=True), Effects()),
+    "distortion": (Effects(distortion=True), Effects()),
+    "exposure": (Effects(exposure=True), Effects()),
+    "background": (Effects(background=(0.1, 0.2, 0.3)), Effects()),
+    "depth": (Effects(), Effects(outputs=("color", "alpha"))),
+    "alpha": (Effects(outputs=("color", "alpha")), Effects(outputs=("color",))),
+    "median_depth": (Effects(outputs=(*OUTPUTS, "median_depth")), Effects()),
+}
+
+
+@pytest.mark.parametrize("name", EFFECTS)
+def test_an_effect_that_is_off_leaves_no_trace(name):
+    """Off with its arrays passed = a program that never had them; on adds operations."""
+    on, off = EFFECTS[name]
+    gaussians, camera = cloud(8, degree=3), cameras(16, 16)
+    arrays = {"captured": camera, "distortion": jnp.asarray(LENS), "exposures": jnp.asarray(EXPOSURE)}
+    never = operations(replace(gaussians, sh=gaussians.sh[:, :1]) if name == "sh" else gaussians, camera, off)
+    without, having = operations(gaussians, camera, off, **arrays), operations(gaussians, camera, on, **arrays)
+    # SH bands that are not evaluated are still looked at for NaN, one comparison an entry.
+    assert without[0] == never[0] + (1 if name == "sh" else 0) or without[0] == never[0]
+    if name != "sh":
+        assert without == never
+    assert having[0] > without[0] and having[1] > without[1]
+
+
+def test_features_that_are_not_passed_leave_no_trace():
+    gaussians, camera = cloud(8), cameras(16, 16)
+    plain = operations(gaussians, camera, Effects())
+    assert operations(gaussians, camera, Effects(), features=jnp.ones((8, 2)))[0] > plain[0]
+
+
+def test_distortion_follows_opencvs_formula_and_its_derivative():
+    random = np.random.default_rng(0)
+    x, y = random.uniform(-0.5, 0.5, (2, 1, 50))
+    k1, k2, p1, p2, k3 = LENS.astype(float)
+
+    def opencv(x, y):
+        r2 = x**2 + y**2
+        radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+        across = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+        return np.array([across, y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y])
+
+    (dx, dy), slopes = distort(*(jnp.asarray(v, jnp.float32) for v in (x, y)), jnp.asarray(LENS)[None])
+    np.testing.assert_allclose(np.stack([dx, dy]), opencv(x, y), atol=1e-6)
+    h = 1e-6
+    measured = [*(opencv(x + h, y) - opencv(x - h, y)) / 2 / h, *(opencv(x, y + h) - opencv(x, y - h)) / 2 / h]
+    for got, wanted in zip(slopes, (measured[0], measured[2], measured[1], measured[3]), strict=True):
+        np.testing.assert_allclose(got, wanted, atol=1e-5)
+
+
+def test_a_lens_of_zeros_is_a_pinhole():
+    gaussians, camera = cloud(), cameras(21, 30)
+    lens = render(gaussians, camera, effects=Effects(distortion=True), distortion=jnp.zeros(5), max_pairs=1 << 12)
+    np.testing.assert_allclose(lens.color, render(gaussians, camera, max_pairs=1 << 12).color, atol=1e-5)
+
+
+def test_exposure_is_affine_in_colour():
+    gaussians, camera = cloud(), cameras(21, 30)
+    plain = np.asarray(render(gaussians, camera, max_pairs=1 << 12).color)
+    out = render(gaussians, camera, effects=Effects(exposure=True), exposures=jnp.asarray(EXPOSURE), max_pairs=1 << 12)
+    np.testing.assert_allclose(out.color, np.maximum(plain @ EXPOSURE[:, :3].T + EXPOSURE[:, 3], 0), atol=1e-5)
+
+
+def test_the_3d_filter_is_two_tenths_of_a_sampling_interval_and_keeps_mass():
+    gaussians, camera = cloud(size=0.01), cameras(210, 300)
+    smoothed = filter_3d(gaussians, camera)
+    view = np.asarray(camera.viewmats)
+    points = np.asarray(gaussians.means) @ view[:3, :3].T + view[:3, 3]
+    pixels = points[:, :2] / points[:, 2:] * np.diag(camera.Ks)[:2] + np.asarray(camera.Ks)[:2, 2]
+    seen = np.all(np.abs(pixels / [210, 300] - 0.5) < 0.6, axis=1)
+    assert seen.sum() > 20
+    added = np.asarray(smoothed.scales) ** 2 - np.asarray(gaussians.scales) ** 2
+    wanted = 0.2 * (points[:, 2] / float(camera.Ks[0, 0])) ** 2
+    np.testing.assert_allclose(added[seen], np.broadcast_to(wanted[seen, None], added[seen].shape), rtol=1e-3)
+    mass = lambda g: np.asarray(g.opacities) * np.prod(np.asarray(g.scales), axis=1)  # noqa: E731
+    np.testing.assert_allclose(mass(smoothed), mass(gaussians), rtol=1e-5)
+
+
+def test_the_3d_filter_of_cameras_that_see_nothing_does_nothing():
+    gaussians, camera = cloud(), cameras(21, 30)
+    away = replace(camera, viewmats=camera.viewmats.at[2, 3].set(-100.0))
+    np.testing.assert_allclose(filter_3d(gaussians, away).scales, gaussians.scales, rtol=1e-6)
+
+
+def test_effects_for_asks_only_for_what_the_scene_needs():
+    gaussians, camera = cloud(degree=3), cameras(210, 300, batch=2)
+    assert effects_for(gaussians, camera) == Effects(sh_degree=3)
+    flat = replace(gaussians, sh=gaussians.sh.at[:, 4:].set(0.0))
+    assert effects_for(flat, camera).sh_degree == 1
+    assert effects_for(replace(gaussians, sh=gaussians.sh.at[:, 1:].set(0.0)), camera).sh_degree == 0
+    assert not effects_for(gaussians, camera, distortion=jnp.zeros((2, 5))).distortion
+    assert effects_for(gaussians, camera, distortion=jnp.asarray(np.stack([LENS] * 2))).distortion
+    same = jnp.asarray(np.stack([EXPOSURE] * 2))
+    assert not effects_for(gaussians, camera, exposures=same).exposure
+    assert effects_for(gaussians, camera, exposures=same.at[0, 0, 0].add(0.1)).exposure
+    assert not effects_for(gaussians, camera, captured=camera).filter_3d
+    closer = Camera(viewmats=camera.viewmats, Ks=camera.Ks * jnp.array([[2.0], [2.0], [1.0]]), width=420, height=600)
+    assert effects_for(gaussians, closer, captured=camera).filter_3d
+
+
+def test_what_effects_for_leaves_out_changes_no_pixel():
+    gaussians, camera = cloud(degree=3), cameras(21, 30)
+    flat = replace(gaussians, sh=gaussians.sh.at[:, 4:].set(0.0))
+    least = render(flat, camera, effects=effects_for(flat, camera), max_pairs=1 << 12)
+    np.testing.assert_allclose(least.color, render(flat, camera, max_pairs=1 << 12).color, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "fields", [{"sh_degree": 4}, {"antialias": "fxaa"}, {"outputs": ("colour",)}], ids=["degree", "antialias", "output"]
+)
+def test_unknown_effects_are_refused(fields):
+    with pytest.raises(InputError, match="effects:"):
+        Effects(**fields)

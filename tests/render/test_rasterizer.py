@@ -1,0 +1,167 @@
+"""The fast path and the reference against the NumPy oracle, and the fast path's gradients against the reference's."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ssplat_jax.errors import InputError
+from ssplat_jax.gaussians import concatenate, mask_gaussians
+from ssplat_jax.render import Effects, render
+from ssplat_jax.render.reference import render_reference
+from ssplat_jax.struct import replace
+from tests.render import oracle
+from tests.render.scenes import cameras, cloud
+
+FORWARD = 2e-5  # float32 sums of about 60 samples, depths up to 4; far below the 1e-4 that issue 3 asks for
+GRADIENT = 1e-4  # relative L2, float32 against float64
+DIFFERENCES = 1e-3  # central differences of a piecewise smooth image in float64
+ALL = Effects(outputs=("color", "alpha", "depth", "median_depth"), background=(0.2, 0.5, 0.9))
+
+
+def relative(a, b) -> float:
+    a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
+    return float(np.linalg.norm(a - b) / max(np.linalg.norm(b), 1e-12))
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return cloud(degree=3), cameras(21, 30)  # portrait, and no multiple of a tile
+
+
+@pytest.mark.parametrize("antialias", ["mip", "classic", "none"])
+def test_both_paths_show_what_the_textbook_says(scene, antialias):
+    gaussians, camera = scene
+    effects = ALL.replace(antialias=antialias, background=None)
+    color, alpha, depth, median = oracle.render(gaussians, camera.viewmats, camera.Ks, 21, 30, antialias)
+    with jax.enable_x64(True):
+        exact = render_reference(*jax.tree.map(lambda x: x.astype(jnp.float64), scene), effects=effects)
+        exact = jax.tree.map(np.asarray, exact)
+    for name, wanted in (("color", color), ("alpha", alpha), ("depth", depth), ("median_depth", median)):
+        np.testing.assert_allclose(getattr(exact, name), wanted, atol=1e-10, err_msg=name)
+    fast = render(gaussians, camera, effects=effects)
+    for name, wanted in (("color", color), ("alpha", alpha), ("depth", depth), ("median_depth", median)):
+        np.testing.assert_allclose(getattr(fast, name), wanted, atol=FORWARD, err_msg=name)
+
+
+def test_gradients_equal_the_references_in_float64():
+    gaussians, camera = cloud(degree=1), cameras(21, 30, batch=2)
+    features = jnp.asarray(np.random.default_rng(2).normal(size=(60, 2)), jnp.float32)
+    effects = Effects(background=(0.2, 0.5, 0.9))
+    random = np.random.default_rng(3)
+    cotangents = [random.normal(size=(2, 30, 21, *tail)) for tail in ((3,), (), (), (2,))]
+
+    def loss(renderer):
+        def inner(inputs):
+            out = renderer(inputs[0], inputs[1], features=inputs[2], effects=effects)
+            images = (out.color, out.alpha, out.depth, out.features)
+            return sum(jnp.sum(jnp.asarray(c, x.dtype) * x) for c, x in zip(cotangents, images, strict=True))
+
+        return jax.jit(jax.grad(inner))
+
+    got = loss(lambda *a, **k: render(*a, max_pairs=1 << 12, **k))((gaussians, camera, features))
+    with jax.enable_x64(True):
+        doubles = jax.tree.map(lambda x: x.astype(jnp.float64), (gaussians, camera, features))
+        wanted = loss(lambda *a, **k: render_reference(*a, rows_at_once=30, **k))(doubles)
+        wanted = jax.tree.map(np.asarray, wanted)
+    for (path, a), b in zip(jax.tree_util.tree_leaves_with_path(got), jax.tree.leaves(wanted), strict=True):
+        assert relative(a, b) < GRADIENT, (jax.tree_util.keystr(path), relative(a, b))
+        cosine = np.vdot(a, b) / np.linalg.norm(a) / np.linalg.norm(b)
+        assert cosine > 0.99999, jax.tree_util.keystr(path)
+
+
+def test_gradients_equal_finite_differences_in_float64():
+    # Few, wide, faint Gaussians: no alpha threshold is crossed by a step of 1e-6.
+    with jax.enable_x64(True):
+        scene = cloud(6, degree=1, size=0.4, dtype=np.float64), cameras(12, 10, dtype=np.float64)
+
+        @jax.jit
+        def loss(inputs):
+            out = render(*inputs, max_pairs=1 << 12)
+            return jnp.mean(out.color**2) + jnp.mean(out.depth) + jnp.mean(out.alpha)
+
+        grads = jax.jit(jax.grad(loss))(scene)
+        random = np.random.default_rng(0)
+        for (path, leaf), grad in zip(jax.tree_util.tree_leaves_with_path(scene), jax.tree.leaves(grads), strict=True):
+            direction = random.normal(size=leaf.shape)
+            if "viewmats" in jax.tree_util.keystr(path):
+                direction[3] = 0  # the last row of a rigid transform is not a variable
+            if "Ks" in jax.tree_util.keystr(path):
+                direction *= np.array([[1, 0, 1], [0, 1, 1], [0, 0, 0]])
+
+            def moved(step, path=path, direction=direction):
+                shift = lambda p, x: x + step * jnp.asarray(direction) if p == path else x  # noqa: E731
+                return loss(jax.tree_util.tree_map_with_path(shift, scene))
+
+            measured = float(moved(1e-6) - moved(-1e-6)) / 2e-6
+            stated = float(np.vdot(grad, direction))
+            assert abs(measured - stated) <= DIFFERENCES * max(abs(stated), 1e-3), jax.tree_util.keystr(path)
+
+
+def test_a_batch_equals_its_cameras_one_by_one(scene):
+    gaussians, camera = cloud(degree=3), cameras(21, 30, batch=2)
+    together = render(gaussians, camera, effects=ALL, max_pairs=1 << 12)
+    for i in range(2):
+        alone = render(gaussians, camera[i], effects=ALL, max_pairs=1 << 12)
+        np.testing.assert_allclose(together.color[i], alone.color, atol=1e-6)
+        np.testing.assert_array_equal(together.median_depth[i], alone.median_depth)
+
+
+def test_tile_sizes_agree(scene):
+    small, large = (render(*scene, tile=tile, max_pairs=1 << 12) for tile in (8, 16))
+    np.testing.assert_allclose(small.color, large.color, atol=FORWARD)
+    assert int(large.num_pairs) < int(small.num_pairs)
+
+
+def test_absent_rows_and_their_order_change_nothing(scene):
+    gaussians, camera = scene
+    absent = mask_gaussians(gaussians, jnp.zeros(60, bool))
+    padded = render(concatenate([absent, gaussians]), camera, max_pairs=1 << 12)
+    plain = render(gaussians, camera, max_pairs=1 << 12)
+    np.testing.assert_allclose(padded.color, plain.color, atol=1e-6)
+    assert int(padded.num_pairs) == int(plain.num_pairs)
+
+
+def test_a_capacity_too_small_is_counted_inside_jit_and_retried_outside(scene):
+    wanted = render(*scene)
+    assert int(wanted.num_overflow) == 0
+    retried = render(*scene, max_pairs=64)
+    np.testing.assert_array_equal(retried.color, wanted.color)
+    assert int(retried.num_overflow) == 0
+    inside = jax.jit(lambda g: render(g, scene[1], max_pairs=64))(scene[0])
+    assert int(inside.num_overflow) == int(wanted.num_pairs) - 64 > 0
+
+
+def test_keys_wider_than_32_bits_sort_alike(scene, monkeypatch):
+    from ssplat_jax.render import binning
+
+    wanted = render(*scene, max_pairs=1 << 12)
+    monkeypatch.setattr(binning, "KEY_BITS", 4)
+    jax.clear_caches()
+    np.testing.assert_array_equal(render(*scene, max_pairs=1 << 12).color, wanted.color)
+    jax.clear_caches()
+
+
+def test_what_is_given_back_is_what_was_asked_for(scene):
+    out = render(*scene, effects=Effects(outputs=("color",)), max_pairs=1 << 12)
+    assert out.alpha is None and out.depth is None and out.median_depth is None and out.features is None
+    np.testing.assert_allclose(out.color, render(*scene, max_pairs=1 << 12).color, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"features": jnp.zeros((3, 2))}, "features must be"),
+        ({"effects": Effects(filter_3d=True)}, "captured"),
+        ({"effects": Effects(distortion=True)}, "distortion must be"),
+        ({"effects": Effects(exposure=True), "exposures": jnp.zeros((3, 3, 4))}, "exposures must be"),
+    ],
+)
+def test_bad_input_says_what_was_wanted(scene, changes, message):
+    with pytest.raises(InputError, match=message):
+        render(*scene, **changes)
+
+
+def test_a_camera_of_no_pixels_is_refused(scene):
+    with pytest.raises(InputError, match="1x1"):
+        render(scene[0], replace(scene[1], width=0))

@@ -1,0 +1,318 @@
+"""The rasterizer where it could break: named hard cases, and a sweep over the grid of extremes.
+
+One compiled program serves every case (64 Gaussians, 24x16 pixels, SH degree 3), so a case costs no compilation. Each
+must give finite images and finite gradients by every input and, where a limit exists, the right image.
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ssplat_jax.gaussians import Gaussians
+from ssplat_jax.geometry.cameras import Camera
+from ssplat_jax.render import Effects, api, render
+from ssplat_jax.struct import replace
+from tests.render import oracle
+
+NUM, WIDTH, HEIGHT = 64, 24, 16
+EFFECTS = Effects(outputs=("color", "alpha", "depth", "median_depth"))
+TOLERANCE = 1e-4  # issue 3's: float32 against the float64 oracle
+FIELDS = ("means", "quats", "scales", "opacities", "sh")
+F = np.float32
+
+
+def base() -> dict[str, np.ndarray]:
+    """One visible grey Gaussian in the middle; the other rows absent."""
+    arrays = {
+        "means": np.zeros((NUM, 3)),
+        "quats": np.tile([1.0, 0.0, 0.0, 0.0], (NUM, 1)),
+        "scales": np.full((NUM, 3), 0.1),
+        "opacities": np.zeros(NUM),
+        "sh": np.zeros((NUM, 16, 3)),
+        "viewmat": np.eye(4),
+        "K": np.array([[20.0, 0, 12], [0, 20, 8], [0, 0, 1]]),
+    }
+    arrays["means"][0], arrays["opacities"][0] = [0.05, -0.02, 2.0], 0.8
+    arrays["sh"][:, 0] = [0.4, -0.2, 0.7]
+    return arrays
+
+
+def backdrop(a: dict) -> None:
+    """A second, plain Gaussian behind the hard one: it must still be seen."""
+    a["means"][1], a["scales"][1], a["opacities"][1] = [0.2, 0.1, 4.0], 0.5, 0.6
+
+
+CASES = {}
+
+
+def case(name: str):
+    def register(change):
+        CASES[name] = change
+        return change
+
+    return register
+
+
+def simple(name: str, **fields) -> None:
+    """A case that sets fields of row 0 (or `viewmat`, `K`), before a plain backdrop."""
+
+    def change(a):
+        backdrop(a)
+        for key, value in fields.items():
+            if key in ("viewmat", "K"):
+                a[key] = np.asarray(value, float)
+            else:
+                a[key][0] = value
+
+    CASES[name] = change
+
+
+# -- position
+simple("at the camera centre", means=[0, 0, 0])
+simple("on the near plane", means=[0, 0, 0.01])
+simple("just before the near plane", means=[0, 0, 0.0099])
+simple("just behind the near plane", means=[0, 0, 0.0101], scales=1e-4)
+simple("near and huge", means=[0, 0, 0.02], scales=1.0)
+simple("behind", means=[0, 0, -2])
+simple("far behind", means=[0, 0, -1e10])
+simple("beside the camera", means=[1e-3, 0, 1e-30])
+simple("off screen to the right by 1e8 px", means=[1e7, 0, 2.0])
+simple("off screen upwards by 1e8 px", means=[0, -1e7, 2.0])
+simple("off screen but reaching in", means=[2.5, 0, 2.0], scales=0.6)
+simple("grazing the image plane", means=[5.0, 0, 0.05], scales=0.2)
+simple("very far", means=[0, 0, 1e8])
+simple("very far and huge", means=[0, 0, 1e8], scales=1e7)
+simple("on a pixel centre", means=[0.05, 0.05, 2.0])
+simple("on a tile corner", means=[0.4, 0.0, 2.0])
+simple("at the image corner", means=[-1.2, -0.8, 2.0])
+# -- shape
+simple("scale 0", scales=0.0)
+simple("scale 1e-12", scales=1e-12)
+simple("scale 1e-30", scales=1e-30)
+simple("scale 1e6", scales=1e6)
+simple("scale 1e11", scales=1e11)
+simple("one scale 0", scales=[0.0, 0.2, 0.2])
+simple("disc towards the camera", scales=[0.2, 0.2, 0.0])
+simple("disc on edge", scales=[0.0, 0.3, 0.3])
+simple("needle 1e6 : 1", scales=[0.2, 2e-7, 2e-7])
+simple("needle 1e6 : 1, large", scales=[1e3, 1e-3, 1e-3])
+simple("needle along the view", scales=[1e-6, 1e-6, 1.0])
+simple("needle on the diagonal", scales=[1.0, 1e-6, 1e-6], quats=[0.92, 0, 0, 0.38])
+simple("determinant to 0", scales=[1.0, 1e-5, 1e-5], quats=[0.9, 0.1, 0.2, 0.3])
+simple("negative scale", scales=-0.1)
+simple("view exactly along an axis", means=[0, 0, 2.0], scales=[0.1, 0.2, 0.3])
+# -- rotation
+simple("quaternion 0", quats=0.0)
+simple("quaternion unnormalised", quats=[3.0, 1.0, -2.0, 0.5])
+simple("quaternion 1e-20", quats=[1e-20, 0, 1e-20, 0])
+simple("quaternion 1e11", quats=[1e11, 1e11, 0, 0])
+simple("quaternion negated", quats=[-1.0, 0, 0, 0])
+simple("quaternion NaN", quats=np.nan)
+simple("quaternion of half a turn", quats=[0.0, 1.0, 0, 0], scales=[0.1, 0.2, 0.3])
+# -- opacity
+simple("opacity 0", opacities=0.0)
+simple("opacity 1/255", opacities=1 / 255)
+simple("opacity just below 1/255", opacities=0.99 / 255)
+simple("opacity 1", opacities=1.0)
+simple("opacity above 1", opacities=1.5)
+simple("opacity negative", opacities=-0.5)
+simple("opacity 1e-40", opacities=1e-40)
+# -- colour
+simple("colour below 0", sh=-5.0)
+simple("colour 1e6", sh=1e6)
+simple("SH looking along the pole", means=[0, 0, 2.0], sh=np.linspace(-0.5, 0.5, 48).reshape(16, 3))
+simple("SH of degree 3 aside", means=[0.8, 0.5, 2.0], sh=np.linspace(-0.5, 0.5, 48).reshape(16, 3))
+# -- not finite: culled and counted
+for field in ("means", "scales", "opacities", "sh"):
+    simple(f"{field} NaN", **{field: np.nan})
+    simple(f"{field} infinite", **{field: np.inf})
+simple("means -infinite", means=[0, 0, -np.inf])
+simple("one NaN entry", means=[np.nan, 0, 2.0])
+# -- camera
+simple("focal 1", K=[[1, 0, 12], [0, 1, 8], [0, 0, 1]])
+simple("focal 1e5", K=[[1e5, 0, 12], [0, 1e5, 8], [0, 0, 1]], means=[0, 0, 2.0], scales=1e-4)
+simple("unequal focals", K=[[5, 0, 12], [0, 80, 8], [0, 0, 1]])
+simple("principal point outside the image", K=[[20, 0, -30], [0, 20, 40], [0, 0, 1]])
+simple("camera upside down", viewmat=np.diag([-1.0, -1, 1, 1]))
+
+
+@case("empty scene")
+def _(a):
+    a["opacities"][:] = 0
+
+
+@case("every row masked, with NaN in them")
+def _(a):
+    a["opacities"][:], a["means"][:] = 0, np.nan
+
+
+@case("hundreds of coincident Gaussians")
+def _(a):
+    a["means"][:], a["opacities"][:] = [0.05, -0.02, 2.0], 0.5
+
+
+@case("equal depths")
+def _(a):
+    a["means"][:, :2] = np.random.default_rng(0).uniform(-0.5, 0.5, (NUM, 2))
+    a["means"][:, 2], a["opacities"][:] = 2.0, 0.6
+    a["sh"][:, 0] = np.random.default_rng(1).normal(size=(NUM, 3))
+
+
+@case("opaque layers until transmittance underflows")
+def _(a):
+    a["means"][:] = np.stack([np.zeros(NUM), np.zeros(NUM), np.linspace(1, 3, NUM)], axis=1)
+    a["scales"][:], a["opacities"][:] = 10.0, 0.985
+
+
+@case("opaque layers that end on the stop")
+def _(a):
+    a["means"][:] = np.stack([np.zeros(NUM), np.zeros(NUM), np.linspace(1, 3, NUM)], axis=1)
+    a["scales"][:], a["opacities"][:] = 10.0, 1.0
+
+
+@case("faint layers down to the stop")
+def _(a):
+    a["means"][:] = np.stack([np.zeros(NUM), np.zeros(NUM), np.linspace(1, 3, NUM)], axis=1)
+    a["scales"][:], a["opacities"][:] = 10.0, 0.17
+
+
+@case("depths one ulp apart")
+def _(a):
+    steps = np.nextafter(F(2), F(3)) - F(2)
+    a["means"][:, 2] = 2.0 + steps * np.random.default_rng(0).permutation(NUM)
+    a["opacities"][:], a["scales"][:] = 0.3, 0.3
+    a["sh"][:, 0] = np.random.default_rng(1).normal(size=(NUM, 3))
+
+
+@case("world shifted by 6.4e6")
+def _(a):
+    backdrop(a)
+    a["means"] += [0, 0, 6.4e6]
+    a["viewmat"][2, 3] = -6.4e6
+
+
+@case("more opacity than a tile can hold, all behind")
+def _(a):
+    a["means"][:], a["opacities"][:] = [0, 0, -1.0], 1.0
+
+
+# Cases with no limit to compare with: the value depends on rounding that float32 decides otherwise than float64.
+WITHOUT_LIMIT = {
+    "world shifted by 6.4e6",  # a step of float32 is 0.5 there
+    "scale 1e11",
+    "faint layers down to the stop",
+    "opaque layers that end on the stop",  # (1 - 0.99)^2 is the stop itself
+    "opacity 1/255",
+    "colour 1e6",
+}
+
+
+@functools.cache
+def program():
+    """Images, and gradients of a loss that uses all of them."""
+
+    def loss(gaussians, camera):
+        out = render(gaussians, camera, effects=EFFECTS, max_pairs=1 << 12)
+        images = (out.color, out.alpha, out.depth, out.median_depth)
+        weights = np.random.default_rng(5).normal(size=(HEIGHT, WIDTH)).astype(F)
+        total = sum(jnp.sum(x * (weights[..., None] if x.ndim == 3 else weights)) for x in images)
+        return total + jnp.sum(out.color**2), out
+
+    return jax.jit(jax.value_and_grad(loss, argnums=(0, 1), has_aux=True))
+
+
+def build(arrays: dict[str, np.ndarray]) -> tuple[Gaussians, Camera]:
+    gaussians = Gaussians(**{name: jnp.asarray(arrays[name], jnp.float32) for name in FIELDS})
+    view, K = (jnp.asarray(arrays[name], jnp.float32) for name in ("viewmat", "K"))
+    return gaussians, Camera(viewmats=view, Ks=K, width=WIDTH, height=HEIGHT)
+
+
+def is_finite(tree) -> bool:
+    return all(bool(np.all(np.isfinite(x))) for x in jax.tree.leaves(tree))
+
+
+def test_there_are_at_least_sixty_cases():
+    assert len(CASES) >= 60
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_hard_case(name):
+    arrays = base()
+    CASES[name](arrays)
+    gaussians, camera = build(arrays)
+    (value, out), grads = program()(gaussians, camera)
+    assert is_finite((value, out)), "value"
+    assert is_finite(grads), "gradient"
+    rows = [np.isfinite(arrays[k].reshape(NUM, -1)).all(1) for k in FIELDS]
+    broken = ~np.all(rows, axis=0)
+    assert int(out.num_non_finite) == int(np.sum(broken & (arrays["opacities"] != 0)))
+    if name in WITHOUT_LIMIT:
+        return
+    color, alpha, depth, median = oracle.render(gaussians, camera.viewmats, camera.Ks, WIDTH, HEIGHT)
+    band = np.abs(np.asarray(out.alpha) - alpha) > 1 / 300  # a sample at the 1/255 threshold, decided by rounding
+    assert band.mean() < 0.02
+    scale = max(1.0, np.abs(color).max())
+    assert np.abs(np.where(band[..., None], 0, out.color - color)).max() <= TOLERANCE * scale
+    assert np.abs(np.where(band, 0, out.alpha - alpha)).max() <= TOLERANCE
+    seen = (alpha > 0.02) & ~band
+    assert np.abs(np.where(seen, out.depth - depth, 0)).max() <= TOLERANCE * max(1.0, depth.max())
+    assert np.mean(np.abs(np.asarray(out.median_depth) - median) > 1e-5 * max(1.0, median.max())) < 0.02
+
+
+def test_equal_depths_keep_the_order_of_rows():
+    """Two coincident opaque Gaussians: the one that stands first in the arrays is in front."""
+    arrays = base()
+    arrays["means"][:2], arrays["opacities"][:2], arrays["scales"][:2] = [0, 0, 2.0], 1.0, 5.0
+    arrays["sh"][0, 0], arrays["sh"][1, 0] = [1.5, 0, 0], [0, 1.5, 0]
+    (_, out), _ = program()(*build(arrays))
+    assert float(out.color[8, 12, 0]) > 0.8 > 0.6 > float(out.color[8, 12, 1])
+
+
+def test_a_row_that_is_culled_gets_no_gradient():
+    arrays = base()
+    backdrop(arrays)
+    arrays["means"][0] = [np.nan, 0, 2]
+    _, (grads, _) = program()(*build(arrays))
+    assert all(np.all(np.asarray(x)[0] == 0) for x in jax.tree.leaves(grads))
+    assert np.any(np.asarray(grads.means)[1] != 0)
+
+
+def test_ten_thousand_extremes_have_no_non_finite_gradient():
+    """Every field of every Gaussian drawn from its extremes, 64 at a time, in front of extreme cameras."""
+    random = np.random.default_rng(7)
+    pick = lambda values, size: random.choice(np.array(values), size)  # noqa: E731
+    bad = 0
+    for _ in range(10_000 // NUM + 1):
+        arrays = base()
+        sign = pick([-1, 1], (NUM, 3))
+        arrays["means"] = sign * pick([0, 1e-30, 1e-3, 0.01, 0.3, 2, 1e4, 1e8, np.nan], (NUM, 3))
+        arrays["scales"] = pick([0, 1e-30, 1e-12, 1e-6, 0.1, 3, 1e3, 1e6, np.inf], (NUM, 3))
+        quats = pick([-1, 0, 1e-20, 1, 1e10, np.nan], (NUM, 4))
+        arrays["quats"] = quats if random.uniform() < 0.5 else random.normal(size=(NUM, 4))
+        arrays["opacities"] = pick([0, 1e-30, 1 / 255, 0.5, 0.99, 1, 2], NUM)
+        arrays["sh"] = pick([-3, -1, 0, 1e-30, 1, 3], (NUM, 16, 3))
+        focal = pick([1.0, 20.0, 1e5], 2)
+        arrays["K"] = np.array([[focal[0], 0, 12], [0, focal[1], 8], [0, 0, 1]])
+        (value, out), grads = program()(*build(arrays))
+        bad += not is_finite((value, out, grads))
+    assert bad == 0
+
+
+def test_an_image_of_one_pixel():
+    gaussians, camera = build(base())
+    out = render(gaussians, replace(camera, width=1, height=1), effects=EFFECTS, max_pairs=1 << 12)
+    assert out.color.shape == (1, 1, 3) and is_finite(out)
+    wanted = oracle.render(gaussians, camera.viewmats, camera.Ks, 1, 1)
+    np.testing.assert_allclose(out.color, wanted[0], atol=TOLERANCE)
+
+
+def test_bfloat16_colours_are_composited_in_float32():
+    gaussians, camera = build(base())
+    half = replace(gaussians, sh=gaussians.sh.astype(jnp.bfloat16))
+    shapes = jax.eval_shape(lambda g: render(g, camera, effects=EFFECTS, max_pairs=1 << 12), half)
+    assert shapes.color.dtype == shapes.depth.dtype == jnp.float32
+    prepared = api.prepare(api.Inputs(half, camera), EFFECTS)[0]
+    np.testing.assert_array_equal(prepared.sh, half.sh.astype(jnp.float32))
