@@ -179,7 +179,7 @@ def _finish(session: Session, frame: StreamFrame, capture: Capture, indices: lis
         "capture": capture.name,
         "size": [capture.width, capture.height],
         "views": len(indices),
-        "seen_views": scores,  # views of the stream itself: how well the scene explains its input, not a novel-view score
+        "seen_views": scores,  # of the stream itself: how well the scene explains its input
         "ply": dataclasses.asdict(report),
         "compile_s": round(session.compile_seconds, 2),
         "step_memory_bytes": session.step_memory_bytes,

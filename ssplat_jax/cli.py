@@ -123,7 +123,7 @@ class Run:
 class Eval:
     """Score novel views of a capture that the stream never saw: metrics.json and target | render | depth pictures.
 
-    Example: ssplat eval path/to/capture --protocol interleaved --stride 5 --context 64 --size 320x240 --out runs/eval
+    Example: ssplat eval path/to/capture --stride 5 --context 64 --size 320x240 --out runs/eval
     """
 
     capture: Annotated[str, tyro.conf.Positional]
@@ -133,11 +133,11 @@ class Eval:
     out: Path
     """Where the results go."""
     protocol: Literal["interleaved", "paper"] = "interleaved"
-    """interleaved: every 8th frame from the 5th on is a target. paper: targets uniform over the whole trajectory."""
+    """interleaved: every 8th frame from the 5th on is a target. paper: targets uniform over the trajectory."""
     stride: int = 1
     """Take every so many-th frame."""
     targets: int | None = None
-    """Number of targets: of the paper's protocol (default 16), or at most so many, evenly spread, of the interleaved."""
+    """Targets of the paper's protocol (default 16); of the interleaved, the most that are kept, evenly spread."""
     size: str | None = None
     """Image size WxH to work at; default the capture's own."""
     weights: str = "tiny"
@@ -162,7 +162,8 @@ class Eval:
         print(
             f"{capture.name}: PSNR {metrics['psnr']:.2f} dB, SSIM {metrics['ssim']:.3f} over {metrics['target_views']}"
             f" views (copying the nearest view {reference['nearest_view_psnr']:.2f}, a mean colour"
-            f" {reference['mean_colour_psnr']:.2f}); {metrics['chunk_ms']['median']:.0f} ms a chunk; {self.out}/metrics.json"
+            f" {reference['mean_colour_psnr']:.2f}); {metrics['chunk_ms']['median']:.0f} ms a chunk;"
+            f" {self.out}/metrics.json"
         )
         return 0
 
@@ -237,7 +238,9 @@ class Export:
         from ssplat_jax.checkpoint.weights import load_params
 
         report = export_run(self.run_dir, self.to, load_params(self.weights))
-        print(f"wrote {self.to}: {report.num_written} Gaussians ({report.num_dropped} invisible or not finite left out)")
+        print(
+            f"wrote {self.to}: {report.num_written} Gaussians ({report.num_dropped} invisible or not finite left out)"
+        )
         return 0
 
 

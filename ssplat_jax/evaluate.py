@@ -38,7 +38,11 @@ class ViewScore:
 
 
 def stream_context(
-    session: Session, capture: Capture, split: Split, frame: StreamFrame, on_chunk: Callable[[int], None] = lambda n: None
+    session: Session,
+    capture: Capture,
+    split: Split,
+    frame: StreamFrame,
+    on_chunk: Callable[[int], None] = lambda n: None,
 ) -> list:
     """Feeds the context to `session`; calls `on_chunk(views so far)`. Returns the last few chunks, for timing."""
     recent: list = []

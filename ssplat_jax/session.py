@@ -1,4 +1,4 @@
-"""`Session`: a stream on the host. It holds the cache, makes room, compiles once per shape, and counts what that took."""
+"""`Session`: a stream on the host. It holds the cache, makes room, compiles once per shape, and counts."""
 
 import time
 
@@ -12,7 +12,7 @@ from ssplat_jax.model import GRID_STRIDE
 from ssplat_jax.stream import ChunkOutput, StreamSplat
 
 ROOM_AT_START = 4
-"""A new cache holds at least this many chunks of tokens that all open voxels of their own: few captures make it grow."""
+"""A new cache holds this many chunks of tokens that all open voxels of their own: few captures make it grow."""
 
 
 class Session:

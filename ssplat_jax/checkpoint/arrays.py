@@ -1,17 +1,15 @@
 """Named arrays in one `.npz`: no pickle, a JSON header, a sha256 for every array, written atomically."""
 
-import contextlib
 import hashlib
 import io
 import json
-import os
-import tempfile
 import zipfile
 from pathlib import Path
 
 import numpy as np
 
 from ssplat_jax.errors import StorageError
+from ssplat_jax.export.atomic import write_atomic
 
 SCHEMA = 1
 _HEADER = "header"
@@ -24,32 +22,11 @@ def save_arrays(path: Path, arrays: dict[str, np.ndarray], header: dict) -> None
         StorageError: the folder cannot be written or the disk is full.
     """
     path = Path(path)
-    leaves = {
-        name: {"shape": list(x.shape), "dtype": str(x.dtype), "sha256": _sha256(x)} for name, x in arrays.items()
-    }
+    leaves = {name: {"shape": list(x.shape), "dtype": str(x.dtype), "sha256": _sha256(x)} for name, x in arrays.items()}
     text = json.dumps({"schema": SCHEMA, "leaves": leaves, "header": header}, sort_keys=True)
     buffer = io.BytesIO()
     np.savez(buffer, **{_HEADER: np.frombuffer(text.encode(), np.uint8)}, **arrays)
-    write_atomically(path, buffer.getvalue())
-
-
-def write_atomically(path: Path, content: bytes) -> None:
-    """Puts `content` at `path` by way of a temporary file beside it that is on disk before it is renamed."""
-    temporary = None
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-        with os.fdopen(descriptor, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    except OSError as error:
-        if temporary is not None:
-            with contextlib.suppress(OSError):
-                os.unlink(temporary)
-        raise StorageError(f"{path}: cannot write: {error.strerror or error}; free space or choose another folder.") from error
+    write_atomic(path, buffer.getvalue())
 
 
 def load_arrays(path: Path) -> tuple[dict[str, np.ndarray], dict]:
@@ -75,7 +52,16 @@ def load_arrays(path: Path) -> tuple[dict[str, np.ndarray], dict]:
     except FileNotFoundError:
         raise StorageError(f"{path}: no such file.") from None
     # A damaged archive surfaces as almost anything: zlib, struct, UTF-8, JSON or key errors.
-    except (OSError, ValueError, KeyError, TypeError, EOFError, MemoryError, NotImplementedError, zipfile.BadZipFile) as error:
+    except (
+        OSError,
+        ValueError,
+        KeyError,
+        TypeError,
+        EOFError,
+        MemoryError,
+        NotImplementedError,
+        zipfile.BadZipFile,
+    ) as error:
         raise StorageError(f"{path}: cannot be read ({type(error).__name__}: {error}); the file is corrupt.") from error
 
 

@@ -1,4 +1,4 @@
-"""Weights files: parameters by path, float16 on disk (half of the rounding error of a render's 8 bits), float32 in use."""
+"""Weights files: parameters by path, float16 on disk, float32 in use."""
 
 from importlib import resources
 from pathlib import Path

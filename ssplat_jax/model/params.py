@@ -1,5 +1,7 @@
 """Fresh parameters of every stage: plain nested dicts whose names are the checkpoint format."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 
@@ -13,6 +15,7 @@ from ssplat_jax.model.mixer import Mixer
 from ssplat_jax.model.tokens import TokenRegressor
 
 
+@functools.partial(jax.jit, static_argnums=1)  # eagerly, every layer's every operation would be compiled by itself
 def init_params(key: jax.Array, config: StreamConfig) -> dict:
     """Parameters for `config`, drawn from `key`. Shapes depend on the configuration alone, never on an image."""
     v, side, c = 2, config.attention_window, config.token_width

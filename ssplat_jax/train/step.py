@@ -106,7 +106,7 @@ def loss_fn(params: dict, model: StreamSplat, sample: Sample, recipe: Recipe, fr
         loss = recipe.depth_weight * loss + 10.0 * (mse + recipe.gradient_weight * gradients)
         metrics |= {
             "psnr": -10 * jnp.log10(mse + 1e-10),
-            "alpha": output.alpha.mean(),
+            "alpha": output.alpha.mean(),  # pyright: ignore[reportOptionalMemberAccess]
             "overflow": output.num_overflow.astype(jnp.float32),
         }
     return loss, metrics | {"loss": loss}

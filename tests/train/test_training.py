@@ -58,7 +58,11 @@ def test_soft_targets_peak_at_the_truth_and_the_loss_is_least_there():
     np.testing.assert_allclose(np.asarray(target.sum(-1)), 1.0, atol=1e-6)
     assert int(jnp.argmax(target[0, 0, 0])) == 7
     usable = jnp.ones((1, 2, 2), bool)
-    at = lambda k: float(depth_loss(20.0 * jax.nn.one_hot(jnp.full((1, 2, 2), k), 21), truth, truth, candidates, usable)[0])  # noqa: E731
+
+    def at(k):
+        logits = 20.0 * jax.nn.one_hot(jnp.full((1, 2, 2), k), 21)
+        return float(depth_loss(logits, truth, truth, candidates, usable)[0])
+
     assert at(7) < at(6) < at(5)
 
 
@@ -90,7 +94,9 @@ def test_a_step_with_a_non_finite_gradient_changes_nothing_but_its_count():
     model = StreamSplat(training_config(NARROW, RECIPE))
     sample = sample_for_step(0, RECIPE, model.config)
     broken = dataclasses.replace(sample, log_depths=sample.log_depths.at[0, 0, 8, 8].set(jnp.nan))
-    broken = dataclasses.replace(broken, chunks=dataclasses.replace(sample.chunks, images=sample.chunks.images * jnp.inf))
+    broken = dataclasses.replace(
+        broken, chunks=dataclasses.replace(sample.chunks, images=sample.chunks.images * jnp.inf)
+    )
     state = init_state(model, RECIPE)
     before = flat(state.params)
     after, metrics = Trainer(model, RECIPE).step(state, broken, jnp.float32(1e-3))
@@ -111,7 +117,9 @@ def test_frozen_stages_stay_and_the_others_move():
     for a, b in zip(flat(after.params["encoder"]), flat(before["encoder"]), strict=True):
         np.testing.assert_array_equal(a, b)
     for name in ("cost_volume", "tokens", "mixer", "decoder"):
-        assert any(not np.array_equal(a, b) for a, b in zip(flat(after.params[name]), flat(before[name]), strict=True)), name
+        assert any(
+            not np.array_equal(a, b) for a, b in zip(flat(after.params[name]), flat(before[name]), strict=True)
+        ), name
 
 
 def test_an_interrupted_run_ends_as_an_uninterrupted_one(tmp_path):
