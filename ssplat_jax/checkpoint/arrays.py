@@ -25,7 +25,7 @@ def save_arrays(path: Path, arrays: dict[str, np.ndarray], header: dict) -> None
     leaves = {name: {"shape": list(x.shape), "dtype": str(x.dtype), "sha256": _sha256(x)} for name, x in arrays.items()}
     text = json.dumps({"schema": SCHEMA, "leaves": leaves, "header": header}, sort_keys=True)
     buffer = io.BytesIO()
-    np.savez(buffer, **{_HEADER: np.frombuffer(text.encode(), np.uint8)}, **arrays)
+    np.savez(buffer, **{_HEADER: np.frombuffer(text.encode(), np.uint8)}, **arrays)  # pyright: ignore[reportArgumentType]
     write_atomic(path, buffer.getvalue())
 
 
