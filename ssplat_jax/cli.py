@@ -282,6 +282,8 @@ def apply_changes(config: StreamConfig, changes: tuple[str, ...]) -> StreamConfi
             parsed[name], bool
         ):
             raise InputError(f"--set {name}: wanted a value like {held!r}, got {value!r}.")
+        if isinstance(held, float) and isinstance(parsed[name], int):
+            parsed[name] = float(parsed[name])
     return config.replace(**parsed)
 
 

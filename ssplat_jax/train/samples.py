@@ -56,7 +56,7 @@ def make_sample(seed: int, *, num_chunks: int, num_targets: int, size: tuple[int
     context = np.flatnonzero(~is_target)
 
     scale = config.median_depth / np.median(depths[context]) * np.exp(rng.uniform(-JITTER, JITTER))
-    viewmats = _stream_viewmats(camtoworlds.astype(np.float64), context[0], scale)
+    viewmats = _stream_viewmats(camtoworlds.astype(np.float64), int(context[0]), float(scale))
     depths = depths * scale
     low, high = np.quantile(depths[context], [0.01, 0.99])
     near = NEAR_FACTOR * low * np.exp(rng.uniform(-JITTER, JITTER))

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from ssplat_jax.model import init_params, inject_features, mix_tokens
+from ssplat_jax.model.layers import rms_normalize
 from ssplat_jax.model.mixer import nearest_tokens
 from ssplat_jax.model.wires import prepare_views
 from ssplat_jax.struct import replace
@@ -125,10 +126,18 @@ def test_a_valid_token_never_hears_cells_outside_the_image():
     np.testing.assert_array_equal(*out)
 
 
-def test_a_mixer_of_no_blocks_is_the_identity():
+def test_a_mixer_of_no_blocks_only_gives_unit_rms():
     config = CONFIG.replace(mixer_blocks=0)
-    out = mix_tokens({}, maps(4, C), maps(5, 3), jnp.ones(GRID, bool), jnp.ones(3, bool), config)
-    np.testing.assert_array_equal(out, maps(4, C))
+    feats = maps(4, C)
+    out = np.asarray(mix_tokens({}, feats, maps(5, 3), jnp.ones(GRID, bool), jnp.ones(3, bool), config))
+    np.testing.assert_allclose((out**2).mean(axis=-1), 1.0, atol=1e-4)
+    norms = np.linalg.norm(out, axis=-1) * np.linalg.norm(feats, axis=-1)
+    np.testing.assert_allclose((out * np.asarray(feats)).sum(axis=-1) / norms, 1.0, atol=1e-5)
+
+
+def test_unit_rms_of_zero_is_zero_with_a_finite_gradient():
+    assert not np.asarray(rms_normalize(jnp.zeros((2, 4)))).any()
+    assert np.isfinite(jax.grad(lambda x: rms_normalize(x).sum())(jnp.zeros((2, 4)))).all()
 
 
 def test_tokens_at_one_point_are_mixed_finitely():
