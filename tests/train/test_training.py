@@ -20,6 +20,13 @@ from tests.test_stream import NARROW
 RECIPE = smoke_recipe(4)
 
 
+@pytest.fixture(autouse=True)
+def standard_promotion():
+    """Optax raises a float to an int32 count in Adam's bias correction, which strict promotion refuses."""
+    with jax.numpy_dtype_promotion("standard"):
+        yield
+
+
 def flat(tree):
     return [np.asarray(x) for x in jax.tree.leaves(tree)]
 
