@@ -129,6 +129,7 @@ def test_frozen_stages_stay_and_the_others_move():
         ), name
 
 
+@pytest.mark.slow  # two runs, each compiling both phases
 def test_an_interrupted_run_ends_as_an_uninterrupted_one(tmp_path):
     whole = loop.train(NARROW, RECIPE, tmp_path / "whole", save_every=2)
     assert whole.step == RECIPE.num_steps
