@@ -1,12 +1,20 @@
 """What all tests share: shapes and types checked at every call, strict dtypes, and where the real captures are."""
 
+import atexit
 import os
+import shutil
+import tempfile
 from pathlib import Path
 
 from jaxtyping import install_import_hook
 
 # Laws to the last bit are laws of the CPU backend; set the variable to test another.
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
+
+# Workers and command lines started by tests compile the same programs: they share one cache, which ends with the run.
+if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = tempfile.mkdtemp(prefix="ssplat-tests-")
+    atexit.register(shutil.rmtree, os.environ["JAX_COMPILATION_CACHE_DIR"], ignore_errors=True)
 
 # Before anything of the package is imported: every annotated signature of it is checked at run time.
 install_import_hook("ssplat_jax", "beartype.beartype")

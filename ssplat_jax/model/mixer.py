@@ -26,13 +26,18 @@ def nearest_tokens(
     radius = config.mixer_radius
     side = 2 * radius + 1
     flat = jnp.arange(v * hf * wf).reshape(v, hf, wf)
-    rows = jnp.clip(jnp.arange(hf)[:, None] + jnp.arange(side) - radius, 0, hf - 1)
-    columns = jnp.clip(jnp.arange(wf)[:, None] + jnp.arange(side) - radius, 0, wf - 1)
+    rows = jnp.arange(hf)[:, None] + jnp.arange(side) - radius
+    columns = jnp.arange(wf)[:, None] + jnp.arange(side) - radius
+    in_rows, in_columns = (rows >= 0) & (rows < hf), (columns >= 0) & (columns < wf)
+    in_grid = in_rows[:, None, :, None] & in_columns[None, :, None, :]
+    in_grid = jnp.broadcast_to(in_grid, (v, *in_grid.shape)).reshape(v * hf * wf, side * side)
+    rows, columns = jnp.clip(rows, 0, hf - 1), jnp.clip(columns, 0, wf - 1)
     candidates = flat[:, rows[:, None, :, None], columns[None, :, None, :]].reshape(v * hf * wf, side * side)
     points, usable = positions.reshape(-1, 3), inside.reshape(-1)
     offsets = points[candidates] - points[:, None]
-    distances = jnp.where(usable[candidates], jnp.sum(offsets**2, axis=-1), jnp.inf)
-    distances = jnp.where(candidates == jnp.arange(v * hf * wf)[:, None], -1.0, distances)
+    # A patch that sticks out of the grid reads border cells twice: only the first reading counts.
+    distances = jnp.where(usable[candidates] & in_grid, jnp.sum(offsets**2, axis=-1), jnp.inf)
+    distances = distances.at[:, side * side // 2].set(-1.0)  # itself
     _, best = jax.lax.top_k(-distances, min(config.mixer_neighbours, side * side))
     return jnp.take_along_axis(candidates, best, axis=1)
 

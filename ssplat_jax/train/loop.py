@@ -70,7 +70,7 @@ def train(
             for i, sample in samples:
                 waited += time.perf_counter() - before
                 rate = jnp.asarray(learning_rate(recipe, i), jnp.float32)
-                state, metrics = trainer.step(state, sample, rate, frozen=recipe.phase_at(i)[0].frozen)
+                state, metrics = trainer.step(state, sample, rate, form=recipe.phase_at(i)[0].form)
                 window.append(metrics)
                 step = i + 1
                 if step % log_every == 0 or step == recipe.num_steps:

@@ -1,9 +1,21 @@
 """What a training run is, as data: phases of a curriculum and the optimiser's numbers. No JAX here."""
 
 import dataclasses
+from typing import Literal
 
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.errors import InputError
+
+
+@dataclasses.dataclass(frozen=True)
+class PhaseForm:
+    """What of a phase the compiled step depends on, the shapes of its samples aside."""
+
+    frozen: tuple[str, ...] = ()
+    """Stages (keys of the parameters) that the phase leaves as they are; no gradient is computed through them."""
+    decode: Literal["tokens", "cache"] = "tokens"
+    """What is rendered: the tokens of all chunks with their gradients (the paper), or the cache, as inference does.
+    The cache holds constants, so `cache` trains the Gaussian head alone."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -20,8 +32,7 @@ class Phase:
     """Image sizes (height, width), taken in turn."""
     learning_rate: float
     """Peak of the phase; it decays to a tenth by cosine."""
-    frozen: tuple[str, ...] = ()
-    """Stages (keys of the parameters) that the phase leaves as they are; no gradient is computed through them."""
+    form: PhaseForm = PhaseForm()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,7 +44,7 @@ class Recipe:
     warmup_steps: int = 50
     weight_decay: float = 0.01
     clip_norm: float = 1.0
-    ema_decay: float = 0.998
+    ema_decay: float = 0.99
     depth_weight: float = 0.1
     """Weight of the depth losses beside the rendering loss (procedural scenes know their depth; DESIGN 6.13)."""
     gradient_weight: float = 0.1
@@ -68,6 +79,8 @@ class Recipe:
         return dataclasses.replace(self, phases=phases)
 
 
+ALL_BUT_HEAD = ("encoder", "cost_volume", "hpda", "tokens", "cgfi", "mixer")
+
 TINY = Recipe(
     phases=(
         Phase("depth", 1800, num_chunks=1, num_targets=0, sizes=((96, 128),), learning_rate=1e-3),
@@ -80,16 +93,18 @@ TINY = Recipe(
             learning_rate=1e-3,
             # The matcher is done by then; without its backward pass a step costs a third, and rendering teaches it
             # less about depth than depth itself did.
-            frozen=("encoder", "cost_volume"),
+            form=PhaseForm(frozen=("encoder", "cost_volume")),
         ),
         Phase(
             "settle",
             200,
-            num_chunks=6,
-            num_targets=4,
-            sizes=((96, 128),),
-            learning_rate=5e-4,
-            frozen=("encoder", "cost_volume"),
+            num_chunks=5,
+            num_targets=3,
+            # No backward pass through the network leaves time for images of the size that inference streams, where
+            # pivots merge as they do there.
+            sizes=((192, 256),),
+            learning_rate=1e-3,
+            form=PhaseForm(frozen=ALL_BUT_HEAD, decode="cache"),
         ),
     )
 )

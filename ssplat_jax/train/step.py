@@ -9,12 +9,12 @@ import optax
 from jaxtyping import Array, Float, Int
 
 from ssplat_jax.cache import Tokens, fuse
-from ssplat_jax.gaussians import mask_gaussians
+from ssplat_jax.gaussians import Gaussians, mask_gaussians
 from ssplat_jax.render import render
 from ssplat_jax.stream import StreamSplat
 from ssplat_jax.struct import pytree
 from ssplat_jax.train.losses import depth_loss, image_gradient_l1
-from ssplat_jax.train.recipe import Recipe
+from ssplat_jax.train.recipe import PhaseForm, Recipe
 from ssplat_jax.train.samples import Sample
 
 
@@ -59,9 +59,9 @@ def learning_rate(recipe: Recipe, step: int) -> float:
 
 
 def stream_chunks(model: StreamSplat, params: dict, sample: Sample, *, recompute: bool):
-    """Streams the sample's chunks; returns the tokens of all chunks with gradients and the mean depth losses.
+    """Streams the sample's chunks; returns the last cache, the tokens of all chunks and the mean depth losses.
 
-    What is written to the cache stops gradients (ALGORITHM 9.35). With `recompute`, each chunk's activations are
+    Tokens carry gradients; what is written to the cache does not (ALGORITHM 9.35). With `recompute`, each chunk's activations are
     computed again on the way back, so that memory does not grow with their number.
     """
 
@@ -80,27 +80,28 @@ def stream_chunks(model: StreamSplat, params: dict, sample: Sample, *, recompute
 
     if recompute:
         body = jax.checkpoint(body)
-    _, (tokens, losses) = jax.lax.scan(body, model.init_cache(), (sample.chunks, sample.log_depths))
+    cache, (tokens, losses) = jax.lax.scan(body, model.init_cache(), (sample.chunks, sample.log_depths))
     flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), tokens)
-    return flat, jax.tree.map(jnp.mean, losses)
+    return cache, flat, jax.tree.map(jnp.mean, losses)
 
 
-def render_tokens(model: StreamSplat, params: dict, tokens: Tokens, sample: Sample, recipe: Recipe):
-    """Renders the targets from the tokens that the cache would accept: training sees the scene that inference sees."""
+def decode_accepted(model: StreamSplat, params: dict, tokens: Tokens) -> Gaussians:
+    """Gaussians of the tokens that the cache would accept: training sees the scene that inference sees."""
     gaussians = model.decode_tokens(params, tokens)
-    gaussians = mask_gaussians(gaussians, tokens.valid & (tokens.confidences >= model.config.min_confidence))
-    return render(gaussians, sample.target_camera, max_pairs=recipe.max_pairs)
+    return mask_gaussians(gaussians, tokens.valid & (tokens.confidences >= model.config.min_confidence))
 
 
-def loss_fn(params: dict, model: StreamSplat, sample: Sample, recipe: Recipe, frozen: tuple[str, ...] = ()):
-    """Loss and the numbers to log. Stages in `frozen` are constants: nothing is computed backward through them."""
-    params = {name: jax.lax.stop_gradient(p) if name in frozen else p for name, p in params.items()}
-    tokens, (entropy, depth_l1) = stream_chunks(model, params, sample, recompute=recipe.recompute)
+def loss_fn(params: dict, model: StreamSplat, sample: Sample, recipe: Recipe, form: PhaseForm):
+    """Loss and the numbers to log. Frozen stages are constants: nothing is computed backward through them."""
+    params = {name: jax.lax.stop_gradient(p) if name in form.frozen else p for name, p in params.items()}
+    cache, tokens, (entropy, depth_l1) = stream_chunks(model, params, sample, recompute=recipe.recompute)
     loss = entropy + 2.0 * depth_l1
     accepted = jnp.mean((tokens.confidences >= model.config.min_confidence).astype(jnp.float32))
     metrics = {"depth_entropy": entropy, "depth_l1": depth_l1, "accepted": accepted}
     if sample.target_images.shape[0]:
-        output = render_tokens(model, params, tokens, sample, recipe)
+        is_cache = form.decode == "cache"
+        gaussians = model.decode(params, cache) if is_cache else decode_accepted(model, params, tokens)
+        output = render(gaussians, sample.target_camera, max_pairs=recipe.max_pairs)
         mse = jnp.mean((output.color - sample.target_images) ** 2)
         gradients = image_gradient_l1(output.color, sample.target_images)
         loss = recipe.depth_weight * loss + 10.0 * (mse + recipe.gradient_weight * gradients)
@@ -119,15 +120,15 @@ def train_step(
     *,
     model: StreamSplat,
     recipe: Recipe,
-    frozen: tuple[str, ...] = (),
+    form: PhaseForm,
 ) -> tuple[TrainState, dict]:
     """One update. A step with a non-finite gradient changes nothing but the count of such steps."""
-    gradients, metrics = jax.grad(loss_fn, has_aux=True)(state.params, model, sample, recipe, frozen)
+    gradients, metrics = jax.grad(loss_fn, has_aux=True)(state.params, model, sample, recipe, form)
     norm = optax.global_norm(gradients)
     is_finite = jnp.isfinite(norm)
     updates, opt_state = optimizer(recipe).update(gradients, state.opt_state, state.params)
     # Momentum and weight decay would go on moving what is frozen.
-    updates = {name: jax.tree.map(jnp.zeros_like, u) if name in frozen else u for name, u in updates.items()}  # pyright: ignore[reportAttributeAccessIssue]
+    updates = {name: jax.tree.map(jnp.zeros_like, u) if name in form.frozen else u for name, u in updates.items()}  # pyright: ignore[reportAttributeAccessIssue]
     params = jax.tree.map(lambda p, u: p - rate * u, state.params, updates)
     # The average warms up: early on it follows the parameters instead of remembering the random start.
     step = state.step.astype(jnp.float32)
@@ -153,6 +154,6 @@ class Trainer:
 
     @functools.cached_property
     def step(self):
-        """`(state, sample, rate, frozen=()) -> (state, metrics)`, the state donated."""
+        """`(state, sample, rate, form=PhaseForm()) -> (state, metrics)`, the state donated."""
         bound = functools.partial(train_step, model=self.model, recipe=self.recipe)
-        return jax.jit(bound, donate_argnums=0, static_argnames="frozen")
+        return jax.jit(bound, donate_argnums=0, static_argnames="form")

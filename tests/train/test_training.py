@@ -12,9 +12,9 @@ from ssplat_jax.errors import InputError
 from ssplat_jax.stream import StreamSplat
 from ssplat_jax.train import loop
 from ssplat_jax.train.losses import depth_loss, image_gradient_l1, soft_targets
-from ssplat_jax.train.recipe import Phase, smoke_recipe, training_config
+from ssplat_jax.train.recipe import ALL_BUT_HEAD, Phase, PhaseForm, smoke_recipe, training_config
 from ssplat_jax.train.samples import make_sample, prefetched, sample_for_step
-from ssplat_jax.train.step import Trainer, init_state, learning_rate
+from ssplat_jax.train.step import Trainer, init_state, learning_rate, loss_fn
 from tests.test_stream import NARROW
 
 RECIPE = smoke_recipe(4)
@@ -114,12 +114,13 @@ def test_a_step_with_a_non_finite_gradient_changes_nothing_but_its_count():
 
 
 def test_frozen_stages_stay_and_the_others_move():
-    recipe = dataclasses.replace(RECIPE, phases=(Phase("stream", 1, 2, 1, ((64, 64),), 1e-3, frozen=("encoder",)),))
+    form = PhaseForm(frozen=("encoder",))
+    recipe = dataclasses.replace(RECIPE, phases=(Phase("stream", 1, 2, 1, ((64, 64),), 1e-3, form),))
     model = StreamSplat(training_config(NARROW, recipe))
     state = init_state(model, recipe)
     before = jax.tree.map(np.asarray, state.params)
     sample = sample_for_step(0, recipe, model.config)
-    after, metrics = Trainer(model, recipe).step(state, sample, jnp.float32(1e-3), frozen=("encoder",))
+    after, metrics = Trainer(model, recipe).step(state, sample, jnp.float32(1e-3), form=form)
     assert np.isfinite(float(metrics["psnr"]))
     for a, b in zip(flat(after.params["encoder"]), flat(before["encoder"]), strict=True):
         np.testing.assert_array_equal(a, b)
@@ -127,6 +128,24 @@ def test_frozen_stages_stay_and_the_others_move():
         assert any(
             not np.array_equal(a, b) for a, b in zip(flat(after.params[name]), flat(before[name]), strict=True)
         ), name
+
+
+def test_rendering_the_cache_trains_the_head_alone_whatever_is_frozen():
+    sample = sample_for_step(RECIPE.num_steps - 1, RECIPE, NARROW)
+    model = StreamSplat(training_config(NARROW, RECIPE))
+    params = model.init(jax.random.key(0))
+    recipe = dataclasses.replace(RECIPE, depth_weight=0.0)
+
+    def gradient(frozen):
+        form = PhaseForm(frozen=frozen, decode="cache")
+        return jax.jit(lambda p: jax.grad(loss_fn, has_aux=True)(p, model, sample, recipe, form)[0])(params)
+
+    gradients = {frozen: gradient(frozen) for frozen in ((), ALL_BUT_HEAD)}
+    for name in params:
+        norm = float(sum(jnp.abs(g).sum() for g in jax.tree.leaves(gradients[()][name])))
+        assert (norm > 0) == (name == "decoder"), name
+    for a, b in zip(flat(gradients[()]["decoder"]), flat(gradients[ALL_BUT_HEAD]["decoder"]), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-7)
 
 
 @pytest.mark.slow  # two runs, each compiling both phases

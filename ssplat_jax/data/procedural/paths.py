@@ -14,6 +14,8 @@ from ssplat_jax.data.procedural.scene import Scene, clearance
 from ssplat_jax.errors import InputError
 
 UP = np.array([0.0, -1.0, 0.0])
+MAX_IRREGULARITY = 0.7  # deviation of the log of a path's steps; the least is 0.1, a video at an even walk
+MAX_STEP_FACTOR = 3.0
 
 
 @dataclasses.dataclass
@@ -60,12 +62,17 @@ def sample_path(
     style = _STYLES[kind or drawn]
     typical = step if step is not None else float(scene.orbit_radius) * np.exp(rng.uniform(np.log(0.01), np.log(0.1)))
     walker = _start(rng, scene, kind or drawn, min_clearance)
-    wobble = rng.uniform(0.0, 0.03)
+    wobble, irregularity = rng.uniform(0.0, 0.03), rng.uniform(0.1, MAX_IRREGULARITY)
     poses = []
     for _ in range(num_views):
         poses.append(_pose(rng, walker, wobble))
-        _advance(rng, scene, walker, style, typical * rng.uniform(0.6, 1.4), min_clearance)
+        _advance(rng, scene, walker, style, typical * _step_factor(rng, irregularity), min_clearance)
     return np.stack(poses).astype(np.float32), _intrinsics(rng, num_views, height, width)
+
+
+def _step_factor(rng: np.random.Generator, irregularity: float) -> float:
+    """One step over the typical one: its log is normal, but no step is a leap of more than 3."""
+    return float(np.clip(np.exp(irregularity * rng.standard_normal()), 1 / MAX_STEP_FACTOR, MAX_STEP_FACTOR))
 
 
 def _intrinsics(rng: np.random.Generator, num_views: int, height: int, width: int) -> np.ndarray:
