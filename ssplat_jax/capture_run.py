@@ -7,12 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
-from ssplat_jax.checkpoint.state import load_newest_state, load_state, previous_path, save_state
+from ssplat_jax.checkpoint.state import load_newest_state, load_state, save_state
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.data.capture import Capture, open_capture
 from ssplat_jax.data.frame import StreamFrame
 from ssplat_jax.errors import InputError, StorageError
 from ssplat_jax.evaluate import cache_facts, save_comparison, score_view
+from ssplat_jax.export.atomic import previous_path
 from ssplat_jax.export.ply import ExportReport, save_ply
 from ssplat_jax.interrupts import Interrupts
 from ssplat_jax.report import Reporter

@@ -12,6 +12,8 @@ from ssplat_jax.config import PRESETS, StreamConfig, preset
 from ssplat_jax.errors import InputError, StorageError
 from ssplat_jax.model import init_params
 
+KIND = "weights"
+
 
 def save_weights(path: Path, params: dict, config: StreamConfig, provenance: dict) -> None:
     """Writes the parameters of a model with `config`; `provenance` says how they came to be (steps, data, scores)."""
@@ -19,19 +21,17 @@ def save_weights(path: Path, params: dict, config: StreamConfig, provenance: dic
     arrays = {name: np.asarray(leaf, np.float16) for name, leaf in leaves.items()}
     if bad := [name for name, x in arrays.items() if not np.isfinite(x).all()]:
         raise StorageError(f"{path}: {bad[0]} has values beyond float16 or not finite; the weights are not saved.")
-    save_arrays(path, arrays, {"kind": "weights", "config": config.to_dict(), "provenance": provenance})
+    save_arrays(path, arrays, KIND, {"config": config.to_dict(), "provenance": provenance})
 
 
 def load_weights(path: Path) -> tuple[dict, StreamConfig]:
     """(params, config) of a weights file.
 
     Raises:
-        StorageError: missing or corrupt.
-        InputError: the file holds something else, or weights whose shapes its configuration does not give.
+        StorageError: missing, corrupt or of another kind.
+        InputError: weights whose shapes its configuration does not give.
     """
-    arrays, header = load_arrays(path)
-    if header.get("kind") != "weights":
-        raise InputError(f"{path}: wanted weights, got {header.get('kind')!r}; give a file that `ssplat train` wrote.")
+    arrays, header = load_arrays(path, KIND)
     config = StreamConfig.from_dict(header["config"])
     return _restore(path, arrays, config), config
 
@@ -49,7 +49,7 @@ def load_params(name: str = "tiny") -> dict:
             raise InputError(f"weights: wanted a preset with shipped weights ({known}) or a file, got {name!r}.")
         return load_weights(Path(name))[0]
     with resources.as_file(resources.files("ssplat_jax") / "weights" / f"{name}.npz") as path:
-        arrays, _ = load_arrays(path)
+        arrays, _ = load_arrays(path, KIND)
         return _restore(path, arrays, preset(name))
 
 

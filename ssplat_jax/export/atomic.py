@@ -2,43 +2,54 @@
 
 import contextlib
 import os
-import tempfile
 from pathlib import Path
 
 from ssplat_jax.errors import StorageError
 
 
-def write_atomic(path: str | os.PathLike, data: bytes) -> None:
+def write_atomic(path: str | os.PathLike, data: bytes, *, keep_previous: bool = False) -> None:
     """Puts `data` at `path`; whoever opens `path`, at any time, finds the old file or the new one.
 
-    The bytes go to a temporary file in the same folder, to the disk, and then take the name in one step.
+    The bytes go to `<name>.partial` in the same folder, to the disk, and then take the name in one step. A process
+    killed on the way leaves that file behind; the next write overwrites it.
+
+    Args:
+        path: where to; its folder is made.
+        data: the whole file.
+        keep_previous: what was at `path` stays as `previous_path(path)`.
 
     Raises:
         StorageError: the folder cannot be made or the file not written; what was at `path` is untouched.
     """
     path = Path(path)
-    temporary = None
+    partial = path.with_name(path.name + ".partial")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        descriptor, temporary = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent)
-        with os.fdopen(descriptor, "wb") as file:
+        with partial.open("wb") as file:
             file.write(data)
             file.flush()
             os.fsync(file.fileno())
-        # mkstemp makes private files; a scene is as readable as the user's other files.
-        os.chmod(temporary, 0o666 & ~_umask())
-        os.replace(temporary, path)
+        if keep_previous and path.exists():
+            os.replace(path, previous_path(path))
+        os.replace(partial, path)
+        _sync_directory(path.parent)
     except OSError as error:
-        if temporary is not None:
-            with contextlib.suppress(OSError):
-                os.unlink(temporary)
+        with contextlib.suppress(OSError):
+            partial.unlink(missing_ok=True)
         raise StorageError(
-            f"{path}: cannot be written ({error.strerror or error}); free space or choose another place."
+            f"{path}: cannot be written ({error.strerror or error}); free some space or choose another place."
         ) from error
 
 
-def _umask() -> int:
-    """The process's file mode mask, which can only be read by setting it."""
-    mask = os.umask(0o077)
-    os.umask(mask)
-    return mask
+def previous_path(path: str | os.PathLike) -> Path:
+    """Where the file before the one at `path` is kept."""
+    return Path(path).with_name(Path(path).name + ".previous")
+
+
+def _sync_directory(directory: Path) -> None:
+    """Makes the renames themselves durable."""
+    descriptor = os.open(directory, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -61,8 +61,8 @@ def learning_rate(recipe: Recipe, step: int) -> float:
 def stream_chunks(model: StreamSplat, params: dict, sample: Sample, *, recompute: bool):
     """Streams the sample's chunks; returns the last cache, the tokens of all chunks and the mean depth losses.
 
-    Tokens carry gradients; what is written to the cache does not (ALGORITHM 9.35). With `recompute`, each chunk's activations are
-    computed again on the way back, so that memory does not grow with their number.
+    Tokens carry gradients; what is written to the cache does not (ALGORITHM 9.35). With `recompute`, each chunk's
+    activations are computed again on the way back, so that memory does not grow with their number.
     """
 
     def body(cache, chunk_and_truth):

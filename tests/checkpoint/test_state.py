@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from ssplat_jax.cache import init_cache
-from ssplat_jax.checkpoint.state import load_newest_state, load_state, previous_path, save_state
+from ssplat_jax.checkpoint.state import load_newest_state, load_state, save_state
 from ssplat_jax.errors import StorageError
+from ssplat_jax.export.atomic import previous_path
 from ssplat_jax.struct import replace
 from tests.cache.streams import CAPACITY, CONFIG, Recipe, fuse, to_jax
 
@@ -66,7 +67,7 @@ def test_any_reader_of_npz_can_open_it(saved):
     with np.load(saved) as arrays:
         facts = json.loads(arrays["header"].tobytes())
         assert len(arrays["means"]) == int(arrays["num_voxels"])
-    assert facts["header"] == HEADER and set(facts["leaves"]["means"]) == {"dtype", "sha256"}
+    assert facts["header"]["caller"] == HEADER and set(facts["leaves"]["means"]) == {"dtype", "sha256"}
 
 
 def test_no_flipped_bit_is_loaded(saved, tmp_path):

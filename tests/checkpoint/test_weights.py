@@ -1,0 +1,64 @@
+"""Weights files: what is trained is what is loaded, or nothing is."""
+
+import jax
+import numpy as np
+import pytest
+
+from ssplat_jax.checkpoint.weights import load_params, load_weights, save_weights
+from ssplat_jax.config import preset
+from ssplat_jax.errors import InputError, StorageError
+from ssplat_jax.model import init_params
+from tests.test_stream import NARROW
+
+
+@pytest.fixture(scope="module")
+def params():
+    return init_params(jax.random.key(1), NARROW)
+
+
+@pytest.fixture
+def saved(params, tmp_path):
+    save_weights(tmp_path / "weights.npz", params, NARROW, {"steps": 3})
+    return tmp_path / "weights.npz"
+
+
+def test_weights_come_back_as_float16_holds_them(params, saved):
+    loaded, config = load_weights(saved)
+    assert config == NARROW
+    jax.tree.map(lambda a, b: np.testing.assert_array_equal(a, np.asarray(b, np.float16)), loaded, params)
+    assert {str(x.dtype) for x in jax.tree.leaves(loaded)} == {"float32"}
+
+
+def test_shipped_weights_fit_their_preset_and_are_no_fresh_ones():
+    shipped, fresh = load_params("tiny"), init_params(jax.random.key(0), preset("tiny"))
+    assert jax.tree.map(lambda x: x.shape, shipped) == jax.tree.map(lambda x: x.shape, fresh)
+    # The head starts at standard deviation 1e-3: trained, it decides opacity and size.
+    assert float(np.std(shipped["decoder"]["out"]["kernel"])) > 0.02
+
+
+def test_a_flipped_bit_is_named(saved):
+    contents = bytearray(saved.read_bytes())
+    for byte in np.random.default_rng(0).integers(0, len(contents), 30):
+        flipped = contents.copy()
+        flipped[byte] ^= 4
+        saved.write_bytes(flipped)
+        with pytest.raises(StorageError, match=r"weights\.npz"):
+            load_weights(saved)
+
+
+def test_weights_of_another_width_are_refused_by_name(params, tmp_path):
+    save_weights(tmp_path / "w.npz", params, NARROW.replace(token_width=NARROW.token_width * 2), {})
+    with pytest.raises(InputError, match="must be"):
+        load_params(str(tmp_path / "w.npz"))
+
+
+def test_overflowing_weights_are_not_saved(params, tmp_path):
+    broken = jax.tree.map(lambda x: x + 1e6, params)
+    with pytest.raises(StorageError, match="float16"):
+        save_weights(tmp_path / "w.npz", broken, NARROW, {})
+    assert not list(tmp_path.iterdir())
+
+
+def test_no_such_preset_and_no_such_file():
+    with pytest.raises(InputError, match="tiny"):
+        load_params("absent.npz")
