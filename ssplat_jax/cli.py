@@ -244,6 +244,68 @@ class Export:
         return 0
 
 
+@dataclasses.dataclass(frozen=True)
+class Bench:
+    """Measure speed and memory on this machine; figures that are compared are taken in turns in one run.
+
+    Example: ssplat bench render --json render.json
+    """
+
+    name: Annotated[Literal["render", "stream"], tyro.conf.Positional]
+    """render: the rasterizer. stream: the cache's fuse and projection over long streams."""
+    json: Path | None = None
+    """Write {machine, rows: [{name, value, unit}]} here as well."""
+    against: Path | None = None
+    """render only: a Python file with `scene` and `render` functions, timed in the same run."""
+    scaling: bool = False
+    """render only: also 4k to 1M Gaussians, at four image sizes."""
+
+    def run(self) -> int:
+        from ssplat_jax.benchmarks import run_benchmark
+
+        result = run_benchmark(self.name, against=self.against, scaling=self.scaling)
+        print(result["machine"])
+        for row in result["rows"]:
+            print(f"{row['name']:<44} {row['value']:>14.6g} {row['unit']}")
+        if self.json is not None:
+            from ssplat_jax.export.atomic import write_atomic
+
+            write_atomic(self.json, (json_text(result) + "\n").encode())
+        return 0
+
+
+@dataclasses.dataclass(frozen=True)
+class Experiment:
+    """Run one of the experiments that the documentation's figures come from.
+
+    Example: ssplat experiment captures --captures path/to/captures --out runs/captures
+    """
+
+    name: Annotated[str, tyro.conf.Positional]
+    """captures: novel views of real captures. accuracy_vs_time: what accuracy costs in time."""
+    out: Path
+    """Tables, plots and pictures."""
+    captures: Path | None = None
+    """Folder of real captures; experiments that can do without leave them out."""
+    scale: Literal["smoke", "full"] = "full"
+    """smoke: the same program on as little as shows that it works."""
+    quiet: bool = False
+    """Print only the closing line."""
+
+    def run(self) -> int:
+        from importlib.metadata import entry_points
+
+        from ssplat_jax.report import Reporter
+
+        # The roof is not imported from below: experiments, ours and others', register under this group.
+        found = {point.name: point for point in entry_points(group="ssplat_jax.experiments")}
+        if self.name not in found:
+            raise InputError(f"experiment: wanted one of {', '.join(sorted(found))}, got {self.name!r}.")
+        self.out.mkdir(parents=True, exist_ok=True)
+        print(found[self.name].load()(self.captures, self.out, self.scale, Reporter(self.quiet)))
+        return 0
+
+
 # -- what the commands share ------------------------------------------------------------------------------------------
 
 
@@ -320,6 +382,8 @@ Command = (
     | Annotated[Eval, tyro.conf.subcommand("eval")]
     | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Export, tyro.conf.subcommand("export")]
+    | Annotated[Bench, tyro.conf.subcommand("bench")]
+    | Annotated[Experiment, tyro.conf.subcommand("experiment")]
 )
 
 

@@ -18,7 +18,8 @@ KIND = "weights"
 def save_weights(path: Path, params: dict, config: StreamConfig, provenance: dict) -> None:
     """Writes the parameters of a model with `config`; `provenance` says how they came to be (steps, data, scores)."""
     leaves = {"/".join(k.key for k in keys): leaf for keys, leaf in jax.tree_util.tree_flatten_with_path(params)[0]}
-    arrays = {name: np.asarray(leaf, np.float16) for name, leaf in leaves.items()}
+    with np.errstate(over="ignore"):  # becomes infinite, and is refused below
+        arrays = {name: np.asarray(leaf, np.float16) for name, leaf in leaves.items()}
     if bad := [name for name, x in arrays.items() if not np.isfinite(x).all()]:
         raise StorageError(f"{path}: {bad[0]} has values beyond float16 or not finite; the weights are not saved.")
     save_arrays(path, arrays, KIND, {"config": config.to_dict(), "provenance": provenance})

@@ -8,8 +8,6 @@ Units: ms are medians over the repetitions, `bytes` are XLA's own temporary memo
 
 import functools
 import importlib.util
-import json
-import platform
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -167,24 +165,18 @@ def rows_of(num: int, size: int, *, against: Path | None = None, stages: bool = 
     return rows + [{"name": f"{label}/{name}", "value": value, "unit": "ratio"} for name, value in ratios.items()]
 
 
-def run(json_path: Path | None = None, against: Path | None = None, *, scaling: bool = False) -> dict[str, Any]:
-    """Runs the benchmark and writes `{machine, rows}`, each row `{name, value, unit}`.
+def bench_render(against: Path | None = None, *, scaling: bool = False) -> list[dict[str, Any]]:
+    """All rows, each `{name, value, unit}`.
 
     Args:
-        json_path: where to write the result; None writes nothing.
         against: a Python file with `scene` and `render` as the prototype has them, timed in the same run.
         scaling: also 4k to 1M Gaussians, without stages.
 
     Raises:
         InputError: `against` is not a file.
     """
-    device = jax.devices()[0]
-    machine = f"{platform.node()} {platform.machine()} {device.platform} {device.device_kind} jax {jax.__version__}"
     rows = [row for num, size in SIZES for row in rows_of(num, size, against=against)]
     if scaling:
         rest = [s for s in SCALING if s not in SIZES]
         rows += [row for num, size in rest for row in rows_of(num, size, stages=False)]
-    result = {"machine": machine, "rows": rows}
-    if json_path is not None:
-        json_path.write_text(json.dumps(result, indent=1))
-    return result
+    return rows

@@ -12,7 +12,7 @@ from PIL import Image
 
 from ssplat_jax import cli
 
-COMMANDS = ("demo", "inspect", "run", "eval", "train", "export")
+COMMANDS = ("demo", "inspect", "run", "eval", "train", "export", "bench", "experiment")
 
 
 def run(*arguments: str) -> int:

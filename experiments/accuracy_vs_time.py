@@ -1,0 +1,173 @@
+"""What accuracy costs in time: PSNR of unseen views against milliseconds per chunk, one knob at a time.
+
+    ssplat experiment accuracy_vs_time --captures path/to/captures --out runs/accuracy_vs_time
+
+Every setting streams the same context views of `procedural:room` (and of redkitchen, where `--captures` has it) with
+the shipped weights, no retraining, and is scored on the same targets at the same size, whatever size it streamed at.
+Time is chunk in -> one novel view out on the full cache, warm. Writes `table.json`, `table.md` and `plot.png`;
+docs/performance.md holds the numbers to expect. Wants a machine with nothing else to do: 20 minutes on two cores.
+"""
+
+import dataclasses
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ssplat_jax.checkpoint.weights import load_params
+from ssplat_jax.config import preset
+from ssplat_jax.data.capture import Capture, open_capture
+from ssplat_jax.data.protocol import Split, interleaved
+from ssplat_jax.evaluate import cache_facts, mean_psnr, measure_latency, stream_context
+from ssplat_jax.export.atomic import write_atomic
+from ssplat_jax.report import Reporter
+from ssplat_jax.session import Session
+from ssplat_jax.stream import StreamSplat
+
+SCORED = (320, 240)
+CONTEXT = {"full": 32, "smoke": 8}
+
+
+@dataclasses.dataclass(frozen=True)
+class Setting:
+    """A point of the plot: the size that is streamed and what differs from the preset."""
+
+    name: str
+    size: tuple[int, int] = SCORED
+    changes: dict[str, Any] = dataclasses.field(default_factory=dict)
+
+
+SETTINGS = (
+    Setting("preset"),
+    Setting("160x120", (160, 120)),
+    Setting("240x180", (240, 180)),
+    Setting("480x360", (480, 360)),
+    Setting("1 source", changes={"num_sources": 1}),
+    Setting("2 sources", changes={"num_sources": 2}),
+    Setting("voxel 0.02", changes={"voxel_size": 0.02}),
+    Setting("voxel 0.08", changes={"voxel_size": 0.08}),
+    Setting("1 pivot", changes={"pivots_per_voxel": 1}),
+    Setting("8 pivots", changes={"pivots_per_voxel": 8}),
+    Setting("tau 0.3", changes={"min_confidence": 0.3}),
+    Setting("tau 0.7", changes={"min_confidence": 0.7}),
+    Setting("chunks of 2", changes={"chunk_size": 2}),
+    Setting("chunks of 8", changes={"chunk_size": 8}),
+    Setting("mean readout", changes={"depth_readout": "mean"}),
+    Setting("no HPDA", changes={"hpda": False}),
+    Setting("no CGFI", changes={"cgfi": False}),
+    Setting("no mixer", changes={"mixer_blocks": 0}),
+    Setting("160x120, 1 source", (160, 120), {"num_sources": 1}),
+    Setting("480x360, voxel 0.02", (480, 360), {"voxel_size": 0.02}),
+)
+
+
+def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str:
+    """Measures every setting on every scene that is there; `smoke` takes the first two settings and 8 views."""
+    settings = SETTINGS if scale == "full" else SETTINGS[:2]
+    scenes = _scenes(captures, CONTEXT[scale])
+    if len(scenes) == 1:
+        reporter.warn("no redkitchen under --captures: the procedural scene stands alone")
+    rows: list[dict[str, Any]] = []
+    with reporter.progress("measuring", len(settings) * len(scenes)) as advance:
+        for scene, (opened, split) in scenes.items():
+            for setting in settings:
+                rows.append({"scene": scene} | measure(setting, opened, split))
+                advance(len(rows), f"{scene}, {setting.name}")
+    for scene in scenes:
+        mark_front([row for row in rows if row["scene"] == scene])
+    write_atomic(out / "table.json", (json.dumps(rows, indent=1) + "\n").encode())
+    write_atomic(out / "table.md", _markdown(rows).encode())
+    plot(out / "plot.png", rows)
+    return f"wrote {out}/table.json, table.md and plot.png: {len(rows)} measured settings"
+
+
+Opened = Callable[[tuple[int, int]], Capture]
+
+
+def _scenes(captures: Path | None, context: int) -> dict[str, tuple[Opened, Split]]:
+    """How to open each scene at a size, and its split."""
+    frames = interleaved(10_000, 1, context).context[-1] + 1
+    scenes: dict[str, tuple[Opened, Split]] = {
+        "room": (
+            lambda size: open_capture(f"procedural:room?frames={frames}", size=size),
+            interleaved(frames, 1, context),
+        )
+    }
+    if captures is not None and (captures / "redkitchen").is_dir():
+        path = captures / "redkitchen"
+        scenes["redkitchen"] = (
+            lambda size: open_capture(path, size=size),
+            interleaved(len(open_capture(path)), 5, context),
+        )
+    return scenes
+
+
+def measure(setting: Setting, opened: Opened, split: Split) -> dict[str, Any]:
+    """One row: quality and time of a setting on a scene."""
+    session = Session(StreamSplat(preset("tiny").replace(**setting.changes)), load_params("tiny"))
+    capture, scored = opened(setting.size), opened(SCORED)
+    frame = capture.stream_frame(session.model.config, split.context)
+    recent = stream_context(session, capture, split, frame)
+    quality = mean_psnr(session.gaussians(), scored, split.targets, frame)
+    middle = split.targets[len(split.targets) // 2]
+    latency = measure_latency(session, recent, scored.camera(middle, frame))
+    views = session.model.config.chunk_size
+    return {
+        "setting": setting.name,
+        "psnr": round(quality, 3),
+        "ms_per_view": round(latency["chunk_ms"]["median"] / views, 1),
+        "chunk_ms": latency["chunk_ms"]["median"],
+        "render_ms": latency["render_ms"],
+        "compile_s": round(session.compile_seconds, 1),
+        "gaussians": cache_facts(session)["pivots"],
+        "step_memory_mb": round((session.step_memory_bytes or 0) / 2**20, 1),
+    }
+
+
+def mark_front(rows: list[dict[str, Any]]) -> None:
+    """Sets `front` on every row: no other row of the scene is both faster and at least as good."""
+    best = -np.inf
+    for row in sorted(rows, key=lambda row: (row["ms_per_view"], -row["psnr"])):
+        row["front"] = bool(row["psnr"] > best)
+        best = max(best, row["psnr"])
+
+
+def _markdown(rows: list[dict[str, Any]]) -> str:
+    """The table, fastest first within a scene; the front in bold."""
+    lines = ["| scene | setting | PSNR dB | ms per view | Gaussians | step memory MiB |", "|---|---|---|---|---|---|"]
+    for row in sorted(rows, key=lambda row: (row["scene"], row["ms_per_view"])):
+        name = f"**{row['setting']}**" if row["front"] else row["setting"]
+        cells = (row["scene"], name, f"{row['psnr']:.2f}", row["ms_per_view"], row["gaussians"], row["step_memory_mb"])
+        lines.append("| " + " | ".join(map(str, cells)) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def plot(path: Path, rows: list[dict[str, Any]]) -> None:
+    """A panel per scene, every setting by name, the front as a line. Left out without matplotlib (`plots` extra)."""
+    try:
+        import matplotlib
+
+        matplotlib.use("Agg")
+        from matplotlib import pyplot
+    except ImportError:
+        return
+    scenes = list(dict.fromkeys(row["scene"] for row in rows))
+    figure, panels = pyplot.subplots(1, len(scenes), figsize=(7 * len(scenes), 5), layout="constrained", squeeze=False)
+    for axes, scene in zip(panels[0], scenes, strict=True):
+        here = [row for row in rows if row["scene"] == scene]
+        front = sorted((r for r in here if r["front"]), key=lambda r: r["ms_per_view"])
+        axes.plot([r["ms_per_view"] for r in front], [r["psnr"] for r in front], color="#c06030", lw=1.2, zorder=1)
+        for row in here:
+            colour = "#c06030" if row["front"] else "#30507a"
+            axes.scatter(row["ms_per_view"], row["psnr"], s=18, color=colour, zorder=2)
+            offset = {"textcoords": "offset points", "xytext": (4, 3), "fontsize": 7, "color": colour}
+            axes.annotate(row["setting"], (row["ms_per_view"], row["psnr"]), **offset)
+        axes.set_xscale("log")
+        axes.set_xlabel("ms per view, chunk in to novel view out")
+        axes.set_ylabel("PSNR of unseen views, dB")
+        axes.set_title(scene)
+        axes.spines[["top", "right"]].set_visible(False)
+    figure.savefig(path, dpi=150)
+    pyplot.close(figure)
