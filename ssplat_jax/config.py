@@ -96,7 +96,7 @@ class StreamConfig:
     voxel_size: float = 0.04
     pivots_per_voxel: int = 4
     min_confidence: float = 0.5
-    """tau_conf: tokens below it never enter the cache. The paper's 0.3 is a peak; as a window's mass that is more."""
+    """tau_conf: tokens below it never enter the cache, pivots that sink below it are not decoded. The paper's 0.3 is a peak; as a window's mass that is more."""
     capacity: int = 1 << 15
     """Voxels the cache can hold, a power of two; outside jit `grow` doubles it."""
     overflow: Literal["grow", "drop_new", "evict_lowest", "error"] = "grow"
@@ -104,6 +104,8 @@ class StreamConfig:
     """Whose cosine selects the closest pair."""
     merge_weight: Literal["max", "count"] = "max"
     """`max` is the printed omega* = max; `count` weighs by the number of members, a true running mean."""
+    carving: bool = True
+    """Later views lower the confidence of pivots that they look through and raise that of those they see (ours)."""
     cluster_ratio: float = 1.15
     """Depth ratio that holds the front cluster of the projection together; `inf` is the plain mean (literal)."""
 

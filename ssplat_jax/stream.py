@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ssplat_jax import model as stages
-from ssplat_jax.cache import Tokens, VoxelCache, fuse, init_cache, project
+from ssplat_jax.cache import Tokens, VoxelCache, carve, fuse, init_cache, project
 from ssplat_jax.chunk import Chunk
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.gaussians import Gaussians, mask_gaussians
@@ -98,18 +98,28 @@ class StreamSplat:
         )
 
     def step(self, params: dict, cache: VoxelCache, chunk: Chunk) -> tuple[VoxelCache, ChunkOutput]:
-        """One chunk: predict its tokens, fuse them into the cache (VACC). Carry first, in and out."""
+        """One chunk: predict its tokens, fuse them into the cache (VACC), carve. Carry first, in and out."""
         prediction = self.predict(params, cache, chunk)
+        return self.remember(cache, prediction), prediction.output
+
+    def remember(self, cache: VoxelCache, prediction: Prediction) -> VoxelCache:
+        """The cache after a chunk: its tokens fused in, all pivots judged by what its views see. Constants throughout.
+
+        The new pivots are judged too: views of a chunk that disagree carve each other's tokens at once.
+        """
+        prediction = jax.lax.stop_gradient(prediction)
+        output = prediction.output
         with jax.named_scope("VACC"):
-            cache = fuse(cache, jax.lax.stop_gradient(prediction.tokens), self.config)
-        return cache, prediction.output
+            cache = fuse(cache, prediction.tokens, self.config)
+        with jax.named_scope("carve"):
+            return carve(cache, prediction.views.grid_camera, output.depths, output.confidences, self.config)
 
     def run(self, params: dict, cache: VoxelCache, chunks: Chunk) -> tuple[VoxelCache, ChunkOutput]:
         """`step` over stacked chunks (leading axis t) as one `lax.scan`."""
         return jax.lax.scan(functools.partial(self.step, params), cache, chunks)
 
     def decode(self, params: dict, cache: VoxelCache) -> Gaussians:
-        """The scene so far: one Gaussian per pivot, in the stream frame; dead pivots have opacity 0."""
+        """The scene so far: one Gaussian per pivot, in the stream frame; dead and carved pivots have opacity 0."""
         flat = lambda x: x.reshape(-1, *x.shape[2:])  # noqa: E731
         gaussians = stages.decode_tokens(
             params["decoder"],
@@ -120,7 +130,7 @@ class StreamSplat:
             footprints=flat(cache.footprints),
             config=self.config,
         )
-        return mask_gaussians(gaussians, flat(cache.alive))
+        return mask_gaussians(gaussians, flat(cache.alive & (cache.confidences >= self.config.min_confidence)))
 
     def decode_tokens(self, params: dict, tokens: Tokens) -> Gaussians:
         """Gaussians of tokens that need not be in a cache: what training renders (Sec. 3.7)."""

@@ -1,5 +1,6 @@
-"""VACC, the Voxel-Aligned Causal Cache: the stream's only memory, its write (`fuse`) and its read (`project`)."""
+"""VACC, the Voxel-Aligned Causal Cache: the stream's only memory, its write (`fuse`), its read (`project`) and its doubt (`carve`)."""
 
+from ssplat_jax.cache.carve import carve
 from ssplat_jax.cache.fuse import Touched, fuse, fuse_touched
 from ssplat_jax.cache.policy import check, ensure_room, grow
 from ssplat_jax.cache.project import ProjectedCache, project
@@ -12,6 +13,7 @@ __all__ = [
     "Tokens",
     "Touched",
     "VoxelCache",
+    "carve",
     "check",
     "ensure_room",
     "fuse",

@@ -44,7 +44,7 @@ class ProjectedCache:
 
 
 @pytree
-class _Pairs:
+class PivotPairs:
     """What the pivots of a block of rows are in every view, flattened over views and pivots."""
 
     pixels: Int[Array, " p"]  # flat over all views; the number of pixels where it is not seen
@@ -79,18 +79,23 @@ def project(cache: VoxelCache, camera: Camera, config: StreamConfig) -> Projecte
     )
 
 
+def blocks_of_rows(cache: VoxelCache) -> tuple[int, Int[Array, ""]]:
+    """Rows of a block, and how many blocks hold the voxels that there are."""
+    num_rows = math.gcd(cache.capacity, ROWS_PER_BLOCK)
+    return num_rows, (cache.num_voxels + num_rows - 1) // num_rows
+
+
 def _over_blocks(cache: VoxelCache, camera: Camera, visit, start):
     """Folds `visit(state, pairs, first_row)` over the blocks of rows that hold voxels."""
-    num_rows = math.gcd(cache.capacity, ROWS_PER_BLOCK)
-    num_blocks = (cache.num_voxels + num_rows - 1) // num_rows
+    num_rows, num_blocks = blocks_of_rows(cache)
 
     def step(i, state):
-        return visit(state, _pairs_of_rows(cache, camera, i * num_rows, num_rows), i * num_rows)
+        return visit(state, pairs_of_rows(cache, camera, i * num_rows, num_rows), i * num_rows)
 
     return jax.lax.fori_loop(0, num_blocks, step, start)
 
 
-def _nearest(fronts, pairs: _Pairs, first_row):
+def _nearest(fronts, pairs: PivotPairs, first_row):
     del first_row
     return fronts.at[pairs.pixels].min(pairs.log_depths, mode="drop")
 
@@ -98,7 +103,7 @@ def _nearest(fronts, pairs: _Pairs, first_row):
 def _front_means(cache, camera, fronts, window):
     """Mean log depth of each pixel's front window, measured from its nearest pivot."""
 
-    def visit(sums, pairs: _Pairs, first_row):
+    def visit(sums, pairs: PivotPairs, first_row):
         del first_row
         behind = _behind(pairs, fronts)
         weights = jnp.where(behind <= window, pairs.weights, 0.0)
@@ -113,7 +118,7 @@ def _cluster_sums(cache, camera, fronts, centres, window):
     flat_feats = cache.feats.reshape(-1, cache.feats.shape[-1])
     pivots_per_row = cache.feats.shape[1]
 
-    def visit(state, pairs: _Pairs, first_row):
+    def visit(state, pairs: PivotPairs, first_row):
         scalars, feats = state
         behind = _behind(pairs, fronts)
         weights = jnp.where(jnp.abs(behind - centres[pairs.pixels]) <= window, pairs.weights, 0.0)
@@ -151,7 +156,7 @@ def _add_feats(sums, flat_feats, pixels, weights, first_pivot, num_views):
     return jax.lax.fori_loop(0, num_blocks, add_block, sums)
 
 
-def _pairs_of_rows(cache: VoxelCache, camera: Camera, first_row, num_rows: int) -> _Pairs:
+def pairs_of_rows(cache: VoxelCache, camera: Camera, first_row, num_rows: int) -> PivotPairs:
     """Projects the pivots of `num_rows` rows into all views."""
 
     def block(x):
@@ -173,14 +178,14 @@ def _pairs_of_rows(cache: VoxelCache, camera: Camera, first_row, num_rows: int) 
     columns, rows = (jnp.where(is_seen, jnp.floor(c), 0.0).astype(jnp.int32) for c in (u, v))
     first_pixel = jnp.arange(len(camera.viewmats), dtype=jnp.int32)[:, None] * (camera.height * camera.width)
     num_pixels = len(camera.viewmats) * camera.height * camera.width
-    return _Pairs(
+    return PivotPairs(
         pixels=jnp.where(is_seen, first_pixel + rows * camera.width + columns, num_pixels).reshape(-1),
         log_depths=jnp.where(is_seen, jnp.log(jnp.where(is_seen, z, 1.0)), 0.0).reshape(-1),
         weights=jnp.where(is_seen, weights, 0.0).reshape(-1),
     )
 
 
-def _behind(pairs: _Pairs, fronts):
+def _behind(pairs: PivotPairs, fronts):
     """Log depth behind the nearest pivot of the pixel; 0 where not seen."""
     return jnp.where(pairs.weights > 0, pairs.log_depths - fronts[pairs.pixels], 0.0)
 

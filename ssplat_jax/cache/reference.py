@@ -187,6 +187,32 @@ def project(cache: dict, viewmats, Ks, height: int, width: int, config: StreamCo
     return depths, confidences, feats, mask, min(margins)
 
 
+def carve(cache: dict, viewmats, Ks, depths, confidences, config: StreamConfig) -> float:
+    """Revises the confidences of the pivots in place; returns the margin of the closest decision."""
+    pivots = [pivot for _, row in cache["rows"] for pivot in row]
+    evidence, margins = {id(p): 0.0 for p in pivots}, [math.inf]
+    for v in range(len(viewmats)):
+        trusted = (confidences[v] >= np.float32(config.min_confidence)) & (confidences[v] > 0) & (depths[v] > 0)
+        with np.errstate(all="ignore"):
+            ell = np.where(trusted & np.isfinite(depths[v]), np.log(depths[v].astype(np.float64)), -math.inf)
+        viewmat, K = np.asarray(viewmats[v], np.float64), np.asarray(Ks[v], np.float64)
+        for (row, column), pairs in _on_pixels(pivots, viewmat, K, *ell.shape, margins).items():
+            if ell[row, column] == -math.inf:
+                continue
+            weight = float(confidences[v][row, column])
+            nearest = ell[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2].min()
+            for own, pivot in pairs:
+                free, same = nearest - math.log(config.cluster_ratio), abs(own - ell[row, column])
+                margins += [abs(own - free), abs(same - math.log(1.1))]
+                evidence[id(pivot)] += weight * (-2.0 if own < free else 0.5 if same <= math.log(1.1) else 0.0)
+    for pivot in pivots:
+        if evidence[id(pivot)]:
+            known = min(max(pivot["confidences"], 0.02), 0.95)
+            judged = 1 / (1 + (1 - known) / known * math.exp(-evidence[id(pivot)]))
+            pivot["confidences"] = min(max(judged, 0.02), 0.95)
+    return min(margins)
+
+
 def _on_pixels(pivots, viewmat, K, height, width, margins) -> dict:
     """(log depth, pivot) of what is seen, by pixel (row, column)."""
     pixels: dict = {}

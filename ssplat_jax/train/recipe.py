@@ -86,7 +86,7 @@ TINY = Recipe(
         Phase("depth", 1800, num_chunks=1, num_targets=0, sizes=((96, 128),), learning_rate=1e-3),
         Phase(
             "stream",
-            850,
+            600,
             num_chunks=4,
             num_targets=4,
             sizes=((96, 128),),

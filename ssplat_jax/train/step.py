@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float, Int
 
-from ssplat_jax.cache import Tokens, fuse
+from ssplat_jax.cache import Tokens
 from ssplat_jax.gaussians import Gaussians, mask_gaussians
 from ssplat_jax.render import render
 from ssplat_jax.stream import StreamSplat
@@ -68,7 +68,7 @@ def stream_chunks(model: StreamSplat, params: dict, sample: Sample, *, recompute
     def body(cache, chunk_and_truth):
         chunk, truth = chunk_and_truth
         prediction = model.predict(params, cache, chunk)
-        cache = fuse(cache, jax.lax.stop_gradient(prediction.tokens), model.config)
+        cache = model.remember(cache, prediction)
         losses = depth_loss(
             prediction.logits,
             prediction.log_depths,
