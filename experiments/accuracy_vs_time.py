@@ -121,7 +121,7 @@ def measure(setting: Setting, opened: Opened, split: Split) -> dict[str, Any]:
         "chunk_ms": latency["chunk_ms"]["median"],
         "render_ms": latency["render_ms"],
         "compile_s": round(session.compile_seconds, 1),
-        "gaussians": cache_facts(session)["pivots"],
+        "gaussians": cache_facts(session)["decoded"],
         "step_memory_mb": round((session.step_memory_bytes or 0) / 2**20, 1),
     }
 

@@ -71,9 +71,9 @@ def run_capture(
                 if interrupts.received:
                     break
     if interrupts.received:
-        return RunResult(done, cache_facts(session)["pivots"], interrupts.received)
+        return RunResult(done, cache_facts(session)["decoded"], interrupts.received)
     _finish(session, frame, capture, indices, out)
-    return RunResult(done, cache_facts(session)["pivots"], None)
+    return RunResult(done, cache_facts(session)["decoded"], None)
 
 
 def export_run(run_dir: Path, to: Path, params: dict) -> ExportReport:

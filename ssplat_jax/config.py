@@ -96,7 +96,8 @@ class StreamConfig:
     voxel_size: float = 0.04
     pivots_per_voxel: int = 4
     min_confidence: float = 0.5
-    """tau_conf: tokens below it never enter the cache, pivots that sink below it are not decoded. The paper's 0.3 is a peak; as a window's mass that is more."""
+    """tau_conf: tokens below it never enter the cache, pivots that sink below it are not decoded. The paper's 0.3 is of
+    a peak; the mass of a window is more."""
     capacity: int = 1 << 15
     """Voxels the cache can hold, a power of two; outside jit `grow` doubles it."""
     overflow: Literal["grow", "drop_new", "evict_lowest", "error"] = "grow"

@@ -72,7 +72,7 @@ def _score_stage(session: Session, capture, split, frame, seen: int):
         "psnr": round(float(np.mean([s.psnr for s in scores])), 2),
         "ssim": round(float(np.mean([s.ssim for s in scores])), 3),
         "coverage": round(float(np.mean([s.coverage for s in scores])), 3),
-        "num_gaussians": cache_facts(session)["pivots"],
+        "num_gaussians": cache_facts(session)["decoded"],
     }
     return row, scored[len(scored) // 2][1]
 

@@ -125,6 +125,7 @@ def cache_facts(session: Session) -> dict:
     return {
         "voxels": int(cache.num_voxels),
         "pivots": int(cache.counts.sum()),
+        "decoded": int((cache.alive & (cache.confidences >= session.model.config.min_confidence)).sum()),
         "capacity": cache.capacity,
         "overflow": stats["num_dropped"],
         "accepted_fraction": round(stats["num_accepted"] / max(stats["num_seen"], 1), 4),
@@ -178,7 +179,7 @@ def evaluate(
         "compilations": session.num_compilations,
         "step_memory_bytes": session.step_memory_bytes,
         "cache": facts,
-        "num_gaussians": facts["pivots"],
+        "num_gaussians": facts["decoded"],
         "config_hash": session.model.config.hash,
         "stream_frame": {"scale": frame.scale, "near": frame.near, "far": frame.far},
         "baselines": reference,

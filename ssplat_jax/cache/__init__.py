@@ -1,4 +1,4 @@
-"""VACC, the Voxel-Aligned Causal Cache: the stream's only memory, its write (`fuse`), its read (`project`) and its doubt (`carve`)."""
+"""VACC, the Voxel-Aligned Causal Cache: the stream's only memory. `fuse` writes, `project` reads, `carve` doubts."""
 
 from ssplat_jax.cache.carve import carve
 from ssplat_jax.cache.fuse import Touched, fuse, fuse_touched

@@ -3,9 +3,9 @@
 A pivot's confidence is taken as the probability that a surface is there. Every trusted cell of a new view that the
 pivot falls on is a witness, with the cell's own confidence as its weight:
 
-    sees past it    log depth before the nearest surface of the 3 x 3 cells by more than ln(cluster_ratio)   odds / e^2w
-    sees it         log depth within ln(1.1) of the cell's surface                                           odds x e^0.5w
-    hidden, unseen  anything else                                                                            unchanged
+    sees past it    log depth before the nearest surface of the 3 x 3 cells by more than ln(cluster_ratio): odds / e^2w
+    sees it         log depth within ln(1.1) of the cell's surface: odds x e^0.5w
+    hidden, unseen  anything else: unchanged
 
 Contradiction counts more than agreement: a wrong depth agrees by chance with its neighbours, but what was looked
 through is not there. One witness moves a sure pivot little, several sink it below tau, where `decode` leaves it out; it
