@@ -11,6 +11,7 @@ encode ─► match ─► P_i ──────────► anchor_depth (H
 
 import dataclasses
 import functools
+import math
 
 import jax
 import jax.numpy as jnp
@@ -127,7 +128,7 @@ class StreamSplat:
             feats=flat(cache.feats),
             rgbs=flat(cache.rgbs),
             quats=flat(cache.quats),
-            footprints=flat(cache.footprints),
+            footprints=flat(merged_footprints(cache, self.config)),
             config=self.config,
         )
         return mask_gaussians(gaussians, flat(cache.alive & (cache.confidences >= self.config.min_confidence)))
@@ -144,6 +145,17 @@ class StreamSplat:
             config=self.config,
         )
         return mask_gaussians(gaussians, tokens.valid)
+
+
+def merged_footprints(cache: VoxelCache, config: StreamConfig) -> Float[Array, "capacity k"]:
+    """Footprints of pivots, grown with their members up to the share of a voxel's face that each of K pivots covers.
+
+    A pivot keeps the footprint of its best member. Where cells are finer than that share, many merge into K pivots, and
+    K single footprints would leave cracks between them.
+    """
+    share = config.voxel_size / math.sqrt(config.pivots_per_voxel)
+    grown = cache.footprints * jnp.sqrt(cache.num_members.astype(jnp.float32))
+    return jnp.minimum(grown, jnp.maximum(cache.footprints, share))
 
 
 def _flatten_tokens(positions, feats, confidences, footprints, views: Views) -> Tokens:

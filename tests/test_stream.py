@@ -8,7 +8,7 @@ import pytest
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.data.capture import open_capture
 from ssplat_jax.session import Session
-from ssplat_jax.stream import StreamSplat
+from ssplat_jax.stream import StreamSplat, merged_footprints
 from ssplat_jax.struct import replace
 
 # Narrow, and without a confidence threshold: untrained distributions are flat and would leave the cache empty.
@@ -151,6 +151,29 @@ def test_decoded_dead_pivots_are_absent(model, params, looped):
     opacities = np.asarray(gaussians.opacities)
     assert (opacities[alive] > 0).all() and (opacities[~alive] == 0).all()
     np.testing.assert_array_equal(np.asarray(gaussians.means)[alive], np.asarray(looped[0].means).reshape(-1, 3)[alive])
+
+
+def test_carved_pivots_are_not_decoded_but_remembered(model, params, looped):
+    cache = looped[0]
+    doubted = StreamSplat(NARROW.replace(min_confidence=float(np.median(cache.confidences[cache.alive]))))
+    opacities = np.asarray(doubted.decode(params, cache).opacities).reshape(cache.confidences.shape)
+    is_shown = np.asarray(cache.alive & (cache.confidences >= doubted.config.min_confidence))
+    assert 0 < is_shown.sum() < np.asarray(cache.alive).sum()
+    np.testing.assert_array_equal(opacities > 0, is_shown)
+
+
+@pytest.mark.parametrize(
+    ("footprint", "members", "wanted"),
+    [(0.01, 1, 0.01), (0.01, 2, 0.01 * 2**0.5), (0.01, 100, 0.02), (0.05, 100, 0.05), (0.02, 3, 0.02)],
+)
+def test_merged_footprints_grow_to_the_share_of_a_voxel_s_face(model, footprint, members, wanted):
+    cache = model.init_cache()  # voxel_size 0.04, 4 pivots: a share of 0.02
+    cache = replace(
+        cache,
+        footprints=cache.footprints.at[0, 0].set(footprint),
+        num_members=cache.num_members.at[0, 0].set(members),
+    )
+    assert float(merged_footprints(cache, model.config)[0, 0]) == pytest.approx(wanted, rel=1e-6)
 
 
 def test_session_compiles_once_and_needs_the_same_memory_throughout(model, params, chunks):

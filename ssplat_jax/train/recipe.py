@@ -97,7 +97,7 @@ TINY = Recipe(
         ),
         Phase(
             "settle",
-            200,
+            150,
             num_chunks=5,
             num_targets=3,
             # No backward pass through the network leaves time for images of the size that inference streams, where
