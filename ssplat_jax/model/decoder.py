@@ -9,9 +9,9 @@ from ssplat_jax.gaussians import SH_C0, Gaussians
 from ssplat_jax.geometry.rotations import multiply_quats
 
 START_OPACITY = 1.5  # logit: 0.82, a surface that mostly hides what is behind it
-START_SCALE = 0.55  # of a cell's footprint, sideways: neighbours overlap into a closed surface
+START_SCALE = 0.5  # of a cell's footprint, sideways: neighbours overlap into a closed surface
 START_THICKNESS = 0.4  # of the sideways scale, along the viewing direction
-MAX_LOG_GAIN = 2.0  # a Gaussian stays within e^2 of where it starts: no needle hides behind a rare feature
+MAX_LOG_GAIN = 0.3  # a Gaussian stays within a third of its cell's size: larger ones fill holes over what lies behind
 MIN_SCALE = 1e-6
 
 

@@ -52,7 +52,7 @@ class Recipe:
     recompute: bool = False
     """Recompute each chunk's activations backward: less memory, more time."""
     cache_capacity: int = 1 << 14
-    max_pairs: int = 1 << 19
+    max_pairs: int = 1 << 20
     """Tile pairs the rasterizer may use per target batch; overflow is logged."""
 
     def __post_init__(self) -> None:
@@ -79,6 +79,7 @@ class Recipe:
         return dataclasses.replace(self, phases=phases)
 
 
+# The parameters that rendering the cache leaves without a gradient.
 ALL_BUT_HEAD = ("encoder", "cost_volume", "hpda", "tokens", "cgfi", "mixer")
 
 TINY = Recipe(
@@ -94,17 +95,6 @@ TINY = Recipe(
             # The matcher is done by then; without its backward pass a step costs a third, and rendering teaches it
             # less about depth than depth itself did.
             form=PhaseForm(frozen=("encoder", "cost_volume")),
-        ),
-        Phase(
-            "settle",
-            150,
-            num_chunks=5,
-            num_targets=3,
-            # No backward pass through the network leaves time for images of the size that inference streams, where
-            # pivots merge as they do there.
-            sizes=((192, 256),),
-            learning_rate=1e-3,
-            form=PhaseForm(frozen=ALL_BUT_HEAD, decode="cache"),
         ),
     )
 )
