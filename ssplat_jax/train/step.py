@@ -120,7 +120,7 @@ def train_step(
     *,
     model: StreamSplat,
     recipe: Recipe,
-    form: PhaseForm,
+    form: PhaseForm = PhaseForm(),
 ) -> tuple[TrainState, dict]:
     """One update. A step with a non-finite gradient changes nothing but the count of such steps."""
     gradients, metrics = jax.grad(loss_fn, has_aux=True)(state.params, model, sample, recipe, form)

@@ -21,7 +21,7 @@ CONFIDENCES = ("random", "tied", "at_tau")
 
 fuse = jax.jit(fuse_touched, static_argnums=2, donate_argnums=0)
 
-CONFIG = StreamConfig(token_width=WIDTH, capacity=128, voxel_size=0.25, overflow="drop_new")
+CONFIG = StreamConfig(token_width=WIDTH, capacity=128, voxel_size=0.25, min_confidence=0.3, overflow="drop_new")
 
 
 @dataclasses.dataclass(frozen=True)

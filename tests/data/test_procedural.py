@@ -44,8 +44,8 @@ def test_parallax_of_training_samples(samples):
     baselines = np.array([relative_baselines(depths, poses) for _, depths, poses, _ in samples])
     medians = np.median(baselines, axis=1)
     assert medians.min() > 0.01 and medians.max() < 0.46
-    # Video and photo sets: a tenth of the samples steps less than 3 %, a tenth more than 20 % of the median depth.
-    assert np.quantile(medians, 0.1) < 0.03 and np.quantile(medians, 0.9) > 0.2
+    # Video and photo sets: a tenth of the samples steps less than 3.5 %, a tenth more than 20 % of the median depth.
+    assert np.quantile(medians, 0.1) < 0.035 and np.quantile(medians, 0.9) > 0.2
     assert 0.04 < np.median(medians) < 0.16
     ratios = baselines.max(axis=1) / medians
     assert ratios.min() < 1.5 and ratios.max() > 2  # even walks and irregular ones

@@ -180,7 +180,8 @@ def test_a_point_has_one_depth_in_every_view(seed):
         is_smooth = np.max(corners, axis=0) < 1.1 * np.min(corners, axis=0)
         ratio = (z[inside] / seen)[is_smooth]
         assert (np.abs(ratio - 1) < REPROJECTION_TOLERANCE).mean() > 0.7
-        assert (ratio < 1 - REPROJECTION_TOLERANCE).mean() < 0.01
+        # Views far apart meet at more grazing angles and edges, where a bilinear depth is between two surfaces.
+        assert (ratio < 1 - REPROJECTION_TOLERANCE).mean() < 0.02
 
 
 def test_scaled_scene_looks_the_same_from_scaled_cameras():
