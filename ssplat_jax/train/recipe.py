@@ -18,6 +18,9 @@ class PhaseForm:
     The cache holds constants, so `cache` trains the Gaussian head alone."""
 
 
+PAPER_FORM = PhaseForm()
+
+
 @dataclasses.dataclass(frozen=True)
 class Phase:
     """A stretch of training with samples of one form (one compiled program per image size)."""
@@ -32,7 +35,7 @@ class Phase:
     """Image sizes (height, width), taken in turn."""
     learning_rate: float
     """Peak of the phase; it decays to a tenth by cosine."""
-    form: PhaseForm = PhaseForm()
+    form: PhaseForm = PAPER_FORM
 
 
 @dataclasses.dataclass(frozen=True)

@@ -14,7 +14,7 @@ from ssplat_jax.render import render
 from ssplat_jax.stream import StreamSplat
 from ssplat_jax.struct import pytree
 from ssplat_jax.train.losses import depth_loss, image_gradient_l1
-from ssplat_jax.train.recipe import PhaseForm, Recipe
+from ssplat_jax.train.recipe import PAPER_FORM, PhaseForm, Recipe
 from ssplat_jax.train.samples import Sample
 
 
@@ -120,7 +120,7 @@ def train_step(
     *,
     model: StreamSplat,
     recipe: Recipe,
-    form: PhaseForm = PhaseForm(),
+    form: PhaseForm = PAPER_FORM,
 ) -> tuple[TrainState, dict]:
     """One update. A step with a non-finite gradient changes nothing but the count of such steps."""
     gradients, metrics = jax.grad(loss_fn, has_aux=True)(state.params, model, sample, recipe, form)
@@ -154,6 +154,6 @@ class Trainer:
 
     @functools.cached_property
     def step(self):
-        """`(state, sample, rate, form=PhaseForm()) -> (state, metrics)`, the state donated."""
+        """`(state, sample, rate, form=PAPER_FORM) -> (state, metrics)`, the state donated."""
         bound = functools.partial(train_step, model=self.model, recipe=self.recipe)
         return jax.jit(bound, donate_argnums=0, static_argnames="form")

@@ -106,7 +106,13 @@ def test_the_cache_is_read_and_remembered():
 
 
 @pytest.mark.parametrize(
-    "changes", [{"num_depths": 1}, {"chunk_size": 1}, {"num_sources": 1, "fine_matching": False}], ids=str
+    "changes",
+    [
+        {"num_depths": 1},
+        {"chunk_size": 1},
+        pytest.param({"num_sources": 1, "fine_matching": False}, marks=pytest.mark.slow),
+    ],
+    ids=str,
 )
 def test_the_smallest_configurations_run(changes):
     config = CONFIG.replace(**changes)

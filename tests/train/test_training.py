@@ -97,30 +97,36 @@ def test_learning_rate_warms_up_and_decays_in_every_phase():
     assert rates[first] < recipe.phases[1].learning_rate and rates[first + 2] > 0.8 * recipe.phases[1].learning_rate
 
 
-def test_a_step_with_a_non_finite_gradient_changes_nothing_but_its_count():
-    model = StreamSplat(training_config(NARROW, RECIPE))
-    sample = sample_for_step(0, RECIPE, model.config)
+FROZEN_ENCODER = PhaseForm(frozen=("encoder",))
+STREAM_RECIPE = dataclasses.replace(RECIPE, phases=(Phase("stream", 1, 2, 1, ((64, 64),), 1e-3, FROZEN_ENCODER),))
+
+
+@pytest.fixture(scope="module")
+def trainer():
+    """One compiled step for the tests that take one."""
+    return Trainer(StreamSplat(training_config(NARROW, STREAM_RECIPE)), STREAM_RECIPE)
+
+
+def test_a_step_with_a_non_finite_gradient_changes_nothing_but_its_count(trainer):
+    sample = sample_for_step(0, STREAM_RECIPE, trainer.model.config)
     broken = dataclasses.replace(sample, log_depths=sample.log_depths.at[0, 0, 8, 8].set(jnp.nan))
     broken = dataclasses.replace(
         broken, chunks=dataclasses.replace(sample.chunks, images=sample.chunks.images * jnp.inf)
     )
-    state = init_state(model, RECIPE)
+    state = init_state(trainer.model, STREAM_RECIPE)
     before = flat(state.params)
-    after, metrics = Trainer(model, RECIPE).step(state, broken, jnp.float32(1e-3))
+    after, metrics = trainer.step(state, broken, jnp.float32(1e-3), form=FROZEN_ENCODER)
     assert not np.isfinite(float(metrics["grad_norm"]))
     assert int(after.num_skipped) == 1 and int(after.step) == 1
     for a, b in zip(flat(after.params), before, strict=True):
         np.testing.assert_array_equal(a, b)
 
 
-def test_frozen_stages_stay_and_the_others_move():
-    form = PhaseForm(frozen=("encoder",))
-    recipe = dataclasses.replace(RECIPE, phases=(Phase("stream", 1, 2, 1, ((64, 64),), 1e-3, form),))
-    model = StreamSplat(training_config(NARROW, recipe))
-    state = init_state(model, recipe)
+def test_frozen_stages_stay_and_the_others_move(trainer):
+    state = init_state(trainer.model, STREAM_RECIPE)
     before = jax.tree.map(np.asarray, state.params)
-    sample = sample_for_step(0, recipe, model.config)
-    after, metrics = Trainer(model, recipe).step(state, sample, jnp.float32(1e-3), form=form)
+    sample = sample_for_step(0, STREAM_RECIPE, trainer.model.config)
+    after, metrics = trainer.step(state, sample, jnp.float32(1e-3), form=FROZEN_ENCODER)
     assert np.isfinite(float(metrics["psnr"]))
     for a, b in zip(flat(after.params["encoder"]), flat(before["encoder"]), strict=True):
         np.testing.assert_array_equal(a, b)
@@ -130,6 +136,7 @@ def test_frozen_stages_stay_and_the_others_move():
         ), name
 
 
+@pytest.mark.slow  # two programs of a whole training step
 def test_rendering_the_cache_trains_the_head_alone_whatever_is_frozen():
     sample = sample_for_step(RECIPE.num_steps - 1, RECIPE, NARROW)
     model = StreamSplat(training_config(NARROW, RECIPE))
