@@ -196,7 +196,7 @@ def carve(cache: dict, viewmats, Ks, depths, confidences, config: StreamConfig) 
         with np.errstate(all="ignore"):
             ell = np.where(trusted & np.isfinite(depths[v]), np.log(depths[v].astype(np.float64)), -math.inf)
         viewmat, K = np.asarray(viewmats[v], np.float64), np.asarray(Ks[v], np.float64)
-        for (row, column), pairs in _on_pixels(pivots, viewmat, K, *ell.shape, margins).items():
+        for (row, column), pairs in _on_pixels(pivots, viewmat, K, ell.shape[0], ell.shape[1], margins).items():
             if ell[row, column] == -math.inf:
                 continue
             weight = float(confidences[v][row, column])
