@@ -1,5 +1,7 @@
 """Safe primitives. Each states its limits; tests/stability/test_numerics.py holds a test for every line of them."""
 
+import math
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -32,6 +34,4 @@ def safe_log(x: Float[Array, "*s"], eps: float = 1e-12) -> Float[Array, "*s"]:
 
 def softplus_inverse(y: float) -> float:
     """The x with softplus(x) = y, for y > 0, in plain Python (initial values)."""
-    import math
-
     return y + math.log(-math.expm1(-y))
