@@ -35,6 +35,19 @@ def _shared(name: str) -> Path:
     return folder
 
 
+@pytest.fixture
+def compiled_plainly():
+    """Programs that take longer to optimize than to run: XLA's passes as ever, LLVM's not.
+
+    For the network, training and the command line. The stream, the cache, the rasterizer and its hard cases are tested
+    as users compile them.
+    """
+    before = jax.config.read("jax_disable_most_optimizations")
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", before)
+
+
 @pytest.fixture(scope="session")
 def captures() -> Path:
     """Folder of real captures beside the repository."""

@@ -10,6 +10,7 @@ from ssplat_jax.data.capture import open_capture
 from ssplat_jax.session import Session
 from ssplat_jax.stream import StreamSplat, merged_footprints
 from ssplat_jax.struct import replace
+from tests.model.small import random_params
 
 # Narrow, and without a confidence threshold: untrained distributions are flat and would leave the cache empty.
 NARROW = StreamConfig(
@@ -24,7 +25,7 @@ NARROW = StreamConfig(
     mixer_blocks=1,
     mixer_proj=8,
     min_confidence=0.0,
-    capacity=2048,
+    capacity=8192,  # a session starts with it too: one program for loop and session
 )
 
 
@@ -35,10 +36,7 @@ def model():
 
 @pytest.fixture(scope="module")
 def params(model):
-    # Perturbed, so that zero-initialised layers (CGFI, the head) take part. NumPy: no compilation per shape.
-    random = np.random.default_rng(1)
-    noisy = lambda x: jnp.asarray(np.asarray(x) + 0.05 * random.standard_normal(x.shape, np.float32))  # noqa: E731
-    return jax.tree.map(noisy, model.init(jax.random.key(0)))
+    return random_params(model.config, seed=1)
 
 
 @pytest.fixture(scope="module")
@@ -47,9 +45,14 @@ def chunks(model):
 
 
 @pytest.fixture(scope="module")
-def looped(model, params, chunks):
+def step(model):
+    """The jitted step as users are told to write it: the cache it is given is consumed."""
+    return jax.jit(model.step, donate_argnums=1)
+
+
+@pytest.fixture(scope="module")
+def looped(model, params, chunks, step):
     """The cache after a Python loop over the jitted step, and the number of compilations that took."""
-    step = jax.jit(model.step, donate_argnums=1)
     cache = model.init_cache()
     outputs = []
     for chunk in chunks:
@@ -94,10 +97,9 @@ def test_cache_fills_within_its_bounds(model, chunks, looped):
     assert int(cache.stats.num_accepted) == seen - rejected - int(cache.stats.num_dropped)
 
 
-def test_stored_features_are_bounded_however_often_they_come_back(model, params, chunks):
+def test_stored_features_are_bounded_however_often_they_come_back(model, params, chunks, step):
     # Twelve rounds over the same views: every chunk's features are fed by the cache and feed it. Without the bound the
     # loop has gain, and a trained network reached 1e18 after nine chunks of a real capture.
-    step = jax.jit(model.step, donate_argnums=1)
     cache = model.init_cache()
     for _ in range(3):
         for chunk in chunks:
@@ -109,8 +111,7 @@ def test_stored_features_are_bounded_however_often_they_come_back(model, params,
         assert np.sqrt((feats[alive] ** 2).mean(axis=-1)).max() <= 1.0 + 1e-4
 
 
-def test_future_chunks_do_not_change_the_past(model, params, chunks, looped):
-    step = jax.jit(model.step)
+def test_future_chunks_do_not_change_the_past(model, params, chunks, step, looped):
     altered = [*chunks[:2], replace(chunks[2], images=1.0 - chunks[2].images)]
     cache = model.init_cache()
     for chunk, expected in zip(altered[:2], looped[1], strict=False):
@@ -120,17 +121,16 @@ def test_future_chunks_do_not_change_the_past(model, params, chunks, looped):
     assert not np.array_equal(np.asarray(changed.depths), np.asarray(looped[1][2].depths))
 
 
-def test_a_chunk_of_padding_leaves_the_cache_as_it_was(model, params, chunks, looped):
+def test_a_chunk_of_padding_leaves_the_cache_as_it_was(params, chunks, step, looped):
     padding = replace(chunks[0], valid=jnp.zeros(4, bool))
-    cache, _ = jax.jit(model.step)(params, looped[0], padding)
+    cache, _ = step(params, jax.tree.map(jnp.copy, looped[0]), padding)
     for (name, after), (_, before) in zip(leaves_with_names(cache), leaves_with_names(looped[0]), strict=True):
         if "num_chunks" not in name:
             np.testing.assert_array_equal(after, before, err_msg=name)
 
 
-def test_pixels_of_a_padded_view_change_nothing(model, params, chunks, looped):
+def test_pixels_of_a_padded_view_change_nothing(model, params, chunks, step):
     valid = jnp.array([True, True, True, False])
-    step = jax.jit(model.step)
     plain = replace(chunks[0], valid=valid)
     noisy = replace(plain, images=plain.images.at[3].set(0.7))
     first, _ = step(params, model.init_cache(), plain)
@@ -187,7 +187,7 @@ def test_session_compiles_once_and_needs_the_same_memory_throughout(model, param
 
 
 @pytest.mark.parametrize(("width", "height"), [(50, 71), pytest.param(71, 45, marks=pytest.mark.slow)])
-def test_odd_and_portrait_sizes_stream(model, params, width, height):
+def test_odd_and_portrait_sizes_stream(model, params, width, height, compiled_plainly):
     capture = open_capture(f"procedural:room?frames=5&size={width}x{height}")
     session = Session(model, params)
     for chunk in capture.chunks(model.config):

@@ -108,7 +108,7 @@ def test_bad_capture_is_one_line_exit_2_and_nothing_written(case, command, tmp_p
     [
         (("inspect", "no/such/folder"), "no/such/folder"),
         (("eval", "procedural:room", "--context", "5", "--size", "huge", "--out", "x"), "--size"),
-        (("eval", "procedural:room", "--context", "5000", "--out", "x"), "context"),
+        (("eval", "procedural:room?frames=12&size=32x24", "--context", "5000", "--out", "x"), "context"),
         (("eval", "procedural:room", "--context", "8", "--set", "voxel_size=-1", "--out", "x"), "voxel_size"),
         (("eval", "procedural:room", "--context", "8", "--set", "no_such=1", "--out", "x"), "no_such"),
         (("eval", "procedural:room", "--context", "8", "--weights", "no.npz", "--out", "x"), "no.npz"),

@@ -78,8 +78,14 @@ def chunk(seed: int = 0, *, views: int = 3, baseline: float = 0.2, height: int =
 
 @functools.cache
 def step():
-    """The jitted step."""
-    return jax.jit(MODEL.step)
+    """The step in its two halves, both jitted: the first is `predict()`, which is compiled anyway."""
+    remember = jax.jit(MODEL.remember)
+
+    def both(params, cache, chunk):
+        prediction = predict()(params, cache, chunk)
+        return remember(cache, prediction), prediction.output
+
+    return both
 
 
 @functools.cache
