@@ -57,6 +57,8 @@ SETTINGS = (
     Setting("mean readout", changes={"depth_readout": "mean"}),
     Setting("no HPDA", changes={"hpda": False}),
     Setting("no CGFI", changes={"cgfi": False}),
+    Setting("no witnesses", changes={"num_witnesses": 0}),
+    Setting("no carving", changes={"carving": False}),
     Setting("no mixer", changes={"mixer_blocks": 0}),
     Setting("160x120, 1 source", (160, 120), {"num_sources": 1}),
     Setting("480x360, voxel 0.02", (480, 360), {"voxel_size": 0.02}),

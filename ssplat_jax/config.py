@@ -106,7 +106,9 @@ class StreamConfig:
     merge_weight: Literal["max", "count"] = "max"
     """`max` is the printed omega* = max; `count` weighs by the number of members, a true running mean."""
     carving: bool = True
-    """Later views lower the confidence of pivots that they look through and raise that of those they see (ours)."""
+    """Views lower the confidence of pivots that they look through and raise that of those they see (ours)."""
+    num_witnesses: int = 32
+    """Chunks of which a coarse view is kept, to judge the tokens of later ones in the same way; part of `carving`."""
     cluster_ratio: float = 1.15
     """Depth ratio that holds the front cluster of the projection together; `inf` is the plain mean (literal)."""
 
@@ -124,6 +126,7 @@ class StreamConfig:
             ("min_confidence", "in [0, 1]", 0.0 <= self.min_confidence <= 1.0),
             ("sigma0", "positive", self.sigma0 > 0),
             ("lambda_sigma", "not negative", self.lambda_sigma >= 0),
+            ("num_witnesses", "not negative", self.num_witnesses >= 0),
             ("cluster_ratio", "above 1", self.cluster_ratio > 1),
             ("sh_degree", "0 to 3", 0 <= self.sh_degree <= 3),
             (

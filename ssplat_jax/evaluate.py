@@ -15,7 +15,7 @@ from PIL import Image
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.frame import StreamFrame
 from ssplat_jax.data.protocol import Split
-from ssplat_jax.gaussians import Gaussians
+from ssplat_jax.gaussians import Gaussians, mean_color
 from ssplat_jax.metrics import SSIM_ARGUMENTS, psnr, ssim
 from ssplat_jax.render import render
 from ssplat_jax.report import Reporter
@@ -32,7 +32,8 @@ class ViewScore:
     """One target view."""
 
     frame: int
-    psnr: float
+    psnr: float  # dB, holes in the scene's mean colour
+    psnr_over_black: float  # dB
     ssim: float
     coverage: float  # mean alpha: how much of the view the scene covers
 
@@ -58,12 +59,21 @@ def stream_context(
 def score_view(
     gaussians: Gaussians, capture: Capture, i: int, frame: StreamFrame
 ) -> tuple[ViewScore, Images, Float[np.ndarray, "h w"]]:
-    """Score, clipped colour and depth (stream units, 0 where nothing is) of frame `i`."""
+    """Score, clipped colour and depth (stream units, 0 where nothing is) of frame `i`.
+
+    What no Gaussian covers is shown in the scene's mean colour. Black, a colour like any other, would make a hole the
+    worst of errors (docs/decisions.md); the score over it is given too.
+    """
     out = render(gaussians, capture.camera(i, frame))
-    color = np.clip(np.asarray(out.color), 0.0, 1.0)
+    over_black, alpha = np.asarray(out.color), np.asarray(out.alpha)
+    color = np.clip(over_black + (1.0 - alpha[..., None]) * np.asarray(mean_color(gaussians)), 0.0, 1.0)
     target = capture.image(i)
     score = ViewScore(
-        frame=i, psnr=psnr(color, target), ssim=ssim(color, target), coverage=float(np.asarray(out.alpha).mean())
+        frame=i,
+        psnr=psnr(color, target),
+        psnr_over_black=psnr(np.clip(over_black, 0.0, 1.0), target),
+        ssim=ssim(color, target),
+        coverage=float(alpha.mean()),
     )
     return score, color, np.asarray(out.depth)
 
@@ -171,6 +181,7 @@ def evaluate(
         "context_views": len(split.context),
         "target_views": len(split.targets),
         "psnr": round(float(np.mean([s.psnr for s in scores])), 4),
+        "psnr_over_black": round(float(np.mean([s.psnr_over_black for s in scores])), 4),
         "ssim": round(float(np.mean([s.ssim for s in scores])), 4),
         "ssim_arguments": SSIM_ARGUMENTS,
         "lpips": None,

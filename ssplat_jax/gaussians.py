@@ -56,6 +56,16 @@ def concatenate(parts: list[Gaussians]) -> Gaussians:
     )
 
 
+def mean_color(gaussians: Gaussians) -> Float[Array, "3"]:
+    """Mean colour of the Gaussians, SH bands above the constant left out, weighted by opacity; black of none.
+
+    What to show where a reconstruction has holes, when nothing better is known.
+    """
+    colors = jnp.maximum(0.5 + SH_C0 * gaussians.sh[:, 0], 0.0)
+    total = jnp.sum(gaussians.opacities)
+    return jnp.sum(gaussians.opacities[:, None] * colors, axis=0) / jnp.where(total > 0, total, 1.0)
+
+
 def mask_gaussians(gaussians: Gaussians, keep) -> Gaussians:
     """Makes the rows outside `keep` absent (opacity 0, harmless shape), at the same size."""
     identity = jnp.array([1.0, 0.0, 0.0, 0.0], gaussians.quats.dtype)

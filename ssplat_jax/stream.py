@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ssplat_jax import model as stages
-from ssplat_jax.cache import Tokens, VoxelCache, carve, fuse, init_cache, project
+from ssplat_jax.cache import Tokens, VoxelCache, bear_witness, carve, fuse, init_cache, judge, project
 from ssplat_jax.chunk import Chunk
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.gaussians import Gaussians, mask_gaussians
@@ -104,16 +104,19 @@ class StreamSplat:
         return self.remember(cache, prediction), prediction.output
 
     def remember(self, cache: VoxelCache, prediction: Prediction) -> VoxelCache:
-        """The cache after a chunk: its tokens fused in, all pivots judged by what its views see. Constants throughout.
+        """The cache after a chunk: its tokens judged and fused in, all pivots carved. Constants throughout.
 
-        The new pivots are judged too: views of a chunk that disagree carve each other's tokens at once.
+        The new pivots are carved too: views of a chunk that disagree judge each other's tokens at once.
         """
         prediction = jax.lax.stop_gradient(prediction)
-        output = prediction.output
+        seen = (prediction.views.grid_camera, prediction.output.depths, prediction.output.confidences)
+        with jax.named_scope("judge"):
+            tokens = judge(cache.witnesses, prediction.tokens, self.config)
         with jax.named_scope("VACC"):
-            cache = fuse(cache, prediction.tokens, self.config)
+            cache = fuse(cache, tokens, self.config)
         with jax.named_scope("carve"):
-            return carve(cache, prediction.views.grid_camera, output.depths, output.confidences, self.config)
+            cache = carve(cache, *seen, self.config)
+            return bear_witness(cache, *seen, self.config)
 
     def run(self, params: dict, cache: VoxelCache, chunks: Chunk) -> tuple[VoxelCache, ChunkOutput]:
         """`step` over stacked chunks (leading axis t) as one `lax.scan`."""

@@ -1,10 +1,10 @@
 """VACC, the Voxel-Aligned Causal Cache: the stream's only memory. `fuse` writes, `project` reads, `carve` doubts."""
 
-from ssplat_jax.cache.carve import carve
+from ssplat_jax.cache.carve import bear_witness, carve, judge
 from ssplat_jax.cache.fuse import Touched, fuse, fuse_touched
 from ssplat_jax.cache.policy import check, ensure_room, grow
 from ssplat_jax.cache.project import ProjectedCache, project
-from ssplat_jax.cache.state import PIVOT_FIELDS, CacheStats, Tokens, VoxelCache, init_cache
+from ssplat_jax.cache.state import PIVOT_FIELDS, CacheStats, Tokens, VoxelCache, Witnesses, init_cache
 
 __all__ = [
     "PIVOT_FIELDS",
@@ -13,6 +13,8 @@ __all__ = [
     "Tokens",
     "Touched",
     "VoxelCache",
+    "Witnesses",
+    "bear_witness",
     "carve",
     "check",
     "ensure_room",
@@ -20,5 +22,6 @@ __all__ = [
     "fuse_touched",
     "grow",
     "init_cache",
+    "judge",
     "project",
 ]

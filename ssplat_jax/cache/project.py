@@ -44,8 +44,8 @@ class ProjectedCache:
 
 
 @pytree
-class PivotPairs:
-    """What the pivots of a block of rows are in every view, flattened over views and pivots."""
+class PixelPairs:
+    """What points are in every view, flattened over views and points."""
 
     pixels: Int[Array, " p"]  # flat over all views; the number of pixels where it is not seen
     log_depths: Float[Array, " p"]
@@ -95,7 +95,7 @@ def _over_blocks(cache: VoxelCache, camera: Camera, visit, start):
     return jax.lax.fori_loop(0, num_blocks, step, start)
 
 
-def _nearest(fronts, pairs: PivotPairs, first_row):
+def _nearest(fronts, pairs: PixelPairs, first_row):
     del first_row
     return fronts.at[pairs.pixels].min(pairs.log_depths, mode="drop")
 
@@ -103,7 +103,7 @@ def _nearest(fronts, pairs: PivotPairs, first_row):
 def _front_means(cache, camera, fronts, window):
     """Mean log depth of each pixel's front window, measured from its nearest pivot."""
 
-    def visit(sums, pairs: PivotPairs, first_row):
+    def visit(sums, pairs: PixelPairs, first_row):
         del first_row
         behind = _behind(pairs, fronts)
         weights = jnp.where(behind <= window, pairs.weights, 0.0)
@@ -118,7 +118,7 @@ def _cluster_sums(cache, camera, fronts, centres, window):
     flat_feats = cache.feats.reshape(-1, cache.feats.shape[-1])
     pivots_per_row = cache.feats.shape[1]
 
-    def visit(state, pairs: PivotPairs, first_row):
+    def visit(state, pairs: PixelPairs, first_row):
         scalars, feats = state
         behind = _behind(pairs, fronts)
         weights = jnp.where(jnp.abs(behind - centres[pairs.pixels]) <= window, pairs.weights, 0.0)
@@ -156,8 +156,8 @@ def _add_feats(sums, flat_feats, pixels, weights, first_pivot, num_views):
     return jax.lax.fori_loop(0, num_blocks, add_block, sums)
 
 
-def pairs_of_rows(cache: VoxelCache, camera: Camera, first_row, num_rows: int) -> PivotPairs:
-    """Projects the pivots of `num_rows` rows into all views."""
+def pairs_of_rows(cache: VoxelCache, camera: Camera, first_row, num_rows: int) -> PixelPairs:
+    """The pixels of all views that the pivots of `num_rows` rows fall on."""
 
     def block(x):
         return jax.lax.dynamic_slice_in_dim(x, first_row, num_rows).reshape(-1, *x.shape[2:])
@@ -165,8 +165,13 @@ def pairs_of_rows(cache: VoxelCache, camera: Camera, first_row, num_rows: int) -
     k = cache.means.shape[1]
     counts = jax.lax.dynamic_slice_in_dim(cache.counts, first_row, num_rows)
     weights = jnp.where(jnp.arange(k) < counts[:, None], block(cache.confidences).reshape(-1, k), 0.0).reshape(-1)
-    # Written out per coordinate: three rows of products vectorise over the pivots, a 3 x 3 matrix product does not.
-    px, py, pz = jnp.moveaxis(block(cache.means), -1, 0)
+    return pairs_of_points(block(cache.means), weights, camera)
+
+
+def pairs_of_points(points: Float[Array, "n 3"], weights: Float[Array, " n"], camera: Camera) -> PixelPairs:
+    """The pixels of all views that `points` fall on; those of weight 0 or NaN are not seen."""
+    # Written out per coordinate: three rows of products vectorise over the points, a 3 x 3 matrix product does not.
+    px, py, pz = jnp.moveaxis(points, -1, 0)
     views = camera.viewmats[:, :3, :, None]
     x, y, z = (views[:, i, 0] * px + views[:, i, 1] * py + views[:, i, 2] * pz + views[:, i, 3] for i in range(3))
     in_front = (z > NEAR) & jnp.isfinite(z) & (weights > 0)
@@ -178,14 +183,14 @@ def pairs_of_rows(cache: VoxelCache, camera: Camera, first_row, num_rows: int) -
     columns, rows = (jnp.where(is_seen, jnp.floor(c), 0.0).astype(jnp.int32) for c in (u, v))
     first_pixel = jnp.arange(len(camera.viewmats), dtype=jnp.int32)[:, None] * (camera.height * camera.width)
     num_pixels = len(camera.viewmats) * camera.height * camera.width
-    return PivotPairs(
+    return PixelPairs(
         pixels=jnp.where(is_seen, first_pixel + rows * camera.width + columns, num_pixels).reshape(-1),
         log_depths=jnp.where(is_seen, jnp.log(jnp.where(is_seen, z, 1.0)), 0.0).reshape(-1),
         weights=jnp.where(is_seen, weights, 0.0).reshape(-1),
     )
 
 
-def _behind(pairs: PivotPairs, fronts):
+def _behind(pairs: PixelPairs, fronts):
     """Log depth behind the nearest pivot of the pixel; 0 where not seen."""
     return jnp.where(pairs.weights > 0, pairs.log_depths - fronts[pairs.pixels], 0.0)
 

@@ -189,27 +189,71 @@ def project(cache: dict, viewmats, Ks, height: int, width: int, config: StreamCo
 
 def carve(cache: dict, viewmats, Ks, depths, confidences, config: StreamConfig) -> float:
     """Revises the confidences of the pivots in place; returns the margin of the closest decision."""
-    pivots = [pivot for _, row in cache["rows"] for pivot in row]
-    evidence, margins = {id(p): 0.0 for p in pivots}, [math.inf]
-    for v in range(len(viewmats)):
-        trusted = (confidences[v] >= np.float32(config.min_confidence)) & (confidences[v] > 0) & (depths[v] > 0)
-        with np.errstate(all="ignore"):
-            ell = np.where(trusted & np.isfinite(depths[v]), np.log(depths[v].astype(np.float64)), -math.inf)
-        viewmat, K = np.asarray(viewmats[v], np.float64), np.asarray(Ks[v], np.float64)
-        for (row, column), pairs in _on_pixels(pivots, viewmat, K, ell.shape[0], ell.shape[1], margins).items():
-            if ell[row, column] == -math.inf:
+    views = []
+    for viewmat, K, depth, confidence in zip(viewmats, Ks, depths, confidences, strict=True):
+        ell = _trusted_log_depths(depth, confidence, config)
+        around = np.pad(ell, 1, constant_values=math.inf)
+        nearest = np.array([[around[r : r + 3, c : c + 3].min() for c in range(ell.shape[1])] for r in range(len(ell))])
+        views.append((viewmat, K, ell, nearest, confidence))
+    return _revise([pivot for _, row in cache["rows"] for pivot in row], views)
+
+
+def witness(viewmats, Ks, depths, confidences, side: int, config: StreamConfig) -> tuple | None:
+    """The view of a chunk that is kept: viewmat, K, nearest log depths and weights of `side` x `side` parts."""
+    trusted = [_trusted_log_depths(d, c, config) for d, c in zip(depths, confidences, strict=True)]
+    view = int(np.argmax([np.isfinite(ell).sum() for ell in trusted]))
+    ell, confidence = trusted[view], np.asarray(confidences[view], np.float64)
+    if not np.isfinite(ell).any():
+        return None
+    height, width = ell.shape
+    nearest, weights = np.full((side, side), -math.inf), np.zeros((side, side))
+    for row, column in itertools.product(range(side), repeat=2):
+        touched = np.s_[
+            row * height // side : math.ceil((row + 1) * height / side),
+            column * width // side : math.ceil((column + 1) * width / side),
+        ]
+        if np.isfinite(ell[touched]).all():
+            nearest[row, column], weights[row, column] = ell[touched].min(), confidence[touched].min()
+    K = np.diag([side / width, side / height, 1.0]) @ np.asarray(Ks[view], np.float64)
+    return viewmats[view], K, nearest, nearest, weights
+
+
+def judge(witnesses: list[tuple], tokens: dict, config: StreamConfig) -> tuple[np.ndarray, float]:
+    """Confidences of `tokens` after the witnesses, and the margin of the closest decision."""
+    judged = np.asarray(tokens["confidences"], np.float64).copy()
+    chosen = np.flatnonzero(tokens["valid"] & (tokens["confidences"] >= np.float32(config.min_confidence)))
+    points = [{"means": np.asarray(tokens["means"][j], np.float64), "confidences": judged[j]} for j in chosen]
+    margin = _revise(points, witnesses)
+    judged[chosen] = [point["confidences"] for point in points]
+    return judged, margin
+
+
+def _trusted_log_depths(depths, confidences, config) -> np.ndarray:
+    """Log depth where a cell is a witness, -inf elsewhere."""
+    trusted = (confidences >= np.float32(config.min_confidence)) & (confidences > 0) & (depths > 0)
+    with np.errstate(all="ignore"):
+        return np.where(trusted & np.isfinite(depths), np.log(np.asarray(depths, np.float64)), -math.inf)
+
+
+def _revise(points: list, views: list[tuple]) -> float:
+    """Lets the cells of (viewmat, K, log depths, nearest, weights) judge the confidences of the points, in place."""
+    evidence, margins = {id(p): 0.0 for p in points}, [math.inf]
+    for viewmat, K, ell, nearest, weights in views:
+        seen = _on_pixels(points, np.asarray(viewmat, np.float64), np.asarray(K, np.float64), *ell.shape, margins)
+        for cell, pairs in seen.items():
+            if ell[cell] == -math.inf:
                 continue
-            weight = float(confidences[v][row, column])
-            nearest = ell[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2].min()
-            for own, pivot in pairs:
-                free, same = nearest - math.log(config.cluster_ratio), abs(own - ell[row, column])
+            for own, point in pairs:
+                free, same = nearest[cell] - math.log(1.02), abs(own - ell[cell])
                 margins += [abs(own - free), abs(same - math.log(1.1))]
-                evidence[id(pivot)] += weight * (-2.0 if own < free else 0.5 if same <= math.log(1.1) else 0.0)
-    for pivot in pivots:
-        if evidence[id(pivot)]:
-            known = min(max(pivot["confidences"], 0.02), 0.95)
-            judged = 1 / (1 + (1 - known) / known * math.exp(-evidence[id(pivot)]))
-            pivot["confidences"] = min(max(judged, 0.02), 0.95)
+                evidence[id(point)] += float(weights[cell]) * (
+                    -2.0 if own < free else 0.5 if same <= math.log(1.1) else 0.0
+                )
+    for point in points:
+        if evidence[id(point)]:
+            known = min(max(point["confidences"], 0.02), 0.95)
+            judged = 1 / (1 + (1 - known) / known * math.exp(-evidence[id(point)]))
+            point["confidences"] = min(max(judged, 0.02), 0.95)
     return min(margins)
 
 

@@ -16,11 +16,25 @@ class CacheStats:
     num_seen: Int[Array, ""]  # tokens of valid views offered to the cache
     num_accepted: Int[Array, ""]  # appended or merged
     num_merged: Int[Array, ""]  # merges done (each leaves the number of pivots as it was)
-    num_low_confidence: Int[Array, ""]  # rejected: below tau_conf
+    num_low_confidence: Int[Array, ""]  # rejected: below tau_conf, as they came or once judged
     num_non_finite: Int[Array, ""]  # rejected: NaN or infinite
     num_out_of_range: Int[Array, ""]  # rejected: voxel index beyond +-2^20
     num_dropped: Int[Array, ""]  # rejected: no room for a new voxel (overflow)
     num_evicted: Int[Array, ""]  # pivots lost to overflow="evict_lowest"
+
+
+@pytree
+class Witnesses:
+    """The views of `w` chunks, coarsely: what they looked through and saw, kept to judge what later chunks claim.
+
+    A ring: chunk `n` writes entry `n % w`. A cell holds the nearest surface that its part of the view saw, if all of
+    that part was trusted.
+    """
+
+    viewmats: Float[Array, "w 4 4"]
+    Ks: Float[Array, "w 3 3"]  # in units of the coarse cells
+    log_depths: Float[Array, "w g g"]
+    weights: Float[Array, "w g g"]  # least confidence in the cell; 0 where it is no witness
 
 
 @pytree
@@ -47,6 +61,7 @@ class VoxelCache:
     footprints: Float[Array, "capacity k"]  # size of a grid cell at the most confident member, stream units
     num_members: Int[Array, "capacity k"]  # tokens merged into the pivot
     last_chunks: Int[Array, "capacity k"]  # chunk that last wrote it
+    witnesses: Witnesses
     stats: CacheStats
 
     @property
@@ -87,6 +102,22 @@ class Tokens:
     valid: Bool[Array, " m"]  # False: padding; neither used nor counted
 
 
+WITNESS_CELLS = 32
+"""Cells of a witness along each side of its view."""
+
+
+def init_witnesses(config: StreamConfig) -> Witnesses:
+    """Room for the config's witnesses (none without carving); they have seen nothing yet."""
+    w = config.num_witnesses if config.carving else 0
+    cells = (w, WITNESS_CELLS, WITNESS_CELLS)
+    return Witnesses(
+        viewmats=jnp.zeros((w, 4, 4)),
+        Ks=jnp.zeros((w, 3, 3)),
+        log_depths=jnp.zeros(cells),
+        weights=jnp.zeros(cells),
+    )
+
+
 def init_cache(config: StreamConfig, capacity: int | None = None) -> VoxelCache:
     """An empty cache of `capacity` voxels (default: the config's)."""
     capacity = capacity or config.capacity
@@ -106,5 +137,6 @@ def init_cache(config: StreamConfig, capacity: int | None = None) -> VoxelCache:
         footprints=jnp.zeros((capacity, k)),
         num_members=jnp.zeros((capacity, k), jnp.int32),
         last_chunks=jnp.zeros((capacity, k), jnp.int32),
+        witnesses=init_witnesses(config),
         stats=CacheStats(*(zero() for _ in range(9))),
     )

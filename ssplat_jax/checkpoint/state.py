@@ -10,12 +10,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ssplat_jax.cache.state import PIVOT_FIELDS, CacheStats, VoxelCache
+from ssplat_jax.cache.state import PIVOT_FIELDS, CacheStats, VoxelCache, Witnesses
 from ssplat_jax.checkpoint.arrays import load_arrays, save_arrays
 from ssplat_jax.errors import StorageError
 from ssplat_jax.export.atomic import previous_path
 
-KIND = "stream state"
+KIND = "stream state 2"  # 2: with witnesses
 _ROW_FIELDS = ("voxels", "counts", *PIVOT_FIELDS)
 
 
@@ -64,13 +64,14 @@ def _leaves(cache: VoxelCache) -> dict[str, np.ndarray]:
 
 
 def _build(leaves: dict[str, np.ndarray], capacity: int) -> VoxelCache:
-    stats = {name.removeprefix("stats."): jnp.asarray(x) for name, x in leaves.items() if name.startswith("stats.")}
-    fields: dict[str, Any] = {}
+    fields: dict[str, Any] = {"stats": {}, "witnesses": {}}
     for name, leaf in leaves.items():
         if name in _ROW_FIELDS:
             full = np.zeros((capacity, *leaf.shape[1:]), leaf.dtype)
             full[: len(leaf)] = leaf
-            fields[name] = jnp.asarray(full)
-        elif not name.startswith("stats."):
-            fields[name] = jnp.asarray(leaf)
-    return VoxelCache(**fields, stats=CacheStats(**stats))
+            leaf = full
+        *owner, field = name.split(".")
+        (fields[owner[0]] if owner else fields)[field] = jnp.asarray(leaf)
+    return VoxelCache(
+        **fields | {"stats": CacheStats(**fields["stats"]), "witnesses": Witnesses(**fields["witnesses"])}
+    )

@@ -1,4 +1,4 @@
-"""Carving against its NumPy oracle, and what a witness may and may not do."""
+"""Carving and judging against their NumPy oracle, and what a witness may and may not do."""
 
 import jax
 import jax.numpy as jnp
@@ -7,7 +7,9 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from ssplat_jax.cache import carve, reference
+from ssplat_jax.cache import Tokens, bear_witness, carve, init_cache, judge, reference
+from ssplat_jax.cache.state import WITNESS_CELLS
+from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.struct import replace
 from tests.cache.streams import CAPACITY, CONFIG
 from tests.cache.test_project_oracle import (
@@ -24,12 +26,44 @@ from tests.cache.test_project_oracle import (
 )
 
 jit_carve = jax.jit(carve, static_argnums=4)
+jit_judge = jax.jit(judge, static_argnums=2)
+jit_bear_witness = jax.jit(bear_witness, static_argnums=4)
 SHAPE = (1, HEIGHT, GRID_WIDTH)
 
 
 def seen(depth: float, confidence: float = 0.8):
     """Every cell of the front camera sees the same."""
     return jnp.full(SHAPE, depth), jnp.full(SHAPE, confidence)
+
+
+def random_views(seed: int, height: int = HEIGHT, width: int = GRID_WIDTH):
+    """Depths and confidences of two views, some of which are no witnesses."""
+    rng = np.random.default_rng(seed)
+    shape = (2, height, width)
+    depths = rng.uniform(2.5, 5.5, shape).astype(np.float32)
+    depths.reshape(-1)[:3] = [np.nan, np.inf, 0.0]
+    confidences = rng.choice([0.0, 0.25, 0.6, 0.7, 0.8, 0.9, 1.0], shape, p=[0.02, 0.02, *[0.192] * 5])
+    return depths, confidences.astype(np.float32)
+
+
+def offered(means, confidences, valid=None) -> Tokens:
+    """Tokens of which only place and confidence matter."""
+    n = len(means)
+    return Tokens(
+        means=jnp.asarray(means, jnp.float32),
+        feats=jnp.ones((n, CONFIG.token_width)),
+        confidences=jnp.asarray(confidences, jnp.float32),
+        rgbs=jnp.ones((n, 3)),
+        quats=jnp.ones((n, 4)),
+        footprints=jnp.ones(n),
+        valid=jnp.ones(n, bool) if valid is None else jnp.asarray(valid),
+    )
+
+
+def after_chunk(cache, camera, depths, confidences, config=CONFIG):
+    """The cache once a chunk was counted and has borne witness."""
+    stats = replace(cache.stats, num_chunks=cache.stats.num_chunks + 1)
+    return jit_bear_witness(replace(cache, stats=stats), camera, depths, confidences, config)
 
 
 def confidence_after(pivot_depth: float, *views, start: float = 0.6, config=CONFIG) -> float:
@@ -44,11 +78,7 @@ def confidence_after(pivot_depth: float, *views, start: float = 0.6, config=CONF
 @given(scene_seed=SEED, camera_seed=SEED, num_voxels=st.integers(0, CAPACITY), depth_spread=DEPTHS)
 def test_carving_equals_the_loop(scene_seed, camera_seed, num_voxels, depth_spread):
     cache, camera = scene(scene_seed, num_voxels, depth_spread), cameras(camera_seed)
-    rng = np.random.default_rng(camera_seed)
-    shape = (2, HEIGHT, GRID_WIDTH)
-    depths = rng.uniform(2.5, 5.5, shape).astype(np.float32)
-    depths.reshape(-1)[:3] = [np.nan, np.inf, 0.0]
-    confidences = rng.choice([0.0, 0.45, 0.6, 0.7, 0.8, 0.9, 1.0], shape).astype(np.float32)
+    depths, confidences = random_views(camera_seed)
     wanted = reference.from_arrays(cache)
     margin = reference.carve(wanted, camera.viewmats, camera.Ks, depths, confidences, CONFIG)
     assume(margin > DECISION_MARGIN)
@@ -114,3 +144,81 @@ def test_switched_off_it_is_the_identity_and_leaves_no_trace():
     assert confidence_after(1.0, seen(2.0), config=off) == np.float32(0.6)
     inputs = (with_pivots([[0.0, 0.0, 1.0]]), front_camera(), *seen(2.0))
     assert not jax.make_jaxpr(lambda *args: carve(*args, off))(*inputs).eqns
+
+
+@SETTINGS
+@given(seed=SEED, camera_seed=SEED, size=st.sampled_from([(HEIGHT, GRID_WIDTH), (40, 33), (32, 64)]))
+def test_judging_equals_the_loop(seed, camera_seed, size):
+    height, width = size
+    cache, views, rng = init_cache(CONFIG, CAPACITY), [], np.random.default_rng(seed)
+    for chunk in range(2):
+        camera = cameras(camera_seed + chunk)
+        scale = jnp.array([width / GRID_WIDTH, height / HEIGHT, 1.0])[:, None]
+        camera = Camera(viewmats=camera.viewmats, Ks=camera.Ks * scale, width=width, height=height)
+        depths, confidences = random_views(seed + chunk, height, width)
+        cache = after_chunk(cache, camera, depths, confidences)
+        seen = reference.witness(camera.viewmats, camera.Ks, depths, confidences, WITNESS_CELLS, CONFIG)
+        views.append(seen)
+        viewmat, K, nearest, _, weights = seen
+        np.testing.assert_array_equal(cache.witnesses.viewmats[chunk], viewmat)
+        np.testing.assert_allclose(cache.witnesses.Ks[chunk], K, rtol=1e-6)
+        np.testing.assert_allclose(cache.witnesses.weights[chunk], weights, rtol=1e-6)
+        has_weight = weights > 0
+        np.testing.assert_allclose(cache.witnesses.log_depths[chunk][has_weight], nearest[has_weight], atol=1e-6)
+    tokens = offered(
+        rng.uniform(-1, 1, (200, 3)), rng.choice([0.2, 0.4, 0.6, 0.9], 200), valid=rng.uniform(size=200) < 0.9
+    )
+    arrays = {name: np.asarray(getattr(tokens, name)) for name in ("means", "confidences", "valid")}
+    wanted, margin = reference.judge(views, arrays, CONFIG)
+    assume(margin > DECISION_MARGIN / 4)  # 400 pairs: a smaller margin, or none would be left
+    got = jit_judge(cache.witnesses, tokens, CONFIG)
+    np.testing.assert_allclose(got.confidences, wanted, rtol=2e-5)
+    jax.tree.map(np.testing.assert_array_equal, replace(got, confidences=tokens.confidences), tokens)
+
+
+def judged(mean, confidence=0.6, valid=True, config=CONFIG) -> float:
+    """Of a token, after one chunk whose view saw a wall at depth 2."""
+    cache = after_chunk(init_cache(config, CAPACITY), front_camera(), *seen(2.0), config)
+    token = offered([mean], [confidence], [valid])
+    return float(jit_judge(cache.witnesses, token, config).confidences[0])
+
+
+def test_a_token_is_judged_by_what_earlier_chunks_saw():
+    assert judged([0, 0, 1.9]) < 0.6 < judged([0, 0, 1.99])
+    assert judged([0, 0, 2.1]) > 0.6
+    unchanged = np.float32(0.6)
+    assert judged([0, 0, 3.0]) == unchanged  # hidden
+    assert judged([0, 0, -1.0]) == judged([5.0, 0, 1.0]) == unchanged  # unseen
+    assert judged([0, 0, np.nan]) == judged([0, np.inf, 1.0]) == unchanged
+    assert judged([0, 0, 1.0], valid=False) == unchanged
+    assert judged([0, 0, 1.0], confidence=0.2) == np.float32(0.2)  # below tau: it never enters, agreed with or not
+    assert np.isnan(judged([0, 0, 1.0], confidence=np.nan))
+
+
+def test_the_best_witness_of_a_chunk_is_kept_and_the_oldest_chunk_forgotten():
+    config = CONFIG.replace(num_witnesses=2)
+    cache = init_cache(config, CAPACITY)
+    camera = cameras(3)
+    for chunk in range(3):
+        depths = np.full((2, HEIGHT, GRID_WIDTH), 2.0 + chunk, np.float32)
+        confidences = np.full_like(depths, 0.8)
+        confidences[1 - chunk % 2, 0, 0] = 0.0  # so the other view has one witness more
+        cache = after_chunk(cache, camera, depths, confidences, config)
+        np.testing.assert_array_equal(cache.witnesses.viewmats[chunk % 2], camera.viewmats[chunk % 2])
+    np.testing.assert_allclose(np.exp(cache.witnesses.log_depths.max(axis=(1, 2))), [4.0, 3.0], rtol=1e-6)
+
+
+def test_a_chunk_of_padding_displaces_no_witness():
+    config = CONFIG.replace(num_witnesses=1)
+    before = after_chunk(init_cache(config, CAPACITY), front_camera(), *seen(2.0), config)
+    after = jit_bear_witness(before, front_camera(), *seen(3.0, 0.0), config)
+    jax.tree.map(np.testing.assert_array_equal, after, before)
+
+
+@pytest.mark.parametrize("off", [CONFIG.replace(carving=False), CONFIG.replace(num_witnesses=0)])
+def test_without_witnesses_judging_leaves_no_trace(off):
+    assert judged([0, 0, 1.0], config=off) == np.float32(0.6)
+    cache, token = init_cache(off, CAPACITY), offered([[0, 0, 1.0]], [0.6])
+    assert cache.witnesses.weights.size == 0
+    assert not jax.make_jaxpr(lambda *args: judge(*args, off))(cache.witnesses, token).eqns
+    assert not jax.make_jaxpr(lambda *args: bear_witness(*args, off))(cache, front_camera(), *seen(2.0)).eqns

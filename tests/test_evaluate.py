@@ -1,0 +1,43 @@
+"""What a score counts: holes in the scene's mean colour, and what they would cost over black."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ssplat_jax.config import StreamConfig
+from ssplat_jax.data.capture import open_capture
+from ssplat_jax.evaluate import score_view
+from ssplat_jax.gaussians import Gaussians, mean_color
+from ssplat_jax.metrics import psnr
+
+
+def gaussians(colors, opacities, depth: float = -5.0) -> Gaussians:
+    """On the axis of the stream's first view; by default behind it."""
+    n = len(opacities)
+    return Gaussians.from_rgb(
+        means=jnp.tile(jnp.array([0.0, 0.0, depth]), (n, 1)),
+        quats=jnp.tile(jnp.array([1.0, 0.0, 0.0, 0.0]), (n, 1)),
+        scales=jnp.full((n, 3), 1e-3),
+        opacities=jnp.asarray(opacities, jnp.float32),
+        colors=jnp.asarray(colors, jnp.float32),
+    )
+
+
+def test_mean_colour_weighs_by_opacity_and_leaves_absent_rows_out():
+    scene = gaussians([[1, 0, 0], [0, 1, 0], [0, 0, 1]], [0.3, 0.9, 0.0])
+    np.testing.assert_allclose(mean_color(scene), [0.25, 0.75, 0], atol=1e-6)
+    np.testing.assert_array_equal(mean_color(gaussians([[0.2, 0.3, 0.4]], [0.0])), 0)
+
+
+@pytest.fixture(scope="module")
+def capture():
+    return open_capture("procedural:room?frames=5&size=32x24")
+
+
+def test_a_view_that_nothing_covers_is_scored_on_the_mean_colour(capture):
+    frame = capture.stream_frame(StreamConfig(), (0, 1, 3, 4))
+    score, color, depth = score_view(gaussians([[0.2, 0.4, 0.6]], [0.9]), capture, 0, frame)
+    np.testing.assert_allclose(color, np.broadcast_to([0.2, 0.4, 0.6], color.shape), atol=1e-6)
+    target = capture.image(0)
+    assert score.psnr == pytest.approx(psnr(color, target)) and score.coverage == 0 and not depth.any()
+    assert score.psnr_over_black == pytest.approx(psnr(np.zeros_like(target), target))
