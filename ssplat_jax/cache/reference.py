@@ -239,7 +239,8 @@ def _revise(points: list, views: list[tuple]) -> float:
     """Lets the cells of (viewmat, K, log depths, nearest, weights) judge the confidences of the points, in place."""
     evidence, margins = {id(p): 0.0 for p in points}, [math.inf]
     for viewmat, K, ell, nearest, weights in views:
-        seen = _on_pixels(points, np.asarray(viewmat, np.float64), np.asarray(K, np.float64), *ell.shape, margins)
+        viewmat, K = np.asarray(viewmat, np.float64), np.asarray(K, np.float64)
+        seen = _on_pixels(points, viewmat, K, ell.shape[0], ell.shape[1], margins)
         for cell, pairs in seen.items():
             if ell[cell] == -math.inf:
                 continue
