@@ -3,7 +3,7 @@
 A turn of the loop takes the next `TURN` Gaussians of each of `BATCH` tiles. Arrays are `[p u t]`: pixels of a tile,
 then the turn's Gaussians, then the batch's tiles, so that every kernel runs over contiguous tiles with the pixel's
 offset as a constant, and sums over Gaussians or pixels are sums over a short middle axis (XLA vectorises those; sums
-over the last or a long first axis cost five times as much). Nothing per pair is stored: the backward pass walks the
+over the last or a long first axis cost five times as much). Nothing per sample is stored: the backward pass walks the
 same turns again, front to back, knowing the totals from the forward pass.
 
     w_i = a_i T_i,  T_{i+1} = T_i (1 - a_i)        out = sum_i w_i c_i
@@ -20,7 +20,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from ssplat_jax.render import constants
-from ssplat_jax.render.binning import Grid, Pairs
+from ssplat_jax.render.binning import Grid, Pairs, take_rows
 
 TURN = 8
 BATCH = 64
@@ -34,11 +34,11 @@ def composite(
 
     Gradients reach `shapes` and `channels`. Samples fainter than 1/255 or capped at 0.99 pass none on to their opacity.
     """
-    return _forward(grid, shapes, channels, pairs)
+    return _forward(grid, _sorted_table(shapes, channels, pairs), pairs)
 
 
-def _forward(grid: Grid, shapes, channels, pairs: Pairs):
-    table = _sorted_table(shapes, channels, pairs)
+def _forward(grid: Grid, table, pairs: Pairs):
+    num_channels = table.shape[1] - 6
 
     def batch(tiles):
         first, last = _loads(pairs, tiles)
@@ -51,23 +51,23 @@ def _forward(grid: Grid, shapes, channels, pairs: Pairs):
             out = [o + jnp.sum(weights * value, axis=1) for o, value in zip(out, values[6:], strict=True)]
             return i + 1, transmittance, out
 
-        blank = jnp.zeros((grid.tile**2, tiles.shape[0]), shapes.dtype)
-        start = (0, blank + 1, [blank] * channels.shape[1])
+        blank = jnp.zeros((grid.tile**2, tiles.shape[0]), table.dtype)
+        start = (0, blank + 1, [blank] * num_channels)
         return jnp.stack(lax.while_loop(_goes_on(first, last), turn, start)[2])
 
     batches = _batches(pairs.bounds, grid)
-    out = jnp.moveaxis(lax.map(batch, batches), -1, 1).reshape(-1, channels.shape[1], grid.tile**2)
+    out = jnp.moveaxis(lax.map(batch, batches), -1, 1).reshape(-1, num_channels, grid.tile**2)
     return jnp.zeros((grid.num_tiles, *out.shape[1:]), out.dtype).at[batches.reshape(-1)].set(out, mode="drop")
 
 
 def _composite_fwd(grid: Grid, shapes, channels, pairs: Pairs):
-    out = _forward(grid, shapes, channels, pairs)
-    return out, (shapes, channels, pairs, out)
+    table = _sorted_table(shapes, channels, pairs)
+    out = _forward(grid, table, pairs)
+    return out, (shapes, table, pairs, out)
 
 
 def _composite_bwd(grid: Grid, residuals, cotangents):
-    shapes, channels, pairs, out = residuals
-    table = _sorted_table(shapes, channels, pairs)
+    shapes, table, pairs, out = residuals
     ids = jnp.pad(pairs.rows, (0, TURN))
     tails = jnp.sum(out * cotangents, axis=1)
 
@@ -125,7 +125,7 @@ def median_rows(grid: Grid, shapes: Float[Array, "m 6"], pairs: Pairs) -> Int[Ar
 
 def _sorted_table(shapes, channels, pairs: Pairs) -> Float[Array, "p f"]:
     """One row a pair in sorted order, so that a tile's are contiguous; a turn may read past the end."""
-    return jnp.pad(jnp.concatenate([shapes, channels], axis=1)[pairs.rows], ((0, TURN), (0, 0)))
+    return take_rows(jnp.concatenate([shapes, channels], axis=1), jnp.pad(pairs.rows, (0, TURN)))
 
 
 def _batches(bounds: Int[Array, " tiles_and_one"], grid: Grid) -> Int[Array, "batches t"]:
