@@ -106,9 +106,9 @@ def bin_splats(splats: Splats, grid: Grid, max_pairs: int) -> Pairs:
 def take_rows(table: Shaped[Array, "m f"], rows: Int[Array, " p"]) -> Shaped[Array, "p f"]:
     """`table[rows]`.
 
-    In a loop, whose operands are computed once and whose gather copies rows: left to itself, XLA's CPU compiler fuses
-    all that leads to the table into the gather and computes it anew for every entry (half the time of a render of
-    262,144 Gaussians; `lax.optimization_barrier` is gone by then).
+    In a loop, where the gather copies rows of operands that are there: left to itself, XLA's CPU compiler fuses it with
+    what stands around it and goes entry by entry (forward 993 ms instead of 604 at 262,144 Gaussians;
+    `lax.optimization_barrier` is gone by then).
     """
     padded = jnp.pad(rows, (0, -rows.shape[0] % PARTS))
     taken = lax.map(lambda part: table[part], padded.reshape(PARTS, -1))
