@@ -9,6 +9,7 @@ row by row. Wants a machine with nothing else to do: about 45 minutes on two cor
 """
 
 import dataclasses
+import io
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -176,5 +177,7 @@ def plot(path: Path, rows: list[dict[str, Any]]) -> None:
         axes.set_ylabel("PSNR of unseen views, dB")
         axes.set_title(scene)
         axes.spines[["top", "right"]].set_visible(False)
-    figure.savefig(path, dpi=150)
+    encoded = io.BytesIO()
+    figure.savefig(encoded, dpi=150)
     pyplot.close(figure)
+    write_atomic(path, encoded.getvalue())

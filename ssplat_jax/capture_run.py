@@ -7,20 +7,24 @@ from pathlib import Path
 
 import numpy as np
 
-from ssplat_jax.checkpoint.state import load_newest_state, load_state, save_state
+from ssplat_jax.checkpoint.delta import save_delta
+from ssplat_jax.checkpoint.state import load_newest_state, load_state, restore_previous, save_state
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.data.capture import Capture, open_capture
 from ssplat_jax.data.frame import StreamFrame
 from ssplat_jax.errors import InputError, StorageError
 from ssplat_jax.evaluate import cache_facts, save_comparison, score_view
-from ssplat_jax.export.atomic import previous_path
+from ssplat_jax.export.atomic import previous_path, write_atomic
 from ssplat_jax.export.ply import ExportReport, save_ply
+from ssplat_jax.follow import SceneFeed
+from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.interrupts import Interrupts
 from ssplat_jax.report import Reporter
 from ssplat_jax.session import Session
 from ssplat_jax.stream import StreamSplat
 
 STATE_FILE, SCENE_FILE, METRICS_FILE = "state.npz", "scene.ply", "metrics.json"
+DELTAS = "deltas"  # <views so far>.npz: the changes of one chunk
 NUM_PICTURES = 8  # views of the stream, evenly spread, rendered from the finished scene
 
 
@@ -44,9 +48,12 @@ def run_capture(
     max_views: int | None,
     save_every: int,
     overwrite: bool,
+    deltas: bool = False,
     reporter: Reporter,
 ) -> RunResult:
     """Streams the capture at `path` into `out`, continuing what stands there.
+
+    With `deltas`, what every chunk changed in the scene is written too, in the stream's frame (`checkpoint/delta.py`).
 
     Raises:
         InputError: the capture is unusable, or `out` holds a run of another capture or configuration.
@@ -58,13 +65,17 @@ def run_capture(
     if overwrite and out.exists():
         for stale in (out / STATE_FILE, previous_path(out / STATE_FILE), out / SCENE_FILE, out / METRICS_FILE):
             stale.unlink(missing_ok=True)
+        shutil.rmtree(out / DELTAS, ignore_errors=True)
     session, frame, done = _resume(model, params, capture, indices, out, reporter)
+    feed = SceneFeed(model, params, session.cache) if deltas else None
     with Interrupts() as interrupts, reporter.progress("streaming", len(indices)) as advance:
         advance(done)
         if done < len(indices):
             for number, chunk in enumerate(capture.chunks(model.config, indices[done:], frame=frame)):
                 session.feed(chunk)
                 done += int(np.asarray(chunk.valid).sum())
+                if feed is not None and session.cache is not None:
+                    save_delta(out / DELTAS / f"{done:06d}.npz", feed.update(session.cache))
                 advance(done)
                 if interrupts.received or (number + 1) % save_every == 0 or done == len(indices):
                     _save(session, frame, capture, indices, done, out)
@@ -72,7 +83,7 @@ def run_capture(
                     break
     if interrupts.received:
         return RunResult(done, cache_facts(session)["decoded"], interrupts.received)
-    _finish(session, frame, capture, indices, out)
+    _finish(session, frame, capture, indices, out, reporter)
     return RunResult(done, cache_facts(session)["decoded"], None)
 
 
@@ -89,7 +100,13 @@ def export_run(run_dir: Path, to: Path, params: dict) -> ExportReport:
         raise InputError(f"{run_dir}: wanted the folder of an `ssplat run`, found no {STATE_FILE} in it.")
     cache, header = load_state(run_dir / STATE_FILE)
     session = Session(StreamSplat(StreamConfig.from_dict(header["config"])), params, cache)
-    return save_ply(to, _frame_from(header["frame"]).gaussians_to_capture(session.gaussians()))
+    return save_scene(to, session.gaussians(), _frame_from(header["frame"]))
+
+
+def save_scene(path: Path, gaussians: Gaussians, frame: StreamFrame) -> ExportReport:
+    """Writes Gaussians of the stream in the capture's frame; far from its origin, from the frame's offset."""
+    offset = frame.offset
+    return save_ply(path, frame.gaussians_to_capture(gaussians, offset=offset), offset=offset)
 
 
 def _identity(model: StreamSplat, capture: Capture, indices: list[int]) -> dict:
@@ -110,8 +127,6 @@ def _resume(
     if not state.exists() and not previous_path(state).exists():
         return Session(model, params), capture.stream_frame(model.config, indices), 0
     cache, header, damage = load_newest_state(state)
-    if damage is not None:
-        reporter.warn(f"{damage} Continuing from the state saved before it, after {header['done']} views.")
     wanted = _identity(model, capture, indices)
     for name, value in wanted.items():
         if header[name] != value:
@@ -119,6 +134,9 @@ def _resume(
                 f"{out}: holds a run with another {name} ({_difference(header[name], value)}); choose another --out,"
                 " repeat the old options, or start anew with --overwrite."
             )
+    if damage is not None:
+        reporter.warn(f"{damage} Continuing from the state saved before it, after {header['done']} views.")
+        restore_previous(state)
     return Session(model, params, cache), _frame_from(header["frame"]), header["done"]
 
 
@@ -163,13 +181,18 @@ def _frame_from(fields: dict) -> StreamFrame:
     )
 
 
-def _finish(session: Session, frame: StreamFrame, capture: Capture, indices: list[int], out: Path) -> None:
+def _finish(
+    session: Session, frame: StreamFrame, capture: Capture, indices: list[int], out: Path, reporter: Reporter
+) -> None:
     """Scene, pictures and metrics of a finished stream."""
     gaussians = session.gaussians()
-    report = save_ply(out / SCENE_FILE, frame.gaussians_to_capture(gaussians))
+    report = save_scene(out / SCENE_FILE, gaussians, frame)
+    if any(report.offset):
+        reporter.warn(
+            f"{SCENE_FILE}: the capture lies far from its origin; positions are counted from {list(report.offset)}."
+        )
     pictures = out / "views"
     shutil.rmtree(pictures, ignore_errors=True)
-    pictures.mkdir(parents=True)
     shown = sorted({indices[round(i)] for i in np.linspace(0, len(indices) - 1, NUM_PICTURES)})
     scores = []
     for i in shown:
@@ -188,4 +211,4 @@ def _finish(session: Session, frame: StreamFrame, capture: Capture, indices: lis
         "stream_frame": _frame_to(frame),
         "config_hash": session.model.config.hash,
     }
-    (out / METRICS_FILE).write_text(json.dumps(metrics, indent=1) + "\n")
+    write_atomic(out / METRICS_FILE, (json.dumps(metrics, indent=1) + "\n").encode())

@@ -92,6 +92,8 @@ class Run:
     """Chunks between saved states."""
     overwrite: bool = False
     """Start anew over what the folder holds."""
+    deltas: bool = False
+    """Also write what every chunk changed, for a viewer that follows: deltas/<views so far>.npz."""
     quiet: bool = False
     """Print only the closing line."""
 
@@ -110,6 +112,7 @@ class Run:
             max_views=self.max_views,
             save_every=self.save_every,
             overwrite=self.overwrite,
+            deltas=self.deltas,
             reporter=Reporter(self.quiet),
         )
         if result.interrupted:

@@ -1,5 +1,6 @@
 """`ssplat demo`: an embedded procedural scene, streamed with the shipped weights; what more views give, in numbers."""
 
+import io
 import json
 import time
 from pathlib import Path
@@ -11,6 +12,7 @@ from ssplat_jax.config import preset
 from ssplat_jax.data.capture import open_capture
 from ssplat_jax.data.protocol import interleaved
 from ssplat_jax.evaluate import cache_facts, save_comparison, save_image, score_view
+from ssplat_jax.export.atomic import write_atomic
 from ssplat_jax.export.ply import save_ply
 from ssplat_jax.report import Reporter
 from ssplat_jax.session import Session
@@ -55,7 +57,7 @@ def run_demo(scene: str, out: Path, reporter: Reporter) -> dict:
         "seconds": round(time.perf_counter() - since, 1),
         "config_hash": model.config.hash,
     }
-    (out / "metrics.json").write_text(json.dumps(metrics, indent=1) + "\n")
+    write_atomic(out / "metrics.json", (json.dumps(metrics, indent=1) + "\n").encode())
     _plot(out / "quality.png", rows)
     header = ("views", "PSNR dB", "SSIM", "covered", "Gaussians")
     reporter.table(f"{scene}: quality of unseen views", header, [tuple(row.values()) for row in rows])
@@ -93,5 +95,7 @@ def _plot(path: Path, rows: list[dict]) -> None:
     axes.set_xlabel("views seen")
     axes.set_ylabel("PSNR of unseen views, dB")
     axes.spines[["top", "right"]].set_visible(False)
-    figure.savefig(path, dpi=150)
+    encoded = io.BytesIO()
+    figure.savefig(encoded, dpi=150)
     pyplot.close(figure)
+    write_atomic(path, encoded.getvalue())

@@ -1,6 +1,7 @@
 """Quality and cost on one capture: stream the context, decode the cache, render views that were never shown."""
 
 import dataclasses
+import io
 import json
 import time
 from collections.abc import Callable
@@ -15,6 +16,7 @@ from PIL import Image
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.frame import StreamFrame
 from ssplat_jax.data.protocol import Split
+from ssplat_jax.export.atomic import write_atomic
 from ssplat_jax.gaussians import Gaussians, mean_color
 from ssplat_jax.metrics import SSIM_ARGUMENTS, psnr, ssim
 from ssplat_jax.render import render
@@ -196,7 +198,7 @@ def evaluate(
         "baselines": reference,
         "per_view": [dataclasses.asdict(s) for s in scores],
     }
-    (out / "metrics.json").write_text(json.dumps(metrics, indent=1) + "\n")
+    write_atomic(out / "metrics.json", (json.dumps(metrics, indent=1) + "\n").encode())
     return metrics
 
 
@@ -216,8 +218,15 @@ def colour_depth(depth: Float[np.ndarray, "h w"], near: float, far: float) -> Im
 
 
 def save_image(path: Path, image: Images) -> None:
-    """Writes an image in [0, 1] as an 8-bit file."""
-    Image.fromarray((np.clip(image, 0.0, 1.0) * 255 + 0.5).astype(np.uint8)).save(path)
+    """Writes an image in [0, 1] as an 8-bit file of the format that the suffix names.
+
+    Raises:
+        StorageError: the file cannot be written.
+    """
+    encoded = io.BytesIO()
+    pixels = (np.clip(image, 0.0, 1.0) * 255 + 0.5).astype(np.uint8)
+    Image.fromarray(pixels).save(encoded, Image.registered_extensions()[path.suffix])
+    write_atomic(path, encoded.getvalue())
 
 
 def save_comparison(path: Path, target: Images, color: Images, depth, depth_range: tuple[float, float]) -> None:

@@ -9,10 +9,11 @@ from rich.table import Table
 
 
 class Reporter:
-    """Progress and tables on stderr; silent when quiet."""
+    """Progress and tables on stderr, none when quiet; warnings in any case."""
 
     def __init__(self, quiet: bool = False) -> None:
         self.console = Console(stderr=True, quiet=quiet)
+        self._warnings = Console(stderr=True)
 
     @contextlib.contextmanager
     def progress(self, name: str, total: int) -> Iterator[Callable[..., None]]:
@@ -30,7 +31,8 @@ class Reporter:
 
     def warn(self, message: str) -> None:
         """One line that is worth stopping at."""
-        self.console.print(f"warning: {message}", style="yellow", highlight=False)
+        # One line however narrow the terminal; brackets are text, not rich's markup.
+        self._warnings.print(f"warning: {message}", style="yellow", highlight=False, markup=False, soft_wrap=True)
 
     def table(self, title: str, header: tuple[str, ...], rows: list[tuple]) -> None:
         """A table of right-aligned columns."""

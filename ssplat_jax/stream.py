@@ -15,16 +15,16 @@ import math
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from ssplat_jax import model as stages
-from ssplat_jax.cache import Tokens, VoxelCache, bear_witness, carve, fuse, init_cache, judge, project
+from ssplat_jax.cache import PIVOT_FIELDS, Tokens, VoxelCache, bear_witness, carve, fuse, init_cache, judge, project
 from ssplat_jax.chunk import Chunk
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.gaussians import Gaussians, mask_gaussians
 from ssplat_jax.geometry.rotations import matrices_to_quats
 from ssplat_jax.model.wires import Views
-from ssplat_jax.struct import pytree
+from ssplat_jax.struct import pytree, replace
 
 
 @pytree
@@ -61,6 +61,8 @@ class StreamSplat:
     """
 
     config: StreamConfig
+    axis: str | None = None
+    """Name of the mapped axis over which the cache is sharded by voxel (`parallel.py`); None: one cache holds all."""
 
     def init(self, key: jax.Array) -> dict:
         """Fresh parameters (a nested dict); `ssplat_jax.load_params` gives trained ones."""
@@ -75,7 +77,7 @@ class StreamSplat:
         config = self.config
         views = stages.prepare_views(chunk, config)
         with jax.named_scope("project"):
-            history = project(jax.lax.stop_gradient(cache), views.grid_camera, config)
+            history = project(jax.lax.stop_gradient(cache), views.grid_camera, config, axis=self.axis)
         with jax.named_scope("encode"):
             features = stages.encode(params["encoder"], views, config)
         with jax.named_scope("match"):
@@ -113,7 +115,7 @@ class StreamSplat:
         with jax.named_scope("judge"):
             tokens = judge(cache.witnesses, prediction.tokens, self.config)
         with jax.named_scope("VACC"):
-            cache = fuse(cache, tokens, self.config)
+            cache = fuse(cache, tokens, self.config, axis=self.axis)
         with jax.named_scope("carve"):
             cache = carve(cache, *seen, self.config)
             return bear_witness(cache, *seen, self.config)
@@ -134,7 +136,12 @@ class StreamSplat:
             footprints=flat(merged_footprints(cache, self.config)),
             config=self.config,
         )
-        return mask_gaussians(gaussians, flat(cache.alive & (cache.confidences >= self.config.min_confidence)))
+        return mask_gaussians(gaussians, flat(shown_pivots(cache, self.config)))
+
+    def decode_rows(self, params: dict, cache: VoxelCache, rows: Int[Array, " r"]) -> Gaussians:
+        """What `decode` gives for the voxels `rows`, k Gaussians each, at the cost of those; rows of -1 are absent."""
+        part = {name: getattr(cache, name)[rows] for name in ("voxels", *PIVOT_FIELDS)}
+        return self.decode(params, replace(cache, counts=jnp.where(rows >= 0, cache.counts[rows], 0), **part))
 
     def decode_tokens(self, params: dict, tokens: Tokens) -> Gaussians:
         """Gaussians of tokens that need not be in a cache: what training renders (Sec. 3.7)."""
@@ -148,6 +155,11 @@ class StreamSplat:
             config=self.config,
         )
         return mask_gaussians(gaussians, tokens.valid)
+
+
+def shown_pivots(cache: VoxelCache, config: StreamConfig) -> Bool[Array, "capacity k"]:
+    """Which pivots `decode` shows: those alive that views have not carved away."""
+    return cache.alive & (cache.confidences >= config.min_confidence)
 
 
 def merged_footprints(cache: VoxelCache, config: StreamConfig) -> Float[Array, "capacity k"]:

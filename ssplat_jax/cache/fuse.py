@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Int
 
 from ssplat_jax.cache.policy import evict
 from ssplat_jax.cache.state import PIVOT_FIELDS, CacheStats, Tokens, VoxelCache
-from ssplat_jax.cache.table import build_table, find_rows, group_equal, insert_rows
+from ssplat_jax.cache.table import build_table, find_rows, group_equal, insert_rows, shards_of
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.errors import InputError
 from ssplat_jax.geometry.voxels import voxel_indices
@@ -58,9 +58,21 @@ class Plan:
         return (self.rows >= 0) & (self.leaders == jnp.arange(self.rows.shape[0]))
 
 
-def fuse(cache: VoxelCache, tokens: Tokens, config: StreamConfig) -> VoxelCache:
-    """`cache` after inserting `tokens` in order; see `fuse_touched`."""
-    return fuse_touched(cache, tokens, config)[0]
+def fuse(cache: VoxelCache, tokens: Tokens, config: StreamConfig, *, axis: str | None = None) -> VoxelCache:
+    """`cache` after inserting `tokens` in order; see `fuse_touched`.
+
+    Given the name of a mapped `axis`, `cache` is one shard of several, each of which is given all tokens and takes
+    those of its own voxels (`shards_of`). A voxel lies in one shard whole, so its pivots are those of a single cache.
+    The shards' counters add up to those of a single cache, but for `num_chunks`, which all of them count.
+    """
+    if axis is None:
+        return fuse_touched(cache, tokens, config)[0]
+    # Tokens that will be rejected have a voxel too (index 0 out of range), so each is counted by one shard.
+    voxels, _ = voxel_indices(tokens.means, config.voxel_size)
+    is_own = shards_of(voxels, jax.lax.axis_size(axis)) == jax.lax.axis_index(axis)
+    fused = fuse_touched(cache, replace(tokens, valid=tokens.valid & is_own), config)[0]
+    num_chunks = cache.stats.num_chunks + jnp.any(tokens.valid).astype(jnp.int32)
+    return replace(fused, stats=replace(fused.stats, num_chunks=num_chunks))
 
 
 def fuse_touched(cache: VoxelCache, tokens: Tokens, config: StreamConfig) -> tuple[VoxelCache, Touched]:

@@ -33,12 +33,16 @@ def ensure_room(cache: VoxelCache, config: StreamConfig, num_new_tokens: int) ->
     """
     if config.overflow != "grow":
         return cache
-    new_rows = num_new_tokens if config.vacc == "voxel" else -(-num_new_tokens // config.pivots_per_voxel)
-    wanted = int(cache.num_voxels) + new_rows
-    capacity = cache.capacity
-    while capacity < wanted:
-        capacity *= 2
+    capacity = roomy_capacity(cache.capacity, int(cache.num_voxels), num_new_tokens, config)
     return cache if capacity == cache.capacity else grow(cache, capacity)
+
+
+def roomy_capacity(capacity: int, num_voxels: int, num_new_tokens: int, config: StreamConfig) -> int:
+    """`capacity`, doubled as often as needed for `num_new_tokens` that all open voxels beside the `num_voxels` held."""
+    new_rows = num_new_tokens if config.vacc == "voxel" else -(-num_new_tokens // config.pivots_per_voxel)
+    while capacity < num_voxels + new_rows:
+        capacity *= 2
+    return capacity
 
 
 def grow(cache: VoxelCache, capacity: int) -> VoxelCache:
@@ -64,16 +68,24 @@ def check(cache: VoxelCache, config: StreamConfig) -> None:
     Raises:
         CacheError: tokens were dropped for want of room under `overflow` "grow" or "error".
     """
-    num_dropped = int(np.asarray(cache.stats.num_dropped))
+    check_dropped(int(np.asarray(cache.stats.num_dropped)), cache.capacity, config)
+
+
+def check_dropped(num_dropped: int, capacity: int, config: StreamConfig) -> None:
+    """Raises if `num_dropped` tokens found no room in `capacity` voxels and the policy does not allow that.
+
+    Raises:
+        CacheError: as `check`.
+    """
     if num_dropped and config.overflow == "grow":
         raise CacheError(
-            f"cache: {num_dropped} tokens found no room in {cache.capacity} voxels; "
+            f"cache: {num_dropped} tokens found no room in {capacity} voxels; "
             "call cache.ensure_room(cache, config, num_new_tokens) before each step."
         )
     if num_dropped and config.overflow == "error":
         raise CacheError(
-            f"cache: {num_dropped} tokens found no room in {cache.capacity} voxels; raise capacity to "
-            f"{2 * cache.capacity} or voxel_size above {config.voxel_size}, or choose overflow='grow'."
+            f"cache: {num_dropped} tokens found no room in {capacity} voxels; raise capacity to "
+            f"{2 * capacity} or voxel_size above {config.voxel_size}, or choose overflow='grow'."
         )
 
 

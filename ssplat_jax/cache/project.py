@@ -52,22 +52,26 @@ class PixelPairs:
     weights: Float[Array, " p"]  # 0 where it is not seen
 
 
-def project(cache: VoxelCache, camera: Camera, config: StreamConfig) -> ProjectedCache:
+def project(cache: VoxelCache, camera: Camera, config: StreamConfig, *, axis: str | None = None) -> ProjectedCache:
     """Depth, confidence and features of `cache` in the pixels of `camera` (a batch of views at grid resolution).
 
-    A constant for differentiation: no gradient flows to the cache or the cameras.
+    A constant for differentiation: no gradient flows to the cache or the cameras. Given the name of a mapped `axis`,
+    `cache` is one shard of several, and every shard gets the projection of all of them.
 
     Limits:
         Camera z <= 0.01, confidence 0 and centres outside the image are not seen.
         An empty cache, and a pixel without a pivot, give zeros and a False mask.
+        Over an axis the sums run in another order than over one cache: results agree to float32 rounding.
     """
     cache, camera = jax.lax.stop_gradient((cache, camera))
     shape = (camera.viewmats.shape[0], camera.height, camera.width)
     window = math.log(config.cluster_ratio)
     with jax.named_scope("project"):
         fronts = _over_blocks(cache, camera, _nearest, jnp.full((math.prod(shape),), jnp.inf))
-        centres = _front_means(cache, camera, fronts, window)
-        weights, squares, offsets, feats = _cluster_sums(cache, camera, fronts, centres, window)
+        fronts = _over_shards(jax.lax.pmin, fronts, axis)
+        centres = _front_means(cache, camera, fronts, window, axis)
+        sums = _cluster_sums(cache, camera, fronts, centres, window)
+        weights, squares, offsets, feats = _over_shards(jax.lax.psum, sums, axis)
     mask = weights > 0
     total = jnp.where(mask, weights, 1.0)
     log_depths = jnp.where(mask, fronts, 0.0) + offsets / total
@@ -77,6 +81,11 @@ def project(cache: VoxelCache, camera: Camera, config: StreamConfig) -> Projecte
         feats=(feats / total[:, None]).reshape(*shape, -1),
         mask=mask.reshape(shape),
     )
+
+
+def _over_shards(reduce, partial, axis: str | None):
+    """What all shards have together; `partial` itself without an axis."""
+    return partial if axis is None else reduce(partial, axis)
 
 
 def blocks_of_rows(cache: VoxelCache) -> tuple[int, Int[Array, ""]]:
@@ -100,7 +109,7 @@ def _nearest(fronts, pairs: PixelPairs, first_row):
     return fronts.at[pairs.pixels].min(pairs.log_depths, mode="drop")
 
 
-def _front_means(cache, camera, fronts, window):
+def _front_means(cache, camera, fronts, window, axis):
     """Mean log depth of each pixel's front window, measured from its nearest pivot."""
 
     def visit(sums, pairs: PixelPairs, first_row):
@@ -109,7 +118,8 @@ def _front_means(cache, camera, fronts, window):
         weights = jnp.where(behind <= window, pairs.weights, 0.0)
         return _add(sums, pairs.pixels, (weights, weights * behind))
 
-    weights, offsets = _over_blocks(cache, camera, visit, (jnp.zeros_like(fronts), jnp.zeros_like(fronts)))
+    sums = _over_blocks(cache, camera, visit, (jnp.zeros_like(fronts), jnp.zeros_like(fronts)))
+    weights, offsets = _over_shards(jax.lax.psum, sums, axis)
     return offsets / jnp.where(weights > 0, weights, 1.0)
 
 

@@ -84,3 +84,14 @@ def build_table(voxels: Int[Array, "capacity 3"], num_voxels: Int[Array, ""]) ->
 
 def _first_slots(table, voxels):
     return (hash_voxels(voxels) & jnp.uint32(table.shape[0] - 1)).astype(jnp.int32)
+
+
+def shards_of(voxels: Int[Array, "*s 3"], num_shards: int) -> Int[Array, "*s"]:
+    """Which of `num_shards` caches holds each voxel, evenly by hash.
+
+    Limits:
+        Up to 2^16 shards.
+    """
+    # The highest bits: a table searches from the lowest, and a shard's voxels must not share those.
+    high_bits = hash_voxels(voxels) >> 16
+    return (high_bits * jnp.uint32(num_shards) >> 16).astype(jnp.int32)

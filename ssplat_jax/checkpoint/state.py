@@ -3,6 +3,8 @@
 Of the arrays with one row per voxel only the occupied rows are stored, since the others hold zeros.
 """
 
+import contextlib
+import os
 from pathlib import Path
 from typing import Any
 
@@ -48,9 +50,24 @@ def load_newest_state(path: Path) -> tuple[VoxelCache, dict[str, Any], StorageEr
     try:
         return *load_state(path), None
     except StorageError as error:
-        if not previous_path(path).exists():
-            raise
-        return *load_state(previous_path(path)), error
+        with contextlib.suppress(StorageError):
+            return *load_state(previous_path(path)), error
+        raise
+
+
+def restore_previous(path: Path) -> None:
+    """Puts the previous state in the place of a damaged or missing one.
+
+    Whoever continues from the previous state does so first: the next save keeps what is at `path` as the previous
+    state, and would put a damaged file over the only good one.
+
+    Raises:
+        StorageError: the file could not be renamed.
+    """
+    try:
+        os.replace(previous_path(path), path)
+    except OSError as error:
+        raise StorageError(f"{path}: cannot be replaced by {previous_path(path).name} ({error.strerror}).") from error
 
 
 def _leaves(cache: VoxelCache) -> dict[str, np.ndarray]:
@@ -58,8 +75,9 @@ def _leaves(cache: VoxelCache) -> dict[str, np.ndarray]:
     leaves = {}
     for path, leaf in jax.tree_util.tree_flatten_with_path(cache)[0]:
         name = ".".join(key.name for key in path)
-        array = leaf[:num_voxels] if name in _ROW_FIELDS else leaf
-        leaves[name] = np.ascontiguousarray(np.asarray(array)).reshape(array.shape)
+        # Cut on the host: JAX would compile a program for every number of voxels, and there is a new one at every save.
+        array = np.asarray(leaf)[:num_voxels] if name in _ROW_FIELDS else np.asarray(leaf)
+        leaves[name] = np.ascontiguousarray(array).reshape(array.shape)
     return leaves
 
 

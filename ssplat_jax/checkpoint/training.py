@@ -8,6 +8,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 
 from ssplat_jax.errors import InputError, StorageError
+from ssplat_jax.export.atomic import write_atomic
 
 RECIPE_FILE = "recipe.json"
 
@@ -34,7 +35,7 @@ class TrainingCheckpoints:
     def _claim(self, description: dict) -> None:
         path = self.directory / RECIPE_FILE
         if not path.exists():
-            path.write_text(json.dumps(description, indent=1, sort_keys=True))
+            write_atomic(path, json.dumps(description, indent=1, sort_keys=True).encode())
             return
         held = json.loads(path.read_text())
         for name in sorted(held.keys() | description.keys()):

@@ -17,6 +17,9 @@ from ssplat_jax.data.sh_rotation import sh_rotation
 from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.geometry.rotations import matrices_to_quats, multiply_quats
 
+COARSEST_SPACING = 1e-4
+"""Stream units between neighbouring float32 numbers at the capture's coordinates that still do for its positions."""
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class StreamFrame:
@@ -63,15 +66,29 @@ class StreamFrame:
         camtoworlds[..., 3, 3] = 1.0
         return camtoworlds
 
-    def gaussians_to_capture(self, gaussians: Gaussians) -> Gaussians:
+    @property
+    def offset(self) -> tuple[float, float, float]:
+        """A point of the capture to count positions from: its origin, or, where float32 is too coarse there, the
+        stream's, in whole units.
+        """
+        spacing = float(np.spacing(np.float32(np.abs(self.origin).max())))
+        is_coarse = spacing * self.scale > COARSEST_SPACING
+        x, y, z = (np.round(self.origin) if is_coarse else np.zeros(3)).tolist()
+        return x, y, z
+
+    def gaussians_to_capture(
+        self, gaussians: Gaussians, *, offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    ) -> Gaussians:
         """Gaussians of the stream in the capture's own frame and scale: positions, orientations, sizes and SH bands.
 
+        Positions are counted from `offset`, a point of the capture.
+
         Limits:
-            The result is float32: 1e5 capture units from the capture's origin, means are held to 1e-2 only.
+            The result is float32: means 1e5 capture units from `offset` are held to 1e-2 only.
         """
         quat = matrices_to_quats(jnp.asarray(self.rotation, jnp.float32))
         mixing = sh_rotation(self.rotation, gaussians.sh_degree)
-        means = self.points_to_capture(np.asarray(gaussians.means, np.float64))
+        means = self.points_to_capture(np.asarray(gaussians.means, np.float64)) - np.asarray(offset, np.float64)
         return Gaussians(
             means=jnp.asarray(means, jnp.float32),
             quats=multiply_quats(jnp.broadcast_to(quat, gaussians.quats.shape), gaussians.quats),

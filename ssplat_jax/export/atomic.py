@@ -19,10 +19,12 @@ def write_atomic(path: str | os.PathLike, data: bytes, *, keep_previous: bool = 
         keep_previous: what was at `path` stays as `previous_path(path)`.
 
     Raises:
-        StorageError: the folder cannot be made or the file not written; what was at `path` is untouched.
+        StorageError: the folder cannot be made or the file not written; what was at `path` is there as before (or,
+            if all that failed is making the new name durable, the whole new file).
     """
     path = Path(path)
     partial = path.with_name(path.name + ".partial")
+    moved = False
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with partial.open("wb") as file:
@@ -31,11 +33,15 @@ def write_atomic(path: str | os.PathLike, data: bytes, *, keep_previous: bool = 
             os.fsync(file.fileno())
         if keep_previous and path.exists():
             os.replace(path, previous_path(path))
+            moved = True
         os.replace(partial, path)
+        moved = False
         _sync_directory(path.parent)
     except OSError as error:
         with contextlib.suppress(OSError):
             partial.unlink(missing_ok=True)
+            if moved:
+                os.replace(previous_path(path), path)
         raise StorageError(
             f"{path}: cannot be written ({error.strerror or error}); free some space or choose another place."
         ) from error

@@ -6,7 +6,9 @@ Binary little endian, one row of float32 per Gaussian, in the frame and units of
 
 `opacity` is a logit, `scale` ln of the standard deviation, `rot` a quaternion wxyz, colour = 0.5 + 0.28209 f_dc + ...;
 `f_rest` is channel-major: the K = 0, 3, 8 or 15 coefficients of red, then of green, then of blue. The comment
-`SplatRenderMode: mip` says that the scene is meant for a renderer with the 2D Mip filter, as ours is.
+`SplatRenderMode: mip` says that the scene is meant for a renderer with the 2D Mip filter, as ours is. A scene far from
+the origin of its frame, where float32 is too coarse for it, is written from an offset near by, and the comment
+`offset x y z` says what to add.
 """
 
 import dataclasses
@@ -50,15 +52,24 @@ class ExportReport:
     num_written: int
     num_dropped: int
     """Non-finite, of negative scale, or fainter than 1/255 (absent rows included)."""
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """To be added to the file's positions."""
 
 
-def save_ply(path: str | os.PathLike, gaussians: Gaussians, *, render_mode: str = "mip") -> ExportReport:
+def save_ply(
+    path: str | os.PathLike,
+    gaussians: Gaussians,
+    *,
+    render_mode: str = "mip",
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> ExportReport:
     """Writes `gaussians` to `path`, all or nothing; the same Gaussians give the same bytes.
 
     Args:
         path: of the file; folders are made.
         gaussians: in the frame the file should be in (`Capture` scenes: the capture's own).
         render_mode: the comment `SplatRenderMode`, one of `default`, `mip`, `2dgs`.
+        offset: where the origin of `gaussians` lies in the frame the file should be in; a comment unless zero.
 
     Limits:
         Rows with an entry that is not finite, a negative scale or an opacity below 1/255 are dropped and counted.
@@ -71,8 +82,9 @@ def save_ply(path: str | os.PathLike, gaussians: Gaussians, *, render_mode: str 
     if render_mode not in RENDER_MODES:
         raise InputError(f"save_ply: render_mode must be one of {', '.join(RENDER_MODES)}, got {render_mode!r}.")
     rows = _rows(gaussians)
-    write_atomic(path, _header(len(rows), gaussians.sh_degree, render_mode) + rows.astype("<f4").tobytes())
-    return ExportReport(num_written=len(rows), num_dropped=gaussians.num_gaussians - len(rows))
+    header = _header(len(rows), gaussians.sh_degree, render_mode, offset)
+    write_atomic(path, header + rows.astype("<f4").tobytes())
+    return ExportReport(num_written=len(rows), num_dropped=gaussians.num_gaussians - len(rows), offset=offset)
 
 
 def property_names(sh_degree: int) -> list[str]:
@@ -82,12 +94,13 @@ def property_names(sh_degree: int) -> list[str]:
     return [*names, "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
 
 
-def _header(num_rows: int, sh_degree: int, render_mode: str) -> bytes:
+def _header(num_rows: int, sh_degree: int, render_mode: str, offset: tuple[float, float, float]) -> bytes:
     lines = [
         "ply",
         "format binary_little_endian 1.0",
         f"comment SplatRenderMode: {render_mode}",
         f"comment SH degree: {sh_degree}",
+        *([f"comment offset {' '.join(map(repr, offset))}"] if any(offset) else []),
         f"element vertex {num_rows}",
         *(f"property float {name}" for name in property_names(sh_degree)),
         "end_header\n",

@@ -36,9 +36,13 @@ def inject_features(
     """Eq. cache_feature_attenuation and token_regressor_input.
 
     Besides (1 - omega) F_H the U-Net sees Omega, because a zero feature alone does not tell a hole from a feature.
+
+    Limits:
+        omega = 1: F_H is not heard. Features of any precision are injected in float32.
     """
     if not config.cgfi:
         return feats
-    attenuated = (1 - confidences)[..., None] * history.feats
+    feats = feats.astype(jnp.float32)
+    attenuated = (1 - confidences)[..., None] * history.feats.astype(jnp.float32)
     hints = jnp.concatenate([attenuated, history.confidences[..., None]], axis=-1)
     return Aggregator(config).apply({"params": params}, feats, hints, views.valid)  # pyright: ignore[reportReturnType]

@@ -33,6 +33,10 @@ def plane_sweep(features: Features, views: Views, config: StreamConfig) -> Float
     """Mean cosine of each cell with its source views at every candidate, coarse then (if configured) fine.
 
     Views outside the image, behind the source camera or padded do not count; a cell that no source sees scores 0.
+
+    Limits:
+        Without parallax (equal centres, a pure rotation) a pair of views scores all candidates that it sees alike.
+        Zero features score 0, equal ones 1.
     """
     v, hf, wf = views.inside.shape
     maps = [(GRID_STRIDE, unit_features(features.grid), unit_features(features.grid))]
@@ -96,6 +100,7 @@ class CostVolume(nn.Module):
 
 
 def match(params, features: Features, views: Views, config: StreamConfig) -> DepthBelief:
-    """P_i(k | u) by plane sweep, U-Net and softmax."""
+    """P_i(k | u) by plane sweep, U-Net and softmax, in float32 whatever the features' precision."""
+    features = jax.tree.map(lambda x: x.astype(jnp.float32), features)
     cost = plane_sweep(features, views, config)
     return CostVolume(config).apply({"params": params}, cost, features.context, views.valid)  # pyright: ignore[reportReturnType]

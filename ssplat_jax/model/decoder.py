@@ -50,9 +50,9 @@ def decode_tokens(
     """Gaussians of tokens or of cache pivots: one each.
 
     The head's rotation is in the frame of the camera in `quats` (DESIGN 6.7); its colour is a residual on the
-    appearance anchor `rgbs` (DESIGN 6.6).
+    appearance anchor `rgbs` (DESIGN 6.6). Features of any precision are read in float32.
     """
-    raw = GaussianHead(config).apply({"params": params}, feats)
+    raw = GaussianHead(config).apply({"params": params}, feats.astype(jnp.float32))
     opacity, scale, rotation, sh = jnp.split(raw, [1, 4, 8], axis=-1)  # pyright: ignore[reportArgumentType]
     sh = sh.reshape(feats.shape[0], -1, 3)
     base = jnp.zeros_like(sh).at[:, 0].set((rgbs - 0.5) / SH_C0)

@@ -10,6 +10,9 @@ from ssplat_jax.config import StreamConfig
 from ssplat_jax.model.wires import AnchoredDepth, DepthBelief, Views
 from ssplat_jax.numerics import safe_log, softplus_inverse
 
+MIN_SIGMA = 1e-6
+"""Narrower anchors are all alike, one candidate or none; a width of zero would divide by zero."""
+
 
 class AnchorStrength(nn.Module):
     """gamma_d = softplus(raw), the one learnable scalar of HPDA."""
@@ -25,9 +28,14 @@ class AnchorStrength(nn.Module):
 def cache_anchor(
     history: ProjectedCache, log_candidates: Float[Array, " d"], config: StreamConfig
 ) -> Float[Array, "v hf wf d"]:
-    """P_H of Eq. cache_depth_prior; zero where the cache has a hole."""
+    """P_H of Eq. cache_depth_prior.
+
+    Limits:
+        Zeros where the cache has a hole, and for Omega = 0.
+        sigma is at least 1e-6. sigma -> 0: Omega at the candidate that equals D_H, zeros where none does.
+    """
     omega = history.confidences[..., None]
-    sigma = config.sigma0 + config.lambda_sigma * (1 - omega)
+    sigma = jnp.maximum(config.sigma0 + config.lambda_sigma * (1 - omega), MIN_SIGMA)
     if config.anchor_space == "log":
         offsets = log_candidates - safe_log(history.depths)[..., None]
     else:
@@ -41,14 +49,21 @@ def cache_anchor(
 def inject_anchor(
     probs: Float[Array, "*b d"], anchor: Float[Array, "*b d"], gamma: Float[Array, ""]
 ) -> Float[Array, "*b d"]:
-    """P^v of Eq. cache_prior_injection. Where the anchor is all zero, `probs` is returned bit for bit."""
-    mixed = probs + gamma * anchor
-    has_anchor = jnp.any(anchor > 0, axis=-1, keepdims=True)
-    return jnp.where(has_anchor, mixed / mixed.sum(axis=-1, keepdims=True), probs)
+    """P^v of Eq. cache_prior_injection; `probs` sum to 1, so only the anchor's mass is left to divide by.
+
+    Limits:
+        gamma = 0, and an anchor of zeros: `probs`, bit for bit.
+        gamma -> inf: the anchor, scaled to mass 1.
+    """
+    return (probs + gamma * anchor) / (1 + gamma * anchor.sum(axis=-1, keepdims=True))
 
 
 def peak_confidence(probs: Float[Array, "*b d"], config: StreamConfig) -> Float[Array, "*b"]:
-    """omega: the peak of a distribution, or the largest mass of a few neighbouring candidates."""
+    """omega: the peak of a distribution, or the largest mass of a few neighbouring candidates.
+
+    Limits:
+        At most 1, which a one-hot distribution gives, and one of a single candidate.
+    """
     if config.confidence == "peak":
         return probs.max(axis=-1)
     width = 2 * config.confidence_window + 1
@@ -59,7 +74,13 @@ def peak_confidence(probs: Float[Array, "*b d"], config: StreamConfig) -> Float[
 def expected_log_depth(
     probs: Float[Array, "*b d"], log_candidates: Float[Array, " d"], config: StreamConfig
 ) -> Float[Array, "*b"]:
-    """Eq. base_depth_regression, in the space of the candidates (DESIGN 6.3)."""
+    """Eq. base_depth_regression, in the space of the candidates (DESIGN 6.3).
+
+    Limits:
+        A one-hot distribution, at either end too, gives its candidate, bit for bit. A single candidate is the depth
+        whatever was matched, with a zero gradient.
+        `depth_readout="window"` looks around the nearest of equal peaks.
+    """
     if config.depth_readout == "window":
         distance = jnp.abs(jnp.arange(probs.shape[-1]) - jnp.argmax(probs, axis=-1)[..., None])
         probs = jnp.where(distance <= config.readout_window, probs, 0.0)

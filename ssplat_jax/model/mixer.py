@@ -135,5 +135,6 @@ def mix_tokens(
     They have unit RMS. What is stored comes back through CGFI a chunk later, so without a bound the stream is a loop
     with gain: trained on four chunks, features grew to 1e18 by the ninth. The head normalises anyway.
     """
+    feats = feats.astype(jnp.float32)
     mixed = Mixer(config).apply({"params": params}, feats, positions, inside, view_valid)
     return rms_normalize(mixed)  # pyright: ignore[reportArgumentType]

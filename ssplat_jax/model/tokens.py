@@ -38,7 +38,8 @@ def regress_tokens(
     relative = (jax.lax.stop_gradient(depth.log_depths)[..., None] - low) / jnp.maximum(high - low, MIN_LOG_RANGE)
     match = jax.lax.stop_gradient(depth.anchored_confidences)[..., None]
     patches = pixel_unshuffle(views.images - 0.5, GRID_STRIDE)
-    return TokenRegressor(config).apply({"params": params}, patches, relative, match, features.context, belief.decoder)  # pyright: ignore[reportReturnType]
+    context, decoder = features.context.astype(jnp.float32), belief.decoder.astype(jnp.float32)
+    return TokenRegressor(config).apply({"params": params}, patches, relative, match, context, decoder)  # pyright: ignore[reportReturnType]
 
 
 def back_project(

@@ -62,7 +62,11 @@ class AnchoredDepth:
 
 
 def prepare_views(chunk: Chunk, config: StreamConfig) -> Views:
-    """Pads the images of `chunk` (edge values) to the network's multiple and lays out the candidates."""
+    """Pads the images of `chunk` (edge values) to the network's multiple and lays out the candidates.
+
+    Limits:
+        A single candidate is `near`.
+    """
     height, width = chunk.images.shape[1:3]
     multiple = config.size_multiple
     pad_h, pad_w = -height % multiple, -width % multiple

@@ -3,6 +3,7 @@
 import contextlib
 import json
 import resource
+import shutil
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +18,7 @@ from ssplat_jax.struct import replace
 from tests.cache.streams import CAPACITY, CONFIG, Recipe, fuse, to_jax
 
 HEADER = {"config": CONFIG.to_dict(), "chunks": 3, "note": "ω"}
+PREVIOUS_HEADER = HEADER | {"chunks": 2}
 CHUNKS = [to_jax(Recipe(seed, "few", "normal", "random").tokens()) for seed in range(4)]
 
 
@@ -31,6 +33,13 @@ def stream(chunks):
 def saved(tmp_path_factory):
     path = tmp_path_factory.mktemp("state") / "state.npz"
     save_state(path, stream(CHUNKS[:3]), HEADER)
+    return path
+
+
+@pytest.fixture(scope="module")
+def previous(tmp_path_factory):
+    path = tmp_path_factory.mktemp("state") / "previous.npz"
+    save_state(path, stream(CHUNKS[:2]), PREVIOUS_HEADER)
     return path
 
 
@@ -70,7 +79,16 @@ def test_any_reader_of_npz_can_open_it(saved):
     assert facts["header"]["caller"] == HEADER and set(facts["leaves"]["means"]) == {"dtype", "sha256"}
 
 
-def test_no_flipped_bit_is_loaded(saved, tmp_path):
+def refuse_but_load_previous(damaged, previous):
+    """The file is refused by name; with a good one before it, that one is loaded, and the refusal handed on."""
+    with pytest.raises(StorageError, match=r"damaged\.npz"):
+        load_state(damaged)
+    shutil.copy(previous, previous_path(damaged))
+    _, header, error = load_newest_state(damaged)
+    assert header == PREVIOUS_HEADER and "damaged.npz: the file is corrupt" in str(error)
+
+
+def test_no_flipped_bit_is_loaded(saved, previous, tmp_path):
     contents, rng = bytearray(saved.read_bytes()), np.random.default_rng(0)
     damaged = tmp_path / "damaged.npz"
     ends = [*range(64), *range(len(contents) - 100, len(contents))]  # zip's own records and the seal
@@ -78,16 +96,14 @@ def test_no_flipped_bit_is_loaded(saved, tmp_path):
         flipped = contents.copy()
         flipped[byte] ^= 1 << rng.integers(8)
         damaged.write_bytes(flipped)
-        with pytest.raises(StorageError, match=r"damaged\.npz"):
-            load_state(damaged)
+        refuse_but_load_previous(damaged, previous)
 
 
-def test_no_truncated_file_is_loaded(saved, tmp_path):
+def test_no_truncated_file_is_loaded(saved, previous, tmp_path):
     contents, damaged = saved.read_bytes(), tmp_path / "damaged.npz"
     for length in [*np.linspace(0, len(contents) - 1, 10).astype(int), len(contents) - 64, len(contents) - 65]:
         damaged.write_bytes(contents[:length])
-        with pytest.raises(StorageError, match=r"damaged\.npz"):
-            load_state(damaged)
+        refuse_but_load_previous(damaged, previous)
 
 
 def test_foreign_files_and_no_file_are_refused(tmp_path):
@@ -108,6 +124,9 @@ def test_the_previous_state_is_used_when_the_newest_is_corrupt(tmp_path):
     assert_identical(cache, old)
     previous_path(path).unlink()
     with pytest.raises(StorageError, match="corrupt"):
+        load_newest_state(path)
+    previous_path(path).write_bytes(b"damaged too")
+    with pytest.raises(StorageError, match=r"state\.npz: the file is corrupt"):
         load_newest_state(path)
 
 

@@ -1,16 +1,25 @@
 """The command line: help at once, clear refusals, nothing half-written. Heavy commands are run small."""
 
+import dataclasses
+import functools
 import json
 import shutil
 import subprocess
 import sys
 import time
 
+import jax
 import numpy as np
 import pytest
 from PIL import Image
 
 from ssplat_jax import cli
+from ssplat_jax.checkpoint.delta import load_delta
+from ssplat_jax.checkpoint.state import load_state
+from ssplat_jax.checkpoint.weights import load_params
+from ssplat_jax.config import StreamConfig
+from ssplat_jax.follow import apply_delta
+from ssplat_jax.stream import StreamSplat
 
 COMMANDS = ("demo", "inspect", "run", "eval", "train", "export", "bench", "experiment")
 
@@ -130,11 +139,25 @@ def test_inspect_prints_json(capsys):
     assert facts["num_frames"] == 12 and facts["near"] < facts["far"]
 
 
+def assert_deltas_give_the_scene(out):
+    """The changes of every chunk, put together, against the final state decoded at once."""
+    files = sorted((out / "deltas").iterdir())
+    assert [path.name for path in files] == ["000004.npz", "000008.npz", "000012.npz"]
+    told = functools.reduce(apply_delta, map(load_delta, files), None)
+    cache, header = load_state(out / "state.npz")
+    model = StreamSplat(StreamConfig.from_dict(header["config"]))
+    scene = jax.jit(model.decode)(load_params("tiny"), cache)
+    assert 0 < (told.opacities > 0).sum() == (np.asarray(scene.opacities) > 0).sum()
+    for field in dataclasses.fields(scene):
+        np.testing.assert_allclose(getattr(told, field.name), getattr(scene, field.name), rtol=1e-5, atol=1e-5)
+
+
 def test_run_stops_resumes_and_exports(tmp_path, capsys):
     out = tmp_path / "run"
     capture = "procedural:room?frames=12&size=64x48"
-    assert run("run", capture, "--out", str(out), "--save-every", "1", "--quiet") == 0
+    assert run("run", capture, "--out", str(out), "--save-every", "1", "--deltas", "--quiet") == 0
     assert {"scene.ply", "state.npz", "metrics.json"} <= {p.name for p in out.iterdir()}
+    assert_deltas_give_the_scene(out)
     metrics = json.loads((out / "metrics.json").read_text())
     assert metrics["cache"]["num_chunks"] == 3
     assert run("export", str(out), "--to", str(tmp_path / "again.ply")) == 0
@@ -142,8 +165,15 @@ def test_run_stops_resumes_and_exports(tmp_path, capsys):
     # A finished run is not streamed twice; another configuration is refused.
     assert run("run", capture, "--out", str(out), "--quiet") == 0
     assert json.loads((out / "metrics.json").read_text())["cache"]["num_chunks"] == 3
-    assert run("run", capture, "--out", str(out), "--set", "voxel_size=0.1", "--quiet") == 2
-    assert "voxel_size" in capsys.readouterr().err
+    for changes, difference in (
+        (("--set", "voxel_size=0.1"), "another config (voxel_size: 0.04 there, 0.1 now)"),
+        (("--stride", "2"), "another frames (12 there, 6 now"),
+        (("--size", "32x24"), "another size ([64, 48] there, [32, 24] now)"),
+    ):
+        capsys.readouterr()
+        assert run("run", capture, "--out", str(out), *changes, "--quiet") == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert difference in line and "--overwrite" in line
 
 
 def test_eval_writes_every_promised_field(tmp_path):

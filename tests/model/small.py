@@ -102,16 +102,30 @@ def predict():
 
 @functools.cache
 def gradients():
-    """Jitted gradient of a sum over everything a chunk's tokens become, in parameters, images, poses and intrinsics."""
+    """Jitted gradient of a sum over everything a chunk's tokens become: `(cache, chunk, weights) -> value, gradients`.
 
-    def total(params, images, viewmats, Ks, cache, chunk):
+    By parameters, images, poses, intrinsics, and the positions and features in the cache.
+    """
+
+    def total(params, images, viewmats, Ks, remembered, cache, chunk):
+        cache = replace(cache, means=remembered[0], feats=remembered[1])
         prediction = MODEL.predict(params, cache, replace(chunk, images=images, viewmats=viewmats, Ks=Ks))
         scene = MODEL.decode_tokens(params, prediction.tokens)
         leaves = (scene, prediction.tokens.confidences, prediction.log_depths)
         return sum(jnp.mean(jnp.sin(x)) for x in jax.tree.leaves(leaves))
 
-    function = jax.jit(jax.value_and_grad(total, argnums=(0, 1, 2, 3)))
-    return lambda cache, chunk: function(params(), chunk.images, chunk.viewmats, chunk.Ks, cache, chunk)
+    function = jax.jit(jax.value_and_grad(total, argnums=(0, 1, 2, 3, 4)))
+
+    def run(cache, chunk, weights=None):
+        weights = params() if weights is None else weights
+        return function(weights, chunk.images, chunk.viewmats, chunk.Ks, (cache.means, cache.feats), cache, chunk)
+
+    return run
+
+
+def with_gamma(raw_gamma: float) -> dict:
+    """The parameters with another strength of the anchor: softplus of -200 is 0, of 1e6 it is 1e6."""
+    return params() | {"hpda": {"raw_gamma": jnp.float32(raw_gamma)}}
 
 
 def history(depths, confidences, feats=None, mask=None) -> ProjectedCache:

@@ -1,4 +1,8 @@
-"""The network as a whole: padded views are nothing, and no view is too hard to give finite tokens and gradients."""
+"""The network as a whole: padded views are nothing, and no view is too hard to give finite tokens and gradients.
+
+The hard cases of its stages are in tests/stability/test_memory_hard_cases.py. Numbers in names are those of
+ALGORITHM.md, section 12.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +12,21 @@ import pytest
 from ssplat_jax.stream import StreamSplat
 from ssplat_jax.struct import replace
 from tests.geometry.test_rotations import rodrigues
-from tests.model.small import CONFIG, MODEL, chunk, finite, gradients, params, predict, random_params, step, warm_cache
+from tests.model.small import (
+    CONFIG,
+    MODEL,
+    chunk,
+    finite,
+    gradients,
+    params,
+    predict,
+    random_params,
+    step,
+    warm_cache,
+    with_gamma,
+)
+
+SUMS = 1e-6
 
 
 def turned(angle_step: float):
@@ -41,17 +59,86 @@ HARD = {
 }
 
 
-@pytest.mark.parametrize("name", HARD)
-def test_hard_chunk_gives_finite_tokens_and_gradients(name):
-    hard = HARD[name](chunk())
-    value, gradient = gradients()(warm_cache(), hard)
+def remembering(**changes):
+    """The warm cache with fields of its living pivots set."""
+
+    def change():
+        cache = warm_cache()
+        alive = cache.alive
+        fields = {}
+        for name, value in changes.items():
+            old = getattr(cache, name)
+            mask = alive.reshape(alive.shape + (1,) * (old.ndim - 2))
+            fields[name] = jnp.where(mask, jnp.broadcast_to(jnp.asarray(value, old.dtype), old.shape), 0)
+        return replace(cache, **fields)
+
+    return change
+
+
+HARD_MEMORIES = {  # cache, and raw strength of the anchor
+    "empty": (MODEL.init_cache, 0.0),
+    "empty, gamma 1e6": (MODEL.init_cache, 1e6),
+    "gamma 0": (warm_cache, -200.0),
+    "gamma 1e6": (warm_cache, 1e6),
+    "omega 0": (remembering(confidences=0.0), 0.0),
+    "omega 1": (remembering(confidences=1.0), 0.0),
+    "omega 1, gamma 1e6": (remembering(confidences=1.0), 1e6),
+    "equal confidences": (remembering(confidences=0.5), 0.0),
+    "zero features": (remembering(feats=0.0, seeds=0.0), 0.0),
+    "identical features": (remembering(feats=1.0, seeds=1.0), 0.0),
+    "all at the near end": (remembering(means=[0.0, 0.0, 1.0]), 1e6),
+    "all at the far end": (remembering(means=[0.0, 0.0, 6.0]), 1e6),
+    "all at the first camera": (remembering(means=0.0), 1e6),
+}
+
+
+def check_prediction(chunk, cache, weights):
+    """Values, gradients, distributions and ranges of one chunk, and a finite cache after it."""
+    value, gradient = gradients()(cache, chunk, weights)
     assert finite((value, gradient))
-    prediction = predict()(params(), warm_cache(), hard)
-    assert finite(prediction)
-    np.testing.assert_allclose(jax.nn.softmax(prediction.logits).sum(-1), 1, atol=1e-5)
-    span = np.log([hard.near, hard.far])
+    prediction = predict()(weights, cache, chunk)
+    after, _ = step()(weights, cache, chunk)
+    assert finite(prediction) and finite(after)
+    probs = np.asarray(jax.nn.softmax(prediction.logits), np.float64)
+    assert (probs >= 0).all()
+    np.testing.assert_allclose(probs.sum(-1), 1, rtol=0, atol=SUMS)
+    span = np.log([chunk.near, chunk.far])
     assert (prediction.log_depths >= span[0] - 1e-4).all() and (prediction.log_depths <= span[1] + 1e-4).all()
     assert ((prediction.output.confidences >= 0) & (prediction.output.confidences <= 1)).all()
+
+
+@pytest.mark.parametrize("name", HARD)
+def test_hard_chunk_gives_finite_tokens_and_gradients(name):
+    check_prediction(HARD[name](chunk()), warm_cache(), params())
+
+
+@pytest.mark.parametrize("name", HARD_MEMORIES)
+def test_hard_memory_gives_finite_tokens_and_gradients(name):
+    cache, raw_gamma = HARD_MEMORIES[name]
+    check_prediction(chunk(), cache(), with_gamma(raw_gamma))
+
+
+def test_1_without_strength_a_full_cache_says_of_depth_what_an_empty_one_does():
+    weak, blank = (predict()(with_gamma(-200.0), cache, chunk()) for cache in (warm_cache(), MODEL.init_cache()))
+    np.testing.assert_array_equal(weak.log_depths, blank.log_depths)
+    np.testing.assert_array_equal(weak.tokens.means, blank.tokens.means)
+    strong = predict()(with_gamma(0.0), warm_cache(), chunk())
+    assert float(jnp.abs(strong.log_depths - blank.log_depths).max()) > 1e-3
+
+
+def test_9_gamma_is_learned_where_there_is_history_and_only_there():
+    def slope(cache):
+        return float(gradients()(cache, chunk())[1][0]["hpda"]["raw_gamma"])
+
+    assert slope(warm_cache()) != 0
+    assert slope(MODEL.init_cache()) == 0
+    assert slope(remembering(confidences=0.0)()) == 0
+
+
+def test_9_no_gradient_reaches_what_earlier_chunks_left():
+    _, (*_, remembered) = gradients()(warm_cache(), chunk())
+    for gradient in remembered:
+        np.testing.assert_array_equal(gradient, 0)
 
 
 def test_every_part_of_the_network_hears_the_gradient():
@@ -121,3 +208,5 @@ def test_the_smallest_configurations_run(changes):
     cache, output = jax.jit(model.step)(weights, model.init_cache(), chunk(views=config.chunk_size))
     assert finite((cache, output)) and int(cache.num_voxels) > 0
     assert finite(model.decode(weights, cache))
+    if config.num_depths == 1:
+        np.testing.assert_allclose(output.depths, chunk().near, rtol=1e-6)
