@@ -38,13 +38,17 @@ class Setting:
     name: str
     size: tuple[int, int] = SCORED
     changes: dict[str, Any] = dataclasses.field(default_factory=dict)
+    quality: str = ""
+    """The `--quality` that this is, if it is one."""
 
 
 SETTINGS = (
-    Setting("preset"),
-    Setting("160x120", (160, 120)),
-    Setting("240x180", (240, 180)),
+    Setting("preset", quality="accurate"),
+    Setting("160x120", (160, 120), quality="fast"),
+    Setting("240x180", (240, 180), quality="balanced"),
     Setting("480x360", (480, 360)),
+    Setting("160x120, 1 source", (160, 120), {"num_sources": 1}),
+    Setting("480x360, voxel 0.02", (480, 360), {"voxel_size": 0.02}),
     Setting("1 source", changes={"num_sources": 1}),
     Setting("2 sources", changes={"num_sources": 2}),
     Setting("voxel 0.02", changes={"voxel_size": 0.02}),
@@ -61,8 +65,6 @@ SETTINGS = (
     Setting("no witnesses", changes={"num_witnesses": 0}),
     Setting("no carving", changes={"carving": False}),
     Setting("no mixer", changes={"mixer_blocks": 0}),
-    Setting("160x120, 1 source", (160, 120), {"num_sources": 1}),
-    Setting("480x360, voxel 0.02", (480, 360), {"voxel_size": 0.02}),
 )
 
 
@@ -146,14 +148,23 @@ def _markdown(rows: list[dict[str, Any]]) -> str:
     """The table, fastest first within a scene; the front in bold."""
     lines = ["| scene | setting | PSNR dB | ms per view | Gaussians | step memory MiB |", "|---|---|---|---|---|---|"]
     for row in sorted(rows, key=lambda row: (row["scene"], row["ms_per_view"])):
-        name = f"**{row['setting']}**" if row["front"] else row["setting"]
+        name = f"**{_label(row)}**" if row["front"] else _label(row)
         cells = (row["scene"], name, f"{row['psnr']:.2f}", row["ms_per_view"], row["gaussians"], row["step_memory_mb"])
         lines.append("| " + " | ".join(map(str, cells)) + " |")
     return "\n".join(lines) + "\n"
 
 
+def _label(row: dict[str, Any]) -> str:
+    """The setting, and the quality that it is."""
+    quality = {setting.name: setting.quality for setting in SETTINGS}.get(row["setting"])
+    return f"{row['setting']} ({quality})" if quality else row["setting"]
+
+
 def plot(path: Path, rows: list[dict[str, Any]]) -> None:
-    """A panel per scene, every setting by name, the front as a line. Left out without matplotlib (`plots` extra)."""
+    """A panel per scene, the front as a line, the qualities ringed; names where there is room, the front's first.
+
+    Left out without matplotlib (`plots` extra).
+    """
     try:
         import matplotlib
 
@@ -165,14 +176,29 @@ def plot(path: Path, rows: list[dict[str, Any]]) -> None:
     figure, panels = pyplot.subplots(1, len(scenes), figsize=(7 * len(scenes), 5), layout="constrained", squeeze=False)
     for axes, scene in zip(panels[0], scenes, strict=True):
         here = [row for row in rows if row["scene"] == scene]
+        times, psnrs = [r["ms_per_view"] for r in here], [r["psnr"] for r in here]
+        axes.set_xscale("log")
+        axes.set_xlim(0.8 * min(times), 1.8 * max(times))
+        axes.set_ylim(min(psnrs) - 0.3, max(psnrs) + 0.3)
         front = sorted((r for r in here if r["front"]), key=lambda r: r["ms_per_view"])
         axes.plot([r["ms_per_view"] for r in front], [r["psnr"] for r in front], color="#c06030", lw=1.2, zorder=1)
-        for row in here:
+        figure.draw_without_rendering()  # lays the panel out, so that names know where they are
+        names = []
+        for row in sorted(here, key=lambda r: (_label(r) == r["setting"], not r["front"], r["ms_per_view"])):
             colour = "#c06030" if row["front"] else "#30507a"
-            axes.scatter(row["ms_per_view"], row["psnr"], s=18, color=colour, zorder=2)
-            offset = {"textcoords": "offset points", "xytext": (4, 3), "fontsize": 7, "color": colour}
-            axes.annotate(row["setting"], (row["ms_per_view"], row["psnr"]), **offset)
-        axes.set_xscale("log")
+            at = (row["ms_per_view"], row["psnr"])
+            axes.scatter(*at, s=18, color=colour, zorder=2)
+            is_quality = _label(row) != row["setting"]
+            if is_quality:
+                axes.scatter(*at, s=90, facecolors="none", edgecolors=colour, zorder=2)
+            weight = "bold" if is_quality else "normal"
+            offset = {"textcoords": "offset points", "xytext": (6, 4), "fontsize": 7, "color": colour, "weight": weight}
+            name = axes.annotate(_label(row), at, **offset)
+            box = name.get_window_extent()
+            if any(box.overlaps(other) for other in names):
+                name.remove()
+            else:
+                names.append(box)
         axes.set_xlabel("ms per view, chunk in to novel view out")
         axes.set_ylabel("PSNR of unseen views, dB")
         axes.set_title(scene)

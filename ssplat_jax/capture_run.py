@@ -44,6 +44,7 @@ def run_capture(
     out: Path,
     *,
     size: tuple[int, int] | None,
+    scale: float = 1.0,
     stride: int,
     max_views: int | None,
     save_every: int,
@@ -53,13 +54,14 @@ def run_capture(
 ) -> RunResult:
     """Streams the capture at `path` into `out`, continuing what stands there.
 
-    With `deltas`, what every chunk changed in the scene is written too, in the stream's frame (`checkpoint/delta.py`).
+    Images are `scale` times `size` (default: their own). With `deltas`, what every chunk changed in the scene is
+    written too, in the stream's frame (`checkpoint/delta.py`).
 
     Raises:
         InputError: the capture is unusable, or `out` holds a run of another capture or configuration.
         StorageError: `out` cannot be written or its state is corrupt.
     """
-    capture = open_capture(path, size=size)
+    capture = open_capture(path, size=size).scaled(scale)
     indices = list(range(0, len(capture), stride))[:max_views]
     capture.verify(indices)
     if overwrite and out.exists():

@@ -13,10 +13,12 @@ from typing import Annotated, Literal
 
 import tyro
 
-from ssplat_jax.config import StreamConfig, preset
+from ssplat_jax.config import QUALITIES, StreamConfig, preset
 from ssplat_jax.errors import CacheError, InputError, StorageError
 
 EXIT_INPUT, EXIT_STORAGE, EXIT_MEMORY = 2, 3, 4
+
+QualityName = Literal["fast", "balanced", "accurate"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,6 +33,8 @@ class Demo:
     """Which scene."""
     out: Path = Path("ssplat_demo")
     """Where the results go."""
+    quality: QualityName = "accurate"
+    """What accuracy may cost in time: fast and balanced stream smaller images (docs/performance.md)."""
     quiet: bool = False
     """Print only the closing line."""
 
@@ -38,7 +42,7 @@ class Demo:
         from ssplat_jax.demo import run_demo
         from ssplat_jax.report import Reporter
 
-        run_demo(self.scene, self.out, Reporter(self.quiet))
+        run_demo(self.scene, self.out, Reporter(self.quiet), QUALITIES[self.quality])
         print(f"wrote {self.out}/scene.ply, metrics.json and pictures")
         return 0
 
@@ -84,6 +88,8 @@ class Run:
     """Stop after so many views."""
     size: str | None = None
     """Image size WxH to work at; default the capture's own."""
+    quality: QualityName = "accurate"
+    """What accuracy may cost in time: fast and balanced stream smaller images (docs/performance.md)."""
     weights: str = "tiny"
     """Preset with shipped weights, or a weights file."""
     set: tuple[str, ...] = ()
@@ -101,13 +107,14 @@ class Run:
         from ssplat_jax.capture_run import run_capture
         from ssplat_jax.report import Reporter
 
-        model, params = load_model(self.weights, self.set)
+        model, params = load_model(self.weights, self.set, self.quality)
         result = run_capture(
             model,
             params,
             self.capture,
             self.out,
             size=parse_size(self.size),
+            scale=QUALITIES[self.quality].scale,
             stride=self.stride,
             max_views=self.max_views,
             save_every=self.save_every,
@@ -142,9 +149,15 @@ class Eval:
     targets: int | None = None
     """Targets of the paper's protocol (default 16); of the interleaved, the most that are kept, evenly spread."""
     size: str | None = None
-    """Image size WxH to work at; default the capture's own."""
+    """Image size WxH to score at, and to stream at with the quality `accurate`; default the capture's own."""
+    quality: QualityName = "accurate"
+    """What accuracy may cost in time: fast and balanced stream smaller images (docs/performance.md)."""
     weights: str = "tiny"
     """Preset with shipped weights, or a weights file."""
+    lpips_vgg: Path | None = None
+    """torchvision's vgg16 state dict (.pth or .npz): with --lpips-heads, LPIPS is scored too."""
+    lpips_heads: Path | None = None
+    """The VGG16 heads of the `lpips` package (its weights/v0.1/vgg.pth, or .npz)."""
     set: tuple[str, ...] = ()
     """Changes to the configuration, as field=value."""
     quiet: bool = False
@@ -157,10 +170,20 @@ class Eval:
         from ssplat_jax.report import Reporter
         from ssplat_jax.session import Session
 
-        model, params = load_model(self.weights, self.set)
+        lpips_weights = load_lpips_weights(self.lpips_vgg, self.lpips_heads)
+        model, params = load_model(self.weights, self.set, self.quality)
         capture = open_capture(self.capture, size=parse_size(self.size))
+        streamed = capture.scaled(QUALITIES[self.quality].scale)
         split = choose_split(self.protocol, len(capture), self.stride, self.context, self.targets)
-        metrics = evaluate(Session(model, params), capture, split, self.out, Reporter(self.quiet))
+        metrics = evaluate(
+            Session(model, params),
+            capture,
+            split,
+            self.out,
+            Reporter(self.quiet),
+            streamed=streamed,
+            lpips_weights=lpips_weights,
+        )
         reference = metrics["baselines"]
         print(
             f"{capture.name}: PSNR {metrics['psnr']:.2f} dB, SSIM {metrics['ssim']:.3f} over {metrics['target_views']}"
@@ -188,6 +211,10 @@ class Train:
     """Of the initial parameters and of the scenes."""
     init_weights: Path | None = None
     """Start from a weights file instead of from random parameters."""
+    lpips_vgg: Path | None = None
+    """torchvision's vgg16 state dict (.pth or .npz): with --lpips-heads, the rendering loss is MSE + 0.05 LPIPS."""
+    lpips_heads: Path | None = None
+    """The VGG16 heads of the `lpips` package (its weights/v0.1/vgg.pth, or .npz)."""
     save_every: int = 200
     """Steps between checkpoints."""
     set: tuple[str, ...] = ()
@@ -204,12 +231,14 @@ class Train:
         config = apply_changes(preset(self.preset), self.set)
         recipe = dataclasses.replace(RECIPES[self.preset].scaled(self.scale_steps), seed=self.seed)
         params = load_weights(self.init_weights)[0] if self.init_weights else None
+        lpips_weights = load_lpips_weights(self.lpips_vgg, self.lpips_heads)
         with Reporter(self.quiet).progress("training", recipe.num_steps) as advance:
             result = train(
                 config,
                 recipe,
                 self.out,
                 params=params,
+                lpips_weights=lpips_weights,
                 save_every=self.save_every,
                 report=lambda record: advance(record["step"], describe_record(record)),
             )
@@ -285,7 +314,8 @@ class Experiment:
     """
 
     name: Annotated[str, tyro.conf.Positional]
-    """captures: novel views of real captures. accuracy_vs_time: what accuracy costs in time."""
+    """captures: novel views of real captures. accuracy_vs_time: what accuracy costs in time.
+    ablation: what the cache's modules are worth. depth_error: errors of depth, and whether confidence knows them."""
     out: Path
     """Tables, plots and pictures."""
     captures: Path | None = None
@@ -352,8 +382,8 @@ def apply_changes(config: StreamConfig, changes: tuple[str, ...]) -> StreamConfi
     return config.replace(**parsed)
 
 
-def load_model(weights: str, changes: tuple[str, ...]):
-    """(model, params) of a preset's shipped weights or of a weights file, with changes to the configuration."""
+def load_model(weights: str, changes: tuple[str, ...], quality: QualityName = "accurate"):
+    """(model, params) of a preset's shipped weights or of a weights file; the quality's changes, then `changes`."""
     from ssplat_jax.checkpoint.weights import load_params, load_weights
     from ssplat_jax.config import PRESETS
     from ssplat_jax.stream import StreamSplat
@@ -364,7 +394,24 @@ def load_model(weights: str, changes: tuple[str, ...]):
         params, config = load_weights(Path(weights))
     else:
         params, config = load_params(weights), preset("tiny")
+    config = config.replace(**dict(QUALITIES[quality].changes))
     return StreamSplat(apply_changes(config, changes)), params
+
+
+def load_lpips_weights(vgg: Path | None, heads: Path | None):
+    """LPIPS weights of both files, or None where neither is given.
+
+    Raises:
+        InputError: only one is given, or a file is not what it should be.
+    """
+    if vgg is None and heads is None:
+        return None
+    if vgg is None or heads is None:
+        missing, given = ("--lpips-vgg", "--lpips-heads") if vgg is None else ("--lpips-heads", "--lpips-vgg")
+        raise InputError(f"{given}: wanted {missing} beside it, LPIPS needs both files; got one.")
+    from ssplat_jax.lpips import load_lpips
+
+    return load_lpips(vgg, heads)
 
 
 def describe_record(record: dict) -> str:

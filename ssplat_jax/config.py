@@ -177,6 +177,20 @@ def _is_positive(value: Any) -> bool:
 PRESETS: dict[str, StreamConfig] = {"tiny": StreamConfig()}
 
 
+@dataclasses.dataclass(frozen=True)
+class Quality:
+    """A point on the front of accuracy against time (`experiments/accuracy_vs_time.py`, docs/performance.md)."""
+
+    scale: float
+    """Of the images' size, at which they are streamed."""
+    changes: tuple[tuple[str, Any], ...] = ()
+    """Fields of the configuration that differ from the preset, and their values."""
+
+
+QUALITIES: dict[str, Quality] = {"fast": Quality(0.5), "balanced": Quality(0.75), "accurate": Quality(1.0)}
+"""What `--quality` chooses from; `accurate` is what the preset does by itself."""
+
+
 def preset(name: str) -> StreamConfig:
     """The configuration called `name`.
 

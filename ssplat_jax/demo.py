@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ssplat_jax.checkpoint.weights import load_params
-from ssplat_jax.config import preset
+from ssplat_jax.config import QUALITIES, Quality, preset
 from ssplat_jax.data.capture import open_capture
 from ssplat_jax.data.protocol import interleaved
 from ssplat_jax.evaluate import cache_facts, save_comparison, save_image, score_view
@@ -22,17 +22,18 @@ STAGES = (4, 8, 16, 32, 64)  # views after which the scene is decoded and scored
 NUM_FRAMES = 73  # 64 context views and the 9 interleaved targets between them
 
 
-def run_demo(scene: str, out: Path, reporter: Reporter) -> dict:
+def run_demo(scene: str, out: Path, reporter: Reporter, quality: Quality = QUALITIES["accurate"]) -> dict:
     """Streams `procedural:scene`, scores the same targets after every stage, writes scene, pictures and metrics."""
     since = time.perf_counter()
-    model, params = StreamSplat(preset("tiny")), load_params("tiny")
+    model, params = StreamSplat(preset("tiny").replace(**dict(quality.changes))), load_params("tiny")
     capture = open_capture(f"procedural:{scene}?frames={NUM_FRAMES}")
+    streamed = capture.scaled(quality.scale)
     split = interleaved(len(capture), stride=1, context=STAGES[-1])
-    frame = capture.stream_frame(model.config, split.context)
+    frame = streamed.stream_frame(model.config, split.context)
     session = Session(model, params)
     rows, strip, seen = [], [], 0
     with reporter.progress("streaming", STAGES[-1]) as advance:
-        for chunk in capture.chunks(model.config, split.context, frame=frame):
+        for chunk in streamed.chunks(model.config, split.context, frame=frame):
             session.feed(chunk)
             seen += int(np.asarray(chunk.valid).sum())
             advance(seen)
@@ -51,6 +52,7 @@ def run_demo(scene: str, out: Path, reporter: Reporter) -> dict:
     metrics = {
         "scene": scene,
         "size": [capture.width, capture.height],
+        "streamed_size": [streamed.width, streamed.height],
         "stages": rows,
         "cache": cache_facts(session),
         "compile_s": round(session.compile_seconds, 2),

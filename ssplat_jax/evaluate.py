@@ -18,6 +18,7 @@ from ssplat_jax.data.frame import StreamFrame
 from ssplat_jax.data.protocol import Split
 from ssplat_jax.export.atomic import write_atomic
 from ssplat_jax.gaussians import Gaussians, mean_color
+from ssplat_jax.lpips import LpipsWeights, check_size, lpips
 from ssplat_jax.metrics import SSIM_ARGUMENTS, psnr, ssim
 from ssplat_jax.render import render
 from ssplat_jax.report import Reporter
@@ -37,6 +38,7 @@ class ViewScore:
     psnr: float  # dB, holes in the scene's mean colour
     psnr_over_black: float  # dB
     ssim: float
+    lpips: float | None  # None without weights
     coverage: float  # mean alpha: how much of the view the scene covers
 
 
@@ -58,8 +60,11 @@ def stream_context(
     return recent
 
 
+_lpips = jax.jit(lpips)
+
+
 def score_view(
-    gaussians: Gaussians, capture: Capture, i: int, frame: StreamFrame
+    gaussians: Gaussians, capture: Capture, i: int, frame: StreamFrame, lpips_weights: LpipsWeights | None = None
 ) -> tuple[ViewScore, Images, Float[np.ndarray, "h w"]]:
     """Score, clipped colour and depth (stream units, 0 where nothing is) of frame `i`.
 
@@ -70,11 +75,13 @@ def score_view(
     over_black, alpha = np.asarray(out.color), np.asarray(out.alpha)
     color = np.clip(over_black + (1.0 - alpha[..., None]) * np.asarray(mean_color(gaussians)), 0.0, 1.0)
     target = capture.image(i)
+    distance = None if lpips_weights is None else float(_lpips(lpips_weights, jnp.asarray(color), jnp.asarray(target)))
     score = ViewScore(
         frame=i,
         psnr=psnr(color, target),
         psnr_over_black=psnr(np.clip(over_black, 0.0, 1.0), target),
         ssim=ssim(color, target),
+        lpips=distance,
         coverage=float(alpha.mean()),
     )
     return score, color, np.asarray(out.depth)
@@ -151,33 +158,43 @@ def evaluate(
     split: Split,
     out: Path,
     reporter: Reporter | None = None,
+    *,
+    streamed: Capture | None = None,
+    lpips_weights: LpipsWeights | None = None,
 ) -> dict:
     """Streams, scores and times; writes `metrics.json` and a picture per target (target | render | depth) into `out`.
 
-    Every frame is decoded once before anything is written, so that a damaged one leaves no half of a result.
+    `capture` is scored; `streamed` (default: `capture` itself) is the same at the size that is streamed. Every frame is
+    decoded once before anything is written, so that a damaged one leaves no half of a result. Without `lpips_weights`
+    the fields `lpips` are null.
 
     Raises:
-        InputError: a frame is damaged.
+        InputError: a frame is damaged, or too small for LPIPS where its weights are given.
         StorageError: `out` cannot be written.
     """
+    if lpips_weights is not None:
+        check_size(capture.height, capture.width)
     capture.verify((*split.context, *split.targets))
-    frame = capture.stream_frame(session.model.config, split.context)
+    streamed = streamed or capture
+    frame = streamed.stream_frame(session.model.config, split.context)
     reference = baselines(capture, split)
     with (reporter or Reporter(quiet=True)).progress("streaming", len(split.context)) as advance:
-        recent = stream_context(session, capture, split, frame, advance)
+        recent = stream_context(session, streamed, split, frame, advance)
     gaussians = session.gaussians()
     facts = cache_facts(session)
     out.mkdir(parents=True, exist_ok=True)
     scores = []
     for i in split.targets:
-        score, color, depth = score_view(gaussians, capture, i, frame)
+        score, color, depth = score_view(gaussians, capture, i, frame, lpips_weights)
         scores.append(score)
         save_comparison(out / f"view_{i:05d}.png", capture.image(i), color, depth, (frame.near, frame.far))
+    distances = [s.lpips for s in scores if s.lpips is not None]
     middle = split.targets[len(split.targets) // 2]
     latency = measure_latency(session, recent, capture.camera(middle, frame))
     metrics = {
         "capture": capture.name,
         "size": [capture.width, capture.height],
+        "streamed_size": [streamed.width, streamed.height],
         "protocol": split.protocol,
         "split_sha256": split.sha256,
         "context_views": len(split.context),
@@ -186,7 +203,7 @@ def evaluate(
         "psnr_over_black": round(float(np.mean([s.psnr_over_black for s in scores])), 4),
         "ssim": round(float(np.mean([s.ssim for s in scores])), 4),
         "ssim_arguments": SSIM_ARGUMENTS,
-        "lpips": None,
+        "lpips": round(float(np.mean(distances)), 4) if distances else None,
         **latency,
         "compile_s": round(session.compile_seconds, 2),
         "compilations": session.num_compilations,

@@ -38,7 +38,7 @@ class ShardedStream:
 
     What the voxels axis divides is the cache: its memory and the work of `project`, `fuse` and `carve` on it. The
     network runs alike on all devices of a stream, and its time does not shrink. A device with several streams takes
-    one after another.
+    one after another, and copies their caches in every step.
 
     Args:
         model: what to run; its config's `capacity` is that of one shard.

@@ -8,7 +8,9 @@ from ssplat_jax.config import StreamConfig
 from ssplat_jax.data.capture import open_capture
 from ssplat_jax.evaluate import score_view
 from ssplat_jax.gaussians import Gaussians, mean_color
+from ssplat_jax.lpips import load_lpips, lpips
 from ssplat_jax.metrics import psnr
+from tests.lpips_fixture import random_heads, random_vgg
 
 
 def gaussians(colors, opacities, depth: float = -5.0) -> Gaussians:
@@ -41,3 +43,14 @@ def test_a_view_that_nothing_covers_is_scored_on_the_mean_colour(capture):
     target = capture.image(0)
     assert score.psnr == pytest.approx(psnr(color, target)) and score.coverage == 0 and not depth.any()
     assert score.psnr_over_black == pytest.approx(psnr(np.zeros_like(target), target))
+
+
+def test_lpips_is_scored_where_weights_are_given_and_absent_where_not(capture, compiled_plainly, tmp_path):
+    np.savez(tmp_path / "vgg.npz", **random_vgg())
+    np.savez(tmp_path / "heads.npz", **random_heads())
+    weights = load_lpips(tmp_path / "vgg.npz", tmp_path / "heads.npz")
+    scene, frame = gaussians([[0.2, 0.4, 0.6]], [0.9]), capture.stream_frame(StreamConfig(), (0, 1, 3, 4))
+    score, color, _ = score_view(scene, capture, 2, frame, weights)
+    expected = float(lpips(weights, jnp.asarray(color), jnp.asarray(capture.image(2))))
+    assert score.lpips == pytest.approx(expected, rel=1e-5) and expected > 0.1
+    assert score_view(scene, capture, 2, frame)[0].lpips is None

@@ -1,11 +1,15 @@
 """What the experiments compute beside what they measure, and how the command line finds them."""
 
 from importlib.metadata import entry_points
+from typing import get_args
 
+import numpy as np
 import pytest
 
-from experiments.accuracy_vs_time import mark_front
-from ssplat_jax.cli import Experiment, guarded
+from experiments.accuracy_vs_time import SCORED, SETTINGS, mark_front
+from experiments.depth_error import cell_depths, summary
+from ssplat_jax.cli import Experiment, QualityName, guarded
+from ssplat_jax.config import QUALITIES
 
 
 def row(ms, psnr):
@@ -20,9 +24,34 @@ def test_the_front_holds_what_nothing_beats_in_both():
         assert a["front"] != beaten
 
 
+def test_the_qualities_are_settings_that_were_measured():
+    measured = {setting.quality: setting for setting in SETTINGS if setting.quality}
+    assert measured.keys() == QUALITIES.keys() == set(get_args(QualityName))
+    for name, quality in QUALITIES.items():
+        assert measured[name].changes == dict(quality.changes)
+        assert measured[name].size == tuple(quality.scale * side for side in SCORED)
+
+
+def test_depth_errors_are_free_of_one_global_scale_and_binned_by_confidence():
+    confidences = np.array([0.2, 0.55, 0.65, 0.95, 1.0])
+    row = summary(3.0 * np.array([2.0, 1.1, 1.0, 1.0, 1.02]), confidences, tau=0.5)
+    assert row["accepted"] == 0.8 and row["global_scale"] == pytest.approx(3.03)
+    errors = [entry["median_error"] for entry in row["by_confidence"] if entry["tokens"]]
+    np.testing.assert_allclose(errors, [0.9802, 0.0891, 0.0099, 0.0099], atol=1e-4)
+    assert sum(entry["tokens"] for entry in row["by_confidence"]) == 5
+
+
+def test_a_cell_s_depth_is_the_median_of_what_is_known_of_it():
+    depth = np.zeros((9, 8), np.float32)
+    depth[:4, :4] = np.arange(1, 17).reshape(4, 4)
+    depth[:2, 4:] = 5.0
+    depth[4, 4] = 7.0
+    np.testing.assert_array_equal(cell_depths(depth), [[8.0, 5.0], [0.0, 0.0]])
+
+
 def test_every_registered_experiment_can_be_loaded():
     points = entry_points(group="ssplat_jax.experiments")
-    assert {"captures", "accuracy_vs_time"} <= {point.name for point in points}
+    assert {"captures", "accuracy_vs_time", "ablation", "depth_error"} <= {point.name for point in points}
     assert all(callable(point.load()) for point in points)
 
 

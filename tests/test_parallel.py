@@ -357,6 +357,7 @@ def common_rows(a, b):
     return len(pairs), in_a, in_b
 
 
+@pytest.mark.slow
 def test_streams_together_are_each_what_it_is_alone(streamed):
     sharded, alone = streamed["sharded"], streamed["alone"]
     is_padding = np.arange(len(sharded["caches"])) == PADDED_STEP
@@ -370,16 +371,19 @@ def test_streams_together_are_each_what_it_is_alone(streamed):
         assert_close_to_one_device(kept, outputs, stream, wanted)
 
 
+@pytest.mark.slow
 def test_padding_of_one_stream_changes_nothing_of_it(streamed):
     before, after = (part(streamed["sharded"]["caches"][t], 0) for t in (PADDED_STEP - 1, PADDED_STEP))
     assert_same_bits(after, before)
     assert int(before.num_voxels.min()) > 50
 
 
+@pytest.mark.slow
 def test_one_compilation_for_all_steps(streamed):
     assert streamed["sharded"]["num_compilations"] == 1
 
 
+@pytest.mark.slow
 def test_scenes_are_those_of_the_shards(params, streamed):
     gaussians = streamed["sharded"]["gaussians"]
     for stream, (_, _, wanted) in enumerate(streamed["alone"]):
@@ -392,6 +396,7 @@ def test_scenes_are_those_of_the_shards(params, streamed):
             np.testing.assert_allclose(found.sum(), wanted.opacities.sum(), rtol=STEP_RTOL)
 
 
+@pytest.mark.slow
 def test_all_shards_grow_alike_and_keep_what_they_hold(streamed):
     caches, grown = streamed["sharded"]["caches"][-1], streamed["sharded"]["grown"]
     capacity = 8 * MODEL_CONFIG.capacity

@@ -59,7 +59,9 @@ def grow(cache: VoxelCache, capacity: int) -> VoxelCache:
         for name in ("voxels", "counts", *PIVOT_FIELDS)
         for x in (getattr(cache, name),)
     }
-    return replace(cache, table=jax.jit(build_table)(fields["voxels"], cache.num_voxels), **fields)
+    # Rows that no table leads to (vacc="append") have no voxels of their own to be entered by.
+    num_entered = jnp.where(jnp.any(cache.table >= 0), cache.num_voxels, 0)
+    return replace(cache, table=jax.jit(build_table)(fields["voxels"], num_entered), **fields)
 
 
 def check(cache: VoxelCache, config: StreamConfig) -> None:

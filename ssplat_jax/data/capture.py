@@ -51,6 +51,11 @@ class Capture:
         """All poses, capture frame."""
         return np.stack([frame.camtoworld for frame in self.frames])
 
+    def scaled(self, factor: float) -> "Capture":
+        """The same capture with images of `factor` times the size, at least one pixel."""
+        width, height = (max(1, round(side * factor)) for side in (self.width, self.height))
+        return dataclasses.replace(self, width=width, height=height)
+
     def crop(self, i: int) -> Crop:
         """What the delivered image shows of the stored one."""
         return Crop.cover((self.frames[i].width, self.frames[i].height), (self.width, self.height))

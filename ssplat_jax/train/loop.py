@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from ssplat_jax.checkpoint.training import TrainingCheckpoints
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.interrupts import Interrupts
+from ssplat_jax.lpips import LpipsWeights
 from ssplat_jax.stream import StreamSplat
 from ssplat_jax.train.recipe import Recipe, training_config
 from ssplat_jax.train.samples import prefetched, sample_for_step
@@ -34,6 +35,7 @@ def train(
     out: Path,
     *,
     params: dict | None = None,
+    lpips_weights: LpipsWeights | None = None,
     save_every: int = 200,
     log_every: int = 10,
     report: Callable[[dict], None] = lambda record: None,
@@ -45,6 +47,7 @@ def train(
         recipe: phases and optimiser.
         out: directory of `log.jsonl`, `recipe.json` and `checkpoints/`.
         params: start from these instead of from the recipe's seed (ignored on resume).
+        lpips_weights: with them the rendering loss is the paper's, MSE + 0.05 LPIPS.
         save_every: steps between checkpoints; SIGINT and SIGTERM save too.
         log_every: steps between records (means over the steps between).
         report: called with every record.
@@ -54,7 +57,9 @@ def train(
         StorageError: a checkpoint cannot be written or read.
     """
     model = StreamSplat(training_config(config, recipe))
-    description = {"config": model.config.to_dict(), "recipe": dataclasses.asdict(recipe)}
+    description: dict = {"config": model.config.to_dict(), "recipe": dataclasses.asdict(recipe)}
+    if lpips_weights is not None:
+        description["rendering_loss"] = "MSE + 0.05 LPIPS"
     checkpoints = TrainingCheckpoints(out, description)
     state, start = init_state(model, recipe, params), 0
     if (restored := checkpoints.restore_latest(state)) is not None:
@@ -70,7 +75,8 @@ def train(
             for i, sample in samples:
                 waited += time.perf_counter() - before
                 rate = jnp.asarray(learning_rate(recipe, i), jnp.float32)
-                state, metrics = trainer.step(state, sample, rate, form=recipe.phase_at(i)[0].form)
+                form = recipe.phase_at(i)[0].form
+                state, metrics = trainer.step(state, sample, rate, form=form, lpips_weights=lpips_weights)
                 window.append(metrics)
                 step = i + 1
                 if step % log_every == 0 or step == recipe.num_steps:

@@ -10,10 +10,11 @@ from jaxtyping import Array, Float, Int
 
 from ssplat_jax.cache import Tokens
 from ssplat_jax.gaussians import Gaussians, mask_gaussians
+from ssplat_jax.lpips import LpipsWeights
 from ssplat_jax.render import render
 from ssplat_jax.stream import StreamSplat
 from ssplat_jax.struct import pytree
-from ssplat_jax.train.losses import depth_loss, image_gradient_l1
+from ssplat_jax.train.losses import depth_loss, rendering_loss
 from ssplat_jax.train.recipe import PAPER_FORM, PhaseForm, Recipe
 from ssplat_jax.train.samples import Sample
 
@@ -91,7 +92,14 @@ def decode_accepted(model: StreamSplat, params: dict, tokens: Tokens) -> Gaussia
     return mask_gaussians(gaussians, tokens.valid & (tokens.confidences >= model.config.min_confidence))
 
 
-def loss_fn(params: dict, model: StreamSplat, sample: Sample, recipe: Recipe, form: PhaseForm):
+def loss_fn(
+    params: dict,
+    model: StreamSplat,
+    sample: Sample,
+    recipe: Recipe,
+    form: PhaseForm,
+    lpips_weights: LpipsWeights | None = None,
+):
     """Loss and the numbers to log. Frozen stages are constants: nothing is computed backward through them."""
     params = {name: jax.lax.stop_gradient(p) if name in form.frozen else p for name, p in params.items()}
     cache, tokens, (entropy, depth_l1) = stream_chunks(model, params, sample, recompute=recipe.recompute)
@@ -102,11 +110,16 @@ def loss_fn(params: dict, model: StreamSplat, sample: Sample, recipe: Recipe, fo
         is_cache = form.decode == "cache"
         gaussians = model.decode(params, cache) if is_cache else decode_accepted(model, params, tokens)
         output = render(gaussians, sample.target_camera, max_pairs=recipe.max_pairs)
-        mse = jnp.mean((output.color - sample.target_images) ** 2)
-        gradients = image_gradient_l1(output.color, sample.target_images)
-        loss = recipe.depth_weight * loss + 10.0 * (mse + recipe.gradient_weight * gradients)
+        rendering = rendering_loss(
+            output.color,
+            sample.target_images,
+            gradient_weight=recipe.gradient_weight,
+            lpips_weights=lpips_weights,
+        )
+        loss = recipe.depth_weight * loss + 10.0 * rendering.total
+        metrics |= {} if rendering.lpips is None else {"lpips": rendering.lpips}
         metrics |= {
-            "psnr": -10 * jnp.log10(mse + 1e-10),
+            "psnr": -10 * jnp.log10(rendering.mse + 1e-10),
             "alpha": output.alpha.mean(),  # pyright: ignore[reportOptionalMemberAccess]
             "overflow": output.num_overflow.astype(jnp.float32),
         }
@@ -121,9 +134,10 @@ def train_step(
     model: StreamSplat,
     recipe: Recipe,
     form: PhaseForm = PAPER_FORM,
+    lpips_weights: LpipsWeights | None = None,
 ) -> tuple[TrainState, dict]:
     """One update. A step with a non-finite gradient changes nothing but the count of such steps."""
-    gradients, metrics = jax.grad(loss_fn, has_aux=True)(state.params, model, sample, recipe, form)
+    gradients, metrics = jax.grad(loss_fn, has_aux=True)(state.params, model, sample, recipe, form, lpips_weights)
     norm = optax.global_norm(gradients)
     is_finite = jnp.isfinite(norm)
     updates, opt_state = optimizer(recipe).update(gradients, state.opt_state, state.params)
@@ -154,6 +168,6 @@ class Trainer:
 
     @functools.cached_property
     def step(self):
-        """`(state, sample, rate, form=PAPER_FORM) -> (state, metrics)`, the state donated."""
+        """`(state, sample, rate, form=PAPER_FORM, lpips_weights=None) -> (state, metrics)`, the state donated."""
         bound = functools.partial(train_step, model=self.model, recipe=self.recipe)
         return jax.jit(bound, donate_argnums=0, static_argnames="form")

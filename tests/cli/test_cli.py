@@ -121,6 +121,8 @@ def test_bad_capture_is_one_line_exit_2_and_nothing_written(case, command, tmp_p
         (("eval", "procedural:room", "--context", "8", "--set", "voxel_size=-1", "--out", "x"), "voxel_size"),
         (("eval", "procedural:room", "--context", "8", "--set", "no_such=1", "--out", "x"), "no_such"),
         (("eval", "procedural:room", "--context", "8", "--weights", "no.npz", "--out", "x"), "no.npz"),
+        (("eval", "procedural:room", "--context", "8", "--lpips-vgg", "vgg.pth", "--out", "x"), "--lpips-heads"),
+        (("train", "--lpips-vgg", "no.pth", "--lpips-heads", "heads.pth", "--out", "x"), "no.pth"),
         (("export", "no_run", "--to", "x.ply"), "no_run"),
         (("inspect", "procedural:castle"), "castle"),
     ],
@@ -169,6 +171,7 @@ def test_run_stops_resumes_and_exports(tmp_path, capsys):
         (("--set", "voxel_size=0.1"), "another config (voxel_size: 0.04 there, 0.1 now)"),
         (("--stride", "2"), "another frames (12 there, 6 now"),
         (("--size", "32x24"), "another size ([64, 48] there, [32, 24] now)"),
+        (("--quality", "fast"), "another size ([64, 48] there, [32, 24] now)"),
     ):
         capsys.readouterr()
         assert run("run", capture, "--out", str(out), *changes, "--quiet") == 2
@@ -179,7 +182,7 @@ def test_run_stops_resumes_and_exports(tmp_path, capsys):
 def test_eval_writes_every_promised_field(tmp_path):
     out = tmp_path / "eval"
     arguments = ("eval", "procedural:room?frames=12&size=64x48", "--context", "8", "--out", str(out), "--quiet")
-    assert run(*arguments) == 0
+    assert run(*arguments, "--quality", "fast") == 0
     metrics = json.loads((out / "metrics.json").read_text())
     promised = {
         "psnr", "ssim", "lpips", "per_view", "context_views", "target_views", "chunk_ms", "render_ms", "compile_s",
@@ -190,5 +193,7 @@ def test_eval_writes_every_promised_field(tmp_path):
     assert {"nearest_view_psnr", "mean_colour_psnr"} <= metrics["baselines"].keys()
     assert metrics["context_views"] == 8 and metrics["target_views"] == len(metrics["per_view"]) == 1
     assert metrics["cache"]["pivots"] >= metrics["cache"]["decoded"] == metrics["num_gaussians"] > 0
+    # Streamed at half the size, scored at the whole.
+    assert (metrics["streamed_size"], metrics["size"]) == ([32, 24], [64, 48])
     with Image.open(out / "view_00004.png") as picture:
         assert picture.size == (3 * 64, 48)

@@ -265,6 +265,18 @@ def test_a_capture_point_is_seen_at_the_same_pixel_after_size_and_stream_frame()
         np.testing.assert_allclose(depths, 2.5 * in_camera[:, 2], rtol=1e-5)
 
 
+def test_a_scaled_capture_is_seen_alike_by_smaller_images():
+    capture = resized(smooth_capture(), 40, 40)
+    half = capture.scaled(0.5)
+    assert (half.width, half.height) == (20, 20)
+    point = np.array([0.1, -0.2, 2.0])
+    for i in range(len(capture)):
+        pixels = [(c.K(i) @ point)[:2] / point[2] for c in (half, capture)]
+        np.testing.assert_allclose(2 * pixels[0], pixels[1], rtol=1e-12)
+        np.testing.assert_allclose(half.image(i).mean(axis=(0, 1)), capture.image(i).mean(axis=(0, 1)), atol=0.01)
+    assert (capture.scaled(1e-9).width, capture.scaled(1e-9).height) == (1, 1)
+
+
 def test_chunks_hold_the_frames_in_order_and_pad_the_last():
     capture = smooth_capture()
     frame = frame_of(capture)

@@ -234,6 +234,7 @@ def test_8_without_alignment_voxels_fall_otherwise_but_stand_for_the_same_places
         assert (distances > UNSHIFTED).mean() > 0.02  # so alignment is not for nothing
 
 
+@pytest.mark.slow
 def test_8_depth_range_and_scale_of_matched_captures_move_along():
     """Of images large enough for keypoints; those above are too small, and their scale is guessed from the steps."""
     capture = open_capture("procedural:room?frames=4&size=160x120")

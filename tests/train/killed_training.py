@@ -1,0 +1,33 @@
+"""A short training run of the narrow model in a process of its own: `python -m tests.train.killed_training OUT`.
+
+Prints every step it has done; at the end the state, flattened, is in `final.npz`.
+"""
+
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from ssplat_jax.train import loop
+from ssplat_jax.train.recipe import smoke_recipe
+from tests.test_stream import NARROW
+
+STEPS = 200
+
+
+def main(out: Path) -> None:
+    result = loop.train(
+        NARROW,
+        smoke_recipe(STEPS),
+        out,
+        save_every=10,
+        log_every=1,
+        report=lambda record: print(record["step"], flush=True),
+    )
+    leaves = jax.tree_util.tree_flatten_with_path(result.state)[0]
+    np.savez(out / "final.npz", **{jax.tree_util.keystr(path): np.asarray(leaf) for path, leaf in leaves})
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))
