@@ -28,6 +28,21 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 
 
+# Workers take whole files, in this order: the long ones first, so that no worker ends long after the others.
+LONG_FILES = (
+    "tests/train/",
+    "tests/test_stream.py",
+    "tests/cli/",
+    "tests/model/test_predict.py",
+    "tests/test_parallel.py",
+)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Puts the long files first."""
+    items.sort(key=lambda item: not item.nodeid.startswith(LONG_FILES))
+
+
 def _shared(name: str) -> Path:
     folder = SHARED / name
     if not folder.is_dir():

@@ -59,6 +59,7 @@ def test_equal_images_are_at_zero_and_at_rest(image, weights):
     assert float(value) == 0 and not np.asarray(gradient).any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("other", [BLACK, GREY], ids=["black", "grey"])
 def test_symmetric_and_finite_against_flat_images(other, weights):
     forward, gradient = distance_and_gradient(weights, other, NOISE)
@@ -77,6 +78,7 @@ def test_features_that_are_off_have_no_gradient_rather_than_nan(bias, weights):
         assert float(value) == 0 and not np.asarray(gradient).any()
 
 
+@pytest.mark.slow
 def test_leading_axes_are_pairs_of_their_own(weights):
     a, b = jnp.stack([BLACK, NOISE])[:, None], jnp.stack([NOISE, GREY])[:, None]
     parts = layers(weights, a, b)

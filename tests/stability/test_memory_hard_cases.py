@@ -422,6 +422,7 @@ def _(given):
     return given, limit
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("k", [0, D - 1])
 def test_matched_at_an_end_of_the_candidates(k):
     given = surely(ordinary(), k)
@@ -472,6 +473,7 @@ def test_hard_features(name):
         limit(*results)
 
 
+@pytest.mark.slow
 def test_one_candidate_is_certain():
     """D = 1 through the matcher; what is read from it is among the anchor's cases."""
     config = CONFIG.replace(num_depths=1, fine_matching=False)

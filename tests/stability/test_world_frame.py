@@ -166,6 +166,7 @@ def pairs(points, others):
     return cKDTree(others).query(points)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("vacc", ["voxel", "append"])
 @pytest.mark.parametrize("name", MOTIONS)
 def test_8_moving_the_world_moves_the_gaussians(open_moved, name, vacc):
@@ -211,6 +212,7 @@ def elsewhere(frame: StreamFrame) -> StreamFrame:
     return dataclasses.replace(frame, rotation=TURN @ frame.rotation, origin=frame.origin + SOMEWHERE / 7)
 
 
+@pytest.mark.slow
 def test_8_without_alignment_every_token_still_moves_with_the_world(open_moved):
     """The network hears relative poses only. A token in a hundred may fall into another pixel by rounding."""
     aligned = stream(open_moved(None), "append")
@@ -220,6 +222,7 @@ def test_8_without_alignment_every_token_still_moves_with_the_world(open_moved):
         assert np.quantile(errors.reshape(len(errors), -1).max(axis=1), SHARE) < UNSHIFTED
 
 
+@pytest.mark.slow
 def test_8_without_alignment_voxels_fall_otherwise_but_stand_for_the_same_places(open_moved):
     """One chunk: the next ones are anchored to where the pivots of the first came to lie.
 
