@@ -20,6 +20,7 @@ from ssplat_jax.checkpoint.weights import load_params
 from ssplat_jax.config import preset
 from ssplat_jax.data.capture import Capture, open_capture
 from ssplat_jax.data.protocol import interleaved
+from ssplat_jax.errors import InputError
 from ssplat_jax.export.atomic import write_atomic
 from ssplat_jax.model import GRID_STRIDE
 from ssplat_jax.report import Reporter
@@ -67,12 +68,15 @@ def measure(capture: Capture, stride: int, context: int) -> dict[str, Any]:
         output = session.feed(chunk)
         for v in np.flatnonzero(np.asarray(chunk.valid)):
             depth = capture.depth(next(views))
-            assert depth is not None, "captures of this experiment have depth maps"
+            if depth is None:
+                continue  # not every frame need have a map
             truth = frame.scale * cell_depths(depth)
             rows, columns = truth.shape
             ratio = np.asarray(output.depths[v])[:rows, :columns] / np.where(truth > 0, truth, np.nan)
             ratios.append(ratio[truth > 0])
             confidences.append(np.asarray(output.confidences[v])[:rows, :columns][truth > 0])
+    if not ratios:
+        raise InputError(f"experiment depth_error: {capture.name} has no depth map among its context frames.")
     return summary(np.concatenate(ratios), np.concatenate(confidences), model.config.min_confidence)
 
 
