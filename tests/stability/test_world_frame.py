@@ -25,6 +25,7 @@ from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.geometry.rotations import quats_to_matrices
 from ssplat_jax.stream import StreamSplat
 from tests.geometry.test_rotations import rodrigues
+from tests.model import small
 from tests.model.small import random_params
 from tests.model.test_plane_sweep import WALL, texture
 
@@ -33,20 +34,11 @@ SHARE = 0.99  # of the Gaussians
 FRAMES, SIDE = 8, 64
 VOXEL = 0.25  # stream units: large enough that tokens of an untrained network merge
 
-CONFIG = StreamConfig(
-    encoder_widths=(8, 16),
-    encoder_blocks=1,
+CONFIG = small.CONFIG.replace(
+    chunk_size=4,
     attention_blocks=1,
+    attention_window=StreamConfig().attention_window,
     fine_matching=False,
-    match_width=8,
-    num_depths=12,
-    unet_width=8,
-    token_width=16,
-    cgfi_width=8,
-    mixer_blocks=1,
-    mixer_neighbours=4,
-    mixer_proj=8,
-    min_confidence=0.0,
     sh_degree=1,
     voxel_size=VOXEL,
     capacity=4096,
