@@ -9,7 +9,7 @@ import dataclasses
 import functools
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -158,7 +158,7 @@ def compile_fuse(config: StreamConfig, capacity: int, chunk: Tokens) -> jax.stag
     return jax.jit(lambda cache, tokens: fuse(cache, tokens, config), donate_argnums=0).lower(cache, chunk).compile()
 
 
-def take_turns(calls: list[Callable[[], object]], repeats: int) -> list[float]:
+def take_turns(calls: Sequence[Callable[[], object]], repeats: int) -> list[float]:
     """Least seconds of each call, taken in turns after two calls of warming up."""
     seconds = [[_seconds(call) for call in calls] for _ in range(repeats + 2)][2:]
     return [min(column) for column in zip(*seconds, strict=True)]
