@@ -45,6 +45,7 @@ def test_a_view_that_nothing_covers_is_scored_on_the_mean_colour(capture):
     assert score.psnr_over_black == pytest.approx(psnr(np.zeros_like(target), target))
 
 
+@pytest.mark.slow  # a whole evaluation
 def test_lpips_is_scored_where_weights_are_given_and_absent_where_not(capture, compiled_plainly, tmp_path):
     np.savez(tmp_path / "vgg.npz", **random_vgg())
     np.savez(tmp_path / "heads.npz", **random_heads())

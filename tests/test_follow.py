@@ -55,8 +55,9 @@ def assert_same_scene(told, scene):
         )
 
 
-@pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS)
-def test_the_changes_put_together_are_the_scene(config):
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n == "evict" else n for n in CONFIGS])
+def test_the_changes_put_together_are_the_scene(name):
+    config = CONFIGS[name]
     model, params, rng = StreamSplat(config), decoder_params(config), np.random.default_rng(0)
     cache, feed, told = init_cache(config, CAPACITY), SceneFeed(model, params), None
     decode = jax.jit(model.decode)

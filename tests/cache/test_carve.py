@@ -147,7 +147,7 @@ def test_switched_off_it_is_the_identity_and_leaves_no_trace():
 
 
 @SETTINGS
-@given(seed=SEED, camera_seed=SEED, size=st.sampled_from([(HEIGHT, GRID_WIDTH), (40, 33), (32, 64)]))
+@given(seed=SEED, camera_seed=SEED, size=st.sampled_from([(HEIGHT, GRID_WIDTH), (40, 33)]))
 def test_judging_equals_the_loop(seed, camera_seed, size):
     height, width = size
     cache, views, rng = init_cache(CONFIG, CAPACITY), [], np.random.default_rng(seed)

@@ -8,12 +8,13 @@ from ssplat_jax.checkpoint.weights import load_params, load_weights, save_weight
 from ssplat_jax.config import preset
 from ssplat_jax.errors import InputError, StorageError
 from ssplat_jax.model import init_params
+from tests.model.small import random_params
 from tests.test_stream import NARROW
 
 
 @pytest.fixture(scope="module")
 def params():
-    return init_params(jax.random.key(1), NARROW)
+    return random_params(NARROW)
 
 
 @pytest.fixture

@@ -31,17 +31,19 @@ def run(*arguments: str) -> int:
 
 
 def make_capture(folder, num_frames=6, size=(32, 24)):
-    """A small valid transforms.json capture: a camera sliding along a random wall."""
-    rng = np.random.default_rng(0)
+    """A small valid transforms.json capture: a camera sliding along a chequered wall, three pixels a frame."""
+    width, height = size
+    cells = np.random.default_rng(0).integers(0, 255, (height // 4, width // 4 + num_frames, 3), dtype=np.uint8)
+    wall = cells.repeat(4, axis=0).repeat(4, axis=1)
     (folder / "images").mkdir(parents=True)
     frames = []
     for i in range(num_frames):
-        pixels = rng.integers(0, 255, (size[1], size[0], 3), dtype=np.uint8)
-        Image.fromarray(pixels).save(folder / "images" / f"{i}.png")
+        Image.fromarray(wall[:, 3 * i : 3 * i + width]).save(folder / "images" / f"{i}.png")
         pose = np.eye(4)
         pose[0, 3] = 0.1 * i
         frames.append({"file_path": f"images/{i}.png", "transform_matrix": pose.tolist()})
-    facts = {"w": size[0], "h": size[1], "fl_x": 30.0, "fl_y": 30.0, "cx": 16.0, "cy": 12.0, "frames": frames}
+    facts = {"w": width, "h": height, "fl_x": float(width), "fl_y": float(width), "cx": width / 2, "cy": height / 2}
+    facts["frames"] = frames
     (folder / "transforms.json").write_text(json.dumps(facts))
     return folder
 
@@ -156,7 +158,7 @@ def assert_deltas_give_the_scene(out):
 
 def test_run_stops_resumes_and_exports(tmp_path, capsys):
     out = tmp_path / "run"
-    capture = "procedural:room?frames=12&size=64x48"
+    capture = str(make_capture(tmp_path / "capture", num_frames=12, size=(64, 48)))
     assert run("run", capture, "--out", str(out), "--save-every", "1", "--deltas", "--quiet") == 0
     assert {"scene.ply", "state.npz", "metrics.json"} <= {p.name for p in out.iterdir()}
     assert_deltas_give_the_scene(out)
@@ -181,7 +183,8 @@ def test_run_stops_resumes_and_exports(tmp_path, capsys):
 
 def test_eval_writes_every_promised_field(tmp_path):
     out = tmp_path / "eval"
-    arguments = ("eval", "procedural:room?frames=12&size=64x48", "--context", "8", "--out", str(out), "--quiet")
+    capture = make_capture(tmp_path / "capture", num_frames=12, size=(128, 96))
+    arguments = ("eval", str(capture), "--context", "8", "--out", str(out), "--quiet")
     assert run(*arguments, "--quality", "fast") == 0
     metrics = json.loads((out / "metrics.json").read_text())
     promised = {
@@ -194,6 +197,6 @@ def test_eval_writes_every_promised_field(tmp_path):
     assert metrics["context_views"] == 8 and metrics["target_views"] == len(metrics["per_view"]) == 1
     assert metrics["cache"]["pivots"] >= metrics["cache"]["decoded"] == metrics["num_gaussians"] > 0
     # Streamed at half the size, scored at the whole.
-    assert (metrics["streamed_size"], metrics["size"]) == ([32, 24], [64, 48])
+    assert (metrics["streamed_size"], metrics["size"]) == ([64, 48], [128, 96])
     with Image.open(out / "view_00004.png") as picture:
-        assert picture.size == (3 * 64, 48)
+        assert picture.size == (3 * 128, 96)

@@ -195,6 +195,7 @@ def test_scaled_scene_looks_the_same_from_scaled_cameras():
     assert np.quantile(np.abs(np.asarray(images) - np.asarray(scaled_images)), 0.99) < 0.01
 
 
+@pytest.mark.slow  # renders at four times the size
 def test_supersampling_converges_to_the_mean_of_finer_images():
     """Two rays a pixel agree with the mean of a four times finer image better than one does."""
     scene = sample_scene(4)

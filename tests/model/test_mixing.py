@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ssplat_jax.model import init_params, inject_features, mix_tokens
+from ssplat_jax.model import inject_features, mix_tokens
+from ssplat_jax.model.cgfi import Aggregator
 from ssplat_jax.model.layers import rms_normalize
 from ssplat_jax.model.mixer import nearest_tokens
 from ssplat_jax.model.wires import prepare_views
@@ -21,7 +22,8 @@ def maps(seed: int, *channels):
 
 
 def fresh() -> dict:
-    return {"cgfi": jax.jit(lambda key: init_params(key, CONFIG)["cgfi"])(jax.random.key(0))}
+    hints = jnp.zeros((*GRID, C + 1))
+    return {"cgfi": jax.jit(Aggregator(CONFIG).init)(jax.random.key(0), hints[..., :C], hints, views().valid)["params"]}
 
 
 def views():

@@ -196,7 +196,7 @@ def test_the_cache_is_read_and_remembered():
     "changes",
     [
         {"num_depths": 1},
-        {"chunk_size": 1},
+        pytest.param({"chunk_size": 1}, marks=pytest.mark.slow),
         pytest.param({"num_sources": 1, "fine_matching": False}, marks=pytest.mark.slow),
     ],
     ids=str,

@@ -29,7 +29,7 @@ def scene():
     return cloud(degree=3), cameras(21, 30)  # portrait, and no multiple of a tile
 
 
-@pytest.mark.parametrize("antialias", ["mip", "classic", "none"])
+@pytest.mark.parametrize("antialias", ["mip", pytest.param("classic", marks=pytest.mark.slow), "none"])
 def test_both_paths_show_what_the_textbook_says(scene, antialias):
     gaussians, camera = scene
     effects = ALL.replace(antialias=antialias, background=None)
@@ -132,16 +132,6 @@ def test_a_capacity_too_small_is_counted_inside_jit_and_retried_outside(scene):
     assert int(inside.num_overflow) == int(wanted.num_pairs) - 64 > 0
 
 
-def test_keys_wider_than_32_bits_sort_alike(scene, monkeypatch):
-    from ssplat_jax.render import binning
-
-    wanted = render(*scene, max_pairs=1 << 12)
-    monkeypatch.setattr(binning, "KEY_BITS", 4)
-    jax.clear_caches()
-    np.testing.assert_array_equal(render(*scene, max_pairs=1 << 12).color, wanted.color)
-    jax.clear_caches()
-
-
 def test_what_is_given_back_is_what_was_asked_for(scene):
     out = render(*scene, effects=Effects(outputs=("color",)), max_pairs=1 << 12)
     assert out.alpha is None and out.depth is None and out.median_depth is None and out.features is None
@@ -165,3 +155,14 @@ def test_bad_input_says_what_was_wanted(scene, changes, message):
 def test_a_camera_of_no_pixels_is_refused(scene):
     with pytest.raises(InputError, match="1x1"):
         render(scene[0], replace(scene[1], width=0))
+
+
+# Last: it empties the caches of compiled programs.
+def test_keys_wider_than_32_bits_sort_alike(scene, monkeypatch):
+    from ssplat_jax.render import binning
+
+    wanted = render(*scene, max_pairs=1 << 12)
+    monkeypatch.setattr(binning, "KEY_BITS", 4)
+    jax.clear_caches()
+    np.testing.assert_array_equal(render(*scene, max_pairs=1 << 12).color, wanted.color)
+    jax.clear_caches()

@@ -41,7 +41,7 @@ def oracle(quats, points):
     return points + 2 * (quats[:, :1] * turned + np.cross(quats[:, 1:], turned))
 
 
-@pytest.mark.parametrize("rotated", [rotate_all, rotate_broadcast])
+@pytest.mark.parametrize("rotated", [pytest.param(rotate_all, marks=pytest.mark.slow), rotate_broadcast])
 def test_every_row_of_every_batch_size_is_right(rotated):
     rng = np.random.default_rng(0)
     for n in SIZES:

@@ -182,6 +182,7 @@ def test_8_moving_the_world_moves_the_gaussians(open_moved, name, vacc):
         assert np.quantile(np.abs(deviation).reshape(len(nearest), -1).max(axis=1), share) < UNSHIFTED
 
 
+@pytest.mark.slow  # a whole stream
 def test_the_ply_of_a_far_capture_counts_from_an_offset(open_moved, tmp_path):
     """At 6.4e6 float32 has steps of 0.5; from the offset that the file names the scene is as fine as at the origin."""
     far = stream(open_moved("shifted by 6.4e6"), "voxel")
