@@ -29,11 +29,11 @@ from ssplat_jax.train.loop import train
 from ssplat_jax.train.recipe import Phase, PhaseForm, Recipe
 
 VARIANTS: dict[str, dict[str, Any]] = {
-    "baseline": {"vacc": "append", "hpda": False, "cgfi": False},
-    "without VACC": {"vacc": "append"},
+    "full": {},
     "without HPDA": {"hpda": False},
     "without CGFI": {"cgfi": False},
-    "full": {},
+    "without VACC": {"vacc": "append"},
+    "baseline": {"vacc": "append", "hpda": False, "cgfi": False},
 }
 
 
@@ -57,7 +57,7 @@ class Budget:
 
 BUDGETS = {
     "smoke": Budget(steps=4, num_chunks=2, size=(64, 64), seeds=(0,), context=8, scored=(64, 64)),
-    "full": Budget(steps=150, num_chunks=4, size=(96, 128), seeds=(0, 1, 2), context=32, scored=(320, 240)),
+    "full": Budget(steps=100, num_chunks=4, size=(96, 128), seeds=(0, 1, 2), context=32, scored=(320, 240)),
 }
 
 
@@ -67,8 +67,8 @@ def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str
     scenes = _scenes(captures, budget)
     rows, done = [], 0
     with reporter.progress("variants", len(VARIANTS) * len(budget.seeds)) as advance:
-        for variant, changes in VARIANTS.items():
-            for seed in budget.seeds:
+        for seed in budget.seeds:  # outermost: stopped early, the variants have had the same seeds
+            for variant, changes in VARIANTS.items():
                 place = out / variant.replace(" ", "_") / f"seed{seed}"
                 scores = _measure(changes, seed, budget, scenes, place)
                 rows += [{"variant": variant, "seed": seed} | score for score in scores]
@@ -82,20 +82,24 @@ def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str
 def _measure(changes: dict[str, Any], seed: int, budget: Budget, scenes, place: Path) -> list[dict[str, Any]]:
     """Scores of one trained variant on every scene; read back if they stand there."""
     scores = place / "scores.json"
+    asked = json.loads(json.dumps({"budget": dataclasses.asdict(budget), "changes": changes, "scenes": list(scenes)}))
     if scores.exists():
-        return json.loads(scores.read_text())
+        held = json.loads(scores.read_text())
+        if held["asked"] != asked:
+            raise InputError(f"{scores}: was measured with {held['asked']}, wanted {asked}; choose another --out.")
+        return held["rows"]
     config = preset("tiny").replace(**changes)
     trained = train(config, budget.recipe(seed), place, params=load_params("tiny"))
     if trained.interrupted:
         raise KeyboardInterrupt
     rows = []
     for scene, (capture, split) in scenes.items():
-        session = Session(StreamSplat(config), trained.state.params)
+        session = Session(StreamSplat(config), trained.state.ema)
         frame = capture.stream_frame(config, split.context)
         stream_context(session, capture, split, frame)
         psnr = round(mean_psnr(session.gaussians(), capture, split.targets, frame), 3)
         rows.append({"scene": scene, "psnr": psnr, "gaussians": cache_facts(session)["decoded"]})
-    write_atomic(scores, (json.dumps(rows, indent=1) + "\n").encode())
+    write_atomic(scores, (json.dumps({"asked": asked, "rows": rows}, indent=1) + "\n").encode())
     return rows
 
 

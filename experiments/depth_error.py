@@ -30,6 +30,7 @@ from ssplat_jax.stream import StreamSplat
 SIZE = (320, 240)
 CONTEXT = {"full": 64, "smoke": 8}
 STRIDES = {"redkitchen": 5}
+EDGE = 1.05  # depth ratio within a cell that is no longer one surface
 EDGES = (0.0, 0.3, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)  # of the bins of confidence
 
 
@@ -81,13 +82,20 @@ def measure(capture: Capture, stride: int, context: int) -> dict[str, Any]:
 
 
 def cell_depths(depth: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "hf wf"]:
-    """Median of the known depths of each whole grid cell; 0 where fewer than half of its pixels are known."""
+    """Median of the known depths of each whole grid cell; 0 where fewer than half of its pixels are known.
+
+    Of an even number the mean of the middle two, unless an edge lies between them: then the nearer.
+    """
     rows, columns = (side // GRID_STRIDE for side in depth.shape)
     cells = depth[: rows * GRID_STRIDE, : columns * GRID_STRIDE].reshape(rows, GRID_STRIDE, columns, GRID_STRIDE)
     cells = np.moveaxis(cells, 2, 1).reshape(rows, columns, -1)
     known = np.sort(np.where(cells > 0, cells, np.inf), axis=-1)
     num_known = (cells > 0).sum(axis=-1)
-    middle = np.take_along_axis(known, np.maximum(num_known - 1, 0)[..., None] // 2, axis=-1)[..., 0]
+    lower, upper = (
+        np.take_along_axis(known, np.clip(i, 0, cells.shape[-1] - 1)[..., None], axis=-1)[..., 0]
+        for i in ((num_known - 1) // 2, num_known // 2)
+    )
+    middle = np.where(upper <= EDGE * lower, 0.5 * (lower + upper), lower)
     return np.where(2 * num_known >= cells.shape[-1], middle, 0.0).astype(np.float32)
 
 

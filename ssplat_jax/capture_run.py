@@ -8,12 +8,13 @@ from pathlib import Path
 import numpy as np
 
 from ssplat_jax.checkpoint.delta import save_delta
-from ssplat_jax.checkpoint.state import load_newest_state, load_state, restore_previous, save_state
+from ssplat_jax.checkpoint.state import load_newest_state, restore_previous, save_state
+from ssplat_jax.checkpoint.weights import params_digest
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.data.capture import Capture, open_capture
 from ssplat_jax.data.frame import StreamFrame
-from ssplat_jax.errors import InputError, StorageError
-from ssplat_jax.evaluate import cache_facts, save_comparison, score_view
+from ssplat_jax.errors import InputError, StorageError, require_positive
+from ssplat_jax.evaluate import cache_facts, check_scorable, save_comparison, score_view
 from ssplat_jax.export.atomic import previous_path, write_atomic
 from ssplat_jax.export.ply import ExportReport, save_ply
 from ssplat_jax.follow import SceneFeed
@@ -24,6 +25,7 @@ from ssplat_jax.session import Session
 from ssplat_jax.stream import StreamSplat
 
 STATE_FILE, SCENE_FILE, METRICS_FILE = "state.npz", "scene.ply", "metrics.json"
+PICTURES = "views"
 DELTAS = "deltas"  # <views so far>.npz: the changes of one chunk
 NUM_PICTURES = 8  # views of the stream, evenly spread, rendered from the finished scene
 
@@ -61,15 +63,27 @@ def run_capture(
         InputError: the capture is unusable, or `out` holds a run of another capture or configuration.
         StorageError: `out` cannot be written or its state is corrupt.
     """
+    require_positive(stride=stride, save_every=save_every)
+    if max_views is not None:
+        require_positive(max_views=max_views)
     capture = open_capture(path, size=size).scaled(scale)
+    check_scorable(capture)
     indices = list(range(0, len(capture), stride))[:max_views]
     capture.verify(indices)
     if overwrite and out.exists():
         for stale in (out / STATE_FILE, previous_path(out / STATE_FILE), out / SCENE_FILE, out / METRICS_FILE):
             stale.unlink(missing_ok=True)
-        shutil.rmtree(out / DELTAS, ignore_errors=True)
-    session, frame, done = _resume(model, params, capture, indices, out, reporter)
-    feed = SceneFeed(model, params, session.cache) if deltas else None
+        for stale in (out / DELTAS, out / PICTURES):
+            shutil.rmtree(stale, ignore_errors=True)
+    identity = _identity(model, params, capture, indices)
+    session, frame, done = _resume(model, params, capture, indices, identity, out, reporter)
+    feed = None
+    if deltas:
+        # Without the changes up to here, the first delta is the whole scene: what the folder holds always adds up.
+        is_told = done == 0 or _delta_path(out, done).exists()
+        feed = SceneFeed(model, params, session.cache if is_told else None)
+        if not is_told and done == len(indices) and session.cache is not None:
+            save_delta(_delta_path(out, done), feed.update(session.cache))
     with Interrupts() as interrupts, reporter.progress("streaming", len(indices)) as advance:
         advance(done)
         if done < len(indices):
@@ -77,63 +91,77 @@ def run_capture(
                 session.feed(chunk)
                 done += int(np.asarray(chunk.valid).sum())
                 if feed is not None and session.cache is not None:
-                    save_delta(out / DELTAS / f"{done:06d}.npz", feed.update(session.cache))
+                    save_delta(_delta_path(out, done), feed.update(session.cache))
                 advance(done)
-                if interrupts.received or (number + 1) % save_every == 0 or done == len(indices):
-                    _save(session, frame, capture, indices, done, out)
-                if interrupts.received:
-                    break
-    if interrupts.received:
-        return RunResult(done, cache_facts(session)["decoded"], interrupts.received)
-    _finish(session, frame, capture, indices, out, reporter)
-    return RunResult(done, cache_facts(session)["decoded"], None)
+                stopped = interrupts.received  # read once: a signal may come at any time
+                if stopped or (number + 1) % save_every == 0 or done == len(indices):
+                    _save(session, frame, identity, done, out)
+                if stopped:
+                    return RunResult(done, cache_facts(session)["decoded"], stopped)
+    report = _finish(session, frame, capture, indices, out, reporter)
+    return RunResult(done, report.num_written, None)
 
 
-def export_run(run_dir: Path, to: Path, params: dict) -> ExportReport:
+def export_run(run_dir: Path, to: Path, params: dict, reporter: Reporter) -> ExportReport:
     """Decodes the saved state of a run and writes its scene, in the capture's frame, to `to`.
 
+    Of a damaged state the one saved before it is taken, which is said.
+
     Raises:
-        InputError: no run there, or `to` is not a .ply.
+        InputError: no run there, a run with other weights, or `to` is not a .ply.
         StorageError: the state is corrupt or `to` cannot be written.
     """
     if to.suffix != ".ply":
         raise InputError(f"--to: wanted a .ply file, got {to.name!r}.")
-    if not (run_dir / STATE_FILE).exists():
+    state = run_dir / STATE_FILE
+    if not state.exists() and not previous_path(state).exists():
         raise InputError(f"{run_dir}: wanted the folder of an `ssplat run`, found no {STATE_FILE} in it.")
-    cache, header = load_state(run_dir / STATE_FILE)
+    cache, header, damage = load_newest_state(state)
+    if damage is not None:
+        reporter.warn(f"{damage} Exporting the state saved before it, after {header['done']} views.")
+    if header["weights"] != params_digest(params):
+        raise InputError(f"{run_dir}: was streamed with other weights than these; give the run's own with --weights.")
     session = Session(StreamSplat(StreamConfig.from_dict(header["config"])), params, cache)
-    return save_scene(to, session.gaussians(), _frame_from(header["frame"]))
+    return save_scene(to, session.gaussians(), _frame_from(header["frame"]), reporter)
 
 
-def save_scene(path: Path, gaussians: Gaussians, frame: StreamFrame) -> ExportReport:
+def save_scene(path: Path, gaussians: Gaussians, frame: StreamFrame, reporter: Reporter) -> ExportReport:
     """Writes Gaussians of the stream in the capture's frame; far from its origin, from the frame's offset."""
     offset = frame.offset
-    return save_ply(path, frame.gaussians_to_capture(gaussians, offset=offset), offset=offset)
+    report = save_ply(path, frame.gaussians_to_capture(gaussians, offset=offset), offset=offset)
+    if any(offset):
+        reporter.warn(f"{path.name}: the capture lies far from its origin; positions are counted from {list(offset)}.")
+    return report
 
 
-def _identity(model: StreamSplat, capture: Capture, indices: list[int]) -> dict:
+def _delta_path(out: Path, done: int) -> Path:
+    return out / DELTAS / f"{done:06d}.npz"
+
+
+def _identity(model: StreamSplat, params: dict, capture: Capture, indices: list[int]) -> dict:
     """What must be equal for a run to be continued."""
     return {
         "config": model.config.to_dict(),
         "capture": capture.name,
         "size": [capture.width, capture.height],
         "frames": indices,
+        "poses": capture.digest(indices),
+        "weights": params_digest(params),
     }
 
 
 def _resume(
-    model, params, capture: Capture, indices: list[int], out: Path, reporter: Reporter
+    model, params, capture: Capture, indices: list[int], identity: dict, out: Path, reporter: Reporter
 ) -> tuple[Session, StreamFrame, int]:
     """The session that `out` holds, or a new one; of a damaged state the one saved before it, which is said."""
     state = out / STATE_FILE
     if not state.exists() and not previous_path(state).exists():
         return Session(model, params), capture.stream_frame(model.config, indices), 0
     cache, header, damage = load_newest_state(state)
-    wanted = _identity(model, capture, indices)
-    for name, value in wanted.items():
-        if header[name] != value:
+    for name, value in identity.items():
+        if (held := header.get(name)) != value:
             raise InputError(
-                f"{out}: holds a run with another {name} ({_difference(header[name], value)}); choose another --out,"
+                f"{out}: holds a run with another {name} ({_difference(held, value)}); choose another --out,"
                 " repeat the old options, or start anew with --overwrite."
             )
     if damage is not None:
@@ -153,9 +181,9 @@ def _difference(held, wanted) -> str:
     return f"{held!r} there, {wanted!r} now"
 
 
-def _save(session: Session, frame: StreamFrame, capture, indices, done: int, out: Path) -> None:
+def _save(session: Session, frame: StreamFrame, identity: dict, done: int, out: Path) -> None:
     assert session.cache is not None
-    header = _identity(session.model, capture, indices) | {"frame": _frame_to(frame), "done": done}
+    header = identity | {"frame": _frame_to(frame), "done": done}
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -185,15 +213,11 @@ def _frame_from(fields: dict) -> StreamFrame:
 
 def _finish(
     session: Session, frame: StreamFrame, capture: Capture, indices: list[int], out: Path, reporter: Reporter
-) -> None:
+) -> ExportReport:
     """Scene, pictures and metrics of a finished stream."""
     gaussians = session.gaussians()
-    report = save_scene(out / SCENE_FILE, gaussians, frame)
-    if any(report.offset):
-        reporter.warn(
-            f"{SCENE_FILE}: the capture lies far from its origin; positions are counted from {list(report.offset)}."
-        )
-    pictures = out / "views"
+    report = save_scene(out / SCENE_FILE, gaussians, frame, reporter)
+    pictures = out / PICTURES
     shutil.rmtree(pictures, ignore_errors=True)
     shown = sorted({indices[round(i)] for i in np.linspace(0, len(indices) - 1, NUM_PICTURES)})
     scores = []
@@ -214,3 +238,4 @@ def _finish(
         "config_hash": session.model.config.hash,
     }
     write_atomic(out / METRICS_FILE, (json.dumps(metrics, indent=1) + "\n").encode())
+    return report

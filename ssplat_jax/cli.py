@@ -6,6 +6,7 @@ JAX is imported by the commands, not here: `ssplat --help` answers at once. Exit
 
 import dataclasses
 import json
+import math
 import re
 import sys
 from pathlib import Path
@@ -14,7 +15,7 @@ from typing import Annotated, Literal
 import tyro
 
 from ssplat_jax.config import QUALITIES, StreamConfig, preset
-from ssplat_jax.errors import CacheError, InputError, StorageError
+from ssplat_jax.errors import CacheError, InputError, StorageError, require_positive
 
 EXIT_INPUT, EXIT_STORAGE, EXIT_MEMORY = 2, 3, 4
 
@@ -223,14 +224,18 @@ class Train:
     """Print only the closing line."""
 
     def run(self) -> int:
-        from ssplat_jax.checkpoint.weights import load_weights, save_weights
+        from ssplat_jax.checkpoint.weights import check_params, load_weights, save_weights
         from ssplat_jax.report import Reporter
         from ssplat_jax.train.loop import train
         from ssplat_jax.train.recipe import RECIPES
 
+        require_positive(scale_steps=self.scale_steps, save_every=self.save_every)
         config = apply_changes(preset(self.preset), self.set)
         recipe = dataclasses.replace(RECIPES[self.preset].scaled(self.scale_steps), seed=self.seed)
-        params = load_weights(self.init_weights)[0] if self.init_weights else None
+        params = None
+        if self.init_weights:
+            params = load_weights(self.init_weights)[0]
+            check_params(params, config, str(self.init_weights))
         lpips_weights = load_lpips_weights(self.lpips_vgg, self.lpips_heads)
         with Reporter(self.quiet).progress("training", recipe.num_steps) as advance:
             result = train(
@@ -245,7 +250,12 @@ class Train:
         if result.interrupted:
             print(f"stopped at step {result.step}; the same command continues", file=sys.stderr)
             return 128 + result.interrupted
-        provenance = {"recipe": dataclasses.asdict(recipe), "steps": result.step}
+        provenance = {
+            "recipe": dataclasses.asdict(recipe),
+            "steps": result.step,
+            "init_weights": self.init_weights and self.init_weights.name,
+            "rendering_loss": "MSE + 0.05 LPIPS" if lpips_weights else "MSE + image gradients",
+        }
         save_weights(self.out / "weights.npz", result.state.ema, config, provenance)
         print(f"wrote {self.out}/weights.npz after {result.step} steps")
         return 0
@@ -268,8 +278,9 @@ class Export:
     def run(self) -> int:
         from ssplat_jax.capture_run import export_run
         from ssplat_jax.checkpoint.weights import load_params
+        from ssplat_jax.report import Reporter
 
-        report = export_run(self.run_dir, self.to, load_params(self.weights))
+        report = export_run(self.run_dir, self.to, load_params(self.weights), Reporter(quiet=False))
         print(
             f"wrote {self.to}: {report.num_written} Gaussians ({report.num_dropped} invisible or not finite left out)"
         )
@@ -315,7 +326,8 @@ class Experiment:
 
     name: Annotated[str, tyro.conf.Positional]
     """captures: novel views of real captures. accuracy_vs_time: what accuracy costs in time.
-    ablation: what the cache's modules are worth. depth_error: errors of depth, and whether confidence knows them."""
+    ablation: what the cache's modules are worth. depth_error: errors of depth, and whether confidence knows them.
+    more_views: the paper's protocol over growing numbers of views."""
     out: Path
     """Tables, plots and pictures."""
     captures: Path | None = None
@@ -364,27 +376,27 @@ def apply_changes(config: StreamConfig, changes: tuple[str, ...]) -> StreamConfi
     """
     parsed = {}
     for change in changes:
-        name, equals, value = change.partition("=")
+        name, equals, text = change.partition("=")
         if not equals:
             raise InputError(f"--set: wanted field=value, got {change!r}; for example --set voxel_size=0.02.")
-        held = getattr(config, name, None)
         try:
-            parsed[name] = json.loads(value)
+            value = json.loads(text)
         except json.JSONDecodeError:
-            parsed[name] = value
-        is_number = isinstance(held, (int, float)) and not isinstance(held, bool)
-        if (is_number and not isinstance(parsed[name], (int, float))) or isinstance(held, bool) != isinstance(
-            parsed[name], bool
-        ):
-            raise InputError(f"--set {name}: wanted a value like {held!r}, got {value!r}.")
-        if isinstance(held, float) and isinstance(parsed[name], int):
-            parsed[name] = float(parsed[name])
+            value = math.inf if text == "inf" else text
+        value = tuple(value) if isinstance(value, list) else value
+        held = getattr(config, name, value)  # of an unknown field, `replace` says so
+        # A field that takes a word or a number (scene_scale) holds a word; the configuration itself judges both.
+        if not isinstance(held, str):
+            value = float(value) if isinstance(held, float) and type(value) is int else value
+            if type(value) is not type(held):
+                raise InputError(f"--set {name}: wanted a value like {held!r}, got {text!r}.")
+        parsed[name] = value
     return config.replace(**parsed)
 
 
 def load_model(weights: str, changes: tuple[str, ...], quality: QualityName = "accurate"):
     """(model, params) of a preset's shipped weights or of a weights file; the quality's changes, then `changes`."""
-    from ssplat_jax.checkpoint.weights import load_params, load_weights
+    from ssplat_jax.checkpoint.weights import check_params, load_params, load_weights
     from ssplat_jax.config import PRESETS
     from ssplat_jax.stream import StreamSplat
 
@@ -394,8 +406,10 @@ def load_model(weights: str, changes: tuple[str, ...], quality: QualityName = "a
         params, config = load_weights(Path(weights))
     else:
         params, config = load_params(weights), preset("tiny")
-    config = config.replace(**dict(QUALITIES[quality].changes))
-    return StreamSplat(apply_changes(config, changes)), params
+    changed = apply_changes(config.replace(**dict(QUALITIES[quality].changes)), changes)
+    if changed != config:
+        check_params(params, changed, weights)
+    return StreamSplat(changed), params
 
 
 def load_lpips_weights(vgg: Path | None, heads: Path | None):

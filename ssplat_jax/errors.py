@@ -8,6 +8,17 @@ class InputError(ValueError):
     """
 
 
+def require_positive(**numbers: int | float) -> None:
+    """Refuses options below what counts one thing.
+
+    Raises:
+        InputError: naming the first number that is not positive.
+    """
+    for name, value in numbers.items():
+        if not value > 0:
+            raise InputError(f"--{name.replace('_', '-')}: wanted a number above 0, got {value}.")
+
+
 class StorageError(OSError):
     """Reading or writing saved state failed: a full disk, a corrupt checkpoint. Exit code 3."""
 

@@ -16,6 +16,7 @@ from PIL import Image
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.frame import StreamFrame
 from ssplat_jax.data.protocol import Split
+from ssplat_jax.errors import InputError, StorageError
 from ssplat_jax.export.atomic import write_atomic
 from ssplat_jax.gaussians import Gaussians, mean_color
 from ssplat_jax.lpips import LpipsWeights, check_size, lpips
@@ -61,6 +62,19 @@ def stream_context(
 
 
 _lpips = jax.jit(lpips)
+
+
+def check_scorable(capture: Capture) -> None:
+    """Refuses images that SSIM's window does not fit in.
+
+    Raises:
+        InputError: a side is below 11 pixels.
+    """
+    if min(capture.width, capture.height) < (least := SSIM_ARGUMENTS["win_size"]):
+        raise InputError(
+            f"{capture.name}: wanted images of at least {least} pixels a side, got {capture.width}x{capture.height};"
+            " give a larger --size."
+        )
 
 
 def score_view(
@@ -162,19 +176,28 @@ def evaluate(
     streamed: Capture | None = None,
     lpips_weights: LpipsWeights | None = None,
 ) -> dict:
-    """Streams, scores and times; writes `metrics.json` and a picture per target (target | render | depth) into `out`.
+    """Streams, scores and times; writes `metrics.json`, `split.json` and a picture per target into `out`.
+
+    A picture is target | render | depth. `split.json` holds the frames used; its SHA-256 is in the metrics.
 
     `capture` is scored; `streamed` (default: `capture` itself) is the same at the size that is streamed. Every frame is
     decoded once before anything is written, so that a damaged one leaves no half of a result. Without `lpips_weights`
     the fields `lpips` are null.
 
     Raises:
-        InputError: a frame is damaged, or too small for LPIPS where its weights are given.
+        InputError: a frame is damaged or too small to be scored.
         StorageError: `out` cannot be written.
     """
+    check_scorable(capture)
     if lpips_weights is not None:
         check_size(capture.height, capture.width)
     capture.verify((*split.context, *split.targets))
+    try:  # before the long part
+        out.mkdir(parents=True, exist_ok=True)
+        for stale in out.glob("view_*.png"):  # of another split
+            stale.unlink()
+    except OSError as error:
+        raise StorageError(f"{out}: cannot be written ({error.strerror}); choose another --out.") from error
     streamed = streamed or capture
     frame = streamed.stream_frame(session.model.config, split.context)
     reference = baselines(capture, split)
@@ -182,7 +205,6 @@ def evaluate(
         recent = stream_context(session, streamed, split, frame, advance)
     gaussians = session.gaussians()
     facts = cache_facts(session)
-    out.mkdir(parents=True, exist_ok=True)
     scores = []
     for i in split.targets:
         score, color, depth = score_view(gaussians, capture, i, frame, lpips_weights)
@@ -215,6 +237,7 @@ def evaluate(
         "baselines": reference,
         "per_view": [dataclasses.asdict(s) for s in scores],
     }
+    write_atomic(out / "split.json", split.to_json().encode())
     write_atomic(out / "metrics.json", (json.dumps(metrics, indent=1) + "\n").encode())
     return metrics
 

@@ -69,7 +69,7 @@ class SceneFeed:
 
 
 def apply_delta(scene: Gaussians | None, delta: SceneDelta) -> Gaussians:
-    """`scene` (None: nothing yet) with the changes: what `decode` gives, row for row."""
+    """`scene` (None: nothing yet) with the changes: what `decode` gives, row for row, once a delta has had rows."""
     num_rows = len(delta.rows)
     k = delta.gaussians.num_gaussians // num_rows if num_rows else 1
     places = (delta.rows[:, None] * k + np.arange(k)).reshape(-1)

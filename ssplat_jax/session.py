@@ -7,6 +7,7 @@ import jax
 from ssplat_jax.cache import VoxelCache, check, ensure_room
 from ssplat_jax.cache.state import init_cache
 from ssplat_jax.chunk import Chunk
+from ssplat_jax.config import StreamConfig
 from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.model import GRID_STRIDE
 from ssplat_jax.stream import ChunkOutput, StreamSplat
@@ -40,7 +41,7 @@ class Session:
         """
         config, num_tokens = self.model.config, tokens_per_chunk(chunk, self.model.config.size_multiple)
         if self.cache is None:
-            self.cache = init_cache(config, starting_capacity(config.capacity, num_tokens))
+            self.cache = init_cache(config, starting_capacity(config, num_tokens))
         self.cache = ensure_room(self.cache, config, num_tokens)
         step = self._program(chunk)
         self.cache, out = jax.block_until_ready(step(self.params, self.cache, chunk))
@@ -85,6 +86,8 @@ def tokens_per_chunk(chunk: Chunk, size_multiple: int) -> int:
     return v * padded // GRID_STRIDE**2
 
 
-def starting_capacity(configured: int, num_tokens: int) -> int:
-    """The configured capacity, or the power of two that holds the first chunks whatever they show."""
-    return max(configured, 1 << (ROOM_AT_START * num_tokens - 1).bit_length())
+def starting_capacity(config: StreamConfig, num_tokens: int) -> int:
+    """The configured capacity; if it may grow, at least the power of two that holds the first chunks in any case."""
+    if config.overflow != "grow":
+        return config.capacity
+    return max(config.capacity, 1 << (ROOM_AT_START * num_tokens - 1).bit_length())

@@ -51,7 +51,7 @@ def test_a_cell_s_depth_is_the_median_of_what_is_known_of_it():
 
 def test_every_registered_experiment_can_be_loaded():
     points = entry_points(group="ssplat_jax.experiments")
-    assert {"captures", "accuracy_vs_time", "ablation", "depth_error"} <= {point.name for point in points}
+    assert {"captures", "accuracy_vs_time", "ablation", "depth_error", "more_views"} <= {point.name for point in points}
     assert all(callable(point.load()) for point in points)
 
 

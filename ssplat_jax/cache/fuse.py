@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Int
 
 from ssplat_jax.cache.policy import evict
-from ssplat_jax.cache.state import PIVOT_FIELDS, CacheStats, Tokens, VoxelCache
+from ssplat_jax.cache.state import PIVOT_FIELDS, CacheStats, Tokens, VoxelCache, add_to
 from ssplat_jax.cache.table import build_table, find_rows, group_equal, insert_rows, shards_of
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.errors import InputError
@@ -105,10 +105,10 @@ def fuse_touched(cache: VoxelCache, tokens: Tokens, config: StreamConfig) -> tup
     num_placed = jnp.sum(plan.rows >= 0, dtype=jnp.int32)
     stats = replace(
         stats,
-        num_accepted=stats.num_accepted + num_placed,
-        num_merged=stats.num_merged + num_placed - jnp.sum(appends >= 0, dtype=jnp.int32),
-        num_dropped=stats.num_dropped + jnp.sum(accepted, dtype=jnp.int32) - num_placed,
-        num_evicted=stats.num_evicted + num_evicted,
+        num_accepted=add_to(stats.num_accepted, num_placed),
+        num_merged=add_to(stats.num_merged, num_placed - jnp.sum(appends >= 0, dtype=jnp.int32)),
+        num_dropped=add_to(stats.num_dropped, jnp.sum(accepted, dtype=jnp.int32) - num_placed),
+        num_evicted=add_to(stats.num_evicted, num_evicted),
     )
     return replace(cache, counts=counts, stats=stats, **pivots), _touched(plan)
 
@@ -128,10 +128,10 @@ def _classify(
     stats = replace(
         stats,
         num_chunks=stats.num_chunks + jnp.any(tokens.valid).astype(jnp.int32),
-        num_seen=stats.num_seen + count(tokens.valid),
-        num_non_finite=stats.num_non_finite + count(~finite),
-        num_low_confidence=stats.num_low_confidence + count(finite & ~confident),
-        num_out_of_range=stats.num_out_of_range + count(finite & confident & ~in_range),
+        num_seen=add_to(stats.num_seen, count(tokens.valid)),
+        num_non_finite=add_to(stats.num_non_finite, count(~finite)),
+        num_low_confidence=add_to(stats.num_low_confidence, count(finite & ~confident)),
+        num_out_of_range=add_to(stats.num_out_of_range, count(finite & confident & ~in_range)),
     )
     return stats, voxels, accepted
 

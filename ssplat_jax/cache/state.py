@@ -5,12 +5,21 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ssplat_jax.cache.table import SLOTS_PER_ROW
 from ssplat_jax.config import StreamConfig
+from ssplat_jax.errors import InputError
 from ssplat_jax.struct import pytree
+
+
+def add_to(counter: Int[Array, ""], more: Int[Array, ""]) -> Int[Array, ""]:
+    """`counter + more`, both not negative, that stops at the largest integer instead of turning negative."""
+    return counter + jnp.minimum(more, jnp.iinfo(counter.dtype).max - counter)
 
 
 @pytree
 class CacheStats:
-    """Counters over the whole stream: what only the running program knows. Read them outside jit; `check` does."""
+    """Counters over the whole stream: what only the running program knows. Read them outside jit; `check` does.
+
+    They stop at 2^31 - 1 (`add_to`): tokens of 4 views at 1080p are that many after 4000 chunks.
+    """
 
     num_chunks: Int[Array, ""]
     num_seen: Int[Array, ""]  # tokens of valid views offered to the cache
@@ -119,8 +128,14 @@ def init_witnesses(config: StreamConfig) -> Witnesses:
 
 
 def init_cache(config: StreamConfig, capacity: int | None = None) -> VoxelCache:
-    """An empty cache of `capacity` voxels (default: the config's)."""
-    capacity = capacity or config.capacity
+    """An empty cache of `capacity` voxels (default: the config's).
+
+    Raises:
+        InputError: `capacity` is no power of two, which the hash table's masks need.
+    """
+    capacity = config.capacity if capacity is None else capacity
+    if capacity < 1 or capacity & (capacity - 1):
+        raise InputError(f"cache: capacity must be a power of two, got {capacity}.")
     k, c = config.pivots_per_voxel, config.token_width
     zero = lambda: jnp.zeros((), jnp.int32)  # noqa: E731 - one fresh buffer per counter, so that all can be donated
     return VoxelCache(

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -11,6 +12,17 @@ from ssplat_jax.errors import InputError, StorageError
 from ssplat_jax.export.atomic import write_atomic
 
 RECIPE_FILE = "recipe.json"
+
+
+def first_difference(held: Any, wanted: Any, name: str = "") -> tuple[str, Any, Any] | None:
+    """(path, held, wanted) of the first place where two JSON values differ, or None."""
+    if isinstance(held, dict) and isinstance(wanted, dict):
+        pairs = [(f"{name}.{k}".lstrip("."), held.get(k), wanted.get(k)) for k in sorted(held.keys() | wanted.keys())]
+    elif isinstance(held, list) and isinstance(wanted, list) and len(held) == len(wanted):
+        pairs = [(f"{name}[{i}]", a, b) for i, (a, b) in enumerate(zip(held, wanted, strict=True))]
+    else:
+        return None if held == wanted else (name, held, wanted)
+    return next((found for path, a, b in pairs if (found := first_difference(a, b, path)) is not None), None)
 
 
 class TrainingCheckpoints:
@@ -37,13 +49,12 @@ class TrainingCheckpoints:
         if not path.exists():
             write_atomic(path, json.dumps(description, indent=1, sort_keys=True).encode())
             return
-        held = json.loads(path.read_text())
-        for name in sorted(held.keys() | description.keys()):
-            if held.get(name) != description.get(name):
-                raise InputError(
-                    f"{path}: this directory holds a run with {name} = {held.get(name)!r}, wanted"
-                    f" {description.get(name)!r}; choose another --out or repeat the old options."
-                )
+        if (found := first_difference(json.loads(path.read_text()), description)) is not None:
+            name, held, wanted = found
+            raise InputError(
+                f"{path}: this directory holds a run with {name} = {held!r}, wanted {wanted!r}; choose another --out"
+                " or repeat the old options."
+            )
 
     def save(self, step: int, state) -> None:
         """Writes `state` as `step`; returns when it is on disk."""

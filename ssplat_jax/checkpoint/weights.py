@@ -1,7 +1,10 @@
 """Weights files: parameters by path, float16 on disk, float32 in use."""
 
+import hashlib
+from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -54,9 +57,30 @@ def load_params(name: str = "tiny") -> dict:
         return _restore(path, arrays, preset(name))
 
 
-def _restore(path: Path, arrays: dict[str, np.ndarray], config: StreamConfig) -> dict:
+def params_digest(params: dict) -> str:
+    """Twelve hex digits that name these parameters in saved states."""
+    digest = hashlib.sha256()
+    for leaf in jax.tree.leaves(params):  # dicts are traversed in the order of their keys
+        digest.update(np.ascontiguousarray(leaf).tobytes())
+    return digest.hexdigest()[:12]
+
+
+def check_params(params: dict, config: StreamConfig, origin: str) -> None:
+    """Whether `params` are those of a model with `config`.
+
+    Raises:
+        InputError: `config` wants other names or shapes; `origin` says where the parameters came from.
+    """
+    named = {"/".join(k.key for k in keys): leaf for keys, leaf in jax.tree_util.tree_flatten_with_path(params)[0]}
+    _restore(origin, named, config)
+
+
+def _restore(path: Path | str, arrays: Mapping[str, Any], config: StreamConfig) -> dict:
     """Arrays by path as the tree that `config` wants, every shape checked."""
     wanted = jax.eval_shape(lambda key: init_params(key, config), jax.random.key(0))
+    names = {"/".join(k.key for k in keys) for keys, _ in jax.tree_util.tree_flatten_with_path(wanted)[0]}
+    if unknown := sorted(arrays.keys() - names):
+        raise InputError(f"{path}: {unknown[0]} is no parameter of this config; the weights are of another config.")
 
     def leaf(keys, shape):
         name = "/".join(k.key for k in keys)

@@ -5,6 +5,7 @@ use, so that damage is found before anything is written.
 """
 
 import dataclasses
+import hashlib
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -26,7 +27,7 @@ from ssplat_jax.geometry.cameras import Camera
 
 READERS = (transforms_json,)
 PROCEDURAL = "procedural"
-PROCEDURAL_FRAMES = 72  # 64 context views and the interleaved targets between them
+PROCEDURAL_FRAMES = 73  # 64 context views and the 9 interleaved targets between them
 PROCEDURAL_SIZE = (128, 96)  # (width, height): a demo on two cores ends within two minutes
 MAX_SIDE = 16384  # of a delivered image
 
@@ -50,6 +51,14 @@ class Capture:
     def camtoworlds(self) -> Float64[np.ndarray, "v 4 4"]:
         """All poses, capture frame."""
         return np.stack([frame.camtoworld for frame in self.frames])
+
+    def digest(self, indices: Sequence[int]) -> str:
+        """Twelve hex digits that name the poses, intrinsics and file names of the frames `indices`."""
+        digest = hashlib.sha256()
+        for frame in (self.frames[i] for i in indices):
+            digest.update(f"{frame.name}\n".encode())
+            digest.update(frame.camtoworld.tobytes() + frame.K.tobytes())
+        return digest.hexdigest()[:12]
 
     def scaled(self, factor: float) -> "Capture":
         """The same capture with images of `factor` times the size, at least one pixel."""
@@ -144,7 +153,7 @@ class Capture:
 def open_capture(path: str | Path, *, size: tuple[int, int] | None = None) -> Capture:
     """The capture at `path`: a folder with a transforms.json, such a file, or `procedural:NAME`.
 
-    `procedural:room?frames=72&size=128x96&seed=0`; scenes are room, orbit, corridor. `size` is the (width, height) of
+    `procedural:room?frames=73&size=128x96&seed=0`; scenes are room, orbit, corridor. `size` is the (width, height) of
     delivered images: stored ones are scaled to cover it and cropped at the centre, `K` following exactly.
 
     Raises:
@@ -202,7 +211,7 @@ def _procedural(spec: str, size: tuple[int, int] | None) -> Capture:
     name, _, query = spec.removeprefix(f"{PROCEDURAL}:").partition("?")
     options = dict(parse_qsl(query, keep_blank_values=True))
     if unknown := sorted(set(options) - {"frames", "size", "seed"}):
-        fix = f"write {PROCEDURAL}:{name}?frames=72&size=128x96&seed=0"
+        fix = f"write {PROCEDURAL}:{name}?frames={PROCEDURAL_FRAMES}&size=128x96&seed=0"
         raise refusal(spec, wanted="the options frames, size, seed", got=echo(unknown[0]), fix=fix)
     num_frames = _whole(spec, "frames", options.get("frames", str(PROCEDURAL_FRAMES)), 1, 100_000)
     seed = _whole(spec, "seed", options.get("seed", "0"), 0, 2**31 - 1)
@@ -228,7 +237,8 @@ def _procedural(spec: str, size: tuple[int, int] | None) -> Capture:
         for i, (fx, fy, cx, cy) in enumerate(intrinsics)
     )
     pixels = ArrayPixels(images=np.asarray(images, np.float32), depths=np.asarray(depths, np.float32))
-    return _capture(Listing(name=f"{PROCEDURAL}-{name}", frames=frames), PROCEDURAL, pixels, size)
+    title = f"{PROCEDURAL}-{name}" + (f"-seed{seed}" if seed else "")
+    return _capture(Listing(name=title, frames=frames), PROCEDURAL, pixels, size)
 
 
 def _whole(spec: str, option: str, text: str, low: int, high: int) -> int:

@@ -16,7 +16,8 @@ def write_atomic(path: str | os.PathLike, data: bytes, *, keep_previous: bool = 
     Args:
         path: where to; its folder is made.
         data: the whole file.
-        keep_previous: what was at `path` stays as `previous_path(path)`.
+        keep_previous: what was at `path` stays as `previous_path(path)`. Between the two renames there is no `path`:
+            readers then look there.
 
     Raises:
         StorageError: the folder cannot be made or the file not written; what was at `path` is there as before (or,

@@ -130,6 +130,7 @@ def load_ply(path: str | os.PathLike) -> Gaussians:
         Opacity logits of +-inf (other writers' unguarded logits) give 0 and 1; any other entry that is not finite in
         float32 is refused.
         Scales are clamped to [e^-20, e^20]; quaternions are normalised, a zero one becomes the identity.
+        A comment `offset x y z` (`save_ply`) is not added: positions stay what float32 holds exactly.
 
     Raises:
         InputError: the file is no 3DGS PLY, is cut off, or holds entries that are not finite.

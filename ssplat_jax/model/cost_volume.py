@@ -22,7 +22,9 @@ def sweep_pixels(views: Views, reference, source) -> tuple[Float[Array, "d n 2"]
     cells = pixel_grid(hf * GRID_STRIDE, wf * GRID_STRIDE, GRID_STRIDE).reshape(-1, 2)
     rays = unproject(cells, jnp.ones(cells.shape[0]), views.Ks[reference])
     points = rays[None] * jnp.exp(views.log_candidates)[:, None, None]
-    source_from_reference = views.viewmats[source] @ invert_poses(views.viewmats[reference])
+    source_from_reference = jnp.matmul(
+        views.viewmats[source], invert_poses(views.viewmats[reference]), precision=jax.lax.Precision.HIGHEST
+    )
     points = transform_points(source_from_reference[None], points)
     pixels, depths = project_points(points, views.Ks[source][None], MIN_SOURCE_DEPTH)
     x, y = pixels[..., 0], pixels[..., 1]

@@ -79,7 +79,7 @@ class Encoder(nn.Module):
     def __call__(
         self, images: Float[Array, "v h w 3"], sources: Int[Array, "v s"], source_valid: Bool[Array, "v s"]
     ) -> Features:
-        x = (images - jnp.array(IMAGE_MEAN)) / jnp.array(IMAGE_STD)
+        x = (images - jnp.array(IMAGE_MEAN, images.dtype)) / jnp.array(IMAGE_STD, images.dtype)
         x = nn.relu(instance_norm(self.stem(x)))
         for block in self.fine_blocks:
             x = block(x)

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Num
 from ssplat_jax.errors import InputError
 from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.geometry.cameras import Camera
-from ssplat_jax.render.binning import Grid, bin_splats, count_pairs
+from ssplat_jax.render.binning import MOST_PAIRS, Grid, bin_splats, count_pairs
 from ssplat_jax.render.effects import Effects
 from ssplat_jax.render.output import RenderOutput, finish, splat_channels
 from ssplat_jax.render.projection import Splats, cull_non_finite, project
@@ -62,19 +62,43 @@ def render(
         tile: side of a tile in pixels, 8 or 16: 16 where most Gaussians are larger than 8 pixels.
 
     Raises:
-        InputError: an array does not have the shape above, or an effect lacks its array.
+        InputError: an array does not have the shape above, an effect lacks its array, or (outside jit) there are more
+            pairs than 2^31.
     """
     effects = effects or Effects()
     inputs = Inputs(gaussians, camera, features, captured, distortion, exposures)
     _check(inputs, effects)
+    inputs = _at_least_one_row(inputs)
+    in_trace = max_pairs or default_max_pairs(inputs.gaussians, camera)
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(inputs)):
-        return _render(inputs, effects, max_pairs or default_max_pairs(gaussians, camera), tile)
+        return _render(inputs, effects, in_trace, tile)
     if max_pairs is None:
-        max_pairs = round_up(int(_count(inputs, effects, tile)))
+        counted = _count(inputs, effects, tile)
+        if isinstance(counted, Tracer):  # a traced function closes over these arrays
+            return _render(inputs, effects, in_trace, tile)
+        max_pairs = _room_for(int(counted))
     out = _render_jit(inputs, effects, max_pairs, tile)
-    if int(out.num_overflow):
-        out = _render_jit(inputs, effects, round_up(int(out.num_pairs)), tile)
+    if not isinstance(out.num_overflow, Tracer) and int(out.num_overflow):
+        out = _render_jit(inputs, effects, _room_for(int(out.num_pairs)), tile)
     return out
+
+
+def _room_for(num_pairs: int) -> int:
+    """`round_up`, for a number that an index can reach."""
+    if num_pairs >= MOST_PAIRS:
+        raise InputError(
+            f"render: wanted fewer than {MOST_PAIRS} pairs of a tile and a Gaussian, got more; render fewer cameras at"
+            " once or with tile=16."
+        )
+    return round_up(num_pairs)
+
+
+def _at_least_one_row(inputs: Inputs) -> Inputs:
+    """A scene of no Gaussians gets an absent one: arrays of no rows have nothing to index."""
+    if inputs.gaussians.num_gaussians:
+        return inputs
+    one = jax.tree.map(lambda x: jnp.zeros((1, *x.shape[1:]), x.dtype), (inputs.gaussians, inputs.features))
+    return replace(inputs, gaussians=one[0], features=one[1])
 
 
 def default_max_pairs(gaussians: Gaussians, camera: Camera) -> int:

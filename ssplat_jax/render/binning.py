@@ -15,6 +15,7 @@ from ssplat_jax.render.projection import Splats
 from ssplat_jax.struct import pytree, static
 
 PARTS = 4  # turns of the loop in `take_rows`; a loop of one is none
+MOST_PAIRS = (1 << 31) - 1  # what an index reaches; counts of pairs stop there
 KEY_BITS = 32  # keys wider than this are sorted as 64-bit integers
 
 
@@ -62,9 +63,15 @@ def tile_boxes(splats: Splats, grid: Grid) -> Int[Array, "m 4"]:
 
 
 def count_pairs(splats: Splats, grid: Grid) -> Int[Array, ""]:
-    """Pairs that `bin_splats` needs room for."""
+    """Pairs that `bin_splats` needs room for; `MOST_PAIRS` stands for any number from there on."""
     boxes = tile_boxes(splats, grid)
-    return jnp.sum(boxes[:, 2] * boxes[:, 3])
+    return _running_sum(boxes[:, 2] * boxes[:, 3])[-1]
+
+
+def _running_sum(counts: Int[Array, " m"]) -> Int[Array, " m"]:
+    """Inclusive sums that stop at `MOST_PAIRS`: 20,000 Gaussians before all tiles of a 4k image already pass it."""
+    with jax.enable_x64(True):
+        return jnp.minimum(jnp.cumsum(counts.astype(jnp.int64)), MOST_PAIRS).astype(jnp.int32)
 
 
 def depth_order(splats: Splats) -> Int[Array, " m"]:
@@ -88,7 +95,7 @@ def bin_splats(splats: Splats, grid: Grid, max_pairs: int) -> Pairs:
     visible_first = jnp.arange(num_rows) < jnp.sum(splats.visible)
     boxes = jnp.where(visible_first[:, None], take_rows(tile_boxes(splats, grid), order), 0)
     counts = boxes[:, 2] * boxes[:, 3]
-    ends = jnp.cumsum(counts)
+    ends = _running_sum(counts)
     ranks = _owners(ends, max_pairs)
     tiles_per_image = grid.rows * grid.columns
     first_tiles = (order // splats.depths.shape[1]) * tiles_per_image + boxes[:, 1] * grid.columns + boxes[:, 0]

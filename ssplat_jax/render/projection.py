@@ -13,7 +13,7 @@ from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.geometry.rotations import quats_to_matrices
 from ssplat_jax.render import constants
-from ssplat_jax.render.distortion import distort, is_folded
+from ssplat_jax.render.distortion import distort, is_folded, lens_field
 from ssplat_jax.render.effects import Effects
 from ssplat_jax.struct import pytree, replace
 
@@ -77,7 +77,7 @@ def project(
         Scales below about 1e-6 px under the Mip filter are invisible (compensation 0), with a zero gradient.
         Larger than 1e8 px on the screen, or that far from it in 1e9 px: invisible, zero gradient.
         Quaternions of any length; zero counts as the identity.
-        Where the distortion polynomial has folded back: invisible, zero gradient.
+        Beyond where the distortion polynomial first turns back, or 89.4 degrees off axis: invisible, zero gradient.
     """
     x, y, z = camera_points(gaussians.means, camera.viewmats)
     in_front = z > constants.NEAR
@@ -85,13 +85,15 @@ def project(
     fx, fy, cx, cy = (camera.Ks[:, i, j, None] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
     tan_x, tan_y = x / z, y / z
     if effects.distortion and distortion is not None:
-        in_front &= ~is_folded(distort(tan_x, tan_y, distortion)[1])
+        turn, corner = lens_field(jax.lax.stop_gradient(distortion), _corner(jax.lax.stop_gradient(camera)))
+        is_seen = tan_x * tan_x + tan_y * tan_y <= (turn * turn)[:, None]
+        in_front &= is_seen & ~is_folded(distort(tan_x, tan_y, distortion)[1])
         tan_x, tan_y = (jnp.where(in_front, tan, 0.0) for tan in (tan_x, tan_y))
         means2d = distort(tan_x, tan_y, distortion)[0]
     else:
-        distortion, means2d = None, (tan_x, tan_y)
+        distortion, corner, means2d = None, None, (tan_x, tan_y)
     means2d = jnp.stack([fx * means2d[0] + cx, fy * means2d[1] + cy], axis=-1)
-    roots = _screen_roots(gaussians, camera, (tan_x, tan_y, z), distortion)
+    roots = _screen_roots(gaussians, camera, (tan_x, tan_y, z), distortion, corner)
     conics, variances, compensation = _filtered(*roots, effects)
     opacities = gaussians.opacities * compensation
     visible = (
@@ -113,14 +115,23 @@ def project(
     )
 
 
-def _screen_roots(gaussians: Gaussians, camera: Camera, points: tuple[Float[Array, "b n"], ...], distortion):
+def _corner(camera: Camera) -> Float[Array, " b"]:
+    """Distance of the farthest corner of the image, with its margin, from the axis: a tangent, if nothing distorts."""
+    margin = 1 + constants.FRUSTUM_MARGIN
+    fx, fy, cx, cy = (camera.Ks[:, i, j] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    return margin * jnp.hypot(jnp.maximum(cx, camera.width - cx) / fx, jnp.maximum(cy, camera.height - cy) / fy)
+
+
+def _screen_roots(gaussians: Gaussians, camera: Camera, points: tuple[Float[Array, "b n"], ...], distortion, corner):
     """Rows of M = J W R S, a square root of the screen covariance, at (x / z, y / z, z); each a triple of `[b n]`."""
     tan_x, tan_y, z = points
     fx, fy, cx, cy = (camera.Ks[:, i, j, None] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
     margin_x = constants.FRUSTUM_MARGIN * 0.5 * camera.width / fx
     margin_y = constants.FRUSTUM_MARGIN * 0.5 * camera.height / fy
-    tan_x = jnp.clip(tan_x, -cx / fx - margin_x, (camera.width - cx) / fx + margin_x)
-    tan_y = jnp.clip(tan_y, -cy / fy - margin_y, (camera.height - cy) / fy + margin_y)
+    # A barrel lens sees farther than its image is wide: up to there, nothing is clamped.
+    wider = 1.0 if corner is None else jnp.maximum(corner / _corner(camera), 1.0)[:, None]
+    tan_x = jnp.clip(tan_x, wider * (-cx / fx - margin_x), wider * ((camera.width - cx) / fx + margin_x))
+    tan_y = jnp.clip(tan_y, wider * (-cy / fy - margin_y), wider * ((camera.height - cy) / fy + margin_y))
     world = camera.viewmats[:, :3, :3, None]  # b 3 3 1
     # Rows of J W: what a world displacement does to the pixel.
     to_u = [(world[:, 0, j] - tan_x * world[:, 2, j]) / z for j in range(3)]

@@ -58,7 +58,7 @@ def sh_colors(
     Degree 0 does not look at `directions`, which may then be None, and gives one colour per Gaussian: `[n 3]`.
 
     Limits:
-        0.5 + sum <= 0 gives 0, with a zero gradient.
+        0.5 + sum < 0 gives 0, with a zero gradient; exactly 0 gets half of it.
     """
     if degree == 0 or directions is None:
         return jnp.maximum(0.5 + SH_C0 * sh[:, 0, :], 0.0)

@@ -46,7 +46,7 @@ def filter_3d(gaussians: Gaussians, captured: Camera) -> Gaussians:
         Scale 0: opacity 0 (the mass of a point is nothing), gradient finite.
     """
     rates = jax.lax.stop_gradient(sampling_rates(gaussians.means, captured))
-    lowest = jnp.min(jnp.where(rates > 0, rates, jnp.inf))
+    lowest = jnp.min(jnp.where((rates > 0) & (gaussians.opacities > 0), rates, jnp.inf))
     rates = jnp.where(rates > 0, rates, lowest)
     variances = constants.MIP3D_VARIANCE / (rates * rates)  # 0 where nothing is seen at all
     squares = gaussians.scales**2 + variances[:, None]

@@ -1,12 +1,16 @@
 """Capacity: growth changes nothing, and what the other policies lose is counted."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from ssplat_jax.cache import check, ensure_room, grow, init_cache
+from ssplat_jax.cache.state import add_to
 from ssplat_jax.cache.table import find_rows
 from ssplat_jax.errors import CacheError, InputError
+from ssplat_jax.session import starting_capacity
+from ssplat_jax.struct import replace
 from tests.cache.streams import CONFIG, NUM_TOKENS, Recipe, fuse, to_jax
 from tests.cache.test_invariants import EVICT, assert_same
 
@@ -105,3 +109,23 @@ def test_evict_lowest_needs_voxels():
     config = CONFIG.replace(vacc="append", overflow="evict_lowest")
     with pytest.raises(InputError, match="drop_new"):
         fuse(init_cache(config, 16), to_jax(STREAM[0]), config)
+
+
+@pytest.mark.parametrize("capacity", [0, -4, 100])
+def test_a_capacity_that_the_hash_table_cannot_mask_is_refused(capacity):
+    with pytest.raises(InputError, match="power of two"):
+        init_cache(CONFIG, capacity)
+
+
+@pytest.mark.parametrize(("policy", "wanted"), [("grow", 1 << 18), ("drop_new", 128), ("evict_lowest", 128)])
+def test_a_session_starts_with_room_only_where_the_cache_may_grow(policy, wanted):
+    assert starting_capacity(CONFIG.replace(capacity=128, overflow=policy), 50_000) == wanted
+
+
+def test_counters_stop_instead_of_turning_negative():
+    most = 2**31 - 1
+    for now, more, wanted in ((0, 5, 5), (most - 3, 3, most), (most - 3, 4, most), (most, most, most)):
+        assert int(add_to(jnp.int32(now), jnp.int32(more))) == wanted
+    cache = init_cache(CONFIG)
+    full = replace(cache, stats=replace(cache.stats, num_seen=jnp.int32(most)))
+    assert int(fuse(full, to_jax(STREAM[0]), CONFIG)[0].stats.num_seen) == most

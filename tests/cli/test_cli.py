@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import hashlib
 import json
 import shutil
 import subprocess
@@ -16,8 +17,8 @@ from PIL import Image
 from ssplat_jax import cli
 from ssplat_jax.checkpoint.delta import load_delta
 from ssplat_jax.checkpoint.state import load_state
-from ssplat_jax.checkpoint.weights import load_params
-from ssplat_jax.config import StreamConfig
+from ssplat_jax.checkpoint.weights import load_params, save_weights
+from ssplat_jax.config import StreamConfig, preset
 from ssplat_jax.follow import apply_delta
 from ssplat_jax.stream import StreamSplat
 
@@ -125,6 +126,15 @@ def test_bad_capture_is_one_line_exit_2_and_nothing_written(case, command, tmp_p
         (("eval", "procedural:room", "--context", "8", "--weights", "no.npz", "--out", "x"), "no.npz"),
         (("eval", "procedural:room", "--context", "8", "--lpips-vgg", "vgg.pth", "--out", "x"), "--lpips-heads"),
         (("train", "--lpips-vgg", "no.pth", "--lpips-heads", "heads.pth", "--out", "x"), "no.pth"),
+        (("run", "procedural:room?frames=2&size=32x24", "--stride", "0", "--out", "x"), "--stride"),
+        (("run", "procedural:room?frames=2&size=32x24", "--save-every", "0", "--out", "x"), "--save-every"),
+        (("run", "procedural:room?frames=2&size=32x24", "--max-views", "-1", "--out", "x"), "--max-views"),
+        (("run", "procedural:room?frames=2&size=10x10", "--out", "x"), "11 pixels"),
+        (("train", "--scale-steps", "0", "--out", "x"), "--scale-steps"),
+        (("run", "procedural:room", "--set", "capacity=65536.0", "--out", "x"), "capacity"),
+        (("run", "procedural:room", "--set", "chunk_size=4.5", "--out", "x"), "chunk_size"),
+        (("run", "procedural:room", "--set", "sh_degree=1", "--out", "x"), "another config"),
+        (("train", "--set", "encoder_widths=[16, 0]", "--out", "x"), "encoder_widths"),
         (("export", "no_run", "--to", "x.ply"), "no_run"),
         (("inspect", "procedural:castle"), "castle"),
     ],
@@ -141,6 +151,23 @@ def test_inspect_prints_json(capsys):
     assert run("inspect", "procedural:orbit?frames=12&size=64x48", "--json") == 0
     facts = json.loads(capsys.readouterr().out)
     assert facts["num_frames"] == 12 and facts["near"] < facts["far"]
+
+
+@pytest.mark.parametrize(
+    ("change", "field", "value"),
+    [
+        ("cluster_ratio=inf", "cluster_ratio", float("inf")),
+        ("voxel_size=1", "voxel_size", 1.0),
+        ("encoder_widths=[16, 32]", "encoder_widths", (16, 32)),
+        ("scene_scale=2.5", "scene_scale", 2.5),
+        ("vacc=append", "vacc", "append"),
+        ("carving=false", "carving", False),
+    ],
+)
+def test_set_takes_what_the_field_holds(change, field, value):
+    changed = cli.apply_changes(preset("tiny"), (change,))
+    assert getattr(changed, field) == value and type(getattr(changed, field)) is type(value)
+    hash(changed)
 
 
 def assert_deltas_give_the_scene(out):
@@ -166,6 +193,11 @@ def test_run_stops_resumes_and_exports(tmp_path, capsys):
     assert metrics["cache"]["num_chunks"] == 3
     assert run("export", str(out), "--to", str(tmp_path / "again.ply")) == 0
     assert (tmp_path / "again.ply").read_bytes() == (out / "scene.ply").read_bytes()
+    other = tmp_path / "other.npz"
+    params, config = load_params("tiny"), preset("tiny")
+    save_weights(other, jax.tree.map(lambda x: 0.5 * x, params), config, {})
+    assert run("export", str(out), "--to", str(tmp_path / "wrong.ply"), "--weights", str(other)) == 2
+    assert "other weights" in capsys.readouterr().err and not (tmp_path / "wrong.ply").exists()
     # A finished run is not streamed twice; another configuration is refused.
     assert run("run", capture, "--out", str(out), "--quiet") == 0
     assert json.loads((out / "metrics.json").read_text())["cache"]["num_chunks"] == 3
@@ -174,11 +206,15 @@ def test_run_stops_resumes_and_exports(tmp_path, capsys):
         (("--stride", "2"), "another frames (12 there, 6 now"),
         (("--size", "32x24"), "another size ([64, 48] there, [32, 24] now)"),
         (("--quality", "fast"), "another size ([64, 48] there, [32, 24] now)"),
+        (("--weights", str(other)), "another weights"),
     ):
         capsys.readouterr()
         assert run("run", capture, "--out", str(out), *changes, "--quiet") == 2
         (line,) = capsys.readouterr().err.splitlines()
         assert difference in line and "--overwrite" in line
+    edit("transform_matrix", np.diag([1.0, 1.0, 1.0, 1.0]).tolist())(tmp_path / "capture")  # a corrected pose
+    assert run("run", capture, "--out", str(out), "--quiet") == 2
+    assert "another poses" in capsys.readouterr().err
 
 
 def test_eval_writes_every_promised_field(tmp_path):
@@ -196,6 +232,7 @@ def test_eval_writes_every_promised_field(tmp_path):
     assert {"nearest_view_psnr", "mean_colour_psnr"} <= metrics["baselines"].keys()
     assert metrics["context_views"] == 8 and metrics["target_views"] == len(metrics["per_view"]) == 1
     assert metrics["cache"]["pivots"] >= metrics["cache"]["decoded"] == metrics["num_gaussians"] > 0
+    assert hashlib.sha256((out / "split.json").read_bytes()).hexdigest() == metrics["split_sha256"]
     # Streamed at half the size, scored at the whole.
     assert (metrics["streamed_size"], metrics["size"]) == ([64, 48], [128, 96])
     with Image.open(out / "view_00004.png") as picture:

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from ssplat_jax.errors import InputError
+from ssplat_jax.gaussians import Gaussians, concatenate, mask_gaussians
 from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.render import Effects, effects_for, filter_3d, render
 from ssplat_jax.render.distortion import distort
+from ssplat_jax.render.projection import project
 from ssplat_jax.struct import replace
 from tests.render.scenes import cameras, cloud
 
@@ -149,3 +151,73 @@ def test_what_effects_for_leaves_out_changes_no_pixel():
 def test_unknown_effects_are_refused(fields):
     with pytest.raises(InputError, match="effects:"):
         Effects(**fields)
+
+
+def one(mean, size=0.01) -> Gaussians:
+    return Gaussians(
+        means=jnp.array([mean], jnp.float32),
+        quats=jnp.array([[1.0, 0.0, 0.0, 0.0]]),
+        scales=jnp.full((1, 3), size),
+        opacities=jnp.array([0.9]),
+        sh=jnp.ones((1, 1, 3)),
+    )
+
+
+WIDE = Camera(
+    viewmats=jnp.eye(4),
+    Ks=jnp.array([[200.0, 0, 200], [0, 200.0, 150], [0, 0, 1]]),
+    width=400,
+    height=300,
+)
+
+
+@pytest.mark.parametrize(("lens", "tangent"), [((-0.1, 0.003, 0, 0, 0), 4.1), ((-0.3, 0.03, 0, 0, 0), 2.2)])
+def test_what_a_lens_folds_back_into_the_image_is_not_seen(lens, tangent):
+    # Beyond its first turn the polynomial falls, and beyond its second it rises again: ghosts from the side.
+    lens = jnp.array(lens, jnp.float32)
+    assert 1 + tangent**2 * (3 * lens[0] + tangent**2 * 5 * lens[1]) > 0  # it has turned twice
+    out = render(one([tangent, 0.1, 1.0]), WIDE, effects=Effects(distortion=True), distortion=lens, max_pairs=1 << 12)
+    assert int(out.num_pairs) == 0
+    assert int(render(one([0.2, 0.1, 1.0]), WIDE, effects=Effects(distortion=True), distortion=lens).num_pairs) > 0
+
+
+@pytest.mark.parametrize("mean", [(1.6, 1.2, 1.0), (0.3, -0.2, 1.0), (-1.5, 1.1, 1.0)])
+def test_a_wide_lens_shapes_gaussians_as_its_derivative_says(mean):
+    lens = jnp.array([-0.15, 0.012, 0, 0, 0], jnp.float32)
+
+    def pixel(point):
+        (x, y), _ = distort(*(point[i][None, None] / point[2] for i in range(2)), lens[None])
+        return jnp.stack([200 * x[0, 0] + 200, 200 * y[0, 0] + 150])
+
+    jacobian = np.asarray(jax.jacobian(pixel)(jnp.array(mean)), np.float64)
+    wanted = np.linalg.inv(1e-4 * jacobian @ jacobian.T)
+    camera = replace(WIDE, viewmats=WIDE.viewmats[None], Ks=WIDE.Ks[None])
+    splats = project(one(mean), camera, Effects(distortion=True, antialias="none"), lens[None])
+    xx, xy, yy = np.asarray(splats.conics[0, 0], np.float64)
+    np.testing.assert_allclose([[xx, xy], [xy, yy]], wanted, rtol=2e-3)
+
+
+def test_a_lens_has_finite_gradients_however_far_from_its_axis():
+    lens = jnp.array([0.1, 0.01, 0, 0, 0.01], jnp.float32)
+
+    def loss(means):
+        scene = replace(one([0.0, 0.0, 1.0]), means=means)
+        out = render(scene, WIDE, effects=Effects(distortion=True), distortion=lens, max_pairs=1 << 12)
+        return out.color.sum()
+
+    for mean in ([1e6, 0.0, 0.05], [1e3, 1e3, 0.02], [0.1, 0.0, 1.0]):
+        assert np.isfinite(jax.jit(jax.grad(loss))(jnp.array([mean]))).all()
+
+
+def test_the_3d_filter_does_not_look_at_absent_rows():
+    captured = Camera(
+        viewmats=jnp.stack([jnp.eye(4), jnp.eye(4).at[2, 3].set(50.0)]),
+        Ks=jnp.stack([WIDE.Ks] * 2),
+        width=400,
+        height=300,
+    )
+    seen, unseen = one([0.0, 0.0, 1.0]), one([0.0, 0.0, -100.0])
+    scene = concatenate([seen, unseen])
+    absent = mask_gaussians(seen, jnp.zeros(1, bool))
+    alone, padded = filter_3d(scene, captured), filter_3d(concatenate([scene, absent]), captured)
+    np.testing.assert_array_equal(padded.scales[:2], alone.scales)

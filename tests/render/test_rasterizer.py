@@ -8,6 +8,8 @@ import pytest
 from ssplat_jax.errors import InputError
 from ssplat_jax.gaussians import concatenate, mask_gaussians
 from ssplat_jax.render import Effects, render
+from ssplat_jax.render.binning import Grid, bin_splats
+from ssplat_jax.render.projection import project
 from ssplat_jax.render.reference import render_reference
 from ssplat_jax.struct import replace
 from tests.render import oracle
@@ -155,6 +157,35 @@ def test_bad_input_says_what_was_wanted(scene, changes, message):
 def test_a_camera_of_no_pixels_is_refused(scene):
     with pytest.raises(InputError, match="1x1"):
         render(scene[0], replace(scene[1], width=0))
+
+
+def test_a_scene_of_no_gaussians_is_black(scene):
+    nothing = jax.tree.map(lambda x: x[:0], scene[0])
+    for draw in (render, jax.jit(lambda *scene: render(*scene, max_pairs=1 << 12))):
+        out = draw(nothing, scene[1])
+        assert not out.color.any() and not out.alpha.any() and int(out.num_pairs) == 0
+
+
+def test_arrays_that_a_traced_function_closes_over_are_rendered(scene):
+    wanted = render(*scene).color
+    for max_pairs in (None, 1 << 12):
+        inside = jax.jit(lambda factor, n=max_pairs: factor * render(*scene, max_pairs=n).color)
+        np.testing.assert_allclose(inside(jnp.float32(2.0)), 2 * wanted, atol=1e-6)
+
+
+def test_more_pairs_than_an_index_reaches_are_counted_and_refused():
+    # 20,000 Gaussians before each of the 129,600 tiles of a 4k image: 2.6e9 pairs, negative in 32 bits.
+    flat = cloud(1, size=1e3)
+    wall = jax.tree.map(lambda x: jnp.broadcast_to(x, (20_000, *x.shape[1:])), replace(flat, opacities=jnp.ones(1)))
+    camera = cameras(3840, 2160)
+    with pytest.raises(InputError, match="fewer than 2147483647"):
+        render(wall, camera)
+    with jax.enable_x64(False):
+        grid = Grid(num_images=1, height=2160, width=3840, tile=8)
+        one_axis = replace(camera, viewmats=camera.viewmats[None], Ks=camera.Ks[None])
+        splats = project(wall, one_axis, Effects())
+        pairs = jax.jit(bin_splats, static_argnums=(1, 2))(splats, grid, 1 << 12)
+    assert int(pairs.num_pairs) == 2**31 - 1
 
 
 # Last: it empties the caches of compiled programs.
