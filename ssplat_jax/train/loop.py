@@ -67,7 +67,7 @@ def train(
     trainer = Trainer(model, recipe)
     interrupts = Interrupts()
     window: list[dict] = []
-    waited, since, step = 0.0, time.perf_counter(), start
+    waited, since, step, stopped = 0.0, time.perf_counter(), start, None
     samples = prefetched(lambda i: sample_for_step(i, recipe, model.config), iter(range(start, recipe.num_steps)))
     with interrupts:
         try:
@@ -84,17 +84,16 @@ def train(
                     _append(out / LOG_FILE, record)
                     report(record)
                     window, waited, since = [], 0.0, time.perf_counter()
-                if step % save_every == 0 or interrupts.received:
+                stopped = interrupts.received  # read once: a signal may come at any time
+                if step % save_every == 0 or step == recipe.num_steps or stopped:
                     checkpoints.save(step, state)
-                if interrupts.received:
+                if stopped:
                     break
                 before = time.perf_counter()
-            if step > start and not interrupts.received and step % save_every:
-                checkpoints.save(step, state)
         finally:
             samples.close()
             checkpoints.close()
-    return TrainResult(state=state, step=step, interrupted=interrupts.received)
+    return TrainResult(state=state, step=step, interrupted=stopped if step < recipe.num_steps else None)
 
 
 def _record(step, recipe, window, state, waited, elapsed) -> dict:

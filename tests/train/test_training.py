@@ -8,12 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from ssplat_jax.checkpoint.training import TrainingCheckpoints
 from ssplat_jax.errors import InputError
 from ssplat_jax.stream import StreamSplat
 from ssplat_jax.train import loop
 from ssplat_jax.train.losses import depth_loss, image_gradient_l1, soft_targets
 from ssplat_jax.train.recipe import ALL_BUT_HEAD, Phase, PhaseForm, smoke_recipe, training_config
-from ssplat_jax.train.samples import make_sample, prefetched, sample_for_step
+from ssplat_jax.train.samples import log_depths_at_cells, make_sample, prefetched, sample_for_step
 from ssplat_jax.train.step import Trainer, init_state, learning_rate, loss_fn
 from tests.model.small import random_params
 from tests.test_stream import NARROW
@@ -45,6 +46,26 @@ def test_sample_depth_lies_in_the_sweep_and_first_camera_is_the_origin():
     np.testing.assert_allclose(np.asarray(sample.chunks.viewmats[0, 0]), np.eye(4), atol=1e-6)
     inside = (sample.log_depths > jnp.log(sample.chunks.near[0])) & (sample.log_depths < jnp.log(sample.chunks.far[0]))
     assert float(inside.mean()) > 0.97  # the margins leave out at most the tails beyond the 1 % quantiles
+
+
+def test_the_truth_of_a_cell_is_the_depth_at_its_centre():
+    # A wall that recedes evenly in log depth: a cell's centre is the corner of its pixels 1 and 2, at (2, 2).
+    y, x = np.mgrid[0:8, 0:12] + 0.5
+    logs = 0.01 * y - 0.005 * x
+    centres_y, centres_x = np.mgrid[0:2, 0:3] * 4.0 + 2.0
+    found = log_depths_at_cells(np.exp(logs))
+    np.testing.assert_allclose(found, 0.01 * centres_y - 0.005 * centres_x, atol=1e-6)
+    # An edge through the centre: one of its two surfaces, never what lies between them.
+    logs[:, 6:] += 1.0
+    assert np.abs(log_depths_at_cells(np.exp(logs))[:, 1] - found[:, 1] - 1.0).max() < 0.02
+
+
+def test_a_run_of_another_recipe_is_refused_by_the_first_difference(tmp_path):
+    description = {"config": {"width": 8}, "recipe": {"phases": [{"steps": 5}], "seed": 0}}
+    TrainingCheckpoints(tmp_path, description).close()
+    other = {"config": {"width": 8}, "recipe": {"phases": [{"steps": 6}], "seed": 0}}
+    with pytest.raises(InputError, match=r"recipe\.phases\[0\]\.steps = 5, wanted 6"):
+        TrainingCheckpoints(tmp_path, other)
 
 
 def test_prefetch_keeps_order_and_passes_errors_on():

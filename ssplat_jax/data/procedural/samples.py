@@ -15,8 +15,8 @@ Views = tuple[
 
 MIN_DEPTH, MAX_DEPTH = 0.3, 15.0
 MEDIANS = (1.2, 3.5)  # median depth of a training sample
-STEPS = (0.018, 0.4)  # typical step over the median depth, log-uniform: from video to a set of photos
-BASELINES = (0.012, 0.45)  # median step of a training sample over its median depth
+STEPS = (0.005, 0.4)  # typical step over the median depth, log-uniform: from every frame of a video to a set of photos
+BASELINES = (0.004, 0.45)  # median step of a training sample over its median depth
 MIN_DEPTH_RATIO = 1.4  # between the 95th and the 5th percentile of depth: a sample is not one bare wall
 _FIRST_STEPS = 4
 _PROBE = 8  # the low-resolution depth that scales a sample is this many times coarser
@@ -32,7 +32,7 @@ _PATHS = {  # paths that suit a kind of world: around its pile of objects, along
 def training_sample(seed: int, num_views: int, height: int, width: int, supersample: int = 1) -> Views:
     """Images, z-depths, camera-to-world poses and intrinsics of a random path through a random world.
 
-    Views are in the order of time; consecutive centres lie 1 to 45 % of the median depth apart in the median, single
+    Views are in the order of time; consecutive centres lie 0.4 to 45 % of the median depth apart in the median, single
     steps up to three times as far: hand-held video as much as a set of photos. Units are such
     that the median depth is between 1.2 and 3.5, no surface is nearer than about 0.3 and none farther than 15. The
     same seed gives the same sample. One colour ray per pixel costs a third of the default of captures: training is fed
