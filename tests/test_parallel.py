@@ -169,13 +169,19 @@ def each_of(shards):
 @pytest.fixture(scope="module")
 def fused(tmp_path_factory):
     """Shards and their projections: by voxel from one process of eight devices, appended from two of four."""
-    workers = {
-        name: Worker(tmp_path_factory.mktemp(name), {"fused": fuse_job(name)}, 8 // num_processes, num_processes)
-        for name, num_processes in (("voxels", 1), ("append", 2))
-    }
-    results = {name: worker.results() for name, worker in workers.items()}
-    assert [(x["num_devices"], x["num_processes"]) for x in results.values()] == [(8, 1), (8, 2)]
-    return {name: tuple(each_of(x) for x in results[name]["fused"]) for name in results}
+
+    @functools.cache
+    def of(name: str):
+        num_processes = {"voxels": 1, "append": 2}[name]
+        worker = Worker(tmp_path_factory.mktemp(name), {"fused": fuse_job(name)}, 8 // num_processes, num_processes)
+        results = worker.results()
+        assert (results["num_devices"], results["num_processes"]) == (8, num_processes)
+        return tuple(each_of(x) for x in results["fused"])
+
+    return of
+
+
+APPEND = pytest.param("append", marks=pytest.mark.slow)
 
 
 def assert_same_voxels(shards, alone):
@@ -196,19 +202,21 @@ def assert_same_projection(of_shards, wanted, rtol):
 
 
 def test_every_voxel_holds_what_it_would_in_one_cache(fused):
-    assert_same_voxels(fused["voxels"][0], fused_alone(CONFIG, ROOMY)[0])
+    assert_same_voxels(fused("voxels")[0], fused_alone(CONFIG, ROOMY)[0])
 
 
-@pytest.mark.parametrize(("name", "rtol"), [("voxels", SUM_RTOL), ("append", LONG_SUM_RTOL)])
+@pytest.mark.parametrize(
+    ("name", "rtol"), [("voxels", SUM_RTOL), pytest.param("append", LONG_SUM_RTOL, marks=pytest.mark.slow)]
+)
 def test_all_shards_see_the_projection_of_one_cache(fused, name, rtol):
     config, _, capacity = FUSED[name]
-    assert_same_projection(fused[name][1], fused_alone(config, capacity)[1], rtol)
+    assert_same_projection(fused(name)[1], fused_alone(config, capacity)[1], rtol)
 
 
-@pytest.mark.parametrize("name", ["voxels", "append"])
+@pytest.mark.parametrize("name", ["voxels", APPEND])
 def test_every_token_is_counted_by_one_shard_and_every_chunk_by_all(fused, name):
     config, _, capacity = FUSED[name]
-    shards, (alone, _) = fused[name][0], fused_alone(config, capacity)
+    shards, (alone, _) = fused(name)[0], fused_alone(config, capacity)
     for reason in ("merged", "low_confidence", "non_finite", "out_of_range"):
         assert int(getattr(alone.stats, f"num_{reason}")) > 0 or (reason, name) == ("merged", "append")
     for counter in COUNTERS:
@@ -217,9 +225,10 @@ def test_every_token_is_counted_by_one_shard_and_every_chunk_by_all(fused, name)
     assert [int(shard.stats.num_chunks) for shard in shards] == [len(TOKENS.valid)] * len(shards)
 
 
+@pytest.mark.slow
 def test_appended_pivots_are_those_of_one_cache(fused):
     config, _, capacity = FUSED["append"]
-    found, wanted = sorted_pivots(fused["append"][0]), sorted_pivots([fused_alone(config, capacity)[0]])
+    found, wanted = sorted_pivots(fused("append")[0]), sorted_pivots([fused_alone(config, capacity)[0]])
     assert len(wanted) > 1500
     np.testing.assert_array_equal(found, wanted)
 

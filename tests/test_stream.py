@@ -16,7 +16,8 @@ from tests.model.small import random_params
 NARROW = StreamConfig(
     encoder_widths=(8, 16),
     encoder_blocks=1,
-    attention_blocks=1,
+    attention_blocks=0,  # tests/model compiles attention
+    fine_matching=False,
     match_width=8,
     num_depths=16,
     unet_width=16,

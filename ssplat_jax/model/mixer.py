@@ -133,9 +133,8 @@ def mix_tokens(
     """Context-aggregated token features, ready for the head and for the cache (DESIGN 6.8).
 
     They have unit RMS. What is stored comes back through CGFI a chunk later, so without a bound the stream is a loop
-    with gain: trained on four chunks, features grew to 1e18 by the ninth. The head normalises anyway. What comes in is
-    brought to unit RMS too: nothing else holds the size of what CGFI adds, and the blocks would drown in it.
+    with gain: trained on four chunks, features grew to 1e18 by the ninth. The head normalises anyway.
     """
-    feats = rms_normalize(feats.astype(jnp.float32))  # pyright: ignore[reportAssignmentType]
+    feats = feats.astype(jnp.float32)
     mixed = Mixer(config).apply({"params": params}, feats, positions, inside, view_valid)
     return rms_normalize(mixed)  # pyright: ignore[reportArgumentType]

@@ -8,7 +8,6 @@ from jaxtyping import Array, Float
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.geometry.cameras import invert_poses, pixel_grid, transform_points, unproject
 from ssplat_jax.model.convolution import Conv, pixel_unshuffle
-from ssplat_jax.model.layers import rms_normalize
 from ssplat_jax.model.wires import GRID_STRIDE, AnchoredDepth, DepthBelief, Features, Views
 
 MIN_LOG_RANGE = 1e-3
@@ -31,10 +30,7 @@ class TokenRegressor(nn.Module):
 def regress_tokens(
     params, features: Features, belief: DepthBelief, depth: AnchoredDepth, views: Views, config: StreamConfig
 ) -> Float[Array, "v hf wf c"]:
-    """f^v(u): what the current views say about each token, of unit RMS.
-
-    What follows is residual and ends in a norm: nothing else would hold the size of f, and what CGFI and the mixer add
-    would drown in large features.
+    """f^v(u): what the current views say about each token.
 
     The depth enters as a constant: it is trained through the positions it gives, not through this hint.
     """
@@ -43,8 +39,7 @@ def regress_tokens(
     match = jax.lax.stop_gradient(depth.anchored_confidences)[..., None]
     patches = pixel_unshuffle(views.images - 0.5, GRID_STRIDE)
     context, decoder = features.context.astype(jnp.float32), belief.decoder.astype(jnp.float32)
-    feats = TokenRegressor(config).apply({"params": params}, patches, relative, match, context, decoder)
-    return rms_normalize(feats)  # pyright: ignore[reportArgumentType]
+    return TokenRegressor(config).apply({"params": params}, patches, relative, match, context, decoder)  # pyright: ignore[reportReturnType]
 
 
 def back_project(

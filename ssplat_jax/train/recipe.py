@@ -87,10 +87,10 @@ ALL_BUT_HEAD = ("encoder", "cost_volume", "hpda", "tokens", "cgfi", "mixer")
 
 TINY = Recipe(
     phases=(
-        Phase("depth", 2600, num_chunks=1, num_targets=0, sizes=((96, 128),), learning_rate=1e-3),
+        Phase("depth", 1800, num_chunks=1, num_targets=0, sizes=((96, 128),), learning_rate=1e-3),
         Phase(
             "stream",
-            700,
+            600,
             num_chunks=4,
             num_targets=4,
             sizes=((96, 128),),

@@ -9,7 +9,7 @@ import optax
 from jaxtyping import Array, Float, Int
 
 from ssplat_jax.cache import Tokens
-from ssplat_jax.gaussians import Gaussians, mask_gaussians, mean_color
+from ssplat_jax.gaussians import Gaussians, mask_gaussians
 from ssplat_jax.lpips import LpipsWeights
 from ssplat_jax.render import render
 from ssplat_jax.stream import StreamSplat
@@ -110,11 +110,8 @@ def loss_fn(
         is_cache = form.decode == "cache"
         gaussians = model.decode(params, cache) if is_cache else decode_accepted(model, params, tokens)
         output = render(gaussians, sample.target_camera, max_pairs=recipe.max_pairs)
-        transmittance = 1.0 - output.alpha  # pyright: ignore[reportOperatorIssue]
-        # Holes are shown in the scene's mean colour, as where views are scored (`evaluate.score_view`).
-        holes = transmittance[..., None] * jax.lax.stop_gradient(mean_color(gaussians))
         rendering = rendering_loss(
-            output.color + holes,
+            output.color,
             sample.target_images,
             gradient_weight=recipe.gradient_weight,
             lpips_weights=lpips_weights,

@@ -1,5 +1,7 @@
 """Each effect: right when on, no trace when off, asked for only by scenes that need it."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -30,8 +32,17 @@ def operations(gaussians, camera, effects: Effects, **arrays) -> tuple[int, floa
     def program(gaussians):
         return render(gaussians, camera, effects=effects, max_pairs=1 << 12, **arrays)
 
-    cost = jax.jit(program).lower(gaussians).cost_analysis() or {}
-    return count(jax.make_jaxpr(program)(gaussians).jaxpr), float(cost.get("flops", 0.0))
+    traced = jax.jit(program).trace(gaussians)
+    cost = traced.lower().cost_analysis() or {}
+    return count(traced.jaxpr.jaxpr), float(cost.get("flops", 0.0))
+
+
+@functools.cache  # many effects are compared with the same program
+def operations_of(effects: Effects, degree: int = 3, *, with_arrays: bool = False) -> tuple[int, float]:
+    gaussians, camera = cloud(8, degree=3), cameras(16, 16)
+    scene = replace(gaussians, sh=gaussians.sh[:, : (degree + 1) ** 2])
+    arrays = {"captured": camera, "distortion": jnp.asarray(LENS), "exposures": jnp.asarray(EXPOSURE)}
+    return operations(scene, camera, effects, **(arrays if with_arrays else {}))
 
 
 EFFECTS = {
@@ -52,10 +63,8 @@ EFFECTS = {
 def test_an_effect_that_is_off_leaves_no_trace(name):
     """Off with its arrays passed = a program that never had them; on adds operations."""
     on, off = EFFECTS[name]
-    gaussians, camera = cloud(8, degree=3), cameras(16, 16)
-    arrays = {"captured": camera, "distortion": jnp.asarray(LENS), "exposures": jnp.asarray(EXPOSURE)}
-    never = operations(replace(gaussians, sh=gaussians.sh[:, :1]) if name == "sh" else gaussians, camera, off)
-    without, having = operations(gaussians, camera, off, **arrays), operations(gaussians, camera, on, **arrays)
+    never = operations_of(off, degree=0 if name == "sh" else 3)
+    without, having = (operations_of(effects, with_arrays=True) for effects in (off, on))
     # SH bands that are not evaluated are still looked at for NaN, one comparison an entry.
     assert without[0] == never[0] + (1 if name == "sh" else 0) or without[0] == never[0]
     if name != "sh":
