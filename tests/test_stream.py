@@ -187,7 +187,8 @@ def test_session_compiles_once_and_needs_the_same_memory_throughout(model, param
     assert memory[0] is not None and len(set(memory)) == 1
 
 
-@pytest.mark.parametrize(("width", "height"), [(50, 71), pytest.param(71, 45, marks=pytest.mark.slow)])
+@pytest.mark.slow  # a program each
+@pytest.mark.parametrize(("width", "height"), [(50, 71), (71, 45)])
 def test_odd_and_portrait_sizes_stream(model, params, width, height, compiled_plainly):
     capture = open_capture(f"procedural:room?frames=5&size={width}x{height}")
     session = Session(model, params)

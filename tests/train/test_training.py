@@ -119,29 +119,30 @@ def test_learning_rate_warms_up_and_decays_in_every_phase():
     assert rates[first] < recipe.phases[1].learning_rate and rates[first + 2] > 0.8 * recipe.phases[1].learning_rate
 
 
-FROZEN_MATCHER = PhaseForm(frozen=("encoder", "cost_volume"))
-STREAM_RECIPE = dataclasses.replace(RECIPE, phases=(Phase("stream", 1, 2, 1, ((64, 64),), 1e-3, FROZEN_MATCHER),))
+FROZEN_ENCODER = PhaseForm(frozen=("encoder",))
+# Depth alone: steps that render take a minute to compile, and are slow tests.
+DEPTH_RECIPE = dataclasses.replace(RECIPE, phases=(Phase("depth", 1, 1, 0, ((64, 64),), 1e-3, FROZEN_ENCODER),))
 
 
 @pytest.fixture(scope="module")
 def trainer():
     """One compiled step for the tests that take one."""
-    return Trainer(StreamSplat(training_config(NARROW, STREAM_RECIPE)), STREAM_RECIPE)
+    return Trainer(StreamSplat(training_config(NARROW, DEPTH_RECIPE)), DEPTH_RECIPE)
 
 
 def start(trainer):
-    return init_state(trainer.model, STREAM_RECIPE, random_params(trainer.model.config))
+    return init_state(trainer.model, DEPTH_RECIPE, random_params(trainer.model.config))
 
 
 def test_a_step_with_a_non_finite_gradient_changes_nothing_but_its_count(trainer):
-    sample = sample_for_step(0, STREAM_RECIPE, trainer.model.config)
+    sample = sample_for_step(0, DEPTH_RECIPE, trainer.model.config)
     broken = dataclasses.replace(sample, log_depths=sample.log_depths.at[0, 0, 8, 8].set(jnp.nan))
     broken = dataclasses.replace(
         broken, chunks=dataclasses.replace(sample.chunks, images=sample.chunks.images * jnp.inf)
     )
     state = start(trainer)
     before = flat(state.params)
-    after, metrics = trainer.step(state, broken, jnp.float32(1e-3), form=FROZEN_MATCHER)
+    after, metrics = trainer.step(state, broken, jnp.float32(1e-3), form=FROZEN_ENCODER)
     assert not np.isfinite(float(metrics["grad_norm"]))
     assert int(after.num_skipped) == 1 and int(after.step) == 1
     for a, b in zip(flat(after.params), before, strict=True):
@@ -151,16 +152,13 @@ def test_a_step_with_a_non_finite_gradient_changes_nothing_but_its_count(trainer
 def test_frozen_stages_stay_and_the_others_move(trainer):
     state = start(trainer)
     before = jax.tree.map(np.asarray, state.params)
-    sample = sample_for_step(0, STREAM_RECIPE, trainer.model.config)
-    after, metrics = trainer.step(state, sample, jnp.float32(1e-3), form=FROZEN_MATCHER)
-    assert np.isfinite(float(metrics["psnr"]))
-    for name in FROZEN_MATCHER.frozen:
-        for a, b in zip(flat(after.params[name]), flat(before[name]), strict=True):
-            np.testing.assert_array_equal(a, b)
-    for name in ("tokens", "mixer", "decoder"):
-        assert any(
-            not np.array_equal(a, b) for a, b in zip(flat(after.params[name]), flat(before[name]), strict=True)
-        ), name
+    sample = sample_for_step(0, DEPTH_RECIPE, trainer.model.config)
+    after, metrics = trainer.step(state, sample, jnp.float32(1e-3), form=FROZEN_ENCODER)
+    assert np.isfinite(float(metrics["loss"])) and int(after.num_skipped) == 0
+    for a, b in zip(flat(after.params["encoder"]), flat(before["encoder"]), strict=True):
+        np.testing.assert_array_equal(a, b)
+    moved = zip(flat(after.params["cost_volume"]), flat(before["cost_volume"]), strict=True)
+    assert any(not np.array_equal(a, b) for a, b in moved)
 
 
 @pytest.mark.slow  # two programs of a whole training step
