@@ -119,7 +119,7 @@ def export_run(run_dir: Path, to: Path, params: dict, reporter: Reporter) -> Exp
     cache, header, damage = load_newest_state(state)
     if damage is not None:
         reporter.warn(f"{damage} Exporting the state saved before it, after {header['done']} views.")
-    if header["weights"] != params_digest(params):
+    if header.get("weights") != params_digest(params):
         raise InputError(f"{run_dir}: was streamed with other weights than these; give the run's own with --weights.")
     session = Session(StreamSplat(StreamConfig.from_dict(header["config"])), params, cache)
     return save_scene(to, session.gaussians(), _frame_from(header["frame"]), reporter)
