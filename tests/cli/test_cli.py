@@ -170,10 +170,10 @@ def test_set_takes_what_the_field_holds(change, field, value):
     hash(changed)
 
 
-def assert_deltas_give_the_scene(out):
+def assert_deltas_give_the_scene(out, *names):
     """The changes of every chunk, put together, against the final state decoded at once."""
     files = sorted((out / "deltas").iterdir())
-    assert [path.name for path in files] == ["000004.npz", "000008.npz", "000012.npz"]
+    assert [path.name for path in files] == list(names)
     told = functools.reduce(apply_delta, map(load_delta, files), None)
     cache, header = load_state(out / "state.npz")
     model = StreamSplat(StreamConfig.from_dict(header["config"]))
@@ -188,7 +188,7 @@ def test_run_stops_resumes_and_exports(tmp_path, capsys):
     capture = str(make_capture(tmp_path / "capture", num_frames=12, size=(64, 48)))
     assert run("run", capture, "--out", str(out), "--save-every", "1", "--deltas", "--quiet") == 0
     assert {"scene.ply", "state.npz", "metrics.json"} <= {p.name for p in out.iterdir()}
-    assert_deltas_give_the_scene(out)
+    assert_deltas_give_the_scene(out, "000004.npz", "000008.npz", "000012.npz")
     metrics = json.loads((out / "metrics.json").read_text())
     assert metrics["cache"]["num_chunks"] == 3
     assert run("export", str(out), "--to", str(tmp_path / "again.ply")) == 0
@@ -198,8 +198,11 @@ def test_run_stops_resumes_and_exports(tmp_path, capsys):
     save_weights(other, jax.tree.map(lambda x: 0.5 * x, params), config, {})
     assert run("export", str(out), "--to", str(tmp_path / "wrong.ply"), "--weights", str(other)) == 2
     assert "other weights" in capsys.readouterr().err and not (tmp_path / "wrong.ply").exists()
-    # A finished run is not streamed twice; another configuration is refused.
-    assert run("run", capture, "--out", str(out), "--quiet") == 0
+    # A finished run is not streamed twice; deltas asked for only now begin with the whole scene.
+    shutil.rmtree(out / "deltas")
+    assert run("run", capture, "--out", str(out), "--deltas", "--quiet") == 0
+    assert_deltas_give_the_scene(out, "000012.npz")
+    # Another configuration is refused.
     assert json.loads((out / "metrics.json").read_text())["cache"]["num_chunks"] == 3
     for changes, difference in (
         (("--set", "voxel_size=0.1"), "another config (voxel_size: 0.04 there, 0.1 now)"),
