@@ -97,7 +97,7 @@ def test_distortion_follows_opencvs_formula_and_its_derivative():
         np.testing.assert_allclose(got, wanted, atol=1e-5)
 
 
-def test_a_lens_of_zeros_is_a_pinhole(compiled_plainly):
+def test_a_lens_of_zeros_is_a_pinhole():
     gaussians, camera = cloud(), cameras(21, 30)
     lens = render(gaussians, camera, effects=Effects(distortion=True), distortion=jnp.zeros(5), max_pairs=1 << 12)
     np.testing.assert_allclose(lens.color, render(gaussians, camera, max_pairs=1 << 12).color, atol=1e-5)
@@ -147,7 +147,7 @@ def test_effects_for_asks_only_for_what_the_scene_needs():
     assert effects_for(gaussians, closer, captured=camera).filter_3d
 
 
-def test_what_effects_for_leaves_out_changes_no_pixel(compiled_plainly):
+def test_what_effects_for_leaves_out_changes_no_pixel():
     gaussians, camera = cloud(degree=3), cameras(21, 30)
     flat = replace(gaussians, sh=gaussians.sh.at[:, 4:].set(0.0))
     least = render(flat, camera, effects=effects_for(flat, camera), max_pairs=1 << 12)
@@ -181,7 +181,7 @@ WIDE = Camera(
 
 
 @pytest.mark.parametrize(("lens", "tangent"), [((-0.1, 0.003, 0, 0, 0), 4.1), ((-0.3, 0.03, 0, 0, 0), 2.2)])
-def test_what_a_lens_folds_back_into_the_image_is_not_seen(lens, tangent, compiled_plainly):
+def test_what_a_lens_folds_back_into_the_image_is_not_seen(lens, tangent):
     # Beyond its first turn the polynomial falls, and beyond its second it rises again: ghosts from the side.
     lens = jnp.array(lens, jnp.float32)
     assert 1 + tangent**2 * (3 * lens[0] + tangent**2 * 5 * lens[1]) > 0  # it has turned twice

@@ -162,21 +162,21 @@ def test_a_camera_of_no_pixels_is_refused(scene):
         render(scene[0], replace(scene[1], width=0))
 
 
-def test_a_scene_of_no_gaussians_is_black(scene, compiled_plainly):
+def test_a_scene_of_no_gaussians_is_black(scene):
     nothing = jax.tree.map(lambda x: x[:0], scene[0])
     for draw in (render, jax.jit(lambda *scene: render(*scene, max_pairs=1 << 12))):
         out = draw(nothing, scene[1])
         assert not out.color.any() and not out.alpha.any() and int(out.num_pairs) == 0
 
 
-def test_arrays_that_a_traced_function_closes_over_are_rendered(scene, compiled_plainly):
+def test_arrays_that_a_traced_function_closes_over_are_rendered(scene):
     wanted = render(*scene).color
     for max_pairs in (None, 1 << 12):
         inside = jax.jit(lambda factor, n=max_pairs: factor * render(*scene, max_pairs=n).color)
         np.testing.assert_allclose(inside(jnp.float32(2.0)), 2 * wanted, atol=1e-6)
 
 
-def test_more_pairs_than_an_index_reaches_are_counted_and_refused(compiled_plainly):
+def test_more_pairs_than_an_index_reaches_are_counted_and_refused():
     # 20,000 Gaussians before each of the 129,600 tiles of a 4k image: 2.6e9 pairs, negative in 32 bits.
     flat = cloud(1, size=1e3)
     wall = jax.tree.map(lambda x: jnp.broadcast_to(x, (20_000, *x.shape[1:])), replace(flat, opacities=jnp.ones(1)))
@@ -195,6 +195,7 @@ def test_more_pairs_than_an_index_reaches_are_counted_and_refused(compiled_plain
 def test_keys_wider_than_32_bits_sort_alike(scene, monkeypatch):
     from ssplat_jax.render import binning
 
+    jax.clear_caches()  # both are compiled here, alike
     wanted = render(*scene, max_pairs=1 << 12)
     monkeypatch.setattr(binning, "KEY_BITS", 4)
     jax.clear_caches()
