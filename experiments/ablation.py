@@ -22,6 +22,7 @@ from ssplat_jax.data.protocol import interleaved
 from ssplat_jax.errors import InputError
 from ssplat_jax.evaluate import cache_facts, mean_psnr, stream_context
 from ssplat_jax.export.atomic import write_atomic
+from ssplat_jax.export.json_files import write_json
 from ssplat_jax.report import Reporter
 from ssplat_jax.session import Session
 from ssplat_jax.stream import StreamSplat
@@ -72,7 +73,7 @@ def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str
                 place = out / variant.replace(" ", "_") / f"seed{seed}"
                 scores = _measure(changes, seed, budget, scenes, place)
                 rows += [{"variant": variant, "seed": seed} | score for score in scores]
-                write_atomic(out / "table.json", (json.dumps(rows, indent=1) + "\n").encode())
+                write_json(out / "table.json", rows)
                 write_atomic(out / "table.md", _markdown(rows).encode())
                 done += 1
                 advance(done, f"{variant}, seed {seed}")
@@ -99,7 +100,7 @@ def _measure(changes: dict[str, Any], seed: int, budget: Budget, scenes, place: 
         stream_context(session, capture, split, frame)
         psnr = round(mean_psnr(session.gaussians(), capture, split.targets, frame), 3)
         rows.append({"scene": scene, "psnr": psnr, "gaussians": cache_facts(session)["decoded"]})
-    write_atomic(scores, (json.dumps({"asked": asked, "rows": rows}, indent=1) + "\n").encode())
+    write_json(scores, {"asked": asked, "rows": rows})
     return rows
 
 

@@ -10,7 +10,6 @@ row by row. Wants a machine with nothing else to do: about 45 minutes on two cor
 
 import dataclasses
 import io
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -23,6 +22,7 @@ from ssplat_jax.data.capture import Capture, open_capture
 from ssplat_jax.data.protocol import Split, interleaved
 from ssplat_jax.evaluate import cache_facts, mean_psnr, measure_latency, stream_context
 from ssplat_jax.export.atomic import write_atomic
+from ssplat_jax.export.json_files import write_json
 from ssplat_jax.report import Reporter
 from ssplat_jax.session import Session
 from ssplat_jax.stream import StreamSplat
@@ -88,7 +88,7 @@ def _write(out: Path, rows: list[dict[str, Any]]) -> None:
     """The table in two forms and the plot, with the front of what is measured so far."""
     for scene in {row["scene"] for row in rows}:
         mark_front([row for row in rows if row["scene"] == scene])
-    write_atomic(out / "table.json", (json.dumps(rows, indent=1) + "\n").encode())
+    write_json(out / "table.json", rows)
     write_atomic(out / "table.md", _markdown(rows).encode())
     plot(out / "plot.png", rows)
 

@@ -7,7 +7,6 @@ protocol, decoded cache); a table goes to the terminal and `table.json`, picture
 the numbers to expect.
 """
 
-import json
 from pathlib import Path
 
 from ssplat_jax.checkpoint.weights import load_params
@@ -16,7 +15,7 @@ from ssplat_jax.data.capture import open_capture
 from ssplat_jax.data.protocol import interleaved
 from ssplat_jax.errors import InputError
 from ssplat_jax.evaluate import evaluate
-from ssplat_jax.export.atomic import write_atomic
+from ssplat_jax.export.json_files import write_json
 from ssplat_jax.report import Reporter
 from ssplat_jax.session import Session
 from ssplat_jax.stream import StreamSplat
@@ -60,5 +59,5 @@ def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str
     if not rows:
         raise InputError(f"experiment captures: {captures} holds none of {', '.join(s[0] for s in SETTINGS)}.")
     reporter.table("novel views of real captures", tuple(rows[0]), [tuple(row.values()) for row in rows])
-    write_atomic(out / "table.json", (json.dumps(rows, indent=1) + "\n").encode())
+    write_json(out / "table.json", rows)
     return f"wrote {out}/table.json and pictures beside it"

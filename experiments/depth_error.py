@@ -9,7 +9,6 @@ falls as it rises. docs/model_card.md holds the numbers to expect.
 """
 
 import itertools
-import json
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,7 @@ from ssplat_jax.config import preset
 from ssplat_jax.data.capture import Capture, open_capture
 from ssplat_jax.data.protocol import interleaved
 from ssplat_jax.errors import InputError
-from ssplat_jax.export.atomic import write_atomic
+from ssplat_jax.export.json_files import write_json
 from ssplat_jax.model import GRID_STRIDE
 from ssplat_jax.report import Reporter
 from ssplat_jax.session import Session
@@ -47,7 +46,7 @@ def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str
     rows: list[dict[str, Any]] = []
     for name, (capture, stride) in opened.items():
         rows.append({"capture": name} | measure(capture, stride, context))
-    write_atomic(out / "table.json", (json.dumps(rows, indent=1) + "\n").encode())
+    write_json(out / "table.json", rows)
     for row in rows:
         reporter.table(
             f"{row['capture']}: {row['accepted']:.0%} accepted, median error {row['median_error']:.1%}",

@@ -8,7 +8,6 @@ and the first 24, 64, 128, 256, 512 others are streamed, each count by itself, a
 with pictures, `metrics.json` and `split.json`. docs/model_card.md holds the numbers to expect.
 """
 
-import json
 from pathlib import Path
 
 from ssplat_jax.checkpoint.weights import load_params
@@ -18,6 +17,7 @@ from ssplat_jax.data.protocol import paper
 from ssplat_jax.errors import InputError
 from ssplat_jax.evaluate import evaluate
 from ssplat_jax.export.atomic import write_atomic
+from ssplat_jax.export.json_files import write_json
 from ssplat_jax.report import Reporter
 from ssplat_jax.session import Session
 from ssplat_jax.stream import StreamSplat
@@ -48,7 +48,7 @@ def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str
                 "split_sha256": split.sha256[:12],
             }
         )
-        write_atomic(out / "table.json", (json.dumps(rows, indent=1) + "\n").encode())
+        write_json(out / "table.json", rows)
         write_atomic(out / "table.md", _markdown(rows).encode())
     reporter.table(f"{capture.name}: the paper's protocol", tuple(rows[0]), [tuple(row.values()) for row in rows])
     gain = rows[-1]["psnr"] - rows[0]["psnr"]

@@ -1,7 +1,6 @@
 """`ssplat run`: a capture into a scene, with the state on disk every few chunks so that a stopped run goes on."""
 
 import dataclasses
-import json
 import shutil
 from pathlib import Path
 
@@ -15,7 +14,8 @@ from ssplat_jax.data.capture import Capture, open_capture
 from ssplat_jax.data.frame import StreamFrame
 from ssplat_jax.errors import InputError, StorageError, require_positive
 from ssplat_jax.evaluate import cache_facts, check_scorable, save_comparison, score_view
-from ssplat_jax.export.atomic import previous_path, write_atomic
+from ssplat_jax.export.atomic import previous_path
+from ssplat_jax.export.json_files import write_json
 from ssplat_jax.export.ply import ExportReport, save_ply
 from ssplat_jax.follow import SceneFeed
 from ssplat_jax.gaussians import Gaussians
@@ -237,5 +237,5 @@ def _finish(
         "stream_frame": _frame_to(frame),
         "config_hash": session.model.config.hash,
     }
-    write_atomic(out / METRICS_FILE, (json.dumps(metrics, indent=1) + "\n").encode())
+    write_json(out / METRICS_FILE, metrics)
     return report

@@ -65,6 +65,7 @@ class Inspect:
     def run(self) -> int:
         from ssplat_jax.data.capture import open_capture
         from ssplat_jax.data.inspect import summarize
+        from ssplat_jax.export.json_files import json_text
         from ssplat_jax.report import print_facts
 
         facts = summarize(open_capture(self.capture, size=parse_size(self.size)), preset("tiny")).to_dict()
@@ -311,9 +312,9 @@ class Bench:
         for row in result["rows"]:
             print(f"{row['name']:<44} {row['value']:>14.6g} {row['unit']}")
         if self.json is not None:
-            from ssplat_jax.export.atomic import write_atomic
+            from ssplat_jax.export.json_files import write_json
 
-            write_atomic(self.json, (json_text(result) + "\n").encode())
+            write_json(self.json, result)
         return 0
 
 
@@ -432,11 +433,6 @@ def describe_record(record: dict) -> str:
     """The few numbers of a training record that fit beside a progress bar."""
     shown = {"loss": "loss", "depth_l1": "depth", "psnr": "psnr", "accepted": "accepted"}
     return "  ".join(f"{label} {record[name]:.3f}" for name, label in shown.items() if name in record)
-
-
-def json_text(facts: dict) -> str:
-    """Indented JSON."""
-    return json.dumps(facts, indent=1)
 
 
 Command = (

@@ -1,7 +1,6 @@
 """`ssplat demo`: an embedded procedural scene, streamed with the shipped weights; what more views give, in numbers."""
 
 import io
-import json
 import time
 from pathlib import Path
 
@@ -13,6 +12,7 @@ from ssplat_jax.data.capture import open_capture
 from ssplat_jax.data.protocol import interleaved
 from ssplat_jax.evaluate import cache_facts, save_comparison, save_image, score_view
 from ssplat_jax.export.atomic import write_atomic
+from ssplat_jax.export.json_files import write_json
 from ssplat_jax.export.ply import save_ply
 from ssplat_jax.report import Reporter
 from ssplat_jax.session import Session
@@ -59,7 +59,7 @@ def run_demo(scene: str, out: Path, reporter: Reporter, quality: Quality = QUALI
         "seconds": round(time.perf_counter() - since, 1),
         "config_hash": model.config.hash,
     }
-    write_atomic(out / "metrics.json", (json.dumps(metrics, indent=1) + "\n").encode())
+    write_json(out / "metrics.json", metrics)
     _plot(out / "quality.png", rows)
     header = ("views", "PSNR dB", "SSIM", "covered", "Gaussians")
     reporter.table(f"{scene}: quality of unseen views", header, [tuple(row.values()) for row in rows])

@@ -2,7 +2,6 @@
 
 import dataclasses
 import io
-import json
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -18,6 +17,7 @@ from ssplat_jax.data.frame import StreamFrame
 from ssplat_jax.data.protocol import Split
 from ssplat_jax.errors import InputError, StorageError
 from ssplat_jax.export.atomic import write_atomic
+from ssplat_jax.export.json_files import write_json
 from ssplat_jax.gaussians import Gaussians, mean_color
 from ssplat_jax.lpips import LpipsWeights, check_size, lpips
 from ssplat_jax.metrics import SSIM_ARGUMENTS, psnr, ssim
@@ -238,7 +238,7 @@ def evaluate(
         "per_view": [dataclasses.asdict(s) for s in scores],
     }
     write_atomic(out / "split.json", split.to_json().encode())
-    write_atomic(out / "metrics.json", (json.dumps(metrics, indent=1) + "\n").encode())
+    write_json(out / "metrics.json", metrics)
     return metrics
 
 

@@ -1,7 +1,6 @@
 """The training loop: draws samples ahead, steps, logs JSON lines, saves, resumes, stops cleanly on a signal."""
 
 import dataclasses
-import json
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -10,6 +9,7 @@ import jax.numpy as jnp
 
 from ssplat_jax.checkpoint.training import TrainingCheckpoints
 from ssplat_jax.config import StreamConfig
+from ssplat_jax.export.json_files import json_text
 from ssplat_jax.interrupts import Interrupts
 from ssplat_jax.lpips import LpipsWeights
 from ssplat_jax.stream import StreamSplat
@@ -115,4 +115,4 @@ def _record(step, recipe, window, state, waited, elapsed) -> dict:
 
 def _append(path: Path, record: dict) -> None:
     with path.open("a") as file:
-        file.write(json.dumps(record) + "\n")
+        file.write(json_text(record, indent=None) + "\n")
