@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from ssplat_jax.checkpoint.weights import load_params, load_weights, save_weights
+from ssplat_jax.checkpoint.weights import check_params, load_params, load_weights, save_weights
 from ssplat_jax.config import preset
 from ssplat_jax.errors import InputError, StorageError
 from ssplat_jax.model import init_params
@@ -52,6 +52,13 @@ def test_weights_of_another_width_are_refused_by_name(params, tmp_path):
     save_weights(tmp_path / "w.npz", params, NARROW.replace(token_width=NARROW.token_width * 2), {})
     with pytest.raises(InputError, match="must be"):
         load_params(str(tmp_path / "w.npz"))
+
+
+def test_a_stage_that_a_configuration_leaves_out_may_stand_in_the_weights(params):
+    """`--set mixer_blocks=0` and the like switch stages off; a stage too many is still refused."""
+    check_params(params, NARROW.replace(mixer_blocks=0), "here")
+    with pytest.raises(InputError, match="here.*mixer"):
+        check_params(params, NARROW.replace(mixer_blocks=NARROW.mixer_blocks + 1), "here")
 
 
 def test_overflowing_weights_are_not_saved(params, tmp_path):
