@@ -29,6 +29,8 @@ LONG_SIDE = 320  # pixels of the working images; small ones grow, since ORB sees
 MIN_SIDE = 48  # narrower strips leave no room for an ORB patch
 NUM_KEYPOINTS = 400
 FAST_THRESHOLD = 0.05
+FULL_CONTRAST = 0.5  # between the 1 % and 99 % quantiles of grey: images of less are stretched to it, ...
+MOST_STRETCH = 20.0  # ... by this much at most
 MAX_HAMMING = 72  # of 256 bits
 MAX_RATIO = 0.85  # Lowe's test: best over second-best descriptor distance
 MAX_EPIPOLAR_PX = 2.0  # of the working images
@@ -45,6 +47,10 @@ FAR_PARALLAX_DEGREES = 1.5  # points of less are too uncertain to say how far th
 MOST_POINTS = 0.9  # if fewer of all points than this have it, ...
 FEW_PAIRS = 12  # ... or fewer pairs than this were found, so that backgrounds may have been missed, ...
 MIN_REACH = 2.3  # ... the 99 % quantile is taken to be at least this many medians
+PARALLAX_ERROR = 0.15  # degrees, of a triangulated point: half a pixel of the working images
+BEYOND = 0.1  # share of the image that may surely lie beyond far; where a background fills more, far goes there
+CLOSE_SHARE = 0.15  # of the points of a nearest partner with parallax enough to count; false matches are fewer
+CLOSE_POINTS = 0.9  # quantile, in inverse depth, of what a nearest partner matches: false matches are beyond it
 # Guesses
 GUESSED_SPREAD = 4.0  # median over the 1 % quantile, and 99 % over the median, where nothing tells
 BASELINE_DEPTH = 5.0  # median depth over the median step between frames, where nothing matches
@@ -52,6 +58,7 @@ BASELINE_DEPTH = 5.0  # median depth over the median step between frames, where 
 NEAR_FACTOR = 0.55  # of the 1 % quantile: keypoints miss the nearest surfaces
 FAR_FACTOR = 1.8  # of the 99 % quantile: and the farthest
 MIN_RANGE, MAX_RANGE = 4.0, 60.0  # far / near
+NEAREST = 1 / 8  # of the median: a range that is too wide loses what is nearer than this before it loses what is far
 
 
 @runtime_checkable
@@ -99,6 +106,7 @@ class _Points:
     inverse_depths: Float64[np.ndarray, " n"]  # in the first camera, signed
     parallax: Float64[np.ndarray, " n"]  # degrees, same sign
     weights: Float64[np.ndarray, " n"]  # 1 / points in the same cell of the image
+    close: Float64[np.ndarray, " m"]  # inverse depths of those that only a nearer partner still matches
 
 
 _KeypointsOf = Callable[[int], _Keypoints]
@@ -137,12 +145,14 @@ def stream_scale(depths: DepthStatistics, config: StreamConfig) -> tuple[float, 
     """(scale, near, far): stream units per capture unit, and the depth range in stream units.
 
     Limits:
-        far / near stays in [4, 60]: widened to both sides, or cut at the far end.
+        far / near stays in [4, 60]: widened to both sides; or cut, at the near end up to an eighth of the median, then
+        at the far end.
     """
     scale = config.median_depth / depths.median if config.scene_scale == "auto" else float(config.scene_scale)
     near, far = NEAR_FACTOR * depths.q01, FAR_FACTOR * depths.q99
     widen = max(1.0, math.sqrt(MIN_RANGE * near / far))
     near, far = near / widen, far * widen
+    near = max(near, min(far / MAX_RANGE, NEAREST * depths.median))
     return scale, scale * near, scale * min(far, near * MAX_RANGE)
 
 
@@ -150,11 +160,17 @@ def _statistics(pairs: list[_Points]) -> DepthStatistics:
     """Quantiles from pairs of sufficient parallax."""
     inverse = np.concatenate([p.inverse_depths for p in pairs])
     parallax = np.concatenate([p.parallax for p in pairs])
-    nearest, middle = np.quantile(inverse, 0.99), _median(pairs)
+    close = np.concatenate([p.close for p in pairs])
+    nearest = max(np.quantile(inverse, 0.99), np.quantile(close, CLOSE_POINTS) if close.size else 0.0)
+    middle = _median(pairs)
     reached = inverse[parallax >= FAR_PARALLAX_DEGREES]
     reach = 1 / np.quantile(reached, 0.01) if reached.size else 0.0
     if reached.size < MOST_POINTS * inverse.size or len(pairs) < FEW_PAIRS:
         reach = max(reach, MIN_REACH / middle)
+    least = _least_inverse_depth(pairs)
+    if least < 1 / (FAR_FACTOR * reach):
+        farthest = MAX_RANGE * NEAR_FACTOR / (FAR_FACTOR * nearest)
+        reach = max(reach, min(1 / least, farthest))
     return DepthStatistics(
         q01=float(1 / nearest),
         median=float(1 / middle),
@@ -202,7 +218,15 @@ def _best_pair(
         if best is not None:
             break
         best = _triangulated(capture, i, partners[rank], keypoints)
-    return best
+    if best is None:
+        return None
+    # What is close turns out of view first: with a wide baseline, the background alone would say what is near.
+    nearest = _triangulated(capture, i, partners[0], keypoints)
+    if nearest is None:
+        return best
+    close = nearest.inverse_depths[nearest.parallax >= FAR_PARALLAX_DEGREES]
+    is_some = close.size >= max(MIN_POINTS, CLOSE_SHARE * nearest.parallax.size)
+    return dataclasses.replace(best, close=close) if is_some else best
 
 
 def _partners(capture: PosedImages, i: int, others: Sequence[int]) -> tuple[list[int], Float64[np.ndarray, " n"]]:
@@ -229,6 +253,9 @@ def _keypoints(image: Float32[np.ndarray, "h w 3"]) -> _Keypoints:
         return nothing
     grey = Image.fromarray(np.ascontiguousarray(image @ np.array([0.299, 0.587, 0.114], np.float32)))
     small = np.asarray(grey.resize(size, Image.Resampling.BICUBIC), np.float64)
+    dark, bright = np.quantile(small, [0.01, 0.99])
+    if bright - dark < FULL_CONTRAST:  # night, fog: corners are as sharp there, only fainter
+        small = (small - dark) * min(FULL_CONTRAST / max(bright - dark, 1e-9), MOST_STRETCH)
     detector: Any = ORB(n_keypoints=NUM_KEYPOINTS, n_scales=4, downscale=1.4, fast_threshold=FAST_THRESHOLD)
     try:
         detector.detect_and_extract(small)
@@ -251,16 +278,34 @@ def _triangulated(capture: PosedImages, i: int, j: int, keypoints: _KeypointsOf)
     inverse_depths, parallax = triangulate(rays_a[idx_a], rays_b[idx_b], R, t)
     cells = (ka.pixels[idx_a] / (CELL * ka.pixel)).astype(int)
     _, cell, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
-    return _Points(inverse_depths=inverse_depths, parallax=parallax, weights=1 / counts[cell.ravel()])
+    weights = 1 / counts[cell.ravel()]
+    return _Points(inverse_depths=inverse_depths, parallax=parallax, weights=weights, close=np.zeros(0))
 
 
 def _median(pairs: list[_Points]) -> float:
     """Median inverse depth by area of the image: keypoints crowd on what is rich in corners, near or far."""
-    inverse = np.concatenate([p.inverse_depths for p in pairs])
-    weights = np.concatenate([p.weights for p in pairs])
-    order = np.argsort(inverse)
+    return _quantile_by_area(pairs, [p.inverse_depths for p in pairs], 0.5)
+
+
+def _quantile_by_area(pairs: list[_Points], values: list[Float64[np.ndarray, " _"]], share: float) -> float:
+    """The value that `share` of the image has less than."""
+    flat, weights = np.concatenate(values), np.concatenate([p.weights for p in pairs])
+    order = np.argsort(flat)
     cumulative = np.cumsum(weights[order])
-    return float(inverse[order][np.searchsorted(cumulative, cumulative[-1] / 2)])
+    return float(flat[order][np.searchsorted(cumulative, share * cumulative[-1])])
+
+
+def _least_inverse_depth(pairs: list[_Points]) -> float:
+    """What the `BEYOND` farthest of the image are surely below, error and all. Points surely behind are false."""
+    bounds = [p.inverse_depths + _error(p) for p in pairs]
+    return _quantile_by_area(pairs, [np.where(b > 0, b, np.inf) for b in bounds], BEYOND)
+
+
+def _error(points: _Points) -> Float64[np.ndarray, " n"]:
+    """Of the inverse depths of a pair: parallax tells little about what lies near the direction of motion."""
+    moved = points.parallax != 0
+    slopes = np.abs(points.inverse_depths / np.where(moved, points.parallax, 1.0))
+    return np.where(moved, PARALLAX_ERROR * slopes, np.inf)
 
 
 def _rays(K: Float64[np.ndarray, "3 3"], pixels: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarray, "n 3"]:

@@ -57,7 +57,7 @@ def test_weights_of_another_width_are_refused_by_name(params, tmp_path):
 def test_a_stage_that_a_configuration_leaves_out_may_stand_in_the_weights(params):
     """`--set mixer_blocks=0` and the like switch stages off; a stage too many is still refused."""
     check_params(params, NARROW.replace(mixer_blocks=0), "here")
-    with pytest.raises(InputError, match="here.*mixer"):
+    with pytest.raises(InputError, match=r"here.*mixer"):
         check_params(params, NARROW.replace(mixer_blocks=NARROW.mixer_blocks + 1), "here")
 
 

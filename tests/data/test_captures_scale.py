@@ -30,10 +30,13 @@ def texture(rng):
     return gaussian(sum(noise) / 3, 1.0, channel_axis=-1).astype(np.float32)
 
 
-def two_planes(num_frames, step, *, forward=0.0, units=1.0, spin=0.0, seed=0):
+def two_planes(
+    num_frames, step, *, forward=0.0, units=1.0, spin=0.0, seed=0, start=0.0, wall_at=FAR_PLANE, board_half=0.4
+):
     """Frames that slide past a textured wall at depth 4 with a board at depth 2 before it; lengths times `units`.
 
-    `step`: sideways motion per frame, `forward`: along the axis, `spin`: degrees per frame about the camera's y axis.
+    `step`: sideways motion per frame, `forward`: along the axis, `spin`: degrees per frame about the camera's y axis,
+    `start`: where the motion starts sideways, `wall_at`: the wall's depth, `board_half`: half the board's side.
     """
     rng = np.random.default_rng(seed)
     wall, board = texture(rng), texture(rng)
@@ -42,18 +45,19 @@ def two_planes(num_frames, step, *, forward=0.0, units=1.0, spin=0.0, seed=0):
     images, depths, frames = [], [], []
     for i in range(num_frames):
         c, s = np.cos(np.radians(spin * i)), np.sin(np.radians(spin * i))
-        pose = np.array([[c, 0, s, step * i], [0, 1, 0, 0], [-s, 0, c, forward * i], [0, 0, 0, 1.0]])
+        pose = np.array([[c, 0, s, start + step * i], [0, 1, 0, 0], [-s, 0, c, forward * i], [0, 0, 0, 1.0]])
         world = rays @ pose[:3, :3].T
         image, depth = None, None
-        for plane, colours, extent in ((FAR_PLANE, wall, 16), (NEAR_PLANE, board, 8)):  # about a texel a pixel
+        for plane, colours in ((wall_at, wall), (NEAR_PLANE, board)):
+            extent = 4 * plane  # about a texel a pixel
             along = (plane - pose[2, 3]) / world[..., 2]
             hit = pose[:3, 3] + along[..., None] * world
-            texel = np.clip(((hit[..., :2] / extent + 0.5) * 512).astype(int), 0, 511)
+            texel = np.floor((hit[..., :2] / extent + 0.5) * 512).astype(int) % 512
             shade = colours[texel[..., 1], texel[..., 0]]
             if image is None:
                 image, depth = shade, along
             else:
-                on_board = (np.abs(hit[..., :2]) < 0.4).all(-1)
+                on_board = (np.abs(hit[..., :2]) < board_half).all(-1)
                 image, depth = np.where(on_board[..., None], shade, image), np.where(on_board, along, depth)
         images.append(image)
         depths.append(depth * units)
@@ -94,6 +98,33 @@ def assert_right(capture, indices, tolerance=MEDIAN_TOLERANCE):
 def test_depths_of_a_known_scene(motion):
     capture = two_planes(16, **motion)
     assert_right(capture, range(16), tolerance=2.0 if motion["step"] < 0.01 else MEDIAN_TOLERANCE)
+
+
+def share_outside(capture):
+    """Shares of the pixels nearer than near and farther than far."""
+    indices = range(len(capture))
+    _, near, far = stream_scale(estimate_depths(capture, indices), StreamConfig(scene_scale=1.0))
+    truth = true_depths(capture, indices)
+    return np.mean(truth < near), np.mean(truth > far)
+
+
+def test_a_background_far_behind_is_within_reach():
+    """It has hardly any parallax, but its points are surely beyond what has, and a sweep that ends before it puts
+    floaters there."""
+    nearer, beyond = share_outside(two_planes(12, 0.06, wall_at=30.0, board_half=0.9))
+    assert nearer < 0.01 and beyond < 0.01
+
+
+def test_what_is_near_counts_where_only_the_background_matches_over_wide_baselines():
+    nearer, beyond = share_outside(two_planes(16, 0.3, start=-2.4, wall_at=30.0, board_half=0.56))
+    assert nearer < 0.01 and beyond < 0.01
+
+
+def test_dark_images_are_seen():
+    capture = two_planes(12, 0.05)
+    assert isinstance(capture.pixels, ArrayPixels)
+    capture.pixels.images[:] *= 0.08
+    assert_right(capture, range(12))
 
 
 def test_units_of_the_capture_do_not_matter():
@@ -153,7 +184,8 @@ def test_range_is_bounded_and_scales(median, spread_near, spread_far):
     scale, near, far = stream_scale(depths, StreamConfig(median_depth=2.0))
     np.testing.assert_allclose(scale * median, 2.0, rtol=1e-12)
     assert scale_module.MIN_RANGE * (1 - 1e-9) <= far / near <= scale_module.MAX_RANGE * (1 + 1e-9)
-    assert near <= scale * depths.q01
+    assert near <= max(scale * depths.q01, 2.0 / 8) * (1 + 1e-9)
+    assert near < 2.0 < far
     unit, unit_near, unit_far = stream_scale(depths, StreamConfig(scene_scale=1.0))
     assert unit == 1.0
     np.testing.assert_allclose([unit_near * scale, unit_far * scale], [near, far], rtol=1e-9)
