@@ -61,10 +61,11 @@ def measure(capture: Capture, stride: int, context: int) -> dict[str, Any]:
     model = StreamSplat(preset("tiny"))
     split = interleaved(len(capture), stride, context)
     frame = capture.stream_frame(model.config, split.context)
+    order = capture.stream_order(model.config, split.context, frame)
     session = Session(model, load_params("tiny"))
     ratios, confidences = [], []
-    views = iter(split.context)
-    for chunk in capture.chunks(model.config, split.context, frame=frame):
+    views = iter(order)
+    for chunk in capture.chunks(model.config, order, frame=frame):
         output = session.feed(chunk)
         for v in np.flatnonzero(np.asarray(chunk.valid)):
             depth = capture.depth(next(views))

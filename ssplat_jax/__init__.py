@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from ssplat_jax.geometry.cameras import Camera as Camera
     from ssplat_jax.render import Effects as Effects
     from ssplat_jax.render import RenderOutput as RenderOutput
+    from ssplat_jax.render import fill_holes as fill_holes
     from ssplat_jax.render import render as render
     from ssplat_jax.stream import StreamSplat as StreamSplat
 
@@ -50,6 +51,7 @@ _HOMES = {
     "VoxelCache": "cache",
     "check": "cache",
     "ensure_room": "cache",
+    "fill_holes": "render",
     "load_params": "checkpoint.weights",
     "load_ply": "export.ply",
     "open_capture": "data.capture",

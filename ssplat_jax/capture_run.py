@@ -77,6 +77,7 @@ def run_capture(
             shutil.rmtree(stale, ignore_errors=True)
     identity = _identity(model, params, capture, indices)
     session, frame, done = _resume(model, params, capture, indices, identity, out, reporter)
+    order = capture.stream_order(model.config, indices, frame)
     feed = None
     if deltas:
         # Without the changes up to here, the first delta is the whole scene: what the folder holds always adds up.
@@ -87,7 +88,7 @@ def run_capture(
     with Interrupts() as interrupts, reporter.progress("streaming", len(indices)) as advance:
         advance(done)
         if done < len(indices):
-            for number, chunk in enumerate(capture.chunks(model.config, indices[done:], frame=frame)):
+            for number, chunk in enumerate(capture.chunks(model.config, order[done:], frame=frame)):
                 session.feed(chunk)
                 done += int(np.asarray(chunk.valid).sum())
                 if feed is not None and session.cache is not None:

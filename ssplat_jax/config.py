@@ -109,6 +109,8 @@ class StreamConfig:
     """Views lower the confidence of pivots that they look through and raise that of those they see (ours)."""
     num_witnesses: int = 32
     """Chunks of which a coarse view is kept, to judge the tokens of later ones in the same way; part of `carving`."""
+    chunk_step: float = 0.03
+    """Video is dealt out so that the views of a chunk are this share of the depth apart (ours); 0: in order."""
     cluster_ratio: float = 1.15
     """Depth ratio that holds the front cluster of the projection together; `inf` is the plain mean (literal)."""
 
@@ -143,6 +145,7 @@ class StreamConfig:
             ("sigma0", "positive", self.sigma0 > 0),
             ("lambda_sigma", "not negative", self.lambda_sigma >= 0),
             ("num_witnesses", "not negative", self.num_witnesses >= 0),
+            ("chunk_step", "not negative", self.chunk_step >= 0),
             ("cluster_ratio", "above 1", self.cluster_ratio > 1),
             ("sh_degree", "0 to 3", 0 <= self.sh_degree <= 3),
             (

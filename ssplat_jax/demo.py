@@ -30,10 +30,11 @@ def run_demo(scene: str, out: Path, reporter: Reporter, quality: Quality = QUALI
     streamed = capture.scaled(quality.scale)
     split = interleaved(len(capture), stride=1, context=STAGES[-1])
     frame = streamed.stream_frame(model.config, split.context)
+    order = streamed.stream_order(model.config, split.context, frame)
     session = Session(model, params)
     rows, strip, seen = [], [], 0
     with reporter.progress("streaming", STAGES[-1]) as advance:
-        for chunk in streamed.chunks(model.config, split.context, frame=frame):
+        for chunk in streamed.chunks(model.config, order, frame=frame):
             session.feed(chunk)
             seen += int(np.asarray(chunk.valid).sum())
             advance(seen)

@@ -21,7 +21,7 @@ from ssplat_jax.export.json_files import write_json
 from ssplat_jax.gaussians import Gaussians, mean_color
 from ssplat_jax.lpips import LpipsWeights, check_size, lpips
 from ssplat_jax.metrics import SSIM_ARGUMENTS, psnr, ssim
-from ssplat_jax.render import render
+from ssplat_jax.render import fill_holes, render
 from ssplat_jax.report import Reporter
 from ssplat_jax.session import Session
 
@@ -36,7 +36,7 @@ class ViewScore:
     """One target view."""
 
     frame: int
-    psnr: float  # dB, holes in the scene's mean colour
+    psnr: float  # dB, holes in the colours around
     psnr_over_black: float  # dB
     ssim: float
     lpips: float | None  # None without weights
@@ -53,7 +53,8 @@ def stream_context(
     """Feeds the context to `session`; calls `on_chunk(views so far)`. Returns the last few chunks, for timing."""
     recent: list = []
     seen = 0
-    for chunk in capture.chunks(session.model.config, split.context, frame=frame):
+    config = session.model.config
+    for chunk in capture.chunks(config, capture.stream_order(config, split.context, frame), frame=frame):
         session.feed(chunk)
         seen += int(np.asarray(chunk.valid).sum())
         recent = [*recent, chunk][-LATENCY_CHUNKS:]
@@ -61,7 +62,7 @@ def stream_context(
     return recent
 
 
-_lpips = jax.jit(lpips)
+_lpips, _filled = jax.jit(lpips), jax.jit(fill_holes)
 
 
 def check_scorable(capture: Capture) -> None:
@@ -82,12 +83,13 @@ def score_view(
 ) -> tuple[ViewScore, Images, Float[np.ndarray, "h w"]]:
     """Score, clipped colour and depth (stream units, 0 where nothing is) of frame `i`.
 
-    What no Gaussian covers is shown in the scene's mean colour. Black, a colour like any other, would make a hole the
-    worst of errors (docs/decisions.md); the score over it is given too.
+    What the Gaussians leave open is shown in the colours around, or in the scene's mean colour (`fill_holes`). Black, a
+    colour like any other, would make a hole the worst of errors (docs/decisions.md); the score over it is given too.
     """
     out = render(gaussians, capture.camera(i, frame))
+    assert out.color is not None and out.alpha is not None
     over_black, alpha = np.asarray(out.color), np.asarray(out.alpha)
-    color = np.clip(over_black + (1.0 - alpha[..., None]) * np.asarray(mean_color(gaussians)), 0.0, 1.0)
+    color = np.clip(_filled(out.color, out.alpha, mean_color(gaussians)), 0.0, 1.0)
     target = capture.image(i)
     distance = None if lpips_weights is None else float(_lpips(lpips_weights, jnp.asarray(color), jnp.asarray(target)))
     score = ViewScore(

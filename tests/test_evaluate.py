@@ -1,4 +1,4 @@
-"""What a score counts: holes in the scene's mean colour, and what they would cost over black."""
+"""What a score counts: holes in the colours around, and what they would cost over black."""
 
 import jax.numpy as jnp
 import numpy as np

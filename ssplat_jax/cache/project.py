@@ -59,18 +59,18 @@ def project(cache: VoxelCache, camera: Camera, config: StreamConfig, *, axis: st
     `cache` is one shard of several, and every shard gets the projection of all of them.
 
     Limits:
-        Camera z <= 0.01, confidence 0 and centres outside the image are not seen.
+        Camera z <= 0.01, confidence 0 (with `carving`, below `min_confidence`) and centres outside the image are not
+        seen.
         An empty cache, and a pixel without a pivot, give zeros and a False mask.
         Over an axis the sums run in another order than over one cache: results agree to float32 rounding.
     """
     cache, camera = jax.lax.stop_gradient((cache, camera))
     shape = (camera.viewmats.shape[0], camera.height, camera.width)
-    window = math.log(config.cluster_ratio)
     with jax.named_scope("project"):
-        fronts = _over_blocks(cache, camera, _nearest, jnp.full((math.prod(shape),), jnp.inf))
+        fronts = _over_blocks(cache, camera, config, _nearest, jnp.full((math.prod(shape),), jnp.inf))
         fronts = _over_shards(jax.lax.pmin, fronts, axis)
-        centres = _front_means(cache, camera, fronts, window, axis)
-        sums = _cluster_sums(cache, camera, fronts, centres, window)
+        centres = _front_means(cache, camera, config, fronts, axis)
+        sums = _cluster_sums(cache, camera, config, fronts, centres)
         weights, squares, offsets, feats = _over_shards(jax.lax.psum, sums, axis)
     mask = weights > 0
     total = jnp.where(mask, weights, 1.0)
@@ -94,12 +94,14 @@ def blocks_of_rows(cache: VoxelCache) -> tuple[int, Int[Array, ""]]:
     return num_rows, (cache.num_voxels + num_rows - 1) // num_rows
 
 
-def _over_blocks(cache: VoxelCache, camera: Camera, visit, start):
+def _over_blocks(cache: VoxelCache, camera: Camera, config: StreamConfig, visit, start):
     """Folds `visit(state, pairs, first_row)` over the blocks of rows that hold voxels."""
     num_rows, num_blocks = blocks_of_rows(cache)
+    # What views have carved away hides nothing; every pivot was accepted at tau or more.
+    least = config.min_confidence if config.carving else 0.0
 
     def step(i, state):
-        return visit(state, pairs_of_rows(cache, camera, i * num_rows, num_rows), i * num_rows)
+        return visit(state, pairs_of_rows(cache, camera, i * num_rows, num_rows, least=least), i * num_rows)
 
     return jax.lax.fori_loop(0, num_blocks, step, start)
 
@@ -109,8 +111,9 @@ def _nearest(fronts, pairs: PixelPairs, first_row):
     return fronts.at[pairs.pixels].min(pairs.log_depths, mode="drop")
 
 
-def _front_means(cache, camera, fronts, window, axis):
+def _front_means(cache, camera, config, fronts, axis):
     """Mean log depth of each pixel's front window, measured from its nearest pivot."""
+    window = math.log(config.cluster_ratio)
 
     def visit(sums, pairs: PixelPairs, first_row):
         del first_row
@@ -118,13 +121,14 @@ def _front_means(cache, camera, fronts, window, axis):
         weights = jnp.where(behind <= window, pairs.weights, 0.0)
         return _add(sums, pairs.pixels, (weights, weights * behind))
 
-    sums = _over_blocks(cache, camera, visit, (jnp.zeros_like(fronts), jnp.zeros_like(fronts)))
+    sums = _over_blocks(cache, camera, config, visit, (jnp.zeros_like(fronts), jnp.zeros_like(fronts)))
     weights, offsets = _over_shards(jax.lax.psum, sums, axis)
     return offsets / jnp.where(weights > 0, weights, 1.0)
 
 
-def _cluster_sums(cache, camera, fronts, centres, window):
+def _cluster_sums(cache, camera, config, fronts, centres):
     """Sums over each pixel's re-centred cluster: w, w^2, w times log depth from the nearest pivot, w times feature."""
+    window = math.log(config.cluster_ratio)
     flat_feats = cache.feats.reshape(-1, cache.feats.shape[-1])
     pivots_per_row = cache.feats.shape[1]
 
@@ -139,7 +143,7 @@ def _cluster_sums(cache, camera, fronts, centres, window):
 
     zeros = jnp.zeros_like(fronts)
     feats = jnp.zeros((fronts.shape[0], cache.feats.shape[-1]))
-    scalars, feats = _over_blocks(cache, camera, visit, ((zeros, zeros, zeros), feats))
+    scalars, feats = _over_blocks(cache, camera, config, visit, ((zeros, zeros, zeros), feats))
     return *scalars, feats
 
 
@@ -166,16 +170,17 @@ def _add_feats(sums, flat_feats, pixels, weights, first_pivot, num_views):
     return jax.lax.fori_loop(0, num_blocks, add_block, sums)
 
 
-def pairs_of_rows(cache: VoxelCache, camera: Camera, first_row, num_rows: int) -> PixelPairs:
-    """The pixels of all views that the pivots of `num_rows` rows fall on."""
+def pairs_of_rows(cache: VoxelCache, camera: Camera, first_row, num_rows: int, *, least: float = 0.0) -> PixelPairs:
+    """The pixels of all views that the pivots of `num_rows` rows fall on; those of confidence below `least` on none."""
 
     def block(x):
         return jax.lax.dynamic_slice_in_dim(x, first_row, num_rows).reshape(-1, *x.shape[2:])
 
     k = cache.means.shape[1]
     counts = jax.lax.dynamic_slice_in_dim(cache.counts, first_row, num_rows)
-    weights = jnp.where(jnp.arange(k) < counts[:, None], block(cache.confidences).reshape(-1, k), 0.0).reshape(-1)
-    return pairs_of_points(block(cache.means), weights, camera)
+    confidences = block(cache.confidences).reshape(-1, k)
+    is_shown = (jnp.arange(k) < counts[:, None]) & (confidences >= least)
+    return pairs_of_points(block(cache.means), jnp.where(is_shown, confidences, 0.0).reshape(-1), camera)
 
 
 def pairs_of_points(points: Float[Array, "n 3"], weights: Float[Array, " n"], camera: Camera) -> PixelPairs:

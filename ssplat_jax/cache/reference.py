@@ -170,7 +170,8 @@ def project(cache: dict, viewmats, Ks, height: int, width: int, config: StreamCo
 
     Where the margin (pixels, log depths) is within rounding of 0, another precision may decide otherwise.
     """
-    pivots = [pivot for _, row in cache["rows"] for pivot in row]
+    least = np.float32(config.min_confidence) if config.carving else 0.0
+    pivots = [pivot for _, row in cache["rows"] for pivot in row if pivot["confidences"] >= least]
     shape = (len(viewmats), height, width)
     depths, confidences, mask = np.zeros(shape), np.zeros(shape), np.zeros(shape, bool)
     feats, margins = np.zeros((*shape, config.token_width)), [math.inf]

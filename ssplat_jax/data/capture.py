@@ -6,6 +6,7 @@ use, so that damage is found before anything is written.
 
 import dataclasses
 import hashlib
+import math
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -18,6 +19,7 @@ from jaxtyping import Float32, Float64
 from ssplat_jax.chunk import Chunk
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.data.frame import StreamFrame
+from ssplat_jax.data.order import deal
 from ssplat_jax.data.pixels import ArrayPixels, Crop, FilePixels, Pixels, decode_all, resize_depth, resize_image
 from ssplat_jax.data.posed_frame import Frame, check_camtoworld, check_intrinsics
 from ssplat_jax.data.readers import Listing, transforms_json
@@ -112,6 +114,17 @@ class Capture:
         viewmat = frame.viewmats(self.frames[i].camtoworld)
         K = self.K(i).astype(np.float32)
         return Camera(viewmats=jnp.asarray(viewmat), Ks=jnp.asarray(K), width=self.width, height=self.height)
+
+    def stream_order(self, config: StreamConfig, indices: Sequence[int] | None, frame: StreamFrame) -> list[int]:
+        """`indices` (default all) as `run`, `eval` and `demo` stream them: video dealt out (`data.order`).
+
+        The typical depth is taken to be the geometric mean of the sweep's ends.
+        """
+        used = _indices(self, indices)
+        centers = np.stack([self.frames[i].center for i in used])
+        return deal(
+            centers, used, config.chunk_size, config.chunk_step * math.sqrt(frame.near * frame.far) / frame.scale
+        )
 
     def chunks(
         self, config: StreamConfig, indices: Sequence[int] | None = None, *, frame: StreamFrame | None = None

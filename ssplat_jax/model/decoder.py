@@ -8,8 +8,8 @@ from ssplat_jax.config import StreamConfig
 from ssplat_jax.gaussians import SH_C0, Gaussians
 from ssplat_jax.geometry.rotations import multiply_quats
 
-START_OPACITY = 1.5  # logit: 0.82, a surface that mostly hides what is behind it
-START_SCALE = 0.5  # of a cell's footprint, sideways: neighbours overlap into a closed surface
+START_OPACITY = 0.0  # logit: 0.5; a surface is several tokens deep, and half opaque ones average each other's errors
+START_SCALE = 0.55  # of a cell's footprint, sideways: neighbours overlap into a closed surface
 START_THICKNESS = 0.4  # of the sideways scale, along the viewing direction
 MAX_LOG_GAIN = 0.3  # a Gaussian stays within a third of its cell's size: larger ones fill holes over what lies behind
 MIN_SCALE = 1e-6
