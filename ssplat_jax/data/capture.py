@@ -55,11 +55,13 @@ class Capture:
         return np.stack([frame.camtoworld for frame in self.frames])
 
     def digest(self, indices: Sequence[int]) -> str:
-        """Twelve hex digits that name the poses, intrinsics and file names of the frames `indices`."""
+        """Twelve hex digits that name the poses, intrinsics, lenses and file names of the frames `indices`."""
         digest = hashlib.sha256()
         for frame in (self.frames[i] for i in indices):
             digest.update(f"{frame.name}\n".encode())
             digest.update(frame.camtoworld.tobytes() + frame.K.tobytes())
+            if frame.lens is not None:
+                digest.update(repr(frame.lens).encode())
         return digest.hexdigest()[:12]
 
     def scaled(self, factor: float) -> "Capture":

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 from PIL import Image
 
+from ssplat_jax.data.lens import undistorted
 from ssplat_jax.data.posed_frame import Frame
 from ssplat_jax.data.refusal import refusal
 
@@ -44,18 +45,25 @@ class Pixels(Protocol):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class FilePixels:
-    """Images and depth maps decoded from the files of `frames` at each call."""
+    """Images and depth maps decoded from the files of `frames` at each call, lens distortion undone."""
 
     frames: Sequence[Frame]
 
     def image(self, i: int) -> Float32[np.ndarray, "h w 3"]:
         frame = self.frames[i]
         assert frame.path is not None  # readers of files always set it
-        return decode_image(frame.path, (frame.width, frame.height))
+        image = decode_image(frame.path, (frame.width, frame.height))
+        return image if frame.lens is None else undistorted(image, frame.lens, frame.K)
 
     def depth(self, i: int) -> Float32[np.ndarray, "h w"] | None:
-        path = self.frames[i].depth_path
-        return None if path is None else decode_depth(path)
+        frame = self.frames[i]
+        if frame.depth_path is None:
+            return None
+        depth = decode_depth(frame.depth_path)
+        if frame.lens is None:
+            return depth
+        sizes = np.array([depth.shape[1] / frame.width, depth.shape[0] / frame.height, 1.0])
+        return undistorted(depth, frame.lens, np.diag(sizes) @ frame.K, order=0)
 
     def has_depth(self, i: int) -> bool:
         return self.frames[i].depth_path is not None

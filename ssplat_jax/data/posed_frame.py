@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
+from ssplat_jax.data.lens import Lens
 from ssplat_jax.data.refusal import echo, refusal
 
 ROTATION_TOLERANCE = 1e-3  # largest |R^T R - I| that is taken for rounding and projected to a rotation
 ROTATION_ROUNDING = 1e-5  # deviations beyond this are reported
-DISTORTION_TOLERANCE_PX = 0.5  # largest displacement by lens distortion, in pixels, that is ignored
 MIN_FOCAL_PX = 3.0  # smaller focal lengths are intrinsics in units of the image, not in pixels
 
 
@@ -30,7 +30,8 @@ class Frame:
     path: Path | None = None  # None: the image lives in memory
     depth_path: Path | None = None  # 16-bit PNG of millimetres
     pose_deviation: float = 0.0  # |R^T R - I| before projection
-    distortion_px: float = 0.0  # largest displacement by the distortion that is ignored
+    lens: Lens | None = None  # distortion of the stored image, undone when it is delivered
+    distortion_px: float = 0.0  # largest displacement by distortion, ignored or undone
 
     @property
     def center(self) -> Float64[np.ndarray, "3"]:
@@ -94,30 +95,3 @@ def check_intrinsics(
             fix = "give the principal point in pixels of the stored image"
             raise refusal(f"{where}.{name}", wanted=f"a value in [0, {extent}]", got=echo(center), fix=fix)
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-
-
-def check_distortion(
-    coefficients: dict[str, float], K: Float64[np.ndarray, "3 3"], width: int, height: int, where: str
-) -> float:
-    """Largest displacement in pixels by Brown's model (k1 k2 k3 k4 radial, p1 p2 tangential), refused if it shows.
-
-    Limits:
-        Up to 0.5 px anywhere on the image's border: ignored, the value returned. Beyond: refused.
-    """
-    get = lambda name: coefficients.get(name, 0.0)  # noqa: E731 - absent means zero
-    t = np.linspace(0.0, 1.0, 9)
-    edge = np.concatenate([np.stack(np.broadcast_arrays(t, s), -1) for s in (0.0, 1.0)])
-    border = np.concatenate([edge, edge[:, ::-1]]) * (width, height)
-    x = (border[:, 0] - K[0, 2]) / K[0, 0]
-    y = (border[:, 1] - K[1, 2]) / K[1, 1]
-    r2 = x * x + y * y
-    with np.errstate(over="ignore", invalid="ignore"):
-        radial = r2 * (get("k1") + r2 * (get("k2") + r2 * (get("k3") + r2 * get("k4"))))
-        dx = x * radial + 2 * get("p1") * x * y + get("p2") * (r2 + 2 * x * x)
-        dy = y * radial + get("p1") * (r2 + 2 * y * y) + 2 * get("p2") * x * y
-        shift = float(np.nan_to_num(np.hypot(K[0, 0] * dx, K[1, 1] * dy).max(), nan=np.inf))
-    if shift > DISTORTION_TOLERANCE_PX:
-        shown = ", ".join(f"{k}={v:.3g}" for k, v in coefficients.items() if v != 0)
-        fix = "undistort first (COLMAP: `colmap image_undistorter`) and set k1..p2 to 0"
-        raise refusal(where, wanted="undistorted images", got=f"{shown}, which moves pixels by {shift:.3g}", fix=fix)
-    return shift

@@ -220,8 +220,8 @@ CASES = (
     Case("fisheye flag", top(is_fisheye=True), ("camera_model", "undistort")),
     Case("unknown camera model", top(camera_model="EQUIRECTANGULAR"), ("camera_model", "EQUIRECTANGULAR")),
     Case("camera model a list", top(camera_model=[1]), ("camera_model",)),
-    Case("distorted", top(k1=0.06), ("k1=0.06", "undistort")),
-    Case("tangentially distorted", top(p2=0.1), ("p2=0.1", "undistort")),
+    Case("distorted until it folds", top(k1=-2.0), ("k1=-2", "undistort")),
+    Case("tangentially distorted until it folds", top(p2=2.0), ("p2=2", "undistort")),
     Case("distortion beyond measure", top(k1=1e308), ("undistort",)),
     # paths
     Case("path outside", outside("../secret.jpg"), (PATH, "inside", "copy")),

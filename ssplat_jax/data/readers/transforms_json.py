@@ -3,10 +3,12 @@
 Poses are camera-to-world with OpenGL axes (+x right, +y up, +z backward); here they become OpenCV's. They are otherwise
 left alone: no re-centring, no rescaling, no `applied_transform`, so results stand in the file's own frame.
 Intrinsics are global or per frame, a frame's own value first: fl_x, fl_y, cx, cy, w, h in pixels of the stored image,
-or camera_angle_x in radians. Absent: fl_y = fl_x, centre of the image, size from the image's header.
+or camera_angle_x in radians. Absent: fl_y = fl_x, centre of the image, size from the image's header. Distortion (k1 to
+k4, p1, p2) is Brown's, and is undone when images are delivered.
 Frames are streamed in the natural order of `file_path` ("9.jpg" before "10.jpg"), whatever their order in the file.
 """
 
+import dataclasses
 import math
 import re
 from pathlib import Path
@@ -14,12 +16,12 @@ from typing import Any
 
 import numpy as np
 
+from ssplat_jax.data.lens import IGNORED_PX, Lens, check_lens
 from ssplat_jax.data.pixels import check_depth_header, image_size
 from ssplat_jax.data.posed_frame import (
     ROTATION_ROUNDING,
     Frame,
     check_camtoworld,
-    check_distortion,
     check_intrinsics,
 )
 from ssplat_jax.data.readers import Listing
@@ -30,7 +32,6 @@ FORMAT = "transforms.json"
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 EXTENSIONS = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG", ".webp")
 PINHOLE_MODELS = (None, "OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
-DISTORTION_NAMES = ("k1", "k2", "k3", "k4", "p1", "p2")
 
 
 def matches(path: Path) -> bool:
@@ -80,7 +81,8 @@ def _read_frame(root: Path, meta: dict[str, Any], entry: dict[str, Any], where: 
     fx, fy = _focal(fields, width, height)
     cx, cy = fields.number("cx", width / 2), fields.number("cy", height / 2)
     K = check_intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height, where=where)
-    distortion = {n: fields.number(n, 0.0) for n in DISTORTION_NAMES}
+    lens = Lens(**{field.name: fields.number(field.name, 0.0) for field in dataclasses.fields(Lens)})
+    distortion_px = check_lens(lens, K, width, height, where)
     return Frame(
         name=str(name),
         camtoworld=opengl @ OPENGL_TO_OPENCV,
@@ -90,7 +92,8 @@ def _read_frame(root: Path, meta: dict[str, Any], entry: dict[str, Any], where: 
         path=path,
         depth_path=depth_path,
         pose_deviation=deviation,
-        distortion_px=check_distortion(distortion, K, width, height, where),
+        lens=lens if distortion_px > IGNORED_PX else None,
+        distortion_px=distortion_px,
     )
 
 
@@ -190,7 +193,8 @@ def _notes(frames: list[Frame]) -> tuple[str, ...]:
         notes.append(
             f"{len(off)} poses were not quite rotations (by up to {worst:.1e}) and were projected to the nearest."
         )
-    worst_px = max(f.distortion_px for f in frames)
-    if worst_px > 0:
-        notes.append(f"Lens distortion of up to {worst_px:.2f} px is ignored.")
+    for what, kind in (("undone", [f for f in frames if f.lens]), ("ignored", [f for f in frames if not f.lens])):
+        worst_px = max((f.distortion_px for f in kind), default=0.0)
+        if worst_px > 0:
+            notes.append(f"Lens distortion of up to {worst_px:.2f} px is {what}.")
     return tuple(notes)
