@@ -13,7 +13,7 @@ from jaxtyping import Float64
 from ssplat_jax.data.lens import Lens
 from ssplat_jax.data.refusal import echo, refusal
 
-ROTATION_TOLERANCE = 1e-3  # largest |R^T R - I| that is taken for rounding and projected to a rotation
+ROTATION_TOLERANCE = 5e-3  # largest |R^T R - I| that is taken for rounding, to three decimals, and projected
 ROTATION_ROUNDING = 1e-5  # deviations beyond this are reported
 MIN_FOCAL_PX = 3.0  # smaller focal lengths are intrinsics in units of the image, not in pixels
 
@@ -30,6 +30,7 @@ class Frame:
     path: Path | None = None  # None: the image lives in memory
     depth_path: Path | None = None  # 16-bit PNG of millimetres
     pose_deviation: float = 0.0  # |R^T R - I| before projection
+    shrink: float = 1.0  # of the stored image against the one that the intrinsics were given for
     lens: Lens | None = None  # distortion of the stored image, undone when it is delivered
     distortion_px: float = 0.0  # largest displacement by distortion, ignored or undone
 
@@ -43,7 +44,7 @@ def check_camtoworld(matrix: object, where: str) -> tuple[Float64[np.ndarray, "4
     """A rigid camera-to-world transform from numbers of outside, and how far its rotation was from one.
 
     Limits:
-        |R^T R - I| <= 1e-3: replaced by the nearest rotation. Beyond: refused.
+        |R^T R - I| <= 5e-3: replaced by the nearest rotation. Beyond: refused.
         det R < 0 (a mirrored frame): refused.
     """
     try:
@@ -58,7 +59,7 @@ def check_camtoworld(matrix: object, where: str) -> tuple[Float64[np.ndarray, "4
         raise refusal(where, wanted="a 4x4 matrix", got=f"shape {pose.shape}", fix="write four rows of four numbers")
     if not np.isfinite(pose).all():
         raise refusal(where, wanted="finite numbers", got="NaN or infinity", fix="drop the frame (tracking was lost)")
-    if not np.array_equal(pose[3], [0.0, 0.0, 0.0, 1.0]):
+    if not np.allclose(pose[3], [0.0, 0.0, 0.0, 1.0], rtol=0, atol=1e-6):
         transposed = np.array_equal(pose[:, 3], [0.0, 0.0, 0.0, 1.0])
         fix = "transpose the matrix" if transposed else "give a rigid camera-to-world transform"
         raise refusal(where, wanted="a last row of 0 0 0 1", got=echo(pose[3].tolist()), fix=fix)
@@ -75,7 +76,7 @@ def check_camtoworld(matrix: object, where: str) -> tuple[Float64[np.ndarray, "4
         fix = "flip one axis of the camera or undo the mirroring of the world"
         raise refusal(where, wanted="a rotation with determinant 1", got="determinant -1 (a reflection)", fix=fix)
     u, _, vt = np.linalg.svd(rotation)
-    pose[:3, :3] = u @ vt
+    pose[:3, :3], pose[3] = u @ vt, [0.0, 0.0, 0.0, 1.0]
     return pose, deviation
 
 

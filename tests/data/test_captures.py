@@ -145,6 +145,59 @@ def test_distortion_too_small_to_see_is_ignored_and_reported(tmp_path):
     assert "distortion" in capture.notes[0]
 
 
+def test_shrunk_images_shrink_their_intrinsics(tmp_path):
+    """nerfstudio's images_2: the file still describes the full size."""
+    full = open_capture(make(tmp_path / "a"))
+    names = ("w", "h", "fl_x", "fl_y", "cx", "cy")
+
+    def describe_twice_the_size(root, meta):
+        meta.update({name: 2 * value for name, value in zip(names, (WIDTH, HEIGHT, *intrinsics(full)), strict=True)})
+
+    shrunk = open_capture(make(tmp_path / "b", describe_twice_the_size))
+    np.testing.assert_allclose(shrunk.frames[1].K, full.frames[1].K, rtol=1e-12)
+    assert (shrunk.width, shrunk.height) == (WIDTH, HEIGHT) and "0.5 times" in shrunk.notes[0]
+
+
+def test_images_of_a_shrunk_folder_stand_in_for_missing_ones(tmp_path):
+    root = make(tmp_path / "c")
+    (root / "images").rename(root / "images_4")
+    capture = open_capture(root)
+    assert {frame.path.parent.name for frame in capture.frames if frame.path} == {"images_4"}
+
+
+def intrinsics(capture):
+    K = capture.frames[0].K
+    return K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+
+
+def test_names_without_an_order_leave_the_files(tmp_path):
+    """Random names, or all left images before all right ones: the camera's way tells."""
+
+    def rename(root, meta):
+        for name, entry, x in zip("cadb", meta["frames"], range(4), strict=False):
+            path = root / entry["file_path"]
+            entry["file_path"] = f"images/{name}{path.suffix}"
+            path.rename(root / entry["file_path"])
+            entry["transform_matrix"][0][3] = float(x)
+
+    def names(capture):
+        return [frame.name[7] for frame in capture.frames]
+
+    told = open_capture(make(tmp_path / "d", rename))
+    assert names(told) == list("cadb")
+    assert any("file's order" in note for note in told.notes)
+
+
+def test_rotations_of_three_decimals_are_rotations():
+    for degrees in range(0, 180, 7):
+        check_camtoworld(np.round(rotated(float(degrees)) @ tilted(degrees / 3), 3).tolist(), "here")
+
+
+def tilted(degrees):
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    return np.array([[1, 0, 0, 0], [0, c, -s, 0], [0, s, c, 0], [0, 0, 0, 1.0]])
+
+
 def test_depth_is_metres_from_millimetres_and_zero_is_unknown(tmp_path):
     def change(root, meta):
         depth = np.full((HEIGHT, WIDTH), 1500, np.uint16)

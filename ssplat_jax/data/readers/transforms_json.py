@@ -5,10 +5,12 @@ left alone: no re-centring, no rescaling, no `applied_transform`, so results sta
 Intrinsics are global or per frame, a frame's own value first: fl_x, fl_y, cx, cy, w, h in pixels of the stored image,
 or camera_angle_x in radians. Absent: fl_y = fl_x, centre of the image, size from the image's header. Distortion (k1 to
 k4, p1, p2) is Brown's, and is undone when images are delivered.
-Frames are streamed in the natural order of `file_path` ("9.jpg" before "10.jpg"), whatever their order in the file.
+Frames are streamed in the natural order of `file_path` ("9.jpg" before "10.jpg"), whatever their order in the file,
+unless the file's order makes the camera's way less than half as long (names without an order, several cameras).
 """
 
 import dataclasses
+import itertools
 import math
 import re
 from pathlib import Path
@@ -30,7 +32,9 @@ from ssplat_jax.data.refusal import echo, refusal
 
 FORMAT = "transforms.json"
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+MUCH_SHORTER = 0.5  # of the camera's way by name: the file's order is taken
 EXTENSIONS = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG", ".webp")
+SHRUNK_FOLDERS = ("images_2", "images_4", "images_8")  # where images/ was left out of a download
 PINHOLE_MODELS = (None, "OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 
 
@@ -59,14 +63,22 @@ def read(path: Path) -> Listing:
             got = f"{echo(frame.name)} in both {first.split(': ')[-1]} and frames[{i}]"
             raise refusal(f"{where}.file_path", wanted="every image once", got=got, fix="drop one of the two frames")
         frames.append(frame)
-    frames.sort(key=lambda frame: _natural(frame.name))
-    return Listing(name=root.name, frames=tuple(frames), notes=_notes(frames))
+    ordered = sorted(frames, key=lambda frame: _natural(frame.name))
+    if _path_length(frames) < MUCH_SHORTER * _path_length(ordered):
+        note = "Frames are streamed in the file's order: by name, the camera would go more than twice as far."
+        return Listing(name=root.name, frames=tuple(frames), notes=(*_notes(frames), note))
+    return Listing(name=root.name, frames=tuple(ordered), notes=_notes(frames))
+
+
+def _path_length(frames: list[Frame]) -> float:
+    """How far the camera goes from frame to frame."""
+    return sum(math.dist(a.center, b.center) for a, b in itertools.pairwise(frames))
 
 
 def _read_frame(root: Path, meta: dict[str, Any], entry: dict[str, Any], where: str) -> Frame:
     """One checked frame."""
     name = entry.get("file_path")
-    path = _inside(root, name, f"{where}.file_path", EXTENSIONS)
+    path = _inside(root, name, f"{where}.file_path", EXTENSIONS, SHRUNK_FOLDERS)
     depth_path = None
     if "depth_file_path" in entry:
         depth_path = _inside(root, entry["depth_file_path"], f"{where}.depth_file_path", ("",))
@@ -76,10 +88,10 @@ def _read_frame(root: Path, meta: dict[str, Any], entry: dict[str, Any], where: 
         raise refusal(f"{where}.transform_matrix", wanted="a 4x4 matrix", got="nothing", fix=fix)
     opengl, deviation = check_camtoworld(entry["transform_matrix"], f"{where}.transform_matrix")
     fields = _Fields(meta, entry, where)
-    width, height = _check_size(fields, path)
+    (width, height), shrink = _check_size(fields, path)
     _check_model(fields)
-    fx, fy = _focal(fields, width, height)
-    cx, cy = fields.number("cx", width / 2), fields.number("cy", height / 2)
+    fx, fy = (shrink * focal for focal in _focal(fields, width / shrink, height / shrink))
+    cx, cy = (shrink * fields.number(name, side / shrink / 2) for name, side in (("cx", width), ("cy", height)))
     K = check_intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height, where=where)
     lens = Lens(**{field.name: fields.number(field.name, 0.0) for field in dataclasses.fields(Lens)})
     distortion_px = check_lens(lens, K, width, height, where)
@@ -92,6 +104,7 @@ def _read_frame(root: Path, meta: dict[str, Any], entry: dict[str, Any], where: 
         path=path,
         depth_path=depth_path,
         pose_deviation=deviation,
+        shrink=shrink,
         lens=lens if distortion_px > IGNORED_PX else None,
         distortion_px=distortion_px,
     )
@@ -120,13 +133,17 @@ class _Fields:
         raise refusal(f"{self.where}.{name}", wanted="a finite number", got=echo(value), fix=fix)
 
 
-def _inside(root: Path, name: object, where: str, extensions: tuple[str, ...]) -> Path:
-    """The file `name` of the capture, its extension completed; symbolic links are followed before it is judged."""
+def _inside(root: Path, name: object, where: str, extensions: tuple[str, ...], folders: tuple[str, ...] = ()) -> Path:
+    """The file `name` of the capture, its extension completed; symbolic links are followed before it is judged.
+
+    A name in images/ may lie in one of `folders` instead.
+    """
     if not isinstance(name, str) or not name or "\0" in name:
         raise refusal(where, wanted="the path of a file", got=echo(name), fix="give it relative to the capture")
-    for extension in extensions:
+    names = [name, *(folder + name.removeprefix("images") for folder in folders if name.startswith("images/"))]
+    for candidate in (n + extension for n in names for extension in extensions):
         try:
-            path = (root / (name + extension)).resolve()
+            path = (root / candidate).resolve()
             found = path.is_file()
         except (OSError, RuntimeError, ValueError):  # too long a name, a loop of links
             continue
@@ -139,17 +156,24 @@ def _inside(root: Path, name: object, where: str, extensions: tuple[str, ...]) -
     raise refusal(where, wanted="an existing file", got=got, fix="add the file or drop the frame")
 
 
-def _check_size(fields: _Fields, path: Path) -> tuple[int, int]:
-    """(width, height) of the stored image, which w and h must repeat where they are given."""
+def _check_size(fields: _Fields, path: Path) -> tuple[tuple[int, int], float]:
+    """(width, height) of the stored image, and how much smaller it is than the w and h of its intrinsics.
+
+    Folders of shrunk images (nerfstudio's images_2, images_4) keep the intrinsics of the full size: both sides shrunk
+    alike, to a pixel, are taken for such.
+    """
     width, height = image_size(path)
     wanted = (fields.number("w", float(width)), fields.number("h", float(height)))
-    if wanted != (width, height):
-        fix = "set w and h to the stored size and scale fl_x, fl_y, cx, cy with them"
-        if wanted == (height, width):
-            fix = "the image lies on its side: rotate the file (EXIF orientation is not applied) or swap the intrinsics"
-        came = f"{width}x{height} in {path.name}"
-        raise refusal(f"{fields.where}: w, h", wanted=f"{wanted[0]:g}x{wanted[1]:g}", got=came, fix=fix)
-    return width, height
+    if wanted == (width, height):
+        return (width, height), 1.0
+    shrink = width / wanted[0] if wanted[0] > 0 else math.inf
+    if abs(wanted[1] * shrink - height) <= max(1.0, shrink):
+        return (width, height), shrink
+    fix = "set w and h to the stored size and scale fl_x, fl_y, cx, cy with them"
+    if wanted == (height, width):
+        fix = "the image lies on its side: rotate the file (EXIF orientation is not applied) or swap the intrinsics"
+    came = f"{width}x{height} in {path.name}"
+    raise refusal(f"{fields.where}: w, h", wanted=f"{wanted[0]:g}x{wanted[1]:g}", got=came, fix=fix)
 
 
 def _check_model(fields: _Fields) -> None:
@@ -161,7 +185,7 @@ def _check_model(fields: _Fields) -> None:
         )
 
 
-def _focal(fields: _Fields, width: int, height: int) -> tuple[float, float]:
+def _focal(fields: _Fields, width: float, height: float) -> tuple[float, float]:
     """Focal lengths in pixels from fl_x, fl_y, or the fields of view camera_angle_x, camera_angle_y."""
     focals = {}
     for axis, extent in (("x", width), ("y", height)):
@@ -193,6 +217,8 @@ def _notes(frames: list[Frame]) -> tuple[str, ...]:
         notes.append(
             f"{len(off)} poses were not quite rotations (by up to {worst:.1e}) and were projected to the nearest."
         )
+    if shrinks := {f.shrink for f in frames if f.shrink != 1.0}:
+        notes.append(f"Images are {min(shrinks):.4g} times the size of the intrinsics, which were scaled with them.")
     for what, kind in (("undone", [f for f in frames if f.lens]), ("ignored", [f for f in frames if not f.lens])):
         worst_px = max((f.distortion_px for f in kind), default=0.0)
         if worst_px > 0:
