@@ -77,6 +77,8 @@ def run_capture(
             shutil.rmtree(stale, ignore_errors=True)
     identity = _identity(model, params, capture, indices)
     session, frame, done = _resume(model, params, capture, indices, identity, out, reporter)
+    for warning in (*capture.notes, *filter(None, [frame.warning])):
+        reporter.warn(warning)
     order = capture.stream_order(model.config, indices, frame)
     feed = None
     if deltas:

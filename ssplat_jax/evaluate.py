@@ -202,8 +202,11 @@ def evaluate(
         raise StorageError(f"{out}: cannot be written ({error.strerror}); choose another --out.") from error
     streamed = streamed or capture
     frame = streamed.stream_frame(session.model.config, split.context)
+    reporter = reporter or Reporter(quiet=True)
+    for warning in (*capture.notes, *filter(None, [frame.warning])):
+        reporter.warn(warning)
     reference = baselines(capture, split)
-    with (reporter or Reporter(quiet=True)).progress("streaming", len(split.context)) as advance:
+    with reporter.progress("streaming", len(split.context)) as advance:
         recent = stream_context(session, streamed, split, frame, advance)
     gaussians = session.gaussians()
     facts = cache_facts(session)
@@ -235,7 +238,7 @@ def evaluate(
         "cache": facts,
         "num_gaussians": facts["decoded"],
         "config_hash": session.model.config.hash,
-        "stream_frame": {"scale": frame.scale, "near": frame.near, "far": frame.far},
+        "stream_frame": {"scale": frame.scale, "near": frame.near, "far": frame.far, "warning": frame.warning},
         "baselines": reference,
         "per_view": [dataclasses.asdict(s) for s in scores],
     }

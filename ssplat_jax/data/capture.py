@@ -108,8 +108,10 @@ class Capture:
         frames, the targets of an evaluation among them, have no say.
         """
         used = _indices(self, indices)
-        scale, near, far = stream_scale(estimate_depths(self, used), config)
-        return StreamFrame.at_camera(self.frames[used[0]].camtoworld, scale=scale, near=near, far=far)
+        depths = estimate_depths(self, used)
+        scale, near, far = stream_scale(depths, config)
+        first = self.frames[used[0]].camtoworld
+        return StreamFrame.at_camera(first, scale=scale, near=near, far=far, warning=depths.warning)
 
     def camera(self, i: int, frame: StreamFrame) -> Camera:
         """The camera of frame `i` in the stream frame."""

@@ -30,12 +30,20 @@ class StreamFrame:
     scale: float  # stream units per capture unit
     near: float  # nearest depth candidate, stream units
     far: float
+    warning: str | None = None  # why scale, near and far may be wrong
 
     @staticmethod
-    def at_camera(camtoworld: Float64[np.ndarray, "4 4"], *, scale: float, near: float, far: float) -> "StreamFrame":
+    def at_camera(
+        camtoworld: Float64[np.ndarray, "4 4"], *, scale: float, near: float, far: float, warning: str | None = None
+    ) -> "StreamFrame":
         """The frame of a camera of the capture; `near` and `far` in stream units."""
         return StreamFrame(
-            rotation=camtoworld[:3, :3].copy(), origin=camtoworld[:3, 3].copy(), scale=scale, near=near, far=far
+            rotation=camtoworld[:3, :3].copy(),
+            origin=camtoworld[:3, 3].copy(),
+            scale=scale,
+            near=near,
+            far=far,
+            warning=warning,
         )
 
     def points_to_stream(self, points: Float64[np.ndarray, "*n 3"]) -> Float64[np.ndarray, "*n 3"]:

@@ -96,11 +96,8 @@ def _warnings(capture: Capture, depths: DepthStatistics, steps: np.ndarray) -> l
         return ["All cameras stand in one place: no parallax, so depth is a guess; add frames from other places."]
     found = []
     step = float(np.median(steps)) / depths.median
-    if depths.source == "baselines":
-        found.append(
-            "Hardly any matches between frames: depth, near, far and scale are guessed from the steps between cameras; "
-            "check poses and axes, or set the scene scale."
-        )
+    if depths.source == "baselines" and depths.warning is not None:
+        found.append(depths.warning)
     elif depths.source == "poor parallax" or step < LOW_STEP:
         stride = max(2, round(GOOD_STEP / max(step, 1e-6)))
         found.append(

@@ -91,6 +91,20 @@ class DepthStatistics:
     parallax_degrees: float  # median over the points; 0 without any
     source: str  # "matches"; "poor parallax": the median only; "baselines": a guess
 
+    @property
+    def warning(self) -> str | None:
+        """What to tell a user about a measurement that failed."""
+        if self.source == "baselines":
+            return (
+                "Hardly any matches between frames: depth, near, far and scale are guessed from the steps between"
+                " cameras; check poses and axes, or set the scene scale."
+            )
+        if self.source == "poor parallax":
+            return (
+                "Low parallax: near and far are guessed around the median depth; take frames farther apart (--stride)."
+            )
+        return None
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Keypoints:
