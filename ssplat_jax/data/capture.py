@@ -133,13 +133,17 @@ class Capture:
     def chunks(
         self, config: StreamConfig, indices: Sequence[int] | None = None, *, frame: StreamFrame | None = None
     ) -> Iterator[Chunk]:
-        """The frames `indices` (default all) in chunks of `config.chunk_size`; a thread reads one chunk ahead.
+        """The frames `indices`, as they stand, in chunks of `config.chunk_size`; a thread reads one chunk ahead.
+
+        Without `indices`: all frames, in `stream_order`.
 
         The last chunk is padded to full size with views that are not valid: black images, the identity pose, the
         intrinsics of the chunk's first view. `frame` defaults to `stream_frame(config, indices)`.
         """
         used = _indices(self, indices)
         frame = frame or self.stream_frame(config, used)
+        if indices is None:
+            used = self.stream_order(config, None, frame)
         groups = [used[k : k + config.chunk_size] for k in range(0, len(used), config.chunk_size)]
         with ThreadPoolExecutor(1) as reader:
             ahead = reader.submit(self._views, groups[0], config.chunk_size, frame)

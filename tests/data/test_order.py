@@ -5,7 +5,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ssplat_jax.config import StreamConfig
+from ssplat_jax.data.frame import StreamFrame
 from ssplat_jax.data.order import MOST_HANDS, deal
+from tests.data.test_captures_scale import two_planes
 
 
 def along_a_line(steps):
@@ -32,6 +35,16 @@ def test_speed_is_judged_block_by_block():
     """A slow stretch is dealt, a fast one after it is not."""
     order = deal(along_a_line([0.01] * 36 + [0.05] * 35), list(range(72)), 4, 0.03)
     assert order[:4] == [0, 3, 6, 9] and order[-16:] == list(range(56, 72))
+
+
+def test_a_capture_deals_what_it_streams_unless_it_is_told_the_frames():
+    capture = two_planes(16, 0.01)  # at a depth of 2 to 4
+    frame = StreamFrame.at_camera(np.eye(4), scale=1.0, near=2.0, far=4.0)
+    centers = [np.asarray(chunk.viewmats)[:, 0, 3] for chunk in capture.chunks(StreamConfig(), frame=frame)]
+    np.testing.assert_allclose(centers[0], [0, -0.04, -0.08, -0.12], atol=1e-7)  # all 16 at once, in four hands
+    np.testing.assert_allclose(centers[1], [-0.01, -0.05, -0.09, -0.13], atol=1e-7)
+    told = next(capture.chunks(StreamConfig(), range(16), frame=frame))
+    np.testing.assert_allclose(np.asarray(told.viewmats)[:, 0, 3], [0, -0.01, -0.02, -0.03], atol=1e-7)
 
 
 @settings(max_examples=200, deadline=None)
