@@ -73,7 +73,7 @@ def stream_chunks(model: StreamSplat, params: dict, sample: Sample, *, recompute
         losses = depth_loss(
             prediction.logits,
             prediction.log_depths,
-            truth,
+            pad_like(truth, prediction.log_depths),
             prediction.views.log_candidates,
             prediction.views.inside,
         )
@@ -84,6 +84,11 @@ def stream_chunks(model: StreamSplat, params: dict, sample: Sample, *, recompute
     cache, (tokens, losses) = jax.lax.scan(body, model.init_cache(), (sample.chunks, sample.log_depths))
     flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), tokens)
     return cache, flat, jax.tree.map(jnp.mean, losses)
+
+
+def pad_like(truth: Float[Array, "v h w"], predicted: Float[Array, "v hf wf"]) -> Float[Array, "v hf wf"]:
+    """`truth` with its last rows and columns repeated, as the images were padded; `inside` leaves them out."""
+    return jnp.pad(truth, [(0, n - m) for m, n in zip(truth.shape, predicted.shape, strict=True)], mode="edge")
 
 
 def decode_accepted(model: StreamSplat, params: dict, tokens: Tokens) -> Gaussians:

@@ -15,7 +15,7 @@ from ssplat_jax.train import loop
 from ssplat_jax.train.losses import depth_loss, image_gradient_l1, soft_targets
 from ssplat_jax.train.recipe import ALL_BUT_HEAD, Phase, PhaseForm, smoke_recipe, training_config
 from ssplat_jax.train.samples import log_depths_at_cells, make_sample, prefetched, sample_for_step
-from ssplat_jax.train.step import Trainer, init_state, learning_rate, loss_fn
+from ssplat_jax.train.step import Trainer, init_state, learning_rate, loss_fn, pad_like, stream_chunks
 from tests.model.small import random_params
 from tests.test_stream import NARROW
 
@@ -103,6 +103,19 @@ def test_cells_out_of_range_have_no_part_in_the_depth_loss():
     gradient = jax.grad(loss)(logits)
     assert float(jnp.abs(gradient[0, 0, 0]).max()) > 0
     assert float(jnp.abs(gradient[0, 0, 1]).max()) == 0
+
+
+def test_sizes_that_the_network_pads_train():
+    """72 rows become 96: the truth is padded like the images, and padding has no part in the loss."""
+    sample = make_sample(0, num_chunks=1, num_targets=0, size=(72, 64), config=NARROW)
+    model = StreamSplat(training_config(NARROW, RECIPE))
+    params = jax.eval_shape(model.init, jax.random.key(0))
+    jax.eval_shape(lambda p, s: stream_chunks(model, p, s, recompute=False), params, sample)
+    truth = np.asarray(sample.log_depths[0])
+    padded = np.asarray(pad_like(jnp.asarray(truth), jnp.zeros((4, 24, 16))))
+    assert truth.shape == (4, 18, 16)
+    np.testing.assert_array_equal(padded[:, :18], truth)
+    np.testing.assert_array_equal(padded[:, 18:], np.repeat(truth[:, -1:], 6, axis=1))
 
 
 def test_image_gradient_l1_ignores_a_constant_and_sees_an_edge():
