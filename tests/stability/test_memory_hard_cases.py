@@ -628,7 +628,8 @@ SEEN = {
 
 @functools.cache
 def reading():
-    return jax.jit(functools.partial(project, config=CACHE))
+    # Without carving pivots of any confidence are seen, down to those whose square underflows.
+    return jax.jit(functools.partial(project, config=CACHE.replace(carving=False)))
 
 
 @pytest.mark.parametrize("name", SEEN)
@@ -640,6 +641,15 @@ def test_hard_projection(name):
     if wanted is not None:
         assert np.argwhere(np.asarray(seen.mask)).tolist() == [[0, 3, 4]]
         np.testing.assert_allclose((seen.depths[0, 3, 4], seen.confidences[0, 3, 4]), wanted, rtol=1e-4)
+
+
+def test_what_was_carved_away_hides_nothing_from_the_projection():
+    cache = with_pivots([[0.0, 0.0, 1.0], [0.0, 0.0, 2.0]], [0.02, 0.9])
+    carved = project(cache, front_camera(), CACHE.replace(carving=True))
+    kept = project(cache, front_camera(), CACHE.replace(carving=False))
+    depths = [float(np.max(np.asarray(seen.depths))) for seen in (carved, kept)]
+    np.testing.assert_allclose(depths, [2.0, 1.0], rtol=1e-5)
+    np.testing.assert_allclose(np.max(np.asarray(carved.confidences)), 0.9, rtol=1e-5)
 
 
 def test_projection_into_cameras_at_one_place_is_the_same_in_each():
