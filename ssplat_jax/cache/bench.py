@@ -218,7 +218,7 @@ def _room(config: StreamConfig, capacity: int, num_rows: int) -> VoxelCache:
     values = {
         "means": rng.uniform([-2.0, -1.5, 1.0], [2.0, 1.5, 4.0], (num_rows, k, 3)),
         "feats": rng.normal(size=(num_rows, k, config.token_width)),
-        "confidences": rng.uniform(0.3, 1.0, (num_rows, k)),
+        "confidences": rng.uniform(config.min_confidence, 1.0, (num_rows, k)),
     }
     filled = {name: getattr(cache, name).at[:num_rows].set(jnp.asarray(x, jnp.float32)) for name, x in values.items()}
     counts = cache.counts.at[:num_rows].set(k)
