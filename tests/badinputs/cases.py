@@ -180,6 +180,9 @@ CASES = (
     Case("an image of another size", other_size(10, 10), ("frames[2]: w, h", "64x48", "10x10")),
     Case("an image on its side", other_size(HEIGHT, WIDTH), ("frames[2]: w, h", "48x64", "EXIF")),
     Case("intrinsics of another size", top(w=128, h=90), ("frames[0]: w, h", "128x90", "64x48", "scale fl_x")),
+    Case("intrinsics of a pixel", top(w=1, h=1), ("frames[0]: w, h", "1x1", "64x48")),
+    Case("intrinsics of nothing", top(w=0, h=96), ("frames[0]: w, h", "0x96", "64x48")),
+    Case("intrinsics of half the size", top(w=32, h=24), ("frames[0]: w, h", "32x24", "64x48")),
     Case("two sizes", both(top(w=None, h=None), other_size(70, 48)), ("64x48", "70x48", "--size")),
     Case("a format that is not read", other_size(WIDTH, HEIGHT, format="TGA"), (IMAGE, "PNG")),
     # poses

@@ -160,14 +160,13 @@ def _check_size(fields: _Fields, path: Path) -> tuple[tuple[int, int], float]:
     """(width, height) of the stored image, and how much smaller it is than the w and h of its intrinsics.
 
     Folders of shrunk images (nerfstudio's images_2, images_4) keep the intrinsics of the full size: both sides shrunk
-    alike, to a pixel, are taken for such.
+    alike, to a pixel, are taken for such. Larger images than described are not.
     """
     width, height = image_size(path)
     wanted = (fields.number("w", float(width)), fields.number("h", float(height)))
     if wanted == (width, height):
         return (width, height), 1.0
-    shrink = width / wanted[0] if wanted[0] > 0 else math.inf
-    if abs(wanted[1] * shrink - height) <= max(1.0, shrink):
+    if wanted[0] > width and abs(wanted[1] * (shrink := width / wanted[0]) - height) <= 1.0:
         return (width, height), shrink
     fix = "set w and h to the stored size and scale fl_x, fl_y, cx, cy with them"
     if wanted == (height, width):
