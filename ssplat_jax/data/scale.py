@@ -47,7 +47,7 @@ FAR_PARALLAX_DEGREES = 1.5  # points of less are too uncertain to say how far th
 MOST_POINTS = 0.9  # if fewer of all points than this have it, ...
 FEW_PAIRS = 12  # ... or fewer pairs than this were found, so that backgrounds may have been missed, ...
 MIN_REACH = 2.3  # ... the 99 % quantile is taken to be at least this many medians
-PARALLAX_ERROR = 0.15  # degrees, of a triangulated point: half a pixel of the working images
+PARALLAX_ERROR = 0.15  # degrees, of a triangulated point: most of a pixel of the working images
 BEYOND = 0.1  # share of the image that may surely lie beyond far; where a background fills more, far goes there
 CLOSE_SHARE = 0.15  # of the points of a nearest partner with parallax enough to count; false matches are fewer
 CLOSE_POINTS = 0.9  # quantile, in inverse depth, of what a nearest partner matches: false matches are beyond it
@@ -120,7 +120,7 @@ class _Points:
     inverse_depths: Float64[np.ndarray, " n"]  # in the first camera, signed
     parallax: Float64[np.ndarray, " n"]  # degrees, same sign
     weights: Float64[np.ndarray, " n"]  # 1 / points in the same cell of the image
-    close: Float64[np.ndarray, " m"]  # inverse depths of those that only a nearer partner still matches
+    close: Float64[np.ndarray, " m"]  # inverse depths, with parallax enough, that the nearest partner gives
 
 
 _KeypointsOf = Callable[[int], _Keypoints]
