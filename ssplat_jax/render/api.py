@@ -13,7 +13,7 @@ from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.render.binning import MOST_PAIRS, Grid, bin_splats, count_pairs
 from ssplat_jax.render.effects import Effects
 from ssplat_jax.render.output import RenderOutput, finish, splat_channels
-from ssplat_jax.render.projection import Splats, cull_non_finite, project
+from ssplat_jax.render.projection import Splats, cull_cameras, cull_non_finite, project
 from ssplat_jax.render.smoothing import filter_3d
 from ssplat_jax.render.tiled import composite, median_rows
 from ssplat_jax.struct import pytree, replace
@@ -57,26 +57,26 @@ def render(
         distortion: for `effects.distortion`, OPENCV coefficients k1, k2, p1, p2, k3.
         exposures: for `effects.exposure`, an affine colour correction a frame.
         max_pairs: room for (tile, Gaussian) pairs, of all cameras together. Outside jit it is counted (and rounded up
-            to a power of two, so that few programs are compiled). Inside jit the default is four pairs a Gaussian and
-            camera; look at `num_overflow` there: what does not fit is the farthest Gaussians.
+            to a power of two, so that few programs are compiled), under `jax.grad` too. Inside jit the default is four
+            pairs a Gaussian and camera; look at `num_overflow` there: what does not fit is the farthest Gaussians.
         tile: side of a tile in pixels, 8 or 16: 16 where most Gaussians are larger than 8 pixels.
 
     Raises:
-        InputError: an array does not have the shape above, an effect lacks its array, or (outside jit) there are more
-            pairs than 2^31.
+        InputError: an array does not have the shape above, an effect lacks its array, `max_pairs` or `tile` is no
+            positive number, or (outside jit) there are more pairs than 2^31.
     """
     effects = effects or Effects()
     inputs = Inputs(gaussians, camera, features, captured, distortion, exposures)
     _check(inputs, effects)
     inputs = _at_least_one_row(inputs)
-    in_trace = max_pairs or default_max_pairs(inputs.gaussians, camera)
-    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(inputs)):
-        return _render(inputs, effects, in_trace, tile)
+    for name, number in (("max_pairs", max_pairs), ("tile", tile)):
+        if number is not None and number < 1:
+            raise InputError(f"render: {name} must be at least 1, got {number}.")
     if max_pairs is None:
-        counted = _count(inputs, effects, tile)
-        if isinstance(counted, Tracer):  # a traced function closes over these arrays
-            return _render(inputs, effects, in_trace, tile)
-        max_pairs = _room_for(int(counted))
+        # Differentiation alone leaves the numbers there: without its tangents, what it traces can be counted.
+        counted = _count(jax.lax.stop_gradient(inputs), effects, tile)
+        is_traced = isinstance(counted, Tracer)
+        max_pairs = default_max_pairs(inputs.gaussians, camera) if is_traced else _room_for(int(counted))
     out = _render_jit(inputs, effects, max_pairs, tile)
     if not isinstance(out.num_overflow, Tracer) and int(out.num_overflow):
         out = _render_jit(inputs, effects, _room_for(int(out.num_pairs)), tile)
@@ -120,6 +120,10 @@ def _check(inputs: Inputs, effects: Effects) -> None:
             "render: camera wants viewmats [*b 4 4] and Ks [*b 3 3], "
             f"got {list(camera.viewmats.shape)} and {list(camera.Ks.shape)}."
         )
+    if 0 in batch:
+        raise InputError(f"render: wanted at least one camera, got a batch of shape {list(batch)}.")
+    if inputs.gaussians.sh.shape[1] not in (1, 4, 9, 16):
+        raise InputError(f"render: sh must hold 1, 4, 9 or 16 terms a Gaussian, got {inputs.gaussians.sh.shape[1]}.")
     if camera.width < 1 or camera.height < 1:
         raise InputError(f"render: the image must have at least 1x1 pixels, got {camera.width}x{camera.height}.")
     if features is not None and (features.ndim != 2 or features.shape[0] != rows):
@@ -139,7 +143,10 @@ def prepare(inputs: Inputs, effects: Effects):
     """Finite float32 (or wider) Gaussians, a camera of one batch axis, their splats, and the number of rows culled."""
     given = inputs.gaussians.means.dtype
     dtype = given if given == jnp.float64 else jnp.dtype(jnp.float32)
-    gaussians, num_non_finite = cull_non_finite(jax.tree.map(lambda x: x.astype(dtype), inputs.gaussians))
+    gaussians = jax.tree.map(lambda x: x.astype(dtype), inputs.gaussians)
+    if effects.sh_degree is not None:
+        gaussians = replace(gaussians, sh=gaussians.sh[:, : (effects.sh_degree + 1) ** 2])
+    gaussians, num_non_finite = cull_non_finite(gaussians, inputs.features)
     if effects.filter_3d and inputs.captured is not None:
         gaussians = filter_3d(gaussians, inputs.captured)
     camera = inputs.camera
@@ -147,7 +154,12 @@ def prepare(inputs: Inputs, effects: Effects):
         camera, viewmats=camera.viewmats.reshape(-1, 4, 4).astype(dtype), Ks=camera.Ks.reshape(-1, 3, 3).astype(dtype)
     )
     distortion = inputs.distortion.reshape(-1, 5).astype(dtype) if effects.distortion else None  # pyright: ignore[reportOptionalMemberAccess]
-    return gaussians, camera, project(gaussians, camera, effects, distortion), num_non_finite
+    camera, usable = cull_cameras(camera)
+    splats = project(gaussians, camera, effects, distortion)
+    visible = splats.visible & usable[:, None]
+    splats = replace(splats, visible=visible, opacities=jnp.where(visible, splats.opacities, 0.0))
+    num_unseen = jnp.sum(~usable, dtype=jnp.int32) * gaussians.num_gaussians
+    return gaussians, camera, splats, num_non_finite + num_unseen
 
 
 def grid_of(camera: Camera, tile: int) -> Grid:
@@ -171,7 +183,7 @@ def _render(inputs: Inputs, effects: Effects, max_pairs: int, tile: int) -> Rend
     median_depth = None
     with jax.named_scope("composite"):
         shapes = shape_rows(splats)
-        tiles = composite(grid, shapes, channels.reshape(-1, channels.shape[-1]), pairs)
+        tiles = composite(grid, effects.needs_alpha, shapes, channels.reshape(-1, channels.shape[-1]), pairs)
         if "median_depth" in effects.outputs:
             rows = untile(median_rows(grid, jax.lax.stop_gradient(shapes), pairs)[:, None], grid)[..., 0]
             median_depth = jnp.where(rows >= 0, splats.depths.reshape(-1)[jnp.maximum(rows, 0)], 0.0)
@@ -191,8 +203,8 @@ _render_jit = functools.partial(jax.jit, static_argnums=(1, 2, 3))(_render)
 
 
 def shape_rows(splats: Splats) -> Float[Array, "m 6"]:
-    """What compositing needs of each (camera, Gaussian): x, y, conic xx, xy, yy, opacity."""
-    return jnp.concatenate([splats.means2d, splats.conics, splats.opacities[..., None]], axis=-1).reshape(-1, 6)
+    """What compositing needs of each (camera, Gaussian): x, y, the three factors of its exponent, opacity."""
+    return jnp.concatenate([splats.means2d, splats.factors, splats.opacities[..., None]], axis=-1).reshape(-1, 6)
 
 
 def untile(tiles: Num[Array, "tiles c p"], grid: Grid) -> Num[Array, "b h w c"]:

@@ -118,7 +118,7 @@ def _stages(gaussians: Gaussians, camera: Camera, max_pairs: int) -> dict[str, C
 
     grid = Grid(num_images=1, height=camera.height, width=camera.width, tile=api.TILE)
     binned = jax.jit(lambda splats: bin_splats(splats, grid, max_pairs))
-    composited = jax.jit(lambda shapes, channels, pairs: tiled.composite(grid, shapes, channels, pairs))
+    composited = jax.jit(lambda shapes, channels, pairs: tiled.composite(grid, True, shapes, channels, pairs))
     splats, channels = projected(gaussians)
     shapes, channels, pairs = api.shape_rows(splats), channels.reshape(-1, channels.shape[-1]), binned(splats)
     return {

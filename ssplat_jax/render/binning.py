@@ -78,9 +78,12 @@ def depth_order(splats: Splats) -> Int[Array, " m"]:
     """Rows from near to far, ties by row number; invisible rows last (and all alike: row 0).
 
     One 64-bit integer a row, depth bits above row number, whatever `jax_enable_x64` says: exact and without payload.
+    Depths in float64 fill that integer alone and are sorted with their row.
     """
-    depths = splats.depths.reshape(-1).astype(jnp.float32)
-    visible = splats.visible.reshape(-1)
+    depths, visible = splats.depths.reshape(-1), splats.visible.reshape(-1)
+    if depths.dtype == jnp.float64:
+        rows = lax.iota(jnp.int32, depths.shape[0])
+        return jnp.where(visible, rows, 0)[lax.sort((jnp.where(visible, depths, jnp.inf), rows), num_keys=2)[1]]
     with jax.enable_x64(True):
         bits = lax.bitcast_convert_type(depths, jnp.uint32).astype(jnp.uint64)  # positive floats sort as integers
         keys = (bits << jnp.uint64(32)) | lax.iota(jnp.uint64, depths.shape[0])
@@ -123,9 +126,9 @@ def take_rows(table: Shaped[Array, "m f"], rows: Int[Array, " p"]) -> Shaped[Arr
 
 
 def _outlines(splats: Splats, order: Int[Array, " m"]) -> Float[Array, "m 6"]:
-    """Mean, conic, and the largest exponent at which alpha is still 1/255, in depth order."""
+    """Mean, factors of the exponent, and the largest exponent at which alpha is still 1/255, in depth order."""
     bounds = jnp.log(jnp.maximum(splats.opacities / constants.ALPHA_MIN, 1.0))
-    columns = [*jnp.moveaxis(splats.means2d, -1, 0), *jnp.moveaxis(splats.conics, -1, 0), bounds]
+    columns = [*jnp.moveaxis(splats.means2d, -1, 0), *jnp.moveaxis(splats.factors, -1, 0), bounds]
     return take_rows(jnp.stack([column.reshape(-1) for column in columns], axis=-1), order)
 
 
@@ -142,16 +145,16 @@ def _reaches(outline, origins, tile: int):
     The least exponent over the tile lies on an edge that faces the mean (or is 0 inside); what float32 may lose of it,
     for needles, is given back, so that no pair is missed.
     """
-    x, y, xx, xy, yy, bound = outline
+    x, y, p, q, r, bound = outline
     low_x, low_y = origins[0] - x, origins[1] - y
     high_x, high_y = low_x + (tile - 1), low_y + (tile - 1)
     near_x, near_y = jnp.clip(0.0, low_x, high_x), jnp.clip(0.0, low_y, high_y)
-    along_x = jnp.clip(-xy * near_y / jnp.maximum(xx, 1e-30), low_x, high_x)
-    along_y = jnp.clip(-xy * near_x / jnp.maximum(yy, 1e-30), low_y, high_y)
+    along_x = jnp.clip(-q * near_y / jnp.maximum(p, 1e-15), low_x, high_x)
+    along_y = jnp.clip(-p * q * near_x / jnp.maximum(q * q + r * r, 1e-30), low_y, high_y)
 
     def least(dx, dy):
-        squares = 0.5 * (xx * dx * dx + yy * dy * dy)
-        return squares + xy * dx * dy - 1e-6 * squares
+        across, lost = jnp.abs(p * dx + q * dy), 1e-6 * (jnp.abs(p * dx) + jnp.abs(q * dy))
+        return jnp.maximum(across - lost, 0.0) ** 2 + (r * dy) ** 2
 
     return jnp.minimum(least(near_x, along_y), least(along_x, near_y)) <= bound * 1.0001 + 1e-4
 

@@ -1,6 +1,7 @@
 """What a render simulates. Everything here is static: an effect that is off is not in the compiled program."""
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -27,9 +28,9 @@ class Effects:
     """OPENCV radial-tangential lens distortion, coefficients given as `distortion`."""
     exposure: bool = False
     """Affine colour correction per frame (exposure, white balance), given as `exposures`."""
-    background: tuple[float, float, float] | None = None
+    background: Sequence[float] | None = None
     """Colour behind the scene; None is black, at no cost."""
-    outputs: tuple[str, ...] = ("color", "alpha", "depth")
+    outputs: Sequence[str] = ("color", "alpha", "depth")
     """What is wanted: `color` (always there), `alpha`, `depth`, `median_depth`."""
 
     def __post_init__(self) -> None:
@@ -39,6 +40,13 @@ class Effects:
             raise InputError(f"effects: antialias must be 'mip', 'classic' or 'none', got {self.antialias!r}.")
         if unknown := [name for name in self.outputs if name not in OUTPUTS]:
             raise InputError(f"effects: no output {unknown[0]!r}; there is {', '.join(OUTPUTS)}.")
+        # Lists would make the effects unhashable, long after this line.
+        object.__setattr__(self, "outputs", tuple(self.outputs))
+        if self.background is not None:
+            background = tuple(float(c) for c in self.background)
+            if len(background) != 3:
+                raise InputError(f"effects: background must be three numbers or None, got {len(background)}.")
+            object.__setattr__(self, "background", background)
 
     def replace(self, **changes: Any) -> "Effects":
         """A copy with `changes`."""
@@ -62,8 +70,8 @@ def effects_for(
     """The least that shows this scene right from these cameras. Looks at values: call it outside jit.
 
     SH bands that are zero everywhere are not evaluated; zero distortion coefficients are a pinhole; exposures that are
-    the same for all frames are none (the scene's colours hold them already); no camera that samples the scene at most
-    1.05 times as finely as the `captured` ones did needs the 3D filter.
+    the same for all of several frames are none (the scene's colours hold them already); no camera that samples the
+    scene at most 1.05 times as finely as the `captured` ones did needs the 3D filter.
     """
     return Effects(
         sh_degree=_used_degree(np.asarray(gaussians.sh, np.float32)),
@@ -82,7 +90,9 @@ def _used_degree(sh: np.ndarray) -> int:
 
 def _differ(exposures: np.ndarray) -> bool:
     flat = exposures.reshape(-1, 12)
-    return bool(np.any(np.abs(flat - flat[:1]) > 1e-6))
+    # One frame alone differs from others that are not here, unless its correction is none.
+    usual = flat[:1] if len(flat) > 1 else np.eye(3, 4).reshape(1, 12)
+    return bool(np.any(np.abs(flat - usual) > 1e-6))
 
 
 def _sampling_ratio(gaussians: Gaussians, camera: Camera, captured: Camera) -> float:

@@ -2,6 +2,7 @@
 
 import math
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -38,5 +39,5 @@ def _blur(values: Float[Array, "*b h w c"], taps: np.ndarray, axis: int) -> Floa
     padding = [(0, 0)] * values.ndim
     padding[axis % values.ndim] = (radius, radius)
     padded = jnp.pad(values, padding)
-    take = lambda k: jnp.take(padded, jnp.arange(k, k + length), axis=axis)  # noqa: E731
+    take = lambda k: jax.lax.slice_in_dim(padded, k, k + length, axis=axis % values.ndim)  # noqa: E731
     return sum((float(t) * take(k) for k, t in enumerate(taps)), jnp.zeros_like(values))

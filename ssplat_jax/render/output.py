@@ -33,7 +33,7 @@ def splat_channels(
     effects: Effects,
     features: Float[Array, "n c"] | None,
 ) -> Float[Array, "b n channels"]:
-    """Per camera and Gaussian: RGB, then depth, features and 1 (which composites to alpha), those that are wanted."""
+    """Per camera and Gaussian: RGB, then depth and features, those that are wanted."""
     degree = gaussians.sh_degree if effects.sh_degree is None else min(effects.sh_degree, gaussians.sh_degree)
     directions = None
     if degree > 0:
@@ -47,8 +47,6 @@ def splat_channels(
         usable = jnp.all(jnp.isfinite(features), axis=-1, keepdims=True)
         features = jnp.where(usable, features, 0).astype(splats.depths.dtype)
         parts.append(jnp.broadcast_to(features, (*shape, features.shape[-1])))
-    if effects.needs_alpha:
-        parts.append(jnp.ones((*shape, 1), splats.depths.dtype))
     return jnp.concatenate(parts, axis=-1)
 
 
@@ -63,7 +61,7 @@ def finish(
     num_overflow: Int[Array, ""],
     num_non_finite: Int[Array, ""],
 ) -> RenderOutput:
-    """The output of composited `splat_channels`, in the camera's batch shape."""
+    """The output of composited `splat_channels`, and alpha behind them if wanted, in the camera's batch shape."""
     batch = camera.viewmats.shape[:-2]
     images = composited.reshape(*batch, *composited.shape[1:])
     color, rest, alpha, depth = images[..., :3], images[..., 3:], None, None

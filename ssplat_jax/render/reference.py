@@ -23,11 +23,11 @@ def sample_weights(
 ) -> tuple[Float[Array, "q n"], Float[Array, "q n"], Int[Array, " n"]]:
     """Weights of one camera's splats (batch axis 1) at `pixels`, transmittances after each, and the depth order."""
     order = jnp.argsort(jnp.where(splats.visible[0], splats.depths[0], jnp.inf), stable=True)
-    means2d, conics = splats.means2d[0, order], splats.conics[0, order]
+    means2d, factors = splats.means2d[0, order], splats.factors[0, order]
     offsets = pixels[:, None, :] - means2d
     dx, dy = offsets[..., 0], offsets[..., 1]
-    quadratic = 0.5 * (conics[:, 0] * dx * dx + conics[:, 2] * dy * dy) + conics[:, 1] * dx * dy
-    raw = splats.opacities[0, order] * jnp.exp(-jnp.maximum(quadratic, 0.0))
+    exponents = (factors[:, 0] * dx + factors[:, 1] * dy) ** 2 + (factors[:, 2] * dy) ** 2
+    raw = splats.opacities[0, order] * jnp.exp(-exponents)
     alphas = jnp.where(raw >= constants.ALPHA_MIN, jnp.minimum(raw, constants.ALPHA_MAX), 0.0)
     after = jnp.cumprod(1.0 - alphas, axis=1)
     before = jnp.concatenate([jnp.ones_like(after[:, :1]), after[:, :-1]], axis=1)
@@ -55,12 +55,14 @@ def render_reference(
 ) -> RenderOutput:
     """The images that `ssplat_jax.render.render` must give, in the dtype of `gaussians`; one band of rows at a time."""
     effects = effects or Effects()
-    gaussians, num_non_finite = cull_non_finite(gaussians)
+    gaussians, num_non_finite = cull_non_finite(gaussians, features)
     if effects.filter_3d and captured is not None:
         gaussians = filter_3d(gaussians, captured)
     flat = replace(camera, viewmats=camera.viewmats.reshape(-1, 4, 4), Ks=camera.Ks.reshape(-1, 3, 3))
     splats = project(gaussians, flat, effects, None if distortion is None else distortion.reshape(-1, 5))
     channels = splat_channels(gaussians, splats, flat, effects, features)
+    if effects.needs_alpha:
+        channels = jnp.concatenate([channels, jnp.ones_like(channels[..., :1])], axis=-1)
     xs, ys = (jnp.arange(size, dtype=channels.dtype) + 0.5 for size in (camera.width, camera.height))
     pixels = jnp.stack(jnp.broadcast_arrays(xs[None, :], ys[:, None]), axis=-1)
     bands = [pixels[i : i + rows_at_once].reshape(-1, 2) for i in range(0, camera.height, rows_at_once)]

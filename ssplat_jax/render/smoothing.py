@@ -51,5 +51,5 @@ def filter_3d(gaussians: Gaussians, captured: Camera) -> Gaussians:
     variances = constants.MIP3D_VARIANCE / (rates * rates)  # 0 where nothing is seen at all
     squares = gaussians.scales**2 + variances[:, None]
     scales = jnp.sqrt(jnp.maximum(squares, jnp.finfo(squares.dtype).tiny))
-    kept = jnp.prod(jnp.minimum(gaussians.scales / scales, 1.0), axis=-1)
+    kept = jnp.prod(jnp.minimum(jnp.abs(gaussians.scales) / scales, 1.0), axis=-1)
     return replace(gaussians, scales=scales, opacities=gaussians.opacities * kept)

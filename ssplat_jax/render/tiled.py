@@ -26,19 +26,21 @@ TURN = 8
 BATCH = 64
 
 
-@functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
+@functools.partial(jax.custom_vjp, nondiff_argnums=(0, 1))
 def composite(
-    grid: Grid, shapes: Float[Array, "m 6"], channels: Float[Array, "m c"], pairs: Pairs
-) -> Float[Array, "tiles c p"]:
-    """Channels composited over the pixels of every tile; `shapes` are (x, y, conic xx, xy, yy, opacity).
+    grid: Grid, with_alpha: bool, shapes: Float[Array, "m 6"], channels: Float[Array, "m c"], pairs: Pairs
+) -> Float[Array, "tiles co p"]:
+    """Channels, and alpha behind them if wanted, composited over the pixels of every tile.
+
+    `shapes` are (x, y, p, q, r, opacity) as `Splats` has them.
 
     Gradients reach `shapes` and `channels`. Samples fainter than 1/255 or capped at 0.99 pass none on to their opacity.
     """
-    return _forward(grid, _sorted_table(shapes, channels, pairs), pairs)
+    return _forward(grid, with_alpha, _sorted_table(shapes, channels, pairs), pairs)
 
 
-def _forward(grid: Grid, table, pairs: Pairs):
-    num_channels = table.shape[1] - 6
+def _forward(grid: Grid, with_alpha: bool, table, pairs: Pairs):
+    num_outputs = table.shape[1] - 6 + with_alpha
 
     def batch(tiles):
         first, last = _loads(pairs, tiles)
@@ -48,25 +50,26 @@ def _forward(grid: Grid, table, pairs: Pairs):
             values, alphas = _turn(grid, table, tiles, first + i * TURN, last)
             weights, _, transmittance = _weights(alphas, transmittance)
             weights = jnp.stack(weights, axis=1)
-            out = [o + jnp.sum(weights * value, axis=1) for o, value in zip(out, values[6:], strict=True)]
+            layers = [weights * value for value in values[6:]] + [weights] * with_alpha
+            out = [o + jnp.sum(layer, axis=1) for o, layer in zip(out, layers, strict=True)]
             return i + 1, transmittance, out
 
         blank = jnp.zeros((grid.tile**2, tiles.shape[0]), table.dtype)
-        start = (0, blank + 1, [blank] * num_channels)
+        start = (0, blank + 1, [blank] * num_outputs)
         return jnp.stack(lax.while_loop(_goes_on(first, last), turn, start)[2])
 
     batches = _batches(pairs.bounds, grid)
-    out = jnp.moveaxis(lax.map(batch, batches), -1, 1).reshape(-1, num_channels, grid.tile**2)
+    out = jnp.moveaxis(lax.map(batch, batches), -1, 1).reshape(-1, num_outputs, grid.tile**2)
     return jnp.zeros((grid.num_tiles, *out.shape[1:]), out.dtype).at[batches.reshape(-1)].set(out, mode="drop")
 
 
-def _composite_fwd(grid: Grid, shapes, channels, pairs: Pairs):
+def _composite_fwd(grid: Grid, with_alpha: bool, shapes, channels, pairs: Pairs):
     table = _sorted_table(shapes, channels, pairs)
-    out = _forward(grid, table, pairs)
+    out = _forward(grid, with_alpha, table, pairs)
     return out, (shapes, table, pairs, out)
 
 
-def _composite_bwd(grid: Grid, residuals, cotangents):
+def _composite_bwd(grid: Grid, with_alpha: bool, residuals, cotangents):
     shapes, table, pairs, out = residuals
     ids = jnp.pad(pairs.rows, (0, TURN))
     tails = jnp.sum(out * cotangents, axis=1)
@@ -74,16 +77,17 @@ def _composite_bwd(grid: Grid, residuals, cotangents):
     def batch(grads, tiles):
         first, last = _loads(pairs, tiles)
         inside = jnp.minimum(tiles, grid.num_tiles - 1)
-        cotangent = lax.optimization_barrier(jnp.moveaxis(cotangents[inside], 0, -1))  # c p t
+        cotangent = lax.optimization_barrier(jnp.moveaxis(cotangents[inside], 0, -1))  # co p t
+        by_channel, by_alpha = (cotangent[:-1], cotangent[-1, :, None]) if with_alpha else (cotangent, 0.0)
 
         def turn(carry):
             i, transmittance, tail, grads = carry
             values, alphas = _turn(grid, table, tiles, first + i * TURN, last)
             weights, afters, transmittance = _weights(alphas, transmittance)
             weights = jnp.stack(weights, axis=1)
-            slopes = sum(c[:, None] * value for c, value in zip(cotangent, values[6:], strict=True))
+            slopes = sum((c[:, None] * value for c, value in zip(by_channel, values[6:], strict=True)), by_alpha)
             tail, exponents = _exponent_gradients(alphas, weights, weights * slopes, afters, tail)
-            grad_channels = [_sum_pixels(grid, weights * c[:, None]) for c in cotangent]
+            grad_channels = [_sum_pixels(grid, weights * c[:, None]) for c in by_channel]
             rows = jnp.stack([*_shape_gradients(grid, exponents, values), *grad_channels], axis=-1)
             grads = grads.at[_next(ids, first + i * TURN).T].add(rows)  # what is read past a tile's end adds zeros
             return i + 1, transmittance, tail, grads
@@ -144,15 +148,13 @@ def _loads(pairs: Pairs, tiles: Int[Array, " t"]) -> tuple[Int[Array, " t"], Int
 
 
 def _goes_on(first, last):
-    """Whether a batch has another turn: Gaussians are left, and a pixel that one could still reach."""
-    turns = (jnp.max(last - first) + TURN - 1) // TURN
-    return lambda carry: (carry[0] < turns) & jnp.any(carry[1] >= constants.TRANSMITTANCE_STOP)
+    """Whether a batch has another turn: in one of its tiles Gaussians are left, and a pixel that one could reach."""
+    return lambda carry: jnp.any((carry[1] >= constants.TRANSMITTANCE_STOP) & (first + carry[0] * TURN < last))
 
 
-def _pixel_offsets(grid: Grid, dtype) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
-    """Pixel centres from the centre of their tile."""
-    offsets = jnp.arange(grid.tile, dtype=dtype) - (grid.tile - 1) / 2
-    return jnp.tile(offsets, grid.tile), jnp.repeat(offsets, grid.tile)
+def _tile_offsets(grid: Grid, dtype) -> Float[Array, " side"]:
+    """Pixel centres of a row or a column from the centre of their tile."""
+    return jnp.arange(grid.tile, dtype=dtype) - (grid.tile - 1) / 2
 
 
 def _next(rows: Array, start: Int[Array, " t"]) -> Array:
@@ -164,17 +166,29 @@ def _turn(grid: Grid, table, tiles, start, last):
     """Of the next `TURN` Gaussians of each tile: columns of the table (x, y from the tile's centre), and opacities."""
     turn = _next(table, start)
     # A stack is a copy that XLA does not fuse away: the kernels below then read columns, not strided rows.
-    x, y, conic_xx, conic_xy, conic_yy, opacity, *channels = jnp.stack(list(jnp.moveaxis(turn, (2, 1, 0), (0, 1, 2))))
+    x, y, p, q, r, opacity, *channels = jnp.stack(list(jnp.moveaxis(turn, (2, 1, 0), (0, 1, 2))))
     opacity = jnp.where(start + jnp.arange(TURN, dtype=jnp.int32)[:, None] < last, opacity, 0.0)
     within = tiles % (grid.rows * grid.columns)
     x -= ((within % grid.columns).astype(x.dtype) + 0.5) * grid.tile
     y -= ((within // grid.columns).astype(x.dtype) + 0.5) * grid.tile
-    offset_x, offset_y = (o[:, None, None] for o in _pixel_offsets(grid, x.dtype))
-    dx, dy = offset_x - x, offset_y - y
-    exponent = 0.5 * (conic_xx * dx * dx + conic_yy * dy * dy) + conic_xy * dx * dy
-    raw = opacity * jnp.exp(-jnp.maximum(exponent, 0.0))  # a needle's may round to below 0
+    values = [x, y, p, q, r, opacity, *channels]
+    across, along = _across_and_along(grid, values)
+    raw = opacity * jnp.exp(-(across * across) - along)
     alphas = jnp.where(raw >= constants.ALPHA_MIN, jnp.minimum(raw, constants.ALPHA_MAX), 0.0)
-    return [x, y, conic_xx, conic_xy, conic_yy, opacity, *channels], alphas
+    return values, alphas
+
+
+def _across_and_along(grid: Grid, values) -> tuple[Float[Array, "p u t"], Float[Array, "p u t"]]:
+    """p dx + q dy and (r dy)^2 of every sample: what is the same along a row of pixels is computed once a row.
+
+    The stack is a copy again: without it XLA computes a row's share for each of its pixels.
+    """
+    x, y, p, q, r = values[:5]
+    offsets = _tile_offsets(grid, x.dtype)
+    dys = offsets[:, None, None] - y
+    shares, squares = jnp.stack([q * dys - p * x, (r * dys) ** 2])
+    across = p * offsets[:, None, None] + shares[:, None]  # row, column, u, t
+    return tuple(jnp.broadcast_to(z, across.shape).reshape(-1, *across.shape[2:]) for z in (across, squares[:, None]))
 
 
 def _weights(alphas, transmittance):
@@ -224,22 +238,25 @@ def _sum_pixels(grid: Grid, values: Float[Array, "p u t"]) -> Float[Array, "u t"
 
 
 def _shape_gradients(grid: Grid, exponents: Float[Array, "p u t"], values) -> list[Float[Array, "u t"]]:
-    """Gradients by x, y, conic xx, xy, yy and opacity, from moments of the exponent gradients over the pixels."""
-    x, y, conic_xx, conic_xy, conic_yy, opacity = values[:6]
-    offsets_x, _ = _pixel_offsets(grid, exponents.dtype)
-    dx = offsets_x[:, None, None] - x
-    rows = [_sum_rows(grid, exponents), _sum_rows(grid, exponents * dx), _sum_rows(grid, exponents * dx * dx)]
-    dys = [(j - (grid.tile - 1) / 2) - y for j in range(grid.tile)]
-    total = _total(rows[0])
-    sum_dx, sum_dxdx = _total(rows[1]), _total(rows[2])
-    sum_dy = _total(row * dy for row, dy in zip(rows[0], dys, strict=True))
-    sum_dxdy = _total(row * dy for row, dy in zip(rows[1], dys, strict=True))
-    sum_dydy = _total(row * dy * dy for row, dy in zip(rows[0], dys, strict=True))
+    """Gradients by x, y, p, q, r and opacity, from moments of the exponent gradients over the pixels.
+
+    The exponent is s^2 + (r dy)^2 with s = p dx + q dy, which the moments hold as it is: made of those of dx and dy, it
+    would cancel for needles.
+    """
+    x, y, p, q, r, opacity = values[:6]
+    across, _ = _across_and_along(grid, values)
+    dx = jnp.tile(_tile_offsets(grid, x.dtype), grid.tile)[:, None, None] - x
+    rows, rows_s, rows_sdx = (_sum_rows(grid, exponents * weight) for weight in (1.0, across, across * dx))
+    dys = [offset - y for offset in _tile_offsets(grid, x.dtype)]
+    sum_s, sum_sdx = _total(rows_s), _total(rows_sdx)
+    sum_sdy = _total(row * dy for row, dy in zip(rows_s, dys, strict=True))
+    sum_dy = _total(row * dy for row, dy in zip(rows, dys, strict=True))
+    sum_dydy = _total(row * dy * dy for row, dy in zip(rows, dys, strict=True))
     return [
-        -(conic_xx * sum_dx + conic_xy * sum_dy),
-        -(conic_xy * sum_dx + conic_yy * sum_dy),
-        0.5 * sum_dxdx,
-        sum_dxdy,
-        0.5 * sum_dydy,
-        -total / jnp.where(opacity > 0, opacity, 1.0),
+        -2.0 * p * sum_s,
+        -2.0 * (q * sum_s + r * r * sum_dy),
+        2.0 * sum_sdx,
+        2.0 * sum_sdy,
+        2.0 * r * sum_dydy,
+        -_total(rows) / jnp.where(opacity > 0, opacity, 1.0),
     ]

@@ -202,8 +202,8 @@ def test_a_wide_lens_shapes_gaussians_as_its_derivative_says(mean):
     wanted = np.linalg.inv(1e-4 * jacobian @ jacobian.T)
     camera = replace(WIDE, viewmats=WIDE.viewmats[None], Ks=WIDE.Ks[None])
     splats = project(one(mean), camera, Effects(distortion=True, antialias="none"), lens[None])
-    xx, xy, yy = np.asarray(splats.conics[0, 0], np.float64)
-    np.testing.assert_allclose([[xx, xy], [xy, yy]], wanted, rtol=2e-3)
+    p, q, r = np.asarray(splats.factors[0, 0], np.float64)
+    np.testing.assert_allclose([[2 * p * p, 2 * p * q], [2 * p * q, 2 * (q * q + r * r)]], wanted, rtol=2e-3)
 
 
 def test_a_lens_has_finite_gradients_however_far_from_its_axis():
@@ -230,3 +230,25 @@ def test_the_3d_filter_does_not_look_at_absent_rows():
     absent = mask_gaussians(seen, jnp.zeros(1, bool))
     alone, padded = filter_3d(scene, captured), filter_3d(concatenate([scene, absent]), captured)
     np.testing.assert_array_equal(padded.scales[:2], alone.scales)
+
+
+def test_one_exposure_is_none_only_if_it_changes_nothing():
+    scene, camera = cloud(4), cameras(16, 16)
+    several = jnp.asarray(np.stack([EXPOSURE] * 3))
+    for exposures, wanted in ((EXPOSURE, True), (np.eye(3, 4, dtype=np.float32), False), (several, False)):
+        assert effects_for(scene, camera, exposures=jnp.asarray(exposures)).exposure is wanted
+
+
+def test_the_3d_filter_reads_a_negative_scale_as_its_size():
+    captured = Camera(viewmats=jnp.eye(4)[None], Ks=WIDE.Ks[None], width=400, height=300)
+    scene = one([0.0, 0.0, 1.0])
+    plain, mirrored = filter_3d(scene, captured), filter_3d(replace(scene, scales=-scene.scales), captured)
+    np.testing.assert_array_equal(plain.opacities, mirrored.opacities)
+    assert float(plain.opacities[0]) > 0
+
+
+def test_effects_given_as_lists_are_hashable_and_a_background_has_three_parts():
+    listed, plain = (Effects(outputs=kind(["color"]), background=kind([1.0, 0.0, 0.0])) for kind in (list, tuple))
+    assert listed == plain and hash(listed) == hash(plain)
+    with pytest.raises(InputError, match="three numbers"):
+        Effects(background=(1.0, 0.0))

@@ -1,13 +1,16 @@
 """The fast path and the reference against the NumPy oracle, and the fast path's gradients against the reference's."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from ssplat_jax.errors import InputError
-from ssplat_jax.gaussians import concatenate, mask_gaussians
-from ssplat_jax.render import Effects, render
+from ssplat_jax.gaussians import Gaussians, concatenate, mask_gaussians
+from ssplat_jax.geometry.cameras import Camera
+from ssplat_jax.render import Effects, api, render
 from ssplat_jax.render.binning import Grid, bin_splats
 from ssplat_jax.render.projection import project
 from ssplat_jax.render.reference import render_reference
@@ -143,9 +146,88 @@ def test_what_is_given_back_is_what_was_asked_for(scene):
     np.testing.assert_allclose(out.color, render(*scene, max_pairs=1 << 12).color, atol=1e-6)
 
 
+def test_gradients_outside_jit_leave_nothing_out():
+    # Larger Gaussians than the default capacity inside jit is made for: more than four tiles each.
+    gaussians, camera = cloud(600, size=0.2), cameras(80, 96)
+    counted = int(render(gaussians, camera).num_pairs)
+    assert counted > api.default_max_pairs(gaussians, camera)
+    loss = lambda g, **options: jnp.sum(render(g, camera, **options).color ** 2)  # noqa: E731
+    value, gradient = jax.value_and_grad(loss)(gaussians)
+    wanted_value, wanted = jax.jit(jax.value_and_grad(functools.partial(loss, max_pairs=counted)))(gaussians)
+    np.testing.assert_allclose(value, wanted_value, rtol=1e-6)
+    for a, b in zip(jax.tree.leaves(gradient), jax.tree.leaves(wanted), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-5 * float(jnp.abs(b).max()))
+
+
+@pytest.mark.parametrize("length", [30, 150, 600])
+def test_long_thin_gaussians_are_as_exact_as_round_ones(length):
+    focal, turn = 1000.0, np.deg2rad(43.7)
+
+    def drawn(dtype, draw):
+        row = lambda x: jnp.asarray([x], dtype)  # noqa: E731
+        gaussians = Gaussians.from_rgb(
+            means=row([0, 0, 1]),
+            quats=row([np.cos(turn / 2), 0, 0, np.sin(turn / 2)]),
+            scales=row([length / focal, 2 / focal, 0.02 / focal]),
+            opacities=jnp.asarray([0.9], dtype),
+            colors=row([1, 0.5, 0.2]),
+        )
+        K = jnp.asarray([[focal, 0, 100.3], [0, focal, 80.7], [0, 0, 1]], dtype)
+        camera = Camera(viewmats=jnp.eye(4, dtype=dtype), Ks=K, width=200, height=160)
+        return draw(gaussians, camera, effects=Effects(antialias="none", outputs=("color", "alpha"))).alpha
+
+    fast = np.asarray(drawn(jnp.float32, render))
+    with jax.enable_x64(True):
+        exact = np.asarray(drawn(jnp.float64, render_reference))
+    assert fast.max() > 0.8
+    is_edge = np.abs(exact - 1 / 255) < 2e-4  # a sample just below 1/255 is skipped, just above it is not
+    np.testing.assert_allclose(fast[~is_edge], exact[~is_edge], atol=1e-4)
+
+
+def test_float64_is_sorted_in_float64(scene):
+    with jax.enable_x64(True):
+        two = jax.tree.map(lambda x: jnp.repeat(x[:1], 2, axis=0).astype(jnp.float64), cloud(1, degree=0, size=0.5))
+        two = replace(
+            two,
+            means=jnp.array([[0.0, 0.0, 2.0 + 1e-9], [0.0, 0.0, 2.0]]),
+            opacities=jnp.full(2, 0.95),
+            sh=jnp.array([[[1.0, 0, 0]], [[0, 1.0, 0]]]),
+        )
+        camera = Camera(viewmats=jnp.eye(4), Ks=jnp.array([[20.0, 0, 8], [0, 20, 8], [0, 0, 1]]), width=16, height=16)
+        middle = np.asarray(render(two, camera).color)[8, 8]
+        np.testing.assert_allclose(middle, np.asarray(render_reference(two, camera).color)[8, 8], atol=1e-9)
+    assert middle[1] > middle[0] + 0.2
+
+
+def test_a_camera_that_is_not_finite_sees_nothing_and_spoils_nothing(scene):
+    gaussians, camera = cloud(degree=3), cameras(21, 30, batch=2)
+    for field, entry in (("viewmats", jnp.nan), ("Ks", jnp.inf), ("Ks", 0.0)):
+        bad = replace(camera, **{field: getattr(camera, field).at[1, 0, 0].set(entry)})
+
+        def loss(inputs):
+            out = render(*inputs, effects=ALL, max_pairs=1 << 12)
+            return jnp.sum(out.color[0] ** 2) + jnp.sum(out.alpha[1]), out
+
+        gradients, out = jax.jit(jax.grad(loss, has_aux=True))((gaussians, bad))
+        assert not out.alpha[1].any() and int(out.num_non_finite) == gaussians.num_gaussians
+        np.testing.assert_allclose(out.color[0], render(gaussians, camera[0], effects=ALL).color, atol=1e-6)
+        for gradient in jax.tree.leaves(gradients):
+            assert np.isfinite(gradient).all()
+
+
+def test_rows_whose_features_are_not_finite_are_culled_and_counted(scene):
+    features = jnp.ones((60, 2)).at[3, 1].set(jnp.nan)
+    out = render(*scene, features=features, max_pairs=1 << 12)
+    without = mask_gaussians(scene[0], jnp.arange(60) != 3)
+    assert int(out.num_non_finite) == 1 and np.isfinite(out.features).all()
+    np.testing.assert_array_equal(out.color, render(without, scene[1], max_pairs=1 << 12).color)
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
+        ({"max_pairs": 0}, "max_pairs must be at least 1, got 0"),
+        ({"tile": 0}, "tile must be at least 1, got 0"),
         ({"features": jnp.zeros((3, 2))}, "features must be"),
         ({"effects": Effects(filter_3d=True)}, "captured"),
         ({"effects": Effects(distortion=True)}, "distortion must be"),
@@ -155,6 +237,13 @@ def test_what_is_given_back_is_what_was_asked_for(scene):
 def test_bad_input_says_what_was_wanted(scene, changes, message):
     with pytest.raises(InputError, match=message):
         render(*scene, **changes)
+
+
+def test_scenes_and_cameras_of_no_known_form_are_refused(scene):
+    with pytest.raises(InputError, match="1, 4, 9 or 16 terms"):
+        render(replace(scene[0], sh=scene[0].sh[:, :5]), scene[1])
+    with pytest.raises(InputError, match="at least one camera"):
+        render(scene[0], cameras(21, 30, batch=2)[:0])
 
 
 def test_a_camera_of_no_pixels_is_refused(scene):

@@ -103,11 +103,12 @@ def at_pixels(inputs, pixels):
     weights, after, order = sample_weights(splats, pixels)
     before = jnp.concatenate([jnp.ones_like(after[:, :1]), after[:, :-1]], axis=1)
     offsets = pixels[:, None] - splats.means2d[0, order]
-    a, b, c = jnp.moveaxis(splats.conics[0, order], -1, 0)
-    quadratic = 0.5 * (a * offsets[..., 0] ** 2 + c * offsets[..., 1] ** 2) + b * offsets[..., 0] * offsets[..., 1]
-    raw = splats.opacities[0, order] * jnp.exp(-quadratic)
+    p, q, r = jnp.moveaxis(splats.factors[0, order], -1, 0)
+    exponents = (p * offsets[..., 0] + q * offsets[..., 1]) ** 2 + (r * offsets[..., 1]) ** 2
+    raw = splats.opacities[0, order] * jnp.exp(-exponents)
     edge = jnp.where(before > 1e-4, jnp.minimum(jnp.abs(raw * 255 - 1), jnp.abs(after * 1e4 - 1)), 1.0)
-    return jnp.sum(weights[..., None] * channels[order], axis=1), jnp.min(edge, axis=1)
+    sums = jnp.sum(weights[..., None] * channels[order], axis=1)
+    return jnp.concatenate([sums, jnp.sum(weights, axis=1)[:, None]], axis=1), jnp.min(edge, axis=1)
 
 
 @pytest.mark.parametrize("name", SCENES)
