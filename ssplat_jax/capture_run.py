@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ssplat_jax.cache import grow
 from ssplat_jax.checkpoint.delta import save_delta
 from ssplat_jax.checkpoint.state import load_newest_state, restore_previous, save_state
 from ssplat_jax.checkpoint.weights import params_digest
@@ -17,7 +18,7 @@ from ssplat_jax.evaluate import cache_facts, check_scorable, save_comparison, sc
 from ssplat_jax.export.atomic import previous_path
 from ssplat_jax.export.json_files import write_json
 from ssplat_jax.export.ply import ExportReport, save_ply
-from ssplat_jax.follow import SceneFeed
+from ssplat_jax.follow import SceneDelta, SceneFeed
 from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.interrupts import Interrupts
 from ssplat_jax.report import Reporter
@@ -77,6 +78,9 @@ def run_capture(
             shutil.rmtree(stale, ignore_errors=True)
     identity = _identity(model, params, capture, indices)
     session, frame, done = _resume(model, params, capture, indices, identity, out, reporter)
+    if done == 0:
+        # Of a run that was stopped before its first save: its changes are not those of this one.
+        shutil.rmtree(out / DELTAS, ignore_errors=True)
     for warning in (*capture.notes, *filter(None, [frame.warning])):
         reporter.warn(warning)
     order = capture.stream_order(model.config, indices, frame)
@@ -86,7 +90,7 @@ def run_capture(
         is_told = done == 0 or _delta_path(out, done).exists()
         feed = SceneFeed(model, params, session.cache if is_told else None)
         if not is_told and done == len(indices) and session.cache is not None:
-            save_delta(_delta_path(out, done), feed.update(session.cache))
+            _save_delta(out, done, feed.update(session.cache), frame)
     with Interrupts() as interrupts, reporter.progress("streaming", len(indices)) as advance:
         advance(done)
         if done < len(indices):
@@ -94,13 +98,15 @@ def run_capture(
                 session.feed(chunk)
                 done += int(np.asarray(chunk.valid).sum())
                 if feed is not None and session.cache is not None:
-                    save_delta(_delta_path(out, done), feed.update(session.cache))
+                    _save_delta(out, done, feed.update(session.cache), frame)
                 advance(done)
                 stopped = interrupts.received  # read once: a signal may come at any time
                 if stopped or (number + 1) % save_every == 0 or done == len(indices):
                     _save(session, frame, identity, done, out)
                 if stopped:
-                    return RunResult(done, cache_facts(session)["decoded"], stopped)
+                    break
+        if stopped := interrupts.received:  # during the last save, too
+            return RunResult(done, cache_facts(session)["decoded"], stopped)
     report = _finish(session, frame, capture, indices, out, reporter)
     return RunResult(done, report.num_written, None)
 
@@ -141,6 +147,11 @@ def _delta_path(out: Path, done: int) -> Path:
     return out / DELTAS / f"{done:06d}.npz"
 
 
+def _save_delta(out: Path, done: int, delta: SceneDelta, frame: StreamFrame) -> None:
+    """A chunk's changes, and what a viewer needs to put them into the capture's frame."""
+    save_delta(_delta_path(out, done), delta, {"frame": _frame_to(frame), "views": done})
+
+
 def _identity(model: StreamSplat, params: dict, capture: Capture, indices: list[int]) -> dict:
     """What must be equal for a run to be continued."""
     return {
@@ -162,7 +173,10 @@ def _resume(
         return Session(model, params), capture.stream_frame(model.config, indices), 0
     cache, header, damage = load_newest_state(state)
     for name, value in identity.items():
-        if (held := header.get(name)) != value:
+        held = header.get(name)
+        if name == "config":
+            held, value = _what_counts(held), _what_counts(value)
+        if held != value:
             raise InputError(
                 f"{out}: holds a run with another {name} ({_difference(held, value)}); choose another --out,"
                 " repeat the old options, or start anew with --overwrite."
@@ -170,7 +184,19 @@ def _resume(
     if damage is not None:
         reporter.warn(f"{damage} Continuing from the state saved before it, after {header['done']} views.")
         restore_previous(state)
+    if cache.capacity < model.config.capacity:
+        cache = grow(cache, model.config.capacity)
     return Session(model, params, cache), _frame_from(header["frame"]), header["done"]
+
+
+def _what_counts(config: dict) -> dict:
+    """Of a configuration, what a scene depends on: where no token is left out for want of room, not how much there is.
+
+    So a run that stopped for want of room goes on with the remedy that it was given.
+    """
+    if config.get("overflow") not in ("grow", "error"):
+        return config
+    return {name: value for name, value in config.items() if name not in ("overflow", "capacity")}
 
 
 def _difference(held, wanted) -> str:
@@ -201,6 +227,7 @@ def _frame_to(frame: StreamFrame) -> dict:
         "scale": frame.scale,
         "near": frame.near,
         "far": frame.far,
+        "warning": frame.warning,
     }
 
 
@@ -211,6 +238,7 @@ def _frame_from(fields: dict) -> StreamFrame:
         scale=fields["scale"],
         near=fields["near"],
         far=fields["far"],
+        warning=fields.get("warning"),
     )
 
 

@@ -56,7 +56,7 @@ def load_newest_state(path: Path) -> tuple[VoxelCache, dict[str, Any], StorageEr
 
 
 def restore_previous(path: Path) -> None:
-    """Puts the previous state in the place of a damaged or missing one.
+    """Puts the previous state in the place of a damaged or missing one, which is kept as `<name>.damaged`.
 
     Whoever continues from the previous state does so first: the next save keeps what is at `path` as the previous
     state, and would put a damaged file over the only good one.
@@ -65,6 +65,9 @@ def restore_previous(path: Path) -> None:
         StorageError: the file could not be renamed.
     """
     try:
+        if path.exists():
+            # What could not be read now may be readable elsewhere, or with a later version.
+            os.replace(path, path.with_name(path.name + ".damaged"))
         os.replace(previous_path(path), path)
     except OSError as error:
         raise StorageError(f"{path}: cannot be replaced by {previous_path(path).name} ({error.strerror}).") from error

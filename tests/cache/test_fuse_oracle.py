@@ -12,6 +12,7 @@ from tests.cache.streams import CONFIG, WIDTH, assert_equal_to_oracle, fuse, rec
 CONFIGS = {
     "literal": CONFIG,
     "count": CONFIG.replace(merge_weight="count", pivots_per_voxel=3),
+    "feature": CONFIG.replace(merge_key="feature"),
     "single": CONFIG.replace(pivots_per_voxel=1),
     "evict": CONFIG.replace(overflow="evict_lowest", pivots_per_voxel=2),
     "append": CONFIG.replace(vacc="append"),

@@ -15,7 +15,7 @@ import pytest
 from PIL import Image
 
 from ssplat_jax import cli
-from ssplat_jax.checkpoint.delta import load_delta
+from ssplat_jax.checkpoint.delta import load_delta, load_delta_header
 from ssplat_jax.checkpoint.state import load_state
 from ssplat_jax.checkpoint.weights import load_params, save_weights
 from ssplat_jax.config import StreamConfig, preset
@@ -176,6 +176,7 @@ def assert_deltas_give_the_scene(out, *names):
     assert [path.name for path in files] == list(names)
     told = functools.reduce(apply_delta, map(load_delta, files), None)
     cache, header = load_state(out / "state.npz")
+    assert load_delta_header(files[-1]) == {"frame": header["frame"], "views": header["done"]}
     model = StreamSplat(StreamConfig.from_dict(header["config"]))
     scene = jax.jit(model.decode)(load_params("tiny"), cache)
     assert 0 < (told.opacities > 0).sum() == (np.asarray(scene.opacities) > 0).sum()
@@ -186,6 +187,8 @@ def assert_deltas_give_the_scene(out, *names):
 def test_run_stops_resumes_and_exports(tmp_path, capsys):
     out = tmp_path / "run"
     capture = str(make_capture(tmp_path / "capture", num_frames=12, size=(64, 48)))
+    (out / "deltas").mkdir(parents=True)
+    (out / "deltas" / "000003.npz").write_bytes(b"of a run that was stopped before its first save")
     assert run("run", capture, "--out", str(out), "--save-every", "1", "--deltas", "--quiet") == 0
     assert {"scene.ply", "state.npz", "metrics.json"} <= {p.name for p in out.iterdir()}
     assert_deltas_give_the_scene(out, "000004.npz", "000008.npz", "000012.npz")
@@ -202,6 +205,8 @@ def test_run_stops_resumes_and_exports(tmp_path, capsys):
     shutil.rmtree(out / "deltas")
     assert run("run", capture, "--out", str(out), "--deltas", "--quiet") == 0
     assert_deltas_give_the_scene(out, "000012.npz")
+    # More room, the remedy for a run that stopped for want of it, goes on with what was saved.
+    assert run("run", capture, "--out", str(out), "--set", "capacity=65536", "--set", "overflow=error", "--quiet") == 0
     # Another configuration is refused.
     assert json.loads((out / "metrics.json").read_text())["cache"]["num_chunks"] == 3
     for changes, difference in (
