@@ -206,7 +206,9 @@ class Train:
     out: Path
     """Log, checkpoints and, at the end, weights.npz."""
     preset: str = "tiny"
-    """Configuration and recipe."""
+    """Configuration."""
+    recipe: Literal["tiny", "stream"] = "tiny"
+    """`tiny` trains depth, from scratch to the shipped weights; `stream` what comes behind it, for --init-weights."""
     scale_steps: float = 1.0
     """Lengthens or shortens every phase of the recipe."""
     seed: int = 0
@@ -232,7 +234,7 @@ class Train:
 
         require_positive(scale_steps=self.scale_steps, save_every=self.save_every)
         config = apply_changes(preset(self.preset), self.set)
-        recipe = dataclasses.replace(RECIPES[self.preset].scaled(self.scale_steps), seed=self.seed)
+        recipe = dataclasses.replace(RECIPES[self.recipe].scaled(self.scale_steps), seed=self.seed)
         params = None
         if self.init_weights:
             params = load_weights(self.init_weights)[0]

@@ -93,7 +93,7 @@ class StreamConfig:
     # -- VACC (Eq. vacc_capacity_update, vacc_pair_selection_and_merge) -------------------------------------------
     vacc: Literal["voxel", "append"] = "voxel"
     """`append` keeps every accepted token (the paper's ablation)."""
-    voxel_size: float = 0.04
+    voxel_size: float = 0.03
     pivots_per_voxel: int = 4
     min_confidence: float = 0.5
     """tau_conf: tokens below it never enter the cache, pivots that sink below it are not decoded. The paper's 0.3 is of

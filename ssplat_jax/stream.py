@@ -26,6 +26,8 @@ from ssplat_jax.geometry.rotations import matrices_to_quats
 from ssplat_jax.model.wires import Views
 from ssplat_jax.struct import pytree, replace
 
+COVER = 1.2  # pivots gather in the middle of their voxel: covering it edge to edge takes more than equal shares
+
 
 @pytree
 class ChunkOutput:
@@ -134,6 +136,7 @@ class StreamSplat:
             rgbs=flat(cache.rgbs),
             quats=flat(cache.quats),
             footprints=flat(merged_footprints(cache, self.config)),
+            num_members=flat(cache.num_members),
             config=self.config,
         )
         return mask_gaussians(gaussians, flat(shown_pivots(cache, self.config)))
@@ -163,12 +166,12 @@ def shown_pivots(cache: VoxelCache, config: StreamConfig) -> Bool[Array, "capaci
 
 
 def merged_footprints(cache: VoxelCache, config: StreamConfig) -> Float[Array, "capacity k"]:
-    """Footprints of pivots, grown with their members up to the share of a voxel's face that each of K pivots covers.
+    """Footprints of pivots, grown with their members up to what K pivots need to cover a voxel's face.
 
     A pivot keeps the footprint of its best member. Where cells are finer than that share, many merge into K pivots, and
     K single footprints would leave cracks between them.
     """
-    share = config.voxel_size / math.sqrt(config.pivots_per_voxel)
+    share = COVER * config.voxel_size / math.sqrt(config.pivots_per_voxel)
     grown = cache.footprints * jnp.sqrt(cache.num_members.astype(jnp.float32))
     return jnp.minimum(grown, jnp.maximum(cache.footprints, share))
 

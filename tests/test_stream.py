@@ -26,6 +26,7 @@ NARROW = StreamConfig(
     mixer_blocks=1,
     mixer_proj=8,
     min_confidence=0.0,
+    voxel_size=0.04,
     capacity=8192,  # a session starts with it too: one program for loop and session
 )
 
@@ -165,10 +166,10 @@ def test_carved_pivots_are_not_decoded_but_remembered(model, params, looped):
 
 @pytest.mark.parametrize(
     ("footprint", "members", "wanted"),
-    [(0.01, 1, 0.01), (0.01, 2, 0.01 * 2**0.5), (0.01, 100, 0.02), (0.05, 100, 0.05), (0.02, 3, 0.02)],
+    [(0.01, 1, 0.01), (0.01, 2, 0.01 * 2**0.5), (0.01, 100, 0.024), (0.05, 100, 0.05), (0.024, 3, 0.024)],
 )
-def test_merged_footprints_grow_to_the_share_of_a_voxel_s_face(model, footprint, members, wanted):
-    cache = model.init_cache()  # voxel_size 0.04, 4 pivots: a share of 0.02
+def test_merged_footprints_grow_until_they_cover_a_voxel_s_face(model, footprint, members, wanted):
+    cache = model.init_cache()  # voxel_size 0.04, 4 pivots: 1.2 times a share of 0.02
     cache = replace(
         cache,
         footprints=cache.footprints.at[0, 0].set(footprint),

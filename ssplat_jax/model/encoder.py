@@ -2,6 +2,7 @@
 
 import flax.linen as nn
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ssplat_jax.config import StreamConfig
@@ -45,12 +46,12 @@ class AttentionLayer(nn.Module):
     ffn_ratio: int = 0
 
     @nn.compact
-    def __call__(self, x, context, context_valid=None):
+    def __call__(self, x, context, allowed=None):
         c = x.shape[-1]
         q = nn.Dense(c, use_bias=False, name="q")(x)
         k = nn.Dense(c, use_bias=False, name="k")(context)
         v = nn.Dense(c, use_bias=False, name="v")(context)
-        message = attend(q[..., None, :], k[..., None, :], v[..., None, :], context_valid)[..., 0, :]
+        message = attend(q[..., None, :], k[..., None, :], v[..., None, :], allowed)[..., 0, :]
         message = nn.LayerNorm(name="norm1")(nn.Dense(c, use_bias=False, name="merge")(message))
         if self.ffn_ratio:
             hidden = nn.Dense(self.ffn_ratio * c, use_bias=False, name="ffn1")(jnp.concatenate([x, message], axis=-1))
@@ -104,13 +105,21 @@ class Encoder(nn.Module):
         for i, (own, cross) in enumerate(zip(self.self_attention, self.cross_attention, strict=True)):
             shift = side // 2 if i % 2 else 0
             windows = to_windows(jnp.roll(x, (-shift, -shift), axis=(1, 2)), side)
-            windows = own(windows, windows)
+            together = _together(h, w, side, shift)
+            windows = own(windows, windows, together)
             context = windows[sources].transpose(0, 2, 1, 3, 4).reshape(v, windows.shape[1], num_sources * side**2, c)
-            context_valid = jnp.repeat(source_valid, side**2, axis=1)[:, None, :]
-            context_valid = jnp.broadcast_to(context_valid, context.shape[:-1])
-            windows = cross(windows, context, context_valid)
+            allowed = jnp.repeat(source_valid, side**2, axis=1)[:, None, None] & jnp.tile(together, num_sources)
+            windows = cross(windows, context, allowed)
             x = jnp.roll(from_windows(windows, side, h, w), (shift, shift), axis=(1, 2))
         return x
+
+
+def _together(height: int, width: int, side: int, shift: int) -> Bool[Array, "1 windows cells cells"]:
+    """Which cells of the windows of a map rolled by `-shift` are neighbours, not opposite borders in one window."""
+    rows, cols = (np.arange(n) >= n - shift for n in (height, width))
+    regions = jnp.asarray((2 * rows[:, None] + cols)[None, :, :, None], jnp.float32)
+    cells = to_windows(regions, side)[..., 0]
+    return cells[..., :, None] == cells[..., None, :]
 
 
 def encode(params, views: Views, config: StreamConfig) -> Features:

@@ -30,19 +30,19 @@ def attend(
     queries: Float[Array, "*b q heads c"],
     keys: Float[Array, "*b k heads c"],
     values: Float[Array, "*b k heads c"],
-    key_valid: Bool[Array, "*b k"] | None = None,
+    allowed: Bool[Array, "*#b #q k"] | None = None,
 ) -> Float[Array, "*b q heads c"]:
-    """Scaled dot-product attention, softmax in float32.
+    """Scaled dot-product attention of each query to the keys that it is allowed, softmax in float32.
 
     Limits:
-        No valid key gives zeros.
+        No allowed key gives zeros.
     """
     scores = jnp.einsum("...qhc,...khc->...hqk", queries, keys).astype(jnp.float32) * queries.shape[-1] ** -0.5
-    if key_valid is None:
+    if allowed is None:
         weights = jax.nn.softmax(scores, axis=-1)
     else:
-        valid = key_valid[..., None, None, :]
-        weights = jax.nn.softmax(jnp.where(valid, scores, -1e9), axis=-1) * valid.astype(jnp.float32)
+        allowed = allowed[..., None, :, :]
+        weights = jax.nn.softmax(jnp.where(allowed, scores, -1e9), axis=-1) * allowed.astype(jnp.float32)
     return jnp.einsum("...hqk,...khc->...qhc", weights.astype(values.dtype), values)
 
 
@@ -100,8 +100,8 @@ class JointAttention(nn.Module):
     def __call__(self, x, view_valid):
         v, h, w, c = x.shape
         qkv = nn.Dense(3 * c, name="qkv")(nn.GroupNorm(8, name="norm")(x)).reshape(1, v * h * w, 3, self.heads, -1)
-        key_valid = jnp.repeat(view_valid, h * w)[None]
-        mixed = attend(qkv[:, :, 0], qkv[:, :, 1], qkv[:, :, 2], key_valid).reshape(v, h, w, c)
+        allowed = jnp.repeat(view_valid, h * w)[None, None]
+        mixed = attend(qkv[:, :, 0], qkv[:, :, 1], qkv[:, :, 2], allowed).reshape(v, h, w, c)
         return x + nn.Dense(c, kernel_init=nn.initializers.zeros, name="out")(mixed)
 
 

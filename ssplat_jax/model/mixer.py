@@ -69,7 +69,8 @@ class NeighbourBlock(nn.Module):
         q, k, v = jnp.split(
             nn.Dense(3 * self.config.mixer_proj, use_bias=False, name="qkv")(nn.LayerNorm(name="norm1")(x)), 3, axis=-1
         )
-        mixed = attend(q[:, None, None], k[neighbours][:, :, None], v[neighbours][:, :, None], usable[neighbours])
+        allowed = usable[neighbours][:, None]
+        mixed = attend(q[:, None, None], k[neighbours][:, :, None], v[neighbours][:, :, None], allowed)
         x = x + nn.Dense(c, name="project")(mixed[:, 0, 0])
         hidden = nn.gelu(nn.Dense(2 * c, name="mlp1")(nn.LayerNorm(name="norm2")(x)))
         return x + nn.Dense(c, name="mlp2")(hidden)
@@ -85,10 +86,10 @@ class GlobalBlock(nn.Module):
         v, c = x.shape[0], x.shape[-1]
         y = nn.LayerNorm(name="norm_in")(nn.Dense(c, name="shrink")(pixel_unshuffle(x, GLOBAL_FACTOR)))
         tokens = y.reshape(1, -1, c)
-        key_valid = jnp.repeat(view_valid, tokens.shape[1] // v)[None]
+        allowed = jnp.repeat(view_valid, tokens.shape[1] // v)[None, None]
         qkv = nn.Dense(3 * c, use_bias=False, name="qkv")(nn.LayerNorm(name="norm1")(tokens))
         qkv = qkv.reshape(1, tokens.shape[1], 3, self.heads, -1)
-        mixed = attend(qkv[:, :, 0], qkv[:, :, 1], qkv[:, :, 2], key_valid)
+        mixed = attend(qkv[:, :, 0], qkv[:, :, 1], qkv[:, :, 2], allowed)
         tokens = tokens + nn.Dense(c, name="project")(mixed.reshape(tokens.shape))
         hidden = nn.gelu(nn.Dense(4 * c, name="mlp1")(nn.LayerNorm(name="norm2")(tokens)))
         tokens = tokens + nn.Dense(c, name="mlp2")(hidden)
@@ -134,7 +135,9 @@ def mix_tokens(
 
     They have unit RMS. What is stored comes back through CGFI a chunk later, so without a bound the stream is a loop
     with gain: trained on four chunks, features grew to 1e18 by the ninth. The head normalises anyway.
+    What comes in is brought to unit RMS too: nothing else holds the size of what CGFI adds, and the blocks would drown
+    in it.
     """
-    feats = feats.astype(jnp.float32)
+    feats = rms_normalize(feats.astype(jnp.float32))  # pyright: ignore[reportAssignmentType]
     mixed = Mixer(config).apply({"params": params}, feats, positions, inside, view_valid)
     return rms_normalize(mixed)  # pyright: ignore[reportArgumentType]

@@ -8,6 +8,7 @@ from jaxtyping import Array, Float
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.geometry.cameras import invert_poses, pixel_grid, transform_points, unproject
 from ssplat_jax.model.convolution import Conv, pixel_unshuffle
+from ssplat_jax.model.layers import rms_normalize
 from ssplat_jax.model.wires import GRID_STRIDE, AnchoredDepth, DepthBelief, Features, Views
 
 MIN_LOG_RANGE = 1e-3
@@ -30,16 +31,21 @@ class TokenRegressor(nn.Module):
 def regress_tokens(
     params, features: Features, belief: DepthBelief, depth: AnchoredDepth, views: Views, config: StreamConfig
 ) -> Float[Array, "v hf wf c"]:
-    """f^v(u): what the current views say about each token.
+    """f^v(u): what the current views say about each token, of unit RMS.
+
+    What follows is residual and ends in a norm: nothing else would hold the size of f, and what CGFI and the mixer add
+    would drown in large features. All that enters has about that size too: colours and confidence are few channels
+    beside many.
 
     The depth enters as a constant: it is trained through the positions it gives, not through this hint.
     """
     low, high = views.log_candidates[0], views.log_candidates[-1]
     relative = (jax.lax.stop_gradient(depth.log_depths)[..., None] - low) / jnp.maximum(high - low, MIN_LOG_RANGE)
-    match = jax.lax.stop_gradient(depth.anchored_confidences)[..., None]
-    patches = pixel_unshuffle(views.images - 0.5, GRID_STRIDE)
-    context, decoder = features.context.astype(jnp.float32), belief.decoder.astype(jnp.float32)
-    return TokenRegressor(config).apply({"params": params}, patches, relative, match, context, decoder)  # pyright: ignore[reportReturnType]
+    match = 4.0 * (jax.lax.stop_gradient(depth.anchored_confidences)[..., None] - 0.75)
+    patches = 4.0 * pixel_unshuffle(views.images - 0.5, GRID_STRIDE)
+    context, decoder = (rms_normalize(x.astype(jnp.float32)) for x in (features.context, belief.decoder))
+    feats = TokenRegressor(config).apply({"params": params}, patches, relative, match, context, decoder)
+    return rms_normalize(feats)  # pyright: ignore[reportArgumentType]
 
 
 def back_project(

@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 
 from ssplat_jax.checkpoint.training import TrainingCheckpoints
@@ -80,6 +81,7 @@ def train(
                 window.append(metrics)
                 step = i + 1
                 if step % log_every == 0 or step == recipe.num_steps:
+                    jax.block_until_ready(metrics)  # steps are dispatched, not done
                     record = _record(step, recipe, window, state, waited, time.perf_counter() - since)
                     _append(out / LOG_FILE, record)
                     report(record)

@@ -34,8 +34,12 @@ class Phase:
     sizes: tuple[tuple[int, int], ...]
     """Image sizes (height, width), taken in turn."""
     learning_rate: float
-    """Peak of the phase; it decays to a tenth by cosine."""
+    """Peak of the phase; it decays by cosine."""
     form: PhaseForm = PAPER_FORM
+    final_share: float = 0.1
+    """Of the peak, what the learning rate decays to."""
+    steps_of_depth: tuple[float, float] = (0.005, 0.4)
+    """From what to what consecutive views of a sample step, in median depths: hand-held video to sets of photos."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,8 +54,12 @@ class Recipe:
     ema_decay: float = 0.99
     depth_weight: float = 0.1
     """Weight of the depth losses beside the rendering loss (procedural scenes know their depth; DESIGN 6.13)."""
-    gradient_weight: float = 0.1
-    """Weight of the L1 of image gradients beside the MSE, in place of LPIPS, whose weights cannot be shipped."""
+    gradient_weight: float = 0.02
+    """Weight of the L1 of image gradients beside the MSE, in place of LPIPS, whose weights cannot be shipped. One
+    colour a cell shows no texture below it: a larger weight asks for that in vain, or for blur."""
+    black_weight: float = 0.05
+    """Share of the rendering loss over black; the rest has holes in the colours around, as views are scored. That alone
+    would make all surfaces sheer: what is open costs it nothing."""
     recompute: bool = False
     """Recompute each chunk's activations backward: less memory, more time."""
     cache_capacity: int = 1 << 14
@@ -87,23 +95,43 @@ ALL_BUT_HEAD = ("encoder", "cost_volume", "hpda", "tokens", "cgfi", "mixer")
 
 TINY = Recipe(
     phases=(
-        Phase("depth", 1800, num_chunks=1, num_targets=0, sizes=((96, 128),), learning_rate=1e-3),
+        Phase("depth", 3000, num_chunks=1, num_targets=0, sizes=((96, 128),), learning_rate=1e-3),
+        # Nearer the size of what is streamed, and upright too.
+        Phase(
+            "larger",
+            400,
+            num_chunks=1,
+            num_targets=0,
+            sizes=((160, 224), (224, 160)),
+            learning_rate=5e-4,
+            final_share=0.02,
+            steps_of_depth=(0.02, 0.4),  # what is streamed has been dealt out to 3 % and more
+        ),
+    )
+)
+"""From scratch to the shipped `tiny` weights; docs/model_card.md has the command, hours and machine."""
+
+STREAM = Recipe(
+    phases=(
         Phase(
             "stream",
-            600,
+            400,
             num_chunks=4,
             num_targets=4,
             sizes=((96, 128),),
             learning_rate=1e-3,
+            final_share=0.02,
+            steps_of_depth=(0.01, 0.15),
             # The matcher is done by then; without its backward pass a step costs a third, and rendering teaches it
             # less about depth than depth itself did.
             form=PhaseForm(frozen=("encoder", "cost_volume")),
         ),
     )
 )
-"""From scratch to the shipped `tiny` weights; docs/model_card.md has the command, hours and machine."""
+"""What comes behind the matcher (gamma, features, CGFI, mixer, head), for weights that know depth. Not part of the
+shipped ones: docs/model_card.md says what it gave."""
 
-RECIPES = {"tiny": TINY}
+RECIPES = {"tiny": TINY, "stream": STREAM}
 
 
 def smoke_recipe(steps: int = 20) -> Recipe:

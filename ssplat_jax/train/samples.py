@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from ssplat_jax.chunk import Chunk
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.data.procedural import training_sample
+from ssplat_jax.data.procedural import STEPS, training_sample
 from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.model import GRID_STRIDE
 from ssplat_jax.struct import pytree
@@ -43,13 +43,21 @@ def choose_targets(rng: np.random.Generator, num_views: int, num_targets: int) -
     return np.sort(rng.choice(np.arange(1, num_views - 1), size=num_targets, replace=False))
 
 
-def make_sample(seed: int, *, num_chunks: int, num_targets: int, size: tuple[int, int], config: StreamConfig) -> Sample:
+def make_sample(
+    seed: int,
+    *,
+    num_chunks: int,
+    num_targets: int,
+    size: tuple[int, int],
+    config: StreamConfig,
+    steps_of_depth: tuple[float, float] = STEPS,
+) -> Sample:
     """The sample called `seed`: always the same arrays for the same arguments."""
     rng = np.random.default_rng([seed, 7])
     height, width = size
     num_context = num_chunks * config.chunk_size
     num_views = num_context + num_targets
-    arrays = training_sample(seed, num_views, height, width)
+    arrays = training_sample(seed, num_views, height, width, steps=steps_of_depth)
     images, depths, camtoworlds, Ks = (np.asarray(a) for a in arrays)
     is_target = np.zeros(num_views, bool)
     if num_targets:
@@ -152,4 +160,5 @@ def sample_for_step(step: int, recipe: Recipe, config: StreamConfig) -> Sample:
         num_targets=phase.num_targets,
         size=phase.sizes[position % len(phase.sizes)],
         config=config,
+        steps_of_depth=phase.steps_of_depth,
     )

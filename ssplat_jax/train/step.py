@@ -2,16 +2,17 @@
 
 import dataclasses
 import functools
+import math
 
 import jax
 import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float, Int
 
-from ssplat_jax.cache import Tokens
-from ssplat_jax.gaussians import Gaussians, mask_gaussians
+from ssplat_jax.cache import Tokens, VoxelCache, judge
+from ssplat_jax.gaussians import Gaussians, mask_gaussians, mean_color
 from ssplat_jax.lpips import LpipsWeights
-from ssplat_jax.render import render
+from ssplat_jax.render import fill_holes, render
 from ssplat_jax.stream import StreamSplat
 from ssplat_jax.struct import pytree
 from ssplat_jax.train.losses import depth_loss, rendering_loss
@@ -52,11 +53,11 @@ def init_state(model: StreamSplat, recipe: Recipe, params: dict | None = None) -
 
 
 def learning_rate(recipe: Recipe, step: int) -> float:
-    """Warm-up at the start of every phase, then cosine to a tenth of its peak."""
+    """Warm-up at the start of every phase, then cosine from its peak to the share of it that the phase ends with."""
     phase, position = recipe.phase_at(step)
     warmup = min(1.0, (position + 1) / recipe.warmup_steps)
-    progress = position / phase.steps
-    return phase.learning_rate * warmup * float(0.1 + 0.45 * (1 + jnp.cos(jnp.pi * progress)))
+    cosine = math.cos(math.pi * position / phase.steps)
+    return phase.learning_rate * warmup * (phase.final_share + 0.5 * (1 - phase.final_share) * (1 + cosine))
 
 
 def stream_chunks(model: StreamSplat, params: dict, sample: Sample, *, recompute: bool):
@@ -91,10 +92,12 @@ def pad_like(truth: Float[Array, "v h w"], predicted: Float[Array, "v hf wf"]) -
     return jnp.pad(truth, [(0, n - m) for m, n in zip(truth.shape, predicted.shape, strict=True)], mode="edge")
 
 
-def decode_accepted(model: StreamSplat, params: dict, tokens: Tokens) -> Gaussians:
-    """Gaussians of the tokens that the cache would accept: training sees the scene that inference sees."""
+def decode_accepted(model: StreamSplat, params: dict, cache: VoxelCache, tokens: Tokens) -> Gaussians:
+    """Gaussians of the tokens that are trusted and that the stream's witnesses did not look through: nearly the scene
+    that inference sees, but not merged."""
     gaussians = model.decode_tokens(params, tokens)
-    return mask_gaussians(gaussians, tokens.valid & (tokens.confidences >= model.config.min_confidence))
+    judged = judge(*jax.lax.stop_gradient((cache.witnesses, tokens)), model.config)
+    return mask_gaussians(gaussians, tokens.valid & (judged.confidences >= model.config.min_confidence))
 
 
 def loss_fn(
@@ -113,19 +116,26 @@ def loss_fn(
     metrics = {"depth_entropy": entropy, "depth_l1": depth_l1, "accepted": accepted}
     if sample.target_images.shape[0]:
         is_cache = form.decode == "cache"
-        gaussians = model.decode(params, cache) if is_cache else decode_accepted(model, params, tokens)
+        gaussians = model.decode(params, cache) if is_cache else decode_accepted(model, params, cache, tokens)
         output = render(gaussians, sample.target_camera, max_pairs=recipe.max_pairs)
-        rendering = rendering_loss(
-            output.color,
-            sample.target_images,
-            gradient_weight=recipe.gradient_weight,
-            lpips_weights=lpips_weights,
+        assert output.color is not None and output.alpha is not None
+        filled = fill_holes(output.color, output.alpha, jax.lax.stop_gradient(mean_color(gaussians)))
+        rendering, over_black = (
+            rendering_loss(
+                image,
+                sample.target_images,
+                gradient_weight=recipe.gradient_weight,
+                lpips_weights=lpips_weights,
+            )
+            for image in (filled, output.color)
         )
-        loss = recipe.depth_weight * loss + 10.0 * rendering.total
+        total = (1 - recipe.black_weight) * rendering.total + recipe.black_weight * over_black.total
+        loss = recipe.depth_weight * loss + 10.0 * total
         metrics |= {} if rendering.lpips is None else {"lpips": rendering.lpips}
         metrics |= {
             "psnr": -10 * jnp.log10(rendering.mse + 1e-10),
-            "alpha": output.alpha.mean(),  # pyright: ignore[reportOptionalMemberAccess]
+            "psnr_over_black": -10 * jnp.log10(over_black.mse + 1e-10),
+            "alpha": output.alpha.mean(),
             "overflow": output.num_overflow.astype(jnp.float32),
         }
     return loss, metrics | {"loss": loss}

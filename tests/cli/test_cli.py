@@ -210,7 +210,7 @@ def test_run_stops_resumes_and_exports(tmp_path, capsys):
     # Another configuration is refused.
     assert json.loads((out / "metrics.json").read_text())["cache"]["num_chunks"] == 3
     for changes, difference in (
-        (("--set", "voxel_size=0.1"), "another config (voxel_size: 0.04 there, 0.1 now)"),
+        (("--set", "voxel_size=0.1"), "another config (voxel_size: 0.03 there, 0.1 now)"),
         (("--stride", "2"), "another frames (12 there, 6 now"),
         (("--size", "32x24"), "another size ([64, 48] there, [32, 24] now)"),
         (("--quality", "fast"), "another size ([64, 48] there, [32, 24] now)"),

@@ -9,12 +9,12 @@ from ssplat_jax.gaussians import SH_C0
 from ssplat_jax.geometry.cameras import pixel_grid, project_points, transform_points
 from ssplat_jax.geometry.rotations import quats_to_matrices
 from ssplat_jax.model import GRID_STRIDE, back_project, count_params, decode_tokens, init_params
-from ssplat_jax.model.decoder import MIN_SCALE, START_SCALE, START_THICKNESS, token_scales
-from ssplat_jax.model.encoder import from_windows, sine_positions, to_windows
+from ssplat_jax.model.decoder import MIN_SCALE, START_OPACITY, START_SCALE, START_THICKNESS, token_scales
+from ssplat_jax.model.encoder import Encoder, from_windows, sine_positions, to_windows
 from ssplat_jax.model.wires import nearest_sources, prepare_views
 from ssplat_jax.struct import replace
 from tests.geometry.test_cameras import poses
-from tests.model.small import CONFIG, HEIGHT, WIDTH, chunk
+from tests.model.small import CONFIG, HEIGHT, WIDTH, chunk, params
 
 FLOAT32 = 1e-5
 
@@ -92,6 +92,22 @@ def test_position_code_is_detrs():
     np.testing.assert_allclose(sine_positions(side, channels), wanted, atol=1e-5)
 
 
+def test_shifted_windows_do_not_join_opposite_borders():
+    views = prepare_views(chunk(), CONFIG)
+    sources, source_valid = nearest_sources(views.viewmats, views.valid, CONFIG.num_sources)
+    cnn = jax.random.normal(jax.random.key(0), (3, 8, 8, 16))
+
+    def attended(cnn):
+        stage = Encoder(CONFIG)
+        return np.asarray(
+            stage.apply({"params": params()["encoder"]}, cnn, sources, source_valid, method="attend_views")
+        )
+
+    changed = np.abs(attended(cnn.at[0, 0, 0].add(1.0)) - attended(cnn)).max(axis=-1) > 0
+    # The first layer's windows are cells 0-3 and 4-7, the second's 0-1, 2-5 and 6-7.
+    assert changed[:, :6, :6].all() and not changed[:, 6:].any() and not changed[:, :, 6:].any()
+
+
 def test_positions_project_to_their_cells_at_their_depths():
     viewmats = jnp.asarray(poses(3, 2.0), jnp.float32)
     views = prepare_views(replace(chunk(), viewmats=viewmats), CONFIG)
@@ -105,7 +121,7 @@ def test_positions_project_to_their_cells_at_their_depths():
     np.testing.assert_allclose(footprints, np.exp(log_depths) * GRID_STRIDE / focal[:, None, None], rtol=1e-5)
 
 
-def decoded(m: int = 10, **changes):
+def decoded(m: int = 10, num_members=1, **changes):
     config = CONFIG.replace(**changes)
     rng = np.random.default_rng(0)
     f32 = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
@@ -118,7 +134,7 @@ def decoded(m: int = 10, **changes):
     }
     shapes = jax.eval_shape(lambda key: init_params(key, config)["decoder"], jax.random.key(0))
     params = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape), shapes)
-    return decode_tokens(params, **inputs, config=config), inputs
+    return decode_tokens(params, **inputs, num_members=num_members, config=config), inputs
 
 
 def test_an_untrained_head_puts_a_disc_of_the_patchs_colour_exactly_on_the_token():
@@ -130,7 +146,34 @@ def test_an_untrained_head_puts_a_disc_of_the_patchs_colour_exactly_on_the_token
     np.testing.assert_allclose(gaussians.scales, wanted, rtol=1e-5)
     # Thin along the viewing direction of the camera that saw it.
     np.testing.assert_allclose(quats_to_matrices(gaussians.quats), quats_to_matrices(inputs["quats"]), atol=FLOAT32)
-    np.testing.assert_allclose(gaussians.opacities, 0.5)
+    np.testing.assert_allclose(gaussians.opacities, 1 / (1 + np.exp(-START_OPACITY)), rtol=1e-6)
+
+
+def test_a_pivot_is_as_opaque_as_its_members_in_one_place():
+    members = np.array([0, 1, 2, 3, 17, 1000, 2**31 - 1], np.int32)
+    gaussians, _ = decoded(len(members), num_members=jnp.asarray(members))
+    single = 1 / (1 + np.exp(-START_OPACITY))
+    np.testing.assert_allclose(gaussians.opacities, 1 - (1 - single) ** members.astype(float), rtol=1e-6, atol=1e-7)
+
+    def opacity(bias, n):
+        raw = jnp.zeros(8 + 3).at[0].set(bias)
+        params = {"out": {"kernel": jnp.zeros((4, 11)), "bias": raw}, **hidden_layers()}
+        one = lambda *shape: jnp.ones((1, *shape))  # noqa: E731
+        values = {"means": one(3), "feats": one(4), "rgbs": one(3), "quats": one(4), "footprints": one()}
+        return decode_tokens(params, **values, num_members=n, config=CONFIG.replace(token_width=4)).opacities[0]
+
+    for bias in (-200.0, 0.0, 200.0):
+        for n in (0, 1, 2**31 - 1):
+            value, slope = jax.value_and_grad(opacity)(bias, jnp.array([n]))
+            assert 0 <= value <= 1 and np.isfinite(slope)
+
+
+def hidden_layers():
+    """The layers of a head of four channels, before its last."""
+    return {
+        "norm": {"scale": jnp.ones(4), "bias": jnp.zeros(4)},
+        "hidden": {"kernel": jnp.zeros((4, 4)), "bias": jnp.zeros(4)},
+    }
 
 
 def test_no_feature_makes_a_gaussian_of_absurd_size():

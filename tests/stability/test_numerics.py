@@ -84,7 +84,7 @@ def test_attention_is_the_softmax_average():
 
 def test_attention_to_no_valid_key_is_zero_with_a_zero_gradient():
     q, k, v = attention_arrays()
-    none = jnp.zeros((2, 7), bool)
+    none = jnp.zeros((2, 1, 7), bool)
     np.testing.assert_array_equal(attend(q, k, v, none), 0)
     for gradient in jax.grad(lambda *x: jnp.sum(attend(*x, none) ** 2 + attend(*x, none)), (0, 1, 2))(q, k, v):
         np.testing.assert_array_equal(gradient, 0)
@@ -92,10 +92,10 @@ def test_attention_to_no_valid_key_is_zero_with_a_zero_gradient():
 
 def test_attention_never_hears_invalid_keys():
     q, k, v = attention_arrays()
-    valid = jnp.broadcast_to(jnp.array([True, False, True, True, False, True, False]), (2, 7))
-    loud = jnp.where(valid[..., None, None], 0.0, 1e6)
+    valid = jnp.broadcast_to(jnp.array([True, False, True, True, False, True, False]), (2, 1, 7))
+    loud = jnp.where(valid[:, 0, :, None, None], 0.0, 1e6)
     np.testing.assert_array_equal(attend(q, k, v, valid), attend(q, k + loud, v - loud, valid))
-    keep = np.flatnonzero(valid[0])
+    keep = np.flatnonzero(valid[0, 0])
     np.testing.assert_allclose(attend(q, k, v, valid), attend(q, k[:, keep], v[:, keep]), atol=1e-6)
 
 

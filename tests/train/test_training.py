@@ -8,14 +8,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from ssplat_jax.cache import Tokens
 from ssplat_jax.checkpoint.training import TrainingCheckpoints
+from ssplat_jax.data.procedural import training_sample
 from ssplat_jax.errors import InputError
 from ssplat_jax.stream import StreamSplat
+from ssplat_jax.struct import replace
 from ssplat_jax.train import loop
 from ssplat_jax.train.losses import depth_loss, image_gradient_l1, soft_targets
 from ssplat_jax.train.recipe import ALL_BUT_HEAD, Phase, PhaseForm, smoke_recipe, training_config
 from ssplat_jax.train.samples import log_depths_at_cells, make_sample, prefetched, sample_for_step
-from ssplat_jax.train.step import Trainer, init_state, learning_rate, loss_fn, pad_like, stream_chunks
+from ssplat_jax.train.step import Trainer, decode_accepted, init_state, learning_rate, loss_fn, pad_like, stream_chunks
 from tests.model.small import random_params
 from tests.test_stream import NARROW
 
@@ -130,6 +133,44 @@ def test_learning_rate_warms_up_and_decays_in_every_phase():
     first = recipe.phases[0].steps
     assert rates[0] < rates[1] and rates[first - 1] < 0.2 * recipe.phases[0].learning_rate
     assert rates[first] < recipe.phases[1].learning_rate and rates[first + 2] > 0.8 * recipe.phases[1].learning_rate
+    quiet = dataclasses.replace(recipe, phases=(dataclasses.replace(recipe.phases[0], steps=200, final_share=0.02),))
+    assert learning_rate(quiet, 199) == pytest.approx(0.02 * quiet.phases[0].learning_rate, rel=0.01)
+
+
+def test_what_a_witness_looked_through_is_not_rendered():
+    model = StreamSplat(NARROW)
+    params, cache = random_params(NARROW), model.init_cache()
+    side = cache.witnesses.weights.shape[-1]
+    # One witness at the origin that saw a wall at depth 2 everywhere.
+    witnesses = replace(
+        cache.witnesses,
+        viewmats=cache.witnesses.viewmats.at[0].set(jnp.eye(4)),
+        Ks=cache.witnesses.Ks.at[0].set(jnp.array([[side, 0, side / 2], [0, side, side / 2], [0, 0, 1.0]])),
+        log_depths=cache.witnesses.log_depths.at[0].set(np.log(2.0)),
+        weights=cache.witnesses.weights.at[0].set(1.0),
+    )
+    depths = jnp.array([1.0, 2.0, 3.0, 2.0])  # a floater, the wall, what it hides, and what is not trusted
+    tokens = Tokens(
+        means=jnp.array([[0.01, 0.01, 1.0]]) * depths[:, None],
+        feats=jnp.ones((4, NARROW.token_width)),
+        confidences=jnp.array([0.6, 0.6, 0.6, 0.2]),
+        rgbs=jnp.full((4, 3), 0.5),
+        quats=jnp.tile(jnp.array([1.0, 0, 0, 0]), (4, 1)),
+        footprints=jnp.full(4, 0.02),
+        valid=jnp.ones(4, bool),
+    )
+    config = NARROW.replace(min_confidence=0.5)
+    shown = decode_accepted(StreamSplat(config), params, replace(cache, witnesses=witnesses), tokens).opacities > 0
+    np.testing.assert_array_equal(shown, [False, True, True, False])
+
+
+def test_a_phase_says_how_far_views_step():
+    rng = np.random.default_rng(0)
+    for low, high in ((0.01, 0.02), (0.2, 0.3)):
+        for seed in rng.integers(0, 1000, 3):
+            _, depths, poses, _ = training_sample(int(seed), 8, 24, 32, steps=(low, high))
+            step = np.median(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=-1)) / np.median(depths)
+            assert low / 2 < step < 2 * high
 
 
 FROZEN_ENCODER = PhaseForm(frozen=("encoder",))

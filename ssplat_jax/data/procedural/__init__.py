@@ -2,7 +2,7 @@
 
 from ssplat_jax.data.procedural.paths import PATH_KINDS, sample_path
 from ssplat_jax.data.procedural.raycast import raycast, raycast_depths
-from ssplat_jax.data.procedural.samples import CAPTURES, procedural_capture_arrays, training_sample
+from ssplat_jax.data.procedural.samples import CAPTURES, STEPS, procedural_capture_arrays, training_sample
 from ssplat_jax.data.procedural.scene import Scene, clearance, scale_scene
 from ssplat_jax.data.procedural.scenes import SCENE_KINDS, sample_scene
 from ssplat_jax.data.procedural.textures import texture_library
@@ -11,6 +11,7 @@ __all__ = [
     "CAPTURES",
     "PATH_KINDS",
     "SCENE_KINDS",
+    "STEPS",
     "Scene",
     "clearance",
     "procedural_capture_arrays",

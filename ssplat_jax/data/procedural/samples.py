@@ -29,13 +29,15 @@ _PATHS = {  # paths that suit a kind of world: around its pile of objects, along
 }
 
 
-def training_sample(seed: int, num_views: int, height: int, width: int, supersample: int = 1) -> Views:
+def training_sample(
+    seed: int, num_views: int, height: int, width: int, supersample: int = 1, *, steps: tuple[float, float] = STEPS
+) -> Views:
     """Images, z-depths, camera-to-world poses and intrinsics of a random path through a random world.
 
-    Views are in the order of time; consecutive centres lie 0.4 to 45 % of the median depth apart in the median, single
-    steps up to three times as far: hand-held video as much as a set of photos. Units are such
-    that the median depth is between 1.2 and 3.5, no surface is nearer than about 0.3 and none farther than 15. The
-    same seed gives the same sample. One colour ray per pixel costs a third of the default of captures: training is fed
+    Views are in the order of time; consecutive centres lie `steps` median depths apart (a range, log-uniform; by
+    default hand-held video as much as a set of photos), single steps up to three times as far. Units are such that the
+    median depth is between 1.2 and 3.5, no surface is nearer than about 0.3 and none farther than 15. The same
+    arguments give the same sample. One colour ray per pixel costs a third of the default of captures: training is fed
     on the same two cores that it runs on.
     """
     rng = np.random.default_rng([3, seed])
@@ -43,17 +45,17 @@ def training_sample(seed: int, num_views: int, height: int, width: int, supersam
     while found is None:
         kind = str(rng.choice(SCENE_KINDS, p=SCENE_SHARES))
         scene = sample_scene(int(rng.integers(2**31)), kind)
-        found = _scaled_path(rng, scene, _PATHS[kind], num_views, height, width)
+        found = _scaled_path(rng, scene, _PATHS[kind], num_views, height, width, steps)
     scene, poses, Ks = found
     images, depths = _cast(scene, poses, Ks, height, width, supersample)
     return _through_sensor(rng, scene, images), depths, poses, Ks
 
 
-def _scaled_path(rng, scene: Scene, kinds: tuple[str, ...], num_views: int, height: int, width: int):
+def _scaled_path(rng, scene: Scene, kinds: tuple[str, ...], num_views: int, height: int, width: int, steps):
     """Scene, poses and intrinsics in sample units; None if the path comes too close to something."""
     kind = kinds[rng.integers(len(kinds))]
     seed = int(rng.integers(2**31))
-    step = np.exp(rng.uniform(*np.log(STEPS)))
+    step = np.exp(rng.uniform(*np.log(steps)))
     # A few first steps measure the depth that the steps of the whole walk are fractions of.
     poses, Ks = sample_path(seed, scene, kind, _FIRST_STEPS, height, width, step=step * float(scene.orbit_radius) * 1.5)
     median = float(np.median(_probe(scene, poses, Ks, height, width)))
