@@ -175,7 +175,7 @@ def _resume(
     for name, value in identity.items():
         held = header.get(name)
         if name == "config":
-            held, value = _what_counts(held), _what_counts(value)
+            held, value = _what_counts(held or {}), _what_counts(value)
         if held != value:
             raise InputError(
                 f"{out}: holds a run with another {name} ({_difference(held, value)}); choose another --out,"

@@ -188,7 +188,8 @@ def _across_and_along(grid: Grid, values) -> tuple[Float[Array, "p u t"], Float[
     dys = offsets[:, None, None] - y
     shares, squares = jnp.stack([q * dys - p * x, (r * dys) ** 2])
     across = p * offsets[:, None, None] + shares[:, None]  # row, column, u, t
-    return tuple(jnp.broadcast_to(z, across.shape).reshape(-1, *across.shape[2:]) for z in (across, squares[:, None]))
+    along = jnp.broadcast_to(squares[:, None], across.shape)
+    return across.reshape(-1, *across.shape[2:]), along.reshape(-1, *across.shape[2:])
 
 
 def _weights(alphas, transmittance):

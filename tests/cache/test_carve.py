@@ -146,7 +146,7 @@ def test_switched_off_it_is_the_identity_and_leaves_no_trace():
     assert not jax.make_jaxpr(lambda *args: carve(*args, off))(*inputs).eqns
 
 
-@settings(SETTINGS, max_examples=12)  # two chunks each, in the loop too
+@settings(SETTINGS, max_examples=6)  # two chunks each, in the loop too
 @given(seed=SEED, camera_seed=SEED, size=st.sampled_from([(HEIGHT, GRID_WIDTH), (40, 33)]))
 def test_judging_equals_the_loop(seed, camera_seed, size):
     height, width = size

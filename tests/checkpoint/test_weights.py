@@ -34,8 +34,9 @@ def test_shipped_weights_fit_their_preset_and_are_no_fresh_ones():
     shipped = load_params("tiny")
     fresh = jax.eval_shape(lambda key: init_params(key, preset("tiny")), jax.random.key(0))
     assert jax.tree.map(lambda x: x.shape, shipped) == jax.tree.map(lambda x: x.shape, fresh)
-    # The head starts at standard deviation 1e-3: trained, it decides opacity and size.
-    assert float(np.std(shipped["decoder"]["out"]["kernel"])) > 0.005
+    # The last layers of the matcher's blocks start at zero: trained, they decide the depth.
+    for block in ("down0", "down1", "middle1", "middle2", "up0", "up1"):
+        assert float(np.std(shipped["cost_volume"]["unet"][block]["conv2"]["kernel"])) > 0.005
 
 
 def test_a_flipped_bit_is_named(saved):

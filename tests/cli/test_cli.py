@@ -205,8 +205,6 @@ def test_run_stops_resumes_and_exports(tmp_path, capsys):
     shutil.rmtree(out / "deltas")
     assert run("run", capture, "--out", str(out), "--deltas", "--quiet") == 0
     assert_deltas_give_the_scene(out, "000012.npz")
-    # More room, the remedy for a run that stopped for want of it, goes on with what was saved.
-    assert run("run", capture, "--out", str(out), "--set", "capacity=65536", "--set", "overflow=error", "--quiet") == 0
     # Another configuration is refused.
     assert json.loads((out / "metrics.json").read_text())["cache"]["num_chunks"] == 3
     for changes, difference in (
@@ -223,6 +221,16 @@ def test_run_stops_resumes_and_exports(tmp_path, capsys):
     edit("transform_matrix", np.diag([1.0, 1.0, 1.0, 1.0]).tolist())(tmp_path / "capture")  # a corrected pose
     assert run("run", capture, "--out", str(out), "--quiet") == 2
     assert "another poses" in capsys.readouterr().err
+
+
+@pytest.mark.slow  # a program of its own
+def test_more_room_the_remedy_for_a_run_that_stopped_for_want_of_it_goes_on_with_what_was_saved(tmp_path):
+    out, capture = tmp_path / "run", str(make_capture(tmp_path / "capture", num_frames=8, size=(64, 48)))
+    assert run("run", capture, "--out", str(out), "--set", "overflow=error", "--quiet") == 0
+    scene = (out / "scene.ply").read_bytes()
+    more = ("--set", "capacity=65536", "--set", "overflow=grow")
+    assert run("run", capture, "--out", str(out), *more, "--quiet") == 0
+    assert load_state(out / "state.npz")[0].num_voxels > 0 and (out / "scene.ply").read_bytes() == scene
 
 
 def test_eval_writes_every_promised_field(tmp_path):

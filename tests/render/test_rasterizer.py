@@ -78,6 +78,7 @@ def test_gradients_equal_the_references_in_float64():
         assert cosine > 0.99999, jax.tree_util.keystr(path)
 
 
+@pytest.mark.slow  # the reference's own gradients are compared with in every run, just above
 def test_gradients_equal_finite_differences_in_float64():
     # Few, wide, faint Gaussians: no alpha threshold is crossed by a step of 1e-6.
     with jax.enable_x64(True):
@@ -200,17 +201,19 @@ def test_float64_is_sorted_in_float64(scene):
 
 
 def test_a_camera_that_is_not_finite_sees_nothing_and_spoils_nothing(scene):
-    gaussians, camera = cloud(degree=3), cameras(21, 30, batch=2)
+    gaussians, camera = cloud(degree=1), cameras(21, 30, batch=2)
+
+    def loss(inputs):
+        out = render(*inputs, max_pairs=1 << 12)
+        return jnp.sum(out.color[0] ** 2) + jnp.sum(out.alpha[1]), out
+
+    slopes = jax.jit(jax.grad(loss, has_aux=True))
+    wanted = slopes((gaussians, camera))[1].color[0]
     for field, entry in (("viewmats", jnp.nan), ("Ks", jnp.inf), ("Ks", 0.0)):
         bad = replace(camera, **{field: getattr(camera, field).at[1, 0, 0].set(entry)})
-
-        def loss(inputs):
-            out = render(*inputs, effects=ALL, max_pairs=1 << 12)
-            return jnp.sum(out.color[0] ** 2) + jnp.sum(out.alpha[1]), out
-
-        gradients, out = jax.jit(jax.grad(loss, has_aux=True))((gaussians, bad))
+        gradients, out = slopes((gaussians, bad))
         assert not out.alpha[1].any() and int(out.num_non_finite) == gaussians.num_gaussians
-        np.testing.assert_allclose(out.color[0], render(gaussians, camera[0], effects=ALL).color, atol=1e-6)
+        np.testing.assert_array_equal(out.color[0], wanted)
         for gradient in jax.tree.leaves(gradients):
             assert np.isfinite(gradient).all()
 
