@@ -140,8 +140,9 @@ def _prototype(path: Path, num: int, size: int, pairs: int) -> Callable[[], Any]
     arrays = module.scene(num, size)
     focal = arrays.pop("f")
     arrays = [jnp.asarray(arrays[name]) for name in ("means", "scales", "quats", "opacities", "colors")]
-    capacity = 2 * api.round_up(pairs)
-    return lambda: module.render(*arrays, focal, H=size, W=size, max_pairs=capacity)
+    draw = functools.partial(module.render, *arrays, focal, H=size, W=size)
+    own_pairs = int(draw(max_pairs=2 * api.round_up(pairs))[1])
+    return lambda: draw(max_pairs=api.round_up(own_pairs))  # room by the same rule as ours
 
 
 def rows_of(num: int, size: int, *, against: Path | None = None, stages: bool = True) -> list[dict[str, Any]]:

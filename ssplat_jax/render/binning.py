@@ -5,15 +5,18 @@ once by (depth, row); a pair's key is then `tile << bits | depth rank`, so that 
 everything in exact order. XLA sorts single integers five times faster than (key, payload) tuples, hence the packing.
 """
 
+import functools
+
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float, Int, Shaped
+from jaxtyping import Array, Int, Shaped
 
 from ssplat_jax.render import constants
 from ssplat_jax.render.projection import Splats
 from ssplat_jax.struct import pytree, static
 
+EIGHTHS = (5, 6, 8)  # of the room for pairs (a power of two): the least share that holds them is what is sorted
 PARTS = 4  # turns of the loop in `take_rows`; a loop of one is none
 MOST_PAIRS = (1 << 31) - 1  # what an index reaches; counts of pairs stop there
 KEY_BITS = 32  # keys wider than this are sorted as 64-bit integers
@@ -87,7 +90,7 @@ def depth_order(splats: Splats) -> Int[Array, " m"]:
     with jax.enable_x64(True):
         bits = lax.bitcast_convert_type(depths, jnp.uint32).astype(jnp.uint64)  # positive floats sort as integers
         keys = (bits << jnp.uint64(32)) | lax.iota(jnp.uint64, depths.shape[0])
-        keys = lax.sort(jnp.where(visible, keys, jnp.uint64(0xFFFFFFFF00000000)), is_stable=False)
+        keys = lax.sort(jnp.where(visible, keys, jnp.uint64(0xFFFFFFFF00000000)))
         return (keys & jnp.uint64(0xFFFFFFFF)).astype(jnp.int32)
 
 
@@ -97,20 +100,18 @@ def bin_splats(splats: Splats, grid: Grid, max_pairs: int) -> Pairs:
     num_rows = order.shape[0]
     visible_first = jnp.arange(num_rows) < jnp.sum(splats.visible)
     boxes = jnp.where(visible_first[:, None], take_rows(tile_boxes(splats, grid), order), 0)
-    counts = boxes[:, 2] * boxes[:, 3]
-    ends = _running_sum(counts)
-    ranks = _owners(ends, max_pairs)
-    tiles_per_image = grid.rows * grid.columns
-    first_tiles = (order // splats.depths.shape[1]) * tiles_per_image + boxes[:, 1] * grid.columns + boxes[:, 0]
-    table = jnp.stack([ends - counts, first_tiles, jnp.maximum(boxes[:, 2], 1)], axis=-1)[ranks]
-    pair = jnp.arange(max_pairs, dtype=jnp.int32)
-    within = pair - table[:, 0]
-    tiles = table[:, 1] + within // table[:, 2] * grid.columns + within % table[:, 2]
-    origins = [origin.astype(splats.depths.dtype) for origin in _tile_origins(tiles, grid)]
-    outlines = take_rows(_outlines(splats, order), ranks)
-    reached = _reaches(jnp.moveaxis(outlines, -1, 0), origins, grid.tile)
-    sorted_ranks, bounds = _sort_pairs(tiles, ranks, (pair < ends[-1]) & reached, grid.num_tiles, num_rows)
-    return Pairs(rows=order[sorted_ranks], bounds=bounds, num_pairs=ends[-1])
+    ends = _running_sum(boxes[:, 2] * boxes[:, 3])
+    outlines = _outlines(splats, boxes, ends, order, grid)
+
+    def sorted_pairs(room: int):
+        ranks = _owners(ends, room)
+        ranks, bounds = _sort_pairs(_tiles(outlines, ranks, ends[-1], grid), ranks, grid.num_tiles, num_rows)
+        return jnp.pad(order[ranks], (0, max_pairs - room)), bounds
+
+    rooms = sorted({-(-max_pairs * share // 8) for share in EIGHTHS})
+    enough = jnp.sum(ends[-1] > jnp.array(rooms[:-1], jnp.int32), dtype=jnp.int32)
+    rows, bounds = lax.switch(enough, [functools.partial(sorted_pairs, room) for room in rooms])
+    return Pairs(rows=rows, bounds=bounds, num_pairs=ends[-1])
 
 
 def take_rows(table: Shaped[Array, "m f"], rows: Int[Array, " p"]) -> Shaped[Array, "p f"]:
@@ -125,28 +126,49 @@ def take_rows(table: Shaped[Array, "m f"], rows: Int[Array, " p"]) -> Shaped[Arr
     return taken.reshape(-1, table.shape[1])[: rows.shape[0]]
 
 
-def _outlines(splats: Splats, order: Int[Array, " m"]) -> Float[Array, "m 6"]:
-    """Mean, factors of the exponent, and the largest exponent at which alpha is still 1/255, in depth order."""
+def _outlines(splats: Splats, boxes: Int[Array, "m 4"], ends: Int[Array, " m"], order: Int[Array, " m"], grid: Grid):
+    """What the pairs of each Gaussian are found from, in depth order: integers and floats `[m]`.
+
+    Its first pair, its first tile and the columns of its box; its mean from the centre of that tile's first pixel, the
+    factors of its exponent, and the largest exponent at which alpha is still 1/255.
+    """
+    image = order // splats.depths.shape[1]
+    first_tiles = (image * grid.rows + boxes[:, 1]) * grid.columns + boxes[:, 0]
+    whole = ends - boxes[:, 2] * boxes[:, 3], first_tiles, jnp.maximum(boxes[:, 2], 1)
     bounds = jnp.log(jnp.maximum(splats.opacities / constants.ALPHA_MIN, 1.0))
     columns = [*jnp.moveaxis(splats.means2d, -1, 0), *jnp.moveaxis(splats.factors, -1, 0), bounds]
-    return take_rows(jnp.stack([column.reshape(-1) for column in columns], axis=-1), order)
+    x, y, *rest = take_rows(jnp.stack([column.reshape(-1) for column in columns], axis=-1), order).T
+    x, y = (mean - ((boxes[:, i] * grid.tile).astype(mean.dtype) + 0.5) for i, mean in enumerate((x, y)))
+    return whole, (x, y, *rest)
 
 
-def _tile_origins(tiles: Int[Array, " p"], grid: Grid) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
-    """Centre of the first pixel of each tile, in its image."""
-    within = tiles % (grid.rows * grid.columns)
-    x, y = within % grid.columns * grid.tile, within // grid.columns * grid.tile
-    return x.astype(jnp.float32) + 0.5, y.astype(jnp.float32) + 0.5
+def _tiles(outlines, ranks: Int[Array, " p"], num_pairs: Int[Array, ""], grid: Grid) -> Int[Array, " p"]:
+    """The tile of every pair; `grid.num_tiles` where there is none, or one that the Gaussian's ellipse misses.
+
+    In a loop, whose operands are there before it: one kernel then reads what it needs of each pair's Gaussian.
+    """
+    padded = jnp.pad(ranks, (0, -ranks.shape[0] % PARTS)).reshape(PARTS, -1)
+
+    def part(operands):
+        number, ranks = operands
+        (starts, tiles, columns), (x, y, *rest) = jax.tree.map(lambda column: column[ranks], outlines)
+        pair = number * ranks.shape[0] + jnp.arange(ranks.shape[0], dtype=jnp.int32)
+        down = (pair - starts) // columns
+        right = pair - starts - down * columns
+        low = [(side * grid.tile).astype(x.dtype) - mean for side, mean in ((right, x), (down, y))]
+        reached = _reaches(low, rest, grid.tile) & (pair < num_pairs)
+        return jnp.where(reached, tiles + down * grid.columns + right, grid.num_tiles)
+
+    return lax.map(part, (jnp.arange(PARTS, dtype=jnp.int32), padded)).reshape(-1)[: ranks.shape[0]]
 
 
-def _reaches(outline, origins, tile: int):
+def _reaches(low, shape, tile: int):
     """Whether a Gaussian's ellipse of alpha = 1/255 reaches the pixel centres of a tile: a quarter of a box's do not.
 
     The least exponent over the tile lies on an edge that faces the mean (or is 0 inside); what float32 may lose of it,
     for needles, is given back, so that no pair is missed.
     """
-    x, y, p, q, r, bound = outline
-    low_x, low_y = origins[0] - x, origins[1] - y
+    (low_x, low_y), (p, q, r, bound) = low, shape
     high_x, high_y = low_x + (tile - 1), low_y + (tile - 1)
     near_x, near_y = jnp.clip(0.0, low_x, high_x), jnp.clip(0.0, low_y, high_y)
     along_x = jnp.clip(-q * near_y / jnp.maximum(p, 1e-15), low_x, high_x)
@@ -166,7 +188,7 @@ def _owners(ends: Int[Array, " m"], max_pairs: int) -> Int[Array, " p"]:
 
 
 def _sort_pairs(
-    tiles: Int[Array, " p"], ranks: Int[Array, " p"], exists: Array, num_tiles: int, num_rows: int
+    tiles: Int[Array, " p"], ranks: Int[Array, " p"], num_tiles: int, num_rows: int
 ) -> tuple[Int[Array, " p"], Int[Array, " tiles_and_one"]]:
     """Depth ranks in order of (tile, rank), and where each tile's begin."""
     bits = max(1, (num_rows - 1).bit_length())
@@ -175,7 +197,7 @@ def _sort_pairs(
         dtype = jnp.uint32 if fits else jnp.uint64
         shift = jnp.array(bits, dtype)
         keys = (tiles.astype(dtype) << shift) | ranks.astype(dtype)
-        keys = lax.sort(jnp.where(exists, keys, ~jnp.array(0, dtype)), is_stable=False)
+        keys = lax.sort(keys)
         starts = jnp.arange(num_tiles + 1, dtype=dtype) << shift
         bounds = jnp.searchsorted(keys, starts).astype(jnp.int32)
         sorted_ranks = (keys & ((jnp.array(1, dtype) << shift) - jnp.array(1, dtype))).astype(jnp.int32)

@@ -12,7 +12,7 @@ same turns again, front to back, knowing the totals from the forward pass.
 
 import functools
 import operator
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 import jax
 import jax.numpy as jnp
@@ -22,8 +22,9 @@ from jaxtyping import Array, Float, Int
 from ssplat_jax.render import constants
 from ssplat_jax.render.binning import Grid, Pairs, take_rows
 
-TURN = 8
+TURN = 4
 BATCH = 64
+READ_AHEAD = 2 * TURN  # rows that may be read past a tile's last
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0, 1))
@@ -40,26 +41,22 @@ def composite(
 
 
 def _forward(grid: Grid, with_alpha: bool, table, pairs: Pairs):
-    num_outputs = table.shape[1] - 6 + with_alpha
+    num_channels = table.shape[1] - 6
 
     def batch(tiles):
-        first, last = _loads(pairs, tiles)
-
-        def turn(carry):
-            i, transmittance, out = carry
-            values, alphas = _turn(grid, table, tiles, first + i * TURN, last)
-            weights, _, transmittance = _weights(alphas, transmittance)
-            weights = jnp.stack(weights, axis=1)
-            layers = [weights * value for value in values[6:]] + [weights] * with_alpha
-            out = [o + jnp.sum(layer, axis=1) for o, layer in zip(out, layers, strict=True)]
-            return i + 1, transmittance, out
+        def turn(_, values, alphas, transmittance, out):
+            weights, afters = _weights(alphas, transmittance)
+            new = [_total(weight * values[6:, None, u] for u, weight in enumerate(weights))]
+            new += [_total(weights)] * with_alpha
+            return afters[-1], [o + n for o, n in zip(out, new, strict=True)]
 
         blank = jnp.zeros((grid.tile**2, tiles.shape[0]), table.dtype)
-        start = (0, blank + 1, [blank] * num_outputs)
-        return jnp.stack(lax.while_loop(_goes_on(first, last), turn, start)[2])
+        start = [jnp.zeros((num_channels, *blank.shape), table.dtype)] + [blank] * with_alpha
+        channels, *alpha = _walk(grid, table, pairs, tiles, turn, start)
+        return jnp.concatenate([channels, *(a[None] for a in alpha)])
 
     batches = _batches(pairs.bounds, grid)
-    out = jnp.moveaxis(lax.map(batch, batches), -1, 1).reshape(-1, num_outputs, grid.tile**2)
+    out = jnp.moveaxis(lax.map(batch, batches), -1, 1).reshape(-1, num_channels + with_alpha, grid.tile**2)
     return jnp.zeros((grid.num_tiles, *out.shape[1:]), out.dtype).at[batches.reshape(-1)].set(out, mode="drop")
 
 
@@ -71,29 +68,26 @@ def _composite_fwd(grid: Grid, with_alpha: bool, shapes, channels, pairs: Pairs)
 
 def _composite_bwd(grid: Grid, with_alpha: bool, residuals, cotangents):
     shapes, table, pairs, out = residuals
-    ids = jnp.pad(pairs.rows, (0, TURN))
+    ids = jnp.pad(pairs.rows, (0, READ_AHEAD))
     tails = jnp.sum(out * cotangents, axis=1)
 
     def batch(grads, tiles):
-        first, last = _loads(pairs, tiles)
         inside = jnp.minimum(tiles, grid.num_tiles - 1)
         cotangent = lax.optimization_barrier(jnp.moveaxis(cotangents[inside], 0, -1))  # co p t
         by_channel, by_alpha = (cotangent[:-1], cotangent[-1, :, None]) if with_alpha else (cotangent, 0.0)
 
-        def turn(carry):
-            i, transmittance, tail, grads = carry
-            values, alphas = _turn(grid, table, tiles, first + i * TURN, last)
-            weights, afters, transmittance = _weights(alphas, transmittance)
+        def turn(start, values, alphas, transmittance, state):
+            tail, grads = state
+            weights, afters = _weights(alphas, transmittance)
             weights = jnp.stack(weights, axis=1)
             slopes = sum((c[:, None] * value for c, value in zip(by_channel, values[6:], strict=True)), by_alpha)
-            tail, exponents = _exponent_gradients(alphas, weights, weights * slopes, afters, tail)
+            tail, exponents = _exponent_gradients(alphas, weights, weights * slopes, tail)
             grad_channels = [_sum_pixels(grid, weights * c[:, None]) for c in by_channel]
             rows = jnp.stack([*_shape_gradients(grid, exponents, values), *grad_channels], axis=-1)
-            grads = grads.at[_next(ids, first + i * TURN).T].add(rows)  # what is read past a tile's end adds zeros
-            return i + 1, transmittance, tail, grads
+            grads = grads.at[_next(ids, start).T].add(rows)  # what is read past a tile's end adds zeros
+            return afters[-1], (tail, grads)
 
-        start = (0, jnp.ones((grid.tile**2, tiles.shape[0]), shapes.dtype), tails[inside].T, grads)
-        return lax.while_loop(_goes_on(first, last), turn, start)[3], None
+        return _walk(grid, table, pairs, tiles, turn, (tails[inside].T, grads))[1], None
 
     grads = jnp.zeros((shapes.shape[0], table.shape[1]), shapes.dtype)
     grads = lax.scan(batch, grads, _batches(pairs.bounds, grid))[0]
@@ -106,21 +100,16 @@ composite.defvjp(_composite_fwd, _composite_bwd)
 def median_rows(grid: Grid, shapes: Float[Array, "m 6"], pairs: Pairs) -> Int[Array, "tiles p"]:
     """The row whose sample brings each pixel's transmittance below one half; -1 where none does. No gradient."""
     table = _sorted_table(shapes, shapes[:, :0], pairs)
-    ids = jnp.pad(pairs.rows, (0, TURN))
+    ids = jnp.pad(pairs.rows, (0, READ_AHEAD))
 
     def batch(tiles):
-        first, last = _loads(pairs, tiles)
+        def turn(start, _, alphas, transmittance, found):
+            afters = _weights(alphas, transmittance)[1]
+            for after, row in zip(afters, _next(ids, start).T, strict=True):
+                found = jnp.where((found < 0) & (after < constants.MEDIAN_TRANSMITTANCE), row, found)
+            return afters[-1], found
 
-        def turn(carry):
-            i, transmittance, found = carry
-            _, alphas = _turn(grid, table, tiles, first + i * TURN, last)
-            _, afters, after = _weights(alphas, transmittance)
-            for u, row in enumerate(_next(ids, first + i * TURN).T):
-                found = jnp.where((found < 0) & (afters[u] < constants.MEDIAN_TRANSMITTANCE), row, found)
-            return i + 1, after, found
-
-        blank = jnp.ones((grid.tile**2, tiles.shape[0]), shapes.dtype)
-        return lax.while_loop(_goes_on(first, last), turn, (0, blank, jnp.full(blank.shape, -1, jnp.int32)))[2]
+        return _walk(grid, table, pairs, tiles, turn, jnp.full((grid.tile**2, tiles.shape[0]), -1, jnp.int32))
 
     batches = _batches(pairs.bounds, grid)
     out = jnp.moveaxis(lax.map(batch, batches), -1, 1).reshape(-1, grid.tile**2)
@@ -129,7 +118,7 @@ def median_rows(grid: Grid, shapes: Float[Array, "m 6"], pairs: Pairs) -> Int[Ar
 
 def _sorted_table(shapes, channels, pairs: Pairs) -> Float[Array, "p f"]:
     """One row a pair in sorted order, so that a tile's are contiguous; a turn may read past the end."""
-    return take_rows(jnp.concatenate([shapes, channels], axis=1), jnp.pad(pairs.rows, (0, TURN)))
+    return take_rows(jnp.concatenate([shapes, channels], axis=1), jnp.pad(pairs.rows, (0, READ_AHEAD)))
 
 
 def _batches(bounds: Int[Array, " tiles_and_one"], grid: Grid) -> Int[Array, "batches t"]:
@@ -147,14 +136,29 @@ def _loads(pairs: Pairs, tiles: Int[Array, " t"]) -> tuple[Int[Array, " t"], Int
     return pairs.bounds[jnp.minimum(tiles, last)], pairs.bounds[jnp.minimum(tiles + 1, last)]
 
 
-def _goes_on(first, last):
-    """Whether a batch has another turn: in one of its tiles Gaussians are left, and a pixel that one could reach."""
-    return lambda carry: jnp.any((carry[1] >= constants.TRANSMITTANCE_STOP) & (first + carry[0] * TURN < last))
+def _walk(grid: Grid, table, pairs: Pairs, tiles: Int[Array, " t"], turn: Callable, state):
+    """`state` after all turns of a batch, front to back.
 
+    `turn(start, values, alphas, transmittance, state)` gives the transmittance and the state after it. There is another
+    turn while, in one of the tiles, Gaussians are left and a pixel that one could reach.
 
-def _tile_offsets(grid: Grid, dtype) -> Float[Array, " side"]:
-    """Pixel centres of a row or a column from the centre of their tile."""
-    return jnp.arange(grid.tile, dtype=dtype) - (grid.tile - 1) / 2
+    A turn reads for the one after it: what a loop carries lies in memory. Read in the turn itself, XLA fuses the
+    reading with every kernel that uses it, and each strides over the table once a sample (docs/performance.md).
+    """
+    first, last = _loads(pairs, tiles)
+
+    def goes_on(carry):
+        i, transmittance = carry[:2]
+        return jnp.any((transmittance >= constants.TRANSMITTANCE_STOP) & (first + i * TURN < last))
+
+    def body(carry):
+        i, transmittance, state, values = carry
+        start = first + i * TURN
+        transmittance, state = turn(start, values, _alphas(grid, values), transmittance, state)
+        return i + 1, transmittance, state, _read(grid, table, tiles, start + TURN, last)
+
+    clear = jnp.ones((grid.tile**2, tiles.shape[0]), table.dtype)
+    return lax.while_loop(goes_on, body, (0, clear, state, _read(grid, table, tiles, first, last)))[2]
 
 
 def _next(rows: Array, start: Int[Array, " t"]) -> Array:
@@ -162,51 +166,45 @@ def _next(rows: Array, start: Int[Array, " t"]) -> Array:
     return jax.vmap(lambda first: lax.dynamic_slice_in_dim(rows, first, TURN))(start)
 
 
-def _turn(grid: Grid, table, tiles, start, last):
-    """Of the next `TURN` Gaussians of each tile: columns of the table (x, y from the tile's centre), and opacities."""
-    turn = _next(table, start)
-    # A stack is a copy that XLA does not fuse away: the kernels below then read columns, not strided rows.
-    x, y, p, q, r, opacity, *channels = jnp.stack(list(jnp.moveaxis(turn, (2, 1, 0), (0, 1, 2))))
-    opacity = jnp.where(start + jnp.arange(TURN, dtype=jnp.int32)[:, None] < last, opacity, 0.0)
+def _read(grid: Grid, table, tiles, start, last) -> Float[Array, "f u t"]:
+    """Columns of the next `TURN` Gaussians of each tile: x and y from the tile's centre, opacity 0 past its end."""
+    x, y, p, q, r, opacity, *channels = jnp.moveaxis(_next(table, start), (2, 1, 0), (0, 1, 2))
     within = tiles % (grid.rows * grid.columns)
-    x -= ((within % grid.columns).astype(x.dtype) + 0.5) * grid.tile
-    y -= ((within // grid.columns).astype(x.dtype) + 0.5) * grid.tile
-    values = [x, y, p, q, r, opacity, *channels]
-    across, along = _across_and_along(grid, values)
-    raw = opacity * jnp.exp(-(across * across) - along)
-    alphas = jnp.where(raw >= constants.ALPHA_MIN, jnp.minimum(raw, constants.ALPHA_MAX), 0.0)
-    return values, alphas
+    x = x - ((within % grid.columns).astype(x.dtype) + 0.5) * grid.tile
+    y = y - ((within // grid.columns).astype(x.dtype) + 0.5) * grid.tile
+    opacity = jnp.where(start + jnp.arange(TURN, dtype=jnp.int32)[:, None] < last, opacity, 0.0)
+    return jnp.stack([x, y, p, q, r, opacity, *channels])
 
 
-def _across_and_along(grid: Grid, values) -> tuple[Float[Array, "p u t"], Float[Array, "p u t"]]:
-    """p dx + q dy and (r dy)^2 of every sample: what is the same along a row of pixels is computed once a row.
+def _offsets(grid: Grid, values) -> tuple[Float[Array, "p u t"], Float[Array, "p u t"]]:
+    """dx and dy of every sample: its pixel's centre from the Gaussian's."""
+    side = jnp.arange(grid.tile, dtype=values.dtype) - (grid.tile - 1) / 2  # from the tile's centre
+    return jnp.tile(side, grid.tile)[:, None, None] - values[0], jnp.repeat(side, grid.tile)[:, None, None] - values[1]
 
-    The stack is a copy again: without it XLA computes a row's share for each of its pixels.
-    """
-    x, y, p, q, r = values[:5]
-    offsets = _tile_offsets(grid, x.dtype)
-    dys = offsets[:, None, None] - y
-    shares, squares = jnp.stack([q * dys - p * x, (r * dys) ** 2])
-    across = p * offsets[:, None, None] + shares[:, None]  # row, column, u, t
-    along = jnp.broadcast_to(squares[:, None], across.shape)
-    return across.reshape(-1, *across.shape[2:]), along.reshape(-1, *across.shape[2:])
+
+def _alphas(grid: Grid, values) -> Float[Array, "p u t"]:
+    dx, dy = _offsets(grid, values)
+    p, q, r, opacity = values[2:6]
+    across, along = p * dx + q * dy, r * dy
+    raw = opacity * jnp.exp(-(across * across) - along * along)
+    return jnp.where(raw >= constants.ALPHA_MIN, jnp.minimum(raw, constants.ALPHA_MAX), 0.0)
 
 
 def _weights(alphas, transmittance):
-    """Weights of a turn's samples, the transmittance after each, and after all.
+    """Weights of a turn's samples and the transmittance after each, `[p t]` a Gaussian.
 
     The transmittance runs on below the stop: it only ever falls, so comparing it needs no flag that a pixel has ended.
     """
     weights, afters = [], []
     for u in range(alphas.shape[1]):
         weight = alphas[:, u] * transmittance
-        transmittance = transmittance - weight
+        transmittance = transmittance * (1.0 - alphas[:, u])
         weights.append(jnp.where(transmittance >= constants.TRANSMITTANCE_STOP, weight, 0.0))
         afters.append(transmittance)
-    return weights, afters, afters[-1]
+    return weights, afters
 
 
-def _exponent_gradients(alphas, weights, gains, afters, tail):
+def _exponent_gradients(alphas, weights, gains, tail):
     """The tail after the turn, and dL/dq of every sample, where raw = opacity exp(-q).
 
     dL/dq = -a dL/da = -w s + a / (1 - a) tail; 0 for samples that are skipped, capped or beyond the stop.
@@ -244,11 +242,11 @@ def _shape_gradients(grid: Grid, exponents: Float[Array, "p u t"], values) -> li
     The exponent is s^2 + (r dy)^2 with s = p dx + q dy, which the moments hold as it is: made of those of dx and dy, it
     would cancel for needles.
     """
-    x, y, p, q, r, opacity = values[:6]
-    across, _ = _across_and_along(grid, values)
-    dx = jnp.tile(_tile_offsets(grid, x.dtype), grid.tile)[:, None, None] - x
+    p, q, r, opacity = values[2:6]
+    dx, dy = _offsets(grid, values)
+    across = p * dx + q * dy
     rows, rows_s, rows_sdx = (_sum_rows(grid, exponents * weight) for weight in (1.0, across, across * dx))
-    dys = [offset - y for offset in _tile_offsets(grid, x.dtype)]
+    dys = dy[:: grid.tile]  # one a row
     sum_s, sum_sdx = _total(rows_s), _total(rows_sdx)
     sum_sdy = _total(row * dy for row, dy in zip(rows_s, dys, strict=True))
     sum_dy = _total(row * dy for row, dy in zip(rows, dys, strict=True))
