@@ -161,6 +161,9 @@ class StreamConfig:
             if options and getattr(self, field.name) not in options:
                 wanted = ", ".join(map(repr, options))
                 raise InputError(f"config: {field.name} must be one of {wanted}, got {getattr(self, field.name)!r}.")
+        # Without voxels there is nothing to choose between.
+        if self.vacc == "append" and self.overflow == "evict_lowest":
+            raise InputError("config: overflow='evict_lowest' needs vacc='voxel', got vacc='append'; use 'drop_new'.")
 
     def replace(self, **changes: Any) -> "StreamConfig":
         """A copy with `changes`; unknown names and bad values raise `InputError`."""

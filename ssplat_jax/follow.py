@@ -3,7 +3,7 @@
     feed = SceneFeed(model, params)
     for chunk in chunks:
         cache, _ = step(params, cache, chunk)
-        delta = feed.update(cache)          # rows and their Gaussians: O(chunk), not O(scene)
+        delta = feed.update(cache)          # the rows that changed and their Gaussians: only those are decoded
         scene = apply_delta(scene, delta)   # equals model.decode(params, cache)
 
 A voxel's Gaussians change when a token is written to it, which the cache remembers per pivot (`last_chunks`), or when
@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Int32
 
 from ssplat_jax.cache import VoxelCache
+from ssplat_jax.cache.state import require_one
 from ssplat_jax.gaussians import Gaussians, mask_gaussians
 from ssplat_jax.stream import StreamSplat, shown_pivots
 
@@ -51,7 +52,12 @@ class SceneFeed:
             self._changed_rows(known)
 
     def update(self, cache: VoxelCache) -> SceneDelta:
-        """The changes since the last call."""
+        """The changes since the last call.
+
+        Raises:
+            InputError: `cache` is several, of streams or shards.
+        """
+        require_one(cache, "SceneFeed.update")
         rows = self._changed_rows(cache)
         num_padded = max(FEWEST_ROWS, 1 << max(len(rows) - 1, 0).bit_length())
         padded = np.pad(rows, (0, num_padded - len(rows)), constant_values=-1)

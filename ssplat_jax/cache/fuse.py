@@ -24,7 +24,6 @@ from ssplat_jax.cache.policy import evict
 from ssplat_jax.cache.state import PIVOT_FIELDS, CacheStats, Tokens, VoxelCache, add_to
 from ssplat_jax.cache.table import build_table, find_rows, group_equal, insert_rows, shards_of
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.errors import InputError
 from ssplat_jax.geometry.voxels import voxel_indices
 from ssplat_jax.struct import pytree, replace
 
@@ -87,9 +86,6 @@ def fuse_touched(cache: VoxelCache, tokens: Tokens, config: StreamConfig) -> tup
         Feature norms in [1e-9, 1e9]: beyond, and for zero features, a pair counts as orthogonal.
         Two members of confidence 0 are averaged with equal weights.
         A merged mean lies between its members, to the last bit, and so in their voxel.
-
-    Raises:
-        InputError: `vacc="append"` with `overflow="evict_lowest"`: without voxels there is nothing to choose between.
     """
     cache, tokens = jax.lax.stop_gradient((cache, tokens))
     stats, voxels, accepted = _classify(cache.stats, tokens, config)
@@ -167,8 +163,6 @@ def _place_at_end(
 ) -> tuple[VoxelCache, Plan, Int[Array, ""]]:
     """The ablation: rows are filled one slot after another and voxels play no part."""
     del voxels
-    if config.overflow == "evict_lowest":
-        raise InputError("config: overflow='evict_lowest' needs vacc='voxel', got vacc='append'; use 'drop_new'.")
     k = config.pivots_per_voxel
     last = jnp.maximum(cache.num_voxels - 1, 0)
     num_pivots = last * k + cache.counts[last]

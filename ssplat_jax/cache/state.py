@@ -127,6 +127,19 @@ def init_witnesses(config: StreamConfig) -> Witnesses:
     )
 
 
+def require_one(cache: VoxelCache, caller: str) -> None:
+    """Refuses caches with leading axes, of streams or shards, where `caller` takes one.
+
+    Raises:
+        InputError: there are several.
+    """
+    if shape := cache.num_voxels.shape:
+        raise InputError(
+            f"{caller}: wanted the cache of one stream on one device, got caches of shape {list(shape)}; take one at a"
+            f" time, jax.tree.map(lambda x: x[{', '.join('0' * len(shape))}], caches)."
+        )
+
+
 def init_cache(config: StreamConfig, capacity: int | None = None) -> VoxelCache:
     """An empty cache of `capacity` voxels (default: the config's).
 

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ssplat_jax.cache.state import PIVOT_FIELDS, CacheStats, VoxelCache, Witnesses
+from ssplat_jax.cache.state import PIVOT_FIELDS, CacheStats, VoxelCache, Witnesses, require_one
 from ssplat_jax.checkpoint.arrays import load_arrays, save_arrays
 from ssplat_jax.errors import StorageError
 from ssplat_jax.export.atomic import previous_path
@@ -26,7 +26,9 @@ def save_state(path: Path, cache: VoxelCache, header: dict[str, Any]) -> None:
 
     Raises:
         StorageError: the file could not be written; what was at `path` before is untouched.
+        InputError: `cache` is several, of streams or shards.
     """
+    require_one(cache, "save_state")
     facts = {"capacity": cache.capacity, "caller": header}
     save_arrays(path, _leaves(cache), KIND, facts, keep_previous=True)
 

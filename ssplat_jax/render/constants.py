@@ -31,6 +31,10 @@ CLASSIC_DILATION = 0.3
 UNFILTERED_FLOOR = 1e-8
 """px^2 added with no filter at all: keeps the screen covariance invertible, 1e-4 px, and invisible at float32."""
 
+FLATTEST = 1e-17
+"""At least this share of the square of its size is added to a screen covariance (0.1 px^2 of 1e8 px): gradients pass
+through its inverse."""
+
 COMPENSATION_CUT = 1e-12
 """det / det' below this counts as 0, with a zero gradient: the square root has no derivative there."""
 

@@ -60,6 +60,8 @@ class Row:
     calls: Callable[[], Scene]
     spares: Callable[[], Scene]
     off: Effects = BASE
+    arrays: tuple[str, ...] = ()
+    """Inputs that the program without the effect is not given."""
 
 
 ROWS = (
@@ -110,6 +112,14 @@ ROWS = (
     ),
     Row("alpha", "asked for", BASE.replace(outputs=("color", "alpha")), _plain, _plain),
     Row("depth (with alpha)", "asked for", BASE.replace(outputs=("color", "alpha", "depth")), _plain, _plain),
+    Row(
+        "8 feature channels",
+        "passed",
+        BASE,
+        lambda: _plain(features=jnp.ones((NUM, 8))),
+        lambda: _plain(features=jnp.ones((NUM, 8))),
+        arrays=("features",),
+    ),
     Row("median depth", "asked for", BASE.replace(outputs=("color", "median_depth")), _plain, _plain),
 )
 
@@ -132,9 +142,11 @@ def measure(row: Row) -> dict[str, Any]:
     figures: dict[str, Any] = {"name": row.name, "when": row.when}
     for kind, scene in (("calls", row.calls()), ("spares", row.spares())):
         gaussians, camera, arrays = scene
-        counts = [api.render(gaussians, camera, effects=e, **arrays).num_pairs for e in (row.on, row.off)]
+        without = gaussians, camera, {name: array for name, array in arrays.items() if name not in row.arrays}
+        pairs = ((scene, row.on), (without, row.off))
+        counts = [api.render(g, c, effects=effects, **given).num_pairs for (g, c, given), effects in pairs]
         max_pairs = api.round_up(max(int(count) for count in counts))
-        (cost_on, on), (cost_off, off) = (_program(scene, effects, max_pairs) for effects in (row.on, row.off))
+        (cost_on, on), (cost_off, off) = (_program(*pair, max_pairs) for pair in pairs)
         figures[f"dB_{kind}"] = decibels(off().color, on().color)
         if kind == "calls":
             times = bench.alternate({"on": on, "off": off}, repetitions=5)

@@ -180,7 +180,7 @@ def _filtered(root_u, root_v, effects: Effects):
     sized = largest <= constants.LARGEST_SCREEN
     unit = jnp.where(sized, jnp.maximum(largest, 1.0), 1.0)
     u, v = ([jnp.where(sized, m, 0.0) / unit for m in root] for root in (root_u, root_v))
-    kernel = kernel / unit / unit
+    kernel = jnp.maximum(kernel / unit / unit, constants.FLATTEST)
     uu, uv, vv = (sum(a * b for a, b in zip(p, q, strict=True)) for p, q in ((u, u), (u, v), (v, v)))
     cross = (u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0])
     det = sum(c * c for c in cross)

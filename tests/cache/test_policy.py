@@ -106,9 +106,8 @@ def test_evict_lowest_takes_the_least_confident_voxel_and_the_oldest_of_equals()
 
 
 def test_evict_lowest_needs_voxels():
-    config = CONFIG.replace(vacc="append", overflow="evict_lowest")
     with pytest.raises(InputError, match="drop_new"):
-        fuse(init_cache(config, 16), to_jax(STREAM[0]), config)
+        CONFIG.replace(vacc="append", overflow="evict_lowest")
 
 
 @pytest.mark.parametrize("capacity", [0, -4, 100])

@@ -12,7 +12,7 @@ import pytest
 
 from ssplat_jax.cache import init_cache
 from ssplat_jax.checkpoint.state import load_newest_state, load_state, save_state
-from ssplat_jax.errors import StorageError
+from ssplat_jax.errors import InputError, StorageError
 from ssplat_jax.export.atomic import previous_path
 from ssplat_jax.struct import replace
 from tests.cache.streams import CAPACITY, CONFIG, Recipe, fuse, to_jax
@@ -52,6 +52,13 @@ def test_state_is_read_back_to_the_last_bit(saved):
     cache, header = load_state(saved)
     assert header == HEADER
     assert_identical(cache, stream(CHUNKS[:3]))
+
+
+def test_caches_of_several_streams_are_refused_and_nothing_is_written(saved, tmp_path):
+    caches = jax.tree.map(lambda x: jnp.stack([x, x])[None], load_state(saved)[0])
+    with pytest.raises(InputError, match=r"\[1, 2\].*one at a time"):
+        save_state(tmp_path / "state.npz", caches, HEADER)
+    assert not list(tmp_path.iterdir())
 
 
 def test_11_saving_in_mid_stream_gives_the_same_continuation(saved):

@@ -1,7 +1,8 @@
 """The rasterizer where it could break: named hard cases, and a sweep over the grid of extremes.
 
-One compiled program serves every case (64 Gaussians, 24x16 pixels, SH degree 3), so a case costs no compilation. Each
-must give finite images and finite gradients by every input and, where a limit exists, the right image.
+One compiled program serves every case (64 Gaussians, 24x16 pixels, SH degree 3), so a case costs no compilation; one
+more serves crowds (4096). Each must give finite images and finite gradients by every input and, where a limit exists,
+the right image.
 """
 
 import functools
@@ -17,21 +18,21 @@ from ssplat_jax.render import Effects, api, render
 from ssplat_jax.struct import replace
 from tests.render import oracle
 
-NUM, WIDTH, HEIGHT = 64, 24, 16
+NUM, CROWD, WIDTH, HEIGHT = 64, 4096, 24, 16
 EFFECTS = Effects(outputs=("color", "alpha", "depth", "median_depth"))
 TOLERANCE = 1e-4  # issue 3's: float32 against the float64 oracle
 FIELDS = ("means", "quats", "scales", "opacities", "sh")
 F = np.float32
 
 
-def base() -> dict[str, np.ndarray]:
+def base(num: int = NUM) -> dict[str, np.ndarray]:
     """One visible grey Gaussian in the middle; the other rows absent."""
     arrays = {
-        "means": np.zeros((NUM, 3)),
-        "quats": np.tile([1.0, 0.0, 0.0, 0.0], (NUM, 1)),
-        "scales": np.full((NUM, 3), 0.1),
-        "opacities": np.zeros(NUM),
-        "sh": np.zeros((NUM, 16, 3)),
+        "means": np.zeros((num, 3)),
+        "quats": np.tile([1.0, 0.0, 0.0, 0.0], (num, 1)),
+        "scales": np.full((num, 3), 0.1),
+        "opacities": np.zeros(num),
+        "sh": np.zeros((num, 16, 3)),
         "viewmat": np.eye(4),
         "K": np.array([[20.0, 0, 12], [0, 20, 8], [0, 0, 1]]),
     }
@@ -149,7 +150,7 @@ def _(a):
     a["opacities"][:], a["means"][:] = 0, np.nan
 
 
-@case("hundreds of coincident Gaussians")
+@case("coincident Gaussians")
 def _(a):
     a["means"][:], a["opacities"][:] = [0.05, -0.02, 2.0], 0.5
 
@@ -161,7 +162,7 @@ def _(a):
     a["sh"][:, 0] = np.random.default_rng(1).normal(size=(NUM, 3))
 
 
-@case("opaque layers until transmittance underflows")
+@case("opaque layers")
 def _(a):
     a["means"][:] = np.stack([np.zeros(NUM), np.zeros(NUM), np.linspace(1, 3, NUM)], axis=1)
     a["scales"][:], a["opacities"][:] = 10.0, 0.985
@@ -210,18 +211,39 @@ WITHOUT_LIMIT = {
 }
 
 
-@functools.cache
-def program():
-    """Images, and gradients of a loss that uses all of them."""
+def layers(a: dict, opacity: float) -> None:
+    """All rows behind one another, each over the whole image, in colours of their own."""
+    num = len(a["means"])
+    a["means"][:] = np.stack([np.zeros(num), np.zeros(num), np.linspace(1, 3, num)], axis=1)
+    a["scales"][:], a["opacities"][:] = 10.0, opacity
+    a["sh"][:, 0] = np.random.default_rng(1).normal(size=(num, 3))
 
-    def loss(gaussians, camera):
-        out = render(gaussians, camera, effects=EFFECTS, max_pairs=1 << 12)
+
+def coincident(a: dict) -> None:
+    a["means"][:], a["opacities"][:] = [0.05, -0.02, 2.0], 0.02
+    a["sh"][:, 0] = np.random.default_rng(1).normal(size=(len(a["means"]), 3))
+
+
+CROWDS = {
+    "thousands of coincident Gaussians": coincident,
+    "thousands of opaque layers": lambda a: layers(a, 0.985),  # the transmittance underflows many times over
+    "thousands of faint layers": lambda a: layers(a, 0.005),  # 1800 of them to the stop
+}
+
+
+@functools.cache
+def program(effects: Effects = EFFECTS, max_pairs: int = 1 << 12):
+    """Images, and gradients of a loss that uses all of them; `arrays` are what `effects` need."""
+
+    def loss(gaussians, camera, arrays):
+        out = render(gaussians, camera, effects=effects, max_pairs=max_pairs, **arrays)
         images = (out.color, out.alpha, out.depth, out.median_depth)
         weights = np.random.default_rng(5).normal(size=(HEIGHT, WIDTH)).astype(F)
         total = sum(jnp.sum(x * (weights[..., None] if x.ndim == 3 else weights)) for x in images)
         return total + jnp.sum(out.color**2), out
 
-    return jax.jit(jax.value_and_grad(loss, argnums=(0, 1), has_aux=True))
+    differentiated = jax.jit(jax.value_and_grad(loss, argnums=(0, 1), has_aux=True))
+    return lambda gaussians, camera, **arrays: differentiated(gaussians, camera, arrays)
 
 
 def build(arrays: dict[str, np.ndarray]) -> tuple[Gaussians, Camera]:
@@ -249,8 +271,24 @@ def test_hard_case(name):
     rows = [np.isfinite(arrays[k].reshape(NUM, -1)).all(1) for k in FIELDS]
     broken = ~np.all(rows, axis=0)
     assert int(out.num_non_finite) == int(np.sum(broken & (arrays["opacities"] != 0)))
-    if name in WITHOUT_LIMIT:
-        return
+    if name not in WITHOUT_LIMIT:
+        assert_right(gaussians, camera, out)
+
+
+@pytest.mark.parametrize("name", CROWDS)
+def test_crowd(name):
+    arrays = base(CROWD)
+    CROWDS[name](arrays)
+    gaussians, camera = build(arrays)
+    (value, out), grads = program(max_pairs=1 << 15)(gaussians, camera)
+    assert int(out.num_pairs) >= CROWD and int(out.num_overflow) == 0
+    assert is_finite((value, out)), "value"
+    assert is_finite(grads), "gradient"
+    assert_right(gaussians, camera, out)
+
+
+def assert_right(gaussians: Gaussians, camera: Camera, out) -> None:
+    """The images are the oracle's but for samples at a threshold, which rounding decides."""
     color, alpha, depth, median = oracle.render(gaussians, camera.viewmats, camera.Ks, WIDTH, HEIGHT)
     band = np.abs(np.asarray(out.alpha) - alpha) > 1 / 300  # a sample at the 1/255 threshold, decided by rounding
     assert band.mean() < 0.02
@@ -280,8 +318,25 @@ def test_a_row_that_is_culled_gets_no_gradient():
     assert np.any(np.asarray(grads.means)[1] != 0)
 
 
-def test_ten_thousand_extremes_have_no_non_finite_gradient():
+LENS = {"distortion": jnp.array([-0.3, 0.1, 0.01, -0.02, 0.05])}
+GAINS = {"exposures": jnp.array([[1.2, 0.0, 0.1, 0.01], [0.0, 0.9, 0.0, 0.0], [0.0, 0.0, 1.1, -0.02]])}
+SWEEPS = {
+    "mip": (EFFECTS, {}),
+    "classic": (EFFECTS.replace(antialias="classic"), {}),
+    "none": (EFFECTS.replace(antialias="none"), {}),
+    "every effect": (
+        EFFECTS.replace(filter_3d=True, distortion=True, exposure=True, background=(0.1, 0.5, 0.9)),
+        LENS | GAINS,
+    ),
+}
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=() if name == "mip" else pytest.mark.slow) for name in SWEEPS]
+)
+def test_ten_thousand_extremes_have_no_non_finite_gradient(name):
     """Every field of every Gaussian drawn from its extremes, 64 at a time, in front of extreme cameras."""
+    effects, given = SWEEPS[name]
     random = np.random.default_rng(7)
     pick = lambda values, size: random.choice(np.array(values), size)  # noqa: E731
     bad = 0
@@ -296,7 +351,9 @@ def test_ten_thousand_extremes_have_no_non_finite_gradient():
         arrays["sh"] = pick([-3, -1, 0, 1e-30, 1, 3], (NUM, 16, 3))
         focal = pick([1.0, 20.0, 1e5], 2)
         arrays["K"] = np.array([[focal[0], 0, 12], [0, focal[1], 8], [0, 0, 1]])
-        (value, out), grads = program()(*build(arrays))
+        gaussians, camera = build(arrays)
+        captured = {"captured": camera} if effects.filter_3d else {}
+        (value, out), grads = program(effects)(gaussians, camera, **given, **captured)
         bad += not is_finite((value, out, grads))
     assert bad == 0
 
@@ -316,3 +373,15 @@ def test_bfloat16_colours_are_composited_in_float32():
     assert shapes.color.dtype == shapes.depth.dtype == jnp.float32
     prepared = api.prepare(api.Inputs(half, camera), EFFECTS)[0]
     np.testing.assert_array_equal(prepared.sh, half.sh.astype(jnp.float32))
+
+
+@pytest.mark.slow
+def test_bfloat16_colours_give_the_rounded_colours_image_and_gradient():
+    gaussians, camera = build(base())
+    half = replace(gaussians, sh=gaussians.sh.astype(jnp.bfloat16))
+    rounded = replace(gaussians, sh=half.sh.astype(jnp.float32))
+    (_, out), (grads, _) = program()(half, camera)
+    (_, wanted), (wanted_grads, _) = program()(rounded, camera)
+    np.testing.assert_array_equal(out.color, wanted.color)
+    assert grads.sh.dtype == jnp.bfloat16
+    np.testing.assert_array_equal(grads.sh, wanted_grads.sh.astype(jnp.bfloat16))
