@@ -79,9 +79,9 @@ def bench_step(*, num_chunks: int = 2500, late_size: tuple[int, int] = (64, 48),
         Row("step_320x240", step * 1e3, "ms"),
         Row("step_tokens_per_second", num_tokens / step, "1/s"),
         Row("step_late_chunk_over_early", late / early, "x", "<= 1.05"),
-        Row("step_memory_bytes", memory[-1], "B"),
-        Row("step_memory_growth", memory[-1] - memory[0], "B", "0"),
-        Row("step_compilations", session.num_compilations, "", "1"),
+        Row("step_memory_bytes", float(memory[-1]), "B"),
+        Row("step_memory_growth", float(memory[-1] - memory[0]), "B", "0"),
+        Row("step_compilations", float(session.num_compilations), "", "1"),
     ]
 
 

@@ -44,7 +44,8 @@ def garden(scenes, index: int) -> tuple[Gaussians, Camera]:
         quats=jnp.tile(jnp.array([1.0, 0, 0, 0]), (num, 1)),
         scales=jnp.asarray(np.repeat(np.maximum(distance, 1e-5)[:, None], 3, axis=1), jnp.float32),
         opacities=jnp.full((num,), 0.8),
-        colors=jnp.asarray(data["colors"] / 255.0, jnp.float32),
+        # Black lies on the clamp of colours at 0, where rounding decides whether there is a gradient.
+        colors=jnp.asarray(np.maximum(data["colors"] / 255.0, 1e-3), jnp.float32),
     )
     K = data["Ks"][index].astype(np.float32) / np.array([[4], [4], [1]], np.float32)
     size = {"width": int(data["width"]) // 4, "height": int(data["height"]) // 4}
@@ -147,7 +148,11 @@ def test_tiles_equal_the_reference_in_float64(request, name):
     got = np.concatenate([out.color, (out.depth * out.alpha)[..., None], out.alpha[..., None]], axis=-1)[rows, columns]
     scale = np.maximum(1.0, np.abs(wanted).max(axis=0))
     assert np.abs((got - wanted) / scale)[outside].max() <= FORWARD
+    whole = np.sqrt(sum(np.vdot(b, b) for b in exact))
     for (path, a), b in zip(jax.tree_util.tree_leaves_with_path(ours(inputs)), exact, strict=True):
         a, name = np.asarray(a, np.float64), jax.tree_util.keystr(path)
+        if np.linalg.norm(b) <= 1e-12 * whole:  # turning round Gaussians changes nothing: 0, but for rounding
+            assert np.linalg.norm(a) <= 1e-6 * whole, name
+            continue
         assert np.linalg.norm(a - b) <= GRADIENT * np.linalg.norm(b), name
         assert np.vdot(a, b) >= 0.99999 * np.linalg.norm(a) * np.linalg.norm(b), name
