@@ -17,7 +17,7 @@ from ssplat_jax.render.projection import Splats
 from ssplat_jax.struct import pytree, static
 
 EIGHTHS = (5, 6, 8)  # of the room for pairs (a power of two): the least share that holds them is what is sorted
-PARTS = 4  # turns of the loop in `take_rows`; a loop of one is none
+PARTS = 4  # turns of the loops in `take_rows` and `_tiles`; a loop of one is none
 MOST_PAIRS = (1 << 31) - 1  # what an index reaches; counts of pairs stop there
 KEY_BITS = 32  # keys wider than this are sorted as 64-bit integers
 
