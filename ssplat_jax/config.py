@@ -84,6 +84,8 @@ class StreamConfig:
     """Neighbours are looked for in a (2 r + 1)^2 patch of the token's own view; 0 searches all tokens of the chunk."""
     mixer_proj: int = 32
     """Channels of the kNN attention."""
+    gaussians_per_token: Literal[1, 4, 16] = 4
+    """In a square over the token's cell, each with the mean colour of its part of the patch (ours; literal: 1)."""
     sh_degree: int = 0
     scale_mode: Literal["footprint", "absolute"] = "footprint"
     """Gaussian scale relative to the token's footprint (depth x cell / focal), or softplus in scene units (literal)."""

@@ -24,6 +24,7 @@ from ssplat_jax.metrics import SSIM_ARGUMENTS, psnr, ssim
 from ssplat_jax.render import fill_holes, render
 from ssplat_jax.report import Reporter
 from ssplat_jax.session import Session
+from ssplat_jax.stream import shown_pivots
 
 LATENCY_CHUNKS = 4  # the last chunks are fed again to the full cache, each this often, to time them warm
 LATENCY_REPEATS = 3
@@ -153,14 +154,14 @@ def measure_latency(session: Session, chunks: list, camera) -> dict:
 
 
 def cache_facts(session: Session) -> dict:
-    """Occupancy and counters of the session's cache."""
-    cache = session.cache
+    """Occupancy and counters of the session's cache; `decoded`: Gaussians that it shows."""
+    cache, config = session.cache, session.model.config
     assert cache is not None
     stats = {field.name: int(getattr(cache.stats, field.name)) for field in dataclasses.fields(cache.stats)}
     return {
         "voxels": int(cache.num_voxels),
         "pivots": int(cache.counts.sum()),
-        "decoded": int((cache.alive & (cache.confidences >= session.model.config.min_confidence)).sum()),
+        "decoded": config.gaussians_per_token * int(shown_pivots(cache, config).sum()),
         "capacity": cache.capacity,
         "overflow": stats["num_dropped"],
         "accepted_fraction": round(stats["num_accepted"] / max(stats["num_seen"], 1), 4),

@@ -27,10 +27,10 @@ FEWEST_ROWS = 256  # numbers of rows are rounded up to powers of two from here o
 
 @dataclasses.dataclass(frozen=True)
 class SceneDelta:
-    """The voxels that changed, and what they hold now: `k` Gaussians each, absent ones (opacity 0) among them."""
+    """The voxels that changed, and what they hold now, absent Gaussians (opacity 0) among it."""
 
     rows: Int32[np.ndarray, " r"]  # ascending
-    gaussians: Gaussians  # [r * k], in the order of `rows`
+    gaussians: Gaussians  # [r * k], in the order of `rows`; k = pivots_per_voxel * gaussians_per_token
     capacity: int  # of the cache: the scene has capacity * k Gaussians
 
 
@@ -62,7 +62,7 @@ class SceneFeed:
         num_padded = max(FEWEST_ROWS, 1 << max(len(rows) - 1, 0).bit_length())
         padded = np.pad(rows, (0, num_padded - len(rows)), constant_values=-1)
         gaussians = self._decode_rows(self._params, cache, jnp.asarray(padded))
-        num_gaussians = len(rows) * self._shown.shape[1]
+        num_gaussians = gaussians.num_gaussians // num_padded * len(rows)
         return SceneDelta(rows, jax.tree.map(lambda x: x[:num_gaussians], gaussians), cache.capacity)
 
     def _changed_rows(self, cache: VoxelCache) -> Int32[np.ndarray, " r"]:

@@ -3,6 +3,7 @@
 import time
 
 import jax
+import jax.numpy as jnp
 
 from ssplat_jax.cache import VoxelCache, check, ensure_room
 from ssplat_jax.cache.state import init_cache
@@ -10,10 +11,13 @@ from ssplat_jax.chunk import Chunk
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.model import GRID_STRIDE
-from ssplat_jax.stream import ChunkOutput, StreamSplat
+from ssplat_jax.stream import ChunkOutput, StreamSplat, shown_pivots
 
 ROOM_AT_START = 4
 """A new cache holds this many chunks of tokens that all open voxels of their own: few captures make it grow."""
+
+FEWEST_DECODED = 1 << 15
+"""Pivots that are decoded at least: below, a growing scene would compile more than it saves."""
 
 
 class Session:
@@ -30,7 +34,8 @@ class Session:
         self.compile_seconds = 0.0
         self.num_compilations = 0
         self._programs: dict[tuple, jax.stages.Compiled] = {}
-        self._decode = jax.jit(model.decode)
+        self._count_shown = jax.jit(lambda cache: jnp.sum(shown_pivots(cache, model.config), dtype=jnp.int32))
+        self._decode_shown = jax.jit(model.decode_shown, static_argnums=2)
         self._last_program: jax.stages.Compiled | None = None
 
     def feed(self, chunk: Chunk) -> ChunkOutput:
@@ -49,10 +54,16 @@ class Session:
         return out
 
     def gaussians(self) -> Gaussians:
-        """The scene so far, in the stream frame; rows of opacity 0 are absent."""
+        """The scene so far, in the stream frame: what `model.decode` shows; rows of opacity 0, all last, are absent.
+
+        A cache has room for many more pivots than it holds, and decoding and rendering cost what their rows cost. The
+        number of pivots decoded is a power of two, so that few programs are compiled.
+        """
         if self.cache is None:
             self.cache = self.model.init_cache()
-        return self._decode(self.params, self.cache)
+        num_shown = int(self._count_shown(self.cache))
+        num_pivots = min(max(FEWEST_DECODED, 1 << max(num_shown - 1, 0).bit_length()), self.cache.alive.size)
+        return self._decode_shown(self.params, self.cache, num_pivots)
 
     @property
     def step_memory_bytes(self) -> int | None:

@@ -12,6 +12,7 @@ encode ─► match ─► P_i ──────────► anchor_depth (H
 import dataclasses
 import functools
 import math
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -95,7 +96,7 @@ class StreamSplat:
             feats = stages.mix_tokens(params["mixer"], feats, positions, views.inside, views.valid, config)
         confidences = jnp.where(views.inside, depth.matcher_confidences, 0.0)
         return Prediction(
-            tokens=_flatten_tokens(positions, feats, confidences, footprints, views),
+            tokens=_flatten_tokens(positions, feats, confidences, footprints, views, config),
             logits=belief.logits,
             log_depths=depth.log_depths,
             views=views,
@@ -127,8 +128,28 @@ class StreamSplat:
         return jax.lax.scan(functools.partial(self.step, params), cache, chunks)
 
     def decode(self, params: dict, cache: VoxelCache) -> Gaussians:
-        """The scene so far: one Gaussian per pivot, in the stream frame; dead and carved pivots have opacity 0."""
-        flat = lambda x: x.reshape(-1, *x.shape[2:])  # noqa: E731
+        """The scene so far, in the stream frame: `gaussians_per_token` Gaussians of each pivot, pivot by pivot.
+
+        Those of dead and carved pivots have opacity 0.
+        """
+        return self._decode_pivots(params, cache, shown_pivots(cache, self.config).reshape(-1), lambda x: x)
+
+    def decode_shown(self, params: dict, cache: VoxelCache, num_pivots: int) -> Gaussians:
+        """The Gaussians that `decode` shows, in their order, and nothing between them, at the cost of `num_pivots`.
+
+        Limits:
+            Of fewer shown pivots, the last rows are absent; of more, those beyond are left out.
+        """
+        is_shown = shown_pivots(cache, self.config).reshape(-1)
+        places = jnp.nonzero(is_shown, size=num_pivots, fill_value=is_shown.size)[0]
+        last = is_shown.size - 1
+        return self._decode_pivots(params, cache, places <= last, lambda x: x[jnp.minimum(places, last)])
+
+    def _decode_pivots(
+        self, params: dict, cache: VoxelCache, is_shown: Bool[Array, " m"], take: Callable[[Array], Array]
+    ) -> Gaussians:
+        """Gaussians of the pivots that `take` takes of all."""
+        flat = lambda x: take(x.reshape(-1, *x.shape[2:]))  # noqa: E731
         gaussians = stages.decode_tokens(
             params["decoder"],
             means=flat(cache.means),
@@ -139,10 +160,10 @@ class StreamSplat:
             num_members=flat(cache.num_members),
             config=self.config,
         )
-        return mask_gaussians(gaussians, flat(shown_pivots(cache, self.config)))
+        return mask_gaussians(gaussians, self.each_gaussian(is_shown))
 
     def decode_rows(self, params: dict, cache: VoxelCache, rows: Int[Array, " r"]) -> Gaussians:
-        """What `decode` gives for the voxels `rows`, k Gaussians each, at the cost of those; rows of -1 are absent."""
+        """What `decode` gives for the voxels `rows`, k pivots each, at the cost of those; rows of -1 are absent."""
         part = {name: getattr(cache, name)[rows] for name in ("voxels", *PIVOT_FIELDS)}
         return self.decode(params, replace(cache, counts=jnp.where(rows >= 0, cache.counts[rows], 0), **part))
 
@@ -157,7 +178,11 @@ class StreamSplat:
             footprints=tokens.footprints,
             config=self.config,
         )
-        return mask_gaussians(gaussians, tokens.valid)
+        return mask_gaussians(gaussians, self.each_gaussian(tokens.valid))
+
+    def each_gaussian(self, of_tokens: Bool[Array, " m"]) -> Bool[Array, " n"]:
+        """For every Gaussian, what is said of its token or pivot."""
+        return jnp.repeat(of_tokens, self.config.gaussians_per_token)
 
 
 def shown_pivots(cache: VoxelCache, config: StreamConfig) -> Bool[Array, "capacity k"]:
@@ -176,16 +201,15 @@ def merged_footprints(cache: VoxelCache, config: StreamConfig) -> Float[Array, "
     return jnp.minimum(grown, jnp.maximum(cache.footprints, share))
 
 
-def _flatten_tokens(positions, feats, confidences, footprints, views: Views) -> Tokens:
+def _flatten_tokens(positions, feats, confidences, footprints, views: Views, config: StreamConfig) -> Tokens:
     """Maps to tokens in order of insertion: view-major, row-major (DESIGN 6.9)."""
     v, hf, wf, _ = positions.shape
-    rgbs = stages.average_pool(views.images, stages.GRID_STRIDE)
     quats = matrices_to_quats(jnp.swapaxes(views.viewmats[:, :3, :3], -1, -2))
     return Tokens(
         means=positions.reshape(-1, 3),
         feats=feats.reshape(v * hf * wf, -1),
         confidences=confidences.reshape(-1),
-        rgbs=rgbs.reshape(-1, 3),
+        rgbs=stages.patch_colors(views.images, config).reshape(v * hf * wf, -1),
         quats=jnp.repeat(quats, hf * wf, axis=0),
         footprints=footprints.reshape(-1),
         valid=views.inside.reshape(-1),

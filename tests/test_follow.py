@@ -102,7 +102,7 @@ def test_a_cache_that_grows_is_followed():
     told = apply_delta(None, feed.update(cache))
     cache, _ = fuse(grow(cache, 2 * CAPACITY), chunk(3), CONFIG)
     told = apply_delta(told, feed.update(cache))
-    assert told.num_gaussians == 2 * CAPACITY * CONFIG.pivots_per_voxel
+    assert told.num_gaussians == 2 * CAPACITY * CONFIG.pivots_per_voxel * CONFIG.gaussians_per_token
     assert_same_scene(told, jax.jit(model.decode)(params, cache))
 
 

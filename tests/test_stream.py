@@ -150,18 +150,35 @@ def test_history_is_seen_from_the_second_chunk_on(looped):
 def test_decoded_dead_pivots_are_absent(model, params, looped):
     gaussians = model.decode(params, looped[0])
     alive = np.asarray(looped[0].alive).reshape(-1)
-    opacities = np.asarray(gaussians.opacities)
+    opacities = np.asarray(gaussians.opacities).reshape(len(alive), -1)
     assert (opacities[alive] > 0).all() and (opacities[~alive] == 0).all()
-    np.testing.assert_array_equal(np.asarray(gaussians.means)[alive], np.asarray(looped[0].means).reshape(-1, 3)[alive])
+    centres = np.asarray(gaussians.means).reshape(len(alive), -1, 3).mean(axis=1)
+    np.testing.assert_allclose(centres[alive], np.asarray(looped[0].means).reshape(-1, 3)[alive], atol=1e-5)
+
+
+@pytest.mark.parametrize("fewest", [1, 1 << 15])
+def test_a_session_decodes_the_rows_that_show_and_no_more_than_a_power_of_two(
+    model, params, looped, fewest, monkeypatch
+):
+    monkeypatch.setattr("ssplat_jax.session.FEWEST_DECODED", fewest)
+    whole, session = model.decode(params, looped[0]), Session(model, params, looped[0])
+    shown, is_shown = session.gaussians(), np.asarray(whole.opacities) > 0
+    num_pivots = shown.num_gaussians // model.config.gaussians_per_token
+    assert is_shown.sum() / model.config.gaussians_per_token <= num_pivots <= model.init_cache().alive.size
+    assert num_pivots & (num_pivots - 1) == 0
+    kept = slice(0, is_shown.sum())
+    for (name, held), (_, full) in zip(leaves_with_names(shown), leaves_with_names(whole), strict=True):
+        np.testing.assert_allclose(held[kept], full[is_shown], rtol=1e-5, atol=1e-6, err_msg=name)
+    assert not np.asarray(shown.opacities)[is_shown.sum() :].any()
 
 
 def test_carved_pivots_are_not_decoded_but_remembered(model, params, looped):
     cache = looped[0]
     doubted = StreamSplat(NARROW.replace(min_confidence=float(np.median(cache.confidences[cache.alive]))))
-    opacities = np.asarray(doubted.decode(params, cache).opacities).reshape(cache.confidences.shape)
+    opacities = np.asarray(doubted.decode(params, cache).opacities).reshape(*cache.confidences.shape, -1)
     is_shown = np.asarray(cache.alive & (cache.confidences >= doubted.config.min_confidence))
     assert 0 < is_shown.sum() < np.asarray(cache.alive).sum()
-    np.testing.assert_array_equal(opacities > 0, is_shown)
+    np.testing.assert_array_equal(opacities > 0, np.broadcast_to(is_shown[..., None], opacities.shape))
 
 
 @pytest.mark.parametrize(

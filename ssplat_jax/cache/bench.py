@@ -144,7 +144,7 @@ def patch_tokens(config: StreamConfig, num_tokens: int, num_voxels: int = PATCH)
         "means": (corners + rng.uniform(0.05, 0.95, (num_tokens, 3))) * config.voxel_size,
         "feats": rng.normal(size=(num_tokens, config.token_width)),
         "confidences": rng.uniform(config.min_confidence, 1.0, num_tokens),
-        "rgbs": rng.uniform(size=(num_tokens, 3)),
+        "rgbs": rng.uniform(size=(num_tokens, 3 * config.gaussians_per_token)),
         "quats": rng.normal(size=(num_tokens, 4)),
         "footprints": rng.uniform(0.01, 0.05, num_tokens),
     }

@@ -65,7 +65,7 @@ class VoxelCache:
     feats: Float[Array, "capacity k c"]  # the token state f
     seeds: Float[Array, "capacity k c"]  # feature of the most confident member, for matching
     confidences: Float[Array, "capacity k"]  # omega, (0, 1]
-    rgbs: Float[Array, "capacity k 3"]  # appearance anchor: mean colour of the token's patch
+    rgbs: Float[Array, "capacity k a"]  # appearance anchor: mean colours of the parts of the token's patch
     quats: Float[Array, "capacity k 4"]  # camera-to-world orientation of the most confident member, wxyz
     footprints: Float[Array, "capacity k"]  # size of a grid cell at the most confident member, stream units
     num_members: Int[Array, "capacity k"]  # tokens merged into the pivot
@@ -105,7 +105,7 @@ class Tokens:
     means: Float[Array, "m 3"]
     feats: Float[Array, "m c"]
     confidences: Float[Array, " m"]
-    rgbs: Float[Array, "m 3"]
+    rgbs: Float[Array, "m a"]  # 3 of each of its Gaussians, row by row over the cell
     quats: Float[Array, "m 4"]  # orientation of the camera that saw the token, camera-to-world, wxyz
     footprints: Float[Array, " m"]
     valid: Bool[Array, " m"]  # False: padding; neither used nor counted
@@ -160,7 +160,7 @@ def init_cache(config: StreamConfig, capacity: int | None = None) -> VoxelCache:
         feats=jnp.zeros((capacity, k, c)),
         seeds=jnp.zeros((capacity, k, c)),
         confidences=jnp.zeros((capacity, k)),
-        rgbs=jnp.zeros((capacity, k, 3)),
+        rgbs=jnp.zeros((capacity, k, 3 * config.gaussians_per_token)),
         quats=jnp.zeros((capacity, k, 4)),
         footprints=jnp.zeros((capacity, k)),
         num_members=jnp.zeros((capacity, k), jnp.int32),

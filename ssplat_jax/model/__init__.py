@@ -10,6 +10,7 @@ from ssplat_jax.model.mixer import mix_tokens as mix_tokens
 from ssplat_jax.model.params import count_params as count_params
 from ssplat_jax.model.params import init_params as init_params
 from ssplat_jax.model.tokens import back_project as back_project
+from ssplat_jax.model.tokens import patch_colors as patch_colors
 from ssplat_jax.model.tokens import regress_tokens as regress_tokens
 from ssplat_jax.model.wires import GRID_STRIDE as GRID_STRIDE
 from ssplat_jax.model.wires import prepare_views as prepare_views

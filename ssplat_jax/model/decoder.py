@@ -1,16 +1,19 @@
-"""Gaussian head: a two-layer MLP from a token's feature to its Gaussian; centre = position, exactly (Sec. 3.7)."""
+"""Gaussian head: a two-layer MLP from a token's feature to its Gaussians, whose middle is its position (Sec. 3.7)."""
+
+import math
 
 import flax.linen as nn
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.gaussians import SH_C0, Gaussians
-from ssplat_jax.geometry.rotations import multiply_quats
+from ssplat_jax.geometry.rotations import multiply_quats, quats_to_matrices
 
-START_OPACITY = -0.4  # logit: 0.4; a surface is several tokens deep, and sheer ones average each other's errors
-START_SCALE = 0.43  # of a cell's footprint, sideways: neighbours overlap into a closed surface
-START_THICKNESS = 0.4  # of the sideways scale, along the viewing direction
+START_OPACITY = -0.6  # logit: 0.35; a surface is several tokens deep, and sheer ones average each other's errors
+START_SCALE = 0.43  # of a Gaussian's share of the cell, sideways: neighbours overlap into a closed surface
+START_THICKNESS = 0.05  # of the cell's footprint, along the viewing direction
 MAX_LOG_GAIN = 0.3  # a Gaussian stays within a third of its cell's size: larger ones fill holes over what lies behind
 MIN_SCALE = 1e-6
 
@@ -30,11 +33,12 @@ class GaussianHead(nn.Module):
 
 
 def token_scales(raw: Float[Array, "m 3"], footprints: Float[Array, " m"], config: StreamConfig) -> Float[Array, "m 3"]:
-    """Standard deviations in stream units, along the axes of the token's camera."""
+    """Standard deviations of each Gaussian of a token in stream units, along the axes of the token's camera."""
+    side = math.isqrt(config.gaussians_per_token)
     if config.scale_mode == "absolute":
-        scales = nn.softplus(raw - 4.0)
+        scales = nn.softplus(raw - 4.0) / jnp.array([side, side, 1.0])
     else:
-        start = START_SCALE * jnp.array([1.0, 1.0, START_THICKNESS])
+        start = jnp.array([START_SCALE / side, START_SCALE / side, START_THICKNESS])
         scales = footprints[:, None] * start * jnp.exp(MAX_LOG_GAIN * jnp.tanh(raw / MAX_LOG_GAIN))
     return jnp.clip(scales, MIN_SCALE, config.max_scale)
 
@@ -44,28 +48,41 @@ def decode_tokens(
     *,
     means: Float[Array, "m 3"],
     feats: Float[Array, "m c"],
-    rgbs: Float[Array, "m 3"],
+    rgbs: Float[Array, "m a"],
     quats: Float[Array, "m 4"],
     footprints: Float[Array, " m"],
     num_members: Int[Array, " m"] | int = 1,
     config: StreamConfig,
 ) -> Gaussians:
-    """Gaussians of tokens or of cache pivots: one each.
+    """Gaussians of tokens or of cache pivots: `gaussians_per_token` of each, in a square over its cell, row by row.
 
-    A pivot of n members stands for n tokens in one place and is as opaque as they would be, 1 - (1 - o)^n.
+    The head gives all of a token's the same shape and opacity; they differ in place and colour. A pivot of n
+    members stands for n tokens in one place and is as opaque as they would be, 1 - (1 - o)^n.
 
     The head's rotation is in the frame of the camera in `quats` (DESIGN 6.7); its colour is a residual on the
-    appearance anchor `rgbs` (DESIGN 6.6). Features of any precision are read in float32.
+    appearance anchors `rgbs` (DESIGN 6.6). Features of any precision are read in float32.
     """
     raw = GaussianHead(config).apply({"params": params}, feats.astype(jnp.float32))
     opacity, scale, rotation, sh = jnp.split(raw, [1, 4, 8], axis=-1)  # pyright: ignore[reportArgumentType]
     sh = sh.reshape(feats.shape[0], -1, 3)
-    base = jnp.zeros_like(sh).at[:, 0].set((rgbs - 0.5) / SH_C0)
     optical_depths = jnp.asarray(num_members, jnp.float32) * nn.softplus(opacity[:, 0] + START_OPACITY)
+    each = lambda x: jnp.repeat(x, config.gaussians_per_token, axis=0)  # noqa: E731
     return Gaussians(
-        means=means,
-        quats=multiply_quats(quats, rotation + jnp.array([1.0, 0.0, 0.0, 0.0])),
-        scales=token_scales(scale, footprints, config),
-        opacities=-jnp.expm1(-optical_depths),
-        sh=sh + base,
+        means=_spread(means, quats, footprints, config),
+        quats=each(multiply_quats(quats, rotation + jnp.array([1.0, 0.0, 0.0, 0.0]))),
+        scales=each(token_scales(scale, footprints, config)),
+        opacities=each(-jnp.expm1(-optical_depths)),
+        sh=each(sh).at[:, 0].add((rgbs.reshape(-1, 3) - 0.5) / SH_C0),
     )
+
+
+def _spread(
+    means: Float[Array, "m 3"], quats: Float[Array, "m 4"], footprints: Float[Array, " m"], config: StreamConfig
+) -> Float[Array, "n 3"]:
+    """Centres of the parts of each token's cell, row by row, in the plane that faces the camera in `quats`."""
+    side = math.isqrt(config.gaussians_per_token)
+    steps = (np.arange(side, dtype=np.float32) + 0.5) / side - 0.5  # of a cell
+    down, right = (x.reshape(-1, 1) for x in np.meshgrid(steps, steps, indexing="ij"))
+    axes = quats_to_matrices(quats)
+    moves = right * axes[:, None, :, 0] + down * axes[:, None, :, 1]
+    return (means[:, None] + footprints[:, None, None] * moves).reshape(-1, 3)

@@ -1,5 +1,7 @@
 """Token positions and features before the history comes in (Sec. 3.3; ReSplat's regressor, ALGORITHM 3.1)."""
 
+import math
+
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
@@ -8,7 +10,7 @@ from jaxtyping import Array, Float
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.geometry.cameras import invert_poses, pixel_grid, transform_points, unproject
 from ssplat_jax.model.convolution import Conv, pixel_unshuffle
-from ssplat_jax.model.layers import rms_normalize
+from ssplat_jax.model.layers import average_pool, rms_normalize
 from ssplat_jax.model.wires import GRID_STRIDE, AnchoredDepth, DepthBelief, Features, Views
 
 MIN_LOG_RANGE = 1e-3
@@ -46,6 +48,15 @@ def regress_tokens(
     context, decoder = (rms_normalize(x.astype(jnp.float32)) for x in (features.context, belief.decoder))
     feats = TokenRegressor(config).apply({"params": params}, patches, relative, match, context, decoder)
     return rms_normalize(feats)  # pyright: ignore[reportArgumentType]
+
+
+def patch_colors(images: Float[Array, "v h w 3"], config: StreamConfig) -> Float[Array, "v hf wf a"]:
+    """Appearance anchors: of each token's patch the mean colours of `gaussians_per_token` parts, row by row."""
+    side = math.isqrt(config.gaussians_per_token)
+    parts = average_pool(images, GRID_STRIDE // side)
+    v, h, w, _ = parts.shape
+    parts = parts.reshape(v, h // side, side, w // side, side, 3).swapaxes(2, 3)
+    return parts.reshape(v, h // side, w // side, 3 * side * side)
 
 
 def back_project(

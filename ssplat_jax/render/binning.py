@@ -17,6 +17,7 @@ from ssplat_jax.render.projection import Splats
 from ssplat_jax.struct import pytree, static
 
 EIGHTHS = (5, 6, 8)  # of the room for pairs (a power of two): the least share that holds them is what is sorted
+WORTH_CHOOSING = 1 << 16  # room for pairs below which all of it is sorted: each share is compiled by itself
 PARTS = 4  # turns of the loops in `take_rows` and `_tiles`; a loop of one is none
 MOST_PAIRS = (1 << 31) - 1  # what an index reaches; counts of pairs stop there
 KEY_BITS = 32  # keys wider than this are sorted as 64-bit integers
@@ -108,7 +109,8 @@ def bin_splats(splats: Splats, grid: Grid, max_pairs: int) -> Pairs:
         ranks, bounds = _sort_pairs(_tiles(outlines, ranks, ends[-1], grid), ranks, grid.num_tiles, num_rows)
         return jnp.pad(order[ranks], (0, max_pairs - room)), bounds
 
-    rooms = sorted({-(-max_pairs * share // 8) for share in EIGHTHS})
+    shares = EIGHTHS if max_pairs >= WORTH_CHOOSING else EIGHTHS[-1:]
+    rooms = sorted({-(-max_pairs * share // 8) for share in shares})
     enough = jnp.sum(ends[-1] > jnp.array(rooms[:-1], jnp.int32), dtype=jnp.int32)
     rows, bounds = lax.switch(enough, [functools.partial(sorted_pairs, room) for room in rooms])
     return Pairs(rows=rows, bounds=bounds, num_pairs=ends[-1])

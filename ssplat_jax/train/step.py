@@ -97,7 +97,8 @@ def decode_accepted(model: StreamSplat, params: dict, cache: VoxelCache, tokens:
     that inference sees, but not merged."""
     gaussians = model.decode_tokens(params, tokens)
     judged = judge(*jax.lax.stop_gradient((cache.witnesses, tokens)), model.config)
-    return mask_gaussians(gaussians, tokens.valid & (judged.confidences >= model.config.min_confidence))
+    is_accepted = tokens.valid & (judged.confidences >= model.config.min_confidence)
+    return mask_gaussians(gaussians, model.each_gaussian(is_accepted))
 
 
 def loss_fn(

@@ -43,7 +43,7 @@ class Recipe:
             "means": _means(rng, m, self.places),
             "feats": _feats(rng, m, self.features),
             "confidences": _confidences(rng, m, self.confidences),
-            "rgbs": rng.uniform(0, 1, (m, 3)),
+            "rgbs": rng.uniform(0, 1, (m, 3 * CONFIG.gaussians_per_token)),
             "quats": rng.normal(size=(m, 4)),
             "footprints": rng.uniform(0.01, 0.1, m),
         }

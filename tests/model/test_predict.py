@@ -195,7 +195,7 @@ def test_the_cache_is_read_and_remembered():
 @pytest.mark.parametrize(
     "changes",
     [
-        {"num_depths": 1},
+        pytest.param({"num_depths": 1}, marks=pytest.mark.slow),
         pytest.param({"chunk_size": 1}, marks=pytest.mark.slow),
         pytest.param({"num_sources": 1, "fine_matching": False}, marks=pytest.mark.slow),
     ],

@@ -1,14 +1,17 @@
 """What passes between the stages: padding, candidates, choice of sources; positions and the head's Gaussians."""
 
+import math
+
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from ssplat_jax.config import preset
 from ssplat_jax.gaussians import SH_C0
 from ssplat_jax.geometry.cameras import pixel_grid, project_points, transform_points
-from ssplat_jax.geometry.rotations import quats_to_matrices
-from ssplat_jax.model import GRID_STRIDE, back_project, count_params, decode_tokens, init_params
+from ssplat_jax.geometry.rotations import matrices_to_quats, quats_to_matrices
+from ssplat_jax.model import GRID_STRIDE, back_project, count_params, decode_tokens, init_params, patch_colors
 from ssplat_jax.model.decoder import MIN_SCALE, START_OPACITY, START_SCALE, START_THICKNESS, token_scales
 from ssplat_jax.model.encoder import Encoder, from_windows, sine_positions, to_windows
 from ssplat_jax.model.wires import nearest_sources, prepare_views
@@ -121,28 +124,29 @@ def test_positions_project_to_their_cells_at_their_depths():
     np.testing.assert_allclose(footprints, np.exp(log_depths) * GRID_STRIDE / focal[:, None, None], rtol=1e-5)
 
 
-def decoded(m: int = 10, num_members=1, **changes):
+def decoded(m: int = 10, num_members=1, means=None, footprints=None, quats=None, rgbs=None, **changes):
     config = CONFIG.replace(**changes)
+    given = {"means": means, "footprints": footprints, "quats": quats, "rgbs": rgbs}
     rng = np.random.default_rng(0)
     f32 = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
     inputs = {
         "means": f32(rng.normal(size=(m, 3))),
         "feats": f32(rng.normal(size=(m, config.token_width))),
-        "rgbs": f32(rng.uniform(size=(m, 3))),
+        "rgbs": f32(rng.uniform(size=(m, 3 * config.gaussians_per_token))),
         "quats": f32(rng.normal(size=(m, 4))),
         "footprints": f32(rng.uniform(0.01, 0.3, m)),
-    }
+    } | {name: x for name, x in given.items() if x is not None}
     shapes = jax.eval_shape(lambda key: init_params(key, config)["decoder"], jax.random.key(0))
     params = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape), shapes)
     return decode_tokens(params, **inputs, num_members=num_members, config=config), inputs
 
 
 def test_an_untrained_head_puts_a_disc_of_the_patchs_colour_exactly_on_the_token():
-    gaussians, inputs = decoded(sh_degree=1)
+    gaussians, inputs = decoded(sh_degree=1, gaussians_per_token=1)
     np.testing.assert_array_equal(gaussians.means, inputs["means"])
     np.testing.assert_allclose(0.5 + SH_C0 * gaussians.sh[:, 0], inputs["rgbs"], atol=1e-6)
     np.testing.assert_array_equal(gaussians.sh[:, 1:], 0)
-    wanted = np.outer(inputs["footprints"], START_SCALE * np.array([1, 1, START_THICKNESS]))
+    wanted = np.outer(inputs["footprints"], [START_SCALE, START_SCALE, START_THICKNESS])
     np.testing.assert_allclose(gaussians.scales, wanted, rtol=1e-5)
     # Thin along the viewing direction of the camera that saw it.
     np.testing.assert_allclose(quats_to_matrices(gaussians.quats), quats_to_matrices(inputs["quats"]), atol=FLOAT32)
@@ -151,7 +155,7 @@ def test_an_untrained_head_puts_a_disc_of_the_patchs_colour_exactly_on_the_token
 
 def test_a_pivot_is_as_opaque_as_its_members_in_one_place():
     members = np.array([0, 1, 2, 3, 17, 1000, 2**31 - 1], np.int32)
-    gaussians, _ = decoded(len(members), num_members=jnp.asarray(members))
+    gaussians, _ = decoded(len(members), num_members=jnp.asarray(members), gaussians_per_token=1)
     single = 1 / (1 + np.exp(-START_OPACITY))
     np.testing.assert_allclose(gaussians.opacities, 1 - (1 - single) ** members.astype(float), rtol=1e-6, atol=1e-7)
 
@@ -159,13 +163,40 @@ def test_a_pivot_is_as_opaque_as_its_members_in_one_place():
         raw = jnp.zeros(8 + 3).at[0].set(bias)
         params = {"out": {"kernel": jnp.zeros((4, 11)), "bias": raw}, **hidden_layers()}
         one = lambda *shape: jnp.ones((1, *shape))  # noqa: E731
-        values = {"means": one(3), "feats": one(4), "rgbs": one(3), "quats": one(4), "footprints": one()}
+        values = {"means": one(3), "feats": one(4), "rgbs": one(12), "quats": one(4), "footprints": one()}
         return decode_tokens(params, **values, num_members=n, config=CONFIG.replace(token_width=4)).opacities[0]
 
     for bias in (-200.0, 0.0, 200.0):
         for n in (0, 1, 2**31 - 1):
             value, slope = jax.value_and_grad(opacity)(bias, jnp.array([n]))
             assert 0 <= value <= 1 and np.isfinite(slope)
+
+
+@pytest.mark.parametrize("per_token", [1, 4, 16])
+def test_the_gaussians_of_a_token_lie_where_their_parts_of_the_patch_are_seen(per_token):
+    """Seen by the camera that made the token, each projects to the middle of the part whose colour it has."""
+    config = CONFIG.replace(gaussians_per_token=per_token)
+    camera, images = prepare_views(chunk(), config), np.random.default_rng(0).uniform(size=(3, 32, 32, 3))
+    colors = patch_colors(jnp.asarray(images, jnp.float32), config)
+    side = math.isqrt(per_token)
+    positions, footprints = back_project(jnp.full((3, 8, 8), np.log(2.0)), camera)
+    quats = matrices_to_quats(jnp.swapaxes(camera.viewmats[:, :3, :3], -1, -2))
+    gaussians, _ = decoded(
+        192,
+        means=positions.reshape(-1, 3),
+        footprints=footprints.reshape(-1),
+        quats=jnp.repeat(quats, 64, axis=0),
+        rgbs=colors.reshape(192, -1),
+        gaussians_per_token=per_token,
+    )
+    seen, _ = project_points(transform_points(camera.viewmats, gaussians.means.reshape(3, -1, 3)), camera.Ks)
+    parts = np.asarray(seen).reshape(3, -1, 2) * side / GRID_STRIDE
+    # A footprint is square; the camera's cells are not quite (fx and fy differ by 4 %).
+    np.testing.assert_allclose(parts % 1, 0.5, atol=0.03)
+    pooled = images.reshape(3, 8 * side, 4 // side, 8 * side, 4 // side, 3).mean(axis=(2, 4))
+    columns, rows = np.floor(parts).astype(int).transpose(2, 0, 1)
+    wanted = pooled[np.arange(3)[:, None], rows, columns]
+    np.testing.assert_allclose(0.5 + SH_C0 * gaussians.sh[:, 0].reshape(3, -1, 3), wanted, atol=1e-5)
 
 
 def hidden_layers():
@@ -183,7 +214,9 @@ def test_no_feature_makes_a_gaussian_of_absurd_size():
         scales = token_scales(raw, jnp.array([0.1, 1e9]), config)
         assert (scales >= MIN_SCALE).all() and (scales <= 2.0).all()
     literal = token_scales(
-        jnp.array([[0.0, 1.0, 5.0]]), jnp.ones(1), CONFIG.replace(scale_mode="absolute", max_scale=9.0)
+        jnp.array([[0.0, 1.0, 5.0]]),
+        jnp.ones(1),
+        CONFIG.replace(scale_mode="absolute", max_scale=9.0, gaussians_per_token=1),
     )
     np.testing.assert_allclose(literal[0], np.log1p(np.exp([-4.0, -3.0, 1.0])), rtol=1e-5)
 

@@ -20,6 +20,8 @@ LENS = np.array([-0.2, 0.05, 0.002, -0.003, 0.01], np.float32)
 EXPOSURE = np.concatenate([np.diag([1.2, 0.9, 1.1]), [[0.01], [0.0], [-0.02]]], axis=1).astype(np.float32)
 OUTPUTS = ("color", "alpha", "depth")
 
+plainly = pytest.mark.usefixtures("compiled_plainly")  # laws within a tolerance, of programs used once
+
 
 def operations(gaussians, camera, effects: Effects, **arrays) -> tuple[int, float]:
     """Operations in the traced program, calls included, and what XLA says it computes."""
@@ -97,12 +99,14 @@ def test_distortion_follows_opencvs_formula_and_its_derivative():
         np.testing.assert_allclose(got, wanted, atol=1e-5)
 
 
+@plainly
 def test_a_lens_of_zeros_is_a_pinhole():
     gaussians, camera = cloud(), cameras(21, 30)
     lens = render(gaussians, camera, effects=Effects(distortion=True), distortion=jnp.zeros(5), max_pairs=1 << 12)
     np.testing.assert_allclose(lens.color, render(gaussians, camera, max_pairs=1 << 12).color, atol=1e-5)
 
 
+@plainly
 def test_exposure_is_affine_in_colour():
     gaussians, camera = cloud(), cameras(21, 30)
     plain = np.asarray(render(gaussians, camera, max_pairs=1 << 12).color)
@@ -147,6 +151,7 @@ def test_effects_for_asks_only_for_what_the_scene_needs():
     assert effects_for(gaussians, closer, captured=camera).filter_3d
 
 
+@plainly
 def test_what_effects_for_leaves_out_changes_no_pixel():
     gaussians, camera = cloud(degree=3), cameras(21, 30)
     flat = replace(gaussians, sh=gaussians.sh.at[:, 4:].set(0.0))
@@ -181,6 +186,7 @@ WIDE = Camera(
 
 
 @pytest.mark.parametrize(("lens", "tangent"), [((-0.1, 0.003, 0, 0, 0), 4.1), ((-0.3, 0.03, 0, 0, 0), 2.2)])
+@plainly
 def test_what_a_lens_folds_back_into_the_image_is_not_seen(lens, tangent):
     # Beyond its first turn the polynomial falls, and beyond its second it rises again: ghosts from the side.
     lens = jnp.array(lens, jnp.float32)
@@ -191,6 +197,7 @@ def test_what_a_lens_folds_back_into_the_image_is_not_seen(lens, tangent):
 
 
 @pytest.mark.parametrize("mean", [(1.6, 1.2, 1.0), (0.3, -0.2, 1.0), (-1.5, 1.1, 1.0)])
+@plainly
 def test_a_wide_lens_shapes_gaussians_as_its_derivative_says(mean):
     lens = jnp.array([-0.15, 0.012, 0, 0, 0], jnp.float32)
 
@@ -206,6 +213,7 @@ def test_a_wide_lens_shapes_gaussians_as_its_derivative_says(mean):
     np.testing.assert_allclose([[2 * p * p, 2 * p * q], [2 * p * q, 2 * (q * q + r * r)]], wanted, rtol=2e-3)
 
 
+@plainly
 def test_a_lens_has_finite_gradients_however_far_from_its_axis():
     lens = jnp.array([0.1, 0.01, 0, 0, 0.01], jnp.float32)
 

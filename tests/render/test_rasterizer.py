@@ -23,6 +23,8 @@ GRADIENT = 1e-4  # relative L2, float32 against float64
 DIFFERENCES = 1e-3  # central differences of a piecewise smooth image in float64
 ALL = Effects(outputs=("color", "alpha", "depth", "median_depth"), background=(0.2, 0.5, 0.9))
 
+plainly = pytest.mark.usefixtures("compiled_plainly")  # laws within a tolerance, of programs used once
+
 
 def relative(a, b) -> float:
     a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
@@ -141,12 +143,14 @@ def test_a_capacity_too_small_is_counted_inside_jit_and_retried_outside(scene):
     assert int(inside.num_overflow) == int(wanted.num_pairs) - 64 > 0
 
 
+@plainly
 def test_what_is_given_back_is_what_was_asked_for(scene):
     out = render(*scene, effects=Effects(outputs=("color",)), max_pairs=1 << 12)
     assert out.alpha is None and out.depth is None and out.median_depth is None and out.features is None
     np.testing.assert_allclose(out.color, render(*scene, max_pairs=1 << 12).color, atol=1e-6)
 
 
+@plainly
 def test_gradients_outside_jit_leave_nothing_out():
     # Larger Gaussians than the default capacity inside jit is made for: more than four tiles each.
     gaussians, camera = cloud(600, size=0.2), cameras(80, 96)
@@ -161,6 +165,7 @@ def test_gradients_outside_jit_leave_nothing_out():
 
 
 @pytest.mark.parametrize("length", [30, 150, 600])
+@plainly
 def test_long_thin_gaussians_are_as_exact_as_round_ones(length):
     focal, turn = 1000.0, np.deg2rad(43.7)
 
@@ -185,6 +190,7 @@ def test_long_thin_gaussians_are_as_exact_as_round_ones(length):
     np.testing.assert_allclose(fast[~is_edge], exact[~is_edge], atol=1e-4)
 
 
+@plainly
 def test_float64_is_sorted_in_float64(scene):
     with jax.enable_x64(True):
         two = jax.tree.map(lambda x: jnp.repeat(x[:1], 2, axis=0).astype(jnp.float64), cloud(1, degree=0, size=0.5))
@@ -200,6 +206,7 @@ def test_float64_is_sorted_in_float64(scene):
     assert middle[1] > middle[0] + 0.2
 
 
+@plainly
 def test_a_camera_that_is_not_finite_sees_nothing_and_spoils_nothing(scene):
     gaussians, camera = cloud(degree=1), cameras(21, 30, batch=2)
 
@@ -254,6 +261,7 @@ def test_a_camera_of_no_pixels_is_refused(scene):
         render(scene[0], replace(scene[1], width=0))
 
 
+@plainly
 def test_a_scene_of_no_gaussians_is_black(scene):
     nothing = jax.tree.map(lambda x: x[:0], scene[0])
     for draw in (render, jax.jit(lambda *scene: render(*scene, max_pairs=1 << 12))):
@@ -261,6 +269,7 @@ def test_a_scene_of_no_gaussians_is_black(scene):
         assert not out.color.any() and not out.alpha.any() and int(out.num_pairs) == 0
 
 
+@plainly
 def test_arrays_that_a_traced_function_closes_over_are_rendered(scene):
     wanted = render(*scene).color
     for max_pairs in (None, 1 << 12):
@@ -284,6 +293,7 @@ def test_more_pairs_than_an_index_reaches_are_counted_and_refused():
 
 
 # Last: it empties the caches of compiled programs.
+@pytest.mark.slow  # nothing compiled before it serves after it
 def test_keys_wider_than_32_bits_sort_alike(scene, monkeypatch):
     from ssplat_jax.render import binning
 

@@ -276,6 +276,7 @@ def test_hard_case(name):
 
 
 @pytest.mark.parametrize("name", CROWDS)
+@pytest.mark.usefixtures("compiled_plainly")
 def test_crowd(name):
     arrays = base(CROWD)
     CROWDS[name](arrays)

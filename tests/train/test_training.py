@@ -154,14 +154,14 @@ def test_what_a_witness_looked_through_is_not_rendered():
         means=jnp.array([[0.01, 0.01, 1.0]]) * depths[:, None],
         feats=jnp.ones((4, NARROW.token_width)),
         confidences=jnp.array([0.6, 0.6, 0.6, 0.2]),
-        rgbs=jnp.full((4, 3), 0.5),
+        rgbs=jnp.full((4, 12), 0.5),
         quats=jnp.tile(jnp.array([1.0, 0, 0, 0]), (4, 1)),
         footprints=jnp.full(4, 0.02),
         valid=jnp.ones(4, bool),
     )
     config = NARROW.replace(min_confidence=0.5)
     shown = decode_accepted(StreamSplat(config), params, replace(cache, witnesses=witnesses), tokens).opacities > 0
-    np.testing.assert_array_equal(shown, [False, True, True, False])
+    np.testing.assert_array_equal(shown.reshape(4, -1).T, [[False, True, True, False]] * 4)
 
 
 def test_a_phase_says_how_far_views_step():
