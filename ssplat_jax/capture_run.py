@@ -17,6 +17,7 @@ from ssplat_jax.errors import InputError, StorageError, require_positive
 from ssplat_jax.evaluate import cache_facts, check_scorable, save_comparison, score_view
 from ssplat_jax.export.atomic import previous_path
 from ssplat_jax.export.json_files import write_json
+from ssplat_jax.export.only_writer import only_writer
 from ssplat_jax.export.ply import ExportReport, save_ply
 from ssplat_jax.follow import SceneDelta, SceneFeed
 from ssplat_jax.gaussians import Gaussians
@@ -61,7 +62,8 @@ def run_capture(
     written too, in the stream's frame (`checkpoint/delta.py`).
 
     Raises:
-        InputError: the capture is unusable, or `out` holds a run of another capture or configuration.
+        InputError: the capture is unusable, `out` holds a run of another capture or configuration, or another process
+            is writing to it.
         StorageError: `out` cannot be written or its state is corrupt.
     """
     require_positive(stride=stride, save_every=save_every)
@@ -71,11 +73,31 @@ def run_capture(
     check_scorable(capture)
     indices = list(range(0, len(capture), stride))[:max_views]
     capture.verify(indices)
-    if overwrite and out.exists():
-        for stale in (out / STATE_FILE, previous_path(out / STATE_FILE), out / SCENE_FILE, out / METRICS_FILE):
-            stale.unlink(missing_ok=True)
-        for stale in (out / DELTAS, out / PICTURES):
-            shutil.rmtree(stale, ignore_errors=True)
+    with only_writer(out):
+        if overwrite:
+            _forget(out)
+        return _go_on(model, params, capture, indices, out, save_every, deltas, reporter)
+
+
+def _forget(out: Path) -> None:
+    """Removes the run that `out` holds."""
+    for stale in (out / STATE_FILE, previous_path(out / STATE_FILE), out / SCENE_FILE, out / METRICS_FILE):
+        stale.unlink(missing_ok=True)
+    for stale in (out / DELTAS, out / PICTURES):
+        shutil.rmtree(stale, ignore_errors=True)
+
+
+def _go_on(
+    model: StreamSplat,
+    params: dict,
+    capture: Capture,
+    indices: list[int],
+    out: Path,
+    save_every: int,
+    deltas: bool,
+    reporter: Reporter,
+) -> RunResult:
+    """Streams what the run in `out` has not had yet, and finishes it."""
     identity = _identity(model, params, capture, indices)
     session, frame, done = _resume(model, params, capture, indices, identity, out, reporter)
     if done == 0:

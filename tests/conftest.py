@@ -11,8 +11,8 @@ from jaxtyping import install_import_hook
 # Laws to the last bit are laws of the CPU backend; set the variable to test another.
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 
-# Most of the run is compilation, and most of that LLVM's last optimizations. `XLA_FLAGS= pytest` compiles as users do.
-os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=1")
+# Most of the run is compilation, and most of that LLVM's. `XLA_FLAGS= pytest` compiles as users do.
+os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
 
 # Workers and command lines started by tests compile the same programs: they share one cache, which ends with the run.
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ:

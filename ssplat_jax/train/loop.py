@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from ssplat_jax.checkpoint.training import TrainingCheckpoints
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.export.json_files import json_text
+from ssplat_jax.export.only_writer import only_writer
 from ssplat_jax.interrupts import Interrupts
 from ssplat_jax.lpips import LpipsWeights
 from ssplat_jax.stream import StreamSplat
@@ -54,9 +55,14 @@ def train(
         report: called with every record.
 
     Raises:
-        InputError: `out` holds a run of another recipe or configuration.
+        InputError: `out` holds a run of another recipe or configuration, or another process is training into it.
         StorageError: a checkpoint cannot be written or read.
     """
+    with only_writer(out):
+        return _train(config, recipe, out, params, lpips_weights, save_every, log_every, report)
+
+
+def _train(config, recipe, out, params, lpips_weights, save_every, log_every, report) -> TrainResult:
     model = StreamSplat(training_config(config, recipe))
     description: dict = {"config": model.config.to_dict(), "recipe": dataclasses.asdict(recipe)}
     if lpips_weights is not None:

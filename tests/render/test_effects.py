@@ -100,6 +100,7 @@ def test_distortion_follows_opencvs_formula_and_its_derivative():
 
 
 @plainly
+@pytest.mark.slow  # programs of its own
 def test_a_lens_of_zeros_is_a_pinhole():
     gaussians, camera = cloud(), cameras(21, 30)
     lens = render(gaussians, camera, effects=Effects(distortion=True), distortion=jnp.zeros(5), max_pairs=1 << 12)
@@ -187,6 +188,7 @@ WIDE = Camera(
 
 @pytest.mark.parametrize(("lens", "tangent"), [((-0.1, 0.003, 0, 0, 0), 4.1), ((-0.3, 0.03, 0, 0, 0), 2.2)])
 @plainly
+@pytest.mark.slow  # programs of its own
 def test_what_a_lens_folds_back_into_the_image_is_not_seen(lens, tangent):
     # Beyond its first turn the polynomial falls, and beyond its second it rises again: ghosts from the side.
     lens = jnp.array(lens, jnp.float32)
@@ -198,6 +200,7 @@ def test_what_a_lens_folds_back_into_the_image_is_not_seen(lens, tangent):
 
 @pytest.mark.parametrize("mean", [(1.6, 1.2, 1.0), (0.3, -0.2, 1.0), (-1.5, 1.1, 1.0)])
 @plainly
+@pytest.mark.slow  # programs of its own
 def test_a_wide_lens_shapes_gaussians_as_its_derivative_says(mean):
     lens = jnp.array([-0.15, 0.012, 0, 0, 0], jnp.float32)
 

@@ -151,6 +151,7 @@ def test_what_is_given_back_is_what_was_asked_for(scene):
 
 
 @plainly
+@pytest.mark.slow  # the retry is tested forward in every run
 def test_gradients_outside_jit_leave_nothing_out():
     # Larger Gaussians than the default capacity inside jit is made for: more than four tiles each.
     gaussians, camera = cloud(600, size=0.2), cameras(80, 96)
@@ -166,6 +167,7 @@ def test_gradients_outside_jit_leave_nothing_out():
 
 @pytest.mark.parametrize("length", [30, 150, 600])
 @plainly
+@pytest.mark.slow  # programs of its own
 def test_long_thin_gaussians_are_as_exact_as_round_ones(length):
     focal, turn = 1000.0, np.deg2rad(43.7)
 
@@ -191,6 +193,7 @@ def test_long_thin_gaussians_are_as_exact_as_round_ones(length):
 
 
 @plainly
+@pytest.mark.slow  # programs of its own
 def test_float64_is_sorted_in_float64(scene):
     with jax.enable_x64(True):
         two = jax.tree.map(lambda x: jnp.repeat(x[:1], 2, axis=0).astype(jnp.float64), cloud(1, degree=0, size=0.5))

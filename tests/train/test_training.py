@@ -108,6 +108,7 @@ def test_cells_out_of_range_have_no_part_in_the_depth_loss():
     assert float(jnp.abs(gradient[0, 0, 1]).max()) == 0
 
 
+@pytest.mark.slow  # a program of its own
 def test_sizes_that_the_network_pads_train():
     """72 rows become 96: the truth is padded like the images, and padding has no part in the loss."""
     sample = make_sample(0, num_chunks=1, num_targets=0, size=(72, 64), config=NARROW)

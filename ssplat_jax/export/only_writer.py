@@ -1,0 +1,41 @@
+"""One process at a time in a folder that is written to over hours."""
+
+import contextlib
+import fcntl
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+from ssplat_jax.errors import InputError, StorageError
+
+
+@contextlib.contextmanager
+def only_writer(folder: Path) -> Iterator[None]:
+    """Holds `folder`, which is made if absent, against other processes that ask for the same.
+
+    The system's lock on the folder itself: there is no file to be left behind, and it ends with its process, however
+    that ends. If nothing was written, a folder made here is taken away again.
+
+    Raises:
+        InputError: another process holds it.
+        StorageError: the folder cannot be made.
+    """
+    is_new = not folder.exists()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(folder, os.O_RDONLY)
+    except OSError as error:
+        raise StorageError(f"{folder}: cannot be written ({error.strerror or error}); choose another place.") from error
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise InputError(
+                f"{folder}: another process is writing to it; wait until it ends, or choose another --out."
+            ) from error
+        yield
+    finally:
+        os.close(descriptor)
+        if is_new:
+            with contextlib.suppress(OSError):  # not empty: the usual case
+                folder.rmdir()
