@@ -240,7 +240,8 @@ class Train:
             params = load_weights(self.init_weights)[0]
             check_params(params, config, str(self.init_weights))
         lpips_weights = load_lpips_weights(self.lpips_vgg, self.lpips_heads)
-        with Reporter(self.quiet).progress("training", recipe.num_steps) as advance:
+        reporter = Reporter(self.quiet)
+        with reporter.progress("training", recipe.num_steps) as advance:
             result = train(
                 config,
                 recipe,
@@ -249,6 +250,7 @@ class Train:
                 lpips_weights=lpips_weights,
                 save_every=self.save_every,
                 report=lambda record: advance(record["step"], describe_record(record)),
+                warn=reporter.warn,
             )
         if result.interrupted:
             print(f"stopped at step {result.step}; the same command continues", file=sys.stderr)

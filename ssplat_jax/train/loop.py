@@ -2,6 +2,7 @@
 
 import dataclasses
 import time
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -41,6 +42,7 @@ def train(
     save_every: int = 200,
     log_every: int = 10,
     report: Callable[[dict], None] = lambda record: None,
+    warn: Callable[[str], None] = warnings.warn,
 ) -> TrainResult:
     """Trains until the recipe is done, continuing from what `out` holds.
 
@@ -53,23 +55,24 @@ def train(
         save_every: steps between checkpoints; SIGINT and SIGTERM save too.
         log_every: steps between records (means over the steps between).
         report: called with every record.
+        warn: called with what a user should know, a damaged checkpoint.
 
     Raises:
         InputError: `out` holds a run of another recipe or configuration, or another process is training into it.
         StorageError: a checkpoint cannot be written or read.
     """
     with only_writer(out):
-        return _train(config, recipe, out, params, lpips_weights, save_every, log_every, report)
+        return _train(config, recipe, out, params, lpips_weights, save_every, log_every, report, warn)
 
 
-def _train(config, recipe, out, params, lpips_weights, save_every, log_every, report) -> TrainResult:
+def _train(config, recipe, out, params, lpips_weights, save_every, log_every, report, warn) -> TrainResult:
     model = StreamSplat(training_config(config, recipe))
     description: dict = {"config": model.config.to_dict(), "recipe": dataclasses.asdict(recipe)}
     if lpips_weights is not None:
         description["rendering_loss"] = "MSE + 0.05 LPIPS"
     checkpoints = TrainingCheckpoints(out, description)
     state, start = init_state(model, recipe, params), 0
-    if (restored := checkpoints.restore_latest(state)) is not None:
+    if (restored := checkpoints.restore_latest(state, warn)) is not None:
         start, state = restored
     trainer = Trainer(model, recipe)
     interrupts = Interrupts()
