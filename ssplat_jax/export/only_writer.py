@@ -18,7 +18,7 @@ def only_writer(folder: Path) -> Iterator[None]:
 
     Raises:
         InputError: another process holds it.
-        StorageError: the folder cannot be made.
+        StorageError: the folder cannot be made, or its file system has no locks.
     """
     is_new = not folder.exists()
     try:
@@ -33,9 +33,13 @@ def only_writer(folder: Path) -> Iterator[None]:
             raise InputError(
                 f"{folder}: another process is writing to it; wait until it ends, or choose another --out."
             ) from error
+        except OSError as error:
+            raise StorageError(
+                f"{folder}: cannot be locked ({error.strerror or error}); choose another place."
+            ) from error
         yield
     finally:
-        os.close(descriptor)
         if is_new:
             with contextlib.suppress(OSError):  # not empty: the usual case
                 folder.rmdir()
+        os.close(descriptor)  # last: until then it is ours

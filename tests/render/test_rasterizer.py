@@ -295,6 +295,29 @@ def test_more_pairs_than_an_index_reaches_are_counted_and_refused():
     assert int(pairs.num_pairs) == 2**31 - 1
 
 
+def test_the_room_for_pairs_does_not_change_what_is_found():
+    """From 65,536 on a share of the room is sorted, the least that holds the pairs: each share is seen here."""
+    size = 160
+    grid = Grid(num_images=1, height=size, width=size, tile=8)
+    gaussians = cloud(4000, degree=0, size=0.2)
+    camera = cameras(size, size)
+    one_axis = replace(camera, viewmats=camera.viewmats[None], Ks=camera.Ks[None])
+    binned, room = jax.jit(bin_splats, static_argnums=(1, 2)), 1 << 16
+    shares = set()
+    splats = project(gaussians, one_axis, Effects())
+    total = int(binned(splats, grid, 2 * room).num_pairs)
+    for wanted in (0.5, 0.7, 0.9):
+        shown = jnp.arange(4000) < int(4000 * wanted * room / total)
+        part = project(mask_gaussians(gaussians, shown), one_axis, Effects())
+        chosen, plenty = (binned(part, grid, n) for n in (room, 2 * room))
+        num_pairs = int(plenty.num_pairs)
+        shares.add(np.searchsorted([5 / 8, 6 / 8, 1], num_pairs / room))
+        assert int(chosen.num_pairs) == num_pairs
+        np.testing.assert_array_equal(chosen.bounds, plenty.bounds)
+        np.testing.assert_array_equal(chosen.rows[:num_pairs], plenty.rows[:num_pairs])
+    assert shares == {0, 1, 2}
+
+
 # Last: it empties the caches of compiled programs.
 @pytest.mark.slow  # nothing compiled before it serves after it
 def test_keys_wider_than_32_bits_sort_alike(scene, monkeypatch):
