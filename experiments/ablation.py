@@ -97,8 +97,8 @@ def _measure(changes: dict[str, Any], seed: int, budget: Budget, scenes, place: 
     for scene, (capture, split) in scenes.items():
         session = Session(StreamSplat(config), trained.state.ema)
         frame = capture.stream_frame(config, split.context)
-        stream_context(session, capture, split, frame)
-        psnr = round(mean_psnr(session.gaussians(), capture, split.targets, frame), 3)
+        exposures, _ = stream_context(session, capture, split, frame)
+        psnr = round(mean_psnr(session.gaussians(), capture, split.targets, frame, exposures), 3)
         rows.append({"scene": scene, "psnr": psnr, "gaussians": cache_facts(session)["decoded"]})
     write_json(scores, {"asked": asked, "rows": rows})
     return rows

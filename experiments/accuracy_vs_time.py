@@ -121,8 +121,8 @@ def measure(setting: Setting, opened: Opened, split: Split) -> dict[str, Any]:
     session = Session(StreamSplat(preset("tiny").replace(**setting.changes)), load_params("tiny"))
     capture, scored = opened(setting.size), opened(SCORED)
     frame = capture.stream_frame(session.model.config, split.context)
-    recent = stream_context(session, capture, split, frame)
-    quality = mean_psnr(session.gaussians(), scored, split.targets, frame)
+    exposures, recent = stream_context(session, capture, split, frame)
+    quality = mean_psnr(session.gaussians(), scored, split.targets, frame, exposures)
     middle = split.targets[len(split.targets) // 2]
     latency = measure_latency(session, recent[-2:], scored.camera(middle, frame))
     views = session.model.config.chunk_size

@@ -49,6 +49,7 @@ def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str
             "context": len(split.context),
             "psnr": metrics["psnr"],
             "over_black": metrics["psnr_over_black"],
+            "one_exposure": metrics["psnr_one_exposure"],
             "ssim": metrics["ssim"],
             "copy": metrics["baselines"]["nearest_view_psnr"],
             "accepted": metrics["cache"]["accepted_fraction"],

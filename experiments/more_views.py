@@ -40,6 +40,7 @@ def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str
                 "views": context,
                 "psnr": metrics["psnr"],
                 "over_black": metrics["psnr_over_black"],
+                "one_exposure": metrics["psnr_one_exposure"],
                 "ssim": metrics["ssim"],
                 "coverage": round(sum(v["coverage"] for v in metrics["per_view"]) / len(split.targets), 3),
                 "gaussians": metrics["num_gaussians"],

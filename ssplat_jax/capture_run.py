@@ -14,7 +14,16 @@ from ssplat_jax.config import StreamConfig
 from ssplat_jax.data.capture import Capture, open_capture
 from ssplat_jax.data.frame import StreamFrame
 from ssplat_jax.errors import InputError, StorageError, require_positive
-from ssplat_jax.evaluate import cache_facts, check_scorable, save_comparison, score_view
+from ssplat_jax.evaluate import (
+    Exposures,
+    cache_facts,
+    check_scorable,
+    exposures_from_json,
+    exposures_of,
+    exposures_to_json,
+    save_comparison,
+    score_view,
+)
 from ssplat_jax.export.atomic import previous_path
 from ssplat_jax.export.json_files import write_json
 from ssplat_jax.export.only_writer import only_writer
@@ -99,7 +108,8 @@ def _go_on(
 ) -> RunResult:
     """Streams what the run in `out` has not had yet, and finishes it."""
     identity = _identity(model, params, capture, indices)
-    session, frame, done = _resume(model, params, capture, indices, identity, out, reporter)
+    session, frame, exposures = _resume(model, params, capture, indices, identity, out, reporter)
+    done = len(exposures)
     if done == 0:
         # Of a run that was stopped before its first save: its changes are not those of this one.
         shutil.rmtree(out / DELTAS, ignore_errors=True)
@@ -117,19 +127,19 @@ def _go_on(
         advance(done)
         if done < len(indices):
             for number, chunk in enumerate(capture.chunks(model.config, order[done:], frame=frame)):
-                session.feed(chunk)
-                done += int(np.asarray(chunk.valid).sum())
+                exposures |= exposures_of(session.feed(chunk), chunk, order[done:])
+                done = len(exposures)
                 if feed is not None and session.cache is not None:
                     _save_delta(out, done, feed.update(session.cache), frame)
                 advance(done)
                 stopped = interrupts.received  # read once: a signal may come at any time
                 if stopped or (number + 1) % save_every == 0 or done == len(indices):
-                    _save(session, frame, identity, done, out)
+                    _save(session, frame, identity, exposures, out)
                 if stopped:
                     break
         if stopped := interrupts.received:  # during the last save, too
             return RunResult(done, cache_facts(session)["decoded"], stopped)
-    report = _finish(session, frame, capture, indices, out, reporter)
+    report = _finish(session, frame, capture, indices, exposures, out, reporter)
     return RunResult(done, report.num_written, None)
 
 
@@ -188,11 +198,14 @@ def _identity(model: StreamSplat, params: dict, capture: Capture, indices: list[
 
 def _resume(
     model, params, capture: Capture, indices: list[int], identity: dict, out: Path, reporter: Reporter
-) -> tuple[Session, StreamFrame, int]:
-    """The session that `out` holds, or a new one; of a damaged state the one saved before it, which is said."""
+) -> tuple[Session, StreamFrame, Exposures]:
+    """The session that `out` holds, or a new one, and the exposures of the views that it has had.
+
+    Of a damaged state the one saved before it, which is said.
+    """
     state = out / STATE_FILE
     if not state.exists() and not previous_path(state).exists():
-        return Session(model, params), capture.stream_frame(model.config, indices), 0
+        return Session(model, params), capture.stream_frame(model.config, indices), {}
     cache, header, damage = load_newest_state(state)
     for name, value in identity.items():
         held = header.get(name)
@@ -208,7 +221,7 @@ def _resume(
         restore_previous(state)
     if cache.capacity < model.config.capacity:
         cache = grow(cache, model.config.capacity)
-    return Session(model, params, cache), _frame_from(header["frame"]), header["done"]
+    return Session(model, params, cache), _frame_from(header["frame"]), exposures_from_json(header["exposures"])
 
 
 def _what_counts(config: dict) -> dict:
@@ -232,9 +245,13 @@ def _difference(held, wanted) -> str:
     return f"{held!r} there, {wanted!r} now"
 
 
-def _save(session: Session, frame: StreamFrame, identity: dict, done: int, out: Path) -> None:
+def _save(session: Session, frame: StreamFrame, identity: dict, exposures: Exposures, out: Path) -> None:
     assert session.cache is not None
-    header = identity | {"frame": _frame_to(frame), "done": done}
+    header = identity | {
+        "frame": _frame_to(frame),
+        "done": len(exposures),
+        "exposures": exposures_to_json(exposures),
+    }
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -265,7 +282,13 @@ def _frame_from(fields: dict) -> StreamFrame:
 
 
 def _finish(
-    session: Session, frame: StreamFrame, capture: Capture, indices: list[int], out: Path, reporter: Reporter
+    session: Session,
+    frame: StreamFrame,
+    capture: Capture,
+    indices: list[int],
+    exposures: Exposures,
+    out: Path,
+    reporter: Reporter,
 ) -> ExportReport:
     """Scene, pictures and metrics of a finished stream."""
     gaussians = session.gaussians()
@@ -275,13 +298,14 @@ def _finish(
     shown = sorted({indices[round(i)] for i in np.linspace(0, len(indices) - 1, NUM_PICTURES)})
     scores = []
     for i in shown:
-        score, color, depth = score_view(gaussians, capture, i, frame)
+        score, color, depth = score_view(gaussians, capture, i, frame, exposures)
         scores.append(dataclasses.asdict(score))
         save_comparison(pictures / f"{i:05d}.png", capture.image(i), color, depth, (frame.near, frame.far))
     metrics = {
         "capture": capture.name,
         "size": [capture.width, capture.height],
         "views": len(indices),
+        "exposures": exposures_to_json(exposures),
         "seen_views": scores,  # of the stream itself: how well the scene explains its input
         "ply": dataclasses.asdict(report),
         "compile_s": round(session.compile_seconds, 2),

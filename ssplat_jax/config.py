@@ -111,6 +111,8 @@ class StreamConfig:
     """Views lower the confidence of pivots that they look through and raise that of those they see (ours)."""
     num_witnesses: int = 32
     """Chunks of which a coarse view is kept, to judge the tokens of later ones in the same way; part of `carving`."""
+    match_exposure: bool = True
+    """Colours are remembered at the exposure of the first views; that of every other view is estimated (ours)."""
     chunk_step: float = 0.03
     """Video is dealt out so that the views of a chunk are this share of the depth apart (ours); 0: in order."""
     cluster_ratio: float = 1.15

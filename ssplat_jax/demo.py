@@ -10,7 +10,7 @@ from ssplat_jax.checkpoint.weights import load_params
 from ssplat_jax.config import QUALITIES, Quality, preset
 from ssplat_jax.data.capture import open_capture
 from ssplat_jax.data.protocol import interleaved
-from ssplat_jax.evaluate import cache_facts, save_comparison, save_image, score_view
+from ssplat_jax.evaluate import Exposures, cache_facts, exposures_of, save_comparison, save_image, score_view
 from ssplat_jax.export.atomic import write_atomic
 from ssplat_jax.export.json_files import write_json
 from ssplat_jax.export.ply import save_ply
@@ -32,21 +32,21 @@ def run_demo(scene: str, out: Path, reporter: Reporter, quality: Quality = QUALI
     frame = streamed.stream_frame(model.config, split.context)
     order = streamed.stream_order(model.config, split.context, frame)
     session = Session(model, params)
-    rows, strip, seen = [], [], 0
+    rows, strip = [], []
+    exposures: Exposures = {}
     with reporter.progress("streaming", STAGES[-1]) as advance:
         for chunk in streamed.chunks(model.config, order, frame=frame):
-            session.feed(chunk)
-            seen += int(np.asarray(chunk.valid).sum())
-            advance(seen)
-            if seen in STAGES:
-                row, middle = _score_stage(session, capture, split, frame, seen)
+            exposures |= exposures_of(session.feed(chunk), chunk, order[len(exposures) :])
+            advance(len(exposures))
+            if len(exposures) in STAGES:
+                row, middle = _score_stage(session, capture, split, frame, exposures)
                 rows.append(row)
                 strip.append(middle)
     out.mkdir(parents=True, exist_ok=True)
     gaussians = session.gaussians()
     save_ply(out / "scene.ply", frame.gaussians_to_capture(gaussians))
     for i in split.targets:
-        _, color, depth = score_view(gaussians, capture, i, frame)
+        _, color, depth = score_view(gaussians, capture, i, frame, exposures)
         save_comparison(out / f"view_{i:05d}.png", capture.image(i), color, depth, (frame.near, frame.far))
     middle_target = capture.image(split.targets[len(split.targets) // 2])
     save_image(out / "views_4_8_16_32_64_target.png", np.concatenate([*strip, middle_target], axis=1))
@@ -67,13 +67,13 @@ def run_demo(scene: str, out: Path, reporter: Reporter, quality: Quality = QUALI
     return metrics
 
 
-def _score_stage(session: Session, capture, split, frame, seen: int):
+def _score_stage(session: Session, capture, split, frame, exposures: Exposures):
     """A row of the table, and the render of the middle target."""
     gaussians = session.gaussians()
-    scored = [score_view(gaussians, capture, i, frame) for i in split.targets]
+    scored = [score_view(gaussians, capture, i, frame, exposures) for i in split.targets]
     scores = [score for score, _, _ in scored]
     row = {
-        "views": seen,
+        "views": len(exposures),
         "psnr": round(float(np.mean([s.psnr for s in scores])), 2),
         "ssim": round(float(np.mean([s.ssim for s in scores])), 3),
         "coverage": round(float(np.mean([s.coverage for s in scores])), 3),

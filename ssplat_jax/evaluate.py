@@ -3,7 +3,7 @@
 import dataclasses
 import io
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import jax
@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from PIL import Image
 
+from ssplat_jax.chunk import Chunk
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.frame import StreamFrame
 from ssplat_jax.data.protocol import Split
@@ -24,12 +25,16 @@ from ssplat_jax.metrics import SSIM_ARGUMENTS, psnr, ssim
 from ssplat_jax.render import fill_holes, render
 from ssplat_jax.report import Reporter
 from ssplat_jax.session import Session
-from ssplat_jax.stream import shown_pivots
+from ssplat_jax.stream import ChunkOutput, shown_pivots
 
 LATENCY_CHUNKS = 4  # the last chunks are fed again to the full cache, each this often, to time them warm
 LATENCY_REPEATS = 3
 
+EXPOSURE_VIEWS = 3  # streamed views whose exposures are averaged for a novel one
+
 Images = Float[np.ndarray, "h w 3"]
+Exposures = dict[int, Float[np.ndarray, "3"]]
+"""Of each streamed frame, what takes the scene's colours to the frame's."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,8 +42,9 @@ class ViewScore:
     """One target view."""
 
     frame: int
-    psnr: float  # dB, holes in the colours around
-    psnr_over_black: float  # dB
+    psnr: float  # dB, at the exposure of the nearest streamed views, holes in the colours around
+    psnr_over_black: float  # dB, at that exposure
+    psnr_one_exposure: float  # dB, at the scene's exposure, holes in the colours around
     ssim: float
     lpips: float | None  # None without weights
     coverage: float  # mean alpha: how much of the view the scene covers
@@ -50,17 +56,45 @@ def stream_context(
     split: Split,
     frame: StreamFrame,
     on_chunk: Callable[[int], None] = lambda n: None,
-) -> list:
-    """Feeds the context to `session`; calls `on_chunk(views so far)`. Returns the last few chunks, for timing."""
+) -> tuple[Exposures, list]:
+    """Feeds the context to `session`; calls `on_chunk(views so far)`.
+
+    Returns:
+        The exposures of the context, and the last few chunks, for timing.
+    """
     recent: list = []
-    seen = 0
+    exposures: Exposures = {}
     config = session.model.config
-    for chunk in capture.chunks(config, capture.stream_order(config, split.context, frame), frame=frame):
-        session.feed(chunk)
-        seen += int(np.asarray(chunk.valid).sum())
+    order = capture.stream_order(config, split.context, frame)
+    for chunk in capture.chunks(config, order, frame=frame):
+        exposures |= exposures_of(session.feed(chunk), chunk, order[len(exposures) :])
         recent = [*recent, chunk][-LATENCY_CHUNKS:]
-        on_chunk(seen)
-    return recent
+        on_chunk(len(exposures))
+    return exposures, recent
+
+
+def exposures_of(output: ChunkOutput, chunk: Chunk, frames: Sequence[int]) -> Exposures:
+    """Exposures of the views of a chunk, which are the first of `frames`."""
+    seen = np.asarray(output.exposures)[np.asarray(chunk.valid)]
+    return dict(zip(frames[: len(seen)], seen, strict=True))
+
+
+def exposures_to_json(exposures: Exposures) -> dict[str, list[float]]:
+    """As results and saved states hold them, to the last bit."""
+    return {str(i): np.asarray(exposures[i], np.float64).tolist() for i in sorted(exposures)}
+
+
+def exposures_from_json(fields: dict[str, list[float]]) -> Exposures:
+    """Inverse of `exposures_to_json`."""
+    return {int(i): np.array(exposure, np.float32) for i, exposure in fields.items()}
+
+
+def exposure_for(capture: Capture, i: int, exposures: Exposures) -> Float[np.ndarray, "3"]:
+    """The exposure to show frame `i` at: its own if it was streamed, else the mean (of logs) of the nearest views'."""
+    if not exposures:
+        return np.ones(3)
+    nearest = [i] if i in exposures else nearest_contexts(capture, i, tuple(exposures))[:EXPOSURE_VIEWS]
+    return np.exp(np.mean([np.log(np.asarray(exposures[j], np.float64)) for j in nearest], axis=0))
 
 
 _lpips, _filled = jax.jit(lpips), jax.jit(fill_holes)
@@ -80,43 +114,57 @@ def check_scorable(capture: Capture) -> None:
 
 
 def score_view(
-    gaussians: Gaussians, capture: Capture, i: int, frame: StreamFrame, lpips_weights: LpipsWeights | None = None
+    gaussians: Gaussians,
+    capture: Capture,
+    i: int,
+    frame: StreamFrame,
+    exposures: Exposures,
+    lpips_weights: LpipsWeights | None = None,
 ) -> tuple[ViewScore, Images, Float[np.ndarray, "h w"]]:
     """Score, clipped colour and depth (stream units, 0 where nothing is) of frame `i`.
+
+    The scene has one exposure; the view is shown at that of the nearest streamed views (`exposure_for`), about what a
+    camera there would have had. The score without is given too.
 
     What the Gaussians leave open is shown in the colours around, or in the scene's mean colour (`fill_holes`). Black, a
     colour like any other, would make a hole the worst of errors (docs/decisions.md); the score over it is given too.
     """
     out = render(gaussians, capture.camera(i, frame))
     assert out.color is not None and out.alpha is not None
-    over_black, alpha = np.asarray(out.color), np.asarray(out.alpha)
-    color = np.clip(_filled(out.color, out.alpha, mean_color(gaussians)), 0.0, 1.0)
+    exposure = exposure_for(capture, i, exposures)
+    filled = np.asarray(_filled(out.color, out.alpha, mean_color(gaussians)))
+    color, over_black = (
+        np.clip(image * exposure, 0.0, 1.0).astype(np.float32) for image in (filled, np.asarray(out.color))
+    )
     target = capture.image(i)
     distance = None if lpips_weights is None else float(_lpips(lpips_weights, jnp.asarray(color), jnp.asarray(target)))
     score = ViewScore(
         frame=i,
         psnr=psnr(color, target),
-        psnr_over_black=psnr(np.clip(over_black, 0.0, 1.0), target),
+        psnr_over_black=psnr(over_black, target),
+        psnr_one_exposure=psnr(np.clip(filled, 0.0, 1.0), target),
         ssim=ssim(color, target),
         lpips=distance,
-        coverage=float(alpha.mean()),
+        coverage=float(np.asarray(out.alpha).mean()),
     )
     return score, color, np.asarray(out.depth)
 
 
-def mean_psnr(gaussians: Gaussians, capture: Capture, targets: tuple[int, ...], frame: StreamFrame) -> float:
+def mean_psnr(
+    gaussians: Gaussians, capture: Capture, targets: tuple[int, ...], frame: StreamFrame, exposures: Exposures
+) -> float:
     """Mean over targets of the PSNR, in dB."""
-    return float(np.mean([score_view(gaussians, capture, i, frame)[0].psnr for i in targets]))
+    return float(np.mean([score_view(gaussians, capture, i, frame, exposures)[0].psnr for i in targets]))
 
 
-def nearest_context(capture: Capture, target: int, context: tuple[int, ...]) -> int:
-    """The context frame whose pose is nearest: centre distance over the context's span, plus the angle between axes."""
+def nearest_contexts(capture: Capture, target: int, context: tuple[int, ...]) -> list[int]:
+    """Context frames, those of near poses first: centre distance over the context's span, plus angle between axes."""
     poses = capture.camtoworlds
     centers = poses[list(context), :3, 3]
     span = max(float(np.linalg.norm(centers.max(axis=0) - centers.min(axis=0))), 1e-12)
     distances = np.linalg.norm(centers - poses[target, :3, 3], axis=1) / span
     cosines = np.einsum("vi,i->v", poses[list(context), :3, 2], poses[target, :3, 2])
-    return context[int(np.argmin(distances + np.arccos(np.clip(cosines, -1, 1))))]
+    return [context[j] for j in np.argsort(distances + np.arccos(np.clip(cosines, -1, 1)), kind="stable")]
 
 
 def baselines(capture: Capture, split: Split) -> dict[str, float]:
@@ -125,7 +173,7 @@ def baselines(capture: Capture, split: Split) -> dict[str, float]:
     copies, flats = [], []
     for i in split.targets:
         target = capture.image(i)
-        copies.append(psnr(capture.image(nearest_context(capture, i, split.context)), target))
+        copies.append(psnr(capture.image(nearest_contexts(capture, i, split.context)[0]), target))
         flats.append(psnr(np.broadcast_to(mean_colour, target.shape).astype(np.float32), target))
     return {"nearest_view_psnr": round(float(np.mean(copies)), 4), "mean_colour_psnr": round(float(np.mean(flats)), 4)}
 
@@ -208,12 +256,12 @@ def evaluate(
         reporter.warn(warning)
     reference = baselines(capture, split)
     with reporter.progress("streaming", len(split.context)) as advance:
-        recent = stream_context(session, streamed, split, frame, advance)
+        exposures, recent = stream_context(session, streamed, split, frame, advance)
     gaussians = session.gaussians()
     facts = cache_facts(session)
     scores = []
     for i in split.targets:
-        score, color, depth = score_view(gaussians, capture, i, frame, lpips_weights)
+        score, color, depth = score_view(gaussians, capture, i, frame, exposures, lpips_weights)
         scores.append(score)
         save_comparison(out / f"view_{i:05d}.png", capture.image(i), color, depth, (frame.near, frame.far))
     distances = [s.lpips for s in scores if s.lpips is not None]
@@ -229,6 +277,7 @@ def evaluate(
         "target_views": len(split.targets),
         "psnr": round(float(np.mean([s.psnr for s in scores])), 4),
         "psnr_over_black": round(float(np.mean([s.psnr_over_black for s in scores])), 4),
+        "psnr_one_exposure": round(float(np.mean([s.psnr_one_exposure for s in scores])), 4),
         "ssim": round(float(np.mean([s.ssim for s in scores])), 4),
         "ssim_arguments": SSIM_ARGUMENTS,
         "lpips": round(float(np.mean(distances)), 4) if distances else None,
@@ -241,6 +290,7 @@ def evaluate(
         "config_hash": session.model.config.hash,
         "stream_frame": {"scale": frame.scale, "near": frame.near, "far": frame.far, "warning": frame.warning},
         "baselines": reference,
+        "exposures": exposures_to_json(exposures),
         "per_view": [dataclasses.asdict(s) for s in scores],
     }
     write_atomic(out / "split.json", split.to_json().encode())

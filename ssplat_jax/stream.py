@@ -37,6 +37,9 @@ class ChunkOutput:
     depths: Float[Array, "*t v hf wf"]  # stream units
     confidences: Float[Array, "*t v hf wf"]  # omega of VACC; 0 outside the image and in padded views
     history: Float[Array, "*t v hf wf"]  # Omega_H of the cache before this chunk; 0 in its holes
+    exposures: Float[
+        Array, "*t v 3"
+    ]  # what takes the scene's colours to those of each view; 1 without `match_exposure`
 
 
 @pytree
@@ -95,12 +98,19 @@ class StreamSplat:
         with jax.named_scope("mixer"):
             feats = stages.mix_tokens(params["mixer"], feats, positions, views.inside, views.valid, config)
         confidences = jnp.where(views.inside, depth.matcher_confidences, 0.0)
+        with jax.named_scope("exposure"):
+            exposures = stages.estimate_exposures(history, depth.log_depths, confidences, views, config)
         return Prediction(
-            tokens=_flatten_tokens(positions, feats, confidences, footprints, views, config),
+            tokens=_flatten_tokens(positions, feats, confidences, footprints, exposures, views, config),
             logits=belief.logits,
             log_depths=depth.log_depths,
             views=views,
-            output=ChunkOutput(depths=jnp.exp(depth.log_depths), confidences=confidences, history=history.confidences),
+            output=ChunkOutput(
+                depths=jnp.exp(depth.log_depths),
+                confidences=confidences,
+                history=history.confidences,
+                exposures=exposures,
+            ),
         )
 
     def step(self, params: dict, cache: VoxelCache, chunk: Chunk) -> tuple[VoxelCache, ChunkOutput]:
@@ -201,15 +211,16 @@ def merged_footprints(cache: VoxelCache, config: StreamConfig) -> Float[Array, "
     return jnp.minimum(grown, jnp.maximum(cache.footprints, share))
 
 
-def _flatten_tokens(positions, feats, confidences, footprints, views: Views, config: StreamConfig) -> Tokens:
-    """Maps to tokens in order of insertion: view-major, row-major (DESIGN 6.9)."""
+def _flatten_tokens(positions, feats, confidences, footprints, exposures, views: Views, config: StreamConfig) -> Tokens:
+    """Maps to tokens in order of insertion: view-major, row-major (DESIGN 6.9). Colours at the scene's exposure."""
     v, hf, wf, _ = positions.shape
+    colors = stages.patch_colors(views.images, config).reshape(v, hf, wf, -1, 3) / exposures[:, None, None, None]
     quats = matrices_to_quats(jnp.swapaxes(views.viewmats[:, :3, :3], -1, -2))
     return Tokens(
         means=positions.reshape(-1, 3),
         feats=feats.reshape(v * hf * wf, -1),
         confidences=confidences.reshape(-1),
-        rgbs=stages.patch_colors(views.images, config).reshape(v * hf * wf, -1),
+        rgbs=colors.reshape(v * hf * wf, -1),
         quats=jnp.repeat(quats, hf * wf, axis=0),
         footprints=footprints.reshape(-1),
         valid=views.inside.reshape(-1),

@@ -1,6 +1,6 @@
 """VACC, the Voxel-Aligned Causal Cache: the stream's only memory. `fuse` writes, `project` reads, `carve` doubts."""
 
-from ssplat_jax.cache.carve import bear_witness, carve, judge
+from ssplat_jax.cache.carve import SAME_SURFACE, bear_witness, carve, judge
 from ssplat_jax.cache.fuse import Touched, fuse, fuse_touched
 from ssplat_jax.cache.policy import check, ensure_room, grow
 from ssplat_jax.cache.project import ProjectedCache, project
@@ -8,6 +8,7 @@ from ssplat_jax.cache.state import PIVOT_FIELDS, CacheStats, Tokens, VoxelCache,
 
 __all__ = [
     "PIVOT_FIELDS",
+    "SAME_SURFACE",
     "CacheStats",
     "ProjectedCache",
     "Tokens",

@@ -41,6 +41,7 @@ class ProjectedCache:
     confidences: Float[Array, "v hf wf"]  # Omega_H = sum w^2 / sum w
     feats: Float[Array, "v hf wf c"]  # F_H
     mask: Bool[Array, "v hf wf"]
+    colors: Float[Array, "v hf wf 3"] | None  # averaged like F_H; None without `match_exposure`
 
 
 @pytree
@@ -71,15 +72,18 @@ def project(cache: VoxelCache, camera: Camera, config: StreamConfig, *, axis: st
         fronts = _over_shards(jax.lax.pmin, fronts, axis)
         centres = _front_means(cache, camera, config, fronts, axis)
         sums = _cluster_sums(cache, camera, config, fronts, centres)
-        weights, squares, offsets, feats = _over_shards(jax.lax.psum, sums, axis)
+        weights, squares, offsets, values = _over_shards(jax.lax.psum, sums, axis)
     mask = weights > 0
     total = jnp.where(mask, weights, 1.0)
+    means = (values / total[:, None]).reshape(*shape, -1)
+    width = cache.feats.shape[-1]
     log_depths = jnp.where(mask, fronts, 0.0) + offsets / total
     return ProjectedCache(
         depths=jnp.where(mask, jnp.exp(log_depths), 0.0).reshape(shape),
         confidences=(squares / total).reshape(shape),
-        feats=(feats / total[:, None]).reshape(*shape, -1),
+        feats=means[..., :width],
         mask=mask.reshape(shape),
+        colors=means[..., width:] if config.match_exposure else None,
     )
 
 
@@ -127,28 +131,36 @@ def _front_means(cache, camera, config, fronts, axis):
 
 
 def _cluster_sums(cache, camera, config, fronts, centres):
-    """Sums over each pixel's re-centred cluster: w, w^2, w times log depth from the nearest pivot, w times feature."""
+    """Sums over each pixel's re-centred cluster: w, w^2, w times log depth from the nearest pivot, w times values."""
     window = math.log(config.cluster_ratio)
-    flat_feats = cache.feats.reshape(-1, cache.feats.shape[-1])
     pivots_per_row = cache.feats.shape[1]
+    flat = lambda x: x.reshape(-1, x.shape[-1])  # noqa: E731
+
+    def values_of(pivots):
+        feats = flat(cache.feats)[pivots].astype(jnp.float32)
+        if not config.match_exposure:
+            return feats
+        colors = flat(cache.rgbs)[pivots].reshape(len(pivots), -1, 3).mean(axis=1)
+        return jnp.concatenate([feats, colors], axis=1)
+
+    num_values = jax.eval_shape(values_of, jnp.zeros(1, jnp.int32)).shape[1]
 
     def visit(state, pairs: PixelPairs, first_row):
-        scalars, feats = state
+        scalars, sums = state
         behind = _behind(pairs, fronts)
         weights = jnp.where(jnp.abs(behind - centres[pairs.pixels]) <= window, pairs.weights, 0.0)
         scalars = _add(scalars, pairs.pixels, (weights, weights * weights, weights * behind))
-        return scalars, _add_feats(
-            feats, flat_feats, pairs.pixels, weights, first_row * pivots_per_row, len(camera.viewmats)
-        )
+        first_pivot, num_views = first_row * pivots_per_row, len(camera.viewmats)
+        return scalars, _add_values(sums, values_of, pairs.pixels, weights, first_pivot, num_views)
 
     zeros = jnp.zeros_like(fronts)
-    feats = jnp.zeros((fronts.shape[0], cache.feats.shape[-1]))
-    scalars, feats = _over_blocks(cache, camera, config, visit, ((zeros, zeros, zeros), feats))
-    return *scalars, feats
+    sums = jnp.zeros((fronts.shape[0], num_values))
+    scalars, sums = _over_blocks(cache, camera, config, visit, ((zeros, zeros, zeros), sums))
+    return *scalars, sums
 
 
-def _add_feats(sums, flat_feats, pixels, weights, first_pivot, num_views):
-    """Adds w times feature for the pairs that have weight, gathered to the front first: they are a small share."""
+def _add_values(sums, values_of, pixels, weights, first_pivot, num_views):
+    """Adds w times value for the pairs that have weight, gathered to the front first: they are a small share."""
     num_pairs = pixels.shape[0]
     block = min(num_pairs, PAIRS_PER_BLOCK)
     has_weight = weights > 0
@@ -161,9 +173,8 @@ def _add_feats(sums, flat_feats, pixels, weights, first_pivot, num_views):
         pairs = jax.lax.dynamic_slice(listed, (i * block,), (block,))
         is_pair = pairs < num_pairs
         pairs = jnp.minimum(pairs, num_pairs - 1)
-        values = (
-            flat_feats[first_pivot + pairs % (num_pairs // num_views)].astype(jnp.float32) * weights[pairs][:, None]
-        )
+        pivots = first_pivot + pairs % (num_pairs // num_views)
+        values = values_of(pivots) * weights[pairs][:, None]
         return sums.at[jnp.where(is_pair, pixels[pairs], sums.shape[0])].add(values, mode="drop")
 
     num_blocks = (jnp.sum(has_weight, dtype=jnp.int32) + block - 1) // block

@@ -166,7 +166,7 @@ def merge(older: dict, newer: dict, config: StreamConfig) -> dict:
 
 
 def project(cache: dict, viewmats, Ks, height: int, width: int, config: StreamConfig) -> tuple:
-    """Depths, confidences, features and mask of each view, and the margin of the closest decision made on the way.
+    """Depths, confidences, features, mask and colours of each view, and the margin of the closest decision made.
 
     Where the margin (pixels, log depths) is within rounding of 0, another precision may decide otherwise.
     """
@@ -174,7 +174,7 @@ def project(cache: dict, viewmats, Ks, height: int, width: int, config: StreamCo
     pivots = [pivot for _, row in cache["rows"] for pivot in row if pivot["confidences"] >= least]
     shape = (len(viewmats), height, width)
     depths, confidences, mask = np.zeros(shape), np.zeros(shape), np.zeros(shape, bool)
-    feats, margins = np.zeros((*shape, config.token_width)), [math.inf]
+    feats, colors, margins = np.zeros((*shape, config.token_width)), np.zeros((*shape, 3)), [math.inf]
     for v in range(len(viewmats)):
         viewmat, K = np.asarray(viewmats[v], np.float64), np.asarray(Ks[v], np.float64)
         for (row, column), pairs in _on_pixels(pivots, viewmat, K, height, width, margins).items():
@@ -185,7 +185,8 @@ def project(cache: dict, viewmats, Ks, height: int, width: int, config: StreamCo
             depths[at] = math.exp(sum(p["confidences"] * ell for ell, p in cluster) / total)
             confidences[at] = sum(p["confidences"] ** 2 for _, p in cluster) / total
             feats[at] = sum(p["confidences"] * p["feats"] for _, p in cluster) / total
-    return depths, confidences, feats, mask, min(margins)
+            colors[at] = sum(p["confidences"] * p["rgbs"].reshape(-1, 3).mean(axis=0) for _, p in cluster) / total
+    return depths, confidences, feats, mask, colors, min(margins)
 
 
 def carve(cache: dict, viewmats, Ks, depths, confidences, config: StreamConfig) -> float:

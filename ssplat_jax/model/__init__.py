@@ -4,6 +4,7 @@ from ssplat_jax.model.cgfi import inject_features as inject_features
 from ssplat_jax.model.cost_volume import match as match
 from ssplat_jax.model.decoder import decode_tokens as decode_tokens
 from ssplat_jax.model.encoder import encode as encode
+from ssplat_jax.model.exposure import estimate_exposures as estimate_exposures
 from ssplat_jax.model.hpda import anchor_depth as anchor_depth
 from ssplat_jax.model.layers import average_pool as average_pool
 from ssplat_jax.model.mixer import mix_tokens as mix_tokens

@@ -149,5 +149,8 @@ def smoke_recipe(steps: int = 20) -> Recipe:
 
 
 def training_config(config: StreamConfig, recipe: Recipe) -> StreamConfig:
-    """The configuration trained with: a cache as large as a sample needs, and no growth inside jit."""
-    return config.replace(capacity=recipe.cache_capacity, overflow="drop_new")
+    """The configuration trained with: a cache as large as a sample needs, and no growth inside jit.
+
+    Colours stay as they are seen: the targets have exposures of their own, which nothing estimates.
+    """
+    return config.replace(capacity=recipe.cache_capacity, overflow="drop_new", match_exposure=False)

@@ -1,5 +1,6 @@
 """The projection against its NumPy oracle, and ALGORITHM.md section 12, point 6."""
 
+import functools
 import importlib
 
 import jax
@@ -50,6 +51,7 @@ def scene(seed: int, num_voxels: int, depth_spread: float) -> VoxelCache:
         "means": means * alive[..., None],
         "confidences": rng.choice([0.0, 0.3, 0.5, 1.0], (CAPACITY, k)) * alive,
         "feats": rng.normal(size=(CAPACITY, k, WIDTH)) * alive[..., None],
+        "rgbs": rng.uniform(size=(CAPACITY, k, 3 * CONFIG.gaussians_per_token)) * alive[..., None],
     }
     return replace(
         cache,
@@ -60,13 +62,13 @@ def scene(seed: int, num_voxels: int, depth_spread: float) -> VoxelCache:
 
 
 def assert_equal_to_oracle(cache, camera, config):
-    depths, confidences, feats, mask, margin = reference.project(
+    depths, confidences, feats, mask, colors, margin = reference.project(
         reference.from_arrays(cache), camera.viewmats, camera.Ks, camera.height, camera.width, config
     )
     assume(margin > DECISION_MARGIN)
     result = jit_project(cache, camera, config)
     np.testing.assert_array_equal(result.mask, mask)
-    for name, wanted in (("depths", depths), ("confidences", confidences), ("feats", feats)):
+    for name, wanted in (("depths", depths), ("confidences", confidences), ("feats", feats), ("colors", colors)):
         scale = np.abs(wanted).max(initial=1e-30)
         np.testing.assert_allclose(getattr(result, name) / scale, wanted / scale, rtol=0, atol=VALUE_RTOL, err_msg=name)
 
@@ -117,7 +119,7 @@ def test_single_token_gives_its_depth_and_feature_at_its_pixel_and_zero_elsewher
     assert result.depths[0, 3, 4] == pytest.approx(2.0, rel=VALUE_RTOL)
     assert result.confidences[0, 3, 4] == 0.5
     np.testing.assert_array_equal(result.feats[0, 3, 4], np.ones(WIDTH))
-    for x in (result.depths, result.confidences, result.feats):
+    for x in (result.depths, result.confidences, result.feats, result.colors):
         assert not np.any(np.asarray(x)[~np.asarray(result.mask)])
 
 
@@ -175,6 +177,22 @@ def test_walking_in_blocks_changes_nothing(monkeypatch):
     np.testing.assert_array_equal(whole.mask, blocks.mask)
     for name in ("depths", "confidences", "feats"):
         np.testing.assert_allclose(getattr(whole, name), getattr(blocks, name), rtol=0, atol=4 * VALUE_RTOL)
+
+
+def test_the_colour_of_a_pixel_is_the_mean_over_parts_and_pivots():
+    cache = with_pivots([[0.0, 0.0, 2.0], [0.0, 0.0, 2.1]], confidences=[0.75, 0.5])
+    parts = np.arange(24.0).reshape(2, 4, 3)  # pivots, parts of a patch, channels
+    cache = replace(cache, rgbs=cache.rgbs.at[:2, 0].set(jnp.asarray(parts.reshape(2, 12), jnp.float32)))
+    wanted = 0.6 * parts[0].mean(axis=0) + 0.4 * parts[1].mean(axis=0)
+    np.testing.assert_allclose(jit_project(cache, front_camera(), CONFIG).colors[0, 3, 4], wanted, rtol=VALUE_RTOL)
+
+
+def test_unmatched_exposure_leaves_no_trace_in_the_projection():
+    cache, camera = with_pivots([[0.0, 0.0, 2.0]]), front_camera()
+    for matched in (True, False):
+        program = jax.jit(functools.partial(project, config=CONFIG.replace(match_exposure=matched)))
+        assert matched == (f"x{WIDTH + 3}xf32" in program.lower(cache, camera).as_text())
+    assert project(cache, camera, CONFIG.replace(match_exposure=False)).colors is None
 
 
 def test_projection_is_deterministic():

@@ -193,7 +193,7 @@ def test_run_stops_resumes_and_exports(tmp_path, capsys):
     assert {"scene.ply", "state.npz", "metrics.json"} <= {p.name for p in out.iterdir()}
     assert_deltas_give_the_scene(out, "000004.npz", "000008.npz", "000012.npz")
     metrics = json.loads((out / "metrics.json").read_text())
-    assert metrics["cache"]["num_chunks"] == 3
+    assert metrics["cache"]["num_chunks"] == 3 and list(metrics["exposures"]) == [str(i) for i in range(12)]
     assert run("export", str(out), "--to", str(tmp_path / "again.ply")) == 0
     assert (tmp_path / "again.ply").read_bytes() == (out / "scene.ply").read_bytes()
     other = tmp_path / "other.npz"

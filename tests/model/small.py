@@ -128,7 +128,7 @@ def with_gamma(raw_gamma: float) -> dict:
     return params() | {"hpda": {"raw_gamma": jnp.float32(raw_gamma)}}
 
 
-def history(depths, confidences, feats=None, mask=None) -> ProjectedCache:
+def history(depths, confidences, feats=None, mask=None, colors=None) -> ProjectedCache:
     """What a cache would say, given by hand; `mask` defaults to where there is a depth."""
     depths, confidences = jnp.asarray(depths, jnp.float32), jnp.asarray(confidences, jnp.float32)
     return ProjectedCache(
@@ -136,6 +136,7 @@ def history(depths, confidences, feats=None, mask=None) -> ProjectedCache:
         confidences=confidences,
         feats=jnp.zeros((*depths.shape, CONFIG.token_width)) if feats is None else jnp.asarray(feats, jnp.float32),
         mask=depths > 0 if mask is None else jnp.asarray(mask),
+        colors=jnp.zeros((*depths.shape, 3)) if colors is None else jnp.asarray(colors, jnp.float32),
     )
 
 

@@ -1,0 +1,164 @@
+"""Exposure of views against the scene: the median of ratios, where both see the same surface, and its limits."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from ssplat_jax.model import estimate_exposures, prepare_views
+from ssplat_jax.model.exposure import FEWEST_CELLS
+from ssplat_jax.struct import replace
+from tests.model.small import CONFIG, chunk, history
+
+TRUSTING = CONFIG.replace(min_confidence=0.5)
+SIDE, VIEWS = 64, 3
+CELLS = SIDE // 4
+GAINS = np.array([[0.6, 0.7, 0.8], [1.0, 1.0, 1.0], [1.6, 1.3, 1.1]])
+
+
+@functools.cache
+def estimate():
+    """The jitted stage over images: `(history, log_depths, confidences, images, valid) -> exposures`."""
+
+    def run(remembered, log_depths, confidences, images, valid):
+        views = prepare_views(replace(chunk(height=SIDE, width=SIDE), images=images, valid=valid), TRUSTING)
+        return estimate_exposures(remembered, log_depths, confidences, views, TRUSTING)
+
+    return jax.jit(run)
+
+
+def scene(seed: int = 0):
+    """Colours of the cells as the cache remembers them, and depths, of all views."""
+    rng = np.random.default_rng(seed)
+    return rng.uniform(0.2, 0.55, (VIEWS, CELLS, CELLS, 3)), rng.uniform(1, 6, (VIEWS, CELLS, CELLS))
+
+
+def exposures(remembered, colors, depths, *, seen_depths=None, confidences=0.9, mask=None, valid=None):
+    """What the stage says of cells `colors` against cells `remembered`."""
+    seen_depths = depths if seen_depths is None else seen_depths
+    images = np.repeat(np.repeat(colors, 4, axis=1), 4, axis=2)
+    known = history(depths, np.full(depths.shape, 0.8), mask=mask, colors=remembered)
+    with np.errstate(all="ignore"):
+        log_depths = jnp.asarray(np.log(seen_depths), jnp.float32)
+    trust = jnp.asarray(np.broadcast_to(confidences, depths.shape), jnp.float32)
+    valid = jnp.ones(VIEWS, bool) if valid is None else jnp.asarray(valid)
+    return np.asarray(estimate()(known, log_depths, trust, jnp.asarray(images, jnp.float32), valid))
+
+
+def oracle(remembered, colors, depths, seen_depths, confidences, mask):
+    """The same in float64, a cell at a time."""
+    logs = []
+    for v in range(VIEWS):
+        ratios = []
+        for cell in np.ndindex(CELLS, CELLS):
+            at = (v, *cell)
+            seen, old = colors[at].astype(np.float64), remembered[at].astype(np.float64)
+            if not mask[at] or confidences[at] < 0.5 or abs(np.log(seen_depths[at] / depths[at])) > np.log(1.1):
+                continue
+            if (seen >= 0.03).all() and (seen <= 0.97).all() and (old >= 0.03).all():
+                ratios.append(np.log(seen / old))
+        n = len(ratios)
+        logs.append(np.clip(np.sort(ratios, axis=0)[n // 2], -np.log(4), np.log(4)) if n >= FEWEST_CELLS else None)
+    known = [log for log in logs if log is not None]
+    fallback = np.mean(known, axis=0) if known else np.zeros(3)
+    return np.exp([fallback if log is None else log for log in logs])
+
+
+@settings(max_examples=40, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+@given(seed=st.integers(0, 2**32 - 1), agreeing=st.sampled_from([0.1, 0.3, 0.6, 1.0]), spread=st.sampled_from([0, 2]))
+def test_estimate_equals_the_loop(seed, agreeing, spread):
+    rng = np.random.default_rng(seed)
+    remembered, depths = scene(seed)
+    colors = remembered * np.exp(spread * rng.normal(size=(VIEWS, 1, 1, 3)) + 0.1 * rng.normal(size=remembered.shape))
+    remembered, colors = (np.clip(x, 0, 1).astype(np.float32) for x in (remembered, colors))
+    seen_depths = depths * np.where(rng.uniform(size=depths.shape) < agreeing, 1.05, 1.2)
+    confidences = rng.choice([0.25, 0.75], depths.shape)
+    mask = rng.uniform(size=depths.shape) < 0.9
+    wanted = oracle(remembered, colors, depths, seen_depths, confidences, mask)
+    got = exposures(remembered, colors, depths, seen_depths=seen_depths, confidences=confidences, mask=mask)
+    np.testing.assert_allclose(got, wanted, rtol=2e-6)
+
+
+def test_gains_of_views_are_found_among_noise_and_outliers():
+    rng = np.random.default_rng(1)
+    remembered, depths = scene()
+    colors = remembered * GAINS[:, None, None] * np.exp(0.1 * rng.normal(size=remembered.shape))
+    colors[:, :5] = rng.uniform(0.1, 0.9, colors[:, :5].shape)  # a third is another colour altogether
+    np.testing.assert_allclose(exposures(remembered, colors, depths), GAINS, rtol=0.05)
+
+
+def test_a_view_of_another_surface_is_not_compared():
+    """What it sees in front of the remembered wall is red; its exposure is that of the views that see the wall."""
+    remembered, depths = scene()
+    colors, nearer = remembered * 0.5, depths.copy()
+    colors[1], nearer[1] = [0.9, 0.1, 0.1], 0.8 * depths[1]
+    np.testing.assert_allclose(exposures(remembered, colors, depths, seen_depths=nearer), 0.5, rtol=1e-5)
+
+
+def test_clipped_and_black_cells_tell_nothing():
+    remembered, depths = scene()
+    colors = np.clip(remembered * 2.0, 0, 1)
+    assert (colors.max(axis=-1) > 0.97).mean() > 0.2
+    np.testing.assert_allclose(exposures(remembered, colors, depths), 2.0, rtol=1e-5)
+    np.testing.assert_array_equal(exposures(remembered, remembered * 0.01, depths), 1.0)
+
+
+@pytest.mark.parametrize(("num_cells", "is_known"), [(FEWEST_CELLS, True), (FEWEST_CELLS - 1, False)])
+def test_a_view_that_shares_too_little_has_the_mean_of_the_others(num_cells, is_known):
+    remembered, depths = scene()
+    mask = np.ones(depths.shape, bool)
+    mask[1].flat[num_cells:] = False
+    colors = remembered * np.array([0.5, 0.8, 2.0]).reshape(3, 1, 1, 1)
+    colors = np.clip(colors, 0, 0.96)
+    got = exposures(
+        np.minimum(remembered, 0.48),
+        np.minimum(remembered, 0.48) * [[[[0.5]]], [[[0.8]]], [[[2.0]]]],
+        depths,
+        mask=mask,
+    )
+    np.testing.assert_allclose(got[:, 0], [0.5, 0.8 if is_known else 1.0, 2.0], rtol=1e-5)
+
+
+def test_nothing_remembered_is_exposure_one():
+    remembered, depths = scene()
+    nothing = np.zeros(depths.shape, bool)
+    np.testing.assert_array_equal(exposures(remembered, remembered * 0.5, depths, mask=nothing), 1.0)
+
+
+def test_padded_views_have_the_mean_of_the_others_and_do_not_count():
+    remembered, depths = scene()
+    colors = remembered * np.array([0.5, 0.5, 1.5]).reshape(3, 1, 1, 1)
+    np.testing.assert_allclose(exposures(remembered, colors, depths, valid=[True, True, False]), 0.5, rtol=1e-5)
+
+
+@pytest.mark.parametrize(("gain", "wanted"), [(0.1, 0.25), (1e6, 4.0)])
+def test_exposures_are_bounded(gain, wanted):
+    remembered, depths = scene()
+    dim = remembered if gain < 1 else np.full(remembered.shape, 0.1)
+    colors = np.maximum(remembered * gain, 0.03) if gain < 1 else np.full(remembered.shape, 0.96)
+    np.testing.assert_allclose(exposures(dim, colors, depths), wanted, rtol=1e-5)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -1.0])
+def test_what_is_not_finite_is_not_compared(bad):
+    remembered, depths = scene()
+    colors, seen_depths = 0.5 * remembered, depths.copy()
+    colors[:, 0], remembered[:, 1], seen_depths[:, 2] = bad, bad, bad
+    np.testing.assert_allclose(exposures(remembered, colors, depths, seen_depths=seen_depths), 0.5, rtol=1e-5)
+
+
+def test_no_gradient_passes_the_exposures():
+    remembered, depths = scene()
+
+    def total(colors, log_depths):
+        images = jnp.repeat(jnp.repeat(colors, 4, axis=1), 4, axis=2)
+        known = history(depths, np.full(depths.shape, 0.8), colors=remembered)
+        views = prepare_views(replace(chunk(height=SIDE, width=SIDE), images=images), TRUSTING)
+        return estimate_exposures(known, log_depths, jnp.full(depths.shape, 0.9), views, TRUSTING).sum()
+
+    inputs = (jnp.asarray(0.5 * remembered, jnp.float32), jnp.asarray(np.log(depths), jnp.float32))
+    assert not any(np.any(np.asarray(g)) for g in jax.grad(total, argnums=(0, 1))(*inputs))
