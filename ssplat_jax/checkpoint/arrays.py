@@ -59,7 +59,9 @@ def load_arrays(path: Path, kind: str) -> tuple[dict[str, np.ndarray], dict[str,
     except (ValueError, KeyError, TypeError, OSError, EOFError, zipfile.BadZipFile) as error:
         raise StorageError(f"{path}: the file is corrupt ({error}); take it from a backup or make it anew.") from error
     if facts["kind"] != kind:
-        raise StorageError(f"{path}: wanted a file of {kind}, got one of {facts['kind']}.")
+        raise StorageError(
+            f"{path}: wanted a file of {kind}, got one of {facts['kind']}; one of another version has to be made anew."
+        )
     return arrays, facts["header"]
 
 

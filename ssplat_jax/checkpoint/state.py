@@ -17,7 +17,7 @@ from ssplat_jax.checkpoint.arrays import load_arrays, save_arrays
 from ssplat_jax.errors import StorageError
 from ssplat_jax.export.atomic import previous_path
 
-KIND = "stream state 2"  # 2: with witnesses
+KIND = "stream state 3"  # 2: with witnesses; 3: colours of the parts of a patch, at one exposure
 _ROW_FIELDS = ("voxels", "counts", *PIVOT_FIELDS)
 
 
