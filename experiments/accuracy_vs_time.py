@@ -174,6 +174,9 @@ def plot(path: Path, rows: list[dict[str, Any]]) -> None:
         times, psnrs = [r["ms_per_view"] for r in here], [r["psnr"] for r in here]
         axes.set_xscale("log")
         axes.set_xlim(0.8 * min(times), 1.8 * max(times))
+        ticks = [10**k * m for k in range(6) for m in (1, 2, 5) if min(times) <= 1.25 * 10**k * m <= 2 * max(times)]
+        axes.set_xticks(ticks, [str(tick) for tick in ticks])
+        axes.minorticks_off()
         axes.set_ylim(min(psnrs) - 0.3, max(psnrs) + 0.3)
         front = sorted((r for r in here if r["front"]), key=lambda r: r["ms_per_view"])
         axes.plot([r["ms_per_view"] for r in front], [r["psnr"] for r in front], color="#c06030", lw=1.2, zorder=1)
