@@ -217,6 +217,7 @@ def test_a_wide_lens_shapes_gaussians_as_its_derivative_says(mean):
 
 
 @plainly
+@pytest.mark.slow  # a program of its own
 def test_a_lens_has_finite_gradients_however_far_from_its_axis():
     lens = jnp.array([0.1, 0.01, 0, 0, 0.01], jnp.float32)
 

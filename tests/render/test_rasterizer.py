@@ -118,6 +118,7 @@ def test_a_batch_equals_its_cameras_one_by_one(scene):
         np.testing.assert_array_equal(together.median_depth[i], alone.median_depth)
 
 
+@pytest.mark.slow  # programs of its own
 def test_tile_sizes_agree(scene):
     small, large = (render(*scene, tile=tile, max_pairs=1 << 12) for tile in (8, 16))
     np.testing.assert_allclose(small.color, large.color, atol=FORWARD)
