@@ -1,6 +1,7 @@
 """What all tests share: shapes and types checked at every call, strict dtypes, and where the real captures are."""
 
 import atexit
+import importlib.metadata
 import os
 import shutil
 import tempfile
@@ -12,7 +13,10 @@ from jaxtyping import install_import_hook
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 
 # Most of the run is compilation, and most of that LLVM's. `XLA_FLAGS= pytest` compiles as users do.
-os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
+FAST_COMPILATION = ["--xla_backend_optimization_level=0", "--xla_cpu_parallel_codegen_split_count=1"]
+if importlib.metadata.version("jaxlib").startswith("0.10."):  # later ones know no other emitters, and no flag for them
+    FAST_COMPILATION.append("--xla_cpu_use_fusion_emitters=false")
+os.environ.setdefault("XLA_FLAGS", " ".join(FAST_COMPILATION))
 
 # Workers and command lines started by tests compile the same programs: they share one cache, which ends with the run.
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ:

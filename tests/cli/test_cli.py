@@ -25,6 +25,12 @@ from ssplat_jax.stream import StreamSplat
 COMMANDS = ("demo", "inspect", "run", "eval", "train", "export", "bench", "experiment")
 
 
+@pytest.fixture(autouse=True)
+def few_pivots(monkeypatch):
+    """Scenes this small are not decoded and rendered at the size of large ones."""
+    monkeypatch.setattr("ssplat_jax.session.FEWEST_DECODED", 1 << 11)
+
+
 def run(*arguments: str) -> int:
     with pytest.raises(SystemExit) as stopped:
         cli.main(list(arguments))
