@@ -1,7 +1,6 @@
 """`ssplat run`: a capture into a scene, with the state on disk every few chunks so that a stopped run goes on."""
 
 import dataclasses
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +24,7 @@ from ssplat_jax.evaluate import (
     score_view,
 )
 from ssplat_jax.export.atomic import previous_path
+from ssplat_jax.export.folders import remove_numbered
 from ssplat_jax.export.json_files import write_json
 from ssplat_jax.export.only_writer import only_writer
 from ssplat_jax.export.ply import ExportReport, save_ply
@@ -36,8 +36,8 @@ from ssplat_jax.session import Session
 from ssplat_jax.stream import StreamSplat
 
 STATE_FILE, SCENE_FILE, METRICS_FILE = "state.npz", "scene.ply", "metrics.json"
-PICTURES = "views"
-DELTAS = "deltas"  # <views so far>.npz: the changes of one chunk
+PICTURES, PICTURE = "views", "#####.png"
+DELTAS, DELTA = "deltas", "######.npz"  # <views so far>: the changes of one chunk
 NUM_PICTURES = 8  # views of the stream, evenly spread, rendered from the finished scene
 
 
@@ -71,8 +71,8 @@ def run_capture(
     written too, in the stream's frame (`checkpoint/delta.py`).
 
     Raises:
-        InputError: the capture is unusable, `out` holds a run of another capture or configuration, or another process
-            is writing to it.
+        InputError: the capture is unusable or lies in `out`, `out` holds a run of another capture or configuration, or
+            another process is writing to it.
         StorageError: `out` cannot be written or its state is corrupt.
     """
     require_positive(stride=stride, save_every=save_every)
@@ -81,6 +81,7 @@ def run_capture(
     capture = open_capture(path, size=size).scaled(scale)
     check_scorable(capture)
     indices = list(range(0, len(capture), stride))[:max_views]
+    capture.check_apart(out)
     capture.verify(indices)
     with only_writer(out):
         if overwrite:
@@ -92,8 +93,8 @@ def _forget(out: Path) -> None:
     """Removes the run that `out` holds."""
     for stale in (out / STATE_FILE, previous_path(out / STATE_FILE), out / SCENE_FILE, out / METRICS_FILE):
         stale.unlink(missing_ok=True)
-    for stale in (out / DELTAS, out / PICTURES):
-        shutil.rmtree(stale, ignore_errors=True)
+    remove_numbered(out / DELTAS, DELTA)
+    remove_numbered(out / PICTURES, PICTURE)
 
 
 def _go_on(
@@ -112,7 +113,7 @@ def _go_on(
     done = len(exposures)
     if done == 0:
         # Of a run that was stopped before its first save: its changes are not those of this one.
-        shutil.rmtree(out / DELTAS, ignore_errors=True)
+        remove_numbered(out / DELTAS, DELTA)
     for warning in (*capture.notes, *filter(None, [frame.warning])):
         reporter.warn(warning)
     order = capture.stream_order(model.config, indices, frame)
@@ -294,7 +295,7 @@ def _finish(
     gaussians = session.gaussians()
     report = save_scene(out / SCENE_FILE, gaussians, frame, reporter)
     pictures = out / PICTURES
-    shutil.rmtree(pictures, ignore_errors=True)
+    remove_numbered(pictures, PICTURE)
     shown = sorted({indices[round(i)] for i in np.linspace(0, len(indices) - 1, NUM_PICTURES)})
     scores = []
     for i in shown:

@@ -125,7 +125,8 @@ class Run:
             reporter=Reporter(self.quiet),
         )
         if result.interrupted:
-            print(f"stopped after {result.num_views} views; the same command continues", file=sys.stderr)
+            how = " without --overwrite" if self.overwrite else ""
+            print(f"stopped after {result.num_views} views; the same command{how} continues", file=sys.stderr)
             return 128 + result.interrupted
         print(f"wrote {self.out}/scene.ply ({result.num_gaussians} Gaussians from {result.num_views} views)")
         return 0

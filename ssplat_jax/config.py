@@ -6,6 +6,7 @@ Numbers are the paper's where it gives them; where it is silent the default and 
 import dataclasses
 import hashlib
 import json
+import math
 from typing import Any, Literal, get_args, get_origin
 
 from ssplat_jax.errors import InputError
@@ -122,7 +123,7 @@ class StreamConfig:
         for name, wanted, good in (
             ("chunk_size", "at least 1", self.chunk_size >= 1),
             ("num_sources", "not negative", self.num_sources >= 0),
-            ("encoder_widths", "two positive widths", len(self.encoder_widths) == 2 and min(self.encoder_widths) >= 1),
+            ("encoder_widths", "two positive widths, the second even", _are_widths(self.encoder_widths)),
             ("encoder_blocks", "at least 1", self.encoder_blocks >= 1),
             ("attention_blocks", "not negative", self.attention_blocks >= 0),
             ("attention_window", "a multiple of 4", self.attention_window >= 4 and self.attention_window % 4 == 0),
@@ -131,12 +132,17 @@ class StreamConfig:
             ("token_width", "a multiple of 4", self.token_width >= 4 and self.token_width % 4 == 0),
             ("cgfi_width", "a multiple of 8", self.cgfi_width >= 8 and self.cgfi_width % 8 == 0),
             ("mixer_blocks", "not negative", self.mixer_blocks >= 0),
+            ("mixer_neighbours", "at least 1", self.mixer_neighbours >= 1),
+            ("attention_ffn", "at least 1", self.attention_ffn >= 1),
+            ("readout_window", "not negative", self.readout_window >= 0),
+            ("confidence_window", "not negative", self.confidence_window >= 0),
+            ("median_depth", "a positive length", _is_positive(self.median_depth)),
             ("mixer_radius", "not negative", self.mixer_radius >= 0),
             ("mixer_proj", "at least 1", self.mixer_proj >= 1),
-            ("gamma_init", "positive", self.gamma_init > 0),
-            ("max_scale", "positive", self.max_scale > 0),
+            ("gamma_init", "positive", _is_positive(self.gamma_init)),
+            ("max_scale", "positive", _is_positive(self.max_scale)),
             ("num_depths", "at least 1", self.num_depths >= 1),
-            ("voxel_size", "a positive length", self.voxel_size > 0),
+            ("voxel_size", "a positive length", _is_positive(self.voxel_size)),
             ("pivots_per_voxel", "at least 1", self.pivots_per_voxel >= 1),
             (
                 "capacity",
@@ -146,10 +152,10 @@ class StreamConfig:
             ("min_confidence", "in [0, 1]", 0.0 <= self.min_confidence <= 1.0),
             # Judged confidences stay below 0.95 (`cache.carve.HIGHEST`): what views confirm would be rejected.
             ("min_confidence", "at most 0.95 while views carve", not self.carving or self.min_confidence <= 0.95),
-            ("sigma0", "positive", self.sigma0 > 0),
-            ("lambda_sigma", "not negative", self.lambda_sigma >= 0),
+            ("sigma0", "positive", _is_positive(self.sigma0)),
+            ("lambda_sigma", "not negative, and finite", 0 <= self.lambda_sigma < math.inf),
             ("num_witnesses", "not negative", self.num_witnesses >= 0),
-            ("chunk_step", "not negative", self.chunk_step >= 0),
+            ("chunk_step", "not negative, and finite", 0 <= self.chunk_step < math.inf),
             ("cluster_ratio", "above 1", self.cluster_ratio > 1),
             ("sh_degree", "0 to 3", 0 <= self.sh_degree <= 3),
             (
@@ -196,8 +202,13 @@ class StreamConfig:
         return hashlib.sha256(json.dumps(self.to_dict(), sort_keys=True).encode()).hexdigest()[:12]
 
 
+def _are_widths(value: Any) -> bool:
+    is_good = len(value) == 2 and all(isinstance(width, int) and width >= 1 for width in value)
+    return is_good and value[1] % 2 == 0  # positions are sines and cosines
+
+
 def _is_positive(value: Any) -> bool:
-    return isinstance(value, int | float) and value > 0
+    return isinstance(value, int | float) and 0 < value < math.inf
 
 
 PRESETS: dict[str, StreamConfig] = {"tiny": StreamConfig()}

@@ -12,6 +12,7 @@ from ssplat_jax.data.capture import open_capture
 from ssplat_jax.data.protocol import interleaved
 from ssplat_jax.evaluate import Exposures, cache_facts, exposures_of, save_comparison, save_image, score_view
 from ssplat_jax.export.atomic import write_atomic
+from ssplat_jax.export.folders import make_writable
 from ssplat_jax.export.json_files import write_json
 from ssplat_jax.export.ply import save_ply
 from ssplat_jax.report import Reporter
@@ -24,6 +25,7 @@ NUM_FRAMES = 73  # 64 context views and the 9 interleaved targets between them
 
 def run_demo(scene: str, out: Path, reporter: Reporter, quality: Quality = QUALITIES["accurate"]) -> dict:
     """Streams `procedural:scene`, scores the same targets after every stage, writes scene, pictures and metrics."""
+    make_writable(out)  # before the long part
     since = time.perf_counter()
     model, params = StreamSplat(preset("tiny").replace(**dict(quality.changes))), load_params("tiny")
     capture = open_capture(f"procedural:{scene}?frames={NUM_FRAMES}")
@@ -42,7 +44,6 @@ def run_demo(scene: str, out: Path, reporter: Reporter, quality: Quality = QUALI
                 row, middle = _score_stage(session, capture, split, frame, exposures)
                 rows.append(row)
                 strip.append(middle)
-    out.mkdir(parents=True, exist_ok=True)
     gaussians = session.gaussians()
     save_ply(out / "scene.ply", frame.gaussians_to_capture(gaussians))
     for i in split.targets:

@@ -12,19 +12,21 @@ import numpy as np
 from jaxtyping import Float
 from PIL import Image
 
+from ssplat_jax.cache import ensure_room
 from ssplat_jax.chunk import Chunk
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.frame import StreamFrame
 from ssplat_jax.data.protocol import Split
-from ssplat_jax.errors import InputError, StorageError
+from ssplat_jax.errors import InputError
 from ssplat_jax.export.atomic import write_atomic
+from ssplat_jax.export.folders import make_writable, remove_numbered
 from ssplat_jax.export.json_files import write_json
 from ssplat_jax.gaussians import Gaussians, mean_color
 from ssplat_jax.lpips import LpipsWeights, check_size, lpips
 from ssplat_jax.metrics import SSIM_ARGUMENTS, psnr, ssim
 from ssplat_jax.render import fill_holes, render
 from ssplat_jax.report import Reporter
-from ssplat_jax.session import Session
+from ssplat_jax.session import Session, tokens_per_chunk
 from ssplat_jax.stream import ChunkOutput, shown_pivots
 
 LATENCY_CHUNKS = 4  # the last chunks are fed again to the full cache, each this often, to time them warm
@@ -181,10 +183,13 @@ def baselines(capture: Capture, split: Split) -> dict[str, float]:
 def measure_latency(session: Session, chunks: list, camera) -> dict:
     """Chunk in -> one novel view out on the full cache, everything compiled, each result waited for. Milliseconds."""
     totals, renders = [], []
-    cache = session.cache
+    cache, config = session.cache, session.model.config
+    assert cache is not None
+    # Growing happens a few times in a stream's life and is no part of what a chunk costs.
+    roomy = ensure_room(cache, config, tokens_per_chunk(chunks[0], config.size_multiple))
     for chunk in chunks:
         for repeat in range(LATENCY_REPEATS + 1):
-            session.cache = jax.block_until_ready(jax.tree.map(jnp.copy, cache))
+            session.cache = jax.block_until_ready(jax.tree.map(jnp.copy, roomy))
             since = time.perf_counter()
             session.feed(chunk)
             gaussians = jax.block_until_ready(session.gaussians())
@@ -236,19 +241,16 @@ def evaluate(
     the fields `lpips` are null.
 
     Raises:
-        InputError: a frame is damaged or too small to be scored.
+        InputError: a frame is damaged or too small to be scored, or the capture lies in `out`.
         StorageError: `out` cannot be written.
     """
     check_scorable(capture)
     if lpips_weights is not None:
         check_size(capture.height, capture.width)
+    capture.check_apart(out)
     capture.verify((*split.context, *split.targets))
-    try:  # before the long part
-        out.mkdir(parents=True, exist_ok=True)
-        for stale in out.glob("view_*.png"):  # of another split
-            stale.unlink()
-    except OSError as error:
-        raise StorageError(f"{out}: cannot be written ({error.strerror}); choose another --out.") from error
+    make_writable(out)  # before the long part
+    remove_numbered(out, "view_#####.png")  # of another split
     streamed = streamed or capture
     frame = streamed.stream_frame(session.model.config, split.context)
     reporter = reporter or Reporter(quiet=True)
@@ -259,6 +261,11 @@ def evaluate(
         exposures, recent = stream_context(session, streamed, split, frame, advance)
     gaussians = session.gaussians()
     facts = cache_facts(session)
+    stream = {  # before timing, which may make room that the stream did not need
+        "compile_s": round(session.compile_seconds, 2),
+        "compilations": session.num_compilations,
+        "step_memory_bytes": session.step_memory_bytes,
+    }
     scores = []
     for i in split.targets:
         score, color, depth = score_view(gaussians, capture, i, frame, exposures, lpips_weights)
@@ -282,9 +289,7 @@ def evaluate(
         "ssim_arguments": SSIM_ARGUMENTS,
         "lpips": round(float(np.mean(distances)), 4) if distances else None,
         **latency,
-        "compile_s": round(session.compile_seconds, 2),
-        "compilations": session.num_compilations,
-        "step_memory_bytes": session.step_memory_bytes,
+        **stream,
         "cache": facts,
         "num_gaussians": facts["decoded"],
         "config_hash": session.model.config.hash,

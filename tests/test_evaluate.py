@@ -1,17 +1,22 @@
 """What a score counts: holes in the colours around, and what they would cost over black."""
 
 import json
+from typing import ClassVar
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from ssplat_jax import evaluate
+from ssplat_jax.cache import init_cache
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.data.capture import open_capture
-from ssplat_jax.evaluate import exposures_from_json, exposures_to_json, nearest_contexts, score_view
+from ssplat_jax.evaluate import exposures_from_json, exposures_to_json, measure_latency, nearest_contexts, score_view
 from ssplat_jax.gaussians import Gaussians, mean_color
 from ssplat_jax.lpips import load_lpips, lpips
 from ssplat_jax.metrics import psnr
+from ssplat_jax.session import Session
+from ssplat_jax.stream import StreamSplat
 from tests.lpips_fixture import random_heads, random_vgg
 
 
@@ -63,6 +68,28 @@ def test_a_view_is_shown_at_the_mean_exposure_of_the_nearest_that_were_streamed(
     np.testing.assert_allclose(color, np.broadcast_to([0.2, 0.4, 1.0], color.shape), atol=1e-6)
 
 
+def test_making_room_is_no_part_of_a_chunks_time(capture, monkeypatch):
+    """A cache that the next chunk might not fit is doubled before the clock starts, and given back as it was."""
+    monkeypatch.setattr(evaluate, "LATENCY_REPEATS", 1)
+
+    class Watched(Session):
+        capacities: ClassVar[list[int]] = []
+
+        def feed(self, chunk):
+            self.capacities.append(self.cache.capacity)
+
+        def gaussians(self):
+            return gaussians([[0.2, 0.4, 0.6]], [0.9])
+
+    config = StreamConfig(capacity=128)
+    chunk = next(iter(capture.chunks(config, (0, 1, 3, 4))))
+    session = Watched(StreamSplat(config), {}, init_cache(config))
+    frame = capture.stream_frame(config, (0, 1, 3, 4))
+    milliseconds = measure_latency(session, [chunk], capture.camera(2, frame))
+    assert session.capacities == [256, 256] and session.cache.capacity == 128  # 4 x 8 x 8 tokens
+    assert milliseconds["render_ms"] > 0
+
+
 def test_exposures_survive_a_file_to_the_last_bit():
     exposures = {7: np.array([1 / 3, 0.1, 2.0], np.float32), 0: np.ones(3, np.float32)}
     back = exposures_from_json(json.loads(json.dumps(exposures_to_json(exposures))))
@@ -70,7 +97,6 @@ def test_exposures_survive_a_file_to_the_last_bit():
     assert all(np.array_equal(back[i], exposures[i]) and back[i].dtype == np.float32 for i in back)
 
 
-@pytest.mark.slow  # a whole evaluation
 def test_lpips_is_scored_where_weights_are_given_and_absent_where_not(capture, compiled_plainly, tmp_path):
     np.savez(tmp_path / "vgg.npz", **random_vgg())
     np.savez(tmp_path / "heads.npz", **random_heads())

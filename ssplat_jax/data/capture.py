@@ -93,6 +93,19 @@ class Capture:
             return depth
         return resize_depth(depth, crop, (frame.width, frame.height))
 
+    def check_apart(self, out: Path) -> None:
+        """Refuses results among the capture's own files: what stands in `out` is cleared and written over.
+
+        Raises:
+            InputError: an image or depth map lies in `out` or below.
+        """
+        folder = out.resolve()
+        for frame in self.frames:
+            for path in (frame.path, frame.depth_path):
+                if path is not None and path.resolve().is_relative_to(folder):
+                    got, fix = "the folder of the capture's own images", "choose another --out"
+                    raise refusal(str(out), wanted="a folder for results alone", got=got, fix=fix)
+
     def verify(self, indices: Sequence[int] | None = None) -> None:
         """Decodes the images and depth maps of `indices` (default all) once, on all cores: about 1 ms for 480x360.
 

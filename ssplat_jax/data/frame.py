@@ -8,6 +8,7 @@ earth-centred coordinates float32 has a step of 0.5 m.
 """
 
 import dataclasses
+import math
 
 import jax.numpy as jnp
 import numpy as np
@@ -77,11 +78,12 @@ class StreamFrame:
     @property
     def offset(self) -> tuple[float, float, float]:
         """A point of the capture to count positions from: its origin, or, where float32 is too coarse there, the
-        stream's, in whole units.
+        stream's, in whole units, or in as many decimals as the scene is small.
         """
         spacing = float(np.spacing(np.float32(np.abs(self.origin).max())))
         is_coarse = spacing * self.scale > COARSEST_SPACING
-        x, y, z = (np.round(self.origin) if is_coarse else np.zeros(3)).tolist()
+        decimals = max(0, math.ceil(math.log10(self.scale)))
+        x, y, z = (np.round(self.origin, decimals) if is_coarse else np.zeros(3)).tolist()
         return x, y, z
 
     def gaussians_to_capture(

@@ -7,7 +7,7 @@ import numpy as np
 
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.data.capture import Capture
-from ssplat_jax.data.scale import DepthStatistics, estimate_depths, stream_scale
+from ssplat_jax.data.scale import DepthStatistics, estimate_depths, still, stream_scale
 
 LOW_STEP = 0.012  # step between frames over median depth: below it, four frames in a row have hardly any parallax
 GOOD_STEP = 0.03  # what a suggested stride aims at
@@ -92,7 +92,7 @@ def _warnings(capture: Capture, depths: DepthStatistics, steps: np.ndarray) -> l
     """What may go wrong, each with what to do."""
     if len(capture) == 1:
         return ["One frame: no parallax, so its depth is a guess; add frames from other places."]
-    if not steps.any():
+    if not (steps > still(capture)).any():
         return ["All cameras stand in one place: no parallax, so depth is a guess; add frames from other places."]
     found = []
     step = float(np.median(steps)) / depths.median
@@ -105,7 +105,7 @@ def _warnings(capture: Capture, depths: DepthStatistics, steps: np.ndarray) -> l
         )
     elif step > HIGH_STEP:
         found.append(f"Wide steps: {step:.0%} of the median depth; neighbours hardly overlap, so add frames between.")
-    moved = steps[steps > 0]
+    moved = steps[steps > still(capture)]
     if (steps > JUMP * np.median(moved)).any():
         i = int(steps.argmax())
         found.append(

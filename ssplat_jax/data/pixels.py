@@ -24,6 +24,7 @@ IMAGE_FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "PPM")
 MAX_PIXELS = 64_000_000  # larger headers are refused before anything is decoded
 MILLIMETRE = 1e-3
 DEPTH_MODES = ("I;16", "I;16B", "I")
+ORIENTATION, UPRIGHT = 274, 1  # EXIF
 
 
 @runtime_checkable
@@ -106,6 +107,15 @@ def _open(path: Path, what: str) -> Image.Image:
         size = f"{image.width}x{image.height}"
         image.close()
         raise refusal(str(path), wanted=f"at most {MAX_PIXELS:,} pixels", got=size, fix="scale the images down")
+    is_tiff = image.format == "TIFF"
+    if image.mode == "F" or (is_tiff and image.mode == "I"):
+        image.close()
+        got, fix = "floats or 32-bit integers, of which nothing says what is white", "store 8 or 16 bits a channel"
+        raise refusal(str(path), wanted=what, got=got, fix=fix)
+    if is_tiff and image.getexif().get(ORIENTATION, UPRIGHT) != UPRIGHT:  # which Pillow applies, and to TIFFs alone
+        image.close()
+        fix = "rotate the pixels and drop the tag, and see that the intrinsics are those of the rotated image"
+        raise refusal(str(path), wanted=what, got="a TIFF with an orientation tag", fix=fix)
     return image
 
 

@@ -41,6 +41,8 @@ MIN_POINTS = 10  # a pair with fewer common points is no pair
 GOOD_PARALLAX_DEGREES = 4.0  # median parallax at which a reference stops looking for a wider partner
 POOR_PARALLAX_DEGREES = 0.5  # pairs of less tell the median roughly, and nothing about the range
 # Which points
+ROUNDING = 1e-12  # of poses, against how far from the origin they lie (or 1): cameras this near stand in one place
+
 CELL = 40  # pixels of the working images: points of one cell share one vote on the median
 MIN_TOTAL_POINTS = 30  # with fewer, depths are guessed from baselines
 FAR_PARALLAX_DEGREES = 1.5  # points of less are too uncertain to say how far the scene reaches
@@ -144,15 +146,20 @@ def estimate_depths(capture: PosedImages, indices: Sequence[int]) -> DepthStatis
             inverse_depth = _median(pairs)
             baseline = math.radians(GOOD_PARALLAX_DEGREES) / max(inverse_depth, 1e-300)
     good = [p for p in pairs if np.median(p.parallax) >= POOR_PARALLAX_DEGREES]
-    if sum(p.parallax.size for p in good) >= MIN_TOTAL_POINTS:
+    if sum(p.parallax.size for p in good) >= MIN_TOTAL_POINTS and _median(good) > 0:
         return _statistics(good)
     if sum(p.parallax.size for p in pairs) >= MIN_TOTAL_POINTS:
         inverse_depth = _median(pairs)
         if inverse_depth > 0:
             return _guess(1 / inverse_depth, "poor parallax", pairs)
     steps = np.linalg.norm(np.diff(np.stack([capture.frames[i].center for i in indices]), axis=0), axis=-1)
-    steps = steps[steps > 0]
+    steps = steps[steps > still(capture)]
     return _guess(BASELINE_DEPTH * float(np.median(steps)) if steps.size else 1.0, "baselines", [])
+
+
+def still(capture: PosedImages) -> float:
+    """How far apart two cameras may be that stand in one place: poses are rounded, as by inverting their matrices."""
+    return ROUNDING * max(1.0, *(float(np.abs(frame.center).max()) for frame in capture.frames))
 
 
 def stream_scale(depths: DepthStatistics, config: StreamConfig) -> tuple[float, float, float]:
@@ -252,7 +259,9 @@ def _partners(capture: PosedImages, i: int, others: Sequence[int]) -> tuple[list
     offsets = np.stack([capture.frames[j].center for j in others]) - frame.center
     axes = np.stack([capture.frames[j].camtoworld[:3, 2] for j in others])
     distances = np.linalg.norm(offsets, axis=-1)
-    is_partner = (axes @ frame.camtoworld[:3, 2] > math.cos(math.radians(MAX_AXIS_DEGREES))) & (distances > 0)
+    is_partner = (axes @ frame.camtoworld[:3, 2] > math.cos(math.radians(MAX_AXIS_DEGREES))) & (
+        distances > still(capture)
+    )
     order = [int(k) for k in np.argsort(distances, kind="stable") if is_partner[k]]
     return [others[k] for k in order], distances[order]
 

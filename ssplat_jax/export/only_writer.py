@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from ssplat_jax.errors import InputError, StorageError
+from ssplat_jax.export.folders import make_writable
 
 
 @contextlib.contextmanager
@@ -18,14 +19,14 @@ def only_writer(folder: Path) -> Iterator[None]:
 
     Raises:
         InputError: another process holds it.
-        StorageError: the folder cannot be made, or its file system has no locks.
+        StorageError: the folder cannot be made or written to, or its file system has no locks.
     """
     is_new = not folder.exists()
+    make_writable(folder)
     try:
-        folder.mkdir(parents=True, exist_ok=True)
         descriptor = os.open(folder, os.O_RDONLY)
     except OSError as error:
-        raise StorageError(f"{folder}: cannot be written ({error.strerror or error}); choose another place.") from error
+        raise StorageError(f"{folder}: cannot be opened ({error.strerror or error}); choose another place.") from error
     try:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Num
 from ssplat_jax.errors import InputError
 from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.geometry.cameras import Camera
-from ssplat_jax.render.binning import MOST_PAIRS, Grid, bin_splats, count_pairs
+from ssplat_jax.render.binning import Grid, bin_splats, count_pairs
 from ssplat_jax.render.effects import Effects
 from ssplat_jax.render.output import RenderOutput, finish, splat_channels
 from ssplat_jax.render.projection import Splats, cull_cameras, cull_non_finite, project
@@ -20,6 +20,7 @@ from ssplat_jax.struct import pytree, replace
 
 TILE = 8
 MIN_PAIRS = 1 << 12
+MOST_ROOM = 1 << 30  # the last power of two that an index reaches
 
 
 @pytree
@@ -84,10 +85,10 @@ def render(
 
 
 def _room_for(num_pairs: int) -> int:
-    """`round_up`, for a number that an index can reach."""
-    if num_pairs >= MOST_PAIRS:
+    """`round_up`, for a number whose power of two an index can reach."""
+    if num_pairs > MOST_ROOM:
         raise InputError(
-            f"render: wanted fewer than {MOST_PAIRS} pairs of a tile and a Gaussian, got more; render fewer cameras at"
+            f"render: wanted at most {MOST_ROOM} pairs of a tile and a Gaussian, got more; render fewer cameras at"
             " once or with tile=16."
         )
     return round_up(num_pairs)
@@ -104,7 +105,7 @@ def _at_least_one_row(inputs: Inputs) -> Inputs:
 def default_max_pairs(gaussians: Gaussians, camera: Camera) -> int:
     """The capacity inside jit when none is passed: four pairs a row and camera, as a power of two."""
     cameras = camera.viewmats.size // 16
-    return round_up(4 * cameras * gaussians.num_gaussians)
+    return min(round_up(4 * cameras * gaussians.num_gaussians), MOST_ROOM)
 
 
 def round_up(num_pairs: int) -> int:

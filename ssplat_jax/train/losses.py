@@ -14,12 +14,20 @@ from ssplat_jax.metrics import SSIM_ARGUMENTS
 LPIPS_WEIGHT = 0.05
 """Of LPIPS beside the MSE, as in the paper."""
 
+NARROWEST_STEP = 1e-6
+"""Of log depth between candidates: where near is far, there is nothing to divide by."""
+
 
 def soft_targets(
     log_depths: Float[Array, "*b"], log_candidates: Float[Array, " d"], width: float = 0.6
 ) -> Float[Array, "*b d"]:
-    """True depth as a narrow distribution over the candidates: a Gaussian of `width` bins, normalised."""
-    step = (log_candidates[-1] - log_candidates[0]) / (log_candidates.shape[0] - 1)
+    """True depth as a narrow distribution over the candidates: a Gaussian of `width` bins, normalised.
+
+    Limits:
+        One candidate, or all at one depth: it is the whole distribution, or all alike.
+    """
+    step = (log_candidates[-1] - log_candidates[0]) / max(log_candidates.shape[0] - 1, 1)
+    step = jnp.maximum(step, NARROWEST_STEP)
     return jax.nn.softmax(-0.5 * ((log_candidates - log_depths[..., None]) / (width * step)) ** 2, axis=-1)
 
 
@@ -30,8 +38,13 @@ def depth_loss(
     log_candidates: Float[Array, " d"],
     usable: Bool[Array, "v hf wf"],
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Cross entropy of P_i and L1 of the anchored log depth, each a mean over usable cells with a depth in range."""
+    """Cross entropy of P_i and L1 of the anchored log depth, each a mean over usable cells with a depth in range.
+
+    Limits:
+        A true depth of 0 (unknown), infinite or NaN is out of range, and no part of value or gradient.
+    """
     in_range = usable & (truth > log_candidates[0]) & (truth < log_candidates[-1])
+    truth = jnp.where(in_range, truth, jax.lax.stop_gradient(predicted))
     weight = in_range.astype(jnp.float32) / jnp.maximum(in_range.sum(), 1).astype(jnp.float32)
     targets = soft_targets(truth, log_candidates)
     entropy = -jnp.sum(targets * jax.nn.log_softmax(logits, axis=-1), axis=-1)

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from ssplat_jax.chunk import Chunk
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.data.procedural import STEPS, training_sample
+from ssplat_jax.errors import InputError
 from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.model import GRID_STRIDE
 from ssplat_jax.struct import pytree
@@ -56,6 +57,8 @@ def make_sample(
     rng = np.random.default_rng([seed, 7])
     height, width = size
     num_context = num_chunks * config.chunk_size
+    if num_targets and num_context < 2:
+        raise InputError("training: targets lie between context views, got a context of one view; ask for no targets.")
     num_views = num_context + num_targets
     arrays = training_sample(seed, num_views, height, width, steps=steps_of_depth)
     images, depths, camtoworlds, Ks = (np.asarray(a) for a in arrays)
@@ -93,11 +96,12 @@ def log_depths_at_cells(depths: Float[np.ndarray, "*b h w"]) -> Float[np.ndarray
 
     Across a depth edge a mean is on no surface: where the four differ by more than `EDGE`, one of them is taken.
     """
-    rows, cols = depths.shape[-2:]
     before = GRID_STRIDE // 2 - 1
+    # A cell at the border whose centre is the image's edge has pixels to one side only, and is none.
+    rows, cols = ((side - before - 2) // GRID_STRIDE + 1 for side in depths.shape[-2:])
     around = np.log(
         [
-            depths[..., y:rows:GRID_STRIDE, x:cols:GRID_STRIDE]
+            depths[..., y::GRID_STRIDE, x::GRID_STRIDE][..., :rows, :cols]
             for y in (before, before + 1)
             for x in (before, before + 1)
         ]

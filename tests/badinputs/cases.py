@@ -122,6 +122,17 @@ def both(*spoilers):
     return lambda root, meta: [spoil(root, meta) for spoil in spoilers]
 
 
+def shrunk_without_a_size(root, meta):
+    """Full-size intrinsics, and only images_4: nothing says how much smaller those are."""
+    (root / "images").rename(root / "images_4")
+    top(w=None, h=None)(root, meta)
+
+
+def tiff(pixels, **options):
+    """Replaces image 2 by a TIFF."""
+    return lambda root, meta: Image.fromarray(pixels).save(root / "images" / "2.jpg", format="TIFF", **options)
+
+
 def linked_outside(root, meta):
     outside = root.parent / "outside.jpg"
     (root / "images" / "2.jpg").rename(outside)
@@ -183,6 +194,11 @@ CASES = (
     Case("intrinsics of a pixel", top(w=1, h=1), ("frames[0]: w, h", "1x1", "64x48")),
     Case("intrinsics of nothing", top(w=0, h=96), ("frames[0]: w, h", "0x96", "64x48")),
     Case("intrinsics of half the size", top(w=32, h=24), ("frames[0]: w, h", "32x24", "64x48")),
+    Case("shrunk, nothing says how far", shrunk_without_a_size, ("frames[0]: w, h", "images_4/0.jpg", "add w and h")),
+    Case("floats in a TIFF", tiff(np.ones((HEIGHT, WIDTH), np.float32)), (IMAGE, "8 or 16 bits")),
+    Case("32-bit integers in a TIFF", tiff(np.ones((HEIGHT, WIDTH), np.int32)), (IMAGE, "8 or 16 bits")),
+    Case("a TIFF on its side", tiff(np.zeros((WIDTH, HEIGHT, 3), np.uint8), tiffinfo={274: 6}), (IMAGE, "orientation")),
+    Case("a TIFF upside down", tiff(np.zeros((HEIGHT, WIDTH, 3), np.uint8), tiffinfo={274: 3}), (IMAGE, "orientation")),
     Case("two sizes", both(top(w=None, h=None), other_size(70, 48)), ("64x48", "70x48", "--size")),
     Case("a format that is not read", other_size(WIDTH, HEIGHT, format="TGA"), (IMAGE, "PNG")),
     # poses

@@ -121,6 +121,20 @@ def test_bad_capture_is_one_line_exit_2_and_nothing_written(case, command, tmp_p
     assert not out.exists()
 
 
+@pytest.mark.parametrize("place", ["views", "deltas", "images"])
+@pytest.mark.parametrize("command", ["eval", "run"])
+def test_results_among_the_captures_own_images_are_refused(command, place, tmp_path, capsys):
+    """What a run writes over and clears may be what it reads."""
+    make_capture(tmp_path / place)
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*.*")}
+    options = ("--context", "5") if command == "eval" else ("--overwrite",)
+    for out in (tmp_path, tmp_path / place, tmp_path / place / "images"):
+        assert run(command, str(tmp_path / place), *options, "--out", str(out)) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert "--out" in line
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*.*")} == before
+
+
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
@@ -229,7 +243,6 @@ def test_run_stops_resumes_and_exports(tmp_path, capsys):
     assert "another poses" in capsys.readouterr().err
 
 
-@pytest.mark.slow  # a program of its own
 def test_more_room_the_remedy_for_a_run_that_stopped_for_want_of_it_goes_on_with_what_was_saved(tmp_path):
     out, capture = tmp_path / "run", str(make_capture(tmp_path / "capture", num_frames=8, size=(64, 48)))
     assert run("run", capture, "--out", str(out), "--set", "overflow=error", "--quiet") == 0

@@ -165,6 +165,20 @@ def test_images_of_a_shrunk_folder_stand_in_for_missing_ones(tmp_path):
     assert {frame.path.parent.name for frame in capture.frames if frame.path} == {"images_4"}
 
 
+@pytest.mark.parametrize("turned", [False, True], ids=["landscape", "portrait"])
+def test_the_longer_side_says_how_far_images_were_shrunk(tmp_path, turned):
+    """1087 / 8 is rounded down to 135: scaled by the ratio of the short sides, the long one would be off by more."""
+    wanted, stored = ((1087, 1920), (135, 240)) if turned else ((1920, 1087), (240, 135))
+
+    def describe(root, meta):
+        for path in (root / "images").iterdir():
+            Image.new("RGB", stored).save(path)
+        meta.update(w=wanted[0], h=wanted[1], fl_x=1500.0, fl_y=1500.0, cx=wanted[0] / 2, cy=wanted[1] / 2)
+
+    capture = open_capture(make(tmp_path / "c", describe))
+    np.testing.assert_allclose(intrinsics(capture)[:2], 1500 / 8)
+
+
 def intrinsics(capture):
     K = capture.frames[0].K
     return K[0, 0], K[1, 1], K[0, 2], K[1, 2]

@@ -12,6 +12,7 @@ from skimage.transform import resize
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.data import scale as scale_module
 from ssplat_jax.data.capture import Capture, open_capture
+from ssplat_jax.data.inspect import summarize
 from ssplat_jax.data.pixels import ArrayPixels
 from ssplat_jax.data.posed_frame import Frame
 from ssplat_jax.data.protocol import interleaved
@@ -152,6 +153,32 @@ def test_order_of_the_frames_does_not_bring_false_pairs():
 def test_no_motion_is_a_guess_of_one(num_frames):
     depths = estimate_depths(two_planes(num_frames, 0.0), range(num_frames))
     assert (depths.source, depths.median, depths.num_points) == ("baselines", 1.0, 0)
+
+
+@pytest.mark.parametrize("center", [[1.0, 2.0, 0.5], [0.0, 0.0, 0.0], [4.2e6, 6.1e5, 4.7e6]])
+def test_a_tripods_rounding_is_no_motion(center):
+    """Inverted matrices put one place at slightly different ones: no baseline to measure depth by."""
+    capture, rng = two_planes(6, 0.0, spin=3.0), np.random.default_rng(0)
+    for frame in capture.frames:
+        frame.camtoworld[:3, 3] = np.array(center) * (1 + rng.uniform(-1e-15, 1e-15, 3)) + rng.uniform(-1e-16, 1e-16, 3)
+    depths = estimate_depths(capture, range(6))
+    assert (depths.source, depths.median) == ("baselines", 1.0)
+    assert "one place" in summarize(capture, StreamConfig()).warnings[-1]
+
+
+def test_a_median_behind_the_camera_is_no_depth(monkeypatch):
+    """False matches of some cells of the image may outvote the true ones of a crowded cell."""
+    n = 40
+    points = scale_module._Points(
+        inverse_depths=np.where(np.arange(n) < n // 4, -0.5, 0.5),
+        parallax=np.where(np.arange(n) < n // 4, -3.0, 3.0),
+        weights=np.where(np.arange(n) < n // 4, 1.0, 0.1),
+        close=np.zeros(0),
+    )
+    monkeypatch.setattr(scale_module, "_best_pair", lambda *_: points)
+    depths = estimate_depths(two_planes(3, 0.2), range(3))
+    assert depths.source == "baselines" and depths.median == pytest.approx(5 * 0.2)
+    assert min(stream_scale(depths, StreamConfig())) > 0
 
 
 def test_bare_walls_are_a_guess_from_the_steps():

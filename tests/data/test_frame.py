@@ -110,6 +110,16 @@ def test_gaussians_in_the_capture_frame_are_the_same_ellipsoids():
     np.testing.assert_allclose(after.sh, before.sh, rtol=0, atol=FLOAT32_ROUNDING)
 
 
+def test_a_scene_far_smaller_than_its_distance_keeps_its_points_apart():
+    """Centimetres at 0.3 of a unit of kilometres: whole units would count positions from 0 again."""
+    rng = np.random.default_rng(6)
+    frame = frame_at(random_pose(rng, np.array([0.3, -0.4, 0.2])), scale=1e6)
+    before = gaussians(rng, 0)
+    assert any(frame.offset) and np.abs(frame.origin - frame.offset).max() <= 0.5 / frame.scale
+    means = np.asarray(frame.gaussians_to_capture(before, offset=frame.offset).means, np.float64) + frame.offset
+    np.testing.assert_allclose(frame.points_to_stream(means), before.means, rtol=0, atol=4 * FLOAT32_ROUNDING)
+
+
 def legendre_color(sh, direction):
     """Colour of degree-1 SH as every splat viewer computes it."""
     x, y, z = direction

@@ -2,11 +2,13 @@
 
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 from ssplat_jax.cli import main
 from ssplat_jax.errors import InputError, StorageError
+from ssplat_jax.export.folders import remove_numbered
 from ssplat_jax.export.only_writer import only_writer
 
 
@@ -19,6 +21,24 @@ def test_a_second_writer_is_refused_until_the_first_has_left(tmp_path):
         pass
     with only_writer(tmp_path):
         pass
+
+
+def test_a_folder_that_takes_no_files_is_found_out_at_once():
+    with pytest.raises(StorageError, match="cannot be written"), only_writer(Path("/proc")):  # not even root's
+        pass
+
+
+def test_only_files_of_our_own_names_are_removed(tmp_path):
+    kept = ("00001.jpg", "0001.png", "000001.png", "holiday.png", "view_00001.png")
+    for name in (*kept, "00001.png", "12345.png"):
+        (tmp_path / name).touch()
+    remove_numbered(tmp_path, "#####.png")
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(kept)
+    for path in tmp_path.iterdir():
+        path.unlink()
+    remove_numbered(tmp_path, "#####.png")
+    assert not tmp_path.exists()
+    remove_numbered(tmp_path, "#####.png")
 
 
 def test_a_killed_writer_holds_nothing(tmp_path):

@@ -108,6 +108,32 @@ def test_cells_out_of_range_have_no_part_in_the_depth_loss():
     assert float(jnp.abs(gradient[0, 0, 1]).max()) == 0
 
 
+@pytest.mark.parametrize("unknown", [-np.inf, np.inf, np.nan, 3.0])
+@pytest.mark.parametrize("candidates", [np.linspace(0.0, 1.0, 5), np.zeros(1)], ids=["five", "one"])
+def test_cells_of_unknown_depth_leave_the_loss_finite(candidates, unknown):
+    candidates = jnp.asarray(candidates, jnp.float32)
+    truth, usable = jnp.array([[[0.5, unknown]]]), jnp.ones((1, 1, 2), bool)
+    logits = jnp.zeros((1, 1, 2, len(candidates)))
+    loss = lambda x, y: sum(depth_loss(x, y, truth, candidates, usable))  # noqa: E731
+    value, gradients = jax.value_and_grad(loss, argnums=(0, 1))(logits, jnp.full((1, 1, 2), 0.2))
+    assert np.isfinite(value) and all(np.isfinite(g).all() for g in gradients)
+    assert not any(np.asarray(g)[0, 0, 1].any() for g in gradients)
+
+
+@pytest.mark.parametrize("rows", range(5, 13))
+def test_every_size_has_the_depth_of_the_cells_whose_centres_it_holds(rows):
+    log_depths = np.linspace(0.0, 0.01 * rows, rows)[:, None] * np.ones((1, 8))
+    found = log_depths_at_cells(np.exp(log_depths))
+    centers = 4 * np.arange((rows + 1) // 4) + 2  # of cells, in pixels; between pixels 1 and 2 of each
+    assert centers[-1] < rows <= centers[-1] + 4
+    np.testing.assert_allclose(found[:, 0], (log_depths[centers - 1, 0] + log_depths[centers, 0]) / 2, atol=1e-6)
+
+
+def test_targets_need_views_around_them():
+    with pytest.raises(InputError, match="a context of one view"):
+        make_sample(0, num_chunks=1, num_targets=1, size=(16, 16), config=NARROW.replace(chunk_size=1))
+
+
 @pytest.mark.slow  # a program of its own
 def test_sizes_that_the_network_pads_train():
     """72 rows become 96: the truth is padded like the images, and padding has no part in the loss."""

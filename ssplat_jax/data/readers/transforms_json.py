@@ -88,7 +88,8 @@ def _read_frame(root: Path, meta: dict[str, Any], entry: dict[str, Any], where: 
         raise refusal(f"{where}.transform_matrix", wanted="a 4x4 matrix", got="nothing", fix=fix)
     opengl, deviation = check_camtoworld(entry["transform_matrix"], f"{where}.transform_matrix")
     fields = _Fields(meta, entry, where)
-    (width, height), shrink = _check_size(fields, path)
+    is_shrunk = path.relative_to(root).parts[0] in SHRUNK_FOLDERS and str(name).startswith("images/")
+    (width, height), shrink = _check_size(fields, path, is_shrunk=is_shrunk)
     _check_model(fields)
     fx, fy = (shrink * focal for focal in _focal(fields, width / shrink, height / shrink))
     cx, cy = (shrink * fields.number(name, side / shrink / 2) for name, side in (("cx", width), ("cy", height)))
@@ -156,17 +157,23 @@ def _inside(root: Path, name: object, where: str, extensions: tuple[str, ...], f
     raise refusal(where, wanted="an existing file", got=got, fix="add the file or drop the frame")
 
 
-def _check_size(fields: _Fields, path: Path) -> tuple[tuple[int, int], float]:
+def _check_size(fields: _Fields, path: Path, *, is_shrunk: bool) -> tuple[tuple[int, int], float]:
     """(width, height) of the stored image, and how much smaller it is than the w and h of its intrinsics.
 
     Folders of shrunk images (nerfstudio's images_2, images_4) keep the intrinsics of the full size: both sides shrunk
     alike, to a pixel, are taken for such. Larger images than described are not.
     """
     width, height = image_size(path)
+    in_pixels = any(fields.get(name) is not None for name in ("fl_x", "fl_y", "cx", "cy"))
+    if is_shrunk and in_pixels and None in (fields.get("w"), fields.get("h")):
+        got = f"none, and {path.parent.name}/{path.name} of {width}x{height} in its place"
+        fix = "add w and h, so that the intrinsics can be shrunk too"
+        raise refusal(f"{fields.where}: w, h", wanted="the size of the image that is described", got=got, fix=fix)
     wanted = (fields.number("w", float(width)), fields.number("h", float(height)))
     if wanted == (width, height):
         return (width, height), 1.0
-    if wanted[0] > width and abs(wanted[1] * (shrink := width / wanted[0]) - height) <= 1.0:
+    shrink = max(width, height) / max(*wanted, 1e-9)  # the longer side is rounded less
+    if shrink < 1 and all(abs(w * shrink - side) <= 1.0 for w, side in zip(wanted, (width, height), strict=True)):
         return (width, height), shrink
     fix = "set w and h to the stored size and scale fl_x, fl_y, cx, cy with them"
     if wanted == (height, width):
