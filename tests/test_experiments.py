@@ -6,6 +6,7 @@ from typing import get_args
 import numpy as np
 import pytest
 
+from experiments.ablation import table
 from experiments.accuracy_vs_time import SCORED, SETTINGS, mark_front
 from experiments.depth_error import cell_depths, summary
 from ssplat_jax.cli import Experiment, QualityName, guarded
@@ -47,6 +48,20 @@ def test_a_cell_s_depth_is_the_median_of_what_is_known_of_it():
     depth[:2, 4:] = 5.0
     depth[4, 4] = 7.0
     np.testing.assert_array_equal(cell_depths(depth), [[8.0, 5.0], [0.0, 0.0]])
+
+
+def test_variants_are_compared_with_the_full_model_of_the_same_seed():
+    """Seeds move all scores alike: the difference's spread is not that of the scores."""
+    scores = {"full": (20.0, 22.0, 24.0), "without HPDA": (19.9, 21.8, 23.9), "without CGFI": (20.5,)}
+    rows = [
+        {"scene": "room", "variant": variant, "seed": seed, "psnr": psnr, "gaussians": 10}
+        for variant, column in scores.items()
+        for seed, psnr in enumerate(column)
+    ]
+    lines = table(rows).splitlines()[2:]
+    assert lines[0] == "| room | full | 22.00 ± 2.00 (3) |  | 10 |"
+    assert lines[1] == "| room | without HPDA | 21.87 ± 2.00 (3) | 0.13 ± 0.06 (3) | 10 |"
+    assert lines[2] == "| room | without CGFI | 20.50 (one seed) | -0.50 (one seed) | 10 |"
 
 
 def test_every_registered_experiment_can_be_loaded():
