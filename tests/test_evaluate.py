@@ -1,7 +1,6 @@
 """What a score counts: holes in the colours around, and what they would cost over black."""
 
 import json
-from typing import ClassVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -68,25 +67,26 @@ def test_a_view_is_shown_at_the_mean_exposure_of_the_nearest_that_were_streamed(
     np.testing.assert_allclose(color, np.broadcast_to([0.2, 0.4, 1.0], color.shape), atol=1e-6)
 
 
-def test_making_room_is_no_part_of_a_chunks_time(capture, monkeypatch):
+@pytest.mark.parametrize(("overflow", "capacity"), [("grow", 256), ("error", 256), ("drop_new", 128)])
+def test_making_room_is_no_part_of_a_chunks_time(overflow, capacity, capture, monkeypatch):
     """A cache that the next chunk might not fit is doubled before the clock starts, and given back as it was."""
     monkeypatch.setattr(evaluate, "LATENCY_REPEATS", 1)
 
-    class Watched(Session):
-        capacities: ClassVar[list[int]] = []
+    capacities = []
 
+    class Watched(Session):
         def feed(self, chunk):
-            self.capacities.append(self.cache.capacity)
+            capacities.append(self.cache.capacity)
 
         def gaussians(self):
             return gaussians([[0.2, 0.4, 0.6]], [0.9])
 
-    config = StreamConfig(capacity=128)
+    config = StreamConfig(capacity=128, overflow=overflow)
     chunk = next(iter(capture.chunks(config, (0, 1, 3, 4))))
     session = Watched(StreamSplat(config), {}, init_cache(config))
     frame = capture.stream_frame(config, (0, 1, 3, 4))
     milliseconds = measure_latency(session, [chunk], capture.camera(2, frame))
-    assert session.capacities == [256, 256] and session.cache.capacity == 128  # 4 x 8 x 8 tokens
+    assert capacities == [capacity] * 2 and session.cache.capacity == 128  # 4 x 8 x 8 tokens
     assert milliseconds["render_ms"] > 0
 
 
