@@ -1,8 +1,10 @@
 """Which Gaussians touch which tile, front to back: sorted (tile, Gaussian) pairs.
 
 Rows are (camera, Gaussian) flattened to `m = b n`; tiles are numbered camera-major, row-major. Gaussians are sorted
-once by (depth, row); a pair's key is then `tile << bits | depth rank`, so that one sort of plain integers puts
+once by (depth, row); a pair's key is then `tile << bits | depth rank`, so that a sort of plain integers puts
 everything in exact order. XLA sorts single integers five times faster than (key, payload) tuples, hence the packing.
+Pairs are found from near to far, so that pieces of them, sorted each by itself, need only be laid one after the other
+within each tile: XLA's CPU runtime sorts the pieces on all cores, a single array on one.
 """
 
 import functools
@@ -10,7 +12,7 @@ import functools
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Int, Shaped
+from jaxtyping import Array, Bool, Int, Shaped
 
 from ssplat_jax.render import constants
 from ssplat_jax.render.projection import Splats
@@ -18,7 +20,8 @@ from ssplat_jax.struct import pytree, static
 
 EIGHTHS = (5, 6, 8)  # of the room for pairs (a power of two): the least share that holds them is what is sorted
 WORTH_CHOOSING = 1 << 16  # room for pairs below which all of it is sorted: each share is compiled by itself
-PARTS = 4  # turns of the loops in `take_rows` and `_tiles`; a loop of one is none
+PIECES = 16  # sorted by themselves where room is chosen; the CPU runtime shares out what waits from nine at a time on
+PARTS = 4  # turns of the loop in `_tiles`; a loop of one is none
 MOST_PAIRS = (1 << 31) - 1  # what an index reaches; counts of pairs stop there
 KEY_BITS = 32  # keys wider than this are sorted as 64-bit integers
 
@@ -100,9 +103,10 @@ def bin_splats(splats: Splats, grid: Grid, max_pairs: int) -> Pairs:
     order = depth_order(splats)
     num_rows = order.shape[0]
     visible_first = jnp.arange(num_rows) < jnp.sum(splats.visible)
-    boxes = jnp.where(visible_first[:, None], take_rows(tile_boxes(splats, grid), order), 0)
+    seen = jnp.any(splats.visible)
+    boxes = jnp.where(visible_first[:, None], take_rows(tile_boxes(splats, grid), order, seen), 0)
     ends = _running_sum(boxes[:, 2] * boxes[:, 3])
-    outlines = _outlines(splats, boxes, ends, order, grid)
+    outlines = _outlines(splats, boxes, ends, order, seen, grid)
 
     def sorted_pairs(room: int):
         ranks = _owners(ends, room)
@@ -116,19 +120,24 @@ def bin_splats(splats: Splats, grid: Grid, max_pairs: int) -> Pairs:
     return Pairs(rows=rows, bounds=bounds, num_pairs=ends[-1])
 
 
-def take_rows(table: Shaped[Array, "m f"], rows: Int[Array, " p"]) -> Shaped[Array, "p f"]:
-    """`table[rows]`.
+def take_rows(table: Shaped[Array, "m f"], rows: Int[Array, " p"], wanted: Bool[Array, ""]) -> Shaped[Array, "p f"]:
+    """`table[rows]` if `wanted`, else zeros.
 
-    In a loop, where the gather copies rows of operands that are there: left to itself, XLA's CPU compiler fuses it with
-    what stands around it and goes entry by entry (forward 993 ms instead of 604 at 262,144 Gaussians;
-    `lax.optimization_barrier` is gone by then).
+    In a branch, the gather copies rows of operands that are there: left to itself, XLA's CPU compiler fuses it with
+    what stands around it and goes entry by entry (`lax.optimization_barrier` is gone by then). A loop would do as well,
+    but first fills its result with zeros.
     """
-    padded = jnp.pad(rows, (0, -rows.shape[0] % PARTS))
-    taken = lax.map(lambda part: table[part], padded.reshape(PARTS, -1))
-    return taken.reshape(-1, table.shape[1])[: rows.shape[0]]
+    return lax.cond(wanted, lambda: table[rows], lambda: jnp.zeros((rows.shape[0], table.shape[1]), table.dtype))
 
 
-def _outlines(splats: Splats, boxes: Int[Array, "m 4"], ends: Int[Array, " m"], order: Int[Array, " m"], grid: Grid):
+def _outlines(
+    splats: Splats,
+    boxes: Int[Array, "m 4"],
+    ends: Int[Array, " m"],
+    order: Int[Array, " m"],
+    seen: Bool[Array, ""],
+    grid: Grid,
+):
     """What the pairs of each Gaussian are found from, in depth order: integers and floats `[m]`.
 
     Its first pair, its first tile and the columns of its box; its mean from the centre of that tile's first pixel, the
@@ -139,7 +148,7 @@ def _outlines(splats: Splats, boxes: Int[Array, "m 4"], ends: Int[Array, " m"], 
     whole = ends - boxes[:, 2] * boxes[:, 3], first_tiles, jnp.maximum(boxes[:, 2], 1)
     bounds = jnp.log(jnp.maximum(splats.opacities / constants.ALPHA_MIN, 1.0))
     columns = [*jnp.moveaxis(splats.means2d, -1, 0), *jnp.moveaxis(splats.factors, -1, 0), bounds]
-    x, y, *rest = take_rows(jnp.stack([column.reshape(-1) for column in columns], axis=-1), order).T
+    x, y, *rest = take_rows(jnp.stack([column.reshape(-1) for column in columns], axis=-1), order, seen).T
     x, y = (mean - ((boxes[:, i] * grid.tile).astype(mean.dtype) + 0.5) for i, mean in enumerate((x, y)))
     return whole, (x, y, *rest)
 
@@ -192,15 +201,33 @@ def _owners(ends: Int[Array, " m"], max_pairs: int) -> Int[Array, " p"]:
 def _sort_pairs(
     tiles: Int[Array, " p"], ranks: Int[Array, " p"], num_tiles: int, num_rows: int
 ) -> tuple[Int[Array, " p"], Int[Array, " tiles_and_one"]]:
-    """Depth ranks in order of (tile, rank), and where each tile's begin."""
+    """Depth ranks in order of (tile, rank), and where each tile's begin, of pairs in order of rank."""
+    room = tiles.shape[0]
+    pieces = PIECES if room >= WORTH_CHOOSING else 1
+    padding = (0, -room % pieces)
     bits = max(1, (num_rows - 1).bit_length())
     fits = num_tiles.bit_length() + bits <= KEY_BITS
     with jax.enable_x64(not fits):
         dtype = jnp.uint32 if fits else jnp.uint64
         shift = jnp.array(bits, dtype)
-        keys = (tiles.astype(dtype) << shift) | ranks.astype(dtype)
-        keys = lax.sort(keys)
+        tiles = jnp.pad(tiles, padding, constant_values=num_tiles).astype(dtype)
+        keys = (tiles << shift) | jnp.pad(ranks, padding).astype(dtype)
+        keys = jnp.stack([lax.sort(piece) for piece in jnp.split(keys, pieces)])
         starts = jnp.arange(num_tiles + 1, dtype=dtype) << shift
-        bounds = jnp.searchsorted(keys, starts).astype(jnp.int32)
-        sorted_ranks = (keys & ((jnp.array(1, dtype) << shift) - jnp.array(1, dtype))).astype(jnp.int32)
-    return jnp.minimum(sorted_ranks, num_rows - 1), bounds
+        bounds = jax.vmap(lambda piece: jnp.searchsorted(piece, starts))(keys).astype(jnp.int32)
+        tiles = (keys >> shift).astype(jnp.int32)
+        ranks = (keys & ((jnp.array(1, dtype) << shift) - jnp.array(1, dtype))).astype(jnp.int32)
+    ranks = jnp.minimum(ranks, num_rows - 1)
+    return (ranks[0], bounds[0]) if pieces == 1 else _join(tiles, ranks, bounds, room)
+
+
+def _join(tiles: Int[Array, "s n"], ranks: Int[Array, "s n"], bounds: Int[Array, "s tiles_and_one"], room: int):
+    """The ranks of sorted pieces, piece after piece within each tile, and where each tile's begin."""
+    num_pieces, size = tiles.shape
+    counts = jnp.diff(bounds, axis=1, append=size)
+    begins = jnp.sum(bounds, axis=0)  # as many stand before a tile as stand before it in all pieces
+    moves = begins + jnp.cumsum(counts, axis=0) - counts - bounds  # of a piece's part in a tile
+    numbers = jnp.arange(num_pieces, dtype=jnp.int32)[:, None] * bounds.shape[1] + tiles
+    places = moves.reshape(-1)[numbers] + jnp.arange(size, dtype=jnp.int32)
+    places = places.reshape(-1)
+    return jnp.zeros_like(places).at[places].set(ranks.reshape(-1), unique_indices=True)[:room], begins

@@ -118,7 +118,8 @@ def median_rows(grid: Grid, shapes: Float[Array, "m 6"], pairs: Pairs) -> Int[Ar
 
 def _sorted_table(shapes, channels, pairs: Pairs) -> Float[Array, "p f"]:
     """One row a pair in sorted order, so that a tile's are contiguous; a turn may read past the end."""
-    return take_rows(jnp.concatenate([shapes, channels], axis=1), jnp.pad(pairs.rows, (0, READ_AHEAD)))
+    rows = jnp.pad(pairs.rows, (0, READ_AHEAD))
+    return take_rows(jnp.concatenate([shapes, channels], axis=1), rows, pairs.num_pairs > 0)
 
 
 def _batches(bounds: Int[Array, " tiles_and_one"], grid: Grid) -> Int[Array, "batches t"]:

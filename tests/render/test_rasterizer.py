@@ -10,7 +10,7 @@ import pytest
 from ssplat_jax.errors import InputError
 from ssplat_jax.gaussians import Gaussians, concatenate, mask_gaussians
 from ssplat_jax.geometry.cameras import Camera
-from ssplat_jax.render import Effects, api, render
+from ssplat_jax.render import Effects, api, binning, render
 from ssplat_jax.render.binning import Grid, bin_splats
 from ssplat_jax.render.projection import project
 from ssplat_jax.render.reference import render_reference
@@ -319,11 +319,31 @@ def test_the_room_for_pairs_does_not_change_what_is_found():
     assert shares == {0, 1, 2}
 
 
+def test_pairs_sorted_in_pieces_are_those_sorted_at_once(monkeypatch):
+    """Several images, rooms that the pieces do not divide and one too small, equal depths."""
+    camera = cameras(90, 130, batch=3)
+    grid = Grid(num_images=3, height=130, width=90, tile=8)
+    gaussians = cloud(3000, degree=0, size=0.2)
+    twice = jax.tree.map(lambda x: jnp.concatenate([x, x[::-1]]), gaussians)
+    splats = project(twice, camera, Effects())
+
+    def binned(pieces, room):
+        monkeypatch.setattr(binning, "PIECES", pieces)
+        return jax.jit(lambda splats: bin_splats(splats, grid, room))(splats)
+
+    for room in (1 << 18, (1 << 17) + 11, 1 << 16):
+        wanted, got = binned(1, room), binned(16, room)
+        num_pairs = int(wanted.bounds[-1])
+        assert num_pairs > room / 8
+        assert int(got.num_pairs) == int(wanted.num_pairs)
+        np.testing.assert_array_equal(got.bounds, wanted.bounds)
+        np.testing.assert_array_equal(got.rows[:num_pairs], wanted.rows[:num_pairs])
+    assert int(wanted.num_pairs) > room
+
+
 # Last: it empties the caches of compiled programs.
 @pytest.mark.slow  # nothing compiled before it serves after it
 def test_keys_wider_than_32_bits_sort_alike(scene, monkeypatch):
-    from ssplat_jax.render import binning
-
     jax.clear_caches()  # both are compiled here, alike
     wanted = render(*scene, max_pairs=1 << 12)
     monkeypatch.setattr(binning, "KEY_BITS", 4)
