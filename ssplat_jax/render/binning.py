@@ -8,6 +8,7 @@ within each tile: XLA's CPU runtime sorts the pieces on all cores, a single arra
 """
 
 import functools
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -121,13 +122,19 @@ def bin_splats(splats: Splats, grid: Grid, max_pairs: int) -> Pairs:
 
 
 def take_rows(table: Shaped[Array, "m f"], rows: Int[Array, " p"], wanted: Bool[Array, ""]) -> Shaped[Array, "p f"]:
-    """`table[rows]` if `wanted`, else zeros.
+    """`table[rows]` if `wanted`, else zeros: copied row by row, since it is done apart."""
+    return apart(wanted, lambda: table[rows])
 
-    In a branch, the gather copies rows of operands that are there: left to itself, XLA's CPU compiler fuses it with
-    what stands around it and goes entry by entry (`lax.optimization_barrier` is gone by then). A loop would do as well,
-    but first fills its result with zeros.
+
+def apart(wanted: Bool[Array, ""], compute: Callable[[], Array]) -> Array:
+    """`compute()` if `wanted`, else zeros: by kernels of its own, from operands that are there.
+
+    Left to itself, XLA's CPU compiler fuses a gather with what stands around it, does it again in each kernel that
+    uses it, and goes entry by entry (`lax.optimization_barrier` is gone by then). It fuses nothing across the edge of
+    a branch. A loop would do as well, but first fills its result with zeros.
     """
-    return lax.cond(wanted, lambda: table[rows], lambda: jnp.zeros((rows.shape[0], table.shape[1]), table.dtype))
+    shape = jax.eval_shape(compute)
+    return lax.cond(wanted, compute, lambda: jnp.zeros(shape.shape, shape.dtype))
 
 
 def _outlines(

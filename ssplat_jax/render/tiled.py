@@ -11,6 +11,7 @@ same turns again, front to back, knowing the totals from the forward pass.
 """
 
 import functools
+import math
 import operator
 from collections.abc import Callable, Iterable
 
@@ -20,11 +21,13 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from ssplat_jax.render import constants
-from ssplat_jax.render.binning import Grid, Pairs, take_rows
+from ssplat_jax.render.binning import Grid, Pairs, apart
 
-TURN = 4
-BATCH = 64
-READ_AHEAD = 2 * TURN  # rows that may be read past a tile's last
+TURN = 8
+BATCH = 128
+LOG_LEAST = math.log(constants.ALPHA_MIN)
+LOG_MOST = math.log(constants.ALPHA_MAX)
+CAPPED = constants.ALPHA_MAX * (1 - 1e-6)  # no less is what exp(LOG_MOST) is rounded to
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0, 1))
@@ -37,38 +40,33 @@ def composite(
 
     Gradients reach `shapes` and `channels`. Samples fainter than 1/255 or capped at 0.99 pass none on to their opacity.
     """
-    return _forward(grid, with_alpha, _sorted_table(shapes, channels, pairs), pairs)
+    return _forward(grid, with_alpha, _table(shapes, channels), pairs)
 
 
 def _forward(grid: Grid, with_alpha: bool, table, pairs: Pairs):
-    num_channels = table.shape[1] - 6
+    num_channels = table.shape[1] - 6 + with_alpha  # alpha is what a channel of ones becomes
 
     def batch(tiles):
         def turn(_, values, alphas, transmittance, out):
             weights, afters = _weights(alphas, transmittance)
-            new = [_total(weight * values[6:, None, u] for u, weight in enumerate(weights))]
-            new += [_total(weights)] * with_alpha
-            return afters[-1], [o + n for o, n in zip(out, new, strict=True)]
+            return afters[-1], out + _total(weight * values[6:, None, u] for u, weight in enumerate(weights))
 
-        blank = jnp.zeros((grid.tile**2, tiles.shape[0]), table.dtype)
-        start = [jnp.zeros((num_channels, *blank.shape), table.dtype)] + [blank] * with_alpha
-        channels, *alpha = _walk(grid, table, pairs, tiles, turn, start)
-        return jnp.concatenate([channels, *(a[None] for a in alpha)])
+        start = jnp.zeros((num_channels, grid.tile**2, tiles.shape[0]), table.dtype)
+        return _walk(grid, table, pairs, tiles, turn, start, with_ones=with_alpha)
 
     batches = _batches(pairs.bounds, grid)
-    out = jnp.moveaxis(lax.map(batch, batches), -1, 1).reshape(-1, num_channels + with_alpha, grid.tile**2)
+    out = jnp.moveaxis(lax.map(batch, batches), -1, 1).reshape(-1, num_channels, grid.tile**2)
     return jnp.zeros((grid.num_tiles, *out.shape[1:]), out.dtype).at[batches.reshape(-1)].set(out, mode="drop")
 
 
 def _composite_fwd(grid: Grid, with_alpha: bool, shapes, channels, pairs: Pairs):
-    table = _sorted_table(shapes, channels, pairs)
+    table = _table(shapes, channels)
     out = _forward(grid, with_alpha, table, pairs)
     return out, (shapes, table, pairs, out)
 
 
 def _composite_bwd(grid: Grid, with_alpha: bool, residuals, cotangents):
     shapes, table, pairs, out = residuals
-    ids = jnp.pad(pairs.rows, (0, READ_AHEAD))
     tails = jnp.sum(out * cotangents, axis=1)
 
     def batch(grads, tiles):
@@ -76,7 +74,7 @@ def _composite_bwd(grid: Grid, with_alpha: bool, residuals, cotangents):
         cotangent = lax.optimization_barrier(jnp.moveaxis(cotangents[inside], 0, -1))  # co p t
         by_channel, by_alpha = (cotangent[:-1], cotangent[-1, :, None]) if with_alpha else (cotangent, 0.0)
 
-        def turn(start, values, alphas, transmittance, state):
+        def turn(numbers, values, alphas, transmittance, state):
             tail, grads = state
             weights, afters = _weights(alphas, transmittance)
             weights = jnp.stack(weights, axis=1)
@@ -84,14 +82,16 @@ def _composite_bwd(grid: Grid, with_alpha: bool, residuals, cotangents):
             tail, exponents = _exponent_gradients(alphas, weights, weights * slopes, tail)
             grad_channels = [_sum_pixels(grid, weights * c[:, None]) for c in by_channel]
             rows = jnp.stack([*_shape_gradients(grid, exponents, values), *grad_channels], axis=-1)
-            grads = grads.at[_next(ids, start).T].add(rows)  # what is read past a tile's end adds zeros
+            grads = grads.at[numbers.T].add(rows)  # what is read past a tile's end adds zeros
             return afters[-1], (tail, grads)
 
         return _walk(grid, table, pairs, tiles, turn, (tails[inside].T, grads))[1], None
 
     grads = jnp.zeros((shapes.shape[0], table.shape[1]), shapes.dtype)
     grads = lax.scan(batch, grads, _batches(pairs.bounds, grid))[0]
-    return grads[:, :6], grads[:, 6:], None
+    opacities = shapes[:, 5:]
+    by_opacity = grads[:, 5:6] / jnp.where(opacities > 0, opacities, 1.0)
+    return jnp.concatenate([grads[:, :5], by_opacity], axis=1), grads[:, 6:], None
 
 
 composite.defvjp(_composite_fwd, _composite_bwd)
@@ -99,13 +99,12 @@ composite.defvjp(_composite_fwd, _composite_bwd)
 
 def median_rows(grid: Grid, shapes: Float[Array, "m 6"], pairs: Pairs) -> Int[Array, "tiles p"]:
     """The row whose sample brings each pixel's transmittance below one half; -1 where none does. No gradient."""
-    table = _sorted_table(shapes, shapes[:, :0], pairs)
-    ids = jnp.pad(pairs.rows, (0, READ_AHEAD))
+    table = _table(shapes, shapes[:, :0])
 
     def batch(tiles):
-        def turn(start, _, alphas, transmittance, found):
+        def turn(numbers, _, alphas, transmittance, found):
             afters = _weights(alphas, transmittance)[1]
-            for after, row in zip(afters, _next(ids, start).T, strict=True):
+            for after, row in zip(afters, numbers.T, strict=True):
                 found = jnp.where((found < 0) & (after < constants.MEDIAN_TRANSMITTANCE), row, found)
             return afters[-1], found
 
@@ -116,10 +115,14 @@ def median_rows(grid: Grid, shapes: Float[Array, "m 6"], pairs: Pairs) -> Int[Ar
     return jnp.full((grid.num_tiles, grid.tile**2), -1, jnp.int32).at[batches.reshape(-1)].set(out, mode="drop")
 
 
-def _sorted_table(shapes, channels, pairs: Pairs) -> Float[Array, "p f"]:
-    """One row a pair in sorted order, so that a tile's are contiguous; a turn may read past the end."""
-    rows = jnp.pad(pairs.rows, (0, READ_AHEAD))
-    return take_rows(jnp.concatenate([shapes, channels], axis=1), rows, pairs.num_pairs > 0)
+def _table(shapes, channels) -> Float[Array, "m f"]:
+    """What compositing reads of each row: `shapes` with the opacity's logarithm in its place, and `channels`.
+
+    An alpha is then one exponential, whose limits act on its power. XLA keeps the exponentials of a turn, and does
+    again in every kernel what comes after them.
+    """
+    logs = jnp.maximum(jnp.log(shapes[:, 5:]), LOG_LEAST)  # no pair has less; that of 1/255 may be rounded to less
+    return jnp.concatenate([shapes[:, :5], logs, channels], axis=1)
 
 
 def _batches(bounds: Int[Array, " tiles_and_one"], grid: Grid) -> Int[Array, "batches t"]:
@@ -137,44 +140,52 @@ def _loads(pairs: Pairs, tiles: Int[Array, " t"]) -> tuple[Int[Array, " t"], Int
     return pairs.bounds[jnp.minimum(tiles, last)], pairs.bounds[jnp.minimum(tiles + 1, last)]
 
 
-def _walk(grid: Grid, table, pairs: Pairs, tiles: Int[Array, " t"], turn: Callable, state):
+def _walk(grid: Grid, table, pairs: Pairs, tiles: Int[Array, " t"], turn: Callable, state, *, with_ones: bool = False):
     """`state` after all turns of a batch, front to back.
 
-    `turn(start, values, alphas, transmittance, state)` gives the transmittance and the state after it. There is another
-    turn while, in one of the tiles, Gaussians are left and a pixel that one could reach.
+    `turn(numbers, values, alphas, transmittance, state)` gives the transmittance and the state after it; `numbers` are
+    rows of `table`, as `_table` makes it. There is another turn while, in one of the tiles, Gaussians are left and a
+    pixel that one could reach.
 
-    A turn reads for the one after it: what a loop carries lies in memory. Read in the turn itself, XLA fuses the
-    reading with every kernel that uses it, and each strides over the table once a sample (docs/performance.md).
+    A turn's Gaussians are looked up, copied and laid in columns `apart`: XLA would otherwise fuse that with every
+    kernel that uses them, and each would go through the table once a sample (docs/performance.md).
     """
     first, last = _loads(pairs, tiles)
+    some = pairs.num_pairs > 0
+    rows = jnp.pad(pairs.rows, (0, TURN))  # a turn may read past the last
 
     def goes_on(carry):
         i, transmittance = carry[:2]
-        return jnp.any((transmittance >= constants.TRANSMITTANCE_STOP) & (first + i * TURN < last))
+        clearest = jnp.max(transmittance, axis=0)
+        return jnp.any((clearest >= constants.TRANSMITTANCE_STOP) & (first + i * TURN < last))
 
     def body(carry):
-        i, transmittance, state, values = carry
+        i, transmittance, state = carry
         start = first + i * TURN
-        transmittance, state = turn(start, values, _alphas(grid, values), transmittance, state)
-        return i + 1, transmittance, state, _read(grid, table, tiles, start + TURN, last)
+        numbers = apart(some, lambda: _next(rows, start))
+        gaussians = apart(some, lambda: table[numbers])
+        values = apart(some, lambda: _columns(grid, gaussians, tiles, start, last, with_ones))
+        transmittance, state = turn(numbers, values, _alphas(grid, values), transmittance, state)
+        return i + 1, transmittance, state
 
     clear = jnp.ones((grid.tile**2, tiles.shape[0]), table.dtype)
-    return lax.while_loop(goes_on, body, (0, clear, state, _read(grid, table, tiles, first, last)))[2]
+    return lax.while_loop(goes_on, body, (0, clear, state))[2]
 
 
 def _next(rows: Array, start: Int[Array, " t"]) -> Array:
-    """`TURN` consecutive rows from each start, `[t u ...]`: copied as blocks, 20 times faster than row by row."""
+    """`TURN` consecutive rows from each start, `[t u ...]`: copied as blocks."""
     return jax.vmap(lambda first: lax.dynamic_slice_in_dim(rows, first, TURN))(start)
 
 
-def _read(grid: Grid, table, tiles, start, last) -> Float[Array, "f u t"]:
-    """Columns of the next `TURN` Gaussians of each tile: x and y from the tile's centre, opacity 0 past its end."""
-    x, y, p, q, r, opacity, *channels = jnp.moveaxis(_next(table, start), (2, 1, 0), (0, 1, 2))
+def _columns(grid: Grid, gaussians: Float[Array, "t u f"], tiles, start, last, with_ones: bool):
+    """A turn's Gaussians, `[f u t]`: x and y from the tile's centre, no opacity past a tile's end, ones if wanted."""
+    x, y, p, q, r, log_opacity, *channels = jnp.moveaxis(gaussians, (2, 1, 0), (0, 1, 2))
     within = tiles % (grid.rows * grid.columns)
     x = x - ((within % grid.columns).astype(x.dtype) + 0.5) * grid.tile
     y = y - ((within // grid.columns).astype(x.dtype) + 0.5) * grid.tile
-    opacity = jnp.where(start + jnp.arange(TURN, dtype=jnp.int32)[:, None] < last, opacity, 0.0)
-    return jnp.stack([x, y, p, q, r, opacity, *channels])
+    is_own = start + jnp.arange(TURN, dtype=jnp.int32)[:, None] < last
+    ones = [jnp.ones_like(x)] * with_ones
+    return jnp.stack([x, y, p, q, r, jnp.where(is_own, log_opacity, -jnp.inf), *channels, *ones])
 
 
 def _offsets(grid: Grid, values) -> tuple[Float[Array, "p u t"], Float[Array, "p u t"]]:
@@ -185,10 +196,10 @@ def _offsets(grid: Grid, values) -> tuple[Float[Array, "p u t"], Float[Array, "p
 
 def _alphas(grid: Grid, values) -> Float[Array, "p u t"]:
     dx, dy = _offsets(grid, values)
-    p, q, r, opacity = values[2:6]
+    p, q, r, log_opacity = values[2:6]
     across, along = p * dx + q * dy, r * dy
-    raw = opacity * jnp.exp(-(across * across) - along * along)
-    return jnp.where(raw >= constants.ALPHA_MIN, jnp.minimum(raw, constants.ALPHA_MAX), 0.0)
+    power = log_opacity - across * across - along * along
+    return jnp.exp(jnp.where(power >= LOG_LEAST, jnp.minimum(power, LOG_MOST), -jnp.inf))
 
 
 def _weights(alphas, transmittance):
@@ -216,7 +227,7 @@ def _exponent_gradients(alphas, weights, gains, tail):
         tail = tail - gains[:, u]
         tails.append(tail)
     last, tails = tails[-1], lax.optimization_barrier(jnp.stack(lax.optimization_barrier(tails), axis=1))
-    free = (weights > 0) & (alphas < constants.ALPHA_MAX)
+    free = (weights > 0) & (alphas < CAPPED)
     ratio = alphas / (1.0 - alphas)
     return last, lax.optimization_barrier(jnp.where(free, ratio * tails - gains, 0.0))
 
@@ -238,12 +249,12 @@ def _sum_pixels(grid: Grid, values: Float[Array, "p u t"]) -> Float[Array, "u t"
 
 
 def _shape_gradients(grid: Grid, exponents: Float[Array, "p u t"], values) -> list[Float[Array, "u t"]]:
-    """Gradients by x, y, p, q, r and opacity, from moments of the exponent gradients over the pixels.
+    """Gradients by x, y, p, q, r and the opacity's logarithm, from moments of the exponent gradients over the pixels.
 
     The exponent is s^2 + (r dy)^2 with s = p dx + q dy, which the moments hold as it is: made of those of dx and dy, it
     would cancel for needles.
     """
-    p, q, r, opacity = values[2:6]
+    p, q, r = values[2:5]
     dx, dy = _offsets(grid, values)
     across = p * dx + q * dy
     rows, rows_s, rows_sdx = (_sum_rows(grid, exponents * weight) for weight in (1.0, across, across * dx))
@@ -258,5 +269,5 @@ def _shape_gradients(grid: Grid, exponents: Float[Array, "p u t"], values) -> li
         2.0 * sum_sdx,
         2.0 * sum_sdy,
         2.0 * r * sum_dydy,
-        -_total(rows) / jnp.where(opacity > 0, opacity, 1.0),
+        -_total(rows),
     ]
