@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
@@ -27,7 +28,11 @@ TURN = 8
 BATCH = 128
 LOG_LEAST = math.log(constants.ALPHA_MIN)
 LOG_MOST = math.log(constants.ALPHA_MAX)
-CAPPED = constants.ALPHA_MAX * (1 - 1e-6)  # no less is what exp(LOG_MOST) is rounded to
+CAPPED = constants.ALPHA_MAX * (1 - 1e-5)  # no less is what exp(LOG_MOST) comes out as
+SQUARINGS = 3
+GROWTH = np.polynomial.Chebyshev.interpolate(np.exp, 5, [0.0, -LOG_LEAST / 2**SQUARINGS]).convert(
+    kind=np.polynomial.Polynomial
+)  # e^y
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0, 1))
@@ -199,7 +204,23 @@ def _alphas(grid: Grid, values) -> Float[Array, "p u t"]:
     p, q, r, log_opacity = values[2:6]
     across, along = p * dx + q * dy, r * dy
     power = log_opacity - across * across - along * along
-    return jnp.exp(jnp.where(power >= LOG_LEAST, jnp.minimum(power, LOG_MOST), -jnp.inf))
+    return _exp(jnp.where(power >= LOG_LEAST, jnp.minimum(power, LOG_MOST), -jnp.inf))
+
+
+def _exp(power: Array) -> Array:
+    """e^power of powers from `LOG_LEAST` to 0 to 3e-6 of itself (float64: exactly), and 0 of minus infinity.
+
+    On that short range, a polynomial of an eighth of it and three squarings take two thirds of the time of XLA's
+    exponential. XLA's CPU compiler keeps what comes out of a division, as it does of an exponential: every kernel would
+    otherwise compute the alphas again.
+    """
+    if power.dtype == jnp.float64:
+        return jnp.exp(power)
+    eighth = power * (-1.0 / 2**SQUARINGS)
+    growth = functools.reduce(lambda total, c: total * eighth + float(c), GROWTH.coef[-2::-1], float(GROWTH.coef[-1]))
+    for _ in range(SQUARINGS):
+        growth = growth * growth
+    return 1.0 / growth
 
 
 def _weights(alphas, transmittance):

@@ -10,7 +10,7 @@ import pytest
 from ssplat_jax.errors import InputError
 from ssplat_jax.gaussians import Gaussians, concatenate, mask_gaussians
 from ssplat_jax.geometry.cameras import Camera
-from ssplat_jax.render import Effects, api, binning, render
+from ssplat_jax.render import Effects, api, binning, render, tiled
 from ssplat_jax.render.binning import Grid, bin_splats
 from ssplat_jax.render.projection import project
 from ssplat_jax.render.reference import render_reference
@@ -191,6 +191,19 @@ def test_long_thin_gaussians_are_as_exact_as_round_ones(length):
     assert fast.max() > 0.8
     is_edge = np.abs(exact - 1 / 255) < 2e-4  # a sample just below 1/255 is skipped, just above it is not
     np.testing.assert_allclose(fast[~is_edge], exact[~is_edge], atol=1e-4)
+
+
+@plainly
+def test_alphas_are_exponentials_of_their_powers():
+    powers = np.linspace(tiled.LOG_LEAST, 0.0, 1_000_001)
+    for dtype, allowed in ((jnp.float32, 3e-6), (jnp.float64, 1e-15)):
+        with jax.enable_x64(dtype == jnp.float64):
+            given = jnp.asarray(powers, dtype)
+            alphas = np.asarray(jax.jit(tiled._exp)(given), np.float64)
+            np.testing.assert_allclose(alphas, np.exp(np.asarray(given, np.float64)), rtol=allowed, atol=0)
+            assert tiled._exp(jnp.array([-jnp.inf], dtype))[0] == 0
+            capped = tiled._exp(jnp.array([tiled.LOG_MOST], dtype))[0]
+            assert tiled.CAPPED <= capped < 1.0
 
 
 @plainly
