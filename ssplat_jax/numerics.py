@@ -3,6 +3,7 @@
 import math
 
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Float
 
 
@@ -20,6 +21,14 @@ def safe_normalize(x: Float[Array, "*s n"], eps: float = 1e-12) -> Float[Array, 
     del shimmed
     unit = scaled / jnp.sqrt(jnp.sum(scaled * scaled, axis=-1, keepdims=True))
     return jnp.where(is_zero, jnp.zeros_like(x), unit)
+
+
+def columns(x: Float[Array, "*s n"]) -> tuple[Float[Array, "*s"], ...]:
+    """The `n` entries along the last axis.
+
+    Split, not indexed: the gradient lays them side by side again. Of indices, it pads each with zeros and adds them up.
+    """
+    return tuple(jnp.squeeze(column, axis=-1) for column in lax.split(x, (1,) * x.shape[-1], axis=-1))
 
 
 def safe_log(x: Float[Array, "*s"], eps: float = 1e-12) -> Float[Array, "*s"]:

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ssplat_jax.numerics import safe_normalize
+from ssplat_jax.numerics import columns, safe_normalize
 
 
 def quats_to_matrices(quats: Float[Array, "*s 4"]) -> Float[Array, "*s 3 3"]:
@@ -12,15 +12,19 @@ def quats_to_matrices(quats: Float[Array, "*s 4"]) -> Float[Array, "*s 3 3"]:
     Limits:
         |q| <= 1e-12 gives the identity, and a zero gradient.
     """
+    return jnp.stack([jnp.stack(row, axis=-1) for row in matrix_entries(quats)], axis=-2)
+
+
+def matrix_entries(quats: Float[Array, "*s 4"]) -> tuple[tuple[Float[Array, "*s"], ...], ...]:
+    """The rows of `quats_to_matrices`, entry by entry: arithmetic on them is fused, and its gradient pads nothing."""
     unit = safe_normalize(quats)
     is_zero = jnp.all(unit == 0, axis=-1, keepdims=True)
-    w, x, y, z = jnp.moveaxis(jnp.where(is_zero, jnp.array([1, 0, 0, 0], unit.dtype), unit), -1, 0)
-    rows = (
+    w, x, y, z = columns(jnp.where(is_zero, jnp.array([1, 0, 0, 0], unit.dtype), unit))
+    return (
         (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
         (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
         (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
     )
-    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def matrices_to_quats(matrices: Float[Array, "*s 3 3"]) -> Float[Array, "*s 4"]:

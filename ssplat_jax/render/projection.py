@@ -13,7 +13,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.geometry.cameras import Camera
-from ssplat_jax.geometry.rotations import quats_to_matrices
+from ssplat_jax.geometry.rotations import matrix_entries
+from ssplat_jax.numerics import columns
 from ssplat_jax.render import constants
 from ssplat_jax.render.distortion import distort, is_folded, lens_field
 from ssplat_jax.render.effects import Effects
@@ -79,8 +80,9 @@ def cull_cameras(camera: Camera) -> tuple[Camera, Bool[Array, " b"]]:
 
 def camera_points(means: Float[Array, "n 3"], viewmats: Float[Array, "b 4 4"]) -> tuple[Float[Array, "b n"], ...]:
     """The three camera coordinates of world points."""
+    entries = columns(means)
     return tuple(
-        sum(viewmats[:, i, j, None] * means[:, j] for j in range(3)) + viewmats[:, i, 3, None] for i in range(3)
+        sum(viewmats[:, i, j, None] * entries[j] for j in range(3)) + viewmats[:, i, 3, None] for i in range(3)
     )
 
 
@@ -160,9 +162,10 @@ def _screen_roots(gaussians: Gaussians, camera: Camera, points: tuple[Float[Arra
         xx, xy, yx, yy = distort(tan_x, tan_y, distortion)[1]
         to_u, to_v = ([a * u + b * v for u, v in zip(to_u, to_v, strict=True)] for a, b in ((xx, xy), (yx, yy)))
     to_u, to_v = [fx * u for u in to_u], [fy * v for v in to_v]
-    axes = quats_to_matrices(gaussians.quats) * gaussians.scales[:, None, :]  # n 3 3, columns are the scaled axes
-    root_u = [sum(to_u[j] * axes[:, j, k] for j in range(3)) for k in range(3)]
-    root_v = [sum(to_v[j] * axes[:, j, k] for j in range(3)) for k in range(3)]
+    rotation, scales = matrix_entries(gaussians.quats), columns(gaussians.scales)
+    axes = [[rotation[j][k] * scales[k] for k in range(3)] for j in range(3)]  # columns are the scaled axes
+    root_u = [sum(to_u[j] * axes[j][k] for j in range(3)) for k in range(3)]
+    root_v = [sum(to_v[j] * axes[j][k] for j in range(3)) for k in range(3)]
     return root_u, root_v
 
 
