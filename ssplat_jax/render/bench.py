@@ -3,7 +3,8 @@
 Scenes are `num` Gaussians of about one pixel over a square image, between depth 1 and 5. Every repetition times all
 candidates one after the other, so that a busy machine slows them alike: the ratios are what to read.
 
-Units: ms are medians over the repetitions, `bytes` are XLA's own temporary memory, `ratio` rows are of those medians.
+Units: ms are medians over the repetitions, `bytes` are XLA's own temporary memory, `ratio` rows are medians of the
+repetitions' ratios.
 """
 
 import functools
@@ -59,8 +60,8 @@ def floor(table: Float[Array, "p 6"], x: Float[Array, " q"], y: Float[Array, " q
     return jnp.minimum(0.99, table[:, 5:6] * jnp.exp(-power)).astype(jnp.bfloat16)
 
 
-def alternate(candidates: dict[str, Callable[[], Any]], repetitions: int = 7) -> dict[str, float]:
-    """Median milliseconds of each candidate, run in turn; the first run of each (its compilation) is not counted."""
+def alternate(candidates: dict[str, Callable[[], Any]], repetitions: int = 11) -> dict[str, Float[np.ndarray, " r"]]:
+    """Milliseconds of each candidate, run in turn; the first run of each (its compilation) is not counted."""
     times: dict[str, list[float]] = {name: [] for name in candidates}
     for turn in range(repetitions + 1):
         for name, candidate in candidates.items():
@@ -68,7 +69,7 @@ def alternate(candidates: dict[str, Callable[[], Any]], repetitions: int = 7) ->
             jax.block_until_ready(candidate())
             if turn:
                 times[name].append(1e3 * (time.perf_counter() - start))
-    return {name: float(np.median(t)) for name, t in times.items()}
+    return {name: np.array(t) for name, t in times.items()}
 
 
 def _loss(gaussians: Gaussians, camera: Camera, max_pairs: int):
@@ -149,7 +150,7 @@ def rows_of(num: int, size: int, *, against: Path | None = None, stages: bool = 
     """The rows of one scene."""
     runs, facts = candidates(num, size, stages=stages)
     if against is not None:
-        runs["against"] = _prototype(against, num, size, int(facts["pairs"]))
+        runs = {"against": _prototype(against, num, size, int(facts["pairs"]))} | runs  # right before "forward"
     times = alternate(runs)
     ratios = {
         "forward_over_floor": times["forward"] / times["floor"],
@@ -159,11 +160,13 @@ def rows_of(num: int, size: int, *, against: Path | None = None, stages: bool = 
         ratios["forward_over_against"] = times["forward"] / times["against"]
     label = f"{num}_{size}"
     units = {"_s": "s", "_bytes": "bytes"}
-    rows = [{"name": f"{label}/{name}", "value": value, "unit": "ms"} for name, value in times.items()]
+    medians = {name: float(np.median(t)) for name, t in times.items()}
+    rows = [{"name": f"{label}/{name}", "value": value, "unit": "ms"} for name, value in medians.items()]
     for name, value in facts.items():
         unit = next((u for suffix, u in units.items() if name.endswith(suffix)), "count")
         rows.append({"name": f"{label}/{name}", "value": value, "unit": unit})
-    return rows + [{"name": f"{label}/{name}", "value": value, "unit": "ratio"} for name, value in ratios.items()]
+    medians = {name: float(np.median(t)) for name, t in ratios.items()}
+    return rows + [{"name": f"{label}/{name}", "value": value, "unit": "ratio"} for name, value in medians.items()]
 
 
 def bench_render(against: Path | None = None, *, scaling: bool = False) -> list[dict[str, Any]]:
