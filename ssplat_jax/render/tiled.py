@@ -30,9 +30,8 @@ LOG_LEAST = math.log(constants.ALPHA_MIN)
 LOG_MOST = math.log(constants.ALPHA_MAX)
 CAPPED = constants.ALPHA_MAX * (1 - 1e-5)  # no less is what exp(LOG_MOST) comes out as
 SQUARINGS = 3
-GROWTH = np.polynomial.Chebyshev.interpolate(np.exp, 5, [0.0, -LOG_LEAST / 2**SQUARINGS]).convert(
-    kind=np.polynomial.Polynomial
-)  # e^y
+CURVE = np.polynomial.Chebyshev.interpolate(np.exp, 5, [0.0, -LOG_LEAST / 2**SQUARINGS])
+GROWTH = CURVE.convert(kind=np.polynomial.Polynomial)  # e^y of an eighth of what an alpha's power can be
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0, 1))
@@ -217,7 +216,9 @@ def _exp(power: Array) -> Array:
     if power.dtype == jnp.float64:
         return jnp.exp(power)
     eighth = power * (-1.0 / 2**SQUARINGS)
-    growth = functools.reduce(lambda total, c: total * eighth + float(c), GROWTH.coef[-2::-1], float(GROWTH.coef[-1]))
+    growth = jnp.asarray(GROWTH.coef[-1], power.dtype)
+    for coefficient in GROWTH.coef[-2::-1]:
+        growth = growth * eighth + float(coefficient)
     for _ in range(SQUARINGS):
         growth = growth * growth
     return 1.0 / growth
