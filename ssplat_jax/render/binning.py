@@ -235,6 +235,5 @@ def _join(tiles: Int[Array, "s n"], ranks: Int[Array, "s n"], bounds: Int[Array,
     begins = jnp.sum(bounds, axis=0)  # as many stand before a tile as stand before it in all pieces
     moves = begins + jnp.cumsum(counts, axis=0) - counts - bounds  # of a piece's part in a tile
     numbers = jnp.arange(num_pieces, dtype=jnp.int32)[:, None] * bounds.shape[1] + tiles
-    places = moves.reshape(-1)[numbers] + jnp.arange(size, dtype=jnp.int32)
-    places = places.reshape(-1)
+    places = (moves.reshape(-1)[numbers] + jnp.arange(size, dtype=jnp.int32)).reshape(-1)
     return jnp.zeros_like(places).at[places].set(ranks.reshape(-1), unique_indices=True)[:room], begins

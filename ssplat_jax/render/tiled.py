@@ -30,8 +30,10 @@ LOG_LEAST = math.log(constants.ALPHA_MIN)
 LOG_MOST = math.log(constants.ALPHA_MAX)
 CAPPED = constants.ALPHA_MAX * (1 - 1e-5)  # no less is what exp(LOG_MOST) comes out as
 SQUARINGS = 3
-CURVE = np.polynomial.Chebyshev.interpolate(np.exp, 5, [0.0, -LOG_LEAST / 2**SQUARINGS])
-GROWTH = CURVE.convert(kind=np.polynomial.Polynomial)  # e^y of an eighth of what an alpha's power can be
+# e^y of an eighth of what an alpha's power can be, a polynomial
+GROWTH = np.polynomial.Chebyshev.interpolate(np.exp, 5, [0.0, -LOG_LEAST / 2**SQUARINGS]).convert(
+    kind=np.polynomial.Polynomial
+)
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0, 1))
