@@ -1,10 +1,12 @@
 """Safe primitives. Each states its limits; tests/stability/test_numerics.py holds a test for every line of them."""
 
 import math
+from collections.abc import Callable
 
+import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 
 def safe_normalize(x: Float[Array, "*s n"], eps: float = 1e-12) -> Float[Array, "*s n"]:
@@ -29,6 +31,17 @@ def columns(x: Float[Array, "*s n"]) -> tuple[Float[Array, "*s"], ...]:
     Split, not indexed: the gradient lays them side by side again. Of indices, it pads each with zeros and adds them up.
     """
     return tuple(jnp.squeeze(column, axis=-1) for column in lax.split(x, (1,) * x.shape[-1], axis=-1))
+
+
+def apart(wanted: Bool[Array, ""], compute: Callable[[], Array]) -> Array:
+    """`compute()` if `wanted`, else zeros: by kernels of its own, from operands that are there.
+
+    Left to itself, XLA's CPU compiler fuses a gather with what stands around it, does it again in each kernel that
+    uses it, and goes entry by entry (`lax.optimization_barrier` is gone by then). It fuses nothing across the edge of
+    a branch. A loop would do as well, but first fills its result with zeros.
+    """
+    shape = jax.eval_shape(compute)
+    return lax.cond(wanted, compute, lambda: jnp.zeros(shape.shape, shape.dtype))
 
 
 def safe_log(x: Float[Array, "*s"], eps: float = 1e-12) -> Float[Array, "*s"]:

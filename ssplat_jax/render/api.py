@@ -10,11 +10,12 @@ from jaxtyping import Array, Float, Num
 from ssplat_jax.errors import InputError
 from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.geometry.cameras import Camera
-from ssplat_jax.render.binning import Grid, bin_splats, count_pairs
+from ssplat_jax.render.binning import Grid, bin_rows, count_pairs
 from ssplat_jax.render.effects import Effects
 from ssplat_jax.render.output import RenderOutput, finish, splat_channels
-from ssplat_jax.render.projection import Splats, cull_cameras, cull_non_finite, project
+from ssplat_jax.render.projection import cull_cameras, cull_non_finite, project
 from ssplat_jax.render.smoothing import filter_3d
+from ssplat_jax.render.table import depth_order, sort_rows, splat_table
 from ssplat_jax.render.tiled import composite, median_rows
 from ssplat_jax.struct import pytree, replace
 
@@ -179,15 +180,19 @@ def _render(inputs: Inputs, effects: Effects, max_pairs: int, tile: int) -> Rend
         gaussians, camera, splats, num_non_finite = prepare(inputs, effects)
         channels = splat_channels(gaussians, splats, camera, effects, inputs.features)
     grid = grid_of(camera, tile)
+    with jax.named_scope("sort"):
+        order = depth_order(splats)
+        table = sort_rows(splat_table(splats, channels), order)
     with jax.named_scope("bin"):
-        pairs = bin_splats(jax.lax.stop_gradient(splats), grid, max_pairs)
+        images = order // gaussians.num_gaussians
+        pairs = bin_rows(jax.lax.stop_gradient(table), images, grid, max_pairs)
     median_depth = None
     with jax.named_scope("composite"):
-        shapes = shape_rows(splats)
-        tiles = composite(grid, effects.needs_alpha, shapes, channels.reshape(-1, channels.shape[-1]), pairs)
+        tiles = composite(grid, effects.needs_alpha, table, pairs)
         if "median_depth" in effects.outputs:
-            rows = untile(median_rows(grid, jax.lax.stop_gradient(shapes), pairs)[:, None], grid)[..., 0]
-            median_depth = jnp.where(rows >= 0, splats.depths.reshape(-1)[jnp.maximum(rows, 0)], 0.0)
+            rows = untile(median_rows(grid, jax.lax.stop_gradient(table), pairs)[:, None], grid)[..., 0]
+            depths = splats.depths.reshape(-1)[order[jnp.maximum(rows, 0)]]
+            median_depth = jnp.where(rows >= 0, depths, 0.0)
     return finish(
         untile(tiles, grid),  # pyright: ignore[reportArgumentType] - custom_vjp hides the type
         inputs.camera,
@@ -201,11 +206,6 @@ def _render(inputs: Inputs, effects: Effects, max_pairs: int, tile: int) -> Rend
 
 
 _render_jit = functools.partial(jax.jit, static_argnums=(1, 2, 3))(_render)
-
-
-def shape_rows(splats: Splats) -> Float[Array, "m 6"]:
-    """What compositing needs of each (camera, Gaussian): x, y, the three factors of its exponent, opacity."""
-    return jnp.concatenate([splats.means2d, splats.factors, splats.opacities[..., None]], axis=-1).reshape(-1, 6)
 
 
 def untile(tiles: Num[Array, "tiles c p"], grid: Grid) -> Num[Array, "b h w c"]:

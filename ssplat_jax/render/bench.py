@@ -23,9 +23,10 @@ from ssplat_jax.errors import InputError
 from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.render import api, tiled
-from ssplat_jax.render.binning import Grid, bin_splats
+from ssplat_jax.render.binning import Grid, bin_rows
 from ssplat_jax.render.effects import Effects
 from ssplat_jax.render.output import splat_channels
+from ssplat_jax.render.table import depth_order, sort_rows, splat_table
 
 EFFECTS = Effects(antialias="classic")  # what the prototype does
 SIZES = ((65_536, 256), (262_144, 512))
@@ -117,15 +118,20 @@ def _stages(gaussians: Gaussians, camera: Camera, max_pairs: int) -> dict[str, C
         usable, flat, splats, _ = api.prepare(api.Inputs(gaussians, camera), EFFECTS)
         return splats, splat_channels(usable, splats, flat, EFFECTS, None)
 
+    @jax.jit
+    def binned(splats, channels):
+        order = depth_order(splats)
+        table = sort_rows(splat_table(splats, channels), order)
+        return table, bin_rows(table, jnp.zeros_like(order), grid, max_pairs)
+
     grid = Grid(num_images=1, height=camera.height, width=camera.width, tile=api.TILE)
-    binned = jax.jit(lambda splats: bin_splats(splats, grid, max_pairs))
-    composited = jax.jit(lambda shapes, channels, pairs: tiled.composite(grid, True, shapes, channels, pairs))
+    composited = jax.jit(lambda table, pairs: tiled.composite(grid, True, table, pairs))
     splats, channels = projected(gaussians)
-    shapes, channels, pairs = api.shape_rows(splats), channels.reshape(-1, channels.shape[-1]), binned(splats)
+    table, pairs = binned(splats, channels)
     return {
         "stage_project": lambda: projected(gaussians),
-        "stage_bin": lambda: binned(splats),
-        "stage_composite": lambda: composited(shapes, channels, pairs),
+        "stage_bin": lambda: binned(splats, channels),
+        "stage_composite": lambda: composited(table, pairs),
     }
 
 

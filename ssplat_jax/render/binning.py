@@ -8,22 +8,28 @@ within each tile: XLA's CPU runtime sorts the pieces on all cores, a single arra
 """
 
 import functools
-from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Int, Shaped
+from jaxtyping import Array, Float, Int
 
+from ssplat_jax.numerics import apart, columns
 from ssplat_jax.render import constants
 from ssplat_jax.render.projection import Splats
+from ssplat_jax.render.table import BOX, SHAPE
 from ssplat_jax.struct import pytree, static
 
-EIGHTHS = (5, 6, 8)  # of the room for pairs (a power of two): the least share that holds them is what is sorted
+SHARES = (
+    9,
+    11,
+    13,
+    16,
+)  # in sixteenths, of the room for pairs (a power of two): the least share that holds them is what is sorted
 WORTH_CHOOSING = 1 << 16  # room for pairs below which all of it is sorted: each share is compiled by itself
 PIECES = 16  # sorted by themselves where room is chosen; the CPU runtime shares out what waits from nine at a time on
-PARTS = 4  # turns of the loop in `_tiles`; a loop of one is none
 MOST_PAIRS = (1 << 31) - 1  # what an index reaches; counts of pairs stop there
+READ_AHEAD = 8  # places behind the last pair that may be read
 KEY_BITS = 32  # keys wider than this are sorted as 64-bit integers
 
 
@@ -56,24 +62,26 @@ class Grid:
 class Pairs:
     """For each tile the rows that touch it, front to back: `rows[bounds[t] : bounds[t + 1]]`."""
 
-    rows: Int[Array, " p"]
+    rows: Int[Array, " p"]  # `READ_AHEAD` more than there is room for
     bounds: Int[Array, " tiles_and_one"]  # pairs whose ellipse misses the tile are left out
     num_pairs: Int[Array, ""]  # needed; those beyond the capacity `p` (the farthest Gaussians) are missing
 
 
-def tile_boxes(splats: Splats, grid: Grid) -> Int[Array, "m 4"]:
-    """Tile ranges (x from, y from, columns, rows) that each row's box covers; invisible ones cover none."""
-    limit = jnp.array([grid.columns, grid.rows], splats.means2d.dtype)
-    low = jnp.clip(jnp.floor((splats.means2d - splats.extents) / grid.tile), 0, limit)
-    high = jnp.clip(jnp.floor((splats.means2d + splats.extents) / grid.tile) + 1, 0, limit)
-    size = jnp.where(splats.visible[..., None], high - low, 0)
-    return jnp.concatenate([low, size], axis=-1).astype(jnp.int32).reshape(-1, 4)
+def tile_boxes(means2d: Float[Array, "*m 2"], halves: Float[Array, "*m 2"], grid: Grid) -> tuple[Int[Array, "*m"], ...]:
+    """Tile ranges (x from, y from, columns, rows) that each row's box covers; boxes of no size cover none."""
+    sides = []
+    for mean, half, limit in zip(columns(means2d), columns(halves), (grid.columns, grid.rows), strict=True):
+        low, high = (jnp.floor((mean + sign * half) / grid.tile) for sign in (-1, 1))
+        low, high = jnp.clip(low, 0, limit), jnp.clip(high + 1, 0, limit)
+        sides.append((low.astype(jnp.int32), jnp.where(half > 0, high - low, 0).astype(jnp.int32)))
+    (left, width), (top, height) = sides
+    return left, top, width, height
 
 
 def count_pairs(splats: Splats, grid: Grid) -> Int[Array, ""]:
-    """Pairs that `bin_splats` needs room for; `MOST_PAIRS` stands for any number from there on."""
-    boxes = tile_boxes(splats, grid)
-    return _running_sum(boxes[:, 2] * boxes[:, 3])[-1]
+    """Pairs that `bin_rows` needs room for; `MOST_PAIRS` stands for any number from there on."""
+    _, _, width, height = tile_boxes(splats.means2d, splats.extents, grid)
+    return _running_sum((width * height).reshape(-1))[-1]
 
 
 def _running_sum(counts: Int[Array, " m"]) -> Int[Array, " m"]:
@@ -82,102 +90,53 @@ def _running_sum(counts: Int[Array, " m"]) -> Int[Array, " m"]:
         return jnp.minimum(jnp.cumsum(counts.astype(jnp.int64)), MOST_PAIRS).astype(jnp.int32)
 
 
-def depth_order(splats: Splats) -> Int[Array, " m"]:
-    """Rows from near to far, ties by row number; invisible rows last (and all alike: row 0).
+def bin_rows(table: Float[Array, "m f"], images: Int[Array, " m"], grid: Grid, max_pairs: int) -> Pairs:
+    """The sorted pairs of tiles and the rows of a table (from near to far), at most `max_pairs` of them.
 
-    One 64-bit integer a row, depth bits above row number, whatever `jax_enable_x64` says: exact and without payload.
-    Depths in float64 fill that integer alone and are sorted with their row.
+    Args:
+        table: as `splat_table` makes it, sorted.
+        images: which image each row is seen in.
+        grid: the tiles.
+        max_pairs: room for pairs.
     """
-    depths, visible = splats.depths.reshape(-1), splats.visible.reshape(-1)
-    if depths.dtype == jnp.float64:
-        rows = lax.iota(jnp.int32, depths.shape[0])
-        return jnp.where(visible, rows, 0)[lax.sort((jnp.where(visible, depths, jnp.inf), rows), num_keys=2)[1]]
-    with jax.enable_x64(True):
-        bits = lax.bitcast_convert_type(depths, jnp.uint32).astype(jnp.uint64)  # positive floats sort as integers
-        keys = (bits << jnp.uint64(32)) | lax.iota(jnp.uint64, depths.shape[0])
-        keys = lax.sort(jnp.where(visible, keys, jnp.uint64(0xFFFFFFFF00000000)))
-        return (keys & jnp.uint64(0xFFFFFFFF)).astype(jnp.int32)
-
-
-def bin_splats(splats: Splats, grid: Grid, max_pairs: int) -> Pairs:
-    """The sorted pairs of `splats` and tiles, at most `max_pairs` of them."""
-    order = depth_order(splats)
-    num_rows = order.shape[0]
-    visible_first = jnp.arange(num_rows) < jnp.sum(splats.visible)
-    seen = jnp.any(splats.visible)
-    boxes = jnp.where(visible_first[:, None], take_rows(tile_boxes(splats, grid), order, seen), 0)
-    ends = _running_sum(boxes[:, 2] * boxes[:, 3])
-    outlines = _outlines(splats, boxes, ends, order, seen, grid)
+    num_rows = table.shape[0]
+    left, top, width, height = tile_boxes(table[:, :2], table[:, -BOX:], grid)
+    ends = _running_sum(width * height)
+    # What a row's pairs are found from: its first pair, its first tile and the columns of its box; its mean from the
+    # centre of that tile's first pixel, the factors of its exponent, and the largest exponent with alpha still 1/255.
+    first_tiles = (images * grid.rows + top) * grid.columns + left
+    x, y, *factors, logs = columns(table[:, :SHAPE])
+    x, y = (mean - ((side * grid.tile).astype(mean.dtype) + 0.5) for mean, side in ((x, left), (y, top)))
+    outlines = (
+        (ends - width * height, first_tiles, jnp.maximum(width, 1)),
+        (x, y, *factors, logs - constants.LOG_ALPHA_MIN),
+    )
 
     def sorted_pairs(room: int):
         ranks = _owners(ends, room)
         ranks, bounds = _sort_pairs(_tiles(outlines, ranks, ends[-1], grid), ranks, grid.num_tiles, num_rows)
-        return jnp.pad(order[ranks], (0, max_pairs - room)), bounds
+        return jnp.pad(ranks, (0, max_pairs - room + READ_AHEAD)), bounds
 
-    shares = EIGHTHS if max_pairs >= WORTH_CHOOSING else EIGHTHS[-1:]
-    rooms = sorted({-(-max_pairs * share // 8) for share in shares})
+    shares = SHARES if max_pairs >= WORTH_CHOOSING else SHARES[-1:]
+    rooms = sorted({-(-max_pairs * share // 16) for share in shares})
     enough = jnp.sum(ends[-1] > jnp.array(rooms[:-1], jnp.int32), dtype=jnp.int32)
     rows, bounds = lax.switch(enough, [functools.partial(sorted_pairs, room) for room in rooms])
     return Pairs(rows=rows, bounds=bounds, num_pairs=ends[-1])
 
 
-def take_rows(table: Shaped[Array, "m f"], rows: Int[Array, " p"], wanted: Bool[Array, ""]) -> Shaped[Array, "p f"]:
-    """`table[rows]` if `wanted`, else zeros: copied row by row, since it is done apart."""
-    return apart(wanted, lambda: table[rows])
-
-
-def apart(wanted: Bool[Array, ""], compute: Callable[[], Array]) -> Array:
-    """`compute()` if `wanted`, else zeros: by kernels of its own, from operands that are there.
-
-    Left to itself, XLA's CPU compiler fuses a gather with what stands around it, does it again in each kernel that
-    uses it, and goes entry by entry (`lax.optimization_barrier` is gone by then). It fuses nothing across the edge of
-    a branch. A loop would do as well, but first fills its result with zeros.
-    """
-    shape = jax.eval_shape(compute)
-    return lax.cond(wanted, compute, lambda: jnp.zeros(shape.shape, shape.dtype))
-
-
-def _outlines(
-    splats: Splats,
-    boxes: Int[Array, "m 4"],
-    ends: Int[Array, " m"],
-    order: Int[Array, " m"],
-    seen: Bool[Array, ""],
-    grid: Grid,
-):
-    """What the pairs of each Gaussian are found from, in depth order: integers and floats `[m]`.
-
-    Its first pair, its first tile and the columns of its box; its mean from the centre of that tile's first pixel, the
-    factors of its exponent, and the largest exponent at which alpha is still 1/255.
-    """
-    image = order // splats.depths.shape[1]
-    first_tiles = (image * grid.rows + boxes[:, 1]) * grid.columns + boxes[:, 0]
-    whole = ends - boxes[:, 2] * boxes[:, 3], first_tiles, jnp.maximum(boxes[:, 2], 1)
-    bounds = jnp.log(jnp.maximum(splats.opacities / constants.ALPHA_MIN, 1.0))
-    columns = [*jnp.moveaxis(splats.means2d, -1, 0), *jnp.moveaxis(splats.factors, -1, 0), bounds]
-    x, y, *rest = take_rows(jnp.stack([column.reshape(-1) for column in columns], axis=-1), order, seen).T
-    x, y = (mean - ((boxes[:, i] * grid.tile).astype(mean.dtype) + 0.5) for i, mean in enumerate((x, y)))
-    return whole, (x, y, *rest)
-
-
 def _tiles(outlines, ranks: Int[Array, " p"], num_pairs: Int[Array, ""], grid: Grid) -> Int[Array, " p"]:
-    """The tile of every pair; `grid.num_tiles` where there is none, or one that the Gaussian's ellipse misses.
+    """The tile of every pair; `grid.num_tiles` where there is none, or one that the Gaussian's ellipse misses."""
 
-    In a loop, whose operands are there before it: one kernel then reads what it needs of each pair's Gaussian.
-    """
-    padded = jnp.pad(ranks, (0, -ranks.shape[0] % PARTS)).reshape(PARTS, -1)
-
-    def part(operands):
-        number, ranks = operands
+    def tiles_of():
         (starts, tiles, columns), (x, y, *rest) = jax.tree.map(lambda column: column[ranks], outlines)
-        pair = number * ranks.shape[0] + jnp.arange(ranks.shape[0], dtype=jnp.int32)
+        pair = jnp.arange(ranks.shape[0], dtype=jnp.int32)
         down = (pair - starts) // columns
         right = pair - starts - down * columns
         low = [(side * grid.tile).astype(x.dtype) - mean for side, mean in ((right, x), (down, y))]
         reached = _reaches(low, rest, grid.tile) & (pair < num_pairs)
         return jnp.where(reached, tiles + down * grid.columns + right, grid.num_tiles)
 
-    return lax.map(part, (jnp.arange(PARTS, dtype=jnp.int32), padded)).reshape(-1)[: ranks.shape[0]]
+    return apart(num_pairs >= 0, tiles_of)  # always, which the compiler does not know
 
 
 def _reaches(low, shape, tile: int):

@@ -4,11 +4,16 @@ Others' values: 3DGS 0.2 near, 0.3 px^2 dilation; Mip-Splatting 0.2 near, 0.1; g
 alpha capped at 0.999 up to 1.5.3. Which one is used where is said beside the constant.
 """
 
+import math
+
 NEAR = 0.01
 """Camera z, scene units, at and below which a Gaussian is culled (gsplat; metric scenes have surfaces before 0.2)."""
 
 ALPHA_MIN = 1.0 / 255.0
 """Samples fainter than this are skipped (3DGS, Mip-Splatting, gsplat)."""
+
+LOG_ALPHA_MIN = math.log(ALPHA_MIN)
+"""The least power of e that a sample can be."""
 
 ALPHA_MAX = 0.99
 """Opacity of one sample is capped here, so that 1 - alpha stays invertible (3DGS, Mip-Splatting, gsplat HEAD)."""

@@ -21,12 +21,14 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from ssplat_jax.numerics import apart
 from ssplat_jax.render import constants
-from ssplat_jax.render.binning import Grid, Pairs, apart
+from ssplat_jax.render.binning import READ_AHEAD, Grid, Pairs
+from ssplat_jax.render.table import BOX, SHAPE
 
-TURN = 8
+TURN = READ_AHEAD  # the last of a tile may look past all pairs
 BATCH = 128
-LOG_LEAST = math.log(constants.ALPHA_MIN)
+LOG_LEAST = constants.LOG_ALPHA_MIN
 LOG_MOST = math.log(constants.ALPHA_MAX)
 CAPPED = constants.ALPHA_MAX * (1 - 1e-5)  # no less is what exp(LOG_MOST) comes out as
 SQUARINGS = 3
@@ -37,25 +39,22 @@ GROWTH = np.polynomial.Chebyshev.interpolate(np.exp, 5, [0.0, -LOG_LEAST / 2**SQ
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0, 1))
-def composite(
-    grid: Grid, with_alpha: bool, shapes: Float[Array, "m 6"], channels: Float[Array, "m c"], pairs: Pairs
-) -> Float[Array, "tiles co p"]:
-    """Channels, and alpha behind them if wanted, composited over the pixels of every tile.
+def composite(grid: Grid, with_alpha: bool, table: Float[Array, "m f"], pairs: Pairs) -> Float[Array, "tiles co p"]:
+    """The channels of a sorted `splat_table`, and alpha behind them if wanted, composited over every tile's pixels.
 
-    `shapes` are (x, y, p, q, r, opacity) as `Splats` has them.
-
-    Gradients reach `shapes` and `channels`. Samples fainter than 1/255 or capped at 0.99 pass none on to their opacity.
+    Gradients reach the columns of the shape and the channels. Samples fainter than 1/255 or capped at 0.99 pass none on
+    to their opacity.
     """
-    return _forward(grid, with_alpha, _table(shapes, channels), pairs)
+    return _forward(grid, with_alpha, table, pairs)
 
 
 def _forward(grid: Grid, with_alpha: bool, table, pairs: Pairs):
-    num_channels = table.shape[1] - 6 + with_alpha  # alpha is what a channel of ones becomes
+    num_channels = table.shape[1] - SHAPE - BOX + with_alpha  # alpha is what a channel of ones becomes
 
     def batch(tiles):
         def turn(_, values, alphas, transmittance, out):
             weights, afters = _weights(alphas, transmittance)
-            return afters[-1], out + _total(weight * values[6:, None, u] for u, weight in enumerate(weights))
+            return afters[-1], out + _total(weight * values[SHAPE:, None, u] for u, weight in enumerate(weights))
 
         start = jnp.zeros((num_channels, grid.tile**2, tiles.shape[0]), table.dtype)
         return _walk(grid, table, pairs, tiles, turn, start, with_ones=with_alpha)
@@ -65,14 +64,13 @@ def _forward(grid: Grid, with_alpha: bool, table, pairs: Pairs):
     return jnp.zeros((grid.num_tiles, *out.shape[1:]), out.dtype).at[batches.reshape(-1)].set(out, mode="drop")
 
 
-def _composite_fwd(grid: Grid, with_alpha: bool, shapes, channels, pairs: Pairs):
-    table = _table(shapes, channels)
+def _composite_fwd(grid: Grid, with_alpha: bool, table, pairs: Pairs):
     out = _forward(grid, with_alpha, table, pairs)
-    return out, (shapes, table, pairs, out)
+    return out, (table, pairs, out)
 
 
 def _composite_bwd(grid: Grid, with_alpha: bool, residuals, cotangents):
-    shapes, table, pairs, out = residuals
+    table, pairs, out = residuals
     tails = jnp.sum(out * cotangents, axis=1)
 
     def batch(grads, tiles):
@@ -84,7 +82,7 @@ def _composite_bwd(grid: Grid, with_alpha: bool, residuals, cotangents):
             tail, grads = state
             weights, afters = _weights(alphas, transmittance)
             weights = jnp.stack(weights, axis=1)
-            slopes = sum((c[:, None] * value for c, value in zip(by_channel, values[6:], strict=True)), by_alpha)
+            slopes = sum((c[:, None] * value for c, value in zip(by_channel, values[SHAPE:], strict=True)), by_alpha)
             tail, exponents = _exponent_gradients(alphas, weights, weights * slopes, tail)
             grad_channels = [_sum_pixels(grid, weights * c[:, None]) for c in by_channel]
             rows = jnp.stack([*_shape_gradients(grid, exponents, values), *grad_channels], axis=-1)
@@ -93,19 +91,19 @@ def _composite_bwd(grid: Grid, with_alpha: bool, residuals, cotangents):
 
         return _walk(grid, table, pairs, tiles, turn, (tails[inside].T, grads))[1], None
 
-    grads = jnp.zeros((shapes.shape[0], table.shape[1]), shapes.dtype)
+    grads = jnp.zeros((table.shape[0], table.shape[1] - BOX), table.dtype)
     grads = lax.scan(batch, grads, _batches(pairs.bounds, grid))[0]
-    opacities = shapes[:, 5:]
-    by_opacity = grads[:, 5:6] / jnp.where(opacities > 0, opacities, 1.0)
-    return jnp.concatenate([grads[:, :5], by_opacity], axis=1), grads[:, 6:], None
+    return jnp.pad(grads, ((0, 0), (0, BOX))), None
 
 
 composite.defvjp(_composite_fwd, _composite_bwd)
 
 
-def median_rows(grid: Grid, shapes: Float[Array, "m 6"], pairs: Pairs) -> Int[Array, "tiles p"]:
-    """The row whose sample brings each pixel's transmittance below one half; -1 where none does. No gradient."""
-    table = _table(shapes, shapes[:, :0])
+def median_rows(grid: Grid, table: Float[Array, "m f"], pairs: Pairs) -> Int[Array, "tiles p"]:
+    """The row of a sorted `splat_table` whose sample brings each pixel's transmittance below one half, or -1.
+
+    No gradient.
+    """
 
     def batch(tiles):
         def turn(numbers, _, alphas, transmittance, found):
@@ -119,16 +117,6 @@ def median_rows(grid: Grid, shapes: Float[Array, "m 6"], pairs: Pairs) -> Int[Ar
     batches = _batches(pairs.bounds, grid)
     out = jnp.moveaxis(lax.map(batch, batches), -1, 1).reshape(-1, grid.tile**2)
     return jnp.full((grid.num_tiles, grid.tile**2), -1, jnp.int32).at[batches.reshape(-1)].set(out, mode="drop")
-
-
-def _table(shapes, channels) -> Float[Array, "m f"]:
-    """What compositing reads of each row: `shapes` with the opacity's logarithm in its place, and `channels`.
-
-    An alpha is then one exponential, whose limits act on its power. XLA keeps the exponentials of a turn, and does
-    again in every kernel what comes after them.
-    """
-    logs = jnp.maximum(jnp.log(shapes[:, 5:]), LOG_LEAST)  # no pair has less; that of 1/255 may be rounded to less
-    return jnp.concatenate([shapes[:, :5], logs, channels], axis=1)
 
 
 def _batches(bounds: Int[Array, " tiles_and_one"], grid: Grid) -> Int[Array, "batches t"]:
@@ -150,7 +138,7 @@ def _walk(grid: Grid, table, pairs: Pairs, tiles: Int[Array, " t"], turn: Callab
     """`state` after all turns of a batch, front to back.
 
     `turn(numbers, values, alphas, transmittance, state)` gives the transmittance and the state after it; `numbers` are
-    rows of `table`, as `_table` makes it. There is another turn while, in one of the tiles, Gaussians are left and a
+    rows of `table`. There is another turn while, in one of the tiles, Gaussians are left and a
     pixel that one could reach.
 
     A turn's Gaussians are looked up, copied and laid in columns `apart`: XLA would otherwise fuse that with every
@@ -158,7 +146,6 @@ def _walk(grid: Grid, table, pairs: Pairs, tiles: Int[Array, " t"], turn: Callab
     """
     first, last = _loads(pairs, tiles)
     some = pairs.num_pairs > 0
-    rows = jnp.pad(pairs.rows, (0, TURN))  # a turn may read past the last
 
     def goes_on(carry):
         i, transmittance = carry[:2]
@@ -168,7 +155,7 @@ def _walk(grid: Grid, table, pairs: Pairs, tiles: Int[Array, " t"], turn: Callab
     def body(carry):
         i, transmittance, state = carry
         start = first + i * TURN
-        numbers = apart(some, lambda: _next(rows, start))
+        numbers = apart(some, lambda: _next(pairs.rows, start))
         gaussians = apart(some, lambda: table[numbers])
         values = apart(some, lambda: _columns(grid, gaussians, tiles, start, last, with_ones))
         transmittance, state = turn(numbers, values, _alphas(grid, values), transmittance, state)
@@ -185,7 +172,7 @@ def _next(rows: Array, start: Int[Array, " t"]) -> Array:
 
 def _columns(grid: Grid, gaussians: Float[Array, "t u f"], tiles, start, last, with_ones: bool):
     """A turn's Gaussians, `[f u t]`: x and y from the tile's centre, no opacity past a tile's end, ones if wanted."""
-    x, y, p, q, r, log_opacity, *channels = jnp.moveaxis(gaussians, (2, 1, 0), (0, 1, 2))
+    x, y, p, q, r, log_opacity, *channels = jnp.moveaxis(gaussians[..., :-BOX], (2, 1, 0), (0, 1, 2))
     within = tiles % (grid.rows * grid.columns)
     x = x - ((within % grid.columns).astype(x.dtype) + 0.5) * grid.tile
     y = y - ((within // grid.columns).astype(x.dtype) + 0.5) * grid.tile

@@ -11,9 +11,10 @@ from ssplat_jax.errors import InputError
 from ssplat_jax.gaussians import Gaussians, concatenate, mask_gaussians
 from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.render import Effects, api, binning, render, tiled
-from ssplat_jax.render.binning import Grid, bin_splats
-from ssplat_jax.render.projection import project
+from ssplat_jax.render.binning import Grid, Pairs, bin_rows
+from ssplat_jax.render.projection import Splats, project
 from ssplat_jax.render.reference import render_reference
+from ssplat_jax.render.table import SHAPE, depth_order, sort_rows, splat_table
 from ssplat_jax.struct import replace
 from tests.render import oracle
 from tests.render.scenes import cameras, cloud
@@ -305,8 +306,56 @@ def test_more_pairs_than_an_index_reaches_are_counted_and_refused():
         grid = Grid(num_images=1, height=2160, width=3840, tile=8)
         one_axis = replace(camera, viewmats=camera.viewmats[None], Ks=camera.Ks[None])
         splats = project(wall, one_axis, Effects())
-        pairs = jax.jit(bin_splats, static_argnums=(1, 2))(splats, grid, 1 << 12)
+        pairs = pairs_of(splats, grid, 1 << 12)
     assert int(pairs.num_pairs) == 2**31 - 1
+
+
+@functools.partial(jax.jit, static_argnums=(1, 2))
+def pairs_of(splats: Splats, grid: Grid, room: int) -> Pairs:
+    """The pairs of splats without channels."""
+    order = depth_order(splats)
+    table = sort_rows(splat_table(splats, jnp.zeros((*splats.depths.shape, 0))), order)
+    return bin_rows(table, order // splats.depths.shape[1], grid, room)
+
+
+def test_rows_are_sorted_whole_and_gradients_go_back_to_where_they_came_from():
+    """From near to far over all cameras, ties by row, the invisible last; against NumPy's stable sort."""
+    random = np.random.default_rng(0)
+    shape = (2, 500)
+    depths = np.float32(random.choice(np.exp(random.normal(0, 3, 100)), shape))
+    visible = random.random(shape) < 0.8
+
+    def draw(*tail):
+        entries = random.uniform(0.1, 1, (*shape, *tail)) * visible.reshape(*shape, *(1 for _ in tail))
+        return jnp.asarray(entries, jnp.float32)
+
+    splats = Splats(
+        means2d=draw(2),
+        factors=draw(3),
+        opacities=draw(),
+        depths=jnp.asarray(depths),
+        extents=draw(2),
+        visible=jnp.asarray(visible),
+    )
+    channels = draw(4)
+    wanted_order = np.argsort(np.where(visible, depths, np.inf).reshape(-1), kind="stable")
+    rows = [splats.means2d, splats.factors, np.log(np.maximum(splats.opacities, 0.5 / 255))[..., None], channels]
+    rows = np.concatenate([*rows, splats.extents], axis=-1).reshape(1000, -1)[wanted_order]
+    cotangent = np.float32(random.normal(size=rows.shape))
+
+    @jax.jit
+    def sorted_table(splats, channels):
+        return sort_rows(splat_table(splats, channels), depth_order(splats))
+
+    got, pull = jax.vjp(lambda m, c: sorted_table(replace(splats, means2d=m), c), splats.means2d, channels)
+    num_seen = visible.sum()
+    np.testing.assert_array_equal(jax.jit(depth_order)(splats), wanted_order)
+    np.testing.assert_allclose(got[:num_seen], rows[:num_seen], rtol=1e-6)
+    assert np.all(got[num_seen:, -2:] == 0) and np.all(got[:num_seen, -2:] > 0)
+    back = np.empty_like(cotangent)
+    back[wanted_order] = cotangent
+    for gradient, columns in zip(pull(jnp.asarray(cotangent)), (slice(0, 2), slice(SHAPE, SHAPE + 4)), strict=True):
+        np.testing.assert_array_equal(gradient, back[:, columns].reshape(gradient.shape))
 
 
 def test_the_room_for_pairs_does_not_change_what_is_found():
@@ -316,20 +365,20 @@ def test_the_room_for_pairs_does_not_change_what_is_found():
     gaussians = cloud(4000, degree=0, size=0.2)
     camera = cameras(size, size)
     one_axis = replace(camera, viewmats=camera.viewmats[None], Ks=camera.Ks[None])
-    binned, room = jax.jit(bin_splats, static_argnums=(1, 2)), 1 << 16
+    room = 1 << 16
     shares = set()
     splats = project(gaussians, one_axis, Effects())
-    total = int(binned(splats, grid, 2 * room).num_pairs)
-    for wanted in (0.5, 0.7, 0.9):
+    total = int(pairs_of(splats, grid, 2 * room).num_pairs)
+    for wanted in (0.5, 0.62, 0.75, 0.9):
         shown = jnp.arange(4000) < int(4000 * wanted * room / total)
         part = project(mask_gaussians(gaussians, shown), one_axis, Effects())
-        chosen, plenty = (binned(part, grid, n) for n in (room, 2 * room))
+        chosen, plenty = (pairs_of(part, grid, n) for n in (room, 2 * room))
         num_pairs = int(plenty.num_pairs)
-        shares.add(np.searchsorted([5 / 8, 6 / 8, 1], num_pairs / room))
+        shares.add(np.searchsorted([9 / 16, 11 / 16, 13 / 16, 1], num_pairs / room))
         assert int(chosen.num_pairs) == num_pairs
         np.testing.assert_array_equal(chosen.bounds, plenty.bounds)
         np.testing.assert_array_equal(chosen.rows[:num_pairs], plenty.rows[:num_pairs])
-    assert shares == {0, 1, 2}
+    assert shares == {0, 1, 2, 3}
 
 
 def test_pairs_sorted_in_pieces_are_those_sorted_at_once(monkeypatch):
@@ -342,7 +391,8 @@ def test_pairs_sorted_in_pieces_are_those_sorted_at_once(monkeypatch):
 
     def binned(pieces, room):
         monkeypatch.setattr(binning, "PIECES", pieces)
-        return jax.jit(lambda splats: bin_splats(splats, grid, room))(splats)
+        pairs_of.clear_cache()
+        return pairs_of(splats, grid, room)
 
     for room in (1 << 18, (1 << 17) + 11, 1 << 16):
         wanted, got = binned(1, room), binned(16, room)
