@@ -1,10 +1,10 @@
 """Which Gaussians touch which tile, front to back: sorted (tile, Gaussian) pairs.
 
-Rows are (camera, Gaussian) flattened to `m = b n`; tiles are numbered camera-major, row-major. Gaussians are sorted
-once by (depth, row); a pair's key is then `tile << bits | depth rank`, so that a sort of plain integers puts
-everything in exact order. XLA sorts single integers five times faster than (key, payload) tuples, hence the packing.
-Pairs are found from near to far, so that pieces of them, sorted each by itself, need only be laid one after the other
-within each tile: XLA's CPU runtime sorts the pieces on all cores, a single array on one.
+Rows are those of a `splat_table` sorted from near to far; tiles are numbered camera-major, row-major. A pair's key is
+`tile << bits | row`, so that a sort of plain integers puts everything in exact order. XLA sorts single integers five
+times faster than (key, payload) tuples, hence the packing. Pairs are found from near to far, so that pieces of them,
+sorted each by itself, need only be laid one after the other within each tile: XLA's CPU runtime sorts the pieces on all
+cores, a single array on one.
 """
 
 import functools
@@ -62,9 +62,9 @@ class Grid:
 class Pairs:
     """For each tile the rows that touch it, front to back: `rows[bounds[t] : bounds[t + 1]]`."""
 
-    rows: Int[Array, " p"]  # `READ_AHEAD` more than there is room for
+    rows: Int[Array, " p"]  # room for pairs, and `READ_AHEAD` more
     bounds: Int[Array, " tiles_and_one"]  # pairs whose ellipse misses the tile are left out
-    num_pairs: Int[Array, ""]  # needed; those beyond the capacity `p` (the farthest Gaussians) are missing
+    num_pairs: Int[Array, ""]  # needed; those beyond the room (the farthest Gaussians) are missing
 
 
 def tile_boxes(means2d: Float[Array, "*m 2"], halves: Float[Array, "*m 2"], grid: Grid) -> tuple[Int[Array, "*m"], ...]:
@@ -113,9 +113,9 @@ def bin_rows(table: Float[Array, "m f"], images: Int[Array, " m"], grid: Grid, m
     )
 
     def sorted_pairs(room: int):
-        ranks = _owners(ends, room)
-        ranks, bounds = _sort_pairs(_tiles(outlines, ranks, ends[-1], grid), ranks, grid.num_tiles, num_rows)
-        return jnp.pad(ranks, (0, max_pairs - room + READ_AHEAD)), bounds
+        rows = _owners(ends, room)
+        rows, bounds = _sort_pairs(_tiles(outlines, rows, ends[-1], grid), rows, grid.num_tiles, num_rows)
+        return jnp.pad(rows, (0, max_pairs - room + READ_AHEAD)), bounds
 
     shares = SHARES if max_pairs >= WORTH_CHOOSING else SHARES[-1:]
     rooms = sorted({-(-max_pairs * share // 16) for share in shares})
@@ -124,12 +124,12 @@ def bin_rows(table: Float[Array, "m f"], images: Int[Array, " m"], grid: Grid, m
     return Pairs(rows=rows, bounds=bounds, num_pairs=ends[-1])
 
 
-def _tiles(outlines, ranks: Int[Array, " p"], num_pairs: Int[Array, ""], grid: Grid) -> Int[Array, " p"]:
+def _tiles(outlines, rows: Int[Array, " p"], num_pairs: Int[Array, ""], grid: Grid) -> Int[Array, " p"]:
     """The tile of every pair; `grid.num_tiles` where there is none, or one that the Gaussian's ellipse misses."""
 
     def tiles_of():
-        (starts, tiles, columns), (x, y, *rest) = jax.tree.map(lambda column: column[ranks], outlines)
-        pair = jnp.arange(ranks.shape[0], dtype=jnp.int32)
+        (starts, tiles, columns), (x, y, *rest) = jax.tree.map(lambda column: column[rows], outlines)
+        pair = jnp.arange(rows.shape[0], dtype=jnp.int32)
         down = (pair - starts) // columns
         right = pair - starts - down * columns
         low = [(side * grid.tile).astype(x.dtype) - mean for side, mean in ((right, x), (down, y))]
@@ -165,9 +165,9 @@ def _owners(ends: Int[Array, " m"], max_pairs: int) -> Int[Array, " p"]:
 
 
 def _sort_pairs(
-    tiles: Int[Array, " p"], ranks: Int[Array, " p"], num_tiles: int, num_rows: int
+    tiles: Int[Array, " p"], rows: Int[Array, " p"], num_tiles: int, num_rows: int
 ) -> tuple[Int[Array, " p"], Int[Array, " tiles_and_one"]]:
-    """Depth ranks in order of (tile, rank), and where each tile's begin, of pairs in order of rank."""
+    """Rows in order of (tile, row), and where each tile's begin, of pairs in order of row."""
     room = tiles.shape[0]
     pieces = PIECES if room >= WORTH_CHOOSING else 1
     padding = (0, -room % pieces)
@@ -177,22 +177,22 @@ def _sort_pairs(
         dtype = jnp.uint32 if fits else jnp.uint64
         shift = jnp.array(bits, dtype)
         tiles = jnp.pad(tiles, padding, constant_values=num_tiles).astype(dtype)
-        keys = (tiles << shift) | jnp.pad(ranks, padding).astype(dtype)
+        keys = (tiles << shift) | jnp.pad(rows, padding).astype(dtype)
         keys = jnp.stack([lax.sort(piece) for piece in jnp.split(keys, pieces)])
         starts = jnp.arange(num_tiles + 1, dtype=dtype) << shift
         bounds = jax.vmap(lambda piece: jnp.searchsorted(piece, starts))(keys).astype(jnp.int32)
         tiles = (keys >> shift).astype(jnp.int32)
-        ranks = (keys & ((jnp.array(1, dtype) << shift) - jnp.array(1, dtype))).astype(jnp.int32)
-    ranks = jnp.minimum(ranks, num_rows - 1)
-    return (ranks[0], bounds[0]) if pieces == 1 else _join(tiles, ranks, bounds, room)
+        rows = (keys & ((jnp.array(1, dtype) << shift) - jnp.array(1, dtype))).astype(jnp.int32)
+    rows = jnp.minimum(rows, num_rows - 1)
+    return (rows[0], bounds[0]) if pieces == 1 else _join(tiles, rows, bounds, room)
 
 
-def _join(tiles: Int[Array, "s n"], ranks: Int[Array, "s n"], bounds: Int[Array, "s tiles_and_one"], room: int):
-    """The ranks of sorted pieces, piece after piece within each tile, and where each tile's begin."""
+def _join(tiles: Int[Array, "s n"], rows: Int[Array, "s n"], bounds: Int[Array, "s tiles_and_one"], room: int):
+    """The rows of sorted pieces, piece after piece within each tile, and where each tile's begin."""
     num_pieces, size = tiles.shape
     counts = jnp.diff(bounds, axis=1, append=size)
     begins = jnp.sum(bounds, axis=0)  # as many stand before a tile as stand before it in all pieces
     moves = begins + jnp.cumsum(counts, axis=0) - counts - bounds  # of a piece's part in a tile
     numbers = jnp.arange(num_pieces, dtype=jnp.int32)[:, None] * bounds.shape[1] + tiles
     places = (moves.reshape(-1)[numbers] + jnp.arange(size, dtype=jnp.int32)).reshape(-1)
-    return jnp.zeros_like(places).at[places].set(ranks.reshape(-1), unique_indices=True)[:room], begins
+    return jnp.zeros_like(places).at[places].set(rows.reshape(-1), unique_indices=True)[:room], begins

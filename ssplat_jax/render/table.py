@@ -2,8 +2,7 @@
 
 Columns: x, y, p, q, r and the opacity's logarithm; the channels; half the width and height of the box.
 
-Gathered in one go: each row then takes one look into a memory larger than the caches, and the pairs of tiles that are
-read together lie near each other.
+Sorted, a row's number is its place in depth, and what tiles read of it in one turn lies near together in memory.
 """
 
 import jax
@@ -19,7 +18,11 @@ SHAPE, BOX = 6, 2  # columns before the channels and behind them
 
 
 def splat_table(splats: Splats, channels: Float[Array, "b n c"]) -> Float[Array, "m f"]:
-    """The rows of all cameras, `m = b n`, camera-major. Boxes have no size where nothing is seen."""
+    """The rows of all cameras, `m = b n`, camera-major. Boxes have no size where nothing is seen.
+
+    The opacity enters as its logarithm: an alpha is then one exponential, whose limits act on its power. XLA keeps the
+    exponentials of a turn, and does again in every kernel what comes after them.
+    """
     logs = safe_log(splats.opacities, 0.5 * constants.ALPHA_MIN)
     # Of those that are seen none has less; that of 1/255 may be rounded to less.
     logs += lax.stop_gradient(jnp.maximum(logs, constants.LOG_ALPHA_MIN) - logs)
@@ -46,6 +49,6 @@ def depth_order(splats: Splats) -> Int[Array, " m"]:
 
 
 def sort_rows(table: Float[Array, "m f"], order: Int[Array, " m"]) -> Float[Array, "m f"]:
-    """`table[order]`, copied row by row."""
+    """`table[order]`, copied row by row; the gradient goes back to where the rows came from."""
     always = order[0] >= 0  # which the compiler does not know
     return apart(always, lambda: table.at[order].get(mode="promise_in_bounds", unique_indices=True))

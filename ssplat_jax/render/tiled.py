@@ -104,6 +104,7 @@ def median_rows(grid: Grid, table: Float[Array, "m f"], pairs: Pairs) -> Int[Arr
 
     No gradient.
     """
+    table = jnp.concatenate([table[:, :SHAPE], table[:, -BOX:]], axis=1)
 
     def batch(tiles):
         def turn(numbers, _, alphas, transmittance, found):
@@ -138,8 +139,8 @@ def _walk(grid: Grid, table, pairs: Pairs, tiles: Int[Array, " t"], turn: Callab
     """`state` after all turns of a batch, front to back.
 
     `turn(numbers, values, alphas, transmittance, state)` gives the transmittance and the state after it; `numbers` are
-    rows of `table`. There is another turn while, in one of the tiles, Gaussians are left and a
-    pixel that one could reach.
+    rows of `table`. There is another turn while, in one of the tiles, Gaussians are left and a pixel that one could
+    reach.
 
     A turn's Gaussians are looked up, copied and laid in columns `apart`: XLA would otherwise fuse that with every
     kernel that uses them, and each would go through the table once a sample (docs/performance.md).
