@@ -144,11 +144,11 @@ def measure(row: Row) -> dict[str, Any]:
         gaussians, camera, arrays = scene
         without = gaussians, camera, {name: array for name, array in arrays.items() if name not in row.arrays}
         pairs = ((scene, row.on), (without, row.off))
-        counts = [api.render(g, c, effects=effects, **given).num_pairs for (g, c, given), effects in pairs]
-        max_pairs = api.round_up(max(int(count) for count in counts))
-        (cost_on, on), (cost_off, off) = (_program(*pair, max_pairs) for pair in pairs)
-        figures[f"dB_{kind}"] = decibels(off().color, on().color)
+        drawn_on, drawn_off = (api.render(g, c, effects=effects, **given) for (g, c, given), effects in pairs)
+        figures[f"dB_{kind}"] = decibels(drawn_off.color, drawn_on.color)
         if kind == "calls":
+            max_pairs = api.round_up(max(int(drawn_on.num_pairs), int(drawn_off.num_pairs)))
+            (cost_on, on), (cost_off, off) = (_program(*pair, max_pairs) for pair in pairs)
             times = bench.alternate({"on": on, "off": off}, repetitions=7)
             figures["ms"] = float(np.median(times["on"] - times["off"]))
             for key, name in (("flops", "flops"), ("bytes accessed", "bytes")):
