@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ssplat_jax.model.layers import attend, average_pool, instance_norm, unit_features
-from ssplat_jax.numerics import safe_log, safe_normalize, softplus_inverse
+from ssplat_jax.numerics import apart, columns, safe_log, safe_normalize, softplus_inverse
 
 ULP = float(np.finfo(np.float32).eps)
 
@@ -47,6 +47,30 @@ def test_safe_log_below_its_floor_is_the_floor_with_a_zero_gradient():
     np.testing.assert_allclose(safe_log(x), np.log(1e-12), rtol=1e-6)
     np.testing.assert_array_equal(jax.grad(lambda v: safe_log(v).sum())(x), 0)
     np.testing.assert_allclose(safe_log(x, eps=0.1), np.log(0.1), rtol=1e-6)
+
+
+def test_columns_are_the_entries_and_their_gradients_stand_where_they_did():
+    x = jax.random.normal(jax.random.key(0), (5, 3))
+    values, pull = jax.vjp(columns, x)
+    for i, value in enumerate(values):
+        np.testing.assert_array_equal(value, x[:, i])
+    weights = np.arange(3, dtype=np.float32)
+    (gradient,) = pull(tuple(weight * value for weight, value in zip(weights, values, strict=True)))
+    np.testing.assert_array_equal(gradient, weights * x)
+
+
+@pytest.mark.parametrize("wanted", [True, False])
+def test_what_is_computed_apart_is_there_if_wanted_and_nothing_reaches_it_if_not(wanted):
+    x = jnp.array([2.0, 0.0, -3.0])
+    rows = jnp.array([2, 0])
+
+    @jax.jit
+    def gathered(x, wanted):
+        return apart(wanted, lambda: 1.0 / x[rows])
+
+    value, pull = jax.vjp(lambda x: gathered(x, jnp.array(wanted)), x)
+    np.testing.assert_allclose(value, [-1 / 3, 0.5] if wanted else [0, 0], rtol=1e-6)
+    np.testing.assert_allclose(pull(jnp.ones(2))[0], [-0.25, 0, -1 / 9] if wanted else [0, 0, 0], rtol=1e-6)
 
 
 @pytest.mark.parametrize("y", [1e-9, 1e-3, 0.1, 1.0, 20.0, 500.0])
