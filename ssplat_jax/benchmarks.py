@@ -24,19 +24,20 @@ from ssplat_jax.stream import StreamSplat
 ROUND = 40  # frames of the walk that a benchmark's stream repeats
 
 
-def run_benchmark(name: str, *, against: Path | None = None, scaling: bool = False) -> dict[str, Any]:
+def run_benchmark(
+    name: str, *, against: Path | None = None, scaling: bool = False, full_hd: bool = False
+) -> dict[str, Any]:
     """Runs the benchmark `render` or `stream`.
 
     Args:
         name: which.
-        against: `render` only: a Python file with `scene` and `render` as the prototype has them, timed in turns.
-        scaling: `render` only: also 4k to 1M Gaussians.
+        against, scaling, full_hd: `render` only: as `bench_render` has them.
 
     Raises:
-        InputError: no such benchmark, or `against` is not a file.
+        InputError: no such benchmark, or `against` is no file that could be timed.
     """
     if name == "render":
-        rows = bench_render(against, scaling=scaling)
+        rows = bench_render(against, scaling=scaling, full_hd=full_hd)
     elif name == "stream":
         rows = [dataclasses.asdict(row) for row in (*bench_cache(preset("tiny")), *bench_step())]
     else:

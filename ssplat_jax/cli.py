@@ -305,14 +305,17 @@ class Bench:
     json: Path | None = None
     """Write {machine, rows: [{name, value, unit}]} here as well."""
     against: Path | None = None
-    """render only: a Python file with `scene` and `render` functions, timed in the same run."""
+    """render only: another rasterizer's Python file, timed in the same run: one with the functions that
+    docs/performance.md names, as experiments/gsplat_rasterizer.py has them."""
     scaling: bool = False
     """render only: also 4k to 1M Gaussians, at four image sizes."""
+    full_hd: bool = False
+    """render only: also 1M Gaussians at 1920 x 1080."""
 
     def run(self) -> int:
         from ssplat_jax.benchmarks import run_benchmark
 
-        result = run_benchmark(self.name, against=self.against, scaling=self.scaling)
+        result = run_benchmark(self.name, against=self.against, scaling=self.scaling, full_hd=self.full_hd)
         print(result["machine"])
         for row in result["rows"]:
             print(f"{row['name']:<44} {row['value']:>14.6g} {row['unit']}")

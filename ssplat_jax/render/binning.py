@@ -20,12 +20,8 @@ from ssplat_jax.render.projection import Splats
 from ssplat_jax.render.table import BOX, SHAPE
 from ssplat_jax.struct import pytree, static
 
-SHARES = (
-    9,
-    11,
-    13,
-    16,
-)  # in sixteenths, of the room for pairs (a power of two): the least share that holds them is what is sorted
+# In sixteenths, of the room for pairs (a power of two): the least share that holds them is what is sorted.
+SHARES = (9, 11, 13, 16)
 WORTH_CHOOSING = 1 << 16  # room for pairs below which all of it is sorted: each share is compiled by itself
 PIECES = 16  # sorted by themselves where room is chosen; the CPU runtime shares out what waits from nine at a time on
 MOST_PAIRS = (1 << 31) - 1  # what an index reaches; counts of pairs stop there

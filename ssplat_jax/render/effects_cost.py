@@ -24,7 +24,7 @@ Scene = tuple[Gaussians, Camera, dict[str, Any]]
 
 
 def _plain(pixels: float = 1.5, **arrays: Any) -> Scene:
-    return (*bench.scene(NUM, SIZE, pixels), arrays)
+    return (*bench.scene(NUM, SIZE, pixels=pixels), arrays)
 
 
 def _bands(scale: float) -> Scene:
