@@ -157,7 +157,7 @@ def _walk(grid: Grid, table, pairs: Pairs, tiles: Int[Array, " t"], turn: Callab
         i, transmittance, state = carry
         start = first + i * TURN
         numbers = apart(some, lambda: _next(pairs.rows, start))
-        gaussians = apart(some, lambda: table[numbers])
+        gaussians = apart(some, lambda: table[numbers][..., :-BOX])
         values = apart(some, lambda: _columns(grid, gaussians, tiles, start, last, with_ones))
         transmittance, state = turn(numbers, values, _alphas(grid, values), transmittance, state)
         return i + 1, transmittance, state
@@ -173,7 +173,7 @@ def _next(rows: Array, start: Int[Array, " t"]) -> Array:
 
 def _columns(grid: Grid, gaussians: Float[Array, "t u f"], tiles, start, last, with_ones: bool):
     """A turn's Gaussians, `[f u t]`: x and y from the tile's centre, no opacity past a tile's end, ones if wanted."""
-    x, y, p, q, r, log_opacity, *channels = jnp.moveaxis(gaussians[..., :-BOX], (2, 1, 0), (0, 1, 2))
+    x, y, p, q, r, log_opacity, *channels = jnp.moveaxis(gaussians, (2, 1, 0), (0, 1, 2))
     within = tiles % (grid.rows * grid.columns)
     x = x - ((within % grid.columns).astype(x.dtype) + 0.5) * grid.tile
     y = y - ((within // grid.columns).astype(x.dtype) + 0.5) * grid.tile
