@@ -77,7 +77,8 @@ class Disk:
             return
         resource.setrlimit(resource.RLIMIT_FSIZE, self._limits)  # the file that could not grow has been closed
         is_read = event == "open" and not arguments[2] & (os.O_WRONLY | os.O_RDWR)
-        if event == "os.remove" or is_read or (event == "os.mkdir" and os.path.isdir(path)):  # these need no room
+        # These need no room; a folder is opened to try whether files can be made in it (`make_writable`).
+        if event == "os.remove" or is_read or (event in ("os.mkdir", "open") and os.path.isdir(path)):
             return
         if event == "open" and self.kind == "write" and self._is_next(path):
             resource.setrlimit(resource.RLIMIT_FSIZE, (self.limit, self._limits[1]))
