@@ -10,12 +10,13 @@ from jaxtyping import Array, Float, Num
 from ssplat_jax.errors import InputError
 from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.geometry.cameras import Camera
-from ssplat_jax.render.binning import Grid, bin_rows, count_pairs
+from ssplat_jax.render.binning import bin_rows, count_pairs
 from ssplat_jax.render.effects import Effects
+from ssplat_jax.render.grid import Grid
 from ssplat_jax.render.output import RenderOutput, finish, splat_channels
 from ssplat_jax.render.projection import cull_cameras, cull_non_finite, project
 from ssplat_jax.render.smoothing import filter_3d
-from ssplat_jax.render.table import depth_order, sort_rows, splat_table
+from ssplat_jax.render.table import sorted_table
 from ssplat_jax.render.tiled import composite, median_rows
 from ssplat_jax.struct import pytree, replace
 
@@ -181,8 +182,7 @@ def _render(inputs: Inputs, effects: Effects, max_pairs: int, tile: int) -> Rend
         channels = splat_channels(gaussians, splats, camera, effects, inputs.features)
     grid = grid_of(camera, tile)
     with jax.named_scope("sort"):
-        order = depth_order(splats)
-        table = sort_rows(splat_table(splats, channels), order)
+        table, order = sorted_table(splats, channels, grid)
     with jax.named_scope("bin"):
         images = order // gaussians.num_gaussians
         pairs = bin_rows(jax.lax.stop_gradient(table), images, grid, max_pairs)

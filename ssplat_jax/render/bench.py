@@ -24,10 +24,11 @@ from ssplat_jax.errors import InputError
 from ssplat_jax.gaussians import SH_C0, Gaussians
 from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.render import api, tiled
-from ssplat_jax.render.binning import Grid, bin_rows
+from ssplat_jax.render.binning import bin_rows
 from ssplat_jax.render.effects import Effects
+from ssplat_jax.render.grid import Grid
 from ssplat_jax.render.output import splat_channels
-from ssplat_jax.render.table import depth_order, sort_rows, splat_table
+from ssplat_jax.render.table import sorted_table
 
 EFFECTS = Effects(antialias="classic")  # what the prototype does
 SIZES = ((65_536, 256), (262_144, 512))  # Gaussians, side of the image
@@ -127,8 +128,7 @@ def _stages(gaussians: Gaussians, camera: Camera, max_pairs: int) -> dict[str, C
 
     @jax.jit
     def binned(splats, channels):
-        order = depth_order(splats)
-        table = sort_rows(splat_table(splats, channels), order)
+        table, order = sorted_table(splats, channels, grid)
         return table, bin_rows(table, jnp.zeros_like(order), grid, max_pairs)
 
     grid = Grid(num_images=1, height=camera.height, width=camera.width, tile=api.TILE)

@@ -23,7 +23,8 @@ from jaxtyping import Array, Float, Int
 
 from ssplat_jax.numerics import apart
 from ssplat_jax.render import constants
-from ssplat_jax.render.binning import READ_AHEAD, Grid, Pairs
+from ssplat_jax.render.binning import READ_AHEAD, Pairs
+from ssplat_jax.render.grid import Grid
 from ssplat_jax.render.table import BOX, SHAPE
 
 TURN = READ_AHEAD  # the last of a tile may look past all pairs
@@ -40,7 +41,7 @@ GROWTH = np.polynomial.Chebyshev.interpolate(np.exp, 5, [0.0, -LOG_LEAST / 2**SQ
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0, 1))
 def composite(grid: Grid, with_alpha: bool, table: Float[Array, "m f"], pairs: Pairs) -> Float[Array, "tiles co p"]:
-    """The channels of a sorted `splat_table`, and alpha behind them if wanted, composited over every tile's pixels.
+    """The channels of a `sorted_table`, and alpha behind them if wanted, composited over every tile's pixels.
 
     Gradients reach the columns of the shape and the channels. Samples fainter than 1/255 or capped at 0.99 pass none on
     to their opacity.
@@ -51,17 +52,17 @@ def composite(grid: Grid, with_alpha: bool, table: Float[Array, "m f"], pairs: P
 def _forward(grid: Grid, with_alpha: bool, table, pairs: Pairs):
     num_channels = table.shape[1] - SHAPE - BOX + with_alpha  # alpha is what a channel of ones becomes
 
-    def batch(tiles):
+    def batch(out, tiles):
         def turn(_, values, alphas, transmittance, out):
             weights, afters = _weights(alphas, transmittance)
             return afters[-1], out + _total(weight * values[SHAPE:, None, u] for u, weight in enumerate(weights))
 
         start = jnp.zeros((num_channels, grid.tile**2, tiles.shape[0]), table.dtype)
-        return _walk(grid, table, pairs, tiles, turn, start, with_ones=with_alpha)
+        drawn = _walk(grid, table, pairs, tiles, turn, start, with_ones=with_alpha)
+        return out.at[tiles].set(jnp.moveaxis(drawn, -1, 0), mode="drop"), None
 
-    batches = _batches(pairs.bounds, grid)
-    out = jnp.moveaxis(lax.map(batch, batches), -1, 1).reshape(-1, num_channels, grid.tile**2)
-    return jnp.zeros((grid.num_tiles, *out.shape[1:]), out.dtype).at[batches.reshape(-1)].set(out, mode="drop")
+    out = jnp.zeros((grid.num_tiles, num_channels, grid.tile**2), table.dtype)
+    return lax.scan(batch, out, _batches(pairs.bounds, grid))[0]
 
 
 def _composite_fwd(grid: Grid, with_alpha: bool, table, pairs: Pairs):
@@ -100,7 +101,7 @@ composite.defvjp(_composite_fwd, _composite_bwd)
 
 
 def median_rows(grid: Grid, table: Float[Array, "m f"], pairs: Pairs) -> Int[Array, "tiles p"]:
-    """The row of a sorted `splat_table` whose sample brings each pixel's transmittance below one half, or -1.
+    """The row of a `sorted_table` whose sample brings each pixel's transmittance below one half, or -1.
 
     No gradient.
     """
