@@ -61,7 +61,7 @@ def bin_rows(table: Float[Array, "m f"], images: Int[Array, " m"], grid: Grid, m
         max_pairs: room for pairs.
     """
     num_rows = table.shape[0]
-    width, height = columns(table[:, -2:].astype(jnp.int32))
+    width, height = (side.astype(jnp.int32) for side in columns(table[:, -2:]))
     ends = _running_sum(width * height)
 
     def sorted_pairs(room: int):

@@ -12,6 +12,7 @@ from ssplat_jax.gaussians import Gaussians, concatenate, mask_gaussians
 from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.render import Effects, api, binning, render, tiled
 from ssplat_jax.render.binning import Pairs, bin_rows
+from ssplat_jax.render.grid import Grid
 from ssplat_jax.render.projection import Splats, project
 from ssplat_jax.render.reference import render_reference
 from ssplat_jax.render.table import SHAPE, sorted_table
