@@ -53,10 +53,12 @@ def depth_order(depths: Float[Array, "b n"], shown: Bool[Array, "b n"]) -> Int[A
     One 64-bit integer a row, depth bits above row number, whatever `jax_enable_x64` says: exact and without payload.
     Depths in float64 fill that integer alone and are sorted with their row.
     """
-    keys = jnp.where(shown, depths, jnp.inf).reshape(-1)
-    if keys.dtype == jnp.float64:
+    depths, shown = depths.reshape(-1), shown.reshape(-1)
+    if depths.dtype == jnp.float64:
+        keys = jnp.where(shown, depths, jnp.nan)  # behind an infinite depth
         return lax.sort((keys, lax.iota(jnp.int32, keys.shape[0])), num_keys=2)[1]
+    bits = lax.bitcast_convert_type(depths, jnp.uint32)  # in the order of the depths, the infinite one below the last
+    bits = jnp.where(shown, bits, jnp.uint32(0xFFFFFFFF))
     with jax.enable_x64(True):
-        bits = lax.bitcast_convert_type(keys, jnp.uint32).astype(jnp.uint64)  # in the order of the depths
-        keys = (bits << jnp.uint64(32)) | lax.iota(jnp.uint64, keys.shape[0])
+        keys = (bits.astype(jnp.uint64) << jnp.uint64(32)) | lax.iota(jnp.uint64, bits.shape[0])
         return (lax.sort(keys) & jnp.uint64(0xFFFFFFFF)).astype(jnp.int32)

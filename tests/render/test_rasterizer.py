@@ -322,7 +322,7 @@ def test_rows_are_sorted_whole_and_gradients_go_back_to_where_they_came_from():
     """From near to far over all cameras, ties by row, what touches no tile last; against NumPy's stable sort."""
     random = np.random.default_rng(0)
     shape = (2, 500)
-    depths = np.float32(random.choice(np.exp(random.normal(0, 3, 100)), shape))
+    depths = np.float32(random.choice([*np.exp(random.normal(0, 3, 100)), np.inf], shape))
     visible = random.random(shape) < 0.8
 
     def draw(*tail):
@@ -344,7 +344,7 @@ def test_rows_are_sorted_whole_and_gradients_go_back_to_where_they_came_from():
     boxes = np.concatenate([low, (high - low) * visible[..., None]], axis=-1)
     shown = boxes[..., 2:].prod(axis=-1) > 0
     assert 500 < shown.sum() < visible.sum()
-    wanted_order = np.argsort(np.where(shown, depths, np.inf).reshape(-1), kind="stable")
+    wanted_order = np.argsort(np.where(shown, depths, np.nan).reshape(-1), kind="stable")
     rows = [splats.means2d, splats.factors, np.log(np.maximum(splats.opacities, 0.5 / 255))[..., None], channels, boxes]
     rows = np.concatenate(rows, axis=-1).reshape(1000, -1)[wanted_order]
     cotangent = np.float32(random.normal(size=rows.shape))
