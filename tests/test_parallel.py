@@ -397,10 +397,11 @@ def test_scenes_are_those_of_the_shards(params, streamed):
     gaussians = streamed["sharded"]["gaussians"]
     for stream, (_, _, wanted) in enumerate(streamed["alone"]):
         found = gaussians.opacities[stream]
-        k = MODEL_CONFIG.pivots_per_voxel
-        assert found.shape == (4 * MODEL_CONFIG.capacity * k,)
+        k, per_pivot = MODEL_CONFIG.pivots_per_voxel, MODEL_CONFIG.gaussians_per_token
+        assert found.shape == (4 * MODEL_CONFIG.capacity * k * per_pivot,)
         shards = shards_of_stream(streamed["sharded"]["caches"][-1], stream)
-        np.testing.assert_array_equal(found > 0, np.concatenate([shard.alive.reshape(-1) for shard in shards]))
+        alive = np.concatenate([shard.alive.reshape(-1) for shard in shards])
+        np.testing.assert_array_equal(found > 0, alive.repeat(per_pivot))
         if stream:
             np.testing.assert_allclose(found.sum(), wanted.opacities.sum(), rtol=STEP_RTOL)
 
