@@ -164,7 +164,7 @@ def export_run(run_dir: Path, to: Path, params: dict, reporter: Reporter) -> Exp
     if header.get("weights") != params_digest(params):
         raise InputError(f"{run_dir}: was streamed with other weights than these; give the run's own with --weights.")
     session = Session(StreamSplat(StreamConfig.from_dict(header["config"])), params, cache)
-    return save_scene(to, session.gaussians(), _frame_from(header["frame"]), reporter)
+    return save_scene(to, session.gaussians(), StreamFrame.from_dict(header["frame"]), reporter)
 
 
 def save_scene(path: Path, gaussians: Gaussians, frame: StreamFrame, reporter: Reporter) -> ExportReport:
@@ -182,7 +182,7 @@ def _delta_path(out: Path, done: int) -> Path:
 
 def _save_delta(out: Path, done: int, delta: SceneDelta, frame: StreamFrame) -> None:
     """A chunk's changes, and what a viewer needs to put them into the capture's frame."""
-    save_delta(_delta_path(out, done), delta, {"frame": _frame_to(frame), "views": done})
+    save_delta(_delta_path(out, done), delta, {"frame": frame.to_dict(), "views": done})
 
 
 def _identity(model: StreamSplat, params: dict, capture: Capture, indices: list[int]) -> dict:
@@ -193,6 +193,7 @@ def _identity(model: StreamSplat, params: dict, capture: Capture, indices: list[
         "size": [capture.width, capture.height],
         "frames": indices,
         "poses": capture.digest(indices),
+        "images": capture.images_digest(indices),
         "weights": params_digest(params),
     }
 
@@ -214,7 +215,7 @@ def _resume(
             held, value = _what_counts(held or {}), _what_counts(value)
         if held != value:
             raise InputError(
-                f"{out}: holds a run with another {name} ({_difference(held, value)}); choose another --out,"
+                f"{out}: holds a run that differs in its {name} ({_difference(held, value)}); choose another --out,"
                 " repeat the old options, or start anew with --overwrite."
             )
     if damage is not None:
@@ -222,7 +223,11 @@ def _resume(
         restore_previous(state)
     if cache.capacity < model.config.capacity:
         cache = grow(cache, model.config.capacity)
-    return Session(model, params, cache), _frame_from(header["frame"]), exposures_from_json(header["exposures"])
+    return (
+        Session(model, params, cache),
+        StreamFrame.from_dict(header["frame"]),
+        exposures_from_json(header["exposures"]),
+    )
 
 
 def _what_counts(config: dict) -> dict:
@@ -249,7 +254,7 @@ def _difference(held, wanted) -> str:
 def _save(session: Session, frame: StreamFrame, identity: dict, exposures: Exposures, out: Path) -> None:
     assert session.cache is not None
     header = identity | {
-        "frame": _frame_to(frame),
+        "frame": frame.to_dict(),
         "done": len(exposures),
         "exposures": exposures_to_json(exposures),
     }
@@ -258,28 +263,6 @@ def _save(session: Session, frame: StreamFrame, identity: dict, exposures: Expos
     except OSError as error:
         raise StorageError(f"{out}: cannot be made ({error.strerror}); choose another --out.") from error
     save_state(out / STATE_FILE, session.cache, header)
-
-
-def _frame_to(frame: StreamFrame) -> dict:
-    return {
-        "rotation": frame.rotation.tolist(),
-        "origin": frame.origin.tolist(),
-        "scale": frame.scale,
-        "near": frame.near,
-        "far": frame.far,
-        "warning": frame.warning,
-    }
-
-
-def _frame_from(fields: dict) -> StreamFrame:
-    return StreamFrame(
-        rotation=np.array(fields["rotation"]),
-        origin=np.array(fields["origin"]),
-        scale=fields["scale"],
-        near=fields["near"],
-        far=fields["far"],
-        warning=fields.get("warning"),
-    )
 
 
 def _finish(
@@ -312,7 +295,7 @@ def _finish(
         "compile_s": round(session.compile_seconds, 2),
         "step_memory_bytes": session.step_memory_bytes,
         "cache": cache_facts(session),
-        "stream_frame": _frame_to(frame),
+        "stream_frame": frame.to_dict(),
         "config_hash": session.model.config.hash,
     }
     write_json(out / METRICS_FILE, metrics)

@@ -56,7 +56,9 @@ class Inspect:
     """
 
     capture: Annotated[str, tyro.conf.Positional]
-    """Folder with a transforms.json, or procedural:NAME."""
+    """Folder of a posed capture, or procedural:NAME. Formats: transforms.json (nerfstudio, instant-ngp, Blender,
+    DL3DV); COLMAP (sparse/0 beside images/); ScanNet (color/, pose/, intrinsic/intrinsic_color.txt); TUM RGB-D
+    (rgb.txt, groundtruth.txt); RealEstate10K (its .txt, or the folder with that and the frames)."""
     size: str | None = None
     """Image size WxH to work at; default the capture's own."""
     json: bool = False
@@ -81,7 +83,7 @@ class Run:
     """
 
     capture: Annotated[str, tyro.conf.Positional]
-    """Folder with a transforms.json, or procedural:NAME."""
+    """Folder of a posed capture (formats: ssplat inspect --help), or procedural:NAME."""
     out: Path
     """Where the results go; a run that was stopped there is continued."""
     stride: int = 1
@@ -140,7 +142,7 @@ class Eval:
     """
 
     capture: Annotated[str, tyro.conf.Positional]
-    """Folder with a transforms.json, or procedural:NAME."""
+    """Folder of a posed capture (formats: ssplat inspect --help), or procedural:NAME."""
     context: int
     """Context views to stream."""
     out: Path
@@ -290,6 +292,67 @@ class Export:
         print(
             f"wrote {self.to}: {report.num_written} Gaussians ({report.num_dropped} invisible or not finite left out)"
         )
+        return 0
+
+
+@dataclasses.dataclass(frozen=True)
+class Render:
+    """Render a scene from the cameras of a capture, a picture each.
+
+    Example: ssplat render runs/kitchen path/to/capture --stride 10 --out runs/pictures
+    """
+
+    scene: Annotated[Path, tyro.conf.Positional]
+    """A 3DGS .ply in the capture's frame, or the folder of an `ssplat run`."""
+    capture: Annotated[str, tyro.conf.Positional]
+    """Folder of a posed capture (formats: ssplat inspect --help), or procedural:NAME."""
+    out: Path
+    """Where the pictures go, views/<frame>.png."""
+    stride: int = 1
+    """Take every so many-th camera."""
+    max_views: int | None = None
+    """Stop after so many pictures."""
+    size: str | None = None
+    """Size WxH of the pictures; default the capture's own."""
+    over_black: bool = False
+    """Show black, not the colours around, where the scene lets light through."""
+    quiet: bool = False
+    """No progress."""
+
+    def run(self) -> int:
+        from ssplat_jax.pictures import render_scene
+        from ssplat_jax.report import Reporter
+
+        size, reporter = parse_size(self.size), Reporter(self.quiet)
+        options = {"size": size, "stride": self.stride, "max_views": self.max_views, "over_black": self.over_black}
+        num_pictures = render_scene(self.scene, self.capture, self.out, reporter=reporter, **options)
+        print(f"wrote {num_pictures} pictures to {self.out}/views")
+        return 0
+
+
+@dataclasses.dataclass(frozen=True)
+class View:
+    """Show a scene in a browser, or follow a run (`ssplat run --deltas`) while it grows. Needs the extra `viewer`.
+
+    Example: ssplat view runs/kitchen
+    """
+
+    scene: Annotated[Path, tyro.conf.Positional]
+    """A 3DGS .ply, or the folder of an `ssplat run`."""
+    port: int = 8080
+    """Port; the next free one if it is taken."""
+    host: str = "127.0.0.1"
+    """Address to listen on: this machine alone; 0.0.0.0 lets others look, without a password."""
+    most: int = 500_000
+    """Most Gaussians sent to a browser; of more, every so many-th."""
+
+    def run(self) -> int:
+        from ssplat_jax.errors import require_positive
+        from ssplat_jax.report import Reporter
+        from ssplat_jax.watch import view_scene
+
+        require_positive(port=self.port, most=self.most)
+        view_scene(self.scene, host=self.host, port=self.port, most=self.most, reporter=Reporter(quiet=False))
         return 0
 
 
@@ -450,6 +513,8 @@ Command = (
     | Annotated[Eval, tyro.conf.subcommand("eval")]
     | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Export, tyro.conf.subcommand("export")]
+    | Annotated[Render, tyro.conf.subcommand("render")]
+    | Annotated[View, tyro.conf.subcommand("view")]
     | Annotated[Bench, tyro.conf.subcommand("bench")]
     | Annotated[Experiment, tyro.conf.subcommand("experiment")]
 )

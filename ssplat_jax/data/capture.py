@@ -22,12 +22,12 @@ from ssplat_jax.data.frame import StreamFrame
 from ssplat_jax.data.order import deal
 from ssplat_jax.data.pixels import ArrayPixels, Crop, FilePixels, Pixels, decode_all, resize_depth, resize_image
 from ssplat_jax.data.posed_frame import Frame, check_camtoworld, check_intrinsics
-from ssplat_jax.data.readers import Listing, transforms_json
+from ssplat_jax.data.readers import Listing, colmap, realestate10k, scannet, transforms_json, tum
 from ssplat_jax.data.refusal import echo, refusal
 from ssplat_jax.data.scale import estimate_depths, stream_scale
 from ssplat_jax.geometry.cameras import Camera
 
-READERS = (transforms_json,)
+READERS = (transforms_json, colmap, scannet, tum, realestate10k)  # the first that matches reads
 PROCEDURAL = "procedural"
 PROCEDURAL_FRAMES = 73  # 64 context views and the 9 interleaved targets between them
 PROCEDURAL_SIZE = (128, 96)  # (width, height): a demo on two cores ends within two minutes
@@ -63,6 +63,20 @@ class Capture:
             if frame.lens is not None:
                 digest.update(repr(frame.lens).encode())
         return digest.hexdigest()[:12]
+
+    def images_digest(self, indices: Sequence[int]) -> str:
+        """Twelve hex digits that name the image files of the frames `indices` by their bytes, on all cores.
+
+        Images in memory are made from the capture's name.
+        """
+
+        def digest_file(path: Path) -> bytes:
+            with path.open("rb") as file:
+                return hashlib.file_digest(file, "sha256").digest()
+
+        paths = [path for path in (self.frames[i].path for i in indices) if path is not None]
+        with ThreadPoolExecutor() as pool:
+            return hashlib.sha256(b"".join(pool.map(digest_file, paths))).hexdigest()[:12]
 
     def scaled(self, factor: float) -> "Capture":
         """The same capture with images of `factor` times the size, at least one pixel."""
@@ -185,7 +199,7 @@ class Capture:
 
 
 def open_capture(path: str | Path, *, size: tuple[int, int] | None = None) -> Capture:
-    """The capture at `path`: a folder with a transforms.json, such a file, or `procedural:NAME`.
+    """The capture at `path`: a folder in one of the formats of `readers`, its file, or `procedural:NAME`.
 
     `procedural:room?frames=73&size=128x96&seed=0`; scenes are room, orbit, corridor. `size` is the (width, height) of
     delivered images: stored ones are scaled to cover it and cropped at the centre, `K` following exactly.
@@ -207,8 +221,9 @@ def open_capture(path: str | Path, *, size: tuple[int, int] | None = None) -> Ca
     elif folder.is_dir() and not any(folder.iterdir()):
         got, fix = "an empty folder", "check the path"
     else:
-        got, fix = "no transforms.json", f"export the capture as transforms.json, or try {PROCEDURAL}:room"
-    raise refusal(str(path), wanted="a folder with a transforms.json", got=got, fix=fix)
+        got, fix = "none of these", f"see --help of `ssplat inspect` for their files, or try {PROCEDURAL}:room"
+    formats = ", ".join(reader.FORMAT for reader in READERS)
+    raise refusal(str(path), wanted=f"a posed capture ({formats})", got=got, fix=fix)
 
 
 def _capture(listing: Listing, format: str, pixels: Pixels, size: tuple[int, int] | None) -> Capture:

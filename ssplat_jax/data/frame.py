@@ -9,6 +9,7 @@ earth-centred coordinates float32 has a step of 0.5 m.
 
 import dataclasses
 import math
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -45,6 +46,29 @@ class StreamFrame:
             near=near,
             far=far,
             warning=warning,
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain JSON types."""
+        return {
+            "rotation": self.rotation.tolist(),
+            "origin": self.origin.tolist(),
+            "scale": self.scale,
+            "near": self.near,
+            "far": self.far,
+            "warning": self.warning,
+        }
+
+    @staticmethod
+    def from_dict(fields: dict[str, Any]) -> "StreamFrame":
+        """What `to_dict` gave."""
+        return StreamFrame(
+            rotation=np.array(fields["rotation"]),
+            origin=np.array(fields["origin"]),
+            scale=fields["scale"],
+            near=fields["near"],
+            far=fields["far"],
+            warning=fields.get("warning"),
         )
 
     def points_to_stream(self, points: Float64[np.ndarray, "*n 3"]) -> Float64[np.ndarray, "*n 3"]:

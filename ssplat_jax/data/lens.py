@@ -43,6 +43,9 @@ class Lens:
             return self.distorted((points - center) / focal) * focal + center
 
 
+PINHOLE = Lens()
+
+
 def check_lens(lens: Lens, K: Float64[np.ndarray, "3 3"], width: int, height: int, where: str) -> float:
     """Largest displacement in pixels on the image's border.
 

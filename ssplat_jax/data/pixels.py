@@ -22,7 +22,6 @@ from ssplat_jax.data.refusal import refusal
 
 IMAGE_FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "PPM")
 MAX_PIXELS = 64_000_000  # larger headers are refused before anything is decoded
-MILLIMETRE = 1e-3
 DEPTH_MODES = ("I;16", "I;16B", "I")
 ORIENTATION, UPRIGHT = 274, 1  # EXIF
 
@@ -60,7 +59,7 @@ class FilePixels:
         frame = self.frames[i]
         if frame.depth_path is None:
             return None
-        depth = decode_depth(frame.depth_path)
+        depth = decode_depth(frame.depth_path, frame.depth_unit)
         if frame.lens is None:
             return depth
         sizes = np.array([depth.shape[1] / frame.width, depth.shape[0] / frame.height, 1.0])
@@ -143,7 +142,7 @@ def check_depth_header(path: Path) -> None:
     """Refuses what is not a 16-bit depth image."""
     with _open(path, "a depth image") as image:
         if image.mode not in DEPTH_MODES:
-            fix = "store depth as 16-bit PNG of millimetres"
+            fix = "store depth as 16-bit PNG"
             raise refusal(str(path), wanted="one channel of 16 bits", got=f"mode {image.mode}", fix=fix)
 
 
@@ -168,11 +167,11 @@ def decode_image(path: Path, size: tuple[int, int]) -> Float32[np.ndarray, "h w 
         return np.asarray(image.convert("RGB"), dtype=np.float32) / np.float32(255)
 
 
-def decode_depth(path: Path) -> Float32[np.ndarray, "h w"]:
-    """Depth in metres from a 16-bit image of millimetres; 0 stays 0, "unknown"."""
+def decode_depth(path: Path, unit: float) -> Float32[np.ndarray, "h w"]:
+    """Depth from a 16-bit image of steps of `unit`; 0 stays 0, "unknown"."""
     with _open(path, "a depth image") as image:
         _load(image, path)
-        return np.asarray(image, dtype=np.float32) * np.float32(MILLIMETRE)
+        return np.asarray(image, dtype=np.float32) * np.float32(unit)
 
 
 def decode_all(pixels: Pixels, indices: Sequence[int]) -> None:

@@ -15,6 +15,7 @@ from ssplat_jax.data.refusal import echo, refusal
 
 ROTATION_TOLERANCE = 5e-3  # largest |R^T R - I| that is taken for rounding, to three decimals, and projected
 ROTATION_ROUNDING = 1e-5  # deviations beyond this are reported
+MILLIMETRE = 1e-3
 MIN_FOCAL_PX = 3.0  # smaller focal lengths are intrinsics in units of the image, not in pixels
 
 
@@ -28,7 +29,8 @@ class Frame:
     width: int
     height: int
     path: Path | None = None  # None: the image lives in memory
-    depth_path: Path | None = None  # 16-bit PNG of millimetres
+    depth_path: Path | None = None  # 16-bit PNG
+    depth_unit: float = MILLIMETRE  # capture units of one step of its values
     pose_deviation: float = 0.0  # |R^T R - I| before projection
     shrink: float = 1.0  # of the stored image against the one that the intrinsics were given for
     lens: Lens | None = None  # distortion of the stored image, undone when it is delivered
@@ -78,6 +80,38 @@ def check_camtoworld(matrix: object, where: str) -> tuple[Float64[np.ndarray, "4
     u, _, vt = np.linalg.svd(rotation)
     pose[:3, :3], pose[3] = u @ vt, [0.0, 0.0, 0.0, 1.0]
     return pose, deviation
+
+
+def pose_of(wxyz: object, translation: object, where: str) -> Float64[np.ndarray, "4 4"]:
+    """The rigid transform of a quaternion and a translation from outside.
+
+    Limits:
+        Quaternions of any length are normalised; one shorter than 1e-6 is no rotation and is refused.
+    """
+    quat, translation = np.asarray(wxyz, np.float64), np.asarray(translation, np.float64)
+    length = float(np.linalg.norm(quat))
+    if not (np.isfinite(quat).all() and np.isfinite(translation).all()):
+        raise refusal(where, wanted="finite numbers", got="NaN or infinity", fix="drop the frame (tracking was lost)")
+    if not 1e-6 <= length < math.inf:
+        got = f"a quaternion of length {length:.2g}"
+        raise refusal(where, wanted="a rotation", got=got, fix="drop the frame or write a unit quaternion")
+    w, x, y, z = quat / length
+    pose = np.eye(4)
+    pose[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    pose[:3, 3] = translation
+    return pose
+
+
+def inverse(pose: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "4 4"]:
+    """The inverse of a rigid transform."""
+    back = np.eye(4)
+    back[:3, :3] = pose[:3, :3].T
+    back[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
+    return back
 
 
 def check_intrinsics(

@@ -56,6 +56,17 @@ class ExportReport:
     """To be added to the file's positions."""
 
 
+@dataclasses.dataclass(frozen=True)
+class SplatFile:
+    """What a file holds: its Gaussians, and what its comments say of them."""
+
+    gaussians: Gaussians
+    render_mode: str
+    """The kind of renderer that they were made for: `mip` (ours), `2dgs`, or `default`, that of 3DGS."""
+    offset: tuple[float, float, float]
+    """To be added to the positions."""
+
+
 def save_ply(
     path: str | os.PathLike,
     gaussians: Gaussians,
@@ -135,7 +146,16 @@ def load_ply(path: str | os.PathLike) -> Gaussians:
     Raises:
         InputError: the file is no 3DGS PLY, is cut off, or holds entries that are not finite.
     """
-    columns, _ = read_vertices(path)
+    return read_ply(path).gaussians
+
+
+def read_ply(path: str | os.PathLike) -> SplatFile:
+    """What `load_ply` gives, and the comments `SplatRenderMode` and `offset`.
+
+    Raises:
+        InputError: as `load_ply`, or an offset that is not three numbers.
+    """
+    columns, comments = read_vertices(path)
     missing = [name for name in BASE_PROPERTIES if name not in columns]
     if missing:
         packed = (
@@ -164,7 +184,29 @@ def load_ply(path: str | os.PathLike) -> Gaussians:
         "opacities": 0.5 * (1 + np.tanh(0.5 * logits)),  # the sigmoid, without overflow
         "sh": np.concatenate([dc[:, None], rest], axis=1),
     }
-    return Gaussians(**{name: jnp.asarray(field, jnp.float32) for name, field in fields.items()})
+    return SplatFile(
+        gaussians=Gaussians(**{name: jnp.asarray(field, jnp.float32) for name, field in fields.items()}),
+        render_mode=_render_mode(comments),
+        offset=_offset(path, comments),
+    )
+
+
+def _render_mode(comments: list[str]) -> str:
+    said = [comment.split()[-1] for comment in comments if comment.startswith("SplatRenderMode:")]
+    return said[-1] if said and said[-1] in RENDER_MODES else "default"
+
+
+def _offset(path, comments: list[str]) -> tuple[float, float, float]:
+    for comment in comments:
+        if comment.split()[:1] == ["offset"]:
+            try:
+                x, y, z = (float(word) for word in comment.split()[1:])
+            except ValueError:
+                x = y = z = np.nan
+            if not np.isfinite([x, y, z]).all():
+                raise InputError(f"{path}: comment offset: wanted three numbers, got {comment!a}; correct the comment.")
+            return x, y, z
+    return 0.0, 0.0, 0.0
 
 
 def _stacked(path, columns: dict[str, np.ndarray], names, *, allow_infinite: bool = False) -> np.ndarray:

@@ -281,5 +281,5 @@ CASES = (
     Case("zero frames", top(frames=[]), ("transforms.json: frames", "[]")),
     Case("frames an object", top(frames={"0": {}}), ("transforms.json: frames", "list")),
     Case("a frame is null", lambda root, meta: meta["frames"].__setitem__(2, None), ("frames[2]", "object")),
-    Case("transforms.json is a folder", lambda root, meta: (root / "transforms.json").mkdir(), ("no transforms.json",)),
+    Case("transforms.json is a folder", lambda root, meta: (root / "transforms.json").mkdir(), ("none of these",)),
 )  # fmt: skip

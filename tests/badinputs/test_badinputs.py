@@ -49,8 +49,8 @@ def test_bad_capture_is_refused_in_one_line(tmp_path, case):
     [
         ("nowhere", "nothing of that name"),
         ("empty", "an empty folder"),
-        ("full", "no transforms.json"),
-        ("file.txt", "no transforms.json"),
+        ("full", "transforms.json, COLMAP"),
+        ("file.txt", "none of these"),
         ("other.json", "frames"),
     ],
 )

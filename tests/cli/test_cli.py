@@ -22,7 +22,7 @@ from ssplat_jax.config import StreamConfig, preset
 from ssplat_jax.follow import apply_delta
 from ssplat_jax.stream import StreamSplat
 
-COMMANDS = ("demo", "inspect", "run", "eval", "train", "export", "bench", "experiment")
+COMMANDS = ("demo", "inspect", "run", "eval", "train", "export", "render", "view", "bench", "experiment")
 
 
 @pytest.fixture(autouse=True)
@@ -228,19 +228,25 @@ def test_run_stops_resumes_and_exports(tmp_path, capsys):
     # Another configuration is refused.
     assert json.loads((out / "metrics.json").read_text())["cache"]["num_chunks"] == 3
     for changes, difference in (
-        (("--set", "voxel_size=0.1"), "another config (voxel_size: 0.03 there, 0.1 now)"),
-        (("--stride", "2"), "another frames (12 there, 6 now"),
-        (("--size", "32x24"), "another size ([64, 48] there, [32, 24] now)"),
-        (("--quality", "fast"), "another size ([64, 48] there, [32, 24] now)"),
-        (("--weights", str(other)), "another weights"),
+        (("--set", "voxel_size=0.1"), "differs in its config (voxel_size: 0.03 there, 0.1 now)"),
+        (("--stride", "2"), "differs in its frames (12 there, 6 now"),
+        (("--size", "32x24"), "differs in its size ([64, 48] there, [32, 24] now)"),
+        (("--quality", "fast"), "differs in its size ([64, 48] there, [32, 24] now)"),
+        (("--weights", str(other)), "differs in its weights"),
     ):
         capsys.readouterr()
         assert run("run", capture, "--out", str(out), *changes, "--quiet") == 2
         (line,) = capsys.readouterr().err.splitlines()
         assert difference in line and "--overwrite" in line
+    images = tmp_path / "capture" / "images"
+    kept = (images / "5.png").read_bytes()
+    (images / "5.png").write_bytes((images / "4.png").read_bytes())
+    assert run("run", capture, "--out", str(out), "--quiet") == 2
+    assert "differs in its images" in capsys.readouterr().err
+    (images / "5.png").write_bytes(kept)
     edit("transform_matrix", np.diag([1.0, 1.0, 1.0, 1.0]).tolist())(tmp_path / "capture")  # a corrected pose
     assert run("run", capture, "--out", str(out), "--quiet") == 2
-    assert "another poses" in capsys.readouterr().err
+    assert "differs in its poses" in capsys.readouterr().err
 
 
 def test_more_room_the_remedy_for_a_run_that_stopped_for_want_of_it_goes_on_with_what_was_saved(tmp_path):

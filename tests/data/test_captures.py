@@ -103,6 +103,16 @@ def test_blenders_angle_and_missing_extension(tmp_path):
     np.testing.assert_allclose(capture.K(0), wanted, rtol=1e-14)
 
 
+def test_the_digest_of_images_is_of_the_frames_named_and_their_bytes(tmp_path):
+    capture = open_capture(make(tmp_path))
+    before = capture.images_digest([0, 1])
+    assert before != capture.images_digest([1, 0]) != capture.images_digest([1])
+    Image.new("RGB", (WIDTH, HEIGHT), (1, 2, 3)).save(capture.frames[2].path)
+    assert capture.images_digest([0, 1]) == before
+    Image.new("RGB", (WIDTH, HEIGHT), (1, 2, 3)).save(capture.frames[1].path)
+    assert capture.images_digest([0, 1]) != before
+
+
 def test_a_file_of_any_name_and_odd_file_names_are_read(tmp_path):
     def change(root, meta):
         (root / "images" / "1.jpg").rename(root / "images" / "Küche 1.JPG")

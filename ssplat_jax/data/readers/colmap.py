@@ -1,0 +1,231 @@
+"""A COLMAP reconstruction: `sparse/0/`, `sparse/` or `colmap/sparse/0/` with `cameras` and `images`, binary or text.
+
+Poses are world-to-camera with OpenCV's axes; the world stays COLMAP's. A pixel's centre is at +0.5, as here. Images
+lie in `images/` (or, shrunk, in `images_2`, `images_4`, `images_8`), else in the capture's folder; those that COLMAP
+did not register are no frames. Of the camera models those without fish-eye are read, FULL_OPENCV without its
+denominator (k4 to k6). Format: colmap.github.io/format.html; of binary and text files the binary ones are read.
+"""
+
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from ssplat_jax.data.lens import Lens
+from ssplat_jax.data.posed_frame import Frame, inverse, pose_of
+from ssplat_jax.data.readers import Listing
+from ssplat_jax.data.readers.frames import SHRUNK_FOLDERS, Intrinsics, file_named, make_frame, stored_size, streamed
+from ssplat_jax.data.readers.strict_text import load_lines, numbers
+from ssplat_jax.data.refusal import echo, refusal
+
+FORMAT = "COLMAP"
+FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", ".")
+MODELS = (  # by id; None: fish-eye, no pinhole camera even after Brown's distortion
+    ("SIMPLE_PINHOLE", "f cx cy"),
+    ("PINHOLE", "fx fy cx cy"),
+    ("SIMPLE_RADIAL", "f cx cy k1"),
+    ("RADIAL", "f cx cy k1 k2"),
+    ("OPENCV", "fx fy cx cy k1 k2 p1 p2"),
+    ("OPENCV_FISHEYE", None),
+    ("FULL_OPENCV", "fx fy cx cy k1 k2 p1 p2 k3 d1 d2 d3"),
+    ("FOV", None),
+    ("SIMPLE_RADIAL_FISHEYE", None),
+    ("RADIAL_FISHEYE", None),
+    ("THIN_PRISM_FISHEYE", None),
+)
+UNDISTORT = "undistort the images to pinhole cameras first (`colmap image_undistorter`)"
+COPY_AGAIN = "copy the reconstruction again"
+POINT_BYTES = 24  # of a 2D point of an image: x, y, id of its 3D point
+
+
+class ImageEntry(NamedTuple):
+    """One registered image."""
+
+    name: str
+    quat: tuple[float, ...]  # world-to-camera, wxyz
+    translation: tuple[float, ...]
+    camera: int
+    where: str
+
+
+class CameraEntry(NamedTuple):
+    """One camera."""
+
+    size: tuple[float, float]  # (width, height), as COLMAP saw the images
+    intrinsics: Intrinsics
+
+
+def matches(path: Path) -> bool:
+    """Whether `path` is a folder with a reconstruction."""
+    return _model_folder(path) is not None
+
+
+def read(path: Path) -> Listing:
+    """The registered images of the reconstruction in the folder `path`."""
+    model, root = _model_folder(path), path.resolve()
+    assert model is not None  # as `matches` said
+    if (model / "images.bin").is_file():
+        cameras, entries = _binary_cameras(model / "cameras.bin"), list(_binary_images(model / "images.bin"))
+    else:
+        cameras, entries = _text_cameras(model / "cameras.txt"), list(_text_images(model / "images.txt"))
+    if not entries:
+        fix = "run the reconstruction again: no image was registered"
+        raise refusal(str(model), wanted="registered images", got="none", fix=fix)
+    folder = "images/" if any((root / name).is_dir() for name in ("images", *SHRUNK_FOLDERS)) else ""
+    seen: dict[Path | None, str] = {}
+    frames = []
+    for entry in entries:
+        frame = _frame(root, folder, entry, cameras)
+        if seen.setdefault(frame.path, entry.where) is not entry.where:
+            got = f"{echo(entry.name)} twice"
+            raise refusal(entry.where, wanted="every image once", got=got, fix="remove one of the two")
+        frames.append(frame)
+    return streamed(root.name, frames)
+
+
+def _model_folder(path: Path) -> Path | None:
+    """Where the reconstruction lies."""
+    for folder in FOLDERS:
+        if any((path / folder / f"images.{kind}").is_file() for kind in ("bin", "txt")):
+            return path / folder
+    return None
+
+
+def _frame(root: Path, folder: str, entry: ImageEntry, cameras: dict[int, CameraEntry]) -> Frame:
+    if entry.camera not in cameras:
+        got = f"camera {entry.camera}, which is not there"
+        raise refusal(entry.where, wanted="a camera of the reconstruction", got=got, fix=COPY_AGAIN)
+    camera = cameras[entry.camera]
+    path = file_named(root, folder + entry.name, entry.where, folders=SHRUNK_FOLDERS)
+    fix = "give the images that COLMAP saw"
+    size, shrink = stored_size(path, camera.size, entry.where, fix)
+    return make_frame(
+        entry.name,
+        path,
+        inverse(pose_of(entry.quat, entry.translation, entry.where)),
+        camera.intrinsics,
+        size,
+        f"{entry.where}, camera {entry.camera}",
+        shrink=shrink,
+    )
+
+
+def _camera(model: str, width: int, height: int, params: list[float], where: str) -> CameraEntry:
+    names = dict(MODELS).get(model)
+    if names is None:
+        supported = ", ".join(name for name, params in MODELS if params is not None)
+        raise refusal(where, wanted=f"one of {supported}", got=echo(model), fix=UNDISTORT)
+    if len(params) != len(names.split()):
+        got = str(len(params))
+        raise refusal(where, wanted=f"{len(names.split())} parameters ({names})", got=got, fix=COPY_AGAIN)
+    fields: dict[str, Any] = dict(zip(names.split(), params, strict=True))
+    if any(fields.pop(name, 0.0) != 0.0 for name in ("d1", "d2", "d3")):
+        raise refusal(where, wanted="FULL_OPENCV with k4 = k5 = k6 = 0", got="a denominator", fix=UNDISTORT)
+    focal = fields.pop("f", None)
+    fx, fy = (fields.pop("fx", focal), fields.pop("fy", focal))
+    cx, cy = fields.pop("cx"), fields.pop("cy")
+    return CameraEntry((float(width), float(height)), Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, lens=Lens(**fields)))
+
+
+class _Binary:
+    """Little-endian values from the front of a file; too short a file is refused."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        try:
+            self._data = memoryview(path.read_bytes())
+        except OSError as error:
+            raise refusal(str(path), wanted="a readable file", got=error.strerror, fix=COPY_AGAIN) from None
+        self._at = 0
+
+    def take(self, layout: str) -> tuple:
+        """Values of a `struct` layout."""
+        layout = "<" + layout
+        return struct.unpack(layout, self._bytes(struct.calcsize(layout)))
+
+    def skip(self, num_bytes: int) -> None:
+        """Goes on `num_bytes` further."""
+        self._bytes(num_bytes)
+
+    def count(self, least_bytes: int) -> int:
+        """A number of entries of at least `least_bytes` each, of which the rest of the file has room."""
+        (count,) = self.take("Q")
+        if count * least_bytes > len(self._data) - self._at:
+            got = f"{count} in {len(self._data)} bytes"
+            raise refusal(str(self.path), wanted="as many entries as the file holds", got=got, fix=COPY_AGAIN)
+        return count
+
+    def text(self) -> str:
+        """Up to the next zero byte."""
+        end = bytes(self._data[self._at : self._at + 4096]).find(0)
+        try:
+            if end >= 0:
+                return bytes(self._bytes(end + 1))[:-1].decode("utf-8")
+        except UnicodeDecodeError:
+            pass
+        where = f"{self.path}: byte {self._at}"
+        raise refusal(where, wanted="the name of an image, UTF-8", got="other bytes", fix=COPY_AGAIN)
+
+    def _bytes(self, num_bytes: int) -> memoryview:
+        end = self._at + num_bytes
+        if end > len(self._data):
+            got = f"the end of the file after {len(self._data)} bytes"
+            raise refusal(str(self.path), wanted=f"{num_bytes} more bytes at {self._at}", got=got, fix=COPY_AGAIN)
+        self._at, taken = end, self._data[self._at : end]
+        return taken
+
+
+def _binary_cameras(path: Path) -> dict[int, CameraEntry]:
+    file, cameras = _Binary(path), {}
+    for _ in range(file.count(24)):
+        camera, model, width, height = file.take("IiQQ")
+        where = f"{path}: camera {camera}"
+        name, params = MODELS[model] if 0 <= model < len(MODELS) else (f"model {model}", None)
+        values = file.take(f"{len(params.split())}d") if params is not None else ()
+        cameras[camera] = _camera(name, width, height, list(values), where)
+    return cameras
+
+
+def _binary_images(path: Path) -> Iterator[ImageEntry]:
+    file = _Binary(path)
+    for _ in range(file.count(73)):
+        image, *pose, camera = file.take("I7dI")
+        name = file.text()
+        file.skip(POINT_BYTES * file.count(POINT_BYTES))
+        yield ImageEntry(name, tuple(pose[:4]), tuple(pose[4:]), camera, f"{path}: image {image}")
+
+
+def _text_cameras(path: Path) -> dict[int, CameraEntry]:
+    cameras = {}
+    for number, line in load_lines(path):
+        if not line:
+            continue
+        where, words = f"{path}: line {number}", line.split()
+        if len(words) < 4:
+            raise refusal(where, wanted="id, model, width, height, parameters", got=echo(line), fix=COPY_AGAIN)
+        camera, width, height = (_whole(word, where) for word in (words[0], *words[2:4]))
+        cameras[camera] = _camera(words[1], width, height, numbers(words[4:], where), where)
+    return cameras
+
+
+def _text_images(path: Path) -> Iterator[ImageEntry]:
+    """Two lines an image: its pose and name, and its 2D points, a line that may be empty."""
+    lines = iter(load_lines(path))
+    for number, line in lines:
+        if not line:
+            continue
+        where, words = f"{path}: line {number}", line.split(maxsplit=9)
+        if len(words) != 10:
+            wanted = "id, quaternion, translation, camera id, name"
+            raise refusal(where, wanted=wanted, got=echo(line), fix=COPY_AGAIN)
+        pose = numbers(words[1:8], where)
+        points = next(lines, (number, ""))[1].split()
+        if len(points) % 3 or (points and not points[-1].lstrip("-").isdigit()):
+            raise refusal(where, wanted="a line of 2D points below", got="another line", fix=COPY_AGAIN)
+        yield ImageEntry(words[9], tuple(pose[:4]), tuple(pose[4:]), _whole(words[8], where), where)
+
+
+def _whole(word: str, where: str) -> int:
+    if word.isascii() and word.isdigit() and len(word) < 19:
+        return int(word)
+    raise refusal(where, wanted="a whole number", got=echo(word), fix=COPY_AGAIN)

@@ -1,0 +1,63 @@
+"""A ScanNet export: `color/0.jpg`, `pose/0.txt`, `intrinsic/intrinsic_color.txt` and, if there, `depth/0.png`.
+
+Poses are camera-to-world with OpenCV's axes, metres; where tracking was lost they hold -inf, and the frame is left out.
+Depth maps hold millimetres, at a resolution of their own; they are taken as seen by the colour camera, as their
+frames were registered.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from ssplat_jax.data.pixels import check_depth_header, image_size
+from ssplat_jax.data.posed_frame import check_camtoworld
+from ssplat_jax.data.readers import Listing
+from ssplat_jax.data.readers.frames import Intrinsics, file_named, find_file, make_frame, streamed
+from ssplat_jax.data.readers.strict_text import load_rows
+from ssplat_jax.data.refusal import refusal
+
+FORMAT = "ScanNet"
+IMAGES = (".jpg", ".jpeg", ".png")
+
+
+def matches(path: Path) -> bool:
+    """Whether `path` is a folder with `color/` and `pose/`."""
+    return (path / "color").is_dir() and (path / "pose").is_dir()
+
+
+def read(path: Path) -> Listing:
+    """The tracked frames of the export in the folder `path`."""
+    root = path.resolve()
+    file = file_named(root, "intrinsic/intrinsic_color.txt", f"{path}: intrinsics")
+    K = _matrix(file)
+    intrinsics = Intrinsics(fx=K[0, 0], fy=K[1, 1], cx=K[0, 2], cy=K[1, 2])
+    images = [image for image in sorted((root / "color").iterdir()) if image.suffix.lower() in IMAGES]
+    frames, num_lost = [], 0
+    for image in images:
+        pose_file = find_file(root, [f"pose/{image.stem}.txt"], str(image))
+        matrix = None if pose_file is None else _matrix(pose_file)
+        if matrix is None or not np.isfinite(matrix).all():
+            num_lost += 1
+            continue
+        camtoworld, deviation = check_camtoworld(matrix, str(pose_file))
+        where = f"{file} for {image.name}"
+        depth = find_file(root, [f"depth/{image.stem}.png"], str(image))
+        if depth is not None:
+            check_depth_header(depth)
+        size = image_size(image)
+        name = f"color/{image.name}"
+        frames.append(
+            make_frame(name, image, camtoworld, intrinsics, size, where, pose_deviation=deviation, depth_path=depth)
+        )
+    if not frames:
+        got = f"{len(images)} images, none of them with a finite pose"
+        raise refusal(str(path), wanted="tracked frames", got=got, fix="export color/ and pose/ again")
+    lost = [f"{num_lost} of {len(images)} frames are left out: tracking was lost there."] if num_lost else []
+    return streamed(root.name, frames, lost)
+
+
+def _matrix(file: Path) -> np.ndarray:
+    rows = load_rows(file, 4)
+    if rows.shape != (4, 4):
+        raise refusal(str(file), wanted="four rows of four numbers", got=f"{len(rows)} rows", fix="export it again")
+    return rows
