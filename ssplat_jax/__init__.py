@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     from ssplat_jax.errors import StorageError as StorageError
     from ssplat_jax.export.ply import load_ply as load_ply
     from ssplat_jax.export.ply import save_ply as save_ply
+    from ssplat_jax.export.splat import save_splat as save_splat
+    from ssplat_jax.export.spz import save_spz as save_spz
     from ssplat_jax.gaussians import Gaussians as Gaussians
     from ssplat_jax.geometry.cameras import Camera as Camera
     from ssplat_jax.render import Effects as Effects
@@ -58,6 +60,8 @@ _HOMES = {
     "preset": "config",
     "render": "render",
     "save_ply": "export.ply",
+    "save_splat": "export.splat",
+    "save_spz": "export.spz",
 }
 __version__ = "0.1.0"
 __all__ = sorted(_HOMES)

@@ -25,9 +25,10 @@ from ssplat_jax.evaluate import (
 )
 from ssplat_jax.export.atomic import previous_path
 from ssplat_jax.export.folders import remove_numbered
+from ssplat_jax.export.formats import check_format, save_gaussians
 from ssplat_jax.export.json_files import write_json
 from ssplat_jax.export.only_writer import only_writer
-from ssplat_jax.export.ply import ExportReport, save_ply
+from ssplat_jax.export.rows import ExportReport
 from ssplat_jax.follow import SceneDelta, SceneFeed
 from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.interrupts import Interrupts
@@ -150,11 +151,10 @@ def export_run(run_dir: Path, to: Path, params: dict, reporter: Reporter) -> Exp
     Of a damaged state the one saved before it is taken, which is said.
 
     Raises:
-        InputError: no run there, a run with other weights, or `to` is not a .ply.
+        InputError: no run there, a run with other weights, or `to` has the ending of no format.
         StorageError: the state is corrupt or `to` cannot be written.
     """
-    if to.suffix != ".ply":
-        raise InputError(f"--to: wanted a .ply file, got {to.name!r}.")
+    check_format(to)
     state = run_dir / STATE_FILE
     if not state.exists() and not previous_path(state).exists():
         raise InputError(f"{run_dir}: wanted the folder of an `ssplat run`, found no {STATE_FILE} in it.")
@@ -164,16 +164,12 @@ def export_run(run_dir: Path, to: Path, params: dict, reporter: Reporter) -> Exp
     if header.get("weights") != params_digest(params):
         raise InputError(f"{run_dir}: was streamed with other weights than these; give the run's own with --weights.")
     session = Session(StreamSplat(StreamConfig.from_dict(header["config"])), params, cache)
-    return save_scene(to, session.gaussians(), StreamFrame.from_dict(header["frame"]), reporter)
+    return _save_scene(to, session.gaussians(), StreamFrame.from_dict(header["frame"]))
 
 
-def save_scene(path: Path, gaussians: Gaussians, frame: StreamFrame, reporter: Reporter) -> ExportReport:
+def _save_scene(path: Path, gaussians: Gaussians, frame: StreamFrame) -> ExportReport:
     """Writes Gaussians of the stream in the capture's frame; far from its origin, from the frame's offset."""
-    offset = frame.offset
-    report = save_ply(path, frame.gaussians_to_capture(gaussians, offset=offset), offset=offset)
-    if any(offset):
-        reporter.warn(f"{path.name}: the capture lies far from its origin; positions are counted from {list(offset)}.")
-    return report
+    return save_gaussians(path, frame.gaussians_to_capture(gaussians, offset=frame.offset), offset=frame.offset)
 
 
 def _delta_path(out: Path, done: int) -> Path:
@@ -276,7 +272,9 @@ def _finish(
 ) -> ExportReport:
     """Scene, pictures and metrics of a finished stream."""
     gaussians = session.gaussians()
-    report = save_scene(out / SCENE_FILE, gaussians, frame, reporter)
+    report = _save_scene(out / SCENE_FILE, gaussians, frame)
+    if report.warning is not None:
+        reporter.warn(f"{SCENE_FILE}: {report.warning}")
     pictures = out / PICTURES
     remove_numbered(pictures, PICTURE)
     shown = sorted({indices[round(i)] for i in np.linspace(0, len(indices) - 1, NUM_PICTURES)})

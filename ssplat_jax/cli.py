@@ -271,24 +271,31 @@ class Train:
 
 @dataclasses.dataclass(frozen=True)
 class Export:
-    """Write the scene of a run again, from its saved state.
+    """Write the scene of a run again, from its saved state, or a .ply in another format.
 
-    Example: ssplat export runs/kitchen --to kitchen.ply
+    Example: ssplat export runs/kitchen --to kitchen.spz
     """
 
-    run_dir: Annotated[Path, tyro.conf.Positional]
-    """Folder of an `ssplat run`."""
+    scene: Annotated[Path, tyro.conf.Positional]
+    """Folder of an `ssplat run`, or a 3DGS .ply."""
     to: Path
-    """File to write; .ply."""
+    """File to write: .ply; .spz, a seventh of its size; or .splat, which older viewers in browsers take."""
     weights: str = "tiny"
     """The weights of that run."""
 
     def run(self) -> int:
         from ssplat_jax.capture_run import export_run
         from ssplat_jax.checkpoint.weights import load_params
+        from ssplat_jax.export.formats import convert_ply
         from ssplat_jax.report import Reporter
 
-        report = export_run(self.run_dir, self.to, load_params(self.weights), Reporter(quiet=False))
+        reporter = Reporter(quiet=False)
+        if self.scene.is_file():
+            report = convert_ply(self.scene, self.to)
+        else:
+            report = export_run(self.scene, self.to, load_params(self.weights), reporter)
+        if report.warning is not None:
+            reporter.warn(f"{self.to.name}: {report.warning}")
         print(
             f"wrote {self.to}: {report.num_written} Gaussians ({report.num_dropped} invisible or not finite left out)"
         )

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Float64
 
 from ssplat_jax.errors import InputError
-from ssplat_jax.export.ply import MIN_OPACITY
+from ssplat_jax.export.rows import MIN_OPACITY
 from ssplat_jax.gaussians import SH_C0, Gaussians
 from ssplat_jax.geometry.rotations import quats_to_matrices
 

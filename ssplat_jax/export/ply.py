@@ -20,18 +20,10 @@ import numpy as np
 from ssplat_jax.errors import InputError
 from ssplat_jax.export.atomic import write_atomic
 from ssplat_jax.export.ply_table import read_vertices
+from ssplat_jax.export.rows import LOG_SCALE_LIMIT, ExportReport, SceneRows, scene_rows, unit_quats
 from ssplat_jax.gaussians import Gaussians
 
 RENDER_MODES = ("default", "mip", "2dgs")
-
-MIN_OPACITY = 1.0 / 255.0
-"""Rows fainter than this draw nothing in any renderer and are not written; absent rows (opacity 0) are among them."""
-
-OPACITY_GUARD = 1e-6
-"""Opacities are written no nearer than this to 0 and 1, where the logit is infinite."""
-
-LOG_SCALE_LIMIT = 20.0
-"""|ln sigma| beyond this is clamped: 2e-9 to 5e8 units, the range of the compressed formats made from such a file."""
 
 REST_TERMS = {0: 0, 9: 1, 24: 2, 45: 3}
 """Number of f_rest properties to SH degree."""
@@ -43,17 +35,6 @@ BASE_PROPERTIES = (
     *("scale_0", "scale_1", "scale_2"),
     *("rot_0", "rot_1", "rot_2", "rot_3"),
 )
-
-
-@dataclasses.dataclass(frozen=True)
-class ExportReport:
-    """What became of the rows of a scene."""
-
-    num_written: int
-    num_dropped: int
-    """Non-finite, of negative scale, or fainter than 1/255 (absent rows included)."""
-    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """To be added to the file's positions."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,8 +64,7 @@ def save_ply(
         offset: where the origin of `gaussians` lies in the frame the file should be in; a comment unless zero.
 
     Limits:
-        Rows with an entry that is not finite, a negative scale or an opacity below 1/255 are dropped and counted.
-        Opacities are clamped to [1e-6, 1 - 1e-6], scales to [e^-20, e^20]; a zero quaternion becomes the identity.
+        As `scene_rows`; what it leaves out is counted.
 
     Raises:
         InputError: no such render mode.
@@ -92,9 +72,9 @@ def save_ply(
     """
     if render_mode not in RENDER_MODES:
         raise InputError(f"save_ply: render_mode must be one of {', '.join(RENDER_MODES)}, got {render_mode!r}.")
-    rows = _rows(gaussians)
+    rows = scene_rows(gaussians)
     header = _header(len(rows), gaussians.sh_degree, render_mode, offset)
-    write_atomic(path, header + rows.astype("<f4").tobytes())
+    write_atomic(path, header + _table(rows).astype("<f4").tobytes())
     return ExportReport(num_written=len(rows), num_dropped=gaussians.num_gaussians - len(rows), offset=offset)
 
 
@@ -119,18 +99,12 @@ def _header(num_rows: int, sh_degree: int, render_mode: str, offset: tuple[float
     return "\n".join(lines).encode("ascii")
 
 
-def _rows(gaussians: Gaussians) -> np.ndarray:
-    """One row of raw values per Gaussian worth writing, float64 until the last cast."""
-    fields = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
-    means, quats, scales, opacities, sh = (np.asarray(field, np.float64) for field in fields)
-    entries = np.concatenate([means, quats, scales, opacities[:, None], sh.reshape(len(sh), 3 * sh.shape[1])], axis=1)
-    keep = np.isfinite(entries).all(axis=1) & (scales >= 0).all(axis=1) & (opacities >= MIN_OPACITY)
-    means, quats, scales, opacities, sh = (field[keep] for field in (means, quats, scales, opacities, sh))
-    opacities = np.clip(opacities, OPACITY_GUARD, 1 - OPACITY_GUARD)
-    log_scales = np.log(np.clip(scales, np.exp(-LOG_SCALE_LIMIT), np.exp(LOG_SCALE_LIMIT)))
-    rest = sh[:, 1:].transpose(0, 2, 1).reshape(len(sh), 3 * (sh.shape[1] - 1))
-    logits = np.log(opacities) - np.log1p(-opacities)
-    columns = [means, np.zeros_like(means), sh[:, 0], rest, logits[:, None], log_scales, _unit_quats(quats)]
+def _table(rows: SceneRows) -> np.ndarray:
+    """One row of raw values per Gaussian, float64 until the last cast."""
+    rest = rows.sh[:, 1:].transpose(0, 2, 1).reshape(len(rows), 3 * (rows.sh.shape[1] - 1))
+    logits = np.log(rows.opacities) - np.log1p(-rows.opacities)
+    normals = np.zeros_like(rows.means)
+    columns = [rows.means, normals, rows.sh[:, 0], rest, logits[:, None], rows.log_scales, rows.quats]
     return np.concatenate(columns, axis=1)
 
 
@@ -179,7 +153,7 @@ def read_ply(path: str | os.PathLike) -> SplatFile:
     quats = _stacked(path, columns, ("rot_0", "rot_1", "rot_2", "rot_3"))
     fields = {
         "means": means,
-        "quats": _unit_quats(quats),
+        "quats": unit_quats(quats),
         "scales": np.exp(np.clip(log_scales, -LOG_SCALE_LIMIT, LOG_SCALE_LIMIT)),
         "opacities": 0.5 * (1 + np.tanh(0.5 * logits)),  # the sigmoid, without overflow
         "sh": np.concatenate([dc[:, None], rest], axis=1),
@@ -222,11 +196,3 @@ def _stacked(path, columns: dict[str, np.ndarray], names, *, allow_infinite: boo
             "drop them."
         )
     return stacked
-
-
-def _unit_quats(quats: np.ndarray) -> np.ndarray:
-    """Unit quaternions; the identity for those the renderer takes as one (all entries within 1e-12 of 0)."""
-    largest = np.abs(quats).max(axis=1, keepdims=True, initial=0.0)
-    quats = np.where(largest > 1e-12, quats, np.array([1.0, 0.0, 0.0, 0.0]))
-    quats = quats / np.abs(quats).max(axis=1, keepdims=True, initial=0.0)
-    return quats / np.linalg.norm(quats, axis=1, keepdims=True)
