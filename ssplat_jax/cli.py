@@ -323,6 +323,8 @@ class Render:
     """Size WxH of the pictures; default the capture's own."""
     over_black: bool = False
     """Show black, not the colours around, where the scene lets light through."""
+    film: int | None = None
+    """Write film.mp4 too, which takes so many pictures from each camera to the next, 24 a second (extra `video`)."""
     quiet: bool = False
     """No progress."""
 
@@ -331,9 +333,18 @@ class Render:
         from ssplat_jax.report import Reporter
 
         size, reporter = parse_size(self.size), Reporter(self.quiet)
-        options = {"size": size, "stride": self.stride, "max_views": self.max_views, "over_black": self.over_black}
-        num_pictures = render_scene(self.scene, self.capture, self.out, reporter=reporter, **options)
-        print(f"wrote {num_pictures} pictures to {self.out}/views")
+        num_pictures = render_scene(
+            self.scene,
+            self.capture,
+            self.out,
+            size=size,
+            stride=self.stride,
+            max_views=self.max_views,
+            over_black=self.over_black,
+            film_steps=self.film,
+            reporter=reporter,
+        )
+        print(f"wrote {num_pictures} pictures to {self.out}/views" + (", and film.mp4" if self.film else ""))
         return 0
 
 

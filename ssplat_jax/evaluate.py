@@ -9,7 +9,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from PIL import Image
 
 from ssplat_jax.cache import ensure_room
@@ -327,9 +327,13 @@ def save_image(path: Path, image: Images) -> None:
         StorageError: the file cannot be written.
     """
     encoded = io.BytesIO()
-    pixels = (np.clip(image, 0.0, 1.0) * 255 + 0.5).astype(np.uint8)
-    Image.fromarray(pixels).save(encoded, Image.registered_extensions()[path.suffix])
+    Image.fromarray(eight_bits(image)).save(encoded, Image.registered_extensions()[path.suffix])
     write_atomic(path, encoded.getvalue())
+
+
+def eight_bits(image: Images) -> UInt8[np.ndarray, "h w 3"]:
+    """An image in [0, 1] in steps of 1/255."""
+    return (np.clip(image, 0.0, 1.0) * 255 + 0.5).astype(np.uint8)
 
 
 def save_comparison(path: Path, target: Images, color: Images, depth, depth_range: tuple[float, float]) -> None:

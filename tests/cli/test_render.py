@@ -1,4 +1,6 @@
-"""`ssplat render`: pictures of a scene file from a capture's cameras."""
+"""`ssplat render`: pictures of a scene file from a capture's cameras, and a film."""
+
+import sys
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,6 +15,7 @@ from ssplat_jax.struct import replace
 from tests.cli.test_cli import make_capture, run
 
 LEVEL = 1.0 / 255
+FILM_DB = 38.0  # x264's losses, of the brightness: colours have half the resolution
 SHIFT = (4096.0, -512.0, 64.0)  # whole numbers, so that the positions counted from it are the same floats
 
 
@@ -107,3 +110,41 @@ def test_an_offset_that_is_none_is_refused(tmp_path, capture, capsys):
     arguments = ("--out", str(tmp_path / "out"), "--quiet")
     assert run("render", str(tmp_path / "scene.ply"), str(capture), *arguments) == 2
     assert "three numbers" in capsys.readouterr().err
+
+
+def decode(path):
+    av = pytest.importorskip("av")
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        return stream.average_rate, [f.to_ndarray(format="rgb24") / 255 for f in container.decode(stream)]
+
+
+def test_a_film_goes_from_camera_to_camera(tmp_path, capture):
+    pytest.importorskip("av")
+    ss.save_ply(tmp_path / "scene.ply", scene())
+    out = tmp_path / "out"
+    arguments = ("--size", "45x31", "--out", str(out), "--quiet")
+    assert run("render", str(tmp_path / "scene.ply"), str(capture), "--film", "4", *arguments) == 0
+    rate, film = decode(out / "film.mp4")
+    assert (rate, len(film)) == (24, 2 * 4 + 1)
+    views = [picture(out / "views" / f"{i:05d}.png")[:30, :44] for i in range(3)]
+    brightness = np.array([0.2126, 0.7152, 0.0722])
+    error = lambda a, b: -10 * np.log10(np.mean(((a - b) @ brightness) ** 2))  # noqa: E731
+    for i, view in enumerate(views):
+        assert error(film[4 * i], view) > FILM_DB
+        assert np.abs((film[4 * i] - view).mean(axis=(0, 1))).max() < 3 * LEVEL
+    # In between it shows neither of its ends.
+    assert max(error(film[2], views[0]), error(film[2], views[1])) < min(error(film[0], views[0]), FILM_DB) - 5
+    # Without a film, none of another scene stays.
+    assert run("render", str(tmp_path / "scene.ply"), str(capture), *arguments) == 0
+    assert sorted(path.name for path in out.iterdir()) == ["views"]
+
+
+@pytest.mark.parametrize(("film", "words"), [("0", "film"), ("-3", "film"), ("2", 'pip install "ssplat-jax[video]"')])
+def test_a_film_that_cannot_be_made_is_said_and_nothing_written(film, words, tmp_path, capture, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "av", None)  # not installed
+    ss.save_ply(tmp_path / "scene.ply", scene())
+    out = tmp_path / "out"
+    assert run("render", str(tmp_path / "scene.ply"), str(capture), "--film", film, "--out", str(out), "--quiet") == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert words in line and not out.exists()
