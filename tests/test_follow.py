@@ -21,7 +21,7 @@ CONFIGS = {
     "evict": CONFIG.replace(overflow="evict_lowest", pivots_per_voxel=2),
     "append": CONFIG.replace(vacc="append"),
 }
-HEAD_TOL = 1e-5  # relative and absolute: a matrix product of other rows may round otherwise
+HEAD_TOL = 1e-5  # relative and absolute: a program for another number of rows may round otherwise
 
 pytestmark = pytest.mark.usefixtures("compiled_plainly")
 
@@ -45,7 +45,6 @@ def carved(cache, rng, config):
 def assert_same_scene(told, scene):
     shown = np.asarray(scene.opacities) > 0
     np.testing.assert_array_equal(told.opacities > 0, shown)
-    np.testing.assert_array_equal(told.means[shown], np.asarray(scene.means)[shown])
     for field in dataclasses.fields(scene):
         np.testing.assert_allclose(
             getattr(told, field.name)[shown],
