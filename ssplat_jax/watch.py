@@ -47,9 +47,11 @@ class SceneFile:
 
     def start_camera(self) -> StartCamera | None:
         """Where to look from at first: where the run beside it began, if one is there."""
-        metrics = self._path.parent / METRICS_FILE
-        fields = json.loads(metrics.read_text()).get("stream_frame") if metrics.is_file() else None
-        return None if fields is None else first_camera(StreamFrame.from_dict(fields))
+        try:
+            fields = json.loads((self._path.parent / METRICS_FILE).read_bytes())["stream_frame"]
+            return first_camera(StreamFrame.from_dict(fields))
+        except (OSError, ValueError, TypeError, LookupError):  # whatever else bears that name is no reason not to look
+            return None
 
 
 class GrowingScene:

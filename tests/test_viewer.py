@@ -1,5 +1,6 @@
 """What a browser is sent, and where it comes from. With viser and Chromium there, what the browser then shows."""
 
+import json
 import shutil
 import signal
 import socket
@@ -158,6 +159,16 @@ def test_a_scene_file_is_read_again_when_it_is_written_again(tmp_path):
     assert source.changed().num_gaussians == 7
     file.unlink()
     assert source.changed() is None  # shown on
+
+
+def test_a_scene_is_looked_at_from_where_its_run_began_if_that_is_known(tmp_path):
+    ss.save_ply(tmp_path / "scene.ply", scene(5))
+    metrics, source = tmp_path / "metrics.json", source_of(tmp_path)
+    metrics.write_text(json.dumps({"stream_frame": frame((1.0, 2.0, 3.0)).to_dict()}))
+    np.testing.assert_allclose(source.start_camera().position, [1.0, 2.0, 3.0])
+    for other in ("", "{", "[]", "{}", '{"stream_frame": null}', '{"stream_frame": {"rotation": 1}}', "\x00"):
+        metrics.write_text(other)
+        assert source.start_camera() is None
 
 
 def test_a_browser_starts_at_the_first_camera_of_the_stream():
