@@ -6,8 +6,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.geometry.cameras import invert_poses, pixel_grid, project_points, transform_points, unproject
-from ssplat_jax.geometry.sampling import bilinear_taps, correlate_warped
+from ssplat_jax.geometry.cameras import invert_poses, pixel_grid, unproject
+from ssplat_jax.geometry.sampling import correlate_warped, places_of
 from ssplat_jax.model.convolution import Conv
 from ssplat_jax.model.layers import UNet, average_pool, unit_features
 from ssplat_jax.model.wires import GRID_STRIDE, DepthBelief, Features, Views, nearest_sources
@@ -16,19 +16,25 @@ MIN_SOURCE_DEPTH = 1e-3
 """A candidate nearer than this to the source camera's plane, or behind it, is not seen by it."""
 
 
-def sweep_pixels(views: Views, reference, source) -> tuple[Float[Array, "d n 2"], Bool[Array, "d n"]]:
-    """Where the grid cells of view `reference`, put at every candidate depth, appear in view `source` (pixels)."""
+def sweep_pixels(
+    views: Views, reference, source
+) -> tuple[Float[Array, "d n"], Float[Array, "d n"], Bool[Array, "d n"]]:
+    """Where the grid cells of view `reference`, at every candidate depth, appear in view `source`: x, y (pixels)."""
     hf, wf = views.inside.shape[1:]
     cells = pixel_grid(hf * GRID_STRIDE, wf * GRID_STRIDE, GRID_STRIDE).reshape(-1, 2)
     rays = unproject(cells, jnp.ones(cells.shape[0]), views.Ks[reference])
-    points = rays[None] * jnp.exp(views.log_candidates)[:, None, None]
-    source_from_reference = jnp.matmul(
-        views.viewmats[source], invert_poses(views.viewmats[reference]), precision=jax.lax.Precision.HIGHEST
-    )
-    points = transform_points(source_from_reference[None], points)
-    pixels, depths = project_points(points, views.Ks[source][None], MIN_SOURCE_DEPTH)
-    x, y = pixels[..., 0], pixels[..., 1]
-    return pixels, (depths > MIN_SOURCE_DEPTH) & (x >= 0) & (x <= views.width) & (y >= 0) & (y <= views.height)
+    exact = jax.lax.Precision.HIGHEST
+    pose = jnp.matmul(views.viewmats[source], invert_poses(views.viewmats[reference]), precision=exact)
+    # At depth d along a ray r, a point is imaged at K R r + K t / d: the rays are turned once, and without parallax
+    # every depth gives the same pixel to the last bit.
+    a = jnp.einsum("ij,jk,nk->in", views.Ks[source], pose[:3, :3], rays, precision=exact)
+    b = jnp.einsum("ij,j->i", views.Ks[source], pose[:3, 3], precision=exact)
+    nearness = jnp.exp(-views.log_candidates)[:, None]
+    x, y, w = (a[i] + nearness * b[i] for i in range(3))
+    in_front = w > MIN_SOURCE_DEPTH * nearness
+    w = jnp.where(in_front, w, 1.0)
+    x, y = x / w, y / w
+    return x, y, in_front & (x >= 0) & (x <= views.width) & (y >= 0) & (y <= views.height)
 
 
 def plane_sweep(features: Features, views: Views, config: StreamConfig) -> Float[Array, "v hf wf dl"]:
@@ -50,15 +56,13 @@ def plane_sweep(features: Features, views: Views, config: StreamConfig) -> Float
 
     def correlate_pair(pair):
         reference, source, is_valid = pair
-        pixels, seen = sweep_pixels(views, reference, source)
+        x, y, seen = jax.lax.stop_gradient(sweep_pixels(views, reference, source))
         seen = seen & is_valid
         scores = []
         for stride, reference_map, source_map in maps:
-            height, width = source_map.shape[1:3]
-            taps, weights = bilinear_taps(jax.lax.stop_gradient(pixels / stride - 0.5), height, width)
-            channels = source_map.shape[-1]
-            flat_reference = reference_map[reference].reshape(-1, channels)
-            score = correlate_warped(flat_reference, source_map[source].reshape(-1, channels), taps, weights)
+            places = places_of(x / stride - 0.5, y / stride - 0.5, *source_map.shape[1:3])
+            flat_reference = reference_map[reference].reshape(-1, reference_map.shape[-1])
+            score = correlate_warped(flat_reference, source_map[source], places)
             scores.append(jnp.where(seen, score, 0.0))
         return jnp.stack(scores), seen.astype(jnp.float32)
 

@@ -7,7 +7,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.model.convolution import Conv, pixel_shuffle, pixel_unshuffle
-from ssplat_jax.model.layers import attend, rms_normalize
+from ssplat_jax.model.layers import attend, attend_own, rms_normalize
 
 GLOBAL_FACTOR = 4  # the global block works on 4 x 4 cells
 SEARCH_BLOCK = 1024  # queries at a time in the global search: bounds its distance matrix
@@ -69,9 +69,8 @@ class NeighbourBlock(nn.Module):
         q, k, v = jnp.split(
             nn.Dense(3 * self.config.mixer_proj, use_bias=False, name="qkv")(nn.LayerNorm(name="norm1")(x)), 3, axis=-1
         )
-        allowed = usable[neighbours][:, None]
-        mixed = attend(q[:, None, None], k[neighbours][:, :, None], v[neighbours][:, :, None], allowed)
-        x = x + nn.Dense(c, name="project")(mixed[:, 0, 0])
+        mixed = attend_own(q, k[neighbours], v[neighbours], usable[neighbours])
+        x = x + nn.Dense(c, name="project")(mixed)
         hidden = nn.gelu(nn.Dense(2 * c, name="mlp1")(nn.LayerNorm(name="norm2")(x)))
         return x + nn.Dense(c, name="mlp2")(hidden)
 

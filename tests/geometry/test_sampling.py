@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ssplat_jax.geometry.sampling import bilinear_taps, correlate_warped
+from ssplat_jax.geometry.sampling import correlate_warped, neighbours, places_of
 
 FLOAT32 = 2e-5  # sums of a dozen products of unit normals
 HEIGHT, WIDTH, CHANNELS = 5, 7, 6
@@ -21,12 +21,11 @@ def coordinates(seed: int = 0) -> np.ndarray:
 
 def arrays(seed: int = 0):
     rng = np.random.default_rng(seed)
-    return rng.normal(size=(15, CHANNELS)), rng.normal(size=(HEIGHT * WIDTH, CHANNELS))
+    return rng.normal(size=(15, CHANNELS)), rng.normal(size=(HEIGHT, WIDTH, CHANNELS))
 
 
-def warp_then_correlate(reference, source, coords):
+def warp_then_correlate(reference, image, coords):
     """Bilinear interpolation point by point, border held, then dot products."""
-    image = source.reshape(HEIGHT, WIDTH, CHANNELS)
     out = np.zeros(coords.shape[:2])
     for d, n in np.ndindex(*out.shape):
         x, y = np.clip(coords[d, n], 0, [WIDTH - 1, HEIGHT - 1])
@@ -42,23 +41,41 @@ def f32(x):
     return jnp.asarray(x, jnp.float32)
 
 
-def test_correlation_is_that_of_the_warped_map():
-    reference, source = arrays()
-    taps, weights = bilinear_taps(f32(coordinates()), HEIGHT, WIDTH)
-    got = correlate_warped(f32(reference), f32(source), taps, weights)
+def places(coords):
+    x, y = np.moveaxis(np.asarray(coords, np.float32), -1, 0)
+    return places_of(jnp.asarray(x), jnp.asarray(y), HEIGHT, WIDTH)
+
+
+def read(values, at):
+    """A map of numbers at `at`, by the four samples' weights."""
+    to_right, to_below = neighbours(*values.shape)
+    flat = values.reshape(-1)
+    above, below = (
+        (1 - at.right) * flat[at.corners + step] + at.right * flat[at.corners + step + to_right]
+        for step in (0, to_below)
+    )
+    return (1 - at.down) * above + at.down * below
+
+
+@pytest.mark.parametrize("channels", [6, 16, 48, 1])
+def test_correlation_is_that_of_the_warped_map(channels):
+    rng = np.random.default_rng(5)
+    reference, source = rng.normal(size=(15, channels)), rng.normal(size=(HEIGHT, WIDTH, channels))
+    got = correlate_warped(f32(reference), f32(source), places(coordinates()))
     np.testing.assert_allclose(got, warp_then_correlate(reference, source, coordinates()), atol=FLOAT32)
 
 
 def test_gradients_are_those_of_the_plain_sum():
     reference, source = map(f32, arrays(1))
-    taps, weights = bilinear_taps(f32(coordinates(1)), HEIGHT, WIDTH)
+    at = places(coordinates(1))
     cotangent = f32(np.random.default_rng(2).normal(size=(4, 15)))
 
     def plain(reference, source):
-        return jnp.sum(cotangent * jnp.einsum("dntc,dnt,nc->dn", source[taps], weights, reference))
+        warped = jax.vmap(lambda channel: read(channel, at), in_axes=-1, out_axes=-1)(source)
+        return jnp.sum(cotangent * jnp.sum(warped * reference, axis=-1))
 
     def fast(reference, source):
-        return jnp.sum(cotangent * correlate_warped(reference, source, taps, weights))
+        return jnp.sum(cotangent * correlate_warped(reference, source, at))
 
     wanted, got = jax.grad(plain, (0, 1))(reference, source), jax.jit(jax.grad(fast, (0, 1)))(reference, source)
     for w, g in zip(wanted, got, strict=True):
@@ -68,8 +85,7 @@ def test_gradients_are_those_of_the_plain_sum():
 def test_gradient_is_the_finite_difference_of_the_oracle():
     """The function is bilinear, so a difference quotient of any step is exact: float64, no truncation error."""
     (reference, source), coords = arrays(3), coordinates(3)
-    taps, weights = bilinear_taps(f32(coords), HEIGHT, WIDTH)
-    total = lambda r, s: jnp.sum(correlate_warped(r, s, taps, weights))  # noqa: E731
+    total = lambda r, s: jnp.sum(correlate_warped(r, s, places(coords)))  # noqa: E731
     by_reference, by_source = jax.grad(total, (0, 1))(f32(reference), f32(source))
     rng = np.random.default_rng(4)
     step_reference, step_source = rng.normal(size=reference.shape), rng.normal(size=source.shape)
@@ -80,24 +96,31 @@ def test_gradient_is_the_finite_difference_of_the_oracle():
     assert np.sum(np.asarray(by_source) * step_source) == pytest.approx(difference, abs=1e-3)
 
 
+VALUES = jnp.arange(HEIGHT * WIDTH, dtype=jnp.float32).reshape(HEIGHT, WIDTH)
+
+
 def test_sampling_at_a_sample_reads_that_sample():
     ys, xs = np.meshgrid(np.arange(HEIGHT), np.arange(WIDTH), indexing="ij")
-    taps, weights = bilinear_taps(f32(np.stack([xs, ys], -1)), HEIGHT, WIDTH)
-    values = jnp.arange(HEIGHT * WIDTH, dtype=jnp.float32)
-    np.testing.assert_array_equal(jnp.sum(values[taps] * weights, -1).reshape(-1), values)
+    np.testing.assert_array_equal(read(VALUES, places(np.stack([xs, ys], -1))), VALUES)
 
 
 def test_beyond_the_border_and_not_a_number_read_the_nearest_border_sample():
-    coords = f32([[-5, 2], [1e30, -1e30], [np.inf, -np.inf], [np.nan, np.nan], [3, 99]])
-    taps, weights = bilinear_taps(coords, HEIGHT, WIDTH)
-    values = jnp.arange(HEIGHT * WIDTH, dtype=jnp.float32)
+    at = places([[-5, 2], [1e30, -1e30], [np.inf, -np.inf], [np.nan, np.nan], [3, 99]])
     nearest = [2 * WIDTH, WIDTH - 1, WIDTH - 1, 0, (HEIGHT - 1) * WIDTH + 3]
-    np.testing.assert_array_equal(jnp.sum(values[taps] * weights, -1), nearest)
-    assert ((taps >= 0) & (taps < HEIGHT * WIDTH)).all()
-    np.testing.assert_allclose(weights.sum(-1), 1.0, atol=1e-6)
+    np.testing.assert_array_equal(read(VALUES, at), nearest)
+    # All four samples lie in the map.
+    assert ((at.corners >= 0) & (at.corners + sum(neighbours(HEIGHT, WIDTH)) < HEIGHT * WIDTH)).all()
+    for share in (at.right, at.down):
+        assert ((share >= 0) & (share <= 1)).all()
 
 
-def test_a_map_of_one_sample():
-    taps, weights = bilinear_taps(f32([[0, 0], [4, -4]]), 1, 1)
-    assert (taps == 0).all()
-    np.testing.assert_array_equal(weights.sum(-1), 1)
+@pytest.mark.parametrize(("height", "width"), [(1, 1), (1, 3), (3, 1)])
+def test_maps_with_a_side_of_one_sample(height, width):
+    rng = np.random.default_rng(0)
+    source, x, y = rng.normal(size=(height, width, 4)), rng.uniform(-1, 4, (2, 5)), rng.uniform(-1, 4, (2, 5))
+    at = places_of(f32(x), f32(y), height, width)
+    assert ((at.corners >= 0) & (at.corners + sum(neighbours(height, width)) < height * width)).all()
+    got = correlate_warped(jnp.ones((5, 4)), f32(source), at)
+    along = source.sum(axis=-1).reshape(-1)
+    wanted = np.interp(x if width > 1 else y, np.arange(len(along)), along)
+    np.testing.assert_allclose(got, wanted, atol=FLOAT32)

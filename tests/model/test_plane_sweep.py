@@ -72,7 +72,8 @@ def test_the_cost_of_an_untrained_network_peaks_at_the_wall():
 
 def test_the_sweep_puts_the_wall_where_the_other_camera_sees_it():
     views = prepare_views(wall_chunk(), CONFIG)
-    pixels, seen = sweep_pixels(views, 1, 2)
+    x, y, seen = sweep_pixels(views, 1, 2)
+    pixels = np.stack([x, y], axis=-1)
     cells = np.stack(np.meshgrid(np.arange(16) * 4 + 2.0, np.arange(16) * 4 + 2.0), -1).reshape(-1, 2)
     for d, log_depth in enumerate(np.asarray(views.log_candidates, np.float64)):
         parallax = FOCAL * BASELINE / np.exp(log_depth)

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ssplat_jax.model.layers import attend, average_pool, instance_norm, unit_features
-from ssplat_jax.numerics import apart, columns, safe_log, safe_normalize, softplus_inverse
+from ssplat_jax.model.layers import attend, attend_own, average_pool, instance_norm, unit_features
+from ssplat_jax.numerics import apart, columns, lane_sum, safe_log, safe_normalize, softplus_inverse
 
 ULP = float(np.finfo(np.float32).eps)
 
@@ -121,6 +121,28 @@ def test_attention_never_hears_invalid_keys():
     np.testing.assert_array_equal(attend(q, k, v, valid), attend(q, k + loud, v - loud, valid))
     keep = np.flatnonzero(valid[0, 0])
     np.testing.assert_allclose(attend(q, k, v, valid), attend(q, k[:, keep], v[:, keep]), atol=1e-6)
+
+
+def test_attention_of_queries_with_keys_of_their_own_is_that_of_one_head():
+    rng = np.random.default_rng(0)
+    q, k, v = (jnp.asarray(rng.normal(size=shape), jnp.float32) for shape in ((6, 20), (6, 5, 20), (6, 5, 20)))
+    allowed = jnp.asarray(rng.uniform(size=(6, 5)) < 0.6).at[2].set(False)
+    one_head = lambda q, k, v: attend(q[:, None, None], k[:, :, None], v[:, :, None], allowed[:, None])[:, 0, 0]  # noqa: E731
+    own = lambda q, k, v: attend_own(q, k, v, allowed)  # noqa: E731
+    np.testing.assert_allclose(own(q, k, v), one_head(q, k, v), atol=1e-6)
+    np.testing.assert_array_equal(own(q, k, v)[2], 0)
+    np.testing.assert_array_equal(own(q, k, v), own(q, *(jnp.where(allowed[..., None], x, 1e6) for x in (k, v))))
+    gradients = (jax.grad(lambda *x, f=f: jnp.sum(f(*x) ** 2), (0, 1, 2))(q, k, v) for f in (own, one_head))
+    for got, wanted in zip(*gradients, strict=True):
+        np.testing.assert_allclose(got, wanted, atol=1e-5)
+        np.testing.assert_array_equal(got[2], 0)
+
+
+@pytest.mark.parametrize("n", [0, 1, 7, 16, 48, 100])
+def test_a_sum_in_lanes_is_the_sum(n):
+    x = jnp.asarray(np.random.default_rng(n).integers(-9, 9, (3, 2, n)), jnp.float32)
+    np.testing.assert_array_equal(lane_sum(x), np.asarray(x).sum(-1))
+    np.testing.assert_array_equal(jax.grad(lambda x: lane_sum(x).sum())(x), np.ones((3, 2, n)))
 
 
 def test_attention_of_huge_scores_is_finite():
