@@ -303,6 +303,37 @@ class Export:
 
 
 @dataclasses.dataclass(frozen=True)
+class ImportWeights:
+    """Convert weights that ReSplat's PyTorch code saved, without PyTorch. What the file lacks is initialised afresh.
+
+    Example: ssplat import-weights resplat-small.pth --out small.npz
+    """
+
+    checkpoint: Annotated[Path, tyro.conf.Positional]
+    """The full model, its depth network or Depth Anything V2: what torch.save wrote, or an .npz of the same names."""
+    out: Path
+    """Weights file to write: `ssplat run --weights` takes it."""
+    preset: Literal["small", "base"] = "small"
+    """Size of the network."""
+    set: tuple[str, ...] = ()
+    """Changes to the configuration, as field=value."""
+
+    def run(self) -> int:
+        import numpy as np
+
+        from ssplat_jax.checkpoint.upstream import import_params
+        from ssplat_jax.checkpoint.weights import save_weights
+
+        config = apply_changes(preset(self.preset), self.set)
+        imported = import_params(self.checkpoint, config)
+        provenance = {"imported_from": self.checkpoint.name, "fresh": imported.fresh}
+        save_weights(self.out, imported.params, config, provenance, np.float32)
+        fresh = ", ".join((*imported.fresh, "HPDA and CGFI, which upstream does not have"))
+        print(f"wrote {self.out}: {imported.num_imported} tensors ({imported.num_unused} not used); fresh: {fresh}")
+        return 0
+
+
+@dataclasses.dataclass(frozen=True)
 class Render:
     """Render a scene from the cameras of a capture, a picture each.
 
@@ -478,7 +509,7 @@ def apply_changes(config: StreamConfig, changes: tuple[str, ...]) -> StreamConfi
         # A field that takes a word or a number (scene_scale) holds a word; the configuration itself judges both.
         if not isinstance(held, str):
             value = float(value) if isinstance(held, float) and type(value) is int else value
-            if type(value) is not type(held):
+            if held is not None and type(value) is not type(held):
                 raise InputError(f"--set {name}: wanted a value like {held!r}, got {text!r}.")
         parsed[name] = value
     return config.replace(**parsed)
@@ -533,6 +564,7 @@ Command = (
     | Annotated[Export, tyro.conf.subcommand("export")]
     | Annotated[Render, tyro.conf.subcommand("render")]
     | Annotated[View, tyro.conf.subcommand("view")]
+    | Annotated[ImportWeights, tyro.conf.subcommand("import-weights")]
     | Annotated[Bench, tyro.conf.subcommand("bench")]
     | Annotated[Experiment, tyro.conf.subcommand("experiment")]
 )

@@ -19,6 +19,21 @@ class StreamConfig:
     preset: str = "tiny"
     """Name of the preset this configuration started from."""
 
+    # -- network --------------------------------------------------------------------------------------------------
+    network: Literal["compact", "resplat"] = "compact"
+    """`compact` is ours, narrow enough for a CPU; `resplat` is ReSplat's, layer by layer, so that its weights convert.
+    It has fields of its own, next; of those of the encoder, the sweep and the U-Net below it reads `num_depths` and
+    `num_sources` alone."""
+    vit: Literal["s", "b", "l"] = "s"
+    """Size of the vision transformer (`resplat`)."""
+    match_stride: Literal[4, 8] = 4
+    """Pixels to a side of a cell of the cost volume (8: `resplat` alone)."""
+    depth_range: tuple[float, float] | None = None
+    """Nearest and farthest candidate in stream units, where weights are of one range; None: what the chunk says."""
+    upstream_compat: bool = False
+    """Sweeps as DepthSplat's code does, pixels by their corners and all views by one K, to compare numbers
+    (`resplat`)."""
+
     # -- stream ---------------------------------------------------------------------------------------------------
     chunk_size: int = 4
     """Views in a chunk."""
@@ -121,6 +136,8 @@ class StreamConfig:
 
     def __post_init__(self) -> None:
         for name, wanted, good in (
+            ("match_stride", "4 with this network", self.match_stride == 4 or self.network == "resplat"),
+            ("depth_range", "two depths, the nearer first", _is_range(self.depth_range)),
             ("chunk_size", "at least 1", self.chunk_size >= 1),
             ("num_sources", "not negative", self.num_sources >= 0),
             ("encoder_widths", "two positive widths, the second even", _are_widths(self.encoder_widths)),
@@ -184,8 +201,8 @@ class StreamConfig:
 
     @property
     def size_multiple(self) -> int:
-        """Images are padded inside to a multiple of this: 1/4 grid x (attention window, U-Net depth)."""
-        return 4 * self.attention_window
+        """Images are padded inside to a multiple of this: grid x (attention windows, U-Net depth)."""
+        return 8 * self.match_stride if self.network == "resplat" else 4 * self.attention_window
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON types; `StreamConfig(**d)` after `from_dict` gives it back."""
@@ -211,7 +228,38 @@ def _is_positive(value: Any) -> bool:
     return isinstance(value, int | float) and 0 < value < math.inf
 
 
-PRESETS: dict[str, StreamConfig] = {"tiny": StreamConfig()}
+def _is_range(value: Any) -> bool:
+    return value is None or (len(value) == 2 and all(map(_is_positive, value)) and value[0] < value[1])
+
+
+RESPLAT = StreamConfig(
+    preset="small",
+    network="resplat",
+    match_stride=8,
+    depth_range=(0.01, 200.0),
+    num_depths=128,
+    num_sources=2,
+    depth_readout="mean",
+    confidence="peak",
+    min_confidence=0.3,
+    token_width=256,
+    cgfi_width=128,
+    mixer_blocks=6,
+    mixer_neighbours=16,
+    mixer_radius=0,
+    mixer_proj=64,
+    gaussians_per_token=1,
+    sh_degree=3,
+    scale_mode="absolute",
+    voxel_size=0.04,
+)
+"""ReSplat's layout, and the paper's own numbers for what comes after it (ALGORITHM 3 and 11)."""
+
+PRESETS: dict[str, StreamConfig] = {
+    "tiny": StreamConfig(),
+    "small": RESPLAT,
+    "base": RESPLAT.replace(preset="base", vit="b", token_width=512),
+}
 
 
 @dataclasses.dataclass(frozen=True)

@@ -35,6 +35,7 @@ _DTYPES = {
 _LEGACY_MAGIC = 0x1950A86A20F9469CFC6C
 _LEGACY_VERSION = 1001
 _LEGACY_START = b"\x80\x02\x8a\x0a" + _LEGACY_MAGIC.to_bytes(10, "little")
+_INSIDE = ("state_dict", "model")  # where checkpoints of a training hold their state dict
 _MAX_PICKLE_BYTES = 1 << 24  # names and shapes alone: thousands of tensors take less than a million
 
 _REMEDY = (
@@ -59,10 +60,23 @@ def read_arrays(path: Path, shapes: dict[str, tuple[int, ...]]) -> dict[str, Flo
         InputError: no such file, one of another kind or damaged, a pickle that asks for anything but tensors, a name
             that is missing, another shape, or a value that is not finite.
     """
+    return _reading(path, lambda held: {name: _checked(held, name, shape) for name, shape in shapes.items()})
+
+
+def read_shapes(path: Path) -> dict[str, tuple[int, ...]]:
+    """Shapes of all arrays of a state dict, by name; their numbers are not read.
+
+    Raises:
+        InputError: as `read_arrays`, of the file as a whole.
+    """
+    return _reading(path, lambda held: {name: tuple(array.shape) for name, array in held.items()})
+
+
+def _reading(path: Path, use: Callable[[dict[str, "_Held"]], dict]) -> dict:
+    """What `use` makes of the contents of a file; whatever goes wrong as one clear error."""
     try:
         with path.open("rb") as file:
-            held = _contents(file)
-            return {name: _checked(held, name, shape) for name, shape in shapes.items()}
+            return use(_contents(file))
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error}).") from error
     except InputError as error:
@@ -198,6 +212,8 @@ class _Tensor(NamedTuple):
 def _tensors(value: Any, storage_bytes: Callable[[_Storage], bytes]) -> dict[str, _Held]:
     if not isinstance(value, dict):
         raise InputError(f"wanted a state dict, got a {type(value).__name__}. {_REMEDY}")
+    for name in _INSIDE:
+        value = value[name] if isinstance(value.get(name), dict) else value
     found = {name: x for name, x in value.items() if isinstance(x, _Tensor)}
     return {name: _Held(x.shape, lambda x=x: _view(x, storage_bytes)) for name, x in found.items()}
 

@@ -3,10 +3,10 @@
 chunk (4 images + cameras)          cache H_{t-1}
   │                                   │ project
   ▼                                   ▼
-encode ─► match ─► P_i ──────────► anchor_depth (HPDA) ─► depth ─► back_project ─► p
-  │                                   │                                            │
-  └─► regress_tokens ─► f ─► inject_features (CGFI) ─► mix_tokens ─► f             │
-                                                        └──────► fuse (VACC) ◄─────┘ ─► cache H_t ─► decode
+encode ─► match ─► P_i ──────────► anchor_depth (HPDA) ─► refine_depth ─► back_project ─► p
+  │                                   │                                                   │
+  └─► regress_tokens ─► f ─► inject_features (CGFI) ─► mix_tokens ─► f                    │
+                                                        └──────► fuse (VACC) ◄────────────┘ ─► cache H_t ─► decode
 """
 
 import dataclasses
@@ -19,12 +19,23 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ssplat_jax import model as stages
-from ssplat_jax.cache import PIVOT_FIELDS, Tokens, VoxelCache, bear_witness, carve, fuse, init_cache, judge, project
+from ssplat_jax.cache import (
+    PIVOT_FIELDS,
+    Tokens,
+    VoxelCache,
+    bear_witness,
+    carve,
+    coarser,
+    fuse,
+    init_cache,
+    judge,
+    project,
+)
 from ssplat_jax.chunk import Chunk
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.gaussians import Gaussians, mask_gaussians
 from ssplat_jax.geometry.rotations import matrices_to_quats
-from ssplat_jax.model.wires import Views
+from ssplat_jax.model.wires import TokenShapes, Views
 from ssplat_jax.struct import pytree, replace
 
 COVER = 1.2  # pivots gather in the middle of their voxel: covering it edge to edge takes more than equal shares
@@ -80,29 +91,32 @@ class StreamSplat:
 
     def predict(self, params: dict, cache: VoxelCache, chunk: Chunk) -> Prediction:
         """Tokens of a chunk, given what the cache remembers (Eqs. 2-9). The cache is read as a constant."""
-        config = self.config
+        config, network = self.config, stages.network_of(self.config)
         views = stages.prepare_views(chunk, config)
+        factor = config.match_stride // stages.GRID_STRIDE
         with jax.named_scope("project"):
             history = project(jax.lax.stop_gradient(cache), views.grid_camera, config, axis=self.axis)
         with jax.named_scope("encode"):
-            features = stages.encode(params["encoder"], views, config)
+            features = network.encode(params["encoder"], views, config)
         with jax.named_scope("match"):
-            belief = stages.match(params["cost_volume"], features, views, config)
+            belief = network.match(params["cost_volume"], features, views, config)
         with jax.named_scope("HPDA"):
-            depth = stages.anchor_depth(params["hpda"], belief, history, views, config)
+            depth = stages.anchor_depth(params["hpda"], belief, coarser(history, factor), views, config)
+        with jax.named_scope("refine"):
+            depth = network.refine_depth(params.get("upsampler"), features, depth, views, config)
         with jax.named_scope("tokens"):
             positions, footprints = stages.back_project(depth.log_depths, views)
-            feats = stages.regress_tokens(params["tokens"], features, belief, depth, views, config)
+            feats = network.regress_tokens(params["tokens"], features, belief, depth, views, config)
         with jax.named_scope("CGFI"):
             feats = stages.inject_features(params["cgfi"], feats, history, depth.anchored_confidences, views, config)
         with jax.named_scope("mixer"):
-            feats = stages.mix_tokens(params["mixer"], feats, positions, views.inside, views.valid, config)
+            feats = network.mix_tokens(params["mixer"], feats, positions, views.inside, views.valid, config)
         confidences = jnp.where(views.inside, depth.matcher_confidences, 0.0)
         with jax.named_scope("exposure"):
             exposures = stages.estimate_exposures(history, depth.log_depths, confidences, views, config)
         return Prediction(
             tokens=_flatten_tokens(positions, feats, confidences, footprints, exposures, views, config),
-            logits=belief.logits,
+            logits=stages.repeat_cells(belief.logits, factor),
             log_depths=depth.log_depths,
             views=views,
             output=ChunkOutput(
@@ -161,9 +175,8 @@ class StreamSplat:
         """Gaussians of the pivots that `take` takes of all."""
         flat = lambda x: take(x.reshape(-1, *x.shape[2:]))  # noqa: E731
         gaussians = stages.decode_tokens(
-            params["decoder"],
+            self._read_shapes(params, flat(cache.feats)),
             means=flat(cache.means),
-            feats=flat(cache.feats),
             rgbs=flat(cache.rgbs),
             quats=flat(cache.quats),
             footprints=flat(merged_footprints(cache, self.config)),
@@ -180,15 +193,17 @@ class StreamSplat:
     def decode_tokens(self, params: dict, tokens: Tokens) -> Gaussians:
         """Gaussians of tokens that need not be in a cache: what training renders (Sec. 3.7)."""
         gaussians = stages.decode_tokens(
-            params["decoder"],
+            self._read_shapes(params, tokens.feats),
             means=tokens.means,
-            feats=tokens.feats,
             rgbs=tokens.rgbs,
             quats=tokens.quats,
             footprints=tokens.footprints,
             config=self.config,
         )
         return mask_gaussians(gaussians, self.each_gaussian(tokens.valid))
+
+    def _read_shapes(self, params: dict, feats: Float[Array, "m c"]) -> TokenShapes:
+        return stages.network_of(self.config).read_shapes(params["decoder"], feats, self.config)
 
     def each_gaussian(self, of_tokens: Bool[Array, " m"]) -> Bool[Array, " n"]:
         """For every Gaussian, what is said of its token or pivot."""

@@ -85,14 +85,14 @@ def test_dictionary_and_back_is_the_same_configuration():
 
 
 def test_every_field_changes_the_hash():
-    base = StreamConfig()
+    base = StreamConfig(network="resplat")  # which has a choice of strides
     change = {
         bool: lambda x: not x,
         int: lambda x: 2 * x,
         float: lambda x: 0.5 * x + 0.7,
         tuple: lambda x: (x[0] + 8, *x[1:]),
     }
-    by_name = {"preset": "other", "scene_scale": 3.0, "sh_degree": 3}
+    by_name = {"preset": "other", "scene_scale": 3.0, "sh_degree": 3, "depth_range": (0.5, 9.0)}
     hashes = {base.hash}
     for field in dataclasses.fields(base):
         value = getattr(base, field.name)

@@ -3,7 +3,7 @@
 from ssplat_jax.cache.carve import SAME_SURFACE, bear_witness, carve, judge
 from ssplat_jax.cache.fuse import Touched, fuse, fuse_touched
 from ssplat_jax.cache.policy import check, ensure_room, grow
-from ssplat_jax.cache.project import ProjectedCache, project
+from ssplat_jax.cache.project import ProjectedCache, coarser, project
 from ssplat_jax.cache.state import PIVOT_FIELDS, CacheStats, Tokens, VoxelCache, Witnesses, init_cache
 
 __all__ = [
@@ -18,6 +18,7 @@ __all__ = [
     "bear_witness",
     "carve",
     "check",
+    "coarser",
     "ensure_room",
     "fuse",
     "fuse_touched",

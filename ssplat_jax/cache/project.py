@@ -87,6 +87,32 @@ def project(cache: VoxelCache, camera: Camera, config: StreamConfig, *, axis: st
     )
 
 
+def coarser(history: ProjectedCache, factor: int) -> ProjectedCache:
+    """`history` on a grid of `factor` x `factor` cells each: of those the nearest, whole, since a mean of front and
+    back is neither.
+
+    Limits:
+        A cell of holes is a hole; where there is one cell of several, it alone is seen.
+    """
+    if factor == 1:
+        return history
+    v, h, w = history.depths.shape
+
+    def patches(x):
+        x = x.reshape(v, h // factor, factor, w // factor, factor, -1).swapaxes(2, 3)
+        return x.reshape(v, h // factor, w // factor, factor * factor, -1)
+
+    nearest = jnp.argmin(patches(jnp.where(history.mask, history.depths, jnp.inf)), axis=3, keepdims=True)
+    take = lambda x: jnp.take_along_axis(patches(x), nearest, axis=3)[..., 0, :]  # noqa: E731
+    return ProjectedCache(
+        depths=take(history.depths)[..., 0],
+        confidences=take(history.confidences)[..., 0],
+        feats=take(history.feats),
+        mask=take(history.mask)[..., 0],
+        colors=None if history.colors is None else take(history.colors),
+    )
+
+
 def _over_shards(reduce, partial, axis: str | None):
     """What all shards have together; `partial` itself without an axis."""
     return partial if axis is None else reduce(partial, axis)

@@ -1,4 +1,4 @@
-"""Weights files: parameters by path, float16 on disk, float32 in use."""
+"""Weights files: parameters by path, float16 on disk (imported ones float32), float32 in use."""
 
 import hashlib
 from collections.abc import Mapping
@@ -18,13 +18,19 @@ from ssplat_jax.model import init_params
 KIND = "weights"
 
 
-def save_weights(path: Path, params: dict, config: StreamConfig, provenance: dict) -> None:
-    """Writes the parameters of a model with `config`; `provenance` says how they came to be (steps, data, scores)."""
+def save_weights(
+    path: Path, params: dict, config: StreamConfig, provenance: dict, dtype: type[np.floating] = np.float16
+) -> None:
+    """Writes the parameters of a model with `config`; `provenance` says how they came to be (steps, data, scores).
+
+    Raises:
+        StorageError: a value is not finite, or too large for `dtype`.
+    """
     leaves = {"/".join(k.key for k in keys): leaf for keys, leaf in jax.tree_util.tree_flatten_with_path(params)[0]}
     with np.errstate(over="ignore"):  # becomes infinite, and is refused below
-        arrays = {name: np.asarray(leaf, np.float16) for name, leaf in leaves.items()}
+        arrays = {name: np.asarray(leaf, dtype) for name, leaf in leaves.items()}
     if bad := [name for name, x in arrays.items() if not np.isfinite(x).all()]:
-        raise StorageError(f"{path}: {bad[0]} has values beyond float16 or not finite; the weights are not saved.")
+        raise StorageError(f"{path}: {bad[0]} has values beyond {np.dtype(dtype)} or not finite; not saved.")
     save_arrays(path, arrays, KIND, {"config": config.to_dict(), "provenance": provenance})
 
 
@@ -52,7 +58,13 @@ def load_params(name: str = "tiny") -> dict:
             known = ", ".join(sorted(PRESETS))
             raise InputError(f"weights: wanted a preset with shipped weights ({known}) or a file, got {name!r}.")
         return load_weights(Path(name))[0]
-    with resources.as_file(resources.files("ssplat_jax") / "weights" / f"{name}.npz") as path:
+    shipped = resources.files("ssplat_jax") / "weights" / f"{name}.npz"
+    if not shipped.is_file():
+        raise InputError(
+            f"weights: none ship with the preset {name!r}; convert ReSplat's (ssplat import-weights) or train"
+            f" (ssplat train --preset {name}), and give the file."
+        )
+    with resources.as_file(shipped) as path:
         arrays, _ = load_arrays(path, KIND)
         return _restore(path, arrays, preset(name))
 

@@ -6,35 +6,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.geometry.cameras import invert_poses, pixel_grid, unproject
 from ssplat_jax.geometry.sampling import correlate_warped, places_of
 from ssplat_jax.model.convolution import Conv
 from ssplat_jax.model.layers import UNet, average_pool, unit_features
+from ssplat_jax.model.sweep import sweep_pixels
 from ssplat_jax.model.wires import GRID_STRIDE, DepthBelief, Features, Views, nearest_sources
-
-MIN_SOURCE_DEPTH = 1e-3
-"""A candidate nearer than this to the source camera's plane, or behind it, is not seen by it."""
-
-
-def sweep_pixels(
-    views: Views, reference, source
-) -> tuple[Float[Array, "d n"], Float[Array, "d n"], Bool[Array, "d n"]]:
-    """Where the grid cells of view `reference`, at every candidate depth, appear in view `source`: x, y (pixels)."""
-    hf, wf = views.inside.shape[1:]
-    cells = pixel_grid(hf * GRID_STRIDE, wf * GRID_STRIDE, GRID_STRIDE).reshape(-1, 2)
-    rays = unproject(cells, jnp.ones(cells.shape[0]), views.Ks[reference])
-    exact = jax.lax.Precision.HIGHEST
-    pose = jnp.matmul(views.viewmats[source], invert_poses(views.viewmats[reference]), precision=exact)
-    # At depth d along a ray r, a point is imaged at K R r + K t / d: the rays are turned once, and without parallax
-    # every depth gives the same pixel to the last bit.
-    a = jnp.einsum("ij,jk,nk->in", views.Ks[source], pose[:3, :3], rays, precision=exact)
-    b = jnp.einsum("ij,j->i", views.Ks[source], pose[:3, 3], precision=exact)
-    nearness = jnp.exp(-views.log_candidates)[:, None]
-    x, y, w = (a[i] + nearness * b[i] for i in range(3))
-    in_front = w > MIN_SOURCE_DEPTH * nearness
-    w = jnp.where(in_front, w, 1.0)
-    x, y = x / w, y / w
-    return x, y, in_front & (x >= 0) & (x <= views.width) & (y >= 0) & (y <= views.height)
 
 
 def plane_sweep(features: Features, views: Views, config: StreamConfig) -> Float[Array, "v hf wf dl"]:
@@ -56,7 +32,7 @@ def plane_sweep(features: Features, views: Views, config: StreamConfig) -> Float
 
     def correlate_pair(pair):
         reference, source, is_valid = pair
-        x, y, seen = jax.lax.stop_gradient(sweep_pixels(views, reference, source))
+        x, y, seen = jax.lax.stop_gradient(sweep_pixels(views, reference, source, GRID_STRIDE))
         seen = seen & is_valid
         scores = []
         for stride, reference_map, source_map in maps:

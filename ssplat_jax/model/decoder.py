@@ -10,6 +10,7 @@ from jaxtyping import Array, Float, Int
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.gaussians import SH_C0, Gaussians
 from ssplat_jax.geometry.rotations import multiply_quats, quats_to_matrices
+from ssplat_jax.model.wires import TokenShapes
 
 START_OPACITY = -0.6  # logit: 0.35; a surface is several tokens deep, and sheer ones average each other's errors
 START_SCALE = 0.43  # of a Gaussian's share of the cell, sideways: neighbours overlap into a closed surface
@@ -32,6 +33,18 @@ class GaussianHead(nn.Module):
         return nn.Dense(outputs, kernel_init=nn.initializers.normal(1e-3), name="out")(hidden)
 
 
+def read_shapes(params, feats: Float[Array, "m c"], config: StreamConfig) -> TokenShapes:
+    """What the head makes of features of any precision, read in float32."""
+    raw = GaussianHead(config).apply({"params": params}, feats.astype(jnp.float32))
+    opacity, scale, rotation, sh = jnp.split(raw, [1, 4, 8], axis=-1)  # pyright: ignore[reportArgumentType]
+    return TokenShapes(
+        opacity_logits=opacity[:, 0] + START_OPACITY,
+        raw_scales=scale,
+        quats=rotation + jnp.array([1.0, 0.0, 0.0, 0.0]),
+        sh=sh.reshape(feats.shape[0], -1, 3),
+    )
+
+
 def token_scales(raw: Float[Array, "m 3"], footprints: Float[Array, " m"], config: StreamConfig) -> Float[Array, "m 3"]:
     """Standard deviations of each Gaussian of a token in stream units, along the axes of the token's camera."""
     side = math.isqrt(config.gaussians_per_token)
@@ -44,10 +57,9 @@ def token_scales(raw: Float[Array, "m 3"], footprints: Float[Array, " m"], confi
 
 
 def decode_tokens(
-    params,
+    shapes: TokenShapes,
     *,
     means: Float[Array, "m 3"],
-    feats: Float[Array, "m c"],
     rgbs: Float[Array, "m a"],
     quats: Float[Array, "m 4"],
     footprints: Float[Array, " m"],
@@ -60,19 +72,16 @@ def decode_tokens(
     members stands for n tokens in one place and is as opaque as they would be, 1 - (1 - o)^n.
 
     The head's rotation is in the frame of the camera in `quats` (DESIGN 6.7); its colour is a residual on the
-    appearance anchors `rgbs` (DESIGN 6.6). Features of any precision are read in float32.
+    appearance anchors `rgbs` (DESIGN 6.6).
     """
-    raw = GaussianHead(config).apply({"params": params}, feats.astype(jnp.float32))
-    opacity, scale, rotation, sh = jnp.split(raw, [1, 4, 8], axis=-1)  # pyright: ignore[reportArgumentType]
-    sh = sh.reshape(feats.shape[0], -1, 3)
-    optical_depths = jnp.asarray(num_members, jnp.float32) * nn.softplus(opacity[:, 0] + START_OPACITY)
+    optical_depths = jnp.asarray(num_members, jnp.float32) * nn.softplus(shapes.opacity_logits)
     each = lambda x: jnp.repeat(x, config.gaussians_per_token, axis=0)  # noqa: E731
     return Gaussians(
         means=_spread(means, quats, footprints, config),
-        quats=each(multiply_quats(quats, rotation + jnp.array([1.0, 0.0, 0.0, 0.0]))),
-        scales=each(token_scales(scale, footprints, config)),
+        quats=each(multiply_quats(quats, shapes.quats)),
+        scales=each(token_scales(shapes.raw_scales, footprints, config)),
         opacities=each(-jnp.expm1(-optical_depths)),
-        sh=each(sh).at[:, 0].add((rgbs.reshape(-1, 3) - 0.5) / SH_C0),
+        sh=each(shapes.sh).at[:, 0].add((rgbs.reshape(-1, 3) - 0.5) / SH_C0),
     )
 
 

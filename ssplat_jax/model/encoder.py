@@ -2,42 +2,13 @@
 
 import flax.linen as nn
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.model.convolution import Conv, HalvingConv
-from ssplat_jax.model.layers import ResidualBlock, attend, instance_norm
+from ssplat_jax.model.layers import ResidualBlock, attend, instance_norm, normalize_images
+from ssplat_jax.model.windows import from_windows, in_one_region, sine_positions, to_windows
 from ssplat_jax.model.wires import Features, Views, nearest_sources
-
-IMAGE_MEAN = (0.485, 0.456, 0.406)  # ImageNet, as DepthSplat
-IMAGE_STD = (0.229, 0.224, 0.225)
-
-
-def sine_positions(side: int, features: int) -> Float[Array, "side side c"]:
-    """Sine position code of a square window: half of the channels for y, half for x (DETR's, normalised to 2 pi)."""
-    steps = (jnp.arange(side, dtype=jnp.float32) + 1) / side * 2 * jnp.pi
-    rates = 10000.0 ** (2 * (jnp.arange(features // 2) // 2).astype(jnp.float32) / (features // 2))
-    phases = steps[:, None] / rates
-    code = jnp.where(jnp.arange(features // 2) % 2 == 0, jnp.sin(phases), jnp.cos(phases))
-    grid_shape = (side, side, features // 2)
-    return jnp.concatenate(
-        [jnp.broadcast_to(code[:, None], grid_shape), jnp.broadcast_to(code[None, :], grid_shape)], axis=-1
-    )
-
-
-def to_windows(x: Float[Array, "v h w c"], side: int) -> Float[Array, "v windows cells c"]:
-    """Cuts a map into `side` x `side` windows."""
-    v, h, w, c = x.shape
-    x = x.reshape(v, h // side, side, w // side, side, c).transpose(0, 1, 3, 2, 4, 5)
-    return x.reshape(v, (h // side) * (w // side), side * side, c)
-
-
-def from_windows(x: Float[Array, "v windows cells c"], side: int, height: int, width: int) -> Float[Array, "v h w c"]:
-    """Inverse of `to_windows`."""
-    v, c = x.shape[0], x.shape[-1]
-    x = x.reshape(v, height // side, width // side, side, side, c).transpose(0, 1, 3, 2, 4, 5)
-    return x.reshape(v, height, width, c)
 
 
 class AttentionLayer(nn.Module):
@@ -80,8 +51,7 @@ class Encoder(nn.Module):
     def __call__(
         self, images: Float[Array, "v h w 3"], sources: Int[Array, "v s"], source_valid: Bool[Array, "v s"]
     ) -> Features:
-        x = (images - jnp.array(IMAGE_MEAN, images.dtype)) / jnp.array(IMAGE_STD, images.dtype)
-        x = nn.relu(instance_norm(self.stem(x)))
+        x = nn.relu(instance_norm(self.stem(normalize_images(images))))
         for block in self.fine_blocks:
             x = block(x)
         fine = x
@@ -99,27 +69,19 @@ class Encoder(nn.Module):
         """Alternates attention inside a view with attention to the same window of the source views (Swin shifts)."""
         side = self.config.attention_window
         v, h, w, c = cnn.shape
-        positions = jnp.tile(sine_positions(side, c), (h // side, w // side, 1))
-        x = cnn + positions
+        window = (side, side)
+        x = cnn + jnp.tile(sine_positions(*window, c), (h // side, w // side, 1))
         num_sources = sources.shape[1]
         for i, (own, cross) in enumerate(zip(self.self_attention, self.cross_attention, strict=True)):
             shift = side // 2 if i % 2 else 0
-            windows = to_windows(jnp.roll(x, (-shift, -shift), axis=(1, 2)), side)
-            together = _together(h, w, side, shift)
+            windows = to_windows(jnp.roll(x, (-shift, -shift), axis=(1, 2)), window)
+            together = in_one_region(h, w, window, (shift, shift))
             windows = own(windows, windows, together)
             context = windows[sources].transpose(0, 2, 1, 3, 4).reshape(v, windows.shape[1], num_sources * side**2, c)
             allowed = jnp.repeat(source_valid, side**2, axis=1)[:, None, None] & jnp.tile(together, num_sources)
             windows = cross(windows, context, allowed)
-            x = jnp.roll(from_windows(windows, side, h, w), (shift, shift), axis=(1, 2))
+            x = jnp.roll(from_windows(windows, window, h, w), (shift, shift), axis=(1, 2))
         return x
-
-
-def _together(height: int, width: int, side: int, shift: int) -> Bool[Array, "1 windows cells cells"]:
-    """Which cells of the windows of a map rolled by `-shift` are neighbours, not opposite borders in one window."""
-    rows, cols = (np.arange(n) >= n - shift for n in (height, width))
-    regions = jnp.asarray((2 * rows[:, None] + cols)[None, :, :, None], jnp.float32)
-    cells = to_windows(regions, side)[..., 0]
-    return cells[..., :, None] == cells[..., None, :]
 
 
 def encode(params, views: Views, config: StreamConfig) -> Features:

@@ -8,6 +8,14 @@ from jaxtyping import Array, Bool, Float
 from ssplat_jax.model.convolution import Conv, HalvingConv
 from ssplat_jax.numerics import lane_sum, safe_normalize
 
+IMAGE_MEAN = (0.485, 0.456, 0.406)  # ImageNet, as DepthSplat
+IMAGE_STD = (0.229, 0.224, 0.225)
+
+
+def normalize_images(images: Float[Array, "v h w 3"]) -> Float[Array, "v h w 3"]:
+    """Images in [0, 1] as the networks take them."""
+    return (images - jnp.array(IMAGE_MEAN, images.dtype)) / jnp.array(IMAGE_STD, images.dtype)
+
 
 def instance_norm(x: Float[Array, "v h w c"], eps: float = 1e-5) -> Float[Array, "v h w c"]:
     """Zero mean, unit (biased) variance per image and channel; no parameters.
@@ -85,6 +93,8 @@ class ResidualBlock(nn.Module):
 
     features: int
     stride: int = 1
+    skip: str = "skip"
+    """Name of the projection."""
 
     @nn.compact
     def __call__(self, x):
@@ -92,7 +102,7 @@ class ResidualBlock(nn.Module):
         y = nn.relu(instance_norm(first(self.features, use_bias=False, name="conv1")(x)))
         y = nn.relu(instance_norm(Conv(self.features, use_bias=False, name="conv2")(y)))
         if x.shape[-1] != self.features or self.stride != 1:
-            x = instance_norm(nn.Dense(self.features, name="skip")(x[:, :: self.stride, :: self.stride]))
+            x = instance_norm(nn.Dense(self.features, name=self.skip)(x[:, :: self.stride, :: self.stride]))
         return nn.relu(x + y)
 
 

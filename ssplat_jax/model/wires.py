@@ -44,21 +44,36 @@ class Features:
 
 @pytree
 class DepthBelief:
-    """P_i(k | u), what the current views alone say, and the decoder features it was read from."""
+    """P_i(k | u), what the current views alone say, and the decoder features it was read from; on the match grid."""
 
-    probs: Float[Array, "v hf wf d"]
-    logits: Float[Array, "v hf wf d"]
-    decoder: Float[Array, "v hf wf c"]
+    probs: Float[Array, "v hm wm d"]
+    logits: Float[Array, "v hm wm d"]
+    decoder: Float[Array, "v hm wm c"]
 
 
 @pytree
 class AnchoredDepth:
-    """P^v(k | u) and what is read from it."""
+    """P^v(k | u) and what is read from it: on the match grid, and refined on the 1/4 grid but for `probs`."""
 
-    probs: Float[Array, "v hf wf d"]
+    probs: Float[Array, "v hm wm d"]
     log_depths: Float[Array, "v hf wf"]
     matcher_confidences: Float[Array, "v hf wf"]  # peak of P_i, before the anchor: what VACC trusts
     anchored_confidences: Float[Array, "v hf wf"]  # peak of P^v: what CGFI attenuates by
+
+
+@pytree
+class TokenShapes:
+    """What the head says of tokens, before they are Gaussians."""
+
+    opacity_logits: Float[Array, " m"]
+    raw_scales: Float[Array, "m 3"]  # see `decoder.token_scales`
+    quats: Float[Array, "m 4"]  # wxyz, any length, in the frame of the token's camera
+    sh: Float[Array, "m k 3"]  # colour beside the appearance anchor
+
+
+def repeat_cells(x: Array, factor: int) -> Array:
+    """A map `[v, h, w, ...]` on a finer grid: every cell `factor` times in both directions."""
+    return jnp.repeat(jnp.repeat(x, factor, axis=1), factor, axis=2)
 
 
 def prepare_views(chunk: Chunk, config: StreamConfig) -> Views:
@@ -74,7 +89,8 @@ def prepare_views(chunk: Chunk, config: StreamConfig) -> Views:
     centres = pixel_grid(height + pad_h, width + pad_w, GRID_STRIDE)
     in_image = (centres[..., 0] < width) & (centres[..., 1] < height)
     fractions = jnp.linspace(0.0, 1.0, config.num_depths)
-    log_near, log_far = jnp.log(chunk.near), jnp.log(chunk.far)
+    near, far = (chunk.near, chunk.far) if config.depth_range is None else map(jnp.float32, config.depth_range)
+    log_near, log_far = jnp.log(near), jnp.log(far)
     return Views(
         images=images,
         viewmats=chunk.viewmats,

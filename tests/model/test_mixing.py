@@ -5,10 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ssplat_jax.model import inject_features, mix_tokens
+from ssplat_jax.model import inject_features
 from ssplat_jax.model.cgfi import Aggregator
 from ssplat_jax.model.layers import rms_normalize
-from ssplat_jax.model.mixer import nearest_tokens
+from ssplat_jax.model.mixer import mix_tokens
+from ssplat_jax.model.neighbours import nearest_tokens
 from ssplat_jax.model.wires import prepare_views
 from ssplat_jax.struct import replace
 from tests.model.small import CONFIG, chunk, history, params

@@ -6,8 +6,9 @@ import numpy as np
 
 from ssplat_jax.chunk import Chunk
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.model.cost_volume import plane_sweep, sweep_pixels
+from ssplat_jax.model.cost_volume import plane_sweep
 from ssplat_jax.model.encoder import encode
+from ssplat_jax.model.sweep import sweep_pixels
 from ssplat_jax.model.wires import prepare_views
 from ssplat_jax.struct import replace
 from tests.model.small import random_params
@@ -72,7 +73,7 @@ def test_the_cost_of_an_untrained_network_peaks_at_the_wall():
 
 def test_the_sweep_puts_the_wall_where_the_other_camera_sees_it():
     views = prepare_views(wall_chunk(), CONFIG)
-    x, y, seen = sweep_pixels(views, 1, 2)
+    x, y, seen = sweep_pixels(views, 1, 2, 4)
     pixels = np.stack([x, y], axis=-1)
     cells = np.stack(np.meshgrid(np.arange(16) * 4 + 2.0, np.arange(16) * 4 + 2.0), -1).reshape(-1, 2)
     for d, log_depth in enumerate(np.asarray(views.log_candidates, np.float64)):

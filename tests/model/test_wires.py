@@ -12,8 +12,9 @@ from ssplat_jax.gaussians import SH_C0
 from ssplat_jax.geometry.cameras import pixel_grid, project_points, transform_points
 from ssplat_jax.geometry.rotations import matrices_to_quats, quats_to_matrices
 from ssplat_jax.model import GRID_STRIDE, back_project, count_params, decode_tokens, init_params, patch_colors
-from ssplat_jax.model.decoder import MIN_SCALE, START_OPACITY, START_SCALE, START_THICKNESS, token_scales
-from ssplat_jax.model.encoder import Encoder, from_windows, sine_positions, to_windows
+from ssplat_jax.model.decoder import MIN_SCALE, START_OPACITY, START_SCALE, START_THICKNESS, read_shapes, token_scales
+from ssplat_jax.model.encoder import Encoder
+from ssplat_jax.model.windows import from_windows, sine_positions, to_windows
 from ssplat_jax.model.wires import nearest_sources, prepare_views
 from ssplat_jax.struct import replace
 from tests.geometry.test_cameras import poses
@@ -78,21 +79,21 @@ def test_padded_views_are_chosen_last_and_marked():
 
 def test_windows_and_back():
     x = jnp.arange(2.0 * 8 * 12 * 3).reshape(2, 8, 12, 3)
-    windows = to_windows(x, 4)
-    assert windows.shape == (2, 6, 16, 3)
-    np.testing.assert_array_equal(windows[1, 4].reshape(4, 4, 3), x[1, 4:8, 4:8])
-    np.testing.assert_array_equal(from_windows(windows, 4, 8, 12), x)
+    windows = to_windows(x, (4, 6))
+    assert windows.shape == (2, 4, 24, 3)
+    np.testing.assert_array_equal(windows[1, 3].reshape(4, 6, 3), x[1, 4:8, 6:12])
+    np.testing.assert_array_equal(from_windows(windows, (4, 6), 8, 12), x)
 
 
 def test_position_code_is_detrs():
-    side, channels = 4, 8
-    wanted = np.zeros((side, side, channels))
-    for y, x, c in np.ndindex(side, side, channels // 2):
+    height, width, channels = 4, 6, 8
+    wanted = np.zeros((height, width, channels))
+    for y, x, c in np.ndindex(height, width, channels // 2):
         rate = 10000.0 ** (2 * (c // 2) / (channels // 2))
         wave = np.sin if c % 2 == 0 else np.cos
-        wanted[y, x, c] = wave((y + 1) / side * 2 * np.pi / rate)
-        wanted[y, x, channels // 2 + c] = wave((x + 1) / side * 2 * np.pi / rate)
-    np.testing.assert_allclose(sine_positions(side, channels), wanted, atol=1e-5)
+        wanted[y, x, c] = wave((y + 1) / height * 2 * np.pi / rate)
+        wanted[y, x, channels // 2 + c] = wave((x + 1) / width * 2 * np.pi / rate)
+    np.testing.assert_allclose(sine_positions(height, width, channels), wanted, atol=1e-5)
 
 
 def test_shifted_windows_do_not_join_opposite_borders():
@@ -136,9 +137,11 @@ def decoded(m: int = 10, num_members=1, means=None, footprints=None, quats=None,
         "quats": f32(rng.normal(size=(m, 4))),
         "footprints": f32(rng.uniform(0.01, 0.3, m)),
     } | {name: x for name, x in given.items() if x is not None}
-    shapes = jax.eval_shape(lambda key: init_params(key, config)["decoder"], jax.random.key(0))
-    params = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape), shapes)
-    return decode_tokens(params, **inputs, num_members=num_members, config=config), inputs
+    wanted = jax.eval_shape(lambda key: init_params(key, config)["decoder"], jax.random.key(0))
+    params = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape), wanted)
+    rest = {name: x for name, x in inputs.items() if name != "feats"}
+    shapes = read_shapes(params, inputs["feats"], config)
+    return decode_tokens(shapes, **rest, num_members=num_members, config=config), inputs
 
 
 def test_an_untrained_head_puts_a_disc_of_the_patchs_colour_exactly_on_the_token():
@@ -163,8 +166,10 @@ def test_a_pivot_is_as_opaque_as_its_members_in_one_place():
         raw = jnp.zeros(8 + 3).at[0].set(bias)
         params = {"out": {"kernel": jnp.zeros((4, 11)), "bias": raw}, **hidden_layers()}
         one = lambda *shape: jnp.ones((1, *shape))  # noqa: E731
-        values = {"means": one(3), "feats": one(4), "rgbs": one(12), "quats": one(4), "footprints": one()}
-        return decode_tokens(params, **values, num_members=n, config=CONFIG.replace(token_width=4)).opacities[0]
+        config = CONFIG.replace(token_width=4)
+        values = {"means": one(3), "rgbs": one(12), "quats": one(4), "footprints": one()}
+        shapes = read_shapes(params, one(4), config)
+        return decode_tokens(shapes, **values, num_members=n, config=config).opacities[0]
 
     for bias in (-200.0, 0.0, 200.0):
         for n in (0, 1, 2**31 - 1):

@@ -19,6 +19,7 @@ import pytest
 from ssplat_jax import model as stages
 from ssplat_jax.cache import PIVOT_FIELDS, Tokens, VoxelCache, bear_witness, carve, init_cache, judge, project
 from ssplat_jax.geometry.cameras import Camera
+from ssplat_jax.model import compact
 from ssplat_jax.model.cost_volume import plane_sweep
 from ssplat_jax.model.wires import DepthBelief, Features, Views, prepare_views
 from ssplat_jax.numerics import softplus_inverse
@@ -248,16 +249,15 @@ def tokens_and_gaussians():
 
     def run(params, features, viewmats, views: Views, past):
         views = replace(views, viewmats=viewmats)
-        belief = stages.match(params["cost_volume"], features, views, CONFIG)
+        belief = compact.match(params["cost_volume"], features, views, CONFIG)
         depth = stages.anchor_depth(params["hpda"], belief, past, views, CONFIG)
         positions, footprints = stages.back_project(depth.log_depths, views)
-        regressed = stages.regress_tokens(params["tokens"], features, belief, depth, views, CONFIG)
+        regressed = compact.regress_tokens(params["tokens"], features, belief, depth, views, CONFIG)
         injected = stages.inject_features(params["cgfi"], regressed, past, depth.anchored_confidences, views, CONFIG)
-        mixed = stages.mix_tokens(params["mixer"], injected, positions, views.inside, views.valid, CONFIG)
+        mixed = compact.mix_tokens(params["mixer"], injected, positions, views.inside, views.valid, CONFIG)
         gaussians = stages.decode_tokens(
-            params["decoder"],
+            compact.read_shapes(params["decoder"], mixed.reshape(-1, CONFIG.token_width).astype(HALF), CONFIG),
             means=positions.reshape(-1, 3),
-            feats=mixed.reshape(-1, CONFIG.token_width).astype(HALF),
             rgbs=stages.patch_colors(views.images, CONFIG).reshape(footprints.size, -1),
             quats=jnp.ones((footprints.size, 4)),
             footprints=footprints.reshape(-1),
@@ -482,7 +482,7 @@ def test_one_candidate_is_certain():
     np.testing.assert_array_equal(views.log_candidates, np.log(chunk().near))
 
     def total(weights, features):
-        belief = stages.match(weights, features, views, config)
+        belief = compact.match(weights, features, views, config)
         return wave(belief), belief
 
     weights = random_params(config)["cost_volume"]

@@ -1,0 +1,125 @@
+"""Monocular branch: a DINOv2 vision transformer as Depth Anything V2 trained it (ALGORITHM 2.4)."""
+
+import flax.linen as nn
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ssplat_jax.model.layers import attend
+from ssplat_jax.model.resplat.layers import PIXELS_PER_VIT_CELL, Mlp, resize
+
+POSITIONS_SIDE = 37
+"""The position code is of 37 x 37 cells, and one for the class token; other grids resample it."""
+LONGEST_SIDE = 560
+"""Larger images are shrunk to this, in pixels."""
+CUBIC = -0.75
+"""torch's bicubic kernel; JAX's is that of -0.5."""
+
+VITS = {
+    # width, blocks, heads, blocks that are read
+    "s": (384, 12, 6, (2, 5, 8, 11)),
+    "b": (768, 12, 12, (2, 5, 8, 11)),
+    "l": (1024, 24, 16, (4, 11, 17, 23)),
+}
+
+
+def grid_size(height: int, width: int) -> tuple[int, int]:
+    """Cells of the ViT for an image."""
+    shrink = min(1.0, LONGEST_SIDE / max(height, width))
+    cells = lambda side: max(1, int(side * shrink) // PIXELS_PER_VIT_CELL)  # noqa: E731
+    return cells(height), cells(width)
+
+
+def resampled_positions(codes: Float[Array, "1 n c"], height: int, width: int) -> Float[Array, "1 m c"]:
+    """The position code of a grid of `height` x `width` cells.
+
+    DINOv2 asks torch for the factor (size + 0.1) / 37 and not for the size, and torch places the samples by the factor.
+    """
+    if (height, width) == (POSITIONS_SIDE, POSITIONS_SIDE):
+        return codes[:, 1:]
+    rows, columns = _cubic(height), _cubic(width)
+    grid = codes[0, 1:].reshape(POSITIONS_SIDE, POSITIONS_SIDE, -1)
+    return jnp.einsum("ph,hwc,qw->pqc", rows, grid, columns, precision="highest").reshape(1, height * width, -1)
+
+
+def _cubic(wanted: int) -> np.ndarray:
+    """Weights of the 37 samples along one axis in each of `wanted`, the border repeated."""
+    places = (np.arange(wanted) + 0.5) * POSITIONS_SIDE / (wanted + 0.1) - 0.5
+    weights = np.zeros((wanted, POSITIONS_SIDE), np.float32)
+    for tap in range(-1, 3):
+        sample = np.floor(places) + tap
+        t = np.abs(places - sample)
+        inner = (CUBIC + 2) * t**3 - (CUBIC + 3) * t**2 + 1
+        outer = CUBIC * (t**3 - 5 * t**2 + 8 * t - 4)
+        column = np.clip(sample, 0, POSITIONS_SIDE - 1).astype(int)
+        np.add.at(weights, (np.arange(wanted), column), np.where(t <= 1, inner, outer))
+    return weights
+
+
+class Attention(nn.Module):
+    """Self-attention of the tokens of each view."""
+
+    heads: int
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "v n c"]) -> Float[Array, "v n c"]:
+        v, n, c = x.shape
+        qkv = nn.Dense(3 * c, name="qkv")(x).reshape(v, n, 3, self.heads, c // self.heads)
+        return nn.Dense(c, name="proj")(attend(qkv[:, :, 0], qkv[:, :, 1], qkv[:, :, 2]).reshape(v, n, c))
+
+
+class LayerScale(nn.Module):
+    """A learned factor per channel."""
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "*b c"]) -> Float[Array, "*b c"]:
+        return x * self.param("gamma", nn.initializers.constant(1e-5), (x.shape[-1],))  # pyright: ignore
+
+
+class Block(nn.Module):
+    """Pre-norm transformer block."""
+
+    heads: int
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "v n c"]) -> Float[Array, "v n c"]:
+        norm = lambda name: nn.LayerNorm(epsilon=1e-6, use_fast_variance=False, name=name)  # noqa: E731
+        x = x + LayerScale(name="ls1")(Attention(self.heads, name="attn")(norm("norm1")(x)))
+        return x + LayerScale(name="ls2")(Mlp(name="mlp")(norm("norm2")(x)))
+
+
+class PatchEmbed(nn.Module):
+    """Each 14 x 14 patch to a token."""
+
+    features: int
+
+    @nn.compact
+    def __call__(self, images: Float[Array, "v h w 3"]) -> Float[Array, "v n c"]:
+        side = PIXELS_PER_VIT_CELL
+        conv = nn.Conv(self.features, (side, side), strides=(side, side), padding="VALID", name="proj")
+        return conv(images).reshape(images.shape[0], -1, self.features)
+
+
+class VisionTransformer(nn.Module):
+    """Normalised images to the maps of four of its blocks."""
+
+    size: str
+
+    @nn.compact
+    def __call__(self, images: Float[Array, "v h w 3"]) -> tuple[Float[Array, "v hp wp c"], ...]:
+        width, num_blocks, heads, read = VITS[self.size]
+        rows, columns = grid_size(*images.shape[1:3])
+        small = resize(images, rows * PIXELS_PER_VIT_CELL, columns * PIXELS_PER_VIT_CELL)
+        start = nn.initializers.normal(0.02)
+        class_token = self.param("cls_token", start, (1, 1, width))
+        codes = self.param("pos_embed", start, (1, 1 + POSITIONS_SIDE**2, width))
+        x = PatchEmbed(width, name="patch_embed")(small) + resampled_positions(codes, rows, columns)  # pyright: ignore
+        first = jnp.broadcast_to(class_token + codes[:, :1], (x.shape[0], 1, width))  # pyright: ignore
+        x = jnp.concatenate([first, x], axis=1)
+        norm = nn.LayerNorm(epsilon=1e-6, use_fast_variance=False, name="norm")
+        maps = []
+        for i in range(num_blocks):
+            x = Block(heads, name=f"blocks_{i}")(x)
+            if i in read:
+                maps.append(norm(x)[:, 1:].reshape(-1, rows, columns, width))
+        return tuple(maps)
