@@ -324,7 +324,8 @@ class ImportWeights:
         from ssplat_jax.checkpoint.upstream import import_params
         from ssplat_jax.checkpoint.weights import save_weights
 
-        config = apply_changes(preset(self.preset), self.set)
+        # The weights were trained with what their code does; --set says otherwise.
+        config = apply_changes(preset(self.preset).replace(upstream_compat=True), self.set)
         imported = import_params(self.checkpoint, config)
         provenance = {"imported_from": self.checkpoint.name, "fresh": imported.fresh}
         save_weights(self.out, imported.params, config, provenance, np.float32)

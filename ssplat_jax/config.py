@@ -31,8 +31,7 @@ class StreamConfig:
     depth_range: tuple[float, float] | None = None
     """Nearest and farthest candidate in stream units, where weights are of one range; None: what the chunk says."""
     upstream_compat: bool = False
-    """Sweeps as DepthSplat's code does, pixels by their corners and all views by one K, to compare numbers
-    (`resplat`)."""
+    """Sweeps and masks attention as ReSplat's code does, which its weights were trained with (`resplat`)."""
 
     # -- stream ---------------------------------------------------------------------------------------------------
     chunk_size: int = 4

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from ssplat_jax.errors import InputError
-from ssplat_jax.state_dict import read_arrays
+from ssplat_jax.state_dict import read_arrays, read_shapes
 from tests.lpips_fixture import FOLDER, small_dict
 
 FILES = {"zip": FOLDER / "zip.pth", "legacy": FOLDER / "legacy.pth"}
@@ -92,6 +92,14 @@ def test_offsets_and_strides_are_honoured(tmp_path):
     arrays = read_arrays(path, {"x": (2, 2), "y": (3,)})
     np.testing.assert_array_equal(arrays["x"], [[1, 4], [2, 5]])
     np.testing.assert_array_equal(arrays["y"], [5, 5, 5])
+
+
+@pytest.mark.parametrize("name", ["state_dict", "model"])
+def test_what_a_training_saved_beside_its_state_dict_is_left(name, tmp_path):
+    inside = b"}(" + text("x") + tensor(0, (2, 3), (3, 1)) + b"u"
+    path = in_zip(tmp_path / "a", state_dict(epoch=number(7), **{name: inside}), np.arange(6, dtype="<f4").tobytes())
+    assert read_shapes(path) == {"x": (2, 3)}
+    np.testing.assert_array_equal(read_arrays(path, {"x": (2, 3)})["x"], [[0, 1, 2], [3, 4, 5]])
 
 
 @pytest.mark.parametrize(

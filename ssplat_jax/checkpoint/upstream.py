@@ -58,7 +58,7 @@ class Imported(NamedTuple):
     num_imported: int
     num_unused: int
     fresh: tuple[str, ...]
-    """Parts that the file does not have, by the names of their first stages."""
+    """Parts that the file does not have, by the first of their modules."""
 
 
 def tensor_of(path: tuple[str, ...], shape: tuple[int, ...]) -> Tensor | None:
@@ -111,19 +111,22 @@ def import_params(path: Path, config: StreamConfig, seed: int = 0) -> Imported:
                 f"{path}: wanted an array {in_file[absent[0]]}, the file has none; is it another network's?"
             )
         if absent:
-            fresh.append((part if isinstance(part, str) else part[0]).removeprefix(DEPTH).strip("."))
+            first = part if isinstance(part, str) else part[0]
+            fresh.append(first.removeprefix(DEPTH).removeprefix("encoder.").strip("."))
     if len(missing) == len(tensors):
         raise InputError(
             f"{path}: wanted weights of ReSplat, its depth network or Depth Anything V2; the file has none of their"
             f" {len(tensors)} tensors."
         )
+    lacking = {name.partition("/")[0] for name, t in tensors_of(config).items() if t is None or t.name in missing}
     arrays = read_arrays(path, {in_file[t.name]: t.shape for t in tensors.values() if t.name not in missing})
 
-    def parameter(keys, start):
-        tensor = tensors.get("/".join(k.key for k in keys))
-        if tensor is None or tensor.name in missing:
-            return start
-        return jnp.asarray(tensor.to_parameter(arrays[in_file[tensor.name]]))
-
-    params = jax.tree_util.tree_map_with_path(parameter, init_params(jax.random.key(seed), config))
+    params = init_params(jax.random.key(seed), config, lacking)
+    for place, tensor in tensors.items():
+        if tensor.name not in missing:
+            *folders, leaf = place.split("/")
+            folder = params
+            for name in folders:
+                folder = folder.setdefault(name, {})
+            folder[leaf] = jnp.asarray(tensor.to_parameter(arrays[in_file[tensor.name]]))
     return Imported(params, len(arrays), len(held) - len(arrays), tuple(fresh))

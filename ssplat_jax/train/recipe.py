@@ -91,7 +91,7 @@ class Recipe:
 
 
 # The parameters that rendering the cache leaves without a gradient.
-ALL_BUT_HEAD = ("encoder", "cost_volume", "hpda", "tokens", "cgfi", "mixer")
+ALL_BUT_HEAD = ("encoder", "cost_volume", "upsampler", "hpda", "tokens", "cgfi", "mixer")
 
 TINY = Recipe(
     phases=(
@@ -124,7 +124,7 @@ STREAM = Recipe(
             steps_of_depth=(0.01, 0.15),
             # The matcher is done by then; without its backward pass a step costs a third, and rendering teaches it
             # less about depth than depth itself did.
-            form=PhaseForm(frozen=("encoder", "cost_volume")),
+            form=PhaseForm(frozen=("encoder", "cost_volume", "upsampler")),
         ),
     )
 )

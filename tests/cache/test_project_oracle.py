@@ -10,7 +10,7 @@ import pytest
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
-from ssplat_jax.cache import VoxelCache, init_cache, project, reference
+from ssplat_jax.cache import VoxelCache, coarser, init_cache, project, reference
 from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.struct import replace
 from tests.cache.streams import CAPACITY, CONFIG, VALUE_RTOL, WIDTH
@@ -214,3 +214,19 @@ def test_no_gradient_passes_the_projection():
 
     grads = jax.grad(loss, argnums=(0, 1))(scene(2, CAPACITY, 1.0).means, cameras(1).viewmats)
     assert not any(np.any(np.asarray(g)) for g in grads)
+
+
+def test_a_coarser_cell_is_the_nearest_of_its_cells_whole():
+    fine = jit_project(scene(5, CAPACITY, 0.3), cameras(6), CONFIG)
+    assert coarser(fine, 1) is fine
+    coarse = coarser(fine, 2)
+    mask, depths = np.asarray(fine.mask), np.asarray(fine.depths)
+    assert 0 < mask.mean() < 1
+    for v, i, j in np.ndindex(*coarse.depths.shape):
+        cells = [(v, 2 * i + y, 2 * j + x) for y, x in np.ndindex(2, 2) if mask[v, 2 * i + y, 2 * j + x]]
+        assert bool(coarse.mask[v, i, j]) == bool(cells)
+        if not cells:
+            assert not any(np.any(np.asarray(x)[v, i, j]) for x in jax.tree.leaves(coarse))
+            continue
+        nearest = min(cells, key=lambda cell: depths[cell])
+        jax.tree.map(lambda c, f: np.testing.assert_array_equal(c[v, i, j], f[nearest]), coarse, fine)  # noqa: B023

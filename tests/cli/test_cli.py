@@ -17,12 +17,16 @@ from PIL import Image
 from ssplat_jax import cli, evaluate
 from ssplat_jax.checkpoint.delta import load_delta, load_delta_header
 from ssplat_jax.checkpoint.state import load_state
-from ssplat_jax.checkpoint.weights import load_params, save_weights
+from ssplat_jax.checkpoint.upstream import tensors_of
+from ssplat_jax.checkpoint.weights import load_params, load_weights, save_weights
 from ssplat_jax.config import StreamConfig, preset
 from ssplat_jax.follow import apply_delta
 from ssplat_jax.stream import StreamSplat
+from tests.model.resplat_fixture import named_tensor
 
-COMMANDS = ("demo", "inspect", "run", "eval", "train", "export", "render", "view", "bench", "experiment")
+COMMANDS = (
+    *("demo", "inspect", "run", "eval", "train", "export", "render", "view", "import-weights", "bench", "experiment"),
+)
 
 
 @pytest.fixture(autouse=True)
@@ -156,6 +160,8 @@ def test_results_among_the_captures_own_images_are_refused(command, place, tmp_p
         (("run", "procedural:room", "--set", "sh_degree=1", "--out", "x"), "another config"),
         (("train", "--set", "encoder_widths=[16, 0]", "--out", "x"), "encoder_widths"),
         (("export", "no_run", "--to", "x.ply"), "no_run"),
+        (("import-weights", "no.pth", "--out", "x.npz"), "no.pth: cannot be read"),
+        (("run", "procedural:room", "--weights", "small", "--out", "x"), "none ship with the preset 'small'"),
         (("inspect", "procedural:castle"), "castle"),
     ],
 )
@@ -280,3 +286,20 @@ def test_eval_writes_every_promised_field(tmp_path, monkeypatch):
     assert (metrics["streamed_size"], metrics["size"]) == ([64, 48], [128, 96])
     with Image.open(out / "view_00004.png") as picture:
         assert picture.size == (3 * 128, 96)
+
+
+@pytest.mark.slow  # compiles a network of 62 million parameters
+def test_imported_weights_stream_a_capture(tmp_path, capsys):
+    tensors = {t.name: named_tensor(t.name, t.shape) for t in tensors_of(preset("small")).values() if t is not None}
+    np.savez(tmp_path / "upstream.npz", **tensors)
+    assert run("import-weights", str(tmp_path / "upstream.npz"), "--out", str(tmp_path / "small.npz")) == 0
+    assert "701 tensors (0 not used); fresh: HPDA and CGFI" in capsys.readouterr().out
+    params, config = load_weights(tmp_path / "small.npz")
+    assert config.upstream_compat and config.preset == "small"
+    assert params["decoder"]["gaussian_head_2"]["kernel"].dtype == np.float32
+    name = "encoder.gaussian_head.2.weight"
+    np.testing.assert_array_equal(params["decoder"]["gaussian_head_2"]["kernel"], tensors[name].T)
+    capture, out = make_capture(tmp_path / "capture"), tmp_path / "out"
+    weights = ("--weights", str(tmp_path / "small.npz"), "--set", "min_confidence=0.0")
+    assert run("run", str(capture), "--out", str(out), *weights, "--quiet") == 0
+    assert json.loads((out / "metrics.json").read_text())["num_gaussians"] > 0

@@ -1,0 +1,168 @@
+"""ReSplat's network by itself: its sizes, its parts against plain definitions, and the stream around it."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ssplat_jax.config import StreamConfig, preset
+from ssplat_jax.errors import InputError
+from ssplat_jax.model import count_params, init_params
+from ssplat_jax.model.resplat.encoder import Transformer
+from ssplat_jax.model.resplat.layers import EdgeConv, GrowingConv, resize
+from ssplat_jax.model.resplat.vit import POSITIONS_SIDE, grid_size, resampled_positions
+from ssplat_jax.model.windows import in_one_region
+from ssplat_jax.stream import StreamSplat
+from ssplat_jax.struct import replace
+from tests.model.small import chunk, random_params
+
+CONFIG = preset("small").replace(mixer_blocks=1, num_depths=32, min_confidence=0.0, capacity=1 << 11)
+MODEL = StreamSplat(CONFIG)
+
+
+@pytest.mark.parametrize(("name", "millions"), [("small", 62.1), ("base", 209.4)])
+def test_presets_have_the_published_number_of_parameters(name, millions):
+    params = jax.eval_shape(lambda key: init_params(key, preset(name)), jax.random.key(0))
+    ours = ("hpda", "cgfi")  # StreamSplat's, which ReSplat does not have
+    counted = count_params({stage: p for stage, p in params.items() if stage not in ours})
+    assert round(counted / 1e6, 1) == millions
+
+
+def test_a_stage_by_itself_is_initialised_as_among_all():
+    config = StreamConfig(token_width=8, cgfi_width=8, mixer_blocks=1)
+    whole, part = (init_params(jax.random.key(3), config, only) for only in (None, ("hpda", "decoder")))
+    assert set(part) == {"hpda", "decoder"}
+    jax.tree.map(np.testing.assert_array_equal, part, {name: whole[name] for name in part})
+
+
+def test_resizing_keeps_corners_and_draws_straight_lines_between():
+    rng = np.random.default_rng(0)
+    x = rng.normal(size=(2, 5, 7, 3)).astype(np.float32)
+    for height, width in ((5, 7), (9, 13), (3, 4), (16, 11), (1, 1)):
+        rows, columns = np.linspace(0, 4, height), np.linspace(0, 6, width)
+        wanted = np.empty((2, height, width, 3))
+        for v, c in np.ndindex(2, 3):
+            between = np.array([np.interp(columns, np.arange(7), row) for row in x[v, :, :, c]])
+            wanted[v, :, :, c] = np.array([np.interp(rows, np.arange(5), column) for column in between.T]).T
+        np.testing.assert_allclose(resize(jnp.asarray(x), height, width), wanted, atol=1e-5)
+
+
+def test_a_growing_convolution_makes_a_patch_of_every_sample():
+    rng = np.random.default_rng(0)
+    shapes = ((1, 2, 3, 4), (2, 2, 4, 5), (5,))
+    x, kernel, bias = (jnp.asarray(rng.normal(size=shape), jnp.float32) for shape in shapes)
+    y = GrowingConv(5, 2).apply({"params": {"kernel": kernel, "bias": bias}}, x)
+    for i, j in np.ndindex(4, 6):
+        wanted = x[0, i // 2, j // 2] @ kernel[i % 2, j % 2] + bias
+        np.testing.assert_allclose(np.asarray(y)[0, i, j], wanted, rtol=1e-5, atol=1e-5)
+
+
+def test_an_edge_convolution_sees_a_constant_as_a_constant():
+    kernel = jnp.asarray(np.random.default_rng(0).normal(size=(3, 3, 2, 4)), jnp.float32)
+    y = EdgeConv(4).apply({"params": {"kernel": kernel, "bias": jnp.zeros(4)}}, jnp.ones((1, 4, 5, 2)))
+    np.testing.assert_allclose(y, np.broadcast_to(kernel.sum(axis=(0, 1, 2)), (1, 4, 5, 4)), rtol=1e-5, atol=1e-5)
+
+
+def test_position_codes_are_resampled_as_dinov2_asks_torch_to():
+    rng = np.random.default_rng(0)
+    codes = jnp.asarray(rng.normal(size=(1, 1 + POSITIONS_SIDE**2, 2)), jnp.float32)
+    np.testing.assert_array_equal(resampled_positions(codes, 37, 37), codes[:, 1:])
+    np.testing.assert_allclose(resampled_positions(jnp.ones_like(codes), 9, 50), 1.0, atol=1e-5)
+    # Keys' cubic convolution with a = -0.75 (JAX's has -0.5), at the places of a factor of (size + 0.1) / 37.
+    rows, columns = 9, 50
+    wanted = np.zeros((rows, columns, 2))
+    grid = np.asarray(codes[0, 1:], np.float64).reshape(37, 37, 2)
+    for i, j in np.ndindex(rows, columns):
+        y, x = (i + 0.5) * 37 / (rows + 0.1) - 0.5, (j + 0.5) * 37 / (columns + 0.1) - 0.5
+        for v, u in np.ndindex(4, 4):
+            row, column = int(np.floor(y)) + v - 1, int(np.floor(x)) + u - 1
+            weight = keys_kernel(y - row) * keys_kernel(x - column)
+            wanted[i, j] += weight * grid[np.clip(row, 0, 36), np.clip(column, 0, 36)]
+    np.testing.assert_allclose(resampled_positions(codes, rows, columns), wanted.reshape(1, -1, 2), atol=1e-5)
+
+
+def keys_kernel(t: float, a: float = -0.75) -> float:
+    t = abs(t)
+    if t <= 1:
+        return (a + 2) * t**3 - (a + 3) * t**2 + 1
+    return a * (t**3 - 5 * t**2 + 8 * t - 4) if t < 2 else 0.0
+
+
+def test_the_vit_sees_at_most_560_pixels_and_at_least_a_cell():
+    assert grid_size(128, 192) == (9, 13)
+    assert grid_size(512, 768) == (26, 40)
+    assert grid_size(4, 8) == (1, 1)
+
+
+def test_keys_of_all_sources_are_masked_alike():
+    together = in_one_region(4, 6, (4, 6), (2, 3))
+    keys = Transformer(upstream_compat=False).of_sources(together, 2)
+    np.testing.assert_array_equal(keys[..., :24], together)
+    np.testing.assert_array_equal(keys[..., 24:], together)
+    one = Transformer(upstream_compat=True)
+    np.testing.assert_array_equal(one.of_sources(together, 1), together)  # of one source there is no other way
+    assert (np.asarray(one.of_sources(together, 2)) != np.asarray(keys)).any()
+
+
+def test_the_compact_network_has_no_coarser_match_grid():
+    with pytest.raises(InputError, match="match_stride must be 4 with this network, got 8"):
+        StreamConfig(match_stride=8)
+    with pytest.raises(InputError, match="depth_range must be two depths, the nearer first"):
+        preset("small").replace(depth_range=(2.0, 1.0))
+
+
+# -- in the stream ----------------------------------------------------------------------------------------------------
+
+
+@functools.cache
+def params() -> dict:
+    return random_params(CONFIG)
+
+
+@functools.cache
+def step():
+    return jax.jit(MODEL.step)
+
+
+def views(**changes):
+    return replace(chunk(0, views=3, height=40, width=56), **changes)
+
+
+def test_the_stream_fills_its_memory_and_depths_stay_among_the_candidates():
+    cache, out = step()(params(), MODEL.init_cache(), views())
+    near, far = CONFIG.depth_range
+    assert out.depths.shape == (3, 16, 16)  # padded to 64 x 64
+    assert near * (1 - 1e-5) <= out.depths.min() and out.depths.max() <= far * (1 + 1e-5)
+    assert int(cache.stats.num_accepted) == 3 * 10 * 14
+    gaussians = MODEL.decode(params(), cache)
+    assert gaussians.sh.shape[1:] == (16, 3)
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves(gaussians))
+    # History is heard a chunk later: what is remembered of the same views changes what they say.
+    _, later = step()(params(), cache, views())
+    assert (later.history > 0).mean() > 0.2
+    assert np.abs(np.asarray(later.depths - out.depths)).max() > 1e-4
+
+
+def test_a_padded_view_changes_nothing():
+    valid = jnp.array([True, True, False])
+    images = views().images
+    outs = [step()(params(), MODEL.init_cache(), views(valid=valid, images=images.at[2].set(x)))[1] for x in (0.0, 0.7)]
+    for name in ("depths", "confidences"):
+        first, second = (np.asarray(getattr(out, name))[:2] for out in outs)
+        np.testing.assert_array_equal(first, second)
+    assert not np.asarray(outs[0].confidences)[2].any()
+
+
+@pytest.mark.slow  # compiles for two minutes
+def test_gradients_are_finite_and_reach_every_stage():
+    def loss(params):
+        prediction = MODEL.predict(params, MODEL.init_cache(), views())
+        gaussians = MODEL.decode_tokens(params, prediction.tokens)
+        return sum(jnp.sum(jnp.sin(x)) for x in (gaussians.means, gaussians.scales, gaussians.opacities, gaussians.sh))
+
+    gradients = jax.jit(jax.grad(loss))(params())
+    sizes = {name: float(sum(jnp.sum(jnp.abs(x)) for x in jax.tree.leaves(part))) for name, part in gradients.items()}
+    assert all(np.isfinite(size) for size in sizes.values())
+    assert all(size > 0 for name, size in sizes.items() if name != "hpda"), sizes  # no history yet: no anchor
