@@ -20,6 +20,7 @@ from ssplat_jax.checkpoint.state import load_state
 from ssplat_jax.checkpoint.upstream import tensors_of
 from ssplat_jax.checkpoint.weights import load_params, load_weights, save_weights
 from ssplat_jax.config import StreamConfig, preset
+from ssplat_jax.export.ply import load_ply
 from ssplat_jax.follow import apply_delta
 from ssplat_jax.stream import StreamSplat
 from tests.model.resplat_fixture import named_tensor
@@ -302,4 +303,4 @@ def test_imported_weights_stream_a_capture(tmp_path, capsys):
     capture, out = make_capture(tmp_path / "capture"), tmp_path / "out"
     weights = ("--weights", str(tmp_path / "small.npz"), "--set", "min_confidence=0.0")
     assert run("run", str(capture), "--out", str(out), *weights, "--quiet") == 0
-    assert json.loads((out / "metrics.json").read_text())["num_gaussians"] > 0
+    assert load_ply(out / "scene.ply").num_gaussians > 0
