@@ -306,6 +306,8 @@ class Export:
 class ImportWeights:
     """Convert weights that ReSplat's PyTorch code saved, without PyTorch. What the file lacks is initialised afresh.
 
+    DepthSplat's depth network, of RealEstate10K for instance, needs to be told how it was trained: --depth-only
+    --set depth_space=inverse match_stride=4 num_sources=1 depth_range=[0.5,100].
     Example: ssplat import-weights resplat-small.pth --out small.npz
     """
 
@@ -315,6 +317,8 @@ class ImportWeights:
     """Weights file to write: `ssplat run --weights` takes it."""
     preset: Literal["small", "base"] = "small"
     """Size of the network."""
+    depth_only: bool = False
+    """Leave what stands behind the depth in the file."""
     set: tuple[str, ...] = ()
     """Changes to the configuration, as field=value."""
 
@@ -326,7 +330,7 @@ class ImportWeights:
 
         # The weights were trained with what their code does; --set says otherwise.
         config = apply_changes(preset(self.preset).replace(upstream_compat=True), self.set)
-        imported = import_params(self.checkpoint, config)
+        imported = import_params(self.checkpoint, config, depth_only=self.depth_only)
         provenance = {"imported_from": self.checkpoint.name, "fresh": imported.fresh}
         save_weights(self.out, imported.params, config, provenance, np.float32)
         fresh = ", ".join((*imported.fresh, "HPDA and CGFI, which upstream does not have"))

@@ -30,6 +30,9 @@ class StreamConfig:
     """Pixels to a side of a cell of the cost volume (8: `resplat` alone)."""
     depth_range: tuple[float, float] | None = None
     """Nearest and farthest candidate in stream units, where weights are of one range; None: what the chunk says."""
+    depth_space: Literal["log", "inverse"] = "log"
+    """Where candidates are equally far apart and depths are averaged: log depth, or 1 / depth, which is DepthSplat's
+    (`resplat`)."""
     upstream_compat: bool = False
     """Sweeps and masks attention as ReSplat's code does, which its weights were trained with (`resplat`)."""
 
@@ -136,6 +139,7 @@ class StreamConfig:
     def __post_init__(self) -> None:
         for name, wanted, good in (
             ("match_stride", "4 with this network", self.match_stride == 4 or self.network == "resplat"),
+            ("depth_space", "'log' with this network", self.depth_space == "log" or self.network == "resplat"),
             ("depth_range", "two depths, the nearer first", _is_range(self.depth_range)),
             ("chunk_size", "at least 1", self.chunk_size >= 1),
             ("num_sources", "not negative", self.num_sources >= 0),

@@ -87,8 +87,10 @@ def tensors_of(config: StreamConfig) -> dict[str, Tensor | None]:
     return {"/".join(k.key for k in keys): tensor_of(tuple(k.key for k in keys), x.shape) for keys, x in leaves}
 
 
-def import_params(path: Path, config: StreamConfig, seed: int = 0) -> Imported:
+def import_params(path: Path, config: StreamConfig, seed: int = 0, *, depth_only: bool = False) -> Imported:
     """Parameters of a model with `config` from a checkpoint of PyTorch (`.pth`, `.ckpt`, `.npz`).
+
+    With `depth_only`, what stands behind the depth is left in the file: DepthSplat's is another than ReSplat's.
 
     Raises:
         InputError: a configuration of another network, a file that is no state dict, is damaged, has nothing of this
@@ -101,7 +103,8 @@ def import_params(path: Path, config: StreamConfig, seed: int = 0) -> Imported:
     bare = "" if any(name.startswith("encoder.") for name in held) else DEPTH
     tensors = {name: t for name, t in tensors_of(config).items() if t is not None}
     in_file = {t.name: t.name.removeprefix(bare) for t in tensors.values()}
-    missing = {t.name for t in tensors.values() if in_file[t.name] not in held}
+    wanted = {t.name for t in tensors.values() if t.name.startswith(DEPTH) or not depth_only}
+    missing = {t.name for t in tensors.values() if t.name not in wanted or in_file[t.name] not in held}
     fresh = []
     for part in PARTS:
         of_part = [t.name for t in tensors.values() if t.name.startswith(part)]

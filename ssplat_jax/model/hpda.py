@@ -1,13 +1,12 @@
 """History-Projected Depth Anchoring: cached geometry as a Gaussian anchor over depth candidates (Sec. 3.5, HPDA)."""
 
 import flax.linen as nn
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ssplat_jax.cache import ProjectedCache
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.model.wires import AnchoredDepth, DepthBelief, Views
+from ssplat_jax.model.wires import AnchoredDepth, DepthBelief, Views, from_candidate_space, to_candidate_space
 from ssplat_jax.numerics import safe_log, softplus_inverse
 
 MIN_SIGMA = 1e-6
@@ -85,7 +84,8 @@ def expected_log_depth(
         distance = jnp.abs(jnp.arange(probs.shape[-1]) - jnp.argmax(probs, axis=-1)[..., None])
         probs = jnp.where(distance <= config.readout_window, probs, 0.0)
         probs = probs / probs.sum(axis=-1, keepdims=True)
-    return jnp.einsum("...d,d->...", probs, log_candidates, precision=jax.lax.Precision.HIGHEST)
+    candidates = to_candidate_space(log_candidates, config)
+    return from_candidate_space(jnp.einsum("...d,d->...", probs, candidates, precision="highest"), config)
 
 
 def anchor_depth(

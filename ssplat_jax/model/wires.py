@@ -21,7 +21,7 @@ class Views:
     Ks: Float[Array, "v 3 3"]
     valid: Bool[Array, " v"]
     inside: Bool[Array, "v hf wf"]  # cells of valid views whose centre lies in the unpadded image
-    log_candidates: Float[Array, " d"]  # ln of the depth candidates, near to far
+    log_candidates: Float[Array, " d"]  # ln of the depth candidates, near to far (of inverse depth: far to near)
     height: int = static()  # of the unpadded image
     width: int = static()
 
@@ -88,19 +88,35 @@ def prepare_views(chunk: Chunk, config: StreamConfig) -> Views:
     images = jnp.pad(chunk.images, ((0, 0), (0, pad_h), (0, pad_w), (0, 0)), mode="edge")
     centres = pixel_grid(height + pad_h, width + pad_w, GRID_STRIDE)
     in_image = (centres[..., 0] < width) & (centres[..., 1] < height)
-    fractions = jnp.linspace(0.0, 1.0, config.num_depths)
     near, far = (chunk.near, chunk.far) if config.depth_range is None else map(jnp.float32, config.depth_range)
-    log_near, log_far = jnp.log(near), jnp.log(far)
     return Views(
         images=images,
         viewmats=chunk.viewmats,
         Ks=chunk.Ks,
         valid=chunk.valid,
         inside=in_image[None] & chunk.valid[:, None, None],
-        log_candidates=log_near + (log_far - log_near) * fractions,
+        log_candidates=_log_candidates(near, far, config),
         height=height,
         width=width,
     )
+
+
+def _log_candidates(near, far, config: StreamConfig) -> Float[Array, " d"]:
+    fractions = jnp.linspace(0.0, 1.0, config.num_depths)
+    if config.depth_space == "inverse":
+        return -jnp.log(1 / far + (1 / near - 1 / far) * fractions)
+    log_near, log_far = jnp.log(near), jnp.log(far)
+    return log_near + (log_far - log_near) * fractions
+
+
+def to_candidate_space(log_depths: Float[Array, "*b"], config: StreamConfig) -> Float[Array, "*b"]:
+    """Depths where candidates are equally far apart: their logarithms, or inverses."""
+    return jnp.exp(-log_depths) if config.depth_space == "inverse" else log_depths
+
+
+def from_candidate_space(x: Float[Array, "*b"], config: StreamConfig) -> Float[Array, "*b"]:
+    """Log depths; inverse of `to_candidate_space`."""
+    return -jnp.log(x) if config.depth_space == "inverse" else x
 
 
 def nearest_sources(

@@ -21,13 +21,14 @@ NARROWEST_STEP = 1e-6
 def soft_targets(
     log_depths: Float[Array, "*b"], log_candidates: Float[Array, " d"], width: float = 0.6
 ) -> Float[Array, "*b d"]:
-    """True depth as a narrow distribution over the candidates: a Gaussian of `width` bins, normalised.
+    """True depth as a narrow distribution over the candidates: a Gaussian of `width` steps between them, normalised.
 
     Limits:
         One candidate, or all at one depth: it is the whole distribution, or all alike.
     """
-    step = (log_candidates[-1] - log_candidates[0]) / max(log_candidates.shape[0] - 1, 1)
-    step = jnp.maximum(step, NARROWEST_STEP)
+    # Candidates that are not uniform in log depth each have the step there.
+    steps = jnp.abs(jnp.gradient(log_candidates)) if log_candidates.shape[0] > 1 else jnp.zeros(1)
+    step = jnp.maximum(steps, NARROWEST_STEP)
     return jax.nn.softmax(-0.5 * ((log_candidates - log_depths[..., None]) / (width * step)) ** 2, axis=-1)
 
 
@@ -43,7 +44,7 @@ def depth_loss(
     Limits:
         A true depth of 0 (unknown), infinite or NaN is out of range, and no part of value or gradient.
     """
-    in_range = usable & (truth > log_candidates[0]) & (truth < log_candidates[-1])
+    in_range = usable & (truth > log_candidates.min()) & (truth < log_candidates.max())
     truth = jnp.where(in_range, truth, jax.lax.stop_gradient(predicted))
     weight = in_range.astype(jnp.float32) / jnp.maximum(in_range.sum(), 1).astype(jnp.float32)
     targets = soft_targets(truth, log_candidates)

@@ -97,6 +97,21 @@ def test_a_depth_network_by_itself_leaves_the_rest_fresh(depth_network, tensors)
         jax.tree.map(np.testing.assert_array_equal, imported.params[name], stage)
 
 
+def test_of_another_network_the_depth_alone_can_be_taken(tmp_path, tensors):
+    path = tmp_path / "depthsplat.ckpt.npz"
+    other = {f"{HEAD}0.weight": np.zeros((37, 64, 3, 3), np.float32), "encoder.feature_upsampler.x": np.zeros(3)}
+    pretrained = {name: x for name, x in tensors.items() if ".pretrained." in name or ".backbone." in name}
+    np.savez(path, **pretrained, **other)
+    with pytest.raises(InputError, match=r"encoder\.gaussian_head"):
+        import_params(path, CONFIG)
+    imported = import_params(path, CONFIG, depth_only=True)
+    assert imported.num_imported == len(pretrained) and imported.num_unused == 2
+    assert {"transformer", "upsampler", "regressor", "gaussian_head"} <= set(imported.fresh)
+    assert not {"backbone", "pretrained"} & set(imported.fresh)
+    name = f"{DEPTH}backbone.conv1.weight"
+    assert float(imported.params["encoder"]["backbone"]["conv1"]["kernel"][0, 0, 0, 0]) == tensors[name].flat[0]
+
+
 def saved(path, **arrays):
     np.savez(path, **arrays)
     return path

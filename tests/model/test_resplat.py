@@ -9,13 +9,16 @@ import pytest
 
 from ssplat_jax.config import StreamConfig, preset
 from ssplat_jax.errors import InputError
-from ssplat_jax.model import count_params, init_params
+from ssplat_jax.model import count_params, init_params, prepare_views
+from ssplat_jax.model.hpda import expected_log_depth
 from ssplat_jax.model.resplat.encoder import Transformer
 from ssplat_jax.model.resplat.layers import EdgeConv, GrowingConv, resize
 from ssplat_jax.model.resplat.vit import POSITIONS_SIDE, grid_size, resampled_positions
 from ssplat_jax.model.windows import in_one_region
+from ssplat_jax.model.wires import to_candidate_space
 from ssplat_jax.stream import StreamSplat
 from ssplat_jax.struct import replace
+from ssplat_jax.train.losses import soft_targets
 from tests.model.small import chunk, random_params
 
 CONFIG = preset("small").replace(mixer_blocks=1, num_depths=32, min_confidence=0.0, capacity=1 << 11)
@@ -111,6 +114,26 @@ def test_the_compact_network_has_no_coarser_match_grid():
         StreamConfig(match_stride=8)
     with pytest.raises(InputError, match="depth_range must be two depths, the nearer first"):
         preset("small").replace(depth_range=(2.0, 1.0))
+    with pytest.raises(InputError, match="depth_space must be 'log' with this network, got 'inverse'"):
+        StreamConfig(depth_space="inverse")
+
+
+def test_depths_are_averaged_where_candidates_are_equally_far_apart():
+    given = views()
+    for space, average in (("log", np.sqrt(2.0 * 8.0)), ("inverse", 2 / (1 / 2.0 + 1 / 8.0))):
+        config = CONFIG.replace(depth_space=space, depth_range=(2.0, 8.0))
+        candidates = prepare_views(given, config).log_candidates
+        apart = np.diff(np.asarray(to_candidate_space(candidates, config), np.float64))
+        np.testing.assert_allclose(apart, apart[0], rtol=1e-3)
+        np.testing.assert_allclose(np.exp(sorted(candidates[jnp.array([0, -1])])), [2.0, 8.0], rtol=1e-6)
+        both_ends = jnp.zeros(config.num_depths).at[jnp.array([0, -1])].set(0.5)
+        assert np.exp(expected_log_depth(both_ends, candidates, config)) == pytest.approx(average, rel=1e-5)
+        # A true depth is one of the candidates around it, however far apart they are there.
+        for truth in np.log([2.05, 3.0, 5.0, 7.8]):
+            targets = np.asarray(soft_targets(jnp.float32(truth), candidates))
+            assert targets.sum() == pytest.approx(1.0, abs=1e-5)
+            nearest = np.argsort(np.abs(np.asarray(candidates) - truth))[:2]
+            assert np.argmax(targets) in nearest and targets[nearest].sum() > 0.6
 
 
 # -- in the stream ----------------------------------------------------------------------------------------------------

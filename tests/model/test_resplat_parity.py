@@ -17,12 +17,11 @@ from ssplat_jax.geometry.rotations import matrices_to_quats, quats_to_matrices
 from ssplat_jax.model import resplat
 from ssplat_jax.model.convolution import pixel_unshuffle
 from ssplat_jax.model.hpda import expected_log_depth
-from ssplat_jax.model.resplat.cost_volume import CostVolume, plane_sweep
 from ssplat_jax.model.resplat.head import GaussianHead
+from ssplat_jax.model.resplat.layers import resize
 from ssplat_jax.model.resplat.tokens import token_context
 from ssplat_jax.model.resplat.upsampler import Upsampler
-from ssplat_jax.model.wires import AnchoredDepth, Views, prepare_views
-from ssplat_jax.struct import replace
+from ssplat_jax.model.wires import AnchoredDepth, Views, prepare_views, to_candidate_space
 from tests.model.resplat_fixture import load_golden, named_params, tap_error
 
 TOLERANCE = 2e-4
@@ -132,22 +131,26 @@ def test_resplats_shifted_windows_are_masked_as_upstream_only_when_asked():
 def test_depthsplats_depth_network_agrees_on_the_finer_grid():
     """Two views, 1/4, candidates in inverse depth: the other layout of the same parts."""
     golden = load_golden("depthsplat_small")
-    config = preset("small").replace(match_stride=4, num_sources=1, upstream_compat=True)
+    near, far = golden["in.near_far"].tolist()
+    layout = {"match_stride": 4, "num_sources": 1, "depth_space": "inverse", "depth_range": (near, far)}
+    config = preset("small").replace(**layout, upstream_compat=True)
     params = named_params(config)
-    near, far = golden["in.near_far"]
     views = prepare_views(read_inputs(golden), config)
-    views = replace(views, log_candidates=-jnp.log(jnp.linspace(1 / far, 1 / near, config.num_depths)))
 
     def run(params, views):
         features = resplat.encode(params["encoder"], views, config)
-        cost = plane_sweep(features, views, config)
-        belief = CostVolume(config).apply({"params": params["cost_volume"]}, cost, features, views.valid)
-        return features, belief
+        belief = resplat.match(params["cost_volume"], features, views, config)
+        inverse = to_candidate_space(expected_log_depth(belief.probs, views.log_candidates, config), config)
+        height, width = views.images.shape[1:3]
+        residual = Upsampler(config).apply({"params": params["upsampler"]}, features, inverse, height, width)
+        return features, belief, residual, 1 / (resize(inverse[..., None], height, width)[..., 0] + residual)
 
-    features, belief = jax.jit(run)(params, views)
+    features, belief, residual, depths = jax.jit(run)(params, views)
     wanted = lambda name: golden[f"tap.depth_predictor.{name}"]  # noqa: E731
     for i, x in enumerate(features.cnn):
         assert tap_error(wanted(f"backbone.{i}"), nchw(x)) < TOLERANCE
     for i in range(2):
         assert tap_error(wanted(f"transformer.{i}"), nchw(features.multiview[i : i + 1])) < TOLERANCE
     assert tap_error(wanted("depth_head.0"), nchw(belief.logits)) < TOLERANCE
+    assert tap_error(wanted("upsampler"), residual) < TOLERANCE
+    assert tap_error(golden["out.depth"], depths) < TOLERANCE

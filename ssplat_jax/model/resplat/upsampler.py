@@ -7,7 +7,14 @@ from jaxtyping import Array, Float
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.model.convolution import Conv, HalvingConv
 from ssplat_jax.model.resplat.layers import EdgeConv, GrowingConv, ReSplatFeatures, resize
-from ssplat_jax.model.wires import GRID_STRIDE, AnchoredDepth, Views, repeat_cells
+from ssplat_jax.model.wires import (
+    GRID_STRIDE,
+    AnchoredDepth,
+    Views,
+    from_candidate_space,
+    repeat_cells,
+    to_candidate_space,
+)
 
 SIZES = {
     # width of the fusion, channels of the four levels
@@ -59,13 +66,13 @@ class Scratch(nn.Module):
 
 
 class Upsampler(nn.Module):
-    """What to add to the upsampled log depth."""
+    """What to add to the upsampled depth, in the space of the candidates."""
 
     config: StreamConfig
 
     @nn.compact
     def __call__(
-        self, features: ReSplatFeatures, log_depths: Float[Array, "v hm wm"], height: int, width: int
+        self, features: ReSplatFeatures, depths: Float[Array, "v hm wm"], height: int, width: int
     ) -> Float[Array, "v h w"]:
         fused, channels = SIZES[self.config.vit]
         mono = [resize(x, height // 8, width // 8) for x in features.mono]
@@ -78,7 +85,7 @@ class Upsampler(nn.Module):
         ]
         half, middle, grid = features.cnn
         before = [[half], [middle], [grid]] if self.config.match_stride == 8 else [[half, middle], [grid], []]
-        behind = [features.multiview, log_depths[..., None]]  # where the match grid's own CNN features are
+        behind = [features.multiview, depths[..., None]]  # where the match grid's own CNN features are
         for i, maps in enumerate(before):
             joined = [*maps, levels[i], *(behind if maps and maps[-1] is grid else [])]
             levels[i] = Conv(channels[i], 1, name=f"concat_projects_{i}")(jnp.concatenate(joined, axis=-1))
@@ -94,10 +101,12 @@ def refine_depth(
         Depths stay between the first and the last candidate.
     """
     height, width = views.images.shape[1:3]
-    residual = Upsampler(config).apply({"params": params}, features, depth.log_depths, height, width)
-    fine = resize(depth.log_depths[..., None], height, width)[..., 0] + residual  # pyright: ignore[reportOperatorIssue]
-    fine = jnp.clip(fine, views.log_candidates[0], views.log_candidates[-1])
-    latent = jnp.log(resize(jnp.exp(fine)[..., None], height // GRID_STRIDE, width // GRID_STRIDE)[..., 0])
+    coarse = to_candidate_space(depth.log_depths, config)
+    residual = Upsampler(config).apply({"params": params}, features, coarse, height, width)
+    fine = resize(coarse[..., None], height, width)[..., 0] + residual  # pyright: ignore[reportOperatorIssue]
+    ends = to_candidate_space(views.log_candidates[jnp.array([0, -1])], config)
+    fine = jnp.exp(from_candidate_space(jnp.clip(fine, ends.min(), ends.max()), config))
+    latent = jnp.log(resize(fine[..., None], height // GRID_STRIDE, width // GRID_STRIDE)[..., 0])
     factor = config.match_stride // GRID_STRIDE
     return AnchoredDepth(
         probs=depth.probs,
