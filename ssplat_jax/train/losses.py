@@ -27,7 +27,7 @@ def soft_targets(
         One candidate, or all at one depth: it is the whole distribution, or all alike.
     """
     # Candidates that are not uniform in log depth each have the step there.
-    steps = jnp.abs(jnp.gradient(log_candidates)) if log_candidates.shape[0] > 1 else jnp.zeros(1)
+    steps = jnp.abs(jnp.asarray(jnp.gradient(log_candidates))) if len(log_candidates) > 1 else jnp.zeros(1)
     step = jnp.maximum(steps, NARROWEST_STEP)
     return jax.nn.softmax(-0.5 * ((log_candidates - log_depths[..., None]) / (width * step)) ** 2, axis=-1)
 
