@@ -7,7 +7,7 @@ from jaxtyping import Array, Bool, Float
 from ssplat_jax.cache import ProjectedCache
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.model.convolution import Conv
-from ssplat_jax.model.layers import UNet
+from ssplat_jax.model.layers import UNet, rms_normalize
 from ssplat_jax.model.wires import Views
 
 
@@ -43,6 +43,10 @@ def inject_features(
     if not config.cgfi:
         return feats
     feats = feats.astype(jnp.float32)
-    attenuated = (1 - confidences)[..., None] * history.feats.astype(jnp.float32)
+    remembered = history.feats.astype(jnp.float32)
+    if config.network == "resplat":
+        # Its features have any size, and what is injected is stored: without a bound the stream is a loop with gain.
+        remembered = rms_normalize(remembered)
+    attenuated = (1 - confidences)[..., None] * remembered
     hints = jnp.concatenate([attenuated, history.confidences[..., None]], axis=-1)
     return Aggregator(config).apply({"params": params}, feats, hints, views.valid)  # pyright: ignore[reportReturnType]

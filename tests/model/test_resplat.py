@@ -9,7 +9,7 @@ import pytest
 
 from ssplat_jax.config import StreamConfig, preset
 from ssplat_jax.errors import InputError
-from ssplat_jax.model import count_params, init_params, prepare_views
+from ssplat_jax.model import count_params, init_params, inject_features, prepare_views
 from ssplat_jax.model.hpda import expected_log_depth
 from ssplat_jax.model.resplat.encoder import Transformer
 from ssplat_jax.model.resplat.layers import EdgeConv, GrowingConv, resize
@@ -19,7 +19,7 @@ from ssplat_jax.model.wires import to_candidate_space
 from ssplat_jax.stream import StreamSplat
 from ssplat_jax.struct import replace
 from ssplat_jax.train.losses import soft_targets
-from tests.model.small import chunk, random_params
+from tests.model.small import chunk, history, random_params
 
 CONFIG = preset("small").replace(mixer_blocks=1, num_depths=32, min_confidence=0.0, capacity=1 << 11)
 MODEL = StreamSplat(CONFIG)
@@ -176,6 +176,21 @@ def test_a_padded_view_changes_nothing():
         first, second = (np.asarray(getattr(out, name))[:2] for out in outs)
         np.testing.assert_array_equal(first, second)
     assert not np.asarray(outs[0].confidences)[2].any()
+
+
+def test_what_cgfi_hears_has_one_size_however_large_features_are():
+    rng = np.random.default_rng(0)
+    grid, c = (3, 8, 8), CONFIG.token_width
+    feats = jnp.asarray(rng.normal(size=(*grid, c)), jnp.float32)
+    remembered = rng.normal(size=(*grid, c))
+    here = prepare_views(views(), CONFIG)
+    program = jax.jit(inject_features, static_argnums=5)
+    injected = []
+    for size in (1.0, 1e6):
+        past = history(np.ones(grid), np.full(grid, 0.7), feats=size * remembered)
+        injected.append(program(params()["cgfi"], feats, past, jnp.full(grid, 0.2), here, CONFIG))
+    np.testing.assert_allclose(injected[1], injected[0], rtol=1e-3, atol=1e-3)
+    assert np.abs(np.asarray(injected[0] - feats)).max() > 0.1
 
 
 @pytest.mark.slow  # compiles for two minutes
