@@ -307,7 +307,8 @@ class ImportWeights:
     """Convert weights that ReSplat's PyTorch code saved, without PyTorch. What the file lacks is initialised afresh.
 
     DepthSplat's depth network, of RealEstate10K for instance, needs to be told how it was trained: --depth-only
-    --set depth_space=inverse match_stride=4 num_sources=1 depth_range=[0.5,100].
+    --set depth_space=inverse match_stride=4 depth_range=[0.5,100].
+
     Example: ssplat import-weights resplat-small.pth --out small.npz
     """
 

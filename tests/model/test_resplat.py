@@ -9,8 +9,9 @@ import pytest
 
 from ssplat_jax.config import StreamConfig, preset
 from ssplat_jax.errors import InputError
-from ssplat_jax.model import count_params, init_params, inject_features, prepare_views
+from ssplat_jax.model import count_params, init_params, inject_features, prepare_views, resplat
 from ssplat_jax.model.hpda import expected_log_depth
+from ssplat_jax.model.resplat.cost_volume import plane_sweep
 from ssplat_jax.model.resplat.encoder import Transformer
 from ssplat_jax.model.resplat.layers import EdgeConv, GrowingConv, resize
 from ssplat_jax.model.resplat.vit import POSITIONS_SIDE, grid_size, resampled_positions
@@ -176,6 +177,19 @@ def test_a_padded_view_changes_nothing():
         first, second = (np.asarray(getattr(out, name))[:2] for out in outs)
         np.testing.assert_array_equal(first, second)
     assert not np.asarray(outs[0].confidences)[2].any()
+
+
+def test_a_view_alone_is_matched_with_nothing_and_stays_finite():
+    one = chunk(0, views=1, height=40, width=56)
+
+    def see(params):
+        here = prepare_views(one, CONFIG)
+        features = resplat.encode(params["encoder"], here, CONFIG)
+        return plane_sweep(features, here, CONFIG), resplat.match(params["cost_volume"], features, here, CONFIG)
+
+    cost, belief = jax.jit(see)(params())
+    assert not np.asarray(cost).any()
+    np.testing.assert_allclose(belief.probs.sum(axis=-1), 1.0, atol=1e-5)
 
 
 def test_what_cgfi_hears_has_one_size_however_large_features_are():

@@ -58,8 +58,8 @@ class TransformerBlock(nn.Module):
 
     @nn.compact
     def __call__(self, windows, sources, together, allowed):
-        v, n, _, c = windows.shape
-        context = windows[sources].transpose(0, 2, 1, 3, 4).reshape(v, n, -1, c)
+        v, n, cells, c = windows.shape
+        context = windows[sources].transpose(0, 2, 1, 3, 4).reshape(v, n, sources.shape[1] * cells, c)
         windows = AttentionLayer(name="self_attn")(windows, windows, together)
         return AttentionLayer(has_ffn=True, name="cross_attn_ffn")(windows, context, allowed)
 
