@@ -27,6 +27,13 @@ from tests.model.resplat_fixture import load_golden, named_params, tap_error
 TOLERANCE = 2e-4
 
 
+@pytest.fixture(autouse=True)
+def _exact_products():
+    """GPUs round the factors of matrix products unless told otherwise."""
+    with jax.default_matmul_precision("highest"):
+        yield
+
+
 def read_inputs(golden: dict) -> Chunk:
     images = jnp.asarray(golden["in.image_u8"].transpose(0, 2, 3, 1) / 255.0, jnp.float32)
     v, height, width, _ = images.shape
