@@ -112,8 +112,9 @@ def _go_on(
     identity = _identity(model, params, capture, indices)
     session, frame, exposures = _resume(model, params, capture, indices, identity, out, reporter)
     done = len(exposures)
-    if done == 0:
-        # Of a run that was stopped before its first save: its changes are not those of this one.
+    if done == 0 or (done < len(indices) and not deltas):
+        # Of a run that was stopped before its first save, whose changes are not those of this one; or of one that goes
+        # on without telling more, whose changes would no longer add up to the scene.
         remove_numbered(out / DELTAS, DELTA)
     for warning in (*capture.notes, *filter(None, [frame.warning])):
         reporter.warn(warning)

@@ -6,6 +6,7 @@ to a world in which the first camera looks at a point at distance 1.
 """
 
 import dataclasses
+import socket
 from typing import Any
 
 import jax.numpy as jnp
@@ -72,6 +73,22 @@ def splats_of(gaussians: Gaussians, unit: float, most: int) -> Splats:
     )
 
 
+def _check_address(host: str, port: int) -> None:
+    """Whether `host` is this machine's: viser looks for a free port in a thread of its own, and waits for ever.
+
+    Raises:
+        InputError: nothing can listen there.
+    """
+    try:
+        if not 0 < port < 1 << 16:
+            raise OSError("ports are 1 to 65535")
+        family, kind, protocol, _, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind, protocol) as probe:
+            probe.bind(address)
+    except (OSError, UnicodeError) as error:
+        raise InputError(f"view: cannot listen on {host}:{port} ({error}); choose another.") from error
+
+
 class Viewer:
     """A server that browsers on this machine look at; on others too, with a `host` of more than loopback.
 
@@ -81,12 +98,10 @@ class Viewer:
 
     def __init__(self, *, host: str, port: int, most: int) -> None:
         viser = _viser()
-        try:
-            self._server: Any = viser.ViserServer(host=host, port=port, label="ssplat", verbose=False)
-        except OSError as error:
-            raise InputError(f"view: cannot listen on {host}:{port} ({error.strerror}); choose another.") from error
+        _check_address(host, port)
+        self._server: Any = viser.ViserServer(host=host, port=port, label="ssplat", verbose=False)
         self._most, self._unit, self._distance, self._node = most, 1.0, 1.0, None
-        name = "localhost" if host in (*LOCAL_HOSTS, "0.0.0.0") else host
+        name = "localhost" if host in (*LOCAL_HOSTS, "0.0.0.0", "::") else f"[{host}]" if ":" in host else host
         self.url = f"http://{name}:{self._server.get_port()}"
 
     def look_from(self, camera: StartCamera) -> None:

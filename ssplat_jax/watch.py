@@ -132,9 +132,10 @@ def source_of(path: Path) -> SceneFile | GrowingScene:
     Raises:
         InputError: there is none.
     """
-    if (path / DELTAS).is_dir():
-        return GrowingScene(path / DELTAS)
     file = path / SCENE_FILE if path.is_dir() else path
+    deltas = path / DELTAS
+    if deltas.is_dir() and (any(deltas.glob("*.npz")) or not file.is_file()):
+        return GrowingScene(deltas)
     if not file.is_file():
         raise InputError(
             f"{path}: wanted a .ply, or the folder of an `ssplat run` that has ended or writes --deltas, found neither;"

@@ -193,6 +193,21 @@ def test_without_viser_the_command_that_installs_it_is_said(monkeypatch):
         Viewer(host="127.0.0.1", port=8080, most=10)
 
 
+@pytest.mark.parametrize(
+    ("host", "port"), [("192.0.2.7", 8080), ("nosuch.invalid", 8080), ("127.0.0.1", 70000), ("127.0.0.1", 0)]
+)
+def test_where_nothing_can_listen_that_is_said_at_once(host, port):
+    with pytest.raises(InputError, match=rf"view: cannot listen on {host}:{port} \(.*\); choose another"):
+        Viewer(host=host, port=port, most=10)
+
+
+def test_an_empty_folder_of_deltas_hides_no_scene(tmp_path):
+    (tmp_path / "deltas").mkdir()
+    assert isinstance(source_of(tmp_path), GrowingScene)
+    (tmp_path / "scene.ply").write_bytes(b"")
+    assert isinstance(source_of(tmp_path), SceneFile)
+
+
 def free_port():
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))

@@ -211,12 +211,16 @@ def open_capture(path: str | Path, *, size: tuple[int, int] | None = None) -> Ca
         raise refusal("size", wanted=f"sides of 1 to {MAX_SIDE}", got=echo(size), fix="give WIDTHxHEIGHT in pixels")
     if str(path).startswith(f"{PROCEDURAL}:"):
         return _procedural(str(path), size)
-    folder = Path(path).expanduser()
-    for reader in READERS:
-        if reader.matches(folder):
-            listing = reader.read(folder)
-            return _capture(listing, reader.FORMAT, FilePixels(listing.frames), size)
-    if not folder.exists():
+    try:
+        folder = Path(path).expanduser()
+        found = next((reader for reader in READERS if reader.matches(folder)), None)
+        exists = folder.exists()
+    except (OSError, RuntimeError, ValueError) as error:  # no such user, too long a name, no permission
+        raise refusal(str(path)[:80], wanted="a path", got=str(error)[:200], fix="check the path") from None
+    if found is not None:
+        listing = found.read(folder)
+        return _capture(listing, found.FORMAT, FilePixels(listing.frames), size)
+    if not exists:
         got, fix = "nothing of that name", "check the path"
     elif folder.is_dir() and not any(folder.iterdir()):
         got, fix = "an empty folder", "check the path"

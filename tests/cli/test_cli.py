@@ -232,6 +232,12 @@ def test_run_stops_resumes_and_exports(tmp_path, capsys):
     shutil.rmtree(out / "deltas")
     assert run("run", capture, "--out", str(out), "--deltas", "--quiet") == 0
     assert_deltas_give_the_scene(out, "000012.npz")
+    # Without deltas it is left alone; going on without telling more leaves none that would not add up to the scene.
+    assert run("run", capture, "--out", str(out), "--quiet") == 0
+    assert_deltas_give_the_scene(out, "000012.npz")
+    shutil.copy(out / "state.npz.previous", out / "state.npz")
+    assert run("run", capture, "--out", str(out), "--quiet") == 0
+    assert not any((out / "deltas").glob("*.npz"))
     # Another configuration is refused.
     assert json.loads((out / "metrics.json").read_text())["cache"]["num_chunks"] == 3
     for changes, difference in (

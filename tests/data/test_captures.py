@@ -12,6 +12,7 @@ from ssplat_jax.data.capture import Capture, open_capture
 from ssplat_jax.data.frame import StreamFrame
 from ssplat_jax.data.pixels import ArrayPixels, Crop
 from ssplat_jax.data.posed_frame import Frame, check_camtoworld
+from ssplat_jax.errors import InputError
 from ssplat_jax.geometry.cameras import project_points, transform_points
 from tests.badinputs.cases import HEIGHT, WIDTH, good_capture, rotated, write_capture
 
@@ -173,6 +174,46 @@ def test_images_of_a_shrunk_folder_stand_in_for_missing_ones(tmp_path):
     (root / "images").rename(root / "images_4")
     capture = open_capture(root)
     assert {frame.path.parent.name for frame in capture.frames if frame.path} == {"images_4"}
+
+    def dotted(root, meta):
+        (root / "images").rename(root / "images_4")
+        meta["frames"] = [frame | {"file_path": f"./{frame['file_path']}"} for frame in meta["frames"]]
+
+    capture = open_capture(make(tmp_path / "dotted", dotted))
+    assert {frame.path.parent.name for frame in capture.frames if frame.path} == {"images_4"}
+
+
+@pytest.mark.parametrize("path", ["~nosuchuser/capture", "a" * 300, "a\0b"])
+def test_what_can_be_no_path_is_refused(path):
+    with pytest.raises(InputError, match=r"wanted a p(ath|osed capture)"):
+        open_capture(path)
+
+
+def test_a_principal_point_far_off_the_centre_is_told(tmp_path):
+    def describe(root, meta):
+        meta.pop("w"), meta.pop("h")
+        meta.update(cx=0.9 * WIDTH, cy=0.5 * HEIGHT)
+
+    assert any(
+        "principal point lies 40% of a side off" in note for note in open_capture(make(tmp_path / "c", describe)).notes
+    )
+    assert not any("principal point" in note for note in open_capture(make(tmp_path / "centred")).notes)
+
+
+def test_a_depth_map_of_null_is_none(tmp_path):
+    def describe(root, meta):
+        meta["frames"][0]["depth_file_path"] = None
+
+    assert open_capture(make(tmp_path / "c", describe)).frames[0].depth_path is None
+
+
+def test_an_angle_of_view_too_small_to_divide_by_is_refused(tmp_path):
+    def describe(root, meta):
+        meta.pop("fl_x", None), meta.pop("fl_y", None)
+        meta["camera_angle_x"] = 5e-324
+
+    with pytest.raises(InputError, match="an angle in"):
+        open_capture(make(tmp_path / "c", describe))
 
 
 @pytest.mark.parametrize("turned", [False, True], ids=["landscape", "portrait"])

@@ -254,6 +254,27 @@ def test_poses_of_tum_are_interpolated_in_time(tmp_path):
     np.testing.assert_allclose(capture.camtoworlds, wanted, atol=1e-5)
 
 
+def test_images_of_tum_stream_in_order_of_time_whatever_they_are_called(tmp_path):
+    """0.4, 0.4333, 0.4666, 0.5: as names with numbers in them, 0.4 and 0.5 come before 0.4333."""
+    write_tum(tmp_path)
+    names = [f"rgb/1305031102.{digits}.png" for digits in ("4", "4333", "4666", "5")]
+    lines = (tmp_path / "rgb.txt").read_text().splitlines()[1:]
+    for line, name in zip(lines, names, strict=True):
+        (tmp_path / line.split()[1]).rename(tmp_path / name)
+    renamed = [f"{line.split()[0]} {name}" for line, name in zip(lines, names, strict=True)]
+    (tmp_path / "rgb.txt").write_text("\n".join(reversed(renamed)))
+    assert [frame.name for frame in open_capture(tmp_path).frames] == names
+
+
+def test_names_of_a_reconstruction_may_begin_with_its_image_folder(tmp_path, monkeypatch):
+    monkeypatch.setattr("tests.data.test_readers.COLMAP_IMAGES", tuple(f"images/{name}" for name in COLMAP_IMAGES))
+    write_colmap_text(tmp_path)
+    for path in sorted((tmp_path / "images" / "images").iterdir()):
+        path.rename(tmp_path / "images" / path.name)
+    (tmp_path / "images" / "images").rmdir()
+    assert len(open_capture(tmp_path).frames) == NUM_FRAMES
+
+
 def test_images_of_tum_without_poses_near_in_time_are_left_out(tmp_path):
     write_tum(tmp_path)
     lines = (tmp_path / "groundtruth.txt").read_text().splitlines()

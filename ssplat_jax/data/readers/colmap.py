@@ -72,6 +72,8 @@ def read(path: Path) -> Listing:
         fix = "run the reconstruction again: no image was registered"
         raise refusal(str(model), wanted="registered images", got="none", fix=fix)
     folder = "images/" if any((root / name).is_dir() for name in ("images", *SHRUNK_FOLDERS)) else ""
+    if folder and all(entry.name.startswith(folder) for entry in entries):
+        folder = ""  # COLMAP was given the folder around it, and names say so
     seen: dict[Path | None, str] = {}
     frames = []
     for entry in entries:

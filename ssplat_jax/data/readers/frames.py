@@ -3,6 +3,7 @@
 import dataclasses
 import itertools
 import math
+import posixpath
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,6 +18,7 @@ from ssplat_jax.data.readers import Listing
 from ssplat_jax.data.refusal import echo, refusal
 
 MUCH_SHORTER = 0.5  # of the camera's way by name: the file's order is taken
+FAR_OFF_CENTRE = 0.2  # of a side: a principal point so far off is worth a note
 EXTENSIONS = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG", ".webp")
 SHRUNK_FOLDERS = ("images_2", "images_4", "images_8")  # where images/ was left out of a download
 
@@ -62,12 +64,19 @@ def file_named(
     """
     if not isinstance(name, str) or not name or "\0" in name:
         raise refusal(where, wanted="the path of a file", got=echo(name), fix="give it relative to the capture")
-    names = [name, *(folder + name.removeprefix("images") for folder in folders if name.startswith("images/"))]
+    below = in_images(name)
+    names = [name, *(f"{folder}/{below}" for folder in folders if below is not None)]
     path = find_file(root, [n + extension for n in names for extension in extensions], where)
     if path is None:
         got = f"{echo(name)}, which does not exist"
         raise refusal(where, wanted="an existing file", got=got, fix="add the file or drop the frame")
     return path
+
+
+def in_images(name: str) -> str | None:
+    """What follows images/ in a file's name, which may begin with ./; None of others."""
+    plain = posixpath.normpath(name)
+    return plain.removeprefix("images/") if plain.startswith("images/") else None
 
 
 def stored_size(path: Path, described: tuple[float, float], where: str, fix: str) -> tuple[tuple[int, int], float]:
@@ -121,14 +130,17 @@ def make_frame(
     )
 
 
-def streamed(name: str, frames: list[Frame], notes: Sequence[str] = ()) -> Listing:
+def streamed(name: str, frames: list[Frame], notes: Sequence[str] = (), *, in_time: bool = False) -> Listing:
     """The frames in the order in which they are streamed, and what is worth telling of them.
 
-    That is the natural order of names ("9.jpg" before "10.jpg"), unless the given order makes the camera's way less
-    than half as long (names without an order, several cameras).
+    That is the given order where it is known to be that of time, else the natural order of names ("9.jpg" before
+    "10.jpg"), unless the given order makes the camera's way less than half as long (names without an order, several
+    cameras).
     """
-    ordered = sorted(frames, key=lambda frame: _natural(frame.name))
     notes = (*notes, *_notes(frames))
+    if in_time:
+        return Listing(name=name, frames=tuple(frames), notes=notes)
+    ordered = sorted(frames, key=lambda frame: _natural(frame.name))
     if _path_length(frames) < MUCH_SHORTER * _path_length(ordered):
         note = "Frames are streamed in the file's order: by name, the camera would go more than twice as far."
         return Listing(name=name, frames=tuple(frames), notes=(*notes, note))
@@ -156,6 +168,12 @@ def _notes(frames: list[Frame]) -> tuple[str, ...]:
         )
     if shrinks := {f.shrink for f in frames if f.shrink != 1.0}:
         notes.append(f"Images are {min(shrinks):.4g} times the size of the intrinsics, which were scaled with them.")
+    offsets = [max(abs(f.K[0, 2] / f.width - 0.5), abs(f.K[1, 2] / f.height - 0.5)) for f in frames]
+    if max(offsets, default=0.0) > FAR_OFF_CENTRE:
+        notes.append(
+            f"The principal point lies {max(offsets):.0%} of a side off the image's centre: are the intrinsics those of"
+            " images of another size?"
+        )
     for what, kind in (("undone", [f for f in frames if f.lens]), ("ignored", [f for f in frames if not f.lens])):
         worst_px = max((f.distortion_px for f in kind), default=0.0)
         if worst_px > 0:

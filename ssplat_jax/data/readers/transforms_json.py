@@ -25,6 +25,7 @@ from ssplat_jax.data.readers.frames import (
     SHRUNK_FOLDERS,
     Intrinsics,
     file_named,
+    in_images,
     make_frame,
     stored_size,
     streamed,
@@ -70,7 +71,7 @@ def _read_frame(root: Path, meta: dict[str, Any], entry: dict[str, Any], where: 
     name = entry.get("file_path")
     path = file_named(root, name, f"{where}.file_path", EXTENSIONS, SHRUNK_FOLDERS)
     depth_path = None
-    if "depth_file_path" in entry:
+    if entry.get("depth_file_path") is not None:
         depth_path = file_named(root, entry["depth_file_path"], f"{where}.depth_file_path")
         check_depth_header(depth_path)
     if "transform_matrix" not in entry:
@@ -78,7 +79,7 @@ def _read_frame(root: Path, meta: dict[str, Any], entry: dict[str, Any], where: 
         raise refusal(f"{where}.transform_matrix", wanted="a 4x4 matrix", got="nothing", fix=fix)
     opengl, deviation = check_camtoworld(entry["transform_matrix"], f"{where}.transform_matrix")
     fields = _Fields(meta, entry, where)
-    is_shrunk = path.relative_to(root).parts[0] in SHRUNK_FOLDERS and str(name).startswith("images/")
+    is_shrunk = path.relative_to(root).parts[0] in SHRUNK_FOLDERS and in_images(str(name)) is not None
     (width, height), shrink = _check_size(fields, path, is_shrunk=is_shrunk)
     _check_model(fields)
     fx, fy = _focal(fields, width / shrink, height / shrink)
@@ -150,7 +151,7 @@ def _focal(fields: _Fields, width: float, height: float) -> tuple[float, float]:
             focals[axis] = fields.number(f"fl_{axis}", 0.0)
         elif fields.get(f"camera_angle_{axis}") is not None:
             angle = fields.number(f"camera_angle_{axis}", 0.0)
-            if not 0 < angle < math.pi:
+            if not (0 < angle < math.pi and math.tan(angle / 2) > 0):
                 where = f"{fields.where}.camera_angle_{axis}"
                 raise refusal(where, wanted="an angle in (0, pi)", got=echo(angle), fix="give it in radians")
             focals[axis] = extent / (2 * math.tan(angle / 2))

@@ -64,7 +64,7 @@ def read(path: Path) -> Listing:
         raise refusal(str(path), wanted="images with poses", got=got, fix="use the groundtruth.txt of these images")
     num_lost = len(images) - len(frames)
     lost = [f"{num_lost} of {len(images)} frames are left out: no pose is known at their time."] if num_lost else []
-    return streamed(root.name, frames, lost)
+    return streamed(root.name, frames, lost, in_time=True)
 
 
 def _files(root: Path, name: str) -> list[tuple[float, Path]]:
