@@ -101,7 +101,8 @@ def import_params(path: Path, config: StreamConfig, seed: int = 0, *, depth_only
     held = read_shapes(path)
     # A depth network by itself is saved without the names of what it stood in.
     bare = "" if any(name.startswith("encoder.") for name in held) else DEPTH
-    tensors = {name: t for name, t in tensors_of(config).items() if t is not None}
+    places = tensors_of(config)
+    tensors = {place: t for place, t in places.items() if t is not None}
     in_file = {t.name: t.name.removeprefix(bare) for t in tensors.values()}
     wanted = {t.name for t in tensors.values() if t.name.startswith(DEPTH) or not depth_only}
     missing = {t.name for t in tensors.values() if t.name not in wanted or in_file[t.name] not in held}
@@ -121,7 +122,7 @@ def import_params(path: Path, config: StreamConfig, seed: int = 0, *, depth_only
             f"{path}: wanted weights of ReSplat, its depth network or Depth Anything V2; the file has none of their"
             f" {len(tensors)} tensors."
         )
-    lacking = {name.partition("/")[0] for name, t in tensors_of(config).items() if t is None or t.name in missing}
+    lacking = {place.partition("/")[0] for place, t in places.items() if t is None or t.name in missing}
     arrays = read_arrays(path, {in_file[t.name]: t.shape for t in tensors.values() if t.name not in missing})
 
     params = init_params(jax.random.key(seed), config, lacking)

@@ -3,6 +3,7 @@
 import hashlib
 from collections.abc import Mapping
 from importlib import resources
+from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
 
@@ -55,10 +56,10 @@ def load_params(name: str = "tiny") -> dict:
     """
     if name not in PRESETS:
         if not Path(name).is_file():
-            known = ", ".join(sorted(PRESETS))
+            known = ", ".join(preset for preset in sorted(PRESETS) if _shipped(preset).is_file())
             raise InputError(f"weights: wanted a preset with shipped weights ({known}) or a file, got {name!r}.")
         return load_weights(Path(name))[0]
-    shipped = resources.files("ssplat_jax") / "weights" / f"{name}.npz"
+    shipped = _shipped(name)
     if not shipped.is_file():
         raise InputError(
             f"weights: none ship with the preset {name!r}; convert ReSplat's (ssplat import-weights) or train"
@@ -67,6 +68,11 @@ def load_params(name: str = "tiny") -> dict:
     with resources.as_file(shipped) as path:
         arrays, _ = load_arrays(path, KIND)
         return _restore(path, arrays, preset(name))
+
+
+def _shipped(preset_name: str) -> Traversable:
+    """Where the package holds the weights of a preset, if it has them."""
+    return resources.files("ssplat_jax") / "weights" / f"{preset_name}.npz"
 
 
 def params_digest(params: dict) -> str:

@@ -134,6 +134,11 @@ def test_what_is_no_checkpoint_of_resplat_is_refused(tmp_path, tensors):
         import_params(tmp_path / "nothing.pth", CONFIG)
 
 
+def test_only_presets_with_weights_are_named_as_such():
+    with pytest.raises(InputError, match=r"a preset with shipped weights \(tiny\) or a file, got 'huge'"):
+        load_params("huge")
+
+
 def test_a_preset_without_shipped_weights_says_how_to_get_them():
     with pytest.raises(
         InputError, match=r"none ship with the preset 'small'; convert ReSplat's \(ssplat import-weights"

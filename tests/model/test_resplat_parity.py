@@ -119,7 +119,9 @@ RESPLAT_TAPS = (
 @pytest.mark.parametrize("name", RESPLAT_TAPS)
 def test_resplat_computes_what_the_authors_code_computed(name):
     wanted, came = resplat_values()[name]
-    assert tap_error(wanted, came) < TOLERANCE
+    error = tap_error(wanted, came)
+    print(f"{name}: {error:.1e} of its standard deviation")  # `pytest -rP` shows it
+    assert error < TOLERANCE
 
 
 def test_resplats_shifted_windows_are_masked_as_upstream_only_when_asked():
@@ -131,8 +133,9 @@ def test_resplats_shifted_windows_are_masked_as_upstream_only_when_asked():
         jax.jit(lambda p, c=c: resplat.encode(p, views, c).multiview)(params)
         for c in (config, config.replace(upstream_compat=True))
     )
-    difference = np.abs(np.asarray(right - upstream)).max() / np.std(np.asarray(right))
-    assert 0.01 < difference < 1  # two sources: a few in a hundred, seen in no tap of two views
+    difference = np.std(np.asarray(right - upstream)) / np.std(np.asarray(right))
+    print(f"the mask moves features by {difference:.1%} of their standard deviation")
+    assert 0.01 < difference < 0.2
 
 
 def test_depthsplats_depth_network_agrees_on_the_finer_grid():
