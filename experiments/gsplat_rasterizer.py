@@ -3,8 +3,8 @@
     pip install torch gsplat
     ssplat bench render --against experiments/gsplat_rasterizer.py --full-hd --json render.json
 
-What both draw: colour, alpha and expected depth of the same Gaussians, dilated by 0.3 square pixels; the gradient
-reaches means, quaternions, scales, opacities and colours. Written for gsplat 1.5.
+What both draw: color, alpha and expected depth of the same Gaussians, dilated by 0.3 square pixels; the gradient
+reaches means, quaternions, scales, opacities and colors. Written for gsplat 1.5.
 """
 
 from collections.abc import Callable

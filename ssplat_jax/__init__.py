@@ -11,13 +11,11 @@ Names are imported on first use, so that `ssplat --help` answers without loading
 """
 
 import importlib
-import sys
-import types
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from ssplat_jax.cache import VoxelCache as VoxelCache
-    from ssplat_jax.cache import check as check
+    from ssplat_jax.cache import check_cache as check_cache
     from ssplat_jax.cache import ensure_room as ensure_room
     from ssplat_jax.checkpoint.weights import load_params as load_params
     from ssplat_jax.chunk import Chunk as Chunk
@@ -27,41 +25,41 @@ if TYPE_CHECKING:
     from ssplat_jax.errors import CacheError as CacheError
     from ssplat_jax.errors import InputError as InputError
     from ssplat_jax.errors import StorageError as StorageError
-    from ssplat_jax.export.ply import load_ply as load_ply
-    from ssplat_jax.export.ply import save_ply as save_ply
-    from ssplat_jax.export.splat import save_splat as save_splat
-    from ssplat_jax.export.spz import save_spz as save_spz
     from ssplat_jax.gaussians import Gaussians as Gaussians
     from ssplat_jax.geometry.cameras import Camera as Camera
-    from ssplat_jax.render import Effects as Effects
-    from ssplat_jax.render import RenderOutput as RenderOutput
-    from ssplat_jax.render import fill_holes as fill_holes
-    from ssplat_jax.render import render as render
-    from ssplat_jax.stream import StreamSplat as StreamSplat
+    from ssplat_jax.rasterizer import Effects as Effects
+    from ssplat_jax.rasterizer import RenderOutput as RenderOutput
+    from ssplat_jax.rasterizer import fill_holes as fill_holes
+    from ssplat_jax.rasterizer import render as render
+    from ssplat_jax.scene_files.ply import load_ply as load_ply
+    from ssplat_jax.scene_files.ply import save_ply as save_ply
+    from ssplat_jax.scene_files.splat import save_splat as save_splat
+    from ssplat_jax.scene_files.spz import save_spz as save_spz
+    from ssplat_jax.streaming.streamsplat import StreamSplat as StreamSplat
 
 _HOMES = {
-    "Camera": "geometry.cameras",
     "CacheError": "errors",
+    "Camera": "geometry.cameras",
     "Chunk": "chunk",
-    "Effects": "render",
+    "Effects": "rasterizer",
     "Gaussians": "gaussians",
     "InputError": "errors",
-    "RenderOutput": "render",
+    "RenderOutput": "rasterizer",
     "StorageError": "errors",
     "StreamConfig": "config",
-    "StreamSplat": "stream",
+    "StreamSplat": "streaming.streamsplat",
     "VoxelCache": "cache",
-    "check": "cache",
+    "check_cache": "cache",
     "ensure_room": "cache",
-    "fill_holes": "render",
+    "fill_holes": "rasterizer",
     "load_params": "checkpoint.weights",
-    "load_ply": "export.ply",
+    "load_ply": "scene_files.ply",
     "open_capture": "data.capture",
     "preset": "config",
-    "render": "render",
-    "save_ply": "export.ply",
-    "save_splat": "export.splat",
-    "save_spz": "export.spz",
+    "render": "rasterizer",
+    "save_ply": "scene_files.ply",
+    "save_splat": "scene_files.splat",
+    "save_spz": "scene_files.spz",
 }
 __version__ = "0.1.0"
 __all__ = sorted(_HOMES)
@@ -77,18 +75,3 @@ def __getattr__(name: str):
 
 def __dir__() -> list[str]:
     return [*__all__, "__version__"]
-
-
-class _Package(types.ModuleType):
-    """`render` names a function here and a package below; the function wins, whichever was imported first."""
-
-    @property
-    def render(self):
-        return importlib.import_module("ssplat_jax.render.api").render
-
-    @render.setter
-    def render(self, package) -> None:
-        """Where the import system would put the package."""
-
-
-sys.modules[__name__].__class__ = _Package

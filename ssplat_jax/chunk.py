@@ -3,7 +3,7 @@
 from jaxtyping import Array, Bool, Float
 
 from ssplat_jax.geometry.cameras import Camera
-from ssplat_jax.struct import pytree
+from ssplat_jax.pytree import pytree
 
 
 @pytree

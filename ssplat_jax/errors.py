@@ -24,4 +24,21 @@ class StorageError(OSError):
 
 
 class CacheError(RuntimeError):
-    """The cache could not hold what it was given; raised by `cache.check`, outside jit, with the remedy."""
+    """The cache could not hold what it was given; raised by `cache.check_cache`, outside jit, with the remedy."""
+
+
+MAX_ECHO_LENGTH = 80  # characters of a refused value that are repeated: a message stays one line
+
+
+def refusal(where: str, *, wanted: str, got: object, fix: str) -> InputError:
+    """An `InputError` of one line: the file and field, what was wanted, what came, what to do.
+
+    `got` is shown as it is when a string written here, so quote values from outside with `echo`.
+    """
+    return InputError(f"{where}: wanted {wanted}, got {got}; {fix}.")
+
+
+def echo(value: object) -> str:
+    """A value from outside, made safe to print: on one line, escaped, and not longer than `MAX_ECHO_LENGTH`."""
+    text = ascii(value)
+    return text if len(text) <= MAX_ECHO_LENGTH else text[: MAX_ECHO_LENGTH - 3] + "..."

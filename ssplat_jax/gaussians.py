@@ -3,9 +3,9 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ssplat_jax.struct import pytree, replace
+from ssplat_jax.pytree import pytree, replace
 
-SH_C0 = 0.28209479177387814  # Y_0^0, the constant band: colour = 0.5 + SH_C0 * dc
+SH_C0 = 0.28209479177387814  # Y_0^0, the constant band: color = 0.5 + SH_C0 * dc
 
 
 @pytree
@@ -19,7 +19,7 @@ class Gaussians:
     quats: Float[Array, "n 4"]  # wxyz, any length
     scales: Float[Array, "n 3"]  # standard deviations along the axes, scene units
     opacities: Float[Array, " n"]  # [0, 1]
-    sh: Float[Array, "n k 3"]  # real SH, (degree + 1)^2 terms; colour = clip(0.5 + sum, 0, inf)
+    sh: Float[Array, "n k 3"]  # real SH, (degree + 1)^2 terms; color = clip(0.5 + sum, 0, inf)
 
     @staticmethod
     def from_rgb(
@@ -30,7 +30,7 @@ class Gaussians:
         opacities: Float[Array, " n"],
         colors: Float[Array, "n 3"],
     ) -> "Gaussians":
-        """Gaussians of one colour from every side; `colors` in [0, 1]."""
+        """Gaussians of one color from every side; `colors` in [0, 1]."""
         return Gaussians(
             means=means, quats=quats, scales=scales, opacities=opacities, sh=((colors - 0.5) / SH_C0)[:, None, :]
         )
@@ -57,7 +57,7 @@ def concatenate(parts: list[Gaussians]) -> Gaussians:
 
 
 def mean_color(gaussians: Gaussians) -> Float[Array, "3"]:
-    """Mean colour of the Gaussians, SH bands above the constant left out, weighted by opacity; black of none.
+    """Mean color of the Gaussians, SH bands above the constant left out, weighted by opacity; black of none.
 
     What to show where a reconstruction has holes, when nothing better is known.
     """

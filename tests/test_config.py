@@ -4,11 +4,11 @@ import dataclasses
 import re
 import subprocess
 import sys
-from typing import Literal, get_args, get_origin
+from typing import ClassVar, Literal, get_args, get_origin
 
 import pytest
 
-from ssplat_jax.config import PRESETS, StreamConfig, preset
+from ssplat_jax.config import PRESETS, CompactConfig, StreamConfig, preset
 from ssplat_jax.errors import InputError
 
 BAD = [
@@ -36,7 +36,7 @@ BAD = [
     {"scene_scale": float("inf")},
     {"readout_window": -1},
     {"confidence_window": -1},
-    {"mixer_neighbours": 0},
+    {"mixer_neighbors": 0},
     {"attention_ffn": 0},
     {"encoder_widths": ("a", 1)},
     {"encoder_widths": (32, 63)},
@@ -60,12 +60,14 @@ BAD = [
 @pytest.mark.parametrize("changes", BAD, ids=str)
 def test_bad_value_is_refused_by_name_with_what_came(changes):
     ((name, value),) = changes.items()
+    group_name, name = StreamConfig().find(name)
+    group = getattr(StreamConfig(), group_name)
     # Past the type checks that the tests switch on: users do not have them.
-    config = object.__new__(StreamConfig)
-    for field in dataclasses.fields(StreamConfig):
-        object.__setattr__(config, field.name, changes.get(field.name, field.default))
+    bad = object.__new__(type(group))
+    for field in dataclasses.fields(group):
+        object.__setattr__(bad, field.name, changes.get(field.name, getattr(group, field.name)))
     with pytest.raises(InputError, match=rf"config: {name} must be .*got {re.escape(repr(value))}"):
-        config.__post_init__()
+        bad.__post_init__()
 
 
 def test_replacing_checks_what_it_builds():
@@ -84,26 +86,62 @@ def test_dictionary_and_back_is_the_same_configuration():
     assert again == config and again.hash == config.hash and hash(again) == hash(config)
 
 
-def test_every_field_changes_the_hash():
-    base = StreamConfig(network="resplat")  # which has a choice of strides
+@pytest.mark.parametrize("network", ["compact", "resplat"])
+def test_every_field_changes_the_hash(network):
+    base = StreamConfig().replace(network=network)
     change = {
         bool: lambda x: not x,
         int: lambda x: 2 * x,
         float: lambda x: 0.5 * x + 0.7,
         tuple: lambda x: (x[0] + 8, *x[1:]),
     }
-    by_name = {"preset": "other", "scene_scale": 3.0, "sh_degree": 3, "depth_range": (0.5, 9.0)}
-    hashes = {base.hash}
-    for field in dataclasses.fields(base):
-        value = getattr(base, field.name)
-        if field.name in by_name:
-            changed = by_name[field.name]
-        elif get_origin(field.type) is Literal:
-            changed = next(option for option in get_args(field.type) if option != value)
-        else:
-            changed = change[type(value)](value)
-        hashes.add(base.replace(**{field.name: changed}).hash)
-    assert len(hashes) == 1 + len(dataclasses.fields(base))
+    by_name = {"scene_scale": 3.0, "sh_degree": 3, "depth_range": (0.5, 9.0), "mixer_radius": 7}
+    hashes = {base.hash, base.replace(preset="other").hash}
+    num_fields = 1
+    for group in base.groups():
+        for field in dataclasses.fields(getattr(base, group)):
+            value = base.get(field.name)
+            if field.name in by_name:
+                changed = by_name[field.name]
+            elif get_origin(field.type) is Literal:
+                changed = next(option for option in get_args(field.type) if option != value)
+            else:
+                changed = change[type(value)](value)
+            hashes.add(base.replace(**{f"{group}.{field.name}": changed}).hash)
+            num_fields += 1
+    assert len(hashes) == 1 + num_fields
+
+
+def test_full_and_short_names_are_the_same_field():
+    for name, value in (("memory.voxel_size", 0.07), ("network.token_width", 32)):
+        assert StreamConfig().replace(**{name: value}) == StreamConfig().replace(**{name.split(".")[1]: value})
+
+
+def test_flat_dictionary_of_version_0_1_still_reads():
+    flat = {"preset": "tiny", "network": "compact", "vit": "s", "match_stride": 4, "depth_range": None}
+    flat |= {"mixer_neighbours": 9, "voxel_size": 0.05, "encoder_widths": [8, 16]}
+    config = StreamConfig().replace(mixer_neighbors=9, voxel_size=0.05, encoder_widths=(8, 16))
+    assert StreamConfig.from_dict(flat) == config
+    resplat = {"preset": "small", "network": "resplat", "match_stride": 4, "unet_width": 64, "token_width": 128}
+    wanted = StreamConfig().replace(preset="small", network="resplat").replace(match_stride=4, token_width=128)
+    assert StreamConfig.from_dict(resplat) == wanted
+
+
+def test_field_of_another_network_is_refused():
+    with pytest.raises(InputError, match="no field 'vit' with network 'compact'"):
+        StreamConfig().replace(vit="b")
+
+
+def test_short_name_that_two_groups_share_is_refused(monkeypatch):
+    @dataclasses.dataclass(frozen=True)
+    class Twin(CompactConfig):
+        kind: ClassVar[str] = "twin"
+        voxel_size: float = 1.0
+
+    config = StreamConfig().replace(network=Twin())
+    with pytest.raises(InputError, match=r"'voxel_size' could be network.voxel_size or memory.voxel_size"):
+        config.replace(voxel_size=0.5)
+    assert config.replace(**{"network.voxel_size": 0.5}).get("network.voxel_size") == 0.5
 
 
 def test_presets_carry_their_name_and_unknown_ones_are_refused():
@@ -127,6 +165,6 @@ def test_the_public_names_are_all_there():
 
     for name in ssplat_jax.__all__:
         assert getattr(ssplat_jax, name) is not None
-    assert callable(ssplat_jax.render)  # the function, not the package of the same name
+    assert callable(ssplat_jax.render)
     with pytest.raises(AttributeError, match="no attribute 'renders'"):
         _ = ssplat_jax.renders

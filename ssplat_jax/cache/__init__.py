@@ -1,8 +1,8 @@
 """VACC, the Voxel-Aligned Causal Cache: the stream's only memory. `fuse` writes, `project` reads, `carve` doubts."""
 
+from ssplat_jax.cache.capacity import check_cache, ensure_room, grow
 from ssplat_jax.cache.carve import SAME_SURFACE, bear_witness, carve, judge
 from ssplat_jax.cache.fuse import Touched, fuse, fuse_touched
-from ssplat_jax.cache.policy import check, ensure_room, grow
 from ssplat_jax.cache.project import ProjectedCache, coarser, project
 from ssplat_jax.cache.state import PIVOT_FIELDS, CacheStats, Tokens, VoxelCache, Witnesses, init_cache
 
@@ -17,7 +17,7 @@ __all__ = [
     "Witnesses",
     "bear_witness",
     "carve",
-    "check",
+    "check_cache",
     "coarser",
     "ensure_room",
     "fuse",

@@ -7,7 +7,7 @@ a witness, with the cell's own confidence w as its weight:
     sees it         log depth within ln(1.1) of the cell's surface: odds x e^0.5w
     hidden, unseen  anything else: unchanged
 
-Contradiction counts more than agreement: a wrong depth agrees by chance with its neighbours, but what was looked
+Contradiction counts more than agreement: a wrong depth agrees by chance with its neighbors, but what was looked
 through is not there. One witness moves a sure pivot little, several sink it below tau, where `decode` leaves it out; it
 stays in the cache and can recover.
 
@@ -28,7 +28,7 @@ from ssplat_jax.cache.state import Tokens, VoxelCache, Witnesses
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.numerics import safe_log
-from ssplat_jax.struct import replace
+from ssplat_jax.pytree import replace
 
 CONTRADICTION, AGREEMENT = 2.0, 0.5  # log odds of a witness of confidence 1
 FREE_SPACE = math.log(1.02)  # what is nearer than a surface by this much is before it
@@ -56,7 +56,7 @@ def carve(
         Depths that are not finite or not positive are no witnesses. Pivots that no witness sees keep their confidence
         to the last bit; the others' stays in [0.02, 0.95].
     """
-    if not config.carving:
+    if not config.memory.carving:
         return cache
     is_witness = _is_witness(depths, confidences, config)
     log_depths = safe_log(jnp.where(is_witness, depths, 1.0))
@@ -86,7 +86,7 @@ def judge(witnesses: Witnesses, tokens: Tokens, config: StreamConfig) -> Tokens:
         return tokens
     side = witnesses.weights.shape[-1]
     camera = Camera(viewmats=witnesses.viewmats, Ks=witnesses.Ks, width=side, height=side)
-    is_judged = tokens.valid & (tokens.confidences >= config.min_confidence)
+    is_judged = tokens.valid & (tokens.confidences >= config.memory.min_confidence)
     pairs = pairs_of_points(tokens.means, jnp.where(is_judged, tokens.confidences, 0.0), camera)
     log_depths = witnesses.log_depths.reshape(-1)
     evidence = _evidence(pairs, witnesses.weights.reshape(-1), log_depths, log_depths)
@@ -127,7 +127,7 @@ def bear_witness(
 
 
 def _is_witness(depths, confidences, config: StreamConfig) -> Bool[Array, "v hf wf"]:
-    return (confidences >= config.min_confidence) & (confidences > 0) & jnp.isfinite(depths) & (depths > 0)
+    return (confidences >= config.memory.min_confidence) & (confidences > 0) & jnp.isfinite(depths) & (depths > 0)
 
 
 def _nearest_around(log_depths: Float[Array, "v hf wf"]) -> Float[Array, "v hf wf"]:

@@ -20,12 +20,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int
 
-from ssplat_jax.cache.policy import evict
+from ssplat_jax.cache.capacity import evict
+from ssplat_jax.cache.hash_table import build_table, find_rows, group_equal, insert_rows, shards_of
 from ssplat_jax.cache.state import PIVOT_FIELDS, CacheStats, Tokens, VoxelCache, add_to
-from ssplat_jax.cache.table import build_table, find_rows, group_equal, insert_rows, shards_of
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.geometry.voxels import voxel_indices
-from ssplat_jax.struct import pytree, replace
+from ssplat_jax.pytree import pytree, replace
 
 MERGE_BLOCKS = ((512, 64), (16, 1))
 """(voxels merged at a time, fewest voxels left in a round for which that pays)."""
@@ -67,7 +67,7 @@ def fuse(cache: VoxelCache, tokens: Tokens, config: StreamConfig, *, axis: str |
     if axis is None:
         return fuse_touched(cache, tokens, config)[0]
     # Tokens that will be rejected have a voxel too (index 0 out of range), so each is counted by one shard.
-    voxels, _ = voxel_indices(tokens.means, config.voxel_size)
+    voxels, _ = voxel_indices(tokens.means, config.memory.voxel_size)
     is_own = shards_of(voxels, jax.lax.axis_size(axis)) == jax.lax.axis_index(axis)
     fused = fuse_touched(cache, replace(tokens, valid=tokens.valid & is_own), config)[0]
     num_chunks = cache.stats.num_chunks + jnp.any(tokens.valid).astype(jnp.int32)
@@ -89,14 +89,14 @@ def fuse_touched(cache: VoxelCache, tokens: Tokens, config: StreamConfig) -> tup
     """
     cache, tokens = jax.lax.stop_gradient((cache, tokens))
     stats, voxels, accepted = _classify(cache.stats, tokens, config)
-    place = {"voxel": _place_in_voxels, "append": _place_at_end}[config.vacc]
+    place = {"voxel": _place_in_voxels, "append": _place_at_end}[config.memory.vacc]
     cache, plan, num_evicted = place(cache, voxels, accepted, config)
     pivots = {name: getattr(cache, name) for name in PIVOT_FIELDS}
     new = _new_pivots(tokens, cache)
-    appends = jnp.where(plan.slots < config.pivots_per_voxel, plan.rows, -1)
+    appends = jnp.where(plan.slots < config.memory.pivots_per_voxel, plan.rows, -1)
     counts = cache.counts.at[_drop_negative(appends, cache.capacity)].max(plan.slots + 1, mode="drop")
     pivots = _write(pivots, appends, plan.slots, new)
-    if config.vacc == "voxel":
+    if config.memory.vacc == "voxel":
         pivots = _merge_all(pivots, new, plan, config)
     num_placed = jnp.sum(plan.rows >= 0, dtype=jnp.int32)
     stats = replace(
@@ -113,12 +113,12 @@ def _classify(
     stats: CacheStats, tokens: Tokens, config: StreamConfig
 ) -> tuple[CacheStats, Int[Array, "m 3"], Bool[Array, " m"]]:
     """Counts the tokens that stay out, each for one reason; voxels and acceptance of all."""
-    voxels, in_range = voxel_indices(tokens.means, config.voxel_size)
+    voxels, in_range = voxel_indices(tokens.means, config.memory.voxel_size)
     floats = (tokens.means, tokens.feats, tokens.rgbs, tokens.quats)
     finite = jnp.isfinite(tokens.confidences) & jnp.isfinite(tokens.footprints)
     for x in floats:
         finite &= jnp.all(jnp.isfinite(x), axis=-1)
-    confident = tokens.confidences >= config.min_confidence
+    confident = tokens.confidences >= config.memory.min_confidence
     accepted = tokens.valid & finite & confident & in_range
     count = lambda mask: jnp.sum(tokens.valid & mask, dtype=jnp.int32)  # noqa: E731
     stats = replace(
@@ -163,7 +163,7 @@ def _place_at_end(
 ) -> tuple[VoxelCache, Plan, Int[Array, ""]]:
     """The ablation: rows are filled one slot after another and voxels play no part."""
     del voxels
-    k = config.pivots_per_voxel
+    k = config.memory.pivots_per_voxel
     last = jnp.maximum(cache.num_voxels - 1, 0)
     num_pivots = last * k + cache.counts[last]
     flat = num_pivots + jnp.cumsum(accepted, dtype=jnp.int32) - 1
@@ -182,7 +182,7 @@ def _add_rows(cache, voxels, rows, is_new, config):
     new_rows = cache.num_voxels + jnp.cumsum(is_new, dtype=jnp.int32) - 1
     num_wanted = cache.num_voxels + jnp.sum(is_new, dtype=jnp.int32)
     num_evicted = jnp.zeros((), jnp.int32)
-    if config.overflow == "evict_lowest":
+    if config.memory.overflow == "evict_lowest":
         cache, victims, num_evicted = evict(cache, rows, num_wanted - capacity)
         new_rows = jnp.where(new_rows < capacity, new_rows, victims[jnp.clip(new_rows - capacity, 0, m - 1)])
     has_row = is_new & (new_rows >= 0) & (new_rows < capacity)
@@ -191,7 +191,7 @@ def _add_rows(cache, voxels, rows, is_new, config):
         voxels=cache.voxels.at[jnp.where(has_row, new_rows, capacity)].set(voxels, mode="drop"),
         num_voxels=jnp.minimum(num_wanted, capacity),
     )
-    if config.overflow == "evict_lowest":
+    if config.memory.overflow == "evict_lowest":
         # Open addressing cannot forget one entry, so a table that loses rows is built anew.
         rebuild = lambda: build_table(cache.voxels, cache.num_voxels)  # noqa: E731
         insert = lambda: insert_rows(cache.table, voxels, new_rows, has_row)  # noqa: E731
@@ -214,7 +214,7 @@ def _new_pivots(tokens: Tokens, cache: VoxelCache) -> dict[str, Array]:
 
 def _merge_all(pivots: dict[str, Array], new: dict[str, Array], plan: Plan, config: StreamConfig) -> dict[str, Array]:
     """Round r merges the r-th surplus token of every voxel that has one, voxels with most of them first."""
-    m, k = plan.order.shape[0], config.pivots_per_voxel
+    m, k = plan.order.shape[0], config.memory.pivots_per_voxel
     is_surplus = (plan.rows >= 0) & (plan.slots >= k)
     sizes = jnp.zeros((m,), jnp.int32).at[jnp.where(is_surplus, plan.leaders, m)].add(1, mode="drop")
     places = jnp.zeros((m,), jnp.int32).at[plan.order].set(jnp.arange(m, dtype=jnp.int32), unique_indices=True)
@@ -248,8 +248,8 @@ def _merge_closest(
     pivots: dict[str, Array], new: dict[str, Array], rows: Int[Array, " b"], config: StreamConfig
 ) -> dict[str, Array]:
     """MergeClosest for one token of each of the full voxels `rows` (-1: nothing to do)."""
-    k = config.pivots_per_voxel
-    key = {"seed": "seeds", "feature": "feats"}[config.merge_key]
+    k = config.memory.pivots_per_voxel
+    key = {"seed": "seeds", "feature": "feats"}[config.memory.merge_key]
     first, second = _closest_pair(jnp.concatenate([pivots[key][rows], new[key][:, None]], axis=1))
     takes_new = second == k
     slots = jnp.stack([first, jnp.minimum(second, k - 1)], axis=1)
@@ -270,7 +270,7 @@ def _closest_pair(keys: Array) -> tuple[Int[Array, " b"], Int[Array, " b"]]:
     """
     b, num_keys, c = keys.shape
     lanes = math.gcd(c, 8)
-    # Partial sums in lanes: XLA's CPU backend vectorises a sum over a major axis but not one over the minor.
+    # Partial sums in lanes: XLA's CPU backend vectorizes a sum over a major axis but not one over the minor.
     keys = keys.astype(jnp.float32).reshape(b, num_keys, c // lanes, lanes)
     dot = lambda x, y: jnp.sum(jnp.sum(x * y, axis=-2), axis=-1)  # noqa: E731
     firsts, seconds = (jnp.array(x, jnp.int32) for x in zip(*itertools.combinations(range(num_keys), 2), strict=True))
@@ -286,7 +286,7 @@ def _merge_pair(older: dict[str, Array], newer: dict[str, Array], config: Stream
     """The merged pivots of pairs (Eq. vacc_pair_selection_and_merge); `older` are those in the lower slot."""
     weight_older, weight_newer = older["confidences"], newer["confidences"]
     newer_is_best = weight_newer > weight_older
-    if config.merge_weight == "count":
+    if config.memory.merge_weight == "count":
         weight_older = weight_older * older["num_members"].astype(weight_older.dtype)
         weight_newer = weight_newer * newer["num_members"].astype(weight_newer.dtype)
     total = weight_older + weight_newer

@@ -4,11 +4,11 @@ Per pixel the front cluster in log depth. With ell = ln z, w = confidence and wi
 
     pass 1   L0 = min ell                            over the pivots that fall on the pixel
     pass 2   mu = sum w ell / sum w                  over ell <= L0 + window
-    pass 3   D, Omega, F from w-weighted sums        over |ell - mu| <= window     (re-centred once)
+    pass 3   D, Omega, F from w-weighted sums        over |ell - mu| <= window     (re-centered once)
 
 A plain mean mixes background into a fifth of the pixels; a narrow window about the minimum is biased towards the
 camera, and the bias would feed back through the anchor into the cache (ALGORITHM 10.2). A pivot covers the one pixel
-that its centre falls into.
+that its center falls into.
 
 Cost is proportional to the live pivots: rows are dense, so the passes walk blocks of rows up to `num_voxels`. Features
 are touched only for the pairs (view, pivot) in a cluster. Sums run in the order of rows, so on the CPU the result is
@@ -24,7 +24,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ssplat_jax.cache.state import VoxelCache
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.geometry.cameras import Camera
-from ssplat_jax.struct import pytree
+from ssplat_jax.pytree import pytree
 
 NEAR = 0.01
 """Pivots at or before this camera z (stream units) are not seen; the renderer's near plane."""
@@ -60,7 +60,7 @@ def project(cache: VoxelCache, camera: Camera, config: StreamConfig, *, axis: st
     `cache` is one shard of several, and every shard gets the projection of all of them.
 
     Limits:
-        Camera z <= 0.01, confidence 0 (with `carving`, below `min_confidence`) and centres outside the image are not
+        Camera z <= 0.01, confidence 0 (with `carving`, below `min_confidence`) and centers outside the image are not
         seen.
         An empty cache, and a pixel without a pivot, give zeros and a False mask.
         Over an axis the sums run in another order than over one cache: results agree to float32 rounding.
@@ -70,8 +70,8 @@ def project(cache: VoxelCache, camera: Camera, config: StreamConfig, *, axis: st
     with jax.named_scope("project"):
         fronts = _over_blocks(cache, camera, config, _nearest, jnp.full((math.prod(shape),), jnp.inf))
         fronts = _over_shards(jax.lax.pmin, fronts, axis)
-        centres = _front_means(cache, camera, config, fronts, axis)
-        sums = _cluster_sums(cache, camera, config, fronts, centres)
+        centers = _front_means(cache, camera, config, fronts, axis)
+        sums = _cluster_sums(cache, camera, config, fronts, centers)
         weights, squares, offsets, values = _over_shards(jax.lax.psum, sums, axis)
     mask = weights > 0
     total = jnp.where(mask, weights, 1.0)
@@ -83,7 +83,7 @@ def project(cache: VoxelCache, camera: Camera, config: StreamConfig, *, axis: st
         confidences=(squares / total).reshape(shape),
         feats=means[..., :width],
         mask=mask.reshape(shape),
-        colors=means[..., width:] if config.match_exposure else None,
+        colors=means[..., width:] if config.stream.match_exposure else None,
     )
 
 
@@ -128,7 +128,7 @@ def _over_blocks(cache: VoxelCache, camera: Camera, config: StreamConfig, visit,
     """Folds `visit(state, pairs, first_row)` over the blocks of rows that hold voxels."""
     num_rows, num_blocks = blocks_of_rows(cache)
     # What views have carved away hides nothing; every pivot was accepted at tau or more.
-    least = config.min_confidence if config.carving else 0.0
+    least = config.memory.min_confidence if config.memory.carving else 0.0
 
     def step(i, state):
         return visit(state, pairs_of_rows(cache, camera, i * num_rows, num_rows, least=least), i * num_rows)
@@ -143,7 +143,7 @@ def _nearest(fronts, pairs: PixelPairs, first_row):
 
 def _front_means(cache, camera, config, fronts, axis):
     """Mean log depth of each pixel's front window, measured from its nearest pivot."""
-    window = math.log(config.cluster_ratio)
+    window = math.log(config.history.cluster_ratio)
 
     def visit(sums, pairs: PixelPairs, first_row):
         del first_row
@@ -156,15 +156,15 @@ def _front_means(cache, camera, config, fronts, axis):
     return offsets / jnp.where(weights > 0, weights, 1.0)
 
 
-def _cluster_sums(cache, camera, config, fronts, centres):
-    """Sums over each pixel's re-centred cluster: w, w^2, w times log depth from the nearest pivot, w times values."""
-    window = math.log(config.cluster_ratio)
+def _cluster_sums(cache, camera, config, fronts, centers):
+    """Sums over each pixel's re-centered cluster: w, w^2, w times log depth from the nearest pivot, w times values."""
+    window = math.log(config.history.cluster_ratio)
     pivots_per_row = cache.feats.shape[1]
     flat = lambda x: x.reshape(-1, x.shape[-1])  # noqa: E731
 
     def values_of(pivots):
         feats = flat(cache.feats)[pivots].astype(jnp.float32)
-        if not config.match_exposure:
+        if not config.stream.match_exposure:
             return feats
         colors = flat(cache.rgbs)[pivots].reshape(len(pivots), -1, 3).mean(axis=1)
         return jnp.concatenate([feats, colors], axis=1)
@@ -174,7 +174,7 @@ def _cluster_sums(cache, camera, config, fronts, centres):
     def visit(state, pairs: PixelPairs, first_row):
         scalars, sums = state
         behind = _behind(pairs, fronts)
-        weights = jnp.where(jnp.abs(behind - centres[pairs.pixels]) <= window, pairs.weights, 0.0)
+        weights = jnp.where(jnp.abs(behind - centers[pairs.pixels]) <= window, pairs.weights, 0.0)
         scalars = _add(scalars, pairs.pixels, (weights, weights * weights, weights * behind))
         first_pivot, num_views = first_row * pivots_per_row, len(camera.viewmats)
         return scalars, _add_values(sums, values_of, pairs.pixels, weights, first_pivot, num_views)
@@ -222,7 +222,7 @@ def pairs_of_rows(cache: VoxelCache, camera: Camera, first_row, num_rows: int, *
 
 def pairs_of_points(points: Float[Array, "n 3"], weights: Float[Array, " n"], camera: Camera) -> PixelPairs:
     """The pixels of all views that `points` fall on; those of weight 0 or NaN are not seen."""
-    # Written out per coordinate: three rows of products vectorise over the points, a 3 x 3 matrix product does not.
+    # Written out per coordinate: three rows of products vectorize over the points, a 3 x 3 matrix product does not.
     px, py, pz = jnp.moveaxis(points, -1, 0)
     views = camera.viewmats[:, :3, :, None]
     x, y, z = (views[:, i, 0] * px + views[:, i, 1] * py + views[:, i, 2] * pz + views[:, i, 3] for i in range(3))

@@ -3,10 +3,10 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ssplat_jax.cache.table import SLOTS_PER_ROW
+from ssplat_jax.cache.hash_table import SLOTS_PER_ROW
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.errors import InputError
-from ssplat_jax.struct import pytree
+from ssplat_jax.pytree import pytree
 
 
 def add_to(counter: Int[Array, ""], more: Int[Array, ""]) -> Int[Array, ""]:
@@ -16,7 +16,7 @@ def add_to(counter: Int[Array, ""], more: Int[Array, ""]) -> Int[Array, ""]:
 
 @pytree
 class CacheStats:
-    """Counters over the whole stream: what only the running program knows. Read them outside jit; `check` does.
+    """Counters over the whole stream: what only the running program knows. Read them outside jit; `check_cache` does.
 
     They stop at 2^31 - 1 (`add_to`): tokens of 4 views at 1080p are that many after 4000 chunks.
     """
@@ -65,7 +65,7 @@ class VoxelCache:
     feats: Float[Array, "capacity k c"]  # the token state f
     seeds: Float[Array, "capacity k c"]  # feature of the most confident member, for matching
     confidences: Float[Array, "capacity k"]  # omega, (0, 1]
-    rgbs: Float[Array, "capacity k a"]  # appearance anchor: mean colours of the parts of the token's patch
+    rgbs: Float[Array, "capacity k a"]  # appearance anchor: mean colors of the parts of the token's patch
     quats: Float[Array, "capacity k 4"]  # camera-to-world orientation of the most confident member, wxyz
     footprints: Float[Array, "capacity k"]  # size of a grid cell at the most confident member, stream units
     num_members: Int[Array, "capacity k"]  # tokens merged into the pivot
@@ -117,7 +117,7 @@ WITNESS_CELLS = 32
 
 def init_witnesses(config: StreamConfig) -> Witnesses:
     """Room for the config's witnesses (none without carving); they have seen nothing yet."""
-    w = config.num_witnesses if config.carving else 0
+    w = config.memory.num_witnesses if config.memory.carving else 0
     cells = (w, WITNESS_CELLS, WITNESS_CELLS)
     return Witnesses(
         viewmats=jnp.zeros((w, 4, 4)),
@@ -146,10 +146,10 @@ def init_cache(config: StreamConfig, capacity: int | None = None) -> VoxelCache:
     Raises:
         InputError: `capacity` is no power of two, which the hash table's masks need.
     """
-    capacity = config.capacity if capacity is None else capacity
+    capacity = config.memory.capacity if capacity is None else capacity
     if capacity < 1 or capacity & (capacity - 1):
         raise InputError(f"cache: capacity must be a power of two, got {capacity}.")
-    k, c = config.pivots_per_voxel, config.token_width
+    k, c = config.memory.pivots_per_voxel, config.network.token_width
     zero = lambda: jnp.zeros((), jnp.int32)  # noqa: E731 - one fresh buffer per counter, so that all can be donated
     return VoxelCache(
         voxels=jnp.zeros((capacity, 3), jnp.int32),
@@ -160,7 +160,7 @@ def init_cache(config: StreamConfig, capacity: int | None = None) -> VoxelCache:
         feats=jnp.zeros((capacity, k, c)),
         seeds=jnp.zeros((capacity, k, c)),
         confidences=jnp.zeros((capacity, k)),
-        rgbs=jnp.zeros((capacity, k, 3 * config.gaussians_per_token)),
+        rgbs=jnp.zeros((capacity, k, 3 * config.head.gaussians_per_token)),
         quats=jnp.zeros((capacity, k, 4)),
         footprints=jnp.zeros((capacity, k)),
         num_members=jnp.zeros((capacity, k), jnp.int32),

@@ -11,10 +11,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ssplat_jax.checkpoint.arrays import load_arrays, save_arrays
 from ssplat_jax.config import PRESETS, StreamConfig, preset
 from ssplat_jax.errors import InputError, StorageError
 from ssplat_jax.model import init_params
+from ssplat_jax.storage.npz import load_arrays, save_arrays
 
 KIND = "weights"
 

@@ -9,7 +9,7 @@ def camera_path(
 ) -> tuple[Float64[np.ndarray, "m 4 4"], Float64[np.ndarray, "m 3 3"]]:
     """The cameras and, between each and the next, `steps - 1` others: m = (n - 1) steps + 1.
 
-    Centres and the entries of rotations follow Catmull and Rom's spline, which passes through all that it is given;
+    Centers and the entries of rotations follow Catmull and Rom's spline, which passes through all that it is given;
     each matrix is then replaced by the nearest rotation. Intrinsics change in proportion.
 
     Limits:

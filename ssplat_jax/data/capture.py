@@ -18,13 +18,13 @@ from jaxtyping import Float32, Float64
 
 from ssplat_jax.chunk import Chunk
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.data.frame import StreamFrame
-from ssplat_jax.data.order import deal
-from ssplat_jax.data.pixels import ArrayPixels, Crop, FilePixels, Pixels, decode_all, resize_depth, resize_image
-from ssplat_jax.data.posed_frame import Frame, check_camtoworld, check_intrinsics
+from ssplat_jax.data.depth_range import estimate_depths, stream_scale
+from ssplat_jax.data.images import ArrayPixels, Crop, FilePixels, Pixels, decode_all, resize_depth, resize_image
+from ssplat_jax.data.interleave import deal
+from ssplat_jax.data.posed_image import Frame, check_camtoworld, check_intrinsics
 from ssplat_jax.data.readers import Listing, colmap, realestate10k, scannet, transforms_json, tum
-from ssplat_jax.data.refusal import echo, refusal
-from ssplat_jax.data.scale import estimate_depths, stream_scale
+from ssplat_jax.data.stream_frame import StreamFrame
+from ssplat_jax.errors import echo, refusal
 from ssplat_jax.geometry.cameras import Camera
 
 READERS = (transforms_json, colmap, scannet, tum, realestate10k)  # the first that matches reads
@@ -154,13 +154,16 @@ class Capture:
         used = _indices(self, indices)
         centers = np.stack([self.frames[i].center for i in used])
         return deal(
-            centers, used, config.chunk_size, config.chunk_step * math.sqrt(frame.near * frame.far) / frame.scale
+            centers,
+            used,
+            config.stream.chunk_size,
+            config.stream.chunk_step * math.sqrt(frame.near * frame.far) / frame.scale,
         )
 
     def chunks(
         self, config: StreamConfig, indices: Sequence[int] | None = None, *, frame: StreamFrame | None = None
     ) -> Iterator[Chunk]:
-        """The frames `indices`, as they stand, in chunks of `config.chunk_size`; a thread reads one chunk ahead.
+        """The frames `indices`, as they stand, in chunks of `config.stream.chunk_size`; a thread reads one chunk ahead.
 
         Without `indices`: all frames, in `stream_order`.
 
@@ -171,13 +174,13 @@ class Capture:
         frame = frame or self.stream_frame(config, used)
         if indices is None:
             used = self.stream_order(config, None, frame)
-        groups = [used[k : k + config.chunk_size] for k in range(0, len(used), config.chunk_size)]
+        groups = [used[k : k + config.stream.chunk_size] for k in range(0, len(used), config.stream.chunk_size)]
         with ThreadPoolExecutor(1) as reader:
-            ahead = reader.submit(self._views, groups[0], config.chunk_size, frame)
+            ahead = reader.submit(self._views, groups[0], config.stream.chunk_size, frame)
             for following in (*groups[1:], None):
                 images, viewmats, Ks, valid = ahead.result()
                 if following is not None:
-                    ahead = reader.submit(self._views, following, config.chunk_size, frame)
+                    ahead = reader.submit(self._views, following, config.stream.chunk_size, frame)
                 yield Chunk(
                     images=jnp.asarray(images),
                     viewmats=jnp.asarray(viewmats),
@@ -202,7 +205,7 @@ def open_capture(path: str | Path, *, size: tuple[int, int] | None = None) -> Ca
     """The capture at `path`: a folder in one of the formats of `readers`, its file, or `procedural:NAME`.
 
     `procedural:room?frames=73&size=128x96&seed=0`; scenes are room, orbit, corridor. `size` is the (width, height) of
-    delivered images: stored ones are scaled to cover it and cropped at the centre, `K` following exactly.
+    delivered images: stored ones are scaled to cover it and cropped at the center, `K` following exactly.
 
     Raises:
         InputError: nothing readable there, or anything in it is unusable; names the file and field.

@@ -1,10 +1,10 @@
-"""Pinhole cameras. Conventions in shapes.py: OpenCV axes, world->camera `viewmats`, pixel `Ks`, centres at +0.5."""
+"""Pinhole cameras. Conventions in shapes.py: OpenCV axes, world->camera `viewmats`, pixel `Ks`, centers at +0.5."""
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ssplat_jax.struct import pytree, static
+from ssplat_jax.pytree import pytree, static
 
 
 @pytree
@@ -15,7 +15,7 @@ class Camera:
     """
 
     viewmats: Float[Array, "*b 4 4"]  # world -> camera
-    Ks: Float[Array, "*b 3 3"]  # pixels; off-centre principal points are respected
+    Ks: Float[Array, "*b 3 3"]  # pixels; off-center principal points are respected
     width: int = static()
     height: int = static()
 
@@ -26,7 +26,7 @@ class Camera:
 
     @property
     def centers(self) -> Float[Array, "*b 3"]:
-        """Camera centres in the world."""
+        """Camera centers in the world."""
         return self.camtoworlds[..., :3, 3]
 
     def __getitem__(self, idx) -> "Camera":
@@ -51,7 +51,7 @@ def transform_points(poses: Float[Array, "*#b 4 4"], points: Float[Array, "*#b n
 def unproject(
     pixels: Float[Array, "*b n 2"], depths: Float[Array, "*b n"], Ks: Float[Array, "*b 3 3"]
 ) -> Float[Array, "*b n 3"]:
-    """Camera-frame points at z-depth `depths` behind `pixels` (x, y in pixel units, centres at +0.5)."""
+    """Camera-frame points at z-depth `depths` behind `pixels` (x, y in pixel units, centers at +0.5)."""
     x = (pixels[..., 0] - Ks[..., None, 0, 2]) / Ks[..., None, 0, 0]
     y = (pixels[..., 1] - Ks[..., None, 1, 2]) / Ks[..., None, 1, 1]
     return jnp.stack([x * depths, y * depths, depths], axis=-1)
@@ -73,7 +73,7 @@ def project_points(
 
 
 def pixel_grid(height: int, width: int, stride: int = 1) -> Float[Array, "hf wf 2"]:
-    """Pixel coordinates (x, y) of the centres of `stride` x `stride` cells of a `height` x `width` image."""
+    """Pixel coordinates (x, y) of the centers of `stride` x `stride` cells of a `height` x `width` image."""
     ys = (jnp.arange(height // stride, dtype=jnp.float32) + 0.5) * stride
     xs = (jnp.arange(width // stride, dtype=jnp.float32) + 0.5) * stride
     return jnp.stack(jnp.broadcast_arrays(xs[None, :], ys[:, None]), axis=-1)

@@ -12,13 +12,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from ssplat_jax.numerics import lane_sum
-from ssplat_jax.struct import pytree
+from ssplat_jax.pytree import pytree
+from ssplat_jax.xla_cpu import lane_sum
 
 
 @pytree
 class Places:
-    """Where a map is read: between a sample, its neighbours to the right and below, and the one across."""
+    """Where a map is read: between a sample, its neighbors to the right and below, and the one across."""
 
     corners: Int[Array, "*s"]  # flat index of the sample up and to the left
     right: Float[Array, "*s"]  # how far right of it, in [0, 1]
@@ -38,7 +38,7 @@ def places_of(x: Float[Array, "*s"], y: Float[Array, "*s"], height: int, width: 
     return Places(corners=corners, right=x - column, down=y - row)
 
 
-def neighbours(height: int, width: int) -> tuple[int, int]:
+def neighbors(height: int, width: int) -> tuple[int, int]:
     """Steps from a sample's flat index to the one on its right and the one below; 0 where a map has but one."""
     return min(width - 1, 1), width if height > 1 else 0
 
@@ -53,7 +53,7 @@ def correlate_warped(
     """
     height, width, channels = source.shape
     samples = source.reshape(-1, channels)
-    to_right, to_below = neighbours(height, width)
+    to_right, to_below = neighbors(height, width)
 
     def at_depth(places):
         right, down = places.right[:, None], places.down[:, None]
@@ -76,7 +76,7 @@ def _correlate_forward(reference, source, places):
 def _correlate_backward(residuals, cotangent):
     reference, source, places = residuals
     height, width, channels = source.shape
-    to_right, to_below = neighbours(height, width)
+    to_right, to_below = neighbors(height, width)
     corners, right, down = places.corners, places.right, places.down
     taps = jnp.stack([corners, corners + to_right, corners + to_below, corners + to_below + to_right], axis=-1)
     weights = jnp.stack([(1 - down) * (1 - right), (1 - down) * right, down * (1 - right), down * right], axis=-1)

@@ -10,50 +10,23 @@ from jaxtyping import Array, Float, Int
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.gaussians import SH_C0, Gaussians
 from ssplat_jax.geometry.rotations import multiply_quats, quats_to_matrices
-from ssplat_jax.model.wires import TokenShapes
+from ssplat_jax.model.types import TokenShapes
 
-START_OPACITY = -0.6  # logit: 0.35; a surface is several tokens deep, and sheer ones average each other's errors
-START_SCALE = 0.43  # of a Gaussian's share of the cell, sideways: neighbours overlap into a closed surface
+START_SCALE = 0.43  # of a Gaussian's share of the cell, sideways: neighbors overlap into a closed surface
 START_THICKNESS = 0.05  # of the cell's footprint, along the viewing direction
 MAX_LOG_GAIN = 0.3  # a Gaussian stays within a third of its cell's size: larger ones fill holes over what lies behind
 MIN_SCALE = 1e-6
 
 
-class GaussianHead(nn.Module):
-    """Feature to raw opacity, scale, rotation and SH residual, all zero before training."""
-
-    config: StreamConfig
-
-    @nn.compact
-    def __call__(self, feats: Float[Array, "m c"]) -> Float[Array, "m o"]:
-        outputs = 1 + 3 + 4 + 3 * (self.config.sh_degree + 1) ** 2
-        hidden = nn.gelu(nn.Dense(feats.shape[-1], name="hidden")(nn.LayerNorm(name="norm")(feats)))
-        # Of mean 0: else what all tokens have in common, which a bias holds, moves faster than what tells them apart.
-        hidden = nn.LayerNorm(use_bias=False, use_scale=False)(hidden)
-        return nn.Dense(outputs, kernel_init=nn.initializers.normal(1e-3), name="out")(hidden)
-
-
-def read_shapes(params, feats: Float[Array, "m c"], config: StreamConfig) -> TokenShapes:
-    """What the head makes of features of any precision, read in float32."""
-    raw = GaussianHead(config).apply({"params": params}, feats.astype(jnp.float32))
-    opacity, scale, rotation, sh = jnp.split(raw, [1, 4, 8], axis=-1)  # pyright: ignore[reportArgumentType]
-    return TokenShapes(
-        opacity_logits=opacity[:, 0] + START_OPACITY,
-        raw_scales=scale,
-        quats=rotation + jnp.array([1.0, 0.0, 0.0, 0.0]),
-        sh=sh.reshape(feats.shape[0], -1, 3),
-    )
-
-
 def token_scales(raw: Float[Array, "m 3"], footprints: Float[Array, " m"], config: StreamConfig) -> Float[Array, "m 3"]:
     """Standard deviations of each Gaussian of a token in stream units, along the axes of the token's camera."""
-    side = math.isqrt(config.gaussians_per_token)
-    if config.scale_mode == "absolute":
+    side = math.isqrt(config.head.gaussians_per_token)
+    if config.head.scale_mode == "absolute":
         scales = nn.softplus(raw - 4.0) / jnp.array([side, side, 1.0])
     else:
         start = jnp.array([START_SCALE / side, START_SCALE / side, START_THICKNESS])
         scales = footprints[:, None] * start * jnp.exp(MAX_LOG_GAIN * jnp.tanh(raw / MAX_LOG_GAIN))
-    return jnp.clip(scales, MIN_SCALE, config.max_scale)
+    return jnp.clip(scales, MIN_SCALE, config.head.max_scale)
 
 
 def decode_tokens(
@@ -68,14 +41,14 @@ def decode_tokens(
 ) -> Gaussians:
     """Gaussians of tokens or of cache pivots: `gaussians_per_token` of each, in a square over its cell, row by row.
 
-    The head gives all of a token's the same shape and opacity; they differ in place and colour. A pivot of n
+    The head gives all of a token's the same shape and opacity; they differ in place and color. A pivot of n
     members stands for n tokens in one place and is as opaque as they would be, 1 - (1 - o)^n.
 
-    The head's rotation is in the frame of the camera in `quats` (DESIGN 6.7); its colour is a residual on the
+    The head's rotation is in the frame of the camera in `quats` (DESIGN 6.7); its color is a residual on the
     appearance anchors `rgbs` (DESIGN 6.6).
     """
     optical_depths = jnp.asarray(num_members, jnp.float32) * nn.softplus(shapes.opacity_logits)
-    each = lambda x: jnp.repeat(x, config.gaussians_per_token, axis=0)  # noqa: E731
+    each = lambda x: jnp.repeat(x, config.head.gaussians_per_token, axis=0)  # noqa: E731
     return Gaussians(
         means=_spread(means, quats, footprints, config),
         quats=each(multiply_quats(quats, shapes.quats)),
@@ -88,8 +61,8 @@ def decode_tokens(
 def _spread(
     means: Float[Array, "m 3"], quats: Float[Array, "m 4"], footprints: Float[Array, " m"], config: StreamConfig
 ) -> Float[Array, "n 3"]:
-    """Centres of the parts of each token's cell, row by row, in the plane that faces the camera in `quats`."""
-    side = math.isqrt(config.gaussians_per_token)
+    """Centers of the parts of each token's cell, row by row, in the plane that faces the camera in `quats`."""
+    side = math.isqrt(config.head.gaussians_per_token)
     steps = (np.arange(side, dtype=np.float32) + 0.5) / side - 0.5  # of a cell
     down, right = (x.reshape(-1, 1) for x in np.meshgrid(steps, steps, indexing="ij"))
     axes = quats_to_matrices(quats)

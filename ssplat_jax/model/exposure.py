@@ -1,8 +1,8 @@
-"""Exposure: every view against the scene (ours), so that the cache remembers colours at one exposure.
+"""Exposure: every view against the scene (ours), so that the cache remembers colors at one exposure.
 
 Exposure and white balance of a camera drift over a video, by a factor of two on redkitchen; remembered as they come,
-the colours of one surface differ from patch to patch and fit no view. A view's exposure is, per channel, the median
-ratio of the colours it sees to those that the cache remembers, over the cells where both see the same surface. The
+the colors of one surface differ from patch to patch and fit no view. A view's exposure is, per channel, the median
+ratio of the colors it sees to those that the cache remembers, over the cells where both see the same surface. The
 scene keeps the exposure of the first views.
 """
 
@@ -15,11 +15,11 @@ from jaxtyping import Array, Float
 from ssplat_jax.cache import SAME_SURFACE, ProjectedCache
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.model.layers import average_pool
-from ssplat_jax.model.wires import GRID_STRIDE, Views
+from ssplat_jax.model.types import GRID_STRIDE, Views
 from ssplat_jax.numerics import safe_log
 
-DARKEST, BRIGHTEST = 0.03, 0.97  # colours between which an image is about proportional to the exposure
-FEWEST_CELLS = 64  # fewer tell less than the neighbouring views do
+DARKEST, BRIGHTEST = 0.03, 0.97  # colors between which an image is about proportional to the exposure
+FEWEST_CELLS = 64  # fewer tell less than the neighboring views do
 MOST = 4.0  # the largest exposure, and one over the smallest
 
 
@@ -30,7 +30,7 @@ def estimate_exposures(
     views: Views,
     config: StreamConfig,
 ) -> Float[Array, "v 3"]:
-    """What takes the scene's colours to those of each view; a constant for differentiation.
+    """What takes the scene's colors to those of each view; a constant for differentiation.
 
     Args:
         history: the projected cache.
@@ -49,7 +49,7 @@ def estimate_exposures(
     is_compared = (
         history.mask
         & views.inside
-        & (confidences >= config.min_confidence)
+        & (confidences >= config.memory.min_confidence)
         & (jnp.abs(log_depths - remembered_log_depths) <= SAME_SURFACE)
         & ((seen >= DARKEST) & (seen <= BRIGHTEST) & (remembered >= DARKEST)).all(axis=-1)
     )

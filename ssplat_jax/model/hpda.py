@@ -6,7 +6,7 @@ from jaxtyping import Array, Float
 
 from ssplat_jax.cache import ProjectedCache
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.model.wires import AnchoredDepth, DepthBelief, Views, from_candidate_space, to_candidate_space
+from ssplat_jax.model.types import AnchoredDepth, DepthBelief, Views, from_candidate_space, to_candidate_space
 from ssplat_jax.numerics import safe_log, softplus_inverse
 
 MIN_SIGMA = 1e-6
@@ -20,7 +20,7 @@ class AnchorStrength(nn.Module):
 
     @nn.compact
     def __call__(self) -> Float[Array, ""]:
-        raw = self.param("raw_gamma", nn.initializers.constant(softplus_inverse(self.config.gamma_init)), ())
+        raw = self.param("raw_gamma", nn.initializers.constant(softplus_inverse(self.config.history.gamma_init)), ())
         return nn.softplus(raw)
 
 
@@ -34,13 +34,13 @@ def cache_anchor(
         sigma is at least 1e-6. sigma -> 0: Omega at the candidate that equals D_H, zeros where none does.
     """
     omega = history.confidences[..., None]
-    sigma = jnp.maximum(config.sigma0 + config.lambda_sigma * (1 - omega), MIN_SIGMA)
-    if config.anchor_space == "log":
+    sigma = jnp.maximum(config.history.sigma0 + config.history.lambda_sigma * (1 - omega), MIN_SIGMA)
+    if config.history.anchor_space == "log":
         offsets = log_candidates - safe_log(history.depths)[..., None]
     else:
         offsets = jnp.exp(log_candidates) - history.depths[..., None]
     anchor = jnp.exp(-0.5 * (offsets / sigma) ** 2)
-    if config.anchor_norm == "mass":
+    if config.history.anchor_norm == "mass":
         anchor = anchor / jnp.maximum(anchor.sum(axis=-1, keepdims=True), 1e-12)
     return jnp.where(history.mask[..., None], omega * anchor, 0.0)
 
@@ -58,14 +58,14 @@ def inject_anchor(
 
 
 def peak_confidence(probs: Float[Array, "*b d"], config: StreamConfig) -> Float[Array, "*b"]:
-    """omega: the peak of a distribution, or the largest mass of a few neighbouring candidates.
+    """omega: the peak of a distribution, or the largest mass of a few neighboring candidates.
 
     Limits:
         At most 1, which a one-hot distribution gives, and one of a single candidate.
     """
-    if config.confidence == "peak":
+    if config.depth.confidence == "peak":
         return probs.max(axis=-1)
-    width = 2 * config.confidence_window + 1
+    width = 2 * config.depth.confidence_window + 1
     cumulative = jnp.cumsum(jnp.pad(probs, [(0, 0)] * (probs.ndim - 1) + [(width, width - 1)]), axis=-1)
     return jnp.clip((cumulative[..., width:] - cumulative[..., :-width]).max(axis=-1), 0.0, 1.0)
 
@@ -80,9 +80,9 @@ def expected_log_depth(
         whatever was matched, with a zero gradient.
         `depth_readout="window"` looks around the nearest of equal peaks.
     """
-    if config.depth_readout == "window":
+    if config.depth.depth_readout == "window":
         distance = jnp.abs(jnp.arange(probs.shape[-1]) - jnp.argmax(probs, axis=-1)[..., None])
-        probs = jnp.where(distance <= config.readout_window, probs, 0.0)
+        probs = jnp.where(distance <= config.depth.readout_window, probs, 0.0)
         probs = probs / probs.sum(axis=-1, keepdims=True)
     candidates = to_candidate_space(log_candidates, config)
     return from_candidate_space(jnp.einsum("...d,d->...", probs, candidates, precision="highest"), config)
@@ -93,7 +93,7 @@ def anchor_depth(
 ) -> AnchoredDepth:
     """Fuses the matcher's distribution with the cache's anchor and reads depth and confidences."""
     probs = belief.probs
-    if config.hpda:
+    if config.history.hpda:
         gamma = AnchorStrength(config).apply({"params": params})
         probs = inject_anchor(probs, cache_anchor(history, views.log_candidates, config), gamma)  # pyright: ignore[reportArgumentType]
     return AnchoredDepth(

@@ -6,7 +6,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from ssplat_jax.model.convolution import Conv, HalvingConv
-from ssplat_jax.numerics import lane_sum, safe_normalize
+from ssplat_jax.numerics import safe_normalize
+from ssplat_jax.xla_cpu import lane_sum
 
 IMAGE_MEAN = (0.485, 0.456, 0.406)  # ImageNet, as DepthSplat
 IMAGE_STD = (0.229, 0.224, 0.225)
@@ -122,7 +123,7 @@ class UNetBlock(nn.Module):
 
 
 class JointAttention(nn.Module):
-    """Self-attention over the cells of all views of the chunk together, residual, last layer zero-initialised."""
+    """Self-attention over the cells of all views of the chunk together, residual, last layer zero-initialized."""
 
     heads: int = 4
 

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.model.cgfi import Aggregator
 from ssplat_jax.model.hpda import AnchorStrength
-from ssplat_jax.model.networks import network_of
-from ssplat_jax.model.wires import GRID_STRIDE
+from ssplat_jax.model.network import network_of
+from ssplat_jax.model.types import GRID_STRIDE
 
 STAGES = ("encoder", "cost_volume", "hpda", "upsampler", "tokens", "cgfi", "mixer", "decoder")
 
@@ -38,9 +38,9 @@ def _init_stage(key: jax.Array, config: StreamConfig, name: str) -> dict:
 
 def _modules(config: StreamConfig) -> dict:
     """Every stage with parameters, and inputs of the shapes that it takes."""
-    v, side, c = 2, config.size_multiple // GRID_STRIDE, config.token_width
+    v, side, c = 2, config.network.size_multiple // GRID_STRIDE, config.network.token_width
     grid = lambda channels: jnp.zeros((v, side, side, channels))  # noqa: E731
-    return network_of(config).modules(config) | {
+    return network_of(config).stages(config) | {
         "hpda": (AnchorStrength(config), ()),
         "cgfi": (Aggregator(config), (grid(c), grid(c + 1), jnp.ones(v, bool))),
     }

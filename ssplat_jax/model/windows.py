@@ -6,7 +6,7 @@ from jaxtyping import Array, Bool, Float
 
 
 def sine_positions(height: int, width: int, features: int) -> Float[np.ndarray, "h w c"]:
-    """Sine position code of a window: half of the channels for y, half for x (DETR's, normalised to 2 pi)."""
+    """Sine position code of a window: half of the channels for y, half for x (DETR's, normalized to 2 pi)."""
     half = features // 2
     rates = 10000.0 ** (2 * (np.arange(half) // 2) / half)
 
@@ -38,7 +38,7 @@ def from_windows(
 def in_one_region(
     height: int, width: int, side: tuple[int, int], shift: tuple[int, int]
 ) -> Bool[Array, "1 windows cells cells"]:
-    """Which cells of the windows of a map rolled by `-shift` are neighbours, not opposite borders in one window."""
+    """Which cells of the windows of a map rolled by `-shift` are neighbors, not opposite borders in one window."""
     rows, columns = (np.arange(n) >= n - s for n, s in zip((height, width), shift, strict=True))
     regions = jnp.asarray((2 * rows[:, None] + columns)[None, :, :, None], jnp.float32)
     cells = to_windows(regions, side)[..., 0]

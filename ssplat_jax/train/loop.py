@@ -9,13 +9,13 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 
-from ssplat_jax.checkpoint.training import TrainingCheckpoints
+from ssplat_jax.checkpoint.training_state import TrainingCheckpoints
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.export.json_files import json_text
-from ssplat_jax.export.only_writer import only_writer
-from ssplat_jax.interrupts import Interrupts
-from ssplat_jax.lpips import LpipsWeights
-from ssplat_jax.stream import StreamSplat
+from ssplat_jax.metrics.lpips import LpipsWeights
+from ssplat_jax.storage.folder_lock import only_writer
+from ssplat_jax.storage.interrupts import Interrupts
+from ssplat_jax.storage.json_files import json_text
+from ssplat_jax.streaming.streamsplat import StreamSplat
 from ssplat_jax.train.recipe import Recipe, training_config
 from ssplat_jax.train.samples import prefetched, sample_for_step
 from ssplat_jax.train.step import Trainer, TrainState, init_state, learning_rate
@@ -48,7 +48,7 @@ def train(
 
     Args:
         config: of the model; its cache is replaced by the recipe's.
-        recipe: phases and optimiser.
+        recipe: phases and optimizer.
         out: directory of `log.jsonl`, `recipe.json` and `checkpoints/`.
         params: start from these instead of from the recipe's seed (ignored on resume).
         lpips_weights: with them the rendering loss is the paper's, MSE + 0.05 LPIPS.

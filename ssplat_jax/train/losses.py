@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ssplat_jax.errors import InputError
-from ssplat_jax.lpips import LpipsWeights, lpips
-from ssplat_jax.metrics import SSIM_ARGUMENTS
+from ssplat_jax.metrics.lpips import LpipsWeights, lpips
+from ssplat_jax.metrics.psnr_ssim import SSIM_ARGUMENTS
 
 LPIPS_WEIGHT = 0.05
 """Of LPIPS beside the MSE, as in the paper."""
@@ -21,7 +21,7 @@ NARROWEST_STEP = 1e-6
 def soft_targets(
     log_depths: Float[Array, "*b"], log_candidates: Float[Array, " d"], width: float = 0.6
 ) -> Float[Array, "*b d"]:
-    """True depth as a narrow distribution over the candidates: a Gaussian of `width` steps between them, normalised.
+    """True depth as a narrow distribution over the candidates: a Gaussian of `width` steps between them, normalized.
 
     Limits:
         One candidate, or all at one depth: it is the whole distribution, or all alike.

@@ -1,4 +1,4 @@
-"""What a training run is, as data: phases of a curriculum and the optimiser's numbers. No JAX here."""
+"""What a training run is, as data: phases of a curriculum and the optimizer's numbers. No JAX here."""
 
 import dataclasses
 from typing import Literal
@@ -56,9 +56,9 @@ class Recipe:
     """Weight of the depth losses beside the rendering loss (procedural scenes know their depth; DESIGN 6.13)."""
     gradient_weight: float = 0.02
     """Weight of the L1 of image gradients beside the MSE, in place of LPIPS, whose weights cannot be shipped. One
-    colour a cell shows no texture below it: a larger weight asks for that in vain, or for blur."""
+    color a cell shows no texture below it: a larger weight asks for that in vain, or for blur."""
     black_weight: float = 0.05
-    """Share of the rendering loss over black; the rest has holes in the colours around, as views are scored. That alone
+    """Share of the rendering loss over black; the rest has holes in the colors around, as views are scored. That alone
     would make all surfaces sheer: what is open costs it nothing."""
     recompute: bool = False
     """Recompute each chunk's activations backward: less memory, more time."""
@@ -151,6 +151,6 @@ def smoke_recipe(steps: int = 20) -> Recipe:
 def training_config(config: StreamConfig, recipe: Recipe) -> StreamConfig:
     """The configuration trained with: a cache as large as a sample needs, and no growth inside jit.
 
-    Colours stay as they are seen: the targets have exposures of their own, which nothing estimates.
+    Colors stay as they are seen: the targets have exposures of their own, which nothing estimates.
     """
     return config.replace(capacity=recipe.cache_capacity, overflow="drop_new", match_exposure=False)

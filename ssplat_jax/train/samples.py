@@ -14,11 +14,11 @@ from ssplat_jax.data.procedural import STEPS, training_sample
 from ssplat_jax.errors import InputError
 from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.model import GRID_STRIDE
-from ssplat_jax.struct import pytree
+from ssplat_jax.pytree import pytree
 from ssplat_jax.train.recipe import Recipe
 
 NEAR_FACTOR, FAR_FACTOR = 0.55, 1.8  # as data.scale: margins around the 1 % and 99 % quantiles of depth
-EDGE = 0.05  # of log depth, between neighbouring pixels
+EDGE = 0.05  # of log depth, between neighboring pixels
 JITTER = 0.25  # relative error that the sweep's range and the scene scale are trained to bear
 
 
@@ -56,7 +56,7 @@ def make_sample(
     """The sample called `seed`: always the same arrays for the same arguments."""
     rng = np.random.default_rng([seed, 7])
     height, width = size
-    num_context = num_chunks * config.chunk_size
+    num_context = num_chunks * config.stream.chunk_size
     if num_targets and num_context < 2:
         raise InputError("training: targets lie between context views, got a context of one view; ask for no targets.")
     num_views = num_context + num_targets
@@ -67,20 +67,20 @@ def make_sample(
         is_target[choose_targets(rng, num_views, num_targets)] = True
     context = np.flatnonzero(~is_target)
 
-    scale = config.median_depth / np.median(depths[context]) * np.exp(rng.uniform(-JITTER, JITTER))
+    scale = config.stream.median_depth / np.median(depths[context]) * np.exp(rng.uniform(-JITTER, JITTER))
     viewmats = _stream_viewmats(camtoworlds.astype(np.float64), int(context[0]), float(scale))
     depths = depths * scale
     low, high = np.quantile(depths[context], [0.01, 0.99])
     near = NEAR_FACTOR * low * np.exp(rng.uniform(-JITTER, JITTER))
     far = FAR_FACTOR * high * np.exp(rng.uniform(-JITTER, JITTER))
 
-    chunked = lambda x: x[context].reshape(num_chunks, config.chunk_size, *x.shape[1:])  # noqa: E731
+    chunked = lambda x: x[context].reshape(num_chunks, config.stream.chunk_size, *x.shape[1:])  # noqa: E731
     return Sample(
         chunks=Chunk(
             images=jnp.asarray(chunked(images)),
             viewmats=jnp.asarray(chunked(viewmats)),
             Ks=jnp.asarray(chunked(Ks.astype(np.float32))),
-            valid=jnp.ones((num_chunks, config.chunk_size), bool),
+            valid=jnp.ones((num_chunks, config.stream.chunk_size), bool),
             near=jnp.full(num_chunks, near, jnp.float32),
             far=jnp.full(num_chunks, far, jnp.float32),
         ),
@@ -92,12 +92,12 @@ def make_sample(
 
 
 def log_depths_at_cells(depths: Float[np.ndarray, "*b h w"]) -> Float[np.ndarray, "*b hf wf"]:
-    """ln z at the centres of the grid's cells, which are corners of pixels: the mean of the four pixels around.
+    """ln z at the centers of the grid's cells, which are corners of pixels: the mean of the four pixels around.
 
     Across a depth edge a mean is on no surface: where the four differ by more than `EDGE`, one of them is taken.
     """
     before = GRID_STRIDE // 2 - 1
-    # A cell at the border whose centre is the image's edge has pixels to one side only, and is none.
+    # A cell at the border whose center is the image's edge has pixels to one side only, and is none.
     rows, cols = ((side - before - 2) // GRID_STRIDE + 1 for side in depths.shape[-2:])
     around = np.log(
         [

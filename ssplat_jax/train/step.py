@@ -11,10 +11,10 @@ from jaxtyping import Array, Float, Int
 
 from ssplat_jax.cache import Tokens, VoxelCache, judge
 from ssplat_jax.gaussians import Gaussians, mask_gaussians, mean_color
-from ssplat_jax.lpips import LpipsWeights
-from ssplat_jax.render import fill_holes, render
-from ssplat_jax.stream import StreamSplat
-from ssplat_jax.struct import pytree
+from ssplat_jax.metrics.lpips import LpipsWeights
+from ssplat_jax.pytree import pytree
+from ssplat_jax.rasterizer import fill_holes, render
+from ssplat_jax.streaming.streamsplat import StreamSplat
 from ssplat_jax.train.losses import depth_loss, rendering_loss
 from ssplat_jax.train.recipe import PAPER_FORM, PhaseForm, Recipe
 from ssplat_jax.train.samples import Sample
@@ -97,7 +97,7 @@ def decode_accepted(model: StreamSplat, params: dict, cache: VoxelCache, tokens:
     that inference sees, but not merged."""
     gaussians = model.decode_tokens(params, tokens)
     judged = judge(*jax.lax.stop_gradient((cache.witnesses, tokens)), model.config)
-    is_accepted = tokens.valid & (judged.confidences >= model.config.min_confidence)
+    is_accepted = tokens.valid & (judged.confidences >= model.config.memory.min_confidence)
     return mask_gaussians(gaussians, model.each_gaussian(is_accepted))
 
 
@@ -113,7 +113,7 @@ def loss_fn(
     params = {name: jax.lax.stop_gradient(p) if name in form.frozen else p for name, p in params.items()}
     cache, tokens, (entropy, depth_l1) = stream_chunks(model, params, sample, recompute=recipe.recompute)
     loss = entropy + 2.0 * depth_l1
-    accepted = jnp.mean((tokens.confidences >= model.config.min_confidence).astype(jnp.float32))
+    accepted = jnp.mean((tokens.confidences >= model.config.memory.min_confidence).astype(jnp.float32))
     metrics = {"depth_entropy": entropy, "depth_l1": depth_l1, "accepted": accepted}
     if sample.target_images.shape[0]:
         is_cache = form.decode == "cache"

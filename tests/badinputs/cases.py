@@ -224,7 +224,7 @@ CASES = (
     Case("focal length 0", top(fl_x=0.0), ("frames[0].fl_x", "above 0")),
     Case("focal length below 0", top(fl_y=-50.0), ("frames[0].fl_y", "above 0")),
     Case("focal length NaN", top(fl_x=float("nan")), ("frames[0].fl_x", "finite")),
-    Case("focal length in units of the image", top(fl_x=0.8, fl_y=1.1), ("frames[0].fl_x", "pixels", "normalised")),
+    Case("focal length in units of the image", top(fl_x=0.8, fl_y=1.1), ("frames[0].fl_x", "pixels", "normalized")),
     Case("focal length a word", top(fl_x="50"), ("frames[0].fl_x", "number")),
     Case("focal length true", top(fl_x=True), ("frames[0].fl_x", "number")),
     Case("focal length of 400 digits", top(fl_x=10**400), ("frames[0].fl_x", "number")),
@@ -262,7 +262,7 @@ CASES = (
     Case("missing depth", frame(2, depth_file_path="nowhere.png"), ("frames[2].depth_file_path", "does not exist")),
     Case("depth outside", frame(2, depth_file_path="../d.png"), ("frames[2].depth_file_path", "inside")),
     Case("depth of 8 bits", depth_file("L"), ("d.png", "16 bits")),
-    Case("depth in colour", depth_file("RGB"), ("d.png", "16 bits")),
+    Case("depth in color", depth_file("RGB"), ("d.png", "16 bits")),
     Case("depth cut short", depth_file("I;16", cut=60), ("d.png",)),
     Case("depth is a JPEG", frame(2, depth_file_path="images/1.jpg"), ("1.jpg", "16 bits")),
     # the container

@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from hypothesis import strategies as st
 
-from ssplat_jax.cache import PIVOT_FIELDS, Tokens, VoxelCache, fuse_touched, reference
+from ssplat_jax.cache import PIVOT_FIELDS, Tokens, VoxelCache, fuse_touched
+from ssplat_jax.cache import numpy_reference as reference
 from ssplat_jax.config import StreamConfig
 
 WIDTH = 4  # channels
@@ -21,7 +22,9 @@ CONFIDENCES = ("random", "tied", "at_tau")
 
 fuse = jax.jit(fuse_touched, static_argnums=2, donate_argnums=0)
 
-CONFIG = StreamConfig(token_width=WIDTH, capacity=128, voxel_size=0.25, min_confidence=0.3, overflow="drop_new")
+CONFIG = StreamConfig().replace(
+    token_width=WIDTH, capacity=128, voxel_size=0.25, min_confidence=0.3, overflow="drop_new"
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,7 +46,7 @@ class Recipe:
             "means": _means(rng, m, self.places),
             "feats": _feats(rng, m, self.features),
             "confidences": _confidences(rng, m, self.confidences),
-            "rgbs": rng.uniform(0, 1, (m, 3 * CONFIG.gaussians_per_token)),
+            "rgbs": rng.uniform(0, 1, (m, 3 * CONFIG.head.gaussians_per_token)),
             "quats": rng.normal(size=(m, 4)),
             "footprints": rng.uniform(0.01, 0.1, m),
         }
@@ -57,7 +60,7 @@ class Recipe:
 
 
 def _means(rng, m, places):
-    size = CONFIG.voxel_size
+    size = CONFIG.memory.voxel_size
     if places == "edges":
         limit = np.float64(1 << 20)
         cells = rng.choice([-limit - 1, -limit, 1 - limit, -1.0, 0.0, limit - 1, limit, 3e9], (m, 3))
@@ -78,7 +81,7 @@ def _feats(rng, m, features):
 
 
 def _confidences(rng, m, confidences):
-    tau = np.float32(CONFIG.min_confidence)
+    tau = np.float32(CONFIG.memory.min_confidence)
     if confidences == "at_tau":
         return rng.choice([np.nextafter(tau, np.float32(0)), tau, np.nextafter(tau, np.float32(1))], m)
     return rng.choice([0.2, 0.5, 0.5, 1.0], m) if confidences == "tied" else rng.uniform(0.2, 1.0, m)

@@ -7,10 +7,11 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from ssplat_jax.cache import Tokens, bear_witness, carve, init_cache, judge, reference
+from ssplat_jax.cache import Tokens, bear_witness, carve, init_cache, judge
+from ssplat_jax.cache import numpy_reference as reference
 from ssplat_jax.cache.state import WITNESS_CELLS
 from ssplat_jax.geometry.cameras import Camera
-from ssplat_jax.struct import replace
+from ssplat_jax.pytree import replace
 from tests.cache.streams import CAPACITY, CONFIG
 from tests.cache.test_project_oracle import (
     DECISION_MARGIN,
@@ -51,9 +52,9 @@ def offered(means, confidences, valid=None) -> Tokens:
     n = len(means)
     return Tokens(
         means=jnp.asarray(means, jnp.float32),
-        feats=jnp.ones((n, CONFIG.token_width)),
+        feats=jnp.ones((n, CONFIG.network.token_width)),
         confidences=jnp.asarray(confidences, jnp.float32),
-        rgbs=jnp.ones((n, 3 * CONFIG.gaussians_per_token)),
+        rgbs=jnp.ones((n, 3 * CONFIG.head.gaussians_per_token)),
         quats=jnp.ones((n, 4)),
         footprints=jnp.ones(n),
         valid=jnp.ones(n, bool) if valid is None else jnp.asarray(valid),
@@ -118,7 +119,7 @@ def test_beliefs_stay_revisable():
 @pytest.mark.parametrize(
     "witness",
     [
-        seen(2.0, CONFIG.min_confidence - 0.01),
+        seen(2.0, CONFIG.memory.min_confidence - 0.01),
         seen(2.0, 0.0),
         seen(np.nan),
         seen(np.inf),
@@ -131,7 +132,7 @@ def test_no_witness_no_change(witness):
     assert confidence_after(1.0, witness) == np.float32(0.6)
 
 
-def test_an_untrusted_neighbour_forbids_carving_but_not_agreement():
+def test_an_untrusted_neighbor_forbids_carving_but_not_agreement():
     depths, confidences = seen(2.0)
     for row, column in ((2, 3), (3, 5), (4, 4)):
         unsure = (depths, confidences.at[0, row, column].set(0.1))

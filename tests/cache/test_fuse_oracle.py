@@ -5,7 +5,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from ssplat_jax.cache import init_cache, reference
+from ssplat_jax.cache import init_cache
+from ssplat_jax.cache import numpy_reference as reference
 from ssplat_jax.cache.fuse import MERGE_BLOCKS
 from tests.cache.streams import CONFIG, WIDTH, assert_equal_to_oracle, fuse, recipes, run_both, to_jax
 
@@ -39,7 +40,7 @@ def test_rounds_of_every_width_equal_the_loop():
         "means": (np.stack([columns, 0 * columns, 0 * columns], axis=-1) + rng.uniform(0.1, 0.9, (m, 3))) / 4,
         "feats": rng.integers(-2, 3, (m, WIDTH)),
         "confidences": rng.choice([0.2, 0.5, 0.5, 1.0], m),
-        "rgbs": rng.uniform(size=(m, 3 * CONFIG.gaussians_per_token)),
+        "rgbs": rng.uniform(size=(m, 3 * CONFIG.head.gaussians_per_token)),
         "quats": rng.normal(size=(m, 4)),
         "footprints": rng.uniform(size=m),
     }

@@ -10,10 +10,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from ssplat_jax.cache import PIVOT_FIELDS, Tokens, VoxelCache, init_cache, reference
+from ssplat_jax.cache import PIVOT_FIELDS, Tokens, VoxelCache, init_cache
 from ssplat_jax.cache import fuse as plain_fuse
+from ssplat_jax.cache import numpy_reference as reference
 from ssplat_jax.geometry.voxels import voxel_indices
-from ssplat_jax.struct import replace
+from ssplat_jax.pytree import replace
 from tests.cache.streams import CAPACITY, CONFIG, NUM_TOKENS, PLACES, VALUE_RTOL, Recipe, fuse, recipes, to_jax
 
 SETTINGS = settings(max_examples=30, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
@@ -44,10 +45,10 @@ def test_3_pivots_are_bounded_inside_their_voxels_and_findable(config, stream):
     cache = jax.tree.map(np.asarray, run(stream, config))
     rows = np.arange(CAPACITY) < cache.num_voxels
     assert np.all(cache.counts[rows] >= 1) and np.all(cache.counts[~rows] == 0)
-    assert np.all(cache.counts <= config.pivots_per_voxel) and cache.num_voxels <= CAPACITY
+    assert np.all(cache.counts <= config.memory.pivots_per_voxel) and cache.num_voxels <= CAPACITY
     for name in PIVOT_FIELDS:
         assert not np.any(getattr(cache, name)[~cache.alive]), f"dead pivots hold zeros: {name}"
-    voxels, in_range = voxel_indices(jnp.asarray(cache.means), config.voxel_size)
+    voxels, in_range = voxel_indices(jnp.asarray(cache.means), config.memory.voxel_size)
     where = np.broadcast_to(cache.voxels[:, None], voxels.shape)
     np.testing.assert_array_equal(np.asarray(voxels)[cache.alive], where[cache.alive])
     assert np.all(np.asarray(in_range)[cache.alive])
@@ -89,16 +90,16 @@ def test_4_reinserting_a_chunk_bounds_pivots_and_leaves_positions():
     """With fewer distinct tokens in a voxel than pivots, repetitions only ever merge with themselves."""
     tokens = Recipe(seed=1, places="many", features="normal", confidences="random").tokens()
     tokens["means"] = (
-        np.repeat(np.arange(NUM_TOKENS // 3), 3)[:, None] * CONFIG.voxel_size + tokens["means"] % 0.2 + 0.01
+        np.repeat(np.arange(NUM_TOKENS // 3), 3)[:, None] * CONFIG.memory.voxel_size + tokens["means"] % 0.2 + 0.01
     )
     cache, after = init_cache(CONFIG, CAPACITY), []
     for _ in range(6):
         cache, _ = fuse(cache, to_jax(tokens), CONFIG)
         after.append({tuple(p) for p in np.asarray(cache.means)[np.asarray(cache.alive)]})
-    accepted = tokens["confidences"] >= np.float32(CONFIG.min_confidence)
+    accepted = tokens["confidences"] >= np.float32(CONFIG.memory.min_confidence)
     assert after[0] == {tuple(p) for p in tokens["means"].astype(np.float32)[accepted]}
     assert all(positions == after[0] for positions in after)
-    assert int(jnp.max(cache.counts)) <= CONFIG.pivots_per_voxel
+    assert int(jnp.max(cache.counts)) <= CONFIG.memory.pivots_per_voxel
     assert int(cache.stats.num_merged) > 0
 
 
@@ -159,7 +160,7 @@ def test_8_moving_the_world_by_whole_voxels_moves_the_pivots_exactly():
     """Voxel size and positions are dyadic, so that the shift itself has no rounding."""
     tokens = Recipe(seed=7, places="few", features="integers", confidences="tied").tokens()
     tokens["means"] = np.round(tokens["means"] * 1024) / 1024
-    shift = np.array([3, -5, 2]) * CONFIG.voxel_size
+    shift = np.array([3, -5, 2]) * CONFIG.memory.voxel_size
     moved = tokens | {"means": (tokens["means"] + shift).astype(np.float32)}
     a, _ = fuse(init_cache(CONFIG, CAPACITY), to_jax(tokens), CONFIG)
     b, _ = fuse(init_cache(CONFIG, CAPACITY), to_jax(moved), CONFIG)
@@ -173,7 +174,7 @@ def test_8_append_keeps_every_token_as_it_came():
     config = CONFIG.replace(vacc="append")
     tokens = Recipe(seed=8, places="one_voxel", features="normal", confidences="random").tokens()
     cache, _ = fuse(init_cache(config, CAPACITY), to_jax(tokens), config)
-    accepted = tokens["confidences"] >= np.float32(config.min_confidence)
+    accepted = tokens["confidences"] >= np.float32(config.memory.min_confidence)
     alive = np.asarray(cache.alive)
     for name in ("means", "feats", "confidences", "rgbs", "quats", "footprints"):
         np.testing.assert_array_equal(np.asarray(getattr(cache, name))[alive], tokens[name][accepted])
@@ -283,7 +284,7 @@ def test_ten_thousand_chunks_leave_memory_and_counters_as_they_must_be():
         if i == 500:
             before = resident_bytes()
     assert resident_bytes() - before <= 50 * 2**20
-    assert int(cache.num_voxels) <= CAPACITY and int(jnp.max(cache.counts)) <= config.pivots_per_voxel
+    assert int(cache.num_voxels) <= CAPACITY and int(jnp.max(cache.counts)) <= config.memory.pivots_per_voxel
     stats = jax.tree.map(int, cache.stats)
     once = reference.empty(CAPACITY)
     for tokens in stream:

@@ -10,9 +10,10 @@ import pytest
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
-from ssplat_jax.cache import VoxelCache, coarser, init_cache, project, reference
+from ssplat_jax.cache import VoxelCache, coarser, init_cache, project
+from ssplat_jax.cache import numpy_reference as reference
 from ssplat_jax.geometry.cameras import Camera
-from ssplat_jax.struct import replace
+from ssplat_jax.pytree import replace
 from tests.cache.streams import CAPACITY, CONFIG, VALUE_RTOL, WIDTH
 
 HEIGHT, GRID_WIDTH = 6, 8
@@ -43,7 +44,7 @@ def scene(seed: int, num_voxels: int, depth_spread: float) -> VoxelCache:
     """A cache of random pivots about the origin, `depth_spread` deep, crowded on few pixels."""
     rng = np.random.default_rng(seed)
     cache = init_cache(CONFIG, CAPACITY)
-    k = CONFIG.pivots_per_voxel
+    k = CONFIG.memory.pivots_per_voxel
     counts = np.where(np.arange(CAPACITY) < num_voxels, rng.integers(1, k + 1, CAPACITY), 0)
     alive = np.arange(k) < counts[:, None]
     means = rng.uniform(-1, 1, (CAPACITY, k, 3)) * [1.0, 1.0, depth_spread]
@@ -51,7 +52,7 @@ def scene(seed: int, num_voxels: int, depth_spread: float) -> VoxelCache:
         "means": means * alive[..., None],
         "confidences": rng.choice([0.0, 0.3, 0.5, 1.0], (CAPACITY, k)) * alive,
         "feats": rng.normal(size=(CAPACITY, k, WIDTH)) * alive[..., None],
-        "rgbs": rng.uniform(size=(CAPACITY, k, 3 * CONFIG.gaussians_per_token)) * alive[..., None],
+        "rgbs": rng.uniform(size=(CAPACITY, k, 3 * CONFIG.head.gaussians_per_token)) * alive[..., None],
     }
     return replace(
         cache,
@@ -179,7 +180,7 @@ def test_walking_in_blocks_changes_nothing(monkeypatch):
         np.testing.assert_allclose(getattr(whole, name), getattr(blocks, name), rtol=0, atol=4 * VALUE_RTOL)
 
 
-def test_the_colour_of_a_pixel_is_the_mean_over_parts_and_pivots():
+def test_the_color_of_a_pixel_is_the_mean_over_parts_and_pivots():
     cache = with_pivots([[0.0, 0.0, 2.0], [0.0, 0.0, 2.1]], confidences=[0.75, 0.5])
     parts = np.arange(24.0).reshape(2, 4, 3)  # pivots, parts of a patch, channels
     cache = replace(cache, rgbs=cache.rgbs.at[:2, 0].set(jnp.asarray(parts.reshape(2, 12), jnp.float32)))

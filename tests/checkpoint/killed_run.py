@@ -58,7 +58,7 @@ def die_at(file: str, step: str, count: int, delay: float) -> None:
 
 def note_chunks(notes: str) -> None:
     """Lets every fed chunk leave a line in the file `notes`, unbuffered: what is killed flushes nothing."""
-    from ssplat_jax.session import Session
+    from ssplat_jax.streaming.session import Session
 
     feed, descriptor = Session.feed, os.open(notes, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
 
@@ -75,7 +75,7 @@ def main(notes: str, moment: str, *arguments: str) -> None:
     if moment != "-":
         file, step, count, delay = moment.split(",")
         die_at(file, step, int(count), float(delay))
-    from ssplat_jax.cli import main
+    from ssplat_jax.commands.main import main
 
     main(list(arguments))
 

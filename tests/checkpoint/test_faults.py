@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from ssplat_jax.checkpoint.state import load_newest_state
+from ssplat_jax.checkpoint.stream_state import load_newest_state
 from ssplat_jax.data.procedural import procedural_capture_arrays
-from ssplat_jax.export.atomic import previous_path
+from ssplat_jax.storage.atomic import previous_path
 
 ROOT = Path(__file__).resolve().parents[2]
 NUM_CHUNKS, CHUNK_SIZE = 64, 4

@@ -18,12 +18,12 @@ import jax
 import numpy as np
 import pytest
 
-from ssplat_jax import cli
-from ssplat_jax.checkpoint.state import load_newest_state
+from ssplat_jax.checkpoint.stream_state import load_newest_state
+from ssplat_jax.commands import main as cli
 from ssplat_jax.errors import StorageError
-from ssplat_jax.export.atomic import previous_path, write_atomic
-from ssplat_jax.session import Session
-from tests.cli.test_cli import make_capture
+from ssplat_jax.storage.atomic import previous_path, write_atomic
+from ssplat_jax.streaming.session import Session
+from tests.commands.test_cli import make_capture
 
 NUM_CHUNKS, CHUNK_SIZE = 3, 2
 FIELDS_OF_ONE_PROCESS = ("compile_s", "step_memory_bytes")  # of metrics.json

@@ -9,7 +9,7 @@ from ssplat_jax.config import preset
 from ssplat_jax.errors import InputError, StorageError
 from ssplat_jax.model import init_params
 from tests.model.small import random_params
-from tests.test_stream import NARROW
+from tests.streaming.test_streamsplat import NARROW
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +50,7 @@ def test_a_flipped_bit_is_named(saved):
 
 
 def test_weights_of_another_width_are_refused_by_name(params, tmp_path):
-    save_weights(tmp_path / "w.npz", params, NARROW.replace(token_width=NARROW.token_width * 2), {})
+    save_weights(tmp_path / "w.npz", params, NARROW.replace(token_width=NARROW.network.token_width * 2), {})
     with pytest.raises(InputError, match="must be"):
         load_params(str(tmp_path / "w.npz"))
 
@@ -59,7 +59,7 @@ def test_a_stage_that_a_configuration_leaves_out_may_stand_in_the_weights(params
     """`--set mixer_blocks=0` and the like switch stages off; a stage too many is still refused."""
     check_params(params, NARROW.replace(mixer_blocks=0), "here")
     with pytest.raises(InputError, match=r"here.*mixer"):
-        check_params(params, NARROW.replace(mixer_blocks=NARROW.mixer_blocks + 1), "here")
+        check_params(params, NARROW.replace(mixer_blocks=NARROW.network.mixer_blocks + 1), "here")
 
 
 def test_overflowing_weights_are_not_saved(params, tmp_path):

@@ -8,7 +8,7 @@ import pytest
 from ssplat_jax.data.capture import open_capture
 from ssplat_jax.data.lens import Lens, check_lens, undistorted
 from ssplat_jax.errors import InputError
-from tests.data.test_captures import HEIGHT, WIDTH, make
+from tests.data.test_capture import HEIGHT, WIDTH, make
 
 WIDE, HIGH = 160, 120
 K = np.array([[130.0, 0, 83.0], [0, 128.0, 58.0], [0, 0, 1]])
@@ -33,7 +33,7 @@ def pinhole_pixels(lens, pixels):
     return found
 
 
-def centres():
+def centers():
     rows, columns = np.mgrid[:HIGH, :WIDE]
     return np.stack([columns, rows], axis=-1) + 0.5
 
@@ -41,9 +41,9 @@ def centres():
 @pytest.mark.parametrize("lens", LENSES, ids=str)
 def test_undistorted_is_what_a_pinhole_camera_sees(lens):
     assert check_lens(lens, K, WIDE, HIGH, "here") > 0.5
-    stored = scene(pinhole_pixels(lens, centres())).astype(np.float32)
-    delivered, expected = undistorted(stored, lens, K), scene(centres())
-    source = lens.pixels(K, centres())
+    stored = scene(pinhole_pixels(lens, centers())).astype(np.float32)
+    delivered, expected = undistorted(stored, lens, K), scene(centers())
+    source = lens.pixels(K, centers())
     inside = ((source > 1) & (source < (WIDE - 1, HIGH - 1))).all(-1)
     assert inside.mean() > 0.9
     assert np.abs(delivered - expected)[inside].max() < 0.005  # linear sampling
@@ -51,13 +51,13 @@ def test_undistorted_is_what_a_pinhole_camera_sees(lens):
 
 
 def test_no_distortion_changes_nothing():
-    image = scene(centres()).astype(np.float32)
+    image = scene(centers()).astype(np.float32)
     np.testing.assert_allclose(undistorted(image, Lens(), K), image, atol=1e-6)
     assert check_lens(Lens(), K, WIDE, HIGH, "here") == 0
 
 
 def test_depth_is_not_mixed_across_edges():
-    depth = np.where(centres()[..., 0] < 70, 1.0, 5.0).astype(np.float32)
+    depth = np.where(centers()[..., 0] < 70, 1.0, 5.0).astype(np.float32)
     assert set(np.unique(undistorted(depth, LENSES[0], K, order=0))) == {1.0, 5.0}
 
 

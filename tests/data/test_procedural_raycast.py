@@ -29,7 +29,7 @@ def pixel_rays(pose, K):
     return pose[:3, 3].astype(np.float64), local @ pose[:3, :3].T.astype(np.float64)
 
 
-def grey_library():
+def gray_library():
     """One white tile, and one whose left half is dark."""
     tiles = np.full((2, 256, 256, 3), 255, np.uint8)
     tiles[1, :, :128] = 51
@@ -37,7 +37,7 @@ def grey_library():
 
 
 def empty_builder(half=(4.0, 3.0, 5.0)):
-    b = SceneBuilder(np.random.default_rng(0), grey_library())
+    b = SceneBuilder(np.random.default_rng(0), gray_library())
     white = Finish((0,), glow=1.0, gain=(0.2, 0.4, 0.6))
     b.shell([0, 0, 0], half, white, white, white)
     b.dome(100.0, white)

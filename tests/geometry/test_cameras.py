@@ -1,4 +1,4 @@
-"""Cameras against float64: frames, pixels, and the one convention of pixel centres."""
+"""Cameras against float64: frames, pixels, and the one convention of pixel centers."""
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +23,7 @@ def poses(num: int, reach: float, seed: int = 0) -> np.ndarray:
 
 
 def intrinsics(num: int, seed: int = 0) -> np.ndarray:
-    """Off-centre, anisotropic."""
+    """Off-center, anisotropic."""
     rng = np.random.default_rng(seed)
     Ks = np.tile(np.eye(3), (num, 1, 1))
     Ks[:, 0, 0], Ks[:, 1, 1] = rng.uniform(200, 900, (2, num))
@@ -80,7 +80,7 @@ def test_pixel_centres_are_at_half():
     coarse = pixel_grid(8, 12, 4)
     assert coarse.shape == (2, 3, 2)
     np.testing.assert_array_equal(coarse[1, 2], [10, 6])
-    # A cell's centre is the mean of its pixels' centres.
+    # A cell's center is the mean of its pixels' centers.
     np.testing.assert_array_equal(coarse[1, 2], pixel_grid(8, 12)[4:8, 8:12].mean(axis=(0, 1)))
 
 
@@ -115,7 +115,7 @@ def test_a_point_between_two_points_of_a_voxel_is_in_that_voxel():
     np.testing.assert_array_equal(between[same], va[same])
 
 
-def test_hashes_of_neighbouring_voxels_spread_over_the_low_bits():
+def test_hashes_of_neighboring_voxels_spread_over_the_low_bits():
     side = np.arange(-16, 16)
     voxels = jnp.asarray(np.stack(np.meshgrid(side, side, side), -1).reshape(-1, 3), jnp.int32)
     hashes = np.asarray(hash_voxels(voxels))

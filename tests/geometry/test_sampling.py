@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ssplat_jax.geometry.sampling import correlate_warped, neighbours, places_of
+from ssplat_jax.geometry.sampling import correlate_warped, neighbors, places_of
 
 FLOAT32 = 2e-5  # sums of a dozen products of unit normals
 HEIGHT, WIDTH, CHANNELS = 5, 7, 6
@@ -48,7 +48,7 @@ def places(coords):
 
 def read(values, at):
     """A map of numbers at `at`, by the four samples' weights."""
-    to_right, to_below = neighbours(*values.shape)
+    to_right, to_below = neighbors(*values.shape)
     flat = values.reshape(-1)
     above, below = (
         (1 - at.right) * flat[at.corners + step] + at.right * flat[at.corners + step + to_right]
@@ -109,7 +109,7 @@ def test_beyond_the_border_and_not_a_number_read_the_nearest_border_sample():
     nearest = [2 * WIDTH, WIDTH - 1, WIDTH - 1, 0, (HEIGHT - 1) * WIDTH + 3]
     np.testing.assert_array_equal(read(VALUES, at), nearest)
     # All four samples lie in the map.
-    assert ((at.corners >= 0) & (at.corners + sum(neighbours(HEIGHT, WIDTH)) < HEIGHT * WIDTH)).all()
+    assert ((at.corners >= 0) & (at.corners + sum(neighbors(HEIGHT, WIDTH)) < HEIGHT * WIDTH)).all()
     for share in (at.right, at.down):
         assert ((share >= 0) & (share <= 1)).all()
 
@@ -119,7 +119,7 @@ def test_maps_with_a_side_of_one_sample(height, width):
     rng = np.random.default_rng(0)
     source, x, y = rng.normal(size=(height, width, 4)), rng.uniform(-1, 4, (2, 5)), rng.uniform(-1, 4, (2, 5))
     at = places_of(f32(x), f32(y), height, width)
-    assert ((at.corners >= 0) & (at.corners + sum(neighbours(height, width)) < height * width)).all()
+    assert ((at.corners >= 0) & (at.corners + sum(neighbors(height, width)) < height * width)).all()
     got = correlate_warped(jnp.ones((5, 4)), f32(source), at)
     along = source.sum(axis=-1).reshape(-1)
     wanted = np.interp(x if width > 1 else y, np.arange(len(along)), along)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ssplat_jax.checkpoint.upstream import tensors_of
+from ssplat_jax.checkpoint.published_weights import tensors_of
 from ssplat_jax.config import StreamConfig
 
 PARITY = Path(__file__).parents[3] / "shared" / "parity"

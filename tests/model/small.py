@@ -9,8 +9,8 @@ import numpy as np
 from ssplat_jax.cache import ProjectedCache
 from ssplat_jax.chunk import Chunk
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.stream import StreamSplat
-from ssplat_jax.struct import replace
+from ssplat_jax.pytree import replace
+from ssplat_jax.streaming.streamsplat import StreamSplat
 
 CONFIG = StreamConfig().replace(
     chunk_size=3,
@@ -24,7 +24,7 @@ CONFIG = StreamConfig().replace(
     token_width=16,
     cgfi_width=8,
     mixer_blocks=1,
-    mixer_neighbours=4,
+    mixer_neighbors=4,
     mixer_proj=8,
     min_confidence=0.0,
     capacity=1 << 10,
@@ -34,7 +34,7 @@ HEIGHT, WIDTH = 24, 30  # padded to 32 x 32: cells outside the image are part of
 
 
 def random_params(config: StreamConfig, seed: int = 0) -> dict:
-    """Random parameters: away from the start, where zero-initialised layers would hide what they do.
+    """Random parameters: away from the start, where zero-initialized layers would hide what they do.
 
     Drawn with NumPy for the shapes of `init`: nothing is compiled.
     """
@@ -134,7 +134,9 @@ def history(depths, confidences, feats=None, mask=None, colors=None) -> Projecte
     return ProjectedCache(
         depths=depths,
         confidences=confidences,
-        feats=jnp.zeros((*depths.shape, CONFIG.token_width)) if feats is None else jnp.asarray(feats, jnp.float32),
+        feats=jnp.zeros((*depths.shape, CONFIG.network.token_width))
+        if feats is None
+        else jnp.asarray(feats, jnp.float32),
         mask=depths > 0 if mask is None else jnp.asarray(mask),
         colors=jnp.zeros((*depths.shape, 3)) if colors is None else jnp.asarray(colors, jnp.float32),
     )

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from ssplat_jax.model import estimate_exposures, prepare_views
 from ssplat_jax.model.exposure import FEWEST_CELLS
-from ssplat_jax.struct import replace
+from ssplat_jax.pytree import replace
 from tests.model.small import CONFIG, chunk, history
 
 TRUSTING = CONFIG.replace(min_confidence=0.5)
@@ -32,7 +32,7 @@ def estimate():
 
 
 def scene(seed: int = 0):
-    """Colours of the cells as the cache remembers them, and depths, of all views."""
+    """Colors of the cells as the cache remembers them, and depths, of all views."""
     rng = np.random.default_rng(seed)
     return rng.uniform(0.2, 0.55, (VIEWS, CELLS, CELLS, 3)), rng.uniform(1, 6, (VIEWS, CELLS, CELLS))
 
@@ -87,7 +87,7 @@ def test_gains_of_views_are_found_among_noise_and_outliers():
     rng = np.random.default_rng(1)
     remembered, depths = scene()
     colors = remembered * GAINS[:, None, None] * np.exp(0.1 * rng.normal(size=remembered.shape))
-    colors[:, :5] = rng.uniform(0.1, 0.9, colors[:, :5].shape)  # a third is another colour altogether
+    colors[:, :5] = rng.uniform(0.1, 0.9, colors[:, :5].shape)  # a third is another color altogether
     np.testing.assert_allclose(exposures(remembered, colors, depths), GAINS, rtol=0.05)
 
 

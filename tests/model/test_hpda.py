@@ -7,7 +7,7 @@ import pytest
 
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.model.hpda import anchor_depth, cache_anchor, expected_log_depth, inject_anchor, peak_confidence
-from ssplat_jax.model.wires import DepthBelief, prepare_views
+from ssplat_jax.model.types import DepthBelief, prepare_views
 from tests.model.small import chunk, finite, history
 
 D = 24
@@ -121,7 +121,7 @@ def test_mass_norm_makes_gamma_the_odds_of_history():
 
 
 @pytest.mark.parametrize("half_width", [0, 1, 3])
-def test_window_confidence_is_the_best_mass_of_neighbouring_candidates(half_width):
+def test_window_confidence_is_the_best_mass_of_neighboring_candidates(half_width):
     config = CONFIG.replace(confidence="window", confidence_window=half_width)
     probs = np.asarray(beliefs(3), np.float64)
     sums = [probs[..., max(0, i - half_width) : i + half_width + 1].sum(-1) for i in range(D)]

@@ -1,4 +1,4 @@
-"""CGFI and the 3D mixer: when history is heard, and who a token's neighbours are."""
+"""CGFI and the 3D mixer: when history is heard, and who a token's neighbors are."""
 
 import jax
 import jax.numpy as jnp
@@ -7,14 +7,14 @@ import pytest
 
 from ssplat_jax.model import inject_features
 from ssplat_jax.model.cgfi import Aggregator
+from ssplat_jax.model.compact.local_mixer import mix_tokens
 from ssplat_jax.model.layers import rms_normalize
-from ssplat_jax.model.mixer import mix_tokens
-from ssplat_jax.model.neighbours import nearest_tokens
-from ssplat_jax.model.wires import prepare_views
-from ssplat_jax.struct import replace
+from ssplat_jax.model.nearest_tokens import nearest_tokens
+from ssplat_jax.model.types import prepare_views
+from ssplat_jax.pytree import replace
 from tests.model.small import CONFIG, chunk, history, params
 
-C = CONFIG.token_width
+C = CONFIG.network.token_width
 GRID = (3, 8, 8)
 
 
@@ -78,8 +78,8 @@ def brute_force(points, usable, candidates, k):
 
 
 @pytest.mark.parametrize("radius", [0, 1, 2])
-def test_neighbours_are_the_nearest_in_space_the_token_itself_first(radius):
-    config = CONFIG.replace(mixer_radius=radius, mixer_neighbours=4)
+def test_neighbors_are_the_nearest_in_space_the_token_itself_first(radius):
+    config = CONFIG.replace(mixer_radius=radius, mixer_neighbors=4)
     positions = maps(2, 3)
     inside = jnp.asarray(np.random.default_rng(3).uniform(size=GRID) < 0.8)
     found = np.asarray(nearest_tokens(positions, inside, config))
@@ -117,12 +117,10 @@ def test_mixing_does_not_depend_on_the_order_of_the_views():
 def test_a_valid_token_never_hears_cells_outside_the_image():
     feats, positions = maps(4, C), maps(5, 3)
     inside = jnp.ones(GRID, bool).at[:, :, 6:].set(False)
-    neighbours_only = {**params()["mixer"]}
-    neighbours_only["global_blocks_0"] = jax.tree.map(jnp.zeros_like, neighbours_only["global_blocks_0"])
+    neighbors_only = {**params()["mixer"]}
+    neighbors_only["global_blocks_0"] = jax.tree.map(jnp.zeros_like, neighbors_only["global_blocks_0"])
     loud = jnp.where(inside[..., None], feats, feats + 100.0)
-    out = [
-        mix_tokens(neighbours_only, f, positions, inside, jnp.ones(3, bool), CONFIG)[:, :, :6] for f in (feats, loud)
-    ]
+    out = [mix_tokens(neighbors_only, f, positions, inside, jnp.ones(3, bool), CONFIG)[:, :, :6] for f in (feats, loud)]
     np.testing.assert_array_equal(*out)
 
 

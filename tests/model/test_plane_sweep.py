@@ -6,11 +6,11 @@ import numpy as np
 
 from ssplat_jax.chunk import Chunk
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.model.cost_volume import plane_sweep
-from ssplat_jax.model.encoder import encode
-from ssplat_jax.model.sweep import sweep_pixels
-from ssplat_jax.model.wires import prepare_views
-from ssplat_jax.struct import replace
+from ssplat_jax.model.compact.cnn_encoder import encode
+from ssplat_jax.model.compact.sweep_matching import plane_sweep
+from ssplat_jax.model.plane_sweep import sweep_pixels
+from ssplat_jax.model.types import prepare_views
+from ssplat_jax.pytree import replace
 from tests.model.small import random_params
 
 CONFIG = StreamConfig().replace(
@@ -33,12 +33,12 @@ def texture(x, y):
 
 def wall_chunk() -> Chunk:
     """Three views of the wall z = WALL, side by side."""
-    centres = BASELINE * np.array([-1.0, 0.0, 1.0])
+    centers = BASELINE * np.array([-1.0, 0.0, 1.0])
     pixel = np.arange(SIDE) + 0.5
     u, v = np.meshgrid(pixel, pixel)
-    images = [texture((u - SIDE / 2) / FOCAL * WALL + c, (v - SIDE / 2) / FOCAL * WALL) for c in centres]
+    images = [texture((u - SIDE / 2) / FOCAL * WALL + c, (v - SIDE / 2) / FOCAL * WALL) for c in centers]
     viewmats = np.tile(np.eye(4), (3, 1, 1))
-    viewmats[:, 0, 3] = -centres
+    viewmats[:, 0, 3] = -centers
     K = np.array([[FOCAL, 0, SIDE / 2], [0, FOCAL, SIDE / 2], [0, 0, 1]])
     return Chunk(
         images=jnp.asarray(np.stack(images), jnp.float32),
@@ -57,14 +57,14 @@ def cost(params, chunk):
 
 
 def wall_cost(chunk):
-    return np.asarray(cost(random_params(CONFIG), chunk)).reshape(3, SIDE // 4, SIDE // 4, 2, CONFIG.num_depths)
+    return np.asarray(cost(random_params(CONFIG), chunk)).reshape(3, SIDE // 4, SIDE // 4, 2, CONFIG.network.num_depths)
 
 
 def test_the_cost_of_an_untrained_network_peaks_at_the_wall():
     both = wall_cost(wall_chunk())
     assert (np.abs(both) <= 1 + 1e-5).all()  # means of cosines
     scores = both.sum(axis=3)
-    candidates = np.exp(np.linspace(np.log(1.0), np.log(5.0), CONFIG.num_depths))
+    candidates = np.exp(np.linspace(np.log(1.0), np.log(5.0), CONFIG.network.num_depths))
     truth = int(np.argmin(np.abs(np.log(candidates / WALL))))
     # The middle view's cells that both others see at every candidate behind 1.3.
     near = np.abs(scores[1, :, 4:-4].argmax(-1) - truth) <= 1

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ssplat_jax.stream import StreamSplat
-from ssplat_jax.struct import replace
+from ssplat_jax.pytree import replace
+from ssplat_jax.streaming.streamsplat import StreamSplat
 from tests.geometry.test_rotations import rodrigues
 from tests.model.small import (
     CONFIG,
@@ -30,7 +30,7 @@ SUMS = 1e-6
 
 
 def turned(angle_step: float):
-    """Rotations about the vertical through one centre: no parallax at all."""
+    """Rotations about the vertical through one center: no parallax at all."""
     viewmats = np.tile(np.eye(4), (3, 1, 1))
     for i, matrix in enumerate(viewmats):
         matrix[:3, :3] = rodrigues([0, 1, 0], angle_step * i)
@@ -205,8 +205,8 @@ def test_the_smallest_configurations_run(changes):
     config = CONFIG.replace(**changes)
     model = StreamSplat(config)
     weights = random_params(config)
-    cache, output = jax.jit(model.step)(weights, model.init_cache(), chunk(views=config.chunk_size))
+    cache, output = jax.jit(model.step)(weights, model.init_cache(), chunk(views=config.stream.chunk_size))
     assert finite((cache, output)) and int(cache.num_voxels) > 0
     assert finite(model.decode(weights, cache))
-    if config.num_depths == 1:
+    if config.network.num_depths == 1:
         np.testing.assert_allclose(output.depths, chunk().near, rtol=1e-6)

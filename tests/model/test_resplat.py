@@ -13,12 +13,12 @@ from ssplat_jax.model import count_params, init_params, inject_features, prepare
 from ssplat_jax.model.hpda import expected_log_depth
 from ssplat_jax.model.resplat.cost_volume import plane_sweep
 from ssplat_jax.model.resplat.encoder import Transformer
-from ssplat_jax.model.resplat.layers import EdgeConv, GrowingConv, resize
+from ssplat_jax.model.resplat.swin_layers import EdgeConv, GrowingConv, resize
 from ssplat_jax.model.resplat.vit import POSITIONS_SIDE, grid_size, resampled_positions
+from ssplat_jax.model.types import to_candidate_space
 from ssplat_jax.model.windows import in_one_region
-from ssplat_jax.model.wires import to_candidate_space
-from ssplat_jax.stream import StreamSplat
-from ssplat_jax.struct import replace
+from ssplat_jax.pytree import replace
+from ssplat_jax.streaming.streamsplat import StreamSplat
 from ssplat_jax.train.losses import soft_targets
 from tests.model.small import chunk, history, random_params
 
@@ -35,7 +35,7 @@ def test_presets_have_the_published_number_of_parameters(name, millions):
 
 
 def test_a_stage_by_itself_is_initialised_as_among_all():
-    config = StreamConfig(token_width=8, cgfi_width=8, mixer_blocks=1)
+    config = StreamConfig().replace(token_width=8, cgfi_width=8, mixer_blocks=1)
     whole, part = (init_params(jax.random.key(3), config, only) for only in (None, ("hpda", "decoder")))
     assert set(part) == {"hpda", "decoder"}
     jax.tree.map(np.testing.assert_array_equal, part, {name: whole[name] for name in part})
@@ -112,11 +112,11 @@ def test_keys_of_all_sources_are_masked_alike():
 
 def test_the_compact_network_has_no_coarser_match_grid():
     with pytest.raises(InputError, match="match_stride must be 4 with this network, got 8"):
-        StreamConfig(match_stride=8)
+        StreamConfig().replace(match_stride=8)
     with pytest.raises(InputError, match="depth_range must be two depths, the nearer first"):
         preset("small").replace(depth_range=(2.0, 1.0))
     with pytest.raises(InputError, match="depth_space must be 'log' with this network, got 'inverse'"):
-        StreamConfig(depth_space="inverse")
+        StreamConfig().replace(depth_space="inverse")
 
 
 def test_depths_are_averaged_where_candidates_are_equally_far_apart():
@@ -127,7 +127,7 @@ def test_depths_are_averaged_where_candidates_are_equally_far_apart():
         apart = np.diff(np.asarray(to_candidate_space(candidates, config), np.float64))
         np.testing.assert_allclose(apart, apart[0], rtol=1e-3)
         np.testing.assert_allclose(np.exp(sorted(candidates[jnp.array([0, -1])])), [2.0, 8.0], rtol=1e-6)
-        both_ends = jnp.zeros(config.num_depths).at[jnp.array([0, -1])].set(0.5)
+        both_ends = jnp.zeros(config.network.num_depths).at[jnp.array([0, -1])].set(0.5)
         assert np.exp(expected_log_depth(both_ends, candidates, config)) == pytest.approx(average, rel=1e-5)
         # A true depth is one of the candidates around it, however far apart they are there.
         for truth in np.log([2.05, 3.0, 5.0, 7.8]):
@@ -156,7 +156,7 @@ def views(**changes):
 
 def test_the_stream_fills_its_memory_and_depths_stay_among_the_candidates():
     cache, out = step()(params(), MODEL.init_cache(), views())
-    near, far = CONFIG.depth_range
+    near, far = CONFIG.network.depth_range
     assert out.depths.shape == (3, 16, 16)  # padded to 64 x 64
     assert near * (1 - 1e-5) <= out.depths.min() and out.depths.max() <= far * (1 + 1e-5)
     assert int(cache.stats.num_accepted) == 3 * 10 * 14
@@ -194,7 +194,7 @@ def test_a_view_alone_is_matched_with_nothing_and_stays_finite():
 
 def test_what_cgfi_hears_has_one_size_however_large_features_are():
     rng = np.random.default_rng(0)
-    grid, c = (3, 8, 8), CONFIG.token_width
+    grid, c = (3, 8, 8), CONFIG.network.token_width
     feats = jnp.asarray(rng.normal(size=(*grid, c)), jnp.float32)
     remembered = rng.normal(size=(*grid, c))
     here = prepare_views(views(), CONFIG)

@@ -18,10 +18,10 @@ from ssplat_jax.model import resplat
 from ssplat_jax.model.convolution import pixel_unshuffle
 from ssplat_jax.model.hpda import expected_log_depth
 from ssplat_jax.model.resplat.head import GaussianHead
-from ssplat_jax.model.resplat.layers import resize
+from ssplat_jax.model.resplat.swin_layers import resize
 from ssplat_jax.model.resplat.tokens import token_context
 from ssplat_jax.model.resplat.upsampler import Upsampler
-from ssplat_jax.model.wires import AnchoredDepth, Views, prepare_views, to_candidate_space
+from ssplat_jax.model.types import AnchoredDepth, Views, prepare_views, to_candidate_space
 from tests.model.resplat_fixture import load_golden, named_params, tap_error
 
 TOLERANCE = 2e-4
@@ -76,7 +76,7 @@ def resplat_values() -> dict[str, tuple[np.ndarray, np.ndarray]]:
         feats = resplat.regress_tokens(params["tokens"], features, belief, depth, views, config)
         positions, footprints = stages.back_project(depth.log_depths, views)
         mixed = resplat.mix_tokens(params["mixer"], feats, positions, views.inside, views.valid, config)
-        flat = mixed.reshape(-1, config.token_width)
+        flat = mixed.reshape(-1, config.network.token_width)
         shapes = resplat.read_shapes(params["decoder"], flat, config)
         quats = matrices_to_quats(jnp.swapaxes(views.viewmats[:, :3, :3], -1, -2))
         gaussians = stages.decode_tokens(

@@ -20,10 +20,10 @@ from ssplat_jax import model as stages
 from ssplat_jax.cache import PIVOT_FIELDS, Tokens, VoxelCache, bear_witness, carve, init_cache, judge, project
 from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.model import compact
-from ssplat_jax.model.cost_volume import plane_sweep
-from ssplat_jax.model.wires import DepthBelief, Features, Views, prepare_views
+from ssplat_jax.model.compact.sweep_matching import plane_sweep
+from ssplat_jax.model.types import DepthBelief, Features, Views, prepare_views
 from ssplat_jax.numerics import softplus_inverse
-from ssplat_jax.struct import replace
+from ssplat_jax.pytree import replace
 from tests.cache import streams
 from tests.cache.test_project_oracle import front_camera, with_pivots
 from tests.geometry.test_rotations import rodrigues
@@ -32,7 +32,7 @@ from tests.model.small import CONFIG, chunk, finite, history, params, random_par
 SUMS = 1e-6  # of probabilities: issue 3's, a dozen float32 roundings
 FLOAT32 = 1e-5
 OFF = -200.0  # softplus underflows: gamma is 0
-D = CONFIG.num_depths
+D = CONFIG.network.num_depths
 
 
 @pytest.fixture(autouse=True)
@@ -87,7 +87,7 @@ def is_the_matchers(given, matched, result):
 def is_the_anchor(given, matched, result):
     omega = np.asarray(given["confidences"], np.float64)[..., None]
     offsets = np.asarray(CANDIDATES, np.float64) - np.log(np.asarray(given["depths"], np.float64))[..., None]
-    anchor = omega * np.exp(-0.5 * (offsets / (CONFIG.sigma0 + CONFIG.lambda_sigma * (1 - omega))) ** 2)
+    anchor = omega * np.exp(-0.5 * (offsets / (CONFIG.history.sigma0 + CONFIG.history.lambda_sigma * (1 - omega))) ** 2)
     np.testing.assert_allclose(result.probs, anchor / anchor.sum(-1, keepdims=True), atol=FLOAT32)
 
 
@@ -225,7 +225,7 @@ HALF = jnp.bfloat16
 def ordinary() -> dict:
     """Inputs of the stages behind the encoder: bfloat16 features, a history over two thirds of the cells."""
     rng = np.random.default_rng(1)
-    width = CONFIG.encoder_widths[1]
+    width = CONFIG.network.encoder_widths[1]
     normal = lambda *shape: jnp.asarray(rng.normal(size=shape), HALF)  # noqa: E731
     known = rng.uniform(size=GRID) < 2 / 3
     past = history(
@@ -234,11 +234,11 @@ def ordinary() -> dict:
     return {
         "params": params(),
         "features": Features(
-            fine=normal(3, 16, 16, CONFIG.match_width),
-            grid=normal(*GRID, CONFIG.match_width),
+            fine=normal(3, 16, 16, CONFIG.network.match_width),
+            grid=normal(*GRID, CONFIG.network.match_width),
             context=normal(*GRID, 2 * width),
         ),
-        "past": replace(past, feats=normal(*GRID, CONFIG.token_width) * known[..., None].astype(HALF)),
+        "past": replace(past, feats=normal(*GRID, CONFIG.network.token_width) * known[..., None].astype(HALF)),
         "views": prepare_views(chunk(), CONFIG),
     }
 
@@ -256,7 +256,7 @@ def tokens_and_gaussians():
         injected = stages.inject_features(params["cgfi"], regressed, past, depth.anchored_confidences, views, CONFIG)
         mixed = compact.mix_tokens(params["mixer"], injected, positions, views.inside, views.valid, CONFIG)
         gaussians = stages.decode_tokens(
-            compact.read_shapes(params["decoder"], mixed.reshape(-1, CONFIG.token_width).astype(HALF), CONFIG),
+            compact.read_shapes(params["decoder"], mixed.reshape(-1, CONFIG.network.token_width).astype(HALF), CONFIG),
             means=positions.reshape(-1, 3),
             rgbs=stages.patch_colors(views.images, CONFIG).reshape(footprints.size, -1),
             quats=jnp.ones((footprints.size, 4)),
@@ -500,14 +500,14 @@ ANY = CACHE.replace(min_confidence=0.0)
 
 
 def offered(means, confidences=0.5, feats=1.0, valid=True, **changes) -> Tokens:
-    """Tokens at `means`; their colours number them."""
+    """Tokens at `means`; their colors number them."""
     n = len(means)
     full = lambda x, *shape: jnp.broadcast_to(jnp.asarray(x, jnp.float32), (n, *shape))  # noqa: E731
     tokens = Tokens(
         means=jnp.asarray(means, jnp.float32),
         feats=full(feats, streams.WIDTH),
         confidences=full(confidences),
-        rgbs=jnp.arange(n, dtype=jnp.float32)[:, None] * jnp.ones(3 * CONFIG.gaussians_per_token),
+        rgbs=jnp.arange(n, dtype=jnp.float32)[:, None] * jnp.ones(3 * CONFIG.head.gaussians_per_token),
         quats=full([1.0, 0, 0, 0], 4),
         footprints=full(0.1),
         valid=jnp.broadcast_to(jnp.asarray(valid), (n,)),
@@ -673,7 +673,7 @@ VERDICTS = {
     "omega 1 seen": (1.0, 1.0, 1.0, 0.95),
     "omega to 0 seen": (1e-37, 1.0, 1.0, 0.0326),  # held to 0.02, then odds x e^0.5
     "witness of omega 0": (0.6, 2.0, 0.0, NOT_JUDGED),
-    "witness at tau": (0.6, 2.0, float(np.float32(CACHE.min_confidence)), 0.4515),
+    "witness at tau": (0.6, 2.0, float(np.float32(CACHE.memory.min_confidence)), 0.4515),
     "surface on the camera": (0.6, 1e-30, 1.0, NOT_JUDGED),  # the pivot is hidden behind it
     "surface at infinity": (0.6, np.inf, 1.0, NOT_JUDGED),
     "surface at 1e30": (0.6, 1e30, 1.0, 0.1687),
@@ -701,7 +701,7 @@ def test_hard_verdict_on_pivots_and_on_tokens(name):
     witness = bearing(replace(empty(), stats=replace(empty().stats, num_chunks=jnp.int32(1))), *seen)
     token = judging(witness.witnesses, offered([[0, 0, 1.0]], confidences=confidence))
     assert finite((witness, token))
-    below_tau = confidence < CACHE.min_confidence
+    below_tau = confidence < CACHE.memory.min_confidence
     assert float(token.confidences[0]) == pytest.approx(confidence if below_tau else wanted, rel=2e-3)
 
 

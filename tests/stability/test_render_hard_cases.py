@@ -14,9 +14,10 @@ import pytest
 
 from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.geometry.cameras import Camera
-from ssplat_jax.render import Effects, api, render
-from ssplat_jax.struct import replace
-from tests.render import oracle
+from ssplat_jax.pytree import replace
+from ssplat_jax.rasterizer import Effects, render
+from ssplat_jax.rasterizer.render import Inputs, prepare
+from tests.rasterizer import oracle
 
 NUM, CROWD, WIDTH, HEIGHT = 64, 4096, 24, 16
 EFFECTS = Effects(outputs=("color", "alpha", "depth", "median_depth"))
@@ -26,7 +27,7 @@ F = np.float32
 
 
 def base(num: int = NUM) -> dict[str, np.ndarray]:
-    """One visible grey Gaussian in the middle; the other rows absent."""
+    """One visible gray Gaussian in the middle; the other rows absent."""
     arrays = {
         "means": np.zeros((num, 3)),
         "quats": np.tile([1.0, 0.0, 0.0, 0.0], (num, 1)),
@@ -72,7 +73,7 @@ def simple(name: str, **fields) -> None:
 
 
 # -- position
-simple("at the camera centre", means=[0, 0, 0])
+simple("at the camera center", means=[0, 0, 0])
 simple("on the near plane", means=[0, 0, 0.01])
 simple("just before the near plane", means=[0, 0, 0.0099])
 simple("just behind the near plane", means=[0, 0, 0.0101], scales=1e-4)
@@ -86,7 +87,7 @@ simple("off screen but reaching in", means=[2.5, 0, 2.0], scales=0.6)
 simple("grazing the image plane", means=[5.0, 0, 0.05], scales=0.2)
 simple("very far", means=[0, 0, 1e8])
 simple("very far and huge", means=[0, 0, 1e8], scales=1e7)
-simple("on a pixel centre", means=[0.05, 0.05, 2.0])
+simple("on a pixel center", means=[0.05, 0.05, 2.0])
 simple("on a tile corner", means=[0.4, 0.0, 2.0])
 simple("at the image corner", means=[-1.2, -0.8, 2.0])
 # -- shape
@@ -107,7 +108,7 @@ simple("negative scale", scales=-0.1)
 simple("view exactly along an axis", means=[0, 0, 2.0], scales=[0.1, 0.2, 0.3])
 # -- rotation
 simple("quaternion 0", quats=0.0)
-simple("quaternion unnormalised", quats=[3.0, 1.0, -2.0, 0.5])
+simple("quaternion unnormalized", quats=[3.0, 1.0, -2.0, 0.5])
 simple("quaternion 1e-20", quats=[1e-20, 0, 1e-20, 0])
 simple("quaternion 1e11", quats=[1e11, 1e11, 0, 0])
 simple("quaternion negated", quats=[-1.0, 0, 0, 0])
@@ -121,9 +122,9 @@ simple("opacity 1", opacities=1.0)
 simple("opacity above 1", opacities=1.5)
 simple("opacity negative", opacities=-0.5)
 simple("opacity 1e-40", opacities=1e-40)
-# -- colour
-simple("colour below 0", sh=-5.0)
-simple("colour 1e6", sh=1e6)
+# -- color
+simple("color below 0", sh=-5.0)
+simple("color 1e6", sh=1e6)
 simple("SH looking along the pole", means=[0, 0, 2.0], sh=np.linspace(-0.5, 0.5, 48).reshape(16, 3))
 simple("SH of degree 3 aside", means=[0.8, 0.5, 2.0], sh=np.linspace(-0.5, 0.5, 48).reshape(16, 3))
 # -- not finite: culled and counted
@@ -207,12 +208,12 @@ WITHOUT_LIMIT = {
     "faint layers down to the stop",
     "opaque layers that end on the stop",  # (1 - 0.99)^2 is the stop itself
     "opacity 1/255",
-    "colour 1e6",
+    "color 1e6",
 }
 
 
 def layers(a: dict, opacity: float) -> None:
-    """All rows behind one another, each over the whole image, in colours of their own."""
+    """All rows behind one another, each over the whole image, in colors of their own."""
     num = len(a["means"])
     a["means"][:] = np.stack([np.zeros(num), np.zeros(num), np.linspace(1, 3, num)], axis=1)
     a["scales"][:], a["opacities"][:] = 10.0, opacity
@@ -367,17 +368,17 @@ def test_an_image_of_one_pixel():
     np.testing.assert_allclose(out.color, wanted[0], atol=TOLERANCE)
 
 
-def test_bfloat16_colours_are_composited_in_float32():
+def test_bfloat16_colors_are_composited_in_float32():
     gaussians, camera = build(base())
     half = replace(gaussians, sh=gaussians.sh.astype(jnp.bfloat16))
     shapes = jax.eval_shape(lambda g: render(g, camera, effects=EFFECTS, max_pairs=1 << 12), half)
     assert shapes.color.dtype == shapes.depth.dtype == jnp.float32
-    prepared = api.prepare(api.Inputs(half, camera), EFFECTS)[0]
+    prepared = prepare(Inputs(half, camera), EFFECTS)[0]
     np.testing.assert_array_equal(prepared.sh, half.sh.astype(jnp.float32))
 
 
 @pytest.mark.slow
-def test_bfloat16_colours_give_the_rounded_colours_image_and_gradient():
+def test_bfloat16_colors_give_the_rounded_colors_image_and_gradient():
     gaussians, camera = build(base())
     half = replace(gaussians, sh=gaussians.sh.astype(jnp.bfloat16))
     rounded = replace(gaussians, sh=half.sh.astype(jnp.float32))

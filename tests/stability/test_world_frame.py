@@ -18,18 +18,18 @@ from scipy.spatial import cKDTree
 from ssplat_jax.cache import init_cache
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.data.capture import Capture, open_capture
-from ssplat_jax.data.frame import StreamFrame
-from ssplat_jax.data.sh_rotation import sh_rotation
-from ssplat_jax.export.ply import load_ply, save_ply
+from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.geometry.rotations import quats_to_matrices
-from ssplat_jax.stream import StreamSplat
+from ssplat_jax.geometry.sh_rotation import sh_rotation
+from ssplat_jax.scene_files.ply import load_ply, save_ply
+from ssplat_jax.streaming.streamsplat import StreamSplat
 from tests.geometry.test_rotations import rodrigues
 from tests.model import small
 from tests.model.small import random_params
 from tests.model.test_plane_sweep import WALL, texture
 
-UNSHIFTED = 1e-3  # issue 3's, in units of a room of some metres
+UNSHIFTED = 1e-3  # issue 3's, in units of a room of some meters
 SHARE = 0.99  # of the Gaussians
 FRAMES, SIDE = 8, 64
 VOXEL = 0.25  # stream units: large enough that tokens of an untrained network merge
@@ -37,7 +37,7 @@ VOXEL = 0.25  # stream units: large enough that tokens of an untrained network m
 CONFIG = small.CONFIG.replace(
     chunk_size=4,
     attention_blocks=1,
-    attention_window=StreamConfig().attention_window,
+    attention_window=StreamConfig().network.attention_window,
     fine_matching=False,
     sh_degree=1,
     voxel_size=VOXEL,
@@ -52,7 +52,7 @@ MOTIONS = {  # scale, rotation, translation of the world
     "shifted by 6.4e6": (1.0, np.eye(3), EARTH),
     "turned and shifted": (1.0, TURN, SOMEWHERE),
     "turned and shifted by 6.4e6": (1.0, TURN, EARTH),
-    "in millimetres": (1000.0, np.eye(3), np.zeros(3)),
+    "in millimeters": (1000.0, np.eye(3), np.zeros(3)),
     "in another unit, turned and shifted": (0.013, TURN, SOMEWHERE),
 }
 
@@ -176,7 +176,7 @@ def test_8_moving_the_world_moves_the_gaussians(open_moved, name, vacc):
         b.axes[nearest] - rotation @ a.axes[is_same],
         b.scales[nearest] / (scale * a.scales[is_same]) - 1,
         b.opacities[nearest] - a.opacities[is_same],
-        b.sh[nearest] - np.einsum("kl,nlc->nkc", sh_rotation(rotation, CONFIG.sh_degree), a.sh[is_same]),
+        b.sh[nearest] - np.einsum("kl,nlc->nkc", sh_rotation(rotation, CONFIG.head.sh_degree), a.sh[is_same]),
     )
     for deviation in deviations:
         assert np.quantile(np.abs(deviation).reshape(len(nearest), -1).max(axis=1), share) < UNSHIFTED

@@ -11,7 +11,7 @@ import numpy as np
 
 from ssplat_jax.train import loop
 from ssplat_jax.train.recipe import smoke_recipe
-from tests.test_stream import NARROW
+from tests.streaming.test_streamsplat import NARROW
 
 STEPS = 200
 

@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 
 from ssplat_jax.cache import Tokens
-from ssplat_jax.checkpoint.training import TrainingCheckpoints
+from ssplat_jax.checkpoint.training_state import TrainingCheckpoints
 from ssplat_jax.data.procedural import training_sample
 from ssplat_jax.errors import InputError
-from ssplat_jax.stream import StreamSplat
-from ssplat_jax.struct import replace
+from ssplat_jax.pytree import replace
+from ssplat_jax.streaming.streamsplat import StreamSplat
 from ssplat_jax.train import loop
 from ssplat_jax.train.losses import depth_loss, image_gradient_l1, soft_targets
 from ssplat_jax.train.recipe import ALL_BUT_HEAD, Phase, PhaseForm, smoke_recipe, training_config
 from ssplat_jax.train.samples import log_depths_at_cells, make_sample, prefetched, sample_for_step
 from ssplat_jax.train.step import Trainer, decode_accepted, init_state, learning_rate, loss_fn, pad_like, stream_chunks
 from tests.model.small import random_params
-from tests.test_stream import NARROW
+from tests.streaming.test_streamsplat import NARROW
 
 RECIPE = smoke_recipe(4)
 
@@ -51,14 +51,14 @@ def test_sample_depth_lies_in_the_sweep_and_first_camera_is_the_origin():
     assert float(inside.mean()) > 0.97  # the margins leave out at most the tails beyond the 1 % quantiles
 
 
-def test_the_truth_of_a_cell_is_the_depth_at_its_centre():
-    # A wall that recedes evenly in log depth: a cell's centre is the corner of its pixels 1 and 2, at (2, 2).
+def test_the_truth_of_a_cell_is_the_depth_at_its_center():
+    # A wall that recedes evenly in log depth: a cell's center is the corner of its pixels 1 and 2, at (2, 2).
     y, x = np.mgrid[0:8, 0:12] + 0.5
     logs = 0.01 * y - 0.005 * x
-    centres_y, centres_x = np.mgrid[0:2, 0:3] * 4.0 + 2.0
+    centers_y, centers_x = np.mgrid[0:2, 0:3] * 4.0 + 2.0
     found = log_depths_at_cells(np.exp(logs))
-    np.testing.assert_allclose(found, 0.01 * centres_y - 0.005 * centres_x, atol=1e-6)
-    # An edge through the centre: one of its two surfaces, never what lies between them.
+    np.testing.assert_allclose(found, 0.01 * centers_y - 0.005 * centers_x, atol=1e-6)
+    # An edge through the center: one of its two surfaces, never what lies between them.
     logs[:, 6:] += 1.0
     assert np.abs(log_depths_at_cells(np.exp(logs))[:, 1] - found[:, 1] - 1.0).max() < 0.02
 
@@ -179,7 +179,7 @@ def test_what_a_witness_looked_through_is_not_rendered():
     depths = jnp.array([1.0, 2.0, 3.0, 2.0])  # a floater, the wall, what it hides, and what is not trusted
     tokens = Tokens(
         means=jnp.array([[0.01, 0.01, 1.0]]) * depths[:, None],
-        feats=jnp.ones((4, NARROW.token_width)),
+        feats=jnp.ones((4, NARROW.network.token_width)),
         confidences=jnp.array([0.6, 0.6, 0.6, 0.2]),
         rgbs=jnp.full((4, 12), 0.5),
         quats=jnp.tile(jnp.array([1.0, 0, 0, 0]), (4, 1)),

@@ -1,8 +1,8 @@
 """Procedural worlds with exact cameras and depth: for training, for the demo, for tests. +y is down."""
 
 from ssplat_jax.data.procedural.paths import PATH_KINDS, sample_path
+from ssplat_jax.data.procedural.procedural_views import CAPTURES, STEPS, procedural_capture_arrays, training_sample
 from ssplat_jax.data.procedural.raycast import raycast, raycast_depths
-from ssplat_jax.data.procedural.samples import CAPTURES, STEPS, procedural_capture_arrays, training_sample
 from ssplat_jax.data.procedural.scene import Scene, clearance, scale_scene
 from ssplat_jax.data.procedural.scenes import SCENE_KINDS, sample_scene
 from ssplat_jax.data.procedural.textures import texture_library

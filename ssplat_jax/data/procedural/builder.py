@@ -21,7 +21,7 @@ class Finish:
     bias: tuple[float, float, float] = (0.0, 0.0, 0.0)
     glow: float = 0.0  # 1: lights itself, unshaded
     is_turned: bool = False  # tiles are turned by a random angle
-    is_centered: bool = False  # tiles are symmetric about the solid's centre, which closes a dome's seams
+    is_centered: bool = False  # tiles are symmetric about the solid's center, which closes a dome's seams
 
 
 def yaw_rotation(angle: float) -> np.ndarray:
@@ -54,7 +54,7 @@ class SceneBuilder:
     # -- finishes ---------------------------------------------------------------------------------------------------
 
     def finish(self, *groups: str, tile: float = 1.0, same: bool = True, tint: float = 0.15, **options) -> Finish:
-        """A finish from one of the texture `groups`, its colour shifted by up to `tint`."""
+        """A finish from one of the texture `groups`, its color shifted by up to `tint`."""
         rng = self.rng
         ids = self.library.groups[groups[rng.integers(len(groups))]]
         textures = tuple(int(i) for i in rng.choice(ids, 1 if same else 3))

@@ -76,7 +76,7 @@ def _step_factor(rng: np.random.Generator, irregularity: float) -> float:
 
 
 def _intrinsics(rng: np.random.Generator, num_views: int, height: int, width: int) -> np.ndarray:
-    """A focal length of 0.6 to 1.3 long sides and a principal point up to 4 % off the centre."""
+    """A focal length of 0.6 to 1.3 long sides and a principal point up to 4 % off the center."""
     focal = np.exp(rng.uniform(np.log(0.6), np.log(1.3))) * max(height, width)
     cx, cy = (0.5 + rng.uniform(-0.04, 0.04, 2)) * [width, height]
     K = np.array([[focal, 0, cx], [0, focal * rng.uniform(0.99, 1.01), cy], [0, 0, 1]], np.float32)

@@ -1,8 +1,8 @@
-"""The ray-caster: exact depth and antialiased colour of a `Scene`, one compilation for every scene.
+"""The ray-caster: exact depth and antialiased color of a `Scene`, one compilation for every scene.
 
 Rays carry a direction whose camera z is 1, so the parameter of a hit is its z-depth. Each solid is a unit shape (cube,
 ball, cylinder along y) in its own frame, entered where all of its slabs have been entered; the shell closes the world
-and is left, not entered. Depth is that of the pixel's centre; colour is the mean of `supersample` rays per pixel, each
+and is left, not entered. Depth is that of the pixel's center; color is the mean of `supersample` rays per pixel, each
 with a trilinear texture lookup at the ray's own footprint. Unused rows cost nothing: loops run to the scene's counts.
 """
 
@@ -31,7 +31,7 @@ def raycast(
     width: int,
     supersample: int = 2,
 ) -> tuple[Float[Array, "v h w 3"], Float[Array, "v h w"]]:
-    """Images in [0, 1] and z-depths of the scene in every view, `supersample` colour rays a pixel.
+    """Images in [0, 1] and z-depths of the scene in every view, `supersample` color rays a pixel.
 
     Limits:
         A camera outside the shell or inside a solid sees what lies beyond, not an error: keep `clearance` positive.
@@ -67,13 +67,13 @@ def raycast_depths(
 
 
 def _camera_frame(viewmat: Array) -> tuple[Array, Array]:
-    """Camera centre and camera-to-world rotation."""
+    """Camera center and camera-to-world rotation."""
     rotation = viewmat[:3, :3].T
     return -jnp.einsum("ij,j->i", rotation, viewmat[:3, 3], precision=jax.lax.Precision.HIGHEST), rotation
 
 
 def _pixel_offsets(count: int) -> np.ndarray:
-    """The pixel's centre; where `count` > 1, then that many points of a rank-1 lattice inside the pixel."""
+    """The pixel's center; where `count` > 1, then that many points of a rank-1 lattice inside the pixel."""
     center = np.full((1, 2), 0.5, np.float32)
     if count <= 1:
         return center
@@ -166,7 +166,7 @@ def _ranges(scene: Scene) -> list[tuple[int, Array]]:
 def _shade(
     scene: Scene, origin: Array, rays: Rays, t: Array, solid_idx: Array, pixel: Array
 ) -> Float[Array, "s h w 3"]:
-    """Colour of each hit; `pixel` is a ray's footprint at unit depth."""
+    """Color of each hit; `pixel` is a ray's footprint at unit depth."""
     points = [o + t * d for o, d in zip(origin, rays, strict=True)]
     frame = jnp.moveaxis(scene.frames.reshape(-1, 12)[solid_idx], -1, 0)
     local = [frame[4 * i] * points[0] + frame[4 * i + 1] * points[1] + frame[4 * i + 2] * points[2] + frame[4 * i + 3]

@@ -1,4 +1,4 @@
-"""The kinds of world: rooms, corridors, streets, piles of objects, clutter. Lengths are metres until a sample rescales.
+"""The kinds of world: rooms, corridors, streets, piles of objects, clutter. Lengths are meters until a sample rescales.
 
 Each kind is a recipe `SceneBuilder -> Scene` in a registry; furniture is drawn from a second one.
 """

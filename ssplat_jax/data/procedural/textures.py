@@ -98,7 +98,7 @@ def _photo(rng: np.random.Generator) -> np.ndarray:
 
 
 def _jitter(rng: np.random.Generator, tile: np.ndarray) -> np.ndarray:
-    """Random contrast, brightness and tint; a grey image becomes a duotone one time in two."""
+    """Random contrast, brightness and tint; a gray image becomes a duotone one time in two."""
     if np.ptp(tile, axis=-1).mean() < 0.02 and rng.random() < 0.5:
         dark, light = _color(rng, 0.0, 0.4), _color(rng, 0.6, 1.0)
         tile = dark + tile * (light - dark)
@@ -110,7 +110,7 @@ def _jitter(rng: np.random.Generator, tile: np.ndarray) -> np.ndarray:
 
 
 def _color(rng: np.random.Generator, low: float = 0.1, high: float = 0.95) -> np.ndarray:
-    """A colour of random value and mostly mild saturation; warm hues more often than cold ones."""
+    """A color of random value and mostly mild saturation; warm hues more often than cold ones."""
     value, saturation, hue = rng.uniform(low, high), rng.beta(0.9, 2.2), rng.uniform(0, 1)
     hue = hue * 0.2 - 0.05 if rng.random() < 0.5 else hue
     ramp = np.abs((6 * hue + np.array([0.0, 4.0, 2.0])) % 6 - 3) - 1  # the hue circle: red at 0, green at 1/3
@@ -129,7 +129,7 @@ def _spectrum(rng: np.random.Generator, exponent: float, stretch: float = 1.0) -
 
 
 def _colored_noise(rng: np.random.Generator) -> np.ndarray:
-    """1/f^a noise between three colours; half of it warped into veins or threshold blotches."""
+    """1/f^a noise between three colors; half of it warped into veins or threshold blotches."""
     field = _spectrum(rng, rng.uniform(0.7, 2.0), rng.choice([1.0, 1.0, 4.0]))
     style = rng.integers(4)
     if style == 0:
@@ -162,7 +162,7 @@ def _cells(rng: np.random.Generator, rows: int, cols: int, bond: float, gap: flo
 
 
 def _masonry(rng: np.random.Generator, rows: int, cols: int, bond: float, spread: float) -> np.ndarray:
-    """Bricks, tiles or planks: cells of varying tone, noisy, between joints of another colour."""
+    """Bricks, tiles or planks: cells of varying tone, noisy, between joints of another color."""
     cell, joint = _cells(rng, rows, cols, bond, rng.uniform(0.002, 0.008))
     tone = 1 + spread * rng.standard_normal((rows * cols, 1)) + 0.3 * spread * rng.standard_normal((rows * cols, 3))
     grain = _spectrum(rng, rng.uniform(0.5, 1.6), rng.choice([1.0, 6.0])) * rng.uniform(0.02, 0.12)
@@ -221,7 +221,7 @@ def _facade(rng: np.random.Generator) -> np.ndarray:
 
 
 def _bookshelf(rng: np.random.Generator) -> np.ndarray:
-    """Shelves of upright spines of random widths, heights and colours."""
+    """Shelves of upright spines of random widths, heights and colors."""
     tile = np.full((SIZE, SIZE, 3), 0.06)
     shelf = SIZE // int(rng.integers(3, 6))
     wood = _color(rng, 0.3, 0.7)
@@ -238,7 +238,7 @@ def _bookshelf(rng: np.random.Generator) -> np.ndarray:
 
 
 def _dead_leaves(rng: np.random.Generator) -> np.ndarray:
-    """Discs and rectangles of random colours, large below small: edges at every scale."""
+    """Discs and rectangles of random colors, large below small: edges at every scale."""
     tile = np.broadcast_to(_color(rng), (SIZE, SIZE, 3)).copy()
     y, x = np.mgrid[0:SIZE, 0:SIZE]
     for radius in np.sort(3.0 + 60.0 * rng.pareto(2.0, 220) / 4)[::-1].clip(3, 90):
@@ -251,7 +251,7 @@ def _dead_leaves(rng: np.random.Generator) -> np.ndarray:
 
 
 def _sky(rng: np.random.Generator) -> np.ndarray:
-    """Clouds on a blue, grey or dusky ground."""
+    """Clouds on a blue, gray or dusky ground."""
     clouds = np.clip(_spectrum(rng, 1.7) * 0.4 + rng.uniform(0.1, 0.5), 0, 1)[..., None]
     base = np.array([[0.45, 0.62, 0.85], [0.62, 0.68, 0.75], [0.75, 0.6, 0.55]])[rng.integers(3)]
     return base + (np.array([0.95, 0.95, 0.97]) - base) * clouds

@@ -6,7 +6,7 @@ raises `InputError`.
 
 import dataclasses
 
-from ssplat_jax.data.posed_frame import Frame
+from ssplat_jax.data.posed_image import Frame
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -1,6 +1,6 @@
 """A COLMAP reconstruction: `sparse/0/`, `sparse/` or `colmap/sparse/0/` with `cameras` and `images`, binary or text.
 
-Poses are world-to-camera with OpenCV's axes; the world stays COLMAP's. A pixel's centre is at +0.5, as here. Images
+Poses are world-to-camera with OpenCV's axes; the world stays COLMAP's. A pixel's center is at +0.5, as here. Images
 lie in `images/` (or, shrunk, in `images_2`, `images_4`, `images_8`), else in the capture's folder; those that COLMAP
 did not register are no frames. Of the camera models those without fish-eye are read, FULL_OPENCV without its
 denominator (k4 to k6). Format: colmap.github.io/format.html; of binary and text files the binary ones are read.
@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ssplat_jax.data.lens import Lens
-from ssplat_jax.data.posed_frame import Frame, inverse, pose_of
+from ssplat_jax.data.posed_image import Frame, inverse, pose_of
 from ssplat_jax.data.readers import Listing
-from ssplat_jax.data.readers.frames import SHRUNK_FOLDERS, Intrinsics, file_named, make_frame, stored_size, streamed
+from ssplat_jax.data.readers.frame_list import SHRUNK_FOLDERS, Intrinsics, file_named, make_frame, stored_size, streamed
 from ssplat_jax.data.readers.strict_text import load_lines, numbers
-from ssplat_jax.data.refusal import echo, refusal
+from ssplat_jax.errors import echo, refusal
 
 FORMAT = "COLMAP"
 FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", ".")

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
-from ssplat_jax.data.pixels import image_size
-from ssplat_jax.data.posed_frame import check_camtoworld, inverse
+from ssplat_jax.data.images import image_size
+from ssplat_jax.data.posed_image import check_camtoworld, inverse
 from ssplat_jax.data.readers import Listing
-from ssplat_jax.data.readers.frames import EXTENSIONS, Intrinsics, find_file, make_frame, streamed
+from ssplat_jax.data.readers.frame_list import EXTENSIONS, Intrinsics, find_file, make_frame, streamed
 from ssplat_jax.data.readers.strict_text import load_lines, load_rows
-from ssplat_jax.data.refusal import echo, refusal
+from ssplat_jax.errors import echo, refusal
 
 FORMAT = "RealEstate10K"
 COLUMNS = 19

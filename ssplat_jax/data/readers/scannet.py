@@ -1,7 +1,7 @@
 """A ScanNet export: `color/0.jpg`, `pose/0.txt`, `intrinsic/intrinsic_color.txt` and, if there, `depth/0.png`.
 
-Poses are camera-to-world with OpenCV's axes, metres; where tracking was lost they hold -inf, and the frame is left out.
-Depth maps hold millimetres, at a resolution of their own; they are taken as seen by the colour camera, as their
+Poses are camera-to-world with OpenCV's axes, meters; where tracking was lost they hold -inf, and the frame is left out.
+Depth maps hold millimeters, at a resolution of their own; they are taken as seen by the color camera, as their
 frames were registered.
 """
 
@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
-from ssplat_jax.data.pixels import check_depth_header, image_size
-from ssplat_jax.data.posed_frame import check_camtoworld
+from ssplat_jax.data.images import check_depth_header, image_size
+from ssplat_jax.data.posed_image import check_camtoworld
 from ssplat_jax.data.readers import Listing
-from ssplat_jax.data.readers.frames import Intrinsics, file_named, find_file, make_frame, streamed
+from ssplat_jax.data.readers.frame_list import Intrinsics, file_named, find_file, make_frame, streamed
 from ssplat_jax.data.readers.strict_text import load_rows
-from ssplat_jax.data.refusal import refusal
+from ssplat_jax.errors import refusal
 
 FORMAT = "ScanNet"
 IMAGES = (".jpg", ".jpeg", ".png")

@@ -5,7 +5,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from ssplat_jax.data.refusal import echo, refusal
+from ssplat_jax.errors import echo, refusal
 
 MAX_BYTES = 256 << 20
 

@@ -1,9 +1,9 @@
 """nerfstudio / instant-ngp / Blender `transforms.json`.
 
 Poses are camera-to-world with OpenGL axes (+x right, +y up, +z backward); here they become OpenCV's. They are otherwise
-left alone: no re-centring, no rescaling, no `applied_transform`, so results stand in the file's own frame.
+left alone: no re-centering, no rescaling, no `applied_transform`, so results stand in the file's own frame.
 Intrinsics are global or per frame, a frame's own value first: fl_x, fl_y, cx, cy, w, h in pixels of the stored image,
-or camera_angle_x in radians. Absent: fl_y = fl_x, centre of the image, size from the image's header. Distortion (k1 to
+or camera_angle_x in radians. Absent: fl_y = fl_x, center of the image, size from the image's header. Distortion (k1 to
 k4, p1, p2) is Brown's, and is undone when images are delivered.
 Frames are streamed in the natural order of `file_path` ("9.jpg" before "10.jpg"), whatever their order in the file,
 unless the file's order makes the camera's way less than half as long (names without an order, several cameras).
@@ -16,11 +16,11 @@ from typing import Any
 
 import numpy as np
 
+from ssplat_jax.data.images import check_depth_header, image_size
 from ssplat_jax.data.lens import Lens
-from ssplat_jax.data.pixels import check_depth_header, image_size
-from ssplat_jax.data.posed_frame import Frame, check_camtoworld
+from ssplat_jax.data.posed_image import Frame, check_camtoworld
 from ssplat_jax.data.readers import Listing
-from ssplat_jax.data.readers.frames import (
+from ssplat_jax.data.readers.frame_list import (
     EXTENSIONS,
     SHRUNK_FOLDERS,
     Intrinsics,
@@ -31,7 +31,7 @@ from ssplat_jax.data.readers.frames import (
     streamed,
 )
 from ssplat_jax.data.readers.strict_json import load_json
-from ssplat_jax.data.refusal import echo, refusal
+from ssplat_jax.errors import echo, refusal
 
 FORMAT = "transforms.json"
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])

@@ -1,10 +1,10 @@
 """TUM RGB-D: `rgb.txt` and `depth.txt` (time, file), `groundtruth.txt` (time, tx ty tz, qx qy qz qw camera-to-world).
 
-The pose of an image is interpolated between its two neighbours in time; images without neighbours closer than
+The pose of an image is interpolated between its two neighbors in time; images without neighbors closer than
 `LONGEST_GAP` are left out. Depth maps are of 1/5000 m, the nearest within `DEPTH_GAP` counts.
 Intrinsics: `calibration.txt` (fx fy cx cy, and k1 k2 p1 p2 k3 if there), else, by the `freiburg1` to `freiburg3` in
-the folder's name, those of the colour camera in cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats. They count
-pixels from the first one's centre; half a pixel is added.
+the folder's name, those of the color camera in cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats. They count
+pixels from the first one's center; half a pixel is added.
 """
 
 import re
@@ -13,13 +13,13 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
+from ssplat_jax.data.images import check_depth_header, image_size
 from ssplat_jax.data.lens import Lens
-from ssplat_jax.data.pixels import check_depth_header, image_size
-from ssplat_jax.data.posed_frame import pose_of
+from ssplat_jax.data.posed_image import pose_of
 from ssplat_jax.data.readers import Listing
-from ssplat_jax.data.readers.frames import Intrinsics, file_named, make_frame, streamed
+from ssplat_jax.data.readers.frame_list import Intrinsics, file_named, make_frame, streamed
 from ssplat_jax.data.readers.strict_text import load_lines, load_rows, numbers
-from ssplat_jax.data.refusal import echo, refusal
+from ssplat_jax.errors import echo, refusal
 
 FORMAT = "TUM RGB-D"
 LONGEST_GAP = 0.1  # seconds between the two poses that an image lies between
@@ -102,7 +102,7 @@ def _depth_at(time: float, depths: list[tuple[float, Path]]) -> Path | None:
 
 
 def _intrinsics(root: Path) -> tuple[Intrinsics, str]:
-    """The colour camera's, and where they stand."""
+    """The color camera's, and where they stand."""
     file = root / "calibration.txt"
     if file.is_file():
         where = str(file)

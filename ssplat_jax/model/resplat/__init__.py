@@ -1,28 +1,26 @@
 """ReSplat's network, which the paper builds on, a stage a file. Parameters have the names of its PyTorch modules."""
 
+from typing import ClassVar
+
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.model.resplat.cost_volume import CostVolume
-from ssplat_jax.model.resplat.cost_volume import match as match
-from ssplat_jax.model.resplat.encoder import WIDTHS, Encoder
-from ssplat_jax.model.resplat.encoder import encode as encode
-from ssplat_jax.model.resplat.head import GaussianHead
-from ssplat_jax.model.resplat.head import read_shapes as read_shapes
-from ssplat_jax.model.resplat.layers import ReSplatFeatures
-from ssplat_jax.model.resplat.mixer import Mixer
-from ssplat_jax.model.resplat.mixer import mix_tokens as mix_tokens
-from ssplat_jax.model.resplat.tokens import TokenRegressor
-from ssplat_jax.model.resplat.tokens import regress_tokens as regress_tokens
-from ssplat_jax.model.resplat.upsampler import Upsampler
-from ssplat_jax.model.resplat.upsampler import refine_depth as refine_depth
+from ssplat_jax.model.layers import rms_normalize
+from ssplat_jax.model.resplat.cost_volume import CostVolume, match
+from ssplat_jax.model.resplat.encoder import WIDTHS, Encoder, encode
+from ssplat_jax.model.resplat.head import GaussianHead, read_shapes
+from ssplat_jax.model.resplat.mixer import Mixer, mix_tokens
+from ssplat_jax.model.resplat.swin_layers import ReSplatFeatures
+from ssplat_jax.model.resplat.tokens import TokenRegressor, regress_tokens
+from ssplat_jax.model.resplat.upsampler import Upsampler, refine_depth
 from ssplat_jax.model.resplat.vit import VITS, grid_size
 
 
-def modules(config: StreamConfig) -> dict:
-    """Every stage with parameters of its own, and inputs of the shapes that it takes."""
-    v, side, stride = 2, config.size_multiple, config.match_stride
-    c, mono_width = config.token_width, VITS[config.vit][0]
+def stages(config: StreamConfig) -> dict:
+    """Linen module and example inputs of every stage that has parameters."""
+    v, side, stride = 2, config.network.size_multiple, config.network.match_stride
+    c, mono_width = config.network.token_width, VITS[config.network.vit][0]
     at = lambda stride, channels: jnp.zeros((v, side // stride, side // stride, channels))  # noqa: E731
     vit_map = jnp.zeros((v, *grid_size(side, side), mono_width))
     features = ReSplatFeatures(
@@ -35,9 +33,28 @@ def modules(config: StreamConfig) -> dict:
     inside = jnp.ones((v, side // 4, side // 4), bool)
     return {
         "encoder": (Encoder(config), (at(1, 3), sources, valid[:, None])),
-        "cost_volume": (CostVolume(config), (at(stride, config.num_depths), features, valid)),
+        "cost_volume": (CostVolume(config), (at(stride, config.network.num_depths), features, valid)),
         "upsampler": (Upsampler(config), (features, at(stride, 1)[..., 0], side, side)),
         "tokens": (TokenRegressor(config), (at(4, 48), at(4, 1), at(4, 1), context)),
         "mixer": (Mixer(config), (at(4, c), at(4, 3), inside, valid)),
         "decoder": (GaussianHead(config), (jnp.zeros((1, c)),)),
     }
+
+
+def bound_history(feats: Float[Array, "v hf wf c"]) -> Float[Array, "v hf wf c"]:
+    """`feats` at unit RMS: this network's features have any size, and injected ones are stored again."""
+    return rms_normalize(feats)
+
+
+class ResplatNetwork:
+    """The stages of ReSplat's network; fulfils `ssplat_jax.model.network.Network`."""
+
+    matcher_stages: ClassVar[tuple[str, ...]] = ("encoder", "cost_volume", "upsampler")
+    stages = staticmethod(stages)
+    encode = staticmethod(encode)
+    match = staticmethod(match)
+    refine_depth = staticmethod(refine_depth)
+    regress_tokens = staticmethod(regress_tokens)
+    bound_history = staticmethod(bound_history)
+    mix_tokens = staticmethod(mix_tokens)
+    read_shapes = staticmethod(read_shapes)

@@ -9,9 +9,9 @@ from ssplat_jax.config import StreamConfig
 from ssplat_jax.geometry.sampling import correlate_warped, places_of
 from ssplat_jax.model.convolution import Conv, HalvingConv
 from ssplat_jax.model.layers import attend
-from ssplat_jax.model.resplat.layers import EdgeConv, ReSplatFeatures, resize
-from ssplat_jax.model.sweep import sweep_pixels, upstream_sweep_pixels
-from ssplat_jax.model.wires import DepthBelief, Views, nearest_sources
+from ssplat_jax.model.plane_sweep import sweep_pixels, upstream_sweep_pixels
+from ssplat_jax.model.resplat.swin_layers import EdgeConv, ReSplatFeatures, resize
+from ssplat_jax.model.types import DepthBelief, Views, nearest_sources
 
 WIDTH = 128
 HEADS = 4
@@ -24,29 +24,29 @@ def plane_sweep(features: ReSplatFeatures, views: Views, config: StreamConfig) -
     `upstream_compat` all sources count, what they do not see as 0, and pixels are taken for their corners.
 
     Limits:
-        Without parallax (equal centres, a pure rotation) a pair of views scores all candidates that it sees alike.
+        Without parallax (equal centers, a pure rotation) a pair of views scores all candidates that it sees alike.
     """
     v, hm, wm, c = features.multiview.shape
-    sources, source_valid = nearest_sources(views.viewmats, views.valid, config.num_sources)
+    sources, source_valid = nearest_sources(views.viewmats, views.valid, config.network.num_sources)
     # A sample beyond the border is mixed with the zeros of a frame around the map.
     framed = jnp.pad(features.multiview, ((0, 0), (1, 1), (1, 1), (0, 0)))
 
     def correlate_pair(pair):
         reference, source, is_valid = pair
         flat_reference = features.multiview[reference].reshape(-1, c)
-        if config.upstream_compat:
-            x, y = jax.lax.stop_gradient(upstream_sweep_pixels(views, reference, source, config.match_stride))
+        if config.network.upstream_compat:
+            x, y = jax.lax.stop_gradient(upstream_sweep_pixels(views, reference, source, config.network.match_stride))
             places = places_of(x + 1, y + 1, hm + 2, wm + 2)
             return correlate_warped(flat_reference, framed[source], places), jnp.broadcast_to(is_valid, x.shape)
-        x, y, seen = jax.lax.stop_gradient(sweep_pixels(views, reference, source, config.match_stride))
-        places = places_of(x / config.match_stride - 0.5, y / config.match_stride - 0.5, hm, wm)
+        x, y, seen = jax.lax.stop_gradient(sweep_pixels(views, reference, source, config.network.match_stride))
+        places = places_of(x / config.network.match_stride - 0.5, y / config.network.match_stride - 0.5, hm, wm)
         seen = seen & is_valid
         return jnp.where(seen, correlate_warped(flat_reference, features.multiview[source], places), 0.0), seen
 
     num_sources = sources.shape[1]
     pairs = (jnp.repeat(jnp.arange(v), num_sources), sources.reshape(-1), source_valid.reshape(-1))
     scores, seen = jax.lax.map(correlate_pair, pairs)
-    shape = (v, num_sources, config.num_depths, hm, wm)
+    shape = (v, num_sources, config.network.num_depths, hm, wm)
     counts = seen.astype(jnp.float32).reshape(shape).sum(axis=1)
     mean = scores.reshape(shape).sum(axis=1) / jnp.maximum(counts, 1.0)
     return mean.transpose(0, 2, 3, 1) * c**-0.5
@@ -125,7 +125,9 @@ class CostVolume(nn.Module):
         self, cost: Float[Array, "v hm wm d"], features: ReSplatFeatures, view_valid: Bool[Array, " v"]
     ) -> DepthBelief:
         _, hm, wm, _ = cost.shape
-        mono = resize(features.mono[-1], hm * self.config.match_stride // 8, wm * self.config.match_stride // 8)
+        mono = resize(
+            features.mono[-1], hm * self.config.network.match_stride // 8, wm * self.config.network.match_stride // 8
+        )
         mono = resize(mono, hm, wm)
         x = jnp.concatenate([cost, features.cnn[-1], features.multiview, mono], axis=-1)
         y = Conv(WIDTH, name="regressor_0_0")(x)
@@ -134,7 +136,7 @@ class CostVolume(nn.Module):
         y = Conv(WIDTH, name="regressor_0_4")(y)
         decoder = y + Conv(WIDTH, 1, name="regressor_residual_0")(x)
         hidden = nn.gelu(EdgeConv(2 * WIDTH, name="depth_head_0_0")(decoder), approximate=False)
-        logits = EdgeConv(self.config.num_depths, name="depth_head_0_2")(hidden)
+        logits = EdgeConv(self.config.network.num_depths, name="depth_head_0_2")(hidden)
         return DepthBelief(probs=jax.nn.softmax(logits, axis=-1), logits=logits, decoder=decoder)
 
 

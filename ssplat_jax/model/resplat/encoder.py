@@ -8,10 +8,10 @@ from jaxtyping import Array, Bool, Float, Int
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.model.convolution import Conv, HalvingConv
 from ssplat_jax.model.layers import ResidualBlock, attend, instance_norm, normalize_images
-from ssplat_jax.model.resplat.layers import ReSplatFeatures
+from ssplat_jax.model.resplat.swin_layers import ReSplatFeatures
 from ssplat_jax.model.resplat.vit import VisionTransformer
+from ssplat_jax.model.types import Views, nearest_sources
 from ssplat_jax.model.windows import from_windows, in_one_region, sine_positions, to_windows
-from ssplat_jax.model.wires import Views, nearest_sources
 
 WIDTHS = (64, 96, 128)
 NUM_BLOCKS = 6
@@ -116,13 +116,13 @@ class Encoder(nn.Module):
         self, images: Float[Array, "v h w 3"], sources: Int[Array, "v s"], source_valid: Bool[Array, "v s"]
     ) -> ReSplatFeatures:
         images = normalize_images(images)
-        cnn = Backbone(self.config.match_stride, name="backbone")(images)
-        multiview = Transformer(self.config.upstream_compat, name="transformer")(cnn[-1], sources, source_valid)
-        mono = VisionTransformer(self.config.vit, name="pretrained")(images)
+        cnn = Backbone(self.config.network.match_stride, name="backbone")(images)
+        multiview = Transformer(self.config.network.upstream_compat, name="transformer")(cnn[-1], sources, source_valid)
+        mono = VisionTransformer(self.config.network.vit, name="pretrained")(images)
         return ReSplatFeatures(cnn=cnn, multiview=multiview, mono=mono)
 
 
 def encode(params, views: Views, config: StreamConfig) -> ReSplatFeatures:
     """Features of every view, informed by its source views."""
-    sources, source_valid = nearest_sources(views.viewmats, views.valid, config.num_sources)
+    sources, source_valid = nearest_sources(views.viewmats, views.valid, config.network.num_sources)
     return Encoder(config).apply({"params": params}, views.images, sources, source_valid)  # pyright: ignore[reportReturnType]

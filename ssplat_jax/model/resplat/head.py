@@ -6,10 +6,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.model.wires import TokenShapes
+from ssplat_jax.model.types import TokenShapes
 
 ROWS = (4, 3, 1, 2)
-"""Rotation (xyzw), scale, opacity, offset in the pixel; then colour coefficients. Offsets are not used: a pivot's
+"""Rotation (xyzw), scale, opacity, offset in the pixel; then color coefficients. Offsets are not used: a pivot's
 Gaussian stands where its tokens are (ALGORITHM 9.32)."""
 
 
@@ -20,7 +20,7 @@ class GaussianHead(nn.Module):
 
     @nn.compact
     def __call__(self, feats: Float[Array, "m c"]) -> Float[Array, "m o"]:
-        outputs = sum(ROWS) + 3 * (self.config.sh_degree + 1) ** 2
+        outputs = sum(ROWS) + 3 * (self.config.head.sh_degree + 1) ** 2
         hidden = nn.gelu(nn.Dense(outputs, name="gaussian_head_0")(feats), approximate=False)
         return nn.Dense(outputs, kernel_init=nn.initializers.normal(1e-3), name="gaussian_head_2")(hidden)
 

@@ -1,4 +1,4 @@
-"""3D token mixer: attention among 3D neighbours, then among all views at 1/16 (ReSplat; ALGORITHM 3.2)."""
+"""3D token mixer: attention among 3D neighbors, then among all views at 1/16 (ReSplat; ALGORITHM 3.2)."""
 
 import flax.linen as nn
 import jax
@@ -8,34 +8,34 @@ from jaxtyping import Array, Bool, Float
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.model.convolution import Conv, pixel_shuffle, pixel_unshuffle
 from ssplat_jax.model.layers import attend, attend_own
-from ssplat_jax.model.neighbours import nearest_tokens
-from ssplat_jax.model.resplat.layers import Mlp
+from ssplat_jax.model.nearest_tokens import nearest_tokens
+from ssplat_jax.model.resplat.swin_layers import Mlp
 
 GLOBAL_FACTOR = 4  # the global block works on 4 x 4 cells
 HEADS = 4
 
 
-class NeighbourAttention(nn.Module):
-    """One-head attention of each token to its 3D neighbours."""
+class NeighborAttention(nn.Module):
+    """One-head attention of each token to its 3D neighbors."""
 
     width: int
 
     @nn.compact
-    def __call__(self, x, neighbours, usable):
+    def __call__(self, x, neighbors, usable):
         qkv = nn.Dense(3 * self.width, use_bias=False, name="qkv")(x)
         q, k, v = jnp.split(qkv, 3, axis=-1)
-        return nn.Dense(x.shape[-1], name="proj")(attend_own(q, k[neighbours], v[neighbours], usable[neighbours]))
+        return nn.Dense(x.shape[-1], name="proj")(attend_own(q, k[neighbors], v[neighbors], usable[neighbors]))
 
 
-class NeighbourBlock(nn.Module):
-    """Pre-norm attention of each token to its 3D neighbours, then an MLP."""
+class NeighborBlock(nn.Module):
+    """Pre-norm attention of each token to its 3D neighbors, then an MLP."""
 
     width: int
 
     @nn.compact
-    def __call__(self, x, neighbours, usable):
+    def __call__(self, x, neighbors, usable):
         norm = lambda name: nn.LayerNorm(epsilon=1e-5, use_fast_variance=False, name=name)  # noqa: E731
-        x = x + NeighbourAttention(self.width, name="attn")(norm("norm1")(x), neighbours, usable)
+        x = x + NeighborAttention(self.width, name="attn")(norm("norm1")(x), neighbors, usable)
         return x + Mlp(name="mlp")(norm("norm2")(x))
 
 
@@ -81,11 +81,11 @@ class Mixer(nn.Module):
 
     @nn.compact
     def __call__(self, feats, positions, inside, view_valid):
-        neighbours = nearest_tokens(jax.lax.stop_gradient(positions), inside, self.config)
+        neighbors = nearest_tokens(jax.lax.stop_gradient(positions), inside, self.config)
         x, usable = feats, inside.reshape(-1)
-        for i in range(self.config.mixer_blocks):
-            block = NeighbourBlock(self.config.mixer_proj, name=f"blocks_{i}")
-            x = block(x.reshape(-1, x.shape[-1]), neighbours, usable).reshape(x.shape)
+        for i in range(self.config.network.mixer_blocks):
+            block = NeighborBlock(self.config.network.mixer_proj, name=f"blocks_{i}")
+            x = block(x.reshape(-1, x.shape[-1]), neighbors, usable).reshape(x.shape)
             x = GlobalBlock(name=f"mv_blocks_{i}")(x, view_valid)
         return x
 
@@ -99,6 +99,6 @@ def mix_tokens(
     config: StreamConfig,
 ) -> Float[Array, "v hf wf c"]:
     """Context-aggregated token features, ready for the head and for the cache (DESIGN 6.8)."""
-    if not config.mixer_blocks:
+    if not config.network.mixer_blocks:
         return feats
     return feats + Mixer(config).apply({"params": params}, feats, positions, inside, view_valid)  # pyright: ignore

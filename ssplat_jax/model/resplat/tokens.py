@@ -6,8 +6,8 @@ from jaxtyping import Array, Float
 
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.model.convolution import Conv, pixel_shuffle, pixel_unshuffle
-from ssplat_jax.model.resplat.layers import ReSplatFeatures, resize
-from ssplat_jax.model.wires import GRID_STRIDE, AnchoredDepth, DepthBelief, Views, repeat_cells
+from ssplat_jax.model.resplat.swin_layers import ReSplatFeatures, resize
+from ssplat_jax.model.types import GRID_STRIDE, AnchoredDepth, DepthBelief, Views, repeat_cells
 
 
 class TokenRegressor(nn.Module):
@@ -17,7 +17,7 @@ class TokenRegressor(nn.Module):
 
     @nn.compact
     def __call__(self, patches, depths, match, features) -> Float[Array, "v hf wf c"]:
-        c = self.config.token_width
+        c = self.config.network.token_width
         x = jnp.concatenate([patches, depths, match, features], axis=-1)
         x = nn.gelu(Conv(c, name="gaussian_regressor_0")(x), approximate=False)
         x = Conv(c, name="gaussian_regressor_2")(x)
@@ -38,7 +38,7 @@ def regress_tokens(
     del belief  # the match probability is that of the depth that is used
     _, hf, wf = depth.log_depths.shape
     patches = pixel_unshuffle(views.images, GRID_STRIDE)
-    match = repeat_cells(depth.probs.max(axis=-1, keepdims=True), config.match_stride // GRID_STRIDE)
+    match = repeat_cells(depth.probs.max(axis=-1, keepdims=True), config.network.match_stride // GRID_STRIDE)
     context = token_context(features, hf, wf)
     depths = jnp.exp(depth.log_depths)[..., None]
     return TokenRegressor(config).apply({"params": params}, patches, depths, match, context)  # pyright: ignore[reportReturnType]

@@ -6,8 +6,8 @@ from jaxtyping import Array, Float
 
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.model.convolution import Conv, HalvingConv
-from ssplat_jax.model.resplat.layers import EdgeConv, GrowingConv, ReSplatFeatures, resize
-from ssplat_jax.model.wires import (
+from ssplat_jax.model.resplat.swin_layers import EdgeConv, GrowingConv, ReSplatFeatures, resize
+from ssplat_jax.model.types import (
     GRID_STRIDE,
     AnchoredDepth,
     Views,
@@ -74,7 +74,7 @@ class Upsampler(nn.Module):
     def __call__(
         self, features: ReSplatFeatures, depths: Float[Array, "v hm wm"], height: int, width: int
     ) -> Float[Array, "v h w"]:
-        fused, channels = SIZES[self.config.vit]
+        fused, channels = SIZES[self.config.network.vit]
         mono = [resize(x, height // 8, width // 8) for x in features.mono]
         mono = [Conv(c, 1, name=f"projects_{i}")(x) for i, (x, c) in enumerate(zip(mono, channels, strict=True))]
         levels = [
@@ -84,7 +84,7 @@ class Upsampler(nn.Module):
             HalvingConv(channels[3], name="resize_layers_3")(mono[3]),
         ]
         half, middle, grid = features.cnn
-        before = [[half], [middle], [grid]] if self.config.match_stride == 8 else [[half, middle], [grid], []]
+        before = [[half], [middle], [grid]] if self.config.network.match_stride == 8 else [[half, middle], [grid], []]
         behind = [features.multiview, depths[..., None]]  # where the match grid's own CNN features are
         for i, maps in enumerate(before):
             joined = [*maps, levels[i], *(behind if maps and maps[-1] is grid else [])]
@@ -107,7 +107,7 @@ def refine_depth(
     ends = to_candidate_space(views.log_candidates[jnp.array([0, -1])], config)
     fine = jnp.exp(from_candidate_space(jnp.clip(fine, ends.min(), ends.max()), config))
     latent = jnp.log(resize(fine[..., None], height // GRID_STRIDE, width // GRID_STRIDE)[..., 0])
-    factor = config.match_stride // GRID_STRIDE
+    factor = config.network.match_stride // GRID_STRIDE
     return AnchoredDepth(
         probs=depth.probs,
         log_depths=latent,

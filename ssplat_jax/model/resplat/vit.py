@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ssplat_jax.model.layers import attend
-from ssplat_jax.model.resplat.layers import PIXELS_PER_VIT_CELL, Mlp, resize
+from ssplat_jax.model.resplat.swin_layers import PIXELS_PER_VIT_CELL, Mlp, resize
 
 POSITIONS_SIDE = 37
 """The position code is of 37 x 37 cells, and one for the class token; other grids resample it."""
@@ -101,7 +101,7 @@ class PatchEmbed(nn.Module):
 
 
 class VisionTransformer(nn.Module):
-    """Normalised images to the maps of four of its blocks."""
+    """Normalized images to the maps of four of its blocks."""
 
     size: str
 

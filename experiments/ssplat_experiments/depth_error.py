@@ -1,0 +1,117 @@
+"""How wrong depths are where they are known, and whether their confidence says so.
+
+    ssplat experiment depth_error --captures path/to/captures --out runs/depth_error
+
+Streams captures that have depth maps with the shipped weights and compares the depth of every token with the median of
+its cell's map, after one scale for the whole capture (the median ratio over accepted tokens). Writes `table.json`:
+accepted fraction, median relative error of accepted tokens, and both by confidence, which is calibrated if the error
+falls as it rises. docs/model_card.md holds the numbers to expect.
+"""
+
+import itertools
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from ssplat_jax.checkpoint.weights import load_params
+from ssplat_jax.config import preset
+from ssplat_jax.console import Reporter
+from ssplat_jax.data.capture import Capture, open_capture
+from ssplat_jax.data.split import interleaved
+from ssplat_jax.errors import InputError
+from ssplat_jax.model import GRID_STRIDE
+from ssplat_jax.storage.json_files import write_json
+from ssplat_jax.streaming.session import Session
+from ssplat_jax.streaming.streamsplat import StreamSplat
+
+SIZE = (320, 240)
+CONTEXT = {"full": 64, "smoke": 8}
+STRIDES = {"redkitchen": 5}
+EDGE = 1.05  # depth ratio within a cell that is no longer one surface
+EDGES = (0.0, 0.3, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)  # of the bins of confidence
+
+
+def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str:
+    """Measures `procedural:room` and, where `--captures` has it, redkitchen."""
+    context = CONTEXT[scale]
+    frames = interleaved(10_000, 1, context).context[-1] + 1
+    opened = {"room": (open_capture(f"procedural:room?frames={frames}", size=SIZE), 1)}
+    for name, stride in STRIDES.items():
+        if captures is not None and (captures / name).is_dir():
+            opened[name] = (open_capture(captures / name, size=SIZE), stride)
+        else:
+            reporter.warn(f"{name}: not under --captures, left out")
+    rows: list[dict[str, Any]] = []
+    for name, (capture, stride) in opened.items():
+        rows.append({"capture": name} | measure(capture, stride, context))
+    write_json(out / "table.json", rows)
+    for row in rows:
+        reporter.table(
+            f"{row['capture']}: {row['accepted']:.0%} accepted, median error {row['median_error']:.1%}",
+            ("confidence", "tokens", "median error"),
+            [(entry["confidence"], entry["tokens"], entry["median_error"]) for entry in row["by_confidence"]],
+        )
+    return f"wrote {out}/table.json: " + ", ".join(f"{r['capture']} {r['median_error']:.1%}" for r in rows)
+
+
+def measure(capture: Capture, stride: int, context: int) -> dict[str, Any]:
+    """One row: errors of the tokens of the first `context` views."""
+    model = StreamSplat(preset("tiny"))
+    split = interleaved(len(capture), stride, context)
+    frame = capture.stream_frame(model.config, split.context)
+    order = capture.stream_order(model.config, split.context, frame)
+    session = Session(model, load_params("tiny"))
+    ratios, confidences = [], []
+    views = iter(order)
+    for chunk in capture.chunks(model.config, order, frame=frame):
+        output = session.feed(chunk)
+        for v in np.flatnonzero(np.asarray(chunk.valid)):
+            depth = capture.depth(next(views))
+            if depth is None:
+                continue  # not every frame need have a map
+            truth = frame.scale * cell_depths(depth)
+            rows, columns = truth.shape
+            ratio = np.asarray(output.depths[v])[:rows, :columns] / np.where(truth > 0, truth, np.nan)
+            ratios.append(ratio[truth > 0])
+            confidences.append(np.asarray(output.confidences[v])[:rows, :columns][truth > 0])
+    if not ratios:
+        raise InputError(f"experiment depth_error: {capture.name} has no depth map among its context frames.")
+    return summary(np.concatenate(ratios), np.concatenate(confidences), model.config.memory.min_confidence)
+
+
+def cell_depths(depth: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "hf wf"]:
+    """Median of the known depths of each whole grid cell; 0 where fewer than half of its pixels are known.
+
+    Of an even number the mean of the middle two, unless an edge lies between them: then the nearer.
+    """
+    rows, columns = (side // GRID_STRIDE for side in depth.shape)
+    cells = depth[: rows * GRID_STRIDE, : columns * GRID_STRIDE].reshape(rows, GRID_STRIDE, columns, GRID_STRIDE)
+    cells = np.moveaxis(cells, 2, 1).reshape(rows, columns, -1)
+    known = np.sort(np.where(cells > 0, cells, np.inf), axis=-1)
+    num_known = (cells > 0).sum(axis=-1)
+    lower, upper = (
+        np.take_along_axis(known, np.clip(i, 0, cells.shape[-1] - 1)[..., None], axis=-1)[..., 0]
+        for i in ((num_known - 1) // 2, num_known // 2)
+    )
+    middle = np.where(upper <= EDGE * lower, 0.5 * (lower + upper), lower)
+    return np.where(2 * num_known >= cells.shape[-1], middle, 0.0).astype(np.float32)
+
+
+def summary(ratios: Float[np.ndarray, " m"], confidences: Float[np.ndarray, " m"], tau: float) -> dict[str, Any]:
+    """Errors after one global scale, of accepted tokens and by confidence."""
+    accepted = confidences >= tau
+    scale = float(np.median(ratios[accepted]))
+    errors = np.abs(ratios / scale - 1.0)
+    bins = []
+    for low, high in itertools.pairwise(EDGES):
+        inside = (confidences >= low) & ((confidences < high) | (high == EDGES[-1]))
+        error = round(float(np.median(errors[inside])), 4) if inside.any() else None
+        bins.append({"confidence": f"{low} to {high}", "tokens": int(inside.sum()), "median_error": error})
+    return {
+        "accepted": round(float(accepted.mean()), 4),
+        "global_scale": round(scale, 4),
+        "median_error": round(float(np.median(errors[accepted])), 4),
+        "by_confidence": bins,
+    }

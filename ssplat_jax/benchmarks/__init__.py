@@ -1,0 +1,1 @@
+"""What `ssplat bench` measures."""

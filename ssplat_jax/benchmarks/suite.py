@@ -1,0 +1,101 @@
+"""`ssplat bench NAME`: the benchmarks of the package in one form, `{machine, rows: [{name, value, unit}]}`."""
+
+import dataclasses
+import itertools
+import platform
+import statistics
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from ssplat_jax.benchmarks.cache_benchmark import Row, bench_cache
+from ssplat_jax.benchmarks.rasterizer_benchmark import bench_render
+from ssplat_jax.checkpoint.weights import load_params
+from ssplat_jax.chunk import Chunk
+from ssplat_jax.config import preset
+from ssplat_jax.data.capture import open_capture
+from ssplat_jax.errors import InputError
+from ssplat_jax.streaming.session import Session, tokens_per_chunk
+from ssplat_jax.streaming.streamsplat import StreamSplat
+
+ROUND = 40  # frames of the walk that a benchmark's stream repeats
+
+
+def run_benchmark(
+    name: str, *, against: Path | None = None, scaling: bool = False, full_hd: bool = False
+) -> dict[str, Any]:
+    """Runs the benchmark `render` or `stream`.
+
+    Args:
+        name: which.
+        against, scaling, full_hd: `render` only: as `bench_render` has them.
+
+    Raises:
+        InputError: no such benchmark, or `against` is no file that could be timed.
+    """
+    if name == "render":
+        rows = bench_render(against, scaling=scaling, full_hd=full_hd)
+    elif name == "stream":
+        rows = [dataclasses.asdict(row) for row in (*bench_cache(preset("tiny")), *bench_step())]
+    else:
+        raise InputError(f"bench: wanted render or stream, got {name!r}.")
+    device = jax.devices()[0]
+    machine = f"{platform.machine()} {device.platform} {device.device_kind}, jax {jax.__version__}"
+    return {"machine": machine, "rows": rows}
+
+
+def bench_step(*, num_chunks: int = 2500, late_size: tuple[int, int] = (64, 48), repeats: int = 15) -> list[Row]:
+    """The whole step with the shipped weights: tokens a second at 320 x 240, and what a stream's age changes.
+
+    The stream goes round the same room again and again. For its age, a smaller image does: what could grow with it is
+    the cache's part of a step. Both ages go on from copies of their caches in turns; medians over turns count.
+
+    Args:
+        num_chunks: the late age; the early one is ten.
+        late_size: width and height of the images of the stream that grows old.
+        repeats: turns.
+    """
+    session, chunks = _round((320, 240))
+    seconds = [_seconds(session, chunk) for chunk in chunks]
+    step = statistics.median(seconds[1:])  # the first has compiled
+    num_tokens = tokens_per_chunk(chunks[0], session.model.config.network.size_multiple)
+
+    session, chunks = _round(late_size)
+    caches, memory = [], []
+    for number, chunk in enumerate(itertools.islice(itertools.cycle(chunks), num_chunks), 1):
+        session.feed(chunk)
+        if number in (10, num_chunks):
+            caches.append(jax.tree.map(jnp.copy, session.cache))
+            memory.append(session.step_memory_bytes or 0)
+    times: list[list[float]] = [[] for _ in caches]
+    for _ in range(repeats):
+        for cache, column in zip(caches, times, strict=True):
+            session.cache = jax.tree.map(jnp.copy, cache)
+            column.append(min(_seconds(session, chunk) for chunk in chunks[:3]))
+    early, late = map(statistics.median, times)
+    return [
+        Row("step_320x240", step * 1e3, "ms"),
+        Row("step_tokens_per_second", num_tokens / step, "1/s"),
+        Row("step_late_chunk_over_early", late / early, "x", "<= 1.05"),
+        Row("step_memory_bytes", float(memory[-1]), "B"),
+        Row("step_memory_growth", float(memory[-1] - memory[0]), "B", "0"),
+        Row("step_compilations", float(session.num_compilations), "", "1"),
+    ]
+
+
+def _round(size: tuple[int, int]) -> tuple[Session, list[Chunk]]:
+    """A session of a cache that keeps its size, and the chunks of one walk through a room."""
+    model = StreamSplat(preset("tiny").replace(overflow="drop_new"))
+    capture = open_capture(f"procedural:room?frames={ROUND}", size=size)
+    indices = tuple(range(ROUND))
+    frame = capture.stream_frame(model.config, indices)
+    return Session(model, load_params("tiny")), list(capture.chunks(model.config, indices, frame=frame))
+
+
+def _seconds(session: Session, chunk: Chunk) -> float:
+    start = time.perf_counter()
+    session.feed(chunk)
+    return time.perf_counter() - start

@@ -1,0 +1,285 @@
+"""The definition of VACC's write and read as plain NumPy float64 loops: slow, obvious, and sharing nothing with them.
+
+The only float32 step is the voxel index itself, which is a rounding of the stored position.
+"""
+
+import itertools
+import math
+
+import numpy as np
+
+from ssplat_jax.cache.state import PIVOT_FIELDS, VoxelCache
+from ssplat_jax.config import StreamConfig
+
+INDEX_LIMIT = 1 << 20
+NEAR = 0.01
+SAME_DIRECTION = 1.0 - 1e-6
+
+
+def empty(capacity: int) -> dict:
+    """A cache: `rows` is a list of (voxel, list of pivots), a pivot a dict."""
+    names = "chunks seen accepted merged low_confidence non_finite out_of_range dropped evicted"
+    return {"capacity": capacity, "rows": [], "stats": {f"num_{name}": 0 for name in names.split()}}
+
+
+def fuse(cache: dict, tokens: dict, config: StreamConfig) -> dict:
+    """Inserts `tokens` (arrays named as the fields of `Tokens`) one after another, in place."""
+    stats = cache["stats"]
+    chunk = stats["num_chunks"]
+    stats["num_chunks"] += bool(np.any(tokens["valid"]))
+    accepted = []
+    for j in range(len(tokens["valid"])):
+        if not tokens["valid"][j]:
+            continue
+        stats["num_seen"] += 1
+        pivot = {name: np.asarray(x[j], np.float64) for name, x in tokens.items() if name != "valid"}
+        voxel = voxel_of(tokens["means"][j], config.memory.voxel_size)
+        if not all(np.isfinite(x).all() for x in pivot.values()):
+            stats["num_non_finite"] += 1
+        elif pivot["confidences"] < np.float32(config.memory.min_confidence):
+            stats["num_low_confidence"] += 1
+        elif voxel is None:
+            stats["num_out_of_range"] += 1
+        else:
+            accepted.append((voxel, pivot | {"seeds": pivot["feats"], "num_members": 1, "last_chunks": chunk}))
+    if config.memory.vacc == "append":
+        _append_all(cache, accepted, config)
+    else:
+        _insert_all(cache, accepted, config)
+    return cache
+
+
+def from_arrays(cache: VoxelCache) -> dict:
+    """The pivots of a real cache, to compare projections of the very same numbers."""
+    arrays = {name: np.asarray(getattr(cache, name)) for name in PIVOT_FIELDS}
+    counts = np.asarray(cache.counts)
+    pivots = [
+        [{name: x[row, k].astype(np.float64) for name, x in arrays.items()} for k in range(counts[row])]
+        for row in range(int(cache.num_voxels))
+    ]
+    voxels = np.asarray(cache.voxels).tolist()
+    return {"capacity": cache.capacity, "rows": [(tuple(v), p) for v, p in zip(voxels, pivots, strict=False)]}
+
+
+def voxel_of(point: np.ndarray, voxel_size: float) -> tuple[int, ...] | None:
+    """Index triple of a float32 point; None out of range."""
+    with np.errstate(all="ignore"):
+        cells = np.floor(np.float32(point) * np.float32(1.0 / voxel_size))
+    return tuple(int(c) for c in cells) if np.all(np.abs(cells) < INDEX_LIMIT) else None
+
+
+def _insert_all(cache, accepted, config):
+    rows, stats = cache["rows"], cache["stats"]
+    row_of = {voxel: row for row, (voxel, _) in enumerate(rows) if voxel is not None}
+    victims = _victims(cache, {voxel for voxel, _ in accepted}, config)
+    for voxel, pivot in accepted:
+        if voxel not in row_of:
+            if len(rows) < cache["capacity"]:
+                rows.append((voxel, []))
+                row_of[voxel] = len(rows) - 1
+            elif config.memory.overflow == "evict_lowest" and victims:
+                row = victims.pop(0)
+                stats["num_evicted"] += len(rows[row][1])
+                del row_of[rows[row][0]]
+                rows[row] = (voxel, [])
+                row_of[voxel] = row
+            else:
+                stats["num_dropped"] += 1
+                continue
+        stats["num_accepted"] += 1
+        pivots = rows[row_of[voxel]][1]
+        if len(pivots) < config.memory.pivots_per_voxel:
+            pivots.append(pivot)
+        else:
+            stats["num_merged"] += 1
+            merge_closest(pivots, pivot, config)
+
+
+def _append_all(cache, accepted, config):
+    rows, stats = cache["rows"], cache["stats"]
+    for _, pivot in accepted:
+        if not rows or len(rows[-1][1]) == config.memory.pivots_per_voxel:
+            if len(rows) == cache["capacity"]:
+                stats["num_dropped"] += 1
+                continue
+            rows.append((None, []))
+        stats["num_accepted"] += 1
+        rows[-1][1].append(pivot)
+
+
+def _victims(cache, touched, config):
+    """Rows that may make way for new voxels of this chunk, first to go first."""
+
+    def rank(row):
+        _, pivots = cache["rows"][row]
+        return max(p["confidences"] for p in pivots), max(p["last_chunks"] for p in pivots), row
+
+    if config.memory.overflow != "evict_lowest":
+        return []
+    return sorted((row for row, (voxel, _) in enumerate(cache["rows"]) if voxel not in touched), key=rank)
+
+
+def merge_closest(pivots: list, new: dict, config: StreamConfig) -> None:
+    """Adds `new` to the full list `pivots` and merges the closest pair, in place."""
+    key = {"seed": "seeds", "feature": "feats"}[config.memory.merge_key]
+    candidates = [*pivots, new]
+    best, best_score = (0, 1), -math.inf
+    for i, j in itertools.combinations(range(len(candidates)), 2):
+        score = similarity(candidates[i][key], candidates[j][key])
+        if score > best_score:
+            best, best_score = (i, j), score
+    i, j = best
+    merged = merge(candidates[i], candidates[j], config)
+    if j < len(pivots):
+        pivots[j] = new
+    pivots[i] = merged
+
+
+def similarity(a: np.ndarray, b: np.ndarray) -> float:
+    """cos |cos| of two vectors: ordered as the cosine. 0 where a norm is 0, 1 where the directions are the same."""
+    dot, product = float(np.dot(a, b)), float(np.dot(a, a)) * float(np.dot(b, b))
+    score = dot * abs(dot) / product if product > 0 else 0.0
+    return 1.0 if score > SAME_DIRECTION else score
+
+
+def merge(older: dict, newer: dict, config: StreamConfig) -> dict:
+    """The pivot that replaces two."""
+    weights = [float(x["confidences"]) for x in (older, newer)]
+    best = newer if weights[1] > weights[0] else older
+    if config.memory.merge_weight == "count":
+        weights = [w * x["num_members"] for w, x in zip(weights, (older, newer), strict=True)]
+    if sum(weights) == 0:
+        weights = [0.5, 0.5]
+    mean = {
+        name: (weights[0] * older[name] + weights[1] * newer[name]) / sum(weights)
+        for name in ("means", "feats", "rgbs")
+    }
+    kept = {name: best[name] for name in ("seeds", "confidences", "quats", "footprints")}
+    return (
+        mean
+        | kept
+        | {
+            "num_members": older["num_members"] + newer["num_members"],
+            "last_chunks": max(older["last_chunks"], newer["last_chunks"]),
+        }
+    )
+
+
+def project(cache: dict, viewmats, Ks, height: int, width: int, config: StreamConfig) -> tuple:
+    """Depths, confidences, features, mask and colors of each view, and the margin of the closest decision made.
+
+    Where the margin (pixels, log depths) is within rounding of 0, another precision may decide otherwise.
+    """
+    least = np.float32(config.memory.min_confidence) if config.memory.carving else 0.0
+    pivots = [pivot for _, row in cache["rows"] for pivot in row if pivot["confidences"] >= least]
+    shape = (len(viewmats), height, width)
+    depths, confidences, mask = np.zeros(shape), np.zeros(shape), np.zeros(shape, bool)
+    feats, colors, margins = np.zeros((*shape, config.network.token_width)), np.zeros((*shape, 3)), [math.inf]
+    for v in range(len(viewmats)):
+        viewmat, K = np.asarray(viewmats[v], np.float64), np.asarray(Ks[v], np.float64)
+        for (row, column), pairs in _on_pixels(pivots, viewmat, K, height, width, margins).items():
+            cluster = _front_cluster(pairs, math.log(config.history.cluster_ratio), margins)
+            total = sum(p["confidences"] for _, p in cluster)
+            at = (v, row, column)
+            mask[at] = True
+            depths[at] = math.exp(sum(p["confidences"] * ell for ell, p in cluster) / total)
+            confidences[at] = sum(p["confidences"] ** 2 for _, p in cluster) / total
+            feats[at] = sum(p["confidences"] * p["feats"] for _, p in cluster) / total
+            colors[at] = sum(p["confidences"] * p["rgbs"].reshape(-1, 3).mean(axis=0) for _, p in cluster) / total
+    return depths, confidences, feats, mask, colors, min(margins)
+
+
+def carve(cache: dict, viewmats, Ks, depths, confidences, config: StreamConfig) -> float:
+    """Revises the confidences of the pivots in place; returns the margin of the closest decision."""
+    views = []
+    for viewmat, K, depth, confidence in zip(viewmats, Ks, depths, confidences, strict=True):
+        ell = _trusted_log_depths(depth, confidence, config)
+        around = np.pad(ell, 1, constant_values=math.inf)
+        nearest = np.array([[around[r : r + 3, c : c + 3].min() for c in range(ell.shape[1])] for r in range(len(ell))])
+        views.append((viewmat, K, ell, nearest, confidence))
+    return _revise([pivot for _, row in cache["rows"] for pivot in row], views)
+
+
+def witness(viewmats, Ks, depths, confidences, side: int, config: StreamConfig) -> tuple | None:
+    """The view of a chunk that is kept: viewmat, K, nearest log depths and weights of `side` x `side` parts."""
+    trusted = [_trusted_log_depths(d, c, config) for d, c in zip(depths, confidences, strict=True)]
+    view = int(np.argmax([np.isfinite(ell).sum() for ell in trusted]))
+    ell, confidence = trusted[view], np.asarray(confidences[view], np.float64)
+    if not np.isfinite(ell).any():
+        return None
+    height, width = ell.shape
+    nearest, weights = np.full((side, side), -math.inf), np.zeros((side, side))
+    for row, column in itertools.product(range(side), repeat=2):
+        touched = np.s_[
+            row * height // side : math.ceil((row + 1) * height / side),
+            column * width // side : math.ceil((column + 1) * width / side),
+        ]
+        if np.isfinite(ell[touched]).all():
+            nearest[row, column], weights[row, column] = ell[touched].min(), confidence[touched].min()
+    K = np.diag([side / width, side / height, 1.0]) @ np.asarray(Ks[view], np.float64)
+    return viewmats[view], K, nearest, nearest, weights
+
+
+def judge(witnesses: list[tuple], tokens: dict, config: StreamConfig) -> tuple[np.ndarray, float]:
+    """Confidences of `tokens` after the witnesses, and the margin of the closest decision."""
+    judged = np.asarray(tokens["confidences"], np.float64).copy()
+    chosen = np.flatnonzero(tokens["valid"] & (tokens["confidences"] >= np.float32(config.memory.min_confidence)))
+    points = [{"means": np.asarray(tokens["means"][j], np.float64), "confidences": judged[j]} for j in chosen]
+    margin = _revise(points, witnesses)
+    judged[chosen] = [point["confidences"] for point in points]
+    return judged, margin
+
+
+def _trusted_log_depths(depths, confidences, config) -> np.ndarray:
+    """Log depth where a cell is a witness, -inf elsewhere."""
+    trusted = (confidences >= np.float32(config.memory.min_confidence)) & (confidences > 0) & (depths > 0)
+    with np.errstate(all="ignore"):
+        return np.where(trusted & np.isfinite(depths), np.log(np.asarray(depths, np.float64)), -math.inf)
+
+
+def _revise(points: list, views: list[tuple]) -> float:
+    """Lets the cells of (viewmat, K, log depths, nearest, weights) judge the confidences of the points, in place."""
+    evidence, margins = {id(p): 0.0 for p in points}, [math.inf]
+    for viewmat, K, ell, nearest, weights in views:
+        viewmat, K = np.asarray(viewmat, np.float64), np.asarray(K, np.float64)
+        seen = _on_pixels(points, viewmat, K, ell.shape[0], ell.shape[1], margins)
+        for cell, pairs in seen.items():
+            if ell[cell] == -math.inf:
+                continue
+            for own, point in pairs:
+                free, same = nearest[cell] - math.log(1.02), abs(own - ell[cell])
+                margins += [abs(own - free), abs(same - math.log(1.1))]
+                evidence[id(point)] += float(weights[cell]) * (
+                    -2.0 if own < free else 0.5 if same <= math.log(1.1) else 0.0
+                )
+    for point in points:
+        if evidence[id(point)]:
+            known = min(max(point["confidences"], 0.02), 0.95)
+            judged = 1 / (1 + (1 - known) / known * math.exp(-evidence[id(point)]))
+            point["confidences"] = min(max(judged, 0.02), 0.95)
+    return min(margins)
+
+
+def _on_pixels(pivots, viewmat, K, height, width, margins) -> dict:
+    """(log depth, pivot) of what is seen, by pixel (row, column)."""
+    pixels: dict = {}
+    for pivot in pivots:
+        x, y, z = viewmat[:3, :3] @ pivot["means"] + viewmat[:3, 3]
+        margins.append(abs(z - NEAR))
+        if z <= NEAR or pivot["confidences"] <= 0:
+            continue
+        column, row = K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
+        margins += [abs(column - round(column)), abs(row - round(row))]
+        if 0 <= column < width and 0 <= row < height:
+            pixels.setdefault((math.floor(row), math.floor(column)), []).append((math.log(z), pivot))
+    return pixels
+
+
+def _front_cluster(pairs, window, margins) -> list:
+    """The front window of the pairs on one pixel, re-centered once."""
+    front = min(ell for ell, _ in pairs)
+    members = [(ell, p["confidences"]) for ell, p in pairs if ell <= front + window]
+    center = sum(w * ell for ell, w in members) / sum(w for _, w in members)
+    margins += [abs(ell - front - window) for ell, _ in pairs]
+    margins += [abs(abs(ell - center) - window) for ell, _ in pairs]
+    return [(ell, p) for ell, p in pairs if abs(ell - center) <= window]

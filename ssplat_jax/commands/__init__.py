@@ -1,0 +1,1 @@
+"""The `ssplat` command line, a command a file."""

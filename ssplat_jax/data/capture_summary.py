@@ -1,0 +1,118 @@
+"""What `ssplat inspect` tells about a capture: facts, the numbers a run would use, and warnings with their remedies."""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+from ssplat_jax.config import StreamConfig
+from ssplat_jax.data.capture import Capture
+from ssplat_jax.data.depth_range import DepthStatistics, estimate_depths, still, stream_scale
+
+LOW_STEP = 0.012  # step between frames over median depth: below it, four frames in a row have hardly any parallax
+GOOD_STEP = 0.03  # what a suggested stride aims at
+HIGH_STEP = 0.6  # beyond it, neighbors hardly overlap
+FOCAL_SPREAD = 4.0  # largest over smallest focal length that passes without a word
+JUMP = 20.0  # a step of this many median steps
+
+
+@dataclasses.dataclass(frozen=True)
+class Summary:
+    """Facts about a capture. Lengths in capture units, `near`, `far` in stream units (capture x `scene_scale`)."""
+
+    name: str
+    format: str
+    num_frames: int
+    num_depth_maps: int
+    size: tuple[int, int]  # (width, height) delivered
+    stored_size: tuple[int, int]  # of the first frame
+    focal: tuple[float, float]  # delivered pixels, first frame
+    fov_degrees: tuple[float, float]
+    path_length: float
+    extent: float  # diagonal of the camera centers' bounding box
+    median_step: float  # between frames in stream order
+    step_over_depth: float  # median step over median depth
+    median_depth: float
+    depth_source: str
+    num_matches: int
+    parallax_degrees: float
+    scene_scale: float
+    near: float
+    far: float
+    voxel_in_capture_units: float
+    warnings: tuple[str, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain JSON types."""
+        return {k: list(v) if isinstance(v, tuple) else v for k, v in dataclasses.asdict(self).items()}
+
+
+def summarize(capture: Capture, config: StreamConfig) -> Summary:
+    """Everything `ssplat inspect` prints.
+
+    Raises:
+        InputError: an image that the depth estimate looks at is damaged.
+    """
+    depths = estimate_depths(capture, range(len(capture)))
+    scale, near, far = stream_scale(depths, config)
+    centers = capture.camtoworlds[:, :3, 3]
+    steps = np.linalg.norm(np.diff(centers, axis=0), axis=-1)
+    median_step = float(np.median(steps)) if steps.size else 0.0
+    K = capture.K(0)
+    return Summary(
+        name=capture.name,
+        format=capture.format,
+        num_frames=len(capture),
+        num_depth_maps=sum(capture.pixels.has_depth(i) for i in range(len(capture))),
+        size=(capture.width, capture.height),
+        stored_size=(capture.frames[0].width, capture.frames[0].height),
+        focal=(float(K[0, 0]), float(K[1, 1])),
+        fov_degrees=(_fov(capture.width, K[0, 0]), _fov(capture.height, K[1, 1])),
+        path_length=float(steps.sum()),
+        extent=float(np.linalg.norm(np.ptp(centers, axis=0))),
+        median_step=median_step,
+        step_over_depth=median_step / depths.median,
+        median_depth=depths.median,
+        depth_source=depths.source,
+        num_matches=depths.num_points,
+        parallax_degrees=depths.parallax_degrees,
+        scene_scale=scale,
+        near=near,
+        far=far,
+        voxel_in_capture_units=config.memory.voxel_size / scale,
+        warnings=(*capture.notes, *_warnings(capture, depths, steps)),
+    )
+
+
+def _fov(extent: int, focal: float) -> float:
+    return float(np.degrees(2 * np.arctan(extent / (2 * focal))))
+
+
+def _warnings(capture: Capture, depths: DepthStatistics, steps: np.ndarray) -> list[str]:
+    """What may go wrong, each with what to do."""
+    if len(capture) == 1:
+        return ["One frame: no parallax, so its depth is a guess; add frames from other places."]
+    if not (steps > still(capture)).any():
+        return ["All cameras stand in one place: no parallax, so depth is a guess; add frames from other places."]
+    found = []
+    step = float(np.median(steps)) / depths.median
+    if depths.source == "baselines" and depths.warning is not None:
+        found.append(depths.warning)
+    elif depths.source == "poor parallax" or step < LOW_STEP:
+        stride = max(2, round(GOOD_STEP / max(step, 1e-6)))
+        found.append(
+            f"Low parallax: a step is {step:.2%} of the median depth; try --stride {min(stride, len(capture))}."
+        )
+    elif step > HIGH_STEP:
+        found.append(f"Wide steps: {step:.0%} of the median depth; neighbors hardly overlap, so add frames between.")
+    moved = steps[steps > still(capture)]
+    if (steps > JUMP * np.median(moved)).any():
+        i = int(steps.argmax())
+        found.append(
+            f"A jump of {steps[i] / np.median(moved):.0f} median steps between frames {i} and {i + 1}: "
+            "check that the frames are one stream and in order."
+        )
+    focals = [frame.K[0, 0] for frame in capture.frames]
+    if max(focals) > FOCAL_SPREAD * min(focals):
+        found.append(f"Focal lengths from {min(focals):.0f} to {max(focals):.0f} pixels: check the intrinsics.")
+    return found

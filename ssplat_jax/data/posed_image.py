@@ -1,0 +1,132 @@
+"""`Frame`: one posed image of a capture, and the checks that every reader's cameras pass through.
+
+Poses and intrinsics are float64: float32 has a step of 0.5 m at earth-centered coordinates.
+"""
+
+import dataclasses
+import math
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+
+from ssplat_jax.data.lens import Lens
+from ssplat_jax.errors import echo, refusal
+
+ROTATION_TOLERANCE = 5e-3  # largest |R^T R - I| that is taken for rounding, to three decimals, and projected
+ROTATION_ROUNDING = 1e-5  # deviations beyond this are reported
+MILLIMETER = 1e-3
+MIN_FOCAL_PX = 3.0  # smaller focal lengths are intrinsics in units of the image, not in pixels
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Frame:
+    """One posed image as stored, before any change of size."""
+
+    name: str  # as the capture calls it
+    camtoworld: Float64[np.ndarray, "4 4"]  # OpenCV axes, capture frame
+    K: Float64[np.ndarray, "3 3"]  # pixels of the stored image, first pixel's center at (0.5, 0.5)
+    width: int
+    height: int
+    path: Path | None = None  # None: the image lives in memory
+    depth_path: Path | None = None  # 16-bit PNG
+    depth_unit: float = MILLIMETER  # capture units of one step of its values
+    pose_deviation: float = 0.0  # |R^T R - I| before projection
+    shrink: float = 1.0  # of the stored image against the one that the intrinsics were given for
+    lens: Lens | None = None  # distortion of the stored image, undone when it is delivered
+    distortion_px: float = 0.0  # largest displacement by distortion, ignored or undone
+
+    @property
+    def center(self) -> Float64[np.ndarray, "3"]:
+        """Camera center in the capture frame."""
+        return self.camtoworld[:3, 3]
+
+
+def check_camtoworld(matrix: object, where: str) -> tuple[Float64[np.ndarray, "4 4"], float]:
+    """A rigid camera-to-world transform from numbers of outside, and how far its rotation was from one.
+
+    Limits:
+        |R^T R - I| <= 5e-3: replaced by the nearest rotation. Beyond: refused.
+        det R < 0 (a mirrored frame): refused.
+    """
+    try:
+        pose = np.array(matrix, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        raise refusal(
+            where, wanted="a 4x4 matrix of numbers", got=echo(matrix), fix="write four rows of four"
+        ) from None
+    if pose.shape == (3, 4):
+        pose = np.vstack([pose, [0.0, 0.0, 0.0, 1.0]])
+    if pose.shape != (4, 4):
+        raise refusal(where, wanted="a 4x4 matrix", got=f"shape {pose.shape}", fix="write four rows of four numbers")
+    if not np.isfinite(pose).all():
+        raise refusal(where, wanted="finite numbers", got="NaN or infinity", fix="drop the frame (tracking was lost)")
+    if not np.allclose(pose[3], [0.0, 0.0, 0.0, 1.0], rtol=0, atol=1e-6):
+        transposed = np.array_equal(pose[:, 3], [0.0, 0.0, 0.0, 1.0])
+        fix = "transpose the matrix" if transposed else "give a rigid camera-to-world transform"
+        raise refusal(where, wanted="a last row of 0 0 0 1", got=echo(pose[3].tolist()), fix=fix)
+    rotation = pose[:3, :3]
+    # Huge entries overflow in the product: an infinite deviation is refused like any other.
+    with np.errstate(over="ignore", invalid="ignore"):
+        deviation = float(np.nan_to_num(np.abs(rotation.T @ rotation - np.eye(3)).max(), nan=np.inf))
+    if deviation > ROTATION_TOLERANCE:
+        got = f"R^T R off the identity by {deviation:.2g}"
+        raise refusal(
+            where, wanted="a rotation (no scale, no shear)", got=got, fix="divide the scale out of the matrix"
+        )
+    if np.linalg.det(rotation) < 0:
+        fix = "flip one axis of the camera or undo the mirroring of the world"
+        raise refusal(where, wanted="a rotation with determinant 1", got="determinant -1 (a reflection)", fix=fix)
+    u, _, vt = np.linalg.svd(rotation)
+    pose[:3, :3], pose[3] = u @ vt, [0.0, 0.0, 0.0, 1.0]
+    return pose, deviation
+
+
+def pose_of(wxyz: object, translation: object, where: str) -> Float64[np.ndarray, "4 4"]:
+    """The rigid transform of a quaternion and a translation from outside.
+
+    Limits:
+        Quaternions of any length are normalized; one shorter than 1e-6 is no rotation and is refused.
+    """
+    quat, translation = np.asarray(wxyz, np.float64), np.asarray(translation, np.float64)
+    length = float(np.linalg.norm(quat))
+    if not (np.isfinite(quat).all() and np.isfinite(translation).all()):
+        raise refusal(where, wanted="finite numbers", got="NaN or infinity", fix="drop the frame (tracking was lost)")
+    if not 1e-6 <= length < math.inf:
+        got = f"a quaternion of length {length:.2g}"
+        raise refusal(where, wanted="a rotation", got=got, fix="drop the frame or write a unit quaternion")
+    w, x, y, z = quat / length
+    pose = np.eye(4)
+    pose[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    pose[:3, 3] = translation
+    return pose
+
+
+def inverse(pose: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "4 4"]:
+    """The inverse of a rigid transform."""
+    back = np.eye(4)
+    back[:3, :3] = pose[:3, :3].T
+    back[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
+    return back
+
+
+def check_intrinsics(
+    *, fx: float, fy: float, cx: float, cy: float, width: int, height: int, where: str
+) -> Float64[np.ndarray, "3 3"]:
+    """The 3x3 matrix of plausible pixel intrinsics."""
+    for name, focal in (("fl_x", fx), ("fl_y", fy)):
+        if not (math.isfinite(focal) and focal > 0):
+            fix = "give the focal length in pixels"
+            raise refusal(f"{where}.{name}", wanted="a focal length above 0", got=echo(focal), fix=fix)
+        if focal < MIN_FOCAL_PX:
+            fix = f"multiply it by the image's {'width' if name == 'fl_x' else 'height'} if it is normalized"
+            raise refusal(f"{where}.{name}", wanted="a focal length in pixels", got=echo(focal), fix=fix)
+    for name, center, extent in (("cx", cx, width), ("cy", cy, height)):
+        if not 0 <= center <= extent:  # false for NaN too
+            fix = "give the principal point in pixels of the stored image"
+            raise refusal(f"{where}.{name}", wanted=f"a value in [0, {extent}]", got=echo(center), fix=fix)
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])

@@ -1,0 +1,166 @@
+"""Ready samples: random views for training, smooth captures for the demo. Host functions over the jitted ray-caster."""
+
+import numpy as np
+from jaxtyping import Float
+
+from ssplat_jax.data.procedural.paths import look_at, sample_path
+from ssplat_jax.data.procedural.raycast import raycast, raycast_depths
+from ssplat_jax.data.procedural.scene import NUM_SOLIDS, Scene, clearance, scale_scene
+from ssplat_jax.data.procedural.scenes import SCENE_KINDS, SCENE_SHARES, sample_scene
+from ssplat_jax.errors import InputError
+
+Views = tuple[
+    Float[np.ndarray, "v h w 3"], Float[np.ndarray, "v h w"], Float[np.ndarray, "v 4 4"], Float[np.ndarray, "v 3 3"]
+]
+
+MIN_DEPTH, MAX_DEPTH = 0.3, 15.0
+MEDIANS = (1.2, 3.5)  # median depth of a training sample
+STEPS = (0.005, 0.4)  # typical step over the median depth, log-uniform: from every frame of a video to a set of photos
+BASELINES = (0.004, 0.45)  # median step of a training sample over its median depth
+MIN_DEPTH_RATIO = 1.4  # between the 95th and the 5th percentile of depth: a sample is not one bare wall
+_FIRST_STEPS = 4
+_PROBE = 8  # the low-resolution depth that scales a sample is this many times coarser
+_PATHS = {  # paths that suit a kind of world: around its pile of objects, along its corridor, anywhere in a room
+    "room": ("handheld", "handheld", "sideways", "forward", "pan", "orbit"),
+    "corridor": ("forward", "forward", "handheld", "sideways"),
+    "street": ("forward", "handheld", "sideways", "pan"),
+    "objects": ("orbit", "orbit", "orbit", "gazing"),
+    "clutter": ("handheld", "sideways", "forward", "pan", "orbit"),
+}
+
+
+def training_sample(
+    seed: int, num_views: int, height: int, width: int, supersample: int = 1, *, steps: tuple[float, float] = STEPS
+) -> Views:
+    """Images, z-depths, camera-to-world poses and intrinsics of a random path through a random world.
+
+    Views are in the order of time; consecutive centers lie `steps` median depths apart (a range, log-uniform; by
+    default hand-held video as much as a set of photos), single steps up to three times as far. Units are such that the
+    median depth is between 1.2 and 3.5, no surface is nearer than about 0.3 and none farther than 15. The same
+    arguments give the same sample. One color ray per pixel costs a third of the default of captures: training is fed
+    on the same two cores that it runs on.
+    """
+    rng = np.random.default_rng([3, seed])
+    found = None
+    while found is None:
+        kind = str(rng.choice(SCENE_KINDS, p=SCENE_SHARES))
+        scene = sample_scene(int(rng.integers(2**31)), kind)
+        found = _scaled_path(rng, scene, _PATHS[kind], num_views, height, width, steps)
+    scene, poses, Ks = found
+    images, depths = _cast(scene, poses, Ks, height, width, supersample)
+    return _through_sensor(rng, scene, images), depths, poses, Ks
+
+
+def _scaled_path(rng, scene: Scene, kinds: tuple[str, ...], num_views: int, height: int, width: int, steps):
+    """Scene, poses and intrinsics in sample units; None if the path comes too close to something."""
+    kind = kinds[rng.integers(len(kinds))]
+    seed = int(rng.integers(2**31))
+    step = np.exp(rng.uniform(*np.log(steps)))
+    # A few first steps measure the depth that the steps of the whole walk are fractions of.
+    poses, Ks = sample_path(seed, scene, kind, _FIRST_STEPS, height, width, step=step * float(scene.orbit_radius) * 1.5)
+    median = float(np.median(_probe(scene, poses, Ks, height, width)))
+    poses, Ks = sample_path(seed, scene, kind, num_views, height, width, step=step * median)
+    depths = _probe(scene, poses, Ks, height, width)
+    median = float(np.median(depths))
+    target = rng.uniform(*MEDIANS)
+    factor = min(max(target / median, 1.1 * MIN_DEPTH / float(depths.min())), 0.9 * MAX_DEPTH / float(depths.max()))
+    free = factor * clearance(scene, poses[:, :3, 3]).min()
+    baselines = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=-1) / median
+    is_flat = np.quantile(depths, 0.95) < MIN_DEPTH_RATIO * np.quantile(depths, 0.05)
+    if free < MIN_DEPTH or factor * depths.min() < 1.09 * MIN_DEPTH or not MEDIANS[0] <= factor * median <= MEDIANS[1]:
+        return None
+    if is_flat or (num_views > 1 and not BASELINES[0] <= np.median(baselines) <= BASELINES[1]):
+        return None
+    poses[:, :3, 3] *= np.float32(factor)
+    return scale_scene(scene, factor), poses, Ks
+
+
+def _probe(scene: Scene, poses: np.ndarray, Ks: np.ndarray, height: int, width: int) -> np.ndarray:
+    """Coarse depths of all views."""
+    rows, cols = max(height // _PROBE, 12), max(width // _PROBE, 12)
+    coarse = Ks * np.array([cols / width, rows / height, 1], np.float32)[:, None]
+    return np.asarray(raycast_depths(scene, _inverted(poses), coarse, rows, cols))
+
+
+def _cast(scene: Scene, poses: np.ndarray, Ks: np.ndarray, height: int, width: int, supersample: int = 2):
+    images, depths = raycast(scene, _inverted(poses), Ks, height, width, supersample)
+    return np.asarray(images), np.asarray(depths)
+
+
+def _inverted(poses: np.ndarray) -> np.ndarray:
+    """World-to-camera of camera-to-world, in float64 inside."""
+    return np.linalg.inv(poses.astype(np.float64)).astype(np.float32)
+
+
+def _through_sensor(rng: np.random.Generator, scene: Scene, images: np.ndarray) -> np.ndarray:
+    """Exposes very dark or bright samples as a camera would; a gain per view and noise as the scene asks for."""
+    mean = float(images.mean())
+    gains = np.clip(mean, 0.3, 0.6) / mean * np.exp(float(scene.exposure_jitter) * rng.standard_normal(len(images)))
+    images = images * gains.astype(np.float32)[:, None, None, None]
+    if scene.sensor_noise:
+        images = images + np.float32(scene.sensor_noise) * rng.standard_normal(images.shape, np.float32)
+    return np.clip(images, 0, 1)
+
+
+# -- captures for the demo --------------------------------------------------------------------------------------------
+
+
+def procedural_capture_arrays(name: str, num_frames: int, height: int, width: int, seed: int = 0) -> Views:
+    """The capture `procedural:NAME`: smooth paths that cover their world evenly, in meters.
+
+    Args:
+        name: one of `CAPTURES`.
+        num_frames: views, spread evenly over the whole path.
+        height: image rows.
+        width: image columns.
+        seed: another world of the same kind.
+
+    Raises:
+        InputError: no such capture, or no frames.
+    """
+    if name not in CAPTURES:
+        raise InputError(f"procedural:{name}: no such capture; there is {', '.join(CAPTURES)}.")
+    if num_frames < 1:
+        raise InputError(f"procedural:{name}: num_frames must be at least 1, got {num_frames}.")
+    kind, route, first_seed = _ROUTES[name]
+    rng = np.random.default_rng([4, first_seed + seed])
+    while True:
+        scene = sample_scene(int(rng.integers(2**31)), kind)
+        poses = np.stack([route(scene, s) for s in (np.arange(num_frames) + 0.5) / num_frames]).astype(np.float32)
+        if clearance(scene, poses[:, :3, 3]).min() > MIN_DEPTH:
+            break
+    focal = 0.8 * max(height, width)
+    K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], np.float32)
+    Ks = np.tile(K, (num_frames, 1, 1))
+    images, depths = _cast(scene, poses, Ks, height, width)
+    return np.clip(images * np.float32(np.clip(images.mean(), 0.38, 0.55) / images.mean()), 0, 1), depths, poses, Ks
+
+
+def _around_room(scene: Scene, s: float) -> np.ndarray:
+    """Once around a room's middle, looking across it; `s` in [0, 1]."""
+    angle = 2 * np.pi * s
+    position = np.array([0.5 * np.sin(angle), -1.4 + 0.15 * np.sin(3 * angle), 0.5 * np.cos(angle)])
+    return look_at(position, np.array([-np.sin(angle), -1.15, -np.cos(angle)]))
+
+
+def _around_object(scene: Scene, s: float) -> np.ndarray:
+    """Once around the pile of objects, rising and sinking."""
+    angle, focus, radius = 2 * np.pi * s, np.asarray(scene.focus, np.float64), 1.15 * float(scene.orbit_radius)
+    elevation = 0.45 + 0.2 * np.sin(2 * angle)
+    around = [np.cos(elevation) * np.sin(angle), -np.sin(elevation), np.cos(elevation) * np.cos(angle)]
+    return look_at(focus + radius * np.array(around), focus)
+
+
+def _along_corridor(scene: Scene, s: float) -> np.ndarray:
+    """From one end of a corridor towards the other, looking left and right."""
+    half_z = float(scene.halves[NUM_SOLIDS, 2])
+    position = np.array([0.12 * np.sin(9 * s), -1.45 + 0.05 * np.sin(14 * s), half_z * (-0.85 + 1.3 * s)])
+    return look_at(position, position + np.array([0.45 * np.sin(11 * s), 0.12, 1.0]))
+
+
+_ROUTES = {  # kind of world, path through it, and the seed of one that shows much, which seed 0 stands for
+    "room": ("room", _around_room, 13),
+    "orbit": ("objects", _around_object, 3),
+    "corridor": ("corridor", _along_corridor, 8),
+}
+CAPTURES = tuple(_ROUTES)

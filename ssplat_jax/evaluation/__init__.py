@@ -1,0 +1,1 @@
+"""Scores, exposures and latency of novel views."""

@@ -1,0 +1,88 @@
+"""Plane sweep and cost-volume U-Net: P_i(k | u), what the chunk alone says of depth (Sec. 3.3; ALGORITHM 2.5-2.7)."""
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from ssplat_jax.config import StreamConfig
+from ssplat_jax.geometry.sampling import correlate_warped, places_of
+from ssplat_jax.model.convolution import Conv
+from ssplat_jax.model.layers import UNet, average_pool, unit_features
+from ssplat_jax.model.plane_sweep import sweep_pixels
+from ssplat_jax.model.types import GRID_STRIDE, DepthBelief, Features, Views, nearest_sources
+
+
+def plane_sweep(features: Features, views: Views, config: StreamConfig) -> Float[Array, "v hf wf dl"]:
+    """Mean cosine of each cell with its source views at every candidate, coarse then (if configured) fine.
+
+    Views outside the image, behind the source camera or padded do not count; a cell that no source sees scores 0.
+
+    Limits:
+        Without parallax (equal centers, a pure rotation) a pair of views scores all candidates that it sees alike.
+        Zero features score 0, equal ones 1.
+    """
+    v, hf, wf = views.inside.shape
+    maps = [(GRID_STRIDE, unit_features(features.grid), unit_features(features.grid))]
+    if config.network.fine_matching:
+        fine = unit_features(features.fine)
+        # A cell's center is the corner between 2 x 2 fine pixels: their mean is the bilinear sample there.
+        maps.append((GRID_STRIDE // 2, unit_features(average_pool(features.fine, 2)), fine))
+    sources, source_valid = nearest_sources(views.viewmats, views.valid, config.network.num_sources)
+
+    def correlate_pair(pair):
+        reference, source, is_valid = pair
+        x, y, seen = jax.lax.stop_gradient(sweep_pixels(views, reference, source, GRID_STRIDE))
+        seen = seen & is_valid
+        scores = []
+        for stride, reference_map, source_map in maps:
+            places = places_of(x / stride - 0.5, y / stride - 0.5, *source_map.shape[1:3])
+            flat_reference = reference_map[reference].reshape(-1, reference_map.shape[-1])
+            score = correlate_warped(flat_reference, source_map[source], places)
+            scores.append(jnp.where(seen, score, 0.0))
+        return jnp.stack(scores), seen.astype(jnp.float32)
+
+    num_sources = sources.shape[1]
+    pairs = (jnp.repeat(jnp.arange(v), num_sources), sources.reshape(-1), source_valid.reshape(-1))
+    scores, seen = jax.lax.map(correlate_pair, pairs)
+    scores = scores.reshape(v, num_sources, len(maps), config.network.num_depths, hf, wf).sum(axis=1)
+    counts = seen.reshape(v, num_sources, 1, config.network.num_depths, hf, wf).sum(axis=1)
+    mean = scores / jnp.maximum(counts, 1.0)
+    return mean.reshape(v, -1, hf, wf).transpose(0, 2, 3, 1)
+
+
+class CostVolume(nn.Module):
+    """U-Net over [cost, context]; the logits start as the scaled cost, so that an untrained network already matches."""
+
+    config: StreamConfig
+
+    def setup(self):
+        width = self.config.network.unet_width
+        self.enter = Conv(width)
+        self.enter_norm = nn.GroupNorm(8)
+        self.unet = UNet(width)
+        self.leave = Conv(width)
+        self.skip = Conv(width, 1)
+        self.head1 = Conv(width)
+        self.head2 = Conv(self.config.network.num_depths, kernel_init=nn.initializers.normal(1e-3))
+        levels = 2 if self.config.network.fine_matching else 1
+        self.log_temperatures = self.param("log_temperatures", nn.initializers.constant(2.0), (levels,))
+
+    def __call__(
+        self, cost: Float[Array, "v hf wf dl"], context: Float[Array, "v hf wf c"], view_valid: Bool[Array, " v"]
+    ) -> DepthBelief:
+        v, hf, wf, _ = cost.shape
+        levels = self.log_temperatures.shape[0]
+        scaled = cost.reshape(v, hf, wf, levels, -1) * jnp.exp(self.log_temperatures)[:, None]
+        x = jnp.concatenate([scaled.reshape(v, hf, wf, -1), context], axis=-1)
+        y = self.unet(nn.gelu(self.enter_norm(self.enter(x))), view_valid)
+        decoder = self.leave(y) + self.skip(x)
+        logits = scaled.sum(axis=3) + self.head2(nn.gelu(self.head1(decoder)))
+        return DepthBelief(probs=jax.nn.softmax(logits, axis=-1), logits=logits, decoder=decoder)
+
+
+def match(params, features: Features, views: Views, config: StreamConfig) -> DepthBelief:
+    """P_i(k | u) by plane sweep, U-Net and softmax, in float32 whatever the features' precision."""
+    features = jax.tree.map(lambda x: x.astype(jnp.float32), features)
+    cost = plane_sweep(features, views, config)
+    return CostVolume(config).apply({"params": params}, cost, features.context, views.valid)  # pyright: ignore[reportReturnType]

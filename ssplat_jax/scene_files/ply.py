@@ -1,0 +1,198 @@
+"""The 3DGS PLY file: what every splat viewer opens.
+
+Binary little endian, one row of float32 per Gaussian, in the frame and units of the Gaussians:
+
+    x y z · nx ny nz (zeros) · f_dc_0..2 · f_rest_0..3K-1 · opacity · scale_0..2 · rot_0..3
+
+`opacity` is a logit, `scale` ln of the standard deviation, `rot` a quaternion wxyz, color = 0.5 + 0.28209 f_dc + ...;
+`f_rest` is channel-major: the K = 0, 3, 8 or 15 coefficients of red, then of green, then of blue. The comment
+`SplatRenderMode: mip` says that the scene is meant for a renderer with the 2D Mip filter, as ours is. A scene far from
+the origin of its frame, where float32 is too coarse for it, is written from an offset near by, and the comment
+`offset x y z` says what to add.
+"""
+
+import dataclasses
+import os
+
+import jax.numpy as jnp
+import numpy as np
+
+from ssplat_jax.errors import InputError
+from ssplat_jax.gaussians import Gaussians
+from ssplat_jax.scene_files.export_rows import LOG_SCALE_LIMIT, ExportReport, SceneRows, scene_rows, unit_quats
+from ssplat_jax.scene_files.ply_table import read_vertices
+from ssplat_jax.storage.atomic import write_atomic
+
+RENDER_MODES = ("default", "mip", "2dgs")
+
+REST_TERMS = {0: 0, 9: 1, 24: 2, 45: 3}
+"""Number of f_rest properties to SH degree."""
+
+BASE_PROPERTIES = (
+    *("x", "y", "z"),
+    *("f_dc_0", "f_dc_1", "f_dc_2"),
+    "opacity",
+    *("scale_0", "scale_1", "scale_2"),
+    *("rot_0", "rot_1", "rot_2", "rot_3"),
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class SplatFile:
+    """What a file holds: its Gaussians, and what its comments say of them."""
+
+    gaussians: Gaussians
+    render_mode: str
+    """The kind of renderer that they were made for: `mip` (ours), `2dgs`, or `default`, that of 3DGS."""
+    offset: tuple[float, float, float]
+    """To be added to the positions."""
+
+
+def save_ply(
+    path: str | os.PathLike,
+    gaussians: Gaussians,
+    *,
+    render_mode: str = "mip",
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> ExportReport:
+    """Writes `gaussians` to `path`, all or nothing; the same Gaussians give the same bytes.
+
+    Args:
+        path: of the file; folders are made.
+        gaussians: in the frame the file should be in (`Capture` scenes: the capture's own).
+        render_mode: the comment `SplatRenderMode`, one of `default`, `mip`, `2dgs`.
+        offset: where the origin of `gaussians` lies in the frame the file should be in; a comment unless zero.
+
+    Limits:
+        As `scene_rows`; what it leaves out is counted.
+
+    Raises:
+        InputError: no such render mode.
+        StorageError: the file cannot be written.
+    """
+    if render_mode not in RENDER_MODES:
+        raise InputError(f"save_ply: render_mode must be one of {', '.join(RENDER_MODES)}, got {render_mode!r}.")
+    rows = scene_rows(gaussians)
+    header = _header(len(rows), gaussians.sh_degree, render_mode, offset)
+    write_atomic(path, header + _table(rows).astype("<f4").tobytes())
+    return ExportReport(num_written=len(rows), num_dropped=gaussians.num_gaussians - len(rows), offset=offset)
+
+
+def property_names(sh_degree: int) -> list[str]:
+    """The properties of a row, in the order of the file."""
+    rest = 3 * ((sh_degree + 1) ** 2 - 1)
+    names = ["x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3)), *(f"f_rest_{i}" for i in range(rest))]
+    return [*names, "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
+
+
+def _header(num_rows: int, sh_degree: int, render_mode: str, offset: tuple[float, float, float]) -> bytes:
+    lines = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"comment SplatRenderMode: {render_mode}",
+        f"comment SH degree: {sh_degree}",
+        *([f"comment offset {' '.join(map(repr, offset))}"] if any(offset) else []),
+        f"element vertex {num_rows}",
+        *(f"property float {name}" for name in property_names(sh_degree)),
+        "end_header\n",
+    ]
+    return "\n".join(lines).encode("ascii")
+
+
+def _table(rows: SceneRows) -> np.ndarray:
+    """One row of raw values per Gaussian, float64 until the last cast."""
+    rest = rows.sh[:, 1:].transpose(0, 2, 1).reshape(len(rows), 3 * (rows.sh.shape[1] - 1))
+    logits = np.log(rows.opacities) - np.log1p(-rows.opacities)
+    normals = np.zeros_like(rows.means)
+    columns = [rows.means, normals, rows.sh[:, 0], rest, logits[:, None], rows.log_scales, rows.quats]
+    return np.concatenate(columns, axis=1)
+
+
+def load_ply(path: str | os.PathLike) -> Gaussians:
+    """The Gaussians of a 3DGS PLY file: ascii or binary of either byte order, properties in any order, others ignored.
+
+    Limits:
+        Opacity logits of +-inf (other writers' unguarded logits) give 0 and 1; any other entry that is not finite in
+        float32 is refused.
+        Scales are clamped to [e^-20, e^20]; quaternions are normalized, a zero one becomes the identity.
+        A comment `offset x y z` (`save_ply`) is not added: positions stay what float32 holds exactly.
+
+    Raises:
+        InputError: the file is no 3DGS PLY, is cut off, or holds entries that are not finite.
+    """
+    return read_ply(path).gaussians
+
+
+def read_ply(path: str | os.PathLike) -> SplatFile:
+    """What `load_ply` gives, and the comments `SplatRenderMode` and `offset`.
+
+    Raises:
+        InputError: as `load_ply`, or an offset that is not three numbers.
+    """
+    columns, comments = read_vertices(path)
+    missing = [name for name in BASE_PROPERTIES if name not in columns]
+    if missing:
+        packed = (
+            " it is compressed; convert it to a plain 3DGS .ply"
+            if "packed_position" in columns
+            else " give a 3DGS .ply"
+        )
+        raise InputError(f"{path}: element vertex: wanted the property {missing[0]!r}, it is missing;{packed}.")
+    num_rest = sum(name.startswith("f_rest_") for name in columns)
+    rest_names = [f"f_rest_{i}" for i in range(num_rest)]
+    if num_rest not in REST_TERMS or not all(name in columns for name in rest_names):
+        raise InputError(
+            f"{path}: element vertex: wanted f_rest_0, f_rest_1, ... of 0, 9, 24 or 45 coefficients, got {num_rest}; "
+            "write the file again with a full SH degree."
+        )
+    means = _stacked(path, columns, ("x", "y", "z"))
+    dc = _stacked(path, columns, ("f_dc_0", "f_dc_1", "f_dc_2"))
+    rest = _stacked(path, columns, rest_names).reshape(len(means), 3, num_rest // 3).transpose(0, 2, 1)
+    logits = _stacked(path, columns, ("opacity",), allow_infinite=True)[:, 0]
+    log_scales = _stacked(path, columns, ("scale_0", "scale_1", "scale_2"))
+    quats = _stacked(path, columns, ("rot_0", "rot_1", "rot_2", "rot_3"))
+    fields = {
+        "means": means,
+        "quats": unit_quats(quats),
+        "scales": np.exp(np.clip(log_scales, -LOG_SCALE_LIMIT, LOG_SCALE_LIMIT)),
+        "opacities": 0.5 * (1 + np.tanh(0.5 * logits)),  # the sigmoid, without overflow
+        "sh": np.concatenate([dc[:, None], rest], axis=1),
+    }
+    return SplatFile(
+        gaussians=Gaussians(**{name: jnp.asarray(field, jnp.float32) for name, field in fields.items()}),
+        render_mode=_render_mode(comments),
+        offset=_offset(path, comments),
+    )
+
+
+def _render_mode(comments: list[str]) -> str:
+    said = [comment.split()[-1] for comment in comments if comment.startswith("SplatRenderMode:")]
+    return said[-1] if said and said[-1] in RENDER_MODES else "default"
+
+
+def _offset(path, comments: list[str]) -> tuple[float, float, float]:
+    for comment in comments:
+        if comment.split()[:1] == ["offset"]:
+            try:
+                x, y, z = (float(word) for word in comment.split()[1:])
+            except ValueError:
+                x = y = z = np.nan
+            if not np.isfinite([x, y, z]).all():
+                raise InputError(f"{path}: comment offset: wanted three numbers, got {comment!a}; correct the comment.")
+            return x, y, z
+    return 0.0, 0.0, 0.0
+
+
+def _stacked(path, columns: dict[str, np.ndarray], names, *, allow_infinite: bool = False) -> np.ndarray:
+    """Columns side by side in float64, checked to be finite once they are float32."""
+    if not names:
+        return np.zeros((len(columns["x"]), 0))
+    stacked = np.stack([columns[name] for name in names], axis=1).astype(np.float64)
+    bad = np.isnan(stacked) | ((np.abs(stacked) > np.finfo(np.float32).max) & (not allow_infinite))
+    if bad.any():
+        (row, column), num_bad = np.argwhere(bad)[0], bad.any(axis=1).sum()
+        raise InputError(
+            f"{path}: vertex {row}: wanted a finite {names[column]}, got {stacked[row, column]} ({num_bad} such rows); "
+            "drop them."
+        )
+    return stacked

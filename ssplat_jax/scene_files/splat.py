@@ -1,0 +1,39 @@
+"""The .splat file of the first viewers for browsers: 32 bytes a Gaussian, in one color from every side.
+
+    x y z (float32) · scales (float32, standard deviations) · r g b opacity (uint8) · w x y z (uint8, 128 + 128 q)
+
+A viewer may stop reading early, so what covers most comes first: in order of volume times opacity. There is no header;
+whoever draws the file takes its frame as y down and dilates as 3DGS does.
+"""
+
+import os
+
+import numpy as np
+
+from ssplat_jax.gaussians import SH_C0, Gaussians
+from ssplat_jax.scene_files.export_rows import ExportReport, scene_rows, to_bytes
+from ssplat_jax.storage.atomic import write_atomic
+
+ROW = np.dtype([("mean", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
+
+
+def save_splat(path: str | os.PathLike, gaussians: Gaussians) -> ExportReport:
+    """Writes `gaussians` to `path`, all or nothing; the same Gaussians give the same bytes.
+
+    Limits:
+        As `scene_rows`. Colors are cut to [0, 1]; SH bands above the constant are left out.
+
+    Raises:
+        StorageError: the file cannot be written.
+    """
+    rows = scene_rows(gaussians)
+    prominence = rows.log_scales.sum(axis=1) + np.log(rows.opacities)
+    order = np.argsort(-prominence, kind="stable")
+    table = np.zeros(len(rows), ROW)
+    table["mean"] = rows.means[order]
+    table["scales"] = np.exp(rows.log_scales[order])
+    table["rgba"][:, :3] = to_bytes(255 * (0.5 + SH_C0 * rows.sh[order, 0]))
+    table["rgba"][:, 3] = to_bytes(255 * rows.opacities[order])
+    table["quat"] = to_bytes(128 + 128 * rows.quats[order])
+    write_atomic(path, table.tobytes())
+    return ExportReport(num_written=len(rows), num_dropped=gaussians.num_gaussians - len(rows))

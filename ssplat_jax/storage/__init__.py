@@ -1,0 +1,1 @@
+"""Files and folders: atomic writes, locks, JSON, npz, images, video, PyTorch files."""

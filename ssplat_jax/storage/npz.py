@@ -1,0 +1,91 @@
+"""Named arrays in one `.npz`, no pickle, that is either read back exactly or refused.
+
+    header          JSON bytes: schema, kind, dtype and sha256 of every array, and the caller's own facts
+    <name>          the arrays; bfloat16, which `.npy` has no name for, as its 16 bits
+    archive comment sha256 of every byte before it, so that no bit of the file can change unnoticed
+
+`numpy.load` reads the file as it is.
+"""
+
+import hashlib
+import io
+import json
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import ml_dtypes
+import numpy as np
+
+from ssplat_jax.errors import StorageError
+from ssplat_jax.storage.atomic import write_atomic
+
+SCHEMA = 2
+_HEADER = "header"
+_DIGEST_LENGTH = 64  # hex digits
+
+
+def save_arrays(
+    path: Path, arrays: dict[str, np.ndarray], kind: str, header: dict[str, Any], *, keep_previous: bool = False
+) -> None:
+    """Writes `arrays` and the JSON-able `header`; `path` holds the old file or the whole new one, never a part.
+
+    Raises:
+        StorageError: the folder cannot be written or the disk is full.
+    """
+    leaves = {name: {"dtype": str(x.dtype), "sha256": _digest(x)} for name, x in arrays.items()}
+    text = json.dumps({"schema": SCHEMA, "kind": kind, "leaves": leaves, "header": header}, sort_keys=True)
+    buffer = io.BytesIO()
+    bits = {name: x if x.dtype.isbuiltin == 1 else x.view(f"u{x.dtype.itemsize}") for name, x in arrays.items()}
+    np.savez(buffer, **{_HEADER: np.frombuffer(text.encode(), np.uint8)}, **bits)  # pyright: ignore[reportArgumentType]
+    # The last field of a zip file without comment is the comment's length.
+    sealed = buffer.getvalue()[:-2] + _DIGEST_LENGTH.to_bytes(2, "little")
+    write_atomic(path, sealed + _hex_digest(sealed), keep_previous=keep_previous)
+
+
+def load_arrays(path: Path, kind: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """(arrays, header) of a file that `save_arrays` wrote.
+
+    Raises:
+        StorageError: no such file, another kind, or one that is not, bit for bit, what was written.
+    """
+    try:
+        contents = Path(path).read_bytes()
+    except OSError as error:
+        raise StorageError(f"{path}: cannot be read ({error.strerror or error}).") from error
+    try:
+        arrays, facts = _parse(contents)
+    # A damaged archive surfaces as almost anything: zlib, struct, UTF-8, JSON or key errors.
+    except (ValueError, KeyError, TypeError, OSError, EOFError, zipfile.BadZipFile) as error:
+        raise StorageError(f"{path}: the file is corrupt ({error}); take it from a backup or make it anew.") from error
+    if facts["kind"] != kind:
+        raise StorageError(
+            f"{path}: wanted a file of {kind}, got one of {facts['kind']}; one of another version has to be made anew."
+        )
+    return arrays, facts["header"]
+
+
+def _parse(contents: bytes) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    if _hex_digest(memoryview(contents)[:-_DIGEST_LENGTH]) != contents[-_DIGEST_LENGTH:]:
+        raise ValueError("its checksum does not match")
+    with np.load(io.BytesIO(contents), allow_pickle=False) as archive:
+        facts = json.loads(archive[_HEADER].tobytes())
+        if facts["schema"] != SCHEMA:
+            raise ValueError(f"its schema is {facts['schema']}, this version reads {SCHEMA}")
+        arrays = {name: archive[name].view(_dtype(leaf["dtype"])) for name, leaf in facts["leaves"].items()}
+    for name, leaf in facts["leaves"].items():
+        if _digest(arrays[name]) != leaf["sha256"]:
+            raise ValueError(f"the checksum of {name} does not match")
+    return arrays, facts
+
+
+def _dtype(name: str) -> np.dtype:
+    return np.dtype(getattr(ml_dtypes, name, name))
+
+
+def _digest(x: np.ndarray) -> str:
+    return hashlib.sha256(f"{x.dtype} {x.shape} ".encode() + x.tobytes()).hexdigest()
+
+
+def _hex_digest(data: bytes | memoryview) -> bytes:
+    return hashlib.sha256(data).hexdigest().encode()

@@ -1,0 +1,1 @@
+"""The step, and what feeds it chunk by chunk."""

@@ -1,0 +1,98 @@
+"""Following a growing scene: after each chunk only the Gaussians that changed, for a viewer or a file.
+
+    feed = SceneFeed(model, params)
+    for chunk in chunks:
+        cache, _ = step(params, cache, chunk)
+        delta = feed.update(cache)          # the rows that changed and their Gaussians: only those are decoded
+        scene = apply_delta(scene, delta)   # equals model.decode(params, cache)
+
+A voxel's Gaussians change when a token is written to it, which the cache remembers per pivot (`last_chunks`), or when
+views carve a pivot away or bring it back, which the feed sees by comparing what is shown with what was.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Int32
+
+from ssplat_jax.cache import VoxelCache
+from ssplat_jax.cache.state import require_one
+from ssplat_jax.gaussians import Gaussians, mask_gaussians
+from ssplat_jax.streaming.streamsplat import StreamSplat, shown_pivots
+
+FEWEST_ROWS = 256  # numbers of rows are rounded up to powers of two from here on, so that few programs are compiled
+
+
+@dataclasses.dataclass(frozen=True)
+class SceneDelta:
+    """The voxels that changed, and what they hold now, absent Gaussians (opacity 0) among it."""
+
+    rows: Int32[np.ndarray, " r"]  # ascending
+    gaussians: Gaussians  # [r * k], in the order of `rows`; k = pivots_per_voxel * gaussians_per_token
+    capacity: int  # of the cache: the scene has capacity * k Gaussians
+
+
+class SceneFeed:
+    """What a follower of one stream has been told. Call `update` after as many chunks as you like.
+
+    Args:
+        model: the stream's.
+        params: its parameters.
+        known: a cache that the follower has already; by default it knows nothing.
+    """
+
+    def __init__(self, model: StreamSplat, params: dict, known: VoxelCache | None = None) -> None:
+        self._params = params
+        self._shown_pivots = jax.jit(lambda cache: shown_pivots(cache, model.config))
+        self._decode_rows = jax.jit(model.decode_rows)
+        self._next_chunk, self._shown = 0, np.zeros((0, model.config.memory.pivots_per_voxel), bool)
+        if known is not None:
+            self._changed_rows(known)
+
+    def update(self, cache: VoxelCache) -> SceneDelta:
+        """The changes since the last call.
+
+        Raises:
+            InputError: `cache` is several, of streams or shards.
+        """
+        require_one(cache, "SceneFeed.update")
+        rows = self._changed_rows(cache)
+        num_padded = max(FEWEST_ROWS, 1 << max(len(rows) - 1, 0).bit_length())
+        padded = np.pad(rows, (0, num_padded - len(rows)), constant_values=-1)
+        gaussians = self._decode_rows(self._params, cache, jnp.asarray(padded))
+        num_gaussians = gaussians.num_gaussians // num_padded * len(rows)
+        return SceneDelta(rows, jax.tree.map(lambda x: x[:num_gaussians], gaussians), cache.capacity)
+
+    def _changed_rows(self, cache: VoxelCache) -> Int32[np.ndarray, " r"]:
+        """Rows written or carved since the last call; remembers that they are told."""
+        shown = np.asarray(self._shown_pivots(cache))
+        known = np.pad(self._shown, [(0, cache.capacity - len(self._shown)), (0, 0)])  # the cache may have grown
+        is_written = np.asarray(cache.alive) & (np.asarray(cache.last_chunks) >= self._next_chunk)
+        self._next_chunk, self._shown = int(cache.stats.num_chunks), shown
+        return np.flatnonzero((is_written | (shown != known)).any(axis=1)).astype(np.int32)
+
+
+def apply_delta(scene: Gaussians | None, delta: SceneDelta) -> Gaussians:
+    """`scene` (None: nothing yet) with the changes: what `decode` gives, row for row, once a delta has had rows."""
+    num_rows = len(delta.rows)
+    k = delta.gaussians.num_gaussians // num_rows if num_rows else 1
+    places = (delta.rows[:, None] * k + np.arange(k)).reshape(-1)
+    if scene is None:
+        scene = _absent(delta.gaussians, 0)
+    missing = max(delta.capacity * k - scene.num_gaussians, 0) if num_rows else 0
+    grown = jax.tree.map(lambda a, b: np.concatenate([a, b]), scene, _absent(delta.gaussians, missing))
+    return jax.tree.map(lambda x, new: _with_rows(x, places, new), grown, delta.gaussians)
+
+
+def _absent(like: Gaussians, num_rows: int) -> Gaussians:
+    """`num_rows` Gaussians that are not there, as `decode` writes them."""
+    empty = jax.tree.map(lambda x: jnp.zeros((num_rows, *x.shape[1:]), x.dtype), like)
+    return jax.tree.map(np.asarray, mask_gaussians(empty, jnp.zeros((num_rows,), bool)))
+
+
+def _with_rows(x: np.ndarray, rows: np.ndarray, values) -> np.ndarray:
+    x = np.array(x)
+    x[rows] = np.asarray(values)
+    return x

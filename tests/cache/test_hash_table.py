@@ -1,0 +1,79 @@
+"""Voxel keys and the hash table: indices as float32 NumPy has them, every voxel found, none mistaken for another."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ssplat_jax.cache.fuse import _stable_order
+from ssplat_jax.cache.hash_table import build_table, find_rows, group_equal, insert_rows
+from ssplat_jax.geometry.voxels import INDEX_LIMIT, hash_voxels, voxel_indices
+
+RNG = np.random.default_rng(0)
+
+
+@pytest.mark.parametrize("voxel_size", [0.04, 0.25, 0.1, 1 / 3])
+def test_voxel_is_the_floor_of_one_float32_product(voxel_size):
+    points = np.concatenate([RNG.uniform(-5, 5, (500, 3)), RNG.integers(-9, 9, (500, 3)) * voxel_size])
+    points = points.astype(np.float32)
+    voxels, in_range = voxel_indices(jnp.asarray(points), voxel_size)
+    np.testing.assert_array_equal(voxels, np.floor(points * np.float32(1 / voxel_size)).astype(int))
+    assert np.all(np.asarray(in_range))
+
+
+@pytest.mark.parametrize("cell", [INDEX_LIMIT, -INDEX_LIMIT, 1e30, np.inf, -np.inf, np.nan])
+def test_out_of_range_gives_index_zero_and_false(cell):
+    voxels, in_range = voxel_indices(jnp.array([[0.0, cell * 0.25, 1.0]]), 0.25)
+    assert not bool(in_range[0]) and not np.any(np.asarray(voxels))
+
+
+def test_the_last_voxels_in_range_are_kept():
+    cells = np.array([[INDEX_LIMIT - 1, 1 - INDEX_LIMIT, 0]])
+    voxels, in_range = voxel_indices(jnp.asarray((cells + 0.5) * 0.25, jnp.float32), 0.25)
+    assert bool(in_range[0])
+    np.testing.assert_array_equal(voxels, cells)
+
+
+def test_hash_spreads_a_plane_of_neighbors_like_chance():
+    """Surfaces are planes of voxels: 2^14 of them in 2^16 slots collide as often as random keys do."""
+    side = 128
+    for fixed in range(3):
+        plane = np.insert(np.stack(np.divmod(np.arange(side**2), side), axis=-1) - 64, fixed, 7, axis=1)
+        slots = np.asarray(hash_voxels(jnp.asarray(plane))) % (4 * side**2)
+        expected = 4 * side**2 * (1 - np.exp(-1 / 4))  # distinct slots hit by random keys
+        assert abs(len(np.unique(slots)) - expected) < 4 * np.sqrt(side**2)
+
+
+def colliding(num: int) -> np.ndarray:
+    """Distinct voxels that all hash to the same slot of 64."""
+    voxels = RNG.integers(-500, 500, (200 * num, 3))
+    voxels = voxels[np.asarray(hash_voxels(jnp.asarray(voxels))) % 64 == 5]
+    return np.unique(voxels, axis=0)[:num].astype(np.int32)
+
+
+def test_voxels_of_one_hash_are_told_apart():
+    voxels = colliding(12)
+    assert len(voxels) == 12
+    table = build_table(jnp.asarray(np.pad(voxels, ((0, 4), (0, 0)))), jnp.int32(8))
+    held = jnp.asarray(np.pad(voxels, ((0, 4), (0, 0))))
+    rows = find_rows(table, held, jnp.asarray(voxels), jnp.ones(12, bool))
+    np.testing.assert_array_equal(rows, [*range(8), *[-1] * 4])
+    table = insert_rows(table, jnp.asarray(voxels), jnp.arange(12), jnp.arange(12) >= 8)
+    np.testing.assert_array_equal(find_rows(table, held, jnp.asarray(voxels), jnp.ones(12, bool)), np.arange(12))
+
+
+def test_equal_voxels_are_grouped_under_the_first():
+    voxels = np.concatenate([colliding(8), RNG.integers(0, 3, (56, 3))]).astype(np.int32)
+    voxels = voxels[RNG.integers(0, 64, 400)]
+    active = RNG.uniform(size=400) < 0.8
+    leaders = jax.jit(group_equal)(jnp.asarray(voxels), jnp.asarray(active))
+    first: dict = {}
+    expected = [first.setdefault(tuple(v), i) if a else i for i, (v, a) in enumerate(zip(voxels, active, strict=True))]
+    np.testing.assert_array_equal(leaders, expected)
+
+
+@pytest.mark.parametrize("num_tokens", [1, 1000, 65535, 65600])
+def test_stable_order_holds_for_any_number_of_tokens(num_tokens):
+    """65536 is where key and index no longer fit one 32-bit word together."""
+    keys = np.minimum(RNG.integers(0, num_tokens + 1, num_tokens) // 7 * 7, num_tokens).astype(np.int32)
+    np.testing.assert_array_equal(_stable_order(jnp.asarray(keys)), np.argsort(keys, kind="stable"))

@@ -1,0 +1,146 @@
+"""ReSplat's checkpoints: every tensor finds its place, and what is no such file is refused."""
+
+import jax
+import numpy as np
+import pytest
+
+from ssplat_jax.checkpoint.published_weights import DEPTH, import_params, tensor_of, tensors_of
+from ssplat_jax.checkpoint.weights import load_params
+from ssplat_jax.config import StreamConfig, preset
+from ssplat_jax.errors import InputError
+from ssplat_jax.model import init_params
+from tests.model.resplat_fixture import listed_tensors
+
+CONFIG = preset("small").replace(mixer_blocks=1)
+HEAD = "encoder.gaussian_head."
+
+
+@pytest.fixture(scope="module")
+def tensors() -> dict[str, np.ndarray]:
+    """A checkpoint with numbers that say where they belong."""
+    shapes = {t.name: t.shape for t in tensors_of(CONFIG).values() if t is not None}
+    return {name: np.full(shape, i, np.float32) for i, (name, shape) in enumerate(shapes.items())}
+
+
+@pytest.fixture(scope="module")
+def depth_network(tensors, tmp_path_factory):
+    """Without what stands behind the depth, and without the names of what it stood in."""
+    path = tmp_path_factory.mktemp("upstream") / "depth.npz"
+    np.savez(path, **{name.removeprefix(DEPTH): x for name, x in tensors.items() if name.startswith(DEPTH)})
+    return path
+
+
+def test_every_tensor_of_the_authors_list_has_a_place_and_its_shape():
+    ours = {t.name: t.shape for t in tensors_of(preset("small")).values() if t is not None}
+    assert ours == listed_tensors("resplat_small")
+
+
+@pytest.mark.parametrize(
+    ("place", "shape", "name", "theirs"),
+    [
+        (
+            "encoder/backbone/layer1_0/conv1/kernel",
+            (3, 3, 5, 7),
+            f"{DEPTH}backbone.layer1.0.conv1.weight",
+            (7, 5, 3, 3),
+        ),
+        (
+            "encoder/backbone/layer2_0/downsample_0/kernel",
+            (5, 7),
+            f"{DEPTH}backbone.layer2.0.downsample.0.weight",
+            (7, 5, 1, 1),
+        ),
+        ("encoder/pretrained/blocks_11/ls1/gamma", (5,), f"{DEPTH}pretrained.blocks.11.ls1.gamma", (5,)),
+        (
+            "cost_volume/regressor_0_3/input_blocks_5_1/qkv/kernel",
+            (5, 7),
+            f"{DEPTH}regressor.0.3.input_blocks.5.1.qkv.weight",
+            (7, 5, 1),
+        ),
+        ("upsampler/resize_layers_1/kernel", (2, 2, 5, 7), f"{DEPTH}upsampler.resize_layers.1.weight", (5, 7, 2, 2)),
+        ("upsampler/resize_layers_3/kernel", (3, 3, 5, 7), f"{DEPTH}upsampler.resize_layers.3.weight", (7, 5, 3, 3)),
+        ("mixer/blocks_0/norm1/scale", (5,), "encoder.pt.blocks.0.norm1.weight", (5,)),
+        ("decoder/gaussian_head_2/kernel", (5, 7), f"{HEAD}2.weight", (7, 5)),
+    ],
+)
+def test_a_parameter_is_found_by_its_name(place, shape, name, theirs):
+    tensor = tensor_of(tuple(place.split("/")), shape)
+    assert tensor is not None and (tensor.name, tensor.shape) == (name, theirs)
+    x = np.random.default_rng(0).normal(size=theirs)
+    came = tensor.to_parameter(x)
+    assert came.shape == shape
+    if len(shape) > 1:  # entry (in 2, out 4); transposed convolutions have them in that order there too
+        index = (2, 4) if theirs[0] == 5 else (4, 2)
+        np.testing.assert_array_equal(came[..., 2, 4].reshape(-1), x[index].reshape(-1))
+
+
+def test_hpda_and_cgfi_are_of_no_checkpoint():
+    assert tensor_of(("hpda", "raw_gamma"), ()) is None
+    assert tensor_of(("cgfi", "enter", "kernel"), (3, 3, 5, 7)) is None
+
+
+def test_a_depth_network_by_itself_leaves_the_rest_fresh(depth_network, tensors):
+    imported = import_params(depth_network, CONFIG, seed=5)
+    assert imported.fresh == ("gaussian_regressor", "pt", "gaussian_head")
+    assert imported.num_imported == sum(name.startswith(DEPTH) for name in tensors) and imported.num_unused == 0
+    wanted = jax.eval_shape(lambda key: init_params(key, CONFIG), jax.random.key(0))
+    shapes = lambda tree: jax.tree.map(lambda x: (x.shape, x.dtype), tree)  # noqa: E731
+    assert shapes(imported.params) == shapes(wanted)
+    for place, tensor in tensors_of(CONFIG).items():
+        if tensor is not None and tensor.name.startswith(DEPTH):
+            leaf = imported.params
+            for name in place.split("/"):
+                leaf = leaf[name]
+            assert float(leaf.reshape(-1)[0]) == tensors[tensor.name].reshape(-1)[0], place
+    fresh = init_params(jax.random.key(5), CONFIG, ("hpda", "tokens", "cgfi", "mixer", "decoder"))
+    for name, stage in fresh.items():
+        jax.tree.map(np.testing.assert_array_equal, imported.params[name], stage)
+
+
+def test_of_another_network_the_depth_alone_can_be_taken(tmp_path, tensors):
+    path = tmp_path / "depthsplat.ckpt.npz"
+    other = {f"{HEAD}0.weight": np.zeros((37, 64, 3, 3), np.float32), "encoder.feature_upsampler.x": np.zeros(3)}
+    pretrained = {name: x for name, x in tensors.items() if ".pretrained." in name or ".backbone." in name}
+    np.savez(path, **pretrained, **other)
+    with pytest.raises(InputError, match=r"encoder\.gaussian_head"):
+        import_params(path, CONFIG)
+    imported = import_params(path, CONFIG, depth_only=True)
+    assert imported.num_imported == len(pretrained) and imported.num_unused == 2
+    assert {"transformer", "upsampler", "regressor", "gaussian_head"} <= set(imported.fresh)
+    assert not {"backbone", "pretrained"} & set(imported.fresh)
+    name = f"{DEPTH}backbone.conv1.weight"
+    assert float(imported.params["encoder"]["backbone"]["conv1"]["kernel"][0, 0, 0, 0]) == tensors[name].flat[0]
+
+
+def saved(path, **arrays):
+    np.savez(path, **arrays)
+    return path
+
+
+def test_what_is_no_checkpoint_of_resplat_is_refused(tmp_path, tensors):
+    head = {name: x for name, x in tensors.items() if name.startswith(HEAD)}
+    path = tmp_path / "a.npz"
+    with pytest.raises(InputError, match=r"wanted a preset of ReSplat's network \(small, base\), got 'tiny'"):
+        import_params(saved(path, **head), StreamConfig())
+    with pytest.raises(InputError, match=r"a\.npz: wanted weights of ReSplat, .* none of their \d+ tensors"):
+        import_params(saved(path, **{"encoder.other.weight": np.zeros(3, np.float32)}), CONFIG)
+    lacking = {name: x for name, x in head.items() if not name.endswith("2.bias")}
+    with pytest.raises(InputError, match=r"a\.npz: wanted an array encoder\.gaussian_head\.2\.bias, the file has none"):
+        import_params(saved(path, **lacking), CONFIG)
+    other = head | {f"{HEAD}2.bias": np.zeros(37, np.float32)}
+    with pytest.raises(InputError, match=r"wanted encoder\.gaussian_head\.2\.bias of shape \(58,\), got \(37,\)"):
+        import_params(saved(path, **other), CONFIG)
+    with pytest.raises(InputError, match="cannot be read"):
+        import_params(tmp_path / "nothing.pth", CONFIG)
+
+
+def test_only_presets_with_weights_are_named_as_such():
+    with pytest.raises(InputError, match=r"a preset with shipped weights \(tiny\) or a file, got 'huge'"):
+        load_params("huge")
+
+
+def test_a_preset_without_shipped_weights_says_how_to_get_them():
+    with pytest.raises(
+        InputError, match=r"none ship with the preset 'small'; convert ReSplat's \(ssplat import-weights"
+    ):
+        load_params("small")

@@ -1,0 +1,110 @@
+"""A training goes on from the newest checkpoint that is whole, and never from a damaged one."""
+
+import gc
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ssplat_jax.checkpoint.training_state import TrainingCheckpoints
+from ssplat_jax.errors import StorageError
+
+# Orbax leaves tasks behind where a damaged file stops it.
+pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+
+STATE = {"weights": jnp.linspace(-1.0, 1.0, 5000).reshape(50, 100), "step": jnp.array(0, jnp.int32)}
+
+
+@pytest.fixture(autouse=True)
+def _nothing_left_behind():
+    yield
+    gc.collect()  # what they complain of when they go is not the next test's
+
+
+def state_of(step: int):
+    return {"weights": STATE["weights"] * step, "step": jnp.array(step, jnp.int32)}
+
+
+def saved(folder, *steps: int) -> None:
+    checkpoints = TrainingCheckpoints(folder, {})
+    for step in steps:
+        checkpoints.save(step, state_of(step))
+    checkpoints.close()
+
+
+def restored(folder):
+    """What a new process finds, and what it was told."""
+    told = []
+    checkpoints = TrainingCheckpoints(folder, {})
+    try:
+        return checkpoints.restore_latest(STATE, told.append), told
+    finally:
+        checkpoints.close()
+
+
+def files_of(folder, step: int):
+    """The files of a checkpoint that hold something, largest first: arrays before their descriptions."""
+    found = [p for p in (folder / "checkpoints" / str(step)).rglob("*") if p.is_file() and p.stat().st_size]
+    return sorted(found, key=lambda p: -p.stat().st_size)
+
+
+def flip_a_bit(path, place: int) -> None:
+    contents = bytearray(path.read_bytes())
+    contents[place % len(contents)] ^= 1 << (place % 8)
+    path.write_bytes(contents)
+
+
+def assert_state(found, step: int) -> None:
+    assert found is not None and found[0] == step
+    jax.tree.map(np.testing.assert_array_equal, found[1], state_of(step))
+
+
+def test_the_newest_is_restored_and_nothing_is_said(tmp_path):
+    assert restored(tmp_path) == (None, [])
+    saved(tmp_path, 1, 2, 3)
+    found, told = restored(tmp_path)
+    assert_state(found, 3)
+    assert told == []
+
+
+def test_no_flipped_bit_is_restored(tmp_path):
+    """Wherever it is: the state is the newest as it was saved, or the one before, which is said."""
+    saved(tmp_path, 1, 2)
+    original = {path: path.read_bytes() for path in files_of(tmp_path, 2)}
+    random, num_fallen_back = np.random.default_rng(0), 0
+    for number, path in enumerate(list(original) * 3):
+        flip_a_bit(path, int(random.integers(len(original[path]))))
+        found, told = restored(tmp_path)
+        if told:
+            assert_state(found, 1)
+            assert "checkpoint 2 is damaged" in told[0]
+            (tmp_path / "damaged-2").rename(tmp_path / "checkpoints" / "2")
+            num_fallen_back += 1
+        else:
+            assert_state(found, 2)
+        path.write_bytes(original[path])
+        assert number or told  # the first is the largest array: no part of it is to spare
+    assert num_fallen_back >= 3
+
+
+def test_training_goes_on_after_a_damaged_checkpoint(tmp_path):
+    saved(tmp_path, 1, 2)
+    files_of(tmp_path, 2)[0].write_bytes(b"")
+    checkpoints, told = TrainingCheckpoints(tmp_path, {}), []
+    assert_state(checkpoints.restore_latest(STATE, told.append), 1)
+    checkpoints.save(2, state_of(2))  # the step that was lost, once more
+    checkpoints.close()
+    assert len(told) == 1 and (tmp_path / "damaged-2").is_dir()
+    found, told = restored(tmp_path)
+    assert_state(found, 2)
+    assert told == []
+
+
+def test_where_all_are_damaged_that_is_said_and_nothing_moved(tmp_path):
+    saved(tmp_path, 1, 2)
+    for step in (1, 2):
+        files_of(tmp_path, step)[0].unlink()
+    with pytest.raises(StorageError, match="checkpoints 2, 1 are damaged"):
+        restored(tmp_path)
+    assert sorted(p.name for p in (tmp_path / "checkpoints").iterdir() if p.is_dir()) == ["1", "2"]

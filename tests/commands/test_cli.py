@@ -1,0 +1,313 @@
+"""The command line: help at once, clear refusals, nothing half-written. Heavy commands are run small."""
+
+import dataclasses
+import functools
+import hashlib
+import json
+import shutil
+import subprocess
+import sys
+import time
+
+import jax
+import numpy as np
+import pytest
+from PIL import Image
+
+from ssplat_jax.checkpoint.delta_files import load_delta, load_delta_header
+from ssplat_jax.checkpoint.published_weights import tensors_of
+from ssplat_jax.checkpoint.stream_state import load_state
+from ssplat_jax.checkpoint.weights import load_params, load_weights, save_weights
+from ssplat_jax.commands import main as cli
+from ssplat_jax.config import StreamConfig, preset
+from ssplat_jax.evaluation import evaluate
+from ssplat_jax.scene_files.ply import load_ply
+from ssplat_jax.streaming.scene_delta import apply_delta
+from ssplat_jax.streaming.streamsplat import StreamSplat
+from tests.model.resplat_fixture import named_tensor
+
+COMMANDS = (
+    *("demo", "inspect", "run", "eval", "train", "export", "render", "view", "import-weights", "bench", "experiment"),
+)
+
+
+@pytest.fixture(autouse=True)
+def few_pivots(monkeypatch):
+    """Scenes this small are not decoded and rendered at the size of large ones."""
+    monkeypatch.setattr("ssplat_jax.streaming.session.FEWEST_DECODED", 1 << 11)
+
+
+def run(*arguments: str) -> int:
+    with pytest.raises(SystemExit) as stopped:
+        cli.main(list(arguments))
+    return int(stopped.value.code or 0)
+
+
+def make_capture(folder, num_frames=6, size=(32, 24)):
+    """A small valid transforms.json capture: a camera sliding along a chequered wall, three pixels a frame."""
+    width, height = size
+    cells = np.random.default_rng(0).integers(0, 255, (height // 4, width // 4 + num_frames, 3), dtype=np.uint8)
+    wall = cells.repeat(4, axis=0).repeat(4, axis=1)
+    (folder / "images").mkdir(parents=True)
+    frames = []
+    for i in range(num_frames):
+        Image.fromarray(wall[:, 3 * i : 3 * i + width]).save(folder / "images" / f"{i}.png")
+        pose = np.eye(4)
+        pose[0, 3] = 0.1 * i
+        frames.append({"file_path": f"images/{i}.png", "transform_matrix": pose.tolist()})
+    facts = {"w": width, "h": height, "fl_x": float(width), "fl_y": float(width), "cx": width / 2, "cy": height / 2}
+    facts["frames"] = frames
+    (folder / "transforms.json").write_text(json.dumps(facts))
+    return folder
+
+
+@pytest.mark.parametrize("command", [(), *((c,) for c in COMMANDS)])
+def test_help_does_not_import_jax_and_shows_an_example(command):
+    code = (
+        "import sys\nfrom ssplat_jax.commands.main import main\n"
+        f"sys.argv = ['ssplat', *{command!r}, '--help']\n"
+        "try:\n    main()\nexcept SystemExit as stop:\n    assert not stop.code\n"
+        "assert 'jax' not in sys.modules, 'help imported jax'\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    if command:
+        assert f"Example: ssplat {command[0]}" in " ".join(done.stdout.split())
+
+
+@pytest.mark.slow
+def test_help_answers_within_a_second():
+    since = time.perf_counter()
+    subprocess.run([sys.executable, "-m", "ssplat_jax.commands.main", "--help"], capture_output=True, check=True)
+    assert time.perf_counter() - since < 1.0
+
+
+def truncate(capture):
+    path = capture / "images" / "2.png"
+    path.write_bytes(path.read_bytes()[:200])
+
+
+def edit(field, value):
+    def change(capture):
+        facts = json.loads((capture / "transforms.json").read_text())
+        target = facts if field in facts else facts["frames"][1]
+        target[field] = value
+        (capture / "transforms.json").write_text(json.dumps(facts))
+
+    return change
+
+
+SHEARED = [[1, 0.5, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+NAN_POSE = [[1, 0, 0, float("nan")], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+BAD_CAPTURES = {
+    "missing image": (lambda c: (c / "images" / "3.png").unlink(), "3.png"),
+    "truncated image": (truncate, "2.png"),
+    "NaN pose": (edit("transform_matrix", NAN_POSE), "transform_matrix"),
+    "non-rotation pose": (edit("transform_matrix", SHEARED), "transform_matrix"),
+    "focal zero": (edit("fl_x", 0.0), "fl_x"),
+    "size differs": (edit("w", 64), "64"),
+    "empty folder": (lambda c: [shutil.rmtree(c), c.mkdir()], "empty"),
+    "path outside": (edit("file_path", "../../secret.png"), "secret"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_CAPTURES)
+@pytest.mark.parametrize("command", ["eval", "run"])
+def test_bad_capture_is_one_line_exit_2_and_nothing_written(case, command, tmp_path, capsys):
+    capture = make_capture(tmp_path / "capture")
+    spoil, named = BAD_CAPTURES[case]
+    spoil(capture)
+    out = tmp_path / "out"
+    options = ("--context", "5") if command == "eval" else ()
+    # Fresh weights: refusing must not depend on the shipped ones.
+    code = run(command, str(capture), *options, "--out", str(out))
+    captured = capsys.readouterr()
+    assert code == 2
+    lines = [line for line in captured.err.splitlines() if line.strip()]
+    assert len(lines) == 1 and named in lines[0], captured.err
+    assert not out.exists()
+
+
+@pytest.mark.parametrize("place", ["views", "deltas", "images"])
+@pytest.mark.parametrize("command", ["eval", "run"])
+def test_results_among_the_captures_own_images_are_refused(command, place, tmp_path, capsys):
+    """What a run writes over and clears may be what it reads."""
+    make_capture(tmp_path / place)
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*.*")}
+    options = ("--context", "5") if command == "eval" else ("--overwrite",)
+    for out in (tmp_path, tmp_path / place, tmp_path / place / "images"):
+        assert run(command, str(tmp_path / place), *options, "--out", str(out)) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert "--out" in line
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*.*")} == before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (("inspect", "no/such/folder"), "no/such/folder"),
+        (("eval", "procedural:room", "--context", "5", "--size", "huge", "--out", "x"), "--size"),
+        (("eval", "procedural:room?frames=12&size=32x24", "--context", "5000", "--out", "x"), "context"),
+        (("eval", "procedural:room", "--context", "8", "--set", "voxel_size=-1", "--out", "x"), "voxel_size"),
+        (("eval", "procedural:room", "--context", "8", "--set", "no_such=1", "--out", "x"), "no_such"),
+        (("eval", "procedural:room", "--context", "8", "--weights", "no.npz", "--out", "x"), "no.npz"),
+        (("eval", "procedural:room", "--context", "8", "--lpips-vgg", "vgg.pth", "--out", "x"), "--lpips-heads"),
+        (("train", "--lpips-vgg", "no.pth", "--lpips-heads", "heads.pth", "--out", "x"), "no.pth"),
+        (("run", "procedural:room?frames=2&size=32x24", "--stride", "0", "--out", "x"), "--stride"),
+        (("run", "procedural:room?frames=2&size=32x24", "--save-every", "0", "--out", "x"), "--save-every"),
+        (("run", "procedural:room?frames=2&size=32x24", "--max-views", "-1", "--out", "x"), "--max-views"),
+        (("run", "procedural:room?frames=2&size=10x10", "--out", "x"), "11 pixels"),
+        (("train", "--scale-steps", "0", "--out", "x"), "--scale-steps"),
+        (("run", "procedural:room", "--set", "capacity=65536.0", "--out", "x"), "capacity"),
+        (("run", "procedural:room", "--set", "chunk_size=4.5", "--out", "x"), "chunk_size"),
+        (("run", "procedural:room", "--set", "sh_degree=1", "--out", "x"), "another config"),
+        (("train", "--set", "encoder_widths=[16, 0]", "--out", "x"), "encoder_widths"),
+        (("export", "no_run", "--to", "x.ply"), "no_run"),
+        (("import-weights", "no.pth", "--out", "x.npz"), "no.pth: cannot be read"),
+        (("run", "procedural:room", "--weights", "small", "--out", "x"), "none ship with the preset 'small'"),
+        (("inspect", "procedural:castle"), "castle"),
+    ],
+)
+def test_bad_usage_is_one_line_and_exit_2(arguments, named, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert run(*arguments) == 2
+    lines = [line for line in capsys.readouterr().err.splitlines() if line.strip()]
+    assert len(lines) == 1 and named in lines[0]
+    assert not any(tmp_path.iterdir())
+
+
+def test_inspect_prints_json(capsys):
+    assert run("inspect", "procedural:orbit?frames=12&size=64x48", "--json") == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["num_frames"] == 12 and facts["near"] < facts["far"]
+
+
+@pytest.mark.parametrize(
+    ("change", "field", "value"),
+    [
+        ("cluster_ratio=inf", "cluster_ratio", float("inf")),
+        ("voxel_size=1", "voxel_size", 1.0),
+        ("encoder_widths=[16, 32]", "encoder_widths", (16, 32)),
+        ("scene_scale=2.5", "scene_scale", 2.5),
+        ("vacc=append", "vacc", "append"),
+        ("carving=false", "carving", False),
+    ],
+)
+def test_set_takes_what_the_field_holds(change, field, value):
+    changed = cli.apply_changes(preset("tiny"), (change,))
+    assert getattr(changed, field) == value and type(getattr(changed, field)) is type(value)
+    hash(changed)
+
+
+def assert_deltas_give_the_scene(out, *names):
+    """The changes of every chunk, put together, against the final state decoded at once."""
+    files = sorted((out / "deltas").iterdir())
+    assert [path.name for path in files] == list(names)
+    told = functools.reduce(apply_delta, map(load_delta, files), None)
+    cache, header = load_state(out / "state.npz")
+    assert load_delta_header(files[-1]) == {"frame": header["frame"], "views": header["done"]}
+    model = StreamSplat(StreamConfig.from_dict(header["config"]))
+    scene = jax.jit(model.decode)(load_params("tiny"), cache)
+    assert 0 < (told.opacities > 0).sum() == (np.asarray(scene.opacities) > 0).sum()
+    for field in dataclasses.fields(scene):
+        np.testing.assert_allclose(getattr(told, field.name), getattr(scene, field.name), rtol=1e-5, atol=1e-5)
+
+
+def test_run_stops_resumes_and_exports(tmp_path, capsys):
+    out = tmp_path / "run"
+    capture = str(make_capture(tmp_path / "capture", num_frames=12, size=(64, 48)))
+    (out / "deltas").mkdir(parents=True)
+    (out / "deltas" / "000003.npz").write_bytes(b"of a run that was stopped before its first save")
+    assert run("run", capture, "--out", str(out), "--save-every", "1", "--deltas", "--quiet") == 0
+    assert {"scene.ply", "state.npz", "metrics.json"} <= {p.name for p in out.iterdir()}
+    assert_deltas_give_the_scene(out, "000004.npz", "000008.npz", "000012.npz")
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["cache"]["num_chunks"] == 3 and list(metrics["exposures"]) == [str(i) for i in range(12)]
+    assert run("export", str(out), "--to", str(tmp_path / "again.ply")) == 0
+    assert (tmp_path / "again.ply").read_bytes() == (out / "scene.ply").read_bytes()
+    other = tmp_path / "other.npz"
+    params, config = load_params("tiny"), preset("tiny")
+    save_weights(other, jax.tree.map(lambda x: 0.5 * x, params), config, {})
+    assert run("export", str(out), "--to", str(tmp_path / "wrong.ply"), "--weights", str(other)) == 2
+    assert "other weights" in capsys.readouterr().err and not (tmp_path / "wrong.ply").exists()
+    # A finished run is not streamed twice; deltas asked for only now begin with the whole scene.
+    shutil.rmtree(out / "deltas")
+    assert run("run", capture, "--out", str(out), "--deltas", "--quiet") == 0
+    assert_deltas_give_the_scene(out, "000012.npz")
+    # Without deltas it is left alone; going on without telling more leaves none that would not add up to the scene.
+    assert run("run", capture, "--out", str(out), "--quiet") == 0
+    assert_deltas_give_the_scene(out, "000012.npz")
+    shutil.copy(out / "state.npz.previous", out / "state.npz")
+    assert run("run", capture, "--out", str(out), "--quiet") == 0
+    assert not any((out / "deltas").glob("*.npz"))
+    # Another configuration is refused.
+    assert json.loads((out / "metrics.json").read_text())["cache"]["num_chunks"] == 3
+    for changes, difference in (
+        (("--set", "voxel_size=0.1"), "differs in its config (voxel_size: 0.03 there, 0.1 now)"),
+        (("--stride", "2"), "differs in its frames (12 there, 6 now"),
+        (("--size", "32x24"), "differs in its size ([64, 48] there, [32, 24] now)"),
+        (("--quality", "fast"), "differs in its size ([64, 48] there, [32, 24] now)"),
+        (("--weights", str(other)), "differs in its weights"),
+    ):
+        capsys.readouterr()
+        assert run("run", capture, "--out", str(out), *changes, "--quiet") == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert difference in line and "--overwrite" in line
+    images = tmp_path / "capture" / "images"
+    kept = (images / "5.png").read_bytes()
+    (images / "5.png").write_bytes((images / "4.png").read_bytes())
+    assert run("run", capture, "--out", str(out), "--quiet") == 2
+    assert "differs in its images" in capsys.readouterr().err
+    (images / "5.png").write_bytes(kept)
+    edit("transform_matrix", np.diag([1.0, 1.0, 1.0, 1.0]).tolist())(tmp_path / "capture")  # a corrected pose
+    assert run("run", capture, "--out", str(out), "--quiet") == 2
+    assert "differs in its poses" in capsys.readouterr().err
+
+
+def test_more_room_the_remedy_for_a_run_that_stopped_for_want_of_it_goes_on_with_what_was_saved(tmp_path):
+    out, capture = tmp_path / "run", str(make_capture(tmp_path / "capture", num_frames=8, size=(64, 48)))
+    assert run("run", capture, "--out", str(out), "--set", "overflow=error", "--quiet") == 0
+    scene = (out / "scene.ply").read_bytes()
+    more = ("--set", "capacity=65536", "--set", "overflow=grow")
+    assert run("run", capture, "--out", str(out), *more, "--quiet") == 0
+    assert load_state(out / "state.npz")[0].num_voxels > 0 and (out / "scene.ply").read_bytes() == scene
+
+
+def test_eval_writes_every_promised_field(tmp_path, monkeypatch):
+    monkeypatch.setattr(evaluate, "LATENCY_REPEATS", 1)  # how often it times is not what is tested
+    out = tmp_path / "eval"
+    capture = make_capture(tmp_path / "capture", num_frames=12, size=(128, 96))
+    arguments = ("eval", str(capture), "--context", "8", "--out", str(out), "--quiet")
+    assert run(*arguments, "--quality", "fast") == 0
+    metrics = json.loads((out / "metrics.json").read_text())
+    promised = {
+        "psnr", "ssim", "lpips", "per_view", "context_views", "target_views", "chunk_ms", "render_ms", "compile_s",
+        "step_memory_bytes", "cache", "num_gaussians", "config_hash", "baselines",
+    }  # fmt: skip
+    assert promised <= metrics.keys()
+    assert {"voxels", "pivots", "capacity", "overflow", "accepted_fraction"} <= metrics["cache"].keys()
+    assert {"nearest_view_psnr", "mean_color_psnr"} <= metrics["baselines"].keys()
+    assert metrics["context_views"] == 8 and metrics["target_views"] == len(metrics["per_view"]) == 1
+    per_token = preset("tiny").head.gaussians_per_token
+    assert per_token * metrics["cache"]["pivots"] >= metrics["cache"]["decoded"] == metrics["num_gaussians"] > 0
+    assert hashlib.sha256((out / "split.json").read_bytes()).hexdigest() == metrics["split_sha256"]
+    # Streamed at half the size, scored at the whole.
+    assert (metrics["streamed_size"], metrics["size"]) == ([64, 48], [128, 96])
+    with Image.open(out / "view_00004.png") as picture:
+        assert picture.size == (3 * 128, 96)
+
+
+@pytest.mark.slow  # compiles a network of 62 million parameters
+def test_imported_weights_stream_a_capture(tmp_path, capsys):
+    tensors = {t.name: named_tensor(t.name, t.shape) for t in tensors_of(preset("small")).values() if t is not None}
+    np.savez(tmp_path / "upstream.npz", **tensors)
+    assert run("import-weights", str(tmp_path / "upstream.npz"), "--out", str(tmp_path / "small.npz")) == 0
+    assert "701 tensors (0 not used); fresh: HPDA and CGFI" in capsys.readouterr().out
+    params, config = load_weights(tmp_path / "small.npz")
+    assert config.network.upstream_compat and config.preset == "small"
+    assert params["decoder"]["gaussian_head_2"]["kernel"].dtype == np.float32
+    name = "encoder.gaussian_head.2.weight"
+    np.testing.assert_array_equal(params["decoder"]["gaussian_head_2"]["kernel"], tensors[name].T)
+    capture, out = make_capture(tmp_path / "capture"), tmp_path / "out"
+    weights = ("--weights", str(tmp_path / "small.npz"), "--set", "min_confidence=0.0")
+    assert run("run", str(capture), "--out", str(out), *weights, "--quiet") == 0
+    assert load_ply(out / "scene.ply").num_gaussians > 0

@@ -1,0 +1,150 @@
+"""`ssplat render`: pictures of a scene file from a capture's cameras, and a film."""
+
+import sys
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from PIL import Image
+
+import ssplat_jax as ss
+from ssplat_jax.data.stream_frame import StreamFrame
+from ssplat_jax.gaussians import mean_color
+from ssplat_jax.pytree import replace
+from ssplat_jax.rasterizer import Effects, fill_holes
+from tests.commands.test_cli import make_capture, run
+
+LEVEL = 1.0 / 255
+FILM_DB = 38.0  # x264's losses, of the brightness: colors have half the resolution
+SHIFT = (4096.0, -512.0, 64.0)  # whole numbers, so that the positions counted from it are the same floats
+
+
+def scene(num_gaussians=60):
+    rng = np.random.default_rng(3)
+    values = {
+        "means": np.round(rng.uniform([-1, -1, -4], [1, 1, -2], (num_gaussians, 3)) * 256) / 256,
+        "quats": rng.normal(size=(num_gaussians, 4)),
+        "scales": rng.uniform(0.02, 0.2, (num_gaussians, 3)),
+        "opacities": rng.uniform(0.2, 0.9, num_gaussians),
+        "colors": rng.uniform(size=(num_gaussians, 3)),
+    }
+    return ss.Gaussians.from_rgb(**{name: jnp.asarray(x, jnp.float32) for name, x in values.items()})
+
+
+def picture(path):
+    with Image.open(path) as image:
+        return np.asarray(image, np.float64) / 255
+
+
+@pytest.fixture
+def capture(tmp_path):
+    return make_capture(tmp_path / "capture", num_frames=3, size=(48, 32))
+
+
+def wanted(capture, gaussians, i, antialias, *, filled=True):
+    opened = ss.open_capture(capture)
+    camera = opened.camera(i, StreamFrame.at_camera(np.eye(4), scale=1.0, near=0.0, far=1.0))
+    out = ss.render(gaussians, camera, effects=Effects(antialias=antialias))
+    return np.clip(fill_holes(out.color, out.alpha, mean_color(gaussians)) if filled else out.color, 0, 1)
+
+
+def test_pictures_are_what_the_cameras_see(tmp_path, capture, capsys):
+    ss.save_ply(tmp_path / "run" / "scene.ply", scene())
+    out = tmp_path / "pictures"
+    assert run("render", str(tmp_path / "run"), str(capture), "--stride", "2", "--out", str(out), "--quiet") == 0
+    assert "2 pictures" in capsys.readouterr().out
+    assert sorted(path.name for path in (out / "views").iterdir()) == ["00000.png", "00002.png"]
+    loaded = ss.load_ply(tmp_path / "run" / "scene.ply")
+    for i in (0, 2):
+        found = picture(out / "views" / f"{i:05d}.png")
+        np.testing.assert_allclose(found, wanted(capture, loaded, i, "mip"), atol=0.51 * LEVEL)
+    assert np.abs(picture(out / "views" / "00000.png") - picture(out / "views" / "00002.png")).max() > 0.1
+    # Fewer pictures than before: the others do not stay.
+    arguments = ("--max-views", "1", "--over-black", "--quiet")
+    assert run("render", str(tmp_path / "run"), str(capture), "--out", str(out), *arguments) == 0
+    (only,) = (out / "views").iterdir()
+    np.testing.assert_allclose(picture(only), wanted(capture, loaded, 0, "mip", filled=False), atol=0.51 * LEVEL)
+
+
+def test_a_scene_for_another_renderer_is_drawn_as_there(tmp_path, capture):
+    ss.save_ply(tmp_path / "scene.ply", scene(), render_mode="default")
+    data = (tmp_path / "scene.ply").read_bytes()
+    (tmp_path / "scene.ply").write_bytes(data.replace(b"comment SplatRenderMode: default\n", b""))
+    arguments = ("--max-views", "1", "--out", str(tmp_path / "out"), "--quiet")
+    assert run("render", str(tmp_path / "scene.ply"), str(capture), *arguments) == 0
+    loaded, found = ss.load_ply(tmp_path / "scene.ply"), picture(tmp_path / "out" / "views" / "00000.png")
+    np.testing.assert_allclose(found, wanted(capture, loaded, 0, "classic"), atol=0.51 * LEVEL)
+    assert np.abs(found - wanted(capture, loaded, 0, "mip")).max() > 3 * LEVEL
+
+
+def test_a_scene_counted_from_an_offset_is_seen_where_it_is(tmp_path, capture):
+    gaussians = scene()
+    ss.save_ply(tmp_path / "near.ply", gaussians)
+    moved = replace(gaussians, means=gaussians.means - jnp.asarray(SHIFT, jnp.float32))
+    ss.save_ply(tmp_path / "counted.ply", moved, offset=SHIFT)
+    for name in ("near", "counted"):
+        arguments = ("--max-views", "1", "--out", str(tmp_path / name), "--quiet")
+        assert run("render", str(tmp_path / f"{name}.ply"), str(capture), *arguments) == 0
+    pictures = [picture(tmp_path / name / "views" / "00000.png") for name in ("near", "counted")]
+    # The camera's place among numbers of 4096 is rounded to 2e-4: a hundredth of a pixel.
+    np.testing.assert_allclose(*pictures, atol=3 * LEVEL)
+
+
+@pytest.mark.parametrize(
+    ("mode", "name", "words"),
+    [("2dgs", "scene.ply", "2dgs"), ("mip", "other.ply", "other.ply"), ("mip", "empty", "scene.ply")],
+)
+def test_what_cannot_be_rendered_is_said_in_a_line_and_nothing_written(mode, name, words, tmp_path, capture, capsys):
+    ss.save_ply(tmp_path / "scene.ply", scene(), render_mode=mode)
+    (tmp_path / "empty").mkdir()
+    out = tmp_path / "out"
+    assert run("render", str(tmp_path / name), str(capture), "--out", str(out), "--quiet") == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert words in line and not out.exists()
+
+
+def test_an_offset_that_is_none_is_refused(tmp_path, capture, capsys):
+    ss.save_ply(tmp_path / "scene.ply", scene(), offset=SHIFT)
+    data = (tmp_path / "scene.ply").read_bytes()
+    (tmp_path / "scene.ply").write_bytes(data.replace(b"offset 4096.0", b"offset 4096,0"))
+    arguments = ("--out", str(tmp_path / "out"), "--quiet")
+    assert run("render", str(tmp_path / "scene.ply"), str(capture), *arguments) == 2
+    assert "three numbers" in capsys.readouterr().err
+
+
+def decode(path):
+    av = pytest.importorskip("av")
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        return stream.average_rate, [f.to_ndarray(format="rgb24") / 255 for f in container.decode(stream)]
+
+
+def test_a_film_goes_from_camera_to_camera(tmp_path, capture):
+    pytest.importorskip("av")
+    ss.save_ply(tmp_path / "scene.ply", scene())
+    out = tmp_path / "out"
+    arguments = ("--size", "45x31", "--out", str(out), "--quiet")
+    assert run("render", str(tmp_path / "scene.ply"), str(capture), "--film", "4", *arguments) == 0
+    rate, film = decode(out / "film.mp4")
+    assert (rate, len(film)) == (24, 2 * 4 + 1)
+    views = [picture(out / "views" / f"{i:05d}.png")[:30, :44] for i in range(3)]
+    brightness = np.array([0.2126, 0.7152, 0.0722])
+    error = lambda a, b: -10 * np.log10(np.mean(((a - b) @ brightness) ** 2))  # noqa: E731
+    for i, view in enumerate(views):
+        assert error(film[4 * i], view) > FILM_DB
+        assert np.abs((film[4 * i] - view).mean(axis=(0, 1))).max() < 3 * LEVEL
+    # In between it shows neither of its ends.
+    assert max(error(film[2], views[0]), error(film[2], views[1])) < min(error(film[0], views[0]), FILM_DB) - 5
+    # Without a film, none of another scene stays.
+    assert run("render", str(tmp_path / "scene.ply"), str(capture), *arguments) == 0
+    assert sorted(path.name for path in out.iterdir()) == ["views"]
+
+
+@pytest.mark.parametrize(("film", "words"), [("0", "film"), ("-3", "film"), ("2", 'pip install "ssplat-jax[video]"')])
+def test_a_film_that_cannot_be_made_is_said_and_nothing_written(film, words, tmp_path, capture, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "av", None)  # not installed
+    ss.save_ply(tmp_path / "scene.ply", scene())
+    out = tmp_path / "out"
+    assert run("render", str(tmp_path / "scene.ply"), str(capture), "--film", film, "--out", str(out), "--quiet") == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert words in line and not out.exists()

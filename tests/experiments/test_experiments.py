@@ -1,0 +1,85 @@
+"""What the experiments compute beside what they measure, and how the command line finds them."""
+
+from importlib.metadata import entry_points
+from typing import get_args
+
+import numpy as np
+import pytest
+from ssplat_experiments.ablation import table
+from ssplat_experiments.accuracy_vs_time import SCORED, SETTINGS, mark_front
+from ssplat_experiments.depth_error import cell_depths, summary
+
+from ssplat_jax.commands.main import Experiment, QualityName, guarded
+from ssplat_jax.config import QUALITIES
+
+
+def row(ms, psnr):
+    return {"ms_per_view": ms, "psnr": psnr}
+
+
+def test_the_front_holds_what_nothing_beats_in_both():
+    rows = [row(10, 15.0), row(20, 14.0), row(20, 18.0), row(5, 12.0), row(30, 18.0), row(40, 18.5)]
+    mark_front(rows)
+    for a in rows:
+        beaten = any(b["ms_per_view"] <= a["ms_per_view"] and b["psnr"] >= a["psnr"] and b is not a for b in rows)
+        assert a["front"] != beaten
+
+
+def test_the_qualities_are_settings_that_were_measured():
+    measured = {setting.quality: setting for setting in SETTINGS if setting.quality}
+    assert measured.keys() == QUALITIES.keys() == set(get_args(QualityName))
+    for name, quality in QUALITIES.items():
+        assert measured[name].changes == dict(quality.changes)
+        assert measured[name].size == tuple(quality.scale * side for side in SCORED)
+
+
+def test_depth_errors_are_free_of_one_global_scale_and_binned_by_confidence():
+    confidences = np.array([0.2, 0.55, 0.65, 0.95, 1.0])
+    row = summary(3.0 * np.array([2.0, 1.1, 1.0, 1.0, 1.02]), confidences, tau=0.5)
+    assert row["accepted"] == 0.8 and row["global_scale"] == pytest.approx(3.03)
+    errors = [entry["median_error"] for entry in row["by_confidence"] if entry["tokens"]]
+    np.testing.assert_allclose(errors, [0.9802, 0.0891, 0.0099, 0.0099], atol=1e-4)
+    assert sum(entry["tokens"] for entry in row["by_confidence"]) == 5
+
+
+def test_a_cell_s_depth_is_the_median_of_what_is_known_of_it():
+    depth = np.zeros((9, 8), np.float32)
+    depth[:4, :4] = np.arange(1, 17).reshape(4, 4)
+    depth[:2, 4:] = 5.0
+    depth[4, 4] = 7.0
+    np.testing.assert_array_equal(cell_depths(depth), [[8.0, 5.0], [0.0, 0.0]])
+
+
+def test_variants_are_compared_with_the_full_model_of_the_same_seed():
+    """Seeds move all scores alike: the difference's spread is not that of the scores."""
+    scores = {"full": (20.0, 22.0, 24.0), "without HPDA": (19.9, 21.8, 23.9), "without CGFI": (20.5,)}
+    rows = [
+        {"scene": "room", "variant": variant, "seed": seed, "psnr": psnr, "gaussians": 10}
+        for variant, column in scores.items()
+        for seed, psnr in enumerate(column)
+    ]
+    lines = table(rows).splitlines()[2:]
+    assert lines[0] == "| room | full | 22.00 ± 2.00 (3) |  | 10 |"
+    assert lines[1] == "| room | without HPDA | 21.87 ± 2.00 (3) | 0.13 ± 0.06 (3) | 10 |"
+    assert lines[2] == "| room | without CGFI | 20.50 (one seed) | -0.50 (one seed) | 10 |"
+
+
+def test_every_registered_experiment_can_be_loaded():
+    points = entry_points(group="ssplat_jax.experiments")
+    assert {"captures", "accuracy_vs_time", "ablation", "depth_error", "more_views"} <= {point.name for point in points}
+    assert all(callable(point.load()) for point in points)
+
+
+def test_an_unknown_experiment_is_refused_before_anything_is_written(tmp_path, capsys):
+    assert guarded(Experiment("no_such", out=tmp_path / "out").run) == 2
+    assert "accuracy_vs_time" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("missing", [None, "empty"])
+def test_the_captures_experiment_says_what_it_wanted(missing, tmp_path, capsys):
+    folder = None if missing is None else tmp_path / missing
+    if folder:
+        folder.mkdir()
+    assert guarded(Experiment("captures", out=tmp_path / "out", captures=folder, quiet=True).run) == 2
+    assert "captures" in capsys.readouterr().err

@@ -1,0 +1,233 @@
+"""What passes between the stages: padding, candidates, choice of sources; positions and the head's Gaussians."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ssplat_jax.config import preset
+from ssplat_jax.gaussians import SH_C0
+from ssplat_jax.geometry.cameras import pixel_grid, project_points, transform_points
+from ssplat_jax.geometry.rotations import matrices_to_quats, quats_to_matrices
+from ssplat_jax.model import GRID_STRIDE, back_project, count_params, decode_tokens, init_params, patch_colors
+from ssplat_jax.model.compact.cnn_encoder import Encoder
+from ssplat_jax.model.compact.gaussian_head import START_OPACITY, read_shapes
+from ssplat_jax.model.decoder import MIN_SCALE, START_SCALE, START_THICKNESS, token_scales
+from ssplat_jax.model.types import nearest_sources, prepare_views
+from ssplat_jax.model.windows import from_windows, sine_positions, to_windows
+from ssplat_jax.pytree import replace
+from tests.geometry.test_cameras import poses
+from tests.model.small import CONFIG, HEIGHT, WIDTH, chunk, params
+
+FLOAT32 = 1e-5
+
+
+def test_padding_keeps_the_image_and_says_what_is_inside():
+    views = prepare_views(chunk(), CONFIG)
+    np.testing.assert_array_equal(views.images[:, :HEIGHT, :WIDTH], chunk().images)
+    np.testing.assert_array_equal(views.images[:, HEIGHT:, :WIDTH], np.repeat(chunk().images[:, -1:], 32 - HEIGHT, 1))
+    np.testing.assert_array_equal(views.Ks, chunk().Ks)
+    centers = np.asarray(pixel_grid(32, 32, GRID_STRIDE))
+    wanted = (centers[..., 0] < WIDTH) & (centers[..., 1] < HEIGHT)
+    np.testing.assert_array_equal(views.inside, np.broadcast_to(wanted, (3, 8, 8)))
+    assert wanted.sum() == 6 * 7  # the seventh column's centers, x = 26, lie in the image; x = 30 does not
+
+
+def test_a_padded_view_has_no_cell_inside():
+    views = prepare_views(replace(chunk(), valid=jnp.array([True, False, True])), CONFIG)
+    np.testing.assert_array_equal(views.inside.any(axis=(1, 2)), [True, False, True])
+
+
+def test_candidates_are_uniform_in_log_depth_from_near_to_far():
+    logs = prepare_views(chunk(), CONFIG).log_candidates
+    np.testing.assert_allclose(logs, np.linspace(np.log(1.0), np.log(6.0), CONFIG.network.num_depths), atol=FLOAT32)
+
+
+def test_the_grid_camera_sees_cell_centres_at_pixel_centers():
+    views = prepare_views(chunk(), CONFIG)
+    points = jnp.array([[[0.3, -0.2, 2.0]]])
+    fine, _ = project_points(points, views.Ks[:1])
+    coarse, _ = project_points(points, views.grid_camera.Ks[:1])
+    np.testing.assert_allclose(coarse * GRID_STRIDE, fine, atol=1e-4)
+    assert (views.grid_camera.height, views.grid_camera.width) == (8, 8)
+
+
+def line_of_cameras(*xs) -> jax.Array:
+    return jnp.stack([jnp.eye(4).at[0, 3].set(-float(x)) for x in xs])
+
+
+def test_sources_are_the_nearest_other_views():
+    sources, valid = nearest_sources(line_of_cameras(0, 1, 3, 7), jnp.ones(4, bool), 2)
+    np.testing.assert_array_equal(sources, [[1, 2], [0, 2], [1, 0], [2, 1]])
+    assert valid.all()
+
+
+def test_a_view_is_never_its_own_source_even_among_cameras_at_one_place():
+    sources, valid = nearest_sources(line_of_cameras(0, 0, 0, 0), jnp.ones(4, bool), 3)
+    assert valid.all() and (sources != jnp.arange(4)[:, None]).all()
+    assert all(len(set(row)) == 3 for row in np.asarray(sources).tolist())
+
+
+def test_padded_views_are_chosen_last_and_marked():
+    sources, valid = nearest_sources(line_of_cameras(0, 0.1, 5, 9), jnp.array([True, False, True, True]), 3)
+    np.testing.assert_array_equal(sources[0], [2, 3, 1])
+    np.testing.assert_array_equal(valid[0], [True, True, False])
+    alone, valid = nearest_sources(line_of_cameras(0, 1), jnp.array([True, False]), 3)
+    assert alone.shape == (2, 1) and not valid[0].any() and int(alone[0, 0]) == 1
+
+
+def test_windows_and_back():
+    x = jnp.arange(2.0 * 8 * 12 * 3).reshape(2, 8, 12, 3)
+    windows = to_windows(x, (4, 6))
+    assert windows.shape == (2, 4, 24, 3)
+    np.testing.assert_array_equal(windows[1, 3].reshape(4, 6, 3), x[1, 4:8, 6:12])
+    np.testing.assert_array_equal(from_windows(windows, (4, 6), 8, 12), x)
+
+
+def test_position_code_is_detrs():
+    height, width, channels = 4, 6, 8
+    wanted = np.zeros((height, width, channels))
+    for y, x, c in np.ndindex(height, width, channels // 2):
+        rate = 10000.0 ** (2 * (c // 2) / (channels // 2))
+        wave = np.sin if c % 2 == 0 else np.cos
+        wanted[y, x, c] = wave((y + 1) / height * 2 * np.pi / rate)
+        wanted[y, x, channels // 2 + c] = wave((x + 1) / width * 2 * np.pi / rate)
+    np.testing.assert_allclose(sine_positions(height, width, channels), wanted, atol=1e-5)
+
+
+def test_shifted_windows_do_not_join_opposite_borders():
+    views = prepare_views(chunk(), CONFIG)
+    sources, source_valid = nearest_sources(views.viewmats, views.valid, CONFIG.network.num_sources)
+    cnn = jax.random.normal(jax.random.key(0), (3, 8, 8, 16))
+
+    def attended(cnn):
+        stage = Encoder(CONFIG)
+        return np.asarray(
+            stage.apply({"params": params()["encoder"]}, cnn, sources, source_valid, method="attend_views")
+        )
+
+    changed = np.abs(attended(cnn.at[0, 0, 0].add(1.0)) - attended(cnn)).max(axis=-1) > 0
+    # The first layer's windows are cells 0-3 and 4-7, the second's 0-1, 2-5 and 6-7.
+    assert changed[:, :6, :6].all() and not changed[:, 6:].any() and not changed[:, :, 6:].any()
+
+
+def test_positions_project_to_their_cells_at_their_depths():
+    viewmats = jnp.asarray(poses(3, 2.0), jnp.float32)
+    views = prepare_views(replace(chunk(), viewmats=viewmats), CONFIG)
+    log_depths = jnp.asarray(np.random.default_rng(0).uniform(0, 2, (3, 8, 8)), jnp.float32)
+    positions, footprints = back_project(log_depths, views)
+    pixels, depths = project_points(transform_points(viewmats, positions.reshape(3, -1, 3)), views.Ks)
+    cells = pixel_grid(32, 32, GRID_STRIDE).reshape(-1, 2)
+    np.testing.assert_allclose(pixels, np.broadcast_to(cells, (3, 64, 2)), atol=2e-3)
+    np.testing.assert_allclose(depths.reshape(3, 8, 8), np.exp(log_depths), rtol=1e-5)
+    focal = np.asarray(views.Ks[:, 0, 0] + views.Ks[:, 1, 1]) / 2
+    np.testing.assert_allclose(footprints, np.exp(log_depths) * GRID_STRIDE / focal[:, None, None], rtol=1e-5)
+
+
+def decoded(m: int = 10, num_members=1, means=None, footprints=None, quats=None, rgbs=None, **changes):
+    config = CONFIG.replace(**changes)
+    given = {"means": means, "footprints": footprints, "quats": quats, "rgbs": rgbs}
+    rng = np.random.default_rng(0)
+    f32 = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
+    inputs = {
+        "means": f32(rng.normal(size=(m, 3))),
+        "feats": f32(rng.normal(size=(m, config.network.token_width))),
+        "rgbs": f32(rng.uniform(size=(m, 3 * config.head.gaussians_per_token))),
+        "quats": f32(rng.normal(size=(m, 4))),
+        "footprints": f32(rng.uniform(0.01, 0.3, m)),
+    } | {name: x for name, x in given.items() if x is not None}
+    wanted = jax.eval_shape(lambda key: init_params(key, config)["decoder"], jax.random.key(0))
+    params = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape), wanted)
+    rest = {name: x for name, x in inputs.items() if name != "feats"}
+    shapes = read_shapes(params, inputs["feats"], config)
+    return decode_tokens(shapes, **rest, num_members=num_members, config=config), inputs
+
+
+def test_an_untrained_head_puts_a_disc_of_the_patchs_color_exactly_on_the_token():
+    gaussians, inputs = decoded(sh_degree=1, gaussians_per_token=1)
+    np.testing.assert_array_equal(gaussians.means, inputs["means"])
+    np.testing.assert_allclose(0.5 + SH_C0 * gaussians.sh[:, 0], inputs["rgbs"], atol=1e-6)
+    np.testing.assert_array_equal(gaussians.sh[:, 1:], 0)
+    wanted = np.outer(inputs["footprints"], [START_SCALE, START_SCALE, START_THICKNESS])
+    np.testing.assert_allclose(gaussians.scales, wanted, rtol=1e-5)
+    # Thin along the viewing direction of the camera that saw it.
+    np.testing.assert_allclose(quats_to_matrices(gaussians.quats), quats_to_matrices(inputs["quats"]), atol=FLOAT32)
+    np.testing.assert_allclose(gaussians.opacities, 1 / (1 + np.exp(-START_OPACITY)), rtol=1e-6)
+
+
+def test_a_pivot_is_as_opaque_as_its_members_in_one_place():
+    members = np.array([0, 1, 2, 3, 17, 1000, 2**31 - 1], np.int32)
+    gaussians, _ = decoded(len(members), num_members=jnp.asarray(members), gaussians_per_token=1)
+    single = 1 / (1 + np.exp(-START_OPACITY))
+    np.testing.assert_allclose(gaussians.opacities, 1 - (1 - single) ** members.astype(float), rtol=1e-6, atol=1e-7)
+
+    def opacity(bias, n):
+        raw = jnp.zeros(8 + 3).at[0].set(bias)
+        params = {"out": {"kernel": jnp.zeros((4, 11)), "bias": raw}, **hidden_layers()}
+        one = lambda *shape: jnp.ones((1, *shape))  # noqa: E731
+        config = CONFIG.replace(token_width=4)
+        values = {"means": one(3), "rgbs": one(12), "quats": one(4), "footprints": one()}
+        shapes = read_shapes(params, one(4), config)
+        return decode_tokens(shapes, **values, num_members=n, config=config).opacities[0]
+
+    for bias in (-200.0, 0.0, 200.0):
+        for n in (0, 1, 2**31 - 1):
+            value, slope = jax.value_and_grad(opacity)(bias, jnp.array([n]))
+            assert 0 <= value <= 1 and np.isfinite(slope)
+
+
+@pytest.mark.parametrize("per_token", [1, 4, 16])
+def test_the_gaussians_of_a_token_lie_where_their_parts_of_the_patch_are_seen(per_token):
+    """Seen by the camera that made the token, each projects to the middle of the part whose color it has."""
+    config = CONFIG.replace(gaussians_per_token=per_token)
+    camera, images = prepare_views(chunk(), config), np.random.default_rng(0).uniform(size=(3, 32, 32, 3))
+    colors = patch_colors(jnp.asarray(images, jnp.float32), config)
+    side = math.isqrt(per_token)
+    positions, footprints = back_project(jnp.full((3, 8, 8), np.log(2.0)), camera)
+    quats = matrices_to_quats(jnp.swapaxes(camera.viewmats[:, :3, :3], -1, -2))
+    gaussians, _ = decoded(
+        192,
+        means=positions.reshape(-1, 3),
+        footprints=footprints.reshape(-1),
+        quats=jnp.repeat(quats, 64, axis=0),
+        rgbs=colors.reshape(192, -1),
+        gaussians_per_token=per_token,
+    )
+    seen, _ = project_points(transform_points(camera.viewmats, gaussians.means.reshape(3, -1, 3)), camera.Ks)
+    parts = np.asarray(seen).reshape(3, -1, 2) * side / GRID_STRIDE
+    # A footprint is square; the camera's cells are not quite (fx and fy differ by 4 %).
+    np.testing.assert_allclose(parts % 1, 0.5, atol=0.03)
+    pooled = images.reshape(3, 8 * side, 4 // side, 8 * side, 4 // side, 3).mean(axis=(2, 4))
+    columns, rows = np.floor(parts).astype(int).transpose(2, 0, 1)
+    wanted = pooled[np.arange(3)[:, None], rows, columns]
+    np.testing.assert_allclose(0.5 + SH_C0 * gaussians.sh[:, 0].reshape(3, -1, 3), wanted, atol=1e-5)
+
+
+def hidden_layers():
+    """The layers of a head of four channels, before its last."""
+    return {
+        "norm": {"scale": jnp.ones(4), "bias": jnp.zeros(4)},
+        "hidden": {"kernel": jnp.zeros((4, 4)), "bias": jnp.zeros(4)},
+    }
+
+
+def test_no_feature_makes_a_gaussian_of_absurd_size():
+    raw = jnp.array([[1e30, -1e30, 0.0], [jnp.inf, -jnp.inf, 3.0]])
+    for mode in ("footprint", "absolute"):
+        config = CONFIG.replace(scale_mode=mode, max_scale=2.0)
+        scales = token_scales(raw, jnp.array([0.1, 1e9]), config)
+        assert (scales >= MIN_SCALE).all() and (scales <= 2.0).all()
+    literal = token_scales(
+        jnp.array([[0.0, 1.0, 5.0]]),
+        jnp.ones(1),
+        CONFIG.replace(scale_mode="absolute", max_scale=9.0, gaussians_per_token=1),
+    )
+    np.testing.assert_allclose(literal[0], np.log1p(np.exp([-4.0, -3.0, 1.0])), rtol=1e-5)
+
+
+def test_the_tiny_preset_is_as_small_as_promised_and_names_its_stages():
+    params = jax.eval_shape(lambda key: init_params(key, preset("tiny")), jax.random.key(0))
+    assert set(params) == {"encoder", "cost_volume", "hpda", "tokens", "cgfi", "mixer", "decoder"}
+    assert 1e6 < count_params(params) < 3e6

@@ -1,0 +1,266 @@
+"""Each effect: right when on, no trace when off, asked for only by scenes that need it."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ssplat_jax.errors import InputError
+from ssplat_jax.gaussians import Gaussians, concatenate, mask_gaussians
+from ssplat_jax.geometry.cameras import Camera
+from ssplat_jax.pytree import replace
+from ssplat_jax.rasterizer import Effects, effects_for, filter_3d, render
+from ssplat_jax.rasterizer.lens_distortion import distort
+from ssplat_jax.rasterizer.projection import project
+from tests.rasterizer.scenes import cameras, cloud
+
+LENS = np.array([-0.2, 0.05, 0.002, -0.003, 0.01], np.float32)
+EXPOSURE = np.concatenate([np.diag([1.2, 0.9, 1.1]), [[0.01], [0.0], [-0.02]]], axis=1).astype(np.float32)
+OUTPUTS = ("color", "alpha", "depth")
+
+plainly = pytest.mark.usefixtures("compiled_plainly")  # laws within a tolerance, of programs used once
+
+
+def operations(gaussians, camera, effects: Effects, **arrays) -> tuple[int, float]:
+    """Operations in the traced program, calls included, and what XLA says it computes."""
+
+    def count(jaxpr) -> int:
+        is_program = lambda p: hasattr(p, "eqns") or hasattr(p, "jaxpr")  # noqa: E731
+        parts = [p for e in jaxpr.eqns for p in jax.tree.leaves(e.params, is_leaf=is_program)]
+        return len(jaxpr.eqns) + sum(count(getattr(p, "jaxpr", p)) for p in parts if is_program(p))
+
+    def program(gaussians):
+        return render(gaussians, camera, effects=effects, max_pairs=1 << 12, **arrays)
+
+    traced = jax.jit(program).trace(gaussians)
+    cost = traced.lower().cost_analysis() or {}
+    return count(traced.jaxpr.jaxpr), float(cost.get("flops", 0.0))
+
+
+@functools.cache  # many effects are compared with the same program
+def operations_of(effects: Effects, degree: int = 3, *, with_arrays: bool = False) -> tuple[int, float]:
+    gaussians, camera = cloud(8, degree=3), cameras(16, 16)
+    scene = replace(gaussians, sh=gaussians.sh[:, : (degree + 1) ** 2])
+    arrays = {"captured": camera, "distortion": jnp.asarray(LENS), "exposures": jnp.asarray(EXPOSURE)}
+    return operations(scene, camera, effects, **(arrays if with_arrays else {}))
+
+
+EFFECTS = {
+    "sh": (Effects(sh_degree=3), Effects(sh_degree=0)),
+    "mip": (Effects(), Effects(antialias="none")),
+    "classic": (Effects(antialias="mip"), Effects(antialias="classic")),
+    "filter_3d": (Effects(filter_3d=True), Effects()),
+    "distortion": (Effects(distortion=True), Effects()),
+    "exposure": (Effects(exposure=True), Effects()),
+    "background": (Effects(background=(0.1, 0.2, 0.3)), Effects()),
+    "depth": (Effects(), Effects(outputs=("color", "alpha"))),
+    "alpha": (Effects(outputs=("color", "alpha")), Effects(outputs=("color",))),
+    "median_depth": (Effects(outputs=(*OUTPUTS, "median_depth")), Effects()),
+}
+
+
+@pytest.mark.parametrize("name", EFFECTS)
+def test_an_effect_that_is_off_leaves_no_trace(name):
+    """Off with its arrays passed = a program that never had them; on adds operations."""
+    on, off = EFFECTS[name]
+    never = operations_of(off, degree=0 if name == "sh" else 3)
+    without, having = (operations_of(effects, with_arrays=True) for effects in (off, on))
+    # SH bands that are not evaluated are still looked at for NaN, one comparison an entry.
+    assert without[0] == never[0] + (1 if name == "sh" else 0) or without[0] == never[0]
+    if name != "sh":
+        assert without == never
+    assert having[0] > without[0] and having[1] > without[1]
+
+
+def test_features_that_are_not_passed_leave_no_trace():
+    gaussians, camera = cloud(8), cameras(16, 16)
+    plain = operations(gaussians, camera, Effects())
+    assert operations(gaussians, camera, Effects(), features=jnp.ones((8, 2)))[0] > plain[0]
+
+
+def test_distortion_follows_opencvs_formula_and_its_derivative():
+    random = np.random.default_rng(0)
+    x, y = random.uniform(-0.5, 0.5, (2, 1, 50))
+    k1, k2, p1, p2, k3 = LENS.astype(float)
+
+    def opencv(x, y):
+        r2 = x**2 + y**2
+        radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+        across = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+        return np.array([across, y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y])
+
+    (dx, dy), slopes = distort(*(jnp.asarray(v, jnp.float32) for v in (x, y)), jnp.asarray(LENS)[None])
+    np.testing.assert_allclose(np.stack([dx, dy]), opencv(x, y), atol=1e-6)
+    h = 1e-6
+    measured = [*(opencv(x + h, y) - opencv(x - h, y)) / 2 / h, *(opencv(x, y + h) - opencv(x, y - h)) / 2 / h]
+    for got, wanted in zip(slopes, (measured[0], measured[2], measured[1], measured[3]), strict=True):
+        np.testing.assert_allclose(got, wanted, atol=1e-5)
+
+
+@plainly
+@pytest.mark.slow  # programs of its own
+def test_a_lens_of_zeros_is_a_pinhole():
+    gaussians, camera = cloud(), cameras(21, 30)
+    lens = render(gaussians, camera, effects=Effects(distortion=True), distortion=jnp.zeros(5), max_pairs=1 << 12)
+    np.testing.assert_allclose(lens.color, render(gaussians, camera, max_pairs=1 << 12).color, atol=1e-5)
+
+
+@plainly
+def test_exposure_is_affine_in_color():
+    gaussians, camera = cloud(), cameras(21, 30)
+    plain = np.asarray(render(gaussians, camera, max_pairs=1 << 12).color)
+    out = render(gaussians, camera, effects=Effects(exposure=True), exposures=jnp.asarray(EXPOSURE), max_pairs=1 << 12)
+    np.testing.assert_allclose(out.color, np.maximum(plain @ EXPOSURE[:, :3].T + EXPOSURE[:, 3], 0), atol=1e-5)
+
+
+def test_the_3d_filter_is_two_tenths_of_a_sampling_interval_and_keeps_mass():
+    gaussians, camera = cloud(size=0.01), cameras(210, 300)
+    smoothed = filter_3d(gaussians, camera)
+    view = np.asarray(camera.viewmats)
+    points = np.asarray(gaussians.means) @ view[:3, :3].T + view[:3, 3]
+    pixels = points[:, :2] / points[:, 2:] * np.diag(camera.Ks)[:2] + np.asarray(camera.Ks)[:2, 2]
+    seen = np.all(np.abs(pixels / [210, 300] - 0.5) < 0.6, axis=1)
+    assert seen.sum() > 20
+    added = np.asarray(smoothed.scales) ** 2 - np.asarray(gaussians.scales) ** 2
+    wanted = 0.2 * (points[:, 2] / float(camera.Ks[0, 0])) ** 2
+    np.testing.assert_allclose(added[seen], np.broadcast_to(wanted[seen, None], added[seen].shape), rtol=1e-3)
+    mass = lambda g: np.asarray(g.opacities) * np.prod(np.asarray(g.scales), axis=1)  # noqa: E731
+    np.testing.assert_allclose(mass(smoothed), mass(gaussians), rtol=1e-5)
+
+
+def test_the_3d_filter_of_cameras_that_see_nothing_does_nothing():
+    gaussians, camera = cloud(), cameras(21, 30)
+    away = replace(camera, viewmats=camera.viewmats.at[2, 3].set(-100.0))
+    np.testing.assert_allclose(filter_3d(gaussians, away).scales, gaussians.scales, rtol=1e-6)
+
+
+def test_effects_for_asks_only_for_what_the_scene_needs():
+    gaussians, camera = cloud(degree=3), cameras(210, 300, batch=2)
+    assert effects_for(gaussians, camera) == Effects(sh_degree=3)
+    flat = replace(gaussians, sh=gaussians.sh.at[:, 4:].set(0.0))
+    assert effects_for(flat, camera).sh_degree == 1
+    assert effects_for(replace(gaussians, sh=gaussians.sh.at[:, 1:].set(0.0)), camera).sh_degree == 0
+    assert not effects_for(gaussians, camera, distortion=jnp.zeros((2, 5))).distortion
+    assert effects_for(gaussians, camera, distortion=jnp.asarray(np.stack([LENS] * 2))).distortion
+    same = jnp.asarray(np.stack([EXPOSURE] * 2))
+    assert not effects_for(gaussians, camera, exposures=same).exposure
+    assert effects_for(gaussians, camera, exposures=same.at[0, 0, 0].add(0.1)).exposure
+    assert not effects_for(gaussians, camera, captured=camera).filter_3d
+    closer = Camera(viewmats=camera.viewmats, Ks=camera.Ks * jnp.array([[2.0], [2.0], [1.0]]), width=420, height=600)
+    assert effects_for(gaussians, closer, captured=camera).filter_3d
+
+
+@plainly
+def test_what_effects_for_leaves_out_changes_no_pixel():
+    gaussians, camera = cloud(degree=3), cameras(21, 30)
+    flat = replace(gaussians, sh=gaussians.sh.at[:, 4:].set(0.0))
+    least = render(flat, camera, effects=effects_for(flat, camera), max_pairs=1 << 12)
+    np.testing.assert_allclose(least.color, render(flat, camera, max_pairs=1 << 12).color, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "fields", [{"sh_degree": 4}, {"antialias": "fxaa"}, {"outputs": ("color",)}], ids=["degree", "antialias", "output"]
+)
+def test_unknown_effects_are_refused(fields):
+    with pytest.raises(InputError, match="effects:"):
+        Effects(**fields)
+
+
+def one(mean, size=0.01) -> Gaussians:
+    return Gaussians(
+        means=jnp.array([mean], jnp.float32),
+        quats=jnp.array([[1.0, 0.0, 0.0, 0.0]]),
+        scales=jnp.full((1, 3), size),
+        opacities=jnp.array([0.9]),
+        sh=jnp.ones((1, 1, 3)),
+    )
+
+
+WIDE = Camera(
+    viewmats=jnp.eye(4),
+    Ks=jnp.array([[200.0, 0, 200], [0, 200.0, 150], [0, 0, 1]]),
+    width=400,
+    height=300,
+)
+
+
+@pytest.mark.parametrize(("lens", "tangent"), [((-0.1, 0.003, 0, 0, 0), 4.1), ((-0.3, 0.03, 0, 0, 0), 2.2)])
+@plainly
+@pytest.mark.slow  # programs of its own
+def test_what_a_lens_folds_back_into_the_image_is_not_seen(lens, tangent):
+    # Beyond its first turn the polynomial falls, and beyond its second it rises again: ghosts from the side.
+    lens = jnp.array(lens, jnp.float32)
+    assert 1 + tangent**2 * (3 * lens[0] + tangent**2 * 5 * lens[1]) > 0  # it has turned twice
+    out = render(one([tangent, 0.1, 1.0]), WIDE, effects=Effects(distortion=True), distortion=lens, max_pairs=1 << 12)
+    assert int(out.num_pairs) == 0
+    assert int(render(one([0.2, 0.1, 1.0]), WIDE, effects=Effects(distortion=True), distortion=lens).num_pairs) > 0
+
+
+@pytest.mark.parametrize("mean", [(1.6, 1.2, 1.0), (0.3, -0.2, 1.0), (-1.5, 1.1, 1.0)])
+@plainly
+@pytest.mark.slow  # programs of its own
+def test_a_wide_lens_shapes_gaussians_as_its_derivative_says(mean):
+    lens = jnp.array([-0.15, 0.012, 0, 0, 0], jnp.float32)
+
+    def pixel(point):
+        (x, y), _ = distort(*(point[i][None, None] / point[2] for i in range(2)), lens[None])
+        return jnp.stack([200 * x[0, 0] + 200, 200 * y[0, 0] + 150])
+
+    jacobian = np.asarray(jax.jacobian(pixel)(jnp.array(mean)), np.float64)
+    wanted = np.linalg.inv(1e-4 * jacobian @ jacobian.T)
+    camera = replace(WIDE, viewmats=WIDE.viewmats[None], Ks=WIDE.Ks[None])
+    splats = project(one(mean), camera, Effects(distortion=True, antialias="none"), lens[None])
+    p, q, r = np.asarray(splats.factors[0, 0], np.float64)
+    np.testing.assert_allclose([[2 * p * p, 2 * p * q], [2 * p * q, 2 * (q * q + r * r)]], wanted, rtol=2e-3)
+
+
+@plainly
+@pytest.mark.slow  # a program of its own
+def test_a_lens_has_finite_gradients_however_far_from_its_axis():
+    lens = jnp.array([0.1, 0.01, 0, 0, 0.01], jnp.float32)
+
+    def loss(means):
+        scene = replace(one([0.0, 0.0, 1.0]), means=means)
+        out = render(scene, WIDE, effects=Effects(distortion=True), distortion=lens, max_pairs=1 << 12)
+        return out.color.sum()
+
+    for mean in ([1e6, 0.0, 0.05], [1e3, 1e3, 0.02], [0.1, 0.0, 1.0]):
+        assert np.isfinite(jax.jit(jax.grad(loss))(jnp.array([mean]))).all()
+
+
+def test_the_3d_filter_does_not_look_at_absent_rows():
+    captured = Camera(
+        viewmats=jnp.stack([jnp.eye(4), jnp.eye(4).at[2, 3].set(50.0)]),
+        Ks=jnp.stack([WIDE.Ks] * 2),
+        width=400,
+        height=300,
+    )
+    seen, unseen = one([0.0, 0.0, 1.0]), one([0.0, 0.0, -100.0])
+    scene = concatenate([seen, unseen])
+    absent = mask_gaussians(seen, jnp.zeros(1, bool))
+    alone, padded = filter_3d(scene, captured), filter_3d(concatenate([scene, absent]), captured)
+    np.testing.assert_array_equal(padded.scales[:2], alone.scales)
+
+
+def test_one_exposure_is_none_only_if_it_changes_nothing():
+    scene, camera = cloud(4), cameras(16, 16)
+    several = jnp.asarray(np.stack([EXPOSURE] * 3))
+    for exposures, wanted in ((EXPOSURE, True), (np.eye(3, 4, dtype=np.float32), False), (several, False)):
+        assert effects_for(scene, camera, exposures=jnp.asarray(exposures)).exposure is wanted
+
+
+def test_the_3d_filter_reads_a_negative_scale_as_its_size():
+    captured = Camera(viewmats=jnp.eye(4)[None], Ks=WIDE.Ks[None], width=400, height=300)
+    scene = one([0.0, 0.0, 1.0])
+    plain, mirrored = filter_3d(scene, captured), filter_3d(replace(scene, scales=-scene.scales), captured)
+    np.testing.assert_array_equal(plain.opacities, mirrored.opacities)
+    assert float(plain.opacities[0]) > 0
+
+
+def test_effects_given_as_lists_are_hashable_and_a_background_has_three_parts():
+    listed, plain = (Effects(outputs=kind(["color"]), background=kind([1.0, 0.0, 0.0])) for kind in (list, tuple))
+    assert listed == plain and hash(listed) == hash(plain)
+    with pytest.raises(InputError, match="three numbers"):
+        Effects(background=(1.0, 0.0))

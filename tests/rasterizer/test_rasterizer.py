@@ -1,0 +1,422 @@
+"""The fast path and the reference against the NumPy oracle, and the fast path's gradients against the reference's."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ssplat_jax.errors import InputError
+from ssplat_jax.gaussians import Gaussians, concatenate, mask_gaussians
+from ssplat_jax.geometry.cameras import Camera
+from ssplat_jax.pytree import replace
+from ssplat_jax.rasterizer import Effects, binning, compositing, render
+from ssplat_jax.rasterizer.binning import Pairs, bin_rows
+from ssplat_jax.rasterizer.depth_sorted_table import SHAPE, sorted_table
+from ssplat_jax.rasterizer.projection import Splats, project
+from ssplat_jax.rasterizer.reference import render_reference
+from ssplat_jax.rasterizer.render import default_max_pairs
+from ssplat_jax.rasterizer.tile_grid import Grid
+from tests.rasterizer import oracle
+from tests.rasterizer.scenes import cameras, cloud
+
+FORWARD = 2e-5  # float32 sums of about 60 samples, depths up to 4; far below the 1e-4 that issue 3 asks for
+GRADIENT = 1e-4  # relative L2, float32 against float64
+DIFFERENCES = 1e-3  # central differences of a piecewise smooth image in float64
+ALL = Effects(outputs=("color", "alpha", "depth", "median_depth"), background=(0.2, 0.5, 0.9))
+
+plainly = pytest.mark.usefixtures("compiled_plainly")  # laws within a tolerance, of programs used once
+
+
+def relative(a, b) -> float:
+    a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
+    return float(np.linalg.norm(a - b) / max(np.linalg.norm(b), 1e-12))
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return cloud(degree=3), cameras(21, 30)  # portrait, and no multiple of a tile
+
+
+@pytest.mark.parametrize(
+    "antialias", ["mip", *(pytest.param(name, marks=pytest.mark.slow) for name in ("classic", "none"))]
+)
+def test_both_paths_show_what_the_textbook_says(scene, antialias):
+    gaussians, camera = scene
+    effects = ALL.replace(antialias=antialias, background=None)
+    color, alpha, depth, median = oracle.render(gaussians, camera.viewmats, camera.Ks, 21, 30, antialias)
+    with jax.enable_x64(True):
+        reference = jax.jit(lambda *inputs: render_reference(*inputs, effects=effects))
+        exact = reference(*jax.tree.map(lambda x: x.astype(jnp.float64), scene))
+        exact = jax.tree.map(np.asarray, exact)
+    for name, wanted in (("color", color), ("alpha", alpha), ("depth", depth), ("median_depth", median)):
+        np.testing.assert_allclose(getattr(exact, name), wanted, atol=1e-10, err_msg=name)
+    fast = render(gaussians, camera, effects=effects)
+    for name, wanted in (("color", color), ("alpha", alpha), ("depth", depth), ("median_depth", median)):
+        np.testing.assert_allclose(getattr(fast, name), wanted, atol=FORWARD, err_msg=name)
+
+
+def test_gradients_equal_the_references_in_float64():
+    gaussians, camera = cloud(degree=1), cameras(21, 30, batch=2)
+    features = jnp.asarray(np.random.default_rng(2).normal(size=(60, 2)), jnp.float32)
+    effects = Effects(background=(0.2, 0.5, 0.9))
+    random = np.random.default_rng(3)
+    cotangents = [random.normal(size=(2, 30, 21, *tail)) for tail in ((3,), (), (), (2,))]
+
+    def loss(renderer):
+        def inner(inputs):
+            out = renderer(inputs[0], inputs[1], features=inputs[2], effects=effects)
+            images = (out.color, out.alpha, out.depth, out.features)
+            return sum(jnp.sum(jnp.asarray(c, x.dtype) * x) for c, x in zip(cotangents, images, strict=True))
+
+        return jax.jit(jax.grad(inner))
+
+    got = loss(lambda *a, **k: render(*a, max_pairs=1 << 12, **k))((gaussians, camera, features))
+    with jax.enable_x64(True):
+        doubles = jax.tree.map(lambda x: x.astype(jnp.float64), (gaussians, camera, features))
+        wanted = loss(lambda *a, **k: render_reference(*a, rows_at_once=30, **k))(doubles)
+        wanted = jax.tree.map(np.asarray, wanted)
+    for (path, a), b in zip(jax.tree_util.tree_leaves_with_path(got), jax.tree.leaves(wanted), strict=True):
+        assert relative(a, b) < GRADIENT, (jax.tree_util.keystr(path), relative(a, b))
+        cosine = np.vdot(a, b) / np.linalg.norm(a) / np.linalg.norm(b)
+        assert cosine > 0.99999, jax.tree_util.keystr(path)
+
+
+@pytest.mark.slow  # the reference's own gradients are compared with in every run, just above
+def test_gradients_equal_finite_differences_in_float64():
+    # Few, wide, faint Gaussians: no alpha threshold is crossed by a step of 1e-6.
+    with jax.enable_x64(True):
+        scene = cloud(6, degree=1, size=0.4, dtype=np.float64), cameras(12, 10, dtype=np.float64)
+
+        @jax.jit
+        def loss(inputs):
+            out = render(*inputs, max_pairs=1 << 12)
+            return jnp.mean(out.color**2) + jnp.mean(out.depth) + jnp.mean(out.alpha)
+
+        grads = jax.jit(jax.grad(loss))(scene)
+        random = np.random.default_rng(0)
+        for (path, leaf), grad in zip(jax.tree_util.tree_leaves_with_path(scene), jax.tree.leaves(grads), strict=True):
+            direction = random.normal(size=leaf.shape)
+            if "viewmats" in jax.tree_util.keystr(path):
+                direction[3] = 0  # the last row of a rigid transform is not a variable
+            if "Ks" in jax.tree_util.keystr(path):
+                direction *= np.array([[1, 0, 1], [0, 1, 1], [0, 0, 0]])
+
+            def moved(step, path=path, direction=direction):
+                shift = lambda p, x: x + step * jnp.asarray(direction) if p == path else x  # noqa: E731
+                return loss(jax.tree_util.tree_map_with_path(shift, scene))
+
+            measured = float(moved(1e-6) - moved(-1e-6)) / 2e-6
+            stated = float(np.vdot(grad, direction))
+            assert abs(measured - stated) <= DIFFERENCES * max(abs(stated), 1e-3), jax.tree_util.keystr(path)
+
+
+def test_a_batch_equals_its_cameras_one_by_one(scene):
+    gaussians, camera = cloud(degree=3), cameras(21, 30, batch=2)
+    together = render(gaussians, camera, effects=ALL, max_pairs=1 << 12)
+    for i in range(2):
+        alone = render(gaussians, camera[i], effects=ALL, max_pairs=1 << 12)
+        np.testing.assert_allclose(together.color[i], alone.color, atol=1e-6)
+        np.testing.assert_array_equal(together.median_depth[i], alone.median_depth)
+
+
+@pytest.mark.slow  # programs of its own
+def test_tile_sizes_agree(scene):
+    small, large = (render(*scene, tile=tile, max_pairs=1 << 12) for tile in (8, 16))
+    np.testing.assert_allclose(small.color, large.color, atol=FORWARD)
+    assert int(large.num_pairs) < int(small.num_pairs)
+
+
+def test_absent_rows_and_their_order_change_nothing(scene):
+    gaussians, camera = scene
+    absent = mask_gaussians(gaussians, jnp.zeros(60, bool))
+    padded = render(concatenate([absent, gaussians]), camera, max_pairs=1 << 12)
+    plain = render(gaussians, camera, max_pairs=1 << 12)
+    np.testing.assert_allclose(padded.color, plain.color, atol=1e-6)
+    assert int(padded.num_pairs) == int(plain.num_pairs)
+
+
+def test_a_capacity_too_small_is_counted_inside_jit_and_retried_outside(scene):
+    wanted = render(*scene)
+    assert int(wanted.num_overflow) == 0
+    retried = render(*scene, max_pairs=64)
+    np.testing.assert_array_equal(retried.color, wanted.color)
+    assert int(retried.num_overflow) == 0
+    inside = jax.jit(lambda g: render(g, scene[1], max_pairs=64))(scene[0])
+    assert int(inside.num_overflow) == int(wanted.num_pairs) - 64 > 0
+
+
+@plainly
+def test_what_is_given_back_is_what_was_asked_for(scene):
+    out = render(*scene, effects=Effects(outputs=("color",)), max_pairs=1 << 12)
+    assert out.alpha is None and out.depth is None and out.median_depth is None and out.features is None
+    np.testing.assert_allclose(out.color, render(*scene, max_pairs=1 << 12).color, atol=1e-6)
+
+
+@plainly
+@pytest.mark.slow  # the retry is tested forward in every run
+def test_gradients_outside_jit_leave_nothing_out():
+    # Larger Gaussians than the default capacity inside jit is made for: more than four tiles each.
+    gaussians, camera = cloud(600, size=0.2), cameras(80, 96)
+    counted = int(render(gaussians, camera).num_pairs)
+    assert counted > default_max_pairs(gaussians, camera)
+    loss = lambda g, **options: jnp.sum(render(g, camera, **options).color ** 2)  # noqa: E731
+    value, gradient = jax.value_and_grad(loss)(gaussians)
+    wanted_value, wanted = jax.jit(jax.value_and_grad(functools.partial(loss, max_pairs=counted)))(gaussians)
+    np.testing.assert_allclose(value, wanted_value, rtol=1e-6)
+    for a, b in zip(jax.tree.leaves(gradient), jax.tree.leaves(wanted), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-5 * float(jnp.abs(b).max()))
+
+
+@pytest.mark.parametrize("length", [30, 150, 600])
+@plainly
+@pytest.mark.slow  # programs of its own
+def test_long_thin_gaussians_are_as_exact_as_round_ones(length):
+    focal, turn = 1000.0, np.deg2rad(43.7)
+
+    def drawn(dtype, draw):
+        row = lambda x: jnp.asarray([x], dtype)  # noqa: E731
+        gaussians = Gaussians.from_rgb(
+            means=row([0, 0, 1]),
+            quats=row([np.cos(turn / 2), 0, 0, np.sin(turn / 2)]),
+            scales=row([length / focal, 2 / focal, 0.02 / focal]),
+            opacities=jnp.asarray([0.9], dtype),
+            colors=row([1, 0.5, 0.2]),
+        )
+        K = jnp.asarray([[focal, 0, 100.3], [0, focal, 80.7], [0, 0, 1]], dtype)
+        camera = Camera(viewmats=jnp.eye(4, dtype=dtype), Ks=K, width=200, height=160)
+        return draw(gaussians, camera, effects=Effects(antialias="none", outputs=("color", "alpha"))).alpha
+
+    fast = np.asarray(drawn(jnp.float32, render))
+    with jax.enable_x64(True):
+        exact = np.asarray(drawn(jnp.float64, render_reference))
+    assert fast.max() > 0.8
+    is_edge = np.abs(exact - 1 / 255) < 2e-4  # a sample just below 1/255 is skipped, just above it is not
+    np.testing.assert_allclose(fast[~is_edge], exact[~is_edge], atol=1e-4)
+
+
+@plainly
+def test_alphas_are_exponentials_of_their_powers():
+    powers = np.linspace(compositing.LOG_LEAST, 0.0, 1_000_001)
+    for dtype, allowed in ((jnp.float32, 3e-6), (jnp.float64, 1e-15)):
+        with jax.enable_x64(dtype == jnp.float64):
+            given = jnp.asarray(powers, dtype)
+            alphas = np.asarray(jax.jit(compositing._exp)(given), np.float64)
+            np.testing.assert_allclose(alphas, np.exp(np.asarray(given, np.float64)), rtol=allowed, atol=0)
+            assert compositing._exp(jnp.array([-jnp.inf], dtype))[0] == 0
+            capped = compositing._exp(jnp.array([compositing.LOG_MOST], dtype))[0]
+            assert compositing.CAPPED <= capped < 1.0
+
+
+@plainly
+@pytest.mark.slow  # programs of its own
+def test_float64_is_sorted_in_float64(scene):
+    with jax.enable_x64(True):
+        two = jax.tree.map(lambda x: jnp.repeat(x[:1], 2, axis=0).astype(jnp.float64), cloud(1, degree=0, size=0.5))
+        two = replace(
+            two,
+            means=jnp.array([[0.0, 0.0, 2.0 + 1e-9], [0.0, 0.0, 2.0]]),
+            opacities=jnp.full(2, 0.95),
+            sh=jnp.array([[[1.0, 0, 0]], [[0, 1.0, 0]]]),
+        )
+        camera = Camera(viewmats=jnp.eye(4), Ks=jnp.array([[20.0, 0, 8], [0, 20, 8], [0, 0, 1]]), width=16, height=16)
+        middle = np.asarray(render(two, camera).color)[8, 8]
+        np.testing.assert_allclose(middle, np.asarray(render_reference(two, camera).color)[8, 8], atol=1e-9)
+    assert middle[1] > middle[0] + 0.2
+
+
+@plainly
+def test_a_camera_that_is_not_finite_sees_nothing_and_spoils_nothing(scene):
+    gaussians, camera = cloud(degree=1), cameras(21, 30, batch=2)
+
+    def loss(inputs):
+        out = render(*inputs, max_pairs=1 << 12)
+        return jnp.sum(out.color[0] ** 2) + jnp.sum(out.alpha[1]), out
+
+    slopes = jax.jit(jax.grad(loss, has_aux=True))
+    wanted = slopes((gaussians, camera))[1].color[0]
+    for field, entry in (("viewmats", jnp.nan), ("Ks", jnp.inf), ("Ks", 0.0)):
+        bad = replace(camera, **{field: getattr(camera, field).at[1, 0, 0].set(entry)})
+        gradients, out = slopes((gaussians, bad))
+        assert not out.alpha[1].any() and int(out.num_non_finite) == gaussians.num_gaussians
+        np.testing.assert_array_equal(out.color[0], wanted)
+        for gradient in jax.tree.leaves(gradients):
+            assert np.isfinite(gradient).all()
+
+
+def test_rows_whose_features_are_not_finite_are_culled_and_counted(scene):
+    features = jnp.ones((60, 2)).at[3, 1].set(jnp.nan)
+    out = render(*scene, features=features, max_pairs=1 << 12)
+    without = mask_gaussians(scene[0], jnp.arange(60) != 3)
+    assert int(out.num_non_finite) == 1 and np.isfinite(out.features).all()
+    np.testing.assert_array_equal(out.color, render(without, scene[1], max_pairs=1 << 12).color)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"max_pairs": 0}, "max_pairs must be at least 1, got 0"),
+        ({"tile": 0}, "tile must be at least 1, got 0"),
+        ({"features": jnp.zeros((3, 2))}, "features must be"),
+        ({"effects": Effects(filter_3d=True)}, "captured"),
+        ({"effects": Effects(distortion=True)}, "distortion must be"),
+        ({"effects": Effects(exposure=True), "exposures": jnp.zeros((3, 3, 4))}, "exposures must be"),
+    ],
+)
+def test_bad_input_says_what_was_wanted(scene, changes, message):
+    with pytest.raises(InputError, match=message):
+        render(*scene, **changes)
+
+
+def test_scenes_and_cameras_of_no_known_form_are_refused(scene):
+    with pytest.raises(InputError, match="1, 4, 9 or 16 terms"):
+        render(replace(scene[0], sh=scene[0].sh[:, :5]), scene[1])
+    with pytest.raises(InputError, match="at least one camera"):
+        render(scene[0], cameras(21, 30, batch=2)[:0])
+
+
+def test_a_camera_of_no_pixels_is_refused(scene):
+    with pytest.raises(InputError, match="1x1"):
+        render(scene[0], replace(scene[1], width=0))
+
+
+@plainly
+def test_a_scene_of_no_gaussians_is_black(scene):
+    nothing = jax.tree.map(lambda x: x[:0], scene[0])
+    for draw in (render, jax.jit(lambda *scene: render(*scene, max_pairs=1 << 12))):
+        out = draw(nothing, scene[1])
+        assert not out.color.any() and not out.alpha.any() and int(out.num_pairs) == 0
+
+
+@plainly
+def test_arrays_that_a_traced_function_closes_over_are_rendered(scene):
+    wanted = render(*scene).color
+    for max_pairs in (None, 1 << 12):
+        inside = jax.jit(lambda factor, n=max_pairs: factor * render(*scene, max_pairs=n).color)
+        np.testing.assert_allclose(inside(jnp.float32(2.0)), 2 * wanted, atol=1e-6)
+
+
+def test_more_pairs_than_an_index_reaches_are_counted_and_refused():
+    # 20,000 Gaussians before each of the 129,600 tiles of a 4k image: 2.6e9 pairs, negative in 32 bits.
+    flat = cloud(1, size=1e3)
+    wall = jax.tree.map(lambda x: jnp.broadcast_to(x, (20_000, *x.shape[1:])), replace(flat, opacities=jnp.ones(1)))
+    camera = cameras(3840, 2160)
+    with pytest.raises(InputError, match="at most 1073741824"):
+        render(wall, camera)
+    with jax.enable_x64(False):
+        grid = Grid(num_images=1, height=2160, width=3840, tile=8)
+        one_axis = replace(camera, viewmats=camera.viewmats[None], Ks=camera.Ks[None])
+        splats = project(wall, one_axis, Effects())
+        pairs = pairs_of(splats, grid, 1 << 12)
+    assert int(pairs.num_pairs) == 2**31 - 1
+
+
+@functools.partial(jax.jit, static_argnums=(1, 2))
+def pairs_of(splats: Splats, grid: Grid, room: int) -> Pairs:
+    """The pairs of splats without channels."""
+    table, order = sorted_table(splats, jnp.zeros((*splats.depths.shape, 0)), grid)
+    return bin_rows(table, order // splats.depths.shape[1], grid, room)
+
+
+def test_rows_are_sorted_whole_and_gradients_go_back_to_where_they_came_from():
+    """From near to far over all cameras, ties by row, what touches no tile last; against NumPy's stable sort."""
+    random = np.random.default_rng(0)
+    shape = (2, 500)
+    depths = np.float32(random.choice([*np.exp(random.normal(0, 3, 100)), np.inf], shape))
+    visible = random.random(shape) < 0.8
+
+    def draw(*tail):
+        entries = random.uniform(0.1, 1, (*shape, *tail)) * visible.reshape(*shape, *(1 for _ in tail))
+        return jnp.asarray(entries, jnp.float32)
+
+    splats = Splats(
+        means2d=draw(2) * jnp.array([160.0, 100.0]) - 30,
+        factors=draw(3),
+        opacities=draw(),
+        depths=jnp.asarray(depths),
+        extents=10 * draw(2),
+        visible=jnp.asarray(visible),
+    )
+    channels = draw(4)
+    grid = Grid(num_images=2, height=60, width=100, tile=8)
+    sides = [np.floor((splats.means2d + sign * splats.extents) / 8) for sign in (-1, 1)]
+    low, high = (np.clip(side + after, 0, (13, 8)) for side, after in zip(sides, (0, 1), strict=True))
+    boxes = np.concatenate([low, (high - low) * visible[..., None]], axis=-1)
+    shown = boxes[..., 2:].prod(axis=-1) > 0
+    assert 500 < shown.sum() < visible.sum()
+    wanted_order = np.argsort(np.where(shown, depths, np.nan).reshape(-1), kind="stable")
+    rows = [splats.means2d, splats.factors, np.log(np.maximum(splats.opacities, 0.5 / 255))[..., None], channels, boxes]
+    rows = np.concatenate(rows, axis=-1).reshape(1000, -1)[wanted_order]
+    cotangent = np.float32(random.normal(size=rows.shape))
+
+    @jax.jit
+    def table_of(means2d, channels):
+        return sorted_table(replace(splats, means2d=means2d), channels, grid)
+
+    got, pull, order = jax.vjp(table_of, splats.means2d, channels, has_aux=True)
+    num_seen = shown.sum()
+    np.testing.assert_array_equal(order, wanted_order)
+    np.testing.assert_allclose(got[:num_seen], rows[:num_seen], rtol=1e-6)
+    assert np.all(got[num_seen:, -2] * got[num_seen:, -1] == 0)
+    back = np.empty_like(cotangent)
+    back[wanted_order] = cotangent
+    for gradient, columns in zip(pull(jnp.asarray(cotangent)), (slice(0, 2), slice(SHAPE, SHAPE + 4)), strict=True):
+        np.testing.assert_array_equal(gradient, back[:, columns].reshape(gradient.shape))
+
+
+def test_the_room_for_pairs_does_not_change_what_is_found():
+    """From 65,536 on a share of the room is sorted, the least that holds the pairs: each share is seen here."""
+    size = 160
+    grid = Grid(num_images=1, height=size, width=size, tile=8)
+    gaussians = cloud(4000, degree=0, size=0.2)
+    camera = cameras(size, size)
+    one_axis = replace(camera, viewmats=camera.viewmats[None], Ks=camera.Ks[None])
+    room = 1 << 16
+    shares = set()
+    splats = project(gaussians, one_axis, Effects())
+    total = int(pairs_of(splats, grid, 2 * room).num_pairs)
+    for wanted in (0.5, 0.58, 0.68, 0.8, 0.95):
+        shown = jnp.arange(4000) < int(4000 * wanted * room / total)
+        part = project(mask_gaussians(gaussians, shown), one_axis, Effects())
+        chosen, plenty = (pairs_of(part, grid, n) for n in (room, 2 * room))
+        num_pairs = int(plenty.num_pairs)
+        shares.add(np.searchsorted(np.array([17, 20, 24, 28, 32]) / 32, num_pairs / room))
+        assert int(chosen.num_pairs) == num_pairs
+        np.testing.assert_array_equal(chosen.bounds, plenty.bounds)
+        np.testing.assert_array_equal(chosen.rows[:num_pairs], plenty.rows[:num_pairs])
+    assert shares == {0, 1, 2, 3, 4}
+
+
+def test_pairs_sorted_in_pieces_are_those_sorted_at_once(monkeypatch):
+    """Several images, rooms that the pieces do not divide and one too small, equal depths."""
+    camera = cameras(90, 130, batch=3)
+    grid = Grid(num_images=3, height=130, width=90, tile=8)
+    gaussians = cloud(3000, degree=0, size=0.2)
+    twice = jax.tree.map(lambda x: jnp.concatenate([x, x[::-1]]), gaussians)
+    splats = project(twice, camera, Effects())
+
+    def binned(pieces, room):
+        monkeypatch.setattr(binning, "PIECES", pieces)
+        pairs_of.clear_cache()
+        return pairs_of(splats, grid, room)
+
+    for room in (1 << 18, (1 << 17) + 11, 1 << 16):
+        wanted, got = binned(1, room), binned(16, room)
+        num_pairs = int(wanted.bounds[-1])
+        assert num_pairs > room / 8
+        assert int(got.num_pairs) == int(wanted.num_pairs)
+        np.testing.assert_array_equal(got.bounds, wanted.bounds)
+        np.testing.assert_array_equal(got.rows[:num_pairs], wanted.rows[:num_pairs])
+    assert int(wanted.num_pairs) > room
+
+
+# Last: it empties the caches of compiled programs.
+@pytest.mark.slow  # nothing compiled before it serves after it
+def test_keys_wider_than_32_bits_sort_alike(scene, monkeypatch):
+    jax.clear_caches()  # both are compiled here, alike
+    wanted = render(*scene, max_pairs=1 << 12)
+    monkeypatch.setattr(binning, "KEY_BITS", 4)
+    jax.clear_caches()
+    np.testing.assert_array_equal(render(*scene, max_pairs=1 << 12).color, wanted.color)
+    jax.clear_caches()

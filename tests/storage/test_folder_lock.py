@@ -1,0 +1,82 @@
+"""Two processes do not write into one folder."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from ssplat_jax.commands.main import main
+from ssplat_jax.errors import InputError, StorageError
+from ssplat_jax.storage.folder_lock import only_writer
+from ssplat_jax.storage.folders import remove_numbered
+
+
+def test_a_second_writer_is_refused_until_the_first_has_left(tmp_path):
+    with (
+        only_writer(tmp_path),
+        pytest.raises(InputError, match="another process is writing to it"),
+        only_writer(tmp_path),
+    ):
+        pass
+    with only_writer(tmp_path):
+        pass
+
+
+def test_a_folder_that_takes_no_files_is_found_out_at_once():
+    with pytest.raises(StorageError, match="cannot be written"), only_writer(Path("/proc")):  # not even root's
+        pass
+
+
+def test_only_files_of_our_own_names_are_removed(tmp_path):
+    kept = ("00001.jpg", "0001.png", "000001.png", "holiday.png", "view_00001.png")
+    for name in (*kept, "00001.png", "12345.png"):
+        (tmp_path / name).touch()
+    remove_numbered(tmp_path, "#####.png")
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(kept)
+    for path in tmp_path.iterdir():
+        path.unlink()
+    remove_numbered(tmp_path, "#####.png")
+    assert not tmp_path.exists()
+    remove_numbered(tmp_path, "#####.png")
+
+
+def test_a_killed_writer_holds_nothing(tmp_path):
+    hold = (
+        "import sys, time; from pathlib import Path; from ssplat_jax.storage.folder_lock import only_writer\n"
+        "with only_writer(Path(sys.argv[1])): print('held', flush=True); time.sleep(60)"
+    )
+    with subprocess.Popen([sys.executable, "-c", hold, str(tmp_path)], stdout=subprocess.PIPE, text=True) as holder:
+        assert holder.stdout.readline() == "held\n"
+        with pytest.raises(InputError), only_writer(tmp_path):
+            pass
+        holder.kill()
+    with only_writer(tmp_path):
+        pass
+
+
+def test_a_folder_in_which_nothing_was_written_is_taken_away_again(tmp_path):
+    with pytest.raises(KeyError), only_writer(tmp_path / "new"):
+        raise KeyError
+    assert not (tmp_path / "new").exists()
+    with only_writer(tmp_path / "new"):
+        (tmp_path / "new" / "file").write_text("kept")
+    assert (tmp_path / "new" / "file").read_text() == "kept"
+    with only_writer(tmp_path / "new"):
+        (tmp_path / "new" / "file").unlink()
+    assert (tmp_path / "new").exists()  # it was there before
+
+
+def test_a_folder_that_cannot_be_made_is_a_storage_error(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(StorageError, match="choose another place"), only_writer(tmp_path / "file"):
+        pass
+
+
+@pytest.mark.parametrize("command", [("run", "procedural:room?frames=4&size=32x24"), ("train",)])
+def test_commands_that_go_on_refuse_a_folder_in_use(command, tmp_path, capsys):
+    with only_writer(tmp_path), pytest.raises(SystemExit) as stopped:
+        main([*command, "--out", str(tmp_path)])
+    assert stopped.value.code == 2
+    *_, line = capsys.readouterr().err.splitlines()  # after the progress of `train`
+    assert "another process" in line and "--out" in line and not any(tmp_path.iterdir())

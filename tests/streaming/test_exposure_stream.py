@@ -1,0 +1,40 @@
+"""Exposure over a whole stream: views that are darker or tinted leave the scene as it was."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ssplat_jax.checkpoint.weights import load_params
+from ssplat_jax.config import preset
+from ssplat_jax.data.capture import open_capture
+from ssplat_jax.gaussians import mean_color
+from ssplat_jax.pytree import replace
+from ssplat_jax.streaming.session import Session
+from ssplat_jax.streaming.streamsplat import StreamSplat
+
+TINT = np.array([0.6, 0.75, 0.9])
+
+
+def streamed(tint, **changes):
+    """Exposures of the second of two chunks whose views are tinted, and the mean color of the scene."""
+    config = preset("tiny").replace(capacity=1 << 12, **changes)
+    capture = open_capture("procedural:room?frames=73&size=128x96")
+    session = Session(StreamSplat(config), load_params("tiny"))
+    frame = capture.stream_frame(config, range(8))
+    first, second = capture.chunks(config, range(8), frame=frame)
+    session.feed(first)
+    out = session.feed(replace(second, images=second.images * jnp.asarray(tint, jnp.float32)))
+    return np.asarray(out.exposures), np.asarray(mean_color(session.gaussians()))
+
+
+@pytest.mark.slow  # two steps with the shipped weights
+def test_tinted_views_are_found_out_and_leave_the_scene_as_it_was():
+    exposures, color = streamed(np.ones(3))
+    np.testing.assert_allclose(exposures, 1.0, atol=0.01)
+    assert np.all(exposures != 1.0)  # the views share enough with the scene to be compared
+    tinted_exposures, tinted_color = streamed(TINT)
+    np.testing.assert_allclose(tinted_exposures, np.tile(TINT, (4, 1)), rtol=0.02)
+    np.testing.assert_allclose(tinted_color, color, rtol=0.02)
+    unmatched_exposures, unmatched_color = streamed(TINT, match_exposure=False)
+    np.testing.assert_array_equal(unmatched_exposures, 1.0)
+    assert np.all(unmatched_color < 0.97 * color)

@@ -1,0 +1,221 @@
+"""The stream as a whole: step, scan, session. One narrow model, one procedural capture, shared by the module."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ssplat_jax.config import StreamConfig
+from ssplat_jax.data.capture import open_capture
+from ssplat_jax.pytree import replace
+from ssplat_jax.streaming.session import Session
+from ssplat_jax.streaming.streamsplat import StreamSplat, merged_footprints
+from tests.model.small import random_params
+
+# Narrow, and without a confidence threshold: untrained distributions are flat and would leave the cache empty.
+NARROW = StreamConfig().replace(
+    encoder_widths=(8, 16),
+    encoder_blocks=1,
+    attention_blocks=0,  # tests/model compiles attention
+    fine_matching=False,
+    match_width=8,
+    num_depths=16,
+    unet_width=16,
+    token_width=16,
+    cgfi_width=16,
+    mixer_blocks=1,
+    mixer_proj=8,
+    min_confidence=0.0,
+    voxel_size=0.04,
+    capacity=8192,  # a session starts with it too: one program for loop and session
+)
+
+
+@pytest.fixture(scope="module")
+def model():
+    return StreamSplat(NARROW)
+
+
+@pytest.fixture(scope="module")
+def params(model):
+    return random_params(model.config, seed=1)
+
+
+@pytest.fixture(scope="module")
+def chunks(model):
+    return list(open_capture("procedural:room?frames=16&size=64x64").chunks(model.config))
+
+
+@pytest.fixture(scope="module")
+def step(model):
+    """The jitted step as users are told to write it: the cache it is given is consumed."""
+    return jax.jit(model.step, donate_argnums=1)
+
+
+@pytest.fixture(scope="module")
+def looped(model, params, chunks, step):
+    """The cache after a Python loop over the jitted step, and the number of compilations that took."""
+    cache = model.init_cache()
+    outputs = []
+    for chunk in chunks:
+        cache, out = step(params, cache, chunk)
+        outputs.append(out)
+    return cache, outputs, step._cache_size()
+
+
+def leaves_with_names(tree):
+    return [(jax.tree_util.keystr(k), np.asarray(x)) for k, x in jax.tree_util.tree_flatten_with_path(tree)[0]]
+
+
+def test_scan_equals_loop_bit_for_bit(model, params, chunks, looped):
+    stacked = jax.tree.map(lambda *x: jnp.stack(x), *chunks)
+    cache, outputs = jax.jit(model.run)(params, model.init_cache(), stacked)
+    for (name, scanned), (_, stepped) in zip(leaves_with_names(cache), leaves_with_names(looped[0]), strict=True):
+        np.testing.assert_array_equal(scanned, stepped, err_msg=name)
+    depths = np.stack([np.asarray(out.depths) for out in looped[1]])
+    np.testing.assert_array_equal(np.asarray(outputs.depths), depths)
+
+
+def test_one_compilation_for_the_whole_stream(looped):
+    assert looped[2] == 1
+
+
+def test_cache_fills_within_its_bounds(model, chunks, looped):
+    cache = looped[0]
+    config = model.config
+    occupied = int(cache.num_voxels)
+    assert 0 < occupied <= config.memory.capacity
+    assert int(cache.counts.max()) <= config.memory.pivots_per_voxel
+    corners = np.asarray(cache.voxels[:occupied]) * config.memory.voxel_size
+    alive = np.asarray(cache.alive[:occupied])
+    offsets = np.asarray(cache.means[:occupied]) - corners[:, None]
+    # A few ulp of the coordinates: the voxel of a mean is found by one float32 division.
+    slack = 1e-5 * (1 + np.abs(corners).max())
+    assert (offsets[alive] >= -slack).all() and (offsets[alive] <= config.memory.voxel_size + slack).all()
+    assert int(cache.stats.num_chunks) == len(chunks)
+    seen = int(cache.stats.num_seen)
+    rejected = sum(int(getattr(cache.stats, f"num_{why}")) for why in ("low_confidence", "non_finite", "out_of_range"))
+    assert seen == sum(chunk.images.shape[0] for chunk in chunks) * 16 * 16
+    assert int(cache.stats.num_accepted) == seen - rejected - int(cache.stats.num_dropped)
+
+
+def test_stored_features_are_bounded_however_often_they_come_back(model, params, chunks, step):
+    # Twelve rounds over the same views: every chunk's features are fed by the cache and feed it. Without the bound the
+    # loop has gain, and a trained network reached 1e18 after nine chunks of a real capture.
+    cache = model.init_cache()
+    for _ in range(3):
+        for chunk in chunks:
+            cache, _ = step(params, cache, chunk)
+    assert int(cache.stats.num_non_finite) == 0
+    alive = np.asarray(cache.alive)
+    for feats in (np.asarray(cache.feats), np.asarray(cache.seeds)):
+        # A weighted mean of vectors of unit RMS has at most unit RMS.
+        assert np.sqrt((feats[alive] ** 2).mean(axis=-1)).max() <= 1.0 + 1e-4
+
+
+def test_future_chunks_do_not_change_the_past(model, params, chunks, step, looped):
+    altered = [*chunks[:2], replace(chunks[2], images=1.0 - chunks[2].images)]
+    cache = model.init_cache()
+    for chunk, expected in zip(altered[:2], looped[1], strict=False):
+        cache, out = step(params, cache, chunk)
+        np.testing.assert_array_equal(np.asarray(out.depths), np.asarray(expected.depths))
+    _, changed = step(params, cache, altered[2])
+    assert not np.array_equal(np.asarray(changed.depths), np.asarray(looped[1][2].depths))
+
+
+def test_a_chunk_of_padding_leaves_the_cache_as_it_was(params, chunks, step, looped):
+    padding = replace(chunks[0], valid=jnp.zeros(4, bool))
+    cache, _ = step(params, jax.tree.map(jnp.copy, looped[0]), padding)
+    for (name, after), (_, before) in zip(leaves_with_names(cache), leaves_with_names(looped[0]), strict=True):
+        if "num_chunks" not in name:
+            np.testing.assert_array_equal(after, before, err_msg=name)
+
+
+def test_pixels_of_a_padded_view_change_nothing(model, params, chunks, step):
+    valid = jnp.array([True, True, True, False])
+    plain = replace(chunks[0], valid=valid)
+    noisy = replace(plain, images=plain.images.at[3].set(0.7))
+    first, _ = step(params, model.init_cache(), plain)
+    second, _ = step(params, model.init_cache(), noisy)
+    for (name, a), (_, b) in zip(leaves_with_names(first), leaves_with_names(second), strict=True):
+        np.testing.assert_array_equal(a, b, err_msg=name)
+
+
+def test_history_is_seen_from_the_second_chunk_on(looped):
+    histories = [float(out.history.sum()) for out in looped[1]]
+    assert histories[0] == 0.0
+    assert all(h > 0 for h in histories[1:])
+
+
+def test_decoded_dead_pivots_are_absent(model, params, looped):
+    gaussians = model.decode(params, looped[0])
+    alive = np.asarray(looped[0].alive).reshape(-1)
+    opacities = np.asarray(gaussians.opacities).reshape(len(alive), -1)
+    assert (opacities[alive] > 0).all() and (opacities[~alive] == 0).all()
+    centers = np.asarray(gaussians.means).reshape(len(alive), -1, 3).mean(axis=1)
+    np.testing.assert_allclose(centers[alive], np.asarray(looped[0].means).reshape(-1, 3)[alive], atol=1e-5)
+
+
+@pytest.mark.parametrize("fewest", [1, 1 << 15])
+def test_a_session_decodes_the_rows_that_show_and_no_more_than_a_power_of_two(
+    model, params, looped, fewest, monkeypatch
+):
+    monkeypatch.setattr("ssplat_jax.streaming.session.FEWEST_DECODED", fewest)
+    whole, session = model.decode(params, looped[0]), Session(model, params, looped[0])
+    shown, is_shown = session.gaussians(), np.asarray(whole.opacities) > 0
+    num_pivots = shown.num_gaussians // model.config.head.gaussians_per_token
+    assert is_shown.sum() / model.config.head.gaussians_per_token <= num_pivots <= model.init_cache().alive.size
+    assert num_pivots & (num_pivots - 1) == 0
+    kept = slice(0, is_shown.sum())
+    for (name, held), (_, full) in zip(leaves_with_names(shown), leaves_with_names(whole), strict=True):
+        np.testing.assert_allclose(held[kept], full[is_shown], rtol=1e-5, atol=1e-6, err_msg=name)
+    assert not np.asarray(shown.opacities)[is_shown.sum() :].any()
+
+
+def test_carved_pivots_are_not_decoded_but_remembered(model, params, looped):
+    cache = looped[0]
+    doubted = StreamSplat(NARROW.replace(min_confidence=float(np.median(cache.confidences[cache.alive]))))
+    opacities = np.asarray(doubted.decode(params, cache).opacities).reshape(*cache.confidences.shape, -1)
+    is_shown = np.asarray(cache.alive & (cache.confidences >= doubted.config.memory.min_confidence))
+    assert 0 < is_shown.sum() < np.asarray(cache.alive).sum()
+    np.testing.assert_array_equal(opacities > 0, np.broadcast_to(is_shown[..., None], opacities.shape))
+
+
+@pytest.mark.parametrize(
+    ("footprint", "members", "wanted"),
+    [(0.01, 1, 0.01), (0.01, 2, 0.01 * 2**0.5), (0.01, 100, 0.024), (0.05, 100, 0.05), (0.024, 3, 0.024)],
+)
+def test_merged_footprints_grow_until_they_cover_a_voxel_s_face(model, footprint, members, wanted):
+    cache = model.init_cache()  # voxel_size 0.04, 4 pivots: 1.2 times a share of 0.02
+    cache = replace(
+        cache,
+        footprints=cache.footprints.at[0, 0].set(footprint),
+        num_members=cache.num_members.at[0, 0].set(members),
+    )
+    assert float(merged_footprints(cache, model.config)[0, 0]) == pytest.approx(wanted, rel=1e-6)
+
+
+def test_session_compiles_once_and_needs_the_same_memory_throughout(model, params, chunks):
+    session = Session(model, params)
+    memory = []
+    for chunk in chunks:
+        session.feed(chunk)
+        memory.append(session.step_memory_bytes)
+    assert session.num_compilations == 1
+    assert memory[0] is not None and len(set(memory)) == 1
+
+
+@pytest.mark.slow  # a program each
+@pytest.mark.parametrize(("width", "height"), [(50, 71), (71, 45)])
+def test_odd_and_portrait_sizes_stream(model, params, width, height, compiled_plainly):
+    capture = open_capture(f"procedural:room?frames=5&size={width}x{height}")
+    session = Session(model, params)
+    for chunk in capture.chunks(model.config):
+        session.feed(chunk)
+    cells = sum(
+        1
+        for y in range(2, 4 * (height // 4 + 1), 4)
+        for x in range(2, 4 * (width // 4 + 1), 4)
+        if x < width and y < height
+    )
+    assert int(session.cache.stats.num_seen) == 5 * cells

@@ -1,0 +1,287 @@
+"""What a browser is sent, and where it comes from. With viser and Chromium there, what the browser then shows."""
+
+import json
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import ssplat_jax as ss
+from ssplat_jax.checkpoint.delta_files import load_delta, save_delta
+from ssplat_jax.data.posed_image import inverse, pose_of
+from ssplat_jax.data.stream_frame import StreamFrame
+from ssplat_jax.errors import InputError, StorageError
+from ssplat_jax.geometry.cameras import Camera
+from ssplat_jax.pytree import replace
+from ssplat_jax.rasterizer import Effects
+from ssplat_jax.streaming.scene_delta import SceneDelta, apply_delta
+from ssplat_jax.viewer.view_scene import GrowingScene, SceneFile, camera_before, first_camera, source_of
+from ssplat_jax.viewer.viser_viewer import LARGEST_SIGMA, Viewer, median_size, splats_of
+
+HALF_PRECISION = 2.0**-11  # relative rounding of a 16-bit float
+BROWSER_DB = 38.0  # of the browser's picture against ours: 8 bits, 16-bit covariances, JPEG
+
+
+def scene(num_gaussians=50, size=1.0):
+    rng = np.random.default_rng(0)
+    values = {
+        "means": size * rng.uniform([-1, -1, 2], [1, 1, 4], (num_gaussians, 3)),
+        "quats": rng.normal(size=(num_gaussians, 4)),
+        "scales": size * rng.uniform(0.02, 0.2, (num_gaussians, 3)),
+        "opacities": rng.uniform(0.2, 0.9, num_gaussians),
+        "colors": rng.uniform(size=(num_gaussians, 3)),
+    }
+    return ss.Gaussians.from_rgb(**{name: jnp.asarray(x, jnp.float32) for name, x in values.items()})
+
+
+def frame(origin=(0.0, 0.0, 0.0)):
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix()
+    pose[:3, 3] = origin
+    return StreamFrame.at_camera(pose, scale=2.0, near=0.5, far=8.0)
+
+
+@pytest.mark.parametrize("size", [1e-4, 1.0, 1e4])
+def test_splats_are_the_gaussians_and_survive_16_bits_at_any_size(size):
+    gaussians = scene(size=size)
+    unit = median_size(gaussians)
+    splats = splats_of(gaussians, unit, most=1000)
+    rotations = Rotation.from_quat(np.asarray(gaussians.quats)[:, [1, 2, 3, 0]]).as_matrix()
+    variances = np.asarray(gaussians.scales, np.float64) ** 2
+    wanted = np.einsum("nij,nj,nkj->nik", rotations, variances, rotations)
+    largest = np.abs(wanted).max(axis=(1, 2), keepdims=True)
+    sent = splats.covariances.astype(np.float16).astype(np.float64) * unit**2
+    np.testing.assert_allclose(sent / largest, wanted / largest, atol=2 * HALF_PRECISION)
+    np.testing.assert_allclose(splats.centers * unit, gaussians.means, rtol=1e-5, atol=1e-6 * size)
+    np.testing.assert_allclose(splats.rgbs, np.clip(0.5 + 0.28209479 * np.asarray(gaussians.sh[:, 0]), 0, 1), atol=1e-6)
+    np.testing.assert_array_equal(splats.opacities[:, 0], gaussians.opacities)
+
+
+def test_what_cannot_be_drawn_is_not_sent_and_what_is_huge_is_cut():
+    gaussians = scene()
+    means = gaussians.means.at[0, 0].set(np.nan)
+    scales = gaussians.scales.at[1].set(np.inf).at[2].set(1e6)
+    opacities = gaussians.opacities.at[3].set(0.0).at[4].set(1 / 256)
+    splats = splats_of(replace(gaussians, means=means, scales=scales, opacities=opacities), 0.1, most=1000)
+    assert len(splats.centers) == 50 - 4
+    assert all(np.isfinite(x).all() for x in vars(splats).values())
+    assert np.isfinite(splats.covariances.astype(np.float16)).all()
+    np.testing.assert_allclose(np.linalg.eigvalsh(splats.covariances[0]), LARGEST_SIGMA**2, rtol=1e-5)
+
+
+def test_of_too_many_every_so_many_th_is_sent():
+    gaussians = scene()
+    all_of_them, some = splats_of(gaussians, 1.0, most=50), splats_of(gaussians, 1.0, most=17)
+    places = [int(np.flatnonzero((all_of_them.centers == center).all(axis=1))[0]) for center in some.centers]
+    assert len(places) == 17 and places[0] == 0 and places[-1] == 49
+    assert set(np.diff(places)) == {3, 4}
+
+
+def test_an_empty_scene_has_a_size_and_nothing_to_send():
+    nothing = replace(scene(), opacities=jnp.zeros(50))
+    assert median_size(nothing) == 1.0 and len(splats_of(nothing, 1.0, most=10).centers) == 0
+    assert camera_before(nothing) is None
+
+
+def delta(rows, seed):
+    rng = np.random.default_rng(seed)
+    gaussians = scene(2 * len(rows))
+    return SceneDelta(
+        np.asarray(rows, np.int32),
+        replace(gaussians, opacities=jnp.asarray(rng.uniform(0.2, 0.9, 2 * len(rows)), jnp.float32)),
+        8,
+    )
+
+
+def test_a_growing_run_is_what_its_deltas_add_up_to(tmp_path):
+    origin = (5e6, 0.0, 1.0)  # so far that positions are counted from an offset
+    header, source = {"frame": frame(origin).to_dict()}, GrowingScene(tmp_path)
+    assert source.changed() is None and source.start_camera() is None
+    deltas = [delta([0, 1], 1), delta([1, 2, 5], 2), delta([0], 3)]
+    save_delta(tmp_path / "000004.npz", deltas[0], header)
+    first = source.changed()
+    assert first is not None and source.changed() is None
+    for number, more in enumerate(deltas[1:], start=2):
+        save_delta(tmp_path / f"{4 * number:06d}.npz", more, header)
+    found = source.changed()
+    known = None
+    for part in deltas:
+        known = apply_delta(known, part)
+    known = jax.tree.map(jnp.asarray, known)
+    wanted = frame(origin).gaussians_to_capture(known, offset=frame(origin).offset)
+    for name in ("means", "quats", "scales", "opacities", "sh"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(wanted, name))
+    # Started anew: what the old run had is forgotten.
+    for path in tmp_path.iterdir():
+        path.unlink()
+    save_delta(tmp_path / "000004.npz", deltas[1], header)
+    anew = source.changed()
+    assert anew is not None
+    np.testing.assert_array_equal(np.asarray(anew.opacities) > 0, np.repeat([0, 1, 1, 0, 0, 1, 0, 0], 2) > 0)
+
+
+def test_a_run_that_starts_anew_while_it_is_read_is_read_again(tmp_path, monkeypatch):
+    header, source = {"frame": frame().to_dict()}, GrowingScene(tmp_path)
+    for number in (1, 2):
+        save_delta(tmp_path / f"{4 * number:06d}.npz", delta([0, 1], number), header)
+
+    def vanish(path):
+        if path.name == "000008.npz":
+            path.unlink()
+        return load_delta(path)
+
+    monkeypatch.setattr("ssplat_jax.viewer.view_scene.load_delta", vanish)
+    assert source.changed() is None
+    found = source.changed()
+    assert found is not None
+    np.testing.assert_array_equal(found.opacities[:4], delta([0, 1], 1).gaussians.opacities)
+    (tmp_path / "000012.npz").write_bytes(b"damaged")
+    with pytest.raises(StorageError, match=r"000012\.npz"):
+        source.changed()
+
+
+def test_a_scene_file_is_read_again_when_it_is_written_again(tmp_path):
+    file = tmp_path / "scene.ply"
+    ss.save_ply(file, scene(5))
+    source = source_of(tmp_path)
+    assert isinstance(source, SceneFile) and source.start_camera() is None
+    assert source.changed().num_gaussians == 5 and source.changed() is None
+    ss.save_ply(file, scene(7))
+    assert source.changed().num_gaussians == 7
+    file.unlink()
+    assert source.changed() is None  # shown on
+
+
+def test_a_scene_is_looked_at_from_where_its_run_began_if_that_is_known(tmp_path):
+    ss.save_ply(tmp_path / "scene.ply", scene(5))
+    metrics, source = tmp_path / "metrics.json", source_of(tmp_path)
+    metrics.write_text(json.dumps({"stream_frame": frame((1.0, 2.0, 3.0)).to_dict()}))
+    np.testing.assert_allclose(source.start_camera().position, [1.0, 2.0, 3.0])
+    for other in ("", "{", "[]", "{}", '{"stream_frame": null}', '{"stream_frame": {"rotation": 1}}', "\x00"):
+        metrics.write_text(other)
+        assert source.start_camera() is None
+
+
+def test_a_browser_starts_at_the_first_camera_of_the_stream():
+    camera = first_camera(frame((1.0, 2.0, 3.0)))
+    rotation = frame().rotation
+    np.testing.assert_allclose(camera.position, [1.0, 2.0, 3.0])
+    # The middle depth of 0.5 to 8 stream units is 2 of them, 1 of the capture's.
+    np.testing.assert_allclose(camera.look_at, camera.position + rotation @ [0, 0, 1.0])
+    np.testing.assert_allclose(camera.up, rotation @ [0, -1, 0])
+
+
+@pytest.mark.parametrize("name", ["nowhere", "empty", "nowhere.ply"])
+def test_where_no_scene_is_that_is_said(name, tmp_path):
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match=r"wanted a \.ply, or the folder"):
+        source_of(tmp_path / name)
+
+
+def test_without_viser_the_command_that_installs_it_is_said(monkeypatch):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    with pytest.raises(InputError, match=r'pip install "ssplat-jax\[viewer\]"'):
+        Viewer(host="127.0.0.1", port=8080, most=10)
+
+
+@pytest.mark.parametrize(
+    ("host", "port"), [("192.0.2.7", 8080), ("nosuch.invalid", 8080), ("127.0.0.1", 70000), ("127.0.0.1", 0)]
+)
+def test_where_nothing_can_listen_that_is_said_at_once(host, port):
+    with pytest.raises(InputError, match=rf"view: cannot listen on {host}:{port} \(.*\); choose another"):
+        Viewer(host=host, port=port, most=10)
+
+
+def test_an_empty_folder_of_deltas_hides_no_scene(tmp_path):
+    (tmp_path / "deltas").mkdir()
+    assert isinstance(source_of(tmp_path), GrowingScene)
+    (tmp_path / "scene.ply").write_bytes(b"")
+    assert isinstance(source_of(tmp_path), SceneFile)
+
+
+def free_port():
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def test_the_server_is_reached_at_what_it_prints_and_updates_in_place():
+    pytest.importorskip("viser")
+    viewer = Viewer(host="127.0.0.1", port=free_port(), most=40)
+    try:
+        assert viewer.url.startswith("http://localhost:")
+        with urllib.request.urlopen(viewer.url, timeout=20) as page:
+            assert page.status == 200
+        assert viewer.show(replace(scene(), opacities=jnp.zeros(50))) == 0
+        assert viewer.show(scene(30)) == 30
+        node = viewer._node
+        assert viewer.show(scene(60)) == 40 and viewer._node is node
+    finally:
+        viewer.close()
+
+
+@pytest.mark.slow
+def test_the_command_shows_a_file_until_it_is_interrupted(tmp_path):
+    pytest.importorskip("viser")
+    ss.save_ply(tmp_path / "scene.ply", scene())
+    command = "import sys; from ssplat_jax.commands.main import main; sys.argv[0] = 'ssplat'; main()"
+    arguments = ("view", str(tmp_path / "scene.ply"), "--port", str(free_port()))
+    with subprocess.Popen([sys.executable, "-c", command, *arguments], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        line = next(line for line in process.stdout if line.startswith("http://localhost:"))
+        with urllib.request.urlopen(line.split()[0], timeout=20) as page:
+            assert page.status == 200
+        process.send_signal(signal.SIGINT)
+        assert process.wait(timeout=60) == 0
+
+
+@pytest.mark.slow
+def test_a_browser_shows_what_the_rasterizer_draws():
+    """Chromium's WebGL and `render`, from the same camera, of a tiny scene and after an update."""
+    pytest.importorskip("viser")
+    chromium = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    if chromium is None:
+        pytest.skip("no Chromium")
+    viewer = Viewer(host="127.0.0.1", port=free_port(), most=1000)
+    switches = ("--headless=new", "--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader")
+    command = [chromium, *switches, "--enable-unsafe-swiftshader", "--window-size=640,480", viewer.url]
+    size = 1e-4
+    start = camera_before(scene(200, size))
+    assert start is not None
+    viewer.look_from(start)
+    viewer.show(scene(200, size))
+    browser = subprocess.Popen(command, stderr=subprocess.DEVNULL)
+    try:
+        deadline = time.monotonic() + 90
+        while not (clients := viewer._server.get_clients()) and time.monotonic() < deadline:
+            time.sleep(0.2)
+        (client,) = clients.values()
+        for num_gaussians in (200, 300):
+            viewer.show(scene(num_gaussians, size))
+            time.sleep(6)  # until it is drawn
+            camera = client.camera
+            height, width = camera.image_height, camera.image_width
+            found = client.get_render(height, width, timeout=60)[..., :3] / 255
+            focal = height / 2 / np.tan(camera.fov / 2)
+            K = jnp.asarray([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], jnp.float32)
+            # In the browser the first camera looks 1 far; here the scene is drawn at size 1.
+            position = camera.position * np.linalg.norm(start.look_at - start.position) / size
+            viewmat = jnp.asarray(inverse(pose_of(camera.wxyz, position, "browser")), jnp.float32)
+            effects = Effects(antialias="classic", background=(1.0, 1.0, 1.0))
+            view = Camera(viewmats=viewmat, Ks=K, width=width, height=height)
+            wanted = ss.render(scene(num_gaussians), view, effects=effects).color
+            assert np.std(wanted) > 0.02  # there is something to see
+            assert -10 * np.log10(np.mean((found - np.clip(wanted, 0, 1)) ** 2)) > BROWSER_DB
+    finally:
+        browser.kill()
+        browser.wait()
+        viewer.close()
