@@ -7,7 +7,7 @@
         cache, out = step(params, cache, chunk)
     gaussians = model.decode(params, cache)
 
-Names are imported on first use, so that `ssplat --help` answers without loading JAX.
+Names are imported on first use, so that `ssplat --help` does not load JAX.
 """
 
 import importlib
@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from ssplat_jax.cache import VoxelCache as VoxelCache
     from ssplat_jax.cache import check_cache as check_cache
-    from ssplat_jax.cache import ensure_room as ensure_room
+    from ssplat_jax.cache import ensure_capacity as ensure_capacity
     from ssplat_jax.checkpoint.weights import load_params as load_params
     from ssplat_jax.chunk import Chunk as Chunk
     from ssplat_jax.config import StreamConfig as StreamConfig
@@ -37,7 +37,8 @@ if TYPE_CHECKING:
     from ssplat_jax.scene_files.spz import save_spz as save_spz
     from ssplat_jax.streaming.streamsplat import StreamSplat as StreamSplat
 
-_HOMES = {
+# Public name -> module that defines it.
+_MODULES = {
     "CacheError": "errors",
     "Camera": "geometry.cameras",
     "Chunk": "chunk",
@@ -50,7 +51,7 @@ _HOMES = {
     "StreamSplat": "streaming.streamsplat",
     "VoxelCache": "cache",
     "check_cache": "cache",
-    "ensure_room": "cache",
+    "ensure_capacity": "cache",
     "fill_holes": "rasterizer",
     "load_params": "checkpoint.weights",
     "load_ply": "scene_files.ply",
@@ -62,14 +63,14 @@ _HOMES = {
     "save_spz": "scene_files.spz",
 }
 __version__ = "0.1.0"
-__all__ = sorted(_HOMES)
+__all__ = sorted(_MODULES)
 
 
 def __getattr__(name: str):
-    if name not in _HOMES:
+    if name not in _MODULES:
         raise AttributeError(f"module 'ssplat_jax' has no attribute {name!r}")
-    home = importlib.import_module(f"ssplat_jax.{_HOMES[name]}")
-    globals()[name] = value = getattr(home, name)
+    module = importlib.import_module(f"ssplat_jax.{_MODULES[name]}")
+    globals()[name] = value = getattr(module, name)
     return value
 
 

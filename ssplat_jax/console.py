@@ -1,4 +1,4 @@
-"""What commands show while they work: progress bars and tables (rich), or nothing with --quiet."""
+"""Terminal output of the commands: progress bars, tables, warnings and facts."""
 
 import contextlib
 from collections.abc import Callable, Iterator
@@ -9,7 +9,7 @@ from rich.table import Table
 
 
 class Reporter:
-    """Progress and tables on stderr, none when quiet; warnings in any case."""
+    """Progress, tables and warnings on stderr; if quiet, warnings only."""
 
     def __init__(self, quiet: bool = False) -> None:
         self.console = Console(stderr=True, quiet=quiet)
@@ -17,7 +17,7 @@ class Reporter:
 
     @contextlib.contextmanager
     def progress(self, name: str, total: int) -> Iterator[Callable[..., None]]:
-        """A bar of `total` steps; gives `advance(done, note="")`."""
+        """A progress bar of `total` steps; yields `advance(done, note="")`."""
         columns = (
             TextColumn("{task.description}"),
             BarColumn(),
@@ -30,12 +30,17 @@ class Reporter:
             yield lambda done, note="": bar.update(task, completed=done, note=note)
 
     def warn(self, message: str) -> None:
-        """One line that is worth stopping at."""
+        """Prints a warning."""
         # One line however narrow the terminal; brackets are text, not rich's markup.
         self._warnings.print(f"warning: {message}", style="yellow", highlight=False, markup=False, soft_wrap=True)
 
+    def warn_all(self, *messages: str | None) -> None:
+        """Prints each message that is not None or empty as a warning."""
+        for message in filter(None, messages):
+            self.warn(message)
+
     def table(self, title: str, header: tuple[str, ...], rows: list[tuple]) -> None:
-        """A table of right-aligned columns."""
+        """Prints a table of right-aligned columns."""
         table = Table(title=title)
         for name in header:
             table.add_column(name, justify="right")
@@ -45,18 +50,18 @@ class Reporter:
 
 
 def print_facts(facts: dict) -> None:
-    """Facts on stdout, a line each; warnings last, each on its own line."""
+    """Prints facts on stdout, one per line, then their `warnings`."""
     width = max(map(len, facts))
     for name, value in facts.items():
         if name != "warnings":
-            print(f"{name:<{width}}  {_plain(value)}")
+            print(f"{name:<{width}}  {_readable(value)}")
     for warning in facts.get("warnings", ()):
         print(f"warning: {warning}")
 
 
-def _plain(value) -> str:
+def _readable(value) -> str:
     if isinstance(value, float):
         return f"{value:.4g}"
     if isinstance(value, (list, tuple)):
-        return " x ".join(_plain(v) for v in value)
+        return " x ".join(_readable(v) for v in value)
     return str(value)

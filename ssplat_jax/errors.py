@@ -1,15 +1,39 @@
-"""What can go wrong outside jit. The command line turns each into one line and an exit code."""
+"""Errors that users can cause. The command line prints each as one line and exits with its code."""
 
 
 class InputError(ValueError):
     """Input from outside is unusable: a capture, an image, a camera, an option. Exit code 2.
 
-    The message says which file (and field), what was wanted, what came, and what to do.
+    The message names the file (and field) and says what was wanted, what came, and what to do.
     """
 
 
+class StorageError(OSError):
+    """Saved data cannot be read or written: a full disk, a corrupt checkpoint. Exit code 3."""
+
+
+class CacheError(RuntimeError):
+    """The cache cannot hold its tokens. Raised outside jit by `cache.check_cache`; the message says what to do."""
+
+
+MAX_ECHO_LENGTH = 80
+"""Characters of a refused value that a message repeats, so that it stays one line."""
+
+
+def refusal(where: str, *, wanted: str, got: object, fix: str) -> InputError:
+    """An `InputError` of one line.
+
+    Args:
+        where: the file, and the field in it.
+        wanted: what would have been accepted.
+        got: what came instead. Strings are shown as they are: pass values from outside through `echo`.
+        fix: what to do.
+    """
+    return InputError(f"{where}: wanted {wanted}, got {got}; {fix}.")
+
+
 def require_positive(**numbers: int | float) -> None:
-    """Refuses options below what counts one thing.
+    """Checks that options, given by their names, are above 0.
 
     Raises:
         InputError: naming the first number that is not positive.
@@ -19,26 +43,7 @@ def require_positive(**numbers: int | float) -> None:
             raise InputError(f"--{name.replace('_', '-')}: wanted a number above 0, got {value}.")
 
 
-class StorageError(OSError):
-    """Reading or writing saved state failed: a full disk, a corrupt checkpoint. Exit code 3."""
-
-
-class CacheError(RuntimeError):
-    """The cache could not hold what it was given; raised by `cache.check_cache`, outside jit, with the remedy."""
-
-
-MAX_ECHO_LENGTH = 80  # characters of a refused value that are repeated: a message stays one line
-
-
-def refusal(where: str, *, wanted: str, got: object, fix: str) -> InputError:
-    """An `InputError` of one line: the file and field, what was wanted, what came, what to do.
-
-    `got` is shown as it is when a string written here, so quote values from outside with `echo`.
-    """
-    return InputError(f"{where}: wanted {wanted}, got {got}; {fix}.")
-
-
 def echo(value: object) -> str:
-    """A value from outside, made safe to print: on one line, escaped, and not longer than `MAX_ECHO_LENGTH`."""
+    """A value from outside as text that is safe to print: one line, escaped, at most `MAX_ECHO_LENGTH` characters."""
     text = ascii(value)
     return text if len(text) <= MAX_ECHO_LENGTH else text[: MAX_ECHO_LENGTH - 3] + "..."

@@ -1,4 +1,4 @@
-"""The scene: 3D Gaussians as one pytree of activated values."""
+"""`Gaussians`: a scene of 3D Gaussians as one pytree of activated values."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -10,7 +10,7 @@ SH_C0 = 0.28209479177387814  # Y_0^0, the constant band: color = 0.5 + SH_C0 * d
 
 @pytree
 class Gaussians:
-    """`n` 3D Gaussians in the world frame of the cameras that look at them.
+    """`n` 3D Gaussians in the world frame of the cameras.
 
     A row with opacity 0 is absent: fixed-capacity producers (the cache) pad with such rows.
     """
@@ -30,7 +30,7 @@ class Gaussians:
         opacities: Float[Array, " n"],
         colors: Float[Array, "n 3"],
     ) -> "Gaussians":
-        """Gaussians of one color from every side; `colors` in [0, 1]."""
+        """Gaussians whose color does not depend on the view; `colors` in [0, 1], the rest as in the class."""
         return Gaussians(
             means=means, quats=quats, scales=scales, opacities=opacities, sh=((colors - 0.5) / SH_C0)[:, None, :]
         )
@@ -42,24 +42,14 @@ class Gaussians:
 
     @property
     def sh_degree(self) -> int:
-        """Highest SH band held."""
+        """Highest SH band."""
         return round(self.sh.shape[-2] ** 0.5) - 1
 
 
-def concatenate(parts: list[Gaussians]) -> Gaussians:
-    """All rows of `parts` (equal SH degree), in order."""
-    return Gaussians(
-        *(
-            jnp.concatenate([getattr(p, name) for p in parts], axis=0)
-            for name in ("means", "quats", "scales", "opacities", "sh")
-        )
-    )
-
-
 def mean_color(gaussians: Gaussians) -> Float[Array, "3"]:
-    """Mean color of the Gaussians, SH bands above the constant left out, weighted by opacity; black of none.
+    """Mean constant color of the Gaussians, weighted by opacity; black for an empty scene.
 
-    What to show where a reconstruction has holes, when nothing better is known.
+    It serves as the background of `fill_holes`.
     """
     colors = jnp.maximum(0.5 + SH_C0 * gaussians.sh[:, 0], 0.0)
     total = jnp.sum(gaussians.opacities)
@@ -67,7 +57,7 @@ def mean_color(gaussians: Gaussians) -> Float[Array, "3"]:
 
 
 def mask_gaussians(gaussians: Gaussians, keep) -> Gaussians:
-    """Makes the rows outside `keep` absent (opacity 0, harmless shape), at the same size."""
+    """`gaussians` with the rows outside `keep` made absent: opacity 0, harmless shape, same size."""
     identity = jnp.array([1.0, 0.0, 0.0, 0.0], gaussians.quats.dtype)
     return replace(
         gaussians,

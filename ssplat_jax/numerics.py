@@ -1,4 +1,4 @@
-"""Safe primitives. Each states its limits; tests/stability/test_numerics.py holds a test for every line of them."""
+"""Numerically safe primitives. tests/stability/test_numerics.py tests every line of their limits."""
 
 import math
 
@@ -26,7 +26,8 @@ def safe_normalize(x: Float[Array, "*s n"], eps: float = 1e-12) -> Float[Array, 
 def columns(x: Float[Array, "*s n"]) -> tuple[Float[Array, "*s"], ...]:
     """The `n` entries along the last axis.
 
-    Split, not indexed: the gradient lays them side by side again. Of indices, it pads each with zeros and adds them up.
+    They are split, not indexed: the gradient of a split is a concatenation, that of an index an array padded with
+    zeros, `n` of which are then added.
     """
     return tuple(jnp.squeeze(column, axis=-1) for column in lax.split(x, (1,) * x.shape[-1], axis=-1))
 
@@ -42,5 +43,5 @@ def safe_log(x: Float[Array, "*s"], eps: float = 1e-12) -> Float[Array, "*s"]:
 
 
 def softplus_inverse(y: float) -> float:
-    """The x with softplus(x) = y, for y > 0, in plain Python (initial values)."""
+    """The x with softplus(x) = y, for y > 0, in plain Python; for initial values."""
     return y + math.log(-math.expm1(-y))

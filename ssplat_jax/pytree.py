@@ -1,4 +1,4 @@
-"""Frozen dataclasses that are pytrees: checked when written by hand, silent when a transform rebuilds them."""
+"""Frozen dataclasses that are pytrees, type-checked when built by hand but not when a transform rebuilds them."""
 
 import dataclasses
 from typing import Any, TypeVar, dataclass_transform
@@ -9,7 +9,7 @@ T = TypeVar("T")
 
 
 def static(**kwargs: Any) -> Any:
-    """A field that is part of the tree's structure: changing it recompiles."""
+    """A dataclass field that is part of the tree's structure: changing it recompiles."""
     return dataclasses.field(metadata={"static": True}, **kwargs)
 
 
@@ -18,8 +18,8 @@ def pytree(cls: type[T]) -> type[T]:
     """Makes `cls` a frozen dataclass and registers it with JAX.
 
     Fields are leaves in declaration order, except those declared with `static()`. Building an instance by hand runs
-    `__init__` (and so the type checks that the tests switch on); transforms rebuild instances past it, because they
-    put tracers, `None`, shardings and batched arrays where arrays are annotated.
+    `__init__`, and with it the type checks that the tests switch on. Transforms bypass it, because they put tracers,
+    `None`, shardings and batched arrays where arrays are annotated.
     """
     cls = dataclasses.dataclass(frozen=True)(cls)
     fields = dataclasses.fields(cls)  # pyright: ignore[reportArgumentType]

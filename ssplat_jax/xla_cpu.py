@@ -1,32 +1,90 @@
-"""Forms that exist only because of XLA's CPU backend. Each has the measurement behind it and says when it may go."""
+"""Forms that exist only because of XLA's CPU backend, each with its measurement and when it may go.
 
+Measured with jax 0.10.1 on two CPU cores; docs/performance.md and docs/decisions.md
+have the machines. Two more stand where they are used: the kernel gradient of `model/convolution.py`, and sort keys
+packed into one integer (`rasterizer/depth_sorted_table.py`, `rasterizer/binning.py`, `cache/fuse.py`).
+"""
+
+import functools
 import math
 from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, UInt
 
-LANES = 16  # 32-bit numbers that a wide processor adds at once
+LANES = 16
+"""32-bit numbers that a wide processor adds at once (AVX-512)."""
+
+SORT_PIECES = 16
+"""Arrays to sort side by side: the CPU runtime shares out work among cores from nine waiting operations on."""
+
+EXP_SQUARINGS = 3
+"""Times that `short_exp` squares its polynomial, which covers a 2^3th of the range."""
 
 
 def lane_sum(x: Float[Array, "*s n"]) -> Float[Array, "*s"]:
     """Sum over the last axis, in up to 16 partial sums side by side.
 
-    XLA's CPU backend vectorizes a sum over a major axis but not one over the minor, and leaves what it fuses with it
-    unvectorized too.
+    Why: XLA's CPU backend vectorizes a sum over a major axis but not one over the minor, and leaves what it fuses with
+    it unvectorized too. The plane sweep takes 2.4 and 4.6 ms at its two scales, where an einsum of gathered samples
+    took 19 and 20; attention to a few own keys takes 3 ms instead of 13 (docs/decisions.md).
+    May go when `jnp.sum(x, axis=-1)` is as fast there.
     """
     lanes = math.gcd(x.shape[-1], LANES)
     return jnp.sum(jnp.sum(x.reshape(*x.shape[:-1], -1, lanes), axis=-2), axis=-1)
 
 
-def apart(wanted: Bool[Array, ""], compute: Callable[[], Array]) -> Array:
-    """`compute()` if `wanted`, else zeros: by kernels of its own, from operands that are there.
+def in_own_kernel(wanted: Bool[Array, ""], compute: Callable[[], Array]) -> Array:
+    """`compute()` where `wanted` is true, else zeros; XLA does not fuse it with the operations around it.
 
-    Left to itself, XLA's CPU compiler fuses a gather with what stands around it, does it again in each kernel that
-    uses it, and goes entry by entry (`lax.optimization_barrier` is gone by then). It fuses nothing across the edge of
-    a branch. A loop would do as well, but first fills its result with zeros.
+    Why: the CPU compiler fuses a gather with every kernel that uses it, and each repeats it entry by entry
+    (`lax.optimization_barrier` is removed before that). It does not fuse across the edge of a `lax.cond`. A loop
+    would do as well, but XLA first fills its result with zeros. At 262,144 Gaussians, compositing takes 200 ms instead
+    of 350 (docs/performance.md).
+    May go when `ssplat bench render` is as fast with a plain `compute()`. Where `wanted` is always true, it must be a
+    value that the compiler does not know.
     """
     shape = jax.eval_shape(compute)
     return lax.cond(wanted, compute, lambda: jnp.zeros(shape.shape, shape.dtype))
+
+
+def sort_pieces(keys: UInt[Array, "s n"]) -> UInt[Array, "s n"]:
+    """Each row sorted, by an operation of its own.
+
+    Why: the CPU runtime sorts one array on one core, but several arrays on all cores. 1.3 million keys in
+    `SORT_PIECES` rows take 50 ms instead of 113 (docs/performance.md).
+    May go when one sort runs on all cores: sort the keys as one array, then.
+    """
+    return jnp.stack([lax.sort(piece) for piece in keys])
+
+
+def short_exp(x: Float[Array, "*s"], low: float) -> Float[Array, "*s"]:
+    """e^x for x from `low` to 0 to a relative 3e-6 (float64: exactly), and 0 for minus infinity.
+
+    Why: on a short range, a polynomial of an eighth of x and three squarings take two thirds of the time of XLA's
+    exponential, and compositing 0.86 of its time (docs/decisions.md; `low` = log(1/255)). It ends in a division because
+    the CPU compiler keeps the result of one, as it does for an exponential: otherwise every kernel that reads the
+    result would compute it again.
+    May go when `jnp.exp` is as fast.
+    """
+    if x.dtype == jnp.float64:
+        return jnp.exp(x)
+    coefficients = _growth_coefficients(low)
+    fraction = x * (-1.0 / 2**EXP_SQUARINGS)
+    growth = jnp.asarray(coefficients[-1], x.dtype)
+    for coefficient in coefficients[-2::-1]:
+        growth = growth * fraction + float(coefficient)
+    for _ in range(EXP_SQUARINGS):
+        growth = growth * growth
+    return 1.0 / growth
+
+
+@functools.cache
+def _growth_coefficients(low: float) -> np.ndarray:
+    """Polynomial of degree 5 for e^y on [0, -low / 2^EXP_SQUARINGS], lowest power first."""
+    interval = [0.0, -low / 2**EXP_SQUARINGS]
+    chebyshev = np.polynomial.Chebyshev.interpolate(np.exp, 5, interval)
+    return chebyshev.convert(kind=np.polynomial.Polynomial).coef

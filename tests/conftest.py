@@ -1,4 +1,4 @@
-"""What all tests share: shapes and types checked at every call, strict dtypes, and where the real captures are."""
+"""Set-up of all tests: shapes and types checked at every call, strict dtypes, and the folders of real data."""
 
 import atexit
 import importlib.metadata
@@ -23,7 +23,7 @@ if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     os.environ["JAX_COMPILATION_CACHE_DIR"] = tempfile.mkdtemp(prefix="ssplat-tests-")
     atexit.register(shutil.rmtree, os.environ["JAX_COMPILATION_CACHE_DIR"], ignore_errors=True)
 
-# Before anything of the package is imported: every annotated signature of it is checked at run time.
+# Before the package is imported: every annotated signature in it is checked at run time.
 install_import_hook("ssplat_jax", "beartype.beartype")
 
 import jax  # noqa: E402
@@ -38,10 +38,9 @@ SHARED = Path(__file__).resolve().parents[2] / "shared"
 # Workers take whole files, in this order: the long ones first, so that no worker ends long after the others.
 LONG_FILES = (
     "tests/train/",
-    "tests/test_stream.py",
-    "tests/cli/",
+    "tests/streaming/",
+    "tests/commands/",
     "tests/model/test_predict.py",
-    "tests/test_parallel.py",
 )
 
 

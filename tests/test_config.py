@@ -1,4 +1,4 @@
-"""The configuration: what is refused, what identifies it, and that it needs no JAX."""
+"""The configuration: bad values are refused, every field changes the hash, and no JAX is needed."""
 
 import dataclasses
 import re
@@ -43,7 +43,7 @@ BAD = [
     {"chunk_step": float("inf")},
     {"lambda_sigma": float("inf")},
     {"min_confidence": 1.5},
-    {"min_confidence": 0.96},  # views carve, and what they confirm is held to 0.95
+    {"min_confidence": 0.96},  # carving keeps confidences below 0.95
     {"min_confidence": float("nan")},
     {"sigma0": 0.0},
     {"lambda_sigma": -0.1},
@@ -58,11 +58,11 @@ BAD = [
 
 
 @pytest.mark.parametrize("changes", BAD, ids=str)
-def test_bad_value_is_refused_by_name_with_what_came(changes):
+def test_bad_value_is_refused_by_name_and_value(changes):
     ((name, value),) = changes.items()
     group_name, name = StreamConfig().find(name)
     group = getattr(StreamConfig(), group_name)
-    # Past the type checks that the tests switch on: users do not have them.
+    # Without the type checks of the tests, which users do not have.
     bad = object.__new__(type(group))
     for field in dataclasses.fields(group):
         object.__setattr__(bad, field.name, changes.get(field.name, getattr(group, field.name)))
@@ -75,7 +75,7 @@ def test_replacing_checks_what_it_builds():
         StreamConfig().replace(voxel_size=-1.0)
 
 
-def test_unknown_field_is_refused_and_the_known_ones_are_listed():
+def test_unknown_field_is_refused_with_the_known_ones():
     with pytest.raises(InputError, match=r"no field 'voxelsize'.*voxel_size"):
         StreamConfig().replace(voxelsize=1.0)
 
@@ -117,7 +117,7 @@ def test_full_and_short_names_are_the_same_field():
         assert StreamConfig().replace(**{name: value}) == StreamConfig().replace(**{name.split(".")[1]: value})
 
 
-def test_flat_dictionary_of_version_0_1_still_reads():
+def test_flat_dictionary_of_version_0_1_is_read():
     flat = {"preset": "tiny", "network": "compact", "vit": "s", "match_stride": 4, "depth_range": None}
     flat |= {"mixer_neighbours": 9, "voxel_size": 0.05, "encoder_widths": [8, 16]}
     config = StreamConfig().replace(mixer_neighbors=9, voxel_size=0.05, encoder_widths=(8, 16))
@@ -144,7 +144,7 @@ def test_short_name_that_two_groups_share_is_refused(monkeypatch):
     assert config.replace(**{"network.voxel_size": 0.5}).get("network.voxel_size") == 0.5
 
 
-def test_presets_carry_their_name_and_unknown_ones_are_refused():
+def test_presets_have_their_name_and_unknown_are_refused():
     for name, config in PRESETS.items():
         assert preset(name) is config and config.preset == name
     with pytest.raises(InputError, match=r"no preset 'huge'; there is .*tiny"):
@@ -152,7 +152,7 @@ def test_presets_carry_their_name_and_unknown_ones_are_refused():
 
 
 def test_help_needs_no_jax():
-    """The package, its configuration, recipes and errors load without JAX: `--help` answers in well under a second."""
+    """The package, its configuration, recipes and errors are imported without JAX, so that `--help` is fast."""
     code = (
         "import sys, ssplat_jax, ssplat_jax.config, ssplat_jax.errors, ssplat_jax.train.recipe; "
         "sys.exit('jax' in sys.modules)"
@@ -160,7 +160,7 @@ def test_help_needs_no_jax():
     assert subprocess.run([sys.executable, "-c", code], timeout=60).returncode == 0
 
 
-def test_the_public_names_are_all_there():
+def test_all_public_names_exist():
     import ssplat_jax
 
     for name in ssplat_jax.__all__:

@@ -1,13 +1,13 @@
-"""What the cache's modules are worth: each switched off, trained for the same short budget, scored alike.
+"""Ablation of the paper's modules: each is switched off, trained for the same short budget and scored.
 
     ssplat experiment ablation --captures path/to/captures --out runs/ablation
 
-Every variant of the paper's table starts from the shipped weights and trains everything behind the matcher for the same
+Every variant of the paper's table starts from the shipped weights and trains all stages after the matcher for the same
 steps on the same samples, once per seed; then the decoded cache is scored on unseen views of `procedural:room` (and of
-redkitchen, where `--captures` has it). What stands in `--out` already is not repeated; a stopped experiment goes on.
-Writes `table.json` and `table.md`: mean and standard deviation over seeds, and those of the difference from the full
-model trained with the same seed, which seeds move less than scores. `--scale smoke` shows in some minutes that every
-switch trains.
+redkitchen, where `--captures` has it). Results in `--out` are not computed again, so that a stopped experiment
+continues. Writes `table.json` and `table.md`: mean and standard deviation over seeds, of the scores and of their
+difference from the full model with the same seed, which varies less. `--scale smoke` trains every variant for a few
+steps.
 """
 
 import dataclasses
@@ -16,15 +16,15 @@ import statistics
 from pathlib import Path
 from typing import Any
 
+from ssplat_experiments.scenes import REDKITCHEN, open_redkitchen, open_room
 from ssplat_jax.checkpoint.weights import load_params
 from ssplat_jax.config import preset
 from ssplat_jax.console import Reporter
-from ssplat_jax.data.capture import open_capture
-from ssplat_jax.data.split import interleaved
 from ssplat_jax.errors import InputError
-from ssplat_jax.evaluation.evaluate import cache_facts, mean_psnr, stream_context
+from ssplat_jax.evaluation.scoring import mean_psnr
 from ssplat_jax.storage.atomic import write_atomic
 from ssplat_jax.storage.json_files import write_json
+from ssplat_jax.streaming.feed import feed_capture
 from ssplat_jax.streaming.session import Session
 from ssplat_jax.streaming.streamsplat import StreamSplat
 from ssplat_jax.train.loop import train
@@ -41,7 +41,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
 
 @dataclasses.dataclass(frozen=True)
 class Budget:
-    """What a variant is trained and scored with."""
+    """Training steps and views of a variant."""
 
     steps: int
     num_chunks: int
@@ -69,7 +69,7 @@ def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str
     scenes = _scenes(captures, budget)
     rows, done = [], 0
     with reporter.progress("variants", len(VARIANTS) * len(budget.seeds)) as advance:
-        for seed in budget.seeds:  # outermost: stopped early, the variants have had the same seeds
+        for seed in budget.seeds:  # outermost, so that variants have the same seeds if this is stopped early
             for variant, changes in VARIANTS.items():
                 place = out / variant.replace(" ", "_") / f"seed{seed}"
                 scores = _measure(changes, seed, budget, scenes, place)
@@ -82,7 +82,7 @@ def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str
 
 
 def _measure(changes: dict[str, Any], seed: int, budget: Budget, scenes, place: Path) -> list[dict[str, Any]]:
-    """Scores of one trained variant on every scene; read back if they stand there."""
+    """Scores of one trained variant on every scene, from the file if they were measured before."""
     scores = place / "scores.json"
     asked = json.loads(json.dumps({"budget": dataclasses.asdict(budget), "changes": changes, "scenes": list(scenes)}))
     if scores.exists():
@@ -98,28 +98,25 @@ def _measure(changes: dict[str, Any], seed: int, budget: Budget, scenes, place: 
     for scene, (capture, split) in scenes.items():
         session = Session(StreamSplat(config), trained.state.ema)
         frame = capture.stream_frame(config, split.context)
-        exposures, _ = stream_context(session, capture, split, frame)
+        exposures, _ = feed_capture(session, capture, split.context, frame)
         psnr = round(mean_psnr(session.gaussians(), capture, split.targets, frame, exposures), 3)
-        rows.append({"scene": scene, "psnr": psnr, "gaussians": cache_facts(session)["decoded"]})
+        rows.append({"scene": scene, "psnr": psnr, "gaussians": session.cache_facts()["decoded"]})
     write_json(scores, {"asked": asked, "rows": rows})
     return rows
 
 
 def _scenes(captures: Path | None, budget: Budget) -> dict:
     """Captures at the scored size, each with its split."""
-    frames = interleaved(10_000, 1, budget.context).context[-1] + 1
-    room = open_capture(f"procedural:room?frames={frames}", size=budget.scored)
-    scenes = {"room": (room, interleaved(frames, 1, budget.context))}
+    scenes = {"room": open_room(budget.context, budget.scored)}
     if captures is not None:
-        if not (captures / "redkitchen").is_dir():
-            raise InputError(f"experiment ablation: wanted redkitchen in --captures, {captures} does not hold it.")
-        kitchen = open_capture(captures / "redkitchen", size=budget.scored)
-        scenes["redkitchen"] = (kitchen, interleaved(len(kitchen), 5, budget.context))
+        if not (captures / REDKITCHEN).is_dir():
+            raise InputError(f"experiment ablation: wanted {REDKITCHEN} in --captures, {captures} does not hold it.")
+        scenes[REDKITCHEN] = open_redkitchen(captures, budget.context, budget.scored)
     return scenes
 
 
 def table(rows: list[dict[str, Any]]) -> str:
-    """Mean and spread over seeds, a row per variant and scene; the differences are taken seed by seed."""
+    """Markdown table of mean and spread over seeds, a row per variant and scene; differences are taken per seed."""
     lines = ["| scene | variant | PSNR dB | full, same seed, minus it | Gaussians |", "|---|---|---|---|---|"]
     for scene in dict.fromkeys(row["scene"] for row in rows):
         for variant in VARIANTS:
@@ -135,6 +132,6 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 
 def _spread(values: list[float]) -> str:
-    """Mean and standard deviation, and of how many."""
+    """Mean, standard deviation and number of values."""
     mean = f"{statistics.mean(values):.2f}"
     return f"{mean} ± {statistics.stdev(values):.2f} ({len(values)})" if len(values) > 1 else f"{mean} (one seed)"

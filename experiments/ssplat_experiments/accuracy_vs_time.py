@@ -1,29 +1,33 @@
-"""What accuracy costs in time: PSNR of unseen views against milliseconds per chunk, one knob at a time.
+"""Accuracy against time: PSNR of unseen views and milliseconds per view, one setting changed at a time.
 
     ssplat experiment accuracy_vs_time --captures path/to/captures --out runs/accuracy_vs_time
 
 Every setting streams the same context views of `procedural:room` (and of redkitchen, where `--captures` has it) with
 the shipped weights, no retraining, and is scored on the same targets at the same size, whatever size it streamed at.
 Time is chunk in -> one novel view out on the full cache, warm. Writes `table.json`, `table.md` and `plot.png`,
-row by row. Wants a machine with nothing else to do: about 40 minutes on two cores.
+row by row. Needs an idle machine: about 40 minutes on two cores.
 """
 
 import dataclasses
-import io
+import functools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ssplat_experiments.scenes import REDKITCHEN, open_redkitchen, open_room
 from ssplat_jax.checkpoint.weights import load_params
 from ssplat_jax.config import preset
 from ssplat_jax.console import Reporter
-from ssplat_jax.data.capture import Capture, open_capture
-from ssplat_jax.data.split import Split, interleaved
-from ssplat_jax.evaluation.evaluate import cache_facts, mean_psnr, measure_latency, stream_context
+from ssplat_jax.data.capture import Capture
+from ssplat_jax.data.split import Split
+from ssplat_jax.evaluation.latency import measure_latency
+from ssplat_jax.evaluation.plots import import_pyplot, save_figure
+from ssplat_jax.evaluation.scoring import mean_psnr
 from ssplat_jax.storage.atomic import write_atomic
 from ssplat_jax.storage.json_files import write_json
+from ssplat_jax.streaming.feed import feed_capture
 from ssplat_jax.streaming.session import Session
 from ssplat_jax.streaming.streamsplat import StreamSplat
 
@@ -39,7 +43,7 @@ class Setting:
     size: tuple[int, int] = SCORED
     changes: dict[str, Any] = dataclasses.field(default_factory=dict)
     quality: str = ""
-    """The `--quality` that this is, if it is one."""
+    """Name of the `--quality` with this setting, or empty."""
 
 
 SETTINGS = (
@@ -64,7 +68,7 @@ SETTINGS = (
 
 
 def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str:
-    """Measures every setting on every scene that is there; `smoke` takes the first two settings and 8 views."""
+    """Measures every setting on every available scene; `smoke` takes the first two settings and 8 views."""
     settings = SETTINGS if scale == "full" else SETTINGS[:2]
     scenes = _scenes(captures, CONTEXT[scale])
     if len(scenes) == 1:
@@ -72,15 +76,15 @@ def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str
     rows: list[dict[str, Any]] = []
     with reporter.progress("measuring", len(settings) * len(scenes)) as advance:
         for setting in settings:
-            for scene, (opened, split) in scenes.items():
-                rows.append({"scene": scene} | measure(setting, opened, split))
+            for scene, opened in scenes.items():
+                rows.append({"scene": scene} | measure(setting, opened))
                 _write(out, rows)  # what an interrupted run has measured is kept
                 advance(len(rows), f"{scene}, {setting.name}")
     return f"wrote {out}/table.json, table.md and plot.png: {len(rows)} measured settings"
 
 
 def _write(out: Path, rows: list[dict[str, Any]]) -> None:
-    """The table in two forms and the plot, with the front of what is measured so far."""
+    """The table in two forms and the plot, with the front of the rows so far."""
     for scene in {row["scene"] for row in rows}:
         mark_front([row for row in rows if row["scene"] == scene])
     write_json(out / "table.json", rows)
@@ -88,36 +92,27 @@ def _write(out: Path, rows: list[dict[str, Any]]) -> None:
     plot(out / "plot.png", rows)
 
 
-Opened = Callable[[tuple[int, int]], Capture]
+Opened = Callable[[tuple[int, int]], tuple[Capture, Split]]
+"""Opens a scene with images of a (width, height)."""
 
 
-def _scenes(captures: Path | None, context: int) -> dict[str, tuple[Opened, Split]]:
-    """How to open each scene at a size, and its split."""
-    frames = interleaved(10_000, 1, context).context[-1] + 1
-    scenes: dict[str, tuple[Opened, Split]] = {
-        "room": (
-            lambda size: open_capture(f"procedural:room?frames={frames}", size=size),
-            interleaved(frames, 1, context),
-        )
-    }
-    if captures is not None and (captures / "redkitchen").is_dir():
-        path = captures / "redkitchen"
-        scenes["redkitchen"] = (
-            lambda size: open_capture(path, size=size),
-            interleaved(len(open_capture(path)), 5, context),
-        )
+def _scenes(captures: Path | None, context: int) -> dict[str, Opened]:
+    """The available scenes by name."""
+    scenes: dict[str, Opened] = {"room": functools.partial(open_room, context)}
+    if captures is not None and (captures / REDKITCHEN).is_dir():
+        scenes[REDKITCHEN] = functools.partial(open_redkitchen, captures, context)
     return scenes
 
 
-def measure(setting: Setting, opened: Opened, split: Split) -> dict[str, Any]:
+def measure(setting: Setting, opened: Opened) -> dict[str, Any]:
     """One row: quality and time of a setting on a scene."""
     session = Session(StreamSplat(preset("tiny").replace(**setting.changes)), load_params("tiny"))
-    capture, scored = opened(setting.size), opened(SCORED)
+    (capture, split), (scored, _) = opened(setting.size), opened(SCORED)
     frame = capture.stream_frame(session.model.config, split.context)
-    exposures, recent = stream_context(session, capture, split, frame)
+    exposures, recent = feed_capture(session, capture, split.context, frame, num_recent=2)
     quality = mean_psnr(session.gaussians(), scored, split.targets, frame, exposures)
     middle = split.targets[len(split.targets) // 2]
-    latency = measure_latency(session, recent[-2:], scored.camera(middle, frame))
+    latency = measure_latency(session, recent, scored.camera(middle, frame))
     views = session.model.config.stream.chunk_size
     return {
         "setting": setting.name,
@@ -126,7 +121,7 @@ def measure(setting: Setting, opened: Opened, split: Split) -> dict[str, Any]:
         "chunk_ms": latency["chunk_ms"]["median"],
         "render_ms": latency["render_ms"],
         "compile_s": round(session.compile_seconds, 1),
-        "gaussians": cache_facts(session)["decoded"],
+        "gaussians": session.cache_facts()["decoded"],
         "step_memory_mb": round((session.step_memory_bytes or 0) / 2**20, 1),
     }
 
@@ -160,12 +155,7 @@ def plot(path: Path, rows: list[dict[str, Any]]) -> None:
 
     Left out without matplotlib (`plots` extra).
     """
-    try:
-        import matplotlib
-
-        matplotlib.use("Agg")
-        from matplotlib import pyplot
-    except ImportError:
+    if (pyplot := import_pyplot()) is None:
         return
     scenes = list(dict.fromkeys(row["scene"] for row in rows))
     figure, panels = pyplot.subplots(1, len(scenes), figsize=(7 * len(scenes), 5), layout="constrained", squeeze=False)
@@ -201,7 +191,4 @@ def plot(path: Path, rows: list[dict[str, Any]]) -> None:
         axes.set_ylabel("PSNR of unseen views, dB")
         axes.set_title(scene)
         axes.spines[["top", "right"]].set_visible(False)
-    encoded = io.BytesIO()
-    figure.savefig(encoded, dpi=150)
-    pyplot.close(figure)
-    write_atomic(path, encoded.getvalue())
+    save_figure(path, figure)

@@ -13,7 +13,7 @@ from ssplat_jax.checkpoint.weights import load_params
 from ssplat_jax.config import preset
 from ssplat_jax.console import Reporter
 from ssplat_jax.data.capture import open_capture
-from ssplat_jax.data.split import interleaved
+from ssplat_jax.data.split import interleaved_split
 from ssplat_jax.errors import InputError
 from ssplat_jax.evaluation.evaluate import evaluate
 from ssplat_jax.storage.json_files import write_json
@@ -31,7 +31,7 @@ SETTINGS: tuple[
 
 
 def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str:
-    """Evaluates what is there, writes the table; `smoke` takes 8 context views of each."""
+    """Evaluates the captures that are there and writes the table; `smoke` takes 8 context views of each."""
     if captures is None:
         raise InputError("experiment captures: wanted --captures, a folder with captures by their names.")
     model, params = StreamSplat(preset("tiny")), load_params("tiny")
@@ -41,7 +41,7 @@ def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str
             reporter.warn(f"{name}: not in {captures}, left out")
             continue
         capture = open_capture(captures / name, size=size)
-        split = interleaved(len(capture), stride, context if scale == "full" else 8)
+        split = interleaved_split(len(capture), stride, context if scale == "full" else 8)
         metrics = evaluate(Session(model, params), capture, split, out / f"{name}_stride{stride}", reporter)
         row = {
             "capture": name,

@@ -1,11 +1,11 @@
-"""How wrong depths are where they are known, and whether their confidence says so.
+"""Errors of estimated depths, and how well confidence predicts them.
 
     ssplat experiment depth_error --captures path/to/captures --out runs/depth_error
 
 Streams captures that have depth maps with the shipped weights and compares the depth of every token with the median of
 its cell's map, after one scale for the whole capture (the median ratio over accepted tokens). Writes `table.json`:
-accepted fraction, median relative error of accepted tokens, and both by confidence, which is calibrated if the error
-falls as it rises. docs/model_card.md holds the numbers to expect.
+accepted fraction, median relative error of accepted tokens, and the error by confidence; confidence is
+calibrated if the error falls as it rises. docs/model_card.md holds the numbers to expect.
 """
 
 import itertools
@@ -15,37 +15,36 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from ssplat_experiments.scenes import REDKITCHEN, open_redkitchen, open_room
 from ssplat_jax.checkpoint.weights import load_params
 from ssplat_jax.config import preset
 from ssplat_jax.console import Reporter
-from ssplat_jax.data.capture import Capture, open_capture
-from ssplat_jax.data.split import interleaved
+from ssplat_jax.data.capture import Capture
+from ssplat_jax.data.split import Split
 from ssplat_jax.errors import InputError
 from ssplat_jax.model import GRID_STRIDE
 from ssplat_jax.storage.json_files import write_json
+from ssplat_jax.streaming.feed import feed_chunks
 from ssplat_jax.streaming.session import Session
 from ssplat_jax.streaming.streamsplat import StreamSplat
 
 SIZE = (320, 240)
 CONTEXT = {"full": 64, "smoke": 8}
-STRIDES = {"redkitchen": 5}
-EDGE = 1.05  # depth ratio within a cell that is no longer one surface
-EDGES = (0.0, 0.3, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)  # of the bins of confidence
+EDGE = 1.05  # depth ratio within a cell above which it shows two surfaces
+BIN_EDGES = (0.0, 0.3, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)  # bins of confidence
 
 
 def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str:
     """Measures `procedural:room` and, where `--captures` has it, redkitchen."""
     context = CONTEXT[scale]
-    frames = interleaved(10_000, 1, context).context[-1] + 1
-    opened = {"room": (open_capture(f"procedural:room?frames={frames}", size=SIZE), 1)}
-    for name, stride in STRIDES.items():
-        if captures is not None and (captures / name).is_dir():
-            opened[name] = (open_capture(captures / name, size=SIZE), stride)
-        else:
-            reporter.warn(f"{name}: not under --captures, left out")
+    scenes = {"room": open_room(context, SIZE)}
+    if captures is not None and (captures / REDKITCHEN).is_dir():
+        scenes[REDKITCHEN] = open_redkitchen(captures, context, SIZE)
+    else:
+        reporter.warn(f"{REDKITCHEN}: not under --captures, left out")
     rows: list[dict[str, Any]] = []
-    for name, (capture, stride) in opened.items():
-        rows.append({"capture": name} | measure(capture, stride, context))
+    for name, (capture, split) in scenes.items():
+        rows.append({"capture": name} | measure(capture, split))
     write_json(out / "table.json", rows)
     for row in rows:
         reporter.table(
@@ -56,26 +55,23 @@ def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str
     return f"wrote {out}/table.json: " + ", ".join(f"{r['capture']} {r['median_error']:.1%}" for r in rows)
 
 
-def measure(capture: Capture, stride: int, context: int) -> dict[str, Any]:
-    """One row: errors of the tokens of the first `context` views."""
+def measure(capture: Capture, split: Split) -> dict[str, Any]:
+    """One row: errors of the tokens of the context views."""
     model = StreamSplat(preset("tiny"))
-    split = interleaved(len(capture), stride, context)
     frame = capture.stream_frame(model.config, split.context)
     order = capture.stream_order(model.config, split.context, frame)
     session = Session(model, load_params("tiny"))
     ratios, confidences = [], []
-    views = iter(order)
-    for chunk in capture.chunks(model.config, order, frame=frame):
-        output = session.feed(chunk)
-        for v in np.flatnonzero(np.asarray(chunk.valid)):
-            depth = capture.depth(next(views))
+    for fed in feed_chunks(session, capture, order, frame):
+        for v, i in enumerate(fed.frames):  # padded views come last
+            depth = capture.depth(i)
             if depth is None:
                 continue  # not every frame need have a map
             truth = frame.scale * cell_depths(depth)
             rows, columns = truth.shape
-            ratio = np.asarray(output.depths[v])[:rows, :columns] / np.where(truth > 0, truth, np.nan)
+            ratio = np.asarray(fed.output.depths[v])[:rows, :columns] / np.where(truth > 0, truth, np.nan)
             ratios.append(ratio[truth > 0])
-            confidences.append(np.asarray(output.confidences[v])[:rows, :columns][truth > 0])
+            confidences.append(np.asarray(fed.output.confidences[v])[:rows, :columns][truth > 0])
     if not ratios:
         raise InputError(f"experiment depth_error: {capture.name} has no depth map among its context frames.")
     return summary(np.concatenate(ratios), np.concatenate(confidences), model.config.memory.min_confidence)
@@ -84,7 +80,7 @@ def measure(capture: Capture, stride: int, context: int) -> dict[str, Any]:
 def cell_depths(depth: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "hf wf"]:
     """Median of the known depths of each whole grid cell; 0 where fewer than half of its pixels are known.
 
-    Of an even number the mean of the middle two, unless an edge lies between them: then the nearer.
+    The median of an even number is the mean of the middle two, or the nearer if an edge lies between them.
     """
     rows, columns = (side // GRID_STRIDE for side in depth.shape)
     cells = depth[: rows * GRID_STRIDE, : columns * GRID_STRIDE].reshape(rows, GRID_STRIDE, columns, GRID_STRIDE)
@@ -100,13 +96,13 @@ def cell_depths(depth: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "hf wf"]:
 
 
 def summary(ratios: Float[np.ndarray, " m"], confidences: Float[np.ndarray, " m"], tau: float) -> dict[str, Any]:
-    """Errors after one global scale, of accepted tokens and by confidence."""
+    """Errors of accepted tokens and by confidence, after one global scale."""
     accepted = confidences >= tau
     scale = float(np.median(ratios[accepted]))
     errors = np.abs(ratios / scale - 1.0)
     bins = []
-    for low, high in itertools.pairwise(EDGES):
-        inside = (confidences >= low) & ((confidences < high) | (high == EDGES[-1]))
+    for low, high in itertools.pairwise(BIN_EDGES):
+        inside = (confidences >= low) & ((confidences < high) | (high == BIN_EDGES[-1]))
         error = round(float(np.median(errors[inside])), 4) if inside.any() else None
         bins.append({"confidence": f"{low} to {high}", "tokens": int(inside.sum()), "median_error": error})
     return {

@@ -1,11 +1,11 @@
-"""What more views give, and what they cost: the paper's protocol on one long capture.
+"""Quality and cost against the number of views: the paper's protocol on one long capture.
 
     ssplat experiment more_views --captures path/to/captures --out runs/more_views
 
 All frames of redkitchen (without `--captures`, of `procedural:room`) are the trajectory: 16 targets uniform over it,
-and the first 24, 64, 128, 256, 512 others are streamed, each count by itself, as `ssplat eval --protocol paper
---context V` does. Few views see little of what the targets show. Writes `table.json`, `table.md` and a folder per count
-with pictures, `metrics.json` and `split.json`. docs/model_card.md holds the numbers to expect.
+and the first 24, 64, 128, 256, 512 others are streamed, each number in a stream of its own, as `ssplat eval --protocol
+paper --context V` does. With few views, little of the targets is covered. Writes `table.json`, `table.md` and a folder
+per number of views with pictures, `metrics.json` and `split.json`. docs/model_card.md holds the numbers to expect.
 """
 
 from pathlib import Path
@@ -14,7 +14,7 @@ from ssplat_jax.checkpoint.weights import load_params
 from ssplat_jax.config import preset
 from ssplat_jax.console import Reporter
 from ssplat_jax.data.capture import Capture, open_capture
-from ssplat_jax.data.split import paper
+from ssplat_jax.data.split import paper_split
 from ssplat_jax.errors import InputError
 from ssplat_jax.evaluation.evaluate import evaluate
 from ssplat_jax.storage.atomic import write_atomic
@@ -28,12 +28,12 @@ ROOM_FRAMES = {"full": 600, "smoke": 40}
 
 
 def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str:
-    """Evaluates every count of views; what was measured is in the tables even if a later count is interrupted."""
+    """Evaluates every number of views; the tables are written after each, so that an interruption loses little."""
     capture = _open(captures, scale)
     model, params = StreamSplat(preset("tiny")), load_params("tiny")
     rows = []
     for context in COUNTS[scale]:
-        split = paper(len(capture), context)
+        split = paper_split(len(capture), context)
         metrics = evaluate(Session(model, params), capture, split, out / f"{context}_views", reporter)
         rows.append(
             {

@@ -1,1 +1,1 @@
-"""What `ssplat bench` measures."""
+"""The benchmarks of `ssplat bench`."""

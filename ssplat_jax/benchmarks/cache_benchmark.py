@@ -1,8 +1,7 @@
-"""Speed of the cache, by itself: what a chunk costs, and that the cost depends on the chunk alone.
+"""Speed of the cache: the cost of a chunk, and whether it depends on anything but the chunk.
 
-The chunk of the fuse is the dearest kind: it looks again at a patch of voxels that are all full, so that every token
-merges. Timings that are compared are taken in turns in one process, and each is the least of its turns: what else runs
-on the machine only ever adds.
+The chunk that is fused is the most expensive kind: its voxels are all full, so that every token merges. Timings to be
+compared are taken alternately in one process, and the minimum counts: other load on the machine only adds time.
 """
 
 import dataclasses
@@ -24,13 +23,13 @@ from ssplat_jax.config import StreamConfig
 from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.pytree import replace
 
-PATCH = 2048
-"""Voxels that the chunk of the fuse falls into."""
+NUM_PATCH_VOXELS = 2048
+"""Voxels into which the tokens of the fused chunk fall."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """One figure."""
+    """One figure, with the value that is wanted."""
 
     name: str
     value: float
@@ -39,7 +38,7 @@ class Row:
 
 
 def bench_cache(config: StreamConfig, *, num_tokens: int = 16384, repeats: int = 25) -> list[Row]:
-    """All figures of the cache: fuse against occupancy, capacity and the NumPy loop, projection, stream length."""
+    """All figures of the cache: fuse by occupancy, by capacity and against NumPy, projection, stream length."""
     config = config.replace(overflow="drop_new", vacc="voxel")
     return [
         *bench_occupancy(config, num_tokens=num_tokens, repeats=repeats),
@@ -51,11 +50,11 @@ def bench_cache(config: StreamConfig, *, num_tokens: int = 16384, repeats: int =
 
 
 def bench_occupancy(config: StreamConfig, *, num_tokens: int, repeats: int, capacity: int = 1 << 18) -> list[Row]:
-    """The same chunk in a cache that is 1 % and one that is 90 % full."""
+    """Fusing one chunk into a cache that is 1 % full and one that is 90 % full."""
     chunk = patch_tokens(config, num_tokens)
     step = compile_fuse(config, capacity, chunk)
     caches = [_occupied(config, step(init_cache(config, capacity), chunk), share) for share in (0.01, 0.9)]
-    low, high = take_turns([_Stream(step, cache, chunk) for cache in caches], repeats)
+    low, high = time_alternately([_Stream(step, cache, chunk) for cache in caches], repeats)
     return [
         Row("fuse_at_1_percent", low * 1e3, "ms"),
         Row("fuse_at_90_percent", high * 1e3, "ms"),
@@ -64,19 +63,19 @@ def bench_occupancy(config: StreamConfig, *, num_tokens: int, repeats: int, capa
 
 
 def bench_capacity(config: StreamConfig, *, num_tokens: int, repeats: int) -> list[Row]:
-    """The same chunk in a small and in a large cache, and what of the large one is copied."""
+    """Fusing one chunk into a small and a large cache, and the bytes of the large one that are copied."""
     chunk = patch_tokens(config, num_tokens)
     capacities = (1 << 14, 1 << 18)
     steps = [compile_fuse(config, capacity, chunk) for capacity in capacities]
     caches = [init_cache(config, capacity) for capacity in capacities]
-    small, large = take_turns([_Stream(*pair, chunk) for pair in zip(steps, caches, strict=True)], repeats)
+    small, large = time_alternately([_Stream(*pair, chunk) for pair in zip(steps, caches, strict=True)], repeats)
     rows = [
         Row("fuse_at_2^14", small * 1e3, "ms"),
         Row("fuse_at_2^18", large * 1e3, "ms"),
         Row("fuse_capacity_ratio", large / small, "x", "<= 1.25"),
     ]
     memory = steps[1].memory_analysis()
-    if memory is not None:  # not every backend can say
+    if memory is not None:  # None on some backends
         copied = num_bytes(init_cache(config, capacities[1])) - memory.alias_size_in_bytes
         rows.append(Row("fuse_cache_bytes_copied", copied, "B", "0"))
         rows.append(Row("fuse_work_memory", memory.temp_size_in_bytes, "B"))
@@ -84,13 +83,13 @@ def bench_capacity(config: StreamConfig, *, num_tokens: int, repeats: int) -> li
 
 
 def bench_oracle(config: StreamConfig, *, num_tokens: int, repeats: int) -> list[Row]:
-    """Tokens per second, and how many times the NumPy loop that is."""
+    """Tokens fused per second, and the ratio to the NumPy loop."""
     chunk = patch_tokens(config, num_tokens)
     stream = _Stream(compile_fuse(config, config.memory.capacity, chunk), init_cache(config), chunk)
     arrays = {field.name: np.asarray(getattr(chunk, field.name)) for field in dataclasses.fields(Tokens)}
     oracle = reference.fuse(reference.empty(config.memory.capacity), arrays, config)
-    # A stream does not wait a second between two chunks: what it fused last is still in the processor's caches.
-    *fast, slow = take_turns([*[stream] * 8, lambda: reference.fuse(oracle, arrays, config)], min(repeats, 3))
+    # Eight calls in a row: in a stream, the last chunk fused is still in the processor's caches.
+    *fast, slow = time_alternately([*[stream] * 8, lambda: reference.fuse(oracle, arrays, config)], min(repeats, 3))
     return [
         Row("fuse_tokens_per_second", num_tokens / min(fast), "1/s", ">= 400000"),
         Row("fuse_speedup_over_numpy_loop", slow / min(fast), "x", ">= 200"),
@@ -98,11 +97,11 @@ def bench_oracle(config: StreamConfig, *, num_tokens: int, repeats: int) -> list
 
 
 def bench_projection(config: StreamConfig, *, repeats: int, num_rows: int = 25_000) -> list[Row]:
-    """100,000 pivots into four views of 60 x 80 cells, and the same pivots in a larger cache."""
+    """Projecting 100,000 pivots into four views of 60 x 80 cells, from a small and a large cache."""
     camera = _cameras()
     step = jax.jit(lambda cache: project(cache, camera, config))
-    caches = [_room(config, capacity, num_rows) for capacity in (1 << 15, 1 << 18)]
-    small, large = take_turns([functools.partial(step, cache) for cache in caches], repeats)
+    caches = [_filled(config, capacity, num_rows) for capacity in (1 << 15, 1 << 18)]
+    small, large = time_alternately([functools.partial(step, cache) for cache in caches], repeats)
     return [
         Row("project_100k_pivots", small * 1e3, "ms", "<= 150"),
         Row("project_capacity_ratio", large / small, "x", "<= 1.25"),
@@ -110,17 +109,17 @@ def bench_projection(config: StreamConfig, *, repeats: int, num_rows: int = 25_0
 
 
 def bench_stream(config: StreamConfig, *, num_tokens: int = 1024, num_chunks: int = 2500) -> list[Row]:
-    """Fuse and projection over the same ground: a stream that has seen `num_chunks` against one that has seen ten.
+    """Fuse and projection of one repeated chunk, after `num_chunks` chunks against after ten.
 
-    Where its arrays happen to lie in memory speeds a stream up or slows it down by a tenth, so both go on from fresh
-    copies again and again, and the medians count.
+    The addresses of its arrays change a stream's speed by a tenth, so both ages are timed from many fresh copies, and
+    the medians count.
     """
     camera, chunk, traces = _cameras(), patch_tokens(config, num_tokens), []
 
     def step(cache, tokens):
         traces.append(1)
         seen = project(cache, camera, config)
-        # Tokens depend on the projection, as they do in the model, so that it is not optimized away.
+        # Tokens depend on the projection, as in the model, so that it is not optimized away.
         return fuse(cache, replace(tokens, valid=tokens.valid & jnp.isfinite(seen.feats).all()), config)
 
     program = jax.jit(step, donate_argnums=0)
@@ -136,8 +135,8 @@ def bench_stream(config: StreamConfig, *, num_tokens: int = 1024, num_chunks: in
     ]
 
 
-def patch_tokens(config: StreamConfig, num_tokens: int, num_voxels: int = PATCH) -> Tokens:
-    """Random tokens in a square patch of voxels, all good enough to enter."""
+def patch_tokens(config: StreamConfig, num_tokens: int, num_voxels: int = NUM_PATCH_VOXELS) -> Tokens:
+    """Random tokens in a rectangular patch of voxels, all confident enough to enter."""
     rng = np.random.default_rng(0)
     cells = rng.integers(0, num_voxels, num_tokens)
     corners = np.stack([cells % 64, cells // 64, np.zeros_like(cells)], axis=-1)
@@ -154,13 +153,13 @@ def patch_tokens(config: StreamConfig, num_tokens: int, num_voxels: int = PATCH)
 
 
 def compile_fuse(config: StreamConfig, capacity: int, chunk: Tokens) -> jax.stages.Compiled:
-    """The program of one fuse, cache donated."""
+    """The compiled fuse of `chunk`, cache donated."""
     cache = jax.eval_shape(lambda: init_cache(config, capacity))
     return jax.jit(lambda cache, tokens: fuse(cache, tokens, config), donate_argnums=0).lower(cache, chunk).compile()
 
 
-def take_turns(calls: Sequence[Callable[[], object]], repeats: int) -> list[float]:
-    """Least seconds of each call, taken in turns after two calls of warming up."""
+def time_alternately(calls: Sequence[Callable[[], object]], repeats: int) -> list[float]:
+    """Minimum seconds of each call, timed alternately after two rounds of warm-up."""
     seconds = [[_seconds(call) for call in calls] for _ in range(repeats + 2)][2:]
     return [min(column) for column in zip(*seconds, strict=True)]
 
@@ -171,16 +170,16 @@ def num_bytes(tree: object) -> int:
 
 
 def _medians_over_copies(program, caches: list[VoxelCache], chunk: Tokens, *, repeats: int = 30) -> list[float]:
-    """Median seconds of a step from each of `caches`, over copies of it; each copy's least of three, in turns."""
+    """Median seconds of a step from each of `caches`, over copies; for each copy, the minimum of three."""
     seconds = []
     for _ in range(repeats):
         streams = [_Stream(program, jax.tree.map(jnp.copy, cache), chunk) for cache in caches]
-        seconds.append(take_turns(streams, repeats=3))
+        seconds.append(time_alternately(streams, repeats=3))
     return [statistics.median(column) for column in zip(*seconds, strict=True)]
 
 
 class _Stream:
-    """Feeds one chunk again and again to a cache that is donated each time."""
+    """Feeds one chunk repeatedly to a cache that is donated each time."""
 
     def __init__(self, step: Callable[[VoxelCache, Tokens], VoxelCache], cache: VoxelCache, chunk: Tokens) -> None:
         self._step, self.cache, self._chunk = step, cache, chunk
@@ -212,7 +211,7 @@ def _occupied(config: StreamConfig, cache: VoxelCache, share: float) -> VoxelCac
     )
 
 
-def _room(config: StreamConfig, capacity: int, num_rows: int) -> VoxelCache:
+def _filled(config: StreamConfig, capacity: int, num_rows: int) -> VoxelCache:
     """A cache whose pivots fill the space in front of `_cameras`."""
     rng = np.random.default_rng(0)
     k, cache = config.memory.pivots_per_voxel, init_cache(config, capacity)
@@ -227,7 +226,7 @@ def _room(config: StreamConfig, capacity: int, num_rows: int) -> VoxelCache:
 
 
 def _cameras() -> Camera:
-    """Four views of 60 x 80 cells from the origin, a little apart."""
+    """Four views of 60 x 80 cells from the origin, 0.1 units from each other."""
     viewmats = np.tile(np.eye(4, dtype=np.float32), (4, 1, 1))
     viewmats[:, 0, 3] = [0.0, 0.1, 0.2, 0.3]
     K = np.array([[60.0, 0, 40.0], [0, 60.0, 30.0], [0, 0, 1]], np.float32)

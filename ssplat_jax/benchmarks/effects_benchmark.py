@@ -1,8 +1,8 @@
-"""What each effect costs and what it is worth: the table of docs/effects.md.
+"""Cost and value of each effect: the table of docs/effects.md, which gives the command.
 
 dB is the PSNR of the image without the effect against the image with it: low where the scene calls for it, high (or
-infinite) where it does not. FLOPs and bytes are XLA's count of the program before optimization, in which the body of
-the compositing loop counts once; `ms` is the median difference of the two programs run in turn.
+infinite) where it does not. FLOPs and bytes are XLA's count for the program before optimization, in which the body of
+the compositing loop counts once. `ms` is the median difference between the two programs, run alternately.
 """
 
 import dataclasses
@@ -35,7 +35,7 @@ def _bands(scale: float) -> Scene:
 
 
 def _zoomed(factor: float) -> Scene:
-    """Captured by a camera of `1 / factor` of the focal length."""
+    """A scene captured by a camera with `1 / factor` of the focal length."""
     gaussians, camera, _ = _plain(0.7)
     captured = replace(camera, Ks=camera.Ks / jnp.array([[factor], [factor], [1.0]]))
     return gaussians, camera, {"captured": captured}
@@ -53,7 +53,7 @@ BASE = Effects(sh_degree=0, antialias="none", outputs=("color",))
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """One effect: when a scene calls for it, the programs with and without it, and a scene of either kind."""
+    """One effect: when a scene calls for it, the effects with and without it, and a scene of either kind."""
 
     name: str
     when: str
@@ -61,8 +61,7 @@ class Row:
     calls: Callable[[], Scene]
     spares: Callable[[], Scene]
     off: Effects = BASE
-    arrays: tuple[str, ...] = ()
-    """Inputs that the program without the effect is not given."""
+    """Rendered without the scene's arrays."""
 
 
 ROWS = (
@@ -119,7 +118,6 @@ ROWS = (
         BASE,
         lambda: _plain(features=jnp.ones((NUM, 8))),
         lambda: _plain(features=jnp.ones((NUM, 8))),
-        arrays=("features",),
     ),
     Row("median depth", "asked for", BASE.replace(outputs=("color", "median_depth")), _plain, _plain),
 )
@@ -132,21 +130,20 @@ def _program(scene: Scene, effects: Effects, max_pairs: int):
     return lowered.cost_analysis() or {}, lambda: compiled(gaussians)
 
 
-def decibels(image, truth) -> float:
+def _decibels(image, truth) -> float:
     """PSNR of `image` against `truth`, peak 1; infinite where they are equal."""
     error = float(np.mean((np.asarray(image, np.float64) - np.asarray(truth, np.float64)) ** 2))
     return float("inf") if error == 0 else -10 * float(np.log10(error))
 
 
-def measure(row: Row) -> dict[str, Any]:
-    """The figures of one effect."""
+def _measure(row: Row) -> dict[str, Any]:
+    """The figures of one effect: costs where a scene calls for it, and dB of both kinds of scene."""
     figures: dict[str, Any] = {"name": row.name, "when": row.when}
     for kind, scene in (("calls", row.calls()), ("spares", row.spares())):
-        gaussians, camera, arrays = scene
-        without = gaussians, camera, {name: array for name, array in arrays.items() if name not in row.arrays}
-        pairs = ((scene, row.on), (without, row.off))
+        gaussians, camera, _ = scene
+        pairs = ((scene, row.on), ((gaussians, camera, {}), row.off))
         drawn_on, drawn_off = (render(g, c, effects=effects, **given) for (g, c, given), effects in pairs)
-        figures[f"dB_{kind}"] = decibels(drawn_off.color, drawn_on.color)
+        figures[f"dB_{kind}"] = _decibels(drawn_off.color, drawn_on.color)
         if kind == "calls":
             max_pairs = round_up(max(int(drawn_on.num_pairs), int(drawn_off.num_pairs)))
             (cost_on, on), (cost_off, off) = (_program(*pair, max_pairs) for pair in pairs)
@@ -164,7 +161,7 @@ def table() -> str:
         "|---|---|---|---|---|---|---|",
     ]
     for row in ROWS:
-        f = measure(row)
+        f = _measure(row)
         lines.append(
             f"| {f['name']} | {f['when']} | {f['flops']:.3g} | {f['bytes']:.3g} | {f['ms']:.1f} "
             f"| {f['dB_calls']:.1f} | {f['dB_spares']:.1f} |"

@@ -1,7 +1,7 @@
-"""Times the rasterizer against its arithmetic floor and, in the same run, against another rasterizer.
+"""Times of the rasterizer, against its arithmetic floor and, in the same run, against another rasterizer.
 
-Scenes are `num` Gaussians of about one pixel over an image, between depth 1 and 5. Every repetition times all
-candidates one after the other, so that a busy machine slows them alike: the ratios are what to read.
+Scenes are `num` Gaussians of about one pixel over an image, at depths from 1 to 5. Every repetition times all
+candidates one after the other, so that a busy machine slows all alike: read the ratios.
 
 Units: ms are medians over the repetitions, `bytes` are XLA's own temporary memory, `ratio` rows are medians of the
 repetitions' ratios.
@@ -23,25 +23,36 @@ from jaxtyping import Array, Float
 from ssplat_jax.errors import InputError
 from ssplat_jax.gaussians import SH_C0, Gaussians
 from ssplat_jax.geometry.cameras import Camera
-from ssplat_jax.rasterizer.binning import bin_rows
+from ssplat_jax.rasterizer import constants
+from ssplat_jax.rasterizer.binning import intersect_tiles
 from ssplat_jax.rasterizer.compositing import composite
 from ssplat_jax.rasterizer.depth_sorted_table import sorted_table
 from ssplat_jax.rasterizer.effects import Effects
 from ssplat_jax.rasterizer.outputs import splat_channels
-from ssplat_jax.rasterizer.render import TILE, Inputs, prepare, render, round_up
+from ssplat_jax.rasterizer.render import TILE, RenderInputs, prepare, render, round_up
 from ssplat_jax.rasterizer.tile_grid import Grid
 
-EFFECTS = Effects(antialias="classic")  # what the prototype does
+EFFECTS = Effects(antialias="classic")  # as in the prototype that it was first compared with
 SIZES = ((65_536, 256), (262_144, 512))  # Gaussians, side of the image
-SCALING = ((4_096, 128), (16_384, 128), (524_288, 724), (1_048_576, 1024))  # besides those
-GROWTH = (65_536, 256), (524_288, 724)  # the same density
+SCALING = ((4_096, 128), (16_384, 128), (524_288, 724), (1_048_576, 1024))  # added by --scaling
+GROWTH = (65_536, 256), (524_288, 724)  # of the same density
 FULL_HD = 1_048_576, 1920, 1080
 
 
 def scene(
     num: int, width: int, height: int | None = None, *, pixels: float = 1.0, seed: int = 0
 ) -> tuple[Gaussians, Camera]:
-    """`num` Gaussians with standard deviations of about `pixels`, all over an image, square if not told."""
+    """Random Gaussians all over an image.
+
+    Args:
+        num: number of Gaussians.
+        width, height: the image, square by default.
+        pixels: standard deviation on the screen, about.
+        seed: of the random numbers.
+
+    Returns:
+        The scene and its camera.
+    """
     height = width if height is None else height
     random = np.random.default_rng(seed)
     focal = 0.9 * width
@@ -63,20 +74,20 @@ def scene(
 
 @jax.jit
 def floor(table: Float[Array, "p 6"], x: Float[Array, " q"], y: Float[Array, " q"]):
-    """The unavoidable arithmetic: one opacity per pixel and pair. Written in half precision, to time no memory."""
+    """The unavoidable arithmetic: one alpha per pixel and pair, stored in half precision to spare memory traffic."""
     dx, dy = x - table[:, 0:1], y - table[:, 1:2]
     power = 0.5 * (table[:, 2:3] * dx * dx + table[:, 4:5] * dy * dy) + table[:, 3:4] * dx * dy
-    return jnp.minimum(0.99, table[:, 5:6] * jnp.exp(-power)).astype(jnp.bfloat16)
+    return jnp.minimum(constants.ALPHA_MAX, table[:, 5:6] * jnp.exp(-power)).astype(jnp.bfloat16)
 
 
 def alternate(candidates: dict[str, Callable[[], Any]], repetitions: int = 11) -> dict[str, Float[np.ndarray, " r"]]:
-    """Milliseconds of each candidate, run in turn; the first run of each (its compilation) is not counted."""
+    """Milliseconds of each candidate, run alternately; the first run of each (its compilation) is not counted."""
     times: dict[str, list[float]] = {name: [] for name in candidates}
-    for turn in range(repetitions + 1):
+    for repetition in range(repetitions + 1):
         for name, candidate in candidates.items():
             start = time.perf_counter()
             jax.block_until_ready(candidate())
-            if turn:
+            if repetition:
                 times[name].append(1e3 * (time.perf_counter() - start))
     return {name: np.array(t) for name, t in times.items()}
 
@@ -89,7 +100,7 @@ def _loss(gaussians: Gaussians, camera: Camera, max_pairs: int):
 def candidates(
     gaussians: Gaussians, camera: Camera, *, stages: bool
 ) -> tuple[dict[str, Callable[[], Any]], dict[str, float]]:
-    """What is timed on one scene, and facts about it (pairs, compile seconds, temporary bytes)."""
+    """The functions to time on one scene, and facts about it: pairs, compile seconds, temporary bytes."""
     pairs = int(render(gaussians, camera, effects=EFFECTS).num_pairs)
     max_pairs = round_up(pairs)
     start = time.perf_counter()
@@ -124,13 +135,13 @@ def _stages(gaussians: Gaussians, camera: Camera, max_pairs: int) -> dict[str, C
 
     @jax.jit
     def projected(gaussians):
-        usable, flat, splats, _ = prepare(Inputs(gaussians, camera), EFFECTS)
+        usable, flat, splats, _ = prepare(RenderInputs(gaussians, camera), EFFECTS)
         return splats, splat_channels(usable, splats, flat, EFFECTS, None)
 
     @jax.jit
     def binned(splats, channels):
         table, order = sorted_table(splats, channels, grid)
-        return table, bin_rows(table, jnp.zeros_like(order), grid, max_pairs)
+        return table, intersect_tiles(table, jnp.zeros_like(order), grid, max_pairs)
 
     grid = Grid(num_images=1, height=camera.height, width=camera.width, tile=TILE)
     composited = jax.jit(lambda table, pairs: composite(grid, True, table, pairs))
@@ -144,15 +155,15 @@ def _stages(gaussians: Gaussians, camera: Camera, max_pairs: int) -> dict[str, C
 
 
 def load_rasterizer(path: Path) -> ModuleType:
-    """Another rasterizer's Python file, of one of two kinds.
+    """Another rasterizer, as a Python module of one of two kinds.
 
-    With `candidates(means, quats, scales, opacities, colors, viewmat, K, width, height)`: it draws our scene, given as
-    NumPy arrays, in the functions that this gives back, `forward` and perhaps `forward_backward`, which wait until it
-    is drawn. With `scene(num, size)` and `render`, as the prototype has them: a forward pass in JAX on its own scene of
-    the same statistics, in square images.
+    Either it has `candidates(means, quats, scales, opacities, colors, viewmat, K, width, height)`, which takes our
+    scene as NumPy arrays and returns functions that render it and wait, `forward` and optionally `forward_backward`.
+    Or it has `scene(num, size)` and `render`: a forward pass in JAX on its own scene of the same statistics, in square
+    images.
 
     Raises:
-        InputError: `path` is not a file, or imports what is not installed.
+        InputError: `path` is not a file, or imports a package that is not installed.
     """
     spec = importlib.util.spec_from_file_location("against", path)
     if spec is None or spec.loader is None or not path.is_file():
@@ -163,12 +174,12 @@ def load_rasterizer(path: Path) -> ModuleType:
     try:
         spec.loader.exec_module(module)
     except ImportError as error:
-        raise InputError(f"bench render: {path} needs what is not installed: {error}.") from error
+        raise InputError(f"bench render: {path} needs a package that is not installed: {error}; install it.") from error
     return module
 
 
 def _against(module: ModuleType, gaussians: Gaussians, camera: Camera, pairs: int) -> dict[str, Callable[[], Any]]:
-    """What is timed of a `load_rasterizer`."""
+    """The functions of another rasterizer to time."""
     if hasattr(module, "candidates"):
         arrays = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)
         colors = gaussians.sh[:, 0] * SH_C0 + 0.5
@@ -179,13 +190,23 @@ def _against(module: ModuleType, gaussians: Gaussians, camera: Camera, pairs: in
     arrays = [jnp.asarray(arrays[name]) for name in ("means", "scales", "quats", "opacities", "colors")]
     draw = functools.partial(module.render, *arrays, focal, H=camera.height, W=camera.width)
     own_pairs = int(draw(max_pairs=2 * round_up(pairs))[1])
-    return {"against_forward": lambda: draw(max_pairs=round_up(own_pairs))}  # room by the same rule as ours
+    return {"against_forward": lambda: draw(max_pairs=round_up(own_pairs))}  # capacity by our rule
 
 
 def rows_of(
     num: int, width: int, height: int | None = None, *, against: ModuleType | None = None, stages: bool = True
 ) -> list[dict[str, Any]]:
-    """The rows of one scene."""
+    """The rows of one scene.
+
+    Args:
+        num: number of Gaussians.
+        width, height: the image, square by default.
+        against: another rasterizer, from `load_rasterizer`.
+        stages: whether each stage is timed too.
+
+    Returns:
+        Rows of name, value and unit.
+    """
     gaussians, camera = scene(num, width, height)
     runs, facts = candidates(gaussians, camera, stages=stages)
     others = {} if against is None else _against(against, gaussians, camera, int(facts["pairs"]))
@@ -209,7 +230,7 @@ def rows_of(
 
 
 def growth_row() -> dict[str, Any]:
-    """One forward pass at the larger size of `GROWTH` over as many Gaussians in passes at the smaller, run in turn."""
+    """Time of a forward pass at the larger size of `GROWTH` over that of as many Gaussians at the smaller size."""
     (few, side), (many, large_side) = GROWTH
     small, large = (candidates(*scene(*size), stages=False)[0]["forward"] for size in GROWTH)
     passes = many // few
@@ -223,11 +244,14 @@ def bench_render(against: Path | None = None, *, scaling: bool = False, full_hd:
 
     Args:
         against: a file for `load_rasterizer`, timed in the same run.
-        scaling: also 4k to 1M Gaussians, without stages, and the growth from 64k to 512k.
-        full_hd: also 1M Gaussians at 1920 x 1080.
+        scaling: whether to add 4k to 1M Gaussians, without stages, and the growth from 64k to 512k.
+        full_hd: whether to add 1M Gaussians at 1920 x 1080.
+
+    Returns:
+        The rows.
 
     Raises:
-        InputError: `against` is not a file, misses a package, or cannot draw what is asked.
+        InputError: `against` is not a file, misses a package, or cannot render these sizes.
     """
     other = None if against is None else load_rasterizer(against)
     if full_hd and other is not None and not hasattr(other, "candidates"):

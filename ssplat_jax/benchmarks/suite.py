@@ -21,49 +21,56 @@ from ssplat_jax.errors import InputError
 from ssplat_jax.streaming.session import Session, tokens_per_chunk
 from ssplat_jax.streaming.streamsplat import StreamSplat
 
-ROUND = 40  # frames of the walk that a benchmark's stream repeats
+NUM_FRAMES = 40
+"""Frames of the walk that a benchmark's stream repeats."""
 
 
 def run_benchmark(
     name: str, *, against: Path | None = None, scaling: bool = False, full_hd: bool = False
 ) -> dict[str, Any]:
-    """Runs the benchmark `render` or `stream`.
+    """The figures of a benchmark.
 
     Args:
-        name: which.
-        against, scaling, full_hd: `render` only: as `bench_render` has them.
+        name: `render` or `stream`.
+        against, scaling, full_hd: for `render`; see `bench_render`.
+
+    Returns:
+        The machine, and rows of name, value and unit.
 
     Raises:
-        InputError: no such benchmark, or `against` is no file that could be timed.
+        InputError: `name` is no benchmark, or the file `against` cannot be timed.
     """
     if name == "render":
         rows = bench_render(against, scaling=scaling, full_hd=full_hd)
     elif name == "stream":
         rows = [dataclasses.asdict(row) for row in (*bench_cache(preset("tiny")), *bench_step())]
     else:
-        raise InputError(f"bench: wanted render or stream, got {name!r}.")
+        raise InputError(f"bench: wanted render or stream, got {name!r}; choose one of them.")
     device = jax.devices()[0]
     machine = f"{platform.machine()} {device.platform} {device.device_kind}, jax {jax.__version__}"
     return {"machine": machine, "rows": rows}
 
 
 def bench_step(*, num_chunks: int = 2500, late_size: tuple[int, int] = (64, 48), repeats: int = 15) -> list[Row]:
-    """The whole step with the shipped weights: tokens a second at 320 x 240, and what a stream's age changes.
+    """The whole step with the shipped weights: speed at 320 x 240, and how it depends on the stream's age.
 
-    The stream goes round the same room again and again. For its age, a smaller image does: what could grow with it is
-    the cache's part of a step. Both ages go on from copies of their caches in turns; medians over turns count.
+    The stream repeats one walk through a room. Its age is measured with smaller images, since only the cache's part of
+    a step could grow. Steps from copies of the early and the late cache are timed alternately.
 
     Args:
-        num_chunks: the late age; the early one is ten.
-        late_size: width and height of the images of the stream that grows old.
-        repeats: turns.
+        num_chunks: chunks before the late age; the early one is ten.
+        late_size: width and height of the images whose stream grows old.
+        repeats: timings of each age, of which the median counts.
+
+    Returns:
+        One row for each figure.
     """
-    session, chunks = _round((320, 240))
+    session, chunks = _session_and_chunks((320, 240))
     seconds = [_seconds(session, chunk) for chunk in chunks]
     step = statistics.median(seconds[1:])  # the first has compiled
     num_tokens = tokens_per_chunk(chunks[0], session.model.config.network.size_multiple)
 
-    session, chunks = _round(late_size)
+    session, chunks = _session_and_chunks(late_size)
     caches, memory = [], []
     for number, chunk in enumerate(itertools.islice(itertools.cycle(chunks), num_chunks), 1):
         session.feed(chunk)
@@ -86,11 +93,11 @@ def bench_step(*, num_chunks: int = 2500, late_size: tuple[int, int] = (64, 48),
     ]
 
 
-def _round(size: tuple[int, int]) -> tuple[Session, list[Chunk]]:
-    """A session of a cache that keeps its size, and the chunks of one walk through a room."""
+def _session_and_chunks(size: tuple[int, int]) -> tuple[Session, list[Chunk]]:
+    """A session whose cache keeps its capacity, and the chunks of one walk through a room."""
     model = StreamSplat(preset("tiny").replace(overflow="drop_new"))
-    capture = open_capture(f"procedural:room?frames={ROUND}", size=size)
-    indices = tuple(range(ROUND))
+    capture = open_capture(f"procedural:room?frames={NUM_FRAMES}", size=size)
+    indices = tuple(range(NUM_FRAMES))
     frame = capture.stream_frame(model.config, indices)
     return Session(model, load_params("tiny")), list(capture.chunks(model.config, indices, frame=frame))
 

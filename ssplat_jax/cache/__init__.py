@@ -1,29 +1,27 @@
-"""VACC, the Voxel-Aligned Causal Cache: the stream's only memory. `fuse` writes, `project` reads, `carve` doubts."""
+"""VACC, the Voxel-Aligned Causal Cache (Sec. 3.4): `fuse` writes tokens, `project` reads views, `carve` revises."""
 
-from ssplat_jax.cache.capacity import check_cache, ensure_room, grow
-from ssplat_jax.cache.carve import SAME_SURFACE, bear_witness, carve, judge
-from ssplat_jax.cache.fuse import Touched, fuse, fuse_touched
-from ssplat_jax.cache.project import ProjectedCache, coarser, project
+from ssplat_jax.cache.capacity import check_cache, ensure_capacity, grow
+from ssplat_jax.cache.carve import SAME_SURFACE_MARGIN, carve, judge, store_witness
+from ssplat_jax.cache.fuse import fuse
+from ssplat_jax.cache.project import ProjectedCache, coarsen, project
 from ssplat_jax.cache.state import PIVOT_FIELDS, CacheStats, Tokens, VoxelCache, Witnesses, init_cache
 
 __all__ = [
     "PIVOT_FIELDS",
-    "SAME_SURFACE",
+    "SAME_SURFACE_MARGIN",
     "CacheStats",
     "ProjectedCache",
     "Tokens",
-    "Touched",
     "VoxelCache",
     "Witnesses",
-    "bear_witness",
     "carve",
     "check_cache",
-    "coarser",
-    "ensure_room",
+    "coarsen",
+    "ensure_capacity",
     "fuse",
-    "fuse_touched",
     "grow",
     "init_cache",
     "judge",
     "project",
+    "store_witness",
 ]

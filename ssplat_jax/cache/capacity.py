@@ -1,13 +1,13 @@
-"""What happens when the cache is full.
+"""Overflow policies: what happens when the cache is full (`config.memory.overflow`).
 
-    grow          the host doubles the capacity before a step that might not fit (`ensure_room`)
-    drop_new      tokens of new voxels are left out and counted
-    evict_lowest  the voxels of least confidence make way, those seen longest ago first among equals
+    grow          the host doubles the capacity before a step that might not fit (`ensure_capacity`)
+    drop_new      tokens that open a new voxel are dropped and counted
+    evict_lowest  the voxels of lowest confidence are evicted; among equals, those written longest ago
     error         as drop_new; `check_cache` raises
 
-Inside jit nothing raises: what was lost is a number in `cache.stats`, and `check_cache` reads it on the host:
+Nothing raises inside jit: losses are counted in `cache.stats`, and `check_cache` reads the counters on the host:
 
-    cache = ensure_room(cache, config, num_new_tokens)
+    cache = ensure_capacity(cache, config, num_new_tokens)
     cache, out = step(params, cache, chunk)
     check_cache(cache, config)
 """
@@ -24,21 +24,31 @@ from ssplat_jax.errors import CacheError, InputError
 from ssplat_jax.pytree import replace
 
 
-def ensure_room(cache: VoxelCache, config: StreamConfig, num_new_tokens: int) -> VoxelCache:
+def ensure_capacity(cache: VoxelCache, config: StreamConfig, num_new_tokens: int) -> VoxelCache:
     """`cache`, doubled as often as needed to hold `num_new_tokens` more even if each opens a new voxel.
 
-    Outside jit, and only for `overflow="grow"`; otherwise `cache` itself. Rows keep their numbers, so the stream goes
-    on exactly as if the cache had had this capacity from the start. A new capacity compiles the step anew, which
-    doubling keeps to log2 of the final size.
+    Call it outside jit. Only `overflow="grow"` changes the cache. Rows keep their numbers, so the stream continues
+    exactly as if the cache had had the new capacity from the start. The step is compiled again for a new capacity;
+    doubling limits the number of compilations to log2 of the final size.
     """
     if config.memory.overflow != "grow":
         return cache
-    capacity = roomy_capacity(cache.capacity, int(cache.num_voxels), num_new_tokens, config)
+    capacity = required_capacity(cache.capacity, int(cache.num_voxels), num_new_tokens, config)
     return cache if capacity == cache.capacity else grow(cache, capacity)
 
 
-def roomy_capacity(capacity: int, num_voxels: int, num_new_tokens: int, config: StreamConfig) -> int:
-    """`capacity`, doubled as often as needed for `num_new_tokens` that all open voxels beside the `num_voxels` held."""
+def required_capacity(capacity: int, num_voxels: int, num_new_tokens: int, config: StreamConfig) -> int:
+    """The capacity, doubled as often as needed, that holds all new tokens in the worst case.
+
+    Args:
+        capacity: present number of rows.
+        num_voxels: rows that are occupied.
+        num_new_tokens: tokens to come; in the worst case each opens a new voxel.
+        config: `vacc` decides how many rows the new tokens can fill.
+
+    Returns:
+        `capacity` times a power of two.
+    """
     new_rows = num_new_tokens if config.memory.vacc == "voxel" else -(-num_new_tokens // config.memory.pivots_per_voxel)
     while capacity < num_voxels + new_rows:
         capacity *= 2
@@ -46,10 +56,10 @@ def roomy_capacity(capacity: int, num_voxels: int, num_new_tokens: int, config: 
 
 
 def grow(cache: VoxelCache, capacity: int) -> VoxelCache:
-    """`cache` with room for `capacity` voxels, a power of two.
+    """`cache` enlarged to `capacity` voxels, a power of two.
 
     Raises:
-        InputError: fewer than now, or no power of two.
+        InputError: `capacity` is below the present one or no power of two.
     """
     extra = capacity - cache.capacity
     if extra < 0 or capacity & (capacity - 1):
@@ -59,34 +69,34 @@ def grow(cache: VoxelCache, capacity: int) -> VoxelCache:
         for name in ("voxels", "counts", *PIVOT_FIELDS)
         for x in (getattr(cache, name),)
     }
-    # Rows that no table leads to (vacc="append") have no voxels of their own to be entered by.
+    # With vacc="append" the table is empty: rows have no voxel of their own to be entered by.
     num_entered = jnp.where(jnp.any(cache.table >= 0), cache.num_voxels, 0)
     return replace(cache, table=jax.jit(build_table)(fields["voxels"], num_entered), **fields)
 
 
 def check_cache(cache: VoxelCache, config: StreamConfig) -> None:
-    """Raises if the cache lost something that its policy promises to keep; call it outside jit.
+    """Raises if the cache lost tokens that its overflow policy promises to keep. Call it outside jit.
 
     Raises:
-        CacheError: tokens were dropped for want of room under `overflow` "grow" or "error".
+        CacheError: tokens were dropped under `overflow` "grow" or "error".
     """
     check_dropped(int(np.asarray(cache.stats.num_dropped)), cache.capacity, config)
 
 
 def check_dropped(num_dropped: int, capacity: int, config: StreamConfig) -> None:
-    """Raises if `num_dropped` tokens found no room in `capacity` voxels and the policy does not allow that.
+    """Raises if `num_dropped` tokens did not fit in `capacity` voxels and the policy does not allow that.
 
     Raises:
         CacheError: as `check_cache`.
     """
     if num_dropped and config.memory.overflow == "grow":
         raise CacheError(
-            f"cache: {num_dropped} tokens found no room in {capacity} voxels; "
-            "call cache.ensure_room(cache, config, num_new_tokens) before each step."
+            f"cache: wanted to keep every token, but {num_dropped} did not fit in {capacity} voxels; "
+            "call cache.ensure_capacity(cache, config, num_new_tokens) before each step."
         )
     if num_dropped and config.memory.overflow == "error":
         raise CacheError(
-            f"cache: {num_dropped} tokens found no room in {capacity} voxels; raise capacity to "
+            f"cache: wanted to keep every token, but {num_dropped} did not fit in {capacity} voxels; raise capacity to "
             f"{2 * capacity} or voxel_size above {config.memory.voxel_size}, or choose overflow='grow'."
         )
 
@@ -96,9 +106,12 @@ def evict(
 ) -> tuple[VoxelCache, Int[Array, " m"], Int[Array, ""]]:
     """Empties `num_needed` rows, or as many as there are beside `touched_rows` (-1: none).
 
-    First go the voxels whose best pivot has the lowest confidence; among equals the one written longest ago, then the
-    lowest row. Returns the cache with those rows zeroed but their table entries left, the rows (-1 after the last) and
-    the number of pivots lost. Ranking the voxels costs a sort of the capacity, in the steps that overflow only.
+    Voxels go in order of the confidence of their best pivot, lowest first; among equals the one written longest ago
+    goes first, then the lowest row. The ranking sorts the whole capacity, in the steps that overflow only.
+
+    Returns:
+        The cache with those rows zeroed but their table entries left in place, the evicted rows (-1 after the last),
+        and the number of pivots lost.
     """
     m, capacity = touched_rows.shape[0], cache.capacity
 

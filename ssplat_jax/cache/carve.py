@@ -1,19 +1,18 @@
-"""Views judge what others claim: free space is carved, seen surfaces are confirmed (ours, not VACC's).
+"""Free-space carving: views lower the confidence of pivots they see through and raise that of surfaces they see.
 
-A confidence is taken as the probability that a surface is there. Every trusted cell that a pivot or a token falls on is
-a witness, with the cell's own confidence w as its weight:
+This is an addition to the paper's VACC. A confidence is read as the probability that a surface is there. Every trusted
+cell that a pivot or a token projects to is a witness, weighted by the cell's own confidence w:
 
-    sees past it    log depth before the cell's nearest surface by more than ln(1.02): odds / e^2w
-    sees it         log depth within ln(1.1) of the cell's surface: odds x e^0.5w
-    hidden, unseen  anything else: unchanged
+    sees through it    log depth before the cell's nearest surface by more than ln(1.02): odds / e^2w
+    sees it            log depth within ln(1.1) of the cell's surface: odds x e^0.5w
+    hidden or unseen   anything else: unchanged
 
-Contradiction counts more than agreement: a wrong depth agrees by chance with its neighbors, but what was looked
-through is not there. One witness moves a sure pivot little, several sink it below tau, where `decode` leaves it out; it
-stays in the cache and can recover.
+Contradiction weighs more than agreement: a wrong depth may agree with its neighbors by chance, but nothing stands where
+a view looked through. One witness changes a confident pivot little; several take it below tau, where `decode` omits it.
+It stays in the cache and can recover.
 
-The views of a chunk judge all pivots (`carve`). One of them is kept coarsely (`bear_witness`) and judges the tokens of
-later chunks before they enter (`judge`): earlier views looked through what the last chunk claims. docs/decisions.md has
-what this is worth.
+The views of a chunk revise all pivots (`carve`). A coarse copy of one of them is kept (`store_witness`) and revises the
+tokens of later chunks before they enter the cache (`judge`). docs/decisions.md reports the measured gain.
 """
 
 import math
@@ -23,17 +22,24 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ssplat_jax.cache.project import PixelPairs, blocks_of_rows, pairs_of_points, pairs_of_rows
+from ssplat_jax.cache.project import PixelPairs, project_points, project_rows, row_blocks
 from ssplat_jax.cache.state import Tokens, VoxelCache, Witnesses
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.numerics import safe_log
 from ssplat_jax.pytree import replace
 
-CONTRADICTION, AGREEMENT = 2.0, 0.5  # log odds of a witness of confidence 1
-FREE_SPACE = math.log(1.02)  # what is nearer than a surface by this much is before it
-SAME_SURFACE = math.log(1.1)
-LOWEST, HIGHEST = 0.02, 0.95  # what judged confidences stay within: no belief is beyond revision
+CONTRADICTION_LOG_ODDS, AGREEMENT_LOG_ODDS = 2.0, 0.5
+"""Log odds that a witness of confidence 1 takes away or adds."""
+
+FREE_SPACE_MARGIN = math.log(1.02)
+"""A point nearer than a surface by more than this, in log depth, lies in the free space before it."""
+
+SAME_SURFACE_MARGIN = math.log(1.1)
+"""Two log depths at most this far apart belong to one surface."""
+
+MIN_REVISED, MAX_REVISED = 0.02, 0.95
+"""Bounds of revised confidences: inside them a later witness can still change a confidence either way."""
 
 
 def carve(
@@ -43,68 +49,81 @@ def carve(
     confidences: Float[Array, "v hf wf"],
     config: StreamConfig,
 ) -> VoxelCache:
-    """`cache` with the confidences that its pivots deserve after views of `camera` saw `depths`.
+    """`cache` with the confidences of its pivots revised by the views of one chunk.
 
     Args:
-        cache: what is judged.
-        camera: a batch of views at grid resolution.
-        depths: camera z of what each cell sees.
-        confidences: of those depths; cells below `min_confidence`, or of 0, are no witnesses.
-        config: `carving=False` returns the cache as it is.
+        cache: the cache after the chunk was fused.
+        camera: the chunk's views at grid resolution.
+        depths: camera z of each cell, stream units.
+        confidences: confidence of each depth; cells of 0 or below `min_confidence` are no witnesses.
+        config: with `carving=False` the cache is returned unchanged.
+
+    Returns:
+        The cache; only `confidences` differs.
 
     Limits:
-        Depths that are not finite or not positive are no witnesses. Pivots that no witness sees keep their confidence
-        to the last bit; the others' stays in [0.02, 0.95].
+        Depths that are not finite or not positive are no witnesses. Pivots without a witness keep their confidence to
+        the last bit; all others end in [0.02, 0.95].
     """
     if not config.memory.carving:
         return cache
     is_witness = _is_witness(depths, confidences, config)
     log_depths = safe_log(jnp.where(is_witness, depths, 1.0))
-    # A cell beside an untrusted one cannot say that space is free: an edge may run between them.
-    nearest = _nearest_around(jnp.where(is_witness, log_depths, -jnp.inf))
+    # A cell beside an untrusted one cannot declare space free: a depth edge may run between them.
+    nearest = _min_of_neighbors(jnp.where(is_witness, log_depths, -jnp.inf))
     weights = jnp.where(is_witness, confidences, 0.0)
     flat = (weights.reshape(-1), log_depths.reshape(-1), nearest.reshape(-1))
-    num_rows, num_blocks = blocks_of_rows(cache)
+    num_rows, num_blocks = row_blocks(cache)
 
     def judge_block(i, revised):
         block = jax.lax.dynamic_slice_in_dim(revised, i * num_rows, num_rows)
-        pairs = pairs_of_rows(replace(cache, confidences=revised), camera, i * num_rows, num_rows)
+        pairs = project_rows(replace(cache, confidences=revised), camera, i * num_rows, num_rows)
         evidence = _evidence(pairs, *flat).reshape(len(camera.viewmats), *block.shape).sum(axis=0)
-        return jax.lax.dynamic_update_slice_in_dim(revised, _revised(block, evidence), i * num_rows, axis=0)
+        return jax.lax.dynamic_update_slice_in_dim(revised, _revise(block, evidence), i * num_rows, axis=0)
 
     return replace(cache, confidences=jax.lax.fori_loop(0, num_blocks, judge_block, cache.confidences))
 
 
 def judge(witnesses: Witnesses, tokens: Tokens, config: StreamConfig) -> Tokens:
-    """`tokens` with the confidences that they deserve after what earlier chunks saw.
+    """`tokens` with their confidences revised by the stored views of earlier chunks.
 
     Limits:
-        Tokens below `min_confidence`, invalid or not finite, and those that no witness sees, keep their confidence to
-        the last bit; the others' stays in [0.02, 0.95].
+        Tokens that are invalid, not finite, below `min_confidence` or without a witness keep their confidence to the
+        last bit; all others end in [0.02, 0.95].
     """
     if not witnesses.weights.shape[0]:
         return tokens
     side = witnesses.weights.shape[-1]
     camera = Camera(viewmats=witnesses.viewmats, Ks=witnesses.Ks, width=side, height=side)
     is_judged = tokens.valid & (tokens.confidences >= config.memory.min_confidence)
-    pairs = pairs_of_points(tokens.means, jnp.where(is_judged, tokens.confidences, 0.0), camera)
+    pairs = project_points(tokens.means, jnp.where(is_judged, tokens.confidences, 0.0), camera)
     log_depths = witnesses.log_depths.reshape(-1)
     evidence = _evidence(pairs, witnesses.weights.reshape(-1), log_depths, log_depths)
     evidence = evidence.reshape(len(witnesses.viewmats), -1).sum(axis=0)
-    return replace(tokens, confidences=_revised(tokens.confidences, evidence))
+    return replace(tokens, confidences=_revise(tokens.confidences, evidence))
 
 
-def bear_witness(
+def store_witness(
     cache: VoxelCache,
     camera: Camera,
     depths: Float[Array, "v hf wf"],
     confidences: Float[Array, "v hf wf"],
     config: StreamConfig,
 ) -> VoxelCache:
-    """`cache` with the view of the chunk just fused that has the most witnesses among its cells (first of equals).
+    """`cache` with a coarse copy of the chunk's view that has the most trusted cells (the first of equals).
+
+    Args:
+        cache: the cache after the chunk was fused.
+        camera: the chunk's views at grid resolution.
+        depths: camera z of each cell, stream units.
+        confidences: confidence of each depth.
+        config: decides which cells are trusted, as in `carve`.
+
+    Returns:
+        The cache; only `witnesses` differs.
 
     Limits:
-        A chunk without a trusted cell, padding for one, is not kept, and displaces nothing.
+        A chunk without a trusted cell, such as padding, is not stored and displaces no other.
     """
     capacity, side = cache.witnesses.weights.shape[:2]
     if not capacity:
@@ -112,8 +131,8 @@ def bear_witness(
     is_witness = _is_witness(depths, confidences, config)
     view = jnp.argmax(is_witness.sum(axis=(1, 2)))
     seen = is_witness[view]
-    log_depths = _least_of_parts(jnp.where(seen, safe_log(jnp.where(seen, depths[view], 1.0)), -jnp.inf), side)
-    weights = _least_of_parts(jnp.where(seen, confidences[view], 0.0), side)
+    log_depths = _min_per_part(jnp.where(seen, safe_log(jnp.where(seen, depths[view], 1.0)), -jnp.inf), side)
+    weights = _min_per_part(jnp.where(seen, confidences[view], 0.0), side)
     shrink = jnp.array([side / camera.width, side / camera.height, 1.0], camera.Ks.dtype)[:, None]
     entry = Witnesses(
         viewmats=camera.viewmats[view][None],
@@ -130,35 +149,35 @@ def _is_witness(depths, confidences, config: StreamConfig) -> Bool[Array, "v hf 
     return (confidences >= config.memory.min_confidence) & (confidences > 0) & jnp.isfinite(depths) & (depths > 0)
 
 
-def _nearest_around(log_depths: Float[Array, "v hf wf"]) -> Float[Array, "v hf wf"]:
-    """Least of the 3 x 3 cells around each."""
+def _min_of_neighbors(log_depths: Float[Array, "v hf wf"]) -> Float[Array, "v hf wf"]:
+    """Minimum over the 3 x 3 cells around each cell."""
     return jax.lax.reduce_window(log_depths, jnp.inf, jax.lax.min, (1, 3, 3), (1, 1, 1), "SAME")
 
 
-def _least_of_parts(values: Float[Array, "hf wf"], side: int) -> Float[Array, "side side"]:
-    """Least of the cells that each of `side` x `side` equal parts of the view touches."""
+def _min_per_part(values: Float[Array, "hf wf"], side: int) -> Float[Array, "side side"]:
+    """Minimum over the cells that each of `side` x `side` equal parts of the view touches."""
     for axis in (0, 1):
         values = jnp.take(values, _cells_of_parts(values.shape[axis], side), axis=axis).min(axis=axis + 1)
     return values
 
 
 def _cells_of_parts(num_cells: int, side: int) -> Int[np.ndarray, "side n"]:
-    """The cells that each of `side` equal parts of a line touches; short parts name their last cell again."""
+    """Indices of the cells that each of `side` equal parts of a line touches; short parts repeat their last cell."""
     parts = np.arange(side)
     first, last = parts * num_cells // side, -(-(parts + 1) * num_cells // side) - 1
     return np.minimum(first[:, None] + np.arange((last - first).max() + 1), last[:, None])
 
 
 def _evidence(pairs: PixelPairs, weights, log_depths, nearest) -> Float[Array, " p"]:
-    """Log odds that each pair of view and point adds to the point."""
+    """Log odds that each pair of view and point adds to the point's confidence."""
     read = lambda x: x.at[pairs.pixels].get(mode="fill", fill_value=0.0)  # noqa: E731
-    is_past = pairs.log_depths < read(nearest) - FREE_SPACE
-    is_there = jnp.abs(pairs.log_depths - read(log_depths)) <= SAME_SURFACE
-    return read(weights) * jnp.where(is_past, -CONTRADICTION, jnp.where(is_there, AGREEMENT, 0.0))
+    is_free = pairs.log_depths < read(nearest) - FREE_SPACE_MARGIN
+    is_seen = jnp.abs(pairs.log_depths - read(log_depths)) <= SAME_SURFACE_MARGIN
+    return read(weights) * jnp.where(is_free, -CONTRADICTION_LOG_ODDS, jnp.where(is_seen, AGREEMENT_LOG_ODDS, 0.0))
 
 
-def _revised(confidences, evidence):
-    """Confidences after evidence in log odds; those without any are left as they are."""
-    known = jnp.clip(confidences, LOWEST, HIGHEST)
+def _revise(confidences, evidence):
+    """Confidences after evidence in log odds; unchanged where there is no evidence."""
+    known = jnp.clip(confidences, MIN_REVISED, MAX_REVISED)
     judged = jax.nn.sigmoid(safe_log(known) - safe_log(1 - known) + evidence)
-    return jnp.where(evidence != 0, jnp.clip(judged, LOWEST, HIGHEST), confidences)
+    return jnp.where(evidence != 0, jnp.clip(judged, MIN_REVISED, MAX_REVISED), confidences)

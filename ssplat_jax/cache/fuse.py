@@ -1,15 +1,15 @@
-"""VACC's write: tokens into voxels (Sec. 3.4, Eq. vacc_capacity_update, vacc_pair_selection_and_merge).
+"""VACC's write: fuses tokens into voxels (Sec. 3.4, Eq. vacc_capacity_update, vacc_pair_selection_and_merge).
 
-The result is that of inserting the tokens one after another; `reference.fuse` is that loop. Voxels do not depend on
-each other, so here all of them advance together:
+The result equals inserting the tokens one after another, which is how `numpy_reference.fuse` does it. Voxels do not
+depend on each other, so all of them advance in parallel:
 
     tokens ─ classify ─ group by voxel ─ rows (found, or new in order of first token)
                                            │
               rank in voxel + count < K ───┤── append: all at once, one scatter
                                            └── merge: round r takes the r-th merging token of every voxel that has one
 
-Voxels are ordered by how many tokens they have to merge, so a round is a prefix of them and the work shrinks with the
-rounds. Nothing here grows with the capacity or with what the cache holds. Buffers are written in place when donated.
+Voxels are sorted by the number of tokens they have to merge, so each round works on a prefix of them, and the prefixes
+shrink. Neither time nor working memory grows with the capacity or the occupancy. Donated buffers are updated in place.
 """
 
 import itertools
@@ -22,71 +22,63 @@ from jaxtyping import Array, Bool, Int
 
 from ssplat_jax.cache.capacity import evict
 from ssplat_jax.cache.hash_table import build_table, find_rows, group_equal, insert_rows, shards_of
-from ssplat_jax.cache.state import PIVOT_FIELDS, CacheStats, Tokens, VoxelCache, add_to
+from ssplat_jax.cache.state import PIVOT_FIELDS, CacheStats, Tokens, VoxelCache, saturating_add
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.geometry.voxels import voxel_indices
 from ssplat_jax.pytree import pytree, replace
 
 MERGE_BLOCKS = ((512, 64), (16, 1))
-"""(voxels merged at a time, fewest voxels left in a round for which that pays)."""
+"""Pairs (voxels merged at a time, least number of voxels in a round for which that block size pays)."""
 
 SAME_DIRECTION = 1.0 - 1e-6
-"""Signed squared cosines above this are ties: the frame given twice must not let rounding choose the pair."""
-
-
-@pytree
-class Touched:
-    """The rows that a call wrote, each once; padded with -1."""
-
-    rows: Int[Array, " m"]
-    num_rows: Int[Array, ""]
+"""Signed squared cosines above this are ties: if a frame is given twice, rounding must not choose the pair."""
 
 
 @pytree
 class Plan:
-    """Where every token goes."""
+    """The place of every token."""
 
-    rows: Int[Array, " m"]  # -1 where it has none
-    slots: Int[Array, " m"]  # tokens that its row will have been given before it; from K on it merges
-    leaders: Int[Array, " m"]  # the first token of the same row
-    order: Int[Array, " m"]  # tokens row by row, in a row by arrival
-
-    @property
-    def is_first(self) -> Bool[Array, " m"]:
-        """Which tokens are the first of their row."""
-        return (self.rows >= 0) & (self.leaders == jnp.arange(self.rows.shape[0]))
+    rows: Int[Array, " m"]  # -1 for tokens left out
+    slots: Int[Array, " m"]  # pivots and tokens that precede it in its row; from K on it merges
+    leaders: Int[Array, " m"]  # the first token of the same row; used for merging only
+    order: Int[Array, " m"]  # tokens sorted by row, in order of arrival within a row; used for merging only
 
 
 def fuse(cache: VoxelCache, tokens: Tokens, config: StreamConfig, *, axis: str | None = None) -> VoxelCache:
-    """`cache` after inserting `tokens` in order; see `fuse_touched`.
+    """`cache` after inserting `tokens` in order.
 
-    Given the name of a mapped `axis`, `cache` is one shard of several, each of which is given all tokens and takes
-    those of its own voxels (`shards_of`). A voxel lies in one shard whole, so its pivots are those of a single cache.
-    The shards' counters add up to those of a single cache, but for `num_chunks`, which all of them count.
+    A voxel with a free slot stores the token as a new pivot. A full voxel merges the closest pair among its pivots and
+    the token: the merged pivot keeps the lower slot and, if both were old pivots, the token takes the freed one. Tokens
+    that are not finite, below `min_confidence`, out of range or without a free row are left out and counted in `stats`.
+
+    Args:
+        cache: the whole cache, or one shard of it.
+        tokens: all tokens of a chunk, on every shard.
+        config: sizes, thresholds and the variant of VACC.
+        axis: name of the mapped axis over which the cache is sharded by voxel; None if `cache` is the whole cache. A
+            voxel lies in one shard (`shards_of`), which alone inserts and counts its tokens.
+
+    Returns:
+        The cache; no gradient flows through it. The counters of the shards add up to those of a whole cache, except
+        `num_chunks`, which every shard counts.
+
+    Limits:
+        Feature norms in [1e-9, 1e9]: outside, and for zero features, a pair counts as orthogonal.
+        Two members of confidence 0 are averaged with equal weights.
+        A merged mean lies between its members, to the last bit, and so in their voxel.
     """
     if axis is None:
-        return fuse_touched(cache, tokens, config)[0]
-    # Tokens that will be rejected have a voxel too (index 0 out of range), so each is counted by one shard.
+        return _insert(cache, tokens, config)[0]
+    # Rejected tokens have a voxel too (index 0 if out of range), so each is counted by one shard.
     voxels, _ = voxel_indices(tokens.means, config.memory.voxel_size)
     is_own = shards_of(voxels, jax.lax.axis_size(axis)) == jax.lax.axis_index(axis)
-    fused = fuse_touched(cache, replace(tokens, valid=tokens.valid & is_own), config)[0]
+    fused = _insert(cache, replace(tokens, valid=tokens.valid & is_own), config)[0]
     num_chunks = cache.stats.num_chunks + jnp.any(tokens.valid).astype(jnp.int32)
     return replace(fused, stats=replace(fused.stats, num_chunks=num_chunks))
 
 
-def fuse_touched(cache: VoxelCache, tokens: Tokens, config: StreamConfig) -> tuple[VoxelCache, Touched]:
-    """`cache` after inserting `tokens` in order, and the rows that were written.
-
-    A voxel with room takes the token as a new pivot. A full one merges the closest pair of its pivots and the token:
-    the merged pivot keeps the lower slot and, if the pair was two old pivots, the token takes the freed one. Tokens
-    below `min_confidence`, not finite, out of range or without room are left out and counted in `stats`. Nothing
-    written has a gradient.
-
-    Limits:
-        Feature norms in [1e-9, 1e9]: beyond, and for zero features, a pair counts as orthogonal.
-        Two members of confidence 0 are averaged with equal weights.
-        A merged mean lies between its members, to the last bit, and so in their voxel.
-    """
+def _insert(cache: VoxelCache, tokens: Tokens, config: StreamConfig) -> tuple[VoxelCache, Plan]:
+    """`cache` after inserting `tokens` in order, and where each of them went."""
     cache, tokens = jax.lax.stop_gradient((cache, tokens))
     stats, voxels, accepted = _classify(cache.stats, tokens, config)
     place = {"voxel": _place_in_voxels, "append": _place_at_end}[config.memory.vacc]
@@ -101,18 +93,18 @@ def fuse_touched(cache: VoxelCache, tokens: Tokens, config: StreamConfig) -> tup
     num_placed = jnp.sum(plan.rows >= 0, dtype=jnp.int32)
     stats = replace(
         stats,
-        num_accepted=add_to(stats.num_accepted, num_placed),
-        num_merged=add_to(stats.num_merged, num_placed - jnp.sum(appends >= 0, dtype=jnp.int32)),
-        num_dropped=add_to(stats.num_dropped, jnp.sum(accepted, dtype=jnp.int32) - num_placed),
-        num_evicted=add_to(stats.num_evicted, num_evicted),
+        num_accepted=saturating_add(stats.num_accepted, num_placed),
+        num_merged=saturating_add(stats.num_merged, num_placed - jnp.sum(appends >= 0, dtype=jnp.int32)),
+        num_dropped=saturating_add(stats.num_dropped, jnp.sum(accepted, dtype=jnp.int32) - num_placed),
+        num_evicted=saturating_add(stats.num_evicted, num_evicted),
     )
-    return replace(cache, counts=counts, stats=stats, **pivots), _touched(plan)
+    return replace(cache, counts=counts, stats=stats, **pivots), plan
 
 
 def _classify(
     stats: CacheStats, tokens: Tokens, config: StreamConfig
 ) -> tuple[CacheStats, Int[Array, "m 3"], Bool[Array, " m"]]:
-    """Counts the tokens that stay out, each for one reason; voxels and acceptance of all."""
+    """Voxels of all tokens and which are accepted; counts each rejected token under one reason."""
     voxels, in_range = voxel_indices(tokens.means, config.memory.voxel_size)
     floats = (tokens.means, tokens.feats, tokens.rgbs, tokens.quats)
     finite = jnp.isfinite(tokens.confidences) & jnp.isfinite(tokens.footprints)
@@ -124,10 +116,10 @@ def _classify(
     stats = replace(
         stats,
         num_chunks=stats.num_chunks + jnp.any(tokens.valid).astype(jnp.int32),
-        num_seen=add_to(stats.num_seen, count(tokens.valid)),
-        num_non_finite=add_to(stats.num_non_finite, count(~finite)),
-        num_low_confidence=add_to(stats.num_low_confidence, count(finite & ~confident)),
-        num_out_of_range=add_to(stats.num_out_of_range, count(finite & confident & ~in_range)),
+        num_seen=saturating_add(stats.num_seen, count(tokens.valid)),
+        num_non_finite=saturating_add(stats.num_non_finite, count(~finite)),
+        num_low_confidence=saturating_add(stats.num_low_confidence, count(finite & ~confident)),
+        num_out_of_range=saturating_add(stats.num_out_of_range, count(finite & confident & ~in_range)),
     )
     return stats, voxels, accepted
 
@@ -135,7 +127,7 @@ def _classify(
 def _place_in_voxels(
     cache: VoxelCache, voxels: Int[Array, "m 3"], accepted: Bool[Array, " m"], config: StreamConfig
 ) -> tuple[VoxelCache, Plan, Int[Array, ""]]:
-    """Finds or makes the row of every token's voxel; also the number of pivots evicted to make room."""
+    """Finds or creates the row of every token's voxel. The last result is the number of pivots evicted for that."""
     tokens = jnp.arange(accepted.shape[0], dtype=jnp.int32)
     leaders = group_equal(voxels, accepted)
     is_leader = accepted & (leaders == tokens)
@@ -153,7 +145,7 @@ def _stable_order(keys: Int[Array, " m"]) -> Int[Array, " m"]:
     m = keys.shape[0]
     indices = jnp.arange(m, dtype=jnp.uint32)
     if (m + 1) * m <= 2**32:
-        # Key and index in one word: XLA's CPU sort of one array is 6 x as fast as that of a pair.
+        # Key and index share one word: XLA's CPU backend sorts one array 6 times as fast as a pair.
         return (jnp.sort(keys.astype(jnp.uint32) * m + indices) % m).astype(jnp.int32)
     return jax.lax.sort((keys, indices.astype(jnp.int32)), num_keys=2, is_stable=False)[1]
 
@@ -161,23 +153,21 @@ def _stable_order(keys: Int[Array, " m"]) -> Int[Array, " m"]:
 def _place_at_end(
     cache: VoxelCache, voxels: Int[Array, "m 3"], accepted: Bool[Array, " m"], config: StreamConfig
 ) -> tuple[VoxelCache, Plan, Int[Array, ""]]:
-    """The ablation: rows are filled one slot after another and voxels play no part."""
+    """The ablation `vacc="append"`: tokens fill the rows one slot after another, whatever their voxel."""
     del voxels
     k = config.memory.pivots_per_voxel
     last = jnp.maximum(cache.num_voxels - 1, 0)
     num_pivots = last * k + cache.counts[last]
     flat = num_pivots + jnp.cumsum(accepted, dtype=jnp.int32) - 1
-    has_room = accepted & (flat < cache.capacity * k)
-    rows, slots = jnp.where(has_room, flat // k, -1), flat % k
+    rows, slots = jnp.where(accepted & (flat < cache.capacity * k), flat // k, -1), flat % k
     num_voxels = jnp.maximum(cache.num_voxels, jnp.max(rows, initial=-1) + 1)
     tokens = jnp.arange(accepted.shape[0], dtype=jnp.int32)
-    is_first = has_room & ((slots == 0) | (flat == num_pivots))
-    plan = Plan(rows=rows, slots=slots, leaders=jax.lax.cummax(jnp.where(is_first, tokens, 0)), order=tokens)
+    plan = Plan(rows=rows, slots=slots, leaders=tokens, order=tokens)  # nothing merges
     return replace(cache, num_voxels=num_voxels), plan, jnp.zeros((), jnp.int32)
 
 
 def _add_rows(cache, voxels, rows, is_new, config):
-    """Gives a row to each voxel that `is_new`, in order of their first tokens, as far as there is room."""
+    """Gives a row to each voxel that `is_new`, in order of their first tokens, until the capacity is used up."""
     m, capacity = rows.shape[0], cache.capacity
     new_rows = cache.num_voxels + jnp.cumsum(is_new, dtype=jnp.int32) - 1
     num_wanted = cache.num_voxels + jnp.sum(is_new, dtype=jnp.int32)
@@ -192,7 +182,7 @@ def _add_rows(cache, voxels, rows, is_new, config):
         num_voxels=jnp.minimum(num_wanted, capacity),
     )
     if config.memory.overflow == "evict_lowest":
-        # Open addressing cannot forget one entry, so a table that loses rows is built anew.
+        # Open addressing cannot delete single entries, so a table that loses rows is rebuilt.
         rebuild = lambda: build_table(cache.voxels, cache.num_voxels)  # noqa: E731
         insert = lambda: insert_rows(cache.table, voxels, new_rows, has_row)  # noqa: E731
         table = jax.lax.cond(num_evicted > 0, rebuild, insert)
@@ -213,7 +203,7 @@ def _new_pivots(tokens: Tokens, cache: VoxelCache) -> dict[str, Array]:
 
 
 def _merge_all(pivots: dict[str, Array], new: dict[str, Array], plan: Plan, config: StreamConfig) -> dict[str, Array]:
-    """Round r merges the r-th surplus token of every voxel that has one, voxels with most of them first."""
+    """Merges the surplus tokens: round r takes the r-th one of every voxel, voxels with most of them first."""
     m, k = plan.order.shape[0], config.memory.pivots_per_voxel
     is_surplus = (plan.rows >= 0) & (plan.slots >= k)
     sizes = jnp.zeros((m,), jnp.int32).at[jnp.where(is_surplus, plan.leaders, m)].add(1, mode="drop")
@@ -234,10 +224,10 @@ def _merge_all(pivots: dict[str, Array], new: dict[str, Array], plan: Plan, conf
         return pivots, round_idx + is_over.astype(jnp.int32), jnp.where(is_over, 0, first + block)
 
     state = (pivots, jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32))
-    for block, fewest in MERGE_BLOCKS:
-        if fewest <= m:
+    for block, min_voxels in MERGE_BLOCKS:
+        if min_voxels <= m:
             state = jax.lax.while_loop(
-                lambda s, fewest=fewest: (s[2] > 0) | (sizes[fewest - 1] > s[1]),
+                lambda s, min_voxels=min_voxels: (s[2] > 0) | (sizes[min_voxels - 1] > s[1]),
                 lambda s, block=block: merge_block(block, s),
                 state,
             )
@@ -247,7 +237,7 @@ def _merge_all(pivots: dict[str, Array], new: dict[str, Array], plan: Plan, conf
 def _merge_closest(
     pivots: dict[str, Array], new: dict[str, Array], rows: Int[Array, " b"], config: StreamConfig
 ) -> dict[str, Array]:
-    """MergeClosest for one token of each of the full voxels `rows` (-1: nothing to do)."""
+    """Inserts one token into each of the full voxels `rows` by merging the closest pair (-1: no voxel)."""
     k = config.memory.pivots_per_voxel
     key = {"seed": "seeds", "feature": "feats"}[config.memory.merge_key]
     first, second = _closest_pair(jnp.concatenate([pivots[key][rows], new[key][:, None]], axis=1))
@@ -262,15 +252,15 @@ def _merge_closest(
 
 
 def _closest_pair(keys: Array) -> tuple[Int[Array, " b"], Int[Array, " b"]]:
-    """Indices i < j of the pair of `keys` `[b, k + 1, c]` with the largest cosine; the lowest pair of equals.
+    """Indices i < j of the pair of `keys` `[b, k + 1, c]` with the largest cosine; the lowest pair among equals.
 
-    Pairs are compared by cos |cos| = dot |dot| / (norm^2 norm^2), which has the order of the cosine but no root whose
-    rounding would break ties: where features are small integers, equal cosines compare as equal. Beyond
-    `SAME_DIRECTION` all pairs are equal.
+    Pairs are compared by cos |cos| = dot |dot| / (norm^2 norm^2), which orders them as the cosine does but takes no
+    root, whose rounding would break ties: for features of small integers, equal cosines compare as equal. All pairs
+    above `SAME_DIRECTION` count as equal.
     """
     b, num_keys, c = keys.shape
     lanes = math.gcd(c, 8)
-    # Partial sums in lanes: XLA's CPU backend vectorizes a sum over a major axis but not one over the minor.
+    # Partial sums in lanes: XLA's CPU backend vectorizes a sum over a major axis but not over the minor one.
     keys = keys.astype(jnp.float32).reshape(b, num_keys, c // lanes, lanes)
     dot = lambda x, y: jnp.sum(jnp.sum(x * y, axis=-2), axis=-1)  # noqa: E731
     firsts, seconds = (jnp.array(x, jnp.int32) for x in zip(*itertools.combinations(range(num_keys), 2), strict=True))
@@ -283,7 +273,7 @@ def _closest_pair(keys: Array) -> tuple[Int[Array, " b"], Int[Array, " b"]]:
 
 
 def _merge_pair(older: dict[str, Array], newer: dict[str, Array], config: StreamConfig) -> dict[str, Array]:
-    """The merged pivots of pairs (Eq. vacc_pair_selection_and_merge); `older` are those in the lower slot."""
+    """Merged pivots (Eq. vacc_pair_selection_and_merge); `older` holds those of the lower slot."""
     weight_older, weight_newer = older["confidences"], newer["confidences"]
     newer_is_best = weight_newer > weight_older
     if config.memory.merge_weight == "count":
@@ -293,7 +283,7 @@ def _merge_pair(older: dict[str, Array], newer: dict[str, Array], config: Stream
     share = jnp.where(total > 0, weight_newer / jnp.where(total > 0, total, 1.0), 0.5)
 
     def average(name):
-        # From one end towards the other and never past it: rounding cannot take a mean out of its voxel.
+        # Interpolated and clipped: rounding cannot take a mean out of its voxel.
         a, b = older[name].astype(jnp.float32), newer[name].astype(jnp.float32)
         return jnp.clip(a + share[:, None] * (b - a), jnp.minimum(a, b), jnp.maximum(a, b))
 
@@ -309,7 +299,7 @@ def _merge_pair(older: dict[str, Array], newer: dict[str, Array], config: Stream
 def _write(
     pivots: dict[str, Array], rows: Int[Array, "*b"], slots: Int[Array, "*b"], values: dict[str, Array]
 ) -> dict[str, Array]:
-    """Sets pivots at distinct places; rows of -1 are left out."""
+    """`pivots` with `values` at distinct places; rows of -1 are skipped."""
     return {
         name: x.at[_drop_negative(rows, x.shape[0]), slots].set(values[name].astype(x.dtype), mode="drop")
         for name, x in pivots.items()
@@ -317,19 +307,10 @@ def _write(
 
 
 def _drop_negative(rows, capacity):
-    """Moves -1, which indexing would wrap, past the end, where `mode="drop"` leaves it out."""
+    """Replaces -1, which indexing would wrap, by an index past the end, which `mode="drop"` skips."""
     return jnp.where(rows < 0, capacity, rows)
 
 
 def _select(condition, x, y):
     """`where` along the first axis."""
     return jnp.where(condition.reshape(condition.shape + (1,) * (x.ndim - 1)), x.astype(y.dtype), y)
-
-
-def _touched(plan: Plan) -> Touched:
-    m = plan.rows.shape[0]
-    places = jnp.where(plan.is_first, jnp.cumsum(plan.is_first) - 1, m)
-    return Touched(
-        rows=jnp.full((m,), -1, jnp.int32).at[places].set(plan.rows, mode="drop"),
-        num_rows=jnp.sum(plan.is_first, dtype=jnp.int32),
-    )

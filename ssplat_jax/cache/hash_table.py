@@ -1,7 +1,6 @@
-"""The open-addressing hash from voxel index to row: linear probing, verified against the stored triples.
+"""Hash table from voxel index to row: open addressing with linear probing, verified against the stored indices.
 
-Entries are rows, -1 where empty, and never removed one by one: a table is rebuilt when rows change hands. It has four
-slots per row, so it is at most a quarter full and a search ends after a few probes, whatever the cache holds.
+Entries are rows, -1 where empty. Single entries are never deleted: a table is rebuilt when rows change their voxels.
 """
 
 import jax
@@ -11,6 +10,7 @@ from jaxtyping import Array, Bool, Int
 from ssplat_jax.geometry.voxels import hash_voxels
 
 SLOTS_PER_ROW = 4
+"""Table slots per cache row: the table is at most a quarter full, so a search ends after a few probes."""
 
 
 def find_rows(
@@ -19,7 +19,17 @@ def find_rows(
     wanted: Int[Array, "m 3"],
     active: Bool[Array, " m"],
 ) -> Int[Array, " m"]:
-    """Rows of the voxels `wanted`, -1 for those not held and those not `active`."""
+    """Rows of the voxels `wanted`.
+
+    Args:
+        table: hash table over the rows.
+        voxels: index of the voxel in each row.
+        wanted: indices to look up.
+        active: which of them to look up.
+
+    Returns:
+        Rows; -1 for voxels that are not stored or not active.
+    """
 
     def probe(state):
         slots, rows, searching = state
@@ -36,9 +46,18 @@ def find_rows(
 def insert_rows(
     table: Int[Array, " slots"], voxels: Int[Array, "m 3"], rows: Int[Array, " m"], active: Bool[Array, " m"]
 ) -> Int[Array, " slots"]:
-    """Enters the `active` ones of distinct `voxels` that are not held yet.
+    """`table` with new voxels entered.
 
-    All claim their slot at once; of several claims on one empty slot the highest row wins, and the others go on.
+    All voxels claim their slots in parallel; the highest row wins an empty slot, and the others probe on.
+
+    Args:
+        table: hash table that holds none of the active voxels.
+        voxels: indices, distinct where active.
+        rows: row of each voxel.
+        active: which voxels to enter.
+
+    Returns:
+        The hash table.
     """
     num_slots = table.shape[0]
 
@@ -54,9 +73,9 @@ def insert_rows(
 
 
 def group_equal(voxels: Int[Array, "m 3"], active: Bool[Array, " m"]) -> Int[Array, " m"]:
-    """For each of the `active` voxels the index of the first one equal to it; its own index for the others.
+    """For each active voxel the position of the first one equal to it; for the others their own position.
 
-    A table of its own, of tokens instead of rows. Equal voxels search in step, so the lowest of them claims their slot.
+    Uses a temporary hash table of positions. Equal voxels probe in lockstep, so the first of them claims their slot.
     """
     m = voxels.shape[0]
     tokens = jnp.arange(m, dtype=jnp.int32)
@@ -76,7 +95,7 @@ def group_equal(voxels: Int[Array, "m 3"], active: Bool[Array, " m"]) -> Int[Arr
 
 
 def build_table(voxels: Int[Array, "capacity 3"], num_voxels: Int[Array, ""]) -> Int[Array, " slots"]:
-    """A fresh table of the first `num_voxels` rows."""
+    """A new hash table of the first `num_voxels` rows."""
     rows = jnp.arange(voxels.shape[0], dtype=jnp.int32)
     empty = jnp.full((SLOTS_PER_ROW * voxels.shape[0],), -1, jnp.int32)
     return insert_rows(empty, voxels, rows, rows < num_voxels)
@@ -87,11 +106,11 @@ def _first_slots(table, voxels):
 
 
 def shards_of(voxels: Int[Array, "*s 3"], num_shards: int) -> Int[Array, "*s"]:
-    """Which of `num_shards` caches holds each voxel, evenly by hash.
+    """Which of `num_shards` caches holds each voxel: an even split by hash.
 
     Limits:
         Up to 2^16 shards.
     """
-    # The highest bits: a table searches from the lowest, and a shard's voxels must not share those.
+    # The highest bits, because the hash table uses the lowest: voxels of one shard must still differ in those.
     high_bits = hash_voxels(voxels) >> 16
     return (high_bits * jnp.uint32(num_shards) >> 16).astype(jnp.int32)

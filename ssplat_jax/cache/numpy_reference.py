@@ -1,6 +1,7 @@
-"""The definition of VACC's write and read as plain NumPy float64 loops: slow, obvious, and sharing nothing with them.
+"""Sequential NumPy definition of the cache: fuse, project, carve and judge as plain float64 loops.
 
-The only float32 step is the voxel index itself, which is a rounding of the stored position.
+It is slow, obvious and shares no code with the JAX implementation, which is tested against it. Only the voxel index is
+computed in float32, because it is defined as the floor of one float32 product.
 """
 
 import itertools
@@ -11,13 +12,13 @@ import numpy as np
 from ssplat_jax.cache.state import PIVOT_FIELDS, VoxelCache
 from ssplat_jax.config import StreamConfig
 
-INDEX_LIMIT = 1 << 20
-NEAR = 0.01
-SAME_DIRECTION = 1.0 - 1e-6
+INDEX_LIMIT = 1 << 20  # voxel indices are below it in magnitude
+NEAR = 0.01  # near plane, stream units
+SAME_DIRECTION = 1.0 - 1e-6  # similarities above it are ties
 
 
 def empty(capacity: int) -> dict:
-    """A cache: `rows` is a list of (voxel, list of pivots), a pivot a dict."""
+    """An empty cache: `rows` is a list of (voxel, list of pivots), and a pivot is a dict."""
     names = "chunks seen accepted merged low_confidence non_finite out_of_range dropped evicted"
     return {"capacity": capacity, "rows": [], "stats": {f"num_{name}": 0 for name in names.split()}}
 
@@ -50,7 +51,7 @@ def fuse(cache: dict, tokens: dict, config: StreamConfig) -> dict:
 
 
 def from_arrays(cache: VoxelCache) -> dict:
-    """The pivots of a real cache, to compare projections of the very same numbers."""
+    """A `VoxelCache` in the form of this module, without its counters."""
     arrays = {name: np.asarray(getattr(cache, name)) for name in PIVOT_FIELDS}
     counts = np.asarray(cache.counts)
     pivots = [
@@ -62,7 +63,7 @@ def from_arrays(cache: VoxelCache) -> dict:
 
 
 def voxel_of(point: np.ndarray, voxel_size: float) -> tuple[int, ...] | None:
-    """Index triple of a float32 point; None out of range."""
+    """Index triple of a float32 point; None if it is out of range."""
     with np.errstate(all="ignore"):
         cells = np.floor(np.float32(point) * np.float32(1.0 / voxel_size))
     return tuple(int(c) for c in cells) if np.all(np.abs(cells) < INDEX_LIMIT) else None
@@ -108,7 +109,7 @@ def _append_all(cache, accepted, config):
 
 
 def _victims(cache, touched, config):
-    """Rows that may make way for new voxels of this chunk, first to go first."""
+    """Rows that may be evicted for new voxels of this chunk, in order of eviction."""
 
     def rank(row):
         _, pivots = cache["rows"][row]
@@ -136,14 +137,14 @@ def merge_closest(pivots: list, new: dict, config: StreamConfig) -> None:
 
 
 def similarity(a: np.ndarray, b: np.ndarray) -> float:
-    """cos |cos| of two vectors: ordered as the cosine. 0 where a norm is 0, 1 where the directions are the same."""
+    """cos |cos| of two vectors, which orders pairs as the cosine does: 0 if a norm is 0, 1 if the directions agree."""
     dot, product = float(np.dot(a, b)), float(np.dot(a, a)) * float(np.dot(b, b))
     score = dot * abs(dot) / product if product > 0 else 0.0
     return 1.0 if score > SAME_DIRECTION else score
 
 
 def merge(older: dict, newer: dict, config: StreamConfig) -> dict:
-    """The pivot that replaces two."""
+    """The pivot that replaces two; `older` is the one in the lower slot."""
     weights = [float(x["confidences"]) for x in (older, newer)]
     best = newer if weights[1] > weights[0] else older
     if config.memory.merge_weight == "count":
@@ -166,12 +167,22 @@ def merge(older: dict, newer: dict, config: StreamConfig) -> dict:
 
 
 def project(cache: dict, viewmats, Ks, height: int, width: int, config: StreamConfig) -> tuple:
-    """Depths, confidences, features, mask and colors of each view, and the margin of the closest decision made.
+    """The projection of the cache into views.
 
-    Where the margin (pixels, log depths) is within rounding of 0, another precision may decide otherwise.
+    Args:
+        cache: in the form of this module.
+        viewmats: world to camera, `[v, 4, 4]`.
+        Ks: intrinsics in pixels of the maps, `[v, 3, 3]`.
+        height: of the maps.
+        width: of the maps.
+        config: `cluster_ratio`, and with `carving` also `min_confidence`.
+
+    Returns:
+        Depths, confidences, features, mask and colors of each view, and the margin of the closest decision in pixels
+        or log depths. If the margin is within rounding of 0, another precision may decide otherwise.
     """
-    least = np.float32(config.memory.min_confidence) if config.memory.carving else 0.0
-    pivots = [pivot for _, row in cache["rows"] for pivot in row if pivot["confidences"] >= least]
+    min_confidence = np.float32(config.memory.min_confidence) if config.memory.carving else 0.0
+    pivots = [pivot for _, row in cache["rows"] for pivot in row if pivot["confidences"] >= min_confidence]
     shape = (len(viewmats), height, width)
     depths, confidences, mask = np.zeros(shape), np.zeros(shape), np.zeros(shape, bool)
     feats, colors, margins = np.zeros((*shape, config.network.token_width)), np.zeros((*shape, 3)), [math.inf]
@@ -190,7 +201,19 @@ def project(cache: dict, viewmats, Ks, height: int, width: int, config: StreamCo
 
 
 def carve(cache: dict, viewmats, Ks, depths, confidences, config: StreamConfig) -> float:
-    """Revises the confidences of the pivots in place; returns the margin of the closest decision."""
+    """Revises the confidences of the pivots in place.
+
+    Args:
+        cache: in the form of this module.
+        viewmats: world to camera, `[v, 4, 4]`.
+        Ks: intrinsics in pixels of the maps, `[v, 3, 3]`.
+        depths: camera z, `[v, height, width]`.
+        confidences: of the depths.
+        config: its `min_confidence` decides which cells are witnesses.
+
+    Returns:
+        The margin of the closest decision in pixels or log depths.
+    """
     views = []
     for viewmat, K, depth, confidence in zip(viewmats, Ks, depths, confidences, strict=True):
         ell = _trusted_log_depths(depth, confidence, config)
@@ -201,7 +224,19 @@ def carve(cache: dict, viewmats, Ks, depths, confidences, config: StreamConfig) 
 
 
 def witness(viewmats, Ks, depths, confidences, side: int, config: StreamConfig) -> tuple | None:
-    """The view of a chunk that is kept: viewmat, K, nearest log depths and weights of `side` x `side` parts."""
+    """The stored witness of a chunk: its view with the most trusted cells, reduced to `side` x `side` parts.
+
+    Args:
+        viewmats: world to camera, `[v, 4, 4]`.
+        Ks: intrinsics in pixels of the maps, `[v, 3, 3]`.
+        depths: camera z, `[v, height, width]`.
+        confidences: of the depths.
+        side: parts along each side of the view.
+        config: its `min_confidence` decides which cells are trusted.
+
+    Returns:
+        (viewmat, K, log depths, the same log depths, weights), as `judge` takes them; None without a trusted cell.
+    """
     trusted = [_trusted_log_depths(d, c, config) for d, c in zip(depths, confidences, strict=True)]
     view = int(np.argmax([np.isfinite(ell).sum() for ell in trusted]))
     ell, confidence = trusted[view], np.asarray(confidences[view], np.float64)
@@ -221,7 +256,7 @@ def witness(viewmats, Ks, depths, confidences, side: int, config: StreamConfig) 
 
 
 def judge(witnesses: list[tuple], tokens: dict, config: StreamConfig) -> tuple[np.ndarray, float]:
-    """Confidences of `tokens` after the witnesses, and the margin of the closest decision."""
+    """Confidences of `tokens` revised by the witnesses, and the margin of the closest decision."""
     judged = np.asarray(tokens["confidences"], np.float64).copy()
     chosen = np.flatnonzero(tokens["valid"] & (tokens["confidences"] >= np.float32(config.memory.min_confidence)))
     points = [{"means": np.asarray(tokens["means"][j], np.float64), "confidences": judged[j]} for j in chosen]
@@ -231,14 +266,14 @@ def judge(witnesses: list[tuple], tokens: dict, config: StreamConfig) -> tuple[n
 
 
 def _trusted_log_depths(depths, confidences, config) -> np.ndarray:
-    """Log depth where a cell is a witness, -inf elsewhere."""
+    """Log depth in trusted cells, -inf elsewhere."""
     trusted = (confidences >= np.float32(config.memory.min_confidence)) & (confidences > 0) & (depths > 0)
     with np.errstate(all="ignore"):
         return np.where(trusted & np.isfinite(depths), np.log(np.asarray(depths, np.float64)), -math.inf)
 
 
 def _revise(points: list, views: list[tuple]) -> float:
-    """Lets the cells of (viewmat, K, log depths, nearest, weights) judge the confidences of the points, in place."""
+    """Revises the confidences of the points in place, by the cells of (viewmat, K, log depths, nearest, weights)."""
     evidence, margins = {id(p): 0.0 for p in points}, [math.inf]
     for viewmat, K, ell, nearest, weights in views:
         viewmat, K = np.asarray(viewmat, np.float64), np.asarray(K, np.float64)
@@ -261,7 +296,7 @@ def _revise(points: list, views: list[tuple]) -> float:
 
 
 def _on_pixels(pivots, viewmat, K, height, width, margins) -> dict:
-    """(log depth, pivot) of what is seen, by pixel (row, column)."""
+    """The visible pivots as (log depth, pivot), by pixel (row, column)."""
     pixels: dict = {}
     for pivot in pivots:
         x, y, z = viewmat[:3, :3] @ pivot["means"] + viewmat[:3, 3]
@@ -276,7 +311,7 @@ def _on_pixels(pivots, viewmat, K, height, width, margins) -> dict:
 
 
 def _front_cluster(pairs, window, margins) -> list:
-    """The front window of the pairs on one pixel, re-centered once."""
+    """The pairs in the front window of one pixel, re-centered once."""
     front = min(ell for ell, _ in pairs)
     members = [(ell, p["confidences"]) for ell, p in pairs if ell <= front + window]
     center = sum(w * ell for ell, w in members) / sum(w for _, w in members)

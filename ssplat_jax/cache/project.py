@@ -1,18 +1,18 @@
 """VACC's read: the projection P of the cache into views (Eq. cache_projection).
 
-Per pixel the front cluster in log depth. With ell = ln z, w = confidence and window = ln(cluster_ratio):
+Each pixel reads its front cluster in log depth. With ell = ln z, w = confidence and window = ln(cluster_ratio):
 
     pass 1   L0 = min ell                            over the pivots that fall on the pixel
     pass 2   mu = sum w ell / sum w                  over ell <= L0 + window
     pass 3   D, Omega, F from w-weighted sums        over |ell - mu| <= window     (re-centered once)
 
-A plain mean mixes background into a fifth of the pixels; a narrow window about the minimum is biased towards the
-camera, and the bias would feed back through the anchor into the cache (ALGORITHM 10.2). A pivot covers the one pixel
-that its center falls into.
+A plain mean would mix background into a fifth of the pixels. A window about the minimum alone would be biased towards
+the camera, and the bias would feed back through the anchor into the cache. A pivot covers the one pixel that contains
+its projected center.
 
-Cost is proportional to the live pivots: rows are dense, so the passes walk blocks of rows up to `num_voxels`. Features
-are touched only for the pairs (view, pivot) in a cluster. Sums run in the order of rows, so on the CPU the result is
-the same to the last bit every time.
+The cost is proportional to the number of live pivots: rows are dense, so each pass visits blocks of rows up to
+`num_voxels`. Features are read only for the pairs (view, pivot) in a cluster. Sums run in row order, so on the CPU the
+result is the same to the last bit every time.
 """
 
 import math
@@ -27,15 +27,18 @@ from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.pytree import pytree
 
 NEAR = 0.01
-"""Pivots at or before this camera z (stream units) are not seen; the renderer's near plane."""
+"""Near plane: pivots at or before this camera z (stream units) are invisible, as in the renderer."""
 
 ROWS_PER_BLOCK = 4096
+"""Most cache rows that a pass projects at a time."""
+
 PAIRS_PER_BLOCK = 4096
+"""Most pairs whose features are gathered at a time."""
 
 
 @pytree
 class ProjectedCache:
-    """What history says about each pixel of the views: zeros and `mask` False where it says nothing."""
+    """The cache as seen from each view: zeros, and `mask` False, in pixels without a pivot."""
 
     depths: Float[Array, "v hf wf"]  # D_H, camera z
     confidences: Float[Array, "v hf wf"]  # Omega_H = sum w^2 / sum w
@@ -46,33 +49,39 @@ class ProjectedCache:
 
 @pytree
 class PixelPairs:
-    """What points are in every view, flattened over views and points."""
+    """Pairs (view, point), flattened: the pixel and the depth at which the view sees the point."""
 
-    pixels: Int[Array, " p"]  # flat over all views; the number of pixels where it is not seen
+    pixels: Int[Array, " p"]  # flat over all views; the number of pixels if the point is not seen
     log_depths: Float[Array, " p"]
-    weights: Float[Array, " p"]  # 0 where it is not seen
+    weights: Float[Array, " p"]  # 0 if the point is not seen
 
 
 def project(cache: VoxelCache, camera: Camera, config: StreamConfig, *, axis: str | None = None) -> ProjectedCache:
-    """Depth, confidence and features of `cache` in the pixels of `camera` (a batch of views at grid resolution).
+    """Depth, confidence and features of `cache` in the pixels of `camera`.
 
-    A constant for differentiation: no gradient flows to the cache or the cameras. Given the name of a mapped `axis`,
-    `cache` is one shard of several, and every shard gets the projection of all of them.
+    Args:
+        cache: what is projected.
+        camera: a batch of views at grid resolution.
+        config: its `cluster_ratio` is the depth ratio that a pixel's front cluster spans.
+        axis: name of the mapped axis over which the cache is sharded by voxel; None if `cache` is the whole cache.
+
+    Returns:
+        The projection of the whole cache, on every shard; no gradient flows to the cache or the cameras.
 
     Limits:
-        Camera z <= 0.01, confidence 0 (with `carving`, below `min_confidence`) and centers outside the image are not
-        seen.
+        Pivots with camera z <= 0.01, confidence 0 (with `carving`, below `min_confidence`) or a center outside the
+        image are not seen.
         An empty cache, and a pixel without a pivot, give zeros and a False mask.
         Over an axis the sums run in another order than over one cache: results agree to float32 rounding.
     """
     cache, camera = jax.lax.stop_gradient((cache, camera))
     shape = (camera.viewmats.shape[0], camera.height, camera.width)
     with jax.named_scope("project"):
-        fronts = _over_blocks(cache, camera, config, _nearest, jnp.full((math.prod(shape),), jnp.inf))
-        fronts = _over_shards(jax.lax.pmin, fronts, axis)
+        fronts = _fold_blocks(cache, camera, config, _min_log_depths, jnp.full((math.prod(shape),), jnp.inf))
+        fronts = _reduce_shards(jax.lax.pmin, fronts, axis)
         centers = _front_means(cache, camera, config, fronts, axis)
         sums = _cluster_sums(cache, camera, config, fronts, centers)
-        weights, squares, offsets, values = _over_shards(jax.lax.psum, sums, axis)
+        weights, squares, offsets, values = _reduce_shards(jax.lax.psum, sums, axis)
     mask = weights > 0
     total = jnp.where(mask, weights, 1.0)
     means = (values / total[:, None]).reshape(*shape, -1)
@@ -87,12 +96,13 @@ def project(cache: VoxelCache, camera: Camera, config: StreamConfig, *, axis: st
     )
 
 
-def coarser(history: ProjectedCache, factor: int) -> ProjectedCache:
-    """`history` on a grid of `factor` x `factor` cells each: of those the nearest, whole, since a mean of front and
-    back is neither.
+def coarsen(history: ProjectedCache, factor: int) -> ProjectedCache:
+    """`history` on a grid coarser by `factor`: each coarse cell takes all values of its nearest fine cell.
+
+    Cells are not averaged, since the mean of a front and a back surface lies on neither.
 
     Limits:
-        A cell of holes is a hole; where there is one cell of several, it alone is seen.
+        A coarse cell without a filled fine cell is a hole.
     """
     if factor == 1:
         return history
@@ -113,51 +123,53 @@ def coarser(history: ProjectedCache, factor: int) -> ProjectedCache:
     )
 
 
-def _over_shards(reduce, partial, axis: str | None):
-    """What all shards have together; `partial` itself without an axis."""
+def _reduce_shards(reduce, partial, axis: str | None):
+    """`partial` reduced over all shards; `partial` itself without an axis."""
     return partial if axis is None else reduce(partial, axis)
 
 
-def blocks_of_rows(cache: VoxelCache) -> tuple[int, Int[Array, ""]]:
-    """Rows of a block, and how many blocks hold the voxels that there are."""
+def row_blocks(cache: VoxelCache) -> tuple[int, Int[Array, ""]]:
+    """Number of rows in a block, and number of blocks that cover the occupied rows."""
     num_rows = math.gcd(cache.capacity, ROWS_PER_BLOCK)
     return num_rows, (cache.num_voxels + num_rows - 1) // num_rows
 
 
-def _over_blocks(cache: VoxelCache, camera: Camera, config: StreamConfig, visit, start):
-    """Folds `visit(state, pairs, first_row)` over the blocks of rows that hold voxels."""
-    num_rows, num_blocks = blocks_of_rows(cache)
-    # What views have carved away hides nothing; every pivot was accepted at tau or more.
-    least = config.memory.min_confidence if config.memory.carving else 0.0
+def _fold_blocks(cache: VoxelCache, camera: Camera, config: StreamConfig, visit, start):
+    """Folds `visit(state, pairs, first_row)` over the blocks of occupied rows."""
+    num_rows, num_blocks = row_blocks(cache)
+    # Carved pivots must not occlude. Without carving no pivot is below tau: all were accepted at tau or more.
+    min_confidence = config.memory.min_confidence if config.memory.carving else 0.0
 
     def step(i, state):
-        return visit(state, pairs_of_rows(cache, camera, i * num_rows, num_rows, least=least), i * num_rows)
+        pairs = project_rows(cache, camera, i * num_rows, num_rows, min_confidence=min_confidence)
+        return visit(state, pairs, i * num_rows)
 
     return jax.lax.fori_loop(0, num_blocks, step, start)
 
 
-def _nearest(fronts, pairs: PixelPairs, first_row):
+def _min_log_depths(fronts, pairs: PixelPairs, first_row):
+    """Pass 1: log depth of the nearest pivot in each pixel."""
     del first_row
     return fronts.at[pairs.pixels].min(pairs.log_depths, mode="drop")
 
 
 def _front_means(cache, camera, config, fronts, axis):
-    """Mean log depth of each pixel's front window, measured from its nearest pivot."""
+    """Pass 2: mean log depth of each pixel's front window, relative to its nearest pivot."""
     window = math.log(config.history.cluster_ratio)
 
     def visit(sums, pairs: PixelPairs, first_row):
         del first_row
-        behind = _behind(pairs, fronts)
-        weights = jnp.where(behind <= window, pairs.weights, 0.0)
-        return _add(sums, pairs.pixels, (weights, weights * behind))
+        offsets = _offsets_from_front(pairs, fronts)
+        weights = jnp.where(offsets <= window, pairs.weights, 0.0)
+        return _scatter_add(sums, pairs.pixels, (weights, weights * offsets))
 
-    sums = _over_blocks(cache, camera, config, visit, (jnp.zeros_like(fronts), jnp.zeros_like(fronts)))
-    weights, offsets = _over_shards(jax.lax.psum, sums, axis)
+    sums = _fold_blocks(cache, camera, config, visit, (jnp.zeros_like(fronts), jnp.zeros_like(fronts)))
+    weights, offsets = _reduce_shards(jax.lax.psum, sums, axis)
     return offsets / jnp.where(weights > 0, weights, 1.0)
 
 
 def _cluster_sums(cache, camera, config, fronts, centers):
-    """Sums over each pixel's re-centered cluster: w, w^2, w times log depth from the nearest pivot, w times values."""
+    """Pass 3: sums over each pixel's re-centered cluster: w, w^2, w times offset from the front, w times values."""
     window = math.log(config.history.cluster_ratio)
     pivots_per_row = cache.feats.shape[1]
     flat = lambda x: x.reshape(-1, x.shape[-1])  # noqa: E731
@@ -173,25 +185,25 @@ def _cluster_sums(cache, camera, config, fronts, centers):
 
     def visit(state, pairs: PixelPairs, first_row):
         scalars, sums = state
-        behind = _behind(pairs, fronts)
-        weights = jnp.where(jnp.abs(behind - centers[pairs.pixels]) <= window, pairs.weights, 0.0)
-        scalars = _add(scalars, pairs.pixels, (weights, weights * weights, weights * behind))
+        offsets = _offsets_from_front(pairs, fronts)
+        weights = jnp.where(jnp.abs(offsets - centers[pairs.pixels]) <= window, pairs.weights, 0.0)
+        scalars = _scatter_add(scalars, pairs.pixels, (weights, weights * weights, weights * offsets))
         first_pivot, num_views = first_row * pivots_per_row, len(camera.viewmats)
         return scalars, _add_values(sums, values_of, pairs.pixels, weights, first_pivot, num_views)
 
     zeros = jnp.zeros_like(fronts)
     sums = jnp.zeros((fronts.shape[0], num_values))
-    scalars, sums = _over_blocks(cache, camera, config, visit, ((zeros, zeros, zeros), sums))
+    scalars, sums = _fold_blocks(cache, camera, config, visit, ((zeros, zeros, zeros), sums))
     return *scalars, sums
 
 
 def _add_values(sums, values_of, pixels, weights, first_pivot, num_views):
-    """Adds w times value for the pairs that have weight, gathered to the front first: they are a small share."""
+    """Adds w times value for the pairs of nonzero weight, which are compacted first: they are few."""
     num_pairs = pixels.shape[0]
     block = min(num_pairs, PAIRS_PER_BLOCK)
     has_weight = weights > 0
     places = jnp.where(has_weight, jnp.cumsum(has_weight) - 1, num_pairs)
-    # Entries beyond the last pair stay at num_pairs; a multiple of the block, so that no slice is moved back.
+    # Padded to a multiple of the block, because dynamic_slice shifts a slice that would pass the end.
     listed = jnp.full((num_pairs + -num_pairs % block,), num_pairs, jnp.int32)
     listed = listed.at[places].set(jnp.arange(num_pairs, dtype=jnp.int32), mode="drop")
 
@@ -207,8 +219,21 @@ def _add_values(sums, values_of, pixels, weights, first_pivot, num_views):
     return jax.lax.fori_loop(0, num_blocks, add_block, sums)
 
 
-def pairs_of_rows(cache: VoxelCache, camera: Camera, first_row, num_rows: int, *, least: float = 0.0) -> PixelPairs:
-    """The pixels of all views that the pivots of `num_rows` rows fall on; those of confidence below `least` on none."""
+def project_rows(
+    cache: VoxelCache, camera: Camera, first_row, num_rows: int, *, min_confidence: float = 0.0
+) -> PixelPairs:
+    """Pairs of all views with the pivots of a block of rows.
+
+    Args:
+        cache: holds the pivots; dead ones are not seen.
+        camera: a batch of views.
+        first_row: where the block begins (a traced integer).
+        num_rows: length of the block.
+        min_confidence: pivots below it are not seen.
+
+    Returns:
+        `v * num_rows * k` pairs, view-major.
+    """
 
     def block(x):
         return jax.lax.dynamic_slice_in_dim(x, first_row, num_rows).reshape(-1, *x.shape[2:])
@@ -216,12 +241,12 @@ def pairs_of_rows(cache: VoxelCache, camera: Camera, first_row, num_rows: int, *
     k = cache.means.shape[1]
     counts = jax.lax.dynamic_slice_in_dim(cache.counts, first_row, num_rows)
     confidences = block(cache.confidences).reshape(-1, k)
-    is_shown = (jnp.arange(k) < counts[:, None]) & (confidences >= least)
-    return pairs_of_points(block(cache.means), jnp.where(is_shown, confidences, 0.0).reshape(-1), camera)
+    is_visible = (jnp.arange(k) < counts[:, None]) & (confidences >= min_confidence)
+    return project_points(block(cache.means), jnp.where(is_visible, confidences, 0.0).reshape(-1), camera)
 
 
-def pairs_of_points(points: Float[Array, "n 3"], weights: Float[Array, " n"], camera: Camera) -> PixelPairs:
-    """The pixels of all views that `points` fall on; those of weight 0 or NaN are not seen."""
+def project_points(points: Float[Array, "n 3"], weights: Float[Array, " n"], camera: Camera) -> PixelPairs:
+    """Pairs of all views with `points`, view-major; points of weight 0 or NaN are not seen."""
     # Written out per coordinate: three rows of products vectorize over the points, a 3 x 3 matrix product does not.
     px, py, pz = jnp.moveaxis(points, -1, 0)
     views = camera.viewmats[:, :3, :, None]
@@ -242,10 +267,10 @@ def pairs_of_points(points: Float[Array, "n 3"], weights: Float[Array, " n"], ca
     )
 
 
-def _behind(pairs: PixelPairs, fronts):
-    """Log depth behind the nearest pivot of the pixel; 0 where not seen."""
+def _offsets_from_front(pairs: PixelPairs, fronts):
+    """Log depth relative to the pixel's nearest pivot; 0 for points not seen."""
     return jnp.where(pairs.weights > 0, pairs.log_depths - fronts[pairs.pixels], 0.0)
 
 
-def _add(sums, pixels, values):
+def _scatter_add(sums, pixels, values):
     return tuple(s.at[pixels].add(x, mode="drop") for s, x in zip(sums, values, strict=True))

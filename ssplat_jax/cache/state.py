@@ -1,4 +1,4 @@
-"""`VoxelCache`: the stream's only memory, a pure pytree of fixed size (Sec. 3.4, VACC)."""
+"""`VoxelCache`: the stream's only memory, a pytree of fixed size (Sec. 3.4, VACC)."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -9,67 +9,67 @@ from ssplat_jax.errors import InputError
 from ssplat_jax.pytree import pytree
 
 
-def add_to(counter: Int[Array, ""], more: Int[Array, ""]) -> Int[Array, ""]:
-    """`counter + more`, both not negative, that stops at the largest integer instead of turning negative."""
+def saturating_add(counter: Int[Array, ""], more: Int[Array, ""]) -> Int[Array, ""]:
+    """`counter + more` for numbers that are not negative; stops at the largest integer instead of overflowing."""
     return counter + jnp.minimum(more, jnp.iinfo(counter.dtype).max - counter)
 
 
 @pytree
 class CacheStats:
-    """Counters over the whole stream: what only the running program knows. Read them outside jit; `check_cache` does.
+    """Counters over the whole stream, to be read outside jit (`check_cache`).
 
-    They stop at 2^31 - 1 (`add_to`): tokens of 4 views at 1080p are that many after 4000 chunks.
+    They stop at 2^31 - 1 (`saturating_add`), which tokens of 4 views at 1080p reach after 4000 chunks.
     """
 
     num_chunks: Int[Array, ""]
     num_seen: Int[Array, ""]  # tokens of valid views offered to the cache
     num_accepted: Int[Array, ""]  # appended or merged
-    num_merged: Int[Array, ""]  # merges done (each leaves the number of pivots as it was)
-    num_low_confidence: Int[Array, ""]  # rejected: below tau_conf, as they came or once judged
+    num_merged: Int[Array, ""]  # accepted by a merge, which leaves the number of pivots unchanged
+    num_low_confidence: Int[Array, ""]  # rejected: below tau_conf, as predicted or after `judge`
     num_non_finite: Int[Array, ""]  # rejected: NaN or infinite
-    num_out_of_range: Int[Array, ""]  # rejected: voxel index beyond +-2^20
-    num_dropped: Int[Array, ""]  # rejected: no room for a new voxel (overflow)
+    num_out_of_range: Int[Array, ""]  # rejected: voxel index outside +-2^20
+    num_dropped: Int[Array, ""]  # rejected: no free row for a new voxel (overflow)
     num_evicted: Int[Array, ""]  # pivots lost to overflow="evict_lowest"
 
 
 @pytree
 class Witnesses:
-    """The views of `w` chunks, coarsely: what they looked through and saw, kept to judge what later chunks claim.
+    """Coarse depth maps of one view from each of the last `w` chunks, against which later tokens are judged.
 
-    A ring: chunk `n` writes entry `n % w`. A cell holds the nearest surface that its part of the view saw, if all of
-    that part was trusted.
+    A ring buffer: chunk `n` writes entry `n % w`. A coarse cell holds its nearest surface if all fine cells in it were
+    trusted.
     """
 
     viewmats: Float[Array, "w 4 4"]
     Ks: Float[Array, "w 3 3"]  # in units of the coarse cells
     log_depths: Float[Array, "w g g"]
-    weights: Float[Array, "w g g"]  # least confidence in the cell; 0 where it is no witness
+    weights: Float[Array, "w g g"]  # lowest confidence in the coarse cell; 0 if not all of it was trusted
 
 
 @pytree
 class VoxelCache:
     """Up to `capacity` voxels of up to `k` pivots each.
 
-    Rows are dense: voxels 0 .. num_voxels-1 are occupied, in order of their first token; in a row the first
-    `counts` pivots are alive. `table` is an open-addressing hash from voxel index to row, verified against `voxels`.
-    Dead pivots hold zeros.
+    Rows are dense: rows 0 .. num_voxels-1 are occupied, in order of their first token, and the first `counts` pivots
+    of a row are alive. Dead pivots hold zeros. `table` is an open-addressing hash table from voxel index to row,
+    verified against `voxels`.
     """
 
-    # which voxels there are
+    # Voxels.
     voxels: Int[Array, "capacity 3"]  # floor(mean / voxel_size)
     counts: Int[Array, " capacity"]  # alive pivots, 0 .. k
     num_voxels: Int[Array, ""]
-    table: Int[Array, " slots"]  # row of the voxel hashed here, -1 where empty (table.py)
-    # their pivots
+    table: Int[Array, " slots"]  # row of the voxel hashed here, -1 where empty (hash_table.py)
+    # Pivots.
     means: Float[Array, "capacity k 3"]  # stream frame
     feats: Float[Array, "capacity k c"]  # the token state f
     seeds: Float[Array, "capacity k c"]  # feature of the most confident member, for matching
     confidences: Float[Array, "capacity k"]  # omega, (0, 1]
     rgbs: Float[Array, "capacity k a"]  # appearance anchor: mean colors of the parts of the token's patch
     quats: Float[Array, "capacity k 4"]  # camera-to-world orientation of the most confident member, wxyz
-    footprints: Float[Array, "capacity k"]  # size of a grid cell at the most confident member, stream units
+    footprints: Float[Array, "capacity k"]  # width of a grid cell at the most confident member, stream units
     num_members: Int[Array, "capacity k"]  # tokens merged into the pivot
-    last_chunks: Int[Array, "capacity k"]  # chunk that last wrote it
+    last_chunks: Int[Array, "capacity k"]  # chunk that last wrote the pivot
     witnesses: Witnesses
     stats: CacheStats
 
@@ -80,7 +80,7 @@ class VoxelCache:
 
     @property
     def capacity(self) -> int:
-        """Voxels it can hold."""
+        """Number of voxels that the cache can hold."""
         return self.voxels.shape[0]
 
 
@@ -95,28 +95,28 @@ PIVOT_FIELDS = (
     "num_members",
     "last_chunks",
 )
-"""The fields of `VoxelCache` that hold one entry per pivot, `[capacity, k, ...]`."""
+"""Fields of `VoxelCache` with one entry per pivot, `[capacity, k, ...]`."""
 
 
 @pytree
 class Tokens:
-    """`m` tokens on their way into the cache, in order of insertion (view-major, row-major)."""
+    """`m` tokens to be fused, in order of insertion (view-major, row-major)."""
 
     means: Float[Array, "m 3"]
     feats: Float[Array, "m c"]
     confidences: Float[Array, " m"]
-    rgbs: Float[Array, "m a"]  # 3 of each of its Gaussians, row by row over the cell
+    rgbs: Float[Array, "m a"]  # appearance anchor: the color of each of the token's Gaussians, row-major in the cell
     quats: Float[Array, "m 4"]  # orientation of the camera that saw the token, camera-to-world, wxyz
     footprints: Float[Array, " m"]
-    valid: Bool[Array, " m"]  # False: padding; neither used nor counted
+    valid: Bool[Array, " m"]  # False for padding, which is neither used nor counted
 
 
 WITNESS_CELLS = 32
-"""Cells of a witness along each side of its view."""
+"""Coarse cells of a witness along each side of its view."""
 
 
 def init_witnesses(config: StreamConfig) -> Witnesses:
-    """Room for the config's witnesses (none without carving); they have seen nothing yet."""
+    """Empty witnesses, as many as the config asks for; none without carving."""
     w = config.memory.num_witnesses if config.memory.carving else 0
     cells = (w, WITNESS_CELLS, WITNESS_CELLS)
     return Witnesses(
@@ -127,11 +127,11 @@ def init_witnesses(config: StreamConfig) -> Witnesses:
     )
 
 
-def require_one(cache: VoxelCache, caller: str) -> None:
-    """Refuses caches with leading axes, of streams or shards, where `caller` takes one.
+def require_single_cache(cache: VoxelCache, caller: str) -> None:
+    """Raises if `cache` has leading axes, of streams or shards; the message names `caller`.
 
     Raises:
-        InputError: there are several.
+        InputError: `cache` holds several caches.
     """
     if shape := cache.num_voxels.shape:
         raise InputError(
@@ -144,7 +144,7 @@ def init_cache(config: StreamConfig, capacity: int | None = None) -> VoxelCache:
     """An empty cache of `capacity` voxels (default: the config's).
 
     Raises:
-        InputError: `capacity` is no power of two, which the hash table's masks need.
+        InputError: `capacity` is no power of two, which the bit masks of the hash table need.
     """
     capacity = config.memory.capacity if capacity is None else capacity
     if capacity < 1 or capacity & (capacity - 1):

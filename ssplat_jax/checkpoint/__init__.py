@@ -1,1 +1,1 @@
-"""What is kept on disk: training states (Orbax), shipped weights and stream states (npz, verified by sha256)."""
+"""Saved states: training states (Orbax), and weights, stream states and scene deltas (checksummed npz files)."""

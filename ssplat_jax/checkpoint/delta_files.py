@@ -1,4 +1,4 @@
-"""The changes of a growing scene on disk, one `.npz` a chunk; put together in order they are the scene."""
+"""Scene deltas on disk, one `.npz` per chunk; applied in order they give the scene."""
 
 import dataclasses
 from pathlib import Path
@@ -11,24 +11,24 @@ from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.storage.npz import load_arrays, save_arrays
 from ssplat_jax.streaming.scene_delta import SceneDelta
 
-KIND = "scene delta 1"
+KIND = "scene delta 1"  # kind and version of the file
 
 
 def save_delta(path: Path, delta: SceneDelta, header: dict[str, Any] | None = None) -> None:
-    """Writes one `.npz` (readable with `numpy.load`), atomically, with the JSON-able `header` of the caller.
+    """Writes one delta and the caller's JSON-serializable `header` to an `.npz` file, atomically.
 
     Raises:
-        StorageError: it could not be written.
+        StorageError: the file cannot be written.
     """
     arrays = {field.name: np.asarray(getattr(delta.gaussians, field.name)) for field in dataclasses.fields(Gaussians)}
     save_arrays(path, arrays | {"rows": delta.rows}, KIND, {"capacity": delta.capacity, "caller": header or {}})
 
 
 def load_delta(path: Path) -> SceneDelta:
-    """What `save_delta` wrote.
+    """Reads a delta that `save_delta` wrote.
 
     Raises:
-        StorageError: no such file, or one that is not, bit for bit, what was written.
+        StorageError: the file is missing, of another kind, or damaged.
     """
     arrays, facts = load_arrays(path, KIND)
     rows = arrays.pop("rows")
@@ -36,9 +36,9 @@ def load_delta(path: Path) -> SceneDelta:
 
 
 def load_delta_header(path: Path) -> dict[str, Any]:
-    """The header that `save_delta` was given.
+    """Reads the caller's header of a delta; empty if the file has none.
 
     Raises:
-        StorageError: as `load_delta`.
+        StorageError: the file is missing, of another kind, or damaged.
     """
     return load_arrays(path, KIND)[1].get("caller", {})

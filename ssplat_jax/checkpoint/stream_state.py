@@ -1,6 +1,6 @@
-"""The stream's state on disk: the cache's leaves by their path (`means`, `stats.num_seen`), the last file kept.
+"""Stream state on disk: the leaves of the cache by path (`means`, `stats.num_seen`); the previous file is kept.
 
-Of the arrays with one row per voxel only the occupied rows are stored, since the others hold zeros.
+Arrays with one row per voxel are stored without their unoccupied rows, which hold zeros.
 """
 
 import contextlib
@@ -12,42 +12,45 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ssplat_jax.cache.state import PIVOT_FIELDS, CacheStats, VoxelCache, Witnesses, require_one
+from ssplat_jax.cache.state import PIVOT_FIELDS, CacheStats, VoxelCache, Witnesses, require_single_cache
 from ssplat_jax.errors import StorageError
 from ssplat_jax.storage.atomic import previous_path
 from ssplat_jax.storage.npz import load_arrays, save_arrays
 
-KIND = "stream state 3"  # 2: with witnesses; 3: colors of the parts of a patch, at one exposure
-_ROW_FIELDS = ("voxels", "counts", *PIVOT_FIELDS)
+KIND = "stream state 3"  # version 2 added witnesses; version 3 colors per part of a patch, at one exposure
+_ROW_FIELDS = ("voxels", "counts", *PIVOT_FIELDS)  # arrays with one row per voxel
 
 
 def save_state(path: Path, cache: VoxelCache, header: dict[str, Any]) -> None:
-    """Writes `cache` and the JSON-able `header` to `path`, atomically; what was there becomes `<name>.previous`.
+    """Writes `cache` and a JSON-serializable `header` to `path`, atomically; the old file becomes `<name>.previous`.
 
     Raises:
-        StorageError: the file could not be written; what was at `path` before is untouched.
-        InputError: `cache` is several, of streams or shards.
+        StorageError: the file cannot be written; the old file at `path` is unchanged.
+        InputError: `cache` is a batch of caches, of several streams or shards.
     """
-    require_one(cache, "save_state")
+    require_single_cache(cache, "save_state")
     facts = {"capacity": cache.capacity, "caller": header}
     save_arrays(path, _leaves(cache), KIND, facts, keep_previous=True)
 
 
 def load_state(path: Path) -> tuple[VoxelCache, dict[str, Any]]:
-    """The cache and the header that `save_state` wrote.
+    """Reads the cache and the header that `save_state` wrote.
 
     Raises:
-        StorageError: no such file, or one that is not, bit for bit, what was written.
+        StorageError: the file is missing, of another kind, or damaged.
     """
     leaves, facts = load_arrays(path, KIND)
     return _build(leaves, facts["capacity"]), facts["caller"]
 
 
 def load_newest_state(path: Path) -> tuple[VoxelCache, dict[str, Any], StorageError | None]:
-    """As `load_state`, but falls back on the previous file; also why the newest was refused, if it was.
+    """Reads the newest state, or the previous one if the newest is missing or damaged.
+
+    Returns:
+        The cache, the header, and the error of the newest file if the previous one was read, else None.
 
     Raises:
-        StorageError: neither file is good; the message is about the newest.
+        StorageError: neither file can be read; the message is about the newest.
     """
     try:
         return *load_state(path), None
@@ -58,17 +61,17 @@ def load_newest_state(path: Path) -> tuple[VoxelCache, dict[str, Any], StorageEr
 
 
 def restore_previous(path: Path) -> None:
-    """Puts the previous state in the place of a damaged or missing one, which is kept as `<name>.damaged`.
+    """Replaces a damaged or missing state by the previous one; the damaged file is kept as `<name>.damaged`.
 
-    Whoever continues from the previous state does so first: the next save keeps what is at `path` as the previous
-    state, and would put a damaged file over the only good one.
+    Call this before a stream continues from the previous state: the next save would otherwise keep the damaged file as
+    the previous state and overwrite the only good one.
 
     Raises:
-        StorageError: the file could not be renamed.
+        StorageError: a file cannot be renamed.
     """
     try:
         if path.exists():
-            # What could not be read now may be readable elsewhere, or with a later version.
+            # Another machine or a later version may be able to read the damaged file.
             os.replace(path, path.with_name(path.name + ".damaged"))
         os.replace(previous_path(path), path)
     except OSError as error:
@@ -76,17 +79,19 @@ def restore_previous(path: Path) -> None:
 
 
 def _leaves(cache: VoxelCache) -> dict[str, np.ndarray]:
+    """Leaves of the cache by path, row arrays cut to the occupied rows."""
     num_voxels = int(cache.num_voxels)
     leaves = {}
     for path, leaf in jax.tree_util.tree_flatten_with_path(cache)[0]:
         name = ".".join(key.name for key in path)
-        # Cut on the host: JAX would compile a program for every number of voxels, and there is a new one at every save.
+        # Sliced on the host: JAX would compile a program for each number of voxels, which differs at every save.
         array = np.asarray(leaf)[:num_voxels] if name in _ROW_FIELDS else np.asarray(leaf)
         leaves[name] = np.ascontiguousarray(array).reshape(array.shape)
     return leaves
 
 
 def _build(leaves: dict[str, np.ndarray], capacity: int) -> VoxelCache:
+    """Cache of the leaves by path, row arrays padded with zeros to `capacity`."""
     fields: dict[str, Any] = {"stats": {}, "witnesses": {}}
     for name, leaf in leaves.items():
         if name in _ROW_FIELDS:

@@ -1,6 +1,6 @@
-"""Training checkpoints: an Orbax manager over plain dicts, with the recipe beside them so that a resume can refuse.
+"""Training checkpoints, saved with Orbax; the recipe is stored beside them, so that another run cannot resume them.
 
-Orbax reads an array with a flipped bit without complaint, so every checkpoint holds the sha256 of its leaves.
+Orbax does not detect flipped bits in an array, so every checkpoint holds the sha256 of its leaves.
 """
 
 import hashlib
@@ -14,15 +14,16 @@ import jax
 import numpy as np
 import orbax.checkpoint as ocp
 
+from ssplat_jax.checkpoint.saved_config import config_from_header
 from ssplat_jax.errors import InputError, StorageError
 from ssplat_jax.storage.atomic import write_atomic
 
-RECIPE_FILE = "recipe.json"
-DIGEST = "sha256"  # the leaf beside the state's own, which are numbered
+RECIPE_FILE = "recipe.json"  # holds the description of the run
+DIGEST = "sha256"  # name of the digest among the leaves, which are numbered
 
 
 def first_difference(held: Any, wanted: Any, name: str = "") -> tuple[str, Any, Any] | None:
-    """(path, held, wanted) of the first place where two JSON values differ, or None."""
+    """Returns (path, held, wanted) of the first difference between two JSON values, or None."""
     if isinstance(held, dict) and isinstance(wanted, dict):
         pairs = [(f"{name}.{k}".lstrip("."), held.get(k), wanted.get(k)) for k in sorted(held.keys() | wanted.keys())]
     elif isinstance(held, list) and isinstance(wanted, list) and len(held) == len(wanted):
@@ -33,30 +34,37 @@ def first_difference(held: Any, wanted: Any, name: str = "") -> tuple[str, Any, 
 
 
 class TrainingCheckpoints:
-    """Saves and restores training states under `directory`; keeps the last two.
+    """Saves and restores training states in a directory; the last two are kept.
 
     Args:
-        directory: created if absent.
-        description: JSON-able facts that decide the run (recipe, model configuration). A directory that holds a run
-            of another description is refused.
+        directory: created if missing.
+        description: JSON-serializable facts that determine the run, such as the recipe and the model configuration. A
+            directory with another description is refused.
+        upgrade: adds the fields that earlier versions did not write to the description in the directory.
 
     Raises:
         InputError: the directory holds another run.
     """
 
-    def __init__(self, directory: Path, description: dict) -> None:
+    def __init__(
+        self, directory: Path, description: dict, upgrade: Callable[[dict], dict] = lambda description: description
+    ) -> None:
         self.directory = Path(directory).resolve()
         self.directory.mkdir(parents=True, exist_ok=True)
-        self._claim(json.loads(json.dumps(description)))
+        self._claim(json.loads(json.dumps(description)), upgrade)
         options = ocp.CheckpointManagerOptions(max_to_keep=2, create=True, enable_async_checkpointing=False)
         self._manager = ocp.CheckpointManager(self.directory / "checkpoints", options=options)
 
-    def _claim(self, description: dict) -> None:
+    def _claim(self, description: dict, upgrade: Callable[[dict], dict]) -> None:
+        """Writes the description into a new directory, or compares it with that of an existing one."""
         path = self.directory / RECIPE_FILE
         if not path.exists():
             write_atomic(path, json.dumps(description, indent=1, sort_keys=True).encode())
             return
-        if (found := first_difference(json.loads(path.read_text()), description)) is not None:
+        held_description = json.loads(path.read_text())
+        if "chunk_size" in held_description.get("config", {}):  # flat, as version 0.1 wrote it
+            held_description["config"] = config_from_header(held_description["config"]).to_dict()
+        if (found := first_difference(upgrade(held_description), description)) is not None:
             name, held, wanted = found
             raise InputError(
                 f"{path}: this directory holds a run with {name} = {held!r}, wanted {wanted!r}; choose another --out"
@@ -64,7 +72,11 @@ class TrainingCheckpoints:
             )
 
     def save(self, step: int, state) -> None:
-        """Writes `state` as `step`; returns when it is on disk."""
+        """Saves `state` as checkpoint `step`; returns when it is on disk.
+
+        Raises:
+            StorageError: it cannot be written.
+        """
         leaves = {f"{i:04d}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(state))}
         leaves[DIGEST] = _digest(leaves)
         try:
@@ -74,19 +86,23 @@ class TrainingCheckpoints:
             raise StorageError(f"{self.directory}: could not save step {step}: {error}") from error
 
     def restore_latest(self, like, warn: Callable[[str], None]):
-        """(step, state) of the newest checkpoint that is whole, shaped as `like`; None where there is none.
+        """Returns (step, state) of the newest intact checkpoint, or None if there is no checkpoint.
 
-        Damaged ones are put aside as `damaged-<step>`, which `warn` is told.
+        Newer, damaged checkpoints are renamed to `damaged-<step>`.
+
+        Args:
+            like: a state of the same structure, shapes and types.
+            warn: called with a message for each damaged checkpoint.
 
         Raises:
-            StorageError: all are damaged; they stay where they are.
+            StorageError: all checkpoints are damaged; they are left in place.
         """
         steps = sorted(self._manager.all_steps(), reverse=True)
         for number, step in enumerate(steps):
             if (state := self._restore(step, like)) is None:
                 continue
             for damaged in steps[:number]:
-                warn(f"{self.directory}: checkpoint {damaged} is damaged; going on from that of step {step}.")
+                warn(f"{self.directory}: checkpoint {damaged} is damaged; continuing from step {step}.")
                 aside = self.directory / f"damaged-{damaged}"
                 os.replace(self._manager.directory / str(damaged), aside)
             self._manager.reload()
@@ -99,13 +115,13 @@ class TrainingCheckpoints:
         return None
 
     def _restore(self, step: int, like):
-        """The state of `step`, or None if it cannot be read or is not what was saved."""
+        """State of checkpoint `step`, or None if it is damaged."""
         leaves, treedef = jax.tree.flatten(like)
         abstract = {f"{i:04d}": jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for i, leaf in enumerate(leaves)}
         abstract[DIGEST] = jax.ShapeDtypeStruct((32,), np.uint8)
         try:
             held = self._manager.restore(step, args=ocp.args.StandardRestore(abstract))
-        except Exception:  # Orbax raises whatever the damaged part makes it stumble over
+        except Exception:  # a damaged checkpoint can make Orbax raise anything
             return None
         arrays = {name: np.asarray(leaf) for name, leaf in held.items()}
         if not np.array_equal(arrays.pop(DIGEST), _digest(arrays)):
@@ -118,7 +134,7 @@ class TrainingCheckpoints:
 
 
 def _digest(leaves: dict[str, np.ndarray]) -> np.ndarray:
-    """sha256 of names, types, shapes and values, as 32 bytes."""
+    """sha256 of the names, types, shapes and values of the leaves, as 32 bytes."""
     digest = hashlib.sha256()
     for name, leaf in sorted(leaves.items()):
         digest.update(f"{name} {leaf.dtype} {leaf.shape}".encode())

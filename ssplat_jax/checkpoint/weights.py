@@ -1,4 +1,4 @@
-"""Weights files: parameters by path, float16 on disk (imported ones float32), float32 in use."""
+"""Weights files: parameters by path, stored as float16 (imported ones as float32) and loaded as float32."""
 
 import hashlib
 from collections.abc import Mapping
@@ -11,24 +11,32 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ssplat_jax.checkpoint.saved_config import config_from_header
 from ssplat_jax.config import PRESETS, StreamConfig, preset
 from ssplat_jax.errors import InputError, StorageError
 from ssplat_jax.model import init_params
 from ssplat_jax.storage.npz import load_arrays, save_arrays
 
-KIND = "weights"
+KIND = "weights"  # kind of the file
 
 
 def save_weights(
     path: Path, params: dict, config: StreamConfig, provenance: dict, dtype: type[np.floating] = np.float16
 ) -> None:
-    """Writes the parameters of a model with `config`; `provenance` says how they came to be (steps, data, scores).
+    """Writes the parameters of a model and its configuration to a weights file.
+
+    Args:
+        path: the file to write.
+        params: parameters, as nested dicts.
+        config: the configuration of the model.
+        provenance: JSON-serializable facts about the training (steps, data, scores).
+        dtype: type of the parameters on disk.
 
     Raises:
-        StorageError: a value is not finite, or too large for `dtype`.
+        StorageError: a value is not finite or too large for `dtype`, or the file cannot be written.
     """
-    leaves = {"/".join(k.key for k in keys): leaf for keys, leaf in jax.tree_util.tree_flatten_with_path(params)[0]}
-    with np.errstate(over="ignore"):  # becomes infinite, and is refused below
+    leaves = _by_path(params)
+    with np.errstate(over="ignore"):  # values that overflow become infinite and are refused below
         arrays = {name: np.asarray(leaf, dtype) for name, leaf in leaves.items()}
     if bad := [name for name, x in arrays.items() if not np.isfinite(x).all()]:
         raise StorageError(f"{path}: {bad[0]} has values beyond {np.dtype(dtype)} or not finite; not saved.")
@@ -36,23 +44,23 @@ def save_weights(
 
 
 def load_weights(path: Path) -> tuple[dict, StreamConfig]:
-    """(params, config) of a weights file.
+    """Reads (params, config) from a weights file.
 
     Raises:
-        StorageError: missing, corrupt or of another kind.
-        InputError: weights whose shapes its configuration does not give.
+        StorageError: the file is missing, damaged or of another kind.
+        InputError: the parameters do not have the shapes of the file's configuration.
     """
     arrays, header = load_arrays(path, KIND)
-    config = StreamConfig.from_dict(header["config"])
+    config = config_from_header(header["config"])
     return _restore(path, arrays, config), config
 
 
 def load_params(name: str = "tiny") -> dict:
-    """Trained parameters: the shipped ones of a preset, or those of a weights file.
+    """Returns trained parameters: those shipped with the preset `name`, or those of the weights file `name`.
 
     Raises:
-        InputError: no preset and no file of that name, or weights of other shapes.
-        StorageError: the file is corrupt.
+        InputError: there is no such preset or file, no weights ship with the preset, or the shapes do not match.
+        StorageError: the file is damaged.
     """
     if name not in PRESETS:
         if not Path(name).is_file():
@@ -71,38 +79,43 @@ def load_params(name: str = "tiny") -> dict:
 
 
 def _shipped(preset_name: str) -> Traversable:
-    """Where the package holds the weights of a preset, if it has them."""
+    """Location of the weights that ship with a preset; the file may not exist."""
     return resources.files("ssplat_jax") / "weights" / f"{preset_name}.npz"
 
 
 def params_digest(params: dict) -> str:
-    """Twelve hex digits that name these parameters in saved states."""
+    """Digest of the parameters (12 hex digits), which identifies them in saved states."""
     digest = hashlib.sha256()
-    for leaf in jax.tree.leaves(params):  # dicts are traversed in the order of their keys
+    for leaf in jax.tree.leaves(params):  # jax.tree traverses dicts in the order of their keys
         digest.update(np.ascontiguousarray(leaf).tobytes())
     return digest.hexdigest()[:12]
 
 
 def check_params(params: dict, config: StreamConfig, origin: str) -> None:
-    """Whether `params` are those of a model with `config`.
+    """Checks that `params` has the parameters of a model with `config`; additional ones are allowed.
 
     Raises:
-        InputError: `config` wants parameters that are not there or of other shapes (more than it wants, as for
-            `mixer_blocks=0`, is no fault); `origin` says where the parameters came from.
+        InputError: a parameter is missing or has another shape; the message names `origin`, the source of `params`.
     """
-    named = {"/".join(k.key for k in keys): leaf for keys, leaf in jax.tree_util.tree_flatten_with_path(params)[0]}
-    _restore(origin, named, config)
+    _restore(origin, _by_path(params), config)
+
+
+def _by_path(params: dict) -> dict[str, Any]:
+    """Leaves of the parameter tree by their path, such as `encoder/conv1/kernel`."""
+    return {"/".join(k.key for k in keys): leaf for keys, leaf in jax.tree_util.tree_flatten_with_path(params)[0]}
 
 
 def _restore(path: Path | str, arrays: Mapping[str, Any], config: StreamConfig) -> dict:
-    """Arrays by path as the tree that `config` wants, every shape checked."""
+    """Builds the parameter tree of a model with `config` from arrays by path, and checks their shapes."""
     wanted = jax.eval_shape(lambda key: init_params(key, config), jax.random.key(0))
 
     def leaf(keys, shape):
         name = "/".join(k.key for k in keys)
         if name not in arrays or arrays[name].shape != shape.shape:
             came = arrays[name].shape if name in arrays else "nothing"
-            raise InputError(f"{path}: {name} must be {shape.shape}, got {came}; the weights are of another config.")
+            raise InputError(
+                f"{path}: {name} must be {shape.shape}, got {came}; the weights belong to another configuration."
+            )
         return jnp.asarray(arrays[name], jnp.float32)
 
     return jax.tree_util.tree_map_with_path(leaf, wanted)

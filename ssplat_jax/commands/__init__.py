@@ -1,1 +1,1 @@
-"""The `ssplat` command line, a command a file."""
+"""The `ssplat` command line: one file per command."""

@@ -1,4 +1,6 @@
-"""Posed captures: reading them, putting them into the stream frame, choosing frames. NumPy and Pillow until the chunk.
+"""Posed captures: readers, the stream frame, and the choice and order of frames.
 
-path -> readers/ -> Frame (checked) -> Capture -> scale.py -> StreamFrame -> chunks
+    path -> readers/ -> Frame (checked) -> Capture -> depth_range.py -> StreamFrame -> chunks
+
+Everything is NumPy and Pillow up to the chunks, which are JAX arrays.
 """

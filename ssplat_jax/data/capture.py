@@ -1,7 +1,7 @@
-"""`open_capture`: a folder of posed images, or a procedural scene, as frames that are checked before anything runs.
+"""`open_capture`: posed images from a folder or a procedural scene, checked when they are opened.
 
-Opening reads poses, intrinsics and image headers; images are decoded when asked for. `verify` decodes those a run will
-use, so that damage is found before anything is written.
+Opening a capture reads poses, intrinsics and image headers; images are decoded on request. `verify` decodes the images
+that a run will use, so that damaged files are found before anything is written.
 """
 
 import dataclasses
@@ -20,42 +20,42 @@ from ssplat_jax.chunk import Chunk
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.data.depth_range import estimate_depths, stream_scale
 from ssplat_jax.data.images import ArrayPixels, Crop, FilePixels, Pixels, decode_all, resize_depth, resize_image
-from ssplat_jax.data.interleave import deal
+from ssplat_jax.data.interleave import interleave
 from ssplat_jax.data.posed_image import Frame, check_camtoworld, check_intrinsics
 from ssplat_jax.data.readers import Listing, colmap, realestate10k, scannet, transforms_json, tum
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.errors import echo, refusal
 from ssplat_jax.geometry.cameras import Camera
 
-READERS = (transforms_json, colmap, scannet, tum, realestate10k)  # the first that matches reads
-PROCEDURAL = "procedural"
+READERS = (transforms_json, colmap, scannet, tum, realestate10k)  # the first one that matches reads the capture
+PROCEDURAL = "procedural"  # scheme of the paths of procedural captures
 PROCEDURAL_FRAMES = 73  # 64 context views and the 9 interleaved targets between them
-PROCEDURAL_SIZE = (128, 96)  # (width, height): a demo on two cores ends within two minutes
-MAX_SIDE = 16384  # of a delivered image
+PROCEDURAL_SIZE = (128, 96)  # (width, height); the demo takes less than two minutes on two cores at this size
+MAX_SIDE = 16384  # pixels of a delivered image
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Capture:
-    """Posed images in the order in which they are streamed. Poses and intrinsics float64, OpenCV axes."""
+    """Posed images of one size, in the order of the reader. Poses and intrinsics are float64, with OpenCV axes."""
 
     name: str
     format: str
-    frames: tuple[Frame, ...]  # as stored
+    frames: tuple[Frame, ...]  # the stored images, before they are resized
     pixels: Pixels
     width: int  # of the delivered images
     height: int
-    notes: tuple[str, ...] = ()  # what reading found worth telling
+    notes: tuple[str, ...] = ()  # messages of the reader for the user
 
     def __len__(self) -> int:
         return len(self.frames)
 
     @property
     def camtoworlds(self) -> Float64[np.ndarray, "v 4 4"]:
-        """All poses, capture frame."""
+        """Camera-to-world poses of all frames, in the capture frame."""
         return np.stack([frame.camtoworld for frame in self.frames])
 
     def digest(self, indices: Sequence[int]) -> str:
-        """Twelve hex digits that name the poses, intrinsics, lenses and file names of the frames `indices`."""
+        """Digest (12 hex digits) of the poses, intrinsics, lenses and file names of the frames `indices`."""
         digest = hashlib.sha256()
         for frame in (self.frames[i] for i in indices):
             digest.update(f"{frame.name}\n".encode())
@@ -65,9 +65,9 @@ class Capture:
         return digest.hexdigest()[:12]
 
     def images_digest(self, indices: Sequence[int]) -> str:
-        """Twelve hex digits that name the image files of the frames `indices` by their bytes, on all cores.
+        """Digest (12 hex digits) of the bytes of the image files of the frames `indices`; uses all cores.
 
-        Images in memory are made from the capture's name.
+        Images without a file are ignored: procedural images follow from the name of the capture.
         """
 
         def digest_file(path: Path) -> bytes:
@@ -79,20 +79,20 @@ class Capture:
             return hashlib.sha256(b"".join(pool.map(digest_file, paths))).hexdigest()[:12]
 
     def scaled(self, factor: float) -> "Capture":
-        """The same capture with images of `factor` times the size, at least one pixel."""
+        """Returns the same capture with images `factor` times as large, at least one pixel."""
         width, height = (max(1, round(side * factor)) for side in (self.width, self.height))
         return dataclasses.replace(self, width=width, height=height)
 
     def crop(self, i: int) -> Crop:
-        """What the delivered image shows of the stored one."""
+        """The part of stored image `i` that the delivered image shows."""
         return Crop.cover((self.frames[i].width, self.frames[i].height), (self.width, self.height))
 
     def K(self, i: int) -> Float64[np.ndarray, "3 3"]:
-        """Intrinsics of the delivered image, pixels."""
+        """Intrinsics of delivered image `i`, in pixels."""
         return self.crop(i).intrinsics(self.frames[i].K)
 
     def image(self, i: int) -> Float32[np.ndarray, "h w 3"]:
-        """RGB in [0, 1], at the capture's size.
+        """Returns image `i` as RGB in [0, 1], at the size of the capture.
 
         Raises:
             InputError: the file is damaged.
@@ -101,17 +101,17 @@ class Capture:
         return image if crop.is_identity else resize_image(image, crop)
 
     def depth(self, i: int) -> Float32[np.ndarray, "h w"] | None:
-        """Camera z in capture units at the capture's size, 0 where unknown; None without a depth map."""
+        """Returns depth map `i` (camera z in capture units, 0 where unknown), or None if the frame has none."""
         depth, frame, crop = self.pixels.depth(i), self.frames[i], self.crop(i)
         if depth is None or (crop.is_identity and depth.shape == (self.height, self.width)):
             return depth
         return resize_depth(depth, crop, (frame.width, frame.height))
 
-    def check_apart(self, out: Path) -> None:
-        """Refuses results among the capture's own files: what stands in `out` is cleared and written over.
+    def check_output_folder(self, out: Path) -> None:
+        """Checks that the capture's files do not lie in the output folder, whose contents are overwritten.
 
         Raises:
-            InputError: an image or depth map lies in `out` or below.
+            InputError: an image or depth map lies in `out` or in a folder below it.
         """
         folder = out.resolve()
         for frame in self.frames:
@@ -121,18 +121,20 @@ class Capture:
                     raise refusal(str(out), wanted="a folder for results alone", got=got, fix=fix)
 
     def verify(self, indices: Sequence[int] | None = None) -> None:
-        """Decodes the images and depth maps of `indices` (default all) once, on all cores: about 1 ms for 480x360.
+        """Decodes the images and depth maps of the frames `indices` (default: all) to find damaged files.
+
+        Decoding uses all cores and takes about 1 ms per image of 480x360 pixels.
 
         Raises:
-            InputError: naming the first damaged file.
+            InputError: a file is damaged; the message names the first one.
         """
         decode_all(self.pixels, range(len(self)) if indices is None else indices)
 
     def stream_frame(self, config: StreamConfig, indices: Sequence[int] | None = None) -> StreamFrame:
-        """The stream frame of a run over the frames `indices` (default all): its first camera, scale and depth range.
+        """Returns the stream frame of a run over the frames `indices` (default: all).
 
-        Near, far and the automatic scale come from matches among these frames only (`data.scale`), so a capture's other
-        frames, the targets of an evaluation among them, have no say.
+        Near, far and the automatic scale are estimated from these frames only (`data.depth_range`); the other frames,
+        which include the targets of an evaluation, have no influence.
         """
         used = _indices(self, indices)
         depths = estimate_depths(self, used)
@@ -141,19 +143,19 @@ class Capture:
         return StreamFrame.at_camera(first, scale=scale, near=near, far=far, warning=depths.warning)
 
     def camera(self, i: int, frame: StreamFrame) -> Camera:
-        """The camera of frame `i` in the stream frame."""
+        """Returns the camera of frame `i` in the stream frame."""
         viewmat = frame.viewmats(self.frames[i].camtoworld)
         K = self.K(i).astype(np.float32)
         return Camera(viewmats=jnp.asarray(viewmat), Ks=jnp.asarray(K), width=self.width, height=self.height)
 
     def stream_order(self, config: StreamConfig, indices: Sequence[int] | None, frame: StreamFrame) -> list[int]:
-        """`indices` (default all) as `run`, `eval` and `demo` stream them: video dealt out (`data.order`).
+        """Returns `indices` (default: all) in the order of streaming, with slow video interleaved (`data.interleave`).
 
-        The typical depth is taken to be the geometric mean of the sweep's ends.
+        The typical depth is taken to be the geometric mean of `near` and `far`.
         """
         used = _indices(self, indices)
         centers = np.stack([self.frames[i].center for i in used])
-        return deal(
+        return interleave(
             centers,
             used,
             config.stream.chunk_size,
@@ -163,12 +165,15 @@ class Capture:
     def chunks(
         self, config: StreamConfig, indices: Sequence[int] | None = None, *, frame: StreamFrame | None = None
     ) -> Iterator[Chunk]:
-        """The frames `indices`, as they stand, in chunks of `config.stream.chunk_size`; a thread reads one chunk ahead.
+        """Yields chunks of `config.stream.chunk_size` views; a thread reads one chunk ahead.
 
-        Without `indices`: all frames, in `stream_order`.
+        The last chunk is padded with invalid views: black images with the identity pose and the intrinsics of the
+        chunk's first view.
 
-        The last chunk is padded to full size with views that are not valid: black images, the identity pose, the
-        intrinsics of the chunk's first view. `frame` defaults to `stream_frame(config, indices)`.
+        Args:
+            config: the configuration of the model.
+            indices: frames in the order of streaming; by default all frames, in `stream_order`.
+            frame: by default `stream_frame(config, indices)`.
         """
         used = _indices(self, indices)
         frame = frame or self.stream_frame(config, used)
@@ -191,7 +196,7 @@ class Capture:
                 )
 
     def _views(self, group: Sequence[int], chunk_size: int, frame: StreamFrame) -> tuple[np.ndarray, ...]:
-        """Images, viewmats, Ks and valid of one chunk, padded."""
+        """Images, viewmats, Ks and validity of one padded chunk."""
         images = np.zeros((chunk_size, self.height, self.width, 3), np.float32)
         viewmats = np.tile(np.eye(4, dtype=np.float32), (chunk_size, 1, 1))
         Ks = np.tile(self.K(group[0]).astype(np.float32), (chunk_size, 1, 1))
@@ -202,13 +207,16 @@ class Capture:
 
 
 def open_capture(path: str | Path, *, size: tuple[int, int] | None = None) -> Capture:
-    """The capture at `path`: a folder in one of the formats of `readers`, its file, or `procedural:NAME`.
+    """Opens the capture at `path`.
 
-    `procedural:room?frames=73&size=128x96&seed=0`; scenes are room, orbit, corridor. `size` is the (width, height) of
-    delivered images: stored ones are scaled to cover it and cropped at the center, `K` following exactly.
+    Args:
+        path: a folder or file in one of the formats of `data.readers`, or a procedural scene (room, orbit, corridor),
+            such as `procedural:room?frames=73&size=128x96&seed=0`.
+        size: (width, height) of delivered images. Stored images are scaled to cover it and cropped at the center, and
+            the intrinsics follow exactly. By default the size of the stored images.
 
     Raises:
-        InputError: nothing readable there, or anything in it is unusable; names the file and field.
+        InputError: there is no capture at `path`, or a file or field of it is unusable; the message names it.
     """
     if size is not None and not all(1 <= side <= MAX_SIDE for side in size):
         raise refusal("size", wanted=f"sides of 1 to {MAX_SIDE}", got=echo(size), fix="give WIDTHxHEIGHT in pixels")
@@ -218,7 +226,7 @@ def open_capture(path: str | Path, *, size: tuple[int, int] | None = None) -> Ca
         folder = Path(path).expanduser()
         found = next((reader for reader in READERS if reader.matches(folder)), None)
         exists = folder.exists()
-    except (OSError, RuntimeError, ValueError) as error:  # no such user, too long a name, no permission
+    except (OSError, RuntimeError, ValueError) as error:  # unknown user, name too long, no permission
         raise refusal(str(path)[:80], wanted="a path", got=str(error)[:200], fix="check the path") from None
     if found is not None:
         listing = found.read(folder)
@@ -234,7 +242,7 @@ def open_capture(path: str | Path, *, size: tuple[int, int] | None = None) -> Ca
 
 
 def _capture(listing: Listing, format: str, pixels: Pixels, size: tuple[int, int] | None) -> Capture:
-    """A capture whose images all have one size."""
+    """Capture of a listing whose images all have one size."""
     if size is None:
         first = listing.frames[0]
         size = (first.width, first.height)
@@ -254,7 +262,7 @@ def _capture(listing: Listing, format: str, pixels: Pixels, size: tuple[int, int
 
 
 def _indices(capture: Capture, indices: Sequence[int] | None) -> list[int]:
-    """The frames to use, checked."""
+    """Returns `indices`, checked, or those of all frames."""
     used = list(range(len(capture)) if indices is None else indices)
     if not used or not all(0 <= i < len(capture) for i in used):
         wanted = f"frame numbers in [0, {len(capture) - 1}], at least one"
@@ -263,7 +271,7 @@ def _indices(capture: Capture, indices: Sequence[int] | None) -> list[int]:
 
 
 def _procedural(spec: str, size: tuple[int, int] | None) -> Capture:
-    """The scene that `spec` names, ray-cast at once (at `size` unless the spec has its own)."""
+    """Procedural capture `spec`, rendered immediately; a size in `spec` comes before `size`."""
     name, _, query = spec.removeprefix(f"{PROCEDURAL}:").partition("?")
     options = dict(parse_qsl(query, keep_blank_values=True))
     if unknown := sorted(set(options) - {"frames", "size", "seed"}):
@@ -277,7 +285,7 @@ def _procedural(spec: str, size: tuple[int, int] | None) -> Capture:
         if len(sides) != 2:
             raise refusal(f"{spec}: size", wanted="WIDTHxHEIGHT", got=echo(options["size"]), fix="write 128x96")
         width, height = (_whole(spec, "size", side, 8, MAX_SIDE) for side in sides)
-    # Imported here: the scenes bring their textures along, which no other capture needs.
+    # Imported here because the scenes load their textures, which no other capture needs.
     from ssplat_jax.data.procedural import procedural_capture_arrays
 
     images, depths, camtoworlds, Ks = procedural_capture_arrays(name, num_frames, height, width, seed=seed)
@@ -298,7 +306,9 @@ def _procedural(spec: str, size: tuple[int, int] | None) -> Capture:
 
 
 def _whole(spec: str, option: str, text: str, low: int, high: int) -> int:
-    """A whole number of the spec."""
+    """Parses an option of a procedural path as a whole number in [low, high]."""
     if text.isascii() and text.isdigit() and len(text) < 12 and low <= int(text) <= high:
         return int(text)
-    raise refusal(f"{spec}: {option}", wanted=f"a whole number in [{low}, {high}]", got=echo(text), fix="change it")
+    raise refusal(
+        f"{spec}: {option}", wanted=f"a whole number in [{low}, {high}]", got=echo(text), fix="change the option"
+    )

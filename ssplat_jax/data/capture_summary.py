@@ -1,4 +1,4 @@
-"""What `ssplat inspect` tells about a capture: facts, the numbers a run would use, and warnings with their remedies."""
+"""Summary of a capture for `ssplat inspect`: facts, the scale and depth range of a run, and warnings with remedies."""
 
 import dataclasses
 from typing import Any
@@ -7,26 +7,26 @@ import numpy as np
 
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.data.capture import Capture
-from ssplat_jax.data.depth_range import DepthStatistics, estimate_depths, still, stream_scale
+from ssplat_jax.data.depth_range import DepthStatistics, estimate_depths, same_place_distance, stream_scale
 
-LOW_STEP = 0.012  # step between frames over median depth: below it, four frames in a row have hardly any parallax
-GOOD_STEP = 0.03  # what a suggested stride aims at
-HIGH_STEP = 0.6  # beyond it, neighbors hardly overlap
-FOCAL_SPREAD = 4.0  # largest over smallest focal length that passes without a word
-JUMP = 20.0  # a step of this many median steps
+LOW_STEP = 0.012  # step between frames over median depth, below which four consecutive frames have little parallax
+GOOD_STEP = 0.03  # step over median depth that a suggested stride aims at
+HIGH_STEP = 0.6  # step over median depth, above which neighboring frames hardly overlap
+MAX_FOCAL_RATIO = 4.0  # largest over smallest focal length; above it there is a warning
+JUMP_RATIO = 20.0  # step over median step, above which there is a warning
 
 
 @dataclasses.dataclass(frozen=True)
 class Summary:
-    """Facts about a capture. Lengths in capture units, `near`, `far` in stream units (capture x `scene_scale`)."""
+    """Facts about a capture, lengths in capture units but `near` and `far` in stream units (times `scene_scale`)."""
 
     name: str
     format: str
     num_frames: int
     num_depth_maps: int
-    size: tuple[int, int]  # (width, height) delivered
+    size: tuple[int, int]  # (width, height) of delivered images
     stored_size: tuple[int, int]  # of the first frame
-    focal: tuple[float, float]  # delivered pixels, first frame
+    focal: tuple[float, float]  # pixels of the first delivered image
     fov_degrees: tuple[float, float]
     path_length: float
     extent: float  # diagonal of the camera centers' bounding box
@@ -43,15 +43,15 @@ class Summary:
     warnings: tuple[str, ...]
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain JSON types."""
+        """Returns the fields as plain JSON types."""
         return {k: list(v) if isinstance(v, tuple) else v for k, v in dataclasses.asdict(self).items()}
 
 
 def summarize(capture: Capture, config: StreamConfig) -> Summary:
-    """Everything `ssplat inspect` prints.
+    """Returns the summary of a capture for a run with `config`.
 
     Raises:
-        InputError: an image that the depth estimate looks at is damaged.
+        InputError: an image that the depth estimate uses is damaged.
     """
     depths = estimate_depths(capture, range(len(capture)))
     scale, near, far = stream_scale(depths, config)
@@ -85,14 +85,15 @@ def summarize(capture: Capture, config: StreamConfig) -> Summary:
 
 
 def _fov(extent: int, focal: float) -> float:
+    """Field of view in degrees of an image side of `extent` pixels."""
     return float(np.degrees(2 * np.arctan(extent / (2 * focal))))
 
 
 def _warnings(capture: Capture, depths: DepthStatistics, steps: np.ndarray) -> list[str]:
-    """What may go wrong, each with what to do."""
+    """Likely problems of the capture, each with a remedy."""
     if len(capture) == 1:
         return ["One frame: no parallax, so its depth is a guess; add frames from other places."]
-    if not (steps > still(capture)).any():
+    if not (steps > same_place_distance(capture)).any():
         return ["All cameras stand in one place: no parallax, so depth is a guess; add frames from other places."]
     found = []
     step = float(np.median(steps)) / depths.median
@@ -105,14 +106,14 @@ def _warnings(capture: Capture, depths: DepthStatistics, steps: np.ndarray) -> l
         )
     elif step > HIGH_STEP:
         found.append(f"Wide steps: {step:.0%} of the median depth; neighbors hardly overlap, so add frames between.")
-    moved = steps[steps > still(capture)]
-    if (steps > JUMP * np.median(moved)).any():
+    moved = steps[steps > same_place_distance(capture)]
+    if (steps > JUMP_RATIO * np.median(moved)).any():
         i = int(steps.argmax())
         found.append(
             f"A jump of {steps[i] / np.median(moved):.0f} median steps between frames {i} and {i + 1}: "
             "check that the frames are one stream and in order."
         )
     focals = [frame.K[0, 0] for frame in capture.frames]
-    if max(focals) > FOCAL_SPREAD * min(focals):
+    if max(focals) > MAX_FOCAL_RATIO * min(focals):
         found.append(f"Focal lengths from {min(focals):.0f} to {max(focals):.0f} pixels: check the intrinsics.")
     return found

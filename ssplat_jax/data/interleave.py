@@ -1,8 +1,9 @@
-"""The order in which a stream takes its frames: video is dealt out, so that the views of a chunk stand apart.
+"""Interleaving of slow video, so that the views of a chunk are far enough apart to measure depth.
 
-Frames of a video step less than a hundredth of the depth; four in a row cannot tell how far anything is. Dealt into
-`s` chunks like cards, frames 0, s, 2s, 3s come first, then 1, s + 1 and so on: every frame is used, and a frame waits
-for at most the `chunk_size * s` around it. Poses alone decide, so the order is known before an image is read.
+Frames of a video are often less than a hundredth of the depth apart, and four consecutive ones have too little
+parallax. Interleaved over `s` chunks, frames 0, s, 2s, 3s form the first chunk, 1, s + 1, ... the second, and so on:
+every frame is used, and none is delayed by more than a block of `chunk_size * s` frames. The order depends on poses
+only, so it is known before an image is read.
 """
 
 from collections.abc import Sequence
@@ -10,11 +11,12 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float64
 
-MOST_HANDS = 8  # chunks dealt at a time: 32 frames of video, about a second
+MAX_INTERLEAVED_CHUNKS = 8
+"""Largest number of chunks interleaved at a time: with chunks of 4, 32 frames or about a second of video."""
 
 
-def deal(centers: Float64[np.ndarray, "n 3"], indices: Sequence[int], chunk_size: int, step: float) -> list[int]:
-    """`indices` in an order in which the views of a chunk are about `step` apart, or as far as the frames themselves.
+def interleave(centers: Float64[np.ndarray, "n 3"], indices: Sequence[int], chunk_size: int, step: float) -> list[int]:
+    """Orders frames so that consecutive views of a chunk are about `step` apart.
 
     Args:
         centers: camera centers of the frames `indices`, in any unit.
@@ -22,19 +24,19 @@ def deal(centers: Float64[np.ndarray, "n 3"], indices: Sequence[int], chunk_size
         chunk_size: views of a chunk.
         step: wanted distance between consecutive views of a chunk, in the unit of `centers`; 0 keeps the order.
 
-    Limits:
-        Frames that already step `step` or more, and frames that do not move, stay in order.
-        A permutation always: blocks of `chunk_size * s` frames, s between 1 and `MOST_HANDS`, are dealt one by one.
+    Returns:
+        A permutation of `indices`. Blocks of `chunk_size * s` frames are interleaved one after the other, with s from 1
+        to `MAX_INTERLEAVED_CHUNKS`. Frames that are `step` apart already and frames that do not move keep their order.
     """
     steps = np.linalg.norm(np.diff(centers, axis=0), axis=-1)
     order: list[int] = []
     while len(order) < len(indices):
         first = len(order)
-        ahead = steps[first : first + chunk_size * MOST_HANDS - 1]
+        ahead = steps[first : first + chunk_size * MAX_INTERLEAVED_CHUNKS - 1]
         typical = float(np.median(ahead)) if ahead.size else 0.0
-        hands = int(np.clip(round(step / typical), 1, MOST_HANDS)) if typical > 0 else 1
-        block = list(indices[first : first + chunk_size * hands])
-        hands = -(-len(block) // chunk_size)
-        for hand in range(hands):
-            order += block[hand::hands]
+        num_chunks = int(np.clip(round(step / typical), 1, MAX_INTERLEAVED_CHUNKS)) if typical > 0 else 1
+        block = list(indices[first : first + chunk_size * num_chunks])
+        num_chunks = -(-len(block) // chunk_size)
+        for chunk in range(num_chunks):
+            order += block[chunk::num_chunks]
     return order

@@ -1,4 +1,4 @@
-"""Lens distortion of stored images by Brown's model (OpenCV's), and images as by a pinhole camera."""
+"""Lens distortion by the Brown-Conrady model (as in OpenCV), and undistortion of images."""
 
 import dataclasses
 
@@ -8,12 +8,12 @@ from skimage.transform import warp
 
 from ssplat_jax.errors import refusal
 
-IGNORED_PX = 0.5  # images whose pixels move by no more are left as they are
+IGNORED_PX = 0.5  # images with a smaller displacement by distortion are not undistorted
 
 
 @dataclasses.dataclass(frozen=True)
 class Lens:
-    """x_d = x (1 + k1 r^2 + k2 r^4 + k3 r^6 + k4 r^8) + 2 p1 x y + p2 (r^2 + 2 x^2), and y_d likewise."""
+    """Distortion coefficients: x_d = x (1 + k1 r^2 + k2 r^4 + k3 r^6 + k4 r^8) + 2 p1 x y + p2 (r^2 + 2 x^2)."""
 
     k1: float = 0.0
     k2: float = 0.0
@@ -23,7 +23,7 @@ class Lens:
     p2: float = 0.0
 
     def distorted(self, points: Float64[np.ndarray, "*n 2"]) -> Float64[np.ndarray, "*n 2"]:
-        """Where points of the pinhole camera's plane z = 1 appear through the lens."""
+        """Maps points on the plane z = 1 of the pinhole camera to their distorted positions."""
         x, y = points[..., 0], points[..., 1]
         with np.errstate(over="ignore", invalid="ignore"):
             r2 = x * x + y * y
@@ -37,26 +37,38 @@ class Lens:
             )
 
     def pixels(self, K: Float64[np.ndarray, "3 3"], points: Float64[np.ndarray, "*n 2"]) -> Float64[np.ndarray, "*n 2"]:
-        """Pixels of the distorted image for pixels of the pinhole one; both have intrinsics `K`."""
+        """Maps pixels of the pinhole image to pixels of the distorted one; both have the intrinsics `K`."""
         center, focal = K[:2, 2], np.diag(K)[:2]
         with np.errstate(over="ignore", invalid="ignore"):
             return self.distorted((points - center) / focal) * focal + center
 
 
-PINHOLE = Lens()
+PINHOLE = Lens()  # no distortion
 
 
 def check_lens(lens: Lens, K: Float64[np.ndarray, "3 3"], width: int, height: int, where: str) -> float:
-    """Largest displacement in pixels on the image's border.
+    """Returns the largest displacement by distortion on the border of the image, in pixels.
 
-    Limits:
-        A lens that folds the image, or throws pixels farther than the image is large, is refused: such coefficients
-        belong to another model.
+    Args:
+        lens: the distortion.
+        K: intrinsics in pixels.
+        width: image width in pixels.
+        height: image height in pixels.
+        where: location of the coefficients for error messages.
+
+    Returns:
+        The displacement in pixels; exactly 0 without distortion.
+
+    Raises:
+        InputError: the distortion folds the image or moves pixels by more than the image size, so the coefficients
+            probably belong to another model.
     """
     t = np.linspace(0.0, 1.0, 9)
     edge = np.concatenate([np.stack(np.broadcast_arrays(t, s), -1) for s in (0.0, 1.0)])
     border = np.concatenate([edge, edge[:, ::-1]]) * (width, height)
-    spokes = K[:2, 2] + np.linspace(0.0, 1.0, 33)[:, None, None] * (border - K[:2, 2])  # principal point to border
+    spokes = K[:2, 2] + np.linspace(0.0, 1.0, 33)[:, None, None] * (
+        border - K[:2, 2]
+    )  # lines from the principal point to the border
     moved = lens.pixels(K, spokes)
     with np.errstate(over="ignore", invalid="ignore"):
         rays = (border - K[:2, 2]) / np.diag(K)[:2]
@@ -70,12 +82,19 @@ def check_lens(lens: Lens, K: Float64[np.ndarray, "3 3"], width: int, height: in
     return shift
 
 
-def undistorted(
+def undistort(
     image: Float32[np.ndarray, "h w *c"], lens: Lens, K: Float64[np.ndarray, "3 3"], *, order: int = 1
 ) -> Float32[np.ndarray, "h w *c"]:
-    """The image that a pinhole camera of intrinsics `K` would have taken.
+    """Returns the image that a pinhole camera would have taken.
 
-    Sampled linearly (`order` 0: nearest, for depth); what lies beyond the stored image repeats its border.
+    Args:
+        image: the distorted image, or a depth map.
+        lens: its distortion.
+        K: intrinsics of both images, in pixels.
+        order: 1 samples linearly, 0 takes the nearest pixel (for depth maps).
+
+    Returns:
+        The undistorted image; pixels outside the stored image repeat its border.
     """
     rows, columns = np.mgrid[: image.shape[0], : image.shape[1]]
     pixels = lens.pixels(K, np.stack([columns, rows], axis=-1) + 0.5) - 0.5

@@ -1,6 +1,6 @@
-"""`Frame`: one posed image of a capture, and the checks that every reader's cameras pass through.
+"""`Frame`, one posed image of a capture, and the checks of poses and intrinsics that all readers use.
 
-Poses and intrinsics are float64: float32 has a step of 0.5 m at earth-centered coordinates.
+Poses and intrinsics are float64, because float32 has a spacing of 0.5 m at earth-centered coordinates.
 """
 
 import dataclasses
@@ -13,28 +13,28 @@ from jaxtyping import Float64
 from ssplat_jax.data.lens import Lens
 from ssplat_jax.errors import echo, refusal
 
-ROTATION_TOLERANCE = 5e-3  # largest |R^T R - I| that is taken for rounding, to three decimals, and projected
-ROTATION_ROUNDING = 1e-5  # deviations beyond this are reported
-MILLIMETER = 1e-3
-MIN_FOCAL_PX = 3.0  # smaller focal lengths are intrinsics in units of the image, not in pixels
+ROTATION_TOLERANCE = 5e-3  # largest |R^T R - I| that rounding to three decimals explains; larger ones are refused
+ROTATION_ROUNDING = 1e-5  # deviations above this are reported to the user
+MILLIMETER = 1e-3  # meters
+MIN_FOCAL_PX = 3.0  # smaller focal lengths are taken to be in units of the image size instead of pixels
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Frame:
-    """One posed image as stored, before any change of size."""
+    """One posed image as stored, before it is resized."""
 
-    name: str  # as the capture calls it
+    name: str  # in the capture's files
     camtoworld: Float64[np.ndarray, "4 4"]  # OpenCV axes, capture frame
-    K: Float64[np.ndarray, "3 3"]  # pixels of the stored image, first pixel's center at (0.5, 0.5)
+    K: Float64[np.ndarray, "3 3"]  # pixels of the stored image; the center of the first pixel is (0.5, 0.5)
     width: int
     height: int
-    path: Path | None = None  # None: the image lives in memory
+    path: Path | None = None  # None: the image is in memory
     depth_path: Path | None = None  # 16-bit PNG
-    depth_unit: float = MILLIMETER  # capture units of one step of its values
+    depth_unit: float = MILLIMETER  # capture units per step of the depth image
     pose_deviation: float = 0.0  # |R^T R - I| before projection
-    shrink: float = 1.0  # of the stored image against the one that the intrinsics were given for
-    lens: Lens | None = None  # distortion of the stored image, undone when it is delivered
-    distortion_px: float = 0.0  # largest displacement by distortion, ignored or undone
+    shrink: float = 1.0  # size of the stored image over the size that the intrinsics were given for
+    lens: Lens | None = None  # distortion of the stored image, removed when the image is delivered
+    distortion_px: float = 0.0  # largest displacement by distortion, whether it is ignored or removed
 
     @property
     def center(self) -> Float64[np.ndarray, "3"]:
@@ -43,11 +43,18 @@ class Frame:
 
 
 def check_camtoworld(matrix: object, where: str) -> tuple[Float64[np.ndarray, "4 4"], float]:
-    """A rigid camera-to-world transform from numbers of outside, and how far its rotation was from one.
+    """Checks a camera-to-world matrix, 4x4 or 3x4, and replaces its rotation by the nearest one.
 
-    Limits:
-        |R^T R - I| <= 5e-3: replaced by the nearest rotation. Beyond: refused.
-        det R < 0 (a mirrored frame): refused.
+    Args:
+        matrix: untrusted values.
+        where: location of the matrix for error messages.
+
+    Returns:
+        The rigid transform, and the deviation |R^T R - I| of the given rotation.
+
+    Raises:
+        InputError: the matrix is not of numbers or of another shape, |R^T R - I| is above `ROTATION_TOLERANCE`, or
+            the rotation is a reflection.
     """
     try:
         pose = np.array(matrix, dtype=np.float64)
@@ -70,7 +77,7 @@ def check_camtoworld(matrix: object, where: str) -> tuple[Float64[np.ndarray, "4
     with np.errstate(over="ignore", invalid="ignore"):
         deviation = float(np.nan_to_num(np.abs(rotation.T @ rotation - np.eye(3)).max(), nan=np.inf))
     if deviation > ROTATION_TOLERANCE:
-        got = f"R^T R off the identity by {deviation:.2g}"
+        got = f"R^T R that differs from the identity by {deviation:.2g}"
         raise refusal(
             where, wanted="a rotation (no scale, no shear)", got=got, fix="divide the scale out of the matrix"
         )
@@ -82,11 +89,16 @@ def check_camtoworld(matrix: object, where: str) -> tuple[Float64[np.ndarray, "4
     return pose, deviation
 
 
-def pose_of(wxyz: object, translation: object, where: str) -> Float64[np.ndarray, "4 4"]:
-    """The rigid transform of a quaternion and a translation from outside.
+def pose_from_quat(wxyz: object, translation: object, where: str) -> Float64[np.ndarray, "4 4"]:
+    """Returns the rigid transform of a quaternion, which is normalized, and a translation.
 
-    Limits:
-        Quaternions of any length are normalized; one shorter than 1e-6 is no rotation and is refused.
+    Args:
+        wxyz: untrusted quaternion.
+        translation: untrusted vector.
+        where: location of the values for error messages.
+
+    Raises:
+        InputError: a value is not finite, or the quaternion is shorter than 1e-6.
     """
     quat, translation = np.asarray(wxyz, np.float64), np.asarray(translation, np.float64)
     length = float(np.linalg.norm(quat))
@@ -106,8 +118,8 @@ def pose_of(wxyz: object, translation: object, where: str) -> Float64[np.ndarray
     return pose
 
 
-def inverse(pose: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "4 4"]:
-    """The inverse of a rigid transform."""
+def invert_pose(pose: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "4 4"]:
+    """Returns the inverse of a rigid transform."""
     back = np.eye(4)
     back[:3, :3] = pose[:3, :3].T
     back[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
@@ -117,7 +129,23 @@ def inverse(pose: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "4 4"]:
 def check_intrinsics(
     *, fx: float, fy: float, cx: float, cy: float, width: int, height: int, where: str
 ) -> Float64[np.ndarray, "3 3"]:
-    """The 3x3 matrix of plausible pixel intrinsics."""
+    """Returns the intrinsics matrix of checked values.
+
+    Args:
+        fx: focal length in x, pixels.
+        fy: focal length in y, pixels.
+        cx: principal point in x, pixels; the center of the first pixel is 0.5.
+        cy: principal point in y, pixels.
+        width: image width, pixels.
+        height: image height, pixels.
+        where: location of the values for error messages.
+
+    Returns:
+        The 3x3 matrix K.
+
+    Raises:
+        InputError: a focal length is not positive or not in pixels, or the principal point is outside the image.
+    """
     for name, focal in (("fl_x", fx), ("fl_y", fy)):
         if not (math.isfinite(focal) and focal > 0):
             fix = "give the focal length in pixels"

@@ -1,10 +1,10 @@
-"""Which frames are context and which are targets. Pure functions of counts, so that a result can be repeated anywhere.
+"""Split of a capture's frames into context views and targets; a function of counts only, so splits are reproducible.
 
-interleaved   of the frames taken with a stride, those at positions 4, 12, 20, ... are targets and the first V others
-              are context; targets outside the context's span are left out, since nothing can be known there.
-paper         StreamSplat's appendix: targets uniform over the trajectory, end points inclusive; context is the first V
-              of the rest. ScanNet's runs thin the trajectory to 1088 frames and put 8 anchors, spread over the rest,
-              in front.
+interleaved   Of every `stride`-th frame, those at positions 4, 12, 20, ... are targets, and the first V others are
+              context. Targets outside the span of the context are dropped, since they show unseen space.
+paper         The protocol of StreamSplat's appendix: targets are uniform over the trajectory, including both ends, and
+              the first V of the other frames are context. On ScanNet the trajectory is thinned to 1088 frames, and 8
+              anchors, spread over it, come first.
 """
 
 import dataclasses
@@ -15,34 +15,34 @@ import numpy as np
 
 from ssplat_jax.errors import refusal
 
-FIRST_TARGET, TARGET_STEP = 4, 8  # positions of the interleaved targets
+FIRST_TARGET, TARGET_STEP = 4, 8  # first position and spacing of the interleaved targets
 
 
 @dataclasses.dataclass(frozen=True)
 class Split:
-    """Frame numbers of a run, disjoint by construction."""
+    """Context and target frames of a run; a frame occurs only once."""
 
     protocol: str
-    context: tuple[int, ...]  # in the order in which they are streamed
+    context: tuple[int, ...]  # in the order of streaming
     targets: tuple[int, ...]
 
     def __post_init__(self) -> None:
         used = self.context + self.targets
         if len(set(used)) != len(used):
-            raise ValueError("a frame stands twice in the split, as context, as target or as both.")
+            raise ValueError("a frame occurs twice in the split.")
 
     def to_json(self) -> str:
-        """Canonical JSON: the same split gives the same text."""
+        """Returns canonical JSON: equal splits give equal text."""
         return json.dumps(dataclasses.asdict(self), sort_keys=True, separators=(",", ":"))
 
     @property
     def sha256(self) -> str:
-        """Names the split in results."""
+        """Digest that identifies the split in results."""
         return hashlib.sha256(self.to_json().encode()).hexdigest()
 
 
-def interleaved(num_frames: int, stride: int, context: int) -> Split:
-    """Every 8th frame of those taken with `stride` is a target, from position 4 on; the first `context` others stream.
+def interleaved_split(num_frames: int, stride: int, context: int) -> Split:
+    """Returns the interleaved split: every 8th strided frame is a target, the first `context` others are context.
 
     Raises:
         InputError: too few frames for `context` views and one target between them.
@@ -54,19 +54,29 @@ def interleaved(num_frames: int, stride: int, context: int) -> Split:
     chosen = _first(pool, context, num_frames, f"with stride {stride}")
     targets = [i for i, target in zip(taken, is_target, strict=True) if target and chosen[0] < i < chosen[-1]]
     if not targets:
-        got = f"{context} (the first target stands at position {FIRST_TARGET})"
+        got = f"{context} (the first target is at position {FIRST_TARGET})"
         fix = f"ask for at least {FIRST_TARGET + 1}"
         raise refusal("context", wanted="enough views to span a target", got=got, fix=fix)
     return Split(protocol="interleaved", context=tuple(chosen), targets=tuple(targets))
 
 
-def paper(num_frames: int, context: int, *, targets: int = 16, anchors: int = 0, thin_to: int | None = None) -> Split:
-    """The paper's appendix: `targets` uniform frames, then the first `context` of the rest, `anchors` of them up front.
+def paper_split(
+    num_frames: int, context: int, *, targets: int = 16, anchors: int = 0, thin_to: int | None = None
+) -> Split:
+    """Returns the split of the paper's appendix; the defaults are those for DL3DV and RE10K.
 
-    DL3DV and RE10K: the defaults. ScanNet: targets=64, anchors=8, thin_to=1088.
+    Args:
+        num_frames: length of the trajectory.
+        context: number of context views.
+        targets: number of targets (ScanNet: 64), uniform over the trajectory.
+        anchors: number of context views (ScanNet: 8) that are spread over the trajectory and come first.
+        thin_to: number of frames to which the trajectory is thinned first (ScanNet: 1088); None keeps all.
+
+    Returns:
+        The split.
 
     Raises:
-        InputError: the trajectory is too short.
+        InputError: the trajectory is too short, or a count is not positive.
     """
     _check_counts(context=context, targets=targets)
     if not 0 <= anchors <= context:
@@ -84,11 +94,12 @@ def paper(num_frames: int, context: int, *, targets: int = 16, anchors: int = 0,
 
 
 def _uniform(length: int, count: int) -> list[int]:
-    """Up to `count` different positions in [0, length), evenly spread, both ends included."""
+    """Up to `count` distinct, evenly spaced positions in [0, length), including both ends."""
     return np.unique(np.linspace(0, max(length - 1, 0), count).round().astype(int)).tolist() if length else []
 
 
 def _first(pool: list[int], count: int, num_frames: int, how: str) -> list[int]:
+    """The first `count` frames of `pool`; too small a pool is refused."""
     if len(pool) < count:
         got = f"{len(pool)} of {num_frames} frames {how}"
         raise refusal("context", wanted=f"{count} views", got=got, fix="ask for fewer views or a smaller stride")
@@ -102,16 +113,24 @@ def _check_counts(**counts: int) -> None:
 
 
 def choose_split(protocol: str, num_frames: int, stride: int, context: int, targets: int | None) -> Split:
-    """The split that the command line's words describe.
+    """Returns the split for the options of the command line.
 
-    `targets` is the number of targets of the paper's protocol (default 16), over every `stride`-th frame; of the
-    interleaved one it is the most that are kept, evenly spread.
+    Args:
+        protocol: "interleaved" or "paper".
+        num_frames: number of frames of the capture.
+        stride: every `stride`-th frame is used.
+        context: number of context views.
+        targets: for "paper", the number of targets (default 16); for "interleaved", the largest number of targets
+            that are kept, evenly spaced (default: all).
+
+    Returns:
+        The split.
 
     Raises:
-        InputError: no such protocol, or too few frames.
+        InputError: the protocol is unknown, or there are too few frames.
     """
     if protocol == "interleaved":
-        split = interleaved(num_frames, stride, context)
+        split = interleaved_split(num_frames, stride, context)
         if targets is None:
             return split
         _check_counts(targets=targets)
@@ -121,6 +140,6 @@ def choose_split(protocol: str, num_frames: int, stride: int, context: int, targ
         raise refusal("protocol", wanted="interleaved or paper", got=repr(protocol), fix="choose one of them")
     _check_counts(stride=stride)
     taken = range(0, num_frames, stride)
-    split = paper(len(taken), context, targets=16 if targets is None else targets)
+    split = paper_split(len(taken), context, targets=16 if targets is None else targets)
     at = lambda positions: tuple(taken[p] for p in positions)  # noqa: E731
     return Split(protocol="paper", context=at(split.context), targets=at(split.targets))

@@ -1,10 +1,10 @@
-"""`StreamFrame`: the similarity between the capture's frame and the one the network works in.
+"""`StreamFrame`: the similarity transform from the frame of the capture to the frame of the network.
 
     x_stream = scale * R^T (x_capture - t)      R, t: orientation and center of the first camera used
 
-The first camera is the origin and looks along +z, so neither where nor how a capture lies in its world matters; `scale`
-makes a voxel and a depth candidate mean the same in every capture. All of it is float64 until the last cast: at
-earth-centered coordinates float32 has a step of 0.5 m.
+The first camera is at the origin and looks along +z, so results do not depend on the position and orientation of the
+capture in its world. `scale` gives voxels and depth candidates the same meaning in every capture. Computations are
+float64 up to the final cast, because float32 has a spacing of 0.5 m at earth-centered coordinates.
 """
 
 import dataclasses
@@ -19,26 +19,37 @@ from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.geometry.rotations import matrices_to_quats, multiply_quats
 from ssplat_jax.geometry.sh_rotation import sh_rotation
 
-COARSEST_SPACING = 1e-4
-"""Stream units between neighboring float32 numbers at the capture's coordinates that still do for its positions."""
+MAX_COORDINATE_SPACING = 1e-4
+"""Largest float32 spacing, in stream units, at which positions are stored without an offset."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class StreamFrame:
-    """A similarity, and the depth range of the stream."""
+    """Similarity transform between capture and stream, and the depth range of the stream."""
 
-    rotation: Float64[np.ndarray, "3 3"]  # stream axes in the capture frame: the first camera's orientation
-    origin: Float64[np.ndarray, "3"]  # capture frame
+    rotation: Float64[np.ndarray, "3 3"]  # stream axes in the capture frame, the orientation of the first camera
+    origin: Float64[np.ndarray, "3"]  # center of the first camera in the capture frame
     scale: float  # stream units per capture unit
     near: float  # nearest depth candidate, stream units
-    far: float
-    warning: str | None = None  # why scale, near and far may be wrong
+    far: float  # farthest depth candidate, stream units
+    warning: str | None = None  # reason why scale, near and far may be wrong
 
     @staticmethod
     def at_camera(
         camtoworld: Float64[np.ndarray, "4 4"], *, scale: float, near: float, far: float, warning: str | None = None
     ) -> "StreamFrame":
-        """The frame of a camera of the capture; `near` and `far` in stream units."""
+        """Returns the stream frame whose origin is a camera of the capture.
+
+        Args:
+            camtoworld: pose of the camera in the capture frame.
+            scale: stream units per capture unit.
+            near: nearest depth candidate, stream units.
+            far: farthest depth candidate, stream units.
+            warning: reason why scale, near and far may be wrong.
+
+        Returns:
+            The stream frame.
+        """
         return StreamFrame(
             rotation=camtoworld[:3, :3].copy(),
             origin=camtoworld[:3, 3].copy(),
@@ -49,7 +60,7 @@ class StreamFrame:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain JSON types."""
+        """Returns the fields as plain JSON types; the inverse is `from_dict`."""
         return {
             "rotation": self.rotation.tolist(),
             "origin": self.origin.tolist(),
@@ -61,7 +72,7 @@ class StreamFrame:
 
     @staticmethod
     def from_dict(fields: dict[str, Any]) -> "StreamFrame":
-        """What `to_dict` gave."""
+        """Returns the stream frame of the fields that `to_dict` gave."""
         return StreamFrame(
             rotation=np.array(fields["rotation"]),
             origin=np.array(fields["origin"]),
@@ -72,15 +83,15 @@ class StreamFrame:
         )
 
     def points_to_stream(self, points: Float64[np.ndarray, "*n 3"]) -> Float64[np.ndarray, "*n 3"]:
-        """Capture -> stream."""
+        """Transforms points from the capture frame to the stream frame."""
         return self.scale * np.einsum("ji,...j->...i", self.rotation, points - self.origin)
 
     def points_to_capture(self, points: Float64[np.ndarray, "*n 3"]) -> Float64[np.ndarray, "*n 3"]:
-        """Stream -> capture: the inverse of `points_to_stream`."""
+        """Transforms points from the stream frame to the capture frame."""
         return np.einsum("ij,...j->...i", self.rotation, points) / self.scale + self.origin
 
     def viewmats(self, camtoworlds: Float64[np.ndarray, "*v 4 4"]) -> Float32[np.ndarray, "*v 4 4"]:
-        """World-to-camera matrices of the stream for camera-to-world ones of the capture."""
+        """Converts camera-to-world matrices of the capture to world-to-camera matrices of the stream."""
         rotations = np.einsum("...ji,jk->...ik", camtoworlds[..., :3, :3], self.rotation)
         centers = self.points_to_stream(camtoworlds[..., :3, 3])
         viewmats = np.zeros(camtoworlds.shape)
@@ -90,7 +101,7 @@ class StreamFrame:
         return viewmats.astype(np.float32)
 
     def camtoworlds(self, viewmats: Float64[np.ndarray, "*v 4 4"]) -> Float64[np.ndarray, "*v 4 4"]:
-        """Camera-to-world matrices of the capture for world-to-camera ones of the stream."""
+        """Converts world-to-camera matrices of the stream to camera-to-world matrices of the capture."""
         rotations = np.swapaxes(viewmats[..., :3, :3], -1, -2)
         centers = -np.einsum("...ij,...j->...i", rotations, viewmats[..., :3, 3])
         camtoworlds = np.zeros(viewmats.shape)
@@ -101,11 +112,13 @@ class StreamFrame:
 
     @property
     def offset(self) -> tuple[float, float, float]:
-        """A point of the capture to count positions from: its origin, or, where float32 is too coarse there, the
-        stream's, in whole units, or in as many decimals as the scene is small.
+        """Point of the capture frame to which exported positions are relative.
+
+        It is zero unless float32 is too coarse for the capture's coordinates. Then it is the origin of the stream,
+        rounded to whole units, or to more decimals if the scene is smaller than a unit.
         """
         spacing = float(np.spacing(np.float32(np.abs(self.origin).max())))
-        is_coarse = spacing * self.scale > COARSEST_SPACING
+        is_coarse = spacing * self.scale > MAX_COORDINATE_SPACING
         decimals = max(0, math.ceil(math.log10(self.scale)))
         x, y, z = (np.round(self.origin, decimals) if is_coarse else np.zeros(3)).tolist()
         return x, y, z
@@ -113,12 +126,12 @@ class StreamFrame:
     def gaussians_to_capture(
         self, gaussians: Gaussians, *, offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     ) -> Gaussians:
-        """Gaussians of the stream in the capture's own frame and scale: positions, orientations, sizes and SH bands.
+        """Transforms Gaussians from the stream frame to the capture frame: means, quaternions, scales and SH bands.
 
-        Positions are counted from `offset`, a point of the capture.
+        Means are relative to `offset`, a point of the capture frame.
 
         Limits:
-            The result is float32: means 1e5 capture units from `offset` are held to 1e-2 only.
+            The result is float32: means 1e5 capture units from `offset` have an error of up to 1e-2.
         """
         quat = matrices_to_quats(jnp.asarray(self.rotation, jnp.float32))
         mixing = sh_rotation(self.rotation, gaussians.sh_degree)

@@ -1,1 +1,1 @@
-"""Scores, exposures and latency of novel views."""
+"""Scores, exposures and latency of rendered views."""

@@ -1,1 +1,1 @@
-"""Rotations, cameras, sampling and voxel keys: plain functions of arrays, no networks."""
+"""Cameras, rotations, sampling and voxel keys: plain functions of arrays, no networks."""

@@ -1,4 +1,8 @@
-"""Rotations as unit quaternions, wxyz, and as matrices. Leading axes broadcast; no vmap (see pyproject.toml)."""
+"""Rotations as quaternions (wxyz) and as matrices.
+
+Leading axes broadcast. There is no vmap here: jax 0.10.2 miscompiles vmapped 3-vector arithmetic on the CPU
+(tests/stability/test_vmap_three_vectors.py).
+"""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -7,16 +11,19 @@ from ssplat_jax.numerics import columns, safe_normalize
 
 
 def quats_to_matrices(quats: Float[Array, "*s 4"]) -> Float[Array, "*s 3 3"]:
-    """Rotation matrices of quaternions wxyz of any length.
+    """Rotation matrices of quaternions of any length.
 
     Limits:
-        |q| <= 1e-12 gives the identity, and a zero gradient.
+        A quaternion of length 1e-12 or less gives the identity and a zero gradient.
     """
     return jnp.stack([jnp.stack(row, axis=-1) for row in matrix_entries(quats)], axis=-2)
 
 
 def matrix_entries(quats: Float[Array, "*s 4"]) -> tuple[tuple[Float[Array, "*s"], ...], ...]:
-    """The rows of `quats_to_matrices`, entry by entry: arithmetic on them is fused, and its gradient pads nothing."""
+    """The nine entries of `quats_to_matrices` as separate arrays, row by row.
+
+    XLA fuses arithmetic on them, and their gradient needs no padding.
+    """
     unit = safe_normalize(quats)
     is_zero = jnp.all(unit == 0, axis=-1, keepdims=True)
     w, x, y, z = columns(jnp.where(is_zero, jnp.array([1, 0, 0, 0], unit.dtype), unit))
@@ -28,12 +35,15 @@ def matrix_entries(quats: Float[Array, "*s 4"]) -> tuple[tuple[Float[Array, "*s"
 
 
 def matrices_to_quats(matrices: Float[Array, "*s 3 3"]) -> Float[Array, "*s 4"]:
-    """Unit quaternions wxyz, w >= 0, of rotation matrices: the largest of four equal forms, so none divides by 0."""
+    """Unit quaternions with w >= 0 of rotation matrices.
+
+    Four formulas give the same quaternion; the one with the largest divisor is used, so that none divides by 0.
+    """
     m = matrices
     m00, m11, m22 = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
     a, b, c = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]
     d, e, f = m[..., 0, 1] + m[..., 1, 0], m[..., 0, 2] + m[..., 2, 0], m[..., 1, 2] + m[..., 2, 1]
-    # Row i is 4 q_i q: the squares stand on the diagonal, and the row of the largest is well conditioned.
+    # Row i is 4 q_i q. Squares are on the diagonal, and the row with the largest one is well conditioned.
     rows = jnp.stack(
         [
             jnp.stack([1 + m00 + m11 + m22, a, b, c], axis=-1),
@@ -49,7 +59,7 @@ def matrices_to_quats(matrices: Float[Array, "*s 3 3"]) -> Float[Array, "*s 4"]:
 
 
 def multiply_quats(a: Float[Array, "*s 4"], b: Float[Array, "*s 4"]) -> Float[Array, "*s 4"]:
-    """Hamilton product: the rotation `b`, then `a`."""
+    """Hamilton product: the rotation `b` followed by the rotation `a`."""
     aw, ax, ay, az = jnp.moveaxis(a, -1, 0)
     bw, bx, by, bz = jnp.moveaxis(b, -1, 0)
     return jnp.stack(

@@ -1,6 +1,6 @@
-"""Voxel keys: which cell of a regular grid a point lies in, and a hash of that cell.
+"""Voxel indices of points, and hashes of voxel indices.
 
-A key is the integer triple itself; a hash only says where to look for it and is always verified against the triple.
+The index triple identifies a voxel. Its hash only says where to look for it; a lookup compares the triple.
 """
 
 import jax.numpy as jnp
@@ -8,17 +8,17 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
 INDEX_LIMIT = 1 << 20
-"""Voxel indices are below this in magnitude: +-42 km at 4 cm, and still exact in float32."""
+"""Upper bound of the magnitude of a voxel index: 42 km at 4 cm, and exact in float32."""
 
 
 def voxel_indices(points: Float[Array, "*s 3"], voxel_size: float) -> tuple[Int[Array, "*s 3"], Bool[Array, "*s"]]:
-    """Index of the voxel around each point, floor(p / voxel_size), and whether it is in range.
+    """Voxel index of each point, floor(p / voxel_size), and whether it is in range.
 
-    The division is one multiplication by the float32 reciprocal, rounded the same way on every backend; it is
-    monotone, so a point between two points of a voxel is in that voxel, to the last bit.
+    Points are multiplied by the float32 reciprocal, which every backend rounds the same way. The product is monotone: a
+    point between two points of a voxel lies in that voxel.
 
     Limits:
-        |index| >= 2^20 (infinities and NaN included) gives index 0 and False.
+        Indices of magnitude 2^20 or more, infinities and NaN give index 0 and False.
     """
     cells = jnp.floor(points * inverse_voxel_size(voxel_size))
     in_range = jnp.all(jnp.abs(cells) < INDEX_LIMIT, axis=-1)
@@ -26,12 +26,12 @@ def voxel_indices(points: Float[Array, "*s 3"], voxel_size: float) -> tuple[Int[
 
 
 def inverse_voxel_size(voxel_size: float) -> float:
-    """The float32 number that points are multiplied by."""
+    """Float32 reciprocal of `voxel_size`."""
     return float(np.float32(1.0 / voxel_size))
 
 
 def hash_voxels(voxels: Int[Array, "*s 3"]) -> UInt32[Array, "*s"]:
-    """32 well-mixed bits of an index triple (multiply-xorshift rounds; the constants are MurmurHash3's finalizer)."""
+    """32-bit hashes of voxel indices, mixed by the finalizer of MurmurHash3."""
     x, y, z = (voxels[..., axis].astype(jnp.uint32) for axis in range(3))
     mixed = _mix(x + jnp.uint32(0x9E3779B9))
     mixed = _mix(mixed ^ (y + jnp.uint32(0x7F4A7C15)))

@@ -1,1 +1,1 @@
-"""PSNR, SSIM and LPIPS."""
+"""Image quality metrics: PSNR, SSIM and LPIPS."""

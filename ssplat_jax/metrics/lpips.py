@@ -1,7 +1,7 @@
 """LPIPS, the learned perceptual distance (Zhang et al. 2018), version 0.1 on VGG16, as PyTorch's `lpips` computes it.
 
-The trained weights cannot be shipped: the user gives torchvision's `vgg16` file and the package's heads (`vgg.pth`),
-or either as `.npz` with the same names.
+The trained weights cannot be shipped. The user provides torchvision's `vgg16` file and the package's heads (`vgg.pth`),
+or `.npz` files with the same names.
 
     image in [0, 1] -> [-1, 1] -> shift and scale -> VGG16 -> relu1_2, relu2_2, relu3_3, relu4_3, relu5_3
     per layer: features of unit length per pixel, squared difference, head's weights over channels, mean over pixels
@@ -18,15 +18,15 @@ from ssplat_jax.pytree import pytree
 from ssplat_jax.storage.torch_files import read_arrays
 
 MIN_SIDE = 16
-"""Pixels; four halvings leave one for the last layer."""
+"""Smallest side of an image in pixels, of which four halvings leave one for the last layer."""
 
-# The package's constants. Its trained heads assume them.
+# Constants of the package, on which its trained heads depend.
 _SHIFT = (-0.030, -0.088, -0.188)
 _SCALE = (0.458, 0.448, 0.450)
 _NORM_EPS = 1e-10
 
-# torchvision's indices of the convolutions in `vgg16().features` with their channels out; each line ends in a layer
-# that is compared, and a maximum over 2x2 pixels leads to the next line.
+# Indices of the convolutions in torchvision's `vgg16().features`, and their output channels. The last layer of each
+# line is compared; a 2 x 2 maximum leads to the next line.
 _STAGES = (
     ((0, 64), (2, 64)),
     ((5, 128), (7, 128)),
@@ -38,7 +38,7 @@ _STAGES = (
 
 @pytree
 class LpipsWeights:
-    """Convolutions of VGG16 in order, and the heads: one weight per channel of the five layers compared."""
+    """Convolutions of VGG16 in order, and the heads: a weight per channel of the five compared layers."""
 
     kernels: tuple[Float[Array, "3 3 _ _"], ...]  # height, width, channels in, channels out
     biases: tuple[Float[Array, " _"], ...]
@@ -46,14 +46,14 @@ class LpipsWeights:
 
 
 def load_lpips(vgg_path: Path, heads_path: Path) -> LpipsWeights:
-    """Reads both files as data; nothing in them is executed (`state_dict`).
+    """LPIPS weights from two files, which are read as data: no code in them is executed.
 
     Args:
-        vgg_path: torchvision's `vgg16` state dict, `.pth` or `.npz`; of its names only `features.*` are read.
-        heads_path: the heads that the `lpips` package brings for VGG16 (`lin0.model.1.weight` to `lin4`).
+        vgg_path: torchvision's `vgg16` state dict, `.pth` or `.npz`; only the names `features.*` are read.
+        heads_path: heads of the `lpips` package for VGG16 (`lin0.model.1.weight` to `lin4`), `.pth` or `.npz`.
 
     Raises:
-        InputError: a file cannot be read, lacks a name, or holds another shape or a value that is not finite.
+        InputError: a file cannot be read, lacks an array, or has one of another shape or with non-finite values.
     """
     shapes, channels_in = {}, 3
     for i, channels_out in (layer for stage in _STAGES for layer in stage):
@@ -71,13 +71,13 @@ def load_lpips(vgg_path: Path, heads_path: Path) -> LpipsWeights:
 
 
 def lpips(weights: LpipsWeights, a: Float[Array, "*b h w 3"], b: Float[Array, "*b h w 3"]) -> Float[Array, "*b"]:
-    """Perceptual distance of two images in [0, 1]; 0 for equal ones, larger for less alike.
+    """Perceptual distance of images in [0, 1]: 0 for equal images, larger for less similar ones.
 
     Limits:
-        float32: within 1e-5, relative, of the PyTorch package on random weights.
-        The gradient is finite everywhere, at equal and at black images too, and 0 where no channel of a layer is on;
-        the package's own is NaN there.
-        Values outside [0, 1] are taken as they are, as the package does.
+        Within a relative 1e-5 of the PyTorch package in float32, on random weights.
+        The gradient is finite everywhere, also at equal and at black images, and 0 where all channels of a layer are 0;
+        the package's gradient is NaN there.
+        Values outside [0, 1] are not clipped, as in the package.
 
     Raises:
         InputError: a side has fewer than 16 pixels.
@@ -88,7 +88,7 @@ def lpips(weights: LpipsWeights, a: Float[Array, "*b h w 3"], b: Float[Array, "*
 def lpips_layers(
     weights: LpipsWeights, a: Float[Array, "*b h w 3"], b: Float[Array, "*b h w 3"]
 ) -> Float[Array, "*b 5"]:
-    """The five layers' parts of `lpips`.
+    """Contributions of the five layers to `lpips`.
 
     Raises:
         InputError: a side has fewer than 16 pixels.
@@ -100,13 +100,13 @@ def lpips_layers(
     for features, head in zip(vgg_features(weights, both), weights.heads, strict=True):
         unit_a, unit_b = jnp.split(_unit_features(features), 2)
         weighted = jnp.sum((unit_a - unit_b) ** 2 * head, axis=-1)
-        # Row by row: one long float32 sum drifts by more than 1e-5 on flat images.
+        # Means by row first: a single long float32 sum is off by more than 1e-5 on flat images.
         parts.append(jnp.mean(jnp.mean(weighted, axis=2), axis=1))
     return jnp.stack(parts, axis=-1).reshape(*batch, len(parts))
 
 
 def check_size(height: int, width: int) -> None:
-    """Refuses images that VGG16 would halve to nothing.
+    """Checks that images are large enough for VGG16.
 
     Raises:
         InputError: a side has fewer than 16 pixels.
@@ -118,7 +118,7 @@ def check_size(height: int, width: int) -> None:
 
 
 def vgg_features(weights: LpipsWeights, images: Float[Array, "b h w 3"]) -> list[Float[Array, "b _ _ _"]]:
-    """relu1_2 to relu5_3 of images in [0, 1]."""
+    """Layers relu1_2 to relu5_3 of images in [0, 1]."""
     x = (2 * images - 1 - jnp.asarray(_SHIFT, images.dtype)) / jnp.asarray(_SCALE, images.dtype)
     layers = iter(zip(weights.kernels, weights.biases, strict=True))
     outputs = []
@@ -132,14 +132,14 @@ def vgg_features(weights: LpipsWeights, images: Float[Array, "b h w 3"]) -> list
 
 
 def _convolve(x, kernel):
-    # Accelerators multiply float32 in fewer bits unless told otherwise; a published score should not depend on it.
+    # By default, accelerators multiply float32 at lower precision; published scores should not depend on that.
     return jax.lax.conv_general_dilated(
         x, kernel, (1, 1), "SAME", dimension_numbers=("NHWC", "HWIO", "NHWC"), precision=jax.lax.Precision.HIGHEST
     )
 
 
 def _unit_features(x: Float[Array, "b _ _ c"]) -> Float[Array, "b _ _ c"]:
-    """Features divided by their length; zeros stay zeros, with a zero gradient (the root's is infinite there)."""
+    """Features of unit length; zeros stay zeros with a zero gradient, where that of a square root is infinite."""
     squares = jnp.sum(x * x, axis=-1, keepdims=True)
     is_off = squares == 0
     length = jnp.where(is_off, 0.0, jnp.sqrt(jnp.where(is_off, 1.0, squares)))

@@ -1,6 +1,6 @@
-"""The network, a stage a file; `types` holds what passes between them. No stage imports another.
+"""The model, one stage per file. Stages do not import each other; `types` holds the arrays that they exchange.
 
-`network_of` has the stages in which networks differ; the others, the paper's own, are here.
+`network_of` gives the stages in which networks differ. The stages here are shared by all networks.
 """
 
 from ssplat_jax.model.back_projection import back_project as back_project

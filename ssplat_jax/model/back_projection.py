@@ -1,4 +1,4 @@
-"""Positions and mean colors of tokens from the depth map and the images (Sec. 3.3)."""
+"""Token positions and colors from depth maps and images (Sec. 3.3)."""
 
 import math
 
@@ -12,7 +12,7 @@ from ssplat_jax.model.types import GRID_STRIDE, Views
 
 
 def patch_colors(images: Float[Array, "v h w 3"], config: StreamConfig) -> Float[Array, "v hf wf a"]:
-    """Appearance anchors: of each token's patch the mean colors of `gaussians_per_token` parts, row by row."""
+    """Appearance anchors: mean colors of the `gaussians_per_token` parts of each token's patch, row by row."""
     side = math.isqrt(config.head.gaussians_per_token)
     parts = average_pool(images, GRID_STRIDE // side)
     v, h, w, _ = parts.shape
@@ -23,7 +23,7 @@ def patch_colors(images: Float[Array, "v h w 3"], config: StreamConfig) -> Float
 def back_project(
     log_depths: Float[Array, "v hf wf"], views: Views
 ) -> tuple[Float[Array, "v hf wf 3"], Float[Array, "v hf wf"]]:
-    """World positions p_j of the cells at their depths, and the cells' footprints (side of a cell at that depth)."""
+    """World positions p_j of the cells at their depths, and their footprints: the side of a cell at that depth."""
     v, hf, wf = log_depths.shape
     cells = pixel_grid(hf * GRID_STRIDE, wf * GRID_STRIDE, GRID_STRIDE).reshape(-1, 2)
     depths = jnp.exp(log_depths).reshape(v, -1)

@@ -1,4 +1,4 @@
-"""Cache-Guided Feature Injection: cached features where local evidence is weak (Sec. 3.6, CGFI)."""
+"""Cache-Guided Feature Injection (CGFI): adds cached features where the current views are uncertain (Sec. 3.6)."""
 
 from collections.abc import Callable
 
@@ -14,7 +14,7 @@ from ssplat_jax.model.types import Views
 
 
 class Aggregator(nn.Module):
-    """Phi_agg: a U-Net whose output, zero at the start, is added to f: before training, CGFI is the identity."""
+    """Phi_agg: a U-Net whose output is added to f. The output starts at zero, so untrained CGFI is the identity."""
 
     config: StreamConfig
 
@@ -36,12 +36,21 @@ def inject_features(
     config: StreamConfig,
     bound_history: Callable[[Array], Array] = lambda feats: feats,
 ) -> Float[Array, "v hf wf c"]:
-    """Eq. cache_feature_attenuation and token_regressor_input.
+    """Token features with history injected (Eqs. cache_feature_attenuation, token_regressor_input).
 
-    Besides (1 - omega) F_H the U-Net sees Omega, because a zero feature alone does not tell a hole from a feature.
+    The U-Net sees Omega besides (1 - omega) F_H, because a zero feature does not tell a hole from a feature.
 
-    Limits:
-        omega = 1: F_H is not heard. Features of any precision are injected in float32.
+    Args:
+        params: parameters of `Aggregator`.
+        feats: token features f of the current views, of any float dtype.
+        history: the projected cache: F_H and Omega.
+        confidences: omega of the anchored depth.
+        views: the chunk's views.
+        config: `history.cgfi=False` returns `feats` unchanged.
+        bound_history: maps F_H to a bounded size; see `Network.bound_history`.
+
+    Returns:
+        Features in float32. Where omega = 1 they do not depend on F_H.
     """
     if not config.history.cgfi:
         return feats

@@ -1,9 +1,8 @@
-"""Convolutions at stride 1 whose gradients are fast everywhere, inside `lax.scan` on a CPU too.
+"""Convolutions with gradients that are fast inside `lax.scan` on a CPU.
 
-XLA's CPU backend computes the kernel gradient of a convolution by a generic loop whenever it stands inside a `while`
-(https://github.com/jax-ml/jax/issues/12868): 15 x slower than outside, where it is still the slowest part of a step.
-Here the backward pass is spelled out: the input gradient is a convolution with the flipped kernel, the kernel gradient
-one matrix product per tap.
+Inside a loop, XLA's CPU backend computes kernel gradients with a generic algorithm
+(https://github.com/jax-ml/jax/issues/12868), 15 times slower than outside. Here the backward pass is written out: the
+input gradient is a convolution with the flipped kernel, the kernel gradient one matrix product per tap.
 """
 
 import functools
@@ -14,12 +13,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 Pads = tuple[tuple[int, int], tuple[int, int]]
+"""Zero padding ((top, bottom), (left, right))."""
 DIMENSIONS = ("NHWC", "HWIO", "NHWC")
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
 def conv2d(x: Float[Array, "v h w c"], kernel: Float[Array, "kh kw c o"], pads: Pads) -> Float[Array, "v ho wo o"]:
-    """Cross-correlation of `x`, zero-padded by `pads` ((top, bottom), (left, right)), with `kernel`."""
+    """Cross-correlation of `x`, zero-padded by `pads`, with `kernel` at stride 1."""
     return jax.lax.conv_general_dilated(x, kernel, (1, 1), pads, dimension_numbers=DIMENSIONS)
 
 
@@ -47,7 +47,7 @@ conv2d.defvjp(_conv2d_forward, _conv2d_backward)
 
 
 class Conv(nn.Module):
-    """A convolution of stride 1 and odd square kernel with torch's symmetric zero padding; keeps the size."""
+    """Convolution with an odd square kernel, stride 1 and symmetric zero padding, as in PyTorch. Keeps the size."""
 
     features: int
     kernel: int = 3
@@ -63,10 +63,10 @@ class Conv(nn.Module):
 
 
 class HalvingConv(nn.Module):
-    """A convolution of stride 2 and odd kernel, computed at stride 1 on 2 x 2 patches moved into channels.
+    """Convolution with an odd square kernel and stride 2, computed at stride 1 on 2 x 2 patches moved into channels.
 
-    The parameter is the ordinary kernel. A strided convolution's gradient is a dilated one, for which XLA's CPU
-    backend has no fast path.
+    The parameter is the ordinary kernel. The gradient of a strided convolution is a dilated convolution, for which
+    XLA's CPU backend has no fast path.
     """
 
     features: int
@@ -77,7 +77,7 @@ class HalvingConv(nn.Module):
     def __call__(self, x: Float[Array, "v h w c"]) -> Float[Array, "v hf wf o"]:
         c, reach = x.shape[-1], self.kernel // 2
         kernel = self.param("kernel", nn.initializers.lecun_normal(), (self.kernel, self.kernel, c, self.features))
-        # Offset o in -reach .. reach of the kernel is o = 2 m + r: tap m in -before .. reach // 2 of patch pixel r.
+        # Kernel offset o in [-reach, reach] is o = 2 m + r: tap m in [-before, reach // 2] of patch pixel r.
         before = (reach + 1) // 2
         taps = before + reach // 2 + 1
         front = 2 * before - reach
@@ -91,7 +91,7 @@ class HalvingConv(nn.Module):
 
 
 def pixel_unshuffle(x: Float[Array, "v h w c"], factor: int) -> Float[Array, "v hf wf cf"]:
-    """Moves `factor` x `factor` patches into channels, channel-major (torch's order: c, row, column)."""
+    """Map with `factor` x `factor` patches moved into channels, in PyTorch's order (channel, row, column)."""
     v, h, w, c = x.shape
     x = x.reshape(v, h // factor, factor, w // factor, factor, c)
     return x.transpose(0, 1, 3, 5, 2, 4).reshape(v, h // factor, w // factor, c * factor * factor)

@@ -1,4 +1,4 @@
-"""Gaussian head: a two-layer MLP from a token's feature to its Gaussians, whose middle is its position (Sec. 3.7)."""
+"""Gaussians of tokens, from the shapes that the head predicts (Sec. 3.7)."""
 
 import math
 
@@ -12,14 +12,18 @@ from ssplat_jax.gaussians import SH_C0, Gaussians
 from ssplat_jax.geometry.rotations import multiply_quats, quats_to_matrices
 from ssplat_jax.model.types import TokenShapes
 
-START_SCALE = 0.43  # of a Gaussian's share of the cell, sideways: neighbors overlap into a closed surface
-START_THICKNESS = 0.05  # of the cell's footprint, along the viewing direction
-MAX_LOG_GAIN = 0.3  # a Gaussian stays within a third of its cell's size: larger ones fill holes over what lies behind
+START_SCALE = 0.43
+"""Untrained sideways scale, as a fraction of a Gaussian's part of the cell: neighbors overlap to a closed surface."""
+START_THICKNESS = 0.05
+"""Untrained scale along the viewing direction, as a fraction of the cell's footprint."""
+MAX_LOG_GAIN = 0.3
+"""Largest log factor that the head applies to a scale. Larger Gaussians would cover holes and hide what is behind."""
 MIN_SCALE = 1e-6
+"""Smallest scale, in stream units."""
 
 
 def token_scales(raw: Float[Array, "m 3"], footprints: Float[Array, " m"], config: StreamConfig) -> Float[Array, "m 3"]:
-    """Standard deviations of each Gaussian of a token in stream units, along the axes of the token's camera."""
+    """Standard deviations of each token's Gaussians in stream units, along the axes of the token's camera."""
     side = math.isqrt(config.head.gaussians_per_token)
     if config.head.scale_mode == "absolute":
         scales = nn.softplus(raw - 4.0) / jnp.array([side, side, 1.0])
@@ -39,13 +43,23 @@ def decode_tokens(
     num_members: Int[Array, " m"] | int = 1,
     config: StreamConfig,
 ) -> Gaussians:
-    """Gaussians of tokens or of cache pivots: `gaussians_per_token` of each, in a square over its cell, row by row.
+    """Gaussians of tokens or pivots: `gaussians_per_token` each, in a square over the cell, row by row.
 
-    The head gives all of a token's the same shape and opacity; they differ in place and color. A pivot of n
-    members stands for n tokens in one place and is as opaque as they would be, 1 - (1 - o)^n.
+    The Gaussians of a token share shape and opacity and differ in position and color. A pivot of n members is as opaque
+    as n Gaussians of opacity o at one place, 1 - (1 - o)^n.
 
-    The head's rotation is in the frame of the camera in `quats` (DESIGN 6.7); its color is a residual on the
-    appearance anchors `rgbs` (DESIGN 6.6).
+    Args:
+        shapes: what the head predicts. Rotations are in the frame of the token's camera, `shapes.sh` is a residual on
+            the appearance anchors.
+        means: positions of the tokens, stream frame.
+        rgbs: appearance anchors: a color in [0, 1] per Gaussian of the token.
+        quats: camera-to-stream rotation of each token's camera, wxyz.
+        footprints: side of a cell at the token's depth, stream units.
+        num_members: tokens that were merged into the pivot.
+        config: model configuration.
+
+    Returns:
+        Gaussians token by token, stream frame.
     """
     optical_depths = jnp.asarray(num_members, jnp.float32) * nn.softplus(shapes.opacity_logits)
     each = lambda x: jnp.repeat(x, config.head.gaussians_per_token, axis=0)  # noqa: E731
@@ -61,10 +75,10 @@ def decode_tokens(
 def _spread(
     means: Float[Array, "m 3"], quats: Float[Array, "m 4"], footprints: Float[Array, " m"], config: StreamConfig
 ) -> Float[Array, "n 3"]:
-    """Centers of the parts of each token's cell, row by row, in the plane that faces the camera in `quats`."""
+    """Centers of the parts of each cell, row by row, in the plane that faces the token's camera."""
     side = math.isqrt(config.head.gaussians_per_token)
-    steps = (np.arange(side, dtype=np.float32) + 0.5) / side - 0.5  # of a cell
+    steps = (np.arange(side, dtype=np.float32) + 0.5) / side - 0.5  # in cells
     down, right = (x.reshape(-1, 1) for x in np.meshgrid(steps, steps, indexing="ij"))
     axes = quats_to_matrices(quats)
-    moves = right * axes[:, None, :, 0] + down * axes[:, None, :, 1]
-    return (means[:, None] + footprints[:, None, None] * moves).reshape(-1, 3)
+    offsets = right * axes[:, None, :, 0] + down * axes[:, None, :, 1]
+    return (means[:, None] + footprints[:, None, None] * offsets).reshape(-1, 3)

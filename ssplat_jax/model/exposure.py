@@ -1,9 +1,9 @@
-"""Exposure: every view against the scene (ours), so that the cache remembers colors at one exposure.
+"""Exposure of each view relative to the scene, so that the cache stores colors at one exposure (ours).
 
-Exposure and white balance of a camera drift over a video, by a factor of two on redkitchen; remembered as they come,
-the colors of one surface differ from patch to patch and fit no view. A view's exposure is, per channel, the median
-ratio of the colors it sees to those that the cache remembers, over the cells where both see the same surface. The
-scene keeps the exposure of the first views.
+Exposure and white balance drift over a video, by a factor of two on redkitchen. Stored as they come, the colors of one
+surface would differ from patch to patch and match no view. A view's exposure is the median ratio, per channel, of its
+colors to the cached colors, over the cells where both see the same surface. The scene has the exposure of the first
+views.
 """
 
 import math
@@ -12,15 +12,18 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ssplat_jax.cache import SAME_SURFACE, ProjectedCache
+from ssplat_jax.cache import SAME_SURFACE_MARGIN, ProjectedCache
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.model.layers import average_pool
 from ssplat_jax.model.types import GRID_STRIDE, Views
 from ssplat_jax.numerics import safe_log
 
-DARKEST, BRIGHTEST = 0.03, 0.97  # colors between which an image is about proportional to the exposure
-FEWEST_CELLS = 64  # fewer tell less than the neighboring views do
-MOST = 4.0  # the largest exposure, and one over the smallest
+MIN_COLOR, MAX_COLOR = 0.03, 0.97
+"""Range of colors that are about proportional to exposure: darker cells are noise, brighter ones are clipped."""
+MIN_CELLS = 64
+"""Cells that a view must share with the scene. With fewer, the mean over the other views is more reliable."""
+MAX_EXPOSURE = 4.0
+"""Upper bound of an exposure; the lower bound is its reciprocal."""
 
 
 def estimate_exposures(
@@ -30,40 +33,46 @@ def estimate_exposures(
     views: Views,
     config: StreamConfig,
 ) -> Float[Array, "v 3"]:
-    """What takes the scene's colors to those of each view; a constant for differentiation.
+    """Exposure of each view: the factor per channel from the scene's colors to the view's. Not differentiated.
 
     Args:
         history: the projected cache.
-        log_depths: of what each cell sees.
-        confidences: of those depths; cells below `min_confidence` are not compared.
+        log_depths: depths of the cells in the current views.
+        confidences: confidences of those depths; cells below `min_confidence` are not compared.
+        views: the chunk's views.
+        config: model configuration.
+
+    Returns:
+        Factors in [1/4, 4].
 
     Limits:
-        A view that shares fewer than 64 cells with the scene has the mean (of logs) of those that do; without any, 1.
-        Always in [1/4, 4]; cells that are not finite are not compared.
+        A view that shares fewer than `MIN_CELLS` cells with the scene gets the geometric mean of the views that share
+        enough; 1 if there is none.
+        Cells with values that are not finite are not compared.
     """
-    remembered = history.colors
-    if remembered is None:
+    cached = history.colors
+    if cached is None:
         return jnp.ones((len(views.viewmats), 3))
     seen = average_pool(views.images, GRID_STRIDE)
-    remembered_log_depths = safe_log(jnp.where(history.mask, history.depths, 1.0))
+    cached_log_depths = safe_log(jnp.where(history.mask, history.depths, 1.0))
     is_compared = (
         history.mask
         & views.inside
         & (confidences >= config.memory.min_confidence)
-        & (jnp.abs(log_depths - remembered_log_depths) <= SAME_SURFACE)
-        & ((seen >= DARKEST) & (seen <= BRIGHTEST) & (remembered >= DARKEST)).all(axis=-1)
+        & (jnp.abs(log_depths - cached_log_depths) <= SAME_SURFACE_MARGIN)
+        & ((seen >= MIN_COLOR) & (seen <= MAX_COLOR) & (cached >= MIN_COLOR)).all(axis=-1)
     )
-    ratios = jnp.where(is_compared[..., None], seen, 1.0) / jnp.where(is_compared[..., None], remembered, 1.0)
+    ratios = jnp.where(is_compared[..., None], seen, 1.0) / jnp.where(is_compared[..., None], cached, 1.0)
     logs, is_known = _medians(safe_log(ratios), is_compared)
-    logs = jnp.where(is_known, jnp.clip(logs, -math.log(MOST), math.log(MOST)), 0.0)
-    of_others = logs.sum(axis=0) / jnp.maximum(is_known.sum(dtype=jnp.float32), 1.0)
-    return jax.lax.stop_gradient(jnp.exp(jnp.where(is_known, logs, of_others)))
+    logs = jnp.where(is_known, jnp.clip(logs, -math.log(MAX_EXPOSURE), math.log(MAX_EXPOSURE)), 0.0)
+    mean_log = logs.sum(axis=0) / jnp.maximum(is_known.sum(dtype=jnp.float32), 1.0)
+    return jax.lax.stop_gradient(jnp.exp(jnp.where(is_known, logs, mean_log)))
 
 
 def _medians(values, is_counted):
-    """Per view and channel the median (of an even number the upper) of the counted cells, and whether they suffice."""
+    """Upper median of the counted cells per view and channel, and whether there are enough of them."""
     v = len(values)
     ordered = jnp.sort(jnp.where(is_counted[..., None], values, jnp.inf).reshape(v, -1, 3), axis=1)
-    number = is_counted.sum(axis=(1, 2))[:, None]
-    middle = jnp.take_along_axis(ordered, (number // 2)[:, :, None], axis=1)[:, 0]
-    return middle, number >= FEWEST_CELLS
+    num_cells = is_counted.sum(axis=(1, 2))[:, None]
+    middle = jnp.take_along_axis(ordered, (num_cells // 2)[:, :, None], axis=1)[:, 0]
+    return middle, num_cells >= MIN_CELLS

@@ -1,4 +1,4 @@
-"""History-Projected Depth Anchoring: cached geometry as a Gaussian anchor over depth candidates (Sec. 3.5, HPDA)."""
+"""History-Projected Depth Anchoring (HPDA): cached geometry as a Gaussian prior over depth candidates (Sec. 3.5)."""
 
 import flax.linen as nn
 import jax.numpy as jnp
@@ -6,11 +6,11 @@ from jaxtyping import Array, Float
 
 from ssplat_jax.cache import ProjectedCache
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.model.types import AnchoredDepth, DepthBelief, Views, from_candidate_space, to_candidate_space
+from ssplat_jax.model.types import AnchoredDepth, DepthDistribution, Views, from_candidate_space, to_candidate_space
 from ssplat_jax.numerics import safe_log, softplus_inverse
 
 MIN_SIGMA = 1e-6
-"""Narrower anchors are all alike, one candidate or none; a width of zero would divide by zero."""
+"""Smallest width of the anchor. A narrower one would select one candidate or none, and zero would divide by zero."""
 
 
 class AnchorStrength(nn.Module):
@@ -27,11 +27,11 @@ class AnchorStrength(nn.Module):
 def cache_anchor(
     history: ProjectedCache, log_candidates: Float[Array, " d"], config: StreamConfig
 ) -> Float[Array, "v hf wf d"]:
-    """P_H of Eq. cache_depth_prior.
+    """The anchor P_H over the candidates (Eq. cache_depth_prior).
 
     Limits:
-        Zeros where the cache has a hole, and for Omega = 0.
-        sigma is at least 1e-6. sigma -> 0: Omega at the candidate that equals D_H, zeros where none does.
+        Holes of the cache and Omega = 0 give zeros.
+        As sigma -> 0 (it is at least `MIN_SIGMA`), the anchor is Omega at the candidate that equals D_H, else zero.
     """
     omega = history.confidences[..., None]
     sigma = jnp.maximum(config.history.sigma0 + config.history.lambda_sigma * (1 - omega), MIN_SIGMA)
@@ -48,20 +48,20 @@ def cache_anchor(
 def inject_anchor(
     probs: Float[Array, "*b d"], anchor: Float[Array, "*b d"], gamma: Float[Array, ""]
 ) -> Float[Array, "*b d"]:
-    """P^v of Eq. cache_prior_injection; `probs` sum to 1, so only the anchor's mass is left to divide by.
+    """The anchored distribution P^v (Eq. cache_prior_injection); `probs` must sum to 1.
 
     Limits:
-        gamma = 0, and an anchor of zeros: `probs`, bit for bit.
-        gamma -> inf: the anchor, scaled to mass 1.
+        gamma = 0 or an anchor of zeros gives `probs`, bit for bit.
+        gamma -> inf gives the anchor, scaled to mass 1.
     """
     return (probs + gamma * anchor) / (1 + gamma * anchor.sum(axis=-1, keepdims=True))
 
 
 def peak_confidence(probs: Float[Array, "*b d"], config: StreamConfig) -> Float[Array, "*b"]:
-    """omega: the peak of a distribution, or the largest mass of a few neighboring candidates.
+    """Confidence omega: the peak of a distribution, or the largest mass of a window of neighboring candidates.
 
     Limits:
-        At most 1, which a one-hot distribution gives, and one of a single candidate.
+        At most 1; a one-hot distribution and a single candidate give 1.
     """
     if config.depth.confidence == "peak":
         return probs.max(axis=-1)
@@ -73,12 +73,12 @@ def peak_confidence(probs: Float[Array, "*b d"], config: StreamConfig) -> Float[
 def expected_log_depth(
     probs: Float[Array, "*b d"], log_candidates: Float[Array, " d"], config: StreamConfig
 ) -> Float[Array, "*b"]:
-    """Eq. base_depth_regression, in the space of the candidates (DESIGN 6.3).
+    """Expected log depth (Eq. base_depth_regression), averaged in the space of the candidates.
 
     Limits:
-        A one-hot distribution, at either end too, gives its candidate, bit for bit. A single candidate is the depth
-        whatever was matched, with a zero gradient.
-        `depth_readout="window"` looks around the nearest of equal peaks.
+        A one-hot distribution gives its candidate, bit for bit. A single candidate gives its depth, with a zero
+        gradient.
+        Among equal peaks, `depth_readout="window"` takes the first.
     """
     if config.depth.depth_readout == "window":
         distance = jnp.abs(jnp.arange(probs.shape[-1]) - jnp.argmax(probs, axis=-1)[..., None])
@@ -89,16 +89,24 @@ def expected_log_depth(
 
 
 def anchor_depth(
-    params, belief: DepthBelief, history: ProjectedCache, views: Views, config: StreamConfig
+    params, distribution: DepthDistribution, history: ProjectedCache, views: Views, config: StreamConfig
 ) -> AnchoredDepth:
-    """Fuses the matcher's distribution with the cache's anchor and reads depth and confidences."""
-    probs = belief.probs
+    """Depth and confidences read from the matcher's distribution and the cache's anchor.
+
+    Args:
+        params: parameters of `AnchorStrength`.
+        distribution: distribution P_i of the matcher, on the matching grid.
+        history: the projected cache, on the matching grid.
+        views: the chunk's views.
+        config: `history.hpda=False` leaves the matcher's distribution as it is.
+    """
+    probs = distribution.probs
     if config.history.hpda:
         gamma = AnchorStrength(config).apply({"params": params})
         probs = inject_anchor(probs, cache_anchor(history, views.log_candidates, config), gamma)  # pyright: ignore[reportArgumentType]
     return AnchoredDepth(
         probs=probs,
         log_depths=expected_log_depth(probs, views.log_candidates, config),
-        matcher_confidences=peak_confidence(belief.probs, config),
+        matcher_confidences=peak_confidence(distribution.probs, config),
         anchored_confidences=peak_confidence(probs, config),
     )

@@ -1,4 +1,4 @@
-"""Building blocks that several stages share. Norms and softmax are float32 whatever the features' dtype."""
+"""Layers that several stages share. Norms and softmax are computed in float32."""
 
 import flax.linen as nn
 import jax
@@ -6,20 +6,19 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from ssplat_jax.model.convolution import Conv, HalvingConv
-from ssplat_jax.numerics import safe_normalize
 from ssplat_jax.xla_cpu import lane_sum
 
-IMAGE_MEAN = (0.485, 0.456, 0.406)  # ImageNet, as DepthSplat
-IMAGE_STD = (0.229, 0.224, 0.225)
+IMAGE_MEAN, IMAGE_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+"""Mean and standard deviation of ImageNet, RGB."""
 
 
 def normalize_images(images: Float[Array, "v h w 3"]) -> Float[Array, "v h w 3"]:
-    """Images in [0, 1] as the networks take them."""
+    """Images in [0, 1] normalized by the statistics of ImageNet."""
     return (images - jnp.array(IMAGE_MEAN, images.dtype)) / jnp.array(IMAGE_STD, images.dtype)
 
 
 def instance_norm(x: Float[Array, "v h w c"], eps: float = 1e-5) -> Float[Array, "v h w c"]:
-    """Zero mean, unit (biased) variance per image and channel; no parameters.
+    """Features with zero mean and unit variance per image and channel; no parameters.
 
     Limits:
         A constant channel gives zeros.
@@ -41,12 +40,18 @@ def attend(
     values: Float[Array, "*b k heads c"],
     allowed: Bool[Array, "*#b #q k"] | None = None,
 ) -> Float[Array, "*b q heads c"]:
-    """Scaled dot-product attention of each query to the keys that it is allowed, softmax in float32.
+    """Scaled dot-product attention, softmax in float32.
+
+    Args:
+        queries: query features.
+        keys: key features.
+        values: value features, one per key.
+        allowed: which keys each query attends to; None for all.
 
     Limits:
-        No allowed key gives zeros.
+        A query without an allowed key gives zeros.
     """
-    # Heads first, since XLA's CPU backend multiplies matrices that lie so twice as fast.
+    # Heads come first because XLA's CPU backend multiplies matrices in that layout twice as fast.
     queries, keys, values = (jnp.moveaxis(x, -2, -3) for x in (queries, keys, values))
     scores = jnp.matmul(queries, jnp.swapaxes(keys, -1, -2)).astype(jnp.float32) * queries.shape[-1] ** -0.5
     if allowed is None:
@@ -57,45 +62,46 @@ def attend(
     return jnp.moveaxis(mixed * jnp.any(allowed, axis=-1, keepdims=True).astype(mixed.dtype), -3, -2)
 
 
-def attend_own(
+def attend_per_query(
     queries: Float[Array, "m c"],
     keys: Float[Array, "m k c"],
     values: Float[Array, "m k c"],
     allowed: Bool[Array, "m k"],
 ) -> Float[Array, "m c"]:
-    """`attend` with one head, of queries that have a few keys each to themselves.
+    """One-head attention where every query has a few keys of its own.
 
-    Matrix products of one row would be four times as slow on a CPU.
+    `attend` would compute products of one-row matrices, which are four times slower on a CPU.
+
+    Args:
+        queries: query features.
+        keys: the k keys of each query.
+        values: the values of those keys.
+        allowed: which of its keys a query attends to.
 
     Limits:
-        No allowed key gives zeros.
+        A query without an allowed key gives zeros.
     """
     scores = lane_sum(queries[:, None] * keys).astype(jnp.float32) * queries.shape[-1] ** -0.5
     weights = jax.nn.softmax(jnp.where(allowed, scores, -1e9), axis=-1) * allowed.astype(jnp.float32)
     return jnp.sum(weights.astype(values.dtype)[..., None] * values, axis=-2)
 
 
-def unit_features(x: Float[Array, "*b c"]) -> Float[Array, "*b c"]:
-    """Features on the unit sphere, so that a dot product is a cosine (zero stays zero)."""
-    return safe_normalize(x, eps=1e-6)
-
-
 def rms_normalize(x: Float[Array, "*b c"], eps: float = 1e-6) -> Float[Array, "*b c"]:
     """Features scaled to a root mean square of 1.
 
     Limits:
-        Zero gives zeros; below an RMS of about 1e-3 the result shrinks with its input, and gradients stay finite.
+        Zero gives zeros. Below an RMS of about 1e-3 the result shrinks with its input; gradients stay finite.
     """
     return x * jax.lax.rsqrt(jnp.mean(x * x, axis=-1, keepdims=True) + eps)
 
 
 class ResidualBlock(nn.Module):
-    """conv - InstanceNorm - ReLU twice, with a projected skip where the shape changes (ALGORITHM 2.2)."""
+    """Twice conv - InstanceNorm - ReLU, with a projected skip connection where the shape changes."""
 
     features: int
     stride: int = 1
     skip: str = "skip"
-    """Name of the projection."""
+    """Parameter name of the projection."""
 
     @nn.compact
     def __call__(self, x):
@@ -108,7 +114,7 @@ class ResidualBlock(nn.Module):
 
 
 class UNetBlock(nn.Module):
-    """GroupNorm - SiLU - conv twice; the last convolution starts at zero (ALGORITHM 2.7)."""
+    """Residual block: twice GroupNorm - SiLU - conv. The last convolution starts at zero."""
 
     features: int
 
@@ -123,7 +129,7 @@ class UNetBlock(nn.Module):
 
 
 class JointAttention(nn.Module):
-    """Self-attention over the cells of all views of the chunk together, residual, last layer zero-initialized."""
+    """Residual self-attention over the cells of all views of a chunk. The last layer starts at zero."""
 
     heads: int = 4
 
@@ -137,7 +143,7 @@ class JointAttention(nn.Module):
 
 
 class UNet(nn.Module):
-    """Three levels of equal width, one block a level on the way down and up, joint attention at the lowest."""
+    """U-Net of three levels with equal width, one block per level down and up, and joint attention at the lowest."""
 
     features: int
 

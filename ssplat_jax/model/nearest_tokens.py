@@ -1,25 +1,27 @@
-"""The tokens that a token's neighbors in 3D are (ReSplat; ALGORITHM 3.2)."""
+"""Nearest neighbors of tokens in 3D, for the mixers (as in ReSplat)."""
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ssplat_jax.config import StreamConfig
-
-SEARCH_BLOCK = 1024  # queries at a time in the global search: bounds its distance matrix
+SEARCH_BLOCK = 1024
+"""Queries per block of the global search, which bounds the size of its distance matrix."""
 
 
 def nearest_tokens(
-    positions: Float[Array, "v hf wf 3"], inside: Bool[Array, "v hf wf"], config: StreamConfig
+    positions: Float[Array, "v hf wf 3"], inside: Bool[Array, "v hf wf"], num_neighbors: int, radius: int
 ) -> Int[Array, "m k"]:
-    """Flat indices of each token's nearest tokens in 3D, itself first.
+    """Flat indices of each token's nearest tokens in 3D, the token itself first.
 
-    Tokens outside the image are chosen last; a neighborhood with fewer real tokens repeats what it has.
+    Args:
+        positions: token positions, stream frame.
+        inside: tokens in the image. Others are chosen last.
+        num_neighbors: neighbors per token, the token itself included; fewer where there are not so many candidates.
+        radius: candidates are the (2 r + 1)^2 cells around a token in its own view; 0 for all tokens of all views.
     """
-    if config.network.mixer_radius == 0:
-        return _nearest_of_all(positions.reshape(-1, 3), inside.reshape(-1), config.network.mixer_neighbors)
+    if radius == 0:
+        return _nearest_of_all(positions.reshape(-1, 3), inside.reshape(-1), num_neighbors)
     v, hf, wf, _ = positions.shape
-    radius = config.network.mixer_radius
     side = 2 * radius + 1
     flat = jnp.arange(v * hf * wf).reshape(v, hf, wf)
     rows = jnp.arange(hf)[:, None] + jnp.arange(side) - radius
@@ -31,10 +33,10 @@ def nearest_tokens(
     candidates = flat[:, rows[:, None, :, None], columns[None, :, None, :]].reshape(v * hf * wf, side * side)
     points, usable = positions.reshape(-1, 3), inside.reshape(-1)
     offsets = points[candidates] - points[:, None]
-    # A patch that sticks out of the grid reads border cells twice: only the first reading counts.
+    # At the border of the grid, clipped candidates repeat border cells: only cells inside the grid count.
     distances = jnp.where(usable[candidates] & in_grid, jnp.sum(offsets**2, axis=-1), jnp.inf)
-    distances = distances.at[:, side * side // 2].set(-1.0)  # itself
-    _, best = jax.lax.top_k(-distances, min(config.network.mixer_neighbors, side * side))
+    distances = distances.at[:, side * side // 2].set(-1.0)  # the token itself
+    _, best = jax.lax.top_k(-distances, min(num_neighbors, side * side))
     return jnp.take_along_axis(candidates, best, axis=1)
 
 

@@ -1,11 +1,12 @@
-"""The protocol of a network: what it must provide so that `StreamSplat` can run it.
+"""Protocol of a network: what `StreamSplat` needs in order to run one.
 
-A network is a folder beside this file. It has a configuration (a frozen dataclass with the fields that
-`NetworkConfig` names) and an object that fulfils `Network`. Everything else is shared: projection of the cache, HPDA,
-CGFI, exposure, decoding and memory.
+A network has a configuration, a frozen dataclass with the fields of `NetworkConfig`, and an object with the methods of
+`Network`. The shipped networks are folders beside this file; `register_network` adds another. Projection of the cache,
+HPDA, CGFI, exposure, decoding and memory are shared by all networks.
 """
 
-from typing import Any, ClassVar, Protocol, runtime_checkable
+import dataclasses
+from typing import Any, Protocol, runtime_checkable
 
 from jaxtyping import Array, Bool, Float
 
@@ -13,12 +14,12 @@ from ssplat_jax.config import NETWORK_CONFIGS, StreamConfig
 from ssplat_jax.errors import InputError
 from ssplat_jax.model.compact import CompactNetwork
 from ssplat_jax.model.resplat import ResplatNetwork
-from ssplat_jax.model.types import AnchoredDepth, DepthBelief, TokenShapes, Views
+from ssplat_jax.model.types import AnchoredDepth, DepthDistribution, TokenShapes, Views
 
 
 @runtime_checkable
 class NetworkConfig(Protocol):
-    """Static facts about a network that shared stages read. Its other fields are its own."""
+    """Members of a network's configuration that shared stages read. Other fields are the network's own."""
 
     @property
     def kind(self) -> str:
@@ -27,22 +28,22 @@ class NetworkConfig(Protocol):
 
     @property
     def size_multiple(self) -> int:
-        """Images are padded to a multiple of this many pixels."""
+        """Images are padded to a multiple of this: a multiple of `match_stride`, and of 16 for CGFI's U-Net."""
         ...
 
     @property
     def match_stride(self) -> int:
-        """Pixels per side of a cell of the cost volume, a multiple of `GRID_STRIDE`."""
+        """Pixels per side of a cell of the matching grid, a multiple of `GRID_STRIDE`."""
         ...
 
     @property
     def depth_range(self) -> tuple[float, float] | None:
-        """Nearest and farthest candidate in stream units; None takes the chunk's near and far."""
+        """Nearest and farthest depth candidate in stream units; None takes the chunk's near and far."""
         ...
 
     @property
     def depth_space(self) -> str:
-        """`log` or `inverse`: where candidates are uniform."""
+        """Space in which candidates are uniform: `log` or `inverse`."""
         ...
 
     @property
@@ -58,43 +59,51 @@ class NetworkConfig(Protocol):
 
 @runtime_checkable
 class Network(Protocol):
-    """The stages in which networks differ. Every method is a pure function; parameters are nested dicts.
+    """The stages in which networks differ.
 
-    `features` is whatever `encode` returns; only the network itself looks inside.
+    Every method is a pure function, differentiable in parameters and features. `params` are the parameters of that
+    stage alone. `features` is whatever `encode` returns; only the network itself looks inside.
     """
 
-    matcher_stages: ClassVar[tuple[str, ...]]
-    """Stages (keys of the parameters) that end in the depth distribution; a recipe may freeze them."""
-
     def stages(self, config: StreamConfig) -> dict[str, tuple[Any, tuple]]:
-        """Linen module and example inputs of every stage that has parameters, by the stage's name."""
+        """Linen module and example inputs of every stage, by name; used to initialize parameters.
+
+        The names are `encoder`, `cost_volume`, `tokens`, `mixer`, `decoder` and, where depth is refined, `upsampler`. A
+        stage may have no parameters, but its module must be there.
+        """
         ...
 
     def encode(self, params: dict, views: Views, config: StreamConfig) -> Any:
-        """Features of the chunk's views."""
+        """Features of the chunk's views (stage `encoder`)."""
         ...
 
-    def match(self, params: dict, features: Any, views: Views, config: StreamConfig) -> DepthBelief:
-        """Depth distribution P_i(k | u) from the current views alone."""
+    def match(self, params: dict, features: Any, views: Views, config: StreamConfig) -> DepthDistribution:
+        """Depth distribution P_i(k | u) from the current views alone, on the matching grid (stage `cost_volume`)."""
         ...
 
     def refine_depth(
         self, params: dict | None, features: Any, depth: AnchoredDepth, views: Views, config: StreamConfig
     ) -> AnchoredDepth:
-        """Anchored depth on the 1/4 grid; `params` is None for a network without such a stage."""
+        """Anchored depth on the feature grid (stage `upsampler`; `params` is None without such a stage)."""
         ...
 
     def regress_tokens(
-        self, params: dict, features: Any, belief: DepthBelief, depth: AnchoredDepth, views: Views, config: StreamConfig
+        self,
+        params: dict,
+        features: Any,
+        distribution: DepthDistribution,
+        depth: AnchoredDepth,
+        views: Views,
+        config: StreamConfig,
     ) -> Float[Array, "v hf wf c"]:
-        """Token features f^v(u) before history is injected."""
+        """Token features f^v(u) before history is injected (stage `tokens`)."""
         ...
 
     def bound_history(self, feats: Float[Array, "v hf wf c"]) -> Float[Array, "v hf wf c"]:
-        """Projected cache features at a size that cannot grow from chunk to chunk.
+        """Projected cache features, bounded in size.
 
-        Injected features are stored and come back with the next chunk: a network whose mixer does not end in a norm
-        must bound them here.
+        Injected features are stored and come back with the next chunk. A network whose `mix_tokens` does not end in a
+        norm must bound them here, or they grow from chunk to chunk.
         """
         ...
 
@@ -107,15 +116,16 @@ class Network(Protocol):
         view_valid: Bool[Array, " v"],
         config: StreamConfig,
     ) -> Float[Array, "v hf wf c"]:
-        """Token features after attention among tokens, as the cache stores them."""
+        """Token features after attention among tokens, as the cache stores them (stage `mixer`)."""
         ...
 
     def read_shapes(self, params: dict, feats: Float[Array, "m c"], config: StreamConfig) -> TokenShapes:
-        """Opacity, scale, rotation and color residual that the head reads from features."""
+        """Opacity, scale, rotation and color residual of each token's Gaussians (stage `decoder`)."""
         ...
 
 
 NETWORKS: dict[str, Network] = {"compact": CompactNetwork(), "resplat": ResplatNetwork()}
+"""Networks by kind."""
 
 
 def network_of(config: StreamConfig) -> Network:
@@ -127,13 +137,23 @@ def register_network(config_type: type, network: Network) -> None:
     """Adds a network, so that `config.replace(network=KIND)`, saved states and weights files know it.
 
     Args:
-        config_type: frozen dataclass with defaults for every field, which fulfils `NetworkConfig`.
-        network: the object with its stages.
+        config_type: frozen dataclass with a default for every field and the members of `NetworkConfig`. `kind` must be
+            a class variable.
+        network: object with the methods of `Network`.
 
     Raises:
-        InputError: another network has that kind.
+        InputError: `config_type` or `network` lacks something, or another network has that kind.
     """
-    kind = config_type.kind
+    config: Any = config_type()
+    if not dataclasses.is_dataclass(config) or not isinstance(config, NetworkConfig):
+        raise InputError(
+            f"register_network: wanted a dataclass with the members of NetworkConfig, got {config_type.__name__}."
+        )
+    if not isinstance(network, Network):
+        raise InputError(
+            f"register_network: wanted an object with the methods of Network, got {type(network).__name__}."
+        )
+    kind = config.kind
     if kind in NETWORKS and NETWORK_CONFIGS[kind] is not config_type:
         raise InputError(f"register_network: wanted a new kind, got {kind!r}, which is taken; choose another.")
     NETWORK_CONFIGS[kind] = config_type

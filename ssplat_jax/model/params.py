@@ -1,4 +1,4 @@
-"""Fresh parameters of every stage: plain nested dicts whose names are the checkpoint format."""
+"""Untrained parameters of all stages: nested dicts, whose names are part of the weights file format."""
 
 import functools
 from collections.abc import Collection
@@ -7,20 +7,30 @@ import jax
 import jax.numpy as jnp
 
 from ssplat_jax.config import StreamConfig
+from ssplat_jax.errors import InputError
 from ssplat_jax.model.cgfi import Aggregator
 from ssplat_jax.model.hpda import AnchorStrength
 from ssplat_jax.model.network import network_of
 from ssplat_jax.model.types import GRID_STRIDE
 
 STAGES = ("encoder", "cost_volume", "hpda", "upsampler", "tokens", "cgfi", "mixer", "decoder")
+"""Names of the stages with parameters, in the order in which random keys are split among them."""
 
 
 def init_params(key: jax.Array, config: StreamConfig, only: Collection[str] | None = None) -> dict:
-    """Parameters for `config`, drawn from `key`. Shapes depend on the configuration alone, never on an image.
+    """Random parameters for `config`. Their shapes depend on the configuration alone, not on the image size.
 
-    Of the stages in `only`, which are then what the whole would have; default all.
+    Args:
+        key: JAX random key.
+        config: model configuration.
+        only: stages to return, with the values that they have among all stages; default all.
+
+    Raises:
+        InputError: the network has a stage of an unknown name.
     """
     modules = _modules(config)
+    if unknown := sorted(modules.keys() - set(STAGES)):
+        raise InputError(f"network {config.network.kind!r}: wanted stages among {', '.join(STAGES)}, got {unknown}.")
     names = [name for name in STAGES if name in modules]
     keys = jax.random.split(key, len(names))
     return {
@@ -28,8 +38,8 @@ def init_params(key: jax.Array, config: StreamConfig, only: Collection[str] | No
     }
 
 
-# A stage at a time: compiled as one, those of a large network take half as long again. Eagerly, every operation of
-# every layer would be compiled by itself.
+# One program per stage: a single program for all stages of a large network takes 1.5 times as long to compile, and
+# eager initialization compiles every operation of every layer by itself.
 @functools.partial(jax.jit, static_argnums=(1, 2))
 def _init_stage(key: jax.Array, config: StreamConfig, name: str) -> dict:
     module, inputs = _modules(config)[name]
@@ -37,7 +47,7 @@ def _init_stage(key: jax.Array, config: StreamConfig, name: str) -> dict:
 
 
 def _modules(config: StreamConfig) -> dict:
-    """Every stage with parameters, and inputs of the shapes that it takes."""
+    """Linen module and example inputs of every stage."""
     v, side, c = 2, config.network.size_multiple // GRID_STRIDE, config.network.token_width
     grid = lambda channels: jnp.zeros((v, side, side, channels))  # noqa: E731
     return network_of(config).stages(config) | {

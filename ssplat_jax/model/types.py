@@ -1,4 +1,4 @@
-"""The few pytrees that pass between the stages of one step."""
+"""Arrays that the stages of one step exchange."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -9,42 +9,33 @@ from ssplat_jax.geometry.cameras import Camera, pixel_grid
 from ssplat_jax.pytree import pytree, static
 
 GRID_STRIDE = 4
-"""Pixels to a side of a grid cell: one token per 4 x 4 patch (Sec. 3.3, M = N H W / 16)."""
+"""Pixels per side of a grid cell: one token per 4 x 4 patch (Sec. 3.3, M = N H W / 16)."""
 
 
 @pytree
 class Views:
-    """A chunk padded to a size that the network takes. Padding is at the right and bottom, so `Ks` stay as they are."""
+    """A chunk padded to a size that the network accepts. Padding at the right and bottom leaves `Ks` unchanged."""
 
     images: Float[Array, "v hp wp 3"]  # edge-padded
     viewmats: Float[Array, "v 4 4"]
     Ks: Float[Array, "v 3 3"]
     valid: Bool[Array, " v"]
     inside: Bool[Array, "v hf wf"]  # cells of valid views whose center lies in the unpadded image
-    log_candidates: Float[Array, " d"]  # ln of the depth candidates, near to far (of inverse depth: far to near)
+    log_candidates: Float[Array, " d"]  # ln of the candidates, near to far; far to near if `inverse`
     height: int = static()  # of the unpadded image
     width: int = static()
 
     @property
     def grid_camera(self) -> Camera:
-        """The views' cameras at grid resolution: one pixel per cell."""
+        """Cameras of the views at grid resolution: one pixel per cell."""
         hf, wf = self.inside.shape[1:]
         scale = jnp.array([1.0 / GRID_STRIDE, 1.0 / GRID_STRIDE, 1.0])
         return Camera(viewmats=self.viewmats, Ks=self.Ks * scale[:, None], width=wf, height=hf)
 
 
 @pytree
-class Features:
-    """What the encoder sees."""
-
-    fine: Float[Array, "v h2 w2 cm"]  # matching features at 1/2
-    grid: Float[Array, "v hf wf cm"]  # matching features at 1/4, after cross-view attention
-    context: Float[Array, "v hf wf c"]  # everything at 1/4: CNN and multi-view features
-
-
-@pytree
-class DepthBelief:
-    """P_i(k | u), what the current views alone say, and the decoder features it was read from; on the match grid."""
+class DepthDistribution:
+    """The matcher's distribution P_i(k | u) and the features it was predicted from, on the matching grid."""
 
     probs: Float[Array, "v hm wm d"]
     logits: Float[Array, "v hm wm d"]
@@ -53,34 +44,37 @@ class DepthBelief:
 
 @pytree
 class AnchoredDepth:
-    """P^v(k | u) and what is read from it: on the match grid, and refined on the 1/4 grid but for `probs`."""
+    """The anchored distribution P^v(k | u), and the depths and confidences read from it.
+
+    All on the matching grid; after `refine_depth`, all but `probs` are on the feature grid.
+    """
 
     probs: Float[Array, "v hm wm d"]
     log_depths: Float[Array, "v hf wf"]
-    matcher_confidences: Float[Array, "v hf wf"]  # peak of P_i, before the anchor: what VACC trusts
-    anchored_confidences: Float[Array, "v hf wf"]  # peak of P^v: what CGFI attenuates by
+    matcher_confidences: Float[Array, "v hf wf"]  # of P_i, before the anchor: the confidence of tokens in VACC
+    anchored_confidences: Float[Array, "v hf wf"]  # of P^v: CGFI attenuates history by them
 
 
 @pytree
 class TokenShapes:
-    """What the head says of tokens, before they are Gaussians."""
+    """Predictions of the Gaussian head for each token, before activation."""
 
     opacity_logits: Float[Array, " m"]
     raw_scales: Float[Array, "m 3"]  # see `decoder.token_scales`
     quats: Float[Array, "m 4"]  # wxyz, any length, in the frame of the token's camera
-    sh: Float[Array, "m k 3"]  # color beside the appearance anchor
+    sh: Float[Array, "m k 3"]  # residual color on the appearance anchor
 
 
 def repeat_cells(x: Array, factor: int) -> Array:
-    """A map `[v, h, w, ...]` on a finer grid: every cell `factor` times in both directions."""
+    """Map `[v, h, w, ...]` on a finer grid: every cell repeated `factor` times in both directions."""
     return jnp.repeat(jnp.repeat(x, factor, axis=1), factor, axis=2)
 
 
 def prepare_views(chunk: Chunk, config: StreamConfig) -> Views:
-    """Pads the images of `chunk` (edge values) to the network's multiple and lays out the candidates.
+    """Views of `chunk`: images edge-padded to the network's multiple, and the depth candidates.
 
     Limits:
-        A single candidate is `near`.
+        A single candidate lies at `near`.
     """
     height, width = chunk.images.shape[1:3]
     multiple = config.network.size_multiple
@@ -112,27 +106,27 @@ def _log_candidates(near, far, config: StreamConfig) -> Float[Array, " d"]:
 
 
 def to_candidate_space(log_depths: Float[Array, "*b"], config: StreamConfig) -> Float[Array, "*b"]:
-    """Depths where candidates are equally far apart: their logarithms, or inverses."""
+    """Depths in the space in which candidates are uniform: log depth or inverse depth."""
     return jnp.exp(-log_depths) if config.network.depth_space == "inverse" else log_depths
 
 
 def from_candidate_space(x: Float[Array, "*b"], config: StreamConfig) -> Float[Array, "*b"]:
-    """Log depths; inverse of `to_candidate_space`."""
+    """Log depths of values in candidate space; inverse of `to_candidate_space`."""
     return -jnp.log(x) if config.network.depth_space == "inverse" else x
 
 
 def nearest_sources(
     viewmats: Float[Array, "v 4 4"], valid: Bool[Array, " v"], num_sources: int
 ) -> tuple[Int[Array, "v s"], Bool[Array, "v s"]]:
-    """The other views nearest by center distance, and which of them are valid.
+    """Indices of the other views with the nearest camera centers, and which of them are valid.
 
-    A view is excluded by its index, never by its distance: two cameras may share a center (ALGORITHM 2.3).
+    A view is excluded by its index, not by its distance, because two cameras may share a center.
     """
     v = viewmats.shape[0]
     centers = Camera(viewmats=viewmats, Ks=jnp.zeros((v, 3, 3)), width=1, height=1).centers
     distances = jnp.sum((centers[:, None] - centers[None]) ** 2, axis=-1)
     distances = jnp.where(valid[None, :], distances, jnp.inf)
     distances = jnp.where(jnp.eye(v, dtype=bool), jnp.inf, distances)
-    # Own index last even among invalid views: a stable sort on (distance, is_self).
+    # Sorting by (distance, is_self) puts the view itself last, even after invalid views.
     order = jnp.lexsort((jnp.eye(v, dtype=jnp.int32), distances), axis=-1)[:, : min(num_sources, v - 1)]
     return order, jnp.take_along_axis(jnp.isfinite(distances), order, axis=1)

@@ -1,4 +1,4 @@
-"""Windows of a feature map, for attention inside them (Swin; ALGORITHM 2.3)."""
+"""Windows of feature maps for windowed attention (Swin Transformer, Liu et al. 2021)."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -6,7 +6,7 @@ from jaxtyping import Array, Bool, Float
 
 
 def sine_positions(height: int, width: int, features: int) -> Float[np.ndarray, "h w c"]:
-    """Sine position code of a window: half of the channels for y, half for x (DETR's, normalized to 2 pi)."""
+    """Sine position code of a window, normalized to 2 pi as in DETR: half of the channels for y, half for x."""
     half = features // 2
     rates = 10000.0 ** (2 * (np.arange(half) // 2) / half)
 
@@ -20,7 +20,7 @@ def sine_positions(height: int, width: int, features: int) -> Float[np.ndarray, 
 
 
 def to_windows(x: Float[Array, "v h w c"], side: tuple[int, int]) -> Float[Array, "v windows cells c"]:
-    """Cuts a map into windows of `side` cells, (height, width)."""
+    """Map cut into windows of `side` = (height, width) cells."""
     v, h, w, c = x.shape
     x = x.reshape(v, h // side[0], side[0], w // side[1], side[1], c).transpose(0, 1, 3, 2, 4, 5)
     return x.reshape(v, (h // side[0]) * (w // side[1]), side[0] * side[1], c)
@@ -35,10 +35,13 @@ def from_windows(
     return x.reshape(v, height, width, c)
 
 
-def in_one_region(
+def same_region_mask(
     height: int, width: int, side: tuple[int, int], shift: tuple[int, int]
 ) -> Bool[Array, "1 windows cells cells"]:
-    """Which cells of the windows of a map rolled by `-shift` are neighbors, not opposite borders in one window."""
+    """Pairs of cells in one window that may attend to each other, in a map rolled by `-shift`.
+
+    Rolling brings cells from opposite borders of the map into one window; such pairs are False.
+    """
     rows, columns = (np.arange(n) >= n - s for n, s in zip((height, width), shift, strict=True))
     regions = jnp.asarray((2 * rows[:, None] + columns)[None, :, :, None], jnp.float32)
     cells = to_windows(regions, side)[..., 0]

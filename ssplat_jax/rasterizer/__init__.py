@@ -1,4 +1,4 @@
-"""Differentiable rendering of 3D Gaussians in plain JAX."""
+"""Differentiable rasterization of 3D Gaussians in plain JAX."""
 
 from ssplat_jax.rasterizer.effects import Effects as Effects
 from ssplat_jax.rasterizer.effects import effects_for as effects_for

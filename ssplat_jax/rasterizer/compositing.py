@@ -1,10 +1,10 @@
 """The fast path: tiles composited front to back in batches of similar load, with a gradient that recomputes.
 
-A turn of the loop takes the next `TURN` Gaussians of each of `BATCH` tiles. Arrays are `[p u t]`: pixels of a tile,
-then the turn's Gaussians, then the batch's tiles, so that every kernel runs over contiguous tiles with the pixel's
-offset as a constant, and sums over Gaussians or pixels are sums over a short middle axis (XLA vectorizes those; sums
-over the last or a long first axis cost five times as much). Nothing per sample is stored: the backward pass walks the
-same turns again, front to back, knowing the totals from the forward pass.
+A step of the loop takes the next `STEP_SIZE` Gaussians of each of `BATCH_SIZE` tiles. Arrays are `[p u t]`: pixels of a
+tile, the step's Gaussians, the batch's tiles. Every kernel then runs over contiguous tiles with the pixel's offset as a
+constant, and sums over Gaussians or pixels are sums over a short middle axis (XLA's CPU backend vectorizes those; sums
+over the last or a long first axis cost five times as much). Nothing per sample is stored: the backward pass repeats the
+same steps, front to back, with the totals of the forward pass.
 
     w_i = a_i T_i,  T_{i+1} = T_i (1 - a_i)        out = sum_i w_i c_i
     dL/da_i = T_i s_i - tail_i / (1 - a_i)   with s_i = c_i . dL/dout and tail_i = sum_{j>i} w_j s_j
@@ -17,61 +17,82 @@ from collections.abc import Callable, Iterable
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
 from ssplat_jax.rasterizer import constants
-from ssplat_jax.rasterizer.binning import READ_AHEAD, Pairs
-from ssplat_jax.rasterizer.depth_sorted_table import BOX, SHAPE
-from ssplat_jax.rasterizer.tile_grid import Grid
-from ssplat_jax.xla_cpu import apart
-
-TURN = READ_AHEAD  # the last of a tile may look past all pairs
-BATCH = 128
-LOG_LEAST = constants.LOG_ALPHA_MIN
-LOG_MOST = math.log(constants.ALPHA_MAX)
-CAPPED = constants.ALPHA_MAX * (1 - 1e-5)  # no less is what exp(LOG_MOST) comes out as
-SQUARINGS = 3
-# e^y of an eighth of what an alpha's power can be, a polynomial
-GROWTH = np.polynomial.Chebyshev.interpolate(np.exp, 5, [0.0, -LOG_LEAST / 2**SQUARINGS]).convert(
-    kind=np.polynomial.Polynomial
+from ssplat_jax.rasterizer.binning import READ_AHEAD, TileIntersections
+from ssplat_jax.rasterizer.depth_sorted_table import (
+    BOX,
+    CHANNELS,
+    FACTORS,
+    LOG_OPACITY,
+    MEAN_X,
+    MEAN_Y,
+    SHAPE,
+    WITHOUT_BOX,
+    num_channels,
 )
+from ssplat_jax.rasterizer.tile_grid import Grid
+from ssplat_jax.xla_cpu import in_own_kernel, short_exp
+
+STEP_SIZE = READ_AHEAD
+"""Gaussians of a tile in one step; the last step of a tile may read behind all of its pairs. 16 are not faster."""
+
+BATCH_SIZE = 128
+"""Tiles composited side by side. 256 are not faster."""
+
+LOG_ALPHA_MAX = math.log(constants.ALPHA_MAX)
+
+CAPPED_ALPHA = constants.ALPHA_MAX * (1 - 1e-5)
+"""Alphas from here on are capped: `short_exp(LOG_ALPHA_MAX)` is not less."""
+
+STEP_CHANNELS = slice(CHANNELS.start, None)
+"""The channels of a step's columns, which have no box; the ones from which alpha is composited come last."""
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0, 1))
-def composite(grid: Grid, with_alpha: bool, table: Float[Array, "m f"], pairs: Pairs) -> Float[Array, "tiles co p"]:
-    """The channels of a `sorted_table`, and alpha behind them if wanted, composited over every tile's pixels.
+def composite(
+    grid: Grid, with_alpha: bool, table: Float[Array, "m f"], intersections: TileIntersections
+) -> Float[Array, "tiles co p"]:
+    """The channels of a `sorted_table` composited over every tile's pixels.
 
-    Gradients reach the columns of the shape and the channels. Samples fainter than 1/255 or capped at 0.99 pass none on
-    to their opacity.
+    Args:
+        grid: the tiles.
+        with_alpha: whether alpha follows as the last channel.
+        table: from `sorted_table`.
+        intersections: from `intersect_tiles`.
+
+    Returns:
+        Sums of weight times channel for each tile, channel and pixel. Gradients reach the table's shape and channels.
+        Samples fainter than 1/255 or capped at 0.99 have no gradient by their opacity.
     """
-    return _forward(grid, with_alpha, table, pairs)
+    return _forward(grid, with_alpha, table, intersections)
 
 
-def _forward(grid: Grid, with_alpha: bool, table, pairs: Pairs):
-    num_channels = table.shape[1] - SHAPE - BOX + with_alpha  # alpha is what a channel of ones becomes
+def _forward(grid: Grid, with_alpha: bool, table, intersections: TileIntersections):
+    channels = num_channels(table) + with_alpha  # a channel of ones becomes alpha
 
     def batch(out, tiles):
-        def turn(_, values, alphas, transmittance, out):
+        def step(_, values, alphas, transmittance, out):
             weights, afters = _weights(alphas, transmittance)
-            return afters[-1], out + _total(weight * values[SHAPE:, None, u] for u, weight in enumerate(weights))
+            return afters[-1], out + _total(weight * values[STEP_CHANNELS, None, u] for u, weight in enumerate(weights))
 
-        start = jnp.zeros((num_channels, grid.tile**2, tiles.shape[0]), table.dtype)
-        drawn = _walk(grid, table, pairs, tiles, turn, start, with_ones=with_alpha)
+        start = jnp.zeros((channels, grid.tile**2, tiles.shape[0]), table.dtype)
+        drawn = _run_steps(grid, table, intersections, tiles, step, start, with_ones=with_alpha)
         return out.at[tiles].set(jnp.moveaxis(drawn, -1, 0), mode="drop"), None
 
-    out = jnp.zeros((grid.num_tiles, num_channels, grid.tile**2), table.dtype)
-    return lax.scan(batch, out, _batches(pairs.bounds, grid))[0]
+    out = jnp.zeros((grid.num_tiles, channels, grid.tile**2), table.dtype)
+    return lax.scan(batch, out, _batches(intersections.bounds, grid))[0]
 
 
-def _composite_fwd(grid: Grid, with_alpha: bool, table, pairs: Pairs):
-    out = _forward(grid, with_alpha, table, pairs)
-    return out, (table, pairs, out)
+def _composite_fwd(grid: Grid, with_alpha: bool, table, intersections: TileIntersections):
+    out = _forward(grid, with_alpha, table, intersections)
+    return out, (table, intersections, out)
 
 
 def _composite_bwd(grid: Grid, with_alpha: bool, residuals, cotangents):
-    table, pairs, out = residuals
+    table, intersections, out = residuals
     tails = jnp.sum(out * cotangents, axis=1)
 
     def batch(grads, tiles):
@@ -79,146 +100,150 @@ def _composite_bwd(grid: Grid, with_alpha: bool, residuals, cotangents):
         cotangent = lax.optimization_barrier(jnp.moveaxis(cotangents[inside], 0, -1))  # co p t
         by_channel, by_alpha = (cotangent[:-1], cotangent[-1, :, None]) if with_alpha else (cotangent, 0.0)
 
-        def turn(numbers, values, alphas, transmittance, state):
+        def step(rows, values, alphas, transmittance, state):
             tail, grads = state
             weights, afters = _weights(alphas, transmittance)
             weights = jnp.stack(weights, axis=1)
-            slopes = sum((c[:, None] * value for c, value in zip(by_channel, values[SHAPE:], strict=True)), by_alpha)
+            channels = values[STEP_CHANNELS]
+            slopes = sum((c[:, None] * value for c, value in zip(by_channel, channels, strict=True)), by_alpha)
             tail, exponents = _exponent_gradients(alphas, weights, weights * slopes, tail)
             grad_channels = [_sum_pixels(grid, weights * c[:, None]) for c in by_channel]
-            rows = jnp.stack([*_shape_gradients(grid, exponents, values), *grad_channels], axis=-1)
-            grads = grads.at[numbers.T].add(rows)  # what is read past a tile's end adds zeros
+            grad_rows = jnp.stack([*_shape_gradients(grid, exponents, values), *grad_channels], axis=-1)
+            grads = grads.at[rows.T].add(grad_rows)  # rows read behind a tile's end add zeros
             return afters[-1], (tail, grads)
 
-        return _walk(grid, table, pairs, tiles, turn, (tails[inside].T, grads))[1], None
+        return _run_steps(grid, table, intersections, tiles, step, (tails[inside].T, grads))[1], None
 
-    grads = jnp.zeros((table.shape[0], table.shape[1] - BOX), table.dtype)
-    grads = lax.scan(batch, grads, _batches(pairs.bounds, grid))[0]
-    return jnp.pad(grads, ((0, 0), (0, BOX))), None
+    grads = jnp.zeros_like(table[:, WITHOUT_BOX])
+    grads = lax.scan(batch, grads, _batches(intersections.bounds, grid))[0]
+    return jnp.pad(grads, ((0, 0), (0, table.shape[1] - grads.shape[1]))), None
 
 
 composite.defvjp(_composite_fwd, _composite_bwd)
 
 
-def median_rows(grid: Grid, table: Float[Array, "m f"], pairs: Pairs) -> Int[Array, "tiles p"]:
-    """The row of a `sorted_table` whose sample brings each pixel's transmittance below one half, or -1.
-
-    No gradient.
-    """
-    table = jnp.concatenate([table[:, :SHAPE], table[:, -BOX:]], axis=1)
+def median_rows(grid: Grid, table: Float[Array, "m f"], intersections: TileIntersections) -> Int[Array, "tiles p"]:
+    """The table row whose sample brings each pixel's transmittance below one half, or -1; without a gradient."""
+    table = jnp.concatenate([table[:, SHAPE], table[:, BOX]], axis=1)
 
     def batch(tiles):
-        def turn(numbers, _, alphas, transmittance, found):
+        def step(rows, _, alphas, transmittance, found):
             afters = _weights(alphas, transmittance)[1]
-            for after, row in zip(afters, numbers.T, strict=True):
+            for after, row in zip(afters, rows.T, strict=True):
                 found = jnp.where((found < 0) & (after < constants.MEDIAN_TRANSMITTANCE), row, found)
             return afters[-1], found
 
-        return _walk(grid, table, pairs, tiles, turn, jnp.full((grid.tile**2, tiles.shape[0]), -1, jnp.int32))
+        start = jnp.full((grid.tile**2, tiles.shape[0]), -1, jnp.int32)
+        return _run_steps(grid, table, intersections, tiles, step, start)
 
-    batches = _batches(pairs.bounds, grid)
+    batches = _batches(intersections.bounds, grid)
     out = jnp.moveaxis(lax.map(batch, batches), -1, 1).reshape(-1, grid.tile**2)
     return jnp.full((grid.num_tiles, grid.tile**2), -1, jnp.int32).at[batches.reshape(-1)].set(out, mode="drop")
 
 
 def _batches(bounds: Int[Array, " tiles_and_one"], grid: Grid) -> Int[Array, "batches t"]:
-    """Tiles in order of load, so that those of a batch end together; padded with tile numbers beyond the last."""
+    """Tiles in order of load, so that those of a batch end together; padded with `grid.num_tiles`, which is no tile."""
     order = jnp.argsort(bounds[1:] - bounds[:-1]).astype(jnp.int32)
-    size = min(BATCH, grid.num_tiles)
+    size = min(BATCH_SIZE, grid.num_tiles)
     padding = -grid.num_tiles % size
     order = jnp.concatenate([jnp.full((padding,), grid.num_tiles, jnp.int32), order])
     return order.reshape(-1, size)
 
 
-def _loads(pairs: Pairs, tiles: Int[Array, " t"]) -> tuple[Int[Array, " t"], Int[Array, " t"]]:
-    """Where the pairs of `tiles` begin and end; a tile number beyond the last has none."""
-    last = pairs.bounds.shape[0] - 1
-    return pairs.bounds[jnp.minimum(tiles, last)], pairs.bounds[jnp.minimum(tiles + 1, last)]
+def _ranges(intersections: TileIntersections, tiles: Int[Array, " t"]) -> tuple[Int[Array, " t"], Int[Array, " t"]]:
+    """Where the pairs of `tiles` begin and end; equal for the padding of `_batches`."""
+    bounds, last = intersections.bounds, intersections.bounds.shape[0] - 1
+    return bounds[jnp.minimum(tiles, last)], bounds[jnp.minimum(tiles + 1, last)]
 
 
-def _walk(grid: Grid, table, pairs: Pairs, tiles: Int[Array, " t"], turn: Callable, state, *, with_ones: bool = False):
-    """`state` after all turns of a batch, front to back.
+def _run_steps(
+    grid: Grid,
+    table,
+    intersections: TileIntersections,
+    tiles: Int[Array, " t"],
+    step: Callable,
+    state,
+    *,
+    with_ones: bool = False,
+):
+    """`state` after all steps of a batch, front to back.
 
-    `turn(numbers, values, alphas, transmittance, state)` gives the transmittance and the state after it; `numbers` are
-    rows of `table`. There is another turn while, in one of the tiles, Gaussians are left and a pixel that one could
-    reach.
+    A step's Gaussians are looked up, copied and transposed with `in_own_kernel`: XLA would otherwise fuse that with
+    every kernel that uses them, and each would go through the table once a sample (docs/performance.md).
 
-    A turn's Gaussians are looked up, copied and laid in columns `apart`: XLA would otherwise fuse that with every
-    kernel that uses them, and each would go through the table once a sample (docs/performance.md).
+    Args:
+        grid: the tiles.
+        table: from `sorted_table`.
+        intersections: from `intersect_tiles`.
+        tiles: the batch.
+        step: `step(rows, values, alphas, transmittance, state)` returns the transmittance and the state after it;
+            `rows` are row numbers of `table`, `values` their columns.
+        state: the state before the first step.
+        with_ones: whether a column of ones follows the channels.
+
+    Returns:
+        The state. Steps go on while, in one of the tiles, Gaussians are left and a pixel is above the stop.
     """
-    first, last = _loads(pairs, tiles)
-    some = pairs.num_pairs > 0
+    first, last = _ranges(intersections, tiles)
+    has_any = intersections.num_pairs > 0
 
     def goes_on(carry):
         i, transmittance = carry[:2]
         clearest = jnp.max(transmittance, axis=0)
-        return jnp.any((clearest >= constants.TRANSMITTANCE_STOP) & (first + i * TURN < last))
+        return jnp.any((clearest >= constants.TRANSMITTANCE_STOP) & (first + i * STEP_SIZE < last))
 
     def body(carry):
         i, transmittance, state = carry
-        start = first + i * TURN
-        numbers = apart(some, lambda: _next(pairs.rows, start))
-        gaussians = apart(some, lambda: table[numbers][..., :-BOX])
-        values = apart(some, lambda: _columns(grid, gaussians, tiles, start, last, with_ones))
-        transmittance, state = turn(numbers, values, _alphas(grid, values), transmittance, state)
+        start = first + i * STEP_SIZE
+        rows = in_own_kernel(has_any, lambda: _next_rows(intersections.rows, start))
+        gaussians = in_own_kernel(has_any, lambda: table[rows][..., WITHOUT_BOX])
+        values = in_own_kernel(has_any, lambda: _step_columns(grid, gaussians, tiles, start, last, with_ones))
+        transmittance, state = step(rows, values, _alphas(grid, values), transmittance, state)
         return i + 1, transmittance, state
 
     clear = jnp.ones((grid.tile**2, tiles.shape[0]), table.dtype)
     return lax.while_loop(goes_on, body, (0, clear, state))[2]
 
 
-def _next(rows: Array, start: Int[Array, " t"]) -> Array:
-    """`TURN` consecutive rows from each start, `[t u ...]`: copied as blocks."""
-    return jax.vmap(lambda first: lax.dynamic_slice_in_dim(rows, first, TURN))(start)
+def _next_rows(rows: Array, start: Int[Array, " t"]) -> Array:
+    """`STEP_SIZE` consecutive rows from each start, `[t u]`, copied as blocks."""
+    return jax.vmap(lambda first: lax.dynamic_slice_in_dim(rows, first, STEP_SIZE))(start)
 
 
-def _columns(grid: Grid, gaussians: Float[Array, "t u f"], tiles, start, last, with_ones: bool):
-    """A turn's Gaussians, `[f u t]`: x and y from the tile's center, no opacity past a tile's end, ones if wanted."""
+def _step_columns(grid: Grid, gaussians: Float[Array, "t u f"], tiles, start, last, with_ones: bool):
+    """Columns of a step's Gaussians, `[f u t]`: means from the tile's center, opacity 0 behind the tile's end."""
     x, y, p, q, r, log_opacity, *channels = jnp.moveaxis(gaussians, (2, 1, 0), (0, 1, 2))
     within = tiles % (grid.rows * grid.columns)
     x = x - ((within % grid.columns).astype(x.dtype) + 0.5) * grid.tile
     y = y - ((within // grid.columns).astype(x.dtype) + 0.5) * grid.tile
-    is_own = start + jnp.arange(TURN, dtype=jnp.int32)[:, None] < last
+    is_own = start + jnp.arange(STEP_SIZE, dtype=jnp.int32)[:, None] < last
     ones = [jnp.ones_like(x)] * with_ones
     return jnp.stack([x, y, p, q, r, jnp.where(is_own, log_opacity, -jnp.inf), *channels, *ones])
 
 
 def _offsets(grid: Grid, values) -> tuple[Float[Array, "p u t"], Float[Array, "p u t"]]:
-    """dx and dy of every sample: its pixel's center from the Gaussian's."""
+    """dx and dy of every sample: its pixel's center minus the Gaussian's mean."""
     side = jnp.arange(grid.tile, dtype=values.dtype) - (grid.tile - 1) / 2  # from the tile's center
-    return jnp.tile(side, grid.tile)[:, None, None] - values[0], jnp.repeat(side, grid.tile)[:, None, None] - values[1]
+    return (
+        jnp.tile(side, grid.tile)[:, None, None] - values[MEAN_X],
+        jnp.repeat(side, grid.tile)[:, None, None] - values[MEAN_Y],
+    )
 
 
 def _alphas(grid: Grid, values) -> Float[Array, "p u t"]:
+    """Alphas of all samples; 0 where they are skipped."""
     dx, dy = _offsets(grid, values)
-    p, q, r, log_opacity = values[2:6]
+    p, q, r = values[FACTORS]
     across, along = p * dx + q * dy, r * dy
-    power = log_opacity - across * across - along * along
-    return _exp(jnp.where(power >= LOG_LEAST, jnp.minimum(power, LOG_MOST), -jnp.inf))
-
-
-def _exp(power: Array) -> Array:
-    """e^power of powers from `LOG_LEAST` to 0 to 3e-6 of itself (float64: exactly), and 0 of minus infinity.
-
-    On that short range, a polynomial of an eighth of it and three squarings take two thirds of the time of XLA's
-    exponential. XLA's CPU compiler keeps what comes out of a division, as it does of an exponential: every kernel would
-    otherwise compute the alphas again.
-    """
-    if power.dtype == jnp.float64:
-        return jnp.exp(power)
-    eighth = power * (-1.0 / 2**SQUARINGS)
-    growth = jnp.asarray(GROWTH.coef[-1], power.dtype)
-    for coefficient in GROWTH.coef[-2::-1]:
-        growth = growth * eighth + float(coefficient)
-    for _ in range(SQUARINGS):
-        growth = growth * growth
-    return 1.0 / growth
+    log_alpha = values[LOG_OPACITY] - across * across - along * along
+    is_drawn = log_alpha >= constants.LOG_ALPHA_MIN
+    return short_exp(jnp.where(is_drawn, jnp.minimum(log_alpha, LOG_ALPHA_MAX), -jnp.inf), constants.LOG_ALPHA_MIN)
 
 
 def _weights(alphas, transmittance):
-    """Weights of a turn's samples and the transmittance after each, `[p t]` a Gaussian.
+    """Weights of a step's samples and the transmittance after each, `[p t]` for each Gaussian.
 
-    The transmittance runs on below the stop: it only ever falls, so comparing it needs no flag that a pixel has ended.
+    The transmittance goes on falling below the stop, so that comparing it tells whether a pixel has ended.
     """
     weights, afters = [], []
     for u in range(alphas.shape[1]):
@@ -230,9 +255,9 @@ def _weights(alphas, transmittance):
 
 
 def _exponent_gradients(alphas, weights, gains, tail):
-    """The tail after the turn, and dL/dq of every sample, where raw = opacity exp(-q).
+    """The tail after the step, and dL/dq of every sample, where alpha = opacity exp(-q) before its limits.
 
-    dL/dq = -a dL/da = -w s + a / (1 - a) tail; 0 for samples that are skipped, capped or beyond the stop.
+    dL/dq = -a dL/da = -w s + a / (1 - a) tail; 0 for samples that are skipped, capped or behind the stop.
     """
     gains = lax.optimization_barrier(gains)
     tails = []
@@ -240,19 +265,19 @@ def _exponent_gradients(alphas, weights, gains, tail):
         tail = tail - gains[:, u]
         tails.append(tail)
     last, tails = tails[-1], lax.optimization_barrier(jnp.stack(lax.optimization_barrier(tails), axis=1))
-    free = (weights > 0) & (alphas < CAPPED)
+    free = (weights > 0) & (alphas < CAPPED_ALPHA)
     ratio = alphas / (1.0 - alphas)
     return last, lax.optimization_barrier(jnp.where(free, ratio * tails - gains, 0.0))
 
 
 def _sum_rows(grid: Grid, values: Float[Array, "p u t"]) -> Float[Array, "rows u t"]:
-    """Sums over each row of pixels of a tile."""
+    """Sums over each row of a tile's pixels."""
     rows = values.reshape(grid.tile, grid.tile, *values.shape[1:])
     return jnp.sum(rows, axis=1)
 
 
 def _total(terms: Iterable[Array]) -> Array:
-    """The sum of a few arrays, term by term: one fused kernel."""
+    """The sum of a few arrays, term by term, which XLA fuses into one kernel."""
     return functools.reduce(operator.add, terms)
 
 
@@ -262,16 +287,16 @@ def _sum_pixels(grid: Grid, values: Float[Array, "p u t"]) -> Float[Array, "u t"
 
 
 def _shape_gradients(grid: Grid, exponents: Float[Array, "p u t"], values) -> list[Float[Array, "u t"]]:
-    """Gradients by x, y, p, q, r and the opacity's logarithm, from moments of the exponent gradients over the pixels.
+    """Gradients by the shape columns, from moments of the exponent gradients over the pixels.
 
-    The exponent is s^2 + (r dy)^2 with s = p dx + q dy, which the moments hold as it is: made of those of dx and dy, it
-    would cancel for needles.
+    The exponent is s^2 + (r dy)^2 with s = p dx + q dy. The moments are those of s itself: computed from the moments of
+    dx and dy, they would cancel for needles.
     """
-    p, q, r = values[2:5]
+    p, q, r = values[FACTORS]
     dx, dy = _offsets(grid, values)
     across = p * dx + q * dy
     rows, rows_s, rows_sdx = (_sum_rows(grid, exponents * weight) for weight in (1.0, across, across * dx))
-    dys = dy[:: grid.tile]  # one a row
+    dys = dy[:: grid.tile]  # one for each row
     sum_s, sum_sdx = _total(rows_s), _total(rows_sdx)
     sum_sdy = _total(row * dy for row, dy in zip(rows_s, dys, strict=True))
     sum_dy = _total(row * dy for row, dy in zip(rows, dys, strict=True))

@@ -1,4 +1,4 @@
-"""What a render simulates. Everything here is static: an effect that is off is not in the compiled program."""
+"""The effects of a render. All are static: an effect that is off adds no operation to the compiled program."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -10,37 +10,51 @@ from jaxtyping import Array, Float
 from ssplat_jax.errors import InputError
 from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.geometry.cameras import Camera
+from ssplat_jax.rasterizer import constants
 
 OUTPUTS = ("color", "alpha", "depth", "median_depth")
+
+NEEDED_ARRAYS = {"filter_3d": "captured", "distortion": "distortion", "exposure": "exposures"}
+"""The fields of `Effects` that need an array, and the argument of `render` that holds it."""
+
+FINER_SAMPLING = 1.05
+"""A camera calls for the 3D filter when it samples the scene more than this times as finely as the captured ones."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Effects:
-    """The effects of a render, each of which can be left out. Hashable; changing it recompiles."""
+    """The effects of a render. Hashable; changing one recompiles.
+
+    An effect that needs an array is on if `render` is given that array. True asks for the array and False forbids it:
+    `render` refuses a contradiction.
+    """
 
     sh_degree: int | None = None
-    """SH bands that are evaluated; None takes all that the Gaussians hold."""
+    """Highest SH band to evaluate; None takes all that the Gaussians hold."""
     antialias: str = "mip"
     """`mip`: 2D Mip filter (0.1 px^2, opacity compensated); `classic`: 0.3 px^2 dilation; `none`: point sampling."""
-    filter_3d: bool = False
-    """3D smoothing filter: bounds detail by what the cameras given as `captured` could see (Mip-Splatting)."""
-    distortion: bool = False
-    """OPENCV radial-tangential lens distortion, coefficients given as `distortion`."""
-    exposure: bool = False
-    """Affine color correction per frame (exposure, white balance), given as `exposures`."""
+    filter_3d: bool | None = None
+    """3D smoothing filter: limits detail to what the cameras `captured` could see (Mip-Splatting)."""
+    distortion: bool | None = None
+    """OPENCV radial-tangential lens distortion with the coefficients `distortion`."""
+    exposure: bool | None = None
+    """Affine color correction of each frame by `exposures` (exposure, white balance)."""
     background: Sequence[float] | None = None
     """Color behind the scene; None is black, at no cost."""
     outputs: Sequence[str] = ("color", "alpha", "depth")
-    """What is wanted: `color` (always there), `alpha`, `depth`, `median_depth`."""
+    """The outputs to compute, of `color` (always computed), `alpha`, `depth` and `median_depth`."""
 
     def __post_init__(self) -> None:
         if self.sh_degree not in (None, 0, 1, 2, 3):
             raise InputError(f"effects: sh_degree must be None or 0 to 3, got {self.sh_degree!r}.")
         if self.antialias not in ("mip", "classic", "none"):
             raise InputError(f"effects: antialias must be 'mip', 'classic' or 'none', got {self.antialias!r}.")
+        for name in NEEDED_ARRAYS:
+            if not isinstance(flag := getattr(self, name), bool | None):
+                raise InputError(f"effects: {name} must be True, False or None, got {flag!r}.")
         if unknown := [name for name in self.outputs if name not in OUTPUTS]:
-            raise InputError(f"effects: no output {unknown[0]!r}; there is {', '.join(OUTPUTS)}.")
-        # Lists would make the effects unhashable, long after this line.
+            raise InputError(f"effects: outputs must be among {', '.join(OUTPUTS)}, got {unknown[0]!r}.")
+        # A list would make the effects unhashable, which shows only later.
         object.__setattr__(self, "outputs", tuple(self.outputs))
         if self.background is not None:
             background = tuple(float(c) for c in self.background)
@@ -52,9 +66,29 @@ class Effects:
         """A copy with `changes`."""
         return dataclasses.replace(self, **changes)
 
+    def resolve(self, *, captured: object, distortion: object, exposures: object) -> "Effects":
+        """These effects with every flag decided, given the arrays of a render (None: not given).
+
+        Raises:
+            InputError: a flag is True without its array, or False with it.
+        """
+        arrays = {"captured": captured, "distortion": distortion, "exposures": exposures}
+        is_given = {field: arrays[name] is not None for field, name in NEEDED_ARRAYS.items()}
+        for field, name in NEEDED_ARRAYS.items():
+            flag = getattr(self, field)
+            if flag and not is_given[field]:
+                raise InputError(
+                    f"render: effects.{field} is on and wants {name}, got none; pass it or unset the flag."
+                )
+            if flag is False and is_given[field]:
+                raise InputError(
+                    f"render: effects.{field} is off and wants no {name}, got one; leave it out or unset the flag."
+                )
+        return self.replace(**is_given)
+
     @property
     def needs_alpha(self) -> bool:
-        """Whether the transmittance is composited: asked for, or needed by depth or background."""
+        """Whether alpha is composited: asked for, or needed by depth or background."""
         return bool({"alpha", "depth"} & set(self.outputs)) or self.background is not None
 
 
@@ -67,36 +101,46 @@ def effects_for(
     exposures: Float[Array, "*b 3 4"] | None = None,
     outputs: tuple[str, ...] = ("color", "alpha", "depth"),
 ) -> Effects:
-    """The least that shows this scene right from these cameras. Looks at values: call it outside jit.
+    """The fewest effects that show a scene correctly. It looks at values: call it outside jit.
 
-    SH bands that are zero everywhere are not evaluated; zero distortion coefficients are a pinhole; exposures that are
-    the same for all of several frames are none (the scene's colors hold them already); no camera that samples the
-    scene at most 1.05 times as finely as the `captured` ones did needs the 3D filter.
+    Args:
+        gaussians: the scene.
+        camera: the cameras to render from.
+        captured: the cameras that the scene was made from. The 3D filter is on if a camera samples the scene over 1.05
+            times as finely as they do.
+        distortion: OPENCV coefficients; distortion is on if one is not 0.
+        exposures: affine color corrections; exposure is on if those of several frames differ (a common one is in the
+            scene's colors already), or a single one is not the identity.
+        outputs: passed on.
+
+    Returns:
+        The effects, SH degree included. A flag is False where its array is given but not needed: do not pass that
+        array to `render`.
     """
     return Effects(
         sh_degree=_used_degree(np.asarray(gaussians.sh, np.float32)),
-        filter_3d=captured is not None and _sampling_ratio(gaussians, camera, captured) > 1.05,
-        distortion=distortion is not None and bool(np.any(np.asarray(distortion) != 0)),
-        exposure=exposures is not None and _differ(np.asarray(exposures)),
+        filter_3d=None if captured is None else _sampling_ratio(gaussians, camera, captured) > FINER_SAMPLING,
+        distortion=None if distortion is None else bool(np.any(np.asarray(distortion) != 0)),
+        exposure=None if exposures is None else _differ(np.asarray(exposures)),
         outputs=outputs,
     )
 
 
 def _used_degree(sh: np.ndarray) -> int:
-    """The highest SH band with an entry other than 0."""
+    """Highest SH band with an entry other than 0."""
     used = np.flatnonzero(np.any(sh != 0, axis=(0, 2)))
     return int(np.sqrt(used[-1])) if used.size else 0
 
 
 def _differ(exposures: np.ndarray) -> bool:
+    """Whether frames differ in exposure; a single one is compared with no correction."""
     flat = exposures.reshape(-1, 12)
-    # One frame alone differs from others that are not here, unless its correction is none.
     usual = flat[:1] if len(flat) > 1 else np.eye(3, 4).reshape(1, 12)
     return bool(np.any(np.abs(flat - usual) > 1e-6))
 
 
 def _sampling_ratio(gaussians: Gaussians, camera: Camera, captured: Camera) -> float:
-    """By how much the cameras sample the finest-seen present Gaussians more finely (f / z) than the captured ones."""
+    """How many times as finely (f / z) the cameras sample the present Gaussians as the captured ones: 99 % quantile."""
     present = np.asarray(gaussians.opacities) > 0
     means = np.asarray(gaussians.means, np.float64)[present]
     ours, theirs = _sampling_rates(means, camera), _sampling_rates(means, captured)
@@ -105,12 +149,12 @@ def _sampling_ratio(gaussians: Gaussians, camera: Camera, captured: Camera) -> f
 
 
 def _sampling_rates(means: np.ndarray, camera: Camera) -> np.ndarray:
-    """Pixels per scene unit at each mean in the camera that sees it best; 0 where none does."""
+    """Pixels per scene unit at each mean in the camera that samples it most finely; 0 where none sees it."""
     rates = np.zeros(means.shape[0])
     viewmats = np.asarray(camera.viewmats, np.float64).reshape(-1, 4, 4)
     for viewmat, K in zip(viewmats, np.asarray(camera.Ks, np.float64).reshape(-1, 3, 3), strict=True):
         x, y, z = (means @ viewmat[:3, :3].T + viewmat[:3, 3]).T
-        z = np.where(z > 0.01, z, np.inf)
+        z = np.where(z > constants.NEAR, z, np.inf)
         u, v = K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
         inside = (u >= 0) & (u <= camera.width) & (v >= 0) & (v <= camera.height)
         rates = np.maximum(rates, np.where(inside, K[0, 0] / z, 0.0))

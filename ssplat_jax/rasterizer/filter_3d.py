@@ -1,4 +1,4 @@
-"""The 3D smoothing filter: no Gaussian holds more detail than its captured cameras could see (Mip-Splatting)."""
+"""The 3D smoothing filter: no Gaussian has more detail than the captured cameras could see (Mip-Splatting)."""
 
 import jax
 import jax.numpy as jnp
@@ -11,9 +11,9 @@ from ssplat_jax.rasterizer import constants
 
 
 def sampling_rates(means: Float[Array, "n 3"], captured: Camera) -> Float[Array, " n"]:
-    """Pixels per scene unit, f / z, of the captured camera that sees each mean best; 0 where none does.
+    """Pixels per scene unit, f / z, in the captured camera that samples each mean most finely; 0 where none sees it.
 
-    A camera sees what is in front of it and within its image enlarged by 15 % on each side.
+    A camera sees means in front of it and inside its image, enlarged by 15 % on each side.
     """
 
     def see(rates, one):
@@ -36,19 +36,19 @@ def sampling_rates(means: Float[Array, "n 3"], captured: Camera) -> Float[Array,
 
 
 def filter_3d(gaussians: Gaussians, captured: Camera) -> Gaussians:
-    """`gaussians` convolved with a Gaussian of 0.2 squared sampling intervals, their mass kept.
+    """`gaussians` convolved with a Gaussian of variance 0.2 squared sampling intervals, mass preserved.
 
-    Gaussians that no captured camera saw get the widest filter of those that were seen. The filter is a constant to the
+    Gaussians that no captured camera sees get the widest filter of the others. The filter is a constant to the
     gradient; scales and opacities are differentiable through it.
 
     Limits:
-        No camera sees anything: the Gaussians are returned as they are.
-        Scale 0: opacity 0 (the mass of a point is nothing), gradient finite.
+        No camera sees anything: the Gaussians are returned unchanged.
+        Scale 0: opacity 0 (a point has no mass), gradient finite.
     """
     rates = jax.lax.stop_gradient(sampling_rates(gaussians.means, captured))
     lowest = jnp.min(jnp.where((rates > 0) & (gaussians.opacities > 0), rates, jnp.inf))
     rates = jnp.where(rates > 0, rates, lowest)
-    variances = constants.MIP3D_VARIANCE / (rates * rates)  # 0 where nothing is seen at all
+    variances = constants.FILTER_3D_VARIANCE / (rates * rates)  # 0 where no Gaussian is seen
     squares = gaussians.scales**2 + variances[:, None]
     scales = jnp.sqrt(jnp.maximum(squares, jnp.finfo(squares.dtype).tiny))
     kept = jnp.prod(jnp.minimum(jnp.abs(gaussians.scales) / scales, 1.0), axis=-1)

@@ -1,4 +1,4 @@
-"""What both renderers share around compositing: which channels go in, and what is made of them."""
+"""The render output, and the steps before and after compositing that both renderers share."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
@@ -14,16 +14,16 @@ from ssplat_jax.rasterizer.sh import sh_colors
 
 @pytree
 class RenderOutput:
-    """Images of one camera or a batch, and what only the running program knows."""
+    """Images of one camera or a batch, and counts of what was left out."""
 
     color: Float[Array, "*b h w 3"]  # RGB, background included; may exceed 1 (SH), never below 0
     alpha: Float[Array, "*b h w"] | None  # 1 - transmittance
     depth: Float[Array, "*b h w"] | None  # expected camera z, sum(w z) / sum(w); 0 where alpha is 0
     median_depth: Float[Array, "*b h w"] | None  # camera z where the transmittance falls below 1/2; 0 where it does not
     features: Float[Array, "*b h w c"] | None  # sum(w f), not normalized
-    num_pairs: Int[Array, ""]  # (tile, Gaussian) pairs of all images
-    num_overflow: Int[Array, ""]  # pairs that `max_pairs` had no room for; the image is wrong unless 0
-    num_non_finite: Int[Array, ""]  # rows culled for NaN, infinite or absurd entries
+    num_pairs: Int[Array, ""]  # tile intersections, (tile, Gaussian) pairs, of all images
+    num_overflow: Int[Array, ""]  # pairs above `max_pairs`; the image is wrong unless 0
+    num_non_finite: Int[Array, ""]  # rows culled for entries that are NaN, infinite or above 1e12
 
 
 def splat_channels(
@@ -33,7 +33,18 @@ def splat_channels(
     effects: Effects,
     features: Float[Array, "n c"] | None,
 ) -> Float[Array, "b n channels"]:
-    """Per camera and Gaussian: RGB, then depth and features, those that are wanted."""
+    """The channels to composite: RGB, then depth and features where wanted.
+
+    Args:
+        gaussians: the scene, finite.
+        splats: its projection.
+        camera: one batch axis.
+        effects: the SH degree and the outputs.
+        features: further channels; rows that are not finite become 0.
+
+    Returns:
+        Channels of each camera and Gaussian.
+    """
     degree = gaussians.sh_degree if effects.sh_degree is None else min(effects.sh_degree, gaussians.sh_degree)
     directions = None
     if degree > 0:
@@ -61,7 +72,21 @@ def finish(
     num_overflow: Int[Array, ""],
     num_non_finite: Int[Array, ""],
 ) -> RenderOutput:
-    """The output of composited `splat_channels`, and alpha behind them if wanted, in the camera's batch shape."""
+    """The output of a render.
+
+    Args:
+        composited: `splat_channels` composited, alpha last if `effects.needs_alpha`.
+        camera: gives the batch shape.
+        effects: background, exposure and outputs.
+        exposures: affine color correction of each frame.
+        median_depth: passed on, as are the counts.
+        num_pairs: tile intersections.
+        num_overflow: tile intersections above the capacity.
+        num_non_finite: rows culled.
+
+    Returns:
+        Images in the camera's batch shape.
+    """
     batch = camera.viewmats.shape[:-2]
     images = composited.reshape(*batch, *composited.shape[1:])
     color, rest, alpha, depth = images[..., :3], images[..., 3:], None, None
@@ -88,7 +113,7 @@ def finish(
 
 
 def apply_exposures(color: Float[Array, "*b h w 3"], exposures: Float[Array, "*b 3 4"]) -> Float[Array, "*b h w 3"]:
-    """Each frame's affine correction of linear RGB, `matrix @ color + offset`, cut at 0."""
+    """RGB after each frame's affine correction, `matrix @ color + offset`, at least 0."""
     matrices = exposures[..., None, None, :, :]
     corrected = sum(matrices[..., i] * color[..., i, None] for i in range(3)) + matrices[..., 3]
     return jnp.maximum(corrected, 0.0)

@@ -2,9 +2,9 @@
 
 Everything is elementwise over `[b n]` (cameras x Gaussians): no matmul unit, no vmap, any float dtype. Screen
 covariances are built from their 2x3 square root M (cov = M M^T), so they are positive semi-definite and their
-determinant, |row_0 x row_1|^2, does not cancel. The exponent of a sample is a sum of two squares for the same reason:
+determinant, |row_0 x row_1|^2, does not cancel. Conics are held as factors for the same reason: in the quadratic form
 of a long thin Gaussian, the terms of dx^2, dx dy and dy^2 are large and nearly cancel (float32, 0.02 by 300 px at 44
-degrees: alpha off by 2e-2, as squares by 1e-5).
+degrees: alpha is wrong by 2e-2, as a sum of two squares by 1e-5).
 """
 
 import jax
@@ -23,34 +23,38 @@ from ssplat_jax.rasterizer.lens_distortion import distort, is_folded, lens_field
 
 @pytree
 class Splats:
-    """Gaussians on the screens of `b` cameras. Invisible ones have opacity 0 and harmless values elsewhere."""
+    """Gaussians projected to the images of `b` cameras. Invisible ones have opacity 0 and otherwise harmless values.
+
+    `conic_factors` (p, q, r) are the triangular factor of half the conic, the inverse screen covariance: gsplat's
+    `conics` are (2 p^2, 2 p q, 2 (q^2 + r^2)), and alpha = opacity exp(-(p dx + q dy)^2 - (r dy)^2).
+    """
 
     means2d: Float[Array, "b n 2"]  # pixels
-    factors: Float[Array, "b n 3"]  # (p, q, r), 1/px: alpha = opacity exp(-(p dx + q dy)^2 - (r dy)^2)
+    conic_factors: Float[Array, "b n 3"]  # 1/px
     opacities: Float[Array, "b n"]  # after the filter's compensation
     depths: Float[Array, "b n"]  # camera z
-    extents: Float[Array, "b n 2"]  # half size of the box outside of which alpha < 1/255, pixels
+    radii: Float[Array, "b n 2"]  # along x and y, pixels: half size of the box outside which alpha < 1/255
     visible: Bool[Array, "b n"]
 
 
-def finite_rows(gaussians: Gaussians) -> Bool[Array, " n"]:
-    """Rows whose every entry is finite and at most `constants.LARGEST` in magnitude."""
+def _finite_rows(gaussians: Gaussians) -> Bool[Array, " n"]:
+    """Whether all entries of a row are finite and at most `constants.MAX_MAGNITUDE` in magnitude."""
     rows = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities[:, None], gaussians.sh)
-    small = [jnp.abs(x) <= constants.LARGEST for x in rows]  # False for NaN too
+    small = [jnp.abs(x) <= constants.MAX_MAGNITUDE for x in rows]  # False for NaN too
     return jnp.stack([jnp.all(s.reshape(s.shape[0], -1), axis=1) for s in small]).all(axis=0)
 
 
 def cull_non_finite(
     gaussians: Gaussians, features: Float[Array, "n c"] | None = None
 ) -> tuple[Gaussians, Int[Array, ""]]:
-    """`gaussians` with unusable rows made absent, and how many of those were present (opacity not 0).
+    """`gaussians` with non-finite rows made absent, and how many of them were present (opacity not 0).
 
-    A row is unusable for features that are not finite, too.
+    Rows with non-finite features are made absent too.
 
     Limits:
-        NaN and infinite rows become harmless ones before any arithmetic: their gradient is 0, never NaN.
+        NaN and infinite rows become harmless before any arithmetic: their gradient is 0, never NaN.
     """
-    keep = finite_rows(gaussians)
+    keep = _finite_rows(gaussians)
     if features is not None:
         keep &= jnp.all(jnp.isfinite(features), axis=-1)
     num_culled = jnp.sum(~keep & (gaussians.opacities != 0), dtype=jnp.int32)
@@ -67,10 +71,10 @@ def cull_non_finite(
 
 
 def cull_cameras(camera: Camera) -> tuple[Camera, Bool[Array, " b"]]:
-    """`camera` with poses and intrinsics that are not usable made harmless, and which are.
+    """`camera` with unusable poses and intrinsics replaced by identities, and which cameras are usable.
 
     Limits:
-        NaN, infinite entries and a focal length of 0: such a camera sees nothing, and its gradients are 0.
+        NaN, infinite entries and a focal length of 0: the camera is unusable, it sees nothing and its gradients are 0.
     """
     usable = jnp.all(jnp.isfinite(camera.viewmats), axis=(1, 2)) & jnp.all(jnp.isfinite(camera.Ks), axis=(1, 2))
     usable &= (camera.Ks[:, 0, 0] != 0) & (camera.Ks[:, 1, 1] != 0)
@@ -78,8 +82,8 @@ def cull_cameras(camera: Camera) -> tuple[Camera, Bool[Array, " b"]]:
     return replace(camera, viewmats=make_safe(camera.viewmats), Ks=make_safe(camera.Ks)), usable
 
 
-def camera_points(means: Float[Array, "n 3"], viewmats: Float[Array, "b 4 4"]) -> tuple[Float[Array, "b n"], ...]:
-    """The three camera coordinates of world points."""
+def _camera_points(means: Float[Array, "n 3"], viewmats: Float[Array, "b 4 4"]) -> tuple[Float[Array, "b n"], ...]:
+    """Camera coordinates x, y and z of world points."""
     entries = columns(means)
     return tuple(
         sum(viewmats[:, i, j, None] * entries[j] for j in range(3)) + viewmats[:, i, 3, None] for i in range(3)
@@ -89,26 +93,33 @@ def camera_points(means: Float[Array, "n 3"], viewmats: Float[Array, "b 4 4"]) -
 def project(
     gaussians: Gaussians, camera: Camera, effects: Effects, distortion: Float[Array, "b 5"] | None = None
 ) -> Splats:
-    """The screen-space Gaussians that `camera` (one batch axis) sees of finite `gaussians`.
+    """The projection of Gaussians to the screens of cameras.
 
-    Skew, `Ks[0, 1]`, is not modeled. `distortion` is looked at if `effects.distortion` is on.
+    Args:
+        gaussians: the scene, finite.
+        camera: one batch axis; skew, `Ks[0, 1]`, is not modeled.
+        effects: the filter, and whether `distortion` is used.
+        distortion: OPENCV coefficients.
+
+    Returns:
+        Screen-space Gaussians.
 
     Limits:
         z <= 0.01: invisible, zero gradient.
         Outside the image by more than 0.3 half widths (tangent): the Jacobian is that of the clamped direction.
-        Scales below about 1e-6 px under the Mip filter are invisible (compensation 0), with a zero gradient.
-        Larger than 1e8 px on the screen, or that far from it in 1e9 px: invisible, zero gradient.
+        Scales below about 1e-6 px under the Mip filter: invisible (compensation 0), zero gradient.
+        Standard deviation above 1e8 px on the screen, or mean more than 1e9 px off: invisible, zero gradient.
         Quaternions of any length; zero counts as the identity.
-        Beyond where the distortion polynomial first turns back, or 89.4 degrees off axis: invisible, zero gradient.
+        Outside the first maximum of the distortion polynomial, or 89.4 degrees off axis: invisible, zero gradient.
     """
-    x, y, z = camera_points(gaussians.means, camera.viewmats)
+    x, y, z = _camera_points(gaussians.means, camera.viewmats)
     in_front = z > constants.NEAR
     z = jnp.where(in_front, z, 1.0)
     fx, fy, cx, cy = (camera.Ks[:, i, j, None] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
     tan_x, tan_y = x / z, y / z
     if effects.distortion and distortion is not None:
-        turn, corner = lens_field(jax.lax.stop_gradient(distortion), _corner(jax.lax.stop_gradient(camera)))
-        is_seen = tan_x * tan_x + tan_y * tan_y <= (turn * turn)[:, None]
+        maximum, corner = lens_field(jax.lax.stop_gradient(distortion), _corner(jax.lax.stop_gradient(camera)))
+        is_seen = tan_x * tan_x + tan_y * tan_y <= (maximum * maximum)[:, None]
         in_front &= is_seen & ~is_folded(distort(tan_x, tan_y, distortion)[1])
         tan_x, tan_y = (jnp.where(in_front, tan, 0.0) for tan in (tan_x, tan_y))
         means2d = distort(tan_x, tan_y, distortion)[0]
@@ -121,36 +132,44 @@ def project(
     visible = (
         in_front
         & (opacities >= constants.ALPHA_MIN)
-        & jnp.all(jnp.abs(means2d) <= 10 * constants.LARGEST_SCREEN, axis=-1)
+        & jnp.all(jnp.abs(means2d) <= 10 * constants.MAX_SCREEN_SIGMA, axis=-1)
     )
     opacities = jnp.where(visible, opacities, 0.0)
-    # alpha >= 1/255 exactly where the Mahalanobis distance is at most `reach`; the inflation covers its rounding.
+    # alpha >= 1/255 exactly where the Mahalanobis distance is at most `reach`; the margin covers rounding.
     reach = jnp.sqrt(2.0 * jnp.log(jnp.maximum(jax.lax.stop_gradient(opacities) / constants.ALPHA_MIN, 1.0)))
     extents = 1.0001 * reach[..., None] * jnp.sqrt(jax.lax.stop_gradient(variances)) + 1e-3
     return Splats(
         means2d=jnp.where(visible[..., None], means2d, 0.0),
-        factors=jnp.where(visible[..., None], factors, 0.0),
+        conic_factors=jnp.where(visible[..., None], factors, 0.0),
         opacities=opacities,
         depths=z,
-        extents=jnp.where(visible[..., None], extents, 0.0),
+        radii=jnp.where(visible[..., None], extents, 0.0),
         visible=visible,
     )
 
 
 def _corner(camera: Camera) -> Float[Array, " b"]:
-    """Distance of the farthest corner of the image, with its margin, from the axis: a tangent, if nothing distorts."""
+    """Distance of the farthest image corner, margin included, from the axis: a tangent, as without distortion."""
     margin = 1 + constants.FRUSTUM_MARGIN
     fx, fy, cx, cy = (camera.Ks[:, i, j] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
     return margin * jnp.hypot(jnp.maximum(cx, camera.width - cx) / fx, jnp.maximum(cy, camera.height - cy) / fy)
 
 
 def _screen_roots(gaussians: Gaussians, camera: Camera, points: tuple[Float[Array, "b n"], ...], distortion, corner):
-    """Rows of M = J W R S, a square root of the screen covariance, at (x / z, y / z, z); each a triple of `[b n]`."""
+    """Rows of M = J W R S, a square root of the screen covariance, each a triple of `[b n]`.
+
+    Args:
+        gaussians: the scene.
+        camera: one batch axis.
+        points: x / z, y / z and z of the means in the camera.
+        distortion: OPENCV coefficients, or None.
+        corner: undistorted radius of the farthest image corner, or None.
+    """
     tan_x, tan_y, z = points
     fx, fy, cx, cy = (camera.Ks[:, i, j, None] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
     margin_x = constants.FRUSTUM_MARGIN * 0.5 * camera.width / fx
     margin_y = constants.FRUSTUM_MARGIN * 0.5 * camera.height / fy
-    # A barrel lens sees farther than its image is wide: up to there, nothing is clamped.
+    # A barrel lens sees farther than the pinhole image reaches: nothing is clamped up to there.
     wider = 1.0 if corner is None else jnp.maximum(corner / _corner(camera), 1.0)[:, None]
     tan_x = _clip_wider(tan_x, -cx / fx - margin_x, (camera.width - cx) / fx + margin_x, wider)
     tan_y = _clip_wider(tan_y, -cy / fy - margin_y, (camera.height - cy) / fy + margin_y, wider)
@@ -170,20 +189,24 @@ def _screen_roots(gaussians: Gaussians, camera: Camera, points: tuple[Float[Arra
 
 
 def _clip_wider(tan, low, high, wider):
-    """`tan` within `low` and `high`, each moved away from the axis by the factor `wider` where that is outwards."""
+    """`tan` clipped to `low` and `high`, each moved outwards by the factor `wider`."""
     return jnp.clip(tan, jnp.minimum(low, wider * low), jnp.maximum(high, wider * high))
 
 
 def _filtered(root_u, root_v, effects: Effects):
-    """Factors, variances and opacity compensation of the screen covariance, filtered as `effects` say."""
-    kernels = {"mip": constants.MIP_KERNEL, "classic": constants.CLASSIC_DILATION, "none": constants.UNFILTERED_FLOOR}
+    """Conic factors, variances and opacity compensation of the screen covariance, filtered as `effects` say."""
+    kernels = {
+        "mip": constants.MIP_VARIANCE,
+        "classic": constants.CLASSIC_VARIANCE,
+        "none": constants.MIN_SCREEN_VARIANCE,
+    }
     kernel = kernels[effects.antialias]
-    # In units of the largest entry nothing overflows, whatever the scale; a constant to the gradient.
+    # In units of the largest entry nothing overflows at any scale; the unit is a constant to the gradient.
     largest = sum(jnp.abs(jax.lax.stop_gradient(m)) for m in (*root_u, *root_v))
-    sized = largest <= constants.LARGEST_SCREEN
+    sized = largest <= constants.MAX_SCREEN_SIGMA
     unit = jnp.where(sized, jnp.maximum(largest, 1.0), 1.0)
     u, v = ([jnp.where(sized, m, 0.0) / unit for m in root] for root in (root_u, root_v))
-    kernel = jnp.maximum(kernel / unit / unit, constants.FLATTEST)
+    kernel = jnp.maximum(kernel / unit / unit, constants.MIN_RELATIVE_VARIANCE)
     uu, uv, vv = (sum(a * b for a, b in zip(p, q, strict=True)) for p, q in ((u, u), (u, v), (v, v)))
     cross = (u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0])
     det = sum(c * c for c in cross)
@@ -196,5 +219,5 @@ def _filtered(root_u, root_v, effects: Effects):
     if effects.antialias != "mip":
         return factors, variances, jnp.where(sized, 1.0, 0.0).astype(unit.dtype)
     ratio = det * unit * unit / det_filtered
-    keep = sized & (ratio > constants.COMPENSATION_CUT)
+    keep = sized & (ratio > constants.MIN_COMPENSATION)
     return factors, variances, jnp.where(keep, jnp.sqrt(jnp.where(keep, ratio, 1.0)), 0.0)

@@ -1,7 +1,7 @@
-"""The definition: every Gaussian at every pixel, front to back, in plain autodiff and any float dtype.
+"""The reference renderer: every Gaussian at every pixel, front to back, in plain autodiff and any float dtype.
 
-O(pixels x Gaussians) memory: for tests and small scenes. It shares the projection and the constants with the fast path,
-and none of its tiles, bounds, sorting keys or gradients.
+It defines the image. It takes O(pixels x Gaussians) memory: for tests and small scenes. It shares the projection and
+the constants with the fast path, but no tiles, bounds, sort keys or gradients.
 """
 
 import jax
@@ -21,9 +21,9 @@ from ssplat_jax.rasterizer.projection import Splats, cull_non_finite, project
 def sample_weights(
     splats: Splats, pixels: Float[Array, "q 2"]
 ) -> tuple[Float[Array, "q n"], Float[Array, "q n"], Int[Array, " n"]]:
-    """Weights of one camera's splats (batch axis 1) at `pixels`, transmittances after each, and the depth order."""
+    """Weights of one camera's splats (a batch of 1) at `pixels`, transmittance after each, and the depth order."""
     order = jnp.argsort(jnp.where(splats.visible[0], splats.depths[0], jnp.inf), stable=True)
-    means2d, factors = splats.means2d[0, order], splats.factors[0, order]
+    means2d, factors = splats.means2d[0, order], splats.conic_factors[0, order]
     offsets = pixels[:, None, :] - means2d
     dx, dy = offsets[..., 0], offsets[..., 1]
     exponents = (factors[:, 0] * dx + factors[:, 1] * dy) ** 2 + (factors[:, 2] * dy) ** 2
@@ -53,10 +53,21 @@ def render_reference(
     exposures: Float[Array, "*b 3 4"] | None = None,
     rows_at_once: int = 16,
 ) -> RenderOutput:
-    """The images that `ss.render` must give, in the dtype of `gaussians`; one band of rows at a time."""
-    effects = effects or Effects()
+    """The images that `render` must give, in the dtype of `gaussians`.
+
+    Args:
+        gaussians, camera, effects, features, captured, distortion, exposures: as in `render`.
+        rows_at_once: rows of pixels computed together, which bounds the memory.
+
+    Returns:
+        The output; its counts of pairs are 0.
+
+    Raises:
+        InputError: a flag of `effects` contradicts the arrays.
+    """
+    effects = (effects or Effects()).resolve(captured=captured, distortion=distortion, exposures=exposures)
     gaussians, num_non_finite = cull_non_finite(gaussians, features)
-    if effects.filter_3d and captured is not None:
+    if captured is not None:
         gaussians = filter_3d(gaussians, captured)
     flat = replace(camera, viewmats=camera.viewmats.reshape(-1, 4, 4), Ks=camera.Ks.reshape(-1, 3, 3))
     splats = project(gaussians, flat, effects, None if distortion is None else distortion.reshape(-1, 5))

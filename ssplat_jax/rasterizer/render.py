@@ -1,4 +1,4 @@
-"""`render`: Gaussians and cameras to images, differentiably, through the tiled fast path."""
+"""`render`: differentiable images of Gaussians, by the tiled fast path."""
 
 import functools
 
@@ -11,7 +11,7 @@ from ssplat_jax.errors import InputError
 from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.pytree import pytree, replace
-from ssplat_jax.rasterizer.binning import bin_rows, count_pairs
+from ssplat_jax.rasterizer.binning import count_intersections, intersect_tiles
 from ssplat_jax.rasterizer.compositing import composite, median_rows
 from ssplat_jax.rasterizer.depth_sorted_table import sorted_table
 from ssplat_jax.rasterizer.effects import Effects
@@ -21,13 +21,18 @@ from ssplat_jax.rasterizer.projection import cull_cameras, cull_non_finite, proj
 from ssplat_jax.rasterizer.tile_grid import Grid
 
 TILE = 8
-MIN_PAIRS = 1 << 12
-MOST_ROOM = 1 << 30  # the last power of two that an index reaches
+"""Default side of a tile, pixels."""
+
+MIN_CAPACITY = 1 << 12
+"""Least capacity for pairs that `render` chooses."""
+
+MAX_CAPACITY = 1 << 30
+"""The largest power of two that an index reaches."""
 
 
 @pytree
-class Inputs:
-    """The arrays of one call of `render`; what each is stands there."""
+class RenderInputs:
+    """The arrays of one call of `render`, which describes them."""
 
     gaussians: Gaussians
     camera: Camera
@@ -49,55 +54,64 @@ def render(
     max_pairs: int | None = None,
     tile: int = TILE,
 ) -> RenderOutput:
-    """Images of `gaussians` from `camera` (one, or a batch with leading axes), differentiable in every array.
+    """Images of Gaussians, differentiable in every array.
+
+    An array that is given switches its effect on; an array that is None adds no operation to the program.
 
     Args:
-        gaussians: the scene; rows of opacity 0 are absent.
-        camera: poses, intrinsics and the image size (any, not only multiples of a tile).
-        effects: what to simulate and which outputs to give; `effects_for` finds what a scene needs.
+        gaussians: the scene, in the world frame of the camera; rows of opacity 0 are absent.
+        camera: poses (world to camera, OpenCV axes), intrinsics and the image size, of one camera or a batch.
+        effects: filter, background and outputs; `effects_for` finds what a scene needs.
         features: further channels, composited like colors.
-        captured: for `effects.filter_3d`, the cameras that the scene was made from.
-        distortion: for `effects.distortion`, OPENCV coefficients k1, k2, p1, p2, k3.
-        exposures: for `effects.exposure`, an affine color correction a frame.
-        max_pairs: room for (tile, Gaussian) pairs, of all cameras together. Outside jit it is counted (and rounded up
-            to a power of two, so that few programs are compiled), under `jax.grad` too. Inside jit the default is four
-            pairs a Gaussian and camera; look at `num_overflow` there: what does not fit is the farthest Gaussians.
-        tile: side of a tile in pixels, 8 or 16: 16 where most Gaussians are larger than 8 pixels.
+        captured: the cameras that the scene was made from, for the 3D smoothing filter.
+        distortion: OPENCV coefficients k1, k2, p1, p2, k3 of the lens.
+        exposures: affine color correction of each frame, RGB' = matrix @ RGB + offset.
+        max_pairs: capacity for tile intersections, (tile, Gaussian) pairs of all cameras. Outside jit, under `jax.grad`
+            too, the default is their number, rounded up to a power of two so that few programs are compiled. Inside jit
+            it is four for each Gaussian and camera: check `num_overflow`. The farthest Gaussians are left out.
+        tile: side of a tile in pixels, 8 or 16; choose 16 where most Gaussians are larger than 8 pixels.
+
+    Returns:
+        Images with the camera's batch axes, and counts of what was left out.
 
     Raises:
-        InputError: an array does not have the shape above, an effect lacks its array, `max_pairs` or `tile` is no
-            positive number, or (outside jit) there are more pairs than 2^31.
+        InputError: an array does not have the shape above, a flag of `effects` contradicts the arrays, `max_pairs` or
+            `tile` is below 1, or (outside jit) there are more than 2^30 pairs.
     """
-    effects = effects or Effects()
-    inputs = Inputs(gaussians, camera, features, captured, distortion, exposures)
-    _check(inputs, effects)
+    effects = (effects or Effects()).resolve(captured=captured, distortion=distortion, exposures=exposures)
+    inputs = RenderInputs(gaussians, camera, features, captured, distortion, exposures)
+    _check(inputs)
     inputs = _at_least_one_row(inputs)
     for name, number in (("max_pairs", max_pairs), ("tile", tile)):
         if number is not None and number < 1:
             raise InputError(f"render: {name} must be at least 1, got {number}.")
     if max_pairs is None:
-        # Differentiation alone leaves the numbers there: without its tangents, what it traces can be counted.
+        # Under `jax.grad` alone the primal values are concrete: without tangents, the pairs can be counted.
         counted = _count(jax.lax.stop_gradient(inputs), effects, tile)
         is_traced = isinstance(counted, Tracer)
-        max_pairs = default_max_pairs(inputs.gaussians, camera) if is_traced else _room_for(int(counted))
+        max_pairs = default_max_pairs(inputs.gaussians, camera) if is_traced else _capacity_for(int(counted))
     out = _render_jit(inputs, effects, max_pairs, tile)
     if not isinstance(out.num_overflow, Tracer) and int(out.num_overflow):
-        out = _render_jit(inputs, effects, _room_for(int(out.num_pairs)), tile)
+        out = _render_jit(inputs, effects, _capacity_for(int(out.num_pairs)), tile)
     return out
 
 
-def _room_for(num_pairs: int) -> int:
-    """`round_up`, for a number whose power of two an index can reach."""
-    if num_pairs > MOST_ROOM:
+def _capacity_for(num_pairs: int) -> int:
+    """The capacity for a number of pairs.
+
+    Raises:
+        InputError: an index would not reach the last pair.
+    """
+    if num_pairs > MAX_CAPACITY:
         raise InputError(
-            f"render: wanted at most {MOST_ROOM} pairs of a tile and a Gaussian, got more; render fewer cameras at"
-            " once or with tile=16."
+            f"render: wanted at most {MAX_CAPACITY} (tile, Gaussian) pairs, got more; render fewer cameras at once or"
+            " pass tile=16."
         )
     return round_up(num_pairs)
 
 
-def _at_least_one_row(inputs: Inputs) -> Inputs:
-    """A scene of no Gaussians gets an absent one: arrays of no rows have nothing to index."""
+def _at_least_one_row(inputs: RenderInputs) -> RenderInputs:
+    """`inputs`, with one absent Gaussian if the scene is empty: arrays without rows cannot be indexed."""
     if inputs.gaussians.num_gaussians:
         return inputs
     one = jax.tree.map(lambda x: jnp.zeros((1, *x.shape[1:]), x.dtype), (inputs.gaussians, inputs.features))
@@ -105,22 +119,23 @@ def _at_least_one_row(inputs: Inputs) -> Inputs:
 
 
 def default_max_pairs(gaussians: Gaussians, camera: Camera) -> int:
-    """The capacity inside jit when none is passed: four pairs a row and camera, as a power of two."""
+    """Default capacity inside jit: four pairs for each Gaussian and camera, as a power of two."""
     cameras = camera.viewmats.size // 16
-    return min(round_up(4 * cameras * gaussians.num_gaussians), MOST_ROOM)
+    return min(round_up(4 * cameras * gaussians.num_gaussians), MAX_CAPACITY)
 
 
 def round_up(num_pairs: int) -> int:
-    """The next power of two, at least `MIN_PAIRS`."""
-    return max(MIN_PAIRS, 1 << (num_pairs - 1).bit_length()) if num_pairs > 0 else MIN_PAIRS
+    """The next power of two, at least `MIN_CAPACITY`."""
+    return max(MIN_CAPACITY, 1 << (num_pairs - 1).bit_length()) if num_pairs > 0 else MIN_CAPACITY
 
 
-def _check(inputs: Inputs, effects: Effects) -> None:
+def _check(inputs: RenderInputs) -> None:
+    """Refuses arrays of the wrong shape."""
     camera, features = inputs.camera, inputs.features
     batch, rows = camera.viewmats.shape[:-2], inputs.gaussians.num_gaussians
     if camera.viewmats.shape[-2:] != (4, 4) or camera.Ks.shape != (*batch, 3, 3):
         raise InputError(
-            "render: camera wants viewmats [*b 4 4] and Ks [*b 3 3], "
+            "render: the camera must have viewmats [*b 4 4] and Ks [*b 3 3], "
             f"got {list(camera.viewmats.shape)} and {list(camera.Ks.shape)}."
         )
     if 0 in batch:
@@ -131,32 +146,35 @@ def _check(inputs: Inputs, effects: Effects) -> None:
         raise InputError(f"render: the image must have at least 1x1 pixels, got {camera.width}x{camera.height}.")
     if features is not None and (features.ndim != 2 or features.shape[0] != rows):
         raise InputError(f"render: features must be [{rows} c], got {list(features.shape)}.")
-    if effects.filter_3d and inputs.captured is None:
-        raise InputError("render: effects.filter_3d needs the captured cameras; pass captured=... or turn it off.")
-    for on, name, array, tail in (
-        (effects.distortion, "distortion", inputs.distortion, (5,)),
-        (effects.exposure, "exposures", inputs.exposures, (3, 4)),
-    ):
-        if on and (array is None or array.shape != (*batch, *tail)):
-            came = "nothing" if array is None else list(array.shape)
-            raise InputError(f"render: {name} must be {[*batch, *tail]} while its effect is on, got {came}.")
+    for name, array, tail in (("distortion", inputs.distortion, (5,)), ("exposures", inputs.exposures, (3, 4))):
+        if array is not None and array.shape != (*batch, *tail):
+            raise InputError(f"render: {name} must be {[*batch, *tail]}, got {list(array.shape)}.")
 
 
-def prepare(inputs: Inputs, effects: Effects):
-    """Finite float32 (or wider) Gaussians, a camera of one batch axis, their splats, and the number of rows culled."""
+def prepare(inputs: RenderInputs, effects: Effects):
+    """The projection stage.
+
+    Args:
+        inputs: the scene and cameras.
+        effects: resolved, see `Effects.resolve`.
+
+    Returns:
+        Finite Gaussians in float32 (float64 if given), the camera with one batch axis, the splats, and the number of
+        rows culled.
+    """
     given = inputs.gaussians.means.dtype
     dtype = given if given == jnp.float64 else jnp.dtype(jnp.float32)
     gaussians = jax.tree.map(lambda x: x.astype(dtype), inputs.gaussians)
     if effects.sh_degree is not None:
         gaussians = replace(gaussians, sh=gaussians.sh[:, : (effects.sh_degree + 1) ** 2])
     gaussians, num_non_finite = cull_non_finite(gaussians, inputs.features)
-    if effects.filter_3d and inputs.captured is not None:
+    if inputs.captured is not None:
         gaussians = filter_3d(gaussians, inputs.captured)
     camera = inputs.camera
     camera = replace(
         camera, viewmats=camera.viewmats.reshape(-1, 4, 4).astype(dtype), Ks=camera.Ks.reshape(-1, 3, 3).astype(dtype)
     )
-    distortion = inputs.distortion.reshape(-1, 5).astype(dtype) if effects.distortion else None  # pyright: ignore[reportOptionalMemberAccess]
+    distortion = None if inputs.distortion is None else inputs.distortion.reshape(-1, 5).astype(dtype)
     camera, usable = cull_cameras(camera)
     splats = project(gaussians, camera, effects, distortion)
     visible = splats.visible & usable[:, None]
@@ -165,36 +183,36 @@ def prepare(inputs: Inputs, effects: Effects):
     return gaussians, camera, splats, num_non_finite + num_unseen
 
 
-def grid_of(camera: Camera, tile: int) -> Grid:
+def tile_grid_of(camera: Camera, tile: int) -> Grid:
     """The tiles of all images of a camera with one batch axis."""
     return Grid(num_images=camera.viewmats.shape[0], height=camera.height, width=camera.width, tile=tile)
 
 
 @functools.partial(jax.jit, static_argnums=(1, 2))
-def _count(inputs: Inputs, effects: Effects, tile: int):
+def _count(inputs: RenderInputs, effects: Effects, tile: int):
     _, camera, splats, _ = prepare(inputs, effects)
-    return count_pairs(splats, grid_of(camera, tile))
+    return count_intersections(splats, tile_grid_of(camera, tile))
 
 
-def _render(inputs: Inputs, effects: Effects, max_pairs: int, tile: int) -> RenderOutput:
+def _render(inputs: RenderInputs, effects: Effects, max_pairs: int, tile: int) -> RenderOutput:
     with jax.named_scope("project"):
         gaussians, camera, splats, num_non_finite = prepare(inputs, effects)
         channels = splat_channels(gaussians, splats, camera, effects, inputs.features)
-    grid = grid_of(camera, tile)
+    grid = tile_grid_of(camera, tile)
     with jax.named_scope("sort"):
         table, order = sorted_table(splats, channels, grid)
     with jax.named_scope("bin"):
         images = order // gaussians.num_gaussians
-        pairs = bin_rows(jax.lax.stop_gradient(table), images, grid, max_pairs)
+        pairs = intersect_tiles(jax.lax.stop_gradient(table), images, grid, max_pairs)
     median_depth = None
     with jax.named_scope("composite"):
         tiles = composite(grid, effects.needs_alpha, table, pairs)
         if "median_depth" in effects.outputs:
-            rows = untile(median_rows(grid, jax.lax.stop_gradient(table), pairs)[:, None], grid)[..., 0]
+            rows = _untile(median_rows(grid, jax.lax.stop_gradient(table), pairs)[:, None], grid)[..., 0]
             depths = splats.depths.reshape(-1)[order[jnp.maximum(rows, 0)]]
             median_depth = jnp.where(rows >= 0, depths, 0.0)
     return finish(
-        untile(tiles, grid),  # pyright: ignore[reportArgumentType] - custom_vjp hides the type
+        _untile(tiles, grid),  # pyright: ignore[reportArgumentType] - custom_vjp hides the type
         inputs.camera,
         effects,
         exposures=inputs.exposures,
@@ -208,8 +226,8 @@ def _render(inputs: Inputs, effects: Effects, max_pairs: int, tile: int) -> Rend
 _render_jit = functools.partial(jax.jit, static_argnums=(1, 2, 3))(_render)
 
 
-def untile(tiles: Num[Array, "tiles c p"], grid: Grid) -> Num[Array, "b h w c"]:
-    """Tiles put together to images and cropped to their size."""
+def _untile(tiles: Num[Array, "tiles c p"], grid: Grid) -> Num[Array, "b h w c"]:
+    """Images from their tiles, cropped to the image size."""
     side, channels = grid.tile, tiles.shape[1]
     images = tiles.reshape(grid.num_images, grid.rows, grid.columns, channels, side, side).transpose(0, 1, 4, 2, 5, 3)
     images = images.reshape(grid.num_images, grid.rows * side, grid.columns * side, channels)

@@ -1,4 +1,4 @@
-"""Color from real spherical harmonics, degree 0 to 3, as splat files store them (Condon-Shortley, m = -l..l)."""
+"""Colors from real spherical harmonics of degree 0 to 3, as splat files store them (Condon-Shortley, m = -l..l)."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -53,15 +53,15 @@ def sh_basis(directions: Float[Array, "*s 3"], degree: int) -> Float[Array, "*s 
 def sh_colors(
     sh: Float[Array, "n k 3"], directions: Float[Array, "*b n 3"] | None, degree: int
 ) -> Float[Array, "*b n 3"]:
-    """Colors max(0.5 + sum, 0) along unit `directions` (camera to Gaussian), bands above `degree` unused.
+    """Colors max(0.5 + sum, 0) along unit `directions` (camera to Gaussian), from the bands up to `degree`.
 
-    Degree 0 does not look at `directions`, which may then be None, and gives one color per Gaussian: `[n 3]`.
+    At degree 0, `directions` is not used and may be None; the colors are then `[n 3]`.
 
     Limits:
-        0.5 + sum < 0 gives 0, with a zero gradient; exactly 0 gets half of it.
+        0.5 + sum < 0 gives 0, with a zero gradient; at exactly 0 the gradient is halved.
     """
     if degree == 0 or directions is None:
         return jnp.maximum(0.5 + SH_C0 * sh[:, 0, :], 0.0)
     basis = sh_basis(directions, degree)
-    # Written as a sum of products: a dot would fall to the matmul precision of the platform.
+    # A sum of products: a dot product would have the platform's matmul precision.
     return jnp.maximum(0.5 + jnp.sum(basis[..., None] * sh[:, : basis.shape[-1], :], axis=-2), 0.0)

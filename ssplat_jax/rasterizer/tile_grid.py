@@ -1,4 +1,4 @@
-"""The tiles of images, and which of them a box covers."""
+"""The tiles of images, and the tiles that a box covers."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
@@ -32,12 +32,12 @@ class Grid:
         return self.num_images * self.rows * self.columns
 
 
-def tile_boxes(means2d: Float[Array, "*m 2"], halves: Float[Array, "*m 2"], grid: Grid) -> tuple[Int[Array, "*m"], ...]:
-    """Tile ranges (x from, y from, columns, rows) that each row's box covers; boxes of no size cover none."""
+def tile_boxes(means2d: Float[Array, "*m 2"], radii: Float[Array, "*m 2"], grid: Grid) -> tuple[Int[Array, "*m"], ...]:
+    """Left, top, width and height, in tiles, of what each box covers; boxes of radius 0 cover none."""
     sides = []
-    for mean, half, limit in zip(columns(means2d), columns(halves), (grid.columns, grid.rows), strict=True):
-        low, high = (jnp.floor((mean + sign * half) / grid.tile) for sign in (-1, 1))
+    for mean, radius, limit in zip(columns(means2d), columns(radii), (grid.columns, grid.rows), strict=True):
+        low, high = (jnp.floor((mean + sign * radius) / grid.tile) for sign in (-1, 1))
         low, high = jnp.clip(low, 0, limit), jnp.clip(high + 1, 0, limit)
-        sides.append((low.astype(jnp.int32), jnp.where(half > 0, high - low, 0).astype(jnp.int32)))
+        sides.append((low.astype(jnp.int32), jnp.where(radius > 0, high - low, 0).astype(jnp.int32)))
     (left, width), (top, height) = sides
     return left, top, width, height

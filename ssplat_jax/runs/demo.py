@@ -1,96 +1,105 @@
-"""`ssplat demo`: an embedded procedural scene, streamed with the shipped weights; what more views give, in numbers."""
+"""`ssplat demo`: streams an embedded procedural scene and scores unseen views after more and more streamed views."""
 
-import io
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from ssplat_jax.checkpoint.weights import load_params
 from ssplat_jax.config import QUALITIES, Quality, preset
+from ssplat_jax.console import Reporter
 from ssplat_jax.data.capture import open_capture
-from ssplat_jax.data.split import interleaved
-from ssplat_jax.evaluation.evaluate import Exposures, cache_facts, exposures_of, save_comparison, save_image, score_view
-from ssplat_jax.storage.atomic import write_atomic
+from ssplat_jax.data.split import interleaved_split
+from ssplat_jax.evaluation.pictures import save_comparison, save_image
+from ssplat_jax.evaluation.plots import import_pyplot, save_figure
+from ssplat_jax.evaluation.scoring import ScoredView, score_view
+from ssplat_jax.scene_files.ply import save_ply
 from ssplat_jax.storage.folders import make_writable
 from ssplat_jax.storage.json_files import write_json
-from ssplat_jax.scene_files.ply import save_ply
-from ssplat_jax.console import Reporter
+from ssplat_jax.storage.run_folder import RunFolder
+from ssplat_jax.streaming.feed import Exposures, feed_chunks
 from ssplat_jax.streaming.session import Session
 from ssplat_jax.streaming.streamsplat import StreamSplat
 
-STAGES = (4, 8, 16, 32, 64)  # views after which the scene is decoded and scored
-NUM_FRAMES = 73  # 64 context views and the 9 interleaved targets between them
+STAGES = (4, 8, 16, 32, 64)
+"""Numbers of streamed views after which the scene is decoded and scored."""
+
+NUM_FRAMES = 73
+"""64 context views and the 9 interleaved targets between them."""
 
 
 def run_demo(scene: str, out: Path, reporter: Reporter, quality: Quality = QUALITIES["accurate"]) -> dict:
-    """Streams `procedural:scene`, scores the same targets after every stage, writes scene, pictures and metrics."""
+    """Streams `procedural:scene` and scores the same targets after every stage.
+
+    Args:
+        scene: name of the procedural scene.
+        out: folder of the scene, the pictures and the metrics.
+        reporter: shows progress and the table.
+        quality: size at which images are streamed; they are scored at full size.
+
+    Returns:
+        The metrics as written.
+
+    Raises:
+        StorageError: `out` cannot be written.
+    """
+    folder, since = RunFolder(out), time.perf_counter()
     make_writable(out)  # before the long part
-    since = time.perf_counter()
     model, params = StreamSplat(preset("tiny")), load_params("tiny")
     capture = open_capture(f"procedural:{scene}?frames={NUM_FRAMES}")
     streamed = capture.scaled(quality.scale)
-    split = interleaved(len(capture), stride=1, context=STAGES[-1])
+    split = interleaved_split(len(capture), stride=1, context=STAGES[-1])
     frame = streamed.stream_frame(model.config, split.context)
-    order = streamed.stream_order(model.config, split.context, frame)
     session = Session(model, params)
-    rows, strip = [], []
     exposures: Exposures = {}
+    rows, strip, views = [], [], []
     with reporter.progress("streaming", STAGES[-1]) as advance:
-        for chunk in streamed.chunks(model.config, order, frame=frame):
-            exposures |= exposures_of(session.feed(chunk), chunk, order[len(exposures) :])
+        for fed in feed_chunks(session, streamed, streamed.stream_order(model.config, split.context, frame), frame):
+            exposures |= fed.exposures
             advance(len(exposures))
             if len(exposures) in STAGES:
-                row, middle = _score_stage(session, capture, split, frame, exposures)
-                rows.append(row)
-                strip.append(middle)
-    gaussians = session.gaussians()
-    save_ply(out / "scene.ply", frame.gaussians_to_capture(gaussians))
-    for i in split.targets:
-        _, color, depth = score_view(gaussians, capture, i, frame, exposures)
-        save_comparison(out / f"view_{i:05d}.png", capture.image(i), color, depth, (frame.near, frame.far))
-    middle_target = capture.image(split.targets[len(split.targets) // 2])
-    save_image(out / "views_4_8_16_32_64_target.png", np.concatenate([*strip, middle_target], axis=1))
+                gaussians = session.gaussians()
+                views = [score_view(gaussians, capture, i, frame, exposures) for i in split.targets]
+                rows.append(_table_row(views, len(exposures), session))
+                strip.append(views[len(views) // 2].color)
+    save_ply(folder.scene, frame.gaussians_to_capture(session.gaussians()))
+    for view in views:  # of the last stage: the finished scene
+        save_comparison(folder.target(view.score.frame), view.target, view.color, view.depth, (frame.near, frame.far))
+    strip.append(views[len(views) // 2].target)
+    save_image(out / "views_4_8_16_32_64_target.png", np.concatenate(strip, axis=1))
     metrics = {
         "scene": scene,
         "size": [capture.width, capture.height],
         "streamed_size": [streamed.width, streamed.height],
         "stages": rows,
-        "cache": cache_facts(session),
+        "cache": session.cache_facts(),
         "compile_s": round(session.compile_seconds, 2),
         "seconds": round(time.perf_counter() - since, 1),
         "config_hash": model.config.hash,
     }
-    write_json(out / "metrics.json", metrics)
+    write_json(folder.metrics, metrics)
     _plot(out / "quality.png", rows)
     header = ("views", "PSNR dB", "SSIM", "covered", "Gaussians")
     reporter.table(f"{scene}: quality of unseen views", header, [tuple(row.values()) for row in rows])
     return metrics
 
 
-def _score_stage(session: Session, capture, split, frame, exposures: Exposures):
-    """A row of the table, and the render of the middle target."""
-    gaussians = session.gaussians()
-    scored = [score_view(gaussians, capture, i, frame, exposures) for i in split.targets]
-    scores = [score for score, _, _ in scored]
-    row = {
-        "views": len(exposures),
-        "psnr": round(float(np.mean([s.psnr for s in scores])), 2),
-        "ssim": round(float(np.mean([s.ssim for s in scores])), 3),
-        "coverage": round(float(np.mean([s.coverage for s in scores])), 3),
-        "num_gaussians": cache_facts(session)["decoded"],
+def _table_row(views: Sequence[ScoredView], num_streamed: int, session: Session) -> dict:
+    """Mean scores after `num_streamed` views."""
+    mean = lambda name: float(np.mean([getattr(view.score, name) for view in views]))  # noqa: E731
+    return {
+        "views": num_streamed,
+        "psnr": round(mean("psnr"), 2),
+        "ssim": round(mean("ssim"), 3),
+        "coverage": round(mean("coverage"), 3),
+        "num_gaussians": session.cache_facts()["decoded"],
     }
-    return row, scored[len(scored) // 2][1]
 
 
 def _plot(path: Path, rows: list[dict]) -> None:
-    """PSNR against views; left out without matplotlib (the `plots` extra)."""
-    try:
-        import matplotlib
-
-        matplotlib.use("Agg")
-        from matplotlib import pyplot
-    except ImportError:
+    """Plots PSNR against views; does nothing without matplotlib (extra `plots`)."""
+    if (pyplot := import_pyplot()) is None:
         return
     figure, axes = pyplot.subplots(figsize=(5, 3.2), layout="constrained")
     axes.plot([r["views"] for r in rows], [r["psnr"] for r in rows], marker="o", color="#30507a")
@@ -99,7 +108,4 @@ def _plot(path: Path, rows: list[dict]) -> None:
     axes.set_xlabel("views seen")
     axes.set_ylabel("PSNR of unseen views, dB")
     axes.spines[["top", "right"]].set_visible(False)
-    encoded = io.BytesIO()
-    figure.savefig(encoded, dpi=150)
-    pyplot.close(figure)
-    write_atomic(path, encoded.getvalue())
+    save_figure(path, figure)

@@ -1,32 +1,30 @@
-"""`ssplat render`: a scene file as the cameras of a capture see it, a picture each, and a film from one to the next."""
+"""`ssplat render`: pictures of a scene file from the cameras of a capture, and a film through them."""
 
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float, Float64
 
+from ssplat_jax.console import Reporter
 from ssplat_jax.data.camera_path import camera_path
 from ssplat_jax.data.capture import open_capture
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.errors import InputError, require_positive
-from ssplat_jax.evaluation.evaluate import eight_bits, save_image
-from ssplat_jax.storage.video import Film
-from ssplat_jax.storage.folders import remove_numbered
-from ssplat_jax.storage.folder_lock import only_writer
-from ssplat_jax.scene_files.ply import SplatFile, read_ply
+from ssplat_jax.evaluation.pictures import eight_bits, save_image
 from ssplat_jax.gaussians import mean_color
 from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.rasterizer import Effects, fill_holes, render
-from ssplat_jax.console import Reporter
+from ssplat_jax.scene_files.ply import SplatFile, read_ply
+from ssplat_jax.storage.folder_lock import lock_folder
+from ssplat_jax.storage.run_folder import RunFolder
+from ssplat_jax.storage.video import VideoWriter
 
-SCENE_FILE = "scene.ply"  # of a run's folder
-PICTURES, PICTURE = "views", "#####.png"
-FILM_FILE = "film.mp4"
 ANTIALIAS = {"mip": "mip", "default": "classic"}
+"""Antialiasing filter for each render mode that a scene file may name."""
 
-_filled = jax.jit(fill_holes)
+_jitted_fill_holes = jax.jit(fill_holes)
 
 
 def render_scene(
@@ -41,13 +39,24 @@ def render_scene(
     film_steps: int | None,
     reporter: Reporter,
 ) -> int:
-    """Writes `out`/views/<frame>.png for every `stride`-th frame of the capture at `path`; returns how many.
+    """Writes `out`/views/<frame>.png for frames of a capture, and optionally `out`/film.mp4 through their cameras.
 
-    With `film_steps`, `out`/film.mp4 goes through those cameras, so many pictures from one to the next.
+    The scene is drawn with the filter that its file names: mip, or the dilation of 3DGS where the file names none. It
+    is shown at its own exposure.
 
-    The scene, a .ply or the folder of a run, stands in the capture's frame. It is drawn with the filter that its file
-    names: ours, or the dilation of 3DGS where the file names none. Where it lets light through the colors around are
-    shown, or black; exposure is the scene's one.
+    Args:
+        scene: a .ply in the capture's frame, or the folder of a run.
+        path: the capture, as `open_capture` takes it.
+        out: folder of the results.
+        size: (width, height) of the pictures; by default the capture's own.
+        stride: every `stride`-th camera is used.
+        max_views: stop after this many pictures.
+        over_black: show holes black instead of in the colors around them.
+        film_steps: pictures of the film from one camera to the next; None for no film.
+        reporter: shows progress.
+
+    Returns:
+        The number of pictures, without those of the film.
 
     Raises:
         InputError: the scene or the capture is unusable, the capture lies in `out`, or a film is wanted without PyAV.
@@ -58,44 +67,58 @@ def render_scene(
         require_positive(max_views=max_views)
     if film_steps is not None:
         require_positive(film=film_steps)
-    file = scene / SCENE_FILE if scene.is_dir() else scene
+    splats = _read_scene(scene)
+    capture, folder = open_capture(path, size=size), RunFolder(out)
+    capture.check_output_folder(out)
+    indices = range(0, len(capture), stride)[:max_views]
+    film = None if film_steps is None else VideoWriter(capture.width, capture.height)
+    steps = film_steps or 1
+    path_poses, path_Ks = camera_path(
+        np.stack([capture.frames[i].camtoworld for i in indices]), np.stack([capture.K(i) for i in indices]), steps
+    )
+    background = None if over_black else mean_color(splats.gaussians)
+    with lock_folder(out), reporter.progress("rendering", len(path_poses)) as advance:
+        folder.clear_views()
+        folder.film.unlink(missing_ok=True)
+        for place, (camtoworld, K) in enumerate(zip(path_poses, path_Ks, strict=True)):
+            picture = _render_picture(splats, camtoworld, K, (capture.width, capture.height), background)
+            if place % steps == 0:
+                save_image(folder.view(indices[place // steps]), picture)
+            if film is not None:
+                film.add(eight_bits(picture))
+            advance(place + 1)
+        if film is not None:
+            film.save(folder.film)
+    return len(indices)
+
+
+def _read_scene(scene: Path) -> SplatFile:
+    """The scene at a path, which may be the folder of a run."""
+    file = RunFolder(scene).scene if scene.is_dir() else scene
     splats = read_ply(file)
     if splats.render_mode not in ANTIALIAS:
         raise InputError(
             f"{file}: wanted 3D Gaussians, got a scene of {splats.render_mode}; render it where it was made."
         )
-    capture = open_capture(path, size=size)
-    capture.check_apart(out)
-    indices = range(0, len(capture), stride)[:max_views]
-    film = None if film_steps is None else Film(capture.width, capture.height)
-    steps = film_steps or 1
-    path_poses, path_Ks = camera_path(
-        np.stack([capture.frames[i].camtoworld for i in indices]), np.stack([capture.K(i) for i in indices]), steps
-    )
-    beyond = None if over_black else mean_color(splats.gaussians)
-    with only_writer(out), reporter.progress("rendering", len(path_poses)) as advance:
-        remove_numbered(out / PICTURES, PICTURE)
-        (out / FILM_FILE).unlink(missing_ok=True)
-        for place, (camtoworld, K) in enumerate(zip(path_poses, path_Ks, strict=True)):
-            picture = _picture(splats, camtoworld, K, (capture.width, capture.height), beyond)
-            if place % steps == 0:
-                save_image(out / PICTURES / f"{indices[place // steps]:05d}.png", picture)
-            if film is not None:
-                film.add(eight_bits(picture))
-            advance(place + 1)
-        if film is not None:
-            film.save(out / FILM_FILE)
-    return len(indices)
+    return splats
 
 
-def _picture(
+def _render_picture(
     splats: SplatFile,
     camtoworld: Float64[np.ndarray, "4 4"],
     K: Float64[np.ndarray, "3 3"],
     size: tuple[int, int],
-    beyond: jax.Array | None,
-) -> np.ndarray:
-    """What a camera sees, holes filled with what is around and `beyond`, or black."""
+    background: jax.Array | None,
+) -> Float[np.ndarray, "h w 3"]:
+    """Renders a scene from one camera.
+
+    Args:
+        splats: the scene, in the capture's frame relative to its offset.
+        camtoworld: pose of the camera in the capture's frame.
+        K: intrinsics, pixels.
+        size: (width, height) of the picture.
+        background: color of holes that have no colors around them; None shows all holes black.
+    """
     at_offset = np.eye(4)
     at_offset[:3, 3] = splats.offset
     frame = StreamFrame.at_camera(at_offset, scale=1.0, near=0.0, far=np.inf)
@@ -105,4 +128,4 @@ def _picture(
     effects = Effects(antialias=ANTIALIAS[splats.render_mode], outputs=("color", "alpha"))
     out = render(splats.gaussians, camera, effects=effects)
     assert out.color is not None and out.alpha is not None
-    return np.asarray(out.color if beyond is None else _filled(out.color, out.alpha, beyond))
+    return np.asarray(out.color if background is None else _jitted_fill_holes(out.color, out.alpha, background))

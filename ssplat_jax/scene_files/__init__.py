@@ -1,1 +1,1 @@
-"""Scene files. Every format has a writer, a reader that shares no layout code with it, and writes all or nothing."""
+"""Scene files (.ply, .spz, .splat); every writer is atomic, and tests read its files with an independent reader."""

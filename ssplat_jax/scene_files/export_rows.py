@@ -1,4 +1,4 @@
-"""What goes into a scene file, whatever its format: the Gaussians that can be seen, in numbers that a file can hold."""
+"""Selection and clamping of the Gaussians that are written to a scene file, common to all formats."""
 
 import dataclasses
 
@@ -8,35 +8,35 @@ from jaxtyping import Float64, UInt8
 from ssplat_jax.gaussians import Gaussians
 
 MIN_OPACITY = 1.0 / 255.0
-"""Rows fainter than this draw nothing in any renderer and are not written; absent rows (opacity 0) are among them."""
+"""Gaussians below this opacity are invisible in every renderer and are not written (absent rows have opacity 0)."""
 
 OPACITY_GUARD = 1e-6
-"""Opacities are written no nearer than this to 0 and 1, where the logit is infinite."""
+"""Opacities are clamped this far from 0 and 1, where the logit is infinite."""
 
 LOG_SCALE_LIMIT = 20.0
-"""|ln sigma| beyond this is clamped: 2e-9 to 5e8 units, the range of the compressed formats made from such a file."""
+"""|ln sigma| is clamped to this, 2e-9 to 5e8 units: the range of the compressed formats that are made from a .ply."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ExportReport:
-    """What became of the rows of a scene."""
+    """Counts of written and dropped Gaussians, and the offset of the positions in the file."""
 
     num_written: int
     num_dropped: int
-    """Non-finite, of negative scale, or fainter than 1/255 (absent rows included)."""
+    """Gaussians with non-finite entries, a negative scale, or an opacity below 1/255 (absent rows included)."""
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """To be added to the file's positions."""
+    """Vector to add to the positions in the file."""
 
     @property
     def warning(self) -> str | None:
-        """What whoever opens the file should know."""
+        """Note for the user who opens the file, or None."""
         far = "the capture lies far from its origin; positions are counted from"
         return f"{far} {list(self.offset)}." if any(self.offset) else None
 
 
 @dataclasses.dataclass(frozen=True)
 class SceneRows:
-    """The Gaussians to be written, in their order."""
+    """Gaussians to write, float64, in their order in the scene."""
 
     means: Float64[np.ndarray, "n 3"]
     quats: Float64[np.ndarray, "n 4"]  # wxyz, unit
@@ -49,10 +49,10 @@ class SceneRows:
 
 
 def scene_rows(gaussians: Gaussians) -> SceneRows:
-    """The rows worth writing.
+    """Returns the visible Gaussians, with every entry in the range that files can hold.
 
     Limits:
-        Rows with an entry that is not finite, a negative scale or an opacity below 1/255 are left out.
+        Gaussians with a non-finite entry, a negative scale or an opacity below 1/255 are dropped.
         Opacities are clamped to [1e-6, 1 - 1e-6], scales to [e^-20, e^20]; a zero quaternion becomes the identity.
     """
     fields = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
@@ -69,7 +69,7 @@ def scene_rows(gaussians: Gaussians) -> SceneRows:
 
 
 def unit_quats(quats: Float64[np.ndarray, "n 4"]) -> Float64[np.ndarray, "n 4"]:
-    """Unit quaternions; the identity for those the renderer takes as one (all entries within 1e-12 of 0)."""
+    """Normalizes quaternions; those with all entries within 1e-12 of 0 become the identity, as in the renderer."""
     largest = np.abs(quats).max(axis=1, keepdims=True, initial=0.0)
     quats = np.where(largest > 1e-12, quats, np.array([1.0, 0.0, 0.0, 0.0]))
     quats = quats / np.abs(quats).max(axis=1, keepdims=True, initial=0.0)
@@ -77,5 +77,5 @@ def unit_quats(quats: Float64[np.ndarray, "n 4"]) -> Float64[np.ndarray, "n 4"]:
 
 
 def to_bytes(values: Float64[np.ndarray, "*n"]) -> UInt8[np.ndarray, "*n"]:
-    """To the nearest of 0 .. 255."""
+    """Rounds to the nearest integer in [0, 255]."""
     return np.clip(np.round(values), 0, 255).astype(np.uint8)

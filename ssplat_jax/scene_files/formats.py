@@ -1,4 +1,4 @@
-"""A scene into a file of the format that its name says."""
+"""Writes a scene in the format given by the file extension."""
 
 import dataclasses
 from pathlib import Path
@@ -10,11 +10,15 @@ from ssplat_jax.scene_files.ply import read_ply, save_ply
 from ssplat_jax.scene_files.splat import save_splat
 from ssplat_jax.scene_files.spz import save_spz
 
-FORMATS = (".ply", ".spz", ".splat")
+FORMATS = (".ply", ".spz", ".splat")  # file extensions
 
 
 def check_format(path: Path) -> None:
-    """Raises InputError if no format has the name's ending."""
+    """Checks that the extension of `path` is one of `FORMATS`.
+
+    Raises:
+        InputError: it is not.
+    """
     if path.suffix not in FORMATS:
         raise InputError(f"--to: wanted a file named *{', *'.join(FORMATS)}, got {path.name!r}; choose one of these.")
 
@@ -26,10 +30,20 @@ def save_gaussians(
     render_mode: str = "mip",
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> ExportReport:
-    """Writes `gaussians` to `path`; what `save_ply` says of the arguments, as far as the format has a place for it.
+    """Writes `gaussians` to `path` in the format of its extension.
+
+    Args:
+        path: the file to write (.ply, .spz or .splat).
+        gaussians: the scene.
+        render_mode: the renderer that the scene is made for, see `save_ply`; a .spz stores only whether it is "mip",
+            a .splat nothing.
+        offset: origin of `gaussians` in the frame of the capture; only a .ply stores it.
+
+    Returns:
+        Counts of written and dropped Gaussians, and `offset`.
 
     Raises:
-        InputError: another ending than .ply, .spz or .splat, or positions beyond the format's range.
+        InputError: an unknown extension, or positions outside the range of the format.
         StorageError: the file cannot be written.
     """
     check_format(path)
@@ -43,10 +57,10 @@ def save_gaussians(
 
 
 def convert_ply(scene: Path, to: Path) -> ExportReport:
-    """Writes the scene of a .ply again, to `to`, in the format of its ending.
+    """Converts the .ply file `scene` to the format given by the extension of `to`.
 
     Raises:
-        InputError: `scene` is no 3DGS .ply; as `save_gaussians`.
+        InputError: `scene` is not a 3DGS .ply, `to` has an unknown extension, or positions are out of range.
         StorageError: the file cannot be written.
     """
     check_format(to)

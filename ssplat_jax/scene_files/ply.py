@@ -1,4 +1,4 @@
-"""The 3DGS PLY file: what every splat viewer opens.
+"""Reader and writer of the 3DGS .ply file, which every splat viewer opens.
 
 Binary little endian, one row of float32 per Gaussian, in the frame and units of the Gaussians:
 
@@ -6,9 +6,9 @@ Binary little endian, one row of float32 per Gaussian, in the frame and units of
 
 `opacity` is a logit, `scale` ln of the standard deviation, `rot` a quaternion wxyz, color = 0.5 + 0.28209 f_dc + ...;
 `f_rest` is channel-major: the K = 0, 3, 8 or 15 coefficients of red, then of green, then of blue. The comment
-`SplatRenderMode: mip` says that the scene is meant for a renderer with the 2D Mip filter, as ours is. A scene far from
-the origin of its frame, where float32 is too coarse for it, is written from an offset near by, and the comment
-`offset x y z` says what to add.
+`SplatRenderMode: mip` marks a scene made for a renderer with the 2D Mip filter, as ours is. Where a scene is so far
+from the origin of its frame that float32 is too coarse, its positions are relative to a nearby offset, which the
+comment `offset x y z` holds.
 """
 
 import dataclasses
@@ -24,9 +24,10 @@ from ssplat_jax.scene_files.ply_table import read_vertices
 from ssplat_jax.storage.atomic import write_atomic
 
 RENDER_MODES = ("default", "mip", "2dgs")
+"""Values of the comment `SplatRenderMode`: 3DGS, 3DGS with the 2D Mip filter (ours), and 2D Gaussian Splatting."""
 
 REST_TERMS = {0: 0, 9: 1, 24: 2, 45: 3}
-"""Number of f_rest properties to SH degree."""
+"""SH degree by number of f_rest properties."""
 
 BASE_PROPERTIES = (
     *("x", "y", "z"),
@@ -39,13 +40,13 @@ BASE_PROPERTIES = (
 
 @dataclasses.dataclass(frozen=True)
 class SplatFile:
-    """What a file holds: its Gaussians, and what its comments say of them."""
+    """Contents of a .ply file: the Gaussians and the facts in its comments."""
 
     gaussians: Gaussians
     render_mode: str
-    """The kind of renderer that they were made for: `mip` (ours), `2dgs`, or `default`, that of 3DGS."""
+    """Renderer that the scene was made for, one of `RENDER_MODES`."""
     offset: tuple[float, float, float]
-    """To be added to the positions."""
+    """Vector to add to the positions."""
 
 
 def save_ply(
@@ -55,19 +56,19 @@ def save_ply(
     render_mode: str = "mip",
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> ExportReport:
-    """Writes `gaussians` to `path`, all or nothing; the same Gaussians give the same bytes.
+    """Writes `gaussians` to `path` atomically; the same Gaussians give the same bytes.
 
     Args:
-        path: of the file; folders are made.
-        gaussians: in the frame the file should be in (`Capture` scenes: the capture's own).
-        render_mode: the comment `SplatRenderMode`, one of `default`, `mip`, `2dgs`.
-        offset: where the origin of `gaussians` lies in the frame the file should be in; a comment unless zero.
+        path: the file to write; missing folders are created.
+        gaussians: the scene, in the frame of the file (for scenes of a `Capture`, the capture frame).
+        render_mode: value of the comment `SplatRenderMode`, one of `RENDER_MODES`.
+        offset: origin of `gaussians` in the frame of the file; written as a comment unless it is zero.
 
-    Limits:
-        As `scene_rows`; what it leaves out is counted.
+    Returns:
+        Counts of written and dropped Gaussians (`scene_rows`), and `offset`.
 
     Raises:
-        InputError: no such render mode.
+        InputError: an unknown render mode.
         StorageError: the file cannot be written.
     """
     if render_mode not in RENDER_MODES:
@@ -79,7 +80,7 @@ def save_ply(
 
 
 def property_names(sh_degree: int) -> list[str]:
-    """The properties of a row, in the order of the file."""
+    """Names of the vertex properties, in the order of the file."""
     rest = 3 * ((sh_degree + 1) ** 2 - 1)
     names = ["x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3)), *(f"f_rest_{i}" for i in range(rest))]
     return [*names, "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
@@ -100,7 +101,7 @@ def _header(num_rows: int, sh_degree: int, render_mode: str, offset: tuple[float
 
 
 def _table(rows: SceneRows) -> np.ndarray:
-    """One row of raw values per Gaussian, float64 until the last cast."""
+    """Table with one row of raw values per Gaussian, float64."""
     rest = rows.sh[:, 1:].transpose(0, 2, 1).reshape(len(rows), 3 * (rows.sh.shape[1] - 1))
     logits = np.log(rows.opacities) - np.log1p(-rows.opacities)
     normals = np.zeros_like(rows.means)
@@ -109,25 +110,26 @@ def _table(rows: SceneRows) -> np.ndarray:
 
 
 def load_ply(path: str | os.PathLike) -> Gaussians:
-    """The Gaussians of a 3DGS PLY file: ascii or binary of either byte order, properties in any order, others ignored.
+    """Reads the Gaussians of a 3DGS .ply file, ascii or binary, properties in any order; unknown ones are ignored.
 
     Limits:
-        Opacity logits of +-inf (other writers' unguarded logits) give 0 and 1; any other entry that is not finite in
+        Opacity logits of +-inf, which other writers produce, become 0 and 1; any other entry that is not finite in
         float32 is refused.
-        Scales are clamped to [e^-20, e^20]; quaternions are normalized, a zero one becomes the identity.
-        A comment `offset x y z` (`save_ply`) is not added: positions stay what float32 holds exactly.
+        Scales are clamped to [e^-20, e^20]; quaternions are normalized, a zero quaternion becomes the identity.
+        A comment `offset x y z` (`save_ply`) is not added, so that float32 positions stay exact.
 
     Raises:
-        InputError: the file is no 3DGS PLY, is cut off, or holds entries that are not finite.
+        InputError: the file is not a 3DGS .ply, is cut off, or holds entries that are not finite.
     """
     return read_ply(path).gaussians
 
 
 def read_ply(path: str | os.PathLike) -> SplatFile:
-    """What `load_ply` gives, and the comments `SplatRenderMode` and `offset`.
+    """Reads a 3DGS .ply file as `load_ply` does, with its comments `SplatRenderMode` and `offset`.
 
     Raises:
-        InputError: as `load_ply`, or an offset that is not three numbers.
+        InputError: the file is not a 3DGS .ply, is cut off, holds entries that are not finite, or its offset is not
+            three numbers.
     """
     columns, comments = read_vertices(path)
     missing = [name for name in BASE_PROPERTIES if name not in columns]
@@ -166,8 +168,8 @@ def read_ply(path: str | os.PathLike) -> SplatFile:
 
 
 def _render_mode(comments: list[str]) -> str:
-    said = [comment.split()[-1] for comment in comments if comment.startswith("SplatRenderMode:")]
-    return said[-1] if said and said[-1] in RENDER_MODES else "default"
+    modes = [comment.split()[-1] for comment in comments if comment.startswith("SplatRenderMode:")]
+    return modes[-1] if modes and modes[-1] in RENDER_MODES else "default"
 
 
 def _offset(path, comments: list[str]) -> tuple[float, float, float]:
@@ -184,7 +186,7 @@ def _offset(path, comments: list[str]) -> tuple[float, float, float]:
 
 
 def _stacked(path, columns: dict[str, np.ndarray], names, *, allow_infinite: bool = False) -> np.ndarray:
-    """Columns side by side in float64, checked to be finite once they are float32."""
+    """Stacks columns in float64 and checks that they are finite in float32."""
     if not names:
         return np.zeros((len(columns["x"]), 0))
     stacked = np.stack([columns[name] for name in names], axis=1).astype(np.float64)

@@ -1,6 +1,6 @@
-"""Reads the vertex element of a PLY file (ascii, binary of either byte order) into columns by name.
+"""Reader of the vertex element of a PLY file, ascii or binary of either byte order, into columns by name.
 
-Nothing is allocated on the word of the header: a count is compared with the bytes that are there first.
+Counts in the header are compared with the size of the file before anything is allocated.
 """
 
 import dataclasses
@@ -11,7 +11,7 @@ import numpy as np
 
 from ssplat_jax.errors import InputError
 
-MAX_HEADER_BYTES = 1 << 16
+MAX_HEADER_BYTES = 1 << 16  # headers of splat files take a few kilobytes
 
 BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
 
@@ -29,23 +29,23 @@ TYPES = {
 
 @dataclasses.dataclass
 class Element:
-    """One `element` of a header: scalar properties in order, or `has_list` where a row's size is not fixed."""
+    """`element` of a PLY header; with `has_list`, its rows have no fixed size."""
 
     name: str
     count: int
-    properties: dict[str, str]  # name -> numpy type code
+    properties: dict[str, str]  # scalar properties in order: name -> numpy type code
     has_list: bool = False
 
     def dtype(self, order: str) -> np.dtype:
-        """Of one row, packed."""
+        """Packed structured dtype of one row in byte `order`."""
         return np.dtype([(name, order + code) for name, code in self.properties.items()])
 
 
 def read_vertices(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], list[str]]:
-    """Columns of the element `vertex` by property name, and the header's comments.
+    """Reads the columns of the element `vertex`, by property name, and the comments of the header.
 
     Raises:
-        InputError: the file cannot be read, is no PLY, or does not hold what its header says.
+        InputError: the file cannot be read, is not a PLY file, or is shorter than its header states.
     """
     path = Path(path)
     try:
@@ -69,7 +69,7 @@ def _split_header(path: Path, data: bytes) -> tuple[list[str], memoryview]:
     if end < 0 or newline < 0:
         raise InputError(
             f"{path}: header: wanted 'end_header' within {MAX_HEADER_BYTES} bytes, found none; the file is cut off "
-            "or no PLY."
+            "or not a PLY file."
         )
     return head[:end].decode("ascii", "replace").splitlines(), memoryview(data)[newline + 1 :]
 
@@ -99,7 +99,7 @@ def _parse_header(path: Path, lines: list[str]) -> tuple[str, list[Element], lis
 
 
 def _find_vertex(path: Path, elements: list[Element]) -> tuple[list[Element], Element]:
-    """The element `vertex` and those whose rows come before it."""
+    """The elements before `vertex`, and `vertex` itself."""
     names = [element.name for element in elements]
     if "vertex" not in names:
         raise InputError(

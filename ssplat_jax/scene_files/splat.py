@@ -1,9 +1,9 @@
-"""The .splat file of the first viewers for browsers: 32 bytes a Gaussian, in one color from every side.
+"""Writer of the .splat file of the first browser viewers: 32 bytes per Gaussian, without view-dependent color.
 
     x y z (float32) · scales (float32, standard deviations) · r g b opacity (uint8) · w x y z (uint8, 128 + 128 q)
 
-A viewer may stop reading early, so what covers most comes first: in order of volume times opacity. There is no header;
-whoever draws the file takes its frame as y down and dilates as 3DGS does.
+Rows are sorted by volume times opacity, largest first, because a viewer may draw the scene before it is loaded
+completely. There is no header: viewers assume that y points down and dilate as 3DGS does.
 """
 
 import os
@@ -18,10 +18,10 @@ ROW = np.dtype([("mean", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("q
 
 
 def save_splat(path: str | os.PathLike, gaussians: Gaussians) -> ExportReport:
-    """Writes `gaussians` to `path`, all or nothing; the same Gaussians give the same bytes.
+    """Writes `gaussians` to `path` atomically; the same Gaussians give the same bytes.
 
     Limits:
-        As `scene_rows`. Colors are cut to [0, 1]; SH bands above the constant are left out.
+        Those of `scene_rows`. Colors are clipped to [0, 1]; SH bands above the constant one are dropped.
 
     Raises:
         StorageError: the file cannot be written.

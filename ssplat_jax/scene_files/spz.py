@@ -1,12 +1,12 @@
-"""The .spz file (Niantic, version 3): a seventh of the .ply, for browsers and phones.
+"""Writer of the .spz file (Niantic, version 3), a seventh of the size of a .ply, for browsers and phones.
 
-Gzip around a header of 16 bytes and a field after the other, each for all Gaussians:
+A gzip stream of a 16-byte header and the fields one after the other, each for all Gaussians:
 
     positions (3 x 24 bits, fixed point) · opacities (8 bits) · colors (3 x 8) · ln scales (3 x 8, sixteenths)
     · quaternions (32: which entry is largest, then the others in 10 bits each) · f_rest (8 each, term by term)
 
-The format's axes are x right, y up, z backwards: half a turn about x from ours, which turns means and quaternions and
-changes signs of SH terms. Its sources: github.com/nianticlabs/spz.
+The axes of the format are x right, y up, z backward. They differ from ours by a rotation of 180 degrees about x, which
+applies to means and quaternions and flips the signs of some SH terms. Reference: github.com/nianticlabs/spz.
 """
 
 import gzip
@@ -22,22 +22,22 @@ from ssplat_jax.scene_files.export_rows import ExportReport, scene_rows, to_byte
 from ssplat_jax.storage.atomic import write_atomic
 
 MAGIC, VERSION = b"NGSP", 3
-ANTIALIASED = 1
+ANTIALIASED = 1  # flag: made for a renderer with the 2D Mip filter
 POSITION_BITS = 24
-COLOR_STEP = 0.15  # of f_dc: colors reach beyond [0, 1], where other terms bring them back
-HALF_TURN = np.array([1.0, -1.0, -1.0])  # about x
+COLOR_STEP = 0.15  # factor of f_dc; it leaves room for colors outside [0, 1], which other SH terms compensate
+HALF_TURN = np.array([1.0, -1.0, -1.0])  # rotation by 180 degrees about x
 SH_SIGNS = np.array([-1, -1, 1, *(-1, 1, 1, -1, 1), *(-1, 1, -1, -1, 1, -1, 1)], np.float64)
-"""Of the terms of bands 1 to 3 (y z x; xy yz zz xz xx-yy; ...) after y and z have changed theirs."""
+"""Sign of each SH term of bands 1 to 3 (y z x; xy yz zz xz xx-yy; ...) after y and z are negated."""
 
 
 def save_spz(path: str | os.PathLike, gaussians: Gaussians, *, antialiased: bool = True) -> ExportReport:
-    """Writes `gaussians` to `path`, all or nothing; the same Gaussians give the same bytes.
+    """Writes `gaussians` to `path` atomically; the same Gaussians give the same bytes.
 
-    `antialiased` says that the scene is meant for a renderer with the 2D Mip filter, as ours is.
+    `antialiased` marks the scene as made for a renderer with the 2D Mip filter, as ours is.
 
     Limits:
-        As `scene_rows`. Standard deviations are written in steps of 6 % and cut to [4.5e-5, 377] units, f_rest to
-        [-1, 1], f_dc to [-3.3, 3.3]. A position is a 2^-23 of the scene's reach from the origin, or less, off.
+        Those of `scene_rows`. Standard deviations are quantized in steps of 6 % and clipped to [4.5e-5, 377] units,
+        f_rest to [-1, 1], f_dc to [-3.3, 3.3]. The error of a position is at most 2^-23 of the largest coordinate.
 
     Raises:
         InputError: a Gaussian lies 2^23 units or farther from the origin.
@@ -63,7 +63,7 @@ def save_spz(path: str | os.PathLike, gaussians: Gaussians, *, antialiased: bool
 
 
 def _fixed_point(means: Float64[np.ndarray, "n 3"]) -> tuple[UInt8[np.ndarray, "n 3 3"], int]:
-    """Positions as signed integers, low byte first, and how many of their bits are fractional: as many as fit."""
+    """Returns positions as 24-bit integers, low byte first, and the number of their fractional bits: as many as fit."""
     limit = (1 << POSITION_BITS - 1) - 1
     reach = np.abs(means).max(initial=0.0)
     if reach > limit:
@@ -78,13 +78,15 @@ def _fixed_point(means: Float64[np.ndarray, "n 3"]) -> tuple[UInt8[np.ndarray, "
 
 
 def _smallest_three(quats: Float64[np.ndarray, "n 4"]) -> UInt32[np.ndarray, " n"]:
-    """Unit quaternions xyzw without their largest entry, which is made positive and follows from the others."""
+    """Packs unit quaternions xyzw into 32 bits; the largest entry is made positive and dropped, the others imply it."""
     rows = np.arange(len(quats))
     largest = np.abs(quats).argmax(axis=1)
     quats = quats * np.copysign(1.0, quats[rows, largest])[:, None]
     packed = largest.astype("<u4")
     for entry in range(4):
         sign = (quats[:, entry] < 0).astype("<u4")
-        size = np.round(511 * np.sqrt(2) * np.abs(quats[:, entry])).astype("<u4")  # the others reach 1 / sqrt 2
+        size = np.round(511 * np.sqrt(2) * np.abs(quats[:, entry])).astype(
+            "<u4"
+        )  # all but the largest are at most 1 / sqrt 2
         packed = np.where(entry == largest, packed, packed << 10 | sign << 9 | np.minimum(size, 511))
     return packed.astype("<u4")

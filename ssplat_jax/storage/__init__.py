@@ -1,1 +1,1 @@
-"""Files and folders: atomic writes, locks, JSON, npz, images, video, PyTorch files."""
+"""Files and folders: atomic writes, locks, JSON, npz, video, PyTorch checkpoints, run folders."""

@@ -1,4 +1,4 @@
-"""Files that are there completely or not at all."""
+"""Atomic file writes: a reader finds the complete old file or the complete new one."""
 
 import contextlib
 import os
@@ -8,20 +8,20 @@ from ssplat_jax.errors import StorageError
 
 
 def write_atomic(path: str | os.PathLike, data: bytes, *, keep_previous: bool = False) -> None:
-    """Puts `data` at `path`; whoever opens `path`, at any time, finds the old file or the new one.
+    """Writes `data` to `path` atomically: `path` always holds the old file or the complete new one.
 
-    The bytes go to `<name>.partial` in the same folder, to the disk, and then take the name in one step. A process
-    killed on the way leaves that file behind; the next write overwrites it.
+    The bytes are written to `<name>.partial` in the same folder, synced to the disk, and renamed. A process that is
+    killed during the write leaves the partial file behind; the next write overwrites it.
 
     Args:
-        path: where to; its folder is made.
-        data: the whole file.
-        keep_previous: what was at `path` stays as `previous_path(path)`. Between the two renames there is no `path`:
-            readers then look there.
+        path: the file to write; missing folders are created.
+        data: the contents of the file.
+        keep_previous: keep the old file at `previous_path(path)`. Between the two renames `path` does not exist, so
+            readers have to fall back on the previous file.
 
     Raises:
-        StorageError: the folder cannot be made or the file not written; what was at `path` is there as before (or,
-            if all that failed is making the new name durable, the whole new file).
+        StorageError: the folder cannot be created or the file cannot be written. `path` then holds the old file, or
+            the complete new file if only syncing the folder failed.
     """
     path = Path(path)
     partial = path.with_name(path.name + ".partial")
@@ -49,12 +49,12 @@ def write_atomic(path: str | os.PathLike, data: bytes, *, keep_previous: bool = 
 
 
 def previous_path(path: str | os.PathLike) -> Path:
-    """Where the file before the one at `path` is kept."""
+    """Path at which `write_atomic` keeps the previous version of `path`."""
     return Path(path).with_name(Path(path).name + ".previous")
 
 
 def _sync_directory(directory: Path) -> None:
-    """Makes the renames themselves durable."""
+    """Syncs a folder to the disk, so that renames in it survive a power failure."""
     descriptor = os.open(directory, os.O_RDONLY)
     try:
         os.fsync(descriptor)

@@ -1,4 +1,4 @@
-"""One process at a time in a folder that is written to over hours."""
+"""Exclusive lock on an output folder, so that two processes never write to the same one."""
 
 import contextlib
 import fcntl
@@ -11,15 +11,15 @@ from ssplat_jax.storage.folders import make_writable
 
 
 @contextlib.contextmanager
-def only_writer(folder: Path) -> Iterator[None]:
-    """Holds `folder`, which is made if absent, against other processes that ask for the same.
+def lock_folder(folder: Path) -> Iterator[None]:
+    """Holds an exclusive lock on `folder`, which is created if missing.
 
-    The system's lock on the folder itself: there is no file to be left behind, and it ends with its process, however
-    that ends. If nothing was written, a folder made here is taken away again.
+    The lock is the operating system's (`flock`) on the folder itself: it needs no lock file, and it ends with the
+    process even if that is killed. A folder that was created here and is still empty at the end is removed.
 
     Raises:
-        InputError: another process holds it.
-        StorageError: the folder cannot be made or written to, or its file system has no locks.
+        InputError: another process holds the lock.
+        StorageError: the folder cannot be created or written to, or its file system does not support locks.
     """
     is_new = not folder.exists()
     make_writable(folder)
@@ -41,6 +41,6 @@ def only_writer(folder: Path) -> Iterator[None]:
         yield
     finally:
         if is_new:
-            with contextlib.suppress(OSError):  # not empty: the usual case
+            with contextlib.suppress(OSError):  # the folder is usually not empty
                 folder.rmdir()
-        os.close(descriptor)  # last: until then it is ours
+        os.close(descriptor)  # releases the lock, so it comes last

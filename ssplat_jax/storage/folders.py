@@ -1,4 +1,4 @@
-"""Folders that results go to: found unwritable before the long part, and cleared of our own files only."""
+"""Output folders: a check that they are writable, and removal of numbered files from an earlier run."""
 
 import contextlib
 import tempfile
@@ -8,10 +8,10 @@ from ssplat_jax.errors import StorageError
 
 
 def make_writable(folder: Path) -> None:
-    """Makes `folder` if it is absent, and tries whether files can be made in it.
+    """Creates `folder` if it is missing and checks that files can be created in it.
 
     Raises:
-        StorageError: they cannot.
+        StorageError: the folder cannot be created or written to.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -22,17 +22,21 @@ def make_writable(folder: Path) -> None:
 
 
 def remove_numbered(folder: Path, name: str) -> None:
-    """Removes the files of `folder` called `name` with digits for its `#`, and the folder if nothing else is in it.
+    """Removes numbered files from `folder`, and the folder itself if it is empty afterwards.
 
-    A user's own files may stand beside them.
+    Other files in the folder, such as the user's own, are kept.
+
+    Args:
+        folder: the folder to clear; it may be missing.
+        name: file name in which each `#` stands for one digit, such as `#####.png`.
 
     Raises:
-        StorageError: one cannot be removed.
+        StorageError: a file cannot be removed.
     """
     try:
         for path in folder.glob(name.replace("#", "[0-9]")):
             path.unlink()
     except OSError as error:
         raise StorageError(f"{folder}: cannot be cleared ({error.strerror or error}); choose another place.") from error
-    with contextlib.suppress(OSError):  # absent, or not empty
+    with contextlib.suppress(OSError):  # missing, or not empty
         folder.rmdir()

@@ -1,13 +1,15 @@
-"""Ctrl-C and SIGTERM as a request: finish what is under way, save, leave. A second one has its usual effect."""
+"""Graceful interruption: the first Ctrl-C or SIGTERM is recorded, a second one has its usual effect."""
 
 import signal
 import threading
 
 
 class Interrupts:
-    """Context in which `received` holds the number of the first SIGINT or SIGTERM, or None.
+    """Context manager that records the first SIGINT or SIGTERM, so that the caller can save its state and exit.
 
-    Outside the main thread, where Python takes no handlers, it only ever holds None.
+    Attributes:
+        received: number of the signal, or None. Always None outside the main thread, where Python does not allow
+            signal handlers.
     """
 
     def __init__(self) -> None:
@@ -17,10 +19,10 @@ class Interrupts:
     def __enter__(self) -> "Interrupts":
         if threading.current_thread() is threading.main_thread():
             for number in (signal.SIGINT, signal.SIGTERM):
-                self._previous[number] = signal.signal(number, self._note)
+                self._previous[number] = signal.signal(number, self._record)
         return self
 
-    def _note(self, number, frame) -> None:
+    def _record(self, number, frame) -> None:
         self.received = number
         signal.signal(number, self._previous[number])
 

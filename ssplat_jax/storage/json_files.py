@@ -1,4 +1,4 @@
-"""What the program says about itself, as JSON that every reader takes: a number that is not finite is null."""
+"""Strict JSON output: NaN and infinity, which JSON does not have, are written as null."""
 
 import json
 import math
@@ -9,15 +9,15 @@ from ssplat_jax.storage.atomic import write_atomic
 
 
 def json_text(value: Any, indent: int | None = 1) -> str:
-    """`value` as JSON; NaN and infinities, which JSON does not have, as null."""
+    """Returns `value` as JSON text; NaN and infinities become null."""
     return json.dumps(_finite(value), indent=indent, allow_nan=False)
 
 
 def write_json(path: str | os.PathLike, value: Any) -> None:
-    """Puts `value` at `path` as indented JSON, whole or not at all.
+    """Writes `value` to `path` as indented JSON, atomically.
 
     Raises:
-        StorageError: see `write_atomic`.
+        StorageError: the file cannot be written.
     """
     write_atomic(path, (json_text(value) + "\n").encode())
 

@@ -1,10 +1,10 @@
-"""Named arrays in one `.npz`, no pickle, that is either read back exactly or refused.
+"""Checksummed `.npz` files of named arrays without pickles: read back bit for bit, or refused.
 
-    header          JSON bytes: schema, kind, dtype and sha256 of every array, and the caller's own facts
-    <name>          the arrays; bfloat16, which `.npy` has no name for, as its 16 bits
-    archive comment sha256 of every byte before it, so that no bit of the file can change unnoticed
+    header          JSON bytes: schema, kind, dtype and sha256 of each array, and the caller's own header
+    <name>          one array each; bfloat16, which `.npy` has no name for, is stored as uint16
+    archive comment sha256 of all bytes before it, which detects any change of the file
 
-`numpy.load` reads the file as it is.
+`numpy.load` reads such a file.
 """
 
 import hashlib
@@ -20,15 +20,22 @@ import numpy as np
 from ssplat_jax.errors import StorageError
 from ssplat_jax.storage.atomic import write_atomic
 
-SCHEMA = 2
-_HEADER = "header"
-_DIGEST_LENGTH = 64  # hex digits
+SCHEMA = 2  # version of the layout above
+_HEADER = "header"  # name of the JSON member
+_DIGEST_LENGTH = 64  # hex digits of a sha256
 
 
 def save_arrays(
     path: Path, arrays: dict[str, np.ndarray], kind: str, header: dict[str, Any], *, keep_previous: bool = False
 ) -> None:
-    """Writes `arrays` and the JSON-able `header`; `path` holds the old file or the whole new one, never a part.
+    """Writes named arrays and a header to one file, atomically.
+
+    Args:
+        path: the file to write.
+        arrays: arrays by name.
+        kind: the kind of file, with its version ("stream state 3"); `load_arrays` refuses other kinds.
+        header: any JSON-serializable facts.
+        keep_previous: keep the old file at `previous_path(path)`.
 
     Raises:
         StorageError: the folder cannot be written or the disk is full.
@@ -44,10 +51,10 @@ def save_arrays(
 
 
 def load_arrays(path: Path, kind: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """(arrays, header) of a file that `save_arrays` wrote.
+    """Reads (arrays, header) from a file that `save_arrays` wrote.
 
     Raises:
-        StorageError: no such file, another kind, or one that is not, bit for bit, what was written.
+        StorageError: the file is missing, of another kind, or damaged.
     """
     try:
         contents = Path(path).read_bytes()
@@ -57,10 +64,12 @@ def load_arrays(path: Path, kind: str) -> tuple[dict[str, np.ndarray], dict[str,
         arrays, facts = _parse(contents)
     # A damaged archive surfaces as almost anything: zlib, struct, UTF-8, JSON or key errors.
     except (ValueError, KeyError, TypeError, OSError, EOFError, zipfile.BadZipFile) as error:
-        raise StorageError(f"{path}: the file is corrupt ({error}); take it from a backup or make it anew.") from error
+        raise StorageError(
+            f"{path}: the file is corrupt ({error}); restore it from a backup or create it again."
+        ) from error
     if facts["kind"] != kind:
         raise StorageError(
-            f"{path}: wanted a file of {kind}, got one of {facts['kind']}; one of another version has to be made anew."
+            f"{path}: wanted a file of {kind}, got one of {facts['kind']}; create a file of another version again."
         )
     return arrays, facts["header"]
 

@@ -1,4 +1,4 @@
-"""Films as H.264 in .mp4, which every browser and player shows, by PyAV (extra `video`)."""
+"""H.264 video in .mp4 files, which all browsers and players support, encoded with PyAV (extra `video`)."""
 
 import io
 import os
@@ -11,13 +11,13 @@ from jaxtyping import UInt8
 from ssplat_jax.errors import InputError
 from ssplat_jax.storage.atomic import write_atomic
 
-PICTURES_PER_SECOND = 24
-BT709 = 1  # the colors that players expect where nothing is said, which is said all the same
-QUALITY = "18"  # x264's constant rate factor: no difference from the pictures to be seen
+FRAMES_PER_SECOND = 24
+BT709 = 1  # color space; players assume it when a file names none, and ours names it
+QUALITY = "18"  # x264's constant rate factor: visually lossless
 
 
-class Film:
-    """Pictures of one size, encoded as they come; a file once it is saved.
+class VideoWriter:
+    """Encoder of a video of fixed size: frames are encoded as they are added, and `save` writes the file.
 
     Raises:
         InputError: PyAV is not installed.
@@ -27,22 +27,22 @@ class Film:
         av = _av()
         self._encoded, self._frame_of = io.BytesIO(), av.VideoFrame.from_ndarray
         self._container: Any = av.open(self._encoded, "w", format="mp4")
-        self._stream = self._container.add_stream("libx264", Fraction(PICTURES_PER_SECOND), options={"crf": QUALITY})
-        # Colors are stored for two pixels by two: of odd sides the last pixel is left out.
+        self._stream = self._container.add_stream("libx264", Fraction(FRAMES_PER_SECOND), options={"crf": QUALITY})
+        # Chroma is stored per 2x2 pixels, so the last pixel of an odd side is cropped.
         self._stream.width, self._stream.height = width // 2 * 2, height // 2 * 2
         self._stream.pix_fmt = "yuv420p"
         self._stream.codec_context.colorspace = BT709
         self._stream.codec_context.color_primaries = BT709
         self._stream.codec_context.color_trc = BT709
 
-    def add(self, picture: UInt8[np.ndarray, "h w 3"]) -> None:
-        """The next picture."""
-        picture = np.ascontiguousarray(picture[: self._stream.height, : self._stream.width])
-        frame = self._frame_of(picture, format="rgb24").reformat(format="yuv420p", dst_colorspace="ITU709")
+    def add(self, image: UInt8[np.ndarray, "h w 3"]) -> None:
+        """Appends one RGB frame."""
+        image = np.ascontiguousarray(image[: self._stream.height, : self._stream.width])
+        frame = self._frame_of(image, format="rgb24").reformat(format="yuv420p", dst_colorspace="ITU709")
         self._container.mux(self._stream.encode(frame))
 
     def save(self, path: str | os.PathLike) -> None:
-        """Ends the film and writes it, all or nothing.
+        """Finishes the video and writes it to `path` atomically.
 
         Raises:
             StorageError: the file cannot be written.
@@ -56,5 +56,7 @@ def _av() -> Any:
     try:
         import av
     except ImportError as error:
-        raise InputError('film: wanted the package av; run: pip install "ssplat-jax[video]"') from error
+        raise InputError(
+            'video: wanted the package av, which is not installed; run: pip install "ssplat-jax[video]"'
+        ) from error
     return av

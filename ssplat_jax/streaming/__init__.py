@@ -1,1 +1,1 @@
-"""The step, and what feeds it chunk by chunk."""
+"""The streaming step, sessions around it, and the scene changes that it causes."""

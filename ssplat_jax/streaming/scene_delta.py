@@ -1,13 +1,13 @@
-"""Following a growing scene: after each chunk only the Gaussians that changed, for a viewer or a file.
+"""Scene deltas: the Gaussians that changed since the last update, for a viewer or a file.
 
     feed = SceneFeed(model, params)
     for chunk in chunks:
         cache, _ = step(params, cache, chunk)
-        delta = feed.update(cache)          # the rows that changed and their Gaussians: only those are decoded
+        delta = feed.update(cache)          # decodes only the rows that changed
         scene = apply_delta(scene, delta)   # equals model.decode(params, cache)
 
-A voxel's Gaussians change when a token is written to it, which the cache remembers per pivot (`last_chunks`), or when
-views carve a pivot away or bring it back, which the feed sees by comparing what is shown with what was.
+A voxel's Gaussians change when a token is written to it, which the cache records per pivot (`last_chunks`), or when
+views carve a pivot away or restore it, which the feed detects by comparing the shown pivots with the previous ones.
 """
 
 import dataclasses
@@ -18,29 +18,30 @@ import numpy as np
 from jaxtyping import Int32
 
 from ssplat_jax.cache import VoxelCache
-from ssplat_jax.cache.state import require_one
+from ssplat_jax.cache.state import require_single_cache
 from ssplat_jax.gaussians import Gaussians, mask_gaussians
 from ssplat_jax.streaming.streamsplat import StreamSplat, shown_pivots
 
-FEWEST_ROWS = 256  # numbers of rows are rounded up to powers of two from here on, so that few programs are compiled
+MIN_DECODED_ROWS = 256
+"""Decoded rows are padded to a power of two of at least this number, so that few programs are compiled."""
 
 
 @dataclasses.dataclass(frozen=True)
 class SceneDelta:
-    """The voxels that changed, and what they hold now, absent Gaussians (opacity 0) among it."""
+    """The voxels that changed and all their Gaussians now, including absent ones (opacity 0)."""
 
     rows: Int32[np.ndarray, " r"]  # ascending
     gaussians: Gaussians  # [r * k], in the order of `rows`; k = pivots_per_voxel * gaussians_per_token
-    capacity: int  # of the cache: the scene has capacity * k Gaussians
+    capacity: int  # capacity of the cache: the scene has capacity * k Gaussians
 
 
 class SceneFeed:
-    """What a follower of one stream has been told. Call `update` after as many chunks as you like.
+    """The source of deltas of one stream. Call `update` after any number of chunks.
 
     Args:
-        model: the stream's.
-        params: its parameters.
-        known: a cache that the follower has already; by default it knows nothing.
+        model: the stream's model.
+        params: the model's parameters.
+        known: the cache of the scene that the receiver already has; by default it has none.
     """
 
     def __init__(self, model: StreamSplat, params: dict, known: VoxelCache | None = None) -> None:
@@ -55,18 +56,18 @@ class SceneFeed:
         """The changes since the last call.
 
         Raises:
-            InputError: `cache` is several, of streams or shards.
+            InputError: `cache` holds several caches, of streams or shards.
         """
-        require_one(cache, "SceneFeed.update")
+        require_single_cache(cache, "SceneFeed.update")
         rows = self._changed_rows(cache)
-        num_padded = max(FEWEST_ROWS, 1 << max(len(rows) - 1, 0).bit_length())
+        num_padded = max(MIN_DECODED_ROWS, 1 << max(len(rows) - 1, 0).bit_length())
         padded = np.pad(rows, (0, num_padded - len(rows)), constant_values=-1)
         gaussians = self._decode_rows(self._params, cache, jnp.asarray(padded))
         num_gaussians = gaussians.num_gaussians // num_padded * len(rows)
         return SceneDelta(rows, jax.tree.map(lambda x: x[:num_gaussians], gaussians), cache.capacity)
 
     def _changed_rows(self, cache: VoxelCache) -> Int32[np.ndarray, " r"]:
-        """Rows written or carved since the last call; remembers that they are told."""
+        """Rows written, carved or restored since the last call; updates the feed's record."""
         shown = np.asarray(self._shown_pivots(cache))
         known = np.pad(self._shown, [(0, cache.capacity - len(self._shown)), (0, 0)])  # the cache may have grown
         is_written = np.asarray(cache.alive) & (np.asarray(cache.last_chunks) >= self._next_chunk)
@@ -75,7 +76,10 @@ class SceneFeed:
 
 
 def apply_delta(scene: Gaussians | None, delta: SceneDelta) -> Gaussians:
-    """`scene` (None: nothing yet) with the changes: what `decode` gives, row for row, once a delta has had rows."""
+    """`scene` with the changes of `delta`: row for row what `decode` gives, once a delta was not empty.
+
+    `scene` is None before the first delta.
+    """
     num_rows = len(delta.rows)
     k = delta.gaussians.num_gaussians // num_rows if num_rows else 1
     places = (delta.rows[:, None] * k + np.arange(k)).reshape(-1)
@@ -87,7 +91,7 @@ def apply_delta(scene: Gaussians | None, delta: SceneDelta) -> Gaussians:
 
 
 def _absent(like: Gaussians, num_rows: int) -> Gaussians:
-    """`num_rows` Gaussians that are not there, as `decode` writes them."""
+    """`num_rows` absent Gaussians (opacity 0), as `decode` writes them."""
     empty = jax.tree.map(lambda x: jnp.zeros((num_rows, *x.shape[1:]), x.dtype), like)
     return jax.tree.map(np.asarray, mask_gaussians(empty, jnp.zeros((num_rows,), bool)))
 

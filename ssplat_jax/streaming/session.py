@@ -1,11 +1,12 @@
-"""`Session`: a stream on the host. It holds the cache, makes room, compiles once per shape, and counts."""
+"""`Session`: one stream on the host. It holds and grows the cache and compiles the step once per shape."""
 
+import dataclasses
 import time
 
 import jax
 import jax.numpy as jnp
 
-from ssplat_jax.cache import VoxelCache, check_cache, ensure_room
+from ssplat_jax.cache import VoxelCache, check_cache, ensure_capacity
 from ssplat_jax.cache.state import init_cache
 from ssplat_jax.chunk import Chunk
 from ssplat_jax.config import StreamConfig
@@ -13,20 +14,20 @@ from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.model import GRID_STRIDE
 from ssplat_jax.streaming.streamsplat import ChunkOutput, StreamSplat, shown_pivots
 
-ROOM_AT_START = 4
-"""A new cache holds this many chunks of tokens that all open voxels of their own: few captures make it grow."""
+INITIAL_CHUNKS = 4
+"""A new cache has capacity for this many chunks in which every token opens a voxel: few captures make it grow."""
 
-FEWEST_DECODED = 1 << 15
-"""Pivots that are decoded at least: below, a growing scene would compile more than it saves."""
+MIN_DECODED_PIVOTS = 1 << 15
+"""Lower limit of the pivots decoded at once: with fewer, compiling for a growing scene costs more than it saves."""
 
 
 class Session:
     """One stream of one image size.
 
     Args:
-        model: what to run.
-        params: its parameters.
-        cache: continue from this one; by default an empty cache with room for some chunks.
+        model: the model to run.
+        params: the model's parameters.
+        cache: the cache to continue from; by default an empty one with capacity for a few chunks.
     """
 
     def __init__(self, model: StreamSplat, params: dict, cache: VoxelCache | None = None) -> None:
@@ -39,35 +40,35 @@ class Session:
         self._last_program: jax.stages.Compiled | None = None
 
     def feed(self, chunk: Chunk) -> ChunkOutput:
-        """Streams one chunk into the cache; returns when it is done.
+        """Streams one chunk into the cache and waits until it is done.
 
         Raises:
-            CacheError: tokens were lost although the overflow policy promises to keep them.
+            CacheError: tokens were dropped although the overflow policy forbids it.
         """
         config, num_tokens = self.model.config, tokens_per_chunk(chunk, self.model.config.network.size_multiple)
         if self.cache is None:
             self.cache = init_cache(config, starting_capacity(config, num_tokens))
-        self.cache = ensure_room(self.cache, config, num_tokens)
+        self.cache = ensure_capacity(self.cache, config, num_tokens)
         step = self._program(chunk)
         self.cache, out = jax.block_until_ready(step(self.params, self.cache, chunk))
         check_cache(self.cache, config)
         return out
 
     def gaussians(self) -> Gaussians:
-        """The scene so far, in the stream frame: what `model.decode` shows; rows of opacity 0, all last, are absent.
+        """The scene so far, in the stream frame: the Gaussians of `model.decode`, then padding rows of opacity 0.
 
-        A cache has room for many more pivots than it holds, and decoding and rendering cost what their rows cost. The
-        number of pivots decoded is a power of two, so that few programs are compiled.
+        Only shown pivots are decoded, because a cache has capacity for many more than it holds. Their number is rounded
+        up to a power of two, so that few programs are compiled.
         """
         if self.cache is None:
             self.cache = self.model.init_cache()
         num_shown = int(self._count_shown(self.cache))
-        num_pivots = min(max(FEWEST_DECODED, 1 << max(num_shown - 1, 0).bit_length()), self.cache.alive.size)
+        num_pivots = min(max(MIN_DECODED_PIVOTS, 1 << max(num_shown - 1, 0).bit_length()), self.cache.alive.size)
         return self._decode_shown(self.params, self.cache, num_pivots)
 
     @property
     def step_memory_bytes(self) -> int | None:
-        """What the compiled step needs, arguments, results and temporaries together, by XLA's own analysis."""
+        """Memory of the compiled step, by XLA's analysis: arguments, results and temporaries; None if unknown."""
         if self._last_program is None or (memory := self._last_program.memory_analysis()) is None:
             return None
         return (
@@ -77,7 +78,23 @@ class Session:
             - memory.alias_size_in_bytes
         )
 
+    def cache_facts(self) -> dict[str, int | float]:
+        """Occupancy and counters of the cache; `decoded` is the number of Gaussians that are shown."""
+        cache, config = self.cache, self.model.config
+        assert cache is not None
+        stats = {field.name: int(getattr(cache.stats, field.name)) for field in dataclasses.fields(cache.stats)}
+        return {
+            "voxels": int(cache.num_voxels),
+            "pivots": int(cache.counts.sum()),
+            "decoded": config.head.gaussians_per_token * int(shown_pivots(cache, config).sum()),
+            "capacity": cache.capacity,
+            "overflow": stats["num_dropped"],
+            "accepted_fraction": round(stats["num_accepted"] / max(stats["num_seen"], 1), 4),
+            **stats,
+        }
+
     def _program(self, chunk: Chunk) -> jax.stages.Compiled:
+        """The compiled step for the shapes of `chunk` and the cache."""
         assert self.cache is not None
         key = (self.cache.capacity, chunk.images.shape)
         if key not in self._programs:
@@ -91,14 +108,14 @@ class Session:
 
 
 def tokens_per_chunk(chunk: Chunk, size_multiple: int) -> int:
-    """Tokens of one chunk, those of the padding included."""
+    """Number of tokens of one chunk, including those in the padding of its images."""
     v, height, width, _ = chunk.images.shape
     padded = (height + -height % size_multiple) * (width + -width % size_multiple)
     return v * padded // GRID_STRIDE**2
 
 
 def starting_capacity(config: StreamConfig, num_tokens: int) -> int:
-    """The configured capacity; if it may grow, at least the power of two that holds the first chunks in any case."""
+    """Capacity of a new cache: the configured one; under `grow` raised to a power of two that fits the first chunks."""
     if config.memory.overflow != "grow":
         return config.memory.capacity
-    return max(config.memory.capacity, 1 << (ROOM_AT_START * num_tokens - 1).bit_length())
+    return max(config.memory.capacity, 1 << (INITIAL_CHUNKS * num_tokens - 1).bit_length())

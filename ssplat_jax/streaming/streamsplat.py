@@ -1,4 +1,4 @@
-"""`StreamSplat`: the model as pure functions of parameters and cache. `step` is a `lax.scan` body.
+"""`StreamSplat`: the model as pure functions of parameters and cache. `step` has the signature of a `lax.scan` body.
 
 chunk (4 images + cameras)          cache H_{t-1}
   │                                   │ project
@@ -23,13 +23,13 @@ from ssplat_jax.cache import (
     PIVOT_FIELDS,
     Tokens,
     VoxelCache,
-    bear_witness,
     carve,
-    coarser,
+    coarsen,
     fuse,
     init_cache,
     judge,
     project,
+    store_witness,
 )
 from ssplat_jax.chunk import Chunk
 from ssplat_jax.config import StreamConfig
@@ -38,25 +38,26 @@ from ssplat_jax.geometry.rotations import matrices_to_quats
 from ssplat_jax.model.types import TokenShapes, Views
 from ssplat_jax.pytree import pytree, replace
 
-COVER = 1.2  # pivots gather in the middle of their voxel: covering it edge to edge takes more than equal shares
+VOXEL_COVERAGE = 1.2
+"""Share of a voxel's face that its pivots cover together: above 1, because pivots gather in the middle of the voxel."""
 
 
 @pytree
 class ChunkOutput:
-    """What one step reports about its chunk, on the 1/4 grid of the padded image."""
+    """Summary of one step, on the 1/4 grid of the padded images."""
 
-    depths: Float[Array, "*t v hf wf"]  # stream units
+    depths: Float[Array, "*t v hf wf"]  # camera z, stream units
     confidences: Float[Array, "*t v hf wf"]  # omega of VACC; 0 outside the image and in padded views
     history: Float[Array, "*t v hf wf"]  # Omega_H of the cache before this chunk; 0 in its holes
-    exposures: Float[Array, "*t v 3"]  # what takes the scene's colors to those of each view; 1 without `match_exposure`
+    exposures: Float[Array, "*t v 3"]  # factors from the scene's colors to each view's; 1 without `match_exposure`
 
 
 @pytree
 class Prediction:
-    """Everything the network computed for a chunk; the training losses look inside, `step` keeps the summary."""
+    """All results of the network for one chunk. Training losses use all of them; `step` returns only `output`."""
 
     tokens: Tokens
-    logits: Float[Array, "v hf wf d"]  # of P_i
+    logits: Float[Array, "v hf wf d"]  # logits of P_i
     log_depths: Float[Array, "v hf wf"]  # expectation under P^v
     views: Views
     output: ChunkOutput
@@ -64,7 +65,7 @@ class Prediction:
 
 @dataclasses.dataclass(frozen=True)
 class StreamSplat:
-    """The model for one configuration. Holds no arrays: parameters and cache are arguments and results.
+    """The model for one configuration. It holds no arrays: parameters and cache are arguments and results.
 
     Example:
         >>> model = StreamSplat(ss.preset("tiny"))
@@ -77,10 +78,10 @@ class StreamSplat:
 
     config: StreamConfig
     axis: str | None = None
-    """Name of the mapped axis over which the cache is sharded by voxel (`parallel.py`); None: one cache holds all."""
+    """Name of the mapped axis over which the cache is sharded by voxel (`sharded.py`); None for a single cache."""
 
     def init(self, key: jax.Array) -> dict:
-        """Fresh parameters (a nested dict); `ssplat_jax.load_params` gives trained ones."""
+        """Untrained parameters, a nested dict; `ssplat_jax.load_params` loads trained ones."""
         return stages.init_params(key, self.config)
 
     def init_cache(self) -> VoxelCache:
@@ -88,7 +89,7 @@ class StreamSplat:
         return init_cache(self.config)
 
     def predict(self, params: dict, cache: VoxelCache, chunk: Chunk) -> Prediction:
-        """Tokens of a chunk, given what the cache remembers (Eqs. 2-9). The cache is read as a constant."""
+        """Tokens of a chunk, given the cache of the chunks before it (Eqs. 2-9); no gradient flows to the cache."""
         config, network = self.config, stages.network_of(self.config)
         views = stages.prepare_views(chunk, config)
         factor = config.network.match_stride // stages.GRID_STRIDE
@@ -97,51 +98,36 @@ class StreamSplat:
         with jax.named_scope("encode"):
             features = network.encode(params["encoder"], views, config)
         with jax.named_scope("match"):
-            belief = network.match(params["cost_volume"], features, views, config)
+            distribution = network.match(params["cost_volume"], features, views, config)
         with jax.named_scope("HPDA"):
-            depth = stages.anchor_depth(params["hpda"], belief, coarser(history, factor), views, config)
+            depth = stages.anchor_depth(params["hpda"], distribution, coarsen(history, factor), views, config)
         with jax.named_scope("refine"):
             depth = network.refine_depth(params.get("upsampler"), features, depth, views, config)
         with jax.named_scope("tokens"):
             positions, footprints = stages.back_project(depth.log_depths, views)
-            feats = network.regress_tokens(params["tokens"], features, belief, depth, views, config)
+            feats = network.regress_tokens(params["tokens"], features, distribution, depth, views, config)
         with jax.named_scope("CGFI"):
-            feats = stages.inject_features(
-                params["cgfi"],
-                feats,
-                history,
-                depth.anchored_confidences,
-                views,
-                config,
-                bound_history=network.bound_history,
-            )
+            omega, bound = depth.anchored_confidences, network.bound_history
+            feats = stages.inject_features(params["cgfi"], feats, history, omega, views, config, bound_history=bound)
         with jax.named_scope("mixer"):
             feats = network.mix_tokens(params["mixer"], feats, positions, views.inside, views.valid, config)
         confidences = jnp.where(views.inside, depth.matcher_confidences, 0.0)
         with jax.named_scope("exposure"):
             exposures = stages.estimate_exposures(history, depth.log_depths, confidences, views, config)
-        return Prediction(
-            tokens=_flatten_tokens(positions, feats, confidences, footprints, exposures, views, config),
-            logits=stages.repeat_cells(belief.logits, factor),
-            log_depths=depth.log_depths,
-            views=views,
-            output=ChunkOutput(
-                depths=jnp.exp(depth.log_depths),
-                confidences=confidences,
-                history=history.confidences,
-                exposures=exposures,
-            ),
-        )
+        tokens = _flatten_tokens(positions, feats, confidences, footprints, exposures, views, config)
+        logits = stages.repeat_cells(distribution.logits, factor)
+        output = ChunkOutput(jnp.exp(depth.log_depths), confidences, history.confidences, exposures)
+        return Prediction(tokens, logits, depth.log_depths, views, output)
 
     def step(self, params: dict, cache: VoxelCache, chunk: Chunk) -> tuple[VoxelCache, ChunkOutput]:
-        """One chunk: predict its tokens, fuse them into the cache (VACC), carve. Carry first, in and out."""
+        """One chunk: predicts its tokens and updates the cache. The cache comes first, as the carry of a scan."""
         prediction = self.predict(params, cache, chunk)
-        return self.remember(cache, prediction), prediction.output
+        return self.update_cache(cache, prediction), prediction.output
 
-    def remember(self, cache: VoxelCache, prediction: Prediction) -> VoxelCache:
-        """The cache after a chunk: its tokens judged and fused in, all pivots carved. Constants throughout.
+    def update_cache(self, cache: VoxelCache, prediction: Prediction) -> VoxelCache:
+        """The cache after a chunk: tokens are judged and fused (VACC), then all pivots carved. No gradient flows.
 
-        The new pivots are carved too: views of a chunk that disagree judge each other's tokens at once.
+        Carving includes the new pivots, so views of one chunk that disagree lower each other's confidences at once.
         """
         prediction = jax.lax.stop_gradient(prediction)
         seen = (prediction.views.grid_camera, prediction.output.depths, prediction.output.confidences)
@@ -151,24 +137,24 @@ class StreamSplat:
             cache = fuse(cache, tokens, self.config, axis=self.axis)
         with jax.named_scope("carve"):
             cache = carve(cache, *seen, self.config)
-            return bear_witness(cache, *seen, self.config)
+            return store_witness(cache, *seen, self.config)
 
     def run(self, params: dict, cache: VoxelCache, chunks: Chunk) -> tuple[VoxelCache, ChunkOutput]:
-        """`step` over stacked chunks (leading axis t) as one `lax.scan`."""
+        """Runs `step` over stacked chunks (leading axis t) as one `lax.scan`."""
         return jax.lax.scan(functools.partial(self.step, params), cache, chunks)
 
     def decode(self, params: dict, cache: VoxelCache) -> Gaussians:
-        """The scene so far, in the stream frame: `gaussians_per_token` Gaussians of each pivot, pivot by pivot.
+        """The scene so far, in the stream frame: `gaussians_per_token` Gaussians for each pivot, pivot by pivot.
 
-        Those of dead and carved pivots have opacity 0.
+        Gaussians of dead and carved pivots have opacity 0.
         """
         return self._decode_pivots(params, cache, shown_pivots(cache, self.config).reshape(-1), lambda x: x)
 
     def decode_shown(self, params: dict, cache: VoxelCache, num_pivots: int) -> Gaussians:
-        """The Gaussians that `decode` shows, in their order, and nothing between them, at the cost of `num_pivots`.
+        """The Gaussians that `decode` shows, in the same order but without gaps, at the cost of `num_pivots`.
 
         Limits:
-            Of fewer shown pivots, the last rows are absent; of more, those beyond are left out.
+            If fewer pivots are shown, the last rows have opacity 0; if more are shown, the last of them are omitted.
         """
         is_shown = shown_pivots(cache, self.config).reshape(-1)
         places = jnp.nonzero(is_shown, size=num_pivots, fill_value=is_shown.size)[0]
@@ -178,7 +164,7 @@ class StreamSplat:
     def _decode_pivots(
         self, params: dict, cache: VoxelCache, is_shown: Bool[Array, " m"], take: Callable[[Array], Array]
     ) -> Gaussians:
-        """Gaussians of the pivots that `take` takes of all."""
+        """Gaussians of the pivots that `take` selects from a flat array of all pivots."""
         flat = lambda x: take(x.reshape(-1, *x.shape[2:]))  # noqa: E731
         gaussians = stages.decode_tokens(
             self._read_shapes(params, flat(cache.feats)),
@@ -189,15 +175,15 @@ class StreamSplat:
             num_members=flat(cache.num_members),
             config=self.config,
         )
-        return mask_gaussians(gaussians, self.each_gaussian(is_shown))
+        return mask_gaussians(gaussians, self.repeat_per_gaussian(is_shown))
 
     def decode_rows(self, params: dict, cache: VoxelCache, rows: Int[Array, " r"]) -> Gaussians:
-        """What `decode` gives for the voxels `rows`, k pivots each, at the cost of those; rows of -1 are absent."""
+        """Gaussians that `decode` gives for the voxels `rows`, k pivots each; rows of -1 have opacity 0."""
         part = {name: getattr(cache, name)[rows] for name in ("voxels", *PIVOT_FIELDS)}
         return self.decode(params, replace(cache, counts=jnp.where(rows >= 0, cache.counts[rows], 0), **part))
 
     def decode_tokens(self, params: dict, tokens: Tokens) -> Gaussians:
-        """Gaussians of tokens that need not be in a cache: what training renders (Sec. 3.7)."""
+        """Gaussians of tokens that are not in a cache, as training renders them (Sec. 3.7)."""
         gaussians = stages.decode_tokens(
             self._read_shapes(params, tokens.feats),
             means=tokens.means,
@@ -206,34 +192,34 @@ class StreamSplat:
             footprints=tokens.footprints,
             config=self.config,
         )
-        return mask_gaussians(gaussians, self.each_gaussian(tokens.valid))
+        return mask_gaussians(gaussians, self.repeat_per_gaussian(tokens.valid))
 
     def _read_shapes(self, params: dict, feats: Float[Array, "m c"]) -> TokenShapes:
         return stages.network_of(self.config).read_shapes(params["decoder"], feats, self.config)
 
-    def each_gaussian(self, of_tokens: Bool[Array, " m"]) -> Bool[Array, " n"]:
-        """For every Gaussian, what is said of its token or pivot."""
-        return jnp.repeat(of_tokens, self.config.head.gaussians_per_token)
+    def repeat_per_gaussian(self, mask: Bool[Array, " m"]) -> Bool[Array, " n"]:
+        """A mask of tokens or pivots as a mask of their Gaussians."""
+        return jnp.repeat(mask, self.config.head.gaussians_per_token)
 
 
 def shown_pivots(cache: VoxelCache, config: StreamConfig) -> Bool[Array, "capacity k"]:
-    """Which pivots `decode` shows: those alive that views have not carved away."""
+    """Mask of the pivots that `decode` shows: alive and not carved away."""
     return cache.alive & (cache.confidences >= config.memory.min_confidence)
 
 
 def merged_footprints(cache: VoxelCache, config: StreamConfig) -> Float[Array, "capacity k"]:
-    """Footprints of pivots, grown with their members up to what K pivots need to cover a voxel's face.
+    """Footprints of pivots, grown with the number of members until K pivots cover a voxel's face.
 
-    A pivot keeps the footprint of its best member. Where cells are finer than that share, many merge into K pivots, and
-    K single footprints would leave cracks between them.
+    A pivot stores the footprint of its best member. Where grid cells are much finer than voxels, many tokens merge into
+    K pivots, whose stored footprints would leave cracks between them.
     """
-    share = COVER * config.memory.voxel_size / math.sqrt(config.memory.pivots_per_voxel)
+    share = VOXEL_COVERAGE * config.memory.voxel_size / math.sqrt(config.memory.pivots_per_voxel)
     grown = cache.footprints * jnp.sqrt(cache.num_members.astype(jnp.float32))
     return jnp.minimum(grown, jnp.maximum(cache.footprints, share))
 
 
 def _flatten_tokens(positions, feats, confidences, footprints, exposures, views: Views, config: StreamConfig) -> Tokens:
-    """Maps to tokens in order of insertion: view-major, row-major (DESIGN 6.9). Colors at the scene's exposure."""
+    """Maps flattened to tokens in order of insertion: view-major, row-major. Colors are at the scene's exposure."""
     v, hf, wf, _ = positions.shape
     colors = stages.patch_colors(views.images, config).reshape(v, hf, wf, -1, 3) / exposures[:, None, None, None]
     quats = matrices_to_quats(jnp.swapaxes(views.viewmats[:, :3, :3], -1, -2))

@@ -1,1 +1,1 @@
-"""Training: losses, one pure train step, and the loop that logs, saves and resumes."""
+"""Training: recipes, samples, losses, a pure training step, and the loop that logs, saves and resumes."""

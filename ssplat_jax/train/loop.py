@@ -1,4 +1,4 @@
-"""The training loop: draws samples ahead, steps, logs JSON lines, saves, resumes, stops cleanly on a signal."""
+"""The training loop: draws samples ahead, steps, logs, saves, resumes, and stops cleanly on a signal."""
 
 import dataclasses
 import time
@@ -12,24 +12,25 @@ import jax.numpy as jnp
 from ssplat_jax.checkpoint.training_state import TrainingCheckpoints
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.metrics.lpips import LpipsWeights
-from ssplat_jax.storage.folder_lock import only_writer
+from ssplat_jax.storage.folder_lock import lock_folder
 from ssplat_jax.storage.interrupts import Interrupts
 from ssplat_jax.storage.json_files import json_text
 from ssplat_jax.streaming.streamsplat import StreamSplat
-from ssplat_jax.train.recipe import Recipe, training_config
+from ssplat_jax.train.recipe import Recipe, training_config, with_defaults
 from ssplat_jax.train.samples import prefetched, sample_for_step
 from ssplat_jax.train.step import Trainer, TrainState, init_state, learning_rate
 
 LOG_FILE = "log.jsonl"
+"""Name of the log in the output directory: one JSON object per line."""
 
 
 @dataclasses.dataclass(frozen=True)
 class TrainResult:
-    """Where a run stands when `train` returns."""
+    """State of a run when `train` returns."""
 
     state: TrainState
-    step: int
-    interrupted: int | None  # the signal that stopped it, if one did
+    step: int  # steps done
+    interrupted: int | None  # number of the signal that stopped the run, if one did
 
 
 def train(
@@ -44,86 +45,113 @@ def train(
     report: Callable[[dict], None] = lambda record: None,
     warn: Callable[[str], None] = warnings.warn,
 ) -> TrainResult:
-    """Trains until the recipe is done, continuing from what `out` holds.
+    """Trains until the recipe is done or a signal arrives. A run in `out` is resumed.
 
     Args:
-        config: of the model; its cache is replaced by the recipe's.
-        recipe: phases and optimizer.
+        config: model configuration; `training_config` changes cache and exposure.
+        recipe: phases, optimizer and loss.
         out: directory of `log.jsonl`, `recipe.json` and `checkpoints/`.
-        params: start from these instead of from the recipe's seed (ignored on resume).
-        lpips_weights: with them the rendering loss is the paper's, MSE + 0.05 LPIPS.
-        save_every: steps between checkpoints; SIGINT and SIGTERM save too.
-        log_every: steps between records (means over the steps between).
-        report: called with every record.
-        warn: called with what a user should know, a damaged checkpoint.
+        params: initial parameters; default random ones from the recipe's seed. Ignored when a run is resumed.
+        lpips_weights: weights of LPIPS, which the rendering loss then includes.
+        save_every: steps between checkpoints. SIGINT and SIGTERM save one too.
+        log_every: steps between log records, which hold means over these steps.
+        report: called with every log record.
+        warn: called with a message for each damaged checkpoint.
+
+    Returns:
+        The state after the last step.
 
     Raises:
-        InputError: `out` holds a run of another recipe or configuration, or another process is training into it.
+        InputError: `out` holds a run of another recipe or configuration, or another process is training in it.
         StorageError: a checkpoint cannot be written or read.
     """
-    with only_writer(out):
-        return _train(config, recipe, out, params, lpips_weights, save_every, log_every, report, warn)
-
-
-def _train(config, recipe, out, params, lpips_weights, save_every, log_every, report, warn) -> TrainResult:
     model = StreamSplat(training_config(config, recipe))
-    description: dict = {"config": model.config.to_dict(), "recipe": dataclasses.asdict(recipe)}
-    if lpips_weights is not None:
-        description["rendering_loss"] = "MSE + 0.05 LPIPS"
-    checkpoints = TrainingCheckpoints(out, description)
-    state, start = init_state(model, recipe, params), 0
-    if (restored := checkpoints.restore_latest(state, warn)) is not None:
-        start, state = restored
-    trainer = Trainer(model, recipe)
-    interrupts = Interrupts()
-    window: list[dict] = []
-    waited, since, step, stopped = 0.0, time.perf_counter(), start, None
+    with lock_folder(out):
+        description = describe_run(model.config, recipe, has_lpips=lpips_weights is not None)
+        checkpoints = TrainingCheckpoints(out, description, upgrade=upgrade_description)
+        try:
+            state, start = init_state(model, recipe, params), 0
+            if (restored := checkpoints.restore_latest(state, warn)) is not None:
+                start, state = restored
+            log = _Log(out / LOG_FILE, recipe, report)
+            return _run(model, recipe, state, start, lpips_weights, checkpoints, log, save_every, log_every)
+        finally:
+            checkpoints.close()
+
+
+def describe_run(config: StreamConfig, recipe: Recipe, *, has_lpips: bool) -> dict:
+    """Facts that determine the weights of a run; a run with another description is not resumed."""
+    description: dict = {"config": config.to_dict(), "recipe": dataclasses.asdict(recipe)}
+    return description | ({"rendering_loss": f"MSE + {recipe.lpips_weight} LPIPS"} if has_lpips else {})
+
+
+def upgrade_description(description: dict) -> dict:
+    """Description of a run, as read from JSON, with the recipe's fields that older versions did not write."""
+    return description | {"recipe": with_defaults(description.get("recipe", {}))}
+
+
+def _run(model, recipe, state, start, lpips_weights, checkpoints, log, save_every, log_every) -> TrainResult:
+    """Steps from `start` to the end of the recipe or to a signal."""
+    trainer, interrupts = Trainer(model, recipe), Interrupts()
+    step, stopped = start, None
     samples = prefetched(lambda i: sample_for_step(i, recipe, model.config), iter(range(start, recipe.num_steps)))
     with interrupts:
         try:
             before = time.perf_counter()
             for i, sample in samples:
-                waited += time.perf_counter() - before
+                waited = time.perf_counter() - before
                 rate = jnp.asarray(learning_rate(recipe, i), jnp.float32)
                 form = recipe.phase_at(i)[0].form
                 state, metrics = trainer.step(state, sample, rate, form=form, lpips_weights=lpips_weights)
-                window.append(metrics)
+                log.add(metrics, waited)
                 step = i + 1
-                if step % log_every == 0 or step == recipe.num_steps:
-                    jax.block_until_ready(metrics)  # steps are dispatched, not done
-                    record = _record(step, recipe, window, state, waited, time.perf_counter() - since)
-                    _append(out / LOG_FILE, record)
-                    report(record)
-                    window, waited, since = [], 0.0, time.perf_counter()
-                stopped = interrupts.received  # read once: a signal may come at any time
-                if step % save_every == 0 or step == recipe.num_steps or stopped:
+                is_last = step == recipe.num_steps
+                if step % log_every == 0 or is_last:
+                    jax.block_until_ready(metrics)  # steps are dispatched asynchronously
+                    log.write(step, state)
+                stopped = interrupts.received  # read once, since a signal may arrive at any time
+                if step % save_every == 0 or is_last or stopped:
                     checkpoints.save(step, state)
                 if stopped:
                     break
                 before = time.perf_counter()
         finally:
             samples.close()
-            checkpoints.close()
     return TrainResult(state=state, step=step, interrupted=stopped if step < recipe.num_steps else None)
 
 
-def _record(step, recipe, window, state, waited, elapsed) -> dict:
-    """One line of the log: means of the window's metrics and where the time went."""
-    phase, _ = recipe.phase_at(step - 1)
-    means: dict = {}
-    for name in window[-1]:
-        values = [float(m[name]) for m in window if name in m]
-        means[name] = round(sum(values) / len(values), 5)
-    return {
-        "step": step,
-        "phase": phase.name,
-        **means,
-        "skipped": int(state.num_skipped),
-        "seconds_per_step": round(elapsed / len(window), 4),
-        "data_share": round(waited / elapsed, 4),
-    }
+class _Log:
+    """Metrics since the last record, and the file that records are appended to."""
 
+    def __init__(self, path: Path, recipe: Recipe, report: Callable[[dict], None]) -> None:
+        self._path, self._recipe, self._report = path, recipe, report
+        self._start()
 
-def _append(path: Path, record: dict) -> None:
-    with path.open("a") as file:
-        file.write(json_text(record, indent=None) + "\n")
+    def _start(self) -> None:
+        self._metrics: list[dict] = []
+        self._waited, self._since = 0.0, time.perf_counter()
+
+    def add(self, metrics: dict, waited: float) -> None:
+        """Adds the metrics of a step, and the seconds for which it waited for its sample."""
+        self._metrics.append(metrics)
+        self._waited += waited
+
+    def write(self, step: int, state: TrainState) -> None:
+        """Writes and reports a record: means of the metrics and timings since the last one."""
+        elapsed = time.perf_counter() - self._since
+        means: dict = {}
+        for name in self._metrics[-1]:
+            values = [float(metrics[name]) for metrics in self._metrics if name in metrics]
+            means[name] = round(sum(values) / len(values), 5)
+        record = {
+            "step": step,
+            "phase": self._recipe.phase_at(step - 1)[0].name,
+            **means,
+            "skipped": int(state.num_skipped),
+            "seconds_per_step": round(elapsed / len(self._metrics), 4),
+            "data_share": round(self._waited / elapsed, 4),
+        }
+        with self._path.open("a") as file:
+            file.write(json_text(record, indent=None) + "\n")
+        self._report(record)
+        self._start()

@@ -1,7 +1,11 @@
-"""What a training run is, as data: phases of a curriculum and the optimizer's numbers. No JAX here."""
+"""Training recipes: everything that decides the weights, besides the model configuration.
+
+This module does not import JAX, so that `ssplat --help` answers at once.
+"""
 
 import dataclasses
-from typing import Literal
+import json
+from typing import Any, Literal
 
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.errors import InputError
@@ -9,62 +13,98 @@ from ssplat_jax.errors import InputError
 
 @dataclasses.dataclass(frozen=True)
 class PhaseForm:
-    """What of a phase the compiled step depends on, the shapes of its samples aside."""
+    """The part of a phase that the compiled step depends on, besides the shapes of its samples."""
 
     frozen: tuple[str, ...] = ()
-    """Stages (keys of the parameters) that the phase leaves as they are; no gradient is computed through them."""
+    """Stages (keys of the parameters) that the phase does not train; no gradient is computed through them."""
     decode: Literal["tokens", "cache"] = "tokens"
-    """What is rendered: the tokens of all chunks with their gradients (the paper), or the cache, as inference does.
-    The cache holds constants, so `cache` trains the Gaussian head alone."""
+    """Scene that is rendered: the tokens of all chunks, through which gradients flow (the paper), or the decoded cache,
+    as in inference. The cache holds constants, so `cache` trains the Gaussian head alone."""
 
 
 PAPER_FORM = PhaseForm()
+"""The paper's form: all stages are trained, tokens are rendered."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Phase:
-    """A stretch of training with samples of one form (one compiled program per image size)."""
+    """A number of steps on samples of one kind; one program is compiled per image size."""
 
     name: str
+    """Name in logs."""
     steps: int
+    """Number of steps."""
     num_chunks: int
     """Chunks streamed through the cache per sample."""
     num_targets: int
     """Novel views rendered per sample; 0 trains depth alone and never renders."""
     sizes: tuple[tuple[int, int], ...]
-    """Image sizes (height, width), taken in turn."""
+    """Image sizes (height, width), used alternately."""
     learning_rate: float
-    """Peak of the phase; it decays by cosine."""
+    """Peak of the learning rate, from which it decays by a cosine."""
     form: PhaseForm = PAPER_FORM
     final_share: float = 0.1
-    """Of the peak, what the learning rate decays to."""
+    """Learning rate at the end of the phase, as a fraction of the peak."""
     steps_of_depth: tuple[float, float] = (0.005, 0.4)
-    """From what to what consecutive views of a sample step, in median depths: hand-held video to sets of photos."""
+    """Range of the distance between consecutive views in median depths: from hand-held video to photo sets."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Recipe:
-    """Everything that decides the trained weights, the model's configuration aside."""
+    """Everything that decides the trained weights, besides the model configuration.
+
+    The loss of a step is
+
+        depth     = cross entropy + depth_l1_weight x L1
+        rendering = MSE + lpips_weight x LPIPS, or MSE + gradient_weight x L1 of image gradients
+        loss      = depth                                               without target views
+                    depth_weight x depth + rendering_weight x rendering   with target views
+    """
 
     phases: tuple[Phase, ...]
+    """Phases in order."""
     seed: int = 0
+    """Seed of the initial parameters and of the samples."""
     warmup_steps: int = 50
+    """Steps of linear warm-up of the learning rate at the start of every phase."""
+    adam_b1: float = 0.9
+    """Decay of Adam's mean of gradients."""
+    adam_b2: float = 0.99
+    """Decay of Adam's mean of squared gradients."""
+    adam_epsilon: float = 1e-8
+    """Added to Adam's denominator."""
     weight_decay: float = 0.01
+    """Decoupled weight decay, multiplied by the learning rate (AdamW)."""
     clip_norm: float = 1.0
+    """Largest global norm of the gradient; longer ones are scaled down."""
     ema_decay: float = 0.99
+    """Decay of the moving average of the parameters, which is what is evaluated and shipped."""
+    ema_warmup_steps: float = 10.0
+    """At step t the decay is at most (1 + t) / (ema_warmup_steps + t), so that the average forgets the random start."""
+    depth_l1_weight: float = 2.0
+    """Weight of the L1 of log depth beside the cross entropy of the depth distribution."""
+    depth_target_width: float = 0.6
+    """Width of the target distribution around the true depth: the standard deviation in steps between candidates."""
     depth_weight: float = 0.1
-    """Weight of the depth losses beside the rendering loss (procedural scenes know their depth; DESIGN 6.13)."""
+    """Weight of the depth loss beside the rendering loss (ours: procedural scenes have known depth)."""
+    rendering_weight: float = 10.0
+    """Weight of the rendering loss beside the depth loss."""
+    lpips_weight: float = 0.05
+    """Weight of LPIPS beside the MSE, as in the paper (Eq. training_loss); used only when LPIPS weights are given."""
     gradient_weight: float = 0.02
-    """Weight of the L1 of image gradients beside the MSE, in place of LPIPS, whose weights cannot be shipped. One
-    color a cell shows no texture below it: a larger weight asks for that in vain, or for blur."""
+    """Weight of the L1 of image gradients beside the MSE, which replaces LPIPS when its weights are not given. Texture
+    finer than the Gaussians cannot be shown: a larger weight asks for it in vain, or for blur."""
     black_weight: float = 0.05
-    """Share of the rendering loss over black; the rest has holes in the colors around, as views are scored. That alone
-    would make all surfaces sheer: what is open costs it nothing."""
+    """Fraction of the rendering loss computed over a black background. The rest fills holes with the colors around
+    them, as in evaluation; alone, that would make all surfaces translucent, since holes would cost nothing."""
+    range_jitter: float = 0.25
+    """Largest error of scene scale, near and far in samples (log of a factor), for robustness to estimated ones."""
     recompute: bool = False
-    """Recompute each chunk's activations backward: less memory, more time."""
+    """Recomputes the activations of each chunk in the backward pass: less memory, more time."""
     cache_capacity: int = 1 << 14
+    """Voxels of the cache while training."""
     max_pairs: int = 1 << 20
-    """Tile pairs the rasterizer may use per target batch; overflow is logged."""
+    """Tile intersections that the rasterizer may use per batch of targets; overflow is logged."""
 
     def __post_init__(self) -> None:
         for phase in self.phases:
@@ -73,11 +113,11 @@ class Recipe:
 
     @property
     def num_steps(self) -> int:
-        """Steps of all phases."""
+        """Number of steps of all phases."""
         return sum(phase.steps for phase in self.phases)
 
     def phase_at(self, step: int) -> tuple[Phase, int]:
-        """The phase that holds `step` and the step's position in it."""
+        """The phase that contains `step`, and the position of `step` in it."""
         for phase in self.phases:
             if step < phase.steps:
                 return phase, step
@@ -85,18 +125,38 @@ class Recipe:
         raise IndexError(step)
 
     def scaled(self, factor: float) -> "Recipe":
-        """The same curriculum with every phase shortened or lengthened by `factor` (at least one step each)."""
+        """The recipe with the steps of every phase multiplied by `factor`, at least one step each."""
         phases = tuple(dataclasses.replace(p, steps=max(1, round(p.steps * factor))) for p in self.phases)
         return dataclasses.replace(self, phases=phases)
 
 
-# The parameters that rendering the cache leaves without a gradient.
-ALL_BUT_HEAD = ("encoder", "cost_volume", "upsampler", "hpda", "tokens", "cgfi", "mixer")
+def with_defaults(fields: dict[str, Any]) -> dict[str, Any]:
+    """Recipe as plain JSON types, with the defaults of fields that are missing because an older version wrote it.
+
+    Args:
+        fields: `dataclasses.asdict` of a recipe, as read from JSON.
+    """
+    phases = [
+        _defaults(Phase) | phase | {"form": _defaults(PhaseForm) | phase.get("form", {})}
+        for phase in fields.get("phases", [])
+    ]
+    return json.loads(json.dumps(_defaults(Recipe) | fields | {"phases": phases}))
+
+
+def _defaults(kind: type) -> dict[str, Any]:
+    return {field.name: field.default for field in dataclasses.fields(kind) if field.default is not dataclasses.MISSING}
+
+
+MATCHER_STAGES = ("encoder", "cost_volume", "upsampler")
+"""Stages that end in the depth map. A network without an upsampler ignores that name."""
+
+ALL_BUT_HEAD = (*MATCHER_STAGES, "hpda", "tokens", "cgfi", "mixer")
+"""Stages that get no gradient when the cache is rendered."""
 
 TINY = Recipe(
     phases=(
         Phase("depth", 3000, num_chunks=1, num_targets=0, sizes=((96, 128),), learning_rate=1e-3),
-        # Nearer the size of what is streamed, and upright too.
+        # Closer to the size of streamed images, and portrait too.
         Phase(
             "larger",
             400,
@@ -105,11 +165,11 @@ TINY = Recipe(
             sizes=((160, 224), (224, 160)),
             learning_rate=5e-4,
             final_share=0.02,
-            steps_of_depth=(0.02, 0.4),  # what is streamed has been dealt out to 3 % and more
+            steps_of_depth=(0.02, 0.4),  # streamed video is interleaved until views are 3 % apart or more
         ),
     )
 )
-"""From scratch to the shipped `tiny` weights; docs/model_card.md has the command, hours and machine."""
+"""Trains the shipped `tiny` weights from scratch; docs/model_card.md has the command, time and machine."""
 
 STREAM = Recipe(
     phases=(
@@ -122,20 +182,21 @@ STREAM = Recipe(
             learning_rate=1e-3,
             final_share=0.02,
             steps_of_depth=(0.01, 0.15),
-            # The matcher is done by then; without its backward pass a step costs a third, and rendering teaches it
-            # less about depth than depth itself did.
-            form=PhaseForm(frozen=("encoder", "cost_volume", "upsampler")),
+            # The matcher is trained by then. Without its backward pass a step costs a third, and rendering would teach
+            # it less about depth than depth supervision did.
+            form=PhaseForm(frozen=MATCHER_STAGES),
         ),
     )
 )
-"""What comes behind the matcher (gamma, features, CGFI, mixer, head), for weights that know depth. Not part of the
-shipped ones: docs/model_card.md says what it gave."""
+"""Trains the stages after the matcher (gamma, features, CGFI, mixer, head) from weights with a trained matcher. The
+shipped weights do not include it; docs/model_card.md has its results."""
 
 RECIPES = {"tiny": TINY, "stream": STREAM}
+"""Choices of `ssplat train --recipe`."""
 
 
 def smoke_recipe(steps: int = 20) -> Recipe:
-    """A few steps of every kind at the smallest size: what tests train."""
+    """A short recipe at the smallest image size, with both kinds of phases, for tests."""
     size = ((64, 64),)
     return Recipe(
         phases=(
@@ -149,8 +210,8 @@ def smoke_recipe(steps: int = 20) -> Recipe:
 
 
 def training_config(config: StreamConfig, recipe: Recipe) -> StreamConfig:
-    """The configuration trained with: a cache as large as a sample needs, and no growth inside jit.
+    """Model configuration for training: a cache for one sample, without growth, which jit cannot do.
 
-    Colors stay as they are seen: the targets have exposures of their own, which nothing estimates.
+    Exposures are not matched, because those of the target views are not estimated.
     """
     return config.replace(capacity=recipe.cache_capacity, overflow="drop_new", match_exposure=False)

@@ -1,4 +1,4 @@
-"""Training samples: procedural views split into a context stream and targets, framed as a capture would be."""
+"""Training samples: procedural views in the stream frame, split into chunks of context views and target views."""
 
 import queue
 import threading
@@ -10,37 +10,37 @@ from jaxtyping import Array, Float
 
 from ssplat_jax.chunk import Chunk
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.data.procedural import STEPS, training_sample
+from ssplat_jax.data.depth_range import FAR_FACTOR, NEAR_FACTOR
+from ssplat_jax.data.procedural import STEP_RANGE, training_sample
 from ssplat_jax.errors import InputError
 from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.model import GRID_STRIDE
 from ssplat_jax.pytree import pytree
 from ssplat_jax.train.recipe import Recipe
 
-NEAR_FACTOR, FAR_FACTOR = 0.55, 1.8  # as data.scale: margins around the 1 % and 99 % quantiles of depth
-EDGE = 0.05  # of log depth, between neighboring pixels
-JITTER = 0.25  # relative error that the sweep's range and the scene scale are trained to bear
+MAX_LOG_STEP = 0.05
+"""Log depths of neighboring pixels that differ by more belong to different surfaces."""
 
 
 @pytree
 class Sample:
-    """`t` chunks of context with their depth, and target views with theirs."""
+    """`t` chunks of context views with true depths, and target views."""
 
     chunks: Chunk  # leading axis t
-    log_depths: Float[Array, "t v hf wf"]  # true ln z at the grid's cells
+    log_depths: Float[Array, "t v hf wf"]  # true ln z at the centers of cells
     target_images: Float[Array, "s h w 3"]
     target_viewmats: Float[Array, "s 4 4"]
     target_Ks: Float[Array, "s 3 3"]
 
     @property
     def target_camera(self) -> Camera:
-        """The targets' cameras as one batch."""
+        """Cameras of the target views, as one batch."""
         height, width = self.target_images.shape[1:3]
         return Camera(viewmats=self.target_viewmats, Ks=self.target_Ks, width=width, height=height)
 
 
 def choose_targets(rng: np.random.Generator, num_views: int, num_targets: int) -> np.ndarray:
-    """Positions of the targets among `num_views` ordered views, neither first nor last: all are seen between others."""
+    """Ascending positions of targets among `num_views` views. The first and the last view are never targets."""
     return np.sort(rng.choice(np.arange(1, num_views - 1), size=num_targets, replace=False))
 
 
@@ -51,14 +51,28 @@ def make_sample(
     num_targets: int,
     size: tuple[int, int],
     config: StreamConfig,
-    steps_of_depth: tuple[float, float] = STEPS,
+    steps_of_depth: tuple[float, float] = STEP_RANGE,
+    range_jitter: float = Recipe.range_jitter,
 ) -> Sample:
-    """The sample called `seed`: always the same arrays for the same arguments."""
+    """Sample number `seed`, the same for the same arguments.
+
+    Args:
+        seed: number of the sample.
+        num_chunks: chunks of context views.
+        num_targets: target views.
+        size: height and width of the images.
+        config: gives chunk size and median depth.
+        steps_of_depth: see `Phase`.
+        range_jitter: see `Recipe`.
+
+    Raises:
+        InputError: there are targets, but only one context view.
+    """
     rng = np.random.default_rng([seed, 7])
     height, width = size
     num_context = num_chunks * config.stream.chunk_size
     if num_targets and num_context < 2:
-        raise InputError("training: targets lie between context views, got a context of one view; ask for no targets.")
+        raise InputError("training: wanted context views around targets, got a context of one view; use no targets.")
     num_views = num_context + num_targets
     arrays = training_sample(seed, num_views, height, width, steps=steps_of_depth)
     images, depths, camtoworlds, Ks = (np.asarray(a) for a in arrays)
@@ -67,12 +81,12 @@ def make_sample(
         is_target[choose_targets(rng, num_views, num_targets)] = True
     context = np.flatnonzero(~is_target)
 
-    scale = config.stream.median_depth / np.median(depths[context]) * np.exp(rng.uniform(-JITTER, JITTER))
+    scale = config.stream.median_depth / np.median(depths[context]) * np.exp(rng.uniform(-range_jitter, range_jitter))
     viewmats = _stream_viewmats(camtoworlds.astype(np.float64), int(context[0]), float(scale))
     depths = depths * scale
     low, high = np.quantile(depths[context], [0.01, 0.99])
-    near = NEAR_FACTOR * low * np.exp(rng.uniform(-JITTER, JITTER))
-    far = FAR_FACTOR * high * np.exp(rng.uniform(-JITTER, JITTER))
+    near = NEAR_FACTOR * low * np.exp(rng.uniform(-range_jitter, range_jitter))
+    far = FAR_FACTOR * high * np.exp(rng.uniform(-range_jitter, range_jitter))
 
     chunked = lambda x: x[context].reshape(num_chunks, config.stream.chunk_size, *x.shape[1:])  # noqa: E731
     return Sample(
@@ -92,12 +106,12 @@ def make_sample(
 
 
 def log_depths_at_cells(depths: Float[np.ndarray, "*b h w"]) -> Float[np.ndarray, "*b hf wf"]:
-    """ln z at the centers of the grid's cells, which are corners of pixels: the mean of the four pixels around.
+    """Log depths at the centers of cells: means over the four pixels around.
 
-    Across a depth edge a mean is on no surface: where the four differ by more than `EDGE`, one of them is taken.
+    Where the four differ by more than `MAX_LOG_STEP`, their mean is on no surface, and one of the four is taken.
     """
     before = GRID_STRIDE // 2 - 1
-    # A cell at the border whose center is the image's edge has pixels to one side only, and is none.
+    # Cells whose center is on the edge of the image are left out: they have pixels on one side only.
     rows, cols = ((side - before - 2) // GRID_STRIDE + 1 for side in depths.shape[-2:])
     around = np.log(
         [
@@ -106,12 +120,12 @@ def log_depths_at_cells(depths: Float[np.ndarray, "*b h w"]) -> Float[np.ndarray
             for x in (before, before + 1)
         ]
     )
-    is_edge = np.ptp(around, axis=0) > EDGE
+    is_edge = np.ptp(around, axis=0) > MAX_LOG_STEP
     return np.where(is_edge, around[-1], around.mean(axis=0)).astype(np.float32)
 
 
 def _stream_viewmats(camtoworlds, first: int, scale: float):
-    """World-to-camera matrices with view `first` at the origin and lengths scaled, computed in float64."""
+    """World-to-camera matrices with view `first` at the origin and lengths multiplied by `scale`, from float64."""
     relative = np.linalg.inv(camtoworlds[first]) @ camtoworlds
     relative[:, :3, 3] *= scale
     return np.linalg.inv(relative).astype(np.float32)
@@ -120,7 +134,10 @@ def _stream_viewmats(camtoworlds, first: int, scale: float):
 def prefetched(
     produce: Callable[[int], Sample], steps: Iterator[int], depth: int = 2
 ) -> Generator[tuple[int, Sample], None, None]:
-    """(step, produce(step)) in order, computed ahead on a thread. An error in `produce` is raised here."""
+    """Yields (step, produce(step)) in order, computed up to `depth` steps ahead in a thread.
+
+    An exception in `produce` is raised here.
+    """
     ahead: queue.Queue = queue.Queue(maxsize=depth)
     stop = threading.Event()
 
@@ -139,7 +156,7 @@ def prefetched(
                 if not put((step, produce(step), None)):
                     return
             put(None)
-        except BaseException as error:  # handed to the consumer, which raises it
+        except BaseException as error:  # passed to the consumer, which raises it
             put((None, None, error))
 
     thread = threading.Thread(target=work, daemon=True)
@@ -156,7 +173,7 @@ def prefetched(
 
 
 def sample_for_step(step: int, recipe: Recipe, config: StreamConfig) -> Sample:
-    """The sample that training step `step` uses: a function of the recipe alone, which makes resuming exact."""
+    """Sample of a training step. It depends on step, recipe and configuration alone, which makes resuming exact."""
     phase, position = recipe.phase_at(step)
     return make_sample(
         recipe.seed * 1_000_003 + step,
@@ -165,4 +182,5 @@ def sample_for_step(step: int, recipe: Recipe, config: StreamConfig) -> Sample:
         size=phase.sizes[position % len(phase.sizes)],
         config=config,
         steps_of_depth=phase.steps_of_depth,
+        range_jitter=recipe.range_jitter,
     )

@@ -1,1 +1,1 @@
-"""A scene in a browser."""
+"""Viewing a scene in a browser."""

@@ -1,4 +1,4 @@
-"""Bad captures, one line each: a name, how a good capture is spoilt, and what the one-line refusal must mention.
+"""Bad captures, one line each: a name, a function that damages a good capture, and parts of the error message.
 
 A spoiler gets the capture's folder and the contents of its transforms.json, which is written after it has run (unless
 the spoiler wrote that file itself).
@@ -6,6 +6,7 @@ the spoiler wrote that file itself).
 
 import json
 import math
+import random
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,7 +24,7 @@ class Case(NamedTuple):
 
 
 def good_capture(root: Path) -> dict[str, Any]:
-    """Writes the images of a capture that opens, and returns the contents for its transforms.json."""
+    """Writes the images of a good capture and returns the contents of its transforms.json."""
     rng = np.random.default_rng(0)
     (root / "images").mkdir(parents=True)
     frames = []
@@ -38,29 +39,56 @@ def good_capture(root: Path) -> dict[str, Any]:
 
 
 def write_capture(root: Path, meta: dict[str, Any]) -> None:
-    """Writes transforms.json unless it is there."""
+    """Writes transforms.json unless it exists."""
     file = root / "transforms.json"
     if not file.exists():
         file.write_text(json.dumps(meta))
 
 
-# Spoilers: each returns a function of (root, meta).
+def make_capture(root: Path, change: Callable[[Path, dict[str, Any]], Any] = lambda root, meta: None) -> Path:
+    """Writes a good capture to the folder `root`, changed by `change`, and returns the folder."""
+    meta = good_capture(root)
+    change(root, meta)
+    write_capture(root, meta)
+    return root
+
+
+def mutant(data: bytes, rng: random.Random) -> bytes:
+    """Returns `data` after a few random edits: bytes are changed, removed, repeated or replaced."""
+    out = bytearray(data)
+    for _ in range(rng.randint(1, 6)):
+        at = rng.randrange(len(out))
+        kind = rng.randrange(4)
+        if kind == 0:
+            out[at] = rng.randrange(256)
+        elif kind == 1:
+            del out[at : at + rng.randint(1, 30)]
+        elif kind == 2:
+            out[at:at] = out[at : at + rng.randint(1, 30)]
+        else:
+            out[at : at + 1] = rng.choice([b"-", b"1e999", b"null", b"{", b"]", b'"', b"0", b"NaN", b"\xff"])
+        if not out:
+            return b""
+    return bytes(out)
+
+
+# Functions that damage a capture, or return such a function of (root, meta).
 
 
 def top(**fields):
-    """Sets global fields; None removes."""
+    """Sets global fields; None removes a field."""
     return lambda root, meta: [meta.pop(k, None) if v is None else meta.update({k: v}) for k, v in fields.items()]
 
 
 def frame(i, **fields):
-    """Sets fields of frame `i`; None removes."""
+    """Sets fields of frame `i`; None removes a field."""
     return lambda root, meta: [
         meta["frames"][i].pop(k, None) if v is None else meta["frames"][i].update({k: v}) for k, v in fields.items()
     ]
 
 
 def pose(change):
-    """Applies `change` to frame 2's matrix, a NumPy array."""
+    """Applies `change` to the matrix of frame 2, a NumPy array."""
 
     def spoil(root, meta):
         meta["frames"][2]["transform_matrix"] = change(np.array(meta["frames"][2]["transform_matrix"])).tolist()
@@ -69,18 +97,18 @@ def pose(change):
 
 
 def entry(row, column, value):
-    """Sets one entry of frame 2's matrix."""
+    """Sets one entry of the matrix of frame 2."""
     return lambda root, meta: meta["frames"][2]["transform_matrix"][row].__setitem__(column, value)
 
 
 def text(content: str | bytes):
-    """Writes transforms.json as given."""
+    """Writes the given contents to transforms.json."""
     data = content.encode() if isinstance(content, str) else content
     return lambda root, meta: (root / "transforms.json").write_bytes(data)
 
 
 def truncated(fraction):
-    """Cuts image 2 short."""
+    """Truncates image 2."""
 
     def spoil(root, meta):
         file = root / "images" / "2.jpg"
@@ -90,17 +118,17 @@ def truncated(fraction):
 
 
 def image(data: bytes):
-    """Replaces image 2's bytes."""
+    """Replaces the bytes of image 2."""
     return lambda root, meta: (root / "images" / "2.jpg").write_bytes(data)
 
 
 def bomb(root, meta):
-    """A small PNG whose header promises 20000 x 20000 pixels."""
+    """Replaces image 2 by a small PNG of 20000 x 20000 pixels."""
     Image.new("1", (20000, 20000)).save(root / "images" / "2.jpg", format="PNG")
 
 
 def bomb_below_pillows_limit(root, meta):
-    """As above, 80 million pixels: Pillow itself would decode it."""
+    """Replaces image 2 by a PNG of 80 million pixels, which Pillow itself would decode."""
     Image.new("1", (10000, 8000)).save(root / "images" / "2.jpg", format="PNG")
 
 
@@ -114,7 +142,7 @@ def folder_as_image(root, meta):
 
 
 def other_size(width, height, *, format="JPEG"):
-    """Replaces image 2 by a black one."""
+    """Replaces image 2 by a black image."""
     return lambda root, meta: Image.new("RGB", (width, height)).save(root / "images" / "2.jpg", format=format)
 
 
@@ -123,7 +151,7 @@ def both(*spoilers):
 
 
 def shrunk_without_a_size(root, meta):
-    """Full-size intrinsics, and only images_4: nothing says how much smaller those are."""
+    """Leaves only images_4 with intrinsics of an unknown full size."""
     (root / "images").rename(root / "images_4")
     top(w=None, h=None)(root, meta)
 
@@ -145,7 +173,7 @@ def link_loop(root, meta):
 
 
 def outside(path):
-    """Names a file that exists outside the capture."""
+    """Refers to an existing file outside the capture."""
 
     def spoil(root, meta):
         Image.new("RGB", (WIDTH, HEIGHT)).save(root.parent / "secret.jpg")
@@ -155,7 +183,7 @@ def outside(path):
 
 
 def depth_file(mode, *, cut=None):
-    """Gives frame 2 a depth image of Pillow mode `mode`, cut to `cut` bytes."""
+    """Gives frame 2 a depth image of Pillow mode `mode`, truncated to `cut` bytes."""
 
     def spoil(root, meta):
         Image.new(mode, (WIDTH, HEIGHT), 1000 if mode.startswith("I") else 100).save(root / "d.png")
@@ -174,7 +202,7 @@ def rotated(degrees):
 MATRIX, PATH, JSON = "frames[2].transform_matrix", "frames[2].file_path", "transforms.json"
 IMAGE = "2.jpg"
 
-# One line a case, however long.
+# One line per case, however long.
 CASES = (
     # images
     Case("missing image", without_image, (PATH, "images/2.jpg", "does not exist")),

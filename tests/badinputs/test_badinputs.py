@@ -1,4 +1,4 @@
-"""Every bad input is refused by one line that names file and field and says what to do, before anything is written."""
+"""Bad inputs are refused with one line that names file, field and remedy, before anything is written."""
 
 import json
 import random
@@ -7,38 +7,30 @@ import pytest
 
 from ssplat_jax.data.capture import open_capture
 from ssplat_jax.errors import InputError
-from tests.badinputs.cases import CASES, good_capture, write_capture
+from tests.badinputs.cases import CASES, make_capture, mutant
 
-NUM_MUTANTS = 125  # of each kind; seeded, so a failure can be repeated
-
-
-def make(tmp_path, spoil):
-    root = tmp_path / "capture"
-    meta = good_capture(root)
-    spoil(root, meta)
-    write_capture(root, meta)
-    return root
+NUM_MUTANTS = 125  # per file; seeded, so that failures can be repeated
 
 
 def listing(root):
     return sorted(str(p) for p in root.rglob("*"))
 
 
-def test_the_capture_that_the_cases_spoil_is_good(tmp_path):
-    capture = open_capture(make(tmp_path, lambda root, meta: None))
+def test_the_unchanged_capture_of_the_cases_is_good(tmp_path):
+    capture = open_capture(make_capture(tmp_path / "capture", lambda root, meta: None))
     capture.verify()
     assert len(capture) == 4 and capture.notes == ()
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 def test_bad_capture_is_refused_in_one_line(tmp_path, case):
-    root = make(tmp_path, case.spoil)
+    root = make_capture(tmp_path / "capture", case.spoil)
     before = listing(tmp_path)
     with pytest.raises(InputError) as caught:
         open_capture(root).verify()
     message = str(caught.value)
     assert "\n" not in message and message.isascii() and len(message) < 600
-    assert "wanted" in message and "; " in message  # what should be there, and what to do
+    assert "wanted" in message and "; " in message  # the wanted value and the remedy
     for words in case.mentions:
         assert words in message, f"{words!r} is not in {message!r}"
     assert listing(tmp_path) == before
@@ -54,7 +46,7 @@ def test_bad_capture_is_refused_in_one_line(tmp_path, case):
         ("other.json", "frames"),
     ],
 )
-def test_what_is_no_capture_is_refused(tmp_path, path, words):
+def test_files_and_folders_without_a_capture_are_refused(tmp_path, path, words):
     (tmp_path / "empty").mkdir()
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "a.txt").write_text("a")
@@ -86,26 +78,7 @@ def test_bad_procedural_spec_is_refused(spec, words):
 @pytest.mark.parametrize("size", [(0, 10), (10, -1), (10, 10**6)])
 def test_bad_size_is_refused(tmp_path, size):
     with pytest.raises(InputError, match="size"):
-        open_capture(make(tmp_path, lambda root, meta: None), size=size)
-
-
-def mutant(data: bytes, rng: random.Random) -> bytes:
-    """A few random edits: bytes changed, cut out, doubled."""
-    out = bytearray(data)
-    for _ in range(rng.randint(1, 6)):
-        at = rng.randrange(len(out))
-        kind = rng.randrange(4)
-        if kind == 0:
-            out[at] = rng.randrange(256)
-        elif kind == 1:
-            del out[at : at + rng.randint(1, 30)]
-        elif kind == 2:
-            out[at:at] = out[at : at + rng.randint(1, 30)]
-        else:
-            out[at : at + 1] = rng.choice([b"-", b"1e999", b"null", b"{", b"]", b'"', b"0", b"NaN", b"\xff"])
-        if not out:
-            return b""
-    return bytes(out)
+        open_capture(make_capture(tmp_path / "capture", lambda root, meta: None), size=size)
 
 
 @pytest.mark.parametrize("name", ["transforms.json", "images/2.jpg", "images/2.png", "d.png"])
@@ -120,7 +93,7 @@ def test_mutants_are_read_or_refused_and_never_crash(tmp_path, name):
         if name == "images/2.png":
             meta["frames"][2]["file_path"] = name
 
-    root = make(tmp_path, with_other_files)
+    root = make_capture(tmp_path / "capture", with_other_files)
     good = (root / name).read_bytes()
     rng = random.Random(name)
     refused = 0
@@ -134,11 +107,11 @@ def test_mutants_are_read_or_refused_and_never_crash(tmp_path, name):
         except InputError as error:
             assert "\n" not in str(error)
             refused += 1
-    assert refused > NUM_MUTANTS // 20  # the mutants do reach the checks
+    assert refused > NUM_MUTANTS // 20  # enough mutants reach the checks
 
 
-def test_message_does_not_carry_control_characters(tmp_path):
-    root = make(tmp_path, lambda root, meta: meta["frames"][2].update(file_path="\x1b[31m\r\n"))
+def test_messages_have_no_control_characters(tmp_path):
+    root = make_capture(tmp_path / "capture", lambda root, meta: meta["frames"][2].update(file_path="\x1b[31m\r\n"))
     with pytest.raises(InputError) as caught:
         open_capture(root)
     assert all(c.isprintable() for c in str(caught.value))

@@ -22,7 +22,7 @@ def render(means, scales, quats, opacities, colors, f, H, W, max_pairs):
 """
 
 
-# Draws nothing; refuses what is not our scene.
+# Draws nothing; checks that it is given our scene.
 CANDIDATES = """
 import time
 
@@ -39,7 +39,7 @@ def candidates(means, quats, scales, opacities, colors, viewmat, K, width, heigh
 
 @pytest.fixture
 def times(monkeypatch):
-    """What `rows_of` times, as it is timed."""
+    """The times that `rows_of` measures."""
     seen = {}
     alternate = bench.alternate
 
@@ -51,7 +51,7 @@ def times(monkeypatch):
     return seen
 
 
-def test_the_rasterizers_rows_name_times_stages_floor_memory_and_ratios(tmp_path, times):
+def test_rows_hold_times_stages_floor_memory_and_ratios(tmp_path, times):
     (tmp_path / "against.py").write_text(PROTOTYPE)
     rows = {row["name"]: row for row in bench.rows_of(4096, 64, against=bench.load_rasterizer(tmp_path / "against.py"))}
     values = {name.removeprefix("4096_64/"): row["value"] for name, row in rows.items()}
@@ -75,7 +75,7 @@ def test_another_rasterizer_draws_our_scene_forward_and_backward(tmp_path, times
 
 
 @pytest.mark.parametrize(("text", "words"), [("import no_such_package", "no_such_package"), (PROTOTYPE, "square")])
-def test_a_file_that_cannot_be_timed_is_told_so(tmp_path, text, words):
+def test_a_file_that_cannot_be_timed_is_refused(tmp_path, text, words):
     (tmp_path / "against.py").write_text(text)
     with pytest.raises(InputError, match=words):
         bench.bench_render(tmp_path / "against.py", full_hd=True)
@@ -91,7 +91,7 @@ def test_growth_counts_eight_small_passes_against_a_large_one(monkeypatch):
     assert bench.growth_row() == {"name": "2048_90/forward_over_8_of_256_32", "value": 1.0, "unit": "ratio"}
 
 
-def test_a_stream_needs_the_same_memory_and_program_at_every_age():
+def test_a_stream_keeps_its_memory_and_program_at_every_age():
     rows = {row.name: row for row in benchmarks.bench_step(num_chunks=30, late_size=(32, 32), repeats=1)}
     assert rows["step_memory_growth"].value == 0 and rows["step_memory_bytes"].value > 0
     assert rows["step_compilations"].value == 1

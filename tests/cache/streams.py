@@ -1,4 +1,4 @@
-"""Token streams that are hard on the cache, and the comparison of a cache with the oracle."""
+"""Token streams that are hard on the cache, and the comparison of caches with the reference and with each other."""
 
 import dataclasses
 
@@ -7,29 +7,36 @@ import jax.numpy as jnp
 import numpy as np
 from hypothesis import strategies as st
 
-from ssplat_jax.cache import PIVOT_FIELDS, Tokens, VoxelCache, fuse_touched
+from ssplat_jax.cache import PIVOT_FIELDS, Tokens, VoxelCache, init_cache
+from ssplat_jax.cache import fuse as plain_fuse
 from ssplat_jax.cache import numpy_reference as reference
+from ssplat_jax.cache.fuse import _insert
 from ssplat_jax.config import StreamConfig
+from ssplat_jax.pytree import replace
 
-WIDTH = 4  # channels
+WIDTH = 4  # feature channels
 NUM_TOKENS = 48  # per chunk
 CAPACITY = 16
-VALUE_RTOL = 1e-6  # one float32 rounding is 6e-8; the oracle is float64
+VALUE_RTOL = 1e-6  # one float32 rounding is 6e-8; the reference is float64
 
 PLACES = ("one_voxel", "few", "many", "boundaries", "edges")
 FEATURES = ("integers", "normal", "duplicates", "zeros")
 CONFIDENCES = ("random", "tied", "at_tau")
 
-fuse = jax.jit(fuse_touched, static_argnums=2, donate_argnums=0)
+fuse = jax.jit(plain_fuse, static_argnums=2, donate_argnums=0)
+_jit_insert = jax.jit(_insert, static_argnums=2, donate_argnums=0)
 
 CONFIG = StreamConfig().replace(
     token_width=WIDTH, capacity=128, voxel_size=0.25, min_confidence=0.3, overflow="drop_new"
 )
+EVICT = CONFIG.replace(overflow="evict_lowest", pivots_per_voxel=2)
+VARIANTS = {"voxel": CONFIG, "evict": EVICT, "append": CONFIG.replace(vacc="append")}
+"""Every way in which rows are assigned."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Recipe:
-    """Draws one chunk of tokens; hypothesis shrinks its fields."""
+    """A random chunk of tokens; hypothesis shrinks its fields."""
 
     seed: int
     places: str
@@ -99,16 +106,45 @@ recipes = st.builds(
 
 
 def to_jax(tokens: dict[str, np.ndarray]) -> Tokens:
-    """The arrays as the cache takes them."""
+    """The arrays as `Tokens`."""
     return Tokens(**{name: jnp.asarray(x) for name, x in tokens.items()})
 
 
-def assert_equal_to_oracle(cache: VoxelCache, oracle: dict) -> None:
-    """Indices, counts, choices and counters exact; means within `VALUE_RTOL` of a pivot's largest entry."""
+def tokens_at(means, confidences=0.5, feats=1.0, valid=True, **changes) -> Tokens:
+    """Tokens at `means`, otherwise alike; their colors number them."""
+    n = len(means)
+    full = lambda x, *shape: jnp.broadcast_to(jnp.asarray(x, jnp.float32), (n, *shape))  # noqa: E731
+    tokens = Tokens(
+        means=jnp.asarray(means, jnp.float32),
+        feats=full(feats, WIDTH),
+        confidences=full(confidences),
+        rgbs=jnp.arange(n, dtype=jnp.float32)[:, None] * jnp.ones(3 * CONFIG.head.gaussians_per_token),
+        quats=full([1.0, 0, 0, 0], 4),
+        footprints=full(0.1),
+        valid=jnp.broadcast_to(jnp.asarray(valid), (n,)),
+    )
+    return replace(tokens, **changes)
+
+
+def fuse_with_rows(cache: VoxelCache, tokens: Tokens, config: StreamConfig) -> tuple[VoxelCache, set[int]]:
+    """`fuse`, and the rows that it wrote."""
+    cache, plan = _jit_insert(cache, tokens, config)
+    return cache, set(np.asarray(plan.rows).tolist()) - {-1}
+
+
+def assert_same_cache(a: VoxelCache, b: VoxelCache, except_fields=()) -> None:
+    """All fields equal to the last bit, except the counters and the fields named."""
+    for name in ("voxels", "counts", "num_voxels", "table", *PIVOT_FIELDS):
+        if name not in except_fields:
+            np.testing.assert_array_equal(getattr(a, name), getattr(b, name), name)
+
+
+def assert_equal_to_reference(cache: VoxelCache, expected: dict) -> None:
+    """Indices, counts, choices and counters equal; means within `VALUE_RTOL` of a pivot's largest entry."""
     arrays = jax.tree.map(np.asarray, cache)
-    for name, count in oracle["stats"].items():
+    for name, count in expected["stats"].items():
         assert int(getattr(arrays.stats, name)) == count, name
-    rows = oracle["rows"]
+    rows = expected["rows"]
     assert int(arrays.num_voxels) == len(rows)
     np.testing.assert_array_equal(arrays.counts[: len(rows)], [len(pivots) for _, pivots in rows])
     np.testing.assert_array_equal(arrays.counts[len(rows) :], 0)
@@ -128,13 +164,10 @@ def assert_equal_to_oracle(cache: VoxelCache, oracle: dict) -> None:
 
 
 def run_both(recipes, config, capacity=CAPACITY):
-    """The stream through the cache and through the oracle, compared after every chunk."""
-    from ssplat_jax.cache import init_cache
-
-    cache, oracle = init_cache(config, capacity), reference.empty(capacity)
+    """Streams the recipes through the cache and through the reference; compares them after every chunk."""
+    cache, expected = init_cache(config, capacity), reference.empty(capacity)
     for recipe in recipes:
         tokens = recipe.tokens()
-        cache, _ = fuse(cache, to_jax(tokens), config)
-        reference.fuse(oracle, tokens, config)
-        assert_equal_to_oracle(cache, oracle)
-    return cache, oracle
+        cache = fuse(cache, to_jax(tokens), config)
+        reference.fuse(expected, tokens, config)
+        assert_equal_to_reference(cache, expected)

@@ -1,42 +1,41 @@
-"""Capacity: growth changes nothing, and what the other policies lose is counted."""
+"""Overflow policies: growing changes no result, and the losses of the other policies are counted."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ssplat_jax.cache import check_cache, ensure_room, grow, init_cache
+from ssplat_jax.cache import check_cache, ensure_capacity, grow, init_cache
 from ssplat_jax.cache.hash_table import find_rows
-from ssplat_jax.cache.state import add_to
+from ssplat_jax.cache.state import saturating_add
 from ssplat_jax.errors import CacheError, InputError
 from ssplat_jax.pytree import replace
 from ssplat_jax.streaming.session import starting_capacity
-from tests.cache.streams import CONFIG, NUM_TOKENS, Recipe, fuse, to_jax
-from tests.cache.test_invariants import EVICT, assert_same
+from tests.cache.streams import CONFIG, EVICT, NUM_TOKENS, Recipe, assert_same_cache, fuse, to_jax
 
-GROW = CONFIG.replace(overflow="grow")  # only the host reads it; inside jit it is `drop_new`
+GROW = CONFIG.replace(overflow="grow")  # only the host reads it; inside jit it acts as `drop_new`
 STREAM = [Recipe(seed, places, "normal", "random").tokens() for seed, places in enumerate(("many", "few", "many"))]
 
 
 @pytest.mark.parametrize(("vacc", "final"), [("voxel", 128), ("append", 64)])
-def test_growing_is_the_same_as_having_started_large(vacc, final):
+def test_growing_equals_starting_large(vacc, final):
     config = CONFIG.replace(vacc=vacc)
     small, large = init_cache(config, 16), init_cache(config, final)
     capacities = set()
     for tokens in STREAM:
-        small = ensure_room(small, config.replace(overflow="grow"), NUM_TOKENS)
+        small = ensure_capacity(small, config.replace(overflow="grow"), NUM_TOKENS)
         capacities.add(small.capacity)
-        small, _ = fuse(small, to_jax(tokens), config)
-        large, _ = fuse(large, to_jax(tokens), config)
+        small = fuse(small, to_jax(tokens), config)
+        large = fuse(large, to_jax(tokens), config)
         check_cache(small, config.replace(overflow="grow"))
     jax.tree.map(np.testing.assert_array_equal, small.stats, large.stats)
     assert len(capacities) > 1 and small.capacity == final
-    # Tables of voxels differ by the order of entry; `append` has none, and growing must not make one.
-    assert_same(small, large, but=() if vacc == "append" else ("table",))
+    # The tables differ by the order of entry; with `append` they are empty and must stay so.
+    assert_same_cache(small, large, except_fields=() if vacc == "append" else ("table",))
 
 
 def test_every_voxel_is_found_after_growing():
-    cache, _ = fuse(init_cache(CONFIG, 64), to_jax(STREAM[0]), CONFIG)
+    cache = fuse(init_cache(CONFIG, 64), to_jax(STREAM[0]), CONFIG)
     cache = grow(cache, 512)
     rows = find_rows(cache.table, cache.voxels, cache.voxels[:64], np.arange(64) < cache.num_voxels)
     n = int(cache.num_voxels)
@@ -44,12 +43,12 @@ def test_every_voxel_is_found_after_growing():
     np.testing.assert_array_equal(rows, np.where(np.arange(64) < n, np.arange(64), -1))
 
 
-def test_capacity_doubles_so_that_recompilations_are_few():
+def test_capacity_grows_by_doubling():
     cache = init_cache(GROW, 16)
-    assert ensure_room(cache, GROW, 16) is cache
-    assert ensure_room(cache, GROW, 17).capacity == 32
-    assert ensure_room(cache, GROW, 1000).capacity == 1024
-    assert ensure_room(cache, CONFIG, 1000) is cache  # another policy
+    assert ensure_capacity(cache, GROW, 16) is cache
+    assert ensure_capacity(cache, GROW, 17).capacity == 32
+    assert ensure_capacity(cache, GROW, 1000).capacity == 1024
+    assert ensure_capacity(cache, CONFIG, 1000) is cache  # another policy
 
 
 def test_capacity_never_shrinks():
@@ -57,33 +56,33 @@ def test_capacity_never_shrinks():
         grow(init_cache(GROW, 32), 16)
 
 
-def test_drop_new_keeps_the_old_and_counts_the_rest():
+def test_drop_new_keeps_old_voxels_and_counts_the_rest():
     cache = init_cache(CONFIG, 16)
     for tokens in STREAM:
         before = cache.voxels[: int(cache.num_voxels)].copy()
-        cache, _ = fuse(cache, to_jax(tokens), CONFIG)
+        cache = fuse(cache, to_jax(tokens), CONFIG)
         np.testing.assert_array_equal(cache.voxels[: len(before)], before)
     assert int(cache.num_voxels) == 16
     assert int(cache.stats.num_dropped) > 0 and int(cache.stats.num_evicted) == 0
-    check_cache(cache, CONFIG)  # dropping is what was asked for
+    check_cache(cache, CONFIG)  # the policy allows dropping
 
 
-@pytest.mark.parametrize(("policy", "remedy"), [("grow", "ensure_room"), ("error", "raise capacity to 32")])
-def test_check_raises_with_the_remedy(policy, remedy):
+@pytest.mark.parametrize(("policy", "remedy"), [("grow", "ensure_capacity"), ("error", "raise capacity to 32")])
+def test_check_cache_raises_with_the_remedy(policy, remedy):
     config = CONFIG.replace(overflow=policy)
     cache = init_cache(config, 16)
     check_cache(cache, config)
     for tokens in STREAM:
-        cache, _ = fuse(cache, to_jax(tokens), CONFIG)
+        cache = fuse(cache, to_jax(tokens), CONFIG)
     with pytest.raises(CacheError, match=remedy):
         check_cache(cache, config)
 
 
-def test_evict_lowest_always_has_room_for_the_present():
+def test_evict_lowest_always_stores_the_newest_tokens():
     config = EVICT
     cache = init_cache(config, 64)
     for tokens in STREAM:
-        cache, _ = fuse(cache, to_jax(tokens), config)
+        cache = fuse(cache, to_jax(tokens), config)
     assert int(cache.stats.num_dropped) == 0 and int(cache.stats.num_evicted) > 0
     accepted = STREAM[-1]["confidences"] >= np.float32(config.memory.min_confidence)
     positions = {tuple(p) for p in np.asarray(cache.means)[np.asarray(cache.alive)]}
@@ -91,15 +90,15 @@ def test_evict_lowest_always_has_room_for_the_present():
     assert len(newest & positions) > len(newest) / 2  # the others merged
 
 
-def test_evict_lowest_takes_the_least_confident_voxel_and_the_oldest_of_equals():
+def test_evict_lowest_takes_the_least_confident_then_oldest():
     config = EVICT
     tokens = Recipe(0, "many", "normal", "random").tokens()
     tokens["means"] = (np.arange(NUM_TOKENS)[:, None] * np.array([1.0, 0, 0]) + 0.1).astype(np.float32)
     tokens["confidences"] = np.linspace(0.9, 0.4, NUM_TOKENS).astype(np.float32)
-    tokens["confidences"][[3, 7]] = 0.35  # the lowest; both of one chunk, so the lower row goes first
+    tokens["confidences"][[3, 7]] = 0.35  # the lowest; both are from one chunk, so the lower row goes first
     first, second = (np.arange(NUM_TOKENS) < n for n in (16, 17))
-    cache, _ = fuse(init_cache(config, 16), to_jax(tokens | {"valid": first}), config)
-    cache, _ = fuse(cache, to_jax(tokens | {"valid": second & ~first}), config)
+    cache = fuse(init_cache(config, 16), to_jax(tokens | {"valid": first}), config)
+    cache = fuse(cache, to_jax(tokens | {"valid": second & ~first}), config)
     np.testing.assert_array_equal(cache.means[3, 0], tokens["means"][16])
     np.testing.assert_array_equal(cache.means[7, 0], tokens["means"][7])
     assert int(cache.stats.num_evicted) == 1
@@ -111,20 +110,20 @@ def test_evict_lowest_needs_voxels():
 
 
 @pytest.mark.parametrize("capacity", [0, -4, 100])
-def test_a_capacity_that_the_hash_table_cannot_mask_is_refused(capacity):
+def test_capacity_must_be_a_power_of_two(capacity):
     with pytest.raises(InputError, match="power of two"):
         init_cache(CONFIG, capacity)
 
 
 @pytest.mark.parametrize(("policy", "wanted"), [("grow", 1 << 18), ("drop_new", 128), ("evict_lowest", 128)])
-def test_a_session_starts_with_room_only_where_the_cache_may_grow(policy, wanted):
+def test_session_starts_larger_only_if_the_cache_may_grow(policy, wanted):
     assert starting_capacity(CONFIG.replace(capacity=128, overflow=policy), 50_000) == wanted
 
 
-def test_counters_stop_instead_of_turning_negative():
-    most = 2**31 - 1
-    for now, more, wanted in ((0, 5, 5), (most - 3, 3, most), (most - 3, 4, most), (most, most, most)):
-        assert int(add_to(jnp.int32(now), jnp.int32(more))) == wanted
+def test_counters_saturate_instead_of_overflowing():
+    largest = 2**31 - 1
+    for now, more, wanted in ((0, 5, 5), (largest - 3, 3, largest), (largest - 3, 4, largest), (largest,) * 3):
+        assert int(saturating_add(jnp.int32(now), jnp.int32(more))) == wanted
     cache = init_cache(CONFIG)
-    full = replace(cache, stats=replace(cache.stats, num_seen=jnp.int32(most)))
-    assert int(fuse(full, to_jax(STREAM[0]), CONFIG)[0].stats.num_seen) == most
+    full = replace(cache, stats=replace(cache.stats, num_seen=jnp.int32(largest)))
+    assert int(fuse(full, to_jax(STREAM[0]), CONFIG).stats.num_seen) == largest

@@ -1,4 +1,4 @@
-"""Carving and judging against their NumPy oracle, and what a witness may and may not do."""
+"""Carving and judging equal the NumPy reference, and witnesses act within their limits."""
 
 import jax
 import jax.numpy as jnp
@@ -7,13 +7,12 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from ssplat_jax.cache import Tokens, bear_witness, carve, init_cache, judge
+from ssplat_jax.cache import carve, init_cache, judge, store_witness
 from ssplat_jax.cache import numpy_reference as reference
 from ssplat_jax.cache.state import WITNESS_CELLS
 from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.pytree import replace
-from tests.cache.streams import CAPACITY, CONFIG
-from tests.cache.test_project_oracle import (
+from tests.cache.projection_scenes import (
     DECISION_MARGIN,
     DEPTHS,
     GRID_WIDTH,
@@ -25,20 +24,21 @@ from tests.cache.test_project_oracle import (
     scene,
     with_pivots,
 )
+from tests.cache.streams import CAPACITY, CONFIG, tokens_at
 
 jit_carve = jax.jit(carve, static_argnums=4)
 jit_judge = jax.jit(judge, static_argnums=2)
-jit_bear_witness = jax.jit(bear_witness, static_argnums=4)
+jit_bear_witness = jax.jit(store_witness, static_argnums=4)
 SHAPE = (1, HEIGHT, GRID_WIDTH)
 
 
 def seen(depth: float, confidence: float = 0.8):
-    """Every cell of the front camera sees the same."""
+    """Depths and confidences of the front camera, the same in every cell."""
     return jnp.full(SHAPE, depth), jnp.full(SHAPE, confidence)
 
 
 def random_views(seed: int, height: int = HEIGHT, width: int = GRID_WIDTH):
-    """Depths and confidences of two views, some of which are no witnesses."""
+    """Depths and confidences of two views, some of them untrusted."""
     rng = np.random.default_rng(seed)
     shape = (2, height, width)
     depths = rng.uniform(2.5, 5.5, shape).astype(np.float32)
@@ -47,28 +47,14 @@ def random_views(seed: int, height: int = HEIGHT, width: int = GRID_WIDTH):
     return depths, confidences.astype(np.float32)
 
 
-def offered(means, confidences, valid=None) -> Tokens:
-    """Tokens of which only place and confidence matter."""
-    n = len(means)
-    return Tokens(
-        means=jnp.asarray(means, jnp.float32),
-        feats=jnp.ones((n, CONFIG.network.token_width)),
-        confidences=jnp.asarray(confidences, jnp.float32),
-        rgbs=jnp.ones((n, 3 * CONFIG.head.gaussians_per_token)),
-        quats=jnp.ones((n, 4)),
-        footprints=jnp.ones(n),
-        valid=jnp.ones(n, bool) if valid is None else jnp.asarray(valid),
-    )
-
-
 def after_chunk(cache, camera, depths, confidences, config=CONFIG):
-    """The cache once a chunk was counted and has borne witness."""
+    """The cache after a chunk was counted and its witness stored."""
     stats = replace(cache.stats, num_chunks=cache.stats.num_chunks + 1)
     return jit_bear_witness(replace(cache, stats=stats), camera, depths, confidences, config)
 
 
 def confidence_after(pivot_depth: float, *views, start: float = 0.6, config=CONFIG) -> float:
-    """Of one pivot on the axis of the front camera, after witnesses (depths, confidences)."""
+    """Confidence of one pivot on the axis of the front camera after `views` (depths, confidences)."""
     cache = with_pivots([[0.0, 0.0, pivot_depth]], confidences=[start])
     for depths, confidences in views:
         cache = jit_carve(cache, front_camera(), depths, confidences, config)
@@ -77,7 +63,7 @@ def confidence_after(pivot_depth: float, *views, start: float = 0.6, config=CONF
 
 @SETTINGS
 @given(scene_seed=SEED, camera_seed=SEED, num_voxels=st.integers(0, CAPACITY), depth_spread=DEPTHS)
-def test_carving_equals_the_loop(scene_seed, camera_seed, num_voxels, depth_spread):
+def test_carving_equals_the_reference(scene_seed, camera_seed, num_voxels, depth_spread):
     cache, camera = scene(scene_seed, num_voxels, depth_spread), cameras(camera_seed)
     depths, confidences = random_views(camera_seed)
     wanted = reference.from_arrays(cache)
@@ -90,13 +76,14 @@ def test_carving_equals_the_loop(scene_seed, camera_seed, num_voxels, depth_spre
     jax.tree.map(np.testing.assert_array_equal, replace(got, confidences=cache.confidences), cache)
 
 
-def test_looked_through_sinks_seen_rises_hidden_stays():
+def test_free_space_sinks_seen_rises_hidden_stays():
     assert confidence_after(1.0, seen(2.0)) < 0.6
     assert confidence_after(2.0, seen(2.0)) > 0.6
     assert confidence_after(3.0, seen(2.0)) == np.float32(0.6)
 
 
-def test_a_contradiction_weighs_more_than_an_agreement_and_both_by_their_confidence():
+def test_contradiction_outweighs_agreement():
+    """Both are weighted by the confidence of the witness."""
     contradicted, agreed = confidence_after(1.0, seen(2.0)), confidence_after(2.0, seen(2.0))
     assert 0.6 - contradicted > agreed - 0.6
     assert confidence_after(1.0, seen(2.0, 0.6)) > contradicted
@@ -104,12 +91,12 @@ def test_a_contradiction_weighs_more_than_an_agreement_and_both_by_their_confide
 
 
 def test_the_order_of_witnesses_does_not_matter():
-    # Far enough from both bounds: a clipped belief forgets how far beyond the bound it would have been.
+    # Far enough from both bounds: a clipped confidence forgets how far outside it would have been.
     witnesses = (seen(2.0, 0.7), seen(1.0, 0.5), seen(2.0, 0.5))
     assert confidence_after(1.0, *witnesses) == pytest.approx(confidence_after(1.0, *witnesses[::-1]), rel=1e-5)
 
 
-def test_beliefs_stay_revisable():
+def test_confidences_stay_revisable():
     sunk = confidence_after(1.0, *[seen(2.0, 1.0)] * 50)
     assert sunk == pytest.approx(0.02)
     assert confidence_after(1.0, *[seen(2.0, 1.0)] * 50, *[seen(1.0, 1.0)] * 20) > 0.5
@@ -126,30 +113,30 @@ def test_beliefs_stay_revisable():
         seen(-1.0),
         seen(2.0, np.nan),
     ],
-    ids=["unsure", "blind", "nan", "infinite", "negative", "nan_confidence"],
+    ids=["low_confidence", "zero_confidence", "nan", "infinite", "negative", "nan_confidence"],
 )
-def test_no_witness_no_change(witness):
+def test_untrusted_cells_change_nothing(witness):
     assert confidence_after(1.0, witness) == np.float32(0.6)
 
 
 def test_an_untrusted_neighbor_forbids_carving_but_not_agreement():
     depths, confidences = seen(2.0)
     for row, column in ((2, 3), (3, 5), (4, 4)):
-        unsure = (depths, confidences.at[0, row, column].set(0.1))
-        assert confidence_after(1.0, unsure) == np.float32(0.6)
-        assert confidence_after(2.0, unsure) > 0.6
+        views = (depths, confidences.at[0, row, column].set(0.1))
+        assert confidence_after(1.0, views) == np.float32(0.6)
+        assert confidence_after(2.0, views) > 0.6
 
 
-def test_switched_off_it_is_the_identity_and_leaves_no_trace():
+def test_without_carving_nothing_is_computed():
     off = CONFIG.replace(carving=False)
     assert confidence_after(1.0, seen(2.0), config=off) == np.float32(0.6)
     inputs = (with_pivots([[0.0, 0.0, 1.0]]), front_camera(), *seen(2.0))
     assert not jax.make_jaxpr(lambda *args: carve(*args, off))(*inputs).eqns
 
 
-@settings(SETTINGS, max_examples=6)  # two chunks each, in the loop too
+@settings(SETTINGS, max_examples=6)  # two chunks each, also in the slow reference
 @given(seed=SEED, camera_seed=SEED, size=st.sampled_from([(HEIGHT, GRID_WIDTH), (40, 33)]))
-def test_judging_equals_the_loop(seed, camera_seed, size):
+def test_judging_equals_the_reference(seed, camera_seed, size):
     height, width = size
     cache, views, rng = init_cache(CONFIG, CAPACITY), [], np.random.default_rng(seed)
     for chunk in range(2):
@@ -158,33 +145,33 @@ def test_judging_equals_the_loop(seed, camera_seed, size):
         camera = Camera(viewmats=camera.viewmats, Ks=camera.Ks * scale, width=width, height=height)
         depths, confidences = random_views(seed + chunk, height, width)
         cache = after_chunk(cache, camera, depths, confidences)
-        seen = reference.witness(camera.viewmats, camera.Ks, depths, confidences, WITNESS_CELLS, CONFIG)
-        views.append(seen)
-        viewmat, K, nearest, _, weights = seen
+        witness = reference.witness(camera.viewmats, camera.Ks, depths, confidences, WITNESS_CELLS, CONFIG)
+        views.append(witness)
+        viewmat, K, nearest, _, weights = witness
         np.testing.assert_array_equal(cache.witnesses.viewmats[chunk], viewmat)
         np.testing.assert_allclose(cache.witnesses.Ks[chunk], K, rtol=1e-6)
         np.testing.assert_allclose(cache.witnesses.weights[chunk], weights, rtol=1e-6)
         has_weight = weights > 0
         np.testing.assert_allclose(cache.witnesses.log_depths[chunk][has_weight], nearest[has_weight], atol=1e-6)
-    tokens = offered(
+    tokens = tokens_at(
         rng.uniform(-1, 1, (200, 3)), rng.choice([0.2, 0.4, 0.6, 0.9], 200), valid=rng.uniform(size=200) < 0.9
     )
     arrays = {name: np.asarray(getattr(tokens, name)) for name in ("means", "confidences", "valid")}
     wanted, margin = reference.judge(views, arrays, CONFIG)
-    assume(margin > DECISION_MARGIN / 4)  # 400 pairs: a smaller margin, or none would be left
+    assume(margin > DECISION_MARGIN / 4)  # smaller than elsewhere: 400 pairs hardly ever keep the full margin
     got = jit_judge(cache.witnesses, tokens, CONFIG)
     np.testing.assert_allclose(got.confidences, wanted, rtol=2e-5)
     jax.tree.map(np.testing.assert_array_equal, replace(got, confidences=tokens.confidences), tokens)
 
 
 def judged(mean, confidence=0.6, valid=True, config=CONFIG) -> float:
-    """Of a token, after one chunk whose view saw a wall at depth 2."""
+    """Confidence of a token after one chunk whose view saw a wall at depth 2."""
     cache = after_chunk(init_cache(config, CAPACITY), front_camera(), *seen(2.0), config)
-    token = offered([mean], [confidence], [valid])
+    token = tokens_at([mean], [confidence], valid=[valid])
     return float(jit_judge(cache.witnesses, token, config).confidences[0])
 
 
-def test_a_token_is_judged_by_what_earlier_chunks_saw():
+def test_tokens_are_judged_by_views_of_earlier_chunks():
     assert judged([0, 0, 1.9]) < 0.6 < judged([0, 0, 1.99])
     assert judged([0, 0, 2.1]) > 0.6
     unchanged = np.float32(0.6)
@@ -192,24 +179,24 @@ def test_a_token_is_judged_by_what_earlier_chunks_saw():
     assert judged([0, 0, -1.0]) == judged([5.0, 0, 1.0]) == unchanged  # unseen
     assert judged([0, 0, np.nan]) == judged([0, np.inf, 1.0]) == unchanged
     assert judged([0, 0, 1.0], valid=False) == unchanged
-    assert judged([0, 0, 1.0], confidence=0.2) == np.float32(0.2)  # below tau: it never enters, agreed with or not
+    assert judged([0, 0, 1.0], confidence=0.2) == np.float32(0.2)  # below tau: it never enters the cache
     assert np.isnan(judged([0, 0, 1.0], confidence=np.nan))
 
 
-def test_the_best_witness_of_a_chunk_is_kept_and_the_oldest_chunk_forgotten():
+def test_best_view_is_stored_and_the_oldest_chunk_replaced():
     config = CONFIG.replace(num_witnesses=2)
     cache = init_cache(config, CAPACITY)
     camera = cameras(3)
     for chunk in range(3):
         depths = np.full((2, HEIGHT, GRID_WIDTH), 2.0 + chunk, np.float32)
         confidences = np.full_like(depths, 0.8)
-        confidences[1 - chunk % 2, 0, 0] = 0.0  # so the other view has one witness more
+        confidences[1 - chunk % 2, 0, 0] = 0.0  # so that the other view has one trusted cell more
         cache = after_chunk(cache, camera, depths, confidences, config)
         np.testing.assert_array_equal(cache.witnesses.viewmats[chunk % 2], camera.viewmats[chunk % 2])
     np.testing.assert_allclose(np.exp(cache.witnesses.log_depths.max(axis=(1, 2))), [4.0, 3.0], rtol=1e-6)
 
 
-def test_a_chunk_of_padding_displaces_no_witness():
+def test_padding_displaces_no_witness():
     config = CONFIG.replace(num_witnesses=1)
     before = after_chunk(init_cache(config, CAPACITY), front_camera(), *seen(2.0), config)
     after = jit_bear_witness(before, front_camera(), *seen(3.0, 0.0), config)
@@ -217,9 +204,9 @@ def test_a_chunk_of_padding_displaces_no_witness():
 
 
 @pytest.mark.parametrize("off", [CONFIG.replace(carving=False), CONFIG.replace(num_witnesses=0)])
-def test_without_witnesses_judging_leaves_no_trace(off):
+def test_without_witnesses_nothing_is_judged(off):
     assert judged([0, 0, 1.0], config=off) == np.float32(0.6)
-    cache, token = init_cache(off, CAPACITY), offered([[0, 0, 1.0]], [0.6])
+    cache, token = init_cache(off, CAPACITY), tokens_at([[0, 0, 1.0]], [0.6])
     assert cache.witnesses.weights.size == 0
     assert not jax.make_jaxpr(lambda *args: judge(*args, off))(cache.witnesses, token).eqns
-    assert not jax.make_jaxpr(lambda *args: bear_witness(*args, off))(cache, front_camera(), *seen(2.0)).eqns
+    assert not jax.make_jaxpr(lambda *args: store_witness(*args, off))(cache, front_camera(), *seen(2.0)).eqns

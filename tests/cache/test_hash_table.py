@@ -1,4 +1,4 @@
-"""Voxel keys and the hash table: indices as float32 NumPy has them, every voxel found, none mistaken for another."""
+"""Voxel indices equal those of float32 NumPy, and the hash table finds every voxel and confuses no two."""
 
 import jax
 import jax.numpy as jnp
@@ -27,15 +27,15 @@ def test_out_of_range_gives_index_zero_and_false(cell):
     assert not bool(in_range[0]) and not np.any(np.asarray(voxels))
 
 
-def test_the_last_voxels_in_range_are_kept():
+def test_last_voxels_in_range_are_kept():
     cells = np.array([[INDEX_LIMIT - 1, 1 - INDEX_LIMIT, 0]])
     voxels, in_range = voxel_indices(jnp.asarray((cells + 0.5) * 0.25, jnp.float32), 0.25)
     assert bool(in_range[0])
     np.testing.assert_array_equal(voxels, cells)
 
 
-def test_hash_spreads_a_plane_of_neighbors_like_chance():
-    """Surfaces are planes of voxels: 2^14 of them in 2^16 slots collide as often as random keys do."""
+def test_hash_spreads_a_plane_of_voxels_like_random_keys():
+    """Surfaces are planes of voxels: 2^14 voxels in 2^16 slots collide as often as random keys do."""
     side = 128
     for fixed in range(3):
         plane = np.insert(np.stack(np.divmod(np.arange(side**2), side), axis=-1) - 64, fixed, 7, axis=1)
@@ -51,15 +51,15 @@ def colliding(num: int) -> np.ndarray:
     return np.unique(voxels, axis=0)[:num].astype(np.int32)
 
 
-def test_voxels_of_one_hash_are_told_apart():
+def test_voxels_of_equal_hash_are_distinguished():
     voxels = colliding(12)
     assert len(voxels) == 12
     table = build_table(jnp.asarray(np.pad(voxels, ((0, 4), (0, 0)))), jnp.int32(8))
-    held = jnp.asarray(np.pad(voxels, ((0, 4), (0, 0))))
-    rows = find_rows(table, held, jnp.asarray(voxels), jnp.ones(12, bool))
+    stored = jnp.asarray(np.pad(voxels, ((0, 4), (0, 0))))
+    rows = find_rows(table, stored, jnp.asarray(voxels), jnp.ones(12, bool))
     np.testing.assert_array_equal(rows, [*range(8), *[-1] * 4])
     table = insert_rows(table, jnp.asarray(voxels), jnp.arange(12), jnp.arange(12) >= 8)
-    np.testing.assert_array_equal(find_rows(table, held, jnp.asarray(voxels), jnp.ones(12, bool)), np.arange(12))
+    np.testing.assert_array_equal(find_rows(table, stored, jnp.asarray(voxels), jnp.ones(12, bool)), np.arange(12))
 
 
 def test_equal_voxels_are_grouped_under_the_first():
@@ -74,6 +74,6 @@ def test_equal_voxels_are_grouped_under_the_first():
 
 @pytest.mark.parametrize("num_tokens", [1, 1000, 65535, 65600])
 def test_stable_order_holds_for_any_number_of_tokens(num_tokens):
-    """65536 is where key and index no longer fit one 32-bit word together."""
+    """From 65536 tokens on, key and index no longer fit in one 32-bit word."""
     keys = np.minimum(RNG.integers(0, num_tokens + 1, num_tokens) // 7 * 7, num_tokens).astype(np.int32)
     np.testing.assert_array_equal(_stable_order(jnp.asarray(keys)), np.argsort(keys, kind="stable"))

@@ -1,4 +1,4 @@
-"""The invariants of ALGORITHM.md section 12 that concern the cache, by their numbers there."""
+"""Invariants of the cache: bounds, repetition, rejection, padding, translation, gradients and memory."""
 
 import resource
 from pathlib import Path
@@ -15,33 +15,39 @@ from ssplat_jax.cache import fuse as plain_fuse
 from ssplat_jax.cache import numpy_reference as reference
 from ssplat_jax.geometry.voxels import voxel_indices
 from ssplat_jax.pytree import replace
-from tests.cache.streams import CAPACITY, CONFIG, NUM_TOKENS, PLACES, VALUE_RTOL, Recipe, fuse, recipes, to_jax
+from tests.cache.streams import (
+    CAPACITY,
+    CONFIG,
+    EVICT,
+    NUM_TOKENS,
+    PLACES,
+    VALUE_RTOL,
+    VARIANTS,
+    Recipe,
+    assert_same_cache,
+    fuse,
+    fuse_with_rows,
+    recipes,
+    to_jax,
+)
 
 SETTINGS = settings(max_examples=30, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
-EVICT = CONFIG.replace(overflow="evict_lowest", pivots_per_voxel=2)
 
 
 def run(stream, config=CONFIG, capacity=CAPACITY) -> VoxelCache:
     cache = init_cache(config, capacity)
     for recipe in stream:
-        cache, _ = fuse(cache, to_jax(recipe.tokens()), config)
+        cache = fuse(cache, to_jax(recipe.tokens()), config)
     return cache
 
 
-def assert_same(a: VoxelCache, b: VoxelCache, but=()) -> None:
-    """All fields equal to the last bit, except the counters and the fields named."""
-    for name in ("voxels", "counts", "num_voxels", "table", *PIVOT_FIELDS):
-        if name not in but:
-            np.testing.assert_array_equal(getattr(a, name), getattr(b, name), name)
-
-
-# 3. Bounds -----------------------------------------------------------------------------------------------------------
+# Bounds --------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("config", [CONFIG, EVICT], ids=["drop_new", "evict_lowest"])
 @SETTINGS
 @given(st.lists(recipes, min_size=1, max_size=4))
-def test_3_pivots_are_bounded_inside_their_voxels_and_findable(config, stream):
+def test_pivots_are_bounded_inside_their_voxels_and_findable(config, stream):
     cache = jax.tree.map(np.asarray, run(stream, config))
     rows = np.arange(CAPACITY) < cache.num_voxels
     assert np.all(cache.counts[rows] >= 1) and np.all(cache.counts[~rows] == 0)
@@ -58,7 +64,7 @@ def test_3_pivots_are_bounded_inside_their_voxels_and_findable(config, stream):
 
 @SETTINGS
 @given(st.lists(recipes, min_size=2, max_size=4))
-def test_3_every_token_is_counted_once(stream):
+def test_every_token_is_counted_once(stream):
     stats = jax.tree.map(int, run(stream).stats)
     left_out = stats.num_low_confidence + stats.num_non_finite + stats.num_out_of_range + stats.num_dropped
     assert stats.num_seen == sum(r.num_valid for r in stream)
@@ -67,15 +73,15 @@ def test_3_every_token_is_counted_once(stream):
 
 @SETTINGS
 @given(st.lists(recipes, min_size=1, max_size=3), st.integers(1, NUM_TOKENS - 1))
-def test_3_splitting_a_chunk_does_not_matter(stream, at):
+def test_splitting_a_chunk_changes_nothing(stream, at):
     whole, split = init_cache(CONFIG, CAPACITY), init_cache(CONFIG, CAPACITY)
     for recipe in stream:
         tokens = to_jax(recipe.tokens())
         head = jnp.arange(NUM_TOKENS) < at
-        whole, _ = fuse(whole, tokens, CONFIG)
-        split, _ = fuse(split, replace(tokens, valid=tokens.valid & head), CONFIG)
-        split, _ = fuse(split, replace(tokens, valid=tokens.valid & ~head), CONFIG)
-    assert_same(whole, split, but=("table", "last_chunks", "means", "feats", "rgbs"))
+        whole = fuse(whole, tokens, CONFIG)
+        split = fuse(split, replace(tokens, valid=tokens.valid & head), CONFIG)
+        split = fuse(split, replace(tokens, valid=tokens.valid & ~head), CONFIG)
+    assert_same_cache(whole, split, except_fields=("table", "last_chunks", "means", "feats", "rgbs"))
     for name in ("means", "feats", "rgbs"):
         a, b = np.asarray(getattr(whole, name)), np.asarray(getattr(split, name))
         np.testing.assert_allclose(a, b, rtol=0, atol=VALUE_RTOL * np.abs(a).max(initial=1e-30))
@@ -83,18 +89,18 @@ def test_3_splitting_a_chunk_does_not_matter(stream, at):
         assert int(getattr(whole.stats, name)) == int(getattr(split.stats, name))
 
 
-# 4. Repetition -------------------------------------------------------------------------------------------------------
+# Repetition ----------------------------------------------------------------------------------------------------------
 
 
-def test_4_reinserting_a_chunk_bounds_pivots_and_leaves_positions():
-    """With fewer distinct tokens in a voxel than pivots, repetitions only ever merge with themselves."""
+def test_repeating_a_chunk_adds_and_moves_no_pivots():
+    """With fewer distinct tokens in a voxel than pivots, repetitions merge only with themselves."""
     tokens = Recipe(seed=1, places="many", features="normal", confidences="random").tokens()
     tokens["means"] = (
         np.repeat(np.arange(NUM_TOKENS // 3), 3)[:, None] * CONFIG.memory.voxel_size + tokens["means"] % 0.2 + 0.01
     )
     cache, after = init_cache(CONFIG, CAPACITY), []
     for _ in range(6):
-        cache, _ = fuse(cache, to_jax(tokens), CONFIG)
+        cache = fuse(cache, to_jax(tokens), CONFIG)
         after.append({tuple(p) for p in np.asarray(cache.means)[np.asarray(cache.alive)]})
     accepted = tokens["confidences"] >= np.float32(CONFIG.memory.min_confidence)
     assert after[0] == {tuple(p) for p in tokens["means"].astype(np.float32)[accepted]}
@@ -103,7 +109,7 @@ def test_4_reinserting_a_chunk_bounds_pivots_and_leaves_positions():
     assert int(cache.stats.num_merged) > 0
 
 
-# 5. Rejection --------------------------------------------------------------------------------------------------------
+# Rejection -----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -121,69 +127,69 @@ def test_4_reinserting_a_chunk_bounds_pivots_and_leaves_positions():
         ("means", np.float32(-(1 << 20) * 0.25), "num_out_of_range"),
     ],
 )
-def test_5_rejected_tokens_leave_the_state_untouched_and_are_counted(name, value, counter):
+def test_rejected_tokens_change_only_their_counter(name, value, counter):
     tokens = Recipe(seed=2, places="few", features="normal", confidences="tied").tokens()
     before = run([Recipe(seed=3, places="few", features="normal", confidences="tied")])
     tokens["confidences"][:] = 0.5
     tokens[name] = np.full_like(tokens[name], value)
-    after, touched = fuse(jax.tree.map(jnp.copy, before), to_jax(tokens), CONFIG)
-    assert_same(before, after)
-    assert int(touched.num_rows) == 0 and np.all(np.asarray(touched.rows) == -1)
+    after, rows = fuse_with_rows(jax.tree.map(jnp.copy, before), to_jax(tokens), CONFIG)
+    assert_same_cache(before, after)
+    assert not rows
     added = jax.tree.map(lambda a, b: int(a) - int(b), after.stats, before.stats)
     assert getattr(added, counter) == NUM_TOKENS == added.num_seen
     assert added.num_accepted == 0
 
 
-def test_5_token_at_tau_is_accepted():
+def test_token_at_tau_is_accepted():
     tokens = Recipe(seed=2, places="few", features="normal", confidences="tied").tokens()
     tokens["confidences"][:] = np.float32(0.3)
-    cache, _ = fuse(init_cache(CONFIG, CAPACITY), to_jax(tokens), CONFIG)
+    cache = fuse(init_cache(CONFIG, CAPACITY), to_jax(tokens), CONFIG)
     assert int(cache.stats.num_accepted) == NUM_TOKENS
 
 
-# 7. Padding ----------------------------------------------------------------------------------------------------------
+# Padding -------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("places", PLACES)
-def test_7_a_chunk_of_padding_is_the_identity(places):
+def test_padding_is_the_identity(places):
     before = run([Recipe(seed=5, places=places, features="normal", confidences="random")])
     padding = to_jax(Recipe(6, places, "normal", "random", num_valid=0, num_bad=5).tokens())
-    after, touched = fuse(jax.tree.map(jnp.copy, before), padding, CONFIG)
+    after, rows = fuse_with_rows(jax.tree.map(jnp.copy, before), padding, CONFIG)
     jax.tree.map(np.testing.assert_array_equal, before, after)
-    assert int(touched.num_rows) == 0
+    assert not rows
 
 
-# 8. World frame ------------------------------------------------------------------------------------------------------
+# Translation ---------------------------------------------------------------------------------------------------------
 
 
-def test_8_moving_the_world_by_whole_voxels_moves_the_pivots_exactly():
-    """Voxel size and positions are dyadic, so that the shift itself has no rounding."""
+def test_shifting_the_world_by_whole_voxels_shifts_the_pivots():
+    """Voxel size and positions are dyadic, so the shift itself does not round."""
     tokens = Recipe(seed=7, places="few", features="integers", confidences="tied").tokens()
     tokens["means"] = np.round(tokens["means"] * 1024) / 1024
     shift = np.array([3, -5, 2]) * CONFIG.memory.voxel_size
     moved = tokens | {"means": (tokens["means"] + shift).astype(np.float32)}
-    a, _ = fuse(init_cache(CONFIG, CAPACITY), to_jax(tokens), CONFIG)
-    b, _ = fuse(init_cache(CONFIG, CAPACITY), to_jax(moved), CONFIG)
+    a = fuse(init_cache(CONFIG, CAPACITY), to_jax(tokens), CONFIG)
+    b = fuse(init_cache(CONFIG, CAPACITY), to_jax(moved), CONFIG)
     assert int(a.stats.num_merged) > 0
-    assert_same(a, b, but=("table", "means", "voxels"))
+    assert_same_cache(a, b, except_fields=("table", "means", "voxels"))
     expected = np.where(np.asarray(a.alive)[..., None], np.asarray(a.means) + shift.astype(np.float32), 0)
     np.testing.assert_allclose(b.means, expected, rtol=0, atol=2e-7)
 
 
-def test_8_append_keeps_every_token_as_it_came():
+def test_append_keeps_every_token_unchanged():
     config = CONFIG.replace(vacc="append")
     tokens = Recipe(seed=8, places="one_voxel", features="normal", confidences="random").tokens()
-    cache, _ = fuse(init_cache(config, CAPACITY), to_jax(tokens), config)
+    cache = fuse(init_cache(config, CAPACITY), to_jax(tokens), config)
     accepted = tokens["confidences"] >= np.float32(config.memory.min_confidence)
     alive = np.asarray(cache.alive)
     for name in ("means", "feats", "confidences", "rgbs", "quats", "footprints"):
         np.testing.assert_array_equal(np.asarray(getattr(cache, name))[alive], tokens[name][accepted])
 
 
-# 9. Gradients --------------------------------------------------------------------------------------------------------
+# Gradients -----------------------------------------------------------------------------------------------------------
 
 
-def test_9_no_gradient_passes_the_cache():
+def test_no_gradient_passes_the_cache():
     tokens = to_jax(Recipe(seed=9, places="one_voxel", features="normal", confidences="tied").tokens())
 
     def loss(feats, means):
@@ -194,10 +200,10 @@ def test_9_no_gradient_passes_the_cache():
     assert not any(np.any(np.asarray(g)) for g in grads)
 
 
-# 12. Memory and compilation ------------------------------------------------------------------------------------------
+# Memory and compilation ----------------------------------------------------------------------------------------------
 
 
-def test_12_one_compilation_for_a_whole_stream():
+def test_one_compilation_for_a_whole_stream():
     traces = []
 
     def counted(cache, tokens):
@@ -211,13 +217,10 @@ def test_12_one_compilation_for_a_whole_stream():
     assert len(traces) == 1
 
 
-IN_PLACE = {"voxel": CONFIG, "evict": EVICT, "append": CONFIG.replace(vacc="append")}
-
-
-@pytest.mark.parametrize("name", IN_PLACE)
-def test_12_the_cache_is_updated_in_place_and_work_memory_does_not_grow_with_it(name):
+@pytest.mark.parametrize("name", VARIANTS)
+def test_fuse_runs_in_place_with_memory_free_of_capacity(name):
     def analysis(capacity):
-        config = IN_PLACE[name].replace(capacity=capacity)
+        config = VARIANTS[name].replace(capacity=capacity)
         cache = jax.eval_shape(lambda: init_cache(config))
         tokens = jax.eval_shape(lambda: to_jax(Recipe(0, "few", "normal", "random").tokens()))
         compiled = jax.jit(plain_fuse, static_argnums=2, donate_argnums=0).lower(cache, tokens, config).compile()
@@ -227,42 +230,42 @@ def test_12_the_cache_is_updated_in_place_and_work_memory_does_not_grow_with_it(
     small_size, small = analysis(128)
     size, large = analysis(1024)
     assert small.alias_size_in_bytes >= small_size and large.alias_size_in_bytes >= size
-    # "evict" looks for the weakest voxels among all; "append" copies the counts.
+    # "evict" ranks all voxels; "append" copies the counts.
     per_row = {"voxel": 0, "evict": 64, "append": 4}[name]
     assert large.temp_size_in_bytes <= small.temp_size_in_bytes + 64 + per_row * (1024 - 128)
 
 
-# Incremental decode ---------------------------------------------------------------------------------------------------
+# Rows written ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("config", [CONFIG, EVICT, CONFIG.replace(vacc="append")], ids=["voxel", "evict", "append"])
-def test_what_a_chunk_did_not_touch_is_as_it_was(config):
-    """A viewer that copies only the touched rows of every chunk holds the whole cache."""
+@pytest.mark.parametrize("name", VARIANTS)
+def test_rows_without_a_token_stay_unchanged(name):
+    """A copy that takes over only the rows written by each chunk equals the cache."""
+    config = VARIANTS[name]
     cache = init_cache(config, CAPACITY)
-    held = {name: np.zeros(getattr(cache, name).shape) for name in ("counts", *PIVOT_FIELDS)}
+    copy = {name: np.zeros(getattr(cache, name).shape) for name in ("counts", *PIVOT_FIELDS)}
     for seed, places in enumerate(("few", "many", "one_voxel", "many", "edges")):
         recipe = Recipe(seed, places, "normal", "random", num_valid=24)
-        cache, touched = fuse(cache, to_jax(recipe.tokens()), config)
-        rows = np.asarray(touched.rows)[: int(touched.num_rows)]
-        assert len(set(rows)) == len(rows) and np.all(np.asarray(touched.rows)[len(rows) :] == -1)
-        for name, x in held.items():
+        cache, written = fuse_with_rows(cache, to_jax(recipe.tokens()), config)
+        rows = sorted(written)
+        for name, x in copy.items():
             x[rows] = np.asarray(getattr(cache, name))[rows]
             np.testing.assert_array_equal(x, getattr(cache, name), name)
 
 
 def test_bfloat16_features_choose_the_same_pivots():
-    """Small integers are exact in bfloat16, so every choice must be the same; only means of features are rounder.
+    """Small integers are exact in bfloat16, so every choice must be the same; only means of features are rounded more.
 
-    Other means may round otherwise: XLA compiles another program.
+    Other means may differ by float32 rounding, because XLA compiles another program.
     """
     stream = [Recipe(seed, "few", "integers", "tied").tokens() for seed in range(3)]
     exact, short = init_cache(CONFIG, CAPACITY), init_cache(CONFIG, CAPACITY)
     short = replace(short, feats=short.feats.astype(jnp.bfloat16), seeds=short.seeds.astype(jnp.bfloat16))
     for tokens in stream:
-        exact, _ = fuse(exact, to_jax(tokens), CONFIG)
-        short, _ = fuse(short, to_jax(tokens), CONFIG)
+        exact = fuse(exact, to_jax(tokens), CONFIG)
+        short = fuse(short, to_jax(tokens), CONFIG)
     assert short.feats.dtype == jnp.bfloat16 and int(short.stats.num_merged) > 0
-    assert_same(exact, short, but=("feats", "means", "rgbs"))
+    assert_same_cache(exact, short, except_fields=("feats", "means", "rgbs"))
     for name in ("means", "rgbs"):
         np.testing.assert_allclose(getattr(exact, name), getattr(short, name), rtol=VALUE_RTOL, atol=1e-7)
     np.testing.assert_allclose(exact.feats, short.feats.astype(jnp.float32), rtol=0, atol=0.03)  # 2 x 2^-8 per merge
@@ -272,7 +275,7 @@ def test_bfloat16_features_choose_the_same_pivots():
 
 
 @pytest.mark.slow
-def test_ten_thousand_chunks_leave_memory_and_counters_as_they_must_be():
+def test_long_streams_keep_memory_and_counters_in_order():
     def resident_bytes():
         return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
 
@@ -280,7 +283,7 @@ def test_ten_thousand_chunks_leave_memory_and_counters_as_they_must_be():
     stream = [Recipe(seed, PLACES[seed % 5], "normal", "random", num_bad=5).tokens() for seed in range(50)]
     chunks = [to_jax(tokens) for tokens in stream]
     for i in range(10_000):
-        cache, _ = fuse(cache, chunks[i % 50], config)
+        cache = fuse(cache, chunks[i % 50], config)
         if i == 500:
             before = resident_bytes()
     assert resident_bytes() - before <= 50 * 2**20
@@ -298,7 +301,7 @@ def test_ten_thousand_chunks_leave_memory_and_counters_as_they_must_be():
     assert stats.num_evicted > 0
 
 
-# The limits that fuse states -----------------------------------------------------------------------------------------
+# Limits stated by `fuse` ---------------------------------------------------------------------------------------------
 
 
 def one_voxel(feats, confidences, means=None) -> Tokens:
@@ -313,23 +316,24 @@ def one_voxel(feats, confidences, means=None) -> Tokens:
 
 @pytest.mark.parametrize("size", [0.0, 1e-9, 1.0, 1e9, 1e12, 3e38])
 def test_features_of_any_size_give_finite_pivots(size):
+    """Eight of the twelve tokens merge."""
     feats = size * np.random.default_rng(0).uniform(-1, 1, (12, 4))
-    cache, _ = fuse(init_cache(CONFIG, CAPACITY), one_voxel(feats, np.linspace(0.3, 1.0, 12)), CONFIG)
+    cache = fuse(init_cache(CONFIG, CAPACITY), one_voxel(feats, np.linspace(0.3, 1.0, 12)), CONFIG)
     assert all(np.all(np.isfinite(np.asarray(getattr(cache, name)))) for name in PIVOT_FIELDS)
     assert int(cache.stats.num_merged) == 8
 
 
 @pytest.mark.parametrize("size", [1e-9, 1e9])
-def test_feature_norms_at_the_limits_still_select_the_closest_pair(size):
+def test_closest_pair_is_found_at_the_limits_of_norms(size):
     axes = np.eye(4)
     feats = size * np.array([axes[0], axes[1], axes[2], axes[3], axes[2] + 0.1 * axes[3]])
-    cache, _ = fuse(init_cache(CONFIG, CAPACITY), one_voxel(feats, np.full(5, 0.5)), CONFIG)
+    cache = fuse(init_cache(CONFIG, CAPACITY), one_voxel(feats, np.full(5, 0.5)), CONFIG)
     assert np.asarray(cache.num_members)[0].tolist() == [1, 1, 2, 1]
 
 
 def test_zero_features_are_orthogonal_to_everything():
     feats = np.concatenate([np.zeros((4, 4)), np.ones((1, 4))])
-    cache, _ = fuse(init_cache(CONFIG, CAPACITY), one_voxel(feats, np.full(5, 0.5)), CONFIG)
+    cache = fuse(init_cache(CONFIG, CAPACITY), one_voxel(feats, np.full(5, 0.5)), CONFIG)
     assert np.asarray(cache.num_members)[0].tolist() == [2, 1, 1, 1]  # all tied at 0: the lowest pair
 
 
@@ -337,30 +341,30 @@ def test_members_of_confidence_zero_average_with_equal_weights():
     config = CONFIG.replace(min_confidence=0.0)
     means = np.full((5, 3), 0.1) + np.array([0, 0, 0, 0, 0.1])[:, None]
     feats = np.stack([*np.eye(4), np.eye(4)[3]])
-    cache, _ = fuse(init_cache(config, CAPACITY), one_voxel(feats, np.zeros(5), means), config)
+    cache = fuse(init_cache(config, CAPACITY), one_voxel(feats, np.zeros(5), means), config)
     np.testing.assert_allclose(cache.means[0, 3], 0.15, rtol=VALUE_RTOL)
 
 
-def test_merged_means_stay_between_their_members_to_the_last_bit():
-    """Ten thousand merges next to a voxel's upper corner, where rounding up would leave it."""
+def test_merged_means_stay_between_their_members():
+    """Ten thousand merges next to a voxel's upper corner, where rounding up would leave the voxel."""
     edge = np.nextafter(np.float32(0.25), np.float32(0))
     cache = init_cache(CONFIG, CAPACITY)
     rng = np.random.default_rng(0)
     for _ in range(200):
         confidences = rng.uniform(0.3, 1.0, NUM_TOKENS)
         tokens = one_voxel(rng.normal(size=(NUM_TOKENS, 4)), confidences, np.full((NUM_TOKENS, 3), edge))
-        cache, _ = fuse(cache, tokens, CONFIG)
+        cache = fuse(cache, tokens, CONFIG)
     np.testing.assert_array_equal(np.asarray(cache.means)[0], edge)
     assert int(cache.num_voxels) == 1
 
 
-def test_literal_max_weight_forgets_and_count_keeps_a_true_mean():
-    """ALGORITHM 9.52: with equal confidences the printed rule gives each newcomer weight 1/2."""
+def test_max_weight_forgets_and_count_keeps_the_mean():
+    """With equal confidences the paper's rule gives each new token weight 1/2."""
     values = np.arange(1.0, 9.0)
     expected = {"count": values.mean(), "max": 0.5**7 + np.sum(values[1:] * 0.5 ** np.arange(7, 0, -1))}
     for weight, value in expected.items():
         config = CONFIG.replace(merge_weight=weight, pivots_per_voxel=1)
         tokens = replace(one_voxel(np.ones((8, 4)), np.full(8, 0.5)), rgbs=jnp.zeros((NUM_TOKENS, 12)))
         tokens = replace(tokens, rgbs=tokens.rgbs.at[:8].set(jnp.asarray(values, jnp.float32)[:, None]))
-        cache, _ = fuse(init_cache(config, CAPACITY), tokens, config)
+        cache = fuse(init_cache(config, CAPACITY), tokens, config)
         np.testing.assert_allclose(cache.rgbs[0, 0], value, rtol=VALUE_RTOL)

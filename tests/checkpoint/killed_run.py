@@ -1,4 +1,4 @@
-"""`ssplat run` that notes every chunk it has fed and, if asked to, dies by SIGKILL at a chosen moment of a write.
+"""`ssplat run` that records every chunk it has processed and can kill itself at a chosen step of a file write.
 
     python -m tests.checkpoint.killed_run NOTES MOMENT ARGUMENT...
 
@@ -19,11 +19,11 @@ import time
 from pathlib import Path
 
 STEPS = ("open", "keep", "rename", "sync")
-_latest = ""  # the file that was renamed last
+_latest = ""  # name of the file that was renamed last
 
 
 def step_of(event: str, arguments: tuple) -> tuple[str, str] | None:
-    """(file, step) of an audit event, if it is part of a write."""
+    """Returns (file, step) of an audit event that is part of a write, else None."""
     global _latest
     if event == "os.rename":
         source, target = Path(arguments[0]), Path(arguments[1])
@@ -39,7 +39,7 @@ def step_of(event: str, arguments: tuple) -> tuple[str, str] | None:
 
 
 def die_at(file: str, step: str, count: int, delay: float) -> None:
-    """Arranges the death of this process."""
+    """Makes this process kill itself at the `count`-th `step` of `file`, after `delay` seconds."""
     seen = 0
 
     def die():
@@ -57,7 +57,7 @@ def die_at(file: str, step: str, count: int, delay: float) -> None:
 
 
 def note_chunks(notes: str) -> None:
-    """Lets every fed chunk leave a line in the file `notes`, unbuffered: what is killed flushes nothing."""
+    """Appends a line to `notes` for every processed chunk, unbuffered because a killed process does not flush."""
     from ssplat_jax.streaming.session import Session
 
     feed, descriptor = Session.feed, os.open(notes, os.O_WRONLY | os.O_CREAT | os.O_APPEND)

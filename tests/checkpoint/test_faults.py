@@ -1,4 +1,4 @@
-"""A run that is killed or stopped, at any moment and again and again, ends as if nothing had happened.
+"""A run that is killed or stopped repeatedly at any moment gives the same result as an uninterrupted run.
 
 `pytest -m slow -s tests/checkpoint` prints what the sweep did.
 """
@@ -26,23 +26,23 @@ SIZE = (64, 48)
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 NUM_KILLS = 50
-SAVES_IN_ALL = 50  # that lives let pass before their death; what passes while a kill is on its way comes on top
-LAST_CHUNKS = 6  # so near the end lives die at their first save, so that the stream does not end before the kills do
-TIMEOUT = 600.0  # seconds; a life takes some ten
+SAVES_IN_ALL = 50  # that all lives together complete before they are killed, at least
+LAST_CHUNKS = 6  # this near the end, lives are killed at their first save, so that the stream outlasts the kills
+TIMEOUT = 600.0  # seconds; a life takes about ten
 
-FIELDS_OF_ONE_PROCESS = ("compile_s", "step_memory_bytes")  # of metrics.json: what they say is not about the scene
+FIELDS_OF_ONE_PROCESS = ("compile_s", "step_memory_bytes")  # fields of metrics.json that do not depend on the scene
 
 pytestmark = pytest.mark.slow
 
 
 class Life(NamedTuple):
-    saves: int  # to let pass
-    step: str | None  # of the next save, at which the process dies; None: at a random moment after the last of them
-    delay: float  # seconds, or of a life without saves and step a share of the time to the first save
+    saves: int  # completed before the kill
+    step: str | None  # step of the next save at which the process is killed; None: at a random moment after the saves
+    delay: float  # seconds; for a life without saves and step, a share of the time to the first save
 
 
 def plan(rng: np.random.Generator) -> list[Life]:
-    """Half of the deaths at random moments, half inside a save: one delayed into the bytes, one at each other step."""
+    """Half of the kills are at random moments, half inside a save: while it writes, or at one of the other steps."""
     saves = rng.multinomial(SAVES_IN_ALL, np.full(NUM_KILLS, 1 / NUM_KILLS))
     lives = []
     for number, passed in enumerate(saves):
@@ -55,7 +55,7 @@ def plan(rng: np.random.Generator) -> list[Life]:
 
 
 def write_capture(folder: Path) -> Path:
-    """A walk through the procedural room as a transforms.json capture: opening it renders nothing."""
+    """Writes a walk through the procedural room as a transforms.json capture, which opens without rendering."""
     images, _, camtoworlds, Ks = procedural_capture_arrays("room", NUM_CHUNKS * CHUNK_SIZE, SIZE[1], SIZE[0], seed=0)
     (folder / "images").mkdir(parents=True)
     frames = []
@@ -70,7 +70,7 @@ def write_capture(folder: Path) -> Path:
 
 
 class Runs:
-    """`ssplat run` of one capture into one folder, life after life."""
+    """Repeated `ssplat run` of one capture into one folder."""
 
     def __init__(self, capture: Path, out: Path, save_every: int = 1) -> None:
         self.out, self.state, self.notes = out, out / "state.npz", out.with_suffix(".notes")
@@ -79,12 +79,12 @@ class Runs:
     def start(self, moment: str = "-") -> subprocess.Popen:
         self.notes.unlink(missing_ok=True)
         command = [sys.executable, "-m", "tests.checkpoint.killed_run", str(self.notes), moment, *self.arguments]
-        # XLA's own log speaks of the processor when it takes a program from the tests' cache.
+        # XLA logs messages about the processor when it loads a program from the tests' cache.
         quiet = {**os.environ, "TF_CPP_MIN_LOG_LEVEL": "3"}
         return subprocess.Popen(command, cwd=ROOT, env=quiet, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
     def end(self, process: subprocess.Popen) -> tuple[int, str]:
-        """(exit code, stderr) of a process that will end by itself."""
+        """Waits for a process and returns its exit code and stderr."""
         _, errors = process.communicate(timeout=TIMEOUT)
         assert "Traceback" not in errors, errors
         return process.returncode, errors
@@ -94,7 +94,7 @@ class Runs:
         assert code == 0, errors
 
     def fed(self) -> list[int]:
-        """The numbers of the chunks that the last life fed."""
+        """Numbers of the chunks that the last life processed."""
         return [int(line) for line in self.notes.read_text().split()] if self.notes.exists() else []
 
     def chunks_on_disk(self) -> int:
@@ -106,7 +106,7 @@ class Runs:
         return not self.state.exists() and previous_path(self.state).exists()
 
     def wait_for(self, process: subprocess.Popen, happened) -> float:
-        """Seconds until `happened()`; it must, before the process ends."""
+        """Seconds until `happened()`, which must become true before the process ends."""
         since = time.monotonic()
         while not happened():
             assert process.poll() is None, "the process ended early: " + self.end(process)[1]
@@ -115,7 +115,7 @@ class Runs:
         return time.monotonic() - since
 
     def results(self) -> dict[str, bytes | dict]:
-        """Everything that the finished run is judged by."""
+        """Contents of all results of the finished run."""
         files = [self.state, self.out / "scene.ply", *sorted((self.out / "views").iterdir())]
         metrics = json.loads((self.out / "metrics.json").read_text())
         contents: dict[str, bytes | dict] = {file.name: file.read_bytes() for file in files}
@@ -143,7 +143,7 @@ def assert_equal(results, wanted):
 
 
 def live_and_die(runs: Runs, life: Life, time_to_save: float) -> tuple[float, str]:
-    """One life; the seconds to its first save, where that was looked at (else infinity), and its stderr."""
+    """Runs one life; returns the seconds to its first save (infinity if not measured) and its stderr."""
     if life.step is not None:
         process, waited = runs.start(f"state.npz,{life.step},{life.saves + 1},{life.delay}"), np.inf
     else:
@@ -166,7 +166,7 @@ def modified(path: Path) -> int | None:
         return None
 
 
-def test_50_kills_at_random_moments_and_inside_saves_change_nothing(capture, uninterrupted, tmp_path):
+def test_kills_at_random_moments_and_in_saves_change_nothing(capture, uninterrupted, tmp_path):
     runs = Runs(capture, tmp_path / "killed")
     since, time_to_save = time.monotonic(), 5.0
     torn, reached, lost = 0, [], []
@@ -179,7 +179,7 @@ def test_50_kills_at_random_moments_and_inside_saves_change_nothing(capture, uni
         time_to_save = min(time_to_save, waited)
         torn += runs.state.with_suffix(".npz.partial").exists() or runs.is_between_renames()
         after, fed = runs.chunks_on_disk(), runs.fed()
-        # A life goes on from the state on disk; of what it feeds, at most the chunks since its last save are lost.
+        # A life continues from the state on disk and loses at most the chunks since its last save.
         assert fed == list(range(before + 1, before + 1 + len(fed)))
         assert before <= after and (not fed or fed[-1] - after <= 1)
         assert errors.count("Continuing from the state saved before") == len(errors.splitlines()) <= was_between
@@ -187,7 +187,7 @@ def test_50_kills_at_random_moments_and_inside_saves_change_nothing(capture, uni
         lost.append(fed[-1] - after if fed else 0)
         reached.append(after)
     assert reached[-1] < NUM_CHUNKS, "the kills must come before the end of the stream"
-    for file in ("scene.ply", "00000.png", "metrics.json"):  # and while the results are written
+    for file in ("scene.ply", "00000.png", "metrics.json"):  # kills while the results are written
         code, errors = runs.end(runs.start(f"{file},rename,1,0"))
         assert code == -signal.SIGKILL, errors
     runs.to_the_end()
@@ -202,8 +202,8 @@ def test_50_kills_at_random_moments_and_inside_saves_change_nothing(capture, uni
     )
 
 
-def test_sigterm_and_ctrl_c_save_and_exit_with_143_and_130(capture, uninterrupted, tmp_path):
-    runs = Runs(capture, tmp_path / "stopped", save_every=1000)  # so that every state but the last is the signal's
+def test_sigterm_and_ctrl_c_save_the_state_before_exiting(capture, uninterrupted, tmp_path):
+    runs = Runs(capture, tmp_path / "stopped", save_every=1000)  # so that all states but the last are due to signals
     for number, code in ((signal.SIGTERM, 143), (signal.SIGINT, 130)):
         before = runs.chunks_on_disk()
         process = runs.start()

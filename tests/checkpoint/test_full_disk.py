@@ -1,8 +1,7 @@
-"""A disk that is full at any moment of a run, and damaged state files: exit code 3 or a word on stderr, never a wrong
-result, and the same command finishes once there is room.
+"""Runs on a full disk or with damaged state files end with exit code 3 or a warning, never with a wrong result.
 
-Every change that a run asks of the disk is met with an error once: the opening of a file for writing, each folder and
-rename (`refuse`), the writing itself, part of the way (`write`), and what brings it to the disk (`fsync`).
+The same command finishes the run once there is space. Every request to the disk fails once: opening a file for writing,
+creating a folder and renaming (`refuse`), writing after some bytes (`write`), and syncing (`fsync`).
 """
 
 import errno
@@ -19,7 +18,8 @@ import numpy as np
 import pytest
 
 from ssplat_jax.checkpoint.stream_state import load_newest_state
-from ssplat_jax.commands import main as cli
+from ssplat_jax.commands import run_command
+from ssplat_jax.commands.main import main
 from ssplat_jax.errors import StorageError
 from ssplat_jax.storage.atomic import previous_path, write_atomic
 from ssplat_jax.streaming.session import Session
@@ -35,14 +35,14 @@ KINDS = ("refuse", "write", "fsync")
 
 
 class Killed(BaseException):
-    """Ends a run where it stands: nothing of the program catches it."""
+    """Ends a run immediately, since the program does not catch it."""
 
 
 FULL = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 class Disk:
-    """Counts what is asked of the disk for paths that begin with `prefix`; the `failing`-th request of a kind fails.
+    """Counts the disk requests of one kind for paths that begin with `prefix`; the `failing`-th one fails.
 
     For `write`, the kernel lets the file grow to `limit` bytes and no further; else `error` is raised.
     """
@@ -52,8 +52,8 @@ class Disk:
     ) -> None:
         self.prefix, self.kind, self.failing, self.limit, self.error = str(prefix), kind, failing, limit, error
         self.count = 0
-        self.sizes: list[int] = []  # of the files written, in order
-        self.states_saved = 0  # before the failure
+        self.sizes: list[int] = []  # sizes of the written files, in order
+        self.states_saved = 0  # number of states saved before the failure
         self.failed_file = ""
 
     def __enter__(self) -> "Disk":
@@ -69,15 +69,15 @@ class Disk:
         resource.setrlimit(resource.RLIMIT_FSIZE, self._limits)
 
     def heard(self, event: str, arguments: tuple) -> None:
-        """An audit event of the process; it comes before what it announces, and an exception prevents that."""
+        """Handles an audit event, which precedes the operation; an exception prevents the operation."""
         if event not in ("open", "os.rename", "os.mkdir", "os.link", "os.truncate", "os.remove"):
             return
         path = str(arguments[0])
         if not path.startswith(self.prefix):
             return
-        resource.setrlimit(resource.RLIMIT_FSIZE, self._limits)  # the file that could not grow has been closed
+        resource.setrlimit(resource.RLIMIT_FSIZE, self._limits)  # the file with the limit has been closed
         is_read = event == "open" and not arguments[2] & (os.O_WRONLY | os.O_RDWR)
-        # These need no room; a folder is opened to try whether files can be made in it (`make_writable`).
+        # These need no space; `make_writable` opens a folder to check that files can be created in it.
         if event == "os.remove" or is_read or (event in ("os.mkdir", "open") and os.path.isdir(path)):
             return
         if event == "open" and self.kind == "write" and self._is_next(path):
@@ -101,7 +101,7 @@ class Disk:
         return True
 
 
-_watching: list[Disk] = []  # audit hooks cannot be removed: the one there is asks who listens
+_watching: list[Disk] = []  # audit hooks cannot be removed, so one hook serves all
 
 
 def _hook(event, arguments):
@@ -117,7 +117,7 @@ sys.addaudithook(_hook)
 
 @pytest.fixture(scope="module", autouse=True)
 def _compiled_once():
-    """All runs are of one configuration and size: they share their programs, compiled plainly, and the weights."""
+    """All runs have the same configuration and size, and share weights and programs, compiled without optimization."""
     programs: dict = {}
     program = Session._program
 
@@ -127,7 +127,7 @@ def _compiled_once():
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Session, "_program", shared)
-        patch.setattr(cli, "load_model", functools.cache(cli.load_model))
+        patch.setattr(run_command, "load_model", functools.cache(run_command.load_model))
         before = jax.config.read("jax_disable_most_optimizations")
         jax.config.update("jax_disable_most_optimizations", True)
         yield
@@ -140,23 +140,23 @@ def capture(tmp_path_factory):
 
 
 def run(capture: Path, out: Path) -> int:
-    changes = (f"chunk_size={CHUNK_SIZE}", "min_confidence=0", "capacity=1024")  # a small cache is drawn quickly
+    changes = (f"chunk_size={CHUNK_SIZE}", "min_confidence=0", "capacity=1024")  # a small cache is fast to render
     options = ("--save-every", "1", "--set", *changes, "--quiet")
     with pytest.raises(SystemExit) as stopped:
-        cli.main(["run", str(capture), "--out", str(out), *options])
+        main(["run", str(capture), "--out", str(out), *options])
     return int(stopped.value.code or 0)
 
 
 @pytest.fixture(scope="module")
 def undisturbed(capture, tmp_path_factory):
-    """The folder of a run with nothing in its way."""
+    """Folder of an undisturbed run."""
     out = tmp_path_factory.mktemp("disk") / "undisturbed"
     assert run(capture, out) == 0
     return out
 
 
 def contents(out: Path) -> dict[str, bytes | dict]:
-    """Every file below `out` but what was put aside as damaged, of metrics.json what is about the scene."""
+    """Contents of all files below `out`, without damaged states and the process-dependent fields of metrics.json."""
     files = [p for p in out.rglob("*") if p.is_file() and p.suffix != ".damaged"]
     found: dict[str, bytes | dict] = {str(p.relative_to(out)): p.read_bytes() for p in files}
     if "metrics.json" in found:
@@ -174,11 +174,11 @@ def views_done(out: Path) -> int:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_full_disk_at_every_write_is_exit_3_and_costs_nothing(kind, capture, undisturbed, tmp_path, capsys):
+def test_a_full_disk_at_any_write_loses_no_saved_state(kind, capture, undisturbed, tmp_path, capsys):
     with Disk(tmp_path / "count", kind) as disk:
         assert run(capture, tmp_path / "count") == 0
     num_requests, sizes, wanted = disk.count, disk.sizes, contents(undisturbed)
-    num_files = NUM_CHUNKS + len(list(undisturbed.rglob("*.*"))) - 2  # of the states there are two names in the end
+    num_files = NUM_CHUNKS + len(list(undisturbed.rglob("*.*"))) - 2  # the states end up in two files
     assert num_requests >= num_files * {"refuse": 2, "write": 1, "fsync": 2}[kind]
     rng = np.random.default_rng(0)
     capsys.readouterr()
@@ -190,7 +190,7 @@ def test_a_full_disk_at_every_write_is_exit_3_and_costs_nothing(kind, capture, u
         lines = capsys.readouterr().err.splitlines()
         assert code == 3 and len(lines) == 1 and lines[0].startswith("ssplat: "), (disk.failed_file, code, lines)
         assert "cannot be" in lines[0] and "; " in lines[0] and str(out) in lines[0], lines
-        # What was saved before loads, and no file is there in part.
+        # The state saved before can be loaded, and no file is incomplete.
         assert views_done(out) >= CHUNK_SIZE * disk.states_saved, disk.failed_file
         left = contents(out) if out.exists() else {}
         finished = {name for name in left if not name.startswith("state")}
@@ -207,7 +207,7 @@ def test_a_full_disk_at_every_write_is_exit_3_and_costs_nothing(kind, capture, u
 
 
 def damage(contents: bytes, number: int, rng: np.random.Generator) -> bytes:
-    """A flipped bit, or every fourth time a cut."""
+    """Flips a bit, or truncates every fourth time."""
     at = int(rng.integers(len(contents)))
     if number % 4 == 3:
         return contents[:at]
@@ -215,7 +215,7 @@ def damage(contents: bytes, number: int, rng: np.random.Generator) -> bytes:
 
 
 @pytest.mark.slow
-def test_a_damaged_state_is_said_and_the_one_before_it_continued(capture, undisturbed, tmp_path, capsys):
+def test_a_damaged_state_gives_a_warning_and_the_previous_one(capture, undisturbed, tmp_path, capsys):
     wanted, rng = contents(undisturbed), np.random.default_rng(0)
     for number in range(NUM_DAMAGES):
         out = shutil.copytree(undisturbed, tmp_path / str(number))
@@ -229,7 +229,7 @@ def test_a_damaged_state_is_said_and_the_one_before_it_continued(capture, undist
 
 
 @pytest.mark.slow
-def test_two_damaged_states_are_refused_by_the_newest_one_s_name(capture, undisturbed, tmp_path, capsys):
+def test_the_error_about_two_damaged_states_names_the_newest(capture, undisturbed, tmp_path, capsys):
     out = shutil.copytree(undisturbed, tmp_path / "out")
     for state in (out / "state.npz", previous_path(out / "state.npz")):
         state.write_bytes(state.read_bytes()[:-1])
@@ -242,9 +242,9 @@ def test_two_damaged_states_are_refused_by_the_newest_one_s_name(capture, undist
 
 
 @pytest.mark.slow
-def test_a_damaged_state_never_takes_the_place_of_the_good_one(capture, undisturbed, tmp_path):
-    """A run that is killed on its way to the first state after a damaged one: there is always one that loads."""
-    # The damaged one put aside; the good one put back; the new one opened; the good one kept; the new one renamed.
+def test_a_damaged_state_never_replaces_the_good_one(capture, undisturbed, tmp_path):
+    """If a run is killed before it saves the first state after a damaged one, a state can still be loaded."""
+    # Requests: rename the damaged state, restore the good one, open the new one, keep the good one, rename the new one.
     for request in range(1, 6):
         out = shutil.copytree(undisturbed, tmp_path / str(request))
         (out / "state.npz").write_bytes(b"damaged")
@@ -256,7 +256,7 @@ def test_a_damaged_state_never_takes_the_place_of_the_good_one(capture, undistur
 
 
 @pytest.mark.parametrize("failing", ["keep", "rename"])
-def test_a_rename_that_fails_leaves_the_file_in_its_place(failing, tmp_path, monkeypatch):
+def test_a_failed_rename_leaves_the_file_in_place(failing, tmp_path, monkeypatch):
     path, renamed = tmp_path / "file", []
     write_atomic(path, b"old", keep_previous=True)
     replace = os.replace

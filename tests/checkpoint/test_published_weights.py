@@ -1,10 +1,10 @@
-"""ReSplat's checkpoints: every tensor finds its place, and what is no such file is refused."""
+"""Import of ReSplat's checkpoints: every tensor has its place, and other files are refused."""
 
 import jax
 import numpy as np
 import pytest
 
-from ssplat_jax.checkpoint.published_weights import DEPTH, import_params, tensor_of, tensors_of
+from ssplat_jax.checkpoint.published_weights import DEPTH, import_params, published_tensor, published_tensors
 from ssplat_jax.checkpoint.weights import load_params
 from ssplat_jax.config import StreamConfig, preset
 from ssplat_jax.errors import InputError
@@ -17,21 +17,21 @@ HEAD = "encoder.gaussian_head."
 
 @pytest.fixture(scope="module")
 def tensors() -> dict[str, np.ndarray]:
-    """A checkpoint with numbers that say where they belong."""
-    shapes = {t.name: t.shape for t in tensors_of(CONFIG).values() if t is not None}
+    """Checkpoint in which every tensor has its own constant value."""
+    shapes = {t.name: t.shape for t in published_tensors(CONFIG).values() if t is not None}
     return {name: np.full(shape, i, np.float32) for i, (name, shape) in enumerate(shapes.items())}
 
 
 @pytest.fixture(scope="module")
 def depth_network(tensors, tmp_path_factory):
-    """Without what stands behind the depth, and without the names of what it stood in."""
+    """File of the depth network alone, without the prefix of the model around it."""
     path = tmp_path_factory.mktemp("upstream") / "depth.npz"
     np.savez(path, **{name.removeprefix(DEPTH): x for name, x in tensors.items() if name.startswith(DEPTH)})
     return path
 
 
-def test_every_tensor_of_the_authors_list_has_a_place_and_its_shape():
-    ours = {t.name: t.shape for t in tensors_of(preset("small")).values() if t is not None}
+def test_every_published_tensor_has_a_place_and_a_shape():
+    ours = {t.name: t.shape for t in published_tensors(preset("small")).values() if t is not None}
     assert ours == listed_tensors("resplat_small")
 
 
@@ -64,29 +64,29 @@ def test_every_tensor_of_the_authors_list_has_a_place_and_its_shape():
     ],
 )
 def test_a_parameter_is_found_by_its_name(place, shape, name, theirs):
-    tensor = tensor_of(tuple(place.split("/")), shape)
+    tensor = published_tensor(tuple(place.split("/")), shape)
     assert tensor is not None and (tensor.name, tensor.shape) == (name, theirs)
     x = np.random.default_rng(0).normal(size=theirs)
     came = tensor.to_parameter(x)
     assert came.shape == shape
-    if len(shape) > 1:  # entry (in 2, out 4); transposed convolutions have them in that order there too
+    if len(shape) > 1:  # entry (in 2, out 4); the order differs for transposed convolutions
         index = (2, 4) if theirs[0] == 5 else (4, 2)
         np.testing.assert_array_equal(came[..., 2, 4].reshape(-1), x[index].reshape(-1))
 
 
-def test_hpda_and_cgfi_are_of_no_checkpoint():
-    assert tensor_of(("hpda", "raw_gamma"), ()) is None
-    assert tensor_of(("cgfi", "enter", "kernel"), (3, 3, 5, 7)) is None
+def test_hpda_and_cgfi_have_no_published_tensor():
+    assert published_tensor(("hpda", "raw_gamma"), ()) is None
+    assert published_tensor(("cgfi", "enter", "kernel"), (3, 3, 5, 7)) is None
 
 
-def test_a_depth_network_by_itself_leaves_the_rest_fresh(depth_network, tensors):
+def test_a_depth_network_leaves_other_parts_initialized(depth_network, tensors):
     imported = import_params(depth_network, CONFIG, seed=5)
-    assert imported.fresh == ("gaussian_regressor", "pt", "gaussian_head")
+    assert imported.initialized_parts == ("gaussian_regressor", "pt", "gaussian_head")
     assert imported.num_imported == sum(name.startswith(DEPTH) for name in tensors) and imported.num_unused == 0
     wanted = jax.eval_shape(lambda key: init_params(key, CONFIG), jax.random.key(0))
     shapes = lambda tree: jax.tree.map(lambda x: (x.shape, x.dtype), tree)  # noqa: E731
     assert shapes(imported.params) == shapes(wanted)
-    for place, tensor in tensors_of(CONFIG).items():
+    for place, tensor in published_tensors(CONFIG).items():
         if tensor is not None and tensor.name.startswith(DEPTH):
             leaf = imported.params
             for name in place.split("/"):
@@ -97,7 +97,7 @@ def test_a_depth_network_by_itself_leaves_the_rest_fresh(depth_network, tensors)
         jax.tree.map(np.testing.assert_array_equal, imported.params[name], stage)
 
 
-def test_of_another_network_the_depth_alone_can_be_taken(tmp_path, tensors):
+def test_the_depth_network_of_depthsplat_can_be_imported(tmp_path, tensors):
     path = tmp_path / "depthsplat.ckpt.npz"
     other = {f"{HEAD}0.weight": np.zeros((37, 64, 3, 3), np.float32), "encoder.feature_upsampler.x": np.zeros(3)}
     pretrained = {name: x for name, x in tensors.items() if ".pretrained." in name or ".backbone." in name}
@@ -106,8 +106,8 @@ def test_of_another_network_the_depth_alone_can_be_taken(tmp_path, tensors):
         import_params(path, CONFIG)
     imported = import_params(path, CONFIG, depth_only=True)
     assert imported.num_imported == len(pretrained) and imported.num_unused == 2
-    assert {"transformer", "upsampler", "regressor", "gaussian_head"} <= set(imported.fresh)
-    assert not {"backbone", "pretrained"} & set(imported.fresh)
+    assert {"transformer", "upsampler", "regressor", "gaussian_head"} <= set(imported.initialized_parts)
+    assert not {"backbone", "pretrained"} & set(imported.initialized_parts)
     name = f"{DEPTH}backbone.conv1.weight"
     assert float(imported.params["encoder"]["backbone"]["conv1"]["kernel"][0, 0, 0, 0]) == tensors[name].flat[0]
 
@@ -117,7 +117,7 @@ def saved(path, **arrays):
     return path
 
 
-def test_what_is_no_checkpoint_of_resplat_is_refused(tmp_path, tensors):
+def test_files_of_other_networks_are_refused(tmp_path, tensors):
     head = {name: x for name, x in tensors.items() if name.startswith(HEAD)}
     path = tmp_path / "a.npz"
     with pytest.raises(InputError, match=r"wanted a preset of ReSplat's network \(small, base\), got 'tiny'"):
@@ -134,7 +134,7 @@ def test_what_is_no_checkpoint_of_resplat_is_refused(tmp_path, tensors):
         import_params(tmp_path / "nothing.pth", CONFIG)
 
 
-def test_only_presets_with_weights_are_named_as_such():
+def test_errors_list_only_presets_with_shipped_weights():
     with pytest.raises(InputError, match=r"a preset with shipped weights \(tiny\) or a file, got 'huge'"):
         load_params("huge")
 

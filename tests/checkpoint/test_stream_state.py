@@ -1,4 +1,4 @@
-"""State on disk: read back exactly, or refused by name."""
+"""Stream states on disk are read back exactly, or refused by name."""
 
 import contextlib
 import json
@@ -25,7 +25,7 @@ CHUNKS = [to_jax(Recipe(seed, "few", "normal", "random").tokens()) for seed in r
 def stream(chunks):
     cache = init_cache(CONFIG, CAPACITY)
     for tokens in chunks:
-        cache, _ = fuse(cache, tokens, CONFIG)
+        cache = fuse(cache, tokens, CONFIG)
     return cache
 
 
@@ -54,20 +54,20 @@ def test_state_is_read_back_to_the_last_bit(saved):
     assert_identical(cache, stream(CHUNKS[:3]))
 
 
-def test_caches_of_several_streams_are_refused_and_nothing_is_written(saved, tmp_path):
+def test_batches_of_caches_are_refused_and_not_written(saved, tmp_path):
     caches = jax.tree.map(lambda x: jnp.stack([x, x])[None], load_state(saved)[0])
     with pytest.raises(InputError, match=r"\[1, 2\].*one at a time"):
         save_state(tmp_path / "state.npz", caches, HEADER)
     assert not list(tmp_path.iterdir())
 
 
-def test_11_saving_in_mid_stream_gives_the_same_continuation(saved):
+def test_saving_mid_stream_gives_the_same_continuation(saved):
     cache, _ = load_state(saved)
-    cache, _ = fuse(cache, CHUNKS[3], CONFIG)
+    cache = fuse(cache, CHUNKS[3], CONFIG)
     assert_identical(cache, stream(CHUNKS))
 
 
-def test_bfloat16_and_empty_caches_survive(tmp_path):
+def test_empty_and_bfloat16_caches_are_read_back(tmp_path):
     cache = init_cache(CONFIG, CAPACITY)
     cache = replace(cache, feats=cache.feats.astype(jnp.bfloat16))
     save_state(tmp_path / "empty.npz", cache, {})
@@ -87,7 +87,7 @@ def test_any_reader_of_npz_can_open_it(saved):
 
 
 def refuse_but_load_previous(damaged, previous):
-    """The file is refused by name; with a good one before it, that one is loaded, and the refusal handed on."""
+    """Checks that a damaged file is refused by name, and that a good previous one is loaded instead."""
     with pytest.raises(StorageError, match=r"damaged\.npz"):
         load_state(damaged)
     shutil.copy(previous, previous_path(damaged))
@@ -98,7 +98,7 @@ def refuse_but_load_previous(damaged, previous):
 def test_no_flipped_bit_is_loaded(saved, previous, tmp_path):
     contents, rng = bytearray(saved.read_bytes()), np.random.default_rng(0)
     damaged = tmp_path / "damaged.npz"
-    ends = [*range(64), *range(len(contents) - 100, len(contents))]  # zip's own records and the seal
+    ends = [*range(64), *range(len(contents) - 100, len(contents))]  # records of the zip format, and the checksum
     for byte in [*rng.integers(0, len(contents), 300), *ends]:
         flipped = contents.copy()
         flipped[byte] ^= 1 << rng.integers(8)
@@ -113,7 +113,7 @@ def test_no_truncated_file_is_loaded(saved, previous, tmp_path):
         refuse_but_load_previous(damaged, previous)
 
 
-def test_foreign_files_and_no_file_are_refused(tmp_path):
+def test_foreign_and_missing_files_are_refused(tmp_path):
     np.savez(tmp_path / "foreign.npz", x=np.zeros(3))
     for name in ("foreign.npz", "absent.npz"):
         with pytest.raises(StorageError, match=name):
@@ -139,7 +139,7 @@ def test_the_previous_state_is_used_when_the_newest_is_corrupt(tmp_path):
 
 @contextlib.contextmanager
 def full_disk(size):
-    """Lets no file grow beyond `size`; only around the call, since the test's own log is a file too."""
+    """Limits the size of files; use it only around the call, since it affects the log of the tests too."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
     try:

@@ -1,4 +1,4 @@
-"""A training goes on from the newest checkpoint that is whole, and never from a damaged one."""
+"""Training continues from the newest intact checkpoint, never from a damaged one."""
 
 import gc
 
@@ -10,7 +10,7 @@ import pytest
 from ssplat_jax.checkpoint.training_state import TrainingCheckpoints
 from ssplat_jax.errors import StorageError
 
-# Orbax leaves tasks behind where a damaged file stops it.
+# Orbax leaves unfinished tasks behind when it reads a damaged file.
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 
 STATE = {"weights": jnp.linspace(-1.0, 1.0, 5000).reshape(50, 100), "step": jnp.array(0, jnp.int32)}
@@ -19,7 +19,7 @@ STATE = {"weights": jnp.linspace(-1.0, 1.0, 5000).reshape(50, 100), "step": jnp.
 @pytest.fixture(autouse=True)
 def _nothing_left_behind():
     yield
-    gc.collect()  # what they complain of when they go is not the next test's
+    gc.collect()  # their warnings must not appear in the next test
 
 
 def state_of(step: int):
@@ -34,7 +34,7 @@ def saved(folder, *steps: int) -> None:
 
 
 def restored(folder):
-    """What a new process finds, and what it was told."""
+    """Returns what a new process restores, and the warnings."""
     told = []
     checkpoints = TrainingCheckpoints(folder, {})
     try:
@@ -44,7 +44,7 @@ def restored(folder):
 
 
 def files_of(folder, step: int):
-    """The files of a checkpoint that hold something, largest first: arrays before their descriptions."""
+    """Returns the non-empty files of a checkpoint, largest first: arrays before their descriptions."""
     found = [p for p in (folder / "checkpoints" / str(step)).rglob("*") if p.is_file() and p.stat().st_size]
     return sorted(found, key=lambda p: -p.stat().st_size)
 
@@ -60,7 +60,7 @@ def assert_state(found, step: int) -> None:
     jax.tree.map(np.testing.assert_array_equal, found[1], state_of(step))
 
 
-def test_the_newest_is_restored_and_nothing_is_said(tmp_path):
+def test_the_newest_checkpoint_is_restored_without_warning(tmp_path):
     assert restored(tmp_path) == (None, [])
     saved(tmp_path, 1, 2, 3)
     found, told = restored(tmp_path)
@@ -69,7 +69,7 @@ def test_the_newest_is_restored_and_nothing_is_said(tmp_path):
 
 
 def test_no_flipped_bit_is_restored(tmp_path):
-    """Wherever it is: the state is the newest as it was saved, or the one before, which is said."""
+    """The restored state is the newest, unchanged, or the previous one with a warning."""
     saved(tmp_path, 1, 2)
     original = {path: path.read_bytes() for path in files_of(tmp_path, 2)}
     random, num_fallen_back = np.random.default_rng(0), 0
@@ -84,16 +84,16 @@ def test_no_flipped_bit_is_restored(tmp_path):
         else:
             assert_state(found, 2)
         path.write_bytes(original[path])
-        assert number or told  # the first is the largest array: no part of it is to spare
+        assert number or told  # the first file is the largest array, in which every bit matters
     assert num_fallen_back >= 3
 
 
-def test_training_goes_on_after_a_damaged_checkpoint(tmp_path):
+def test_training_continues_after_a_damaged_checkpoint(tmp_path):
     saved(tmp_path, 1, 2)
     files_of(tmp_path, 2)[0].write_bytes(b"")
     checkpoints, told = TrainingCheckpoints(tmp_path, {}), []
     assert_state(checkpoints.restore_latest(STATE, told.append), 1)
-    checkpoints.save(2, state_of(2))  # the step that was lost, once more
+    checkpoints.save(2, state_of(2))  # the damaged step again
     checkpoints.close()
     assert len(told) == 1 and (tmp_path / "damaged-2").is_dir()
     found, told = restored(tmp_path)
@@ -101,7 +101,7 @@ def test_training_goes_on_after_a_damaged_checkpoint(tmp_path):
     assert told == []
 
 
-def test_where_all_are_damaged_that_is_said_and_nothing_moved(tmp_path):
+def test_an_error_is_raised_if_all_checkpoints_are_damaged(tmp_path):
     saved(tmp_path, 1, 2)
     for step in (1, 2):
         files_of(tmp_path, step)[0].unlink()

@@ -15,31 +15,28 @@ import pytest
 from PIL import Image
 
 from ssplat_jax.checkpoint.delta_files import load_delta, load_delta_header
-from ssplat_jax.checkpoint.published_weights import tensors_of
+from ssplat_jax.checkpoint.published_weights import published_tensors
 from ssplat_jax.checkpoint.stream_state import load_state
 from ssplat_jax.checkpoint.weights import load_params, load_weights, save_weights
-from ssplat_jax.commands import main as cli
+from ssplat_jax.commands.main import COMMANDS, main
+from ssplat_jax.commands.options import apply_changes
 from ssplat_jax.config import StreamConfig, preset
-from ssplat_jax.evaluation import evaluate
+from ssplat_jax.evaluation import latency
 from ssplat_jax.scene_files.ply import load_ply
 from ssplat_jax.streaming.scene_delta import apply_delta
 from ssplat_jax.streaming.streamsplat import StreamSplat
 from tests.model.resplat_fixture import named_tensor
 
-COMMANDS = (
-    *("demo", "inspect", "run", "eval", "train", "export", "render", "view", "import-weights", "bench", "experiment"),
-)
-
 
 @pytest.fixture(autouse=True)
 def few_pivots(monkeypatch):
     """Scenes this small are not decoded and rendered at the size of large ones."""
-    monkeypatch.setattr("ssplat_jax.streaming.session.FEWEST_DECODED", 1 << 11)
+    monkeypatch.setattr("ssplat_jax.streaming.session.MIN_DECODED_PIVOTS", 1 << 11)
 
 
 def run(*arguments: str) -> int:
     with pytest.raises(SystemExit) as stopped:
-        cli.main(list(arguments))
+        main(list(arguments))
     return int(stopped.value.code or 0)
 
 
@@ -130,7 +127,7 @@ def test_bad_capture_is_one_line_exit_2_and_nothing_written(case, command, tmp_p
 @pytest.mark.parametrize("place", ["views", "deltas", "images"])
 @pytest.mark.parametrize("command", ["eval", "run"])
 def test_results_among_the_captures_own_images_are_refused(command, place, tmp_path, capsys):
-    """What a run writes over and clears may be what it reads."""
+    """A run overwrites and clears files of its folder, so its images must not lie there."""
     make_capture(tmp_path / place)
     before = {path: path.read_bytes() for path in tmp_path.rglob("*.*")}
     options = ("--context", "5") if command == "eval" else ("--overwrite",)
@@ -193,8 +190,8 @@ def test_inspect_prints_json(capsys):
     ],
 )
 def test_set_takes_what_the_field_holds(change, field, value):
-    changed = cli.apply_changes(preset("tiny"), (change,))
-    assert getattr(changed, field) == value and type(getattr(changed, field)) is type(value)
+    changed = apply_changes(preset("tiny"), (change,))
+    assert changed.get(field) == value and type(changed.get(field)) is type(value)
     hash(changed)
 
 
@@ -263,7 +260,7 @@ def test_run_stops_resumes_and_exports(tmp_path, capsys):
     assert "differs in its poses" in capsys.readouterr().err
 
 
-def test_more_room_the_remedy_for_a_run_that_stopped_for_want_of_it_goes_on_with_what_was_saved(tmp_path):
+def test_a_run_continues_with_a_larger_capacity(tmp_path):
     out, capture = tmp_path / "run", str(make_capture(tmp_path / "capture", num_frames=8, size=(64, 48)))
     assert run("run", capture, "--out", str(out), "--set", "overflow=error", "--quiet") == 0
     scene = (out / "scene.ply").read_bytes()
@@ -273,7 +270,7 @@ def test_more_room_the_remedy_for_a_run_that_stopped_for_want_of_it_goes_on_with
 
 
 def test_eval_writes_every_promised_field(tmp_path, monkeypatch):
-    monkeypatch.setattr(evaluate, "LATENCY_REPEATS", 1)  # how often it times is not what is tested
+    monkeypatch.setattr(latency, "NUM_REPEATS", 1)  # how often it times is not what is tested
     out = tmp_path / "eval"
     capture = make_capture(tmp_path / "capture", num_frames=12, size=(128, 96))
     arguments = ("eval", str(capture), "--context", "8", "--out", str(out), "--quiet")
@@ -298,7 +295,9 @@ def test_eval_writes_every_promised_field(tmp_path, monkeypatch):
 
 @pytest.mark.slow  # compiles a network of 62 million parameters
 def test_imported_weights_stream_a_capture(tmp_path, capsys):
-    tensors = {t.name: named_tensor(t.name, t.shape) for t in tensors_of(preset("small")).values() if t is not None}
+    tensors = {
+        t.name: named_tensor(t.name, t.shape) for t in published_tensors(preset("small")).values() if t is not None
+    }
     np.savez(tmp_path / "upstream.npz", **tensors)
     assert run("import-weights", str(tmp_path / "upstream.npz"), "--out", str(tmp_path / "small.npz")) == 0
     assert "701 tensors (0 not used); fresh: HPDA and CGFI" in capsys.readouterr().out

@@ -94,7 +94,7 @@ def test_a_scene_counted_from_an_offset_is_seen_where_it_is(tmp_path, capture):
     ("mode", "name", "words"),
     [("2dgs", "scene.ply", "2dgs"), ("mip", "other.ply", "other.ply"), ("mip", "empty", "scene.ply")],
 )
-def test_what_cannot_be_rendered_is_said_in_a_line_and_nothing_written(mode, name, words, tmp_path, capture, capsys):
+def test_unrenderable_input_is_refused_and_nothing_written(mode, name, words, tmp_path, capture, capsys):
     ss.save_ply(tmp_path / "scene.ply", scene(), render_mode=mode)
     (tmp_path / "empty").mkdir()
     out = tmp_path / "out"
@@ -103,7 +103,7 @@ def test_what_cannot_be_rendered_is_said_in_a_line_and_nothing_written(mode, nam
     assert words in line and not out.exists()
 
 
-def test_an_offset_that_is_none_is_refused(tmp_path, capture, capsys):
+def test_a_malformed_offset_is_refused(tmp_path, capture, capsys):
     ss.save_ply(tmp_path / "scene.ply", scene(), offset=SHIFT)
     data = (tmp_path / "scene.ply").read_bytes()
     (tmp_path / "scene.ply").write_bytes(data.replace(b"offset 4096.0", b"offset 4096,0"))
@@ -141,7 +141,7 @@ def test_a_film_goes_from_camera_to_camera(tmp_path, capture):
 
 
 @pytest.mark.parametrize(("film", "words"), [("0", "film"), ("-3", "film"), ("2", 'pip install "ssplat-jax[video]"')])
-def test_a_film_that_cannot_be_made_is_said_and_nothing_written(film, words, tmp_path, capture, capsys, monkeypatch):
+def test_an_impossible_film_is_refused_and_nothing_written(film, words, tmp_path, capture, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "av", None)  # not installed
     ss.save_ply(tmp_path / "scene.ply", scene())
     out = tmp_path / "out"

@@ -1,4 +1,4 @@
-"""The way of a film's camera: through every camera it is given, smoothly, and never anything but a rotation."""
+"""Camera paths: they pass through every given camera, are smooth, and have rigid poses."""
 
 import numpy as np
 import pytest
@@ -27,22 +27,22 @@ def test_the_path_passes_through_every_camera(steps):
     Ks = K * np.linspace(1, 2, 7)[:, None, None]
     path, path_Ks = camera_path(given, Ks, steps)
     assert len(path) == len(path_Ks) == 6 * steps + 1
-    assert np.abs(path[::steps] - given).max() < 1e-8  # a part in 1e15 of the coordinates
+    assert np.abs(path[::steps] - given).max() < 1e-8  # relative to the coordinates: 1e-15
     assert np.abs(path_Ks[::steps] - Ks).max() < 1e-12
     np.testing.assert_allclose(path_Ks[:, 0, 0], np.linspace(50, 100, 6 * steps + 1))
 
 
 def test_uniform_motion_stays_uniform():
-    turns, ways = np.arange(5)[:, None] * [0.0, 0.3, 0.0], np.arange(5)[:, None] * [1.0, -2.0, 0.5]
-    path, _ = camera_path(poses(turns, ways), np.tile(K, (5, 1, 1)), 10)
+    rotvecs, centers = np.arange(5)[:, None] * [0.0, 0.3, 0.0], np.arange(5)[:, None] * [1.0, -2.0, 0.5]
+    path, _ = camera_path(poses(rotvecs, centers), np.tile(K, (5, 1, 1)), 10)
     np.testing.assert_allclose(path[:, :3, 3], np.arange(41)[:, None] / 10 * [1.0, -2.0, 0.5], atol=1e-12)
     angles = Rotation.from_matrix(path[:, :3, :3]).as_rotvec()
     assert np.abs(angles[:, [0, 2]]).max() < 1e-12
-    # A chord cut into equal parts is an arc cut into nearly equal ones, least so beyond the ends.
+    # Equal parts of a chord are nearly equal parts of the arc; the deviation is largest at the ends.
     assert np.abs(angles[:, 1] - 0.03 * np.arange(41)).max() < 2e-3
 
 
-def test_every_pose_on_the_way_is_rigid_and_the_way_has_no_corners():
+def test_every_pose_on_the_path_is_rigid_and_the_path_is_smooth():
     steps = 200
     path, _ = camera_path(wandering(), np.tile(K, (7, 1, 1)), steps)
     rotations = path[:, :3, :3]
@@ -51,11 +51,11 @@ def test_every_pose_on_the_way_is_rigid_and_the_way_has_no_corners():
     np.testing.assert_array_equal(path[:, 3], np.tile([0.0, 0.0, 0.0, 1.0], (len(path), 1)))
     velocities = np.diff(path[:, :3], axis=0) * steps
     changes = np.abs(np.diff(velocities, axis=0)).max(axis=(1, 2))
-    assert changes.max() < 0.15  # a corner would be a change of the size of the velocity
+    assert changes.max() < 0.15  # a corner would change the velocity by its own size
     assert np.abs(velocities).max() > 1.0
 
 
-def test_cameras_that_look_away_from_each_other_are_joined_by_rotations():
+def test_cameras_looking_apart_are_joined_by_rotations():
     angle = np.radians(120)
     path, _ = camera_path(poses([[0, 0, 0], [0, angle, 0]], np.zeros((2, 3))), np.tile(K, (2, 1, 1)), 30)
     turns = Rotation.from_matrix(path[:, :3, :3]).as_rotvec()

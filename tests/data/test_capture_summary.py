@@ -1,4 +1,4 @@
-"""What `ssplat inspect` is given: facts of the capture, and warnings that name a remedy."""
+"""Summaries of captures: facts, and warnings that name a remedy."""
 
 import json
 
@@ -7,10 +7,10 @@ import pytest
 
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.data.capture_summary import summarize
-from tests.data.test_depth_range import two_planes
+from tests.data.planes_fixture import two_planes
 
 
-def test_facts_and_the_numbers_a_run_would_use():
+def test_summaries_agree_with_the_stream_frame():
     capture, config = two_planes(8, 0.2), StreamConfig()
     summary = summarize(capture, config)
     assert (summary.num_frames, summary.num_depth_maps, summary.size) == (8, 8, (160, 120))

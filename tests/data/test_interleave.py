@@ -1,4 +1,4 @@
-"""Dealing video out: which frames share a chunk."""
+"""Interleaving of video: which frames share a chunk."""
 
 import numpy as np
 import pytest
@@ -6,9 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.data.interleave import MOST_HANDS, deal
+from ssplat_jax.data.interleave import MAX_INTERLEAVED_CHUNKS, interleave
 from ssplat_jax.data.stream_frame import StreamFrame
-from tests.data.test_depth_range import two_planes
+from tests.data.planes_fixture import two_planes
 
 
 def along_a_line(steps):
@@ -16,35 +16,35 @@ def along_a_line(steps):
     return np.stack([x, np.zeros_like(x), np.zeros_like(x)], axis=-1)
 
 
-def test_slow_video_is_dealt_so_that_a_chunk_steps_as_wanted():
-    order = deal(along_a_line([0.01] * 23), list(range(100, 124)), chunk_size=4, step=0.03)
+def test_slow_video_is_interleaved_to_the_wanted_step():
+    order = interleave(along_a_line([0.01] * 23), list(range(100, 124)), chunk_size=4, step=0.03)
     assert order[:12] == [100, 103, 106, 109, 101, 104, 107, 110, 102, 105, 108, 111]
     assert order[12:16] == [112, 115, 118, 121]
 
 
 @pytest.mark.parametrize("step", [0.0, 0.03, 0.035])
 def test_frames_that_step_far_enough_stay_in_order(step):
-    assert deal(along_a_line([0.03] * 19), list(range(20)), 4, step) == list(range(20))
+    assert interleave(along_a_line([0.03] * 19), list(range(20)), 4, step) == list(range(20))
 
 
 def test_frames_that_do_not_move_stay_in_order():
-    assert deal(np.zeros((9, 3)), list(range(9)), 4, 0.03) == list(range(9))
+    assert interleave(np.zeros((9, 3)), list(range(9)), 4, 0.03) == list(range(9))
 
 
 def test_speed_is_judged_block_by_block():
-    """A slow stretch is dealt, a fast one after it is not."""
-    order = deal(along_a_line([0.01] * 36 + [0.05] * 35), list(range(72)), 4, 0.03)
+    """A slow part is interleaved, a fast part after it is not."""
+    order = interleave(along_a_line([0.01] * 36 + [0.05] * 35), list(range(72)), 4, 0.03)
     assert order[:4] == [0, 3, 6, 9] and order[-16:] == list(range(56, 72))
 
 
-def test_a_capture_deals_what_it_streams_unless_it_is_told_the_frames():
-    capture = two_planes(16, 0.01)  # at a depth of 2 to 4
+def test_a_capture_is_interleaved_unless_frames_are_given():
+    capture = two_planes(16, 0.01)  # depths from 2 to 4
     frame = StreamFrame.at_camera(np.eye(4), scale=1.0, near=2.0, far=4.0)
     centers = [np.asarray(chunk.viewmats)[:, 0, 3] for chunk in capture.chunks(StreamConfig(), frame=frame)]
-    np.testing.assert_allclose(centers[0], [0, -0.04, -0.08, -0.12], atol=1e-7)  # all 16 at once, in four hands
+    np.testing.assert_allclose(centers[0], [0, -0.04, -0.08, -0.12], atol=1e-7)  # one block of four chunks
     np.testing.assert_allclose(centers[1], [-0.01, -0.05, -0.09, -0.13], atol=1e-7)
-    told = next(capture.chunks(StreamConfig(), range(16), frame=frame))
-    np.testing.assert_allclose(np.asarray(told.viewmats)[:, 0, 3], [0, -0.01, -0.02, -0.03], atol=1e-7)
+    in_order = next(capture.chunks(StreamConfig(), range(16), frame=frame))
+    np.testing.assert_allclose(np.asarray(in_order.viewmats)[:, 0, 3], [0, -0.01, -0.02, -0.03], atol=1e-7)
 
 
 @settings(max_examples=200, deadline=None)
@@ -53,14 +53,14 @@ def test_a_capture_deals_what_it_streams_unless_it_is_told_the_frames():
     st.integers(1, 5),
     st.floats(0, 2),
 )
-def test_every_frame_once_and_none_waits_for_more_than_a_block(steps, chunk_size, step):
+def test_interleaving_is_a_permutation_within_blocks(steps, chunk_size, step):
     n = len(steps) + 1
-    order = deal(along_a_line(steps), list(range(n)), chunk_size, step)
+    order = interleave(along_a_line(steps), list(range(n)), chunk_size, step)
     assert sorted(order) == list(range(n))
-    # When a frame is streamed, no frame more than a block ahead of it has been.
-    assert max(abs(place - frame) for place, frame in enumerate(order)) < chunk_size * MOST_HANDS
+    # A frame moves by less than a block.
+    assert max(abs(place - frame) for place, frame in enumerate(order)) < chunk_size * MAX_INTERLEAVED_CHUNKS
 
 
 def test_units_do_not_matter():
     centers = along_a_line(np.random.default_rng(0).uniform(0, 0.05, 40))
-    assert deal(centers, list(range(41)), 4, 0.03) == deal(1024 * centers, list(range(41)), 4, 1024 * 0.03)
+    assert interleave(centers, list(range(41)), 4, 0.03) == interleave(1024 * centers, list(range(41)), 4, 1024 * 0.03)

@@ -1,4 +1,4 @@
-"""Lens distortion: the model against its inverse, images against what a pinhole camera sees, refusals."""
+"""Lens distortion: the model against its inverse, undistorted images against pinhole images, refusals."""
 
 import dataclasses
 
@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from ssplat_jax.data.capture import open_capture
-from ssplat_jax.data.lens import Lens, check_lens, undistorted
+from ssplat_jax.data.lens import Lens, check_lens, undistort
 from ssplat_jax.errors import InputError
-from tests.data.test_capture import HEIGHT, WIDTH, make
+from tests.badinputs.cases import HEIGHT, WIDTH, make_capture
 
 WIDE, HIGH = 160, 120
 K = np.array([[130.0, 0, 83.0], [0, 128.0, 58.0], [0, 0, 1]])
@@ -20,13 +20,13 @@ LENSES = [
 
 
 def scene(pixels):
-    """A smooth picture as a function of pinhole pixels."""
+    """Smooth image as a function of pinhole pixels."""
     x, y = pixels[..., 0], pixels[..., 1]
     return np.stack([np.sin(x / 9) * np.cos(y / 11), np.cos(x / 13 + y / 17), np.sin((x - y) / 15)], -1) / 2 + 0.5
 
 
 def pinhole_pixels(lens, pixels):
-    """Inverse of `Lens.pixels` by fixed-point steps."""
+    """Inverse of `Lens.pixels` by fixed-point iteration."""
     found = pixels.copy()
     for _ in range(60):
         found -= lens.pixels(K, found) - pixels
@@ -42,7 +42,7 @@ def centers():
 def test_undistorted_is_what_a_pinhole_camera_sees(lens):
     assert check_lens(lens, K, WIDE, HIGH, "here") > 0.5
     stored = scene(pinhole_pixels(lens, centers())).astype(np.float32)
-    delivered, expected = undistorted(stored, lens, K), scene(centers())
+    delivered, expected = undistort(stored, lens, K), scene(centers())
     source = lens.pixels(K, centers())
     inside = ((source > 1) & (source < (WIDE - 1, HIGH - 1))).all(-1)
     assert inside.mean() > 0.9
@@ -52,13 +52,13 @@ def test_undistorted_is_what_a_pinhole_camera_sees(lens):
 
 def test_no_distortion_changes_nothing():
     image = scene(centers()).astype(np.float32)
-    np.testing.assert_allclose(undistorted(image, Lens(), K), image, atol=1e-6)
+    np.testing.assert_allclose(undistort(image, Lens(), K), image, atol=1e-6)
     assert check_lens(Lens(), K, WIDE, HIGH, "here") == 0
 
 
 def test_depth_is_not_mixed_across_edges():
     depth = np.where(centers()[..., 0] < 70, 1.0, 5.0).astype(np.float32)
-    assert set(np.unique(undistorted(depth, LENSES[0], K, order=0))) == {1.0, 5.0}
+    assert set(np.unique(undistort(depth, LENSES[0], K, order=0))) == {1.0, 5.0}
 
 
 @pytest.mark.parametrize("lens", [Lens(k1=-3.0), Lens(k1=1e308), Lens(k1=50.0), Lens(p1=5.0)], ids=str)
@@ -67,17 +67,17 @@ def test_lenses_that_fold_the_image_are_refused(lens):
         check_lens(lens, K, WIDE, HIGH, "here")
 
 
-def test_a_capture_is_delivered_undistorted_and_says_so(tmp_path):
-    straight = open_capture(make(tmp_path / "a", lambda root, meta: None))
-    bent = open_capture(make(tmp_path / "b", lambda root, meta: meta.update(k1=-0.2, p1=0.01)))
+def test_a_capture_is_undistorted_and_reports_it(tmp_path):
+    straight = open_capture(make_capture(tmp_path / "a", lambda root, meta: None))
+    bent = open_capture(make_capture(tmp_path / "b", lambda root, meta: meta.update(k1=-0.2, p1=0.01)))
     assert any("undone" in note for note in bent.notes) and not straight.notes
     frame = bent.frames[0]
     assert frame.lens == Lens(k1=-0.2, p1=0.01)
-    expected = undistorted(straight.image(0), frame.lens, frame.K)
+    expected = undistort(straight.image(0), frame.lens, frame.K)
     np.testing.assert_array_equal(bent.image(0), expected)
     assert np.abs(expected - straight.image(0)).max() > 0.01
     assert bent.image(0).shape == (HEIGHT, WIDTH, 3)
     same_files = dataclasses.replace(
         straight, frames=tuple(dataclasses.replace(f, lens=frame.lens) for f in straight.frames)
     )
-    assert same_files.digest([0]) != straight.digest([0])  # another lens is another capture
+    assert same_files.digest([0]) != straight.digest([0])  # the digest depends on the lens

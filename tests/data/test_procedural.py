@@ -1,4 +1,4 @@
-"""What procedural samples promise: determinism, free space, units and parallax."""
+"""Procedural samples: determinism, free space, units and parallax."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ from ssplat_jax.data.procedural.textures import texture_library
 from ssplat_jax.errors import InputError
 
 NUM_SEEDS = 30
-MARGIN = 1.02  # a probe an eighth as fine misses the nearest and farthest points by a little
+MARGIN = 1.02  # the low-resolution probe slightly misses the nearest and farthest points
 
 
 @pytest.fixture(scope="module")
@@ -44,14 +44,14 @@ def test_parallax_of_training_samples(samples):
     baselines = np.array([relative_baselines(depths, poses) for _, depths, poses, _ in samples])
     medians = np.median(baselines, axis=1)
     assert medians.min() > 0.003 and medians.max() < 0.46
-    # Video and photo sets: a tenth of the samples steps less than 1.5 %, a tenth more than 15 % of the median depth.
+    # Steps over median depth: below 1.5 % (video) in a tenth of the samples, above 15 % (sets of photos) in another.
     assert np.quantile(medians, 0.1) < 0.015 and np.quantile(medians, 0.9) > 0.15
     assert 0.02 < np.median(medians) < 0.1
     ratios = baselines.max(axis=1) / medians
-    assert ratios.min() < 1.5 and ratios.max() > 2  # even walks and irregular ones
+    assert ratios.min() < 1.5 and ratios.max() > 2  # even paths and irregular ones
 
 
-def test_images_of_training_samples_are_exposed(samples):
+def test_training_images_are_well_exposed(samples):
     for images, _, _, _ in samples:
         assert images.min() >= 0 and images.max() <= 1 and images.dtype == np.float32
         assert 0.2 < images.mean() < 0.7
@@ -68,7 +68,7 @@ def test_training_cameras_are_varied_and_rigid(samples):
 
 
 def test_cameras_stand_upright(samples):
-    """+y of the camera leans to +y of the world, which is down."""
+    """The camera's +y axis points roughly along the world's +y axis, down."""
     for _, _, poses, _ in samples:
         assert poses[:, 1, 1].min() > 0.2
 
@@ -91,7 +91,7 @@ def test_same_seed_same_scene(kind):
 @pytest.mark.parametrize("kind", SCENE_KINDS)
 @pytest.mark.parametrize("path", PATH_KINDS)
 def test_cameras_stay_in_free_space(kind, path):
-    """All but a few walks: a scene so full that a walk cannot start is thrown away by `training_sample`."""
+    """Some paths may fail: `training_sample` discards scenes that are too full for a path to start."""
     free = []
     for seed in range(6):
         scene = sample_scene(seed, kind)
@@ -141,10 +141,10 @@ def test_captures_are_smooth_and_free(name):
     assert turns.min() > np.cos(np.radians(25))
     steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=-1)
     assert steps.max() < 3 * steps.min()
-    assert np.median(steps) < 0.4 * np.median(depths)  # a third of the demo's frames
+    assert np.median(steps) < 0.4 * np.median(depths)  # with a third of the demo's frames
 
 
-def test_bad_names_are_refused():
+def test_unknown_kinds_are_refused():
     scene = sample_scene(0)
     with pytest.raises(InputError, match="nowhere"):
         sample_scene(0, "nowhere")

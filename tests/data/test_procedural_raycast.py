@@ -1,4 +1,4 @@
-"""The ray-caster against analytic rays in float64, and the laws that exact depth obeys between views."""
+"""Ray caster: comparison with analytic rays in float64, and consistency of depth between views."""
 
 import numpy as np
 import pytest
@@ -9,9 +9,9 @@ from ssplat_jax.data.procedural.paths import look_at
 from ssplat_jax.data.procedural.textures import TextureLibrary, pack_pyramids
 
 HEIGHT, WIDTH = 48, 64
-DEPTH_TOLERANCE = 2e-5  # relative; float32 rounds a slab's distance a few times
-REPROJECTION_TOLERANCE = 0.02  # relative; bilinear depth is off by the curvature within a pixel
-COLOR_TOLERANCE = 1.5 / 255  # texels are 8 bit
+DEPTH_TOLERANCE = 2e-5  # relative; a few float32 roundings
+REPROJECTION_TOLERANCE = 0.02  # relative; bilinear depth ignores the curvature within a pixel
+COLOR_TOLERANCE = 1.5 / 255  # texels have 8 bits
 
 
 def inverted(poses):
@@ -23,14 +23,14 @@ def intrinsics(num_views=1, focal=50.0):
 
 
 def pixel_rays(pose, K):
-    """Float64 origin and directions (camera z = 1) of all pixels."""
+    """Origin and directions (camera z = 1) of the rays through all pixels, float64."""
     y, x = np.mgrid[0:HEIGHT, 0:WIDTH] + 0.5
     local = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones_like(x)], axis=-1).astype(np.float64)
     return pose[:3, 3].astype(np.float64), local @ pose[:3, :3].T.astype(np.float64)
 
 
 def gray_library():
-    """One white tile, and one whose left half is dark."""
+    """Library of a white tile and a tile with a dark left half."""
     tiles = np.full((2, 256, 256, 3), 255, np.uint8)
     tiles[1, :, :128] = 51
     return TextureLibrary(pack_pyramids(tiles), {"wall": np.array([0, 1])})
@@ -49,7 +49,7 @@ def built(b):
 
 
 def slab_depths(origin, directions, center, half, rotation):
-    """Entry and exit of a turned box."""
+    """Depths at which rays enter and leave a rotated box."""
     start, step = (origin - center) @ rotation, directions @ rotation
     with np.errstate(divide="ignore"):
         a, b = (-half - start) / step, (half - start) / step
@@ -84,7 +84,7 @@ POSE = look_at(np.array([0.3, -0.4, -3.1]), np.array([0.1, 0.1, 0.0])).astype(np
 
 def check_depths(scene, wanted):
     depths = np.asarray(raycast_depths(scene, inverted(POSE[None]), intrinsics(), HEIGHT, WIDTH))[0]
-    # A ray that grazes a silhouette may fall on either side of it.
+    # Rays that graze a silhouette may fall on either side of it.
     ok = np.abs(depths - wanted) <= DEPTH_TOLERANCE * wanted
     assert ok.mean() > 0.998
     jumps = [np.abs(np.diff(wanted, axis=axis, prepend=wanted.take([0], axis))) for axis in (0, 1)]
@@ -110,7 +110,7 @@ def test_dome_closes_the_world():
 
 
 @pytest.mark.parametrize("shape", ["box", "ball", "cylinder"])
-def test_solid_is_met_where_algebra_says(shape):
+def test_solids_are_hit_at_their_analytic_depth(shape):
     b = empty_builder()
     rotation = random_rotation(np.random.default_rng(5))
     center = np.array([0.2, -0.1, 0.4])
@@ -135,7 +135,7 @@ def test_camera_inside_a_solid_sees_beyond_it():
 
 
 def test_glowing_face_shows_its_texel_times_gain():
-    """Up and right: the upper half of a +z wall's picture is above, its u = 0 side is at -x."""
+    """On a wall facing -z, u = 0 is at -x, so the dark half of the tile is on the left."""
     b = empty_builder()
     picture = Finish((1,), tile=0.0, glow=1.0, gain=(0.5, 1.0, 0.25))
     b.box([0, 0, 2.0], [2.0, 2.0, 0.1], picture)
@@ -158,7 +158,7 @@ def test_down_is_the_bottom_of_the_image():
 
 @pytest.mark.parametrize("seed", range(6))
 def test_a_point_has_one_depth_in_every_view(seed):
-    """A pixel's point, seen from another view, lies on that view's surface or behind it: never in front."""
+    """A point seen in one view lies on the surface of another view or behind it, never in front of it."""
     scene = sample_scene(seed)
     poses, Ks = sample_path(seed, scene, None, 4, HEIGHT, WIDTH)
     depths = np.asarray(raycast_depths(scene, inverted(poses), Ks, HEIGHT, WIDTH)).astype(np.float64)
@@ -175,12 +175,12 @@ def test_a_point_has_one_depth_in_every_view(seed):
         fx, fy = u[inside] - x0, v[inside] - y0
         corners = [depths[view][y0 + j, x0 + i] for j in (0, 1) for i in (0, 1)]
         weights = [wy * wx for wy in (1 - fy, fy) for wx in (1 - fx, fx)]
-        # On planes it is the inverse of depth that is linear in the image.
+        # On planes the inverse depth is linear in the image.
         seen = 1 / sum(w / c for w, c in zip(weights, corners, strict=True))
         is_smooth = np.max(corners, axis=0) < 1.1 * np.min(corners, axis=0)
         ratio = (z[inside] / seen)[is_smooth]
         assert (np.abs(ratio - 1) < REPROJECTION_TOLERANCE).mean() > 0.7
-        # Views far apart meet at more grazing angles and edges, where a bilinear depth is between two surfaces.
+        # Distant views have more grazing angles and edges, where a bilinear depth lies between two surfaces.
         assert (ratio < 1 - REPROJECTION_TOLERANCE).mean() < 0.02
 
 
@@ -197,7 +197,7 @@ def test_scaled_scene_looks_the_same_from_scaled_cameras():
 
 @pytest.mark.slow  # renders at four times the size
 def test_supersampling_converges_to_the_mean_of_finer_images():
-    """Two rays a pixel agree with the mean of a four times finer image better than one does."""
+    """Two rays per pixel agree better than one with the mean of an image of four times the resolution."""
     scene = sample_scene(4)
     poses, Ks = sample_path(4, scene, None, 1, HEIGHT, WIDTH)
     fine_K = Ks * np.array([4, 4, 1], np.float32)[:, None]

@@ -1,4 +1,4 @@
-"""Which frames are context and targets: exact first indices, disjointness, refusals."""
+"""Splits into context and targets: exact first indices, disjointness, refusals."""
 
 import hashlib
 import json
@@ -7,41 +7,41 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ssplat_jax.data.split import Split, interleaved, paper
+from ssplat_jax.data.split import Split, interleaved_split, paper_split
 from ssplat_jax.errors import InputError
 
 
 def test_interleaved_first_indices():
-    split = interleaved(1000, stride=5, context=64)
+    split = interleaved_split(1000, stride=5, context=64)
     assert split.context[:8] == (0, 5, 10, 15, 25, 30, 35, 40)
     assert split.targets == (20, 60, 100, 140, 180, 220, 260, 300, 340)
     assert len(split.context) == 64 and split.context[-1] == 5 * 72
-    assert 5 * 76 not in split.targets  # the next target lies beyond the last context view
+    assert 5 * 76 not in split.targets  # the next target lies after the last context view
 
 
 def test_interleaved_of_a_short_orbit():
-    split = interleaved(50, stride=1, context=40)
+    split = interleaved_split(50, stride=1, context=40)
     assert split.targets == (4, 12, 20, 28, 36, 44)
     assert len(split.context) == 40 and split.context[-1] == 45
 
 
 def test_paper_first_indices():
-    split = paper(300, context=24)
+    split = paper_split(300, context=24)
     assert split.targets == (0, 20, 40, 60, 80, 100, 120, 140, 159, 179, 199, 219, 239, 259, 279, 299)
     assert split.context == (*range(1, 20), *range(21, 26))
 
 
-def test_paper_with_anchors_is_scannets():
-    split = paper(2000, context=24, targets=64, anchors=8, thin_to=1088)
+def test_paper_split_of_scannet():
+    split = paper_split(2000, context=24, targets=64, anchors=8, thin_to=1088)
     assert len(split.targets) == 64 and split.targets[0] == 0 and split.targets[-1] == 1999
     anchors, prefix = split.context[:8], split.context[8:]
     assert anchors[-1] > 1990 and list(anchors) == sorted(anchors)
     assert list(prefix) == sorted(prefix) and prefix[-1] < anchors[1]
 
 
-def test_more_context_extends_less():
-    """Scores over V compare prefixes of one order on the same targets."""
-    small, large = paper(400, context=24, anchors=8), paper(400, context=64, anchors=8)
+def test_more_context_extends_a_split():
+    """Scores over the number of views compare prefixes of the same order on the same targets."""
+    small, large = paper_split(400, context=24, anchors=8), paper_split(400, context=64, anchors=8)
     assert large.context[:24] == small.context and large.targets == small.targets
 
 
@@ -49,7 +49,7 @@ def test_more_context_extends_less():
 @given(st.integers(1, 3000), st.integers(1, 20), st.integers(1, 300))
 def test_interleaved_laws(num_frames, stride, context):
     try:
-        split = interleaved(num_frames, stride, context)
+        split = interleaved_split(num_frames, stride, context)
     except InputError:
         return
     assert not set(split.context) & set(split.targets)
@@ -64,7 +64,7 @@ def test_interleaved_laws(num_frames, stride, context):
 @given(st.integers(1, 3000), st.integers(1, 300), st.integers(1, 64), st.integers(0, 8))
 def test_paper_laws(num_frames, context, targets, anchors):
     try:
-        split = paper(num_frames, context, targets=targets, anchors=anchors)
+        split = paper_split(num_frames, context, targets=targets, anchors=anchors)
     except InputError:
         return
     assert not set(split.context) & set(split.targets)
@@ -75,14 +75,14 @@ def test_paper_laws(num_frames, context, targets, anchors):
 @pytest.mark.parametrize(
     ("split", "words"),
     [
-        (lambda: interleaved(50, 1, 64), "44 of 50 frames"),
-        (lambda: interleaved(0, 1, 4), "0 of 0 frames"),
-        (lambda: interleaved(50, 1, 4), "span a target"),
-        (lambda: interleaved(50, 0, 4), "stride"),
-        (lambda: interleaved(50, 1, 0), "context"),
-        (lambda: paper(30, 24), "14 of 30 frames"),
-        (lambda: paper(300, 4, anchors=5), "anchors"),
-        (lambda: paper(300, 4, targets=0), "targets"),
+        (lambda: interleaved_split(50, 1, 64), "44 of 50 frames"),
+        (lambda: interleaved_split(0, 1, 4), "0 of 0 frames"),
+        (lambda: interleaved_split(50, 1, 4), "span a target"),
+        (lambda: interleaved_split(50, 0, 4), "stride"),
+        (lambda: interleaved_split(50, 1, 0), "context"),
+        (lambda: paper_split(30, 24), "14 of 30 frames"),
+        (lambda: paper_split(300, 4, anchors=5), "anchors"),
+        (lambda: paper_split(300, 4, targets=0), "targets"),
     ],
 )
 def test_impossible_splits_are_refused(split, words):
@@ -90,15 +90,15 @@ def test_impossible_splits_are_refused(split, words):
         split()
 
 
-def test_json_and_hash_name_the_split():
-    split = interleaved(50, 1, 8)
+def test_json_and_digest_identify_the_split():
+    split = interleaved_split(50, 1, 8)
     assert json.loads(split.to_json()) == {
         "protocol": "interleaved",
         "context": [0, 1, 2, 3, 5, 6, 7, 8],
         "targets": [4],
     }
     assert split.sha256 == hashlib.sha256(split.to_json().encode()).hexdigest()
-    assert split.sha256 != interleaved(50, 1, 9).sha256
+    assert split.sha256 != interleaved_split(50, 1, 9).sha256
 
 
 def test_a_split_with_a_shared_frame_cannot_be_made():

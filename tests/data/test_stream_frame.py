@@ -1,4 +1,4 @@
-"""The stream frame is a similarity: it undoes itself, and what a camera sees does not depend on it."""
+"""Stream frames: they can be inverted, and do not change what a camera sees."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,7 +14,7 @@ FLOAT64_ROUNDING = 1e-12
 FLOAT32_PIXELS = 2e-3  # 1000 pixels x float32's 1e-7 x a dozen operations
 FLOAT32_ROUNDING = 2e-6
 
-EARTH = np.array([4.2e6, 6.1e5, 4.7e6])  # earth-centered meters: float32 has a step of 0.5 m there
+EARTH = np.array([4.2e6, 6.1e5, 4.7e6])  # earth-centered meters, where float32 has a spacing of 0.5 m
 
 
 def random_rotation(rng):
@@ -34,7 +34,7 @@ def frame_at(pose, scale=1.7):
 
 
 @pytest.mark.parametrize("origin", [np.zeros(3), EARTH])
-def test_points_come_back(origin):
+def test_points_survive_a_round_trip(origin):
     rng = np.random.default_rng(0)
     frame = frame_at(random_pose(rng, origin))
     points = origin + rng.normal(size=(50, 3))
@@ -47,7 +47,7 @@ def test_first_camera_is_the_origin_and_looks_along_z():
     np.testing.assert_allclose(frame_at(pose).viewmats(pose), np.eye(4), rtol=0, atol=FLOAT64_ROUNDING)
 
 
-def test_cameras_come_back():
+def test_cameras_survive_a_round_trip():
     rng = np.random.default_rng(2)
     frame = frame_at(random_pose(rng, np.ones(3)))
     poses = np.stack([random_pose(rng, rng.normal(size=3)) for _ in range(5)])
@@ -71,7 +71,7 @@ def test_a_point_is_seen_at_the_same_pixel_and_at_scaled_depth(origin):
     np.testing.assert_allclose(depths, frame.scale * in_camera[:, 2], rtol=FLOAT32_ROUNDING * 4)
 
 
-def test_moving_or_turning_the_capture_changes_nothing_in_the_stream():
+def test_the_stream_does_not_depend_on_the_capture_pose():
     rng = np.random.default_rng(4)
     poses = np.stack([random_pose(rng, rng.normal(size=3)) for _ in range(4)])
     move = random_pose(rng, EARTH)
@@ -110,8 +110,8 @@ def test_gaussians_in_the_capture_frame_are_the_same_ellipsoids():
     np.testing.assert_allclose(after.sh, before.sh, rtol=0, atol=FLOAT32_ROUNDING)
 
 
-def test_a_scene_far_smaller_than_its_distance_keeps_its_points_apart():
-    """Centimetres at 0.3 of a unit of kilometres: whole units would count positions from 0 again."""
+def test_a_small_scene_far_from_the_origin_keeps_its_points():
+    """A scene of centimeters in units of kilometers: an offset in whole units would be zero."""
     rng = np.random.default_rng(6)
     frame = frame_at(random_pose(rng, np.array([0.3, -0.4, 0.2])), scale=1e6)
     before = gaussians(rng, 0)
@@ -121,7 +121,7 @@ def test_a_scene_far_smaller_than_its_distance_keeps_its_points_apart():
 
 
 def legendre_color(sh, direction):
-    """Color of degree-1 SH as every splat viewer computes it."""
+    """Color of SH of degree 1, as splat viewers compute it."""
     x, y, z = direction
     c0, c1 = 0.28209479177387814, 0.4886025119029199
     return 0.5 + c0 * sh[0] - c1 * y * sh[1] + c1 * z * sh[2] - c1 * x * sh[3]
@@ -148,8 +148,8 @@ def test_sh_rotation_is_orthogonal_and_a_homomorphism(degree):
     np.testing.assert_allclose(sh_rotation(a @ b, degree), mixing @ sh_rotation(b, degree), rtol=0, atol=1e-11)
 
 
-def test_far_from_the_origin_means_keep_what_float32_can_hold():
-    """The stated limit of `gaussians_to_capture`."""
+def test_means_far_from_the_origin_have_float32_precision():
+    """This is the documented limit of `gaussians_to_capture`."""
     rng = np.random.default_rng(8)
     frame = frame_at(random_pose(rng, np.array([1e5, 0.0, 0.0])), scale=1.0)
     before = gaussians(rng, 0)

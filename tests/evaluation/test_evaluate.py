@@ -9,14 +9,11 @@ import pytest
 from ssplat_jax.cache import init_cache
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.data.capture import open_capture
-from ssplat_jax.evaluation import evaluate
-from ssplat_jax.evaluation.evaluate import (
-    exposures_from_json,
-    exposures_to_json,
-    measure_latency,
-    nearest_contexts,
-    score_view,
-)
+from ssplat_jax.evaluation import latency
+from ssplat_jax.evaluation.exposures import exposures_from_json, exposures_to_json
+from ssplat_jax.evaluation.latency import measure_latency
+from ssplat_jax.evaluation.nearest_views import nearest_views
+from ssplat_jax.evaluation.scoring import score_view
 from ssplat_jax.gaussians import Gaussians, mean_color
 from ssplat_jax.metrics.lpips import load_lpips, lpips
 from ssplat_jax.metrics.psnr_ssim import psnr
@@ -48,35 +45,37 @@ def capture():
     return open_capture("procedural:room?frames=5&size=32x24")
 
 
-def test_a_view_that_nothing_covers_is_scored_on_the_mean_color(capture):
+def test_an_uncovered_view_is_scored_on_the_mean_color(capture):
     frame = capture.stream_frame(StreamConfig(), (0, 1, 3, 4))
-    score, color, depth = score_view(gaussians([[0.2, 0.4, 0.6]], [0.9]), capture, 0, frame, {})
+    view = score_view(gaussians([[0.2, 0.4, 0.6]], [0.9]), capture, 0, frame, {})
+    score, color, depth = view.score, view.color, view.depth
     np.testing.assert_allclose(color, np.broadcast_to([0.2, 0.4, 0.6], color.shape), atol=1e-6)
     target = capture.image(0)
     assert score.psnr == pytest.approx(psnr(color, target)) and score.coverage == 0 and not depth.any()
     assert score.psnr_over_black == pytest.approx(psnr(np.zeros_like(target), target))
 
 
-def test_a_view_is_shown_at_the_mean_exposure_of_the_nearest_that_were_streamed(capture):
+def test_a_novel_view_has_the_mean_exposure_of_its_neighbors(capture):
     frame, scene = capture.stream_frame(StreamConfig(), (0, 1, 3, 4)), gaussians([[0.2, 0.4, 0.6]], [0.9])
     exposures = {
         i: np.array(e, np.float64) for i, e in {0: [9, 9, 9], 1: [0.5, 1, 2], 3: [0.5, 1, 1], 4: [1, 1, 4]}.items()
     }
-    assert nearest_contexts(capture, 2, tuple(exposures))[-1] == 0  # three are averaged
-    score, color, _ = score_view(scene, capture, 2, frame, exposures)
+    assert nearest_views(capture, 2, tuple(exposures))[-1] == 0  # three are averaged
+    view = score_view(scene, capture, 2, frame, exposures)
+    score, color = view.score, view.color
     wanted = [0.2 * 0.25 ** (1 / 3), 0.4, 1.0]  # 1.2 is clipped
     np.testing.assert_allclose(color, np.broadcast_to(wanted, color.shape), atol=1e-6)
     assert score.psnr == pytest.approx(psnr(color, capture.image(2)))
-    plain, _, _ = score_view(scene, capture, 2, frame, {})
+    plain = score_view(scene, capture, 2, frame, {}).score
     assert score.psnr_one_exposure == pytest.approx(plain.psnr) and score.psnr != pytest.approx(plain.psnr)
-    _, color, _ = score_view(scene, capture, 4, frame, exposures)  # a streamed view has its own
+    color = score_view(scene, capture, 4, frame, exposures).color  # a streamed view has its own
     np.testing.assert_allclose(color, np.broadcast_to([0.2, 0.4, 1.0], color.shape), atol=1e-6)
 
 
 @pytest.mark.parametrize(("overflow", "capacity"), [("grow", 256), ("error", 256), ("drop_new", 128)])
-def test_making_room_is_no_part_of_a_chunks_time(overflow, capacity, capture, monkeypatch):
+def test_growing_the_cache_is_not_timed(overflow, capacity, capture, monkeypatch):
     """A cache that the next chunk might not fit is doubled before the clock starts, and given back as it was."""
-    monkeypatch.setattr(evaluate, "LATENCY_REPEATS", 1)
+    monkeypatch.setattr(latency, "NUM_REPEATS", 1)
 
     capacities = []
 
@@ -96,19 +95,20 @@ def test_making_room_is_no_part_of_a_chunks_time(overflow, capacity, capture, mo
     assert milliseconds["render_ms"] > 0
 
 
-def test_exposures_survive_a_file_to_the_last_bit():
+def test_exposures_are_exact_in_json():
     exposures = {7: np.array([1 / 3, 0.1, 2.0], np.float32), 0: np.ones(3, np.float32)}
     back = exposures_from_json(json.loads(json.dumps(exposures_to_json(exposures))))
     assert back.keys() == exposures.keys()
     assert all(np.array_equal(back[i], exposures[i]) and back[i].dtype == np.float32 for i in back)
 
 
-def test_lpips_is_scored_where_weights_are_given_and_absent_where_not(capture, compiled_plainly, tmp_path):
+def test_lpips_is_scored_if_and_only_if_weights_are_given(capture, compiled_plainly, tmp_path):
     np.savez(tmp_path / "vgg.npz", **random_vgg())
     np.savez(tmp_path / "heads.npz", **random_heads())
     weights = load_lpips(tmp_path / "vgg.npz", tmp_path / "heads.npz")
     scene, frame = gaussians([[0.2, 0.4, 0.6]], [0.9]), capture.stream_frame(StreamConfig(), (0, 1, 3, 4))
-    score, color, _ = score_view(scene, capture, 2, frame, {}, weights)
+    view = score_view(scene, capture, 2, frame, {}, weights)
+    score, color = view.score, view.color
     expected = float(lpips(weights, jnp.asarray(color), jnp.asarray(capture.image(2))))
     assert score.lpips == pytest.approx(expected, rel=1e-5) and expected > 0.1
-    assert score_view(scene, capture, 2, frame, {})[0].lpips is None
+    assert score_view(scene, capture, 2, frame, {}).score.lpips is None

@@ -9,7 +9,9 @@ from ssplat_experiments.ablation import table
 from ssplat_experiments.accuracy_vs_time import SCORED, SETTINGS, mark_front
 from ssplat_experiments.depth_error import cell_depths, summary
 
-from ssplat_jax.commands.main import Experiment, QualityName, guarded
+from ssplat_jax.commands.experiment_command import Experiment
+from ssplat_jax.commands.main import guarded
+from ssplat_jax.commands.options import QualityName
 from ssplat_jax.config import QUALITIES
 
 
@@ -17,7 +19,7 @@ def row(ms, psnr):
     return {"ms_per_view": ms, "psnr": psnr}
 
 
-def test_the_front_holds_what_nothing_beats_in_both():
+def test_the_front_holds_undominated_settings():
     rows = [row(10, 15.0), row(20, 14.0), row(20, 18.0), row(5, 12.0), row(30, 18.0), row(40, 18.5)]
     mark_front(rows)
     for a in rows:
@@ -29,11 +31,11 @@ def test_the_qualities_are_settings_that_were_measured():
     measured = {setting.quality: setting for setting in SETTINGS if setting.quality}
     assert measured.keys() == QUALITIES.keys() == set(get_args(QualityName))
     for name, quality in QUALITIES.items():
-        assert measured[name].changes == dict(quality.changes)
+        assert measured[name].changes == {}  # a quality changes the size only
         assert measured[name].size == tuple(quality.scale * side for side in SCORED)
 
 
-def test_depth_errors_are_free_of_one_global_scale_and_binned_by_confidence():
+def test_depth_errors_ignore_scale_and_are_binned():
     confidences = np.array([0.2, 0.55, 0.65, 0.95, 1.0])
     row = summary(3.0 * np.array([2.0, 1.1, 1.0, 1.0, 1.02]), confidences, tau=0.5)
     assert row["accepted"] == 0.8 and row["global_scale"] == pytest.approx(3.03)
@@ -42,7 +44,7 @@ def test_depth_errors_are_free_of_one_global_scale_and_binned_by_confidence():
     assert sum(entry["tokens"] for entry in row["by_confidence"]) == 5
 
 
-def test_a_cell_s_depth_is_the_median_of_what_is_known_of_it():
+def test_a_cells_depth_is_the_median_of_its_known_depths():
     depth = np.zeros((9, 8), np.float32)
     depth[:4, :4] = np.arange(1, 17).reshape(4, 4)
     depth[:2, 4:] = 5.0
@@ -50,7 +52,7 @@ def test_a_cell_s_depth_is_the_median_of_what_is_known_of_it():
     np.testing.assert_array_equal(cell_depths(depth), [[8.0, 5.0], [0.0, 0.0]])
 
 
-def test_variants_are_compared_with_the_full_model_of_the_same_seed():
+def test_variants_are_compared_with_the_same_seed():
     """Seeds move all scores alike: the difference's spread is not that of the scores."""
     scores = {"full": (20.0, 22.0, 24.0), "without HPDA": (19.9, 21.8, 23.9), "without CGFI": (20.5,)}
     rows = [
@@ -70,7 +72,7 @@ def test_every_registered_experiment_can_be_loaded():
     assert all(callable(point.load()) for point in points)
 
 
-def test_an_unknown_experiment_is_refused_before_anything_is_written(tmp_path, capsys):
+def test_an_unknown_experiment_is_refused_at_once(tmp_path, capsys):
     assert guarded(Experiment("no_such", out=tmp_path / "out").run) == 2
     assert "accuracy_vs_time" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()

@@ -1,4 +1,4 @@
-"""Cameras against float64: frames, pixels, and the one convention of pixel centers."""
+"""Cameras against float64: frames, projection, and pixel centers; and voxel indices."""
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,7 @@ RELATIVE = 2e-6
 
 
 def poses(num: int, reach: float, seed: int = 0) -> np.ndarray:
-    """Random rigid transforms in float64, translations up to `reach`."""
+    """Random rigid transforms in float64 with translations up to `reach`."""
     rng = np.random.default_rng(seed)
     out = np.tile(np.eye(4), (num, 1, 1))
     for pose in out:
@@ -23,7 +23,7 @@ def poses(num: int, reach: float, seed: int = 0) -> np.ndarray:
 
 
 def intrinsics(num: int, seed: int = 0) -> np.ndarray:
-    """Off-center, anisotropic."""
+    """Random intrinsics with different focal lengths and an off-center principal point."""
     rng = np.random.default_rng(seed)
     Ks = np.tile(np.eye(3), (num, 1, 1))
     Ks[:, 0, 0], Ks[:, 1, 1] = rng.uniform(200, 900, (2, num))
@@ -43,7 +43,7 @@ def test_inverse_of_poses():
         np.testing.assert_allclose(back, matrices, atol=RELATIVE * max(1, reach))
 
 
-def test_camera_centre_is_where_the_camera_is():
+def test_camera_center_is_the_translation_of_camtoworld():
     camtoworlds = poses(7, 5.0)
     camera = Camera(viewmats=f32(np.linalg.inv(camtoworlds)), Ks=f32(intrinsics(7)), width=10, height=8)
     np.testing.assert_allclose(camera.centers, camtoworlds[:, :3, 3], atol=1e-5)
@@ -73,7 +73,7 @@ def test_axes_are_right_down_forward():
     np.testing.assert_array_equal(depths, 1)
 
 
-def test_pixel_centres_are_at_half():
+def test_pixel_centers_are_at_half():
     grid = pixel_grid(3, 5)
     np.testing.assert_array_equal(grid[0, 0], [0.5, 0.5])
     np.testing.assert_array_equal(grid[2, 4], [4.5, 2.5])  # (x, y) of row 2, column 4
@@ -84,7 +84,7 @@ def test_pixel_centres_are_at_half():
     np.testing.assert_array_equal(coarse[1, 2], pixel_grid(8, 12)[4:8, 8:12].mean(axis=(0, 1)))
 
 
-def test_points_at_and_behind_the_camera_are_finite_and_known_by_their_depth():
+def test_points_behind_the_camera_project_to_finite_pixels():
     points = f32([[1.0, 1, 0], [1, 1, -2], [1e3, -1e3, 1e-9], [0, 0, 0]])
     K = f32([[500.0, 0, 32], [0, 500, 24], [0, 0, 1]])
     pixels, depths = project_points(points, K, min_depth=1e-3)
@@ -94,7 +94,7 @@ def test_points_at_and_behind_the_camera_are_finite_and_known_by_their_depth():
     assert np.isfinite(pixels).all() and np.isfinite(gradient).all()
 
 
-def test_voxel_of_a_point_is_the_floor_and_what_is_out_of_range_says_so():
+def test_voxel_is_the_floor_and_out_of_range_is_marked():
     points = f32([[0.0, 0.039, 0.041], [-0.001, -0.04, 1.0], [np.nan, 0, 0], [0, np.inf, 0], [0, 0, -1e30]])
     voxels, in_range = voxel_indices(points, 0.04)
     np.testing.assert_array_equal(voxels[:2], [[0, 0, 1], [-1, -1, 25]])
@@ -115,7 +115,7 @@ def test_a_point_between_two_points_of_a_voxel_is_in_that_voxel():
     np.testing.assert_array_equal(between[same], va[same])
 
 
-def test_hashes_of_neighboring_voxels_spread_over_the_low_bits():
+def test_hashes_of_near_voxels_spread_over_the_low_bits():
     side = np.arange(-16, 16)
     voxels = jnp.asarray(np.stack(np.meshgrid(side, side, side), -1).reshape(-1, 3), jnp.int32)
     hashes = np.asarray(hash_voxels(voxels))

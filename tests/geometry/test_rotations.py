@@ -1,4 +1,4 @@
-"""Rotations against Rodrigues' formula in float64, and near every place where a formula could divide by zero."""
+"""Rotations against Rodrigues' formula in float64, also where formulas could divide by zero."""
 
 import jax
 import jax.numpy as jnp
@@ -23,24 +23,24 @@ AXES = np.array(
     ],
     float,
 )
-TURNS = np.array([0.0, 1e-8, 1e-4, 0.3, np.pi / 2, 2 * np.pi / 3, 3.0, np.pi - 1e-3, np.pi - 1e-6, np.pi])
+ANGLES = np.array([0.0, 1e-8, 1e-4, 0.3, np.pi / 2, 2 * np.pi / 3, 3.0, np.pi - 1e-3, np.pi - 1e-6, np.pi])
 
 
 def rodrigues(axis, angle):
-    """R = I + sin(a) K + (1 - cos(a)) K^2 in float64."""
+    """Rodrigues' formula, R = I + sin(a) K + (1 - cos(a)) K^2, in float64."""
     x, y, z = axis / np.linalg.norm(axis)
     K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K
 
 
 def cases():
-    """(quaternion, matrix) of every axis and turn, float64."""
+    """Quaternions and matrices of every axis and angle, in float64."""
     quats, matrices = [], []
     for axis in AXES:
-        for turn in np.r_[TURNS, -TURNS]:
+        for angle in np.r_[ANGLES, -ANGLES]:
             unit = axis / np.linalg.norm(axis)
-            quats.append(np.r_[np.cos(turn / 2), np.sin(turn / 2) * unit])
-            matrices.append(rodrigues(axis, turn))
+            quats.append(np.r_[np.cos(angle / 2), np.sin(angle / 2) * unit])
+            matrices.append(rodrigues(axis, angle))
     return np.array(quats), np.array(matrices)
 
 
@@ -50,14 +50,14 @@ def test_quaternions_are_the_rotations_of_rodrigues():
 
 
 @pytest.mark.parametrize("length", [1e-9, 1e-3, 7.0, 1e20])
-def test_length_and_sign_of_a_quaternion_mean_nothing(length):
+def test_length_and_sign_of_a_quaternion_do_not_matter(length):
     quats, matrices = cases()
     for sign in (1, -1):
         got = quats_to_matrices(jnp.asarray(sign * length * quats, jnp.float32))
         np.testing.assert_allclose(got, matrices, atol=FLOAT32)
 
 
-def test_matrices_become_unit_quaternions_of_the_same_rotation_half_turns_included():
+def test_matrices_to_quats_gives_unit_quats_of_the_rotation():
     _, matrices = cases()
     quats = np.asarray(matrices_to_quats(jnp.asarray(matrices, jnp.float32)), np.float64)
     np.testing.assert_allclose(np.linalg.norm(quats, axis=-1), 1.0, atol=FLOAT32)
@@ -65,7 +65,7 @@ def test_matrices_become_unit_quaternions_of_the_same_rotation_half_turns_includ
     np.testing.assert_allclose(quats_to_matrices(jnp.asarray(quats, jnp.float32)), matrices, atol=2 * FLOAT32)
 
 
-def test_quaternion_to_matrix_and_back_is_the_quaternion_up_to_sign():
+def test_quat_to_matrix_and_back_is_the_quat_up_to_sign():
     quats, _ = cases()
     got = np.asarray(matrices_to_quats(quats_to_matrices(jnp.asarray(quats, jnp.float32))), np.float64)
     np.testing.assert_allclose(np.abs(np.sum(got * quats, axis=-1)), 1.0, atol=FLOAT32)
@@ -92,7 +92,7 @@ def test_zero_quaternions_are_the_identity_with_a_zero_gradient():
     np.testing.assert_array_equal(gradient, 0)
 
 
-def test_gradients_are_finite_at_every_turn():
+def test_gradients_are_finite_at_every_angle():
     quats, matrices = cases()
     weight = jnp.arange(9.0).reshape(3, 3)
     gradient = jax.grad(lambda q: jnp.sum(quats_to_matrices(q) * weight))(jnp.asarray(quats, jnp.float32))

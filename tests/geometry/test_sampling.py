@@ -1,18 +1,18 @@
-"""Warped correlation against an oracle that warps first, correlates after, in float64; and its gradients."""
+"""Warped correlation and its gradients against an oracle in float64 that warps first and then correlates."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ssplat_jax.geometry.sampling import correlate_warped, neighbors, places_of
+from ssplat_jax.geometry.sampling import bilinear_taps, correlate_warped, neighbor_offsets
 
 FLOAT32 = 2e-5  # sums of a dozen products of unit normals
 HEIGHT, WIDTH, CHANNELS = 5, 7, 6
 
 
 def coordinates(seed: int = 0) -> np.ndarray:
-    """Inside, on samples, on the border and beyond it: `[d n 2]` (x, y)."""
+    """Positions (x, y) `[d n 2]` inside the map, on samples, on the border and outside."""
     rng = np.random.default_rng(seed)
     coords = rng.uniform([-2, -2], [WIDTH + 1, HEIGHT + 1], (4, 15, 2))
     coords[0, :3] = [[0, 0], [WIDTH - 1, HEIGHT - 1], [3, 2]]
@@ -25,7 +25,7 @@ def arrays(seed: int = 0):
 
 
 def warp_then_correlate(reference, image, coords):
-    """Bilinear interpolation point by point, border held, then dot products."""
+    """Bilinear interpolation point by point, clamped at the border, then dot products."""
     out = np.zeros(coords.shape[:2])
     for d, n in np.ndindex(*out.shape):
         x, y = np.clip(coords[d, n], 0, [WIDTH - 1, HEIGHT - 1])
@@ -41,14 +41,14 @@ def f32(x):
     return jnp.asarray(x, jnp.float32)
 
 
-def places(coords):
+def taps_at(coords):
     x, y = np.moveaxis(np.asarray(coords, np.float32), -1, 0)
-    return places_of(jnp.asarray(x), jnp.asarray(y), HEIGHT, WIDTH)
+    return bilinear_taps(jnp.asarray(x), jnp.asarray(y), HEIGHT, WIDTH)
 
 
 def read(values, at):
-    """A map of numbers at `at`, by the four samples' weights."""
-    to_right, to_below = neighbors(*values.shape)
+    """Values of a map at the taps `at`, from the four samples and weights."""
+    to_right, to_below = neighbor_offsets(*values.shape)
     flat = values.reshape(-1)
     above, below = (
         (1 - at.right) * flat[at.corners + step] + at.right * flat[at.corners + step + to_right]
@@ -61,13 +61,13 @@ def read(values, at):
 def test_correlation_is_that_of_the_warped_map(channels):
     rng = np.random.default_rng(5)
     reference, source = rng.normal(size=(15, channels)), rng.normal(size=(HEIGHT, WIDTH, channels))
-    got = correlate_warped(f32(reference), f32(source), places(coordinates()))
+    got = correlate_warped(f32(reference), f32(source), taps_at(coordinates()))
     np.testing.assert_allclose(got, warp_then_correlate(reference, source, coordinates()), atol=FLOAT32)
 
 
 def test_gradients_are_those_of_the_plain_sum():
     reference, source = map(f32, arrays(1))
-    at = places(coordinates(1))
+    at = taps_at(coordinates(1))
     cotangent = f32(np.random.default_rng(2).normal(size=(4, 15)))
 
     def plain(reference, source):
@@ -83,9 +83,9 @@ def test_gradients_are_those_of_the_plain_sum():
 
 
 def test_gradient_is_the_finite_difference_of_the_oracle():
-    """The function is bilinear, so a difference quotient of any step is exact: float64, no truncation error."""
+    """The function is bilinear, so difference quotients are exact for any step."""
     (reference, source), coords = arrays(3), coordinates(3)
-    total = lambda r, s: jnp.sum(correlate_warped(r, s, places(coords)))  # noqa: E731
+    total = lambda r, s: jnp.sum(correlate_warped(r, s, taps_at(coords)))  # noqa: E731
     by_reference, by_source = jax.grad(total, (0, 1))(f32(reference), f32(source))
     rng = np.random.default_rng(4)
     step_reference, step_source = rng.normal(size=reference.shape), rng.normal(size=source.shape)
@@ -101,15 +101,15 @@ VALUES = jnp.arange(HEIGHT * WIDTH, dtype=jnp.float32).reshape(HEIGHT, WIDTH)
 
 def test_sampling_at_a_sample_reads_that_sample():
     ys, xs = np.meshgrid(np.arange(HEIGHT), np.arange(WIDTH), indexing="ij")
-    np.testing.assert_array_equal(read(VALUES, places(np.stack([xs, ys], -1))), VALUES)
+    np.testing.assert_array_equal(read(VALUES, taps_at(np.stack([xs, ys], -1))), VALUES)
 
 
-def test_beyond_the_border_and_not_a_number_read_the_nearest_border_sample():
-    at = places([[-5, 2], [1e30, -1e30], [np.inf, -np.inf], [np.nan, np.nan], [3, 99]])
+def test_positions_outside_read_the_nearest_border_sample():
+    at = taps_at([[-5, 2], [1e30, -1e30], [np.inf, -np.inf], [np.nan, np.nan], [3, 99]])
     nearest = [2 * WIDTH, WIDTH - 1, WIDTH - 1, 0, (HEIGHT - 1) * WIDTH + 3]
     np.testing.assert_array_equal(read(VALUES, at), nearest)
     # All four samples lie in the map.
-    assert ((at.corners >= 0) & (at.corners + sum(neighbors(HEIGHT, WIDTH)) < HEIGHT * WIDTH)).all()
+    assert ((at.corners >= 0) & (at.corners + sum(neighbor_offsets(HEIGHT, WIDTH)) < HEIGHT * WIDTH)).all()
     for share in (at.right, at.down):
         assert ((share >= 0) & (share <= 1)).all()
 
@@ -118,8 +118,8 @@ def test_beyond_the_border_and_not_a_number_read_the_nearest_border_sample():
 def test_maps_with_a_side_of_one_sample(height, width):
     rng = np.random.default_rng(0)
     source, x, y = rng.normal(size=(height, width, 4)), rng.uniform(-1, 4, (2, 5)), rng.uniform(-1, 4, (2, 5))
-    at = places_of(f32(x), f32(y), height, width)
-    assert ((at.corners >= 0) & (at.corners + sum(neighbors(height, width)) < height * width)).all()
+    at = bilinear_taps(f32(x), f32(y), height, width)
+    assert ((at.corners >= 0) & (at.corners + sum(neighbor_offsets(height, width)) < height * width)).all()
     got = correlate_warped(jnp.ones((5, 4)), f32(source), at)
     along = source.sum(axis=-1).reshape(-1)
     wanted = np.interp(x if width > 1 else y, np.arange(len(along)), along)

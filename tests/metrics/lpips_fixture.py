@@ -1,10 +1,10 @@
-"""Random VGG16 weights, heads and image pairs, and what PyTorch and its `lpips` package make of them.
+"""Random VGG16 weights, heads and image pairs, and the results of PyTorch's `lpips` package on them.
 
-The tests draw the same numbers again, so that only results are stored, in lpips_data: lpips.json and two small files
-that `torch.save` wrote. To make them anew (PyTorch is no dependency of the project):
+Tests draw the same numbers again; only the results are stored, in lpips_data: lpips.json, and two small files written
+by `torch.save`. To write them again (PyTorch is not a dependency of the project):
 
     python -m venv lpips_env && lpips_env/bin/pip install torch torchvision lpips
-    lpips_env/bin/python tests/lpips_fixture.py
+    lpips_env/bin/python tests/metrics/lpips_fixture.py
 """
 
 import json
@@ -24,13 +24,13 @@ HEADS = (64, 128, 256, 512, 512)
 
 
 def uniform(seed: int, *shape: int) -> np.ndarray:
-    """Float32 in [0, 1) from raw bits: NumPy promises those, not its distributions, to stay from version to version."""
+    """Uniform float32 in [0, 1) from raw bits, which, unlike its distributions, NumPy does not change."""
     bits = np.random.PCG64(seed).random_raw(int(np.prod(shape)))
     return ((bits >> np.uint64(40)).astype(np.float32) / np.float32(1 << 24)).reshape(shape)
 
 
 def random_vgg() -> dict[str, np.ndarray]:
-    """The convolutions under torchvision's names, scaled as He et al. so that activations keep their size."""
+    """Convolutions under torchvision's names, with He initialization, so that activations keep their size."""
     weights = {}
     for i, channels_in, channels_out in CONVOLUTIONS:
         bound = np.float32(np.sqrt(6 / (9 * channels_in)))
@@ -40,7 +40,7 @@ def random_vgg() -> dict[str, np.ndarray]:
 
 
 def random_heads() -> dict[str, np.ndarray]:
-    """The five 1x1 convolutions under the package's names; not negative, as its trained ones."""
+    """The five 1 x 1 convolutions under the package's names; not negative, like the trained ones."""
     return {f"lin{k}.model.1.weight": uniform(200 + k, 1, c, 1, 1) for k, c in enumerate(HEADS)}
 
 
@@ -57,7 +57,7 @@ def image_pairs() -> dict[str, tuple[np.ndarray, np.ndarray]]:
 
 
 def small_dict() -> dict[str, tuple[np.ndarray, str]]:
-    """Arrays and the dtypes in which the small files hold them."""
+    """Arrays in the small files, and their dtypes there."""
     return {
         "plain": (uniform(400, 3, 4), "float32"),
         "transposed": (uniform(401, 4, 3), "float32"),
@@ -69,7 +69,7 @@ def small_dict() -> dict[str, tuple[np.ndarray, str]]:
 
 
 def package_result(model, a: np.ndarray, b: np.ndarray) -> dict:
-    """Layers and total of the `lpips` package, and its gradient in the image `a` at the center."""
+    """Total and layers of the `lpips` package, and its gradient at the center pixel of `a`."""
     import torch
 
     x, y = (torch.from_numpy(z).permute(2, 0, 1)[None].requires_grad_() for z in (a, b))
@@ -80,7 +80,7 @@ def package_result(model, a: np.ndarray, b: np.ndarray) -> dict:
 
 
 def save_small_files() -> None:
-    """`small_dict` in both forms of `torch.save`, with views: a transpose, and the end of a longer storage."""
+    """Writes `small_dict` in both formats of `torch.save`, with views: a transpose, and the end of a longer storage."""
     import torch
 
     held = {name: torch.tensor(x).to(getattr(torch, dtype)) for name, (x, dtype) in small_dict().items()}

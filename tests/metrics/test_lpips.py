@@ -1,4 +1,4 @@
-"""LPIPS against PyTorch's `lpips` package on random weights (`lpips_fixture`), and its laws."""
+"""LPIPS against PyTorch's `lpips` package on random weights (`lpips_fixture`), and its limits."""
 
 import json
 
@@ -42,7 +42,7 @@ def test_equals_the_package_layer_by_layer(pair, weights):
     np.testing.assert_allclose(parts.sum(), PACKAGE[pair]["total"], rtol=PARITY)
 
 
-def test_the_gradient_equals_the_packages(weights):
+def test_gradient_equals_that_of_the_package(weights):
     a, b = map(jnp.asarray, image_pairs()["smallest"])
     wanted = np.array(PACKAGE["smallest"]["gradient"])
     value, gradient = distance_and_gradient(weights, a, b)
@@ -54,7 +54,7 @@ BLACK, GREY, NOISE = jnp.zeros((16, 16, 3)), jnp.full((16, 16, 3), 0.5), jnp.asa
 
 
 @pytest.mark.parametrize("image", [BLACK, GREY, NOISE], ids=["black", "gray", "noise"])
-def test_equal_images_are_at_zero_and_at_rest(image, weights):
+def test_equal_images_have_distance_and_gradient_zero(image, weights):
     value, gradient = distance_and_gradient(weights, image, image)
     assert float(value) == 0 and not np.asarray(gradient).any()
 
@@ -69,8 +69,8 @@ def test_symmetric_and_finite_against_flat_images(other, weights):
 
 
 @pytest.mark.parametrize("bias", [-1e9, -1.0], ids=["all off", "some off"])
-def test_features_that_are_off_have_no_gradient_rather_than_nan(bias, weights):
-    # PyTorch's root has an infinite slope where all channels of a pixel are 0.
+def test_features_that_are_zero_have_no_nan_gradient(bias, weights):
+    # The square root in PyTorch's package has an infinite slope where all channels of a pixel are 0.
     dead = LpipsWeights(weights.kernels, tuple(jnp.full_like(b, bias) for b in weights.biases), weights.heads)
     value, gradient = distance_and_gradient(dead, BLACK, NOISE)
     assert np.isfinite(float(value)) and np.isfinite(gradient).all()
@@ -79,7 +79,7 @@ def test_features_that_are_off_have_no_gradient_rather_than_nan(bias, weights):
 
 
 @pytest.mark.slow
-def test_leading_axes_are_pairs_of_their_own(weights):
+def test_leading_axes_are_separate_pairs(weights):
     a, b = jnp.stack([BLACK, NOISE])[:, None], jnp.stack([NOISE, GREY])[:, None]
     parts = layers(weights, a, b)
     assert parts.shape == (2, 1, 5)
@@ -92,7 +92,7 @@ def test_images_below_sixteen_pixels_are_refused(weights):
         lpips(weights, small, small)
 
 
-def test_files_in_each_others_place_are_named(files):
+def test_swapped_files_are_refused_by_name(files):
     vgg, heads = files
     with pytest.raises(InputError, match=r"heads.npz: wanted an array features.0.weight"):
         load_lpips(heads, heads)

@@ -1,4 +1,4 @@
-"""PSNR and SSIM against their definitions in float64; the SSIM that trains against the one that scores."""
+"""PSNR and SSIM against their definitions in float64, and the SSIM in JAX against that on the host."""
 
 import json
 
@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from ssplat_jax.errors import InputError
+from ssplat_jax.metrics import differentiable_ssim
 from ssplat_jax.metrics.psnr_ssim import SSIM_ARGUMENTS, psnr, ssim
-from ssplat_jax.train import losses
 
 ROUNDING = 1e-9  # float64 sums in another order
 SSIM_SIGMA = 1.5
@@ -17,14 +17,14 @@ SSIM_PARITY = 1e-5  # float32 against float64
 
 
 def image(seed: int, height: int = 24, width: int = 31) -> np.ndarray:
-    """Smooth noise in [0, 1]: has structure at the window's scale."""
+    """Blocky noise in [0, 1], with structure at the scale of the window."""
     rng = np.random.default_rng(seed)
     coarse = rng.uniform(size=(height // 4 + 2, width // 4 + 2, 3))
     return np.repeat(np.repeat(coarse, 4, axis=0), 4, axis=1)[:height, :width].astype(np.float32)
 
 
 def ssim_by_definition(a: np.ndarray, b: np.ndarray) -> float:
-    """Wang et al.'s index, window by window: Gaussian weights, sample covariances, windows inside the image."""
+    """SSIM window by window: Gaussian weights, sample covariances, windows inside the image."""
     side = SSIM_ARGUMENTS["win_size"]
     taps = np.exp(-0.5 * ((np.arange(side) - side // 2) / SSIM_SIGMA) ** 2)
     weights = np.outer(taps, taps) / np.outer(taps, taps).sum()
@@ -49,13 +49,13 @@ def test_psnr_of_a_constant_error_is_its_logarithm():
     assert psnr(dark, dark + 0.01) == pytest.approx(40.0, abs=ROUNDING)
 
 
-def test_psnr_averages_squared_errors_over_all_pixels_not_per_image_scores():
+def test_psnr_averages_squared_errors_over_all_pixels():
     half_wrong = np.zeros((2, 2, 3))
     half_wrong[0] = 0.2
     assert psnr(half_wrong, np.zeros((2, 2, 3))) == pytest.approx(-10 * np.log10(0.02), abs=ROUNDING)
 
 
-def test_equal_images_score_the_cap_and_one_and_fit_into_json():
+def test_equal_images_score_100_db_and_one():
     a = image(0)
     assert psnr(a, a) == 100.0 and ssim(a, a) == pytest.approx(1.0, abs=ROUNDING)
     assert json.loads(json.dumps(psnr(a, a), allow_nan=False)) == 100.0
@@ -75,7 +75,7 @@ def test_values_outside_the_range_count_as_its_ends(score):
 
 
 @pytest.mark.parametrize("score", [psnr, ssim])
-def test_nan_is_not_hidden(score):
+def test_nan_gives_nan(score):
     a = image(5)
     spoiled = a.copy()
     spoiled[3, 4, 1] = np.nan
@@ -84,7 +84,7 @@ def test_nan_is_not_hidden(score):
 
 @pytest.mark.parametrize("score", [psnr, ssim])
 def test_images_of_two_sizes_are_refused(score):
-    # (1, 1, 3) would broadcast without a word.
+    # NumPy would broadcast (1, 1, 3).
     with pytest.raises(InputError, match="one size"):
         score(image(6), image(6)[:1, :1])
 
@@ -109,7 +109,7 @@ def flat(value: float, height: int = 24, width: int = 31) -> np.ndarray:
 
 
 def halves(low: float, high: float) -> np.ndarray:
-    """No single shift centers both halves."""
+    """Two flat halves."""
     x = flat(low)
     x[:, 15:] = high
     return x
@@ -128,7 +128,7 @@ SSIM_PAIRS = {
 }
 
 
-jax_ssim = jax.jit(losses.ssim)
+jax_ssim = jax.jit(differentiable_ssim.ssim)
 plainly = pytest.mark.usefixtures("compiled_plainly")
 
 
@@ -148,11 +148,11 @@ def test_ssim_in_jax_takes_leading_axes():
     np.testing.assert_allclose(scores[:, 0], wanted, atol=SSIM_PARITY)
 
 
-ssim_gradient = jax.jit(jax.grad(losses.ssim))
+ssim_gradient = jax.jit(jax.grad(differentiable_ssim.ssim))
 
 
 @plainly
-def test_the_gradient_of_ssim_is_finite_and_rests_at_equal_images():
+def test_ssim_gradient_is_finite_and_zero_at_equal_images():
     for name in ("noise", "two grays", "black and white", "halves"):
         a, b = map(jnp.asarray, SSIM_PAIRS[name])
         assert np.isfinite(ssim_gradient(a, b)).all(), name
@@ -160,11 +160,11 @@ def test_the_gradient_of_ssim_is_finite_and_rests_at_equal_images():
 
 
 @plainly
-def test_the_gradient_of_ssim_is_its_slope():
+def test_ssim_gradient_is_the_finite_difference():
     a, b = (x.astype(np.float64) for x in SSIM_PAIRS["structure"])
     direction = np.random.default_rng(21).normal(size=a.shape)
     step = 1e-5
-    inside = 0.02 + 0.96 * a  # metrics.ssim clips
+    inside = 0.02 + 0.96 * a  # the SSIM on the host clips
     slope = (ssim(inside + step * direction, b) - ssim(inside - step * direction, b)) / (2 * step)
     gradient = ssim_gradient(jnp.asarray(inside, jnp.float32), jnp.asarray(b, jnp.float32))
     assert float((np.asarray(gradient, np.float64) * direction).sum()) == pytest.approx(slope, rel=1e-3)
@@ -172,12 +172,12 @@ def test_the_gradient_of_ssim_is_its_slope():
 
 @plainly
 def test_ssim_in_jax_does_not_clip():
-    # A loss has to see by how much a color is out of range.
+    # A gradient must bring colors back into the range.
     a, white, beyond = (jnp.asarray(flat(value)) for value in (0.9, 1.0, 1.5))
     assert float(jax_ssim(a, beyond)) < 0.95 < float(jax_ssim(a, white))
 
 
-def test_ssim_in_jax_refuses_what_the_window_does_not_fit():
+def test_ssim_in_jax_refuses_images_smaller_than_the_window():
     small = jnp.zeros((10, 31, 3))
     with pytest.raises(InputError, match="11 pixels a side, got 31x10"):
-        losses.ssim(small, small)
+        differentiable_ssim.ssim(small, small)

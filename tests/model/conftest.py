@@ -1,4 +1,4 @@
-"""Programs here are compiled without LLVM's optimizations; see `compiled_plainly`."""
+"""Compiles the programs of these tests without LLVM's optimizations; see `compiled_plainly`."""
 
 import pytest
 

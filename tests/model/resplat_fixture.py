@@ -1,4 +1,4 @@
-"""What the authors' PyTorch networks computed on fixed inputs (../shared/parity; ALGORITHM 7), and the same weights."""
+"""Reference outputs of the authors' PyTorch networks (../shared/parity), and parameters with the same values."""
 
 import math
 import zlib
@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ssplat_jax.checkpoint.published_weights import tensors_of
+from ssplat_jax.checkpoint.published_weights import published_tensors
 from ssplat_jax.config import StreamConfig
 
 PARITY = Path(__file__).parents[3] / "shared" / "parity"
 
 
 def load_golden(name: str) -> dict[str, np.ndarray]:
-    """Inputs, taps and outputs of one network; the test is skipped where the folder is not."""
+    """Inputs, taps and outputs of one network; the test is skipped if the file is missing."""
     path = PARITY / f"golden_{name}.npz"
     if not path.is_file():
         pytest.skip(f"needs {path.name} in ../shared/parity")
@@ -23,7 +23,7 @@ def load_golden(name: str) -> dict[str, np.ndarray]:
 
 
 def listed_tensors(name: str) -> dict[str, tuple[int, ...]]:
-    """Names and shapes of a network's checkpoint."""
+    """Names and shapes of the tensors in a network's checkpoint."""
     path = PARITY / f"{name}_tensors.txt"
     if not path.is_file():
         pytest.skip(f"needs {path.name} in ../shared/parity")
@@ -32,7 +32,7 @@ def listed_tensors(name: str) -> dict[str, tuple[int, ...]]:
 
 
 def named_tensor(name: str, shape: tuple[int, ...]) -> np.ndarray:
-    """The numbers that the parity files mean by a name."""
+    """Values with which the reference outputs were computed, drawn from a tensor's name."""
     v = np.random.RandomState(zlib.crc32(name.encode())).standard_normal(shape).astype(np.float32)
     factor = np.float32(1)
     if "output_conv" in name and shape[0] == 1:
@@ -48,9 +48,9 @@ def named_tensor(name: str, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def named_params(config: StreamConfig) -> dict:
-    """Parameters of those numbers, for the stages that upstream has."""
+    """Parameters with these values, for the stages that upstream has."""
     params: dict = {}
-    for path, tensor in tensors_of(config).items():
+    for path, tensor in published_tensors(config).items():
         if tensor is not None:
             *folders, leaf = path.split("/")
             place = params
@@ -61,9 +61,9 @@ def named_params(config: StreamConfig) -> dict:
 
 
 def tap_error(tap: np.ndarray, x: np.ndarray) -> float:
-    """Largest difference from a tap at the positions that it holds, and of mean and std, in units of its std.
+    """Largest error of `x`, in PyTorch's order (NCHW), in standard deviations of a tap.
 
-    `x` is in PyTorch's order (NCHW).
+    A tap holds samples at fixed positions, the mean and the standard deviation.
     """
     values, (mean, std) = tap[:-2], tap[-2:]
     flat = np.asarray(x, np.float64).reshape(-1)

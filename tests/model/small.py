@@ -1,4 +1,4 @@
-"""A narrow network and small views that all tests of the network share, so that each program is compiled once."""
+"""A narrow network and small views, shared by the tests of the network so that each program is compiled once."""
 
 import functools
 
@@ -30,13 +30,13 @@ CONFIG = StreamConfig().replace(
     capacity=1 << 10,
 )
 MODEL = StreamSplat(CONFIG)
-HEIGHT, WIDTH = 24, 30  # padded to 32 x 32: cells outside the image are part of every test
+HEIGHT, WIDTH = 24, 30  # padded to 32 x 32, so that every test has cells outside the image
 
 
 def random_params(config: StreamConfig, seed: int = 0) -> dict:
-    """Random parameters: away from the start, where zero-initialized layers would hide what they do.
+    """Random parameters, without the zero-initialized layers of untrained ones, which would hide errors.
 
-    Drawn with NumPy for the shapes of `init`: nothing is compiled.
+    They are drawn with NumPy, so that nothing is compiled.
     """
     rng = np.random.default_rng(seed)
 
@@ -78,8 +78,8 @@ def chunk(seed: int = 0, *, views: int = 3, baseline: float = 0.2, height: int =
 
 @functools.cache
 def step():
-    """The step in its two halves, both jitted: the first is `predict()`, which is compiled anyway."""
-    remember = jax.jit(MODEL.remember)
+    """The jitted step, in two programs: `predict()`, which other tests compile too, and the update of the cache."""
+    remember = jax.jit(MODEL.update_cache)
 
     def both(params, cache, chunk):
         prediction = predict()(params, cache, chunk)
@@ -90,7 +90,7 @@ def step():
 
 @functools.cache
 def warm_cache():
-    """A cache that has seen one chunk: history is there to be projected."""
+    """A cache after one chunk, so that there is a history to project."""
     return step()(params(), MODEL.init_cache(), chunk(7))[0]
 
 
@@ -102,9 +102,9 @@ def predict():
 
 @functools.cache
 def gradients():
-    """Jitted gradient of a sum over everything a chunk's tokens become: `(cache, chunk, weights) -> value, gradients`.
+    """Jitted gradients of a sum over the outputs for a chunk: `(cache, chunk, weights) -> value, gradients`.
 
-    By parameters, images, poses, intrinsics, and the positions and features in the cache.
+    With respect to parameters, images, poses, intrinsics, and the positions and features in the cache.
     """
 
     def total(params, images, viewmats, Ks, remembered, cache, chunk):
@@ -124,12 +124,12 @@ def gradients():
 
 
 def with_gamma(raw_gamma: float) -> dict:
-    """The parameters with another strength of the anchor: softplus of -200 is 0, of 1e6 it is 1e6."""
+    """Parameters with another gamma: softplus(-200) is 0, softplus(1e6) is 1e6."""
     return params() | {"hpda": {"raw_gamma": jnp.float32(raw_gamma)}}
 
 
 def history(depths, confidences, feats=None, mask=None, colors=None) -> ProjectedCache:
-    """What a cache would say, given by hand; `mask` defaults to where there is a depth."""
+    """A projected cache with given values; `mask` defaults to cells with a depth."""
     depths, confidences = jnp.asarray(depths, jnp.float32), jnp.asarray(confidences, jnp.float32)
     return ProjectedCache(
         depths=depths,

@@ -1,4 +1,4 @@
-"""The fast convolutions are the ordinary ones, forward and backward, inside a scan too."""
+"""The fast convolutions equal plain ones, forward and backward, also inside a scan."""
 
 import flax.linen as nn
 import jax
@@ -37,7 +37,7 @@ def test_conv2d_is_the_convolution_forward_and_backward(size, pads):
     check_same_gradients(lambda x, k: conv2d(x, k, pads), lambda x, k: plain(x, k, pads), x, kernel)
 
 
-def test_conv2d_inside_a_scan_has_the_gradients_of_the_unrolled_plain_one():
+def test_conv2d_in_a_scan_has_the_gradients_of_the_plain_one():
     x, kernel, pads = normal(2, 1, 5, 6, 4), 0.3 * normal(3, 3, 3, 4, 4), ((1, 1), (1, 1))
 
     def scanned(x, kernel):
@@ -61,7 +61,7 @@ def test_conv_is_flax_conv_with_the_same_parameters(size):
 
 
 @pytest.mark.parametrize("size", [1, 3, 5, 7])
-def test_halving_conv_is_flax_conv_of_stride_two_with_the_same_parameters(size):
+def test_halving_conv_is_flax_conv_of_stride_two(size):
     x, ours = normal(7, 2, 8, 10, 3), HalvingConv(4, size)
     theirs = nn.Conv(4, (size, size), strides=2, padding=size // 2)
     params = {"kernel": normal(8, size, size, 3, 4), "bias": normal(9, 4)}
@@ -69,7 +69,7 @@ def test_halving_conv_is_flax_conv_of_stride_two_with_the_same_parameters(size):
     check_same_gradients(apply(ours), apply(theirs), params, x)
 
 
-def test_pixel_unshuffle_has_torchs_channel_order():
+def test_pixel_unshuffle_has_pytorch_channel_order():
     x = np.arange(2 * 4 * 6 * 3, dtype=np.float32).reshape(2, 4, 6, 3)
     got = pixel_unshuffle(jnp.asarray(x), 2)
     assert got.shape == (2, 2, 3, 12)

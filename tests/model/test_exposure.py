@@ -1,4 +1,4 @@
-"""Exposure of views against the scene: the median of ratios, where both see the same surface, and its limits."""
+"""Exposure of views relative to the scene: the median of color ratios on common surfaces, and its limits."""
 
 import functools
 
@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from ssplat_jax.model import estimate_exposures, prepare_views
-from ssplat_jax.model.exposure import FEWEST_CELLS
+from ssplat_jax.model.exposure import MIN_CELLS
 from ssplat_jax.pytree import replace
 from tests.model.small import CONFIG, chunk, history
 
@@ -32,13 +32,13 @@ def estimate():
 
 
 def scene(seed: int = 0):
-    """Colors of the cells as the cache remembers them, and depths, of all views."""
+    """Cached colors and depths of the cells of all views."""
     rng = np.random.default_rng(seed)
     return rng.uniform(0.2, 0.55, (VIEWS, CELLS, CELLS, 3)), rng.uniform(1, 6, (VIEWS, CELLS, CELLS))
 
 
 def exposures(remembered, colors, depths, *, seen_depths=None, confidences=0.9, mask=None, valid=None):
-    """What the stage says of cells `colors` against cells `remembered`."""
+    """Exposures estimated from the current `colors` of cells and their `remembered` ones."""
     seen_depths = depths if seen_depths is None else seen_depths
     images = np.repeat(np.repeat(colors, 4, axis=1), 4, axis=2)
     known = history(depths, np.full(depths.shape, 0.8), mask=mask, colors=remembered)
@@ -50,7 +50,7 @@ def exposures(remembered, colors, depths, *, seen_depths=None, confidences=0.9, 
 
 
 def oracle(remembered, colors, depths, seen_depths, confidences, mask):
-    """The same in float64, a cell at a time."""
+    """The same in float64, one cell at a time."""
     logs = []
     for v in range(VIEWS):
         ratios = []
@@ -62,7 +62,7 @@ def oracle(remembered, colors, depths, seen_depths, confidences, mask):
             if (seen >= 0.03).all() and (seen <= 0.97).all() and (old >= 0.03).all():
                 ratios.append(np.log(seen / old))
         n = len(ratios)
-        logs.append(np.clip(np.sort(ratios, axis=0)[n // 2], -np.log(4), np.log(4)) if n >= FEWEST_CELLS else None)
+        logs.append(np.clip(np.sort(ratios, axis=0)[n // 2], -np.log(4), np.log(4)) if n >= MIN_CELLS else None)
     known = [log for log in logs if log is not None]
     fallback = np.mean(known, axis=0) if known else np.zeros(3)
     return np.exp([fallback if log is None else log for log in logs])
@@ -83,23 +83,23 @@ def test_estimate_equals_the_loop(seed, agreeing, spread):
     np.testing.assert_allclose(got, wanted, rtol=2e-6)
 
 
-def test_gains_of_views_are_found_among_noise_and_outliers():
+def test_gains_are_found_among_noise_and_outliers():
     rng = np.random.default_rng(1)
     remembered, depths = scene()
     colors = remembered * GAINS[:, None, None] * np.exp(0.1 * rng.normal(size=remembered.shape))
-    colors[:, :5] = rng.uniform(0.1, 0.9, colors[:, :5].shape)  # a third is another color altogether
+    colors[:, :5] = rng.uniform(0.1, 0.9, colors[:, :5].shape)  # a third has unrelated colors
     np.testing.assert_allclose(exposures(remembered, colors, depths), GAINS, rtol=0.05)
 
 
-def test_a_view_of_another_surface_is_not_compared():
-    """What it sees in front of the remembered wall is red; its exposure is that of the views that see the wall."""
+def test_cells_of_another_surface_are_not_compared():
+    """One view sees red things before the cached wall; its exposure is the mean of the views that see the wall."""
     remembered, depths = scene()
     colors, nearer = remembered * 0.5, depths.copy()
     colors[1], nearer[1] = [0.9, 0.1, 0.1], 0.8 * depths[1]
     np.testing.assert_allclose(exposures(remembered, colors, depths, seen_depths=nearer), 0.5, rtol=1e-5)
 
 
-def test_clipped_and_black_cells_tell_nothing():
+def test_clipped_and_black_cells_are_not_compared():
     remembered, depths = scene()
     colors = np.clip(remembered * 2.0, 0, 1)
     assert (colors.max(axis=-1) > 0.97).mean() > 0.2
@@ -107,8 +107,8 @@ def test_clipped_and_black_cells_tell_nothing():
     np.testing.assert_array_equal(exposures(remembered, remembered * 0.01, depths), 1.0)
 
 
-@pytest.mark.parametrize(("num_cells", "is_known"), [(FEWEST_CELLS, True), (FEWEST_CELLS - 1, False)])
-def test_a_view_that_shares_too_little_has_the_mean_of_the_others(num_cells, is_known):
+@pytest.mark.parametrize(("num_cells", "is_known"), [(MIN_CELLS, True), (MIN_CELLS - 1, False)])
+def test_view_with_too_few_cells_has_the_mean_of_the_others(num_cells, is_known):
     remembered, depths = scene()
     mask = np.ones(depths.shape, bool)
     mask[1].flat[num_cells:] = False
@@ -123,13 +123,13 @@ def test_a_view_that_shares_too_little_has_the_mean_of_the_others(num_cells, is_
     np.testing.assert_allclose(got[:, 0], [0.5, 0.8 if is_known else 1.0, 2.0], rtol=1e-5)
 
 
-def test_nothing_remembered_is_exposure_one():
+def test_empty_history_gives_exposure_one():
     remembered, depths = scene()
     nothing = np.zeros(depths.shape, bool)
     np.testing.assert_array_equal(exposures(remembered, remembered * 0.5, depths, mask=nothing), 1.0)
 
 
-def test_padded_views_have_the_mean_of_the_others_and_do_not_count():
+def test_padded_view_has_the_mean_of_the_others():
     remembered, depths = scene()
     colors = remembered * np.array([0.5, 0.5, 1.5]).reshape(3, 1, 1, 1)
     np.testing.assert_allclose(exposures(remembered, colors, depths, valid=[True, True, False]), 0.5, rtol=1e-5)
@@ -144,14 +144,14 @@ def test_exposures_are_bounded(gain, wanted):
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -1.0])
-def test_what_is_not_finite_is_not_compared(bad):
+def test_values_that_are_not_finite_are_not_compared(bad):
     remembered, depths = scene()
     colors, seen_depths = 0.5 * remembered, depths.copy()
     colors[:, 0], remembered[:, 1], seen_depths[:, 2] = bad, bad, bad
     np.testing.assert_allclose(exposures(remembered, colors, depths, seen_depths=seen_depths), 0.5, rtol=1e-5)
 
 
-def test_no_gradient_passes_the_exposures():
+def test_exposures_have_no_gradient():
     remembered, depths = scene()
 
     def total(colors, log_depths):

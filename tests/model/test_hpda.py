@@ -1,4 +1,4 @@
-"""HPDA's laws: what history may do to a belief about depth, and what it may not."""
+"""HPDA: how history changes depth distributions, and the limits."""
 
 import jax
 import jax.numpy as jnp
@@ -7,7 +7,7 @@ import pytest
 
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.model.hpda import anchor_depth, cache_anchor, expected_log_depth, inject_anchor, peak_confidence
-from ssplat_jax.model.types import DepthBelief, prepare_views
+from ssplat_jax.model.types import DepthDistribution, prepare_views
 from tests.model.small import chunk, finite, history
 
 D = 24
@@ -17,12 +17,12 @@ SHAPE = (2, 3, 4)
 FLOAT32 = 1e-5
 
 
-def beliefs(seed: int = 0) -> jax.Array:
+def distributions(seed: int = 0) -> jax.Array:
     return jax.nn.softmax(jnp.asarray(2 * np.random.default_rng(seed).normal(size=(*SHAPE, D)), jnp.float32))
 
 
 def memories(seed: int = 1):
-    """Depths over the whole range, confidences in (0, 1], every third cell a hole."""
+    """History with depths over the whole range and confidences in (0, 1]; every third cell is a hole."""
     rng = np.random.default_rng(seed)
     depths, confidences = np.exp(rng.uniform(np.log(0.5), np.log(10), SHAPE)), rng.uniform(0.05, 1, SHAPE)
     hole = np.arange(np.prod(SHAPE)).reshape(SHAPE) % 3 == 0
@@ -34,7 +34,7 @@ def gamma(value) -> jax.Array:
 
 
 @pytest.mark.parametrize("space", ["log", "metric"])
-def test_the_anchor_is_the_papers_gaussian_in_the_chosen_space(space):
+def test_anchor_is_the_gaussian_of_the_paper(space):
     past, hole = memories()
     config = CONFIG.replace(anchor_space=space, sigma0=0.2, lambda_sigma=0.7)
     omega, depths = np.asarray(past.confidences, float)[..., None], np.asarray(past.depths, float)[..., None]
@@ -47,9 +47,9 @@ def test_the_anchor_is_the_papers_gaussian_in_the_chosen_space(space):
 
 
 @pytest.mark.parametrize("strength", [0.0, 0.1, 1e6])
-def test_a_hole_leaves_the_belief_bit_for_bit(strength):
+def test_hole_keeps_the_distribution_bit_for_bit(strength):
     past, hole = memories()
-    probs = beliefs()
+    probs = distributions()
     mixed = inject_anchor(probs, cache_anchor(past, LOG_CANDIDATES, CONFIG), gamma(strength))
     np.testing.assert_array_equal(np.asarray(mixed)[hole], np.asarray(probs)[hole])
     if strength:
@@ -60,14 +60,14 @@ def test_a_hole_leaves_the_belief_bit_for_bit(strength):
 @pytest.mark.parametrize(
     "options", [{}, {"anchor_space": "metric"}, {"anchor_norm": "mass"}, {"sigma0": 1e-9}], ids=str
 )
-def test_the_mixture_is_a_distribution_with_finite_gradients(strength, options):
+def test_mixture_is_a_distribution_with_finite_gradients(strength, options):
     past, _ = memories()
     config = CONFIG.replace(**options)
 
     def mix(logits, g):
         return inject_anchor(jax.nn.softmax(logits), cache_anchor(past, LOG_CANDIDATES, config), g)
 
-    logits = jnp.log(beliefs())
+    logits = jnp.log(distributions())
     mixed = mix(logits, gamma(strength))
     assert (mixed >= 0).all()
     np.testing.assert_allclose(np.asarray(mixed, np.float64).sum(-1), 1.0, rtol=0, atol=1e-6)
@@ -75,27 +75,27 @@ def test_the_mixture_is_a_distribution_with_finite_gradients(strength, options):
     assert finite(jax.grad(lambda *x: jnp.sum(mix(*x) * weight), (0, 1))(logits, gamma(strength)))
 
 
-def test_more_strength_pulls_the_expectation_monotonically_towards_history():
+def test_larger_gamma_moves_depth_monotonically_to_history():
     past, hole = memories()
     anchor = cache_anchor(past, LOG_CANDIDATES, CONFIG)
-    read = lambda g: expected_log_depth(inject_anchor(beliefs(), anchor, gamma(g)), LOG_CANDIDATES, CONFIG)  # noqa: E731
+    read = lambda g: expected_log_depth(inject_anchor(distributions(), anchor, gamma(g)), LOG_CANDIDATES, CONFIG)  # noqa: E731
     goal = read(1e6)  # the anchor alone
     distances = np.stack([np.abs(np.asarray(read(g) - goal))[~hole] for g in (0, 0.01, 0.03, 0.1, 0.3, 1, 3, 10, 100)])
     assert (np.diff(distances, axis=0) <= FLOAT32).all()
     assert (distances[-1] < 0.1 * distances[0] + FLOAT32).all()
 
 
-def test_overwhelming_strength_with_a_narrow_anchor_reads_the_remembered_depth():
+def test_huge_gamma_gives_the_cached_depth():
     past = history(np.full(SHAPE, 2.0), np.full(SHAPE, 1.0))
-    mixed = inject_anchor(beliefs(), cache_anchor(past, LOG_CANDIDATES, CONFIG), gamma(1e6))
+    mixed = inject_anchor(distributions(), cache_anchor(past, LOG_CANDIDATES, CONFIG), gamma(1e6))
     np.testing.assert_allclose(expected_log_depth(mixed, LOG_CANDIDATES, CONFIG), np.log(2.0), atol=0.01)
 
 
-def test_1_no_strength_is_no_anchor_bit_for_bit():
+def test_gamma_zero_is_no_anchor_bit_for_bit():
     past, _ = memories()
     for strength in (0.0, 1e-30):
-        mixed = inject_anchor(beliefs(), cache_anchor(past, LOG_CANDIDATES, CONFIG), gamma(strength))
-        np.testing.assert_array_equal(mixed, beliefs())
+        mixed = inject_anchor(distributions(), cache_anchor(past, LOG_CANDIDATES, CONFIG), gamma(strength))
+        np.testing.assert_array_equal(mixed, distributions())
 
 
 def test_sigma_to_zero_is_one_candidate_or_none():
@@ -121,17 +121,17 @@ def test_mass_norm_makes_gamma_the_odds_of_history():
 
 
 @pytest.mark.parametrize("half_width", [0, 1, 3])
-def test_window_confidence_is_the_best_mass_of_neighboring_candidates(half_width):
+def test_window_confidence_is_the_largest_mass_of_neighbors(half_width):
     config = CONFIG.replace(confidence="window", confidence_window=half_width)
-    probs = np.asarray(beliefs(3), np.float64)
+    probs = np.asarray(distributions(3), np.float64)
     sums = [probs[..., max(0, i - half_width) : i + half_width + 1].sum(-1) for i in range(D)]
-    np.testing.assert_allclose(peak_confidence(beliefs(3), config), np.max(sums, axis=0), atol=FLOAT32)
+    np.testing.assert_allclose(peak_confidence(distributions(3), config), np.max(sums, axis=0), atol=FLOAT32)
     if half_width == 0:
-        peak = peak_confidence(beliefs(3), CONFIG.replace(confidence="peak"))
+        peak = peak_confidence(distributions(3), CONFIG.replace(confidence="peak"))
         np.testing.assert_allclose(peak, np.max(sums, axis=0), atol=FLOAT32)
 
 
-def test_the_window_readout_does_not_mix_two_surfaces():
+def test_window_readout_does_not_mix_two_surfaces():
     probs = jnp.zeros((1, D)).at[0, 3].set(0.55).at[0, 20].set(0.45)
     window = expected_log_depth(probs, LOG_CANDIDATES, CONFIG.replace(depth_readout="window"))
     mean = expected_log_depth(probs, LOG_CANDIDATES, CONFIG)
@@ -139,27 +139,29 @@ def test_the_window_readout_does_not_mix_two_surfaces():
     np.testing.assert_allclose(mean, 0.55 * LOG_CANDIDATES[3] + 0.45 * LOG_CANDIDATES[20], atol=FLOAT32)
 
 
-def views_and_belief():
+def views_and_distribution():
     config = CONFIG.replace(attention_window=4)
     views = prepare_views(chunk(views=2), config)
     shape = views.inside.shape
     probs = jax.nn.softmax(jnp.asarray(np.random.default_rng(5).normal(size=(*shape, D)), jnp.float32))
-    return views, DepthBelief(probs=probs, logits=jnp.log(probs), decoder=jnp.zeros((*shape, 8))), config
+    return views, DepthDistribution(probs=probs, logits=jnp.log(probs), decoder=jnp.zeros((*shape, 8))), config
 
 
-def test_what_vacc_trusts_does_not_hear_history():
-    views, belief, config = views_and_belief()
+def test_matcher_confidence_does_not_depend_on_history():
+    views, distribution, config = views_and_distribution()
     params = {"raw_gamma": jnp.float32(3.0)}
     shape = views.inside.shape
-    blank = anchor_depth(params, belief, history(np.zeros(shape), np.zeros(shape)), views, config)
-    loud = anchor_depth(params, belief, history(np.full(shape, 2.0), np.ones(shape)), views, config)
+    blank = anchor_depth(params, distribution, history(np.zeros(shape), np.zeros(shape)), views, config)
+    loud = anchor_depth(params, distribution, history(np.full(shape, 2.0), np.ones(shape)), views, config)
     np.testing.assert_array_equal(blank.matcher_confidences, loud.matcher_confidences)
     assert (loud.anchored_confidences > blank.anchored_confidences).mean() > 0.9
-    np.testing.assert_array_equal(blank.probs, belief.probs)
+    np.testing.assert_array_equal(blank.probs, distribution.probs)
 
 
-def test_switched_off_it_is_not_there():
-    views, belief, config = views_and_belief()
+def test_hpda_switched_off_keeps_the_distribution():
+    views, distribution, config = views_and_distribution()
     shape = views.inside.shape
-    off = anchor_depth({}, belief, history(np.full(shape, 2.0), np.ones(shape)), views, config.replace(hpda=False))
-    np.testing.assert_array_equal(off.probs, belief.probs)
+    off = anchor_depth(
+        {}, distribution, history(np.full(shape, 2.0), np.ones(shape)), views, config.replace(hpda=False)
+    )
+    np.testing.assert_array_equal(off.probs, distribution.probs)

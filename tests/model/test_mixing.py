@@ -1,4 +1,4 @@
-"""CGFI and the 3D mixer: when history is heard, and who a token's neighbors are."""
+"""CGFI and the 3D mixer: where history is injected, and which tokens are neighbors."""
 
 import jax
 import jax.numpy as jnp
@@ -44,7 +44,7 @@ def test_cgfi_is_the_identity_before_training():
     np.testing.assert_array_equal(inject(fresh(), maps(0, C), past(), 0.4), maps(0, C))
 
 
-def test_cgfi_hears_history_only_where_the_current_views_are_unsure():
+def test_cgfi_uses_history_only_where_confidence_is_below_one():
     def effect_of_history(confidence):
         here, other = (inject(params(), maps(0, C), past(seed), confidence) for seed in (1, 2))
         return float(jnp.abs(here - other).max())
@@ -60,7 +60,7 @@ def test_cgfi_tells_a_hole_from_a_zero_feature():
     assert float(jnp.abs(difference).max()) > 1e-3
 
 
-def test_cgfi_switched_off_is_the_identity_whatever_its_parameters():
+def test_cgfi_switched_off_is_the_identity():
     off = inject_features(
         params()["cgfi"], maps(0, C), past(), jnp.full(GRID, 0.2), views(), CONFIG.replace(cgfi=False)
     )
@@ -68,7 +68,7 @@ def test_cgfi_switched_off_is_the_identity_whatever_its_parameters():
 
 
 def brute_force(points, usable, candidates, k):
-    """Per token: itself, then its nearest usable candidates, as a set of distances (ties may come in any order)."""
+    """Sorted distances of each token's nearest usable candidates, the token itself (-1) first."""
     out = []
     for i, point in enumerate(points):
         others = [j for j in candidates(i) if usable[j] and j != i]
@@ -78,11 +78,10 @@ def brute_force(points, usable, candidates, k):
 
 
 @pytest.mark.parametrize("radius", [0, 1, 2])
-def test_neighbors_are_the_nearest_in_space_the_token_itself_first(radius):
-    config = CONFIG.replace(mixer_radius=radius, mixer_neighbors=4)
+def test_neighbors_are_the_nearest_with_the_token_first(radius):
     positions = maps(2, 3)
     inside = jnp.asarray(np.random.default_rng(3).uniform(size=GRID) < 0.8)
-    found = np.asarray(nearest_tokens(positions, inside, config))
+    found = np.asarray(nearest_tokens(positions, inside, 4, radius))
     points, usable = np.asarray(positions, np.float64).reshape(-1, 3), np.asarray(inside).reshape(-1)
     np.testing.assert_array_equal(found[:, 0], np.arange(len(points)))
 
@@ -114,7 +113,7 @@ def test_mixing_does_not_depend_on_the_order_of_the_views():
     assert float(jnp.abs(straight - feats).max()) > 0.1
 
 
-def test_a_valid_token_never_hears_cells_outside_the_image():
+def test_valid_tokens_ignore_cells_outside_the_image():
     feats, positions = maps(4, C), maps(5, 3)
     inside = jnp.ones(GRID, bool).at[:, :, 6:].set(False)
     neighbors_only = {**params()["mixer"]}
@@ -124,7 +123,7 @@ def test_a_valid_token_never_hears_cells_outside_the_image():
     np.testing.assert_array_equal(*out)
 
 
-def test_a_mixer_of_no_blocks_only_gives_unit_rms():
+def test_mixer_without_blocks_only_normalizes():
     config = CONFIG.replace(mixer_blocks=0)
     feats = maps(4, C)
     out = np.asarray(mix_tokens({}, feats, maps(5, 3), jnp.ones(GRID, bool), jnp.ones(3, bool), config))
@@ -149,7 +148,7 @@ def test_tokens_at_one_point_are_mixed_finitely():
     assert np.isfinite(mixed).all() and np.isfinite(gradient).all()
 
 
-def test_padded_views_change_nothing_here_either():
+def test_padded_views_do_not_change_mixing_and_cgfi():
     valid = jnp.array([True, True, False])
     inside = jnp.ones(GRID, bool) & valid[:, None, None]
     feats, positions = maps(4, C), maps(5, 3)

@@ -1,4 +1,4 @@
-"""The plane sweep: an untrained network already finds a textured wall; a cell that no source sees scores nothing."""
+"""The plane sweep: an untrained network finds a textured wall; cells that no source sees score zero."""
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +21,7 @@ CELL_SHARE = 0.7
 
 
 def texture(x, y):
-    """A sum of waves of many lengths on the wall, analytic: no image is resampled from another."""
+    """Analytic texture of the wall, a sum of waves of many lengths."""
     rng = np.random.default_rng(0)
     value = np.zeros((*x.shape, 3))
     for _ in range(40):
@@ -60,7 +60,7 @@ def wall_cost(chunk):
     return np.asarray(cost(random_params(CONFIG), chunk)).reshape(3, SIDE // 4, SIDE // 4, 2, CONFIG.network.num_depths)
 
 
-def test_the_cost_of_an_untrained_network_peaks_at_the_wall():
+def test_untrained_cost_peaks_at_the_wall():
     both = wall_cost(wall_chunk())
     assert (np.abs(both) <= 1 + 1e-5).all()  # means of cosines
     scores = both.sum(axis=3)
@@ -71,7 +71,7 @@ def test_the_cost_of_an_untrained_network_peaks_at_the_wall():
     assert near.mean() > CELL_SHARE, near.mean()
 
 
-def test_the_sweep_puts_the_wall_where_the_other_camera_sees_it():
+def test_sweep_pixels_are_shifted_by_the_parallax():
     views = prepare_views(wall_chunk(), CONFIG)
     x, y, seen = sweep_pixels(views, 1, 2, 4)
     pixels = np.stack([x, y], axis=-1)
@@ -82,7 +82,7 @@ def test_the_sweep_puts_the_wall_where_the_other_camera_sees_it():
         np.testing.assert_array_equal(seen[d], cells[:, 0] - parallax >= 0)
 
 
-def test_what_no_source_sees_scores_zero():
+def test_cells_that_no_source_sees_score_zero():
     away = np.diag([-1.0, 1.0, -1.0, 1.0])  # looks the other way
     chunk = wall_chunk()
     lonely = replace(chunk, viewmats=chunk.viewmats.at[0].set(jnp.asarray(away, jnp.float32)))

@@ -1,7 +1,6 @@
-"""The network as a whole: padded views are nothing, and no view is too hard to give finite tokens and gradients.
+"""The whole network: padding has no effect, and hard chunks and caches give finite tokens and gradients.
 
-The hard cases of its stages are in tests/stability/test_memory_hard_cases.py. Numbers in names are those of
-ALGORITHM.md, section 12.
+Hard cases of single stages are in tests/stability/test_*_hard_cases.py.
 """
 
 import jax
@@ -30,7 +29,7 @@ SUMS = 1e-6
 
 
 def turned(angle_step: float):
-    """Rotations about the vertical through one center: no parallax at all."""
+    """View matrices that rotate about the vertical through one center: there is no parallax."""
     viewmats = np.tile(np.eye(4), (3, 1, 1))
     for i, matrix in enumerate(viewmats):
         matrix[:3, :3] = rodrigues([0, 1, 0], angle_step * i)
@@ -60,7 +59,7 @@ HARD = {
 
 
 def remembering(**changes):
-    """The warm cache with fields of its living pivots set."""
+    """The warm cache with changed fields of its live pivots."""
 
     def change():
         cache = warm_cache()
@@ -93,7 +92,7 @@ HARD_MEMORIES = {  # cache, and raw strength of the anchor
 
 
 def check_prediction(chunk, cache, weights):
-    """Values, gradients, distributions and ranges of one chunk, and a finite cache after it."""
+    """Checks values, gradients, distributions and ranges of a chunk, and the cache after it."""
     value, gradient = gradients()(cache, chunk, weights)
     assert finite((value, gradient))
     prediction = predict()(weights, cache, chunk)
@@ -113,12 +112,12 @@ def test_hard_chunk_gives_finite_tokens_and_gradients(name):
 
 
 @pytest.mark.parametrize("name", HARD_MEMORIES)
-def test_hard_memory_gives_finite_tokens_and_gradients(name):
+def test_hard_cache_gives_finite_tokens_and_gradients(name):
     cache, raw_gamma = HARD_MEMORIES[name]
     check_prediction(chunk(), cache(), with_gamma(raw_gamma))
 
 
-def test_1_without_strength_a_full_cache_says_of_depth_what_an_empty_one_does():
+def test_gamma_zero_gives_the_depths_of_an_empty_cache():
     weak, blank = (predict()(with_gamma(-200.0), cache, chunk()) for cache in (warm_cache(), MODEL.init_cache()))
     np.testing.assert_array_equal(weak.log_depths, blank.log_depths)
     np.testing.assert_array_equal(weak.tokens.means, blank.tokens.means)
@@ -126,7 +125,7 @@ def test_1_without_strength_a_full_cache_says_of_depth_what_an_empty_one_does():
     assert float(jnp.abs(strong.log_depths - blank.log_depths).max()) > 1e-3
 
 
-def test_9_gamma_is_learned_where_there_is_history_and_only_there():
+def test_gamma_gets_a_gradient_only_where_there_is_history():
     def slope(cache):
         return float(gradients()(cache, chunk())[1][0]["hpda"]["raw_gamma"])
 
@@ -135,20 +134,20 @@ def test_9_gamma_is_learned_where_there_is_history_and_only_there():
     assert slope(remembering(confidences=0.0)()) == 0
 
 
-def test_9_no_gradient_reaches_what_earlier_chunks_left():
+def test_no_gradient_reaches_the_cache():
     _, (*_, remembered) = gradients()(warm_cache(), chunk())
     for gradient in remembered:
         np.testing.assert_array_equal(gradient, 0)
 
 
-def test_every_part_of_the_network_hears_the_gradient():
+def test_every_stage_gets_a_gradient():
     _, (by_params, *_) = gradients()(warm_cache(), chunk())
     for stage, gradient in by_params.items():
         assert max(float(jnp.abs(leaf).max()) for leaf in jax.tree.leaves(gradient)) > 0, stage
 
 
 @pytest.mark.parametrize("padded", [0, 1, 2])
-def test_a_padded_view_changes_nothing_in_the_valid_ones(padded):
+def test_padded_view_does_not_change_the_valid_ones(padded):
     valid = jnp.ones(3, bool).at[padded].set(False)
     base = replace(chunk(), valid=valid)
     other = replace(
@@ -165,18 +164,18 @@ def test_a_padded_view_changes_nothing_in_the_valid_ones(padded):
     assert len(rows) == 2 * 42
     for name in ("means", "feats", "confidences", "rgbs", "footprints"):
         np.testing.assert_array_equal(getattr(a.tokens, name)[rows], getattr(b.tokens, name)[rows])
-    # The views do differ where it counts when the view is real.
+    # If the view is valid, the difference shows.
     c, d = (predict()(params(), warm_cache(), replace(x, valid=jnp.ones(3, bool))) for x in (base, other))
     assert float(jnp.abs(c.tokens.feats[rows] - d.tokens.feats[rows]).max()) > 1e-3
 
 
-def test_padded_views_and_cells_outside_the_image_offer_no_token():
+def test_padding_gives_no_valid_tokens():
     prediction = predict()(params(), warm_cache(), replace(chunk(), valid=jnp.array([True, True, False])))
     np.testing.assert_array_equal(prediction.tokens.valid, prediction.views.inside.reshape(-1))
     np.testing.assert_array_equal(np.asarray(prediction.tokens.confidences)[~np.asarray(prediction.tokens.valid)], 0)
 
 
-def test_a_chunk_of_padding_leaves_the_memory_as_it_was():
+def test_chunk_of_padding_does_not_change_the_cache():
     empty = replace(chunk(3), valid=jnp.zeros(3, bool))
     after, output = step()(params(), warm_cache(), empty)
     np.testing.assert_array_equal(output.confidences, 0)
@@ -184,7 +183,7 @@ def test_a_chunk_of_padding_leaves_the_memory_as_it_was():
         np.testing.assert_array_equal(getattr(after, name), getattr(warm_cache(), name))
 
 
-def test_the_cache_is_read_and_remembered():
+def test_history_comes_from_the_cache():
     assert int(warm_cache().num_voxels) > 0
     history = predict()(params(), warm_cache(), chunk()).output.history
     assert float((history > 0).mean()) > 0.05
@@ -201,7 +200,7 @@ def test_the_cache_is_read_and_remembered():
     ],
     ids=str,
 )
-def test_the_smallest_configurations_run(changes):
+def test_smallest_configurations_run(changes):
     config = CONFIG.replace(**changes)
     model = StreamSplat(config)
     weights = random_params(config)

@@ -1,4 +1,4 @@
-"""ReSplat's network by itself: its sizes, its parts against plain definitions, and the stream around it."""
+"""ReSplat's network: its sizes, its layers against plain definitions, and streaming with it."""
 
 import functools
 
@@ -13,10 +13,10 @@ from ssplat_jax.model import count_params, init_params, inject_features, prepare
 from ssplat_jax.model.hpda import expected_log_depth
 from ssplat_jax.model.resplat.cost_volume import plane_sweep
 from ssplat_jax.model.resplat.encoder import Transformer
-from ssplat_jax.model.resplat.swin_layers import EdgeConv, GrowingConv, resize
+from ssplat_jax.model.resplat.torch_layers import EdgePaddedConv, TransposedConv, resize
 from ssplat_jax.model.resplat.vit import POSITIONS_SIDE, grid_size, resampled_positions
 from ssplat_jax.model.types import to_candidate_space
-from ssplat_jax.model.windows import in_one_region
+from ssplat_jax.model.windows import same_region_mask
 from ssplat_jax.pytree import replace
 from ssplat_jax.streaming.streamsplat import StreamSplat
 from ssplat_jax.train.losses import soft_targets
@@ -29,19 +29,19 @@ MODEL = StreamSplat(CONFIG)
 @pytest.mark.parametrize(("name", "millions"), [("small", 62.1), ("base", 209.4)])
 def test_presets_have_the_published_number_of_parameters(name, millions):
     params = jax.eval_shape(lambda key: init_params(key, preset(name)), jax.random.key(0))
-    ours = ("hpda", "cgfi")  # StreamSplat's, which ReSplat does not have
+    ours = ("hpda", "cgfi")  # stages that ReSplat does not have
     counted = count_params({stage: p for stage, p in params.items() if stage not in ours})
     assert round(counted / 1e6, 1) == millions
 
 
-def test_a_stage_by_itself_is_initialised_as_among_all():
+def test_single_stage_is_initialized_as_among_all():
     config = StreamConfig().replace(token_width=8, cgfi_width=8, mixer_blocks=1)
     whole, part = (init_params(jax.random.key(3), config, only) for only in (None, ("hpda", "decoder")))
     assert set(part) == {"hpda", "decoder"}
     jax.tree.map(np.testing.assert_array_equal, part, {name: whole[name] for name in part})
 
 
-def test_resizing_keeps_corners_and_draws_straight_lines_between():
+def test_resize_keeps_corners_and_interpolates_linearly():
     rng = np.random.default_rng(0)
     x = rng.normal(size=(2, 5, 7, 3)).astype(np.float32)
     for height, width in ((5, 7), (9, 13), (3, 4), (16, 11), (1, 1)):
@@ -53,28 +53,28 @@ def test_resizing_keeps_corners_and_draws_straight_lines_between():
         np.testing.assert_allclose(resize(jnp.asarray(x), height, width), wanted, atol=1e-5)
 
 
-def test_a_growing_convolution_makes_a_patch_of_every_sample():
+def test_transposed_conv_makes_a_patch_of_every_sample():
     rng = np.random.default_rng(0)
     shapes = ((1, 2, 3, 4), (2, 2, 4, 5), (5,))
     x, kernel, bias = (jnp.asarray(rng.normal(size=shape), jnp.float32) for shape in shapes)
-    y = GrowingConv(5, 2).apply({"params": {"kernel": kernel, "bias": bias}}, x)
+    y = TransposedConv(5, 2).apply({"params": {"kernel": kernel, "bias": bias}}, x)
     for i, j in np.ndindex(4, 6):
         wanted = x[0, i // 2, j // 2] @ kernel[i % 2, j % 2] + bias
         np.testing.assert_allclose(np.asarray(y)[0, i, j], wanted, rtol=1e-5, atol=1e-5)
 
 
-def test_an_edge_convolution_sees_a_constant_as_a_constant():
+def test_edge_padded_conv_keeps_constants_constant():
     kernel = jnp.asarray(np.random.default_rng(0).normal(size=(3, 3, 2, 4)), jnp.float32)
-    y = EdgeConv(4).apply({"params": {"kernel": kernel, "bias": jnp.zeros(4)}}, jnp.ones((1, 4, 5, 2)))
+    y = EdgePaddedConv(4).apply({"params": {"kernel": kernel, "bias": jnp.zeros(4)}}, jnp.ones((1, 4, 5, 2)))
     np.testing.assert_allclose(y, np.broadcast_to(kernel.sum(axis=(0, 1, 2)), (1, 4, 5, 4)), rtol=1e-5, atol=1e-5)
 
 
-def test_position_codes_are_resampled_as_dinov2_asks_torch_to():
+def test_position_codes_are_resampled_as_by_dinov2():
     rng = np.random.default_rng(0)
     codes = jnp.asarray(rng.normal(size=(1, 1 + POSITIONS_SIDE**2, 2)), jnp.float32)
     np.testing.assert_array_equal(resampled_positions(codes, 37, 37), codes[:, 1:])
     np.testing.assert_allclose(resampled_positions(jnp.ones_like(codes), 9, 50), 1.0, atol=1e-5)
-    # Keys' cubic convolution with a = -0.75 (JAX's has -0.5), at the places of a factor of (size + 0.1) / 37.
+    # Keys' cubic convolution with a = -0.75 (JAX has -0.5), at positions for a factor of (size + 0.1) / 37.
     rows, columns = 9, 50
     wanted = np.zeros((rows, columns, 2))
     grid = np.asarray(codes[0, 1:], np.float64).reshape(37, 37, 2)
@@ -94,32 +94,32 @@ def keys_kernel(t: float, a: float = -0.75) -> float:
     return a * (t**3 - 5 * t**2 + 8 * t - 4) if t < 2 else 0.0
 
 
-def test_the_vit_sees_at_most_560_pixels_and_at_least_a_cell():
+def test_vit_grid_is_bounded():
     assert grid_size(128, 192) == (9, 13)
     assert grid_size(512, 768) == (26, 40)
     assert grid_size(4, 8) == (1, 1)
 
 
 def test_keys_of_all_sources_are_masked_alike():
-    together = in_one_region(4, 6, (4, 6), (2, 3))
-    keys = Transformer(upstream_compat=False).of_sources(together, 2)
+    together = same_region_mask(4, 6, (4, 6), (2, 3))
+    keys = Transformer(upstream_compat=False).source_mask(together, 2)
     np.testing.assert_array_equal(keys[..., :24], together)
     np.testing.assert_array_equal(keys[..., 24:], together)
     one = Transformer(upstream_compat=True)
-    np.testing.assert_array_equal(one.of_sources(together, 1), together)  # of one source there is no other way
-    assert (np.asarray(one.of_sources(together, 2)) != np.asarray(keys)).any()
+    np.testing.assert_array_equal(one.source_mask(together, 1), together)  # one source: the same order
+    assert (np.asarray(one.source_mask(together, 2)) != np.asarray(keys)).any()
 
 
-def test_the_compact_network_has_no_coarser_match_grid():
-    with pytest.raises(InputError, match="match_stride must be 4 with this network, got 8"):
+def test_options_of_the_other_network_are_refused():
+    with pytest.raises(InputError, match="no field 'match_stride' with network 'compact'"):
         StreamConfig().replace(match_stride=8)
     with pytest.raises(InputError, match="depth_range must be two depths, the nearer first"):
         preset("small").replace(depth_range=(2.0, 1.0))
-    with pytest.raises(InputError, match="depth_space must be 'log' with this network, got 'inverse'"):
+    with pytest.raises(InputError, match="no field 'depth_space' with network 'compact'"):
         StreamConfig().replace(depth_space="inverse")
 
 
-def test_depths_are_averaged_where_candidates_are_equally_far_apart():
+def test_depths_are_averaged_in_the_space_of_candidates():
     given = views()
     for space, average in (("log", np.sqrt(2.0 * 8.0)), ("inverse", 2 / (1 / 2.0 + 1 / 8.0))):
         config = CONFIG.replace(depth_space=space, depth_range=(2.0, 8.0))
@@ -129,9 +129,9 @@ def test_depths_are_averaged_where_candidates_are_equally_far_apart():
         np.testing.assert_allclose(np.exp(sorted(candidates[jnp.array([0, -1])])), [2.0, 8.0], rtol=1e-6)
         both_ends = jnp.zeros(config.network.num_depths).at[jnp.array([0, -1])].set(0.5)
         assert np.exp(expected_log_depth(both_ends, candidates, config)) == pytest.approx(average, rel=1e-5)
-        # A true depth is one of the candidates around it, however far apart they are there.
+        # Targets peak at the candidates next to the true depth, whatever their distance.
         for truth in np.log([2.05, 3.0, 5.0, 7.8]):
-            targets = np.asarray(soft_targets(jnp.float32(truth), candidates))
+            targets = np.asarray(soft_targets(jnp.float32(truth), candidates, 0.6))
             assert targets.sum() == pytest.approx(1.0, abs=1e-5)
             nearest = np.argsort(np.abs(np.asarray(candidates) - truth))[:2]
             assert np.argmax(targets) in nearest and targets[nearest].sum() > 0.6
@@ -154,7 +154,7 @@ def views(**changes):
     return replace(chunk(0, views=3, height=40, width=56), **changes)
 
 
-def test_the_stream_fills_its_memory_and_depths_stay_among_the_candidates():
+def test_stream_fills_the_cache_and_depths_stay_in_range():
     cache, out = step()(params(), MODEL.init_cache(), views())
     near, far = CONFIG.network.depth_range
     assert out.depths.shape == (3, 16, 16)  # padded to 64 x 64
@@ -163,7 +163,7 @@ def test_the_stream_fills_its_memory_and_depths_stay_among_the_candidates():
     gaussians = MODEL.decode(params(), cache)
     assert gaussians.sh.shape[1:] == (16, 3)
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(gaussians))
-    # History is heard a chunk later: what is remembered of the same views changes what they say.
+    # The next chunk has a history, which changes its depths.
     _, later = step()(params(), cache, views())
     assert (later.history > 0).mean() > 0.2
     assert np.abs(np.asarray(later.depths - out.depths)).max() > 1e-4
@@ -179,7 +179,7 @@ def test_a_padded_view_changes_nothing():
     assert not np.asarray(outs[0].confidences)[2].any()
 
 
-def test_a_view_alone_is_matched_with_nothing_and_stays_finite():
+def test_single_view_has_zero_cost_and_stays_finite():
     one = chunk(0, views=1, height=40, width=56)
 
     def see(params):
@@ -187,18 +187,18 @@ def test_a_view_alone_is_matched_with_nothing_and_stays_finite():
         features = resplat.encode(params["encoder"], here, CONFIG)
         return plane_sweep(features, here, CONFIG), resplat.match(params["cost_volume"], features, here, CONFIG)
 
-    cost, belief = jax.jit(see)(params())
+    cost, distribution = jax.jit(see)(params())
     assert not np.asarray(cost).any()
-    np.testing.assert_allclose(belief.probs.sum(axis=-1), 1.0, atol=1e-5)
+    np.testing.assert_allclose(distribution.probs.sum(axis=-1), 1.0, atol=1e-5)
 
 
-def test_what_cgfi_hears_has_one_size_however_large_features_are():
+def test_injected_history_is_bounded_for_large_features():
     rng = np.random.default_rng(0)
     grid, c = (3, 8, 8), CONFIG.network.token_width
     feats = jnp.asarray(rng.normal(size=(*grid, c)), jnp.float32)
     remembered = rng.normal(size=(*grid, c))
     here = prepare_views(views(), CONFIG)
-    program = jax.jit(inject_features, static_argnums=5)
+    program = jax.jit(functools.partial(inject_features, bound_history=resplat.bound_history), static_argnums=5)
     injected = []
     for size in (1.0, 1e6):
         past = history(np.ones(grid), np.full(grid, 0.7), feats=size * remembered)
@@ -217,4 +217,4 @@ def test_gradients_are_finite_and_reach_every_stage():
     gradients = jax.jit(jax.grad(loss))(params())
     sizes = {name: float(sum(jnp.sum(jnp.abs(x)) for x in jax.tree.leaves(part))) for name, part in gradients.items()}
     assert all(np.isfinite(size) for size in sizes.values())
-    assert all(size > 0 for name, size in sizes.items() if name != "hpda"), sizes  # no history yet: no anchor
+    assert all(size > 0 for name, size in sizes.items() if name != "hpda"), sizes  # without history, no anchor

@@ -1,7 +1,4 @@
-"""ReSplat's network against what the authors' PyTorch code computed, from the same weights, stage by stage.
-
-The fixtures say that 2e-4 of a tap's standard deviation is a safe tolerance: float32 against float64 gives 3.4e-5.
-"""
+"""ReSplat's network against the outputs of the authors' PyTorch code with the same weights, stage by stage."""
 
 import functools
 
@@ -18,18 +15,19 @@ from ssplat_jax.model import resplat
 from ssplat_jax.model.convolution import pixel_unshuffle
 from ssplat_jax.model.hpda import expected_log_depth
 from ssplat_jax.model.resplat.head import GaussianHead
-from ssplat_jax.model.resplat.swin_layers import resize
 from ssplat_jax.model.resplat.tokens import token_context
+from ssplat_jax.model.resplat.torch_layers import resize
 from ssplat_jax.model.resplat.upsampler import Upsampler
 from ssplat_jax.model.types import AnchoredDepth, Views, prepare_views, to_candidate_space
 from tests.model.resplat_fixture import load_golden, named_params, tap_error
 
 TOLERANCE = 2e-4
+"""Largest error in standard deviations of a tap; float32 against float64 gives 3.4e-5."""
 
 
 @pytest.fixture(autouse=True)
 def _exact_products():
-    """GPUs round the factors of matrix products unless told otherwise."""
+    """Computes matrix products in full float32, which GPUs by default do not."""
     with jax.default_matmul_precision("highest"):
         yield
 
@@ -54,7 +52,7 @@ def nchw(x) -> np.ndarray:
 
 @functools.cache
 def resplat_values() -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Of every tap what was wanted and what came, through all stages from the images."""
+    """Wanted and computed values of every tap, from the images through all stages."""
     golden = load_golden("resplat_small")
     chunk = read_inputs(golden)
     near, far = golden["in.near_far"].tolist()
@@ -64,16 +62,16 @@ def resplat_values() -> dict[str, tuple[np.ndarray, np.ndarray]]:
     def run(params, views: Views):
         height, width = views.images.shape[1:3]
         features = resplat.encode(params["encoder"], views, config)
-        belief = resplat.match(params["cost_volume"], features, views, config)
-        confidences = belief.probs.max(axis=-1)
-        log_depths = expected_log_depth(belief.probs, views.log_candidates, config)
-        depth = AnchoredDepth(belief.probs, log_depths, confidences, confidences)
+        distribution = resplat.match(params["cost_volume"], features, views, config)
+        confidences = distribution.probs.max(axis=-1)
+        log_depths = expected_log_depth(distribution.probs, views.log_candidates, config)
+        depth = AnchoredDepth(distribution.probs, log_depths, confidences, confidences)
         residual = Upsampler(config).apply({"params": params["upsampler"]}, features, log_depths, height, width)
         depth = resplat.refine_depth(params["upsampler"], features, depth, views, config)
         context = token_context(features, height // 4, width // 4)
         match = depth.matcher_confidences[..., None]
         regressed = [pixel_unshuffle(views.images, 4), jnp.exp(depth.log_depths)[..., None], match, context]
-        feats = resplat.regress_tokens(params["tokens"], features, belief, depth, views, config)
+        feats = resplat.regress_tokens(params["tokens"], features, distribution, depth, views, config)
         positions, footprints = stages.back_project(depth.log_depths, views)
         mixed = resplat.mix_tokens(params["mixer"], feats, positions, views.inside, views.valid, config)
         flat = mixed.reshape(-1, config.network.token_width)
@@ -90,8 +88,8 @@ def resplat_values() -> dict[str, tuple[np.ndarray, np.ndarray]]:
         axes = quats_to_matrices(gaussians.quats)
         unit = shapes.quats / jnp.linalg.norm(shapes.quats, axis=1, keepdims=True)
         return {
-            "tap.depth_predictor.depth_head.0.in0": belief.decoder.transpose(0, 3, 1, 2),
-            "tap.depth_predictor.depth_head.0": belief.logits.transpose(0, 3, 1, 2),
+            "tap.depth_predictor.depth_head.0.in0": distribution.decoder.transpose(0, 3, 1, 2),
+            "tap.depth_predictor.depth_head.0": distribution.logits.transpose(0, 3, 1, 2),
             "tap.depth_predictor.upsampler": residual,
             "tap.gaussian_regressor.in0": jnp.concatenate(regressed, axis=-1).transpose(0, 3, 1, 2),
             "tap.proj": feats,
@@ -117,14 +115,14 @@ RESPLAT_TAPS = (
 
 
 @pytest.mark.parametrize("name", RESPLAT_TAPS)
-def test_resplat_computes_what_the_authors_code_computed(name):
+def test_resplat_computes_what_the_authors_code_computes(name):
     wanted, came = resplat_values()[name]
     error = tap_error(wanted, came)
     print(f"{name}: {error:.1e} of its standard deviation")  # `pytest -rP` shows it
     assert error < TOLERANCE
 
 
-def test_resplats_shifted_windows_are_masked_as_upstream_only_when_asked():
+def test_upstream_masks_apply_only_with_upstream_compat():
     golden = load_golden("resplat_small")
     config = preset("small")
     views = prepare_views(read_inputs(golden), config)
@@ -138,8 +136,8 @@ def test_resplats_shifted_windows_are_masked_as_upstream_only_when_asked():
     assert 0.01 < difference < 0.2
 
 
-def test_depthsplats_depth_network_agrees_on_the_finer_grid():
-    """Two views, 1/4, candidates in inverse depth: the other layout of the same parts."""
+def test_depthsplat_depth_network_agrees_on_the_finer_grid():
+    """Another layout of the same layers: two views, matching at 1/4, candidates in inverse depth."""
     golden = load_golden("depthsplat_small")
     near, far = golden["in.near_far"].tolist()
     layout = {"match_stride": 4, "num_sources": 1, "depth_space": "inverse", "depth_range": (near, far)}
@@ -149,18 +147,18 @@ def test_depthsplats_depth_network_agrees_on_the_finer_grid():
 
     def run(params, views):
         features = resplat.encode(params["encoder"], views, config)
-        belief = resplat.match(params["cost_volume"], features, views, config)
-        inverse = to_candidate_space(expected_log_depth(belief.probs, views.log_candidates, config), config)
+        distribution = resplat.match(params["cost_volume"], features, views, config)
+        inverse = to_candidate_space(expected_log_depth(distribution.probs, views.log_candidates, config), config)
         height, width = views.images.shape[1:3]
         residual = Upsampler(config).apply({"params": params["upsampler"]}, features, inverse, height, width)
-        return features, belief, residual, 1 / (resize(inverse[..., None], height, width)[..., 0] + residual)
+        return features, distribution, residual, 1 / (resize(inverse[..., None], height, width)[..., 0] + residual)
 
-    features, belief, residual, depths = jax.jit(run)(params, views)
+    features, distribution, residual, depths = jax.jit(run)(params, views)
     wanted = lambda name: golden[f"tap.depth_predictor.{name}"]  # noqa: E731
     for i, x in enumerate(features.cnn):
         assert tap_error(wanted(f"backbone.{i}"), nchw(x)) < TOLERANCE
     for i in range(2):
         assert tap_error(wanted(f"transformer.{i}"), nchw(features.multiview[i : i + 1])) < TOLERANCE
-    assert tap_error(wanted("depth_head.0"), nchw(belief.logits)) < TOLERANCE
+    assert tap_error(wanted("depth_head.0"), nchw(distribution.logits)) < TOLERANCE
     assert tap_error(wanted("upsampler"), residual) < TOLERANCE
     assert tap_error(golden["out.depth"], depths) < TOLERANCE

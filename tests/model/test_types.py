@@ -1,4 +1,4 @@
-"""What passes between the stages: padding, candidates, choice of sources; positions and the head's Gaussians."""
+"""Views, depth candidates and sources; positions and Gaussians of tokens."""
 
 import math
 
@@ -24,7 +24,7 @@ from tests.model.small import CONFIG, HEIGHT, WIDTH, chunk, params
 FLOAT32 = 1e-5
 
 
-def test_padding_keeps_the_image_and_says_what_is_inside():
+def test_padding_keeps_the_image_and_marks_inside_cells():
     views = prepare_views(chunk(), CONFIG)
     np.testing.assert_array_equal(views.images[:, :HEIGHT, :WIDTH], chunk().images)
     np.testing.assert_array_equal(views.images[:, HEIGHT:, :WIDTH], np.repeat(chunk().images[:, -1:], 32 - HEIGHT, 1))
@@ -32,7 +32,7 @@ def test_padding_keeps_the_image_and_says_what_is_inside():
     centers = np.asarray(pixel_grid(32, 32, GRID_STRIDE))
     wanted = (centers[..., 0] < WIDTH) & (centers[..., 1] < HEIGHT)
     np.testing.assert_array_equal(views.inside, np.broadcast_to(wanted, (3, 8, 8)))
-    assert wanted.sum() == 6 * 7  # the seventh column's centers, x = 26, lie in the image; x = 30 does not
+    assert wanted.sum() == 6 * 7  # the centers of the seventh column, x = 26, lie in the image, x = 30 does not
 
 
 def test_a_padded_view_has_no_cell_inside():
@@ -45,7 +45,7 @@ def test_candidates_are_uniform_in_log_depth_from_near_to_far():
     np.testing.assert_allclose(logs, np.linspace(np.log(1.0), np.log(6.0), CONFIG.network.num_depths), atol=FLOAT32)
 
 
-def test_the_grid_camera_sees_cell_centres_at_pixel_centers():
+def test_grid_camera_has_cell_centers_at_pixel_centers():
     views = prepare_views(chunk(), CONFIG)
     points = jnp.array([[[0.3, -0.2, 2.0]]])
     fine, _ = project_points(points, views.Ks[:1])
@@ -64,7 +64,7 @@ def test_sources_are_the_nearest_other_views():
     assert valid.all()
 
 
-def test_a_view_is_never_its_own_source_even_among_cameras_at_one_place():
+def test_view_is_never_its_own_source_even_at_one_center():
     sources, valid = nearest_sources(line_of_cameras(0, 0, 0, 0), jnp.ones(4, bool), 3)
     assert valid.all() and (sources != jnp.arange(4)[:, None]).all()
     assert all(len(set(row)) == 3 for row in np.asarray(sources).tolist())
@@ -86,7 +86,7 @@ def test_windows_and_back():
     np.testing.assert_array_equal(from_windows(windows, (4, 6), 8, 12), x)
 
 
-def test_position_code_is_detrs():
+def test_position_code_is_that_of_detr():
     height, width, channels = 4, 6, 8
     wanted = np.zeros((height, width, channels))
     for y, x, c in np.ndindex(height, width, channels // 2):
@@ -145,19 +145,19 @@ def decoded(m: int = 10, num_members=1, means=None, footprints=None, quats=None,
     return decode_tokens(shapes, **rest, num_members=num_members, config=config), inputs
 
 
-def test_an_untrained_head_puts_a_disc_of_the_patchs_color_exactly_on_the_token():
+def test_untrained_head_gives_a_disc_of_the_patch_color():
     gaussians, inputs = decoded(sh_degree=1, gaussians_per_token=1)
     np.testing.assert_array_equal(gaussians.means, inputs["means"])
     np.testing.assert_allclose(0.5 + SH_C0 * gaussians.sh[:, 0], inputs["rgbs"], atol=1e-6)
     np.testing.assert_array_equal(gaussians.sh[:, 1:], 0)
     wanted = np.outer(inputs["footprints"], [START_SCALE, START_SCALE, START_THICKNESS])
     np.testing.assert_allclose(gaussians.scales, wanted, rtol=1e-5)
-    # Thin along the viewing direction of the camera that saw it.
+    # The thin axis is the viewing direction of the token's camera.
     np.testing.assert_allclose(quats_to_matrices(gaussians.quats), quats_to_matrices(inputs["quats"]), atol=FLOAT32)
     np.testing.assert_allclose(gaussians.opacities, 1 / (1 + np.exp(-START_OPACITY)), rtol=1e-6)
 
 
-def test_a_pivot_is_as_opaque_as_its_members_in_one_place():
+def test_pivot_is_as_opaque_as_its_members_in_one_place():
     members = np.array([0, 1, 2, 3, 17, 1000, 2**31 - 1], np.int32)
     gaussians, _ = decoded(len(members), num_members=jnp.asarray(members), gaussians_per_token=1)
     single = 1 / (1 + np.exp(-START_OPACITY))
@@ -179,8 +179,8 @@ def test_a_pivot_is_as_opaque_as_its_members_in_one_place():
 
 
 @pytest.mark.parametrize("per_token", [1, 4, 16])
-def test_the_gaussians_of_a_token_lie_where_their_parts_of_the_patch_are_seen(per_token):
-    """Seen by the camera that made the token, each projects to the middle of the part whose color it has."""
+def test_gaussians_of_a_token_project_to_their_parts(per_token):
+    """In the token's camera, each Gaussian projects to the center of the part whose color it has."""
     config = CONFIG.replace(gaussians_per_token=per_token)
     camera, images = prepare_views(chunk(), config), np.random.default_rng(0).uniform(size=(3, 32, 32, 3))
     colors = patch_colors(jnp.asarray(images, jnp.float32), config)
@@ -197,7 +197,7 @@ def test_the_gaussians_of_a_token_lie_where_their_parts_of_the_patch_are_seen(pe
     )
     seen, _ = project_points(transform_points(camera.viewmats, gaussians.means.reshape(3, -1, 3)), camera.Ks)
     parts = np.asarray(seen).reshape(3, -1, 2) * side / GRID_STRIDE
-    # A footprint is square; the camera's cells are not quite (fx and fy differ by 4 %).
+    # Footprints are square; cells are not quite, since fx and fy differ by 4 %.
     np.testing.assert_allclose(parts % 1, 0.5, atol=0.03)
     pooled = images.reshape(3, 8 * side, 4 // side, 8 * side, 4 // side, 3).mean(axis=(2, 4))
     columns, rows = np.floor(parts).astype(int).transpose(2, 0, 1)
@@ -206,14 +206,14 @@ def test_the_gaussians_of_a_token_lie_where_their_parts_of_the_patch_are_seen(pe
 
 
 def hidden_layers():
-    """The layers of a head of four channels, before its last."""
+    """Layers of a head of four channels, except the last."""
     return {
         "norm": {"scale": jnp.ones(4), "bias": jnp.zeros(4)},
         "hidden": {"kernel": jnp.zeros((4, 4)), "bias": jnp.zeros(4)},
     }
 
 
-def test_no_feature_makes_a_gaussian_of_absurd_size():
+def test_scales_are_bounded_for_any_feature():
     raw = jnp.array([[1e30, -1e30, 0.0], [jnp.inf, -jnp.inf, 3.0]])
     for mode in ("footprint", "absolute"):
         config = CONFIG.replace(scale_mode=mode, max_scale=2.0)
@@ -227,7 +227,7 @@ def test_no_feature_makes_a_gaussian_of_absurd_size():
     np.testing.assert_allclose(literal[0], np.log1p(np.exp([-4.0, -3.0, 1.0])), rtol=1e-5)
 
 
-def test_the_tiny_preset_is_as_small_as_promised_and_names_its_stages():
+def test_tiny_preset_has_its_stages_and_size():
     params = jax.eval_shape(lambda key: init_params(key, preset("tiny")), jax.random.key(0))
     assert set(params) == {"encoder", "cost_volume", "hpda", "tokens", "cgfi", "mixer", "decoder"}
     assert 1e6 < count_params(params) < 3e6

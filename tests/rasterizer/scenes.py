@@ -1,5 +1,6 @@
 """Small scenes and cameras for the tests of the rasterizer."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -17,6 +18,11 @@ def cloud(num: int = 60, *, degree: int = 1, size: float = 0.08, seed: int = 0, 
         opacities=jnp.asarray(random.uniform(0.05, 0.95, num).astype(dtype)),
         sh=jnp.asarray(random.normal(0, 0.3, (num, (degree + 1) ** 2, 3)).astype(dtype)),
     )
+
+
+def concatenate(parts: list[Gaussians]) -> Gaussians:
+    """All rows of `parts`, which have the same SH degree, in order."""
+    return jax.tree.map(lambda *rows: jnp.concatenate(rows), *parts)
 
 
 def cameras(width: int, height: int, batch: int | None = None, dtype=np.float32) -> Camera:

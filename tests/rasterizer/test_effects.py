@@ -1,4 +1,4 @@
-"""Each effect: right when on, no trace when off, asked for only by scenes that need it."""
+"""Each effect: right when on, no operation when off, on only where a scene needs it."""
 
 import functools
 
@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 
 from ssplat_jax.errors import InputError
-from ssplat_jax.gaussians import Gaussians, concatenate, mask_gaussians
+from ssplat_jax.gaussians import Gaussians, mask_gaussians
 from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.pytree import replace
 from ssplat_jax.rasterizer import Effects, effects_for, filter_3d, render
 from ssplat_jax.rasterizer.lens_distortion import distort
 from ssplat_jax.rasterizer.projection import project
-from tests.rasterizer.scenes import cameras, cloud
+from ssplat_jax.rasterizer.reference import render_reference
+from tests.rasterizer.scenes import cameras, cloud, concatenate
 
 LENS = np.array([-0.2, 0.05, 0.002, -0.003, 0.01], np.float32)
 EXPOSURE = np.concatenate([np.diag([1.2, 0.9, 1.1]), [[0.01], [0.0], [-0.02]]], axis=1).astype(np.float32)
@@ -39,21 +40,26 @@ def operations(gaussians, camera, effects: Effects, **arrays) -> tuple[int, floa
     return count(traced.jaxpr.jaxpr), float(cost.get("flops", 0.0))
 
 
+ARRAYS = {
+    "captured": cameras(16, 16),
+    "distortion": jnp.asarray(LENS),
+    "exposures": jnp.asarray(EXPOSURE),
+    "features": jnp.ones((8, 2)),
+}
+FLAGS = {"captured": "filter_3d", "distortion": "distortion", "exposures": "exposure"}
+
+
 @functools.cache  # many effects are compared with the same program
-def operations_of(effects: Effects, degree: int = 3, *, with_arrays: bool = False) -> tuple[int, float]:
+def operations_of(effects: Effects, degree: int = 3, *, arrays: tuple[str, ...] = ()) -> tuple[int, float]:
     gaussians, camera = cloud(8, degree=3), cameras(16, 16)
     scene = replace(gaussians, sh=gaussians.sh[:, : (degree + 1) ** 2])
-    arrays = {"captured": camera, "distortion": jnp.asarray(LENS), "exposures": jnp.asarray(EXPOSURE)}
-    return operations(scene, camera, effects, **(arrays if with_arrays else {}))
+    return operations(scene, camera, effects, **{name: ARRAYS[name] for name in arrays})
 
 
 EFFECTS = {
     "sh": (Effects(sh_degree=3), Effects(sh_degree=0)),
     "mip": (Effects(), Effects(antialias="none")),
     "classic": (Effects(antialias="mip"), Effects(antialias="classic")),
-    "filter_3d": (Effects(filter_3d=True), Effects()),
-    "distortion": (Effects(distortion=True), Effects()),
-    "exposure": (Effects(exposure=True), Effects()),
     "background": (Effects(background=(0.1, 0.2, 0.3)), Effects()),
     "depth": (Effects(), Effects(outputs=("color", "alpha"))),
     "alpha": (Effects(outputs=("color", "alpha")), Effects(outputs=("color",))),
@@ -62,25 +68,61 @@ EFFECTS = {
 
 
 @pytest.mark.parametrize("name", EFFECTS)
-def test_an_effect_that_is_off_leaves_no_trace(name):
-    """Off with its arrays passed = a program that never had them; on adds operations."""
+def test_an_effect_that_is_off_adds_no_operation(name):
     on, off = EFFECTS[name]
-    never = operations_of(off, degree=0 if name == "sh" else 3)
-    without, having = (operations_of(effects, with_arrays=True) for effects in (off, on))
-    # SH bands that are not evaluated are still looked at for NaN, one comparison an entry.
-    assert without[0] == never[0] + (1 if name == "sh" else 0) or without[0] == never[0]
-    if name != "sh":
-        assert without == never
+    without, having = map(operations_of, (off, on))
+    if name == "sh":
+        # SH bands that are not evaluated are still checked for NaN, one comparison an entry.
+        never = operations_of(off, degree=0)
+        assert without[0] in (never[0], never[0] + 1)
     assert having[0] > without[0] and having[1] > without[1]
 
 
-def test_features_that_are_not_passed_leave_no_trace():
-    gaussians, camera = cloud(8), cameras(16, 16)
-    plain = operations(gaussians, camera, Effects())
-    assert operations(gaussians, camera, Effects(), features=jnp.ones((8, 2)))[0] > plain[0]
+@pytest.mark.parametrize("name", ARRAYS)
+def test_an_array_that_is_absent_adds_no_operation(name):
+    """An explicit None, and a flag that is off, are the program that never heard of the array."""
+    never, having = operations_of(Effects()), operations_of(Effects(), arrays=(name,))
+    scene = cloud(8, degree=3), cameras(16, 16)
+    assert operations(*scene, Effects(), **{name: None}) == never
+    if name in FLAGS:
+        assert operations(*scene, Effects(**{FLAGS[name]: False})) == never
+        assert operations_of(Effects(**{FLAGS[name]: True}), arrays=(name,)) == having
+    assert having[0] > never[0] and having[1] > never[1]
 
 
-def test_distortion_follows_opencvs_formula_and_its_derivative():
+@plainly
+@pytest.mark.parametrize("draw", [render, render_reference], ids=["tiles", "reference"])
+@pytest.mark.parametrize("name", FLAGS)
+def test_an_array_alone_switches_its_effect_on(name, draw):
+    scene = cloud(8, size=0.02), cameras(16, 16)
+    options = {"max_pairs": 1 << 12} if draw is render else {}
+    plain = draw(*scene, **options)
+    alone, flagged = (
+        draw(*scene, effects=effects, **{name: ARRAYS[name]}, **options)
+        for effects in (Effects(), Effects(**{FLAGS[name]: True}))
+    )
+    np.testing.assert_array_equal(alone.color, flagged.color)
+    assert float(jnp.abs(alone.color - plain.color).max()) > 1e-3
+
+
+@plainly
+def test_features_are_composited_whenever_given():
+    scene, features = (cloud(8), cameras(16, 16)), ARRAYS["features"]
+    out = render(*scene, features=features, max_pairs=1 << 12)
+    np.testing.assert_allclose(out.features, jnp.stack([out.alpha] * 2, axis=-1), atol=1e-6)
+
+
+@pytest.mark.parametrize("draw", [render, render_reference], ids=["tiles", "reference"])
+@pytest.mark.parametrize("name", FLAGS)
+def test_a_flag_that_contradicts_its_array_is_refused(name, draw):
+    scene = cloud(8), cameras(16, 16)
+    with pytest.raises(InputError, match=f"{FLAGS[name]} is off and wants no {name}, got one; leave it out"):
+        draw(*scene, effects=Effects(**{FLAGS[name]: False}), **{name: ARRAYS[name]})
+    with pytest.raises(InputError, match=f"{FLAGS[name]} is on and wants {name}, got none; pass it"):
+        draw(*scene, effects=Effects(**{FLAGS[name]: True}))
+
+
+def test_distortion_follows_opencvs_formula_and_derivative():
     random = np.random.default_rng(0)
     x, y = random.uniform(-0.5, 0.5, (2, 1, 50))
     k1, k2, p1, p2, k3 = LENS.astype(float)
@@ -115,7 +157,7 @@ def test_exposure_is_affine_in_color():
     np.testing.assert_allclose(out.color, np.maximum(plain @ EXPOSURE[:, :3].T + EXPOSURE[:, 3], 0), atol=1e-5)
 
 
-def test_the_3d_filter_is_two_tenths_of_a_sampling_interval_and_keeps_mass():
+def test_the_3d_filter_has_its_variance_and_keeps_mass():
     gaussians, camera = cloud(size=0.01), cameras(210, 300)
     smoothed = filter_3d(gaussians, camera)
     view = np.asarray(camera.viewmats)
@@ -130,13 +172,13 @@ def test_the_3d_filter_is_two_tenths_of_a_sampling_interval_and_keeps_mass():
     np.testing.assert_allclose(mass(smoothed), mass(gaussians), rtol=1e-5)
 
 
-def test_the_3d_filter_of_cameras_that_see_nothing_does_nothing():
+def test_the_3d_filter_without_seeing_cameras_does_nothing():
     gaussians, camera = cloud(), cameras(21, 30)
     away = replace(camera, viewmats=camera.viewmats.at[2, 3].set(-100.0))
     np.testing.assert_allclose(filter_3d(gaussians, away).scales, gaussians.scales, rtol=1e-6)
 
 
-def test_effects_for_asks_only_for_what_the_scene_needs():
+def test_effects_for_finds_only_what_the_scene_needs():
     gaussians, camera = cloud(degree=3), cameras(210, 300, batch=2)
     assert effects_for(gaussians, camera) == Effects(sh_degree=3)
     flat = replace(gaussians, sh=gaussians.sh.at[:, 4:].set(0.0))
@@ -153,7 +195,7 @@ def test_effects_for_asks_only_for_what_the_scene_needs():
 
 
 @plainly
-def test_what_effects_for_leaves_out_changes_no_pixel():
+def test_effects_left_out_by_effects_for_change_no_pixel():
     gaussians, camera = cloud(degree=3), cameras(21, 30)
     flat = replace(gaussians, sh=gaussians.sh.at[:, 4:].set(0.0))
     least = render(flat, camera, effects=effects_for(flat, camera), max_pairs=1 << 12)
@@ -161,7 +203,7 @@ def test_what_effects_for_leaves_out_changes_no_pixel():
 
 
 @pytest.mark.parametrize(
-    "fields", [{"sh_degree": 4}, {"antialias": "fxaa"}, {"outputs": ("color",)}], ids=["degree", "antialias", "output"]
+    "fields", [{"sh_degree": 4}, {"antialias": "fxaa"}, {"outputs": ("colors",)}], ids=["degree", "antialias", "output"]
 )
 def test_unknown_effects_are_refused(fields):
     with pytest.raises(InputError, match="effects:"):
@@ -189,10 +231,10 @@ WIDE = Camera(
 @pytest.mark.parametrize(("lens", "tangent"), [((-0.1, 0.003, 0, 0, 0), 4.1), ((-0.3, 0.03, 0, 0, 0), 2.2)])
 @plainly
 @pytest.mark.slow  # programs of its own
-def test_what_a_lens_folds_back_into_the_image_is_not_seen(lens, tangent):
-    # Beyond its first turn the polynomial falls, and beyond its second it rises again: ghosts from the side.
+def test_points_that_a_lens_folds_into_the_image_are_culled(lens, tangent):
+    # Outside its first maximum the polynomial falls, and farther out it rises again: ghosts from the side.
     lens = jnp.array(lens, jnp.float32)
-    assert 1 + tangent**2 * (3 * lens[0] + tangent**2 * 5 * lens[1]) > 0  # it has turned twice
+    assert 1 + tangent**2 * (3 * lens[0] + tangent**2 * 5 * lens[1]) > 0  # it rises again
     out = render(one([tangent, 0.1, 1.0]), WIDE, effects=Effects(distortion=True), distortion=lens, max_pairs=1 << 12)
     assert int(out.num_pairs) == 0
     assert int(render(one([0.2, 0.1, 1.0]), WIDE, effects=Effects(distortion=True), distortion=lens).num_pairs) > 0
@@ -201,7 +243,7 @@ def test_what_a_lens_folds_back_into_the_image_is_not_seen(lens, tangent):
 @pytest.mark.parametrize("mean", [(1.6, 1.2, 1.0), (0.3, -0.2, 1.0), (-1.5, 1.1, 1.0)])
 @plainly
 @pytest.mark.slow  # programs of its own
-def test_a_wide_lens_shapes_gaussians_as_its_derivative_says(mean):
+def test_a_wide_lens_shapes_gaussians_by_its_derivative(mean):
     lens = jnp.array([-0.15, 0.012, 0, 0, 0], jnp.float32)
 
     def pixel(point):
@@ -212,13 +254,13 @@ def test_a_wide_lens_shapes_gaussians_as_its_derivative_says(mean):
     wanted = np.linalg.inv(1e-4 * jacobian @ jacobian.T)
     camera = replace(WIDE, viewmats=WIDE.viewmats[None], Ks=WIDE.Ks[None])
     splats = project(one(mean), camera, Effects(distortion=True, antialias="none"), lens[None])
-    p, q, r = np.asarray(splats.factors[0, 0], np.float64)
+    p, q, r = np.asarray(splats.conic_factors[0, 0], np.float64)
     np.testing.assert_allclose([[2 * p * p, 2 * p * q], [2 * p * q, 2 * (q * q + r * r)]], wanted, rtol=2e-3)
 
 
 @plainly
 @pytest.mark.slow  # a program of its own
-def test_a_lens_has_finite_gradients_however_far_from_its_axis():
+def test_a_lens_has_finite_gradients_far_from_its_axis():
     lens = jnp.array([0.1, 0.01, 0, 0, 0.01], jnp.float32)
 
     def loss(means):
@@ -230,7 +272,7 @@ def test_a_lens_has_finite_gradients_however_far_from_its_axis():
         assert np.isfinite(jax.jit(jax.grad(loss))(jnp.array([mean]))).all()
 
 
-def test_the_3d_filter_does_not_look_at_absent_rows():
+def test_the_3d_filter_ignores_absent_rows():
     captured = Camera(
         viewmats=jnp.stack([jnp.eye(4), jnp.eye(4).at[2, 3].set(50.0)]),
         Ks=jnp.stack([WIDE.Ks] * 2),
@@ -244,14 +286,14 @@ def test_the_3d_filter_does_not_look_at_absent_rows():
     np.testing.assert_array_equal(padded.scales[:2], alone.scales)
 
 
-def test_one_exposure_is_none_only_if_it_changes_nothing():
+def test_effects_for_needs_a_single_exposure_unless_identity():
     scene, camera = cloud(4), cameras(16, 16)
     several = jnp.asarray(np.stack([EXPOSURE] * 3))
     for exposures, wanted in ((EXPOSURE, True), (np.eye(3, 4, dtype=np.float32), False), (several, False)):
         assert effects_for(scene, camera, exposures=jnp.asarray(exposures)).exposure is wanted
 
 
-def test_the_3d_filter_reads_a_negative_scale_as_its_size():
+def test_the_3d_filter_takes_the_size_of_a_negative_scale():
     captured = Camera(viewmats=jnp.eye(4)[None], Ks=WIDE.Ks[None], width=400, height=300)
     scene = one([0.0, 0.0, 1.0])
     plain, mirrored = filter_3d(scene, captured), filter_3d(replace(scene, scales=-scene.scales), captured)
@@ -259,8 +301,11 @@ def test_the_3d_filter_reads_a_negative_scale_as_its_size():
     assert float(plain.opacities[0]) > 0
 
 
-def test_effects_given_as_lists_are_hashable_and_a_background_has_three_parts():
+def test_effects_given_as_lists_are_hashable():
     listed, plain = (Effects(outputs=kind(["color"]), background=kind([1.0, 0.0, 0.0])) for kind in (list, tuple))
     assert listed == plain and hash(listed) == hash(plain)
+
+
+def test_a_background_has_three_parts():
     with pytest.raises(InputError, match="three numbers"):
         Effects(background=(1.0, 0.0))

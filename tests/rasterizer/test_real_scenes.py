@@ -1,4 +1,4 @@
-"""The fast path on real scenes against the reference in float64, at random pixels: issue 3, must-show 1. Slow.
+"""The fast path on real scenes against the reference in float64, at random pixels. Slow.
 
 The reference's memory is pixels x Gaussians: it is evaluated at a few hundred pixels, and the cotangent is 0 elsewhere.
 """
@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from ssplat_jax.checkpoint.weights import load_params
 from ssplat_jax.config import preset
 from ssplat_jax.data.capture import open_capture
-from ssplat_jax.data.split import interleaved
+from ssplat_jax.data.split import interleaved_split
 from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.rasterizer import Effects, render
@@ -26,9 +26,9 @@ from ssplat_jax.streaming.streamsplat import StreamSplat
 
 pytestmark = pytest.mark.slow
 
-FORWARD = 1e-4  # issue 3, outside the boundary band
+FORWARD = 1e-4  # outside the boundary band
 BAND = 1e-4  # relative distance of a sample to 1/255, or of a transmittance to the stop, that rounding may flip
-GRADIENT = 1e-3  # issue 3, relative L2
+GRADIENT = 1e-3  # relative L2
 PIXELS, AT_ONCE = 256, 16
 EFFECTS = Effects()
 
@@ -63,11 +63,11 @@ def looking_at(gaussians: Gaussians) -> tuple[Gaussians, Camera]:
 
 
 def demo() -> tuple[Gaussians, Camera]:
-    """What `ssplat demo` has decoded after all of its views, seen from its middle target."""
+    """The scene of `ssplat demo` after all views, from its middle target."""
     model = StreamSplat(preset("tiny"))
     session = Session(model, load_params("tiny"))
     capture = open_capture(f"procedural:room?frames={NUM_FRAMES}")
-    split = interleaved(len(capture), stride=1, context=STAGES[-1])
+    split = interleaved_split(len(capture), stride=1, context=STAGES[-1])
     frame = capture.stream_frame(model.config, split.context)
     for chunk in capture.chunks(model.config, split.context, frame=frame):
         session.feed(chunk)
@@ -87,7 +87,7 @@ SCENES = {
 
 
 def decoded(path) -> Gaussians:
-    """What a conforming reader decodes of `guitar.compressed.ply`."""
+    """`guitar.compressed.ply` as a conforming reader decodes it."""
     data = np.load(path)
     names = {"means": "means", "quats": "quats_wxyz", "opacities": "opacity", "colors": "rgb"}
     arrays = {name: jnp.asarray(data[key], jnp.float32) for name, key in names.items()}
@@ -104,7 +104,7 @@ def at_pixels(inputs, pixels):
     weights, after, order = sample_weights(splats, pixels)
     before = jnp.concatenate([jnp.ones_like(after[:, :1]), after[:, :-1]], axis=1)
     offsets = pixels[:, None] - splats.means2d[0, order]
-    p, q, r = jnp.moveaxis(splats.factors[0, order], -1, 0)
+    p, q, r = jnp.moveaxis(splats.conic_factors[0, order], -1, 0)
     exponents = (p * offsets[..., 0] + q * offsets[..., 1]) ** 2 + (r * offsets[..., 1]) ** 2
     raw = splats.opacities[0, order] * jnp.exp(-exponents)
     edge = jnp.where(before > 1e-4, jnp.minimum(jnp.abs(raw * 255 - 1), jnp.abs(after * 1e4 - 1)), 1.0)

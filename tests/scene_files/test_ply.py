@@ -1,4 +1,4 @@
-"""The PLY file: what is written, read by an independent reader, is the scene that was rendered."""
+"""PLY files: an independent reader gets the scene that was written."""
 
 import os
 
@@ -9,42 +9,23 @@ from plyfile import PlyData
 
 from ssplat_jax.errors import InputError, StorageError
 from ssplat_jax.gaussians import SH_C0, Gaussians
-from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.pytree import replace
 from ssplat_jax.rasterizer import render
 from ssplat_jax.scene_files.ply import load_ply, property_names, save_ply
+from tests.scene_files.scene_fixture import ROUND_TRIP, camera, decibels, scene
 
-ROUND_TRIP = 3e-6  # relative: float32 storage of a logarithm up to 20, exponentiated
-RENDER_DB = 60.0  # 0.001 root mean square: far below a step of 8 bits
-
-
-def scene(degree: int = 2, n: int = 60, seed: int = 0) -> Gaussians:
-    """A cloud in front of the camera at the origin, of every size and opacity that is written."""
-    rng = np.random.default_rng(seed)
-    means = rng.uniform([-1, -1, 2], [1, 1, 4], (n, 3))
-    return Gaussians(
-        means=jnp.asarray(means, jnp.float32),
-        quats=jnp.asarray(rng.normal(size=(n, 4)), jnp.float32),
-        scales=jnp.asarray(np.exp(rng.uniform(-4, -1, (n, 3))), jnp.float32),
-        opacities=jnp.asarray(rng.uniform(0.05, 1.0, n), jnp.float32),
-        sh=jnp.asarray(rng.normal(size=(n, (degree + 1) ** 2, 3)) * 0.3, jnp.float32),
-    )
-
-
-def camera(x: float = 0.0) -> Camera:
-    viewmat = jnp.eye(4).at[0, 3].set(x)
-    return Camera(viewmats=viewmat, Ks=jnp.array([[40.0, 0, 24], [0, 40, 16], [0, 0, 1]]), width=48, height=32)
+RENDER_DB = 60.0  # root mean square of 0.001, far below a step of 8 bits
 
 
 def independent_gaussians(path) -> Gaussians:
-    """The file's Gaussians by plyfile and the format's formulas, none of our code."""
+    """Gaussians of a file, read with plyfile and the formulas of the format."""
     v = PlyData.read(str(path))["vertex"].data
     stack = lambda *names: np.stack([v[name].astype(np.float64) for name in names], -1)  # noqa: E731
     rest = [name for name in v.dtype.names if name.startswith("f_rest_")]
     k = len(rest) // 3
     sh = np.stack(
         [stack(f"f_dc_{c}", *(f"f_rest_{c * k + i}" for i in range(k))) for c in range(3)], axis=-1
-    )  # red, green, blue: each its k coefficients in a row
+    )  # the k coefficients of red, then of green, then of blue
     return Gaussians(
         means=jnp.asarray(stack("x", "y", "z"), jnp.float32),
         quats=jnp.asarray(stack("rot_0", "rot_1", "rot_2", "rot_3"), jnp.float32),
@@ -54,16 +35,12 @@ def independent_gaussians(path) -> Gaussians:
     )
 
 
-def decibels(a, b) -> float:
-    return float(-10 * np.log10(np.mean((np.asarray(a, np.float64) - np.asarray(b, np.float64)) ** 2) + 1e-20))
-
-
 def test_export_roundtrip_render(tmp_path):
     gaussians = scene(degree=3)
     save_ply(tmp_path / "a.ply", gaussians)
     for view in (camera(), camera(0.4)):
         drawn = render(gaussians, view).color
-        assert float(drawn.std()) > 0.05  # the scene is in the picture
+        assert float(drawn.std()) > 0.05  # the image shows the scene
         assert decibels(drawn, render(independent_gaussians(tmp_path / "a.ply"), view).color) >= RENDER_DB
         assert decibels(drawn, render(load_ply(tmp_path / "a.ply"), view).color) >= RENDER_DB
 
@@ -106,7 +83,7 @@ def test_color_is_the_constant_band(tmp_path):
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_reading_undoes_writing(tmp_path, degree):
+def test_written_scenes_are_read_back(tmp_path, degree):
     gaussians = scene(degree)
     report = save_ply(tmp_path / "a.ply", gaussians)
     again = load_ply(tmp_path / "a.ply")
@@ -114,11 +91,11 @@ def test_reading_undoes_writing(tmp_path, degree):
     unit = gaussians.quats / jnp.linalg.norm(gaussians.quats, axis=-1, keepdims=True)
     for name, wanted in (("means", gaussians.means), ("quats", unit), ("scales", gaussians.scales)):
         np.testing.assert_allclose(getattr(again, name), wanted, rtol=ROUND_TRIP, atol=1e-6)
-    np.testing.assert_allclose(again.opacities, gaussians.opacities, atol=2e-6)  # the guard next to 1
+    np.testing.assert_allclose(again.opacities, gaussians.opacities, atol=2e-6)  # opacities near 1 are clamped
     np.testing.assert_array_equal(again.sh, gaussians.sh)
 
 
-def test_same_gaussians_same_bytes_and_writing_what_was_read_changes_no_byte(tmp_path):
+def test_files_are_deterministic_and_survive_a_round_trip(tmp_path):
     save_ply(tmp_path / "a.ply", scene())
     save_ply(tmp_path / "b.ply", scene())
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
@@ -128,7 +105,7 @@ def test_same_gaussians_same_bytes_and_writing_what_was_read_changes_no_byte(tmp
         np.testing.assert_allclose(getattr(a, name), getattr(c, name), rtol=ROUND_TRIP, atol=1e-6)
 
 
-def test_rows_that_no_viewer_can_draw_are_dropped_and_counted(tmp_path):
+def test_invisible_rows_are_dropped_and_counted(tmp_path):
     good = scene(1, n=9)
     bad = replace(
         good,
@@ -143,7 +120,7 @@ def test_rows_that_no_viewer_can_draw_are_dropped_and_counted(tmp_path):
     np.testing.assert_array_equal(load_ply(tmp_path / "a.ply").means, good.means[8:])
 
 
-def test_guards_keep_every_written_number_finite(tmp_path):
+def test_every_written_number_is_finite(tmp_path):
     gaussians = replace(
         scene(0, n=4),
         opacities=jnp.array([1.0, 1.0, 1.0 / 254.0, 1.0]),
@@ -160,7 +137,7 @@ def test_guards_keep_every_written_number_finite(tmp_path):
     np.testing.assert_array_equal(quats, [[1, 0, 0, 0], [1, 0, 0, 0], [1, 0, 0, 0], [0, 1, 0, 0]])
 
 
-def test_an_empty_scene_is_a_file_and_a_scene(tmp_path):
+def test_empty_scenes_are_written_and_read(tmp_path):
     empty = replace(scene(1), opacities=jnp.zeros(60))
     report = save_ply(tmp_path / "a.ply", empty)
     assert (report.num_written, report.num_dropped) == (0, 60)
@@ -168,7 +145,7 @@ def test_an_empty_scene_is_a_file_and_a_scene(tmp_path):
     assert again.num_gaussians == 0 and again.sh_degree == 1
 
 
-def test_a_trained_scene_reads_as_an_independent_reader_reads_it(scenes):
+def test_a_trained_scene_agrees_with_an_independent_reader(scenes):
     path = scenes / "kacytran_iter7000.ply"
     ours, theirs = load_ply(path), independent_gaussians(path)
     assert ours.num_gaussians == 9080 and ours.sh_degree == 3
@@ -180,7 +157,7 @@ def test_a_trained_scene_reads_as_an_independent_reader_reads_it(scenes):
     np.testing.assert_allclose(ours.quats, unit, atol=1e-6)
 
 
-def test_a_compressed_scene_is_named_as_such(scenes):
+def test_a_compressed_scene_is_refused_as_such(scenes):
     with pytest.raises(InputError, match="it is compressed"):
         load_ply(scenes / "guitar.compressed.ply")
 
@@ -205,7 +182,7 @@ def test_a_folder_that_cannot_be_made_is_a_storage_error(tmp_path):
         save_ply(tmp_path / "file" / "a.ply", scene(0))
 
 
-def test_other_render_modes_are_written_and_unknown_ones_refused(tmp_path):
+def test_render_modes_are_written_and_unknown_ones_refused(tmp_path):
     save_ply(tmp_path / "a.ply", scene(0), render_mode="default")
     assert "SplatRenderMode: default" in PlyData.read(str(tmp_path / "a.ply")).comments
     with pytest.raises(InputError, match="render_mode"):

@@ -1,4 +1,4 @@
-"""Reading PLY files of others: every form the format allows, and one clear refusal for every form it does not."""
+"""PLY files of other writers: every valid form is read, and invalid ones are refused with one clear message."""
 
 import random
 
@@ -8,15 +8,15 @@ from plyfile import PlyData, PlyElement
 
 from ssplat_jax.errors import InputError
 from ssplat_jax.scene_files.ply import BASE_PROPERTIES, load_ply, save_ply
-from tests.scene_files.test_ply import ROUND_TRIP, scene
+from tests.scene_files.scene_fixture import ROUND_TRIP, scene
 
 FIELDS = ("means", "quats", "scales", "opacities", "sh")
-NUM_MUTANTS = 400  # seeded, so a failure can be repeated
+NUM_MUTANTS = 400  # seeded, so that failures can be repeated
 
 
 @pytest.fixture
 def good(tmp_path):
-    """A good file of degree 1."""
+    """Valid file of SH degree 1."""
     save_ply(tmp_path / "good.ply", scene(1, n=12))
     return tmp_path / "good.ply"
 
@@ -27,7 +27,7 @@ def assert_same_scene(a, b):
 
 
 def rewritten(good, change, **form):
-    """The good file with its table changed and written by plyfile in another form."""
+    """The good file with a changed table, written by plyfile in another form."""
     table = change(PlyData.read(str(good))["vertex"].data)
     path = good.with_name("other.ply")
     PlyData([PlyElement.describe(table, "vertex")], **form).write(str(path))
@@ -48,7 +48,7 @@ def test_every_encoding_is_the_same_scene(good, form, dtype):
     assert_same_scene(load_ply(other), load_ply(good))
 
 
-def test_properties_are_found_by_name_in_any_order_without_normals_and_with_strangers(good):
+def test_properties_are_found_by_name_among_unknown_ones(good):
     def shuffle(table):
         names = [name for name in table.dtype.names if name not in ("nx", "ny", "nz")]
         random.Random(0).shuffle(names)
@@ -61,7 +61,7 @@ def test_properties_are_found_by_name_in_any_order_without_normals_and_with_stra
     assert_same_scene(load_ply(rewritten(good, shuffle)), load_ply(good))
 
 
-def test_elements_around_the_vertices_are_stepped_over(good):
+def test_elements_around_the_vertices_are_skipped(good):
     table = PlyData.read(str(good))["vertex"].data
     camera = np.zeros(3, [("id", "i4"), ("focal", "f8")])
     faces = np.array([([0, 1, 2],)], dtype=[("vertex_indices", "O")])
@@ -79,7 +79,7 @@ def test_windows_line_ends_in_the_header(good):
     assert_same_scene(load_ply(good.with_name("crlf.ply")), load_ply(good))
 
 
-def test_unguarded_logits_of_other_writers_are_opaque_and_absent(good):
+def test_infinite_logits_are_opacities_of_zero_and_one(good):
     def spoil(table):
         table = table.copy()
         table["opacity"][:3] = np.inf, -np.inf, 500.0
@@ -88,7 +88,7 @@ def test_unguarded_logits_of_other_writers_are_opaque_and_absent(good):
     np.testing.assert_array_equal(load_ply(rewritten(good, spoil)).opacities[:3], [1.0, 0.0, 1.0])
 
 
-def test_scales_are_clamped_and_zero_quaternions_are_the_identity(good):
+def test_scales_are_clamped_and_quaternions_normalized(good):
     def spoil(table):
         table = table.copy()
         table["scale_0"][:2] = 300.0, -300.0
@@ -165,25 +165,25 @@ def test_bad_file_is_refused_in_one_line(tmp_path, name):
     assert words in message and "bad.ply" in message and "\n" not in message and len(message) < 600
 
 
-def test_the_table_spoils_a_file_that_is_otherwise_good(tmp_path):
+def test_the_unchanged_file_of_the_cases_is_good(tmp_path):
     (tmp_path / "good.ply").write_bytes(header() + ROW.tobytes())
     assert load_ply(tmp_path / "good.ply").num_gaussians == 1
 
 
-def test_a_path_that_is_no_file_is_refused(tmp_path):
+def test_folders_and_missing_files_are_refused(tmp_path):
     for path in (tmp_path, tmp_path / "nothing.ply"):
         with pytest.raises(InputError, match="cannot be read"):
             load_ply(path)
 
 
-def test_mutated_files_are_read_or_refused_never_worse(good):
+def test_mutated_files_are_read_or_refused(good):
     data = good.read_bytes()
     rng = random.Random(1)
     num_read = 0
     for _ in range(NUM_MUTANTS):
         mutant = bytearray(data[: rng.randrange(len(data))] if rng.random() < 0.3 else data)
         for _ in range(rng.randrange(4)):
-            # Half of the hits are in the header, a third of the file.
+            # Half of the changes are in the header, a third of the file.
             reach = len(mutant) if rng.random() < 0.5 else min(600, len(mutant))
             if reach:
                 mutant[rng.randrange(reach)] = rng.randrange(256)

@@ -1,4 +1,4 @@
-"""The small scene files: what is written, read by a decoder of the format's own description, is the scene."""
+""".spz and .splat files: decoders written after the descriptions of the formats get the scene that was written."""
 
 import gzip
 import math
@@ -17,14 +17,14 @@ from ssplat_jax.scene_files.ply import load_ply, save_ply
 from ssplat_jax.scene_files.splat import save_splat
 from ssplat_jax.scene_files.spz import save_spz
 from tests.commands.test_cli import run
-from tests.scene_files.test_ply import camera, decibels, scene
+from tests.scene_files.scene_fixture import camera, decibels, scene
 
-RENDER_DB = 35.0  # of 8-bit files: a color is 1/510 off, a size 3 %, a direction half a degree
-AXES = np.diag([1.0, -1.0, -1.0, 1.0])  # of .spz: x right, y up, z backwards
+RENDER_DB = 35.0  # 8 bits: errors of 1/510 in color, 3 % in size, half a degree in orientation
+AXES = np.diag([1.0, -1.0, -1.0, 1.0])  # axes of .spz: x right, y up, z backward
 
 
 def read_spz(path) -> tuple[Gaussians, dict]:
-    """Niantic's format, entry by entry; Gaussians in the file's own axes."""
+    """Decodes a .spz file; Gaussians are in the axes of the file."""
     data = gzip.decompress(path.read_bytes())
     magic, version, n, degree, bits, flags, reserved = struct.unpack("<IIIBBBB", data[:16])
     assert (magic, version, reserved) == (0x5053474E, 3, 0)
@@ -55,7 +55,7 @@ def read_spz(path) -> tuple[Gaussians, dict]:
 
 
 def smallest_three(word: int) -> list[float]:
-    """Quaternion wxyz of the 32 bits: two say which of xyzw is left out, the last ten are the last entry's."""
+    """Quaternion wxyz of 32 bits: two bits for the omitted entry of xyzw, then ten for each of the others."""
     xyzw, largest = [0.0] * 4, word >> 30
     for entry in (3, 2, 1, 0):
         if entry != largest:
@@ -66,7 +66,7 @@ def smallest_three(word: int) -> list[float]:
 
 
 def read_splat(path) -> Gaussians:
-    """32 bytes a Gaussian."""
+    """Decodes a .splat file, 32 bytes per Gaussian."""
     rows = [struct.unpack("<6f8B", row) for row in batched(path.read_bytes(), 32)]
     columns = np.array(rows, np.float64).reshape(-1, 14)
     return Gaussians.from_rgb(
@@ -95,11 +95,11 @@ def one(**changes) -> Gaussians:
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_a_spz_file_draws_the_scene(tmp_path, degree):
-    # A camera turned into the file's axes sees the same picture: no sign of any term is taken on trust.
+    # A camera in the axes of the file sees the same image, which checks the signs of all terms.
     gaussians = scene(degree)
     save_spz(tmp_path / "a.spz", gaussians)
     held, header = read_spz(tmp_path / "a.spz")
-    assert header["flags"] == 1  # meant for the Mip filter
+    assert header["flags"] == 1  # made for the Mip filter
     for view in (camera(), camera(0.4)):
         turned = replace(view, viewmats=view.viewmats @ jnp.asarray(AXES, jnp.float32))
         drawn = render(gaussians, view).color
@@ -107,8 +107,8 @@ def test_a_spz_file_draws_the_scene(tmp_path, degree):
         assert decibels(drawn, render(held, turned).color) >= RENDER_DB
 
 
-def test_spz_colors_are_those_of_the_same_directions_in_the_files_axes(tmp_path):
-    # One term at a time, since a picture hardly shows the terms that vanish along its axis.
+def test_spz_colors_agree_in_corresponding_directions(tmp_path):
+    # One term at a time, since an image hardly shows terms that vanish along the optical axis.
     terms, n = 16, 15
     sh = np.zeros((n, terms, 3))
     sh[np.arange(n), 1 + np.arange(n)] = 0.5
@@ -125,7 +125,7 @@ def test_spz_values_are_off_by_half_a_step_at_most(tmp_path):
     gaussians = scene(3, n=500)
     save_spz(tmp_path / "a.spz", gaussians)
     held, header = read_spz(tmp_path / "a.spz")
-    assert header["fractional_bits"] == 21  # positions reach nearly to 4 = 2^23 / 2^21
+    assert header["fractional_bits"] == 21  # the largest coordinate is nearly 4 = 2^23 / 2^21
     off = lambda name: np.abs(np.asarray(getattr(held, name), np.float64) - np.asarray(getattr(gaussians, name)))  # noqa: E731
     means = np.asarray(held.means, np.float64) * [1, -1, -1]
     assert np.abs(means - gaussians.means).max() <= 0.51 * 2.0**-21
@@ -165,7 +165,7 @@ def test_spz_refuses_what_its_positions_cannot_hold(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_values_beyond_a_byte_are_cut_not_wrapped(tmp_path):
+def test_values_beyond_a_byte_are_clipped_not_wrapped(tmp_path):
     extreme = one(scales=jnp.array([[1e-9, 1e6, 0.0]]), opacities=jnp.array([1.0]), sh=jnp.array([[[9.0, -9.0, 0.0]]]))
     save_spz(tmp_path / "a.spz", extreme)
     held, _ = read_spz(tmp_path / "a.spz")
@@ -187,7 +187,7 @@ def test_a_splat_file_draws_the_scene(tmp_path):
         assert decibels(drawn, read) >= RENDER_DB
 
 
-def test_splat_rows_come_in_order_of_what_they_cover(tmp_path):
+def test_splat_rows_are_sorted_by_coverage(tmp_path):
     gaussians = scene(n=200)
     save_splat(tmp_path / "a.splat", gaussians)
     held = read_splat(tmp_path / "a.splat")
@@ -205,7 +205,7 @@ def test_splat_bytes_of_one_gaussian(tmp_path):
 
 
 @pytest.mark.parametrize("save", [save_splat, save_spz])
-def test_absent_and_broken_rows_are_counted_and_the_same_scene_gives_the_same_bytes(tmp_path, save):
+def test_dropped_rows_are_counted_and_files_are_deterministic(tmp_path, save):
     gaussians = scene(degree=1, n=10)
     gaussians = replace(
         gaussians,
@@ -219,7 +219,7 @@ def test_absent_and_broken_rows_are_counted_and_the_same_scene_gives_the_same_by
 
 
 @pytest.mark.parametrize("degree", [0, 3])
-def test_no_gaussians_at_all(tmp_path, degree):
+def test_empty_scenes_are_written(tmp_path, degree):
     nothing = replace(scene(degree), opacities=jnp.zeros(60))
     assert save_splat(tmp_path / "a.splat", nothing).num_written == 0
     assert (tmp_path / "a.splat").read_bytes() == b""
@@ -244,7 +244,7 @@ def test_export_converts_a_ply(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("name", ["scene.txt", "scene", "scene.PLY"])
-def test_an_ending_of_no_format_is_refused_before_anything_is_read(tmp_path, capsys, name):
+def test_unknown_extensions_are_refused_before_reading(tmp_path, capsys, name):
     assert run("export", str(tmp_path / "missing"), "--to", str(tmp_path / name)) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert "*.ply, *.spz, *.splat" in line and name in line

@@ -1,19 +1,20 @@
-"""Every line of the `Limits:` blocks of numerics and layers; those of geometry are tested in tests/geometry."""
+"""Every line of the `Limits:` blocks of numerics and layers; tests/geometry has those of geometry."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ssplat_jax.model.layers import attend, attend_own, average_pool, instance_norm, unit_features
+from ssplat_jax.model.compact.sweep_matching import unit_features
+from ssplat_jax.model.layers import attend, attend_per_query, average_pool, instance_norm
 from ssplat_jax.numerics import columns, safe_log, safe_normalize, softplus_inverse
-from ssplat_jax.xla_cpu import apart, lane_sum
+from ssplat_jax.xla_cpu import in_own_kernel, lane_sum
 
 ULP = float(np.finfo(np.float32).eps)
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-30, 1e-13, 1e-12])
-def test_safe_normalize_of_nothing_is_zero_with_a_zero_gradient(size):
+def test_safe_normalize_of_zero_is_zero_with_a_zero_gradient(size):
     x = jnp.full((2, 3), size, jnp.float32)
     np.testing.assert_array_equal(safe_normalize(x), 0)
     np.testing.assert_array_equal(jax.grad(lambda v: jnp.sum(safe_normalize(v) * jnp.arange(3.0)))(x), 0)
@@ -30,7 +31,7 @@ def test_safe_normalize_length_is_one_within_four_ulp(size, width):
     np.testing.assert_allclose(unit, x / np.linalg.norm(x, axis=-1, keepdims=True), atol=4 * ULP)
 
 
-def test_safe_normalize_gradient_is_the_projection_beside_the_direction():
+def test_safe_normalize_gradient_is_perpendicular():
     x = np.array([0.3, -0.4, 1.2])
     unit, length = x / np.linalg.norm(x), np.linalg.norm(x)
     got = jax.jacobian(safe_normalize)(jnp.asarray(x, jnp.float32))
@@ -43,14 +44,14 @@ def test_safe_log_is_the_logarithm_above_its_floor():
     np.testing.assert_allclose(jax.grad(lambda v: safe_log(v).sum())(jnp.asarray(x, jnp.float32)), 1 / x, rtol=1e-5)
 
 
-def test_safe_log_below_its_floor_is_the_floor_with_a_zero_gradient():
+def test_safe_log_below_its_floor_has_a_zero_gradient():
     x = jnp.array([1e-12, 1e-20, 0.0, -1.0, -jnp.inf])
     np.testing.assert_allclose(safe_log(x), np.log(1e-12), rtol=1e-6)
     np.testing.assert_array_equal(jax.grad(lambda v: safe_log(v).sum())(x), 0)
     np.testing.assert_allclose(safe_log(x, eps=0.1), np.log(0.1), rtol=1e-6)
 
 
-def test_columns_are_the_entries_and_their_gradients_stand_where_they_did():
+def test_columns_are_the_entries_and_gradients_return_to_them():
     x = jax.random.normal(jax.random.key(0), (5, 3))
     values, pull = jax.vjp(columns, x)
     for i, value in enumerate(values):
@@ -61,13 +62,13 @@ def test_columns_are_the_entries_and_their_gradients_stand_where_they_did():
 
 
 @pytest.mark.parametrize("wanted", [True, False])
-def test_what_is_computed_apart_is_there_if_wanted_and_nothing_reaches_it_if_not(wanted):
+def test_in_own_kernel_is_zero_in_value_and_gradient_if_unwanted(wanted):
     x = jnp.array([2.0, 0.0, -3.0])
     rows = jnp.array([2, 0])
 
     @jax.jit
     def gathered(x, wanted):
-        return apart(wanted, lambda: 1.0 / x[rows])
+        return in_own_kernel(wanted, lambda: 1.0 / x[rows])
 
     value, pull = jax.vjp(lambda x: gathered(x, jnp.array(wanted)), x)
     np.testing.assert_allclose(value, [-1 / 3, 0.5] if wanted else [0, 0], rtol=1e-6)
@@ -80,13 +81,13 @@ def test_softplus_inverse(y):
     assert np.logaddexp(0.0, x) == pytest.approx(y, rel=1e-9)
 
 
-def test_instance_norm_of_a_constant_channel_is_zero_with_a_finite_gradient():
+def test_instance_norm_of_a_constant_channel_is_zero():
     x = jnp.ones((2, 4, 4, 3)).at[..., 1].set(7e3)
     np.testing.assert_array_equal(instance_norm(x), 0)
     assert np.isfinite(jax.grad(lambda v: jnp.sum(instance_norm(v) ** 2 + instance_norm(v)))(x)).all()
 
 
-def test_instance_norm_has_zero_mean_and_unit_biased_variance_per_image_and_channel():
+def test_instance_norm_has_zero_mean_and_unit_variance():
     x = np.random.default_rng(0).normal(3.0, 5.0, (2, 6, 5, 4))
     got = np.asarray(instance_norm(jnp.asarray(x, jnp.float32)), np.float64)
     np.testing.assert_allclose(got.mean((1, 2)), 0, atol=1e-6)
@@ -115,7 +116,7 @@ def test_attention_to_no_valid_key_is_zero_with_a_zero_gradient():
         np.testing.assert_array_equal(gradient, 0)
 
 
-def test_attention_never_hears_invalid_keys():
+def test_attention_ignores_invalid_keys():
     q, k, v = attention_arrays()
     valid = jnp.broadcast_to(jnp.array([True, False, True, True, False, True, False]), (2, 1, 7))
     loud = jnp.where(valid[:, 0, :, None, None], 0.0, 1e6)
@@ -124,12 +125,12 @@ def test_attention_never_hears_invalid_keys():
     np.testing.assert_allclose(attend(q, k, v, valid), attend(q, k[:, keep], v[:, keep]), atol=1e-6)
 
 
-def test_attention_of_queries_with_keys_of_their_own_is_that_of_one_head():
+def test_attend_own_equals_attend_with_one_head():
     rng = np.random.default_rng(0)
     q, k, v = (jnp.asarray(rng.normal(size=shape), jnp.float32) for shape in ((6, 20), (6, 5, 20), (6, 5, 20)))
     allowed = jnp.asarray(rng.uniform(size=(6, 5)) < 0.6).at[2].set(False)
     one_head = lambda q, k, v: attend(q[:, None, None], k[:, :, None], v[:, :, None], allowed[:, None])[:, 0, 0]  # noqa: E731
-    own = lambda q, k, v: attend_own(q, k, v, allowed)  # noqa: E731
+    own = lambda q, k, v: attend_per_query(q, k, v, allowed)  # noqa: E731
     np.testing.assert_allclose(own(q, k, v), one_head(q, k, v), atol=1e-6)
     np.testing.assert_array_equal(own(q, k, v)[2], 0)
     np.testing.assert_array_equal(own(q, k, v), own(q, *(jnp.where(allowed[..., None], x, 1e6) for x in (k, v))))
@@ -152,7 +153,7 @@ def test_attention_of_huge_scores_is_finite():
     assert np.isfinite(out).all() and np.abs(out).max() <= np.abs(v).max() * (1 + 1e-6)
 
 
-def test_unit_features_have_cosines_as_dot_products_and_zero_stays_zero():
+def test_unit_features_have_unit_length_and_zero_stays_zero():
     x = jnp.asarray(np.random.default_rng(0).normal(size=(9, 5)) * 1e4, jnp.float32).at[3].set(0.0)
     unit = unit_features(x)
     np.testing.assert_array_equal(unit[3], 0)

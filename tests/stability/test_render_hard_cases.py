@@ -1,4 +1,4 @@
-"""The rasterizer where it could break: named hard cases, and a sweep over the grid of extremes.
+"""Hard cases of the rasterizer by name, and a sweep over extremes of every input.
 
 One compiled program serves every case (64 Gaussians, 24x16 pixels, SH degree 3), so a case costs no compilation; one
 more serves crowds (4096). Each must give finite images and finite gradients by every input and, where a limit exists,
@@ -16,12 +16,12 @@ from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.pytree import replace
 from ssplat_jax.rasterizer import Effects, render
-from ssplat_jax.rasterizer.render import Inputs, prepare
+from ssplat_jax.rasterizer.render import RenderInputs, prepare
 from tests.rasterizer import oracle
 
 NUM, CROWD, WIDTH, HEIGHT = 64, 4096, 24, 16
 EFFECTS = Effects(outputs=("color", "alpha", "depth", "median_depth"))
-TOLERANCE = 1e-4  # issue 3's: float32 against the float64 oracle
+TOLERANCE = 1e-4  # float32 against the float64 oracle
 FIELDS = ("means", "quats", "scales", "opacities", "sh")
 F = np.float32
 
@@ -373,12 +373,12 @@ def test_bfloat16_colors_are_composited_in_float32():
     half = replace(gaussians, sh=gaussians.sh.astype(jnp.bfloat16))
     shapes = jax.eval_shape(lambda g: render(g, camera, effects=EFFECTS, max_pairs=1 << 12), half)
     assert shapes.color.dtype == shapes.depth.dtype == jnp.float32
-    prepared = prepare(Inputs(half, camera), EFFECTS)[0]
+    prepared = prepare(RenderInputs(half, camera), EFFECTS)[0]
     np.testing.assert_array_equal(prepared.sh, half.sh.astype(jnp.float32))
 
 
 @pytest.mark.slow
-def test_bfloat16_colors_give_the_rounded_colors_image_and_gradient():
+def test_bfloat16_colors_render_as_the_rounded_colors():
     gaussians, camera = build(base())
     half = replace(gaussians, sh=gaussians.sh.astype(jnp.bfloat16))
     rounded = replace(gaussians, sh=half.sh.astype(jnp.float32))

@@ -1,8 +1,8 @@
-"""Where, how and in which unit a capture lies in its world does not matter (ALGORITHM.md section 12, point 8).
+"""The scene does not depend on the position, orientation and unit of a capture's world frame.
 
-Captures on disk, their copies with all poses moved, turned or scaled, streamed from `open_capture` to Gaussians in the
-capture's frame. The stream frame stands at the first camera, so all copies are the same stream to float64's rounding,
-voxels included. What the alignment is for is seen with a frame that lies elsewhere.
+A capture on disk and copies of it with all poses moved, turned or scaled are streamed from `open_capture` to Gaussians
+in the capture's frame. The stream frame stands at the first camera, so all copies are the same stream to float64
+rounding, voxels included. A stream frame elsewhere shows what this alignment prevents.
 """
 
 import dataclasses
@@ -29,8 +29,8 @@ from tests.model import small
 from tests.model.small import random_params
 from tests.model.test_plane_sweep import WALL, texture
 
-UNSHIFTED = 1e-3  # issue 3's, in units of a room of some meters
-SHARE = 0.99  # of the Gaussians
+UNSHIFTED = 1e-3  # tolerance of positions, in units of a room of some meters
+SHARE = 0.99  # share of the Gaussians that must agree
 FRAMES, SIDE = 8, 64
 VOXEL = 0.25  # stream units: large enough that tokens of an untrained network merge
 
@@ -111,19 +111,19 @@ def open_moved(tmp_path_factory):
 
 @functools.cache
 def programs(vacc: str):
-    """The step in its two halves, and decode. Both caches are the same to the first half: it is compiled once."""
+    """`predict`, `update_cache` and `decode`, jitted. `predict` does not depend on `vacc` and is compiled once."""
     model = StreamSplat(CONFIG.replace(vacc=vacc))
     predict = programs("voxel")[0] if vacc == "append" else jax.jit(model.predict)
-    return predict, jax.jit(model.remember), jax.jit(model.decode)
+    return predict, jax.jit(model.update_cache), jax.jit(model.decode)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Streamed:
-    """A finished scene in the capture's frame, in NumPy; absent rows left out."""
+    """A finished scene in the capture's frame, in NumPy, without absent Gaussians."""
 
     frame: StreamFrame
     in_stream: Gaussians  # as decoded, absent rows included
-    means: np.ndarray  # float64: float32 has a step of 0.5 at 6.4e6
+    means: np.ndarray  # float64: float32 has a spacing of 0.5 at 6.4e6
     axes: np.ndarray
     scales: np.ndarray
     opacities: np.ndarray
@@ -132,12 +132,12 @@ class Streamed:
 
 @functools.cache
 def stream(capture: Capture, vacc: str, frame: StreamFrame | None = None, num_frames: int = FRAMES) -> Streamed:
-    """The capture from its images to Gaussians; `frame` defaults to the capture's own."""
-    predict, remember, decode = programs(vacc)
+    """Streams the capture from images to Gaussians; `frame` defaults to the capture's own."""
+    predict, update_cache, decode = programs(vacc)
     frame = frame or capture.stream_frame(CONFIG)
     params, cache = random_params(CONFIG, seed=1), init_cache(CONFIG)
     for chunk in capture.chunks(CONFIG, range(num_frames), frame=frame):
-        cache = remember(cache, predict(params, cache, chunk))
+        cache = update_cache(cache, predict(params, cache, chunk))
     assert (int(cache.stats.num_merged) > 0) == (vacc == "voxel") and int(cache.stats.num_dropped) == 0
     in_stream = decode(params, cache)
     gaussians = frame.gaussians_to_capture(in_stream)
@@ -154,19 +154,19 @@ def stream(capture: Capture, vacc: str, frame: StreamFrame | None = None, num_fr
 
 
 def pairs(points, others):
-    """Distance to the nearest of the others, and which it is."""
+    """Distance of each point to the nearest of the others, and its index."""
     return cKDTree(others).query(points)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("vacc", ["voxel", "append"])
 @pytest.mark.parametrize("name", MOTIONS)
-def test_8_moving_the_world_moves_the_gaussians(open_moved, name, vacc):
+def test_moving_the_world_moves_the_gaussians(open_moved, name, vacc):
     scale, rotation, translation = MOTIONS[name]
     a, b = stream(open_moved(None), vacc), stream(open_moved(name), vacc)
     distances, nearest = pairs(a.means, (b.means - translation) @ rotation / scale)
     is_same = distances < UNSHIFTED
-    # A turned pose is rounded otherwise when it becomes float32, which can take a token over an edge. A shift is not.
+    # A turned pose rounds differently to float32, which can move a token across a voxel face. A shifted pose does not.
     share = 1.0 if np.array_equal(rotation, np.eye(3)) else SHARE
     assert is_same.mean() >= share
     assert abs(len(b.means) / len(a.means) - 1) <= 1 - share
@@ -183,8 +183,8 @@ def test_8_moving_the_world_moves_the_gaussians(open_moved, name, vacc):
 
 
 @pytest.mark.slow  # a whole stream
-def test_the_ply_of_a_far_capture_counts_from_an_offset(open_moved, tmp_path):
-    """At 6.4e6 float32 has steps of 0.5; from the offset that the file names the scene is as fine as at the origin."""
+def test_ply_of_a_far_capture_is_relative_to_an_offset(open_moved, tmp_path):
+    """At 6.4e6 float32 has a spacing of 0.5; relative to the file's offset the scene is as fine as at the origin."""
     far = stream(open_moved("shifted by 6.4e6"), "voxel")
     offset = far.frame.offset
     assert np.abs(np.asarray(offset) - far.frame.origin).max() <= 0.5 and stream(
@@ -201,13 +201,13 @@ def test_the_ply_of_a_far_capture_counts_from_an_offset(open_moved, tmp_path):
 
 
 def elsewhere(frame: StreamFrame) -> StreamFrame:
-    """The same scale and depth range in axes and from an origin that no camera has."""
+    """`frame` with the same scale and depth range, but axes and an origin that no camera has."""
     return dataclasses.replace(frame, rotation=TURN @ frame.rotation, origin=frame.origin + SOMEWHERE / 7)
 
 
 @pytest.mark.slow
-def test_8_without_alignment_every_token_still_moves_with_the_world(open_moved):
-    """The network hears relative poses only. A token in a hundred may fall into another pixel by rounding."""
+def test_unaligned_tokens_still_move_with_the_world(open_moved):
+    """The network sees relative poses only. One token in a hundred may fall into another pixel by rounding."""
     aligned = stream(open_moved(None), "append")
     turned = stream(open_moved(None), "append", elsewhere(aligned.frame))
     for name in ("means", "axes"):
@@ -216,8 +216,8 @@ def test_8_without_alignment_every_token_still_moves_with_the_world(open_moved):
 
 
 @pytest.mark.slow
-def test_8_without_alignment_voxels_fall_otherwise_but_stand_for_the_same_places(open_moved):
-    """One chunk: the next ones are anchored to where the pivots of the first came to lie.
+def test_unaligned_voxels_differ_but_cover_the_same_places(open_moved):
+    """One chunk only, because later chunks are anchored to the pivots of the first.
 
     A token and its pivot share a voxel in either frame, so a pivot is within two diagonals of one of the other frame.
     """
@@ -227,12 +227,12 @@ def test_8_without_alignment_voxels_fall_otherwise_but_stand_for_the_same_places
     for distances, _ in (pairs(aligned.means, turned.means), pairs(turned.means, aligned.means)):
         assert distances.max() < 2 * diagonal
         assert np.quantile(distances, 0.95) < diagonal
-        assert (distances > UNSHIFTED).mean() > 0.02  # so alignment is not for nothing
+        assert (distances > UNSHIFTED).mean() > 0.02  # alignment makes a difference
 
 
 @pytest.mark.slow
-def test_8_depth_range_and_scale_of_matched_captures_move_along():
-    """Of images large enough for keypoints; those above are too small, and their scale is guessed from the steps."""
+def test_depth_range_and_scale_of_matched_captures_move_along():
+    """These images are large enough for keypoints; in the other tests the scale is estimated from the steps."""
     capture = open_capture("procedural:room?frames=4&size=160x120")
     frame = capture.stream_frame(CONFIG)
     for name in ("turned and shifted by 6.4e6", "in another unit, turned and shifted"):
@@ -244,6 +244,6 @@ def test_8_depth_range_and_scale_of_matched_captures_move_along():
             pose[:3, 3] = scale * rotation @ pose[:3, 3] + translation
             frames.append(dataclasses.replace(posed, camtoworld=pose))
         moved = dataclasses.replace(capture, frames=tuple(frames)).stream_frame(CONFIG)
-        # 1e-9 is what float64 leaves of a pose at 6.4e6; triangulation at small parallax makes more of it.
+        # float64 resolves a pose at 6.4e6 to 1e-9; triangulation at small parallax amplifies that.
         got, wanted = (scale * moved.scale, moved.near, moved.far), (frame.scale, frame.near, frame.far)
         np.testing.assert_allclose(got, wanted, rtol=1e-5)

@@ -1,4 +1,4 @@
-"""Two processes do not write into one folder."""
+"""Output folders: locks between processes, and removal of numbered files."""
 
 import subprocess
 import sys
@@ -8,27 +8,30 @@ import pytest
 
 from ssplat_jax.commands.main import main
 from ssplat_jax.errors import InputError, StorageError
-from ssplat_jax.storage.folder_lock import only_writer
+from ssplat_jax.storage.folder_lock import lock_folder
 from ssplat_jax.storage.folders import remove_numbered
 
 
-def test_a_second_writer_is_refused_until_the_first_has_left(tmp_path):
+def test_a_second_process_is_refused_until_the_first_ends(tmp_path):
     with (
-        only_writer(tmp_path),
+        lock_folder(tmp_path),
         pytest.raises(InputError, match="another process is writing to it"),
-        only_writer(tmp_path),
+        lock_folder(tmp_path),
     ):
         pass
-    with only_writer(tmp_path):
+    with lock_folder(tmp_path):
         pass
 
 
-def test_a_folder_that_takes_no_files_is_found_out_at_once():
-    with pytest.raises(StorageError, match="cannot be written"), only_writer(Path("/proc")):  # not even root's
+def test_an_unwritable_folder_is_refused_immediately():
+    with (
+        pytest.raises(StorageError, match="cannot be written"),
+        lock_folder(Path("/proc")),
+    ):  # not even for root
         pass
 
 
-def test_only_files_of_our_own_names_are_removed(tmp_path):
+def test_only_numbered_files_are_removed(tmp_path):
     kept = ("00001.jpg", "0001.png", "000001.png", "holiday.png", "view_00001.png")
     for name in (*kept, "00001.png", "12345.png"):
         (tmp_path / name).touch()
@@ -41,42 +44,42 @@ def test_only_files_of_our_own_names_are_removed(tmp_path):
     remove_numbered(tmp_path, "#####.png")
 
 
-def test_a_killed_writer_holds_nothing(tmp_path):
+def test_the_lock_ends_with_a_killed_process(tmp_path):
     hold = (
-        "import sys, time; from pathlib import Path; from ssplat_jax.storage.folder_lock import only_writer\n"
-        "with only_writer(Path(sys.argv[1])): print('held', flush=True); time.sleep(60)"
+        "import sys, time; from pathlib import Path; from ssplat_jax.storage.folder_lock import lock_folder\n"
+        "with lock_folder(Path(sys.argv[1])): print('held', flush=True); time.sleep(60)"
     )
     with subprocess.Popen([sys.executable, "-c", hold, str(tmp_path)], stdout=subprocess.PIPE, text=True) as holder:
         assert holder.stdout.readline() == "held\n"
-        with pytest.raises(InputError), only_writer(tmp_path):
+        with pytest.raises(InputError), lock_folder(tmp_path):
             pass
         holder.kill()
-    with only_writer(tmp_path):
+    with lock_folder(tmp_path):
         pass
 
 
-def test_a_folder_in_which_nothing_was_written_is_taken_away_again(tmp_path):
-    with pytest.raises(KeyError), only_writer(tmp_path / "new"):
+def test_a_new_folder_that_stays_empty_is_removed(tmp_path):
+    with pytest.raises(KeyError), lock_folder(tmp_path / "new"):
         raise KeyError
     assert not (tmp_path / "new").exists()
-    with only_writer(tmp_path / "new"):
+    with lock_folder(tmp_path / "new"):
         (tmp_path / "new" / "file").write_text("kept")
     assert (tmp_path / "new" / "file").read_text() == "kept"
-    with only_writer(tmp_path / "new"):
+    with lock_folder(tmp_path / "new"):
         (tmp_path / "new" / "file").unlink()
-    assert (tmp_path / "new").exists()  # it was there before
+    assert (tmp_path / "new").exists()  # it existed before
 
 
 def test_a_folder_that_cannot_be_made_is_a_storage_error(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(StorageError, match="choose another place"), only_writer(tmp_path / "file"):
+    with pytest.raises(StorageError, match="choose another place"), lock_folder(tmp_path / "file"):
         pass
 
 
 @pytest.mark.parametrize("command", [("run", "procedural:room?frames=4&size=32x24"), ("train",)])
-def test_commands_that_go_on_refuse_a_folder_in_use(command, tmp_path, capsys):
-    with only_writer(tmp_path), pytest.raises(SystemExit) as stopped:
+def test_run_and_train_refuse_a_folder_in_use(command, tmp_path, capsys):
+    with lock_folder(tmp_path), pytest.raises(SystemExit) as stopped:
         main([*command, "--out", str(tmp_path)])
     assert stopped.value.code == 2
-    *_, line = capsys.readouterr().err.splitlines()  # after the progress of `train`
+    *_, line = capsys.readouterr().err.splitlines()  # after the progress output of `train`
     assert "another process" in line and "--out" in line and not any(tmp_path.iterdir())

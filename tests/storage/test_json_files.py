@@ -1,4 +1,4 @@
-"""JSON that leaves the program: strict, whatever the numbers."""
+"""JSON output is strict for all numbers."""
 
 import json
 import math
@@ -16,7 +16,7 @@ def test_numbers_that_are_not_finite_are_null_at_any_depth():
     assert read == {"psnr": None, "rows": [{"x": None}, [1.5, None]], "name": "NaN", "n": 3}
 
 
-def test_a_line_is_one_line():
+def test_json_without_indent_is_one_line():
     assert json_text({"a": [1, 2], "b": "x\ny"}, indent=None) == '{"a": [1, 2], "b": "x\\ny"}'
 
 

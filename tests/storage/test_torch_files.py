@@ -1,4 +1,4 @@
-"""State dicts are read as data: what PyTorch wrote comes back, and nothing a file says is ever carried out."""
+"""State dicts of PyTorch are read exactly, and no pickle is executed."""
 
 import io
 import os
@@ -26,7 +26,7 @@ def rounded(x: np.ndarray, dtype: str) -> np.ndarray:
 
 
 @pytest.mark.parametrize("form", FILES)
-def test_what_pytorch_wrote_comes_back(form):
+def test_files_of_pytorch_are_read_exactly(form):
     arrays = read_arrays(FILES[form], SHAPES)
     assert list(arrays) == list(SHAPES)
     for name, (x, dtype) in small_dict().items():
@@ -34,7 +34,7 @@ def test_what_pytorch_wrote_comes_back(form):
 
 
 @pytest.mark.parametrize("save", [np.savez, np.savez_compressed])
-def test_an_npz_with_the_same_names_is_the_same(save, tmp_path):
+def test_an_npz_with_the_same_names_is_equivalent(save, tmp_path):
     save(tmp_path / "a.npz", **{name: x for name, (x, _) in small_dict().items()})
     for name, array in read_arrays(tmp_path / "a.npz", SHAPES).items():
         np.testing.assert_array_equal(array, small_dict()[name][0])
@@ -86,7 +86,7 @@ def in_legacy(path: Path, pickled: bytes) -> Path:
     return path
 
 
-def test_offsets_and_strides_are_honoured(tmp_path):
+def test_offsets_and_strides_are_respected(tmp_path):
     data = np.arange(6, dtype="<f4").tobytes()
     path = in_zip(tmp_path / "a", state_dict(x=tensor(1, (2, 2), (1, 3)), y=tensor(5, (3,), (0,))), data)
     arrays = read_arrays(path, {"x": (2, 2), "y": (3,)})
@@ -95,7 +95,7 @@ def test_offsets_and_strides_are_honoured(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["state_dict", "model"])
-def test_what_a_training_saved_beside_its_state_dict_is_left(name, tmp_path):
+def test_other_entries_of_training_checkpoints_are_ignored(name, tmp_path):
     inside = b"}(" + text("x") + tensor(0, (2, 3), (3, 1)) + b"u"
     path = in_zip(tmp_path / "a", state_dict(epoch=number(7), **{name: inside}), np.arange(6, dtype="<f4").tobytes())
     assert read_shapes(path) == {"x": (2, 3)}
@@ -110,7 +110,7 @@ def test_what_a_training_saved_beside_its_state_dict_is_left(name, tmp_path):
         (-1, (2,), (1,), 6),
         (5, (2,), (-1,), 6),
         (0, (2,), (1 << 70,), 6),
-        (0, (8,), (1,), 8),  # the file holds six
+        (0, (8,), (1,), 8),  # the file holds six values
         (0, (2,), (1,), -6),
         (0, (2, 2), (1,), 6),
     ],
@@ -121,7 +121,7 @@ def test_a_tensor_beyond_its_storage_is_refused(offset, shape, strides, count, t
         read_arrays(path, {"x": shape})
 
 
-def test_parameters_of_every_age_are_their_tensor(tmp_path):
+def test_parameters_of_every_pytorch_version_are_read(tmp_path):
     plain = tensor(0, (6,), (1,))
     parameter = b"ctorch.nn.parameter\nParameter\n"
     path = in_zip(
@@ -141,7 +141,7 @@ def test_parameters_of_every_age_are_their_tensor(tmp_path):
 
 
 class Calls:
-    """Unpickled, calls `function(argument)`."""
+    """Object whose unpickling calls `function(argument)`."""
 
     def __init__(self, function, argument):
         self.call = (function, (argument,))
@@ -152,17 +152,17 @@ class Calls:
 
 @pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
 @pytest.mark.parametrize("form", [in_zip, in_legacy])
-def test_a_pickle_that_calls_something_is_refused_and_nothing_runs(form, protocol, tmp_path):
+def test_a_pickle_with_a_call_is_refused_and_not_run(form, protocol, tmp_path):
     marker = tmp_path / "executed"
     hostile = pickle.dumps({"x": Calls(os.system, f"touch {marker}")}, protocol)
     path = form(tmp_path / "a.pth", hostile)
     with pytest.raises(InputError, match="nothing was run") as caught:
         read_arrays(path, {"x": (1,)})
     assert not marker.exists() and "\n" not in str(caught.value)
-    if protocol:  # the first protocol has opcodes of its own, which are refused before the name
+    if protocol:  # protocol 0 has opcodes of its own, which are refused before the name
         assert "system" in str(caught.value)
     pickle.loads(hostile)
-    assert marker.exists()  # it would have
+    assert marker.exists()  # unpickling does execute it
 
 
 @pytest.mark.parametrize(
@@ -177,7 +177,7 @@ def test_a_pickle_that_calls_something_is_refused_and_nothing_runs(form, protoco
         (number(5), "wanted an array x"),
     ],
 )
-def test_what_is_no_tensor_is_named(value, said, tmp_path):
+def test_errors_name_what_is_not_a_tensor(value, said, tmp_path):
     with pytest.raises(InputError, match=said):
         read_arrays(in_zip(tmp_path / "a", state_dict(x=value)), {"x": (2,)})
 
@@ -190,7 +190,7 @@ def test_a_key_that_takes_forever_to_hash_is_not_hashed(tmp_path):
     assert time.perf_counter() - since < 5
 
 
-def test_missing_names_and_other_shapes_are_named():
+def test_errors_name_missing_arrays_and_wrong_shapes():
     with pytest.raises(InputError, match=r"zip.pth: wanted an array features.0.weight"):
         read_arrays(FILES["zip"], {"features.0.weight": (64, 3, 3, 3)})
     with pytest.raises(InputError, match=r"wanted plain of shape \(3, 5\), got \(3, 4\)"):
@@ -232,7 +232,7 @@ def test_other_files_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize("form", FILES)
-def test_a_damaged_file_is_refused_or_read_never_anything_else(form, tmp_path):
+def test_damaged_files_are_read_or_refused(form, tmp_path):
     whole = FILES[form].read_bytes()
     path = tmp_path / "a.pth"
     rng = np.random.default_rng(0)

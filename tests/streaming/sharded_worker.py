@@ -1,9 +1,9 @@
-"""What test_parallel.py cannot run itself: sharded streams on several devices, in one process or in several.
+"""A process of a sharded run, with several devices of its own; one or more of them work together.
 
     python -m tests.streaming.sharded_worker FOLDER NUM_DEVICES PROCESS NUM_PROCESSES PORT
 
-Runs the jobs that FOLDER/jobs.pkl names and leaves what they return, as arrays, in FOLDER/results.pkl. The laws are in
-test_parallel.py.
+Runs the jobs listed in FOLDER/jobs.pkl and writes their results, as arrays, to FOLDER/results.pkl. The tests are in
+test_sharded_cache.py and test_sharded_steps.py.
 """
 
 import pickle
@@ -28,7 +28,7 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 
 
 def fuse_and_project(config, num_shards, capacity, tokens, camera):
-    """The shards after fusing the chunks `tokens` `[t, m, ...]`, and what each of them says all of them project to."""
+    """The shards after fusing the chunks `tokens` `[t, m, ...]`, and the projection as each of them computed it."""
     mesh = jax.sharding.Mesh(np.array(jax.devices()[:num_shards]), ("voxels",))
 
     def of_shard(tokens):
@@ -42,7 +42,7 @@ def fuse_and_project(config, num_shards, capacity, tokens, camera):
 
 
 def steps(config, params, chunks, mesh_shape, num_new_tokens=0):
-    """Caches after every step over `chunks` `[t, streams, ...]`, outputs, scenes, and the caches with more room."""
+    """Caches and outputs of every step over `chunks` `[t, streams, ...]`, the last scenes, and the grown caches."""
     sharded, mesh = sharded_stream(config, mesh_shape)
     params, step = on_mesh(mesh, P(), params), jax.jit(sharded.step, donate_argnums=1)
     caches, history, outputs = sharded.init_cache(chunks.valid.shape[1]), [], []
@@ -53,7 +53,7 @@ def steps(config, params, chunks, mesh_shape, num_new_tokens=0):
         history.append(kept)
         outputs.append(output)
     sharded.check(caches)
-    grown = sharded.ensure_room(caches, num_new_tokens)
+    grown = sharded.ensure_capacity(caches, num_new_tokens)
     return {
         "caches": history,
         "outputs": outputs,
@@ -72,7 +72,7 @@ def scanned(config, params, chunks, mesh_shape):
 
 
 def steps_alone(config, params, streams):
-    """Per stream the caches after every step and the outputs, on one device; and the last cache's scene."""
+    """Caches and outputs of every step and the last scene, of each stream by itself on one device."""
     model, results = StreamSplat(config), []
     step, decode = jax.jit(model.step), jax.jit(model.decode)
     for chunks in streams:
@@ -91,7 +91,7 @@ def sharded_stream(config, mesh_shape):
 
 
 def on_mesh(mesh, spec, tree):
-    """Arrays that every process has, each device holding its part."""
+    """`tree`, which every process has, placed on the devices of the mesh."""
     sharding = NamedSharding(jax.sharding.Mesh(mesh.devices, mesh.axis_names), spec)
     return jax.tree.map(lambda x: jax.make_array_from_callback(x.shape, sharding, lambda part: x[part]), tree)
 
@@ -105,7 +105,7 @@ def everywhere(mesh, tree):
 
 
 def unchanged(tree):
-    """A function of the module, so that it is compiled once."""
+    """The identity; a function of the module, so that it is compiled once."""
     return tree
 
 
@@ -118,7 +118,7 @@ def main(folder, num_devices, process, num_processes, port):
     results = {}
     for name, (function_name, arguments) in jobs.items():
         function = globals()[function_name]
-        # The network's programs take longer to optimize than to run: XLA's passes as ever, LLVM's not.
+        # The network's programs take longer to optimize than to run, so LLVM's optimizations are off.
         jax.config.update("jax_disable_most_optimizations", function is not fuse_and_project)
         results[name] = function(**arguments)
     results["num_devices"] = jax.device_count()

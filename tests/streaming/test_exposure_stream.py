@@ -1,4 +1,4 @@
-"""Exposure over a whole stream: views that are darker or tinted leave the scene as it was."""
+"""Exposure over a whole stream: darker or tinted views do not change the colors of the scene."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -16,7 +16,7 @@ TINT = np.array([0.6, 0.75, 0.9])
 
 
 def streamed(tint, **changes):
-    """Exposures of the second of two chunks whose views are tinted, and the mean color of the scene."""
+    """Exposures of the second of two chunks, whose views are tinted, and the mean color of the scene."""
     config = preset("tiny").replace(capacity=1 << 12, **changes)
     capture = open_capture("procedural:room?frames=73&size=128x96")
     session = Session(StreamSplat(config), load_params("tiny"))
@@ -28,10 +28,10 @@ def streamed(tint, **changes):
 
 
 @pytest.mark.slow  # two steps with the shipped weights
-def test_tinted_views_are_found_out_and_leave_the_scene_as_it_was():
+def test_tint_is_estimated_and_kept_out_of_the_scene():
     exposures, color = streamed(np.ones(3))
     np.testing.assert_allclose(exposures, 1.0, atol=0.01)
-    assert np.all(exposures != 1.0)  # the views share enough with the scene to be compared
+    assert np.all(exposures != 1.0)  # the views share enough with the scene for an estimate
     tinted_exposures, tinted_color = streamed(TINT)
     np.testing.assert_allclose(tinted_exposures, np.tile(TINT, (4, 1)), rtol=0.02)
     np.testing.assert_allclose(tinted_color, color, rtol=0.02)

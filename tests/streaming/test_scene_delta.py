@@ -1,4 +1,4 @@
-"""A follower that is told only what changed holds the whole scene."""
+"""Scene deltas put together equal the whole scene."""
 
 import dataclasses
 
@@ -14,14 +14,9 @@ from ssplat_jax.model.compact.gaussian_head import GaussianHead
 from ssplat_jax.pytree import replace
 from ssplat_jax.streaming.scene_delta import SceneFeed, apply_delta
 from ssplat_jax.streaming.streamsplat import StreamSplat
-from tests.cache.streams import CAPACITY, CONFIG, PLACES, Recipe, fuse, to_jax
+from tests.cache.streams import CAPACITY, CONFIG, PLACES, VARIANTS, Recipe, fuse, fuse_with_rows, to_jax
 
-CONFIGS = {
-    "voxel": CONFIG,
-    "evict": CONFIG.replace(overflow="evict_lowest", pivots_per_voxel=2),
-    "append": CONFIG.replace(vacc="append"),
-}
-HEAD_TOL = 1e-5  # relative and absolute: a program for another number of rows may round otherwise
+HEAD_TOL = 1e-5  # relative and absolute: programs for different numbers of rows may round differently
 
 pytestmark = pytest.mark.usefixtures("compiled_plainly")
 
@@ -37,45 +32,45 @@ def chunk(seed):
 
 
 def carved(cache, rng, config):
-    """Some pivots sink below the threshold, some come back, most stay."""
+    """The cache after some pivots sank below the threshold and some came back."""
     factor = rng.choice([0.5, 1.0, 1.0, 1.0, 2.0], cache.confidences.shape).astype(np.float32)
     return replace(cache, confidences=jnp.clip(cache.confidences * factor, 0.0, 0.95))
 
 
-def assert_same_scene(told, scene):
+def assert_same_scene(received, scene):
     shown = np.asarray(scene.opacities) > 0
-    np.testing.assert_array_equal(told.opacities > 0, shown)
+    np.testing.assert_array_equal(received.opacities > 0, shown)
     for field in dataclasses.fields(scene):
         np.testing.assert_allclose(
-            getattr(told, field.name)[shown],
+            getattr(received, field.name)[shown],
             np.asarray(getattr(scene, field.name))[shown],
             rtol=HEAD_TOL,
             atol=HEAD_TOL,
         )
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n == "evict" else n for n in CONFIGS])
-def test_the_changes_put_together_are_the_scene(name):
-    config = CONFIGS[name]
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n == "evict" else n for n in VARIANTS])
+def test_deltas_put_together_equal_the_scene(name):
+    config = VARIANTS[name]
     model, params, rng = StreamSplat(config), decoder_params(config), np.random.default_rng(0)
-    cache, feed, told = init_cache(config, CAPACITY), SceneFeed(model, params), None
+    cache, feed, received = init_cache(config, CAPACITY), SceneFeed(model, params), None
     decode = jax.jit(model.decode)
     for seed in range(8):
-        cache, _ = fuse(cache, chunk(seed), config)
+        cache = fuse(cache, chunk(seed), config)
         cache = carved(cache, rng, config)
         if seed in (2, 3):
-            continue  # a follower may look away for some chunks
-        told = apply_delta(told, feed.update(cache))
-        assert_same_scene(told, decode(params, cache))
-    assert (told.opacities > 0).any() and (told.opacities == 0).any()
+            continue  # a delta may span several chunks
+        received = apply_delta(received, feed.update(cache))
+        assert_same_scene(received, decode(params, cache))
+    assert (received.opacities > 0).any() and (received.opacities == 0).any()
 
 
-def test_only_what_changed_is_told():
+def test_delta_holds_only_changed_rows():
     model, params = StreamSplat(CONFIG), decoder_params(CONFIG)
     feed, cache = SceneFeed(model, params), init_cache(CONFIG, CAPACITY)
     assert len(feed.update(cache).rows) == 0
-    cache, touched = fuse(cache, chunk(1), CONFIG)
-    assert set(feed.update(cache).rows) == set(np.asarray(touched.rows)[: int(touched.num_rows)])
+    cache, rows = fuse_with_rows(cache, chunk(1), CONFIG)
+    assert set(feed.update(cache).rows) == rows
     assert len(feed.update(cache).rows) == 0
     row = int(jnp.argmax(jnp.max(cache.confidences, axis=1)))
     sunk = replace(cache, confidences=cache.confidences.at[row].set(0.1))
@@ -83,31 +78,31 @@ def test_only_what_changed_is_told():
     assert feed.update(cache).rows.tolist() == [row]
 
 
-def test_a_follower_that_knows_a_cache_is_told_the_rest():
+def test_feed_from_a_known_cache_gives_the_rest():
     model, params = StreamSplat(CONFIG), decoder_params(CONFIG)
-    known, _ = fuse(init_cache(CONFIG, CAPACITY), chunk(0), CONFIG)
-    cache, touched = fuse(jax.tree.map(jnp.copy, known), chunk(1), CONFIG)
+    known = fuse(init_cache(CONFIG, CAPACITY), chunk(0), CONFIG)
+    cache, rows = fuse_with_rows(jax.tree.map(jnp.copy, known), chunk(1), CONFIG)
     delta = SceneFeed(model, params, known).update(cache)
-    assert set(delta.rows) == set(np.asarray(touched.rows)[: int(touched.num_rows)])
+    assert set(delta.rows) == rows
     whole = apply_delta(None, SceneFeed(model, params).update(cache))
-    told = apply_delta(apply_delta(None, SceneFeed(model, params).update(known)), delta)
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=HEAD_TOL, atol=HEAD_TOL), told, whole)
+    received = apply_delta(apply_delta(None, SceneFeed(model, params).update(known)), delta)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=HEAD_TOL, atol=HEAD_TOL), received, whole)
 
 
-def test_a_cache_that_grows_is_followed():
+def test_deltas_follow_a_cache_that_grows():
     model, params = StreamSplat(CONFIG), decoder_params(CONFIG)
     feed, cache = SceneFeed(model, params), init_cache(CONFIG, CAPACITY)
-    cache, _ = fuse(cache, chunk(1), CONFIG)
-    told = apply_delta(None, feed.update(cache))
-    cache, _ = fuse(grow(cache, 2 * CAPACITY), chunk(3), CONFIG)
-    told = apply_delta(told, feed.update(cache))
-    assert told.num_gaussians == 2 * CAPACITY * CONFIG.memory.pivots_per_voxel * CONFIG.head.gaussians_per_token
-    assert_same_scene(told, jax.jit(model.decode)(params, cache))
+    cache = fuse(cache, chunk(1), CONFIG)
+    received = apply_delta(None, feed.update(cache))
+    cache = fuse(grow(cache, 2 * CAPACITY), chunk(3), CONFIG)
+    received = apply_delta(received, feed.update(cache))
+    assert received.num_gaussians == 2 * CAPACITY * CONFIG.memory.pivots_per_voxel * CONFIG.head.gaussians_per_token
+    assert_same_scene(received, jax.jit(model.decode)(params, cache))
 
 
-def test_changes_come_back_from_disk_to_the_last_bit(tmp_path):
+def test_deltas_come_back_from_disk_to_the_last_bit(tmp_path):
     model, params = StreamSplat(CONFIG), decoder_params(CONFIG)
-    cache, _ = fuse(init_cache(CONFIG, CAPACITY), chunk(1), CONFIG)
+    cache = fuse(init_cache(CONFIG, CAPACITY), chunk(1), CONFIG)
     delta = SceneFeed(model, params).update(cache)
     save_delta(tmp_path / "00000.npz", delta)
     read = load_delta(tmp_path / "00000.npz")

@@ -1,34 +1,16 @@
-"""The stream as a whole: step, scan, session. One narrow model, one procedural capture, shared by the module."""
+"""The stream as a whole: step, scan, decoding and session, with one narrow model and one procedural capture."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ssplat_jax.config import StreamConfig
 from ssplat_jax.data.capture import open_capture
 from ssplat_jax.pytree import replace
 from ssplat_jax.streaming.session import Session
 from ssplat_jax.streaming.streamsplat import StreamSplat, merged_footprints
 from tests.model.small import random_params
-
-# Narrow, and without a confidence threshold: untrained distributions are flat and would leave the cache empty.
-NARROW = StreamConfig().replace(
-    encoder_widths=(8, 16),
-    encoder_blocks=1,
-    attention_blocks=0,  # tests/model compiles attention
-    fine_matching=False,
-    match_width=8,
-    num_depths=16,
-    unet_width=16,
-    token_width=16,
-    cgfi_width=16,
-    mixer_blocks=1,
-    mixer_proj=8,
-    min_confidence=0.0,
-    voxel_size=0.04,
-    capacity=8192,  # a session starts with it too: one program for loop and session
-)
+from tests.streaming.narrow_model import NARROW, assert_same_bits, leaves_with_names
 
 
 @pytest.fixture(scope="module")
@@ -48,13 +30,13 @@ def chunks(model):
 
 @pytest.fixture(scope="module")
 def step(model):
-    """The jitted step as users are told to write it: the cache it is given is consumed."""
+    """The jitted step as the documentation writes it: its cache argument is donated."""
     return jax.jit(model.step, donate_argnums=1)
 
 
 @pytest.fixture(scope="module")
 def looped(model, params, chunks, step):
-    """The cache after a Python loop over the jitted step, and the number of compilations that took."""
+    """The last cache and all outputs of a Python loop over the jitted step, and the number of compilations."""
     cache = model.init_cache()
     outputs = []
     for chunk in chunks:
@@ -63,15 +45,10 @@ def looped(model, params, chunks, step):
     return cache, outputs, step._cache_size()
 
 
-def leaves_with_names(tree):
-    return [(jax.tree_util.keystr(k), np.asarray(x)) for k, x in jax.tree_util.tree_flatten_with_path(tree)[0]]
-
-
 def test_scan_equals_loop_bit_for_bit(model, params, chunks, looped):
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *chunks)
     cache, outputs = jax.jit(model.run)(params, model.init_cache(), stacked)
-    for (name, scanned), (_, stepped) in zip(leaves_with_names(cache), leaves_with_names(looped[0]), strict=True):
-        np.testing.assert_array_equal(scanned, stepped, err_msg=name)
+    assert_same_bits(cache, looped[0])
     depths = np.stack([np.asarray(out.depths) for out in looped[1]])
     np.testing.assert_array_equal(np.asarray(outputs.depths), depths)
 
@@ -99,9 +76,9 @@ def test_cache_fills_within_its_bounds(model, chunks, looped):
     assert int(cache.stats.num_accepted) == seen - rejected - int(cache.stats.num_dropped)
 
 
-def test_stored_features_are_bounded_however_often_they_come_back(model, params, chunks, step):
-    # Twelve rounds over the same views: every chunk's features are fed by the cache and feed it. Without the bound the
-    # loop has gain, and a trained network reached 1e18 after nine chunks of a real capture.
+def test_stored_features_stay_bounded(model, params, chunks, step):
+    # Features read from the cache enter those written to it. Without the bound this loop has gain: a trained network
+    # reached 1e18 after nine chunks of a real capture.
     cache = model.init_cache()
     for _ in range(3):
         for chunk in chunks:
@@ -123,12 +100,10 @@ def test_future_chunks_do_not_change_the_past(model, params, chunks, step, loope
     assert not np.array_equal(np.asarray(changed.depths), np.asarray(looped[1][2].depths))
 
 
-def test_a_chunk_of_padding_leaves_the_cache_as_it_was(params, chunks, step, looped):
+def test_padding_leaves_the_cache_unchanged(params, chunks, step, looped):
     padding = replace(chunks[0], valid=jnp.zeros(4, bool))
     cache, _ = step(params, jax.tree.map(jnp.copy, looped[0]), padding)
-    for (name, after), (_, before) in zip(leaves_with_names(cache), leaves_with_names(looped[0]), strict=True):
-        if "num_chunks" not in name:
-            np.testing.assert_array_equal(after, before, err_msg=name)
+    assert_same_bits(cache, looped[0], except_fields=("num_chunks",))
 
 
 def test_pixels_of_a_padded_view_change_nothing(model, params, chunks, step):
@@ -137,11 +112,10 @@ def test_pixels_of_a_padded_view_change_nothing(model, params, chunks, step):
     noisy = replace(plain, images=plain.images.at[3].set(0.7))
     first, _ = step(params, model.init_cache(), plain)
     second, _ = step(params, model.init_cache(), noisy)
-    for (name, a), (_, b) in zip(leaves_with_names(first), leaves_with_names(second), strict=True):
-        np.testing.assert_array_equal(a, b, err_msg=name)
+    assert_same_bits(first, second)
 
 
-def test_history_is_seen_from_the_second_chunk_on(looped):
+def test_history_is_used_from_the_second_chunk_on(looped):
     histories = [float(out.history.sum()) for out in looped[1]]
     assert histories[0] == 0.0
     assert all(h > 0 for h in histories[1:])
@@ -156,27 +130,25 @@ def test_decoded_dead_pivots_are_absent(model, params, looped):
     np.testing.assert_allclose(centers[alive], np.asarray(looped[0].means).reshape(-1, 3)[alive], atol=1e-5)
 
 
-@pytest.mark.parametrize("fewest", [1, 1 << 15])
-def test_a_session_decodes_the_rows_that_show_and_no_more_than_a_power_of_two(
-    model, params, looped, fewest, monkeypatch
-):
-    monkeypatch.setattr("ssplat_jax.streaming.session.FEWEST_DECODED", fewest)
+@pytest.mark.parametrize("min_pivots", [1, 1 << 15])
+def test_session_decodes_shown_rows_padded_to_a_power_of_two(model, params, looped, min_pivots, monkeypatch):
+    monkeypatch.setattr("ssplat_jax.streaming.session.MIN_DECODED_PIVOTS", min_pivots)
     whole, session = model.decode(params, looped[0]), Session(model, params, looped[0])
     shown, is_shown = session.gaussians(), np.asarray(whole.opacities) > 0
     num_pivots = shown.num_gaussians // model.config.head.gaussians_per_token
     assert is_shown.sum() / model.config.head.gaussians_per_token <= num_pivots <= model.init_cache().alive.size
     assert num_pivots & (num_pivots - 1) == 0
     kept = slice(0, is_shown.sum())
-    for (name, held), (_, full) in zip(leaves_with_names(shown), leaves_with_names(whole), strict=True):
-        np.testing.assert_allclose(held[kept], full[is_shown], rtol=1e-5, atol=1e-6, err_msg=name)
+    for (name, compact), (_, full) in zip(leaves_with_names(shown), leaves_with_names(whole), strict=True):
+        np.testing.assert_allclose(compact[kept], full[is_shown], rtol=1e-5, atol=1e-6, err_msg=name)
     assert not np.asarray(shown.opacities)[is_shown.sum() :].any()
 
 
-def test_carved_pivots_are_not_decoded_but_remembered(model, params, looped):
+def test_carved_pivots_stay_in_the_cache_but_are_not_decoded(model, params, looped):
     cache = looped[0]
-    doubted = StreamSplat(NARROW.replace(min_confidence=float(np.median(cache.confidences[cache.alive]))))
-    opacities = np.asarray(doubted.decode(params, cache).opacities).reshape(*cache.confidences.shape, -1)
-    is_shown = np.asarray(cache.alive & (cache.confidences >= doubted.config.memory.min_confidence))
+    strict = StreamSplat(NARROW.replace(min_confidence=float(np.median(cache.confidences[cache.alive]))))
+    opacities = np.asarray(strict.decode(params, cache).opacities).reshape(*cache.confidences.shape, -1)
+    is_shown = np.asarray(cache.alive & (cache.confidences >= strict.config.memory.min_confidence))
     assert 0 < is_shown.sum() < np.asarray(cache.alive).sum()
     np.testing.assert_array_equal(opacities > 0, np.broadcast_to(is_shown[..., None], opacities.shape))
 
@@ -185,7 +157,7 @@ def test_carved_pivots_are_not_decoded_but_remembered(model, params, looped):
     ("footprint", "members", "wanted"),
     [(0.01, 1, 0.01), (0.01, 2, 0.01 * 2**0.5), (0.01, 100, 0.024), (0.05, 100, 0.05), (0.024, 3, 0.024)],
 )
-def test_merged_footprints_grow_until_they_cover_a_voxel_s_face(model, footprint, members, wanted):
+def test_merged_footprints_grow_until_they_cover_a_face(model, footprint, members, wanted):
     cache = model.init_cache()  # voxel_size 0.04, 4 pivots: 1.2 times a share of 0.02
     cache = replace(
         cache,
@@ -195,7 +167,7 @@ def test_merged_footprints_grow_until_they_cover_a_voxel_s_face(model, footprint
     assert float(merged_footprints(cache, model.config)[0, 0]) == pytest.approx(wanted, rel=1e-6)
 
 
-def test_session_compiles_once_and_needs_the_same_memory_throughout(model, params, chunks):
+def test_session_compiles_once_and_keeps_its_memory(model, params, chunks):
     session = Session(model, params)
     memory = []
     for chunk in chunks:
@@ -205,7 +177,7 @@ def test_session_compiles_once_and_needs_the_same_memory_throughout(model, param
     assert memory[0] is not None and len(set(memory)) == 1
 
 
-@pytest.mark.slow  # a program each
+@pytest.mark.slow  # compiles a program for each size
 @pytest.mark.parametrize(("width", "height"), [(50, 71), (71, 45)])
 def test_odd_and_portrait_sizes_stream(model, params, width, height, compiled_plainly):
     capture = open_capture(f"procedural:room?frames=5&size={width}x{height}")

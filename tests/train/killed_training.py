@@ -1,6 +1,6 @@
-"""A short training run of the narrow model in a process of its own: `python -m tests.train.killed_training OUT`.
+"""Script: a short training run of the narrow model, `python -m tests.train.killed_training OUT`.
 
-Prints every step it has done; at the end the state, flattened, is in `final.npz`.
+Prints every finished step, and writes the final state, flattened, to `final.npz`.
 """
 
 import sys
@@ -11,7 +11,7 @@ import numpy as np
 
 from ssplat_jax.train import loop
 from ssplat_jax.train.recipe import smoke_recipe
-from tests.streaming.test_streamsplat import NARROW
+from tests.streaming.narrow_model import NARROW
 
 STEPS = 200
 

@@ -1,4 +1,4 @@
-"""Training is a function of its seed, however often it is killed on the way."""
+"""Training is a function of its seed, also when it is killed and resumed."""
 
 import os
 import subprocess
@@ -15,14 +15,14 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 
 
 def start(out) -> subprocess.Popen:
-    # LLVM's passes take longer than these steps; strict promotion is for the tests' own process.
+    # LLVM's passes take longer than these steps.
     environment = os.environ | {"JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}
     command = [sys.executable, "-m", "tests.train.killed_training", str(out)]
     return subprocess.Popen(command, cwd=REPOSITORY, env=environment, stdout=subprocess.PIPE, text=True)
 
 
 def finish(out) -> dict[str, np.ndarray]:
-    """Lets a run go on to its end; its final state."""
+    """Final state of a run that continues to its end."""
     with start(out) as process:
         assert process.stdout is not None
         steps = [int(line) for line in process.stdout]
@@ -32,7 +32,7 @@ def finish(out) -> dict[str, np.ndarray]:
 
 
 def killed_at(out, step: int) -> None:
-    """Lets a run go on until it has reported `step`, and kills it there, in a save or between two."""
+    """Runs until `step` is reported and kills the process there, during a save or between two."""
     with start(out) as process:
         assert process.stdout is not None
         for line in process.stdout:
@@ -49,7 +49,7 @@ def assert_equal(a, b):
 
 
 @pytest.mark.slow  # 12 processes that load JAX and a training step each
-def test_runs_of_one_seed_are_bit_equal_and_so_is_one_killed_ten_times(tmp_path):
+def test_runs_of_one_seed_are_bit_equal_even_if_killed(tmp_path):
     whole = finish(tmp_path / "first")
     assert len(whole) > 50 and all(np.isfinite(x).all() for x in whole.values() if x.dtype.kind == "f")
     assert_equal(whole, finish(tmp_path / "second"))

@@ -1,7 +1,8 @@
-"""Training on the smallest recipe: reproducible, resumable, and it learns."""
+"""Training with the smallest recipe: it is reproducible and resumable."""
 
 import dataclasses
 import json
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -10,24 +11,26 @@ import pytest
 
 from ssplat_jax.cache import Tokens
 from ssplat_jax.checkpoint.training_state import TrainingCheckpoints
+from ssplat_jax.config import preset
 from ssplat_jax.data.procedural import training_sample
 from ssplat_jax.errors import InputError
 from ssplat_jax.pytree import replace
 from ssplat_jax.streaming.streamsplat import StreamSplat
 from ssplat_jax.train import loop
 from ssplat_jax.train.losses import depth_loss, image_gradient_l1, soft_targets
-from ssplat_jax.train.recipe import ALL_BUT_HEAD, Phase, PhaseForm, smoke_recipe, training_config
+from ssplat_jax.train.recipe import ALL_BUT_HEAD, TINY, Phase, PhaseForm, smoke_recipe, training_config, with_defaults
 from ssplat_jax.train.samples import log_depths_at_cells, make_sample, prefetched, sample_for_step
 from ssplat_jax.train.step import Trainer, decode_accepted, init_state, learning_rate, loss_fn, pad_like, stream_chunks
 from tests.model.small import random_params
-from tests.streaming.test_streamsplat import NARROW
+from tests.streaming.narrow_model import NARROW
 
 RECIPE = smoke_recipe(4)
+WIDTH = RECIPE.depth_target_width
 
 
 @pytest.fixture(autouse=True)
 def standard_promotion():
-    """Optax raises a float to an int32 count in Adam's bias correction, which strict promotion refuses."""
+    """Allows type promotion: optax raises a float to an int32 power in Adam's bias correction."""
     with jax.numpy_dtype_promotion("standard"):
         yield
 
@@ -44,26 +47,26 @@ def test_sample_is_a_function_of_its_seed():
     assert not np.array_equal(np.asarray(other.target_images), np.asarray(make_sample(3, **arguments).target_images))
 
 
-def test_sample_depth_lies_in_the_sweep_and_first_camera_is_the_origin():
+def test_sample_starts_at_the_origin_with_depths_in_range():
     sample = make_sample(5, num_chunks=2, num_targets=2, size=(64, 64), config=NARROW)
     np.testing.assert_allclose(np.asarray(sample.chunks.viewmats[0, 0]), np.eye(4), atol=1e-6)
     inside = (sample.log_depths > jnp.log(sample.chunks.near[0])) & (sample.log_depths < jnp.log(sample.chunks.far[0]))
-    assert float(inside.mean()) > 0.97  # the margins leave out at most the tails beyond the 1 % quantiles
+    assert float(inside.mean()) > 0.97  # the margins exclude at most the tails beyond the 1 % quantiles
 
 
-def test_the_truth_of_a_cell_is_the_depth_at_its_center():
-    # A wall that recedes evenly in log depth: a cell's center is the corner of its pixels 1 and 2, at (2, 2).
+def test_true_depth_of_a_cell_is_that_at_its_center():
+    # A plane in log depth: a cell's center is the common corner of its pixels 1 and 2, at (2, 2).
     y, x = np.mgrid[0:8, 0:12] + 0.5
     logs = 0.01 * y - 0.005 * x
     centers_y, centers_x = np.mgrid[0:2, 0:3] * 4.0 + 2.0
     found = log_depths_at_cells(np.exp(logs))
     np.testing.assert_allclose(found, 0.01 * centers_y - 0.005 * centers_x, atol=1e-6)
-    # An edge through the center: one of its two surfaces, never what lies between them.
+    # A depth edge through the center: one of the two surfaces, never a depth between them.
     logs[:, 6:] += 1.0
     assert np.abs(log_depths_at_cells(np.exp(logs))[:, 1] - found[:, 1] - 1.0).max() < 0.02
 
 
-def test_a_run_of_another_recipe_is_refused_by_the_first_difference(tmp_path):
+def test_other_recipe_is_refused_by_its_first_difference(tmp_path):
     description = {"config": {"width": 8}, "recipe": {"phases": [{"steps": 5}], "seed": 0}}
     TrainingCheckpoints(tmp_path, description).close()
     other = {"config": {"width": 8}, "recipe": {"phases": [{"steps": 6}], "seed": 0}}
@@ -71,7 +74,36 @@ def test_a_run_of_another_recipe_is_refused_by_the_first_difference(tmp_path):
         TrainingCheckpoints(tmp_path, other)
 
 
-def test_prefetch_keeps_order_and_passes_errors_on():
+OLD_RUN = Path(__file__).with_name("recipe_0_1.json")  # written by version 0.1 for `ssplat train --scale-steps 0.004`
+
+
+def test_run_of_version_0_1_is_resumed(tmp_path):
+    (tmp_path / "recipe.json").write_text(OLD_RUN.read_text())
+    recipe = TINY.scaled(0.004)
+    config = training_config(preset("tiny"), recipe)
+    description = loop.describe_run(config, recipe, has_lpips=False)
+    TrainingCheckpoints(tmp_path, description, upgrade=loop.upgrade_description).close()
+    for other in (dataclasses.replace(recipe, adam_b2=0.999), dataclasses.replace(recipe, weight_decay=0.02)):
+        description = loop.describe_run(config, other, has_lpips=False)
+        with pytest.raises(InputError, match=r"holds a run with recipe\.(adam_b2|weight_decay)"):
+            TrainingCheckpoints(tmp_path, description, upgrade=loop.upgrade_description)
+    description = loop.describe_run(config.replace(token_width=32), recipe, has_lpips=False)
+    with pytest.raises(InputError, match=r"config\.network\.token_width = 64, wanted 32"):
+        TrainingCheckpoints(tmp_path, description, upgrade=loop.upgrade_description)
+
+
+def test_fields_missing_in_a_recipe_have_their_default():
+    whole = json.loads(json.dumps(dataclasses.asdict(RECIPE)))
+    assert with_defaults(whole) == whole
+    partial = json.loads(json.dumps(whole))
+    for name in ("adam_b1", "lpips_weight", "ema_warmup_steps", "range_jitter"):
+        del partial[name]
+    del partial["phases"][0]["form"], partial["phases"][1]["form"]["frozen"]
+    assert with_defaults(partial) == whole
+    assert with_defaults(partial | {"adam_b1": 0.8})["adam_b1"] == 0.8
+
+
+def test_prefetch_keeps_order_and_raises_errors():
     assert [value for _, value in prefetched(lambda i: i * i, iter(range(5)))] == [0, 1, 4, 9, 16]
 
     def fail(i):
@@ -83,26 +115,27 @@ def test_prefetch_keeps_order_and_passes_errors_on():
         list(prefetched(fail, iter(range(5))))
 
 
-def test_soft_targets_peak_at_the_truth_and_the_loss_is_least_there():
+def test_soft_targets_and_loss_agree_on_the_truth():
     candidates = jnp.linspace(0.0, 2.0, 21)
     truth = jnp.full((1, 2, 2), 0.7)
-    target = soft_targets(truth, candidates)
+    target = soft_targets(truth, candidates, WIDTH)
     np.testing.assert_allclose(np.asarray(target.sum(-1)), 1.0, atol=1e-6)
     assert int(jnp.argmax(target[0, 0, 0])) == 7
     usable = jnp.ones((1, 2, 2), bool)
 
     def at(k):
         logits = 20.0 * jax.nn.one_hot(jnp.full((1, 2, 2), k), 21)
-        return float(depth_loss(logits, truth, truth, candidates, usable)[0])
+        return float(depth_loss(logits, truth, truth, candidates, usable, target_width=WIDTH)[0])
 
     assert at(7) < at(6) < at(5)
 
 
-def test_cells_out_of_range_have_no_part_in_the_depth_loss():
+def test_cells_out_of_range_do_not_count_in_the_depth_loss():
     candidates = jnp.linspace(0.0, 1.0, 5)
     truth = jnp.array([[[0.5, 3.0]]])
     logits = jnp.zeros((1, 1, 2, 5))
-    loss = lambda x: sum(depth_loss(x, truth, truth, candidates, jnp.ones((1, 1, 2), bool)))  # noqa: E731
+    usable = jnp.ones((1, 1, 2), bool)
+    loss = lambda x: sum(depth_loss(x, truth, truth, candidates, usable, target_width=WIDTH))  # noqa: E731
     gradient = jax.grad(loss)(logits)
     assert float(jnp.abs(gradient[0, 0, 0]).max()) > 0
     assert float(jnp.abs(gradient[0, 0, 1]).max()) == 0
@@ -114,14 +147,14 @@ def test_cells_of_unknown_depth_leave_the_loss_finite(candidates, unknown):
     candidates = jnp.asarray(candidates, jnp.float32)
     truth, usable = jnp.array([[[0.5, unknown]]]), jnp.ones((1, 1, 2), bool)
     logits = jnp.zeros((1, 1, 2, len(candidates)))
-    loss = lambda x, y: sum(depth_loss(x, y, truth, candidates, usable))  # noqa: E731
+    loss = lambda x, y: sum(depth_loss(x, y, truth, candidates, usable, target_width=WIDTH))  # noqa: E731
     value, gradients = jax.value_and_grad(loss, argnums=(0, 1))(logits, jnp.full((1, 1, 2), 0.2))
     assert np.isfinite(value) and all(np.isfinite(g).all() for g in gradients)
     assert not any(np.asarray(g)[0, 0, 1].any() for g in gradients)
 
 
 @pytest.mark.parametrize("rows", range(5, 13))
-def test_every_size_has_the_depth_of_the_cells_whose_centres_it_holds(rows):
+def test_only_cells_with_centers_in_the_image_have_depth(rows):
     log_depths = np.linspace(0.0, 0.01 * rows, rows)[:, None] * np.ones((1, 8))
     found = log_depths_at_cells(np.exp(log_depths))
     centers = 4 * np.arange((rows + 1) // 4) + 2  # of cells, in pixels; between pixels 1 and 2 of each
@@ -129,18 +162,18 @@ def test_every_size_has_the_depth_of_the_cells_whose_centres_it_holds(rows):
     np.testing.assert_allclose(found[:, 0], (log_depths[centers - 1, 0] + log_depths[centers, 0]) / 2, atol=1e-6)
 
 
-def test_targets_need_views_around_them():
+def test_targets_need_context_views_around_them():
     with pytest.raises(InputError, match="a context of one view"):
         make_sample(0, num_chunks=1, num_targets=1, size=(16, 16), config=NARROW.replace(chunk_size=1))
 
 
 @pytest.mark.slow  # a program of its own
-def test_sizes_that_the_network_pads_train():
-    """72 rows become 96: the truth is padded like the images, and padding has no part in the loss."""
+def test_padded_sizes_train():
+    """72 rows are padded to 96: the truth is padded like the images, and padding does not count in the loss."""
     sample = make_sample(0, num_chunks=1, num_targets=0, size=(72, 64), config=NARROW)
     model = StreamSplat(training_config(NARROW, RECIPE))
     params = jax.eval_shape(model.init, jax.random.key(0))
-    jax.eval_shape(lambda p, s: stream_chunks(model, p, s, recompute=False), params, sample)
+    jax.eval_shape(lambda p, s: stream_chunks(model, p, s, RECIPE), params, sample)
     truth = np.asarray(sample.log_depths[0])
     padded = np.asarray(pad_like(jnp.asarray(truth), jnp.zeros((4, 24, 16))))
     assert truth.shape == (4, 18, 16)
@@ -148,7 +181,7 @@ def test_sizes_that_the_network_pads_train():
     np.testing.assert_array_equal(padded[:, 18:], np.repeat(truth[:, -1:], 6, axis=1))
 
 
-def test_image_gradient_l1_ignores_a_constant_and_sees_an_edge():
+def test_image_gradient_l1_ignores_a_constant_offset():
     image = jax.random.uniform(jax.random.key(0), (1, 6, 6, 3))
     assert float(image_gradient_l1(image, image + 0.25)) < 1e-6
     assert float(image_gradient_l1(image, image.at[:, :, 3:].add(0.5))) > 0.05
@@ -164,11 +197,11 @@ def test_learning_rate_warms_up_and_decays_in_every_phase():
     assert learning_rate(quiet, 199) == pytest.approx(0.02 * quiet.phases[0].learning_rate, rel=0.01)
 
 
-def test_what_a_witness_looked_through_is_not_rendered():
+def test_tokens_that_a_witness_looked_through_are_not_rendered():
     model = StreamSplat(NARROW)
     params, cache = random_params(NARROW), model.init_cache()
     side = cache.witnesses.weights.shape[-1]
-    # One witness at the origin that saw a wall at depth 2 everywhere.
+    # One witness at the origin saw a wall at depth 2.
     witnesses = replace(
         cache.witnesses,
         viewmats=cache.witnesses.viewmats.at[0].set(jnp.eye(4)),
@@ -176,7 +209,7 @@ def test_what_a_witness_looked_through_is_not_rendered():
         log_depths=cache.witnesses.log_depths.at[0].set(np.log(2.0)),
         weights=cache.witnesses.weights.at[0].set(1.0),
     )
-    depths = jnp.array([1.0, 2.0, 3.0, 2.0])  # a floater, the wall, what it hides, and what is not trusted
+    depths = jnp.array([1.0, 2.0, 3.0, 2.0])  # a floater, the wall, a hidden token, one of low confidence
     tokens = Tokens(
         means=jnp.array([[0.01, 0.01, 1.0]]) * depths[:, None],
         feats=jnp.ones((4, NARROW.network.token_width)),
@@ -191,7 +224,7 @@ def test_what_a_witness_looked_through_is_not_rendered():
     np.testing.assert_array_equal(shown.reshape(4, -1).T, [[False, True, True, False]] * 4)
 
 
-def test_a_phase_says_how_far_views_step():
+def test_views_step_as_far_as_the_phase_says():
     rng = np.random.default_rng(0)
     for low, high in ((0.01, 0.02), (0.2, 0.3)):
         for seed in rng.integers(0, 1000, 3):
@@ -201,13 +234,13 @@ def test_a_phase_says_how_far_views_step():
 
 
 FROZEN_ENCODER = PhaseForm(frozen=("encoder",))
-# Depth alone: steps that render take a minute to compile, and are slow tests.
+# Depth alone: steps that render take a minute to compile and are tested as slow tests.
 DEPTH_RECIPE = dataclasses.replace(RECIPE, phases=(Phase("depth", 1, 1, 0, ((64, 64),), 1e-3, FROZEN_ENCODER),))
 
 
 @pytest.fixture(scope="module")
 def trainer():
-    """One compiled step for the tests that take one."""
+    """One compiled step, shared by the tests that need one."""
     return Trainer(StreamSplat(training_config(NARROW, DEPTH_RECIPE)), DEPTH_RECIPE)
 
 
@@ -215,7 +248,7 @@ def start(trainer):
     return init_state(trainer.model, DEPTH_RECIPE, random_params(trainer.model.config))
 
 
-def test_a_step_with_a_non_finite_gradient_changes_nothing_but_its_count(trainer):
+def test_step_with_a_non_finite_gradient_is_only_counted(trainer):
     sample = sample_for_step(0, DEPTH_RECIPE, trainer.model.config)
     broken = dataclasses.replace(sample, log_depths=sample.log_depths.at[0, 0, 8, 8].set(jnp.nan))
     broken = dataclasses.replace(
@@ -243,7 +276,7 @@ def test_frozen_stages_stay_and_the_others_move(trainer):
 
 
 @pytest.mark.slow  # two programs of a whole training step
-def test_rendering_the_cache_trains_the_head_alone_whatever_is_frozen():
+def test_rendering_the_cache_trains_the_head_alone():
     sample = sample_for_step(RECIPE.num_steps - 1, RECIPE, NARROW)
     model = StreamSplat(training_config(NARROW, RECIPE))
     params = random_params(NARROW)
@@ -262,7 +295,7 @@ def test_rendering_the_cache_trains_the_head_alone_whatever_is_frozen():
 
 
 @pytest.mark.slow  # two runs, each compiling both phases
-def test_an_interrupted_run_ends_as_an_uninterrupted_one(tmp_path):
+def test_interrupted_run_ends_as_an_uninterrupted_one(tmp_path):
     whole = loop.train(NARROW, RECIPE, tmp_path / "whole", save_every=2)
     assert whole.step == RECIPE.num_steps
 

@@ -17,15 +17,17 @@ from scipy.spatial.transform import Rotation
 
 import ssplat_jax as ss
 from ssplat_jax.checkpoint.delta_files import load_delta, save_delta
-from ssplat_jax.data.posed_image import inverse, pose_of
+from ssplat_jax.data.posed_image import invert_pose, pose_from_quat
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.errors import InputError, StorageError
 from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.pytree import replace
 from ssplat_jax.rasterizer import Effects
+from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.streaming.scene_delta import SceneDelta, apply_delta
-from ssplat_jax.viewer.view_scene import GrowingScene, SceneFile, camera_before, first_camera, source_of
-from ssplat_jax.viewer.viser_viewer import LARGEST_SIGMA, Viewer, median_size, splats_of
+from ssplat_jax.viewer.scene_sources import GrowingScene, SceneFile, open_source
+from ssplat_jax.viewer.start_camera import camera_before, first_camera
+from ssplat_jax.viewer.viser_viewer import MAX_SIGMA, Viewer, median_size, visible_splats
 
 HALF_PRECISION = 2.0**-11  # relative rounding of a 16-bit float
 BROWSER_DB = 38.0  # of the browser's picture against ours: 8 bits, 16-bit covariances, JPEG
@@ -51,10 +53,10 @@ def frame(origin=(0.0, 0.0, 0.0)):
 
 
 @pytest.mark.parametrize("size", [1e-4, 1.0, 1e4])
-def test_splats_are_the_gaussians_and_survive_16_bits_at_any_size(size):
+def test_splats_equal_the_gaussians_in_16_bits_at_any_size(size):
     gaussians = scene(size=size)
     unit = median_size(gaussians)
-    splats = splats_of(gaussians, unit, most=1000)
+    splats = visible_splats(gaussians, unit, max_gaussians=1000)
     rotations = Rotation.from_quat(np.asarray(gaussians.quats)[:, [1, 2, 3, 0]]).as_matrix()
     variances = np.asarray(gaussians.scales, np.float64) ** 2
     wanted = np.einsum("nij,nj,nkj->nik", rotations, variances, rotations)
@@ -66,21 +68,26 @@ def test_splats_are_the_gaussians_and_survive_16_bits_at_any_size(size):
     np.testing.assert_array_equal(splats.opacities[:, 0], gaussians.opacities)
 
 
-def test_what_cannot_be_drawn_is_not_sent_and_what_is_huge_is_cut():
+def test_invisible_gaussians_are_dropped_and_huge_ones_cut():
     gaussians = scene()
     means = gaussians.means.at[0, 0].set(np.nan)
     scales = gaussians.scales.at[1].set(np.inf).at[2].set(1e6)
     opacities = gaussians.opacities.at[3].set(0.0).at[4].set(1 / 256)
-    splats = splats_of(replace(gaussians, means=means, scales=scales, opacities=opacities), 0.1, most=1000)
+    splats = visible_splats(
+        replace(gaussians, means=means, scales=scales, opacities=opacities), 0.1, max_gaussians=1000
+    )
     assert len(splats.centers) == 50 - 4
     assert all(np.isfinite(x).all() for x in vars(splats).values())
     assert np.isfinite(splats.covariances.astype(np.float16)).all()
-    np.testing.assert_allclose(np.linalg.eigvalsh(splats.covariances[0]), LARGEST_SIGMA**2, rtol=1e-5)
+    np.testing.assert_allclose(np.linalg.eigvalsh(splats.covariances[0]), MAX_SIGMA**2, rtol=1e-5)
 
 
-def test_of_too_many_every_so_many_th_is_sent():
+def test_too_many_gaussians_are_evenly_subsampled():
     gaussians = scene()
-    all_of_them, some = splats_of(gaussians, 1.0, most=50), splats_of(gaussians, 1.0, most=17)
+    all_of_them, some = (
+        visible_splats(gaussians, 1.0, max_gaussians=50),
+        visible_splats(gaussians, 1.0, max_gaussians=17),
+    )
     places = [int(np.flatnonzero((all_of_them.centers == center).all(axis=1))[0]) for center in some.centers]
     assert len(places) == 17 and places[0] == 0 and places[-1] == 49
     assert set(np.diff(places)) == {3, 4}
@@ -88,7 +95,7 @@ def test_of_too_many_every_so_many_th_is_sent():
 
 def test_an_empty_scene_has_a_size_and_nothing_to_send():
     nothing = replace(scene(), opacities=jnp.zeros(50))
-    assert median_size(nothing) == 1.0 and len(splats_of(nothing, 1.0, most=10).centers) == 0
+    assert median_size(nothing) == 1.0 and len(visible_splats(nothing, 1.0, max_gaussians=10).centers) == 0
     assert camera_before(nothing) is None
 
 
@@ -104,14 +111,14 @@ def delta(rows, seed):
 
 def test_a_growing_run_is_what_its_deltas_add_up_to(tmp_path):
     origin = (5e6, 0.0, 1.0)  # so far that positions are counted from an offset
-    header, source = {"frame": frame(origin).to_dict()}, GrowingScene(tmp_path)
+    header, source = {"frame": frame(origin).to_dict()}, GrowingScene(RunFolder(tmp_path))
     assert source.changed() is None and source.start_camera() is None
     deltas = [delta([0, 1], 1), delta([1, 2, 5], 2), delta([0], 3)]
-    save_delta(tmp_path / "000004.npz", deltas[0], header)
+    save_delta(tmp_path / "deltas" / "000004.npz", deltas[0], header)
     first = source.changed()
     assert first is not None and source.changed() is None
     for number, more in enumerate(deltas[1:], start=2):
-        save_delta(tmp_path / f"{4 * number:06d}.npz", more, header)
+        save_delta(tmp_path / "deltas" / f"{4 * number:06d}.npz", more, header)
     found = source.changed()
     known = None
     for part in deltas:
@@ -121,30 +128,30 @@ def test_a_growing_run_is_what_its_deltas_add_up_to(tmp_path):
     for name in ("means", "quats", "scales", "opacities", "sh"):
         np.testing.assert_array_equal(getattr(found, name), getattr(wanted, name))
     # Started anew: what the old run had is forgotten.
-    for path in tmp_path.iterdir():
+    for path in (tmp_path / "deltas").iterdir():
         path.unlink()
-    save_delta(tmp_path / "000004.npz", deltas[1], header)
+    save_delta(tmp_path / "deltas" / "000004.npz", deltas[1], header)
     anew = source.changed()
     assert anew is not None
     np.testing.assert_array_equal(np.asarray(anew.opacities) > 0, np.repeat([0, 1, 1, 0, 0, 1, 0, 0], 2) > 0)
 
 
 def test_a_run_that_starts_anew_while_it_is_read_is_read_again(tmp_path, monkeypatch):
-    header, source = {"frame": frame().to_dict()}, GrowingScene(tmp_path)
+    header, source = {"frame": frame().to_dict()}, GrowingScene(RunFolder(tmp_path))
     for number in (1, 2):
-        save_delta(tmp_path / f"{4 * number:06d}.npz", delta([0, 1], number), header)
+        save_delta(tmp_path / "deltas" / f"{4 * number:06d}.npz", delta([0, 1], number), header)
 
     def vanish(path):
         if path.name == "000008.npz":
             path.unlink()
         return load_delta(path)
 
-    monkeypatch.setattr("ssplat_jax.viewer.view_scene.load_delta", vanish)
+    monkeypatch.setattr("ssplat_jax.viewer.scene_sources.load_delta", vanish)
     assert source.changed() is None
     found = source.changed()
     assert found is not None
     np.testing.assert_array_equal(found.opacities[:4], delta([0, 1], 1).gaussians.opacities)
-    (tmp_path / "000012.npz").write_bytes(b"damaged")
+    (tmp_path / "deltas" / "000012.npz").write_bytes(b"damaged")
     with pytest.raises(StorageError, match=r"000012\.npz"):
         source.changed()
 
@@ -152,7 +159,7 @@ def test_a_run_that_starts_anew_while_it_is_read_is_read_again(tmp_path, monkeyp
 def test_a_scene_file_is_read_again_when_it_is_written_again(tmp_path):
     file = tmp_path / "scene.ply"
     ss.save_ply(file, scene(5))
-    source = source_of(tmp_path)
+    source = open_source(tmp_path)
     assert isinstance(source, SceneFile) and source.start_camera() is None
     assert source.changed().num_gaussians == 5 and source.changed() is None
     ss.save_ply(file, scene(7))
@@ -161,9 +168,9 @@ def test_a_scene_file_is_read_again_when_it_is_written_again(tmp_path):
     assert source.changed() is None  # shown on
 
 
-def test_a_scene_is_looked_at_from_where_its_run_began_if_that_is_known(tmp_path):
+def test_viewing_starts_at_the_first_camera_of_the_run(tmp_path):
     ss.save_ply(tmp_path / "scene.ply", scene(5))
-    metrics, source = tmp_path / "metrics.json", source_of(tmp_path)
+    metrics, source = tmp_path / "metrics.json", open_source(tmp_path)
     metrics.write_text(json.dumps({"stream_frame": frame((1.0, 2.0, 3.0)).to_dict()}))
     np.testing.assert_allclose(source.start_camera().position, [1.0, 2.0, 3.0])
     for other in ("", "{", "[]", "{}", '{"stream_frame": null}', '{"stream_frame": {"rotation": 1}}', "\x00"):
@@ -181,31 +188,31 @@ def test_a_browser_starts_at_the_first_camera_of_the_stream():
 
 
 @pytest.mark.parametrize("name", ["nowhere", "empty", "nowhere.ply"])
-def test_where_no_scene_is_that_is_said(name, tmp_path):
+def test_a_path_without_a_scene_is_refused(name, tmp_path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match=r"wanted a \.ply, or the folder"):
-        source_of(tmp_path / name)
+        open_source(tmp_path / name)
 
 
-def test_without_viser_the_command_that_installs_it_is_said(monkeypatch):
+def test_a_missing_viser_is_refused_with_the_remedy(monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
     with pytest.raises(InputError, match=r'pip install "ssplat-jax\[viewer\]"'):
-        Viewer(host="127.0.0.1", port=8080, most=10)
+        Viewer(host="127.0.0.1", port=8080, max_gaussians=10)
 
 
 @pytest.mark.parametrize(
     ("host", "port"), [("192.0.2.7", 8080), ("nosuch.invalid", 8080), ("127.0.0.1", 70000), ("127.0.0.1", 0)]
 )
-def test_where_nothing_can_listen_that_is_said_at_once(host, port):
+def test_an_unusable_address_is_refused_at_once(host, port):
     with pytest.raises(InputError, match=rf"view: cannot listen on {host}:{port} \(.*\); choose another"):
-        Viewer(host=host, port=port, most=10)
+        Viewer(host=host, port=port, max_gaussians=10)
 
 
 def test_an_empty_folder_of_deltas_hides_no_scene(tmp_path):
     (tmp_path / "deltas").mkdir()
-    assert isinstance(source_of(tmp_path), GrowingScene)
+    assert isinstance(open_source(tmp_path), GrowingScene)
     (tmp_path / "scene.ply").write_bytes(b"")
-    assert isinstance(source_of(tmp_path), SceneFile)
+    assert isinstance(open_source(tmp_path), SceneFile)
 
 
 def free_port():
@@ -214,9 +221,9 @@ def free_port():
         return probe.getsockname()[1]
 
 
-def test_the_server_is_reached_at_what_it_prints_and_updates_in_place():
+def test_the_server_answers_at_its_url_and_updates_in_place():
     pytest.importorskip("viser")
-    viewer = Viewer(host="127.0.0.1", port=free_port(), most=40)
+    viewer = Viewer(host="127.0.0.1", port=free_port(), max_gaussians=40)
     try:
         assert viewer.url.startswith("http://localhost:")
         with urllib.request.urlopen(viewer.url, timeout=20) as page:
@@ -251,7 +258,7 @@ def test_a_browser_shows_what_the_rasterizer_draws():
     chromium = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
     if chromium is None:
         pytest.skip("no Chromium")
-    viewer = Viewer(host="127.0.0.1", port=free_port(), most=1000)
+    viewer = Viewer(host="127.0.0.1", port=free_port(), max_gaussians=1000)
     switches = ("--headless=new", "--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader")
     command = [chromium, *switches, "--enable-unsafe-swiftshader", "--window-size=640,480", viewer.url]
     size = 1e-4
@@ -275,7 +282,7 @@ def test_a_browser_shows_what_the_rasterizer_draws():
             K = jnp.asarray([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], jnp.float32)
             # In the browser the first camera looks 1 far; here the scene is drawn at size 1.
             position = camera.position * np.linalg.norm(start.look_at - start.position) / size
-            viewmat = jnp.asarray(inverse(pose_of(camera.wxyz, position, "browser")), jnp.float32)
+            viewmat = jnp.asarray(invert_pose(pose_from_quat(camera.wxyz, position, "browser")), jnp.float32)
             effects = Effects(antialias="classic", background=(1.0, 1.0, 1.0))
             view = Camera(viewmats=viewmat, Ks=K, width=width, height=height)
             wanted = ss.render(scene(num_gaussians), view, effects=effects).color

@@ -1,4 +1,4 @@
-"""Fills a `Scene`'s rows one solid at a time."""
+"""`SceneBuilder`: assembles a `Scene` one solid at a time."""
 
 import dataclasses
 
@@ -7,38 +7,38 @@ import numpy as np
 from ssplat_jax.data.procedural.scene import AWAY, NUM_BALLS, NUM_BOXES, NUM_SOLIDS, Scene
 from ssplat_jax.data.procedural.textures import TextureLibrary
 
-# The two unit axes that a face's u and v follow: walls stand upright (v along +y, down).
+# Axes of the unit frame along which u and v run on each face; on walls v runs along +y, down.
 _FACE_AXES = ((2, 1), (2, 1), (0, 2), (0, 2), (0, 1), (0, 1))
 
 
 @dataclasses.dataclass(frozen=True)
 class Finish:
-    """How a solid's faces are covered."""
+    """Appearance of the faces of a solid."""
 
-    textures: tuple[int, ...]  # chosen among, anew for each face
-    tile: float = 1.0  # length that one tile covers; 0 stretches one tile over each face
+    textures: tuple[int, ...]  # one is drawn for each face
+    tile: float = 1.0  # length of one tile; 0 stretches one tile over each face
     gain: tuple[float, float, float] = (1.0, 1.0, 1.0)
     bias: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    glow: float = 0.0  # 1: lights itself, unshaded
-    is_turned: bool = False  # tiles are turned by a random angle
-    is_centered: bool = False  # tiles are symmetric about the solid's center, which closes a dome's seams
+    glow: float = 0.0  # 1: self-luminous, without shading
+    is_turned: bool = False  # tiles are rotated by a random angle
+    is_centered: bool = False  # tiles are symmetric about the center of the solid, which hides the seams of a dome
 
 
 def yaw_rotation(angle: float) -> np.ndarray:
-    """Rotation about the vertical."""
+    """Returns the rotation matrix about the vertical axis by an angle in radians."""
     c, s = np.cos(angle), np.sin(angle)
     return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
 
 
 def random_rotation(rng: np.random.Generator) -> np.ndarray:
-    """Uniform over all rotations."""
+    """Returns a uniformly distributed random rotation matrix."""
     q, r = np.linalg.qr(rng.standard_normal((3, 3)))
     q = q * np.sign(np.diag(r))
     return q * np.sign(np.linalg.det(q))
 
 
 class SceneBuilder:
-    """Collects solids; what exceeds a shape's rows is left out."""
+    """Builder of a scene; solids beyond the fixed number of rows of their shape are dropped."""
 
     def __init__(self, rng: np.random.Generator, library: TextureLibrary) -> None:
         self.rng = rng
@@ -54,7 +54,18 @@ class SceneBuilder:
     # -- finishes ---------------------------------------------------------------------------------------------------
 
     def finish(self, *groups: str, tile: float = 1.0, same: bool = True, tint: float = 0.15, **options) -> Finish:
-        """A finish from one of the texture `groups`, its color shifted by up to `tint`."""
+        """Returns a random finish from one of the texture `groups`.
+
+        Args:
+            groups: groups of the texture library.
+            tile: length of one tile; 0 stretches one tile over each face.
+            same: whether all faces have the same texture.
+            tint: largest relative change of a color channel.
+            **options: other fields of `Finish`.
+
+        Returns:
+            The finish.
+        """
         rng = self.rng
         ids = self.library.groups[groups[rng.integers(len(groups))]]
         textures = tuple(int(i) for i in rng.choice(ids, 1 if same else 3))
@@ -62,6 +73,7 @@ class SceneBuilder:
         return Finish(textures, tile=tile, gain=tuple(gain), **options)
 
     def _cover(self, row: int, finish: Finish) -> None:
+        """Sets the faces of a solid that has been placed."""
         half = self.halves[row]
         for face, axes in enumerate(_FACE_AXES):
             self.face_textures[row, face] = finish.textures[self.rng.integers(len(finish.textures))]
@@ -80,7 +92,15 @@ class SceneBuilder:
     # -- solids -----------------------------------------------------------------------------------------------------
 
     def add(self, shape: str, center, half, finish: Finish, rotation: np.ndarray | None = None) -> None:
-        """A box, ball or cylinder (along its y) of half extents `half`, turned by `rotation` (solid -> world)."""
+        """Adds a solid.
+
+        Args:
+            shape: "box", "ball" or "cylinder" (along its y axis).
+            center: position in the world.
+            half: half extents along the axes of the solid.
+            finish: appearance.
+            rotation: from the solid to the world; by default none.
+        """
         row = self._next[shape]
         if row == self._end[shape]:
             return
@@ -88,6 +108,7 @@ class SceneBuilder:
         self._place(row, center, half, finish, np.eye(3) if rotation is None else rotation)
 
     def _place(self, row: int, center, half, finish: Finish, rotation: np.ndarray) -> None:
+        """Fills one row of the scene."""
         half = np.broadcast_to(np.asarray(half, np.float64), (3,))
         matrix = rotation.T / half[:, None]
         self.frames[row] = np.concatenate([matrix, -matrix @ np.asarray(center, np.float64)[:, None]], axis=1)
@@ -95,11 +116,26 @@ class SceneBuilder:
         self._cover(row, finish)
 
     def box(self, center, half, finish: Finish, yaw: float = 0.0) -> None:
-        """A box turned about the vertical."""
+        """Adds a box that is rotated about the vertical axis.
+
+        Args:
+            center: position in the world.
+            half: half extents along the axes of the box.
+            finish: appearance.
+            yaw: angle in radians.
+        """
         self.add("box", center, half, finish, yaw_rotation(yaw))
 
     def shell(self, center, half, walls: Finish, floor: Finish, ceiling: Finish) -> None:
-        """The world's outer box."""
+        """Sets the outer box of the world.
+
+        Args:
+            center: position in the world.
+            half: half extents.
+            walls: appearance of the walls.
+            floor: appearance of the floor.
+            ceiling: appearance of the ceiling.
+        """
         self._place(NUM_SOLIDS, center, half, walls, np.eye(3))
         wall_faces, wall_textures = self.faces[NUM_SOLIDS].copy(), self.face_textures[NUM_SOLIDS].copy()
         for finish, face in ((floor, 3), (ceiling, 2)):
@@ -108,13 +144,23 @@ class SceneBuilder:
         self.faces[NUM_SOLIDS], self.face_textures[NUM_SOLIDS] = wall_faces, wall_textures
 
     def dome(self, radius: float, finish: Finish) -> None:
-        """The world's outer ball, around the origin."""
+        """Sets the outer ball of the world, around the origin."""
         self._place(NUM_SOLIDS + 1, np.zeros(3), radius, finish, np.eye(3))
 
-    # -- the end ----------------------------------------------------------------------------------------------------
+    # -- scene ------------------------------------------------------------------------------------------------------
 
     def build(self, *, focus, orbit_radius: float, eye, sensor: bool = False) -> Scene:
-        """The scene, under a random light; `sensor` adds exposure changes and noise."""
+        """Returns the scene under a random light.
+
+        Args:
+            focus: point that orbits look at.
+            orbit_radius: distance of orbits from `focus`.
+            eye: free point at which walks start.
+            sensor: whether views have changes of exposure and noise.
+
+        Returns:
+            The scene.
+        """
         rng = self.rng
         light = np.array([rng.normal(), -rng.uniform(0.4, 2.0), rng.normal()])
         floats = {

@@ -1,8 +1,8 @@
-"""Camera paths through free space: what a hand that films does, sampled at random but never through a wall.
+"""Random camera paths through free space that imitate hand-held video.
 
-A path is walked step by step. Each style says which way the next step and the next gaze would like to go; the step is
-turned aside while it would come too close to a surface, and the gaze follows its wish with the inertia of a wrist. Step
-lengths are fractions of the median depth that is seen, because parallax, not distance, is what matching sees.
+A path is generated step by step. Each style gives the wanted direction of the next step and of the gaze. The step is
+deflected if it would come too close to a surface, and the gaze follows with some inertia. Step lengths are fractions of
+the visible median depth, because matching depends on parallax instead of distance.
 """
 
 import dataclasses
@@ -14,19 +14,19 @@ from ssplat_jax.data.procedural.scene import Scene, clearance
 from ssplat_jax.errors import InputError
 
 UP = np.array([0.0, -1.0, 0.0])
-MAX_IRREGULARITY = 0.7  # deviation of the log of a path's steps; the least is 0.1, a video at an even walk
-MAX_STEP_FACTOR = 3.0
+MAX_IRREGULARITY = 0.7  # largest deviation of the log of a path's steps; the smallest, 0.1, is an even walk
+MAX_STEP_FACTOR = 3.0  # largest ratio of a step to the typical step, in either direction
 
 
 @dataclasses.dataclass
 class _Walker:
-    """Where the camera is and what it does next."""
+    """State of the camera along a path."""
 
     position: np.ndarray
     heading: np.ndarray  # unit
     gaze: np.ndarray  # unit
     roll: float
-    turn: float  # direction of an orbit or pan, -1 or 1
+    turn: float  # sense of rotation of an orbit or pan, -1 or 1
 
 
 def sample_path(
@@ -40,20 +40,23 @@ def sample_path(
     step: float | None = None,
     min_clearance: float = 0.45,
 ) -> tuple[Float[np.ndarray, "v 4 4"], Float[np.ndarray, "v 3 3"]]:
-    """Camera-to-world poses (OpenCV axes) and intrinsics of a walk through `scene`, in its units.
+    """Returns a random camera path through a scene.
 
     Args:
         seed: the same seed gives the same path.
-        scene: the world that must not be touched.
+        scene: the world; the path keeps clear of its surfaces.
         kind: one of `PATH_KINDS`; None draws one.
-        num_views: poses wanted.
-        height: image rows; with `width` it sets the intrinsics, one camera for all views.
+        num_views: number of poses.
+        height: image rows; with `width` they determine the intrinsics, which all views share.
         width: image columns.
         step: typical distance between consecutive views; None takes 1 to 10 % of the orbit radius.
-        min_clearance: distance to keep from every surface, as far as the walk finds room.
+        min_clearance: distance to all surfaces, where the path can keep it.
+
+    Returns:
+        Camera-to-world poses (OpenCV axes, in units of the scene) and intrinsics in pixels.
 
     Raises:
-        InputError: no such kind.
+        InputError: an unknown kind.
     """
     if kind is not None and kind not in _STYLES:
         raise InputError(f"procedural path: kind must be one of {', '.join(PATH_KINDS)}, got {kind!r}.")
@@ -71,7 +74,7 @@ def sample_path(
 
 
 def _step_factor(rng: np.random.Generator, irregularity: float) -> float:
-    """One step over the typical one: its log is normal, but no step is a leap of more than 3."""
+    """Ratio of a step to the typical one: log-normal, clipped to `MAX_STEP_FACTOR`."""
     return float(np.clip(np.exp(irregularity * rng.standard_normal()), 1 / MAX_STEP_FACTOR, MAX_STEP_FACTOR))
 
 
@@ -83,11 +86,11 @@ def _intrinsics(rng: np.random.Generator, num_views: int, height: int, width: in
     return np.tile(K, (num_views, 1, 1))
 
 
-# -- the walk ---------------------------------------------------------------------------------------------------------
+# -- steps ------------------------------------------------------------------------------------------------------------
 
 
 def _start(rng: np.random.Generator, scene: Scene, kind: str, min_clearance: float) -> _Walker:
-    """A free spot: around the focus for an orbit, near the eye otherwise."""
+    """Walker at a random free point: around the focus for an orbit, near the eye otherwise."""
     radius, focus = float(scene.orbit_radius), np.asarray(scene.focus, np.float64)
     heading = _unit(rng.standard_normal(3) * [1, 0.15, 1])
     if kind in ("orbit", "gazing"):
@@ -104,14 +107,14 @@ def _start(rng: np.random.Generator, scene: Scene, kind: str, min_clearance: flo
     if kind in ("orbit", "gazing"):
         gaze = to_focus
     else:
-        # More often than not the gaze starts across the middle of the world, where there is something to see.
+        # Most paths start with a view across the middle of the world, where most objects are.
         gaze = _level((to_focus if rng.random() < 0.6 else heading) + rng.normal(0, 0.2, 3))
     heading = gaze if kind == "forward" else heading
     return _Walker(position, heading, gaze, rng.normal(0, 0.06), float(rng.choice([-1.0, 1.0])))
 
 
 def _advance(rng, scene: Scene, walker: _Walker, style, distance: float, min_clearance: float) -> None:
-    """One step and one turn of the wrist."""
+    """Moves the walker by one step and turns its gaze."""
     wish, gaze, share, inertia = style(rng, scene, walker)
     walker.heading = _free_heading(rng, scene, walker, wish, distance * share, min_clearance)
     walker.position = walker.position + distance * share * walker.heading
@@ -120,7 +123,7 @@ def _advance(rng, scene: Scene, walker: _Walker, style, distance: float, min_cle
 
 
 def _free_heading(rng, scene: Scene, walker: _Walker, wish: np.ndarray, distance: float, min_clearance: float):
-    """The direction nearest to `wish` that keeps clear for this step and a few more."""
+    """Direction near `wish` that stays clear of surfaces for this step and the next two."""
     ahead = distance * np.array([1.0, 3.0])
     if clearance(scene, walker.position + ahead[:, None] * wish).min() > min_clearance:
         return wish
@@ -133,13 +136,13 @@ def _free_heading(rng, scene: Scene, walker: _Walker, wish: np.ndarray, distance
 
 
 def _pose(rng: np.random.Generator, walker: _Walker, wobble: float) -> np.ndarray:
-    """The walker's camera, shaken by `wobble` radians."""
+    """Pose of the walker's camera with a random error of `wobble` radians."""
     forward = _unit(walker.gaze + wobble * rng.standard_normal(3))
     return look_along(walker.position, forward, walker.roll)
 
 
 def look_along(position: np.ndarray, forward: np.ndarray, roll: float = 0.0) -> Float[np.ndarray, "4 4"]:
-    """Camera-to-world pose at `position` with +z along unit `forward`, level but for `roll`."""
+    """Returns the camera-to-world pose at `position` with +z along the unit vector `forward`, level up to `roll`."""
     right = _unit(np.cross(forward, UP))
     down = np.cross(forward, right)
     c, s = np.cos(roll), np.sin(roll)
@@ -150,42 +153,44 @@ def look_along(position: np.ndarray, forward: np.ndarray, roll: float = 0.0) -> 
 
 
 def look_at(position: np.ndarray, target: np.ndarray) -> Float[np.ndarray, "4 4"]:
-    """Level camera-to-world pose at `position` that looks at `target`."""
+    """Returns the level camera-to-world pose at `position` that looks at `target`."""
     return look_along(position, _unit(target - position))
 
 
 def _unit(x: np.ndarray) -> np.ndarray:
+    """`x` at unit length."""
     return x / max(float(np.linalg.norm(x)), 1e-9)
 
 
 def _turned(direction: np.ndarray, angle: float) -> np.ndarray:
-    """`direction` turned about the vertical."""
+    """`direction` rotated about the vertical axis."""
     c, s = np.cos(angle), np.sin(angle)
     x, y, z = direction
     return np.array([c * x + s * z, y, -s * x + c * z])
 
 
 def _level(direction: np.ndarray) -> np.ndarray:
+    """Unit vector of `direction` with half its slope."""
     return _unit(direction * [1.0, 0.5, 1.0])
 
 
-# -- styles: (wished heading, wished gaze, share of the step taken, inertia of the gaze) -------------------------------
+# -- styles: (wanted heading, wanted gaze, share of the step taken, inertia of the gaze) -------------------------------
 
 
 def _forward(rng, scene: Scene, walker: _Walker):
-    """Walks where it looks, swaying."""
+    """Moves in the viewing direction and sways."""
     heading = _level(_turned(walker.heading, rng.normal(0, 0.08)) + rng.normal(0, 0.04) * UP)
     return heading, _unit(heading + rng.normal(0, 0.15, 3) * [1, 0.5, 1]), 1.0, 0.8
 
 
 def _sideways(rng, scene: Scene, walker: _Walker):
-    """Walks at right angles to the gaze."""
+    """Moves at right angles to the gaze."""
     heading = _level(_turned(walker.gaze, walker.turn * np.pi / 2) + rng.normal(0, 0.15, 3))
     return heading, _level(_turned(walker.gaze, rng.normal(0, 0.03))), 1.0, 0.7
 
 
 def _orbit(rng, scene: Scene, walker: _Walker):
-    """Circles the focus, rising and sinking, and looks at it."""
+    """Circles the focus at varying height and looks at it."""
     to_focus = np.asarray(scene.focus, np.float64) - walker.position
     tangent = walker.turn * _unit(np.cross(to_focus, UP))
     drift = (np.linalg.norm(to_focus) / float(scene.orbit_radius) - 1) * _unit(to_focus)
@@ -194,14 +199,14 @@ def _orbit(rng, scene: Scene, walker: _Walker):
 
 
 def _pan(rng, scene: Scene, walker: _Walker):
-    """Turns in place, the hand moving on a short arm."""
+    """Turns in place, with small movements."""
     gaze = _turned(walker.gaze, walker.turn * rng.uniform(0.1, 0.35)) + rng.normal(0, 0.05) * UP
     wish = _level(_turned(walker.gaze, walker.turn * np.pi / 2) + rng.normal(0, 0.3, 3))
     return wish, _unit(gaze), 0.8, 0.5
 
 
 def _handheld(rng, scene: Scene, walker: _Walker):
-    """Wanders in three dimensions with a gaze that drifts."""
+    """Wanders in three dimensions with a drifting gaze."""
     heading = _unit(walker.heading + rng.normal(0, 0.4, 3) * [1, 0.6, 1])
     return heading, _unit(walker.gaze + rng.normal(0, 0.12, 3) * [1, 0.5, 1]), 1.0, 0.6
 
@@ -223,4 +228,5 @@ _STYLES = {
     "handheld": _handheld,
 }
 PATH_KINDS = tuple(_STYLES)
+# Probabilities of the kinds, in their order.
 _SHARES = (0.22, 0.2, 0.15, 0.1, 0.1, 0.23)

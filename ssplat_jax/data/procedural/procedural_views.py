@@ -1,4 +1,4 @@
-"""Ready samples: random views for training, smooth captures for the demo. Host functions over the jitted ray-caster."""
+"""Rendered procedural views: random samples for training and smooth captures for the demo."""
 
 import numpy as np
 from jaxtyping import Float
@@ -13,14 +13,14 @@ Views = tuple[
     Float[np.ndarray, "v h w 3"], Float[np.ndarray, "v h w"], Float[np.ndarray, "v 4 4"], Float[np.ndarray, "v 3 3"]
 ]
 
-MIN_DEPTH, MAX_DEPTH = 0.3, 15.0
-MEDIANS = (1.2, 3.5)  # median depth of a training sample
-STEPS = (0.005, 0.4)  # typical step over the median depth, log-uniform: from every frame of a video to a set of photos
-BASELINES = (0.004, 0.45)  # median step of a training sample over its median depth
-MIN_DEPTH_RATIO = 1.4  # between the 95th and the 5th percentile of depth: a sample is not one bare wall
-_FIRST_STEPS = 4
-_PROBE = 8  # the low-resolution depth that scales a sample is this many times coarser
-_PATHS = {  # paths that suit a kind of world: around its pile of objects, along its corridor, anywhere in a room
+MIN_DEPTH, MAX_DEPTH = 0.3, 15.0  # of a training sample, in its units
+MEDIANS = (1.2, 3.5)  # range of the median depth of a training sample
+STEP_RANGE = (0.005, 0.4)  # typical step over median depth: from consecutive video frames to a set of photos
+BASELINES = (0.004, 0.45)  # range of the median step over the median depth of a training sample
+MIN_DEPTH_RATIO = 1.4  # 95th over 5th percentile of depth; samples with less show little but a wall
+_FIRST_STEPS = 4  # views that measure the depth before the path is generated
+_PROBE = 8  # the depth that determines the scale of a sample has this many times fewer rows and columns
+_PATHS = {  # suitable paths by kind of world; repeated ones are more likely
     "room": ("handheld", "handheld", "sideways", "forward", "pan", "orbit"),
     "corridor": ("forward", "forward", "handheld", "sideways"),
     "street": ("forward", "handheld", "sideways", "pan"),
@@ -30,15 +30,24 @@ _PATHS = {  # paths that suit a kind of world: around its pile of objects, along
 
 
 def training_sample(
-    seed: int, num_views: int, height: int, width: int, supersample: int = 1, *, steps: tuple[float, float] = STEPS
+    seed: int, num_views: int, height: int, width: int, supersample: int = 1, *, steps: tuple[float, float] = STEP_RANGE
 ) -> Views:
-    """Images, z-depths, camera-to-world poses and intrinsics of a random path through a random world.
+    """Returns rendered views of a random path through a random world.
 
-    Views are in the order of time; consecutive centers lie `steps` median depths apart (a range, log-uniform; by
-    default hand-held video as much as a set of photos), single steps up to three times as far. Units are such that the
-    median depth is between 1.2 and 3.5, no surface is nearer than about 0.3 and none farther than 15. The same
-    arguments give the same sample. One color ray per pixel costs a third of the default of captures: training is fed
-    on the same two cores that it runs on.
+    The units of a sample are such that the median depth is between 1.2 and 3.5 and all surfaces are between about 0.3
+    and 15 away.
+
+    Args:
+        seed: the same arguments give the same sample.
+        num_views: number of views, in the order of time.
+        height: image rows.
+        width: image columns.
+        supersample: color rays per pixel. One ray costs a third of captures' two; training runs on the same cores.
+        steps: range of the typical distance between consecutive views over the median depth, log-uniform. Single steps
+            are up to three times as long.
+
+    Returns:
+        Images in [0, 1], z-depths, camera-to-world poses and intrinsics in pixels.
     """
     rng = np.random.default_rng([3, seed])
     found = None
@@ -52,11 +61,11 @@ def training_sample(
 
 
 def _scaled_path(rng, scene: Scene, kinds: tuple[str, ...], num_views: int, height: int, width: int, steps):
-    """Scene, poses and intrinsics in sample units; None if the path comes too close to something."""
+    """Scene, poses and intrinsics in the units of the sample; None if the path is unsuitable."""
     kind = kinds[rng.integers(len(kinds))]
     seed = int(rng.integers(2**31))
     step = np.exp(rng.uniform(*np.log(steps)))
-    # A few first steps measure the depth that the steps of the whole walk are fractions of.
+    # A few views measure the median depth, which determines the steps of the whole path.
     poses, Ks = sample_path(seed, scene, kind, _FIRST_STEPS, height, width, step=step * float(scene.orbit_radius) * 1.5)
     median = float(np.median(_probe(scene, poses, Ks, height, width)))
     poses, Ks = sample_path(seed, scene, kind, num_views, height, width, step=step * median)
@@ -76,24 +85,25 @@ def _scaled_path(rng, scene: Scene, kinds: tuple[str, ...], num_views: int, heig
 
 
 def _probe(scene: Scene, poses: np.ndarray, Ks: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Coarse depths of all views."""
+    """Low-resolution depths of all views."""
     rows, cols = max(height // _PROBE, 12), max(width // _PROBE, 12)
     coarse = Ks * np.array([cols / width, rows / height, 1], np.float32)[:, None]
     return np.asarray(raycast_depths(scene, _inverted(poses), coarse, rows, cols))
 
 
 def _cast(scene: Scene, poses: np.ndarray, Ks: np.ndarray, height: int, width: int, supersample: int = 2):
+    """Images and depths of all views, as NumPy arrays."""
     images, depths = raycast(scene, _inverted(poses), Ks, height, width, supersample)
     return np.asarray(images), np.asarray(depths)
 
 
 def _inverted(poses: np.ndarray) -> np.ndarray:
-    """World-to-camera of camera-to-world, in float64 inside."""
+    """World-to-camera matrices of camera-to-world poses, inverted in float64."""
     return np.linalg.inv(poses.astype(np.float64)).astype(np.float32)
 
 
 def _through_sensor(rng: np.random.Generator, scene: Scene, images: np.ndarray) -> np.ndarray:
-    """Exposes very dark or bright samples as a camera would; a gain per view and noise as the scene asks for."""
+    """Applies an automatic exposure, and the gains per view and the noise of the scene's sensor."""
     mean = float(images.mean())
     gains = np.clip(mean, 0.3, 0.6) / mean * np.exp(float(scene.exposure_jitter) * rng.standard_normal(len(images)))
     images = images * gains.astype(np.float32)[:, None, None, None]
@@ -106,17 +116,20 @@ def _through_sensor(rng: np.random.Generator, scene: Scene, images: np.ndarray) 
 
 
 def procedural_capture_arrays(name: str, num_frames: int, height: int, width: int, seed: int = 0) -> Views:
-    """The capture `procedural:NAME`: smooth paths that cover their world evenly, in meters.
+    """Returns the views of the capture `procedural:NAME`, a smooth path that covers its world evenly, in meters.
 
     Args:
         name: one of `CAPTURES`.
-        num_frames: views, spread evenly over the whole path.
+        num_frames: number of views, evenly spread over the path.
         height: image rows.
         width: image columns.
-        seed: another world of the same kind.
+        seed: selects another world of the same kind.
+
+    Returns:
+        Images in [0, 1], z-depths, camera-to-world poses and intrinsics in pixels.
 
     Raises:
-        InputError: no such capture, or no frames.
+        InputError: an unknown capture, or no frames.
     """
     if name not in CAPTURES:
         raise InputError(f"procedural:{name}: no such capture; there is {', '.join(CAPTURES)}.")
@@ -137,14 +150,14 @@ def procedural_capture_arrays(name: str, num_frames: int, height: int, width: in
 
 
 def _around_room(scene: Scene, s: float) -> np.ndarray:
-    """Once around a room's middle, looking across it; `s` in [0, 1]."""
+    """Pose at `s` in [0, 1] on a circle around the middle of a room, looking across it."""
     angle = 2 * np.pi * s
     position = np.array([0.5 * np.sin(angle), -1.4 + 0.15 * np.sin(3 * angle), 0.5 * np.cos(angle)])
     return look_at(position, np.array([-np.sin(angle), -1.15, -np.cos(angle)]))
 
 
 def _around_object(scene: Scene, s: float) -> np.ndarray:
-    """Once around the pile of objects, rising and sinking."""
+    """Pose at `s` in [0, 1] on a circle of varying height around the pile of objects."""
     angle, focus, radius = 2 * np.pi * s, np.asarray(scene.focus, np.float64), 1.15 * float(scene.orbit_radius)
     elevation = 0.45 + 0.2 * np.sin(2 * angle)
     around = [np.cos(elevation) * np.sin(angle), -np.sin(elevation), np.cos(elevation) * np.cos(angle)]
@@ -152,13 +165,13 @@ def _around_object(scene: Scene, s: float) -> np.ndarray:
 
 
 def _along_corridor(scene: Scene, s: float) -> np.ndarray:
-    """From one end of a corridor towards the other, looking left and right."""
+    """Pose at `s` in [0, 1] on the way along a corridor, looking left and right."""
     half_z = float(scene.halves[NUM_SOLIDS, 2])
     position = np.array([0.12 * np.sin(9 * s), -1.45 + 0.05 * np.sin(14 * s), half_z * (-0.85 + 1.3 * s)])
     return look_at(position, position + np.array([0.45 * np.sin(11 * s), 0.12, 1.0]))
 
 
-_ROUTES = {  # kind of world, path through it, and the seed of one that shows much, which seed 0 stands for
+_ROUTES = {  # kind of world, path through it, and the seed of a representative world, which is added to the user's
     "room": ("room", _around_room, 13),
     "orbit": ("objects", _around_object, 3),
     "corridor": ("corridor", _along_corridor, 8),

@@ -1,9 +1,10 @@
-"""The ray-caster: exact depth and antialiased color of a `Scene`, one compilation for every scene.
+"""Ray caster: exact depth and antialiased color of a `Scene`, compiled once for all scenes.
 
-Rays carry a direction whose camera z is 1, so the parameter of a hit is its z-depth. Each solid is a unit shape (cube,
-ball, cylinder along y) in its own frame, entered where all of its slabs have been entered; the shell closes the world
-and is left, not entered. Depth is that of the pixel's center; color is the mean of `supersample` rays per pixel, each
-with a trilinear texture lookup at the ray's own footprint. Unused rows cost nothing: loops run to the scene's counts.
+The direction of a ray has camera z = 1, so the parameter of a hit is its z-depth. Each solid is a unit shape (cube,
+ball, cylinder along y) in its own frame, and is hit where the ray has entered all of its slabs; the shell around the
+world is hit where the ray leaves it. Depth is that of the pixel center. Color is the mean of `supersample` rays per
+pixel, each with a trilinear texture lookup at the footprint of the ray. Loops end at the scene's counts, so unused rows
+cost nothing.
 """
 
 import functools
@@ -16,8 +17,8 @@ from jaxtyping import Array, Float, Int
 from ssplat_jax.data.procedural.scene import NUM_BALLS, NUM_BOXES, NUM_SOLIDS, AnyArray, Scene
 from ssplat_jax.data.procedural.textures import LEVEL_OFFSETS, NUM_LEVELS, NUM_TEXELS, SIZE
 
-_TINY = 1e-9
-_FAR = 1e9
+_TINY = 1e-9  # smallest denominator, and smallest depth of a hit
+_FAR = 1e9  # depth of rays that miss
 
 Rays = tuple[Float[Array, "s h w"], Float[Array, "s h w"], Float[Array, "s h w"]]
 
@@ -31,11 +32,22 @@ def raycast(
     width: int,
     supersample: int = 2,
 ) -> tuple[Float[Array, "v h w 3"], Float[Array, "v h w"]]:
-    """Images in [0, 1] and z-depths of the scene in every view, `supersample` color rays a pixel.
+    """Renders images and depths of a scene.
+
+    Args:
+        scene: the world.
+        viewmats: world-to-camera matrices.
+        Ks: intrinsics in pixels.
+        height: image rows.
+        width: image columns.
+        supersample: color rays per pixel.
+
+    Returns:
+        Images in [0, 1] and z-depths in units of the scene.
 
     Limits:
-        A camera outside the shell or inside a solid sees what lies beyond, not an error: keep `clearance` positive.
-        float32: relative error of a depth below 2e-5, silhouettes apart, in scenes a few units across.
+        Cameras outside the shell or inside a solid look through it; keep `clearance` positive.
+        The relative error of a depth is below 2e-5 (float32), except at silhouettes, in scenes a few units in size.
     """
 
     def render_view(camera):
@@ -55,7 +67,18 @@ def raycast(
 def raycast_depths(
     scene: Scene, viewmats: Float[AnyArray, "v 4 4"], Ks: Float[AnyArray, "v 3 3"], height: int, width: int
 ) -> Float[Array, "v h w"]:
-    """Z-depths alone, as `raycast` gives them."""
+    """Renders the depths of a scene without its colors.
+
+    Args:
+        scene: the world.
+        viewmats: world-to-camera matrices.
+        Ks: intrinsics in pixels.
+        height: image rows.
+        width: image columns.
+
+    Returns:
+        Z-depths in units of the scene, equal to those of `raycast`.
+    """
 
     def render_view(camera):
         viewmat, K = camera
@@ -73,7 +96,7 @@ def _camera_frame(viewmat: Array) -> tuple[Array, Array]:
 
 
 def _pixel_offsets(count: int) -> np.ndarray:
-    """The pixel's center; where `count` > 1, then that many points of a rank-1 lattice inside the pixel."""
+    """Offsets of rays in a pixel: its center, and for `count` > 1 also that many points of a rank-1 lattice."""
     center = np.full((1, 2), 0.5, np.float32)
     if count <= 1:
         return center
@@ -84,7 +107,7 @@ def _pixel_offsets(count: int) -> np.ndarray:
 
 
 def _ray_directions(rotation: Array, K: Array, height: int, width: int, offsets: np.ndarray) -> Rays:
-    """World directions with unit camera z through every pixel at every offset."""
+    """World directions of the rays through all pixels at all offsets, with camera z = 1."""
     x = (jnp.arange(width, dtype=jnp.float32) + offsets[:, :1] - K[0, 2]) / K[0, 0]
     y = (jnp.arange(height, dtype=jnp.float32) + offsets[:, 1:] - K[1, 2]) / K[1, 1]
     x, y = x[:, None, :], y[:, :, None]
@@ -96,7 +119,7 @@ def _ray_directions(rotation: Array, K: Array, height: int, width: int, offsets:
 
 
 def _to_unit(frame: AnyArray, origin: Array, rays: Rays):
-    """A ray in a solid's unit frame: three scalars and three images."""
+    """Rays in the unit frame of a solid: origin (three scalars) and directions (three images)."""
     start = [
         frame[i, 0] * origin[0] + frame[i, 1] * origin[1] + frame[i, 2] * origin[2] + frame[i, 3] for i in range(3)
     ]
@@ -105,17 +128,17 @@ def _to_unit(frame: AnyArray, origin: Array, rays: Rays):
 
 
 def _slab(start: Array, step: Array) -> tuple[Array, Array]:
-    """Where a ray enters and leaves the slab |x| <= 1."""
+    """Depths at which a ray enters and leaves the slab |x| <= 1."""
     inverse = 1.0 / jnp.where(jnp.abs(step) < _TINY, _TINY, step)
     a, b = (-1.0 - start) * inverse, (1.0 - start) * inverse
     return jnp.minimum(a, b), jnp.maximum(a, b)
 
 
 def _quadric(start: list[Array], steps: list[Array]) -> tuple[Array, Array]:
-    """Where a ray enters and leaves the unit ball of as many axes as it is given (two: an endless cylinder)."""
+    """Depths at which a ray enters and leaves the unit ball of the given axes (two: an infinite cylinder)."""
     a = jnp.maximum(sum(d * d for d in steps), _TINY)
     b = sum(o * d for o, d in zip(start, steps, strict=True))
-    # The squared distance of closest approach, without the cancellation of b^2 - a c.
+    # Squared distance of closest approach; it avoids the cancellation in b^2 - a c.
     miss = sum((o - b / a * d) ** 2 for o, d in zip(start, steps, strict=True))
     root = jnp.sqrt(jnp.maximum(1.0 - miss, 0.0) / a)
     enter, leave = -b / a - root, -b / a + root
@@ -123,22 +146,25 @@ def _quadric(start: list[Array], steps: list[Array]) -> tuple[Array, Array]:
 
 
 def _box_interval(start, steps):
+    """Depths at which a ray enters and leaves the unit cube."""
     slabs = [_slab(o, d) for o, d in zip(start, steps, strict=True)]
     return functools.reduce(jnp.maximum, [s[0] for s in slabs]), functools.reduce(jnp.minimum, [s[1] for s in slabs])
 
 
 def _ball_interval(start, steps):
+    """Depths at which a ray enters and leaves the unit ball."""
     return _quadric(start, steps)
 
 
 def _cylinder_interval(start, steps):
+    """Depths at which a ray enters and leaves the unit cylinder along y."""
     enter, leave = _quadric([start[0], start[2]], [steps[0], steps[2]])
     cap_enter, cap_leave = _slab(start[1], steps[1])
     return jnp.maximum(enter, cap_enter), jnp.minimum(leave, cap_leave)
 
 
 def _nearest_hits(scene: Scene, origin: Array, rays: Rays) -> tuple[Float[Array, "s h w"], Int[Array, "s h w"]]:
-    """Z-depth and index of what each ray meets first; the shell's box and dome come after the solids."""
+    """Z-depth and row index of the first surface along each ray; the box and dome of the shell follow the solids."""
     _, box_exit = _box_interval(*_to_unit(scene.frames[NUM_SOLIDS], origin, rays))
     _, dome_exit = _ball_interval(*_to_unit(scene.frames[NUM_SOLIDS + 1], origin, rays))
     t = jnp.minimum(box_exit, dome_exit)
@@ -156,7 +182,7 @@ def _nearest_hits(scene: Scene, origin: Array, rays: Rays) -> tuple[Float[Array,
 
 
 def _ranges(scene: Scene) -> list[tuple[int, Array]]:
-    """First and one past the last used row of boxes, balls and cylinders."""
+    """Ranges of the used rows of boxes, balls and cylinders."""
     return [(first, first + scene.counts[i]) for i, first in enumerate((0, NUM_BOXES, NUM_BOXES + NUM_BALLS))]
 
 
@@ -166,7 +192,7 @@ def _ranges(scene: Scene) -> list[tuple[int, Array]]:
 def _shade(
     scene: Scene, origin: Array, rays: Rays, t: Array, solid_idx: Array, pixel: Array
 ) -> Float[Array, "s h w 3"]:
-    """Color of each hit; `pixel` is a ray's footprint at unit depth."""
+    """Color of each hit; `pixel` is the footprint of a ray at unit depth."""
     points = [o + t * d for o, d in zip(origin, rays, strict=True)]
     frame = jnp.moveaxis(scene.frames.reshape(-1, 12)[solid_idx], -1, 0)
     local = [frame[4 * i] * points[0] + frame[4 * i + 1] * points[1] + frame[4 * i + 2] * points[2] + frame[4 * i + 3]
@@ -183,7 +209,7 @@ def _shade(
     face = jnp.moveaxis(scene.faces.reshape(-1, scene.faces.shape[-1])[solid_idx * 6 + face_idx], -1, 0)
     u = face[0] * local[0] + face[1] * local[1] + face[2] * local[2] + face[3]
     v = face[4] * local[0] + face[5] * local[1] + face[6] * local[2] + face[7]
-    # Nearer to the long than to the short side of the footprint: a little blur at grazing angles, hardly any moire.
+    # Nearer to the long side of the footprint than to the short one: some blur at grazing angles, but little moire.
     texels = t * pixel * face[8] * SIZE * jnp.maximum(facing, 0.08) ** -0.6
     texture_idx = scene.face_textures.reshape(-1)[solid_idx * 6 + face_idx]
     albedo = _sample_textures(scene.pyramids, texture_idx, u, v, jnp.log2(jnp.maximum(texels, 1.0)))
@@ -194,7 +220,7 @@ def _shade(
 
 
 def _faces(local: list[Array], solid_idx: Array):
-    """Face (0..5: -x +x -y +y -z +z) by the dominant axis, and the outward normal in the unit frame."""
+    """Index of the face (0..5: -x +x -y +y -z +z), by the dominant axis, and outward normal in the unit frame."""
     is_cylinder = (solid_idx >= NUM_BOXES + NUM_BALLS) & (solid_idx < NUM_SOLIDS)
     is_round = ((solid_idx >= NUM_BOXES) & (solid_idx < NUM_SOLIDS)) | (solid_idx == NUM_SOLIDS + 1)
     ax, ay, az = (jnp.abs(p) for p in local)
@@ -212,7 +238,7 @@ def _faces(local: list[Array], solid_idx: Array):
 
 
 def _occlusion(scene: Scene, points: list[Array], solid_idx: Array) -> Float[Array, "s h w"]:
-    """Soft darkening where another solid, or the shell's corners, are near."""
+    """Soft darkening near other solids and in the corners of the shell."""
     reach = scene.occlusion_reach
 
     def darken(i, light):
@@ -230,7 +256,7 @@ def _occlusion(scene: Scene, points: list[Array], solid_idx: Array) -> Float[Arr
     is_shell = solid_idx == NUM_SOLIDS
     for gap in gaps:
         near = jnp.maximum(1.0 - jnp.maximum(gap, 0.0) / reach, 0.0)
-        # The wall itself is one of the three: it darkens by the same factor everywhere, which is taken out again.
+        # One of the three gaps is that to the wall itself; its constant factor is divided out below.
         light = light * (1.0 - scene.occlusion * 0.6 * near * near)
     return jnp.where(is_shell, light / (1.0 - scene.occlusion * 0.6), light)
 
@@ -239,7 +265,7 @@ def _occlusion(scene: Scene, points: list[Array], solid_idx: Array) -> Float[Arr
 
 
 def _sample_textures(pyramids: AnyArray, texture_idx: Array, u: Array, v: Array, level: Array) -> list[Array]:
-    """Trilinear, mirrored lookup at (u, v) in tiles; `level` is the fractional mip level."""
+    """Trilinear, mirrored texture lookup at (u, v) in tiles; `level` is the fractional mip level."""
     low = jnp.clip(jnp.floor(level), 0.0, NUM_LEVELS - 2.0)
     blend = jnp.clip(level - low, 0.0, 1.0)
     low_idx = low.astype(jnp.int32)
@@ -249,7 +275,7 @@ def _sample_textures(pyramids: AnyArray, texture_idx: Array, u: Array, v: Array,
 
 
 def _sample_level(pyramids: AnyArray, texture_idx: Array, u: Array, v: Array, level: Array) -> list[Array]:
-    """Bilinear, mirrored lookup in one level of the pyramid."""
+    """Bilinear, mirrored texture lookup in one mip level."""
     size = jnp.right_shift(jnp.int32(SIZE), level)
     base = texture_idx * NUM_TEXELS + jnp.asarray(LEVEL_OFFSETS, jnp.int32)[level]
     x0, x1, fx = _mirrored(u, size)
@@ -263,7 +289,7 @@ def _sample_level(pyramids: AnyArray, texture_idx: Array, u: Array, v: Array, le
 
 
 def _mirrored(u: Array, size: Array) -> tuple[Array, Array, Array]:
-    """The two texels around tile coordinate `u`, mirrored at every tile border, and the fraction between them."""
+    """Indices of the two texels around coordinate `u`, mirrored at tile borders, and the fraction between them."""
     folded = 1.0 - jnp.abs(u - 2.0 * jnp.floor(u / 2.0) - 1.0)
     x = folded * size.astype(jnp.float32) - 0.5
     floor = jnp.floor(x)
@@ -272,6 +298,6 @@ def _mirrored(u: Array, size: Array) -> tuple[Array, Array, Array]:
 
 
 def _unpack(texel: Array) -> list[Array]:
-    """Red, green, blue in [0, 1] of a packed texel."""
+    """Red, green and blue in [0, 1] of packed texels."""
     channels = [jnp.bitwise_and(jnp.right_shift(texel, jnp.uint32(s)), jnp.uint32(255)) for s in (0, 8, 16)]
     return [c.astype(jnp.int32).astype(jnp.float32) * (1.0 / 255.0) for c in channels]

@@ -1,9 +1,9 @@
-"""What a procedural world is: a fixed number of solids inside a closed shell, and the distance to them.
+"""`Scene`: a procedural world of a fixed number of solids inside a closed shell, and the distance to its surfaces.
 
-The world has OpenCV's handedness with +y down; the floor is the plane y = 0 and eyes are at negative y. Solids are unit
-shapes (the cube |x|,|y|,|z| <= 1, the unit ball, the cylinder of radius 1 along y) moved by a frame, in that order in
-the arrays; rows that a scene does not need lie far outside its shell. Two rows follow the solids: the shell's box and
-its dome. The world is their intersection seen from inside, so every ray ends.
+The world has OpenCV's handedness with +y down; the floor is the plane y = 0, and cameras have negative y. Solids are
+transformed unit shapes: cubes |x|,|y|,|z| <= 1, balls, and cylinders of radius 1 along y, in that order; unused rows
+lie far outside the shell. Two rows follow the solids, the box and the dome of the shell. The world is the inside of
+their intersection, so every ray ends.
 """
 
 import numpy as np
@@ -11,16 +11,16 @@ from jaxtyping import Array, Float, Int, UInt32
 
 from ssplat_jax.pytree import pytree, replace
 
-NUM_BOXES, NUM_BALLS, NUM_CYLINDERS = 32, 6, 10
+NUM_BOXES, NUM_BALLS, NUM_CYLINDERS = 32, 6, 10  # rows of each shape
 NUM_SOLIDS = NUM_BOXES + NUM_BALLS + NUM_CYLINDERS
-AWAY = 1e5  # where absent solids lie, in scene units
+AWAY = 1e5  # position of unused solids, in scene units
 
 AnyArray = np.ndarray | Array
 
 
 @pytree
 class Scene:
-    """A procedural world of fixed array shapes. `s` rows: `NUM_SOLIDS` solids, the shell's box, its dome."""
+    """Procedural world with fixed array shapes; the `s` rows are `NUM_SOLIDS` solids, and the shell's box and dome."""
 
     # -- geometry
     frames: Float[AnyArray, "s 3 4"]  # world -> unit frame of the solid
@@ -32,20 +32,20 @@ class Scene:
     pyramids: UInt32[AnyArray, "num_textures texels"]  # `textures.TextureLibrary.pyramids`
     # -- light
     light: Float[AnyArray, "3"]  # unit vector towards the light
-    ambient: Float[AnyArray, ""]  # share of light that has no direction
-    occlusion: Float[AnyArray, ""]  # darkening at contact, [0, 1)
-    occlusion_reach: Float[AnyArray, ""]  # length over which it fades
-    # -- the sensor that looks at it; used by `training_sample`, never by `raycast`
+    ambient: Float[AnyArray, ""]  # share of light without direction
+    occlusion: Float[AnyArray, ""]  # darkening at contact, in [0, 1)
+    occlusion_reach: Float[AnyArray, ""]  # length over which the darkening fades
+    # -- sensor; `training_sample` uses it, `raycast` does not
     exposure_jitter: Float[AnyArray, ""]  # standard deviation of a view's log gain
     sensor_noise: Float[AnyArray, ""]  # standard deviation of a pixel's noise
-    # -- where cameras do well
-    focus: Float[AnyArray, "3"]  # what an orbit looks at
-    orbit_radius: Float[AnyArray, ""]  # distance of an orbit from `focus`
-    eye: Float[AnyArray, "3"]  # a free spot to start a walk from
+    # -- places for cameras
+    focus: Float[AnyArray, "3"]  # point that orbits look at
+    orbit_radius: Float[AnyArray, ""]  # distance of orbits from `focus`
+    eye: Float[AnyArray, "3"]  # free point at which walks start
 
 
 def scale_scene(scene: Scene, factor: float) -> Scene:
-    """The same world with all lengths multiplied by `factor`; it looks the same from scaled cameras."""
+    """Returns the scene with all lengths multiplied by `factor`; it looks the same from scaled cameras."""
     f = np.float32(factor)
     frames = np.concatenate([scene.frames[..., :3] / f, scene.frames[..., 3:]], axis=-1)
     faces = np.array(scene.faces)
@@ -63,10 +63,10 @@ def scale_scene(scene: Scene, factor: float) -> Scene:
 
 
 def clearance(scene: Scene, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-    """Distance from each point to the nearest surface, negative inside a solid or outside the shell.
+    """Returns the distance from points to the nearest surface, negative inside a solid or outside the shell.
 
     Limits:
-        Exact outside boxes, round balls and round cylinders; never more than the distance for stretched balls.
+        Exact outside boxes, round balls and round cylinders; a lower bound for stretched balls.
     """
     frames, halves = np.asarray(scene.frames, np.float64), np.asarray(scene.halves, np.float64)
     local = np.einsum("sij,nj->nsi", frames[..., :3], points) + frames[..., 3]
@@ -75,6 +75,7 @@ def clearance(scene: Scene, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarra
     box_half, ball_half, cylinder_half = np.split(halves[:NUM_SOLIDS], np.cumsum([NUM_BOXES, NUM_BALLS]))
 
     def outside(gaps):
+        """Distance to a box of which `gaps` are the signed distances along its axes."""
         return np.linalg.norm(np.maximum(gaps, 0), axis=-1) + np.minimum(gaps.max(axis=-1), 0)
 
     box = outside((np.abs(boxes) - 1) * box_half)

@@ -1,30 +1,31 @@
-"""The kinds of world: rooms, corridors, streets, piles of objects, clutter. Lengths are meters until a sample rescales.
+"""Random worlds: rooms, corridors, streets, piles of objects and clutter, in meters.
 
-Each kind is a recipe `SceneBuilder -> Scene` in a registry; furniture is drawn from a second one.
+Each kind is a function `SceneBuilder -> Scene` in a registry; furniture has a registry of its own.
 """
 
 from collections.abc import Callable
 
 import numpy as np
 
-from ssplat_jax.data.procedural.builder import Finish, SceneBuilder, random_rotation
+from ssplat_jax.data.procedural.builder import Finish, SceneBuilder, random_rotation, yaw_rotation
 from ssplat_jax.data.procedural.scene import Scene
 from ssplat_jax.data.procedural.textures import TextureLibrary, texture_library
 from ssplat_jax.errors import InputError
 
+# Texture groups for objects of any kind.
 _EVERYTHING = ("photo", "floor", "pattern", "noise", "facade", "leaves", "photo")
 
 
 def sample_scene(seed: int, kind: str | None = None, textures: TextureLibrary | None = None) -> Scene:
-    """A random world, the same for the same seed and scikit-image release.
+    """Returns a random world, which depends on the arguments and the release of scikit-image.
 
     Args:
         seed: any non-negative integer.
         kind: one of `SCENE_KINDS`; None draws one.
-        textures: the tiles to choose from, by default `texture_library()`.
+        textures: by default `texture_library()`.
 
     Raises:
-        InputError: no such kind.
+        InputError: an unknown kind.
     """
     if kind is not None and kind not in _RECIPES:
         raise InputError(f"procedural scene: kind must be one of {', '.join(SCENE_KINDS)}, got {kind!r}.")
@@ -33,7 +34,7 @@ def sample_scene(seed: int, kind: str | None = None, textures: TextureLibrary | 
     return _RECIPES[kind or drawn](SceneBuilder(rng, textures or texture_library()))
 
 
-# -- furniture: each stands on the floor at (x, z), within about `size` of it ------------------------------------------
+# -- furniture: each piece stands on the floor at (x, z), within about `size` of it ------------------------------------
 
 
 def _cabinet(b: SceneBuilder, x: float, z: float, yaw: float, size: float) -> None:
@@ -59,7 +60,7 @@ def _table(b: SceneBuilder, x: float, z: float, yaw: float, size: float) -> None
 
 
 def _shelf(b: SceneBuilder, x: float, z: float, yaw: float, size: float) -> None:
-    """Boards between two sides, or one block of books."""
+    """Boards between two sides, or a block of books."""
     half = np.array([size * 0.7, b.rng.uniform(0.5, 1.0), 0.18])
     if b.rng.random() < 0.5:
         b.box([x, -half[1], z], half, b.finish("facade", "leaves", tile=0.0), yaw)
@@ -104,7 +105,7 @@ def _barrel(b: SceneBuilder, x: float, z: float, yaw: float, size: float) -> Non
 
 
 def _trinket(b: SceneBuilder, x: float, y: float, z: float, size: float) -> None:
-    """Something small that stands at height `y`."""
+    """Small object that stands at height `y`."""
     half = b.rng.uniform(0.3, 0.8, 3) * size
     finish = b.finish(*_EVERYTHING, tile=b.rng.choice([0.0, 0.3, 0.5]))
     shape = b.rng.choice(["box", "box", "ball", "cylinder"])
@@ -115,9 +116,8 @@ def _trinket(b: SceneBuilder, x: float, y: float, z: float, size: float) -> None
 
 
 def _yawed(b: SceneBuilder) -> np.ndarray:
-    angle = b.rng.uniform(0, 2 * np.pi)
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+    """Random rotation about the vertical axis."""
+    return yaw_rotation(b.rng.uniform(0, 2 * np.pi))
 
 
 _FURNITURE: tuple[Callable[[SceneBuilder, float, float, float, float], None], ...] = (
@@ -126,7 +126,7 @@ _FURNITURE: tuple[Callable[[SceneBuilder, float, float, float, float], None], ..
 
 
 def _furnish(b: SceneBuilder, half_x: float, half_z: float, count: int, middle: float) -> None:
-    """Furniture along the walls of a room around the origin, or anywhere outside a free circle of radius `middle`."""
+    """Furniture along the walls of a room around the origin, outside a free circle of radius `middle`."""
     taken: list[tuple[float, float, float]] = []
     for _ in range(count * 8):
         size = b.rng.uniform(0.35, 0.9)
@@ -160,7 +160,7 @@ def _posters(b: SceneBuilder, half_x: float, half_z: float, count: int) -> None:
 
 
 def _wall_finish(b: SceneBuilder) -> Finish:
-    """Mostly quiet walls, some wallpaper or brick."""
+    """Finish of a wall: mostly plain, sometimes wallpaper or brick."""
     if b.rng.random() < 0.55:
         return b.finish("wall", tile=b.rng.uniform(1.5, 4.0), same=b.rng.random() < 0.5)
     return b.finish("pattern", "noise", "floor", "photo", tile=b.rng.uniform(0.8, 3.0), same=b.rng.random() < 0.6)
@@ -185,7 +185,7 @@ def _room(b: SceneBuilder) -> Scene:
 
 
 def _partition(b: SceneBuilder, half_x: float, z: float, height: float) -> None:
-    """A wall across the room at `z`, with a door opening."""
+    """Wall across the room at `z`, with an opening for a door."""
     finish = _wall_finish(b)
     door, wide, tall = b.rng.uniform(-0.5, 0.5) * half_x, b.rng.uniform(0.4, 0.7), min(2.0, height - 0.2)
     for low, high in ((-half_x, door - wide), (door + wide, half_x)):
@@ -220,7 +220,7 @@ def _corridor(b: SceneBuilder) -> Scene:
 
 
 def _outdoors(b: SceneBuilder, radius: float, ground: Finish) -> None:
-    """A ground plane under a sky."""
+    """Ground plane and sky."""
     sky = b.finish("sky", tile=radius * b.rng.uniform(1.0, 2.0), tint=0.1, glow=1.0, is_centered=True)
     b.dome(radius, sky)
     b.shell([0, -2 * radius, 0], [2 * radius, 2 * radius, 2 * radius], sky, ground, sky)
@@ -247,7 +247,7 @@ def _street(b: SceneBuilder) -> Scene:
 
 
 def _roadside(b: SceneBuilder, x: float, z: float) -> None:
-    """A tree, a pole, a parked car, or a box."""
+    """Tree, pole, parked car, or stack of boxes."""
     style = b.rng.integers(4)
     if style == 0:
         tall = b.rng.uniform(1.5, 2.5)
@@ -266,7 +266,7 @@ def _roadside(b: SceneBuilder, x: float, z: float) -> None:
 
 
 def _objects(b: SceneBuilder) -> Scene:
-    """A pile of things on the ground or a table, seen from around it; outdoors or in a room."""
+    """Pile of objects on the ground or on a table, outdoors or in a room, with cameras around it."""
     radius = b.rng.uniform(5.0, 8.0)
     ground = b.finish("floor", "noise", "pattern", "photo", tile=b.rng.uniform(0.8, 2.5))
     if b.rng.random() < 0.5:
@@ -297,7 +297,7 @@ def _objects(b: SceneBuilder) -> Scene:
 
 
 def _clutter(b: SceneBuilder) -> Scene:
-    """Solids of every size and turn, floating around a free middle: no habit of real scenes to rely on."""
+    """Floating solids of all sizes and orientations around a free middle, without the regularities of real scenes."""
     half = b.rng.uniform(2.0, 4.0, 3)
     b.shell([0, 0, 0], half, b.finish(*_EVERYTHING, "wall", tile=b.rng.uniform(0.8, 3.0), same=False),
             b.finish(*_EVERYTHING, tile=1.5), b.finish(*_EVERYTHING, "wall", tile=1.5))  # fmt: skip
@@ -323,4 +323,4 @@ _RECIPES: dict[str, Callable[[SceneBuilder], Scene]] = {
     "clutter": _clutter,
 }
 SCENE_KINDS = tuple(_RECIPES)
-SCENE_SHARES = (0.32, 0.12, 0.12, 0.26, 0.18)
+SCENE_SHARES = (0.32, 0.12, 0.12, 0.26, 0.18)  # probabilities of the kinds, in their order

@@ -1,9 +1,9 @@
-"""The texture library: a few hundred 256 x 256 tiles, built once per process from a fixed seed.
+"""Texture library: a few hundred 256 x 256 tiles, built once per process from a fixed seed.
 
-Photographs are cropped from those that scikit-image carries inside its wheel (read from its folder, never fetched); a
-release that carries fewer gives fewer photographs and more noise. Everything else is drawn here. A tile repeats
-mirrored, so it need not be periodic. Tiles are kept as mip pyramids with a packed `uint32` (0x00BBGGRR) per texel: the
-ray-caster is bound by gathers, and a packed texel is one element instead of three.
+Photographs are crops of those in the wheel of scikit-image (read from its folder, never downloaded); a release with
+fewer of them gives more noise textures instead. All other textures are synthetic. Tiles are repeated with mirroring, so
+they need not be periodic. They are stored as mip pyramids with one packed `uint32` (0x00BBGGRR) per texel, because the
+ray caster is bound by gathers.
 """
 
 import functools
@@ -14,11 +14,12 @@ import numpy as np
 from jaxtyping import UInt8, UInt32
 from PIL import Image
 
-SIZE = 256
+SIZE = 256  # texels per side of a tile
 NUM_LEVELS = 9  # 256, 128, ..., 1
-LEVEL_OFFSETS = tuple((4**9 - 4 ** (9 - level)) // 3 for level in range(NUM_LEVELS))
-NUM_TEXELS = (4**9 - 1) // 3
+LEVEL_OFFSETS = tuple((4**9 - 4 ** (9 - level)) // 3 for level in range(NUM_LEVELS))  # first texel of a level
+NUM_TEXELS = (4**9 - 1) // 3  # of a pyramid
 
+# Files of scikit-image.
 _PHOTOS = (
     "astronaut.png", "brick.png", "camera.png", "cell.png", "chelsea.png", "coffee.png", "coins.png", "color.png",
     "grass.png", "gravel.png", "hubble_deep_field.jpg", "ihc.png", "moon.png", "motorcycle_left.png",
@@ -27,7 +28,7 @@ _PHOTOS = (
 
 
 class TextureLibrary:
-    """Packed mip pyramids and the groups that scenes choose from.
+    """Mip pyramids of all textures, and their groups.
 
     Attributes:
         pyramids: packed texels, level 0 first, each level row by row.
@@ -41,7 +42,7 @@ class TextureLibrary:
 
 @functools.lru_cache(maxsize=1)
 def texture_library() -> TextureLibrary:
-    """The library that every scene shares; about two seconds on the first call."""
+    """Returns the library that all scenes share; the first call takes about two seconds."""
     rng = np.random.default_rng(20240607)
     recipes: dict[str, tuple[int, Callable[[np.random.Generator], np.ndarray]]] = {
         "photo": (72, _photo),
@@ -61,7 +62,7 @@ def texture_library() -> TextureLibrary:
 
 
 def pack_pyramids(tiles: UInt8[np.ndarray, "n 256 256 3"]) -> UInt32[np.ndarray, "n texels"]:
-    """Box-filtered mip pyramids of `tiles`, packed one `uint32` per texel."""
+    """Returns box-filtered mip pyramids of `tiles`, packed into one `uint32` per texel."""
     levels, level = [], tiles.astype(np.float32)
     for _ in range(NUM_LEVELS):
         r, g, b = np.moveaxis(np.round(level).astype(np.uint32), -1, 0)
@@ -77,7 +78,7 @@ def pack_pyramids(tiles: UInt8[np.ndarray, "n 256 256 3"]) -> UInt32[np.ndarray,
 
 @functools.lru_cache(maxsize=1)
 def _photographs() -> tuple[Image.Image, ...]:
-    """The bundled photographs of the installed scikit-image, in RGB."""
+    """Photographs in the installed scikit-image, in RGB."""
     import skimage
 
     folder = Path(skimage.__file__).parent / "data"
@@ -85,7 +86,7 @@ def _photographs() -> tuple[Image.Image, ...]:
 
 
 def _photo(rng: np.random.Generator) -> np.ndarray:
-    """A random square of a random photograph: turned, mirrored, tinted."""
+    """Random square of a random photograph: rotated, mirrored and tinted."""
     photos = _photographs()
     if not photos:
         return _colored_noise(rng)
@@ -98,7 +99,7 @@ def _photo(rng: np.random.Generator) -> np.ndarray:
 
 
 def _jitter(rng: np.random.Generator, tile: np.ndarray) -> np.ndarray:
-    """Random contrast, brightness and tint; a gray image becomes a duotone one time in two."""
+    """Applies random contrast, brightness and tint; half of the gray images become duotone."""
     if np.ptp(tile, axis=-1).mean() < 0.02 and rng.random() < 0.5:
         dark, light = _color(rng, 0.0, 0.4), _color(rng, 0.6, 1.0)
         tile = dark + tile * (light - dark)
@@ -106,11 +107,11 @@ def _jitter(rng: np.random.Generator, tile: np.ndarray) -> np.ndarray:
     return (tile - mean) * rng.uniform(0.7, 1.2) + mean * rng.uniform(0.85, 1.15, 3) + rng.uniform(-0.05, 0.1)
 
 
-# -- drawn textures ---------------------------------------------------------------------------------------------------
+# -- synthetic textures ------------------------------------------------------------------------------------------------
 
 
 def _color(rng: np.random.Generator, low: float = 0.1, high: float = 0.95) -> np.ndarray:
-    """A color of random value and mostly mild saturation; warm hues more often than cold ones."""
+    """Random color, mostly of mild saturation; warm hues are more likely than cold ones."""
     value, saturation, hue = rng.uniform(low, high), rng.beta(0.9, 2.2), rng.uniform(0, 1)
     hue = hue * 0.2 - 0.05 if rng.random() < 0.5 else hue
     ramp = np.abs((6 * hue + np.array([0.0, 4.0, 2.0])) % 6 - 3) - 1  # the hue circle: red at 0, green at 1/3
@@ -118,7 +119,7 @@ def _color(rng: np.random.Generator, low: float = 0.1, high: float = 0.95) -> np
 
 
 def _spectrum(rng: np.random.Generator, exponent: float, stretch: float = 1.0) -> np.ndarray:
-    """Periodic 1/f^exponent noise of mean 0 and deviation 1, its features `stretch` times longer along x than y."""
+    """Periodic 1/f^exponent noise with mean 0 and deviation 1; features are `stretch` times longer in x than in y."""
     fy = np.fft.fftfreq(SIZE)[:, None]
     fx = np.fft.rfftfreq(SIZE)[None, :] * stretch
     radius = np.maximum(np.hypot(fx, fy), 1 / SIZE)
@@ -129,7 +130,7 @@ def _spectrum(rng: np.random.Generator, exponent: float, stretch: float = 1.0) -
 
 
 def _colored_noise(rng: np.random.Generator) -> np.ndarray:
-    """1/f^a noise between three colors; half of it warped into veins or threshold blotches."""
+    """1/f^a noise between three colors; half of the tiles are warped into veins or blotches."""
     field = _spectrum(rng, rng.uniform(0.7, 2.0), rng.choice([1.0, 1.0, 4.0]))
     style = rng.integers(4)
     if style == 0:
@@ -143,7 +144,7 @@ def _colored_noise(rng: np.random.Generator) -> np.ndarray:
 
 
 def _plain(rng: np.random.Generator) -> np.ndarray:
-    """A nearly uniform wall: faint plaster noise and slow stains."""
+    """Nearly uniform wall with faint plaster noise and large stains."""
     base = 0.7 * _color(rng, 0.45, 0.95) + 0.3 * rng.uniform(0.5, 0.95)
     fine = _spectrum(rng, rng.uniform(0.2, 1.0))[..., None] * rng.uniform(0.004, 0.025)
     slow = _spectrum(rng, 1.8)[..., None] * rng.uniform(0.0, 0.04)
@@ -151,7 +152,7 @@ def _plain(rng: np.random.Generator) -> np.ndarray:
 
 
 def _cells(rng: np.random.Generator, rows: int, cols: int, bond: float, gap: float):
-    """Cell index and joint mask of a `rows` x `cols` lattice whose odd rows shift by `bond` of a cell."""
+    """Cell index and joint mask of a `rows` x `cols` lattice whose odd rows are shifted by `bond` of a cell."""
     y, x = np.mgrid[0:SIZE, 0:SIZE] / SIZE
     row = np.floor(y * rows).astype(int)
     shifted = x * cols + bond * (row % 2)
@@ -162,7 +163,7 @@ def _cells(rng: np.random.Generator, rows: int, cols: int, bond: float, gap: flo
 
 
 def _masonry(rng: np.random.Generator, rows: int, cols: int, bond: float, spread: float) -> np.ndarray:
-    """Bricks, tiles or planks: cells of varying tone, noisy, between joints of another color."""
+    """Bricks, tiles or planks: noisy cells of varying tone, and joints of another color."""
     cell, joint = _cells(rng, rows, cols, bond, rng.uniform(0.002, 0.008))
     tone = 1 + spread * rng.standard_normal((rows * cols, 1)) + 0.3 * spread * rng.standard_normal((rows * cols, 3))
     grain = _spectrum(rng, rng.uniform(0.5, 1.6), rng.choice([1.0, 6.0])) * rng.uniform(0.02, 0.12)
@@ -171,7 +172,7 @@ def _masonry(rng: np.random.Generator, rows: int, cols: int, bond: float, spread
 
 
 def _floor(rng: np.random.Generator) -> np.ndarray:
-    """Planks, tiles, gravel, carpet."""
+    """Planks, tiles, gravel or carpet."""
     style = rng.integers(4)
     if style == 0:
         return _masonry(rng, int(rng.integers(6, 12)), int(rng.integers(1, 3)), 0.5, 0.15)
@@ -184,7 +185,7 @@ def _floor(rng: np.random.Generator) -> np.ndarray:
 
 
 def _pattern(rng: np.random.Generator) -> np.ndarray:
-    """Checkers, stripes, bricks, dots."""
+    """Checkers, stripes, bricks or dots."""
     style = rng.integers(4)
     y, x = np.mgrid[0:SIZE, 0:SIZE] / SIZE
     if style == 0:
@@ -204,7 +205,7 @@ def _pattern(rng: np.random.Generator) -> np.ndarray:
 
 
 def _facade(rng: np.random.Generator) -> np.ndarray:
-    """Rows of windows in a wall, or books on shelves."""
+    """Wall with rows of windows, or shelves of books."""
     if rng.random() < 0.4:
         return _bookshelf(rng)
     rows, cols = rng.integers(2, 6, 2)
@@ -221,7 +222,7 @@ def _facade(rng: np.random.Generator) -> np.ndarray:
 
 
 def _bookshelf(rng: np.random.Generator) -> np.ndarray:
-    """Shelves of upright spines of random widths, heights and colors."""
+    """Shelves of books with random widths, heights and colors."""
     tile = np.full((SIZE, SIZE, 3), 0.06)
     shelf = SIZE // int(rng.integers(3, 6))
     wood = _color(rng, 0.3, 0.7)
@@ -238,7 +239,7 @@ def _bookshelf(rng: np.random.Generator) -> np.ndarray:
 
 
 def _dead_leaves(rng: np.random.Generator) -> np.ndarray:
-    """Discs and rectangles of random colors, large below small: edges at every scale."""
+    """Discs and rectangles of random colors, small over large, which give edges at all scales."""
     tile = np.broadcast_to(_color(rng), (SIZE, SIZE, 3)).copy()
     y, x = np.mgrid[0:SIZE, 0:SIZE]
     for radius in np.sort(3.0 + 60.0 * rng.pareto(2.0, 220) / 4)[::-1].clip(3, 90):
@@ -251,7 +252,7 @@ def _dead_leaves(rng: np.random.Generator) -> np.ndarray:
 
 
 def _sky(rng: np.random.Generator) -> np.ndarray:
-    """Clouds on a blue, gray or dusky ground."""
+    """Clouds on a blue, gray or dusky sky."""
     clouds = np.clip(_spectrum(rng, 1.7) * 0.4 + rng.uniform(0.1, 0.5), 0, 1)[..., None]
     base = np.array([[0.45, 0.62, 0.85], [0.62, 0.68, 0.75], [0.75, 0.6, 0.55]])[rng.integers(3)]
     return base + (np.array([0.95, 0.95, 0.97]) - base) * clouds

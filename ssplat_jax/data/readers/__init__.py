@@ -1,7 +1,6 @@
-"""One file per capture format. Each offers `FORMAT` (its name), `matches(path)` and `read(path) -> Listing`.
+"""Readers of capture formats, one module each with `FORMAT` (its name), `matches(path)` and `read(path) -> Listing`.
 
-A reader checks everything that can be checked without decoding an image, through `posed_frame` and `pixels`, and
-raises `InputError`.
+A reader checks everything that can be checked without decoding an image, and raises `InputError`.
 """
 
 import dataclasses
@@ -11,8 +10,8 @@ from ssplat_jax.data.posed_image import Frame
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Listing:
-    """What a reader found."""
+    """Frames of a capture, as a reader found them."""
 
     name: str
-    frames: tuple[Frame, ...]  # in the order in which they are streamed
-    notes: tuple[str, ...] = ()  # what the user should know, one sentence each
+    frames: tuple[Frame, ...]  # in the order of streaming
+    notes: tuple[str, ...] = ()  # messages for the user, one sentence each

@@ -1,9 +1,9 @@
-"""A COLMAP reconstruction: `sparse/0/`, `sparse/` or `colmap/sparse/0/` with `cameras` and `images`, binary or text.
+"""Reader of COLMAP reconstructions: `sparse/0/`, `sparse/` or `colmap/sparse/0/` with `cameras` and `images`.
 
-Poses are world-to-camera with OpenCV's axes; the world stays COLMAP's. A pixel's center is at +0.5, as here. Images
-lie in `images/` (or, shrunk, in `images_2`, `images_4`, `images_8`), else in the capture's folder; those that COLMAP
-did not register are no frames. Of the camera models those without fish-eye are read, FULL_OPENCV without its
-denominator (k4 to k6). Format: colmap.github.io/format.html; of binary and text files the binary ones are read.
+Poses are world-to-camera with OpenCV axes, in COLMAP's world; pixel centers are at +0.5. Images are in `images/` (or
+downscaled in `images_2`, `images_4`, `images_8`), else in the folder of the capture; images that COLMAP did not
+register are ignored. All camera models but the fish-eye ones are supported, FULL_OPENCV only without its denominator
+(k4 to k6). If there are binary and text files, the binary ones are read. Format: colmap.github.io/format.html.
 """
 
 import struct
@@ -12,15 +12,22 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ssplat_jax.data.lens import Lens
-from ssplat_jax.data.posed_image import Frame, inverse, pose_of
+from ssplat_jax.data.posed_image import Frame, invert_pose, pose_from_quat
 from ssplat_jax.data.readers import Listing
-from ssplat_jax.data.readers.frame_list import SHRUNK_FOLDERS, Intrinsics, file_named, make_frame, stored_size, streamed
-from ssplat_jax.data.readers.strict_text import load_lines, numbers
+from ssplat_jax.data.readers.frame_list import (
+    SHRUNK_FOLDERS,
+    Intrinsics,
+    file_named,
+    make_frame,
+    order_frames,
+    stored_size,
+)
+from ssplat_jax.data.readers.strict_text import load_lines, parse_numbers
 from ssplat_jax.errors import echo, refusal
 
 FORMAT = "COLMAP"
-FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", ".")
-MODELS = (  # by id; None: fish-eye, no pinhole camera even after Brown's distortion
+FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", ".")  # places of a reconstruction, in the order of search
+MODELS = (  # name and parameters, by id; None: fish-eye models, which are not supported
     ("SIMPLE_PINHOLE", "f cx cy"),
     ("PINHOLE", "fx fy cx cy"),
     ("SIMPLE_RADIAL", "f cx cy k1"),
@@ -35,23 +42,25 @@ MODELS = (  # by id; None: fish-eye, no pinhole camera even after Brown's distor
 )
 UNDISTORT = "undistort the images to pinhole cameras first (`colmap image_undistorter`)"
 COPY_AGAIN = "copy the reconstruction again"
-POINT_BYTES = 24  # of a 2D point of an image: x, y, id of its 3D point
+CAMERA_BYTES = 24  # id, model, width and height of a camera
+IMAGE_BYTES = 73  # id, pose, camera, empty name and number of points of an image, at least
+POINT_BYTES = 24  # x, y and 3D point of a 2D point
 
 
 class ImageEntry(NamedTuple):
-    """One registered image."""
+    """Registered image."""
 
     name: str
     quat: tuple[float, ...]  # world-to-camera, wxyz
     translation: tuple[float, ...]
-    camera: int
-    where: str
+    camera: int  # id
+    where: str  # location in the file for error messages
 
 
 class CameraEntry(NamedTuple):
-    """One camera."""
+    """Camera with its intrinsics."""
 
-    size: tuple[float, float]  # (width, height), as COLMAP saw the images
+    size: tuple[float, float]  # (width, height) of the images that COLMAP used
     intrinsics: Intrinsics
 
 
@@ -61,9 +70,9 @@ def matches(path: Path) -> bool:
 
 
 def read(path: Path) -> Listing:
-    """The registered images of the reconstruction in the folder `path`."""
+    """Reads the registered images of the reconstruction in the folder `path`."""
     model, root = _model_folder(path), path.resolve()
-    assert model is not None  # as `matches` said
+    assert model is not None  # `matches` is true
     if (model / "images.bin").is_file():
         cameras, entries = _binary_cameras(model / "cameras.bin"), list(_binary_images(model / "images.bin"))
     else:
@@ -73,7 +82,7 @@ def read(path: Path) -> Listing:
         raise refusal(str(model), wanted="registered images", got="none", fix=fix)
     folder = "images/" if any((root / name).is_dir() for name in ("images", *SHRUNK_FOLDERS)) else ""
     if folder and all(entry.name.startswith(folder) for entry in entries):
-        folder = ""  # COLMAP was given the folder around it, and names say so
+        folder = ""  # COLMAP ran on the parent folder, so the names include images/
     seen: dict[Path | None, str] = {}
     frames = []
     for entry in entries:
@@ -82,11 +91,11 @@ def read(path: Path) -> Listing:
             got = f"{echo(entry.name)} twice"
             raise refusal(entry.where, wanted="every image once", got=got, fix="remove one of the two")
         frames.append(frame)
-    return streamed(root.name, frames)
+    return order_frames(root.name, frames)
 
 
 def _model_folder(path: Path) -> Path | None:
-    """Where the reconstruction lies."""
+    """Folder of the reconstruction, or None."""
     for folder in FOLDERS:
         if any((path / folder / f"images.{kind}").is_file() for kind in ("bin", "txt")):
             return path / folder
@@ -94,17 +103,18 @@ def _model_folder(path: Path) -> Path | None:
 
 
 def _frame(root: Path, folder: str, entry: ImageEntry, cameras: dict[int, CameraEntry]) -> Frame:
+    """Checked frame of a registered image."""
     if entry.camera not in cameras:
-        got = f"camera {entry.camera}, which is not there"
+        got = f"camera {entry.camera}, which is missing"
         raise refusal(entry.where, wanted="a camera of the reconstruction", got=got, fix=COPY_AGAIN)
     camera = cameras[entry.camera]
     path = file_named(root, folder + entry.name, entry.where, folders=SHRUNK_FOLDERS)
-    fix = "give the images that COLMAP saw"
+    fix = "use the images that COLMAP used"
     size, shrink = stored_size(path, camera.size, entry.where, fix)
     return make_frame(
         entry.name,
         path,
-        inverse(pose_of(entry.quat, entry.translation, entry.where)),
+        invert_pose(pose_from_quat(entry.quat, entry.translation, entry.where)),
         camera.intrinsics,
         size,
         f"{entry.where}, camera {entry.camera}",
@@ -113,6 +123,7 @@ def _frame(root: Path, folder: str, entry: ImageEntry, cameras: dict[int, Camera
 
 
 def _camera(model: str, width: int, height: int, params: list[float], where: str) -> CameraEntry:
+    """Camera with checked parameters; unsupported models are refused."""
     names = dict(MODELS).get(model)
     if names is None:
         supported = ", ".join(name for name, params in MODELS if params is not None)
@@ -130,7 +141,7 @@ def _camera(model: str, width: int, height: int, params: list[float], where: str
 
 
 class _Binary:
-    """Little-endian values from the front of a file; too short a file is refused."""
+    """Sequential reader of little-endian values; reading past the end of the file is refused."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -141,24 +152,24 @@ class _Binary:
         self._at = 0
 
     def take(self, layout: str) -> tuple:
-        """Values of a `struct` layout."""
+        """Returns the values of a `struct` layout."""
         layout = "<" + layout
         return struct.unpack(layout, self._bytes(struct.calcsize(layout)))
 
     def skip(self, num_bytes: int) -> None:
-        """Goes on `num_bytes` further."""
+        """Skips `num_bytes`."""
         self._bytes(num_bytes)
 
-    def count(self, least_bytes: int) -> int:
-        """A number of entries of at least `least_bytes` each, of which the rest of the file has room."""
+    def count(self, min_bytes: int) -> int:
+        """Returns a number of entries of at least `min_bytes` each; more than fit into the file are refused."""
         (count,) = self.take("Q")
-        if count * least_bytes > len(self._data) - self._at:
+        if count * min_bytes > len(self._data) - self._at:
             got = f"{count} in {len(self._data)} bytes"
             raise refusal(str(self.path), wanted="as many entries as the file holds", got=got, fix=COPY_AGAIN)
         return count
 
     def text(self) -> str:
-        """Up to the next zero byte."""
+        """Returns the UTF-8 text up to the next zero byte."""
         end = bytes(self._data[self._at : self._at + 4096]).find(0)
         try:
             if end >= 0:
@@ -169,6 +180,7 @@ class _Binary:
         raise refusal(where, wanted="the name of an image, UTF-8", got="other bytes", fix=COPY_AGAIN)
 
     def _bytes(self, num_bytes: int) -> memoryview:
+        """The next `num_bytes`."""
         end = self._at + num_bytes
         if end > len(self._data):
             got = f"the end of the file after {len(self._data)} bytes"
@@ -178,8 +190,9 @@ class _Binary:
 
 
 def _binary_cameras(path: Path) -> dict[int, CameraEntry]:
+    """Cameras of cameras.bin by id."""
     file, cameras = _Binary(path), {}
-    for _ in range(file.count(24)):
+    for _ in range(file.count(CAMERA_BYTES)):
         camera, model, width, height = file.take("IiQQ")
         where = f"{path}: camera {camera}"
         name, params = MODELS[model] if 0 <= model < len(MODELS) else (f"model {model}", None)
@@ -189,8 +202,9 @@ def _binary_cameras(path: Path) -> dict[int, CameraEntry]:
 
 
 def _binary_images(path: Path) -> Iterator[ImageEntry]:
+    """Images of images.bin; their 2D points are skipped."""
     file = _Binary(path)
-    for _ in range(file.count(73)):
+    for _ in range(file.count(IMAGE_BYTES)):
         image, *pose, camera = file.take("I7dI")
         name = file.text()
         file.skip(POINT_BYTES * file.count(POINT_BYTES))
@@ -198,6 +212,7 @@ def _binary_images(path: Path) -> Iterator[ImageEntry]:
 
 
 def _text_cameras(path: Path) -> dict[int, CameraEntry]:
+    """Cameras of cameras.txt by id."""
     cameras = {}
     for number, line in load_lines(path):
         if not line:
@@ -206,12 +221,12 @@ def _text_cameras(path: Path) -> dict[int, CameraEntry]:
         if len(words) < 4:
             raise refusal(where, wanted="id, model, width, height, parameters", got=echo(line), fix=COPY_AGAIN)
         camera, width, height = (_whole(word, where) for word in (words[0], *words[2:4]))
-        cameras[camera] = _camera(words[1], width, height, numbers(words[4:], where), where)
+        cameras[camera] = _camera(words[1], width, height, parse_numbers(words[4:], where), where)
     return cameras
 
 
 def _text_images(path: Path) -> Iterator[ImageEntry]:
-    """Two lines an image: its pose and name, and its 2D points, a line that may be empty."""
+    """Images of images.txt, two lines each: pose and name, and the 2D points (this line may be empty)."""
     lines = iter(load_lines(path))
     for number, line in lines:
         if not line:
@@ -220,7 +235,7 @@ def _text_images(path: Path) -> Iterator[ImageEntry]:
         if len(words) != 10:
             wanted = "id, quaternion, translation, camera id, name"
             raise refusal(where, wanted=wanted, got=echo(line), fix=COPY_AGAIN)
-        pose = numbers(words[1:8], where)
+        pose = parse_numbers(words[1:8], where)
         points = next(lines, (number, ""))[1].split()
         if len(points) % 3 or (points and not points[-1].lstrip("-").isdigit()):
             raise refusal(where, wanted="a line of 2D points below", got="another line", fix=COPY_AGAIN)
@@ -228,6 +243,7 @@ def _text_images(path: Path) -> Iterator[ImageEntry]:
 
 
 def _whole(word: str, where: str) -> int:
+    """Parses a whole number of up to 18 digits."""
     if word.isascii() and word.isdigit() and len(word) < 19:
         return int(word)
     raise refusal(where, wanted="a whole number", got=echo(word), fix=COPY_AGAIN)

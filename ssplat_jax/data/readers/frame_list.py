@@ -1,4 +1,4 @@
-"""What every reader does with what it found: look for files, check a frame, put frames into the order of streaming."""
+"""Steps that all readers share: finding files, checking a frame, and ordering the frames."""
 
 import dataclasses
 import itertools
@@ -17,15 +17,15 @@ from ssplat_jax.data.posed_image import MILLIMETER, ROTATION_ROUNDING, Frame, ch
 from ssplat_jax.data.readers import Listing
 from ssplat_jax.errors import echo, refusal
 
-MUCH_SHORTER = 0.5  # of the camera's way by name: the file's order is taken
-FAR_OFF_CENTER = 0.2  # of a side: a principal point so far off is worth a note
+SHORTER_PATH_RATIO = 0.5  # camera path in the file's order over that by name, below which the file's order is used
+MAX_CENTER_OFFSET = 0.2  # of a side; a principal point farther from the center is reported
 EXTENSIONS = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG", ".webp")
-SHRUNK_FOLDERS = ("images_2", "images_4", "images_8")  # where images/ was left out of a download
+SHRUNK_FOLDERS = ("images_2", "images_4", "images_8")  # downscaled copies of images/, which may be missing
 
 
 @dataclasses.dataclass(frozen=True)
 class Intrinsics:
-    """Of the image as described, which the stored one may be a smaller copy of, in its pixels."""
+    """Intrinsics in pixels of the image that the capture describes; the stored image may be a smaller copy of it."""
 
     fx: float
     fy: float
@@ -35,16 +35,16 @@ class Intrinsics:
 
 
 def find_file(root: Path, names: Sequence[str], where: str) -> Path | None:
-    """The first of `names` that is a file of the capture; symbolic links are followed before it is judged.
+    """Returns the first of `names` that is a file in the folder `root`, after symbolic links are resolved, or None.
 
     Raises:
-        InputError: one lies outside `root`.
+        InputError: a name leads outside `root`; the message starts with `where`.
     """
     for name in names:
         try:
             path = (root / name).resolve()
             found = path.is_file()
-        except (OSError, RuntimeError, ValueError):  # too long a name, a loop of links
+        except (OSError, RuntimeError, ValueError):  # name too long, loop of links
             continue
         if not path.is_relative_to(root):
             fix = "copy the file into the capture's folder and give its relative path"
@@ -57,10 +57,20 @@ def find_file(root: Path, names: Sequence[str], where: str) -> Path | None:
 def file_named(
     root: Path, name: object, where: str, extensions: tuple[str, ...] = ("",), folders: tuple[str, ...] = ()
 ) -> Path:
-    """The file `name` of the capture, its extension completed. A name in images/ may lie in one of `folders` instead.
+    """Returns the path of the file `name` of the capture.
+
+    Args:
+        root: folder of the capture.
+        name: path relative to `root`, not yet checked.
+        where: location of the name for error messages.
+        extensions: extensions to try.
+        folders: folders to try in place of images/.
+
+    Returns:
+        The resolved path.
 
     Raises:
-        InputError: no such file, or outside `root`.
+        InputError: there is no such file, or it is outside `root`.
     """
     if not isinstance(name, str) or not name or "\0" in name:
         raise refusal(where, wanted="the path of a file", got=echo(name), fix="give it relative to the capture")
@@ -74,21 +84,33 @@ def file_named(
 
 
 def in_images(name: str) -> str | None:
-    """What follows images/ in a file's name, which may begin with ./; None of others."""
+    """Returns the part of a file name after images/ (or ./images/), or None for files elsewhere."""
     plain = posixpath.normpath(name)
     return plain.removeprefix("images/") if plain.startswith("images/") else None
 
 
 def stored_size(path: Path, described: tuple[float, float], where: str, fix: str) -> tuple[tuple[int, int], float]:
-    """(width, height) of the stored image, and how much smaller it is than it is `described`.
+    """Returns (width, height) of a stored image, and its size relative to the described one.
 
-    Folders of shrunk images (images_2, images_4) keep the intrinsics of the full size: both sides shrunk alike, to a
-    pixel, are taken for such. Larger images than described are not.
+    Downscaled copies (images_2, images_4) are described by the intrinsics of the full size. An image counts as such a
+    copy if both sides are smaller by the same factor, to a pixel.
+
+    Args:
+        path: the image.
+        described: (width, height) in the capture's files.
+        where: location of that size for error messages.
+        fix: remedy for error messages.
+
+    Returns:
+        The size of the stored image, and a factor of at most 1.
+
+    Raises:
+        InputError: the image is neither of the described size nor a downscaled copy.
     """
     width, height = image_size(path)
     if described == (width, height):
         return (width, height), 1.0
-    shrink = max(width, height) / max(*described, 1e-9)  # the longer side is rounded less
+    shrink = max(width, height) / max(*described, 1e-9)  # rounding affects the longer side less
     if shrink < 1 and all(abs(w * shrink - side) <= 1.0 for w, side in zip(described, (width, height), strict=True)):
         return (width, height), shrink
     if described == (height, width):
@@ -110,7 +132,26 @@ def make_frame(
     depth_path: Path | None = None,
     depth_unit: float = MILLIMETER,
 ) -> Frame:
-    """A frame of a checked pose, OpenCV axes; its intrinsics are checked here. `size` is the stored image's."""
+    """Returns a frame with checked intrinsics.
+
+    Args:
+        name: name of the frame in the capture's files.
+        path: the image.
+        camtoworld: checked pose with OpenCV axes.
+        intrinsics: intrinsics of the described image.
+        size: (width, height) of the stored image.
+        where: location of the intrinsics for error messages.
+        pose_deviation: |R^T R - I| of the pose as given.
+        shrink: size of the stored image relative to the described one.
+        depth_path: 16-bit depth image.
+        depth_unit: capture units per step of the depth image.
+
+    Returns:
+        The frame.
+
+    Raises:
+        InputError: the intrinsics are implausible, or the distortion folds the image.
+    """
     fx, fy, cx, cy = (shrink * x for x in (intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy))
     K = check_intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, width=size[0], height=size[1], where=where)
     distortion_px = check_lens(intrinsics.lens, K, *size, where)
@@ -130,49 +171,58 @@ def make_frame(
     )
 
 
-def streamed(name: str, frames: list[Frame], notes: Sequence[str] = (), *, in_time: bool = False) -> Listing:
-    """The frames in the order in which they are streamed, and what is worth telling of them.
+def order_frames(name: str, frames: list[Frame], notes: Sequence[str] = (), *, is_in_time: bool = False) -> Listing:
+    """Returns the frames in the order of streaming, with notes for the user.
 
-    That is the given order where it is known to be that of time, else the natural order of names ("9.jpg" before
-    "10.jpg"), unless the given order makes the camera's way less than half as long (names without an order, several
-    cameras).
+    Frames are sorted by name in natural order ("9.jpg" before "10.jpg"). The given order is kept if it is the order of
+    time, or if it makes the path of the camera less than half as long, as with random names or several cameras.
+
+    Args:
+        name: name of the capture.
+        frames: frames in the order of the file.
+        notes: messages for the user.
+        is_in_time: whether `frames` are in the order of time.
+
+    Returns:
+        The listing.
     """
     notes = (*notes, *_notes(frames))
-    if in_time:
+    if is_in_time:
         return Listing(name=name, frames=tuple(frames), notes=notes)
     ordered = sorted(frames, key=lambda frame: _natural(frame.name))
-    if _path_length(frames) < MUCH_SHORTER * _path_length(ordered):
-        note = "Frames are streamed in the file's order: by name, the camera would go more than twice as far."
+    if _path_length(frames) < SHORTER_PATH_RATIO * _path_length(ordered):
+        note = "Frames are streamed in the file's order: by name, the camera path would be more than twice as long."
         return Listing(name=name, frames=tuple(frames), notes=(*notes, note))
     return Listing(name=name, frames=tuple(ordered), notes=notes)
 
 
 def _path_length(frames: list[Frame]) -> float:
-    """How far the camera goes from frame to frame."""
+    """Length of the camera path."""
     return sum(math.dist(a.center, b.center) for a, b in itertools.pairwise(frames))
 
 
 def _natural(name: str) -> list[tuple[int, int, str]]:
-    """Sort key in which digits count as numbers."""
-    parts = re.split(r"([0-9]+)", name)  # every second part is a number
+    """Sort key that compares runs of digits as numbers."""
+    parts = re.split(r"([0-9]+)", name)  # parts with an odd index are digits
     return [(0, int(part), "") if k % 2 else (1, 0, part) for k, part in enumerate(parts)]
 
 
 def _notes(frames: list[Frame]) -> tuple[str, ...]:
+    """Notes for the user about deviations of poses, sizes and intrinsics."""
     notes = []
     off = [f for f in frames if f.pose_deviation > ROTATION_ROUNDING]
     if off:
         worst = max(f.pose_deviation for f in off)
         notes.append(
-            f"{len(off)} poses were not quite rotations (by up to {worst:.1e}) and were projected to the nearest."
+            f"{len(off)} poses were not exact rotations (off by up to {worst:.1e}); the nearest ones are used."
         )
     if shrinks := {f.shrink for f in frames if f.shrink != 1.0}:
         notes.append(f"Images are {min(shrinks):.4g} times the size of the intrinsics, which were scaled with them.")
     offsets = [max(abs(f.K[0, 2] / f.width - 0.5), abs(f.K[1, 2] / f.height - 0.5)) for f in frames]
-    if max(offsets, default=0.0) > FAR_OFF_CENTER:
+    if max(offsets, default=0.0) > MAX_CENTER_OFFSET:
         notes.append(
-            f"The principal point lies {max(offsets):.0%} of a side off the image's center: are the intrinsics those of"
-            " images of another size?"
+            f"The principal point lies {max(offsets):.0%} of a side off the image's center; check that the"
+            " intrinsics belong to images of this size."
         )
     for what, kind in (("undone", [f for f in frames if f.lens]), ("ignored", [f for f in frames if not f.lens])):
         worst_px = max((f.distortion_px for f in kind), default=0.0)

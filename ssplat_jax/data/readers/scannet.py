@@ -1,8 +1,7 @@
-"""A ScanNet export: `color/0.jpg`, `pose/0.txt`, `intrinsic/intrinsic_color.txt` and, if there, `depth/0.png`.
+"""Reader of ScanNet exports: `color/0.jpg`, `pose/0.txt`, `intrinsic/intrinsic_color.txt`, optionally `depth/0.png`.
 
-Poses are camera-to-world with OpenCV's axes, meters; where tracking was lost they hold -inf, and the frame is left out.
-Depth maps hold millimeters, at a resolution of their own; they are taken as seen by the color camera, as their
-frames were registered.
+Poses are camera-to-world with OpenCV axes, in meters. Where tracking was lost they hold -inf, and the frame is skipped.
+Depth maps hold millimeters and have their own resolution; they are taken to be registered to the color camera.
 """
 
 from pathlib import Path
@@ -12,12 +11,12 @@ import numpy as np
 from ssplat_jax.data.images import check_depth_header, image_size
 from ssplat_jax.data.posed_image import check_camtoworld
 from ssplat_jax.data.readers import Listing
-from ssplat_jax.data.readers.frame_list import Intrinsics, file_named, find_file, make_frame, streamed
+from ssplat_jax.data.readers.frame_list import Intrinsics, file_named, find_file, make_frame, order_frames
 from ssplat_jax.data.readers.strict_text import load_rows
 from ssplat_jax.errors import refusal
 
 FORMAT = "ScanNet"
-IMAGES = (".jpg", ".jpeg", ".png")
+IMAGES = (".jpg", ".jpeg", ".png")  # extensions of color images
 
 
 def matches(path: Path) -> bool:
@@ -26,7 +25,7 @@ def matches(path: Path) -> bool:
 
 
 def read(path: Path) -> Listing:
-    """The tracked frames of the export in the folder `path`."""
+    """Reads the tracked frames of the export in the folder `path`."""
     root = path.resolve()
     file = file_named(root, "intrinsic/intrinsic_color.txt", f"{path}: intrinsics")
     K = _matrix(file)
@@ -52,11 +51,12 @@ def read(path: Path) -> Listing:
     if not frames:
         got = f"{len(images)} images, none of them with a finite pose"
         raise refusal(str(path), wanted="tracked frames", got=got, fix="export color/ and pose/ again")
-    lost = [f"{num_lost} of {len(images)} frames are left out: tracking was lost there."] if num_lost else []
-    return streamed(root.name, frames, lost)
+    lost = [f"{num_lost} of {len(images)} frames are skipped: tracking was lost."] if num_lost else []
+    return order_frames(root.name, frames, lost)
 
 
 def _matrix(file: Path) -> np.ndarray:
+    """Reads a 4x4 matrix."""
     rows = load_rows(file, 4)
     if rows.shape != (4, 4):
         raise refusal(str(file), wanted="four rows of four numbers", got=f"{len(rows)} rows", fix="export it again")

@@ -1,20 +1,24 @@
-"""JSON from outside: size and nesting bounded, no duplicate keys, UTF-8. NaN and Infinity are let through as floats,
-so that the field that holds them can be named."""
+"""Reader of untrusted JSON: bounded size and nesting, UTF-8, no duplicate keys.
+
+NaN and Infinity are accepted as floats, so that a later check can name the field that holds them.
+"""
 
 import json
 from pathlib import Path
 from typing import Any
 
+from ssplat_jax.data.readers.strict_text import read_text
 from ssplat_jax.errors import echo, refusal
 
-MAX_BYTES = 256 << 20
+MAX_BYTES = 256 << 20  # files of real captures take a few megabytes
 
 
 class _DuplicateKey(ValueError):
-    pass
+    """A key that occurs twice in an object."""
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Dict of `pairs`, whose keys must be unique."""
     fields = dict(pairs)
     if len(fields) != len(pairs):
         seen: set[str] = set()
@@ -23,35 +27,32 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def load_json(path: Path) -> dict[str, Any]:
-    """The object in the file.
+    """Returns the object in a JSON file.
 
     Raises:
-        InputError: unreadable, larger than 256 MiB, not UTF-8, not JSON, nested too deeply, a key twice, no object.
+        InputError: the file is unreadable, larger than `MAX_BYTES`, not UTF-8 or not JSON, is nested too deeply, has a
+            duplicate key, or does not hold an object.
     """
     where = str(path)
+    text = read_text(path, MAX_BYTES)
     try:
-        size = path.stat().st_size
-        if size > MAX_BYTES:
-            raise refusal(where, wanted=f"at most {MAX_BYTES:,} bytes", got=f"{size:,}", fix="split the capture")
-        fields = json.loads(path.read_bytes().decode("utf-8-sig"), object_pairs_hook=_unique)
-    except OSError as error:
-        fix = "check that the file exists and may be read"
-        raise refusal(where, wanted="a readable file", got=error.strerror, fix=fix) from None
-    except UnicodeDecodeError as error:
-        got = f"byte {error.object[error.start]:#04x} at {error.start}"
-        raise refusal(where, wanted="UTF-8 text", got=got, fix="save the file as UTF-8") from None
+        fields = json.loads(text, object_pairs_hook=_unique)
     except RecursionError:
-        raise refusal(where, wanted="JSON of sane depth", got="endless nesting", fix="write the file anew") from None
+        raise refusal(
+            where, wanted="JSON of reasonable depth", got="too deep nesting", fix="write the file again"
+        ) from None
     except _DuplicateKey as error:
         got = f"{echo(str(error))} twice in one object"
         raise refusal(where, wanted="every key once", got=got, fix="remove one of the two") from None
     except json.JSONDecodeError as error:
         got = f"{error.msg} (line {error.lineno}, column {error.colno})"
-        raise refusal(where, wanted="JSON", got=got, fix="write the file anew") from None
+        raise refusal(where, wanted="JSON", got=got, fix="write the file again") from None
     except ValueError as error:  # an integer of thousands of digits
         got = echo(str(error))
-        raise refusal(where, wanted="JSON with numbers of sane length", got=got, fix="write the file anew") from None
+        raise refusal(
+            where, wanted="JSON with numbers of reasonable length", got=got, fix="write the file again"
+        ) from None
     if not isinstance(fields, dict):
         got = f"a {type(fields).__name__}"
-        raise refusal(where, wanted="a JSON object with `frames`", got=got, fix="write the file anew")
+        raise refusal(where, wanted="a JSON object with `frames`", got=got, fix="write the file again")
     return fields

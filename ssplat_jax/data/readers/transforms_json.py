@@ -1,12 +1,11 @@
-"""nerfstudio / instant-ngp / Blender `transforms.json`.
+"""Reader of `transforms.json` of nerfstudio, instant-ngp and Blender.
 
-Poses are camera-to-world with OpenGL axes (+x right, +y up, +z backward); here they become OpenCV's. They are otherwise
-left alone: no re-centering, no rescaling, no `applied_transform`, so results stand in the file's own frame.
-Intrinsics are global or per frame, a frame's own value first: fl_x, fl_y, cx, cy, w, h in pixels of the stored image,
-or camera_angle_x in radians. Absent: fl_y = fl_x, center of the image, size from the image's header. Distortion (k1 to
-k4, p1, p2) is Brown's, and is undone when images are delivered.
-Frames are streamed in the natural order of `file_path` ("9.jpg" before "10.jpg"), whatever their order in the file,
-unless the file's order makes the camera's way less than half as long (names without an order, several cameras).
+Poses are camera-to-world with OpenGL axes (+x right, +y up, +z backward) and are converted to OpenCV axes. They are not
+re-centered or rescaled, and `applied_transform` is ignored, so results are in the frame of the file.
+Intrinsics are global or per frame, and a frame's own value comes first: fl_x, fl_y, cx, cy, w, h in pixels of the
+stored image, or camera_angle_x in radians. Defaults are fl_y = fl_x, the center of the image, and the size of the
+image file. Distortion (k1 to k4, p1, p2) follows the Brown-Conrady model and is removed when images are delivered.
+Frames are streamed in the natural order of `file_path`, with the exception in `frame_list.order_frames`.
 """
 
 import dataclasses
@@ -27,24 +26,24 @@ from ssplat_jax.data.readers.frame_list import (
     file_named,
     in_images,
     make_frame,
+    order_frames,
     stored_size,
-    streamed,
 )
 from ssplat_jax.data.readers.strict_json import load_json
 from ssplat_jax.errors import echo, refusal
 
 FORMAT = "transforms.json"
-OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
-PINHOLE_MODELS = (None, "OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
+OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # flips the y and z axes of a camera
+PINHOLE_MODELS = (None, "OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")  # supported models
 
 
 def matches(path: Path) -> bool:
-    """Whether `path` is a folder with a transforms.json, or such a file under any name."""
+    """Whether `path` is a folder with a transforms.json, or a .json file."""
     return (path / "transforms.json").is_file() or (path.is_file() and path.suffix == ".json")
 
 
 def read(path: Path) -> Listing:
-    """The frames of the capture in the folder `path`, or of the file `path` in its folder."""
+    """Reads the frames of the capture in the folder `path`, or of the file `path`."""
     file = path if path.is_file() else path / "transforms.json"
     root = file.parent.resolve()
     meta = load_json(file)
@@ -63,11 +62,11 @@ def read(path: Path) -> Listing:
             got = f"{echo(frame.name)} in both {first.split(': ')[-1]} and frames[{i}]"
             raise refusal(f"{where}.file_path", wanted="every image once", got=got, fix="drop one of the two frames")
         frames.append(frame)
-    return streamed(root.name, frames)
+    return order_frames(root.name, frames)
 
 
 def _read_frame(root: Path, meta: dict[str, Any], entry: dict[str, Any], where: str) -> Frame:
-    """One checked frame."""
+    """Checked frame of one entry of the list `frames`."""
     name = entry.get("file_path")
     path = file_named(root, name, f"{where}.file_path", EXTENSIONS, SHRUNK_FOLDERS)
     depth_path = None
@@ -99,30 +98,31 @@ def _read_frame(root: Path, meta: dict[str, Any], entry: dict[str, Any], where: 
 
 
 class _Fields:
-    """A frame's own fields before the file's global ones."""
+    """Fields of a frame; its own values come before the global ones."""
 
     def __init__(self, meta: dict[str, Any], entry: dict[str, Any], where: str) -> None:
         self._meta, self._entry, self.where = meta, entry, where
 
     def get(self, name: str) -> Any:
+        """Returns the value of a field, or None."""
         return self._entry.get(name, self._meta.get(name))
 
     def number(self, name: str, default: float) -> float:
-        """The field as float64; `default` where absent or null."""
+        """Returns a field as float, or `default` if it is missing or null."""
         value = self.get(name)
         if value is None:
             return float(default)
         try:
             if isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
                 return float(value)
-        except OverflowError:  # an integer beyond float64
+        except OverflowError:  # an integer too large for float64
             pass
         fix = "write a plain JSON number"
         raise refusal(f"{self.where}.{name}", wanted="a finite number", got=echo(value), fix=fix)
 
 
 def _check_size(fields: _Fields, path: Path, *, is_shrunk: bool) -> tuple[tuple[int, int], float]:
-    """(width, height) of the stored image, and how much smaller it is than the w and h of its intrinsics."""
+    """Returns (width, height) of the stored image, and its size relative to the w and h of the intrinsics."""
     width, height = image_size(path)
     in_pixels = any(fields.get(name) is not None for name in ("fl_x", "fl_y", "cx", "cy"))
     if is_shrunk and in_pixels and None in (fields.get("w"), fields.get("h")):
@@ -135,6 +135,7 @@ def _check_size(fields: _Fields, path: Path, *, is_shrunk: bool) -> tuple[tuple[
 
 
 def _check_model(fields: _Fields) -> None:
+    """Refuses camera models that are not pinhole cameras with Brown-Conrady distortion."""
     model = fields.get("camera_model")
     if model not in PINHOLE_MODELS or fields.get("is_fisheye"):
         fix = "undistort the images to a pinhole camera first (COLMAP: `colmap image_undistorter`)"
@@ -144,7 +145,7 @@ def _check_model(fields: _Fields) -> None:
 
 
 def _focal(fields: _Fields, width: float, height: float) -> tuple[float, float]:
-    """Focal lengths in pixels from fl_x, fl_y, or the fields of view camera_angle_x, camera_angle_y."""
+    """Focal lengths in pixels, from fl_x and fl_y or the fields of view camera_angle_x and camera_angle_y."""
     focals = {}
     for axis, extent in (("x", width), ("y", height)):
         if fields.get(f"fl_{axis}") is not None:

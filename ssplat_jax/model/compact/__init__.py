@@ -1,6 +1,4 @@
-"""Our own network for a CPU, a stage a file."""
-
-from typing import ClassVar
+"""The compact network, small enough for a CPU. One stage per file."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -15,18 +13,18 @@ from ssplat_jax.model.types import AnchoredDepth
 
 
 def refine_depth(params, features, depth: AnchoredDepth, views, config: StreamConfig) -> AnchoredDepth:
-    """`depth` itself: the matching grid is the token grid."""
+    """`depth` unchanged: the matching grid is the feature grid."""
     del params, features, views, config
     return depth
 
 
 def bound_history(feats: Float[Array, "v hf wf c"]) -> Float[Array, "v hf wf c"]:
-    """`feats` themselves: `mix_tokens` ends in a norm."""
+    """`feats` unchanged: `mix_tokens` ends in a norm."""
     return feats
 
 
 def stages(config: StreamConfig) -> dict:
-    """Linen module and example inputs of every stage that has parameters."""
+    """Linen module and example inputs of every stage."""
     v, side, c = 2, config.network.attention_window, config.network.token_width
     images = jnp.zeros((v, 4 * side, 4 * side, 3))
     sources = jnp.zeros((v, 1), jnp.int32)
@@ -47,7 +45,6 @@ def stages(config: StreamConfig) -> dict:
 class CompactNetwork:
     """The stages of the compact network; fulfils `ssplat_jax.model.network.Network`."""
 
-    matcher_stages: ClassVar[tuple[str, ...]] = ("encoder", "cost_volume")
     stages = staticmethod(stages)
     encode = staticmethod(encode)
     match = staticmethod(match)

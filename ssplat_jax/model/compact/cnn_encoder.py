@@ -1,20 +1,22 @@
-"""Image encoder: a CNN and windowed self- and cross-view attention (DepthSplat; ALGORITHM 2.2, 2.3)."""
+"""Image encoder: a CNN, then windowed self-attention and cross-view attention (as in DepthSplat)."""
 
 import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ssplat_jax.config import StreamConfig
+from ssplat_jax.model.compact.compact_features import CompactFeatures
 from ssplat_jax.model.convolution import Conv, HalvingConv
 from ssplat_jax.model.layers import ResidualBlock, attend, instance_norm, normalize_images
-from ssplat_jax.model.types import Features, Views, nearest_sources
-from ssplat_jax.model.windows import from_windows, in_one_region, sine_positions, to_windows
+from ssplat_jax.model.types import Views, nearest_sources
+from ssplat_jax.model.windows import from_windows, same_region_mask, sine_positions, to_windows
 
 
 class AttentionLayer(nn.Module):
-    """One-head attention of windows, LayerNorm after the merge; optionally a feed-forward on [source, message]."""
+    """Residual one-head attention in windows, with an optional feed-forward layer on [input, message]."""
 
     ffn_ratio: int = 0
+    """Ratio of the feed-forward width to the feature width; 0 for no feed-forward layer."""
 
     @nn.compact
     def __call__(self, x, context, allowed=None):
@@ -32,7 +34,7 @@ class AttentionLayer(nn.Module):
 
 
 class Encoder(nn.Module):
-    """Images to matching features at 1/2 and 1/4 and context features at 1/4."""
+    """Maps images to matching features at 1/2 and 1/4 and context features at 1/4."""
 
     config: StreamConfig
 
@@ -52,7 +54,7 @@ class Encoder(nn.Module):
 
     def __call__(
         self, images: Float[Array, "v h w 3"], sources: Int[Array, "v s"], source_valid: Bool[Array, "v s"]
-    ) -> Features:
+    ) -> CompactFeatures:
         x = nn.relu(instance_norm(self.stem(normalize_images(images))))
         for block in self.fine_blocks:
             x = block(x)
@@ -61,14 +63,17 @@ class Encoder(nn.Module):
             x = block(x)
         cnn = self.project(x)
         attended = self.attend_views(cnn, sources, source_valid)
-        return Features(
+        return CompactFeatures(
             fine=self.match_fine(fine),
             grid=self.match_grid(attended),
             context=jnp.concatenate([cnn, attended], axis=-1),
         )
 
     def attend_views(self, cnn, sources, source_valid):
-        """Alternates attention inside a view with attention to the same window of the source views (Swin shifts)."""
+        """CNN features after alternating attention within each view and to the same window of its source views.
+
+        Every other pair of layers shifts the windows by half a window.
+        """
         side = self.config.network.attention_window
         v, h, w, c = cnn.shape
         window = (side, side)
@@ -77,7 +82,7 @@ class Encoder(nn.Module):
         for i, (own, cross) in enumerate(zip(self.self_attention, self.cross_attention, strict=True)):
             shift = side // 2 if i % 2 else 0
             windows = to_windows(jnp.roll(x, (-shift, -shift), axis=(1, 2)), window)
-            together = in_one_region(h, w, window, (shift, shift))
+            together = same_region_mask(h, w, window, (shift, shift))
             windows = own(windows, windows, together)
             context = windows[sources].transpose(0, 2, 1, 3, 4).reshape(v, windows.shape[1], num_sources * side**2, c)
             allowed = jnp.repeat(source_valid, side**2, axis=1)[:, None, None] & jnp.tile(together, num_sources)
@@ -86,7 +91,7 @@ class Encoder(nn.Module):
         return x
 
 
-def encode(params, views: Views, config: StreamConfig) -> Features:
-    """Features of every view, informed by its source views."""
+def encode(params, views: Views, config: StreamConfig) -> CompactFeatures:
+    """Features of each view, with attention to its source views."""
     sources, source_valid = nearest_sources(views.viewmats, views.valid, config.network.num_sources)
     return Encoder(config).apply({"params": params}, views.images, sources, source_valid)  # pyright: ignore[reportReturnType]

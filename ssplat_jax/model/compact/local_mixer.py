@@ -1,4 +1,4 @@
-"""3D token mixer: attention among 3D neighbors, then among all views at 1/16 (ReSplat; ALGORITHM 3.2)."""
+"""3D token mixer: attention to 3D neighbors, then among all views at 1/16 (as in ReSplat)."""
 
 import flax.linen as nn
 import jax
@@ -7,14 +7,15 @@ from jaxtyping import Array, Bool, Float
 
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.model.convolution import Conv, pixel_shuffle, pixel_unshuffle
-from ssplat_jax.model.layers import attend, attend_own, rms_normalize
+from ssplat_jax.model.layers import attend, attend_per_query, rms_normalize
 from ssplat_jax.model.nearest_tokens import nearest_tokens
 
-GLOBAL_FACTOR = 4  # the global block works on 4 x 4 cells
+GLOBAL_FACTOR = 4
+"""Cells per side that the global block joins to one."""
 
 
 class NeighborBlock(nn.Module):
-    """Pre-norm attention of each token to its 3D neighbors, then an MLP."""
+    """Pre-norm transformer block in which each token attends to its 3D neighbors."""
 
     config: StreamConfig
 
@@ -26,14 +27,14 @@ class NeighborBlock(nn.Module):
             3,
             axis=-1,
         )
-        mixed = attend_own(q, k[neighbors], v[neighbors], usable[neighbors])
+        mixed = attend_per_query(q, k[neighbors], v[neighbors], usable[neighbors])
         x = x + nn.Dense(c, name="project")(mixed)
         hidden = nn.gelu(nn.Dense(2 * c, name="mlp1")(nn.LayerNorm(name="norm2")(x)))
         return x + nn.Dense(c, name="mlp2")(hidden)
 
 
 class GlobalBlock(nn.Module):
-    """One transformer block over all views' tokens at 1/16 of the image, back to the grid by pixel shuffle."""
+    """Transformer block over the tokens of all views at 1/16 of the image."""
 
     heads: int = 4
 
@@ -54,7 +55,7 @@ class GlobalBlock(nn.Module):
 
 
 class Mixer(nn.Module):
-    """[kNN block, global block] repeated; the result is added to the tokens."""
+    """Alternating neighbor blocks and global blocks."""
 
     config: StreamConfig
 
@@ -71,7 +72,10 @@ class Mixer(nn.Module):
     ) -> Float[Array, "v hf wf c"]:
         if not self.local_blocks:
             return feats
-        neighbors = nearest_tokens(jax.lax.stop_gradient(positions), inside, self.config)
+        network = self.config.network
+        neighbors = nearest_tokens(
+            jax.lax.stop_gradient(positions), inside, network.mixer_neighbors, network.mixer_radius
+        )
         x = feats
         for local, joint in zip(self.local_blocks, self.global_blocks, strict=True):
             flat = local(x.reshape(-1, x.shape[-1]), neighbors, inside.reshape(-1))
@@ -87,12 +91,11 @@ def mix_tokens(
     view_valid: Bool[Array, " v"],
     config: StreamConfig,
 ) -> Float[Array, "v hf wf c"]:
-    """Context-aggregated token features, ready for the head and for the cache (DESIGN 6.8).
+    """Mixed token features of unit RMS, for the head and the cache.
 
-    They have unit RMS. What is stored comes back through CGFI a chunk later, so without a bound the stream is a loop
-    with gain: trained on four chunks, features grew to 1e18 by the ninth. The head normalizes anyway.
-    What comes in is brought to unit RMS too: nothing else holds the size of what CGFI adds, and the blocks would drown
-    in it.
+    Stored features come back through CGFI with the next chunk. Without a bound they grow from chunk to chunk: trained
+    on four chunks, they reached 1e18 by the ninth. The input is brought to unit RMS too, because nothing else bounds
+    what CGFI adds, and large features would outweigh the output of the blocks.
     """
     feats = rms_normalize(feats.astype(jnp.float32))  # pyright: ignore[reportAssignmentType]
     mixed = Mixer(config).apply({"params": params}, feats, positions, inside, view_valid)

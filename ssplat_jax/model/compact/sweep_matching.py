@@ -1,4 +1,4 @@
-"""Plane sweep and cost-volume U-Net: P_i(k | u), what the chunk alone says of depth (Sec. 3.3; ALGORITHM 2.5-2.7)."""
+"""Plane sweep and cost-volume U-Net of the compact network: P_i(k | u) from the chunk alone (Sec. 3.3)."""
 
 import flax.linen as nn
 import jax
@@ -6,27 +6,35 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.geometry.sampling import correlate_warped, places_of
+from ssplat_jax.geometry.sampling import bilinear_taps, correlate_warped
+from ssplat_jax.model.compact.compact_features import CompactFeatures
 from ssplat_jax.model.convolution import Conv
-from ssplat_jax.model.layers import UNet, average_pool, unit_features
+from ssplat_jax.model.layers import UNet, average_pool
 from ssplat_jax.model.plane_sweep import sweep_pixels
-from ssplat_jax.model.types import GRID_STRIDE, DepthBelief, Features, Views, nearest_sources
+from ssplat_jax.model.types import GRID_STRIDE, DepthDistribution, Views, nearest_sources
+from ssplat_jax.numerics import safe_normalize
 
 
-def plane_sweep(features: Features, views: Views, config: StreamConfig) -> Float[Array, "v hf wf dl"]:
-    """Mean cosine of each cell with its source views at every candidate, coarse then (if configured) fine.
+def unit_features(x: Float[Array, "*b c"]) -> Float[Array, "*b c"]:
+    """Features of unit length, whose dot products are cosines; zero stays zero."""
+    return safe_normalize(x, eps=1e-6)
 
-    Views outside the image, behind the source camera or padded do not count; a cell that no source sees scores 0.
+
+def plane_sweep(features: CompactFeatures, views: Views, config: StreamConfig) -> Float[Array, "v hf wf dl"]:
+    """Cost volume: mean cosine of each cell with its source views at every candidate, at one or two scales.
+
+    The mean is over the valid source views that see the candidate.
 
     Limits:
-        Without parallax (equal centers, a pure rotation) a pair of views scores all candidates that it sees alike.
-        Zero features score 0, equal ones 1.
+        A candidate that no source sees scores 0.
+        Without parallax (equal centers, a pure rotation), a pair of views gives all candidates that it sees one score.
+        Zero features score 0, equal features 1.
     """
     v, hf, wf = views.inside.shape
     maps = [(GRID_STRIDE, unit_features(features.grid), unit_features(features.grid))]
     if config.network.fine_matching:
         fine = unit_features(features.fine)
-        # A cell's center is the corner between 2 x 2 fine pixels: their mean is the bilinear sample there.
+        # A cell's center is the common corner of 2 x 2 fine pixels: their mean is the bilinear sample there.
         maps.append((GRID_STRIDE // 2, unit_features(average_pool(features.fine, 2)), fine))
     sources, source_valid = nearest_sources(views.viewmats, views.valid, config.network.num_sources)
 
@@ -36,9 +44,9 @@ def plane_sweep(features: Features, views: Views, config: StreamConfig) -> Float
         seen = seen & is_valid
         scores = []
         for stride, reference_map, source_map in maps:
-            places = places_of(x / stride - 0.5, y / stride - 0.5, *source_map.shape[1:3])
+            taps = bilinear_taps(x / stride - 0.5, y / stride - 0.5, *source_map.shape[1:3])
             flat_reference = reference_map[reference].reshape(-1, reference_map.shape[-1])
-            score = correlate_warped(flat_reference, source_map[source], places)
+            score = correlate_warped(flat_reference, source_map[source], taps)
             scores.append(jnp.where(seen, score, 0.0))
         return jnp.stack(scores), seen.astype(jnp.float32)
 
@@ -52,7 +60,7 @@ def plane_sweep(features: Features, views: Views, config: StreamConfig) -> Float
 
 
 class CostVolume(nn.Module):
-    """U-Net over [cost, context]; the logits start as the scaled cost, so that an untrained network already matches."""
+    """U-Net over [cost, context]. Logits start as the scaled cost, so that an untrained network already matches."""
 
     config: StreamConfig
 
@@ -70,7 +78,7 @@ class CostVolume(nn.Module):
 
     def __call__(
         self, cost: Float[Array, "v hf wf dl"], context: Float[Array, "v hf wf c"], view_valid: Bool[Array, " v"]
-    ) -> DepthBelief:
+    ) -> DepthDistribution:
         v, hf, wf, _ = cost.shape
         levels = self.log_temperatures.shape[0]
         scaled = cost.reshape(v, hf, wf, levels, -1) * jnp.exp(self.log_temperatures)[:, None]
@@ -78,11 +86,11 @@ class CostVolume(nn.Module):
         y = self.unet(nn.gelu(self.enter_norm(self.enter(x))), view_valid)
         decoder = self.leave(y) + self.skip(x)
         logits = scaled.sum(axis=3) + self.head2(nn.gelu(self.head1(decoder)))
-        return DepthBelief(probs=jax.nn.softmax(logits, axis=-1), logits=logits, decoder=decoder)
+        return DepthDistribution(probs=jax.nn.softmax(logits, axis=-1), logits=logits, decoder=decoder)
 
 
-def match(params, features: Features, views: Views, config: StreamConfig) -> DepthBelief:
-    """P_i(k | u) by plane sweep, U-Net and softmax, in float32 whatever the features' precision."""
+def match(params, features: CompactFeatures, views: Views, config: StreamConfig) -> DepthDistribution:
+    """P_i(k | u) by plane sweep, U-Net and softmax, in float32 for features of any float dtype."""
     features = jax.tree.map(lambda x: x.astype(jnp.float32), features)
     cost = plane_sweep(features, views, config)
     return CostVolume(config).apply({"params": params}, cost, features.context, views.valid)  # pyright: ignore[reportReturnType]

@@ -1,4 +1,4 @@
-"""Token features before the history is injected (Sec. 3.3; ReSplat's regressor)."""
+"""Token features of the compact network, before history is injected (Sec. 3.3)."""
 
 import flax.linen as nn
 import jax
@@ -6,16 +6,17 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ssplat_jax.config import StreamConfig
+from ssplat_jax.model.compact.compact_features import CompactFeatures
 from ssplat_jax.model.convolution import Conv, pixel_unshuffle
 from ssplat_jax.model.layers import rms_normalize
-from ssplat_jax.model.types import GRID_STRIDE, AnchoredDepth, DepthBelief, Features, Views
+from ssplat_jax.model.types import GRID_STRIDE, AnchoredDepth, DepthDistribution, Views
 
 MIN_LOG_RANGE = 1e-3
-"""A sweep narrower than this (a single candidate, near = far) gives a hint near 0, not 0 / 0."""
+"""Lower bound of the range that log depths are divided by, for a single candidate and near = far."""
 
 
 class TokenRegressor(nn.Module):
-    """[patch, depth, match probability, context, decoder features] to f; patch and probability go in a second time."""
+    """Maps [patch, depth, match probability, context, decoder features] to f, with a skip for patch and probability."""
 
     config: StreamConfig
 
@@ -28,20 +29,25 @@ class TokenRegressor(nn.Module):
 
 
 def regress_tokens(
-    params, features: Features, belief: DepthBelief, depth: AnchoredDepth, views: Views, config: StreamConfig
+    params,
+    features: CompactFeatures,
+    distribution: DepthDistribution,
+    depth: AnchoredDepth,
+    views: Views,
+    config: StreamConfig,
 ) -> Float[Array, "v hf wf c"]:
-    """f^v(u): what the current views say about each token, of unit RMS.
+    """Token features f^v(u) of the current views, of unit RMS.
 
-    What follows is residual and ends in a norm: nothing else would hold the size of f, and what CGFI and the mixer add
-    would drown in large features. All that enters has about that size too: colors and confidence are few channels
-    beside many.
+    The following stages are residual and end in a norm, so nothing else would bound f, and large features would
+    outweigh what CGFI and the mixer add. The inputs have about unit size too: colors and confidence are few channels
+    among many.
 
-    The depth enters as a constant: it is trained through the positions it gives, not through this hint.
+    Depth and confidence enter as constants: depth is trained through positions only.
     """
     low, high = views.log_candidates[0], views.log_candidates[-1]
     relative = (jax.lax.stop_gradient(depth.log_depths)[..., None] - low) / jnp.maximum(high - low, MIN_LOG_RANGE)
     match = 4.0 * (jax.lax.stop_gradient(depth.anchored_confidences)[..., None] - 0.75)
     patches = 4.0 * pixel_unshuffle(views.images - 0.5, GRID_STRIDE)
-    context, decoder = (rms_normalize(x.astype(jnp.float32)) for x in (features.context, belief.decoder))
+    context, decoder = (rms_normalize(x.astype(jnp.float32)) for x in (features.context, distribution.decoder))
     feats = TokenRegressor(config).apply({"params": params}, patches, relative, match, context, decoder)
     return rms_normalize(feats)  # pyright: ignore[reportArgumentType]

@@ -1,6 +1,4 @@
-"""ReSplat's network, which the paper builds on, a stage a file. Parameters have the names of its PyTorch modules."""
-
-from typing import ClassVar
+"""ReSplat's network, which the paper builds on. One stage per file; parameters are named as its PyTorch modules."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -11,14 +9,14 @@ from ssplat_jax.model.resplat.cost_volume import CostVolume, match
 from ssplat_jax.model.resplat.encoder import WIDTHS, Encoder, encode
 from ssplat_jax.model.resplat.head import GaussianHead, read_shapes
 from ssplat_jax.model.resplat.mixer import Mixer, mix_tokens
-from ssplat_jax.model.resplat.swin_layers import ReSplatFeatures
+from ssplat_jax.model.resplat.resplat_features import ReSplatFeatures
 from ssplat_jax.model.resplat.tokens import TokenRegressor, regress_tokens
 from ssplat_jax.model.resplat.upsampler import Upsampler, refine_depth
 from ssplat_jax.model.resplat.vit import VITS, grid_size
 
 
 def stages(config: StreamConfig) -> dict:
-    """Linen module and example inputs of every stage that has parameters."""
+    """Linen module and example inputs of every stage."""
     v, side, stride = 2, config.network.size_multiple, config.network.match_stride
     c, mono_width = config.network.token_width, VITS[config.network.vit][0]
     at = lambda stride, channels: jnp.zeros((v, side // stride, side // stride, channels))  # noqa: E731
@@ -42,14 +40,13 @@ def stages(config: StreamConfig) -> dict:
 
 
 def bound_history(feats: Float[Array, "v hf wf c"]) -> Float[Array, "v hf wf c"]:
-    """`feats` at unit RMS: this network's features have any size, and injected ones are stored again."""
+    """`feats` at unit RMS, because features of this network have no bound."""
     return rms_normalize(feats)
 
 
 class ResplatNetwork:
     """The stages of ReSplat's network; fulfils `ssplat_jax.model.network.Network`."""
 
-    matcher_stages: ClassVar[tuple[str, ...]] = ("encoder", "cost_volume", "upsampler")
     stages = staticmethod(stages)
     encode = staticmethod(encode)
     match = staticmethod(match)

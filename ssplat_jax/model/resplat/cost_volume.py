@@ -1,4 +1,4 @@
-"""Plane sweep and cost-volume U-Net: P_i(k | u), what the chunk alone says of depth (Sec. 3.3; ALGORITHM 2.5-2.7)."""
+"""Plane sweep and cost-volume U-Net of ReSplat's network: P_i(k | u) from the chunk alone (Sec. 3.3)."""
 
 import flax.linen as nn
 import jax
@@ -6,42 +6,68 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.geometry.sampling import correlate_warped, places_of
+from ssplat_jax.geometry.cameras import invert_poses, pixel_grid, unproject
+from ssplat_jax.geometry.sampling import bilinear_taps, correlate_warped
 from ssplat_jax.model.convolution import Conv, HalvingConv
 from ssplat_jax.model.layers import attend
-from ssplat_jax.model.plane_sweep import sweep_pixels, upstream_sweep_pixels
-from ssplat_jax.model.resplat.swin_layers import EdgeConv, ReSplatFeatures, resize
-from ssplat_jax.model.types import DepthBelief, Views, nearest_sources
+from ssplat_jax.model.plane_sweep import MIN_SOURCE_DEPTH, sweep_pixels
+from ssplat_jax.model.resplat.resplat_features import ReSplatFeatures
+from ssplat_jax.model.resplat.torch_layers import EdgePaddedConv, group_norm, resize
+from ssplat_jax.model.types import DepthDistribution, Views, nearest_sources
 
 WIDTH = 128
+"""Channels of the U-Net."""
 HEADS = 4
+"""Heads of the joint attention."""
+
+
+def upstream_sweep_pixels(
+    views: Views, reference, source, stride: int
+) -> tuple[Float[Array, "d n"], Float[Array, "d n"]]:
+    """`sweep_pixels` as DepthSplat's code computes it: x and y in samples of the maps, without a visibility test.
+
+    Cells are taken at their upper left corners. DepthSplat also uses the intrinsics of `reference` for both views; that
+    is not repeated here, since the published weights do not need it.
+    """
+    height, width = (side // stride for side in views.images.shape[1:3])
+    exact = jax.lax.Precision.HIGHEST
+    K, source_K = views.Ks[jnp.stack([reference, source])] * jnp.array([1.0 / stride, 1.0 / stride, 1.0])[:, None]
+    corners = pixel_grid(height, width, 1).reshape(-1, 2) - 0.5
+    rays = unproject(corners, jnp.ones(len(corners)), K)
+    pose = jnp.matmul(views.viewmats[source], invert_poses(views.viewmats[reference]), precision=exact)
+    rotated = jnp.einsum("ij,nj->in", pose[:3, :3], rays, precision=exact)
+    points = jnp.exp(views.log_candidates)[None, :, None] * rotated[:, None] + pose[:3, 3, None, None]
+    x, y, w = jnp.einsum("ij,jdn->idn", source_K, points, precision=exact)
+    w = jnp.maximum(w, MIN_SOURCE_DEPTH)
+    return x / w, y / w
 
 
 def plane_sweep(features: ReSplatFeatures, views: Views, config: StreamConfig) -> Float[Array, "v hm wm d"]:
-    """Mean scaled product of each cell with its source views at every candidate.
+    """Cost volume: mean scaled dot product of each cell with its source views at every candidate.
 
-    Views outside the image, behind the source camera or padded do not count; a cell that no source sees scores 0. With
-    `upstream_compat` all sources count, what they do not see as 0, and pixels are taken for their corners.
+    The mean is over the valid source views that see the candidate. With `upstream_compat` it is over all valid sources,
+    with 0 for those that do not see it, and cells are taken at their corners.
 
     Limits:
-        Without parallax (equal centers, a pure rotation) a pair of views scores all candidates that it sees alike.
+        A candidate that no source sees scores 0.
+        Without parallax (equal centers, a pure rotation), a pair of views gives all candidates that it sees one score.
     """
     v, hm, wm, c = features.multiview.shape
     sources, source_valid = nearest_sources(views.viewmats, views.valid, config.network.num_sources)
-    # A sample beyond the border is mixed with the zeros of a frame around the map.
-    framed = jnp.pad(features.multiview, ((0, 0), (1, 1), (1, 1), (0, 0)))
+    # Samples outside the map are interpolated with zeros.
+    padded = jnp.pad(features.multiview, ((0, 0), (1, 1), (1, 1), (0, 0)))
 
     def correlate_pair(pair):
         reference, source, is_valid = pair
         flat_reference = features.multiview[reference].reshape(-1, c)
         if config.network.upstream_compat:
             x, y = jax.lax.stop_gradient(upstream_sweep_pixels(views, reference, source, config.network.match_stride))
-            places = places_of(x + 1, y + 1, hm + 2, wm + 2)
-            return correlate_warped(flat_reference, framed[source], places), jnp.broadcast_to(is_valid, x.shape)
+            taps = bilinear_taps(x + 1, y + 1, hm + 2, wm + 2)
+            return correlate_warped(flat_reference, padded[source], taps), jnp.broadcast_to(is_valid, x.shape)
         x, y, seen = jax.lax.stop_gradient(sweep_pixels(views, reference, source, config.network.match_stride))
-        places = places_of(x / config.network.match_stride - 0.5, y / config.network.match_stride - 0.5, hm, wm)
+        taps = bilinear_taps(x / config.network.match_stride - 0.5, y / config.network.match_stride - 0.5, hm, wm)
         seen = seen & is_valid
-        return jnp.where(seen, correlate_warped(flat_reference, features.multiview[source], places), 0.0), seen
+        return jnp.where(seen, correlate_warped(flat_reference, features.multiview[source], taps), 0.0), seen
 
     num_sources = sources.shape[1]
     pairs = (jnp.repeat(jnp.arange(v), num_sources), sources.reshape(-1), source_valid.reshape(-1))
@@ -53,40 +79,39 @@ def plane_sweep(features: ReSplatFeatures, views: Views, config: StreamConfig) -
 
 
 class ResBlock(nn.Module):
-    """GroupNorm - SiLU - conv twice; the last convolution starts at zero."""
+    """Residual block: twice GroupNorm - SiLU - conv. The last convolution starts at zero."""
 
     @nn.compact
     def __call__(self, x):
-        norm = lambda name: nn.GroupNorm(8, epsilon=1e-5, use_fast_variance=False, name=name)  # noqa: E731
-        y = Conv(WIDTH, name="in_layers_2")(nn.silu(norm("in_layers_0")(x)))
-        y = nn.silu(norm("out_layers_0")(y))
+        y = Conv(WIDTH, name="in_layers_2")(nn.silu(group_norm("in_layers_0")(x)))
+        y = nn.silu(group_norm("out_layers_0")(y))
         y = Conv(WIDTH, kernel_init=nn.initializers.zeros, name="out_layers_3")(y)
         return (x if x.shape[-1] == WIDTH else Conv(WIDTH, 1, name="skip_connection")(x)) + y
 
 
 class JointAttention(nn.Module):
-    """Self-attention over the cells of all views of the chunk together."""
+    """Residual self-attention over the cells of all views of a chunk."""
 
     @nn.compact
     def __call__(self, x: Float[Array, "v h w c"], view_valid: Bool[Array, " v"]) -> Float[Array, "v h w c"]:
         v, h, w, c = x.shape
-        normed = nn.GroupNorm(8, epsilon=1e-5, use_fast_variance=False, name="norm")(x)  # view by view
+        normed = group_norm("norm")(x)  # per view, though attention is over all views
         qkv = nn.Dense(3 * c, name="qkv")(normed).reshape(1, v * h * w, HEADS, 3, c // HEADS)
         allowed = jnp.repeat(view_valid, h * w)[None, None]
         mixed = attend(qkv[..., 0, :], qkv[..., 1, :], qkv[..., 2, :], allowed).reshape(v, h, w, c)
         return x + nn.Dense(c, kernel_init=nn.initializers.zeros, name="proj_out")(mixed)
 
 
-class Shrink(nn.Module):
-    """To half the size."""
+class Downsample(nn.Module):
+    """Convolution to half the size."""
 
     @nn.compact
     def __call__(self, x):
         return HalvingConv(WIDTH, name="op")(x)
 
 
-class Grow(nn.Module):
-    """To twice the size."""
+class Upsample(nn.Module):
+    """Nearest-neighbor upsampling to twice the size, then a convolution."""
 
     @nn.compact
     def __call__(self, x):
@@ -94,7 +119,7 @@ class Grow(nn.Module):
 
 
 class UNet(nn.Module):
-    """Three levels of equal width, joint attention at the lowest; blocks are numbered as upstream does."""
+    """U-Net of three levels with equal width and joint attention at the lowest. Blocks have upstream's numbers."""
 
     @nn.compact
     def __call__(self, x, view_valid):
@@ -102,28 +127,27 @@ class UNet(nn.Module):
         joint = lambda name: JointAttention(name=name)  # noqa: E731
         x = Conv(WIDTH, name="input_blocks_0_0")(x)
         skips = [x]
-        for i, shrinks in enumerate((False, True, False, True, False), 1):
-            x = (Shrink(name=f"input_blocks_{i}_0") if shrinks else res(f"input_blocks_{i}_0"))(x)
+        for i, is_downsample in enumerate((False, True, False, True, False), 1):
+            x = (Downsample(name=f"input_blocks_{i}_0") if is_downsample else res(f"input_blocks_{i}_0"))(x)
             x = joint(f"input_blocks_{i}_1")(x, view_valid) if i == 5 else x
             skips.append(x)
         x = res("middle_block_2")(res("middle_block_0")(x))
         for i in range(6):
             x = res(f"output_blocks_{i}_0")(jnp.concatenate([x, skips.pop()], axis=-1))
             x = joint(f"output_blocks_{i}_1")(x, view_valid) if i < 2 else x
-            x = Grow(name={1: "output_blocks_1_2", 3: "output_blocks_3_1"}[i])(x) if i in (1, 3) else x
-        norm = nn.GroupNorm(8, epsilon=1e-5, use_fast_variance=False, name="out_0")
-        return Conv(WIDTH, name="out_2")(nn.silu(norm(x)))
+            x = Upsample(name={1: "output_blocks_1_2", 3: "output_blocks_3_1"}[i])(x) if i in (1, 3) else x
+        return Conv(WIDTH, name="out_2")(nn.silu(group_norm("out_0")(x)))
 
 
 class CostVolume(nn.Module):
-    """U-Net over [cost, CNN, multi-view and monocular features], and the logits of the candidates."""
+    """U-Net over [cost, CNN features, multi-view features, monocular features] to logits of the candidates."""
 
     config: StreamConfig
 
     @nn.compact
     def __call__(
         self, cost: Float[Array, "v hm wm d"], features: ReSplatFeatures, view_valid: Bool[Array, " v"]
-    ) -> DepthBelief:
+    ) -> DepthDistribution:
         _, hm, wm, _ = cost.shape
         mono = resize(
             features.mono[-1], hm * self.config.network.match_stride // 8, wm * self.config.network.match_stride // 8
@@ -131,16 +155,16 @@ class CostVolume(nn.Module):
         mono = resize(mono, hm, wm)
         x = jnp.concatenate([cost, features.cnn[-1], features.multiview, mono], axis=-1)
         y = Conv(WIDTH, name="regressor_0_0")(x)
-        y = nn.GroupNorm(8, epsilon=1e-5, use_fast_variance=False, name="regressor_0_1")(y)
+        y = group_norm("regressor_0_1")(y)
         y = UNet(name="regressor_0_3")(nn.gelu(y, approximate=False), view_valid)
         y = Conv(WIDTH, name="regressor_0_4")(y)
         decoder = y + Conv(WIDTH, 1, name="regressor_residual_0")(x)
-        hidden = nn.gelu(EdgeConv(2 * WIDTH, name="depth_head_0_0")(decoder), approximate=False)
-        logits = EdgeConv(self.config.network.num_depths, name="depth_head_0_2")(hidden)
-        return DepthBelief(probs=jax.nn.softmax(logits, axis=-1), logits=logits, decoder=decoder)
+        hidden = nn.gelu(EdgePaddedConv(2 * WIDTH, name="depth_head_0_0")(decoder), approximate=False)
+        logits = EdgePaddedConv(self.config.network.num_depths, name="depth_head_0_2")(hidden)
+        return DepthDistribution(probs=jax.nn.softmax(logits, axis=-1), logits=logits, decoder=decoder)
 
 
-def match(params, features: ReSplatFeatures, views: Views, config: StreamConfig) -> DepthBelief:
-    """P_i(k | u) on the match grid by plane sweep, U-Net and softmax, in float32."""
+def match(params, features: ReSplatFeatures, views: Views, config: StreamConfig) -> DepthDistribution:
+    """P_i(k | u) on the matching grid by plane sweep, U-Net and softmax, in float32."""
     cost = plane_sweep(features, views, config)
     return CostVolume(config).apply({"params": params}, cost, features, views.valid)  # pyright: ignore[reportReturnType]

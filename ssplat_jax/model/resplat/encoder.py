@@ -1,4 +1,4 @@
-"""Image encoder: CNN, multi-view transformer and ViT (DepthSplat; ALGORITHM 2.2 to 2.4)."""
+"""Image encoder: a CNN, a multi-view transformer and a vision transformer (as in DepthSplat)."""
 
 import flax.linen as nn
 import jax.numpy as jnp
@@ -8,18 +8,22 @@ from jaxtyping import Array, Bool, Float, Int
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.model.convolution import Conv, HalvingConv
 from ssplat_jax.model.layers import ResidualBlock, attend, instance_norm, normalize_images
-from ssplat_jax.model.resplat.swin_layers import ReSplatFeatures
+from ssplat_jax.model.resplat.resplat_features import ReSplatFeatures
+from ssplat_jax.model.resplat.torch_layers import layer_norm
 from ssplat_jax.model.resplat.vit import VisionTransformer
 from ssplat_jax.model.types import Views, nearest_sources
-from ssplat_jax.model.windows import from_windows, in_one_region, sine_positions, to_windows
+from ssplat_jax.model.windows import from_windows, same_region_mask, sine_positions, to_windows
 
 WIDTHS = (64, 96, 128)
+"""Channels of the three CNN levels."""
 NUM_BLOCKS = 6
-FFN_RATIO = 4  # of [source, message]
+"""Blocks of the multi-view transformer."""
+FFN_RATIO = 4
+"""Ratio of the feed-forward width to the width of [input, message]."""
 
 
 class Backbone(nn.Module):
-    """Features of 64, 96 and 128 channels; the last on the match grid, the first at 1/2."""
+    """CNN features at three levels: the first at 1/2 of the image, the last on the matching grid."""
 
     match_stride: int
 
@@ -35,7 +39,7 @@ class Backbone(nn.Module):
 
 
 class AttentionLayer(nn.Module):
-    """One-head attention of windows, LayerNorm after the merge; optionally a feed-forward on [source, message]."""
+    """Residual one-head attention in windows, with an optional feed-forward layer on [input, message]."""
 
     has_ffn: bool = False
 
@@ -43,18 +47,17 @@ class AttentionLayer(nn.Module):
     def __call__(self, x, context, allowed):
         c = x.shape[-1]
         dense = lambda features, name: nn.Dense(features, use_bias=False, name=name)  # noqa: E731
-        norm = lambda name: nn.LayerNorm(epsilon=1e-5, use_fast_variance=False, name=name)  # noqa: E731
         q, k, v = dense(c, "q_proj")(x), dense(c, "k_proj")(context), dense(c, "v_proj")(context)
         message = attend(q[..., None, :], k[..., None, :], v[..., None, :], allowed)[..., 0, :]
-        message = norm("norm1")(dense(c, "merge")(message))
+        message = layer_norm("norm1")(dense(c, "merge")(message))
         if self.has_ffn:
             hidden = dense(FFN_RATIO * 2 * c, "mlp_0")(jnp.concatenate([x, message], axis=-1))
-            message = norm("norm2")(dense(c, "mlp_2")(nn.gelu(hidden, approximate=False)))
+            message = layer_norm("norm2")(dense(c, "mlp_2")(nn.gelu(hidden, approximate=False)))
         return x + message
 
 
 class TransformerBlock(nn.Module):
-    """Attention inside each view, then to the same window of its source views as they came in."""
+    """Attention within each view, then to the same window of its source views as they entered the block."""
 
     @nn.compact
     def __call__(self, windows, sources, together, allowed):
@@ -65,7 +68,7 @@ class TransformerBlock(nn.Module):
 
 
 class Transformer(nn.Module):
-    """Six blocks in windows of a part of the map, every other block shifted by half a window."""
+    """Six blocks of windowed attention; every other block shifts the windows by half a window."""
 
     upstream_compat: bool
 
@@ -74,25 +77,25 @@ class Transformer(nn.Module):
         self, x: Float[Array, "v h w c"], sources: Int[Array, "v s"], source_valid: Bool[Array, "v s"]
     ) -> Float[Array, "v h w c"]:
         _, h, w, c = x.shape
-        parts = num_splits(w)
+        parts = num_windows(w)
         side = (h // parts, w // parts)
         x = x + jnp.tile(sine_positions(*side, c), (parts, parts, 1))
         cells = side[0] * side[1]
         for i in range(NUM_BLOCKS):
             shift = (side[0] // 2, side[1] // 2) if i % 2 else (0, 0)
-            together = in_one_region(h, w, side, shift)
+            together = same_region_mask(h, w, side, shift)
             seen = jnp.repeat(source_valid, cells, axis=1)[:, None, None]
             windows = to_windows(jnp.roll(x, (-shift[0], -shift[1]), axis=(1, 2)), side)
-            allowed = seen & self.of_sources(together, sources.shape[1])
+            allowed = seen & self.source_mask(together, sources.shape[1])
             windows = TransformerBlock(name=f"layers_{i}")(windows, sources, together, allowed)
             x = jnp.roll(from_windows(windows, side, h, w), shift, axis=(1, 2))
         return x
 
-    def of_sources(self, together: Bool[Array, "1 n q k"], num_sources: int) -> Bool[Array, "1 n q sk"]:
-        """Which keys of all sources a cell may attend to: those of its own region.
+    def source_mask(self, together: Bool[Array, "1 n q k"], num_sources: int) -> Bool[Array, "1 n q sk"]:
+        """Keys of all sources that a cell may attend to: those of its own region.
 
-        Upstream lays the keys cell by cell and the mask source by source: of several sources, shifted windows attend
-        across borders, to half of what they should. Its weights were trained so.
+        Upstream orders keys by cell but the mask by source, so that with several sources the mask of shifted windows
+        selects wrong keys. Its weights were trained with that; `upstream_compat` reproduces it.
         """
         if not self.upstream_compat:
             return jnp.tile(together, num_sources)
@@ -101,13 +104,13 @@ class Transformer(nn.Module):
         return together[..., (cell * num_sources + source) % cells]
 
 
-def num_splits(width: int) -> int:
-    """Windows along a side of a map: more of wide ones (ReSplat)."""
+def num_windows(width: int) -> int:
+    """Windows along each side of a map of that width (ReSplat's rule)."""
     return 2 if width <= 96 else 4 if width <= 192 else 8
 
 
 class Encoder(nn.Module):
-    """Images to the features of all three branches."""
+    """Maps images to the features of all three branches."""
 
     config: StreamConfig
 
@@ -123,6 +126,6 @@ class Encoder(nn.Module):
 
 
 def encode(params, views: Views, config: StreamConfig) -> ReSplatFeatures:
-    """Features of every view, informed by its source views."""
+    """Features of each view, with attention to its source views."""
     sources, source_valid = nearest_sources(views.viewmats, views.valid, config.network.num_sources)
     return Encoder(config).apply({"params": params}, views.images, sources, source_valid)  # pyright: ignore[reportReturnType]

@@ -1,4 +1,4 @@
-"""Gaussian head: a two-layer MLP from a token's feature to its Gaussian (ReSplat; ALGORITHM 3.3)."""
+"""Gaussian head of ReSplat's network: a two-layer MLP from a token's feature to the shape of its Gaussian."""
 
 import flax.linen as nn
 import jax.numpy as jnp
@@ -9,12 +9,12 @@ from ssplat_jax.config import StreamConfig
 from ssplat_jax.model.types import TokenShapes
 
 ROWS = (4, 3, 1, 2)
-"""Rotation (xyzw), scale, opacity, offset in the pixel; then color coefficients. Offsets are not used: a pivot's
-Gaussian stands where its tokens are (ALGORITHM 9.32)."""
+"""Widths of rotation (xyzw), scale, opacity and offset in the output; color coefficients follow. The offset in the
+pixel is not used: a pivot's Gaussian is at the pivot's position."""
 
 
 class GaussianHead(nn.Module):
-    """Feature to raw rotation, scale, opacity, offset and SH residual; all but the rotation zero before training."""
+    """Maps features to raw rotation, scale, opacity, offset and SH residual."""
 
     config: StreamConfig
 
@@ -26,7 +26,7 @@ class GaussianHead(nn.Module):
 
 
 def read_shapes(params, feats: Float[Array, "m c"], config: StreamConfig) -> TokenShapes:
-    """What the head makes of features of any precision, read in float32."""
+    """Shapes predicted from features of any float dtype, in float32."""
     raw = GaussianHead(config).apply({"params": params}, feats.astype(jnp.float32))
     rotation, scale, opacity, _, sh = jnp.split(raw, np.cumsum(ROWS).tolist(), axis=-1)  # pyright: ignore[reportArgumentType]
     return TokenShapes(

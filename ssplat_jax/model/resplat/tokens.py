@@ -1,4 +1,4 @@
-"""Token features before the history comes in (ReSplat; ALGORITHM 3.1)."""
+"""Token features of ReSplat's network, before history is injected."""
 
 import flax.linen as nn
 import jax.numpy as jnp
@@ -6,12 +6,13 @@ from jaxtyping import Array, Float
 
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.model.convolution import Conv, pixel_shuffle, pixel_unshuffle
-from ssplat_jax.model.resplat.swin_layers import ReSplatFeatures, resize
-from ssplat_jax.model.types import GRID_STRIDE, AnchoredDepth, DepthBelief, Views, repeat_cells
+from ssplat_jax.model.resplat.resplat_features import ReSplatFeatures
+from ssplat_jax.model.resplat.torch_layers import resize
+from ssplat_jax.model.types import GRID_STRIDE, AnchoredDepth, DepthDistribution, Views, repeat_cells
 
 
 class TokenRegressor(nn.Module):
-    """[patch, depth, match probability, features] to f; patch, features and probability go in a second time."""
+    """Maps [patch, depth, match probability, context] to f, with a skip for all but the depth."""
 
     config: StreamConfig
 
@@ -25,17 +26,22 @@ class TokenRegressor(nn.Module):
 
 
 def token_context(features: ReSplatFeatures, height: int, width: int) -> Float[Array, "v hf wf c"]:
-    """All that the encoder saw, on a grid of `height` x `width`: ViT, CNN, multi-view features."""
+    """Encoder features on a grid of `height` x `width` cells: ViT, CNN, multi-view."""
     mono = [pixel_shuffle(resize(x, height // 4, width // 4), 4) for x in features.mono]
     maps = [resize(x, height, width) for x in (*features.cnn, features.multiview)]
     return jnp.concatenate([*mono, *maps], axis=-1)
 
 
 def regress_tokens(
-    params, features: ReSplatFeatures, belief: DepthBelief, depth: AnchoredDepth, views: Views, config: StreamConfig
+    params,
+    features: ReSplatFeatures,
+    distribution: DepthDistribution,
+    depth: AnchoredDepth,
+    views: Views,
+    config: StreamConfig,
 ) -> Float[Array, "v hf wf c"]:
-    """f^v(u): what the current views say about each token."""
-    del belief  # the match probability is that of the depth that is used
+    """Token features f^v(u) of the current views."""
+    del distribution  # the match probability is that of the anchored depth
     _, hf, wf = depth.log_depths.shape
     patches = pixel_unshuffle(views.images, GRID_STRIDE)
     match = repeat_cells(depth.probs.max(axis=-1, keepdims=True), config.network.match_stride // GRID_STRIDE)

@@ -1,4 +1,4 @@
-"""From the match grid to the pixels: a dense prediction head over the ViT adds what the sweep left (ALGORITHM 2.8)."""
+"""Depth upsampler: a dense prediction head (DPT) over ViT features adds a residual to the upsampled depth."""
 
 import flax.linen as nn
 import jax.numpy as jnp
@@ -6,7 +6,8 @@ from jaxtyping import Array, Float
 
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.model.convolution import Conv, HalvingConv
-from ssplat_jax.model.resplat.swin_layers import EdgeConv, GrowingConv, ReSplatFeatures, resize
+from ssplat_jax.model.resplat.resplat_features import ReSplatFeatures
+from ssplat_jax.model.resplat.torch_layers import EdgePaddedConv, TransposedConv, resize
 from ssplat_jax.model.types import (
     GRID_STRIDE,
     AnchoredDepth,
@@ -22,10 +23,11 @@ SIZES = {
     "b": (48, (96, 192, 384, 768)),
     "l": (64, (256, 512, 1024, 1024)),
 }
+"""Widths by size of the vision transformer."""
 
 
 class ResidualUnit(nn.Module):
-    """ReLU - conv twice, residual."""
+    """Residual block: twice ReLU - conv."""
 
     features: int
 
@@ -36,7 +38,7 @@ class ResidualUnit(nn.Module):
 
 
 class Fusion(nn.Module):
-    """A level joins what comes from the coarser ones; the result at the size of the next."""
+    """Fusion of one level with the coarser ones, resized to the next finer level."""
 
     features: int
 
@@ -49,7 +51,7 @@ class Fusion(nn.Module):
 
 
 class Scratch(nn.Module):
-    """The pyramid from four levels to one map of the image's size."""
+    """Fusion of the four-level pyramid to one map of the image's size."""
 
     features: int
 
@@ -60,13 +62,13 @@ class Scratch(nn.Module):
         x = Fusion(self.features, name="refinenet4")(levels[3], None, *sizes[3])
         for i in (2, 1, 0):
             x = Fusion(self.features, name=f"refinenet{i + 1}")(x, levels[i], *sizes[i])
-        x = nn.gelu(EdgeConv(16, name="output_conv_0")(x), approximate=False)
-        x = nn.gelu(EdgeConv(16, name="output_conv_2")(x), approximate=False)
+        x = nn.gelu(EdgePaddedConv(16, name="output_conv_0")(x), approximate=False)
+        x = nn.gelu(EdgePaddedConv(16, name="output_conv_2")(x), approximate=False)
         return Conv(1, 1, name="output_conv_4")(x)
 
 
 class Upsampler(nn.Module):
-    """What to add to the upsampled depth, in the space of the candidates."""
+    """Residual on the upsampled depth, in the space of the candidates."""
 
     config: StreamConfig
 
@@ -78,16 +80,17 @@ class Upsampler(nn.Module):
         mono = [resize(x, height // 8, width // 8) for x in features.mono]
         mono = [Conv(c, 1, name=f"projects_{i}")(x) for i, (x, c) in enumerate(zip(mono, channels, strict=True))]
         levels = [
-            GrowingConv(channels[0], 4, name="resize_layers_0")(mono[0]),
-            GrowingConv(channels[1], 2, name="resize_layers_1")(mono[1]),
+            TransposedConv(channels[0], 4, name="resize_layers_0")(mono[0]),
+            TransposedConv(channels[1], 2, name="resize_layers_1")(mono[1]),
             mono[2],
             HalvingConv(channels[3], name="resize_layers_3")(mono[3]),
         ]
         half, middle, grid = features.cnn
-        before = [[half], [middle], [grid]] if self.config.network.match_stride == 8 else [[half, middle], [grid], []]
-        behind = [features.multiview, depths[..., None]]  # where the match grid's own CNN features are
-        for i, maps in enumerate(before):
-            joined = [*maps, levels[i], *(behind if maps and maps[-1] is grid else [])]
+        cnn_maps = [[half], [middle], [grid]] if self.config.network.match_stride == 8 else [[half, middle], [grid], []]
+        # These join the level that has the matching grid's CNN features.
+        match_maps = [features.multiview, depths[..., None]]
+        for i, maps in enumerate(cnn_maps):
+            joined = [*maps, levels[i], *(match_maps if maps and maps[-1] is grid else [])]
             levels[i] = Conv(channels[i], 1, name=f"concat_projects_{i}")(jnp.concatenate(joined, axis=-1))
         return Scratch(fused, name="scratch")(levels, height, width)[..., 0]
 
@@ -95,7 +98,10 @@ class Upsampler(nn.Module):
 def refine_depth(
     params, features: ReSplatFeatures, depth: AnchoredDepth, views: Views, config: StreamConfig
 ) -> AnchoredDepth:
-    """The depths of the 1/4 grid, from those of the match grid by way of the pixels; confidences of the nearest cell.
+    """Anchored depth on the feature grid.
+
+    Depths go from the matching grid to pixels, where the upsampler's residual is added, and from there to the feature
+    grid. Confidences are those of the matching cell.
 
     Limits:
         Depths stay between the first and the last candidate.
@@ -106,11 +112,11 @@ def refine_depth(
     fine = resize(coarse[..., None], height, width)[..., 0] + residual  # pyright: ignore[reportOperatorIssue]
     ends = to_candidate_space(views.log_candidates[jnp.array([0, -1])], config)
     fine = jnp.exp(from_candidate_space(jnp.clip(fine, ends.min(), ends.max()), config))
-    latent = jnp.log(resize(fine[..., None], height // GRID_STRIDE, width // GRID_STRIDE)[..., 0])
+    log_depths = jnp.log(resize(fine[..., None], height // GRID_STRIDE, width // GRID_STRIDE)[..., 0])
     factor = config.network.match_stride // GRID_STRIDE
     return AnchoredDepth(
         probs=depth.probs,
-        log_depths=latent,
+        log_depths=log_depths,
         matcher_confidences=repeat_cells(depth.matcher_confidences, factor),
         anchored_confidences=repeat_cells(depth.anchored_confidences, factor),
     )

@@ -1,4 +1,4 @@
-"""Monocular branch: a DINOv2 vision transformer as Depth Anything V2 trained it (ALGORITHM 2.4)."""
+"""Monocular branch: a DINOv2 vision transformer, as trained by Depth Anything V2."""
 
 import flax.linen as nn
 import jax.numpy as jnp
@@ -6,58 +6,61 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ssplat_jax.model.layers import attend
-from ssplat_jax.model.resplat.swin_layers import PIXELS_PER_VIT_CELL, Mlp, resize
+from ssplat_jax.model.resplat.torch_layers import Mlp, layer_norm, resize
 
+PIXELS_PER_VIT_CELL = 14
+"""Side of a patch."""
 POSITIONS_SIDE = 37
-"""The position code is of 37 x 37 cells, and one for the class token; other grids resample it."""
-LONGEST_SIDE = 560
-"""Larger images are shrunk to this, in pixels."""
-CUBIC = -0.75
-"""torch's bicubic kernel; JAX's is that of -0.5."""
+"""Cells per side of the trained position code, which is resampled to other grids."""
+MAX_SIDE = 560
+"""Longer side, in pixels, to which larger images are resized."""
+CUBIC_A = -0.75
+"""Parameter of PyTorch's bicubic kernel; JAX's is -0.5."""
 
 VITS = {
-    # width, blocks, heads, blocks that are read
+    # width, blocks, heads, indices of the blocks whose maps are returned
     "s": (384, 12, 6, (2, 5, 8, 11)),
     "b": (768, 12, 12, (2, 5, 8, 11)),
     "l": (1024, 24, 16, (4, 11, 17, 23)),
 }
+"""Layout by size of the vision transformer."""
 
 
 def grid_size(height: int, width: int) -> tuple[int, int]:
-    """Cells of the ViT for an image."""
-    shrink = min(1.0, LONGEST_SIDE / max(height, width))
-    cells = lambda side: max(1, int(side * shrink) // PIXELS_PER_VIT_CELL)  # noqa: E731
+    """Rows and columns of ViT cells for an image of that size."""
+    scale = min(1.0, MAX_SIDE / max(height, width))
+    cells = lambda side: max(1, int(side * scale) // PIXELS_PER_VIT_CELL)  # noqa: E731
     return cells(height), cells(width)
 
 
 def resampled_positions(codes: Float[Array, "1 n c"], height: int, width: int) -> Float[Array, "1 m c"]:
-    """The position code of a grid of `height` x `width` cells.
+    """Position code resampled to a grid of `height` x `width` cells, without the class token's.
 
-    DINOv2 asks torch for the factor (size + 0.1) / 37 and not for the size, and torch places the samples by the factor.
+    DINOv2 gives PyTorch the scale factor (size + 0.1) / 37 instead of the size; sample positions follow the factor.
     """
     if (height, width) == (POSITIONS_SIDE, POSITIONS_SIDE):
         return codes[:, 1:]
-    rows, columns = _cubic(height), _cubic(width)
+    rows, columns = _cubic_weights(height), _cubic_weights(width)
     grid = codes[0, 1:].reshape(POSITIONS_SIDE, POSITIONS_SIDE, -1)
     return jnp.einsum("ph,hwc,qw->pqc", rows, grid, columns, precision="highest").reshape(1, height * width, -1)
 
 
-def _cubic(wanted: int) -> np.ndarray:
-    """Weights of the 37 samples along one axis in each of `wanted`, the border repeated."""
-    places = (np.arange(wanted) + 0.5) * POSITIONS_SIDE / (wanted + 0.1) - 0.5
-    weights = np.zeros((wanted, POSITIONS_SIDE), np.float32)
+def _cubic_weights(size: int) -> np.ndarray:
+    """Bicubic weights of the trained samples along one axis for `size` resampled ones, with edge padding."""
+    positions = (np.arange(size) + 0.5) * POSITIONS_SIDE / (size + 0.1) - 0.5
+    weights = np.zeros((size, POSITIONS_SIDE), np.float32)
     for tap in range(-1, 3):
-        sample = np.floor(places) + tap
-        t = np.abs(places - sample)
-        inner = (CUBIC + 2) * t**3 - (CUBIC + 3) * t**2 + 1
-        outer = CUBIC * (t**3 - 5 * t**2 + 8 * t - 4)
+        sample = np.floor(positions) + tap
+        t = np.abs(positions - sample)
+        inner = (CUBIC_A + 2) * t**3 - (CUBIC_A + 3) * t**2 + 1
+        outer = CUBIC_A * (t**3 - 5 * t**2 + 8 * t - 4)
         column = np.clip(sample, 0, POSITIONS_SIDE - 1).astype(int)
-        np.add.at(weights, (np.arange(wanted), column), np.where(t <= 1, inner, outer))
+        np.add.at(weights, (np.arange(size), column), np.where(t <= 1, inner, outer))
     return weights
 
 
 class Attention(nn.Module):
-    """Self-attention of the tokens of each view."""
+    """Self-attention among the tokens of each view."""
 
     heads: int
 
@@ -69,7 +72,7 @@ class Attention(nn.Module):
 
 
 class LayerScale(nn.Module):
-    """A learned factor per channel."""
+    """Learned factor per channel."""
 
     @nn.compact
     def __call__(self, x: Float[Array, "*b c"]) -> Float[Array, "*b c"]:
@@ -83,13 +86,13 @@ class Block(nn.Module):
 
     @nn.compact
     def __call__(self, x: Float[Array, "v n c"]) -> Float[Array, "v n c"]:
-        norm = lambda name: nn.LayerNorm(epsilon=1e-6, use_fast_variance=False, name=name)  # noqa: E731
+        norm = lambda name: layer_norm(name, epsilon=1e-6)  # noqa: E731
         x = x + LayerScale(name="ls1")(Attention(self.heads, name="attn")(norm("norm1")(x)))
         return x + LayerScale(name="ls2")(Mlp(name="mlp")(norm("norm2")(x)))
 
 
 class PatchEmbed(nn.Module):
-    """Each 14 x 14 patch to a token."""
+    """Projection of each 14 x 14 patch to a token."""
 
     features: int
 
@@ -101,7 +104,7 @@ class PatchEmbed(nn.Module):
 
 
 class VisionTransformer(nn.Module):
-    """Normalized images to the maps of four of its blocks."""
+    """Maps normalized images to the outputs of four blocks."""
 
     size: str
 
@@ -116,7 +119,7 @@ class VisionTransformer(nn.Module):
         x = PatchEmbed(width, name="patch_embed")(small) + resampled_positions(codes, rows, columns)  # pyright: ignore
         first = jnp.broadcast_to(class_token + codes[:, :1], (x.shape[0], 1, width))  # pyright: ignore
         x = jnp.concatenate([first, x], axis=1)
-        norm = nn.LayerNorm(epsilon=1e-6, use_fast_variance=False, name="norm")
+        norm = layer_norm("norm", epsilon=1e-6)
         maps = []
         for i in range(num_blocks):
             x = Block(heads, name=f"blocks_{i}")(x)

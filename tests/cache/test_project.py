@@ -1,4 +1,4 @@
-"""The projection against its NumPy oracle, and ALGORITHM.md section 12, point 6."""
+"""The projection equals the NumPy reference and sees the front surface of each pixel."""
 
 import functools
 import importlib
@@ -7,62 +7,29 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from ssplat_jax.cache import VoxelCache, coarser, init_cache, project
+from ssplat_jax.cache import coarsen, init_cache, project
 from ssplat_jax.cache import numpy_reference as reference
-from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.pytree import replace
+from tests.cache.projection_scenes import (
+    DECISION_MARGIN,
+    DEPTHS,
+    SEED,
+    SETTINGS,
+    cameras,
+    front_camera,
+    scene,
+    with_pivots,
+)
 from tests.cache.streams import CAPACITY, CONFIG, VALUE_RTOL, WIDTH
 
-HEIGHT, GRID_WIDTH = 6, 8
-DECISION_MARGIN = 1e-4  # pixels, log depths: no float32 rounding of the inputs below moves a decision this far
-
 jit_project = jax.jit(project, static_argnums=2)
-LITERAL = CONFIG.replace(cluster_ratio=float("inf"))
+PLAIN_MEAN = CONFIG.replace(cluster_ratio=float("inf"))
 
 
-def cameras(seed: int, num_views: int = 2) -> Camera:
-    """Cameras around (0, 0, -4) that look along +z, with different intrinsics."""
-    rng = np.random.default_rng(seed)
-    viewmats = np.tile(np.eye(4), (num_views, 1, 1))
-    for viewmat in viewmats:
-        q, _ = np.linalg.qr(np.eye(3) + 0.2 * rng.normal(size=(3, 3)))
-        viewmat[:3, :3] = q * np.sign(np.diagonal(q))
-        viewmat[:3, 3] = rng.uniform(-0.3, 0.3, 3) + np.array([0, 0, 4])
-    Ks = np.tile([[9.0, 0, 4.3], [0, 8.0, 2.8], [0, 0, 1]], (num_views, 1, 1)) * rng.uniform(
-        0.9, 1.1, (num_views, 1, 1)
-    )
-    Ks[:, 2, 2] = 1
-    return Camera(
-        viewmats=jnp.asarray(viewmats, jnp.float32), Ks=jnp.asarray(Ks, jnp.float32), width=GRID_WIDTH, height=HEIGHT
-    )
-
-
-def scene(seed: int, num_voxels: int, depth_spread: float) -> VoxelCache:
-    """A cache of random pivots about the origin, `depth_spread` deep, crowded on few pixels."""
-    rng = np.random.default_rng(seed)
-    cache = init_cache(CONFIG, CAPACITY)
-    k = CONFIG.memory.pivots_per_voxel
-    counts = np.where(np.arange(CAPACITY) < num_voxels, rng.integers(1, k + 1, CAPACITY), 0)
-    alive = np.arange(k) < counts[:, None]
-    means = rng.uniform(-1, 1, (CAPACITY, k, 3)) * [1.0, 1.0, depth_spread]
-    values = {
-        "means": means * alive[..., None],
-        "confidences": rng.choice([0.0, 0.3, 0.5, 1.0], (CAPACITY, k)) * alive,
-        "feats": rng.normal(size=(CAPACITY, k, WIDTH)) * alive[..., None],
-        "rgbs": rng.uniform(size=(CAPACITY, k, 3 * CONFIG.head.gaussians_per_token)) * alive[..., None],
-    }
-    return replace(
-        cache,
-        counts=jnp.asarray(counts, jnp.int32),
-        num_voxels=jnp.asarray(num_voxels, jnp.int32),
-        **{name: jnp.asarray(x, jnp.float32) for name, x in values.items()},
-    )
-
-
-def assert_equal_to_oracle(cache, camera, config):
+def assert_equal_to_reference(cache, camera, config):
     depths, confidences, feats, mask, colors, margin = reference.project(
         reference.from_arrays(cache), camera.viewmats, camera.Ks, camera.height, camera.width, config
     )
@@ -74,47 +41,21 @@ def assert_equal_to_oracle(cache, camera, config):
         np.testing.assert_allclose(getattr(result, name) / scale, wanted / scale, rtol=0, atol=VALUE_RTOL, err_msg=name)
 
 
-SETTINGS = settings(max_examples=60, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
-SEED = st.integers(0, 2**32 - 1)
-DEPTHS = st.sampled_from([0.1, 0.5, 1.0, 6.0])  # 6: some pivots are behind the cameras
-
-
-@pytest.mark.parametrize("config", [CONFIG, LITERAL], ids=["cluster", "plain_mean"])
+@pytest.mark.parametrize("config", [CONFIG, PLAIN_MEAN], ids=["cluster", "plain_mean"])
 @SETTINGS
 @given(scene_seed=SEED, camera_seed=SEED, num_voxels=st.integers(0, CAPACITY), depth_spread=DEPTHS)
-def test_projection_equals_the_loop(config, scene_seed, camera_seed, num_voxels, depth_spread):
-    assert_equal_to_oracle(scene(scene_seed, num_voxels, depth_spread), cameras(camera_seed), config)
+def test_projection_equals_the_reference(config, scene_seed, camera_seed, num_voxels, depth_spread):
+    assert_equal_to_reference(scene(scene_seed, num_voxels, depth_spread), cameras(camera_seed), config)
 
 
 @pytest.mark.slow
 @settings(SETTINGS, max_examples=2000)
 @given(scene_seed=SEED, camera_seed=SEED, num_voxels=st.integers(0, CAPACITY), depth_spread=DEPTHS)
-def test_projection_equals_the_loop_on_2000_scenes(scene_seed, camera_seed, num_voxels, depth_spread):
-    assert_equal_to_oracle(scene(scene_seed, num_voxels, depth_spread), cameras(camera_seed), CONFIG)
+def test_projection_equals_the_reference_on_many_scenes(scene_seed, camera_seed, num_voxels, depth_spread):
+    assert_equal_to_reference(scene(scene_seed, num_voxels, depth_spread), cameras(camera_seed), CONFIG)
 
 
-def with_pivots(means, confidences=None) -> VoxelCache:
-    """A cache of one pivot per row at `means`; features number the pivots."""
-    n = len(means)
-    cache = init_cache(CONFIG, CAPACITY)
-    confidences = np.full(n, 0.5) if confidences is None else confidences
-    return replace(
-        cache,
-        counts=cache.counts.at[:n].set(1),
-        num_voxels=jnp.asarray(n, jnp.int32),
-        means=cache.means.at[:n, 0].set(jnp.asarray(means, jnp.float32)),
-        confidences=cache.confidences.at[:n, 0].set(jnp.asarray(confidences, jnp.float32)),
-        feats=cache.feats.at[:n, 0].set(jnp.arange(1.0, n + 1)[:, None] * jnp.ones(WIDTH)),
-    )
-
-
-def front_camera() -> Camera:
-    """At the origin, looking along +z, principal point in the middle of pixel (3, 4)."""
-    K = jnp.array([[8.0, 0, 4.5], [0, 8.0, 3.5], [0, 0, 1]])
-    return Camera(viewmats=jnp.eye(4)[None], Ks=K[None], width=GRID_WIDTH, height=HEIGHT)
-
-
-def test_single_token_gives_its_depth_and_feature_at_its_pixel_and_zero_elsewhere():
+def test_single_pivot_fills_its_pixel_only():
     result = jit_project(with_pivots([[0.0, 0.0, 2.0]]), front_camera(), CONFIG)
     assert np.argwhere(np.asarray(result.mask)).tolist() == [[0, 3, 4]]
     assert result.depths[0, 3, 4] == pytest.approx(2.0, rel=VALUE_RTOL)
@@ -125,35 +66,35 @@ def test_single_token_gives_its_depth_and_feature_at_its_pixel_and_zero_elsewher
 
 
 @pytest.mark.parametrize("z", [-2.0, 0.0, 0.01])
-def test_token_behind_the_near_plane_is_invisible(z):
+def test_pivot_behind_the_near_plane_is_invisible(z):
     assert not np.any(jit_project(with_pivots([[0.0, 0.0, z]]), front_camera(), CONFIG).mask)
 
 
-def test_token_of_confidence_zero_hides_nothing():
+def test_pivot_of_confidence_zero_occludes_nothing():
     cache = with_pivots([[0.0, 0.0, 1.0], [0.0, 0.0, 3.0]], confidences=[0.0, 0.5])
     assert jit_project(cache, front_camera(), CONFIG).depths[0, 3, 4] == pytest.approx(3.0, rel=VALUE_RTOL)
 
 
-def test_of_two_surfaces_the_front_one_is_seen():
+def test_front_surface_is_seen():
     result = jit_project(with_pivots([[0.0, 0.0, 4.0], [0.0, 0.0, 2.0], [0.0, 0.0, 2.1]]), front_camera(), CONFIG)
     assert result.depths[0, 3, 4] == pytest.approx(np.sqrt(2.0 * 2.1), rel=VALUE_RTOL)  # the mean of logs
     np.testing.assert_allclose(result.feats[0, 3, 4], 2.5, rtol=VALUE_RTOL)
 
 
 def test_plain_mean_mixes_the_surfaces():
-    result = jit_project(with_pivots([[0.0, 0.0, 4.0], [0.0, 0.0, 1.0]]), front_camera(), LITERAL)
+    result = jit_project(with_pivots([[0.0, 0.0, 4.0], [0.0, 0.0, 1.0]]), front_camera(), PLAIN_MEAN)
     assert result.depths[0, 3, 4] == pytest.approx(2.0, rel=VALUE_RTOL)
 
 
-def test_recentring_undoes_the_bias_towards_the_camera():
-    """The nearest of many noisy samples of one surface is far in front of it; the cluster's mean must not be."""
+def test_recentering_removes_the_bias_towards_the_camera():
+    """The nearest of many noisy samples lies far in front of their surface; the cluster's mean must not."""
     rng = np.random.default_rng(0)
     biases = []
     for _ in range(60):
         depths = 2.0 * np.exp(0.05 * rng.normal(size=CAPACITY))
         means = np.stack([np.zeros(CAPACITY), np.zeros(CAPACITY), depths], axis=-1)
         biases.append(float(jit_project(with_pivots(means), front_camera(), CONFIG).depths[0, 3, 4]) / 2.0 - 1.0)
-    assert abs(np.mean(biases)) < 0.005  # ALGORITHM 10.2: -2 % without, under 0.2 % with; 60 x 16 samples give +-0.2 %
+    assert abs(np.mean(biases)) < 0.005  # -2 % without re-centering; 60 x 16 samples give +-0.2 %
 
 
 def test_permuted_pivots_give_the_same_maps():
@@ -167,8 +108,8 @@ def test_permuted_pivots_give_the_same_maps():
         np.testing.assert_allclose(getattr(a, name), getattr(b, name), rtol=0, atol=4 * VALUE_RTOL)
 
 
-def test_walking_in_blocks_changes_nothing(monkeypatch):
-    """Blocks so small that rows and pairs take many, the last of them partly empty."""
+def test_block_size_changes_nothing(monkeypatch):
+    """Blocks so small that rows and pairs take many of them, the last one partly empty."""
     cache, camera = scene(7, CAPACITY - 3, 0.1), cameras(8)
     whole = jit_project(cache, camera, CONFIG)
     module = importlib.import_module("ssplat_jax.cache.project")  # the package's `project` is the function
@@ -180,7 +121,7 @@ def test_walking_in_blocks_changes_nothing(monkeypatch):
         np.testing.assert_allclose(getattr(whole, name), getattr(blocks, name), rtol=0, atol=4 * VALUE_RTOL)
 
 
-def test_the_color_of_a_pixel_is_the_mean_over_parts_and_pivots():
+def test_pixel_color_is_the_mean_over_parts_and_pivots():
     cache = with_pivots([[0.0, 0.0, 2.0], [0.0, 0.0, 2.1]], confidences=[0.75, 0.5])
     parts = np.arange(24.0).reshape(2, 4, 3)  # pivots, parts of a patch, channels
     cache = replace(cache, rgbs=cache.rgbs.at[:2, 0].set(jnp.asarray(parts.reshape(2, 12), jnp.float32)))
@@ -188,7 +129,7 @@ def test_the_color_of_a_pixel_is_the_mean_over_parts_and_pivots():
     np.testing.assert_allclose(jit_project(cache, front_camera(), CONFIG).colors[0, 3, 4], wanted, rtol=VALUE_RTOL)
 
 
-def test_unmatched_exposure_leaves_no_trace_in_the_projection():
+def test_colors_are_projected_only_to_match_exposure():
     cache, camera = with_pivots([[0.0, 0.0, 2.0]]), front_camera()
     for matched in (True, False):
         program = jax.jit(functools.partial(project, config=CONFIG.replace(match_exposure=matched)))
@@ -217,10 +158,10 @@ def test_no_gradient_passes_the_projection():
     assert not any(np.any(np.asarray(g)) for g in grads)
 
 
-def test_a_coarser_cell_is_the_nearest_of_its_cells_whole():
+def test_coarse_cell_equals_its_nearest_fine_cell():
     fine = jit_project(scene(5, CAPACITY, 0.3), cameras(6), CONFIG)
-    assert coarser(fine, 1) is fine
-    coarse = coarser(fine, 2)
+    assert coarsen(fine, 1) is fine
+    coarse = coarsen(fine, 2)
     mask, depths = np.asarray(fine.mask), np.asarray(fine.depths)
     assert 0 < mask.mean() < 1
     for v, i, j in np.ndindex(*coarse.depths.shape):

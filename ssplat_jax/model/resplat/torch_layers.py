@@ -1,4 +1,4 @@
-"""What the stages of this network share: PyTorch's resizing, and convolutions that ours do not have."""
+"""Layers that only ReSplat's network has, computed as in PyTorch."""
 
 import flax.linen as nn
 import jax.numpy as jnp
@@ -6,33 +6,31 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ssplat_jax.model.convolution import conv2d, pixel_shuffle
-from ssplat_jax.pytree import pytree
-
-PIXELS_PER_VIT_CELL = 14
 
 
-@pytree
-class ReSplatFeatures:
-    """What the encoder sees. `m` is the match grid's, `p` the ViT's."""
+def layer_norm(name: str, epsilon: float = 1e-5) -> nn.LayerNorm:
+    """LayerNorm with PyTorch's epsilon and two-pass variance."""
+    return nn.LayerNorm(epsilon=epsilon, use_fast_variance=False, name=name)
 
-    cnn: tuple[Float[Array, "v h2 w2 c1"], Float[Array, "v h3 w3 c2"], Float[Array, "v hm wm c3"]]
-    multiview: Float[Array, "v hm wm c3"]  # after cross-view attention: what the sweep correlates
-    mono: tuple[Float[Array, "v hp wp c4"], ...]  # four depths of the ViT
+
+def group_norm(name: str) -> nn.GroupNorm:
+    """GroupNorm of 8 groups with PyTorch's epsilon and two-pass variance."""
+    return nn.GroupNorm(8, epsilon=1e-5, use_fast_variance=False, name=name)
 
 
 def resize(x: Float[Array, "v h w c"], height: int, width: int) -> Float[Array, "v ho wo c"]:
-    """Bilinear, corner samples on corner samples (torch's `align_corners=True`)."""
-    rows, columns = _between_corners(x.shape[1], height), _between_corners(x.shape[2], width)
+    """Map resized bilinearly with corner samples aligned (PyTorch's `align_corners=True`)."""
+    rows, columns = _resize_weights(x.shape[1], height), _resize_weights(x.shape[2], width)
     return jnp.einsum("ph,vhwc,qw->vpqc", rows, x, columns, precision="highest")
 
 
-def _between_corners(size: int, wanted: int) -> np.ndarray:
-    places = np.linspace(0.0, size - 1.0, wanted)
-    return np.maximum(0.0, 1.0 - np.abs(places[:, None] - np.arange(size))).astype(np.float32)
+def _resize_weights(size: int, new_size: int) -> np.ndarray:
+    positions = np.linspace(0.0, size - 1.0, new_size)
+    return np.maximum(0.0, 1.0 - np.abs(positions[:, None] - np.arange(size))).astype(np.float32)
 
 
-class EdgeConv(nn.Module):
-    """3 x 3 convolution whose padding repeats the border."""
+class EdgePaddedConv(nn.Module):
+    """3 x 3 convolution with edge padding."""
 
     features: int
 
@@ -44,8 +42,8 @@ class EdgeConv(nn.Module):
         return conv2d(padded, kernel, ((0, 0), (0, 0))) + bias  # pyright: ignore
 
 
-class GrowingConv(nn.Module):
-    """Transposed convolution whose stride is its kernel's side: every sample becomes a patch of its own."""
+class TransposedConv(nn.Module):
+    """Transposed convolution with a stride equal to the kernel's side: each sample becomes one patch."""
 
     features: int
     factor: int
@@ -60,7 +58,7 @@ class GrowingConv(nn.Module):
 
 
 class Mlp(nn.Module):
-    """Two layers, four times as wide between."""
+    """Two-layer MLP with a hidden layer four times as wide."""
 
     @nn.compact
     def __call__(self, x: Float[Array, "*b c"]) -> Float[Array, "*b c"]:

@@ -1,0 +1,40 @@
+"""`ssplat bench`: speed and memory on this machine."""
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+
+@dataclasses.dataclass(frozen=True)
+class Bench:
+    """Measure speed and memory on this machine; compared candidates are measured in turns.
+
+    Example: ssplat bench render --json render.json
+    """
+
+    name: Annotated[Literal["render", "stream"], tyro.conf.Positional]
+    """render: the rasterizer. stream: the cache's fuse and projection over long streams."""
+    json: Path | None = None
+    """Write {machine, rows: [{name, value, unit}]} here as well."""
+    against: Path | None = None
+    """render only: another rasterizer's Python file, timed in the same run: one with the functions that
+    docs/performance.md names, as experiments/gsplat_rasterizer.py has them."""
+    scaling: bool = False
+    """render only: also 4k to 1M Gaussians, at four image sizes."""
+    full_hd: bool = False
+    """render only: also 1M Gaussians at 1920 x 1080."""
+
+    def run(self) -> int:
+        from ssplat_jax.benchmarks.suite import run_benchmark
+
+        result = run_benchmark(self.name, against=self.against, scaling=self.scaling, full_hd=self.full_hd)
+        print(result["machine"])
+        for row in result["rows"]:
+            print(f"{row['name']:<44} {row['value']:>14.6g} {row['unit']}")
+        if self.json is not None:
+            from ssplat_jax.storage.json_files import write_json
+
+            write_json(self.json, result)
+        return 0

@@ -1,0 +1,32 @@
+"""`ssplat demo`: an embedded scene, streamed with the shipped weights."""
+
+import dataclasses
+from pathlib import Path
+from typing import Literal
+
+from ssplat_jax.commands.options import QualityOption, QuietOption
+from ssplat_jax.config import QUALITIES
+
+
+@dataclasses.dataclass(frozen=True)
+class Demo:
+    """Stream an embedded procedural scene with the shipped weights and show how the scene improves with more views.
+
+    Writes scene.ply, pictures, metrics.json and (with the `plots` extra) a plot.
+    Example: ssplat demo
+    """
+
+    scene: Literal["room", "orbit", "corridor"] = "room"
+    """Scene to stream."""
+    out: Path = Path("ssplat_demo")
+    """Where the results go."""
+    quality: QualityOption = "accurate"
+    quiet: QuietOption = False
+
+    def run(self) -> int:
+        from ssplat_jax.console import Reporter
+        from ssplat_jax.runs.demo import run_demo
+
+        run_demo(self.scene, self.out, Reporter(self.quiet), QUALITIES[self.quality])
+        print(f"wrote {self.out}/scene.ply, metrics.json and pictures")
+        return 0

@@ -1,0 +1,77 @@
+"""`ssplat eval`: scores of novel views of a capture."""
+
+import dataclasses
+from pathlib import Path
+from typing import Literal
+
+from ssplat_jax.commands.options import (
+    CapturePath,
+    ConfigChanges,
+    LpipsHeads,
+    QualityOption,
+    QuietOption,
+    WeightsOption,
+    load_lpips_weights,
+    load_model,
+    parse_size,
+)
+from ssplat_jax.config import QUALITIES
+
+
+@dataclasses.dataclass(frozen=True)
+class Eval:
+    """Score novel views of a capture: metrics.json and target | render | depth pictures.
+
+    Example: ssplat eval path/to/capture --stride 5 --context 64 --size 320x240 --out runs/eval
+    """
+
+    capture: CapturePath
+    context: int
+    """Context views to stream."""
+    out: Path
+    """Where the results go."""
+    protocol: Literal["interleaved", "paper"] = "interleaved"
+    """interleaved: every 8th frame from the 5th on is a target. paper: targets uniform over the trajectory."""
+    stride: int = 1
+    """Use every STRIDE-th frame."""
+    targets: int | None = None
+    """paper: number of targets, default 16. interleaved: most targets to keep, evenly spread."""
+    size: str | None = None
+    """Image size WxH of the scored views; default the capture's own. --quality sets the streamed size."""
+    quality: QualityOption = "accurate"
+    weights: WeightsOption = "tiny"
+    lpips_vgg: Path | None = None
+    """torchvision's vgg16 state dict (.pth or .npz): with --lpips-heads, LPIPS is scored too."""
+    lpips_heads: LpipsHeads = None
+    set: ConfigChanges = ()
+    quiet: QuietOption = False
+
+    def run(self) -> int:
+        from ssplat_jax.console import Reporter
+        from ssplat_jax.data.capture import open_capture
+        from ssplat_jax.data.split import choose_split
+        from ssplat_jax.evaluation.evaluate import evaluate
+        from ssplat_jax.streaming.session import Session
+
+        lpips_weights = load_lpips_weights(self.lpips_vgg, self.lpips_heads)
+        model, params = load_model(self.weights, self.set)
+        capture = open_capture(self.capture, size=parse_size(self.size))
+        streamed = capture.scaled(QUALITIES[self.quality].scale)
+        split = choose_split(self.protocol, len(capture), self.stride, self.context, self.targets)
+        metrics = evaluate(
+            Session(model, params),
+            capture,
+            split,
+            self.out,
+            Reporter(self.quiet),
+            streamed=streamed,
+            lpips_weights=lpips_weights,
+        )
+        reference = metrics["baselines"]
+        print(
+            f"{capture.name}: PSNR {metrics['psnr']:.2f} dB, SSIM {metrics['ssim']:.3f} over {metrics['target_views']}"
+            f" views (copying the nearest view {reference['nearest_view_psnr']:.2f}, a mean color"
+            f" {reference['mean_color_psnr']:.2f}); {metrics['chunk_ms']['median']:.0f} ms a chunk;"
+            f" {self.out}/metrics.json"
+        )
+        return 0

@@ -1,0 +1,43 @@
+"""`ssplat experiment`: the experiments behind the figures in the documentation."""
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from ssplat_jax.commands.options import QuietOption
+from ssplat_jax.errors import InputError
+
+
+@dataclasses.dataclass(frozen=True)
+class Experiment:
+    """Run one of the experiments behind the figures in the documentation.
+
+    Example: ssplat experiment captures --captures path/to/captures --out runs/captures
+    """
+
+    name: Annotated[str, tyro.conf.Positional]
+    """captures: novel views of real captures. accuracy_vs_time: accuracy against time.
+    ablation: the effect of each module. depth_error: errors of depth, by confidence.
+    more_views: the paper's protocol over growing numbers of views."""
+    out: Path
+    """Folder of the tables, plots and pictures."""
+    captures: Path | None = None
+    """Folder of real captures; some experiments run without."""
+    scale: Literal["smoke", "full"] = "full"
+    """smoke: the same program on as little data as possible."""
+    quiet: QuietOption = False
+
+    def run(self) -> int:
+        from importlib.metadata import entry_points
+
+        from ssplat_jax.console import Reporter
+
+        # The library does not import experiments: ours and others' register as entry points of this group.
+        found = {point.name: point for point in entry_points(group="ssplat_jax.experiments")}
+        if self.name not in found:
+            raise InputError(f"experiment: wanted one of {', '.join(sorted(found))}, got {self.name!r}.")
+        self.out.mkdir(parents=True, exist_ok=True)
+        print(found[self.name].load()(self.captures, self.out, self.scale, Reporter(self.quiet)))
+        return 0

@@ -1,0 +1,36 @@
+"""`ssplat inspect`: facts and warnings about a capture."""
+
+import dataclasses
+from typing import Annotated
+
+import tyro
+
+from ssplat_jax.commands.options import parse_size
+from ssplat_jax.config import preset
+
+
+@dataclasses.dataclass(frozen=True)
+class Inspect:
+    """Show the facts of a capture and how a run would use it: scale, depth range, warnings with remedies.
+
+    Example: ssplat inspect path/to/capture
+    """
+
+    capture: Annotated[str, tyro.conf.Positional]
+    """Folder of a posed capture, or procedural:NAME. Formats: transforms.json (nerfstudio, instant-ngp, Blender,
+    DL3DV); COLMAP (sparse/0 beside images/); ScanNet (color/, pose/, intrinsic/intrinsic_color.txt); TUM RGB-D
+    (rgb.txt, groundtruth.txt); RealEstate10K (its .txt, or the folder of that file and the frames)."""
+    size: str | None = None
+    """Image size WxH; default the capture's own."""
+    json: bool = False
+    """Print JSON instead of a table."""
+
+    def run(self) -> int:
+        from ssplat_jax.console import print_facts
+        from ssplat_jax.data.capture import open_capture
+        from ssplat_jax.data.capture_summary import summarize
+        from ssplat_jax.storage.json_files import json_text
+
+        facts = summarize(open_capture(self.capture, size=parse_size(self.size)), preset("tiny")).to_dict()
+        print(json_text(facts)) if self.json else print_facts(facts)
+        return 0

@@ -1,0 +1,113 @@
+"""Options and helpers that several commands share. Nothing here imports JAX before a command runs."""
+
+import json
+import math
+import re
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from ssplat_jax.config import StreamConfig, preset
+from ssplat_jax.errors import InputError
+
+QualityName = Literal["fast", "balanced", "accurate"]
+
+CapturePath = Annotated[
+    str,
+    tyro.conf.Positional,
+    tyro.conf.arg(help="Folder of a posed capture (formats: ssplat inspect --help), or procedural:NAME."),
+]
+QualityOption = Annotated[
+    QualityName,
+    tyro.conf.arg(help="Accuracy against time: fast and balanced stream smaller images (docs/performance.md)."),
+]
+WeightsOption = Annotated[str, tyro.conf.arg(help="Preset with shipped weights, or a weights file.")]
+ConfigChanges = Annotated[tuple[str, ...], tyro.conf.arg(help="Changes to the configuration, as field=value.")]
+QuietOption = Annotated[bool, tyro.conf.arg(help="Print only the closing line.")]
+LpipsHeads = Annotated[
+    Path | None,
+    tyro.conf.arg(help="VGG16 heads of the `lpips` package (its weights/v0.1/vgg.pth, or .npz)."),
+]
+
+
+def parse_size(text: str | None) -> tuple[int, int] | None:
+    """(width, height) from "WxH".
+
+    Raises:
+        InputError: the text has another form.
+    """
+    if text is None:
+        return None
+    found = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text)
+    if not found:
+        raise InputError(f"--size: wanted WIDTHxHEIGHT in pixels, got {text!r}; for example --size 320x240.")
+    return int(found[1]), int(found[2])
+
+
+def apply_changes(config: StreamConfig, changes: tuple[str, ...]) -> StreamConfig:
+    """`config` with changes given as "field=value"; a value is JSON, or else plain text.
+
+    Raises:
+        InputError: no such field, or a value that the field does not take.
+    """
+    parsed = {}
+    for change in changes:
+        name, equals, text = change.partition("=")
+        if not equals:
+            raise InputError(f"--set: wanted field=value, got {change!r}; for example --set voxel_size=0.02.")
+        try:
+            value = json.loads(text)
+        except json.JSONDecodeError:
+            value = math.inf if text == "inf" else text
+        value = tuple(value) if isinstance(value, list) else value
+        held = config.preset if name == "preset" else config.get(name)
+        # A field that takes a word or a number (scene_scale) holds a word by default; the configuration checks both.
+        if not isinstance(held, str):
+            value = float(value) if isinstance(held, float) and type(value) is int else value
+            if held is not None and type(value) is not type(held):
+                raise InputError(f"--set {name}: wanted a value like {held!r}, got {text!r}.")
+        parsed[name] = value
+    return config.replace(**parsed)
+
+
+def load_model(weights: str, changes: tuple[str, ...]):
+    """(model, params) of a preset's shipped weights, or of a weights file.
+
+    Args:
+        weights: name of a preset, or path of a weights file.
+        changes: changes to the configuration, as "field=value".
+
+    Raises:
+        InputError: no such weights, a bad change, or a change that does not fit the weights.
+    """
+    from ssplat_jax.checkpoint.weights import check_params, load_params, load_weights
+    from ssplat_jax.config import PRESETS
+    from ssplat_jax.streaming.streamsplat import StreamSplat
+
+    if weights in PRESETS:
+        config, params = preset(weights), load_params(weights)
+    elif Path(weights).is_file():
+        params, config = load_weights(Path(weights))
+    else:
+        params, config = load_params(weights), preset("tiny")
+    changed = apply_changes(config, changes)
+    if changed != config:
+        check_params(params, changed, weights)
+    return StreamSplat(changed), params
+
+
+def load_lpips_weights(vgg: Path | None, heads: Path | None):
+    """LPIPS weights from their two files; None if neither is given.
+
+    Raises:
+        InputError: only one is given, or a file has other contents.
+    """
+    if vgg is None and heads is None:
+        return None
+    if vgg is None or heads is None:
+        missing, given = ("--lpips-vgg", "--lpips-heads") if vgg is None else ("--lpips-heads", "--lpips-vgg")
+        raise InputError(f"{given}: wanted {missing} beside it, LPIPS needs both files; got one.")
+    from ssplat_jax.metrics.lpips import load_lpips
+
+    return load_lpips(vgg, heads)

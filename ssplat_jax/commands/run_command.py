@@ -1,0 +1,70 @@
+"""`ssplat run`: a capture streamed into a scene."""
+
+import dataclasses
+import sys
+from pathlib import Path
+
+from ssplat_jax.commands.options import (
+    CapturePath,
+    ConfigChanges,
+    QualityOption,
+    QuietOption,
+    WeightsOption,
+    load_model,
+    parse_size,
+)
+from ssplat_jax.config import QUALITIES
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """Stream a capture into a scene: scene.ply in the capture's frame, pictures, metrics.json. Continues a stopped run.
+
+    Example: ssplat run path/to/capture --stride 5 --size 320x240 --out runs/kitchen
+    """
+
+    capture: CapturePath
+    out: Path
+    """Where the results go; a run that was stopped there is continued."""
+    stride: int = 1
+    """Use every STRIDE-th frame."""
+    max_views: int | None = None
+    """Stop after this many views."""
+    size: str | None = None
+    """Image size WxH; default the capture's own."""
+    quality: QualityOption = "accurate"
+    weights: WeightsOption = "tiny"
+    set: ConfigChanges = ()
+    save_every: int = 8
+    """Chunks between saved states."""
+    overwrite: bool = False
+    """Remove the run in the folder and start anew."""
+    deltas: bool = False
+    """Also write the changes of each chunk, deltas/<views so far>.npz, for `ssplat view` to follow."""
+    quiet: QuietOption = False
+
+    def run(self) -> int:
+        from ssplat_jax.console import Reporter
+        from ssplat_jax.runs.capture_run import run_capture
+
+        model, params = load_model(self.weights, self.set)
+        result = run_capture(
+            model,
+            params,
+            self.capture,
+            self.out,
+            size=parse_size(self.size),
+            scale=QUALITIES[self.quality].scale,
+            stride=self.stride,
+            max_views=self.max_views,
+            save_every=self.save_every,
+            overwrite=self.overwrite,
+            deltas=self.deltas,
+            reporter=Reporter(self.quiet),
+        )
+        if result.interrupted:
+            how = " without --overwrite" if self.overwrite else ""
+            print(f"stopped after {result.num_views} views; the same command{how} continues", file=sys.stderr)
+            return 128 + result.interrupted
+        print(f"wrote {self.out}/scene.ply ({result.num_gaussians} Gaussians from {result.num_views} views)")
+        return 0

@@ -1,0 +1,83 @@
+"""`ssplat train`: training on procedural scenes."""
+
+import dataclasses
+import sys
+from pathlib import Path
+from typing import Literal
+
+from ssplat_jax.commands.options import ConfigChanges, LpipsHeads, QuietOption, apply_changes, load_lpips_weights
+from ssplat_jax.config import preset
+from ssplat_jax.errors import require_positive
+
+
+@dataclasses.dataclass(frozen=True)
+class Train:
+    """Train the network on procedural scenes. Saves regularly and on Ctrl-C, and continues a stopped training.
+
+    Example: ssplat train --out runs/tiny
+    """
+
+    out: Path
+    """Folder of the log, the checkpoints and, at the end, weights.npz."""
+    preset: str = "tiny"
+    """Preset of the configuration."""
+    recipe: Literal["tiny", "stream"] = "tiny"
+    """tiny: trains depth from scratch, as for the shipped weights. stream: trains the stages after depth."""
+    scale_steps: float = 1.0
+    """Factor of the number of steps of every phase."""
+    seed: int = 0
+    """Seed of the initial parameters and of the scenes."""
+    init_weights: Path | None = None
+    """Start from a weights file instead of from random parameters."""
+    lpips_vgg: Path | None = None
+    """torchvision's vgg16 state dict (.pth or .npz): with --lpips-heads, the rendering loss is MSE + 0.05 LPIPS."""
+    lpips_heads: LpipsHeads = None
+    save_every: int = 200
+    """Steps between checkpoints."""
+    set: ConfigChanges = ()
+    quiet: QuietOption = False
+
+    def run(self) -> int:
+        from ssplat_jax.checkpoint.weights import check_params, load_weights, save_weights
+        from ssplat_jax.console import Reporter
+        from ssplat_jax.train.loop import train
+        from ssplat_jax.train.recipe import RECIPES
+
+        require_positive(scale_steps=self.scale_steps, save_every=self.save_every)
+        config = apply_changes(preset(self.preset), self.set)
+        recipe = dataclasses.replace(RECIPES[self.recipe].scaled(self.scale_steps), seed=self.seed)
+        params = None
+        if self.init_weights:
+            params = load_weights(self.init_weights)[0]
+            check_params(params, config, str(self.init_weights))
+        lpips_weights = load_lpips_weights(self.lpips_vgg, self.lpips_heads)
+        reporter = Reporter(self.quiet)
+        with reporter.progress("training", recipe.num_steps) as advance:
+            result = train(
+                config,
+                recipe,
+                self.out,
+                params=params,
+                lpips_weights=lpips_weights,
+                save_every=self.save_every,
+                report=lambda record: advance(record["step"], _describe_record(record)),
+                warn=reporter.warn,
+            )
+        if result.interrupted:
+            print(f"stopped at step {result.step}; the same command continues", file=sys.stderr)
+            return 128 + result.interrupted
+        provenance = {
+            "recipe": dataclasses.asdict(recipe),
+            "steps": result.step,
+            "init_weights": self.init_weights and self.init_weights.name,
+            "rendering_loss": "MSE + 0.05 LPIPS" if lpips_weights else "MSE + image gradients",
+        }
+        save_weights(self.out / "weights.npz", result.state.ema, config, provenance)
+        print(f"wrote {self.out}/weights.npz after {result.step} steps")
+        return 0
+
+
+def _describe_record(record: dict) -> str:
+    """Numbers of a training record that fit beside a progress bar."""
+    shown = {"loss": "loss", "depth_l1": "depth", "psnr": "psnr", "accepted": "accepted"}
+    return "  ".join(f"{label} {record[name]:.3f}" for name, label in shown.items() if name in record)

@@ -1,0 +1,53 @@
+"""Time from a chunk to a novel view."""
+
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ssplat_jax.cache import ensure_capacity
+from ssplat_jax.chunk import Chunk
+from ssplat_jax.geometry.cameras import Camera
+from ssplat_jax.rasterizer import render
+from ssplat_jax.streaming.session import Session, tokens_per_chunk
+
+NUM_CHUNKS = 4
+"""The last chunks of a stream that an evaluation feeds again to the full cache to time them."""
+
+NUM_REPEATS = 3
+"""Measurements per chunk."""
+
+
+def measure_latency(session: Session, chunks: list[Chunk], camera: Camera) -> dict:
+    """Milliseconds from a chunk to a novel view on the full cache, and of the rendering in it.
+
+    Everything is compiled before it is timed, and every result is waited for. The session keeps its cache.
+
+    Returns:
+        `chunk_ms`, with `median` and `p99`, and `render_ms`, the median.
+    """
+    totals, renders = [], []
+    cache, config = session.cache, session.model.config
+    assert cache is not None
+    # Growing happens a few times in a stream's life and is not part of a chunk's cost. Under the policy `error`, too,
+    # the cache grows here: the chunks are fed a second time, which must not fail a stream that fitted.
+    policy = config.replace(overflow="grow") if config.memory.overflow == "error" else config
+    grown = ensure_capacity(cache, policy, tokens_per_chunk(chunks[0], config.network.size_multiple))
+    for chunk in chunks:
+        for repeat in range(NUM_REPEATS + 1):
+            session.cache = jax.block_until_ready(jax.tree.map(jnp.copy, grown))
+            since = time.perf_counter()
+            session.feed(chunk)
+            gaussians = jax.block_until_ready(session.gaussians())
+            decoded = time.perf_counter()
+            jax.block_until_ready(render(gaussians, camera).color)
+            done = time.perf_counter()
+            if repeat:  # the first may compile the renderer for this number of pairs
+                totals.append(1e3 * (done - since))
+                renders.append(1e3 * (done - decoded))
+    session.cache = cache
+    return {
+        "chunk_ms": {"median": round(float(np.median(totals)), 1), "p99": round(float(np.quantile(totals, 0.99)), 1)},
+        "render_ms": round(float(np.median(renders)), 1),
+    }

@@ -1,0 +1,60 @@
+"""Image files of renders: color, depth, and comparisons with a target."""
+
+import io
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from PIL import Image
+
+from ssplat_jax.storage.atomic import write_atomic
+
+_DEPTH_COLORS = np.array(  # near to far, perceptually even, readable in print
+    [(0.99, 0.91, 0.62), (0.97, 0.60, 0.32), (0.80, 0.27, 0.37), (0.47, 0.13, 0.48), (0.13, 0.07, 0.33)], np.float32
+)
+
+
+def color_depth(depth: Float[np.ndarray, "h w"], near: float, far: float) -> Float[np.ndarray, "h w 3"]:
+    """Log depth as color, light near and dark far; black where depth is 0."""
+    position = np.log(np.maximum(depth, 1e-9) / near) / np.log(far / near)
+    stops = np.linspace(0.0, 1.0, len(_DEPTH_COLORS))
+    channels = [np.interp(position, stops, _DEPTH_COLORS[:, c]) for c in range(3)]
+    return np.where(depth[..., None] > 0, np.stack(channels, axis=-1), 0.0).astype(np.float32)
+
+
+def eight_bits(image: Float[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+    """An image in [0, 1] as 8-bit values."""
+    return (np.clip(image, 0.0, 1.0) * 255 + 0.5).astype(np.uint8)
+
+
+def save_image(path: Path, image: Float[np.ndarray, "h w 3"]) -> None:
+    """Writes an image in [0, 1] as an 8-bit file in the format of the suffix.
+
+    Raises:
+        StorageError: the file cannot be written.
+    """
+    encoded = io.BytesIO()
+    Image.fromarray(eight_bits(image)).save(encoded, Image.registered_extensions()[path.suffix])
+    write_atomic(path, encoded.getvalue())
+
+
+def save_comparison(
+    path: Path,
+    target: Float[np.ndarray, "h w 3"],
+    color: Float[np.ndarray, "h w 3"],
+    depth: Float[np.ndarray, "h w"],
+    depth_range: tuple[float, float],
+) -> None:
+    """Writes target | render | depth side by side.
+
+    Args:
+        path: file to write; its suffix names the format.
+        target: image in [0, 1].
+        color: render in [0, 1].
+        depth: depth of the render, 0 where nothing is.
+        depth_range: nearest and farthest depth of the color scale, in the units of `depth`.
+
+    Raises:
+        StorageError: the file cannot be written.
+    """
+    save_image(path, np.concatenate([target, color, color_depth(depth, *depth_range)], axis=1))

@@ -1,0 +1,128 @@
+"""Refinement on the host: many steps, in a few compiled programs, stopped where they no longer help."""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ssplat_jax.errors import InputError
+from ssplat_jax.gaussians import Gaussians
+from ssplat_jax.geometry.cameras import Camera
+from ssplat_jax.rasterizer import render
+from ssplat_jax.rasterizer.render import round_up
+from ssplat_jax.refinement.key_views import KeyViews
+from ssplat_jax.refinement.refine_config import RefineConfig
+from ssplat_jax.refinement.refine_step import (
+    EFFECTS,
+    apply_revision,
+    current_gaussians,
+    init_refinement,
+    refine_step,
+)
+
+PAIRS_MARGIN = 1.25
+"""Capacity for tile intersections over what the fullest key view needs: Gaussians grow while they are refined."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Refinement:
+    """What `refine` did."""
+
+    num_steps: int
+    num_skipped: int  # steps whose gradient was not finite
+    losses: list[float]  # per step, on the pixels that are learned from
+    held_back: list[float]  # per step, on the pixels that are not
+    stopped_early: bool  # the held-back error had stopped falling
+
+
+def refine(
+    gaussians: Gaussians,
+    cameras: Camera,
+    images: Float[Array, "v h w 3"],
+    *,
+    steps: int = 100,
+    exposures: Float[Array, "_ 3"] | None = None,
+    config: RefineConfig | None = None,
+    on_step: Callable[[int, float], None] = lambda step, loss: None,
+) -> tuple[Gaussians, Refinement]:
+    """Gaussians revised by gradient descent on views that show the same scene.
+
+    Works on any Gaussians: a decoded cache, a loaded `.ply`. Rows keep their places, and absent rows stay absent.
+
+    Args:
+        gaussians: the scene.
+        cameras: one batch axis of poses and intrinsics, in the frame of the scene.
+        images: what those cameras saw, in [0, 1].
+        steps: most gradient steps; 0 returns `gaussians` as they are. Each renders one view.
+        exposures: factors from the scene's colors to each view's; default 1.
+        config: learning rates and bounds.
+        on_step: called with the number of steps done and the last loss.
+
+    Returns:
+        The revised scene and what was done. Refinement ends before `steps` where the held-back pixels of a whole round
+        of views are no better than those of the round before.
+
+    Raises:
+        InputError: shapes do not fit, `steps` is negative, or there is no view.
+    """
+    _check(cameras, images, exposures, steps)
+    if steps == 0:
+        return gaussians, Refinement(0, 0, [], [], False)
+    config = config or RefineConfig()
+    key_views = KeyViews.of(cameras, jnp.asarray(images), exposures)
+    state = init_refinement(gaussians)
+    max_pairs = _capacity(gaussians, key_views)
+    losses, held_back, stopped_early = [], [], False
+    for step in range(steps):
+        rate = jnp.float32(config.final_rate ** (step / steps))
+        state, report = _step(config, max_pairs)(state, key_views, rate)
+        losses.append(float(report.loss))
+        held_back.append(float(report.held_back))
+        if int(report.num_overflow):
+            max_pairs = _capacity(apply_revision(state.start, state.revision), key_views)
+        on_step(step + 1, losses[-1])
+        if stopped_early := has_stopped_helping(held_back, key_views.num_slots):
+            break
+    return current_gaussians(state), Refinement(len(losses), int(state.num_skipped), losses, held_back, stopped_early)
+
+
+def has_stopped_helping(held_back: list[float], num_views: int) -> bool:
+    """Whether the last whole round of views has a held-back error no smaller than the round before it."""
+    if len(held_back) < 2 * num_views or len(held_back) % num_views or not any(held_back):
+        return False  # too early to say, or no pixel is held back
+    return float(np.mean(held_back[-num_views:])) >= float(np.mean(held_back[-2 * num_views : -num_views]))
+
+
+@functools.cache
+def _step(config: RefineConfig, max_pairs: int):
+    step = functools.partial(refine_step, config=config, max_pairs=max_pairs)
+    return jax.jit(step, donate_argnums=0)
+
+
+def _capacity(gaussians: Gaussians, key_views: KeyViews) -> int:
+    """Capacity for tile intersections that every key view fits into."""
+    counts = [int(render(gaussians, key_views.camera(i), effects=EFFECTS).num_pairs) for i in _spread(key_views)]
+    return round_up(int(PAIRS_MARGIN * max(counts)))
+
+
+def _spread(key_views: KeyViews, most: int = 8) -> list[int]:
+    """A few views, evenly spread, from which the capacity is estimated."""
+    return sorted({round(i) for i in np.linspace(0, key_views.num_slots - 1, most)})
+
+
+def _check(cameras: Camera, images, exposures, steps: int) -> None:
+    if steps < 0:
+        raise InputError(f"refine: steps must be at least 0, got {steps}.")
+    if cameras.viewmats.ndim != 3 or not len(cameras.viewmats):
+        raise InputError(
+            f"refine: cameras must have one batch axis, viewmats [v 4 4], got {list(cameras.viewmats.shape)}."
+        )
+    wanted = (len(cameras.viewmats), cameras.height, cameras.width, 3)
+    if tuple(images.shape) != wanted:
+        raise InputError(f"refine: images must be {list(wanted)} like the cameras, got {list(images.shape)}.")
+    if exposures is not None and tuple(exposures.shape) != (wanted[0], 3):
+        raise InputError(f"refine: exposures must be {[wanted[0], 3]}, got {list(exposures.shape)}.")

@@ -1,0 +1,92 @@
+"""Paths of the files in a result folder. Their names are written here and nowhere else."""
+
+import dataclasses
+from pathlib import Path
+
+from ssplat_jax.storage.atomic import previous_path
+from ssplat_jax.storage.folders import remove_numbered
+
+
+@dataclasses.dataclass(frozen=True)
+class RunFolder:
+    """The result folder of `ssplat run`, `demo`, `eval` or `render`; each writes some of these files."""
+
+    path: Path
+
+    @property
+    def scene(self) -> Path:
+        """The scene, in the capture's frame."""
+        return self.path / "scene.ply"
+
+    @property
+    def state(self) -> Path:
+        """The saved stream state, from which a stopped run continues."""
+        return self.path / "state.npz"
+
+    @property
+    def metrics(self) -> Path:
+        """The facts and scores of the run as JSON."""
+        return self.path / "metrics.json"
+
+    @property
+    def split(self) -> Path:
+        """The context and target frames of an evaluation."""
+        return self.path / "split.json"
+
+    @property
+    def film(self) -> Path:
+        """The film that `ssplat render --film` writes."""
+        return self.path / "film.mp4"
+
+    @property
+    def deltas(self) -> Path:
+        """The folder with one file of scene changes per chunk."""
+        return self.path / "deltas"
+
+    @property
+    def views(self) -> Path:
+        """The folder with one picture per rendered frame."""
+        return self.path / "views"
+
+    def delta(self, num_views: int) -> Path:
+        """The scene changes of the chunk that brought the stream to `num_views` views."""
+        return self.deltas / f"{num_views:06d}.npz"
+
+    def view(self, i: int) -> Path:
+        """The picture of frame `i`."""
+        return self.views / f"{i:05d}.png"
+
+    def target(self, i: int) -> Path:
+        """The picture of target frame `i` of an evaluation or the demo: target | render | depth."""
+        return self.path / f"view_{i:05d}.png"
+
+    def has_state(self) -> bool:
+        """Whether a state, the newest or the one before it, is saved here."""
+        return self.state.exists() or previous_path(self.state).exists()
+
+    def has_deltas(self) -> bool:
+        """Whether at least one delta is saved here."""
+        return any(self.deltas.glob("*.npz"))
+
+    def delta_files(self) -> list[Path]:
+        """All deltas in stream order; the list is empty if there is no such folder."""
+        return sorted(self.deltas.glob("*.npz"))
+
+    def clear_run(self) -> None:
+        """Removes the run that the folder holds; files of the user stay."""
+        for stale in (self.state, previous_path(self.state), self.scene, self.metrics):
+            stale.unlink(missing_ok=True)
+        self.clear_deltas()
+        self.clear_views()
+
+    def clear_deltas(self) -> None:
+        """Removes all deltas."""
+        remove_numbered(self.deltas, "######.npz")
+
+    def clear_views(self) -> None:
+        """Removes the pictures in `views`."""
+        remove_numbered(self.views, "#####.png")
+
+    def clear_targets(self) -> None:
+        """Removes the pictures of targets."""
+        remove_numbered(self.path, "view_#####.png")

@@ -1,0 +1,82 @@
+"""Streaming the frames of a capture through a session, chunk by chunk, with the exposure of every frame."""
+
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from ssplat_jax.chunk import Chunk
+from ssplat_jax.data.capture import Capture
+from ssplat_jax.data.stream_frame import StreamFrame
+from ssplat_jax.streaming.session import Session
+from ssplat_jax.streaming.streamsplat import ChunkOutput
+
+Exposures = dict[int, Float[np.ndarray, "3"]]
+"""RGB factor per streamed frame that takes the scene's colors to the colors of that frame."""
+
+
+@dataclasses.dataclass(frozen=True)
+class FedChunk:
+    """One chunk after the session has processed it."""
+
+    chunk: Chunk
+    frames: list[int]  # frame numbers of the chunk's valid views, in their order
+    output: ChunkOutput
+
+    @property
+    def exposures(self) -> Exposures:
+        """The exposures of `frames`."""
+        valid = np.asarray(self.output.exposures)[np.asarray(self.chunk.valid)]
+        return dict(zip(self.frames, valid, strict=True))
+
+
+def feed_chunks(session: Session, capture: Capture, order: Sequence[int], frame: StreamFrame) -> Iterator[FedChunk]:
+    """Feeds frames of a capture to a session and yields after each chunk.
+
+    Args:
+        session: the stream; its cache grows in place.
+        capture: where the images come from.
+        order: frame numbers in stream order (`Capture.stream_order`); may be empty.
+        frame: the similarity between the capture's frame and the stream's.
+    """
+    config = session.model.config
+    if len(order) == 0:
+        return
+    num_fed = 0
+    for chunk in capture.chunks(config, order, frame=frame):
+        frames = list(order[num_fed : num_fed + config.stream.chunk_size])
+        num_fed += len(frames)
+        yield FedChunk(chunk, frames, session.feed(chunk))
+
+
+def feed_capture(
+    session: Session,
+    capture: Capture,
+    indices: Sequence[int],
+    frame: StreamFrame,
+    *,
+    num_recent: int = 0,
+    on_chunk: Callable[[int], None] = lambda num_views: None,
+) -> tuple[Exposures, list[Chunk]]:
+    """Feeds all frames `indices` of a capture, in stream order, to a session.
+
+    Args:
+        session: the stream; its cache grows in place.
+        capture: where the images come from.
+        indices: frame numbers, in any order.
+        frame: the similarity between the capture's frame and the stream's.
+        num_recent: how many of the last chunks to return.
+        on_chunk: called after each chunk with the number of views fed so far.
+
+    Returns:
+        The exposures of the frames, and the last `num_recent` chunks.
+    """
+    exposures: Exposures = {}
+    recent: list[Chunk] = []
+    order = capture.stream_order(session.model.config, indices, frame)
+    for fed in feed_chunks(session, capture, order, frame):
+        exposures |= fed.exposures
+        recent = [*recent, fed.chunk][-num_recent:] if num_recent else []
+        on_chunk(len(exposures))
+    return exposures, recent

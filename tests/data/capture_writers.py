@@ -1,0 +1,134 @@
+"""Writers of one small capture in every format that `data.readers` reads.
+
+Rotations are converted with SciPy, which the readers do not use.
+"""
+
+import struct
+
+import numpy as np
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+WIDTH, HEIGHT, NUM_FRAMES = 64, 48, 4
+FX, FY, CX, CY = 50.0, 51.0, 31.0, 25.0
+K = np.array([[FX, 0, CX], [0, FY, CY], [0, 0, 1]])
+COLMAP_IMAGES = ("b 0.jpg", "9.jpg", "10.jpg", "c/1.jpg")  # names with spaces, folders and numbers, unsorted
+IDS = (7, 3, 900, 12)  # COLMAP's ids of the images
+
+
+def poses():
+    """Camera-to-world matrices of a moving and rotating camera."""
+    rotations = Rotation.from_rotvec([[0.1 * i, 0.2 - 0.1 * i, 0.05] for i in range(NUM_FRAMES)])
+    matrices = np.tile(np.eye(4), (NUM_FRAMES, 1, 1))
+    matrices[:, :3, :3] = rotations.as_matrix()
+    matrices[:, :3, 3] = [[0.1 * i, 0.02 * i * i, 0.3] for i in range(NUM_FRAMES)]
+    return matrices
+
+
+def write_image(path, i=0, size=(WIDTH, HEIGHT)):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pixels = np.random.default_rng(i).integers(0, 256, (size[1], size[0], 3), dtype=np.uint8)
+    Image.fromarray(pixels).save(path)
+
+
+def write_depth(path, value):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(np.full((HEIGHT // 2, WIDTH // 2), value, np.uint16)).save(path)
+
+
+def colmap_pose(i):
+    """(quaternion wxyz, translation) of the world-to-camera transform."""
+    worldtocam = np.linalg.inv(poses()[i])
+    x, y, z, w = Rotation.from_matrix(worldtocam[:3, :3]).as_quat()
+    return (w, x, y, z), tuple(worldtocam[:3, 3])
+
+
+def write_colmap_images(root, folder="images", size=(WIDTH, HEIGHT)):
+    for i, name in enumerate(COLMAP_IMAGES):
+        write_image(root / folder / name, i, size)
+
+
+def write_colmap_text(root, *, camera=f"1 PINHOLE {WIDTH} {HEIGHT} {FX} {FY} {CX} {CY}", sparse="sparse/0"):
+    write_colmap_images(root)
+    (root / sparse).mkdir(parents=True, exist_ok=True)
+    (root / sparse / "cameras.txt").write_text(f"# a comment\n{camera}\n")
+    lines = ["# IMAGE_ID, QW ...", "# POINTS2D"]
+    for i in (2, 0, 3, 1):
+        quat, translation = colmap_pose(i)
+        # Two 2D points, one of them with a 3D point; one image has none.
+        points = "1.5 2.5 -1 3.5 4.5 17" if i else ""
+        pose = " ".join(repr(float(x)) for x in (*quat, *translation))
+        lines += [f"{IDS[i]} {pose} 1 {COLMAP_IMAGES[i]}", points]
+    (root / sparse / "images.txt").write_text("\n".join(lines) + "\n")
+
+
+def camera_bytes(model, params, camera=1, size=(WIDTH, HEIGHT)):
+    return struct.pack(f"<IiQQ{len(params)}d", camera, model, *size, *params)
+
+
+def write_colmap_binary(root, cameras=None, sparse="sparse/0"):
+    write_colmap_images(root)
+    (root / sparse).mkdir(parents=True, exist_ok=True)
+    cameras = [camera_bytes(1, (FX, FY, CX, CY))] if cameras is None else cameras
+    (root / sparse / "cameras.bin").write_bytes(struct.pack("<Q", len(cameras)) + b"".join(cameras))
+    data = struct.pack("<Q", NUM_FRAMES)
+    for i in (2, 0, 3, 1):
+        quat, translation = colmap_pose(i)
+        data += struct.pack("<I7dI", IDS[i], *quat, *translation, 1) + COLMAP_IMAGES[i].encode() + b"\0"
+        data += struct.pack("<Q", i) + i * struct.pack("<ddq", 1.5, 2.5, -1)
+    (root / sparse / "images.bin").write_bytes(data)
+
+
+def matrix_text(matrix):
+    return "\n".join(" ".join(repr(float(x)) for x in row) for row in matrix) + "\n"
+
+
+def write_scannet(root):
+    for i, pose in enumerate(poses()):
+        write_image(root / "color" / f"{9 + i}.jpg", i)
+        write_depth(root / "depth" / f"{9 + i}.png", 1500)
+        (root / "pose").mkdir(exist_ok=True)
+        (root / "pose" / f"{9 + i}.txt").write_text(matrix_text(pose))
+    (root / "intrinsic").mkdir()
+    intrinsics = np.eye(4)
+    intrinsics[:3, :3] = K
+    (root / "intrinsic" / "intrinsic_color.txt").write_text(matrix_text(intrinsics))
+
+
+def tum_line(time, pose):
+    x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat()
+    return f"{time:.4f} " + " ".join(repr(float(v)) for v in (*pose[:3, 3], x, y, z, w))
+
+
+def write_tum(root):
+    images, depths, truth = ["# color images"], [], ["# ground truth"]
+    for i, pose in enumerate(poses()):
+        time = 1305031102.25 + i / 30
+        write_image(root / "rgb" / f"{time:.6f}.png", i)
+        write_depth(root / "depth" / f"{i}.png", 7500)
+        images.append(f"{time:.6f} rgb/{time:.6f}.png")
+        depths.append(f"{time + 0.01:.6f} depth/{i}.png")
+        truth.append(f"{time:.6f} " + tum_line(0, pose).split(maxsplit=1)[1])
+    truth[2:4] = truth[3:1:-1]  # unsorted
+    (root / "rgb.txt").write_text("\n".join(images))
+    (root / "depth.txt").write_text("\n".join(depths))
+    (root / "groundtruth.txt").write_text("\n".join(truth))
+    (root / "calibration.txt").write_text(f"{FX} {FY} {CX - 0.5} {CY - 0.5}\n")
+
+
+def write_realestate(root):
+    lines = ["https://www.youtube.com/watch?v=0123456789a"]
+    for i, pose in enumerate(poses()):
+        write_image(root / "0a1b" / f"{90000 + 33367 * i}.png", i)
+        row = (FX / WIDTH, FY / HEIGHT, CX / WIDTH, CY / HEIGHT, 0, 0, *np.linalg.inv(pose)[:3].reshape(-1))
+        lines.append(f"{90000 + 33367 * i} " + " ".join(repr(float(x)) for x in row))
+    (root / "0a1b.txt").write_text("\n".join(lines))
+
+
+WRITERS = {
+    "COLMAP": write_colmap_binary,
+    "COLMAP text": write_colmap_text,
+    "ScanNet": write_scannet,
+    "TUM RGB-D": write_tum,
+    "RealEstate10K": write_realestate,
+}

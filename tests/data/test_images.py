@@ -1,0 +1,111 @@
+"""Decoding and resizing of images and depth maps."""
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from ssplat_jax.data.capture import open_capture
+from ssplat_jax.data.images import Crop
+from tests.badinputs.cases import HEIGHT, WIDTH, make_capture
+from tests.data.capture_fixture import resized, smooth_capture
+
+EIGHT_BITS = 0.5 / 255
+SIZES = [(64, 48), (32, 24), (32, 32), (24, 48), (100, 20), (63, 47), (128, 96)]
+
+
+def test_depth_is_meters_from_millimeters_and_zero_is_unknown(tmp_path):
+    def change(root, meta):
+        depth = np.full((HEIGHT, WIDTH), 1500, np.uint16)
+        depth[0, 0], depth[0, 1] = 0, 65535
+        Image.fromarray(depth).save(root / "d.png")
+        meta["frames"][2]["depth_file_path"] = "d.png"
+
+    capture = open_capture(make_capture(tmp_path / "c", change))
+    depth = capture.depth(2)
+    assert capture.depth(1) is None and depth is not None
+    np.testing.assert_allclose([depth[0, 0], depth[0, 1], depth[5, 5]], [0, 65.535, 1.5], rtol=1e-6)
+
+
+@pytest.mark.parametrize("mode", ["RGB", "L", "P", "RGBA", "CMYK", "I;16", "1"])
+def test_every_kind_of_image_becomes_rgb(tmp_path, mode):
+    """A uniform gray of 60 % is decoded from every mode; transparent pixels are composited over black."""
+    value = 153
+    if mode == "I;16":
+        stored, wanted = Image.fromarray(np.full((HEIGHT, WIDTH), 39321, np.uint16)), 0.6
+    elif mode == "RGBA":
+        stored, wanted = Image.new("RGBA", (WIDTH, HEIGHT), (value, value, value, 51)), 0.6 * 0.2
+    elif mode == "1":
+        stored, wanted = Image.new("1", (WIDTH, HEIGHT), 1), 1.0
+    else:
+        stored, wanted = Image.new("RGB", (WIDTH, HEIGHT), (value,) * 3).convert(mode), 0.6
+
+    def change(root, meta):
+        stored.save(root / "images" / "2.tif")
+        meta["frames"][2]["file_path"] = "images/2.tif"
+
+    image = open_capture(make_capture(tmp_path / "c", change)).image(2)
+    assert image.shape == (HEIGHT, WIDTH, 3) and image.dtype == np.float32
+    np.testing.assert_allclose(image, wanted, atol=3 * EIGHT_BITS)
+
+
+def test_exif_orientation_is_not_applied(tmp_path):
+    """Intrinsics refer to the stored pixels."""
+
+    def change(root, meta):
+        exif = Image.Exif()
+        exif[0x0112] = 6
+        image = Image.new("RGB", (WIDTH, HEIGHT), (255, 0, 0))
+        image.paste((0, 0, 255), (0, 0, WIDTH // 2, HEIGHT))
+        image.save(root / "images" / "2.jpg", exif=exif, quality=95)
+
+    image = open_capture(make_capture(tmp_path / "c", change)).image(2)
+    assert image[HEIGHT // 2, 5, 2] > 0.9 and image[HEIGHT // 2, -5, 0] > 0.9
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_a_point_moves_to_where_its_color_moves(size):
+    """The image holds its own pixel coordinates, so pixels must agree with the intrinsics."""
+    capture = smooth_capture()
+    small = resized(capture, *size)
+    old, new = capture.K(0), small.K(0)
+    image = small.image(0)
+    assert image.shape == (size[1], size[0], 3)
+    columns, rows = np.meshgrid(np.arange(size[0]) + 0.5, np.arange(size[1]) + 0.5)
+    rays = np.stack([(columns - new[0, 2]) / new[0, 0], (rows - new[1, 2]) / new[1, 1]], -1)
+    stored = rays * [old[0, 0], old[1, 1]] + old[:2, 2]
+    inner = (
+        slice(size[1] // 5, -(size[1] // 5)),
+        slice(size[0] // 5, -(size[0] // 5)),
+    )  # not the border
+    shown = image[..., :2] * [64, 48]
+    np.testing.assert_allclose(shown[inner], stored[inner], rtol=0, atol=0.05)  # pixels; half a pixel would be 0.5
+    depth = small.depth(0)
+    assert depth is not None and depth.shape == image.shape[:2]
+    np.testing.assert_allclose(depth, 1 + stored[..., 0] / 64, rtol=0, atol=0.51 / 64 * (1 + 1e-5))
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_the_crop_is_centered_and_covers_the_size(size):
+    crop = Crop.cover((64, 48), size)
+    corners = [crop.left, crop.top, crop.left + size[0] / crop.scale, crop.top + size[1] / crop.scale]
+    np.testing.assert_allclose([corners[0] + corners[2], corners[1] + corners[3]], [64, 48], rtol=1e-14)
+    assert corners[0] >= -1e-12 and corners[1] >= -1e-12 and min(crop.left, crop.top) < 1e-12
+
+
+def test_the_stored_size_leaves_pixels_unchanged(tmp_path):
+    root = make_capture(tmp_path / "c")
+    with Image.open(root / "images" / "1.jpg") as stored:
+        wanted = np.asarray(stored, np.float32) / 255
+    np.testing.assert_array_equal(open_capture(root).image(1), wanted)
+    np.testing.assert_array_equal(open_capture(root, size=(WIDTH, HEIGHT)).image(1), wanted)
+
+
+def test_depth_maps_of_another_resolution_are_resized(tmp_path):
+    def change(root, meta):
+        depth = np.repeat(np.arange(1, WIDTH // 2 + 1, dtype=np.uint16)[None] * 100, HEIGHT // 2, axis=0)
+        Image.fromarray(depth).save(root / "d.png")
+        meta["frames"][0]["depth_file_path"] = "d.png"
+
+    depth = open_capture(make_capture(tmp_path / "c", change)).depth(0)
+    assert depth is not None and depth.shape == (HEIGHT, WIDTH)
+    np.testing.assert_allclose(depth[3, :6], [0.1, 0.1, 0.2, 0.2, 0.3, 0.3], rtol=1e-6)

@@ -1,0 +1,198 @@
+"""The transforms.json reader: conventions, defaults, odd files, notes for the user."""
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from ssplat_jax.data.capture import open_capture
+from ssplat_jax.data.posed_image import check_camtoworld
+from ssplat_jax.errors import InputError
+from tests.badinputs.cases import HEIGHT, WIDTH, make_capture, rotated
+
+
+def test_poses_become_opencv_and_keep_their_frame(tmp_path):
+    """OpenGL looks along -z with +y up: the center is kept, the second and third axes are negated."""
+    opengl = rotated(30.0)
+    opengl[:3, 3] = [1.0, 2.0, 3.0]
+
+    def change(root, meta):
+        meta["frames"][1]["transform_matrix"] = opengl.tolist()
+        meta["applied_transform"] = [[0, 1, 0, 5], [1, 0, 0, 5], [0, 0, -1, 5]]
+
+    pose = open_capture(make_capture(tmp_path / "c", change)).frames[1].camtoworld
+    np.testing.assert_array_equal(pose[:, 3], opengl[:, 3])
+    np.testing.assert_allclose(pose[:3, 0], opengl[:3, 0], atol=1e-15)
+    np.testing.assert_allclose(pose[:3, 1:3], -opengl[:3, 1:3], atol=1e-15)
+
+
+def test_frames_stream_in_natural_order(tmp_path):
+    def change(root, meta):
+        for i, name in enumerate(("10", "9", "2b", "2a")):
+            (root / "images" / f"{i}.jpg").rename(root / "images" / f"{name}.jpg")
+            meta["frames"][i]["file_path"] = f"images/{name}.jpg"
+
+    names = [frame.name for frame in open_capture(make_capture(tmp_path / "c", change)).frames]
+    assert names == ["images/2a.jpg", "images/2b.jpg", "images/9.jpg", "images/10.jpg"]
+
+
+def test_a_frames_own_intrinsics_come_first(tmp_path):
+    capture = open_capture(make_capture(tmp_path / "c", lambda root, meta: meta["frames"][2].update(fl_x=70.0, cx=10)))
+    np.testing.assert_array_equal(capture.K(2), [[70, 0, 10], [0, 51, 25], [0, 0, 1]])
+    np.testing.assert_array_equal(capture.K(1), [[50, 0, 31], [0, 51, 25], [0, 0, 1]])
+
+
+def test_blender_angles_and_missing_extensions_are_read(tmp_path):
+    def change(root, meta):
+        for name in ("fl_x", "fl_y", "cx", "cy", "w", "h"):
+            del meta[name]
+        meta["camera_angle_x"] = 2 * np.arctan(0.5)
+        for frame in meta["frames"]:
+            frame["file_path"] = frame["file_path"].removesuffix(".jpg")
+
+    capture = open_capture(make_capture(tmp_path / "c", change))
+    wanted = [[WIDTH, 0, WIDTH / 2], [0, WIDTH, HEIGHT / 2], [0, 0, 1]]
+    np.testing.assert_allclose(capture.K(0), wanted, rtol=1e-14)
+
+
+def test_a_file_of_any_name_and_odd_file_names_are_read(tmp_path):
+    def change(root, meta):
+        (root / "images" / "1.jpg").rename(root / "images" / "Küche 1.JPG")
+        meta["frames"][1]["file_path"] = "images/Küche 1"
+
+    root = make_capture(tmp_path / "c", change)
+    (root / "transforms.json").rename(root / "transforms_train.json")
+    capture = open_capture(root / "transforms_train.json")
+    assert len(capture) == 4 and capture.name == "c" and capture.format == "transforms.json"
+    capture.verify()
+
+
+def test_byte_order_mark_and_crlf_are_read(tmp_path):
+    root = make_capture(tmp_path / "c")
+    text = json.dumps(json.loads((root / "transforms.json").read_text()), indent=1)
+    (root / "transforms.json").write_bytes(b"\xef\xbb\xbf" + text.replace("\n", "\r\n").encode())
+    assert len(open_capture(root)) == 4
+
+
+def test_a_pose_almost_a_rotation_is_projected_and_reported(tmp_path):
+    def change(root, meta):
+        meta["frames"][1]["transform_matrix"][0][1] = 5e-4
+
+    capture = open_capture(make_capture(tmp_path / "c", change))
+    rotation = capture.frames[1].camtoworld[:3, :3]
+    np.testing.assert_allclose(rotation.T @ rotation, np.eye(3), rtol=0, atol=1e-14)
+    assert np.abs(rotation - np.diag([1.0, -1, -1])).max() < 5e-4
+    assert len(capture.notes) == 1 and "1 poses" in capture.notes[0]
+
+
+def test_three_rows_are_a_pose():
+    pose, deviation = check_camtoworld(rotated(20.0)[:3].tolist(), "here")
+    np.testing.assert_allclose(pose, rotated(20.0), atol=1e-15)
+    assert deviation < 1e-15
+
+
+def test_small_distortion_is_ignored_and_reported(tmp_path):
+    capture = open_capture(make_capture(tmp_path / "c", lambda root, meta: meta.update(k1=0.01)))
+    assert 0.1 < capture.frames[0].distortion_px < 0.5
+    assert "distortion" in capture.notes[0]
+
+
+def test_shrunk_images_shrink_their_intrinsics(tmp_path):
+    """In nerfstudio's images_2 the file still describes the full size."""
+    full = open_capture(make_capture(tmp_path / "a"))
+    names = ("w", "h", "fl_x", "fl_y", "cx", "cy")
+
+    def describe_twice_the_size(root, meta):
+        meta.update({name: 2 * value for name, value in zip(names, (WIDTH, HEIGHT, *intrinsics(full)), strict=True)})
+
+    shrunk = open_capture(make_capture(tmp_path / "b", describe_twice_the_size))
+    np.testing.assert_allclose(shrunk.frames[1].K, full.frames[1].K, rtol=1e-12)
+    assert (shrunk.width, shrunk.height) == (WIDTH, HEIGHT) and "0.5 times" in shrunk.notes[0]
+
+
+def test_downscaled_folders_replace_missing_images(tmp_path):
+    root = make_capture(tmp_path / "c")
+    (root / "images").rename(root / "images_4")
+    capture = open_capture(root)
+    assert {frame.path.parent.name for frame in capture.frames if frame.path} == {"images_4"}
+
+    def dotted(root, meta):
+        (root / "images").rename(root / "images_4")
+        meta["frames"] = [frame | {"file_path": f"./{frame['file_path']}"} for frame in meta["frames"]]
+
+    capture = open_capture(make_capture(tmp_path / "dotted", dotted))
+    assert {frame.path.parent.name for frame in capture.frames if frame.path} == {"images_4"}
+
+
+def test_a_principal_point_far_off_the_center_is_reported(tmp_path):
+    def describe(root, meta):
+        meta.pop("w"), meta.pop("h")
+        meta.update(cx=0.9 * WIDTH, cy=0.5 * HEIGHT)
+
+    capture = open_capture(make_capture(tmp_path / "c", describe))
+    assert any("principal point lies 40% of a side off" in note for note in capture.notes)
+    assert not any("principal point" in note for note in open_capture(make_capture(tmp_path / "centered")).notes)
+
+
+def test_a_null_depth_map_means_none(tmp_path):
+    def describe(root, meta):
+        meta["frames"][0]["depth_file_path"] = None
+
+    assert open_capture(make_capture(tmp_path / "c", describe)).frames[0].depth_path is None
+
+
+def test_a_vanishing_angle_of_view_is_refused(tmp_path):
+    def describe(root, meta):
+        meta.pop("fl_x", None), meta.pop("fl_y", None)
+        meta["camera_angle_x"] = 5e-324
+
+    with pytest.raises(InputError, match="an angle in"):
+        open_capture(make_capture(tmp_path / "c", describe))
+
+
+@pytest.mark.parametrize("turned", [False, True], ids=["landscape", "portrait"])
+def test_the_longer_side_determines_the_shrink_factor(tmp_path, turned):
+    """1087 / 8 is rounded down to 135; the ratio of the short sides would be too inexact for the long side."""
+    wanted, stored = ((1087, 1920), (135, 240)) if turned else ((1920, 1087), (240, 135))
+
+    def describe(root, meta):
+        for path in (root / "images").iterdir():
+            Image.new("RGB", stored).save(path)
+        meta.update(w=wanted[0], h=wanted[1], fl_x=1500.0, fl_y=1500.0, cx=wanted[0] / 2, cy=wanted[1] / 2)
+
+    capture = open_capture(make_capture(tmp_path / "c", describe))
+    np.testing.assert_allclose(intrinsics(capture)[:2], 1500 / 8)
+
+
+def intrinsics(capture):
+    K = capture.frames[0].K
+    return K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+
+
+def test_names_without_an_order_keep_the_order_of_the_file(tmp_path):
+    """The camera path decides about the order for random names, or all left images before all right ones."""
+
+    def rename(root, meta):
+        for name, entry, x in zip("cadb", meta["frames"], range(4), strict=False):
+            path = root / entry["file_path"]
+            entry["file_path"] = f"images/{name}{path.suffix}"
+            path.rename(root / entry["file_path"])
+            entry["transform_matrix"][0][3] = float(x)
+
+    def names(capture):
+        return [frame.name[7] for frame in capture.frames]
+
+    told = open_capture(make_capture(tmp_path / "d", rename))
+    assert names(told) == list("cadb")
+    assert any("file's order" in note for note in told.notes)
+
+
+def test_rotations_of_three_decimals_are_rotations():
+    for degrees in range(0, 180, 7):
+        check_camtoworld(np.round(rotated(float(degrees)) @ tilted(degrees / 3), 3).tolist(), "here")
+
+
+def tilted(degrees):
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    return np.array([[1, 0, 0, 0], [0, c, -s, 0], [0, s, c, 0], [0, 0, 0, 1.0]])

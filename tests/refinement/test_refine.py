@@ -1,0 +1,214 @@
+"""Laws of gradient refinement, on a small scene whose truth is known."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ssplat_jax.errors import InputError
+from ssplat_jax.gaussians import Gaussians, mask_gaussians
+from ssplat_jax.geometry.cameras import Camera
+from ssplat_jax.metrics.psnr_ssim import psnr
+from ssplat_jax.pytree import replace
+from ssplat_jax.rasterizer import render
+from ssplat_jax.refinement import KeyViews, RefineConfig, current_gaussians, init_refinement, refine, refine_step
+from ssplat_jax.refinement.refine import has_stopped_helping
+from ssplat_jax.refinement.refine_step import held_back_pixels, next_view, sizes
+
+NUM, WIDTH, HEIGHT, NUM_VIEWS, MAX_PAIRS = 48, 24, 16, 4, 1 << 12
+CONFIG = RefineConfig(held_back=0.0, shown_weight=0.0)  # the scene stands before black
+FIELDS = ("means", "quats", "scales", "opacities", "sh")
+
+
+def scene(seed: int = 0) -> Gaussians:
+    """Blobs in front of the cameras, a third of the rows absent."""
+    random = np.random.default_rng(seed)
+    gaussians = Gaussians.from_rgb(
+        means=jnp.asarray(random.uniform((-1.2, -0.8, 2.0), (1.2, 0.8, 4.0), (NUM, 3)), jnp.float32),
+        quats=jnp.asarray(random.normal(size=(NUM, 4)), jnp.float32),
+        scales=jnp.asarray(random.uniform(0.1, 0.4, (NUM, 3)), jnp.float32),
+        opacities=jnp.asarray(random.uniform(0.2, 0.9, NUM), jnp.float32),
+        colors=jnp.asarray(random.uniform(0.1, 0.9, (NUM, 3)), jnp.float32),
+    )
+    return mask_gaussians(gaussians, jnp.arange(NUM) % 3 > 0)
+
+
+def cameras(shifts=(0.0, 0.15, -0.15, 0.3)) -> Camera:
+    """Cameras side by side that look along +z."""
+    viewmats = np.tile(np.eye(4, dtype=np.float32), (len(shifts), 1, 1))
+    viewmats[:, 0, 3] = shifts
+    K = np.array([[20.0, 0, WIDTH / 2], [0, 20.0, HEIGHT / 2], [0, 0, 1]], np.float32)
+    return Camera(
+        viewmats=jnp.asarray(viewmats), Ks=jnp.asarray(np.tile(K, (len(shifts), 1, 1))), width=WIDTH, height=HEIGHT
+    )
+
+
+@functools.cache
+def photographs():
+    """What the cameras see of the true scene."""
+    color = render(scene(), cameras(), max_pairs=MAX_PAIRS).color
+    assert color is not None
+    return color
+
+
+def doubtful() -> Gaussians:
+    """The true scene with wrong colors, sizes and places."""
+    true, random = scene(), np.random.default_rng(1)
+    noise = lambda size: jnp.asarray(random.normal(size=size), jnp.float32)  # noqa: E731
+    return replace(
+        true,
+        means=true.means + 0.05 * noise((NUM, 3)),
+        scales=true.scales * jnp.exp(0.2 * noise((NUM, 3))),
+        sh=true.sh + 0.4 * noise((NUM, 1, 3)),
+    )
+
+
+def key_views(images=None, exposures=None) -> KeyViews:
+    return KeyViews.of(cameras(), photographs() if images is None else images, exposures)
+
+
+STEP = jax.jit(refine_step, static_argnames=("config", "max_pairs"))
+
+
+def step(state, views, rate=1.0, config=CONFIG):
+    return STEP(state, views, jnp.float32(rate), config=config, max_pairs=MAX_PAIRS)
+
+
+def assert_same_bits(a: Gaussians, b: Gaussians) -> None:
+    for name in FIELDS:
+        np.testing.assert_array_equal(np.asarray(getattr(a, name)), np.asarray(getattr(b, name)), err_msg=name)
+
+
+def test_zero_steps_return_the_scene_bit_for_bit():
+    refined, report = refine(doubtful(), cameras(), photographs(), steps=0)
+    assert_same_bits(refined, doubtful())
+    assert report.num_steps == 0 and report.losses == []
+
+
+def test_a_learning_rate_of_zero_changes_no_bit():
+    state, _ = step(init_refinement(doubtful()), key_views(), rate=0.0)
+    assert_same_bits(current_gaussians(state), doubtful())
+
+
+def test_refinement_gains_on_a_view_never_shown():
+    unseen = cameras(shifts=(0.08,))
+    truth = np.asarray(render(scene(), unseen).color)[0]
+    before = psnr(np.asarray(render(doubtful(), unseen).color)[0], truth)
+    refined, report = refine(doubtful(), cameras(), photographs(), steps=60, config=CONFIG)
+    after = psnr(np.asarray(render(refined, unseen).color)[0], truth)
+    assert after > before + 3.0
+    assert np.mean(report.losses[-4:]) < 0.6 * np.mean(report.losses[:4])
+    assert report.num_steps == 60 and report.num_skipped == 0
+
+
+def test_absent_rows_keep_every_bit():
+    refined, _ = refine(doubtful(), cameras(), photographs(), steps=8, config=CONFIG)
+    absent = np.asarray(doubtful().opacities) == 0
+    assert absent.any() and (np.asarray(refined.opacities)[absent] == 0).all()
+    for name in FIELDS:
+        kept, given = (np.asarray(getattr(g, name))[absent] for g in (refined, doubtful()))
+        np.testing.assert_array_equal(kept, given, err_msg=name)
+
+
+def test_scan_equals_the_loop():
+    views, rates = key_views(), jnp.linspace(1.0, 0.3, 5)
+    body = functools.partial(refine_step, config=CONFIG, max_pairs=MAX_PAIRS)
+    scanned, _ = jax.jit(lambda s: jax.lax.scan(lambda c, r: body(c, views, r), s, rates))(init_refinement(doubtful()))
+    looped = init_refinement(doubtful())
+    for rate in rates:
+        looped, _ = step(looped, views, rate)
+    for a, b in zip(jax.tree.leaves(scanned), jax.tree.leaves(looped), strict=True):
+        np.testing.assert_allclose(np.asarray(a), np.asarray(b), rtol=1e-4, atol=1e-5)
+
+
+def test_first_adam_step_is_the_formula_in_float64():
+    """After one step Adam moves every parameter with a gradient by its rate, against the gradient's sign."""
+    state, _ = step(init_refinement(doubtful()), key_views(), config=CONFIG)
+    gradient = {n: np.asarray(getattr(state.first_moment, n), np.float64) / (1 - CONFIG.adam_b1) for n in ("means",)}
+    second = np.asarray(state.second_moment.means, np.float64) / (1 - CONFIG.adam_b2)
+    wanted = -CONFIG.mean_rate * gradient["means"] / (np.sqrt(second) + 1e-15)
+    wanted = np.where(gradient["means"] == 0, 0.0, wanted)
+    np.testing.assert_allclose(np.asarray(state.revision.means), wanted, rtol=1e-3, atol=1e-7)
+    np.testing.assert_allclose(second, gradient["means"] ** 2, rtol=1e-3, atol=1e-24)
+    assert np.any(gradient["means"] != 0)
+
+
+@pytest.mark.parametrize("bad", ["exposure", "image of one view"])
+def test_a_step_that_is_not_finite_changes_only_its_count(bad):
+    views = key_views(exposures=jnp.full((NUM_VIEWS, 3), jnp.nan))
+    if bad == "image of one view":
+        views = replace(key_views(), Ks=key_views().Ks.at[:, 0, 0].set(jnp.inf), exposures=views.exposures)
+    state, _ = step(init_refinement(doubtful()), views)
+    assert_same_bits(current_gaussians(state), doubtful())
+    assert int(state.num_skipped) == 1 and int(state.num_steps) == 1
+    for leaf in jax.tree.leaves((state.revision, state.first_moment, state.second_moment)):
+        assert not np.asarray(leaf).any()
+
+
+def test_no_gaussian_leaves_its_trust_region():
+    config = RefineConfig(held_back=0.0, mean_rate=3.0, log_scale_rate=2.0, max_shift=0.5, max_log_scale_change=0.3)
+    refined, _ = refine(doubtful(), cameras(), 1.0 - photographs(), steps=6, config=config)
+    start = doubtful()
+    moved = np.linalg.norm(np.asarray(refined.means - start.means), axis=1)
+    assert (moved <= 0.5 * np.asarray(sizes(start)) * (1 + 1e-5)).all() and moved.max() > 0
+    grown = np.abs(np.log(np.asarray(refined.scales / start.scales)))
+    assert (grown <= 0.3 + 1e-5).all() and grown.max() > 0.29
+
+
+def test_held_back_pixels_change_no_bit_of_the_scene():
+    config = RefineConfig(held_back=0.4, seed=1)
+    state = init_refinement(doubtful())
+    view = next_view(state.num_steps, key_views().valid, config.seed)
+    held_back = np.asarray(held_back_pixels((HEIGHT, WIDTH), view, config))
+    assert 0 < held_back.mean() < 1
+    other = np.array(photographs())
+    other[int(view)][held_back] = 1.0 - other[int(view)][held_back]
+    first, first_report = step(state, key_views(), config=config)
+    second, second_report = step(state, key_views(jnp.asarray(other)), config=config)
+    assert_same_bits(current_gaussians(first), current_gaussians(second))
+    assert float(first_report.loss) == float(second_report.loss)
+    assert float(first_report.held_back) != float(second_report.held_back)
+
+
+def test_every_round_shows_every_valid_view_once():
+    valid = jnp.array([True, False, True, True, False])
+    order = [int(next_view(jnp.int32(i), valid, seed=0)) for i in range(30)]
+    rounds = [order[i : i + 3] for i in range(0, 30, 3)]
+    assert all(sorted(part) == [0, 2, 3] for part in rounds)
+    assert len({tuple(part) for part in rounds}) > 1
+
+
+def test_the_callers_arrays_survive():
+    given = doubtful()
+    refine(given, cameras(), photographs(), steps=2, config=CONFIG)
+    assert np.isfinite(np.asarray(given.means)).all()
+
+
+def test_refinement_stops_where_held_back_pixels_do_not_gain():
+    falling = [1.0, 1.0, 0.5, 0.5]
+    assert not has_stopped_helping(falling, 2)
+    assert has_stopped_helping([*falling, 0.5, 0.6], 2)
+    assert not has_stopped_helping([*falling, 0.5], 2)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"images": jnp.zeros((NUM_VIEWS, HEIGHT, WIDTH + 1, 3))}, r"images must be \[4, 16, 24, 3\]"),
+        ({"steps": -1}, "steps must be at least 0, got -1"),
+        ({"exposures": jnp.ones((2, 3))}, r"exposures must be \[4, 3\]"),
+        ({"cameras": Camera(jnp.eye(4), jnp.eye(3), WIDTH, HEIGHT)}, "cameras must have one batch axis"),
+    ],
+)
+def test_arguments_that_do_not_fit_are_refused(changes, message):
+    given = {"cameras": cameras(), "images": photographs(), "steps": 1} | changes
+    with pytest.raises(InputError, match=message):
+        refine(doubtful(), given.pop("cameras"), given.pop("images"), **given)
+
+
+@pytest.mark.parametrize("changes", [{"adam_b1": 1.0}, {"held_back": 0.9}, {"mean_rate": -1.0}, {"final_rate": 0.0}])
+def test_config_out_of_range_is_refused_by_name(changes):
+    with pytest.raises(InputError, match=rf"refine: {next(iter(changes))} must be"):
+        RefineConfig(**changes)

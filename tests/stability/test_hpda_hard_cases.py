@@ -1,0 +1,179 @@
+"""Hard cases of HPDA: one small program per configuration.
+
+Values and gradients must be finite, distributions nonnegative with sum 1, and limits reached where they exist.
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ssplat_jax import model as stages
+from ssplat_jax.model.types import DepthDistribution, prepare_views
+from ssplat_jax.numerics import softplus_inverse
+from ssplat_jax.pytree import replace
+from tests.model.small import CONFIG, chunk, finite, history
+from tests.stability.stage_checks import FLOAT32, ZERO_GAMMA, check_depths, wave
+
+pytestmark = pytest.mark.usefixtures("compiled_plainly")
+
+D = CONFIG.network.num_depths
+SHAPE = (1, 2, 4)
+MEAN = CONFIG.replace(depth_readout="mean", confidence="peak")
+WINDOW = CONFIG.replace(depth_readout="window", confidence="window")
+READOUTS = {"mean": MEAN, "window": WINDOW}
+NARROW = 1e-2  # a sigma far below the distance of candidates, 0.16
+CANDIDATES = jnp.linspace(jnp.log(1.0), jnp.log(6.0), D)
+
+ANCHORS = {}  # name -> (changes to the ordinary inputs, check of the result)
+
+
+def anchor_case(name: str, limit=None, **changes):
+    ANCHORS[name] = (changes, limit)
+
+
+def sure(k: int):
+    """Logits of a matcher that is certain of candidate `k`."""
+    return jnp.where(jnp.arange(D) == k, 0.0, -1e4) * jnp.ones((*SHAPE, 1))
+
+
+def equals_matcher(given, matched, result):
+    np.testing.assert_array_equal(result.probs, matched)
+
+
+def equals_anchor(given, matched, result):
+    omega = np.asarray(given["confidences"], np.float64)[..., None]
+    offsets = np.asarray(CANDIDATES, np.float64) - np.log(np.asarray(given["depths"], np.float64))[..., None]
+    anchor = omega * np.exp(-0.5 * (offsets / (CONFIG.history.sigma0 + CONFIG.history.lambda_sigma * (1 - omega))) ** 2)
+    np.testing.assert_allclose(result.probs, anchor / anchor.sum(-1, keepdims=True), atol=FLOAT32)
+
+
+def has_depth_of(k: int, tolerance: float = 0.0):
+    """Check that the depth is that of candidate `k`."""
+
+    def limit(given, matched, result):
+        wanted = np.full(SHAPE, given["log_candidates"][k])
+        np.testing.assert_allclose(result.log_depths, wanted, rtol=0, atol=tolerance)
+
+    return limit
+
+
+def has_matcher_confidence(confidence):
+    def limit(given, matched, result):
+        wanted = confidence(1 if given["config"].depth.confidence == "peak" else 3)
+        np.testing.assert_allclose(result.matcher_confidences, wanted, rtol=1e-6)
+
+    return limit
+
+
+anchor_case("ordinary")
+anchor_case("gamma 0", equals_matcher, raw_gamma=ZERO_GAMMA)
+anchor_case("gamma to 0", equals_matcher, raw_gamma=-40.0)  # gamma 4e-18: below the spacing of every probability
+anchor_case("gamma 1e6", equals_anchor, raw_gamma=1e6)
+anchor_case("all holes", equals_matcher, depths=0.0, confidences=0.0, raw_gamma=1e6)
+anchor_case("omega of history 0", equals_matcher, confidences=0.0, raw_gamma=1e6)
+anchor_case("omega of history 1", equals_anchor, confidences=1.0, raw_gamma=1e6)
+anchor_case("equal confidences", equals_anchor, confidences=0.5, raw_gamma=1e6)
+anchor_case("sigma to 0, on a candidate", has_depth_of(5, 1e-4), sigma0=1e-30, confidences=1.0, at=5, raw_gamma=1e6)
+anchor_case("sigma to 0, beside them", equals_matcher, sigma0=1e-30, confidences=1.0, at=5.4, raw_gamma=1e6)
+# Here two roundings cancel: without a lower bound sigma would be 0.
+anchor_case("omega an ulp above 1", has_depth_of(5, 1e-4), sigma0=2**-24, confidences=1 + 2**-23, at=5, raw_gamma=1e6)
+anchor_case("history at the near end", has_depth_of(0, FLOAT32), sigma0=NARROW, confidences=1.0, at=0, raw_gamma=1e6)
+anchor_case(
+    "history at the far end", has_depth_of(D - 1, FLOAT32), sigma0=NARROW, confidences=1.0, at=D - 1, raw_gamma=1e6
+)
+anchor_case("history before the near end", equals_matcher, sigma0=NARROW, confidences=1.0, depths=1e-30, raw_gamma=1e6)
+anchor_case("history beyond the far end", equals_matcher, sigma0=NARROW, confidences=1.0, depths=1e30, raw_gamma=1e6)
+anchor_case("matched at the near end", has_depth_of(0), logits=sure(0), raw_gamma=ZERO_GAMMA)
+anchor_case("matched at the far end", has_depth_of(D - 1), logits=sure(D - 1), raw_gamma=ZERO_GAMMA)
+anchor_case("matcher sure: omega 1", has_matcher_confidence(lambda width: 1.0), logits=sure(4))
+anchor_case("matcher knows nothing", has_matcher_confidence(lambda width: width / D), logits=jnp.zeros((*SHAPE, D)))
+anchor_case("matcher sure, history elsewhere", logits=sure(2), confidences=1.0, at=9, sigma0=NARROW, raw_gamma=1e6)
+anchor_case(
+    "logits of 1e30", has_matcher_confidence(lambda width: 1.0), logits=1e30 * jnp.eye(D)[3] * jnp.ones((*SHAPE, 1))
+)
+anchor_case("near equals far", has_depth_of(0, FLOAT32), log_candidates=jnp.full(D, 0.7), at=2)
+anchor_case("one candidate", has_depth_of(0), logits=jnp.full((*SHAPE, 1), 3.0), log_candidates=jnp.full(1, 0.7))
+anchor_case(
+    "one candidate, history elsewhere",
+    has_depth_of(0),
+    logits=jnp.full((*SHAPE, 1), 3.0),
+    log_candidates=jnp.full(1, 0.7),
+    depths=5.0,
+    confidences=1.0,
+    raw_gamma=1e6,
+)
+anchor_case("sigma in scene units", anchor_space="metric", sigma0=1e-30, confidences=1.0, at=5, raw_gamma=1e6)
+anchor_case("anchor of mass 0", equals_matcher, anchor_norm="mass", sigma0=NARROW, depths=1e30, raw_gamma=1e6)
+
+
+@functools.cache
+def anchoring(config):
+    views = prepare_views(chunk(), CONFIG)
+
+    def run(logits, raw_gamma, log_candidates, past):
+        probs = jax.nn.softmax(logits)
+        distribution = DepthDistribution(probs=probs, logits=logits, decoder=jnp.zeros((*SHAPE, 8)))
+        here = replace(views, log_candidates=log_candidates)
+        result = stages.anchor_depth({"raw_gamma": raw_gamma}, distribution, past, here, config)
+        return wave(result), (probs, result)
+
+    return jax.jit(jax.value_and_grad(run, argnums=(0, 1, 2), has_aux=True))
+
+
+def anchor_inputs(changes: dict, config) -> dict:
+    rng = np.random.default_rng(0)
+    given = {
+        "logits": jnp.asarray(2 * rng.normal(size=(*SHAPE, D)), jnp.float32),
+        "raw_gamma": softplus_inverse(0.1),
+        "depths": np.exp(rng.uniform(0, np.log(6), SHAPE)),
+        "confidences": rng.uniform(0.1, 1, SHAPE),
+        "log_candidates": CANDIDATES,
+    } | changes
+    options = {name: given.pop(name) for name in ("sigma0", "anchor_space", "anchor_norm") if name in given}
+    if "at" in given:  # halfway between candidates too
+        given["depths"] = np.exp(np.interp(given.pop("at"), np.arange(D), given["log_candidates"]))
+    for name in ("depths", "confidences"):
+        given[name] = np.broadcast_to(given[name], SHAPE)
+    return given | {"config": config.replace(**options)}
+
+
+@pytest.mark.parametrize("readout", READOUTS)
+@pytest.mark.parametrize("name", ANCHORS)
+def test_hard_anchor(name, readout):
+    changes, limit = ANCHORS[name]
+    given = anchor_inputs(changes, READOUTS[readout])
+    past = history(given["depths"], given["confidences"])
+    inputs = (given["logits"], jnp.float32(given["raw_gamma"]), given["log_candidates"])
+    (value, (matched, result)), gradients = anchoring(given["config"])(*inputs, past)
+    assert finite((value, result)), "value"
+    assert finite(gradients), "gradient"
+    check_depths(result, given["log_candidates"])
+    if limit is not None:
+        limit(given, matched, result)
+    if given["logits"].shape[-1] == 1:  # nothing to choose between
+        np.testing.assert_array_equal(gradients[0], 0)
+
+
+def test_sigma_to_zero_in_scene_units_selects_one_candidate():
+    changes, _ = ANCHORS["sigma in scene units"]
+    given = anchor_inputs(changes, MEAN)
+    on_candidate = jnp.full(SHAPE, jnp.exp(CANDIDATES)[5])
+    inputs = (given["logits"], jnp.float32(given["raw_gamma"]), CANDIDATES, history(on_candidate, given["confidences"]))
+    (_, (_, result)), _ = anchoring(given["config"])(*inputs)
+    assert (result.probs[..., 5] > 1 - 1e-4).all()
+
+
+def test_gradient_of_gamma_equals_finite_differences():
+    """Also where gamma is small, so that training can strengthen a weak anchor again."""
+    given = anchor_inputs({}, MEAN)
+    past = history(given["depths"], given["confidences"])
+    program = anchoring(MEAN)
+    value = lambda raw: float(program(given["logits"], jnp.float32(raw), CANDIDATES, past)[0][0])  # noqa: E731
+    for raw in (-2.0, 0.0, 3.0):
+        slope = (value(raw + 0.05) - value(raw - 0.05)) / 0.1
+        (_, _), gradients = program(given["logits"], jnp.float32(raw), CANDIDATES, past)
+        assert slope != 0
+        assert float(gradients[1]) == pytest.approx(slope, rel=2e-2, abs=1e-5)
