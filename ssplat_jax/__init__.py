@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from ssplat_jax.rasterizer import RenderOutput as RenderOutput
     from ssplat_jax.rasterizer import fill_holes as fill_holes
     from ssplat_jax.rasterizer import render as render
+    from ssplat_jax.refinement import refine as refine
     from ssplat_jax.scene_files.ply import load_ply as load_ply
     from ssplat_jax.scene_files.ply import save_ply as save_ply
     from ssplat_jax.scene_files.splat import save_splat as save_splat
@@ -57,6 +58,7 @@ _MODULES = {
     "load_ply": "scene_files.ply",
     "open_capture": "data.capture",
     "preset": "config",
+    "refine": "refinement",
     "render": "rasterizer",
     "save_ply": "scene_files.ply",
     "save_splat": "scene_files.splat",

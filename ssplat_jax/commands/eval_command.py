@@ -16,6 +16,7 @@ from ssplat_jax.commands.options import (
     parse_size,
 )
 from ssplat_jax.config import QUALITIES
+from ssplat_jax.errors import InputError
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,6 +40,8 @@ class Eval:
     size: str | None = None
     """Image size WxH of the scored views; default the capture's own. --quality sets the streamed size."""
     quality: QualityOption = "accurate"
+    refine: int = 0
+    """Gradient steps on the context views after the stream; the scores before are reported too."""
     weights: WeightsOption = "tiny"
     lpips_vgg: Path | None = None
     """torchvision's vgg16 state dict (.pth or .npz): with --lpips-heads, LPIPS is scored too."""
@@ -53,6 +56,8 @@ class Eval:
         from ssplat_jax.evaluation.evaluate import evaluate
         from ssplat_jax.streaming.session import Session
 
+        if self.refine < 0:
+            raise InputError(f"--refine: wanted a number of steps of at least 0, got {self.refine}.")
         lpips_weights = load_lpips_weights(self.lpips_vgg, self.lpips_heads)
         model, params = load_model(self.weights, self.set)
         capture = open_capture(self.capture, size=parse_size(self.size))
@@ -66,6 +71,7 @@ class Eval:
             Reporter(self.quiet),
             streamed=streamed,
             lpips_weights=lpips_weights,
+            refine_steps=self.refine,
         )
         reference = metrics["baselines"]
         print(
@@ -74,4 +80,11 @@ class Eval:
             f" {reference['mean_color_psnr']:.2f}); {metrics['chunk_ms']['median']:.0f} ms a chunk;"
             f" {self.out}/metrics.json"
         )
+        if refined := metrics.get("refinement"):
+            before = refined["before"]
+            print(
+                f"before {refined['steps']} refinement steps of {refined['seconds_per_step']:.2f} s:"
+                f" PSNR {before['psnr']:.2f} dB, over black {before['psnr_over_black']:.2f} dB"
+                f" (now {metrics['psnr_over_black']:.2f}), SSIM {before['ssim']:.3f}"
+            )
         return 0

@@ -1,6 +1,8 @@
 """Quality and cost on one capture: stream the context, decode the cache, score views that were never streamed."""
 
 import dataclasses
+import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +18,7 @@ from ssplat_jax.evaluation.scoring import ViewScore, baselines, check_scorable, 
 from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.metrics.lpips import LpipsWeights, check_size
 from ssplat_jax.metrics.psnr_ssim import SSIM_ARGUMENTS
+from ssplat_jax.refinement import refine_on_capture
 from ssplat_jax.storage.atomic import write_atomic
 from ssplat_jax.storage.folders import make_writable
 from ssplat_jax.storage.json_files import write_json
@@ -33,6 +36,7 @@ def evaluate(
     *,
     streamed: Capture | None = None,
     lpips_weights: LpipsWeights | None = None,
+    refine_steps: int = 0,
 ) -> dict:
     """Streams, scores and times; writes `metrics.json`, `split.json` and a picture per target into `out`.
 
@@ -47,6 +51,8 @@ def evaluate(
         reporter: shows progress and warnings; by default warnings only.
         streamed: the same capture at the size that is streamed; by default `capture`.
         lpips_weights: with them LPIPS is scored too; without, the fields `lpips` are null.
+        refine_steps: gradient steps on the context views before the targets are scored. With them the metrics have a
+            block `refinement`: the steps done, their seconds, and the scores before.
 
     Returns:
         The metrics as written.
@@ -73,7 +79,12 @@ def evaluate(
         "cache": (facts := session.cache_facts()),
         "num_gaussians": facts["decoded"],
     }
-    scores = _score_targets(session.gaussians(), capture, split, frame, exposures, lpips_weights, folder)
+    gaussians, refinement = session.gaussians(), {}
+    if refine_steps:
+        before = [score_view(gaussians, capture, i, frame, exposures, lpips_weights).score for i in split.targets]
+        gaussians, done = _refine(gaussians, streamed, split.context, frame, exposures, refine_steps, reporter)
+        refinement = {"refinement": {**done, "before": _mean_scores(before)}}
+    scores = _score_targets(gaussians, capture, split, frame, exposures, lpips_weights, folder)
     middle = split.targets[len(split.targets) // 2]
     timing = latency.measure_latency(session, recent, capture.camera(middle, frame))
     metrics = {
@@ -86,6 +97,7 @@ def evaluate(
         "target_views": len(split.targets),
         **_mean_scores(scores),
         "ssim_arguments": SSIM_ARGUMENTS,
+        **refinement,
         **timing,
         **cost,
         "config_hash": session.model.config.hash,
@@ -106,6 +118,37 @@ def _check_inputs(capture: Capture, split: Split, out: Path, lpips_weights: Lpip
         check_size(capture.height, capture.width)
     capture.check_output_folder(out)
     capture.verify((*split.context, *split.targets))
+
+
+def _refine(
+    gaussians: Gaussians,
+    streamed: Capture,
+    context: Sequence[int],
+    frame: StreamFrame,
+    exposures: Exposures,
+    steps: int,
+    reporter: Reporter,
+) -> tuple[Gaussians, dict]:
+    """The scene refined on its context views, and what that took."""
+    start = time.perf_counter()
+    with reporter.progress("refining", steps) as advance:
+        refined, report = refine_on_capture(
+            gaussians,
+            streamed,
+            context,
+            frame,
+            exposures,
+            steps=steps,
+            on_step=lambda step, loss: advance(step, f"loss {loss:.4f}"),
+        )
+    done = {
+        "steps": report.num_steps,
+        "stopped_early": report.stopped_early,
+        "skipped_steps": report.num_skipped,
+        "seconds": round(time.perf_counter() - start, 2),
+        "seconds_per_step": round(report.seconds_per_step, 4),
+    }
+    return refined, done
 
 
 def _score_targets(

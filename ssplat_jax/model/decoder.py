@@ -1,4 +1,4 @@
-"""Gaussians of tokens, from the shapes that the head predicts (Sec. 3.7)."""
+"""Gaussians of tokens, from the shapes that the head predicts (Sec. 3.6, Gaussian Decoder)."""
 
 import math
 

@@ -1,27 +1,27 @@
-"""Names in the documentation: every function, file and configuration field that a page names exists."""
+"""Names on the pages: every function and configuration field that a page names exists."""
 
 import functools
 import importlib
 import re
 import tomllib
-from pathlib import Path
 
 import pytest
 
 from ssplat_jax.config import NETWORK_CONFIGS, StreamConfig
 from ssplat_jax.errors import InputError
+from tests.docs.pages import INLINE_CODE, PAGES, ROOT, page_name, prose
 
-ROOT = Path(__file__).resolve().parents[2]
-PAGES = sorted(path for path in (ROOT / "docs").glob("*.md") if path.name != "decisions.md")
-"""All pages but the log of decisions, whose older entries name code that no longer exists."""
+METHOD_PAGE = ROOT / "docs" / "algorithm.md"
 
 ENTRY_POINT_GROUPS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["entry-points"]
 """Groups of entry points, which look like modules but are not."""
 
 DOTTED_NAME = re.compile(r"\bssplat_jax(?:\.\w+)+")
 FUNCTION_ROW = re.compile(r"\| `([\w.]+)` \| `(ssplat_jax/[\w/]+)\.py` \|")
-TEST_PATH = re.compile(r"\btests/[\w/]+(?:\.py)?")
-CONFIG_FIELD = re.compile(rf"`({'|'.join(StreamConfig().groups())})\.(\w+)")
+CONFIG_FIELD = re.compile(rf"`((?:{'|'.join(StreamConfig().groups())})\.(?!py\b)\w+)")
+SETTING = re.compile(r"(\w+)=\S+")
+
+every_page = pytest.mark.parametrize("page", PAGES, ids=page_name)
 
 
 def resolve(name: str) -> object:
@@ -49,8 +49,14 @@ def unresolved(names: set[str]) -> list[str]:
     return missing
 
 
+def named_functions(text: str) -> set[str]:
+    """Dotted names in the text, and those that its rows of function and file stand for."""
+    rows = {f"{file.replace('/', '.')}.{name}" for name, file in FUNCTION_ROW.findall(text)}
+    return rows | set(DOTTED_NAME.findall(text)) - set(ENTRY_POINT_GROUPS)
+
+
 def has_field(name: str) -> bool:
-    """Whether some network's configuration has the field `name`, given as `group.field`."""
+    """Whether the configuration of some network has a field of this full or short name."""
     for kind in NETWORK_CONFIGS:
         try:
             StreamConfig().replace(network=kind).find(name)
@@ -60,41 +66,31 @@ def has_field(name: str) -> bool:
     return False
 
 
-def text_of(page: Path) -> str:
-    return page.read_text(encoding="utf-8")
+@every_page
+def test_named_functions_exist(page):
+    assert not unresolved(named_functions(page.read_text()))
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_dotted_names_resolve(page):
-    assert not unresolved(set(DOTTED_NAME.findall(text_of(page))) - set(ENTRY_POINT_GROUPS))
-
-
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_config_fields_exist(page):
-    names = {f"{group}.{field}" for group, field in CONFIG_FIELD.findall(text_of(page))}
-    assert not [name for name in sorted(names) if not has_field(name)]
-
-
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_functions_are_in_the_files_of_their_rows(page):
-    rows = FUNCTION_ROW.findall(text_of(page))
-    assert not unresolved({f"{file.replace('/', '.')}.{name}" for name, file in rows})
+@every_page
+def test_named_config_fields_exist(page):
+    assert not [name for name in sorted(set(CONFIG_FIELD.findall(page.read_text()))) if not has_field(name)]
 
 
 def test_algorithm_page_names_functions():
-    text = text_of(ROOT / "docs" / "algorithm.md")
-    assert len(FUNCTION_ROW.findall(text)) + len(set(DOTTED_NAME.findall(text))) >= 20
+    assert len(named_functions(METHOD_PAGE.read_text())) >= 20
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_named_tests_exist(page):
-    paths = set(TEST_PATH.findall(text_of(page)))
-    assert not [path for path in sorted(paths) if not (ROOT / path).exists()]
+def test_settings_on_algorithm_page_are_fields():
+    matches = map(SETTING.fullmatch, INLINE_CODE.findall(prose(METHOD_PAGE)))
+    names = {match[1] for match in matches if match}
+    assert names and not [name for name in sorted(names) if not has_field(name)]
 
 
 def test_unknown_names_are_found():
     assert unresolved({"ssplat_jax.model.hpda.no_such_function"})
     assert unresolved({"ssplat_jax.no_such_module.cache_anchor"})
-    assert not unresolved({"ssplat_jax.model.hpda.cache_anchor"})
+    assert unresolved(named_functions("| 1 | `no_such_function` | `ssplat_jax/model/hpda.py` |"))
+    assert not unresolved({"ssplat_jax.model.hpda.cache_anchor", "ssplat_jax.streaming.streamsplat.StreamSplat.step"})
+    assert CONFIG_FIELD.findall("`memory.no_such_field`, `stream.py`") == ["memory.no_such_field"]
     assert not has_field("memory.no_such_field")
     assert has_field("network.vit")

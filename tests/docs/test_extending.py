@@ -1,0 +1,211 @@
+"""The five recipes of docs/extending.md: performed where no edit is needed, else their lists of places are complete."""
+
+import ast
+import dataclasses
+import importlib.metadata
+import json
+import re
+from types import SimpleNamespace
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from PIL import Image
+
+import ssplat_jax as ss
+from ssplat_jax.commands import main as command_line
+from ssplat_jax.config import CompactConfig
+from ssplat_jax.data import capture as captures
+from ssplat_jax.data.readers.frame_list import Intrinsics, make_frame, order_frames
+from ssplat_jax.model.compact import CompactNetwork
+from ssplat_jax.model.network import register_network
+from tests.docs.pages import ROOT, tables
+from tests.model import small
+
+PAGE = ROOT / "docs" / "extending.md"
+RECIPES = dict(
+    (part.split("\n", 1)[0].strip(), part.split("\n", 1)[1])
+    for part in re.split(r"^## ", PAGE.read_text(), flags=re.MULTILINE)[1:]
+)
+
+
+def places(recipe: str) -> list[tuple[str, str]]:
+    """(file, symbol) of the rows of a recipe; the symbol of a place that is yet to be written is `new`."""
+    (table,) = tables(RECIPES[recipe])
+    return [(file.strip("`"), symbol.strip("`")) for file, symbol, _ in table[1:]]
+
+
+def names_in(tree: ast.Module) -> set[str]:
+    """Names that a module defines, and `Class.name` of those that its classes do."""
+    found = set()
+    for scope, prefix in [(tree, ""), *((n, f"{n.name}.") for n in tree.body if isinstance(n, ast.ClassDef))]:
+        for node in scope.body:
+            if isinstance(node, ast.FunctionDef | ast.ClassDef):
+                found.add(prefix + node.name)
+            targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
+            found |= {prefix + target.id for target in targets if isinstance(target, ast.Name)}
+    return found
+
+
+def mentions(word: str, *folders: str) -> set[str]:
+    """Python files below the folders that hold a word."""
+    files = [file for folder in folders for file in (ROOT / folder).rglob("*.py")]
+    found = [file for file in files if re.search(word, file.read_text())]
+    return {file.relative_to(ROOT).as_posix() for file in found}
+
+
+def test_there_are_five_recipes():
+    assert len(RECIPES) == 5
+
+
+@pytest.mark.parametrize("recipe", RECIPES)
+def test_files_and_symbols_of_recipes_exist(recipe):
+    for file, symbol in places(recipe):
+        path = ROOT / file
+        if symbol == "new" and "mine" in file:
+            assert path.parent.is_dir() or path.parent.parent.is_dir(), file
+        elif symbol == "new" or path.suffix != ".py":
+            assert path.is_file(), file
+            assert path.suffix == ".py" or symbol == "new" or symbol in path.read_text(), symbol
+        else:
+            assert symbol in names_in(ast.parse(path.read_text())), f"{file}: {symbol}"
+
+
+# -- a depth network --------------------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True)
+class ToyConfig(CompactConfig):
+    """The compact network's configuration under another name."""
+
+    kind: ClassVar[str] = "toy"
+
+
+class ToyNetwork(CompactNetwork):
+    """A network that is sure of a single depth everywhere."""
+
+    @staticmethod
+    def match(params, features, views, config):
+        belief = CompactNetwork.match(params, features, views, config)
+        probs = jnp.zeros_like(belief.probs).at[..., 3].set(1.0)
+        return dataclasses.replace(belief, probs=probs)
+
+
+@pytest.mark.usefixtures("compiled_plainly", "registered_networks")
+def test_a_registered_network_streams():
+    register_network(ToyConfig, ToyNetwork())
+    narrow = {field.name: getattr(small.CONFIG.network, field.name) for field in dataclasses.fields(CompactConfig)}
+    config = small.CONFIG.replace(network=ToyConfig(**narrow))
+    assert ss.StreamConfig.from_dict(config.to_dict()) == config
+    model = ss.StreamSplat(config)
+    cache, out = jax.jit(model.step)(small.random_params(config), model.init_cache(), small.chunk())
+    assert int(cache.num_voxels) > 0
+    inside = np.asarray(out.confidences) > 0
+    assert np.ptp(np.asarray(out.depths)[inside]) < 1e-4
+
+
+# -- a capture reader -------------------------------------------------------------------------------------------------
+
+
+def toy_reader() -> SimpleNamespace:
+    """A reader of folders with `toy.json`, which holds the camera's x by image."""
+
+    def read(path):
+        facts = json.loads((path / "toy.json").read_text())
+        intrinsics = Intrinsics(fx=40.0, fy=40.0, cx=16.0, cy=12.0)
+        frames = []
+        for name, x in facts.items():
+            pose = np.eye(4)
+            pose[0, 3] = x
+            frames.append(make_frame(name, path / name, pose, intrinsics, (32, 24), str(path / "toy.json")))
+        return order_frames(path.name, frames)
+
+    return SimpleNamespace(FORMAT="toy", matches=lambda path: (path / "toy.json").is_file(), read=read)
+
+
+def test_an_added_reader_opens_its_captures(tmp_path, monkeypatch):
+    monkeypatch.setattr(captures, "READERS", (*captures.READERS, toy_reader()))
+    for i in range(3):
+        Image.new("RGB", (32, 24), (80 * i, 0, 0)).save(tmp_path / f"{i}.png")
+    (tmp_path / "toy.json").write_text(json.dumps({f"{i}.png": 0.1 * i for i in range(3)}))
+    capture = ss.open_capture(tmp_path)
+    assert (capture.format, len(capture), capture.image(2).shape) == ("toy", 3, (24, 32, 3))
+    np.testing.assert_allclose(capture.camtoworlds[:, 0, 3], [0.0, 0.1, 0.2])
+
+
+def test_readers_are_only_listed_in_one_place():
+    assert mentions(r"\bREADERS\b", "ssplat_jax") == {"ssplat_jax/data/capture.py"}
+
+
+# -- a merge rule -----------------------------------------------------------------------------------------------------
+
+
+def test_merge_rules_stand_where_the_recipe_says():
+    listed = {file for file, _ in places("A merge rule")}
+    assert mentions("merge_weight", "ssplat_jax", "tests/cache") == listed
+
+
+# -- a command --------------------------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True)
+class Greet:
+    """Print a greeting.
+
+    Example: ssplat greet --name world
+    """
+
+    name: str = "world"
+    """Whom to greet."""
+
+    def run(self) -> int:
+        print(f"hello {self.name}")
+        return 0
+
+
+def test_an_added_command_runs(monkeypatch, capsys):
+    monkeypatch.setitem(command_line.COMMANDS, "greet", Greet)
+    with pytest.raises(SystemExit) as stop:
+        command_line.main(["greet", "--name", "reader"])
+    assert not stop.value.code
+    assert capsys.readouterr().out == "hello reader\n"
+
+
+def test_every_command_has_a_file_of_its_own():
+    files = {path.name for path in (ROOT / "ssplat_jax" / "commands").glob("*_command.py")}
+    assert files == {f"{name.replace('-', '_')}_command.py" for name in command_line.COMMANDS}
+
+
+def test_an_experiment_of_another_package_is_found(monkeypatch, tmp_path, capsys):
+    point = SimpleNamespace(name="toy", load=lambda: lambda captures, out, scale, reporter: f"toy at {scale}")
+    monkeypatch.setattr(importlib.metadata, "entry_points", lambda group: [point])
+    with pytest.raises(SystemExit) as stop:
+        command_line.main(["experiment", "toy", "--out", str(tmp_path), "--scale", "smoke"])
+    assert not stop.value.code
+    assert "toy at smoke" in capsys.readouterr().out
+
+
+# -- a rasterizer output ----------------------------------------------------------------------------------------------
+
+
+def test_outputs_stand_where_the_recipe_says():
+    listed = {file for file, symbol in places("A rasterizer output") if symbol != "new"}
+    own = mentions(r"median_depth", "ssplat_jax/rasterizer", "ssplat_jax/benchmarks")
+    assert own == {file for file in listed if file.startswith("ssplat_jax/")}
+
+
+@pytest.mark.usefixtures("compiled_plainly")
+def test_features_are_composited_without_a_new_output():
+    gaussians = ss.Gaussians.from_rgb(
+        means=jnp.array([[0.0, 0.0, 2.0]]),
+        quats=jnp.array([[1.0, 0.0, 0.0, 0.0]]),
+        scales=jnp.full((1, 3), 0.2),
+        opacities=jnp.array([0.8]),
+        colors=jnp.full((1, 3), 0.5),
+    )
+    K = jnp.array([[20.0, 0.0, 8.0], [0.0, 20.0, 8.0], [0.0, 0.0, 1.0]])
+    camera = ss.Camera(viewmats=jnp.eye(4), Ks=K, width=16, height=16)
+    out = ss.render(gaussians, camera, features=jnp.array([[2.0]]))
+    np.testing.assert_allclose(out.features[..., 0], 2 * out.alpha, rtol=1e-5, atol=1e-6)
