@@ -89,7 +89,7 @@ class StreamSplat:
         return init_cache(self.config)
 
     def predict(self, params: dict, cache: VoxelCache, chunk: Chunk) -> Prediction:
-        """Tokens of a chunk, given the cache of the chunks before it (Secs. 3.3 to 3.6); no gradient flows to the cache."""
+        """Tokens of a chunk, given the cache before it (Secs. 3.3 to 3.6); no gradient flows to the cache."""
         config, network = self.config, stages.network_of(self.config)
         views = stages.prepare_views(chunk, config)
         factor = config.network.match_stride // stages.GRID_STRIDE

@@ -273,8 +273,8 @@ def test_eval_writes_every_promised_field(tmp_path, monkeypatch):
     monkeypatch.setattr(latency, "NUM_REPEATS", 1)  # how often it times is not what is tested
     out = tmp_path / "eval"
     capture = make_capture(tmp_path / "capture", num_frames=12, size=(128, 96))
-    arguments = ("eval", str(capture), "--context", "8", "--out", str(out), "--quiet")
-    assert run(*arguments, "--quality", "fast") == 0
+    arguments = ("eval", str(capture), "--context", "8", "--quiet")
+    assert run(*arguments, "--quality", "fast", "--out", str(out)) == 0
     metrics = json.loads((out / "metrics.json").read_text())
     promised = {
         "psnr", "ssim", "lpips", "per_view", "context_views", "target_views", "chunk_ms", "render_ms", "compile_s",
@@ -291,6 +291,18 @@ def test_eval_writes_every_promised_field(tmp_path, monkeypatch):
     assert (metrics["streamed_size"], metrics["size"]) == ([64, 48], [128, 96])
     with Image.open(out / "view_00004.png") as picture:
         assert picture.size == (3 * 128, 96)
+    refined = tmp_path / "refined"
+    assert run(*arguments, "--quality", "fast", "--refine", "3", "--out", str(refined)) == 0
+    after = json.loads((refined / "metrics.json").read_text())
+    assert after["refinement"]["steps"] == 3 and after["refinement"]["skipped_steps"] == 0
+    assert all(after["refinement"]["before"][name] == metrics[name] for name in ("psnr", "psnr_over_black", "ssim"))
+    assert after["psnr"] != metrics["psnr"]
+
+
+def test_negative_refinement_steps_are_bad_usage(tmp_path, capsys):
+    capture = make_capture(tmp_path / "capture", num_frames=12, size=(128, 96))
+    assert run("eval", str(capture), "--context", "8", "--out", str(tmp_path / "out"), "--refine", "-1") == 2
+    assert "--refine: wanted a number of steps of at least 0, got -1" in capsys.readouterr().err
 
 
 @pytest.mark.slow  # compiles a network of 62 million parameters

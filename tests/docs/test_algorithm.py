@@ -19,7 +19,7 @@ ENTRY_POINT_GROUPS = tomllib.loads((ROOT / "pyproject.toml").read_text())["proje
 DOTTED_NAME = re.compile(r"\bssplat_jax(?:\.\w+)+")
 FUNCTION_ROW = re.compile(r"\| `([\w.]+)` \| `(ssplat_jax/[\w/]+)\.py` \|")
 CONFIG_FIELD = re.compile(rf"`((?:{'|'.join(StreamConfig().groups())})\.(?!py\b)\w+)")
-SETTING = re.compile(r"(\w+)=\S+")
+SETTING = re.compile(r"([\w.]+)=\S+")
 
 every_page = pytest.mark.parametrize("page", PAGES, ids=page_name)
 

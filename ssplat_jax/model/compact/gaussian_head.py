@@ -1,4 +1,4 @@
-"""Gaussian head of the compact network: an MLP from token features to shapes and colors (Sec. 3.6, Gaussian Decoder)."""
+"""Gaussian head of the compact network: an MLP from features to shapes and colors (Sec. 3.6, Gaussian Decoder)."""
 
 import flax.linen as nn
 import jax.numpy as jnp
