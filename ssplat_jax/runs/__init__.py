@@ -1,0 +1,1 @@
+"""The work behind `ssplat run`, `demo`, `render` and `export`."""

@@ -1,0 +1,47 @@
+"""`ssplat export` of a run: its saved state as a scene file."""
+
+from pathlib import Path
+
+from ssplat_jax.checkpoint.saved_config import config_from_header
+from ssplat_jax.checkpoint.stream_state import load_newest_state
+from ssplat_jax.checkpoint.weights import params_digest
+from ssplat_jax.console import Reporter
+from ssplat_jax.data.stream_frame import StreamFrame
+from ssplat_jax.errors import InputError
+from ssplat_jax.runs.finish_run import save_scene
+from ssplat_jax.scene_files.export_rows import ExportReport
+from ssplat_jax.scene_files.formats import check_format
+from ssplat_jax.storage.run_folder import RunFolder
+from ssplat_jax.streaming.session import Session
+from ssplat_jax.streaming.streamsplat import StreamSplat
+
+
+def export_run(run_dir: Path, to: Path, params: dict, reporter: Reporter) -> ExportReport:
+    """Decodes the saved state of a run and writes its scene, in the capture's frame.
+
+    If the newest state is damaged, the one before it is exported, with a warning.
+
+    Args:
+        run_dir: folder of the run.
+        to: file to write; its suffix names the format.
+        params: parameters of the run's model.
+        reporter: prints warnings.
+
+    Returns:
+        What was written.
+
+    Raises:
+        InputError: no run there, a run with other weights, or a suffix of no known format.
+        StorageError: the state is corrupt, or `to` cannot be written.
+    """
+    check_format(to)
+    folder = RunFolder(run_dir)
+    if not folder.has_state():
+        raise InputError(f"{run_dir}: wanted the folder of an `ssplat run`, found no {folder.state.name} in it.")
+    cache, header, damage = load_newest_state(folder.state)
+    if damage is not None:
+        reporter.warn(f"{damage} Exporting the state saved before it, after {header['done']} views.")
+    if header.get("weights") != params_digest(params):
+        raise InputError(f"{run_dir}: was streamed with other weights than these; give the run's own with --weights.")
+    session = Session(StreamSplat(config_from_header(header["config"])), params, cache)
+    return save_scene(to, session.gaussians(), StreamFrame.from_dict(header["frame"]))

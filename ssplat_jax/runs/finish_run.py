@@ -1,0 +1,78 @@
+"""Scene, pictures and metrics of a finished stream."""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from ssplat_jax.console import Reporter
+from ssplat_jax.data.capture import Capture
+from ssplat_jax.data.stream_frame import StreamFrame
+from ssplat_jax.evaluation.exposures import exposures_to_json
+from ssplat_jax.evaluation.pictures import save_comparison
+from ssplat_jax.evaluation.scoring import score_view
+from ssplat_jax.gaussians import Gaussians
+from ssplat_jax.runs.resume import RunState
+from ssplat_jax.scene_files.export_rows import ExportReport
+from ssplat_jax.scene_files.formats import save_gaussians
+from ssplat_jax.storage.json_files import write_json
+from ssplat_jax.storage.run_folder import RunFolder
+
+NUM_PICTURES = 8
+"""Streamed views, evenly spread, that are rendered from the finished scene."""
+
+
+def finish_run(
+    run: RunState, capture: Capture, indices: Sequence[int], folder: RunFolder, reporter: Reporter
+) -> ExportReport:
+    """Writes the scene, pictures of some streamed views, and the metrics.
+
+    Args:
+        run: the finished stream.
+        capture: the capture that was streamed.
+        indices: frames that were streamed, in the capture's order.
+        folder: where the results go.
+        reporter: prints warnings.
+
+    Returns:
+        What was written to the scene file.
+
+    Raises:
+        StorageError: a file cannot be written.
+    """
+    gaussians, frame = run.session.gaussians(), run.frame
+    report = save_scene(folder.scene, gaussians, frame)
+    if report.warning is not None:
+        reporter.warn(f"{folder.scene.name}: {report.warning}")
+    folder.clear_views()
+    shown = sorted({indices[round(i)] for i in np.linspace(0, len(indices) - 1, NUM_PICTURES)})
+    scores = []
+    for i in shown:
+        view = score_view(gaussians, capture, i, frame, run.exposures)
+        scores.append(dataclasses.asdict(view.score))
+        save_comparison(folder.view(i), view.target, view.color, view.depth, (frame.near, frame.far))
+    metrics = {
+        "capture": capture.name,
+        "size": [capture.width, capture.height],
+        "views": len(indices),
+        "exposures": exposures_to_json(run.exposures),
+        "seen_views": scores,  # of streamed views: how well the scene explains its input
+        "ply": dataclasses.asdict(report),
+        "compile_s": round(run.session.compile_seconds, 2),
+        "step_memory_bytes": run.session.step_memory_bytes,
+        "cache": run.session.cache_facts(),
+        "stream_frame": frame.to_dict(),
+        "config_hash": run.session.model.config.hash,
+    }
+    write_json(folder.metrics, metrics)
+    return report
+
+
+def save_scene(path: Path, gaussians: Gaussians, frame: StreamFrame) -> ExportReport:
+    """Writes Gaussians of the stream in the capture's frame; far from its origin, relative to the frame's offset.
+
+    Raises:
+        StorageError: the file cannot be written.
+    """
+    return save_gaussians(path, frame.gaussians_to_capture(gaussians, offset=frame.offset), offset=frame.offset)
