@@ -21,7 +21,7 @@ from ssplat_jax.checkpoint.weights import load_params
 from ssplat_jax.config import preset
 from ssplat_jax.console import Reporter
 from ssplat_jax.errors import InputError
-from ssplat_jax.evaluation.scoring import mean_psnr
+from ssplat_jax.evaluation.scoring import score_targets
 from ssplat_jax.storage.atomic import write_atomic
 from ssplat_jax.storage.json_files import write_json
 from ssplat_jax.streaming.feed import feed_capture
@@ -29,6 +29,8 @@ from ssplat_jax.streaming.session import Session
 from ssplat_jax.streaming.streamsplat import StreamSplat
 from ssplat_jax.train.loop import train
 from ssplat_jax.train.recipe import Phase, PhaseForm, Recipe
+
+PSNRS = ("shown", "literal")  # columns of the table
 
 VARIANTS: dict[str, dict[str, Any]] = {
     "full": {},
@@ -83,12 +85,13 @@ def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str
 
 def _measure(changes: dict[str, Any], seed: int, budget: Budget, scenes, place: Path) -> list[dict[str, Any]]:
     """Scores of one trained variant on every scene, from the file if they were measured before."""
-    scores = place / "scores.json"
-    asked = json.loads(json.dumps({"budget": dataclasses.asdict(budget), "changes": changes, "scenes": list(scenes)}))
-    if scores.exists():
-        held = json.loads(scores.read_text())
+    measured = place / "scores.json"
+    request = {"budget": dataclasses.asdict(budget), "changes": changes, "scenes": list(scenes), "scores": PSNRS}
+    asked = json.loads(json.dumps(request))
+    if measured.exists():
+        held = json.loads(measured.read_text())
         if held["asked"] != asked:
-            raise InputError(f"{scores}: was measured with {held['asked']}, wanted {asked}; choose another --out.")
+            raise InputError(f"{measured}: was measured with {held['asked']}, wanted {asked}; choose another --out.")
         return held["rows"]
     config = preset("tiny").replace(**changes)
     trained = train(config, budget.recipe(seed), place, params=load_params("tiny"))
@@ -99,9 +102,10 @@ def _measure(changes: dict[str, Any], seed: int, budget: Budget, scenes, place: 
         session = Session(StreamSplat(config), trained.state.ema)
         frame = capture.stream_frame(config, split.context)
         exposures, _ = feed_capture(session, capture, split.context, frame)
-        psnr = round(mean_psnr(session.gaussians(), capture, split.targets, frame, exposures), 3)
-        rows.append({"scene": scene, "psnr": psnr, "gaussians": session.cache_facts()["decoded"]})
-    write_json(scores, {"asked": asked, "rows": rows})
+        scores = score_targets(session.gaussians(), capture, split.targets, frame, exposures)
+        psnrs = {name: round(scores[name]["psnr"], 3) for name in PSNRS}
+        rows.append({"scene": scene, **psnrs, "gaussians": session.cache_facts()["decoded"]})
+    write_json(measured, {"asked": asked, "rows": rows})
     return rows
 
 
@@ -117,17 +121,20 @@ def _scenes(captures: Path | None, budget: Budget) -> dict:
 
 def table(rows: list[dict[str, Any]]) -> str:
     """Markdown table of mean and spread over seeds, a row per variant and scene; differences are taken per seed."""
-    lines = ["| scene | variant | PSNR dB | full, same seed, minus it | Gaussians |", "|---|---|---|---|---|"]
+    lines = [
+        "| scene | variant | shown PSNR dB | full, same seed, minus it | literal PSNR dB | Gaussians |",
+        "|---|---|---|---|---|---|",
+    ]
     for scene in dict.fromkeys(row["scene"] for row in rows):
         for variant in VARIANTS:
             here = [row for row in rows if (row["scene"], row["variant"]) == (scene, variant)]
             if not here:
                 continue
-            whole = {row["seed"]: row["psnr"] for row in rows if (row["scene"], row["variant"]) == (scene, "full")}
-            scores = _spread([row["psnr"] for row in here])
-            differences = "" if variant == "full" else _spread([whole[row["seed"]] - row["psnr"] for row in here])
+            whole = {row["seed"]: row["shown"] for row in rows if (row["scene"], row["variant"]) == (scene, "full")}
+            shown, literal = (_spread([row[name] for row in here]) for name in PSNRS)
+            differences = "" if variant == "full" else _spread([whole[row["seed"]] - row["shown"] for row in here])
             gaussians = round(statistics.mean(row["gaussians"] for row in here))
-            lines.append(f"| {scene} | {variant} | {scores} | {differences} | {gaussians} |")
+            lines.append(f"| {scene} | {variant} | {shown} | {differences} | {literal} | {gaussians} |")
     return "\n".join(lines) + "\n"
 
 

@@ -106,7 +106,7 @@ def _first_slots(table, voxels):
 
 
 def shards_of(voxels: Int[Array, "*s 3"], num_shards: int) -> Int[Array, "*s"]:
-    """Which of `num_shards` caches holds each voxel: an even split by hash.
+    """Number of the cache, of `num_shards`, that holds each voxel: an even split by hash.
 
     Limits:
         Up to 2^16 shards.

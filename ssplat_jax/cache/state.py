@@ -75,7 +75,7 @@ class VoxelCache:
 
     @property
     def alive(self) -> Bool[Array, "capacity k"]:
-        """Which pivots exist."""
+        """Mask of the pivots that exist."""
         return jnp.arange(self.means.shape[1]) < self.counts[:, None]
 
     @property

@@ -19,7 +19,7 @@ class Demo:
     scene: Literal["room", "orbit", "corridor"] = "room"
     """Scene to stream."""
     out: Path = Path("ssplat_demo")
-    """Where the results go."""
+    """Folder of the results."""
     quality: QualityOption = "accurate"
     quiet: QuietOption = False
 

@@ -30,7 +30,7 @@ class Eval:
     context: int
     """Context views to stream."""
     out: Path
-    """Where the results go."""
+    """Folder of the results."""
     protocol: Literal["interleaved", "paper"] = "interleaved"
     """interleaved: every 8th frame from the 5th on is a target. paper: targets uniform over the trajectory."""
     stride: int = 1
@@ -75,16 +75,20 @@ class Eval:
         )
         reference = metrics["baselines"]
         print(
-            f"{capture.name}: PSNR {metrics['psnr']:.2f} dB, SSIM {metrics['ssim']:.3f} over {metrics['target_views']}"
-            f" views (copying the nearest view {reference['nearest_view_psnr']:.2f}, a mean color"
-            f" {reference['mean_color_psnr']:.2f}); {metrics['chunk_ms']['median']:.0f} ms a chunk;"
-            f" {self.out}/metrics.json"
+            f"{capture.name}, {metrics['target_views']} views: {_both_scores(metrics)} (copying the nearest view"
+            f" {reference['nearest_view_psnr']:.2f}, a mean color {reference['mean_color_psnr']:.2f});"
+            f" {metrics['chunk_ms']['median']:.0f} ms a chunk; {self.out}/metrics.json"
         )
         if refined := metrics.get("refinement"):
-            before = refined["before"]
             print(
                 f"before {refined['steps']} refinement steps of {refined['seconds_per_step']:.2f} s:"
-                f" PSNR {before['psnr']:.2f} dB, over black {before['psnr_over_black']:.2f} dB"
-                f" (now {metrics['psnr_over_black']:.2f}), SSIM {before['ssim']:.3f}"
+                f" {_both_scores(refined['before'])}"
             )
         return 0
+
+
+def _both_scores(scores: dict) -> str:
+    """PSNR and SSIM as the paper defines them, and those of the image that is shown."""
+    return ", ".join(
+        f"{name} {scores[name]['psnr']:.2f} dB {scores[name]['ssim']:.3f}" for name in ("shown", "literal")
+    )

@@ -25,7 +25,7 @@ class Run:
 
     capture: CapturePath
     out: Path
-    """Where the results go; a run that was stopped there is continued."""
+    """Folder of the results; a run that stopped there is continued."""
     stride: int = 1
     """Use every STRIDE-th frame."""
     max_views: int | None = None

@@ -9,7 +9,7 @@ from ssplat_jax.config.config_group import ConfigGroup, is_positive
 
 @dataclasses.dataclass(frozen=True)
 class StreamingConfig(ConfigGroup):
-    """How images become chunks: chunk size, scale, order and exposure."""
+    """Fields that decide how images become chunks: chunk size, scale, order and exposure."""
 
     chunk_size: int = 4
     """Views per chunk."""
@@ -35,7 +35,7 @@ class StreamingConfig(ConfigGroup):
 
 @dataclasses.dataclass(frozen=True)
 class DepthConfig(ConfigGroup):
-    """How depths and confidences are read from distributions over candidates."""
+    """Fields that decide how depth and confidence are read from a distribution over candidates."""
 
     depth_readout: Literal["mean", "window"] = "window"
     """Expectation over all candidates (`mean`, literal), or over those around the peak, which does not average two
@@ -56,7 +56,7 @@ class DepthConfig(ConfigGroup):
 
 @dataclasses.dataclass(frozen=True)
 class HistoryConfig(ConfigGroup):
-    """How the cache informs the next chunk: projection, HPDA and CGFI."""
+    """Fields that decide how the cache informs the next chunk: projection, HPDA and CGFI."""
 
     cluster_ratio: float = 1.15
     """Largest ratio of depths within the front cluster of pivots that a cell averages; `inf` averages all (literal)."""
@@ -103,7 +103,7 @@ class MemoryConfig(ConfigGroup):
     capacity: int = 1 << 15
     """Voxels that the cache can hold, a power of two; `overflow="grow"` doubles it outside jit."""
     overflow: Literal["grow", "drop_new", "evict_lowest", "error"] = "grow"
-    """What happens to tokens of new voxels when the cache is full."""
+    """Treatment of tokens of new voxels when the cache is full."""
     merge_key: Literal["seed", "feature"] = "seed"
     """Vectors whose cosine similarity selects the pair to merge."""
     merge_weight: Literal["max", "count"] = "max"

@@ -5,8 +5,6 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-
 from ssplat_jax.console import Reporter
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.split import Split
@@ -14,7 +12,7 @@ from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.evaluation import latency
 from ssplat_jax.evaluation.exposures import exposures_to_json
 from ssplat_jax.evaluation.pictures import save_comparison
-from ssplat_jax.evaluation.scoring import ViewScore, baselines, check_scorable, score_view
+from ssplat_jax.evaluation.scoring import ViewScore, baselines, check_scorable, mean_scores, score_view
 from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.metrics.lpips import LpipsWeights, check_size
 from ssplat_jax.metrics.psnr_ssim import SSIM_ARGUMENTS
@@ -83,7 +81,7 @@ def evaluate(
     if refine_steps:
         before = [score_view(gaussians, capture, i, frame, exposures, lpips_weights).score for i in split.targets]
         gaussians, done = _refine(gaussians, streamed, split.context, frame, exposures, refine_steps, reporter)
-        refinement = {"refinement": {**done, "before": _mean_scores(before)}}
+        refinement = {"refinement": {**done, "before": mean_scores(before)}}
     scores = _score_targets(gaussians, capture, split, frame, exposures, lpips_weights, folder)
     middle = split.targets[len(split.targets) // 2]
     timing = latency.measure_latency(session, recent, capture.camera(middle, frame))
@@ -95,13 +93,13 @@ def evaluate(
         "split_sha256": split.sha256,
         "context_views": len(split.context),
         "target_views": len(split.targets),
-        **_mean_scores(scores),
+        **mean_scores(scores),
         "ssim_arguments": SSIM_ARGUMENTS,
         **refinement,
         **timing,
         **cost,
         "config_hash": session.model.config.hash,
-        "stream_frame": {"scale": frame.scale, "near": frame.near, "far": frame.far, "warning": frame.warning},
+        "stream_frame": frame.to_dict(),
         "baselines": reference,
         "exposures": exposures_to_json(exposures),
         "per_view": [dataclasses.asdict(s) for s in scores],
@@ -167,11 +165,3 @@ def _score_targets(
         save_comparison(folder.target(i), view.target, view.color, view.depth, (frame.near, frame.far))
         scores.append(view.score)
     return scores
-
-
-def _mean_scores(scores: list[ViewScore]) -> dict[str, float | None]:
-    """Means over the targets."""
-    names = ("psnr", "psnr_over_black", "psnr_one_exposure", "ssim")
-    means = {name: round(float(np.mean([getattr(s, name) for s in scores])), 4) for name in names}
-    distances = [s.lpips for s in scores if s.lpips is not None]
-    return means | {"lpips": round(float(np.mean(distances)), 4) if distances else None}

@@ -1,6 +1,8 @@
 """Scores of rendered views against their images, and the baselines to compare them with."""
 
 import dataclasses
+from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -23,15 +25,23 @@ _jitted_lpips, _jitted_fill_holes = jax.jit(lpips), jax.jit(fill_holes)
 
 
 @dataclasses.dataclass(frozen=True)
+class ImageScore:
+    """Scores of one image against its target."""
+
+    psnr: float  # dB
+    ssim: float
+    lpips: float | None  # None without weights
+
+
+@dataclasses.dataclass(frozen=True)
 class ViewScore:
-    """Scores of one view."""
+    """Scores of one view: `literal` as the paper defines them, `shown` of the image that a person is shown."""
 
     frame: int
-    psnr: float  # dB, holes filled, at the exposure of the nearest streamed views
-    psnr_over_black: float  # dB, holes black, at that exposure
+    literal: ImageScore  # holes black, at the scene's exposure
+    shown: ImageScore  # holes filled, at the exposure of the nearest streamed views
+    psnr_over_black: float  # dB, holes black, at the exposure of the nearest streamed views
     psnr_one_exposure: float  # dB, holes filled, at the scene's exposure
-    ssim: float  # of the image that `psnr` compares
-    lpips: float | None  # of the same image; None without weights
     coverage: float  # mean alpha: how much of the view the scene covers
 
 
@@ -41,7 +51,7 @@ class ScoredView:
 
     score: ViewScore
     target: Float[np.ndarray, "h w 3"]
-    color: Float[np.ndarray, "h w 3"]  # what `score.psnr` compares: holes filled, exposed, clipped to [0, 1]
+    color: Float[np.ndarray, "h w 3"]  # what `score.shown` compares: holes filled, exposed, clipped to [0, 1]
     depth: Float[np.ndarray, "h w"]  # stream units, 0 where nothing is
 
 
@@ -68,10 +78,9 @@ def score_view(
 ) -> ScoredView:
     """Renders frame `i` of a capture and scores it.
 
-    The scene has one exposure; the view is shown at that of the nearest streamed views (`exposure_for`), which is about
-    what a camera there would have had. Holes are filled with the colors around them (`fill_holes`), or with the scene's
-    mean color: black, a color like any other, would make a hole the largest error of all (docs/decisions.md). The
-    scores without either are given too.
+    The literal scores compare the render over black at the exposure of the scene. The shown ones compare the image at
+    the exposure of the nearest streamed views (`exposure_for`), about what a camera there would have had, with holes
+    filled by the colors around them (`fill_holes`) or by the scene's mean color (docs/decisions.md).
 
     Args:
         gaussians: the scene, in the stream frame.
@@ -88,28 +97,63 @@ def score_view(
     assert out.color is not None and out.alpha is not None
     exposure = exposure_for(capture, i, exposures)
     filled = np.asarray(_jitted_fill_holes(out.color, out.alpha, mean_color(gaussians)))
-    color, over_black = (
-        np.clip(image * exposure, 0.0, 1.0).astype(np.float32) for image in (filled, np.asarray(out.color))
-    )
-    target, distance = capture.image(i), None
-    if lpips_weights is not None:
-        distance = float(_jitted_lpips(lpips_weights, jnp.asarray(color), jnp.asarray(target)))
+    over_black = np.asarray(out.color)
+    color, target = _displayed(filled, exposure), capture.image(i)
     score = ViewScore(
         frame=i,
-        psnr=psnr(color, target),
-        psnr_over_black=psnr(over_black, target),
-        psnr_one_exposure=psnr(np.clip(filled, 0.0, 1.0), target),
-        ssim=ssim(color, target),
-        lpips=distance,
+        literal=score_image(_displayed(over_black), target, lpips_weights),
+        shown=score_image(color, target, lpips_weights),
+        psnr_over_black=psnr(_displayed(over_black, exposure), target),
+        psnr_one_exposure=psnr(_displayed(filled), target),
         coverage=float(np.asarray(out.alpha).mean()),
     )
     return ScoredView(score, target, color, np.asarray(out.depth))
 
 
-def mean_psnr(
+def _displayed(image: Float[np.ndarray, "h w 3"], exposure: Float[np.ndarray, "3"] | float = 1.0):
+    """An image at an exposure, clipped to [0, 1]."""
+    return np.clip(image * exposure, 0.0, 1.0).astype(np.float32)
+
+
+def score_image(
+    image: Float[np.ndarray, "h w 3"], target: Float[np.ndarray, "h w 3"], lpips_weights: LpipsWeights | None = None
+) -> ImageScore:
+    """Scores of an image in [0, 1] against its target."""
+    distance = None
+    if lpips_weights is not None:
+        distance = float(_jitted_lpips(lpips_weights, jnp.asarray(image), jnp.asarray(target)))
+    return ImageScore(psnr(image, target), ssim(image, target), distance)
+
+
+def mean_scores(scores: Sequence[ViewScore]) -> dict[str, Any]:
+    """Means over views: the blocks `literal` and `shown`, and the two scores between them.
+
+    Returns:
+        `{"literal": {"psnr", "ssim", "lpips"}, "shown": {...}, "psnr_over_black", "psnr_one_exposure"}`;
+        `lpips` is None without weights.
+    """
+    blocks = {name: _mean_image_score([getattr(s, name) for s in scores]) for name in ("literal", "shown")}
+    between = {name: _mean([getattr(s, name) for s in scores]) for name in ("psnr_over_black", "psnr_one_exposure")}
+    return blocks | between
+
+
+def _mean_image_score(scores: Sequence[ImageScore]) -> dict[str, float | None]:
+    distances = [s.lpips for s in scores if s.lpips is not None]
+    return {
+        "psnr": _mean([s.psnr for s in scores]),
+        "ssim": _mean([s.ssim for s in scores]),
+        "lpips": _mean(distances) if distances else None,
+    }
+
+
+def _mean(values: Sequence[float]) -> float:
+    return round(float(np.mean(values)), 4)
+
+
+def score_targets(
     gaussians: Gaussians, capture: Capture, targets: tuple[int, ...], frame: StreamFrame, exposures: Exposures
-) -> float:
-    """Mean PSNR of the target views.
+) -> dict[str, Any]:
+    """Mean scores of the target views.
 
     Args:
         gaussians: the scene, in the stream frame.
@@ -119,9 +163,9 @@ def mean_psnr(
         exposures: exposures of the streamed frames.
 
     Returns:
-        The mean in dB.
+        See `mean_scores`.
     """
-    return float(np.mean([score_view(gaussians, capture, i, frame, exposures).score.psnr for i in targets]))
+    return mean_scores([score_view(gaussians, capture, i, frame, exposures).score for i in targets])
 
 
 def baselines(capture: Capture, split: Split) -> dict[str, float]:

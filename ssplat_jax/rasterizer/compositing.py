@@ -151,7 +151,7 @@ def _batches(bounds: Int[Array, " tiles_and_one"], grid: Grid) -> Int[Array, "ba
 
 
 def _ranges(intersections: TileIntersections, tiles: Int[Array, " t"]) -> tuple[Int[Array, " t"], Int[Array, " t"]]:
-    """Where the pairs of `tiles` begin and end; equal for the padding of `_batches`."""
+    """Start and end of the pairs of each of `tiles`; equal for the padding of `_batches`."""
     bounds, last = intersections.bounds, intersections.bounds.shape[0] - 1
     return bounds[jnp.minimum(tiles, last)], bounds[jnp.minimum(tiles + 1, last)]
 

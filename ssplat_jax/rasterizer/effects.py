@@ -140,7 +140,7 @@ def _differ(exposures: np.ndarray) -> bool:
 
 
 def _sampling_ratio(gaussians: Gaussians, camera: Camera, captured: Camera) -> float:
-    """How many times as finely (f / z) the cameras sample the present Gaussians as the captured ones: 99 % quantile."""
+    """Ratio of the sampling rate (f / z) of present Gaussians to that of the captured cameras: 99 % quantile."""
     present = np.asarray(gaussians.opacities) > 0
     means = np.asarray(gaussians.means, np.float64)[present]
     ours, theirs = _sampling_rates(means, camera), _sampling_rates(means, captured)

@@ -31,7 +31,7 @@ PAIRS_MARGIN = 1.25
 
 @dataclasses.dataclass(frozen=True)
 class Refinement:
-    """What `refine` did."""
+    """Report of a call of `refine`."""
 
     num_steps: int
     num_skipped: int  # steps whose gradient was not finite

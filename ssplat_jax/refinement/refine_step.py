@@ -44,7 +44,7 @@ class RefineState:
 
 @pytree
 class StepReport:
-    """What one step measured, before its update."""
+    """Measurements of one step, taken before its update."""
 
     loss: Float[Array, ""]  # weighted L1 error of the pixels that are learned from
     held_back: Float[Array, ""]  # the same error of the pixels that are not

@@ -21,7 +21,7 @@ from ssplat_jax.streaming.streamsplat import StreamSplat
 
 @dataclasses.dataclass(frozen=True)
 class RunResult:
-    """Where a run stands when `run_capture` returns."""
+    """State of a run when `run_capture` returns."""
 
     num_views: int
     num_gaussians: int

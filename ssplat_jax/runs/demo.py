@@ -13,7 +13,7 @@ from ssplat_jax.data.capture import open_capture
 from ssplat_jax.data.split import interleaved_split
 from ssplat_jax.evaluation.pictures import save_comparison, save_image
 from ssplat_jax.evaluation.plots import import_pyplot, save_figure
-from ssplat_jax.evaluation.scoring import ScoredView, score_view
+from ssplat_jax.evaluation.scoring import ScoredView, mean_scores, score_view
 from ssplat_jax.scene_files.ply import save_ply
 from ssplat_jax.storage.folders import make_writable
 from ssplat_jax.storage.json_files import write_json
@@ -77,22 +77,25 @@ def run_demo(scene: str, out: Path, reporter: Reporter, quality: Quality = QUALI
         "compile_s": round(session.compile_seconds, 2),
         "seconds": round(time.perf_counter() - since, 1),
         "config_hash": model.config.hash,
+        "stream_frame": frame.to_dict(),
     }
     write_json(folder.metrics, metrics)
     _plot(out / "quality.png", rows)
-    header = ("views", "PSNR dB", "SSIM", "covered", "Gaussians")
+    header = ("views", "shown dB", "SSIM", "literal dB", "SSIM", "covered", "Gaussians")
     reporter.table(f"{scene}: quality of unseen views", header, [tuple(row.values()) for row in rows])
     return metrics
 
 
 def _table_row(views: Sequence[ScoredView], num_streamed: int, session: Session) -> dict:
     """Mean scores after `num_streamed` views."""
-    mean = lambda name: float(np.mean([getattr(view.score, name) for view in views]))  # noqa: E731
+    scores = mean_scores([view.score for view in views])
     return {
         "views": num_streamed,
-        "psnr": round(mean("psnr"), 2),
-        "ssim": round(mean("ssim"), 3),
-        "coverage": round(mean("coverage"), 3),
+        "shown_psnr": round(scores["shown"]["psnr"], 2),
+        "shown_ssim": round(scores["shown"]["ssim"], 3),
+        "literal_psnr": round(scores["literal"]["psnr"], 2),
+        "literal_ssim": round(scores["literal"]["ssim"], 3),
+        "coverage": round(float(np.mean([view.score.coverage for view in views])), 3),
         "num_gaussians": session.cache_facts()["decoded"],
     }
 
@@ -102,7 +105,11 @@ def _plot(path: Path, rows: list[dict]) -> None:
     if (pyplot := import_pyplot()) is None:
         return
     figure, axes = pyplot.subplots(figsize=(5, 3.2), layout="constrained")
-    axes.plot([r["views"] for r in rows], [r["psnr"] for r in rows], marker="o", color="#30507a")
+    axes.plot([r["views"] for r in rows], [r["shown_psnr"] for r in rows], marker="o", color="#30507a", label="shown")
+    axes.plot(
+        [r["views"] for r in rows], [r["literal_psnr"] for r in rows], marker="o", color="#c06030", label="literal"
+    )
+    axes.legend(frameon=False)
     axes.set_xscale("log", base=2)
     axes.set_xticks([r["views"] for r in rows], [str(r["views"]) for r in rows])
     axes.set_xlabel("views seen")

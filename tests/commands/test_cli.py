@@ -277,10 +277,11 @@ def test_eval_writes_every_promised_field(tmp_path, monkeypatch):
     assert run(*arguments, "--quality", "fast", "--out", str(out)) == 0
     metrics = json.loads((out / "metrics.json").read_text())
     promised = {
-        "psnr", "ssim", "lpips", "per_view", "context_views", "target_views", "chunk_ms", "render_ms", "compile_s",
-        "step_memory_bytes", "cache", "num_gaussians", "config_hash", "baselines",
+        "literal", "shown", "psnr_over_black", "psnr_one_exposure", "per_view", "context_views", "target_views",
+        "chunk_ms", "render_ms", "compile_s", "step_memory_bytes", "cache", "num_gaussians", "config_hash", "baselines",
     }  # fmt: skip
     assert promised <= metrics.keys()
+    assert metrics["literal"].keys() == metrics["shown"].keys() == {"psnr", "ssim", "lpips"}
     assert {"voxels", "pivots", "capacity", "overflow", "accepted_fraction"} <= metrics["cache"].keys()
     assert {"nearest_view_psnr", "mean_color_psnr"} <= metrics["baselines"].keys()
     assert metrics["context_views"] == 8 and metrics["target_views"] == len(metrics["per_view"]) == 1
@@ -295,8 +296,8 @@ def test_eval_writes_every_promised_field(tmp_path, monkeypatch):
     assert run(*arguments, "--quality", "fast", "--refine", "3", "--out", str(refined)) == 0
     after = json.loads((refined / "metrics.json").read_text())
     assert after["refinement"]["steps"] == 3 and after["refinement"]["skipped_steps"] == 0
-    assert all(after["refinement"]["before"][name] == metrics[name] for name in ("psnr", "psnr_over_black", "ssim"))
-    assert after["psnr"] != metrics["psnr"]
+    assert all(after["refinement"]["before"][name] == metrics[name] for name in ("literal", "shown"))
+    assert after["shown"]["psnr"] != metrics["shown"]["psnr"]
 
 
 def test_negative_refinement_steps_are_bad_usage(tmp_path, capsys):

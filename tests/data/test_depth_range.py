@@ -1,7 +1,5 @@
 """Depth statistics: accurate on known scenes, robust in hard cases, independent of frames that are not given."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -17,7 +15,6 @@ from ssplat_jax.data.sparse_matches import CommonPoints
 from ssplat_jax.data.split import interleaved_split
 from tests.data.planes_fixture import two_planes
 
-CAPTURES = Path(__file__).resolve().parents[3] / "shared" / "captures"
 MEDIAN_TOLERANCE = 1.3  # ratio; keypoints are not distributed like pixels
 RANGE_SLACK = 0.001  # share of the pixels that may lie outside [near, far]
 
@@ -173,11 +170,10 @@ def test_range_is_bounded_and_scales(median, spread_near, spread_far):
 # -- real captures ----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.skipif(not CAPTURES.is_dir(), reason="no ../shared/captures beside the repository")
 @pytest.mark.parametrize(("stride", "context"), [(1, 24), (5, 8)])
-def test_kinect_depths_of_a_hand_held_video(stride, context):
+def test_kinect_depths_of_a_hand_held_video(stride, context, captures):
     """The median is within 35 % of the Kinect's over the same frames, whose depths are inside [near, far]."""
-    capture = open_capture(CAPTURES / "redkitchen", size=(320, 240))
+    capture = open_capture(captures / "redkitchen", size=(320, 240))
     used = interleaved_split(len(capture), stride, context).context
     depths = estimate_depths(capture, used)
     truth = true_depths(capture, range(used[0], used[-1] + 1))

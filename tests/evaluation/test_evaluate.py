@@ -1,4 +1,4 @@
-"""What a score counts: holes in the colors around, and what they would cost over black."""
+"""Scores: holes are filled with the colors around; over black they cost what they are worth."""
 
 import json
 
@@ -16,7 +16,7 @@ from ssplat_jax.evaluation.nearest_views import nearest_views
 from ssplat_jax.evaluation.scoring import score_view
 from ssplat_jax.gaussians import Gaussians, mean_color
 from ssplat_jax.metrics.lpips import load_lpips, lpips
-from ssplat_jax.metrics.psnr_ssim import psnr
+from ssplat_jax.metrics.psnr_ssim import psnr, ssim
 from ssplat_jax.streaming.session import Session
 from ssplat_jax.streaming.streamsplat import StreamSplat
 from tests.metrics.lpips_fixture import random_heads, random_vgg
@@ -51,8 +51,10 @@ def test_an_uncovered_view_is_scored_on_the_mean_color(capture):
     score, color, depth = view.score, view.color, view.depth
     np.testing.assert_allclose(color, np.broadcast_to([0.2, 0.4, 0.6], color.shape), atol=1e-6)
     target = capture.image(0)
-    assert score.psnr == pytest.approx(psnr(color, target)) and score.coverage == 0 and not depth.any()
-    assert score.psnr_over_black == pytest.approx(psnr(np.zeros_like(target), target))
+    assert score.shown.psnr == pytest.approx(psnr(color, target)) and score.coverage == 0 and not depth.any()
+    assert score.psnr_over_black == score.literal.psnr == pytest.approx(psnr(np.zeros_like(target), target))
+    assert score.literal.ssim == pytest.approx(ssim(np.zeros_like(target), target))
+    assert score.shown.lpips is None and score.literal.lpips is None
 
 
 def test_a_novel_view_has_the_mean_exposure_of_its_neighbors(capture):
@@ -65,9 +67,10 @@ def test_a_novel_view_has_the_mean_exposure_of_its_neighbors(capture):
     score, color = view.score, view.color
     wanted = [0.2 * 0.25 ** (1 / 3), 0.4, 1.0]  # 1.2 is clipped
     np.testing.assert_allclose(color, np.broadcast_to(wanted, color.shape), atol=1e-6)
-    assert score.psnr == pytest.approx(psnr(color, capture.image(2)))
+    assert score.shown.psnr == pytest.approx(psnr(color, capture.image(2)))
     plain = score_view(scene, capture, 2, frame, {}).score
-    assert score.psnr_one_exposure == pytest.approx(plain.psnr) and score.psnr != pytest.approx(plain.psnr)
+    assert score.psnr_one_exposure == pytest.approx(plain.shown.psnr) != score.shown.psnr
+    assert score.literal == plain.literal  # exposures do not enter the paper's scores
     color = score_view(scene, capture, 4, frame, exposures).color  # a streamed view has its own
     np.testing.assert_allclose(color, np.broadcast_to([0.2, 0.4, 1.0], color.shape), atol=1e-6)
 
@@ -109,6 +112,9 @@ def test_lpips_is_scored_if_and_only_if_weights_are_given(capture, compiled_plai
     scene, frame = gaussians([[0.2, 0.4, 0.6]], [0.9]), capture.stream_frame(StreamConfig(), (0, 1, 3, 4))
     view = score_view(scene, capture, 2, frame, {}, weights)
     score, color = view.score, view.color
-    expected = float(lpips(weights, jnp.asarray(color), jnp.asarray(capture.image(2))))
-    assert score.lpips == pytest.approx(expected, rel=1e-5) and expected > 0.1
-    assert score_view(scene, capture, 2, frame, {}).score.lpips is None
+    target = jnp.asarray(capture.image(2))
+    for image, given in ((color, score.shown.lpips), (np.zeros_like(color), score.literal.lpips)):
+        expected = float(lpips(weights, jnp.asarray(image), target))
+        assert given == pytest.approx(expected, rel=1e-5) and expected > 0.1
+    plain = score_view(scene, capture, 2, frame, {}).score
+    assert plain.shown.lpips is None and plain.literal.lpips is None

@@ -47,7 +47,7 @@ def cameras(shifts=(0.0, 0.15, -0.15, 0.3)) -> Camera:
 
 @functools.cache
 def photographs():
-    """What the cameras see of the true scene."""
+    """Images of the true scene from `cameras`."""
     color = render(scene(), cameras(), max_pairs=MAX_PAIRS).color
     assert color is not None
     return color

@@ -1,4 +1,4 @@
-"""What a browser is sent, and where it comes from. With viser and Chromium there, what the browser then shows."""
+"""The viewer: what a browser is sent, where it comes from, and, with viser and Chromium, what the browser shows."""
 
 import json
 import shutil
