@@ -19,6 +19,7 @@ from ssplat_jax.commands.experiment_command import Experiment
 from ssplat_jax.commands.export_command import Export
 from ssplat_jax.commands.import_weights_command import ImportWeights
 from ssplat_jax.commands.inspect_command import Inspect
+from ssplat_jax.commands.refine_command import Refine
 from ssplat_jax.commands.render_command import Render
 from ssplat_jax.commands.run_command import Run
 from ssplat_jax.commands.train_command import Train
@@ -31,6 +32,7 @@ COMMANDS = {
     "demo": Demo,
     "inspect": Inspect,
     "run": Run,
+    "refine": Refine,
     "eval": Eval,
     "train": Train,
     "export": Export,

@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +19,7 @@ from ssplat_jax.refinement.key_views import KeyViews
 from ssplat_jax.refinement.refine_config import RefineConfig
 from ssplat_jax.refinement.refine_step import (
     EFFECTS,
+    RefineState,
     apply_revision,
     current_gaussians,
     init_refinement,
@@ -27,6 +28,22 @@ from ssplat_jax.refinement.refine_step import (
 
 PAIRS_MARGIN = 1.25
 """Capacity for tile intersections over what the fullest key view needs: Gaussians grow while they are refined."""
+
+
+@dataclasses.dataclass
+class Progress:
+    """Refinement between two steps: all that the next step depends on, and the measurements so far."""
+
+    state: RefineState
+    max_pairs: int  # capacity for tile intersections of the compiled step
+    losses: list[float] = dataclasses.field(default_factory=list)  # per step, on the pixels that are learned from
+    held_back: list[float] = dataclasses.field(default_factory=list)  # per step, on the pixels that are not
+    seconds: list[float] = dataclasses.field(default_factory=list)  # per step; the first of a process compiles
+
+    @property
+    def num_steps(self) -> int:
+        """Steps done."""
+        return len(self.losses)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,32 +91,55 @@ def refine(
     _check(cameras, images, exposures, steps)
     if steps == 0:
         return gaussians, Refinement(0, 0, [], [], False, 0.0)
-    config = config or RefineConfig()
     key_views = KeyViews.of(cameras, jnp.asarray(images), exposures)
-    state = init_refinement(gaussians)
-    max_pairs = _capacity(gaussians, key_views)
-    losses, held_back, seconds, stopped_early = [], [], [], False
-    for step in range(steps):
+    progress = start_refinement(gaussians, key_views)
+    for _ in continue_refinement(progress, key_views, steps, config):
+        on_step(progress.num_steps, progress.losses[-1])
+    return current_gaussians(progress.state), report_of(progress, key_views)
+
+
+def start_refinement(gaussians: Gaussians, key_views: KeyViews) -> Progress:
+    """Refinement of `gaussians` before its first step."""
+    return Progress(init_refinement(gaussians), _capacity(gaussians, key_views))
+
+
+def continue_refinement(
+    progress: Progress, key_views: KeyViews, steps: int, config: RefineConfig | None = None
+) -> Iterator[None]:
+    """Updates `progress` in place, a step an iteration, until `steps` are done or they no longer help.
+
+    The caller may save `progress` after any iteration. A refinement that continues from it takes the same steps.
+
+    Args:
+        progress: the steps so far.
+        key_views: the views to compare with; the same for all steps.
+        steps: planned steps, those of `progress` included. They decide how fast the learning rates decay.
+        config: learning rates and bounds.
+    """
+    config = config or RefineConfig()
+    while progress.num_steps < steps and not has_stopped_helping(progress.held_back, key_views.num_slots):
         start = time.perf_counter()
-        rate = jnp.float32(config.final_rate ** (step / steps))
-        state, report = _step(config, max_pairs)(state, key_views, rate)
-        losses.append(float(report.loss))
-        held_back.append(float(report.held_back))
-        seconds.append(time.perf_counter() - start)
+        rate = jnp.float32(config.final_rate ** (progress.num_steps / steps))
+        progress.state, report = _step(config, progress.max_pairs)(progress.state, key_views, rate)
+        progress.losses.append(float(report.loss))
+        progress.held_back.append(float(report.held_back))
+        progress.seconds.append(time.perf_counter() - start)
         if int(report.num_overflow):
-            max_pairs = _capacity(apply_revision(state.start, state.revision), key_views)
-        on_step(step + 1, losses[-1])
-        if stopped_early := has_stopped_helping(held_back, key_views.num_slots):
-            break
-    report = Refinement(
-        num_steps=len(losses),
-        num_skipped=int(state.num_skipped),
-        losses=losses,
-        held_back=held_back,
-        stopped_early=stopped_early,
-        seconds_per_step=float(np.median(seconds[1:])) if len(seconds) > 1 else 0.0,
+            revised = apply_revision(progress.state.start, progress.state.revision)
+            progress.max_pairs = _capacity(revised, key_views)
+        yield
+
+
+def report_of(progress: Progress, key_views: KeyViews) -> Refinement:
+    """The report of a refinement that has ended."""
+    return Refinement(
+        num_steps=progress.num_steps,
+        num_skipped=int(progress.state.num_skipped),
+        losses=progress.losses,
+        held_back=progress.held_back,
+        stopped_early=has_stopped_helping(progress.held_back, key_views.num_slots),
+        seconds_per_step=float(np.median(progress.seconds[1:])) if progress.num_steps > 1 else 0.0,
     )
-    return current_gaussians(state), report
 
 
 def has_stopped_helping(held_back: list[float], num_views: int) -> bool:

@@ -19,6 +19,21 @@ class RunFolder:
         return self.path / "scene.ply"
 
     @property
+    def refined_scene(self) -> Path:
+        """The refined scene, in the capture's frame; `scene` stays as it was streamed."""
+        return self.path / "refined.ply"
+
+    @property
+    def refinement(self) -> Path:
+        """The losses and scores of the refinement as JSON."""
+        return self.path / "refinement.json"
+
+    @property
+    def refinement_state(self) -> Path:
+        """The saved refinement, from which a stopped one continues."""
+        return self.path / "refinement.npz"
+
+    @property
     def state(self) -> Path:
         """The saved stream state, from which a stopped run continues."""
         return self.path / "state.npz"
@@ -76,8 +91,14 @@ class RunFolder:
         """Removes the run that the folder holds; files of the user stay."""
         for stale in (self.state, previous_path(self.state), self.scene, self.metrics):
             stale.unlink(missing_ok=True)
+        self.clear_refinement()
         self.clear_deltas()
         self.clear_views()
+
+    def clear_refinement(self) -> None:
+        """Removes the refinement; the streamed scene stays."""
+        for stale in (self.refinement_state, self.refined_scene, self.refinement):
+            stale.unlink(missing_ok=True)
 
     def clear_deltas(self) -> None:
         """Removes all deltas."""

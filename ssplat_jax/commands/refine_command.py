@@ -1,0 +1,55 @@
+"""`ssplat refine`: gradient steps on the scene of a finished run."""
+
+import dataclasses
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from ssplat_jax.commands.options import CapturePath, QuietOption, WeightsOption
+
+
+@dataclasses.dataclass(frozen=True)
+class Refine:
+    """Refine the scene of a run on its own frames: refined.ply beside scene.ply. Continues a stopped refinement.
+
+    Example: ssplat refine runs/kitchen path/to/capture --steps 100
+    """
+
+    folder: Annotated[Path, tyro.conf.Positional]
+    """Folder of a finished `ssplat run`."""
+    capture: CapturePath
+    steps: int = 100
+    """Most gradient steps; each renders one view."""
+    weights: WeightsOption = "tiny"
+    save_every: int = 50
+    """Steps between saved states."""
+    overwrite: bool = False
+    """Remove the refinement in the folder and start anew."""
+    quiet: QuietOption = False
+
+    def run(self) -> int:
+        from ssplat_jax.checkpoint.weights import load_params
+        from ssplat_jax.console import Reporter
+        from ssplat_jax.runs.refine_run import refine_run
+
+        result = refine_run(
+            self.folder,
+            self.capture,
+            load_params(self.weights),
+            steps=self.steps,
+            save_every=self.save_every,
+            overwrite=self.overwrite,
+            reporter=Reporter(self.quiet),
+        )
+        if result.interrupted:
+            how = " without --overwrite" if self.overwrite else ""
+            print(f"stopped after {result.num_steps} steps; the same command{how} continues", file=sys.stderr)
+            return 128 + result.interrupted
+        before, after = (scores["shown"]["psnr"] for scores in (result.before, result.after))
+        print(
+            f"wrote {self.folder}/refined.ply: {result.num_steps} steps, streamed views shown at {after:.2f} dB"
+            f" instead of {before:.2f}"
+        )
+        return 0

@@ -1,0 +1,196 @@
+"""`ssplat refine`: the scene of a finished run, revised on the frames that it was made from."""
+
+import dataclasses
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ssplat_jax.checkpoint.saved_config import config_from_header
+from ssplat_jax.checkpoint.stream_state import load_newest_state
+from ssplat_jax.checkpoint.weights import params_digest
+from ssplat_jax.console import Reporter
+from ssplat_jax.data.capture import Capture, open_capture
+from ssplat_jax.data.stream_frame import StreamFrame
+from ssplat_jax.errors import InputError, require_positive
+from ssplat_jax.evaluation.exposures import exposures_from_json
+from ssplat_jax.evaluation.scoring import score_targets
+from ssplat_jax.gaussians import Gaussians
+from ssplat_jax.refinement import KeyViews, RefineConfig, RefineState, current_gaussians
+from ssplat_jax.refinement.refine import Progress, continue_refinement, report_of, start_refinement
+from ssplat_jax.refinement.refine_capture import key_views_of
+from ssplat_jax.refinement.refine_step import Revision
+from ssplat_jax.runs.finish_run import NUM_PICTURES, save_scene
+from ssplat_jax.storage.folder_lock import lock_folder
+from ssplat_jax.storage.interrupts import Interrupts
+from ssplat_jax.storage.json_files import write_json
+from ssplat_jax.storage.npz import load_arrays, save_arrays
+from ssplat_jax.storage.run_folder import RunFolder
+from ssplat_jax.streaming.feed import Exposures
+from ssplat_jax.streaming.session import Session
+from ssplat_jax.streaming.streamsplat import StreamSplat
+
+KIND = "refinement state 1"
+
+
+@dataclasses.dataclass(frozen=True)
+class RefineResult:
+    """State of a refinement when `refine_run` returns."""
+
+    num_steps: int
+    before: dict  # scores of some streamed views, see `mean_scores`; empty if it was interrupted
+    after: dict
+    interrupted: int | None  # the signal that stopped it, if one did
+
+
+@dataclasses.dataclass(frozen=True)
+class _Run:
+    """A finished run, opened with its capture."""
+
+    gaussians: Gaussians  # in the stream frame
+    capture: Capture
+    indices: list[int]
+    frame: StreamFrame
+    exposures: Exposures
+    identity: dict  # facts that must be equal for a refinement to be continued
+
+
+def refine_run(
+    run_dir: Path, path: str, params: dict, *, steps: int, save_every: int, overwrite: bool, reporter: Reporter
+) -> RefineResult:
+    """Writes `refined.ply` beside the scene of a run, continuing a refinement that stopped. `scene.ply` stays.
+
+    Args:
+        run_dir: folder of a finished `ssplat run`.
+        path: the capture of that run, as `open_capture` takes it.
+        params: parameters of the run's model.
+        steps: most gradient steps, those of an earlier call included.
+        save_every: steps between saved states.
+        overwrite: remove the refinement that the folder holds and start anew.
+        reporter: shows progress and warnings.
+
+    Raises:
+        InputError: there is no finished run of this capture and these weights, or a refinement with other steps.
+        StorageError: the folder cannot be written or a state is corrupt.
+    """
+    require_positive(steps=steps, save_every=save_every)
+    folder, config = RunFolder(run_dir), RefineConfig()
+    run = _open_run(folder, path, params, reporter)
+    identity = run.identity | {"steps": steps, "refine_config": dataclasses.asdict(config)}
+    with lock_folder(run_dir):
+        if overwrite:
+            folder.clear_refinement()
+        key_views = key_views_of(run.capture, run.indices, run.frame, run.exposures)
+        progress = _load(folder, run.gaussians, key_views, identity)
+        stopped = _take_steps(progress, key_views, steps, config, save_every, identity, folder, reporter)
+        if stopped:
+            return RefineResult(progress.num_steps, {}, {}, stopped)
+        refined = current_gaussians(progress.state)
+        save_scene(folder.refined_scene, refined, run.frame)
+        shown = tuple(sorted({run.indices[round(i)] for i in np.linspace(0, len(run.indices) - 1, NUM_PICTURES)}))
+        before, after = (
+            score_targets(scene, run.capture, shown, run.frame, run.exposures) for scene in (run.gaussians, refined)
+        )
+        report = dataclasses.asdict(report_of(progress, key_views))
+        write_json(folder.refinement, report | {"seen_views_before": before, "seen_views_after": after})
+    return RefineResult(progress.num_steps, before, after, None)
+
+
+def _open_run(folder: RunFolder, path: str, params: dict, reporter: Reporter) -> _Run:
+    """The run in a folder with its capture, checked to belong together."""
+    if not folder.has_state():
+        raise InputError(f"{folder.path}: wanted the folder of an `ssplat run`, found no {folder.state.name} in it.")
+    cache, header, damage = load_newest_state(folder.state)
+    if damage is not None:
+        reporter.warn(f"{damage} Refining the state saved before it, after {header['done']} views.")
+    if header["weights"] != params_digest(params):
+        raise InputError(
+            f"{folder.path}: was streamed with other weights than these; give the run's own with --weights."
+        )
+    frames = header["frames"]
+    if header["done"] < len(frames):
+        raise InputError(
+            f"{folder.path}: wanted a finished run, got one after {header['done']} of {len(frames)} views; finish it"
+            " with `ssplat run`."
+        )
+    capture = open_capture(path, size=tuple(header["size"]))
+    is_same = max(frames) < len(capture) and (capture.digest(frames), capture.images_digest(frames)) == (
+        header["poses"],
+        header["images"],
+    )
+    if not is_same:
+        raise InputError(f"{path}: wanted the capture of the run in {folder.path}, got another; give that capture.")
+    session = Session(StreamSplat(config_from_header(header["config"])), params, cache)
+    return _Run(
+        gaussians=session.gaussians(),
+        capture=capture,
+        indices=frames,
+        frame=StreamFrame.from_dict(header["frame"]),
+        exposures=exposures_from_json(header["exposures"]),
+        identity={name: header[name] for name in ("config", "size", "frames", "poses", "images", "weights")},
+    )
+
+
+def _take_steps(
+    progress: Progress,
+    key_views: KeyViews,
+    steps: int,
+    config: RefineConfig,
+    save_every: int,
+    identity: dict,
+    folder: RunFolder,
+    reporter: Reporter,
+) -> int | None:
+    """Takes the steps that are left, saving on the way; returns the signal that stopped them, if one did."""
+    with Interrupts() as interrupts, reporter.progress("refining", steps) as advance:
+        advance(progress.num_steps)
+        for _ in continue_refinement(progress, key_views, steps, config):
+            advance(progress.num_steps, f"loss {progress.losses[-1]:.4f}")
+            stopped = interrupts.received  # read once: a signal may come at any time
+            if stopped:
+                break
+            if progress.num_steps % save_every == 0:
+                _save(folder, progress, identity)
+        _save(folder, progress, identity)
+        return interrupts.received
+
+
+def _save(folder: RunFolder, progress: Progress, identity: dict) -> None:
+    """Saves a refinement, without the scene that it started from: the run has it."""
+    state = progress.state
+    arrays = {
+        f"{part}.{name}": np.asarray(leaf)
+        for part in ("revision", "first_moment", "second_moment")
+        for name, leaf in vars(getattr(state, part)).items()
+    }
+    arrays |= {name: np.asarray(getattr(state, name)) for name in ("num_steps", "num_skipped")}
+    measured = {name: getattr(progress, name) for name in ("max_pairs", "losses", "held_back", "seconds")}
+    save_arrays(folder.refinement_state, arrays, KIND, {"identity": identity, "measured": measured})
+
+
+def _load(folder: RunFolder, gaussians: Gaussians, key_views: KeyViews, identity: dict) -> Progress:
+    """The refinement that the folder holds, or a new one."""
+    if not folder.refinement_state.exists():
+        return start_refinement(gaussians, key_views)
+    arrays, header = load_arrays(folder.refinement_state, KIND)
+    for name, wanted in identity.items():
+        if header["identity"].get(name) != wanted:
+            raise InputError(
+                f"{folder.refinement_state}: holds a refinement that differs in its {name}; repeat the old options, or"
+                " start anew with --overwrite."
+            )
+    parts: dict[str, dict] = {"revision": {}, "first_moment": {}, "second_moment": {}}
+    for name, array in arrays.items():
+        part, _, field = name.partition(".")
+        if field:
+            parts[part][field] = jnp.asarray(array)
+    state = RefineState(
+        start=jax.tree.map(jnp.copy, gaussians),  # a step consumes its state
+        revision=Revision(**parts["revision"]),
+        first_moment=Revision(**parts["first_moment"]),
+        second_moment=Revision(**parts["second_moment"]),
+        num_steps=jnp.asarray(arrays["num_steps"]),
+        num_skipped=jnp.asarray(arrays["num_skipped"]),
+    )
+    return Progress(state, **header["measured"])

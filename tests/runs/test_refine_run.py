@@ -1,0 +1,131 @@
+"""Refinement of a finished run: it continues after a stop, and never loses the scene that it started from."""
+
+import json
+import signal
+
+import pytest
+
+from ssplat_jax.checkpoint.weights import load_params
+from ssplat_jax.config import preset
+from ssplat_jax.console import Reporter
+from ssplat_jax.errors import InputError
+from ssplat_jax.runs import refine_run as module
+from ssplat_jax.runs.capture_run import run_capture
+from ssplat_jax.runs.refine_run import refine_run
+from ssplat_jax.scene_files.ply import read_ply
+from ssplat_jax.storage.run_folder import RunFolder
+from ssplat_jax.streaming.streamsplat import StreamSplat
+
+CAPTURE = "procedural:room?frames=4"
+REFINED = ("refined.ply", "refinement.json", "refinement.npz")
+
+
+def refine(path, steps=4, capture=CAPTURE, overwrite=False):
+    reporter = Reporter(quiet=True)
+    params = load_params("tiny")
+    return refine_run(path, capture, params, steps=steps, save_every=2, overwrite=overwrite, reporter=reporter)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """Folder of a finished run of four small frames."""
+    out = tmp_path_factory.mktemp("run")
+    run_capture(
+        StreamSplat(preset("tiny")),
+        load_params("tiny"),
+        CAPTURE,
+        out,
+        size=(64, 48),
+        stride=1,
+        max_views=None,
+        save_every=8,
+        overwrite=False,
+        reporter=Reporter(quiet=True),
+    )
+    return out
+
+
+def test_a_stopped_refinement_continues_to_the_same_bytes(finished, monkeypatch):
+    folder = RunFolder(finished)
+    streamed = folder.scene.read_bytes()
+    result = refine(finished, overwrite=True)
+    whole = folder.refined_scene.read_bytes()
+    assert result.num_steps == 4 and result.interrupted is None
+    assert result.after["shown"]["psnr"] > result.before["shown"]["psnr"]
+
+    folder.clear_refinement()
+    steps = module.continue_refinement
+
+    def stopped_after_one(progress, *arguments):
+        for _ in steps(progress, *arguments):
+            signal.raise_signal(signal.SIGINT)
+            yield
+
+    monkeypatch.setattr(module, "continue_refinement", stopped_after_one)
+    for taken in (1, 2):
+        result = refine(finished)
+        assert (result.num_steps, result.interrupted) == (taken, signal.SIGINT)
+        assert not folder.refined_scene.exists()
+    monkeypatch.undo()
+    refine(finished)
+    assert folder.refined_scene.read_bytes() == whole
+    assert folder.scene.read_bytes() == streamed != whole
+    report = json.loads(folder.refinement.read_text())
+    assert report["num_steps"] == len(report["losses"]) == 4
+    assert len(read_ply(folder.refined_scene).gaussians.means) == len(read_ply(folder.scene).gaussians.means)
+
+
+def test_a_refinement_with_other_steps_is_refused(finished):
+    refine(finished, steps=2, overwrite=True)
+    with pytest.raises(InputError, match="differs in its steps"):
+        refine(finished, steps=3)
+
+
+def test_another_capture_than_the_runs_is_refused(finished):
+    for other in ("procedural:room?frames=3", "procedural:room?frames=5&seed=1"):
+        with pytest.raises(InputError, match="wanted the capture of the run"):
+            refine(finished, capture=other)
+
+
+def test_a_folder_without_a_finished_run_is_refused(tmp_path, finished):
+    with pytest.raises(InputError, match=r"found no state\.npz"):
+        refine(tmp_path)
+    assert not list(tmp_path.iterdir())
+    run_capture(
+        StreamSplat(preset("tiny")),
+        load_params("tiny"),
+        "procedural:room?frames=8",
+        tmp_path / "run",
+        size=(64, 48),
+        stride=1,
+        max_views=None,
+        save_every=1,
+        overwrite=False,
+        reporter=_StopsAfterOneChunk(),
+    )
+    with pytest.raises(InputError, match="wanted a finished run, got one after 4 of 8 views"):
+        refine(tmp_path / "run", capture="procedural:room?frames=8")
+
+
+class _StopsAfterOneChunk(Reporter):
+    """A reporter that sends Ctrl-C when four views are done."""
+
+    def __init__(self):
+        super().__init__(quiet=True)
+
+    def progress(self, name, total):
+        import contextlib
+
+        @contextlib.contextmanager
+        def bar():
+            yield lambda done, *_: signal.raise_signal(signal.SIGINT) if done == 4 else None
+
+        return bar()
+
+
+def test_starting_a_run_anew_removes_its_refinement(finished):
+    folder = RunFolder(finished)
+    refine(finished, steps=1, overwrite=True)
+    assert all((finished / name).exists() for name in REFINED)
+    folder.clear_run()
+    assert not any((finished / name).exists() for name in REFINED) and not folder.scene.exists()
