@@ -13,7 +13,9 @@ from ssplat_jax.commands.options import (
     load_model,
     parse_size,
 )
+from ssplat_jax.commands.refine_command import Refine
 from ssplat_jax.config import QUALITIES
+from ssplat_jax.errors import InputError
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,12 +43,16 @@ class Run:
     """Remove the run in the folder and start anew."""
     deltas: bool = False
     """Also write the changes of each chunk, deltas/<views so far>.npz, for `ssplat view` to follow."""
+    refine: int = 0
+    """Then take this many gradient steps on the streamed frames, as `ssplat refine` does, into refined.ply."""
     quiet: QuietOption = False
 
     def run(self) -> int:
         from ssplat_jax.console import Reporter
         from ssplat_jax.runs.capture_run import run_capture
 
+        if self.refine < 0:
+            raise InputError(f"--refine: wanted a number of steps of at least 0, got {self.refine}.")
         model, params = load_model(self.weights, self.set)
         result = run_capture(
             model,
@@ -67,4 +73,6 @@ class Run:
             print(f"stopped after {result.num_views} views; the same command{how} continues", file=sys.stderr)
             return 128 + result.interrupted
         print(f"wrote {self.out}/scene.ply ({result.num_gaussians} Gaussians from {result.num_views} views)")
+        if self.refine:
+            return Refine(self.out, self.capture, self.refine, self.weights, quiet=self.quiet).run()
         return 0

@@ -304,6 +304,20 @@ def test_negative_refinement_steps_are_bad_usage(tmp_path, capsys):
     capture = make_capture(tmp_path / "capture", num_frames=12, size=(128, 96))
     assert run("eval", str(capture), "--context", "8", "--out", str(tmp_path / "out"), "--refine", "-1") == 2
     assert "--refine: wanted a number of steps of at least 0, got -1" in capsys.readouterr().err
+    assert run("run", str(capture), "--out", str(tmp_path / "out"), "--refine", "-1") == 2
+    assert "--refine: wanted a number of steps of at least 0, got -1" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_run_refine_equals_run_then_refine(tmp_path, capsys):
+    capture, size = "procedural:room?frames=4", ("--size", "64x48")
+    one, two = (tmp_path / name for name in ("one", "two"))
+    assert run("run", capture, "--out", str(one), *size, "--refine", "2", "--quiet") == 0
+    assert "refined.ply: 2 steps" in capsys.readouterr().out
+    assert run("run", capture, "--out", str(two), *size, "--quiet") == 0
+    assert run("refine", str(two), capture, "--steps", "2", "--quiet") == 0
+    for name in ("scene.ply", "refined.ply"):
+        assert (one / name).read_bytes() == (two / name).read_bytes()
 
 
 @pytest.mark.slow  # compiles a network of 62 million parameters
