@@ -21,7 +21,7 @@ class Refine:
     """Folder of a finished `ssplat run`."""
     capture: CapturePath
     steps: int = 100
-    """Most gradient steps; each renders one view."""
+    """Most gradient steps; each renders two views."""
     weights: WeightsOption = "tiny"
     save_every: int = 50
     """Steps between saved states."""

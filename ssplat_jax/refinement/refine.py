@@ -76,7 +76,8 @@ def refine(
         gaussians: the scene.
         cameras: one batch axis of poses and intrinsics, in the frame of the scene.
         images: what those cameras saw, in [0, 1].
-        steps: most gradient steps; 0 returns `gaussians` as they are. Each renders one view.
+        steps: most gradient steps; 0 returns `gaussians` as they are. Each renders `config.views_per_step`
+            views.
         exposures: factors from the scene's colors to each view's; default 1.
         config: learning rates and bounds.
         on_step: called with the number of steps done and the last loss.
@@ -95,7 +96,7 @@ def refine(
     progress = start_refinement(gaussians, key_views)
     for _ in continue_refinement(progress, key_views, steps, config):
         on_step(progress.num_steps, progress.losses[-1])
-    return current_gaussians(progress.state), report_of(progress, key_views)
+    return current_gaussians(progress.state), report_of(progress, key_views, config)
 
 
 def start_refinement(gaussians: Gaussians, key_views: KeyViews) -> Progress:
@@ -117,7 +118,9 @@ def continue_refinement(
         config: learning rates and bounds.
     """
     config = config or RefineConfig()
-    while progress.num_steps < steps and not has_stopped_helping(progress.held_back, key_views.num_slots):
+    while progress.num_steps < steps and not has_stopped_helping(
+        progress.held_back, _steps_per_round(key_views, config)
+    ):
         start = time.perf_counter()
         rate = jnp.float32(config.final_rate ** (progress.num_steps / steps))
         progress.state, report = _step(config, progress.max_pairs)(progress.state, key_views, rate)
@@ -130,23 +133,30 @@ def continue_refinement(
         yield
 
 
-def report_of(progress: Progress, key_views: KeyViews) -> Refinement:
+def _steps_per_round(key_views: KeyViews, config: RefineConfig) -> int:
+    """Steps in which every view is shown at least once."""
+    return -(-key_views.num_slots // config.views_per_step)
+
+
+def report_of(progress: Progress, key_views: KeyViews, config: RefineConfig | None = None) -> Refinement:
     """The report of a refinement that has ended."""
     return Refinement(
         num_steps=progress.num_steps,
         num_skipped=int(progress.state.num_skipped),
         losses=progress.losses,
         held_back=progress.held_back,
-        stopped_early=has_stopped_helping(progress.held_back, key_views.num_slots),
+        stopped_early=has_stopped_helping(progress.held_back, _steps_per_round(key_views, config or RefineConfig())),
         seconds_per_step=float(np.median(progress.seconds[1:])) if progress.num_steps > 1 else 0.0,
     )
 
 
-def has_stopped_helping(held_back: list[float], num_views: int) -> bool:
+def has_stopped_helping(held_back: list[float], steps_per_round: int) -> bool:
     """Whether the last whole round of views has a held-back error no smaller than the round before it."""
-    if len(held_back) < 2 * num_views or len(held_back) % num_views or not any(held_back):
+    if len(held_back) < 2 * steps_per_round or len(held_back) % steps_per_round or not any(held_back):
         return False  # too early to say, or no pixel is held back
-    return float(np.mean(held_back[-num_views:])) >= float(np.mean(held_back[-2 * num_views : -num_views]))
+    return float(np.mean(held_back[-steps_per_round:])) >= float(
+        np.mean(held_back[-2 * steps_per_round : -steps_per_round])
+    )
 
 
 @functools.cache

@@ -54,7 +54,7 @@ def refine_on_capture(
     progress = start_refinement(gaussians, views)
     for _ in continue_refinement(progress, views, steps, config):
         on_step(progress.num_steps, progress.losses[-1])
-    return current_gaussians(progress.state), report_of(progress, views)
+    return current_gaussians(progress.state), report_of(progress, views, config)
 
 
 def key_views_of(capture: Capture, indices: Sequence[int], frame: StreamFrame, exposures: Exposures) -> KeyViews:

@@ -29,6 +29,8 @@ class RefineConfig:
     """Decay of the first moment."""
     adam_b2: float = 0.99
     """Decay of the second moment: short, since a run has tens to hundreds of steps."""
+    views_per_step: int = 2
+    """Key views whose gradients a step averages: a Gaussian that few views show moves more often."""
     shown_weight: float = 0.7
     """Weight of the L1 error with holes filled; the rest is the L1 error over black."""
     max_shift: float = 4.0
@@ -46,6 +48,7 @@ class RefineConfig:
         for name in ("adam_b1", "adam_b2"):
             self._require(name, "in [0, 1)", 0 <= getattr(self, name) < 1)
         self._require("final_rate", "in (0, 1]", 0 < self.final_rate <= 1)
+        self._require("views_per_step", "at least 1", self.views_per_step >= 1)
         self._require("shown_weight", "in [0, 1]", 0 <= self.shown_weight <= 1)
         self._require("max_shift", "finite and not negative", 0 <= self.max_shift < math.inf)
         self._require("max_log_scale_change", "finite and not negative", 0 <= self.max_log_scale_change < math.inf)

@@ -1,4 +1,4 @@
-"""One refinement step as a pure function: render a key view, compare, move every Gaussian by Adam inside its bounds."""
+"""One refinement step as a pure function: render key views, compare, move every Gaussian by Adam inside its bounds."""
 
 import jax
 import jax.numpy as jnp
@@ -44,12 +44,12 @@ class RefineState:
 
 @pytree
 class StepReport:
-    """Measurements of one step, taken before its update."""
+    """Measurements of one step, taken before its update; means over its views."""
 
     loss: Float[Array, ""]  # weighted L1 error of the pixels that are learned from
     held_back: Float[Array, ""]  # the same error of the pixels that are not
-    view: Int[Array, ""]  # slot of the key view
-    num_overflow: Int[Array, ""]  # tile intersections that found no space; see `render`
+    views: Int[Array, " b"]  # slots of the key views
+    num_overflow: Int[Array, ""]  # most of its views; tile intersections that found no space; see `render`
 
 
 def init_refinement(gaussians: Gaussians) -> RefineState:
@@ -120,7 +120,7 @@ def _unit(quats: Float[Array, "n 4"]) -> Float[Array, "n 4"]:
 def refine_step(
     state: RefineState, key_views: KeyViews, rate: Float[Array, ""], *, config: RefineConfig, max_pairs: int
 ) -> tuple[RefineState, StepReport]:
-    """One step on one key view. A `lax.scan` body over `rate`; donate `state`.
+    """One step on `config.views_per_step` key views. A `lax.scan` body over `rate`; donate `state`.
 
     Args:
         state: the scene so far.
@@ -132,11 +132,18 @@ def refine_step(
     Returns:
         The state after the step, and what was measured before it.
     """
-    view = next_view(state.num_steps, key_views.valid, config.seed)
-    height, width = key_views.images.shape[1:3]
-    held_back = held_back_pixels((height, width), view, config)
-    loss = lambda revision: view_loss(state.start, revision, key_views, view, held_back, config, max_pairs)  # noqa: E731
-    gradient, report = jax.grad(loss, has_aux=True)(state.revision)
+    places = state.num_steps * config.views_per_step + jnp.arange(config.views_per_step)
+    views = jax.vmap(lambda place: next_view(place, key_views.valid, config.seed))(places)
+
+    def add_view(gradient: Revision, view: Int[Array, ""]):
+        loss = lambda revision: view_loss(state.start, revision, key_views, view, config, max_pairs)  # noqa: E731
+        new, measured = jax.grad(loss, has_aux=True)(state.revision)
+        return jax.tree.map(jnp.add, gradient, new), measured
+
+    # A scan holds the intermediate arrays of one view at a time.
+    total, (losses, errors, overflows) = jax.lax.scan(add_view, jax.tree.map(jnp.zeros_like, state.revision), views)
+    gradient = jax.tree.map(lambda x: x / config.views_per_step, total)
+    report = StepReport(loss=jnp.mean(losses), held_back=jnp.mean(errors), views=views, num_overflow=jnp.max(overflows))
     is_finite = jnp.array(True)
     for leaf in jax.tree.leaves(gradient):
         is_finite = is_finite & jnp.all(jnp.isfinite(leaf))
@@ -152,12 +159,15 @@ def refine_step(
     return state, report
 
 
-def next_view(step: Int[Array, ""], valid: Bool[Array, " v"], seed: int) -> Int[Array, ""]:
-    """Slot of the view for `step`: every valid view once a round, in an order drawn anew for each round."""
+def next_view(place: Int[Array, ""], valid: Bool[Array, " v"], seed: int) -> Int[Array, ""]:
+    """Slot of the view at `place` in the sequence of all steps' views.
+
+    Every valid view is shown once a round, in an order drawn anew for each round.
+    """
     num_valid = jnp.maximum(jnp.sum(valid, dtype=jnp.int32), 1)
-    key = jax.random.fold_in(jax.random.key(seed), step // num_valid)
+    key = jax.random.fold_in(jax.random.key(seed), place // num_valid)
     order = jnp.argsort(jnp.where(valid, jax.random.uniform(key, valid.shape), 2.0))
-    return order[step % num_valid].astype(jnp.int32)
+    return order[place % num_valid].astype(jnp.int32)
 
 
 def held_back_pixels(size: tuple[int, int], view: Int[Array, ""], config: RefineConfig) -> Bool[Array, "h w"]:
@@ -173,11 +183,16 @@ def view_loss(
     revision: Revision,
     key_views: KeyViews,
     view: Int[Array, ""],
-    held_back: Bool[Array, "h w"],
     config: RefineConfig,
     max_pairs: int,
-) -> tuple[Float[Array, ""], StepReport]:
-    """L1 error of one key view at its exposure, with holes filled and over black, and its report."""
+) -> tuple[Float[Array, ""], tuple[Float[Array, ""], Float[Array, ""], Int[Array, ""]]]:
+    """L1 error of one key view at its exposure, with holes filled and over black.
+
+    Returns:
+        The loss, and the loss again, the error of the held-back pixels, and the tile intersections that did not fit.
+    """
+    height, width = key_views.images.shape[1:3]
+    held_back = held_back_pixels((height, width), view, config)
     gaussians = apply_revision(start, revision)
     out = render(gaussians, key_views.camera(view), effects=EFFECTS, max_pairs=max_pairs)
     assert out.color is not None and out.alpha is not None
@@ -188,13 +203,7 @@ def view_loss(
     errors = errors + (1 - config.shown_weight) * jnp.abs(out.color * exposure - target)
     errors = jnp.mean(errors, axis=-1)
     loss = _mean_over(errors, ~held_back)
-    report = StepReport(
-        loss=loss,
-        held_back=_mean_over(errors, held_back),
-        view=view,
-        num_overflow=out.num_overflow,
-    )
-    return loss, report
+    return loss, (loss, _mean_over(errors, held_back), out.num_overflow)
 
 
 def _mean_over(errors: Float[Array, "h w"], pixels: Bool[Array, "h w"]) -> Float[Array, ""]:

@@ -92,7 +92,7 @@ def refine_run(
         before, after = (
             score_targets(scene, run.capture, shown, run.frame, run.exposures) for scene in (run.gaussians, refined)
         )
-        report = dataclasses.asdict(report_of(progress, key_views))
+        report = dataclasses.asdict(report_of(progress, key_views, config))
         write_json(folder.refinement, report | {"seen_views_before": before, "seen_views_after": after})
     return RefineResult(progress.num_steps, before, after, None)
 

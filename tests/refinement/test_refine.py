@@ -1,5 +1,6 @@
 """Laws of gradient refinement, on a small scene whose truth is known."""
 
+import dataclasses
 import functools
 
 import jax
@@ -133,6 +134,24 @@ def test_first_adam_step_is_the_formula_in_float64():
     np.testing.assert_allclose(np.asarray(state.revision.means), wanted, rtol=1e-3, atol=1e-7)
     np.testing.assert_allclose(second, gradient["means"] ** 2, rtol=1e-3, atol=1e-24)
     assert np.any(gradient["means"] != 0)
+
+
+def test_a_step_averages_the_gradients_of_its_views():
+    """A step on all views has the mean of the gradients that steps on one view each have."""
+    config = dataclasses.replace(CONFIG, views_per_step=NUM_VIEWS)
+    state, report = step(init_refinement(doubtful()), key_views(), config=config)
+    assert sorted(np.asarray(report.views)) == list(range(NUM_VIEWS))
+    singles, losses = [], []
+    for view in range(NUM_VIEWS):
+        only = replace(key_views(), valid=jnp.arange(NUM_VIEWS) == view)
+        one, measured = step(init_refinement(doubtful()), only, config=dataclasses.replace(CONFIG, views_per_step=1))
+        singles.append(one.first_moment)
+        losses.append(float(measured.loss))
+    for name in ("means", "log_scales", "quats", "logit_opacities", "sh"):
+        wanted = np.mean([np.asarray(getattr(single, name), np.float64) for single in singles], axis=0)
+        moment = np.asarray(getattr(state.first_moment, name))
+        np.testing.assert_allclose(moment, wanted, rtol=1e-4, atol=1e-6 * np.abs(wanted).max())
+    assert float(report.loss) == pytest.approx(np.mean(losses), rel=1e-5)
 
 
 @pytest.mark.parametrize("bad", ["exposure", "image of one view"])
