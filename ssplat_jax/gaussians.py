@@ -35,6 +35,12 @@ class Gaussians:
             means=means, quats=quats, scales=scales, opacities=opacities, sh=((colors - 0.5) / SH_C0)[:, None, :]
         )
 
+    def __repr__(self) -> str:
+        """The number of rows and the SH degree; arrays of a scene are too long to print."""
+        if not hasattr(self.means, "shape") or not hasattr(self.sh, "shape"):
+            return f"Gaussians(means={self.means!r}, sh={self.sh!r})"  # rebuilt by a transform
+        return f"Gaussians({self.num_gaussians:,}, SH {self.sh_degree})"
+
     @property
     def num_gaussians(self) -> int:
         """Rows, absent ones included."""

@@ -69,7 +69,7 @@ def guarded(run) -> int:
     except CacheError as error:
         return _refuse(error, EXIT_MEMORY)
     except KeyboardInterrupt:
-        return 130
+        return _refuse("interrupted", 130)
     except Exception as error:
         # XLA reports an exhausted device as a RuntimeError of its own that starts with this word.
         if "RESOURCE_EXHAUSTED" in str(error):

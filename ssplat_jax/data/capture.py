@@ -31,6 +31,8 @@ READERS = (transforms_json, colmap, scannet, tum, realestate10k)  # the first on
 PROCEDURAL = "procedural"  # scheme of the paths of procedural captures
 PROCEDURAL_FRAMES = 73  # 64 context views and the 9 interleaved targets between them
 PROCEDURAL_SIZE = (128, 96)  # (width, height); the demo takes less than two minutes on two cores at this size
+IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".heic"})  # a folder of these lacks only its poses
+VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".mkv", ".webm"})
 MAX_SIDE = 16384  # pixels of a delivered image
 
 
@@ -235,10 +237,22 @@ def open_capture(path: str | Path, *, size: tuple[int, int] | None = None) -> Ca
         got, fix = "nothing of that name", "check the path"
     elif folder.is_dir() and not any(folder.iterdir()):
         got, fix = "an empty folder", "check the path"
+    elif kind := _unposed(folder):
+        got = f"{kind} without camera poses"
+        fix = "compute the poses first, with COLMAP for instance; docs/your_capture.md has the commands"
     else:
         got, fix = "none of these", f"see --help of `ssplat inspect` for their files, or try {PROCEDURAL}:room"
     formats = ", ".join(reader.FORMAT for reader in READERS)
     raise refusal(str(path), wanted=f"a posed capture ({formats})", got=got, fix=fix)
+
+
+def _unposed(path: Path) -> str | None:
+    """The kind of images that a path holds without poses: "images", "a video", or None."""
+    if path.is_file():
+        return "a video" if path.suffix.lower() in VIDEO_SUFFIXES else None
+    folders = (path, path / "images")
+    suffixes = {file.suffix.lower() for folder in folders if folder.is_dir() for file in folder.iterdir()}
+    return "images" if suffixes & IMAGE_SUFFIXES else "a video" if suffixes & VIDEO_SUFFIXES else None
 
 
 def _capture(listing: Listing, format: str, pixels: Pixels, size: tuple[int, int] | None) -> Capture:

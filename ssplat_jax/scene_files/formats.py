@@ -17,8 +17,12 @@ def check_format(path: Path) -> None:
     """Checks that the extension of `path` is one of `FORMATS`.
 
     Raises:
-        InputError: it is not.
+        InputError: it is not, or the name is that of a compressed .ply.
     """
+    if path.name.endswith(".compressed.ply"):
+        raise InputError(
+            f"--to: {path.name!r} names a compressed .ply, which is not written; choose .spz for a small file."
+        )
     if path.suffix not in FORMATS:
         raise InputError(f"--to: wanted a file named *{', *'.join(FORMATS)}, got {path.name!r}; choose one of these.")
 

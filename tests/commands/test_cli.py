@@ -8,8 +8,10 @@ import shutil
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from PIL import Image
@@ -18,11 +20,13 @@ from ssplat_jax.checkpoint.delta_files import load_delta, load_delta_header
 from ssplat_jax.checkpoint.published_weights import published_tensors
 from ssplat_jax.checkpoint.stream_state import load_state
 from ssplat_jax.checkpoint.weights import load_params, load_weights, save_weights
-from ssplat_jax.commands.main import COMMANDS, main
+from ssplat_jax.commands.main import COMMANDS, guarded, main
 from ssplat_jax.commands.options import apply_changes
 from ssplat_jax.config import StreamConfig, preset
 from ssplat_jax.evaluation import latency
-from ssplat_jax.scene_files.ply import load_ply
+from ssplat_jax.gaussians import Gaussians
+from ssplat_jax.scene_files.ply import load_ply, save_ply
+from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.streaming.scene_delta import apply_delta
 from ssplat_jax.streaming.streamsplat import StreamSplat
 from tests.model.resplat_fixture import named_tensor
@@ -337,3 +341,39 @@ def test_imported_weights_stream_a_capture(tmp_path, capsys):
     weights = ("--weights", str(tmp_path / "small.npz"), "--set", "min_confidence=0.0")
     assert run("run", str(capture), "--out", str(out), *weights, "--quiet") == 0
     assert load_ply(out / "scene.ply").num_gaussians > 0
+
+
+@pytest.mark.parametrize(("name", "kind"), [("a.jpg", "images"), ("images/a.PNG", "images"), ("clip.mp4", "a video")])
+def test_images_without_poses_are_told_how_to_get_them(name, kind, tmp_path, capsys):
+    file = tmp_path / name
+    file.parent.mkdir(exist_ok=True)
+    file.write_bytes(b"")
+    paths = [tmp_path] if kind == "images" else [tmp_path, file]
+    for path in paths:
+        assert run("inspect", str(path)) == 2
+        message = capsys.readouterr().err
+        assert f"got {kind} without camera poses" in message and "COLMAP" in message and message.count("\n") == 1
+    assert (Path(__file__).parents[2] / "docs" / "your_capture.md").exists()
+
+
+def test_a_folder_with_only_a_scene_is_exported(tmp_path, capsys):
+    scene = Gaussians.from_rgb(
+        means=jnp.zeros((3, 3)),
+        quats=jnp.ones((3, 4)),
+        scales=jnp.ones((3, 3)),
+        opacities=jnp.array([0.5, 0.0, 0.5]),
+        colors=jnp.full((3, 3), 0.5),
+    )
+    save_ply(RunFolder(tmp_path).scene, scene)  # as `ssplat demo` leaves it: no saved state
+    assert run("export", str(tmp_path), "--to", str(tmp_path / "scene.spz")) == 0
+    assert "2 Gaussians" in capsys.readouterr().out and (tmp_path / "scene.spz").stat().st_size > 0
+    assert run("export", str(tmp_path), "--to", str(tmp_path / "a.compressed.ply")) == 2
+    assert "compressed .ply" in capsys.readouterr().err and not (tmp_path / "a.compressed.ply").exists()
+
+
+def test_an_interrupt_says_so_and_exits_with_130(capsys):
+    def interrupted():
+        raise KeyboardInterrupt
+
+    assert guarded(interrupted) == 130
+    assert capsys.readouterr().err == "ssplat: interrupted\n"
