@@ -24,6 +24,7 @@ from ssplat_jax.commands.render_command import Render
 from ssplat_jax.commands.run_command import Run
 from ssplat_jax.commands.train_command import Train
 from ssplat_jax.commands.view_command import View
+from ssplat_jax.commands.worlds_command import Worlds
 from ssplat_jax.errors import CacheError, InputError, StorageError
 
 EXIT_INPUT, EXIT_STORAGE, EXIT_MEMORY = 2, 3, 4
@@ -41,6 +42,7 @@ COMMANDS = {
     "import-weights": ImportWeights,
     "bench": Bench,
     "experiment": Experiment,
+    "worlds": Worlds,
 }
 """All commands by name, in the order of `ssplat --help`."""
 
