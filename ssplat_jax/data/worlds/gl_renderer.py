@@ -34,7 +34,7 @@ def open_context():
     except ImportError as error:
         raise InputError('made worlds: moderngl is missing; pip install "ssplat-jax[worlds]".') from error
     try:
-        return moderngl.create_context(standalone=True, backend="egl")  # pyright: ignore[reportCallIssue]
+        return moderngl.create_context(standalone=True, backend="egl")  # pyright: ignore[reportCallIssue, reportArgumentType]
     except Exception as error:  # moderngl raises plain Exception
         raise InputError(
             f"made worlds: no OpenGL driver ({error}); on Debian: apt-get install libegl1 libgl1-mesa-dri."

@@ -93,5 +93,7 @@ def join(meshes: list[Mesh]) -> Mesh:
     """One mesh of several; the texture is that of the first."""
     starts = np.cumsum([0, *(len(mesh.points) for mesh in meshes)])
     triangles = [mesh.triangles + start for mesh, start in zip(meshes, starts, strict=False)]
-    parts = [np.concatenate([getattr(mesh, name) for mesh in meshes]) for name in ("points", "normals", "uv")]
-    return Mesh(*parts, np.concatenate(triangles), meshes[0].layer)
+    points, normals, uv = (
+        np.concatenate([getattr(mesh, name) for mesh in meshes]) for name in ("points", "normals", "uv")
+    )
+    return Mesh(points, normals, uv, np.concatenate(triangles), meshes[0].layer)

@@ -1,5 +1,6 @@
 """Capture folders of made worlds: transforms.json, images and 16-bit z-depth in millimeters. Resumable by world."""
 
+import json
 import os
 import shutil
 from collections.abc import Callable
@@ -44,10 +45,9 @@ def write_worlds(
     Raises:
         InputError: OpenGL is missing, or `out` holds worlds made with other options.
     """
+    context, rendered = open_context(), 0  # first: without OpenGL nothing is written
     make_writable(out)
-    options = {"seed": seed, "size": list(size), "frames": frames}
-    _check_options(out / "worlds.json", options)
-    context, rendered = open_context(), 0
+    _check_options(out / "worlds.json", {"seed": seed, "size": list(size), "frames": frames})
     try:
         for i in range(count):
             folder = out / f"world_{i:05d}"
@@ -61,12 +61,13 @@ def write_worlds(
 
 
 def _check_options(file: Path, options: dict) -> None:
-    import json
-
     if not file.exists():
         write_json(file, options)
         return
-    found = json.loads(file.read_text())
+    try:
+        found = json.loads(file.read_text())
+    except ValueError as error:
+        raise refusal(str(file), wanted="JSON", got=str(error), fix="remove the file or choose another --out") from None
     if found != options:
         raise refusal(
             str(file), wanted=str(options), got=str(found), fix="repeat those options or choose another --out"
