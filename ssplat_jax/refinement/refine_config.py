@@ -13,15 +13,15 @@ class RefineConfig:
     Learning rates are those of Adam: about the change per step of a parameter whose gradient keeps its sign.
     """
 
-    mean_rate: float = 0.08
+    mean_rate: float = 0.04
     """Step of a mean, as a fraction of the Gaussian's own size (the mean of its two larger standard deviations)."""
-    log_scale_rate: float = 0.03
+    log_scale_rate: float = 0.015
     """Step of a log standard deviation."""
-    quat_rate: float = 0.006
+    quat_rate: float = 0.003
     """Step of a unit quaternion's entry."""
-    logit_opacity_rate: float = 0.2
+    logit_opacity_rate: float = 0.1
     """Step of an opacity's logit."""
-    color_rate: float = 0.03
+    color_rate: float = 0.015
     """Step of the constant color band, in units of color; higher bands take a twentieth."""
     final_rate: float = 0.3
     """Fraction of the learning rates that is left at the last planned step; they decay geometrically."""
