@@ -238,7 +238,7 @@ def open_capture(path: str | Path, *, size: tuple[int, int] | None = None) -> Ca
     elif folder.is_dir() and not any(folder.iterdir()):
         got, fix = "an empty folder", "check the path"
     elif kind := _unposed(folder):
-        got = f"{kind} without camera poses"
+        got = f"none of these, but {kind} without camera poses"
         fix = "compute the poses first, with COLMAP for instance; docs/your_capture.md has the commands"
     else:
         got, fix = "none of these", f"see --help of `ssplat inspect` for their files, or try {PROCEDURAL}:room"

@@ -352,7 +352,7 @@ def test_images_without_poses_are_told_how_to_get_them(name, kind, tmp_path, cap
     for path in paths:
         assert run("inspect", str(path)) == 2
         message = capsys.readouterr().err
-        assert f"got {kind} without camera poses" in message and "COLMAP" in message and message.count("\n") == 1
+        assert f"but {kind} without camera poses" in message and "COLMAP" in message and message.count("\n") == 1
     assert (Path(__file__).parents[2] / "docs" / "your_capture.md").exists()
 
 
