@@ -2,7 +2,7 @@
 
 A command is a dataclass, in a file of its own, whose fields are the options and whose `run` returns the exit code.
 Commands import JAX when they run, so that `ssplat --help` answers at once. Exit codes: 0 success, 2 bad input or usage,
-3 storage, 4 out of memory on the device, 130 and 143 interrupted after saving.
+3 storage, 4 out of memory on the device, 130 and 143 interrupted. The script's entry point is `commands/start.py`.
 """
 
 import functools
@@ -85,4 +85,6 @@ def _refuse(message, code: int) -> int:
 
 
 if __name__ == "__main__":
-    main()
+    from ssplat_jax.commands.start import start
+
+    start()

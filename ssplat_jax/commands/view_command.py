@@ -1,6 +1,7 @@
 """`ssplat view`: a scene in a browser."""
 
 import dataclasses
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -30,5 +31,7 @@ class View:
         from ssplat_jax.viewer.view_scene import view_scene
 
         require_positive(port=self.port, most=self.most)
-        view_scene(self.scene, host=self.host, port=self.port, max_gaussians=self.most, reporter=Reporter(quiet=False))
-        return 0
+        reporter = Reporter(quiet=False)
+        ended = view_scene(self.scene, host=self.host, port=self.port, max_gaussians=self.most, reporter=reporter)
+        print("closed the viewer", file=sys.stderr)
+        return 128 + ended

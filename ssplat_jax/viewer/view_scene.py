@@ -17,7 +17,7 @@ POLL_INTERVAL = 0.5
 """Seconds between checks for changes, so that browsers are sent at most two scenes a second."""
 
 
-def view_scene(path: Path, *, host: str, port: int, max_gaussians: int, reporter: Reporter) -> None:
+def view_scene(path: Path, *, host: str, port: int, max_gaussians: int, reporter: Reporter) -> int:
     """Shows a scene and its changes until Ctrl-C.
 
     Args:
@@ -26,6 +26,9 @@ def view_scene(path: Path, *, host: str, port: int, max_gaussians: int, reporter
         port: port to listen on; the next free one if it is taken.
         max_gaussians: most Gaussians sent to a browser.
         reporter: prints warnings.
+
+    Returns:
+        The signal that ended it.
 
     Raises:
         InputError: no scene there, viser is missing, or the address is taken.
@@ -49,5 +52,6 @@ def view_scene(path: Path, *, host: str, port: int, max_gaussians: int, reporter
                     viewer.show(scene)
                 time.sleep(POLL_INTERVAL)
                 scene = source.changed()
+            return interrupts.received
     finally:
         viewer.close()

@@ -248,7 +248,7 @@ def test_the_command_shows_a_file_until_it_is_interrupted(tmp_path):
         with urllib.request.urlopen(line.split()[0], timeout=20) as page:
             assert page.status == 200
         process.send_signal(signal.SIGINT)
-        assert process.wait(timeout=60) == 0
+        assert process.wait(timeout=60) == 130
 
 
 @pytest.mark.slow

@@ -1,0 +1,66 @@
+"""The entry point of the `ssplat` script: Ctrl-C ends every command with a line on stderr and exit code 130.
+
+jaxlib compiles on a thread of its own. An interrupt makes the waiting call return at once, and the thread goes on;
+if the interpreter then takes itself down, it frees the device under that thread, which ends in a segmentation fault
+(jaxlib 0.10.1). So a process that was interrupted unwinds, flushes its output and leaves without that part.
+"""
+
+import contextlib
+import os
+import signal
+import sys
+import threading
+from typing import NoReturn
+
+EXIT_INTERRUPTED, MESSAGE = 130, "ssplat: interrupted\n"
+
+PATIENCE = 10.0
+"""Seconds that a command has to unwind after Ctrl-C; then the process ends where it stands, as after a kill."""
+
+
+def start() -> None:
+    """Runs the command line of this process and exits with its code."""
+    interrupt = _Interrupt()
+    try:
+        if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # a background job may ignore the signal
+            signal.signal(signal.SIGINT, interrupt.receive)
+        from ssplat_jax.commands.main import main
+
+        main()
+    except SystemExit as ended:
+        if ended.code in (EXIT_INTERRUPTED, 128 + signal.SIGTERM):  # the command has said so
+            _leave(int(ended.code))
+        if not interrupt.received:
+            raise
+    except BaseException:  # while modules are imported, a KeyboardInterrupt may come out as another error
+        if not interrupt.received:
+            raise
+    _leave(EXIT_INTERRUPTED, MESSAGE)
+
+
+class _Interrupt:
+    """Handler of SIGINT: the first one raises KeyboardInterrupt, a second one ends the process."""
+
+    def __init__(self) -> None:
+        self.received = False
+
+    def receive(self, number, frame) -> None:
+        if self.received:
+            _leave(EXIT_INTERRUPTED, MESSAGE)
+        self.received = True
+        # Code that runs from a destructor or a callback swallows exceptions.
+        end = threading.Timer(PATIENCE, _leave, (EXIT_INTERRUPTED, MESSAGE))
+        end.daemon = True
+        end.start()
+        raise KeyboardInterrupt
+
+
+def _leave(code: int, message: str = "") -> NoReturn:
+    """Ends the process after flushing its output; nothing else is taken down."""
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(Exception):  # a closed pipe; a stream that the interrupted code is writing to
+            stream.flush()
+    with contextlib.suppress(OSError):
+        shown = "\x1b[?25h" if os.isatty(2) else ""  # a progress bar may have hidden the cursor
+        os.write(2, f"{shown}{message}".encode())
+    os._exit(code)

@@ -1,0 +1,149 @@
+"""Ctrl-C: at every moment, every command ends with exit code 130 and a line, never by a signal.
+
+`pytest -m slow -s tests/commands/test_interrupts.py` prints what the fifty interrupts did.
+"""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ssplat_jax.checkpoint.published_weights import published_tensors
+from ssplat_jax.commands.main import COMMANDS
+from ssplat_jax.config import preset
+from tests.model.resplat_fixture import named_tensor
+
+NUM_INTERRUPTS = 50
+TIMEOUT = 300.0
+
+# A program that takes seconds to compile, as the first step of a stream does.
+COMPILING = """
+import os, signal, threading, time
+import jax, jax.numpy as jnp
+from ssplat_jax.commands import main, start
+
+def command():
+    def compute(x):
+        for i in range(1500):
+            x = jnp.sort(jnp.sin(x + i) @ x)
+        return x
+    lowered = jax.jit(compute).lower(jnp.ones((8, 8)))
+    print("compiling", flush=True)
+    threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()
+    lowered.compile()
+    print("compiled", flush=True)
+    return 0
+
+main.main = lambda: exit(main.guarded(command))
+start.start()
+"""
+
+
+def test_an_interrupted_compilation_ends_with_130_at_once():
+    environment = {**os.environ, "JAX_ENABLE_COMPILATION_CACHE": "false", "XLA_FLAGS": ""}
+    since = time.monotonic()
+    done = subprocess.run(
+        [sys.executable, "-c", COMPILING], capture_output=True, text=True, env=environment, timeout=TIMEOUT
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (130, "compiling\n", "ssplat: interrupted\n")
+    assert time.monotonic() - since < TIMEOUT / 2
+
+
+SWALLOWING = """
+import os, signal, time
+from ssplat_jax.commands import main, start
+
+def command():
+    for _ in range({signals}):
+        try:
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(5)
+        except KeyboardInterrupt:
+            pass
+    {ending}
+
+main.main = lambda: exit(main.guarded(command))
+start.PATIENCE = 0.5
+start.start()
+"""
+
+
+@pytest.mark.parametrize(
+    ("signals", "ending"),
+    [(1, "return 0"), (1, "raise RuntimeError('made of an interrupt')"), (1, "time.sleep(60)"), (2, "time.sleep(60)")],
+)
+def test_a_swallowed_interrupt_still_ends_the_command(signals, ending):
+    code = SWALLOWING.format(signals=signals, ending=ending)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=30)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "ssplat: interrupted\n")
+
+
+def command_lines(folder: Path) -> dict[str, tuple[str, ...]]:
+    """A command line of each command, as new users would type it; `{out}` is a folder of the call's own."""
+    run = folder / "run"
+    room = "procedural:room?frames=8&size=64x48"
+    arguments = ("run", room, "--out", str(run), "--quiet")
+    subprocess.run([sys.executable, "-m", "ssplat_jax.commands.main", *arguments], check=True)
+    tensors = {
+        t.name: named_tensor(t.name, t.shape) for t in published_tensors(preset("small")).values() if t is not None
+    }
+    np.savez(folder / "published.npz", **tensors)
+    return {
+        "demo": ("--out", "{out}"),
+        "inspect": ("procedural:room",),
+        "run": ("procedural:room", "--out", "{out}"),
+        "refine": (str(run), room),
+        "eval": ("procedural:room", "--context", "16", "--out", "{out}"),
+        "train": ("--out", "{out}"),
+        "export": (str(run), "--to", "{out}.spz"),
+        "render": (str(run), room, "--out", "{out}"),
+        "view": (str(run), "--port", "8931"),
+        "import-weights": (str(folder / "published.npz"), "--out", "{out}.npz"),
+        "bench": ("render",),
+        "experiment": ("accuracy_vs_time", "--out", "{out}"),
+        "worlds": ("--out", "{out}", "--count", "4"),
+    }
+
+
+def interrupted(arguments: tuple[str, ...], delay: float) -> tuple[int, str, float] | None:
+    """Exit code, output and seconds from the signal to the end; None if the command ended before the signal."""
+    command = [sys.executable, "-m", "ssplat_jax.commands.main", *arguments]
+    quiet = {**os.environ, "TF_CPP_MIN_LOG_LEVEL": "3"}
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=quiet)
+    try:
+        output, _ = process.communicate(timeout=delay)
+        assert process.returncode == 0, output
+        return None
+    except subprocess.TimeoutExpired:
+        pass
+    process.send_signal(signal.SIGINT)
+    since = time.monotonic()
+    output, _ = process.communicate(timeout=TIMEOUT)
+    return process.returncode, output, time.monotonic() - since
+
+
+@pytest.mark.slow
+def test_fifty_interrupts_at_random_moments_end_with_130(tmp_path):
+    pytest.importorskip("viser")
+    lines, rng = command_lines(tmp_path), np.random.default_rng(int(os.environ.get("SSPLAT_SEED", "0")))
+    assert set(lines) == set(COMMANDS)
+    longest = dict.fromkeys(lines, 45.0)
+    done = 0
+    while done < NUM_INTERRUPTS:
+        name = list(lines)[done % len(lines)]
+        out, delay = tmp_path / f"out{done}", float(rng.uniform(0.3, longest[name]))  # Python itself starts in 0.1 s
+        since = time.monotonic()
+        ended = interrupted((name, *(argument.format(out=out) for argument in lines[name])), delay)
+        if ended is None:
+            longest[name] = max(1.0, 0.9 * (time.monotonic() - since))
+            continue
+        code, output, seconds = ended
+        print(f"{name:<15} after {delay:4.1f} s: {code}, {seconds:4.1f} s later, {output.splitlines()[-1:]}")
+        assert code == 130 and "Traceback" not in output, output
+        assert output.splitlines()[-1].startswith(("ssplat: interrupted", "stopped ", "closed "))
+        done += 1
