@@ -56,6 +56,9 @@ def render(
 ) -> RenderOutput:
     """Images of Gaussians, differentiable in every array.
 
+    Second derivatives are taken forward over reverse: `jax.jvp(jax.grad(loss), ...)`, `jax.hessian`. JAX refuses
+    `jax.grad` of `jax.grad`, and `jax.jvp` alone.
+
     An array that is given switches its effect on; an array that is None adds no operation to the program.
 
     Args:
