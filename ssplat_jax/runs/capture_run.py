@@ -133,10 +133,11 @@ def _stream(
 ) -> int | None:
     """Streams the views that the run has not had yet; returns the signal that stopped it, if one did."""
     order = capture.stream_order(run.session.model.config, indices, run.frame)
-    with Interrupts() as interrupts, reporter.progress("streaming", len(indices)) as advance:
+    with Interrupts(has_work=False) as interrupts, reporter.progress("streaming", len(indices)) as advance:
         advance(run.num_views)
         chunks = feed_chunks(run.session, capture, order[run.num_views :], run.frame)
         for number, fed in enumerate(chunks, start=1):
+            interrupts.has_work = True
             run.exposures |= fed.exposures
             if deltas is not None:
                 deltas.write(run)

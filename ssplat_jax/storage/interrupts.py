@@ -7,13 +7,19 @@ import threading
 class Interrupts:
     """Context manager that records the first SIGINT or SIGTERM, so that the caller can save its state and exit.
 
+    Args:
+        has_work: False if there is nothing to save yet: Ctrl-C then has its usual effect at once, instead of after a
+            compilation that may take a minute. Set the attribute when the first step is done.
+
     Attributes:
         received: number of the signal, or None. Always None outside the main thread, where Python does not allow
             signal handlers.
+        has_work: whether Ctrl-C waits for the caller.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, has_work: bool = True) -> None:
         self.received: int | None = None
+        self.has_work = has_work
         self._previous: dict = {}
 
     def __enter__(self) -> "Interrupts":
@@ -23,8 +29,12 @@ class Interrupts:
         return self
 
     def _record(self, number, frame) -> None:
+        previous = self._previous[number]
+        if not self.has_work and callable(previous):
+            previous(number, frame)
+            return
         self.received = number
-        signal.signal(number, self._previous[number])
+        signal.signal(number, previous)
 
     def __exit__(self, *_) -> None:
         for number, handler in self._previous.items():

@@ -92,7 +92,7 @@ def upgrade_description(description: dict) -> dict:
 
 def _run(model, recipe, state, start, lpips_weights, checkpoints, log, save_every, log_every) -> TrainResult:
     """Steps from `start` to the end of the recipe or to a signal."""
-    trainer, interrupts = Trainer(model, recipe), Interrupts()
+    trainer, interrupts = Trainer(model, recipe), Interrupts(has_work=False)
     step, stopped = start, None
     samples = prefetched(lambda i: sample_for_step(i, recipe, model.config), iter(range(start, recipe.num_steps)))
     with interrupts:
@@ -103,6 +103,7 @@ def _run(model, recipe, state, start, lpips_weights, checkpoints, log, save_ever
                 rate = jnp.asarray(learning_rate(recipe, i), jnp.float32)
                 form = recipe.phase_at(i)[0].form
                 state, metrics = trainer.step(state, sample, rate, form=form, lpips_weights=lpips_weights)
+                interrupts.has_work = True
                 log.add(metrics, waited)
                 step = i + 1
                 is_last = step == recipe.num_steps

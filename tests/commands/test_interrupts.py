@@ -16,10 +16,22 @@ import pytest
 from ssplat_jax.checkpoint.published_weights import published_tensors
 from ssplat_jax.commands.main import COMMANDS
 from ssplat_jax.config import preset
+from ssplat_jax.storage.interrupts import Interrupts
 from tests.model.resplat_fixture import named_tensor
 
 NUM_INTERRUPTS = 50
 TIMEOUT = 300.0
+
+
+@pytest.fixture(autouse=True)
+def heard():
+    """Children hear SIGINT even where the tests run as a background job, which ignores it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+SCRIPT = "from ssplat_jax.commands.start import start; start()"  # as the script `ssplat` does
 
 # A program that takes seconds to compile, as the first step of a stream does.
 COMPILING = """
@@ -83,12 +95,24 @@ def test_a_swallowed_interrupt_still_ends_the_command(signals, ending):
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "ssplat: interrupted\n")
 
 
+def test_ctrl_c_waits_only_where_there_is_work_to_save():
+    with Interrupts(has_work=False) as interrupts:
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        assert interrupts.received is None
+        interrupts.has_work = True
+        signal.raise_signal(signal.SIGINT)
+        assert interrupts.received == signal.SIGINT
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+
+
 def command_lines(folder: Path) -> dict[str, tuple[str, ...]]:
     """A command line of each command, as new users would type it; `{out}` is a folder of the call's own."""
     run = folder / "run"
     room = "procedural:room?frames=8&size=64x48"
     arguments = ("run", room, "--out", str(run), "--quiet")
-    subprocess.run([sys.executable, "-m", "ssplat_jax.commands.main", *arguments], check=True)
+    subprocess.run([sys.executable, "-c", SCRIPT, *arguments], check=True)
     tensors = {
         t.name: named_tensor(t.name, t.shape) for t in published_tensors(preset("small")).values() if t is not None
     }
@@ -112,7 +136,7 @@ def command_lines(folder: Path) -> dict[str, tuple[str, ...]]:
 
 def interrupted(arguments: tuple[str, ...], delay: float) -> tuple[int, str, float] | None:
     """Exit code, output and seconds from the signal to the end; None if the command ended before the signal."""
-    command = [sys.executable, "-m", "ssplat_jax.commands.main", *arguments]
+    command = [sys.executable, "-c", SCRIPT, *arguments]
     quiet = {**os.environ, "TF_CPP_MIN_LOG_LEVEL": "3"}
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=quiet)
     try:
