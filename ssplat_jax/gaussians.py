@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ssplat_jax.errors import InputError
 from ssplat_jax.pytree import pytree, replace
 
 SH_C0 = 0.28209479177387814  # Y_0^0, the constant band: color = 0.5 + SH_C0 * dc
@@ -50,6 +51,24 @@ class Gaussians:
     def sh_degree(self) -> int:
         """Highest SH band."""
         return round(self.sh.shape[-2] ** 0.5) - 1
+
+
+def check_gaussians(gaussians: Gaussians, where: str) -> None:
+    """Checks the shapes of a scene, of tracers too. Not done on construction: inside transforms, fields may hold
+    batches.
+
+    Raises:
+        InputError: naming the field of a wrong shape, after `where`.
+    """
+    n = gaussians.means.shape[0] if getattr(gaussians.means, "ndim", 0) else "n"
+    wanted = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,), "sh": (n, "k", 3)}
+    for name, shape in wanted.items():
+        got = getattr(getattr(gaussians, name), "shape", None)
+        if got is None:
+            raise InputError(f"{where}: {name} must be an array, got {type(getattr(gaussians, name)).__name__}.")
+        if len(got) != len(shape) or any(isinstance(s, int) and s != g for s, g in zip(shape, got, strict=True)):
+            sizes = " ".join(map(str, shape))
+            raise InputError(f"{where}: {name} of the Gaussians must be [{sizes}], got {list(got)}.")
 
 
 def mean_color(gaussians: Gaussians) -> Float[Array, "3"]:

@@ -4,11 +4,12 @@ import functools
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Num
 
-from ssplat_jax.errors import InputError
-from ssplat_jax.gaussians import Gaussians
+from ssplat_jax.errors import InputError, echo
+from ssplat_jax.gaussians import Gaussians, check_gaussians
 from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.pytree import pytree, replace
 from ssplat_jax.rasterizer.binning import count_intersections, intersect_tiles
@@ -22,6 +23,9 @@ from ssplat_jax.rasterizer.tile_grid import Grid
 
 TILE = 8
 """Default side of a tile, pixels."""
+
+TILES = (8, 16)
+"""The sides of tiles that are tested and measured."""
 
 MIN_CAPACITY = 1 << 12
 """Least capacity for pairs that `render` chooses."""
@@ -78,16 +82,17 @@ def render(
         Images with the camera's batch axes, and counts of what was left out.
 
     Raises:
-        InputError: an array does not have the shape above, a flag of `effects` contradicts the arrays, `max_pairs` or
-            `tile` is below 1, or (outside jit) there are more than 2^30 pairs.
+        InputError: an array does not have the shape above, a flag of `effects` contradicts the arrays, `max_pairs` is
+            below 1, `tile` is neither 8 nor 16, or (outside jit) there are more than 2^30 pairs.
     """
     effects = (effects or Effects()).resolve(captured=captured, distortion=distortion, exposures=exposures)
     inputs = RenderInputs(gaussians, camera, features, captured, distortion, exposures)
     _check(inputs)
     inputs = _at_least_one_row(inputs)
-    for name, number in (("max_pairs", max_pairs), ("tile", tile)):
-        if number is not None and number < 1:
-            raise InputError(f"render: {name} must be at least 1, got {number}.")
+    if max_pairs is not None and not (_is_whole(max_pairs) and max_pairs >= 1):
+        raise InputError(f"render: max_pairs must be a whole number of at least 1, got {echo(max_pairs)}.")
+    if not (_is_whole(tile) and tile in TILES):
+        raise InputError(f"render: tile must be 8 or 16 pixels, got {echo(tile)}.")
     if max_pairs is None:
         # Under `jax.grad` alone the primal values are concrete: without tangents, the pairs can be counted.
         counted = _count(jax.lax.stop_gradient(inputs), effects, tile)
@@ -133,8 +138,13 @@ def round_up(num_pairs: int) -> int:
 
 
 def _check(inputs: RenderInputs) -> None:
-    """Refuses arrays of the wrong shape."""
+    """Refuses arrays of the wrong shape, and what is not an array."""
     camera, features = inputs.camera, inputs.features
+    check_gaussians(inputs.gaussians, "render")
+    arrays = {name: getattr(inputs, name) for name in ("features", "distortion", "exposures")}
+    for name, array in {"viewmats": camera.viewmats, "Ks": camera.Ks, **arrays}.items():
+        if array is not None and not hasattr(array, "shape"):
+            raise InputError(f"render: {name} must be an array, got {echo(array)}; wrap it in jnp.asarray.")
     batch, rows = camera.viewmats.shape[:-2], inputs.gaussians.num_gaussians
     if camera.viewmats.shape[-2:] != (4, 4) or camera.Ks.shape != (*batch, 3, 3):
         raise InputError(
@@ -145,13 +155,19 @@ def _check(inputs: RenderInputs) -> None:
         raise InputError(f"render: wanted at least one camera, got a batch of shape {list(batch)}.")
     if inputs.gaussians.sh.shape[1] not in (1, 4, 9, 16):
         raise InputError(f"render: sh must hold 1, 4, 9 or 16 terms a Gaussian, got {inputs.gaussians.sh.shape[1]}.")
-    if camera.width < 1 or camera.height < 1:
-        raise InputError(f"render: the image must have at least 1x1 pixels, got {camera.width}x{camera.height}.")
+    if not all(_is_whole(side) and side >= 1 for side in (camera.width, camera.height)):
+        size = f"{echo(camera.width)}x{echo(camera.height)}"
+        raise InputError(f"render: the image must have whole numbers of pixels, at least 1x1, got {size}.")
     if features is not None and (features.ndim != 2 or features.shape[0] != rows):
         raise InputError(f"render: features must be [{rows} c], got {list(features.shape)}.")
     for name, array, tail in (("distortion", inputs.distortion, (5,)), ("exposures", inputs.exposures, (3, 4))):
         if array is not None and array.shape != (*batch, *tail):
             raise InputError(f"render: {name} must be {[*batch, *tail]}, got {list(array.shape)}.")
+
+
+def _is_whole(number: object) -> bool:
+    """Whether it is a Python or NumPy integer."""
+    return isinstance(number, int | np.integer) and not isinstance(number, bool)
 
 
 def prepare(inputs: RenderInputs, effects: Effects):

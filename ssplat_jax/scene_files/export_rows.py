@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float64, UInt8
 
-from ssplat_jax.gaussians import Gaussians
+from ssplat_jax.gaussians import Gaussians, check_gaussians
 
 MIN_OPACITY = 1.0 / 255.0
 """Gaussians below this opacity are invisible in every renderer and are not written (absent rows have opacity 0)."""
@@ -54,7 +54,11 @@ def scene_rows(gaussians: Gaussians) -> SceneRows:
     Limits:
         Gaussians with a non-finite entry, a negative scale or an opacity below 1/255 are dropped.
         Opacities are clamped to [1e-6, 1 - 1e-6], scales to [e^-20, e^20]; a zero quaternion becomes the identity.
+
+    Raises:
+        InputError: an array of the scene has a wrong shape.
     """
+    check_gaussians(gaussians, "scene")
     fields = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
     means, quats, scales, opacities, sh = (np.asarray(field, np.float64) for field in fields)
     entries = np.concatenate([means, quats, scales, opacities[:, None], sh.reshape(len(sh), 3 * sh.shape[1])], axis=1)

@@ -31,7 +31,7 @@ from ssplat_jax.cache import (
     project,
     store_witness,
 )
-from ssplat_jax.chunk import Chunk
+from ssplat_jax.chunk import Chunk, check_chunk
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.gaussians import Gaussians, mask_gaussians
 from ssplat_jax.geometry.rotations import matrices_to_quats
@@ -91,6 +91,7 @@ class StreamSplat:
     def predict(self, params: dict, cache: VoxelCache, chunk: Chunk) -> Prediction:
         """Tokens of a chunk, given the cache before it (Secs. 3.3 to 3.6); no gradient flows to the cache."""
         config, network = self.config, stages.network_of(self.config)
+        check_chunk(chunk, config.stream.chunk_size)
         views = stages.prepare_views(chunk, config)
         factor = config.network.match_stride // stages.GRID_STRIDE
         with jax.named_scope("project"):

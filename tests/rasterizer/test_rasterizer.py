@@ -258,8 +258,8 @@ def test_rows_with_non_finite_features_are_culled_and_counted(scene):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"max_pairs": 0}, "max_pairs must be at least 1, got 0"),
-        ({"tile": 0}, "tile must be at least 1, got 0"),
+        ({"max_pairs": 0}, "max_pairs must be a whole number of at least 1, got 0"),
+        ({"tile": 0}, "tile must be 8 or 16 pixels, got 0"),
         ({"features": jnp.zeros((3, 2))}, "features must be"),
         ({"distortion": jnp.zeros((2, 5))}, "distortion must be"),
         ({"effects": Effects(exposure=True), "exposures": jnp.zeros((3, 3, 4))}, "exposures must be"),

@@ -1,0 +1,104 @@
+"""Arrays of wrong shapes get one InputError that names them, as users get it: without the tests' own type checks."""
+
+import os
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ssplat_jax.chunk import check_chunk
+from ssplat_jax.errors import InputError
+from ssplat_jax.gaussians import check_gaussians
+from ssplat_jax.rasterizer import render
+from tests.model.small import MODEL, chunk
+from tests.rasterizer.scenes import cameras, cloud
+
+NAMED = {
+    "means=jnp.zeros((9, 2))": "means of the Gaussians must be [9 3], got [9, 2]",
+    "quats=jnp.zeros((9, 3))": "quats of the Gaussians must be [9 4], got [9, 3]",
+    "scales=jnp.zeros(9)": "scales of the Gaussians must be [9 3], got [9]",
+    "opacities=jnp.zeros((9, 1))": "opacities of the Gaussians must be [9], got [9, 1]",
+    "opacities=jnp.zeros(8)": "opacities of the Gaussians must be [9], got [8]",
+    "sh=jnp.zeros((9, 3))": "sh of the Gaussians must be [9 k 3], got [9, 3]",
+    "means=None": "means must be an array, got NoneType",
+    "width=80.5": "whole numbers of pixels, at least 1x1, got 80.5x64",
+    "Ks=jnp.eye(4)": "viewmats [*b 4 4] and Ks [*b 3 3], got [4, 4] and [4, 4]",
+    "Ks=[1, 2]": "Ks must be an array, got [1, 2]",
+    "features=[1, 2]": "features must be an array, got [1, 2]",
+    "features=jnp.zeros((8, 2))": "features must be [9 c], got [8, 2]",
+    "tile=7": "tile must be 8 or 16 pixels, got 7",
+    "tile=8.0": "tile must be 8 or 16 pixels, got 8.0",
+    "max_pairs=1.5": "max_pairs must be a whole number of at least 1, got 1.5",
+}
+"""The message of `render` for each wrong argument."""
+
+SCRIPT = """
+import dataclasses, sys
+import jax, jax.numpy as jnp
+import ssplat_jax as ss
+
+def draw(jit, **wrong):
+    scene = dict(means=jnp.zeros((9, 3)), quats=jnp.ones((9, 4)), scales=jnp.ones((9, 3)), opacities=jnp.ones(9),
+                 sh=jnp.zeros((9, 1, 3)))
+    camera = dict(viewmats=jnp.eye(4), Ks=jnp.eye(3), width=80, height=64)
+    options = {name: value for name, value in wrong.items() if name not in scene and name not in camera}
+    scene, camera = ({**part, **{n: v for n, v in wrong.items() if n in part}} for part in (scene, camera))
+    def inner(scene):
+        return ss.render(ss.Gaussians(**scene), ss.Camera(**camera), **options)
+    (jax.jit(inner) if jit else inner)(scene)
+
+for jit in (False, True):
+    for case in sys.argv[1:]:
+        try:
+            eval(f"draw({jit}, {case})")
+        except ss.InputError as error:
+            print(error)
+        else:
+            print("nothing")
+"""
+
+
+def test_render_names_each_wrong_argument_inside_and_outside_jit():
+    quiet = {**os.environ, "TF_CPP_MIN_LOG_LEVEL": "3"}
+    done = subprocess.run([sys.executable, "-c", SCRIPT, *NAMED], capture_output=True, text=True, env=quiet)
+    assert done.returncode == 0, done.stderr
+    for (case, wanted), line in zip([*NAMED.items()] * 2, done.stdout.splitlines(), strict=True):
+        assert line.startswith("render: ") and wanted in line, (case, line)
+
+
+def wrong(tree, **leaves):
+    """`tree` with other leaves, past the checks of a construction by hand."""
+    paths, form = jax.tree_util.tree_flatten_with_path(tree)
+    return jax.tree.unflatten(form, [leaves.get(path[-1].name, leaf) for path, leaf in paths])
+
+
+def test_a_step_refuses_chunks_of_another_number_of_views():
+    right = chunk()
+    cases = {
+        "images": right.images[:2],
+        "valid": jnp.ones(2, bool),
+        "viewmats": right.viewmats[:, :3],
+        "near": jnp.ones(3),
+    }
+    for name, leaf in cases.items():
+        for call in (MODEL.step, jax.jit(MODEL.step)):
+            with pytest.raises(InputError, match=f"chunk: {name} must be"):
+                call({}, MODEL.init_cache(), wrong(right, **{name: leaf}))
+    with pytest.raises(InputError, match=r"Chunks have 3 views \(`stream.chunk_size`\)"):
+        check_chunk(chunk(views=2), 3)
+
+
+def test_shape_checks_pass_through_transforms():
+    """vmap over scenes and cameras, and trees of anything but arrays."""
+    camera = cameras(12, 10)
+    scenes = jax.tree.map(lambda x: jnp.stack([x, 0.5 * x]), cloud(6))
+    both = jax.vmap(lambda g: render(g, camera, max_pairs=1 << 12).color)(scenes)
+    for i in range(2):
+        single = render(jax.tree.map(lambda x, i=i: x[i], scenes), camera, max_pairs=1 << 12)
+        np.testing.assert_allclose(both[i], single.color, atol=1e-6)
+    with pytest.raises(InputError, match=r"scene: means of the Gaussians must be \[2 3\], got \[2, 6, 3\]"):
+        check_gaussians(scenes, "scene")
+    assert jax.tree.map(lambda _: None, scenes).means is None
