@@ -14,7 +14,7 @@ from typing import NoReturn
 
 EXIT_INTERRUPTED, MESSAGE = 130, "ssplat: interrupted\n"
 
-PATIENCE = 10.0
+PATIENCE = 5.0
 """Seconds that a command has to unwind after Ctrl-C; then the process ends where it stands, as after a kill."""
 
 
@@ -24,6 +24,7 @@ def start() -> None:
     try:
         if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # a background job may ignore the signal
             signal.signal(signal.SIGINT, interrupt.receive)
+            sys.unraisablehook = interrupt.leave_if_swallowed
         from ssplat_jax.commands.main import main
 
         main()
@@ -48,11 +49,17 @@ class _Interrupt:
         if self.received:
             _leave(EXIT_INTERRUPTED, MESSAGE)
         self.received = True
-        # Code that runs from a destructor or a callback swallows exceptions.
+        # A callback out of compiled code may swallow the exception.
         end = threading.Timer(PATIENCE, _leave, (EXIT_INTERRUPTED, MESSAGE))
         end.daemon = True
         end.start()
         raise KeyboardInterrupt
+
+    def leave_if_swallowed(self, unraisable: "sys.UnraisableHookArgs") -> None:
+        """Hook of errors that Python cannot raise: those in destructors and in callbacks of the garbage collector."""
+        if self.received and issubclass(unraisable.exc_type, KeyboardInterrupt):
+            _leave(EXIT_INTERRUPTED, MESSAGE)
+        sys.__unraisablehook__(unraisable)
 
 
 def _leave(code: int, message: str = "") -> NoReturn:

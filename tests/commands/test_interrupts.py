@@ -95,6 +95,31 @@ def test_a_swallowed_interrupt_still_ends_the_command(signals, ending):
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "ssplat: interrupted\n")
 
 
+IN_A_DESTRUCTOR = """
+import os, signal, time
+from ssplat_jax.commands import main, start
+
+class Thing:
+    def __del__(self):
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(5)
+
+def command():
+    thing = Thing()
+    del thing
+    time.sleep(60)
+
+main.main = lambda: exit(main.guarded(command))
+start.PATIENCE = 60.0
+start.start()
+"""
+
+
+def test_an_interrupt_in_a_destructor_ends_the_command_at_once():
+    done = subprocess.run([sys.executable, "-c", IN_A_DESTRUCTOR], capture_output=True, text=True, timeout=30)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "ssplat: interrupted\n")
+
+
 def test_ctrl_c_waits_only_where_there_is_work_to_save():
     with Interrupts(has_work=False) as interrupts:
         with pytest.raises(KeyboardInterrupt):
