@@ -72,7 +72,13 @@ class Run:
             how = " without --overwrite" if self.overwrite else ""
             print(f"stopped after {result.num_views} views; the same command{how} continues", file=sys.stderr)
             return 128 + result.interrupted
-        print(f"wrote {self.out}/scene.ply ({result.num_gaussians} Gaussians from {result.num_views} views)")
+        if result.was_finished:
+            print(
+                f"{self.out} holds this run, finished: scene.ply ({result.num_gaussians} Gaussians from"
+                f" {result.num_views} views), views/ and metrics.json; --overwrite starts it anew"
+            )
+        else:
+            print(f"wrote {self.out}/scene.ply ({result.num_gaussians} Gaussians from {result.num_views} views)")
         if self.refine:
             return Refine(self.out, self.capture, self.refine, self.weights, quiet=self.quiet).run()
         return 0

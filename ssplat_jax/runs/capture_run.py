@@ -9,7 +9,7 @@ from ssplat_jax.console import Reporter
 from ssplat_jax.data.capture import Capture, open_capture
 from ssplat_jax.errors import require_positive
 from ssplat_jax.evaluation.scoring import check_scorable
-from ssplat_jax.runs.finish_run import finish_run
+from ssplat_jax.runs.finish_run import finish_run, finished_scene
 from ssplat_jax.runs.resume import RunState, resume_run, run_identity, save_run
 from ssplat_jax.storage.folder_lock import lock_folder
 from ssplat_jax.storage.interrupts import Interrupts
@@ -26,6 +26,7 @@ class RunResult:
     num_views: int
     num_gaussians: int
     interrupted: int | None  # the signal that stopped it, if one did
+    was_finished: bool = False  # the folder held it already; nothing was streamed or written
 
 
 def run_capture(
@@ -80,6 +81,8 @@ def run_capture(
         run = resume_run(model, params, capture, identity, folder, reporter)
         reporter.warn_all(*capture.notes, run.frame.warning)
         writer = _start_deltas(run, len(indices), folder, deltas)
+        if run.num_views == len(indices) and (num_written := finished_scene(folder, len(indices))) is not None:
+            return RunResult(run.num_views, num_written, None, was_finished=True)
         stopped = _stream(run, capture, indices, identity, folder, writer, save_every, reporter)
         if stopped:
             return RunResult(run.num_views, int(run.session.cache_facts()["decoded"]), stopped)

@@ -1,6 +1,7 @@
 """Scene, pictures and metrics of a finished stream."""
 
 import dataclasses
+import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -41,6 +42,7 @@ def finish_run(
     Raises:
         StorageError: a file cannot be written.
     """
+    folder.metrics.unlink(missing_ok=True)  # see `finished_scene`
     gaussians, frame = run.session.gaussians(), run.frame
     report = save_scene(folder.scene, gaussians, frame)
     if report.warning is not None:
@@ -67,6 +69,20 @@ def finish_run(
     }
     write_json(folder.metrics, metrics)
     return report
+
+
+def finished_scene(folder: RunFolder, num_views: int) -> int | None:
+    """Gaussians in the scene that a finished run of `num_views` views left in `folder`; None if there is no such run.
+
+    The metrics are written last: with them, everything is there.
+    """
+    if not (folder.scene.exists() and folder.metrics.exists()):
+        return None
+    try:
+        metrics = json.loads(folder.metrics.read_text())
+        return metrics["ply"]["num_written"] if metrics["views"] == num_views else None
+    except (ValueError, KeyError, TypeError):  # edited, or of another command: write it again
+        return None
 
 
 def save_scene(path: Path, gaussians: Gaussians, frame: StreamFrame) -> ExportReport:

@@ -237,6 +237,20 @@ def test_run_stops_resumes_and_exports(tmp_path, capsys):
     # Without deltas it is left alone; going on without telling more leaves none that would not add up to the scene.
     assert run("run", capture, "--out", str(out), "--quiet") == 0
     assert_deltas_give_the_scene(out, "000012.npz")
+    # Nothing of it is written or computed again, the figures of the run included.
+    before = {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in out.rglob("*.*")}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("ssplat_jax.runs.capture_run.finish_run", None)
+        patch.setattr("ssplat_jax.streaming.session.Session.gaussians", None)
+        capsys.readouterr()
+        assert run("run", capture, "--out", str(out), "--quiet") == 0
+    assert capsys.readouterr().out.startswith(f"{out} holds this run, finished: scene.ply (")
+    assert {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in out.rglob("*.*")} == before
+    assert json.loads((out / "metrics.json").read_text())["compile_s"] > 0
+    # A run that was stopped while it wrote its results writes them when it goes on.
+    (out / "metrics.json").unlink()
+    assert run("run", capture, "--out", str(out), "--quiet") == 0
+    assert capsys.readouterr().out.startswith("wrote ") and (out / "metrics.json").exists()
     shutil.copy(out / "state.npz.previous", out / "state.npz")
     assert run("run", capture, "--out", str(out), "--quiet") == 0
     assert not any((out / "deltas").glob("*.npz"))
