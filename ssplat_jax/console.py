@@ -7,6 +7,9 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+WAITING = "compiling"
+"""Note of a bar whose first step is not done: compiling is most of it."""
+
 
 class Reporter:
     """Progress, tables and warnings on stderr; if quiet, warnings only."""
@@ -16,8 +19,8 @@ class Reporter:
         self._warnings = Console(stderr=True)
 
     @contextlib.contextmanager
-    def progress(self, name: str, total: int) -> Iterator[Callable[..., None]]:
-        """A progress bar of `total` steps; yields `advance(done, note="")`."""
+    def progress(self, name: str, total: int, *, waiting: str = WAITING) -> Iterator[Callable[..., None]]:
+        """A progress bar of `total` steps; yields `advance(done, note="")`. Until then its note is `waiting`."""
         columns = (
             TextColumn("{task.description}"),
             BarColumn(),
@@ -26,8 +29,12 @@ class Reporter:
             TextColumn("{task.fields[note]}"),
         )
         with Progress(*columns, console=self.console) as bar:
-            task = bar.add_task(name, total=total, note="")
+            task = bar.add_task(name, total=total, note=waiting)
             yield lambda done, note="": bar.update(task, completed=done, note=note)
+
+    def say(self, message: str) -> None:
+        """Prints a message: how long something takes, what to do next."""
+        self.console.print(message, highlight=False, markup=False, soft_wrap=True)
 
     def warn(self, message: str) -> None:
         """Prints a warning."""

@@ -27,6 +27,12 @@ class Demo:
         from ssplat_jax.console import Reporter
         from ssplat_jax.runs.demo import run_demo
 
-        run_demo(self.scene, self.out, Reporter(self.quiet), QUALITIES[self.quality])
+        reporter = Reporter(self.quiet)
+        reporter.say("one to two minutes on two cores, most of it for compiling")
+        run_demo(self.scene, self.out, reporter, QUALITIES[self.quality])
         print(f"wrote {self.out}/scene.ply, metrics.json and pictures")
+        reporter.say(
+            f"next: `ssplat view {self.out}` shows the scene in a browser; `ssplat run CAPTURE --out runs/mine` makes"
+            " one of your own images"
+        )
         return 0

@@ -9,6 +9,9 @@ from ssplat_jax.commands.options import ConfigChanges, LpipsHeads, QuietOption, 
 from ssplat_jax.config import preset
 from ssplat_jax.errors import require_positive
 
+MINUTES = {"tiny": 77, "stream": 15}
+"""Time of each recipe on two cores (docs/model_card.md)."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Train:
@@ -52,7 +55,12 @@ class Train:
             check_params(params, config, str(self.init_weights))
         lpips_weights = load_lpips_weights(self.lpips_vgg, self.lpips_heads)
         reporter = Reporter(self.quiet)
-        with reporter.progress("training", recipe.num_steps) as advance:
+        reporter.say(
+            f"{recipe.num_steps} steps, about {max(1, round(MINUTES[self.recipe] * self.scale_steps))} minutes on two"
+            " cores; Ctrl-C saves them, and the same command continues"
+        )
+        waiting = "compiling; figures come every ten steps"
+        with reporter.progress("training", recipe.num_steps, waiting=waiting) as advance:
             result = train(
                 config,
                 recipe,
@@ -74,6 +82,7 @@ class Train:
         }
         save_weights(self.out / "weights.npz", result.state.ema, config, provenance)
         print(f"wrote {self.out}/weights.npz after {result.step} steps")
+        reporter.say(f"next: `ssplat run CAPTURE --weights {self.out}/weights.npz --out runs/mine` streams with them")
         return 0
 
 

@@ -35,7 +35,7 @@ class Worlds:
         require_positive(count=self.count, frames=self.frames, size=min(size))
         if self.seed < 0:
             raise InputError(f"--seed: wanted a number from 0, got {self.seed}.")
-        with Reporter().progress("worlds", self.count) as advance:
+        with Reporter().progress("worlds", self.count, waiting="") as advance:
             rendered = write_worlds(self.out, self.count, self.seed, size, self.frames, advance)
         print(f"{self.out}: {self.count} worlds, {rendered} of them new")
         return 0

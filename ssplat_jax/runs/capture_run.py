@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ssplat_jax.checkpoint.delta_files import save_delta
-from ssplat_jax.console import Reporter
+from ssplat_jax.console import WAITING, Reporter
 from ssplat_jax.data.capture import Capture, open_capture
 from ssplat_jax.errors import require_positive
 from ssplat_jax.evaluation.scoring import check_scorable
@@ -137,7 +137,7 @@ def _stream(
     """Streams the views that the run has not had yet; returns the signal that stopped it, if one did."""
     order = capture.stream_order(run.session.model.config, indices, run.frame)
     with Interrupts(has_work=False) as interrupts, reporter.progress("streaming", len(indices)) as advance:
-        advance(run.num_views)
+        advance(run.num_views, WAITING)
         chunks = feed_chunks(run.session, capture, order[run.num_views :], run.frame)
         for number, fed in enumerate(chunks, start=1):
             interrupts.has_work = True

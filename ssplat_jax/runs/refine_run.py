@@ -10,7 +10,7 @@ import numpy as np
 from ssplat_jax.checkpoint.saved_config import config_from_header
 from ssplat_jax.checkpoint.stream_state import load_newest_state
 from ssplat_jax.checkpoint.weights import params_digest
-from ssplat_jax.console import Reporter
+from ssplat_jax.console import WAITING, Reporter
 from ssplat_jax.data.capture import Capture, open_capture
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.errors import InputError, require_positive
@@ -144,7 +144,7 @@ def _take_steps(
 ) -> int | None:
     """Takes the steps that are left, saving on the way; returns the signal that stopped them, if one did."""
     with Interrupts() as interrupts, reporter.progress("refining", steps) as advance:
-        advance(progress.num_steps)
+        advance(progress.num_steps, WAITING)
         for _ in continue_refinement(progress, key_views, steps, config):
             advance(progress.num_steps, f"loss {progress.losses[-1]:.4f}")
             stopped = interrupts.received  # read once: a signal may come at any time
