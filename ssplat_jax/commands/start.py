@@ -32,6 +32,8 @@ def start() -> None:
         if ended.code in (EXIT_INTERRUPTED, 128 + signal.SIGTERM):  # the command has said so
             _leave(int(ended.code))
         if not interrupt.received:
+            # All is done: Ctrl-C in the interpreter's last moments, when no handler runs, changes nothing.
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
             raise
     except BaseException:  # while modules are imported, a KeyboardInterrupt may come out as another error
         if not interrupt.received:
