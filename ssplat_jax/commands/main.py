@@ -19,6 +19,7 @@ from ssplat_jax.commands.experiment_command import Experiment
 from ssplat_jax.commands.export_command import Export
 from ssplat_jax.commands.import_weights_command import ImportWeights
 from ssplat_jax.commands.inspect_command import Inspect
+from ssplat_jax.commands.program_cache import keep_programs
 from ssplat_jax.commands.refine_command import Refine
 from ssplat_jax.commands.render_command import Render
 from ssplat_jax.commands.run_command import Run
@@ -57,6 +58,8 @@ def main(arguments: list[str] | None = None) -> None:
         args=arguments,
         config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
     )
+    if not isinstance(command, Bench | Experiment):  # which measure what compiling costs
+        keep_programs()
     sys.exit(guarded(command.run))
 
 

@@ -69,6 +69,10 @@ def _leave(code: int, message: str = "") -> NoReturn:
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(Exception):  # a closed pipe; a stream that the interrupted code is writing to
             stream.flush()
+    with contextlib.suppress(Exception):
+        from ssplat_jax.commands.program_cache import drop_newest
+
+        drop_newest(seconds=PATIENCE)
     with contextlib.suppress(OSError):
         shown = "\x1b[?25h" if os.isatty(2) else ""  # a progress bar may have hidden the cursor
         os.write(2, f"{shown}{message}".encode())

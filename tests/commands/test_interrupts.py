@@ -187,11 +187,11 @@ def test_fifty_interrupts_at_random_moments_end_with_130(tmp_path):
     done = attempts = 0
     while done < NUM_INTERRUPTS:
         name = list(lines)[done % len(lines)]
-        attempts += 1
+        attempts += 1  # Python itself starts in 0.1 s
         out, delay = (
             tmp_path / f"out{attempts}",
             float(rng.uniform(0.3, longest[name])),
-        )  # Python itself starts in 0.1 s
+        )
         since = time.monotonic()
         ended = interrupted((name, *(argument.format(out=out) for argument in lines[name])), delay)
         if ended is None:

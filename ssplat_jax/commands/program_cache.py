@@ -1,0 +1,78 @@
+"""Compiled programs kept on disk between commands, so that the second command of a kind does not compile again.
+
+jax 0.10.1 stores what its key describes: the program, the compiler and its flags. Its key does not tell one CPU from
+another, so each kind of CPU and number of cores has a folder of its own. Results are the same bytes with the cache off,
+empty and full (tests/commands/test_program_cache.py).
+"""
+
+import contextlib
+import hashlib
+import os
+import platform
+import time
+from collections.abc import MutableMapping
+from pathlib import Path
+
+SWITCH = "SSPLAT_PROGRAM_CACHE"
+"""Environment variable: `off`, or a folder in place of the user's cache folder."""
+
+FOLDER, IS_ON = "JAX_COMPILATION_CACHE_DIR", "JAX_ENABLE_COMPILATION_CACHE"
+"""JAX's own variables: where they are set, they hold."""
+
+LEAST_SECONDS = "0.3"
+"""Programs that compile faster are not kept."""
+
+_our_folder: Path | None = None
+
+
+def keep_programs(environment: MutableMapping[str, str] = os.environ) -> None:
+    """Makes JAX keep compiled programs on disk. Called before JAX is imported: it reads these variables then.
+
+    Args:
+        environment: the variables of the process.
+    """
+    global _our_folder
+    if environment.get(SWITCH, "").lower() == "off" or environment.get(IS_ON, "").lower() in ("false", "0"):
+        return
+    if FOLDER not in environment:
+        folder = Path(environment.get(SWITCH) or _users_cache()) / "programs" / _machine()
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError:  # a home that cannot be written: every command compiles, as without a cache
+            return
+        environment[FOLDER], _our_folder = str(folder), folder
+        environment.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", LEAST_SECONDS)
+    # XLA logs an error about preferences of the compiler, which it takes for features of the CPU, at every load.
+    environment.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+
+
+def drop_newest(seconds: float) -> None:
+    """Removes programs of our folder that were written in the last seconds.
+
+    An interrupt may have cut one short, and JAX never replaces a file.
+    """
+    if _our_folder is not None:
+        with contextlib.suppress(OSError):
+            for file in _our_folder.glob("*-cache"):
+                if time.time() - file.stat().st_mtime < seconds:
+                    file.unlink(missing_ok=True)
+
+
+def _users_cache() -> Path:
+    """The package's folder among the user's caches."""
+    from platformdirs import user_cache_path
+
+    return user_cache_path("ssplat")
+
+
+def _machine() -> str:
+    """Letters for this kind of CPU and number of cores: compiled programs hold instructions and shares for them."""
+    described = f"{platform.machine()} {platform.processor()} {_num_cores()}"
+    with contextlib.suppress(OSError, StopIteration), open("/proc/cpuinfo") as file:
+        described += next(line for line in file if line.startswith(("flags", "Features")))
+    return hashlib.sha256(described.encode()).hexdigest()[:12]
+
+
+def _num_cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
