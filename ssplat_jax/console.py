@@ -1,7 +1,7 @@
 """Terminal output of the commands: progress bars, tables, warnings and facts."""
 
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -56,12 +56,13 @@ class Reporter:
         self.console.print(table)
 
 
-def print_facts(facts: dict) -> None:
-    """Prints facts on stdout, one per line, then their `warnings`."""
+def print_facts(facts: dict, units: Mapping[str, str]) -> None:
+    """Prints facts on stdout, one per line with its unit, then their `warnings`; facts that are None are left out."""
+    facts = {name: value for name, value in facts.items() if value is not None}
     width = max(map(len, facts))
     for name, value in facts.items():
         if name != "warnings":
-            print(f"{name:<{width}}  {_readable(value)}")
+            print(f"{name:<{width}}  {_readable(value)} {units.get(name, '')}".rstrip())
     for warning in facts.get("warnings", ()):
         print(f"warning: {warning}")
 

@@ -26,11 +26,16 @@ class Inspect:
     """Print JSON instead of a table."""
 
     def run(self) -> int:
-        from ssplat_jax.console import print_facts
+        from ssplat_jax.console import Reporter, print_facts
         from ssplat_jax.data.capture import open_capture
-        from ssplat_jax.data.capture_summary import summarize
+        from ssplat_jax.data.capture_summary import UNITS, summarize
+        from ssplat_jax.data.depth_range import NUM_REFERENCES
         from ssplat_jax.storage.json_files import json_text
 
-        facts = summarize(open_capture(self.capture, size=parse_size(self.size)), preset("tiny")).to_dict()
-        print(json_text(facts)) if self.json else print_facts(facts)
+        capture = open_capture(self.capture, size=parse_size(self.size))
+        num_steps = min(NUM_REFERENCES, len(capture))
+        with Reporter().progress("matching", num_steps, waiting="") as advance:
+            facts = summarize(capture, preset("tiny"), advance).to_dict()
+            advance(num_steps)
+        print(json_text(facts)) if self.json else print_facts(facts, UNITS)
         return 0

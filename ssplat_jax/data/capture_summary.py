@@ -1,6 +1,7 @@
 """Summary of a capture for `ssplat inspect`: facts, the scale and depth range of a run, and warnings with remedies."""
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -15,10 +16,28 @@ HIGH_STEP = 0.6  # step over median depth, above which neighboring frames hardly
 MAX_FOCAL_RATIO = 4.0  # largest over smallest focal length; above it there is a warning
 JUMP_RATIO = 20.0  # step over median step, above which there is a warning
 
+LOW_PARALLAX_DEGREES = 2.0  # median over the points, below which depth is uncertain
+MAX_DEPTH_RATIO = 1.5  # median of the depth maps over that of the matches, or its inverse; above it there is a warning
+NUM_DEPTH_MAPS_READ = 8  # evenly spread; a median needs no more
+
+_LENGTHS = ("path_length", "extent", "median_step", "median_depth", "depth_maps_median")
+_OTHER_UNITS = {
+    "num_depth_maps": "(a run does not need them; its depths come from the images)",
+    "near": "stream units (capture units times scene_scale)",
+    "far": "stream units (capture units times scene_scale)",
+    "scene_scale": "stream units in a capture unit",
+    "focal": "pixels",
+    "fov_degrees": "degrees",
+    "parallax_degrees": "degrees, median over the matches",
+    "step_over_depth": "(median step over median depth)",
+}
+UNITS = dict.fromkeys(_LENGTHS, "capture units") | _OTHER_UNITS
+"""Units of the facts, or what else a reader needs to know, by their names."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Summary:
-    """Facts about a capture, lengths in capture units but `near` and `far` in stream units (times `scene_scale`)."""
+    """Facts about a capture; `UNITS` has their units."""
 
     name: str
     format: str
@@ -33,6 +52,7 @@ class Summary:
     median_step: float  # between frames in stream order
     step_over_depth: float  # median step over median depth
     median_depth: float
+    depth_maps_median: float | None  # of known depths in some depth maps; None without depth maps
     depth_source: str
     num_matches: int
     parallax_degrees: float
@@ -47,13 +67,19 @@ class Summary:
         return {k: list(v) if isinstance(v, tuple) else v for k, v in dataclasses.asdict(self).items()}
 
 
-def summarize(capture: Capture, config: StreamConfig) -> Summary:
+def summarize(capture: Capture, config: StreamConfig, advance: Callable[[int], None] = lambda done: None) -> Summary:
     """Returns the summary of a capture for a run with `config`.
 
+    Args:
+        capture: the capture.
+        config: the configuration that a run would have.
+        advance: called with the number of frames, of at most `NUM_REFERENCES`, that have been matched.
+
     Raises:
-        InputError: an image that the depth estimate uses is damaged.
+        InputError: an image or depth map that the estimates use is damaged.
     """
-    depths = estimate_depths(capture, range(len(capture)))
+    depths = estimate_depths(capture, range(len(capture)), advance)
+    measured = _depth_maps_median(capture)
     scale, near, far = stream_scale(depths, config)
     centers = capture.camtoworlds[:, :3, 3]
     steps = np.linalg.norm(np.diff(centers, axis=0), axis=-1)
@@ -73,6 +99,7 @@ def summarize(capture: Capture, config: StreamConfig) -> Summary:
         median_step=median_step,
         step_over_depth=median_step / depths.median,
         median_depth=depths.median,
+        depth_maps_median=measured,
         depth_source=depths.source,
         num_matches=depths.num_points,
         parallax_degrees=depths.parallax_degrees,
@@ -80,8 +107,32 @@ def summarize(capture: Capture, config: StreamConfig) -> Summary:
         near=near,
         far=far,
         voxel_in_capture_units=config.memory.voxel_size / scale,
-        warnings=(*capture.notes, *_warnings(capture, depths, steps)),
+        warnings=(*capture.notes, *_warnings(capture, depths, steps), *_depth_map_warnings(depths, measured)),
     )
+
+
+def _depth_maps_median(capture: Capture) -> float | None:
+    """Median of the known depths in some depth maps, in capture units; None without depth maps."""
+    owners = [i for i in range(len(capture)) if capture.pixels.has_depth(i)]
+    if not owners:
+        return None
+    chosen = sorted({owners[round(k)] for k in np.linspace(0, len(owners) - 1, NUM_DEPTH_MAPS_READ)})
+    maps = [depth for i in chosen if (depth := capture.depth(i)) is not None]
+    known = np.concatenate([depth[depth > 0] for depth in maps])
+    return float(np.median(known)) if known.size else None
+
+
+def _depth_map_warnings(depths: DepthStatistics, measured: float | None) -> list[str]:
+    """A warning where depth maps contradict the depths that follow from images and poses."""
+    if measured is None or depths.source != "matches":
+        return []
+    ratio = measured / depths.median
+    if 1 / MAX_DEPTH_RATIO <= ratio <= MAX_DEPTH_RATIO:
+        return []
+    return [
+        f"The depth maps' median is {ratio:.2g} times that of the matches: check the unit of the depth maps and of the"
+        " poses."
+    ]
 
 
 def _fov(extent: int, focal: float) -> float:
@@ -103,6 +154,11 @@ def _warnings(capture: Capture, depths: DepthStatistics, steps: np.ndarray) -> l
         stride = max(2, round(GOOD_STEP / max(step, 1e-6)))
         found.append(
             f"Low parallax: a step is {step:.2%} of the median depth; try --stride {min(stride, len(capture))}."
+        )
+    elif depths.parallax_degrees < LOW_PARALLAX_DEGREES:
+        found.append(
+            f"Little parallax: {depths.parallax_degrees:.1f} degrees at the median, so depth is uncertain; add frames"
+            " from the sides, or come closer."
         )
     elif step > HIGH_STEP:
         found.append(f"Wide steps: {step:.0%} of the median depth; neighbors hardly overlap, so add frames between.")

@@ -13,7 +13,7 @@ median towards the camera (by 30 % at a median parallax of 1 degree); the median
 import dataclasses
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from jaxtyping import Float64
@@ -81,8 +81,15 @@ class DepthStatistics:
         return None
 
 
-def estimate_depths(capture: PosedImages, indices: Sequence[int]) -> DepthStatistics:
+def estimate_depths(
+    capture: PosedImages, indices: Sequence[int], advance: Callable[[int], None] = lambda done: None
+) -> DepthStatistics:
     """Estimates the quantiles of depth in the frames `indices`.
+
+    Args:
+        capture: the frames.
+        indices: those to use.
+        advance: called with the number of references, of at most `NUM_REFERENCES`, that are done.
 
     Limits:
         With a median parallax below 0.5 degrees only the median is measured, and the range is 4 times to both sides.
@@ -93,7 +100,8 @@ def estimate_depths(capture: PosedImages, indices: Sequence[int]) -> DepthStatis
     references = np.unique(np.linspace(0, len(indices) - 1, min(NUM_REFERENCES, len(indices))).round().astype(int))
     pairs: list[CommonPoints] = []
     baseline = 0.0
-    for reference in references:
+    for done, reference in enumerate(references):
+        advance(done)
         points = _best_pair(capture, indices[reference], indices, baseline, keypoints)
         if points is not None:
             pairs.append(points)
