@@ -81,6 +81,13 @@ def mean_color(gaussians: Gaussians) -> Float[Array, "3"]:
     return jnp.sum(gaussians.opacities[:, None] * colors, axis=0) / jnp.where(total > 0, total, 1.0)
 
 
+def scale_colors(gaussians: Gaussians, factors: Float[Array, "3"]) -> Gaussians:
+    """Gaussians whose color, seen from anywhere, is multiplied by a positive factor per channel: another exposure."""
+    # factor * (0.5 + C0 dc) = 0.5 + C0 dc', written so that a factor of 1 changes no bit.
+    constant = gaussians.sh[:, :1] * factors + (factors - 1.0) * (0.5 / SH_C0)
+    return replace(gaussians, sh=jnp.concatenate([constant, gaussians.sh[:, 1:] * factors], axis=1))
+
+
 def mask_gaussians(gaussians: Gaussians, keep) -> Gaussians:
     """`gaussians` with the rows outside `keep` made absent: opacity 0, harmless shape, same size."""
     identity = jnp.array([1.0, 0.0, 0.0, 0.0], gaussians.quats.dtype)

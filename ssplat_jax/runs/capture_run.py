@@ -14,7 +14,7 @@ from ssplat_jax.runs.resume import RunState, resume_run, run_identity, save_run
 from ssplat_jax.storage.folder_lock import lock_folder
 from ssplat_jax.storage.interrupts import Interrupts
 from ssplat_jax.storage.run_folder import RunFolder
-from ssplat_jax.streaming.feed import feed_chunks
+from ssplat_jax.streaming.feed import feed_chunks, middle_exposure
 from ssplat_jax.streaming.scene_delta import SceneFeed
 from ssplat_jax.streaming.streamsplat import StreamSplat
 
@@ -102,7 +102,8 @@ class _DeltaWriter:
         assert run.session.cache is not None
         delta = self._feed.update(run.session.cache)
         path = self._folder.delta(run.num_views)
-        save_delta(path, delta, {"frame": run.frame.to_dict(), "views": run.num_views})
+        exposure = middle_exposure(run.exposures).tolist()
+        save_delta(path, delta, {"frame": run.frame.to_dict(), "views": run.num_views, "exposure": exposure})
 
 
 def _start_deltas(run: RunState, num_wanted: int, folder: RunFolder, deltas: bool) -> _DeltaWriter | None:

@@ -14,7 +14,7 @@ from ssplat_jax.data.split import interleaved_split
 from ssplat_jax.evaluation.pictures import save_comparison, save_image
 from ssplat_jax.evaluation.plots import import_pyplot, save_figure
 from ssplat_jax.evaluation.scoring import ScoredView, mean_scores, score_view
-from ssplat_jax.scene_files.ply import save_ply
+from ssplat_jax.runs.finish_run import save_scene
 from ssplat_jax.storage.folders import make_writable
 from ssplat_jax.storage.json_files import write_json
 from ssplat_jax.storage.run_folder import RunFolder
@@ -63,7 +63,7 @@ def run_demo(scene: str, out: Path, reporter: Reporter, quality: Quality = QUALI
                 views = [score_view(gaussians, capture, i, frame, exposures) for i in split.targets]
                 rows.append(_table_row(views, len(exposures), session))
                 strip.append(views[len(views) // 2].color)
-    save_ply(folder.scene, frame.gaussians_to_capture(session.gaussians()))
+    save_scene(folder.scene, session.gaussians(), frame, exposures)
     for view in views:  # of the last stage: the finished scene
         save_comparison(folder.target(view.score.frame), view.target, view.color, view.depth, (frame.near, frame.far))
     strip.append(views[len(views) // 2].target)

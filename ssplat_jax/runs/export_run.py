@@ -8,6 +8,7 @@ from ssplat_jax.checkpoint.weights import params_digest
 from ssplat_jax.console import Reporter
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.errors import InputError
+from ssplat_jax.evaluation.exposures import exposures_from_json
 from ssplat_jax.runs.finish_run import save_scene
 from ssplat_jax.scene_files.export_rows import ExportReport
 from ssplat_jax.scene_files.formats import check_format
@@ -17,7 +18,7 @@ from ssplat_jax.streaming.streamsplat import StreamSplat
 
 
 def export_run(run_dir: Path, to: Path, params: dict, reporter: Reporter) -> ExportReport:
-    """Decodes the saved state of a run and writes its scene, in the capture's frame.
+    """Decodes the saved state of a run and writes its scene, in the capture's frame, at the middle exposure.
 
     If the newest state is damaged, the one before it is exported, with a warning.
 
@@ -44,4 +45,5 @@ def export_run(run_dir: Path, to: Path, params: dict, reporter: Reporter) -> Exp
     if header.get("weights") != params_digest(params):
         raise InputError(f"{run_dir}: was streamed with other weights than these; give the run's own with --weights.")
     session = Session(StreamSplat(config_from_header(header["config"])), params, cache)
-    return save_scene(to, session.gaussians(), StreamFrame.from_dict(header["frame"]))
+    exposures = exposures_from_json(header["exposures"])
+    return save_scene(to, session.gaussians(), StreamFrame.from_dict(header["frame"]), exposures)

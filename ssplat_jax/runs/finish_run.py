@@ -5,6 +5,7 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 
 from ssplat_jax.console import Reporter
@@ -13,12 +14,13 @@ from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.evaluation.exposures import exposures_to_json
 from ssplat_jax.evaluation.pictures import save_comparison
 from ssplat_jax.evaluation.scoring import score_view
-from ssplat_jax.gaussians import Gaussians
+from ssplat_jax.gaussians import Gaussians, scale_colors
 from ssplat_jax.runs.resume import RunState
 from ssplat_jax.scene_files.export_rows import ExportReport
 from ssplat_jax.scene_files.formats import save_gaussians
 from ssplat_jax.storage.json_files import write_json
 from ssplat_jax.storage.run_folder import RunFolder
+from ssplat_jax.streaming.feed import Exposures, middle_exposure
 
 NUM_PICTURES = 8
 """Streamed views, evenly spread, that are rendered from the finished scene."""
@@ -44,7 +46,7 @@ def finish_run(
     """
     folder.metrics.unlink(missing_ok=True)  # see `finished_scene`
     gaussians, frame = run.session.gaussians(), run.frame
-    report = save_scene(folder.scene, gaussians, frame)
+    report = save_scene(folder.scene, gaussians, frame, run.exposures)
     if report.warning is not None:
         reporter.warn(f"{folder.scene.name}: {report.warning}")
     folder.clear_views()
@@ -59,6 +61,7 @@ def finish_run(
         "size": [capture.width, capture.height],
         "views": len(indices),
         "exposures": exposures_to_json(run.exposures),
+        "scene_exposure": middle_exposure(run.exposures).tolist(),  # of scene.ply, relative to the first views
         "seen_views": scores,  # of streamed views: how well the scene explains its input
         "ply": dataclasses.asdict(report),
         "compile_s": round(run.session.compile_seconds, 2),
@@ -85,10 +88,34 @@ def finished_scene(folder: RunFolder, num_views: int) -> int | None:
         return None
 
 
-def save_scene(path: Path, gaussians: Gaussians, frame: StreamFrame) -> ExportReport:
-    """Writes Gaussians of the stream in the capture's frame; far from its origin, relative to the frame's offset.
+def scene_to_show(gaussians: Gaussians, frame: StreamFrame, exposures: Exposures) -> Gaussians:
+    """Gaussians of the stream as a person gets them: in the capture's frame, at the middle exposure of the stream.
+
+    Args:
+        gaussians: the scene, in the stream frame, at the exposure of the first views.
+        frame: the similarity between the capture's frame and the stream's.
+        exposures: exposures of the streamed frames.
+
+    Returns:
+        The scene in the capture's frame, relative to the frame's offset.
+    """
+    factors = jnp.asarray(middle_exposure(exposures), jnp.float32)
+    return frame.gaussians_to_capture(scale_colors(gaussians, factors), offset=frame.offset)
+
+
+def save_scene(path: Path, gaussians: Gaussians, frame: StreamFrame, exposures: Exposures) -> ExportReport:
+    """Writes Gaussians of the stream as a person gets them (`scene_to_show`).
+
+    Args:
+        path: the file to write; its extension names the format.
+        gaussians: the scene, in the stream frame.
+        frame: the similarity between the capture's frame and the stream's.
+        exposures: exposures of the streamed frames.
+
+    Returns:
+        What was written.
 
     Raises:
         StorageError: the file cannot be written.
     """
-    return save_gaussians(path, frame.gaussians_to_capture(gaussians, offset=frame.offset), offset=frame.offset)
+    return save_gaussians(path, scene_to_show(gaussians, frame, exposures), offset=frame.offset)

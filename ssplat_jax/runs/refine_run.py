@@ -87,7 +87,7 @@ def refine_run(
         if stopped:
             return RefineResult(progress.num_steps, {}, {}, stopped)
         refined = current_gaussians(progress.state)
-        save_scene(folder.refined_scene, refined, run.frame)
+        save_scene(folder.refined_scene, refined, run.frame, run.exposures)
         shown = tuple(sorted({run.indices[round(i)] for i in np.linspace(0, len(run.indices) - 1, NUM_PICTURES)}))
         before, after = (
             score_targets(scene, run.capture, shown, run.frame, run.exposures) for scene in (run.gaussians, refined)

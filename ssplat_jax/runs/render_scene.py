@@ -42,7 +42,7 @@ def render_scene(
     """Writes `out`/views/<frame>.png for frames of a capture, and optionally `out`/film.mp4 through their cameras.
 
     The scene is drawn with the filter that its file names: mip, or the dilation of 3DGS where the file names none. It
-    is shown at its own exposure.
+    is shown at the exposure of its file: the middle one of its stream.
 
     Args:
         scene: a .ply in the capture's frame, or the folder of a run.

@@ -16,6 +16,16 @@ Exposures = dict[int, Float[np.ndarray, "3"]]
 """RGB factor per streamed frame that takes the scene's colors to the colors of that frame."""
 
 
+def middle_exposure(exposures: Exposures) -> Float[np.ndarray, "3"]:
+    """The median over streamed frames of their exposures, per channel; 1 without frames.
+
+    A person is shown the scene at this exposure: that of the first views, which the cache keeps, may be a shadow's.
+    """
+    if not exposures:
+        return np.ones(3)
+    return np.exp(np.median(np.log(np.stack(list(exposures.values())).astype(np.float64)), axis=0))
+
+
 @dataclasses.dataclass(frozen=True)
 class FedChunk:
     """One chunk after the session has processed it."""

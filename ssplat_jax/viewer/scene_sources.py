@@ -5,11 +5,12 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from ssplat_jax.checkpoint.delta_files import load_delta, load_delta_header
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.errors import InputError, StorageError
-from ssplat_jax.gaussians import Gaussians
+from ssplat_jax.gaussians import Gaussians, scale_colors
 from ssplat_jax.scene_files.ply import load_ply
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.streaming.scene_delta import apply_delta
@@ -52,9 +53,10 @@ class GrowingScene:
         self._applied: list[tuple[str, int]] = []  # names and time stamps of the deltas in `_scene`
         self._scene: Gaussians | None = None
         self._frame: StreamFrame | None = None
+        self._exposure = np.ones(3)  # at which the scene is shown: the middle one of the views so far
 
     def changed(self) -> Gaussians | None:
-        """The scene, in the capture's frame, if it has changed since the last call, else None.
+        """The scene as a person gets it so far, in the capture's frame, if it changed since the last call, else None.
 
         If the run was started anew, the old scene is dropped.
 
@@ -73,7 +75,9 @@ class GrowingScene:
             path = self._folder.deltas / name
             try:
                 self._scene = apply_delta(self._scene, load_delta(path))
-                self._frame = StreamFrame.from_dict(load_delta_header(path)["frame"])
+                header = load_delta_header(path)
+                self._frame = StreamFrame.from_dict(header["frame"])
+                self._exposure = np.array(header.get("exposure", [1.0, 1.0, 1.0]))  # earlier versions wrote none
             except StorageError:
                 if path.exists():
                     raise
@@ -81,7 +85,7 @@ class GrowingScene:
                 return None
             self._applied.append((name, stamp))
         assert self._frame is not None
-        scene = jax.tree.map(jnp.asarray, self._scene)
+        scene = scale_colors(jax.tree.map(jnp.asarray, self._scene), jnp.asarray(self._exposure, jnp.float32))
         return self._frame.gaussians_to_capture(scene, offset=self._frame.offset)
 
     def start_camera(self) -> StartCamera | None:

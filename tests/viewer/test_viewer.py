@@ -136,6 +136,16 @@ def test_a_growing_run_is_what_its_deltas_add_up_to(tmp_path):
     np.testing.assert_array_equal(np.asarray(anew.opacities) > 0, np.repeat([0, 1, 1, 0, 0, 1, 0, 0], 2) > 0)
 
 
+def test_a_growing_run_is_shown_at_its_middle_exposure(tmp_path):
+    header, source = {"frame": frame().to_dict()}, GrowingScene(RunFolder(tmp_path))
+    save_delta(tmp_path / "deltas" / "000004.npz", delta([0, 1], 1), header)
+    before = source.changed()
+    save_delta(tmp_path / "deltas" / "000008.npz", delta([2], 2), header | {"exposure": [3.0, 2.0, 0.5]})
+    after = source.changed()
+    colors = [0.5 + 0.28209479 * np.asarray(g.sh[:4, 0], np.float64) for g in (before, after)]
+    np.testing.assert_allclose(colors[1], colors[0] * [3.0, 2.0, 0.5], atol=1e-6)
+
+
 def test_a_run_that_starts_anew_while_it_is_read_is_read_again(tmp_path, monkeypatch):
     header, source = {"frame": frame().to_dict()}, GrowingScene(RunFolder(tmp_path))
     for number in (1, 2):
