@@ -18,6 +18,10 @@ class Export:
     """Folder of an `ssplat run` or `ssplat demo`, or a 3DGS .ply."""
     to: Path
     """File to write: .ply; .spz, a seventh of the size; or .splat, for older browser viewers."""
+    prune: bool = False
+    """Leave out specks, and floaters that one view alone made; their number is printed."""
+    max_splats: int | None = None
+    """Write at most so many Gaussians: those of the largest opacity and area."""
     weights: str = "tiny"
     """Weights of the run: a preset with shipped weights, or a weights file."""
 
@@ -25,21 +29,30 @@ class Export:
         from ssplat_jax.checkpoint.weights import load_params
         from ssplat_jax.console import Reporter
         from ssplat_jax.runs.export_run import export_run
-        from ssplat_jax.scene_files.formats import convert_ply
+        from ssplat_jax.scene_files.formats import convert_scene
+        from ssplat_jax.scene_files.select_gaussians import Selection
         from ssplat_jax.storage.run_folder import RunFolder
 
         reporter = Reporter(quiet=False)
-        folder = RunFolder(self.scene)
+        folder, selection = RunFolder(self.scene), Selection(self.prune, self.max_splats)
         if self.scene.is_file():
-            report = convert_ply(self.scene, self.to)
+            report = convert_scene(self.scene, self.to, selection)
         elif not folder.has_state() and folder.scene.exists():  # a folder of `ssplat demo`
-            report = convert_ply(folder.scene, self.to)
+            report = convert_scene(folder.scene, self.to, selection)
         else:
-            report = export_run(self.scene, self.to, load_params(self.weights), reporter)
+            report = export_run(self.scene, self.to, load_params(self.weights), reporter, selection)
         if report.warning is not None:
             reporter.warn(f"{self.to.name}: {report.warning}")
-        unseen = (
-            f" ({report.num_dropped} more have no visible effect and were not written)" if report.num_dropped else ""
-        )
-        print(f"wrote {self.to}: {report.num_written} Gaussians{unseen}")
+        print(f"wrote {self.to}: {report.num_written} Gaussians{_left_out(report)}")
         return 0
+
+
+def _left_out(report) -> str:
+    """The counts of Gaussians that were not written, in words."""
+    counts = (
+        (report.num_pruned, "specks and floaters were pruned"),
+        (report.num_cut, "beyond --max-splats were left out"),
+        (report.num_dropped, "more have no visible effect and were not written"),
+    )
+    words = [f"{count} {reason}" for count, reason in counts if count]
+    return f" ({'; '.join(words)})" if words else ""

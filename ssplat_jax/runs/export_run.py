@@ -2,6 +2,9 @@
 
 from pathlib import Path
 
+import numpy as np
+from jaxtyping import Int
+
 from ssplat_jax.checkpoint.saved_config import config_from_header
 from ssplat_jax.checkpoint.stream_state import load_newest_state
 from ssplat_jax.checkpoint.weights import params_digest
@@ -9,15 +12,18 @@ from ssplat_jax.console import Reporter
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.errors import InputError
 from ssplat_jax.evaluation.exposures import exposures_from_json
-from ssplat_jax.runs.finish_run import save_scene
+from ssplat_jax.runs.finish_run import scene_to_show
 from ssplat_jax.scene_files.export_rows import ExportReport
-from ssplat_jax.scene_files.formats import check_format
+from ssplat_jax.scene_files.formats import check_format, save_selected
+from ssplat_jax.scene_files.select_gaussians import EVERYTHING, Selection
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.streaming.session import Session
-from ssplat_jax.streaming.streamsplat import StreamSplat
+from ssplat_jax.streaming.streamsplat import StreamSplat, shown_pivots
 
 
-def export_run(run_dir: Path, to: Path, params: dict, reporter: Reporter) -> ExportReport:
+def export_run(
+    run_dir: Path, to: Path, params: dict, reporter: Reporter, selection: Selection = EVERYTHING
+) -> ExportReport:
     """Decodes the saved state of a run and writes its scene, in the capture's frame, at the middle exposure.
 
     If the newest state is damaged, the one before it is exported, with a warning.
@@ -27,6 +33,7 @@ def export_run(run_dir: Path, to: Path, params: dict, reporter: Reporter) -> Exp
         to: file to write; its suffix names the format.
         params: parameters of the run's model.
         reporter: prints warnings.
+        selection: the Gaussians to leave out.
 
     Returns:
         What was written.
@@ -45,5 +52,16 @@ def export_run(run_dir: Path, to: Path, params: dict, reporter: Reporter) -> Exp
     if header.get("weights") != params_digest(params):
         raise InputError(f"{run_dir}: was streamed with other weights than these; give the run's own with --weights.")
     session = Session(StreamSplat(config_from_header(header["config"])), params, cache)
-    exposures = exposures_from_json(header["exposures"])
-    return save_scene(to, session.gaussians(), StreamFrame.from_dict(header["frame"]), exposures)
+    gaussians, frame = session.gaussians(), StreamFrame.from_dict(header["frame"])
+    scene = scene_to_show(gaussians, frame, exposures_from_json(header["exposures"]))
+    members = members_of_gaussians(session, gaussians.num_gaussians)
+    return save_selected(to, scene, selection, members, offset=frame.offset)
+
+
+def members_of_gaussians(session: Session, num_rows: int) -> Int[np.ndarray, " n"]:
+    """Number of tokens that each Gaussian of `Session.gaussians` was merged from; 0 for rows of padding."""
+    assert session.cache is not None
+    is_shown = np.asarray(shown_pivots(session.cache, session.model.config)).reshape(-1)
+    members = np.asarray(session.cache.num_members).reshape(-1)[is_shown]
+    repeated = np.repeat(members, session.model.config.head.gaussians_per_token)
+    return np.concatenate([repeated, np.zeros(num_rows - len(repeated), repeated.dtype)])

@@ -3,7 +3,7 @@
 import dataclasses
 
 import numpy as np
-from jaxtyping import Float64, UInt8
+from jaxtyping import Bool, Float64, UInt8
 
 from ssplat_jax.gaussians import Gaussians, check_gaussians
 
@@ -26,6 +26,10 @@ class ExportReport:
     """Gaussians with non-finite entries, a negative scale, or an opacity below 1/255 (absent rows included)."""
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Vector to add to the positions in the file."""
+    num_pruned: int = 0
+    """Specks and floaters left out on demand (`select_gaussians.prune_mask`)."""
+    num_cut: int = 0
+    """Gaussians left out because there were more than wanted."""
 
     @property
     def warning(self) -> str | None:
@@ -61,8 +65,7 @@ def scene_rows(gaussians: Gaussians) -> SceneRows:
     check_gaussians(gaussians, "scene")
     fields = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
     means, quats, scales, opacities, sh = (np.asarray(field, np.float64) for field in fields)
-    entries = np.concatenate([means, quats, scales, opacities[:, None], sh.reshape(len(sh), 3 * sh.shape[1])], axis=1)
-    keep = np.isfinite(entries).all(axis=1) & (scales >= 0).all(axis=1) & (opacities >= MIN_OPACITY)
+    keep = is_writable(gaussians)
     return SceneRows(
         means=means[keep],
         quats=unit_quats(quats[keep]),
@@ -70,6 +73,14 @@ def scene_rows(gaussians: Gaussians) -> SceneRows:
         opacities=np.clip(opacities[keep], OPACITY_GUARD, 1 - OPACITY_GUARD),
         sh=sh[keep],
     )
+
+
+def is_writable(gaussians: Gaussians) -> Bool[np.ndarray, " n"]:
+    """Mask of the Gaussians that files hold: finite, without a negative scale, with an opacity of at least 1/255."""
+    fields = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
+    means, quats, scales, opacities, sh = (np.asarray(field, np.float64) for field in fields)
+    entries = np.concatenate([means, quats, scales, opacities[:, None], sh.reshape(len(sh), 3 * sh.shape[1])], axis=1)
+    return np.isfinite(entries).all(axis=1) & (scales >= 0).all(axis=1) & (opacities >= MIN_OPACITY)
 
 
 def unit_quats(quats: Float64[np.ndarray, "n 4"]) -> Float64[np.ndarray, "n 4"]:

@@ -11,7 +11,6 @@ from the origin of its frame that float32 is too coarse, its positions are relat
 comment `offset x y z` holds.
 """
 
-import dataclasses
 import os
 
 import jax.numpy as jnp
@@ -21,6 +20,7 @@ from ssplat_jax.errors import InputError
 from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.scene_files.export_rows import LOG_SCALE_LIMIT, ExportReport, SceneRows, scene_rows, unit_quats
 from ssplat_jax.scene_files.ply_table import read_vertices
+from ssplat_jax.scene_files.splat_file import SplatFile
 from ssplat_jax.storage.atomic import write_atomic
 
 RENDER_MODES = ("default", "mip", "2dgs")
@@ -36,17 +36,6 @@ BASE_PROPERTIES = (
     *("scale_0", "scale_1", "scale_2"),
     *("rot_0", "rot_1", "rot_2", "rot_3"),
 )
-
-
-@dataclasses.dataclass(frozen=True)
-class SplatFile:
-    """Contents of a .ply file: the Gaussians and the facts in its comments."""
-
-    gaussians: Gaussians
-    render_mode: str
-    """Renderer that the scene was made for, one of `RENDER_MODES`."""
-    offset: tuple[float, float, float]
-    """Vector to add to the positions."""
 
 
 def save_ply(

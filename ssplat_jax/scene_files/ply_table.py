@@ -1,4 +1,4 @@
-"""Reader of the vertex element of a PLY file, ascii or binary of either byte order, into columns by name.
+"""Reader of elements of a PLY file, ascii or binary of either byte order, into columns by name.
 
 Counts in the header are compared with the size of the file before anything is allocated.
 """
@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from ssplat_jax.errors import InputError
+from ssplat_jax.scene_files.splat_file import read_scene_bytes
 
 MAX_HEADER_BYTES = 1 << 16  # headers of splat files take a few kilobytes
 
@@ -47,17 +48,30 @@ def read_vertices(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], list[
     Raises:
         InputError: the file cannot be read, is not a PLY file, or is shorter than its header states.
     """
+    tables, comments = read_tables(path, ("vertex",))
+    return tables["vertex"], comments
+
+
+def read_tables(path: str | os.PathLike, names: tuple[str, ...]) -> tuple[dict[str, dict[str, np.ndarray]], list[str]]:
+    """Reads the columns of elements, by element and property name, and the comments of the header.
+
+    The first of `names` must be in the file; others that are not are left out.
+
+    Raises:
+        InputError: the file cannot be read, is not a PLY file, or is shorter than its header states.
+    """
     path = Path(path)
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: wanted a PLY file, it cannot be read ({error.strerror}); check the path.") from error
-    lines, body = _split_header(path, data)
+    lines, body = _split_header(path, read_scene_bytes(path, "a PLY file"))
     file_format, elements, comments = _parse_header(path, lines)
-    before, vertex = _find_vertex(path, elements)
-    if file_format == "ascii":
-        return _ascii_columns(path, body, before, vertex), comments
-    return _binary_columns(path, body, before, vertex, BYTE_ORDERS[file_format]), comments
+    held, tables = {element.name for element in elements}, {}
+    for name in names:
+        if name in held or name == names[0]:
+            before, element = _find_element(path, elements, name)
+            if file_format == "ascii":
+                tables[name] = _ascii_columns(path, body, before, element)
+            else:
+                tables[name] = _binary_columns(path, body, before, element, BYTE_ORDERS[file_format])
+    return tables, comments
 
 
 def _split_header(path: Path, data: bytes) -> tuple[list[str], memoryview]:
@@ -98,14 +112,14 @@ def _parse_header(path: Path, lines: list[str]) -> tuple[str, list[Element], lis
     return file_format, elements, comments
 
 
-def _find_vertex(path: Path, elements: list[Element]) -> tuple[list[Element], Element]:
-    """The elements before `vertex`, and `vertex` itself."""
+def _find_element(path: Path, elements: list[Element], name: str) -> tuple[list[Element], Element]:
+    """The elements before the one of a name, and that one."""
     names = [element.name for element in elements]
-    if "vertex" not in names:
+    if name not in names:
         raise InputError(
-            f"{path}: wanted an element 'vertex', there is {', '.join(names) or 'none'}; give a 3DGS .ply."
+            f"{path}: wanted an element {name!r}, there is {', '.join(names) or 'none'}; give a 3DGS .ply."
         )
-    position = names.index("vertex")
+    position = names.index(name)
     for element in elements[: position + 1]:
         if element.has_list or not element.properties:
             came = "a list" if element.has_list else "none"
@@ -115,29 +129,29 @@ def _find_vertex(path: Path, elements: list[Element]) -> tuple[list[Element], El
     return elements[:position], elements[position]
 
 
-def _binary_columns(path: Path, body: memoryview, before: list[Element], vertex: Element, order: str):
+def _binary_columns(path: Path, body: memoryview, before: list[Element], element: Element, order: str):
     offset = sum(element.count * element.dtype(order).itemsize for element in before)
-    dtype = vertex.dtype(order)
-    _check_size(path, vertex, offset + vertex.count * dtype.itemsize, len(body), "bytes")
-    rows = np.frombuffer(body, dtype, count=vertex.count, offset=offset) if vertex.count else np.zeros(0, dtype)
-    return {name: rows[name] for name in vertex.properties}
+    dtype = element.dtype(order)
+    _check_size(path, element, offset + element.count * dtype.itemsize, len(body), "bytes")
+    rows = np.frombuffer(body, dtype, count=element.count, offset=offset) if element.count else np.zeros(0, dtype)
+    return {name: rows[name] for name in element.properties}
 
 
-def _ascii_columns(path: Path, body: memoryview, before: list[Element], vertex: Element):
+def _ascii_columns(path: Path, body: memoryview, before: list[Element], element: Element):
     words = bytes(body).split()
     offset = sum(element.count * len(element.properties) for element in before)
-    size = vertex.count * len(vertex.properties)
-    _check_size(path, vertex, offset + size, len(words), "numbers")
+    size = element.count * len(element.properties)
+    _check_size(path, element, offset + size, len(words), "numbers")
     try:
         numbers = np.array(words[offset : offset + size], dtype=np.float64)
     except ValueError as error:
-        raise InputError(f"{path}: element vertex: wanted numbers ({error}); write the file again.") from error
-    return dict(zip(vertex.properties, numbers.reshape(vertex.count, -1).T, strict=True))
+        raise InputError(f"{path}: element {element.name}: wanted numbers ({error}); write the file again.") from error
+    return dict(zip(element.properties, numbers.reshape(element.count, -1).T, strict=True))
 
 
-def _check_size(path: Path, vertex: Element, wanted: int, came: int, unit: str) -> None:
+def _check_size(path: Path, element: Element, wanted: int, came: int, unit: str) -> None:
     if wanted > came:
         raise InputError(
-            f"{path}: element vertex: wanted {wanted} {unit} for {vertex.count} rows, {came} are there; the file is "
-            "cut off or its header wrong."
+            f"{path}: element {element.name}: wanted {wanted} {unit} for {element.count} rows, {came} are there;"
+            " the file is cut off or its header wrong."
         )
