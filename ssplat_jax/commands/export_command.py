@@ -9,15 +9,15 @@ import tyro
 
 @dataclasses.dataclass(frozen=True)
 class Export:
-    """Write the scene of a run, from its saved state, or a .ply in another format.
+    """Write the scene of a run, from its saved state, or a scene file in another format.
 
     Example: ssplat export runs/kitchen --to kitchen.spz
     """
 
     scene: Annotated[Path, tyro.conf.Positional]
-    """Folder of an `ssplat run` or `ssplat demo`, or a 3DGS .ply."""
+    """Folder of an `ssplat run` or `ssplat demo`, or a scene file."""
     to: Path
-    """File to write: .ply; .spz, a seventh of the size; or .splat, for older browser viewers."""
+    """File to write: .ply; .compressed.ply, .spz or .sog, 4 to 20 times smaller; .glb or .gltf; .splat."""
     prune: bool = False
     """Leave out specks, and floaters that one view alone made; their number is printed."""
     max_splats: int | None = None

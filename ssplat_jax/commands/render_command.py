@@ -17,7 +17,7 @@ class Render:
     """
 
     scene: Annotated[Path, tyro.conf.Positional]
-    """A 3DGS .ply in the capture's frame, or the folder of an `ssplat run`."""
+    """A scene file (.ply, .spz, .sog, .glb, .splat) in the capture's frame, or the folder of an `ssplat run`."""
     capture: CapturePath
     out: Path
     """Folder of the pictures, views/<frame>.png."""

@@ -16,7 +16,8 @@ from ssplat_jax.evaluation.pictures import eight_bits, save_image
 from ssplat_jax.gaussians import mean_color
 from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.rasterizer import Effects, fill_holes, render
-from ssplat_jax.scene_files.ply import SplatFile, read_ply
+from ssplat_jax.scene_files.formats import read_scene
+from ssplat_jax.scene_files.splat_file import SplatFile
 from ssplat_jax.storage.folder_lock import lock_folder
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.storage.video import VideoWriter
@@ -45,7 +46,7 @@ def render_scene(
     is shown at the exposure of its file: the middle one of its stream.
 
     Args:
-        scene: a .ply in the capture's frame, or the folder of a run.
+        scene: a scene file in the capture's frame, or the folder of a run.
         path: the capture, as `open_capture` takes it.
         out: folder of the results.
         size: (width, height) of the pictures; by default the capture's own.
@@ -95,7 +96,7 @@ def render_scene(
 def _read_scene(scene: Path) -> SplatFile:
     """The scene at a path, which may be the folder of a run."""
     file = RunFolder(scene).scene if scene.is_dir() else scene
-    splats = read_ply(file)
+    splats = read_scene(file)
     if splats.render_mode not in ANTIALIAS:
         raise InputError(
             f"{file}: wanted 3D Gaussians, got a scene of {splats.render_mode}; render it where it was made."

@@ -19,7 +19,7 @@ from ssplat_jax.errors import InputError
 from ssplat_jax.gaussians import SH_C0, Gaussians
 from ssplat_jax.scene_files.export_rows import LOG_SCALE_LIMIT, ExportReport, scene_rows, to_bytes
 from ssplat_jax.scene_files.morton import morton_order
-from ssplat_jax.scene_files.ply_table import read_tables
+from ssplat_jax.scene_files.ply_table import MAX_HEADER_BYTES, read_tables
 from ssplat_jax.scene_files.smallest_three import HALF_RANGE, drop_largest, restore_largest
 from ssplat_jax.scene_files.splat_file import SplatFile, gaussians_of_columns
 from ssplat_jax.storage.atomic import write_atomic
@@ -113,6 +113,16 @@ def _pack_rotations(quats: Float64[np.ndarray, "n 4"]) -> UInt32[np.ndarray, " n
         level = np.clip(np.round((0.5 + 0.5 * column / HALF_RANGE) * 1023), 0, 1023)
         packed = packed << 10 | level.astype(np.uint32)
     return packed
+
+
+def is_compressed_ply(path: str | os.PathLike) -> bool:
+    """Whether a file that can be read names the properties of a compressed .ply in its header."""
+    try:
+        with open(path, "rb") as file:
+            header = file.read(MAX_HEADER_BYTES)
+    except OSError:
+        return False
+    return PACKED[0].encode("ascii") in header.partition(b"end_header")[0]
 
 
 def read_compressed_ply(path: str | os.PathLike) -> SplatFile:

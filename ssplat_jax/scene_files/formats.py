@@ -1,6 +1,8 @@
-"""Writes a scene in the format given by the file extension."""
+"""Reads and writes scenes in the format given by the file extension."""
 
 import dataclasses
+import os
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -8,27 +10,51 @@ from jaxtyping import Int
 
 from ssplat_jax.errors import InputError
 from ssplat_jax.gaussians import Gaussians
+from ssplat_jax.scene_files.compressed_ply import is_compressed_ply, read_compressed_ply, save_compressed_ply
 from ssplat_jax.scene_files.export_rows import ExportReport
+from ssplat_jax.scene_files.gltf import save_gltf
+from ssplat_jax.scene_files.gltf_reader import read_gltf
 from ssplat_jax.scene_files.ply import read_ply, save_ply
 from ssplat_jax.scene_files.select_gaussians import EVERYTHING, Selection, select_gaussians
-from ssplat_jax.scene_files.splat import save_splat
+from ssplat_jax.scene_files.sog import save_sog
+from ssplat_jax.scene_files.sog_reader import read_sog
+from ssplat_jax.scene_files.splat import read_splat, save_splat
+from ssplat_jax.scene_files.splat_file import SplatFile
 from ssplat_jax.scene_files.spz import save_spz
+from ssplat_jax.scene_files.spz_reader import read_spz
 
-FORMATS = (".ply", ".spz", ".splat")  # file extensions
+
+@dataclasses.dataclass(frozen=True)
+class Format:
+    """A format of scene files."""
+
+    save: Callable[[Path, Gaussians, str], ExportReport]
+    """Writes Gaussians; the third argument is the render mode, see `save_ply`."""
+    read: Callable[[Path], SplatFile]
 
 
-def check_format(path: Path) -> None:
-    """Checks that the extension of `path` is one of `FORMATS`.
+FORMATS = {
+    ".compressed.ply": Format(lambda path, scene, mode: save_compressed_ply(path, scene), read_compressed_ply),
+    ".ply": Format(lambda path, scene, mode: save_ply(path, scene, render_mode=mode), read_ply),
+    ".spz": Format(lambda path, scene, mode: save_spz(path, scene, antialiased=mode == "mip"), read_spz),
+    ".sog": Format(lambda path, scene, mode: save_sog(path, scene, antialiased=mode == "mip"), read_sog),
+    ".glb": Format(lambda path, scene, mode: save_gltf(path, scene), read_gltf),
+    ".gltf": Format(lambda path, scene, mode: save_gltf(path, scene), read_gltf),
+    ".splat": Format(lambda path, scene, mode: save_splat(path, scene), read_splat),
+}
+"""Formats by the end of the file's name; the first that fits is meant."""
+
+
+def check_format(path: Path, option: str = "--to") -> str:
+    """The key of `FORMATS` that the name of a file ends with.
 
     Raises:
-        InputError: it is not, or the name is that of a compressed .ply.
+        InputError: there is none.
     """
-    if path.name.endswith(".compressed.ply"):
-        raise InputError(
-            f"--to: {path.name!r} names a compressed .ply, which is not written; choose .spz for a small file."
-        )
-    if path.suffix not in FORMATS:
-        raise InputError(f"--to: wanted a file named *{', *'.join(FORMATS)}, got {path.name!r}; choose one of these.")
+    for suffix in FORMATS:
+        if path.name.endswith(suffix):
+            return suffix
+    raise InputError(f"{option}: wanted a file named *{', *'.join(FORMATS)}, got {path.name!r}; choose one of these.")
 
 
 def save_gaussians(
@@ -41,10 +67,10 @@ def save_gaussians(
     """Writes `gaussians` to `path` in the format of its extension.
 
     Args:
-        path: the file to write (.ply, .spz or .splat).
+        path: the file to write; its name ends as one of `FORMATS`.
         gaussians: the scene.
-        render_mode: the renderer that the scene is made for, see `save_ply`; a .spz stores only whether it is "mip",
-            a .splat nothing.
+        render_mode: the renderer that the scene is made for, see `save_ply`; a .spz and a .sog store only whether it is
+            "mip", the others nothing.
         offset: origin of `gaussians` in the frame of the capture; only a .ply stores it.
 
     Returns:
@@ -54,14 +80,35 @@ def save_gaussians(
         InputError: an unknown extension, or positions outside the range of the format.
         StorageError: the file cannot be written.
     """
-    check_format(path)
-    if path.suffix == ".ply":
+    suffix = check_format(path)
+    if suffix == ".ply":
         return save_ply(path, gaussians, render_mode=render_mode, offset=offset)
-    if path.suffix == ".spz":
-        report = save_spz(path, gaussians, antialiased=render_mode == "mip")
-    else:
-        report = save_splat(path, gaussians)
-    return dataclasses.replace(report, offset=offset)
+    return dataclasses.replace(FORMATS[suffix].save(path, gaussians, render_mode), offset=offset)
+
+
+def read_scene(path: str | os.PathLike) -> SplatFile:
+    """Reads a scene file in any of `FORMATS`; a .ply may be a compressed one, whatever its name.
+
+    Raises:
+        InputError: an unknown extension, or the file is damaged or of another format than its name says.
+    """
+    path = Path(path)
+    suffix = check_format(path, "scene")
+    if suffix == ".ply" and is_compressed_ply(path):
+        suffix = ".compressed.ply"
+    return FORMATS[suffix].read(path)
+
+
+def load_scene(path: str | os.PathLike) -> Gaussians:
+    """Reads the Gaussians of a scene file: .ply, .compressed.ply, .spz, .sog, .glb, .gltf or .splat.
+
+    Limits:
+        As `load_ply`; positions of a .ply with a comment `offset x y z` stay relative to that offset.
+
+    Raises:
+        InputError: an unknown extension, or the file is damaged or of another format than its name says.
+    """
+    return read_scene(path).gaussians
 
 
 def save_selected(
@@ -100,14 +147,14 @@ def convert_scene(scene: Path, to: Path, selection: Selection = EVERYTHING) -> E
     """Converts the scene file `scene` to the format given by the extension of `to`.
 
     Args:
-        scene: a 3DGS .ply.
+        scene: a file of one of `FORMATS`.
         to: the file to write.
         selection: the Gaussians to leave out.
 
     Raises:
-        InputError: `scene` is not a 3DGS .ply, `to` has an unknown extension, or positions are out of range.
+        InputError: `scene` is no scene file, `to` has an unknown extension, or positions are out of range.
         StorageError: the file cannot be written.
     """
     check_format(to)
-    splats = read_ply(scene)
+    splats = read_scene(scene)
     return save_selected(to, splats.gaussians, selection, render_mode=splats.render_mode, offset=splats.offset)

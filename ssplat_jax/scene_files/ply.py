@@ -123,11 +123,7 @@ def read_ply(path: str | os.PathLike) -> SplatFile:
     columns, comments = read_vertices(path)
     missing = [name for name in BASE_PROPERTIES if name not in columns]
     if missing:
-        packed = (
-            " it is compressed; convert it to a plain 3DGS .ply"
-            if "packed_position" in columns
-            else " give a 3DGS .ply"
-        )
+        packed = " it is compressed; read it with `load_scene`" if "packed_position" in columns else " give a 3DGS .ply"
         raise InputError(f"{path}: element vertex: wanted the property {missing[0]!r}, it is missing;{packed}.")
     num_rest = sum(name.startswith("f_rest_") for name in columns)
     rest_names = [f"f_rest_{i}" for i in range(num_rest)]

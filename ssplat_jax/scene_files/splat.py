@@ -1,4 +1,4 @@
-"""Writer of the .splat file of the first browser viewers: 32 bytes per Gaussian, without view-dependent color.
+"""Reader and writer of the .splat file of the first browser viewers: 32 bytes per Gaussian, constant colors.
 
     x y z (float32) · scales (float32, standard deviations) · r g b opacity (uint8) · w x y z (uint8, 128 + 128 q)
 
@@ -10,8 +10,10 @@ import os
 
 import numpy as np
 
+from ssplat_jax.errors import InputError
 from ssplat_jax.gaussians import SH_C0, Gaussians
-from ssplat_jax.scene_files.export_rows import ExportReport, scene_rows, to_bytes
+from ssplat_jax.scene_files.export_rows import LOG_SCALE_LIMIT, ExportReport, scene_rows, to_bytes
+from ssplat_jax.scene_files.splat_file import SplatFile, gaussians_of_columns, read_scene_bytes
 from ssplat_jax.storage.atomic import write_atomic
 
 ROW = np.dtype([("mean", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
@@ -37,3 +39,29 @@ def save_splat(path: str | os.PathLike, gaussians: Gaussians) -> ExportReport:
     table["quat"] = to_bytes(128 + 128 * rows.quats[order])
     write_atomic(path, table.tobytes())
     return ExportReport(num_written=len(rows), num_dropped=gaussians.num_gaussians - len(rows))
+
+
+def read_splat(path: str | os.PathLike) -> SplatFile:
+    """Reads a .splat file.
+
+    Raises:
+        InputError: the file cannot be read, is not a whole number of rows, or holds entries that are not finite.
+    """
+    data = read_scene_bytes(path, "a .splat file")
+    if len(data) % ROW.itemsize:
+        raise InputError(
+            f"{path}: wanted rows of {ROW.itemsize} bytes, got {len(data)} bytes; it is cut off or no .splat file."
+        )
+    table = np.frombuffer(data, ROW)
+    rgba = table["rgba"] / 255
+    if (table["scales"] < 0).any():
+        raise InputError(f"{path}: wanted scales of at least 0, got {table['scales'].min()}; write it again.")
+    gaussians = gaussians_of_columns(
+        path,
+        means=table["mean"],
+        quats=(table["quat"].astype(np.float64) - 128) / 128,
+        log_scales=np.log(np.maximum(table["scales"].astype(np.float64), np.exp(-LOG_SCALE_LIMIT))),
+        opacities=rgba[:, 3],
+        sh=((rgba[:, :3] - 0.5) / SH_C0)[:, None],
+    )
+    return SplatFile(gaussians, render_mode="default")

@@ -11,14 +11,14 @@ from ssplat_jax.checkpoint.delta_files import load_delta, load_delta_header
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.errors import InputError, StorageError
 from ssplat_jax.gaussians import Gaussians, scale_colors
-from ssplat_jax.scene_files.ply import load_ply
+from ssplat_jax.scene_files.formats import load_scene
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.streaming.scene_delta import apply_delta
 from ssplat_jax.viewer.start_camera import StartCamera, first_camera
 
 
 class SceneFile:
-    """A .ply, which is read again whenever it is rewritten."""
+    """A scene file, which is read again whenever it is rewritten."""
 
     def __init__(self, path: Path) -> None:
         self._path, self._stamp = path, None
@@ -34,7 +34,7 @@ class SceneFile:
         if self._stamp is not None and stamp in (None, self._stamp):
             return None
         self._stamp = stamp
-        return load_ply(self._path)
+        return load_scene(self._path)
 
     def start_camera(self) -> StartCamera | None:
         """The first camera of the run that wrote the file; None if no metrics of a run are beside it."""

@@ -384,8 +384,6 @@ def test_a_folder_with_only_a_scene_is_exported(tmp_path, capsys):
     save_ply(RunFolder(tmp_path).scene, scene)  # as `ssplat demo` leaves it: no saved state
     assert run("export", str(tmp_path), "--to", str(tmp_path / "scene.spz")) == 0
     assert "2 Gaussians" in capsys.readouterr().out and (tmp_path / "scene.spz").stat().st_size > 0
-    assert run("export", str(tmp_path), "--to", str(tmp_path / "a.compressed.ply")) == 2
-    assert "compressed .ply" in capsys.readouterr().err and not (tmp_path / "a.compressed.ply").exists()
 
 
 def test_an_interrupt_says_so_and_exits_with_130(capsys):

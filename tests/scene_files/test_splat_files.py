@@ -247,5 +247,5 @@ def test_export_converts_a_ply(tmp_path, capsys):
 def test_unknown_extensions_are_refused_before_reading(tmp_path, capsys, name):
     assert run("export", str(tmp_path / "missing"), "--to", str(tmp_path / name)) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert "*.ply, *.spz, *.splat" in line and name in line
+    assert "*.compressed.ply, *.ply, *.spz" in line and name in line
     assert list(tmp_path.iterdir()) == []
