@@ -22,12 +22,15 @@ class Export:
     """Leave out specks, and floaters that one view alone made; their number is printed."""
     max_splats: int | None = None
     """Write at most so many Gaussians: those of the largest opacity and area."""
+    cameras: str | None = None
+    """Capture of the scene: its cameras are written as COLMAP text, cameras.txt and images.txt, beside the file."""
     weights: str = "tiny"
     """Weights of the run: a preset with shipped weights, or a weights file."""
 
     def run(self) -> int:
         from ssplat_jax.checkpoint.weights import load_params
         from ssplat_jax.console import Reporter
+        from ssplat_jax.runs.export_cameras import open_cameras, save_cameras
         from ssplat_jax.runs.export_run import export_run
         from ssplat_jax.scene_files.formats import convert_scene
         from ssplat_jax.scene_files.select_gaussians import Selection
@@ -35,12 +38,15 @@ class Export:
 
         reporter = Reporter(quiet=False)
         folder, selection = RunFolder(self.scene), Selection(self.prune, self.max_splats)
+        cameras = None if self.cameras is None else open_cameras(self.cameras, self.scene, self.to)
         if self.scene.is_file():
             report = convert_scene(self.scene, self.to, selection)
         elif not folder.has_state() and folder.scene.exists():  # a folder of `ssplat demo`
             report = convert_scene(folder.scene, self.to, selection)
         else:
             report = export_run(self.scene, self.to, load_params(self.weights), reporter, selection)
+        if cameras is not None:
+            save_cameras(self.to.parent, cameras, report.offset)
         if report.warning is not None:
             reporter.warn(f"{self.to.name}: {report.warning}")
         print(f"wrote {self.to}: {report.num_written} Gaussians{_left_out(report)}")

@@ -81,10 +81,8 @@ def with_attribute(document, name, values, component, **accessor):
         | accessor.pop("view", {})
     )
     kind = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[values.shape[-1]]
-    document["accessors"].append(
-        {"bufferView": len(document["bufferViews"]) - 1, "componentType": component, "count": 100, "type": kind}
-        | accessor
-    )
+    held = {"bufferView": len(document["bufferViews"]) - 1, "componentType": component, "count": 100, "type": kind}
+    document["accessors"].append(held | accessor)
     document["meshes"][0]["primitives"][0]["attributes"][PREFIX + name] = len(document["accessors"]) - 1
     return document
 
