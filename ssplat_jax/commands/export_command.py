@@ -21,7 +21,7 @@ class Export:
     prune: bool = False
     """Leave out specks, and floaters that one view alone made; their number is printed."""
     max_splats: int | None = None
-    """Write at most so many Gaussians: those of the largest opacity and area."""
+    """Write at most so many Gaussians: opaque ones first, everywhere alike; the number of the others is printed."""
     cameras: str | None = None
     """Capture of the scene: its cameras are written as COLMAP text, cameras.txt and images.txt, beside the file."""
     weights: str = "tiny"

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import jax
 import numpy as np
 from jaxtyping import Int
 
@@ -52,16 +53,17 @@ def export_run(
     if header.get("weights") != params_digest(params):
         raise InputError(f"{run_dir}: was streamed with other weights than these; give the run's own with --weights.")
     session = Session(StreamSplat(config_from_header(header["config"])), params, cache)
-    gaussians, frame = session.gaussians(), StreamFrame.from_dict(header["frame"])
+    members = members_of_gaussians(session)
+    # The rows after these are padding, of which a person need not be told.
+    gaussians = jax.tree.map(lambda x: x[: len(members)], session.gaussians())
+    frame = StreamFrame.from_dict(header["frame"])
     scene = scene_to_show(gaussians, frame, exposures_from_json(header["exposures"]))
-    members = members_of_gaussians(session, gaussians.num_gaussians)
     return save_selected(to, scene, selection, members, offset=frame.offset)
 
 
-def members_of_gaussians(session: Session, num_rows: int) -> Int[np.ndarray, " n"]:
-    """Number of tokens that each Gaussian of `Session.gaussians` was merged from; 0 for rows of padding."""
+def members_of_gaussians(session: Session) -> Int[np.ndarray, " n"]:
+    """Number of tokens that each Gaussian of `Session.gaussians` was merged from, without the rows of padding."""
     assert session.cache is not None
     is_shown = np.asarray(shown_pivots(session.cache, session.model.config)).reshape(-1)
     members = np.asarray(session.cache.num_members).reshape(-1)[is_shown]
-    repeated = np.repeat(members, session.model.config.head.gaussians_per_token)
-    return np.concatenate([repeated, np.zeros(num_rows - len(repeated), repeated.dtype)])
+    return np.repeat(members, session.model.config.head.gaussians_per_token)

@@ -1,1 +1,1 @@
-"""Scene files (.ply, .spz, .splat); every writer is atomic, and tests read its files with an independent reader."""
+"""Scene files (.ply, .compressed.ply, .spz, .sog, glTF, .splat); tests read what is written with other readers, too."""

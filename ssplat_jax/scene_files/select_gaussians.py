@@ -4,7 +4,7 @@ import dataclasses
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
@@ -12,6 +12,7 @@ from scipy.spatial import KDTree
 from ssplat_jax.errors import InputError
 from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.scene_files.export_rows import is_writable
+from ssplat_jax.scene_files.morton import morton_order
 
 NUM_NEIGHBORS = 8
 """Nearest Gaussians that each is compared with; more join no clusters that fewer leave apart on our scenes."""
@@ -25,6 +26,8 @@ SPECK = 16
 FLOATER = 64
 """A cluster of fewer Gaussians than this is a floater if one view alone made it."""
 
+ROUNDING = 1e-9
+
 
 @dataclasses.dataclass(frozen=True)
 class Selection:
@@ -33,7 +36,7 @@ class Selection:
     prune: bool = False
     """Leave out specks and floaters of single views (`prune_mask`)."""
     max_splats: int | None = None
-    """Most Gaussians; the most prominent ones are kept (`prominence`)."""
+    """Most Gaussians; opaque ones are kept first, everywhere alike (`thinned_mask`)."""
 
     def __post_init__(self) -> None:
         if self.max_splats is not None and self.max_splats < 1:
@@ -72,21 +75,32 @@ def select_gaussians(
         keep[writable] = prune_mask(_take(gaussians, writable), members)
     num_pruned = int(writable.sum() - keep.sum())
     if selection.max_splats is not None and keep.sum() > selection.max_splats:
-        places = np.flatnonzero(keep)
-        best = np.argsort(-prominence(_take(gaussians, keep)), kind="stable")[: selection.max_splats]
-        keep = np.zeros_like(keep)
-        keep[places[best]] = True
+        keep[keep] = thinned_mask(_take(gaussians, keep), selection.max_splats)
     num_cut = int(writable.sum()) - num_pruned - int(keep.sum())
     return Selected(_take(gaussians, keep | ~writable), num_pruned, num_cut)
 
 
-def prominence(gaussians: Gaussians) -> Float[np.ndarray, " n"]:
-    """Opacity times the fourth root of the area: the product of the two largest standard deviations.
+def thinned_mask(gaussians: Gaussians, num_kept: int) -> Bool[np.ndarray, " n"]:
+    """Mask of exactly `num_kept` Gaussians that stand for all of them: opaque ones first, everywhere alike.
 
-    The area itself would keep little more than the far background, whose Gaussians are large (docs/decisions.md).
+    A Gaussian is kept with a frequency proportional to the square of its opacity, at most 1. Along the Morton order the
+    frequencies are added up, and one is kept whenever the sum passes a half: no region loses more than its share.
+
+    Args:
+        gaussians: rows that can all be drawn, more than `num_kept`.
+        num_kept: at least 1.
     """
-    scales = np.sort(np.asarray(gaussians.scales, np.float64), axis=1)
-    return np.asarray(gaussians.opacities, np.float64) * (scales[:, 1] * scales[:, 2]) ** 0.25
+    weights = np.square(np.asarray(gaussians.opacities, np.float64))
+    largest_first = np.sort(weights)[::-1]
+    rest = np.cumsum(largest_first[::-1])[::-1]  # sum of each weight and the smaller ones
+    certain = np.arange(num_kept)
+    factors = (num_kept - certain) / rest[:num_kept]  # if so many of the largest are kept for certain
+    factor = factors[np.argmax(factors * largest_first[:num_kept] <= 1.0 + ROUNDING)]
+    order = morton_order(np.asarray(gaussians.means, np.float64))
+    sums = np.floor(np.cumsum(np.minimum(factor * weights[order], 1.0)) + 0.5)
+    mask = np.zeros(len(weights), bool)
+    mask[order] = np.diff(sums, prepend=0.0) > 0
+    return mask
 
 
 def prune_mask(gaussians: Gaussians, num_members: Int[np.ndarray, " n"] | None = None) -> Bool[np.ndarray, " n"]:

@@ -1,4 +1,4 @@
-"""Selection on export: specks and unconfirmed floaters go, surfaces stay, and the most prominent Gaussians survive."""
+"""Selection on export: specks and unconfirmed floaters go, surfaces stay, and what is thinned is thinned alike."""
 
 import jax
 import jax.numpy as jnp
@@ -14,9 +14,9 @@ from ssplat_jax.scene_files.select_gaussians import (
     REACH,
     SPECK,
     Selection,
-    prominence,
     prune_mask,
     select_gaussians,
+    thinned_mask,
 )
 from tests.commands.test_cli import run
 from tests.scene_files.scene_fixture import scene
@@ -93,16 +93,37 @@ def test_the_largest_cluster_of_a_tiny_scene_stays():
     assert len(prune_mask(sheet(0, 0, [0, 0, 0]))) == 0
 
 
-def test_the_most_prominent_stay_in_their_order():
+@pytest.mark.parametrize("num_kept", [1, 7, 20, 49])
+def test_exactly_so_many_stay_in_their_order(num_kept):
     gaussians = scene(1, n=50)
-    selected = select_gaussians(gaussians, Selection(max_splats=20))
-    scales = np.sort(np.asarray(gaussians.scales, np.float64), axis=1)
-    value = np.asarray(gaussians.opacities) * (scales[:, 1] * scales[:, 2]) ** 0.25
-    np.testing.assert_allclose(prominence(gaussians), value)
-    best = np.sort(np.argsort(-value)[:20])
-    assert (selected.num_pruned, selected.num_cut) == (0, 30)
+    selected = select_gaussians(gaussians, Selection(max_splats=num_kept))
+    assert (selected.num_pruned, selected.num_cut) == (0, 50 - num_kept)
+    mask = thinned_mask(gaussians, num_kept)
+    assert mask.sum() == num_kept
     for ours, theirs in zip(jax.tree.leaves(selected.gaussians), jax.tree.leaves(gaussians), strict=True):
-        np.testing.assert_array_equal(ours, np.asarray(theirs)[best])
+        np.testing.assert_array_equal(ours, np.asarray(theirs)[mask])
+
+
+@pytest.mark.parametrize(
+    ("num_kept", "factor"),
+    [(600, 600 / (500 * 1.1125)), (800, (800 - 500) / (500 * 0.3025))],  # with 800 all of the most opaque are kept
+)
+def test_thinning_keeps_as_often_as_opacity_squared(num_kept, factor):
+    values = np.array([0.9, 0.45, 0.3, 0.1])  # squares 0.81, 0.2025, 0.09 and 0.01
+    opacities = np.random.default_rng(0).permutation(np.tile(values, 500))
+    gaussians = replace(sheet(40, 50, [0, 0, 0]), opacities=jnp.asarray(opacities, jnp.float32))
+    mask = thinned_mask(gaussians, num_kept)
+    shares = [mask[opacities == value].mean() for value in values]
+    np.testing.assert_allclose(shares, np.minimum(factor * values**2, 1.0), atol=0.02)
+
+
+def test_thinning_takes_the_same_share_everywhere():
+    parts = [sheet(20, 20, [x, 0, 0]) for x in (0.0, 100.0, 300.0, 301.0)]
+    mask = thinned_mask(joined(*parts), 500)
+    shares = np.split(mask, 4)
+    assert all(abs(int(share.sum()) - 125) <= 2 for share in shares[:2]) and mask.sum() == 500
+    in_a_quarter = mask[:400].reshape(20, 20)[:10, :10].sum()
+    assert abs(int(in_a_quarter) - 125 / 4) <= 6
 
 
 def test_rows_that_no_file_holds_take_no_place():
