@@ -19,6 +19,7 @@ from ssplat_jax.errors import InputError
 from ssplat_jax.gaussians import SH_C0, Gaussians
 from ssplat_jax.scene_files.export_rows import LOG_SCALE_LIMIT, ExportReport, scene_rows, to_bytes
 from ssplat_jax.scene_files.morton import morton_order
+from ssplat_jax.scene_files.ply import offset_comment, offset_of, render_mode_of
 from ssplat_jax.scene_files.ply_table import MAX_HEADER_BYTES, read_tables
 from ssplat_jax.scene_files.smallest_three import HALF_RANGE, drop_largest, restore_largest
 from ssplat_jax.scene_files.splat_file import SplatFile, gaussians_of_columns
@@ -36,8 +37,23 @@ LIMITS = tuple(tuple(f"{end}_{name}" for end in ("min", "max") for name in names
 PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 
 
-def save_compressed_ply(path: str | os.PathLike, gaussians: Gaussians) -> ExportReport:
+def save_compressed_ply(
+    path: str | os.PathLike,
+    gaussians: Gaussians,
+    *,
+    render_mode: str = "mip",
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> ExportReport:
     """Writes `gaussians` to `path` atomically; the same Gaussians give the same bytes.
+
+    Args:
+        path: the file to write; missing folders are created.
+        gaussians: the scene, in the frame of the file.
+        render_mode: value of the comment `SplatRenderMode`, see `save_ply`.
+        offset: origin of `gaussians` in the frame of the file; written as a comment unless it is zero.
+
+    Returns:
+        Counts of written and dropped Gaussians, and `offset`.
 
     Limits:
         Those of `scene_rows`. Within a chunk of 256 neighbors, positions and ln scales have 1024 to 2048 steps, colors
@@ -63,17 +79,19 @@ def save_compressed_ply(path: str | os.PathLike, gaussians: Gaussians) -> Export
         axis=1,
     )
     rest = rows.sh[order, 1:].transpose(0, 2, 1).reshape(len(rows), 3 * (rows.sh.shape[1] - 1))
-    header = _header(len(limits[0]), len(rows), rest.shape[1])
+    comments = [f"comment SplatRenderMode: {render_mode}", *offset_comment(offset)]
+    header = _header(len(limits[0]), len(rows), rest.shape[1], comments)
     body = np.concatenate(limits, axis=1).astype("<f4").tobytes() + vertices.astype("<u4").tobytes()
     levels = np.clip(np.floor((rest / SH_RANGE + 0.5) * 256), 0, 255).astype(np.uint8)
     write_atomic(path, header + body + levels.tobytes())
-    return ExportReport(num_written=len(rows), num_dropped=gaussians.num_gaussians - len(rows))
+    return ExportReport(num_written=len(rows), num_dropped=gaussians.num_gaussians - len(rows), offset=offset)
 
 
-def _header(num_chunks: int, num_rows: int, num_rest: int) -> bytes:
+def _header(num_chunks: int, num_rows: int, num_rest: int, comments: list[str]) -> bytes:
     lines = [
         "ply",
         "format binary_little_endian 1.0",
+        *comments,
         f"element chunk {num_chunks}",
         *(f"property float {name}" for names in LIMITS for name in names),
         f"element vertex {num_rows}",
@@ -131,7 +149,7 @@ def read_compressed_ply(path: str | os.PathLike) -> SplatFile:
     Raises:
         InputError: the file is not a compressed .ply, is cut off, or holds entries that are not finite.
     """
-    tables, _ = read_tables(path, ("vertex", "chunk", "sh"))
+    tables, comments = read_tables(path, ("vertex", "chunk", "sh"))
     vertex, chunk, rest = (tables.get(name, {}) for name in ("vertex", "chunk", "sh"))
     for name, held, wanted in (("vertex", vertex, PACKED), ("chunk", chunk, LIMITS[0] + LIMITS[1])):
         for missing in (x for x in wanted if x not in held):
@@ -152,7 +170,7 @@ def read_compressed_ply(path: str | os.PathLike) -> SplatFile:
         opacities=rgba[:, 3],
         sh=np.concatenate([((colors - 0.5) / SH_C0)[:, None], _unpack_rest(path, rest, num_rows)], axis=1),
     )
-    return SplatFile(gaussians, render_mode="default")
+    return SplatFile(gaussians, render_mode_of(comments), offset_of(path, comments))
 
 
 def _unpack_vectors(packed: UInt32[np.ndarray, " n"]) -> Float64[np.ndarray, "n 3"]:

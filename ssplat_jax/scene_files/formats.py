@@ -28,19 +28,26 @@ from ssplat_jax.scene_files.spz_reader import read_spz
 class Format:
     """A format of scene files."""
 
-    save: Callable[[Path, Gaussians, str], ExportReport]
-    """Writes Gaussians; the third argument is the render mode, see `save_ply`."""
+    save: Callable[[Path, Gaussians, str, tuple[float, float, float]], ExportReport]
+    """Writes Gaussians; the last arguments are the render mode (`save_ply`) and the offset."""
     read: Callable[[Path], SplatFile]
 
 
 FORMATS = {
-    ".compressed.ply": Format(lambda path, scene, mode: save_compressed_ply(path, scene), read_compressed_ply),
-    ".ply": Format(lambda path, scene, mode: save_ply(path, scene, render_mode=mode), read_ply),
-    ".spz": Format(lambda path, scene, mode: save_spz(path, scene, antialiased=mode == "mip"), read_spz),
-    ".sog": Format(lambda path, scene, mode: save_sog(path, scene, antialiased=mode == "mip"), read_sog),
-    ".glb": Format(lambda path, scene, mode: save_gltf(path, scene), read_gltf),
-    ".gltf": Format(lambda path, scene, mode: save_gltf(path, scene), read_gltf),
-    ".splat": Format(lambda path, scene, mode: save_splat(path, scene), read_splat),
+    ".compressed.ply": Format(
+        lambda path, scene, mode, offset: save_compressed_ply(path, scene, render_mode=mode, offset=offset),
+        read_compressed_ply,
+    ),
+    ".ply": Format(lambda path, scene, mode, offset: save_ply(path, scene, render_mode=mode, offset=offset), read_ply),
+    ".spz": Format(lambda path, scene, mode, _: save_spz(path, scene, antialiased=mode == "mip"), read_spz),
+    ".sog": Format(lambda path, scene, mode, _: save_sog(path, scene, antialiased=mode == "mip"), read_sog),
+    ".glb": Format(
+        lambda path, scene, mode, offset: save_gltf(path, scene, render_mode=mode, offset=offset), read_gltf
+    ),
+    ".gltf": Format(
+        lambda path, scene, mode, offset: save_gltf(path, scene, render_mode=mode, offset=offset), read_gltf
+    ),
+    ".splat": Format(lambda path, scene, *_: save_splat(path, scene), read_splat),
 }
 """Formats by the end of the file's name; the first that fits is meant."""
 
@@ -70,8 +77,8 @@ def save_gaussians(
         path: the file to write; its name ends as one of `FORMATS`.
         gaussians: the scene.
         render_mode: the renderer that the scene is made for, see `save_ply`; a .spz and a .sog store only whether it is
-            "mip", the others nothing.
-        offset: origin of `gaussians` in the frame of the capture; only a .ply stores it.
+            "mip", a .splat nothing.
+        offset: origin of `gaussians` in the frame of the capture; a .spz, .sog or .splat does not store it.
 
     Returns:
         Counts of written and dropped Gaussians, and `offset`.
@@ -80,10 +87,8 @@ def save_gaussians(
         InputError: an unknown extension, or positions outside the range of the format.
         StorageError: the file cannot be written.
     """
-    suffix = check_format(path)
-    if suffix == ".ply":
-        return save_ply(path, gaussians, render_mode=render_mode, offset=offset)
-    return dataclasses.replace(FORMATS[suffix].save(path, gaussians, render_mode), offset=offset)
+    report = FORMATS[check_format(path)].save(path, gaussians, render_mode, offset)
+    return dataclasses.replace(report, offset=offset)
 
 
 def read_scene(path: str | os.PathLike) -> SplatFile:

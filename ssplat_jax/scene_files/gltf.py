@@ -31,10 +31,25 @@ HALF_TURN = [0.0, 0.0, 1.0, 0.0]  # quaternion xyzw of 180 degrees about z
 EMBEDDED = "data:application/octet-stream;base64,"
 
 
-def save_gltf(path: str | os.PathLike, gaussians: Gaussians) -> ExportReport:
+def save_gltf(
+    path: str | os.PathLike,
+    gaussians: Gaussians,
+    *,
+    render_mode: str = "mip",
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> ExportReport:
     """Writes `gaussians` to `path` atomically: JSON with an embedded buffer if its suffix is .gltf, else binary.
 
     The same Gaussians give the same bytes.
+
+    Args:
+        path: the file to write; missing folders are created.
+        gaussians: the scene, with the axes of a .ply.
+        render_mode: the renderer that the scene is made for, see `save_ply`; kept in the extras of `asset`.
+        offset: origin of `gaussians` in the frame of the capture; kept there too, unless it is zero.
+
+    Returns:
+        Counts of written and dropped Gaussians, and `offset`.
 
     Limits:
         Those of `scene_rows`.
@@ -45,13 +60,14 @@ def save_gltf(path: str | os.PathLike, gaussians: Gaussians) -> ExportReport:
     rows = scene_rows(gaussians)
     columns = _columns(rows)
     document, buffer = _document(columns, len(rows))
+    document["asset"]["extras"] = {"SplatRenderMode": render_mode} | ({"offset": list(offset)} if any(offset) else {})
     if str(path).endswith(".gltf"):
         document["buffers"][0]["uri"] = EMBEDDED + base64.b64encode(buffer).decode("ascii")
         data = json.dumps(document, indent=1).encode("ascii")
     else:
         data = _binary(document, buffer)
     write_atomic(path, data)
-    return ExportReport(num_written=len(rows), num_dropped=gaussians.num_gaussians - len(rows))
+    return ExportReport(num_written=len(rows), num_dropped=gaussians.num_gaussians - len(rows), offset=offset)
 
 
 def sh_names(num_terms: int) -> list[str]:

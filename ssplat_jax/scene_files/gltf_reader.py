@@ -16,6 +16,7 @@ from ssplat_jax.errors import InputError
 from ssplat_jax.geometry.sh_rotation import sh_rotation
 from ssplat_jax.scene_files.export_rows import LOG_SCALE_LIMIT, unit_quats
 from ssplat_jax.scene_files.gltf import BINARY_CHUNK, EXTENSION, JSON_CHUNK, MAGIC, TYPES, VERSION, sh_names
+from ssplat_jax.scene_files.ply import RENDER_MODES
 from ssplat_jax.scene_files.splat_file import SplatFile, gaussians_of_columns, read_scene_bytes
 
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
@@ -54,7 +55,7 @@ def read_gltf(path: str | os.PathLike) -> SplatFile:
         name: np.concatenate([np.zeros(shape), *(_padded(part[name], name, terms) for part in parts)])
         for name, shape in empty.items()
     }
-    return SplatFile(gaussians_of_columns(path, **columns), render_mode="default")
+    return SplatFile(gaussians_of_columns(path, **columns), *file.facts())
 
 
 def _padded(values: np.ndarray, name: str, terms: int) -> np.ndarray:
@@ -108,6 +109,18 @@ class _Document:
             return found
         except (LookupError, TypeError, ValueError, AttributeError) as error:
             raise self._malformed(error) from error
+
+    def facts(self) -> tuple[str, tuple[float, float, float]]:
+        """Render mode and offset that our writer keeps in the extras of `asset`."""
+        try:
+            extras = self.document["asset"].get("extras") or {}
+            mode = extras.get("SplatRenderMode", "default")
+            x, y, z = (float(value) for value in extras.get("offset", (0.0, 0.0, 0.0)))
+        except (LookupError, TypeError, ValueError, AttributeError) as error:
+            raise self._malformed(error) from error
+        if not np.isfinite([x, y, z]).all():
+            raise self._malformed(ValueError("an offset that is not finite"))
+        return mode if mode in RENDER_MODES else "default", (x, y, z)
 
     def _visit(self, number: int, parent: np.ndarray, found: list, depth: int) -> None:
         if depth > MAX_NODE_DEPTH:

@@ -81,12 +81,17 @@ def _header(num_rows: int, sh_degree: int, render_mode: str, offset: tuple[float
         "format binary_little_endian 1.0",
         f"comment SplatRenderMode: {render_mode}",
         f"comment SH degree: {sh_degree}",
-        *([f"comment offset {' '.join(map(repr, offset))}"] if any(offset) else []),
+        *offset_comment(offset),
         f"element vertex {num_rows}",
         *(f"property float {name}" for name in property_names(sh_degree)),
         "end_header\n",
     ]
     return "\n".join(lines).encode("ascii")
+
+
+def offset_comment(offset: tuple[float, float, float]) -> list[str]:
+    """Header line of an offset; none if it is zero."""
+    return [f"comment offset {' '.join(map(repr, offset))}"] if any(offset) else []
 
 
 def _table(rows: SceneRows) -> np.ndarray:
@@ -147,17 +152,23 @@ def read_ply(path: str | os.PathLike) -> SplatFile:
     }
     return SplatFile(
         gaussians=Gaussians(**{name: jnp.asarray(field, jnp.float32) for name, field in fields.items()}),
-        render_mode=_render_mode(comments),
-        offset=_offset(path, comments),
+        render_mode=render_mode_of(comments),
+        offset=offset_of(path, comments),
     )
 
 
-def _render_mode(comments: list[str]) -> str:
+def render_mode_of(comments: list[str]) -> str:
+    """The renderer that comments name; "default" if they name none."""
     modes = [comment.split()[-1] for comment in comments if comment.startswith("SplatRenderMode:")]
     return modes[-1] if modes and modes[-1] in RENDER_MODES else "default"
 
 
-def _offset(path, comments: list[str]) -> tuple[float, float, float]:
+def offset_of(path: str | os.PathLike, comments: list[str]) -> tuple[float, float, float]:
+    """The offset that comments name; zero if they name none.
+
+    Raises:
+        InputError: it is not three numbers.
+    """
     for comment in comments:
         if comment.split()[:1] == ["offset"]:
             try:

@@ -12,6 +12,7 @@ from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.gaussians import mean_color
 from ssplat_jax.pytree import replace
 from ssplat_jax.rasterizer import Effects, fill_holes
+from ssplat_jax.scene_files.formats import save_gaussians
 from tests.commands.test_cli import make_capture, run
 
 LEVEL = 1.0 / 255
@@ -75,6 +76,15 @@ def test_a_scene_for_another_renderer_is_drawn_as_there(tmp_path, capture):
     loaded, found = ss.load_ply(tmp_path / "scene.ply"), picture(tmp_path / "out" / "views" / "00000.png")
     np.testing.assert_allclose(found, wanted(capture, loaded, 0, "classic"), atol=0.51 * LEVEL)
     assert np.abs(found - wanted(capture, loaded, 0, "mip")).max() > 3 * LEVEL
+
+
+@pytest.mark.parametrize(("suffix", "antialias"), [(".glb", "mip"), (".sog", "mip"), (".splat", "classic")])
+def test_a_scene_of_any_format_is_rendered(tmp_path, capture, suffix, antialias):
+    save_gaussians(tmp_path / f"scene{suffix}", scene())
+    arguments = ("--max-views", "1", "--out", str(tmp_path / "out"), "--quiet")
+    assert run("render", str(tmp_path / f"scene{suffix}"), str(capture), *arguments) == 0
+    loaded, found = ss.load_scene(tmp_path / f"scene{suffix}"), picture(tmp_path / "out" / "views" / "00000.png")
+    np.testing.assert_allclose(found, wanted(capture, loaded, 0, antialias), atol=0.51 * LEVEL)
 
 
 def test_a_scene_counted_from_an_offset_is_seen_where_it_is(tmp_path, capture):

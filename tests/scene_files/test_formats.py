@@ -95,12 +95,21 @@ def test_hidden_rows_are_dropped_and_bytes_repeat(tmp_path, suffix):
     assert ss.load_scene(tmp_path / f"a{suffix}").num_gaussians == 18
 
 
-@pytest.mark.parametrize(("suffix", "told"), [(".ply", "mip"), (".spz", "mip"), (".sog", "mip"), (".splat", "default")])
-def test_the_renderer_of_a_scene_is_told_where_the_format_can(tmp_path, suffix, told):
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_the_renderer_of_a_scene_is_told_where_the_format_can(tmp_path, suffix):
     save_gaussians(tmp_path / f"a{suffix}", scene_for(suffix))
-    assert read_scene(tmp_path / f"a{suffix}").render_mode == told
+    assert read_scene(tmp_path / f"a{suffix}").render_mode == ("default" if suffix == ".splat" else "mip")
     save_gaussians(tmp_path / f"b{suffix}", scene_for(suffix), render_mode="default")
     assert read_scene(tmp_path / f"b{suffix}").render_mode == "default"
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".compressed.ply", ".glb", ".gltf"])
+def test_the_offset_of_a_far_scene_is_kept(tmp_path, suffix):
+    offset = (4.5e6, -0.1, 3.0)
+    report = save_gaussians(tmp_path / f"a{suffix}", scene_for(suffix), offset=offset)
+    found = read_scene(tmp_path / f"a{suffix}")
+    assert report.offset == found.offset == offset
+    assert_draws(found.gaussians, scene_for(suffix), least_db(suffix))
 
 
 @pytest.mark.parametrize("suffix", FORMATS)

@@ -23,6 +23,7 @@ from ssplat_jax.errors import InputError, StorageError
 from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.pytree import replace
 from ssplat_jax.rasterizer import Effects
+from ssplat_jax.scene_files.formats import save_gaussians
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.streaming.scene_delta import SceneDelta, apply_delta
 from ssplat_jax.viewer.scene_sources import GrowingScene, SceneFile, open_source
@@ -176,6 +177,13 @@ def test_a_scene_file_is_read_again_when_it_is_written_again(tmp_path):
     assert source.changed().num_gaussians == 7
     file.unlink()
     assert source.changed() is None  # shown on
+
+
+@pytest.mark.parametrize("suffix", [".compressed.ply", ".sog", ".spz", ".glb", ".splat"])
+def test_a_scene_file_of_any_format_is_shown(tmp_path, suffix):
+    save_gaussians(tmp_path / f"a{suffix}", scene(5))
+    source = open_source(tmp_path / f"a{suffix}")
+    assert source.changed().num_gaussians == 5 and source.changed() is None
 
 
 def test_viewing_starts_at_the_first_camera_of_the_run(tmp_path):
