@@ -22,7 +22,7 @@ from ssplat_jax.scene_files.morton import morton_order
 from ssplat_jax.scene_files.ply import offset_comment, offset_of, render_mode_of
 from ssplat_jax.scene_files.ply_table import MAX_HEADER_BYTES, read_tables
 from ssplat_jax.scene_files.smallest_three import HALF_RANGE, drop_largest, restore_largest
-from ssplat_jax.scene_files.splat_file import SplatFile, gaussians_of_columns
+from ssplat_jax.scene_files.splat_file import SplatFile, gaussians_of_columns, widened
 from ssplat_jax.storage.atomic import write_atomic
 
 CHUNK = 256
@@ -161,7 +161,7 @@ def read_compressed_ply(path: str | os.PathLike) -> SplatFile:
             f"{path}: wanted a chunk for every {CHUNK} of {num_rows} Gaussians, got {num_chunks}; write it again."
         )
     rgba = np.stack([packed[3] >> shift & 255 for shift in (24, 16, 8, 0)], axis=1) / 255
-    colors = _of_chunks(chunk, LIMITS[2], rgba[:, :3]) if LIMITS[2][0] in chunk else rgba[:, :3]
+    colors = _of_chunks(chunk, LIMITS[2], rgba[:, :3]) if all(name in chunk for name in LIMITS[2]) else rgba[:, :3]
     gaussians = gaussians_of_columns(
         path,
         means=_of_chunks(chunk, LIMITS[0], _unpack_vectors(packed[0])),
@@ -188,7 +188,7 @@ def _of_chunks(
     chunk: dict[str, np.ndarray], limits: tuple[str, ...], fractions: Float64[np.ndarray, "n 3"]
 ) -> Float64[np.ndarray, "n 3"]:
     """Values of fractions of the ranges of their chunks."""
-    ends = np.stack([chunk[name] for name in limits], axis=1).astype(np.float64)
+    ends = widened(np.stack([chunk[name] for name in limits], axis=1))
     low, high = ends[:, :3], ends[:, 3:]
     of_row = np.arange(len(fractions)) // CHUNK
     return low[of_row] + fractions * (high - low)[of_row]

@@ -17,7 +17,7 @@ from ssplat_jax.geometry.sh_rotation import sh_rotation
 from ssplat_jax.scene_files.export_rows import LOG_SCALE_LIMIT, unit_quats
 from ssplat_jax.scene_files.gltf import BINARY_CHUNK, EXTENSION, JSON_CHUNK, MAGIC, TYPES, VERSION, sh_names
 from ssplat_jax.scene_files.ply import RENDER_MODES
-from ssplat_jax.scene_files.splat_file import SplatFile, gaussians_of_columns, read_scene_bytes
+from ssplat_jax.scene_files.splat_file import SplatFile, gaussians_of_columns, read_scene_bytes, widened
 
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 """Types of accessors by their number in OpenGL."""
@@ -171,7 +171,7 @@ class _Document:
             raise ValueError(f"accessor {number}: reaches beyond its buffer of {len(data)} bytes")
         shape, strides = (count, num_columns), (stride, dtype.itemsize)
         values = np.ndarray(shape, dtype, data, start, strides) if count else np.zeros(shape, dtype)
-        values = values.astype(np.float64)
+        values = widened(values)
         if accessor.get("normalized", False):
             values = np.maximum(values / np.iinfo(dtype).max, -1.0)
         return values

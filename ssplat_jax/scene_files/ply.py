@@ -20,7 +20,7 @@ from ssplat_jax.errors import InputError
 from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.scene_files.export_rows import LOG_SCALE_LIMIT, ExportReport, SceneRows, scene_rows, unit_quats
 from ssplat_jax.scene_files.ply_table import read_vertices
-from ssplat_jax.scene_files.splat_file import SplatFile
+from ssplat_jax.scene_files.splat_file import SplatFile, widened
 from ssplat_jax.storage.atomic import write_atomic
 
 RENDER_MODES = ("default", "mip", "2dgs")
@@ -185,7 +185,7 @@ def _stacked(path, columns: dict[str, np.ndarray], names, *, allow_infinite: boo
     """Stacks columns in float64 and checks that they are finite in float32."""
     if not names:
         return np.zeros((len(columns["x"]), 0))
-    stacked = np.stack([columns[name] for name in names], axis=1).astype(np.float64)
+    stacked = widened(np.stack([columns[name] for name in names], axis=1))
     bad = np.isnan(stacked) | ((np.abs(stacked) > np.finfo(np.float32).max) & (not allow_infinite))
     if bad.any():
         (row, column), num_bad = np.argwhere(bad)[0], bad.any(axis=1).sum()

@@ -13,7 +13,7 @@ import numpy as np
 from ssplat_jax.errors import InputError
 from ssplat_jax.gaussians import SH_C0, Gaussians
 from ssplat_jax.scene_files.export_rows import LOG_SCALE_LIMIT, ExportReport, scene_rows, to_bytes
-from ssplat_jax.scene_files.splat_file import SplatFile, gaussians_of_columns, read_scene_bytes
+from ssplat_jax.scene_files.splat_file import SplatFile, gaussians_of_columns, read_scene_bytes, widened
 from ssplat_jax.storage.atomic import write_atomic
 
 ROW = np.dtype([("mean", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
@@ -58,9 +58,9 @@ def read_splat(path: str | os.PathLike) -> SplatFile:
         raise InputError(f"{path}: wanted scales of at least 0, got {table['scales'].min()}; write it again.")
     gaussians = gaussians_of_columns(
         path,
-        means=table["mean"],
+        means=widened(table["mean"]),
         quats=(table["quat"].astype(np.float64) - 128) / 128,
-        log_scales=np.log(np.maximum(table["scales"].astype(np.float64), np.exp(-LOG_SCALE_LIMIT))),
+        log_scales=np.log(np.maximum(widened(table["scales"]), np.exp(-LOG_SCALE_LIMIT))),
         opacities=rgba[:, 3],
         sh=((rgba[:, :3] - 0.5) / SH_C0)[:, None],
     )

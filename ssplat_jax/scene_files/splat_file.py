@@ -36,6 +36,12 @@ def read_scene_bytes(path: str | os.PathLike, wanted: str) -> bytes:
         raise InputError(f"{path}: wanted {wanted}, it cannot be read ({error.strerror}); check the path.") from error
 
 
+def widened(values: np.ndarray) -> np.ndarray:
+    """Numbers of a file in float64, without NumPy's warning of NaNs, which are refused by what they mean."""
+    with np.errstate(invalid="ignore"):
+        return values.astype(np.float64)
+
+
 def gaussians_of_columns(
     path: str | os.PathLike,
     *,

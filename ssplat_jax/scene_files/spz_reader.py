@@ -41,6 +41,7 @@ def read_spz(path: str | os.PathLike) -> SplatFile:
             count, widths = _widths(path, header, len(data))
             num_bytes = count * sum(widths.values())
             body = stream.read(num_bytes)
+            stream.read(1)  # to the end, where gzip compares the checksum
     except (OSError, EOFError, zlib.error) as error:
         raise InputError(f"{path}: wanted a .spz file, it cannot be unpacked ({error}); write it again.") from error
     if len(body) < num_bytes:

@@ -151,6 +151,7 @@ def test_files_without_ranges_of_colors_are_read(tmp_path):
     [
         ({"vertex": without("packed_scale")}, "'packed_scale'"),
         ({"chunk": without("max_z")}, "'max_z'"),
+        ({"chunk": lambda x: with_nan(without("max_r")(x))}, "finite position"),  # a color's range is not needed
         ({"chunk": lambda x: x[:0]}, "a chunk for every 256 of 40"),
         ({"chunk": with_nan}, "finite position"),
     ],

@@ -143,6 +143,20 @@ def test_a_file_of_another_format_is_refused(tmp_path, suffix):
         ss.load_scene(tmp_path / f"missing{suffix}")
 
 
+def test_a_flipped_bit_of_a_checked_format_is_refused(tmp_path):
+    rng = random.Random(0)
+    for suffix in (".spz", ".sog"):  # gzip and zip hold checksums
+        path = tmp_path / f"a{suffix}"
+        save_gaussians(path, scene_for(suffix))
+        data = path.read_bytes()
+        for _ in range(20):
+            mutant = bytearray(data)
+            mutant[rng.randrange(len(data) // 4, len(data) // 2)] ^= 1 << rng.randrange(8)
+            path.write_bytes(mutant)
+            with pytest.raises(InputError):
+                ss.load_scene(path)
+
+
 def test_a_compressed_scene_is_known_by_its_header(tmp_path):
     save_gaussians(tmp_path / "a.compressed.ply", scene(2))
     (tmp_path / "plain_name.ply").write_bytes((tmp_path / "a.compressed.ply").read_bytes())
