@@ -22,7 +22,7 @@ from ssplat_jax.streaming.streamsplat import StreamSplat
 from ssplat_jax.train.losses import soft_targets
 from tests.model.small import chunk, history, random_params
 
-CONFIG = preset("small").replace(mixer_blocks=1, num_depths=32, min_confidence=0.0, capacity=1 << 11)
+CONFIG = preset("small").replace(mixer_blocks=1, num_depths=32, min_confidence=0.0, capacity=1 << 11, chunk_size=3)
 MODEL = StreamSplat(CONFIG)
 
 
