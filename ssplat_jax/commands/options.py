@@ -71,6 +71,11 @@ def apply_changes(config: StreamConfig, changes: tuple[str, ...]) -> StreamConfi
     return config.replace(**parsed)
 
 
+def causal_changes(changes: tuple[str, ...], causal: bool) -> tuple[str, ...]:
+    """Changes to the configuration, with those of --causal."""
+    return (*changes, "stream.causal=true") if causal else changes
+
+
 def load_model(weights: str, changes: tuple[str, ...]):
     """(model, params) of a preset's shipped weights, or of a weights file.
 

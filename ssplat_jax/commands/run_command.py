@@ -10,6 +10,7 @@ from ssplat_jax.commands.options import (
     QualityOption,
     QuietOption,
     WeightsOption,
+    causal_changes,
     load_model,
     parse_size,
 )
@@ -45,6 +46,8 @@ class Run:
     """Also write the changes of each chunk, deltas/<views so far>.npz, for `ssplat view` to follow."""
     refine: int = 0
     """Then take this many gradient steps on the streamed frames, as `ssplat refine` does, into refined.ply."""
+    causal: bool = False
+    """No look-ahead: near, far and scale come from the first chunk, and frames keep their order."""
     quiet: QuietOption = False
 
     def run(self) -> int:
@@ -53,7 +56,7 @@ class Run:
 
         if self.refine < 0:
             raise InputError(f"--refine: wanted a number of steps of at least 0, got {self.refine}.")
-        model, params = load_model(self.weights, self.set)
+        model, params = load_model(self.weights, causal_changes(self.set, self.causal))
         result = run_capture(
             model,
             params,

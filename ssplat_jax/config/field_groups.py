@@ -22,6 +22,9 @@ class StreamingConfig(ConfigGroup):
     keeps the order of frames."""
     match_exposure: bool = True
     """Stores colors at the exposure of the first views and estimates the exposures of the others (ours)."""
+    causal: bool = False
+    """Nothing depends on later frames: near, far and scale come from the first chunk, frames keep their order, and
+    later chunks only move near and far outward (`streaming/causal_range.py`)."""
 
     def rules(self) -> tuple[tuple[str, str, bool], ...]:
         is_scale = self.scene_scale == "auto" or is_positive(self.scene_scale)

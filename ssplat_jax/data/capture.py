@@ -136,10 +136,18 @@ class Capture:
         """Returns the stream frame of a run over the frames `indices` (default: all).
 
         Near, far and the automatic scale are estimated from these frames only (`data.depth_range`); the other frames,
-        which include the targets of an evaluation, have no influence.
+        which include the targets of an evaluation, have no influence. With `causal`, only the first chunk has any.
         """
         used = _indices(self, indices)
-        depths = estimate_depths(self, used)
+        if config.stream.causal:
+            used = used[: config.stream.chunk_size]
+            # Other frames must not even bound the rounding of poses.
+            alone = dataclasses.replace(
+                self, frames=tuple(self.frames[i] for i in used), pixels=_Some(self.pixels, used)
+            )
+            depths = estimate_depths(alone, range(len(used)))
+        else:
+            depths = estimate_depths(self, used)
         scale, near, far = stream_scale(depths, config)
         first = self.frames[used[0]].camtoworld
         return StreamFrame.at_camera(first, scale=scale, near=near, far=far, warning=depths.warning)
@@ -153,9 +161,11 @@ class Capture:
     def stream_order(self, config: StreamConfig, indices: Sequence[int] | None, frame: StreamFrame) -> list[int]:
         """Returns `indices` (default: all) in the order of streaming, with slow video interleaved (`data.interleave`).
 
-        The typical depth is taken to be the geometric mean of `near` and `far`.
+        The typical depth is taken to be the geometric mean of `near` and `far`. With `causal`, frames keep their order.
         """
         used = _indices(self, indices)
+        if config.stream.causal:
+            return used
         centers = np.stack([self.frames[i].center for i in used])
         return interleave(
             centers,
@@ -206,6 +216,23 @@ class Capture:
             images[row], Ks[row] = self.image(i), self.K(i)
         viewmats[: len(group)] = frame.viewmats(np.stack([self.frames[i].camtoworld for i in group]))
         return images, viewmats, Ks, np.arange(chunk_size) < len(group)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Some:
+    """The images of some frames, by their place in `indices`."""
+
+    pixels: Pixels
+    indices: Sequence[int]
+
+    def image(self, i: int) -> Float32[np.ndarray, "h w 3"]:
+        return self.pixels.image(self.indices[i])
+
+    def depth(self, i: int) -> Float32[np.ndarray, "h w"] | None:
+        return self.pixels.depth(self.indices[i])
+
+    def has_depth(self, i: int) -> bool:
+        return self.pixels.has_depth(self.indices[i])
 
 
 def open_capture(path: str | Path, *, size: tuple[int, int] | None = None) -> Capture:

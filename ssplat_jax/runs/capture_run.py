@@ -143,6 +143,7 @@ def _stream(
         for number, fed in enumerate(chunks, start=1):
             interrupts.has_work = True
             run.exposures |= fed.exposures
+            run.frame = fed.frame
             if deltas is not None:
                 deltas.write(run)
             advance(run.num_views)

@@ -3,12 +3,15 @@
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from ssplat_jax.chunk import Chunk
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.stream_frame import StreamFrame
+from ssplat_jax.pytree import replace
+from ssplat_jax.streaming.causal_range import widen_range
 from ssplat_jax.streaming.session import Session
 from ssplat_jax.streaming.streamsplat import ChunkOutput
 
@@ -33,6 +36,7 @@ class FedChunk:
     chunk: Chunk
     frames: list[int]  # frame numbers of the chunk's valid views, in their order
     output: ChunkOutput
+    frame: StreamFrame  # of the next chunk: with `causal`, near and far may have moved outward
 
     @property
     def exposures(self) -> Exposures:
@@ -43,6 +47,8 @@ class FedChunk:
 
 def feed_chunks(session: Session, capture: Capture, order: Sequence[int], frame: StreamFrame) -> Iterator[FedChunk]:
     """Feeds frames of a capture to a session and yields after each chunk.
+
+    With `causal`, near and far of a chunk follow from the chunks before it (`streaming.causal_range`).
 
     Args:
         session: the stream; its cache grows in place.
@@ -57,7 +63,12 @@ def feed_chunks(session: Session, capture: Capture, order: Sequence[int], frame:
     for chunk in capture.chunks(config, order, frame=frame):
         frames = list(order[num_fed : num_fed + config.stream.chunk_size])
         num_fed += len(frames)
-        yield FedChunk(chunk, frames, session.feed(chunk))
+        if config.stream.causal:
+            chunk = replace(chunk, near=jnp.float32(frame.near), far=jnp.float32(frame.far))
+        output = session.feed(chunk)
+        if config.stream.causal:
+            frame = widen_range(frame, output, config)
+        yield FedChunk(chunk, frames, output, frame)
 
 
 def feed_capture(

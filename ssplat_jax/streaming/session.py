@@ -10,8 +10,11 @@ from ssplat_jax.cache import VoxelCache, check_cache, ensure_capacity
 from ssplat_jax.cache.state import init_cache
 from ssplat_jax.chunk import Chunk
 from ssplat_jax.config import StreamConfig
+from ssplat_jax.data.stream_frame import StreamFrame
+from ssplat_jax.errors import refusal
 from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.model import GRID_STRIDE
+from ssplat_jax.streaming.live_views import LiveViews
 from ssplat_jax.streaming.streamsplat import ChunkOutput, StreamSplat, shown_pivots
 
 INITIAL_CHUNKS = 4
@@ -28,10 +31,23 @@ class Session:
         model: the model to run.
         params: the model's parameters.
         cache: the cache to continue from; by default an empty one with capacity for a few chunks.
+        causal: the model's configuration with `stream.causal`: no result depends on a later frame.
+        frame: stream frame of `cache`, for `push`; by default that of the first chunk that is pushed.
     """
 
-    def __init__(self, model: StreamSplat, params: dict, cache: VoxelCache | None = None) -> None:
+    def __init__(
+        self,
+        model: StreamSplat,
+        params: dict,
+        cache: VoxelCache | None = None,
+        *,
+        causal: bool = False,
+        frame: StreamFrame | None = None,
+    ) -> None:
+        if causal:
+            model = dataclasses.replace(model, config=model.config.replace(causal=True))
         self.model, self.params, self.cache = model, params, cache
+        self._live = LiveViews(model.config, frame)
         self.compile_seconds = 0.0
         self.num_compilations = 0
         self._programs: dict[tuple, jax.stages.Compiled] = {}
@@ -53,6 +69,48 @@ class Session:
         self.cache, out = jax.block_until_ready(step(self.params, self.cache, chunk))
         check_cache(self.cache, config)
         return out
+
+    def push(self, image: object, K: object, viewmat: object) -> ChunkOutput | None:
+        """Takes one view of a live source, and streams a chunk when enough views have come.
+
+        Near, far and scale come from the first chunk, as with `causal`; `frame` then holds them. A later chunk that
+        contradicts near or far moves them outward for the chunks after it (`streaming.causal_range`).
+
+        Args:
+            image: RGB, height x width x 3, as float in [0, 1] or as uint8.
+            K: 3x3 intrinsics, pixels; the center of the first pixel is (0.5, 0.5).
+            viewmat: 4x4 world-to-camera transform with OpenCV axes, in any world of one scale.
+
+        Returns:
+            The summary of the chunk that the view completed, or None while views are missing.
+
+        Raises:
+            InputError: a value cannot be used, or the image has another size than the first.
+            CacheError: see `feed`.
+        """
+        if self.cache is not None and self.frame is None:
+            fix = "give Session(..., frame=StreamFrame) too, or push all views"
+            raise refusal("push", wanted="the stream frame of the cache that is continued", got="none", fix=fix)
+        return self._feed_live(self._live.add(image, K, viewmat))
+
+    def flush(self) -> ChunkOutput | None:
+        """Streams the views that wait for their chunk, however few, padded with invalid ones; None if none wait.
+
+        A view alone has no partner to match: its depth rests on the history. Views may be pushed afterwards.
+        """
+        return self._feed_live(self._live.rest())
+
+    def _feed_live(self, chunk: Chunk | None) -> ChunkOutput | None:
+        if chunk is None:
+            return None
+        output = self.feed(chunk)
+        self._live.learn(output)
+        return output
+
+    @property
+    def frame(self) -> StreamFrame | None:
+        """The stream frame of the views pushed, with near and far of the next chunk; None before the first chunk."""
+        return self._live.frame
 
     def gaussians(self) -> Gaussians:
         """The scene so far, in the stream frame: the Gaussians of `model.decode`, then padding rows of opacity 0.
