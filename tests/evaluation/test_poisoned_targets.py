@@ -1,0 +1,88 @@
+"""No pixel of a target reaches a result that is not a score: targets are poisoned, and everything else is equal."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+from ssplat_jax.data.capture import open_capture
+from ssplat_jax.data.images import ArrayPixels
+from ssplat_jax.data.split import interleaved_split
+from ssplat_jax.evaluation import evaluate as evaluation
+from ssplat_jax.evaluation import latency
+from ssplat_jax.evaluation.scoring import score_view
+from ssplat_jax.streaming.session import Session
+from ssplat_jax.streaming.streamsplat import StreamSplat
+from tests.streaming.narrow_model import NARROW, assert_same_bits
+
+SPLIT = interleaved_split(14, 1, 10)
+POISONS = {
+    "noise": lambda images: np.random.default_rng(3).uniform(size=images.shape),
+    "NaN": lambda images: np.full(images.shape, np.nan),
+}
+
+
+@pytest.fixture(scope="module")
+def capture():
+    return open_capture("procedural:room?frames=14&size=48x32")
+
+
+@pytest.fixture(scope="module")
+def params():
+    return StreamSplat(NARROW).init(jax.random.key(0))
+
+
+def poisoned(capture, frames, poison):
+    images = np.stack([capture.image(i) for i in range(len(capture))])
+    images[list(frames)] = poison(images[list(frames)])
+    depths = np.zeros(images.shape[:3], np.float32)
+    return dataclasses.replace(capture, pixels=ArrayPixels(images.astype(np.float32), depths))
+
+
+def evaluated(capture, params, causal, out, monkeypatch):
+    """Everything that an evaluation makes besides scores: frame, exposures, cache, scene and rendered pictures."""
+    rendered = []
+
+    def watched(gaussians, scored, i, frame, exposures, *rest):
+        # A score against NaN is NaN, which JSON does not hold: the render is kept, the score taken of something else.
+        blank = np.zeros((len(scored), scored.height, scored.width, 3), np.float32)
+        view = score_view(gaussians, dataclasses.replace(scored, pixels=ArrayPixels(blank, blank[..., 0])), i, frame,
+                          exposures, *rest)  # fmt: skip
+        rendered.append((view.color, view.depth))
+        return view
+
+    monkeypatch.setattr(evaluation, "score_view", watched)
+    monkeypatch.setattr(evaluation, "baselines", lambda capture, split: {})
+    monkeypatch.setattr(latency, "NUM_REPEATS", 1)
+    session = Session(StreamSplat(NARROW), params, causal=causal)
+    metrics = evaluation.evaluate(session, capture, SPLIT, out)
+    facts = {name: metrics[name] for name in ("stream_frame", "exposures", "cache", "num_gaussians", "split_sha256")}
+    return facts, (session.cache, session.gaussians(), rendered)
+
+
+@pytest.mark.parametrize("causal", [False, True])
+def test_poisoned_targets_change_nothing_but_scores(causal, capture, params, tmp_path, monkeypatch):
+    facts, arrays = evaluated(capture, params, causal, tmp_path / "clean", monkeypatch)
+    for name, poison in POISONS.items():
+        other = poisoned(capture, SPLIT.targets, poison)
+        got, there = evaluated(other, params, causal, tmp_path / name, monkeypatch)
+        assert got == facts, name
+        assert_same_bits(there, arrays)
+
+
+def test_a_poisoned_context_view_is_noticed(capture, params, tmp_path, monkeypatch):
+    """The comparison above can fail."""
+    facts, _ = evaluated(capture, params, False, tmp_path / "clean", monkeypatch)
+    other = poisoned(capture, SPLIT.context[-1:], POISONS["noise"])
+    assert evaluated(other, params, False, tmp_path / "noise", monkeypatch)[0] != facts
+
+
+def test_the_scores_do_see_their_targets(capture, params, tmp_path, monkeypatch):
+    monkeypatch.setattr(latency, "NUM_REPEATS", 1)
+    clean, noisy = (
+        evaluation.evaluate(Session(StreamSplat(NARROW), params), c, SPLIT, tmp_path / name)
+        for name, c in (("clean", capture), ("noise", poisoned(capture, SPLIT.targets, POISONS["noise"])))
+    )
+    assert clean["shown"]["psnr"] != noisy["shown"]["psnr"]
+    assert clean["literal"]["psnr"] != noisy["literal"]["psnr"]
