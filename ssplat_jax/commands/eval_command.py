@@ -11,6 +11,7 @@ from ssplat_jax.commands.options import (
     QualityOption,
     QuietOption,
     WeightsOption,
+    causal_changes,
     load_lpips_weights,
     load_model,
     parse_size,
@@ -21,27 +22,40 @@ from ssplat_jax.errors import InputError
 
 @dataclasses.dataclass(frozen=True)
 class Eval:
-    """Score novel views of a capture: metrics.json and target | render | depth pictures.
+    """Score novel views of a capture: metrics.json, index.json and target | render | depth pictures.
 
-    Example: ssplat eval path/to/capture --stride 5 --context 64 --size 320x240 --out runs/eval
+    Frames that are not chosen fit the capture. With --index, the capture may be a folder of the scenes in the index.
+
+    Example: ssplat eval path/to/capture --size 320x240 --out runs/eval
     """
 
     capture: CapturePath
-    context: int
-    """Context views to stream."""
     out: Path
     """Folder of the results."""
-    protocol: Literal["interleaved", "paper"] = "interleaved"
-    """interleaved: every 8th frame from the 5th on is a target. paper: targets uniform over the trajectory."""
-    stride: int = 1
-    """Use every STRIDE-th frame."""
+    context: int | None = None
+    """Context views to stream; default 64, or as many as there are."""
+    protocol: Literal["interleaved", "paper", "scannet"] = "interleaved"
+    """interleaved: every 8th frame from the 5th on is a target. paper: targets uniform over the trajectory. scannet:
+    paper's, thinned to 1088 frames, with 64 targets and 8 anchors first."""
+    stride: int | None = None
+    """Use every STRIDE-th frame; default 1, or with neither --context nor --protocol so that 73 frames are left."""
     targets: int | None = None
-    """paper: number of targets, default 16. interleaved: most targets to keep, evenly spread."""
+    """paper: number of targets, default 16; scannet: 64. interleaved: most targets to keep, evenly spread."""
+    index: Path | None = None
+    """Index file {scene: {"context": [], "target": []} | null} that names the frames, instead of a protocol."""
+    scene: str | None = None
+    """Scene of the index; default the capture's name."""
     size: str | None = None
     """Image size WxH of the scored views; default the capture's own. --quality sets the streamed size."""
     quality: QualityOption = "accurate"
     refine: int = 0
     """Gradient steps on the context views after the stream; the scores before are reported too."""
+    over_black: bool = False
+    """Pictures show holes black instead of in the colors around them."""
+    one_exposure: bool = False
+    """Pictures are at the exposure of the first views instead of that of the nearest streamed ones."""
+    causal: bool = False
+    """No look-ahead: near, far and scale come from the first chunk, and frames keep their order."""
     weights: WeightsOption = "tiny"
     lpips_vgg: Path | None = None
     """torchvision's vgg16 state dict (.pth or .npz): with --lpips-heads, LPIPS is scored too."""
@@ -51,40 +65,53 @@ class Eval:
 
     def run(self) -> int:
         from ssplat_jax.console import Reporter
-        from ssplat_jax.data.capture import open_capture
-        from ssplat_jax.data.split import choose_split
-        from ssplat_jax.evaluation.evaluate import evaluate
-        from ssplat_jax.streaming.session import Session
+        from ssplat_jax.evaluation.scoring import Display
+        from ssplat_jax.runs.eval_run import EvalOptions, eval_path
 
         if self.refine < 0:
             raise InputError(f"--refine: wanted a number of steps of at least 0, got {self.refine}.")
         lpips_weights = load_lpips_weights(self.lpips_vgg, self.lpips_heads)
-        model, params = load_model(self.weights, self.set)
-        capture = open_capture(self.capture, size=parse_size(self.size))
-        streamed = capture.scaled(QUALITIES[self.quality].scale)
-        split = choose_split(self.protocol, len(capture), self.stride, self.context, self.targets)
-        metrics = evaluate(
-            Session(model, params),
-            capture,
-            split,
-            self.out,
-            Reporter(self.quiet),
-            streamed=streamed,
-            lpips_weights=lpips_weights,
+        model, params = load_model(self.weights, causal_changes(self.set, self.causal))
+        options = EvalOptions(
+            size=parse_size(self.size),
+            scale=QUALITIES[self.quality].scale,
+            protocol=self.protocol,
+            stride=self.stride,
+            context=self.context,
+            targets=self.targets,
+            index=self.index,
+            scene=self.scene,
             refine_steps=self.refine,
+            lpips_weights=lpips_weights,
+            display=Display(self.over_black, self.one_exposure),
         )
+        metrics = eval_path(model, params, self.capture, self.out, options, Reporter(self.quiet))
+        if "scenes" in metrics:
+            print(f"{len(metrics['scenes'])} scenes: {_both_scores(metrics['over_scenes'])}; {self.out}/metrics.json")
+        else:
+            self._print(metrics)
+        return 0
+
+    def _print(self, metrics: dict) -> None:
+        """Prints the scores of one capture."""
         reference = metrics["baselines"]
         print(
-            f"{capture.name}, {metrics['target_views']} views: {_both_scores(metrics)} (copying the nearest view"
+            f"{metrics['capture']}, {metrics['target_views']} views: {_both_scores(metrics)} (copying the nearest view"
             f" {reference['nearest_view_psnr']:.2f}, a mean color {reference['mean_color_psnr']:.2f});"
             f" {metrics['chunk_ms']['median']:.0f} ms a chunk; {self.out}/metrics.json"
         )
+        if self.over_black or self.one_exposure:
+            print(f"pictures{_how(self.over_black, self.one_exposure)}: {metrics['pictures']['psnr']:.2f} dB")
         if refined := metrics.get("refinement"):
             print(
                 f"before {refined['steps']} refinement steps of {refined['seconds_per_step']:.2f} s:"
                 f" {_both_scores(refined['before'])}"
             )
-        return 0
+
+
+def _how(over_black: bool, one_exposure: bool) -> str:
+    """The flags of the pictures in words."""
+    return (" over black" if over_black else "") + (" at one exposure" if one_exposure else "")
 
 
 def _both_scores(scores: dict) -> str:

@@ -3,8 +3,13 @@
 interleaved   Of every `stride`-th frame, those at positions 4, 12, 20, ... are targets, and the first V others are
               context. Targets outside the span of the context are dropped, since they show unseen space.
 paper         The protocol of StreamSplat's appendix: targets are uniform over the trajectory, including both ends, and
-              the first V of the other frames are context. On ScanNet the trajectory is thinned to 1088 frames, and 8
-              anchors, spread over it, come first.
+              the first V of the other frames are context.
+scannet       The same with 64 targets: the trajectory is thinned to 1088 frames, and 8 anchors, spread over it, come
+              first. Chunks take the context in that order. A trajectory of fewer frames is used whole; one without room
+              for all targets and V other frames is refused.
+index         Context and targets of an index file (`index_files.py`); chunks take the context in its order.
+
+Counts that are not given fit the capture: see `choose_split`.
 """
 
 import dataclasses
@@ -16,6 +21,12 @@ import numpy as np
 from ssplat_jax.errors import refusal
 
 FIRST_TARGET, TARGET_STEP = 4, 8  # first position and spacing of the interleaved targets
+USUAL_CONTEXT = 64  # context views where none are given, if there are as many
+USUAL_FRAMES = 73  # those context views and the interleaved targets between them
+PAPER_TARGETS = 16
+MAX_TARGET_SHARE = 0.25  # of the frames that become targets of `paper` where their number is not given
+SCANNET_FRAMES, SCANNET_TARGETS, SCANNET_ANCHORS = 1088, 64, 8
+PROTOCOLS = ("interleaved", "paper", "scannet")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,6 +41,11 @@ class Split:
         used = self.context + self.targets
         if len(set(used)) != len(used):
             raise ValueError("a frame occurs twice in the split.")
+
+    @property
+    def keeps_order(self) -> bool:
+        """Whether chunks take the context in its order, without interleaving."""
+        return self.protocol in ("scannet", "index")
 
     def to_json(self) -> str:
         """Returns canonical JSON: equal splits give equal text."""
@@ -112,16 +128,34 @@ def _check_counts(**counts: int) -> None:
             raise refusal(name, wanted="at least 1", got=str(count), fix="ask for a positive number")
 
 
-def choose_split(protocol: str, num_frames: int, stride: int, context: int, targets: int | None) -> Split:
+def scannet_split(num_frames: int, context: int, targets: int = SCANNET_TARGETS) -> Split:
+    """Returns the split of the paper's appendix for ScanNet; `protocol` is "scannet".
+
+    Raises:
+        InputError: the trajectory has no room for that many targets and context views.
+    """
+    if num_frames < targets + context:
+        got, fix = f"{num_frames} frames", "leave the scene out (null in an index file), or ask for fewer"
+        raise refusal("scannet", wanted=f"{targets} targets and {context} other frames", got=got, fix=fix)
+    split = paper_split(
+        num_frames, context, targets=targets, anchors=min(SCANNET_ANCHORS, context), thin_to=SCANNET_FRAMES
+    )
+    return dataclasses.replace(split, protocol="scannet")
+
+
+def choose_split(
+    protocol: str, num_frames: int, stride: int | None, context: int | None, targets: int | None = None
+) -> Split:
     """Returns the split for the options of the command line.
 
     Args:
-        protocol: "interleaved" or "paper".
+        protocol: "interleaved", "paper" or "scannet".
         num_frames: number of frames of the capture.
-        stride: every `stride`-th frame is used.
-        context: number of context views.
-        targets: for "paper", the number of targets (default 16); for "interleaved", the largest number of targets
-            that are kept, evenly spaced (default: all).
+        stride: every `stride`-th frame is used. By default 1; without `context` and with `interleaved`, the largest
+            stride that leaves 73 frames.
+        context: number of context views; by default 64, or as many as there are.
+        targets: for "paper", the number of targets (default 16, or a quarter of a short capture); for "scannet" too
+            (default 64); for "interleaved", the largest number of targets that are kept, evenly spaced (default: all).
 
     Returns:
         The split.
@@ -129,17 +163,42 @@ def choose_split(protocol: str, num_frames: int, stride: int, context: int, targ
     Raises:
         InputError: the protocol is unknown, or there are too few frames.
     """
-    if protocol == "interleaved":
-        split = interleaved_split(num_frames, stride, context)
-        if targets is None:
-            return split
-        _check_counts(targets=targets)
-        kept = tuple(split.targets[p] for p in _uniform(len(split.targets), targets))
-        return dataclasses.replace(split, targets=kept)
-    if protocol != "paper":
-        raise refusal("protocol", wanted="interleaved or paper", got=repr(protocol), fix="choose one of them")
+    if protocol not in PROTOCOLS:
+        raise refusal("protocol", wanted=" or ".join(PROTOCOLS), got=repr(protocol), fix="choose one of them")
+    if stride is None:
+        stride = max(1, num_frames // USUAL_FRAMES) if protocol == "interleaved" and context is None else 1
     _check_counts(stride=stride)
     taken = range(0, num_frames, stride)
-    split = paper_split(len(taken), context, targets=16 if targets is None else targets)
+    if protocol == "interleaved":
+        return _choose_interleaved(num_frames, stride, context, targets)
+    if protocol == "scannet":
+        num_targets = SCANNET_TARGETS if targets is None else targets
+        split = scannet_split(len(taken), _usual_context(len(taken), num_targets, context), num_targets)
+    else:
+        few = max(1, int(MAX_TARGET_SHARE * len(taken))) if context is None else PAPER_TARGETS
+        num_targets = min(PAPER_TARGETS, few) if targets is None else targets
+        split = paper_split(len(taken), _usual_context(len(taken), num_targets, context), targets=num_targets)
     at = lambda positions: tuple(taken[p] for p in positions)  # noqa: E731
-    return Split(protocol="paper", context=at(split.context), targets=at(split.targets))
+    return dataclasses.replace(split, context=at(split.context), targets=at(split.targets))
+
+
+def _usual_context(num_frames: int, targets: int, context: int | None) -> int:
+    """The number of context views: as asked for, or the usual one, or as many as the targets leave."""
+    return max(1, min(USUAL_CONTEXT, num_frames - targets)) if context is None else context
+
+
+def _choose_interleaved(num_frames: int, stride: int, context: int | None, targets: int | None) -> Split:
+    """The interleaved split, with at most `targets` targets."""
+    if context is None:
+        num_taken = len(range(0, num_frames, stride))
+        num_targets = len(range(FIRST_TARGET, num_taken, TARGET_STEP))
+        context = _usual_context(num_taken, num_targets, None)
+        if num_taken <= FIRST_TARGET + 1:
+            wanted = f"at least {FIRST_TARGET + 2} frames for a target between context views"
+            raise refusal("eval", wanted=wanted, got=f"{num_taken}", fix="use a longer capture or a smaller --stride")
+    split = interleaved_split(num_frames, stride, context)
+    if targets is None:
+        return split
+    _check_counts(targets=targets)
+    kept = tuple(split.targets[p] for p in _uniform(len(split.targets), targets))
+    return dataclasses.replace(split, targets=kept)

@@ -5,14 +5,17 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+
 from ssplat_jax.console import Reporter
 from ssplat_jax.data.capture import Capture
+from ssplat_jax.data.index_files import index_to_json
 from ssplat_jax.data.split import Split
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.evaluation import latency
 from ssplat_jax.evaluation.exposures import exposures_to_json
 from ssplat_jax.evaluation.pictures import save_comparison
-from ssplat_jax.evaluation.scoring import ViewScore, baselines, check_scorable, mean_scores, score_view
+from ssplat_jax.evaluation.scoring import Display, ViewScore, baselines, check_scorable, mean_scores, score_view
 from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.metrics.lpips import LpipsWeights, check_size
 from ssplat_jax.metrics.psnr_ssim import SSIM_ARGUMENTS
@@ -35,11 +38,14 @@ def evaluate(
     streamed: Capture | None = None,
     lpips_weights: LpipsWeights | None = None,
     refine_steps: int = 0,
+    scene: str | None = None,
+    display: Display | None = None,
 ) -> dict:
-    """Streams, scores and times; writes `metrics.json`, `split.json` and a picture per target into `out`.
+    """Streams, scores and times; writes metrics, split, index and a picture per target into `out`.
 
-    A picture is target | render | depth. `split.json` holds the frames used; its SHA-256 is in the metrics. Every frame
-    is decoded once before anything is written, so that a damaged one leaves no partial result.
+    A picture is target | render | depth. `split.json` holds the frames used; its SHA-256 is in the metrics.
+    `index.json` holds them as an index file (`data.index_files`). Every frame is decoded once before anything is
+    written, so that a damaged one leaves no partial result.
 
     Args:
         session: a new session with the model and its parameters.
@@ -51,6 +57,8 @@ def evaluate(
         lpips_weights: with them LPIPS is scored too; without, the fields `lpips` are null.
         refine_steps: gradient steps on the context views before the targets are scored. With them the metrics have a
             block `refinement`: the steps done, their seconds, and the scores before.
+        scene: name in `index.json`; by default the capture's.
+        display: how pictures are made; the block `pictures` of the metrics holds it, and the mean PSNR of the pictures.
 
     Returns:
         The metrics as written.
@@ -68,7 +76,13 @@ def evaluate(
     reference = baselines(capture, split)
     with reporter.progress("streaming", len(split.context)) as advance:
         exposures, recent = feed_capture(
-            session, streamed, split.context, frame, num_recent=latency.NUM_CHUNKS, on_chunk=advance
+            session,
+            streamed,
+            split.context,
+            frame,
+            keep_order=split.keeps_order,
+            num_recent=latency.NUM_CHUNKS,
+            on_chunk=advance,
         )
     cost = {  # before the latency is measured, for which the cache may grow and a step be compiled
         "compile_s": round(session.compile_seconds, 2),
@@ -82,7 +96,8 @@ def evaluate(
         before = [score_view(gaussians, capture, i, frame, exposures, lpips_weights).score for i in split.targets]
         gaussians, done = _refine(gaussians, streamed, split.context, frame, exposures, refine_steps, reporter)
         refinement = {"refinement": {**done, "before": mean_scores(before)}}
-    scores = _score_targets(gaussians, capture, split, frame, exposures, lpips_weights, folder)
+    display = display or Display()
+    scores = _score_targets(gaussians, capture, split, frame, exposures, lpips_weights, display, folder)
     middle = split.targets[len(split.targets) // 2]
     timing = latency.measure_latency(session, recent, capture.camera(middle, frame))
     metrics = {
@@ -94,6 +109,7 @@ def evaluate(
         "context_views": len(split.context),
         "target_views": len(split.targets),
         **mean_scores(scores),
+        "pictures": dataclasses.asdict(display) | {"psnr": round(float(np.mean([*map(display.psnr, scores)])), 4)},
         "ssim_arguments": SSIM_ARGUMENTS,
         **refinement,
         **timing,
@@ -105,6 +121,7 @@ def evaluate(
         "per_view": [dataclasses.asdict(s) for s in scores],
     }
     write_atomic(folder.split, split.to_json().encode())
+    write_json(folder.index, index_to_json({scene or capture.name: split}))
     write_json(folder.metrics, metrics)
     return metrics
 
@@ -156,12 +173,13 @@ def _score_targets(
     frame: StreamFrame,
     exposures: Exposures,
     lpips_weights: LpipsWeights | None,
+    display: Display,
     folder: RunFolder,
 ) -> list[ViewScore]:
     """Scores of the targets, whose pictures are written."""
     scores = []
     for i in split.targets:
-        view = score_view(gaussians, capture, i, frame, exposures, lpips_weights)
+        view = score_view(gaussians, capture, i, frame, exposures, lpips_weights, display)
         save_comparison(folder.target(i), view.target, view.color, view.depth, (frame.near, frame.far))
         scores.append(view.score)
     return scores

@@ -46,12 +46,26 @@ class ViewScore:
 
 
 @dataclasses.dataclass(frozen=True)
+class Display:
+    """How a rendered view becomes a picture; with both flags it is the literal image."""
+
+    over_black: bool = False  # holes stay black instead of being filled
+    one_exposure: bool = False  # at the scene's own exposure, that of the first views
+
+    def psnr(self, score: ViewScore) -> float:
+        """The PSNR, in dB, of the picture."""
+        if self.over_black:
+            return score.literal.psnr if self.one_exposure else score.psnr_over_black
+        return score.psnr_one_exposure if self.one_exposure else score.shown.psnr
+
+
+@dataclasses.dataclass(frozen=True)
 class ScoredView:
     """A rendered view, its scores, and the image that it was compared with."""
 
     score: ViewScore
     target: Float[np.ndarray, "h w 3"]
-    color: Float[np.ndarray, "h w 3"]  # what `score.shown` compares: holes filled, exposed, clipped to [0, 1]
+    color: Float[np.ndarray, "h w 3"]  # the picture: by default what `score.shown` compares; clipped to [0, 1]
     depth: Float[np.ndarray, "h w"]  # stream units, 0 where nothing is
 
 
@@ -75,6 +89,7 @@ def score_view(
     frame: StreamFrame,
     exposures: Exposures,
     lpips_weights: LpipsWeights | None = None,
+    display: Display | None = None,
 ) -> ScoredView:
     """Renders frame `i` of a capture and scores it.
 
@@ -89,6 +104,7 @@ def score_view(
         frame: the similarity between the capture's frame and the stream's.
         exposures: exposures of the streamed frames; may be empty.
         lpips_weights: with them LPIPS is scored too.
+        display: how the picture is made; the scores do not depend on it.
 
     Raises:
         InputError: the image is damaged.
@@ -107,7 +123,9 @@ def score_view(
         psnr_one_exposure=psnr(_displayed(filled), target),
         coverage=float(np.asarray(out.alpha).mean()),
     )
-    return ScoredView(score, target, color, np.asarray(out.depth))
+    display = display or Display()
+    picture = _displayed(over_black if display.over_black else filled, 1.0 if display.one_exposure else exposure)
+    return ScoredView(score, target, picture, np.asarray(out.depth))
 
 
 def _displayed(image: Float[np.ndarray, "h w 3"], exposure: Float[np.ndarray, "3"] | float = 1.0):

@@ -49,6 +49,11 @@ class RunFolder:
         return self.path / "split.json"
 
     @property
+    def index(self) -> Path:
+        """The frames of an evaluation as an index file."""
+        return self.path / "index.json"
+
+    @property
     def film(self) -> Path:
         """The film that `ssplat render --film` writes."""
         return self.path / "film.mp4"

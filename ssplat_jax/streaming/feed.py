@@ -77,16 +77,18 @@ def feed_capture(
     indices: Sequence[int],
     frame: StreamFrame,
     *,
+    keep_order: bool = False,
     num_recent: int = 0,
     on_chunk: Callable[[int], None] = lambda num_views: None,
 ) -> tuple[Exposures, list[Chunk]]:
-    """Feeds all frames `indices` of a capture, in stream order, to a session.
+    """Feeds all frames `indices` of a capture to a session, in stream order unless `keep_order`.
 
     Args:
         session: the stream; its cache grows in place.
         capture: where the images come from.
         indices: frame numbers, in any order.
         frame: the similarity between the capture's frame and the stream's.
+        keep_order: stream `indices` in their order, without interleaving.
         num_recent: how many of the last chunks to return.
         on_chunk: called after each chunk with the number of views fed so far.
 
@@ -95,7 +97,7 @@ def feed_capture(
     """
     exposures: Exposures = {}
     recent: list[Chunk] = []
-    order = capture.stream_order(session.model.config, indices, frame)
+    order = list(indices) if keep_order else capture.stream_order(session.model.config, indices, frame)
     for fed in feed_chunks(session, capture, order, frame):
         exposures |= fed.exposures
         recent = [*recent, fed.chunk][-num_recent:] if num_recent else []

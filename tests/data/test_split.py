@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ssplat_jax.data.split import Split, interleaved_split, paper_split
+from ssplat_jax.data.split import Split, choose_split, interleaved_split, paper_split
 from ssplat_jax.errors import InputError
 
 
@@ -104,3 +104,45 @@ def test_json_and_digest_identify_the_split():
 def test_a_split_with_a_shared_frame_cannot_be_made():
     with pytest.raises(ValueError, match="twice"):
         Split(protocol="own", context=(0, 1), targets=(1,))
+
+
+@pytest.mark.parametrize("protocol", ["interleaved", "paper"])
+@pytest.mark.parametrize("num_frames", [6, 12, 24, 72, 73, 146, 366, 3000])
+def test_a_capture_of_any_length_has_a_split(protocol, num_frames):
+    split = choose_split(protocol, num_frames, None, None)
+    assert len(split.context) == min(64, len(split.context)) and len(split.targets) >= 1
+    used = len(split.context) + len(split.targets)
+    assert used >= min(73, num_frames)  # of a short capture every frame
+    if protocol == "interleaved":
+        assert split.context[-1] >= 0.5 * num_frames - 1  # the context reaches over most of the trajectory
+
+
+def test_twenty_four_frames_are_all_used():
+    split = choose_split("interleaved", 24, None, None)
+    assert split.targets == (4, 12, 20) and len(split.context) == 21
+
+
+def test_a_given_context_keeps_the_stride_of_one():
+    assert choose_split("interleaved", 1000, None, 8) == interleaved_split(1000, 1, 8)
+
+
+def test_the_scannet_protocol_is_the_papers():
+    split = choose_split("scannet", 2000, None, 24)
+    assert split.protocol == "scannet" and split.keeps_order
+    paper = paper_split(2000, 24, targets=64, anchors=8, thin_to=1088)
+    assert (split.context, split.targets) == (paper.context, paper.targets)
+    assert split.context[:8] != tuple(sorted(split.context))[:8]  # the anchors come first
+    assert not choose_split("paper", 2000, None, 24).keeps_order
+
+
+def test_a_short_scene_is_not_thinned_and_a_too_short_one_refused():
+    exact = choose_split("scannet", 64 + 24, None, 24)
+    assert len(exact.targets) == 64 and len(exact.context) == 24
+    assert sorted(exact.context + exact.targets) == list(range(88))
+    with pytest.raises(InputError, match=r"wanted 64 targets and 24 other frames, got 87 frames.*leave the scene out"):
+        choose_split("scannet", 87, None, 24)
+
+
+def test_five_frames_have_no_target_between_context_views():
+    with pytest.raises(InputError, match="at least 6 frames"):
+        choose_split("interleaved", 5, None, None)

@@ -1,0 +1,162 @@
+"""`ssplat eval`: one capture, or the scenes of an index file, each in a folder of its own."""
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ssplat_jax.console import Reporter
+from ssplat_jax.data.capture import READERS, Capture, open_capture
+from ssplat_jax.data.index_files import Index, index_to_json, read_index, split_of_scene
+from ssplat_jax.data.split import Split, choose_split
+from ssplat_jax.errors import InputError, echo, refusal
+from ssplat_jax.evaluation.evaluate import evaluate
+from ssplat_jax.evaluation.scoring import Display
+from ssplat_jax.metrics.lpips import LpipsWeights
+from ssplat_jax.storage.json_files import write_json
+from ssplat_jax.storage.run_folder import RunFolder
+from ssplat_jax.streaming.session import Session
+from ssplat_jax.streaming.streamsplat import StreamSplat
+
+SCORES = ("literal", "shown", "psnr_over_black", "psnr_one_exposure")
+"""Scores of a scene that are averaged over scenes."""
+
+
+@dataclasses.dataclass(frozen=True)
+class EvalOptions:
+    """What is scored, and how."""
+
+    size: tuple[int, int] | None = None  # (width, height) of the scored views; None for the capture's own
+    scale: float = 1.0  # of the streamed images relative to the scored ones
+    protocol: str = "interleaved"  # see `data.split`
+    stride: int | None = None
+    context: int | None = None
+    targets: int | None = None
+    index: Path | None = None  # an index file, instead of protocol, stride, context and targets
+    scene: str | None = None  # its scene; None for the name of the capture
+    refine_steps: int = 0
+    lpips_weights: LpipsWeights | None = None
+    display: Display = dataclasses.field(default_factory=Display)
+
+
+def eval_path(
+    model: StreamSplat, params: dict, path: str, out: Path, options: EvalOptions, reporter: Reporter
+) -> dict[str, Any]:
+    """Scores a capture, or every scene of an index file below a folder.
+
+    Args:
+        model: the model to run.
+        params: the model's parameters.
+        path: the capture; with an index also a folder that holds a capture for each scene of the index.
+        out: folder of the results; of many scenes, each has a folder in it.
+        options: what is scored.
+        reporter: shows progress and warnings.
+
+    Returns:
+        The metrics of the capture (`evaluate`), or of the scenes (`scene_metrics`), as written to metrics.json.
+
+    Raises:
+        InputError: a capture or the index is unusable, or options contradict each other.
+        StorageError: `out` cannot be written.
+    """
+    if options.index is None:
+        if options.scene is not None:
+            raise InputError("--scene: wanted --index beside it, whose scene it names; got none.")
+        capture = open_capture(path, size=options.size)
+        split = choose_split(options.protocol, len(capture), options.stride, options.context, options.targets)
+        return _evaluate(model, params, capture, split, out, options, reporter, None)
+    given = {name: getattr(options, name) for name in ("stride", "context", "targets")}
+    given["protocol"] = None if options.protocol == "interleaved" else options.protocol
+    if clash := [name for name, value in given.items() if value is not None]:
+        raise refusal("--index", wanted="no frames chosen otherwise", got=f"--{clash[0]} too", fix="leave one out")
+    index, notes = read_index(options.index)
+    reporter.warn_all(*notes)
+    folder = Path(path).expanduser()
+    if options.scene is None and folder.is_dir() and not any(reader.matches(folder) for reader in READERS):
+        return _eval_scenes(model, params, folder, out, index, options, reporter)
+    capture = open_capture(path, size=options.size)
+    scene = options.scene or capture.name
+    split = split_of_scene(index, scene, len(capture))
+    return _evaluate(model, params, capture, split, out, options, reporter, scene)
+
+
+def _evaluate(
+    model: StreamSplat,
+    params: dict,
+    capture: Capture,
+    split: Split,
+    out: Path,
+    options: EvalOptions,
+    reporter: Reporter,
+    scene: str | None,
+) -> dict[str, Any]:
+    """The metrics of one capture, in a session of its own."""
+    return evaluate(
+        Session(model, params),
+        capture,
+        split,
+        out,
+        reporter,
+        streamed=capture.scaled(options.scale),
+        lpips_weights=options.lpips_weights,
+        refine_steps=options.refine_steps,
+        scene=scene,
+        display=options.display,
+    )
+
+
+def _eval_scenes(
+    model: StreamSplat, params: dict, folder: Path, out: Path, index: Index, options: EvalOptions, reporter: Reporter
+) -> dict[str, Any]:
+    """The metrics of every scene of an index; all are opened before the first is streamed."""
+    if unsafe := [scene for scene in index if not (folder / scene).resolve().is_relative_to(folder.resolve())]:
+        got, fix = echo(unsafe[0]), "name scenes after folders"
+        raise refusal("--index", wanted=f"scenes below {folder}", got=got, fix=fix)
+    if not any((folder / scene).exists() for scene in index):
+        got, fix = "no folder of that name", "give the folder that holds one folder per scene"
+        raise refusal(str(folder), wanted=f"a capture, or scenes such as {next(iter(index))}", got=got, fix=fix)
+    captures = {
+        scene: open_capture(folder / scene, size=options.size) for scene, split in index.items() if split is not None
+    }
+    if not captures:
+        raise refusal("--index", wanted="a scene that is not null", got="none", fix="choose frames for one")
+    for capture in captures.values():
+        capture.check_output_folder(out)
+    splits = {scene: split_of_scene(index, scene, len(capture)) for scene, capture in captures.items()}
+    scored = {}
+    for scene, capture in captures.items():
+        reporter.say(scene)
+        scored[scene] = _evaluate(model, params, capture, splits[scene], out / scene, options, reporter, scene)
+    metrics = scene_metrics(scored) | {"left_out": [scene for scene, split in index.items() if split is None]}
+    write_json(RunFolder(out).index, index_to_json(index))
+    write_json(RunFolder(out).metrics, metrics)
+    return metrics
+
+
+def scene_metrics(scored: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """Means over scenes.
+
+    Args:
+        scored: the metrics of `evaluate` by scene, which are means over the views of the scene.
+
+    Returns:
+        `scenes`, the scores and the number of targets of each; `over_scenes`, the mean over views, then scenes; and
+        `over_views`, the mean over the views of all scenes. `lpips` is None where a scene has none.
+    """
+    rows = {scene: {name: m[name] for name in (*SCORES, "target_views")} for scene, m in scored.items()}
+    weights = np.array([row["target_views"] for row in rows.values()], np.float64)
+    blocks = [{name: row[name] for name in SCORES} for row in rows.values()]
+    return {
+        "scenes": rows,
+        "over_scenes": _weighted_mean(blocks, np.ones(len(blocks))),
+        "over_views": _weighted_mean(blocks, weights),
+    }
+
+
+def _weighted_mean(values: list[Any], weights: np.ndarray) -> Any:
+    """The weighted mean of equal trees of numbers; None where one is None."""
+    if isinstance(values[0], dict):
+        return {name: _weighted_mean([value[name] for value in values], weights) for name in values[0]}
+    return None if None in values else round(float(np.average(values, weights=weights)), 4)
