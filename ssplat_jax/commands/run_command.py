@@ -3,6 +3,7 @@
 import dataclasses
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ssplat_jax.commands.options import (
     CapturePath,
@@ -17,6 +18,9 @@ from ssplat_jax.commands.options import (
 from ssplat_jax.commands.refine_command import Refine
 from ssplat_jax.config import QUALITIES
 from ssplat_jax.errors import InputError
+
+if TYPE_CHECKING:
+    from ssplat_jax.runs.capture_run import RunResult
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,29 +52,18 @@ class Run:
     """Then take this many gradient steps on the streamed frames, as `ssplat refine` does, into refined.ply."""
     causal: bool = False
     """No look-ahead: near, far and scale come from the first chunk, and frames keep their order."""
+    watch: bool = False
+    """The folder is still being written (transforms.json): stream chunks as their images are complete, causally."""
+    quiet_seconds: float = 10.0
+    """With --watch: end after so many seconds without a new frame; a file `done` in the capture ends it at once."""
     quiet: QuietOption = False
 
     def run(self) -> int:
-        from ssplat_jax.console import Reporter
-        from ssplat_jax.runs.capture_run import run_capture
-
         if self.refine < 0:
             raise InputError(f"--refine: wanted a number of steps of at least 0, got {self.refine}.")
-        model, params = load_model(self.weights, causal_changes(self.set, self.causal))
-        result = run_capture(
-            model,
-            params,
-            self.capture,
-            self.out,
-            size=parse_size(self.size),
-            scale=QUALITIES[self.quality].scale,
-            stride=self.stride,
-            max_views=self.max_views,
-            save_every=self.save_every,
-            overwrite=self.overwrite,
-            deltas=self.deltas,
-            reporter=Reporter(self.quiet),
-        )
+        if self.quiet_seconds != Run.quiet_seconds and not self.watch:
+            raise InputError("--quiet-seconds: wanted --watch beside it, which it is for; got none.")
+        result = self._watch() if self.watch else self._stream()
         if result.interrupted:
             how = " without --overwrite" if self.overwrite else ""
             print(f"stopped after {result.num_views} views; the same command{how} continues", file=sys.stderr)
@@ -85,3 +78,42 @@ class Run:
         if self.refine:
             return Refine(self.out, self.capture, self.refine, self.weights, quiet=self.quiet).run()
         return 0
+
+    def _stream(self) -> "RunResult":
+        """Streams a capture that is complete."""
+        from ssplat_jax.console import Reporter
+        from ssplat_jax.runs.capture_run import run_capture
+
+        model, params = load_model(self.weights, causal_changes(self.set, self.causal))
+        return run_capture(
+            model,
+            params,
+            self.capture,
+            self.out,
+            size=parse_size(self.size),
+            scale=QUALITIES[self.quality].scale,
+            stride=self.stride,
+            max_views=self.max_views,
+            save_every=self.save_every,
+            overwrite=self.overwrite,
+            deltas=self.deltas,
+            reporter=Reporter(self.quiet),
+        )
+
+    def _watch(self) -> "RunResult":
+        """Streams a capture while it is written."""
+        from ssplat_jax.console import Reporter
+        from ssplat_jax.runs.watch_run import WatchOptions, watch_capture
+
+        model, params = load_model(self.weights, causal_changes(self.set, True))
+        options = WatchOptions(
+            size=parse_size(self.size),
+            scale=QUALITIES[self.quality].scale,
+            stride=self.stride,
+            max_views=self.max_views,
+            quiet_seconds=self.quiet_seconds,
+            save_every=self.save_every,
+            overwrite=self.overwrite,
+            deltas=self.deltas,
+        )
+        return watch_capture(model, params, self.capture, self.out, options, Reporter(self.quiet))

@@ -259,7 +259,7 @@ def open_capture(path: str | Path, *, size: tuple[int, int] | None = None) -> Ca
         raise refusal(str(path)[:80], wanted="a path", got=str(error)[:200], fix="check the path") from None
     if found is not None:
         listing = found.read(folder)
-        return _capture(listing, found.FORMAT, FilePixels(listing.frames), size)
+        return capture_of_listing(listing, found.FORMAT, FilePixels(listing.frames), size)
     if not exists:
         got, fix = "nothing of that name", "check the path"
     elif folder.is_dir() and not any(folder.iterdir()):
@@ -273,6 +273,11 @@ def open_capture(path: str | Path, *, size: tuple[int, int] | None = None) -> Ca
     raise refusal(str(path), wanted=f"a posed capture ({formats})", got=got, fix=fix)
 
 
+def is_capture(path: Path) -> bool:
+    """Whether a reader reads `path`: it looks like a capture, which may still be damaged."""
+    return any(reader.matches(path) for reader in READERS)
+
+
 def _unposed(path: Path) -> str | None:
     """The kind of images that a path holds without poses: "images", "a video", or None."""
     if path.is_file():
@@ -282,8 +287,8 @@ def _unposed(path: Path) -> str | None:
     return "images" if suffixes & IMAGE_SUFFIXES else "a video" if suffixes & VIDEO_SUFFIXES else None
 
 
-def _capture(listing: Listing, format: str, pixels: Pixels, size: tuple[int, int] | None) -> Capture:
-    """Capture of a listing whose images all have one size."""
+def capture_of_listing(listing: Listing, format: str, pixels: Pixels, size: tuple[int, int] | None) -> Capture:
+    """Capture of a listing whose images all have one size; `size` is that of the delivered ones (`open_capture`)."""
     if size is None:
         first = listing.frames[0]
         size = (first.width, first.height)
@@ -343,7 +348,7 @@ def _procedural(spec: str, size: tuple[int, int] | None) -> Capture:
     )
     pixels = ArrayPixels(images=np.asarray(images, np.float32), depths=np.asarray(depths, np.float32))
     title = f"{PROCEDURAL}-{name}" + (f"-seed{seed}" if seed else "")
-    return _capture(Listing(name=title, frames=frames), PROCEDURAL, pixels, size)
+    return capture_of_listing(Listing(name=title, frames=frames), PROCEDURAL, pixels, size)
 
 
 def _whole(spec: str, option: str, text: str, low: int, high: int) -> int:

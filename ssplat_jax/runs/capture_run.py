@@ -80,7 +80,7 @@ def run_capture(
         identity = run_identity(model, params, capture, indices)
         run = resume_run(model, params, capture, identity, folder, reporter)
         reporter.warn_all(*capture.notes, run.frame.warning)
-        writer = _start_deltas(run, len(indices), folder, deltas)
+        writer = start_deltas(run, len(indices), folder, deltas)
         if run.num_views == len(indices) and (num_written := finished_scene(folder, len(indices))) is not None:
             return RunResult(run.num_views, num_written, None, was_finished=True)
         stopped = _stream(run, capture, indices, identity, folder, writer, save_every, reporter)
@@ -90,7 +90,7 @@ def run_capture(
     return RunResult(run.num_views, report.num_written, None)
 
 
-class _DeltaWriter:
+class DeltaWriter:
     """Writes what changed in the scene since the last call, with the frame that a viewer needs to place it."""
 
     def __init__(self, run: RunState, folder: RunFolder, *, is_complete: bool) -> None:
@@ -106,7 +106,7 @@ class _DeltaWriter:
         save_delta(path, delta, {"frame": run.frame.to_dict(), "views": run.num_views, "exposure": exposure})
 
 
-def _start_deltas(run: RunState, num_wanted: int, folder: RunFolder, deltas: bool) -> _DeltaWriter | None:
+def start_deltas(run: RunState, num_wanted: int, folder: RunFolder, deltas: bool) -> DeltaWriter | None:
     """Removes stale deltas, and returns the writer of the next ones if they are asked for.
 
     The deltas in the folder always add up to the scene: without those of the views so far, the next one is the whole
@@ -119,7 +119,7 @@ def _start_deltas(run: RunState, num_wanted: int, folder: RunFolder, deltas: boo
     if not deltas:
         return None
     is_complete = done == 0 or folder.delta(done).exists()
-    writer = _DeltaWriter(run, folder, is_complete=is_complete)
+    writer = DeltaWriter(run, folder, is_complete=is_complete)
     if not is_complete and done == num_wanted:
         writer.write(run)
     return writer
@@ -131,7 +131,7 @@ def _stream(
     indices: Sequence[int],
     identity: dict,
     folder: RunFolder,
-    deltas: _DeltaWriter | None,
+    deltas: DeltaWriter | None,
     save_every: int,
     reporter: Reporter,
 ) -> int | None:

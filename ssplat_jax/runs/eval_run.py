@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ssplat_jax.console import Reporter
-from ssplat_jax.data.capture import READERS, Capture, open_capture
+from ssplat_jax.data.capture import Capture, is_capture, open_capture
 from ssplat_jax.data.index_files import Index, index_to_json, read_index, split_of_scene
 from ssplat_jax.data.split import Split, choose_split
 from ssplat_jax.errors import InputError, echo, refusal
@@ -74,7 +74,7 @@ def eval_path(
     index, notes = read_index(options.index)
     reporter.warn_all(*notes)
     folder = Path(path).expanduser()
-    if options.scene is None and folder.is_dir() and not any(reader.matches(folder) for reader in READERS):
+    if options.scene is None and folder.is_dir() and not is_capture(folder):
         return _eval_scenes(model, params, folder, out, index, options, reporter)
     capture = open_capture(path, size=options.size)
     scene = options.scene or capture.name

@@ -30,7 +30,7 @@ from ssplat_jax.data.readers.frame_list import (
     stored_size,
 )
 from ssplat_jax.data.readers.strict_json import load_json
-from ssplat_jax.errors import echo, refusal
+from ssplat_jax.errors import InputError, echo, refusal
 
 FORMAT = "transforms.json"
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # flips the y and z axes of a camera
@@ -44,6 +44,25 @@ def matches(path: Path) -> bool:
 
 def read(path: Path) -> Listing:
     """Reads the frames of the capture in the folder `path`, or of the file `path`."""
+    return _read(path, None)
+
+
+def read_complete(path: Path) -> tuple[Listing, str | None]:
+    """Reads the frames before the first that cannot be read, of a capture that is still being written.
+
+    Returns:
+        The listing, and the reason why that frame cannot be read; None if all can.
+
+    Raises:
+        InputError: the file cannot be read, or no frame of it.
+    """
+    problems: list[str] = []
+    listing = _read(path, problems)
+    return listing, problems[0] if problems else None
+
+
+def _read(path: Path, problems: list[str] | None) -> Listing:
+    """The frames of a capture; with `problems`, those before the first problem, which is added to the list."""
     file = path if path.is_file() else path / "transforms.json"
     root = file.parent.resolve()
     meta = load_json(file)
@@ -56,7 +75,13 @@ def read(path: Path) -> Listing:
         where = f"{file}: frames[{i}]"
         if not isinstance(entry, dict):
             raise refusal(where, wanted="an object", got=echo(entry), fix="give file_path and transform_matrix")
-        frame = _read_frame(root, meta, entry, where)
+        try:
+            frame = _read_frame(root, meta, entry, where)
+        except InputError as error:
+            if problems is None or not frames:
+                raise
+            problems.append(str(error))
+            break
         first = fields_of.setdefault(frame.path, where)
         if first is not where:
             got = f"{echo(frame.name)} in both {first.split(': ')[-1]} and frames[{i}]"

@@ -1,0 +1,35 @@
+"""A capture that is still being written: a transforms.json that grows, and images that may not be complete."""
+
+from pathlib import Path
+
+from ssplat_jax.data.capture import Capture, capture_of_listing
+from ssplat_jax.data.images import FilePixels
+from ssplat_jax.data.readers import transforms_json
+from ssplat_jax.errors import InputError
+
+DONE = "done"
+"""A file of this name in the capture's folder says that nothing more will come."""
+
+
+def open_growing(path: Path, *, size: tuple[int, int] | None) -> tuple[Capture | None, str | None]:
+    """Opens what is there of a capture.
+
+    Args:
+        path: folder that holds, or will hold, a transforms.json.
+        size: (width, height) of delivered images; by default that of the stored ones.
+
+    Returns:
+        The capture of the frames before the first whose image or fields cannot be read, None if there is no such frame;
+        and why no more of them can be read, None if all can. Images are complete when `Capture.verify` takes them.
+    """
+    try:
+        listing, problem = transforms_json.read_complete(path)
+        capture = capture_of_listing(listing, transforms_json.FORMAT, FilePixels(listing.frames), size)
+    except InputError as error:  # missing, or being written
+        return None, str(error)
+    return capture, problem
+
+
+def is_done(path: Path) -> bool:
+    """Whether the writer of a capture has said that nothing more will come."""
+    return (path / DONE).exists()

@@ -1,0 +1,195 @@
+"""`ssplat run --watch`: streams a folder that is still being written, chunk by chunk as its images become complete.
+
+The stream is causal. Frames are taken in the order of the capture; a frame that cannot be read yet holds back those
+after it. The run ends when the folder holds a file `done`, or when no frame has become ready for some seconds; the last
+chunk is then padded. What cannot be read at the end is left out, with a warning.
+"""
+
+import dataclasses
+import time
+from pathlib import Path
+
+from ssplat_jax.checkpoint.stream_state import load_newest_state
+from ssplat_jax.console import Reporter
+from ssplat_jax.data.capture import Capture
+from ssplat_jax.data.growing_capture import is_done, open_growing
+from ssplat_jax.errors import InputError, refusal, require_positive
+from ssplat_jax.evaluation.scoring import check_scorable
+from ssplat_jax.runs.capture_run import DeltaWriter, RunResult, start_deltas
+from ssplat_jax.runs.finish_run import finish_run, finished_scene
+from ssplat_jax.runs.resume import RunState, resume_run, run_identity, save_run
+from ssplat_jax.storage.folder_lock import lock_folder
+from ssplat_jax.storage.interrupts import Interrupts
+from ssplat_jax.storage.run_folder import RunFolder
+from ssplat_jax.streaming.feed import feed_chunks
+from ssplat_jax.streaming.streamsplat import StreamSplat
+
+POLL_SECONDS = 0.25
+"""Between two looks at the folder."""
+
+
+@dataclasses.dataclass(frozen=True)
+class WatchOptions:
+    """What of a growing capture is streamed, and when it ends."""
+
+    size: tuple[int, int] | None = None  # (width, height) of the images; None for the capture's own
+    scale: float = 1.0  # factor of `size` at which images are streamed
+    stride: int = 1
+    max_views: int | None = None
+    quiet_seconds: float = 10.0  # without a new frame, after which the run ends
+    save_every: int = 8  # chunks between saved states
+    overwrite: bool = False
+    deltas: bool = False
+
+
+def watch_capture(
+    model: StreamSplat, params: dict, path: str, out: Path, options: WatchOptions, reporter: Reporter
+) -> RunResult:
+    """Streams a capture while it is being written, continuing the run that the folder holds.
+
+    Args:
+        model: the model to run, with a causal configuration.
+        params: the model's parameters.
+        path: folder that holds, or will hold, a transforms.json.
+        out: folder of the results.
+        options: what is streamed, and when it ends.
+        reporter: shows progress and warnings.
+
+    Raises:
+        InputError: nothing readable came, the capture lies in `out`, frames that were streamed have changed, or `out`
+            holds a run of another capture or configuration.
+        StorageError: `out` cannot be written or its state is corrupt.
+    """
+    counts = {"stride": options.stride, "save_every": options.save_every}
+    require_positive(**counts, **({} if options.max_views is None else {"max_views": options.max_views}))
+    if not options.quiet_seconds > 0:
+        got, fix = str(options.quiet_seconds), "give a number of seconds"
+        raise refusal("--quiet-seconds", wanted="a positive time", got=got, fix=fix)
+    assert model.config.stream.causal
+    watch = _Watch(model, params, Path(path).expanduser(), RunFolder(out), options, reporter)
+    with Interrupts(has_work=False) as interrupts:
+        ended = watch.wait_for_frames(interrupts)
+        with lock_folder(out):
+            if options.overwrite:
+                watch.folder.clear_run()
+            run = watch.begin()
+            watch.stream(run, interrupts, ended)
+            if interrupts.received:
+                return RunResult(run.num_views, int(run.session.cache_facts()["decoded"]), interrupts.received)
+            indices = watch.indices[: run.num_views]
+            if (num_written := finished_scene(watch.folder, len(indices))) is not None:
+                return RunResult(run.num_views, num_written, None, was_finished=True)
+            report = finish_run(run, watch.known(), indices, watch.folder, reporter)
+    return RunResult(run.num_views, report.num_written, None)
+
+
+@dataclasses.dataclass
+class _Watch:
+    """The growing capture, and how much of it is complete."""
+
+    model: StreamSplat
+    params: dict
+    path: Path
+    folder: RunFolder
+    options: WatchOptions
+    reporter: Reporter
+    capture: Capture | None = None
+    indices: list[int] = dataclasses.field(default_factory=list)  # frames whose images are complete, in their order
+    problem: str | None = None  # why no more frames are complete
+    last_change: float = dataclasses.field(default_factory=time.monotonic)
+
+    def known(self) -> Capture:
+        """The capture; there is one once `wait_for_frames` has returned."""
+        assert self.capture is not None
+        return self.capture
+
+    def look(self) -> bool:
+        """Looks at the folder; returns whether nothing more is to be expected."""
+        said_so = is_done(self.path)  # before the look: what was written before the file counts
+        capture, self.problem = open_growing(self.path, size=self.options.size)
+        if capture is not None:
+            self._take(capture.scaled(self.options.scale))
+        is_full = self.options.max_views is not None and len(self.indices) >= self.options.max_views
+        return said_so or is_full or time.monotonic() - self.last_change > self.options.quiet_seconds
+
+    def _take(self, capture: Capture) -> None:
+        """Adds the frames of a capture that have become complete."""
+        if self.capture is not None and self.indices:
+            old, new = (c.digest(self.indices) if len(c) > self.indices[-1] else "" for c in (self.capture, capture))
+            if old != new:
+                fix = "name frames so that new ones come last, and leave old ones as they are"
+                raise refusal(str(self.path), wanted="frames added at the end", got="changes to earlier ones", fix=fix)
+        self.capture = capture
+        for i in list(range(0, len(capture), self.options.stride))[len(self.indices) : self.options.max_views]:
+            try:
+                capture.verify([i])
+            except InputError as error:  # being written
+                self.problem = str(error)
+                return
+            self.indices.append(i)
+            self.last_change = time.monotonic()
+
+    def wait_for_frames(self, interrupts: Interrupts) -> bool:
+        """Waits for a first chunk of frames, and for all that the saved run has had; returns whether no more will come.
+
+        Raises:
+            InputError: none came.
+        """
+        needed = self.model.config.stream.chunk_size
+        if self.folder.has_state() and not self.options.overwrite:
+            needed = max(needed, len(load_newest_state(self.folder.state)[1]["frames"]))
+        self.reporter.say(f"waiting for frames in {self.path}")
+        while not (ended := self.look()) and len(self.indices) < needed and not interrupts.received:
+            time.sleep(POLL_SECONDS)
+        if not self.indices:
+            got = self.problem or "none"
+            raise refusal(
+                str(self.path), wanted="a frame that can be read", got=got, fix="see that it is written there"
+            )
+        check_scorable(self.known())
+        self.known().check_output_folder(self.folder.path)
+        return ended
+
+    def begin(self) -> RunState:
+        """The run that the folder holds, or a new one."""
+        chunk = self.indices[: self.model.config.stream.chunk_size]
+        if self.folder.has_state():
+            chunk = self.indices[: len(load_newest_state(self.folder.state)[1]["frames"])]
+        identity = run_identity(self.model, self.params, self.known(), chunk)
+        run = resume_run(self.model, self.params, self.known(), identity, self.folder, self.reporter)
+        self.reporter.warn_all(*self.known().notes, run.frame.warning)
+        return run
+
+    def stream(self, run: RunState, interrupts: Interrupts, ended: bool) -> None:
+        """Streams chunks as they become complete, until nothing more will come or a signal does."""
+        size, num_chunks = self.model.config.stream.chunk_size, 0
+        writer = start_deltas(run, run.num_views + 1, self.folder, self.options.deltas)
+        while not interrupts.received:
+            waiting = len(self.indices) - run.num_views
+            if waiting >= size or (ended and waiting > 0):
+                self._feed(run, self.indices[run.num_views :][:size], writer)
+                interrupts.has_work, num_chunks = True, num_chunks + 1
+                if num_chunks % self.options.save_every == 0:
+                    self._save(run)
+            elif ended:
+                break
+            else:
+                time.sleep(POLL_SECONDS)
+            ended = self.look() or ended
+        if num_chunks % self.options.save_every or interrupts.received:
+            self._save(run)
+        if not interrupts.received and self.problem is not None:
+            self.reporter.warn(f"{self.problem} It and the frames after it are left out.")
+
+    def _feed(self, run: RunState, group: list[int], writer: DeltaWriter | None) -> None:
+        for fed in feed_chunks(run.session, self.known(), group, run.frame):
+            run.exposures |= fed.exposures
+            run.frame = fed.frame
+        if writer is not None:
+            writer.write(run)
+        self.reporter.say(f"{run.num_views} views streamed, {len(self.indices)} complete")
+
+    def _save(self, run: RunState) -> None:
+        if run.num_views:
+            streamed = self.indices[: run.num_views]
+            save_run(run, run_identity(self.model, self.params, self.known(), streamed), self.folder)

@@ -1,0 +1,108 @@
+"""`ssplat run --watch`: a folder that grows gives what the finished folder gives."""
+
+import json
+import shutil
+import threading
+import time
+
+import jax
+import pytest
+
+from ssplat_jax.checkpoint.weights import save_weights
+from ssplat_jax.streaming.streamsplat import StreamSplat
+from tests.commands.test_cli import few_pivots, make_capture, run  # noqa: F401
+from tests.streaming.narrow_model import NARROW
+
+SIZE = (64, 48)
+
+
+@pytest.fixture
+def narrow(tmp_path):
+    """Options for a small model."""
+    path = tmp_path / "narrow.npz"
+    save_weights(path, StreamSplat(NARROW).init(jax.random.key(0)), NARROW, {})
+    return ("--weights", str(path), "--quiet")
+
+
+def write_slowly(whole, growing, pause=0.1):
+    """Writes a capture as a camera does: the listing is ahead of the image, images come in two halves."""
+    facts = json.loads((whole / "transforms.json").read_text())
+    (growing / "images").mkdir(parents=True)
+    for i, frame in enumerate(facts["frames"]):
+        text = json.dumps(facts | {"frames": facts["frames"][: i + 1]})
+        (growing / "transforms.json").write_text(text[: len(text) // 2])
+        time.sleep(pause / 4)
+        (growing / "transforms.json").write_text(text)
+        time.sleep(pause / 4)
+        pixels = (whole / frame["file_path"]).read_bytes()
+        (growing / frame["file_path"]).write_bytes(pixels[: len(pixels) // 2])
+        time.sleep(pause / 2)
+        (growing / frame["file_path"]).write_bytes(pixels)
+    (growing / "done").touch()
+
+
+def test_a_growing_folder_gives_the_scene_of_the_whole_one(tmp_path, narrow):
+    whole = make_capture(tmp_path / "whole" / "capture", num_frames=10, size=SIZE)
+    growing = tmp_path / "growing" / "capture"
+    writer = threading.Thread(target=write_slowly, args=(whole, growing))
+    writer.start()
+    outs = tmp_path / "straight", tmp_path / "watched"
+    watching = ("--watch", "--quiet-seconds", "60", "--deltas", "--save-every", "1")
+    assert run("run", str(growing), "--out", str(outs[1]), *watching, *narrow) == 0
+    writer.join()
+    assert run("run", str(whole), "--causal", "--deltas", "--out", str(outs[0]), *narrow) == 0
+    for name in ("scene.ply", *(f"deltas/{views:06d}.npz" for views in (4, 8, 10))):
+        assert (outs[1] / name).read_bytes() == (outs[0] / name).read_bytes(), name
+    # The finished folder is the causal run of the finished capture.
+    assert run("run", str(growing), "--causal", "--out", str(outs[1]), *narrow) == 0
+
+
+def test_it_ends_after_quiet_seconds_and_goes_on_later(tmp_path, narrow, capsys):
+    whole, growing = make_capture(tmp_path / "whole" / "c", num_frames=9, size=SIZE), tmp_path / "growing" / "c"
+    shutil.copytree(whole, growing)
+    kept = (growing / "images" / "8.png").read_bytes()
+    (growing / "images" / "8.png").write_bytes(kept[:100])
+    out = tmp_path / "out"
+    since = time.monotonic()
+    assert run("run", str(growing), "--watch", "--quiet-seconds", "0.5", "--out", str(out), *narrow) == 0
+    assert time.monotonic() - since > 0.5
+    captured = capsys.readouterr()
+    assert "8.png" in captured.err and "left out" in captured.err and "8 views" in captured.out
+    (growing / "images" / "8.png").write_bytes(kept)
+    (growing / "done").touch()
+    assert run("run", str(growing), "--watch", "--out", str(out), *narrow) == 0
+    assert "9 views" in capsys.readouterr().out
+    straight = tmp_path / "straight"
+    assert run("run", str(whole), "--causal", "--out", str(straight), *narrow) == 0
+    assert (out / "scene.ply").read_bytes() == (straight / "scene.ply").read_bytes()
+    assert run("run", str(growing), "--watch", "--out", str(out), *narrow) == 0
+    assert "holds this run, finished" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--watch", "--quiet-seconds", "0.1"), "a frame that can be read"),
+        (("--watch", "--quiet-seconds", "0"), "positive time"),
+        (("--quiet-seconds", "3"), "--watch beside it"),
+    ],
+)
+def test_a_folder_where_nothing_comes_is_refused(options, words, tmp_path, narrow, capsys):
+    out = tmp_path / "out"
+    (tmp_path / "empty").mkdir()
+    assert run("run", str(tmp_path / "empty"), "--out", str(out), *options, *narrow) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert words in line and not out.exists()
+
+
+def test_frames_that_were_streamed_may_not_change(tmp_path, narrow, capsys):
+    """A frame that sorts before the streamed ones would move them."""
+    capture, out = make_capture(tmp_path / "c", num_frames=8, size=SIZE), tmp_path / "out"
+    (capture / "done").touch()
+    assert run("run", str(capture), "--watch", "--out", str(out), *narrow) == 0
+    facts = json.loads((capture / "transforms.json").read_text())
+    facts["frames"][2]["transform_matrix"][0][3] += 0.01
+    (capture / "transforms.json").write_text(json.dumps(facts))
+    capsys.readouterr()
+    assert run("run", str(capture), "--watch", "--out", str(out), *narrow) == 2
+    assert "differs in its poses" in capsys.readouterr().err
