@@ -29,6 +29,8 @@ class Render:
     """Size WxH of the pictures; default the capture's own."""
     over_black: bool = False
     """Show holes of the scene black instead of in the colors around them."""
+    one_exposure: bool = False
+    """Show a run's scene at the exposure of its first views instead of the middle one of all."""
     film: int | None = None
     """Also write film.mp4, with this many pictures from each camera to the next, 24 a second (extra `video`)."""
     quiet: QuietOption = False
@@ -46,6 +48,7 @@ class Render:
             stride=self.stride,
             max_views=self.max_views,
             over_black=self.over_black,
+            one_exposure=self.one_exposure,
             film_steps=self.film,
             reporter=reporter,
         )

@@ -25,6 +25,10 @@ class View:
     """Address to listen on; the default is reached by this machine only, 0.0.0.0 by others, without a password."""
     most: int = 500_000
     """Most Gaussians sent to a browser; larger scenes are subsampled evenly."""
+    over_black: bool = False
+    """Show the scene over black instead of the browser's background."""
+    one_exposure: bool = False
+    """Show a run's scene at the exposure of its first views instead of the middle one of all."""
 
     def run(self) -> int:
         from ssplat_jax.console import Reporter
@@ -32,6 +36,14 @@ class View:
 
         require_positive(port=self.port, most=self.most)
         reporter = Reporter(quiet=False)
-        ended = view_scene(self.scene, host=self.host, port=self.port, max_gaussians=self.most, reporter=reporter)
+        ended = view_scene(
+            self.scene,
+            host=self.host,
+            port=self.port,
+            max_gaussians=self.most,
+            over_black=self.over_black,
+            one_exposure=self.one_exposure,
+            reporter=reporter,
+        )
         print("closed the viewer", file=sys.stderr)
         return 128 + ended

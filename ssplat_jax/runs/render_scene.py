@@ -1,5 +1,6 @@
 """`ssplat render`: pictures of a scene file from the cameras of a capture, and a film through them."""
 
+import dataclasses
 from pathlib import Path
 
 import jax
@@ -21,6 +22,7 @@ from ssplat_jax.scene_files.splat_file import SplatFile
 from ssplat_jax.storage.folder_lock import lock_folder
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.storage.video import VideoWriter
+from ssplat_jax.streaming.scene_exposure import at_first_exposure, scene_exposure
 
 ANTIALIAS = {"mip": "mip", "default": "classic"}
 """Antialiasing filter for each render mode that a scene file may name."""
@@ -37,6 +39,7 @@ def render_scene(
     stride: int,
     max_views: int | None,
     over_black: bool,
+    one_exposure: bool = False,
     film_steps: int | None,
     reporter: Reporter,
 ) -> int:
@@ -53,6 +56,8 @@ def render_scene(
         stride: every `stride`-th camera is used.
         max_views: stop after this many pictures.
         over_black: show holes black instead of in the colors around them.
+        one_exposure: show the scene at the exposure of the first streamed views; with `over_black` a picture of 8 bits
+            is then the image of the `literal` score.
         film_steps: pictures of the film from one camera to the next; None for no film.
         reporter: shows progress.
 
@@ -60,7 +65,8 @@ def render_scene(
         The number of pictures, without those of the film.
 
     Raises:
-        InputError: the scene or the capture is unusable, the capture lies in `out`, or a film is wanted without PyAV.
+        InputError: the scene or the capture is unusable, the capture lies in `out`, a film is wanted without PyAV, or
+            one exposure of a scene whose run is unknown.
         StorageError: `out` cannot be written.
     """
     require_positive(stride=stride)
@@ -69,6 +75,9 @@ def render_scene(
     if film_steps is not None:
         require_positive(film=film_steps)
     splats = _read_scene(scene)
+    if one_exposure:
+        gaussians = at_first_exposure(splats.gaussians, scene_exposure(scene))
+        splats = dataclasses.replace(splats, gaussians=gaussians)
     capture, folder = open_capture(path, size=size), RunFolder(out)
     capture.check_output_folder(out)
     indices = range(0, len(capture), stride)[:max_views]

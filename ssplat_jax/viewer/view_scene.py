@@ -17,7 +17,16 @@ POLL_INTERVAL = 0.5
 """Seconds between checks for changes, so that browsers are sent at most two scenes a second."""
 
 
-def view_scene(path: Path, *, host: str, port: int, max_gaussians: int, reporter: Reporter) -> int:
+def view_scene(
+    path: Path,
+    *,
+    host: str,
+    port: int,
+    max_gaussians: int,
+    over_black: bool = False,
+    one_exposure: bool = False,
+    reporter: Reporter,
+) -> int:
     """Shows a scene and its changes until Ctrl-C.
 
     Args:
@@ -25,18 +34,21 @@ def view_scene(path: Path, *, host: str, port: int, max_gaussians: int, reporter
         host: address to listen on.
         port: port to listen on; the next free one if it is taken.
         max_gaussians: most Gaussians sent to a browser.
+        over_black: show the scene over black.
+        one_exposure: show a run's scene at the exposure of its first views.
         reporter: prints warnings.
 
     Returns:
         The signal that ended it.
 
     Raises:
-        InputError: no scene there, viser is missing, or the address is taken.
+        InputError: no scene there, one exposure of a scene whose run is unknown, viser is missing, or the address is
+            taken.
         StorageError: a file of the run is damaged.
     """
-    source = open_source(path)
+    source = open_source(path, one_exposure=one_exposure)
     scene = source.changed()
-    viewer = Viewer(host=host, port=port, max_gaussians=max_gaussians)
+    viewer = Viewer(host=host, port=port, max_gaussians=max_gaussians, over_black=over_black)
     try:
         if host not in LOCAL_HOSTS:
             reporter.warn(f"everyone who reaches this machine at {host} can view the scene; there is no password.")

@@ -91,16 +91,18 @@ class Viewer:
         host: address to listen on; a loopback address is reached by this machine only.
         port: port to listen on; the next free one if it is taken.
         max_gaussians: most Gaussians sent to a browser.
-
+        over_black: show the scene over black instead of the browser's background.
 
     Raises:
         InputError: viser is not installed, or cannot listen there.
     """
 
-    def __init__(self, *, host: str, port: int, max_gaussians: int) -> None:
+    def __init__(self, *, host: str, port: int, max_gaussians: int, over_black: bool = False) -> None:
         viser = _viser()
         _check_address(host, port)
         self._server: Any = viser.ViserServer(host=host, port=port, label="ssplat", verbose=False)
+        if over_black:
+            self._server.scene.set_background_image(np.zeros((1, 1, 3), np.uint8), format="png")
         self._max_gaussians, self._unit, self._distance, self._node = max_gaussians, 1.0, 1.0, None
         name = "localhost" if host in (*LOCAL_HOSTS, "0.0.0.0", "::") else f"[{host}]" if ":" in host else host
         self.url = f"http://{name}:{self._server.get_port()}"
