@@ -24,6 +24,7 @@ from ssplat_jax.commands.refine_command import Refine
 from ssplat_jax.commands.render_command import Render
 from ssplat_jax.commands.run_command import Run
 from ssplat_jax.commands.train_command import Train
+from ssplat_jax.commands.usage import check_usage, parse_in_one_line
 from ssplat_jax.commands.view_command import View
 from ssplat_jax.commands.worlds_command import Worlds
 from ssplat_jax.errors import CacheError, InputError, StorageError
@@ -50,17 +51,34 @@ COMMANDS = {
 
 def main(arguments: list[str] | None = None) -> None:
     """Runs the command in `arguments` (default: those of the process) and exits with its code."""
-    commands = [Annotated[command, tyro.conf.subcommand(name)] for name, command in COMMANDS.items()]
-    command = tyro.cli(
-        functools.reduce(operator.or_, commands),  # pyright: ignore[reportCallIssue, reportArgumentType]
-        prog="ssplat",
-        description="StreamSplat in JAX: a calibrated image stream becomes a 3D Gaussian scene, chunk by chunk.",
-        args=arguments,
-        config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
-    )
+    try:
+        command = _parse(sys.argv[1:] if arguments is None else arguments)
+    except InputError as error:
+        sys.exit(_refuse(error, EXIT_INPUT))
     if not isinstance(command, Bench | Experiment):  # which measure what compiling costs
         keep_programs()
     sys.exit(guarded(command.run))
+
+
+def _parse(arguments: list[str]):
+    """The command that `arguments` name, with its options.
+
+    Raises:
+        InputError: no such command or option, or a value that the option does not take.
+    """
+    check_usage(arguments, COMMANDS)
+    commands = [Annotated[command, tyro.conf.subcommand(name)] for name, command in COMMANDS.items()]
+    return parse_in_one_line(
+        functools.partial(
+            tyro.cli,
+            functools.reduce(operator.or_, commands),  # pyright: ignore[reportCallIssue, reportArgumentType]
+            prog="ssplat",
+            description="StreamSplat in JAX: a calibrated image stream becomes a 3D Gaussian scene, chunk by chunk.",
+            args=arguments,
+            config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
+        ),
+        arguments[0],
+    )
 
 
 def guarded(run) -> int:

@@ -16,7 +16,9 @@ QualityName = Literal["fast", "balanced", "accurate"]
 CapturePath = Annotated[
     str,
     tyro.conf.Positional,
-    tyro.conf.arg(help="Folder of a posed capture (formats: ssplat inspect --help), or procedural:NAME."),
+    tyro.conf.arg(
+        metavar="CAPTURE", help="Folder of a posed capture (formats: ssplat inspect --help), or procedural:NAME."
+    ),
 ]
 QualityOption = Annotated[
     QualityName,
@@ -39,7 +41,7 @@ def parse_size(text: str | None) -> tuple[int, int] | None:
     """
     if text is None:
         return None
-    found = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text)
+    found = re.fullmatch(r"(\d{1,9})x(\d{1,9})", text)
     if not found:
         raise InputError(f"--size: wanted WIDTHxHEIGHT in pixels, got {text!r}; for example --size 320x240.")
     return int(found[1]), int(found[2])

@@ -19,7 +19,16 @@ from jaxtyping import Float32, Float64
 from ssplat_jax.chunk import Chunk
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.data.depth_range import estimate_depths, stream_scale
-from ssplat_jax.data.images import ArrayPixels, Crop, FilePixels, Pixels, decode_all, resize_depth, resize_image
+from ssplat_jax.data.images import (
+    MAX_PIXELS,
+    ArrayPixels,
+    Crop,
+    FilePixels,
+    Pixels,
+    decode_all,
+    resize_depth,
+    resize_image,
+)
 from ssplat_jax.data.interleave import interleave
 from ssplat_jax.data.posed_image import Frame, check_camtoworld, check_intrinsics
 from ssplat_jax.data.readers import Listing, colmap, realestate10k, scannet, transforms_json, tum
@@ -110,15 +119,18 @@ class Capture:
         return resize_depth(depth, crop, (frame.width, frame.height))
 
     def check_output_folder(self, out: Path) -> None:
-        """Checks that the capture's files do not lie in the output folder, whose contents are overwritten.
+        """Checks that results do not mix with the capture's files: a run overwrites and clears files of its folder.
 
         Raises:
-            InputError: an image or depth map lies in `out` or in a folder below it.
+            InputError: an image or depth map lies in `out` or below it, or `out` lies below a folder of such files.
         """
         folder = out.resolve()
         for frame in self.frames:
             for path in (frame.path, frame.depth_path):
-                if path is not None and path.resolve().is_relative_to(folder):
+                if path is None:
+                    continue
+                file = path.resolve()
+                if file.is_relative_to(folder) or folder.is_relative_to(file.parent):
                     got, fix = "the folder of the capture's own images", "choose another --out"
                     raise refusal(str(out), wanted="a folder for results alone", got=got, fix=fix)
 
@@ -249,6 +261,9 @@ def open_capture(path: str | Path, *, size: tuple[int, int] | None = None) -> Ca
     """
     if size is not None and not all(1 <= side <= MAX_SIDE for side in size):
         raise refusal("size", wanted=f"sides of 1 to {MAX_SIDE}", got=echo(size), fix="give WIDTHxHEIGHT in pixels")
+    if size is not None and size[0] * size[1] > MAX_PIXELS:
+        wanted = f"at most {MAX_PIXELS:,} pixels"
+        raise refusal("size", wanted=wanted, got=f"{size[0]}x{size[1]}", fix="ask for a smaller one")
     if str(path).startswith(f"{PROCEDURAL}:"):
         return _procedural(str(path), size)
     try:

@@ -11,7 +11,7 @@ from ssplat_jax.config import StreamConfig
 from ssplat_jax.console import Reporter
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.stream_frame import StreamFrame
-from ssplat_jax.errors import InputError
+from ssplat_jax.errors import InputError, StorageError
 from ssplat_jax.evaluation.exposures import exposures_from_json, exposures_to_json
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.streaming.feed import Exposures
@@ -67,7 +67,10 @@ def resume_run(
     """
     if not folder.has_state():
         return RunState(Session(model, params), capture.stream_frame(model.config, identity["frames"]), {})
-    cache, header, damage = load_newest_state(folder.state)
+    try:
+        cache, header, damage = load_newest_state(folder.state)
+    except StorageError as error:
+        raise StorageError(f"{error} No earlier state can be read either; --overwrite starts the run anew.") from error
     _check_identity(header, identity, folder)
     if damage is not None:
         reporter.warn(f"{damage} Continuing from the state saved before it, after {header['done']} views.")

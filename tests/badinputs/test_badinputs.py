@@ -75,7 +75,7 @@ def test_bad_procedural_spec_is_refused(spec, words):
         open_capture(spec)
 
 
-@pytest.mark.parametrize("size", [(0, 10), (10, -1), (10, 10**6)])
+@pytest.mark.parametrize("size", [(0, 10), (10, -1), (10, 10**6), (9000, 9000)])
 def test_bad_size_is_refused(tmp_path, size):
     with pytest.raises(InputError, match="size"):
         open_capture(make_capture(tmp_path / "capture", lambda root, meta: None), size=size)
@@ -116,3 +116,12 @@ def test_messages_have_no_control_characters(tmp_path):
         open_capture(root)
     assert all(c.isprintable() for c in str(caught.value))
     assert json.loads((root / "transforms.json").read_text())["frames"][2]["file_path"] == "\x1b[31m\r\n"
+
+
+def test_a_link_to_nothing_is_called_one(tmp_path):
+    def dangle(root, meta):
+        (root / "images" / "2.jpg").unlink()
+        (root / "images" / "2.jpg").symlink_to("nowhere.jpg")
+
+    with pytest.raises(InputError, match="a link to a file that does not exist"):
+        open_capture(make_capture(tmp_path / "capture", dangle))

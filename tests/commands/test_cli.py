@@ -135,7 +135,7 @@ def test_results_among_the_captures_own_images_are_refused(command, place, tmp_p
     make_capture(tmp_path / place)
     before = {path: path.read_bytes() for path in tmp_path.rglob("*.*")}
     options = ("--context", "5") if command == "eval" else ("--overwrite",)
-    for out in (tmp_path, tmp_path / place, tmp_path / place / "images"):
+    for out in (tmp_path, tmp_path / place, tmp_path / place / "images", tmp_path / place / "images" / "sub"):
         assert run(command, str(tmp_path / place), *options, "--out", str(out)) == 2
         (line,) = capsys.readouterr().err.splitlines()
         assert "--out" in line
@@ -145,7 +145,17 @@ def test_results_among_the_captures_own_images_are_refused(command, place, tmp_p
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
+        ((), "ssplat demo"),
+        (("rnu",), "run"),
+        (("run", "x", "--out", "y", "--szie", "3"), "--size"),
+        (("run", "x", "--out", "y", "--stride", "x"), "whole number"),
+        (("run", "x", "--out", "y", "--quality", "best"), "balanced"),
+        (("run",), "CAPTURE, --out PATH"),
+        (("run", "x", "y", "--out", "z"), "run: Unrecognized options: y"),
+        (("run", "x", "--out"), "--out"),
         (("inspect", "no/such/folder"), "no/such/folder"),
+        (("inspect", "procedural:room", "--size", "100000x100000"), "16384"),
+        (("inspect", "procedural:room", "--size", "9000x9000"), "64,000,000"),
         (("eval", "procedural:room", "--context", "5", "--size", "huge", "--out", "x"), "--size"),
         (("eval", "procedural:room?frames=12&size=32x24", "--context", "5000", "--out", "x"), "context"),
         (("eval", "procedural:room", "--context", "8", "--set", "voxel_size=-1", "--out", "x"), "voxel_size"),

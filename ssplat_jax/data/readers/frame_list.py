@@ -1,6 +1,7 @@
 """Steps that all readers share: finding files, checking a frame, and ordering the frames."""
 
 import dataclasses
+import errno
 import itertools
 import math
 import posixpath
@@ -78,9 +79,25 @@ def file_named(
     names = [name, *(f"{folder}/{below}" for folder in folders if below is not None)]
     path = find_file(root, [n + extension for n in names for extension in extensions], where)
     if path is None:
-        got = f"{echo(name)}, which does not exist"
+        got = f"{echo(name)}, which {_missing(root, names, extensions)}"
         raise refusal(where, wanted="an existing file", got=got, fix="add the file or drop the frame")
     return path
+
+
+def _missing(root: Path, names: Sequence[str], extensions: Sequence[str]) -> str:
+    """How it comes that none of the names, with any of the extensions, is a file: the end of a sentence."""
+    for path in (root / (name + extension) for name in names for extension in extensions):
+        try:
+            if path.is_dir():
+                return "is a folder"
+            if path.is_symlink():
+                path.resolve(strict=True)
+        except FileNotFoundError:
+            return "is a link to a file that does not exist"
+        except (OSError, RuntimeError, ValueError) as error:  # Python 3.13 and later raise OSError for a loop of links
+            if isinstance(error, RuntimeError) or getattr(error, "errno", None) == errno.ELOOP:
+                return "is a link that leads back to itself"
+    return "does not exist"
 
 
 def in_images(name: str) -> str | None:
