@@ -10,8 +10,11 @@ from ssplat_jax.refinement.refine import Refinement as Refinement
 from ssplat_jax.refinement.refine import refine as refine
 from ssplat_jax.refinement.refine_capture import refine_on_capture as refine_on_capture
 from ssplat_jax.refinement.refine_config import RefineConfig as RefineConfig
+from ssplat_jax.refinement.refine_effects import RefineEffects as RefineEffects
 from ssplat_jax.refinement.refine_step import RefineState as RefineState
 from ssplat_jax.refinement.refine_step import StepReport as StepReport
 from ssplat_jax.refinement.refine_step import current_gaussians as current_gaussians
 from ssplat_jax.refinement.refine_step import init_refinement as init_refinement
 from ssplat_jax.refinement.refine_step import refine_step as refine_step
+from ssplat_jax.refinement.view_revision import ViewState as ViewState
+from ssplat_jax.refinement.view_revision import revised_key_views as revised_key_views

@@ -93,15 +93,15 @@ def refine(
     if steps == 0:
         return gaussians, Refinement(0, 0, [], [], False, 0.0)
     key_views = KeyViews.of(cameras, jnp.asarray(images), exposures)
-    progress = start_refinement(gaussians, key_views)
+    progress = start_refinement(gaussians, key_views, config)
     for _ in continue_refinement(progress, key_views, steps, config):
         on_step(progress.num_steps, progress.losses[-1])
     return current_gaussians(progress.state), report_of(progress, key_views, config)
 
 
-def start_refinement(gaussians: Gaussians, key_views: KeyViews) -> Progress:
+def start_refinement(gaussians: Gaussians, key_views: KeyViews, config: RefineConfig | None = None) -> Progress:
     """Refinement of `gaussians` before its first step."""
-    return Progress(init_refinement(gaussians), _capacity(gaussians, key_views))
+    return Progress(init_refinement(gaussians, key_views, config), _capacity(gaussians, key_views))
 
 
 def continue_refinement(

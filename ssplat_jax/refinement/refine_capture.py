@@ -51,7 +51,7 @@ def refine_on_capture(
         InputError: `steps` is negative, or a frame was not streamed.
     """
     views = key_views_of(capture, indices, frame, exposures)
-    progress = start_refinement(gaussians, views)
+    progress = start_refinement(gaussians, views, config)
     for _ in continue_refinement(progress, views, steps, config):
         on_step(progress.num_steps, progress.losses[-1])
     return current_gaussians(progress.state), report_of(progress, views, config)

@@ -4,11 +4,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from ssplat_jax.errors import InputError
 from ssplat_jax.gaussians import SH_C0, Gaussians, mean_color
 from ssplat_jax.pytree import pytree, replace
 from ssplat_jax.rasterizer import Effects, fill_holes, render
 from ssplat_jax.refinement.key_views import KeyViews
 from ssplat_jax.refinement.refine_config import RefineConfig
+from ssplat_jax.refinement.view_revision import ViewRevision, ViewState, init_view_state, revised_view, step_view_state
 
 EFFECTS = Effects(outputs=("color", "alpha"))
 MAX_LOGIT = 12.0
@@ -40,6 +42,7 @@ class RefineState:
     second_moment: Revision
     num_steps: Int[Array, ""]
     num_skipped: Int[Array, ""]  # steps whose gradient was not finite: they changed nothing
+    views: ViewState | None = None  # revision of the key views, if an effect is on
 
 
 @pytree
@@ -52,8 +55,13 @@ class StepReport:
     num_overflow: Int[Array, ""]  # most of its views; tile intersections that found no space; see `render`
 
 
-def init_refinement(gaussians: Gaussians) -> RefineState:
-    """The state before the first step."""
+def init_refinement(
+    gaussians: Gaussians, key_views: KeyViews | None = None, config: RefineConfig | None = None
+) -> RefineState:
+    """The state before the first step. Effects of `config` need the `key_views` that they revise."""
+    effects = (config or RefineConfig()).effects
+    if effects.any and key_views is None:
+        raise InputError(f"refine: the effects {', '.join(effects.names)} need the key views, got none.")
     revision = Revision(
         means=jnp.zeros_like(gaussians.means),
         quats=jnp.zeros_like(gaussians.quats),
@@ -69,6 +77,7 @@ def init_refinement(gaussians: Gaussians) -> RefineState:
         second_moment=zeros(),
         num_steps=jnp.zeros((), jnp.int32),
         num_skipped=jnp.zeros((), jnp.int32),
+        views=None if key_views is None else init_view_state(gaussians, key_views, effects),
     )
 
 
@@ -135,20 +144,31 @@ def refine_step(
     places = state.num_steps * config.views_per_step + jnp.arange(config.views_per_step)
     views = jax.vmap(lambda place: next_view(place, key_views.valid, config.seed))(places)
 
-    def add_view(gradient: Revision, view: Int[Array, ""]):
-        loss = lambda revision: view_loss(state.start, revision, key_views, view, config, max_pairs)  # noqa: E731
-        new, measured = jax.grad(loss, has_aux=True)(state.revision)
+    revisions = (state.revision, None if state.views is None else state.views.revision)
+
+    def loss(revisions: tuple[Revision, ViewRevision | None], view: Int[Array, ""]):
+        revision, of_views = revisions
+        seen = key_views
+        if state.views is not None and of_views is not None:
+            seen = revised_view(state.views, of_views, key_views, view)
+        return view_loss(state.start, revision, seen, view, config, max_pairs)
+
+    def add_view(gradient, view: Int[Array, ""]):
+        new, measured = jax.grad(loss, has_aux=True)(revisions, view)
         return jax.tree.map(jnp.add, gradient, new), measured
 
     # A scan holds the intermediate arrays of one view at a time.
-    total, (losses, errors, overflows) = jax.lax.scan(add_view, jax.tree.map(jnp.zeros_like, state.revision), views)
-    gradient = jax.tree.map(lambda x: x / config.views_per_step, total)
+    total, (losses, errors, overflows) = jax.lax.scan(add_view, jax.tree.map(jnp.zeros_like, revisions), views)
+    gradient, of_views = jax.tree.map(lambda x: x / config.views_per_step, total)
     report = StepReport(loss=jnp.mean(losses), held_back=jnp.mean(errors), views=views, num_overflow=jnp.max(overflows))
     is_finite = jnp.array(True)
-    for leaf in jax.tree.leaves(gradient):
+    for leaf in jax.tree.leaves((gradient, of_views)):
         is_finite = is_finite & jnp.all(jnp.isfinite(leaf))
     is_finite = is_finite & jnp.isfinite(report.loss)
     moved = _adam(state, gradient, rate, config)
+    if state.views is not None:
+        moved_views = step_view_state(state.views, of_views, views, key_views.valid, rate, config.effects)
+        moved = replace(moved, views=moved_views)
     keep = lambda new, old: jnp.where(is_finite, new, old)  # noqa: E731
     kept = jax.tree.map(keep, replace(moved, num_skipped=state.num_skipped), state)
     state = replace(
