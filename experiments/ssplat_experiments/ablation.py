@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from ssplat_experiments.scenes import REDKITCHEN, open_redkitchen, open_room
+from ssplat_experiments.study import at_scale
 from ssplat_jax.checkpoint.weights import load_params
 from ssplat_jax.config import preset
 from ssplat_jax.console import Reporter
@@ -61,13 +62,13 @@ class Budget:
 
 BUDGETS = {
     "smoke": Budget(steps=4, num_chunks=2, size=(64, 64), seeds=(0,), context=8, scored=(64, 64)),
-    "full": Budget(steps=100, num_chunks=4, size=(96, 128), seeds=(0, 1, 2), context=32, scored=(320, 240)),
+    "cpu": Budget(steps=100, num_chunks=4, size=(96, 128), seeds=(0, 1, 2), context=32, scored=(320, 240)),
 }
 
 
 def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str:
     """Trains and scores every variant for every seed."""
-    budget = BUDGETS[scale]
+    budget = at_scale(BUDGETS, scale)
     scenes = _scenes(captures, budget)
     rows, done = [], 0
     with reporter.progress("variants", len(VARIANTS) * len(budget.seeds)) as advance:

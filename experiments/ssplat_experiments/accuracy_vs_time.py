@@ -4,8 +4,8 @@
 
 Every setting streams the same context views of `procedural:room` (and of redkitchen, where `--captures` has it) with
 the shipped weights, no retraining, and is scored on the same targets at the same size, whatever size it streamed at.
-Time is chunk in -> one novel view out on the full cache, warm. Writes `table.json`, `table.md` and `plot.png`,
-row by row. Needs an idle machine: about 40 minutes on two cores.
+Time is chunk in -> one novel view out on the full cache, warm. Writes `table.json`, `table.csv`, `page.md` and
+`plot.png`; what `--out` holds is not measured again. Needs an idle machine: about 40 minutes on two cores.
 """
 
 import dataclasses
@@ -16,23 +16,22 @@ from typing import Any
 
 import numpy as np
 
+from ssplat_experiments.cases import Case, Row
 from ssplat_experiments.scenes import REDKITCHEN, open_redkitchen, open_room
+from ssplat_experiments.study import Study, at_scale, run_study
 from ssplat_jax.checkpoint.weights import load_params
 from ssplat_jax.config import preset
 from ssplat_jax.console import Reporter
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.split import Split
 from ssplat_jax.evaluation.latency import measure_latency
-from ssplat_jax.evaluation.plots import import_pyplot, save_figure
 from ssplat_jax.evaluation.scoring import score_targets
-from ssplat_jax.storage.atomic import write_atomic
-from ssplat_jax.storage.json_files import write_json
 from ssplat_jax.streaming.feed import feed_capture
 from ssplat_jax.streaming.session import Session
 from ssplat_jax.streaming.streamsplat import StreamSplat
 
 SCORED = (320, 240)
-CONTEXT = {"full": 32, "smoke": 8}
+CONTEXT = {"cpu": 32, "smoke": 8}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,27 +68,29 @@ SETTINGS = (
 
 def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str:
     """Measures every setting on every available scene; `smoke` takes the first two settings and 8 views."""
-    settings = SETTINGS if scale == "full" else SETTINGS[:2]
-    scenes = _scenes(captures, CONTEXT[scale])
-    if len(scenes) == 1:
+    if captures is None or not (captures / REDKITCHEN).is_dir():
         reporter.warn("no redkitchen under --captures: the procedural scene stands alone")
-    rows: list[dict[str, Any]] = []
-    with reporter.progress("measuring", len(settings) * len(scenes)) as advance:
-        for setting in settings:
-            for scene, opened in scenes.items():
-                rows.append({"scene": scene} | measure(setting, opened))
-                _write(out, rows)  # what an interrupted run has measured is kept
-                advance(len(rows), f"{scene}, {setting.name}")
-    return f"wrote {out}/table.json, table.md and plot.png: {len(rows)} measured settings"
+    return run_study(STUDY, captures, out, scale, reporter)
 
 
-def _write(out: Path, rows: list[dict[str, Any]]) -> None:
-    """The table in two forms and the plot, with the front of the rows so far."""
-    for scene in {row["scene"] for row in rows}:
-        mark_front([row for row in rows if row["scene"] == scene])
-    write_json(out / "table.json", rows)
-    write_atomic(out / "table.md", _markdown(rows).encode())
-    plot(out / "plot.png", rows)
+def cases(captures: Path | None, scale: str) -> list[Case]:
+    """A case for every setting and scene."""
+    settings = SETTINGS[:2] if scale == "smoke" else SETTINGS
+    context = at_scale(CONTEXT, scale)
+    return [
+        Case(
+            name=f"{scene}, {setting.name}",
+            config=preset("tiny").replace(**setting.changes),
+            asked={"scene": scene, "context": context, "size": setting.size, "scored": SCORED},
+            measure=functools.partial(_measured, scene, setting, opened),
+        )
+        for setting in settings
+        for scene, opened in _scenes(captures, context).items()
+    ]
+
+
+def _measured(scene: str, setting: Setting, opened: "Opened") -> list[Row]:
+    return [{"scene": scene} | measure(setting, opened)]
 
 
 Opened = Callable[[tuple[int, int]], tuple[Capture, Split]]
@@ -123,11 +124,11 @@ def measure(setting: Setting, opened: Opened) -> dict[str, Any]:
         "render_ms": latency["render_ms"],
         "compile_s": round(session.compile_seconds, 1),
         "gaussians": session.cache_facts()["decoded"],
-        "step_memory_mb": round((session.step_memory_bytes or 0) / 2**20, 1),
+        "step_memory_bytes": session.step_memory_bytes,
     }
 
 
-def mark_front(rows: list[dict[str, Any]]) -> None:
+def mark_front(rows: list[Row]) -> None:
     """Sets `front` on every row: no other row of the scene is both faster and at least as good."""
     best = -np.inf
     for row in sorted(rows, key=lambda row: (row["ms_per_view"], -row["shown"])):
@@ -135,25 +136,11 @@ def mark_front(rows: list[dict[str, Any]]) -> None:
         best = max(best, row["shown"])
 
 
-def _markdown(rows: list[dict[str, Any]]) -> str:
-    """The table, fastest first within a scene; the front in bold."""
-    lines = [
-        "| scene | setting | shown PSNR dB | literal PSNR dB | ms per view | Gaussians | step memory MiB |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    for row in sorted(rows, key=lambda row: (row["scene"], row["ms_per_view"])):
-        name = f"**{_label(row)}**" if row["front"] else _label(row)
-        cells = (
-            row["scene"],
-            name,
-            f"{row['shown']:.2f}",
-            f"{row['literal']:.2f}",
-            row["ms_per_view"],
-            row["gaussians"],
-            row["step_memory_mb"],
-        )
-        lines.append("| " + " | ".join(map(str, cells)) + " |")
-    return "\n".join(lines) + "\n"
+def mark_fronts(rows: list[Row]) -> None:
+    """The front of every scene; the fastest rows first within a scene."""
+    for scene in {row["scene"] for row in rows}:
+        mark_front([row for row in rows if row["scene"] == scene])
+    rows.sort(key=lambda row: (row["scene"], row["ms_per_view"]))
 
 
 def _label(row: dict[str, Any]) -> str:
@@ -162,13 +149,8 @@ def _label(row: dict[str, Any]) -> str:
     return f"{row['setting']} ({quality})" if quality else row["setting"]
 
 
-def plot(path: Path, rows: list[dict[str, Any]]) -> None:
-    """A panel per scene, the front as a line, the qualities ringed; names where there is room, the front's first.
-
-    Left out without matplotlib (`plots` extra).
-    """
-    if (pyplot := import_pyplot()) is None:
-        return
+def plot(pyplot: Any, rows: list[Row]) -> Any:
+    """A panel per scene, the front as a line, the qualities ringed; names where there is room, the front's first."""
     scenes = list(dict.fromkeys(row["scene"] for row in rows))
     figure, panels = pyplot.subplots(1, len(scenes), figsize=(7 * len(scenes), 5), layout="constrained", squeeze=False)
     for axes, scene in zip(panels[0], scenes, strict=True):
@@ -203,4 +185,15 @@ def plot(path: Path, rows: list[dict[str, Any]]) -> None:
         axes.set_ylabel("PSNR of unseen views, dB")
         axes.set_title(scene)
         axes.spines[["top", "right"]].set_visible(False)
-    save_figure(path, figure)
+    return figure
+
+
+STUDY = Study(
+    name="accuracy_vs_time",
+    text="""Every setting streams the same context views with the shipped weights and is scored on the same views at the
+same size. Time is chunk in, one novel view out, on the full cache. `front`: no other setting of the scene is both
+faster and at least as good.""",
+    cases=cases,
+    finish=mark_fronts,
+    plot=plot,
+)

@@ -41,7 +41,7 @@ def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str
             reporter.warn(f"{name}: not in {captures}, left out")
             continue
         capture = open_capture(captures / name, size=size)
-        split = interleaved_split(len(capture), stride, context if scale == "full" else 8)
+        split = interleaved_split(len(capture), stride, context if scale != "smoke" else 8)
         metrics = evaluate(Session(model, params), capture, split, out / f"{name}_stride{stride}", reporter)
         row = {
             "capture": name,

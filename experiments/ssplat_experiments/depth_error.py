@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ssplat_experiments.scenes import REDKITCHEN, open_redkitchen, open_room
+from ssplat_experiments.study import at_scale
 from ssplat_jax.checkpoint.weights import load_params
 from ssplat_jax.config import preset
 from ssplat_jax.console import Reporter
@@ -29,14 +30,14 @@ from ssplat_jax.streaming.session import Session
 from ssplat_jax.streaming.streamsplat import StreamSplat
 
 SIZE = (320, 240)
-CONTEXT = {"full": 64, "smoke": 8}
+CONTEXT = {"cpu": 64, "smoke": 8}
 EDGE = 1.05  # depth ratio within a cell above which it shows two surfaces
 BIN_EDGES = (0.0, 0.3, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)  # bins of confidence
 
 
 def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str:
     """Measures `procedural:room` and, where `--captures` has it, redkitchen."""
-    context = CONTEXT[scale]
+    context = at_scale(CONTEXT, scale)
     scenes = {"room": open_room(context, SIZE)}
     if captures is not None and (captures / REDKITCHEN).is_dir():
         scenes[REDKITCHEN] = open_redkitchen(captures, context, SIZE)

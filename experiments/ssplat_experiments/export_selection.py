@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from ssplat_experiments.scenes import REDKITCHEN, open_redkitchen, open_room
+from ssplat_experiments.study import at_scale
 from ssplat_jax.checkpoint.weights import load_params
 from ssplat_jax.config import preset
 from ssplat_jax.console import Reporter
@@ -28,7 +29,7 @@ from ssplat_jax.streaming.session import Session
 from ssplat_jax.streaming.streamsplat import StreamSplat
 
 SIZE = (320, 240)
-CONTEXT = {"full": 40, "smoke": 8}
+CONTEXT = {"cpu": 40, "smoke": 8}
 NUM_TARGETS = 6
 FOX = "fox"
 SHARES = (0.75, 0.5, 0.25)
@@ -37,7 +38,7 @@ SHARES = (0.75, 0.5, 0.25)
 
 def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str:
     """Scores every selection on every capture."""
-    context = CONTEXT[scale]
+    context = at_scale(CONTEXT, scale)
     scenes = {"room": open_room(context, SIZE)}
     if captures is not None and (captures / REDKITCHEN).is_dir():
         scenes[REDKITCHEN] = open_redkitchen(captures, context, SIZE)

@@ -10,6 +10,7 @@ per number of views with pictures, `metrics.json` and `split.json`. docs/model_c
 
 from pathlib import Path
 
+from ssplat_experiments.study import at_scale
 from ssplat_jax.checkpoint.weights import load_params
 from ssplat_jax.config import preset
 from ssplat_jax.console import Reporter
@@ -23,8 +24,8 @@ from ssplat_jax.streaming.session import Session
 from ssplat_jax.streaming.streamsplat import StreamSplat
 
 NAME, SIZE = "redkitchen", (320, 240)
-COUNTS = {"full": (24, 64, 128, 256, 512), "smoke": (8, 16)}
-ROOM_FRAMES = {"full": 600, "smoke": 40}
+COUNTS = {"cpu": (24, 64, 128, 256, 512), "smoke": (8, 16)}
+ROOM_FRAMES = {"cpu": 600, "smoke": 40}
 
 
 def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str:
@@ -32,7 +33,7 @@ def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str
     capture = _open(captures, scale)
     model, params = StreamSplat(preset("tiny")), load_params("tiny")
     rows = []
-    for context in COUNTS[scale]:
+    for context in at_scale(COUNTS, scale):
         split = paper_split(len(capture), context)
         metrics = evaluate(Session(model, params), capture, split, out / f"{context}_views", reporter)
         rows.append(
@@ -60,7 +61,7 @@ def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str
 
 def _open(captures: Path | None, scale: str) -> Capture:
     if captures is None:
-        return open_capture(f"procedural:room?frames={ROOM_FRAMES[scale]}", size=SIZE)
+        return open_capture(f"procedural:room?frames={at_scale(ROOM_FRAMES, scale)}", size=SIZE)
     if not (captures / NAME).is_dir():
         raise InputError(f"experiment more_views: wanted {NAME} in --captures, {captures} does not hold it.")
     return open_capture(captures / NAME, size=SIZE)

@@ -18,15 +18,16 @@ class Experiment:
     """
 
     name: Annotated[str, tyro.conf.Positional]
-    """captures: novel views of real captures. accuracy_vs_time: accuracy against time.
-    ablation: the effect of each module. depth_error: errors of depth, by confidence.
-    more_views: the paper's protocol over growing numbers of views."""
+    """all: the tables and figures of the paper, on one page. accuracy_vs_time: accuracy against time.
+    captures: novel views of real captures. ablation: the effect of each module.
+    depth_error: errors of depth, by confidence. more_views: the paper's protocol over growing numbers of views."""
     out: Path
     """Folder of the tables, plots and pictures."""
     captures: Path | None = None
     """Folder of real captures; some experiments run without."""
-    scale: Literal["smoke", "full"] = "full"
-    """smoke: the same program on as little data as possible."""
+    scale: Literal["smoke", "cpu", "gpu"] = "cpu"
+    """smoke: the same program on as little data as possible. cpu: sizes for a few cores. gpu: the paper's sizes, where
+    an experiment has them."""
     quiet: QuietOption = False
 
     def run(self) -> int:
@@ -38,6 +39,11 @@ class Experiment:
         found = {point.name: point for point in entry_points(group="ssplat_jax.experiments")}
         if self.name not in found:
             raise InputError(f"experiment: wanted one of {', '.join(sorted(found))}, got {self.name!r}.")
+        if self.scale == "gpu":
+            import jax
+
+            if (backend := jax.default_backend()) != "gpu":
+                raise InputError(f"--scale gpu: wanted a GPU, JAX found {backend}; use --scale cpu.")
         self.out.mkdir(parents=True, exist_ok=True)
         print(found[self.name].load()(self.captures, self.out, self.scale, Reporter(self.quiet)))
         return 0

@@ -1,0 +1,131 @@
+"""Cases of an experiment: each is measured once and kept in one file, so that a stopped experiment continues."""
+
+import dataclasses
+import hashlib
+import json
+import re
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from ssplat_experiments import provenance
+from ssplat_jax.config import StreamConfig
+from ssplat_jax.console import Reporter
+from ssplat_jax.errors import InputError
+from ssplat_jax.storage.json_files import json_text, write_json
+
+Row = dict[str, Any]
+"""A line of a table: numbers and words by column."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    """One measurement that is made as a whole."""
+
+    name: str
+    config: StreamConfig
+    asked: dict[str, Any]
+    """Everything besides the configuration that decides the result, as JSON types."""
+    measure: Callable[[], Sequence[Row]]
+
+    @property
+    def request(self) -> dict[str, Any]:
+        """All that decides the result, as JSON holds it."""
+        return json.loads(json_text({"asked": self.asked, "config": self.config.to_dict()}))
+
+    @property
+    def hash(self) -> str:
+        """Hash of 12 hexadecimal digits of the request."""
+        return hashlib.sha256(json.dumps(self.request, sort_keys=True).encode()).hexdigest()[:12]
+
+    def path(self, folder: Path) -> Path:
+        """The file of the case."""
+        return folder / (re.sub(r"[^a-z0-9.]+", "_", self.name.lower()).strip("_") + ".json")
+
+
+def measure_cases(
+    name: str, cases: Sequence[Case], folder: Path, reporter: Reporter, on_case: Callable[[list[Row]], None]
+) -> list[Row]:
+    """Measures the cases whose file is missing, each into a file of its own, written at once and whole.
+
+    Every file is compared with its case before the first is measured, so that a folder never holds results of two
+    configurations.
+
+    Args:
+        name: name of the experiment, for the progress bar.
+        cases: the cases, in the order of the table.
+        folder: where the files are.
+        reporter: shows the progress.
+        on_case: called with all rows so far after each case that was measured.
+
+    Returns:
+        The rows of all cases, each with the machine, the date, the commit and the configuration hash.
+
+    Raises:
+        InputError: a file holds the result of another request, or is no such file.
+    """
+    held = {case.name: _read(case, folder) for case in cases if case.path(folder).exists()}
+    if len({case.path(folder) for case in cases}) != len(cases):
+        raise ValueError(f"{name}: two cases have the same file.")
+    num_held = len(held)
+    with reporter.progress(name, len(cases)) as advance:
+        advance(num_held, "continued" if num_held else "compiling")
+        for case in cases:
+            if case.name in held:
+                continue
+            since = time.perf_counter()
+            rows = list(case.measure())
+            held[case.name] = _record(name, case, rows, time.perf_counter() - since)
+            write_json(case.path(folder), held[case.name])
+            on_case(_rows(cases, held))
+            advance(len(held), case.name)
+    return _rows(cases, held)
+
+
+def _record(name: str, case: Case, rows: list[Row], seconds: float) -> dict[str, Any]:
+    """What the file of a case holds."""
+    return {
+        "experiment": name,
+        "case": case.name,
+        "request": case.request,
+        "request_hash": case.hash,
+        "config": case.config.hash,
+        "commit": provenance.commit(),
+        "date": provenance.today(),
+        "machine": provenance.machine(),
+        "seconds": round(seconds, 2),
+        "rows": rows,
+    }
+
+
+def _read(case: Case, folder: Path) -> dict[str, Any]:
+    """The file of a case, which must answer the same request."""
+    path = case.path(folder)
+    try:
+        record = json.loads(path.read_text())
+        held, rows = record["request_hash"], record["rows"]
+    except (OSError, ValueError, KeyError, TypeError):
+        raise InputError(f"{path}: wanted the result of case {case.name!r}, got something else; remove it.") from None
+    if held != case.hash or not isinstance(rows, list):
+        differing = _differences(record.get("request"), case.request)
+        raise InputError(
+            f"{path}: was measured with another request ({differing}); choose another --out, or remove the file to"
+            " measure it again."
+        )
+    return record
+
+
+def _differences(held: Any, wanted: Any, where: str = "") -> str:
+    """The first fields that differ, as `field: held, wanted now`."""
+    if isinstance(held, dict) and isinstance(wanted, dict):
+        found = [_differences(held.get(k), wanted.get(k), f"{where}.{k}" if where else k) for k in {**held, **wanted}]
+        return "; ".join([difference for difference in found if difference][:3])
+    return "" if held == wanted else f"{where}: {held!r}, wanted now {wanted!r}"
+
+
+def _rows(cases: Sequence[Case], held: dict[str, dict[str, Any]]) -> list[Row]:
+    """Rows of the cases that are there, each with its provenance."""
+    records = [held[case.name] for case in cases if case.name in held]
+    origin = ("config", "commit", "date", "machine")
+    return [{**row, **{field: record[field] for field in origin}} for record in records for row in record["rows"]]

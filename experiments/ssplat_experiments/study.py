@@ -1,0 +1,136 @@
+"""`run_study`: measures the cases of an experiment and writes its table (JSON and CSV), its plot and its page."""
+
+import csv
+import dataclasses
+import io
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+from ssplat_experiments.cases import Case, Row, measure_cases
+from ssplat_jax.console import Reporter
+from ssplat_jax.evaluation.plots import import_pyplot, save_figure
+from ssplat_jax.storage.atomic import write_atomic
+from ssplat_jax.storage.folders import make_writable
+from ssplat_jax.storage.json_files import write_json
+
+T = TypeVar("T")
+
+SCALES = ("smoke", "cpu", "gpu")
+"""Sizes of an experiment: seconds, two cores, a GPU."""
+
+PAGE, PLOT = "page.md", "plot.png"
+
+
+@dataclasses.dataclass(frozen=True)
+class Study:
+    """An experiment as cases and what is made of their rows."""
+
+    name: str
+    text: str
+    """What the page says above the table."""
+    cases: Callable[[Path | None, str], Sequence[Case]]
+    """The cases for a folder of captures and a scale."""
+    finish: Callable[[list[Row]], None] = lambda rows: None
+    """Adds columns that follow from all rows."""
+    plot: Callable[[Any, list[Row]], Any] | None = None
+    """Draws the rows with pyplot and returns the figure."""
+    findings: Callable[[list[Row]], Sequence[str]] = lambda rows: ()
+    """Sentences that follow from the rows, printed and written below the table."""
+
+
+def at_scale(choices: dict[str, T], scale: str) -> T:
+    """The choice for a scale; `gpu` takes that of `cpu` where it has none of its own."""
+    return choices.get(scale, choices["cpu"])
+
+
+def run_study(study: Study, captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str:
+    """Measures the cases that `out` does not hold yet, and writes `table.json`, `table.csv`, `plot.png` and `page.md`.
+
+    Args:
+        study: the experiment.
+        captures: folder of real captures, or None.
+        out: folder of the results; `cases/` in it holds a file for each case.
+        scale: one of `SCALES`.
+        reporter: shows progress.
+
+    Returns:
+        One line for the terminal.
+
+    Raises:
+        InputError: `out` holds results of another request.
+        StorageError: `out` cannot be written.
+    """
+    make_writable(out)
+    cases = study.cases(captures, scale)
+    rows = measure_cases(
+        study.name, cases, out / "cases", reporter, lambda so_far: _write(study, out, scale, _finished(study, so_far))
+    )
+    _write(study, out, scale, rows := _finished(study, rows))
+    if study.plot is not None and (pyplot := import_pyplot()) is None:
+        reporter.warn(f"{study.name}: no {PLOT} without matplotlib; pip install 'ssplat-jax[plots]'")
+    elif study.plot is not None:
+        save_figure(out / PLOT, study.plot(pyplot, rows))
+    for finding in study.findings(rows):
+        reporter.say(finding)
+    return f"wrote {out}/{PAGE}, table.json and table.csv: {len(rows)} rows of {len(cases)} cases"
+
+
+def _finished(study: Study, rows: list[Row]) -> list[Row]:
+    study.finish(rows)
+    return rows
+
+
+def _write(study: Study, out: Path, scale: str, rows: list[Row]) -> None:
+    """The table in both forms and the page."""
+    write_json(out / "table.json", rows)
+    write_atomic(out / "table.csv", csv_table(rows).encode())
+    write_atomic(out / PAGE, page(study, scale, rows).encode())
+
+
+def columns_of(rows: Sequence[Row]) -> list[str]:
+    """All columns of the rows, those of the provenance last, in the order of their first appearance."""
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    last = [name for name in ("config", "commit", "date", "machine") if name in names]
+    return [name for name in names if name not in last] + last
+
+
+def csv_table(rows: Sequence[Row]) -> str:
+    """The rows as CSV; a missing value is empty."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, columns_of(rows), restval="", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+def markdown_table(rows: Sequence[Row]) -> str:
+    """The rows as a Markdown table; a missing value is empty, and bytes are given in MiB."""
+    columns = columns_of(rows)
+    heads = [name.replace("_bytes", "_mib").replace("_", " ") for name in columns]
+    lines = ["| " + " | ".join(heads) + " |", "|" + "---|" * len(columns)]
+    for row in rows:
+        lines.append("| " + " | ".join(_cell(name, row.get(name)) for name in columns) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def _cell(name: str, value: Any) -> str:
+    if value is None:
+        return ""
+    if name.endswith("_bytes"):
+        return f"{value / 2**20:.1f}"
+    if isinstance(value, bool):
+        return "yes" if value else ""
+    return f"{value:.4g}" if isinstance(value, float) and abs(value) < 1e4 else str(value).replace("|", "/")
+
+
+def page(study: Study, scale: str, rows: Sequence[Row]) -> str:
+    """The page of an experiment: what was done, the command, the table, what follows and the plot."""
+    parts = [f"# {study.name}", study.text.strip()]
+    parts.append(f"    ssplat experiment {study.name} --scale {scale} --out runs/{study.name}")
+    if rows:
+        parts.append(markdown_table(rows).strip())
+    parts += study.findings(list(rows))
+    if study.plot is not None:
+        parts.append(f"![{study.name}]({PLOT})")
+    return "\n\n".join(parts) + "\n"
