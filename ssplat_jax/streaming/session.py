@@ -118,11 +118,24 @@ class Session:
         Only shown pivots are decoded, because a cache has capacity for many more than it holds. Their number is rounded
         up to a power of two, so that few programs are compiled.
         """
+        return self._decode_shown(*self._decode_arguments())
+
+    def _decode_arguments(self) -> tuple[dict, VoxelCache, int]:
+        """Parameters, cache and number of pivots to decode."""
         if self.cache is None:
             self.cache = self.model.init_cache()
         num_shown = int(self._count_shown(self.cache))
         num_pivots = min(max(MIN_DECODED_PIVOTS, 1 << max(num_shown - 1, 0).bit_length()), self.cache.alive.size)
-        return self._decode_shown(self.params, self.cache, num_pivots)
+        return self.params, self.cache, num_pivots
+
+    @property
+    def step_program(self) -> jax.stages.Compiled | None:
+        """The compiled step that ran last; None before the first chunk."""
+        return self._last_program
+
+    def decode_program(self) -> jax.stages.Compiled:
+        """The program of `gaussians` for the present cache, compiled once more so that it can be analyzed."""
+        return self._decode_shown.lower(*self._decode_arguments()).compile()
 
     @property
     def step_memory_bytes(self) -> int | None:

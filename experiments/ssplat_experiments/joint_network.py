@@ -1,0 +1,69 @@
+"""The same network over all views at once: the fixed-view method with which the paper compares a stream."""
+
+import jax
+import jax.numpy as jnp
+
+from ssplat_jax.cache import init_cache
+from ssplat_jax.chunk import Chunk
+from ssplat_jax.config import StreamConfig
+from ssplat_jax.evaluation.peak_memory import PeakMemory, added_bytes, allocator_peak, live_bytes, render_bytes
+from ssplat_jax.gaussians import Gaussians, mask_gaussians
+from ssplat_jax.geometry.cameras import Camera
+from ssplat_jax.streaming.streamsplat import StreamSplat
+
+SMALLEST_CAPACITY = 128
+
+
+def joint_config(config: StreamConfig, num_views: int) -> StreamConfig:
+    """`config` with all views in one chunk and nothing that reads a memory."""
+    changes = {"chunk_size": num_views, "hpda": False, "cgfi": False, "carving": False}
+    return config.replace(**changes, capacity=SMALLEST_CAPACITY)
+
+
+class JointNetwork:
+    """The network for a number of views, all of which are matched, mixed and decoded together.
+
+    Args:
+        config: configuration of the stream that it is compared with.
+        params: the parameters of that stream.
+        chunk: all views, as one chunk.
+    """
+
+    def __init__(self, config: StreamConfig, params: dict, chunk: Chunk) -> None:
+        model = StreamSplat(joint_config(config, len(chunk.images)))
+        self.params, self.chunk = params, chunk
+
+        def decode_all(params: dict, chunk: Chunk) -> Gaussians:
+            tokens = model.predict(params, init_cache(model.config), chunk).tokens
+            accepted = tokens.valid & (tokens.confidences >= config.memory.min_confidence)
+            return mask_gaussians(model.decode_tokens(params, tokens), model.repeat_per_gaussian(accepted))
+
+        self.program = jax.jit(decode_all).lower(params, chunk).compile()
+
+    def gaussians(self) -> Gaussians:
+        """The scene of all views, in the stream frame."""
+        return jax.block_until_ready(self.program(self.params, self.chunk))
+
+    def network_bytes(self) -> int | None:
+        """Bytes in use while the network runs."""
+        added = added_bytes(self.program)
+        return None if added is None else added + live_bytes((self.params, self.chunk))
+
+    def peak_memory(self, camera: Camera) -> PeakMemory:
+        """Memory of running the network, which decodes within, and of rendering a view."""
+        gaussians = self.gaussians()
+        rendering = render_bytes(gaussians, camera)
+        held = live_bytes((self.params, gaussians))
+        return PeakMemory(
+            step=(network := self.network_bytes()),
+            decode=network,
+            render=None if rendering is None else held + rendering,
+            allocator=allocator_peak(),
+        )
+
+
+def one_chunk(chunks: list[Chunk]) -> Chunk:
+    """All valid views of a list of chunks as one chunk."""
+    joined = jax.tree.map(lambda *parts: jnp.concatenate(parts) if parts[0].ndim else parts[0], *chunks)
+    keep = jnp.nonzero(joined.valid)[0]
+    return jax.tree.map(lambda x: x[keep] if x.ndim else x, joined)

@@ -1,0 +1,160 @@
+"""Peak memory of step, decode and rendering against the number of views (the paper's Figure 1).
+
+    ssplat experiment memory_curve --scale smoke --out runs/memory_curve
+
+Three methods take in the same views of `procedural:room`: ours, ours with a memory that keeps every token
+(`vacc="append"`), and the same network over all views at once, which is what a fixed-view method does. All run for each
+number of views. On a CPU the bytes are those of XLA's analysis (`ssplat_jax/evaluation/peak_memory.py`); on a GPU each
+number of views runs in a process of its own, and its allocator counts.
+"""
+
+import dataclasses
+import functools
+import multiprocessing
+from pathlib import Path
+from typing import Any
+
+from ssplat_experiments.cases import Case, Row
+from ssplat_experiments.joint_network import JointNetwork, joint_config, one_chunk
+from ssplat_experiments.study import Study, at_scale, run_study
+from ssplat_jax.checkpoint.weights import load_params
+from ssplat_jax.config import StreamConfig, preset
+from ssplat_jax.console import Reporter
+from ssplat_jax.data.capture import Capture, open_capture
+from ssplat_jax.evaluation.peak_memory import peak_memory
+from ssplat_jax.streaming.feed import feed_capture
+from ssplat_jax.streaming.session import Session
+from ssplat_jax.streaming.streamsplat import StreamSplat
+
+START_CAPACITY = 128
+"""Both memories start as small as they can and double when needed, so that the curve shows what a scene needs."""
+
+CHUNK = 4
+METHODS = ("ours", "append-all", "joint")
+COLORS = {"ours": "#c06030", "append-all": "#30507a", "joint": "#308050"}
+
+
+@dataclasses.dataclass(frozen=True)
+class Sizes:
+    """Numbers of views, and the size of the images."""
+
+    counts: tuple[int, ...]
+    width: int
+    height: int
+
+
+SIZES = {
+    "smoke": Sizes((8, 32), 64, 48),
+    "cpu": Sizes((8, 16, 32, 64, 128), 160, 120),
+    "gpu": Sizes((24, 64, 128, 256, 512), 480, 256),
+}
+
+
+def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str:
+    """Measures every method at every number of views."""
+    return run_study(STUDY, captures, out, scale, reporter)
+
+
+def config_of(method: str, num_views: int) -> StreamConfig:
+    """Configuration of a method."""
+    config = preset("tiny").replace(chunk_size=CHUNK, capacity=START_CAPACITY)
+    if method == "joint":
+        return joint_config(config, num_views)
+    return config.replace(vacc="append") if method == "append-all" else config
+
+
+def cases(captures: Path | None, scale: str) -> list[Case]:
+    """A case for each method; joint networks, and processes of their own, take one number of views each."""
+    sizes = at_scale(SIZES, scale)
+    measure = in_own_process if scale == "gpu" else measured
+    found = []
+    for method in METHODS:
+        is_single = method == "joint" or scale == "gpu"
+        for counts in [(count,) for count in sizes.counts] if is_single else [sizes.counts]:
+            found.append(
+                Case(
+                    name=f"{method}, {' '.join(map(str, counts))} views",
+                    config=config_of(method, counts[-1]),
+                    asked={"capture": _spec(sizes), "size": [sizes.width, sizes.height], "views": counts},
+                    measure=functools.partial(measure, method, counts, sizes),
+                )
+            )
+    return found
+
+
+def in_own_process(method: str, counts: tuple[int, ...], sizes: Sizes) -> list[Row]:
+    """`measured` in a fresh process, whose allocator has counted nothing else."""
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        return pool.apply(measured, (method, counts, sizes))
+
+
+def _spec(sizes: Sizes) -> str:
+    return f"procedural:room?frames={max(sizes.counts)}"
+
+
+@functools.lru_cache(maxsize=1)
+def _open(sizes: Sizes) -> Capture:
+    return open_capture(_spec(sizes), size=(sizes.width, sizes.height))
+
+
+def measured(method: str, counts: tuple[int, ...], sizes: Sizes) -> list[Row]:
+    """The rows of a method: the first views of the capture, in one stream that stops at each number of them."""
+    capture, config, params = _open(sizes), config_of(method, counts[-1]), load_params("tiny")
+    frame = capture.stream_frame(config, range(max(sizes.counts)))
+    session, rows, fed = Session(StreamSplat(config), params), [], 0
+    for count in counts:
+        camera = capture.camera(count // 2, frame)
+        if method == "joint":
+            network = JointNetwork(config, params, one_chunk(list(capture.chunks(config, range(count), frame=frame))))
+            memory, shown = network.peak_memory(camera), int((network.gaussians().opacities > 0).sum())
+        else:
+            _, recent = feed_capture(session, capture, range(fed, count), frame, num_recent=1)
+            memory, shown = peak_memory(session, recent[0], camera), session.cache_facts()["decoded"]
+        rows.append({"method": method, "views": count, **memory.to_row(), "gaussians": shown})
+        fed = count
+    return rows
+
+
+def growth(rows: list[Row], method: str) -> tuple[float, float]:
+    """Factor by which a method's memory grows from the fewest views to the most, and bytes per added view."""
+    curve = sorted((row["views"], row["peak_memory_bytes"]) for row in rows if row["method"] == method)
+    (first, low), (last, high) = curve[0], curve[-1]
+    return high / low, (high - low) / max(last - first, 1)
+
+
+def findings(rows: list[Row]) -> list[str]:
+    """How the memory of each method grows."""
+    counts = sorted({row["views"] for row in rows})
+    found = []
+    for method in dict.fromkeys(row["method"] for row in rows):
+        factor, slope = growth(rows, method)
+        found.append(
+            f"{method}: {factor:.2f} x from {counts[0]} to {counts[-1]} views, {slope / 2**20:.2f} MiB a view."
+        )
+    return ["\n".join(f"* {line}" for line in found)]
+
+
+def plot(pyplot: Any, rows: list[Row]) -> Any:
+    """A curve for each method."""
+    figure, axes = pyplot.subplots(figsize=(6, 4), layout="constrained")
+    for method in METHODS:
+        curve = sorted((row["views"], row["peak_memory_bytes"] / 2**20) for row in rows if row["method"] == method)
+        axes.plot(*zip(*curve, strict=True), marker="o", ms=4, color=COLORS[method], label=method)
+    axes.set_xlabel("views")
+    axes.set_ylabel("peak memory of step, decode and render, MiB")
+    axes.set_ylim(bottom=0)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(frameon=False)
+    return figure
+
+
+STUDY = Study(
+    name="memory_curve",
+    text="""Peak memory of step, decode and rendering together, against the number of views, in MiB. `ours` merges
+tokens by voxel, `append-all` keeps every token, `joint` runs the same network over all views at once. The memories of
+`ours` and `append-all` double when they are full. While a step runs, its parameters, cache, images and temporaries
+count.""",
+    cases=cases,
+    plot=plot,
+    findings=findings,
+)

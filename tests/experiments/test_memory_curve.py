@@ -1,0 +1,66 @@
+"""Memory against views: the joint network's grows at least linearly, a stream's does not grow."""
+
+import itertools
+
+import jax
+import numpy as np
+import pytest
+from ssplat_experiments.joint_network import JointNetwork, one_chunk
+from ssplat_experiments.memory_curve import growth
+
+from ssplat_jax.data.capture import open_capture
+from ssplat_jax.evaluation.peak_memory import added_bytes, live_bytes, peak_memory
+from ssplat_jax.streaming.feed import feed_capture
+from ssplat_jax.streaming.session import Session
+from ssplat_jax.streaming.streamsplat import StreamSplat
+from tests.model import small
+
+CONFIG = small.CONFIG.replace(chunk_size=4, capacity=1 << 11, min_confidence=0.05)
+COUNTS = (4, 8, 16)
+
+
+@pytest.fixture(scope="module")
+def room():
+    return open_capture("procedural:room?frames=16", size=(48, 32))
+
+
+@pytest.mark.usefixtures("compiled_plainly")
+def test_memory_of_joint_network_grows_linearly_or_faster(room):
+    params, frame = small.random_params(CONFIG), room.stream_frame(CONFIG)
+    peaks = []
+    for count in COUNTS:
+        chunk = one_chunk(list(room.chunks(CONFIG, range(count), frame=frame)))
+        network = JointNetwork(CONFIG, params, chunk)
+        peaks.append(network.network_bytes())
+    slopes = [(b - a) / (n - m) for (m, a), (n, b) in itertools.pairwise(zip(COUNTS, peaks, strict=True))]
+    assert slopes[0] > live_bytes(chunk.images[0])  # more than the images alone
+    assert slopes[1] >= 0.95 * slopes[0]
+
+
+@pytest.mark.usefixtures("compiled_plainly")
+def test_memory_of_a_stream_does_not_grow_with_views(room):
+    """The cache has capacity for the scene, as it has after its last doubling."""
+    config = CONFIG.replace(overflow="drop_new", voxel_size=0.5)
+    session, frame = Session(StreamSplat(config), small.random_params(config)), room.stream_frame(config)
+    peaks, steps = [], []
+    for _ in range(3):
+        _, recent = feed_capture(session, room, range(16), frame, num_recent=1)
+        memory = peak_memory(session, recent[0], room.camera(3, frame))
+        peaks.append(memory.bytes)
+        steps.append(memory.step)
+    assert len(set(steps)) == 1
+    assert max(peaks) <= 1.05 * peaks[0]
+    assert peaks[0] >= live_bytes((session.params, session.cache))
+
+
+def test_added_bytes_are_results_and_temporaries():
+    x = np.zeros(1 << 16, np.float32)
+    kept = jax.jit(lambda x: x + 1).lower(x).compile()
+    written_over = jax.jit(lambda x: x + 1, donate_argnums=0).lower(x).compile()
+    assert x.nbytes <= added_bytes(kept) <= x.nbytes + 1024
+    assert added_bytes(written_over) <= 1024
+
+
+def test_growth_is_taken_from_first_to_last_view_count():
+    rows = [{"method": "ours", "views": v, "peak_memory_bytes": 100 + 3 * v} for v in (50, 10, 30)]
+    assert growth(rows, "ours") == (250 / 130, 3.0)
