@@ -9,13 +9,19 @@ pages of all of them. A stopped run continues: cases that are there are not meas
 
 from pathlib import Path
 
-from ssplat_experiments import accuracy_vs_time, latency, memory_curve
+from ssplat_experiments import accuracy_vs_time, context_length, latency, long_context, memory_curve
 from ssplat_experiments.study import PAGE, Study, run_study
 from ssplat_jax.console import Reporter
 from ssplat_jax.errors import StorageError
 from ssplat_jax.storage.atomic import write_atomic
 
-STUDIES: tuple[Study, ...] = (memory_curve.STUDY, latency.STUDY, accuracy_vs_time.STUDY)
+STUDIES: tuple[Study, ...] = (
+    context_length.STUDY,
+    long_context.STUDY,
+    memory_curve.STUDY,
+    latency.STUDY,
+    accuracy_vs_time.STUDY,
+)
 FOLDER = "results"
 
 

@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ssplat_experiments.cases import Case, Row
+from ssplat_experiments.memory_curve import START_CAPACITY
 from ssplat_experiments.study import Study, at_scale, run_study
 from ssplat_jax import model as stages
 from ssplat_jax.cache import project
@@ -63,7 +64,7 @@ def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str
 
 def cases(captures: Path | None, scale: str) -> list[Case]:
     """A case for each size."""
-    sizes, config = at_scale(SIZES, scale), preset("tiny")
+    sizes, config = at_scale(SIZES, scale), preset("tiny").replace(capacity=START_CAPACITY)
     return [
         Case(
             name=f"{width}x{height}",

@@ -1,0 +1,199 @@
+"""Quality, memory and time against the number of context views (the paper's Table 1), with baselines.
+
+    ssplat experiment context_length --captures path/to/captures --out runs/context_length
+
+The targets are uniform over a trajectory, and the other frames are streamed in order; the stream stops at each number
+of views and is scored. Suites are procedural walks and every capture in `--captures` that is long enough. `literal`
+scores are those of the paper: over black, at the exposure of the scene. `shown` fills holes and carries the exposure
+over. The baselines see the same frames: the nearest context view, the mean color, the nearest view warped by the depth
+of our scene, and a memory that keeps every token.
+"""
+
+import dataclasses
+import functools
+import itertools
+import statistics
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from ssplat_experiments.cases import Case, Row
+from ssplat_experiments.image_baselines import BASELINES, baseline_scores
+from ssplat_experiments.memory_curve import START_CAPACITY
+from ssplat_experiments.study import Study, at_scale, run_study
+from ssplat_jax.checkpoint.weights import load_params
+from ssplat_jax.config import StreamConfig, preset
+from ssplat_jax.console import Reporter
+from ssplat_jax.data.capture import Capture, open_capture
+from ssplat_jax.data.split import paper_split
+from ssplat_jax.evaluation.latency import measure_latency
+from ssplat_jax.evaluation.peak_memory import peak_memory
+from ssplat_jax.evaluation.scoring import ImageScore, score_view
+from ssplat_jax.streaming.feed import Exposures, feed_capture
+from ssplat_jax.streaming.session import Session
+from ssplat_jax.streaming.streamsplat import StreamSplat
+
+OURS, APPEND = "ours", "append-all"
+NUM_TARGETS = 16
+
+
+@dataclasses.dataclass(frozen=True)
+class Sizes:
+    """Numbers of context views, procedural suites, image size and targets."""
+
+    counts: tuple[int, ...]
+    suites: tuple[str, ...]
+    size: tuple[int, int]
+    targets: int = NUM_TARGETS
+
+
+SIZES = {
+    "smoke": Sizes((8, 16), ("room",), (64, 48), targets=3),
+    "cpu": Sizes((24, 64, 128), ("room", "corridor", "orbit"), (160, 120)),
+    "gpu": Sizes((24, 64, 128), ("room", "corridor", "orbit"), (480, 256)),
+}
+
+
+def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str:
+    """Streams every suite with both memories."""
+    return run_study(STUDY, captures, out, scale, reporter)
+
+
+def cases(captures: Path | None, scale: str) -> list[Case]:
+    """A case for each suite and memory."""
+    return suite_cases(captures, at_scale(SIZES, scale))
+
+
+def suite_cases(captures: Path | None, sizes: Sizes) -> list[Case]:
+    """A case for each suite and memory at these sizes."""
+    num_frames = max(sizes.counts) + sizes.targets
+    paths = [f"procedural:{suite}?frames={num_frames}" for suite in sizes.suites]
+    folders = sorted(path for path in captures.iterdir() if path.is_dir()) if captures is not None else []
+    paths += [str(path) for path in folders if len(open_capture(path, size=sizes.size)) >= num_frames]
+    config = preset("tiny").replace(capacity=START_CAPACITY)  # so that memory is what the scene needs
+    methods = {OURS: config, APPEND: config.replace(vacc="append")}
+    return [
+        Case(
+            name=f"{_suite(path)}, {method}",
+            config=config,
+            asked={"suite": _suite(path), **dataclasses.asdict(sizes)},
+            measure=functools.partial(measured, path, method, config, sizes),
+        )
+        for path in paths
+        for method, config in methods.items()
+    ]
+
+
+def _suite(path: str) -> str:
+    return path if path.startswith("procedural:") else Path(path).name
+
+
+@functools.lru_cache(maxsize=1)
+def _open(path: str, size: tuple[int, int]) -> Capture:
+    return open_capture(path, size=size)
+
+
+def measured(path: str, method: str, config: StreamConfig, sizes: Sizes) -> list[Row]:
+    """A row for each number of views; with our memory, one for each image baseline too."""
+    capture = _open(path, sizes.size)
+    split = paper_split(len(capture), max(sizes.counts), targets=sizes.targets)
+    # Depth range and scale of the fewest views: a stream does not know how long it will be.
+    frame = capture.stream_frame(config, split.context[: min(sizes.counts)])
+    session, exposures, rows = Session(StreamSplat(config), load_params("tiny")), {}, []
+    middle = capture.camera(split.targets[len(split.targets) // 2], frame)
+    for fed, count in itertools.pairwise((0, *sizes.counts)):
+        seen, recent = feed_capture(session, capture, split.context[fed:count], frame, num_recent=1)
+        exposures |= seen
+        place = {"suite": _suite(path).removeprefix("procedural:").partition("?")[0], "views": count}
+        scored = _scores(session, capture, split.targets, split.context[:count], frame, exposures, method == OURS)
+        memory, latency = peak_memory(session, recent[-1], middle), measure_latency(session, recent, middle)
+        cost = {
+            "chunk_ms": latency["chunk_ms"]["median"],
+            "gaussians": session.cache_facts()["decoded"],
+            **memory.to_row(),
+        }
+        for name, scores in scored.items():
+            rows.append({**place, "method": name, **scores} | (cost if name == "scene" else {}))
+            rows[-1]["method"] = method if name == "scene" else name
+    return rows
+
+
+def _scores(
+    session: Session,
+    capture: Capture,
+    targets: Sequence[int],
+    context: Sequence[int],
+    frame: Any,
+    exposures: Exposures,
+    with_baselines: bool,
+) -> dict[str, dict[str, float]]:
+    """Mean scores of the scene and, if asked, of the image baselines, by their names."""
+    gaussians = session.gaussians()
+    found: dict[str, list[dict[str, ImageScore]]] = {"scene": []}
+    for i in targets:
+        view = score_view(gaussians, capture, i, frame, exposures)
+        found["scene"].append({"literal": view.score.literal, "shown": view.score.shown})
+        if with_baselines:
+            for name, scores in baseline_scores(capture, i, context, frame, view.depth, exposures).items():
+                found.setdefault(name, []).append(scores)
+    return {
+        name: {
+            f"{column}_{metric}": round(statistics.mean(getattr(s[column], metric) for s in scores), 4)
+            for column in ("literal", "shown")
+            for metric in ("psnr", "ssim")
+        }
+        for name, scores in found.items()
+    }
+
+
+def findings(rows: list[Row]) -> list[str]:
+    """What more views give and cost, by suite."""
+    lines = []
+    for suite in dict.fromkeys(row["suite"] for row in rows):
+        ours = sorted((r for r in rows if (r["suite"], r["method"]) == (suite, OURS)), key=lambda r: r["views"])
+        if len(ours) < 2:
+            continue
+        first, last = ours[0], ours[-1]
+        gains = [f"{last[f'{c}_psnr'] - first[f'{c}_psnr']:+.2f} dB {c}" for c in ("literal", "shown")]
+        rising = all(a[f"{c}_psnr"] < b[f"{c}_psnr"] for a, b in itertools.pairwise(ours) for c in ("literal", "shown"))
+        time = last["chunk_ms"] / first["chunk_ms"]
+        line = f"* {suite}, {first['views']} to {last['views']} views: {', '.join(gains)}"
+        line += f" ({'rising at every step' if rising else 'not rising at every step'}); chunk time x {time:.2f}"
+        if first["peak_memory_bytes"] and last["peak_memory_bytes"]:
+            line += f", peak memory x {last['peak_memory_bytes'] / first['peak_memory_bytes']:.2f}"
+        lines.append(line + ".")
+    return ["\n".join(lines)] if lines else []
+
+
+def plot(pyplot: Any, rows: list[Row]) -> Any:
+    """Literal and shown PSNR against views, a column of panels for each suite."""
+    suites = list(dict.fromkeys(row["suite"] for row in rows))
+    figure, panels = pyplot.subplots(
+        2, len(suites), figsize=(1 + 3.2 * len(suites), 5), sharex=True, layout="constrained", squeeze=False
+    )
+    for column, suite in enumerate(suites):
+        for axes, kind in zip(panels[:, column], ("literal", "shown"), strict=True):
+            for method in (OURS, APPEND, *BASELINES):
+                line = [(r["views"], r[f"{kind}_psnr"]) for r in rows if (r["suite"], r["method"]) == (suite, method)]
+                if line:
+                    width = 2.0 if method == OURS else 1.0
+                    axes.plot(*zip(*sorted(line), strict=True), marker="o", ms=3, lw=width, label=method)
+            axes.set_xscale("log", base=2)
+            axes.set_ylabel(f"{kind} PSNR, dB")
+            axes.spines[["top", "right"]].set_visible(False)
+        panels[0, column].set_title(suite)
+        panels[1, column].set_xlabel("context views")
+    figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=7)
+    return figure
+
+
+STUDY = Study(
+    name="context_length",
+    text="""One stream stops at each number of views; targets are uniform over the trajectory and never streamed.
+`literal`: over black, at the exposure of the scene, as the paper scores. `shown`: holes filled and the exposure of the
+nearest views. `warp nearest` moves the nearest context view by the depth of our scene. Peak memory is that of step,
+decode and rendering, in MiB.""",
+    cases=cases,
+    plot=plot,
+    findings=findings,
+)

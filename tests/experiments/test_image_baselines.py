@@ -1,0 +1,57 @@
+"""The image baselines against geometry that is known."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+from ssplat_experiments.image_baselines import baseline_scores, warp
+
+from ssplat_jax.config import preset
+from ssplat_jax.data.capture import open_capture
+from ssplat_jax.data.images import ArrayPixels
+from ssplat_jax.geometry.cameras import Camera
+
+K = np.array([[32.0, 0.0, 16.0], [0.0, 32.0, 12.0], [0.0, 0.0, 1.0]], np.float32)
+
+
+def camera(x=0.0):
+    """A camera that stands at x and looks along +z."""
+    viewmat = np.eye(4, dtype=np.float32)
+    viewmat[0, 3] = -x
+    return Camera(viewmats=jnp.asarray(viewmat), Ks=jnp.asarray(K), width=32, height=24)
+
+
+def test_a_wall_is_warped_by_its_disparity():
+    """At depth 2, a step of 0.25 moves a wall by 32 * 0.25 / 2 = 4 pixels."""
+    image = np.random.default_rng(0).uniform(0.1, 1.0, (24, 32, 3)).astype(np.float32)
+    warped, known = warp(image, camera(), camera(0.25), np.full((24, 32), 2.0, np.float32))
+    np.testing.assert_allclose(warped[:, :28], image[:, 4:], atol=1e-5)
+    assert known[:, :28].all() and not known[:, 28:].any() and (warped[:, 28:] == 0).all()
+
+
+def test_pixels_without_depth_stay_black():
+    image = np.ones((24, 32, 3), np.float32)
+    depth = np.full((24, 32), 3.0, np.float32)
+    depth[5:9, 7:11] = 0.0
+    warped, known = warp(image, camera(), camera(), depth)
+    np.testing.assert_array_equal(known, depth > 0)
+    np.testing.assert_allclose(warped[..., 0], depth > 0, atol=1e-6)
+
+
+def test_baselines_do_not_see_the_target():
+    """A target of other pixels has the same baseline images: errors against it follow from those alone."""
+    room = open_capture("procedural:room?frames=10", size=(32, 24))
+    frame = room.stream_frame(preset("tiny"), range(5))
+    depth = np.full((24, 32), 2.0, np.float32)
+    context, i = (0, 1, 2, 3, 4), 6
+    assert isinstance(room.pixels, ArrayPixels)
+    pixels = room.pixels.images * (np.arange(10) != i)[:, None, None, None]
+    black = dataclasses.replace(room, pixels=dataclasses.replace(room.pixels, images=pixels))
+    images = {}
+    for name, capture in (("room", room), ("black", black)):
+        scores = baseline_scores(capture, i, context, frame, depth, {})
+        images[name] = scores
+    mean = np.mean([room.image(j).mean(axis=(0, 1)) for j in context], axis=0)
+    expected = -10 * np.log10(np.mean(mean**2))  # of the mean color against black
+    assert abs(images["black"]["mean color"]["literal"].psnr - expected) < 1e-3
+    assert images["room"]["mean color"]["literal"].psnr != images["black"]["mean color"]["literal"].psnr
