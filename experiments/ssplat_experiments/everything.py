@@ -9,7 +9,7 @@ pages of all of them. A stopped run continues: cases that are there are not meas
 
 from pathlib import Path
 
-from ssplat_experiments import accuracy_vs_time, context_length, latency, long_context, memory_curve
+from ssplat_experiments import accuracy_vs_time, additions, context_length, latency, long_context, memory_curve
 from ssplat_experiments.study import PAGE, Study, run_study
 from ssplat_jax.console import Reporter
 from ssplat_jax.errors import StorageError
@@ -20,6 +20,7 @@ STUDIES: tuple[Study, ...] = (
     long_context.STUDY,
     memory_curve.STUDY,
     latency.STUDY,
+    additions.STUDY,
     accuracy_vs_time.STUDY,
 )
 FOLDER = "results"

@@ -3,8 +3,9 @@
     ssplat experiment memory_curve --scale smoke --out runs/memory_curve
 
 Three methods take in the same views of `procedural:room`: ours, ours with a memory that keeps every token
-(`vacc="append"`), and the same network over all views at once, which is what a fixed-view method does. All run for each
-number of views. On a CPU the bytes are those of XLA's analysis (`ssplat_jax/evaluation/peak_memory.py`); on a GPU each
+(`vacc="append"`), and the same network over all views at once, which is what a fixed-view method does. The walk of
+`Sizes.loop` views is streamed again and again, so that the stream grows and the scene does not; `ours, new views` sees
+new views all the time, so that the scene grows too. All run for each number of views. On a CPU the bytes are those of XLA's analysis (`ssplat_jax/evaluation/peak_memory.py`); on a GPU each
 number of views runs in a process of its own, and its allocator counts.
 """
 
@@ -22,7 +23,7 @@ from ssplat_jax.config import StreamConfig, preset
 from ssplat_jax.console import Reporter
 from ssplat_jax.data.capture import Capture, open_capture
 from ssplat_jax.evaluation.peak_memory import peak_memory
-from ssplat_jax.streaming.feed import feed_capture
+from ssplat_jax.streaming.feed import feed_chunks
 from ssplat_jax.streaming.session import Session
 from ssplat_jax.streaming.streamsplat import StreamSplat
 
@@ -30,8 +31,8 @@ START_CAPACITY = 128
 """Both memories start as small as they can and double when needed, so that the curve shows what a scene needs."""
 
 CHUNK = 4
-METHODS = ("ours", "append-all", "joint")
-COLORS = {"ours": "#c06030", "append-all": "#30507a", "joint": "#308050"}
+METHODS = ("ours", "ours, new views", "append-all", "joint")
+COLORS = {"ours": "#c06030", "ours, new views": "#e0b090", "append-all": "#30507a", "joint": "#308050"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,14 +40,16 @@ class Sizes:
     """Numbers of views, and the size of the images."""
 
     counts: tuple[int, ...]
+    loop: int
+    """Views of the walk that is repeated."""
     width: int
     height: int
 
 
 SIZES = {
-    "smoke": Sizes((8, 32), 64, 48),
-    "cpu": Sizes((8, 16, 32, 64, 128), 160, 120),
-    "gpu": Sizes((24, 64, 128, 256, 512), 480, 256),
+    "smoke": Sizes((8, 32), 8, 64, 48),
+    "cpu": Sizes((16, 32, 64, 128), 16, 160, 120),
+    "gpu": Sizes((24, 64, 128, 256, 512), 24, 480, 256),
 }
 
 
@@ -75,7 +78,12 @@ def cases(captures: Path | None, scale: str) -> list[Case]:
                 Case(
                     name=f"{method}, {' '.join(map(str, counts))} views",
                     config=config_of(method, counts[-1]),
-                    asked={"capture": _spec(sizes), "size": [sizes.width, sizes.height], "views": counts},
+                    asked={
+                        "capture": _spec(sizes),
+                        "size": [sizes.width, sizes.height],
+                        "loop": sizes.loop,
+                        "views": counts,
+                    },
                     measure=functools.partial(measure, method, counts, sizes),
                 )
             )
@@ -101,15 +109,16 @@ def measured(method: str, counts: tuple[int, ...], sizes: Sizes) -> list[Row]:
     """The rows of a method: the first views of the capture, in one stream that stops at each number of them."""
     capture, config, params = _open(sizes), config_of(method, counts[-1]), load_params("tiny")
     frame = capture.stream_frame(config, range(max(sizes.counts)))
+    order = [i if method == "ours, new views" else i % sizes.loop for i in range(counts[-1])]
     session, rows, fed = Session(StreamSplat(config), params), [], 0
     for count in counts:
-        camera = capture.camera(count // 2, frame)
+        camera = capture.camera(order[count // 2], frame)
         if method == "joint":
-            network = JointNetwork(config, params, one_chunk(list(capture.chunks(config, range(count), frame=frame))))
+            network = JointNetwork(config, params, one_chunk(list(capture.chunks(config, order[:count], frame=frame))))
             memory, shown = network.peak_memory(camera), int((network.gaussians().opacities > 0).sum())
         else:
-            _, recent = feed_capture(session, capture, range(fed, count), frame, num_recent=1)
-            memory, shown = peak_memory(session, recent[0], camera), session.cache_facts()["decoded"]
+            last = [streamed.chunk for streamed in feed_chunks(session, capture, order[fed:count], frame)][-1]
+            memory, shown = peak_memory(session, last, camera), session.cache_facts()["decoded"]
         rows.append({"method": method, "views": count, **memory.to_row(), "gaussians": shown})
         fed = count
     return rows
@@ -151,8 +160,9 @@ def plot(pyplot: Any, rows: list[Row]) -> Any:
 STUDY = Study(
     name="memory_curve",
     text="""Peak memory of step, decode and rendering together, against the number of views, in MiB. `ours` merges
-tokens by voxel, `append-all` keeps every token, `joint` runs the same network over all views at once. The memories of
-`ours` and `append-all` double when they are full. While a step runs, its parameters, cache, images and temporaries
+tokens by voxel, `append-all` keeps every token, `joint` runs the same network over all views at once. A walk is
+streamed again and again, so the scene stays as it is; `ours, new views` sees new views instead, and its memory grows
+with the scene. The memories of `ours` and `append-all` double when they are full. While a step runs, its parameters, cache, images and temporaries
 count.""",
     cases=cases,
     plot=plot,

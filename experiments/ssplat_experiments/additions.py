@@ -1,0 +1,209 @@
+"""What each addition to the paper is worth: quality, time and memory, one field of the configuration at a time.
+
+    ssplat experiment additions --captures path/to/captures --out runs/additions
+
+The additions are the fields in which the preset `tiny` differs from the literal one (`paper`, or `small` where that is
+not known), networks aside. They are switched on one after another, from the literal values to those of `tiny`; then
+each is taken away from `tiny` alone. The shipped weights are used as they are, so fields that change the shape of a
+weight are left at the values of `tiny` and named on the page. Scenes are `procedural:room` and the captures of
+`CAPTURES` that are in `--captures`.
+"""
+
+import dataclasses
+import functools
+import itertools
+from pathlib import Path
+from typing import Any
+
+from ssplat_experiments.cases import Case, Row
+from ssplat_experiments.memory_curve import START_CAPACITY
+from ssplat_experiments.scenes import open_room
+from ssplat_experiments.study import Study, at_scale, run_study
+from ssplat_jax.checkpoint.weights import check_params, load_params
+from ssplat_jax.config import PRESETS, StreamConfig, preset
+from ssplat_jax.console import Reporter
+from ssplat_jax.data.capture import Capture, open_capture
+from ssplat_jax.data.split import Split, interleaved_split
+from ssplat_jax.errors import InputError
+from ssplat_jax.evaluation.latency import measure_latency
+from ssplat_jax.evaluation.peak_memory import peak_memory
+from ssplat_jax.evaluation.scoring import score_targets
+from ssplat_jax.streaming.feed import feed_capture
+from ssplat_jax.streaming.session import Session
+from ssplat_jax.streaming.streamsplat import StreamSplat
+
+CAPTURES = {"redkitchen": 5, "fox": 1, "south_building": 1}
+"""Names of real captures, with the stride of their frames."""
+
+NUM_TARGETS = 6
+EARNED_DB = 0.02
+"""A smaller difference of PSNR counts as none."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Sizes:
+    """Context views, image size, and how many of the additions are measured (None: all)."""
+
+    context: int
+    size: tuple[int, int]
+    additions: int | None = None
+
+
+SIZES = {"smoke": Sizes(8, (64, 48), 1), "cpu": Sizes(24, (160, 120)), "gpu": Sizes(64, (320, 240))}
+
+
+@dataclasses.dataclass(frozen=True)
+class Addition:
+    """A field with its literal value and that of `tiny`."""
+
+    field: str
+    literal: Any
+    ours: Any
+
+
+def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str:
+    """Measures every addition on every available scene."""
+    for addition in unmeasured():
+        reporter.warn(f"additions: {addition.field} stays {addition.ours!r}; {addition.literal!r} needs other weights")
+    return run_study(STUDY, captures, out, scale, reporter)
+
+
+def differing_fields() -> list[Addition]:
+    """All fields in which `tiny` differs from the literal preset, networks aside."""
+    literal, ours = preset("paper" if "paper" in PRESETS else "small"), preset("tiny")
+    names = [(g, field.name) for g in ours.groups() if g != "network" for field in dataclasses.fields(getattr(ours, g))]
+    found = [Addition(f"{g}.{f}", literal.get(f"{g}.{f}"), ours.get(f"{g}.{f}")) for g, f in names]
+    return [addition for addition in found if addition.literal != addition.ours]
+
+
+@functools.cache
+def additions() -> list[Addition]:
+    """The additions that the shipped weights can do without."""
+    return [addition for addition in differing_fields() if _fits(addition)]
+
+
+def unmeasured() -> list[Addition]:
+    """The fields that need weights of other shapes, or that no configuration of `tiny` can take back."""
+    return [addition for addition in differing_fields() if addition not in additions()]
+
+
+def _fits(addition: Addition) -> bool:
+    try:
+        check_params(load_params("tiny"), preset("tiny").replace(**{addition.field: addition.literal}), "tiny")
+    except InputError:
+        return False
+    return True
+
+
+def variants(found: list[Addition]) -> list[tuple[str, str, StreamConfig]]:
+    """(path, step, configuration): from the literal fields to `tiny`, then `tiny` without each.
+
+    Args:
+        found: the additions, in the order in which they are switched on.
+
+    Returns:
+        The literal configuration first; each following one of the path `added` differs by one field from the one
+        before, and each of the path `taken away` by one field from `tiny`.
+    """
+    ours = preset("tiny").replace(capacity=START_CAPACITY)
+    steps = [("added", "literal", ours.replace(**{a.field: a.literal for a in found}))]
+    for a in found:
+        steps.append(("added", f"{a.field}={a.ours}", steps[-1][2].replace(**{a.field: a.ours})))
+    return steps + [("taken away", f"{a.field}={a.literal}", ours.replace(**{a.field: a.literal})) for a in found]
+
+
+def cases(captures: Path | None, scale: str) -> list[Case]:
+    """A case for each variant and scene."""
+    sizes = at_scale(SIZES, scale)
+    scenes = ["room", *(name for name in CAPTURES if captures is not None and (captures / name).is_dir())]
+    return [
+        Case(
+            name=f"{scene}, {path} {step}",
+            config=config,
+            asked={"scene": scene, "path": path, "step": step, "context": sizes.context, "size": sizes.size},
+            measure=functools.partial(measured, scene, path, step, config, sizes, captures),
+        )
+        for scene in scenes
+        for path, step, config in variants(additions()[: sizes.additions])
+    ]
+
+
+@functools.lru_cache(maxsize=1)
+def _open(scene: str, sizes: Sizes, captures: Path | None) -> tuple[Capture, Split]:
+    if scene == "room" or captures is None:
+        return open_room(sizes.context, sizes.size)
+    capture = open_capture(captures / scene, size=sizes.size)
+    return capture, interleaved_split(len(capture), CAPTURES[scene], sizes.context)
+
+
+def measured(scene: str, path: str, step: str, config: StreamConfig, sizes: Sizes, captures: Path | None) -> list[Row]:
+    """Scores, time and memory of a configuration on a scene."""
+    capture, split = _open(scene, sizes, captures)
+    frame = capture.stream_frame(config, split.context)
+    session = Session(StreamSplat(config), load_params("tiny"))
+    exposures, recent = feed_capture(session, capture, split.context, frame, num_recent=1)
+    targets = split.targets[:NUM_TARGETS]
+    scores = score_targets(session.gaussians(), capture, targets, frame, exposures)
+    camera = capture.camera(targets[len(targets) // 2], frame)
+    memory = peak_memory(session, recent[0], camera)
+    return [
+        {
+            "scene": scene,
+            "path": path,
+            "step": step,
+            "literal_psnr": scores["literal"]["psnr"],
+            "shown_psnr": scores["shown"]["psnr"],
+            "literal_ssim": scores["literal"]["ssim"],
+            "shown_ssim": scores["shown"]["ssim"],
+            "chunk_ms": measure_latency(session, recent, camera)["chunk_ms"]["median"],
+            "peak_memory_bytes": memory.bytes,
+            "gaussians": session.cache_facts()["decoded"],
+        }
+    ]
+
+
+def add_gains(rows: list[Row]) -> None:
+    """What each addition gives: its row minus the one before, or all of `tiny` minus the row without it."""
+    for scene in {row["scene"] for row in rows}:
+        path = [row for row in rows if (row["scene"], row["path"]) == (scene, "added")]
+        for before, after in itertools.pairwise(path):
+            _set_gains(after, before, after)
+        for row in rows:
+            if (row["scene"], row["path"]) == (scene, "taken away") and path:
+                _set_gains(row, row, path[-1])
+
+
+def _set_gains(row: Row, without: Row, with_it: Row) -> None:
+    for column in ("literal", "shown"):
+        row[f"{column}_gain_db"] = round(with_it[f"{column}_psnr"] - without[f"{column}_psnr"], 3)
+    row["added_ms"] = round(with_it["chunk_ms"] - without["chunk_ms"], 1)
+    if with_it["peak_memory_bytes"] is not None and without["peak_memory_bytes"] is not None:
+        row["added_bytes"] = with_it["peak_memory_bytes"] - without["peak_memory_bytes"]
+
+
+def findings(rows: list[Row]) -> list[str]:
+    """Which additions earn their place, by what their absence from `tiny` costs on the mean of the scenes."""
+    lines = []
+    for step in dict.fromkeys(row["step"] for row in rows if row["path"] == "taken away"):
+        gains = [row for row in rows if (row["path"], row["step"]) == ("taken away", step) and "shown_gain_db" in row]
+        if not gains:
+            continue
+        means = {c: sum(row[f"{c}_gain_db"] for row in gains) / len(gains) for c in ("literal", "shown")}
+        earned = " and ".join(column for column, gain in means.items() if gain >= EARNED_DB) or "neither column"
+        values = ", ".join(f"{gain:+.2f} dB {column}" for column, gain in means.items())
+        lines.append(f"* against {step}: {values} on {len(gains)} scenes; earned in {earned}.")
+    left_out = ", ".join(f"{a.field}={a.literal}" for a in unmeasured())
+    return (
+        ["\n".join([*lines, f"* Not measured, other weights needed: {left_out}."])] if left_out else ["\n".join(lines)]
+    )
+
+
+STUDY = Study(
+    name="additions",
+    text="""Rows `added` start with the literal fields and switch one addition on after another, up to `tiny`; rows
+`taken away` are `tiny` with one field at its literal value. Gains are what the addition gives: dB of PSNR, ms a chunk
+and MiB of peak memory, with the shipped weights and no retraining.""",
+    cases=cases,
+    finish=add_gains,
+    findings=findings,
+)
