@@ -24,7 +24,8 @@ class Case:
     """One measurement that is made as a whole."""
 
     name: str
-    config: StreamConfig
+    config: StreamConfig | None
+    """None for results of another method."""
     asked: dict[str, Any]
     """Everything besides the configuration that decides the result, as JSON types."""
     measure: Callable[[], Sequence[Row]]
@@ -32,7 +33,7 @@ class Case:
     @property
     def request(self) -> dict[str, Any]:
         """All that decides the result, as JSON holds it."""
-        return json.loads(json_text({"asked": self.asked, "config": self.config.to_dict()}))
+        return json.loads(json_text({"asked": self.asked, "config": self.config and self.config.to_dict()}))
 
     @property
     def hash(self) -> str:
@@ -90,7 +91,7 @@ def _record(name: str, case: Case, rows: list[Row], seconds: float) -> dict[str,
         "case": case.name,
         "request": case.request,
         "request_hash": case.hash,
-        "config": case.config.hash,
+        "config": case.config and case.config.hash,
         "commit": provenance.commit(),
         "date": provenance.today(),
         "machine": provenance.machine(),

@@ -5,8 +5,9 @@
 Three methods take in the same views of `procedural:room`: ours, ours with a memory that keeps every token
 (`vacc="append"`), and the same network over all views at once, which is what a fixed-view method does. The walk of
 `Sizes.loop` views is streamed again and again, so that the stream grows and the scene does not; `ours, new views` sees
-new views all the time, so that the scene grows too. All run for each number of views. On a CPU the bytes are those of XLA's analysis (`ssplat_jax/evaluation/peak_memory.py`); on a GPU each
-number of views runs in a process of its own, and its allocator counts.
+new views all the time, so that the scene grows too. On a CPU the bytes are those of XLA's analysis
+(`ssplat_jax/evaluation/peak_memory.py`); on a GPU each number of views runs in a process of its own, and its allocator
+counts.
 """
 
 import dataclasses
@@ -162,8 +163,8 @@ STUDY = Study(
     text="""Peak memory of step, decode and rendering together, against the number of views, in MiB. `ours` merges
 tokens by voxel, `append-all` keeps every token, `joint` runs the same network over all views at once. A walk is
 streamed again and again, so the scene stays as it is; `ours, new views` sees new views instead, and its memory grows
-with the scene. The memories of `ours` and `append-all` double when they are full. While a step runs, its parameters, cache, images and temporaries
-count.""",
+with the scene. The memories of `ours` and `append-all` double when they are full. While a step runs, its parameters,
+cache, images and temporaries count.""",
     cases=cases,
     plot=plot,
     findings=findings,

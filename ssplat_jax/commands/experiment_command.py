@@ -28,9 +28,12 @@ class Experiment:
     scale: Literal["smoke", "cpu", "gpu"] = "cpu"
     """smoke: the same program on as little data as possible. cpu: sizes for a few cores. gpu: the paper's sizes, where
     an experiment has them."""
+    renders: Path | None = None
+    """For `score`: folder of another method's renders, with a split.json; --captures is then the capture itself."""
     quiet: QuietOption = False
 
     def run(self) -> int:
+        import inspect
         from importlib.metadata import entry_points
 
         from ssplat_jax.console import Reporter
@@ -44,6 +47,12 @@ class Experiment:
 
             if (backend := jax.default_backend()) != "gpu":
                 raise InputError(f"--scale gpu: wanted a GPU, JAX found {backend}; use --scale cpu.")
+        run = found[self.name].load()
+        more = {}
+        if self.renders is not None:
+            if "renders" not in inspect.signature(run).parameters:
+                raise InputError(f"--renders: only `experiment score` reads a folder of renders, not {self.name}.")
+            more = {"renders": self.renders}
         self.out.mkdir(parents=True, exist_ok=True)
-        print(found[self.name].load()(self.captures, self.out, self.scale, Reporter(self.quiet)))
+        print(run(self.captures, self.out, self.scale, Reporter(self.quiet), **more))
         return 0

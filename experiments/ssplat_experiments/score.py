@@ -1,0 +1,130 @@
+"""Scores of another method's renders, on the split and against the images of a capture.
+
+    ssplat experiment score --captures path/to/capture --renders path/to/renders --out runs/score
+
+The folder of renders holds `split.json`, as `ssplat eval` writes it, and one image for each target, named by its frame:
+`00004.png`. All images have one size, at which the capture is read. Scores are literal: the pixels as they are, no
+holes filled and no exposure changed. The nearest context view and the mean color stand beside them.
+"""
+
+import functools
+import hashlib
+import json
+import statistics
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from PIL import Image, UnidentifiedImageError
+
+from ssplat_experiments.cases import Case, Row
+from ssplat_experiments.study import Study, run_study
+from ssplat_jax.console import Reporter
+from ssplat_jax.data.capture import Capture, open_capture
+from ssplat_jax.data.split import Split
+from ssplat_jax.errors import InputError
+from ssplat_jax.evaluation.nearest_views import nearest_views
+from ssplat_jax.evaluation.scoring import check_scorable, score_image
+
+SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
+SPLIT = "split.json"
+TEXT = """Renders of another method against the targets of a split: literal scores, of the pixels as they are. The
+nearest context view and the mean color of the context stand beside them."""
+
+
+def run(captures: Path | None, out: Path, scale: str, reporter: Reporter, renders: Path | None = None) -> str:
+    """Scores the renders; every scale is the same."""
+    if captures is None or renders is None:
+        missing = "--captures, the capture itself" if captures is None else "--renders, a folder with split.json"
+        raise InputError(f"experiment score: wanted {missing}; got none.")
+    return run_study(study_of(str(captures), renders), None, out, scale, reporter)
+
+
+def study_of(path: str, renders: Path) -> Study:
+    """The study of one folder of renders.
+
+    Args:
+        path: the capture, or `procedural:NAME`.
+        renders: the folder of the renders.
+
+    Raises:
+        InputError: the split, a render or the capture is missing or unusable.
+    """
+    split = read_split(renders / SPLIT)
+    files = {i: _file_of(renders, i) for i in split.targets}
+    images = {i: read_image(file) for i, file in files.items()}
+    sizes = {image.shape[1::-1] for image in images.values()}
+    if len(sizes) != 1:
+        raise InputError(
+            f"{renders}: wanted renders of one size, got {', '.join(f'{w}x{h}' for w, h in sorted(sizes))}."
+        )
+    ((width, height),) = sizes
+    capture = open_capture(path, size=(width, height))
+    check_scorable(capture)
+    if max(*split.context, *split.targets) >= len(capture):
+        raise InputError(f"{renders / SPLIT}: wanted frames below {len(capture)}, which {capture.name} has.")
+    digest = hashlib.sha256(b"".join(files[i].read_bytes() for i in split.targets)).hexdigest()[:12]
+    frames = capture.digest((*split.context, *split.targets))
+    asked = {"capture": capture.name, "frames": frames, "split": split.sha256[:12], "renders": digest}
+    method = renders.resolve().name
+    case = Case(method, None, asked, functools.partial(measured, method, capture, split, images))
+    return Study("score", TEXT, lambda captures, scale: [case])
+
+
+def measured(method: str, capture: Capture, split: Split, images: dict[int, Float[np.ndarray, "h w 3"]]) -> list[Row]:
+    """Mean scores of the renders and of two baselines."""
+    mean = np.mean([capture.image(i).mean(axis=(0, 1)) for i in split.context], axis=0)
+    flat = np.broadcast_to(mean, capture.image(split.targets[0]).shape).astype(np.float32)
+    shown = {
+        method: images,
+        "copy nearest": {i: capture.image(nearest_views(capture, i, split.context)[0]) for i in split.targets},
+        "mean color": dict.fromkeys(split.targets, flat),
+    }
+    rows = []
+    for name, by_target in shown.items():
+        scores = [score_image(by_target[i], capture.image(i)) for i in split.targets]
+        row = {"method": name, "capture": capture.name, "size": f"{capture.width}x{capture.height}"}
+        row |= {f"literal_{m}": round(statistics.mean(getattr(s, m) for s in scores), 4) for m in ("psnr", "ssim")}
+        rows.append(row | {"targets": len(split.targets), "split": split.sha256[:12]})
+    return rows
+
+
+def read_split(path: Path) -> Split:
+    """The split in a file.
+
+    Raises:
+        InputError: there is none, or it lacks context or targets.
+    """
+    try:
+        fields = json.loads(path.read_text())
+        context, targets = (tuple(map(int, fields[name])) for name in ("context", "targets"))
+        if not context or not targets or min(context + targets) < 0:
+            raise ValueError("no frames")
+        return Split(str(fields["protocol"]), context, targets)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            f"{path}: wanted a split with protocol, context and targets, got {type(error).__name__} ({error}); copy the"
+            " split.json that `ssplat eval` wrote."
+        ) from None
+
+
+def _file_of(folder: Path, i: int) -> Path:
+    """The image of a target."""
+    found = [path for suffix in SUFFIXES if (path := folder / f"{i:05d}{suffix}").is_file()]
+    if len(found) != 1:
+        got = "none" if not found else " and ".join(path.name for path in found)
+        raise InputError(f"{folder}: wanted one image {i:05d}.png of target {i}, got {got}.")
+    return found[0]
+
+
+def read_image(path: Path) -> Float[np.ndarray, "h w 3"]:
+    """An image file as RGB in [0, 1].
+
+    Raises:
+        InputError: the file is damaged.
+    """
+    try:
+        with Image.open(path) as image:
+            return np.asarray(image.convert("RGB"), np.float32) / 255.0
+    except (OSError, UnidentifiedImageError, SyntaxError) as error:
+        raise InputError(f"{path}: wanted an image, got a file that cannot be read ({error}).") from None
