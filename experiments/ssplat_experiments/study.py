@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 
 import jax
 
+from ssplat_experiments import provenance
 from ssplat_experiments.cases import Case, Row, measure_cases
 from ssplat_jax.console import Reporter
 from ssplat_jax.evaluation.plots import import_pyplot, save_figure
@@ -64,6 +65,7 @@ def run_study(study: Study, captures: Path | None, out: Path, scale: str, report
         InputError: `out` holds results of another request.
         StorageError: `out` cannot be written.
     """
+    provenance.commit()  # read now and kept: the files may change while the experiment runs
     make_writable(out)
     cases = study.cases(captures, scale)
     write = lambda so_far: _write(study, out, scale, _finished(study, so_far))  # noqa: E731
