@@ -31,12 +31,37 @@ from ssplat_jax.data.images import (
 )
 from ssplat_jax.data.interleave import interleave
 from ssplat_jax.data.posed_image import Frame, check_camtoworld, check_intrinsics
-from ssplat_jax.data.readers import Listing, colmap, realestate10k, scannet, transforms_json, tum
+from ssplat_jax.data.readers import (
+    Listing,
+    colmap,
+    kitti,
+    llff,
+    opensfm,
+    polycam,
+    realestate10k,
+    record3d,
+    scannet,
+    splat_cameras,
+    transforms_json,
+    tum,
+)
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.errors import echo, refusal
 from ssplat_jax.geometry.cameras import Camera
 
-READERS = (transforms_json, colmap, scannet, tum, realestate10k)  # the first one that matches reads the capture
+READERS = (  # the first one that matches reads the capture
+    transforms_json,
+    colmap,
+    polycam,
+    record3d,
+    opensfm,
+    llff,
+    scannet,
+    tum,
+    kitti,
+    realestate10k,
+    splat_cameras,
+)
 PROCEDURAL = "procedural"  # scheme of the paths of procedural captures
 PROCEDURAL_FRAMES = 73  # 64 context views and the 9 interleaved targets between them
 PROCEDURAL_SIZE = (128, 96)  # (width, height); the demo takes less than two minutes on two cores at this size

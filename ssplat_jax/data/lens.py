@@ -1,4 +1,4 @@
-"""Lens distortion by the Brown-Conrady model (as in OpenCV), and undistortion of images."""
+"""Lens distortion by the Brown-Conrady or the fish-eye model (both as in OpenCV), and undistortion of images."""
 
 import dataclasses
 
@@ -41,6 +41,27 @@ class Lens:
         center, focal = K[:2, 2], np.diag(K)[:2]
         with np.errstate(over="ignore", invalid="ignore"):
             return self.distorted((points - center) / focal) * focal + center
+
+
+@dataclasses.dataclass(frozen=True)
+class FisheyeLens(Lens):
+    """Fish-eye lens: a ray at the angle a to the axis is seen at a (1 + k1 a^2 + k2 a^4 + k3 a^6 + k4 a^8) from the center.
+
+    This is COLMAP's OPENCV_FISHEYE, and without coefficients an equidistant lens. `p1` and `p2` have no meaning here.
+
+    Limits:
+        Rays at 90 degrees and more to the axis have no place in a pinhole image and are not delivered.
+        On the axis the lens is the identity.
+    """
+
+    def distorted(self, points: Float64[np.ndarray, "*n 2"]) -> Float64[np.ndarray, "*n 2"]:
+        """Maps points on the plane z = 1 of the pinhole camera to their distorted positions."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            radius = np.linalg.norm(points, axis=-1, keepdims=True)
+            a2 = np.square(np.arctan(radius))
+            series = 1 + a2 * (self.k1 + a2 * (self.k2 + a2 * (self.k3 + a2 * self.k4)))
+            shrink = np.where(radius > 1e-9, np.arctan(radius) / np.maximum(radius, 1e-9), 1.0)
+            return points * shrink * series
 
 
 PINHOLE = Lens()  # no distortion

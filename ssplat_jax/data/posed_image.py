@@ -16,6 +16,7 @@ from ssplat_jax.errors import echo, refusal
 ROTATION_TOLERANCE = 5e-3  # largest |R^T R - I| that rounding to three decimals explains; larger ones are refused
 ROTATION_ROUNDING = 1e-5  # deviations above this are reported to the user
 MILLIMETER = 1e-3  # meters
+OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # flips the y and z axes of a camera
 MIN_FOCAL_PX = 3.0  # smaller focal lengths are taken to be in units of the image size instead of pixels
 
 

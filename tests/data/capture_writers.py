@@ -3,6 +3,7 @@
 Rotations are converted with SciPy, which the readers do not use.
 """
 
+import json
 import struct
 
 import numpy as np
@@ -125,10 +126,92 @@ def write_realestate(root):
     (root / "0a1b.txt").write_text("\n".join(lines))
 
 
+OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # columns of OpenCV's camera axes to those of OpenGL
+
+
+def write_splat_cameras(root):
+    entries = []
+    for i, pose in enumerate(poses()):
+        write_image(root / "images" / f"frame_{i}.png", i)
+        size = {"width": WIDTH, "height": HEIGHT, "fx": FX, "fy": FY}
+        pose = {"position": pose[:3, 3].tolist(), "rotation": pose[:3, :3].tolist()}
+        entries.append({"id": i, "img_name": f"frame_{i}", **size, **pose})
+    (root / "cameras.json").write_text(json.dumps(entries))
+
+
+def write_polycam(root):
+    for i, pose in enumerate(poses()):
+        write_image(root / "keyframes" / "images" / f"{7000 + i}.jpg", i)
+        write_depth(root / "keyframes" / "depth" / f"{7000 + i}.png", 1500)
+        fields = {"fx": FX, "fy": FY, "cx": CX, "cy": CY, "width": WIDTH, "height": HEIGHT, "blur_score": 80.5}
+        fields |= {f"t_{row}{column}": (pose @ OPENGL)[row, column] for row in range(3) for column in range(4)}
+        (root / "keyframes" / "cameras").mkdir(exist_ok=True)
+        (root / "keyframes" / "cameras" / f"{7000 + i}.json").write_text(json.dumps(fields))
+
+
+def write_record3d(root):
+    rows = []
+    for i, pose in enumerate(poses()):
+        write_image(root / "rgb" / f"{i}.jpg", i)
+        rows.append([*Rotation.from_matrix((pose @ OPENGL)[:3, :3]).as_quat().tolist(), *pose[:3, 3].tolist()])
+    meta = {"w": WIDTH, "h": HEIGHT, "K": K.T.reshape(-1).tolist(), "poses": rows, "fps": 60}
+    (root / "metadata.json").write_text(json.dumps(meta))
+
+
+def write_llff(root):
+    rows = []
+    for i, pose in enumerate(poses()):
+        write_image(root / "images" / f"IMG_{i}.JPG", i)
+        right, down, forward, center = pose[:3].T
+        matrix = np.stack([down, right, -forward, center, (HEIGHT, WIDTH, FX)], axis=1)
+        rows.append([*matrix.reshape(-1), 1.5, 9.0])
+    np.save(root / "poses_bounds.npy", np.array(rows))
+
+
+def write_kitti(root):
+    offset = np.array([0.3, -0.02, 0.005])  # of camera 2 from camera 0, in the axes of both
+    image_K = K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+    lines = [f"P{i}: " + " ".join(["1"] * 12) for i in range(2)]
+    projection = np.hstack([image_K, (image_K @ -offset)[:, None]])
+    lines.append("P2: " + " ".join(repr(float(x)) for x in projection.reshape(-1)))
+    rows = []
+    for i, pose in enumerate(poses()):
+        write_image(root / "image_2" / f"{i:06d}.png", i)
+        back = np.eye(4)
+        back[:3, 3] = -offset
+        rows.append(" ".join(repr(float(x)) for x in (pose @ back)[:3].reshape(-1)))
+    (root / "calib.txt").write_text("\n".join(lines))
+    (root / "poses.txt").write_text("\n".join(rows))
+
+
+def write_opensfm(root):
+    shots = {}
+    for i, pose in enumerate(poses()):
+        write_image(root / "images" / f"{i}.jpg", i)
+        worldtocam = np.linalg.inv(pose)
+        rotation = Rotation.from_matrix(worldtocam[:3, :3]).as_rotvec().tolist()
+        shots[f"{i}.jpg"] = {"camera": "phone", "rotation": rotation, "translation": worldtocam[:3, 3].tolist()}
+    camera = {
+        "projection_type": "brown",
+        "width": WIDTH,
+        "height": HEIGHT,
+        "focal_x": FX / WIDTH,
+        "focal_y": FY / WIDTH,
+    }
+    camera |= {"c_x": (CX - WIDTH / 2) / WIDTH, "c_y": (CY - HEIGHT / 2) / WIDTH, "k1": 0.0, "k2": 0.0}
+    (root / "reconstruction.json").write_text(json.dumps([{"cameras": {"phone": camera}, "shots": shots}]))
+
+
 WRITERS = {
     "COLMAP": write_colmap_binary,
     "COLMAP text": write_colmap_text,
     "ScanNet": write_scannet,
     "TUM RGB-D": write_tum,
     "RealEstate10K": write_realestate,
+    "cameras.json": write_splat_cameras,
+    "Polycam": write_polycam,
+    "Record3D": write_record3d,
+    "LLFF": write_llff,
+    "KITTI": write_kitti,
+    "OpenSfM": write_opensfm,
 }

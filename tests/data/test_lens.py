@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ssplat_jax.data.capture import open_capture
-from ssplat_jax.data.lens import Lens, check_lens, undistort
+from ssplat_jax.data.lens import FisheyeLens, Lens, check_lens, undistort
 from ssplat_jax.errors import InputError
 from tests.badinputs.cases import HEIGHT, WIDTH, make_capture
 
@@ -16,6 +16,8 @@ LENSES = [
     Lens(k1=-0.12, k2=0.02, p1=0.002, p2=-0.003),
     Lens(k1=0.08, k2=-0.01, k3=0.003),
     Lens(k4=0.4),
+    FisheyeLens(),
+    FisheyeLens(k1=0.05, k2=-0.02, k3=0.01, k4=-0.005),
 ]
 
 
@@ -48,6 +50,24 @@ def test_undistorted_is_what_a_pinhole_camera_sees(lens):
     assert inside.mean() > 0.9
     assert np.abs(delivered - expected)[inside].max() < 0.005  # linear sampling
     assert np.abs(stored - expected)[inside].max() > 0.05
+
+
+@pytest.mark.parametrize("degrees", [0.0, 1e-9, 30.0, 60.0, 89.0])
+def test_fisheye_radius_is_the_angle_times_its_series(degrees):
+    angle = np.deg2rad(degrees)
+    direction = np.array([0.6, -0.8])
+    point = np.tan(angle) * direction
+    k1, k2, k3, k4 = 0.05, -0.02, 0.01, -0.005
+    bent = FisheyeLens(k1=k1, k2=k2, k3=k3, k4=k4).distorted(point)
+    radius = angle * (1 + k1 * angle**2 + k2 * angle**4 + k3 * angle**6 + k4 * angle**8)
+    np.testing.assert_allclose(bent, radius * direction, rtol=1e-12, atol=1e-15)
+
+
+@pytest.mark.parametrize("fields", [{"camera_model": "OPENCV_FISHEYE"}, {"is_fisheye": True}])
+def test_a_fisheye_capture_is_undistorted(fields, tmp_path):
+    capture = open_capture(make_capture(tmp_path, lambda root, meta: meta.update(k1=0.03, k3=-0.01, **fields)))
+    assert {frame.lens for frame in capture.frames} == {FisheyeLens(k1=0.03, k3=-0.01)}
+    assert any("undone" in note for note in capture.notes)
 
 
 def test_no_distortion_changes_nothing():

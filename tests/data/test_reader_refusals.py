@@ -1,5 +1,6 @@
 """Damaged and unusable files of every format are refused in one line."""
 
+import json
 import random
 import struct
 
@@ -45,6 +46,12 @@ def remove(file):
     return lambda root: (root / file).unlink()
 
 
+def _edit_json(file, change):
+    contents = json.loads(file.read_text())
+    change(contents)
+    file.write_text(json.dumps(contents))
+
+
 def camera(model, params):
     return write("sparse/0/cameras.bin", struct.pack("<Q", 1) + camera_bytes(model, params))
 
@@ -56,7 +63,8 @@ BAD = {
     "images.bin cut": ("COLMAP", cut("sparse/0/images.bin", 5), ("images.bin",)),
     "images.bin counts 2^63": ("COLMAP", write("sparse/0/images.bin", struct.pack("<Q", 1 << 63)), ("9223372036",)),
     "no image registered": ("COLMAP", write("sparse/0/images.bin", struct.pack("<Q", 0)), ("registered",)),
-    "fish-eye": ("COLMAP", camera(5, (FX, FY, CX, CY, 0, 0, 0, 0)), ("OPENCV_FISHEYE", "image_undistorter")),
+    "field of view": ("COLMAP", camera(7, (FX, FY, CX, CY, 0.9)), ("FOV", "image_undistorter")),
+    "fish-eye that folds": ("COLMAP", camera(5, (FX, FY, CX, CY, -9, 0, 0, 0)), ("fold", "k1=-9")),
     "model to come": ("COLMAP", camera(77, ()), ("model 77", "image_undistorter")),
     "denominator": ("COLMAP", camera(6, (FX, FY, CX, CY, 0, 0, 0, 0, 0, 0.1, 0, 0)), ("FULL_OPENCV", "k4")),
     "focal length 0": ("COLMAP", camera(0, (0, CX, CY)), ("camera 1", "focal length")),
@@ -117,6 +125,52 @@ BAD = {
         lambda root: [file.unlink() for file in (root / "0a1b").iterdir()],
         ("none of 4", "90000.jpg"),
     ),
+    # cameras.json
+    "no list": ("cameras.json", write("cameras.json", b"[3]"), ("list of objects", "[3]")),
+    "no width": ("cameras.json", replace("cameras.json", '"width"', '"w"'), ("[0].width", "nothing")),
+    "rotation of four numbers": (
+        "cameras.json",
+        lambda root: _edit_json(root / "cameras.json", lambda entries: entries[1].update(rotation=[1, 0, 0, 0])),
+        ("[1].rotation", "3 x 3"),
+    ),
+    "camera twice": (
+        "cameras.json",
+        lambda root: _edit_json(root / "cameras.json", lambda entries: entries[1].update(img_name="frame_0")),
+        ("[1]", "every image once"),
+    ),
+    # Polycam
+    "no t_23": ("Polycam", replace("keyframes/cameras/7001.json", '"t_23"', '"t_33"'), ("7001.json.t_23", "nothing")),
+    "mirrored": (
+        "Polycam",
+        lambda root: _edit_json(root / "keyframes/cameras/7001.json", lambda f: f.update(t_00=-f["t_00"])),
+        ("7001.json",),
+    ),
+    # Record3D
+    "eight numbers": ("Record3D", replace("metadata.json", '"K": [', '"K": [1, '), ("metadata.json.K", "9 finite")),
+    "pose of six numbers": (
+        "Record3D",
+        lambda root: _edit_json(root / "metadata.json", lambda meta: meta["poses"][2].pop()),
+        ("poses[2]", "7 finite"),
+    ),
+    # LLFF
+    "image too many": ("LLFF", lambda root: write_image(root / "images" / "IMG_4.JPG"), ("wanted 4 images", "got 5")),
+    "fifteen columns": (
+        "LLFF",
+        lambda root: np.save(root / "poses_bounds.npy", np.zeros((4, 15))),
+        ("rows of 17", "(4, 15)"),
+    ),
+    "pickled": ("LLFF", lambda root: np.save(root / "poses_bounds.npy", np.array([{}])), ("NumPy cannot read",)),
+    # KITTI
+    "no line P2": ("KITTI", write("calib.txt", b"P0: 1\n"), ("calib.txt", "P2")),
+    "eleven numbers": ("KITTI", replace("calib.txt", "P2: 50.0", "P2:"), ("line 3", "12 numbers")),
+    "no poses": ("KITTI", remove("poses.txt"), ("poses.txt", "download")),
+    # OpenSfM
+    "unknown projection": (
+        "OpenSfM",
+        replace("reconstruction.json", '"brown"', '"dual"'),
+        ("projection_type", "'dual'", "perspective"),
+    ),
+    "camera missing": ("OpenSfM", replace("reconstruction.json", '"phone": {', '"other": {'), ("camera", "nothing")),
     "intrinsics in pixels": ("RealEstate10K", replace("0a1b.txt", f" {FX / WIDTH} ", " -1 "), ("line 2", "focal")),
 }
 
@@ -141,6 +195,12 @@ FILES = {
     "ScanNet": ("pose/9.txt", "intrinsic/intrinsic_color.txt"),
     "TUM RGB-D": ("rgb.txt", "depth.txt", "groundtruth.txt", "calibration.txt"),
     "RealEstate10K": ("0a1b.txt",),
+    "cameras.json": ("cameras.json",),
+    "Polycam": ("keyframes/cameras/7000.json",),
+    "Record3D": ("metadata.json",),
+    "LLFF": ("poses_bounds.npy",),
+    "KITTI": ("calib.txt", "poses.txt"),
+    "OpenSfM": ("reconstruction.json",),
 }
 
 

@@ -5,6 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ssplat_jax.data.capture import open_capture
+from ssplat_jax.data.lens import FisheyeLens
 from tests.data.capture_writers import (
     COLMAP_IMAGES,
     CX,
@@ -33,7 +34,18 @@ NAMES = {  # in the order of streaming
     "ScanNet": tuple(f"color/{i}.jpg" for i in range(9, 13)),
     "TUM RGB-D": tuple(f"rgb/{1305031102.25 + i / 30:.6f}.png" for i in range(4)),
     "RealEstate10K": tuple(str(90000 + 33367 * i) for i in range(4)),
+    "cameras.json": tuple(f"frame_{i}" for i in range(4)),
+    "Polycam": tuple(f"{7000 + i}.jpg" for i in range(4)),
+    "Record3D": tuple(f"rgb/{i}.jpg" for i in range(4)),
+    "LLFF": tuple(f"images/IMG_{i}.JPG" for i in range(4)),
+    "KITTI": tuple(f"image_2/{i:06d}.png" for i in range(4)),
+    "OpenSfM": tuple(f"{i}.jpg" for i in range(4)),
 }
+INTRINSICS = {  # of formats that cannot hold K
+    "cameras.json": [[FX, 0, WIDTH / 2], [0, FY, HEIGHT / 2], [0, 0, 1]],
+    "LLFF": [[FX, 0, WIDTH / 2], [0, FX, HEIGHT / 2], [0, 0, 1]],
+}
+WITH_DEPTH = ("ScanNet", "TUM RGB-D", "Polycam")
 
 
 @pytest.mark.parametrize("kind", WRITERS)
@@ -46,18 +58,36 @@ def test_a_capture_is_the_same_in_every_format(kind, tmp_path):
     order = [COLMAP_IMAGES.index(f.name) for f in capture.frames] if capture.format == "COLMAP" else range(NUM_FRAMES)
     np.testing.assert_allclose(capture.camtoworlds, poses()[list(order)], atol=2e-6 if "TUM" in kind else 1e-12)
     for i in range(NUM_FRAMES):
-        np.testing.assert_allclose(capture.K(i), K, rtol=1e-12)
+        np.testing.assert_allclose(capture.K(i), INTRINSICS.get(capture.format, K), rtol=1e-12)
         assert capture.frames[i].lens is None
         if capture.depth(i) is not None:
             np.testing.assert_allclose(capture.depth(i), 1.5, rtol=1e-6)
-    assert capture.pixels.has_depth(0) == (capture.format in ("ScanNet", "TUM RGB-D"))
+    assert capture.pixels.has_depth(0) == (capture.format in WITH_DEPTH)
     assert capture.notes == ()
 
 
-@pytest.mark.parametrize("sparse", ["sparse", "colmap/sparse/0", "."])
+@pytest.mark.parametrize("sparse", ["sparse", "colmap/sparse/0", ".", "sparse/1", "colmap/sparse/12"])
 def test_a_colmap_model_is_found_in_its_usual_places(sparse, tmp_path):
     write_colmap_binary(tmp_path, sparse=sparse)
     assert len(open_capture(tmp_path)) == NUM_FRAMES
+
+
+def test_of_several_colmap_models_the_first_is_read(tmp_path):
+    """The number counts, not the name: 2 comes before 10, and 0 before both."""
+    write_colmap_binary(tmp_path, [camera_bytes(1, (99.0, FY, CX, CY))], sparse="sparse/10")
+    write_colmap_binary(tmp_path, sparse="sparse/2")
+    assert open_capture(tmp_path).frames[0].K[0, 0] == FX
+    write_colmap_binary(tmp_path, [camera_bytes(1, (77.0, FY, CX, CY))])
+    assert open_capture(tmp_path).frames[0].K[0, 0] == 77
+
+
+def test_colmap_cameras_that_no_image_uses_may_be_of_any_model(tmp_path):
+    cameras = [camera_bytes(7, (FX, FY, CX, CY, 0.9), camera=5), camera_bytes(1, (FX, FY, CX, CY))]
+    write_colmap_binary(tmp_path / "binary", [*cameras, camera_bytes(17, (WIDTH, HEIGHT), camera=8)])
+    text = f"5 FOV {WIDTH} {HEIGHT} {FX} {FY} {CX} {CY} 0.9\n1 PINHOLE {WIDTH} {HEIGHT} {FX} {FY} {CX} {CY}\n8 NEW 1 1"
+    write_colmap_text(tmp_path / "text", camera=text)
+    for root in ("binary", "text"):
+        np.testing.assert_array_equal(open_capture(tmp_path / root).frames[0].K, K)
 
 
 def test_binary_files_come_before_text(tmp_path):
@@ -92,6 +122,15 @@ def test_colmap_images_may_be_in_the_root_or_downscaled(tmp_path):
         (3, "RADIAL", (FX, CX, CY, 0.11, 0.02), {"k1": 0.11, "k2": 0.02}),
         (4, "OPENCV", (FX, FY, CX, CY, 0.11, 0.02, 0.01, 0.03), {"k1": 0.11, "k2": 0.02, "p1": 0.01, "p2": 0.03}),
         (
+            5,
+            "OPENCV_FISHEYE",
+            (FX, FY, CX, CY, 0.11, 0.02, 0.01, 0.03),
+            {"k1": 0.11, "k2": 0.02, "k3": 0.01, "k4": 0.03},
+        ),
+        (8, "SIMPLE_RADIAL_FISHEYE", (FX, CX, CY, 0.11), {"k1": 0.11}),
+        (9, "RADIAL_FISHEYE", (FX, CX, CY, 0.11, 0.02), {"k1": 0.11, "k2": 0.02}),
+        (15, "FISHEYE", (FX, FY, CX, CY), {}),
+        (
             6,
             "FULL_OPENCV",
             (FX, FY, CX, CY, 0.11, 0.02, 0.01, 0.03, 0.04, 0, 0, 0),
@@ -109,6 +148,7 @@ def test_colmap_camera_models_give_their_intrinsics(model, name, params, wanted,
         assert (frame.K[0, 2], frame.K[1, 2]) == (CX, CY)
         found = {} if frame.lens is None else {k: v for k, v in vars(frame.lens).items() if v}
         assert found == wanted
+        assert isinstance(frame.lens, FisheyeLens) == ("FISHEYE" in name)
 
 
 def test_scannet_frames_without_tracking_are_skipped(tmp_path):
@@ -191,3 +231,41 @@ def test_realestate_frames_without_images_are_skipped(tmp_path):
     (tmp_path / "0a1b" / "90000.png").unlink()
     capture = open_capture(tmp_path / "0a1b.txt")
     assert len(capture) == 3 and "1 of 4 frames" in capture.notes[0] and capture.name == "0a1b"
+
+
+def test_realestate_cameras_may_lie_beside_other_text_files(tmp_path):
+    write_realestate(tmp_path)
+    (tmp_path / "README.txt").write_text("Frames of one video.\n")
+    assert len(open_capture(tmp_path)) == NUM_FRAMES
+
+
+def test_tum_images_listed_at_several_times_count_once(tmp_path):
+    write_tum(tmp_path)
+    lines = (tmp_path / "rgb.txt").read_text().splitlines()
+    again = f"1305031102.500000 {lines[1].split()[1]}"
+    (tmp_path / "rgb.txt").write_text("\n".join([again, *lines]))
+    capture = open_capture(tmp_path)
+    np.testing.assert_allclose(capture.camtoworlds, poses(), atol=2e-6)
+    assert capture.notes == ("1 lines of rgb.txt list an image again; its first time counts.",)
+
+
+def test_shrunk_images_may_have_another_extension(tmp_path):
+    write_colmap_binary(tmp_path)
+    (tmp_path / "images").rename(tmp_path / "full")
+    write_colmap_images(tmp_path, "images_4", (WIDTH // 4, HEIGHT // 4))
+    for file in [file for file in (tmp_path / "images_4").rglob("*.jpg")]:
+        file.rename(file.with_suffix(".png"))
+    shrunk = open_capture(tmp_path)
+    assert shrunk.frames[0].path == tmp_path / "images_4" / "9.png"
+    np.testing.assert_allclose(shrunk.K(0)[:2], K[:2] / 4)
+
+
+@pytest.mark.parametrize("kind", ["cameras.json", "LLFF", "OpenSfM"])
+def test_shrunk_images_stand_in_for_missing_ones(kind, tmp_path):
+    WRITERS[kind](tmp_path)
+    whole = open_capture(tmp_path).K(0)
+    (tmp_path / "images_2").mkdir()
+    for i, file in enumerate(sorted((tmp_path / "images").iterdir())):
+        write_image(tmp_path / "images_2" / file.name, i, (WIDTH // 2, HEIGHT // 2))
+    (tmp_path / "images").rename(tmp_path / "elsewhere")
+    np.testing.assert_allclose(open_capture(tmp_path).K(0)[:2], whole[:2] / 2, rtol=1e-12)

@@ -1,9 +1,12 @@
 """Reader of COLMAP reconstructions: `sparse/0/`, `sparse/` or `colmap/sparse/0/` with `cameras` and `images`.
 
+Where there is no `sparse/0`, the reconstruction of the lowest number is read.
+
 Poses are world-to-camera with OpenCV axes, in COLMAP's world; pixel centers are at +0.5. Images are in `images/` (or
 downscaled in `images_2`, `images_4`, `images_8`), else in the folder of the capture; images that COLMAP did not
-register are ignored. All camera models but the fish-eye ones are supported, FULL_OPENCV only without its denominator
-(k4 to k6). If there are binary and text files, the binary ones are read. Format: colmap.github.io/format.html.
+register are ignored. Perspective and fish-eye camera models are supported (`MODELS`), FULL_OPENCV only without its
+denominator (k4 to k6); cameras that no image uses may be of any model. If there are binary and text files, the binary
+ones are read. Format: colmap.github.io/format.html.
 """
 
 import struct
@@ -11,7 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ssplat_jax.data.lens import Lens
+from ssplat_jax.data.lens import FisheyeLens, Lens
 from ssplat_jax.data.posed_image import Frame, invert_pose, pose_from_quat
 from ssplat_jax.data.readers import Listing
 from ssplat_jax.data.readers.frame_list import (
@@ -27,18 +30,25 @@ from ssplat_jax.errors import echo, refusal
 
 FORMAT = "COLMAP"
 FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", ".")  # places of a reconstruction, in the order of search
-MODELS = (  # name and parameters, by id; None: fish-eye models, which are not supported
-    ("SIMPLE_PINHOLE", "f cx cy"),
-    ("PINHOLE", "fx fy cx cy"),
-    ("SIMPLE_RADIAL", "f cx cy k1"),
-    ("RADIAL", "f cx cy k1 k2"),
-    ("OPENCV", "fx fy cx cy k1 k2 p1 p2"),
-    ("OPENCV_FISHEYE", None),
-    ("FULL_OPENCV", "fx fy cx cy k1 k2 p1 p2 k3 d1 d2 d3"),
-    ("FOV", None),
-    ("SIMPLE_RADIAL_FISHEYE", None),
-    ("RADIAL_FISHEYE", None),
-    ("THIN_PRISM_FISHEYE", None),
+MODELS = (  # name, parameters, and whether the camera is supported, by id
+    ("SIMPLE_PINHOLE", "f cx cy", True),
+    ("PINHOLE", "fx fy cx cy", True),
+    ("SIMPLE_RADIAL", "f cx cy k1", True),
+    ("RADIAL", "f cx cy k1 k2", True),
+    ("OPENCV", "fx fy cx cy k1 k2 p1 p2", True),
+    ("OPENCV_FISHEYE", "fx fy cx cy k1 k2 k3 k4", True),
+    ("FULL_OPENCV", "fx fy cx cy k1 k2 p1 p2 k3 d1 d2 d3", True),
+    ("FOV", "fx fy cx cy omega", False),
+    ("SIMPLE_RADIAL_FISHEYE", "f cx cy k1", True),
+    ("RADIAL_FISHEYE", "f cx cy k1 k2", True),
+    ("THIN_PRISM_FISHEYE", "fx fy cx cy k1 k2 p1 p2 k3 k4 sx1 sy1", False),
+    ("RAD_TAN_THIN_PRISM_FISHEYE", "fx fy cx cy k0 k1 k2 k3 k4 k5 p0 p1 s0 s1 s2 s3", False),
+    ("SIMPLE_DIVISION", "f cx cy k", False),
+    ("DIVISION", "fx fy cx cy k", False),
+    ("SIMPLE_FISHEYE", "f cx cy", True),
+    ("FISHEYE", "fx fy cx cy", True),
+    ("EUCM", "fx fy cx cy alpha beta", False),
+    ("EQUIRECTANGULAR", "w h", False),
 )
 UNDISTORT = "undistort the images to pinhole cameras first (`colmap image_undistorter`)"
 COPY_AGAIN = "copy the reconstruction again"
@@ -58,10 +68,12 @@ class ImageEntry(NamedTuple):
 
 
 class CameraEntry(NamedTuple):
-    """Camera with its intrinsics."""
+    """Camera as its file gives it; images that use it need a supported model."""
 
+    model: str
     size: tuple[float, float]  # (width, height) of the images that COLMAP used
-    intrinsics: Intrinsics
+    params: tuple[float, ...]
+    where: str  # location in the file for error messages
 
 
 def matches(path: Path) -> bool:
@@ -97,9 +109,20 @@ def read(path: Path) -> Listing:
 def _model_folder(path: Path) -> Path | None:
     """Folder of the reconstruction, or None."""
     for folder in FOLDERS:
-        if any((path / folder / f"images.{kind}").is_file() for kind in ("bin", "txt")):
+        if _is_model(path / folder):
             return path / folder
+    for base in (path / "sparse", path / "colmap" / "sparse"):
+        numbers = sorted(int(file.name) for file in base.glob("[0-9]*") if file.name.isdecimal())
+        if (
+            found := next((base / str(number) for number in numbers if _is_model(base / str(number))), None)
+        ) is not None:
+            return found
     return None
+
+
+def _is_model(folder: Path) -> bool:
+    """Whether a folder holds a reconstruction."""
+    return any((folder / f"images.{kind}").is_file() for kind in ("bin", "txt"))
 
 
 def _frame(root: Path, folder: str, entry: ImageEntry, cameras: dict[int, CameraEntry]) -> Frame:
@@ -115,29 +138,31 @@ def _frame(root: Path, folder: str, entry: ImageEntry, cameras: dict[int, Camera
         entry.name,
         path,
         invert_pose(pose_from_quat(entry.quat, entry.translation, entry.where)),
-        camera.intrinsics,
+        _intrinsics(camera),
         size,
         f"{entry.where}, camera {entry.camera}",
         shrink=shrink,
     )
 
 
-def _camera(model: str, width: int, height: int, params: list[float], where: str) -> CameraEntry:
-    """Camera with checked parameters; unsupported models are refused."""
-    names = dict(MODELS).get(model)
+def _intrinsics(camera: CameraEntry) -> Intrinsics:
+    """Intrinsics of a camera that an image uses; unsupported models are refused."""
+    names = next((params for name, params, supported in MODELS if name == camera.model and supported), None)
     if names is None:
-        supported = ", ".join(name for name, params in MODELS if params is not None)
-        raise refusal(where, wanted=f"one of {supported}", got=echo(model), fix=UNDISTORT)
-    if len(params) != len(names.split()):
-        got = str(len(params))
-        raise refusal(where, wanted=f"{len(names.split())} parameters ({names})", got=got, fix=COPY_AGAIN)
-    fields: dict[str, Any] = dict(zip(names.split(), params, strict=True))
+        supported = ", ".join(name for name, _, supported in MODELS if supported)
+        raise refusal(camera.where, wanted=f"one of {supported}", got=echo(camera.model), fix=UNDISTORT)
+    if len(camera.params) != len(names.split()):
+        got = str(len(camera.params))
+        wanted = f"{len(names.split())} parameters ({names})"
+        raise refusal(camera.where, wanted=wanted, got=got, fix=COPY_AGAIN)
+    fields: dict[str, Any] = dict(zip(names.split(), camera.params, strict=True))
     if any(fields.pop(name, 0.0) != 0.0 for name in ("d1", "d2", "d3")):
-        raise refusal(where, wanted="FULL_OPENCV with k4 = k5 = k6 = 0", got="a denominator", fix=UNDISTORT)
+        raise refusal(camera.where, wanted="FULL_OPENCV with k4 = k5 = k6 = 0", got="a denominator", fix=UNDISTORT)
     focal = fields.pop("f", None)
     fx, fy = (fields.pop("fx", focal), fields.pop("fy", focal))
     cx, cy = fields.pop("cx"), fields.pop("cy")
-    return CameraEntry((float(width), float(height)), Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, lens=Lens(**fields)))
+    lens = FisheyeLens(**fields) if "FISHEYE" in camera.model else Lens(**fields)
+    return Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, lens=lens)
 
 
 class _Binary:
@@ -195,9 +220,12 @@ def _binary_cameras(path: Path) -> dict[int, CameraEntry]:
     for _ in range(file.count(CAMERA_BYTES)):
         camera, model, width, height = file.take("IiQQ")
         where = f"{path}: camera {camera}"
-        name, params = MODELS[model] if 0 <= model < len(MODELS) else (f"model {model}", None)
-        values = file.take(f"{len(params.split())}d") if params is not None else ()
-        cameras[camera] = _camera(name, width, height, list(values), where)
+        if not 0 <= model < len(MODELS):  # the number of its parameters is not known, so nothing after it can be read
+            supported = ", ".join(name for name, _, supported in MODELS if supported)
+            raise refusal(where, wanted=f"one of {supported}", got=f"'model {model}'", fix=UNDISTORT)
+        name, params, _ = MODELS[model]
+        values = file.take(f"{len(params.split())}d")
+        cameras[camera] = CameraEntry(name, (float(width), float(height)), values, where)
     return cameras
 
 
@@ -221,7 +249,8 @@ def _text_cameras(path: Path) -> dict[int, CameraEntry]:
         if len(words) < 4:
             raise refusal(where, wanted="id, model, width, height, parameters", got=echo(line), fix=COPY_AGAIN)
         camera, width, height = (_whole(word, where) for word in (words[0], *words[2:4]))
-        cameras[camera] = _camera(words[1], width, height, parse_numbers(words[4:], where), where)
+        size = (float(width), float(height))
+        cameras[camera] = CameraEntry(words[1], size, tuple(parse_numbers(words[4:], where)), where)
     return cameras
 
 

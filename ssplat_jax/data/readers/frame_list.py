@@ -65,7 +65,7 @@ def file_named(
         name: path relative to `root`, not yet checked.
         where: location of the name for error messages.
         extensions: extensions to try.
-        folders: folders to try in place of images/.
+        folders: folders to try in place of images/; there, any of `EXTENSIONS` may stand in place of the name's own.
 
     Returns:
         The resolved path.
@@ -78,6 +78,9 @@ def file_named(
     below = in_images(name)
     names = [name, *(f"{folder}/{below}" for folder in folders if below is not None)]
     path = find_file(root, [n + extension for n in names for extension in extensions], where)
+    if path is None:
+        stems = [n[: len(n) - len(posixpath.splitext(n)[1])] for n in names[1:]]
+        path = find_file(root, [stem + extension for stem in stems for extension in EXTENSIONS[1:]], where)
     if path is None:
         got = f"{echo(name)}, which {_missing(root, names, extensions)}"
         raise refusal(where, wanted="an existing file", got=got, fix="add the file or drop the frame")
@@ -98,6 +101,24 @@ def _missing(root: Path, names: Sequence[str], extensions: Sequence[str]) -> str
             if isinstance(error, RuntimeError) or getattr(error, "errno", None) == errno.ELOOP:
                 return "is a link that leads back to itself"
     return "does not exist"
+
+
+def check_once(seen: dict[Path, str], path: Path, name: str, where: str) -> None:
+    """Checks that no frame before has the same image, and adds it to `seen`.
+
+    Args:
+        seen: location of the first frame of each image.
+        path: the image.
+        name: its name in the capture's files.
+        where: location of the frame for error messages.
+
+    Raises:
+        InputError: the image is in `seen`.
+    """
+    first = seen.setdefault(path, where)
+    if first is not where:
+        got = f"{echo(name)} again, after {first.split(': ')[-1]}"
+        raise refusal(where, wanted="every image once", got=got, fix="drop one of the two frames")
 
 
 def in_images(name: str) -> str | None:
@@ -215,7 +236,7 @@ def order_frames(name: str, frames: list[Frame], notes: Sequence[str] = (), *, i
 
 def _path_length(frames: list[Frame]) -> float:
     """Length of the camera path."""
-    return sum(math.dist(a.center, b.center) for a, b in itertools.pairwise(frames))
+    return sum((math.dist(a.center, b.center) for a, b in itertools.pairwise(frames)), 0.0)
 
 
 def _natural(name: str) -> list[tuple[int, int, str]]:

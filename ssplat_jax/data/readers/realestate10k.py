@@ -21,12 +21,8 @@ COLUMNS = 19  # numbers per line
 
 
 def matches(path: Path) -> bool:
-    """Whether `path` is a file of cameras, or a folder whose only text file is one."""
-    file = _cameras_file(path)
-    if file is None:
-        return False
-    with file.open("rb") as opened:
-        return opened.read(4) == b"http"
+    """Whether `path` is a file of cameras, or a folder that holds exactly one."""
+    return _cameras_file(path) is not None
 
 
 def read(path: Path) -> Listing:
@@ -67,8 +63,16 @@ def read(path: Path) -> Listing:
 
 
 def _cameras_file(path: Path) -> Path | None:
-    """The text file at `path`, or the only one in the folder `path`."""
+    """The file of cameras at `path`, or the only one in the folder `path`; other text files may lie beside it."""
     if path.is_file():
-        return path if path.suffix == ".txt" else None
-    texts = sorted(path.glob("*.txt")) if path.is_dir() else []
+        return path if path.suffix == ".txt" and _starts_with_address(path) else None
+    texts = [file for file in sorted(path.glob("*.txt")) if _starts_with_address(file)] if path.is_dir() else []
     return texts[0] if len(texts) == 1 else None
+
+
+def _starts_with_address(file: Path) -> bool:
+    """Whether the first line of a file may be the address of a video."""
+    if not file.is_file():
+        return False
+    with file.open("rb") as opened:
+        return opened.read(4) == b"http"

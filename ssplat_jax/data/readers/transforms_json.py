@@ -4,7 +4,9 @@ Poses are camera-to-world with OpenGL axes (+x right, +y up, +z backward) and ar
 re-centered or rescaled, and `applied_transform` is ignored, so results are in the frame of the file.
 Intrinsics are global or per frame, and a frame's own value comes first: fl_x, fl_y, cx, cy, w, h in pixels of the
 stored image, or camera_angle_x in radians. Defaults are fl_y = fl_x, the center of the image, and the size of the
-image file. Distortion (k1 to k4, p1, p2) follows the Brown-Conrady model and is removed when images are delivered.
+image file. Distortion (k1 to k4, p1, p2) follows the Brown-Conrady model, or with `camera_model` OPENCV_FISHEYE or
+`is_fisheye` the fish-eye model (k1 to k4), and is removed when images are delivered.
+DL3DV keeps the file and its images in a folder `nerfstudio`, which is opened with the folder around it.
 Frames are streamed in the natural order of `file_path`, with the exception in `frame_list.order_frames`.
 """
 
@@ -13,12 +15,10 @@ import math
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from ssplat_jax.data.images import check_depth_header, image_size
-from ssplat_jax.data.lens import Lens
-from ssplat_jax.data.posed_image import Frame, check_camtoworld
-from ssplat_jax.data.readers import Listing
+from ssplat_jax.data.lens import FisheyeLens, Lens
+from ssplat_jax.data.posed_image import OPENGL_TO_OPENCV, Frame, check_camtoworld
+from ssplat_jax.data.readers import Listing, splat_cameras
 from ssplat_jax.data.readers.frame_list import (
     EXTENSIONS,
     SHRUNK_FOLDERS,
@@ -33,13 +33,23 @@ from ssplat_jax.data.readers.strict_json import load_json
 from ssplat_jax.errors import InputError, echo, refusal
 
 FORMAT = "transforms.json"
-OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # flips the y and z axes of a camera
-PINHOLE_MODELS = (None, "OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")  # supported models
+PLACES = ("transforms.json", "nerfstudio/transforms.json")
+PINHOLE_MODELS = (None, "OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
+FISHEYE_MODELS = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 
 
 def matches(path: Path) -> bool:
-    """Whether `path` is a folder with a transforms.json, or a .json file."""
-    return (path / "transforms.json").is_file() or (path.is_file() and path.suffix == ".json")
+    """Whether `path` is a folder with a transforms.json, also in `nerfstudio`, or a .json file of an object."""
+    if path.is_file():
+        return path.suffix == ".json" and not splat_cameras.matches(path)
+    return any((path / name).is_file() for name in PLACES)
+
+
+def _file(path: Path) -> Path:
+    """The file at `path` or in the folder `path`."""
+    if path.is_file():
+        return path
+    return next((path / name for name in PLACES if (path / name).is_file()), path / PLACES[0])
 
 
 def read(path: Path) -> Listing:
@@ -63,7 +73,7 @@ def read_complete(path: Path) -> tuple[Listing, str | None]:
 
 def _read(path: Path, problems: list[str] | None) -> Listing:
     """The frames of a capture; with `problems`, those before the first problem, which is added to the list."""
-    file = path if path.is_file() else path / "transforms.json"
+    file = _file(path)
     root = file.parent.resolve()
     meta = load_json(file)
     entries = meta.get("frames")
@@ -105,10 +115,9 @@ def _read_frame(root: Path, meta: dict[str, Any], entry: dict[str, Any], where: 
     fields = _Fields(meta, entry, where)
     is_shrunk = path.relative_to(root).parts[0] in SHRUNK_FOLDERS and in_images(str(name)) is not None
     (width, height), shrink = _check_size(fields, path, is_shrunk=is_shrunk)
-    _check_model(fields)
     fx, fy = _focal(fields, width / shrink, height / shrink)
     cx, cy = (fields.number(name, side / shrink / 2) for name, side in (("cx", width), ("cy", height)))
-    lens = Lens(**{field.name: fields.number(field.name, 0.0) for field in dataclasses.fields(Lens)})
+    lens = _lens(fields)
     return make_frame(
         str(name),
         path,
@@ -159,14 +168,17 @@ def _check_size(fields: _Fields, path: Path, *, is_shrunk: bool) -> tuple[tuple[
     return stored_size(path, wanted, f"{fields.where}: w, h", fix)
 
 
-def _check_model(fields: _Fields) -> None:
-    """Refuses camera models that are not pinhole cameras with Brown-Conrady distortion."""
-    model = fields.get("camera_model")
-    if model not in PINHOLE_MODELS or fields.get("is_fisheye"):
-        fix = "undistort the images to a pinhole camera first (COLMAP: `colmap image_undistorter`)"
-        raise refusal(
-            f"{fields.where}: camera_model", wanted="OPENCV or PINHOLE", got=echo(model or "is_fisheye"), fix=fix
-        )
+def _lens(fields: _Fields) -> Lens:
+    """Distortion by the camera's model; models without one of OpenCV's two lenses are refused."""
+    model, where = fields.get("camera_model"), f"{fields.where}: camera_model"
+    is_fisheye = model in FISHEYE_MODELS or bool(fields.get("is_fisheye"))
+    coefficients = {field.name: fields.number(field.name, 0.0) for field in dataclasses.fields(Lens)}
+    fix = "undistort the images to a pinhole camera first (COLMAP: `colmap image_undistorter`)"
+    if not is_fisheye and model not in PINHOLE_MODELS:
+        raise refusal(where, wanted="OPENCV, PINHOLE or OPENCV_FISHEYE", got=echo(model), fix=fix)
+    if is_fisheye and (coefficients["p1"] or coefficients["p2"]):
+        raise refusal(where, wanted="a fish-eye lens with k1 to k4 alone", got="p1 or p2 beside them", fix=fix)
+    return FisheyeLens(**coefficients) if is_fisheye else Lens(**coefficients)
 
 
 def _focal(fields: _Fields, width: float, height: float) -> tuple[float, float]:

@@ -2,7 +2,7 @@
 
 `rgb.txt` and `depth.txt` list times and files, `groundtruth.txt` camera-to-world poses (time, tx ty tz, qx qy qz qw).
 The pose of an image is interpolated between its neighbors in time; images between poses more than `MAX_POSE_GAP` apart
-are skipped. Depth maps are in units of 1/5000 m; an image gets the nearest one within `MAX_DEPTH_GAP`.
+are skipped, and an image that is listed at several times counts once, at the first. Depth maps are in units of 1/5000 m; an image gets the nearest one within `MAX_DEPTH_GAP`.
 Intrinsics are read from `calibration.txt` (fx fy cx cy, optionally k1 k2 p1 p2 k3). Without it, `freiburg1` to
 `freiburg3` in the name of the folder selects those of the color camera from
 cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats. Both have the center of the first pixel at 0, so half a pixel is
@@ -45,7 +45,7 @@ def read(path: Path) -> Listing:
     intrinsics, calibration = _intrinsics(root)
     poses = load_rows(root / "groundtruth.txt", 8)
     poses = poses[np.argsort(poses[:, 0], kind="stable")]
-    images = _files(root, "rgb.txt")
+    images, num_again = _each_once(_files(root, "rgb.txt"))
     depths = _files(root, "depth.txt") if (root / "depth.txt").is_file() else []
     frames = []
     for time, image in images:
@@ -66,7 +66,16 @@ def read(path: Path) -> Listing:
         raise refusal(str(path), wanted="images with poses", got=got, fix="use the groundtruth.txt of these images")
     num_lost = len(images) - len(frames)
     lost = [f"{num_lost} of {len(images)} frames are skipped: there is no pose at their time."] if num_lost else []
-    return order_frames(root.name, frames, lost, is_in_time=True)
+    again = [f"{num_again} lines of rgb.txt list an image again; its first time counts."] if num_again else []
+    return order_frames(root.name, frames, [*lost, *again], is_in_time=True)
+
+
+def _each_once(files: list[tuple[float, Path]]) -> tuple[list[tuple[float, Path]], int]:
+    """Each file at its first time, and the number of entries that were left out."""
+    first: dict[Path, float] = {}
+    for time, file in files:
+        first.setdefault(file, time)
+    return [(time, file) for file, time in first.items()], len(files) - len(first)
 
 
 def _files(root: Path, name: str) -> list[tuple[float, Path]]:

@@ -1,0 +1,59 @@
+"""Reader of Record3D's exports: `metadata.json` (or `metadata`) and the images `rgb/0.jpg` (or `rgbd/0.jpg`).
+
+`poses` holds a unit quaternion (xyzw) and a camera center per image, camera-to-world with OpenGL axes, in meters. `K` is
+the matrix of intrinsics column by column, in pixels of an image of `w` x `h`. Depth maps are not read: they are
+floating-point EXR or compressed.
+"""
+
+from pathlib import Path
+
+from ssplat_jax.data.posed_image import OPENGL_TO_OPENCV, pose_from_quat
+from ssplat_jax.data.readers import Listing
+from ssplat_jax.data.readers.frame_list import Intrinsics, find_file, make_frame, order_frames, stored_size
+from ssplat_jax.data.readers.strict_json import JsonFields, load_json
+from ssplat_jax.errors import echo, refusal
+
+FORMAT = "Record3D"
+FOLDERS = ("rgb", "rgbd")
+FIX = "export the recording again"
+
+
+def matches(path: Path) -> bool:
+    """Whether `path` is a folder with Record3D's metadata and a folder of images."""
+    return _metadata(path) is not None and any((path / folder).is_dir() for folder in FOLDERS)
+
+
+def read(path: Path) -> Listing:
+    """Reads the images that exist; image `i.jpg` has pose `i`."""
+    root, file = path.resolve(), _metadata(path)
+    assert file is not None  # `matches` is true
+    meta = load_json(file)
+    fields, poses = JsonFields(meta, str(file)), meta.get("poses")
+    if not isinstance(poses, list) or not poses:
+        got = "nothing" if poses is None else echo(poses)
+        raise refusal(f"{file}.poses", wanted="a list of poses", got=got, fix=FIX)
+    K = fields.numbers("K", (9,)).reshape(3, 3).T
+    intrinsics = Intrinsics(fx=K[0, 0], fy=K[1, 1], cx=K[0, 2], cy=K[1, 2])
+    described = (fields.number("w"), fields.number("h"))
+    frames = []
+    for i, entry in enumerate(poses):
+        where = f"{file}: poses[{i}]"
+        names = [f"{folder}/{i}.{suffix}" for folder in FOLDERS for suffix in ("jpg", "png")]
+        image = find_file(root, names, where)
+        if image is None:
+            continue
+        x, y, z, w, *center = JsonFields({"pose": entry}, where).numbers("pose", (7,))
+        opengl = pose_from_quat((w, x, y, z), center, where)
+        size, shrink = stored_size(image, described, f"{file}: w, h", FIX)
+        name = str(image.relative_to(root))
+        frames.append(make_frame(name, image, opengl @ OPENGL_TO_OPENCV, intrinsics, size, str(file), shrink=shrink))
+    if not frames:
+        raise refusal(str(path), wanted="images rgb/0.jpg, ...", got=f"none for {len(poses)} poses", fix=FIX)
+    num_lost = len(poses) - len(frames)
+    lost = [f"{num_lost} of {len(poses)} frames are skipped: their images are missing."] if num_lost else []
+    return order_frames(root.name, frames, lost)
+
+
+def _metadata(path: Path) -> Path | None:
+    """File of the metadata in the folder `path`, or None."""
+    return next((path / name for name in ("metadata.json", "metadata") if (path / name).is_file()), None)
