@@ -18,10 +18,10 @@ class Inspect:
 
     capture: Annotated[str, tyro.conf.Positional]
     """Folder of a posed capture, or procedural:NAME. Formats: transforms.json (nerfstudio, instant-ngp, Blender,
-    DL3DV); COLMAP (sparse/0 beside images/); Polycam (keyframes/); Record3D (metadata.json, rgb/); cameras.json of 3DGS,
-    LLFF (poses_bounds.npy) and OpenSfM (reconstruction.json), each beside images/; ScanNet (color/, pose/,
-    intrinsic/intrinsic_color.txt); TUM RGB-D (rgb.txt, groundtruth.txt); KITTI (a folder of sequences/); RealEstate10K
-    (its .txt, or the folder of that file and the frames)."""
+    DL3DV); COLMAP (sparse/0 beside images/); Polycam (keyframes/); Record3D (metadata.json, rgb/); cameras.json of
+    3DGS, LLFF (poses_bounds.npy) and OpenSfM (reconstruction.json), each beside images/; ScanNet (color/, pose/,
+    intrinsic/intrinsic_color.txt); TUM RGB-D (rgb.txt, groundtruth.txt); KITTI (a folder of sequences/);
+    RealEstate10K (its .txt, or the folder of that file and the frames)."""
     size: str | None = None
     """Image size WxH; default the capture's own."""
     json: bool = False

@@ -45,7 +45,7 @@ class Lens:
 
 @dataclasses.dataclass(frozen=True)
 class FisheyeLens(Lens):
-    """Fish-eye lens: a ray at the angle a to the axis is seen at a (1 + k1 a^2 + k2 a^4 + k3 a^6 + k4 a^8) from the center.
+    """Fish-eye lens: a ray at the angle a to the axis is seen at r = a (1 + k1 a^2 + k2 a^4 + k3 a^6 + k4 a^8).
 
     This is COLMAP's OPENCV_FISHEYE, and without coefficients an equidistant lens. `p1` and `p2` have no meaning here.
 

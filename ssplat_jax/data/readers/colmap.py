@@ -113,10 +113,9 @@ def _model_folder(path: Path) -> Path | None:
             return path / folder
     for base in (path / "sparse", path / "colmap" / "sparse"):
         numbers = sorted(int(file.name) for file in base.glob("[0-9]*") if file.name.isdecimal())
-        if (
-            found := next((base / str(number) for number in numbers if _is_model(base / str(number))), None)
-        ) is not None:
-            return found
+        for number in numbers:
+            if _is_model(base / str(number)):
+                return base / str(number)
     return None
 
 

@@ -1,9 +1,9 @@
 """Reader of KITTI's odometry sequences: `sequences/00/` with `calib.txt` and `image_2/000000.png`, and `poses/00.txt`.
 
-`poses/00.txt`, beside `sequences/`, may also lie in the sequence as `poses.txt`. Line i is the 3x4 camera-to-world matrix
-of camera 0 at image i, with OpenCV axes, in meters. `calib.txt` has a projection matrix P0 to P3 of each rectified
-camera, whose fourth column is its offset from camera 0. The first of image_2, image_3 (color), image_0 and image_1 that
-exists is read. Pixel centers of the calibration are at whole numbers, so half a pixel is added.
+`poses/00.txt`, beside `sequences/`, may also lie in the sequence as `poses.txt`. Line i is the 3x4 camera-to-world
+matrix of camera 0 at image i, with OpenCV axes, in meters. `calib.txt` has a projection matrix P0 to P3 of each
+rectified camera, whose fourth column is its offset from camera 0. The first of image_2, image_3 (color), image_0 and
+image_1 that exists is read. Pixel centers of the calibration are at whole numbers, so half a pixel is added.
 """
 
 from pathlib import Path

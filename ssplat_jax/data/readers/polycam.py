@@ -1,4 +1,4 @@
-"""Reader of Polycam's raw data: `keyframes/images/*.jpg` and `keyframes/cameras/*.json`, optionally `keyframes/depth/*.png`.
+"""Reader of Polycam's raw data: in `keyframes/`, `images/1.jpg` and `cameras/1.json`, and optionally `depth/1.png`.
 
 Where Polycam has optimized the poses, `corrected_images` and `corrected_cameras` are read instead. `t_00` to `t_23` are
 the camera-to-world matrix row by row, in meters, with OpenGL axes in ARKit's world (+y up); `fx fy cx cy width height`
@@ -19,7 +19,7 @@ IMAGES = frozenset({".jpg", ".jpeg", ".png"})
 
 
 def matches(path: Path) -> bool:
-    """Whether `path` is a folder with `keyframes/cameras/` or `keyframes/corrected_cameras/`, or the folder keyframes."""
+    """Whether `path` is a folder with `keyframes/`, or that folder, with images and cameras in it."""
     return _keyframes(path) is not None
 
 

@@ -1,7 +1,7 @@
 """Reader of Record3D's exports: `metadata.json` (or `metadata`) and the images `rgb/0.jpg` (or `rgbd/0.jpg`).
 
-`poses` holds a unit quaternion (xyzw) and a camera center per image, camera-to-world with OpenGL axes, in meters. `K` is
-the matrix of intrinsics column by column, in pixels of an image of `w` x `h`. Depth maps are not read: they are
+`poses` holds a unit quaternion (xyzw) and a camera center per image, camera-to-world with OpenGL axes, in meters. `K`
+is the matrix of intrinsics column by column, in pixels of an image of `w` x `h`. Depth maps are not read: they are
 floating-point EXR or compressed.
 """
 

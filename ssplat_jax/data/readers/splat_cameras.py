@@ -1,8 +1,8 @@
 """Reader of `cameras.json`, which 3D Gaussian splatting writes beside a scene: a list of cameras, and the images.
 
 Each entry has `img_name` (with or without extension), `width`, `height`, `fx` and `fy` in pixels, `position` (camera
-center) and `rotation` (camera-to-world, row by row, OpenCV axes). The principal point is the center of the image. Images
-are in `images/` (or downscaled in `images_2`, `images_4`, `images_8`), else beside the file.
+center) and `rotation` (camera-to-world, row by row, OpenCV axes). The principal point is the center of the image.
+Images are in `images/` (or downscaled in `images_2`, `images_4`, `images_8`), else beside the file.
 """
 
 from pathlib import Path

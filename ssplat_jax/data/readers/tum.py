@@ -2,7 +2,8 @@
 
 `rgb.txt` and `depth.txt` list times and files, `groundtruth.txt` camera-to-world poses (time, tx ty tz, qx qy qz qw).
 The pose of an image is interpolated between its neighbors in time; images between poses more than `MAX_POSE_GAP` apart
-are skipped, and an image that is listed at several times counts once, at the first. Depth maps are in units of 1/5000 m; an image gets the nearest one within `MAX_DEPTH_GAP`.
+are skipped, and an image that is listed at several times counts once, at the first. Depth maps are in units of 1/5000
+m; an image gets the nearest one within `MAX_DEPTH_GAP`.
 Intrinsics are read from `calibration.txt` (fx fy cx cy, optionally k1 k2 p1 p2 k3). Without it, `freiburg1` to
 `freiburg3` in the name of the folder selects those of the color camera from
 cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats. Both have the center of the first pixel at 0, so half a pixel is
