@@ -1,6 +1,7 @@
 """The configuration: bad values are refused, every field changes the hash, and no JAX is needed."""
 
 import dataclasses
+import json
 import re
 import subprocess
 import sys
@@ -84,6 +85,13 @@ def test_dictionary_and_back_is_the_same_configuration():
     config = StreamConfig().replace(encoder_widths=(8, 16), scene_scale=0.5, overflow="error")
     again = StreamConfig.from_dict(config.to_dict())
     assert again == config and again.hash == config.hash and hash(again) == hash(config)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_presets_are_the_same_after_json(name):
+    """As JSON has it: `paper` has an infinite cluster ratio."""
+    text = json.dumps(preset(name).to_dict(), allow_nan=False)
+    assert StreamConfig.from_dict(json.loads(text)) == preset(name)
 
 
 @pytest.mark.parametrize("network", ["compact", "resplat"])

@@ -2,9 +2,9 @@
 
     ssplat experiment additions --captures path/to/captures --out runs/additions
 
-The additions are the fields in which the preset `tiny` differs from the literal one (`paper`, or `small` where that is
-not known), networks aside. They are switched on one after another, from the literal values to those of `tiny`; then
-each is taken away from `tiny` alone. The shipped weights are used as they are, so fields that change the shape of a
+The additions are the fields in which the preset `tiny` differs from `paper`, the literal one, networks and the size of
+the memory aside. They are switched on one after another, from the literal values to those of `tiny`; then each is taken
+away from `tiny` alone. The shipped weights are used as they are, so fields that change the shape of a
 weight are left at the values of `tiny` and named on the page. Scenes are `procedural:room` and the captures of
 `CAPTURES` that are in `--captures`.
 """
@@ -20,7 +20,7 @@ from ssplat_experiments.memory_curve import START_CAPACITY
 from ssplat_experiments.scenes import open_room
 from ssplat_experiments.study import Study, at_scale, run_study
 from ssplat_jax.checkpoint.weights import check_params, load_params
-from ssplat_jax.config import PRESETS, StreamConfig, preset
+from ssplat_jax.config import StreamConfig, preset
 from ssplat_jax.console import Reporter
 from ssplat_jax.data.capture import Capture, open_capture
 from ssplat_jax.data.split import Split, interleaved_split
@@ -36,6 +36,9 @@ CAPTURES = {"redkitchen": 5, "fox": 1, "south_building": 1}
 """Names of real captures, with the stride of their frames."""
 
 NUM_TARGETS = 6
+STORAGE = ("memory.capacity", "memory.overflow")
+"""Fields that say how large the memory is, not what is done."""
+
 EARNED_DB = 0.02
 """A smaller difference of PSNR counts as none."""
 
@@ -69,10 +72,13 @@ def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str
 
 
 def differing_fields() -> list[Addition]:
-    """All fields in which `tiny` differs from the literal preset, networks aside."""
-    literal, ours = preset("paper" if "paper" in PRESETS else "small"), preset("tiny")
-    names = [(g, field.name) for g in ours.groups() if g != "network" for field in dataclasses.fields(getattr(ours, g))]
-    found = [Addition(f"{g}.{f}", literal.get(f"{g}.{f}"), ours.get(f"{g}.{f}")) for g, f in names]
+    """All fields in which `tiny` differs from the literal preset, networks and the size of the memory aside."""
+    literal, ours = preset("paper"), preset("tiny")
+    groups = [group for group in ours.groups() if group != "network"]
+    names = [f"{group}.{field.name}" for group in groups for field in dataclasses.fields(getattr(ours, group))]
+    found = [Addition(name, literal.get(name), ours.get(name)) for name in names if name not in STORAGE]
+    # A causal stream keeps the order of frames whatever chunk_step is, so its effect shows only after this field.
+    found.sort(key=lambda addition: addition.field != "stream.causal")
     return [addition for addition in found if addition.literal != addition.ours]
 
 

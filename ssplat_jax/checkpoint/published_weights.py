@@ -92,6 +92,14 @@ def published_tensors(config: StreamConfig) -> dict[str, PublishedTensor | None]
     return {"/".join(k.key for k in keys): published_tensor(tuple(k.key for k in keys), x.shape) for keys, x in leaves}
 
 
+def as_published(config: StreamConfig) -> StreamConfig:
+    """`config` with the behavior of the code that the published weights were trained with.
+
+    That code reads depth in the space of the candidates (`depth_readout="mean"`), where the paper prints metric depths.
+    """
+    return config.replace(upstream_compat=True, depth_readout="mean")
+
+
 def import_params(path: Path, config: StreamConfig, seed: int = 0, *, depth_only: bool = False) -> ImportedParams:
     """Imports parameters from a PyTorch checkpoint (`.pth`, `.ckpt`) or an `.npz` with the same names.
 
@@ -109,7 +117,9 @@ def import_params(path: Path, config: StreamConfig, seed: int = 0, *, depth_only
             network, has only some tensors of a part, or has tensors of other shapes.
     """
     if config.network.kind != "resplat":
-        raise InputError(f"import-weights: wanted a preset of ReSplat's network (small, base), got {config.preset!r}.")
+        raise InputError(
+            f"import-weights: wanted a preset of ReSplat's network (paper, small, base), got {config.preset!r}."
+        )
     shapes = read_shapes(path)
     # A depth network on its own is saved without the prefix of the model around it.
     missing_prefix = "" if any(name.startswith("encoder.") for name in shapes) else DEPTH

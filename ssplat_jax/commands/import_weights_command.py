@@ -24,8 +24,9 @@ class ImportWeights:
     """The full model, its depth network or Depth Anything V2: a file of torch.save, or an .npz with the same names."""
     out: Path
     """Weights file to write, for `ssplat run --weights`."""
-    preset: Literal["small", "base"] = "small"
-    """Size of the network."""
+    preset: Literal["paper", "small", "base"] = "small"
+    """Configuration of the weights file: small and base by the size of the network, paper for the paper's method to the
+    letter with the network of small."""
     depth_only: bool = False
     """Import the depth network only."""
     set: ConfigChanges = ()
@@ -33,11 +34,11 @@ class ImportWeights:
     def run(self) -> int:
         import numpy as np
 
-        from ssplat_jax.checkpoint.published_weights import import_params
+        from ssplat_jax.checkpoint.published_weights import as_published, import_params
         from ssplat_jax.checkpoint.weights import save_weights
 
         # The weights were trained with the behavior of that code; --set can change it.
-        config = apply_changes(preset(self.preset).replace(upstream_compat=True), self.set)
+        config = apply_changes(as_published(preset(self.preset)), self.set)
         imported = import_params(self.checkpoint, config, depth_only=self.depth_only)
         provenance = {"imported_from": self.checkpoint.name, "fresh": imported.initialized_parts}
         save_weights(self.out, imported.params, config, provenance, np.float32)

@@ -40,9 +40,10 @@ class StreamingConfig(ConfigGroup):
 class DepthConfig(ConfigGroup):
     """Fields that decide how depth and confidence are read from a distribution over candidates."""
 
-    depth_readout: Literal["mean", "window"] = "window"
-    """Expectation over all candidates (`mean`, literal), or over those around the peak, which does not average two
-    surfaces (`window`)."""
+    depth_readout: Literal["metric", "mean", "window"] = "window"
+    """Expectation of the depths of all candidates (`metric`, literal); of all candidates in the space in which they are
+    uniform, as the published networks read it (`mean`); or of those around the peak in that space, which does not
+    average two surfaces (`window`, ours)."""
     readout_window: int = 4
     """Candidates on each side of the peak that `depth_readout="window"` keeps."""
     confidence: Literal["peak", "window"] = "window"
@@ -77,8 +78,14 @@ class HistoryConfig(ConfigGroup):
     """Initial value of the learnable gamma_d = softplus(raw)."""
     cgfi: bool = True
     """Injects cached features where the current views are uncertain."""
+    cgfi_form: Literal["concat", "residual"] = "residual"
+    """`concat`: a U-Net of f and the attenuated F_H gives the new features (literal). `residual`: a U-Net that also
+    sees Omega gives what is added to f (ours)."""
     cgfi_width: int = 48
     """Channels inside the aggregation U-Net."""
+    unit_features: bool = True
+    """Features that come back from the cache have unit RMS (ours): the compact network stores them so, ReSplat's
+    network reads them so."""
 
     def rules(self) -> tuple[tuple[str, str, bool], ...]:
         return (
@@ -144,6 +151,11 @@ class HeadConfig(ConfigGroup):
     """Degree of the spherical harmonics of colors."""
     scale_mode: Literal["footprint", "absolute"] = "footprint"
     """Scales relative to the token's footprint, depth x cell / focal length (ours), or in stream units (literal)."""
+    opacity_mode: Literal["head", "compound"] = "compound"
+    """Opacity o of a pivot: as the head gives it (`head`, literal), or that of its n members in one place,
+    1 - (1 - o)^n (`compound`, ours)."""
+    grow_footprints: bool = True
+    """Footprints of pivots grow with their members until they cover a voxel's face (ours)."""
     max_scale: float = 1.0
     """Upper bound of scales, in stream units."""
 

@@ -3,6 +3,7 @@
 import dataclasses
 import hashlib
 import json
+import math
 from typing import Any
 
 from ssplat_jax.config.field_groups import DepthConfig, HeadConfig, HistoryConfig, MemoryConfig, StreamingConfig
@@ -85,9 +86,10 @@ class StreamConfig:
         return getattr(getattr(self, group), field)
 
     def to_dict(self) -> dict[str, Any]:
-        """Dictionary of plain JSON types, with a dictionary per group."""
+        """Dictionary of plain JSON types, with a dictionary per group; infinity, which JSON lacks, is "inf"."""
         fields = dataclasses.asdict(self)
         fields["network"] = {"kind": self.network.kind, **fields["network"]}
+        fields |= {group: {name: _to_json(x) for name, x in fields[group].items()} for group in self.groups()}
         return json.loads(json.dumps(fields))
 
     @staticmethod
@@ -104,7 +106,7 @@ class StreamConfig:
             if not isinstance(value, dict):
                 changes[name] = value
                 continue
-            changes |= {f"{name}.{field}": _as_tuple(x) for field, x in value.items() if field != "kind"}
+            changes |= {f"{name}.{field}": _from_json(x) for field, x in value.items() if field != "kind"}
             if name == "network":
                 changes["network"] = value["kind"]
         return StreamConfig().replace(**changes)
@@ -115,8 +117,12 @@ class StreamConfig:
         return hashlib.sha256(json.dumps(self.to_dict(), sort_keys=True).encode()).hexdigest()[:12]
 
 
-def _as_tuple(value: Any) -> Any:
-    return tuple(value) if isinstance(value, list) else value
+def _to_json(value: Any) -> Any:
+    return "inf" if value == math.inf else value
+
+
+def _from_json(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list) else math.inf if value == "inf" else value
 
 
 def _from_flat(fields: dict[str, Any]) -> StreamConfig:
@@ -124,22 +130,40 @@ def _from_flat(fields: dict[str, Any]) -> StreamConfig:
     config = StreamConfig().replace(network=fields["network"])
     foreign = {f.name for kind in NETWORK_CONFIGS.values() for f in dataclasses.fields(kind)}
     foreign -= {f.name for f in dataclasses.fields(config.network)}
-    named = {RENAMED_FIELDS.get(name, name): _as_tuple(value) for name, value in fields.items() if name != "network"}
+    named = {RENAMED_FIELDS.get(name, name): _from_json(value) for name, value in fields.items() if name != "network"}
     return config.replace(**{name: value for name, value in named.items() if name not in foreign})
 
 
-SMALL = StreamConfig(
-    preset="small",
+PAPER = StreamConfig(
+    preset="paper",
     network=ResplatConfig(),
-    depth=DepthConfig(depth_readout="mean", confidence="peak"),
-    history=HistoryConfig(cgfi_width=128),
-    memory=MemoryConfig(min_confidence=0.3, voxel_size=0.04),
-    head=HeadConfig(gaussians_per_token=1, sh_degree=3, scale_mode="absolute"),
+    depth=DepthConfig(depth_readout="metric", confidence="peak"),
+    history=HistoryConfig(
+        cluster_ratio=math.inf, anchor_space="metric", cgfi_form="concat", cgfi_width=128, unit_features=False
+    ),
+    memory=MemoryConfig(
+        min_confidence=0.3,
+        voxel_size=0.04,
+        carving=False,
+        num_witnesses=0,
+        overflow="drop_new",
+        capacity=1 << 18,
+    ),
+    head=HeadConfig(
+        gaussians_per_token=1, sh_degree=3, scale_mode="absolute", opacity_mode="head", grow_footprints=False
+    ),
+    stream=StreamingConfig(scene_scale=1.0, chunk_step=0.0, match_exposure=False, causal=True),
 )
-"""ReSplat's network, with the paper's values for the other stages."""
+"""The paper to the letter, with ReSplat's network; docs/algorithm.md lists every field."""
+
+SMALL = PAPER.replace(
+    preset="small", depth_readout="mean", scene_scale="auto", causal=False, overflow="grow", capacity=1 << 15
+)
+"""The paper's method for captures of any scale and length, with depth read as the published networks read it."""
 
 PRESETS: dict[str, StreamConfig] = {
     "tiny": StreamConfig(),
+    "paper": PAPER,
     "small": SMALL,
     "base": SMALL.replace(preset="base", vit="b", token_width=512),
 }

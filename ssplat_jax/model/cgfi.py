@@ -13,8 +13,20 @@ from ssplat_jax.model.layers import UNet
 from ssplat_jax.model.types import Views
 
 
+def _copy_first(key, shape, dtype=jnp.float32) -> Array:
+    """Kernel that copies the first input channels, at the same place."""
+    del key
+    height, width, _, features = shape
+    copied = jnp.arange(features)
+    return jnp.zeros(shape, dtype).at[height // 2, width // 2, copied, copied].set(1.0)
+
+
 class Aggregator(nn.Module):
-    """Phi_agg: a U-Net whose output is added to f. The output starts at zero, so untrained CGFI is the identity."""
+    """Phi_agg: a U-Net of f and its hints. Untrained it is the identity in both forms (`history.cgfi_form`).
+
+    The last layer of `concat` sees the input beside the U-Net's output, as an outermost skip, and starts as a copy of
+    f. That of `residual` starts at zero, and f is added to it.
+    """
 
     config: StreamConfig
 
@@ -22,9 +34,17 @@ class Aggregator(nn.Module):
     def __call__(
         self, feats: Float[Array, "v hf wf c"], history: Float[Array, "v hf wf ch"], view_valid: Bool[Array, " v"]
     ) -> Float[Array, "v hf wf c"]:
-        x = Conv(self.config.history.cgfi_width, name="enter")(jnp.concatenate([feats, history], axis=-1))
+        seen = jnp.concatenate([feats, history], axis=-1)
+        x = Conv(self.config.history.cgfi_width, name="enter")(seen)
         x = UNet(self.config.history.cgfi_width, name="unet")(x, view_valid)
-        return feats + Conv(feats.shape[-1], kernel_init=nn.initializers.zeros, name="leave")(x)
+        if self.config.history.cgfi_form == "residual":
+            return feats + Conv(feats.shape[-1], kernel_init=nn.initializers.zeros, name="leave")(x)
+        return Conv(feats.shape[-1], kernel_init=_copy_first, name="leave")(jnp.concatenate([seen, x], axis=-1))
+
+
+def num_hints(config: StreamConfig) -> int:
+    """Channels that `Aggregator` sees beside f."""
+    return config.network.token_width + (config.history.cgfi_form == "residual")
 
 
 def inject_features(
@@ -38,7 +58,8 @@ def inject_features(
 ) -> Float[Array, "v hf wf c"]:
     """Token features with history injected (Eqs. cache_feature_attenuation, token_regressor_input).
 
-    The U-Net sees Omega besides (1 - omega) F_H, because a zero feature does not tell a hole from a feature.
+    With `cgfi_form="residual"` the U-Net sees Omega besides (1 - omega) F_H, because a zero feature does not tell a
+    hole from a feature.
 
     Args:
         params: parameters of `Aggregator`.
@@ -47,15 +68,18 @@ def inject_features(
         confidences: omega of the anchored depth.
         views: the chunk's views.
         config: `history.cgfi=False` returns `feats` unchanged.
-        bound_history: maps F_H to a bounded size; see `Network.bound_history`.
+        bound_history: maps F_H to a bounded size with `history.unit_features`; see `Network.bound_history`.
 
     Returns:
-        Features in float32. Where omega = 1 they do not depend on F_H.
+        Features in float32. Where omega = 1 everywhere they do not depend on F_H.
     """
     if not config.history.cgfi:
         return feats
     feats = feats.astype(jnp.float32)
-    remembered = bound_history(history.feats.astype(jnp.float32))
-    attenuated = (1 - confidences)[..., None] * remembered
-    hints = jnp.concatenate([attenuated, history.confidences[..., None]], axis=-1)
+    remembered = history.feats.astype(jnp.float32)
+    if config.history.unit_features:
+        remembered = bound_history(remembered)
+    hints = (1 - confidences)[..., None] * remembered
+    if config.history.cgfi_form == "residual":
+        hints = jnp.concatenate([hints, history.confidences[..., None]], axis=-1)
     return Aggregator(config).apply({"params": params}, feats, hints, views.valid)  # pyright: ignore[reportReturnType]

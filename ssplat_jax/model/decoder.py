@@ -45,8 +45,8 @@ def decode_tokens(
 ) -> Gaussians:
     """Gaussians of tokens or pivots: `gaussians_per_token` each, in a square over the cell, row by row.
 
-    The Gaussians of a token share shape and opacity and differ in position and color. A pivot of n members is as opaque
-    as n Gaussians of opacity o at one place, 1 - (1 - o)^n.
+    The Gaussians of a token share shape and opacity and differ in position and color. With `opacity_mode="compound"` a
+    pivot of n members is as opaque as n Gaussians of opacity o at one place, 1 - (1 - o)^n.
 
     Args:
         shapes: what the head predicts. Rotations are in the frame of the token's camera, `shapes.sh` is a residual on
@@ -61,7 +61,9 @@ def decode_tokens(
     Returns:
         Gaussians token by token, stream frame.
     """
-    optical_depths = jnp.asarray(num_members, jnp.float32) * nn.softplus(shapes.opacity_logits)
+    optical_depths = nn.softplus(shapes.opacity_logits)
+    if config.head.opacity_mode == "compound":
+        optical_depths = jnp.asarray(num_members, jnp.float32) * optical_depths
     each = lambda x: jnp.repeat(x, config.head.gaussians_per_token, axis=0)  # noqa: E731
     return Gaussians(
         means=_spread(means, quats, footprints, config),

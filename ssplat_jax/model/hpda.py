@@ -73,13 +73,15 @@ def peak_confidence(probs: Float[Array, "*b d"], config: StreamConfig) -> Float[
 def expected_log_depth(
     probs: Float[Array, "*b d"], log_candidates: Float[Array, " d"], config: StreamConfig
 ) -> Float[Array, "*b"]:
-    """Expected log depth (Eq. base_depth_regression), averaged in the space of the candidates.
+    """Log of the expected depth (Eq. base_depth_regression): of the metric depths, or in the space of the candidates.
 
     Limits:
-        A one-hot distribution gives its candidate, bit for bit. A single candidate gives its depth, with a zero
-        gradient.
+        A one-hot distribution gives its candidate, bit for bit (`metric`: to rounding). A single candidate gives its
+        depth, with a zero gradient.
         Among equal peaks, `depth_readout="window"` takes the first.
     """
+    if config.depth.depth_readout == "metric":
+        return jnp.log(jnp.einsum("...d,d->...", probs, jnp.exp(log_candidates), precision="highest"))
     if config.depth.depth_readout == "window":
         distance = jnp.abs(jnp.arange(probs.shape[-1]) - jnp.argmax(probs, axis=-1)[..., None])
         probs = jnp.where(distance <= config.depth.readout_window, probs, 0.0)

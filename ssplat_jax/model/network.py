@@ -103,7 +103,7 @@ class Network(Protocol):
         """Projected cache features, bounded in size.
 
         Injected features are stored and come back with the next chunk. A network whose `mix_tokens` does not end in a
-        norm must bound them here, or they grow from chunk to chunk.
+        norm must bound them here, or they grow from chunk to chunk. Called only with `history.unit_features`.
         """
         ...
 

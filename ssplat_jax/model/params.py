@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.errors import InputError
-from ssplat_jax.model.cgfi import Aggregator
+from ssplat_jax.model.cgfi import Aggregator, num_hints
 from ssplat_jax.model.hpda import AnchorStrength
 from ssplat_jax.model.network import network_of
 from ssplat_jax.model.types import GRID_STRIDE
@@ -52,7 +52,7 @@ def _modules(config: StreamConfig) -> dict:
     grid = lambda channels: jnp.zeros((v, side, side, channels))  # noqa: E731
     return network_of(config).stages(config) | {
         "hpda": (AnchorStrength(config), ()),
-        "cgfi": (Aggregator(config), (grid(c), grid(c + 1), jnp.ones(v, bool))),
+        "cgfi": (Aggregator(config), (grid(c), grid(num_hints(config)), jnp.ones(v, bool))),
     }
 
 

@@ -212,8 +212,11 @@ def merged_footprints(cache: VoxelCache, config: StreamConfig) -> Float[Array, "
     """Footprints of pivots, grown with the number of members until K pivots cover a voxel's face.
 
     A pivot stores the footprint of its best member. Where grid cells are much finer than voxels, many tokens merge into
-    K pivots, whose stored footprints would leave cracks between them.
+    K pivots, whose stored footprints would leave cracks between them. `head.grow_footprints=False` leaves them as they
+    are stored.
     """
+    if not config.head.grow_footprints:
+        return cache.footprints
     share = VOXEL_COVERAGE * config.memory.voxel_size / math.sqrt(config.memory.pivots_per_voxel)
     grown = cache.footprints * jnp.sqrt(cache.num_members.astype(jnp.float32))
     return jnp.minimum(grown, jnp.maximum(cache.footprints, share))

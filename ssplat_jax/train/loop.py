@@ -9,6 +9,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 
+from ssplat_jax.checkpoint.saved_config import config_from_header
 from ssplat_jax.checkpoint.training_state import TrainingCheckpoints
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.metrics.lpips import LpipsWeights
@@ -86,8 +87,9 @@ def describe_run(config: StreamConfig, recipe: Recipe, *, has_lpips: bool) -> di
 
 
 def upgrade_description(description: dict) -> dict:
-    """Description of a run, as read from JSON, with the recipe's fields that older versions did not write."""
-    return description | {"recipe": with_defaults(description.get("recipe", {}))}
+    """Description of a run, as read from JSON, with the fields that older versions did not write."""
+    config = config_from_header(description["config"]).to_dict()
+    return description | {"config": config, "recipe": with_defaults(description.get("recipe", {}))}
 
 
 def _run(model, recipe, state, start, lpips_weights, checkpoints, log, save_every, log_every) -> TrainResult:

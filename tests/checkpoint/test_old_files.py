@@ -11,7 +11,7 @@ from ssplat_jax.checkpoint.saved_config import config_from_header
 from ssplat_jax.checkpoint.stream_state import load_state
 from ssplat_jax.checkpoint.training_state import RECIPE_FILE, TrainingCheckpoints
 from ssplat_jax.checkpoint.weights import load_params, load_weights
-from ssplat_jax.config import preset
+from ssplat_jax.config import PRESETS, preset
 from ssplat_jax.errors import InputError
 from ssplat_jax.storage.npz import save_arrays
 
@@ -40,6 +40,22 @@ FRAME = {"rotation": np.eye(3).tolist(), "origin": [0.0, 0.0, 1.0], "scale": 0.6
 )
 def test_flat_configurations_are_read(fields):
     assert config_from_header(fields) == preset("tiny")
+
+
+ADDITIONS = {
+    **{"history": {"cgfi_form": "residual", "unit_features": True}},
+    **{"head": {"opacity_mode": "compound", "grow_footprints": True}},
+}
+"""Fields that became switches, with what they did before."""
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_fields_missing_in_a_saved_configuration_do_what_they_did(name):
+    fields = preset(name).to_dict()
+    for group, switches in ADDITIONS.items():
+        fields[group] = {field: value for field, value in fields[group].items() if field not in switches}
+    wanted = {f"{group}.{field}": value for group, switches in ADDITIONS.items() for field, value in switches.items()}
+    assert config_from_header(fields) == preset(name).replace(**wanted)
 
 
 def test_changed_fields_of_flat_configurations_are_kept():

@@ -139,6 +139,27 @@ def test_window_readout_does_not_mix_two_surfaces():
     np.testing.assert_allclose(mean, 0.55 * LOG_CANDIDATES[3] + 0.45 * LOG_CANDIDATES[20], atol=FLOAT32)
 
 
+@pytest.mark.parametrize("space", ["log", "inverse"])
+def test_metric_readout_is_the_mean_of_depths_in_any_space_of_candidates(space):
+    config = CONFIG.replace(network="resplat").replace(depth_readout="metric", depth_space=space, num_depths=D)
+    wanted = (np.asarray(distributions(), float) * np.exp(np.asarray(LOG_CANDIDATES, float))).sum(axis=-1)
+    metric, mean = (
+        jnp.exp(expected_log_depth(distributions(), LOG_CANDIDATES, config.replace(depth_readout=readout)))
+        for readout in ("metric", "mean")
+    )
+    np.testing.assert_allclose(metric, wanted, rtol=FLOAT32)
+    assert (np.asarray(mean) < wanted).all()  # Jensen: no other mean is as far
+
+
+def test_metric_readout_of_one_candidate_is_its_depth_with_a_zero_gradient():
+    config = CONFIG.replace(depth_readout="metric")
+    one_hot = jnp.eye(D)[7]
+    np.testing.assert_allclose(expected_log_depth(one_hot, LOG_CANDIDATES, config), LOG_CANDIDATES[7], rtol=1e-6)
+    read = lambda logit: expected_log_depth(jax.nn.softmax(logit[None]), jnp.log(jnp.array([3.0])), config)  # noqa: E731
+    value, slope = jax.value_and_grad(read)(gamma(2.0))
+    assert float(value) == pytest.approx(np.log(3.0), rel=1e-6) and float(slope) == 0.0
+
+
 def views_and_distribution():
     config = CONFIG.replace(attention_window=4)
     views = prepare_views(chunk(views=2), config)

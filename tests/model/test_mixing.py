@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ssplat_jax.model import inject_features
-from ssplat_jax.model.cgfi import Aggregator
+from ssplat_jax.model.cgfi import Aggregator, num_hints
 from ssplat_jax.model.compact.local_mixer import mix_tokens
 from ssplat_jax.model.layers import rms_normalize
 from ssplat_jax.model.nearest_tokens import nearest_tokens
@@ -22,17 +22,20 @@ def maps(seed: int, *channels):
     return jnp.asarray(np.random.default_rng(seed).normal(size=(*GRID, *channels)), jnp.float32)
 
 
-def fresh() -> dict:
-    hints = jnp.zeros((*GRID, C + 1))
-    return {"cgfi": jax.jit(Aggregator(CONFIG).init)(jax.random.key(0), hints[..., :C], hints, views().valid)["params"]}
+def fresh(config=CONFIG) -> dict:
+    hints = jnp.zeros((*GRID, num_hints(config)))
+    return {"cgfi": jax.jit(Aggregator(config).init)(jax.random.key(0), hints[..., :C], hints, views().valid)["params"]}
 
 
 def views():
     return prepare_views(chunk(), CONFIG)
 
 
-def inject(weights, feats, past, confidences):
-    return inject_features(weights["cgfi"], feats, past, jnp.full(GRID, confidences), views(), CONFIG)
+CONCAT = CONFIG.replace(cgfi_form="concat")
+
+
+def inject(weights, feats, past, confidences, config=CONFIG):
+    return inject_features(weights["cgfi"], feats, past, jnp.full(GRID, confidences), views(), config)
 
 
 def past(seed: int = 1):
@@ -40,13 +43,22 @@ def past(seed: int = 1):
     return history(rng.uniform(1, 5, GRID), np.full(GRID, 0.7), feats=rng.normal(size=(*GRID, C)))
 
 
-def test_cgfi_is_the_identity_before_training():
-    np.testing.assert_array_equal(inject(fresh(), maps(0, C), past(), 0.4), maps(0, C))
+def concat_params() -> dict:
+    """Random weights of the concatenated form."""
+    rng = np.random.default_rng(0)
+    draw = lambda x: jnp.asarray(rng.normal(size=x.shape) / np.sqrt(np.prod(x.shape[:-1]) or 1), jnp.float32)  # noqa: E731
+    return jax.tree.map(draw, fresh(CONCAT))
 
 
-def test_cgfi_uses_history_only_where_confidence_is_below_one():
+@pytest.mark.parametrize("config", [CONFIG, CONCAT], ids=["residual", "concat"])
+def test_cgfi_is_the_identity_before_training(config):
+    np.testing.assert_array_equal(inject(fresh(config), maps(0, C), past(), 0.4, config), maps(0, C))
+
+
+@pytest.mark.parametrize(("config", "weights"), [(CONFIG, params), (CONCAT, concat_params)], ids=["residual", "concat"])
+def test_cgfi_uses_history_only_where_confidence_is_below_one(config, weights):
     def effect_of_history(confidence):
-        here, other = (inject(params(), maps(0, C), past(seed), confidence) for seed in (1, 2))
+        here, other = (inject(weights(), maps(0, C), past(seed), confidence, config) for seed in (1, 2))
         return float(jnp.abs(here - other).max())
 
     assert effect_of_history(1.0) == 0.0
@@ -58,6 +70,32 @@ def test_cgfi_tells_a_hole_from_a_zero_feature():
     zero_feature = history(np.full(GRID, 2.0), np.full(GRID, 0.9))
     difference = inject(params(), maps(0, C), hole, 0.4) - inject(params(), maps(0, C), zero_feature, 0.4)
     assert float(jnp.abs(difference).max()) > 1e-3
+
+
+def test_concatenated_cgfi_adds_nothing_to_its_network():
+    """With zero weights nothing is left, of f neither; the weights of another form are refused by their shape."""
+    zeros = jax.tree.map(jnp.zeros_like, fresh(CONCAT))
+    assert not np.asarray(inject(zeros, maps(0, C), past(), 0.4, CONCAT)).any()
+    assert fresh(CONCAT)["cgfi"]["enter"]["kernel"].shape[2] == 2 * C
+    assert fresh(CONFIG)["cgfi"]["enter"]["kernel"].shape[2] == 2 * C + 1
+
+
+def test_features_keep_their_size_without_unit_norms():
+    config = CONFIG.replace(unit_features=False, mixer_blocks=0)
+    feats = 7.0 * maps(4, C)
+    out = mix_tokens({}, feats, maps(5, 3), jnp.ones(GRID, bool), jnp.ones(3, bool), config)
+    np.testing.assert_array_equal(out, feats)
+
+
+@pytest.mark.parametrize("is_unit", [True, False])
+def test_history_is_bounded_only_with_unit_features(is_unit):
+    config = CONCAT.replace(unit_features=is_unit)
+    seen = []
+    inject_features(
+        fresh(config)["cgfi"], maps(0, C), past(), jnp.full(GRID, 0.2), views(), config,
+        bound_history=lambda feats: seen.append(feats) or feats,
+    )  # fmt: skip
+    assert len(seen) == is_unit
 
 
 def test_cgfi_switched_off_is_the_identity():

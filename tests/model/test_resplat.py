@@ -198,11 +198,12 @@ def test_injected_history_is_bounded_for_large_features():
     feats = jnp.asarray(rng.normal(size=(*grid, c)), jnp.float32)
     remembered = rng.normal(size=(*grid, c))
     here = prepare_views(views(), CONFIG)
+    config = CONFIG.replace(unit_features=True)
     program = jax.jit(functools.partial(inject_features, bound_history=resplat.bound_history), static_argnums=5)
     injected = []
     for size in (1.0, 1e6):
         past = history(np.ones(grid), np.full(grid, 0.7), feats=size * remembered)
-        injected.append(program(params()["cgfi"], feats, past, jnp.full(grid, 0.2), here, CONFIG))
+        injected.append(program(params()["cgfi"], feats, past, jnp.full(grid, 0.2), here, config))
     np.testing.assert_allclose(injected[1], injected[0], rtol=1e-3, atol=1e-3)
     assert np.abs(np.asarray(injected[0] - feats)).max() > 0.1
 

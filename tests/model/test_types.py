@@ -157,6 +157,12 @@ def test_untrained_head_gives_a_disc_of_the_patch_color():
     np.testing.assert_allclose(gaussians.opacities, 1 / (1 + np.exp(-START_OPACITY)), rtol=1e-6)
 
 
+def test_members_do_not_change_an_opacity_that_comes_from_the_head_alone():
+    members = jnp.array([0, 1, 17, 2**31 - 1], jnp.int32)
+    gaussians, _ = decoded(4, num_members=members, gaussians_per_token=1, opacity_mode="head")
+    np.testing.assert_allclose(gaussians.opacities, 1 / (1 + np.exp(-START_OPACITY)), rtol=1e-6)
+
+
 def test_pivot_is_as_opaque_as_its_members_in_one_place():
     members = np.array([0, 1, 2, 3, 17, 1000, 2**31 - 1], np.int32)
     gaussians, _ = decoded(len(members), num_members=jnp.asarray(members), gaussians_per_token=1)

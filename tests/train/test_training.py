@@ -92,6 +92,14 @@ def test_run_of_version_0_1_is_resumed(tmp_path):
         TrainingCheckpoints(tmp_path, description, upgrade=loop.upgrade_description)
 
 
+def test_run_without_the_switches_of_additions_is_resumed(tmp_path):
+    description = loop.describe_run(NARROW, RECIPE, has_lpips=False)
+    old = json.loads(json.dumps(description))
+    del old["config"]["history"]["cgfi_form"], old["config"]["head"]["opacity_mode"]
+    (tmp_path / "recipe.json").write_text(json.dumps(old))
+    TrainingCheckpoints(tmp_path, description, upgrade=loop.upgrade_description).close()
+
+
 def test_fields_missing_in_a_recipe_have_their_default():
     whole = json.loads(json.dumps(dataclasses.asdict(RECIPE)))
     assert with_defaults(whole) == whole
