@@ -1,4 +1,7 @@
-"""ReSplat's network against the outputs of the authors' PyTorch code with the same weights, stage by stage."""
+"""ReSplat's network against the outputs of the authors' PyTorch code with the same weights.
+
+Stage by stage, and through `StreamSplat` with the preset `paper` and an empty cache.
+"""
 
 import functools
 
@@ -8,17 +11,21 @@ import numpy as np
 import pytest
 
 from ssplat_jax import model as stages
+from ssplat_jax.checkpoint.published_weights import as_published
 from ssplat_jax.chunk import Chunk
 from ssplat_jax.config import preset
+from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.geometry.rotations import matrices_to_quats, quats_to_matrices
 from ssplat_jax.model import resplat
 from ssplat_jax.model.convolution import pixel_unshuffle
 from ssplat_jax.model.hpda import expected_log_depth
+from ssplat_jax.model.params import init_params
 from ssplat_jax.model.resplat.head import GaussianHead
 from ssplat_jax.model.resplat.tokens import token_context
 from ssplat_jax.model.resplat.torch_layers import resize
 from ssplat_jax.model.resplat.upsampler import Upsampler
-from ssplat_jax.model.types import AnchoredDepth, Views, prepare_views, to_candidate_space
+from ssplat_jax.model.types import AnchoredDepth, prepare_views, to_candidate_space
+from ssplat_jax.streaming.streamsplat import StreamSplat
 from tests.model.resplat_fixture import load_golden, named_params, tap_error
 
 TOLERANCE = 2e-4
@@ -52,14 +59,16 @@ def nchw(x) -> np.ndarray:
 
 @functools.cache
 def resplat_values() -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Wanted and computed values of every tap, from the images through all stages."""
+    """Wanted and computed values of every tap, from the images through all stages; `paper.*` through `StreamSplat`."""
     golden = load_golden("resplat_small")
-    chunk = read_inputs(golden)
     near, far = golden["in.near_far"].tolist()
-    config = preset("small").replace(depth_range=(near, far), upstream_compat=True)
-    params = named_params(config)
+    # As `import-weights` writes it.
+    config = as_published(preset("paper")).replace(depth_range=(near, far), capacity=128)
+    model = StreamSplat(config)
+    params = init_params(jax.random.key(0), config, {"hpda", "cgfi"}) | named_params(config)
 
-    def run(params, views: Views):
+    def run(params, chunk: Chunk):
+        views = prepare_views(chunk, config)
         height, width = views.images.shape[1:3]
         features = resplat.encode(params["encoder"], views, config)
         distribution = resplat.match(params["cost_volume"], features, views, config)
@@ -85,7 +94,7 @@ def resplat_values() -> dict[str, tuple[np.ndarray, np.ndarray]]:
             footprints=footprints.reshape(-1),
             config=config,
         )
-        axes = quats_to_matrices(gaussians.quats)
+        prediction = model.predict(params, model.init_cache(), chunk)
         unit = shapes.quats / jnp.linalg.norm(shapes.quats, axis=1, keepdims=True)
         return {
             "tap.depth_predictor.depth_head.0.in0": distribution.decoder.transpose(0, 3, 1, 2),
@@ -96,21 +105,34 @@ def resplat_values() -> dict[str, tuple[np.ndarray, np.ndarray]]:
             "tap.pt": mixed - feats,
             "tap.gaussian_head.in0": mixed,
             "tap.gaussian_head": GaussianHead(config).apply({"params": params["decoder"]}, flat),
-            "out.opacities": gaussians.opacities,
-            "out.scales": gaussians.scales,
             "out.rotations": jnp.roll(unit, -1, axis=1),  # xyzw
-            "out.harmonics": gaussians.sh.swapaxes(1, 2),
-            "out.covariances": jnp.einsum("nij,nj,nkj->nik", axes, gaussians.scales**2, axes, precision="highest"),
+            **{f"out.{name}": x for name, x in outputs(gaussians).items()},
+            "paper.tap.depth_predictor.depth_head.0": prediction.logits[:, ::2, ::2].transpose(0, 3, 1, 2),
+            "paper.tap.gaussian_head.in0": prediction.tokens.feats,
+            **{f"paper.out.{name}": x for name, x in outputs(model.decode_tokens(params, prediction.tokens)).items()},
         }
 
-    came = jax.jit(run)(params, prepare_views(chunk, config))
-    return {name: (golden[name], np.asarray(x)) for name, x in came.items()}  # pyright: ignore
+    came = jax.jit(run)(params, read_inputs(golden))
+    return {name: (golden[name.removeprefix("paper.")], np.asarray(x)) for name, x in came.items()}  # pyright: ignore
+
+
+def outputs(gaussians: Gaussians) -> dict:
+    """Gaussians as the authors' code returns them."""
+    axes = quats_to_matrices(gaussians.quats)
+    return {
+        "opacities": gaussians.opacities,
+        "scales": gaussians.scales,
+        "harmonics": gaussians.sh.swapaxes(1, 2),
+        "covariances": jnp.einsum("nij,nj,nkj->nik", axes, gaussians.scales**2, axes, precision="highest"),
+    }
 
 
 RESPLAT_TAPS = (
     *("tap.depth_predictor.depth_head.0.in0", "tap.depth_predictor.depth_head.0", "tap.depth_predictor.upsampler"),
     *("tap.gaussian_regressor.in0", "tap.proj", "tap.pt", "tap.gaussian_head.in0", "tap.gaussian_head"),
     *("out.opacities", "out.scales", "out.rotations", "out.harmonics", "out.covariances"),
+    *("paper.tap.depth_predictor.depth_head.0", "paper.tap.gaussian_head.in0", "paper.out.opacities"),
+    *("paper.out.scales", "paper.out.harmonics", "paper.out.covariances"),
 )
 
 
