@@ -10,7 +10,7 @@ from ssplat_jax.config import preset
 from ssplat_jax.errors import require_positive
 
 MINUTES = {"tiny": 77, "stream": 15}
-"""Time of each recipe on two cores (docs/model_card.md)."""
+"""Time of recipes on two cores (docs/model_card.md)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,8 +24,9 @@ class Train:
     """Folder of the log, the checkpoints and, at the end, weights.npz."""
     preset: str = "tiny"
     """Preset of the configuration."""
-    recipe: Literal["tiny", "stream"] = "tiny"
-    """tiny: trains depth from scratch, as for the shipped weights. stream: trains the stages after depth."""
+    recipe: Literal["tiny", "stream", "paper"] = "tiny"
+    """tiny: trains depth from scratch, as for the shipped weights. stream: trains the stages after depth. paper: the
+    paper's loss and steps, for --preset paper or small and a GPU."""
     scale_steps: float = 1.0
     """Factor of the number of steps of every phase."""
     seed: int = 0
@@ -55,10 +56,10 @@ class Train:
             check_params(params, config, str(self.init_weights))
         lpips_weights = load_lpips_weights(self.lpips_vgg, self.lpips_heads)
         reporter = Reporter(self.quiet)
-        reporter.say(
-            f"{recipe.num_steps} steps, about {max(1, round(MINUTES[self.recipe] * self.scale_steps))} minutes on two"
-            " cores; Ctrl-C saves them, and the same command continues"
-        )
+        duration = ""
+        if self.recipe in MINUTES:
+            duration = f", about {max(1, round(MINUTES[self.recipe] * self.scale_steps))} minutes on two cores"
+        reporter.say(f"{recipe.num_steps} steps{duration}; Ctrl-C saves them, and the same command continues")
         waiting = "compiling; figures come every ten steps"
         with reporter.progress("training", recipe.num_steps, waiting=waiting) as advance:
             result = train(

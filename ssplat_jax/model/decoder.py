@@ -61,9 +61,8 @@ def decode_tokens(
     Returns:
         Gaussians token by token, stream frame.
     """
-    optical_depths = nn.softplus(shapes.opacity_logits)
-    if config.head.opacity_mode == "compound":
-        optical_depths = jnp.asarray(num_members, jnp.float32) * optical_depths
+    layers = jnp.asarray(num_members, jnp.float32) if config.head.opacity_mode == "compound" else 1.0
+    optical_depths = layers * nn.softplus(shapes.opacity_logits)
     each = lambda x: jnp.repeat(x, config.head.gaussians_per_token, axis=0)  # noqa: E731
     return Gaussians(
         means=_spread(means, quats, footprints, config),

@@ -87,14 +87,18 @@ def rendering_loss(
 ) -> RenderingLoss:
     """MSE and LPIPS (Eq. training_loss), or MSE and the L1 of image gradients without LPIPS weights.
 
+    The mean over the views, or with `recipe.sum_views` their sum; the parts are means in either case.
+
     Args:
         images: rendered views, RGB.
         targets: true views, RGB in [0, 1].
         recipe: gives the weights of the terms.
         lpips_weights: weights of LPIPS, if there are any.
     """
+    num_views = len(images) if recipe.sum_views else 1
     mse = jnp.mean((images - targets) ** 2)
     if lpips_weights is None:
-        return RenderingLoss(mse + recipe.gradient_weight * image_gradient_l1(images, targets), mse, None)
+        total = mse + recipe.gradient_weight * image_gradient_l1(images, targets)
+        return RenderingLoss(num_views * total, mse, None)
     distance = lpips(lpips_weights, images, targets).mean()
-    return RenderingLoss(mse + recipe.lpips_weight * distance, mse, distance)
+    return RenderingLoss(num_views * (mse + recipe.lpips_weight * distance), mse, distance)

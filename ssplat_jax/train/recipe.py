@@ -17,13 +17,14 @@ class PhaseForm:
 
     frozen: tuple[str, ...] = ()
     """Stages (keys of the parameters) that the phase does not train; no gradient is computed through them."""
-    decode: Literal["tokens", "cache"] = "tokens"
-    """Scene that is rendered: the tokens of all chunks, through which gradients flow (the paper), or the decoded cache,
-    as in inference. The cache holds constants, so `cache` trains the Gaussian head alone."""
+    decode: Literal["all_tokens", "tokens", "cache"] = "tokens"
+    """Scene that is rendered: the tokens of all chunks, through which gradients flow (`all_tokens`, the paper); those
+    that the cache would accept (`tokens`); or the decoded cache, as in inference. The cache holds constants, so `cache`
+    trains the Gaussian head alone."""
 
 
-PAPER_FORM = PhaseForm()
-"""The paper's form: all stages are trained, tokens are rendered."""
+DEFAULT_FORM = PhaseForm()
+"""All stages are trained, accepted tokens are rendered."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,7 +43,7 @@ class Phase:
     """Image sizes (height, width), used alternately."""
     learning_rate: float
     """Peak of the learning rate, from which it decays by a cosine."""
-    form: PhaseForm = PAPER_FORM
+    form: PhaseForm = DEFAULT_FORM
     final_share: float = 0.1
     """Learning rate at the end of the phase, as a fraction of the peak."""
     steps_of_depth: tuple[float, float] = (0.005, 0.4)
@@ -97,6 +98,8 @@ class Recipe:
     black_weight: float = 0.05
     """Fraction of the rendering loss computed over a black background. The rest fills holes with the colors around
     them, as in evaluation; alone, that would make all surfaces translucent, since holes would cost nothing."""
+    sum_views: bool = False
+    """Adds up the rendering losses of a sample's target views (the paper) instead of taking their mean."""
     range_jitter: float = 0.25
     """Largest error of scene scale, near and far in samples (log of a factor), for robustness to estimated ones."""
     recompute: bool = False
@@ -191,7 +194,33 @@ STREAM = Recipe(
 """Trains the stages after the matcher (gamma, features, CGFI, mixer, head) from weights with a trained matcher. The
 shipped weights do not include it; docs/model_card.md has its results."""
 
-RECIPES = {"tiny": TINY, "stream": STREAM}
+PAPER = Recipe(
+    phases=(
+        Phase(
+            "paper",
+            100_000,
+            num_chunks=4,
+            num_targets=4,
+            sizes=((256, 256),),
+            learning_rate=1e-4,
+            form=PhaseForm(decode="all_tokens"),
+        ),
+    ),
+    adam_b2=0.999,
+    depth_weight=0.0,
+    rendering_weight=1.0,
+    gradient_weight=0.0,
+    black_weight=1.0,
+    sum_views=True,
+    recompute=True,
+    cache_capacity=1 << 16,
+    max_pairs=1 << 22,
+)
+"""The paper's training: 100,000 steps of AdamW at 1e-4 with one sample each, through all stages and all tokens, by the
+rendering loss over black alone. It needs LPIPS weights for the second term and a GPU, and starts from imported weights;
+the paper does not give the number of chunks and targets of a sample."""
+
+RECIPES = {"tiny": TINY, "stream": STREAM, "paper": PAPER}
 """Choices of `ssplat train --recipe`."""
 
 

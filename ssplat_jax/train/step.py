@@ -16,7 +16,7 @@ from ssplat_jax.pytree import pytree
 from ssplat_jax.rasterizer import fill_holes, render
 from ssplat_jax.streaming.streamsplat import StreamSplat
 from ssplat_jax.train.losses import depth_loss, rendering_loss
-from ssplat_jax.train.recipe import PAPER_FORM, PhaseForm, Recipe
+from ssplat_jax.train.recipe import DEFAULT_FORM, PhaseForm, Recipe
 from ssplat_jax.train.samples import Sample
 
 
@@ -134,12 +134,20 @@ def loss_fn(
     accepted = jnp.mean((tokens.confidences >= model.config.memory.min_confidence).astype(jnp.float32))
     metrics = {"depth_entropy": entropy, "depth_l1": depth_l1, "accepted": accepted}
     if sample.target_images.shape[0]:
-        is_cache = form.decode == "cache"
-        gaussians = model.decode(params, cache) if is_cache else decode_accepted(model, params, cache, tokens)
+        gaussians = _rendered_scene(model, params, cache, tokens, form)
         rendering, rendering_metrics = target_loss(gaussians, sample, recipe, lpips_weights)
         loss = recipe.depth_weight * loss + recipe.rendering_weight * rendering
         metrics |= rendering_metrics
     return loss, metrics | {"loss": loss}
+
+
+def _rendered_scene(model: StreamSplat, params: dict, cache: VoxelCache, tokens: Tokens, form: PhaseForm) -> Gaussians:
+    """The Gaussians that a phase renders (`PhaseForm.decode`)."""
+    if form.decode == "cache":
+        return model.decode(params, cache)
+    if form.decode == "all_tokens":
+        return model.decode_tokens(params, tokens)
+    return decode_accepted(model, params, cache, tokens)
 
 
 def target_loss(
@@ -177,7 +185,7 @@ def train_step(
     *,
     model: StreamSplat,
     recipe: Recipe,
-    form: PhaseForm = PAPER_FORM,
+    form: PhaseForm = DEFAULT_FORM,
     lpips_weights: LpipsWeights | None = None,
 ) -> tuple[TrainState, dict]:
     """State after one update, and metrics to log.
@@ -224,6 +232,6 @@ class Trainer:
 
     @functools.cached_property
     def step(self):
-        """`(state, sample, rate, form=PAPER_FORM, lpips_weights=None) -> (state, metrics)`; `state` is donated."""
+        """`(state, sample, rate, form=DEFAULT_FORM, lpips_weights=None) -> (state, metrics)`; `state` is donated."""
         bound = functools.partial(train_step, model=self.model, recipe=self.recipe)
         return jax.jit(bound, donate_argnums=0, static_argnames="form")
