@@ -130,6 +130,49 @@ def test_a_median_behind_the_camera_is_not_used(monkeypatch):
     assert min(stream_scale(depths, StreamConfig())) > 0
 
 
+@pytest.mark.parametrize(
+    ("num_frames", "far_share", "is_widened"), [(16, 0.0, False), (16, 0.3, True), (6, 0.0, True), (6, 0.3, True)]
+)
+def test_far_is_widened_if_either_pairs_or_parallax_are_few(num_frames, far_share, is_widened, monkeypatch):
+    """Few pairs or many points of little parallax, each alone, may have missed the background."""
+    n = 40
+    is_far = np.arange(n) < far_share * n
+    points = CommonPoints(
+        inverse_depths=np.where(is_far, 0.49, 0.5),
+        parallax=np.where(is_far, 1.0, 4.0),
+        weights=np.ones(n),
+        close=np.zeros(0),
+    )
+    monkeypatch.setattr(depth_range, "_best_pair", lambda *_: points)
+    depths = estimate_depths(two_planes(num_frames, 0.01), range(num_frames))
+    assert depths.source == "matches" and depths.q01 == pytest.approx(2.0)
+    assert depths.q99 == pytest.approx(depths.median * (depth_range.MIN_REACH if is_widened else 1.0), rel=0.03)
+
+
+@pytest.mark.parametrize(("near_share", "far_share"), [(1.0, 1 / 8), (1 / 50, 1.0), (1 / 50, 1 / 50), (1.0, 1.0)])
+def test_too_wide_and_too_narrow_ranges_keep_what_they_can(near_share, far_share):
+    """The near end gives way up to an eighth of the median; then the far end does. A narrow range widens alike."""
+    median = 3.0
+    depths = DepthStatistics(
+        q01=near_share * median,
+        median=median,
+        q99=median / far_share,
+        num_points=100,
+        num_pairs=20,
+        parallax_degrees=4.0,
+        source="matches",
+    )
+    _, near, far = stream_scale(depths, StreamConfig().replace(scene_scale=1.0))
+    wanted_near = depth_range.NEAR_FACTOR * near_share * median
+    wanted_far = depth_range.FAR_FACTOR * median / far_share
+    widen = max(1.0, np.sqrt(depth_range.MIN_RANGE * wanted_near / wanted_far))
+    wanted_near, wanted_far = wanted_near / widen, wanted_far * widen
+    if wanted_far > 60 * wanted_near:
+        wanted_near = max(wanted_near, min(wanted_far / 60, median / 8))
+        wanted_far = min(wanted_far, 60 * wanted_near)
+    np.testing.assert_allclose([near, far], [wanted_near, wanted_far], rtol=1e-12)
+
+
 def test_depth_of_bare_walls_is_a_guess_from_the_steps():
     capture = two_planes(6, 0.2)
     assert isinstance(capture.pixels, ArrayPixels)

@@ -1,5 +1,7 @@
 """Interleaving of video: which frames share a chunk."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -59,6 +61,21 @@ def test_interleaving_is_a_permutation_within_blocks(steps, chunk_size, step):
     assert sorted(order) == list(range(n))
     # A frame moves by less than a block.
     assert max(abs(place - frame) for place, frame in enumerate(order)) < chunk_size * MAX_INTERLEAVED_CHUNKS
+
+
+@pytest.mark.parametrize("units", [2.0**-10, 2.0**10])
+def test_the_order_of_a_stream_does_not_change_with_the_units_of_the_capture(units):
+    capture, config = two_planes(48, 0.01), StreamConfig()
+    poses = [frame.camtoworld.copy() for frame in capture.frames]
+    for pose in poses:
+        pose[:3, 3] *= units
+    frames = tuple(dataclasses.replace(f, camtoworld=p) for f, p in zip(capture.frames, poses, strict=True))
+    scaled = dataclasses.replace(capture, frames=frames)
+    orders = [
+        c.stream_order(config, None, StreamFrame.at_camera(np.eye(4), scale=0.5 / u, near=1.0, far=2.0))
+        for c, u in ((capture, 1.0), (scaled, units))
+    ]
+    assert orders[0] == orders[1] != list(range(48))
 
 
 def test_units_do_not_matter():

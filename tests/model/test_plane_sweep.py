@@ -1,4 +1,4 @@
-"""The plane sweep: an untrained network finds a textured wall; cells that no source sees score zero."""
+"""The plane sweep: an untrained network finds a textured wall; only sources that see a cell count in its score."""
 
 import jax
 import jax.numpy as jnp
@@ -7,6 +7,7 @@ import numpy as np
 from ssplat_jax.chunk import Chunk
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.model.compact.cnn_encoder import encode
+from ssplat_jax.model.compact.compact_features import CompactFeatures
 from ssplat_jax.model.compact.sweep_matching import plane_sweep
 from ssplat_jax.model.plane_sweep import sweep_pixels
 from ssplat_jax.model.types import prepare_views
@@ -80,6 +81,23 @@ def test_sweep_pixels_are_shifted_by_the_parallax():
         parallax = FOCAL * BASELINE / np.exp(log_depth)
         np.testing.assert_allclose(pixels[d], cells - [parallax, 0], atol=1e-3)
         np.testing.assert_array_equal(seen[d], cells[:, 0] - parallax >= 0)
+
+
+def test_a_cell_that_one_of_two_sources_sees_scores_as_with_that_source_alone():
+    views = prepare_views(wall_chunk(), CONFIG)
+    random, side = np.random.default_rng(0), SIDE // 4
+    maps = {"fine": (2 * side, 2 * side, 32), "grid": (side, side, 32), "context": (side, side, 8)}
+    features = CompactFeatures(**{k: jnp.asarray(random.normal(size=(3, *v)), jnp.float32) for k, v in maps.items()})
+    sweep = jax.jit(lambda valid: plane_sweep(features, replace(views, valid=valid), CONFIG)[1])
+    both, first, last = (np.asarray(sweep(jnp.array(valid, bool))) for valid in ([1, 1, 1], [1, 1, 0], [0, 1, 1]))
+    # Scores by scale and candidate; whether the source sees the cell does not depend on the scale.
+    seen = [np.asarray(sweep_pixels(views, 1, source, 4)[2]).reshape(-1, side, side) for source in (0, 2)]
+    seen_first, seen_last = (np.concatenate([s, s]).transpose(1, 2, 0) for s in seen)
+    only_first, only_last, by_both = seen_first & ~seen_last, seen_last & ~seen_first, seen_first & seen_last
+    assert min(mask.sum() for mask in (only_first, only_last, by_both)) > 100
+    np.testing.assert_array_equal(both[only_first], first[only_first])
+    np.testing.assert_array_equal(both[only_last], last[only_last])
+    np.testing.assert_allclose(both[by_both], (first + last)[by_both] / 2, atol=1e-6)
 
 
 def test_cells_that_no_source_sees_score_zero():

@@ -149,6 +149,24 @@ def test_cells_out_of_range_do_not_count_in_the_depth_loss():
     assert float(jnp.abs(gradient[0, 0, 1]).max()) == 0
 
 
+def test_unusable_cells_have_neither_value_nor_gradient_in_the_depth_loss():
+    rng = np.random.default_rng(0)
+    candidates, truth = jnp.linspace(0.0, 1.0, 5), jnp.asarray(rng.uniform(0.1, 0.9, (1, 2, 3)), jnp.float32)
+    logits = jnp.asarray(rng.normal(size=(1, 2, 3, 5)), jnp.float32)
+    predicted, usable = truth + 0.2, jnp.array([[[True, False, True], [False, True, True]]])
+
+    def loss(logits, predicted, truth, usable):
+        return sum(depth_loss(logits, predicted, truth, candidates, usable, target_width=WIDTH))
+
+    value, gradients = jax.value_and_grad(loss, argnums=(0, 1))(logits, predicted, truth, usable)
+    # As if those cells did not exist: the mean is over the others.
+    kept = np.asarray(usable)
+    alone = loss(*(x[kept][None, None] for x in (logits, predicted, truth, usable)))
+    np.testing.assert_allclose(value, alone, rtol=1e-6)
+    for gradient in gradients:
+        assert not np.asarray(gradient)[~kept].any() and np.asarray(gradient)[kept].all()
+
+
 @pytest.mark.parametrize("unknown", [-np.inf, np.inf, np.nan, 3.0])
 @pytest.mark.parametrize("candidates", [np.linspace(0.0, 1.0, 5), np.zeros(1)], ids=["five", "one"])
 def test_cells_of_unknown_depth_leave_the_loss_finite(candidates, unknown):
@@ -262,13 +280,16 @@ def test_step_with_a_non_finite_gradient_is_only_counted(trainer):
     broken = dataclasses.replace(
         broken, chunks=dataclasses.replace(sample.chunks, images=sample.chunks.images * jnp.inf)
     )
-    state = start(trainer)
-    before = flat(state.params)
+    # After a good step momentum is not zero and the average differs from the parameters.
+    state, _ = trainer.step(start(trainer), sample, jnp.float32(1e-3), form=FROZEN_ENCODER)
+    before = {name: flat(getattr(state, name)) for name in ("params", "ema", "opt_state")}
+    assert any(np.any(a != b) for a, b in zip(before["params"], before["ema"], strict=True))
     after, metrics = trainer.step(state, broken, jnp.float32(1e-3), form=FROZEN_ENCODER)
     assert not np.isfinite(float(metrics["grad_norm"]))
-    assert int(after.num_skipped) == 1 and int(after.step) == 1
-    for a, b in zip(flat(after.params), before, strict=True):
-        np.testing.assert_array_equal(a, b)
+    assert int(after.num_skipped) == 1 and int(after.step) == 2
+    for name, held in before.items():
+        for a, b in zip(flat(getattr(after, name)), held, strict=True):
+            assert a.tobytes() == b.tobytes(), name
 
 
 def test_frozen_stages_stay_and_the_others_move(trainer):
