@@ -5,12 +5,15 @@ from pathlib import Path
 from typing import Literal
 
 from ssplat_jax.commands.options import (
+    AxesOption,
     CapturePath,
     ConfigChanges,
     LpipsHeads,
+    PosesOption,
     QualityOption,
     QuietOption,
     WeightsOption,
+    capture_path,
     causal_changes,
     load_lpips_weights,
     load_model,
@@ -61,6 +64,8 @@ class Eval:
     """torchvision's vgg16 state dict (.pth or .npz): with --lpips-heads, LPIPS is scored too."""
     lpips_heads: LpipsHeads = None
     set: ConfigChanges = ()
+    axes: AxesOption = None
+    poses: PosesOption = None
     quiet: QuietOption = False
 
     def run(self) -> int:
@@ -85,7 +90,8 @@ class Eval:
             lpips_weights=lpips_weights,
             display=Display(self.over_black, self.one_exposure),
         )
-        metrics = eval_path(model, params, self.capture, self.out, options, Reporter(self.quiet))
+        capture = capture_path(self.capture, self.axes, self.poses)
+        metrics = eval_path(model, params, capture, self.out, options, Reporter(self.quiet))
         if "scenes" in metrics:
             print(f"{len(metrics['scenes'])} scenes: {_both_scores(metrics['over_scenes'])}; {self.out}/metrics.json")
         else:

@@ -1,12 +1,15 @@
 """`ssplat inspect`: facts and warnings about a capture."""
 
 import dataclasses
+import sys
+from pathlib import Path
 from typing import Annotated
 
 import tyro
 
-from ssplat_jax.commands.options import parse_size
+from ssplat_jax.commands.options import AxesOption, PosesOption, capture_path, parse_size
 from ssplat_jax.config import preset
+from ssplat_jax.errors import InputError
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,18 +29,33 @@ class Inspect:
     """Image size WxH; default the capture's own."""
     json: bool = False
     """Print JSON instead of a table."""
+    coverage: Path | None = None
+    """PNG to write: the capture from above, with the path of the cameras and how many of them see each place."""
+    axes: AxesOption = None
+    poses: PosesOption = None
 
     def run(self) -> int:
         from ssplat_jax.console import Reporter, print_facts
         from ssplat_jax.data.capture import open_capture
         from ssplat_jax.data.capture_summary import UNITS, summarize
+        from ssplat_jax.data.coverage_map import draw_coverage
         from ssplat_jax.data.depth_range import NUM_REFERENCES
+        from ssplat_jax.evaluation.pictures import save_image
         from ssplat_jax.storage.json_files import json_text
 
-        capture = open_capture(self.capture, size=parse_size(self.size))
+        if self.coverage is not None and self.coverage.suffix.lower() != ".png":
+            raise InputError(f"--coverage: wanted a file that ends in .png, got {str(self.coverage)!r}; rename it.")
+        path = capture_path(self.capture, self.axes, self.poses)
+        capture = open_capture(path, size=parse_size(self.size))
         num_steps = min(NUM_REFERENCES, len(capture))
         with Reporter().progress("matching", num_steps, waiting="") as advance:
-            facts = summarize(capture, preset("tiny"), advance).to_dict()
+            summary = summarize(capture, preset("tiny"), advance)
             advance(num_steps)
+        facts = summary.to_dict()
         print(json_text(facts)) if self.json else print_facts(facts, UNITS)
+        if self.coverage is not None:
+            far = min(summary.far / summary.scene_scale, 2 * summary.median_depth)
+            picture = draw_coverage(capture, summary.near / summary.scene_scale, far)
+            save_image(self.coverage, picture)
+            print(f"wrote {self.coverage}", file=sys.stderr)
         return 0

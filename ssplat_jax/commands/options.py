@@ -20,6 +20,14 @@ CapturePath = Annotated[
         metavar="CAPTURE", help="Folder of a posed capture (formats: ssplat inspect --help), or procedural:NAME."
     ),
 ]
+AxesOption = Annotated[
+    Literal["opencv", "opengl"] | None,
+    tyro.conf.arg(help="Axes of the cameras in the capture's files, if not those of its format (see ssplat inspect)."),
+]
+PosesOption = Annotated[
+    Literal["camera-to-world", "world-to-camera"] | None,
+    tyro.conf.arg(help="Direction of the poses in the capture's files, if not that of its format."),
+]
 QualityOption = Annotated[
     QualityName,
     tyro.conf.arg(help="Accuracy against time: fast and balanced stream smaller images (docs/performance.md)."),
@@ -31,6 +39,13 @@ LpipsHeads = Annotated[
     Path | None,
     tyro.conf.arg(help="VGG16 heads of the `lpips` package (its weights/v0.1/vgg.pth, or .npz)."),
 ]
+
+
+def capture_path(path: str, axes: str | None, poses: str | None) -> str:
+    """Path of a capture as `open_capture` takes it, with the options --axes and --poses."""
+    from ssplat_jax.data.pose_conventions import with_options
+
+    return with_options(path, axes=axes, poses=poses)
 
 
 def parse_size(text: str | None) -> tuple[int, int] | None:

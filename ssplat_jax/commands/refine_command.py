@@ -7,7 +7,7 @@ from typing import Annotated
 
 import tyro
 
-from ssplat_jax.commands.options import CapturePath, QuietOption, WeightsOption
+from ssplat_jax.commands.options import AxesOption, CapturePath, PosesOption, QuietOption, WeightsOption, capture_path
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,6 +27,8 @@ class Refine:
     """Steps between saved states."""
     overwrite: bool = False
     """Remove the refinement in the folder and start anew."""
+    axes: AxesOption = None
+    poses: PosesOption = None
     quiet: QuietOption = False
 
     def run(self) -> int:
@@ -36,7 +38,7 @@ class Refine:
 
         result = refine_run(
             self.folder,
-            self.capture,
+            capture_path(self.capture, self.axes, self.poses),
             load_params(self.weights),
             steps=self.steps,
             save_every=self.save_every,

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import tyro
 
-from ssplat_jax.commands.options import CapturePath, QuietOption, parse_size
+from ssplat_jax.commands.options import AxesOption, CapturePath, PosesOption, QuietOption, capture_path, parse_size
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,6 +33,8 @@ class Render:
     """Show a run's scene at the exposure of its first views instead of the middle one of all."""
     film: int | None = None
     """Also write film.mp4, with this many pictures from each camera to the next, 24 a second (extra `video`)."""
+    axes: AxesOption = None
+    poses: PosesOption = None
     quiet: QuietOption = False
 
     def run(self) -> int:
@@ -42,7 +44,7 @@ class Render:
         size, reporter = parse_size(self.size), Reporter(self.quiet)
         num_pictures = render_scene(
             self.scene,
-            self.capture,
+            capture_path(self.capture, self.axes, self.poses),
             self.out,
             size=size,
             stride=self.stride,

@@ -6,11 +6,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ssplat_jax.commands.options import (
+    AxesOption,
     CapturePath,
     ConfigChanges,
+    PosesOption,
     QualityOption,
     QuietOption,
     WeightsOption,
+    capture_path,
     causal_changes,
     load_model,
     parse_size,
@@ -56,6 +59,8 @@ class Run:
     """The folder is still being written (transforms.json): stream chunks as their images are complete, causally."""
     quiet_seconds: float = 10.0
     """With --watch: end after so many seconds without a new frame; a file `done` in the capture ends it at once."""
+    axes: AxesOption = None
+    poses: PosesOption = None
     quiet: QuietOption = False
 
     def run(self) -> int:
@@ -63,6 +68,8 @@ class Run:
             raise InputError(f"--refine: wanted a number of steps of at least 0, got {self.refine}.")
         if self.quiet_seconds != Run.quiet_seconds and not self.watch:
             raise InputError("--quiet-seconds: wanted --watch beside it, which it is for; got none.")
+        if self.watch and (self.axes or self.poses):
+            raise InputError("--watch: wanted poses as transforms.json has them, got --axes or --poses; leave one out.")
         result = self._watch() if self.watch else self._stream()
         if result.interrupted:
             how = " without --overwrite" if self.overwrite else ""
@@ -76,7 +83,9 @@ class Run:
         else:
             print(f"wrote {self.out}/scene.ply ({result.num_gaussians} Gaussians from {result.num_views} views)")
         if self.refine:
-            return Refine(self.out, self.capture, self.refine, self.weights, quiet=self.quiet).run()
+            return Refine(
+                self.out, self.capture, self.refine, self.weights, axes=self.axes, poses=self.poses, quiet=self.quiet
+            ).run()
         return 0
 
     def _stream(self) -> "RunResult":
@@ -88,7 +97,7 @@ class Run:
         return run_capture(
             model,
             params,
-            self.capture,
+            capture_path(self.capture, self.axes, self.poses),
             self.out,
             size=parse_size(self.size),
             scale=QUALITIES[self.quality].scale,

@@ -30,6 +30,7 @@ from ssplat_jax.data.images import (
     resize_image,
 )
 from ssplat_jax.data.interleave import interleave
+from ssplat_jax.data.pose_conventions import USUAL, Convention, reinterpreted, split_options
 from ssplat_jax.data.posed_image import Frame, check_camtoworld, check_intrinsics
 from ssplat_jax.data.readers import (
     Listing,
@@ -81,6 +82,7 @@ class Capture:
     width: int  # of the delivered images
     height: int
     notes: tuple[str, ...] = ()  # messages of the reader for the user
+    convention: Convention = USUAL  # of the poses in the files
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -277,7 +279,8 @@ def open_capture(path: str | Path, *, size: tuple[int, int] | None = None) -> Ca
 
     Args:
         path: a folder or file in one of the formats of `data.readers`, or a procedural scene (room, orbit, corridor),
-            such as `procedural:room?frames=73&size=128x96&seed=0`.
+            such as `procedural:room?frames=73&size=128x96&seed=0`. Poses that do not follow the convention of their
+            format are read with options behind it: `folder?axes=opengl&poses=world-to-camera`.
         size: (width, height) of delivered images. Stored images are scaled to cover it and cropped at the center, and
             the intrinsics follow exactly. By default the size of the stored images.
 
@@ -291,6 +294,7 @@ def open_capture(path: str | Path, *, size: tuple[int, int] | None = None) -> Ca
         raise refusal("size", wanted=wanted, got=f"{size[0]}x{size[1]}", fix="ask for a smaller one")
     if str(path).startswith(f"{PROCEDURAL}:"):
         return _procedural(str(path), size)
+    path, options = split_options(str(path))
     try:
         folder = Path(path).expanduser()
         found = next((reader for reader in READERS if reader.matches(folder)), None)
@@ -298,8 +302,12 @@ def open_capture(path: str | Path, *, size: tuple[int, int] | None = None) -> Ca
     except (OSError, RuntimeError, ValueError) as error:  # unknown user, name too long, no permission
         raise refusal(str(path)[:80], wanted="a path", got=str(error)[:200], fix="check the path") from None
     if found is not None:
+        usual = getattr(found, "CONVENTION", USUAL)
+        written = dataclasses.replace(usual, **options)
         listing = found.read(folder)
-        return capture_of_listing(listing, found.FORMAT, FilePixels(listing.frames), size)
+        frames = tuple(reinterpreted(frame, usual, written) for frame in listing.frames)
+        listing = dataclasses.replace(listing, frames=frames if options else listing.frames)
+        return capture_of_listing(listing, found.FORMAT, FilePixels(listing.frames), size, written)
     if not exists:
         got, fix = "nothing of that name", "check the path"
     elif folder.is_dir() and not any(folder.iterdir()):
@@ -327,7 +335,9 @@ def _unposed(path: Path) -> str | None:
     return "images" if suffixes & IMAGE_SUFFIXES else "a video" if suffixes & VIDEO_SUFFIXES else None
 
 
-def capture_of_listing(listing: Listing, format: str, pixels: Pixels, size: tuple[int, int] | None) -> Capture:
+def capture_of_listing(
+    listing: Listing, format: str, pixels: Pixels, size: tuple[int, int] | None, convention: Convention = USUAL
+) -> Capture:
     """Capture of a listing whose images all have one size; `size` is that of the delivered ones (`open_capture`)."""
     if size is None:
         first = listing.frames[0]
@@ -344,6 +354,7 @@ def capture_of_listing(listing: Listing, format: str, pixels: Pixels, size: tupl
         width=size[0],
         height=size[1],
         notes=listing.notes,
+        convention=convention,
     )
 
 

@@ -9,6 +9,9 @@ import numpy as np
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.depth_range import DepthStatistics, estimate_depths, same_place_distance, stream_scale
+from ssplat_jax.data.frame_check import frame_warnings
+from ssplat_jax.data.pose_check import fit_poses, pose_warning
+from ssplat_jax.data.sparse_matches import keypoints_of
 
 LOW_STEP = 0.012  # step between frames over median depth, below which four consecutive frames have little parallax
 GOOD_STEP = 0.03  # step over median depth that a suggested stride aims at
@@ -78,7 +81,9 @@ def summarize(capture: Capture, config: StreamConfig, advance: Callable[[int], N
     Raises:
         InputError: an image or depth map that the estimates use is damaged.
     """
-    depths = estimate_depths(capture, range(len(capture)), advance)
+    keypoints = keypoints_of(capture)
+    depths = estimate_depths(capture, range(len(capture)), advance, keypoints)
+    wrong_poses = pose_warning(fit_poses(capture, capture.convention, keypoints), capture.convention)
     measured = _depth_maps_median(capture)
     scale, near, far = stream_scale(depths, config)
     centers = capture.camtoworlds[:, :3, 3]
@@ -107,7 +112,13 @@ def summarize(capture: Capture, config: StreamConfig, advance: Callable[[int], N
         near=near,
         far=far,
         voxel_in_capture_units=config.memory.voxel_size / scale,
-        warnings=(*capture.notes, *_warnings(capture, depths, steps), *_depth_map_warnings(depths, measured)),
+        warnings=(
+            *capture.notes,
+            # Depths that follow from wrong poses would only mislead.
+            *(_warnings(capture, depths, steps) if wrong_poses is None else [wrong_poses]),
+            *(_depth_map_warnings(depths, measured) if wrong_poses is None else []),
+            *frame_warnings(capture),
+        ),
     )
 
 

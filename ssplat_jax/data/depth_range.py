@@ -11,7 +11,6 @@ median towards the camera (by 30 % at a median parallax of 1 degree); the median
 """
 
 import dataclasses
-import functools
 import math
 from collections.abc import Callable, Sequence
 
@@ -24,7 +23,7 @@ from ssplat_jax.data.sparse_matches import (
     CommonPoints,
     KeypointsOf,
     PosedImages,
-    detect_keypoints,
+    keypoints_of,
     triangulate_pair,
 )
 
@@ -82,7 +81,10 @@ class DepthStatistics:
 
 
 def estimate_depths(
-    capture: PosedImages, indices: Sequence[int], advance: Callable[[int], None] = lambda done: None
+    capture: PosedImages,
+    indices: Sequence[int],
+    advance: Callable[[int], None] = lambda done: None,
+    keypoints: KeypointsOf | None = None,
 ) -> DepthStatistics:
     """Estimates the quantiles of depth in the frames `indices`.
 
@@ -90,13 +92,14 @@ def estimate_depths(
         capture: the frames.
         indices: those to use.
         advance: called with the number of references, of at most `NUM_REFERENCES`, that are done.
+        keypoints: function that returns the keypoints of a frame; by default they are detected.
 
     Limits:
         With a median parallax below 0.5 degrees only the median is measured, and the range is 4 times to both sides.
         Without matches (one frame, a pure rotation, bare walls) the median is 5 median steps between frames, or 1 if
         the camera does not move.
     """
-    keypoints = functools.cache(lambda i: detect_keypoints(capture.image(i)))
+    keypoints = keypoints or keypoints_of(capture)
     references = np.unique(np.linspace(0, len(indices) - 1, min(NUM_REFERENCES, len(indices))).round().astype(int))
     pairs: list[CommonPoints] = []
     baseline = 0.0

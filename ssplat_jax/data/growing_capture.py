@@ -24,7 +24,8 @@ def open_growing(path: Path, *, size: tuple[int, int] | None) -> tuple[Capture |
     """
     try:
         listing, problem = transforms_json.read_complete(path)
-        capture = capture_of_listing(listing, transforms_json.FORMAT, FilePixels(listing.frames), size)
+        pixels, convention = FilePixels(listing.frames), transforms_json.CONVENTION
+        capture = capture_of_listing(listing, transforms_json.FORMAT, pixels, size, convention)
     except InputError as error:  # missing, or being written
         return None, str(error)
     return capture, problem

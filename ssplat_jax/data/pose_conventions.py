@@ -11,15 +11,13 @@ from typing import Literal, get_args
 import numpy as np
 from jaxtyping import Float64
 
-from ssplat_jax.data.posed_image import Frame, invert_pose
+from ssplat_jax.data.posed_image import OPENGL_TO_OPENCV, Frame, invert_pose
 from ssplat_jax.errors import refusal
 
 Axes = Literal["opencv", "opengl"]
 """Axes of a camera: +y down and +z forward (opencv), or +y up and +z backward (opengl)."""
 Direction = Literal["camera-to-world", "world-to-camera"]
 """Direction of the matrices or vectors that a file gives."""
-
-FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # between the two kinds of axes; its own inverse
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,19 +30,20 @@ class Convention:
     def to_opencv(self, written: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "4 4"]:
         """Returns the camera-to-world pose with OpenCV axes of a matrix in this convention."""
         camtoworld = written if self.poses == "camera-to-world" else invert_pose(written)
-        return camtoworld if self.axes == "opencv" else camtoworld @ FLIP
+        return camtoworld if self.axes == "opencv" else camtoworld @ OPENGL_TO_OPENCV
 
     def from_opencv(self, camtoworld: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "4 4"]:
         """Returns the matrix in this convention of a camera-to-world pose with OpenCV axes."""
-        camtoworld = camtoworld if self.axes == "opencv" else camtoworld @ FLIP
+        camtoworld = camtoworld if self.axes == "opencv" else camtoworld @ OPENGL_TO_OPENCV
         return camtoworld if self.poses == "camera-to-world" else invert_pose(camtoworld)
 
     def options(self, usual: "Convention") -> dict[str, str]:
         """Returns the options that ask for this convention in place of the usual one."""
-        return {
-            name: getattr(self, name) for name in ("axes", "poses") if getattr(self, name) != getattr(usual, name)
-        }
+        return {name: getattr(self, name) for name in ("axes", "poses") if getattr(self, name) != getattr(usual, name)}
 
+
+USUAL = Convention()
+"""The convention of captures in memory, and of formats that do not say otherwise."""
 
 CONVENTIONS = tuple(Convention(axes, poses) for axes in get_args(Axes) for poses in get_args(Direction))
 
@@ -72,7 +71,7 @@ def split_options(path: str) -> tuple[str, dict[str, str]]:
     return path[: found.start()], options
 
 
-def with_options(path: str, *, axes: Axes | None, poses: Direction | None) -> str:
+def with_options(path: str, *, axes: str | None = None, poses: str | None = None) -> str:
     """Returns `path` with the options that are not None, which replace those that it has."""
     path, options = split_options(path)
     options |= {name: value for name, value in (("axes", axes), ("poses", poses)) if value is not None}

@@ -4,6 +4,7 @@ Everything is NumPy on the host; geometry is float64, in capture units.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol, runtime_checkable
 
@@ -90,6 +91,11 @@ def detect_keypoints(image: Float32[np.ndarray, "h w 3"]) -> Keypoints:
     return Keypoints(pixels=pixels, descriptors=detector.descriptors.astype(bool), pixel=shrink)
 
 
+def keypoints_of(capture: PosedImages) -> KeypointsOf:
+    """Returns a function that detects the keypoints of a frame of `capture` once and remembers them."""
+    return functools.cache(lambda i: detect_keypoints(capture.image(i)))
+
+
 def triangulate_pair(capture: PosedImages, i: int, j: int, keypoints: KeypointsOf) -> CommonPoints | None:
     """Triangulates the points that two frames have in common.
 
@@ -105,7 +111,7 @@ def triangulate_pair(capture: PosedImages, i: int, j: int, keypoints: KeypointsO
     a, b = capture.frames[i].camtoworld, capture.frames[j].camtoworld
     R, t = b[:3, :3].T @ a[:3, :3], b[:3, :3].T @ (a[:3, 3] - b[:3, 3])  # camera i -> camera j
     ka, kb = keypoints(i), keypoints(j)
-    rays_a, rays_b = _rays(capture.K(i), ka.pixels), _rays(capture.K(j), kb.pixels)
+    rays_a, rays_b = pixel_rays(capture.K(i), ka.pixels), pixel_rays(capture.K(j), kb.pixels)
     near_line = epipolar_distances(rays_a, rays_b, R, t) < MAX_EPIPOLAR_PX * kb.pixel / capture.K(j)[0, 0]
     idx_a, idx_b = match(ka.descriptors, kb.descriptors, near_line)
     if len(idx_a) < MIN_POINTS:
@@ -117,8 +123,8 @@ def triangulate_pair(capture: PosedImages, i: int, j: int, keypoints: KeypointsO
     return CommonPoints(inverse_depths=inverse_depths, parallax=parallax, weights=weights, close=np.zeros(0))
 
 
-def _rays(K: Float64[np.ndarray, "3 3"], pixels: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarray, "n 3"]:
-    """Points at depth 1 on the rays through pixels."""
+def pixel_rays(K: Float64[np.ndarray, "3 3"], pixels: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarray, "n 3"]:
+    """Returns the points at depth 1 on the rays through pixels."""
     return np.concatenate([(pixels - K[:2, 2]) / np.diag(K)[:2], np.ones((len(pixels), 1))], axis=-1)
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from ssplat_jax.console import Reporter
 from ssplat_jax.data.capture import Capture, is_capture, open_capture
 from ssplat_jax.data.index_files import Index, index_to_json, read_index, split_of_scene
+from ssplat_jax.data.pose_conventions import split_options, with_options
 from ssplat_jax.data.split import Split, choose_split
 from ssplat_jax.errors import InputError, echo, refusal
 from ssplat_jax.evaluation.evaluate import evaluate
@@ -73,9 +74,10 @@ def eval_path(
         raise refusal("--index", wanted="no frames chosen otherwise", got=f"--{clash[0]} too", fix="leave one out")
     index, notes = read_index(options.index)
     reporter.warn_all(*notes)
-    folder = Path(path).expanduser()
+    root, written = split_options(path)
+    folder = Path(root).expanduser()
     if options.scene is None and folder.is_dir() and not is_capture(folder):
-        return _eval_scenes(model, params, folder, out, index, options, reporter)
+        return _eval_scenes(model, params, folder, out, index, options, reporter, written)
     capture = open_capture(path, size=options.size)
     scene = options.scene or capture.name
     split = split_of_scene(index, scene, len(capture))
@@ -108,7 +110,14 @@ def _evaluate(
 
 
 def _eval_scenes(
-    model: StreamSplat, params: dict, folder: Path, out: Path, index: Index, options: EvalOptions, reporter: Reporter
+    model: StreamSplat,
+    params: dict,
+    folder: Path,
+    out: Path,
+    index: Index,
+    options: EvalOptions,
+    reporter: Reporter,
+    written: dict[str, str],
 ) -> dict[str, Any]:
     """The metrics of every scene of an index; all are opened before the first is streamed."""
     if unsafe := [scene for scene in index if not (folder / scene).resolve().is_relative_to(folder.resolve())]:
@@ -118,7 +127,9 @@ def _eval_scenes(
         got, fix = "no folder of that name", "give the folder that holds one folder per scene"
         raise refusal(str(folder), wanted=f"a capture, or scenes such as {next(iter(index))}", got=got, fix=fix)
     captures = {
-        scene: open_capture(folder / scene, size=options.size) for scene, split in index.items() if split is not None
+        scene: open_capture(with_options(str(folder / scene), **written), size=options.size)
+        for scene, split in index.items()
+        if split is not None
     }
     if not captures:
         raise refusal("--index", wanted="a scene that is not null", got="none", fix="choose frames for one")

@@ -15,7 +15,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ssplat_jax.data.lens import FisheyeLens, Lens
-from ssplat_jax.data.posed_image import Frame, invert_pose, pose_from_quat
+from ssplat_jax.data.pose_conventions import Convention
+from ssplat_jax.data.posed_image import Frame, pose_from_quat
 from ssplat_jax.data.readers import Listing
 from ssplat_jax.data.readers.frame_list import (
     SHRUNK_FOLDERS,
@@ -29,6 +30,7 @@ from ssplat_jax.data.readers.strict_text import load_lines, parse_numbers
 from ssplat_jax.errors import echo, refusal
 
 FORMAT = "COLMAP"
+CONVENTION = Convention(poses="world-to-camera")
 FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", ".")  # places of a reconstruction, in the order of search
 MODELS = (  # name, parameters, and whether the camera is supported, by id
     ("SIMPLE_PINHOLE", "f cx cy", True),
@@ -136,7 +138,7 @@ def _frame(root: Path, folder: str, entry: ImageEntry, cameras: dict[int, Camera
     return make_frame(
         entry.name,
         path,
-        invert_pose(pose_from_quat(entry.quat, entry.translation, entry.where)),
+        CONVENTION.to_opencv(pose_from_quat(entry.quat, entry.translation, entry.where)),
         _intrinsics(camera),
         size,
         f"{entry.where}, camera {entry.camera}",

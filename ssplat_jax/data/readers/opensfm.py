@@ -12,7 +12,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from ssplat_jax.data.lens import FisheyeLens, Lens
-from ssplat_jax.data.posed_image import invert_pose, pose_from_quat
+from ssplat_jax.data.pose_conventions import Convention
+from ssplat_jax.data.posed_image import pose_from_quat
 from ssplat_jax.data.readers import Listing
 from ssplat_jax.data.readers.frame_list import (
     SHRUNK_FOLDERS,
@@ -26,6 +27,7 @@ from ssplat_jax.data.readers.strict_json import JsonFields, load_json_list
 from ssplat_jax.errors import echo, refusal
 
 FORMAT = "OpenSfM"
+CONVENTION = Convention(poses="world-to-camera")
 PLACES = ("reconstruction.json", "opensfm/reconstruction.json")
 FIX = "write it again with OpenSfM"
 
@@ -53,7 +55,7 @@ def read(path: Path) -> Listing:
         image = file_named(root, f"images/{name}", fields.where, folders=SHRUNK_FOLDERS)
         size, shrink = stored_size(image, described, fields.where, "use the images that OpenSfM used")
         quat = _quat_of_axis_angle(fields.numbers("rotation", (3,)))
-        pose = invert_pose(pose_from_quat(quat, fields.numbers("translation", (3,)), fields.where))
+        pose = CONVENTION.to_opencv(pose_from_quat(quat, fields.numbers("translation", (3,)), fields.where))
         frames.append(make_frame(name, image, pose, intrinsics, size, fields.where, shrink=shrink))
     num_left = sum(sizes) - len(frames)
     left = [f"{num_left} images of smaller reconstructions, which are not connected, are skipped."] if num_left else []

@@ -8,13 +8,15 @@ are in pixels. Depth maps hold millimeters and have their own resolution.
 from pathlib import Path
 
 from ssplat_jax.data.images import check_depth_header
-from ssplat_jax.data.posed_image import OPENGL_TO_OPENCV, check_camtoworld
+from ssplat_jax.data.pose_conventions import Convention
+from ssplat_jax.data.posed_image import check_camtoworld
 from ssplat_jax.data.readers import Listing
 from ssplat_jax.data.readers.frame_list import Intrinsics, find_file, make_frame, order_frames, stored_size
 from ssplat_jax.data.readers.strict_json import JsonFields, load_json
 from ssplat_jax.errors import refusal
 
 FORMAT = "Polycam"
+CONVENTION = Convention(axes="opengl")
 IMAGES = frozenset({".jpg", ".jpeg", ".png"})
 
 
@@ -48,7 +50,7 @@ def read(path: Path) -> Listing:
             make_frame(
                 image.name,
                 image,
-                opengl @ OPENGL_TO_OPENCV,
+                CONVENTION.to_opencv(opengl),
                 Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy),
                 size,
                 str(file),

@@ -10,13 +10,15 @@ from pathlib import Path
 import numpy as np
 
 from ssplat_jax.data.images import image_size
-from ssplat_jax.data.posed_image import check_camtoworld, invert_pose
+from ssplat_jax.data.pose_conventions import Convention
+from ssplat_jax.data.posed_image import check_camtoworld
 from ssplat_jax.data.readers import Listing
 from ssplat_jax.data.readers.frame_list import EXTENSIONS, Intrinsics, find_file, make_frame, order_frames
 from ssplat_jax.data.readers.strict_text import load_lines, load_rows
 from ssplat_jax.errors import echo, refusal
 
 FORMAT = "RealEstate10K"
+CONVENTION = Convention(poses="world-to-camera")
 COLUMNS = 19  # numbers per line
 
 
@@ -50,7 +52,13 @@ def read(path: Path) -> Listing:
         intrinsics = Intrinsics(fx=row[1] * width, fy=row[2] * height, cx=row[3] * width, cy=row[4] * height)
         frames.append(
             make_frame(
-                str(time), image, invert_pose(worldtocam), intrinsics, (width, height), where, pose_deviation=deviation
+                str(time),
+                image,
+                CONVENTION.to_opencv(worldtocam),
+                intrinsics,
+                (width, height),
+                where,
+                pose_deviation=deviation,
             )
         )
     if not frames:

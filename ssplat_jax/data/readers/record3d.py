@@ -7,13 +7,15 @@ floating-point EXR or compressed.
 
 from pathlib import Path
 
-from ssplat_jax.data.posed_image import OPENGL_TO_OPENCV, pose_from_quat
+from ssplat_jax.data.pose_conventions import Convention
+from ssplat_jax.data.posed_image import pose_from_quat
 from ssplat_jax.data.readers import Listing
 from ssplat_jax.data.readers.frame_list import Intrinsics, find_file, make_frame, order_frames, stored_size
 from ssplat_jax.data.readers.strict_json import JsonFields, load_json
 from ssplat_jax.errors import echo, refusal
 
 FORMAT = "Record3D"
+CONVENTION = Convention(axes="opengl")
 FOLDERS = ("rgb", "rgbd")
 FIX = "export the recording again"
 
@@ -46,7 +48,7 @@ def read(path: Path) -> Listing:
         opengl = pose_from_quat((w, x, y, z), center, where)
         size, shrink = stored_size(image, described, f"{file}: w, h", FIX)
         name = str(image.relative_to(root))
-        frames.append(make_frame(name, image, opengl @ OPENGL_TO_OPENCV, intrinsics, size, str(file), shrink=shrink))
+        frames.append(make_frame(name, image, CONVENTION.to_opencv(opengl), intrinsics, size, str(file), shrink=shrink))
     if not frames:
         raise refusal(str(path), wanted="images rgb/0.jpg, ...", got=f"none for {len(poses)} poses", fix=FIX)
     num_lost = len(poses) - len(frames)

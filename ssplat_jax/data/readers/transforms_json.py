@@ -17,7 +17,8 @@ from typing import Any
 
 from ssplat_jax.data.images import check_depth_header, image_size
 from ssplat_jax.data.lens import FisheyeLens, Lens
-from ssplat_jax.data.posed_image import OPENGL_TO_OPENCV, Frame, check_camtoworld
+from ssplat_jax.data.pose_conventions import Convention
+from ssplat_jax.data.posed_image import Frame, check_camtoworld
 from ssplat_jax.data.readers import Listing, splat_cameras
 from ssplat_jax.data.readers.frame_list import (
     EXTENSIONS,
@@ -33,6 +34,7 @@ from ssplat_jax.data.readers.strict_json import load_json
 from ssplat_jax.errors import InputError, echo, refusal
 
 FORMAT = "transforms.json"
+CONVENTION = Convention(axes="opengl")
 PLACES = ("transforms.json", "nerfstudio/transforms.json")
 PINHOLE_MODELS = (None, "OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 FISHEYE_MODELS = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
@@ -121,7 +123,7 @@ def _read_frame(root: Path, meta: dict[str, Any], entry: dict[str, Any], where: 
     return make_frame(
         str(name),
         path,
-        opengl @ OPENGL_TO_OPENCV,
+        CONVENTION.to_opencv(opengl),
         Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, lens=lens),
         (width, height),
         where,

@@ -1,0 +1,168 @@
+"""Whether poses fit the images: epipolar consistency of matches that were found without poses.
+
+    keypoints -> mutual matches, poses unused -> share consistent with the poses in each convention
+
+A match is consistent if it lies near its epipolar line and its point in front of the camera. Poses in a wrong
+convention (camera axes, direction of the matrix) leave a small share of the matches consistent; in the right one most
+are. Poses that fit in no convention, though the matches agree on some motion, belong to other images or are wrong.
+"""
+
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
+
+import numpy as np
+from jaxtyping import Float64
+from skimage.measure import ransac
+from skimage.transform import FundamentalMatrixTransform
+
+from ssplat_jax.data.pose_conventions import CONVENTIONS, Convention
+from ssplat_jax.data.posed_image import Frame
+from ssplat_jax.data.sparse_matches import (
+    MAX_EPIPOLAR_PX,
+    KeypointsOf,
+    PosedImages,
+    epipolar_distances,
+    match,
+    pixel_rays,
+    triangulate,
+)
+
+NUM_PAIRS = 8  # evenly spaced references, one partner each
+GAPS = (1, 3, 8, 20)  # frames from a reference to its partner; the first with enough motion is taken
+MIN_MOTION_PX = 10.0  # median motion of matches in the working image; with less, any epipolar line is near
+MIN_MATCHES = 30  # per pair
+MIN_TOTAL_MATCHES = 100  # with fewer, nothing is said
+CLEAR_PARALLAX_DEGREES = 0.3  # points with less may triangulate behind the camera
+GOOD_SHARE = 0.5  # of matches; right poses are consistent with more, however many matches are false
+BETTER_RATIO = 1.5  # share of another convention over that of the given poses, from which it is named
+POOR_SHARE = 0.6  # of the matches that agree on one motion; poses that are consistent with fewer are wrong
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class MatchedPair:
+    """Matches of two frames, found without their poses."""
+
+    frames: tuple[Frame, Frame]
+    rays: tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]  # points at depth 1
+    pixels: tuple[Float64[np.ndarray, "n 2"], Float64[np.ndarray, "n 2"]]  # in the delivered images
+    tolerance: float  # in the plane z = 1 of the second camera
+    tolerance_px: float  # the same in pixels of the delivered image
+
+
+@dataclasses.dataclass(frozen=True)
+class PoseFit:
+    """Shares of the matches that are consistent with the poses."""
+
+    shares: dict[Convention, float]  # if the files were written in that convention
+    coherent_share: float  # that agree on a motion between the frames, whatever it is
+    num_matches: int
+
+
+def matched_pairs(capture: PosedImages, indices: Sequence[int], keypoints: KeypointsOf) -> Iterator[MatchedPair]:
+    """Yields pairs of frames with matches that move, references evenly spread over `indices`."""
+    references = np.unique(np.linspace(0, len(indices) - 2, NUM_PAIRS).round().astype(int)) if len(indices) > 1 else []
+    for reference in references:
+        for gap in GAPS:
+            if reference + gap < len(indices):
+                pair = _matched(capture, indices[reference], indices[reference + gap], keypoints)
+                if pair is not None:
+                    yield pair
+                    break
+
+
+def _matched(capture: PosedImages, i: int, j: int, keypoints: KeypointsOf) -> MatchedPair | None:
+    """Matches of two frames, or None if they are few or hardly move."""
+    a, b = keypoints(i), keypoints(j)
+    rows, columns = match(a.descriptors, b.descriptors, np.ones((len(a.pixels), len(b.pixels)), bool))
+    pixels = a.pixels[rows], b.pixels[columns]
+    if len(rows) < MIN_MATCHES:
+        return None
+    if np.median(np.linalg.norm(pixels[1] - pixels[0], axis=1)) < MIN_MOTION_PX * b.pixel:
+        return None
+    tolerance_px = MAX_EPIPOLAR_PX * b.pixel
+    return MatchedPair(
+        frames=(capture.frames[i], capture.frames[j]),
+        rays=(pixel_rays(capture.K(i), pixels[0]), pixel_rays(capture.K(j), pixels[1])),
+        pixels=pixels,
+        tolerance=tolerance_px / capture.K(j)[0, 0],
+        tolerance_px=tolerance_px,
+    )
+
+
+def fit_poses(
+    capture: PosedImages,
+    convention: Convention,
+    keypoints: KeypointsOf,
+    advance: Callable[[int], None] = lambda done: None,
+) -> PoseFit | None:
+    """Returns how well the poses fit the images in each convention; None if too few matches move.
+
+    Args:
+        capture: the frames.
+        convention: the convention in which the poses were read.
+        keypoints: function that returns the keypoints of a frame.
+        advance: called with the number of pairs that are done.
+    """
+    counts = dict.fromkeys(CONVENTIONS, 0)
+    total = coherent = 0
+    for done, pair in enumerate(matched_pairs(capture, range(len(capture.frames)), keypoints)):
+        advance(done + 1)
+        total += len(pair.rays[0])
+        coherent += _num_coherent(pair)
+        for other in CONVENTIONS:
+            poses = (other.to_opencv(convention.from_opencv(frame.camtoworld)) for frame in pair.frames)
+            counts[other] += _num_consistent(pair, *poses)
+    if total < MIN_TOTAL_MATCHES:
+        return None
+    shares = {other: count / total for other, count in counts.items()}
+    return PoseFit(shares=shares, coherent_share=coherent / total, num_matches=total)
+
+
+def _num_consistent(pair: MatchedPair, a: Float64[np.ndarray, "4 4"], b: Float64[np.ndarray, "4 4"]) -> int:
+    """Number of matches near their epipolar lines whose points are in front of the first camera."""
+    R, t = b[:3, :3].T @ a[:3, :3], b[:3, :3].T @ (a[:3, 3] - b[:3, 3])
+    rays_a, rays_b = pair.rays
+    if np.linalg.norm(t) == 0:
+        return 0
+    distances = np.diagonal(epipolar_distances(rays_a, rays_b, R, t))
+    inverse_depths, parallax = triangulate(rays_a, rays_b, R, t)
+    in_front = (inverse_depths > 0) | (np.abs(parallax) < CLEAR_PARALLAX_DEGREES)
+    return int(np.sum((distances < pair.tolerance) & in_front))
+
+
+def _num_coherent(pair: MatchedPair) -> int:
+    """Number of matches that agree on one fundamental matrix, found by random sampling with a fixed seed."""
+    _, inliers = ransac(
+        pair.pixels,
+        FundamentalMatrixTransform,
+        min_samples=8,
+        residual_threshold=pair.tolerance_px,
+        max_trials=100,
+        rng=0,
+    )
+    return 0 if inliers is None else int(np.sum(inliers))
+
+
+def pose_warning(fit: PoseFit | None, convention: Convention) -> str | None:
+    """A warning about poses in another convention, with the flags that mend them, or about wrong poses, or None."""
+    if fit is None:
+        return None
+    given, best = fit.shares[convention], max(CONVENTIONS, key=lambda other: fit.shares[other])
+    better = fit.shares[best]
+    if better >= GOOD_SHARE * fit.coherent_share and better >= BETTER_RATIO * given:
+        wrong = " and ".join(
+            text
+            for name, text in (("axes", "the axes of the cameras are turned"), ("poses", "the poses are inverted"))
+            if getattr(best, name) != getattr(convention, name)
+        )
+        flags = " ".join(f"--{name} {value}" for name, value in best.options(convention).items())
+        return (
+            f"Images and poses disagree: {given:.0%} of the matches are consistent, and {better:.0%} would be with"
+            f" {flags}: {wrong}."
+        )
+    if given < POOR_SHARE * fit.coherent_share and fit.coherent_share >= GOOD_SHARE:
+        return (
+            f"Poses do not fit the images: {given:.0%} of the matches are consistent with them, and"
+            f" {fit.coherent_share:.0%} with some motion; check that each pose belongs to its image, and intrinsics."
+        )
+    return None

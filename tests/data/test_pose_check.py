@@ -1,0 +1,116 @@
+"""Poses in another convention are recognised from the images, and read with the options that are named."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from ssplat_jax.config import StreamConfig
+from ssplat_jax.data.capture import Capture, open_capture
+from ssplat_jax.data.capture_summary import summarize
+from ssplat_jax.data.pose_check import fit_poses, pose_warning
+from ssplat_jax.data.pose_conventions import CONVENTIONS, USUAL, Convention, split_options, with_options
+from ssplat_jax.data.sparse_matches import keypoints_of
+from ssplat_jax.errors import InputError
+from tests.data.planes_fixture import two_planes
+
+NAMES = [f"{c.axes}-{c.poses}" for c in CONVENTIONS]
+
+
+@pytest.fixture(scope="module")
+def room() -> Capture:
+    return two_planes(12, 0.1, spin=-3.0, forward=0.1, start=-0.6)
+
+
+@pytest.fixture(scope="module")
+def keypoints(room):
+    return keypoints_of(room)
+
+
+def written_as(capture: Capture, convention: Convention) -> Capture:
+    """The capture that a reader of OpenCV camera-to-world poses makes of files in `convention`."""
+    frames = (dataclasses.replace(f, camtoworld=convention.from_opencv(f.camtoworld)) for f in capture.frames)
+    return dataclasses.replace(capture, frames=tuple(frames))
+
+
+@pytest.mark.parametrize("written", CONVENTIONS, ids=NAMES)
+def test_the_convention_of_the_files_is_found(written, room, keypoints):
+    fit = fit_poses(written_as(room, written), USUAL, keypoints)
+    assert max(fit.shares, key=lambda c: fit.shares[c]) == written
+    assert fit.shares[written] > 0.7 and sorted(fit.shares.values())[-2] < 0.35
+    warning = pose_warning(fit, USUAL)
+    if written == USUAL:
+        assert warning is None
+    else:
+        flags = {"opengl": "--axes opengl", "world-to-camera": "--poses world-to-camera"}
+        for value, flag in flags.items():
+            assert (flag in warning) == (value in (written.axes, written.poses))
+
+
+def test_poses_of_other_images_are_found(room, keypoints):
+    moved = np.random.default_rng(0).permutation(len(room))
+    mixed = dataclasses.replace(room, frames=tuple(room.frames[i] for i in moved))
+    assert "do not fit" in pose_warning(fit_poses(mixed, USUAL, keypoints), USUAL)
+
+
+def test_nothing_is_said_where_hardly_anything_moves(room):
+    still = dataclasses.replace(room, frames=room.frames[:1])
+    assert fit_poses(still, USUAL, keypoints_of(still)) is None and pose_warning(None, USUAL) is None
+
+
+@pytest.mark.parametrize("written", CONVENTIONS, ids=NAMES)
+def test_options_of_the_path_read_files_in_any_convention(written, room, tmp_path):
+    """As transforms.json, whose poses are camera-to-world with OpenGL axes."""
+    frames = []
+    for i, frame in enumerate(room.frames[:3]):
+        Image.fromarray((room.image(i) * 255).astype(np.uint8)).save(tmp_path / f"{i}.png")
+        frames.append({"file_path": f"{i}.png", "transform_matrix": written.from_opencv(frame.camtoworld).tolist()})
+    K = room.K(0)
+    meta = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "frames": frames}
+    (tmp_path / "transforms.json").write_text(json.dumps(meta))
+    path = with_options(str(tmp_path), **written.options(Convention(axes="opengl")))
+    capture = open_capture(path)
+    np.testing.assert_allclose(capture.camtoworlds, room.camtoworlds[:3], atol=1e-9)
+    assert capture.convention == written and capture.name == tmp_path.name
+
+
+def test_inspect_names_the_flag_and_says_nothing_of_depths_from_wrong_poses(room):
+    turned = written_as(room, Convention(axes="opengl"))
+    warnings = summarize(turned, StreamConfig()).warnings
+    assert sum("--axes opengl" in warning for warning in warnings) == 1
+    assert not any("parallax" in warning or "matches between frames" in warning for warning in warnings)
+
+
+def test_options_are_split_from_paths_and_replaced():
+    assert split_options("a/b") == ("a/b", {}) and split_options("a?b=c") == ("a?b=c", {})
+    both = with_options("a/b", axes="opengl", poses="world-to-camera")
+    assert split_options(both) == ("a/b", {"axes": "opengl", "poses": "world-to-camera"})
+    assert with_options(both, axes="opencv") == "a/b?axes=opencv&poses=world-to-camera"
+    assert with_options("a/b") == "a/b"
+
+
+@pytest.mark.parametrize("options", ["axes=opengl2", "axes=", "poses=c2w", "axes=opengl&axes=opengl"])
+def test_unknown_options_are_refused(options, tmp_path):
+    with pytest.raises(InputError, match="change the option"):
+        open_capture(f"{tmp_path}?{options}")
+
+
+CAPTURES = ("fox", "hololens", "plush", "redkitchen", "south_building")
+
+
+@pytest.mark.slow  # seconds each
+@pytest.mark.parametrize("written", CONVENTIONS, ids=NAMES)
+@pytest.mark.parametrize("name", CAPTURES)
+def test_real_captures_in_any_convention(name, written, captures):
+    """Files are OpenGL camera-to-world; `written` is what they are turned into."""
+    capture, right = open_capture(captures / name), Convention(axes="opengl")
+    turned = [
+        dataclasses.replace(f, camtoworld=right.to_opencv(written.from_opencv(f.camtoworld))) for f in capture.frames
+    ]
+    warning = pose_warning(
+        fit_poses(dataclasses.replace(capture, frames=tuple(turned)), right, keypoints_of(capture)), right
+    )
+    wanted = " ".join(f"--{name} {value}" for name, value in written.options(right).items())
+    assert warning is None if written == right else f"with {wanted}:" in warning
