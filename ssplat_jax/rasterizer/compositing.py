@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
@@ -259,7 +260,8 @@ def _exponent_gradients(alphas, weights, gains, tail):
 
     dL/dq = -a dL/da = -w s + a / (1 - a) tail; 0 for samples that are skipped, capped or behind the stop.
     """
-    gains = lax.optimization_barrier(gains)
+    # Without the barrier XLA sees that alpha is a quotient, and computes its denominator again for the ratio.
+    alphas, gains = lax.optimization_barrier((alphas, gains))
     tails = []
     for u in range(alphas.shape[1]):
         tail = tail - gains[:, u]
@@ -270,42 +272,45 @@ def _exponent_gradients(alphas, weights, gains, tail):
     return last, lax.optimization_barrier(jnp.where(free, ratio * tails - gains, 0.0))
 
 
-def _sum_rows(grid: Grid, values: Float[Array, "p u t"]) -> Float[Array, "rows u t"]:
-    """Sums over each row of a tile's pixels."""
-    rows = values.reshape(grid.tile, grid.tile, *values.shape[1:])
-    return jnp.sum(rows, axis=1)
-
-
 def _total(terms: Iterable[Array]) -> Array:
     """The sum of a few arrays, term by term, which XLA fuses into one kernel."""
     return functools.reduce(operator.add, terms)
 
 
 def _sum_pixels(grid: Grid, values: Float[Array, "p u t"]) -> Float[Array, "u t"]:
-    """Sums over the pixels of a tile."""
-    return _total(_sum_rows(grid, values))
+    """Sums over the pixels of a tile, row by row."""
+    return _total(jnp.sum(values.reshape(grid.tile, grid.tile, *values.shape[1:]), axis=1))
+
+
+def _monomials(grid: Grid, dtype) -> Float[Array, "6 p"]:
+    """1, X, Y, X^2, XY and Y^2 at the pixels of a tile, X and Y from its center."""
+    side = np.arange(grid.tile) - (grid.tile - 1) / 2
+    x, y = np.tile(side, grid.tile), np.repeat(side, grid.tile)
+    return jnp.asarray(np.stack([np.ones_like(x), x, y, x * x, x * y, y * y]), dtype)
 
 
 def _shape_gradients(grid: Grid, exponents: Float[Array, "p u t"], values) -> list[Float[Array, "u t"]]:
     """Gradients by the shape columns, from moments of the exponent gradients over the pixels.
 
-    The exponent is s^2 + (r dy)^2 with s = p dx + q dy. The moments are those of s itself: computed from the moments of
-    dx and dy, they would cancel for needles.
+    The exponent is s^2 + (r dy)^2 with s = p dx + q dy. The moments are taken about the tile's center, by one matrix
+    product. There s is `center` + p X + q Y, which is small where a sample is drawn: the moments of s do not cancel,
+    however long and thin the Gaussian is.
     """
+    x, y = values[MEAN_X], values[MEAN_Y]
     p, q, r = values[FACTORS]
-    dx, dy = _offsets(grid, values)
-    across = p * dx + q * dy
-    rows, rows_s, rows_sdx = (_sum_rows(grid, exponents * weight) for weight in (1.0, across, across * dx))
-    dys = dy[:: grid.tile]  # one for each row
-    sum_s, sum_sdx = _total(rows_s), _total(rows_sdx)
-    sum_sdy = _total(row * dy for row, dy in zip(rows_s, dys, strict=True))
-    sum_dy = _total(row * dy for row, dy in zip(rows, dys, strict=True))
-    sum_dydy = _total(row * dy * dy for row, dy in zip(rows, dys, strict=True))
+    moments = jnp.einsum("mp,put->mut", _monomials(grid, exponents.dtype), exponents, precision="highest")
+    one, by_x, by_y, by_xx, by_xy, by_yy = moments
+    center = -(p * x + q * y)
+    sum_s = center * one + p * by_x + q * by_y
+    sum_sdx = center * by_x + p * by_xx + q * by_xy - x * sum_s
+    sum_sdy = center * by_y + p * by_xy + q * by_yy - y * sum_s
+    sum_dy = by_y - y * one
+    sum_dydy = by_yy - y * by_y - y * sum_dy
     return [
         -2.0 * p * sum_s,
         -2.0 * (q * sum_s + r * r * sum_dy),
         2.0 * sum_sdx,
         2.0 * sum_sdy,
         2.0 * r * sum_dydy,
-        -_total(rows),
+        -one,
     ]
