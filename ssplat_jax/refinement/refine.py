@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from ssplat_jax.errors import InputError
 from ssplat_jax.gaussians import Gaussians
@@ -25,9 +25,17 @@ from ssplat_jax.refinement.refine_step import (
     init_refinement,
     refine_step,
 )
+from ssplat_jax.refinement.seen_rows import may_be_seen
 
 PAIRS_MARGIN = 1.25
 """Capacity for tile intersections over what the fullest key view needs: Gaussians grow while they are refined."""
+
+
+ROWS_MARGIN = 1.05
+"""Capacity for rows over what the fullest key view may see."""
+
+ROWS_UNIT = 1 << 12
+"""Row capacities are multiples of this."""
 
 
 @dataclasses.dataclass
@@ -39,6 +47,7 @@ class Progress:
     losses: list[float] = dataclasses.field(default_factory=list)  # per step, on the pixels that are learned from
     held_back: list[float] = dataclasses.field(default_factory=list)  # per step, on the pixels that are not
     seconds: list[float] = dataclasses.field(default_factory=list)  # per step; the first of a process compiles
+    max_rows: int | None = None  # capacity for the rows that a view may see; None before the first step
 
     @property
     def num_steps(self) -> int:
@@ -118,18 +127,21 @@ def continue_refinement(
         config: learning rates and bounds.
     """
     config = config or RefineConfig()
+    if progress.max_rows is None:
+        progress.max_rows = row_capacity(progress.state.start, key_views)
     while progress.num_steps < steps and not has_stopped_helping(
         progress.held_back, _steps_per_round(key_views, config)
     ):
         start = time.perf_counter()
         rate = jnp.float32(config.final_rate ** (progress.num_steps / steps))
-        progress.state, report = _step(config, progress.max_pairs)(progress.state, key_views, rate)
+        progress.state, report = _step(config, progress.max_pairs, progress.max_rows)(progress.state, key_views, rate)
         progress.losses.append(float(report.loss))
         progress.held_back.append(float(report.held_back))
         progress.seconds.append(time.perf_counter() - start)
         if int(report.num_overflow):
             revised = apply_revision(progress.state.start, progress.state.revision)
             progress.max_pairs = _capacity(revised, key_views)
+            progress.max_rows = row_capacity(revised, key_views)
         yield
 
 
@@ -160,8 +172,8 @@ def has_stopped_helping(held_back: list[float], steps_per_round: int) -> bool:
 
 
 @functools.cache
-def _step(config: RefineConfig, max_pairs: int):
-    step = functools.partial(refine_step, config=config, max_pairs=max_pairs)
+def _step(config: RefineConfig, max_pairs: int, max_rows: int):
+    step = functools.partial(refine_step, config=config, max_pairs=max_pairs, max_rows=max_rows)
     return jax.jit(step, donate_argnums=0)
 
 
@@ -169,6 +181,18 @@ def _capacity(gaussians: Gaussians, key_views: KeyViews) -> int:
     """Capacity for tile intersections that every key view fits into."""
     counts = [int(render(gaussians, key_views.camera(i), effects=EFFECTS).num_pairs) for i in _spread(key_views)]
     return round_up(int(PAIRS_MARGIN * max(counts)))
+
+
+def row_capacity(gaussians: Gaussians, key_views: KeyViews) -> int:
+    """Capacity for the rows that a key view may see; all rows, if a view may see most of them."""
+    most = ROWS_MARGIN * int(_most_rows_seen(gaussians, key_views))
+    return min(gaussians.num_gaussians, ROWS_UNIT * -(-int(most) // ROWS_UNIT))
+
+
+@jax.jit
+def _most_rows_seen(gaussians: Gaussians, key_views: KeyViews) -> Int[Array, ""]:
+    num_seen = lambda view: jnp.sum(may_be_seen(gaussians, key_views.camera(view)), dtype=jnp.int32)  # noqa: E731
+    return jnp.max(jax.lax.map(num_seen, jnp.arange(key_views.num_slots)))
 
 
 def _spread(key_views: KeyViews, most: int = 8) -> list[int]:

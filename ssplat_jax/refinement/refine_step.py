@@ -10,6 +10,7 @@ from ssplat_jax.pytree import pytree, replace
 from ssplat_jax.rasterizer import Effects, fill_holes, render
 from ssplat_jax.refinement.key_views import KeyViews
 from ssplat_jax.refinement.refine_config import RefineConfig
+from ssplat_jax.refinement.seen_rows import put_rows, seen_rows, take_rows
 from ssplat_jax.refinement.view_revision import ViewRevision, ViewState, init_view_state, revised_view, step_view_state
 
 EFFECTS = Effects(outputs=("color", "alpha"))
@@ -52,7 +53,7 @@ class StepReport:
     loss: Float[Array, ""]  # weighted L1 error of the pixels that are learned from
     held_back: Float[Array, ""]  # the same error of the pixels that are not
     views: Int[Array, " b"]  # slots of the key views
-    num_overflow: Int[Array, ""]  # most of its views; tile intersections that found no space; see `render`
+    num_overflow: Int[Array, ""]  # most of its views; rows and tile intersections that found no space
 
 
 def init_refinement(
@@ -127,7 +128,13 @@ def _unit(quats: Float[Array, "n 4"]) -> Float[Array, "n 4"]:
 
 
 def refine_step(
-    state: RefineState, key_views: KeyViews, rate: Float[Array, ""], *, config: RefineConfig, max_pairs: int
+    state: RefineState,
+    key_views: KeyViews,
+    rate: Float[Array, ""],
+    *,
+    config: RefineConfig,
+    max_pairs: int,
+    max_rows: int | None = None,
 ) -> tuple[RefineState, StepReport]:
     """One step on `config.views_per_step` key views. A `lax.scan` body over `rate`; donate `state`.
 
@@ -137,6 +144,8 @@ def refine_step(
         rate: factor of all learning rates; 0 changes nothing but the moments.
         config: learning rates, weights and bounds (static).
         max_pairs: capacity for tile intersections (static); `StepReport.num_overflow` says what did not fit.
+        max_rows: capacity for the rows that a view may see (static): gradients are computed for them alone. By
+            default, and where it holds every row, nothing is selected.
 
     Returns:
         The state after the step, and what was measured before it.
@@ -144,30 +153,24 @@ def refine_step(
     places = state.num_steps * config.views_per_step + jnp.arange(config.views_per_step)
     views = jax.vmap(lambda place: next_view(place, key_views.valid, config.seed))(places)
 
-    revisions = (state.revision, None if state.views is None else state.views.revision)
+    current = apply_revision(state.start, state.revision)
 
-    def loss(revisions: tuple[Revision, ViewRevision | None], view: Int[Array, ""]):
-        revision, of_views = revisions
-        seen = key_views
-        if state.views is not None and of_views is not None:
-            seen = revised_view(state.views, of_views, key_views, view)
-        return view_loss(state.start, revision, seen, view, config, max_pairs)
+    def add_view(total, view: Int[Array, ""]):
+        gradient, measured = view_gradient(state, current, key_views, view, config, max_pairs, max_rows)
+        return jax.tree.map(jnp.add, total, gradient), measured
 
-    def add_view(gradient, view: Int[Array, ""]):
-        new, measured = jax.grad(loss, has_aux=True)(revisions, view)
-        return jax.tree.map(jnp.add, gradient, new), measured
-
+    zeros = jax.tree.map(jnp.zeros_like, _revisions(state))
     # A scan holds the intermediate arrays of one view at a time.
-    total, (losses, errors, overflows) = jax.lax.scan(add_view, jax.tree.map(jnp.zeros_like, revisions), views)
-    gradient, of_views = jax.tree.map(lambda x: x / config.views_per_step, total)
+    total, (losses, errors, overflows) = jax.lax.scan(add_view, zeros, views)
+    gradient, slopes_of_views = jax.tree.map(lambda x: x / config.views_per_step, total)
     report = StepReport(loss=jnp.mean(losses), held_back=jnp.mean(errors), views=views, num_overflow=jnp.max(overflows))
     is_finite = jnp.array(True)
-    for leaf in jax.tree.leaves((gradient, of_views)):
+    for leaf in jax.tree.leaves((gradient, slopes_of_views)):
         is_finite = is_finite & jnp.all(jnp.isfinite(leaf))
     is_finite = is_finite & jnp.isfinite(report.loss)
     moved = _adam(state, gradient, rate, config)
     if state.views is not None:
-        moved_views = step_view_state(state.views, of_views, views, key_views.valid, rate, config.effects)
+        moved_views = step_view_state(state.views, slopes_of_views, views, key_views.valid, rate, config.effects)
         moved = replace(moved, views=moved_views)
     keep = lambda new, old: jnp.where(is_finite, new, old)  # noqa: E731
     kept = jax.tree.map(keep, replace(moved, num_skipped=state.num_skipped), state)
@@ -177,6 +180,47 @@ def refine_step(
         num_skipped=state.num_skipped + (~is_finite).astype(jnp.int32),
     )
     return state, report
+
+
+def _revisions(state: RefineState) -> tuple[Revision, ViewRevision | None]:
+    """All that a step revises."""
+    return state.revision, None if state.views is None else state.views.revision
+
+
+def view_gradient(
+    state: RefineState,
+    current: Gaussians,
+    key_views: KeyViews,
+    view: Int[Array, ""],
+    config: RefineConfig,
+    max_pairs: int,
+    max_rows: int | None,
+):
+    """Gradient of `view_loss` by all that is revised, and what `view_loss` measures; `current` is the revised scene.
+
+    With `max_rows`, only the rows that the view may see are projected; the others have a gradient of zero.
+    """
+    background = mean_color(current)
+
+    def loss(revisions: tuple[Revision, ViewRevision | None], start: Gaussians):
+        revision, of_views = revisions
+        seen = key_views
+        if state.views is not None and of_views is not None:
+            seen = revised_view(state.views, of_views, key_views, view)
+        return view_loss(start, revision, background, seen, view, config, max_pairs)
+
+    slopes = jax.grad(loss, has_aux=True)
+    revision, of_views = _revisions(state)
+    if max_rows is None or max_rows >= state.start.num_gaussians:
+        return slopes((revision, of_views), state.start)
+    if state.views is not None:
+        key_views = revised_view(state.views, state.views.revision, key_views, view)
+    selection = seen_rows(current, key_views.camera(view), max_rows)
+    start, revision = take_rows((state.start, revision), selection)
+    start = replace(start, opacities=jnp.where(selection.is_row, start.opacities, 0.0))
+    (gradient, of_views), (value, error, num_overflow) = slopes((revision, of_views), start)
+    num_overflow = jnp.maximum(num_overflow, selection.num_overflow)
+    return (put_rows(gradient, selection), of_views), (value, error, num_overflow)
 
 
 def next_view(place: Int[Array, ""], valid: Bool[Array, " v"], seed: int) -> Int[Array, ""]:
@@ -201,12 +245,13 @@ def held_back_pixels(size: tuple[int, int], view: Int[Array, ""], config: Refine
 def view_loss(
     start: Gaussians,
     revision: Revision,
+    background: Float[Array, "3"],
     key_views: KeyViews,
     view: Int[Array, ""],
     config: RefineConfig,
     max_pairs: int,
 ) -> tuple[Float[Array, ""], tuple[Float[Array, ""], Float[Array, ""], Int[Array, ""]]]:
-    """L1 error of one key view at its exposure, with holes filled and over black.
+    """L1 error of one key view at its exposure, with holes filled by `background` and over black.
 
     Returns:
         The loss, and the loss again, the error of the held-back pixels, and the tile intersections that did not fit.
@@ -216,7 +261,7 @@ def view_loss(
     gaussians = apply_revision(start, revision)
     out = render(gaussians, key_views.camera(view), effects=EFFECTS, max_pairs=max_pairs)
     assert out.color is not None and out.alpha is not None
-    filled = fill_holes(out.color, out.alpha, jax.lax.stop_gradient(mean_color(gaussians)))
+    filled = fill_holes(out.color, out.alpha, background)
     target = key_views.images[view].astype(jnp.float32) / 255
     exposure = key_views.exposures[view]
     errors = config.shown_weight * jnp.abs(filled * exposure - target)

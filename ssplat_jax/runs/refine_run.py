@@ -165,7 +165,7 @@ def _save(folder: RunFolder, progress: Progress, identity: dict) -> None:
         for name, leaf in vars(getattr(state, part)).items()
     }
     arrays |= {name: np.asarray(getattr(state, name)) for name in ("num_steps", "num_skipped")}
-    measured = {name: getattr(progress, name) for name in ("max_pairs", "losses", "held_back", "seconds")}
+    measured = {name: getattr(progress, name) for name in ("max_pairs", "max_rows", "losses", "held_back", "seconds")}
     save_arrays(folder.refinement_state, arrays, KIND, {"identity": identity, "measured": measured})
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from ssplat_jax.errors import InputError
+from ssplat_jax.gaussians import mean_color
 from ssplat_jax.metrics.psnr_ssim import psnr
 from ssplat_jax.pytree import replace
 from ssplat_jax.rasterizer import render
@@ -78,7 +79,7 @@ def test_gradient_of_a_pose_is_the_central_difference(entry):
     def loss(poses):
         moved = ViewRevision(poses=poses, log_focal=None, log_exposures=None)
         seen = revised_view(of_views, moved, views, jnp.int32(1))
-        return view_loss(state.start, state.revision, seen, jnp.int32(1), config, MAX_PAIRS)[0]
+        return view_loss(state.start, state.revision, mean_color(state.start), seen, jnp.int32(1), config, MAX_PAIRS)[0]
 
     poses, width = jnp.zeros((NUM_VIEWS, 6)), 2e-3
     slope = float(jax.grad(loss)(poses)[1, entry])

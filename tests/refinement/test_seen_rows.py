@@ -1,0 +1,119 @@
+"""The rows that a view may see: none that is drawn is missing, and a step on them alone is the step on all."""
+
+import dataclasses
+import importlib
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ssplat_jax.gaussians import Gaussians
+from ssplat_jax.geometry.cameras import Camera
+from ssplat_jax.pytree import replace
+from ssplat_jax.rasterizer.effects import Effects
+from ssplat_jax.rasterizer.render import RenderInputs, prepare, tile_grid_of
+from ssplat_jax.rasterizer.tile_grid import tile_boxes
+from ssplat_jax.refinement import RefineConfig, RefineEffects, init_refinement, refine, refine_step
+from ssplat_jax.refinement.seen_rows import may_be_seen, put_rows, select_rows, take_rows
+from tests.refinement.test_refine import CONFIG, MAX_PAIRS, NUM, cameras, doubtful, key_views, photographs
+
+host = importlib.import_module("ssplat_jax.refinement.refine")
+
+
+def wide() -> Gaussians:
+    """`doubtful`, every other row of which stands outside all views or behind them."""
+    given = doubtful()
+    aside = jnp.asarray([[30.0, 0, 3], [0, -20, 3], [0, 0, -3]])[jnp.arange(NUM) % 3]
+    return replace(given, means=jnp.where(jnp.arange(NUM)[:, None] % 2 > 0, given.means, aside))
+
+
+@pytest.mark.parametrize("antialias", ["mip", "classic"])
+def test_no_row_that_is_drawn_is_missing(antialias):
+    """20,000 Gaussians of all sizes and places: before, behind and beside the camera, across the near plane."""
+    random, num = np.random.default_rng(0), 20_000
+    single = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
+    gaussians = Gaussians(
+        means=single(random.uniform(-1, 1, (num, 3)) * np.exp(random.uniform(-4, 2, (num, 1)))),
+        quats=single(random.normal(size=(num, 4))),
+        scales=single(np.exp(random.uniform(-8, 0, (num, 1)) + random.normal(0, 1, (num, 3)))),
+        opacities=single(np.where(random.random(num) < 0.1, 0, random.uniform(0, 1, num))),
+        sh=jnp.zeros((num, 1, 3)),
+    )
+    K = single([[90, 0, 25], [0, -70, 60], [0, 0, 1]])
+    for focal in (1.0, 0.3, 4.0):
+        scale = jnp.array([[focal, 1, 1], [1, focal, 1], [1, 1, 1]], jnp.float32)
+        camera = Camera(viewmats=cameras().viewmats[1], Ks=K * scale, width=96, height=64)
+        _, flat, splats, _ = prepare(RenderInputs(gaussians, camera), Effects(antialias=antialias))
+        boxes = tile_boxes(splats.means2d, splats.radii, tile_grid_of(flat, 8))
+        is_drawn = np.asarray(splats.visible & (boxes[2] * boxes[3] > 0))[0]
+        is_seen = np.asarray(may_be_seen(gaussians, camera))
+        assert is_drawn.sum() > 1000 and not (is_drawn & ~is_seen).any()
+        assert is_seen.sum() < 1.4 * is_drawn.sum()
+
+
+def test_rows_that_cannot_be_seen_are_left_out():
+    row = lambda **changes: jax.tree.map(lambda x: x[:1], replace(doubtful(), **changes))  # noqa: E731
+    good = {"means": jnp.tile(jnp.array([[0.0, 0, 2]]), (NUM, 1)), "opacities": jnp.ones(NUM)}
+    assert may_be_seen(row(**good), cameras()[0])[0]
+    for changes in (
+        {"means": good["means"] * -1},
+        {"means": good["means"] + jnp.array([[50.0, 0, 0]])},
+        {"means": good["means"] * jnp.nan},
+        {"opacities": jnp.zeros(NUM)},
+    ):
+        assert not may_be_seen(row(**{**good, **changes}), cameras()[0])[0]
+
+
+@pytest.mark.parametrize("max_rows", [3, 4, 9])
+def test_selected_rows_come_back_to_their_places(max_rows):
+    is_seen = jnp.array([False, True, True, False, True, True, False])
+    values = {"a": jnp.arange(1.0, 8), "b": jnp.arange(1.0, 15).reshape(7, 2)}
+    selection = select_rows(is_seen, max_rows)
+    kept = np.flatnonzero(is_seen)[:max_rows]
+    taken, back = take_rows(values, selection), put_rows(take_rows(values, selection), selection)
+    assert int(selection.num_overflow) == max(4 - max_rows, 0)
+    np.testing.assert_array_equal(selection.is_row, np.arange(max_rows) < 4)
+    for name, given in values.items():
+        np.testing.assert_array_equal(taken[name][: len(kept)], given[kept])
+        wanted = np.zeros_like(given)
+        wanted[kept] = given[kept]
+        np.testing.assert_array_equal(back[name], wanted)
+
+
+@pytest.mark.parametrize("effects", [RefineEffects(), RefineEffects(poses=True, exposures=True)])
+def test_a_step_on_seen_rows_is_the_step_on_all(effects):
+    """A row that is not seen has moments of exactly zero; rows that do not fit are counted."""
+    config, views = dataclasses.replace(CONFIG, effects=effects, shown_weight=0.7), key_views()
+    step = jax.jit(refine_step, static_argnames=("config", "max_pairs", "max_rows"))
+    seen = jnp.stack([may_be_seen(wide(), cameras()[i]) for i in range(4)])
+    tight = int(jnp.max(jnp.sum(seen, axis=1)))
+    assert tight < NUM / 2
+    given = {"config": config, "max_pairs": MAX_PAIRS}
+    wanted, all_rows = step(init_refinement(wide(), views, config), views, jnp.float32(1), **given)
+    got, report = step(init_refinement(wide(), views, config), views, jnp.float32(1), **given, max_rows=tight)
+    assert int(report.num_overflow) == 0
+    assert float(report.loss) == pytest.approx(float(all_rows.loss), rel=1e-6)
+    for a, b in zip(jax.tree.leaves(got.first_moment), jax.tree.leaves(wanted.first_moment), strict=True):
+        assert np.abs(b).max() > 0
+        np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5 * np.abs(b).max())
+        assert not np.asarray(a)[~np.asarray(seen).any(axis=0)].any()
+    if wanted.views is not None:
+        slopes = got.views.first_moment, wanted.views.first_moment
+        for a, b in zip(*map(jax.tree.leaves, slopes), strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-5 * np.abs(b).max())
+    _, report = step(init_refinement(doubtful(), views, config), views, jnp.float32(1), **given, max_rows=tight)
+    assert int(report.num_overflow) > 0
+
+
+def test_refine_chooses_a_capacity_that_holds_every_view(monkeypatch):
+    """The refined scene does not depend on it."""
+    config = RefineConfig(held_back=0.0)
+    wanted, _ = refine(wide(), cameras(), photographs(), steps=3, config=config)
+    monkeypatch.setattr(host, "ROWS_UNIT", 1)
+    seen = max(int(jnp.sum(may_be_seen(wide(), cameras()[i]))) for i in range(4))
+    assert seen <= host.row_capacity(wide(), key_views()) <= 1.06 * seen < NUM
+    got, report = refine(wide(), cameras(), photographs(), steps=3, config=config)
+    assert report.num_skipped == 0
+    for a, b in zip(jax.tree.leaves(got), jax.tree.leaves(wanted), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-3, atol=2e-4)
