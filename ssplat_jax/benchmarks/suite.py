@@ -13,6 +13,7 @@ import jax.numpy as jnp
 
 from ssplat_jax.benchmarks.cache_benchmark import Row, bench_cache
 from ssplat_jax.benchmarks.rasterizer_benchmark import bench_render
+from ssplat_jax.benchmarks.refine_benchmark import bench_refine
 from ssplat_jax.checkpoint.weights import load_params
 from ssplat_jax.chunk import Chunk
 from ssplat_jax.config import preset
@@ -31,21 +32,24 @@ def run_benchmark(
     """The figures of a benchmark.
 
     Args:
-        name: `render` or `stream`.
-        against, scaling, full_hd: for `render`; see `bench_render`.
+        name: `render`, `refine` or `stream`.
+        against: for `render` a rasterizer's file, see `bench_render`; for `refine` a checkout, see `bench_refine`.
+        scaling, full_hd: for `render`; see `bench_render`.
 
     Returns:
         The machine, and rows of name, value and unit.
 
     Raises:
-        InputError: `name` is no benchmark, or the file `against` cannot be timed.
+        InputError: `name` is no benchmark, or `against` cannot be timed.
     """
     if name == "render":
         rows = bench_render(against, scaling=scaling, full_hd=full_hd)
+    elif name == "refine":
+        rows = bench_refine(against)
     elif name == "stream":
         rows = [dataclasses.asdict(row) for row in (*bench_cache(preset("tiny")), *bench_step())]
     else:
-        raise InputError(f"bench: wanted render or stream, got {name!r}; choose one of them.")
+        raise InputError(f"bench: wanted render, refine or stream, got {name!r}; choose one of them.")
     device = jax.devices()[0]
     machine = f"{platform.machine()} {device.platform} {device.device_kind}, jax {jax.__version__}"
     return {"machine": machine, "rows": rows}

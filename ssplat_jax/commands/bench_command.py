@@ -14,13 +14,14 @@ class Bench:
     Example: ssplat bench render --json render.json
     """
 
-    name: Annotated[Literal["render", "stream"], tyro.conf.Positional]
-    """render: the rasterizer. stream: the cache's fuse and projection over long streams."""
+    name: Annotated[Literal["render", "refine", "stream"], tyro.conf.Positional]
+    """render: the rasterizer. refine: a step of refinement on a large scene. stream: the cache's fuse and projection
+    over long streams."""
     json: Path | None = None
     """Write {machine, rows: [{name, value, unit}]} here as well."""
     against: Path | None = None
-    """render only: another rasterizer's Python file, timed in the same run: one with the functions that
-    docs/performance.md names, as experiments/gsplat_rasterizer.py has them."""
+    """Timed in the same run. render: another rasterizer's Python file, with the functions that docs/performance.md
+    names, as experiments/gsplat_rasterizer.py has them. refine: the root of another checkout of this package."""
     scaling: bool = False
     """render only: also 4k to 1M Gaussians, at four image sizes."""
     full_hd: bool = False
