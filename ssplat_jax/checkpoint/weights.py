@@ -1,5 +1,6 @@
 """Weights files: parameters by path, stored as float16 (imported ones as float32) and loaded as float32."""
 
+import dataclasses
 import hashlib
 from collections.abc import Mapping
 from importlib import resources
@@ -55,6 +56,28 @@ def load_weights(path: Path) -> tuple[dict, StreamConfig]:
     return _restore(path, arrays, config), config
 
 
+@dataclasses.dataclass(frozen=True)
+class WeightsFacts:
+    """A weights file without its parameters."""
+
+    config: StreamConfig
+    provenance: dict  # JSON facts about the training, as `save_weights` got them
+    num_bytes: int  # of the file
+
+
+def describe_weights(name: str) -> WeightsFacts:
+    """Facts about the weights that ship with the preset `name`, or about the weights file `name`.
+
+    Raises:
+        InputError: there is no such preset or file, or no weights ship with the preset.
+        StorageError: the file is damaged.
+    """
+    with resources.as_file(_source(name)) as path:
+        _, header = load_arrays(path, KIND)
+        config = preset(name) if name in PRESETS else config_from_header(header["config"])
+        return WeightsFacts(config, dict(header.get("provenance") or {}), path.stat().st_size)
+
+
 def load_params(name: str = "tiny") -> dict:
     """Returns trained parameters: those shipped with the preset `name`, or those of the weights file `name`.
 
@@ -63,19 +86,25 @@ def load_params(name: str = "tiny") -> dict:
         StorageError: the file is damaged.
     """
     if name not in PRESETS:
+        return load_weights(Path(str(_source(name))))[0]
+    with resources.as_file(_source(name)) as path:
+        arrays, _ = load_arrays(path, KIND)
+        return _restore(path, arrays, preset(name))
+
+
+def _source(name: str) -> Traversable:
+    """The file of the weights `name`; see `load_params`."""
+    if name not in PRESETS:
         if not Path(name).is_file():
             known = ", ".join(preset for preset in sorted(PRESETS) if _shipped(preset).is_file())
             raise InputError(f"weights: wanted a preset with shipped weights ({known}) or a file, got {name!r}.")
-        return load_weights(Path(name))[0]
-    shipped = _shipped(name)
-    if not shipped.is_file():
+        return Path(name)
+    if not (shipped := _shipped(name)).is_file():
         raise InputError(
             f"weights: none ship with the preset {name!r}; convert ReSplat's (ssplat import-weights) or train"
             f" (ssplat train --preset {name}), and give the file."
         )
-    with resources.as_file(shipped) as path:
-        arrays, _ = load_arrays(path, KIND)
-        return _restore(path, arrays, preset(name))
+    return shipped
 
 
 def _shipped(preset_name: str) -> Traversable:

@@ -26,6 +26,7 @@ from ssplat_jax.commands.run_command import Run
 from ssplat_jax.commands.train_command import Train
 from ssplat_jax.commands.usage import check_usage, parse_in_one_line
 from ssplat_jax.commands.view_command import View
+from ssplat_jax.commands.weights_command import Weights
 from ssplat_jax.commands.worlds_command import Worlds
 from ssplat_jax.errors import CacheError, InputError, StorageError
 
@@ -42,6 +43,7 @@ COMMANDS = {
     "render": Render,
     "view": View,
     "import-weights": ImportWeights,
+    "weights": Weights,
     "bench": Bench,
     "experiment": Experiment,
     "worlds": Worlds,

@@ -153,6 +153,7 @@ def command_lines(folder: Path) -> dict[str, tuple[str, ...]]:
         "render": (str(run), room, "--out", "{out}"),
         "view": (str(run), "--port", "8931"),
         "import-weights": (str(folder / "published.npz"), "--out", "{out}.npz"),
+        "weights": ("tiny",),
         "bench": ("render",),
         "experiment": ("accuracy_vs_time", "--out", "{out}"),
         "worlds": ("--out", "{out}", "--count", "4"),

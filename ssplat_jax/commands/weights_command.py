@@ -1,0 +1,49 @@
+"""`ssplat weights`: what is in a weights file, and how far training moved each stage."""
+
+import dataclasses
+from typing import Annotated
+
+import tyro
+
+
+@dataclasses.dataclass(frozen=True)
+class Weights:
+    """Show a weights file: its training, and for each stage the distance from its random start.
+
+    distance is |weights - start| / |start|. turn is the sine of the angle between both: a stage that weight decay alone
+    has changed is shorter but not turned.
+
+    Example: ssplat weights tiny
+    """
+
+    name: Annotated[str, tyro.conf.Positional]
+    """Preset with shipped weights, or a weights file."""
+
+    def run(self) -> int:
+        from ssplat_jax.checkpoint.stage_changes import stage_changes, start_of
+        from ssplat_jax.checkpoint.weights import describe_weights, load_params
+
+        params = load_params(self.name)
+        facts = describe_weights(self.name)
+        print(
+            f"{self.name}: preset {facts.config.preset!r}, {facts.num_bytes / 1e6:.1f} MB{_training(facts.provenance)}"
+        )
+        if "imported_from" in facts.provenance:
+            print("imported weights have no random start to compare with")
+            return 0
+        print(f"{'stage':<12}{'parameters':>12}{'distance':>10}{'turn':>8}")
+        for change in stage_changes(params, start_of(facts.config, facts.provenance)):
+            print(f"{change.name:<12}{change.num_params:>12,}{change.distance:>10.3f}{change.turn:>8.3f}")
+        return 0
+
+
+def _training(provenance: dict) -> str:
+    """The training in words, as far as the file tells it."""
+    words = []
+    if "steps" in provenance:
+        words.append(f"{provenance['steps']} steps")
+    if provenance.get("init_weights"):
+        words.append(f"from {provenance['init_weights']}")
+    if "imported_from" in provenance:
+        words.append(f"imported from {provenance['imported_from']}")
+    return ", " + " ".join(words) if words else ""
