@@ -15,7 +15,7 @@ from tests.streaming.narrow_model import NARROW
 
 def test_decay_shortens_and_learning_turns():
     rng = np.random.default_rng(0)
-    start = {"a": {"w": rng.normal(size=(7, 3)), "b": rng.normal(size=5)}, "b": rng.normal(size=4), "none": {}}
+    start = {"a": {"w": rng.normal(size=(7, 3)), "b": rng.normal(size=5)}, "b": {"w": rng.normal(size=4)}, "none": {}}
     # A vector of the start's length, perpendicular to it over both leaves of the stage.
     across = {"w": rng.normal(size=(7, 3)), "b": rng.normal(size=5)}
     length2 = sum(np.sum(x**2) for x in start["a"].values())
@@ -24,14 +24,15 @@ def test_decay_shortens_and_learning_turns():
     scale = math.sqrt(length2 / sum(np.sum(x**2) for x in across.values()))
     angle = 0.3
     turned = {n: math.cos(angle) * start["a"][n] + math.sin(angle) * scale * across[n] for n in across}
-    learned, decayed = stage_changes({"a": turned, "b": 0.9 * start["b"], "none": {}}, start)
+    params = {"a": turned, "b": {"w": 0.9 * start["b"]["w"]}, "none": {}}
+    learned, decayed = stage_changes(params, start)
     assert (learned.name, learned.num_params, decayed.name, decayed.num_params) == ("a", 26, "b", 4)
     assert learned.distance == pytest.approx(2 * math.sin(angle / 2)) and learned.turn == pytest.approx(math.sin(angle))
     assert decayed.distance == pytest.approx(0.1) and decayed.turn == pytest.approx(0, abs=1e-12)
 
 
 def test_a_stage_that_starts_at_zero():
-    zero, one = {"a": np.zeros(3)}, {"a": np.ones(3)}
+    zero, one = {"a": {"w": np.zeros(3)}}, {"a": {"w": np.ones(3)}}
     assert [(c.distance, c.turn) for c in stage_changes(zero, zero)] == [(0, 0)]
     assert [(c.distance, c.turn) for c in stage_changes(one, zero)] == [(math.inf, 1)]
     assert [(c.distance, c.turn) for c in stage_changes(zero, one)] == [(1, 0)]  # none of it is left
