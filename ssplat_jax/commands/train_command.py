@@ -1,4 +1,4 @@
-"""`ssplat train`: training on procedural scenes."""
+"""`ssplat train`: training on procedural scenes and captures."""
 
 import dataclasses
 import sys
@@ -7,7 +7,7 @@ from typing import Literal
 
 from ssplat_jax.commands.options import ConfigChanges, LpipsHeads, QuietOption, apply_changes, load_lpips_weights
 from ssplat_jax.config import preset
-from ssplat_jax.errors import require_positive
+from ssplat_jax.errors import InputError, require_positive
 
 MINUTES = {"tiny": 77, "stream": 15}
 """Time of recipes on two cores (docs/model_card.md)."""
@@ -15,7 +15,7 @@ MINUTES = {"tiny": 77, "stream": 15}
 
 @dataclasses.dataclass(frozen=True)
 class Train:
-    """Train the network on procedural scenes. Saves regularly and on Ctrl-C, and continues a stopped training.
+    """Train the network on procedural scenes and captures. Saves regularly and on Ctrl-C, and continues.
 
     Example: ssplat train --out runs/tiny
     """
@@ -33,6 +33,12 @@ class Train:
     """Seed of the initial parameters and of the scenes."""
     init_weights: Path | None = None
     """Start from a weights file instead of from random parameters."""
+    captures: tuple[Path, ...] = ()
+    """Captures to learn from too, or folders of captures as ssplat worlds writes. Every 8th frame is held out."""
+    shares: tuple[float, ...] = ()
+    """Share of the steps of each of --captures; the rest is procedural. Default: half of the steps, equally."""
+    validate_every: int = 200
+    """Steps between scores of held-out frames of --captures, in the log."""
     lpips_vgg: Path | None = None
     """torchvision's vgg16 state dict (.pth or .npz): with --lpips-heads, the rendering loss is MSE + 0.05 LPIPS."""
     lpips_heads: LpipsHeads = None
@@ -47,13 +53,14 @@ class Train:
         from ssplat_jax.train.loop import train
         from ssplat_jax.train.recipe import RECIPES
 
-        require_positive(scale_steps=self.scale_steps, save_every=self.save_every)
+        require_positive(scale_steps=self.scale_steps, save_every=self.save_every, validate_every=self.validate_every)
         config = apply_changes(preset(self.preset), self.set)
         recipe = dataclasses.replace(RECIPES[self.recipe].scaled(self.scale_steps), seed=self.seed)
         params = None
         if self.init_weights:
             params = load_weights(self.init_weights)[0]
             check_params(params, config, str(self.init_weights))
+        recipe, mix = self._opened(config, recipe)
         lpips_weights = load_lpips_weights(self.lpips_vgg, self.lpips_heads)
         reporter = Reporter(self.quiet)
         duration = ""
@@ -67,8 +74,10 @@ class Train:
                 recipe,
                 self.out,
                 params=params,
+                mix=mix,
                 lpips_weights=lpips_weights,
                 save_every=self.save_every,
+                validate_every=self.validate_every,
                 report=lambda record: advance(record["step"], _describe_record(record)),
                 warn=reporter.warn,
             )
@@ -79,6 +88,7 @@ class Train:
             "recipe": dataclasses.asdict(recipe),
             "steps": result.step,
             "init_weights": self.init_weights and self.init_weights.name,
+            "captures": {group.name: group.share for group in mix.groups} if mix else {},
             "rendering_loss": "MSE + 0.05 LPIPS" if lpips_weights else "MSE + image gradients",
         }
         save_weights(self.out / "weights.npz", result.state.ema, config, provenance)
@@ -86,8 +96,24 @@ class Train:
         reporter.say(f"next: `ssplat run CAPTURE --weights {self.out}/weights.npz --out runs/mine` streams with them")
         return 0
 
+    def _opened(self, config, recipe):
+        """The recipe and the captures to learn from, None without --captures."""
+        from ssplat_jax.train.capture_samples import open_mix
+
+        if not self.captures:
+            if self.shares:
+                raise InputError("--shares: wanted --captures beside it, which it divides; got none.")
+            return recipe, None
+        return dataclasses.replace(recipe, fit_gains=True), open_mix(self.captures, self.shares, config, recipe)
+
 
 def _describe_record(record: dict) -> str:
     """Numbers of a training record that fit beside a progress bar."""
-    shown = {"loss": "loss", "depth_l1": "depth", "psnr": "psnr", "accepted": "accepted"}
+    shown = {
+        "validation_psnr": "held-out psnr",
+        "loss": "loss",
+        "depth_l1": "depth",
+        "psnr": "psnr",
+        "accepted": "accepted",
+    }
     return "  ".join(f"{label} {record[name]:.3f}" for name, label in shown.items() if name in record)

@@ -17,9 +17,12 @@ from ssplat_jax.storage.folder_lock import lock_folder
 from ssplat_jax.storage.interrupts import Interrupts
 from ssplat_jax.storage.json_files import json_text
 from ssplat_jax.streaming.streamsplat import StreamSplat
+from ssplat_jax.train.capture_samples import CaptureMix
 from ssplat_jax.train.recipe import Recipe, training_config, with_defaults
-from ssplat_jax.train.samples import prefetched, sample_for_step
+from ssplat_jax.train.samples import prefetched
 from ssplat_jax.train.step import Trainer, TrainState, init_state, learning_rate
+from ssplat_jax.train.step_samples import sample_for_step
+from ssplat_jax.train.validation import Validation
 
 LOG_FILE = "log.jsonl"
 """Name of the log in the output directory: one JSON object per line."""
@@ -40,8 +43,10 @@ def train(
     out: Path,
     *,
     params: dict | None = None,
+    mix: CaptureMix | None = None,
     lpips_weights: LpipsWeights | None = None,
     save_every: int = 200,
+    validate_every: int = 200,
     log_every: int = 10,
     report: Callable[[dict], None] = lambda record: None,
     warn: Callable[[str], None] = warnings.warn,
@@ -53,8 +58,10 @@ def train(
         recipe: phases, optimizer and loss.
         out: directory of `log.jsonl`, `recipe.json` and `checkpoints/`.
         params: initial parameters; default random ones from the recipe's seed. Ignored when a run is resumed.
+        mix: captures to learn from, beside procedural scenes.
         lpips_weights: weights of LPIPS, which the rendering loss then includes.
         save_every: steps between checkpoints. SIGINT and SIGTERM save one too.
+        validate_every: steps between records of the scores of held-out frames of the captures.
         log_every: steps between log records, which hold means over these steps.
         report: called with every log record.
         warn: called with a message for each damaged checkpoint.
@@ -68,22 +75,36 @@ def train(
     """
     model = StreamSplat(training_config(config, recipe))
     with lock_folder(out):
-        description = describe_run(model.config, recipe, has_lpips=lpips_weights is not None)
+        description = describe_run(model.config, recipe, has_lpips=lpips_weights is not None, mix=mix)
         checkpoints = TrainingCheckpoints(out, description, upgrade=upgrade_description)
         try:
             state, start = init_state(model, recipe, params), 0
             if (restored := checkpoints.restore_latest(state, warn)) is not None:
                 start, state = restored
             log = _Log(out / LOG_FILE, recipe, report)
-            return _run(model, recipe, state, start, lpips_weights, checkpoints, log, save_every, log_every)
+            every = _Every(save_every, log_every, validate_every)
+            return _run(model, recipe, state, start, mix, lpips_weights, checkpoints, log, every)
         finally:
             checkpoints.close()
 
 
-def describe_run(config: StreamConfig, recipe: Recipe, *, has_lpips: bool) -> dict:
+@dataclasses.dataclass(frozen=True)
+class _Every:
+    """Steps between events of the loop."""
+
+    save: int
+    log: int
+    validate: int
+
+
+def describe_run(config: StreamConfig, recipe: Recipe, *, has_lpips: bool, mix: CaptureMix | None = None) -> dict:
     """Facts that determine the weights of a run; a run with another description is not resumed."""
     description: dict = {"config": config.to_dict(), "recipe": dataclasses.asdict(recipe)}
-    return description | ({"rendering_loss": f"MSE + {recipe.lpips_weight} LPIPS"} if has_lpips else {})
+    if has_lpips:
+        description["rendering_loss"] = f"MSE + {recipe.lpips_weight} LPIPS"
+    if mix is not None:
+        description["captures"] = mix.describe()
+    return description
 
 
 def upgrade_description(description: dict) -> dict:
@@ -92,28 +113,31 @@ def upgrade_description(description: dict) -> dict:
     return description | {"config": config, "recipe": with_defaults(description.get("recipe", {}))}
 
 
-def _run(model, recipe, state, start, lpips_weights, checkpoints, log, save_every, log_every) -> TrainResult:
+def _run(model, recipe, state, start, mix, lpips_weights, checkpoints, log, every: _Every) -> TrainResult:
     """Steps from `start` to the end of the recipe or to a signal."""
     trainer, interrupts = Trainer(model, recipe), Interrupts(has_work=False)
+    validation = None if mix is None else Validation(model, recipe, mix, lpips_weights)
     step, stopped = start, None
-    samples = prefetched(lambda i: sample_for_step(i, recipe, model.config), iter(range(start, recipe.num_steps)))
+    samples = prefetched(lambda i: sample_for_step(i, recipe, model.config, mix), iter(range(start, recipe.num_steps)))
     with interrupts:
         try:
             before = time.perf_counter()
             for i, sample in samples:
                 waited = time.perf_counter() - before
                 rate = jnp.asarray(learning_rate(recipe, i), jnp.float32)
-                form = recipe.phase_at(i)[0].form
-                state, metrics = trainer.step(state, sample, rate, form=form, lpips_weights=lpips_weights)
+                phase = recipe.phase_at(i)[0]
+                state, metrics = trainer.step(state, sample, rate, form=phase.form, lpips_weights=lpips_weights)
                 interrupts.has_work = True
                 log.add(metrics, waited)
                 step = i + 1
                 is_last = step == recipe.num_steps
-                if step % log_every == 0 or is_last:
+                if step % every.log == 0 or is_last:
                     jax.block_until_ready(metrics)  # steps are dispatched asynchronously
                     log.write(step, state)
+                if validation is not None and (step % every.validate == 0 or is_last):
+                    log.write_scores(step, validation.scores(state.ema, phase))
                 stopped = interrupts.received  # read once, since a signal may arrive at any time
-                if step % save_every == 0 or is_last or stopped:
+                if step % every.save == 0 or is_last or stopped:
                     checkpoints.save(step, state)
                 if stopped:
                     break
@@ -154,7 +178,17 @@ class _Log:
             "seconds_per_step": round(elapsed / len(self._metrics), 4),
             "data_share": round(self._waited / elapsed, 4),
         }
+        self._append(record)
+        self._start()
+
+    def write_scores(self, step: int, scores: dict[str, float]) -> None:
+        """Writes and reports the scores of held-out frames, if there are any, as a record of their own."""
+        if scores:
+            rounded = {name: round(value, 4) for name, value in scores.items()}
+            self._append({"step": step, "phase": self._recipe.phase_at(step - 1)[0].name, **rounded})
+        self._since = time.perf_counter() if not self._metrics else self._since
+
+    def _append(self, record: dict) -> None:
         with self._path.open("a") as file:
             file.write(json_text(record, indent=None) + "\n")
         self._report(record)
-        self._start()

@@ -71,6 +71,10 @@ def image_gradient_l1(a: Float[Array, "s h w 3"], b: Float[Array, "s h w 3"]) ->
     return horizontal + vertical
 
 
+MAX_GAIN = 2.0
+"""Largest gain between a scene and a photograph that training divides out; its reciprocal is the smallest."""
+
+
 class RenderingLoss(NamedTuple):
     """Loss of rendered views, and its parts."""
 
@@ -102,3 +106,17 @@ def rendering_loss(
         return RenderingLoss(num_views * total, mse, None)
     distance = lpips(lpips_weights, images, targets).mean()
     return RenderingLoss(num_views * (mse + recipe.lpips_weight * distance), mse, distance)
+
+
+def fitted_gains(images: Float[Array, "s h w 3"], targets: Float[Array, "s h w 3"]) -> Float[Array, "s 1 1 3"]:
+    """Gain per view and channel with which an image is nearest to its target; not differentiated.
+
+    Photographs have exposures of their own, which a scene of one exposure cannot show and should not learn to.
+
+    Limits:
+        Gains stay in [1 / MAX_GAIN, MAX_GAIN]; of a black image the gain is 1.
+    """
+    images, targets = jax.lax.stop_gradient((images, targets))
+    energy = jnp.sum(images * images, axis=(1, 2), keepdims=True)
+    gains = jnp.sum(images * targets, axis=(1, 2), keepdims=True) / jnp.where(energy > 0, energy, 1.0)
+    return jnp.where(energy > 0, jnp.clip(gains, 1 / MAX_GAIN, MAX_GAIN), 1.0)

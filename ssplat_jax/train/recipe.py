@@ -100,6 +100,9 @@ class Recipe:
     them, as in evaluation; alone, that would make all surfaces translucent, since holes would cost nothing."""
     sum_views: bool = False
     """Adds up the rendering losses of a sample's target views (the paper) instead of taking their mean."""
+    fit_gains: bool = False
+    """Compares each target view at the gain per channel with which the rendered one is nearest to it (ours):
+    photographs differ in exposure. `ssplat train --captures` sets it."""
     range_jitter: float = 0.25
     """Largest error of scene scale, near and far in samples (log of a factor), for robustness to estimated ones."""
     recompute: bool = False

@@ -6,7 +6,7 @@ from collections.abc import Callable, Generator, Iterator
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from ssplat_jax.chunk import Chunk
 from ssplat_jax.config import StreamConfig
@@ -88,6 +88,45 @@ def make_sample(
     near = NEAR_FACTOR * low * np.exp(rng.uniform(-range_jitter, range_jitter))
     far = FAR_FACTOR * high * np.exp(rng.uniform(-range_jitter, range_jitter))
 
+    return sample_of_views(
+        images=images,
+        depths=depths,
+        viewmats=viewmats,
+        Ks=Ks,
+        context=context,
+        targets=np.flatnonzero(is_target),
+        near=near,
+        far=far,
+        config=config,
+    )
+
+
+def sample_of_views(
+    *,
+    images: Float[np.ndarray, "n h w 3"],
+    depths: Float[np.ndarray, "n h w"],
+    viewmats: Float[np.ndarray, "n 4 4"],
+    Ks: Float[np.ndarray, "n 3 3"],
+    context: Int[np.ndarray, " m"],
+    targets: Int[np.ndarray, " s"],
+    near: float,
+    far: float,
+    config: StreamConfig,
+) -> Sample:
+    """Sample of the views `context`, chunk by chunk in their order, and `targets`.
+
+    Args:
+        images: RGB in [0, 1].
+        depths: camera z, stream units; NaN where unknown.
+        viewmats: world to camera, stream frame.
+        Ks: intrinsics, pixels.
+        context: places of the context views, a multiple of the chunk size.
+        targets: places of the target views.
+        near: nearest depth candidate, stream units.
+        far: farthest depth candidate, stream units.
+        config: gives the chunk size.
+    """
+    num_chunks = len(context) // config.stream.chunk_size
     chunked = lambda x: x[context].reshape(num_chunks, config.stream.chunk_size, *x.shape[1:])  # noqa: E731
     return Sample(
         chunks=Chunk(
@@ -99,9 +138,9 @@ def make_sample(
             far=jnp.full(num_chunks, far, jnp.float32),
         ),
         log_depths=jnp.asarray(log_depths_at_cells(chunked(depths))),
-        target_images=jnp.asarray(images[is_target]),
-        target_viewmats=jnp.asarray(viewmats[is_target]),
-        target_Ks=jnp.asarray(Ks[is_target].astype(np.float32)),
+        target_images=jnp.asarray(images[targets]),
+        target_viewmats=jnp.asarray(viewmats[targets]),
+        target_Ks=jnp.asarray(Ks[targets].astype(np.float32)),
     )
 
 
@@ -109,6 +148,9 @@ def log_depths_at_cells(depths: Float[np.ndarray, "*b h w"]) -> Float[np.ndarray
     """Log depths at the centers of cells: means over the four pixels around.
 
     Where the four differ by more than `MAX_LOG_STEP`, their mean is on no surface, and one of the four is taken.
+
+    Limits:
+        NaN where one of the four is NaN.
     """
     before = GRID_STRIDE // 2 - 1
     # Cells whose center is on the edge of the image are left out: they have pixels on one side only.
@@ -170,17 +212,3 @@ def prefetched(
     finally:
         stop.set()
         thread.join()
-
-
-def sample_for_step(step: int, recipe: Recipe, config: StreamConfig) -> Sample:
-    """Sample of a training step. It depends on step, recipe and configuration alone, which makes resuming exact."""
-    phase, position = recipe.phase_at(step)
-    return make_sample(
-        recipe.seed * 1_000_003 + step,
-        num_chunks=phase.num_chunks,
-        num_targets=phase.num_targets,
-        size=phase.sizes[position % len(phase.sizes)],
-        config=config,
-        steps_of_depth=phase.steps_of_depth,
-        range_jitter=recipe.range_jitter,
-    )

@@ -15,7 +15,7 @@ from ssplat_jax.metrics.lpips import LpipsWeights
 from ssplat_jax.pytree import pytree
 from ssplat_jax.rasterizer import fill_holes, render
 from ssplat_jax.streaming.streamsplat import StreamSplat
-from ssplat_jax.train.losses import depth_loss, rendering_loss
+from ssplat_jax.train.losses import depth_loss, fitted_gains, rendering_loss
 from ssplat_jax.train.recipe import DEFAULT_FORM, PhaseForm, Recipe
 from ssplat_jax.train.samples import Sample
 
@@ -164,8 +164,9 @@ def target_loss(
     output = render(gaussians, sample.target_camera, max_pairs=recipe.max_pairs)
     assert output.color is not None and output.alpha is not None
     filled = fill_holes(output.color, output.alpha, jax.lax.stop_gradient(mean_color(gaussians)))
+    gains = fitted_gains(filled, sample.target_images) if recipe.fit_gains else 1.0
     rendering, over_black = (
-        rendering_loss(images, sample.target_images, recipe=recipe, lpips_weights=lpips_weights)
+        rendering_loss(images * gains, sample.target_images, recipe=recipe, lpips_weights=lpips_weights)
         for images in (filled, output.color)
     )
     total = (1 - recipe.black_weight) * rendering.total + recipe.black_weight * over_black.total

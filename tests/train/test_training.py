@@ -19,8 +19,9 @@ from ssplat_jax.streaming.streamsplat import StreamSplat
 from ssplat_jax.train import loop
 from ssplat_jax.train.losses import depth_loss, image_gradient_l1, soft_targets
 from ssplat_jax.train.recipe import ALL_BUT_HEAD, TINY, Phase, PhaseForm, smoke_recipe, training_config, with_defaults
-from ssplat_jax.train.samples import log_depths_at_cells, make_sample, prefetched, sample_for_step
+from ssplat_jax.train.samples import log_depths_at_cells, make_sample, prefetched
 from ssplat_jax.train.step import Trainer, decode_accepted, init_state, learning_rate, loss_fn, pad_like, stream_chunks
+from ssplat_jax.train.step_samples import sample_for_step
 from tests.model.small import random_params
 from tests.streaming.narrow_model import NARROW
 

@@ -1,0 +1,41 @@
+"""The sample of each training step, procedural or of a capture, and the samples of a validation."""
+
+import numpy as np
+
+from ssplat_jax.config import StreamConfig
+from ssplat_jax.train.capture_samples import CaptureMix, capture_sample, validation_sample
+from ssplat_jax.train.recipe import Phase, Recipe
+from ssplat_jax.train.samples import Sample, make_sample
+
+NUM_VALIDATION = 8
+"""Most samples of a validation, one a capture."""
+
+
+def sample_for_step(step: int, recipe: Recipe, config: StreamConfig, mix: CaptureMix | None = None) -> Sample:
+    """Sample of a training step. It depends on the arguments alone, which makes resuming exact.
+
+    Args:
+        step: number of the step.
+        recipe: gives the phase and the seed.
+        config: configuration of the model.
+        mix: captures to learn from; None, and the share of steps that it leaves, take procedural scenes.
+    """
+    phase, position = recipe.phase_at(step)
+    form = {
+        "num_chunks": phase.num_chunks,
+        "num_targets": phase.num_targets,
+        "size": phase.sizes[position % len(phase.sizes)],
+        "config": config,
+        "range_jitter": recipe.range_jitter,
+    }
+    if mix is not None and (capture := mix.draw(np.random.default_rng([recipe.seed, step, 13]))) is not None:
+        return capture_sample(mix, capture, [recipe.seed, step, 17], **form)
+    return make_sample(recipe.seed * 1_000_003 + step, steps_of_depth=phase.steps_of_depth, **form)
+
+
+def validation_samples(mix: CaptureMix, phase: Phase, config: StreamConfig) -> list[Sample]:
+    """Samples with a held-out target each, the same whenever they are made; of one size, so of one program."""
+    return [
+        validation_sample(mix, capture, [i, 19], num_chunks=phase.num_chunks, size=phase.sizes[0], config=config)
+        for i, capture in enumerate(mix.validation_captures(NUM_VALIDATION))
+    ]
