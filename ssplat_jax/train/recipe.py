@@ -76,6 +76,9 @@ class Recipe:
     """Added to Adam's denominator."""
     weight_decay: float = 0.01
     """Decoupled weight decay, multiplied by the learning rate (AdamW)."""
+    part_rates: tuple[tuple[str, float], ...] = ()
+    """Factors of the learning rate by the path of a part of the parameters, such as ("encoder/pretrained", 0.01). Parts
+    that the network does not have are skipped."""
     clip_norm: float = 1.0
     """Largest global norm of the gradient; longer ones are scaled down."""
     ema_decay: float = 0.99
@@ -210,6 +213,7 @@ PAPER = Recipe(
         ),
     ),
     adam_b2=0.999,
+    part_rates=(("encoder/pretrained", 0.01),),  # the vision transformer, as DepthSplat trains it
     depth_weight=0.0,
     rendering_weight=1.0,
     gradient_weight=0.0,

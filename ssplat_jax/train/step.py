@@ -179,6 +179,17 @@ def target_loss(
     }
 
 
+def scale_parts(updates: dict, factors: tuple[tuple[str, float], ...]) -> dict:
+    """`updates` with the parts below some paths multiplied; see `Recipe.part_rates`."""
+    for path, factor in factors:
+        name, _, rest = path.partition("/")
+        if name in updates:
+            part = updates[name]
+            scaled = scale_parts(part, ((rest, factor),)) if rest else jax.tree.map(lambda u, f=factor: f * u, part)
+            updates = {**updates, name: scaled}
+    return updates
+
+
 def train_step(
     state: TrainState,
     sample: Sample,
@@ -209,6 +220,7 @@ def train_step(
     updates, opt_state = optimizer(recipe).update(gradients, state.opt_state, state.params)
     # Without this, momentum and weight decay would move frozen parameters.
     updates = {name: jax.tree.map(jnp.zeros_like, u) if name in form.frozen else u for name, u in updates.items()}  # pyright: ignore[reportAttributeAccessIssue]
+    updates = scale_parts(updates, recipe.part_rates)
     params = jax.tree.map(lambda p, u: p - rate * u, state.params, updates)
     step = state.step.astype(jnp.float32)
     decay = jnp.minimum(recipe.ema_decay, (1.0 + step) / (recipe.ema_warmup_steps + step))

@@ -14,13 +14,32 @@ from ssplat_jax.checkpoint.training_state import TrainingCheckpoints
 from ssplat_jax.config import preset
 from ssplat_jax.data.procedural import training_sample
 from ssplat_jax.errors import InputError
+from ssplat_jax.model import init_params
 from ssplat_jax.pytree import replace
 from ssplat_jax.streaming.streamsplat import StreamSplat
 from ssplat_jax.train import loop
 from ssplat_jax.train.losses import depth_loss, image_gradient_l1, soft_targets
-from ssplat_jax.train.recipe import ALL_BUT_HEAD, TINY, Phase, PhaseForm, smoke_recipe, training_config, with_defaults
+from ssplat_jax.train.recipe import (
+    ALL_BUT_HEAD,
+    RECIPES,
+    TINY,
+    Phase,
+    PhaseForm,
+    smoke_recipe,
+    training_config,
+    with_defaults,
+)
 from ssplat_jax.train.samples import log_depths_at_cells, make_sample, prefetched
-from ssplat_jax.train.step import Trainer, decode_accepted, init_state, learning_rate, loss_fn, pad_like, stream_chunks
+from ssplat_jax.train.step import (
+    Trainer,
+    decode_accepted,
+    init_state,
+    learning_rate,
+    loss_fn,
+    pad_like,
+    scale_parts,
+    stream_chunks,
+)
 from ssplat_jax.train.step_samples import sample_for_step
 from tests.model.small import random_params
 from tests.streaming.narrow_model import NARROW
@@ -249,6 +268,16 @@ def test_tokens_that_a_witness_looked_through_are_not_rendered():
     config = NARROW.replace(min_confidence=0.5)
     shown = decode_accepted(StreamSplat(config), params, replace(cache, witnesses=witnesses), tokens).opacities > 0
     np.testing.assert_array_equal(shown.reshape(4, -1).T, [[False, True, True, False]] * 4)
+
+
+def test_parts_of_the_parameters_have_rates_of_their_own():
+    updates = {"encoder": {"pretrained": {"a": 2.0, "b": {"c": 4.0}}, "cnn": 8.0}, "decoder": 16.0}
+    scaled = scale_parts(updates, (("encoder/pretrained", 0.5), ("decoder", 0.25), ("cnn", 0.0), ("encoder/none", 0.0)))
+    assert scaled == {"encoder": {"pretrained": {"a": 1.0, "b": {"c": 2.0}}, "cnn": 8.0}, "decoder": 4.0}
+    assert updates["decoder"] == 16.0 and scale_parts(updates, ()) is updates
+    vit = RECIPES["paper"].part_rates[0][0].split("/")
+    shapes = jax.eval_shape(lambda key: init_params(key, preset("small")), jax.random.key(0))
+    assert vit[1] in shapes[vit[0]]
 
 
 def test_views_step_as_far_as_the_phase_says():
