@@ -105,7 +105,7 @@ def test_frames_without_depth_have_unknown_depths(mix, capture):
 
 
 def test_steps_are_shared_as_asked(capture):
-    other = open_capture("procedural:orbit?frames=2&size=16x16")
+    other = dataclasses.replace(capture)
     groups = (CaptureGroup("a", 0.2, (capture,)), CaptureGroup("b", 0.5, (other,)))
     drawn = [CaptureMix(groups, NARROW).draw(np.random.default_rng([0, step])) for step in range(3000)]
     rates = [np.mean([x is source for x in drawn]) for source in (capture, other, None)]
@@ -126,17 +126,24 @@ def test_procedural_steps_stay_those_of_a_run_without_captures(mix, capture):
 @pytest.mark.parametrize(
     ("folders", "shares", "message"),
     [
-        (["procedural:room?frames=60&size=8x8"], [0.7, 0.1], r"--shares: wanted 1 numbers .* got 0\.7 0\.1"),
-        (["procedural:room?frames=60&size=8x8"] * 2, [0.7, 0.4], "add up to at most 1"),
-        (["procedural:room?frames=60&size=8x8"], [0.0], "above 0"),
-        (["procedural:room?frames=9&size=8x8"], [], r"at least 9 frames besides .* got 8"),
+        (["here"], [0.7, 0.1], r"--shares: wanted 1 numbers .* got 0\.7 0\.1"),
+        (["here", "there"], [0.7, 0.4], "add up to at most 1"),
+        (["here"], [0.0], "above 0"),
         (["no/such/folder"], [], "nothing of that name"),
     ],
 )
-def test_captures_that_cannot_be_learned_from_are_refused(folders, shares, message, monkeypatch):
-    monkeypatch.setattr("ssplat_jax.train.capture_samples.ESTIMATION_SIZE", (8, 8))
+def test_captures_that_cannot_be_learned_from_are_refused(folders, shares, message):
     with pytest.raises(InputError, match=message):
         open_mix([Path(folder) for folder in folders], shares, NARROW, smoke_recipe(4))
+
+
+def test_a_capture_needs_the_frames_of_a_sample(capture, monkeypatch):
+    opened = lambda path, size: dataclasses.replace(capture, frames=capture.frames[: int(str(path))])  # noqa: E731
+    monkeypatch.setattr("ssplat_jax.train.capture_samples.open_capture", opened)
+    with pytest.raises(InputError, match=r"at least 9 frames besides .* got 8"):
+        open_mix([Path("9")], [], NARROW, smoke_recipe(4))
+    (group,) = open_mix([Path("10")], [], NARROW, smoke_recipe(4)).groups
+    assert group.share == 0.5 and len(group.captures[0]) == 10
 
 
 def test_shares_need_captures(tmp_path):
