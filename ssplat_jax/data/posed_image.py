@@ -17,6 +17,8 @@ ROTATION_TOLERANCE = 5e-3  # largest |R^T R - I| that rounding to three decimals
 ROTATION_ROUNDING = 1e-5  # deviations above this are reported to the user
 MILLIMETER = 1e-3  # meters
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # flips the y and z axes of a camera
+MAX_COORDINATE = 1e12  # capture units; squares of larger ones leave float32 on the way, and no unit explains them
+MAX_FOCAL_SIDES = 1000.0  # of the image; a longer focal length sees less than 0.06 degrees
 MIN_FOCAL_PX = 3.0  # smaller focal lengths are taken to be in units of the image size instead of pixels
 
 
@@ -73,6 +75,10 @@ def check_camtoworld(matrix: object, where: str) -> tuple[Float64[np.ndarray, "4
         transposed = np.array_equal(pose[:, 3], [0.0, 0.0, 0.0, 1.0])
         fix = "transpose the matrix" if transposed else "give a rigid camera-to-world transform"
         raise refusal(where, wanted="a last row of 0 0 0 1", got=echo(pose[3].tolist()), fix=fix)
+    if np.abs(pose[:3, 3]).max() > MAX_COORDINATE:
+        got = f"{np.abs(pose[:3, 3]).max():.2g}"
+        fix = "drop the frame or choose a larger unit"
+        raise refusal(where, wanted=f"coordinates up to {MAX_COORDINATE:.0e}", got=got, fix=fix)
     rotation = pose[:3, :3]
     # Huge entries overflow in the product: an infinite deviation is refused like any other.
     with np.errstate(over="ignore", invalid="ignore"):
@@ -154,6 +160,9 @@ def check_intrinsics(
         if focal < MIN_FOCAL_PX:
             fix = f"multiply it by the image's {'width' if name == 'fl_x' else 'height'} if it is normalized"
             raise refusal(f"{where}.{name}", wanted="a focal length in pixels", got=echo(focal), fix=fix)
+        if focal > MAX_FOCAL_SIDES * max(width, height):
+            wanted = f"a focal length of at most {MAX_FOCAL_SIDES:g} image sides"
+            raise refusal(f"{where}.{name}", wanted=wanted, got=echo(focal), fix="give the focal length in pixels")
     for name, center, extent in (("cx", cx, width), ("cy", cy, height)):
         if not 0 <= center <= extent:  # false for NaN too
             fix = "give the principal point in pixels of the stored image"

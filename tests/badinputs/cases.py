@@ -194,13 +194,37 @@ def depth_file(mode, *, cut=None):
     return spoil
 
 
+def depth_at(make):
+    """Gives frame 2 the depth map d.png, which `make` puts there."""
+
+    def spoil(root, meta):
+        make(root / "d.png")
+        meta["frames"][2]["depth_file_path"] = "d.png"
+
+    return spoil
+
+
+def damaged_png(change):
+    """Replaces image 2 by a PNG whose bytes `change` damages."""
+
+    def spoil(root, meta):
+        file, pixels = (
+            root / "images" / "2.jpg",
+            np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8),
+        )
+        Image.fromarray(pixels).save(file, format="PNG")
+        file.write_bytes(change(file.read_bytes()))
+
+    return spoil
+
+
 def rotated(degrees):
     c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
     return np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])
 
 
 MATRIX, PATH, JSON = "frames[2].transform_matrix", "frames[2].file_path", "transforms.json"
-IMAGE = "2.jpg"
+IMAGE, FILE = "2.jpg", "frames[2].depth_file_path"
 
 # One line per case, however long.
 CASES = (
@@ -229,7 +253,19 @@ CASES = (
     Case("a TIFF upside down", tiff(np.zeros((HEIGHT, WIDTH, 3), np.uint8), tiffinfo={274: 3}), (IMAGE, "orientation")),
     Case("two sizes", both(top(w=None, h=None), other_size(70, 48)), ("64x48", "70x48", "--size")),
     Case("a format that is not read", other_size(WIDTH, HEIGHT, format="TGA"), (IMAGE, "PNG")),
+    Case("a GIF", other_size(WIDTH, HEIGHT, format="GIF"), (IMAGE, "no readable image", "PNG")),
+    Case("PNG cut short", damaged_png(lambda data: data[:-400]), (IMAGE, "truncated")),
+    Case("PNG with a wrong checksum", damaged_png(lambda d: d[:3000] + b"\0\0\0\0" + d[3004:]), (IMAGE, "damaged")),
+    Case("a page that says 404", image(b"<html>404 not found</html>"), (IMAGE, "26 bytes")),
+    Case("a pointer of git-lfs", image(b"version https://git-lfs.github.com/spec/v1\n"), (IMAGE, "no readable")),
+    Case("an image of one pixel", other_size(1, 1), ("frames[2]",)),
     # poses
+    Case("a word in place of a pose", frame(2, transform_matrix="identity"), (MATRIX, "4x4", "'identity'")),
+    Case("a list of poses", pose(lambda m: m[None]), (MATRIX, "(1, 4, 4)")),
+    Case("an empty pose", frame(2, transform_matrix=[]), (MATRIX, "(0,)")),
+    Case("5x5 pose", pose(lambda m: np.eye(5)), (MATRIX, "(5, 5)")),
+    Case("NaN in the last row", entry(3, 3, float("nan")), (MATRIX, "NaN")),
+    Case("a camera beyond the sky", entry(0, 3, 1e308), (MATRIX, "1e+12", "unit")),
     Case("NaN pose", entry(0, 3, float("nan")), (MATRIX, "NaN")),
     Case("infinite pose", entry(1, 1, float("-inf")), (MATRIX, "infinity")),
     Case("all zeros", pose(lambda m: 0 * m), (MATRIX, "last row")),
@@ -270,7 +306,25 @@ CASES = (
     Case("distorted until it folds", top(k1=-2.0), ("k1=-2", "undistort")),
     Case("tangentially distorted until it folds", top(p2=2.0), ("p2=2", "undistort")),
     Case("distortion beyond measure", top(k1=1e308), ("undistort",)),
+    Case("focal length beyond measure", top(fl_x=1e308), ("frames[0].fl_x", "sides", "pixels")),
+    Case("focal length in a list", top(fl_x=[50]), ("frames[0].fl_x", "[50]")),
+    Case("principal point a word", top(cx="middle"), ("frames[0].cx", "'middle'")),
+    Case("principal point infinite", top(cy=float("inf")), ("frames[0].cy", "finite")),
+    Case("principal point in quotes", top(cy="25"), ("frames[0].cy", "plain JSON number")),
+    Case("width a word", top(w="64"), ("frames[0].w", "plain JSON number")),
+    Case("height NaN", top(h=float("nan")), ("frames[0].h", "finite")),
+    Case("angle below 0", top(fl_x=None, fl_y=None, camera_angle_x=-1.0), ("camera_angle_x", "(0, pi)")),
+    Case("angle in quotes", top(fl_x=None, fl_y=None, camera_angle_x="1"), ("camera_angle_x", "plain JSON number")),
+    Case("distortion a word", top(k1="none"), ("frames[0].k1", "'none'")),
+    Case("distortion infinite", top(k2=float("inf")), ("frames[0].k2", "finite")),
+    Case("camera model a number", top(camera_model=5), ("camera_model", "got 5")),
+    Case("fisheye flag a word", top(is_fisheye="yes"), ("is_fisheye", "true or false", "'yes'")),
     # paths
+    Case("path of an address", frame(2, file_path="https://example.org/a.jpg"), (PATH, "does not exist")),
+    Case("path with backslashes", frame(2, file_path="images\\2.jpg"), (PATH, "does not exist")),
+    Case("path with a wildcard", frame(2, file_path="images/*.jpg"), (PATH, "does not exist")),
+    Case("path of the folder", frame(2, file_path="images"), (PATH, "is a folder")),
+    Case("path a list", frame(2, file_path=["images/2.jpg"]), (PATH, "the path of a file")),
     Case("path outside", outside("../secret.jpg"), (PATH, "inside", "copy")),
     Case("path outside by a detour", outside("images/../../secret.jpg"), (PATH, "inside")),
     Case("path outside without extension", outside("../secret"), (PATH, "inside")),
@@ -293,7 +347,19 @@ CASES = (
     Case("depth in color", depth_file("RGB"), ("d.png", "16 bits")),
     Case("depth cut short", depth_file("I;16", cut=60), ("d.png",)),
     Case("depth is a JPEG", frame(2, depth_file_path="images/1.jpg"), ("1.jpg", "16 bits")),
+    Case("depth path a number", frame(2, depth_file_path=3), (FILE, "the path of a file")),
+    Case("depth a folder", depth_at(lambda file: file.mkdir()), (FILE, "is a folder")),
+    Case("depth empty", depth_at(lambda file: file.write_bytes(b"")), ("d.png", "0 bytes")),
+    Case("depth links to itself", depth_at(lambda file: file.symlink_to(file)), (FILE, "leads back to itself")),
     # the container
+    Case("comma at the end", text('{"frames": [],}'), (JSON, "line 1")),
+    Case("a comment", text('{"frames": [] // none'), (JSON, "line 1")),
+    Case("Python in place of JSON", text("{'fl_x': None}"), (JSON, "line 1")),
+    Case("two objects", text("{}{}"), (JSON, "Extra data")),
+    Case("Latin-1", text('{"a": "\u00e9"}'.encode("latin-1")), (JSON, "UTF-8")),
+    Case("an image named transforms.json", text(b"\x89PNG\r\n\x1a\n"), (JSON, "UTF-8")),
+    Case("frames a word", top(frames="all"), ("transforms.json: frames", "'all'")),
+    Case("a frame is a number", lambda root, meta: meta["frames"].__setitem__(2, 7), ("frames[2]", "object")),
     Case("empty file", text(""), (JSON, "JSON")),
     Case("garbage", text("\x00\x01{]"), (JSON, "line 1")),
     Case("cut short", text('{"frames": [{"file_path": "im'), (JSON, "line 1")),

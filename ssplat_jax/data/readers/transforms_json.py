@@ -173,7 +173,10 @@ def _check_size(fields: _Fields, path: Path, *, is_shrunk: bool) -> tuple[tuple[
 def _lens(fields: _Fields) -> Lens:
     """Distortion by the camera's model; models without one of OpenCV's two lenses are refused."""
     model, where = fields.get("camera_model"), f"{fields.where}: camera_model"
-    is_fisheye = model in FISHEYE_MODELS or bool(fields.get("is_fisheye"))
+    flag = fields.get("is_fisheye")
+    if flag not in (None, True, False):
+        raise refusal(f"{fields.where}.is_fisheye", wanted="true or false", got=echo(flag), fix="write a JSON boolean")
+    is_fisheye = model in FISHEYE_MODELS or bool(flag)
     coefficients = {field.name: fields.number(field.name, 0.0) for field in dataclasses.fields(Lens)}
     fix = "undistort the images to a pinhole camera first (COLMAP: `colmap image_undistorter`)"
     if not is_fisheye and model not in PINHOLE_MODELS:
