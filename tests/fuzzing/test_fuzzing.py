@@ -1,0 +1,84 @@
+"""Damaged files of every kind are read or refused: no other exception, no hang, no gigabyte.
+
+`FUZZ_FILES=5000 pytest -n 0 tests/fuzzing` damages 5,000 files for each parser (about two hours); the default run takes
+a few, since the tests of readers and scene files damage a hundred or more each.
+"""
+
+import contextlib
+import os
+import random
+import resource
+import signal
+import time
+import warnings
+
+import pytest
+
+from ssplat_jax.errors import InputError, StorageError
+from tests.badinputs.cases import mutant
+from tests.fuzzing.parsers import PARSERS
+
+NUM_FILES = int(os.environ.get("FUZZ_FILES", "20"))  # for each parser; seeded, so that failures can be repeated
+MAX_SECONDS = 5
+MAX_BYTES = 1 << 30
+
+
+class TooSlow(BaseException):
+    """Not an Exception, which a parser might take for damage."""
+
+
+@contextlib.contextmanager
+def bounded():
+    """Ends what takes longer than `MAX_SECONDS`, and refuses more than `MAX_BYTES` of further memory."""
+
+    def stop(number, frame):
+        raise TooSlow
+
+    with open("/proc/self/statm") as file:
+        used = int(file.read().split()[0]) * resource.getpagesize()
+    limit = resource.getrlimit(resource.RLIMIT_AS)
+    handler = signal.signal(signal.SIGALRM, stop)
+    resource.setrlimit(resource.RLIMIT_AS, (used + MAX_BYTES, limit[1]))
+    signal.setitimer(signal.ITIMER_REAL, MAX_SECONDS)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        resource.setrlimit(resource.RLIMIT_AS, limit)
+        signal.signal(signal.SIGALRM, handler)
+
+
+def damaged(good: bytes, rng: random.Random) -> bytes:
+    """Good bytes after some edits, or cut off."""
+    return good[: rng.randrange(len(good))] if rng.random() < 0.15 else mutant(good, rng)
+
+
+@pytest.mark.parametrize("name", PARSERS)
+def test_damaged_files_are_read_or_refused(name, tmp_path):
+    parser, rng = PARSERS[name], random.Random(name)
+    path = parser.write(tmp_path)
+    good, num_refused = path.read_bytes(), 0
+    parser.read(path)
+    for i in range(NUM_FILES):
+        path.write_bytes(parser.finish(damaged(good, rng)))
+        try:
+            with bounded(), warnings.catch_warnings():
+                warnings.simplefilter("error")
+                parser.read(path)
+        except (InputError, StorageError) as error:
+            assert "\n" not in str(error) and len(str(error)) < 1000
+            num_refused += 1
+        except BaseException as error:
+            kept = path.with_name(f"{path.name}.{i}")
+            kept.write_bytes(path.read_bytes())
+            raise AssertionError(f"{kept} (file {i}): {type(error).__name__}: {error}") from error
+    assert num_refused > 0
+
+
+def test_the_bounds_hold():
+    with pytest.raises(TooSlow), bounded():
+        signal.setitimer(signal.ITIMER_REAL, 0.05)
+        while True:
+            time.sleep(0.01)
+    with pytest.raises(MemoryError), bounded():
+        bytearray(2 * MAX_BYTES)
