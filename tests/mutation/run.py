@@ -1,7 +1,7 @@
 """Runs the mutants of mutants.toml: `python -m tests.mutation.run` prints which of them the default tests notice.
 
 Each mutant is applied to a copy of the tree in a temporary folder, where its tests run until the first failure.
-Arguments are words of files, such as `cache data/lens.py`; without any, all mutants run (an hour on two cores).
+Arguments are parts of `file: old`, such as `cache data/lens.py`; without any, all mutants run (an hour on two cores).
 """
 
 import collections
@@ -68,7 +68,7 @@ def is_killed(folder: Path, mutant: Mutant) -> tuple[bool, str]:
 def main(words: list[str]) -> int:
     with (Path(__file__).parent / "mutants.toml").open("rb") as file:
         mutants = [Mutant(**fields) for fields in tomllib.load(file)["mutant"]]
-    chosen = [m for m in mutants if not words or any(word in m.file for word in words)]
+    chosen = [m for m in mutants if not words or any(word in f"{m.file}: {m.old}" for word in words)]
     counts: collections.Counter[bool] = collections.Counter()
     with tempfile.TemporaryDirectory(prefix="ssplat-mutants-") as name:
         copy_of_tree(Path(name))
