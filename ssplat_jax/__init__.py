@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from ssplat_jax.config import StreamConfig as StreamConfig
     from ssplat_jax.config import preset as preset
     from ssplat_jax.data.capture import open_capture as open_capture
+    from ssplat_jax.data.stream_frame import StreamFrame as StreamFrame
     from ssplat_jax.errors import CacheError as CacheError
     from ssplat_jax.errors import InputError as InputError
     from ssplat_jax.errors import StorageError as StorageError
@@ -50,6 +51,7 @@ _MODULES = {
     "RenderOutput": "rasterizer",
     "StorageError": "errors",
     "StreamConfig": "config",
+    "StreamFrame": "data.stream_frame",
     "StreamSplat": "streaming.streamsplat",
     "VoxelCache": "cache",
     "check_cache": "cache",

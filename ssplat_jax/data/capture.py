@@ -191,8 +191,21 @@ class Capture:
         first = self.frames[used[0]].camtoworld
         return StreamFrame.at_camera(first, scale=scale, near=near, far=far, warning=depths.warning)
 
-    def camera(self, i: int, frame: StreamFrame) -> Camera:
-        """Returns the camera of frame `i` in the stream frame."""
+    def camera(
+        self, i: int, frame: StreamFrame | None = None, *, offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    ) -> Camera:
+        """Returns the camera of frame `i`: in the capture frame, in which scene files are, or in a stream frame.
+
+        Args:
+            i: the number of the frame.
+            frame: a stream frame (`stream_frame`); None gives the camera in the capture frame.
+            offset: point of the capture frame to which a scene's positions are relative, if `frame` is None.
+
+        Raises:
+            InputError: there is no such frame.
+        """
+        _indices(self, [i])
+        frame = frame or StreamFrame.at_point(offset)
         viewmat = frame.viewmats(self.frames[i].camtoworld)
         K = self.K(i).astype(np.float32)
         return Camera(viewmats=jnp.asarray(viewmat), Ks=jnp.asarray(K), width=self.width, height=self.height)

@@ -59,6 +59,13 @@ class StreamFrame:
             warning=warning,
         )
 
+    @staticmethod
+    def at_point(point: tuple[float, float, float]) -> "StreamFrame":
+        """Returns the frame with the axes and units of the capture whose origin is a point of it."""
+        camtoworld = np.eye(4)
+        camtoworld[:3, 3] = point
+        return StreamFrame.at_camera(camtoworld, scale=1.0, near=0.0, far=math.inf)
+
     def to_dict(self) -> dict[str, Any]:
         """Returns the fields as plain JSON types; the inverse is `from_dict`."""
         return {

@@ -74,7 +74,8 @@ def render(
         distortion: OPENCV coefficients k1, k2, p1, p2, k3 of the lens.
         exposures: affine color correction of each frame, RGB' = matrix @ RGB + offset.
         max_pairs: capacity for tile intersections, (tile, Gaussian) pairs of all cameras. Outside jit, under `jax.grad`
-            too, the default is their number, rounded up to a power of two so that few programs are compiled. Inside jit
+            too, the default is their number, rounded up to a power of two so that few programs are compiled; they are
+            counted in the first render of a kind, and again where there are more. Inside jit
             it is four for each Gaussian and camera: check `num_overflow`. The farthest Gaussians are left out.
         tile: side of a tile in pixels, 8 or 16; choose 16 where most Gaussians are larger than 8 pixels.
 
@@ -93,6 +94,11 @@ def render(
         raise InputError(f"render: max_pairs must be a whole number of at least 1, got {echo(max_pairs)}.")
     if not (_is_whole(tile) and tile in TILES):
         raise InputError(f"render: tile must be 8 or 16 pixels, got {echo(tile)}.")
+    is_concrete = max_pairs is None and not any(isinstance(x, Tracer) for x in jax.tree.leaves(inputs))
+    # Views of one scene need about the same capacity: a pass that only counts costs a third of a render.
+    known = (inputs.gaussians.num_gaussians, camera.viewmats.shape, camera.width, camera.height, tile)
+    if is_concrete and known in _CAPACITIES:
+        max_pairs = _CAPACITIES[known]
     if max_pairs is None:
         # Under `jax.grad` alone the primal values are concrete: without tangents, the pairs can be counted.
         counted = _count(jax.lax.stop_gradient(inputs), effects, tile)
@@ -101,7 +107,24 @@ def render(
     out = _render_jit(inputs, effects, max_pairs, tile)
     if not isinstance(out.num_overflow, Tracer) and int(out.num_overflow):
         out = _render_jit(inputs, effects, _capacity_for(int(out.num_pairs)), tile)
+    if is_concrete:
+        _remember_capacity(known, int(out.num_pairs))
     return out
+
+
+_CAPACITIES: dict[tuple, int] = {}
+"""Capacity of the last render outside jit, by number of Gaussians, cameras, image size and tile."""
+
+MAX_REMEMBERED = 256
+"""Kinds of renders that are remembered; a scene that grows with every chunk is a new kind each time."""
+
+
+def _remember_capacity(kind: tuple, num_pairs: int) -> None:
+    """Remembers the capacity for `num_pairs`; a larger one is kept down to a quarter, as it is compiled already."""
+    needed, held = _capacity_for(num_pairs), _CAPACITIES.pop(kind, 0)
+    _CAPACITIES[kind] = held if needed <= held <= 4 * needed else needed
+    if len(_CAPACITIES) > MAX_REMEMBERED:
+        del _CAPACITIES[next(iter(_CAPACITIES))]
 
 
 def _capacity_for(num_pairs: int) -> int:

@@ -129,9 +129,7 @@ def _render_picture(
         size: (width, height) of the picture.
         background: color of holes that have no colors around them; None shows all holes black.
     """
-    at_offset = np.eye(4)
-    at_offset[:3, 3] = splats.offset
-    frame = StreamFrame.at_camera(at_offset, scale=1.0, near=0.0, far=np.inf)
+    frame = StreamFrame.at_point(splats.offset)
     camera = Camera(
         viewmats=jnp.asarray(frame.viewmats(camtoworld)), Ks=jnp.asarray(K, jnp.float32), width=size[0], height=size[1]
     )

@@ -7,10 +7,12 @@ from PIL import Image
 
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.data.capture import open_capture
+from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.errors import InputError
 from ssplat_jax.geometry.cameras import project_points, transform_points
 from tests.badinputs.cases import HEIGHT, WIDTH, make_capture
 from tests.data.capture_fixture import frame_of, resized, smooth_capture
+from tests.data.planes_fixture import two_planes
 
 FLOAT32_PIXELS = 1e-3
 
@@ -107,3 +109,31 @@ def test_unknown_frame_numbers_are_refused(tmp_path, indices):
     capture = open_capture(make_capture(tmp_path / "c"))
     with pytest.raises(ValueError, match="frame numbers"):
         next(capture.chunks(StreamConfig(), indices))
+
+
+def test_a_camera_without_a_frame_is_in_the_frame_of_the_capture():
+    capture = two_planes(3, 0.2, spin=10.0, forward=0.1)
+    offset = (1.0, -2.0, 0.5)
+    for i in range(3):
+        camera, relative = capture.camera(i), capture.camera(i, offset=offset)
+        np.testing.assert_allclose(camera.viewmats, np.linalg.inv(capture.frames[i].camtoworld), atol=1e-6)
+        np.testing.assert_array_equal(camera.Ks, capture.K(i).astype(np.float32))
+        np.testing.assert_allclose(relative.centers + np.array(offset), capture.frames[i].center, atol=1e-6)
+        assert (camera.width, camera.height) == (capture.width, capture.height)
+    for i in (3, -1):
+        with pytest.raises(InputError, match=r"frame numbers in \[0, 2\]"):
+            capture.camera(i)
+
+
+def test_a_scene_file_is_seen_from_the_cameras_of_its_capture():
+    """The scene in the capture's frame, from `camera(i)`, is what the stream's scene is from `camera(i, frame)`."""
+    capture = two_planes(2, 0.2, spin=10.0)
+    frame = StreamFrame.at_camera(capture.frames[1].camtoworld, scale=0.5, near=1.0, far=3.0)
+    points = np.random.default_rng(0).uniform([-1, -1, 2], [1, 1, 4], (50, 3))
+
+    def pixels(camera, points):
+        x = points @ np.asarray(camera.viewmats)[:3, :3].T + np.asarray(camera.viewmats)[:3, 3]
+        return x[:, :2] / x[:, 2:] * np.diag(camera.Ks)[:2] + np.asarray(camera.Ks)[:2, 2]
+
+    seen = pixels(capture.camera(0), points)
+    np.testing.assert_allclose(seen, pixels(capture.camera(0, frame), frame.points_to_stream(points)), atol=1e-3)
