@@ -70,6 +70,12 @@ def test_a_fisheye_capture_is_undistorted(fields, tmp_path):
     assert any("undone" in note for note in capture.notes)
 
 
+def test_distortion_is_the_published_formula():
+    """Worked by hand for (0.5, -0.3): r^2 = 0.34, radial 1.05644, tangential (-0.03 + 0.168, 0.052 - 0.06)."""
+    lens = Lens(k1=0.2, k2=-0.1, p1=0.1, p2=0.2)
+    np.testing.assert_allclose(lens.distorted(np.array([0.5, -0.3])), [0.66622, -0.324932], atol=1e-12)
+
+
 def test_no_distortion_changes_nothing():
     image = scene(centers()).astype(np.float32)
     np.testing.assert_allclose(undistort(image, Lens(), K), image, atol=1e-6)

@@ -23,6 +23,7 @@ from tests.data.capture_writers import (
     write_colmap_binary,
     write_colmap_images,
     write_colmap_text,
+    write_depth,
     write_image,
     write_realestate,
     write_scannet,
@@ -202,6 +203,19 @@ def test_colmap_names_may_include_the_image_folder(tmp_path, monkeypatch):
         path.rename(tmp_path / "images" / path.name)
     (tmp_path / "images" / "images").rmdir()
     assert len(open_capture(tmp_path).frames) == NUM_FRAMES
+
+
+def test_tum_depth_maps_are_those_nearest_in_time(tmp_path):
+    write_tum(tmp_path)
+    lines = (tmp_path / "depth.txt").read_text().splitlines()
+    before = [f"{float(line.split()[0]) - 0.013:.6f} depth/before{i}.png" for i, line in enumerate(lines)]
+    after = [f"{float(line.split()[0]) + 0.004:.6f} depth/after{i}.png" for i, line in enumerate(lines)]
+    for i in range(len(lines)):
+        write_depth(tmp_path / "depth" / f"before{i}.png", 100)
+        write_depth(tmp_path / "depth" / f"after{i}.png", 200)
+    (tmp_path / "depth.txt").write_text("\n".join([*after, *lines, *before]))
+    chosen = [frame.depth_path.name for frame in open_capture(tmp_path).frames]
+    assert chosen == [f"before{i}.png" for i in range(len(lines))]  # 3 ms away; the others 10 and 14
 
 
 def test_tum_images_without_poses_near_in_time_are_skipped(tmp_path):
