@@ -93,7 +93,8 @@ class Eval:
         capture = capture_path(self.capture, self.axes, self.poses)
         metrics = eval_path(model, params, capture, self.out, options, Reporter(self.quiet))
         if "scenes" in metrics:
-            print(f"{len(metrics['scenes'])} scenes: {_both_scores(metrics['over_scenes'])}; {self.out}/metrics.json")
+            scores = _both_scores(metrics["over_scenes"])
+            print(f"{len(metrics['scenes'])} scenes: {scores}; {self.out}/metrics.json, {self.out}/*/report.html")
         else:
             self._print(metrics)
         return 0
@@ -104,7 +105,7 @@ class Eval:
         print(
             f"{metrics['capture']}, {metrics['target_views']} views: {_both_scores(metrics)} (copying the nearest view"
             f" {reference['nearest_view_psnr']:.2f}, a mean color {reference['mean_color_psnr']:.2f});"
-            f" {metrics['chunk_ms']['median']:.0f} ms a chunk; {self.out}/metrics.json"
+            f" {metrics['chunk_ms']['median']:.0f} ms a chunk; {self.out}/report.html, {self.out}/metrics.json"
         )
         if self.over_black or self.one_exposure:
             print(f"pictures{_how(self.over_black, self.one_exposure)}: {metrics['pictures']['psnr']:.2f} dB")

@@ -2,11 +2,12 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
 from ssplat_jax.commands.options import AxesOption, CapturePath, PosesOption, QuietOption, capture_path, parse_size
+from ssplat_jax.errors import InputError
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,15 +33,27 @@ class Render:
     one_exposure: bool = False
     """Show a run's scene at the exposure of its first views instead of the middle one of all."""
     film: int | None = None
-    """Also write film.mp4, with this many pictures from each camera to the next, 24 a second (extra `video`)."""
+    """Also write film.mp4, 24 pictures a second (extra `video`): FILM to each next camera, or in an orbit in all."""
+    film_path: Literal["spline", "orbit"] = "spline"
+    """spline: smooth, through all cameras. orbit: a circle around what the cameras look at; where they look outward, as
+    in a room, a small circle about the middle camera."""
+    film_shows: tuple[Literal["color", "depth", "normals"], ...] = ("color",)
+    """What the film shows; each becomes a file: film.mp4, film_depth.mp4, film_normals.mp4."""
     axes: AxesOption = None
     poses: PosesOption = None
     quiet: QuietOption = False
 
     def run(self) -> int:
         from ssplat_jax.console import Reporter
+        from ssplat_jax.runs.film import FilmOptions
         from ssplat_jax.runs.render_scene import render_scene
+        from ssplat_jax.storage.run_folder import RunFolder
 
+        if self.film is None and (self.film_path != "spline" or self.film_shows != ("color",)):
+            raise InputError(
+                "--film-path, --film-shows: wanted --film N beside them, the number of pictures; got none."
+            )
+        film = None if self.film is None else FilmOptions(self.film, self.film_path, self.film_shows)
         size, reporter = parse_size(self.size), Reporter(self.quiet)
         num_pictures = render_scene(
             self.scene,
@@ -51,8 +64,9 @@ class Render:
             max_views=self.max_views,
             over_black=self.over_black,
             one_exposure=self.one_exposure,
-            film_steps=self.film,
+            film=film,
             reporter=reporter,
         )
-        print(f"wrote {num_pictures} pictures to {self.out}/views" + (", and film.mp4" if self.film else ""))
+        films = [RunFolder(self.out).film(kind).name for kind in film.shows] if film else []
+        print(", ".join([f"wrote {num_pictures} pictures to {self.out}/views", *films]))
         return 0

@@ -1,4 +1,4 @@
-"""Smooth camera path through given cameras, for videos."""
+"""Camera paths for films: smooth ones through given cameras, and around what they look at."""
 
 import numpy as np
 from jaxtyping import Float64
@@ -33,3 +33,85 @@ def camera_path(
     u[:, :, 2] *= np.linalg.det(u @ vt)[:, None]
     path[:, :3, :3] = u @ vt
     return path, (1 - t) * Ks[before] + t * Ks[before + 1]
+
+
+SWAY_RADIUS = 0.08
+"""Radius of a sway, as a share of the distance looked at."""
+
+
+def looked_at(camtoworlds: Float64[np.ndarray, "n 4 4"]) -> Float64[np.ndarray, "3"] | None:
+    """The point nearest to the optical axes of all cameras, by least squares.
+
+    None if a camera has it behind, or if the axes are parallel to about a degree: such cameras look at no common point.
+    """
+    centers, axes = camtoworlds[:, :3, 3], camtoworlds[:, :3, 2]
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # distance from an axis
+    total = across.sum(axis=0)
+    if np.linalg.eigvalsh(total)[0] < 3e-4 * len(axes):
+        return None
+    point = np.linalg.solve(total, np.einsum("nij,nj->i", across, centers))
+    return point if (np.einsum("ni,ni->n", point - centers, axes) > 0).all() else None
+
+
+def upward(camtoworlds: Float64[np.ndarray, "n 4 4"]) -> Float64[np.ndarray, "3"] | None:
+    """The up direction of cameras that are held level: perpendicular to their images' rows, by least squares.
+
+    Where rows do not tell, because all are parallel, it is the mean of the images' up directions; None if that is 0.
+    """
+    mean = -camtoworlds[:, :3, 1].mean(axis=0)
+    if np.linalg.norm(mean) < 0.1:
+        return None
+    shares, axes = np.linalg.eigh(np.einsum("ni,nj->ij", camtoworlds[:, :3, 0], camtoworlds[:, :3, 0]))
+    axis = axes[:, 0] if shares[1] > 1e-2 * len(camtoworlds) else mean / np.linalg.norm(mean)
+    return axis if axis @ mean > 0 else -axis
+
+
+def orbit_path(
+    camtoworlds: Float64[np.ndarray, "n 4 4"], K: Float64[np.ndarray, "3 3"], distance: float, num_cameras: int
+) -> tuple[Float64[np.ndarray, "m 4 4"], Float64[np.ndarray, "m 3 3"]]:
+    """A closed path around what cameras look at: m = `num_cameras` cameras that look at one point.
+
+    Around a common point (`looked_at`) it is a circle about the cameras' up axis (`upward`), at their mean distance
+    from it and their mean height. Cameras that look outward have no such point, and from outside a room shows its walls
+    only: the path is then a sway, a small circle about the middle camera, which looks at a point straight ahead.
+
+    Args:
+        camtoworlds: the cameras, with OpenCV axes.
+        K: intrinsics of the path, pixels.
+        distance: of the point that a sway looks at from the middle camera, in the units of the poses.
+        num_cameras: cameras on the path, the first of which is not repeated.
+    """
+    middle = camtoworlds[len(camtoworlds) // 2]
+    turns = 2 * np.pi * np.arange(num_cameras) / num_cameras
+    target, up = looked_at(camtoworlds), upward(camtoworlds)
+    if target is None or up is None:
+        target, up = middle[:3, 3] + distance * middle[:3, 2], -middle[:3, 1]
+        circle = np.cos(turns)[:, None] * middle[:3, 0] + np.sin(turns)[:, None] * middle[:3, 1]
+        centers = middle[:3, 3] + SWAY_RADIUS * distance * circle
+    else:
+        arms = camtoworlds[:, :3, 3] - target
+        heights = arms @ up
+        flat = arms - heights[:, None] * up
+        lengths = np.linalg.norm(flat, axis=1)
+        first = np.argmax(lengths > 0.5 * lengths.max())  # one that is not on the axis
+        start = flat[first] / lengths[first]
+        circle = np.cos(turns)[:, None] * start + np.sin(turns)[:, None] * np.cross(up, start)
+        centers = target + lengths.mean() * circle + heights.mean() * up
+    path = np.stack([look_at(center, target, up) for center in centers])
+    return path, np.repeat(K[None], num_cameras, axis=0)
+
+
+def look_at(
+    center: Float64[np.ndarray, "3"], target: Float64[np.ndarray, "3"], up: Float64[np.ndarray, "3"]
+) -> Float64[np.ndarray, "4 4"]:
+    """The pose of a camera at `center` that looks at `target`, with `up` upward in its image.
+
+    Limits:
+        A camera that looks along `up` has no upward direction: its rotation then has NaN.
+    """
+    forward = (target - center) / np.linalg.norm(target - center)
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3] = np.stack([right, np.cross(forward, right), forward, center], axis=1)
+    return pose

@@ -9,6 +9,7 @@ from ssplat_jax.console import WAITING, Reporter
 from ssplat_jax.data.capture import Capture, open_capture
 from ssplat_jax.errors import require_positive
 from ssplat_jax.evaluation.scoring import check_scorable
+from ssplat_jax.runs.chunk_recorder import ChunkRecorder, hold_back
 from ssplat_jax.runs.finish_run import finish_run, finished_scene
 from ssplat_jax.runs.resume import RunState, resume_run, run_identity, save_run
 from ssplat_jax.storage.folder_lock import lock_folder
@@ -42,6 +43,7 @@ def run_capture(
     save_every: int,
     overwrite: bool,
     deltas: bool = False,
+    num_held_back: int = 0,
     reporter: Reporter,
 ) -> RunResult:
     """Streams a capture into a folder, continuing the run that the folder holds.
@@ -58,11 +60,12 @@ def run_capture(
         save_every: chunks between saved states.
         overwrite: remove the run that `out` holds and start anew.
         deltas: also write what each chunk changed in the scene, in the stream frame (`checkpoint/delta_files.py`).
+        num_held_back: frames, evenly spread, that are not streamed but scored every few chunks.
         reporter: shows progress and warnings.
 
     Raises:
-        InputError: the capture is unusable or lies in `out`, `out` holds a run of another capture or configuration, or
-            another process is writing to it.
+        InputError: the capture is unusable or lies in `out`, too many frames are held back, `out` holds a run of
+            another capture or configuration, or another process is writing to it.
         StorageError: `out` cannot be written or its state is corrupt.
     """
     require_positive(stride=stride, save_every=save_every)
@@ -70,10 +73,11 @@ def run_capture(
         require_positive(max_views=max_views)
     capture = open_capture(path, size=size).scaled(scale)
     check_scorable(capture)
-    indices = list(range(0, len(capture), stride))[:max_views]
+    indices, held_back = hold_back(list(range(0, len(capture), stride))[:max_views], num_held_back)
     capture.check_output_folder(out)
-    capture.verify(indices)
+    capture.verify([*indices, *held_back])
     folder = RunFolder(out)
+    recorder = ChunkRecorder(capture, folder, held_back)
     with lock_folder(out):
         if overwrite:
             folder.clear_run()
@@ -83,10 +87,10 @@ def run_capture(
         writer = start_deltas(run, len(indices), folder, deltas)
         if run.num_views == len(indices) and (num_written := finished_scene(folder, len(indices))) is not None:
             return RunResult(run.num_views, num_written, None, was_finished=True)
-        stopped = _stream(run, capture, indices, identity, folder, writer, save_every, reporter)
+        stopped = _stream(run, capture, indices, identity, folder, recorder, writer, save_every, reporter)
         if stopped:
             return RunResult(run.num_views, int(run.session.cache_facts()["decoded"]), stopped)
-        report = finish_run(run, capture, indices, folder, reporter)
+        report = finish_run(run, capture, path, indices, folder, reporter)
     return RunResult(run.num_views, report.num_written, None)
 
 
@@ -131,6 +135,7 @@ def _stream(
     indices: Sequence[int],
     identity: dict,
     folder: RunFolder,
+    recorder: ChunkRecorder,
     deltas: DeltaWriter | None,
     save_every: int,
     reporter: Reporter,
@@ -139,6 +144,7 @@ def _stream(
     order = capture.stream_order(run.session.model.config, indices, run.frame)
     with Interrupts(has_work=False) as interrupts, reporter.progress("streaming", len(indices)) as advance:
         advance(run.num_views, WAITING)
+        recorder.start(run)
         chunks = feed_chunks(run.session, capture, order[run.num_views :], run.frame)
         for number, fed in enumerate(chunks, start=1):
             interrupts.has_work = True
@@ -146,6 +152,7 @@ def _stream(
             run.frame = fed.frame
             if deltas is not None:
                 deltas.write(run)
+            recorder.record(run, fed, is_last=run.num_views == len(indices))
             advance(run.num_views)
             stopped = interrupts.received  # read once: a signal may come at any time
             if stopped or number % save_every == 0 or run.num_views == len(indices):

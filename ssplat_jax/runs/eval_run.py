@@ -16,6 +16,7 @@ from ssplat_jax.errors import InputError, echo, refusal
 from ssplat_jax.evaluation.evaluate import evaluate
 from ssplat_jax.evaluation.scoring import Display
 from ssplat_jax.metrics.lpips import LpipsWeights
+from ssplat_jax.runs.reports import report_eval
 from ssplat_jax.storage.json_files import write_json
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.streaming.session import Session
@@ -94,8 +95,8 @@ def _evaluate(
     reporter: Reporter,
     scene: str | None,
 ) -> dict[str, Any]:
-    """The metrics of one capture, in a session of its own."""
-    return evaluate(
+    """The metrics of one capture, in a session of its own; writes its report, too."""
+    metrics = evaluate(
         Session(model, params),
         capture,
         split,
@@ -107,6 +108,8 @@ def _evaluate(
         scene=scene,
         display=options.display,
     )
+    report_eval(RunFolder(out), metrics)
+    return metrics
 
 
 def _eval_scenes(

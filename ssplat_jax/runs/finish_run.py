@@ -15,6 +15,7 @@ from ssplat_jax.evaluation.exposures import exposures_to_json
 from ssplat_jax.evaluation.pictures import save_comparison
 from ssplat_jax.evaluation.scoring import score_view
 from ssplat_jax.gaussians import Gaussians, scale_colors
+from ssplat_jax.runs.reports import report_run
 from ssplat_jax.runs.resume import RunState
 from ssplat_jax.scene_files.export_rows import ExportReport
 from ssplat_jax.scene_files.formats import save_gaussians
@@ -27,13 +28,14 @@ NUM_PICTURES = 8
 
 
 def finish_run(
-    run: RunState, capture: Capture, indices: Sequence[int], folder: RunFolder, reporter: Reporter
+    run: RunState, capture: Capture, path: str, indices: Sequence[int], folder: RunFolder, reporter: Reporter
 ) -> ExportReport:
-    """Writes the scene, pictures of some streamed views, and the metrics.
+    """Writes the scene, pictures of some streamed views, the report, and the metrics.
 
     Args:
         run: the finished stream.
         capture: the capture that was streamed.
+        path: the capture, as the user gave it.
         indices: frames that were streamed, in the capture's order.
         folder: where the results go.
         reporter: prints warnings.
@@ -70,6 +72,7 @@ def finish_run(
         "stream_frame": frame.to_dict(),
         "config_hash": run.session.model.config.hash,
     }
+    report_run(folder, metrics, path)
     write_json(folder.metrics, metrics)
     return report
 

@@ -1,6 +1,7 @@
-"""`ssplat render`: pictures of a scene file from the cameras of a capture, and a film through them."""
+"""`ssplat render`: pictures of a scene file from the cameras of a capture, and films of it."""
 
 import dataclasses
+import functools
 from pathlib import Path
 
 import jax
@@ -9,14 +10,14 @@ import numpy as np
 from jaxtyping import Float, Float64
 
 from ssplat_jax.console import Reporter
-from ssplat_jax.data.camera_path import camera_path
 from ssplat_jax.data.capture import open_capture
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.errors import InputError, require_positive
-from ssplat_jax.evaluation.pictures import eight_bits, save_image
+from ssplat_jax.evaluation.pictures import save_image
 from ssplat_jax.gaussians import mean_color
 from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.rasterizer import Effects, fill_holes, render
+from ssplat_jax.runs.film import KINDS, FilmOptions, depth_range, film_path, write_film
 from ssplat_jax.scene_files.formats import read_scene
 from ssplat_jax.scene_files.splat_file import SplatFile
 from ssplat_jax.storage.folder_lock import lock_folder
@@ -40,10 +41,10 @@ def render_scene(
     max_views: int | None,
     over_black: bool,
     one_exposure: bool = False,
-    film_steps: int | None,
+    film: FilmOptions | None,
     reporter: Reporter,
 ) -> int:
-    """Writes `out`/views/<frame>.png for frames of a capture, and optionally `out`/film.mp4 through their cameras.
+    """Writes `out`/views/<frame>.png for frames of a capture, and optionally `out`/film.mp4 and its like.
 
     The scene is drawn with the filter that its file names: mip, or the dilation of 3DGS where the file names none. It
     is shown at the exposure of its file: the middle one of its stream.
@@ -58,7 +59,7 @@ def render_scene(
         over_black: show holes black instead of in the colors around them.
         one_exposure: show the scene at the exposure of the first streamed views; with `over_black` a picture of 8 bits
             is then the image of the `literal` score.
-        film_steps: pictures of the film from one camera to the next; None for no film.
+        film: the film along or around these cameras; None for no film.
         reporter: shows progress.
 
     Returns:
@@ -72,8 +73,8 @@ def render_scene(
     require_positive(stride=stride)
     if max_views is not None:
         require_positive(max_views=max_views)
-    if film_steps is not None:
-        require_positive(film=film_steps)
+    if film is not None:
+        film.check()
     splats = _read_scene(scene)
     if one_exposure:
         gaussians = at_first_exposure(splats.gaussians, scene_exposure(scene))
@@ -81,24 +82,25 @@ def render_scene(
     capture, folder = open_capture(path, size=size), RunFolder(out)
     capture.check_output_folder(out)
     indices = range(0, len(capture), stride)[:max_views]
-    film = None if film_steps is None else VideoWriter(capture.width, capture.height)
-    steps = film_steps or 1
-    path_poses, path_Ks = camera_path(
-        np.stack([capture.frames[i].camtoworld for i in indices]), np.stack([capture.K(i) for i in indices]), steps
+    size = (capture.width, capture.height)
+    writers = {kind: VideoWriter(*size) for kind in (film.shows if film else ())}
+    draw = functools.partial(
+        _render_picture, splats, size=size, background=None if over_black else mean_color(splats.gaussians)
     )
-    background = None if over_black else mean_color(splats.gaussians)
-    with lock_folder(out), reporter.progress("rendering", len(path_poses)) as advance:
+    with lock_folder(out):
         folder.clear_views()
-        folder.film.unlink(missing_ok=True)
-        for place, (camtoworld, K) in enumerate(zip(path_poses, path_Ks, strict=True)):
-            picture = _render_picture(splats, camtoworld, K, (capture.width, capture.height), background)
-            if place % steps == 0:
-                save_image(folder.view(indices[place // steps]), picture)
-            if film is not None:
-                film.add(eight_bits(picture))
-            advance(place + 1)
+        for kind in KINDS:
+            folder.film(kind).unlink(missing_ok=True)
+        with reporter.progress("rendering", len(indices)) as advance:
+            for place, i in enumerate(indices):
+                save_image(folder.view(i), draw(capture.frames[i].camtoworld, capture.K(i))[0])
+                advance(place + 1)
         if film is not None:
-            film.save(folder.film)
+            poses, Ks = (
+                np.stack(x) for x in zip(*[(capture.frames[i].camtoworld, capture.K(i)) for i in indices], strict=True)
+            )
+            cameras = film_path(poses, Ks, film, splats, size)
+            write_film(cameras, draw, depth_range(splats, cameras, size), writers, folder, reporter)
     return len(indices)
 
 
@@ -117,10 +119,11 @@ def _render_picture(
     splats: SplatFile,
     camtoworld: Float64[np.ndarray, "4 4"],
     K: Float64[np.ndarray, "3 3"],
+    *,
     size: tuple[int, int],
     background: jax.Array | None,
-) -> Float[np.ndarray, "h w 3"]:
-    """Renders a scene from one camera.
+) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
+    """Color and depth (capture units, 0 where nothing is) of a scene from one camera.
 
     Args:
         splats: the scene, in the capture's frame relative to its offset.
@@ -133,7 +136,8 @@ def _render_picture(
     camera = Camera(
         viewmats=jnp.asarray(frame.viewmats(camtoworld)), Ks=jnp.asarray(K, jnp.float32), width=size[0], height=size[1]
     )
-    effects = Effects(antialias=ANTIALIAS[splats.render_mode], outputs=("color", "alpha"))
+    effects = Effects(antialias=ANTIALIAS[splats.render_mode], outputs=("color", "alpha", "depth"))
     out = render(splats.gaussians, camera, effects=effects)
     assert out.color is not None and out.alpha is not None
-    return np.asarray(out.color if background is None else _jitted_fill_holes(out.color, out.alpha, background))
+    color = out.color if background is None else _jitted_fill_holes(out.color, out.alpha, background)
+    return np.asarray(color), np.asarray(out.depth)

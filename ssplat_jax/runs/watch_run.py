@@ -16,6 +16,7 @@ from ssplat_jax.data.growing_capture import is_done, open_growing
 from ssplat_jax.errors import InputError, refusal, require_positive
 from ssplat_jax.evaluation.scoring import check_scorable
 from ssplat_jax.runs.capture_run import DeltaWriter, RunResult, start_deltas
+from ssplat_jax.runs.chunk_recorder import ChunkRecorder
 from ssplat_jax.runs.finish_run import finish_run, finished_scene
 from ssplat_jax.runs.resume import RunState, resume_run, run_identity, save_run
 from ssplat_jax.storage.folder_lock import lock_folder
@@ -79,7 +80,7 @@ def watch_capture(
             indices = watch.indices[: run.num_views]
             if (num_written := finished_scene(watch.folder, len(indices))) is not None:
                 return RunResult(run.num_views, num_written, None, was_finished=True)
-            report = finish_run(run, watch.known(), indices, watch.folder, reporter)
+            report = finish_run(run, watch.known(), path, indices, watch.folder, reporter)
     return RunResult(run.num_views, report.num_written, None)
 
 
@@ -164,10 +165,12 @@ class _Watch:
         """Streams chunks as they become complete, until nothing more will come or a signal does."""
         size, num_chunks = self.model.config.stream.chunk_size, 0
         writer = start_deltas(run, run.num_views + 1, self.folder, self.options.deltas)
+        recorder = ChunkRecorder(self.known(), self.folder)
+        recorder.start(run)
         while not interrupts.received:
             waiting = len(self.indices) - run.num_views
             if waiting >= size or (ended and waiting > 0):
-                self._feed(run, self.indices[run.num_views :][:size], writer)
+                self._feed(run, self.indices[run.num_views :][:size], writer, recorder)
                 interrupts.has_work, num_chunks = True, num_chunks + 1
                 if num_chunks % self.options.save_every == 0:
                     self._save(run)
@@ -181,10 +184,12 @@ class _Watch:
         if not interrupts.received and self.problem is not None:
             self.reporter.warn(f"{self.problem} It and the frames after it are left out.")
 
-    def _feed(self, run: RunState, group: list[int], writer: DeltaWriter | None) -> None:
+    def _feed(self, run: RunState, group: list[int], writer: DeltaWriter | None, recorder: ChunkRecorder) -> None:
+        recorder.capture = self.known()
         for fed in feed_chunks(run.session, self.known(), group, run.frame):
             run.exposures |= fed.exposures
             run.frame = fed.frame
+            recorder.record(run, fed, is_last=False)
         if writer is not None:
             writer.write(run)
         self.reporter.say(f"{run.num_views} views streamed, {len(self.indices)} complete")

@@ -53,15 +53,29 @@ class RunFolder:
         """The frames of an evaluation as an index file."""
         return self.path / "index.json"
 
-    @property
-    def film(self) -> Path:
-        """The film that `ssplat render --film` writes."""
-        return self.path / "film.mp4"
+    def film(self, kind: str = "color") -> Path:
+        """The film of a kind that `ssplat render --film` writes: color, depth or normals."""
+        return self.path / ("film.mp4" if kind == "color" else f"film_{kind}.mp4")
 
     @property
     def deltas(self) -> Path:
         """The folder with one file of scene changes per chunk."""
         return self.path / "deltas"
+
+    @property
+    def chunk_records(self) -> Path:
+        """The folder with one record per chunk."""
+        return self.path / "chunks"
+
+    @property
+    def report(self) -> Path:
+        """The report as one HTML page."""
+        return self.path / "report.html"
+
+    @property
+    def contact_sheet(self) -> Path:
+        """All pictures on one sheet."""
+        return self.path / "contact_sheet.jpg"
 
     @property
     def views(self) -> Path:
@@ -71,6 +85,14 @@ class RunFolder:
     def delta(self, num_views: int) -> Path:
         """The scene changes of the chunk that brought the stream to `num_views` views."""
         return self.deltas / f"{num_views:06d}.npz"
+
+    def chunk_record(self, num_views: int) -> Path:
+        """The record of the chunk that brought the stream to `num_views` views."""
+        return self.chunk_records / f"{num_views:06d}.json"
+
+    def chunk_record_files(self) -> list[Path]:
+        """All chunk records in stream order; the list is empty if there is no such folder."""
+        return sorted(self.chunk_records.glob("*.json"))
 
     def view(self, i: int) -> Path:
         """The picture of frame `i`."""
@@ -98,6 +120,8 @@ class RunFolder:
             stale.unlink(missing_ok=True)
         self.clear_refinement()
         self.clear_deltas()
+        self.clear_report()
+        remove_numbered(self.chunk_records, "######.json")
         self.clear_views()
 
     def clear_refinement(self) -> None:
@@ -108,6 +132,11 @@ class RunFolder:
     def clear_deltas(self) -> None:
         """Removes all deltas."""
         remove_numbered(self.deltas, "######.npz")
+
+    def clear_report(self) -> None:
+        """Removes the report and the contact sheet."""
+        for stale in (self.report, self.contact_sheet):
+            stale.unlink(missing_ok=True)
 
     def clear_views(self) -> None:
         """Removes the pictures in `views`."""

@@ -1,6 +1,7 @@
 """Streaming the frames of a capture through a session, chunk by chunk, with the exposure of every frame."""
 
 import dataclasses
+import time
 from collections.abc import Callable, Iterator, Sequence
 
 import jax.numpy as jnp
@@ -37,6 +38,7 @@ class FedChunk:
     frames: list[int]  # frame numbers of the chunk's valid views, in their order
     output: ChunkOutput
     frame: StreamFrame  # of the next chunk: with `causal`, near and far may have moved outward
+    seconds: float  # of the step, without compiling it
 
     @property
     def exposures(self) -> Exposures:
@@ -65,10 +67,12 @@ def feed_chunks(session: Session, capture: Capture, order: Sequence[int], frame:
         num_fed += len(frames)
         if config.stream.causal:
             chunk = replace(chunk, near=jnp.float32(frame.near), far=jnp.float32(frame.far))
+        since, compiled = time.perf_counter(), session.compile_seconds
         output = session.feed(chunk)
+        seconds = time.perf_counter() - since - (session.compile_seconds - compiled)
         if config.stream.causal:
             frame = widen_range(frame, output, config)
-        yield FedChunk(chunk, frames, output, frame)
+        yield FedChunk(chunk, frames, output, frame, seconds)
 
 
 def feed_capture(

@@ -15,7 +15,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Int32
+from jaxtyping import Float32, Int32
 
 from ssplat_jax.cache import VoxelCache
 from ssplat_jax.cache.state import require_single_cache
@@ -33,6 +33,8 @@ class SceneDelta:
     rows: Int32[np.ndarray, " r"]  # ascending
     gaussians: Gaussians  # [r * k], in the order of `rows`; k = pivots_per_voxel * gaussians_per_token
     capacity: int  # capacity of the cache: the scene has capacity * k Gaussians
+    confidences: Float32[np.ndarray, " n"] | None = None
+    """Omega of the pivots behind `gaussians`, in their order. A change of it alone is no change of a row."""
 
 
 class SceneFeed:
@@ -64,7 +66,14 @@ class SceneFeed:
         padded = np.pad(rows, (0, num_padded - len(rows)), constant_values=-1)
         gaussians = self._decode_rows(self._params, cache, jnp.asarray(padded))
         num_gaussians = gaussians.num_gaussians // num_padded * len(rows)
-        return SceneDelta(rows, jax.tree.map(lambda x: x[:num_gaussians], gaussians), cache.capacity)
+        confidences = np.asarray(cache.confidences, np.float32)[rows].reshape(-1)
+        repeats = num_gaussians // max(confidences.size, 1)
+        return SceneDelta(
+            rows,
+            jax.tree.map(lambda x: x[:num_gaussians], gaussians),
+            cache.capacity,
+            np.repeat(confidences, repeats),
+        )
 
     def _changed_rows(self, cache: VoxelCache) -> Int32[np.ndarray, " r"]:
         """Rows written, carved or restored since the last call; updates the feed's record."""
@@ -73,6 +82,21 @@ class SceneFeed:
         is_written = np.asarray(cache.alive) & (np.asarray(cache.last_chunks) >= self._next_chunk)
         self._next_chunk, self._shown = int(cache.stats.num_chunks), shown
         return np.flatnonzero((is_written | (shown != known)).any(axis=1)).astype(np.int32)
+
+
+def apply_confidences(known: Float32[np.ndarray, " m"] | None, delta: SceneDelta) -> Float32[np.ndarray, " m"] | None:
+    """`known` confidences with those of `delta`, one for each Gaussian of `apply_delta`; absent Gaussians have 0.
+
+    None where a delta has none: earlier versions wrote none.
+    """
+    if delta.confidences is None or (num_rows := len(delta.rows)) == 0:
+        return known
+    k = len(delta.confidences) // num_rows
+    merged = np.zeros(max(delta.capacity * k, 0 if known is None else len(known)), np.float32)
+    if known is not None:
+        merged[: len(known)] = known
+    merged[(delta.rows[:, None] * k + np.arange(k)).reshape(-1)] = delta.confidences
+    return merged
 
 
 def apply_delta(scene: Gaussians | None, delta: SceneDelta) -> Gaussians:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from ssplat_jax.data.camera_path import camera_path
+from ssplat_jax.data.camera_path import SWAY_RADIUS, camera_path, look_at, looked_at, orbit_path
 
 K = np.array([[50.0, 0.0, 32.0], [0.0, 50.0, 24.0], [0.0, 0.0, 1.0]])
 
@@ -68,3 +68,54 @@ def test_one_camera_is_its_own_path():
     path, Ks = camera_path(given, K[None], 5)
     np.testing.assert_array_equal(path, given)
     np.testing.assert_array_equal(Ks, K[None])
+
+
+def inward(num_cameras, height=0.4, radius=2.0, target=(1.0, -2.0, 3.0)):
+    """Cameras on half a circle about z, which look at a point from above it; each a little off its place."""
+    angles = np.linspace(0, np.pi, num_cameras)
+    arms = np.stack([radius * np.cos(angles), radius * np.sin(angles), np.full(num_cameras, height)], axis=1)
+    up = np.array([0.0, 0.0, 1.0])
+    return np.stack([look_at(target + arm, np.array(target), up) for arm in arms])
+
+
+def test_the_point_looked_at_is_where_the_axes_meet():
+    np.testing.assert_allclose(looked_at(inward(9)), [1.0, -2.0, 3.0], atol=1e-9)
+    outward = inward(9)
+    outward[:, :3, [0, 2]] *= -1  # turned about: the same axes, behind
+    assert looked_at(outward) is None
+    parallel = np.tile(np.eye(4), (5, 1, 1))
+    parallel[:, 0, 3] = np.arange(5)
+    assert looked_at(parallel) is None and looked_at(parallel[:1]) is None
+
+
+def test_an_orbit_is_a_circle_through_cameras_that_look_at_one_point():
+    given = inward(9)
+    path, Ks = orbit_path(given, K, 1.0, 16)
+    np.testing.assert_array_equal(Ks, np.tile(K, (16, 1, 1)))
+    # From one camera a half circle away is eight sixteenths: the ninth of the path is the last given one, mirrored.
+    np.testing.assert_allclose(path[0], given[0], atol=1e-3)
+    np.testing.assert_allclose(path[8], given[8], atol=1e-3)
+    arms = path[:, :3, 3] - [1.0, -2.0, 3.0]
+    np.testing.assert_allclose(np.linalg.norm(arms, axis=1), np.hypot(2.0, 0.4), rtol=1e-3)
+    np.testing.assert_allclose(path[:, :3, 2], -arms / np.linalg.norm(arms, axis=1, keepdims=True), atol=1e-6)
+    steps = np.linalg.norm(np.diff(path[:, :3, 3], axis=0, append=path[:1, :3, 3]), axis=1)
+    np.testing.assert_allclose(steps, steps[0], rtol=1e-9)  # closed and even
+
+
+def test_cameras_that_look_outward_sway_about_the_middle_one():
+    given = inward(9)
+    given[:, :3, [0, 2]] *= -1
+    path, _ = orbit_path(given, K, 5.0, 12)
+    middle, target = given[4, :3, 3], given[4, :3, 3] + 5.0 * given[4, :3, 2]
+    np.testing.assert_allclose(np.linalg.norm(path[:, :3, 3] - middle, axis=1), SWAY_RADIUS * 5.0)
+    toward = target - path[:, :3, 3]
+    np.testing.assert_allclose(path[:, :3, 2], toward / np.linalg.norm(toward, axis=1, keepdims=True), atol=1e-12)
+    np.testing.assert_allclose(np.linalg.det(path[:, :3, :3]), 1.0)
+    assert (np.einsum("nj,j->n", path[:, :3, 1], given[4, :3, 1]) > 0.9).all()  # upright
+
+
+def test_cameras_with_opposite_ups_sway_too():
+    given = inward(2)
+    given[1, :3, [0, 1]] *= -1  # rolled by half a turn
+    path, _ = orbit_path(given, K, 5.0, 4)
+    assert np.isfinite(path).all()

@@ -12,7 +12,7 @@ from ssplat_jax.checkpoint.delta_files import load_delta, save_delta
 from ssplat_jax.errors import StorageError
 from ssplat_jax.model.compact.gaussian_head import GaussianHead
 from ssplat_jax.pytree import replace
-from ssplat_jax.streaming.scene_delta import SceneFeed, apply_delta
+from ssplat_jax.streaming.scene_delta import SceneFeed, apply_confidences, apply_delta
 from ssplat_jax.streaming.streamsplat import StreamSplat
 from tests.cache.streams import CAPACITY, CONFIG, PLACES, VARIANTS, Recipe, fuse, fuse_with_rows, to_jax
 
@@ -53,15 +53,22 @@ def assert_same_scene(received, scene):
 def test_deltas_put_together_equal_the_scene(name):
     config = VARIANTS[name]
     model, params, rng = StreamSplat(config), decoder_params(config), np.random.default_rng(0)
-    cache, feed, received = init_cache(config, CAPACITY), SceneFeed(model, params), None
+    cache, feed = init_cache(config, CAPACITY), SceneFeed(model, params)
+    received, confidences = None, None
     decode = jax.jit(model.decode)
     for seed in range(8):
         cache = fuse(cache, chunk(seed), config)
         cache = carved(cache, rng, config)
         if seed in (2, 3):
             continue  # a delta may span several chunks
-        received = apply_delta(received, feed.update(cache))
+        delta = feed.update(cache)
+        received = apply_delta(received, delta)
         assert_same_scene(received, decode(params, cache))
+        confidences = apply_confidences(confidences, delta)
+        shown = np.asarray(received.opacities) > 0
+        wanted = np.repeat(np.asarray(cache.confidences).reshape(-1), len(shown) // cache.confidences.size)
+        rows = np.repeat(np.isin(np.arange(cache.capacity), delta.rows), len(shown) // cache.capacity)
+        np.testing.assert_array_equal(confidences[rows], wanted[rows])
     assert (received.opacities > 0).any() and (received.opacities == 0).any()
 
 
@@ -108,6 +115,7 @@ def test_deltas_come_back_from_disk_to_the_last_bit(tmp_path):
     read = load_delta(tmp_path / "00000.npz")
     assert read.capacity == delta.capacity
     np.testing.assert_array_equal(read.rows, delta.rows)
+    np.testing.assert_array_equal(read.confidences, delta.confidences)
     jax.tree.map(np.testing.assert_array_equal, read.gaussians, delta.gaussians)
     contents = bytearray((tmp_path / "00000.npz").read_bytes())
     contents[len(contents) // 2] ^= 1

@@ -1,0 +1,117 @@
+"""Chunk records: what a run notes after each chunk, one small JSON file each. The viewer and the report read them."""
+
+import base64
+import dataclasses
+import io
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Float64, UInt8
+from PIL import Image
+
+from ssplat_jax.storage.json_files import write_json
+
+KIND = "chunk record 1"  # kind and version of the file
+
+THUMBNAIL_SIDE = 160
+"""Longest side of a thumbnail, pixels."""
+
+
+@dataclasses.dataclass(frozen=True)
+class RecordedView:
+    """A streamed view."""
+
+    frame: int  # in the capture
+    camtoworld: Float64[np.ndarray, "4 4"]  # OpenCV axes, capture frame
+    K: Float64[np.ndarray, "3 3"]  # pixels of the streamed image
+    exposure: Float64[np.ndarray, "3"]  # RGB factor from the colors of the scene's first views to this view's
+    thumbnail: bytes  # JPEG
+
+
+@dataclasses.dataclass(frozen=True)
+class ChunkRecord:
+    """A chunk of a run, and the state of its stream afterwards."""
+
+    num_views: int  # streamed so far
+    size: tuple[int, int]  # (width, height) of the streamed images, pixels
+    views: tuple[RecordedView, ...]
+    seconds: float  # of the step, without compiling
+    occupancy: float  # share of the cache's voxels that are in use
+    num_gaussians: int  # shown
+    held_back_psnr: float | None = None  # dB, mean of the shown scores; None where none was taken
+
+    def to_dict(self) -> dict[str, Any]:
+        """The fields as plain JSON types; the inverse is `from_dict`."""
+        fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        views = [
+            {
+                "frame": view.frame,
+                "camtoworld": view.camtoworld.tolist(),
+                "K": view.K.tolist(),
+                "exposure": view.exposure.tolist(),
+                "thumbnail": base64.b64encode(view.thumbnail).decode(),
+            }
+            for view in self.views
+        ]
+        return {"kind": KIND} | fields | {"views": views}
+
+    @staticmethod
+    def from_dict(fields: dict[str, Any]) -> "ChunkRecord":
+        """The record of the fields that `to_dict` gave.
+
+        Raises:
+            LookupError, TypeError, ValueError: they are of another kind or incomplete.
+        """
+        if fields["kind"] != KIND:
+            raise ValueError(f"wanted {KIND}, got {fields['kind']}")
+        views = tuple(
+            RecordedView(
+                frame=view["frame"],
+                camtoworld=np.array(view["camtoworld"], np.float64).reshape(4, 4),
+                K=np.array(view["K"], np.float64).reshape(3, 3),
+                exposure=np.array(view["exposure"], np.float64).reshape(3),
+                thumbnail=base64.b64decode(view["thumbnail"]),
+            )
+            for view in fields["views"]
+        )
+        rest = {name: fields[name] for name in ("num_views", "seconds", "occupancy", "num_gaussians", "held_back_psnr")}
+        width, height = fields["size"]
+        return ChunkRecord(size=(width, height), views=views, **rest)
+
+
+def save_chunk_record(path: Path, record: ChunkRecord) -> None:
+    """Writes a record, atomically.
+
+    Raises:
+        StorageError: the file cannot be written.
+    """
+    write_json(path, record.to_dict())
+
+
+def load_chunk_records(paths: Sequence[Path]) -> list[ChunkRecord]:
+    """The records in files of `save_chunk_record`, up to the first that is missing or cannot be read."""
+    records = []
+    for path in paths:
+        try:
+            records.append(ChunkRecord.from_dict(json.loads(path.read_bytes())))
+        except (OSError, LookupError, TypeError, ValueError, AttributeError):
+            break  # a run that is being started anew, or a file of another program: pictures of it are a luxury
+    return records
+
+
+def make_thumbnail(image: Float[np.ndarray, "h w 3"]) -> bytes:
+    """A small JPEG of an image in [0, 1]."""
+    picture = Image.fromarray((np.clip(image, 0.0, 1.0) * 255 + 0.5).astype(np.uint8))
+    picture.thumbnail((THUMBNAIL_SIDE, THUMBNAIL_SIDE), Image.Resampling.LANCZOS)
+    encoded = io.BytesIO()
+    picture.save(encoded, "JPEG", quality=85)
+    return encoded.getvalue()
+
+
+def open_thumbnail(encoded: bytes) -> UInt8[np.ndarray, "h w 3"]:
+    """The pixels of a thumbnail."""
+    with Image.open(io.BytesIO(encoded)) as picture:
+        return np.asarray(picture.convert("RGB"))

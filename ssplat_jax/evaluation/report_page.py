@@ -1,0 +1,140 @@
+"""The report: one HTML page that holds its pictures and plots, and loads nothing from elsewhere."""
+
+import base64
+import dataclasses
+import html
+import io
+import itertools
+from collections.abc import Sequence
+from pathlib import Path
+
+from PIL import Image
+
+from ssplat_jax.storage.atomic import write_atomic
+
+STYLE = """
+:root { color-scheme: light dark; --paper: #fbfbf9; --ink: #23282e; --soft: #6b727b; --line: #e2e2dd; --card: #fff; }
+@media (prefers-color-scheme: dark) {
+  :root { --paper: #16181b; --ink: #e4e6e8; --soft: #9aa1a9; --line: #2c3036; --card: #1d2024; }
+}
+* { box-sizing: border-box; }
+body { margin: 0; background: var(--paper); color: var(--ink); font: 16px/1.55 system-ui, sans-serif; }
+main { max-width: 1040px; margin: 0 auto; padding: 48px 24px 72px; }
+h1 { font-size: 1.7rem; font-weight: 600; margin: 0 0 4px; overflow-wrap: anywhere; }
+h2 { font-size: 1.05rem; font-weight: 600; margin: 44px 0 14px; }
+.summary, .note { color: var(--soft); margin: 0; }
+.note { font-size: 0.85rem; margin-bottom: 12px; }
+.facts { display: grid; grid-template-columns: repeat(auto-fit, minmax(150px, 1fr)); gap: 12px; margin-top: 28px; }
+.fact, .plots > div { background: var(--card); border: 1px solid var(--line); border-radius: 8px; padding: 14px 16px; }
+.fact b { display: block; font-size: 1.35rem; font-weight: 600; font-variant-numeric: tabular-nums; }
+.fact span { color: var(--soft); font-size: 0.82rem; }
+.plots { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 420px), 1fr)); gap: 12px; }
+.plot { display: block; width: 100%; }
+.plot text { fill: currentColor; font: 11px system-ui, sans-serif; }
+.plot .title { font-size: 13px; font-weight: 600; }
+.plot .tick { fill: var(--soft); }
+.plot .grid { stroke: var(--line); }
+figure { margin: 0 0 6px; }
+.pairs { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(100%, 440px), 1fr)); gap: 12px; }
+figure img { display: block; width: 100%; border-radius: 6px; background: #000; }
+figcaption { color: var(--soft); font-size: 0.85rem; margin-top: 5px; font-variant-numeric: tabular-nums; }
+table { border-collapse: collapse; width: 100%; font-size: 0.92rem; }
+td { border-top: 1px solid var(--line); padding: 7px 16px 7px 0; vertical-align: top; }
+td:first-child { white-space: nowrap; }
+pre { background: var(--card); border: 1px solid var(--line); border-radius: 8px; padding: 14px 16px; }
+pre { overflow-x: auto; }
+code, pre { font: 0.85rem/1.6 ui-monospace, monospace; }
+a { color: inherit; }
+"""
+
+JPEG_QUALITY = 88
+
+PAIRED_WIDTH = 700
+"""Pictures narrower than this, in pixels, stand side by side."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Report:
+    """The contents of a page, in the order in which they are shown. Empty parts are left out."""
+
+    title: str
+    summary: str  # one sentence
+    facts: Sequence[tuple[str, str]]  # label and value with its unit
+    plots: Sequence[str] = ()  # SVG elements (`svg_plot.line_plot`)
+    pictures: Sequence[tuple[Path, str]] = ()  # image files and captions; missing files are left out
+    pictures_note: str = ""  # how the pictures were made
+    files: Sequence[tuple[str, str]] = ()  # path relative to the page, and its content
+    commands: Sequence[str] = ()  # to go on with
+    details: Sequence[tuple[str, str]] = ()
+
+
+def save_report(path: Path, report: Report) -> None:
+    """Writes a report as one HTML file.
+
+    Raises:
+        StorageError: the file cannot be written.
+    """
+    write_atomic(path, page_text(report).encode())
+
+
+def page_text(report: Report) -> str:
+    """The page as HTML."""
+    files = [(_link(name), html.escape(text)) for name, text in report.files]
+    found = [(file, caption) for file, caption in report.pictures if file.is_file()]
+    kind = "pairs" if found and _width(found[0][0]) < PAIRED_WIDTH else ""
+    facts = "".join(_fact(label, value) for label, value in report.facts)
+    body = [
+        f"<h1>{html.escape(report.title)}</h1>",
+        f'<p class="summary">{html.escape(report.summary)}</p>',
+        f'<div class="facts">{facts}</div>',
+        _section("Over the stream", "".join(f"<div>{plot}</div>" for plot in report.plots), "plots"),
+        _section("Pictures", "\n".join(itertools.starmap(_figure, found)), kind, report.pictures_note),
+        _section("Where everything is", _table(files)),
+        _section("Next", f"<pre>{html.escape(chr(10).join(report.commands))}</pre>" if report.commands else ""),
+        _section("Details", _table([(html.escape(a), html.escape(b)) for a, b in report.details])),
+    ]
+    return (
+        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f"<title>{html.escape(report.title)}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n<main>\n"
+        + "\n".join(filter(None, body))
+        + "\n</main>\n</body>\n</html>\n"
+    )
+
+
+def _section(heading: str, content: str, kind: str = "", note: str = "") -> str:
+    """A heading and its content; nothing without content."""
+    if not content:
+        return ""
+    note = f'<p class="note">{html.escape(note)}</p>' if note else ""
+    return f'<h2>{heading}</h2>\n{note}<div class="{kind}">{content}</div>'
+
+
+def _fact(label: str, value: str) -> str:
+    return f'<div class="fact"><b>{html.escape(value)}</b><span>{html.escape(label)}</span></div>'
+
+
+def _table(rows: Sequence[tuple[str, str]]) -> str:
+    """Rows of HTML; nothing without rows."""
+    return "<table>" + "".join(f"<tr><td>{a}</td><td>{b}</td></tr>" for a, b in rows) + "</table>" if rows else ""
+
+
+def _link(name: str) -> str:
+    return f'<a href="{html.escape(name)}"><code>{html.escape(name)}</code></a>'
+
+
+def _width(file: Path) -> int:
+    with Image.open(file) as picture:
+        return picture.width
+
+
+def _figure(file: Path, caption: str) -> str:
+    """A picture as a data URI, above its caption."""
+    encoded = io.BytesIO()
+    with Image.open(file) as picture:
+        picture.convert("RGB").save(encoded, "JPEG", quality=JPEG_QUALITY)
+    data = base64.b64encode(encoded.getvalue()).decode()
+    caption = html.escape(caption)
+    return (
+        f'<figure><img src="data:image/jpeg;base64,{data}" alt="{caption}"><figcaption>{caption}</figcaption></figure>'
+    )

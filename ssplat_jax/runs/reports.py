@@ -1,0 +1,186 @@
+"""The reports of `ssplat run` and `ssplat eval`: a page and a contact sheet of what their folder holds."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ssplat_jax.checkpoint.chunk_records import ChunkRecord, load_chunk_records
+from ssplat_jax.evaluation.contact_sheet import evenly_spread, save_contact_sheet
+from ssplat_jax.evaluation.report_page import Report, save_report
+from ssplat_jax.evaluation.svg_plot import Line, line_plot
+from ssplat_jax.storage.run_folder import RunFolder
+
+MOST_PICTURES = 12
+"""Pictures on a page; of more, evenly spread ones are shown, and the contact sheet has more of them."""
+
+NOTE = "Left to right: the photograph, the rendered view, its depth (light near, dark far)."
+SHOWN = "holes filled, at the exposure of the nearest streamed views"
+
+FILES = (
+    ("scene.ply", "the scene, in the frame and units of the capture, at the middle exposure of its views"),
+    ("refined.ply", "the scene after gradient steps"),
+    ("metrics.json", "every figure of this page, and more"),
+    ("contact_sheet.jpg", "the pictures on one sheet"),
+    ("views", "pictures of streamed views"),
+    ("chunks", "a record of every chunk: cameras, exposures, time, occupancy"),
+    ("deltas", "the changes of every chunk, for the viewer's time slider"),
+    ("state.npz", "the saved stream, from which a stopped run continues"),
+    ("split.json", "the frames that were streamed and scored"),
+    ("index.json", "the same frames as an index file"),
+)
+
+
+def report_run(folder: RunFolder, metrics: dict[str, Any], path: str) -> None:
+    """Writes the report and the contact sheet of a run.
+
+    Args:
+        folder: the folder of the run, complete but for these.
+        metrics: its metrics.
+        path: the capture, as the user gave it.
+
+    Raises:
+        StorageError: a file cannot be written.
+    """
+    records, scores = load_chunk_records(folder.chunk_record_files()), metrics["seen_views"]
+    pictures = [(folder.view(score["frame"]), _caption(score, "streamed")) for score in scores]
+    save_contact_sheet(folder.contact_sheet, pictures)
+    width, height = metrics["size"]
+    shown = np.mean([score["shown"]["psnr"] for score in scores])
+    facts = [
+        ("views streamed", f"{metrics['views']}"),
+        ("Gaussians in the scene", f"{metrics['ply']['num_written']:,}"),
+        (f"streamed views as shown, mean of {len(scores)}", f"{shown:.2f} dB"),
+    ]
+    if records:
+        facts.append(("a chunk of four views, median", f"{np.median([r.seconds for r in records]):.2f} s"))
+        facts.append(("of the cache in use", f"{records[-1].occupancy:.0%}"))
+    if held_back := [r.held_back_psnr for r in records if r.held_back_psnr is not None]:
+        facts.append(("held-back views as shown", f"{held_back[-1]:.2f} dB"))
+    out, capture = folder.path, _quoted(path)
+    report = Report(
+        title=metrics["capture"],
+        summary=f"A scene of 3D Gaussians from {metrics['views']} views of {width} x {height} pixels, streamed once.",
+        facts=facts,
+        plots=stream_plots(records),
+        pictures=_some(pictures),
+        pictures_note=f"{NOTE} Scores of views that the scene was made from, {SHOWN}.",
+        files=_files(folder),
+        commands=[
+            f"ssplat view {out}    # in a browser",
+            f"ssplat refine {out} {capture} --steps 100    # a better scene, by gradient steps",
+            f"ssplat render {out} {capture} --film 8 --out {out}_film    # a film along the cameras",
+            f"ssplat export {out} --to scene.sog    # for other viewers, at an eighth of the size",
+        ],
+        details=_details(metrics),
+    )
+    save_report(folder.report, report)
+
+
+def report_eval(folder: RunFolder, metrics: dict[str, Any]) -> None:
+    """Writes the report and the contact sheet of an evaluation.
+
+    Args:
+        folder: the folder of the evaluation, complete but for these.
+        metrics: its metrics.
+
+    Raises:
+        StorageError: a file cannot be written.
+    """
+    scores, shown, literal = metrics["per_view"], metrics["shown"], metrics["literal"]
+    pictures = [(folder.target(score["frame"]), _caption(score, "unseen")) for score in scores]
+    save_contact_sheet(folder.contact_sheet, pictures)
+    frames = [score["frame"] for score in scores]
+    psnrs = [Line(name, frames, [score[name]["psnr"] for score in scores]) for name in ("shown", "literal")]
+    facts = [
+        ("PSNR as shown", f"{shown['psnr']:.2f} dB"),
+        ("SSIM as shown", f"{shown['ssim']:.3f}"),
+        ("PSNR, literal", f"{literal['psnr']:.2f} dB"),
+        ("PSNR of copying the nearest view", f"{metrics['baselines']['nearest_view_psnr']:.2f} dB"),
+        ("a chunk of four views, median", f"{metrics['chunk_ms']['median']:.0f} ms"),
+        ("Gaussians in the scene", f"{metrics['num_gaussians']:,}"),
+    ]
+    if refined := metrics.get("refinement"):
+        facts.append(("PSNR as shown, before refinement", f"{refined['before']['shown']['psnr']:.2f} dB"))
+    report = Report(
+        title=metrics["capture"],
+        summary=f"{metrics['target_views']} views that were never streamed, rendered from a scene of"
+        f" {metrics['context_views']} other views.",
+        facts=facts,
+        plots=[line_plot("PSNR of unseen views", "frame", "dB", psnrs), *_exposure_plot(metrics["exposures"])],
+        pictures=_some(pictures),
+        pictures_note=f"{NOTE} Shown: {SHOWN}. Literal: over black, at the exposure of the first views.",
+        files=_files(folder),
+        details=[("protocol", metrics["protocol"]), *_details(metrics)],
+    )
+    save_report(folder.report, report)
+
+
+def stream_plots(records: Sequence[ChunkRecord]) -> list[str]:
+    """Plots of time, occupancy, scene size and held-back scores over the views streamed."""
+    if not records:
+        return []
+    views = [r.num_views for r in records]
+    plots = [
+        line_plot("Time of a chunk", "views streamed", "s", [Line("time", views, [r.seconds for r in records])]),
+        line_plot("Cache in use", "views streamed", "%", [Line("use", views, [100 * r.occupancy for r in records])]),
+    ]
+    scored = [r for r in records if r.held_back_psnr is not None]
+    if scored:
+        line = Line("PSNR", [r.num_views for r in scored], [r.held_back_psnr or np.nan for r in scored])
+        plots.append(line_plot("Views that are held back", "views streamed", "PSNR as shown, dB", [line]))
+    sizes = Line("Gaussians", views, [r.num_gaussians / 1000 for r in records])
+    plots.append(line_plot("Scene", "views streamed", "thousand Gaussians", [sizes]))
+    return [*plots, *_exposure_plot({str(v.frame): v.exposure.tolist() for r in records for v in r.views})]
+
+
+def _exposure_plot(exposures: dict[str, list[float]]) -> list[str]:
+    """The exposures over the frames, if they vary by more than a percent."""
+    frames = sorted(map(int, exposures))
+    values = np.array([exposures[str(i)] for i in frames]).reshape(-1, 3)
+    if len(frames) < 2 or np.ptp(values, axis=0).max() < 0.01:
+        return []
+    names = ("red", "green", "blue")
+    lines = [Line(name, frames, values[:, channel].tolist()) for channel, name in enumerate(names)]
+    return [line_plot("Exposure", "frame", "factor", lines)]
+
+
+def _caption(score: dict[str, Any], kind: str) -> str:
+    """Frame and scores of a picture."""
+    shown, literal = score["shown"], score["literal"]
+    return (
+        f"{kind} frame {score['frame']} · shown {shown['psnr']:.2f} dB, SSIM {shown['ssim']:.3f}"
+        f" · literal {literal['psnr']:.2f} dB"
+    )
+
+
+def _some(pictures: Sequence[tuple[Path, str]]) -> list[tuple[Path, str]]:
+    return [pictures[k] for k in evenly_spread(len(pictures), MOST_PICTURES)]
+
+
+def _files(folder: RunFolder) -> list[tuple[str, str]]:
+    """Files of the folder. A run writes its metrics after the report: with them, everything is there."""
+    last = folder.metrics.name
+    return [(name, text) for name, text in FILES if name == last or (folder.path / name).exists()]
+
+
+def _details(metrics: dict[str, Any]) -> list[tuple[str, str]]:
+    """Facts for those who look closer."""
+    cache, frame = metrics["cache"], metrics["stream_frame"]
+    rows = [
+        ("size", " x ".join(map(str, metrics["size"]))),
+        ("voxels", f"{cache['voxels']:,} of {cache['capacity']:,}"),
+        ("tokens accepted", f"{cache['accepted_fraction']:.1%}"),
+        ("near and far", f"{frame['near'] / frame['scale']:.4g} and {frame['far'] / frame['scale']:.4g} capture units"),
+        ("compiling", f"{metrics['compile_s']:.1f} s"),
+        ("configuration", metrics["config_hash"]),
+    ]
+    if frame.get("warning"):
+        rows.append(("warning", frame["warning"]))
+    return rows
+
+
+def _quoted(path: str) -> str:
+    """A path as one word of a shell."""
+    return f"'{path}'" if set(path) & set(" ?&*()") else path

@@ -1,0 +1,205 @@
+"""Reports: one page that loads nothing, with the pictures and figures of its folder."""
+
+import base64
+import html
+import io
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from ssplat_jax.checkpoint.chunk_records import ChunkRecord, RecordedView, make_thumbnail, save_chunk_record
+from ssplat_jax.evaluation.contact_sheet import GAP, LINE, MAX_PICTURES, evenly_spread, save_contact_sheet
+from ssplat_jax.evaluation.pictures import save_image
+from ssplat_jax.evaluation.report_page import Report, page_text
+from ssplat_jax.evaluation.svg_plot import BOTTOM, HEIGHT, LEFT, RIGHT, TOP, WIDTH, Line, line_plot
+from ssplat_jax.runs.reports import MOST_PICTURES, report_eval, report_run
+from ssplat_jax.storage.run_folder import RunFolder
+
+JPEG_DB = 30.0  # of a smooth picture
+RNG = np.random.default_rng(4)
+
+
+class Page(HTMLParser):
+    """The tags of a page, checked for balance."""
+
+    VOID = ("meta", "img")
+
+    def __init__(self, text):
+        super().__init__()
+        self.tags, self.open, self.text = [], [], ""
+        self.feed(text)
+        assert not self.open
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.text += data
+
+    def named(self, tag):
+        return [attributes for name, attributes in self.tags if name == tag]
+
+
+def smooth_picture(k, height=24, width=96):
+    y, x = np.mgrid[:height, :width] / width
+    return np.stack([x, y, 0.5 + 0.4 * np.sin(6 * x + k)], axis=-1).astype(np.float32)
+
+
+def score(frame):
+    block = {"psnr": 20.0 + frame / 10, "ssim": 0.7, "lpips": None}
+    return {"frame": frame, "shown": block, "literal": block | {"psnr": 15.25}, "coverage": 0.9}
+
+
+def record(num_views, psnr=None):
+    views = tuple(
+        RecordedView(i, np.eye(4), np.eye(3), np.array([1.0, 1 + i / 50, 1.0]), make_thumbnail(smooth_picture(i)))
+        for i in range(num_views - 4, num_views)
+    )
+    return ChunkRecord(num_views, (96, 24), views, 0.25, num_views / 40, 1000 * num_views, psnr)
+
+
+COMMON = {
+    "capture": 'a <room> & "more"',
+    "size": [96, 24],
+    "exposures": {"0": [1.0, 1.0, 1.0], "1": [1.5, 1.0, 1.0]},
+    "cache": {"voxels": 10, "capacity": 20, "accepted_fraction": 0.5},
+    "stream_frame": {"near": 1.0, "far": 4.0, "scale": 2.0, "warning": None},
+    "compile_s": 1.5,
+    "config_hash": "0123456789ab",
+}
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return RunFolder(tmp_path / "run")
+
+
+def images_of(page):
+    for attributes in page.named("img"):
+        kind, data = attributes["src"].split(",", 1)
+        assert kind == "data:image/jpeg;base64"
+        with Image.open(io.BytesIO(base64.b64decode(data))) as image:
+            yield np.asarray(image, np.float64) / 255
+
+
+def check_self_contained(page, text, folder):
+    """Nothing is loaded from elsewhere, and links lead to files beside the page."""
+    assert not re.search(r"https?:|//\w|url\(|@import|<script|<link", re.sub(r'src="data:[^"]*"', "", text))
+    for attributes in page.named("a"):
+        assert (folder.path / attributes["href"]).exists() or attributes["href"] == "metrics.json"
+
+
+def test_the_report_of_a_run_holds_its_pictures_and_figures(folder):
+    frames = list(range(0, 32, 2))
+    for i in frames:
+        save_image(folder.view(i), smooth_picture(i))
+    for k in (4, 8, 12):
+        save_chunk_record(folder.chunk_record(k), record(k, 17.5 + k if k != 8 else None))
+    folder.scene.write_bytes(b"ply")
+    metrics = COMMON | {"views": 12, "ply": {"num_written": 98765}, "seen_views": [score(i) for i in frames]}
+    report_run(folder, metrics, "path to/it")
+    text = folder.report.read_text()
+    page = Page(text)
+    check_self_contained(page, text, folder)
+    for shown in ("98,765", "21.50 dB", "0.25 s", "30%", "29.50 dB", "--steps 100", "0123456789ab"):
+        assert shown in page.text, shown
+    assert "'path to/it'" in page.text and COMMON["capture"] in page.text
+    assert {a["href"] for a in page.named("a")} == {"scene.ply", "metrics.json", "contact_sheet.jpg", "views", "chunks"}
+    images = list(images_of(page))
+    assert len(images) == MOST_PICTURES
+    for place, k in ((0, 0), (-1, 30)):
+        assert -10 * np.log10(np.mean((images[place] - smooth_picture(k)) ** 2)) > JPEG_DB
+    titles = re.findall(r'class="title" >([^<]*)<', text)
+    assert titles == ["Time of a chunk", "Cache in use", "Views that are held back", "Scene", "Exposure"]
+
+
+def test_the_report_of_a_run_without_records_or_pictures_is_whole(folder):
+    metrics = COMMON | {"views": 4, "ply": {"num_written": 5}, "seen_views": [score(0)]}
+    report_run(folder, metrics, "x")
+    text = folder.report.read_text()
+    assert "Over the stream" not in text and "Pictures" not in text and not folder.contact_sheet.exists()
+    assert "Where everything is" in text
+
+
+def test_the_report_of_an_evaluation_holds_both_scores(folder):
+    for i in (3, 7):
+        save_image(folder.target(i), smooth_picture(i))
+    blocks = {"shown": {"psnr": 23.456, "ssim": 0.7521, "lpips": None}, "literal": {"psnr": 17.9, "ssim": 0.66}}
+    refinement = {"steps": 10, "before": {"shown": {"psnr": 22.25}}}
+    rest = {"target_views": 2, "context_views": 6, "num_gaussians": 4321, "protocol": "paper", "refinement": refinement}
+    baselines = {"nearest_view_psnr": 16.28, "mean_color_psnr": 11.0}
+    more = {"baselines": baselines, "chunk_ms": {"median": 730.4}, "per_view": [score(3), score(7)]}
+    report_eval(folder, COMMON | blocks | rest | more)
+    text = folder.report.read_text()
+    page = Page(text)
+    check_self_contained(page, text, folder)
+    for shown in ("23.46 dB", "0.752", "17.90 dB", "16.28 dB", "730 ms", "4,321", "paper", "22.25 dB", "frame 7"):
+        assert shown in page.text, shown
+    assert len(list(images_of(page))) == 2
+
+
+def test_text_is_escaped():
+    report = Report(
+        "<b>&", "<i>", [("<u>", "<s>")], files=[("a", "<p>")], commands=["a && b <c>"], details=[("<", ">")]
+    )
+    text = page_text(report)
+    for raw in ("<b>&", "<i>", "<u>", "<s>", "<p>", "<c>"):
+        assert html.escape(raw) in text
+        assert raw in Page(text).text
+    assert not {"i", "u", "s", "c"} & {tag for tag, _ in Page(text).tags}
+
+
+def coordinates(svg):
+    """Points of the lines of a plot."""
+    return [np.array([p.split() for p in d[1:].split("L")], float) for d in re.findall(r'round" d="([^"]*)"', svg)]
+
+
+def test_a_plot_puts_points_where_its_axes_say():
+    (line,) = coordinates(line_plot("t", "x", "y", [Line("a", [0, 10, 40], [1.0, 3.0, 2.0])]))
+    inner = WIDTH - LEFT - RIGHT
+    np.testing.assert_allclose(line[:, 0], [LEFT, LEFT + inner / 4, WIDTH - RIGHT], atol=0.01)
+    # The y axis goes from 1 to 3 in steps of a half.
+    np.testing.assert_allclose(line[:, 1], [HEIGHT - BOTTOM, TOP, (HEIGHT - BOTTOM + TOP) / 2], atol=0.01)
+
+
+@pytest.mark.parametrize("values", [(0.0, 1e-9), (5.0, 5.0), (-3.2, 7.9), (1e6, 1.00001e6), (0.0, 0.0), (0.013, 0.97)])
+def test_a_plot_shows_any_range_inside_its_frame(values):
+    svg = line_plot("t", "x", "y", [Line("a", [1, 2], values)])
+    (line,) = coordinates(svg)
+    assert (line[:, 0] >= LEFT).all() and (line[:, 0] <= WIDTH - RIGHT).all()
+    assert (line[:, 1] >= TOP - 0.01).all() and (line[:, 1] <= HEIGHT - BOTTOM + 0.01).all()
+    assert 2 <= svg.count('class="grid"') <= 7
+
+
+def test_a_plot_leaves_out_what_is_not_finite_and_says_if_nothing_is():
+    svg = line_plot("t", "x", "y", [Line("a", [0, 1, 2, 3], [1.0, np.nan, None, 2.0]), Line("b", [0], [np.inf])])
+    (line,) = coordinates(svg)
+    assert len(line) == 2
+    assert "nothing to show" in line_plot("t", "x", "y", [Line("b", [], [])])
+
+
+def test_a_contact_sheet_has_pictures_in_order_and_no_more_than_fit(tmp_path):
+    files = [(tmp_path / f"{k}.png", f"frame {k}") for k in range(30)]
+    for k, (file, _) in enumerate(files):
+        save_image(file, np.full((20, 50, 3), k / 30, np.float32))
+    (tmp_path / "3.png").unlink()
+    assert save_contact_sheet(tmp_path / "sheet.jpg", files, columns=3) == MAX_PICTURES
+    with Image.open(tmp_path / "sheet.jpg") as image:
+        sheet = np.asarray(image, np.float64) / 255
+    assert sheet.shape == (GAP + 8 * (20 + LINE + GAP), GAP + 3 * (50 + GAP), 3)
+    found = [sheet[GAP + r * (20 + LINE + GAP) + 10, GAP + c * (50 + GAP) + 25, 0] for r in range(8) for c in range(3)]
+    left = [k for k in range(30) if k != 3]
+    np.testing.assert_allclose(found, [left[k] / 30 for k in evenly_spread(29, MAX_PICTURES)], atol=0.02)
+    assert save_contact_sheet(tmp_path / "none.jpg", [(tmp_path / "no.png", "")]) == 0
+    assert not (tmp_path / "none.jpg").exists()
