@@ -51,6 +51,12 @@ class Run:
     """Remove the run in the folder and start anew."""
     deltas: bool = False
     """Also write the changes of each chunk, deltas/<views so far>.npz, for `ssplat view` to follow."""
+    hold_back: int = 0
+    """Keep so many evenly spread frames out of the stream, and score them every fourth chunk."""
+    view: bool = False
+    """Open a viewer beside the run, which shows the scene while it grows; implies --deltas (extra `viewer`)."""
+    port: int = 8080
+    """With --view: its port; the next free one if it is taken."""
     refine: int = 0
     """Then take this many gradient steps on the streamed frames, as `ssplat refine` does, into refined.ply."""
     causal: bool = False
@@ -64,12 +70,33 @@ class Run:
     quiet: QuietOption = False
 
     def run(self) -> int:
+        self._check()
+        if not self.view:
+            return self._run()
+        from ssplat_jax.viewer.beside_run import viewer_beside
+
+        with viewer_beside(self.out, self.port) as viewer:
+            if code := self._run():
+                return code
+            print("the viewer stays open; Ctrl-C ends it", flush=True)
+            ended = viewer.wait()
+        return 128 + ended if ended else 0
+
+    def _check(self) -> None:
+        """Refuses options that contradict each other."""
         if self.refine < 0:
             raise InputError(f"--refine: wanted a number of steps of at least 0, got {self.refine}.")
         if self.quiet_seconds != Run.quiet_seconds and not self.watch:
             raise InputError("--quiet-seconds: wanted --watch beside it, which it is for; got none.")
         if self.watch and (self.axes or self.poses):
             raise InputError("--watch: wanted poses as transforms.json has them, got --axes or --poses; leave one out.")
+        if self.hold_back and self.watch:
+            raise InputError("--hold-back: wanted a capture that is complete; got --watch. Leave one out.")
+        if self.port != Run.port and not self.view:
+            raise InputError("--port: wanted --view beside it, which it is for; got none.")
+
+    def _run(self) -> int:
+        """Streams, tells what came of it, and refines if that is wanted; returns the exit code."""
         result = self._watch() if self.watch else self._stream()
         if result.interrupted:
             how = " without --overwrite" if self.overwrite else ""
@@ -81,7 +108,10 @@ class Run:
                 f" {result.num_views} views), views/ and metrics.json; --overwrite starts it anew"
             )
         else:
-            print(f"wrote {self.out}/scene.ply ({result.num_gaussians} Gaussians from {result.num_views} views)")
+            print(
+                f"wrote {self.out}/scene.ply ({result.num_gaussians} Gaussians from {result.num_views} views);"
+                f" pictures and figures: {self.out}/report.html"
+            )
         if self.refine:
             return Refine(
                 self.out, self.capture, self.refine, self.weights, axes=self.axes, poses=self.poses, quiet=self.quiet
@@ -105,7 +135,8 @@ class Run:
             max_views=self.max_views,
             save_every=self.save_every,
             overwrite=self.overwrite,
-            deltas=self.deltas,
+            deltas=self.deltas or self.view,
+            num_held_back=self.hold_back,
             reporter=Reporter(self.quiet),
         )
 
@@ -123,6 +154,6 @@ class Run:
             quiet_seconds=self.quiet_seconds,
             save_every=self.save_every,
             overwrite=self.overwrite,
-            deltas=self.deltas,
+            deltas=self.deltas or self.view,
         )
         return watch_capture(model, params, self.capture, self.out, options, Reporter(self.quiet))

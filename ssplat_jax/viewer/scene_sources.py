@@ -1,21 +1,24 @@
 """Scenes on disk that may change while they are viewed: a scene file, or a run that is still streaming."""
 
+import contextlib
 import json
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float32
 
 from ssplat_jax.checkpoint.delta_files import load_delta, load_delta_header
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.errors import InputError, StorageError
 from ssplat_jax.gaussians import Gaussians, scale_colors
-from ssplat_jax.scene_files.formats import load_scene
+from ssplat_jax.scene_files.formats import read_scene
 from ssplat_jax.storage.run_folder import RunFolder
-from ssplat_jax.streaming.scene_delta import apply_delta
+from ssplat_jax.streaming.scene_delta import apply_confidences, apply_delta
 from ssplat_jax.streaming.scene_exposure import at_first_exposure, scene_exposure
 from ssplat_jax.viewer.start_camera import StartCamera, first_camera
+from ssplat_jax.viewer.viewed_scene import ViewedScene
 
 
 class SceneFile:
@@ -26,30 +29,80 @@ class SceneFile:
         one_exposure: give a run's scene at the exposure of its first views.
     """
 
-    def __init__(self, path: Path, *, one_exposure: bool = False) -> None:
-        self._path, self._stamp, self._one_exposure = path, None, one_exposure
+    num_chunks = 1
 
-    def changed(self) -> Gaussians | None:
+    def __init__(self, path: Path, *, one_exposure: bool = False) -> None:
+        self._stamp, self._one_exposure = None, one_exposure
+        self._scene: ViewedScene | None = None
+        self.path, self.folder = path, RunFolder(path.parent)
+
+    def changed(self) -> ViewedScene | None:
         """The scene if it has changed since the last call, else None.
 
         Raises:
             InputError: the file is not a scene, or its exposure is wanted and unknown.
         """
-        stat = self._path.stat() if self._path.exists() else None
+        stat = self.path.stat() if self.path.exists() else None
         stamp = None if stat is None else (stat.st_mtime_ns, stat.st_size)
         if self._stamp is not None and stamp in (None, self._stamp):
             return None
         self._stamp = stamp
-        scene = load_scene(self._path)
-        return at_first_exposure(scene, scene_exposure(self._path)) if self._one_exposure else scene
+        file = read_scene(self.path)
+        gaussians, exposure = file.gaussians, np.ones(3)
+        if self._one_exposure:
+            gaussians = at_first_exposure(gaussians, scene_exposure(self.path))
+        else:
+            with contextlib.suppress(InputError):  # of no run: the exposures of views are not known either
+                exposure = scene_exposure(self.path)
+        antialias = "classic" if file.render_mode == "default" else "mip"
+        self._scene = ViewedScene(gaussians, file.offset, exposure, antialias=antialias)
+        return self._scene
+
+    def at(self, num_chunks: int) -> ViewedScene:
+        """The scene; a file has one only. Call `changed` first."""
+        assert self._scene is not None
+        return self._scene
 
     def start_camera(self) -> StartCamera | None:
         """The first camera of the run that wrote the file; None if no metrics of a run are beside it."""
         try:
-            fields = json.loads(RunFolder(self._path.parent).metrics.read_bytes())["stream_frame"]
+            fields = json.loads(self.folder.metrics.read_bytes())["stream_frame"]
             return first_camera(StreamFrame.from_dict(fields))
         except (OSError, ValueError, TypeError, LookupError):  # another file of that name must not prevent viewing
             return None
+
+
+class _Sum:
+    """The sum of the first deltas of a run."""
+
+    def __init__(self) -> None:
+        self.applied: list[tuple[str, int]] = []  # names and time stamps of the deltas
+        self.frame: StreamFrame | None = None
+        self._scene: Gaussians | None = None
+        self._confidences: Float32[np.ndarray, " n"] | None = None
+        self._exposure = np.ones(3)  # at which the scene is shown: the middle one of the views so far
+
+    def apply(self, path: Path, stamp: int) -> None:
+        """Adds a delta.
+
+        Raises:
+            StorageError: it is damaged or gone.
+        """
+        delta, header = load_delta(path), load_delta_header(path)
+        self._scene = apply_delta(self._scene, delta)
+        self._confidences = apply_confidences(self._confidences, delta)
+        self.frame = StreamFrame.from_dict(header["frame"])
+        self._exposure = np.array(header.get("exposure", [1.0, 1.0, 1.0]))  # earlier versions wrote none
+        self.applied.append((path.name, stamp))
+
+    def viewed(self, *, one_exposure: bool) -> ViewedScene:
+        """The scene in the capture's frame."""
+        assert self.frame is not None
+        exposure = np.ones(3) if one_exposure else self._exposure
+        scene = scale_colors(jax.tree.map(jnp.asarray, self._scene), jnp.asarray(exposure, jnp.float32))
+        offset = self.frame.offset
+        gaussians = self.frame.gaussians_to_capture(scene, offset=offset)
+        return ViewedScene(gaussians, offset, exposure, self._confidences)
 
 
 class GrowingScene:
@@ -61,13 +114,15 @@ class GrowingScene:
     """
 
     def __init__(self, folder: RunFolder, *, one_exposure: bool = False) -> None:
-        self._folder, self._one_exposure = folder, one_exposure
-        self._applied: list[tuple[str, int]] = []  # names and time stamps of the deltas in `_scene`
-        self._scene: Gaussians | None = None
-        self._frame: StreamFrame | None = None
-        self._exposure = np.ones(3)  # at which the scene is shown: the middle one of the views so far
+        self.path, self.folder, self._one_exposure = folder.path, folder, one_exposure
+        self._newest, self._past = _Sum(), _Sum()
 
-    def changed(self) -> Gaussians | None:
+    @property
+    def num_chunks(self) -> int:
+        """Chunks whose deltas have been added."""
+        return len(self._newest.applied)
+
+    def changed(self) -> ViewedScene | None:
         """The scene as a person gets it so far, in the capture's frame, if it changed since the last call, else None.
 
         If the run was started anew, the old scene is dropped.
@@ -76,37 +131,48 @@ class GrowingScene:
             StorageError: a delta is damaged.
         """
         try:
-            found = [(path.name, path.stat().st_mtime_ns) for path in self._folder.delta_files()]
+            found = [(path.name, path.stat().st_mtime_ns) for path in self.folder.delta_files()]
         except FileNotFoundError:  # the run is being started anew
             return None
-        if found == self._applied or not found:
+        if found == self._newest.applied or not found:
             return None
-        if found[: len(self._applied)] != self._applied:
-            self._applied, self._scene = [], None
-        for name, stamp in found[len(self._applied) :]:
-            path = self._folder.deltas / name
+        if found[: self.num_chunks] != self._newest.applied:
+            self._newest = _Sum()
+        for name, stamp in found[self.num_chunks :]:
+            path = self.folder.deltas / name
             try:
-                self._scene = apply_delta(self._scene, load_delta(path))
-                header = load_delta_header(path)
-                self._frame = StreamFrame.from_dict(header["frame"])
-                self._exposure = np.array(header.get("exposure", [1.0, 1.0, 1.0]))  # earlier versions wrote none
+                self._newest.apply(path, stamp)
             except StorageError:
                 if path.exists():
                     raise
-                self._applied, self._scene = [], None  # the run is being started anew
+                self._newest = _Sum()  # the run is being started anew
                 return None
-            self._applied.append((name, stamp))
-        assert self._frame is not None
-        factors = jnp.asarray(np.ones(3) if self._one_exposure else self._exposure, jnp.float32)
-        scene = scale_colors(jax.tree.map(jnp.asarray, self._scene), factors)
-        return self._frame.gaussians_to_capture(scene, offset=self._frame.offset)
+        return self._newest.viewed(one_exposure=self._one_exposure)
+
+    def at(self, num_chunks: int) -> ViewedScene:
+        """The scene as it was after so many chunks, at least one.
+
+        Raises:
+            StorageError: a delta is damaged or gone.
+        """
+        wanted = self._newest.applied[:num_chunks]
+        if num_chunks >= self.num_chunks:
+            return self._newest.viewed(one_exposure=self._one_exposure)
+        if self._past.applied != wanted[: len(self._past.applied)]:  # later than wanted, or of another run
+            self._past = _Sum()
+        for name, stamp in wanted[len(self._past.applied) :]:
+            self._past.apply(self.folder.deltas / name, stamp)
+        return self._past.viewed(one_exposure=self._one_exposure)
 
     def start_camera(self) -> StartCamera | None:
         """The first camera of the stream; None before the first delta."""
-        return None if self._frame is None else first_camera(self._frame)
+        return None if self._newest.frame is None else first_camera(self._newest.frame)
 
 
-def open_source(path: Path, *, one_exposure: bool = False) -> SceneFile | GrowingScene:
+Source = SceneFile | GrowingScene
+
+
+def open_source(path: Path, *, one_exposure: bool = False) -> Source:
     """The source at `path`: a scene file, or the deltas of a run's folder, or else its scene.
 
     With `one_exposure`, scenes are at the exposure of the first views of their run.

@@ -5,16 +5,20 @@ for it.
 """
 
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 from ssplat_jax.console import Reporter
 from ssplat_jax.storage.interrupts import Interrupts
-from ssplat_jax.viewer.scene_sources import open_source
-from ssplat_jax.viewer.start_camera import camera_before
+from ssplat_jax.viewer.scene_sources import Source, open_source
+from ssplat_jax.viewer.stage import Stage
 from ssplat_jax.viewer.viser_viewer import LOCAL_HOSTS, Viewer
 
 POLL_INTERVAL = 0.5
 """Seconds between checks for changes, so that browsers are sent at most two scenes a second."""
+
+TICK = 1 / 30
+"""Seconds between updates of the browsers, for smooth playback."""
 
 
 def view_scene(
@@ -47,23 +51,49 @@ def view_scene(
         StorageError: a file of the run is damaged.
     """
     source = open_source(path, one_exposure=one_exposure)
-    scene = source.changed()
-    viewer = Viewer(host=host, port=port, max_gaussians=max_gaussians, over_black=over_black)
+    where = {"host": host, "port": port}
+    return show_source(source, **where, max_gaussians=max_gaussians, over_black=over_black, reporter=reporter)
+
+
+def show_source(
+    source: Source,
+    *,
+    host: str,
+    port: int,
+    max_gaussians: int,
+    over_black: bool = False,
+    is_wanted: Callable[[], bool] = lambda: True,
+    reporter: Reporter,
+) -> int:
+    """Shows a source and its changes until Ctrl-C; see `view_scene`.
+
+    Args:
+        source: where scenes come from; there need not be one yet.
+        host: address to listen on.
+        port: port to listen on.
+        max_gaussians: most Gaussians sent to a browser.
+        over_black: show the scene over black.
+        is_wanted: asked many times a second; the viewer ends when it says no.
+        reporter: prints warnings.
+
+    Returns:
+        The signal that ended it; 0 if `is_wanted` did.
+    """
+    stage = Stage(source, max_gaussians=max_gaussians, over_black=over_black)
+    stage.refresh()
+    viewer = Viewer(stage, host=host, port=port)
     try:
         if host not in LOCAL_HOSTS:
             reporter.warn(f"everyone who reaches this machine at {host} can view the scene; there is no password.")
-        print(f"{viewer.url} shows {path}; Ctrl-C ends it", flush=True)
-        has_camera = False
+        print(f"{viewer.url} shows {source.path}; Ctrl-C ends it", flush=True)
+        polled = time.monotonic()
         with Interrupts() as interrupts:
-            while not interrupts.received:
-                if scene is not None:
-                    camera = source.start_camera() or camera_before(scene)
-                    if not has_camera and camera is not None:
-                        viewer.look_from(camera)
-                        has_camera = True
-                    viewer.show(scene)
-                time.sleep(POLL_INTERVAL)
-                scene = source.changed()
-            return interrupts.received
+            while not interrupts.received and is_wanted():
+                viewer.update()
+                time.sleep(TICK)
+                if time.monotonic() - polled > POLL_INTERVAL:
+                    polled = time.monotonic()
+                    stage.refresh()
+            return interrupts.received or 0
     finally:
         viewer.close()

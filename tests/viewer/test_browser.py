@@ -1,0 +1,327 @@
+"""One browser: what it is sent for what a person chooses. Its client is a fake one."""
+
+import dataclasses
+import io
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from PIL import Image
+
+import ssplat_jax as ss
+from ssplat_jax.checkpoint.chunk_records import ChunkRecord, RecordedView, make_thumbnail, save_chunk_record
+from ssplat_jax.checkpoint.delta_files import save_delta
+from ssplat_jax.geometry.cameras import Camera
+from ssplat_jax.pytree import replace
+from ssplat_jax.scene_files.ply import load_ply
+from ssplat_jax.storage.run_folder import RunFolder
+from ssplat_jax.viewer import browser as browser_module
+from ssplat_jax.viewer.browser import Browser
+from ssplat_jax.viewer.browser_camera import BrowserCamera
+from ssplat_jax.viewer.drawn_view import draw
+from ssplat_jax.viewer.playback import ORBIT_SECONDS, Orbit, PathPlayback
+from ssplat_jax.viewer.recorded_run import PATH_STEPS, RecordedRun, figures
+from ssplat_jax.viewer.scene_sources import open_source
+from ssplat_jax.viewer.splats import visible_splats
+from ssplat_jax.viewer.stage import Stage
+from ssplat_jax.viewer.viewed_scene import ViewedScene
+from tests.viewer.fake_client import FakeClient
+from tests.viewer.test_viewer import delta, frame, scene
+
+pytestmark = pytest.mark.usefixtures("compiled_plainly")
+
+SIZE = (48, 32)
+LEVEL = 1 / 255
+
+
+@pytest.fixture(autouse=True)
+def small_pictures(monkeypatch):
+    monkeypatch.setattr(browser_module, "DRAFT", (24, 16))
+    monkeypatch.setattr(browser_module, "FINE", SIZE)
+
+
+def pose(x=0.0, z=0.0):
+    matrix = np.eye(4)
+    matrix[:3, 3] = [x, 0.0, z]
+    return matrix
+
+
+def record(k, psnr=None):
+    """The record of chunk k = 1, 2, ... of two views."""
+    views = []
+    for i in (2 * k - 2, 2 * k - 1):
+        image = make_thumbnail(np.full((24, 32, 3), i / 20, np.float32))
+        K = np.array([[32.0, 0, 16], [0, 32.0, 12], [0, 0, 1]])
+        views.append(RecordedView(i, pose(float(i), -1.0), K, np.array([1.0, 1 + i, 0.5]), image))
+    return ChunkRecord(2 * k, (32, 24), tuple(views), 0.5 / k, 0.1 * k, 100 * k, psnr)
+
+
+class Run:
+    """A run that grows by deltas and records, and a browser on it."""
+
+    def __init__(self, path):
+        self.folder, self.num_chunks = RunFolder(path), 0
+        self.folder.deltas.mkdir(parents=True)
+        self.stage = Stage(open_source(path), max_gaussians=1000)
+        self.client = FakeClient(*SIZE)
+        self.browser = Browser(self.client, self.stage)
+        self.controls = self.client.gui.controls
+
+    def grow(self, psnr=None):
+        self.num_chunks += 1
+        rows = [0, 1] if self.num_chunks == 1 else [self.num_chunks]
+        header = {"frame": dataclasses.replace(frame(), far=32.0).to_dict(), "exposure": [1.0, 2.0, 1.0]}
+        part = delta(rows, self.num_chunks)
+        confidences = np.full(2 * len(rows), 0.5 + 0.1 * self.num_chunks, np.float32)
+        part = type(part)(part.rows, part.gaussians, part.capacity, confidences)
+        save_delta(self.folder.delta(2 * self.num_chunks), part, header)
+        save_chunk_record(self.folder.chunk_record(2 * self.num_chunks), record(self.num_chunks, psnr))
+        self.update()
+
+    def update(self):
+        self.stage.refresh()
+        self.browser.update()
+
+    def choose(self, label, value):
+        self.controls[label].value = value
+        self.update()
+
+    @property
+    def splats(self):
+        return self.client.scene.nodes["/scene"]
+
+    def sent(self):
+        """The number of Gaussians that the browser has now."""
+        return len(self.splats.centers)
+
+
+@pytest.fixture
+def run(tmp_path):
+    pytest.importorskip("viser")
+    return Run(tmp_path)
+
+
+def test_a_browser_follows_the_run_until_an_earlier_chunk_is_chosen(run):
+    run.update()
+    assert not run.client.scene.nodes and not run.controls["Chunk"].visible
+    run.grow()
+    assert run.sent() == 4 and not run.controls["Chunk"].visible
+    run.grow()
+    run.grow()
+    assert run.sent() == 8 and (run.controls["Chunk"].value, run.controls["Chunk"].max) == (3, 3)
+    assert run.controls["facts"].content == "**8** Gaussians from **6** views"
+    updates = run.splats.num_updates
+    run.update()
+    assert run.splats.num_updates == updates  # nothing changed, nothing is sent
+    run.choose("Chunk", 1)
+    first = run.stage.source.at(1)
+    wanted = visible_splats(first.gaussians, run.stage.unit, 1000)
+    np.testing.assert_array_equal(run.splats.centers, wanted.centers)
+    np.testing.assert_array_equal(run.splats.rgbs, wanted.rgbs)
+    assert run.sent() == 4 and run.controls["facts"].content == "**4** Gaussians from **2** views"
+    run.grow()  # the past stays in sight
+    assert run.sent() == 4 and run.controls["Chunk"].max == 4
+    run.choose("Chunk", 2)
+    assert run.sent() == 6
+    run.choose("Chunk", 4)
+    run.grow()
+    assert run.sent() == 12 and run.controls["Chunk"].value == 5
+
+
+def test_the_scene_is_sent_in_units_of_its_first_view(run):
+    run.grow()
+    start, scene_now = run.stage.start, run.stage.scene()
+    distance = np.linalg.norm(start.look_at - start.position)
+    assert run.stage.distance == pytest.approx(distance) and distance != 1
+    placed = run.splats.centers * run.splats.scale * distance
+    np.testing.assert_allclose(
+        placed, np.asarray(scene_now.gaussians.means)[np.asarray(scene_now.gaussians.opacities) > 0], atol=1e-4
+    )
+
+
+def test_cameras_stand_where_the_views_were_taken_and_a_click_goes_there(run):
+    run.grow()
+    run.grow()
+    assert list(run.client.scene.nodes) == ["/scene"]
+    run.choose("Cameras", True)
+    nodes = run.client.scene.nodes
+    assert set(nodes) == {"/scene", *(f"/cameras/{i}" for i in range(4))}
+    third = nodes["/cameras/3"]
+    np.testing.assert_allclose(third.position, np.array([3.0, 0.0, -1.0]) / run.stage.distance)
+    assert third.fov == pytest.approx(2 * np.arctan(12 / 32)) and third.aspect == pytest.approx(4 / 3)
+    assert abs(third.image.mean() / 255 - 3 / 20) < 0.01
+    run.browser._play("orbit")
+    third.click()
+    run.update()
+    np.testing.assert_allclose(run.client.camera.position, third.position)  # the orbit has ended
+    run.choose("Chunk", 1)
+    assert [nodes[f"/cameras/{i}"].removed for i in range(4)] == [False, False, True, True]
+    run.choose("Cameras", False)
+    assert all(nodes[f"/cameras/{i}"].removed for i in range(4))
+
+
+def test_figures_are_drawn_as_they_grow(run):
+    run.grow(psnr=15.0)
+    assert not run.controls["Figures"].visible
+    run.grow()
+    assert run.controls["Figures"].visible and "PSNR of held-back views, dB" not in run.controls
+    np.testing.assert_allclose(run.controls["Time of a chunk, s"].data, [[2, 4], [0.5, 0.25]])
+    run.grow(psnr=18.0)
+    np.testing.assert_allclose(run.controls["Cache in use, %"].data, [[2, 4, 6], [10, 20, 30]])
+    np.testing.assert_allclose(run.controls["PSNR of held-back views, dB"].data, [[2, 6], [15, 18]])
+
+
+def test_records_of_a_run_that_starts_anew_are_read_anew(tmp_path):
+    run, folder = RecordedRun(RunFolder(tmp_path)), RunFolder(tmp_path)
+    assert not run.refresh() and run.nearest(np.eye(4)) is None and run.path().shape == (0, 4, 4)
+    for k in (1, 2):
+        save_chunk_record(folder.chunk_record(2 * k), record(k))
+    assert run.refresh() and not run.refresh() and len(run.views()) == 4 and len(run.views(1)) == 2
+    folder.chunk_record(4).unlink()
+    save_chunk_record(folder.chunk_record(2), record(5))
+    assert run.refresh() and [view.frame for view in run.views()] == [8, 9]
+    assert all(len(x) == 0 for x, _ in list(figures([]).values()))
+
+
+def test_a_picture_is_drawn_coarsely_then_finely_and_only_when_something_changes(run):
+    run.grow()
+    run.controls["Show"].value = "depth"
+    run.update()
+    pictures = run.client.scene.backgrounds
+    assert pictures[-1].shape == (16, 24, 3) and not run.splats.visible
+    run.update()
+    assert pictures[-1].shape == (32, 48, 3)
+    count = len(pictures)
+    run.update()
+    assert len(pictures) == count
+    run.client.camera.position = np.array([0.1, 0.0, 0.0])
+    run.update()
+    assert pictures[-1].shape == (16, 24, 3) and len(pictures) == count + 1
+    run.update()
+    run.grow()
+    assert pictures[-1].shape == (16, 24, 3) and len(pictures) == count + 3
+    run.choose("Show", "splats")
+    assert pictures[-1] is None and run.splats.visible and run.sent() == 6
+
+
+def test_a_drawn_picture_is_that_of_the_rasterizer_however_it_is_stretched():
+    viewed = ViewedScene(scene(), exposure=np.array([1.0, 2.0, 0.5]))
+    camera = BrowserCamera(pose(0.1, 0.3), 0.9, SIZE[0] / SIZE[1])
+    focal = 16 / np.tan(0.45)
+    K = jnp.asarray([[focal, 0, 24], [0, focal, 16], [0, 0, 1]], jnp.float32)
+    view = Camera(viewmats=jnp.asarray(np.linalg.inv(camera.camtoworld), jnp.float32), Ks=K, width=48, height=32)
+    wanted = np.clip(ss.render(viewed.gaussians, view).color, 0, 1)
+    found = draw(viewed, "color", camera, SIZE, over_black=True)
+    np.testing.assert_allclose(found / 255, wanted, atol=0.51 * LEVEL)
+    filled = draw(viewed, "color", camera, SIZE)
+    assert (filled.astype(int) - found >= -1).all() and filled.min() > 0  # holes take the colors around them
+    exposed = draw(viewed, "exposure", camera, SIZE, over_black=True, exposure=np.array([0.5, 2.0, 0.5]))
+    np.testing.assert_allclose(exposed / 255, np.clip(wanted * [0.5, 1.0, 1.0], 0, 1), atol=1.1 * LEVEL)
+    # Of another shape: the same view, stretched. Means over 8 x 8 blocks of one are those over 4 x 8 of the other.
+    narrow = draw(viewed, "color", camera, (24, 32), over_black=True)
+    blocks = [x.reshape(4, 8, 6, -1, 3).mean(axis=(1, 3)) / 255 for x in (found, narrow)]
+    np.testing.assert_allclose(*blocks, atol=0.05)
+    assert np.std(blocks[0]) > 0.05
+
+
+def test_depth_normals_and_confidence_show_what_their_names_say():
+    two = {"means": [[-0.5, 0, 2], [0.5, 0, 4]], "quats": [[1, 0, 0, 0]] * 2, "scales": [[0.25, 0.25, 0.01]] * 2}
+    walls = ss.Gaussians.from_rgb(
+        **{name: jnp.asarray(x, jnp.float32) for name, x in two.items()},
+        opacities=jnp.full(2, 0.99),
+        colors=jnp.full((2, 3), 0.5),
+    )
+    camera = BrowserCamera(pose(), 0.9, 1.5)
+    viewed = ViewedScene(walls, confidences=np.array([0.2, 0.9], np.float32))
+    pictures = {kind: draw(viewed, kind, camera, SIZE).astype(float) for kind in ("depth", "confidence", "normals")}
+    left, right = (slice(14, 18), slice(13, 17)), (slice(14, 18), slice(27, 30))
+    depth, confidence, normals = pictures.values()
+    assert depth[left].mean() > depth[right].mean() + 40  # light near
+    assert confidence[left].mean() < confidence[right].mean() - 40  # light where confident
+    np.testing.assert_allclose(normals[left].mean(axis=(0, 1)), [127, 127, 255], atol=12)
+    assert (confidence[0, 0] == 0).all() and (depth[:, 0] == 0).any()
+    covered = draw(ViewedScene(walls), "confidence", camera, SIZE).astype(float)
+    assert covered[left].mean() > 150 and (covered[0, 0] == 0).all()
+
+
+def test_the_exposure_of_a_picture_is_that_of_the_nearest_view(run, monkeypatch):
+    run.grow()
+    run.grow()
+    seen = []
+    monkeypatch.setattr(
+        browser_module, "draw", lambda *_, exposure=None, **__: seen.append(exposure) or np.zeros((1, 1, 3))
+    )
+    run.client.camera.position = np.array([2.9, 0.0, -1.0]) / run.stage.distance
+    run.choose("Show", "exposure")
+    np.testing.assert_allclose(seen[-1], [1.0, 4.0, 0.5])  # of frame 3
+    run.choose("Show", "color")
+    assert seen[-1] is None
+
+
+def test_an_orbit_keeps_its_distance_and_closes():
+    orbit = Orbit(np.array([2.0, 1.0, 0.5]), np.array([0.0, 0.0, 0.5]), np.array([0.0, 0.0, 2.0]))
+    first = orbit.pose(0.0)
+    np.testing.assert_allclose(first[:3, 3], [2.0, 1.0, 0.5])
+    np.testing.assert_allclose(orbit.pose(ORBIT_SECONDS), first, atol=1e-12)
+    np.testing.assert_allclose(orbit.pose(ORBIT_SECONDS / 4)[:3, 3], [-1.0, 2.0, 0.5], atol=1e-12)
+    for seconds in np.linspace(0, ORBIT_SECONDS, 7):
+        found = orbit.pose(seconds)
+        toward = orbit.target - found[:3, 3]
+        np.testing.assert_allclose(found[:3, 2], toward / np.linalg.norm(toward), atol=1e-12)
+        assert np.linalg.norm(toward) == pytest.approx(np.sqrt(5))
+
+
+def test_playback_moves_the_camera_until_it_is_stopped(run, monkeypatch):
+    run.grow()
+    run.grow()
+    now = [100.0]
+    monkeypatch.setattr(browser_module.time, "monotonic", lambda: now[0])
+    run.controls["Play"].click("path")
+    for seconds, x in ((0.0, 0.0), (PATH_STEPS / 24, 1.0), (2 * PATH_STEPS / 24, 2.0)):
+        now[0] = 100.0 + seconds + 1e-3
+        run.update()
+        np.testing.assert_allclose(run.client.camera.position * run.stage.distance, [x, 0, -1], atol=1e-9)
+    run.controls["Play"].click("stop")
+    now[0] += 5
+    run.update()
+    np.testing.assert_allclose(run.client.camera.position * run.stage.distance, [2.0, 0, -1], atol=1e-9)
+    run.client.camera.position, run.client.camera.look_at = np.array([1.0, 0, 0]), np.zeros(3)
+    run.controls["Play"].click("orbit")
+    now[0] += ORBIT_SECONDS / 2
+    run.update()
+    np.testing.assert_allclose(run.client.camera.position, [-1.0, 0, 0], atol=1e-9)
+    assert len(PathPlayback(np.zeros((3, 4, 4))).pose(100.0)) == 4
+
+
+def test_downloads_hold_the_scene_and_the_picture_in_sight(run, tmp_path):
+    run.grow()
+    run.grow()
+    run.choose("Chunk", 1)
+    run.controls["Download scene"].click()
+    file = tmp_path / "got.ply"
+    file.write_bytes(run.client.downloads["scene.ply"])
+    first = run.stage.source.at(1).gaussians
+    shown = np.asarray(first.opacities) > 0
+    np.testing.assert_allclose(load_ply(file).means, np.asarray(first.means)[shown], rtol=1e-6)
+    run.controls["Screenshot"].click()
+    with Image.open(io.BytesIO(run.client.downloads["ssplat_splats.png"])) as image:
+        assert image.size == SIZE and (np.asarray(image) == 77).all()
+    run.choose("Show", "depth")
+    run.update()
+    run.controls["Screenshot"].click()
+    with Image.open(io.BytesIO(run.client.downloads["ssplat_depth.png"])) as image:
+        np.testing.assert_array_equal(np.asarray(image), run.client.scene.backgrounds[-1])
+
+
+def test_a_scene_of_a_file_has_no_slider_and_no_figures(tmp_path):
+    ss.save_ply(tmp_path / "scene.ply", replace(scene(5), opacities=jnp.full(5, 0.5)))
+    stage, client = Stage(open_source(tmp_path), max_gaussians=3), FakeClient()
+    stage.refresh()
+    browser = Browser(client, stage)
+    browser.update()
+    assert len(client.scene.nodes["/scene"].centers) == 3
+    assert not client.gui.controls["Chunk"].visible and not client.gui.controls["Figures"].visible
+    assert client.gui.controls["facts"].content == "**5** Gaussians"
+    client.gui.controls["Play"].click("path")  # there is none
+    browser.update()
+    np.testing.assert_array_equal(client.camera.position, 0)
