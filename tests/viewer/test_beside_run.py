@@ -1,0 +1,68 @@
+"""`ssplat run --view`: a viewer beside a run, which waits for neither the viewer nor its browsers."""
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import urllib.request
+from pathlib import Path
+
+import pytest
+
+from ssplat_jax.checkpoint.delta_files import load_delta
+from ssplat_jax.storage.run_folder import RunFolder
+from tests.commands.test_cli import make_capture, run
+from tests.viewer.chromium import wait_for
+from tests.viewer.test_viewer import free_port
+
+COMMAND = "from ssplat_jax.commands.start import start; start()"
+
+
+def viewer_of(parent: int) -> int | None:
+    """The process of the viewer that a run has started."""
+    for number in Path(f"/proc/{parent}/task/{parent}/children").read_text().split():
+        with contextlib.suppress(OSError):
+            if b"spawn_main" in Path(f"/proc/{number}/cmdline").read_bytes():
+                return int(number)
+    return None
+
+
+def test_a_port_without_a_viewer_and_a_viewer_without_viser_are_refused(tmp_path, capsys, monkeypatch):
+    capture = str(make_capture(tmp_path / "capture"))
+    assert run("run", capture, "--out", str(tmp_path / "out"), "--port", "8090") == 2
+    assert "--view" in capsys.readouterr().err
+    monkeypatch.setitem(sys.modules, "viser", None)
+    assert run("run", capture, "--out", str(tmp_path / "out"), "--view") == 2
+    assert 'pip install "ssplat-jax[viewer]"' in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="finds the viewer's process in /proc")
+def test_a_run_ends_though_its_viewer_stands_still_and_the_viewer_ends_with_it(tmp_path):
+    pytest.importorskip("viser")
+    capture, out = make_capture(tmp_path / "capture", num_frames=10), tmp_path / "out"
+    options = ("--view", "--port", str(free_port()), "--set", "capacity=2048")
+    arguments = [sys.executable, "-c", COMMAND, "run", str(capture), "--out", str(out), *options]
+    process = subprocess.Popen(arguments, stdout=subprocess.PIPE, text=True, start_new_session=True)
+    try:
+        assert process.stdout is not None
+        url = process.stdout.readline().split()[0]  # of the viewer, before the first chunk is compiled
+        with urllib.request.urlopen(url, timeout=60) as page:
+            assert page.status == 200
+        viewer = wait_for(lambda: viewer_of(process.pid))
+        os.kill(viewer, signal.SIGSTOP)
+        folder = RunFolder(out)
+        wait_for(folder.metrics.exists, seconds=400)
+        os.kill(viewer, signal.SIGCONT)
+        assert json.loads(folder.metrics.read_text())["views"] == 10
+        assert [load_delta(path).capacity for path in folder.delta_files()]
+        assert any("stays open" in line for line in process.stdout)
+        os.killpg(process.pid, signal.SIGINT)
+        assert process.wait(timeout=60) == 130
+        assert not Path(f"/proc/{viewer}").exists()
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
