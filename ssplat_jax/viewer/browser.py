@@ -47,11 +47,7 @@ class Browser:
         self.panel.download.on_click(lambda _: self._send_scene())
 
     def update(self) -> None:
-        """Brings the browser up to date; called many times a second.
-
-        Raises:
-            StorageError: a file of an earlier scene is damaged or gone.
-        """
+        """Brings the browser up to date; called many times a second."""
         self.panel.grow(self._stage.num_chunks)
         self._update_scene()
         self._update_notes()

@@ -7,6 +7,7 @@ first camera looks at a point at distance 1.
 import numpy as np
 from jaxtyping import Float64
 
+from ssplat_jax.errors import StorageError
 from ssplat_jax.viewer.recorded_run import RecordedRun
 from ssplat_jax.viewer.scene_sources import Source
 from ssplat_jax.viewer.splats import Splats, median_size, visible_splats
@@ -54,13 +55,13 @@ class Stage:
         return self.source.num_chunks
 
     def scene(self, num_chunks: int | None = None) -> ViewedScene | None:
-        """The scene after so many chunks, by default the newest; None if there is none yet.
-
-        Raises:
-            StorageError: a file of an earlier scene is damaged or gone.
-        """
-        is_newest = num_chunks is None or num_chunks >= self.num_chunks
-        return self._newest if is_newest or num_chunks is None else self.source.at(num_chunks)
+        """The scene after so many chunks, by default the newest; None if there is none yet."""
+        if num_chunks is None or num_chunks >= self.num_chunks:
+            return self._newest
+        try:
+            return self.source.at(num_chunks)
+        except StorageError:  # every file was read before: the run is being started anew
+            return self._newest
 
     def splats(self, scene: ViewedScene) -> Splats:
         """A scene as it is sent, in units of `unit`; kept until another one is asked for, since many browsers ask."""

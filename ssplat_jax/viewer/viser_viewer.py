@@ -72,11 +72,7 @@ class Viewer:
         return list(self._browsers.values())
 
     def update(self) -> None:
-        """Brings every browser up to date with the stage; called many times a second.
-
-        Raises:
-            StorageError: a file of an earlier scene is damaged or gone.
-        """
+        """Brings every browser up to date with the stage; called many times a second."""
         self._set_start_camera()
         for browser in self.browsers:
             browser.update()

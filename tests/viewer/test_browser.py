@@ -128,6 +128,15 @@ def test_a_browser_follows_the_run_until_an_earlier_chunk_is_chosen(run):
     assert run.sent() == 12 and run.controls["Chunk"].value == 5
 
 
+def test_the_past_of_a_run_that_is_being_started_anew_gives_way_to_its_newest_scene(run):
+    run.grow()
+    run.grow()
+    run.folder.delta(2).unlink()
+    run.controls["Chunk"].value = 1
+    run.browser.update()
+    assert run.sent() == 6
+
+
 def test_the_scene_is_sent_in_units_of_its_first_view(run):
     run.grow()
     start, scene_now = run.stage.start, run.stage.scene()

@@ -18,6 +18,7 @@ from ssplat_jax.checkpoint.delta_files import save_delta
 from ssplat_jax.data.posed_image import invert_pose, pose_from_quat
 from ssplat_jax.evaluation.pictures import save_image
 from ssplat_jax.geometry.cameras import Camera
+from ssplat_jax.pytree import replace
 from ssplat_jax.rasterizer import Effects
 from ssplat_jax.runs.reports import report_run
 from ssplat_jax.scene_files.ply import load_ply
@@ -119,7 +120,8 @@ def live_run(path):
     first = frame().rotation
     for k in (1, 2):
         part = delta([2 * k - 2, 2 * k - 1], k)
-        part = type(part)(part.rows, part.gaussians, part.capacity, np.linspace(0.5, 1, 4, dtype=np.float32))
+        moved = replace(part.gaussians, means=part.gaussians.means + jnp.array([0.0, 0.9 * (k - 1), 0.0]))
+        part = type(part)(part.rows, moved, part.capacity, np.linspace(0.5, 1, 4, dtype=np.float32))
         save_delta(folder.delta(4 * k), part, {"frame": frame().to_dict()})
         pose, K = np.eye(4), np.array([[32.0, 0, 16], [0, 32.0, 12], [0, 0, 1]])
         pose[:3, :3], pose[:3, 3] = first, (0.15 * k * first[:, 2] - 0.04 * first[:, 0])
