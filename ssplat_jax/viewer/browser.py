@@ -156,10 +156,12 @@ class Browser:
         size = (int(camera.image_width), int(camera.image_height))
         if kind == SPLATS or scene is None:
             pixels = self._client.get_render(size[1], size[0], transport_format="png", timeout=RENDER_SECONDS)
+            paper = Image.new("RGBA", size, "black" if self._stage.over_black else "white")
+            picture = Image.alpha_composite(paper, Image.fromarray(pixels).convert("RGBA"))  # holes are transparent
         else:
-            pixels = self._draw(scene, kind, camera_of(self._client), FINE)
+            picture = Image.fromarray(self._draw(scene, kind, camera_of(self._client), FINE))
         encoded = io.BytesIO()
-        Image.fromarray(pixels[..., :3]).resize(size, Image.Resampling.LANCZOS).save(encoded, "PNG")
+        picture.convert("RGB").resize(size, Image.Resampling.LANCZOS).save(encoded, "PNG")
         self._client.send_file_download(f"ssplat_{kind}.png", encoded.getvalue(), save_immediately=True)
 
     def _send_scene(self) -> None:

@@ -109,4 +109,7 @@ class FakeClient:
         self.downloads[filename] = content
 
     def get_render(self, height, width, **_):
-        return np.full((height, width, 4), 77, np.uint8)
+        picture = np.full((height, width, 4), 77, np.uint8)
+        picture[..., 3] = 255
+        picture[0] = 0  # a hole
+        return picture

@@ -84,7 +84,7 @@ def settled(page, unlike=None):
 
 
 def db(a, b):
-    return -10 * np.log10(np.mean((np.asarray(a, np.float64) - np.asarray(b, np.float64)) ** 2))
+    return -10 * np.log10(np.mean((np.asarray(a, np.float64) - np.asarray(b, np.float64)) ** 2) + 1e-12)
 
 
 def test_a_browser_shows_what_the_rasterizer_draws(tmp_path):
