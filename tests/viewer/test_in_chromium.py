@@ -4,8 +4,11 @@ pytest -m slow -n 0 tests/viewer
 """
 
 import contextlib
+import os
+import signal
 import threading
 import time
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -38,6 +41,7 @@ BROWSER_DB = 38.0  # of the browser's splats against ours: 8 bits, 16-bit covari
 PICTURE_DB = 28.0  # of a drawn picture in the page: JPEG, stretched over the window
 CHANGE_DB = 32.0  # of pages that differ
 WINDOW = (960, 640)
+LONGEST_UPDATE = 5.0  # seconds, on a busy machine
 CLEAR = (slice(200, None), slice(0, 560))  # rows and columns that no panel or notice covers
 RED = np.array([0.9, 0.1, 0.1], np.float32)
 
@@ -174,6 +178,36 @@ def test_what_a_person_chooses_is_in_the_page(tmp_path):
         page.click("stop")
         settled(page, unlike=splats)
         assert "Time of a chunk" in page.evaluate("document.body.innerText")
+
+
+def test_a_browser_that_stands_still_holds_up_no_other(tmp_path):
+    """One of two browsers is stopped; the other is shown the chunks that come, and no update waits."""
+    folder = live_run(tmp_path / "run")
+    later = folder.delta(8).read_bytes(), folder.chunk_record(8).read_bytes()
+    folder.delta(8).unlink()
+    folder.chunk_record(8).unlink()
+    with opened(folder.path, tmp_path) as (viewer, _, page), Page(viewer.url, tmp_path / "second", WINDOW) as second:
+        wait_for(lambda: len(viewer.browsers) == 2)
+        before = settled(second)
+        family = process_family(page.process.pid)
+        for number in family:
+            os.kill(number, signal.SIGSTOP)
+        try:
+            folder.chunk_record(8).write_bytes(later[1])
+            folder.delta(8).write_bytes(later[0])
+            settled(second, unlike=before)
+            since = time.monotonic()
+            viewer.update()
+            assert time.monotonic() - since < LONGEST_UPDATE
+        finally:
+            for number in family:
+                os.kill(number, signal.SIGCONT)
+
+
+def process_family(number: int) -> list[int]:
+    """A process and all below it."""
+    children = Path(f"/proc/{number}/task/{number}/children").read_text().split()
+    return [number, *(n for child in children for n in process_family(int(child)))]
 
 
 @pytest.mark.parametrize("width", [1200, 480])
