@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from ssplat_jax.data.camera_path import SWAY_RADIUS, camera_path, look_at, looked_at, orbit_path
+from ssplat_jax.data.camera_path import SWAY_RADIUS, camera_path, look_at, looked_at, orbit_path, upward
 
 K = np.array([[50.0, 0.0, 32.0], [0.0, 50.0, 24.0], [0.0, 0.0, 1.0]])
 
@@ -119,3 +119,11 @@ def test_cameras_with_opposite_ups_sway_too():
     given[1, :3, [0, 1]] *= -1  # rolled by half a turn
     path, _ = orbit_path(given, K, 5.0, 4)
     assert np.isfinite(path).all()
+
+
+def test_up_is_where_level_cameras_have_it():
+    given = inward(9)
+    np.testing.assert_allclose(upward(given), [0, 0, 1], atol=1e-9)
+    given[:, :3, :2] *= -1  # all rolled by half a turn
+    np.testing.assert_allclose(upward(given), [0, 0, -1], atol=1e-9)
+    np.testing.assert_allclose(upward(np.tile(np.eye(4), (3, 1, 1))), [0, -1, 0])
