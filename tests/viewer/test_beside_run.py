@@ -49,8 +49,8 @@ def test_a_run_ends_though_its_viewer_stands_still_and_the_viewer_ends_with_it(t
     process = subprocess.Popen(arguments, stdout=subprocess.PIPE, text=True, start_new_session=True)
     try:
         assert process.stdout is not None
-        url = process.stdout.readline().split()[0]  # of the viewer, before the first chunk is compiled
-        with urllib.request.urlopen(url, timeout=60) as page:
+        line = next(line for line in process.stdout if line.startswith("http://localhost:"))
+        with urllib.request.urlopen(line.split()[0], timeout=60) as page:
             assert page.status == 200
         viewer = wait_for(lambda: viewer_of(process.pid))
         os.kill(viewer, signal.SIGSTOP)
@@ -66,3 +66,4 @@ def test_a_run_ends_though_its_viewer_stands_still_and_the_viewer_ends_with_it(t
     finally:
         with contextlib.suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)
+        process.communicate()
