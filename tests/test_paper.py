@@ -14,12 +14,13 @@ import pytest
 from ssplat_jax.cache import ProjectedCache, Tokens, project
 from ssplat_jax.chunk import Chunk
 from ssplat_jax.config import preset
+from ssplat_jax.data.capture import open_capture
 from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.geometry.rotations import quats_to_matrices
 from ssplat_jax.metrics.lpips import LpipsWeights
 from ssplat_jax.model import anchor_depth, inject_features, network_of
 from ssplat_jax.model.cgfi import Aggregator, num_hints
-from ssplat_jax.model.types import DepthDistribution, Views
+from ssplat_jax.model.types import DepthDistribution, Views, prepare_views
 from ssplat_jax.numerics import softplus_inverse
 from ssplat_jax.pytree import replace
 from ssplat_jax.streaming.streamsplat import ChunkOutput, Prediction, StreamSplat
@@ -69,6 +70,16 @@ def remembered(rng) -> ProjectedCache:
         mask=jnp.asarray(mask),
         colors=None,
     )
+
+
+def test_frames_stream_in_their_order_in_the_units_of_the_poses_without_looking_ahead():
+    capture = open_capture("procedural:room?frames=12&size=64x48")
+    frame, start = capture.stream_frame(PAPER), capture.stream_frame(PAPER, range(PAPER.stream.chunk_size))
+    whole = capture.stream_frame(PAPER.replace(causal=False))
+    assert (frame.scale, frame.near, frame.far) == (1.0, start.near, start.far) != (1.0, whole.near, whole.far)
+    assert capture.stream_order(PAPER, [7, 2, 3, 9, 4], frame) == [7, 2, 3, 9, 4]
+    candidates = np.exp(f64(prepare_views(next(iter(capture.chunks(PAPER))), PAPER).log_candidates))
+    assert candidates[[0, -1]] == pytest.approx([0.01, 200.0], rel=1e-5)
 
 
 def test_anchor_fusion_mean_depth_and_both_confidences():

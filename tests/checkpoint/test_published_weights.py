@@ -4,7 +4,13 @@ import jax
 import numpy as np
 import pytest
 
-from ssplat_jax.checkpoint.published_weights import DEPTH, import_params, published_tensor, published_tensors
+from ssplat_jax.checkpoint.published_weights import (
+    DEPTH,
+    as_published,
+    import_params,
+    published_tensor,
+    published_tensors,
+)
 from ssplat_jax.checkpoint.weights import load_params
 from ssplat_jax.config import StreamConfig, preset
 from ssplat_jax.errors import InputError
@@ -28,6 +34,17 @@ def depth_network(tensors, tmp_path_factory):
     path = tmp_path_factory.mktemp("upstream") / "depth.npz"
     np.savez(path, **{name.removeprefix(DEPTH): x for name, x in tensors.items() if name.startswith(DEPTH)})
     return path
+
+
+@pytest.mark.parametrize("name", ["paper", "small", "base"])
+def test_imported_weights_are_run_as_their_code_ran_them(name):
+    config, before = as_published(preset(name)), preset(name)
+    assert config.network.upstream_compat and config.depth.depth_readout == "mean"
+    assert config.replace(upstream_compat=False, depth_readout=before.depth.depth_readout) == before
+    assert {path.split("/")[0] for path, tensor in published_tensors(config).items() if tensor is None} == {
+        "hpda",
+        "cgfi",
+    }
 
 
 def test_every_published_tensor_has_a_place_and_a_shape():

@@ -17,7 +17,7 @@ import pytest
 from PIL import Image
 
 from ssplat_jax.checkpoint.delta_files import load_delta, load_delta_header
-from ssplat_jax.checkpoint.published_weights import published_tensors
+from ssplat_jax.checkpoint.published_weights import as_published, published_tensors
 from ssplat_jax.checkpoint.stream_state import load_state
 from ssplat_jax.checkpoint.weights import load_params, load_weights, save_weights
 from ssplat_jax.commands.main import COMMANDS, guarded, main
@@ -352,20 +352,22 @@ def test_run_refine_equals_run_then_refine(tmp_path, capsys):
 
 
 @pytest.mark.slow  # compiles a network of 62 million parameters
-def test_imported_weights_stream_a_capture(tmp_path, capsys):
+@pytest.mark.parametrize("name", ["small", "paper"])
+def test_imported_weights_stream_a_capture(name, tmp_path, capsys):
     tensors = {
         t.name: named_tensor(t.name, t.shape) for t in published_tensors(preset("small")).values() if t is not None
     }
     np.savez(tmp_path / "upstream.npz", **tensors)
-    assert run("import-weights", str(tmp_path / "upstream.npz"), "--out", str(tmp_path / "small.npz")) == 0
+    checkpoint, file = tmp_path / "upstream.npz", tmp_path / f"{name}.npz"
+    assert run("import-weights", str(checkpoint), "--preset", name, "--out", str(file)) == 0
     assert "701 tensors (0 not used); fresh: HPDA and CGFI" in capsys.readouterr().out
-    params, config = load_weights(tmp_path / "small.npz")
-    assert config.network.upstream_compat and config.preset == "small"
+    params, config = load_weights(file)
+    assert config == as_published(preset(name))
     assert params["decoder"]["gaussian_head_2"]["kernel"].dtype == np.float32
-    name = "encoder.gaussian_head.2.weight"
-    np.testing.assert_array_equal(params["decoder"]["gaussian_head_2"]["kernel"], tensors[name].T)
+    theirs = tensors["encoder.gaussian_head.2.weight"]
+    np.testing.assert_array_equal(params["decoder"]["gaussian_head_2"]["kernel"], theirs.T)
     capture, out = make_capture(tmp_path / "capture"), tmp_path / "out"
-    weights = ("--weights", str(tmp_path / "small.npz"), "--set", "min_confidence=0.0")
+    weights = ("--weights", str(file), "--set", "min_confidence=0.0", "capacity=32768")
     assert run("run", str(capture), "--out", str(out), *weights, "--quiet") == 0
     assert load_ply(out / "scene.ply").num_gaussians > 0
 
