@@ -137,7 +137,7 @@ def saved(path, **arrays):
 def test_files_of_other_networks_are_refused(tmp_path, tensors):
     head = {name: x for name, x in tensors.items() if name.startswith(HEAD)}
     path = tmp_path / "a.npz"
-    with pytest.raises(InputError, match=r"wanted a preset of ReSplat's network \(small, base\), got 'tiny'"):
+    with pytest.raises(InputError, match=r"wanted a preset of ReSplat's network \(paper, small, base\), got 'tiny'"):
         import_params(saved(path, **head), StreamConfig())
     with pytest.raises(InputError, match=r"a\.npz: wanted weights of ReSplat, .* none of their \d+ tensors"):
         import_params(saved(path, **{"encoder.other.weight": np.zeros(3, np.float32)}), CONFIG)
