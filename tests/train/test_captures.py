@@ -22,7 +22,7 @@ from ssplat_jax.train.capture_samples import (
     validation_sample,
 )
 from ssplat_jax.train.losses import MAX_GAIN, fitted_gains
-from ssplat_jax.train.recipe import TINY, Phase, smoke_recipe
+from ssplat_jax.train.recipe import TINY, Phase, Recipe, smoke_recipe
 from ssplat_jax.train.samples import log_depths_at_cells
 from ssplat_jax.train.step_samples import sample_for_step, validation_samples
 from tests.streaming.narrow_model import NARROW
@@ -90,6 +90,10 @@ def test_poses_and_depths_of_a_sample_have_one_scale(mix, capture):
     np.testing.assert_allclose(found, depths, atol=1e-4)
     near, far = float(sample.chunks.near[0]), float(sample.chunks.far[0])
     assert np.mean((np.exp(found) > near) & (np.exp(found) < far)) > 0.9
+    # Scale and range are a little wrong, as estimated ones are, each by a factor of its own.
+    known, jitter = mix.frame_of(capture), Recipe.range_jitter
+    errors = np.log([scales[0] / known.scale, near / scales[0] / (known.near / known.scale)])
+    assert np.all(np.abs(errors) <= jitter + 1e-4) and np.abs(errors).min() > 1e-3
 
 
 def test_frames_without_depth_have_unknown_depths(mix, capture):

@@ -276,7 +276,7 @@ def test_parts_of_the_parameters_have_rates_of_their_own():
     assert scaled == {"encoder": {"pretrained": {"a": 1.0, "b": {"c": 2.0}}, "cnn": 8.0}, "decoder": 4.0}
     assert updates["decoder"] == 16.0 and scale_parts(updates, ()) is updates
     vit = RECIPES["paper"].part_rates[0][0].split("/")
-    shapes = jax.eval_shape(lambda key: init_params(key, preset("small")), jax.random.key(0))
+    shapes = jax.eval_shape(lambda key: init_params(key, preset("small"), ["encoder"]), jax.random.key(0))
     assert vit[1] in shapes[vit[0]]
 
 
