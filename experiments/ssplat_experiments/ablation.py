@@ -1,145 +1,207 @@
-"""Ablation of the paper's modules: each is switched off, trained for the same short budget and scored.
+"""Ablation of the paper's modules (its Table 3): each is switched off, trained for the same short budget and scored.
 
     ssplat experiment ablation --captures path/to/captures --out runs/ablation
 
-Every variant of the paper's table starts from the shipped weights and trains all stages after the matcher for the same
-steps on the same samples, once per seed; then the decoded cache is scored on unseen views of `procedural:room` (and of
-redkitchen, where `--captures` has it). Results in `--out` are not computed again, so that a stopped experiment
-continues. Writes `table.json` and `table.md`: mean and standard deviation over seeds, of the scores and of their
-difference from the full model with the same seed, which varies less. `--scale smoke` trains every variant for a few
-steps.
+Every variant starts from the shipped weights and trains all stages after the matcher for the same steps on the same
+samples, once per seed; then its decoded cache is scored on unseen views of `procedural:room` (and of redkitchen, where
+`--captures` has it). The variants with and without the memory are scored after more views too. `additions off` has the
+literal value of every field that the shipped weights can do without.
 """
 
 import dataclasses
-import json
+import functools
 import statistics
+import tempfile
 from pathlib import Path
 from typing import Any
 
+from ssplat_experiments.additions import additions
+from ssplat_experiments.cases import PICTURE, Case, Row
+from ssplat_experiments.memory_curve import START_CAPACITY
 from ssplat_experiments.scenes import REDKITCHEN, open_redkitchen, open_room
-from ssplat_experiments.study import at_scale
+from ssplat_experiments.study import Study, at_scale, run_study, side_by_side
 from ssplat_jax.checkpoint.weights import load_params
-from ssplat_jax.config import preset
+from ssplat_jax.config import StreamConfig, preset
 from ssplat_jax.console import Reporter
-from ssplat_jax.errors import InputError
-from ssplat_jax.evaluation.scoring import score_targets
-from ssplat_jax.storage.atomic import write_atomic
-from ssplat_jax.storage.json_files import write_json
+from ssplat_jax.data.capture import Capture
+from ssplat_jax.data.split import Split
+from ssplat_jax.evaluation.peak_memory import peak_memory
+from ssplat_jax.evaluation.scoring import score_targets, score_view
 from ssplat_jax.streaming.feed import feed_capture
 from ssplat_jax.streaming.session import Session
 from ssplat_jax.streaming.streamsplat import StreamSplat
 from ssplat_jax.train.loop import train
 from ssplat_jax.train.recipe import Phase, PhaseForm, Recipe
 
-PSNRS = ("shown", "literal")  # columns of the table
-
+FULL = "full"
 VARIANTS: dict[str, dict[str, Any]] = {
-    "full": {},
+    FULL: {},
+    "baseline": {"vacc": "append", "hpda": False, "cgfi": False},
+    "without VACC": {"vacc": "append"},
     "without HPDA": {"hpda": False},
     "without CGFI": {"cgfi": False},
-    "without VACC": {"vacc": "append"},
-    "baseline": {"vacc": "append", "hpda": False, "cgfi": False},
 }
+ADDITIONS_OFF = "additions off"
+LONG = (FULL, "without VACC")
+"""Variants that are scored at every number of views; the others at the first."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Budget:
-    """Training steps and views of a variant."""
+    """Training of a variant, and what it is scored on."""
 
     steps: int
     num_chunks: int
-    size: tuple[int, int]  # training images, height and width
+    size: tuple[int, int]
+    """Training images, height and width."""
+    max_pairs: int
+    """Tile intersections while training."""
     seeds: tuple[int, ...]
-    context: int  # views streamed for a score
-    scored: tuple[int, int]  # width and height
+    views: tuple[int, ...]
+    """Numbers of streamed views."""
+    scored: tuple[int, int]
+    """Scored images, width and height."""
+    variants: int | None = None
+    """How many of the variants are measured; None: all."""
 
     def recipe(self, seed: int) -> Recipe:
         """The stream phase of the tiny recipe, shorter."""
         form = PhaseForm(frozen=("encoder", "cost_volume"))
         phase = Phase("stream", self.steps, self.num_chunks, 2, (self.size,), learning_rate=3e-4, form=form)
-        return Recipe(phases=(phase,), seed=seed, warmup_steps=min(10, self.steps))
+        return Recipe(phases=(phase,), seed=seed, warmup_steps=min(10, self.steps), max_pairs=self.max_pairs)
 
 
 BUDGETS = {
-    "smoke": Budget(steps=4, num_chunks=2, size=(64, 64), seeds=(0,), context=8, scored=(64, 64)),
-    "cpu": Budget(steps=100, num_chunks=4, size=(96, 128), seeds=(0, 1, 2), context=32, scored=(320, 240)),
+    "smoke": Budget(1, 1, (32, 48), 1 << 14, (0,), (8,), (64, 48), variants=2),
+    "cpu": Budget(20, 2, (64, 96), 1 << 18, (0, 1, 2), (32, 64), (160, 120)),
+    "gpu": Budget(1000, 4, (256, 256), 1 << 21, (0, 1, 2), (256, 512), (320, 240)),
 }
 
 
 def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str:
     """Trains and scores every variant for every seed."""
+    return run_study(STUDY, captures, out, scale, reporter)
+
+
+def config_of(variant: str) -> StreamConfig:
+    """Configuration of a variant."""
+    changes = VARIANTS.get(variant)
+    if changes is None:
+        changes = {addition.field: addition.literal for addition in additions()}
+    return preset("tiny").replace(**changes, capacity=START_CAPACITY)
+
+
+def cases(captures: Path | None, scale: str) -> list[Case]:
+    """A case for each variant and seed, the seeds outermost: a study that is stopped early has the same for all."""
     budget = at_scale(BUDGETS, scale)
-    scenes = _scenes(captures, budget)
-    rows, done = [], 0
-    with reporter.progress("variants", len(VARIANTS) * len(budget.seeds)) as advance:
-        for seed in budget.seeds:  # outermost, so that variants have the same seeds if this is stopped early
-            for variant, changes in VARIANTS.items():
-                place = out / variant.replace(" ", "_") / f"seed{seed}"
-                scores = _measure(changes, seed, budget, scenes, place)
-                rows += [{"variant": variant, "seed": seed} | score for score in scores]
-                write_json(out / "table.json", rows)
-                write_atomic(out / "table.md", table(rows).encode())
-                done += 1
-                advance(done, f"{variant}, seed {seed}")
-    return f"wrote {out}/table.json and table.md: {len(VARIANTS)} variants, {len(budget.seeds)} seeds"
+    has_kitchen = captures is not None and (captures / REDKITCHEN).is_dir()
+    scenes = ("room", REDKITCHEN) if has_kitchen else ("room",)
+    asked = {name: value for name, value in dataclasses.asdict(budget).items() if name not in ("seeds", "variants")}
+    return [
+        Case(
+            name=f"{variant}, seed {seed}",
+            config=config_of(variant),
+            asked={"seed": seed, "scenes": scenes, **asked},
+            measure=functools.partial(measured, variant, seed, budget, scenes, captures),
+        )
+        for seed in budget.seeds
+        for variant in (*VARIANTS, ADDITIONS_OFF)[: budget.variants]
+    ]
 
 
-def _measure(changes: dict[str, Any], seed: int, budget: Budget, scenes, place: Path) -> list[dict[str, Any]]:
-    """Scores of one trained variant on every scene, from the file if they were measured before."""
-    measured = place / "scores.json"
-    request = {"budget": dataclasses.asdict(budget), "changes": changes, "scenes": list(scenes), "scores": PSNRS}
-    asked = json.loads(json.dumps(request))
-    if measured.exists():
-        held = json.loads(measured.read_text())
-        if held["asked"] != asked:
-            raise InputError(f"{measured}: was measured with {held['asked']}, wanted {asked}; choose another --out.")
-        return held["rows"]
-    config = preset("tiny").replace(**changes)
-    trained = train(config, budget.recipe(seed), place, params=load_params("tiny"))
+def measured(variant: str, seed: int, budget: Budget, scenes: tuple[str, ...], captures: Path | None) -> list[Row]:
+    """Trains a variant and scores it on every scene."""
+    config = config_of(variant)
+    with tempfile.TemporaryDirectory() as folder:
+        trained = train(config, budget.recipe(seed), Path(folder), params=load_params("tiny"))
     if trained.interrupted:
         raise KeyboardInterrupt
-    rows = []
-    for scene, (capture, split) in scenes.items():
-        session = Session(StreamSplat(config), trained.state.ema)
-        frame = capture.stream_frame(config, split.context)
-        exposures, _ = feed_capture(session, capture, split.context, frame)
-        scores = score_targets(session.gaussians(), capture, split.targets, frame, exposures)
-        psnrs = {name: round(scores[name]["psnr"], 3) for name in PSNRS}
-        rows.append({"scene": scene, **psnrs, "gaussians": session.cache_facts()["decoded"]})
-    write_json(measured, {"asked": asked, "rows": rows})
+    session, rows = Session(StreamSplat(config), trained.state.ema), []
+    for scene in scenes:
+        for views in budget.views if variant in LONG else budget.views[:1]:
+            session.cache = None
+            capture, split = _open(scene, views, budget.scored, captures)
+            rows.append({"scene": scene, "variant": variant, "views": views, "seed": seed})
+            rows[-1] |= scored(session, capture, split)
+            if seed != budget.seeds[0]:
+                rows[-1].pop(PICTURE)  # one seed is enough to look at
     return rows
 
 
-def _scenes(captures: Path | None, budget: Budget) -> dict:
-    """Captures at the scored size, each with its split."""
-    scenes = {"room": open_room(budget.context, budget.scored)}
-    if captures is not None:
-        if not (captures / REDKITCHEN).is_dir():
-            raise InputError(f"experiment ablation: wanted {REDKITCHEN} in --captures, {captures} does not hold it.")
-        scenes[REDKITCHEN] = open_redkitchen(captures, budget.context, budget.scored)
-    return scenes
+@functools.lru_cache(maxsize=4)
+def _open(scene: str, views: int, size: tuple[int, int], captures: Path | None) -> tuple[Capture, Split]:
+    if scene == "room" or captures is None:
+        return open_room(views, size)
+    return open_redkitchen(captures, views, size)
 
 
-def table(rows: list[dict[str, Any]]) -> str:
-    """Markdown table of mean and spread over seeds, a row per variant and scene; differences are taken per seed."""
+def scored(session: Session, capture: Capture, split: Split) -> Row:
+    """Scores, memory and a picture of the scene that a session makes of the context."""
+    frame = capture.stream_frame(session.model.config, split.context)
+    exposures, _ = feed_capture(session, capture, split.context, frame)
+    gaussians, middle = session.gaussians(), split.targets[len(split.targets) // 2]
+    scores = score_targets(gaussians, capture, split.targets, frame, exposures)
+    values = {f"{c}_{m}": scores[c][m] for c in ("shown", "literal") for m in ("psnr", "ssim", "lpips")}
+    return {
+        **values,
+        "peak_memory_bytes": peak_memory(session, capture.camera(middle, frame)).bytes,
+        "gaussians": session.cache_facts()["decoded"],
+        PICTURE: score_view(gaussians, capture, middle, frame, exposures).color,
+    }
+
+
+def add_differences(rows: list[Row]) -> None:
+    """`full minus it`: what the full model with the same seed, scene and views has more, in dB as shown.
+
+    A seed moves all variants alike, so differences vary less than scores.
+    """
+    keys = ("scene", "views", "seed")
+    whole = {tuple(row[key] for key in keys): row["shown_psnr"] for row in rows if row["variant"] == FULL}
+    for row in rows:
+        full = whole.get(tuple(row[key] for key in keys))
+        if row["variant"] != FULL and full is not None:
+            row["full_minus_it_db"] = round(full - row["shown_psnr"], 3)
+
+
+def findings(rows: list[Row]) -> list[str]:
+    """Mean and standard deviation over seeds, by scene, variant and views."""
     lines = [
-        "| scene | variant | shown PSNR dB | full, same seed, minus it | literal PSNR dB | Gaussians |",
-        "|---|---|---|---|---|---|",
+        "| scene | variant | views | shown PSNR dB | full, same seed, minus it | literal PSNR dB | Gaussians |",
+        "|---|---|---|---|---|---|---|",
     ]
-    for scene in dict.fromkeys(row["scene"] for row in rows):
-        for variant in VARIANTS:
-            here = [row for row in rows if (row["scene"], row["variant"]) == (scene, variant)]
-            if not here:
-                continue
-            whole = {row["seed"]: row["shown"] for row in rows if (row["scene"], row["variant"]) == (scene, "full")}
-            shown, literal = (_spread([row[name] for row in here]) for name in PSNRS)
-            differences = "" if variant == "full" else _spread([whole[row["seed"]] - row["shown"] for row in here])
-            gaussians = round(statistics.mean(row["gaussians"] for row in here))
-            lines.append(f"| {scene} | {variant} | {shown} | {differences} | {literal} | {gaussians} |")
-    return "\n".join(lines) + "\n"
+    for scene, variant, views in dict.fromkeys((row["scene"], row["variant"], row["views"]) for row in rows):
+        here = [row for row in rows if (row["scene"], row["variant"], row["views"]) == (scene, variant, views)]
+        shown, literal = (spread([row[f"{column}_psnr"] for row in here]) for column in ("shown", "literal"))
+        differences = [row["full_minus_it_db"] for row in here if "full_minus_it_db" in row]
+        gaussians = round(statistics.mean(row["gaussians"] for row in here))
+        difference = spread(differences) if differences else ""
+        lines.append(f"| {scene} | {variant} | {views} | {shown} | {difference} | {literal} | {gaussians} |")
+    return ["\n".join(lines)]
 
 
-def _spread(values: list[float]) -> str:
+def spread(values: list[float]) -> str:
     """Mean, standard deviation and number of values."""
     mean = f"{statistics.mean(values):.2f}"
     return f"{mean} ± {statistics.stdev(values):.2f} ({len(values)})" if len(values) > 1 else f"{mean} (one seed)"
+
+
+def gallery(rows: list[Row]) -> str:
+    """The variants side by side, a table for each scene."""
+    scenes = dict.fromkeys(row["scene"] for row in rows)
+    tables = [
+        side_by_side([row for row in rows if row["scene"] == scene], lambda row: f"{row['variant']}, {row['views']}")
+        for scene in scenes
+    ]
+    return "\n\n".join(tables)
+
+
+STUDY = Study(
+    name="ablation",
+    text="""Every variant starts from the shipped weights and trains all stages after the matcher for the same steps on
+the same samples, once per seed; scores are of unseen views. `additions off` has the literal value of every field that
+the shipped weights can do without. LPIPS needs weights that are not shipped.""",
+    cases=cases,
+    finish=add_differences,
+    findings=findings,
+    gallery=gallery,
+)

@@ -19,6 +19,7 @@ from ssplat_experiments.cases import Case, Row
 from ssplat_experiments.memory_curve import START_CAPACITY
 from ssplat_experiments.scenes import open_room
 from ssplat_experiments.study import Study, at_scale, run_study
+from ssplat_experiments.warm_sessions import new_session
 from ssplat_jax.checkpoint.weights import check_params, load_params
 from ssplat_jax.config import StreamConfig, preset
 from ssplat_jax.console import Reporter
@@ -29,8 +30,6 @@ from ssplat_jax.evaluation.latency import measure_latency
 from ssplat_jax.evaluation.peak_memory import peak_memory
 from ssplat_jax.evaluation.scoring import score_targets
 from ssplat_jax.streaming.feed import feed_capture
-from ssplat_jax.streaming.session import Session
-from ssplat_jax.streaming.streamsplat import StreamSplat
 
 CAPTURES = {"redkitchen": 5, "fox": 1, "south_building": 1}
 """Names of real captures, with the stride of their frames."""
@@ -129,12 +128,12 @@ def cases(captures: Path | None, scale: str) -> list[Case]:
             asked={"scene": scene, "path": path, "step": step, "context": sizes.context, "size": sizes.size},
             measure=functools.partial(measured, scene, path, step, config, sizes, captures),
         )
+        for path, step, config in variants(additions()[: sizes.additions])  # outermost: scenes share their programs
         for scene in scenes
-        for path, step, config in variants(additions()[: sizes.additions])
     ]
 
 
-@functools.lru_cache(maxsize=1)
+@functools.lru_cache(maxsize=4)
 def _open(scene: str, sizes: Sizes, captures: Path | None) -> tuple[Capture, Split]:
     if scene == "room" or captures is None:
         return open_room(sizes.context, sizes.size)
@@ -146,12 +145,12 @@ def measured(scene: str, path: str, step: str, config: StreamConfig, sizes: Size
     """Scores, time and memory of a configuration on a scene."""
     capture, split = _open(scene, sizes, captures)
     frame = capture.stream_frame(config, split.context)
-    session = Session(StreamSplat(config), load_params("tiny"))
+    session = new_session(config)
     exposures, recent = feed_capture(session, capture, split.context, frame, num_recent=1)
     targets = split.targets[:NUM_TARGETS]
     scores = score_targets(session.gaussians(), capture, targets, frame, exposures)
     camera = capture.camera(targets[len(targets) // 2], frame)
-    memory = peak_memory(session, recent[0], camera)
+    memory = peak_memory(session, camera)
     return [
         {
             "scene": scene,
@@ -169,8 +168,13 @@ def measured(scene: str, path: str, step: str, config: StreamConfig, sizes: Size
 
 
 def add_gains(rows: list[Row]) -> None:
-    """What each addition gives: its row minus the one before, or all of `tiny` minus the row without it."""
-    for scene in {row["scene"] for row in rows}:
+    """What each addition gives: its row minus the one before, or all of `tiny` minus the row without it.
+
+    Scene by scene, in the order in which they were first measured.
+    """
+    scenes = list(dict.fromkeys(row["scene"] for row in rows))
+    rows.sort(key=lambda row: scenes.index(row["scene"]))
+    for scene in scenes:
         path = [row for row in rows if (row["scene"], row["path"]) == (scene, "added")]
         for before, after in itertools.pairwise(path):
             _set_gains(after, before, after)

@@ -13,10 +13,14 @@ from ssplat_experiments import provenance
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.console import Reporter
 from ssplat_jax.errors import InputError
+from ssplat_jax.evaluation.pictures import save_image
 from ssplat_jax.storage.json_files import json_text, write_json
 
 Row = dict[str, Any]
 """A line of a table: numbers and words by column."""
+
+PICTURE = "picture"
+"""Column of an image. `measure` returns it in [0, 1], height x width x 3; the row that is kept holds its file."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,11 +81,21 @@ def measure_cases(
                 continue
             since = time.perf_counter()
             rows = list(case.measure())
+            rows = [_with_file(row, case.path(folder), number) for number, row in enumerate(rows)]
             held[case.name] = _record(name, case, rows, time.perf_counter() - since)
             write_json(case.path(folder), held[case.name])
             on_case(_rows(cases, held))
             advance(len(held), case.name)
     return _rows(cases, held)
+
+
+def _with_file(row: Row, path: Path, number: int) -> Row:
+    """The row with its picture, if it has one, written beside the file of the case."""
+    if PICTURE not in row:
+        return row
+    file = path.with_name(f"{path.stem}_{number}.png")
+    save_image(file, row[PICTURE])
+    return row | {PICTURE: f"{path.parent.name}/{file.name}"}
 
 
 def _record(name: str, case: Case, rows: list[Row], seconds: float) -> dict[str, Any]:

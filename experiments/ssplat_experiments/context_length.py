@@ -6,7 +6,7 @@ The targets are uniform over a trajectory, and the other frames are streamed in 
 of views and is scored. Suites are procedural walks and every capture in `--captures` that is long enough. `literal`
 scores are those of the paper: over black, at the exposure of the scene. `shown` fills holes and carries the exposure
 over. The baselines see the same frames: the nearest context view, the mean color, the nearest view warped by the depth
-of our scene, and a memory that keeps every token.
+of our scene, a memory that keeps every token, and the same network over all views at once (`joint`).
 """
 
 import dataclasses
@@ -17,23 +17,25 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from ssplat_experiments.cases import Case, Row
+from ssplat_experiments.cases import PICTURE, Case, Row
 from ssplat_experiments.image_baselines import BASELINES, baseline_scores
+from ssplat_experiments.joint_network import JointNetwork, joint_config, one_chunk
 from ssplat_experiments.memory_curve import START_CAPACITY
-from ssplat_experiments.study import Study, at_scale, run_study
+from ssplat_experiments.study import Study, at_scale, run_study, side_by_side
+from ssplat_experiments.warm_sessions import new_session
 from ssplat_jax.checkpoint.weights import load_params
 from ssplat_jax.config import StreamConfig, preset
 from ssplat_jax.console import Reporter
 from ssplat_jax.data.capture import Capture, open_capture
-from ssplat_jax.data.split import paper_split
+from ssplat_jax.data.split import Split, paper_split
+from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.evaluation.latency import measure_latency
 from ssplat_jax.evaluation.peak_memory import peak_memory
 from ssplat_jax.evaluation.scoring import ImageScore, score_view
+from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.streaming.feed import Exposures, feed_capture
-from ssplat_jax.streaming.session import Session
-from ssplat_jax.streaming.streamsplat import StreamSplat
 
-OURS, APPEND = "ours", "append-all"
+OURS, APPEND, JOINT = "ours", "append-all", "joint"
 NUM_TARGETS = 16
 
 
@@ -45,6 +47,8 @@ class Sizes:
     suites: tuple[str, ...]
     size: tuple[int, int]
     targets: int = NUM_TARGETS
+    joint: int = 128
+    """Most views of the joint network, whose memory grows with them."""
 
 
 SIZES = {
@@ -60,28 +64,41 @@ def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str
 
 
 def cases(captures: Path | None, scale: str) -> list[Case]:
-    """A case for each suite and memory."""
+    """A case for each suite and method."""
     return suite_cases(captures, at_scale(SIZES, scale))
 
 
 def suite_cases(captures: Path | None, sizes: Sizes) -> list[Case]:
-    """A case for each suite and memory at these sizes."""
+    """A case for each suite and memory at these sizes, and for each number of views of the joint network."""
     num_frames = max(sizes.counts) + sizes.targets
     paths = [f"procedural:{suite}?frames={num_frames}" for suite in sizes.suites]
     folders = sorted(path for path in captures.iterdir() if path.is_dir()) if captures is not None else []
     paths += [str(path) for path in folders if len(open_capture(path, size=sizes.size)) >= num_frames]
     config = preset("tiny").replace(capacity=START_CAPACITY)  # so that memory is what the scene needs
     methods = {OURS: config, APPEND: config.replace(vacc="append")}
-    return [
+    asked = {name: value for name, value in dataclasses.asdict(sizes).items() if name not in ("suites", "joint")}
+    streams = [
         Case(
             name=f"{_suite(path)}, {method}",
             config=config,
-            asked={"suite": _suite(path), **dataclasses.asdict(sizes)},
+            asked={"suite": _suite(path), **asked},
             measure=functools.partial(measured, path, method, config, sizes),
         )
         for path in paths
         for method, config in methods.items()
     ]
+    joint = [
+        Case(
+            name=f"{_suite(path)}, {JOINT}, {count} views",
+            config=joint_config(config, count),
+            asked={"suite": _suite(path), **asked},
+            measure=functools.partial(measured_joint, path, count, config, sizes),
+        )
+        for count in sizes.counts  # outermost: suites share their programs
+        if count <= sizes.joint
+        for path in paths
+    ]
+    return streams + joint
 
 
 def _suite(path: str) -> str:
@@ -95,18 +112,16 @@ def _open(path: str, size: tuple[int, int]) -> Capture:
 
 def measured(path: str, method: str, config: StreamConfig, sizes: Sizes) -> list[Row]:
     """A row for each number of views; with our memory, one for each image baseline too."""
-    capture = _open(path, sizes.size)
-    split = paper_split(len(capture), max(sizes.counts), targets=sizes.targets)
-    # Depth range and scale of the fewest views: a stream does not know how long it will be.
-    frame = capture.stream_frame(config, split.context[: min(sizes.counts)])
-    session, exposures, rows = Session(StreamSplat(config), load_params("tiny")), {}, []
+    capture, split, frame = _opened(path, config, sizes)
+    session, exposures, rows = new_session(config), {}, []
     middle = capture.camera(split.targets[len(split.targets) // 2], frame)
     for fed, count in itertools.pairwise((0, *sizes.counts)):
-        seen, recent = feed_capture(session, capture, split.context[fed:count], frame, num_recent=1)
-        exposures |= seen
-        place = {"suite": _suite(path).removeprefix("procedural:").partition("?")[0], "views": count}
-        scored = _scores(session, capture, split.targets, split.context[:count], frame, exposures, method == OURS)
-        memory, latency = peak_memory(session, recent[-1], middle), measure_latency(session, recent, middle)
+        found, recent = feed_capture(session, capture, split.context[fed:count], frame, num_recent=1)
+        exposures |= found
+        place = {"suite": _short(path), "views": count}
+        seen = split.context[:count] if method == OURS else ()
+        scored = _scores(session.gaussians(), capture, split.targets, frame, exposures, seen)
+        memory, latency = peak_memory(session, middle), measure_latency(session, recent, middle)
         cost = {
             "chunk_ms": latency["chunk_ms"]["median"],
             "gaussians": session.cache_facts()["decoded"],
@@ -115,25 +130,49 @@ def measured(path: str, method: str, config: StreamConfig, sizes: Sizes) -> list
         for name, scores in scored.items():
             rows.append({**place, "method": name, **scores} | (cost if name == "scene" else {}))
             rows[-1]["method"] = method if name == "scene" else name
+        if method == OURS:
+            view = score_view(session.gaussians(), capture, split.targets[len(split.targets) // 2], frame, exposures)
+            rows[-len(scored)][PICTURE] = view.color
     return rows
 
 
+def measured_joint(path: str, count: int, config: StreamConfig, sizes: Sizes) -> list[Row]:
+    """The row of the joint network over the first views, whose chunk is compared with that of the stream `config`."""
+    capture, split, frame = _opened(path, config, sizes)
+    chunk = one_chunk(list(capture.chunks(config, split.context[:count], frame=frame)))
+    network = JointNetwork(config, load_params("tiny"), chunk)
+    gaussians = network.gaussians()
+    scored = _scores(gaussians, capture, split.targets, frame, {}, ())["scene"]
+    middle = capture.camera(split.targets[len(split.targets) // 2], frame)
+    cost = {"gaussians": int((gaussians.opacities > 0).sum()), **network.peak_memory(middle).to_row()}
+    return [{"suite": _short(path), "views": count, "method": JOINT, **scored, **cost}]
+
+
+def _opened(path: str, config: StreamConfig, sizes: Sizes) -> tuple[Capture, Split, StreamFrame]:
+    """Capture, split, and the stream frame of the fewest views: a stream does not know how long it will be."""
+    capture = _open(path, sizes.size)
+    split = paper_split(len(capture), max(sizes.counts), targets=sizes.targets)
+    return capture, split, capture.stream_frame(config, split.context[: min(sizes.counts)])
+
+
+def _short(path: str) -> str:
+    return _suite(path).removeprefix("procedural:").partition("?")[0]
+
+
 def _scores(
-    session: Session,
+    gaussians: Gaussians,
     capture: Capture,
     targets: Sequence[int],
-    context: Sequence[int],
-    frame: Any,
+    frame: StreamFrame,
     exposures: Exposures,
-    with_baselines: bool,
+    context: Sequence[int],
 ) -> dict[str, dict[str, float]]:
-    """Mean scores of the scene and, if asked, of the image baselines, by their names."""
-    gaussians = session.gaussians()
+    """Mean scores of the scene and, for the views of a context, of the image baselines, by their names."""
     found: dict[str, list[dict[str, ImageScore]]] = {"scene": []}
     for i in targets:
         view = score_view(gaussians, capture, i, frame, exposures)
         found["scene"].append({"literal": view.score.literal, "shown": view.score.shown})
-        if with_baselines:
+        if context:
             for name, scores in baseline_scores(capture, i, context, frame, view.depth, exposures).items():
                 found.setdefault(name, []).append(scores)
     return {
@@ -155,14 +194,33 @@ def findings(rows: list[Row]) -> list[str]:
             continue
         first, last = ours[0], ours[-1]
         gains = [f"{last[f'{c}_psnr'] - first[f'{c}_psnr']:+.2f} dB {c}" for c in ("literal", "shown")]
-        rising = all(a[f"{c}_psnr"] < b[f"{c}_psnr"] for a, b in itertools.pairwise(ours) for c in ("literal", "shown"))
+        scores = [f"{c}_{metric}" for c in ("literal", "shown") for metric in ("psnr", "ssim")]
+        falls = [
+            f"{score} at {b['views']} by {a[score] - b[score]:.3f}"
+            for a, b in itertools.pairwise(ours)
+            for score in scores
+            if b[score] <= a[score]
+        ]
         time = last["chunk_ms"] / first["chunk_ms"]
         line = f"* {suite}, {first['views']} to {last['views']} views: {', '.join(gains)}"
-        line += f" ({'rising at every step' if rising else 'not rising at every step'}); chunk time x {time:.2f}"
+        steps = f"falls: {', '.join(falls)}" if falls else "PSNR and SSIM rise at every step"
+        line += f" ({steps}); chunk time x {time:.2f}"
         if first["peak_memory_bytes"] and last["peak_memory_bytes"]:
             line += f", peak memory x {last['peak_memory_bytes'] / first['peak_memory_bytes']:.2f}"
         lines.append(line + ".")
     return ["\n".join(lines)] if lines else []
+
+
+def gallery(rows: list[Row]) -> str:
+    """One target of each suite, from few views to many."""
+    suites = dict.fromkeys(row["suite"] for row in rows)
+    strips = [
+        side_by_side(
+            [row for row in rows if row["suite"] == suite], lambda row: f"{row['suite']}, {row['views']} views"
+        )
+        for suite in suites
+    ]
+    return "\n\n".join(strip for strip in strips if strip)
 
 
 def plot(pyplot: Any, rows: list[Row]) -> Any:
@@ -173,7 +231,7 @@ def plot(pyplot: Any, rows: list[Row]) -> Any:
     )
     for column, suite in enumerate(suites):
         for axes, kind in zip(panels[:, column], ("literal", "shown"), strict=True):
-            for method in (OURS, APPEND, *BASELINES):
+            for method in (OURS, APPEND, JOINT, *BASELINES):
                 line = [(r["views"], r[f"{kind}_psnr"]) for r in rows if (r["suite"], r["method"]) == (suite, method)]
                 if line:
                     width = 2.0 if method == OURS else 1.0
@@ -183,7 +241,7 @@ def plot(pyplot: Any, rows: list[Row]) -> Any:
             axes.spines[["top", "right"]].set_visible(False)
         panels[0, column].set_title(suite)
         panels[1, column].set_xlabel("context views")
-    figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=7)
+    figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=6, fontsize=7)
     return figure
 
 
@@ -191,9 +249,10 @@ STUDY = Study(
     name="context_length",
     text="""One stream stops at each number of views; targets are uniform over the trajectory and never streamed.
 `literal`: over black, at the exposure of the scene, as the paper scores. `shown`: holes filled and the exposure of the
-nearest views. `warp nearest` moves the nearest context view by the depth of our scene. Peak memory is that of step,
-decode and rendering, in MiB.""",
+nearest views. `append-all` keeps every token, `joint` runs the same network over all views at once, and `warp nearest`
+moves the nearest context view by the depth of our scene. Peak memory is that of step, decode and rendering, in MiB.""",
     cases=cases,
     plot=plot,
     findings=findings,
+    gallery=gallery,
 )

@@ -9,7 +9,15 @@ pages of all of them. A stopped run continues: cases that are there are not meas
 
 from pathlib import Path
 
-from ssplat_experiments import accuracy_vs_time, additions, context_length, latency, long_context, memory_curve
+from ssplat_experiments import (
+    ablation,
+    accuracy_vs_time,
+    additions,
+    context_length,
+    latency,
+    long_context,
+    memory_curve,
+)
 from ssplat_experiments.study import PAGE, Study, run_study
 from ssplat_jax.console import Reporter
 from ssplat_jax.errors import StorageError
@@ -18,6 +26,7 @@ from ssplat_jax.storage.atomic import write_atomic
 STUDIES: tuple[Study, ...] = (
     context_length.STUDY,
     long_context.STUDY,
+    ablation.STUDY,
     memory_curve.STUDY,
     latency.STUDY,
     additions.STUDY,

@@ -1,12 +1,22 @@
 """The same network over all views at once: the fixed-view method with which the paper compares a stream."""
 
+import functools
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 
 from ssplat_jax.cache import init_cache
 from ssplat_jax.chunk import Chunk
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.evaluation.peak_memory import PeakMemory, added_bytes, allocator_peak, live_bytes, render_bytes
+from ssplat_jax.evaluation.peak_memory import (
+    PeakMemory,
+    abstract,
+    added_bytes,
+    allocator_peak,
+    live_bytes,
+    render_bytes,
+)
 from ssplat_jax.gaussians import Gaussians, mask_gaussians
 from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.streaming.streamsplat import StreamSplat
@@ -30,15 +40,8 @@ class JointNetwork:
     """
 
     def __init__(self, config: StreamConfig, params: dict, chunk: Chunk) -> None:
-        model = StreamSplat(joint_config(config, len(chunk.images)))
         self.params, self.chunk = params, chunk
-
-        def decode_all(params: dict, chunk: Chunk) -> Gaussians:
-            tokens = model.predict(params, init_cache(model.config), chunk).tokens
-            accepted = tokens.valid & (tokens.confidences >= config.memory.min_confidence)
-            return mask_gaussians(model.decode_tokens(params, tokens), model.repeat_per_gaussian(accepted))
-
-        self.program = jax.jit(decode_all).lower(params, chunk).compile()
+        self.program = _program(joint_config(config, len(chunk.images)), *abstract((params, chunk)))
 
     def gaussians(self) -> Gaussians:
         """The scene of all views, in the stream frame."""
@@ -60,6 +63,19 @@ class JointNetwork:
             render=None if rendering is None else held + rendering,
             allocator=allocator_peak(),
         )
+
+
+@functools.lru_cache(maxsize=4)
+def _program(config: StreamConfig, structure: Any, leaves: tuple) -> jax.stages.Compiled:
+    """The compiled network for the shapes of its parameters and views."""
+    model = StreamSplat(config)
+
+    def decode_all(params: dict, chunk: Chunk) -> Gaussians:
+        tokens = model.predict(params, init_cache(config), chunk).tokens
+        accepted = tokens.valid & (tokens.confidences >= config.memory.min_confidence)
+        return mask_gaussians(model.decode_tokens(params, tokens), model.repeat_per_gaussian(accepted))
+
+    return jax.jit(decode_all).lower(*structure.unflatten(leaves)).compile()
 
 
 def one_chunk(chunks: list[Chunk]) -> Chunk:

@@ -23,9 +23,9 @@ import numpy as np
 from ssplat_experiments.cases import Case, Row
 from ssplat_experiments.memory_curve import START_CAPACITY
 from ssplat_experiments.study import Study, at_scale, run_study
+from ssplat_experiments.warm_sessions import new_session
 from ssplat_jax import model as stages
 from ssplat_jax.cache import project
-from ssplat_jax.checkpoint.weights import load_params
 from ssplat_jax.chunk import Chunk
 from ssplat_jax.config import StreamConfig, preset
 from ssplat_jax.console import Reporter
@@ -35,7 +35,6 @@ from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.rasterizer import render
 from ssplat_jax.streaming.feed import feed_capture
 from ssplat_jax.streaming.session import Session
-from ssplat_jax.streaming.streamsplat import StreamSplat
 
 STAGES = ("copy to device", "project the cache", "network", "fuse and carve", "decode", "render")
 COLORS = ("#909090", "#30507a", "#c06030", "#308050", "#806090", "#b09030")
@@ -80,7 +79,7 @@ def measured(config: StreamConfig, size: tuple[int, int], sizes: Sizes) -> list[
     """A row for each stage, for their sum and for the whole."""
     capture = open_capture(f"procedural:room?frames={sizes.views}", size=size)
     frame = capture.stream_frame(config)
-    session = Session(StreamSplat(config), load_params("tiny"))
+    session = new_session(config)
     _, recent = feed_capture(session, capture, range(sizes.views), frame, num_recent=2)
     camera = capture.camera(sizes.views // 2, frame)
     whole = measure_latency(session, recent, camera)["chunk_ms"]["median"]

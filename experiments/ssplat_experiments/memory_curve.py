@@ -3,11 +3,11 @@
     ssplat experiment memory_curve --scale smoke --out runs/memory_curve
 
 Three methods take in the same views of `procedural:room`: ours, ours with a memory that keeps every token
-(`vacc="append"`), and the same network over all views at once, which is what a fixed-view method does. The walk of
-`Sizes.loop` views is streamed again and again, so that the stream grows and the scene does not; `ours, new views` sees
-new views all the time, so that the scene grows too. On a CPU the bytes are those of XLA's analysis
-(`ssplat_jax/evaluation/peak_memory.py`); on a GPU each number of views runs in a process of its own, and its allocator
-counts.
+(`vacc="append"`), and the same network over all views at once, which is what a fixed-view method does. The streams walk
+through `Sizes.loop` views again and again, so that the stream grows and the scene does not. `ours, new views` and
+`joint` see new views all the time: a joint network that sees a view twice finds no parallax between the two. On a CPU
+the bytes are those of XLA's analysis (`ssplat_jax/evaluation/peak_memory.py`); on a GPU each number of views runs in a
+process of its own, and its allocator counts.
 """
 
 import dataclasses
@@ -19,19 +19,21 @@ from typing import Any
 from ssplat_experiments.cases import Case, Row
 from ssplat_experiments.joint_network import JointNetwork, joint_config, one_chunk
 from ssplat_experiments.study import Study, at_scale, run_study
+from ssplat_experiments.warm_sessions import new_session
 from ssplat_jax.checkpoint.weights import load_params
 from ssplat_jax.config import StreamConfig, preset
 from ssplat_jax.console import Reporter
 from ssplat_jax.data.capture import Capture, open_capture
 from ssplat_jax.evaluation.peak_memory import peak_memory
 from ssplat_jax.streaming.feed import feed_chunks
-from ssplat_jax.streaming.session import Session
-from ssplat_jax.streaming.streamsplat import StreamSplat
 
 START_CAPACITY = 128
 """Both memories start as small as they can and double when needed, so that the curve shows what a scene needs."""
 
 CHUNK = 4
+REPEATING = ("ours", "append-all")
+"""The methods that see the views of the walk again and again."""
+
 METHODS = ("ours", "ours, new views", "append-all", "joint")
 COLORS = {"ours": "#c06030", "ours, new views": "#e0b090", "append-all": "#30507a", "joint": "#308050"}
 
@@ -48,7 +50,7 @@ class Sizes:
 
 
 SIZES = {
-    "smoke": Sizes((8, 32), 8, 64, 48),
+    "smoke": Sizes((8, 16), 8, 64, 48),
     "cpu": Sizes((16, 32, 64, 128), 16, 160, 120),
     "gpu": Sizes((24, 64, 128, 256, 512), 24, 480, 256),
 }
@@ -110,16 +112,17 @@ def measured(method: str, counts: tuple[int, ...], sizes: Sizes) -> list[Row]:
     """The rows of a method: the first views of the capture, in one stream that stops at each number of them."""
     capture, config, params = _open(sizes), config_of(method, counts[-1]), load_params("tiny")
     frame = capture.stream_frame(config, range(max(sizes.counts)))
-    order = [i if method == "ours, new views" else i % sizes.loop for i in range(counts[-1])]
-    session, rows, fed = Session(StreamSplat(config), params), [], 0
+    order = [i % sizes.loop if method in REPEATING else i for i in range(counts[-1])]
+    session, rows, fed = new_session(config), [], 0
     for count in counts:
         camera = capture.camera(order[count // 2], frame)
         if method == "joint":
             network = JointNetwork(config, params, one_chunk(list(capture.chunks(config, order[:count], frame=frame))))
             memory, shown = network.peak_memory(camera), int((network.gaussians().opacities > 0).sum())
         else:
-            last = [streamed.chunk for streamed in feed_chunks(session, capture, order[fed:count], frame)][-1]
-            memory, shown = peak_memory(session, last, camera), session.cache_facts()["decoded"]
+            for _ in feed_chunks(session, capture, order[fed:count], frame):
+                pass
+            memory, shown = peak_memory(session, camera), session.cache_facts()["decoded"]
         rows.append({"method": method, "views": count, **memory.to_row(), "gaussians": shown})
         fed = count
     return rows
@@ -161,10 +164,10 @@ def plot(pyplot: Any, rows: list[Row]) -> Any:
 STUDY = Study(
     name="memory_curve",
     text="""Peak memory of step, decode and rendering together, against the number of views, in MiB. `ours` merges
-tokens by voxel, `append-all` keeps every token, `joint` runs the same network over all views at once. A walk is
-streamed again and again, so the scene stays as it is; `ours, new views` sees new views instead, and its memory grows
-with the scene. The memories of `ours` and `append-all` double when they are full. While a step runs, its parameters,
-cache, images and temporaries count.""",
+tokens by voxel, `append-all` keeps every token, `joint` runs the same network over all views at once. `ours` and
+`append-all` stream one walk again and again, so the scene stays as it is; `ours, new views` and `joint` see new views
+all the time, and the memory of `ours, new views` grows with the scene. The memories of `ours` and `append-all` double
+when they are full. While a step runs, its parameters, cache, images and temporaries count.""",
     cases=cases,
     plot=plot,
     findings=findings,

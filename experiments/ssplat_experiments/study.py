@@ -1,17 +1,16 @@
 """`run_study`: measures the cases of an experiment and writes its table (JSON and CSV), its plot and its page."""
 
-import contextlib
 import csv
 import dataclasses
+import importlib.metadata
 import io
-from collections.abc import Callable, Iterator, Sequence
+import os
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-import jax
-
 from ssplat_experiments import provenance
-from ssplat_experiments.cases import Case, Row, measure_cases
+from ssplat_experiments.cases import PICTURE, Case, Row, measure_cases
 from ssplat_jax.console import Reporter
 from ssplat_jax.evaluation.plots import import_pyplot, save_figure
 from ssplat_jax.storage.atomic import write_atomic
@@ -41,6 +40,10 @@ class Study:
     """Draws the rows with pyplot and returns the figure."""
     findings: Callable[[list[Row]], Sequence[str]] = lambda rows: ()
     """Sentences that follow from the rows, printed and written below the table."""
+    gallery: Callable[[list[Row]], str] = lambda rows: ""
+    """Markdown of the pictures of the rows, for the page."""
+    files: Callable[[list[Row], str], dict[str, Any]] = lambda rows, scale: {}
+    """Further JSON files, by name, that are made of the rows of a scale."""
 
 
 def at_scale(choices: dict[str, T], scale: str) -> T:
@@ -65,13 +68,16 @@ def run_study(study: Study, captures: Path | None, out: Path, scale: str, report
         InputError: `out` holds results of another request.
         StorageError: `out` cannot be written.
     """
+    if scale == "smoke":
+        compile_quickly()
     provenance.commit()  # read now and kept: the files may change while the experiment runs
     make_writable(out)
     cases = study.cases(captures, scale)
     write = lambda so_far: _write(study, out, scale, _finished(study, so_far))  # noqa: E731
-    with _compiled_quickly() if scale == "smoke" else contextlib.nullcontext():
-        rows = measure_cases(study.name, cases, out / "cases", reporter, write)
+    rows = measure_cases(study.name, cases, out / "cases", reporter, write)
     _write(study, out, scale, rows := _finished(study, rows))
+    for name, value in study.files(rows, scale).items():
+        write_json(out / name, value)
     if study.plot is not None and (pyplot := import_pyplot()) is None:
         reporter.warn(f"{study.name}: no {PLOT} without matplotlib; pip install 'ssplat-jax[plots]'")
     elif study.plot is not None:
@@ -81,15 +87,15 @@ def run_study(study: Study, captures: Path | None, out: Path, scale: str, report
     return f"wrote {out}/{PAGE}, table.json and table.csv: {len(rows)} rows of {len(cases)} cases"
 
 
-@contextlib.contextmanager
-def _compiled_quickly() -> Iterator[None]:
-    """Programs that are optimized by XLA but not by LLVM: half the time to compile, the same memory."""
-    before = jax.config.read("jax_disable_most_optimizations")
-    jax.config.update("jax_disable_most_optimizations", True)
-    try:
-        yield
-    finally:
-        jax.config.update("jax_disable_most_optimizations", before)
+def compile_quickly() -> None:
+    """Lets XLA compile the programs of this process in half the time, which makes them slow; `XLA_FLAGS` goes first.
+
+    Has no effect once JAX has computed something.
+    """
+    flags = ["--xla_backend_optimization_level=0", "--xla_cpu_parallel_codegen_split_count=1"]
+    if importlib.metadata.version("jaxlib").startswith("0.10."):  # later ones do not know the flag
+        flags.append("--xla_cpu_use_fusion_emitters=false")
+    os.environ.setdefault("XLA_FLAGS", " ".join(flags))
 
 
 def _finished(study: Study, rows: list[Row]) -> list[Row]:
@@ -106,7 +112,7 @@ def _write(study: Study, out: Path, scale: str, rows: list[Row]) -> None:
 
 def columns_of(rows: Sequence[Row]) -> list[str]:
     """All columns of the rows, those of the provenance last, in the order of their first appearance."""
-    names = list(dict.fromkeys(name for row in rows for name in row))
+    names = list(dict.fromkeys(name for row in rows for name in row if name != PICTURE))
     last = [name for name in ("config", "commit", "date", "machine") if name in names]
     return [name for name in names if name not in last] + last
 
@@ -114,7 +120,7 @@ def columns_of(rows: Sequence[Row]) -> list[str]:
 def csv_table(rows: Sequence[Row]) -> str:
     """The rows as CSV; a missing value is empty."""
     text = io.StringIO()
-    writer = csv.DictWriter(text, columns_of(rows), restval="", lineterminator="\n")
+    writer = csv.DictWriter(text, columns_of(rows), restval="", extrasaction="ignore", lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
     return text.getvalue()
@@ -128,6 +134,13 @@ def markdown_table(rows: Sequence[Row]) -> str:
     for row in rows:
         lines.append("| " + " | ".join(_cell(name, row.get(name)) for name in columns) + " |")
     return "\n".join(lines) + "\n"
+
+
+def side_by_side(rows: Sequence[Row], title: Callable[[Row], str]) -> str:
+    """A Markdown table of the pictures of the rows that have one, each under its title."""
+    shown = [row for row in rows if PICTURE in row]
+    lines = [[title(row) for row in shown], ["---"] * len(shown), [f"![{title(row)}]({row[PICTURE]})" for row in shown]]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines) if shown else ""
 
 
 def _cell(name: str, value: Any) -> str:
@@ -147,6 +160,8 @@ def page(study: Study, scale: str, rows: Sequence[Row]) -> str:
     if rows:
         parts.append(markdown_table(rows).strip())
     parts += study.findings(list(rows))
+    if gallery := study.gallery(list(rows)):
+        parts.append(gallery)
     if study.plot is not None:
         parts.append(f"![{study.name}]({PLOT})")
     return "\n\n".join(parts) + "\n"

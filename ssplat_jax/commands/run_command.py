@@ -1,6 +1,7 @@
 """`ssplat run`: a capture streamed into a scene."""
 
 import dataclasses
+import json
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -43,6 +44,9 @@ class Run:
     size: str | None = None
     """Image size WxH; default the capture's own."""
     quality: QualityOption = "accurate"
+    budget_ms: float | None = None
+    """Choose size and settings that take at most so many ms a view here, by timing this machine first; with the weights
+    tiny. --set goes on top and changes the time."""
     weights: WeightsOption = "tiny"
     set: ConfigChanges = ()
     save_every: int = 8
@@ -94,6 +98,8 @@ class Run:
             raise InputError("--hold-back: wanted a capture that is complete; got --watch. Leave one out.")
         if self.port != Run.port and not self.view:
             raise InputError("--port: wanted --view beside it, which it is for; got none.")
+        if self.budget_ms is not None:
+            self._check_budget()
 
     def _run(self) -> int:
         """Streams, tells what came of it, and refines if that is wanted; returns the exit code."""
@@ -118,26 +124,48 @@ class Run:
             ).run()
         return 0
 
+    def _check_budget(self) -> None:
+        """Refuses options that contradict --budget-ms.
+
+        Raises:
+            InputError: naming the first of them.
+        """
+        for option, is_given in (
+            ("--quality", self.quality != "accurate"),
+            ("--weights", self.weights != "tiny"),
+            ("--watch", self.watch),
+        ):
+            if is_given:
+                raise InputError(f"--budget-ms: wanted it without {option}, got both; leave one out.")
+
     def _stream(self) -> "RunResult":
         """Streams a capture that is complete."""
         from ssplat_jax.console import Reporter
         from ssplat_jax.runs.capture_run import run_capture
+        from ssplat_jax.runs.time_budget import setting_for_run
 
-        model, params = load_model(self.weights, causal_changes(self.set, self.causal))
+        reporter, size, scale = Reporter(self.quiet), parse_size(self.size), QUALITIES[self.quality].scale
+        changes: tuple[str, ...] = ()
+        if self.budget_ms is not None:
+            path = capture_path(self.capture, self.axes, self.poses)
+            point = setting_for_run(self.budget_ms, path, size, self.out, overwrite=self.overwrite, reporter=reporter)
+            scale = point.factor
+            changes = tuple(f"{name}={json.dumps(value)}" for name, value in point.changes.items())
+        model, params = load_model(self.weights, causal_changes((*changes, *self.set), self.causal))
         return run_capture(
             model,
             params,
             capture_path(self.capture, self.axes, self.poses),
             self.out,
-            size=parse_size(self.size),
-            scale=QUALITIES[self.quality].scale,
+            size=size,
+            scale=scale,
             stride=self.stride,
             max_views=self.max_views,
             save_every=self.save_every,
             overwrite=self.overwrite,
             deltas=self.deltas or self.view,
             num_held_back=self.hold_back,
-            reporter=Reporter(self.quiet),
+            reporter=reporter,
         )
 
     def _watch(self) -> "RunResult":

@@ -14,6 +14,7 @@ from ssplat_jax.data.split import Split
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.evaluation import latency
 from ssplat_jax.evaluation.exposures import exposures_to_json
+from ssplat_jax.evaluation.peak_memory import peak_memory
 from ssplat_jax.evaluation.pictures import save_comparison
 from ssplat_jax.evaluation.scoring import Display, ViewScore, baselines, check_scorable, mean_scores, score_view
 from ssplat_jax.gaussians import Gaussians
@@ -96,10 +97,11 @@ def evaluate(
         before = [score_view(gaussians, capture, i, frame, exposures, lpips_weights).score for i in split.targets]
         gaussians, done = _refine(gaussians, streamed, split.context, frame, exposures, refine_steps, reporter)
         refinement = {"refinement": {**done, "before": mean_scores(before)}}
+    middle = capture.camera(split.targets[len(split.targets) // 2], frame)
+    cost["peak_memory_bytes"] = peak_memory(session, middle).bytes
     display = display or Display()
     scores = _score_targets(gaussians, capture, split, frame, exposures, lpips_weights, display, folder)
-    middle = split.targets[len(split.targets) // 2]
-    timing = latency.measure_latency(session, recent, capture.camera(middle, frame))
+    timing = latency.measure_latency(session, recent, middle)
     metrics = {
         "capture": capture.name,
         "size": [capture.width, capture.height],

@@ -6,14 +6,15 @@ On a GPU the allocator counts, from the start of the process.
 """
 
 import dataclasses
+import functools
 from typing import Any
 
 import jax
 
-from ssplat_jax.chunk import Chunk
 from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.rasterizer import render
+from ssplat_jax.rasterizer.render import render_program, round_up
 from ssplat_jax.streaming.session import Session
 
 
@@ -46,14 +47,13 @@ class PeakMemory:
         }
 
 
-def peak_memory(session: Session, chunk: Chunk, camera: Camera) -> PeakMemory:
-    """Memory of a session that takes in one more chunk, decodes its cache and renders a view.
+def peak_memory(session: Session, camera: Camera) -> PeakMemory:
+    """Memory of a session that takes in a chunk, decodes its cache and renders a view.
 
     The programs of decoding and rendering are compiled once more to be analyzed. The session keeps its cache.
 
     Args:
-        session: a stream that has taken in at least one chunk.
-        chunk: a chunk of the shape that the session has taken in last.
+        session: a stream that has taken in at least one chunk; `step` is that of the last.
         camera: the view to render, in the stream frame.
 
     Returns:
@@ -61,9 +61,8 @@ def peak_memory(session: Session, chunk: Chunk, camera: Camera) -> PeakMemory:
     """
     held = live_bytes((session.params, session.cache))
     gaussians = session.gaussians()
-    step = None if session.step_program is None else added_bytes(session.step_program)
     return PeakMemory(
-        step=_sum(held, live_bytes(chunk), step),
+        step=session.step_memory_bytes,
         decode=_sum(held, added_bytes(session.decode_program())),
         render=_sum(held, live_bytes(gaussians), render_bytes(gaussians, camera)),
         allocator=allocator_peak(),
@@ -84,9 +83,20 @@ def added_bytes(program: jax.stages.Compiled) -> int | None:
 
 def render_bytes(gaussians: Gaussians, camera: Camera) -> int | None:
     """Bytes that rendering a view needs beside the Gaussians, with the capacity for pairs that `render` chooses."""
-    max_pairs = 1 << max(int(render(gaussians, camera).num_pairs) - 1, 0).bit_length()
-    drawn = jax.jit(lambda gaussians, camera: render(gaussians, camera, max_pairs=max_pairs))
-    return added_bytes(drawn.lower(gaussians, camera).compile())
+    num_pairs = round_up(int(render(gaussians, camera).num_pairs))
+    return added_bytes(_render_program(num_pairs, *abstract((gaussians, camera))))
+
+
+@functools.lru_cache(maxsize=8)
+def _render_program(max_pairs: int, structure: Any, leaves: tuple) -> jax.stages.Compiled:
+    """`render_program` for shapes of Gaussians and camera; kept, since compiling takes longer than a stream's chunk."""
+    return render_program(*structure.unflatten(leaves), max_pairs)
+
+
+def abstract(arrays: Any) -> tuple[Any, tuple[jax.ShapeDtypeStruct, ...]]:
+    """Structure and leaves of a pytree with shapes in place of arrays; both are hashable."""
+    leaves, structure = jax.tree.flatten(arrays)
+    return structure, tuple(jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in leaves)
 
 
 def allocator_peak() -> int | None:

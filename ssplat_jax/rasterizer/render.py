@@ -268,6 +268,18 @@ def _render(inputs: RenderInputs, effects: Effects, max_pairs: int, tile: int) -
 _render_jit = functools.partial(jax.jit, static_argnums=(1, 2, 3))(_render)
 
 
+def render_program(gaussians: Gaussians, camera: Camera, max_pairs: int) -> jax.stages.Compiled:
+    """The program that `render` runs for arrays of these shapes without effects, compiled so that it can be analyzed.
+
+    Args:
+        gaussians: the scene, or `jax.ShapeDtypeStruct` in place of its arrays.
+        camera: the cameras, likewise.
+        max_pairs: capacity for tile intersections.
+    """
+    effects = Effects().resolve(captured=None, distortion=None, exposures=None)
+    return _render_jit.lower(RenderInputs(gaussians, camera), effects, round_up(max_pairs), TILE).compile()
+
+
 def _untile(tiles: Num[Array, "tiles c p"], grid: Grid) -> Num[Array, "b h w c"]:
     """Images from their tiles, cropped to the image size."""
     side, channels = grid.tile, tiles.shape[1]

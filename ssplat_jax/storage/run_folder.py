@@ -44,6 +44,11 @@ class RunFolder:
         return self.path / "metrics.json"
 
     @property
+    def budget(self) -> Path:
+        """The setting that `ssplat run --budget-ms` has chosen."""
+        return self.path / "budget.json"
+
+    @property
     def split(self) -> Path:
         """The context and target frames of an evaluation."""
         return self.path / "split.json"

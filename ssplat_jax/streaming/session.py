@@ -51,6 +51,7 @@ class Session:
         self.compile_seconds = 0.0
         self.num_compilations = 0
         self._programs: dict[tuple, jax.stages.Compiled] = {}
+        self._decode_programs: dict[tuple, jax.stages.Compiled] = {}
         self._count_shown = jax.jit(lambda cache: jnp.sum(shown_pivots(cache, model.config), dtype=jnp.int32))
         self._decode_shown = jax.jit(model.decode_shown, static_argnums=2)
         self._last_program: jax.stages.Compiled | None = None
@@ -135,7 +136,11 @@ class Session:
 
     def decode_program(self) -> jax.stages.Compiled:
         """The program of `gaussians` for the present cache, compiled once more so that it can be analyzed."""
-        return self._decode_shown.lower(*self._decode_arguments()).compile()
+        params, cache, num_pivots = self._decode_arguments()
+        key = (cache.capacity, num_pivots)
+        if key not in self._decode_programs:
+            self._decode_programs[key] = self._decode_shown.lower(params, cache, num_pivots).compile()
+        return self._decode_programs[key]
 
     @property
     def step_memory_bytes(self) -> int | None:

@@ -5,10 +5,12 @@ from typing import get_args
 
 import numpy as np
 import pytest
-from ssplat_experiments.ablation import table
-from ssplat_experiments.accuracy_vs_time import SCORED, SETTINGS, mark_front
+from ssplat_experiments.ablation import add_differences, findings
+from ssplat_experiments.ablation import cases as ablation_cases
+from ssplat_experiments.accuracy_vs_time import SETTINGS, front_file, mark_front
 from ssplat_experiments.depth_error import cell_depths, summary
 
+from ssplat_jax.checkpoint.weights import check_params, load_params
 from ssplat_jax.commands.experiment_command import Experiment
 from ssplat_jax.commands.main import guarded
 from ssplat_jax.commands.options import QualityName
@@ -32,7 +34,32 @@ def test_the_qualities_are_settings_that_were_measured():
     assert measured.keys() == QUALITIES.keys() == set(get_args(QualityName))
     for name, quality in QUALITIES.items():
         assert measured[name].changes == {}  # a quality changes the size only
-        assert measured[name].size == tuple(quality.scale * side for side in SCORED)
+        assert measured[name].factor == quality.scale
+
+
+def test_settings_are_many_and_differ():
+    assert len(SETTINGS) >= 25
+    assert len({setting.name for setting in SETTINGS}) == len(SETTINGS)
+    assert len({(setting.factor, str(setting.changes)) for setting in SETTINGS}) == len(SETTINGS)
+
+
+def test_the_front_file_holds_means_in_reference_steps():
+    origin = {"machine": "m", "date": "d", "commit": "c"}
+    measured = [
+        ("room", "preset", 200.0, 20.0, 10.0), ("kitchen", "preset", 300.0, 10.0, 12.0),
+        ("room", "size x 0.5", 100.0, 19.0, 10.0), ("kitchen", "size x 0.5", 100.0, 9.0, 10.0),
+        ("room", "size x 0.75", 50.0, 30.0, 10.0),  # measured on one scene alone
+    ]  # fmt: skip
+    rows = [
+        {"scene": s, "setting": n, "ms_per_view": ms, "shown": psnr, "reference_ms": ref} | origin
+        for s, n, ms, psnr, ref in measured
+    ]
+    held = front_file(rows, "cpu")["front.json"]
+    assert [(p["setting"], p["steps_per_view"], p["shown"]) for p in held["points"]] == [
+        ("size x 0.5", 10.0, 14.0),
+        ("preset", 22.5, 15.0),
+    ]
+    assert held["points"][0]["factor"] == 0.5 and held["machine"] == "m"
 
 
 def test_depth_errors_ignore_scale_and_are_binned():
@@ -56,14 +83,25 @@ def test_variants_are_compared_with_the_same_seed():
     """Seeds move all scores alike: the difference's spread is not that of the scores."""
     scores = {"full": (20.0, 22.0, 24.0), "without HPDA": (19.9, 21.8, 23.9), "without CGFI": (20.5,)}
     rows = [
-        {"scene": "room", "variant": variant, "seed": seed, "shown": psnr, "literal": psnr - 2.0, "gaussians": 10}
+        {"scene": "room", "variant": variant, "views": 8, "seed": seed, "shown_psnr": psnr, "literal_psnr": psnr - 2.0,
+         "gaussians": 10}
         for variant, column in scores.items()
         for seed, psnr in enumerate(column)
-    ]
-    lines = table(rows).splitlines()[2:]
-    assert lines[0] == "| room | full | 22.00 ± 2.00 (3) |  | 20.00 ± 2.00 (3) | 10 |"
-    assert lines[1] == "| room | without HPDA | 21.87 ± 2.00 (3) | 0.13 ± 0.06 (3) | 19.87 ± 2.00 (3) | 10 |"
-    assert lines[2] == "| room | without CGFI | 20.50 (one seed) | -0.50 (one seed) | 18.50 (one seed) | 10 |"
+    ]  # fmt: skip
+    add_differences(rows)
+    lines = findings(rows)[0].splitlines()[2:]
+    assert lines[0] == "| room | full | 8 | 22.00 ± 2.00 (3) |  | 20.00 ± 2.00 (3) | 10 |"
+    assert lines[1] == "| room | without HPDA | 8 | 21.87 ± 2.00 (3) | 0.13 ± 0.06 (3) | 19.87 ± 2.00 (3) | 10 |"
+    assert lines[2] == "| room | without CGFI | 8 | 20.50 (one seed) | -0.50 (one seed) | 18.50 (one seed) | 10 |"
+
+
+def test_every_variant_of_the_ablation_differs_and_fits_the_weights():
+    configs = {case.name: case.config for case in ablation_cases(None, "cpu")}
+    assert len(configs) == 6 * 3 and len({config.hash for config in configs.values()}) == 6
+    for config in configs.values():
+        check_params(load_params("tiny"), config, "tiny")
+    off = configs["additions off, seed 0"]
+    assert not off.memory.carving and not off.stream.match_exposure
 
 
 def test_every_registered_experiment_can_be_loaded():

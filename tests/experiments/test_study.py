@@ -3,13 +3,16 @@
 import csv
 import json
 
+import numpy as np
 import pytest
-from ssplat_experiments.cases import Case
-from ssplat_experiments.study import Study, at_scale, run_study
+from PIL import Image
+from ssplat_experiments.cases import PICTURE, Case
+from ssplat_experiments.study import Study, at_scale, run_study, side_by_side
 
 from ssplat_jax.config import preset
 from ssplat_jax.console import Reporter
 from ssplat_jax.errors import InputError
+from ssplat_jax.evaluation.pictures import eight_bits
 
 QUIET = Reporter(quiet=True)
 
@@ -89,6 +92,21 @@ def test_every_row_tells_where_it_comes_from(tmp_path):
     ]
     page = (tmp_path / "page.md").read_text()
     assert "| 2 | 4 | 2.0 |" in page and page.count(preset("tiny").hash) == 3 and "3 numbers." in page
+
+
+def test_a_picture_is_kept_beside_its_case_and_shown_on_the_page(tmp_path):
+    image = np.linspace(0, 1, 4 * 6 * 3).reshape(4, 6, 3)
+
+    def cases(captures, scale):
+        return [Case("one", preset("tiny"), {}, lambda: [{"number": 1}, {"number": 2, PICTURE: image}])]
+
+    study = Study("seen", "Looks.", cases, gallery=lambda rows: side_by_side(rows, lambda row: f"no. {row['number']}"))
+    for _ in range(2):  # the second run reads the files
+        run_study(study, None, tmp_path, "smoke", QUIET)
+        page = (tmp_path / "page.md").read_text()
+        assert "| no. 2 |\n| --- |\n| ![no. 2](cases/one_1.png) |" in page and "| picture" not in page
+    with Image.open(tmp_path / "cases" / "one_1.png") as kept:
+        np.testing.assert_array_equal(np.asarray(kept), eight_bits(image))
 
 
 def test_gpu_takes_the_cpus_choice_where_it_has_none():

@@ -1,0 +1,26 @@
+"""`new_session`: streams of the same configuration share their compiled programs."""
+
+import functools
+
+from ssplat_jax.checkpoint.weights import load_params
+from ssplat_jax.config import StreamConfig
+from ssplat_jax.streaming.session import Session
+from ssplat_jax.streaming.streamsplat import StreamSplat
+
+MAX_KEPT = 4
+"""Configurations whose programs are kept; the one that was used longest ago goes first."""
+
+
+def new_session(config: StreamConfig) -> Session:
+    """A session with an empty cache and the shipped weights, whose programs may be compiled already.
+
+    Two streams of one configuration must not be fed in turns: they are the same object.
+    """
+    session = _session(config)
+    session.cache = None
+    return session
+
+
+@functools.lru_cache(maxsize=MAX_KEPT)
+def _session(config: StreamConfig) -> Session:
+    return Session(StreamSplat(config), load_params("tiny"))

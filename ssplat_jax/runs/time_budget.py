@@ -1,0 +1,175 @@
+"""Time budget: the most accurate setting that this machine can stream in so many milliseconds a view.
+
+The settings are those of `ssplat experiment accuracy_vs_time` that no other beats in both accuracy and time, as it
+wrote them into `front.json`, which lies beside this file. Their times are kept in *reference steps*, so that one timing
+tells them for another machine.
+"""
+
+import dataclasses
+import json
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from ssplat_jax.checkpoint.weights import load_params
+from ssplat_jax.chunk import Chunk
+from ssplat_jax.config import preset
+from ssplat_jax.console import Reporter
+from ssplat_jax.data.capture import open_capture
+from ssplat_jax.errors import InputError
+from ssplat_jax.storage.folders import make_writable
+from ssplat_jax.storage.json_files import write_json
+from ssplat_jax.storage.run_folder import RunFolder
+from ssplat_jax.streaming.session import Session
+from ssplat_jax.streaming.streamsplat import StreamSplat
+
+FRONT_FILE = Path(__file__).parent / "front.json"
+
+REFERENCE_SIZE = (64, 48)
+"""(width, height) of the images of the reference step, with the preset `tiny`: small, so that it compiles soon."""
+
+NUM_REPEATS = 9
+"""Timings of the reference step; the fastest counts, which other programs on the machine disturb least."""
+
+
+@dataclasses.dataclass(frozen=True)
+class FrontPoint:
+    """A setting that no other setting beats in both accuracy and time."""
+
+    setting: str
+    factor: float
+    """Size of the streamed images against those of the capture."""
+    changes: dict[str, Any]
+    """Fields that differ from the preset `tiny`."""
+    steps_per_view: float
+    """Time of one view, chunk in to novel view out, in reference steps."""
+    shown: float
+    """PSNR of unseen views in dB, as shown."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Front:
+    """The points of the front, and the size of the images at which their times hold."""
+
+    size: tuple[int, int]
+    points: tuple[FrontPoint, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Dictionary of plain JSON types."""
+        return dataclasses.asdict(self)
+
+
+def front_of(size: Sequence[int], points: Sequence[FrontPoint]) -> Front:
+    """The points that no other point beats, the fastest first."""
+    kept: list[FrontPoint] = []
+    for point in sorted(points, key=lambda point: (point.steps_per_view, -point.shown)):
+        if not kept or point.shown > kept[-1].shown:
+            kept.append(point)
+    return Front((int(size[0]), int(size[1])), tuple(kept))
+
+
+def load_front(path: Path = FRONT_FILE) -> Front:
+    """The front that is shipped with the package."""
+    fields = json.loads(path.read_text())
+    return front_of(fields["size"], [FrontPoint(**point) for point in fields["points"]])
+
+
+def choose(front: Front, budget_ms: float, size: tuple[int, int], reference_ms: float) -> tuple[FrontPoint, float]:
+    """The most accurate point that fits into a budget, and its expected milliseconds a view.
+
+    Args:
+        front: the points.
+        budget_ms: milliseconds a view, chunk in to novel view out.
+        size: (width, height) of the capture's images; times grow with their pixels.
+        reference_ms: milliseconds of the reference step on this machine.
+
+    Raises:
+        InputError: the budget is no positive time, or no point fits.
+    """
+    if not 0 < budget_ms < float("inf"):
+        raise InputError(f"--budget-ms: wanted a positive number of milliseconds a view, got {budget_ms:g}.")
+    pixels = size[0] * size[1] / (front.size[0] * front.size[1])
+    times = [point.steps_per_view * reference_ms * pixels for point in front.points]
+    fitting = [(point, ms) for point, ms in zip(front.points, times, strict=True) if ms <= budget_ms]
+    if not fitting:
+        raise InputError(
+            f"--budget-ms: wanted at least {min(times):.0f} ms a view, which the fastest setting takes here at"
+            f" {size[0]}x{size[1]}, got {budget_ms:g}; give a smaller --size."
+        )
+    return max(fitting, key=lambda found: found[0].shown)
+
+
+def setting_for_run(
+    budget_ms: float, path: str, size: tuple[int, int] | None, out: Path, *, overwrite: bool, reporter: Reporter
+) -> FrontPoint:
+    """The setting of a run with a budget; a run that continues keeps the one that it started with.
+
+    Times of a machine vary, and a run cannot change its setting on the way: `budget.json` in `out` holds the choice.
+
+    Args:
+        budget_ms: milliseconds a view, chunk in to novel view out.
+        path: the capture, as `open_capture` takes it.
+        size: (width, height) of the images; by default the capture's own.
+        out: folder of the run.
+        overwrite: choose anew.
+        reporter: says what was chosen.
+
+    Raises:
+        InputError: see `choose` and `open_capture`.
+        StorageError: `out` cannot be written.
+    """
+    capture, file = open_capture(path, size=size), RunFolder(out).budget
+    asked = {"budget_ms": budget_ms, "size": [capture.width, capture.height]}
+    if not overwrite and (held := _read_choice(file, asked)) is not None:
+        return held
+    reference_ms = reference_step_ms()
+    point, ms = choose(load_front(), budget_ms, (capture.width, capture.height), reference_ms)
+    reporter.say(f"--budget-ms {budget_ms:g}: {point.setting}, about {ms:.0f} ms a view on this machine")
+    make_writable(out)
+    expected = {"expected_ms": round(ms, 1), "reference_ms": round(reference_ms, 2)}
+    write_json(file, asked | expected | {"point": dataclasses.asdict(point)})
+    return point
+
+
+def _read_choice(file: Path, asked: dict[str, Any]) -> FrontPoint | None:
+    """The choice that an earlier run with the same budget and size has made; None if there is none."""
+    try:
+        held = json.loads(file.read_text())
+        return FrontPoint(**held["point"]) if asked.items() <= held.items() else None
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return None
+
+
+def reference_step_ms() -> float:
+    """Milliseconds of the reference step on this machine: four small images into an empty cache with `tiny`."""
+    session, chunk = Session(StreamSplat(preset("tiny")), load_params("tiny")), _reference_chunk()
+    times = []
+    for _ in range(NUM_REPEATS + 1):  # the first compiles
+        session.cache = jax.block_until_ready(session.model.init_cache())
+        since = time.perf_counter()
+        session.feed(chunk)
+        times.append(1e3 * (time.perf_counter() - since))
+    return min(times[1:])
+
+
+def _reference_chunk() -> Chunk:
+    """Four views of noise, side by side: the time of a step depends on shapes alone."""
+    width, height = REFERENCE_SIZE
+    views = preset("tiny").stream.chunk_size
+    rng = np.random.default_rng(0)
+    viewmats = np.tile(np.eye(4, dtype=np.float32), (views, 1, 1))
+    viewmats[:, 0, 3] = 0.1 * np.arange(views)
+    K = np.array([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1]], np.float32)
+    arrays = Chunk(
+        images=rng.uniform(size=(views, height, width, 3)).astype(np.float32),  # pyright: ignore[reportArgumentType]
+        viewmats=viewmats,  # pyright: ignore[reportArgumentType]
+        Ks=np.tile(K, (views, 1, 1)),  # pyright: ignore[reportArgumentType]
+        valid=np.ones(views, bool),  # pyright: ignore[reportArgumentType]
+        near=np.float32(0.5),  # pyright: ignore[reportArgumentType]
+        far=np.float32(10.0),  # pyright: ignore[reportArgumentType]
+    )
+    return jax.tree.map(jax.numpy.asarray, arrays)

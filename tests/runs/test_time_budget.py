@@ -1,0 +1,81 @@
+"""`--budget-ms`: the front is one, the choice is the best that fits, and a run keeps its choice."""
+
+import itertools
+import json
+
+import numpy as np
+import pytest
+
+from ssplat_jax.checkpoint.weights import check_params, load_params
+from ssplat_jax.config import preset
+from ssplat_jax.console import Reporter
+from ssplat_jax.errors import InputError
+from ssplat_jax.runs import time_budget
+from ssplat_jax.runs.time_budget import Front, FrontPoint, choose, front_of, load_front, setting_for_run
+
+QUIET = Reporter(quiet=True)
+
+
+def point(steps, shown):
+    return FrontPoint(f"{steps} steps", 1.0, {}, steps, shown)
+
+
+def test_a_front_holds_the_points_that_no_other_beats():
+    rng = np.random.default_rng(0)
+    points = [point(float(steps), float(shown)) for steps, shown in rng.integers(1, 12, (40, 2))]
+    front = front_of((160, 120), points).points
+    for kept, next_kept in itertools.pairwise(front):
+        assert kept.steps_per_view < next_kept.steps_per_view and kept.shown < next_kept.shown
+    for p in points:
+        assert any(k.steps_per_view <= p.steps_per_view and k.shown >= p.shown for k in front)
+
+
+def test_the_choice_is_the_best_that_fits_this_machine_and_size():
+    front = Front((100, 100), (point(1.0, 20.0), point(2.0, 22.0), point(4.0, 24.0)))
+    assert choose(front, 40.0, (100, 100), 10.0) == (front.points[2], 40.0)
+    assert choose(front, 39.0, (100, 100), 10.0) == (front.points[1], 20.0)
+    assert choose(front, 40.0, (100, 100), 20.0) == (front.points[1], 40.0)  # a machine half as fast
+    assert choose(front, 40.0, (200, 200), 10.0) == (front.points[0], 40.0)  # four times the pixels
+
+
+def test_a_budget_that_nothing_fits_names_the_least():
+    front = Front((100, 100), (point(1.0, 20.0), point(2.0, 22.0)))
+    with pytest.raises(InputError, match=r"at least 10 ms a view.*100x100, got 9"):
+        choose(front, 9.0, (100, 100), 10.0)
+    for budget in (0.0, -1.0, float("nan"), float("inf")):
+        with pytest.raises(InputError, match="positive number of milliseconds"):
+            choose(front, budget, (100, 100), 10.0)
+
+
+def test_every_shipped_point_runs_with_the_shipped_weights():
+    front, params = load_front(), load_params("tiny")
+    assert len(front.points) >= 5 and front_of(front.size, front.points) == front
+    for p in front.points:
+        check_params(params, preset("tiny").replace(**p.changes), "tiny")
+        assert 0.2 <= p.factor <= 2.0 and p.steps_per_view > 0
+
+
+def test_a_run_that_continues_keeps_its_setting(tmp_path, monkeypatch):
+    speeds = iter([1.0, 100.0, 1.0])
+    monkeypatch.setattr(time_budget, "reference_step_ms", lambda: next(speeds))
+    monkeypatch.setattr(
+        time_budget,
+        "load_front",
+        lambda: Front((64, 48), (point(1.0, 20.0), FrontPoint("two", 0.5, {"hpda": False}, 5.0, 22.0))),
+    )
+
+    def chosen(budget, overwrite=False):
+        return setting_for_run(
+            budget, "procedural:room", (64, 48), tmp_path, overwrite=overwrite, reporter=QUIET
+        ).setting
+
+    assert chosen(6.0) == "two"
+    assert chosen(6.0) == "two"  # not timed again
+    with pytest.raises(InputError, match="at least 100 ms"):
+        chosen(7.0)
+    assert json.loads((tmp_path / "budget.json").read_text())["expected_ms"] == 5.0
+    assert chosen(4.0, overwrite=True) == "1.0 steps"
+
+
+def test_the_reference_step_takes_time():
+    assert 0.1 < time_budget.reference_step_ms() < 60_000
