@@ -15,7 +15,7 @@ from ssplat_experiments.study import at_scale, run_study
 from ssplat_jax.console import Reporter
 
 SIZES = {
-    "smoke": (Sizes((8, 24), ("corridor",), (64, 48), targets=3),),
+    "smoke": (Sizes((8, 24), ("corridor",), (64, 48), targets=3, joint=8),),
     "cpu": (Sizes((24, 256, 512, 1024), ("room",), (96, 72)),),
     "gpu": (
         Sizes((24, 256, 512, 1024), ("room", "corridor"), (480, 256)),
