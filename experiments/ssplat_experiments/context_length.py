@@ -227,7 +227,7 @@ def plot(pyplot: Any, rows: list[Row]) -> Any:
     """Literal and shown PSNR against views, a column of panels for each suite."""
     suites = list(dict.fromkeys(row["suite"] for row in rows))
     figure, panels = pyplot.subplots(
-        2, len(suites), figsize=(1 + 3.2 * len(suites), 5), sharex=True, layout="constrained", squeeze=False
+        2, len(suites), figsize=(2 + 3.2 * len(suites), 5), sharex=True, layout="constrained", squeeze=False
     )
     for column, suite in enumerate(suites):
         for axes, kind in zip(panels[:, column], ("literal", "shown"), strict=True):
@@ -237,11 +237,16 @@ def plot(pyplot: Any, rows: list[Row]) -> Any:
                     width = 2.0 if method == OURS else 1.0
                     axes.plot(*zip(*sorted(line), strict=True), marker="o", ms=3, lw=width, label=method)
             axes.set_xscale("log", base=2)
+            counts = sorted({row["views"] for row in rows})
+            axes.set_xticks(counts, [str(count) for count in counts], fontsize=8)
+            axes.minorticks_off()
             axes.set_ylabel(f"{kind} PSNR, dB")
             axes.spines[["top", "right"]].set_visible(False)
         panels[0, column].set_title(suite)
         panels[1, column].set_xlabel("context views")
-    figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=6, fontsize=7)
+    figure.legend(
+        *panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=min(6, 3 * len(suites)), fontsize=7
+    )
     return figure
 
 
