@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from ssplat_jax.checkpoint.weights import load_params
@@ -164,12 +165,11 @@ def _reference_chunk() -> Chunk:
     viewmats = np.tile(np.eye(4, dtype=np.float32), (views, 1, 1))
     viewmats[:, 0, 3] = 0.1 * np.arange(views)
     K = np.array([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1]], np.float32)
-    arrays = Chunk(
-        images=rng.uniform(size=(views, height, width, 3)).astype(np.float32),  # pyright: ignore[reportArgumentType]
-        viewmats=viewmats,  # pyright: ignore[reportArgumentType]
-        Ks=np.tile(K, (views, 1, 1)),  # pyright: ignore[reportArgumentType]
-        valid=np.ones(views, bool),  # pyright: ignore[reportArgumentType]
-        near=np.float32(0.5),  # pyright: ignore[reportArgumentType]
-        far=np.float32(10.0),  # pyright: ignore[reportArgumentType]
+    return Chunk(
+        images=jnp.asarray(rng.uniform(size=(views, height, width, 3)), jnp.float32),
+        viewmats=jnp.asarray(viewmats),
+        Ks=jnp.tile(jnp.asarray(K), (views, 1, 1)),
+        valid=jnp.ones(views, bool),
+        near=jnp.asarray(0.5),
+        far=jnp.asarray(10.0),
     )
-    return jax.tree.map(jax.numpy.asarray, arrays)
