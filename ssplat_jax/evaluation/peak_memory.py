@@ -90,7 +90,8 @@ def render_bytes(gaussians: Gaussians, camera: Camera) -> int | None:
 @functools.lru_cache(maxsize=8)
 def _render_program(max_pairs: int, structure: Any, leaves: tuple) -> jax.stages.Compiled:
     """`render_program` for shapes of Gaussians and camera; kept, since compiling takes longer than a stream's chunk."""
-    return render_program(*structure.unflatten(leaves), max_pairs)
+    gaussians, camera = structure.unflatten(leaves)
+    return render_program(gaussians, camera, max_pairs)
 
 
 def abstract(arrays: Any) -> tuple[Any, tuple[jax.ShapeDtypeStruct, ...]]:
