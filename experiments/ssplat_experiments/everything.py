@@ -3,8 +3,8 @@
     ssplat experiment all --scale smoke --out runs/all
 
 Runs the experiments of `STUDIES` one after another, each in its folder below `results/`, and writes `results.md`, the
-pages of all of them. A stopped run continues: cases that are there are not measured again. docs/results.md is that page
-(`--out docs`).
+pages of all of them. A stopped run continues: cases that are there are not measured again. With `--out docs` the page
+lies where the documentation can take it up.
 """
 
 from pathlib import Path
