@@ -19,6 +19,7 @@ from ssplat_jax.commands.experiment_command import Experiment
 from ssplat_jax.commands.export_command import Export
 from ssplat_jax.commands.import_weights_command import ImportWeights
 from ssplat_jax.commands.inspect_command import Inspect
+from ssplat_jax.commands.poses_command import Poses
 from ssplat_jax.commands.program_cache import keep_programs
 from ssplat_jax.commands.refine_command import Refine
 from ssplat_jax.commands.render_command import Render
@@ -34,6 +35,7 @@ EXIT_INPUT, EXIT_STORAGE, EXIT_MEMORY = 2, 3, 4
 
 COMMANDS = {
     "demo": Demo,
+    "poses": Poses,
     "inspect": Inspect,
     "run": Run,
     "refine": Refine,

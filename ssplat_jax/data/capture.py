@@ -325,9 +325,11 @@ def open_capture(path: str | Path, *, size: tuple[int, int] | None = None) -> Ca
         got, fix = "nothing of that name", "check the path"
     elif folder.is_dir() and not any(folder.iterdir()):
         got, fix = "an empty folder", "check the path"
-    elif kind := _unposed(folder):
+    elif unposed := _unposed(folder):
+        kind, source = unposed
         got = f"none of these, but {kind} without camera poses"
-        fix = "compute the poses first, with COLMAP for instance; docs/your_capture.md has the commands"
+        example = f"ssplat poses {source} --out {source.stem or 'my'}_capture"
+        fix = f"estimate the poses first: {example} (COLMAP by pycolmap), and give the folder that it writes"
     else:
         got, fix = "none of these", f"see --help of `ssplat inspect` for their files, or try {PROCEDURAL}:room"
     formats = ", ".join(reader.FORMAT for reader in READERS)
@@ -339,13 +341,14 @@ def is_capture(path: Path) -> bool:
     return any(reader.matches(path) for reader in READERS)
 
 
-def _unposed(path: Path) -> str | None:
-    """The kind of images that a path holds without poses: "images", "a video", or None."""
+def _unposed(path: Path) -> tuple[str, Path] | None:
+    """The kind of images that a path holds without poses, "images" or "a video", and where they are; or None."""
     if path.is_file():
-        return "a video" if path.suffix.lower() in VIDEO_SUFFIXES else None
-    folders = (path, path / "images")
-    suffixes = {file.suffix.lower() for folder in folders if folder.is_dir() for file in folder.iterdir()}
-    return "images" if suffixes & IMAGE_SUFFIXES else "a video" if suffixes & VIDEO_SUFFIXES else None
+        return ("a video", path) if path.suffix.lower() in VIDEO_SUFFIXES else None
+    files = [file for folder in (path, path / "images") if folder.is_dir() for file in sorted(folder.iterdir())]
+    if any(file.suffix.lower() in IMAGE_SUFFIXES for file in files):
+        return "images", path
+    return next((("a video", file) for file in files if file.suffix.lower() in VIDEO_SUFFIXES), None)
 
 
 def capture_of_listing(

@@ -12,12 +12,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from ssplat_jax.checkpoint.published_weights import published_tensors
 from ssplat_jax.commands.main import COMMANDS
 from ssplat_jax.config import preset
 from ssplat_jax.storage.interrupts import Interrupts
 from tests.model.resplat_fixture import named_tensor
+from tests.poses.room_fixture import pictures, walk
 
 NUM_INTERRUPTS = 50
 TIMEOUT = 300.0
@@ -142,8 +144,12 @@ def command_lines(folder: Path) -> dict[str, tuple[str, ...]]:
         t.name: named_tensor(t.name, t.shape) for t in published_tensors(preset("small")).values() if t is not None
     }
     np.savez(folder / "published.npz", **tensors)
+    (folder / "photos").mkdir()
+    for i, picture in enumerate(pictures(walk(12))):
+        Image.fromarray(picture).save(folder / "photos" / f"{i}.png")
     return {
         "demo": ("--out", "{out}"),
+        "poses": (str(folder / "photos"), "--out", "{out}"),
         "inspect": ("procedural:room",),
         "run": ("procedural:room", "--out", "{out}"),
         "refine": (str(run), room),

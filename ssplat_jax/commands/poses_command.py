@@ -1,0 +1,50 @@
+"""`ssplat poses`: camera poses for a video or for photos."""
+
+import dataclasses
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from ssplat_jax.commands.options import QuietOption
+from ssplat_jax.errors import require_positive
+
+
+@dataclasses.dataclass(frozen=True)
+class Poses:
+    """Estimate camera poses of a video or of photos, and write a capture: images, transforms.json, sparse/.
+
+    Example: ssplat poses path/to/video.mp4 --out captures/garden
+    """
+
+    source: Annotated[Path, tyro.conf.Positional]
+    """A video of a scene that stands still, or a folder of photos of it."""
+    out: Path
+    """Folder of the capture; a call that stopped there is continued."""
+    frames: int = 120
+    """Frames chosen from a video, at most: sharp ones, at equal distances of motion."""
+    max_side: int = 1600
+    """Longer side in pixels that larger images are reduced to."""
+    fisheye: bool = False
+    """The lens is a fish-eye lens."""
+    overwrite: bool = False
+    """Remove the capture that an earlier call has written to the folder and start anew."""
+    quiet: QuietOption = False
+
+    def run(self) -> int:
+        from ssplat_jax.console import Reporter
+        from ssplat_jax.poses.estimate import PoseOptions, estimate_poses
+        from ssplat_jax.poses.verdict import verdict
+
+        require_positive(frames=self.frames, max_side=self.max_side)
+        options = PoseOptions(max_frames=self.frames, max_side=self.max_side, is_fisheye=self.fisheye)
+        try:
+            found = estimate_poses(self.source, self.out, options, self.overwrite, Reporter(self.quiet))
+        except KeyboardInterrupt:
+            how = " without --overwrite" if self.overwrite else ""
+            print(f"stopped; the same command{how} continues", file=sys.stderr)
+            raise
+        print(f"{self.out}: " + "\n".join(verdict(found)))
+        print(f"next: ssplat run {self.out} --size 320x240 --out runs/{self.out.resolve().name}")
+        return 0

@@ -1,0 +1,96 @@
+"""Photos: a folder of image files becomes upright copies of bounded size, all that structure from motion reads."""
+
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+from PIL import Image, ImageOps
+
+from ssplat_jax.data.capture import IMAGE_SUFFIXES
+from ssplat_jax.data.images import ORIENTATION, UPRIGHT, image_size
+from ssplat_jax.errors import echo, refusal
+
+JPEG_QUALITY = 95
+UNREADABLE = frozenset({".heic", ".heif"})  # what phones write and Pillow does not read
+SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp"})
+
+
+def list_photos(folder: Path) -> list[Path]:
+    """Returns the photos in a folder, or in its `images/`, in the order of names in which digits count as numbers.
+
+    Raises:
+        InputError: there are fewer than two, or they are of a kind that is not read.
+    """
+    for place in (folder, folder / "images"):
+        files = sorted(place.iterdir(), key=_natural) if place.is_dir() else []
+        photos = [file for file in files if file.suffix.lower() in SUFFIXES and file.is_file()]
+        if len(photos) > 1:
+            return photos
+        phone = [file for file in files if file.suffix.lower() in UNREADABLE]
+        if phone:
+            fix = "convert them to JPEG first (the phone's camera settings call JPEG `most compatible`)"
+            raise refusal(str(place), wanted="JPEG or PNG photos", got=f"{len(phone)} HEIC files", fix=fix)
+    kinds = ", ".join(sorted(SUFFIXES | IMAGE_SUFFIXES - UNREADABLE))
+    fix = f"give the folder that holds them ({kinds}), or a video file"
+    raise refusal(str(folder), wanted="a folder of photos", got="fewer than two images", fix=fix)
+
+
+def copy_photos(photos: list[Path], folder: Path, max_side: int, advance: Callable[[int], None]) -> list[str]:
+    """Copies photos into `folder`: as they are where they are upright and small enough, otherwise as JPEG files.
+
+    Args:
+        photos: the files.
+        folder: existing folder of the copies.
+        max_side: longer side of larger images is reduced to so many pixels.
+        advance: called with the number of files so far.
+
+    Returns:
+        The names of the copies, without spaces.
+
+    Raises:
+        InputError: a file is no readable image, or two names differ in spaces alone.
+    """
+    names: list[str] = []
+    for photo in photos:
+        size = image_size(photo)
+        name = re.sub(r"\s", "_", photo.name)
+        with Image.open(photo) as picture:
+            _load(picture, photo)
+            is_upright = picture.getexif().get(ORIENTATION, UPRIGHT) == UPRIGHT
+            if not (is_upright and max(size) <= max_side):
+                name = Path(name).stem + ".jpg"
+            if name in names:
+                fix = "rename one of the two"
+                raise refusal(str(photo), wanted="every name once", got=f"{echo(name)} twice", fix=fix)
+            names.append(name)
+            if is_upright and max(size) <= max_side:
+                shutil.copyfile(photo, folder / name)
+            else:
+                upright = ImageOps.exif_transpose(picture)
+                # Structure from motion reads the focal length in the EXIF data.
+                save_upright(upright, folder / name, max_side, exif=upright.getexif().tobytes())
+        advance(len(names))
+    return names
+
+
+def _load(picture: Image.Image, photo: Path) -> None:
+    """Decodes a photo, so that a damaged one is refused before hours of matching."""
+    try:
+        picture.load()
+    except Exception as error:  # Pillow's decoders raise nearly anything on damaged data
+        got = f"damaged data ({' '.join(str(error).split()) or type(error).__name__})"
+        raise refusal(str(photo), wanted="a complete image", got=got, fix="remove the file") from None
+
+
+def save_upright(picture: Image.Image, path: Path, max_side: int, *, exif: bytes = b"") -> None:
+    """Saves a picture as JPEG, reduced to a longer side of `max_side` pixels if it is larger."""
+    picture = picture.convert("RGB")
+    picture.thumbnail((max_side, max_side), Image.Resampling.LANCZOS)
+    picture.save(path, "JPEG", quality=JPEG_QUALITY, subsampling=0, exif=exif)
+
+
+def _natural(path: Path) -> list[tuple[int, int, str]]:
+    """Sort key that compares runs of digits as numbers."""
+    parts = re.split(r"([0-9]+)", path.name)
+    return [(0, int(part), "") if k % 2 else (1, 0, part) for k, part in enumerate(parts)]
