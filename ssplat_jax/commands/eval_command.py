@@ -12,15 +12,16 @@ from ssplat_jax.commands.options import (
     PosesOption,
     QualityOption,
     QuietOption,
+    ReviseOption,
     WeightsOption,
     capture_path,
     causal_changes,
+    check_refinement,
     load_lpips_weights,
     load_model,
     parse_size,
 )
 from ssplat_jax.config import QUALITIES
-from ssplat_jax.errors import InputError
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,6 +54,7 @@ class Eval:
     quality: QualityOption = "accurate"
     refine: int = 0
     """Gradient steps on the context views after the stream; the scores before are reported too."""
+    revise: ReviseOption = ()
     over_black: bool = False
     """Pictures show holes black instead of in the colors around them."""
     one_exposure: bool = False
@@ -73,8 +75,7 @@ class Eval:
         from ssplat_jax.evaluation.scoring import Display
         from ssplat_jax.runs.eval_run import EvalOptions, eval_path
 
-        if self.refine < 0:
-            raise InputError(f"--refine: wanted a number of steps of at least 0, got {self.refine}.")
+        check_refinement(self.refine, self.revise, "--refine")
         lpips_weights = load_lpips_weights(self.lpips_vgg, self.lpips_heads)
         model, params = load_model(self.weights, causal_changes(self.set, self.causal))
         options = EvalOptions(
@@ -87,6 +88,7 @@ class Eval:
             index=self.index,
             scene=self.scene,
             refine_steps=self.refine,
+            revise=self.revise,
             lpips_weights=lpips_weights,
             display=Display(self.over_black, self.one_exposure),
         )

@@ -34,6 +34,12 @@ QualityOption = Annotated[
 ]
 WeightsOption = Annotated[str, tyro.conf.arg(help="Preset with shipped weights, or a weights file.")]
 ConfigChanges = Annotated[tuple[str, ...], tyro.conf.arg(help="Changes to the configuration, as field=value.")]
+ReviseOption = Annotated[
+    tuple[Literal["auto", "poses", "focal", "exposures", "white_balance"], ...],
+    tyro.conf.arg(
+        help="Parts of the streamed views that refinement revises too: auto chooses those that the residuals call for."
+    ),
+]
 QuietOption = Annotated[bool, tyro.conf.arg(help="Print only the closing line.")]
 LpipsHeads = Annotated[
     Path | None,
@@ -117,6 +123,25 @@ def load_model(weights: str, changes: tuple[str, ...]):
     if changed != config:
         check_params(params, changed, weights)
     return StreamSplat(changed), params
+
+
+def check_refinement(steps: int, revise: tuple[str, ...], flag: str) -> None:
+    """Refuses options of a refinement that make no sense.
+
+    Args:
+        steps: gradient steps, with `flag`.
+        revise: effects, with --revise.
+        flag: name of the option of the steps.
+
+    Raises:
+        InputError: `steps` is negative, or --revise has nothing to revise or names auto among others.
+    """
+    if steps < 0:
+        raise InputError(f"{flag}: wanted a number of steps of at least 0, got {steps}.")
+    if revise and not steps:
+        raise InputError(f"--revise: wanted {flag} beside it, got 0 steps; for example {flag} 100.")
+    if "auto" in revise and len(revise) > 1:
+        raise InputError(f"--revise: wanted auto alone or effects by name, got {' '.join(revise)}.")
 
 
 def load_lpips_weights(vgg: Path | None, heads: Path | None):

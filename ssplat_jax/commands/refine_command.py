@@ -7,7 +7,16 @@ from typing import Annotated
 
 import tyro
 
-from ssplat_jax.commands.options import AxesOption, CapturePath, PosesOption, QuietOption, WeightsOption, capture_path
+from ssplat_jax.commands.options import (
+    AxesOption,
+    CapturePath,
+    PosesOption,
+    QuietOption,
+    ReviseOption,
+    WeightsOption,
+    capture_path,
+    check_refinement,
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,6 +31,7 @@ class Refine:
     capture: CapturePath
     steps: int = 100
     """Most gradient steps; each renders two views."""
+    revise: ReviseOption = ()
     weights: WeightsOption = "tiny"
     save_every: int = 50
     """Steps between saved states."""
@@ -36,11 +46,13 @@ class Refine:
         from ssplat_jax.console import Reporter
         from ssplat_jax.runs.refine_run import refine_run
 
+        check_refinement(self.steps, self.revise, "--steps")
         result = refine_run(
             self.folder,
             capture_path(self.capture, self.axes, self.poses),
             load_params(self.weights),
             steps=self.steps,
+            revise=self.revise,
             save_every=self.save_every,
             overwrite=self.overwrite,
             reporter=Reporter(self.quiet),

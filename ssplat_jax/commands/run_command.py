@@ -13,9 +13,11 @@ from ssplat_jax.commands.options import (
     PosesOption,
     QualityOption,
     QuietOption,
+    ReviseOption,
     WeightsOption,
     capture_path,
     causal_changes,
+    check_refinement,
     load_model,
     parse_size,
 )
@@ -63,6 +65,7 @@ class Run:
     """With --view: its port; the next free one if it is taken."""
     refine: int = 0
     """Then take this many gradient steps on the streamed frames, as `ssplat refine` does, into refined.ply."""
+    revise: ReviseOption = ()
     causal: bool = False
     """No look-ahead: near, far and scale come from the first chunk, and frames keep their order."""
     watch: bool = False
@@ -88,8 +91,7 @@ class Run:
 
     def _check(self) -> None:
         """Refuses options that contradict each other."""
-        if self.refine < 0:
-            raise InputError(f"--refine: wanted a number of steps of at least 0, got {self.refine}.")
+        check_refinement(self.refine, self.revise, "--refine")
         if self.quiet_seconds != Run.quiet_seconds and not self.watch:
             raise InputError("--quiet-seconds: wanted --watch beside it, which it is for; got none.")
         if self.watch and (self.axes or self.poses):
@@ -120,7 +122,14 @@ class Run:
             )
         if self.refine:
             return Refine(
-                self.out, self.capture, self.refine, self.weights, axes=self.axes, poses=self.poses, quiet=self.quiet
+                self.out,
+                self.capture,
+                self.refine,
+                self.revise,
+                self.weights,
+                axes=self.axes,
+                poses=self.poses,
+                quiet=self.quiet,
             ).run()
         return 0
 

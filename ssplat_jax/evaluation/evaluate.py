@@ -20,7 +20,7 @@ from ssplat_jax.evaluation.scoring import Display, ViewScore, baselines, check_s
 from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.metrics.lpips import LpipsWeights, check_size
 from ssplat_jax.metrics.psnr_ssim import SSIM_ARGUMENTS
-from ssplat_jax.refinement import refine_on_capture
+from ssplat_jax.refinement import CaptureRefinement, refine_on_capture
 from ssplat_jax.storage.atomic import write_atomic
 from ssplat_jax.storage.folders import make_writable
 from ssplat_jax.storage.json_files import write_json
@@ -39,6 +39,7 @@ def evaluate(
     streamed: Capture | None = None,
     lpips_weights: LpipsWeights | None = None,
     refine_steps: int = 0,
+    revise: Sequence[str] = (),
     scene: str | None = None,
     display: Display | None = None,
 ) -> dict:
@@ -58,6 +59,7 @@ def evaluate(
         lpips_weights: with them LPIPS is scored too; without, the fields `lpips` are null.
         refine_steps: gradient steps on the context views before the targets are scored. With them the metrics have a
             block `refinement`: the steps done, their seconds, and the scores before.
+        revise: effects of the refinement, see `refine_on_capture`.
         scene: name in `index.json`; by default the capture's.
         display: how pictures are made; the block `pictures` of the metrics holds it, and the mean PSNR of the pictures.
 
@@ -95,7 +97,8 @@ def evaluate(
     gaussians, refinement = session.gaussians(), {}
     if refine_steps:
         before = [score_view(gaussians, capture, i, frame, exposures, lpips_weights).score for i in split.targets]
-        gaussians, done = _refine(gaussians, streamed, split.context, frame, exposures, refine_steps, reporter)
+        refined, done = _refine(gaussians, streamed, split.context, frame, exposures, refine_steps, revise, reporter)
+        gaussians, exposures = refined.gaussians, refined.exposures
         refinement = {"refinement": {**done, "before": mean_scores(before)}}
     middle = capture.camera(split.targets[len(split.targets) // 2], frame)
     cost["peak_memory_bytes"] = peak_memory(session, middle).bytes
@@ -144,26 +147,34 @@ def _refine(
     frame: StreamFrame,
     exposures: Exposures,
     steps: int,
+    revise: Sequence[str],
     reporter: Reporter,
-) -> tuple[Gaussians, dict]:
+) -> tuple[CaptureRefinement, dict]:
     """The scene refined on its context views, and what that took."""
     start = time.perf_counter()
     with reporter.progress("refining", steps) as advance:
-        refined, report = refine_on_capture(
+        refined = refine_on_capture(
             gaussians,
             streamed,
             context,
             frame,
             exposures,
             steps=steps,
+            revise=revise,
             on_step=lambda step, loss: advance(step, f"loss {loss:.4f}"),
         )
+    report = refined.report
+    for reason in refined.choice.reasons:
+        reporter.say(reason)
     done = {
         "steps": report.num_steps,
         "stopped_early": report.stopped_early,
         "skipped_steps": report.num_skipped,
         "seconds": round(time.perf_counter() - start, 2),
         "seconds_per_step": round(report.seconds_per_step, 4),
+        "views_left_out": report.num_left_out,
+        "revised": list(refined.choice.effects.names),
+        "reasons": list(refined.choice.reasons),
     }
     return refined, done
 

@@ -26,6 +26,8 @@ from ssplat_jax.refinement.refine_step import (
     refine_step,
 )
 from ssplat_jax.refinement.seen_rows import may_be_seen
+from ssplat_jax.refinement.usable_views import only_usable
+from ssplat_jax.refinement.view_revision import revised_key_views
 
 PAIRS_MARGIN = 1.25
 """Capacity for tile intersections over what the fullest key view needs: Gaussians grow while they are refined."""
@@ -65,6 +67,8 @@ class Refinement:
     held_back: list[float]  # per step, on the pixels that are not
     stopped_early: bool  # the held-back error had stopped falling
     seconds_per_step: float  # median, without compilation; 0 for fewer than two steps
+    num_left_out: int = 0  # views that could not be learned from, see `only_usable`
+    key_views: KeyViews | None = None  # as the effects revised them; views that were left out are not valid
 
 
 def refine(
@@ -96,21 +100,31 @@ def refine(
         of views are no better than those of the round before.
 
     Raises:
-        InputError: shapes do not fit, `steps` is negative, or there is no view.
+        InputError: shapes do not fit, `steps` is negative, or no view has a finite camera and exposure.
     """
     _check(cameras, images, exposures, steps)
     if steps == 0:
         return gaussians, Refinement(0, 0, [], [], False, 0.0)
-    key_views = KeyViews.of(cameras, jnp.asarray(images), exposures)
-    progress = start_refinement(gaussians, key_views, config)
+    given = KeyViews.of(cameras, jnp.asarray(images), exposures)
+    progress, key_views = start_refinement(gaussians, given, config)
     for _ in continue_refinement(progress, key_views, steps, config):
         on_step(progress.num_steps, progress.losses[-1])
     return current_gaussians(progress.state), report_of(progress, key_views, config)
 
 
-def start_refinement(gaussians: Gaussians, key_views: KeyViews, config: RefineConfig | None = None) -> Progress:
-    """Refinement of `gaussians` before its first step."""
-    return Progress(init_refinement(gaussians, key_views, config), _capacity(gaussians, key_views))
+def start_refinement(
+    gaussians: Gaussians, key_views: KeyViews, config: RefineConfig | None = None
+) -> tuple[Progress, KeyViews]:
+    """Refinement of `gaussians` before its first step, and the key views to give to `continue_refinement`.
+
+    Views that cannot be learned from are no longer valid (`only_usable`).
+
+    Raises:
+        InputError: no view is left.
+    """
+    max_pairs = _capacity(gaussians, key_views)
+    usable = only_usable(gaussians, key_views, max_pairs)
+    return Progress(init_refinement(gaussians, usable, config), max_pairs), usable
 
 
 def continue_refinement(
@@ -147,7 +161,7 @@ def continue_refinement(
 
 def _steps_per_round(key_views: KeyViews, config: RefineConfig) -> int:
     """Steps in which every view is shown at least once."""
-    return -(-key_views.num_slots // config.views_per_step)
+    return -(-int(np.sum(np.asarray(key_views.valid))) // config.views_per_step)
 
 
 def report_of(progress: Progress, key_views: KeyViews, config: RefineConfig | None = None) -> Refinement:
@@ -159,6 +173,8 @@ def report_of(progress: Progress, key_views: KeyViews, config: RefineConfig | No
         held_back=progress.held_back,
         stopped_early=has_stopped_helping(progress.held_back, _steps_per_round(key_views, config or RefineConfig())),
         seconds_per_step=float(np.median(progress.seconds[1:])) if progress.num_steps > 1 else 0.0,
+        num_left_out=int(np.sum(~np.asarray(key_views.valid))),
+        key_views=revised_key_views(progress.state.views, key_views),
     )
 
 

@@ -1,5 +1,6 @@
 """Refinement of a stream's scene on the frames that were streamed."""
 
+import dataclasses
 from collections.abc import Callable, Sequence
 
 import jax
@@ -11,6 +12,7 @@ from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.errors import InputError
 from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.geometry.cameras import Camera
+from ssplat_jax.refinement.choose_effects import EffectsChoice, effects_by_name, with_effects
 from ssplat_jax.refinement.key_views import KeyViews
 from ssplat_jax.refinement.refine import Refinement, continue_refinement, report_of, start_refinement
 from ssplat_jax.refinement.refine_config import RefineConfig
@@ -19,6 +21,16 @@ from ssplat_jax.streaming.feed import Exposures
 
 MAX_KEY_VIEWS = 128
 """Most frames that are kept for refinement, evenly spread over the stream: their memory does not grow with it."""
+
+
+@dataclasses.dataclass(frozen=True)
+class CaptureRefinement:
+    """The refined scene of a stream."""
+
+    gaussians: Gaussians  # in the stream frame
+    exposures: Exposures  # factor per streamed frame; those of key views as the effects revised them
+    report: Refinement
+    choice: EffectsChoice  # effects that were on
 
 
 def refine_on_capture(
@@ -30,8 +42,9 @@ def refine_on_capture(
     *,
     steps: int,
     config: RefineConfig | None = None,
+    revise: Sequence[str] = (),
     on_step: Callable[[int, float], None] = lambda step, loss: None,
-) -> tuple[Gaussians, Refinement]:
+) -> CaptureRefinement:
     """The scene of a stream, revised on at most `MAX_KEY_VIEWS` of its own frames.
 
     Args:
@@ -42,23 +55,45 @@ def refine_on_capture(
         exposures: factor per streamed frame, as the stream estimated it.
         steps: most gradient steps.
         config: learning rates and bounds.
+        revise: names of the effects that are on besides those of `config`, or `("auto",)` for those that the residuals
+            call for.
         on_step: called with the number of steps done and the last loss.
 
-    Returns:
-        The revised scene, in the stream frame, and what was done.
-
     Raises:
-        InputError: `steps` is negative, or a frame was not streamed.
+        InputError: `steps` is negative, a frame was not streamed, or an effect is unknown.
     """
-    views = key_views_of(capture, indices, frame, exposures)
-    progress = start_refinement(gaussians, views, config)
+    given = key_views_of(capture, indices, frame, exposures)
+    choice = effects_by_name(revise, gaussians, given)
+    config = with_effects(config or RefineConfig(), choice)
+    progress, views = start_refinement(gaussians, given, config)
     for _ in continue_refinement(progress, views, steps, config):
         on_step(progress.num_steps, progress.losses[-1])
-    return current_gaussians(progress.state), report_of(progress, views, config)
+    report = report_of(progress, views, config)
+    return CaptureRefinement(
+        gaussians=current_gaussians(progress.state),
+        exposures=revised_exposures(exposures, indices, report.key_views),
+        report=report,
+        choice=choice,
+    )
+
+
+def revised_exposures(exposures: Exposures, indices: Sequence[int], key_views: KeyViews | None) -> Exposures:
+    """`exposures` with those of the valid key views, which are frames of `indices` as `key_frames` chooses them."""
+    if key_views is None:
+        return exposures
+    factors, valid = np.asarray(key_views.exposures), np.asarray(key_views.valid)
+    used = key_frames(indices)
+    return {**exposures, **{i: factors[slot] for slot, i in enumerate(used) if valid[slot]}}
+
+
+def key_frames(indices: Sequence[int]) -> list[int]:
+    """The streamed frames that become key views: at most `MAX_KEY_VIEWS`, evenly spread."""
+    places = np.linspace(0, len(indices) - 1, min(len(indices), MAX_KEY_VIEWS))
+    return [indices[i] for i in sorted({round(place) for place in places})]
 
 
 def key_views_of(capture: Capture, indices: Sequence[int], frame: StreamFrame, exposures: Exposures) -> KeyViews:
-    """At most `MAX_KEY_VIEWS` streamed frames of a capture, evenly spread.
+    """The streamed frames that `key_frames` chooses, with their cameras in the stream frame.
 
     Args:
         capture: where the images come from, at the size that is compared.
@@ -66,16 +101,12 @@ def key_views_of(capture: Capture, indices: Sequence[int], frame: StreamFrame, e
         frame: the similarity between the capture's frame and the stream's.
         exposures: factor per streamed frame, as the stream estimated it.
 
-    Returns:
-        The key views, their cameras in the stream frame.
-
     Raises:
         InputError: a frame was not streamed.
     """
     if missing := [i for i in indices if i not in exposures]:
         raise InputError(f"refine: wanted frames that were streamed, got frame {missing[0]}, which was not.")
-    places = np.linspace(0, len(indices) - 1, min(len(indices), MAX_KEY_VIEWS))
-    used = [indices[i] for i in sorted({round(place) for place in places})]
+    used = key_frames(indices)
     views = [capture.camera(i, frame) for i in used]
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *views)
     cameras = Camera(viewmats=stacked.viewmats, Ks=stacked.Ks, width=capture.width, height=capture.height)

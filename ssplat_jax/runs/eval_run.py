@@ -39,6 +39,7 @@ class EvalOptions:
     index: Path | None = None  # an index file, instead of protocol, stride, context and targets
     scene: str | None = None  # its scene; None for the name of the capture
     refine_steps: int = 0
+    revise: tuple[str, ...] = ()  # effects of the refinement
     lpips_weights: LpipsWeights | None = None
     display: Display = dataclasses.field(default_factory=Display)
 
@@ -105,6 +106,7 @@ def _evaluate(
         streamed=capture.scaled(options.scale),
         lpips_weights=options.lpips_weights,
         refine_steps=options.refine_steps,
+        revise=options.revise,
         scene=scene,
         display=options.display,
     )

@@ -1,10 +1,9 @@
 """`ssplat refine`: the scene of a finished run, revised on the frames that it was made from."""
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from ssplat_jax.checkpoint.saved_config import config_from_header
@@ -17,21 +16,19 @@ from ssplat_jax.errors import InputError, require_positive
 from ssplat_jax.evaluation.exposures import exposures_from_json
 from ssplat_jax.evaluation.scoring import score_targets
 from ssplat_jax.gaussians import Gaussians
-from ssplat_jax.refinement import KeyViews, RefineConfig, RefineState, current_gaussians
+from ssplat_jax.refinement import KeyViews, RefineConfig, current_gaussians
+from ssplat_jax.refinement.choose_effects import effects_by_name, with_effects
 from ssplat_jax.refinement.refine import Progress, continue_refinement, report_of, start_refinement
-from ssplat_jax.refinement.refine_capture import key_views_of
-from ssplat_jax.refinement.refine_step import Revision
+from ssplat_jax.refinement.refine_capture import key_views_of, revised_exposures
 from ssplat_jax.runs.finish_run import NUM_PICTURES, save_scene
+from ssplat_jax.runs.refinement_state import load_refinement, save_refinement
 from ssplat_jax.storage.folder_lock import lock_folder
 from ssplat_jax.storage.interrupts import Interrupts
 from ssplat_jax.storage.json_files import write_json
-from ssplat_jax.storage.npz import load_arrays, save_arrays
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.streaming.feed import Exposures
 from ssplat_jax.streaming.session import Session
 from ssplat_jax.streaming.streamsplat import StreamSplat
-
-KIND = "refinement state 1"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,7 +54,15 @@ class _Run:
 
 
 def refine_run(
-    run_dir: Path, path: str, params: dict, *, steps: int, save_every: int, overwrite: bool, reporter: Reporter
+    run_dir: Path,
+    path: str,
+    params: dict,
+    *,
+    steps: int,
+    revise: Sequence[str] = (),
+    save_every: int,
+    overwrite: bool,
+    reporter: Reporter,
 ) -> RefineResult:
     """Writes `refined.ply` beside the scene of a run, continuing a refinement that stopped. `scene.ply` stays.
 
@@ -66,6 +71,7 @@ def refine_run(
         path: the capture of that run, as `open_capture` takes it.
         params: parameters of the run's model.
         steps: most gradient steps, those of an earlier call included.
+        revise: effects of the refinement, see `refine_on_capture`.
         save_every: steps between saved states.
         overwrite: remove the refinement that the folder holds and start anew.
         reporter: shows progress and warnings.
@@ -75,24 +81,34 @@ def refine_run(
         StorageError: the folder cannot be written or a state is corrupt.
     """
     require_positive(steps=steps, save_every=save_every)
-    folder, config = RunFolder(run_dir), RefineConfig()
+    folder = RunFolder(run_dir)
     run = _open_run(folder, path, params, reporter)
-    identity = run.identity | {"steps": steps, "refine_config": dataclasses.asdict(config)}
     with lock_folder(run_dir):
         if overwrite:
             folder.clear_refinement()
-        key_views = key_views_of(run.capture, run.indices, run.frame, run.exposures)
-        progress = _load(folder, run.gaussians, key_views, identity)
+        given = key_views_of(run.capture, run.indices, run.frame, run.exposures)
+        choice = effects_by_name(revise, run.gaussians, given)
+        for reason in choice.reasons:
+            reporter.say(reason)
+        config = with_effects(RefineConfig(), choice)
+        identity = run.identity | {"steps": steps, "refine_config": dataclasses.asdict(config)}
+        if folder.refinement_state.exists():
+            progress, key_views = load_refinement(folder.refinement_state, run.gaussians, given, config, identity)
+        else:
+            progress, key_views = start_refinement(run.gaussians, given, config)
         stopped = _take_steps(progress, key_views, steps, config, save_every, identity, folder, reporter)
         if stopped:
             return RefineResult(progress.num_steps, {}, {}, stopped)
-        refined = current_gaussians(progress.state)
-        save_scene(folder.refined_scene, refined, run.frame, run.exposures)
+        refined, done = current_gaussians(progress.state), report_of(progress, key_views, config)
+        exposures = revised_exposures(run.exposures, run.indices, done.key_views)
+        save_scene(folder.refined_scene, refined, run.frame, exposures)
         shown = tuple(sorted({run.indices[round(i)] for i in np.linspace(0, len(run.indices) - 1, NUM_PICTURES)}))
         before, after = (
-            score_targets(scene, run.capture, shown, run.frame, run.exposures) for scene in (run.gaussians, refined)
+            score_targets(scene, run.capture, shown, run.frame, factors)
+            for scene, factors in ((run.gaussians, run.exposures), (refined, exposures))
         )
-        report = dataclasses.asdict(report_of(progress, key_views, config))
+        report = {name: value for name, value in vars(done).items() if name != "key_views"}
+        report |= {"revised": list(choice.effects.names), "reasons": list(choice.reasons)}
         write_json(folder.refinement, report | {"seen_views_before": before, "seen_views_after": after})
     return RefineResult(progress.num_steps, before, after, None)
 
@@ -151,46 +167,6 @@ def _take_steps(
             if stopped:
                 break
             if progress.num_steps % save_every == 0:
-                _save(folder, progress, identity)
-        _save(folder, progress, identity)
+                save_refinement(folder.refinement_state, progress, key_views, identity)
+        save_refinement(folder.refinement_state, progress, key_views, identity)
         return interrupts.received
-
-
-def _save(folder: RunFolder, progress: Progress, identity: dict) -> None:
-    """Saves a refinement, without the scene that it started from: the run has it."""
-    state = progress.state
-    arrays = {
-        f"{part}.{name}": np.asarray(leaf)
-        for part in ("revision", "first_moment", "second_moment")
-        for name, leaf in vars(getattr(state, part)).items()
-    }
-    arrays |= {name: np.asarray(getattr(state, name)) for name in ("num_steps", "num_skipped")}
-    measured = {name: getattr(progress, name) for name in ("max_pairs", "max_rows", "losses", "held_back", "seconds")}
-    save_arrays(folder.refinement_state, arrays, KIND, {"identity": identity, "measured": measured})
-
-
-def _load(folder: RunFolder, gaussians: Gaussians, key_views: KeyViews, identity: dict) -> Progress:
-    """The refinement that the folder holds, or a new one."""
-    if not folder.refinement_state.exists():
-        return start_refinement(gaussians, key_views)
-    arrays, header = load_arrays(folder.refinement_state, KIND)
-    for name, wanted in identity.items():
-        if header["identity"].get(name) != wanted:
-            raise InputError(
-                f"{folder.refinement_state}: holds a refinement that differs in its {name}; repeat the old options, or"
-                " start anew with --overwrite."
-            )
-    parts: dict[str, dict] = {"revision": {}, "first_moment": {}, "second_moment": {}}
-    for name, array in arrays.items():
-        part, _, field = name.partition(".")
-        if field:
-            parts[part][field] = jnp.asarray(array)
-    state = RefineState(
-        start=jax.tree.map(jnp.copy, gaussians),  # a step consumes its state
-        revision=Revision(**parts["revision"]),
-        first_moment=Revision(**parts["first_moment"]),
-        second_moment=Revision(**parts["second_moment"]),
-        num_steps=jnp.asarray(arrays["num_steps"]),
-        num_skipped=jnp.asarray(arrays["num_skipped"]),
-    )
-    return Progress(state, **header["measured"])

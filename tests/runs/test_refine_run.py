@@ -20,10 +20,11 @@ CAPTURE = "procedural:room?frames=4"
 REFINED = ("refined.ply", "refinement.json", "refinement.npz")
 
 
-def refine(path, steps=4, capture=CAPTURE, overwrite=False):
+def refine(path, steps=4, capture=CAPTURE, overwrite=False, revise=()):
     reporter = Reporter(quiet=True)
     params = load_params("tiny")
-    return refine_run(path, capture, params, steps=steps, save_every=2, overwrite=overwrite, reporter=reporter)
+    options = {"steps": steps, "revise": revise, "save_every": 2, "overwrite": overwrite}
+    return refine_run(path, capture, params, **options, reporter=reporter)
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +49,8 @@ def finished(tmp_path_factory):
 def test_a_stopped_refinement_continues_to_the_same_bytes(finished, monkeypatch):
     folder = RunFolder(finished)
     streamed = folder.scene.read_bytes()
-    result = refine(finished, overwrite=True)
+    revise = ("poses", "exposures")
+    result = refine(finished, overwrite=True, revise=revise)
     whole = folder.refined_scene.read_bytes()
     assert result.num_steps == 4 and result.interrupted is None
     assert result.after["shown"]["psnr"] > result.before["shown"]["psnr"]
@@ -63,15 +65,16 @@ def test_a_stopped_refinement_continues_to_the_same_bytes(finished, monkeypatch)
 
     monkeypatch.setattr(module, "continue_refinement", stopped_after_one)
     for taken in (1, 2):
-        result = refine(finished)
+        result = refine(finished, revise=revise)
         assert (result.num_steps, result.interrupted) == (taken, signal.SIGINT)
         assert not folder.refined_scene.exists()
     monkeypatch.undo()
-    refine(finished)
+    refine(finished, revise=revise)
     assert folder.refined_scene.read_bytes() == whole
     assert folder.scene.read_bytes() == streamed != whole
     report = json.loads(folder.refinement.read_text())
     assert report["num_steps"] == len(report["losses"]) == 4
+    assert report["revised"] == ["poses", "exposures"] and report["num_left_out"] == 0
     assert len(read_ply(folder.refined_scene).gaussians.means) == len(read_ply(folder.scene).gaussians.means)
 
 
@@ -79,6 +82,8 @@ def test_a_refinement_with_other_steps_is_refused(finished):
     refine(finished, steps=2, overwrite=True)
     with pytest.raises(InputError, match="differs in its steps"):
         refine(finished, steps=3)
+    with pytest.raises(InputError, match="differs in its refine_config"):
+        refine(finished, steps=2, revise=("focal",))
 
 
 def test_another_capture_than_the_runs_is_refused(finished):

@@ -1,0 +1,96 @@
+"""State of a refinement as a file: all that the next step depends on besides the run and its capture."""
+
+import dataclasses
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ssplat_jax.errors import InputError
+from ssplat_jax.gaussians import Gaussians
+from ssplat_jax.pytree import replace
+from ssplat_jax.refinement import KeyViews, RefineConfig, RefineState
+from ssplat_jax.refinement.refine import Progress
+from ssplat_jax.refinement.refine_step import Revision, init_refinement
+from ssplat_jax.storage.npz import load_arrays, save_arrays
+
+KIND = "refinement state 1"
+MOVING = ("revision", "first_moment", "second_moment")
+
+
+def save_refinement(path: Path, progress: Progress, key_views: KeyViews, identity: dict) -> None:
+    """Saves a refinement, without the scene that it started from and without images: the run and its capture have them.
+
+    Args:
+        path: the file.
+        progress: the refinement between two steps.
+        key_views: its key views, of which only the mask of the valid ones is saved.
+        identity: facts that must be equal for it to be continued.
+    """
+    state = progress.state
+    arrays = {
+        f"{part}.{name}": np.asarray(leaf) for part in MOVING for name, leaf in vars(getattr(state, part)).items()
+    }
+    if state.views is not None:
+        arrays |= {f"views.{name}": np.asarray(getattr(state.views, name)) for name in ("num_shown", "depths")}
+        arrays |= {
+            f"views.{part}.{name}": np.asarray(leaf)
+            for part in MOVING
+            for name, leaf in vars(getattr(state.views, part)).items()
+            if leaf is not None
+        }
+    arrays |= {name: np.asarray(getattr(state, name)) for name in ("num_steps", "num_skipped")}
+    arrays["valid"] = np.asarray(key_views.valid)
+    measured = {name: getattr(progress, name) for name in ("max_pairs", "max_rows", "losses", "held_back", "seconds")}
+    save_arrays(path, arrays, KIND, {"identity": identity, "measured": measured})
+
+
+def load_refinement(
+    path: Path, gaussians: Gaussians, key_views: KeyViews, config: RefineConfig, identity: dict
+) -> tuple[Progress, KeyViews]:
+    """The refinement of `gaussians` that a file holds, and its key views.
+
+    Args:
+        path: the file.
+        gaussians: the scene that it started from.
+        key_views: the key views of the run, as given.
+        config: its configuration.
+        identity: facts that the file must agree with.
+
+    Raises:
+        InputError: the file holds the refinement of another run, or one with other options.
+        StorageError: the file is damaged.
+    """
+    arrays, header = load_arrays(path, KIND)
+    held = dict(header["identity"])
+    # Fields that are newer than the file had no effect when it was written, as by default today.
+    held["refine_config"] = dataclasses.asdict(RefineConfig()) | held.get("refine_config", {})
+    for name, wanted in identity.items():
+        if held.get(name) != wanted:
+            raise InputError(
+                f"{path}: holds a refinement that differs in its {name}; repeat the old options, or start anew with"
+                " --overwrite."
+            )
+    if "valid" in arrays:  # saved before views could be left out: all are valid
+        key_views = replace(key_views, valid=jnp.asarray(arrays["valid"]))
+    fresh = init_refinement(gaussians, key_views, config)
+    views = fresh.views
+    if views is not None:
+        taken = lambda part: replace(getattr(views, part), **_below(arrays, f"views.{part}."))  # noqa: E731
+        counts = {name: jnp.asarray(arrays[f"views.{name}"]) for name in ("num_shown", "depths")}
+        views = replace(views, **{part: taken(part) for part in MOVING}, **counts)
+    state = RefineState(
+        start=jax.tree.map(jnp.copy, gaussians),  # a step consumes its state
+        **{part: Revision(**_below(arrays, f"{part}.")) for part in MOVING},
+        num_steps=jnp.asarray(arrays["num_steps"]),
+        num_skipped=jnp.asarray(arrays["num_skipped"]),
+        views=views,
+    )
+    return Progress(state, **header["measured"]), key_views
+
+
+def _below(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, jax.Array]:
+    """Arrays whose name begins with `prefix`, without it."""
+    found = {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
+    return {name: jnp.asarray(array) for name, array in found.items() if "." not in name}
