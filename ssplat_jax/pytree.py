@@ -19,9 +19,12 @@ def pytree(cls: type[T]) -> type[T]:
 
     Fields are leaves in declaration order, except those declared with `static()`. Building an instance by hand runs
     `__init__`, and with it the type checks that the tests switch on. Transforms bypass it, because they put tracers,
-    `None`, shardings and batched arrays where arrays are annotated.
+    `None`, shardings and batched arrays where arrays are annotated. Printed, an array is its dtype and shape.
     """
-    cls = dataclasses.dataclass(frozen=True)(cls)
+    has_own = "__repr__" in vars(cls)
+    cls = dataclasses.dataclass(frozen=True, repr=False)(cls)
+    if not has_own:
+        cls.__repr__ = _summary
     fields = dataclasses.fields(cls)  # pyright: ignore[reportArgumentType]
     leaf_names = [f.name for f in fields if not f.metadata.get("static")]
     static_names = [f.name for f in fields if f.metadata.get("static")]
@@ -41,6 +44,16 @@ def pytree(cls: type[T]) -> type[T]:
 
     jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
     return cls
+
+
+def _summary(x: Any) -> str:
+    """The fields of a dataclass; arrays by dtype and shape, since those of a scene are too long to print."""
+    parts = []
+    for field in dataclasses.fields(x):
+        value = getattr(x, field.name)
+        is_array = hasattr(value, "shape") and hasattr(value, "dtype")
+        parts.append(f"{field.name}={f'{value.dtype}{list(value.shape)}' if is_array else repr(value)}")
+    return f"{type(x).__name__}({', '.join(parts)})"
 
 
 def replace(x: T, **changes: Any) -> T:

@@ -8,6 +8,9 @@ import numpy as np
 import pytest
 from jaxtyping import Array, Float, TypeCheckError
 
+from ssplat_jax.cache import init_cache
+from ssplat_jax.config import preset
+from ssplat_jax.data.capture import open_capture
 from ssplat_jax.gaussians import Gaussians, mask_gaussians
 from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.pytree import pytree, replace, static
@@ -102,3 +105,13 @@ def test_masked_gaussians_are_absent_and_harmless():
     assert np.isfinite(masked.means).all() and np.isfinite(masked.scales[1:]).all()
     np.testing.assert_array_equal(masked.quats[1:], [[1, 0, 0, 0]] * 2)
     assert np.isinf(masked.scales[0]).all()  # what is kept is kept as it is
+
+
+def test_printed_arrays_are_dtype_and_shape():
+    camera = Camera(viewmats=jnp.eye(4), Ks=jnp.eye(3), width=8, height=6)
+    assert repr(camera) == "Camera(viewmats=float32[4, 4], Ks=float32[3, 3], width=8, height=6)"
+    assert repr(jax.tree.map(lambda x: None, camera)) == "Camera(viewmats=None, Ks=None, width=8, height=6)"
+    cache = repr(init_cache(preset("tiny").replace(capacity=128)))
+    assert len(cache) < 1200 and "stats=CacheStats(" in cache
+    capture = open_capture("procedural:room?frames=2&size=32x24")
+    assert repr(capture) == "Capture('procedural-room', procedural, 2 frames of 32x24)"

@@ -84,6 +84,10 @@ class Capture:
     notes: tuple[str, ...] = ()  # messages of the reader for the user
     convention: Convention = USUAL  # of the poses in the files
 
+    def __repr__(self) -> str:
+        """Name, format, and number and size of the images; poses and pixels are too long to print."""
+        return f"Capture({self.name!r}, {self.format}, {len(self)} frames of {self.width}x{self.height})"
+
     def __len__(self) -> int:
         return len(self.frames)
 
