@@ -156,10 +156,8 @@ PAPER = StreamConfig(
 )
 """The paper to the letter, with ReSplat's network; docs/algorithm.md lists every field."""
 
-SMALL = PAPER.replace(
-    preset="small", depth_readout="mean", scene_scale="auto", causal=False, overflow="grow", capacity=1 << 15
-)
-"""The paper's method for captures of any scale and length, with depth read as the published networks read it."""
+SMALL = PAPER.replace(preset="small", depth_readout="mean", causal=False, overflow="grow", capacity=1 << 15)
+"""The paper's method for captures of any length, with depth read as the published networks read it."""
 
 PRESETS: dict[str, StreamConfig] = {
     "tiny": StreamConfig(),
