@@ -24,7 +24,7 @@ def pytree(cls: type[T]) -> type[T]:
     has_own = "__repr__" in vars(cls)
     cls = dataclasses.dataclass(frozen=True, repr=False)(cls)
     if not has_own:
-        cls.__repr__ = _summary
+        setattr(cls, "__repr__", _summary)  # noqa: B010 - the types of the two differ in the name of their argument
     fields = dataclasses.fields(cls)  # pyright: ignore[reportArgumentType]
     leaf_names = [f.name for f in fields if not f.metadata.get("static")]
     static_names = [f.name for f in fields if f.metadata.get("static")]
