@@ -94,7 +94,9 @@ def render(
         raise InputError(f"render: max_pairs must be a whole number of at least 1, got {echo(max_pairs)}.")
     if not (_is_whole(tile) and tile in TILES):
         raise InputError(f"render: tile must be 8 or 16 pixels, got {echo(tile)}.")
-    is_concrete = max_pairs is None and not any(isinstance(x, Tracer) for x in jax.tree.leaves(inputs))
+    # Inside jit every result is traced, even that of arrays which the function closes over.
+    arrays = (*jax.tree.leaves(inputs), jnp.zeros(()))
+    is_concrete = max_pairs is None and not any(isinstance(x, Tracer) for x in arrays)
     # Views of one scene need about the same capacity: a pass that only counts costs a third of a render.
     known = (inputs.gaussians.num_gaussians, camera.viewmats.shape, camera.width, camera.height, tile)
     if is_concrete and known in _CAPACITIES:

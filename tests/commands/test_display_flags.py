@@ -78,7 +78,7 @@ def constants(gaussians):
 
 def test_a_viewed_file_is_shown_at_the_exposure_asked_for(finished):
     out, *_ = finished
-    middle, first = (open_source(out / "scene.ply", one_exposure=one).changed() for one in (False, True))
+    middle, first = (open_source(out / "scene.ply", one_exposure=one).changed().gaussians for one in (False, True))
     np.testing.assert_allclose(constants(first) * MIDDLE, constants(middle), rtol=1e-4, atol=1e-5)
 
 
@@ -89,6 +89,6 @@ def test_followed_deltas_are_those_of_the_cache(finished):
     model, params = StreamSplat(NARROW), StreamSplat(NARROW).init(jax.random.key(0))
     params = jax.tree.map(lambda x: x.astype(jnp.float16).astype(jnp.float32), params)
     wanted = StreamFrame.from_dict(header["frame"]).gaussians_to_capture(model.decode(params, cache))
-    shown = open_source(out, one_exposure=True).changed()
+    shown = open_source(out, one_exposure=True).changed().gaussians
     colors = [constants(jax.tree.map(lambda x, g=g: x[np.asarray(g.opacities) > 0], g)) for g in (shown, wanted)]
     np.testing.assert_allclose(*colors, atol=LEVEL / 100)
