@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from ssplat_jax.rasterizer import RenderOutput as RenderOutput
     from ssplat_jax.rasterizer import fill_holes as fill_holes
     from ssplat_jax.rasterizer import render as render
+    from ssplat_jax.refinement import online_refinement as online_refinement
     from ssplat_jax.refinement import refine as refine
     from ssplat_jax.scene_files.formats import load_scene as load_scene
     from ssplat_jax.scene_files.ply import load_ply as load_ply
@@ -60,6 +61,7 @@ _MODULES = {
     "load_params": "checkpoint.weights",
     "load_ply": "scene_files.ply",
     "load_scene": "scene_files.formats",
+    "online_refinement": "refinement",
     "open_capture": "data.capture",
     "preset": "config",
     "refine": "refinement",

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Int
 
 from ssplat_jax.cache.hash_table import build_table
-from ssplat_jax.cache.state import PIVOT_FIELDS, VoxelCache
+from ssplat_jax.cache.state import VoxelCache, pivot_fields
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.errors import CacheError, InputError
 from ssplat_jax.pytree import replace
@@ -66,7 +66,7 @@ def grow(cache: VoxelCache, capacity: int) -> VoxelCache:
         raise InputError(f"cache: capacity must be a power of two of at least {cache.capacity}, got {capacity}.")
     fields = {
         name: jnp.pad(x, [(0, extra)] + [(0, 0)] * (x.ndim - 1))
-        for name in ("voxels", "counts", *PIVOT_FIELDS)
+        for name in ("voxels", "counts", *pivot_fields(cache))
         for x in (getattr(cache, name),)
     }
     # With vacc="append" the table is empty: rows have no voxel of their own to be entered by.
@@ -132,5 +132,5 @@ def evict(
     victims = jax.lax.cond(num_needed > 0, rank, lambda: jnp.full((m,), -1, jnp.int32))
     places = jnp.where(victims < 0, capacity, victims)
     num_lost = jnp.sum(jnp.where(victims < 0, 0, cache.counts[victims]), dtype=jnp.int32)
-    emptied = {name: getattr(cache, name).at[places].set(0, mode="drop") for name in ("counts", *PIVOT_FIELDS)}
+    emptied = {name: getattr(cache, name).at[places].set(0, mode="drop") for name in ("counts", *pivot_fields(cache))}
     return replace(cache, **emptied), victims, num_lost

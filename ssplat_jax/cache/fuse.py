@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Int
 
 from ssplat_jax.cache.capacity import evict
 from ssplat_jax.cache.hash_table import build_table, find_rows, group_equal, insert_rows, shards_of
-from ssplat_jax.cache.state import PIVOT_FIELDS, CacheStats, Tokens, VoxelCache, saturating_add
+from ssplat_jax.cache.state import PIVOT_FIELDS, CacheStats, Tokens, VoxelCache, pivot_fields, saturating_add
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.geometry.voxels import voxel_indices
 from ssplat_jax.pytree import pytree, replace
@@ -63,6 +63,7 @@ def fuse(cache: VoxelCache, tokens: Tokens, config: StreamConfig, *, axis: str |
         `num_chunks`, which every shard counts.
 
     Limits:
+        A new pivot has residuals of 0; those of merged pivots are averaged with the weights of their means.
         Feature norms in [1e-9, 1e9]: outside, and for zero features, a pair counts as orthogonal.
         Two members of confidence 0 are averaged with equal weights.
         A merged mean lies between its members, to the last bit, and so in their voxel.
@@ -83,7 +84,7 @@ def _insert(cache: VoxelCache, tokens: Tokens, config: StreamConfig) -> tuple[Vo
     stats, voxels, accepted = _classify(cache.stats, tokens, config)
     place = {"voxel": _place_in_voxels, "append": _place_at_end}[config.memory.vacc]
     cache, plan, num_evicted = place(cache, voxels, accepted, config)
-    pivots = {name: getattr(cache, name) for name in PIVOT_FIELDS}
+    pivots = {name: getattr(cache, name) for name in pivot_fields(cache)}
     new = _new_pivots(tokens, cache)
     appends = jnp.where(plan.slots < config.memory.pivots_per_voxel, plan.rows, -1)
     counts = cache.counts.at[_drop_negative(appends, cache.capacity)].max(plan.slots + 1, mode="drop")
@@ -199,6 +200,8 @@ def _new_pivots(tokens: Tokens, cache: VoxelCache) -> dict[str, Array]:
         "num_members": jnp.ones((m,), jnp.int32),
         "last_chunks": jnp.broadcast_to(cache.stats.num_chunks, (m,)),
     }
+    if cache.residuals is not None:
+        values["residuals"] = jnp.zeros((m, cache.residuals.shape[-1]))
     return {name: x.astype(getattr(cache, name).dtype) for name, x in values.items()}
 
 
@@ -287,7 +290,7 @@ def _merge_pair(older: dict[str, Array], newer: dict[str, Array], config: Stream
         a, b = older[name].astype(jnp.float32), newer[name].astype(jnp.float32)
         return jnp.clip(a + share[:, None] * (b - a), jnp.minimum(a, b), jnp.maximum(a, b))
 
-    merged = {name: average(name) for name in ("means", "feats", "rgbs")}
+    merged = {name: average(name) for name in ("means", "feats", "rgbs", "residuals") if name in older}
     best = ("seeds", "confidences", "quats", "footprints")
     merged |= {name: _select(newer_is_best, newer[name], older[name]) for name in best}
     return merged | {

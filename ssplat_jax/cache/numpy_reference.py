@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from ssplat_jax.cache.state import PIVOT_FIELDS, VoxelCache
+from ssplat_jax.cache.state import VoxelCache, pivot_fields
 from ssplat_jax.config import StreamConfig
 
 INDEX_LIMIT = 1 << 20  # voxel indices are below it in magnitude
@@ -42,7 +42,10 @@ def fuse(cache: dict, tokens: dict, config: StreamConfig) -> dict:
         elif voxel is None:
             stats["num_out_of_range"] += 1
         else:
-            accepted.append((voxel, pivot | {"seeds": pivot["feats"], "num_members": 1, "last_chunks": chunk}))
+            pivot |= {"seeds": pivot["feats"], "num_members": 1, "last_chunks": chunk}
+            if config.refine.steps_per_chunk:
+                pivot["residuals"] = np.zeros(14 * config.head.gaussians_per_token)
+            accepted.append((voxel, pivot))
     if config.memory.vacc == "append":
         _append_all(cache, accepted, config)
     else:
@@ -52,7 +55,7 @@ def fuse(cache: dict, tokens: dict, config: StreamConfig) -> dict:
 
 def from_arrays(cache: VoxelCache) -> dict:
     """A `VoxelCache` in the form of this module, without its counters."""
-    arrays = {name: np.asarray(getattr(cache, name)) for name in PIVOT_FIELDS}
+    arrays = {name: np.asarray(getattr(cache, name)) for name in pivot_fields(cache)}
     counts = np.asarray(cache.counts)
     pivots = [
         [{name: x[row, k].astype(np.float64) for name, x in arrays.items()} for k in range(counts[row])]
@@ -153,7 +156,8 @@ def merge(older: dict, newer: dict, config: StreamConfig) -> dict:
         weights = [0.5, 0.5]
     mean = {
         name: (weights[0] * older[name] + weights[1] * newer[name]) / sum(weights)
-        for name in ("means", "feats", "rgbs")
+        for name in ("means", "feats", "rgbs", "residuals")
+        if name in older
     }
     kept = {name: best[name] for name in ("seeds", "confidences", "quats", "footprints")}
     return (

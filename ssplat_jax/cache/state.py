@@ -4,9 +4,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ssplat_jax.cache.hash_table import SLOTS_PER_ROW
+from ssplat_jax.cache.key_views import KeyViews, empty_key_views
+from ssplat_jax.cache.residuals import empty_residuals
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.errors import InputError
-from ssplat_jax.pytree import pytree
+from ssplat_jax.pytree import pytree, replace
 
 
 def saturating_add(counter: Int[Array, ""], more: Int[Array, ""]) -> Int[Array, ""]:
@@ -72,6 +74,9 @@ class VoxelCache:
     last_chunks: Int[Array, "capacity k"]  # chunk that last wrote the pivot
     witnesses: Witnesses
     stats: CacheStats
+    # Of refinement while streaming (`config.refine`); None without it, so that the program has no trace of them.
+    residuals: Float[Array, "capacity k r"] | None = None  # changes to each of the pivot's Gaussians (residuals.py)
+    key_views: KeyViews | None = None  # views that the scene is compared with; None before the first chunk
 
     @property
     def alive(self) -> Bool[Array, "capacity k"]:
@@ -95,7 +100,12 @@ PIVOT_FIELDS = (
     "num_members",
     "last_chunks",
 )
-"""Fields of `VoxelCache` with one entry per pivot, `[capacity, k, ...]`."""
+"""Fields of every `VoxelCache` with one entry per pivot, `[capacity, k, ...]`."""
+
+
+def pivot_fields(cache: VoxelCache) -> tuple[str, ...]:
+    """Names of the pivot fields that `cache` has: `PIVOT_FIELDS`, and `residuals` where they are kept."""
+    return PIVOT_FIELDS if cache.residuals is None else (*PIVOT_FIELDS, "residuals")
 
 
 @pytree
@@ -167,4 +177,23 @@ def init_cache(config: StreamConfig, capacity: int | None = None) -> VoxelCache:
         last_chunks=jnp.zeros((capacity, k), jnp.int32),
         witnesses=init_witnesses(config),
         stats=CacheStats(*(zero() for _ in range(9))),
+        residuals=empty_residuals(capacity, config) if config.refine.steps_per_chunk else None,
     )
+
+
+def with_refinement(cache: VoxelCache, config: StreamConfig, height: int, width: int) -> VoxelCache:
+    """`cache` with residuals and empty key views for images of one size, where it has none yet.
+
+    Raises:
+        InputError: it has key views of another size or number.
+    """
+    slots = (config.refine.num_key_views, height, width, 3)
+    residuals, key_views = cache.residuals, cache.key_views
+    if residuals is None:
+        residuals = empty_residuals(cache.capacity, config)
+    if key_views is None:
+        key_views = empty_key_views(*slots[:3])
+    if key_views.images.shape != slots:
+        wanted, got = "x".join(map(str, key_views.images.shape)), "x".join(map(str, slots))
+        raise InputError(f"cache: wanted key views of {wanted} as before, got {got}; keep size and num_key_views.")
+    return replace(cache, residuals=residuals, key_views=key_views)

@@ -12,13 +12,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ssplat_jax.cache.key_views import KeyViews
 from ssplat_jax.cache.state import PIVOT_FIELDS, CacheStats, VoxelCache, Witnesses, require_single_cache
 from ssplat_jax.errors import StorageError
 from ssplat_jax.storage.atomic import previous_path
 from ssplat_jax.storage.npz import load_arrays, save_arrays
 
 KIND = "stream state 3"  # version 2 added witnesses; version 3 colors per part of a patch, at one exposure
-_ROW_FIELDS = ("voxels", "counts", *PIVOT_FIELDS)  # arrays with one row per voxel
+_ROW_FIELDS = ("voxels", "counts", *PIVOT_FIELDS, "residuals")  # arrays with one row per voxel
+
+_GROUPS = {"stats": CacheStats, "witnesses": Witnesses, "key_views": KeyViews}  # parts with fields of their own
 
 
 def save_state(path: Path, cache: VoxelCache, header: dict[str, Any]) -> None:
@@ -92,14 +95,13 @@ def _leaves(cache: VoxelCache) -> dict[str, np.ndarray]:
 
 def _build(leaves: dict[str, np.ndarray], capacity: int) -> VoxelCache:
     """Cache of the leaves by path, row arrays padded with zeros to `capacity`."""
-    fields: dict[str, Any] = {"stats": {}, "witnesses": {}}
+    fields: dict[str, Any] = {}
+    groups: dict[str, dict[str, Any]] = {}
     for name, leaf in leaves.items():
         if name in _ROW_FIELDS:
             full = np.zeros((capacity, *leaf.shape[1:]), leaf.dtype)
             full[: len(leaf)] = leaf
             leaf = full
         *owner, field = name.split(".")
-        (fields[owner[0]] if owner else fields)[field] = jnp.asarray(leaf)
-    return VoxelCache(
-        **fields | {"stats": CacheStats(**fields["stats"]), "witnesses": Witnesses(**fields["witnesses"])}
-    )
+        (groups.setdefault(owner[0], {}) if owner else fields)[field] = jnp.asarray(leaf)
+    return VoxelCache(**fields, **{name: _GROUPS[name](**leaves) for name, leaves in groups.items()})

@@ -19,6 +19,7 @@ from ssplat_jax.commands.options import (
     check_refinement,
     load_lpips_weights,
     load_model,
+    online_changes,
     parse_size,
 )
 from ssplat_jax.config import QUALITIES
@@ -55,6 +56,8 @@ class Eval:
     refine: int = 0
     """Gradient steps on the context views after the stream; the scores before are reported too."""
     revise: ReviseOption = ()
+    online_refine: int = 0
+    """Gradient steps on kept views after each chunk, while streaming; later chunks see the revised scene."""
     over_black: bool = False
     """Pictures show holes black instead of in the colors around them."""
     one_exposure: bool = False
@@ -77,7 +80,8 @@ class Eval:
 
         check_refinement(self.refine, self.revise, "--refine")
         lpips_weights = load_lpips_weights(self.lpips_vgg, self.lpips_heads)
-        model, params = load_model(self.weights, causal_changes(self.set, self.causal))
+        changes = online_changes(causal_changes(self.set, self.causal), self.online_refine)
+        model, params = load_model(self.weights, changes)
         options = EvalOptions(
             size=parse_size(self.size),
             scale=QUALITIES[self.quality].scale,

@@ -99,6 +99,17 @@ def causal_changes(changes: tuple[str, ...], causal: bool) -> tuple[str, ...]:
     return (*changes, "stream.causal=true") if causal else changes
 
 
+def online_changes(changes: tuple[str, ...], steps: int) -> tuple[str, ...]:
+    """Changes to the configuration, with those of --online-refine.
+
+    Raises:
+        InputError: `steps` is negative.
+    """
+    if steps < 0:
+        raise InputError(f"--online-refine: wanted a number of steps of at least 0, got {steps}.")
+    return (*changes, f"refine.steps_per_chunk={steps}") if steps else changes
+
+
 def load_model(weights: str, changes: tuple[str, ...]):
     """(model, params) of a preset's shipped weights, or of a weights file.
 

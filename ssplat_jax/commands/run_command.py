@@ -19,6 +19,7 @@ from ssplat_jax.commands.options import (
     causal_changes,
     check_refinement,
     load_model,
+    online_changes,
     parse_size,
 )
 from ssplat_jax.commands.refine_command import Refine
@@ -66,6 +67,8 @@ class Run:
     refine: int = 0
     """Then take this many gradient steps on the streamed frames, as `ssplat refine` does, into refined.ply."""
     revise: ReviseOption = ()
+    online_refine: int = 0
+    """Gradient steps on kept views after each chunk, while streaming; later chunks see the revised scene."""
     causal: bool = False
     """No look-ahead: near, far and scale come from the first chunk, and frames keep their order."""
     watch: bool = False
@@ -160,7 +163,8 @@ class Run:
             point = setting_for_run(self.budget_ms, path, size, self.out, overwrite=self.overwrite, reporter=reporter)
             scale = point.factor
             changes = tuple(f"{name}={json.dumps(value)}" for name, value in point.changes.items())
-        model, params = load_model(self.weights, causal_changes((*changes, *self.set), self.causal))
+        changes = online_changes((*changes, *self.set), self.online_refine)
+        model, params = load_model(self.weights, causal_changes(changes, self.causal))
         return run_capture(
             model,
             params,
@@ -182,7 +186,8 @@ class Run:
         from ssplat_jax.console import Reporter
         from ssplat_jax.runs.watch_run import WatchOptions, watch_capture
 
-        model, params = load_model(self.weights, causal_changes(self.set, True))
+        changes = online_changes(self.set, self.online_refine)
+        model, params = load_model(self.weights, causal_changes(changes, True))
         options = WatchOptions(
             size=parse_size(self.size),
             scale=QUALITIES[self.quality].scale,

@@ -5,7 +5,14 @@ follow the paper exactly, "ours" those that it does not have. This module does n
 answers at once.
 """
 
-from ssplat_jax.config.field_groups import DepthConfig, HeadConfig, HistoryConfig, MemoryConfig, StreamingConfig
+from ssplat_jax.config.field_groups import (
+    DepthConfig,
+    HeadConfig,
+    HistoryConfig,
+    MemoryConfig,
+    OnlineRefineConfig,
+    StreamingConfig,
+)
 from ssplat_jax.config.network_configs import NETWORK_CONFIGS, CompactConfig, ResplatConfig, network_config
 from ssplat_jax.config.stream_config import PRESETS, QUALITIES, Quality, StreamConfig, preset
 
@@ -18,6 +25,7 @@ __all__ = [
     "HeadConfig",
     "HistoryConfig",
     "MemoryConfig",
+    "OnlineRefineConfig",
     "Quality",
     "ResplatConfig",
     "StreamConfig",

@@ -164,3 +164,23 @@ class HeadConfig(ConfigGroup):
             ("max_scale", "positive", is_positive(self.max_scale)),
             ("sh_degree", "0 to 3", 0 <= self.sh_degree <= 3),
         )
+
+
+@dataclasses.dataclass(frozen=True)
+class OnlineRefineConfig(ConfigGroup):
+    """Refinement while streaming: gradient steps on key views after each chunk (ours)."""
+
+    steps_per_chunk: int = 0
+    """Key views that revise the scene after each chunk, one a step; 0 leaves no trace in any program."""
+    num_key_views: int = 64
+    """Views that are kept to compare the scene with; of more, the one most like another leaves."""
+    pivots_per_cell: int = 12
+    """Pivots that are revised after a chunk, as a multiple of the grid cells of a view: the nearest before the key
+    views. It fixes time and memory of the steps."""
+
+    def rules(self) -> tuple[tuple[str, str, bool], ...]:
+        return (
+            ("steps_per_chunk", "not negative", self.steps_per_chunk >= 0),
+            ("num_key_views", "at least 1", self.num_key_views >= 1),
+            ("pivots_per_cell", "at least 1", self.pivots_per_cell >= 1),
+        )

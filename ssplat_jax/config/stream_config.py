@@ -6,7 +6,14 @@ import json
 import math
 from typing import Any
 
-from ssplat_jax.config.field_groups import DepthConfig, HeadConfig, HistoryConfig, MemoryConfig, StreamingConfig
+from ssplat_jax.config.field_groups import (
+    DepthConfig,
+    HeadConfig,
+    HistoryConfig,
+    MemoryConfig,
+    OnlineRefineConfig,
+    StreamingConfig,
+)
 from ssplat_jax.config.network_configs import NETWORK_CONFIGS, CompactConfig, ResplatConfig, network_config
 from ssplat_jax.errors import InputError
 
@@ -33,6 +40,7 @@ class StreamConfig:
     memory: MemoryConfig = dataclasses.field(default_factory=MemoryConfig)
     head: HeadConfig = dataclasses.field(default_factory=HeadConfig)
     stream: StreamingConfig = dataclasses.field(default_factory=StreamingConfig)
+    refine: OnlineRefineConfig = dataclasses.field(default_factory=OnlineRefineConfig)
 
     def replace(self, **changes: Any) -> "StreamConfig":
         """Copy with changed values.

@@ -91,6 +91,7 @@ def evaluate(
         "compile_s": round(session.compile_seconds, 2),
         "compilations": session.num_compilations,
         "step_memory_bytes": session.step_memory_bytes,
+        "refine_memory_bytes": session.refine_memory_bytes,  # None without refinement while streaming
         "cache": (facts := session.cache_facts()),
         "num_gaussians": facts["decoded"],
     }

@@ -5,9 +5,10 @@
 `refine` is the loop on the host; `refine_step` is one step as a pure function, `lax.scan`-able.
 """
 
+from ssplat_jax.cache.key_views import KeyViews as KeyViews
 from ssplat_jax.refinement.choose_effects import EffectsChoice as EffectsChoice
 from ssplat_jax.refinement.choose_effects import refine_effects_for as refine_effects_for
-from ssplat_jax.refinement.key_views import KeyViews as KeyViews
+from ssplat_jax.refinement.online import online_refinement as online_refinement
 from ssplat_jax.refinement.refine import Refinement as Refinement
 from ssplat_jax.refinement.refine import refine as refine
 from ssplat_jax.refinement.refine_capture import CaptureRefinement as CaptureRefinement

@@ -10,12 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from ssplat_jax.cache.key_views import KeyViews
 from ssplat_jax.errors import InputError
 from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.rasterizer import render
 from ssplat_jax.rasterizer.render import round_up
-from ssplat_jax.refinement.key_views import KeyViews
 from ssplat_jax.refinement.refine_config import RefineConfig
 from ssplat_jax.refinement.refine_step import (
     EFFECTS,

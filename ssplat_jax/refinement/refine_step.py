@@ -4,11 +4,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from ssplat_jax.cache.key_views import KeyViews
 from ssplat_jax.errors import InputError
 from ssplat_jax.gaussians import SH_C0, Gaussians, mean_color
 from ssplat_jax.pytree import pytree, replace
 from ssplat_jax.rasterizer import Effects, fill_holes, render
-from ssplat_jax.refinement.key_views import KeyViews
 from ssplat_jax.refinement.refine_config import RefineConfig
 from ssplat_jax.refinement.seen_rows import put_rows, seen_rows, take_rows
 from ssplat_jax.refinement.view_revision import ViewRevision, ViewState, init_view_state, revised_view, step_view_state

@@ -7,11 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from ssplat_jax.cache.key_views import KeyViews
 from ssplat_jax.errors import InputError
 from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.pytree import replace
 from ssplat_jax.rasterizer import Effects, render
-from ssplat_jax.refinement.key_views import KeyViews
 
 WORSE_THAN_USUAL = 2.0
 """A view whose error is this many times the median does not show this scene, or not from there."""

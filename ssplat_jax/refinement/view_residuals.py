@@ -14,9 +14,9 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
+from ssplat_jax.cache.key_views import KeyViews
 from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.rasterizer import Effects, render
-from ssplat_jax.refinement.key_views import KeyViews
 from ssplat_jax.refinement.view_revision import median_depths
 
 COVERED = 0.8

@@ -16,6 +16,7 @@ from ssplat_jax.errors import InputError, echo, refusal
 from ssplat_jax.evaluation.evaluate import evaluate
 from ssplat_jax.evaluation.scoring import Display
 from ssplat_jax.metrics.lpips import LpipsWeights
+from ssplat_jax.refinement import online_refinement
 from ssplat_jax.runs.reports import report_eval
 from ssplat_jax.storage.json_files import write_json
 from ssplat_jax.storage.run_folder import RunFolder
@@ -98,7 +99,7 @@ def _evaluate(
 ) -> dict[str, Any]:
     """The metrics of one capture, in a session of its own; writes its report, too."""
     metrics = evaluate(
-        Session(model, params),
+        Session(model, params, revise=online_refinement(model)),
         capture,
         split,
         out,

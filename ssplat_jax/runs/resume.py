@@ -13,6 +13,7 @@ from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.errors import InputError, StorageError
 from ssplat_jax.evaluation.exposures import exposures_from_json, exposures_to_json
+from ssplat_jax.refinement import online_refinement
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.streaming.feed import Exposures
 from ssplat_jax.streaming.session import Session
@@ -65,8 +66,11 @@ def resume_run(
         InputError: the folder holds a run of another identity.
         StorageError: the saved state and the one before it are corrupt.
     """
+    revise = online_refinement(model)
     if not folder.has_state():
-        return RunState(Session(model, params), capture.stream_frame(model.config, identity["frames"]), {})
+        return RunState(
+            Session(model, params, revise=revise), capture.stream_frame(model.config, identity["frames"]), {}
+        )
     try:
         cache, header, damage = load_newest_state(folder.state)
     except StorageError as error:
@@ -78,7 +82,7 @@ def resume_run(
     if cache.capacity < model.config.memory.capacity:
         cache = grow(cache, model.config.memory.capacity)
     return RunState(
-        Session(model, params, cache),
+        Session(model, params, cache, revise=revise),
         StreamFrame.from_dict(header["frame"]),
         exposures_from_json(header["exposures"]),
     )

@@ -2,12 +2,13 @@
 
 import dataclasses
 import time
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 
 from ssplat_jax.cache import VoxelCache, check_cache, ensure_capacity
-from ssplat_jax.cache.state import init_cache
+from ssplat_jax.cache.state import init_cache, with_refinement
 from ssplat_jax.chunk import Chunk
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.data.stream_frame import StreamFrame
@@ -24,6 +25,10 @@ MIN_DECODED_PIVOTS = 1 << 15
 """Lower limit of the pivots decoded at once: with fewer, compiling for a growing scene costs more than it saves."""
 
 
+Revise = Callable[[dict, VoxelCache, Chunk, ChunkOutput], VoxelCache]
+"""Refinement after a chunk: parameters, the cache after the step, the chunk, the step's summary -> the cache."""
+
+
 class Session:
     """One stream of one image size.
 
@@ -33,6 +38,8 @@ class Session:
         cache: the cache to continue from; by default an empty one with capacity for a few chunks.
         causal: the model's configuration with `stream.causal`: no result depends on a later frame.
         frame: stream frame of `cache`, for `push`; by default that of the first chunk that is pushed.
+        revise: what refines the scene after each chunk, as `config.refine` asks
+            (`ssplat_jax.refinement.online_refinement`); None where it asks for nothing.
     """
 
     def __init__(
@@ -43,11 +50,12 @@ class Session:
         *,
         causal: bool = False,
         frame: StreamFrame | None = None,
+        revise: Revise | None = None,
     ) -> None:
         if causal:
             model = dataclasses.replace(model, config=model.config.replace(causal=True))
         self.model, self.params, self.cache = model, params, cache
-        self._live = LiveViews(model.config, frame)
+        self._live, self._revise = LiveViews(model.config, frame), revise
         self.compile_seconds = 0.0
         self.num_compilations = 0
         self._programs: dict[tuple, jax.stages.Compiled] = {}
@@ -55,21 +63,36 @@ class Session:
         self._count_shown = jax.jit(lambda cache: jnp.sum(shown_pivots(cache, model.config), dtype=jnp.int32))
         self._decode_shown = jax.jit(model.decode_shown, static_argnums=2)
         self._last_program: jax.stages.Compiled | None = None
+        self._refine_program: jax.stages.Compiled | None = None
 
     def feed(self, chunk: Chunk) -> ChunkOutput:
         """Streams one chunk into the cache and waits until it is done.
 
         Raises:
             CacheError: tokens were dropped although the overflow policy forbids it.
+            InputError: the configuration asks for refinement and `revise` is not given, or the reverse.
         """
         config, num_tokens = self.model.config, tokens_per_chunk(chunk, self.model.config.network.size_multiple)
         if self.cache is None:
             self.cache = init_cache(config, starting_capacity(config, num_tokens))
         self.cache = ensure_capacity(self.cache, config, num_tokens)
-        step = self._program(chunk)
+        self.cache = self._with_key_views(self.cache, chunk)
+        step = self._last_program = self._program("step", self.model.step, chunk)
         self.cache, out = jax.block_until_ready(step(self.params, self.cache, chunk))
         check_cache(self.cache, config)
+        if self._revise is not None:
+            refine = self._refine_program = self._program("refine", self._revise, chunk, out)
+            self.cache = jax.block_until_ready(refine(self.params, self.cache, chunk, out))
         return out
+
+    def _with_key_views(self, cache: VoxelCache, chunk: Chunk) -> VoxelCache:
+        """`cache` with what refinement keeps in it, which a cache from before has not yet."""
+        config = self.model.config
+        if bool(config.refine.steps_per_chunk) != (self._revise is not None):
+            wanted = "Session(..., revise=online_refinement(model)) with refine.steps_per_chunk above 0, or neither"
+            got = f"steps_per_chunk={config.refine.steps_per_chunk} and revise={self._revise}"
+            raise refusal("Session", wanted=wanted, got=got, fix="call online_refinement with the session's model")
+        return cache if self._revise is None else with_refinement(cache, config, *chunk.images.shape[1:3])
 
     def push(self, image: object, K: object, viewmat: object) -> ChunkOutput | None:
         """Takes one view of a live source, and streams a chunk when enough views have come.
@@ -145,14 +168,12 @@ class Session:
     @property
     def step_memory_bytes(self) -> int | None:
         """Memory of the compiled step, by XLA's analysis: arguments, results and temporaries; None if unknown."""
-        if self._last_program is None or (memory := self._last_program.memory_analysis()) is None:
-            return None
-        return (
-            memory.argument_size_in_bytes
-            + memory.output_size_in_bytes
-            + memory.temp_size_in_bytes
-            - memory.alias_size_in_bytes
-        )
+        return _memory_bytes(self._last_program)
+
+    @property
+    def refine_memory_bytes(self) -> int | None:
+        """Memory of the compiled refinement of a chunk, as `step_memory_bytes`; None without refinement."""
+        return _memory_bytes(self._refine_program)
 
     def cache_facts(self) -> dict[str, int | float]:
         """Occupancy and counters of the cache; `decoded` is the number of Gaussians that are shown."""
@@ -169,18 +190,29 @@ class Session:
             **stats,
         }
 
-    def _program(self, chunk: Chunk) -> jax.stages.Compiled:
-        """The compiled step for the shapes of `chunk` and the cache."""
+    def _program(self, name: str, function: Callable, chunk: Chunk, *more: ChunkOutput) -> jax.stages.Compiled:
+        """`function` compiled for the shapes of `chunk` and the cache, which it consumes."""
         assert self.cache is not None
-        key = (self.cache.capacity, chunk.images.shape)
+        key = (name, self.cache.capacity, chunk.images.shape)
         if key not in self._programs:
             since = time.perf_counter()
-            step = jax.jit(self.model.step, donate_argnums=1)
-            self._programs[key] = step.lower(self.params, self.cache, chunk).compile()
+            arguments = (self.params, self.cache, chunk, *more)
+            self._programs[key] = jax.jit(function, donate_argnums=1).lower(*arguments).compile()
             self.compile_seconds += time.perf_counter() - since
             self.num_compilations += 1
-        self._last_program = self._programs[key]
-        return self._last_program
+        return self._programs[key]
+
+
+def _memory_bytes(program: jax.stages.Compiled | None) -> int | None:
+    """Memory of a program by XLA's analysis: arguments, results and temporaries."""
+    if program is None or (memory := program.memory_analysis()) is None:
+        return None
+    return (
+        memory.argument_size_in_bytes
+        + memory.output_size_in_bytes
+        + memory.temp_size_in_bytes
+        - memory.alias_size_in_bytes
+    )
 
 
 def tokens_per_chunk(chunk: Chunk, size_multiple: int) -> int:

@@ -52,7 +52,7 @@ class ShardedStream:
         A full shard drops tokens, or evicts its own lowest voxels, even if other shards have free or lower rows.
 
     Raises:
-        InputError: `mesh` lacks one of the two axes.
+        InputError: `mesh` lacks one of the two axes, or the config asks for refinement while streaming.
 
     Example:
         >>> mesh = jax.make_mesh((2, 4), ("streams", "voxels"))
@@ -71,6 +71,11 @@ class ShardedStream:
     voxels: str = "voxels"
 
     def __post_init__(self) -> None:
+        if self.model.config.refine.steps_per_chunk:
+            raise InputError(
+                "sharded stream: wanted refine.steps_per_chunk=0, which only a Session carries out, got "
+                f"{self.model.config.refine.steps_per_chunk}; set it to 0 and refine the finished scene with ss.refine."
+            )
         axes = {self.streams, self.voxels}
         if len(axes) < 2 or not axes <= set(self.mesh.axis_names):
             raise InputError(

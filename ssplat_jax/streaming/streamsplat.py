@@ -20,7 +20,6 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ssplat_jax import model as stages
 from ssplat_jax.cache import (
-    PIVOT_FIELDS,
     Tokens,
     VoxelCache,
     carve,
@@ -31,6 +30,8 @@ from ssplat_jax.cache import (
     project,
     store_witness,
 )
+from ssplat_jax.cache.residuals import revise, unpack
+from ssplat_jax.cache.state import pivot_fields
 from ssplat_jax.chunk import Chunk, check_chunk
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.gaussians import Gaussians, mask_gaussians
@@ -162,6 +163,12 @@ class StreamSplat:
         last = is_shown.size - 1
         return self._decode_pivots(params, cache, places <= last, lambda x: x[jnp.minimum(places, last)])
 
+    def decode_pivots(self, params: dict, cache: VoxelCache, pivots: Int[Array, " m"]) -> Gaussians:
+        """The Gaussians that `decode` shows for some pivots, numbered row by row; a pivot of -1 has opacity 0."""
+        taken = jnp.maximum(pivots, 0)
+        is_shown = (pivots >= 0) & shown_pivots(cache, self.config).reshape(-1)[taken]
+        return self._decode_pivots(params, cache, is_shown, lambda x: x[taken])
+
     def _decode_pivots(
         self, params: dict, cache: VoxelCache, is_shown: Bool[Array, " m"], take: Callable[[Array], Array]
     ) -> Gaussians:
@@ -176,11 +183,13 @@ class StreamSplat:
             num_members=flat(cache.num_members),
             config=self.config,
         )
+        if cache.residuals is not None:
+            gaussians = revise(gaussians, unpack(flat(cache.residuals)), max_scale=self.config.head.max_scale)
         return mask_gaussians(gaussians, self.repeat_per_gaussian(is_shown))
 
     def decode_rows(self, params: dict, cache: VoxelCache, rows: Int[Array, " r"]) -> Gaussians:
         """Gaussians that `decode` gives for the voxels `rows`, k pivots each; rows of -1 have opacity 0."""
-        part = {name: getattr(cache, name)[rows] for name in ("voxels", *PIVOT_FIELDS)}
+        part = {name: getattr(cache, name)[rows] for name in ("voxels", *pivot_fields(cache))}
         return self.decode(params, replace(cache, counts=jnp.where(rows >= 0, cache.counts[rows], 0), **part))
 
     def decode_tokens(self, params: dict, tokens: Tokens) -> Gaussians:

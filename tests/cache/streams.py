@@ -11,6 +11,9 @@ from ssplat_jax.cache import PIVOT_FIELDS, Tokens, VoxelCache, init_cache
 from ssplat_jax.cache import fuse as plain_fuse
 from ssplat_jax.cache import numpy_reference as reference
 from ssplat_jax.cache.fuse import _insert
+from ssplat_jax.cache.residuals import WIDTH as RESIDUAL_WIDTH
+from ssplat_jax.cache.residuals import settle, unpack
+from ssplat_jax.cache.state import pivot_fields
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.pytree import replace
 
@@ -151,23 +154,55 @@ def assert_equal_to_reference(cache: VoxelCache, expected: dict) -> None:
     for row, (voxel, _) in enumerate(rows):
         if voxel is not None:
             assert tuple(arrays.voxels[row]) == voxel
-    for name in PIVOT_FIELDS:
+    for name in pivot_fields(cache):
         wanted = np.zeros(getattr(arrays, name).shape)
         for row, (_, pivots) in enumerate(rows):
             for k, pivot in enumerate(pivots):
                 wanted[row, k] = pivot[name]
-        if name in ("means", "feats", "rgbs"):
+        if name in ("means", "feats", "rgbs", "residuals"):
             scale = np.abs(wanted).max(axis=-1, keepdims=True, initial=1e-30)
             np.testing.assert_allclose(getattr(arrays, name) / scale, wanted / scale, rtol=0, atol=VALUE_RTOL)
         else:
             np.testing.assert_array_equal(getattr(arrays, name), wanted.astype(getattr(arrays, name).dtype), name)
 
 
+_settle = jax.jit(lambda means, packed, size: settle(means, unpack(packed), size), static_argnums=2)
+
+
+def revised(cache: VoxelCache, rng: np.random.Generator, config: StreamConfig) -> VoxelCache:
+    """The cache after a refinement that moves and changes every alive pivot at random, by up to twice its voxel."""
+    capacity, k, width = cache.residuals.shape
+    changes = rng.normal(size=(capacity * k, width // RESIDUAL_WIDTH, RESIDUAL_WIDTH))
+    changes[..., :3] *= config.memory.voxel_size
+    packed = cache.residuals + changes.reshape(cache.residuals.shape).astype(np.float32)
+    means, packed = _settle(cache.means.reshape(-1, 3), packed.reshape(-1, width), config.memory.voxel_size)
+    alive = cache.alive[..., None]
+    return replace(
+        cache,
+        means=jnp.where(alive, means.reshape(cache.means.shape), cache.means),
+        residuals=jnp.where(alive, packed.reshape(cache.residuals.shape), cache.residuals),
+    )
+
+
+def revise_reference(expected: dict, cache: VoxelCache) -> None:
+    """Gives the pivots of the reference the places and residuals of those of `cache`, in place."""
+    means, residuals = np.asarray(cache.means, np.float64), np.asarray(cache.residuals, np.float64)
+    for row, (_, pivots) in enumerate(expected["rows"]):
+        for k in range(len(pivots)):
+            pivots[k] = pivots[k] | {"means": means[row, k], "residuals": residuals[row, k]}
+
+
 def run_both(recipes, config, capacity=CAPACITY):
-    """Streams the recipes through the cache and through the reference; compares them after every chunk."""
-    cache, expected = init_cache(config, capacity), reference.empty(capacity)
+    """Streams the recipes through the cache and through the reference; compares them after every chunk.
+
+    Where the configuration asks for refinement, pivots are revised between chunks.
+    """
+    cache, expected, rng = init_cache(config, capacity), reference.empty(capacity), np.random.default_rng(0)
     for recipe in recipes:
         tokens = recipe.tokens()
         cache = fuse(cache, to_jax(tokens), config)
         reference.fuse(expected, tokens, config)
         assert_equal_to_reference(cache, expected)
+        if config.refine.steps_per_chunk:
+            cache = revised(cache, rng, config)
+            revise_reference(expected, cache)

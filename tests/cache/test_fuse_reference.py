@@ -8,12 +8,23 @@ from hypothesis import strategies as st
 from ssplat_jax.cache import init_cache
 from ssplat_jax.cache import numpy_reference as reference
 from ssplat_jax.cache.fuse import MERGE_BLOCKS
-from tests.cache.streams import CONFIG, VARIANTS, WIDTH, assert_equal_to_reference, fuse, recipes, run_both, to_jax
+from tests.cache.streams import (
+    CONFIG,
+    EVICT,
+    VARIANTS,
+    WIDTH,
+    assert_equal_to_reference,
+    fuse,
+    recipes,
+    run_both,
+    to_jax,
+)
 
 CONFIGS = VARIANTS | {
     "count": CONFIG.replace(merge_weight="count", pivots_per_voxel=3),
     "feature": CONFIG.replace(merge_key="feature"),
     "single": CONFIG.replace(pivots_per_voxel=1),
+    "refined": EVICT.replace(steps_per_chunk=1),
 }
 streams = st.lists(recipes, min_size=1, max_size=3)
 QUICK = settings(max_examples=40, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))

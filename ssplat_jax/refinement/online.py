@@ -1,0 +1,176 @@
+"""Refinement while streaming: after each chunk a few gradient steps on key views revise the pivots that they see.
+
+    step ─► cache ─► keep_views ─► key views of this round ─► nearest pivots before them ─► base Gaussians + residuals
+                                                                                                   │ refine_step x M
+                                                    cache' ◄─ settle, write back ◄─────────────────┘
+
+All arrays have fixed sizes: a round costs the same after 10 chunks and after 10,000.
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from ssplat_jax.cache.key_views import KeyViews, keep_views, usable
+from ssplat_jax.cache.project import NEAR
+from ssplat_jax.cache.residuals import Residuals, add, settle, unpack
+from ssplat_jax.cache.state import VoxelCache
+from ssplat_jax.chunk import Chunk
+from ssplat_jax.config import StreamConfig
+from ssplat_jax.gaussians import Gaussians, mean_color
+from ssplat_jax.geometry.cameras import Camera
+from ssplat_jax.model import GRID_STRIDE
+from ssplat_jax.pytree import replace
+from ssplat_jax.rasterizer import fill_holes, render
+from ssplat_jax.rasterizer.render import round_up
+from ssplat_jax.refinement.refine_step import EFFECTS, sizes
+from ssplat_jax.streaming.session import Revise
+from ssplat_jax.streaming.streamsplat import ChunkOutput, StreamSplat, shown_pivots
+
+GAINS = {"means": 20.0, "quats": 1.0, "log_scales": 10.0, "logit_opacities": 30.0, "colors": 0.6}
+"""Step of each part over its mean gradient in the pixels that a Gaussian fills. Newton's method would divide by the
+squared change of a pixel that the part causes; several Gaussians answer for a pixel, so the gains are smaller."""
+
+CAPS = {"means": 0.2, "quats": 0.02, "log_scales": 0.1, "logit_opacities": 0.5, "colors": 0.2}
+"""Largest step of each part. Places are in units of the Gaussian's own size."""
+
+MIN_PIXELS = 0.3
+"""Added to the pixels that a Gaussian fills: one that hardly shows learns little from them."""
+
+SHOWN_WEIGHT = 0.7
+"""Weight of the error with holes filled; the rest is the error over black, as in `RefineConfig.shown_weight`."""
+
+PAIRS_PER_GAUSSIAN = 3
+"""Capacity for tile intersections; the farthest Gaussians of a view are left out beyond it."""
+
+
+def online_refinement(model: StreamSplat) -> Revise | None:
+    """The `revise` of a `Session` with this model; None if its configuration asks for no refinement."""
+    return functools.partial(revise_scene, model) if model.config.refine.steps_per_chunk else None
+
+
+def revise_scene(model: StreamSplat, params: dict, cache: VoxelCache, chunk: Chunk, output: ChunkOutput) -> VoxelCache:
+    """The cache after a round of refinement that follows `model.step` on `chunk`.
+
+    Args:
+        model: the stream's model; `config.refine` says how much is done.
+        params: the model's parameters.
+        cache: the cache after the step, with residuals and key views.
+        chunk: the chunk of the step.
+        output: the step's summary, which holds the exposures.
+
+    Returns:
+        The cache. Only `means`, `residuals`, `last_chunks` and `key_views` differ.
+    """
+    config = model.config
+    assert cache.residuals is not None and cache.key_views is not None
+    arrivals = replace(KeyViews.of(chunk.camera, chunk.images, output.exposures), valid=chunk.valid)
+    views = views_of_round(cache.key_views, arrivals, cache.stats.num_chunks, config.refine.steps_per_chunk)
+    key_views = keep_views(cache.key_views, arrivals, depth=config.stream.median_depth)
+    cache = replace(cache, key_views=key_views)
+    pivots = nearest_pivots(cache, views, config)
+    base = model.decode_pivots(params, replace(cache, residuals=None), pivots)
+    taken = jnp.maximum(pivots, 0)
+    flat = lambda x: x.reshape(-1, *x.shape[2:])  # noqa: E731
+    means, packed = flat(cache.means)[taken], flat(cache.residuals)[taken]
+    revised = _run_steps(base, unpack(packed), views, config)
+    moved, settled = settle(means, revised, config.memory.voxel_size)
+    is_changed = jnp.any(moved != means, axis=1) | jnp.any(settled != packed, axis=1)
+    places = jnp.where(is_changed & (pivots >= 0), pivots, cache.alive.size)
+    put = lambda x, new: flat(x).at[places].set(new, mode="drop").reshape(x.shape)  # noqa: E731
+    last_chunk = jnp.broadcast_to(cache.stats.num_chunks - 1, places.shape)
+    return replace(
+        cache,
+        means=put(cache.means, moved),
+        residuals=put(cache.residuals, settled),
+        last_chunks=put(cache.last_chunks, last_chunk),
+    )
+
+
+def views_of_round(ring: KeyViews, arrivals: KeyViews, num_chunks: Int[Array, ""], num: int) -> KeyViews:
+    """The `num` views of a round: half of them new ones, the others kept ones, drawn anew for each chunk.
+
+    Where there are too few of one kind, the other kind fills up; where there are too few of both, views repeat.
+    """
+    pool = jax.tree.map(lambda *x: jnp.concatenate(x), arrivals, ring)
+    pool = replace(pool, valid=usable(pool))
+    is_new = jnp.arange(pool.num_slots) < arrivals.num_slots
+    drawn = jax.random.uniform(jax.random.fold_in(jax.random.key(0), num_chunks), is_new.shape)
+    order = jnp.argsort(jnp.where(pool.valid, drawn, 2.0))
+    ranks = jnp.zeros_like(drawn).at[order].set(jnp.cumsum(is_new[order], dtype=drawn.dtype))
+    comes_first = is_new & (ranks <= (num + 1) // 2)
+    # New views that come first, then kept ones, then other new ones, then those that cannot be used.
+    group = jnp.where(comes_first, 0.0, jnp.where(is_new, 2.0, 1.0))
+    order = jnp.argsort(jnp.where(pool.valid, drawn + group, 4.0))
+    chosen = order[jnp.arange(num) % jnp.maximum(jnp.sum(pool.valid, dtype=jnp.int32), 1)]
+    return jax.tree.map(lambda x: x[chosen], pool)
+
+
+def nearest_pivots(cache: VoxelCache, views: KeyViews, config: StreamConfig) -> Int[Array, " m"]:
+    """Shown pivots before any of `views`, the nearest if there are more than there is space for; -1 after the last."""
+    height, width = views.images.shape[1:3]
+    cells = -(-height // GRID_STRIDE) * -(-width // GRID_STRIDE)
+    space = min(config.refine.pivots_per_cell * cells, cache.alive.size)
+    shown = shown_pivots(cache, config).reshape(-1)
+    px, py, pz = jnp.moveaxis(cache.means.reshape(-1, 3), -1, 0)
+
+    def nearer(depths: Float[Array, " n"], view: KeyViews):
+        rows = view.viewmats[:3, :, None]
+        x, y, z = (row[0] * px + row[1] * py + row[2] * pz + row[3] for row in rows)
+        is_seen = view.valid & shown & (z > NEAR)
+        u, v = view.Ks[0, 0] * x / z + view.Ks[0, 2], view.Ks[1, 1] * y / z + view.Ks[1, 2]
+        is_seen &= (u > -GRID_STRIDE) & (u < width + GRID_STRIDE) & (v > -GRID_STRIDE) & (v < height + GRID_STRIDE)
+        return jnp.minimum(depths, jnp.where(is_seen, z, jnp.inf)), None
+
+    depths = jax.lax.scan(nearer, jnp.full(shown.shape, jnp.inf), views)[0]
+    order = jnp.argsort(depths)[:space].astype(jnp.int32)
+    return jnp.where(depths[order] < jnp.inf, order, -1)
+
+
+def _run_steps(base: Gaussians, residuals: Residuals, views: KeyViews, config: StreamConfig) -> Residuals:
+    """`residuals` after one step on each of `views`."""
+    max_pairs = round_up(PAIRS_PER_GAUSSIAN * base.num_gaussians)
+    step = functools.partial(online_step, base, max_pairs=max_pairs, max_scale=config.head.max_scale)
+    return jax.lax.scan(lambda residuals, view: (step(residuals, view), None), residuals, views)[0]
+
+
+def online_step(
+    base: Gaussians, residuals: Residuals, view: KeyViews, *, max_pairs: int, max_scale: float
+) -> Residuals:
+    """`residuals` after one step on a single view: gradients over the pixels that each Gaussian fills.
+
+    The squared error of a pixel is a sum over its Gaussians, weighted by how much of the pixel each fills, and so a
+    Gaussian's gradient grows with the number of pixels that it fills. Divided by that number it is a mean error: the
+    step of a color is the mean error of the pixels that show it, which is Jacobi's method for the linear part of the
+    problem. Nothing has to be remembered from step to step.
+    """
+    size = sizes(base)
+    probe = jnp.zeros((base.num_gaussians, 1))
+    gradient, filled = jax.grad(_loss, argnums=(1, 2))(base, residuals, probe, view, max_pairs, max_scale)
+    # Units in which a step is the same for Gaussians of all sizes.
+    units = {"means": size[:, None], "quats": 1.0, "log_scales": 1.0, "logit_opacities": 1.0, "colors": 1.0}
+    new: dict[str, Array] = {}
+    for name, unit in units.items():
+        slope = getattr(gradient, name) * unit
+        pixels = (filled[:, 0] + MIN_PIXELS).reshape(-1, *[1] * (slope.ndim - 1))
+        move = jnp.clip(GAINS[name] * slope / pixels, -CAPS[name], CAPS[name])
+        new[name] = getattr(residuals, name) - unit * jnp.where(view.valid & jnp.isfinite(move), move, 0.0)
+    return Residuals(**new)
+
+
+def _loss(base, residuals, probe, view: KeyViews, max_pairs: int, max_scale: float):
+    """Half the squared error of a view, summed over pixels and channels.
+
+    `probe` is a channel of zeros: it shows nothing, and its gradient says how many pixels each Gaussian fills.
+    """
+    height, width = view.images.shape[:2]
+    camera = Camera(viewmats=view.viewmats, Ks=view.Ks, width=width, height=height)
+    gaussians = add(base, residuals, max_scale=max_scale)
+    out = render(gaussians, camera, effects=EFFECTS, features=probe, max_pairs=max_pairs)
+    assert out.color is not None and out.alpha is not None and out.features is not None
+    filled = fill_holes(out.color, out.alpha, jax.lax.stop_gradient(mean_color(gaussians)))
+    target = view.images.astype(jnp.float32) / 255 / view.exposures
+    error = SHOWN_WEIGHT * (filled - target) ** 2 + (1 - SHOWN_WEIGHT) * (out.color - target) ** 2
+    return 0.5 * jnp.sum(error) + jnp.sum(out.features)

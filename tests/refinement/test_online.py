@@ -1,0 +1,313 @@
+"""Laws of refinement while streaming, on a painted wall whose tokens have the wrong colors."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ssplat_jax.cache import Tokens, fuse, init_cache
+from ssplat_jax.cache.key_views import KeyViews
+from ssplat_jax.cache.residuals import WIDTH as RESIDUAL_WIDTH
+from ssplat_jax.cache.residuals import unpack
+from ssplat_jax.cache.state import with_refinement
+from ssplat_jax.checkpoint.stream_state import load_state, save_state
+from ssplat_jax.chunk import Chunk
+from ssplat_jax.config import StreamConfig
+from ssplat_jax.errors import InputError
+from ssplat_jax.geometry.cameras import Camera
+from ssplat_jax.geometry.voxels import voxel_indices
+from ssplat_jax.metrics.psnr_ssim import psnr
+from ssplat_jax.model.compact.gaussian_head import GaussianHead
+from ssplat_jax.pytree import replace
+from ssplat_jax.rasterizer import render
+from ssplat_jax.refinement.online import nearest_pivots, online_refinement, revise_scene, views_of_round
+from ssplat_jax.streaming.scene_delta import SceneFeed, apply_delta
+from ssplat_jax.streaming.session import Session
+from ssplat_jax.streaming.streamsplat import ChunkOutput, StreamSplat
+
+pytestmark = pytest.mark.usefixtures("compiled_plainly")
+
+WIDE, HIGH, FOCAL, DEPTH = 32, 24, 24.0, 2.0
+CONFIG = StreamConfig().replace(
+    token_width=4,
+    capacity=128,
+    min_confidence=0.3,
+    steps_per_chunk=3,
+    num_key_views=4,
+    overflow="drop_new",
+    voxel_size=0.3,
+)
+MODEL = StreamSplat(CONFIG)
+SHIFTS = (0.0, 0.1, -0.1, 0.2)
+
+
+@functools.cache
+def params() -> dict:
+    return {"decoder": GaussianHead(CONFIG).init(jax.random.key(0), jnp.zeros((1, 4)))["params"]}
+
+
+def wall_colors(points: np.ndarray) -> np.ndarray:
+    """Paint of the wall at x and y."""
+    x, y = points[..., 0], points[..., 1]
+    return np.stack([0.5 + 0.3 * np.sin(3 * x), 0.5 + 0.3 * np.cos(2 * y), 0.5 + 0.2 * np.sin(x + y)], axis=-1)
+
+
+def chunk(shifts=SHIFTS) -> Chunk:
+    """Views of the wall z = DEPTH from cameras side by side that look along +z."""
+    viewmats = np.tile(np.eye(4, dtype=np.float32), (len(shifts), 1, 1))
+    viewmats[:, 0, 3] = -np.asarray(shifts)
+    K = np.array([[FOCAL, 0, WIDE / 2], [0, FOCAL, HIGH / 2], [0, 0, 1]], np.float32)
+    columns, rows = np.meshgrid(np.arange(WIDE) + 0.5, np.arange(HIGH) + 0.5)
+    points = np.stack([(columns - WIDE / 2) / FOCAL * DEPTH, (rows - HIGH / 2) / FOCAL * DEPTH], axis=-1)
+    images = [wall_colors(points + np.array([shift, 0.0])) for shift in shifts]
+    return Chunk(
+        images=jnp.asarray(np.stack(images), jnp.float32),
+        viewmats=jnp.asarray(viewmats),
+        Ks=jnp.asarray(np.tile(K, (len(shifts), 1, 1))),
+        valid=jnp.ones(len(shifts), bool),
+        near=jnp.float32(1.0),
+        far=jnp.float32(4.0),
+    )
+
+
+def summary(exposures=None) -> ChunkOutput:
+    cells = jnp.zeros((4, HIGH // 4, WIDE // 4))
+    return ChunkOutput(cells, cells, cells, jnp.ones((4, 3)) if exposures is None else exposures)
+
+
+def tokens(seed: int = 0, behind: bool = False) -> Tokens:
+    """A token for every cell of the first view, on the wall, with colors that are wrong by about 0.15."""
+    rng = np.random.default_rng(seed)
+    columns, rows = np.meshgrid(np.arange(2, WIDE, 4), np.arange(2, HIGH, 4))
+    x, y = (columns.reshape(-1) - WIDE / 2) / FOCAL * DEPTH, (rows.reshape(-1) - HIGH / 2) / FOCAL * DEPTH
+    means = (
+        np.stack([x, y, np.full(len(x), -DEPTH if behind else DEPTH)], axis=-1) + rng.normal(size=(len(x), 3)) * 0.01
+    )
+    rgbs = np.repeat(wall_colors(means)[:, None], CONFIG.head.gaussians_per_token, axis=1)
+    rgbs = rgbs + 0.15 * rng.normal(size=rgbs.shape)
+    array = lambda value, *shape: jnp.broadcast_to(jnp.asarray(value, jnp.float32), (len(x), *shape))  # noqa: E731
+    return Tokens(
+        means=array(means, 3),
+        feats=array(rng.normal(size=(len(x), 4)), 4),
+        confidences=array(0.9),
+        rgbs=array(rgbs.reshape(len(x), -1), rgbs[0].size),
+        quats=array([1.0, 0, 0, 0], 4),
+        footprints=array(4 * DEPTH / FOCAL),
+        valid=jnp.ones(len(x), bool),
+    )
+
+
+FUSE = jax.jit(fuse, static_argnums=2)
+_REVISE = jax.jit(functools.partial(revise_scene, MODEL))
+_DECODE = jax.jit(MODEL.decode)
+
+
+def revise(cache, chunk, output):
+    return _REVISE(params(), cache, chunk, output)
+
+
+def decode(cache):
+    return _DECODE(params(), cache)
+
+
+def start(*more: Tokens):
+    """A cache after one chunk's tokens, before its first refinement."""
+    cache = init_cache(CONFIG)
+    for part in (tokens(), *more):
+        cache = FUSE(cache, part, CONFIG)
+    return with_refinement(cache, CONFIG, HIGH, WIDE)
+
+
+def score(cache, shift: float = 0.05) -> float:
+    """PSNR of a view that no chunk has shown."""
+    view = chunk((shift,))
+    color = render(decode(cache), view.camera, max_pairs=1 << 12).color
+    assert color is not None
+    return psnr(np.clip(np.asarray(color[0]), 0, 1), np.asarray(view.images[0]))
+
+
+def bits(tree):
+    return [np.asarray(x).tobytes() for x in jax.tree.leaves(tree)]
+
+
+def test_views_never_shown_gain():
+    before = start()
+    after = revise(before, chunk(), summary())
+    again = revise(after, chunk(), summary())
+    assert score(after) > score(before) + 1.0 and score(again) > score(after)
+
+
+def test_only_places_residuals_and_key_views_differ():
+    before = start()
+    after = revise(before, chunk(), summary())
+    changed = {
+        f.name for f in dataclasses.fields(before) if bits(getattr(before, f.name)) != bits(getattr(after, f.name))
+    }
+    assert changed == {"means", "residuals", "key_views"}  # the first chunk wrote every pivot: last_chunks is 0 already
+    cells = lambda cache: np.asarray(voxel_indices(cache.means, CONFIG.memory.voxel_size)[0])  # noqa: E731
+    np.testing.assert_array_equal(cells(after), cells(before))
+
+
+def test_pivots_that_no_key_view_sees_keep_every_bit():
+    before = start(tokens(3, behind=True))
+    after = revise(before, chunk(), summary())
+    is_behind = np.asarray(before.means[..., 2] < 0)
+    for name in ("means", "residuals", "last_chunks"):
+        np.testing.assert_array_equal(
+            np.asarray(getattr(after, name))[is_behind], np.asarray(getattr(before, name))[is_behind]
+        )
+    is_seen = np.asarray(after.alive) & ~is_behind
+    assert np.asarray(after.residuals)[is_seen].any(axis=-1).mean() > 0.9
+    assert (np.asarray(after.last_chunks)[is_seen] == 1).mean() > 0.9 and (
+        np.asarray(before.last_chunks)[is_seen] == 0
+    ).all()
+
+
+def test_a_saved_stream_continues_to_the_same_bytes(tmp_path):
+    once = revise(start(), chunk(), summary())
+    save_state(tmp_path / "state.npz", once, {})
+    loaded, _ = load_state(tmp_path / "state.npz")
+    assert bits(loaded) == bits(once)
+    going_on = lambda cache: revise(FUSE(cache, tokens(5), CONFIG), chunk((0.3, 0.4, 0.5, 0.6)), summary())  # noqa: E731
+    assert bits(going_on(loaded)) == bits(going_on(once))
+
+
+def test_deltas_hold_what_refinement_moved():
+    cache, feed, received = start(tokens(3, behind=True)), SceneFeed(MODEL, params()), None
+    for _ in range(2):
+        received = apply_delta(received, feed.update(cache))
+        # A step on another chunk comes before each refinement.
+        cache = replace(cache, stats=replace(cache.stats, num_chunks=cache.stats.num_chunks + 1))
+        cache = revise(cache, chunk(), summary())
+    delta = feed.update(cache)
+    received = apply_delta(received, delta)
+    expected = decode(cache)
+    for field in dataclasses.fields(expected):
+        np.testing.assert_allclose(getattr(received, field.name), getattr(expected, field.name), atol=1e-5)
+    is_behind = np.asarray((cache.means[..., 2] < 0).any(axis=1))
+    assert len(delta.rows) > 0 and not is_behind[delta.rows].any()
+
+
+def black():
+    return replace(chunk(), images=jnp.zeros((4, HIGH, WIDE, 3))), summary()
+
+
+def unknown_exposure():
+    return chunk(), summary(jnp.full((4, 3), jnp.nan).at[1:].set(1.0))
+
+
+def duplicates():
+    return chunk((0.0, 0.0, 0.0, 0.0)), summary()
+
+
+def one_view():
+    return replace(chunk(), valid=jnp.arange(4) == 0), summary()
+
+
+def no_view():
+    return replace(chunk(), valid=jnp.zeros(4, bool)), summary()
+
+
+def poses_that_are_not_finite():
+    return replace(chunk(), viewmats=chunk().viewmats.at[2].set(jnp.nan)), summary()
+
+
+ADVERSARIES = (black, unknown_exposure, duplicates, one_view, no_view, poses_that_are_not_finite)
+
+
+@pytest.mark.parametrize("views", ADVERSARIES, ids=[case.__name__ for case in ADVERSARIES])
+def test_any_key_views_leave_a_finite_bounded_scene(views):
+    before = cache = start()
+    for _ in range(4):
+        cache = revise(cache, *views())
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves((decode(cache), cache.means, cache.residuals)))
+    cells = lambda cache: np.asarray(voxel_indices(cache.means, CONFIG.memory.voxel_size)[0])  # noqa: E731
+    np.testing.assert_array_equal(cells(cache), cells(before))
+    residuals = unpack(cache.residuals.reshape(-1, cache.residuals.shape[-1]))
+    assert float(jnp.abs(residuals.means).max()) <= CONFIG.memory.voxel_size
+    assert float(jnp.abs(residuals.log_scales).max()) <= 1.5 and float(jnp.abs(residuals.colors).max()) <= 2.0
+    if views is no_view:
+        assert bits(replace(cache, key_views=None)) == bits(replace(before, key_views=None))
+    elif views is not black:
+        assert score(cache) > score(before) - 0.3
+
+
+def test_half_of_a_round_are_new_views_and_the_others_kept_ones():
+    ring = with_key_views(start())
+    new = (1.0, 1.1, 1.2, 1.3)
+    arrivals = KeyViews.of(chunk(new).camera, chunk(new).images)
+    drawn = set()
+    for num_chunks in range(6):
+        chosen = views_of_round(ring, arrivals, jnp.int32(num_chunks), 3)
+        places = [round(-float(x), 2) for x in chosen.viewmats[:, 0, 3]]
+        assert len(set(places)) == 3 and sum(place in new for place in places) == 2
+        drawn |= set(places)
+    assert len(drawn) > 5  # another draw for every chunk
+    only_one = replace(arrivals, valid=jnp.arange(4) == 1)
+    places = [round(-float(x), 2) for x in views_of_round(ring, only_one, jnp.int32(0), 4).viewmats[:, 0, 3]]
+    assert places.count(1.1) == 1 and len(set(places)) == 4
+    none_kept = replace(ring, valid=jnp.zeros(4, bool))
+    places = [round(-float(x), 2) for x in views_of_round(none_kept, arrivals, jnp.int32(0), 6).viewmats[:, 0, 3]]
+    assert set(places) == set(new) and len(places) == 6
+
+
+def test_the_nearest_pivots_are_taken_where_there_is_space_for_few():
+    cache = start(tokens(3, behind=True), replace(tokens(4), means=tokens(4).means + jnp.array([0.0, 0.0, 1.0])))
+    few = CONFIG.replace(pivots_per_cell=1)  # 48 of the 96 pivots before the cameras
+    views = with_key_views(cache)
+    pivots = np.asarray(nearest_pivots(cache, views, few))
+    depths = np.asarray(cache.means.reshape(-1, 3)[pivots, 2])
+    alive = np.asarray(cache.alive.reshape(-1)) & (np.asarray(cache.means.reshape(-1, 3)[:, 2]) > 0)
+    assert len(set(pivots.tolist())) == 48 and (depths < DEPTH + 0.5).all() and alive[pivots].all()
+    many = np.asarray(nearest_pivots(cache, views, CONFIG))
+    assert set(many[many >= 0].tolist()) <= set(np.flatnonzero(alive).tolist()) and (many == -1).any()
+
+
+def with_key_views(cache):
+    """The key views of a cache after one round."""
+    views = revise(cache, chunk(), summary()).key_views
+    assert views is not None
+    return views
+
+
+def test_a_session_refuses_half_of_a_request():
+    for model, revise in ((MODEL, None), (StreamSplat(CONFIG.replace(steps_per_chunk=0)), online_refinement(MODEL))):
+        with pytest.raises(InputError, match="online_refinement"):
+            Session(model, params(), revise=revise).feed(chunk())
+    assert online_refinement(StreamSplat(CONFIG.replace(steps_per_chunk=0))) is None
+
+
+def test_key_views_of_another_size_are_refused():
+    with pytest.raises(InputError, match="keep size"):
+        with_refinement(start(), CONFIG, HIGH, WIDE + 1)
+
+
+def test_a_stream_from_before_gets_empty_residuals_and_key_views():
+    plain = init_cache(CONFIG.replace(steps_per_chunk=0))
+    ready = with_refinement(plain, CONFIG, HIGH, WIDE)
+    assert ready.residuals is not None and ready.key_views is not None
+    assert ready.residuals.shape[-1] == CONFIG.head.gaussians_per_token * RESIDUAL_WIDTH
+    assert not np.any(ready.residuals) and not np.any(ready.key_views.valid)
+
+
+def test_without_steps_the_programs_are_those_without_refinement():
+    """No other field of the group leaves a trace either: the text of the programs is the same."""
+    plain = StreamSplat(CONFIG.replace(steps_per_chunk=0, num_key_views=7, pivots_per_cell=3))
+    default = StreamSplat(CONFIG.replace(steps_per_chunk=0))
+    texts = [
+        jax.jit(model.decode).lower(params(), model.init_cache()).as_text()
+        + jax.jit(fuse, static_argnums=2).lower(model.init_cache(), tokens(), model.config).as_text()
+        for model in (plain, default)
+    ]
+    assert texts[0] == texts[1] != ""
+    assert "residuals" not in texts[0] and len(jax.tree.leaves(default.init_cache())) == 26
+
+
+def test_cameras_are_those_of_the_chunk():
+    views = with_key_views(start())
+    camera: Camera = views.camera(1)
+    np.testing.assert_array_equal(camera.viewmats, chunk().viewmats[1])
+    np.testing.assert_array_equal(views.images, np.round(np.asarray(chunk().images) * 255).astype(np.uint8))
