@@ -74,7 +74,7 @@ class VoxelCache:
     last_chunks: Int[Array, "capacity k"]  # chunk that last wrote the pivot
     witnesses: Witnesses
     stats: CacheStats
-    # Of refinement while streaming (`config.refine`); None without it, so that the program has no trace of them.
+    # Fields of refinement while streaming (`config.refine`); None without it, so that the program has no trace of them.
     residuals: Float[Array, "capacity k r"] | None = None  # changes to each of the pivot's Gaussians (residuals.py)
     key_views: KeyViews | None = None  # views that the scene is compared with; None before the first chunk
 
