@@ -62,7 +62,7 @@ class Budget:
     scored: tuple[int, int]
     """Scored images, width and height."""
     variants: int | None = None
-    """How many of the variants are measured; None: all."""
+    """Number of variants that are measured; None: all."""
 
     def recipe(self, seed: int) -> Recipe:
         """The stream phase of the tiny recipe, shorter."""

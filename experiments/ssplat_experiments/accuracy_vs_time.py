@@ -41,7 +41,7 @@ class Sizes:
     context: int
     scored: tuple[int, int]
     settings: int | None = None
-    """How many of `SETTINGS` are measured; None: all."""
+    """Number of `SETTINGS` that are measured; None: all."""
 
 
 SIZES = {

@@ -1,4 +1,4 @@
-"""What each addition to the paper is worth: quality, time and memory, one field of the configuration at a time.
+"""Worth of each addition to the paper: quality, time and memory, one field of the configuration at a time.
 
     ssplat experiment additions --captures path/to/captures --out runs/additions
 
@@ -168,7 +168,7 @@ def measured(scene: str, path: str, step: str, config: StreamConfig, sizes: Size
 
 
 def add_gains(rows: list[Row]) -> None:
-    """What each addition gives: its row minus the one before, or all of `tiny` minus the row without it.
+    """Gain of each addition: its row minus the one before, or all of `tiny` minus the row without it.
 
     Scene by scene, in the order in which they were first measured.
     """
@@ -192,7 +192,7 @@ def _set_gains(row: Row, without: Row, with_it: Row) -> None:
 
 
 def findings(rows: list[Row]) -> list[str]:
-    """Which additions earn their place, by what their absence from `tiny` costs on the mean of the scenes."""
+    """Additions that earn their place, by what their absence from `tiny` costs on the mean of the scenes."""
     lines = []
     for step in dict.fromkeys(row["step"] for row in rows if row["path"] == "taken away"):
         gains = [row for row in rows if (row["path"], row["step"]) == ("taken away", step) and "shown_gain_db" in row]

@@ -99,7 +99,7 @@ def _with_file(row: Row, path: Path, number: int) -> Row:
 
 
 def _record(name: str, case: Case, rows: list[Row], seconds: float) -> dict[str, Any]:
-    """What the file of a case holds."""
+    """Contents of the file of a case."""
     return {
         "experiment": name,
         "case": case.name,

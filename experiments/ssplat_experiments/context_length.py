@@ -186,7 +186,7 @@ def _scores(
 
 
 def findings(rows: list[Row]) -> list[str]:
-    """What more views give and cost, by suite."""
+    """Gain and cost of more views, by suite."""
     lines = []
     for suite in dict.fromkeys(row["suite"] for row in rows):
         ours = sorted((r for r in rows if (r["suite"], r["method"]) == (suite, OURS)), key=lambda r: r["views"])

@@ -1,4 +1,4 @@
-"""Where the error of novel views lies: exposure, holes, and the size of what is wrong.
+"""Parts of the error of novel views: exposure, holes, and the size of what is wrong.
 
     ssplat experiment error_bands --captures path/to/captures --out runs/error_bands
 

@@ -136,7 +136,7 @@ def growth(rows: list[Row], method: str) -> tuple[float, float]:
 
 
 def findings(rows: list[Row]) -> list[str]:
-    """How the memory of each method grows."""
+    """Growth of the memory of each method."""
     counts = sorted({row["views"] for row in rows})
     found = []
     for method in dict.fromkeys(row["method"] for row in rows):

@@ -31,7 +31,7 @@ class Study:
 
     name: str
     text: str
-    """What the page says above the table."""
+    """Text of the page above the table."""
     cases: Callable[[Path | None, str], Sequence[Case]]
     """The cases for a folder of captures and a scale."""
     finish: Callable[[list[Row]], None] = lambda rows: None
