@@ -95,6 +95,7 @@ def test_variants_are_compared_with_the_same_seed():
     assert lines[2] == "| room | without CGFI | 8 | 20.50 (one seed) | -0.50 (one seed) | 18.50 (one seed) | 10 |"
 
 
+@pytest.mark.slow
 def test_every_variant_of_the_ablation_differs_and_fits_the_weights():
     configs = {case.name: case.config for case in ablation_cases(None, "cpu")}
     assert len(configs) == 6 * 3 and len({config.hash for config in configs.values()}) == 6

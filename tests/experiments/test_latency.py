@@ -19,6 +19,7 @@ def test_compilation_and_preparation_are_not_timed():
     assert median_ms(lambda _: None, 3, prepare=lambda: time.sleep(next(slow_start))) < 50
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("compiled_plainly")
 def test_stages_are_timed_without_touching_the_stream():
     session, chunk = Session(small.MODEL, small.params()), small.chunk()

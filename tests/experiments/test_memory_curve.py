@@ -24,6 +24,7 @@ def room():
     return open_capture("procedural:room?frames=16", size=(48, 32))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("compiled_plainly")
 def test_memory_of_joint_network_grows_linearly_or_faster(room):
     params, frame = small.random_params(CONFIG), room.stream_frame(CONFIG)
@@ -37,6 +38,7 @@ def test_memory_of_joint_network_grows_linearly_or_faster(room):
     assert slopes[1] >= 0.95 * slopes[0]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("compiled_plainly")
 def test_memory_of_a_stream_does_not_grow_with_views(room):
     """The cache has capacity for the scene, as it has after its last doubling."""

@@ -78,5 +78,6 @@ def test_a_run_that_continues_keeps_its_setting(tmp_path, monkeypatch):
     assert chosen(4.0, overwrite=True) == "1.0 steps"
 
 
+@pytest.mark.slow
 def test_the_reference_step_takes_time():
     assert 0.1 < time_budget.reference_step_ms() < 60_000
