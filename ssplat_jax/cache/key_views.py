@@ -99,7 +99,7 @@ def _slot_for(ring: KeyViews, view: KeyViews, depth: float) -> Int[Array, ""]:
 
 
 def camera_distances(viewmats: Float[Array, "n 4 4"], depth: float) -> Float[Array, "n n"]:
-    """How far views are apart: the distance of their centers over `depth`, plus 2 sin(angle / 2) of their rotations."""
+    """Separation of views: the distance of their centers over `depth`, plus 2 sin(angle / 2) of their rotations."""
     rotations = viewmats[:, :3, :3]
     centers = -jnp.einsum("nji,nj->ni", rotations, viewmats[:, :3, 3])
     length = lambda x: jnp.sqrt(jnp.sum(x * x, axis=-1))  # noqa: E731

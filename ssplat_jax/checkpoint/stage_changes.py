@@ -1,4 +1,4 @@
-"""How far training moved each stage from its random start."""
+"""Distance of each stage from its random start."""
 
 import dataclasses
 import math

@@ -38,7 +38,7 @@ class Render:
     """spline: smooth, through all cameras. orbit: a circle around what the cameras look at; where they look outward, as
     in a room, a small circle about the middle camera."""
     film_shows: tuple[Literal["color", "depth", "normals"], ...] = ("color",)
-    """What the film shows; each becomes a file: film.mp4, film_depth.mp4, film_normals.mp4."""
+    """Contents of the film; each becomes a file: film.mp4, film_depth.mp4, film_normals.mp4."""
     axes: AxesOption = None
     poses: PosesOption = None
     quiet: QuietOption = False

@@ -1,4 +1,4 @@
-"""What is wrong with the frames of a capture: copies, disorder, gaps in the motion, blur, jumps of exposure.
+"""Faults of the frames of a capture: copies, disorder, gaps in the motion, blur, jumps of exposure.
 
 Every finding is a sentence with a remedy. Poses are judged over all frames, images over all frames of a short capture
 and over evenly spread pairs of neighbors of a long one, since they must be decoded.
@@ -150,7 +150,7 @@ def _measured(capture: Capture, i: int) -> tuple[np.ndarray, float]:
 
 
 def _is_alike(a: np.ndarray, b: np.ndarray) -> bool:
-    """Whether two thumbnails show the same things."""
+    """True if two thumbnails show the same things."""
     if min(np.std(a), np.std(b)) < 1e-3:
         return False
     return float(np.corrcoef(a.ravel(), b.ravel())[0, 1]) > MIN_CORRELATION

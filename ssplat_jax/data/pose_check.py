@@ -1,4 +1,4 @@
-"""Whether poses fit the images: epipolar consistency of matches that were found without poses.
+"""Test of poses against the images: epipolar consistency of matches that were found without poses.
 
     keypoints -> mutual matches, poses unused -> share consistent with the poses in each convention
 

@@ -22,7 +22,7 @@ Direction = Literal["camera-to-world", "world-to-camera"]
 
 @dataclasses.dataclass(frozen=True)
 class Convention:
-    """How a file writes poses."""
+    """Convention in which a file writes poses."""
 
     axes: Axes = "opencv"
     poses: Direction = "camera-to-world"
