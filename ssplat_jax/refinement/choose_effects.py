@@ -89,8 +89,8 @@ def effects_by_name(names: Sequence[str], gaussians: Gaussians, key_views: KeyVi
 
 def with_effects(config: RefineConfig, choice: EffectsChoice) -> RefineConfig:
     """`config` with the effects of `choice` on besides its own."""
-    names = {*config.effects.names, *choice.effects.names}
-    return dataclasses.replace(config, effects=dataclasses.replace(config.effects, **{name: True for name in names}))
+    chosen = {name: True for name in choice.effects.names}
+    return dataclasses.replace(config, effects=dataclasses.replace(config.effects, **chosen))
 
 
 def _spread(values: np.ndarray) -> float:

@@ -15,7 +15,7 @@ from ssplat_jax.pytree import replace
 from ssplat_jax.rasterizer import Effects, render
 from ssplat_jax.refinement import KeyViews, RefineConfig, RefineEffects, only_usable, refine, refine_effects_for
 from ssplat_jax.refinement.choose_effects import choose_effects, effects_by_name, with_effects
-from ssplat_jax.refinement.usable_views import contradicting
+from ssplat_jax.refinement.usable_views import contradicting, sound_views
 from ssplat_jax.refinement.view_residuals import _columns, view_residuals
 from ssplat_jax.refinement.view_revision import moved_viewmat
 
@@ -108,6 +108,13 @@ def test_good_views_stay_and_so_do_duplicates():
     )
     for given in (good, twice):
         assert np.asarray(only_usable(doubtful(), given, MAX_PAIRS).valid).all()
+
+
+def test_a_sound_view_has_a_positive_exposure_and_a_finite_camera():
+    given = adversaries()
+    unsound = {name: np.flatnonzero(~sound_views(views)).tolist() for name, views in given.items()}
+    broken = ("NaN exposure", "no exposure", "broken camera")
+    assert unsound == {name: [2] if name in broken else [] for name in given}
 
 
 def test_no_view_left_is_an_error_that_says_so():
