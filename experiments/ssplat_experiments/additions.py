@@ -31,8 +31,8 @@ from ssplat_jax.evaluation.peak_memory import peak_memory
 from ssplat_jax.evaluation.scoring import score_targets
 from ssplat_jax.streaming.feed import feed_capture
 
-CAPTURES = {"redkitchen": 5, "fox": 1, "south_building": 1}
-"""Names of real captures, with the stride of their frames."""
+CAPTURES = {"redkitchen": (5, 128), "fox": (1, 40), "south_building": (1, 112)}
+"""Names of real captures, with the stride of their frames and the most context views that they have."""
 
 NUM_TARGETS = 6
 STORAGE = ("memory.capacity", "memory.overflow")
@@ -51,7 +51,7 @@ class Sizes:
     additions: int | None = None
 
 
-SIZES = {"smoke": Sizes(8, (64, 48), 1), "cpu": Sizes(24, (160, 120)), "gpu": Sizes(64, (320, 240))}
+SIZES = {"smoke": Sizes(8, (64, 48), 1), "cpu": Sizes(64, (160, 120)), "gpu": Sizes(128, (320, 240))}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -138,7 +138,8 @@ def _open(scene: str, sizes: Sizes, captures: Path | None) -> tuple[Capture, Spl
     if scene == "room" or captures is None:
         return open_room(sizes.context, sizes.size)
     capture = open_capture(captures / scene, size=sizes.size)
-    return capture, interleaved_split(len(capture), CAPTURES[scene], sizes.context)
+    stride, most = CAPTURES[scene]
+    return capture, interleaved_split(len(capture), stride, min(sizes.context, most))
 
 
 def measured(scene: str, path: str, step: str, config: StreamConfig, sizes: Sizes, captures: Path | None) -> list[Row]:
