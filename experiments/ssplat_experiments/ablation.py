@@ -19,7 +19,7 @@ from ssplat_experiments.additions import additions
 from ssplat_experiments.cases import PICTURE, Case, Row
 from ssplat_experiments.memory_curve import START_CAPACITY
 from ssplat_experiments.scenes import REDKITCHEN, open_redkitchen, open_room
-from ssplat_experiments.study import Study, at_scale, run_study, side_by_side
+from ssplat_experiments.study import PUBLIC_SCENES, Study, at_scale, run_study, side_by_side
 from ssplat_jax.checkpoint.weights import load_params
 from ssplat_jax.config import StreamConfig, preset
 from ssplat_jax.console import Reporter
@@ -186,8 +186,8 @@ def spread(values: list[float]) -> str:
 
 
 def gallery(rows: list[Row]) -> str:
-    """The variants side by side, a table for each scene."""
-    scenes = dict.fromkeys(row["scene"] for row in rows)
+    """The variants side by side, a table for each procedural scene."""
+    scenes = dict.fromkeys(row["scene"] for row in rows if row["scene"] in PUBLIC_SCENES)
     tables = [
         side_by_side([row for row in rows if row["scene"] == scene], lambda row: f"{row['variant']}, {row['views']}")
         for scene in scenes

@@ -21,7 +21,7 @@ from ssplat_experiments.cases import PICTURE, Case, Row
 from ssplat_experiments.image_baselines import BASELINES, baseline_scores
 from ssplat_experiments.joint_network import JointNetwork, joint_config, one_chunk
 from ssplat_experiments.memory_curve import START_CAPACITY
-from ssplat_experiments.study import Study, at_scale, run_study, side_by_side
+from ssplat_experiments.study import PUBLIC_SCENES, Study, at_scale, run_study, side_by_side
 from ssplat_experiments.warm_sessions import new_session
 from ssplat_jax.checkpoint.weights import load_params
 from ssplat_jax.config import StreamConfig, preset
@@ -212,8 +212,8 @@ def findings(rows: list[Row]) -> list[str]:
 
 
 def gallery(rows: list[Row]) -> str:
-    """One target of each suite, from few views to many."""
-    suites = dict.fromkeys(row["suite"] for row in rows)
+    """One target of each procedural suite, from few views to many."""
+    suites = dict.fromkeys(row["suite"] for row in rows if row["suite"] in PUBLIC_SCENES)
     strips = [
         side_by_side(
             [row for row in rows if row["suite"] == suite], lambda row: f"{row['suite']}, {row['views']} views"

@@ -24,6 +24,9 @@ SCALES = ("smoke", "cpu", "gpu")
 
 PAGE, PLOT = "page.md", "plot.png"
 
+PUBLIC_SCENES = ("room", "corridor", "orbit")
+"""Scenes whose pictures a page may show: images of captures can have licences that forbid it. Theirs lie in `cases/`."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Study:

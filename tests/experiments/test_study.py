@@ -6,6 +6,7 @@ import json
 import numpy as np
 import pytest
 from PIL import Image
+from ssplat_experiments import ablation, context_length
 from ssplat_experiments.cases import PICTURE, Case
 from ssplat_experiments.study import Study, at_scale, run_study, side_by_side
 
@@ -112,3 +113,12 @@ def test_a_picture_is_kept_beside_its_case_and_shown_on_the_page(tmp_path):
 def test_gpu_takes_the_cpus_choice_where_it_has_none():
     assert [at_scale({"smoke": 1, "cpu": 2}, scale) for scale in ("smoke", "cpu", "gpu")] == [1, 2, 2]
     assert at_scale({"smoke": 1, "cpu": 2, "gpu": 3}, "gpu") == 3
+
+
+@pytest.mark.parametrize("study", [ablation, context_length], ids=lambda study: study.STUDY.name)
+def test_pages_show_no_pictures_of_captures(study):
+    row = {"variant": "full", "views": 8}
+    rows = [row | {"suite": name, "scene": name, PICTURE: f"cases/{name}.png"} for name in ("room", "kitchen")]
+    page = study.STUDY.gallery(rows)
+    assert "cases/room.png" in page
+    assert "kitchen" not in page
