@@ -25,7 +25,7 @@ SCALES = ("smoke", "cpu", "gpu")
 PAGE, PLOT = "page.md", "plot.png"
 
 PUBLIC_SCENES = ("room", "corridor", "orbit")
-"""Scenes whose pictures a page may show: images of captures can have licences that forbid it. Theirs lie in `cases/`."""
+"""Scenes whose pictures a page shows. Those of captures, whose licences may forbid it, lie in `cases/` only."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -309,8 +309,8 @@ def test_eval_writes_every_promised_field(tmp_path, monkeypatch):
     metrics = json.loads((out / "metrics.json").read_text())
     promised = {
         "literal", "shown", "psnr_over_black", "psnr_one_exposure", "per_view", "context_views", "target_views",
-        "chunk_ms", "render_ms", "compile_s", "step_memory_bytes", "peak_memory_bytes", "cache", "num_gaussians",
-        "config_hash", "baselines",
+        "chunk_ms", "step_ms", "render_ms", "compile_s", "step_memory_bytes", "peak_memory_bytes", "cache",
+        "num_gaussians", "config_hash", "baselines",
     }  # fmt: skip
     assert promised <= metrics.keys()
     assert metrics["peak_memory_bytes"] >= metrics["step_memory_bytes"] > 0
