@@ -12,96 +12,18 @@ measured again. Needs an idle machine.
 import dataclasses
 import functools
 import statistics
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ssplat_experiments.cases import Case, Row
-from ssplat_experiments.memory_curve import START_CAPACITY
+from ssplat_experiments.measured_settings import Opened, config_of, measure, measure_refined
 from ssplat_experiments.scenes import REDKITCHEN, open_redkitchen, open_room
+from ssplat_experiments.settings import REFINED, REFINED_FACTORS, SETTINGS, SIZES, Setting, Sizes
 from ssplat_experiments.study import Study, at_scale, run_study
-from ssplat_experiments.warm_sessions import new_session
-from ssplat_jax.config import StreamConfig, preset
 from ssplat_jax.console import Reporter
-from ssplat_jax.data.capture import Capture
-from ssplat_jax.data.split import Split
-from ssplat_jax.evaluation.latency import measure_latency
-from ssplat_jax.evaluation.peak_memory import peak_memory
-from ssplat_jax.evaluation.scoring import score_targets
-from ssplat_jax.runs.time_budget import FrontPoint, front_of, reference_step_ms
-from ssplat_jax.streaming.feed import feed_capture
-
-
-@dataclasses.dataclass(frozen=True)
-class Sizes:
-    """Context views, and (width, height) of the scored images."""
-
-    context: int
-    scored: tuple[int, int]
-    settings: int | None = None
-    """Number of `SETTINGS` that are measured; None: all."""
-
-
-SIZES = {
-    "smoke": Sizes(8, (64, 48), settings=2),
-    "cpu": Sizes(24, (160, 120)),
-    "gpu": Sizes(64, (320, 240)),
-}
-
-
-@dataclasses.dataclass(frozen=True)
-class Setting:
-    """A point of the plot: the size that is streamed, as a factor, and what differs from the preset."""
-
-    factor: float = 1.0
-    """Size of the streamed images against that of the scored ones."""
-    label: str = ""
-    changes: dict[str, Any] = dataclasses.field(default_factory=dict)
-    quality: str = ""
-    """Name of the `--quality` with this setting, or empty."""
-
-    @property
-    def name(self) -> str:
-        """The factor of the size, if it is not 1, and the label; `preset` without both."""
-        size = "" if self.factor == 1 else f"size x {self.factor:g}"
-        return ", ".join(part for part in (size, self.label) if part) or "preset"
-
-    def size(self, scored: tuple[int, int]) -> tuple[int, int]:
-        """(width, height) of the streamed images."""
-        return round(self.factor * scored[0]), round(self.factor * scored[1])
-
-
-SETTINGS = (
-    Setting(quality="accurate"),
-    Setting(0.5, quality="fast"),
-    Setting(0.75, quality="balanced"),
-    Setting(0.4),
-    Setting(0.6),
-    Setting(0.9),
-    Setting(1.25),
-    Setting(1.5),
-    Setting(1.5, "voxel 0.02", {"voxel_size": 0.02}),
-    Setting(0.4, "1 source", {"num_sources": 1}),
-    Setting(0.5, "1 source", {"num_sources": 1}),
-    Setting(0.75, "1 source", {"num_sources": 1}),
-    Setting(1.0, "1 source", {"num_sources": 1}),
-    Setting(1.25, "1 source", {"num_sources": 1}),
-    Setting(1.0, "1 Gaussian a token", {"gaussians_per_token": 1}),
-    Setting(0.5, "16 Gaussians a token", {"gaussians_per_token": 16}),
-    Setting(0.75, "16 Gaussians a token", {"gaussians_per_token": 16}),
-    Setting(1.0, "16 Gaussians a token", {"gaussians_per_token": 16}),
-    Setting(1.0, "exposure not matched", {"match_exposure": False}),
-    Setting(1.0, "1 pivot", {"pivots_per_voxel": 1}),
-    Setting(1.0, "chunks of 2", {"chunk_size": 2}),
-    Setting(1.0, "chunks of 8", {"chunk_size": 8}),
-    Setting(0.75, "chunks of 8", {"chunk_size": 8}),
-    Setting(1.0, "no HPDA", {"hpda": False}),
-    Setting(1.0, "no CGFI", {"cgfi": False}),
-    Setting(1.0, "no carving", {"carving": False}),
-    Setting(1.0, "no mixer", {"mixer_blocks": 0}),
-)
+from ssplat_jax.runs.time_budget import FrontPoint, front_of
 
 
 def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str:
@@ -112,32 +34,40 @@ def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str
 
 
 def cases(captures: Path | None, scale: str) -> list[Case]:
-    """A case for every setting and scene."""
+    """A case for every setting and scene, then one for every size and scene whose stream is refined."""
     sizes = at_scale(SIZES, scale)
-    return [
+    asked = {**dataclasses.asdict(sizes), "settings": None}
+    scenes = _scenes(captures, sizes.context)
+    found = [
         Case(
             name=f"{scene}, {setting.name}",
-            config=_config(setting, sizes),
-            asked={"scene": scene, "factor": setting.factor, **dataclasses.asdict(sizes)} | {"settings": None},
+            config=config_of(setting, sizes),
+            asked={"scene": scene, "factor": setting.factor, **asked},
             measure=functools.partial(_measured, scene, setting, sizes, opened),
         )
         for setting in SETTINGS[: sizes.settings]
-        for scene, opened in _scenes(captures, sizes.context).items()
+        for scene, opened in scenes.items()
     ]
+    for factor in REFINED_FACTORS if sizes.settings is None else ():
+        settings = [setting for setting in REFINED if setting.factor == factor]
+        found += [
+            Case(
+                name=f"{scene}, size x {factor:g}, refined",
+                config=config_of(settings[0], sizes),
+                asked={"scene": scene, "factor": factor, "steps": [s.refine_steps for s in settings], **asked},
+                measure=functools.partial(_measured_refined, scene, settings, sizes, opened),
+            )
+            for scene, opened in scenes.items()
+        ]
+    return found
 
 
-def _config(setting: Setting, sizes: Sizes) -> StreamConfig:
-    """The preset with the changes; a smoke run shares the programs of other experiments, whose memory starts small."""
-    small = {} if sizes.settings is None else {"capacity": START_CAPACITY}
-    return preset("tiny").replace(**setting.changes, **small)
-
-
-def _measured(scene: str, setting: Setting, sizes: Sizes, opened: "Opened") -> list[Row]:
+def _measured(scene: str, setting: Setting, sizes: Sizes, opened: Opened) -> list[Row]:
     return [{"scene": scene} | measure(setting, sizes, opened)]
 
 
-Opened = Callable[[tuple[int, int]], tuple[Capture, Split]]
-"""Opens a scene with images of a (width, height)."""
+def _measured_refined(scene: str, settings: list[Setting], sizes: Sizes, opened: Opened) -> list[Row]:
+    return [{"scene": scene} | row for row in measure_refined(settings, sizes, opened)]
 
 
 def _scenes(captures: Path | None, context: int) -> dict[str, Opened]:
@@ -146,37 +76,6 @@ def _scenes(captures: Path | None, context: int) -> dict[str, Opened]:
     if captures is not None and (captures / REDKITCHEN).is_dir():
         scenes[REDKITCHEN] = functools.partial(open_redkitchen, captures, context)
     return scenes
-
-
-def measure(setting: Setting, sizes: Sizes, opened: Opened) -> dict[str, Any]:
-    """One row: quality, time and memory of a setting on a scene."""
-    session = new_session(_config(setting, sizes))
-    compiled = session.compile_seconds
-    (capture, split), (scored, _) = opened(setting.size(sizes.scored)), opened(sizes.scored)
-    frame = capture.stream_frame(session.model.config, split.context)
-    exposures, recent = feed_capture(session, capture, split.context, frame, num_recent=2)
-    scores = score_targets(session.gaussians(), scored, split.targets, frame, exposures)
-    camera = scored.camera(split.targets[len(split.targets) // 2], frame)
-    latency = measure_latency(session, recent, camera)
-    views = session.model.config.stream.chunk_size
-    return {
-        "setting": setting.name,
-        "shown": round(scores["shown"]["psnr"], 3),
-        "literal": round(scores["literal"]["psnr"], 3),
-        "ms_per_view": round(latency["chunk_ms"]["median"] / views, 2),
-        "chunk_ms": latency["chunk_ms"]["median"],
-        "render_ms": latency["render_ms"],
-        "reference_ms": round(reference_ms(), 3),
-        "compile_s": round(session.compile_seconds - compiled, 1),
-        "gaussians": session.cache_facts()["decoded"],
-        "peak_memory_bytes": peak_memory(session, camera).bytes,
-    }
-
-
-@functools.cache
-def reference_ms() -> float:
-    """The reference step of `ssplat run --budget-ms` on this machine, timed once a process."""
-    return reference_step_ms()
 
 
 def mark_front(rows: list[Row]) -> None:
@@ -196,15 +95,19 @@ def mark_fronts(rows: list[Row]) -> None:
 
 def _label(row: dict[str, Any]) -> str:
     """The setting, and the quality that it is."""
-    quality = {setting.name: setting.quality for setting in SETTINGS}.get(row["setting"])
+    quality = {setting.name: setting.quality for setting in (*SETTINGS, *REFINED)}.get(row["setting"])
     return f"{row['setting']} ({quality})" if quality else row["setting"]
 
 
 def front_file(rows: list[Row], scale: str) -> dict[str, Any]:
-    """`front.json`: the front of the means over scenes, of the settings that all scenes have."""
+    """`front.json`: the front of the means over scenes, of the settings that all scenes have.
+
+    Settings with refinement are not among them: `ssplat run --budget-ms` bounds the time of a chunk, and they come
+    after the last.
+    """
     num_scenes, by_name = len({row["scene"] for row in rows}), {setting.name: setting for setting in SETTINGS}
     points = []
-    for name in dict.fromkeys(row["setting"] for row in rows):
+    for name in dict.fromkeys(row["setting"] for row in rows if row["setting"] in by_name):
         here = [row for row in rows if row["setting"] == name]
         if len(here) == num_scenes:
             steps = statistics.mean(row["ms_per_view"] / row["reference_ms"] for row in here)
@@ -216,7 +119,7 @@ def front_file(rows: list[Row], scale: str) -> dict[str, Any]:
 
 
 def plot(pyplot: Any, rows: list[Row]) -> Any:
-    """A panel per scene, the front as a line, the qualities ringed, memory as color; the front's points are named."""
+    """A panel per scene, the front as a line, the qualities ringed, memory as color, refined scenes as triangles."""
     scenes = list(dict.fromkeys(row["scene"] for row in rows))
     figure, panels = pyplot.subplots(1, len(scenes), figsize=(7 * len(scenes), 5), layout="constrained", squeeze=False)
     mib = [(row["peak_memory_bytes"] or 0) / 2**20 for row in rows]
@@ -228,9 +131,11 @@ def plot(pyplot: Any, rows: list[Row]) -> Any:
         axes.set_ylim(min(psnrs) - 0.3, max(psnrs) + 0.3)
         front = sorted((r for r in here if r["front"]), key=lambda r: r["ms_per_view"])
         axes.plot([r["ms_per_view"] for r in front], [r["shown"] for r in front], color="#c06030", lw=1.2, zorder=1)
-        places = [[row[column] for row in here] for column in ("ms_per_view", "shown")]
-        colors = [(row["peak_memory_bytes"] or 0) / 2**20 for row in here]
-        dots = axes.scatter(*places, c=colors, s=28, norm=norm, cmap="viridis", zorder=2)
+        for is_refined, marker in ((False, "o"), (True, "^")):
+            of_kind = [row for row in here if ("refine_s" in row) == is_refined]
+            places = [[row[column] for row in of_kind] for column in ("ms_per_view", "shown")]
+            colors = [(row["peak_memory_bytes"] or 0) / 2**20 for row in of_kind]
+            dots = axes.scatter(*places, c=colors, s=28, marker=marker, norm=norm, cmap="viridis", zorder=2)
         figure.draw_without_rendering()  # lays the panel out, so that names know where they are
         _name_points(axes, here)
         axes.set_title(scene)
@@ -247,7 +152,7 @@ def _time_axis(axes: Any, times: list[float]) -> None:
     ticks = [10**k * m for k in range(6) for m in (1, 2, 5) if min(times) <= 1.25 * 10**k * m <= 2 * max(times)]
     axes.set_xticks(ticks, [str(tick) for tick in ticks])
     axes.minorticks_off()
-    axes.set_xlabel("ms per view, chunk in to novel view out")
+    axes.set_xlabel("ms per view, chunk in to novel view out, refinement spread over the views")
 
 
 def _name_points(axes: Any, rows: list[Row]) -> None:
@@ -271,7 +176,9 @@ STUDY = Study(
     name="accuracy_vs_time",
     text="""Every setting streams the same context views with the shipped weights and is scored on the same views at the
 same size. Time is chunk in, one novel view out, on the full cache. `front`: no other setting of the scene is both
-faster and at least as good. `reference ms` is the step that `ssplat run --budget-ms` times.""",
+faster and at least as good. `reference ms` is the step that `ssplat run --budget-ms` times. Rows with steps are the
+second axis: gradient steps on the streamed views after the stream, their time (`refine s`, without compilation) spread
+over the views. One front holds all of them.""",
     cases=cases,
     finish=mark_fronts,
     plot=plot,

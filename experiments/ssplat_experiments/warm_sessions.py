@@ -4,6 +4,7 @@ import functools
 
 from ssplat_jax.checkpoint.weights import load_params
 from ssplat_jax.config import StreamConfig
+from ssplat_jax.refinement import online_refinement
 from ssplat_jax.streaming.session import Session
 from ssplat_jax.streaming.streamsplat import StreamSplat
 
@@ -23,4 +24,5 @@ def new_session(config: StreamConfig) -> Session:
 
 @functools.lru_cache(maxsize=MAX_KEPT)
 def _session(config: StreamConfig) -> Session:
-    return Session(StreamSplat(config), load_params("tiny"))
+    model = StreamSplat(config)
+    return Session(model, load_params("tiny"), revise=online_refinement(model))

@@ -19,6 +19,7 @@ from ssplat_jax.chunk import Chunk
 from ssplat_jax.config import preset
 from ssplat_jax.data.capture import open_capture
 from ssplat_jax.errors import InputError
+from ssplat_jax.refinement import online_refinement
 from ssplat_jax.streaming.session import Session, tokens_per_chunk
 from ssplat_jax.streaming.streamsplat import StreamSplat
 
@@ -47,7 +48,7 @@ def run_benchmark(
     elif name == "refine":
         rows = bench_refine(against)
     elif name == "stream":
-        rows = [dataclasses.asdict(row) for row in (*bench_cache(preset("tiny")), *bench_step())]
+        rows = [dataclasses.asdict(row) for row in (*bench_cache(preset("tiny")), *bench_step(), *bench_online())]
     else:
         raise InputError(f"bench: wanted render, refine or stream, got {name!r}; choose one of them.")
     device = jax.devices()[0]
@@ -55,32 +56,54 @@ def run_benchmark(
     return {"machine": machine, "rows": rows}
 
 
-def bench_step(*, num_chunks: int = 2500, late_size: tuple[int, int] = (64, 48), repeats: int = 15) -> list[Row]:
-    """The whole step with the shipped weights: speed at 320 x 240, and how it depends on the stream's age.
-
-    The stream repeats one walk through a room. Its age is measured with smaller images, since only the cache's part of
-    a step could grow. Steps from copies of the early and the late cache are timed alternately.
-
-    Args:
-        num_chunks: chunks before the late age; the early one is ten.
-        late_size: width and height of the images whose stream grows old.
-        repeats: timings of each age, of which the median counts.
-
-    Returns:
-        One row for each figure.
-    """
+def bench_step() -> list[Row]:
+    """The whole step with the shipped weights: speed at 320 x 240, and how it depends on the stream's age."""
     session, chunks = _session_and_chunks((320, 240))
     seconds = [_seconds(session, chunk) for chunk in chunks]
     step = statistics.median(seconds[1:])  # the first has compiled
     num_tokens = tokens_per_chunk(chunks[0], session.model.config.network.size_multiple)
+    return [
+        Row("step_320x240", step * 1e3, "ms"),
+        Row("step_tokens_per_second", num_tokens / step, "1/s"),
+        *bench_age("step"),
+    ]
 
-    session, chunks = _session_and_chunks(late_size)
+
+def bench_online(*, num_chunks: int = 2500) -> list[Row]:
+    """How a step that refines the scene after each chunk (`--online-refine 2`) depends on the stream's age."""
+    return bench_age("online", num_chunks=num_chunks, steps_per_chunk=2)
+
+
+def bench_age(
+    name: str,
+    *,
+    num_chunks: int = 2500,
+    size: tuple[int, int] = (64, 48),
+    repeats: int = 15,
+    steps_per_chunk: int = 0,
+) -> list[Row]:
+    """Time and memory of a chunk late in a stream against those early in it.
+
+    The stream repeats one walk through a room, with small images, since only the cache's part of a step could grow.
+    Chunks on copies of the early and the late cache are timed alternately.
+
+    Args:
+        name: start of the names of the rows.
+        num_chunks: chunks before the late age; the early one is ten.
+        size: width and height of the images.
+        repeats: timings of each age, of which the median counts.
+        steps_per_chunk: steps of refinement after each chunk.
+
+    Returns:
+        One row for each figure.
+    """
+    session, chunks = _session_and_chunks(size, steps_per_chunk)
     caches, memory = [], []
     for number, chunk in enumerate(itertools.islice(itertools.cycle(chunks), num_chunks), 1):
         session.feed(chunk)
         if number in (10, num_chunks):
             caches.append(jax.tree.map(jnp.copy, session.cache))
-            memory.append(session.step_memory_bytes or 0)
+            memory.append((session.step_memory_bytes or 0) + (session.refine_memory_bytes or 0))
     times: list[list[float]] = [[] for _ in caches]
     for _ in range(repeats):
         for cache, column in zip(caches, times, strict=True):
@@ -88,22 +111,21 @@ def bench_step(*, num_chunks: int = 2500, late_size: tuple[int, int] = (64, 48),
             column.append(min(_seconds(session, chunk) for chunk in chunks[:3]))
     early, late = map(statistics.median, times)
     return [
-        Row("step_320x240", step * 1e3, "ms"),
-        Row("step_tokens_per_second", num_tokens / step, "1/s"),
-        Row("step_late_chunk_over_early", late / early, "x", "<= 1.05"),
-        Row("step_memory_bytes", float(memory[-1]), "B"),
-        Row("step_memory_growth", float(memory[-1] - memory[0]), "B", "0"),
-        Row("step_compilations", float(session.num_compilations), "", "1"),
+        Row(f"{name}_late_chunk_over_early", late / early, "x", "<= 1.05"),
+        Row(f"{name}_memory_bytes", float(memory[-1]), "B"),
+        Row(f"{name}_memory_growth", float(memory[-1] - memory[0]), "B", "0"),
+        Row(f"{name}_compilations", float(session.num_compilations), "", "2" if steps_per_chunk else "1"),
     ]
 
 
-def _session_and_chunks(size: tuple[int, int]) -> tuple[Session, list[Chunk]]:
+def _session_and_chunks(size: tuple[int, int], steps_per_chunk: int = 0) -> tuple[Session, list[Chunk]]:
     """A session whose cache keeps its capacity, and the chunks of one walk through a room."""
-    model = StreamSplat(preset("tiny").replace(overflow="drop_new"))
+    model = StreamSplat(preset("tiny").replace(overflow="drop_new", steps_per_chunk=steps_per_chunk))
     capture = open_capture(f"procedural:room?frames={NUM_FRAMES}", size=size)
     indices = tuple(range(NUM_FRAMES))
     frame = capture.stream_frame(model.config, indices)
-    return Session(model, load_params("tiny")), list(capture.chunks(model.config, indices, frame=frame))
+    session = Session(model, load_params("tiny"), revise=online_refinement(model))
+    return session, list(capture.chunks(model.config, indices, frame=frame))
 
 
 def _seconds(session: Session, chunk: Chunk) -> float:

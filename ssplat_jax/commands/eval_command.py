@@ -21,6 +21,7 @@ from ssplat_jax.commands.options import (
     load_model,
     online_changes,
     parse_size,
+    refinement_steps,
 )
 from ssplat_jax.config import QUALITIES
 
@@ -54,7 +55,8 @@ class Eval:
     """Image size WxH of the scored views; default the capture's own. --quality sets the streamed size."""
     quality: QualityOption = "accurate"
     refine: int = 0
-    """Gradient steps on the context views after the stream; the scores before are reported too."""
+    """Gradient steps on the context views after the stream, default 0, with --quality best 100; the scores before are
+    reported too."""
     revise: ReviseOption = ()
     online_refine: int = 0
     """Gradient steps on kept views after each chunk, while streaming; later chunks see the revised scene."""
@@ -78,7 +80,8 @@ class Eval:
         from ssplat_jax.evaluation.scoring import Display
         from ssplat_jax.runs.eval_run import EvalOptions, eval_path
 
-        check_refinement(self.refine, self.revise, "--refine")
+        refine_steps = refinement_steps(self.quality, self.refine)
+        check_refinement(refine_steps, self.revise, "--refine")
         lpips_weights = load_lpips_weights(self.lpips_vgg, self.lpips_heads)
         changes = online_changes(causal_changes(self.set, self.causal), self.online_refine)
         model, params = load_model(self.weights, changes)
@@ -91,7 +94,7 @@ class Eval:
             targets=self.targets,
             index=self.index,
             scene=self.scene,
-            refine_steps=self.refine,
+            refine_steps=refine_steps,
             revise=self.revise,
             lpips_weights=lpips_weights,
             display=Display(self.over_black, self.one_exposure),

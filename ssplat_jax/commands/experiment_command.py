@@ -19,6 +19,7 @@ class Experiment:
 
     name: Annotated[str, tyro.conf.Positional]
     """all: the tables and figures of the paper, on one page. accuracy_vs_time: accuracy against time.
+    time_to_quality: the stream, refined or not, and per-scene optimization against seconds.
     captures: novel views of real captures. ablation: the effect of each module.
     depth_error: errors of depth, by confidence. more_views: the paper's protocol over growing numbers of views."""
     out: Path

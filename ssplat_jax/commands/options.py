@@ -8,10 +8,10 @@ from typing import Annotated, Literal
 
 import tyro
 
-from ssplat_jax.config import StreamConfig, preset
+from ssplat_jax.config import QUALITIES, StreamConfig, preset
 from ssplat_jax.errors import InputError
 
-QualityName = Literal["fast", "balanced", "accurate"]
+QualityName = Literal["fast", "balanced", "accurate", "best"]
 
 CapturePath = Annotated[
     str,
@@ -30,7 +30,10 @@ PosesOption = Annotated[
 ]
 QualityOption = Annotated[
     QualityName,
-    tyro.conf.arg(help="Accuracy against time: fast and balanced stream smaller images (docs/performance.md)."),
+    tyro.conf.arg(
+        help="Accuracy against time: fast and balanced stream smaller images; best refines the scene after the stream"
+        " (docs/performance.md)."
+    ),
 ]
 WeightsOption = Annotated[str, tyro.conf.arg(help="Preset with shipped weights, or a weights file.")]
 ConfigChanges = Annotated[tuple[str, ...], tyro.conf.arg(help="Changes to the configuration, as field=value.")]
@@ -153,6 +156,11 @@ def check_refinement(steps: int, revise: tuple[str, ...], flag: str) -> None:
         raise InputError(f"--revise: wanted {flag} beside it, got 0 steps; for example {flag} 100.")
     if "auto" in revise and len(revise) > 1:
         raise InputError(f"--revise: wanted auto alone or effects by name, got {' '.join(revise)}.")
+
+
+def refinement_steps(quality: QualityName, steps: int) -> int:
+    """Gradient steps after the stream: those asked for with --refine, else those of --quality."""
+    return steps or QUALITIES[quality].refine_steps
 
 
 def load_lpips_weights(vgg: Path | None, heads: Path | None):

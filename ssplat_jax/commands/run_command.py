@@ -21,6 +21,7 @@ from ssplat_jax.commands.options import (
     load_model,
     online_changes,
     parse_size,
+    refinement_steps,
 )
 from ssplat_jax.commands.refine_command import Refine
 from ssplat_jax.config import QUALITIES
@@ -65,7 +66,8 @@ class Run:
     port: int = 8080
     """With --view: its port; the next free one if it is taken."""
     refine: int = 0
-    """Then take this many gradient steps on the streamed frames, as `ssplat refine` does, into refined.ply."""
+    """Then take this many gradient steps on the streamed frames, as `ssplat refine` does, into refined.ply; default 0,
+    with --quality best 100."""
     revise: ReviseOption = ()
     online_refine: int = 0
     """Gradient steps on kept views after each chunk, while streaming; later chunks see the revised scene."""
@@ -78,6 +80,11 @@ class Run:
     axes: AxesOption = None
     poses: PosesOption = None
     quiet: QuietOption = False
+
+    @property
+    def refine_steps(self) -> int:
+        """Gradient steps after the stream."""
+        return refinement_steps(self.quality, self.refine)
 
     def run(self) -> int:
         self._check()
@@ -94,7 +101,7 @@ class Run:
 
     def _check(self) -> None:
         """Refuses options that contradict each other."""
-        check_refinement(self.refine, self.revise, "--refine")
+        check_refinement(self.refine_steps, self.revise, "--refine")
         if self.quiet_seconds != Run.quiet_seconds and not self.watch:
             raise InputError("--quiet-seconds: wanted --watch beside it, which it is for; got none.")
         if self.watch and (self.axes or self.poses):
@@ -123,11 +130,11 @@ class Run:
                 f"wrote {self.out}/scene.ply ({result.num_gaussians} Gaussians from {result.num_views} views);"
                 f" pictures and figures: {self.out}/report.html"
             )
-        if self.refine:
+        if self.refine_steps:
             return Refine(
                 self.out,
                 self.capture,
-                self.refine,
+                self.refine_steps,
                 self.revise,
                 self.weights,
                 axes=self.axes,

@@ -181,9 +181,16 @@ class Quality:
 
     scale: float
     """Factor by which images are resized before they are streamed."""
+    refine_steps: int = 0
+    """Gradient steps on the streamed views after the stream."""
 
 
-QUALITIES: dict[str, Quality] = {"fast": Quality(0.5), "balanced": Quality(0.75), "accurate": Quality(1.0)}
+QUALITIES: dict[str, Quality] = {
+    "fast": Quality(0.5),
+    "balanced": Quality(0.75),
+    "accurate": Quality(1.0),
+    "best": Quality(1.0, refine_steps=100),
+}
 """Choices of `--quality`."""
 
 

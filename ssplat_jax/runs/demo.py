@@ -9,11 +9,14 @@ import numpy as np
 from ssplat_jax.checkpoint.weights import load_params
 from ssplat_jax.config import QUALITIES, Quality, preset
 from ssplat_jax.console import Reporter
-from ssplat_jax.data.capture import open_capture
-from ssplat_jax.data.split import interleaved_split
+from ssplat_jax.data.capture import Capture, open_capture
+from ssplat_jax.data.split import Split, interleaved_split
+from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.evaluation.pictures import save_comparison, save_image
 from ssplat_jax.evaluation.plots import import_pyplot, save_figure
 from ssplat_jax.evaluation.scoring import ScoredView, mean_scores, score_view
+from ssplat_jax.gaussians import Gaussians
+from ssplat_jax.refinement import CaptureRefinement, refine_on_capture
 from ssplat_jax.runs.finish_run import save_scene
 from ssplat_jax.storage.folders import make_writable
 from ssplat_jax.storage.json_files import write_json
@@ -36,7 +39,8 @@ def run_demo(scene: str, out: Path, reporter: Reporter, quality: Quality = QUALI
         scene: name of the procedural scene.
         out: folder of the scene, the pictures and the metrics.
         reporter: shows progress and the table.
-        quality: size at which images are streamed; they are scored at full size.
+        quality: size at which images are streamed (they are scored at full size), and the gradient steps afterwards,
+            which add a row.
 
     Returns:
         The metrics as written.
@@ -64,7 +68,13 @@ def run_demo(scene: str, out: Path, reporter: Reporter, quality: Quality = QUALI
                 rows.append(_table_row(views, len(exposures), session))
                 strip.append(views[len(views) // 2].color)
     save_scene(folder.scene, session.gaussians(), frame, exposures)
-    for view in views:  # of the last stage: the finished scene
+    refined = {}
+    if quality.refine_steps:
+        done = _refine(session.gaussians(), streamed, split, frame, exposures, quality.refine_steps, reporter)
+        save_scene(folder.refined_scene, done.gaussians, frame, done.exposures)
+        views = [score_view(done.gaussians, capture, i, frame, done.exposures) for i in split.targets]
+        refined = {"refined": {"steps": done.report.num_steps, **_table_row(views, len(exposures), session)}}
+    for view in views:  # of the finished scene
         save_comparison(folder.target(view.score.frame), view.target, view.color, view.depth, (frame.near, frame.far))
     strip.append(views[len(views) // 2].target)
     save_image(out / "views_4_8_16_32_64_target.png", np.concatenate(strip, axis=1))
@@ -73,6 +83,7 @@ def run_demo(scene: str, out: Path, reporter: Reporter, quality: Quality = QUALI
         "size": [capture.width, capture.height],
         "streamed_size": [streamed.width, streamed.height],
         "stages": rows,
+        **refined,
         "cache": session.cache_facts(),
         "compile_s": round(session.compile_seconds, 2),
         "seconds": round(time.perf_counter() - since, 1),
@@ -83,7 +94,28 @@ def run_demo(scene: str, out: Path, reporter: Reporter, quality: Quality = QUALI
     _plot(out / "quality.png", rows)
     header = ("views", "shown dB", "SSIM", "literal dB", "SSIM", "covered", "Gaussians")
     reporter.table(f"{scene}: quality of unseen views", header, [tuple(row.values()) for row in rows])
+    if refined:
+        row = refined["refined"]
+        reporter.say(
+            f"after {row['steps']} refinement steps: shown {row['shown_psnr']:.2f} dB {row['shown_ssim']:.3f},"
+            f" literal {row['literal_psnr']:.2f} dB {row['literal_ssim']:.3f}; {folder.refined_scene}"
+        )
     return metrics
+
+
+def _refine(
+    gaussians: Gaussians,
+    streamed: Capture,
+    split: Split,
+    frame: StreamFrame,
+    exposures: Exposures,
+    steps: int,
+    reporter: Reporter,
+) -> CaptureRefinement:
+    """The scene refined on its context views, with a progress bar."""
+    with reporter.progress("refining", steps) as advance:
+        on_step = lambda step, loss: advance(step, f"loss {loss:.4f}")  # noqa: E731
+        return refine_on_capture(gaussians, streamed, split.context, frame, exposures, steps=steps, on_step=on_step)
 
 
 def _table_row(views: Sequence[ScoredView], num_streamed: int, session: Session) -> dict:

@@ -92,9 +92,16 @@ def test_growth_counts_eight_small_passes_against_a_large_one(monkeypatch):
 
 
 def test_a_stream_keeps_its_memory_and_program_at_every_age():
-    rows = {row.name: row for row in benchmarks.bench_step(num_chunks=30, late_size=(32, 32), repeats=1)}
-    assert rows["step_memory_growth"].value == 0 and rows["step_memory_bytes"].value > 0
-    assert rows["step_compilations"].value == 1
+    for steps, programs in ((0, 1), (1, 2)):  # refinement after each chunk is a program of its own
+        rows = benchmarks.bench_age("any", num_chunks=30, size=(32, 32), repeats=1, steps_per_chunk=steps)
+        found = {row.name: row.value for row in rows}
+        assert all(isinstance(row, Row) for row in rows)
+        assert found["any_memory_growth"] == 0 and found["any_memory_bytes"] > 0
+        assert found["any_compilations"] == programs
+
+
+def test_the_step_is_timed_with_its_tokens(monkeypatch):
+    monkeypatch.setattr(benchmarks, "bench_age", lambda name: [])
+    rows = {row.name: row for row in benchmarks.bench_step()}
     tokens = rows["step_tokens_per_second"].value * rows["step_320x240"].value / 1e3
     assert tokens == pytest.approx(4 * 80 * 64)  # a cell of 4 x 4 pixels, 240 rows padded to 256
-    assert all(isinstance(row, Row) for row in rows.values())

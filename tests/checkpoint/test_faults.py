@@ -26,7 +26,9 @@ SIZE = (64, 48)
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 NUM_KILLS = 50
+NUM_KILLS_ONLINE = 20  # of a run that refines its scene after each chunk
 SAVES_IN_ALL = 50  # that all lives together complete before they are killed, at least
+ONLINE = ("--online-refine", "2")
 LAST_CHUNKS = 6  # this near the end, lives are killed at their first save, so that the stream outlasts the kills
 TIMEOUT = 600.0  # seconds; a life takes about ten
 
@@ -41,9 +43,9 @@ class Life(NamedTuple):
     delay: float  # seconds; for a life without saves and step, a share of the time to the first save
 
 
-def plan(rng: np.random.Generator) -> list[Life]:
+def plan(rng: np.random.Generator, num_kills: int) -> list[Life]:
     """Half of the kills are at random moments, half inside a save: while it writes, or at one of the other steps."""
-    saves = rng.multinomial(SAVES_IN_ALL, np.full(NUM_KILLS, 1 / NUM_KILLS))
+    saves = rng.multinomial(SAVES_IN_ALL, np.full(num_kills, 1 / num_kills))
     lives = []
     for number, passed in enumerate(saves):
         if number % 2 == 0:
@@ -72,9 +74,9 @@ def write_capture(folder: Path) -> Path:
 class Runs:
     """Repeated `ssplat run` of one capture into one folder."""
 
-    def __init__(self, capture: Path, out: Path, save_every: int = 1) -> None:
+    def __init__(self, capture: Path, out: Path, *options: str, save_every: int = 1) -> None:
         self.out, self.state, self.notes = out, out / "state.npz", out.with_suffix(".notes")
-        self.arguments = ("run", str(capture), "--out", str(out), "--save-every", str(save_every), "--quiet")
+        self.arguments = ("run", str(capture), "--out", str(out), "--save-every", str(save_every), "--quiet", *options)
 
     def start(self, moment: str = "-") -> subprocess.Popen:
         self.notes.unlink(missing_ok=True)
@@ -129,7 +131,11 @@ def capture(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def uninterrupted(capture, tmp_path_factory):
-    runs = Runs(capture, tmp_path_factory.mktemp("faults") / "uninterrupted")
+    return results_without_kills(capture, tmp_path_factory.mktemp("faults") / "uninterrupted")
+
+
+def results_without_kills(capture: Path, out: Path, *options: str):
+    runs = Runs(capture, out, *options)
     runs.to_the_end()
     assert runs.fed() == list(range(1, NUM_CHUNKS + 1))
     results = runs.results()
@@ -167,10 +173,20 @@ def modified(path: Path) -> int | None:
 
 
 def test_kills_at_random_moments_and_in_saves_change_nothing(capture, uninterrupted, tmp_path):
-    runs = Runs(capture, tmp_path / "killed")
+    kill_and_compare(Runs(capture, tmp_path / "killed"), NUM_KILLS, uninterrupted)
+
+
+def test_kills_of_a_run_that_refines_while_streaming_change_nothing(capture, uninterrupted, tmp_path):
+    wanted = results_without_kills(capture, tmp_path / "whole", *ONLINE)
+    assert wanted["scene.ply"] != uninterrupted["scene.ply"]  # the steps do something
+    kill_and_compare(Runs(capture, tmp_path / "killed", *ONLINE), NUM_KILLS_ONLINE, wanted)
+
+
+def kill_and_compare(runs: Runs, num_kills: int, wanted) -> None:
+    """Kills a run many times, lets it end, and compares its results with those of a run that was left alone."""
     since, time_to_save = time.monotonic(), 5.0
     torn, reached, lost = 0, [], []
-    lives = plan(np.random.default_rng(0))
+    lives = plan(np.random.default_rng(0), num_kills)
     for life in lives:
         before, was_between = runs.chunks_on_disk(), runs.is_between_renames()
         if before >= NUM_CHUNKS - LAST_CHUNKS:
@@ -191,12 +207,12 @@ def test_kills_at_random_moments_and_in_saves_change_nothing(capture, uninterrup
         code, errors = runs.end(runs.start(f"{file},rename,1,0"))
         assert code == -signal.SIGKILL, errors
     runs.to_the_end()
-    assert_equal(runs.results(), uninterrupted)
+    assert_equal(runs.results(), wanted)
     assert [p.name for p in runs.out.rglob("*.partial")] == []
     inside = sum(life.step is not None for life in lives)
-    assert inside == NUM_KILLS // 2 and torn >= NUM_KILLS // 4
+    assert inside == num_kills // 2 and torn >= num_kills // 4
     print(
-        f"\n{len(lives)} kills, {inside} of them at a chosen step of a save, {torn} left a torn save; the 50th after"
+        f"\n{len(lives)} kills, {inside} of them at a chosen step of a save, {torn} left a torn save; the last after"
         f" {reached[-1]} of {NUM_CHUNKS} chunks; {sum(lost)} chunks lost in all, at most {max(lost)} in a life;"
         f" {time.monotonic() - since:.0f} s"
     )

@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 from ssplat_experiments.ablation import add_differences, findings
 from ssplat_experiments.ablation import cases as ablation_cases
-from ssplat_experiments.accuracy_vs_time import SETTINGS, front_file, mark_front
+from ssplat_experiments.accuracy_vs_time import cases as settings_cases
+from ssplat_experiments.accuracy_vs_time import front_file, mark_front
 from ssplat_experiments.depth_error import cell_depths, summary
+from ssplat_experiments.settings import REFINED, SETTINGS
 
 from ssplat_jax.checkpoint.weights import check_params, load_params
 from ssplat_jax.commands.experiment_command import Experiment
@@ -30,11 +32,11 @@ def test_the_front_holds_undominated_settings():
 
 
 def test_the_qualities_are_settings_that_were_measured():
-    measured = {setting.quality: setting for setting in SETTINGS if setting.quality}
+    measured = {setting.quality: setting for setting in (*SETTINGS, *REFINED) if setting.quality}
     assert measured.keys() == QUALITIES.keys() == set(get_args(QualityName))
     for name, quality in QUALITIES.items():
-        assert measured[name].changes == {}  # a quality changes the size only
-        assert measured[name].factor == quality.scale
+        assert measured[name].changes == {}  # a quality changes the size and the steps only
+        assert (measured[name].factor, measured[name].refine_steps) == (quality.scale, quality.refine_steps)
 
 
 def test_settings_are_many_and_differ():
@@ -43,12 +45,21 @@ def test_settings_are_many_and_differ():
     assert len({(setting.factor, str(setting.changes)) for setting in SETTINGS}) == len(SETTINGS)
 
 
+def test_the_second_axis_has_thirty_points_at_sizes_that_are_measured_without_steps_too():
+    assert len({setting.name for setting in (*SETTINGS, *REFINED)}) == len(SETTINGS) + len(REFINED) >= 57
+    assert {s.factor for s in REFINED} <= {s.factor for s in SETTINGS if not s.changes} and len(REFINED) == 30
+    names = [case.name for case in settings_cases(None, "cpu")]
+    assert len(set(names)) == len(names) == len(SETTINGS) + 6
+    assert not any("refined" in case.name for case in settings_cases(None, "smoke"))
+
+
 def test_the_front_file_holds_means_in_reference_steps():
     origin = {"machine": "m", "date": "d", "commit": "c"}
     measured = [
         ("room", "preset", 200.0, 20.0, 10.0), ("kitchen", "preset", 300.0, 10.0, 12.0),
         ("room", "size x 0.5", 100.0, 19.0, 10.0), ("kitchen", "size x 0.5", 100.0, 9.0, 10.0),
         ("room", "size x 0.75", 50.0, 30.0, 10.0),  # measured on one scene alone
+        ("room", "100 steps", 900.0, 40.0, 10.0), ("kitchen", "100 steps", 900.0, 40.0, 10.0),  # not within a chunk
     ]  # fmt: skip
     rows = [
         {"scene": s, "setting": n, "ms_per_view": ms, "shown": psnr, "reference_ms": ref} | origin

@@ -1,0 +1,98 @@
+"""Curves of quality against seconds: the best so far at each time, where curves cross, and the plot."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ssplat_experiments.cases import Row
+
+OPTIMIZED = "per-scene optimization"
+COLUMNS = {"literal": "literal_psnr", "shown": "shown_psnr"}
+COLORS = ("#30507a", "#c06030", "#3a8a5a", "#8a5a9a", "#b09030")
+
+
+def best_at(rows: Sequence[Row], seconds: float, column: str) -> float:
+    """The best score of some curves that was reached by a time; -inf before the first."""
+    return max((row[column] for row in rows if row["seconds"] <= seconds), default=-np.inf)
+
+
+def lead(rows: Sequence[Row], column: str) -> tuple[float | None, float, float]:
+    """When per-scene optimization comes to lead, and by how much it leads or trails at the end, in dB.
+
+    Rows are those of one scene. Each curve counts with the best that it has reached so far.
+
+    Returns:
+        The first time from which per-scene optimization is ahead to the end (None if it is not), the last time that
+        it was measured, and its score there minus the best of the others.
+    """
+    theirs = [row for row in rows if row["method"] == OPTIMIZED]
+    ours = [row for row in rows if row["method"] != OPTIMIZED]
+    times = sorted({row["seconds"] for row in rows})
+    end = max(row["seconds"] for row in theirs)
+    leads = [best_at(theirs, t, column) - best_at(ours, t, column) for t in times]
+    behind = [t for t, gap in zip(times, leads, strict=True) if not gap > 0]
+    after = [t for t in times if not behind or t > behind[-1]]
+    return (after[0] if after else None), end, best_at(theirs, end, column) - best_at(ours, end, column)
+
+
+def findings(rows: list[Row]) -> list[str]:
+    """Who is ahead, until when, and by how much, for each scene and column."""
+    lines = []
+    for scene in dict.fromkeys(row["scene"] for row in rows):
+        here = [row for row in rows if row["scene"] == scene]
+        methods = {row["method"] for row in here}
+        if OPTIMIZED not in methods or len(methods) < 2:
+            continue
+        for name, column in COLUMNS.items():
+            crossing, end, gap = lead(here, column)
+            first = min((row for row in here if row["method"] != OPTIMIZED), key=lambda row: row["seconds"])
+            ours = [row for row in here if row["method"] != OPTIMIZED]
+            best = max(ours, key=lambda row: row[column])
+            theirs = max((row for row in here if row["method"] == OPTIMIZED), key=lambda row: row[column])
+            where = (
+                f"the curves do not cross up to {end:.0f} s"
+                if crossing is None
+                else f"per-scene optimization leads from {crossing:.1f} s on"
+            )
+            lines.append(
+                f"* {scene}, {name}: {where}; ours has its first score, {first[column]:.2f} dB, after"
+                f" {first['seconds']:.1f} s and its best, {best[column]:.2f} dB ({best['method']}), after"
+                f" {best['seconds']:.1f} s; per-scene optimization its best, {theirs[column]:.2f} dB, after"
+                f" {theirs['seconds']:.1f} s, and at its end it is {gap:+.2f} dB from ours."
+            )
+    return ["\n".join(lines)] if lines else []
+
+
+def plot(pyplot: Any, rows: list[Row]) -> Any:
+    """A column of panels for each scene, literal above shown; per-scene optimization in black."""
+    scenes = list(dict.fromkeys(row["scene"] for row in rows))
+    methods = list(dict.fromkeys(row["method"] for row in rows))
+    color = dict(zip([m for m in methods if m != OPTIMIZED], COLORS, strict=False)) | {OPTIMIZED: "black"}
+    figure, panels = pyplot.subplots(
+        2, len(scenes), figsize=(1 + 3.4 * len(scenes), 5.6), sharex=True, layout="constrained", squeeze=False
+    )
+    for column, scene in enumerate(scenes):
+        for axes, (name, score) in zip(panels[:, column], COLUMNS.items(), strict=True):
+            for method in methods:
+                line = [(r["seconds"], r[score]) for r in rows if (r["scene"], r["method"]) == (scene, method)]
+                line = [(t, psnr) for t, psnr in line if t > 0.1]
+                if line:
+                    style = "--" if method == OPTIMIZED else "-"
+                    axes.plot(*zip(*line, strict=True), style, marker="o", ms=3, color=color.get(method), label=method)
+            axes.set_xscale("log")
+            axes.set_ylabel(f"PSNR, {name}, dB")
+            axes.spines[["top", "right"]].set_visible(False)
+        panels[0, column].set_title(scene)
+        _time_ticks(panels[1, column], [row["seconds"] for row in rows])
+    figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=8)
+    return figure
+
+
+def _time_ticks(axes: Any, times: list[float]) -> None:
+    """Round ticks of seconds on a logarithmic axis."""
+    most = max(times)
+    ticks = [tick for tick in (0.1, 0.3, 1, 3, 10, 30, 100, 300, 1000, 3000) if tick <= 1.3 * most]
+    axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+    axes.minorticks_off()
+    axes.set_xlabel("seconds, without compilation")
