@@ -140,7 +140,7 @@ def optimize(
     config, rng = config or SplattingConfig(), np.random.default_rng(seed)
     extent = camera_extent(views.viewmats)
     state = fitted(start_state(start, config), config)
-    max_pairs = _pairs_capacity(start, views)
+    max_pairs = _pairs_capacity(scene_of(state.parameters, state.is_present), views)
     order: list[int] = []
     for num_steps in itertools.count(1):
         order = order or [int(i) for i in rng.permutation(views.num_slots)]

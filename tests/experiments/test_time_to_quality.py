@@ -93,4 +93,4 @@ def test_a_curve_ends_when_no_column_improves_any_more():
 def test_all_methods_are_measured_on_all_scenes():
     found = [case.name for case in cases(None, "cpu")]
     assert found[:3] == ["room, stream", "room, stream + offline", f"room, {OPTIMIZED}"]
-    assert [name for name in found if "online" in name] == [f"room, stream + online {m}" for m in (2, 4, 8)]
+    assert [name for name in found if "online" in name] == [f"room, stream + online {m}" for m in (4, 8)]
