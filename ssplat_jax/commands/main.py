@@ -7,11 +7,14 @@ Commands import JAX when they run, so that `ssplat --help` answers at once. Exit
 
 import functools
 import operator
+import platform
 import sys
+from importlib import metadata
 from typing import Annotated
 
 import tyro
 
+from ssplat_jax import __version__
 from ssplat_jax.commands.bench_command import Bench
 from ssplat_jax.commands.demo_command import Demo
 from ssplat_jax.commands.eval_command import Eval
@@ -25,7 +28,7 @@ from ssplat_jax.commands.refine_command import Refine
 from ssplat_jax.commands.render_command import Render
 from ssplat_jax.commands.run_command import Run
 from ssplat_jax.commands.train_command import Train
-from ssplat_jax.commands.usage import check_usage, parse_in_one_line
+from ssplat_jax.commands.usage import VERSION, check_usage, parse_in_one_line
 from ssplat_jax.commands.view_command import View
 from ssplat_jax.commands.weights_command import Weights
 from ssplat_jax.commands.worlds_command import Worlds
@@ -55,8 +58,12 @@ COMMANDS = {
 
 def main(arguments: list[str] | None = None) -> None:
     """Runs the command in `arguments` (default: those of the process) and exits with its code."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    if arguments == [VERSION]:
+        print(_version())
+        sys.exit(0)
     try:
-        command = _parse(sys.argv[1:] if arguments is None else arguments)
+        command = _parse(arguments)
     except InputError as error:
         sys.exit(_refuse(error, EXIT_INPUT))
     if not isinstance(command, Bench | Experiment):  # which measure what compiling costs
@@ -77,12 +84,19 @@ def _parse(arguments: list[str]):
             tyro.cli,
             functools.reduce(operator.or_, commands),  # pyright: ignore[reportCallIssue, reportArgumentType]
             prog="ssplat",
-            description="StreamSplat in JAX: a calibrated image stream becomes a 3D Gaussian scene, chunk by chunk.",
+            description="StreamSplat in JAX: a calibrated image stream becomes a 3D Gaussian scene, chunk by chunk."
+            " `ssplat --version` prints versions.",
             args=arguments,
             config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
         ),
         arguments[0],
     )
+
+
+def _version() -> str:
+    """Versions of the package and of what it stands on, for reports of errors; answers without importing JAX."""
+    packages = ", ".join(f"{name} {metadata.version(name)}" for name in ("jax", "jaxlib", "flax"))
+    return f"ssplat {__version__} ({packages}, Python {platform.python_version()}, {platform.platform()})"
 
 
 def guarded(run) -> int:
@@ -91,6 +105,8 @@ def guarded(run) -> int:
         return run()
     except InputError as error:
         return _refuse(error, EXIT_INPUT)
+    except BrokenPipeError:  # nobody reads the output any more, which is no matter of storage
+        raise
     except (StorageError, OSError) as error:
         return _refuse(error, EXIT_STORAGE)
     except CacheError as error:

@@ -13,6 +13,7 @@ import threading
 from typing import NoReturn
 
 EXIT_INTERRUPTED, MESSAGE = 130, "ssplat: interrupted\n"
+EXIT_BROKEN_PIPE = 128 + signal.SIGPIPE
 
 PATIENCE = 5.0
 """Seconds that a command has to unwind after Ctrl-C; then the process ends where it stands, as after a kill."""
@@ -27,7 +28,13 @@ def start() -> None:
             sys.unraisablehook = interrupt.leave_if_swallowed
         from ssplat_jax.commands.main import main
 
-        main()
+        try:
+            main()
+        finally:
+            sys.stdout.flush()
+    except BrokenPipeError:  # nobody reads on, as in `ssplat --help | head -3`
+        if not interrupt.received:
+            _leave(EXIT_BROKEN_PIPE)
     except SystemExit as ended:
         if ended.code in (EXIT_INTERRUPTED, 128 + signal.SIGTERM):  # the command has said so
             _leave(int(ended.code))

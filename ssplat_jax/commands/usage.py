@@ -11,7 +11,7 @@ from typing import Any
 
 from ssplat_jax.errors import InputError, echo
 
-HELP = ("-h", "--help")
+HELP, VERSION = ("-h", "--help"), "--version"
 NAME_INDENT = 4  # of the names of missing options, in the parser's box; help on them is indented by 8
 
 
@@ -29,6 +29,8 @@ def check_usage(arguments: Sequence[str], commands: Mapping[str, type]) -> None:
     if not arguments:
         raise InputError(f"wanted a command ({names}), got none; start with `ssplat demo`, or see `ssplat --help`.")
     name = arguments[0]
+    if name == VERSION:
+        raise InputError(f"{VERSION}: wanted nothing beside it, got {echo(' '.join(arguments[1:]))}; leave that out.")
     if name in HELP or name.startswith("--tyro-"):
         return
     if name not in commands:

@@ -3,9 +3,11 @@
 import dataclasses
 import functools
 import hashlib
+import importlib.metadata
 import json
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -16,6 +18,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from ssplat_jax import __version__
 from ssplat_jax.checkpoint.delta_files import load_delta, load_delta_header
 from ssplat_jax.checkpoint.published_weights import as_published, published_tensors
 from ssplat_jax.checkpoint.stream_state import load_state
@@ -80,6 +83,22 @@ def test_help_answers_within_a_second():
     since = time.perf_counter()
     subprocess.run([sys.executable, "-m", "ssplat_jax.commands.main", "--help"], capture_output=True, check=True)
     assert time.perf_counter() - since < 1.0
+
+
+def test_version_names_what_a_report_of_an_error_needs(capsys):
+    assert run("--version") == 0
+    words = capsys.readouterr().out.split()
+    assert words[:2] == ["ssplat", __version__]
+    assert words[2:4] == ["(jax", f"{importlib.metadata.version('jax')},"]
+
+
+def test_output_that_nobody_reads_ends_a_command_quietly():
+    code = "from ssplat_jax.commands.start import start; start()"
+    command = [sys.executable, "-c", code, "--help"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    assert process.stdout is not None and process.stderr is not None
+    process.stdout.close()
+    assert (process.stderr.read(), process.wait()) == (b"", 128 + signal.SIGPIPE)
 
 
 def truncate(capture):
@@ -147,6 +166,7 @@ def test_results_among_the_captures_own_images_are_refused(command, place, tmp_p
     [
         ((), "ssplat demo"),
         (("rnu",), "run"),
+        (("--version", "run"), "--version: wanted nothing beside it, got 'run'"),
         (("run", "x", "--out", "y", "--szie", "3"), "--size"),
         (("run", "x", "--out", "y", "--stride", "x"), "whole number"),
         (("run", "x", "--out", "y", "--quality", "best"), "balanced"),
@@ -236,6 +256,7 @@ def test_run_stops_resumes_and_exports(tmp_path, capsys):
     assert_deltas_give_the_scene(out, "000004.npz", "000008.npz", "000012.npz")
     metrics = json.loads((out / "metrics.json").read_text())
     assert metrics["cache"]["num_chunks"] == 3 and list(metrics["exposures"]) == [str(i) for i in range(12)]
+    assert metrics["peak_memory_bytes"] >= metrics["step_memory_bytes"] > 0
     assert run("export", str(out), "--to", str(tmp_path / "again.ply")) == 0
     assert (tmp_path / "again.ply").read_bytes() == (out / "scene.ply").read_bytes()
     other = tmp_path / "other.npz"
