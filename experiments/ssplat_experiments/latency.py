@@ -31,12 +31,14 @@ from ssplat_jax.config import StreamConfig, preset
 from ssplat_jax.console import Reporter
 from ssplat_jax.data.capture import open_capture
 from ssplat_jax.evaluation.latency import measure_latency
+from ssplat_jax.evaluation.peak_memory import peak_memory
 from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.rasterizer import render
 from ssplat_jax.streaming.feed import feed_capture
 from ssplat_jax.streaming.session import Session
 
 STAGES = ("copy to device", "project the cache", "network", "fuse and carve", "decode", "render")
+WHOLE = "as a stream runs it"
 COLORS = ("#909090", "#30507a", "#c06030", "#308050", "#806090", "#b09030")
 
 
@@ -76,7 +78,7 @@ def cases(captures: Path | None, scale: str) -> list[Case]:
 
 
 def measured(config: StreamConfig, size: tuple[int, int], sizes: Sizes) -> list[Row]:
-    """A row for each stage, for their sum and for the whole."""
+    """A row for each stage, for their sum and for the whole, which has the memory."""
     capture = open_capture(f"procedural:room?frames={sizes.views}", size=size)
     frame = capture.stream_frame(config)
     session = new_session(config)
@@ -84,7 +86,8 @@ def measured(config: StreamConfig, size: tuple[int, int], sizes: Sizes) -> list[
     camera = capture.camera(sizes.views // 2, frame)
     whole = measure_latency(session, recent, camera)["chunk_ms"]["median"]
     parts = stage_times(session, recent[-1], camera, sizes.repeats)
-    parts |= {"sum of stages": sum(parts.values()), "as a stream runs it": whole}
+    parts |= {"sum of stages": sum(parts.values()), WHOLE: whole}
+    memory = peak_memory(session, camera).bytes
     views = config.stream.chunk_size
     width, height = size
     return [
@@ -94,6 +97,7 @@ def measured(config: StreamConfig, size: tuple[int, int], sizes: Sizes) -> list[
             "ms": round(ms, 2),
             "ms_per_view": round(ms / views, 2),
             "views_per_second": round(1e3 * views / ms, 1) if stage not in STAGES else None,
+            "peak_memory_bytes": memory if stage == WHOLE else None,
         }
         for stage, ms in parts.items()
     ]
@@ -153,7 +157,7 @@ def plot(pyplot: Any, rows: list[Row]) -> Any:
         for stage, color in zip(STAGES, COLORS, strict=True):
             axes.barh(place, parts[stage], left=left, color=color, label=stage if place == 0 else None)
             left += parts[stage]
-        axes.plot([parts["as a stream runs it"]] * 2, [place - 0.45, place + 0.45], color="black", lw=1.5)
+        axes.plot([parts[WHOLE]] * 2, [place - 0.45, place + 0.45], color="black", lw=1.5)
     axes.set_yticks(range(len(sizes)), sizes)
     axes.set_xlabel("ms from a chunk to a novel view")
     axes.spines[["top", "right"]].set_visible(False)

@@ -4,7 +4,8 @@
 
 The folder of renders holds `split.json`, as `ssplat eval` writes it, and one image for each target, named by its frame:
 `00004.png`. All images have one size, at which the capture is read. Scores are literal: the pixels as they are, no
-holes filled and no exposure changed. The nearest context view and the mean color stand beside them.
+holes filled and no exposure changed. The nearest context view and the mean color stand beside them. The row shows the
+`peak_memory_bytes` of `metrics.json`, as `ssplat eval` writes it, where the folder holds one.
 """
 
 import functools
@@ -22,12 +23,12 @@ from ssplat_experiments.study import Study, run_study
 from ssplat_jax.console import Reporter
 from ssplat_jax.data.capture import Capture, open_capture
 from ssplat_jax.data.split import Split
-from ssplat_jax.errors import InputError
+from ssplat_jax.errors import InputError, echo
 from ssplat_jax.evaluation.nearest_views import nearest_views
 from ssplat_jax.evaluation.scoring import check_scorable, score_image
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
-SPLIT = "split.json"
+SPLIT, METRICS = "split.json", "metrics.json"
 TEXT = """Renders of another method against the targets of a split: literal scores, of the pixels as they are. The
 nearest context view and the mean color of the context stand beside them."""
 
@@ -65,14 +66,18 @@ def study_of(path: str, renders: Path) -> Study:
         raise InputError(f"{renders / SPLIT}: wanted frames below {len(capture)}, which {capture.name} has.")
     digest = hashlib.sha256(b"".join(files[i].read_bytes() for i in split.targets)).hexdigest()[:12]
     frames = capture.digest((*split.context, *split.targets))
+    memory = read_memory(renders / METRICS)
     asked = {"capture": capture.name, "frames": frames, "split": split.sha256[:12], "renders": digest}
+    asked |= {} if memory is None else {"peak_memory_bytes": memory}
     method = renders.resolve().name
-    case = Case(method, None, asked, functools.partial(measured, method, capture, split, images))
+    case = Case(method, None, asked, functools.partial(measured, method, capture, split, images, memory))
     return Study("score", TEXT, lambda captures, scale: [case])
 
 
-def measured(method: str, capture: Capture, split: Split, images: dict[int, Float[np.ndarray, "h w 3"]]) -> list[Row]:
-    """Mean scores of the renders and of two baselines."""
+def measured(
+    method: str, capture: Capture, split: Split, images: dict[int, Float[np.ndarray, "h w 3"]], memory: int | None
+) -> list[Row]:
+    """Mean scores of the renders, whose method needed `memory` bytes, and of two baselines."""
     mean = np.mean([capture.image(i).mean(axis=(0, 1)) for i in split.context], axis=0)
     flat = np.broadcast_to(mean, capture.image(split.targets[0]).shape).astype(np.float32)
     shown = {
@@ -85,6 +90,7 @@ def measured(method: str, capture: Capture, split: Split, images: dict[int, Floa
         scores = [score_image(by_target[i], capture.image(i)) for i in split.targets]
         row = {"method": name, "capture": capture.name, "size": f"{capture.width}x{capture.height}"}
         row |= {f"literal_{m}": round(statistics.mean(getattr(s, m) for s in scores), 4) for m in ("psnr", "ssim")}
+        row |= {"peak_memory_bytes": memory if name == method else None}
         rows.append(row | {"targets": len(split.targets), "split": split.sha256[:12]})
     return rows
 
@@ -106,6 +112,24 @@ def read_split(path: Path) -> Split:
             f"{path}: wanted a split with protocol, context and targets, got {type(error).__name__} ({error}); copy the"
             " split.json that `ssplat eval` wrote."
         ) from None
+
+
+def read_memory(path: Path) -> int | None:
+    """The peak memory in bytes that a file of metrics names; None without a file, or if it names none.
+
+    Raises:
+        InputError: the file is damaged, or the number is not one of bytes.
+    """
+    try:
+        found = json.loads(path.read_text()).get("peak_memory_bytes")
+        if found is None or (type(found) is int and found > 0):
+            return found
+        got = f"peak_memory_bytes {echo(found)}"
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, AttributeError) as error:
+        got = f"{type(error).__name__} ({error})"
+    raise InputError(f"{path}: wanted metrics with a number of bytes, got {got}; remove the file or mend it.")
 
 
 def _file_of(folder: Path, i: int) -> Path:

@@ -50,7 +50,7 @@ class PeakMemory:
 def peak_memory(session: Session, camera: Camera) -> PeakMemory:
     """Memory of a session that takes in a chunk, decodes its cache and renders a view.
 
-    The programs of decoding and rendering are compiled once more to be analyzed. The session keeps its cache.
+    The program of rendering is compiled once more to be analyzed. The session keeps its cache.
 
     Args:
         session: a stream that has taken in at least one chunk; `step` is that of the last.

@@ -12,6 +12,7 @@ from ssplat_jax.console import Reporter
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.evaluation.exposures import exposures_to_json
+from ssplat_jax.evaluation.peak_memory import peak_memory
 from ssplat_jax.evaluation.pictures import save_comparison
 from ssplat_jax.evaluation.scoring import score_view
 from ssplat_jax.gaussians import Gaussians, scale_colors
@@ -67,7 +68,8 @@ def finish_run(
         "seen_views": scores,  # of streamed views: how well the scene explains its input
         "ply": dataclasses.asdict(report),
         "compile_s": round(run.session.compile_seconds, 2),
-        "step_memory_bytes": run.session.step_memory_bytes,
+        "step_memory_bytes": run.session.step_memory_bytes,  # None if all views were streamed before this call
+        "peak_memory_bytes": peak_memory(run.session, capture.camera(shown[len(shown) // 2], frame)).bytes,
         "cache": run.session.cache_facts(),
         "stream_frame": frame.to_dict(),
         "config_hash": run.session.model.config.hash,

@@ -142,7 +142,8 @@ class Session:
         Only shown pivots are decoded, because a cache has capacity for many more than it holds. Their number is rounded
         up to a power of two, so that few programs are compiled.
         """
-        return self._decode_shown(*self._decode_arguments())
+        params, cache, _ = self._decode_arguments()
+        return self.decode_program()(params, cache)
 
     def _decode_arguments(self) -> tuple[dict, VoxelCache, int]:
         """Parameters, cache and number of pivots to decode."""
@@ -158,9 +159,10 @@ class Session:
         return self._last_program
 
     def decode_program(self) -> jax.stages.Compiled:
-        """The program of `gaussians` for the present cache, compiled once more so that it can be analyzed."""
+        """The compiled program of `gaussians` for the present cache."""
         params, cache, num_pivots = self._decode_arguments()
-        key = (cache.capacity, num_pivots)
+        leaves, structure = jax.tree.flatten(cache)
+        key = (num_pivots, structure, *((leaf.shape, leaf.dtype) for leaf in leaves))
         if key not in self._decode_programs:
             self._decode_programs[key] = self._decode_shown.lower(params, cache, num_pivots).compile()
         return self._decode_programs[key]

@@ -26,7 +26,7 @@ from ssplat_jax.streaming.session import Session
 from tests.commands.test_cli import make_capture
 
 NUM_CHUNKS, CHUNK_SIZE = 3, 2
-FIELDS_OF_ONE_PROCESS = ("compile_s", "step_memory_bytes")  # of metrics.json
+FIELDS_OF_ONE_PROCESS = ("compile_s", "step_memory_bytes", "peak_memory_bytes")  # of metrics.json
 NUM_DAMAGES = 12
 KINDS = ("refuse", "write", "fsync")
 

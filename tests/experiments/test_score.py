@@ -43,6 +43,20 @@ def test_renders_are_scored_as_they_are(renders, tmp_path):
     assert (theirs["method"], copy["method"], flat["method"]) == ("theirs", "copy nearest", "mean color")
 
 
+def test_the_memory_of_a_method_is_that_of_its_metrics(renders, tmp_path, capsys):
+    folder, _, _ = renders
+    command = Experiment("score", out=tmp_path / "out", captures=Path(ROOM), renders=folder, quiet=True)
+    (folder / "metrics.json").write_text('{"peak_memory_bytes": 123456}')
+    assert guarded(command.run) == 0
+    rows = json.loads((tmp_path / "out" / "table.json").read_text())
+    assert [row["peak_memory_bytes"] for row in rows] == [123456, None, None]
+    bad = {'{"peak_memory_bytes": "much"}': "'much'", '{"peak_memory_bytes": -1}': "-1", "[]": "list"}
+    for text, words in bad.items():
+        (folder / "metrics.json").write_text(text)
+        assert guarded(dataclasses.replace(command, out=tmp_path / "other").run) == 2
+        assert words in capsys.readouterr().err
+
+
 def test_changed_renders_are_not_mixed_with_old_scores(renders, tmp_path, capsys):
     folder, _, split = renders
     command = Experiment("score", out=tmp_path / "out", captures=Path(ROOM), renders=folder, quiet=True)
