@@ -1,5 +1,7 @@
 """`Viewer`: a server of viser (extra `viewer`), which shows the stage in browsers."""
 
+import contextlib
+import io
 import socket
 from typing import Any
 
@@ -43,7 +45,8 @@ class Viewer:
         viser = import_viser()
         check_address(host, port)
         self._stage, self._browsers = stage, {}
-        self._server: Any = viser.ViserServer(host=host, port=port, label="ssplat", verbose=False)
+        with contextlib.redirect_stdout(io.StringIO()):  # viser's banner; `show_source` says the address
+            self._server: Any = viser.ViserServer(host=host, port=port, label="ssplat", verbose=False)
         self._server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
         self._has_camera = False
         self._server.on_client_connect(self._welcome)
@@ -79,7 +82,8 @@ class Viewer:
 
     def close(self) -> None:
         """Stops the server."""
-        self._server.stop()
+        with contextlib.redirect_stdout(io.StringIO()):
+            self._server.stop()
 
 
 def import_viser() -> Any:

@@ -242,7 +242,7 @@ def free_port():
         return probe.getsockname()[1]
 
 
-def test_the_server_answers_at_its_url(tmp_path):
+def test_the_server_answers_at_its_url_and_prints_nothing(tmp_path, capsys):
     pytest.importorskip("viser")
     viewer = Viewer(some_stage(tmp_path), host="127.0.0.1", port=free_port())
     try:
@@ -253,6 +253,7 @@ def test_the_server_answers_at_its_url(tmp_path):
         assert viewer.browsers == []
     finally:
         viewer.close()
+    assert capsys.readouterr() == ("", "")
 
 
 @pytest.mark.slow
