@@ -1,5 +1,6 @@
 """Scores: holes are filled with the colors around; over black they cost what they are worth."""
 
+import dataclasses
 import json
 
 import jax.numpy as jnp
@@ -9,11 +10,12 @@ import pytest
 from ssplat_jax.cache import init_cache
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.data.capture import open_capture
+from ssplat_jax.data.split import Split
 from ssplat_jax.evaluation import latency
 from ssplat_jax.evaluation.exposures import exposures_from_json, exposures_to_json
 from ssplat_jax.evaluation.latency import measure_latency
 from ssplat_jax.evaluation.nearest_views import nearest_views
-from ssplat_jax.evaluation.scoring import score_view
+from ssplat_jax.evaluation.scoring import baselines, score_view
 from ssplat_jax.gaussians import Gaussians, mean_color
 from ssplat_jax.metrics.lpips import load_lpips, lpips
 from ssplat_jax.metrics.psnr_ssim import psnr, ssim
@@ -73,6 +75,29 @@ def test_a_novel_view_has_the_mean_exposure_of_its_neighbors(capture):
     assert score.literal == plain.literal  # exposures do not enter the paper's scores
     color = score_view(scene, capture, 4, frame, exposures).color  # a streamed view has its own
     np.testing.assert_allclose(color, np.broadcast_to([0.2, 0.4, 1.0], color.shape), atol=1e-6)
+
+
+def test_nearness_counts_centers_and_angles(capture):
+    """By the extent, 2 here, of the candidates: half of it is as far as a turn by half a radian."""
+    turns = {0: (0.0, 0.0), 1: (2.0, 0.0), 2: (0.5, 0.0), 3: (0.0, 0.4), 4: (0.0, 1.3)}  # x and angle
+    frames = []
+    for (x, angle), frame in zip(turns.values(), capture.frames, strict=True):
+        pose = np.eye(4)
+        pose[:3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+        pose[0, 3] = x
+        frames.append(dataclasses.replace(frame, camtoworld=pose))
+    turned = dataclasses.replace(capture, frames=tuple(frames))
+    assert nearest_views(turned, 0, (1, 2, 3, 4)) == [2, 3, 1, 4]  # 0.25, 0.4, 1.0, 1.3
+
+
+def test_the_baselines_copy_the_nearest_view_and_show_the_mean_color(capture):
+    split = Split("given", context=(0, 4), targets=(1, 3))
+    found = baselines(capture, split)
+    copies = [psnr(capture.image(near), capture.image(i)) for near, i in ((0, 1), (4, 3))]
+    assert found["nearest_view_psnr"] == pytest.approx(np.mean(copies), abs=1e-4)
+    mean = np.mean([capture.image(0), capture.image(4)], axis=(0, 1, 2))
+    flats = [psnr(np.broadcast_to(mean, capture.image(i).shape).astype(np.float32), capture.image(i)) for i in (1, 3)]
+    assert found["mean_color_psnr"] == pytest.approx(np.mean(flats), abs=1e-4)
 
 
 @pytest.mark.parametrize(("overflow", "capacity"), [("grow", 256), ("error", 256), ("drop_new", 128)])
