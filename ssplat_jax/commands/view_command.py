@@ -23,8 +23,8 @@ class View:
     """Port; the next free one if it is taken."""
     host: str = "127.0.0.1"
     """Address to listen on; the default is reached by this machine only, 0.0.0.0 by others, without a password."""
-    most: int = 500_000
-    """Most Gaussians sent to a browser; larger scenes are subsampled evenly."""
+    most: int = 1_500_000
+    """Most Gaussians sent to a browser; of larger scenes an even selection is sent, enlarged to cover as much."""
     over_black: bool = False
     """Show the scene over black instead of the browser's background."""
     one_exposure: bool = False

@@ -126,9 +126,11 @@ class Browser:
             exposure = view.exposure
         return draw(scene, kind, placed, size, over_black=self._stage.over_black, exposure=exposure)
 
-    def start_at(self, position: np.ndarray, target: np.ndarray, up: np.ndarray) -> None:
-        """Moves the camera to where the stage starts."""
+    def start_at(self, position: np.ndarray, target: np.ndarray, up: np.ndarray, fov: float | None) -> None:
+        """Moves the camera to where the stage starts; without an angle of view it keeps its own."""
         with self._client.atomic():
+            if fov is not None:
+                self._client.camera.fov = fov
             self._client.camera.up_direction = up
             self._client.camera.position = position
             self._client.camera.look_at = target

@@ -41,6 +41,14 @@ class RecordedRun:
         """The views of the first chunks, or of all, in the order of streaming."""
         return [view for record in self.records[:num_chunks] for view in record.views]
 
+    @property
+    def fov(self) -> float | None:
+        """Angle of view of the shorter side of the first view, radians; None without records."""
+        if not self.records:
+            return None
+        (width, height), K = self.records[0].size, self.records[0].views[0].K
+        return float(2 * np.arctan(min(width / K[0, 0], height / K[1, 1]) / 2))
+
     def nearest(self, camtoworld: Float64[np.ndarray, "4 4"]) -> RecordedView | None:
         """The view whose camera is nearest, with a turn by a radian counted as a unit of the cameras' spread."""
         views = self.views()

@@ -38,19 +38,22 @@ def median_size(gaussians: Gaussians) -> float:
 def visible_splats(gaussians: Gaussians, unit: float, max_gaussians: int) -> Splats:
     """The visible Gaussians in units of `unit`.
 
-    If there are more than `max_gaussians`, an evenly spaced selection is taken, the same one each time.
+    If there are more than `max_gaussians`, an evenly spaced selection is taken, the same one each time. Its Gaussians
+    are enlarged until they cover the area that all of them did; otherwise surfaces would show holes.
 
     Limits:
         Standard deviations are cut at 250 units. Rows with a non-finite entry or an opacity below 1/255 are dropped.
     """
-    rows = np.flatnonzero(_is_visible(gaussians))
+    rows, growth = np.flatnonzero(_is_visible(gaussians)), 1.0
     if len(rows) > max_gaussians:
+        growth = np.sqrt(len(rows) / max_gaussians)
         rows = rows[np.linspace(0, len(rows) - 1, max_gaussians).round().astype(int)]
     means, quats, scales, opacities, dc = (
         np.asarray(x)[rows]
         for x in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh[:, 0])
     )
-    axes = np.asarray(quats_to_matrices(jnp.asarray(quats))) * np.clip(scales / unit, 0.0, MAX_SIGMA)[:, None, :]
+    sigmas = np.clip(growth * scales / unit, 0.0, MAX_SIGMA)
+    axes = np.asarray(quats_to_matrices(jnp.asarray(quats))) * sigmas[:, None, :]
     return Splats(
         centers=(means / unit).astype(np.float32),
         covariances=np.einsum("nij,nkj->nik", axes, axes).astype(np.float32),

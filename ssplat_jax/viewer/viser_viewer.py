@@ -66,8 +66,11 @@ class Viewer:
         position, target = start.position / self._stage.distance, start.look_at / self._stage.distance
         self._server.scene.set_up_direction(start.up)
         self._server.initial_camera.position, self._server.initial_camera.look_at = position, target
+        fov = self._stage.run.fov
+        if fov is not None:
+            self._server.initial_camera.fov = fov
         for browser in list(self._browsers.values()):
-            browser.start_at(position, target, start.up)
+            browser.start_at(position, target, start.up, fov)
 
     @property
     def browsers(self) -> list[Browser]:

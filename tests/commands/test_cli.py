@@ -95,10 +95,10 @@ def test_version_names_what_a_report_of_an_error_needs(capsys):
 def test_output_that_nobody_reads_ends_a_command_quietly():
     code = "from ssplat_jax.commands.start import start; start()"
     command = [sys.executable, "-c", code, "--help"]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-    assert process.stdout is not None and process.stderr is not None
-    process.stdout.close()
-    assert (process.stderr.read(), process.wait()) == (b"", 128 + signal.SIGPIPE)
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdout is not None and process.stderr is not None
+        process.stdout.close()
+        assert (process.stderr.read(), process.wait()) == (b"", 128 + signal.SIGPIPE)
 
 
 def truncate(capture):

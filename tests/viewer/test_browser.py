@@ -25,8 +25,9 @@ from ssplat_jax.viewer.scene_sources import open_source
 from ssplat_jax.viewer.splats import visible_splats
 from ssplat_jax.viewer.stage import Stage
 from ssplat_jax.viewer.viewed_scene import ViewedScene
+from ssplat_jax.viewer.viser_viewer import Viewer
 from tests.viewer.fake_client import FakeClient
-from tests.viewer.test_viewer import delta, frame, scene
+from tests.viewer.test_viewer import delta, frame, free_port, scene
 
 pytestmark = pytest.mark.usefixtures("compiled_plainly")
 
@@ -335,3 +336,23 @@ def test_a_scene_of_a_file_has_no_slider_and_no_figures(tmp_path):
     client.gui.controls["Play"].click("path")  # there is none
     browser.update()
     np.testing.assert_array_equal(client.camera.position, 0)
+
+
+def test_browsers_start_with_the_first_cameras_angle_of_view(tmp_path):
+    pytest.importorskip("viser")
+    folder = RunFolder(tmp_path)
+    save_delta(folder.delta(2), delta([0, 1], 1), {"frame": frame().to_dict()})
+    save_chunk_record(folder.chunk_record(2), record(1))
+    stage = Stage(open_source(tmp_path), max_gaussians=1000)
+    viewer = Viewer(stage, host="127.0.0.1", port=free_port())
+    try:
+        waiting = FakeClient()
+        viewer._welcome(waiting)  # before there is a scene
+        stage.refresh()
+        viewer.update()
+        shorter_side = 2 * np.arctan(24 / 2 / 32)
+        assert viewer._server.initial_camera.fov == pytest.approx(shorter_side)
+        assert waiting.camera.fov == pytest.approx(shorter_side)
+    finally:
+        viewer.close()
+    assert RecordedRun(RunFolder(tmp_path / "none")).fov is None

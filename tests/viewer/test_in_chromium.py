@@ -41,6 +41,7 @@ BROWSER_DB = 38.0  # of the browser's splats against ours: 8 bits, 16-bit covari
 PICTURE_DB = 28.0  # of a drawn picture in the page: JPEG, stretched over the window
 CHANGE_DB = 32.0  # of pages that differ
 WINDOW = (960, 640)
+FOV = np.radians(75.0)  # vertical
 LONGEST_UPDATE = 5.0  # seconds, on a busy machine
 CLEAR = (slice(200, None), slice(0, 560))  # rows and columns that no panel or notice covers
 RED = np.array([0.9, 0.1, 0.1], np.float32)
@@ -127,7 +128,8 @@ def live_run(path):
         moved = replace(part.gaussians, means=part.gaussians.means + jnp.array([0.0, 0.9 * (k - 1), 0.0]))
         part = type(part)(part.rows, moved, part.capacity, np.linspace(0.5, 1, 4, dtype=np.float32))
         save_delta(folder.delta(4 * k), part, {"frame": frame().to_dict()})
-        pose, K = np.eye(4), np.array([[32.0, 0, 16], [0, 32.0, 12], [0, 0, 1]])
+        focal = 12 / np.tan(FOV / 2)
+        pose, K = np.eye(4), np.array([[focal, 0, 16], [0, focal, 12], [0, 0, 1]])
         pose[:3, :3], pose[:3, 3] = first, (0.15 * k * first[:, 2] - 0.04 * first[:, 0])
         image = make_thumbnail(np.broadcast_to(RED, (24, 32, 3)))
         views = tuple(RecordedView(2 * k + i, pose, K, np.ones(3), image) for i in (0, 1))

@@ -17,6 +17,8 @@ import ssplat_jax as ss
 from ssplat_jax.checkpoint.delta_files import load_delta, save_delta
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.errors import InputError, StorageError
+from ssplat_jax.gaussians import Gaussians
+from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.pytree import replace
 from ssplat_jax.scene_files.formats import save_gaussians
 from ssplat_jax.storage.run_folder import RunFolder
@@ -88,6 +90,37 @@ def test_too_many_gaussians_are_evenly_subsampled():
     places = [int(np.flatnonzero((all_of_them.centers == center).all(axis=1))[0]) for center in some.centers]
     assert len(places) == 17 and places[0] == 0 and places[-1] == 49
     assert set(np.diff(places)) == {3, 4}
+    growth = some.covariances / all_of_them.covariances[places]
+    np.testing.assert_allclose(growth, 50 / 17, rtol=1e-5)  # as many times the area as there are times fewer
+
+
+def test_a_subsampled_surface_keeps_what_it_covers():
+    """A wall of Gaussians, a pixel apart, from which three of four are left out."""
+    side, camera = 64, Camera(viewmats=jnp.eye(4), Ks=jnp.diag(jnp.array([64.0, 64, 1])), width=48, height=48)
+    x, y = np.meshgrid(*[np.arange(side) / 64] * 2)
+    wall = Gaussians.from_rgb(
+        means=jnp.asarray(np.stack([x.ravel(), y.ravel(), np.ones(side**2)], -1), jnp.float32),
+        quats=jnp.tile(jnp.array([1.0, 0.0, 0.0, 0.0]), (side**2, 1)),
+        scales=jnp.full((side**2, 3), 0.8 / 64),
+        opacities=jnp.full(side**2, 0.7),
+        colors=jnp.full((side**2, 3), 0.5),
+    )
+    shuffled = jax.tree.map(lambda a: a[np.random.default_rng(0).permutation(side**2)], wall)
+    covered = {}
+    for most in (side**2, side**2 // 4):
+        splats = visible_splats(shuffled, 1.0, max_gaussians=most)
+        sizes = np.sqrt(np.diagonal(splats.covariances, axis1=1, axis2=2))
+        n = len(sizes)
+        shown = Gaussians.from_rgb(
+            means=jnp.asarray(splats.centers),
+            quats=jnp.tile(jnp.array([1.0, 0.0, 0.0, 0.0]), (n, 1)),
+            scales=jnp.asarray(sizes, jnp.float32),
+            opacities=jnp.asarray(splats.opacities[:, 0]),
+            colors=jnp.full((n, 3), 0.5),
+        )
+        covered[most] = float(ss.render(shown, camera).alpha.mean())
+    all_of_them, some = covered.values()
+    assert all_of_them > 0.97 and some > 0.9
 
 
 def test_an_empty_scene_has_a_size_and_nothing_to_send():
