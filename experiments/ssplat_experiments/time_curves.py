@@ -9,6 +9,9 @@ from ssplat_experiments.cases import Row
 
 OPTIMIZED = "per-scene optimization"
 COLUMNS = {"literal": "literal_psnr", "shown": "shown_psnr"}
+TIMES = (1, 3, 10, 30, 60, 120)
+"""Seconds of the table of `at_times`."""
+
 COLORS = ("#30507a", "#c06030", "#3a8a5a", "#8a5a9a", "#b09030")
 
 
@@ -61,7 +64,27 @@ def findings(rows: list[Row]) -> list[str]:
                 f" {best['seconds']:.1f} s; per-scene optimization its best, {theirs[column]:.2f} dB, after"
                 f" {theirs['seconds']:.1f} s, and at its end it is {gap:+.2f} dB from ours."
             )
-    return ["\n".join(lines)] if lines else []
+    return [at_times(rows), "\n".join(lines)] if lines else []
+
+
+def at_times(rows: Sequence[Row]) -> str:
+    """A Markdown table: the best of ours and of per-scene optimization that some times have reached, in dB."""
+    names = [f"{seconds} s" for seconds in TIMES]
+    lines = ["| scene | score | " + " | ".join(names) + " |", "|" + "---|" * (2 + len(names))]
+    for scene in dict.fromkeys(row["scene"] for row in rows):
+        kinds = ([], [])
+        for row in rows:
+            if row["scene"] == scene:
+                kinds[row["method"] == OPTIMIZED].append(row)
+        last = max((row["seconds"] for row in kinds[1]), default=0.0)
+        for name, column in COLUMNS.items():
+            cells = []
+            for seconds in TIMES:
+                found = [best_at(kind, seconds, column) for kind in kinds]
+                texts = [f"{score:.2f}" if np.isfinite(score) else "-" for score in found]
+                cells.append(" / ".join(texts) + (" (ended)" if last < seconds else ""))
+            lines.append(f"| {scene} | {name} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
 
 
 def plot(pyplot: Any, rows: list[Row]) -> Any:

@@ -72,7 +72,13 @@ def test_the_lead_is_that_of_the_best_so_far():
 def test_findings_tell_the_crossing_of_each_scene_and_column():
     rows = curve("stream", (1, 20.0)) + curve(OPTIMIZED, (2, 10.0), (3, 22.0))
     rows += curve("stream", (1, 20.0), scene="fox") + curve(OPTIMIZED, (3, 12.0), scene="fox")
-    lines = findings(rows)[0].splitlines()
+    table, text = findings(rows)
+    lines = text.splitlines()
+    # Ours / theirs at 1, 3, 10 s ...; the optimization of the room was measured until 3 s.
+    assert (
+        table.splitlines()[2]
+        == "| room | literal | " + " | ".join(["20.00 / -", "20.00 / 22.00", *["20.00 / 22.00 (ended)"] * 4]) + " |"
+    )
     assert len(lines) == 4 and "room, literal: per-scene optimization leads from 3.0 s on" in lines[0]
     assert "fox, shown: the curves do not cross up to 3 s" in lines[3] and "-8.00 dB from ours" in lines[3]
     assert findings(curve("stream", (1, 20.0))) == []
