@@ -8,12 +8,15 @@ packed into one integer (`rasterizer/depth_sorted_table.py`, `rasterizer/binning
 import functools
 import math
 from collections.abc import Callable
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, UInt
+
+Arrays = TypeVar("Arrays")
 
 LANES = 16
 """32-bit numbers that a wide processor adds at once (AVX-512)."""
@@ -49,6 +52,22 @@ def in_own_kernel(wanted: Bool[Array, ""], compute: Callable[[], Array]) -> Arra
     """
     shape = jax.eval_shape(compute)
     return lax.cond(wanted, compute, lambda: jnp.zeros(shape.shape, shape.dtype))
+
+
+def kept(arrays: Arrays, always: Bool[Array, ""]) -> Arrays:
+    """`arrays`, which XLA then computes once, though several kernels read them.
+
+    Why: the CPU compiler repeats sums and products, with all that leads to them, in every kernel that reads them. A
+    division it does not repeat, so they are divided by a one that it does not know. The gradient of the projection of
+    262,144 Gaussians takes 44 ms of a core's time instead of 153 (docs/performance.md).
+    May go when `ssplat bench refine` is as fast without.
+
+    Args:
+        arrays: any pytree of floats.
+        always: true, which the compiler does not know; where it is false, the arrays are halved.
+    """
+    one = jnp.where(always, 1.0, 2.0)
+    return jax.tree.map(lambda x: x / one.astype(x.dtype), arrays)
 
 
 def sort_pieces(keys: UInt[Array, "s n"]) -> UInt[Array, "s n"]:

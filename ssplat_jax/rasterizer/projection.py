@@ -20,6 +20,13 @@ from ssplat_jax.rasterizer import constants
 from ssplat_jax.rasterizer.effects import Effects
 from ssplat_jax.rasterizer.lens_distortion import distort, is_folded, lens_field
 
+FILTER_VARIANCES = {
+    "mip": constants.MIP_VARIANCE,
+    "classic": constants.CLASSIC_VARIANCE,
+    "none": constants.MIN_SCREEN_VARIANCE,
+}
+"""px^2 added to the screen covariance, by `Effects.antialias`."""
+
 
 @pytree
 class Splats:
@@ -82,7 +89,7 @@ def cull_cameras(camera: Camera) -> tuple[Camera, Bool[Array, " b"]]:
     return replace(camera, viewmats=make_safe(camera.viewmats), Ks=make_safe(camera.Ks)), usable
 
 
-def _camera_points(means: Float[Array, "n 3"], viewmats: Float[Array, "b 4 4"]) -> tuple[Float[Array, "b n"], ...]:
+def camera_points(means: Float[Array, "n 3"], viewmats: Float[Array, "b 4 4"]) -> tuple[Float[Array, "b n"], ...]:
     """Camera coordinates x, y and z of world points."""
     entries = columns(means)
     return tuple(
@@ -112,7 +119,7 @@ def project(
         Quaternions of any length; zero counts as the identity.
         Outside the first maximum of the distortion polynomial, or 89.4 degrees off axis: invisible, zero gradient.
     """
-    x, y, z = _camera_points(gaussians.means, camera.viewmats)
+    x, y, z = camera_points(gaussians.means, camera.viewmats)
     in_front = z > constants.NEAR
     z = jnp.where(in_front, z, 1.0)
     fx, fy, cx, cy = (camera.Ks[:, i, j, None] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
@@ -166,13 +173,11 @@ def _screen_roots(gaussians: Gaussians, camera: Camera, points: tuple[Float[Arra
         corner: undistorted radius of the farthest image corner, or None.
     """
     tan_x, tan_y, z = points
-    fx, fy, cx, cy = (camera.Ks[:, i, j, None] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    margin_x = constants.FRUSTUM_MARGIN * 0.5 * camera.width / fx
-    margin_y = constants.FRUSTUM_MARGIN * 0.5 * camera.height / fy
+    fx, fy = (camera.Ks[:, i, i, None] for i in (0, 1))
     # A barrel lens sees farther than the pinhole image reaches: nothing is clamped up to there.
-    wider = 1.0 if corner is None else jnp.maximum(corner / _corner(camera), 1.0)[:, None]
-    tan_x = _clip_wider(tan_x, -cx / fx - margin_x, (camera.width - cx) / fx + margin_x, wider)
-    tan_y = _clip_wider(tan_y, -cy / fy - margin_y, (camera.height - cy) / fy + margin_y, wider)
+    wider = None if corner is None else jnp.maximum(corner / _corner(camera), 1.0)[:, None]
+    low_x, high_x, low_y, high_y = tangent_bounds(camera, wider)
+    tan_x, tan_y = jnp.clip(tan_x, low_x, high_x), jnp.clip(tan_y, low_y, high_y)
     world = camera.viewmats[:, :3, :3, None]  # b 3 3 1
     # Rows of J W: what a world displacement does to the pixel.
     to_u = [(world[:, 0, j] - tan_x * world[:, 2, j]) / z for j in range(3)]
@@ -188,19 +193,27 @@ def _screen_roots(gaussians: Gaussians, camera: Camera, points: tuple[Float[Arra
     return root_u, root_v
 
 
-def _clip_wider(tan, low, high, wider):
-    """`tan` clipped to `low` and `high`, each moved outwards by the factor `wider`."""
-    return jnp.clip(tan, jnp.minimum(low, wider * low), jnp.maximum(high, wider * high))
+def tangent_bounds(camera: Camera, wider: Float[Array, "b 1"] | None = None) -> tuple[Float[Array, "b 1"], ...]:
+    """Left, right, upper and lower bound of the tangents at which the Jacobian is taken.
+
+    Args:
+        camera: one batch axis.
+        wider: factor at least 1 by which each bound moves outwards, or None.
+    """
+    bounds = []
+    for axis, size in ((0, camera.width), (1, camera.height)):
+        focal, center = camera.Ks[:, axis, axis, None], camera.Ks[:, axis, 2, None]
+        margin = constants.FRUSTUM_MARGIN * 0.5 * size / focal
+        low, high = -center / focal - margin, (size - center) / focal + margin
+        if wider is not None:
+            low, high = jnp.minimum(low, wider * low), jnp.maximum(high, wider * high)
+        bounds += [low, high]
+    return tuple(bounds)
 
 
 def _filtered(root_u, root_v, effects: Effects):
     """Conic factors, variances and opacity compensation of the screen covariance, filtered as `effects` say."""
-    kernels = {
-        "mip": constants.MIP_VARIANCE,
-        "classic": constants.CLASSIC_VARIANCE,
-        "none": constants.MIN_SCREEN_VARIANCE,
-    }
-    kernel = kernels[effects.antialias]
+    kernel = FILTER_VARIANCES[effects.antialias]
     # In units of the largest entry nothing overflows at any scale; the unit is a constant to the gradient.
     largest = sum(jnp.abs(jax.lax.stop_gradient(m)) for m in (*root_u, *root_v))
     sized = largest <= constants.MAX_SCREEN_SIGMA

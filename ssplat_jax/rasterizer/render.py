@@ -18,6 +18,7 @@ from ssplat_jax.rasterizer.depth_sorted_table import sorted_table
 from ssplat_jax.rasterizer.effects import Effects
 from ssplat_jax.rasterizer.filter_3d import filter_3d
 from ssplat_jax.rasterizer.outputs import RenderOutput, finish, splat_channels
+from ssplat_jax.rasterizer.pinhole_projection import project_pinhole
 from ssplat_jax.rasterizer.projection import cull_cameras, cull_non_finite, project
 from ssplat_jax.rasterizer.tile_grid import Grid
 
@@ -220,7 +221,10 @@ def prepare(inputs: RenderInputs, effects: Effects):
     )
     distortion = None if inputs.distortion is None else inputs.distortion.reshape(-1, 5).astype(dtype)
     camera, usable = cull_cameras(camera)
-    splats = project(gaussians, camera, effects, distortion)
+    if effects.distortion and distortion is not None:
+        splats = project(gaussians, camera, effects, distortion)
+    else:
+        splats = project_pinhole(gaussians, camera, effects)
     visible = splats.visible & usable[:, None]
     splats = replace(splats, visible=visible, opacities=jnp.where(visible, splats.opacities, 0.0))
     num_unseen = jnp.sum(~usable, dtype=jnp.int32) * gaussians.num_gaussians

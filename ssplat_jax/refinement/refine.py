@@ -16,45 +16,48 @@ from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.rasterizer import render
 from ssplat_jax.rasterizer.render import round_up
+from ssplat_jax.refinement.present_rows import back_in_place, only_present, present_rows, round_rows
 from ssplat_jax.refinement.refine_config import RefineConfig
 from ssplat_jax.refinement.refine_step import (
     EFFECTS,
     RefineState,
-    apply_revision,
     current_gaussians,
     init_refinement,
     refine_step,
+    views_of_step,
 )
-from ssplat_jax.refinement.seen_rows import may_be_seen
+from ssplat_jax.refinement.revision import apply_revision
+from ssplat_jax.refinement.seen_rows import seen_in_any
 from ssplat_jax.refinement.usable_views import only_usable
 from ssplat_jax.refinement.view_revision import revised_key_views
 
 PAIRS_MARGIN = 1.25
 """Capacity for tile intersections over what the fullest key view needs: Gaussians grow while they are refined."""
 
-
-ROWS_MARGIN = 1.05
-"""Capacity for rows over what the fullest key view may see."""
-
-ROWS_UNIT = 1 << 12
-"""Row capacities are multiples of this."""
+ROWS_MARGIN = 1.02
+"""Capacity for rows over what the views of a step may see at most: Gaussians move while they are refined."""
 
 
 @dataclasses.dataclass
 class Progress:
     """Refinement between two steps: all that the next step depends on, and the measurements so far."""
 
-    state: RefineState
+    state: RefineState  # of the present rows
+    rows: Int[np.ndarray, " m"] | None  # their numbers in the scene that was given, see `present_rows`
     max_pairs: int  # capacity for tile intersections of the compiled step
     losses: list[float] = dataclasses.field(default_factory=list)  # per step, on the pixels that are learned from
     held_back: list[float] = dataclasses.field(default_factory=list)  # per step, on the pixels that are not
     seconds: list[float] = dataclasses.field(default_factory=list)  # per step; the first of a process compiles
-    max_rows: int | None = None  # capacity for the rows that a view may see; None before the first step
+    max_rows: int | None = None  # capacity for the rows that the views of a step may see; None before the first
 
     @property
     def num_steps(self) -> int:
         """Steps done."""
         return len(self.losses)
+
+    def scene(self, given: Gaussians) -> Gaussians:
+        """`given`, the scene that refinement started from, as it is now."""
+        return back_in_place(current_gaussians(self.state), self.rows, given)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -109,7 +112,7 @@ def refine(
     progress, key_views = start_refinement(gaussians, given, config)
     for _ in continue_refinement(progress, key_views, steps, config):
         on_step(progress.num_steps, progress.losses[-1])
-    return current_gaussians(progress.state), report_of(progress, key_views, config)
+    return progress.scene(gaussians), report_of(progress, key_views, config)
 
 
 def start_refinement(
@@ -122,9 +125,11 @@ def start_refinement(
     Raises:
         InputError: no view is left.
     """
+    rows = present_rows(gaussians)
+    gaussians = only_present(gaussians, rows)
     max_pairs = _capacity(gaussians, key_views)
     usable = only_usable(gaussians, key_views, max_pairs)
-    return Progress(init_refinement(gaussians, usable, config), max_pairs), usable
+    return Progress(init_refinement(gaussians, usable, config), rows, max_pairs), usable
 
 
 def continue_refinement(
@@ -142,7 +147,7 @@ def continue_refinement(
     """
     config = config or RefineConfig()
     if progress.max_rows is None:
-        progress.max_rows = row_capacity(progress.state.start, key_views)
+        progress.max_rows = row_capacity(progress.state.start, key_views, range(steps), config)
     while progress.num_steps < steps and not has_stopped_helping(
         progress.held_back, _steps_per_round(key_views, config)
     ):
@@ -155,7 +160,7 @@ def continue_refinement(
         if int(report.num_overflow):
             revised = apply_revision(progress.state.start, progress.state.revision)
             progress.max_pairs = _capacity(revised, key_views)
-            progress.max_rows = row_capacity(revised, key_views)
+            progress.max_rows = row_capacity(revised, key_views, range(progress.num_steps, steps), config)
         yield
 
 
@@ -199,16 +204,21 @@ def _capacity(gaussians: Gaussians, key_views: KeyViews) -> int:
     return round_up(int(PAIRS_MARGIN * max(counts)))
 
 
-def row_capacity(gaussians: Gaussians, key_views: KeyViews) -> int:
-    """Capacity for the rows that a key view may see; all rows, if a view may see most of them."""
-    most = ROWS_MARGIN * int(_most_rows_seen(gaussians, key_views))
-    return min(gaussians.num_gaussians, ROWS_UNIT * -(-int(most) // ROWS_UNIT))
+def row_capacity(gaussians: Gaussians, key_views: KeyViews, steps: range, config: RefineConfig) -> int:
+    """Capacity for the rows that the views of one of `steps` may see; all rows, if some views see most of them."""
+    if not steps:
+        return gaussians.num_gaussians
+    views = jax.vmap(lambda step: views_of_step(step, key_views.valid, config))(jnp.asarray(steps))
+    most = ROWS_MARGIN * int(_most_rows_seen(gaussians, key_views, views))
+    return min(gaussians.num_gaussians, round_rows(int(most)))
 
 
 @jax.jit
-def _most_rows_seen(gaussians: Gaussians, key_views: KeyViews) -> Int[Array, ""]:
-    num_seen = lambda view: jnp.sum(may_be_seen(gaussians, key_views.camera(view)), dtype=jnp.int32)  # noqa: E731
-    return jnp.max(jax.lax.map(num_seen, jnp.arange(key_views.num_slots)))
+def _most_rows_seen(gaussians: Gaussians, key_views: KeyViews, views: Int[Array, "s b"]) -> Int[Array, ""]:
+    def num_seen(of_step: Int[Array, " b"]) -> Int[Array, ""]:
+        return jnp.sum(seen_in_any(gaussians, [key_views.camera(view) for view in of_step]), dtype=jnp.int32)
+
+    return jnp.max(jax.lax.map(num_seen, views))
 
 
 def _spread(key_views: KeyViews, most: int = 8) -> list[int]:

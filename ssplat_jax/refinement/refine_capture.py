@@ -16,7 +16,6 @@ from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.refinement.choose_effects import EffectsChoice, effects_by_name, with_effects
 from ssplat_jax.refinement.refine import Refinement, continue_refinement, report_of, start_refinement
 from ssplat_jax.refinement.refine_config import RefineConfig
-from ssplat_jax.refinement.refine_step import current_gaussians
 from ssplat_jax.streaming.feed import Exposures
 
 MAX_KEY_VIEWS = 128
@@ -70,7 +69,7 @@ def refine_on_capture(
         on_step(progress.num_steps, progress.losses[-1])
     report = report_of(progress, views, config)
     return CaptureRefinement(
-        gaussians=current_gaussians(progress.state),
+        gaussians=progress.scene(gaussians),
         exposures=revised_exposures(exposures, indices, report.key_views),
         report=report,
         choice=choice,

@@ -1,4 +1,6 @@
-"""One refinement step as a pure function: render key views, compare, move every Gaussian by Adam inside its bounds."""
+"""One refinement step as a pure function: render key views, compare, move the Gaussians that they show by Adam."""
+
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -6,31 +8,18 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ssplat_jax.cache.key_views import KeyViews
 from ssplat_jax.errors import InputError
-from ssplat_jax.gaussians import SH_C0, Gaussians, mean_color
+from ssplat_jax.gaussians import Gaussians, mean_color
 from ssplat_jax.pytree import pytree, replace
 from ssplat_jax.rasterizer import Effects, fill_holes, render
+from ssplat_jax.refinement.adam_rows import AdamRows, step_rows
 from ssplat_jax.refinement.refine_config import RefineConfig
-from ssplat_jax.refinement.seen_rows import put_rows, seen_rows, take_rows
+from ssplat_jax.refinement.revision import Revision, apply_revision, is_revised, no_revision
+from ssplat_jax.refinement.seen_rows import put_rows, seen_in_any, select_rows, take_rows
 from ssplat_jax.refinement.view_revision import ViewRevision, ViewState, init_view_state, revised_view, step_view_state
 
 EFFECTS = Effects(outputs=("color", "alpha"))
-MAX_LOGIT = 12.0
-"""Bound of opacity logits: beyond it a float32 opacity is 0 or 1 and its gradient is lost."""
-ADAM_EPSILON = 1e-15
-"""Below any gradient that a visible Gaussian has in a mean over pixels; 1e-8 would stop most of them."""
 BLOCK = 8
 """Side of the pixel blocks that are held back together: neighbors of a pixel give its color away."""
-
-
-@pytree
-class Revision:
-    """Changes to `n` Gaussians, all zero at the start. Also the form of gradients and moments."""
-
-    means: Float[Array, "n 3"]  # in units of the Gaussian's own size
-    quats: Float[Array, "n 4"]  # added to the unit quaternion
-    log_scales: Float[Array, "n 3"]
-    logit_opacities: Float[Array, " n"]
-    sh: Float[Array, "n k 3"]
 
 
 @pytree
@@ -41,6 +30,7 @@ class RefineState:
     revision: Revision
     first_moment: Revision
     second_moment: Revision
+    num_shown: Int[Array, " n"]  # steps that showed a row
     num_steps: Int[Array, ""]
     num_skipped: Int[Array, ""]  # steps whose gradient was not finite: they changed nothing
     views: ViewState | None = None  # revision of the key views, if an effect is on
@@ -63,19 +53,12 @@ def init_refinement(
     effects = (config or RefineConfig()).effects
     if effects.any and key_views is None:
         raise InputError(f"refine: the effects {', '.join(effects.names)} need the key views, got none.")
-    revision = Revision(
-        means=jnp.zeros_like(gaussians.means),
-        quats=jnp.zeros_like(gaussians.quats),
-        log_scales=jnp.zeros_like(gaussians.scales),
-        logit_opacities=jnp.zeros_like(gaussians.opacities),
-        sh=jnp.zeros_like(gaussians.sh),
-    )
-    zeros = lambda: jax.tree.map(jnp.zeros_like, revision)  # noqa: E731
     return RefineState(
         start=jax.tree.map(jnp.copy, gaussians),  # the step consumes its state; the caller's arrays stay
-        revision=revision,
-        first_moment=zeros(),
-        second_moment=zeros(),
+        revision=no_revision(gaussians),
+        first_moment=no_revision(gaussians),
+        second_moment=no_revision(gaussians),
+        num_shown=jnp.zeros(gaussians.num_gaussians, jnp.int32),
         num_steps=jnp.zeros((), jnp.int32),
         num_skipped=jnp.zeros((), jnp.int32),
         views=None if key_views is None else init_view_state(gaussians, key_views, effects),
@@ -89,42 +72,9 @@ def current_gaussians(state: RefineState) -> Gaussians:
         A row without a revision is the row of `state.start`, bit for bit, and absent rows stay absent.
     """
     revised = apply_revision(state.start, state.revision)
-    is_revised = jnp.any(
-        jnp.concatenate([jnp.reshape(x != 0, (x.shape[0], -1)) for x in jax.tree.leaves(state.revision)], axis=1),
-        axis=1,
-    )
-    is_revised = is_revised & (state.start.opacities > 0)
-    keep = lambda new, old: jnp.where(is_revised.reshape(-1, *[1] * (new.ndim - 1)), new, old)  # noqa: E731
+    is_new = is_revised(state.revision) & (state.start.opacities > 0)
+    keep = lambda new, old: jnp.where(is_new.reshape(-1, *[1] * (new.ndim - 1)), new, old)  # noqa: E731
     return jax.tree.map(keep, revised, state.start)
-
-
-def apply_revision(start: Gaussians, revision: Revision) -> Gaussians:
-    """`start` moved by `revision`, differentiable in both.
-
-    Limits:
-        An opacity of 0 stays 0 with a zero gradient; one of 1 counts as the largest below it.
-    """
-    is_present = start.opacities > 0
-    opacities = jnp.clip(jnp.where(is_present, start.opacities, 0.5), 1e-5, 1 - 1e-5)
-    logits = jnp.log(opacities) - jnp.log1p(-opacities) + revision.logit_opacities
-    return Gaussians(
-        means=start.means + sizes(start)[:, None] * revision.means,
-        quats=_unit(start.quats) + revision.quats,
-        scales=start.scales * jnp.exp(revision.log_scales),
-        opacities=jnp.where(is_present, jax.nn.sigmoid(logits), 0.0),
-        sh=start.sh + revision.sh,
-    )
-
-
-def sizes(gaussians: Gaussians) -> Float[Array, " n"]:
-    """Mean of the two larger standard deviations: the extent of a flat Gaussian in its plane."""
-    smallest = jnp.min(gaussians.scales, axis=-1)
-    return (jnp.sum(gaussians.scales, axis=-1) - smallest) / 2
-
-
-def _unit(quats: Float[Array, "n 4"]) -> Float[Array, "n 4"]:
-    length = jnp.linalg.norm(quats, axis=-1, keepdims=True)
-    return quats / jnp.where(length > 0, length, 1.0)
 
 
 def refine_step(
@@ -138,89 +88,103 @@ def refine_step(
 ) -> tuple[RefineState, StepReport]:
     """One step on `config.views_per_step` key views. A `lax.scan` body over `rate`; donate `state`.
 
+    Rows that none of the views shows keep their revision and their moments (`adam_rows`).
+
     Args:
         state: the scene so far.
         key_views: the views to compare with, at least one of them valid.
         rate: factor of all learning rates; 0 changes nothing but the moments.
         config: learning rates, weights and bounds (static).
         max_pairs: capacity for tile intersections (static); `StepReport.num_overflow` says what did not fit.
-        max_rows: capacity for the rows that a view may see (static): gradients are computed for them alone. By
-            default, and where it holds every row, nothing is selected.
+        max_rows: capacity for the rows that the step's views may see (static): all else is done for them alone. By
+            default, and where it holds every row, nothing is selected. The result is the same.
 
     Returns:
         The state after the step, and what was measured before it.
     """
-    places = state.num_steps * config.views_per_step + jnp.arange(config.views_per_step)
-    views = jax.vmap(lambda place: next_view(place, key_views.valid, config.seed))(places)
-
+    views = views_of_step(state.num_steps, key_views.valid, config)
     current = apply_revision(state.start, state.revision)
+    background = mean_color(current)
+    everything = state.start, AdamRows(state.revision, state.first_moment, state.second_moment, state.num_shown)
+    selection = None
+    if max_rows is not None and max_rows < state.start.num_gaussians:
+        cameras = [_revised(state, _view_revision(state), key_views, view).camera(view) for view in views]
+        selection = select_rows(seen_in_any(current, cameras), max_rows)
+    start, rows = everything if selection is None else take_rows(everything, selection)
+    if selection is not None:
+        start = replace(start, opacities=jnp.where(selection.is_row, start.opacities, 0.0))
+    gaussians, pull = jax.vjp(functools.partial(apply_revision, start), rows.revision)
+    slopes, of_views, report = _slopes(state, gaussians, background, key_views, views, config, max_pairs)
+    (gradient,) = pull(slopes)
+    if selection is not None:
+        report = replace(report, num_overflow=jnp.maximum(report.num_overflow, selection.num_overflow))
 
-    def add_view(total, view: Int[Array, ""]):
-        gradient, measured = view_gradient(state, current, key_views, view, config, max_pairs, max_rows)
-        return jax.tree.map(jnp.add, total, gradient), measured
-
-    zeros = jax.tree.map(jnp.zeros_like, _revisions(state))
-    # A scan holds the intermediate arrays of one view at a time.
-    total, (losses, errors, overflows) = jax.lax.scan(add_view, zeros, views)
-    gradient, slopes_of_views = jax.tree.map(lambda x: x / config.views_per_step, total)
-    report = StepReport(loss=jnp.mean(losses), held_back=jnp.mean(errors), views=views, num_overflow=jnp.max(overflows))
-    is_finite = jnp.array(True)
-    for leaf in jax.tree.leaves((gradient, slopes_of_views)):
+    is_finite = jnp.isfinite(report.loss)
+    for leaf in jax.tree.leaves((gradient, of_views)):
         is_finite = is_finite & jnp.all(jnp.isfinite(leaf))
-    is_finite = is_finite & jnp.isfinite(report.loss)
-    moved = _adam(state, gradient, rate, config)
-    if state.views is not None:
-        moved_views = step_view_state(state.views, slopes_of_views, views, key_views.valid, rate, config.effects)
-        moved = replace(moved, views=moved_views)
     keep = lambda new, old: jnp.where(is_finite, new, old)  # noqa: E731
-    kept = jax.tree.map(keep, replace(moved, num_skipped=state.num_skipped), state)
-    state = replace(
-        kept,
+    rows = jax.tree.map(keep, step_rows(rows, gradient, rate, config), rows)
+    if selection is not None:
+        rows = put_rows(rows, selection, everything[1])
+    moved_views = state.views
+    if state.views is not None and of_views is not None:
+        moved_views = step_view_state(state.views, of_views, views, key_views.valid, rate, config.effects)
+        moved_views = jax.tree.map(keep, moved_views, state.views)
+    state = RefineState(
+        start=state.start,
+        revision=rows.revision,
+        first_moment=rows.first_moment,
+        second_moment=rows.second_moment,
+        num_shown=rows.num_shown,
         num_steps=state.num_steps + 1,
         num_skipped=state.num_skipped + (~is_finite).astype(jnp.int32),
+        views=moved_views,
     )
     return state, report
 
 
-def _revisions(state: RefineState) -> tuple[Revision, ViewRevision | None]:
-    """All that a step revises."""
-    return state.revision, None if state.views is None else state.views.revision
+def _view_revision(state: RefineState) -> ViewRevision | None:
+    return None if state.views is None else state.views.revision
 
 
-def view_gradient(
+def _revised(state: RefineState, revision: ViewRevision | None, key_views: KeyViews, view: Int[Array, ""]) -> KeyViews:
+    """`key_views` with the one at slot `view` as `revision` changes it."""
+    if state.views is None or revision is None:
+        return key_views
+    return revised_view(state.views, revision, key_views, view)
+
+
+def _slopes(
     state: RefineState,
-    current: Gaussians,
+    gaussians: Gaussians,
+    background: Float[Array, "3"],
     key_views: KeyViews,
-    view: Int[Array, ""],
+    views: Int[Array, " b"],
     config: RefineConfig,
     max_pairs: int,
-    max_rows: int | None,
-):
-    """Gradient of `view_loss` by all that is revised, and what `view_loss` measures; `current` is the revised scene.
+) -> tuple[Gaussians, ViewRevision | None, StepReport]:
+    """Mean gradient of `view_loss` over the step's views, by the Gaussians and by the view revision."""
 
-    With `max_rows`, only the rows that the view may see are projected; the others have a gradient of zero.
-    """
-    background = mean_color(current)
+    def loss(gaussians: Gaussians, revision: ViewRevision | None, view: Int[Array, ""]):
+        seen = _revised(state, revision, key_views, view)
+        return view_loss(gaussians, background, seen, view, config, max_pairs)
 
-    def loss(revisions: tuple[Revision, ViewRevision | None], start: Gaussians):
-        revision, of_views = revisions
-        seen = key_views
-        if state.views is not None and of_views is not None:
-            seen = revised_view(state.views, of_views, key_views, view)
-        return view_loss(start, revision, background, seen, view, config, max_pairs)
+    def add_view(total, view: Int[Array, ""]):
+        slopes, measured = jax.grad(loss, argnums=(0, 1), has_aux=True)(gaussians, _view_revision(state), view)
+        return jax.tree.map(jnp.add, total, slopes), measured
 
-    slopes = jax.grad(loss, has_aux=True)
-    revision, of_views = _revisions(state)
-    if max_rows is None or max_rows >= state.start.num_gaussians:
-        return slopes((revision, of_views), state.start)
-    if state.views is not None:
-        key_views = revised_view(state.views, state.views.revision, key_views, view)
-    selection = seen_rows(current, key_views.camera(view), max_rows)
-    start, revision = take_rows((state.start, revision), selection)
-    start = replace(start, opacities=jnp.where(selection.is_row, start.opacities, 0.0))
-    (gradient, of_views), (value, error, num_overflow) = slopes((revision, of_views), start)
-    num_overflow = jnp.maximum(num_overflow, selection.num_overflow)
-    return (put_rows(gradient, selection), of_views), (value, error, num_overflow)
+    zeros = jax.tree.map(jnp.zeros_like, (gaussians, _view_revision(state)))
+    # A scan holds the intermediate arrays of one view at a time.
+    total, (losses, errors, overflows) = jax.lax.scan(add_view, zeros, views)
+    slopes, of_views = jax.tree.map(lambda x: x / config.views_per_step, total)
+    report = StepReport(loss=jnp.mean(losses), held_back=jnp.mean(errors), views=views, num_overflow=jnp.max(overflows))
+    return slopes, of_views, report
+
+
+def views_of_step(step: Int[Array, ""], valid: Bool[Array, " v"], config: RefineConfig) -> Int[Array, " b"]:
+    """Slots of the views that a step shows."""
+    places = step * config.views_per_step + jnp.arange(config.views_per_step)
+    return jax.vmap(lambda place: next_view(place, valid, config.seed))(places)
 
 
 def next_view(place: Int[Array, ""], valid: Bool[Array, " v"], seed: int) -> Int[Array, ""]:
@@ -243,8 +207,7 @@ def held_back_pixels(size: tuple[int, int], view: Int[Array, ""], config: Refine
 
 
 def view_loss(
-    start: Gaussians,
-    revision: Revision,
+    gaussians: Gaussians,
     background: Float[Array, "3"],
     key_views: KeyViews,
     view: Int[Array, ""],
@@ -258,7 +221,6 @@ def view_loss(
     """
     height, width = key_views.images.shape[1:3]
     held_back = held_back_pixels((height, width), view, config)
-    gaussians = apply_revision(start, revision)
     out = render(gaussians, key_views.camera(view), effects=EFFECTS, max_pairs=max_pairs)
     assert out.color is not None and out.alpha is not None
     filled = fill_holes(out.color, out.alpha, background)
@@ -274,41 +236,3 @@ def view_loss(
 def _mean_over(errors: Float[Array, "h w"], pixels: Bool[Array, "h w"]) -> Float[Array, ""]:
     """Mean error of some pixels; 0 for none."""
     return jnp.sum(jnp.where(pixels, errors, 0.0)) / jnp.maximum(jnp.sum(pixels, dtype=errors.dtype), 1.0)
-
-
-def _adam(state: RefineState, gradient: Revision, rate: Float[Array, ""], config: RefineConfig) -> RefineState:
-    """Adam with a learning rate per field, then the bounds."""
-    step = (state.num_steps + 1).astype(jnp.float32)
-    first = jax.tree.map(lambda m, g: config.adam_b1 * m + (1 - config.adam_b1) * g, state.first_moment, gradient)
-    second = jax.tree.map(lambda m, g: config.adam_b2 * m + (1 - config.adam_b2) * g * g, state.second_moment, gradient)
-    correct_first, correct_second = 1 - config.adam_b1**step, 1 - config.adam_b2**step
-
-    bands = state.revision.sh.shape[1]
-    rates = {
-        "means": config.mean_rate,
-        "quats": config.quat_rate,
-        "log_scales": config.log_scale_rate,
-        "logit_opacities": config.logit_opacity_rate,
-        # Higher bands move a twentieth as far, as in 3D Gaussian Splatting.
-        "sh": (config.color_rate / SH_C0) * jnp.where(jnp.arange(bands) == 0, 1.0, 0.05)[None, :, None],
-    }
-
-    def moved(name: str) -> Array:
-        m, v = getattr(first, name) / correct_first, getattr(second, name) / correct_second
-        return getattr(state.revision, name) - rate * rates[name] * m / (jnp.sqrt(v) + ADAM_EPSILON)
-
-    revision = Revision(**{name: moved(name) for name in rates})
-    return replace(state, revision=bounded(revision, config), first_moment=first, second_moment=second)
-
-
-def bounded(revision: Revision, config: RefineConfig) -> Revision:
-    """`revision` inside its trust region."""
-    distance = jnp.linalg.norm(revision.means, axis=-1, keepdims=True)
-    shrink = jnp.minimum(1.0, config.max_shift / jnp.maximum(distance, 1e-12))
-    limit = config.max_log_scale_change
-    return replace(
-        revision,
-        means=revision.means * shrink,
-        log_scales=jnp.clip(revision.log_scales, -limit, limit),
-        logit_opacities=jnp.clip(revision.logit_opacities, -MAX_LOGIT, MAX_LOGIT),
-    )

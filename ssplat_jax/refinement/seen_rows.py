@@ -1,10 +1,12 @@
-"""Rows of a scene that a key view may see: gradients of the others are zero, and are not computed.
+"""Rows of a scene that a key view may see: a step has no effect on the others, and leaves them out.
 
 The selection is cautious. It knows each Gaussian only as a ball around its mean, so it holds every row that the
 rasterizer draws, and some that it does not.
 """
 
+import functools
 import math
+from collections.abc import Sequence
 from typing import TypeVar
 
 import jax
@@ -29,14 +31,7 @@ class SeenRows:
 
     rows: Int[Array, " m"]  # row numbers; 0 where there is no further row
     is_row: Bool[Array, " m"]
-    places: Int[Array, " n"]  # of each selected row among `rows`; 0 for the others
-    is_seen: Bool[Array, " n"]  # the selected rows
     num_overflow: Int[Array, ""]  # rows that found no space; they are the last ones
-
-
-def seen_rows(gaussians: Gaussians, camera: Camera, max_rows: int) -> SeenRows:
-    """The rows that one camera may see, at most `max_rows` of them."""
-    return select_rows(may_be_seen(gaussians, camera), max_rows)
 
 
 def may_be_seen(gaussians: Gaussians, camera: Camera) -> Bool[Array, " n"]:
@@ -66,21 +61,20 @@ def may_be_seen(gaussians: Gaussians, camera: Camera) -> Bool[Array, " n"]:
     return is_seen
 
 
+def seen_in_any(gaussians: Gaussians, cameras: Sequence[Camera]) -> Bool[Array, " n"]:
+    """Whether a Gaussian may change a pixel of at least one of some cameras."""
+    return functools.reduce(jnp.logical_or, (may_be_seen(gaussians, camera) for camera in cameras))
+
+
 def select_rows(is_seen: Bool[Array, " n"], max_rows: int) -> SeenRows:
     """The rows where `is_seen`, at most `max_rows` of them."""
     ends = jnp.cumsum(is_seen, dtype=jnp.int32)
-    num_seen = ends[-1]
-    is_seen = is_seen & (ends <= max_rows)
-    places = jnp.where(is_seen, ends - 1, 0)
+    places = jnp.where(is_seen & (ends <= max_rows), ends - 1, max_rows)
     numbers = jnp.arange(is_seen.shape[0], dtype=jnp.int32)
-    rows = jnp.zeros((max_rows,), jnp.int32)
-    rows = rows.at[jnp.where(is_seen, places, max_rows)].set(numbers, mode="drop")
     return SeenRows(
-        rows=rows,
-        is_row=jnp.arange(max_rows, dtype=jnp.int32) < num_seen,
-        places=places,
-        is_seen=is_seen,
-        num_overflow=jnp.maximum(num_seen - max_rows, 0),
+        rows=jnp.zeros((max_rows,), jnp.int32).at[places].set(numbers, mode="drop"),
+        is_row=jnp.arange(max_rows, dtype=jnp.int32) < ends[-1],
+        num_overflow=jnp.maximum(ends[-1] - max_rows, 0),
     )
 
 
@@ -89,11 +83,12 @@ def take_rows(tree: Rows, selection: SeenRows) -> Rows:
     return jax.tree.map(lambda x: x.at[selection.rows].get(mode="promise_in_bounds"), tree)
 
 
-def put_rows(tree: Rows, selection: SeenRows) -> Rows:
-    """Arrays `[m ...]` of selected rows at their places among all rows `[n ...]`, zeros elsewhere."""
+def put_rows(tree: Rows, selection: SeenRows, into: Rows) -> Rows:
+    """`into`, arrays `[n ...]`, with the selected rows replaced by those of arrays `[m ...]`."""
+    numbers = jnp.arange(selection.rows.shape[0], dtype=jnp.int32)
 
-    def put(x: Array) -> Array:
-        found = x.at[selection.places].get(mode="promise_in_bounds")
-        return jnp.where(selection.is_seen.reshape(-1, *[1] * (x.ndim - 1)), found, 0)
+    def put(x: Array, old: Array) -> Array:
+        rows = jnp.where(selection.is_row, selection.rows, old.shape[0] + numbers)  # beyond the last: dropped
+        return old.at[rows].set(x, mode="drop", unique_indices=True)
 
-    return jax.tree.map(put, tree)
+    return jax.tree.map(put, tree, into)

@@ -16,7 +16,7 @@ from ssplat_jax.errors import InputError, require_positive
 from ssplat_jax.evaluation.exposures import exposures_from_json
 from ssplat_jax.evaluation.scoring import score_targets
 from ssplat_jax.gaussians import Gaussians
-from ssplat_jax.refinement import KeyViews, RefineConfig, current_gaussians
+from ssplat_jax.refinement import KeyViews, RefineConfig
 from ssplat_jax.refinement.choose_effects import effects_by_name, with_effects
 from ssplat_jax.refinement.refine import Progress, continue_refinement, report_of, start_refinement
 from ssplat_jax.refinement.refine_capture import key_views_of, revised_exposures
@@ -99,7 +99,7 @@ def refine_run(
         stopped = _take_steps(progress, key_views, steps, config, save_every, identity, folder, reporter)
         if stopped:
             return RefineResult(progress.num_steps, {}, {}, stopped)
-        refined, done = current_gaussians(progress.state), report_of(progress, key_views, config)
+        refined, done = progress.scene(run.gaussians), report_of(progress, key_views, config)
         exposures = revised_exposures(run.exposures, run.indices, done.key_views)
         save_scene(folder.refined_scene, refined, run.frame, exposures)
         shown = tuple(sorted({run.indices[round(i)] for i in np.linspace(0, len(run.indices) - 1, NUM_PICTURES)}))

@@ -10,12 +10,15 @@ import numpy as np
 from ssplat_jax.errors import InputError
 from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.pytree import replace
-from ssplat_jax.refinement import KeyViews, RefineConfig, RefineState
+from ssplat_jax.refinement import KeyViews, RefineConfig
+from ssplat_jax.refinement.present_rows import only_present, present_rows
 from ssplat_jax.refinement.refine import Progress
-from ssplat_jax.refinement.refine_step import Revision, init_refinement
+from ssplat_jax.refinement.refine_step import init_refinement
+from ssplat_jax.refinement.revision import Revision
 from ssplat_jax.storage.npz import load_arrays, save_arrays
 
-KIND = "refinement state 1"
+KIND = "refinement state 2"
+COUNTS = ("num_shown", "num_steps", "num_skipped")
 MOVING = ("revision", "first_moment", "second_moment")
 
 
@@ -40,7 +43,7 @@ def save_refinement(path: Path, progress: Progress, key_views: KeyViews, identit
             for name, leaf in vars(getattr(state.views, part)).items()
             if leaf is not None
         }
-    arrays |= {name: np.asarray(getattr(state, name)) for name in ("num_steps", "num_skipped")}
+    arrays |= {name: np.asarray(getattr(state, name)) for name in COUNTS}
     arrays["valid"] = np.asarray(key_views.valid)
     measured = {name: getattr(progress, name) for name in ("max_pairs", "max_rows", "losses", "held_back", "seconds")}
     save_arrays(path, arrays, KIND, {"identity": identity, "measured": measured})
@@ -74,20 +77,16 @@ def load_refinement(
             )
     if "valid" in arrays:  # saved before views could be left out: all are valid
         key_views = replace(key_views, valid=jnp.asarray(arrays["valid"]))
-    fresh = init_refinement(gaussians, key_views, config)
+    rows = present_rows(gaussians)
+    fresh = init_refinement(only_present(gaussians, rows), key_views, config)
     views = fresh.views
     if views is not None:
         taken = lambda part: replace(getattr(views, part), **_below(arrays, f"views.{part}."))  # noqa: E731
         counts = {name: jnp.asarray(arrays[f"views.{name}"]) for name in ("num_shown", "depths")}
         views = replace(views, **{part: taken(part) for part in MOVING}, **counts)
-    state = RefineState(
-        start=jax.tree.map(jnp.copy, gaussians),  # a step consumes its state
-        **{part: Revision(**_below(arrays, f"{part}.")) for part in MOVING},
-        num_steps=jnp.asarray(arrays["num_steps"]),
-        num_skipped=jnp.asarray(arrays["num_skipped"]),
-        views=views,
-    )
-    return Progress(state, **header["measured"]), key_views
+    moving = {part: Revision(**_below(arrays, f"{part}.")) for part in MOVING}
+    state = replace(fresh, **moving, **{name: jnp.asarray(arrays[name]) for name in COUNTS}, views=views)
+    return Progress(state, rows, **header["measured"]), key_views
 
 
 def _below(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, jax.Array]:

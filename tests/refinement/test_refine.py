@@ -16,7 +16,8 @@ from ssplat_jax.pytree import replace
 from ssplat_jax.rasterizer import render
 from ssplat_jax.refinement import KeyViews, RefineConfig, current_gaussians, init_refinement, refine, refine_step
 from ssplat_jax.refinement.refine import has_stopped_helping
-from ssplat_jax.refinement.refine_step import held_back_pixels, next_view, sizes
+from ssplat_jax.refinement.refine_step import held_back_pixels, next_view
+from ssplat_jax.refinement.revision import sizes
 
 NUM, WIDTH, HEIGHT, NUM_VIEWS, MAX_PAIRS = 48, 24, 16, 4, 1 << 12
 CONFIG = RefineConfig(held_back=0.0, shown_weight=0.0)  # the scene stands before black

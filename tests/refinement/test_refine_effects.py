@@ -79,7 +79,7 @@ def test_gradient_of_a_pose_is_the_central_difference(entry):
     def loss(poses):
         moved = ViewRevision(poses=poses, log_focal=None, log_exposures=None)
         seen = revised_view(of_views, moved, views, jnp.int32(1))
-        return view_loss(state.start, state.revision, mean_color(state.start), seen, jnp.int32(1), config, MAX_PAIRS)[0]
+        return view_loss(state.start, mean_color(state.start), seen, jnp.int32(1), config, MAX_PAIRS)[0]
 
     poses, width = jnp.zeros((NUM_VIEWS, 6)), 2e-3
     slope = float(jax.grad(loss)(poses)[1, entry])

@@ -15,10 +15,12 @@ from ssplat_jax.rasterizer.effects import Effects
 from ssplat_jax.rasterizer.render import RenderInputs, prepare, tile_grid_of
 from ssplat_jax.rasterizer.tile_grid import tile_boxes
 from ssplat_jax.refinement import RefineConfig, RefineEffects, init_refinement, refine, refine_step
+from ssplat_jax.refinement.refine_step import views_of_step
 from ssplat_jax.refinement.seen_rows import may_be_seen, put_rows, select_rows, take_rows
 from tests.refinement.test_refine import CONFIG, MAX_PAIRS, NUM, cameras, doubtful, key_views, photographs
 
 host = importlib.import_module("ssplat_jax.refinement.refine")
+present_rows = importlib.import_module("ssplat_jax.refinement.present_rows")
 
 
 def wide() -> Gaussians:
@@ -72,12 +74,13 @@ def test_selected_rows_come_back_to_their_places(max_rows):
     values = {"a": jnp.arange(1.0, 8), "b": jnp.arange(1.0, 15).reshape(7, 2)}
     selection = select_rows(is_seen, max_rows)
     kept = np.flatnonzero(is_seen)[:max_rows]
-    taken, back = take_rows(values, selection), put_rows(take_rows(values, selection), selection)
+    taken, others = take_rows(values, selection), jax.tree.map(lambda x: -x, values)
+    back = put_rows(taken, selection, others)
     assert int(selection.num_overflow) == max(4 - max_rows, 0)
     np.testing.assert_array_equal(selection.is_row, np.arange(max_rows) < 4)
     for name, given in values.items():
         np.testing.assert_array_equal(taken[name][: len(kept)], given[kept])
-        wanted = np.zeros_like(given)
+        wanted = -np.asarray(given)
         wanted[kept] = given[kept]
         np.testing.assert_array_equal(back[name], wanted)
 
@@ -107,14 +110,42 @@ def test_a_step_on_seen_rows_is_the_step_on_all(effects):
     assert int(report.num_overflow) > 0
 
 
-def test_refine_chooses_a_capacity_that_holds_every_view(monkeypatch):
+def test_refine_chooses_a_capacity_that_holds_every_step(monkeypatch):
     """The refined scene does not depend on it."""
     config = RefineConfig(held_back=0.0)
     wanted, _ = refine(wide(), cameras(), photographs(), steps=3, config=config)
-    monkeypatch.setattr(host, "ROWS_UNIT", 1)
-    seen = max(int(jnp.sum(may_be_seen(wide(), cameras()[i]))) for i in range(4))
-    assert seen <= host.row_capacity(wide(), key_views()) <= 1.06 * seen < NUM
+    monkeypatch.setattr(present_rows, "MIN_ROWS", 1)
+    masks, counts = [may_be_seen(wide(), cameras()[i]) for i in range(4)], []
+    for step in range(3):
+        views = views_of_step(jnp.int32(step), key_views().valid, config)
+        counts.append(int(jnp.sum(masks[views[0]] | masks[views[1]])))
+    capacity = host.row_capacity(wide(), key_views(), range(3), config)
+    assert max(counts) <= capacity <= 1.1 * max(counts) < NUM
     got, report = refine(wide(), cameras(), photographs(), steps=3, config=config)
     assert report.num_skipped == 0
     for a, b in zip(jax.tree.leaves(got), jax.tree.leaves(wanted), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-3, atol=2e-4)
+
+
+def test_absent_rows_are_left_out_and_the_others_keep_their_places(monkeypatch):
+    given = doubtful()
+    assert present_rows.present_rows(given) is None  # too few to be worth it
+    monkeypatch.setattr(present_rows, "MIN_ROWS", 1)
+    rows = present_rows.present_rows(given)
+    np.testing.assert_array_equal(rows, np.flatnonzero(np.asarray(given.opacities) > 0))
+    taken = present_rows.only_present(given, rows)
+    assert taken.num_gaussians == present_rows.round_rows(len(rows)) < NUM
+    np.testing.assert_array_equal(taken.means[: len(rows)], given.means[rows])
+    assert not np.asarray(taken.opacities[len(rows) :]).any()
+    moved = replace(taken, means=taken.means + 1)
+    back = present_rows.back_in_place(moved, rows, given)
+    is_absent = (np.asarray(given.opacities) == 0)[:, None]
+    np.testing.assert_array_equal(back.means, np.where(is_absent, given.means, given.means + 1))
+    for name in ("quats", "scales", "opacities", "sh"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(given, name))
+
+
+@pytest.mark.parametrize("num", [0, 1, 4096, 4097, 131_072, 131_073, 474_140, 700_000])
+def test_capacities_hold_their_rows_and_are_few(num):
+    assert num <= present_rows.round_rows(num) <= max(4096 * -(-max(num, 1) // 4096), num * 17 / 16)
+    assert len({present_rows.round_rows(n) for n in range(262_145, 524_289, 64)}) <= 16

@@ -1,0 +1,41 @@
+"""Rows of opacity 0 stay out of refinement: a stream's scene has space for more Gaussians than it holds."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Int
+
+from ssplat_jax.gaussians import Gaussians
+from ssplat_jax.pytree import replace
+
+MIN_ROWS = 1 << 12
+"""Capacities for rows are multiples of this, or of a 32nd of a larger power of two: few programs are compiled."""
+
+
+def round_rows(num_rows: int) -> int:
+    """The capacity for a number of rows, at most a sixteenth above it where there are many."""
+    unit = max(MIN_ROWS, (1 << max(num_rows - 1, 0).bit_length()) // 32)
+    return max(unit, unit * -(-num_rows // unit))
+
+
+def present_rows(gaussians: Gaussians) -> Int[np.ndarray, " m"] | None:
+    """Numbers of the present rows; None if there is hardly another, so that nothing is left out."""
+    rows = np.flatnonzero(np.asarray(gaussians.opacities) > 0)
+    return rows if round_rows(len(rows)) < gaussians.num_gaussians else None
+
+
+def only_present(gaussians: Gaussians, rows: Int[np.ndarray, " m"] | None) -> Gaussians:
+    """The rows of `present_rows` in their order, and absent ones up to the capacity for them."""
+    if rows is None:
+        return gaussians
+    padded = np.zeros(round_rows(len(rows)), np.int32)
+    padded[: len(rows)] = rows
+    taken = jax.tree.map(lambda x: x[padded], gaussians)
+    return replace(taken, opacities=jnp.where(np.arange(len(padded)) < len(rows), taken.opacities, 0.0))
+
+
+def back_in_place(present: Gaussians, rows: Int[np.ndarray, " m"] | None, gaussians: Gaussians) -> Gaussians:
+    """`gaussians` with the rows of `present_rows` replaced by the first ones of `present`."""
+    if rows is None:
+        return present
+    return jax.tree.map(lambda x, new: x.at[rows].set(new[: len(rows)]), gaussians, present)
