@@ -1,4 +1,4 @@
-"""One refinement step as a pure function: render key views, compare, move the Gaussians that they show by Adam."""
+"""One refinement step as a pure function: render key views, compare, move every Gaussian by Adam inside its bounds."""
 
 import functools
 
@@ -11,7 +11,7 @@ from ssplat_jax.errors import InputError
 from ssplat_jax.gaussians import Gaussians, mean_color
 from ssplat_jax.pytree import pytree, replace
 from ssplat_jax.rasterizer import Effects, fill_holes, render
-from ssplat_jax.refinement.adam_rows import AdamRows, step_rows
+from ssplat_jax.refinement.adam import adam_step
 from ssplat_jax.refinement.refine_config import RefineConfig
 from ssplat_jax.refinement.revision import Revision, apply_revision, is_revised, no_revision
 from ssplat_jax.refinement.seen_rows import put_rows, seen_in_any, select_rows, take_rows
@@ -30,7 +30,6 @@ class RefineState:
     revision: Revision
     first_moment: Revision
     second_moment: Revision
-    num_shown: Int[Array, " n"]  # steps that showed a row
     num_steps: Int[Array, ""]
     num_skipped: Int[Array, ""]  # steps whose gradient was not finite: they changed nothing
     views: ViewState | None = None  # revision of the key views, if an effect is on
@@ -58,7 +57,6 @@ def init_refinement(
         revision=no_revision(gaussians),
         first_moment=no_revision(gaussians),
         second_moment=no_revision(gaussians),
-        num_shown=jnp.zeros(gaussians.num_gaussians, jnp.int32),
         num_steps=jnp.zeros((), jnp.int32),
         num_skipped=jnp.zeros((), jnp.int32),
         views=None if key_views is None else init_view_state(gaussians, key_views, effects),
@@ -88,54 +86,47 @@ def refine_step(
 ) -> tuple[RefineState, StepReport]:
     """One step on `config.views_per_step` key views. A `lax.scan` body over `rate`; donate `state`.
 
-    Rows that none of the views shows keep their revision and their moments (`adam_rows`).
-
     Args:
         state: the scene so far.
         key_views: the views to compare with, at least one of them valid.
         rate: factor of all learning rates; 0 changes nothing but the moments.
         config: learning rates, weights and bounds (static).
         max_pairs: capacity for tile intersections (static); `StepReport.num_overflow` says what did not fit.
-        max_rows: capacity for the rows that the step's views may see (static): all else is done for them alone. By
+        max_rows: capacity for the rows that the step's views may see (static): all but Adam is done for them alone. By
             default, and where it holds every row, nothing is selected. The result is the same.
 
     Returns:
         The state after the step, and what was measured before it.
     """
     views = views_of_step(state.num_steps, key_views.valid, config)
-    current = apply_revision(state.start, state.revision)
-    background = mean_color(current)
-    everything = state.start, AdamRows(state.revision, state.first_moment, state.second_moment, state.num_shown)
-    selection = None
-    if max_rows is not None and max_rows < state.start.num_gaussians:
+    current, pull = jax.vjp(functools.partial(apply_revision, state.start), state.revision)
+    background, gaussians, selection = mean_color(current), current, None
+    if max_rows is not None and max_rows < current.num_gaussians:
         cameras = [_revised(state, _view_revision(state), key_views, view).camera(view) for view in views]
         selection = select_rows(seen_in_any(current, cameras), max_rows)
-    start, rows = everything if selection is None else take_rows(everything, selection)
-    if selection is not None:
-        start = replace(start, opacities=jnp.where(selection.is_row, start.opacities, 0.0))
-    gaussians, pull = jax.vjp(functools.partial(apply_revision, start), rows.revision)
+        gaussians = take_rows(current, selection)
+        gaussians = replace(gaussians, opacities=jnp.where(selection.is_row, gaussians.opacities, 0.0))
     slopes, of_views, report = _slopes(state, gaussians, background, key_views, views, config, max_pairs)
-    (gradient,) = pull(slopes)
     if selection is not None:
+        slopes = put_rows(slopes, selection, jax.tree.map(jnp.zeros_like, current))
         report = replace(report, num_overflow=jnp.maximum(report.num_overflow, selection.num_overflow))
+    (gradient,) = pull(slopes)
 
     is_finite = jnp.isfinite(report.loss)
     for leaf in jax.tree.leaves((gradient, of_views)):
         is_finite = is_finite & jnp.all(jnp.isfinite(leaf))
     keep = lambda new, old: jnp.where(is_finite, new, old)  # noqa: E731
-    rows = jax.tree.map(keep, step_rows(rows, gradient, rate, config), rows)
-    if selection is not None:
-        rows = put_rows(rows, selection, everything[1])
+    before = state.revision, (state.first_moment, state.second_moment)
+    revision, moments = jax.tree.map(keep, adam_step(*before, gradient, state.num_steps, rate, config), before)
     moved_views = state.views
     if state.views is not None and of_views is not None:
         moved_views = step_view_state(state.views, of_views, views, key_views.valid, rate, config.effects)
         moved_views = jax.tree.map(keep, moved_views, state.views)
     state = RefineState(
         start=state.start,
-        revision=rows.revision,
-        first_moment=rows.first_moment,
-        second_moment=rows.second_moment,
-        num_shown=rows.num_shown,
+        revision=revision,
+        first_moment=moments[0],
+        second_moment=moments[1],
         num_steps=state.num_steps + 1,
         num_skipped=state.num_skipped + (~is_finite).astype(jnp.int32),
         views=moved_views,

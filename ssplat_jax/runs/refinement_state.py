@@ -18,7 +18,7 @@ from ssplat_jax.refinement.revision import Revision
 from ssplat_jax.storage.npz import load_arrays, save_arrays
 
 KIND = "refinement state 2"
-COUNTS = ("num_shown", "num_steps", "num_skipped")
+COUNTS = ("num_steps", "num_skipped")
 MOVING = ("revision", "first_moment", "second_moment")
 
 
