@@ -7,6 +7,7 @@ tells them for another machine.
 
 import dataclasses
 import json
+import math
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -79,7 +80,9 @@ def load_front(path: Path = FRONT_FILE) -> Front:
     return front_of(fields["size"], [FrontPoint(**point) for point in fields["points"]])
 
 
-def choose(front: Front, budget_ms: float, size: tuple[int, int], reference_ms: float) -> tuple[FrontPoint, float]:
+def choose(
+    front: Front, budget_ms: float, size: tuple[int, int], reference_ms: float, *, max_factor: float = math.inf
+) -> tuple[FrontPoint, float]:
     """The most accurate point that fits into a budget, and its expected milliseconds a view.
 
     Args:
@@ -87,6 +90,7 @@ def choose(front: Front, budget_ms: float, size: tuple[int, int], reference_ms: 
         budget_ms: milliseconds a view, chunk in to novel view out.
         size: (width, height) of the capture's images; times grow with their pixels.
         reference_ms: milliseconds of the reference step on this machine.
+        max_factor: points that stream larger images, as a factor of `size`, are left out.
 
     Raises:
         InputError: the budget is no positive time, or no point fits.
@@ -94,8 +98,9 @@ def choose(front: Front, budget_ms: float, size: tuple[int, int], reference_ms: 
     if not 0 < budget_ms < float("inf"):
         raise InputError(f"--budget-ms: wanted a positive number of milliseconds a view, got {budget_ms:g}.")
     pixels = size[0] * size[1] / (front.size[0] * front.size[1])
-    times = [point.steps_per_view * reference_ms * pixels for point in front.points]
-    fitting = [(point, ms) for point, ms in zip(front.points, times, strict=True) if ms <= budget_ms]
+    points = [point for point in front.points if point.factor <= max_factor]
+    times = [point.steps_per_view * reference_ms * pixels for point in points]
+    fitting = [(point, ms) for point, ms in zip(points, times, strict=True) if ms <= budget_ms]
     if not fitting:
         raise InputError(
             f"--budget-ms: wanted at least {min(times):.0f} ms a view, which the fastest setting takes here at"
@@ -127,8 +132,10 @@ def setting_for_run(
     asked = {"budget_ms": budget_ms, "size": [capture.width, capture.height]}
     if not overwrite and (held := _read_choice(file, asked)) is not None:
         return held
+    whole = open_capture(path)  # a larger image than the capture has would cost time and show nothing more
+    max_factor = max(1.0, min(whole.width / capture.width, whole.height / capture.height))
     reference_ms = reference_step_ms()
-    point, ms = choose(load_front(), budget_ms, (capture.width, capture.height), reference_ms)
+    point, ms = choose(load_front(), budget_ms, (capture.width, capture.height), reference_ms, max_factor=max_factor)
     reporter.say(f"--budget-ms {budget_ms:g}: {point.setting}, about {ms:.0f} ms a view on this machine")
     make_writable(out)
     expected = {"expected_ms": round(ms, 1), "reference_ms": round(reference_ms, 2)}

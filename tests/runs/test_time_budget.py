@@ -38,6 +38,17 @@ def test_the_choice_is_the_best_that_fits_this_machine_and_size():
     assert choose(front, 40.0, (200, 200), 10.0) == (front.points[0], 40.0)  # four times the pixels
 
 
+@pytest.mark.parametrize("size, chosen", [("128x96", "plain"), ("96x72", "plain"), ("64x48", "large")])
+def test_no_image_is_streamed_larger_than_the_capture_has_it(tmp_path, monkeypatch, size, chosen):
+    front = Front((64, 48), (FrontPoint("plain", 1.0, {}, 1.0, 20.0), FrontPoint("large", 1.5, {}, 2.0, 22.0)))
+    monkeypatch.setattr(time_budget, "reference_step_ms", lambda: 1.0)
+    monkeypatch.setattr(time_budget, "load_front", lambda: front)
+    width, height = map(int, size.split("x"))
+    path = "procedural:room?frames=8"  # 128 x 96 by itself
+    point = setting_for_run(1e6, path, (width, height), tmp_path, overwrite=False, reporter=QUIET)
+    assert point.setting == chosen
+
+
 def test_a_budget_that_nothing_fits_names_the_least():
     front = Front((100, 100), (point(1.0, 20.0), point(2.0, 22.0)))
     with pytest.raises(InputError, match=r"at least 10 ms a view.*100x100, got 9"):
