@@ -108,7 +108,9 @@ def plot(pyplot: Any, rows: list[Row]) -> Any:
             axes.spines[["top", "right"]].set_visible(False)
         panels[0, column].set_title(scene)
         _time_ticks(panels[1, column], [row["seconds"] for row in rows])
-    figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=8)
+    figure.legend(
+        *panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=min(3, 1 + len(scenes)), fontsize=8
+    )
     return figure
 
 
