@@ -10,7 +10,7 @@ import pytest
 from ssplat_experiments.densification import densified, maintained, with_opacities_reset
 from ssplat_experiments.per_scene_optimization import EFFECTS, camera_extent, optimize, view_space_lengths
 from ssplat_experiments.scene_state import Parameters, SceneState, scene_of, start_state
-from ssplat_experiments.sparse_points import gaussians_of_points, random_points
+from ssplat_experiments.sparse_points import gaussians_of_points, random_points, triangulated_points
 from ssplat_experiments.splatting_config import SplattingConfig
 
 from ssplat_jax.cache.key_views import KeyViews
@@ -229,3 +229,21 @@ def test_random_points_lie_between_near_and_far_of_their_views():
     depths = (places[:84] @ pose[:3, :3].T + pose[:3, 3])[:, 2]  # the share of the first view
     assert len(places) == 500 and frame.near * 0.99 < depths.min() < depths.max() < frame.far * 1.01
     assert colors.min() >= 0 and colors.max() <= 1
+
+
+def test_triangulated_points_lie_on_the_surfaces():
+    capture, views = open_capture("procedural:room?frames=73", size=(160, 120)), range(6)
+    frame = capture.stream_frame(preset("tiny"), views)
+    places, colors = triangulated_points(capture, views, frame)
+    assert len(places) > 100 and colors.min() >= 0 and colors.max() <= 1
+    errors = []
+    for i in views:
+        camera, depth = capture.camera(i, frame), capture.depth(i)
+        assert depth is not None
+        pose, K = np.asarray(camera.viewmats, np.float64), np.asarray(camera.Ks, np.float64)
+        points = places @ pose[:3, :3].T + pose[:3, 3]
+        pixels = (points @ K.T)[:, :2] / points[:, 2:]
+        inside = (points[:, 2] > 0) & np.all((pixels >= 0) & (pixels < [160, 120]), axis=1)
+        columns, rows = pixels[inside].astype(int).T
+        errors.append(points[inside, 2] / (frame.scale * depth[rows, columns]) - 1)
+    assert np.median(np.abs(np.concatenate(errors))) < 0.05
