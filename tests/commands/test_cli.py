@@ -169,7 +169,7 @@ def test_results_among_the_captures_own_images_are_refused(command, place, tmp_p
         (("--version", "run"), "--version: wanted nothing beside it, got 'run'"),
         (("run", "x", "--out", "y", "--szie", "3"), "--size"),
         (("run", "x", "--out", "y", "--stride", "x"), "whole number"),
-        (("run", "x", "--out", "y", "--quality", "best"), "balanced"),
+        (("run", "x", "--out", "y", "--quality", "superb"), "balanced"),
         (("run",), "CAPTURE, --out PATH"),
         (("run", "x", "y", "--out", "z"), "run: Unrecognized options: y"),
         (("run", "x", "--out"), "--out"),

@@ -197,6 +197,7 @@ def made_views() -> tuple[np.ndarray, KeyViews]:
     return places, KeyViews.of(cameras, jnp.stack([render(wall, cameras[i], effects=EFFECTS).color for i in range(3)]))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("compiled_plainly")
 def test_a_made_scene_improves_while_it_is_densified():
     places, views = made_views()
@@ -231,6 +232,7 @@ def test_random_points_lie_between_near_and_far_of_their_views():
     assert colors.min() >= 0 and colors.max() <= 1
 
 
+@pytest.mark.slow
 def test_triangulated_points_lie_on_the_surfaces():
     capture, views = open_capture("procedural:room?frames=73", size=(160, 120)), range(6)
     frame = capture.stream_frame(preset("tiny"), views)
