@@ -1,4 +1,4 @@
-"""Where a number comes from: the machine, the date and the commit."""
+"""Origin of a number: the machine, the date and the commit."""
 
 import datetime
 import functools

@@ -11,7 +11,7 @@ from ssplat_jax.pytree import pytree
 
 @pytree
 class Parameters:
-    """What is optimized, as raw values. Also the form of gradients and moments."""
+    """Raw values of the optimized Gaussians. Also the form of gradients and moments."""
 
     means: Float[Array, "n 3"]
     quats: Float[Array, "n 4"]

@@ -21,7 +21,7 @@ def best_at(rows: Sequence[Row], seconds: float, column: str) -> float:
 
 
 def lead(rows: Sequence[Row], column: str) -> tuple[float | None, float, float]:
-    """When per-scene optimization comes to lead, and by how much it leads or trails at the end, in dB.
+    """Time at which per-scene optimization comes to lead, and its lead or lag at the end, in dB.
 
     Rows are those of one scene. Each curve counts with the best that it has reached so far.
 

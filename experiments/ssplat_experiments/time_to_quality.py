@@ -169,7 +169,7 @@ class Curve:
 
     @property
     def has_ended(self) -> bool:
-        """Whether the last `PATIENCE` scores are no better than the best before them, in either column."""
+        """True if the last `PATIENCE` scores are no better than the best before them, in either column."""
         return all(
             max((row[column] for row in self.rows[-PATIENCE:]), default=0.0)
             <= max((row[column] for row in self.rows[:-PATIENCE]), default=-np.inf)

@@ -70,7 +70,7 @@ def bench_step() -> list[Row]:
 
 
 def bench_online(*, num_chunks: int = 2500) -> list[Row]:
-    """How a step that refines the scene after each chunk (`--online-refine 2`) depends on the stream's age."""
+    """Time and memory of a step with online refinement (`--online-refine 2`), late in a stream against early."""
     return bench_age("online", num_chunks=num_chunks, steps_per_chunk=2)
 
 

@@ -47,7 +47,7 @@ class ViewScore:
 
 @dataclasses.dataclass(frozen=True)
 class Display:
-    """How a rendered view becomes a picture; with both flags it is the literal image."""
+    """Rules by which a rendered view becomes a picture; with both flags it is the literal image."""
 
     over_black: bool = False  # holes stay black instead of being filled
     one_exposure: bool = False  # at the scene's own exposure, that of the first views

@@ -43,7 +43,7 @@ OWN_FILES = (RECORD, "transforms.json", "database.db", "database.db-shm", "datab
 
 @dataclasses.dataclass(frozen=True)
 class PoseOptions:
-    """How poses are estimated."""
+    """Settings of the pose estimation."""
 
     max_frames: int = 120  # chosen from a video
     max_side: int = 1600  # pixels: larger images are reduced
@@ -125,7 +125,7 @@ def _clear(out: Path) -> None:
 
 
 def _read_record(out: Path, request: dict[str, Any]) -> dict[str, Any] | None:
-    """What an earlier call of the same request has left, or None."""
+    """Result of an earlier call with the same request, or None."""
     file = out / RECORD
     if not file.exists():
         return None
@@ -199,7 +199,7 @@ def _pairs(space: sfm.Workspace, *, is_video: bool) -> list[Pair]:
 
 
 def findings(names: list[str], models: list[Any]) -> Findings:
-    """What reconstructions of the images `names` hold."""
+    """Contents of the reconstructions of the images `names`."""
     parts = tuple(tuple(sorted(i.name for i in model.images.values() if i.has_pose)) for model in models)
     errors = [point.error for point in models[0].points3D.values()] if models else []
     error = float(np.median(errors)) if errors else 0.0

@@ -16,7 +16,7 @@ MAX_RANGES = 6  # ranges of images that a line names
 
 @dataclasses.dataclass(frozen=True)
 class Findings:
-    """What a reconstruction holds."""
+    """Contents of a reconstruction."""
 
     names: tuple[str, ...]  # of all images, in order
     parts: tuple[tuple[str, ...], ...]  # names of the registered images of each model, the largest first

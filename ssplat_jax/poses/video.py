@@ -20,7 +20,7 @@ FIX = "check that it plays; convert it with `ffmpeg -i INPUT output.mp4`"
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class VideoScan:
-    """What the frames of a video are like, in the order in which they are shown."""
+    """Measurements of the frames of a video, in the order in which they are shown."""
 
     motion: Float64[np.ndarray, " n"]  # since the first frame, in shares of the width
     sharpnesses: Float64[np.ndarray, " n"]

@@ -102,7 +102,7 @@ _project.defvjp(_project_fwd, _project_bwd)
 
 
 class _Sight(NamedTuple):
-    """Where rows lie before a camera; harmless values where they are not visible."""
+    """Places of rows in front of a camera; harmless values for rows that are not visible."""
 
     in_front: Bool[Array, "b n"]
     depths: Float[Array, "b n"]

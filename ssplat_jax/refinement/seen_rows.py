@@ -62,7 +62,7 @@ def may_be_seen(gaussians: Gaussians, camera: Camera) -> Bool[Array, " n"]:
 
 
 def seen_in_any(gaussians: Gaussians, cameras: Sequence[Camera]) -> Bool[Array, " n"]:
-    """Whether a Gaussian may change a pixel of at least one of some cameras."""
+    """Mask of the Gaussians that may change a pixel of at least one of some cameras."""
     return functools.reduce(jnp.logical_or, (may_be_seen(gaussians, camera) for camera in cameras))
 
 

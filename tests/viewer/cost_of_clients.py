@@ -1,4 +1,4 @@
-"""What clients of the viewer cost a stream: `python -m tests.viewer.cost_of_clients`, on a machine at rest.
+"""Cost of the viewer's clients to a stream: `python -m tests.viewer.cost_of_clients`, on a machine at rest.
 
 Runs with `--deltas` alone and runs with `--view` and three clients take turns. Two clients read what they are sent, one
 stalls; none draws, as if the browsers were on other machines. Prints the seconds from chunk to chunk, and their ratio.

@@ -76,7 +76,7 @@ def first_page_commands() -> list[list[str]]:
 
 
 def detail(image: np.ndarray) -> float:
-    """How much of an image is finer than some pixels: standard deviation, by that of the image."""
+    """Share of an image that is finer than some pixels: standard deviation, by that of the image."""
     gray = image.mean(axis=-1)
     return float(np.std(gray - gaussian_filter(gray, DETAIL_PIXELS)) / np.std(gray))
 
