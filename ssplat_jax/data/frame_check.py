@@ -98,8 +98,9 @@ def turn_warnings(capture: Capture) -> list[str]:
     wide = np.flatnonzero(turns > MAX_TURN_SHARE * field)
     if not wide.size or 2 * wide.size > turns.size:
         return []
+    count = "1 turn" if wide.size == 1 else f"{wide.size} turns"
     return [
-        f"{wide.size} turns of up to {turns.max():.0f} degrees between neighbors, whose images then hardly overlap"
+        f"{count} of up to {turns.max():.0f} degrees between neighbors, whose images then hardly overlap"
         f" (after frames {listed(wide.tolist())}): film without gaps, or stream the parts as captures of their own."
     ]
 

@@ -65,7 +65,7 @@ def test_a_turn_without_overlap_is_found(room):
     half = np.diag([-1.0, 1.0, -1.0, 1.0])
     frames[15:] = [dataclasses.replace(f, camtoworld=f.camtoworld @ half) for f in frames[15:]]
     (warning,) = turn_warnings(changed(room, frames=frames))
-    assert warning.startswith("1 turns") and "(after frames 14)" in warning
+    assert warning.startswith("1 turn of") and "(after frames 14)" in warning
 
 
 @pytest.mark.parametrize("i", [0, 11, 23])
@@ -136,8 +136,8 @@ def test_real_captures_have_only_true_findings(name, captures):
     """Copies in redkitchen are equal to the byte; plush and South Building turn by 71 and 130 degrees once."""
     words = {
         "redkitchen": ["90 images are copies"],
-        "plush": ["1 turns of up to 71"],
-        "south_building": ["1 turns of up to 130"],
+        "plush": ["1 turn of up to 71"],
+        "south_building": ["1 turn of up to 130"],
     }
     found = frame_warnings(open_capture(captures / name))
     assert [w.startswith(p) for w, p in zip(found, words.get(name, []), strict=True)] == [True] * len(found)
