@@ -38,7 +38,10 @@ def test_the_choice_is_the_best_that_fits_this_machine_and_size():
     assert choose(front, 40.0, (200, 200), 10.0) == (front.points[0], 40.0)  # four times the pixels
 
 
-@pytest.mark.parametrize("size, chosen", [("128x96", "plain"), ("96x72", "plain"), ("64x48", "large")])
+@pytest.mark.parametrize(
+    "size, chosen",
+    [("128x96", "plain"), ("96x72", "plain"), ("64x48", "large"), ("64x96", "plain"), ("160x120", "plain")],
+)
 def test_no_image_is_streamed_larger_than_the_capture_has_it(tmp_path, monkeypatch, size, chosen):
     front = Front((64, 48), (FrontPoint("plain", 1.0, {}, 1.0, 20.0), FrontPoint("large", 1.5, {}, 2.0, 22.0)))
     monkeypatch.setattr(time_budget, "reference_step_ms", lambda: 1.0)
