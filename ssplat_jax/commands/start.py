@@ -1,8 +1,10 @@
 """The entry point of the `ssplat` script: Ctrl-C ends every command with a line on stderr and exit code 130.
 
-jaxlib compiles on a thread of its own. An interrupt makes the waiting call return at once, and the thread goes on;
-if the interpreter then takes itself down, it frees the device under that thread, which ends in a segmentation fault
-(jaxlib 0.10.1). So a process that was interrupted unwinds, flushes its output and leaves without that part.
+jaxlib compiles on a thread of its own. An exception from the signal handler makes the waiting call return at once, and
+the thread goes on with data that the caller then frees, which ends in a segmentation fault (jaxlib 0.10.1). So an
+interrupt that comes while JAX works ends the process from the handler, before that call returns. Any other interrupt
+unwinds the command, flushes its output and leaves without taking the interpreter down: that would free the device
+under such a thread.
 """
 
 import contextlib
@@ -10,6 +12,7 @@ import os
 import signal
 import sys
 import threading
+from types import FrameType
 from typing import NoReturn
 
 EXIT_INTERRUPTED, MESSAGE = 130, "ssplat: interrupted\n"
@@ -49,13 +52,13 @@ def start() -> None:
 
 
 class _Interrupt:
-    """Handler of SIGINT: the first one raises KeyboardInterrupt, a second one ends the process."""
+    """Handler of SIGINT: the first one raises KeyboardInterrupt; a second one, or one inside JAX, ends the process."""
 
     def __init__(self) -> None:
         self.received = False
 
-    def receive(self, number, frame) -> None:
-        if self.received:
+    def receive(self, number: int, frame: FrameType | None) -> None:
+        if self.received or _is_of_jax(frame):
             _leave(EXIT_INTERRUPTED, MESSAGE)
         self.received = True
         # A callback out of compiled code may swallow the exception.
@@ -69,6 +72,11 @@ class _Interrupt:
         if self.received and issubclass(unraisable.exc_type, KeyboardInterrupt):
             _leave(EXIT_INTERRUPTED, MESSAGE)
         sys.__unraisablehook__(unraisable)
+
+
+def _is_of_jax(frame: FrameType | None) -> bool:
+    """True if the interrupted function is one of JAX, which may wait for a compilation."""
+    return frame is not None and str(frame.f_globals.get("__name__")).partition(".")[0] == "jax"
 
 
 def _leave(code: int, message: str = "") -> NoReturn:

@@ -53,7 +53,12 @@ def command():
     print("compiled", flush=True)
     return 0
 
-main.main = lambda: exit(main.guarded(command))
+def slowly():  # as a busy machine, which leaves a thread that still compiles the time to meet data that are freed
+    code = main.guarded(command)
+    time.sleep(5)
+    exit(code)
+
+main.main = slowly
 start.start()
 """
 
