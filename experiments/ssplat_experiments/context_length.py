@@ -55,7 +55,7 @@ class Sizes:
 
 SIZES = {
     "smoke": Sizes((8, 16), ("room",), (64, 48), targets=3),
-    "cpu": Sizes((24, 64, 128), ("room", "corridor", "orbit"), (160, 120)),
+    "cpu": Sizes((24, 64, 128), ("room", "corridor", "orbit"), (160, 120), joint=64),
     "gpu": Sizes((24, 64, 128), ("room", "corridor", "orbit"), (480, 256)),
 }
 
