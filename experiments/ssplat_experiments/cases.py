@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ssplat_experiments import provenance
+from ssplat_experiments.program_memory import make_room
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.console import Reporter
 from ssplat_jax.errors import InputError
@@ -79,6 +80,7 @@ def measure_cases(
         for case in cases:
             if case.name in held:
                 continue
+            make_room()
             since = time.perf_counter()
             rows = list(case.measure())
             rows = [_with_file(row, case.path(folder), number) for number, row in enumerate(rows)]

@@ -65,6 +65,11 @@ class JointNetwork:
         )
 
 
+def forget() -> None:
+    """Keeps no programs any longer."""
+    _program.cache_clear()
+
+
 @functools.lru_cache(maxsize=4)
 def _program(config: StreamConfig, structure: Any, leaves: tuple) -> jax.stages.Compiled:
     """The compiled network for the shapes of its parameters and views."""

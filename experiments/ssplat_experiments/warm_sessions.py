@@ -22,6 +22,11 @@ def new_session(config: StreamConfig) -> Session:
     return session
 
 
+def forget() -> None:
+    """Keeps no programs any longer."""
+    _session.cache_clear()
+
+
 @functools.lru_cache(maxsize=MAX_KEPT)
 def _session(config: StreamConfig) -> Session:
     model = StreamSplat(config)
