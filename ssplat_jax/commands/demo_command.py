@@ -26,10 +26,12 @@ class Demo:
     def run(self) -> int:
         from ssplat_jax.console import Reporter
         from ssplat_jax.runs.demo import run_demo
+        from ssplat_jax.storage.folder_lock import lock_folder
 
         reporter = Reporter(self.quiet)
         reporter.say("one to two minutes on two cores, most of it for compiling")
-        run_demo(self.scene, self.out, reporter, QUALITIES[self.quality])
+        with lock_folder(self.out):
+            run_demo(self.scene, self.out, reporter, QUALITIES[self.quality])
         print(f"wrote {self.out}/scene.ply, metrics.json and pictures")
         reporter.say(
             f"next: `ssplat view {self.out}` shows the scene in a browser; `ssplat run CAPTURE --out runs/mine` makes"

@@ -79,6 +79,7 @@ class Eval:
         from ssplat_jax.console import Reporter
         from ssplat_jax.evaluation.scoring import Display
         from ssplat_jax.runs.eval_run import EvalOptions, eval_path
+        from ssplat_jax.storage.folder_lock import lock_folder
 
         refine_steps = refinement_steps(self.quality, self.refine)
         check_refinement(refine_steps, self.revise, "--refine")
@@ -100,7 +101,8 @@ class Eval:
             display=Display(self.over_black, self.one_exposure),
         )
         capture = capture_path(self.capture, self.axes, self.poses)
-        metrics = eval_path(model, params, capture, self.out, options, Reporter(self.quiet))
+        with lock_folder(self.out):
+            metrics = eval_path(model, params, capture, self.out, options, Reporter(self.quiet))
         if "scenes" in metrics:
             scores = _both_scores(metrics["over_scenes"])
             print(f"{len(metrics['scenes'])} scenes: {scores}; {self.out}/metrics.json, {self.out}/*/report.html")

@@ -137,6 +137,7 @@ class Run:
                 self.refine_steps,
                 self.revise,
                 self.weights,
+                overwrite=self.overwrite,
                 axes=self.axes,
                 poses=self.poses,
                 quiet=self.quiet,

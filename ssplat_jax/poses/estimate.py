@@ -76,6 +76,7 @@ def estimate_poses(source: Path, out: Path, options: PoseOptions, overwrite: boo
             _clear(out)
         record = _read_record(out, request) or {"request": request}
         if "names" not in record:
+            write_json(out / RECORD, record)  # first: the images of a call that is killed are known as its own
             record["names"] = _gather_images(source, out, options, reporter)
             write_json(out / RECORD, record)
         if "findings" not in record:
@@ -111,9 +112,10 @@ def _check_out(source: Path, out: Path) -> None:
     if source.is_dir() and (folder == place or folder.is_relative_to(place)):
         fix = "choose a folder beside it"
         raise refusal(f"--out {out}", wanted="a folder outside the photos", got="the folder of the photos", fix=fix)
-    if (folder / "images").exists() and not (folder / RECORD).exists():
-        fix = "choose another --out"
-        raise refusal(f"--out {out}", wanted="a new folder", got="one that holds other images", fix=fix)
+    held = [name for name in (*OWN_FOLDERS, *OWN_FILES) if (folder / name).exists()]
+    if held and not (folder / RECORD).exists():
+        got, fix = f"one that holds {', '.join(held)} of another maker", "choose another --out"
+        raise refusal(f"--out {out}", wanted="a new folder", got=got, fix=fix)
 
 
 def _clear(out: Path) -> None:
@@ -152,6 +154,7 @@ def _gather_images(source: Path, out: Path, options: PoseOptions, reporter: Repo
         names = (_copy_photos if source.is_dir() else _choose_from_video)(source, partial, options, reporter)
     except BaseException:
         shutil.rmtree(partial, ignore_errors=True)
+        (out / RECORD).unlink(missing_ok=True)
         raise
     partial.rename(out / "images")
     return names

@@ -159,13 +159,15 @@ def continue_refinement(
         progress.seconds.append(time.perf_counter() - start)
         if int(report.num_overflow):
             revised = apply_revision(progress.state.start, progress.state.revision)
-            progress.max_pairs = _capacity(revised, key_views)
+            # The view that overflowed may not be among those that `_capacity` looks at.
+            needed = round_up(progress.max_pairs + int(report.num_overflow))
+            progress.max_pairs = max(_capacity(revised, key_views), needed)
             progress.max_rows = row_capacity(revised, key_views, range(progress.num_steps, steps), config)
         yield
 
 
 def _steps_per_round(key_views: KeyViews, config: RefineConfig) -> int:
-    """Steps in which every view is shown at least once."""
+    """Steps after which as many views were shown as there are."""
     return -(-int(np.sum(np.asarray(key_views.valid))) // config.views_per_step)
 
 
@@ -199,7 +201,7 @@ def _step(config: RefineConfig, max_pairs: int, max_rows: int):
 
 
 def _capacity(gaussians: Gaussians, key_views: KeyViews) -> int:
-    """Capacity for tile intersections that every key view fits into."""
+    """Capacity for the tile intersections of a key view, from a few of them; a step counts what does not fit."""
     counts = [int(render(gaussians, key_views.camera(i), effects=EFFECTS).num_pairs) for i in _spread(key_views)]
     return round_up(int(PAIRS_MARGIN * max(counts)))
 

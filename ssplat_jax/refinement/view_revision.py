@@ -134,7 +134,8 @@ def step_view_state(
         "log_focal": jnp.array(True),
         "log_exposures": shown[:, None],
     }
-    counts = {"poses": num_shown[:, None], "log_focal": jnp.max(num_shown), "log_exposures": num_shown[:, None]}
+    num_steps = -(-jnp.sum(num_shown) // views.shape[0])  # every step moves the focal length, whichever view it shows
+    counts = {"poses": num_shown[:, None], "log_focal": num_steps, "log_exposures": num_shown[:, None]}
     rates = {"poses": effects.pose_rate, "log_focal": effects.focal_rate, "log_exposures": effects.exposure_rate}
     parts: dict[str, dict[str, Array | None]] = {"revision": {}, "first_moment": {}, "second_moment": {}}
     for name in rates:
@@ -183,6 +184,8 @@ def bounded_views(revision: ViewRevision, valid: Bool[Array, " v"], effects: Ref
             jnp.sum(valid, dtype=log_exposures.dtype), 1.0
         )
         log_exposures = jnp.clip(log_exposures - mean, -effects.max_log_exposure, effects.max_log_exposure)
+        if not effects.exposures:  # Adam divides each channel by its own root mean square, which adds brightness
+            log_exposures = log_exposures - jnp.mean(log_exposures, axis=1, keepdims=True)
     return ViewRevision(poses=poses, log_focal=log_focal, log_exposures=log_exposures)
 
 

@@ -71,7 +71,10 @@ def run_capture(
     require_positive(stride=stride, save_every=save_every)
     if max_views is not None:
         require_positive(max_views=max_views)
-    capture = open_capture(path, size=size).scaled(scale)
+    capture = open_capture(path, size=size)
+    if scale != 1.0:  # as `refine` and `export` will open it, by the size: a procedural capture is rendered for it
+        scaled = capture.scaled(scale)
+        capture = open_capture(path, size=(scaled.width, scaled.height))
     check_scorable(capture)
     indices, held_back = hold_back(list(range(0, len(capture), stride))[:max_views], num_held_back)
     capture.check_output_folder(out)
@@ -120,6 +123,9 @@ def start_deltas(run: RunState, num_wanted: int, folder: RunFolder, deltas: bool
     if done == 0 or (done < num_wanted and not deltas):
         # Left by a run that stopped before its first save, or about to miss the changes of this one.
         folder.clear_deltas()
+    for path in folder.delta_files():  # of chunks that will be streamed again, perhaps with other views
+        if int(path.stem) > done:
+            path.unlink(missing_ok=True)
     if not deltas:
         return None
     is_complete = done == 0 or folder.delta(done).exists()

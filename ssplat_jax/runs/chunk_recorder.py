@@ -44,7 +44,6 @@ class ChunkRecorder:
     capture: Capture
     folder: RunFolder
     held_back: Sequence[int] = ()
-    _num_chunks: int = 0
 
     def start(self, run: RunState) -> None:
         """Removes the records that an interrupted run left of chunks which it will stream again."""
@@ -59,8 +58,8 @@ class ChunkRecorder:
             StorageError: it cannot be written.
         """
         facts = run.session.cache_facts()
-        is_scored = bool(self.held_back) and (is_last or self._num_chunks % CHUNKS_PER_SCORE == 0)
-        self._num_chunks += 1
+        number = -(-run.num_views // run.session.model.config.stream.chunk_size) - 1  # of the chunk, from 0
+        is_scored = bool(self.held_back) and (is_last or number % CHUNKS_PER_SCORE == 0)
         images = np.asarray(fed.chunk.images)
         record = ChunkRecord(
             num_views=run.num_views,

@@ -50,6 +50,7 @@ def run_demo(scene: str, out: Path, reporter: Reporter, quality: Quality = QUALI
     """
     folder, since = RunFolder(out), time.perf_counter()
     make_writable(out)  # before the long part
+    folder.clear_refinement()  # of an earlier demo
     model, params = StreamSplat(preset("tiny")), load_params("tiny")
     capture = open_capture(f"procedural:{scene}?frames={NUM_FRAMES}")
     streamed = capture.scaled(quality.scale)

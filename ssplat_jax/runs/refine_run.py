@@ -101,7 +101,7 @@ def refine_run(
             return RefineResult(progress.num_steps, {}, {}, stopped)
         refined, done = progress.scene(run.gaussians), report_of(progress, key_views, config)
         exposures = revised_exposures(run.exposures, run.indices, done.key_views)
-        save_scene(folder.refined_scene, refined, run.frame, exposures)
+        save_scene(folder.refined_scene, refined, run.frame, run.exposures)  # at the exposure of scene.ply
         shown = tuple(sorted({run.indices[round(i)] for i in np.linspace(0, len(run.indices) - 1, NUM_PICTURES)}))
         before, after = (
             score_targets(scene, run.capture, shown, run.frame, factors)

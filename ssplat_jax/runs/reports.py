@@ -54,7 +54,7 @@ def report_run(folder: RunFolder, metrics: dict[str, Any], path: str) -> None:
         (f"streamed views as shown, mean of {len(scores)}", f"{shown:.2f} dB"),
     ]
     if records:
-        facts.append(("a chunk of four views, median", f"{np.median([r.seconds for r in records]):.2f} s"))
+        facts.append(("a chunk, median", f"{np.median([r.seconds for r in records]):.2f} s"))
         facts.append(("of the cache in use", f"{records[-1].occupancy:.0%}"))
     if held_back := [r.held_back_psnr for r in records if r.held_back_psnr is not None]:
         facts.append(("held-back views as shown", f"{held_back[-1]:.2f} dB"))
@@ -70,7 +70,7 @@ def report_run(folder: RunFolder, metrics: dict[str, Any], path: str) -> None:
         commands=[
             f"ssplat view {out}    # in a browser",
             f"ssplat refine {out} {capture} --steps 100    # a better scene, by gradient steps",
-            f"ssplat render {out} {capture} --film 8 --out {out}_film    # a film along the cameras",
+            f"ssplat render {out} {capture} --size {width}x{height} --film 8 --out {out}_film    # a film",
             f"ssplat export {out} --to scene.sog    # for other viewers, at an eighth of the size",
         ],
         details=_details(metrics),
@@ -98,7 +98,7 @@ def report_eval(folder: RunFolder, metrics: dict[str, Any]) -> None:
         ("SSIM as shown", f"{shown['ssim']:.3f}"),
         ("PSNR, literal", f"{literal['psnr']:.2f} dB"),
         ("PSNR of copying the nearest view", f"{metrics['baselines']['nearest_view_psnr']:.2f} dB"),
-        ("a chunk of four views, median", f"{metrics['chunk_ms']['median']:.0f} ms"),
+        ("a chunk, median", f"{metrics['chunk_ms']['median']:.0f} ms"),
         ("Gaussians in the scene", f"{metrics['num_gaussians']:,}"),
     ]
     if refined := metrics.get("refinement"):

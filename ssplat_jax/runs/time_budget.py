@@ -23,7 +23,7 @@ from ssplat_jax.config import preset
 from ssplat_jax.console import Reporter
 from ssplat_jax.data.capture import open_capture
 from ssplat_jax.errors import InputError
-from ssplat_jax.storage.folders import make_writable
+from ssplat_jax.storage.folder_lock import lock_folder
 from ssplat_jax.storage.json_files import write_json
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.streaming.session import Session
@@ -125,21 +125,23 @@ def setting_for_run(
         reporter: says what was chosen.
 
     Raises:
-        InputError: see `choose` and `open_capture`.
+        InputError: see `choose` and `open_capture`; the capture lies in `out`, or another process writes to it.
         StorageError: `out` cannot be written.
     """
     capture, file = open_capture(path, size=size), RunFolder(out).budget
+    capture.check_output_folder(out)
     asked = {"budget_ms": budget_ms, "size": [capture.width, capture.height]}
     if not overwrite and (held := _read_choice(file, asked)) is not None:
         return held
-    whole = open_capture(path)  # a larger image than the capture has would cost time and show nothing more
-    max_factor = max(1.0, min(whole.width / capture.width, whole.height / capture.height))
+    # A larger image than the capture has would cost time and show nothing more; a procedural one has any size.
+    stored = [open_capture(path)] if path.startswith("procedural:") else capture.frames
+    max_factor = max(1.0, min(min(image.width / capture.width, image.height / capture.height) for image in stored))
     reference_ms = reference_step_ms()
     point, ms = choose(load_front(), budget_ms, (capture.width, capture.height), reference_ms, max_factor=max_factor)
     reporter.say(f"--budget-ms {budget_ms:g}: {point.setting}, about {ms:.0f} ms a view on this machine")
-    make_writable(out)
     expected = {"expected_ms": round(ms, 1), "reference_ms": round(reference_ms, 2)}
-    write_json(file, asked | expected | {"point": dataclasses.asdict(point)})
+    with lock_folder(out):
+        write_json(file, asked | expected | {"point": dataclasses.asdict(point)})
     return point
 
 

@@ -31,7 +31,7 @@ POLL_SECONDS = 0.25
 
 @dataclasses.dataclass(frozen=True)
 class WatchOptions:
-    """What of a growing capture is streamed, and when it ends."""
+    """Frames of a growing capture that are streamed, and when the run ends."""
 
     size: tuple[int, int] | None = None  # (width, height) of the images; None for the capture's own
     scale: float = 1.0  # factor of `size` at which images are streamed
@@ -53,7 +53,7 @@ def watch_capture(
         params: the model's parameters.
         path: folder that holds, or will hold, a transforms.json.
         out: folder of the results.
-        options: what is streamed, and when it ends.
+        options: the frames that are streamed, and when the run ends.
         reporter: shows progress and warnings.
 
     Raises:
@@ -70,18 +70,22 @@ def watch_capture(
     watch = _Watch(model, params, Path(path).expanduser(), RunFolder(out), options, reporter)
     with Interrupts(has_work=False) as interrupts:
         ended = watch.wait_for_frames(interrupts)
+        if interrupts.received:
+            return RunResult(watch.num_saved(), 0, interrupts.received)
         with lock_folder(out):
             if options.overwrite:
                 watch.folder.clear_run()
             run = watch.begin()
             watch.stream(run, interrupts, ended)
             if interrupts.received:
-                return RunResult(run.num_views, int(run.session.cache_facts()["decoded"]), interrupts.received)
+                num_gaussians = int(run.session.cache_facts()["decoded"]) if run.num_views else 0
+                return RunResult(run.num_views, num_gaussians, interrupts.received)
             indices = watch.indices[: run.num_views]
             if (num_written := finished_scene(watch.folder, len(indices))) is not None:
                 return RunResult(run.num_views, num_written, None, was_finished=True)
+            watch.folder.clear_refinement()  # of a scene of fewer views
             report = finish_run(run, watch.known(), path, indices, watch.folder, reporter)
-    return RunResult(run.num_views, report.num_written, None)
+    return RunResult(run.num_views, report.num_written, interrupts.received)
 
 
 @dataclasses.dataclass
@@ -100,9 +104,13 @@ class _Watch:
     last_change: float = dataclasses.field(default_factory=time.monotonic)
 
     def known(self) -> Capture:
-        """The capture; there is one once `wait_for_frames` has returned."""
+        """The capture; there is one once `wait_for_frames` has returned without a signal."""
         assert self.capture is not None
         return self.capture
+
+    def num_saved(self) -> int:
+        """Number of views of the run that the folder holds; 0 if it holds none."""
+        return len(load_newest_state(self.folder.state)[1]["frames"]) if self.folder.has_state() else 0
 
     def look(self) -> bool:
         """Looks at the folder; returns whether nothing more is to be expected."""
@@ -136,12 +144,12 @@ class _Watch:
         Raises:
             InputError: none came.
         """
-        needed = self.model.config.stream.chunk_size
-        if self.folder.has_state() and not self.options.overwrite:
-            needed = max(needed, len(load_newest_state(self.folder.state)[1]["frames"]))
+        needed = max(self.model.config.stream.chunk_size, 0 if self.options.overwrite else self.num_saved())
         self.reporter.say(f"waiting for frames in {self.path}")
         while not (ended := self.look()) and len(self.indices) < needed and not interrupts.received:
             time.sleep(POLL_SECONDS)
+        if interrupts.received:
+            return ended
         if not self.indices:
             got = self.problem or "none"
             raise refusal(
@@ -153,10 +161,8 @@ class _Watch:
 
     def begin(self) -> RunState:
         """The run that the folder holds, or a new one."""
-        chunk = self.indices[: self.model.config.stream.chunk_size]
-        if self.folder.has_state():
-            chunk = self.indices[: len(load_newest_state(self.folder.state)[1]["frames"])]
-        identity = run_identity(self.model, self.params, self.known(), chunk)
+        first = self.indices[: self.num_saved() or self.model.config.stream.chunk_size]
+        identity = run_identity(self.model, self.params, self.known(), first)
         run = resume_run(self.model, self.params, self.known(), identity, self.folder, self.reporter)
         self.reporter.warn_all(*self.known().notes, run.frame.warning)
         return run
@@ -164,7 +170,7 @@ class _Watch:
     def stream(self, run: RunState, interrupts: Interrupts, ended: bool) -> None:
         """Streams chunks as they become complete, until nothing more will come or a signal does."""
         size, num_chunks = self.model.config.stream.chunk_size, 0
-        writer = start_deltas(run, run.num_views + 1, self.folder, self.options.deltas)
+        writer = start_deltas(run, run.num_views, self.folder, self.options.deltas)
         recorder = ChunkRecorder(self.known(), self.folder)
         recorder.start(run)
         while not interrupts.received:
@@ -190,7 +196,9 @@ class _Watch:
             run.exposures |= fed.exposures
             run.frame = fed.frame
             recorder.record(run, fed, is_last=False)
-        if writer is not None:
+        if writer is None:
+            self.folder.clear_deltas()  # they miss the changes of this chunk
+        else:
             writer.write(run)
         self.reporter.say(f"{run.num_views} views streamed, {len(self.indices)} complete")
 

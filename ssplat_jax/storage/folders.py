@@ -21,14 +21,15 @@ def make_writable(folder: Path) -> None:
         raise StorageError(f"{folder}: cannot be written ({error.strerror or error}); choose another place.") from error
 
 
-def remove_numbered(folder: Path, name: str) -> None:
-    """Removes numbered files from `folder`, and the folder itself if it is empty afterwards.
+def remove_numbered(folder: Path, name: str, *, and_folder: bool = True) -> None:
+    """Removes numbered files from `folder`, and by default the folder itself if it is empty afterwards.
 
     Other files in the folder, such as the user's own, are kept.
 
     Args:
         folder: the folder to clear; it may be missing.
         name: file name in which each `#` stands for one digit, such as `#####.png`.
+        and_folder: remove an empty folder too.
 
     Raises:
         StorageError: a file cannot be removed.
@@ -38,5 +39,6 @@ def remove_numbered(folder: Path, name: str) -> None:
             path.unlink()
     except OSError as error:
         raise StorageError(f"{folder}: cannot be cleared ({error.strerror or error}); choose another place.") from error
-    with contextlib.suppress(OSError):  # missing, or not empty
-        folder.rmdir()
+    if and_folder:
+        with contextlib.suppress(OSError):  # missing, or not empty
+            folder.rmdir()

@@ -25,6 +25,8 @@ class Interrupts:
     def __enter__(self) -> "Interrupts":
         if threading.current_thread() is threading.main_thread():
             for number in (signal.SIGINT, signal.SIGTERM):
+                if signal.getsignal(number) is signal.SIG_IGN:
+                    continue  # as of a background job, which the shell has told to ignore Ctrl-C
                 self._previous[number] = signal.signal(number, self._record)
         return self
 

@@ -149,4 +149,4 @@ class RunFolder:
 
     def clear_targets(self) -> None:
         """Removes the pictures of targets."""
-        remove_numbered(self.path, "view_#####.png")
+        remove_numbered(self.path, "view_#####.png", and_folder=False)

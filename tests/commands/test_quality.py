@@ -35,6 +35,9 @@ def test_best_refines_after_the_stream(monkeypatch, tmp_path):
     monkeypatch.setattr("ssplat_jax.runs.capture_run.run_capture", lambda *a, **k: Result())
     assert Run("procedural:room", tmp_path, quality="best", quiet=True).run() == 0
     assert (asked["refine"].steps, asked["refine"].folder) == (100, tmp_path)
+    # A refinement that is stopped says how it continues: without the flag, which would start the run anew.
+    assert Run("procedural:room", tmp_path, quality="best", overwrite=True, quiet=True).run() == 0
+    assert asked["refine"].overwrite
 
 
 SCORES = {name: {"psnr": 20.0, "ssim": 0.5} for name in ("shown", "literal")}

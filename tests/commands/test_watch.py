@@ -1,7 +1,9 @@
 """`ssplat run --watch`: a folder that grows gives what the finished folder gives."""
 
 import json
+import os
 import shutil
+import signal
 import threading
 import time
 
@@ -68,10 +70,11 @@ def test_it_ends_after_quiet_seconds_and_goes_on_later(tmp_path, narrow, capsys)
     assert time.monotonic() - since > 0.5
     captured = capsys.readouterr()
     assert "8.png" in captured.err and "left out" in captured.err and "8 views" in captured.out
+    (out / "refinement.json").write_text("{}")  # of the scene of 8 views
     (growing / "images" / "8.png").write_bytes(kept)
     (growing / "done").touch()
     assert run("run", str(growing), "--watch", "--out", str(out), *narrow) == 0
-    assert "9 views" in capsys.readouterr().out
+    assert "9 views" in capsys.readouterr().out and not (out / "refinement.json").exists()
     straight = tmp_path / "straight"
     assert run("run", str(whole), "--causal", "--out", str(straight), *narrow) == 0
     assert (out / "scene.ply").read_bytes() == (straight / "scene.ply").read_bytes()
@@ -93,6 +96,19 @@ def test_a_folder_where_nothing_comes_is_refused(options, words, tmp_path, narro
     assert run("run", str(tmp_path / "empty"), "--out", str(out), *options, *narrow) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert words in line and not out.exists()
+
+
+@pytest.mark.parametrize("num_frames", [0, 2])
+def test_a_signal_before_the_first_chunk_ends_with_its_code(num_frames, tmp_path, narrow, capsys):
+    growing, out = tmp_path / "c", tmp_path / "out"
+    growing.mkdir()
+    if num_frames:
+        growing.rmdir()
+        make_capture(growing, num_frames=num_frames, size=SIZE)
+    timer = threading.Timer(1.0, os.kill, (os.getpid(), signal.SIGTERM))
+    timer.start()
+    assert run("run", str(growing), "--watch", "--out", str(out), *narrow) == 128 + signal.SIGTERM
+    assert "stopped after 0 views" in capsys.readouterr().err and not out.exists()
 
 
 def test_frames_that_were_streamed_may_not_change(tmp_path, narrow, capsys):

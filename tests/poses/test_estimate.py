@@ -13,6 +13,7 @@ from ssplat_jax.data.capture import open_capture
 from ssplat_jax.errors import InputError
 from ssplat_jax.poses import requirements, sfm
 from ssplat_jax.poses.estimate import PoseOptions, estimate_poses
+from ssplat_jax.storage.json_files import write_json
 from tests.poses.room_fixture import FOCAL, K, pictures, walk
 
 pytest.importorskip("pycolmap", reason="poses need pycolmap: pip install -e '.[poses]'")
@@ -154,3 +155,44 @@ def test_missing_packages_are_named_with_the_command(photos, tmp_path, monkeypat
     with pytest.raises(InputError, match=r'pycolmap.*not installed; run: pip install -e "\.\[poses\]"'):
         estimate(photos, tmp_path / "out")
     assert not Path(tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("name", ["sparse/0/cameras.txt", "transforms.json", "database.db", "images/1.png"])
+def test_files_of_another_maker_are_left_alone(name, photos, tmp_path):
+    held = tmp_path / "capture" / name
+    held.parent.mkdir(parents=True)
+    held.write_text("mine")
+    for overwrite in (False, True):
+        with pytest.raises(InputError, match="of another maker"):
+            estimate(photos, tmp_path / "capture", overwrite)
+    assert held.read_text() == "mine"
+
+
+def test_a_call_killed_among_its_images_continues(photos, estimated, tmp_path, monkeypatch):
+    killed = tmp_path / "capture"
+    with monkeypatch.context() as patched:
+        patched.setattr("ssplat_jax.poses.estimate.write_json", _only_once(write_json))
+        with pytest.raises(MemoryError):
+            estimate(photos, killed)
+    assert (killed / "images").is_dir()
+    assert estimate(photos, killed) == estimated[1]
+
+
+def _only_once(function):
+    """`function`, which the second time ends as a kill does: nothing after it happens."""
+    calls = iter((function,))
+
+    def call(*arguments):
+        try:
+            next(calls)(*arguments)
+        except StopIteration:
+            raise MemoryError from None
+
+    return call
+
+
+def test_a_source_without_images_leaves_no_record(tmp_path):
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError):
+        estimate(tmp_path / "empty", tmp_path / "capture")
+    assert not (tmp_path / "capture" / "poses.json").exists()

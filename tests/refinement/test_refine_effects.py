@@ -14,7 +14,13 @@ from ssplat_jax.pytree import replace
 from ssplat_jax.rasterizer import render
 from ssplat_jax.refinement import RefineConfig, RefineEffects, init_refinement, refine, refine_step, revised_key_views
 from ssplat_jax.refinement.refine_step import view_loss
-from ssplat_jax.refinement.view_revision import ViewRevision, bounded_views, moved_viewmat, revised_view
+from ssplat_jax.refinement.view_revision import (
+    ViewRevision,
+    bounded_views,
+    moved_viewmat,
+    revised_view,
+    step_view_state,
+)
 from tests.refinement.test_refine import (
     CONFIG,
     MAX_PAIRS,
@@ -162,7 +168,18 @@ def test_white_balance_alone_keeps_every_exposure():
     assert state.views is not None
     change = np.asarray(state.views.revision.log_exposures)
     assert np.abs(change).max() > 0
-    np.testing.assert_allclose(change.sum(axis=1), 0, atol=0.02)  # Adam's steps are not exactly opposite
+    np.testing.assert_allclose(change.sum(axis=1), 0, atol=1e-6)
+
+
+def test_a_constant_gradient_moves_the_focal_length_by_its_rate_at_every_step():
+    """Adam without a wrong correction of its bias, whichever view a step shows."""
+    views, effects = key_views(), RefineEffects(focal=True, max_log_focal=1.0)
+    state = init_refinement(scene(), views, dataclasses.replace(CONFIG, effects=effects)).views
+    slope = ViewRevision(poses=None, log_focal=jnp.float32(0.5), log_exposures=None)
+    for i in range(3 * NUM_VIEWS):
+        shown = jnp.array([i % NUM_VIEWS, (i + 1) % NUM_VIEWS])
+        state = step_view_state(state, slope, shown, views.valid, jnp.float32(1), effects)
+        assert float(state.revision.log_focal) == pytest.approx(-(i + 1) * effects.focal_rate, rel=1e-3)
 
 
 def test_no_view_leaves_its_trust_region():

@@ -8,7 +8,9 @@ import pytest
 from ssplat_jax.checkpoint.weights import load_params
 from ssplat_jax.config import preset
 from ssplat_jax.console import Reporter
+from ssplat_jax.data.capture import open_capture
 from ssplat_jax.errors import InputError
+from ssplat_jax.runs import capture_run
 from ssplat_jax.runs import refine_run as module
 from ssplat_jax.runs.capture_run import run_capture
 from ssplat_jax.runs.refine_run import refine_run
@@ -134,3 +136,35 @@ def test_starting_a_run_anew_removes_its_refinement(finished):
     assert all((finished / name).exists() for name in REFINED)
     folder.clear_run()
     assert not any((finished / name).exists() for name in REFINED) and not folder.scene.exists()
+
+
+@pytest.mark.parametrize("scale", [0.5, 0.75, 1.0])
+def test_a_procedural_run_opens_what_refinement_will_open(scale, tmp_path, monkeypatch):
+    """The cameras and images are the same, whatever size is streamed."""
+
+    class Opened(Exception):
+        pass
+
+    def identity(model, params, capture, indices):
+        raise Opened(capture)
+
+    monkeypatch.setattr(capture_run, "run_identity", identity)
+    with pytest.raises(Opened) as raised:
+        run_capture(
+            StreamSplat(preset("tiny")),
+            {},
+            CAPTURE,
+            tmp_path / "run",
+            size=None,
+            scale=scale,
+            stride=1,
+            max_views=None,
+            save_every=8,
+            overwrite=False,
+            reporter=Reporter(quiet=True),
+        )
+    (streamed,) = raised.value.args
+    again = open_capture(CAPTURE, size=(streamed.width, streamed.height))
+    frames = range(len(again))
+    assert streamed.digest(frames) == again.digest(frames)
+    assert streamed.images_digest(frames) == again.images_digest(frames)

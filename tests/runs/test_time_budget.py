@@ -5,6 +5,7 @@ import json
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from ssplat_jax.checkpoint.weights import check_params, load_params
 from ssplat_jax.config import preset
@@ -12,6 +13,7 @@ from ssplat_jax.console import Reporter
 from ssplat_jax.errors import InputError
 from ssplat_jax.runs import time_budget
 from ssplat_jax.runs.time_budget import Front, FrontPoint, choose, front_of, load_front, setting_for_run
+from tests.commands.test_cli import make_capture
 
 QUIET = Reporter(quiet=True)
 
@@ -50,6 +52,24 @@ def test_no_image_is_streamed_larger_than_the_capture_has_it(tmp_path, monkeypat
     path = "procedural:room?frames=8"  # 128 x 96 by itself
     point = setting_for_run(1e6, path, (width, height), tmp_path, overwrite=False, reporter=QUIET)
     assert point.setting == chosen
+
+
+def test_images_of_several_sizes_need_a_size_alone(tmp_path, monkeypatch):
+    capture = make_capture(tmp_path / "c", num_frames=4, size=(64, 48))
+    facts = json.loads((capture / "transforms.json").read_text())
+    Image.new("RGB", (128, 96)).save(capture / facts["frames"][1]["file_path"])
+    facts["frames"][1] |= {"w": 128, "h": 96, "fl_x": 128.0, "fl_y": 128.0, "cx": 64.0, "cy": 48.0}
+    (capture / "transforms.json").write_text(json.dumps(facts))
+    front = Front((32, 24), (FrontPoint("plain", 1.0, {}, 1.0, 20.0), FrontPoint("large", 1.5, {}, 2.0, 22.0)))
+    monkeypatch.setattr(time_budget, "reference_step_ms", lambda: 1.0)
+    monkeypatch.setattr(time_budget, "load_front", lambda: front)
+    for size, chosen in (((32, 24), "large"), ((64, 48), "plain")):
+        out = tmp_path / chosen
+        assert setting_for_run(1e6, str(capture), size, out, overwrite=False, reporter=QUIET).setting == chosen
+        assert json.loads((out / "budget.json").read_text())["point"]["setting"] == chosen
+    with pytest.raises(InputError, match="images"):
+        setting_for_run(1e6, str(capture), (32, 24), capture / "images", overwrite=False, reporter=QUIET)
+    assert not (capture / "images" / "budget.json").exists()
 
 
 def test_a_budget_that_nothing_fits_names_the_least():
