@@ -1,11 +1,14 @@
 """StreamSplat in JAX: a calibrated image stream becomes a 3D Gaussian scene, chunk by chunk.
 
-    import jax, ssplat_jax as ss
+    import ssplat_jax as ss
+    from ssplat_jax.streaming.session import Session
     model, params = ss.StreamSplat(ss.preset("tiny")), ss.load_params("tiny")
-    cache, step = model.init_cache(), jax.jit(model.step, donate_argnums=1)
+    session = Session(model, params)                # holds the cache, grows it, compiles the step
     for chunk in ss.open_capture("path/to/capture").chunks(model.config):
-        cache, out = step(params, cache, chunk)
-    gaussians = model.decode(params, cache)
+        out = session.feed(chunk)
+    gaussians = session.gaussians()                 # in the stream frame
+
+docs/python_api.md has the same loop with pure functions.
 
 Names are imported on first use, so that `ssplat --help` does not load JAX.
 """

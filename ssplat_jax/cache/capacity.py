@@ -30,6 +30,18 @@ def ensure_capacity(cache: VoxelCache, config: StreamConfig, num_new_tokens: int
     Call it outside jit. Only `overflow="grow"` changes the cache. Rows keep their numbers, so the stream continues
     exactly as if the cache had had the new capacity from the start. The step is compiled again for a new capacity;
     doubling limits the number of compilations to log2 of the final size.
+
+    Args:
+        cache: the cache before a step.
+        config: its `overflow` decides.
+        num_new_tokens: tokens of the coming chunk, one per 4 x 4 pixels of the padded images
+            (`ssplat_jax.streaming.session.tokens_per_chunk`).
+
+    Returns:
+        The cache itself, or a larger copy.
+
+    Raises:
+        InputError: the capacity of the cache is no power of two.
     """
     if config.memory.overflow != "grow":
         return cache

@@ -62,7 +62,7 @@ class TrainingCheckpoints:
             write_atomic(path, json.dumps(description, indent=1, sort_keys=True).encode())
             return
         held_description = json.loads(path.read_text())
-        if "chunk_size" in held_description.get("config", {}):  # flat, as version 0.1 wrote it
+        if "chunk_size" in held_description.get("config", {}):  # flat, as before 0.1.0
             held_description["config"] = config_from_header(held_description["config"]).to_dict()
         if (found := first_difference(upgrade(held_description), description)) is not None:
             name, held, wanted = found

@@ -15,8 +15,8 @@ class Bench:
     """
 
     name: Annotated[Literal["render", "refine", "stream"], tyro.conf.Positional]
-    """render: the rasterizer. refine: a step of refinement on a large scene. stream: the cache's fuse and projection
-    over long streams."""
+    """render: the rasterizer. refine: a step of refinement on a large scene. stream: fuse and projection of the cache,
+    and whole steps, with online refinement and without, early and late in a stream."""
     json: Path | None = None
     """Write {machine, rows: [{name, value, unit}]} here as well."""
     against: Path | None = None

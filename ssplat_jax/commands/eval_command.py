@@ -30,7 +30,7 @@ from ssplat_jax.config import QUALITIES
 class Eval:
     """Score novel views of a capture: metrics.json, index.json and target | render | depth pictures.
 
-    Frames that are not chosen fit the capture. With --index, the capture may be a folder of the scenes in the index.
+    Options that are left out follow from the capture. With --index, the capture may be a folder of the index's scenes.
 
     Example: ssplat eval path/to/capture --size 320x240 --out runs/eval
     """
@@ -44,7 +44,7 @@ class Eval:
     """interleaved: every 8th frame from the 5th on is a target. paper: targets uniform over the trajectory. scannet:
     paper's, thinned to 1088 frames, with 64 targets and 8 anchors first."""
     stride: int | None = None
-    """Use every STRIDE-th frame; default 1, or with neither --context nor --protocol so that 73 frames are left."""
+    """Use every STRIDE-th frame; default 1, or without --context the largest that leaves 73 frames (interleaved)."""
     targets: int | None = None
     """paper: number of targets, default 16; scannet: 64. interleaved: most targets to keep, evenly spread."""
     index: Path | None = None

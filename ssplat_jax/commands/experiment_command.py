@@ -18,10 +18,10 @@ class Experiment:
     """
 
     name: Annotated[str, tyro.conf.Positional]
-    """all: the tables and figures of the paper, on one page. accuracy_vs_time: accuracy against time.
-    time_to_quality: the stream, refined or not, and per-scene optimization against seconds.
-    captures: novel views of real captures. ablation: the effect of each module.
-    depth_error: errors of depth, by confidence. more_views: the paper's protocol over growing numbers of views."""
+    """all: the first seven, on one page. context_length, long_context: quality against the number of views (the paper's
+    Tables 1 and 2). ablation: the effect of each module (Table 3). memory_curve: Figure 1. latency: time of each stage.
+    additions: the effect of each addition to the paper. accuracy_vs_time, time_to_quality: quality against time.
+    captures, more_views, depth_error, error_bands, export_selection: real captures. score: another method's renders."""
     out: Path
     """Folder of the tables, plots and pictures."""
     captures: Path | None = None

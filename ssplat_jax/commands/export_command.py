@@ -17,7 +17,7 @@ class Export:
     scene: Annotated[Path, tyro.conf.Positional]
     """Folder of an `ssplat run` or `ssplat demo`, or a scene file."""
     to: Path
-    """File to write: .ply; .compressed.ply, .spz or .sog, 4 to 20 times smaller; .glb or .gltf; .splat."""
+    """File to write: .ply; .compressed.ply, .spz or .sog, 4 to 8 times smaller; .glb or .gltf; .splat."""
     prune: bool = False
     """Leave out specks, and floaters that one view alone made; their number is printed."""
     max_splats: int | None = None

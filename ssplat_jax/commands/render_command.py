@@ -18,7 +18,7 @@ class Render:
     """
 
     scene: Annotated[Path, tyro.conf.Positional]
-    """A scene file (.ply, .spz, .sog, .glb, .splat) in the capture's frame, or the folder of an `ssplat run`."""
+    """A scene file (see `ssplat view --help`) in the capture's frame, or the folder of an `ssplat run`."""
     capture: CapturePath
     out: Path
     """Folder of the pictures, views/<frame>.png."""
@@ -33,7 +33,8 @@ class Render:
     one_exposure: bool = False
     """Show a run's scene at the exposure of its first views instead of the middle one of all."""
     film: int | None = None
-    """Also write film.mp4, 24 pictures a second (extra `video`): FILM to each next camera, or in an orbit in all."""
+    """Also write film.mp4 at 24 frames a second (extra `video`): FILM frames from each camera to the next, or with
+    --film-path orbit FILM frames in all."""
     film_path: Literal["spline", "orbit"] = "spline"
     """spline: smooth, through all cameras. orbit: a circle around what the cameras look at; where they look outward, as
     in a room, a small circle about the middle camera."""

@@ -49,8 +49,8 @@ class Run:
     """Image size WxH; default the capture's own."""
     quality: QualityOption = "accurate"
     budget_ms: float | None = None
-    """Choose size and settings that take at most so many ms a view here, by timing this machine first; with the weights
-    tiny. --set goes on top and changes the time."""
+    """Time this machine, then choose the most accurate size and settings that take at most this many ms a view. Needs
+    the weights tiny; --set is applied afterwards and changes the time."""
     weights: WeightsOption = "tiny"
     set: ConfigChanges = ()
     save_every: int = 8

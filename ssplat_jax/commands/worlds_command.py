@@ -1,4 +1,4 @@
-"""`ssplat worlds`: made worlds as captures with exact poses and depth."""
+"""`ssplat worlds`: synthetic worlds as captures with exact poses and depth."""
 
 import dataclasses
 from pathlib import Path
@@ -9,7 +9,7 @@ from ssplat_jax.errors import require_positive
 
 @dataclasses.dataclass(frozen=True)
 class Worlds:
-    """Render made rooms and streets into capture folders with exact poses and z-depth.
+    """Render synthetic rooms and streets into capture folders with exact poses and z-depth.
 
     Example: ssplat worlds --out worlds --count 2 --seed 0
     """

@@ -1,8 +1,8 @@
 """Configuration of a stream: the static values, whose change recompiles the program.
 
-Defaults are the paper's where it gives them; docs/decisions.md explains the others. "Literal" marks options that
-follow the paper exactly, "ours" those that it does not have. This module does not import JAX, so that `ssplat --help`
-answers at once.
+Defaults are those of the preset `tiny`, with the additions to the paper on; `preset("paper")` has the paper's value of
+every field (docs/algorithm.md has the table). "Literal" marks values that follow the paper exactly, "ours" those that
+it does not have. This module does not import JAX, so that `ssplat --help` answers at once.
 """
 
 from ssplat_jax.config.field_groups import (

@@ -171,9 +171,9 @@ class OnlineRefineConfig(ConfigGroup):
     """Refinement while streaming: gradient steps on key views after each chunk (ours)."""
 
     steps_per_chunk: int = 0
-    """Key views that revise the scene after each chunk, one a step; 0 leaves no trace in any program."""
+    """Gradient steps after each chunk, each on one key view; 0 adds nothing to any program."""
     num_key_views: int = 64
-    """Views that are kept to compare the scene with; of more, the one most like another leaves."""
+    """Key views kept to compare the scene with; when all places are taken, one of the two most similar is replaced."""
     pivots_per_cell: int = 12
     """Pivots that are revised after a chunk, as a multiple of the grid cells of a view: the nearest before the key
     views. It fixes time and memory of the steps."""

@@ -18,7 +18,7 @@ from ssplat_jax.config.network_configs import NETWORK_CONFIGS, CompactConfig, Re
 from ssplat_jax.errors import InputError
 
 RENAMED_FIELDS = {"mixer_neighbours": "mixer_neighbors"}
-"""Current names of fields that version 0.1 called differently."""
+"""Current names of fields that files written before 0.1.0 call differently."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,7 +102,7 @@ class StreamConfig:
 
     @staticmethod
     def from_dict(fields: dict[str, Any]) -> "StreamConfig":
-        """Configuration from `to_dict`, or from the flat dictionary of version 0.1.
+        """Configuration from `to_dict`, or from the flat dictionary of files written before 0.1.0.
 
         Raises:
             InputError: a field is unknown or its value is not allowed.
@@ -134,7 +134,7 @@ def _from_json(value: Any) -> Any:
 
 
 def _from_flat(fields: dict[str, Any]) -> StreamConfig:
-    """Configuration from the flat dictionary of version 0.1, which held the fields of all networks."""
+    """Configuration from the flat dictionary of files written before 0.1.0, which held the fields of all networks."""
     config = StreamConfig().replace(network=fields["network"])
     foreign = {f.name for kind in NETWORK_CONFIGS.values() for f in dataclasses.fields(kind)}
     foreign -= {f.name for f in dataclasses.fields(config.network)}

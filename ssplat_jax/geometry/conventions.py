@@ -43,7 +43,7 @@ Pixel coordinates are (x, y) with the origin at the top left corner of the image
 | Frame | Origin and axes | Unit of length |
 |---|---|---|
 | capture frame | those of the poses as the user gave them | the capture's |
-| stream frame | those of the first camera | capture unit x scene scale (`data.stream_frame.StreamFrame`) |
+| stream frame | those of the first camera | capture unit / scene scale (`data.stream_frame.StreamFrame`) |
 
 The network and the cache work in the stream frame, so that a voxel means the same in every capture. Lengths are in the
 unit of their frame and angles in radians unless a name says otherwise.
@@ -65,6 +65,10 @@ unit of their frame and angles in radians unless a name says otherwise.
 | `m` | tokens |
 | `n` | Gaussians |
 | `k` | pivots of a voxel; coefficients of spherical harmonics in `sh` |
+| `g` | cells along a side of a stored coarse view |
+| `r` | residual numbers of a pivot |
+| `a` | numbers of a pivot's mean colors |
+| `slots` | entries of the hash table |
 | `capacity` | voxels that a cache can hold |
 
 ## Values
@@ -74,5 +78,5 @@ unit of their frame and angles in radians unless a name says otherwise.
 - `log_depths` are natural logarithms of `depths`.
 - Gaussians have `means`, `quats`, `scales`, `opacities` and `sh`. These names stand for activated values (`scales` are
   standard deviations, `opacities` lie in [0, 1]); values before activation say so (`raw_scales`, `log_scales`,
-  `opacity_logits`).
+  `logit_opacities`).
 """

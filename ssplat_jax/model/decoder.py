@@ -62,7 +62,7 @@ def decode_tokens(
         Gaussians token by token, stream frame.
     """
     layers = jnp.asarray(num_members, jnp.float32) if config.head.opacity_mode == "compound" else 1.0
-    optical_depths = layers * nn.softplus(shapes.opacity_logits)
+    optical_depths = layers * nn.softplus(shapes.logit_opacities)
     each = lambda x: jnp.repeat(x, config.head.gaussians_per_token, axis=0)  # noqa: E731
     return Gaussians(
         means=_spread(means, quats, footprints, config),

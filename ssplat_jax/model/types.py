@@ -46,7 +46,7 @@ class DepthDistribution:
 class AnchoredDepth:
     """The anchored distribution P^v(k | u), and the depths and confidences read from it.
 
-    All on the matching grid; after `refine_depth`, all but `probs` are on the feature grid.
+    `probs` is on the matching grid; the others are too, until `refine_depth` brings them to the feature grid.
     """
 
     probs: Float[Array, "v hm wm d"]
@@ -59,7 +59,7 @@ class AnchoredDepth:
 class TokenShapes:
     """Predictions of the Gaussian head for each token, before activation."""
 
-    opacity_logits: Float[Array, " m"]
+    logit_opacities: Float[Array, " m"]
     raw_scales: Float[Array, "m 3"]  # see `decoder.token_scales`
     quats: Float[Array, "m 4"]  # wxyz, any length, in the frame of the token's camera
     sh: Float[Array, "m k 3"]  # residual color on the appearance anchor

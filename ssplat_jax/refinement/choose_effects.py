@@ -68,8 +68,8 @@ def choose_effects(residuals: ViewResiduals) -> EffectsChoice:
         f"poses {_is(poses)}: turning cameras by {turn:.2f} degrees and moving them by {100 * motion:.1f} % of the"
         f" depth explains {100 * by_pose:.0f} % of the squared residual",
         f"focal {_is(focal)}: changing focal lengths by {100 * log_focal:+.1f} % explains {100 * by_focal:.0f} % of it",
-        f"exposures {_is(effects.exposures)}: the brightness of views is off by {100 * gain:.1f} %",
-        f"white_balance {_is(effects.white_balance)}: the colors of views are off by {100 * tint:.1f} %",
+        f"exposures {_is(effects.exposures)}: the brightness of views varies by {100 * gain:.1f} %",
+        f"white_balance {_is(effects.white_balance)}: the tint of views varies by {100 * tint:.1f} %",
     )
     return EffectsChoice(effects, reasons)
 

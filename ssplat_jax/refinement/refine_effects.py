@@ -1,4 +1,4 @@
-"""What refinement may revise besides the Gaussians. No JAX here."""
+"""Parts of the key views that refinement may revise besides the Gaussians. No JAX here."""
 
 import dataclasses
 import math

@@ -1,1 +1,1 @@
-"""The work behind `ssplat run`, `demo`, `render` and `export`."""
+"""The work behind `ssplat run`, `refine`, `eval`, `demo`, `render` and `export`, and their reports."""

@@ -40,7 +40,7 @@ NUM_REPEATS = 9
 
 @dataclasses.dataclass(frozen=True)
 class FrontPoint:
-    """A setting that no other setting beats in both accuracy and time."""
+    """A point of the Pareto front of accuracy and time: no other setting is both faster and at least as good."""
 
     setting: str
     factor: float
@@ -55,7 +55,7 @@ class FrontPoint:
 
 @dataclasses.dataclass(frozen=True)
 class Front:
-    """The points of the front, and the size of the images at which their times hold."""
+    """The Pareto front, and the size of the images at which its times hold."""
 
     size: tuple[int, int]
     points: tuple[FrontPoint, ...]

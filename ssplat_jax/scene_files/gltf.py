@@ -1,4 +1,4 @@
-"""Reader and writer of glTF 2.0 with the extension KHR_gaussian_splatting, as .glb (one binary file) or .gltf (JSON).
+"""Writer of glTF 2.0 with the extension KHR_gaussian_splatting, as .glb (one file) or .gltf (JSON); see gltf_reader.py.
 
 The Gaussians are a primitive of points. Its attributes are POSITION; ROTATION, a unit quaternion xyzw; SCALE, standard
 deviations; OPACITY; and SH_DEGREE_l_COEF_m, the SH coefficients in the order and with the signs of a .ply; all but the

@@ -1,4 +1,4 @@
-"""Reader and writer of .sog files (PlayCanvas, SOG version 2), a fifteenth of the size of a .ply, for browsers.
+"""Writer of .sog files (PlayCanvas, SOG version 2), for browsers; sog_reader.py reads them.
 
 A zip archive of `meta.json` and lossless WebP images of 8 bits a channel; pixel i, row by row, belongs to Gaussian i:
 

@@ -1,4 +1,4 @@
-"""Writer of the .spz file (Niantic, version 3), a seventh of the size of a .ply, for browsers and phones.
+"""Writer of the .spz file (Niantic, version 3), for browsers and phones.
 
 A gzip stream of a 16-byte header and the fields one after the other, each for all Gaussians:
 

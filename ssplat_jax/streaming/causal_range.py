@@ -16,7 +16,7 @@ from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.streaming.streamsplat import ChunkOutput
 
 END_SHARE = 1 / 32
-"""Share of the range of inverse depths that counts as its end: two of 64 candidates."""
+"""Share of the range of inverse depths that counts as its end."""
 MAX_END_SHARE = 0.2
 """Share of the confident cells of a chunk that may lie at an end."""
 STEP = 1.5

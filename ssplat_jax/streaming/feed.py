@@ -23,7 +23,8 @@ Exposures = dict[int, Float[np.ndarray, "3"]]
 def middle_exposure(exposures: Exposures) -> Float[np.ndarray, "3"]:
     """The median over streamed frames of their exposures, per channel; 1 without frames.
 
-    A person is shown the scene at this exposure: that of the first views, which the cache keeps, may be a shadow's.
+    Scenes are shown at this exposure, because the first views, whose exposure the cache keeps, may have been taken in
+    the shade.
     """
     if not exposures:
         return np.ones(3)

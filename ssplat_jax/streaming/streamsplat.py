@@ -73,6 +73,7 @@ class StreamSplat:
         >>> params, cache = model.init(jax.random.key(0)), model.init_cache()
         >>> step = jax.jit(model.step, donate_argnums=1)
         >>> for chunk in chunks:
+        ...     cache = ss.ensure_capacity(cache, model.config, num_tokens)  # one per 4 x 4 pixels of the chunk
         ...     cache, out = step(params, cache, chunk)
         >>> gaussians = model.decode(params, cache)
     """
@@ -122,7 +123,24 @@ class StreamSplat:
         return Prediction(tokens, logits, depth.log_depths, views, output)
 
     def step(self, params: dict, cache: VoxelCache, chunk: Chunk) -> tuple[VoxelCache, ChunkOutput]:
-        """One chunk: predicts its tokens and updates the cache. The cache comes first, as the carry of a scan."""
+        """The cache after one chunk, and a summary of the chunk. Pure; the cache comes first, as the carry of a scan.
+
+        Args:
+            params: parameters, from `init` or `load_params`.
+            cache: the cache before the chunk; may be donated.
+            chunk: `stream.chunk_size` views in the stream frame, without leading axes. Images may have any size: they
+                are padded at the right and bottom.
+
+        Returns:
+            The updated cache, and depths, confidences and exposures of the views.
+
+        Limits:
+            Tokens that find no space are dropped and counted in `cache.stats.num_dropped`: call `ensure_capacity`
+            before the step and `check_cache` after it. No gradient flows through the cache.
+
+        Raises:
+            InputError: a shape of `chunk` is wrong.
+        """
         prediction = self.predict(params, cache, chunk)
         return self.update_cache(cache, prediction), prediction.output
 
@@ -142,7 +160,10 @@ class StreamSplat:
             return store_witness(cache, *seen, self.config)
 
     def run(self, params: dict, cache: VoxelCache, chunks: Chunk) -> tuple[VoxelCache, ChunkOutput]:
-        """Runs `step` over stacked chunks (leading axis t) as one `lax.scan`."""
+        """`step` over stacked chunks (leading axis t) as one `lax.scan`.
+
+        The cache cannot grow inside the scan: give it the capacity for all chunks first (`ensure_capacity`).
+        """
         return jax.lax.scan(functools.partial(self.step, params), cache, chunks)
 
     def decode(self, params: dict, cache: VoxelCache) -> Gaussians:

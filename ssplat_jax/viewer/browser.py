@@ -86,7 +86,7 @@ class Browser:
             self._node.set_gaussians(**fields)
 
     def _show_background(self) -> None:
-        """What lies behind splats: black, or the browser's own."""
+        """Sets the background behind the splats: black, or the browser's own."""
         black = np.zeros((1, 1, 3), np.uint8)
         self._client.scene.set_background_image(black if self._stage.over_black else None, format="png")
         self._drawn = None

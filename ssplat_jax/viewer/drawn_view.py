@@ -13,7 +13,7 @@ from ssplat_jax.viewer.browser_camera import BrowserCamera
 from ssplat_jax.viewer.viewed_scene import ViewedScene
 
 KINDS = ("color", "depth", "normals", "confidence", "exposure")
-"""What a picture can show; `exposure` is color at the exposure of the nearest streamed view."""
+"""Kinds of picture; `exposure` is color at the exposure of the nearest streamed view."""
 
 DRAFT, FINE = (320, 240), (960, 640)
 """Sizes (width, height) of pictures while the camera moves, and when it rests. They are fixed, so that few programs are

@@ -96,6 +96,7 @@ def test_hpda_and_cgfi_have_no_published_tensor():
     assert published_tensor(("cgfi", "enter", "kernel"), (3, 3, 5, 7)) is None
 
 
+@pytest.mark.slow
 def test_a_depth_network_leaves_other_parts_initialized(depth_network, tensors):
     imported = import_params(depth_network, CONFIG, seed=5)
     assert imported.initialized_parts == ("gaussian_regressor", "pt", "gaussian_head")
@@ -114,6 +115,7 @@ def test_a_depth_network_leaves_other_parts_initialized(depth_network, tensors):
         jax.tree.map(np.testing.assert_array_equal, imported.params[name], stage)
 
 
+@pytest.mark.slow
 def test_the_depth_network_of_depthsplat_can_be_imported(tmp_path, tensors):
     path = tmp_path / "depthsplat.ckpt.npz"
     other = {f"{HEAD}0.weight": np.zeros((37, 64, 3, 3), np.float32), "encoder.feature_upsampler.x": np.zeros(3)}

@@ -57,6 +57,7 @@ def test_a_replaced_future_changes_no_earlier_output(tmp_path, weights):
     assert state[1]["done"] == 8
 
 
+@pytest.mark.slow
 def test_a_stopped_causal_run_continues_to_the_same_scene(tmp_path, weights):
     capture = str(make_capture(tmp_path / "capture", num_frames=12, size=SIZE))
     arguments = ("--causal", "--weights", weights, "--save-every", "1", "--quiet")

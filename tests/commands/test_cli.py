@@ -312,6 +312,7 @@ def test_run_stops_resumes_and_exports(tmp_path, capsys):
     assert "differs in its poses" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_run_continues_with_a_larger_capacity(tmp_path):
     out, capture = tmp_path / "run", str(make_capture(tmp_path / "capture", num_frames=8, size=(64, 48)))
     assert run("run", capture, "--out", str(out), "--set", "overflow=error", "--quiet") == 0
@@ -368,6 +369,7 @@ def test_negative_refinement_steps_are_bad_usage(tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_run_refine_equals_run_then_refine(tmp_path, capsys):
     capture, size = "procedural:room?frames=4", ("--size", "64x48")
     one, two = (tmp_path / name for name in ("one", "two"))

@@ -132,6 +132,7 @@ def picture_psnr(path):
     return -10 * math.log10(np.mean((target - rendered) ** 2))
 
 
+@pytest.mark.slow
 def test_pictures_show_what_their_flags_say(tmp_path, narrow):
     """Pictures of 8 bits have the PSNR that the metrics give for their flags."""
     capture, seen = make_capture(tmp_path / "capture", num_frames=7, size=SIZE), set()

@@ -61,7 +61,7 @@ def evaluated(capture, params, causal, out, monkeypatch):
     return facts, (session.cache, session.gaussians(), rendered)
 
 
-@pytest.mark.parametrize("causal", [False, True])
+@pytest.mark.parametrize("causal", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_poisoned_targets_change_nothing_but_scores(causal, capture, params, tmp_path, monkeypatch):
     facts, arrays = evaluated(capture, params, causal, tmp_path / "clean", monkeypatch)
     for name, poison in POISONS.items():
@@ -71,6 +71,7 @@ def test_poisoned_targets_change_nothing_but_scores(causal, capture, params, tmp
         assert_same_bits(there, arrays)
 
 
+@pytest.mark.slow
 def test_a_poisoned_context_view_is_noticed(capture, params, tmp_path, monkeypatch):
     """The comparison above can fail."""
     facts, _ = evaluated(capture, params, False, tmp_path / "clean", monkeypatch)

@@ -19,6 +19,7 @@ def differing(a, b):
     return [name for name in a if a[name] != b[name]]
 
 
+@pytest.mark.slow
 def test_each_step_changes_one_field():
     found = additions()
     steps = variants(found)

@@ -56,6 +56,7 @@ def test_memory_of_a_stream_does_not_grow_with_views(room):
 
 
 @pytest.mark.usefixtures("compiled_plainly")
+@pytest.mark.slow
 def test_joint_network_decodes_a_scene_from_new_views(room):
     """From views that it has seen before it decodes none: two of one place have no parallax."""
     params, frame = small.random_params(CONFIG), room.stream_frame(CONFIG)

@@ -96,6 +96,7 @@ def toy(monkeypatch) -> StreamConfig:
     return StreamConfig().replace(network="toy", capacity=256, min_confidence=0.0, cgfi_width=8, chunk_size=3)
 
 
+@pytest.mark.slow
 def test_registered_network_streams_and_decodes(toy):
     model = StreamSplat(toy)
     params = model.init(jax.random.key(0))

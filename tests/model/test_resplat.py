@@ -34,6 +34,7 @@ def test_presets_have_the_published_number_of_parameters(name, millions):
     assert round(counted / 1e6, 1) == millions
 
 
+@pytest.mark.slow
 def test_single_stage_is_initialized_as_among_all():
     config = StreamConfig().replace(token_width=8, cgfi_width=8, mixer_blocks=1)
     whole, part = (init_params(jax.random.key(3), config, only) for only in (None, ("hpda", "decoder")))
@@ -154,6 +155,7 @@ def views(**changes):
     return replace(chunk(0, views=3, height=40, width=56), **changes)
 
 
+@pytest.mark.slow
 def test_stream_fills_the_cache_and_depths_stay_in_range():
     cache, out = step()(params(), MODEL.init_cache(), views())
     near, far = CONFIG.network.depth_range

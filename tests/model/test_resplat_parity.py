@@ -144,6 +144,7 @@ def test_resplat_computes_what_the_authors_code_computes(name):
     assert error < TOLERANCE
 
 
+@pytest.mark.slow
 def test_upstream_masks_apply_only_with_upstream_compat():
     golden = load_golden("resplat_small")
     config = preset("small")
@@ -158,6 +159,7 @@ def test_upstream_masks_apply_only_with_upstream_compat():
     assert 0.01 < difference < 0.2
 
 
+@pytest.mark.slow
 def test_depthsplat_depth_network_agrees_on_the_finer_grid():
     """Another layout of the same layers: two views, matching at 1/4, candidates in inverse depth."""
     golden = load_golden("depthsplat_small")

@@ -112,6 +112,7 @@ def test_poses_find_back_and_the_first_stays():
     np.testing.assert_array_equal(np.asarray(found.viewmats[0]), np.asarray(given.viewmats[0]))
 
 
+@pytest.mark.slow
 def test_pose_refinement_wins_back_two_thirds_of_the_loss():
     """On a view never shown; poses off by 0.5 degrees and 1 % of the depth."""
     unseen = cameras(shifts=(0.08,))

@@ -31,7 +31,7 @@ def wide() -> Gaussians:
     return jax.tree.map(lambda x: jnp.roll(x, -1, axis=0), given)  # the first row is present, and seen
 
 
-@pytest.mark.parametrize("antialias", ["mip", "classic"])
+@pytest.mark.parametrize("antialias", ["mip", pytest.param("classic", marks=pytest.mark.slow)])
 def test_no_row_that_is_drawn_is_missing(antialias):
     """20,000 Gaussians of all sizes and places: before, behind and beside the camera, across the near plane."""
     random, num = np.random.default_rng(0), 20_000
@@ -85,7 +85,9 @@ def test_selected_rows_come_back_to_their_places(max_rows):
         np.testing.assert_array_equal(back[name], wanted)
 
 
-@pytest.mark.parametrize("effects", [RefineEffects(), RefineEffects(poses=True, exposures=True)])
+@pytest.mark.parametrize(
+    "effects", [RefineEffects(), pytest.param(RefineEffects(poses=True, exposures=True), marks=pytest.mark.slow)]
+)
 def test_a_step_on_seen_rows_is_the_step_on_all(effects):
     """A row that is not seen has moments of exactly zero; rows that do not fit are counted."""
     config, views = dataclasses.replace(CONFIG, effects=effects, shown_weight=0.7), key_views()
@@ -110,6 +112,7 @@ def test_a_step_on_seen_rows_is_the_step_on_all(effects):
     assert int(report.num_overflow) > 0
 
 
+@pytest.mark.slow
 def test_refine_chooses_a_capacity_that_holds_every_step(monkeypatch):
     """The refined scene does not depend on it."""
     config = RefineConfig(held_back=0.0)

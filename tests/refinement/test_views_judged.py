@@ -135,6 +135,7 @@ def test_errors_are_judged_by_their_median():
 
 
 @pytest.mark.parametrize("name", ["black", "NaN exposure", "wrong pose", "duplicate", "one view"])
+@pytest.mark.slow
 def test_adversarial_views_cost_no_more_than_a_third_of_a_decibel(name):
     good = views()
     given = adversaries() | {

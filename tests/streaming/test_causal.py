@@ -59,7 +59,7 @@ def driven(capture, params, config, num_chunks):
     return order[: 4 * num_chunks], frame.to_dict(), outputs, chunk.frame.to_dict()
 
 
-@pytest.mark.parametrize("num_chunks", [1, 2])
+@pytest.mark.parametrize("num_chunks", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_replaced_future_changes_no_chunk_before_it(capture, params, num_chunks):
     other = with_other_future(capture, 4 * num_chunks)
     (order, frame, outputs, after), there = (driven(c, params, CAUSAL, num_chunks) for c in (capture, other))
@@ -67,6 +67,7 @@ def test_a_replaced_future_changes_no_chunk_before_it(capture, params, num_chunk
     assert_same_bits(outputs, there[2])
 
 
+@pytest.mark.slow
 def test_without_causal_the_future_has_influence(capture, params):
     here, there = (driven(c, params, NARROW, 1) for c in (capture, with_other_future(capture, 4)))
     assert here[1] != there[1]

@@ -116,6 +116,7 @@ def test_steps_are_shared_as_asked(capture):
     np.testing.assert_allclose(rates, (0.2, 0.5, 0.3), atol=0.03)
 
 
+@pytest.mark.slow
 def test_procedural_steps_stay_those_of_a_run_without_captures(mix, capture):
     recipe = smoke_recipe(4)
     rarely = CaptureMix((CaptureGroup("room", 1e-9, (capture,)),), NARROW)

@@ -88,7 +88,7 @@ def file_named(
 
 
 def _missing(root: Path, names: Sequence[str], extensions: Sequence[str]) -> str:
-    """How it comes that none of the names, with any of the extensions, is a file: the end of a sentence."""
+    """The reason why none of the names, with any of the extensions, is a file, as the end of a sentence."""
     for path in (root / (name + extension) for name in names for extension in extensions):
         try:
             if path.is_dir():

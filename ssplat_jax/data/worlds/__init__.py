@@ -1,1 +1,1 @@
-"""Made worlds of textured meshes, rendered with OpenGL into capture folders with exact poses and z-depth."""
+"""Synthetic worlds of textured meshes, rendered with OpenGL into capture folders with exact poses and z-depth."""

@@ -30,7 +30,7 @@ def read_shapes(params, feats: Float[Array, "m c"], config: StreamConfig) -> Tok
     raw = GaussianHead(config).apply({"params": params}, feats.astype(jnp.float32))
     opacity, scale, rotation, sh = jnp.split(raw, [1, 4, 8], axis=-1)  # pyright: ignore[reportArgumentType]
     return TokenShapes(
-        opacity_logits=opacity[:, 0] + START_OPACITY,
+        logit_opacities=opacity[:, 0] + START_OPACITY,
         raw_scales=scale,
         quats=rotation + jnp.array([1.0, 0.0, 0.0, 0.0]),
         sh=sh.reshape(feats.shape[0], -1, 3),

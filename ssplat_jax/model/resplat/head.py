@@ -30,7 +30,7 @@ def read_shapes(params, feats: Float[Array, "m c"], config: StreamConfig) -> Tok
     raw = GaussianHead(config).apply({"params": params}, feats.astype(jnp.float32))
     rotation, scale, opacity, _, sh = jnp.split(raw, np.cumsum(ROWS).tolist(), axis=-1)  # pyright: ignore[reportArgumentType]
     return TokenShapes(
-        opacity_logits=opacity[:, 0],
+        logit_opacities=opacity[:, 0],
         raw_scales=scale,
         quats=jnp.roll(rotation, 1, axis=-1),
         sh=sh.reshape(feats.shape[0], 3, -1).swapaxes(1, 2),
