@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from ssplat_jax.chunk import Chunk as Chunk
     from ssplat_jax.config import StreamConfig as StreamConfig
     from ssplat_jax.config import preset as preset
-    from ssplat_jax.data.capture import open_capture as open_capture
+    from ssplat_jax.data.open_capture import open_capture as open_capture
     from ssplat_jax.data.stream_frame import StreamFrame as StreamFrame
     from ssplat_jax.errors import CacheError as CacheError
     from ssplat_jax.errors import InputError as InputError
@@ -65,7 +65,7 @@ _MODULES = {
     "load_ply": "scene_files.ply",
     "load_scene": "scene_files.formats",
     "online_refinement": "refinement",
-    "open_capture": "data.capture",
+    "open_capture": "data.open_capture",
     "preset": "config",
     "refine": "refinement",
     "render": "rasterizer",

@@ -14,7 +14,7 @@ import pytest
 from ssplat_jax.cache import ProjectedCache, Tokens, project
 from ssplat_jax.chunk import Chunk
 from ssplat_jax.config import preset
-from ssplat_jax.data.capture import open_capture
+from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.geometry.rotations import quats_to_matrices
 from ssplat_jax.metrics.lpips import LpipsWeights

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, TypeCheckError
 
 from ssplat_jax.cache import init_cache
 from ssplat_jax.config import preset
-from ssplat_jax.data.capture import open_capture
+from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.gaussians import Gaussians, mask_gaussians
 from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.pytree import pytree, replace, static

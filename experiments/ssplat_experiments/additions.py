@@ -24,7 +24,8 @@ from ssplat_experiments.warm_sessions import new_session
 from ssplat_jax.checkpoint.weights import check_params, load_params
 from ssplat_jax.config import StreamConfig, preset
 from ssplat_jax.console import Reporter
-from ssplat_jax.data.capture import Capture, open_capture
+from ssplat_jax.data.capture import Capture
+from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import Split, interleaved_split
 from ssplat_jax.errors import InputError
 from ssplat_jax.evaluation.latency import measure_latency

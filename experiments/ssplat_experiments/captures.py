@@ -12,7 +12,7 @@ from pathlib import Path
 from ssplat_jax.checkpoint.weights import load_params
 from ssplat_jax.config import preset
 from ssplat_jax.console import Reporter
-from ssplat_jax.data.capture import open_capture
+from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import interleaved_split
 from ssplat_jax.errors import InputError
 from ssplat_jax.evaluation.evaluate import evaluate

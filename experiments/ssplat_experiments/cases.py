@@ -9,11 +9,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from ssplat_experiments import provenance
 from ssplat_experiments.program_memory import make_room
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.console import Reporter
 from ssplat_jax.errors import InputError
+from ssplat_jax.evaluation import provenance
 from ssplat_jax.evaluation.pictures import save_image
 from ssplat_jax.storage.json_files import json_text, write_json
 

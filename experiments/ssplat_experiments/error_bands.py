@@ -25,7 +25,8 @@ from ssplat_experiments.study import Study, at_scale, run_study
 from ssplat_jax.checkpoint.weights import load_params
 from ssplat_jax.config import preset
 from ssplat_jax.console import Reporter
-from ssplat_jax.data.capture import Capture, open_capture
+from ssplat_jax.data.capture import Capture
+from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import Split, interleaved_split
 from ssplat_jax.evaluation.scoring import score_view
 from ssplat_jax.metrics.psnr_ssim import psnr

@@ -17,7 +17,8 @@ from ssplat_experiments.study import at_scale
 from ssplat_jax.checkpoint.weights import load_params
 from ssplat_jax.config import preset
 from ssplat_jax.console import Reporter
-from ssplat_jax.data.capture import Capture, open_capture
+from ssplat_jax.data.capture import Capture
+from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import Split, interleaved_split
 from ssplat_jax.evaluation.scoring import score_targets
 from ssplat_jax.runs.export_run import members_of_gaussians

@@ -29,7 +29,7 @@ from ssplat_jax.cache import project
 from ssplat_jax.chunk import Chunk
 from ssplat_jax.config import StreamConfig, preset
 from ssplat_jax.console import Reporter
-from ssplat_jax.data.capture import open_capture
+from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.evaluation.latency import measure_latency
 from ssplat_jax.evaluation.peak_memory import peak_memory
 from ssplat_jax.geometry.cameras import Camera

@@ -23,7 +23,8 @@ from ssplat_experiments.warm_sessions import new_session
 from ssplat_jax.checkpoint.weights import load_params
 from ssplat_jax.config import StreamConfig, preset
 from ssplat_jax.console import Reporter
-from ssplat_jax.data.capture import Capture, open_capture
+from ssplat_jax.data.capture import Capture
+from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.evaluation.peak_memory import peak_memory
 from ssplat_jax.streaming.feed import feed_chunks
 

@@ -14,7 +14,8 @@ from ssplat_experiments.study import at_scale
 from ssplat_jax.checkpoint.weights import load_params
 from ssplat_jax.config import preset
 from ssplat_jax.console import Reporter
-from ssplat_jax.data.capture import Capture, open_capture
+from ssplat_jax.data.capture import Capture
+from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import paper_split
 from ssplat_jax.errors import InputError
 from ssplat_jax.evaluation.evaluate import evaluate

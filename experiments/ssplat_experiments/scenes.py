@@ -2,7 +2,8 @@
 
 from pathlib import Path
 
-from ssplat_jax.data.capture import Capture, open_capture
+from ssplat_jax.data.capture import Capture
+from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import Split, interleaved_split
 
 REDKITCHEN = "redkitchen"

@@ -1,8 +1,7 @@
-"""`ssplat bench NAME`: the benchmarks of the package in one form, `{machine, rows: [{name, value, unit}]}`."""
+"""`ssplat bench NAME`: benchmarks in one form, `{machine, date, commit, rows: [{name, value, unit}]}`."""
 
 import dataclasses
 import itertools
-import platform
 import statistics
 import time
 from pathlib import Path
@@ -17,8 +16,9 @@ from ssplat_jax.benchmarks.refine_benchmark import bench_refine
 from ssplat_jax.checkpoint.weights import load_params
 from ssplat_jax.chunk import Chunk
 from ssplat_jax.config import preset
-from ssplat_jax.data.capture import open_capture
+from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.errors import InputError
+from ssplat_jax.evaluation.provenance import commit, machine, today
 from ssplat_jax.refinement import online_refinement
 from ssplat_jax.streaming.session import Session, tokens_per_chunk
 from ssplat_jax.streaming.streamsplat import StreamSplat
@@ -38,7 +38,7 @@ def run_benchmark(
         scaling, full_hd: for `render`; see `bench_render`.
 
     Returns:
-        The machine, and rows of name, value and unit.
+        The machine, date and commit, and rows of name, value and unit.
 
     Raises:
         InputError: `name` is no benchmark, or `against` cannot be timed.
@@ -51,9 +51,7 @@ def run_benchmark(
         rows = [dataclasses.asdict(row) for row in (*bench_cache(preset("tiny")), *bench_step(), *bench_online())]
     else:
         raise InputError(f"bench: wanted render, refine or stream, got {name!r}; choose one of them.")
-    device = jax.devices()[0]
-    machine = f"{platform.machine()} {device.platform} {device.device_kind}, jax {jax.__version__}"
-    return {"machine": machine, "rows": rows}
+    return {"machine": machine(), "date": today(), "commit": commit(), "rows": rows}
 
 
 def bench_step() -> list[Row]:

@@ -18,7 +18,7 @@ class Bench:
     """render: the rasterizer. refine: a step of refinement on a large scene. stream: fuse and projection of the cache,
     and whole steps, with online refinement and without, early and late in a stream."""
     json: Path | None = None
-    """Write {machine, rows: [{name, value, unit}]} here as well."""
+    """Write {machine, date, commit, rows: [{name, value, unit}]} here as well."""
     against: Path | None = None
     """Timed in the same run. render: another rasterizer's Python file, with the functions that docs/performance.md
     names, as experiments/gsplat_rasterizer.py has them. refine: the root of another checkout of this package."""

@@ -36,10 +36,10 @@ class Inspect:
 
     def run(self) -> int:
         from ssplat_jax.console import Reporter, print_facts
-        from ssplat_jax.data.capture import open_capture
         from ssplat_jax.data.capture_summary import UNITS, summarize
         from ssplat_jax.data.coverage_map import draw_coverage
         from ssplat_jax.data.depth_range import NUM_REFERENCES
+        from ssplat_jax.data.open_capture import open_capture
         from ssplat_jax.evaluation.pictures import save_image
         from ssplat_jax.storage.json_files import json_text
 

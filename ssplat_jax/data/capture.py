@@ -1,7 +1,6 @@
-"""`open_capture`: posed images from a folder or a procedural scene, checked when they are opened.
+"""`Capture`: posed images whose poses, intrinsics and headers are checked, and whose pixels are decoded on request.
 
-Opening a capture reads poses, intrinsics and image headers; images are decoded on request. `verify` decodes the images
-that a run will use, so that damaged files are found before anything is written.
+`verify` decodes the images that a run will use, so that damaged files are found before anything is written.
 """
 
 import dataclasses
@@ -10,7 +9,6 @@ import math
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from urllib.parse import parse_qsl
 
 import jax.numpy as jnp
 import numpy as np
@@ -20,54 +18,22 @@ from ssplat_jax.chunk import Chunk
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.data.depth_range import estimate_depths, stream_scale
 from ssplat_jax.data.images import (
-    MAX_PIXELS,
-    ArrayPixels,
     Crop,
-    FilePixels,
     Pixels,
     decode_all,
     resize_depth,
     resize_image,
 )
 from ssplat_jax.data.interleave import interleave
-from ssplat_jax.data.pose_conventions import USUAL, Convention, reinterpreted, split_options
-from ssplat_jax.data.posed_image import Frame, check_camtoworld, check_intrinsics
+from ssplat_jax.data.pose_conventions import USUAL, Convention
+from ssplat_jax.data.posed_image import Frame
 from ssplat_jax.data.readers import (
     Listing,
-    colmap,
-    kitti,
-    llff,
-    opensfm,
-    polycam,
-    realestate10k,
-    record3d,
-    scannet,
-    splat_cameras,
-    transforms_json,
-    tum,
 )
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.errors import echo, refusal
 from ssplat_jax.geometry.cameras import Camera
 
-READERS = (  # the first one that matches reads the capture
-    transforms_json,
-    colmap,
-    polycam,
-    record3d,
-    opensfm,
-    llff,
-    scannet,
-    tum,
-    kitti,
-    realestate10k,
-    splat_cameras,
-)
-PROCEDURAL = "procedural"  # scheme of the paths of procedural captures
-PROCEDURAL_FRAMES = 73  # 64 context views and the 9 interleaved targets between them
-PROCEDURAL_SIZE = (128, 96)  # (width, height); the demo takes less than two minutes on two cores at this size
-IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".heic"})  # a folder of these lacks only its poses
-VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".mkv", ".webm"})
 MAX_SIDE = 16384  # pixels of a delivered image
 
 
@@ -291,70 +257,6 @@ class _Some:
         return self.pixels.has_depth(self.indices[i])
 
 
-def open_capture(path: str | Path, *, size: tuple[int, int] | None = None) -> Capture:
-    """Opens the capture at `path`.
-
-    Args:
-        path: a folder or file in one of the formats of `data.readers`, or a procedural scene (room, orbit, corridor),
-            such as `procedural:room?frames=73&size=128x96&seed=0`. Poses that do not follow the convention of their
-            format are read with options behind it: `folder?axes=opengl&poses=world-to-camera`.
-        size: (width, height) of delivered images. Stored images are scaled to cover it and cropped at the center, and
-            the intrinsics follow exactly. By default the size of the stored images.
-
-    Raises:
-        InputError: there is no capture at `path`, or a file or field of it is unusable; the message names it.
-    """
-    if size is not None and not all(1 <= side <= MAX_SIDE for side in size):
-        raise refusal("size", wanted=f"sides of 1 to {MAX_SIDE}", got=echo(size), fix="give WIDTHxHEIGHT in pixels")
-    if size is not None and size[0] * size[1] > MAX_PIXELS:
-        wanted = f"at most {MAX_PIXELS:,} pixels"
-        raise refusal("size", wanted=wanted, got=f"{size[0]}x{size[1]}", fix="ask for a smaller one")
-    if str(path).startswith(f"{PROCEDURAL}:"):
-        return _procedural(str(path), size)
-    path, options = split_options(str(path))
-    try:
-        folder = Path(path).expanduser()
-        found = next((reader for reader in READERS if reader.matches(folder)), None)
-        exists = folder.exists()
-    except (OSError, RuntimeError, ValueError) as error:  # unknown user, name too long, no permission
-        raise refusal(str(path)[:80], wanted="a path", got=str(error)[:200], fix="check the path") from None
-    if found is not None:
-        usual = getattr(found, "CONVENTION", USUAL)
-        written = dataclasses.replace(usual, **options)
-        listing = found.read(folder)
-        frames = tuple(reinterpreted(frame, usual, written) for frame in listing.frames)
-        listing = dataclasses.replace(listing, frames=frames if options else listing.frames)
-        return capture_of_listing(listing, found.FORMAT, FilePixels(listing.frames), size, written)
-    if not exists:
-        got, fix = "nothing of that name", "check the path"
-    elif folder.is_dir() and not any(folder.iterdir()):
-        got, fix = "an empty folder", "check the path"
-    elif unposed := _unposed(folder):
-        kind, source = unposed
-        got = f"none of these, but {kind} without camera poses"
-        example = f"ssplat poses {source} --out {source.stem or 'my'}_capture"
-        fix = f"estimate the poses first: {example} (COLMAP by pycolmap), and give the folder that it writes"
-    else:
-        got, fix = "none of these", f"see --help of `ssplat inspect` for their files, or try {PROCEDURAL}:room"
-    formats = ", ".join(reader.FORMAT for reader in READERS)
-    raise refusal(str(path), wanted=f"a posed capture ({formats})", got=got, fix=fix)
-
-
-def is_capture(path: Path) -> bool:
-    """Whether a reader reads `path`: it looks like a capture, which may still be damaged."""
-    return any(reader.matches(path) for reader in READERS)
-
-
-def _unposed(path: Path) -> tuple[str, Path] | None:
-    """The kind of images that a path holds without poses, "images" or "a video", and where they are; or None."""
-    if path.is_file():
-        return ("a video", path) if path.suffix.lower() in VIDEO_SUFFIXES else None
-    files = [file for folder in (path, path / "images") if folder.is_dir() for file in sorted(folder.iterdir())]
-    if any(file.suffix.lower() in IMAGE_SUFFIXES for file in files):
-        return "images", path
-    return next((("a video", file) for file in files if file.suffix.lower() in VIDEO_SUFFIXES), None)
-
-
 def capture_of_listing(
     listing: Listing, format: str, pixels: Pixels, size: tuple[int, int] | None, convention: Convention = USUAL
 ) -> Capture:
@@ -385,47 +287,3 @@ def _indices(capture: Capture, indices: Sequence[int] | None) -> list[int]:
         wanted = f"frame numbers in [0, {len(capture) - 1}], at least one"
         raise refusal(f"{capture.name}: frames", wanted=wanted, got=echo(used), fix="choose other frames")
     return used
-
-
-def _procedural(spec: str, size: tuple[int, int] | None) -> Capture:
-    """Procedural capture `spec`, rendered immediately; a size in `spec` comes before `size`."""
-    name, _, query = spec.removeprefix(f"{PROCEDURAL}:").partition("?")
-    options = dict(parse_qsl(query, keep_blank_values=True))
-    if unknown := sorted(set(options) - {"frames", "size", "seed"}):
-        fix = f"write {PROCEDURAL}:{name}?frames={PROCEDURAL_FRAMES}&size=128x96&seed=0"
-        raise refusal(spec, wanted="the options frames, size, seed", got=echo(unknown[0]), fix=fix)
-    num_frames = _whole(spec, "frames", options.get("frames", str(PROCEDURAL_FRAMES)), 1, 100_000)
-    seed = _whole(spec, "seed", options.get("seed", "0"), 0, 2**31 - 1)
-    width, height = size or PROCEDURAL_SIZE
-    if "size" in options:
-        sides = options["size"].lower().split("x")
-        if len(sides) != 2:
-            raise refusal(f"{spec}: size", wanted="WIDTHxHEIGHT", got=echo(options["size"]), fix="write 128x96")
-        width, height = (_whole(spec, "size", side, 8, MAX_SIDE) for side in sides)
-    # Imported here because the scenes load their textures, which no other capture needs.
-    from ssplat_jax.data.procedural import procedural_capture_arrays
-
-    images, depths, camtoworlds, Ks = procedural_capture_arrays(name, num_frames, height, width, seed=seed)
-    intrinsics = np.stack([Ks[:, 0, 0], Ks[:, 1, 1], Ks[:, 0, 2], Ks[:, 1, 2]], axis=1).astype(np.float64).tolist()
-    frames = tuple(
-        Frame(
-            name=f"{name}/{i:05d}",
-            camtoworld=check_camtoworld(camtoworlds[i], f"{spec}: pose {i}")[0],
-            K=check_intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height, where=spec),
-            width=width,
-            height=height,
-        )
-        for i, (fx, fy, cx, cy) in enumerate(intrinsics)
-    )
-    pixels = ArrayPixels(images=np.asarray(images, np.float32), depths=np.asarray(depths, np.float32))
-    title = f"{PROCEDURAL}-{name}" + (f"-seed{seed}" if seed else "")
-    return capture_of_listing(Listing(name=title, frames=frames), PROCEDURAL, pixels, size)
-
-
-def _whole(spec: str, option: str, text: str, low: int, high: int) -> int:
-    """Parses an option of a procedural path as a whole number in [low, high]."""
-    if text.isascii() and text.isdigit() and len(text) < 12 and low <= int(text) <= high:
-        return int(text)
-    raise refusal(
-        f"{spec}: {option}", wanted=f"a whole number in [{low}, {high}]", got=echo(text), fix="change the option"
-    )

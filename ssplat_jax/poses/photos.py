@@ -7,8 +7,8 @@ from pathlib import Path
 
 from PIL import Image, ImageOps
 
-from ssplat_jax.data.capture import IMAGE_SUFFIXES
 from ssplat_jax.data.images import ORIENTATION, UPRIGHT, image_size
+from ssplat_jax.data.open_capture import IMAGE_SUFFIXES
 from ssplat_jax.errors import echo, refusal
 
 JPEG_QUALITY = 95

@@ -61,6 +61,8 @@ def refine_on_capture(
     Raises:
         InputError: `steps` is negative, a frame was not streamed, or an effect is unknown.
     """
+    if steps < 0:
+        raise InputError(f"refine: steps must be at least 0, got {steps}.")
     given = key_views_of(capture, indices, frame, exposures)
     choice = effects_by_name(revise, gaussians, given)
     config = with_effects(config or RefineConfig(), choice)

@@ -6,7 +6,8 @@ from pathlib import Path
 
 from ssplat_jax.checkpoint.delta_files import save_delta
 from ssplat_jax.console import WAITING, Reporter
-from ssplat_jax.data.capture import Capture, open_capture
+from ssplat_jax.data.capture import Capture
+from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.errors import require_positive
 from ssplat_jax.evaluation.scoring import check_scorable
 from ssplat_jax.runs.chunk_recorder import ChunkRecorder, hold_back

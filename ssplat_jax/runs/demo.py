@@ -9,7 +9,8 @@ import numpy as np
 from ssplat_jax.checkpoint.weights import load_params
 from ssplat_jax.config import QUALITIES, Quality, preset
 from ssplat_jax.console import Reporter
-from ssplat_jax.data.capture import Capture, open_capture
+from ssplat_jax.data.capture import Capture
+from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import Split, interleaved_split
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.evaluation.pictures import save_comparison, save_image
@@ -27,9 +28,6 @@ from ssplat_jax.streaming.streamsplat import StreamSplat
 
 STAGES = (4, 8, 16, 32, 64)
 """Numbers of streamed views after which the scene is decoded and scored."""
-
-NUM_FRAMES = 73
-"""64 context views and the 9 interleaved targets between them."""
 
 
 def run_demo(scene: str, out: Path, reporter: Reporter, quality: Quality = QUALITIES["accurate"]) -> dict:
@@ -52,7 +50,7 @@ def run_demo(scene: str, out: Path, reporter: Reporter, quality: Quality = QUALI
     make_writable(out)  # before the long part
     folder.clear_refinement()  # of an earlier demo
     model, params = StreamSplat(preset("tiny")), load_params("tiny")
-    capture = open_capture(f"procedural:{scene}?frames={NUM_FRAMES}")
+    capture = open_capture(f"procedural:{scene}")  # 64 context views and the 9 interleaved targets between them
     streamed = capture.scaled(quality.scale)
     split = interleaved_split(len(capture), stride=1, context=STAGES[-1])
     frame = streamed.stream_frame(model.config, split.context)

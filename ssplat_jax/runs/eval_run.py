@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 
 from ssplat_jax.console import Reporter
-from ssplat_jax.data.capture import Capture, is_capture, open_capture
+from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.index_files import Index, index_to_json, read_index, split_of_scene
+from ssplat_jax.data.open_capture import is_capture, open_capture
 from ssplat_jax.data.pose_conventions import split_options, with_options
 from ssplat_jax.data.split import Split, choose_split
 from ssplat_jax.errors import InputError, echo, refusal

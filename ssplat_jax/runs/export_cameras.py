@@ -13,7 +13,8 @@ from pathlib import Path
 from scipy.spatial.transform import Rotation
 
 from ssplat_jax.checkpoint.stream_state import load_newest_state
-from ssplat_jax.data.capture import Capture, open_capture
+from ssplat_jax.data.capture import Capture
+from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.posed_image import invert_pose
 from ssplat_jax.errors import InputError
 from ssplat_jax.storage.atomic import write_atomic

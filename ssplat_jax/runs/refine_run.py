@@ -10,7 +10,8 @@ from ssplat_jax.checkpoint.saved_config import config_from_header
 from ssplat_jax.checkpoint.stream_state import load_newest_state
 from ssplat_jax.checkpoint.weights import params_digest
 from ssplat_jax.console import WAITING, Reporter
-from ssplat_jax.data.capture import Capture, open_capture
+from ssplat_jax.data.capture import Capture
+from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.errors import InputError, require_positive
 from ssplat_jax.evaluation.exposures import exposures_from_json

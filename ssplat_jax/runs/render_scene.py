@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Float64
 
 from ssplat_jax.console import Reporter
-from ssplat_jax.data.capture import open_capture
+from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.errors import InputError, require_positive
 from ssplat_jax.evaluation.pictures import save_image

@@ -21,7 +21,7 @@ from ssplat_jax.checkpoint.weights import load_params
 from ssplat_jax.chunk import Chunk
 from ssplat_jax.config import preset
 from ssplat_jax.console import Reporter
-from ssplat_jax.data.capture import open_capture
+from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.errors import InputError
 from ssplat_jax.storage.folder_lock import lock_folder
 from ssplat_jax.storage.json_files import write_json

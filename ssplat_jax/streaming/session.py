@@ -62,7 +62,7 @@ class Session:
         self._decode_programs: dict[tuple, jax.stages.Compiled] = {}
         self._count_shown = jax.jit(lambda cache: jnp.sum(shown_pivots(cache, model.config), dtype=jnp.int32))
         self._decode_shown = jax.jit(model.decode_shown, static_argnums=2)
-        self._last_program: jax.stages.Compiled | None = None
+        self._last_program: jax.stages.Compiled | None = None  # the step that ran last
         self._refine_program: jax.stages.Compiled | None = None
 
     def feed(self, chunk: Chunk) -> ChunkOutput:
@@ -152,11 +152,6 @@ class Session:
         num_shown = int(self._count_shown(self.cache))
         num_pivots = min(max(MIN_DECODED_PIVOTS, 1 << max(num_shown - 1, 0).bit_length()), self.cache.alive.size)
         return self.params, self.cache, num_pivots
-
-    @property
-    def step_program(self) -> jax.stages.Compiled | None:
-        """The compiled step that ran last; None before the first chunk."""
-        return self._last_program
 
     def decode_program(self) -> jax.stages.Compiled:
         """The compiled program of `gaussians` for the present cache."""

@@ -13,7 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.data.capture import Capture, is_capture, open_capture
+from ssplat_jax.data.capture import Capture
+from ssplat_jax.data.open_capture import is_capture, open_capture
 from ssplat_jax.data.split import FIRST_TARGET, TARGET_STEP
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.errors import refusal

@@ -5,7 +5,7 @@ import random
 
 import pytest
 
-from ssplat_jax.data.capture import open_capture
+from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.errors import InputError
 from tests.badinputs.cases import CASES, make_capture, mutant
 

@@ -6,7 +6,7 @@ import pytest
 from PIL import Image
 
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.data.capture import open_capture
+from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.errors import InputError
 from ssplat_jax.geometry.cameras import project_points, transform_points

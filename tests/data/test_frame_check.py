@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from ssplat_jax.data.capture import Capture, open_capture
+from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.coverage_map import _colors, draw_coverage, ground_axes, views_per_cell
 from ssplat_jax.data.frame_check import frame_warnings, image_warnings, order_warnings, turn_warnings
 from ssplat_jax.data.images import ArrayPixels
+from ssplat_jax.data.open_capture import open_capture
 from tests.badinputs.cases import make_capture
 from tests.data.planes_fixture import two_planes
 

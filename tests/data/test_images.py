@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from ssplat_jax.data.capture import open_capture
 from ssplat_jax.data.images import Crop
+from ssplat_jax.data.open_capture import open_capture
 from tests.badinputs.cases import HEIGHT, WIDTH, make_capture
 from tests.data.capture_fixture import resized, smooth_capture
 

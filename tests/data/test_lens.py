@@ -5,8 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from ssplat_jax.data.capture import open_capture
 from ssplat_jax.data.lens import FisheyeLens, Lens, check_lens, undistort
+from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.errors import InputError
 from tests.badinputs.cases import HEIGHT, WIDTH, make_capture
 

@@ -9,7 +9,7 @@ import json
 import numpy as np
 import pytest
 
-from ssplat_jax.data.capture import open_capture
+from ssplat_jax.data.open_capture import open_capture
 from tests.data.capture_writers import write_image
 
 SIZE, FOCAL = (64, 48), 40.0

@@ -7,7 +7,7 @@ import struct
 import numpy as np
 import pytest
 
-from ssplat_jax.data.capture import open_capture
+from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.errors import InputError
 from tests.badinputs.cases import mutant
 from tests.data.capture_writers import (

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from ssplat_jax.data.capture import open_capture
 from ssplat_jax.data.lens import FisheyeLens
+from ssplat_jax.data.open_capture import open_capture
 from tests.data.capture_writers import (
     COLMAP_IMAGES,
     CX,

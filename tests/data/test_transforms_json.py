@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from ssplat_jax.data.capture import open_capture
+from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.posed_image import check_camtoworld
 from ssplat_jax.errors import InputError
 from tests.badinputs.cases import HEIGHT, WIDTH, make_capture, rotated

@@ -17,7 +17,7 @@ from PIL import Image
 import ssplat_jax as ss
 from ssplat_jax.commands import main as command_line
 from ssplat_jax.config import CompactConfig
-from ssplat_jax.data import capture as captures
+from ssplat_jax.data import open_capture as captures
 from ssplat_jax.data.readers.frame_list import Intrinsics, make_frame, order_frames
 from ssplat_jax.model.compact import CompactNetwork
 from ssplat_jax.model.network import register_network
@@ -141,7 +141,7 @@ def test_an_added_reader_opens_its_captures(tmp_path, monkeypatch):
 
 
 def test_readers_are_only_listed_in_one_place():
-    assert mentions(r"\bREADERS\b", "ssplat_jax") == {"ssplat_jax/data/capture.py"}
+    assert mentions(r"\bREADERS\b", "ssplat_jax") == {"ssplat_jax/data/open_capture.py"}
 
 
 # -- a merge rule -----------------------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ import pytest
 
 from ssplat_jax.cache import init_cache
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.data.capture import open_capture
+from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import Split
 from ssplat_jax.evaluation import latency
 from ssplat_jax.evaluation.exposures import exposures_from_json, exposures_to_json

@@ -6,8 +6,8 @@ import jax
 import numpy as np
 import pytest
 
-from ssplat_jax.data.capture import open_capture
 from ssplat_jax.data.images import ArrayPixels
+from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import interleaved_split
 from ssplat_jax.evaluation import evaluate as evaluation
 from ssplat_jax.evaluation import latency

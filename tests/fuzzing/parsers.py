@@ -15,8 +15,8 @@ from ssplat_jax.cache import init_cache
 from ssplat_jax.checkpoint.delta_files import load_delta, save_delta
 from ssplat_jax.checkpoint.stream_state import load_state, save_state
 from ssplat_jax.checkpoint.weights import load_weights, save_weights
-from ssplat_jax.data.capture import open_capture
 from ssplat_jax.data.index_files import read_index
+from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.scene_files.formats import FORMATS, save_gaussians
 from ssplat_jax.storage.npz import _DIGEST_LENGTH, _hex_digest
 from ssplat_jax.storage.torch_files import read_arrays

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from ssplat_jax.console import Reporter
-from ssplat_jax.data.capture import open_capture
+from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.errors import InputError
 from ssplat_jax.poses import requirements, sfm
 from ssplat_jax.poses.estimate import PoseOptions, estimate_poses

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from ssplat_jax.checkpoint.weights import load_params
 from ssplat_jax.config import preset
-from ssplat_jax.data.capture import open_capture
+from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import interleaved_split
 from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.geometry.cameras import Camera

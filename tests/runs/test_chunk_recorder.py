@@ -12,7 +12,7 @@ from ssplat_jax.checkpoint.chunk_records import (
     open_thumbnail,
     save_chunk_record,
 )
-from ssplat_jax.data.capture import open_capture
+from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.errors import InputError
 from ssplat_jax.runs.chunk_recorder import CHUNKS_PER_SCORE, hold_back
 from ssplat_jax.storage.run_folder import RunFolder

@@ -7,7 +7,7 @@ import pytest
 from ssplat_jax.checkpoint.weights import load_params
 from ssplat_jax.config import preset
 from ssplat_jax.console import Reporter
-from ssplat_jax.data.capture import open_capture
+from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.errors import StorageError
 from ssplat_jax.pytree import replace
 from ssplat_jax.runs.resume import RunState, resume_run, run_identity, save_run

@@ -8,7 +8,7 @@ import pytest
 
 from ssplat_jax.checkpoint.weights import load_params
 from ssplat_jax.config import preset
-from ssplat_jax.data.capture import open_capture
+from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.gaussians import Gaussians, scale_colors
 from ssplat_jax.metrics.psnr_ssim import psnr

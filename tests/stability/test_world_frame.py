@@ -17,7 +17,8 @@ from scipy.spatial import cKDTree
 
 from ssplat_jax.cache import init_cache
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.data.capture import Capture, open_capture
+from ssplat_jax.data.capture import Capture
+from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.geometry.rotations import quats_to_matrices

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ssplat_jax.data.capture import open_capture
 from ssplat_jax.data.images import ArrayPixels
+from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.errors import InputError
 from ssplat_jax.geometry.rotations import quats_to_matrices
 from ssplat_jax.streaming.causal_range import STEP, widen_range

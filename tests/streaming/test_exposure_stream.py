@@ -6,7 +6,7 @@ import pytest
 
 from ssplat_jax.checkpoint.weights import load_params
 from ssplat_jax.config import preset
-from ssplat_jax.data.capture import open_capture
+from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.gaussians import mean_color
 from ssplat_jax.pytree import replace
 from ssplat_jax.streaming.session import Session

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ssplat_jax.cache import grow
-from ssplat_jax.data.capture import open_capture
+from ssplat_jax.data.open_capture import open_capture
 from tests.model.small import random_params
 from tests.streaming.narrow_model import NARROW, assert_same_bits
 from tests.streaming.sharded_jobs import Worker, arrays, part, sorted_voxels, stacked

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from ssplat_jax.commands.train_command import Train
-from ssplat_jax.data.capture import open_capture
+from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.errors import InputError
 from ssplat_jax.train import loop
 from ssplat_jax.train.capture_samples import (

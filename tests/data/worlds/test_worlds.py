@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ssplat_jax.data.capture import open_capture
+from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.worlds.gl_renderer import GlRenderer, open_context
 from ssplat_jax.data.worlds.meshes import box, patch
 from ssplat_jax.data.worlds.world_capture import write_worlds

@@ -34,8 +34,11 @@ def commit() -> str:
     """The commit of the installed files, with `+` if they were changed since; without a repository, the version."""
     folder = Path(__file__).parent
     try:
+        _git(folder, "ls-files", "--error-unmatch", "--", Path(__file__).name)  # installed files are in no repository
         head = _git(folder, "rev-parse", "--short=10", "HEAD")
-        is_changed = bool(_git(folder, "status", "--porcelain", "--untracked-files=no", "--", ":/ssplat_jax", "."))
+        is_changed = bool(
+            _git(folder, "status", "--porcelain", "--untracked-files=no", "--", ":/ssplat_jax", ":/experiments")
+        )
     except (OSError, subprocess.CalledProcessError):
         return f"version {version('ssplat-jax')}"
     return head + ("+" if is_changed else "")
