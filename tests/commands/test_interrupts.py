@@ -25,14 +25,6 @@ NUM_INTERRUPTS = 50
 TIMEOUT = 300.0
 
 
-@pytest.fixture(autouse=True)
-def heard():
-    """Children hear SIGINT even where the tests run as a background job, which ignores it."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
-
-
 SCRIPT = "from ssplat_jax.commands.start import start; start()"  # as the script `ssplat` does
 
 # A program that takes seconds to compile, as the first step of a stream does.
@@ -140,11 +132,14 @@ def test_ctrl_c_waits_only_where_there_is_work_to_save():
 
 
 def test_a_signal_that_the_process_ignores_stays_ignored():
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # as the shell does for a background job; `heard` sets it back
-    with Interrupts() as interrupts:
-        signal.raise_signal(signal.SIGINT)
-        assert interrupts.received is None
-    assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # as the shell does for a background job
+    try:
+        with Interrupts() as interrupts:
+            signal.raise_signal(signal.SIGINT)
+            assert interrupts.received is None
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def command_lines(folder: Path) -> dict[str, tuple[str, ...]]:

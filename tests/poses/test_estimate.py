@@ -116,7 +116,7 @@ def test_a_folder_belongs_to_one_call(photos, estimated, tmp_path):
     with pytest.raises(InputError, match="outside the photos"):
         estimate(photos, photos / "capture")
     (tmp_path / "images").mkdir()
-    with pytest.raises(InputError, match="holds other images"):
+    with pytest.raises(InputError, match="images of another maker"):
         estimate(photos, tmp_path)
     (tmp_path / "poses.json").write_text("{")
     with pytest.raises(InputError, match=r"poses\.json.*damaged.*--overwrite"):
