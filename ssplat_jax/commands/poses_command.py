@@ -46,5 +46,15 @@ class Poses:
             print(f"stopped; the same command{how} continues", file=sys.stderr)
             raise
         print(f"{self.out}: " + "\n".join(verdict(found)))
-        print(f"next: ssplat run {self.out} --size 320x240 --out runs/{self.out.resolve().name}")
+        size = _small_size(self.out / "images" / found.parts[0][0])
+        print(f"next: ssplat run {self.out} --size {size} --out runs/{self.out.resolve().name}")
         return 0
+
+
+def _small_size(image: Path) -> str:
+    """WxH of about 320 pixels on the longer side, in the shape of an image."""
+    from PIL import Image
+
+    with Image.open(image) as opened:
+        sides = opened.size
+    return "x".join(str(round(side * min(1.0, 320 / max(sides)))) for side in sides)

@@ -19,7 +19,7 @@ from ssplat_jax.rasterizer import Effects, render
 from ssplat_jax.rasterizer.outputs import splat_channels
 from ssplat_jax.rasterizer.projection import cull_non_finite, project
 from ssplat_jax.rasterizer.reference import sample_weights
-from ssplat_jax.runs.demo import NUM_FRAMES, STAGES
+from ssplat_jax.runs.demo import STAGES
 from ssplat_jax.scene_files.ply import load_ply
 from ssplat_jax.streaming.session import Session
 from ssplat_jax.streaming.streamsplat import StreamSplat
@@ -66,7 +66,7 @@ def demo() -> tuple[Gaussians, Camera]:
     """The scene of `ssplat demo` after all views, from its middle target."""
     model = StreamSplat(preset("tiny"))
     session = Session(model, load_params("tiny"))
-    capture = open_capture(f"procedural:room?frames={NUM_FRAMES}")
+    capture = open_capture("procedural:room")
     split = interleaved_split(len(capture), stride=1, context=STAGES[-1])
     frame = capture.stream_frame(model.config, split.context)
     for chunk in capture.chunks(model.config, split.context, frame=frame):

@@ -161,7 +161,7 @@ def test_three_commands_of_the_first_page_lead_to_the_browser(name, tmp_path, re
         print(f"$ ssplat {shlex.join(command)}  # {time.monotonic() - since:.0f} s\n{done.stdout}{done.stderr[-500:]}")
     registered, chosen = map(int, re.search(r"registered (\d+) of (\d+)", said[0]).groups())  # pyright: ignore
     assert registered >= REGISTERED * chosen
-    assert f"ssplat run {run[1]} --size 320x240" in said[0]  # the next command, as the page has it
+    assert f"next: ssplat run {run[1]} --size " in said[0]  # the next command, in the shape of the images
     folder = tmp_path / view[1]
     assert RunFolder(folder).report.exists()
     with viewed(view, tmp_path) as url, Page(url, tmp_path, WINDOW) as page:
