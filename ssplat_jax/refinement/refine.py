@@ -34,6 +34,9 @@ from ssplat_jax.refinement.view_revision import revised_key_views
 PAIRS_MARGIN = 1.25
 """Capacity for tile intersections over what the fullest key view needs: Gaussians grow while they are refined."""
 
+PATIENCE = 3
+"""Rounds of views without a better held-back error after which refinement ends: few pixels are held back."""
+
 ROWS_MARGIN = 1.02
 """Capacity for rows over what the views of a step may see at most: Gaussians move while they are refined."""
 
@@ -99,8 +102,8 @@ def refine(
         on_step: called with the number of steps done and the last loss.
 
     Returns:
-        The revised scene and what was done. Refinement ends before `steps` where the held-back pixels of a whole round
-        of views are no better than those of the round before.
+        The revised scene and what was done. Refinement ends before `steps` where the held-back pixels have not become
+        better for `PATIENCE` rounds of views.
 
     Raises:
         InputError: shapes do not fit, `steps` is negative, or no view has a finite camera and exposure.
@@ -186,12 +189,12 @@ def report_of(progress: Progress, key_views: KeyViews, config: RefineConfig | No
 
 
 def has_stopped_helping(held_back: list[float], steps_per_round: int) -> bool:
-    """Whether the last whole round of views has a held-back error no smaller than the round before it."""
-    if len(held_back) < 2 * steps_per_round or len(held_back) % steps_per_round or not any(held_back):
+    """Whether the held-back error of the last `PATIENCE` rounds of views is nowhere below the best before them."""
+    num_rounds, rest = divmod(len(held_back), steps_per_round)
+    if num_rounds <= PATIENCE or rest or not any(held_back):
         return False  # too early to say, or no pixel is held back
-    return float(np.mean(held_back[-steps_per_round:])) >= float(
-        np.mean(held_back[-2 * steps_per_round : -steps_per_round])
-    )
+    rounds = np.reshape(held_back, (num_rounds, steps_per_round)).mean(axis=1)
+    return float(rounds[-PATIENCE:].min()) >= float(rounds[:-PATIENCE].min())
 
 
 @functools.cache

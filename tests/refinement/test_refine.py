@@ -15,7 +15,7 @@ from ssplat_jax.metrics.psnr_ssim import psnr
 from ssplat_jax.pytree import replace
 from ssplat_jax.rasterizer import render
 from ssplat_jax.refinement import KeyViews, RefineConfig, current_gaussians, init_refinement, refine, refine_step
-from ssplat_jax.refinement.refine import has_stopped_helping
+from ssplat_jax.refinement.refine import PATIENCE, has_stopped_helping
 from ssplat_jax.refinement.refine_step import held_back_pixels, next_view
 from ssplat_jax.refinement.revision import sizes
 
@@ -208,9 +208,13 @@ def test_the_callers_arrays_survive():
 
 def test_refinement_stops_where_held_back_pixels_do_not_gain():
     falling = [1.0, 1.0, 0.5, 0.5]
+    flat = [0.5, 0.6] * PATIENCE
     assert not has_stopped_helping(falling, 2)
-    assert has_stopped_helping([*falling, 0.5, 0.6], 2)
-    assert not has_stopped_helping([*falling, 0.5], 2)
+    assert not has_stopped_helping([*falling, *flat[:-1]], 2)  # not a whole round
+    assert not has_stopped_helping([*falling, *flat[2:]], 2)  # a small sample varies from round to round
+    assert has_stopped_helping([*falling, *flat], 2)
+    assert not has_stopped_helping([*falling, *flat[2:], 0.4, 0.5], 2)  # it helps again
+    assert not has_stopped_helping([0.0] * 40, 2)  # nothing is held back
 
 
 @pytest.mark.parametrize(
