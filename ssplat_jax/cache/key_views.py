@@ -56,9 +56,9 @@ def empty_key_views(num_slots: int, height: int, width: int) -> KeyViews:
 def keep_views(ring: KeyViews, arrivals: KeyViews, *, depth: float) -> KeyViews:
     """`ring` after views arrived, one after the other.
 
-    While there are empty slots, a view takes the first. Afterwards a view that is no farther from a kept one than the
-    two most alike are from each other is not kept. Any other view takes the place of one of these two: of the one whose
-    next camera is nearer, or of the lower slot. So the kept views only move apart, and they cover where the camera has
+    While there are empty slots, a view takes the first. Afterwards a view that is no farther from a stored one than
+    the two most alike are from each other is left out. Any other view takes the place of one of these two: the one whose
+    next camera is nearer, or that of the lower slot. So the stored views only move apart, and they cover where the camera has
     been, however long the stream is and however long the camera stands still.
 
     Args:
@@ -84,7 +84,7 @@ def usable(views: KeyViews) -> Bool[Array, " v"]:
 
 
 def _slot_for(ring: KeyViews, view: KeyViews, depth: float) -> Int[Array, ""]:
-    """The slot that a usable view takes; `num_slots` if it is not kept."""
+    """The slot that a usable view takes; `num_slots` if it is left out."""
     valid = jnp.append(ring.valid, True)
     distances = camera_distances(jnp.concatenate([ring.viewmats, view.viewmats[None]]), depth)
     is_pair = valid[:, None] & valid & ~jnp.eye(len(valid), dtype=bool)

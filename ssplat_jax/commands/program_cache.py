@@ -20,7 +20,7 @@ FOLDER, IS_ON = "JAX_COMPILATION_CACHE_DIR", "JAX_ENABLE_COMPILATION_CACHE"
 """JAX's own variables: where they are set, they hold."""
 
 LEAST_SECONDS = "0.3"
-"""Programs that compile faster are not kept."""
+"""Shortest compilation of a program that is stored."""
 
 _our_folder: Path | None = None
 

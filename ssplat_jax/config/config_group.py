@@ -8,17 +8,17 @@ from ssplat_jax.errors import InputError
 
 
 def is_positive(value: Any) -> bool:
-    """Whether a value is a finite number above 0."""
+    """True for a finite number above 0."""
     return isinstance(value, int | float) and 0 < value < math.inf
 
 
 def is_range(value: Any) -> bool:
-    """Whether a value is None or two positive numbers, the smaller first."""
+    """True for None and for two positive numbers, the smaller first."""
     return value is None or (len(value) == 2 and all(map(is_positive, value)) and value[0] < value[1])
 
 
 def are_widths(value: Any) -> bool:
-    """Whether a value is two widths of at least 1, the second even."""
+    """True for two widths of at least 1, the second even."""
     is_good = len(value) == 2 and all(isinstance(width, int) and width >= 1 for width in value)
     return is_good and value[1] % 2 == 0  # the position code has pairs of a sine and a cosine
 

@@ -92,7 +92,7 @@ def open_capture(path: str | Path, *, size: tuple[int, int] | None = None) -> Ca
 
 
 def is_capture(path: Path) -> bool:
-    """Whether a reader reads `path`: it looks like a capture, which may still be damaged."""
+    """True if a reader takes `path`: it looks like a capture, which may still be damaged."""
     return any(reader.matches(path) for reader in READERS)
 
 

@@ -189,7 +189,7 @@ def report_of(progress: Progress, key_views: KeyViews, config: RefineConfig | No
 
 
 def has_stopped_helping(held_back: list[float], steps_per_round: int) -> bool:
-    """Whether the held-back error of the last `PATIENCE` rounds of views is nowhere below the best before them."""
+    """True if none of the last `PATIENCE` rounds of views has a held-back error below the best before them."""
     num_rounds, rest = divmod(len(held_back), steps_per_round)
     if num_rounds <= PATIENCE or rest or not any(held_back):
         return False  # too early to say, or no pixel is held back
