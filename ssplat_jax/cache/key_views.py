@@ -57,9 +57,9 @@ def keep_views(ring: KeyViews, arrivals: KeyViews, *, depth: float) -> KeyViews:
     """`ring` after views arrived, one after the other.
 
     While there are empty slots, a view takes the first. Afterwards a view that is no farther from a stored one than
-    the two most alike are from each other is left out. Any other view takes the place of one of these two: the one whose
-    next camera is nearer, or that of the lower slot. So the stored views only move apart, and they cover where the camera has
-    been, however long the stream is and however long the camera stands still.
+    the two most alike are from each other is left out. Any other view takes the place of one of these two: the one
+    whose next camera is nearer, or that of the lower slot. So the stored views only move apart, and they cover where
+    the camera has been, however long the stream is and however long the camera stands still.
 
     Args:
         ring: the views so far.

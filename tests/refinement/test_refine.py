@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import importlib
 
 import jax
 import jax.numpy as jnp
@@ -15,10 +16,11 @@ from ssplat_jax.metrics.psnr_ssim import psnr
 from ssplat_jax.pytree import replace
 from ssplat_jax.rasterizer import render
 from ssplat_jax.refinement import KeyViews, RefineConfig, current_gaussians, init_refinement, refine, refine_step
-from ssplat_jax.refinement.refine import PATIENCE, has_stopped_helping
-from ssplat_jax.refinement.refine_step import held_back_pixels, next_view
+from ssplat_jax.refinement.refine import has_stopped_helping
+from ssplat_jax.refinement.refine_step import EFFECTS, held_back_pixels, next_view
 from ssplat_jax.refinement.revision import sizes
 
+module = importlib.import_module("ssplat_jax.refinement.refine")  # the package has a function of that name
 NUM, WIDTH, HEIGHT, NUM_VIEWS, MAX_PAIRS = 48, 24, 16, 4, 1 << 12
 CONFIG = RefineConfig(held_back=0.0, shown_weight=0.0)  # the scene stands before black
 FIELDS = ("means", "quats", "scales", "opacities", "sh")
@@ -208,7 +210,7 @@ def test_the_callers_arrays_survive():
 
 def test_refinement_stops_where_held_back_pixels_do_not_gain():
     falling = [1.0, 1.0, 0.5, 0.5]
-    flat = [0.5, 0.6] * PATIENCE
+    flat = [0.5, 0.6] * 3
     assert not has_stopped_helping(falling, 2)
     assert not has_stopped_helping([*falling, *flat[:-1]], 2)  # not a whole round
     assert not has_stopped_helping([*falling, *flat[2:]], 2)  # a small sample varies from round to round
@@ -236,3 +238,15 @@ def test_arguments_that_do_not_fit_are_refused(changes, message):
 def test_config_out_of_range_is_refused_by_name(changes):
     with pytest.raises(InputError, match=rf"refine: {next(iter(changes))} must be"):
         RefineConfig(**changes)
+
+
+def test_the_capacity_grows_for_a_view_that_was_not_looked_at(monkeypatch):
+    """The estimate looks at a few views; one of the others may need more."""
+    monkeypatch.setattr(module, "_capacity", lambda *arguments: 64)
+    progress, views = module.start_refinement(doubtful(), key_views())
+    num_steps = 0
+    for _ in module.continue_refinement(progress, views, 6):
+        num_steps += 1
+    needed = [int(render(doubtful(), views.camera(i), effects=EFFECTS).num_pairs) for i in range(NUM_VIEWS)]
+    assert num_steps == 6 and max(needed) > 64
+    assert progress.max_pairs >= max(needed)

@@ -2,6 +2,7 @@
 
 import json
 import signal
+from unittest.mock import Mock
 
 import pytest
 
@@ -10,10 +11,12 @@ from ssplat_jax.config import preset
 from ssplat_jax.console import Reporter
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.errors import InputError
+from ssplat_jax.evaluation.exposures import exposures_to_json
 from ssplat_jax.runs import capture_run
 from ssplat_jax.runs import refine_run as module
 from ssplat_jax.runs.capture_run import run_capture
 from ssplat_jax.runs.refine_run import refine_run
+from ssplat_jax.runs.resume import RunState
 from ssplat_jax.scene_files.ply import read_ply
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.streaming.streamsplat import StreamSplat
@@ -52,8 +55,14 @@ def test_a_stopped_refinement_continues_to_the_same_bytes(finished, monkeypatch)
     folder = RunFolder(finished)
     streamed = folder.scene.read_bytes()
     revise = ("poses", "exposures")
-    result = refine(finished, overwrite=True, revise=revise)
+    written = []
+    with monkeypatch.context() as patched:
+        save_scene = module.save_scene
+        patched.setattr(module, "save_scene", lambda *given: (written.append(given[3]), save_scene(*given)))
+        result = refine(finished, overwrite=True, revise=revise)
     whole = folder.refined_scene.read_bytes()
+    # The refined scene is at the exposure that metrics.json names, whatever was revised.
+    assert exposures_to_json(written[0]) == json.loads(folder.metrics.read_text())["exposures"]
     assert result.num_steps == 4 and result.interrupted is None
     assert result.after["shown"]["psnr"] > result.before["shown"]["psnr"]
 
@@ -168,3 +177,13 @@ def test_a_procedural_run_opens_what_refinement_will_open(scale, tmp_path, monke
     frames = range(len(again))
     assert streamed.digest(frames) == again.digest(frames)
     assert streamed.images_digest(frames) == again.images_digest(frames)
+
+
+def test_deltas_of_chunks_that_will_be_streamed_again_are_removed(tmp_path):
+    """A killed run has written them after its last save; the same chunks may bring other views."""
+    folder = RunFolder(tmp_path)
+    folder.deltas.mkdir()
+    for views in (4, 8, 10):
+        folder.delta(views).touch()
+    assert capture_run.start_deltas(Mock(spec=RunState, num_views=8), 8, folder, False) is None
+    assert folder.delta_files() == [folder.delta(4), folder.delta(8)]

@@ -1,11 +1,14 @@
 """Output folders: locks between processes, and removal of numbered files."""
 
+import dataclasses
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+from ssplat_jax.commands.demo_command import Demo
+from ssplat_jax.commands.eval_command import Eval
 from ssplat_jax.commands.main import main
 from ssplat_jax.errors import InputError, StorageError
 from ssplat_jax.storage.folder_lock import lock_folder
@@ -83,3 +86,10 @@ def test_run_and_train_refuse_a_folder_in_use(command, tmp_path, capsys):
     assert stopped.value.code == 2
     *_, line = capsys.readouterr().err.splitlines()  # after the progress output of `train`
     assert "another process" in line and "--out" in line and not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("command", [Demo(quiet=True), Eval("procedural:room", Path(), quiet=True)])
+def test_commands_wait_for_no_other_process(command, tmp_path):
+    with lock_folder(tmp_path), pytest.raises(InputError, match="another process is writing to it"):
+        dataclasses.replace(command, out=tmp_path).run()
+    assert not list(tmp_path.iterdir())
