@@ -63,7 +63,8 @@ def fuse(cache: VoxelCache, tokens: Tokens, config: StreamConfig, *, axis: str |
         `num_chunks`, which every shard counts.
 
     Limits:
-        A new pivot has residuals of 0; those of merged pivots are averaged with the weights of their means.
+        A new pivot has residuals of 0; those of merged pivots are averaged with the weights of their means. Sightings start
+        at 0 too; those of merged pivots add up.
         Feature norms in [1e-9, 1e9]: outside, and for zero features, a pair counts as orthogonal.
         Two members of confidence 0 are averaged with equal weights.
         A merged mean lies between its members, to the last bit, and so in their voxel.
@@ -200,8 +201,7 @@ def _new_pivots(tokens: Tokens, cache: VoxelCache) -> dict[str, Array]:
         "num_members": jnp.ones((m,), jnp.int32),
         "last_chunks": jnp.broadcast_to(cache.stats.num_chunks, (m,)),
     }
-    if cache.residuals is not None:
-        values["residuals"] = jnp.zeros((m, cache.residuals.shape[-1]))
+    values |= {name: jnp.zeros((m, getattr(cache, name).shape[-1])) for name in pivot_fields(cache) if name not in values}
     return {name: x.astype(getattr(cache, name).dtype) for name, x in values.items()}
 
 
@@ -293,6 +293,7 @@ def _merge_pair(older: dict[str, Array], newer: dict[str, Array], config: Stream
     merged = {name: average(name) for name in ("means", "feats", "rgbs", "residuals") if name in older}
     best = ("seeds", "confidences", "quats", "footprints")
     merged |= {name: _select(newer_is_best, newer[name], older[name]) for name in best}
+    merged |= {name: older[name] + newer[name] for name in ("sightings",) if name in older}
     return merged | {
         "num_members": older["num_members"] + newer["num_members"],
         "last_chunks": jnp.maximum(older["last_chunks"], newer["last_chunks"]),

@@ -6,6 +6,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ssplat_jax.cache.hash_table import SLOTS_PER_ROW
 from ssplat_jax.cache.key_views import KeyViews, empty_key_views
 from ssplat_jax.cache.residuals import empty_residuals
+from ssplat_jax.cache.sightings import empty_sightings
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.errors import InputError
 from ssplat_jax.pytree import pytree, replace
@@ -74,6 +75,7 @@ class VoxelCache:
     last_chunks: Int[Array, "capacity k"]  # chunk that last wrote the pivot
     witnesses: Witnesses
     stats: CacheStats
+    sightings: Float[Array, "capacity k s"] | None = None  # what views say about the pivot (sightings.py); sums
     # Fields of refinement while streaming (`config.refine`); None without it, so that the program has no trace of them.
     residuals: Float[Array, "capacity k r"] | None = None  # changes to each of the pivot's Gaussians (residuals.py)
     key_views: KeyViews | None = None  # views that the scene is compared with; None before the first chunk
@@ -102,10 +104,13 @@ PIVOT_FIELDS = (
 )
 """Fields of every `VoxelCache` with one entry per pivot, `[capacity, k, ...]`."""
 
+OPTIONAL_PIVOT_FIELDS = ("sightings", "residuals")
+"""Further such fields, None where the configuration does not ask for them."""
+
 
 def pivot_fields(cache: VoxelCache) -> tuple[str, ...]:
-    """Names of the pivot fields that `cache` has: `PIVOT_FIELDS`, and `residuals` where they are kept."""
-    return PIVOT_FIELDS if cache.residuals is None else (*PIVOT_FIELDS, "residuals")
+    """Names of the pivot fields that `cache` has: `PIVOT_FIELDS`, and those of `OPTIONAL_PIVOT_FIELDS` that are kept."""
+    return (*PIVOT_FIELDS, *(name for name in OPTIONAL_PIVOT_FIELDS if getattr(cache, name) is not None))
 
 
 @pytree
@@ -177,6 +182,7 @@ def init_cache(config: StreamConfig, capacity: int | None = None) -> VoxelCache:
         last_chunks=jnp.zeros((capacity, k), jnp.int32),
         witnesses=init_witnesses(config),
         stats=CacheStats(*(zero() for _ in range(9))),
+        sightings=empty_sightings(capacity, k) if config.memory.sightings else None,
         residuals=empty_residuals(capacity, config) if config.refine.steps_per_chunk else None,
     )
 

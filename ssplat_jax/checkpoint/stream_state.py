@@ -13,13 +13,20 @@ import jax.numpy as jnp
 import numpy as np
 
 from ssplat_jax.cache.key_views import KeyViews
-from ssplat_jax.cache.state import PIVOT_FIELDS, CacheStats, VoxelCache, Witnesses, require_single_cache
+from ssplat_jax.cache.state import (
+    OPTIONAL_PIVOT_FIELDS,
+    PIVOT_FIELDS,
+    CacheStats,
+    VoxelCache,
+    Witnesses,
+    require_single_cache,
+)
 from ssplat_jax.errors import StorageError
 from ssplat_jax.storage.atomic import previous_path
 from ssplat_jax.storage.npz import load_arrays, save_arrays
 
 KIND = "stream state 3"  # version 2 added witnesses; version 3 colors per part of a patch, at one exposure
-_ROW_FIELDS = ("voxels", "counts", *PIVOT_FIELDS, "residuals")  # arrays with one row per voxel
+_ROW_FIELDS = ("voxels", "counts", *PIVOT_FIELDS, *OPTIONAL_PIVOT_FIELDS)  # arrays with one row per voxel
 
 _GROUPS = {"stats": CacheStats, "witnesses": Witnesses, "key_views": KeyViews}  # parts with fields of their own
 

@@ -124,6 +124,10 @@ class MemoryConfig(ConfigGroup):
     """Number of past chunks with a stored coarse depth map, which judges the tokens of later chunks (part of
     `carving`)."""
 
+    sightings: bool = True
+    """Pivots count how views saw them and how well their color fitted there, for the decoder (ours, part of
+    `carving`)."""
+
     def rules(self) -> tuple[tuple[str, str, bool], ...]:
         is_power = self.capacity >= 128 and not self.capacity & (self.capacity - 1)
         # Eviction compares the pivots of voxels.

@@ -153,6 +153,7 @@ PAPER = StreamConfig(
         min_confidence=0.3,
         voxel_size=0.04,
         carving=False,
+        sightings=False,
         num_witnesses=0,
         overflow="drop_new",
         capacity=1 << 18,

@@ -156,7 +156,10 @@ class StreamSplat:
         with jax.named_scope("VACC"):
             cache = fuse(cache, tokens, self.config, axis=self.axis)
         with jax.named_scope("carve"):
-            cache = carve(cache, *seen, self.config)
+            colors = None
+            if self.config.memory.sightings:
+                colors = tokens.rgbs.reshape(*prediction.output.depths.shape, -1, 3).mean(axis=-2)
+            cache = carve(cache, *seen, self.config, colors)
             return store_witness(cache, *seen, self.config)
 
     def run(self, params: dict, cache: VoxelCache, chunks: Chunk) -> tuple[VoxelCache, ChunkOutput]:
