@@ -23,7 +23,6 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ssplat_jax.cache.project import PixelPairs, project_points, project_rows, row_blocks
-from ssplat_jax.cache.sightings import sightings_of
 from ssplat_jax.cache.state import Tokens, VoxelCache, Witnesses
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.geometry.cameras import Camera
@@ -49,9 +48,8 @@ def carve(
     depths: Float[Array, "v hf wf"],
     confidences: Float[Array, "v hf wf"],
     config: StreamConfig,
-    colors: Float[Array, "v hf wf 3"] | None = None,
 ) -> VoxelCache:
-    """`cache` with the confidences of its pivots revised, and their sightings added to, by the views of one chunk.
+    """`cache` with the confidences of its pivots revised by the views of one chunk.
 
     Args:
         cache: the cache after the chunk was fused.
@@ -59,10 +57,9 @@ def carve(
         depths: camera z of each cell, stream units.
         confidences: confidence of each depth; cells of 0 or below `min_confidence` are no witnesses.
         config: with `carving=False` the cache is returned unchanged.
-        colors: of each cell at the scene's exposure; needed where the cache keeps sightings.
 
     Returns:
-        The cache; only `confidences` and `sightings` differ.
+        The cache; only `confidences` differs.
 
     Limits:
         Depths that are not finite or not positive are no witnesses. Pivots without a witness keep their confidence to
@@ -79,21 +76,12 @@ def carve(
     num_rows, num_blocks = row_blocks(cache)
 
     def judge_block(i, revised):
-        first, (confidences, sightings) = i * num_rows, revised
-        block = jax.lax.dynamic_slice_in_dim(confidences, first, num_rows)
-        pairs = project_rows(replace(cache, confidences=confidences), camera, first, num_rows)
+        block = jax.lax.dynamic_slice_in_dim(revised, i * num_rows, num_rows)
+        pairs = project_rows(replace(cache, confidences=revised), camera, i * num_rows, num_rows)
         evidence = _evidence(pairs, *flat).reshape(len(camera.viewmats), *block.shape).sum(axis=0)
-        update = lambda x, values: jax.lax.dynamic_update_slice_in_dim(x, values, first, axis=0)  # noqa: E731
-        if colors is not None and sightings is not None:
-            rgbs = jax.lax.dynamic_slice_in_dim(cache.rgbs, first, num_rows)
-            means = rgbs.reshape(block.size, -1, 3).mean(axis=1)
-            more = sightings_of(pairs.pixels, pairs.log_depths, means, flat[0], flat[1], colors.reshape(-1, 3), len(camera.viewmats))
-            before = jax.lax.dynamic_slice_in_dim(sightings, first, num_rows)
-            sightings = update(sightings, before + more.reshape(before.shape))
-        return update(confidences, _revise(block, evidence)), sightings
+        return jax.lax.dynamic_update_slice_in_dim(revised, _revise(block, evidence), i * num_rows, axis=0)
 
-    confidences, sightings = jax.lax.fori_loop(0, num_blocks, judge_block, (cache.confidences, cache.sightings))
-    return replace(cache, confidences=confidences, sightings=sightings)
+    return replace(cache, confidences=jax.lax.fori_loop(0, num_blocks, judge_block, cache.confidences))
 
 
 def judge(witnesses: Witnesses, tokens: Tokens, config: StreamConfig) -> Tokens:

@@ -63,8 +63,8 @@ def fuse(cache: VoxelCache, tokens: Tokens, config: StreamConfig, *, axis: str |
         `num_chunks`, which every shard counts.
 
     Limits:
-        A new pivot has residuals of 0; those of merged pivots are averaged with the weights of their means. Sightings start
-        at 0 too; those of merged pivots add up.
+        A new pivot has residuals of 0; those of merged pivots are averaged with the weights of their means.
+        A new pivot has sightings of 0; those of merged pivots add up.
         Feature norms in [1e-9, 1e9]: outside, and for zero features, a pair counts as orthogonal.
         Two members of confidence 0 are averaged with equal weights.
         A merged mean lies between its members, to the last bit, and so in their voxel.
@@ -201,7 +201,9 @@ def _new_pivots(tokens: Tokens, cache: VoxelCache) -> dict[str, Array]:
         "num_members": jnp.ones((m,), jnp.int32),
         "last_chunks": jnp.broadcast_to(cache.stats.num_chunks, (m,)),
     }
-    values |= {name: jnp.zeros((m, getattr(cache, name).shape[-1])) for name in pivot_fields(cache) if name not in values}
+    values |= {
+        name: jnp.zeros((m, getattr(cache, name).shape[-1])) for name in pivot_fields(cache) if name not in values
+    }
     return {name: x.astype(getattr(cache, name).dtype) for name, x in values.items()}
 
 

@@ -1,4 +1,4 @@
-"""Sequential NumPy definition of the cache: fuse, project, carve and judge as plain float64 loops.
+"""Sequential NumPy definition of the cache: fuse, project, carve, judge and sightings as plain float64 loops.
 
 It is slow, obvious and shares no code with the JAX implementation, which is tested against it. Only the voxel index is
 computed in float32, because it is defined as the floor of one float32 product.
@@ -43,6 +43,8 @@ def fuse(cache: dict, tokens: dict, config: StreamConfig) -> dict:
             stats["num_out_of_range"] += 1
         else:
             pivot |= {"seeds": pivot["feats"], "num_members": 1, "last_chunks": chunk}
+            if config.head.evidence:
+                pivot["sightings"] = np.zeros(9)
             if config.refine.steps_per_chunk:
                 pivot["residuals"] = np.zeros(14 * config.head.gaussians_per_token)
             accepted.append((voxel, pivot))
@@ -160,9 +162,11 @@ def merge(older: dict, newer: dict, config: StreamConfig) -> dict:
         if name in older
     }
     kept = {name: best[name] for name in ("seeds", "confidences", "quats", "footprints")}
+    sums = {name: older[name] + newer[name] for name in ("sightings",) if name in older}
     return (
         mean
         | kept
+        | sums
         | {
             "num_members": older["num_members"] + newer["num_members"],
             "last_chunks": max(older["last_chunks"], newer["last_chunks"]),
@@ -225,6 +229,50 @@ def carve(cache: dict, viewmats, Ks, depths, confidences, config: StreamConfig) 
         nearest = np.array([[around[r : r + 3, c : c + 3].min() for c in range(ell.shape[1])] for r in range(len(ell))])
         views.append((viewmat, K, ell, nearest, confidence))
     return _revise([pivot for _, row in cache["rows"] for pivot in row], views)
+
+
+def add_sightings(cache: dict, viewmats, Ks, depths, confidences, colors, config: StreamConfig) -> float:
+    """Adds what views say about the pivots to their sightings, in place.
+
+    Args:
+        cache: in the form of this module.
+        viewmats: world to camera, `[v, 4, 4]`.
+        Ks: intrinsics in pixels of the maps, `[v, 3, 3]`.
+        depths: camera z, `[v, height, width]`.
+        confidences: of the depths.
+        colors: of the cells, `[v, height, width, 3]`.
+        config: its `min_confidence` decides which cells are trusted and which pivots count as others.
+
+    Returns:
+        The margin of the closest decision in pixels or log depths.
+    """
+    pivots, margins = [pivot for _, row in cache["rows"] for pivot in row], [math.inf]
+    near = math.log(1.03)
+    for viewmat, K, depth, confidence, color in zip(viewmats, Ks, depths, confidences, colors, strict=True):
+        viewmat, K = np.asarray(viewmat, np.float64), np.asarray(K, np.float64)
+        ell = _trusted_log_depths(depth, confidence, config)
+        for cell, pairs in _on_pixels(pivots, viewmat, K, ell.shape[0], ell.shape[1], margins).items():
+            if ell[cell] == -math.inf:
+                continue
+            weight, seen = float(confidence[cell]), []
+            for own, pivot in pairs:
+                offset = (own - ell[cell]) / near
+                error = np.abs(np.asarray(color[cell], np.float64) - pivot["rgbs"].reshape(-1, 3).mean(axis=0)).mean()
+                margins.append(abs(abs(offset) - 1) * near)
+                seen.append((own, pivot, offset, error))
+            tau = np.float32(config.memory.min_confidence)
+            others = [e for _, p, o, e in seen if abs(o) <= 1 and p["confidences"] >= tau]
+            for own, pivot, offset, error in seen:
+                if offset < -1:
+                    more = [0, 1, 0, 0, error, 0, 0, 0, 0]
+                elif offset > 1:
+                    more = [0, 0, 1, 0, 0, 0, 0, 0, 0]
+                else:
+                    size = math.log(pivot["footprints"]) - own + math.log(K[0, 0])
+                    mean = sum(others) / max(len(others), 1)
+                    more = [1, 0, 0, error, 0, offset, math.log(max(len(others), 1)), error - mean, size]
+                pivot["sightings"] = pivot["sightings"] + weight * np.array(more)
+    return min(margins)
 
 
 def witness(viewmats, Ks, depths, confidences, side: int, config: StreamConfig) -> tuple | None:

@@ -1,101 +1,159 @@
 """Sightings: how often views saw a pivot, saw through it or did not see it, and how well its color fitted there.
 
-This is an addition to the paper's VACC. A cell of a chunk's view whose depth is trusted says three things about a pivot
-that projects to it: whether the pivot lies on the cell's surface, before or behind it, how far from it, and what color it
-should have. Sums of these, over all views since the pivot was written, are what its token alone cannot know. The decoder
-reads them (`model/evidence_head.py`).
+This is an addition to the paper's VACC. A pivot projects to a cell of each of a chunk's views. If the depth of the cell
+is trusted, it tells whether the pivot lies on the cell's surface, before it or behind it, and how far from it, how well
+its color fits, and how many other pivots share the cell. The cache keeps the sums of these numbers over all views since
+the pivot was written. The decoder reads them (`model/evidence.py`).
 """
 
 import math
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
+from ssplat_jax.cache.project import PixelPairs, project_rows, row_blocks
+from ssplat_jax.cache.state import VoxelCache
+from ssplat_jax.config import StreamConfig
+from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.numerics import safe_log
-from ssplat_jax.pytree import pytree
+from ssplat_jax.pytree import pytree, replace
 
 ON_SURFACE = math.log(1.03)
 """Largest distance in log depth at which a pivot lies on the surface of a cell."""
 
-NUM_SIGHTINGS = 6
-"""Numbers for each pivot; see `Sightings`."""
+
+@pytree
+class Cells:
+    """Cells of a chunk's views, flat over all views."""
+
+    weights: Float[Array, " c"]  # confidence of the depth; 0 for a cell without a trusted one
+    log_depths: Float[Array, " c"]
+    colors: Float[Array, "c 3"]  # at the exposure of the scene
 
 
 @pytree
-class Sightings:
-    """Sums over the cells that `n` pivots project to, each weighted by the confidence of the cell's depth."""
+class _Pairs:
+    """Pairs of view and pivot of a block of rows, `[v, n]`."""
 
-    on: Float[Array, " n"]  # the pivot lies on the cell's surface
-    before: Float[Array, " n"]  # the cell sees through the pivot
-    behind: Float[Array, " n"]  # the pivot is hidden
-    error_on: Float[Array, " n"]  # mean absolute difference of colors where it lies on the surface
-    error_before: Float[Array, " n"]  # where the cell sees through it
-    offset_on: Float[Array, " n"]  # log depth less the cell's, in units of `ON_SURFACE`, where it lies on the surface
+    weights: Float[Array, "v n"]  # of the cell
+    offsets: Float[Array, "v n"]  # log depth of the pivot less the cell's, in units of `ON_SURFACE`
+    errors: Float[Array, "v n"]  # mean absolute difference of the colors
+    sizes: Float[Array, "v n"]  # log of the pivot's footprint over the cell's
 
 
-def empty_sightings(capacity: int, pivots_per_voxel: int) -> Float[Array, "capacity k s"]:
-    """Zero sightings of all pivots of a cache."""
-    return jnp.zeros((capacity, pivots_per_voxel, NUM_SIGHTINGS))
+def cells_of(
+    depths: Float[Array, "v hf wf"],
+    confidences: Float[Array, "v hf wf"],
+    rgbs: Float[Array, "m a"],
+    config: StreamConfig,
+) -> Cells:
+    """Cells of a chunk whose tokens have the colors `rgbs`, view-major, row-major; trusted as in `carve`."""
+    is_trusted = (confidences >= config.memory.min_confidence) & (confidences > 0) & jnp.isfinite(depths) & (depths > 0)
+    return Cells(
+        weights=jnp.where(is_trusted, confidences, 0.0).reshape(-1),
+        log_depths=safe_log(jnp.where(is_trusted, depths, 1.0)).reshape(-1),
+        colors=rgbs.reshape(len(rgbs), -1, 3).mean(axis=1),
+    )
 
 
-def unpack_sightings(packed: Float[Array, "n s"]) -> Sightings:
-    """The columns of the array that the cache holds."""
-    return Sightings(*jnp.moveaxis(packed, -1, 0))
-
-
-def sightings_of(
-    pixels: Int[Array, " p"],
-    depths: Float[Array, " p"],
-    colors: Float[Array, "n 3"],
-    weights: Float[Array, " c"],
-    log_depths: Float[Array, " c"],
-    cell_colors: Float[Array, "c 3"],
-    num_views: int,
-) -> Float[Array, "n s"]:
-    """Sums of what the cells of `num_views` views say about `n` points.
+def add_sightings(cache: VoxelCache, camera: Camera, cells: Cells, config: StreamConfig) -> VoxelCache:
+    """`cache` with what the views of one chunk say about its pivots added to their sightings.
 
     Args:
-        pixels: cell of each pair of view and point, view-major, flat over all views; the number of cells if the point is not
-            seen.
-        depths: log depth of the point in each pair.
-        colors: of the points, at the exposure of the scene.
-        weights: confidence of each cell, flat over all views; 0 for a cell without a trusted depth.
-        log_depths: of each cell.
-        cell_colors: of each cell, at the exposure of the scene.
-        num_views: number of views.
+        cache: the cache after the chunk was fused; it keeps sightings.
+        camera: the chunk's views at grid resolution.
+        cells: depths, confidences and colors of their cells.
+        config: pivots below its `min_confidence` do not count as others in a cell.
+
+    Returns:
+        The cache; only `sightings` differs.
+
+    Limits:
+        Cells of weight 0 add nothing. Pivots that no trusted cell sees keep their sightings to the last bit.
     """
-    read = lambda x: x.at[pixels].get(mode="fill", fill_value=0.0)  # noqa: E731
+    num_rows, num_blocks = row_blocks(cache)
+    num_cells = cells.weights.shape[0]
+
+    def crowd(i, sums):
+        pairs, seen = _read_block(cache, camera, cells, i * num_rows, num_rows)
+        on = jnp.where(pairs.weights >= config.memory.min_confidence, _on(seen).reshape(-1), 0.0)
+        values = (on, on * seen.errors.reshape(-1))
+        return tuple(x.at[pairs.pixels].add(value, mode="drop") for x, value in zip(sums, values, strict=True))
+
+    zeros = jnp.zeros(num_cells)
+    number, errors = jax.lax.fori_loop(0, num_blocks, crowd, (zeros, zeros))
+    means = errors / jnp.maximum(number, 1.0)
+
+    def add(i, sightings):
+        pairs, seen = _read_block(cache, camera, cells, i * num_rows, num_rows)
+        read = lambda x: x.at[pairs.pixels].get(mode="fill", fill_value=0.0).reshape(seen.weights.shape)  # noqa: E731
+        on = seen.weights * _on(seen)
+        before = jnp.where(seen.offsets < -1, seen.weights, 0.0)
+        sums = (
+            on,
+            before,
+            jnp.where(seen.offsets > 1, seen.weights, 0.0),
+            on * seen.errors,
+            before * seen.errors,
+            on * seen.offsets,
+            on * safe_log(jnp.maximum(read(number), 1.0)),
+            on * (seen.errors - read(means)),
+            on * seen.sizes,
+        )
+        old = jax.lax.dynamic_slice_in_dim(sightings, i * num_rows, num_rows)
+        new = old + jnp.stack([x.sum(axis=0) for x in sums], axis=-1).reshape(old.shape)
+        return jax.lax.dynamic_update_slice_in_dim(sightings, new, i * num_rows, axis=0)
+
+    return replace(cache, sightings=jax.lax.fori_loop(0, num_blocks, add, cache.sightings))
+
+
+def _on(seen: _Pairs) -> Float[Array, "v n"]:
+    """1 where the pivot lies on the surface of a trusted cell, else 0."""
+    return jnp.where((seen.weights > 0) & (jnp.abs(seen.offsets) <= 1), 1.0, 0.0)
+
+
+def _read_block(cache: VoxelCache, camera: Camera, cells: Cells, first_row, num_rows: int) -> tuple[PixelPairs, _Pairs]:
+    """Pairs of all views with the pivots of a block of rows, and what their cells hold; zeros for pivots not seen."""
+    num_views = len(camera.viewmats)
+    pairs = project_rows(cache, camera, first_row, num_rows)
     by_view = lambda x: x.reshape(num_views, -1)  # noqa: E731
-    weight = by_view(read(weights))
-    offset = by_view(depths - read(log_depths)) / ON_SURFACE
+    read = lambda x: by_view(x.at[pairs.pixels].get(mode="fill", fill_value=0.0))  # noqa: E731
+    block = lambda x: jax.lax.dynamic_slice_in_dim(x, first_row, num_rows).reshape(-1, *x.shape[2:])  # noqa: E731
+    colors = block(cache.rgbs)
+    colors = colors.reshape(len(colors), -1, 3).mean(axis=1)
+    log_depths, weights = by_view(pairs.log_depths), read(cells.weights)
+    is_seen = weights > 0
     # One channel at a time: rows of three do not vectorize on a CPU.
-    error = sum(jnp.abs(by_view(read(cell_colors[:, i])) - colors[:, i]) for i in range(3)) / 3
-    on = jnp.where(jnp.abs(offset) <= 1, weight, 0.0)
-    before, behind = jnp.where(offset < -1, weight, 0.0), jnp.where(offset > 1, weight, 0.0)
-    sums = (on, before, behind, on * error, before * error, on * jnp.where(jnp.abs(offset) <= 1, offset, 0.0))
-    return jnp.stack([jnp.sum(x, axis=0) for x in sums], axis=-1)
+    errors = sum(jnp.abs(read(cells.colors[:, i]) - colors[:, i]) for i in range(3)) / 3
+    sizes = safe_log(block(cache.footprints)) - log_depths + jnp.log(camera.Ks[:, 0, 0])[:, None]
+    keep = lambda x: jnp.where(is_seen, x, 0.0)  # noqa: E731
+    offsets = (log_depths - read(cells.log_depths)) / ON_SURFACE
+    return pairs, _Pairs(weights=weights, offsets=keep(offsets), errors=keep(errors), sizes=keep(sizes))
 
 
 def features_of_sightings(packed: Float[Array, "n s"]) -> Float[Array, "n f"]:
-    """What sightings say, as numbers of about unit size.
+    """Sightings as numbers of about unit size: logarithms of the counts, shares, and means.
 
     Limits:
-        Zeros, as for a pivot that no trusted cell has seen, give finite features; gradients are those of the logarithms,
-        which are bounded.
+        Zeros, as for a pivot that no trusted cell has seen, give finite features. No gradient flows to the sightings.
     """
-    s = unpack_sightings(jax.lax.stop_gradient(packed))
-    seen = s.on + s.before
-    total = jnp.maximum(seen + s.behind, 1e-3)
-    error = (s.error_on + s.error_before) / jnp.maximum(seen, 1e-3)
+    on, before, behind, error_on, error_before, offset, crowd, relative, size = jnp.moveaxis(
+        jax.lax.stop_gradient(packed), -1, 0
+    )
+    total, times_on = jnp.maximum(on + before + behind, 1e-3), jnp.maximum(on, 1e-3)
+    error = (error_on + error_before) / jnp.maximum(on + before, 1e-3)
     features = (
-        jnp.log1p(s.on) - 1.5,
-        jnp.log1p(s.before) - 0.5,
-        jnp.log1p(s.behind) - 0.5,
-        4 * (s.before / total - 0.15),
-        4 * (s.behind / total - 0.15),
-        safe_log(0.01 + s.error_on / jnp.maximum(s.on, 1e-3)) + 3.0,
+        jnp.log1p(on) - 1.5,
+        jnp.log1p(before) - 0.5,
+        jnp.log1p(behind) - 0.5,
+        4 * (before / total - 0.15),
+        4 * (behind / total - 0.15),
+        safe_log(0.01 + error_on / times_on) + 3.0,
         safe_log(0.01 + error) + 3.0,
-        3 * s.offset_on / jnp.maximum(s.on, 1e-3),
+        3 * offset / times_on,
+        crowd / times_on - 1.0,
+        20 * relative / times_on,
+        size / times_on,
     )
     return jnp.stack(features, axis=-1)

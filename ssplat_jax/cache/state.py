@@ -6,7 +6,6 @@ from jaxtyping import Array, Bool, Float, Int
 from ssplat_jax.cache.hash_table import SLOTS_PER_ROW
 from ssplat_jax.cache.key_views import KeyViews, empty_key_views
 from ssplat_jax.cache.residuals import empty_residuals
-from ssplat_jax.cache.sightings import empty_sightings
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.errors import InputError
 from ssplat_jax.pytree import pytree, replace
@@ -104,12 +103,15 @@ PIVOT_FIELDS = (
 )
 """Fields of every `VoxelCache` with one entry per pivot, `[capacity, k, ...]`."""
 
+NUM_SIGHTINGS = 9
+"""Numbers that a pivot's sightings hold (`sightings.py`)."""
+
 OPTIONAL_PIVOT_FIELDS = ("sightings", "residuals")
 """Further such fields, None where the configuration does not ask for them."""
 
 
 def pivot_fields(cache: VoxelCache) -> tuple[str, ...]:
-    """Names of the pivot fields that `cache` has: `PIVOT_FIELDS`, and those of `OPTIONAL_PIVOT_FIELDS` that are kept."""
+    """Names of the pivot fields that `cache` has: `PIVOT_FIELDS`, and those of `OPTIONAL_PIVOT_FIELDS` in use."""
     return (*PIVOT_FIELDS, *(name for name in OPTIONAL_PIVOT_FIELDS if getattr(cache, name) is not None))
 
 
@@ -182,7 +184,7 @@ def init_cache(config: StreamConfig, capacity: int | None = None) -> VoxelCache:
         last_chunks=jnp.zeros((capacity, k), jnp.int32),
         witnesses=init_witnesses(config),
         stats=CacheStats(*(zero() for _ in range(9))),
-        sightings=empty_sightings(capacity, k) if config.memory.sightings else None,
+        sightings=jnp.zeros((capacity, k, NUM_SIGHTINGS)) if config.head.evidence else None,
         residuals=empty_residuals(capacity, config) if config.refine.steps_per_chunk else None,
     )
 

@@ -4,6 +4,9 @@ from typing import Any
 
 from ssplat_jax.config import StreamConfig
 
+BEFORE_FIELDS = {"evidence": False}
+"""Values that fields of `HeadConfig` had, in effect, before they were there."""
+
 
 def config_from_header(fields: dict[str, Any]) -> StreamConfig:
     """Returns the configuration in a file's header; files from before there was a second network do not name theirs.
@@ -11,4 +14,7 @@ def config_from_header(fields: dict[str, Any]) -> StreamConfig:
     Raises:
         InputError: a field is unknown or has a bad value.
     """
-    return StreamConfig.from_dict({"network": "compact", **fields})
+    if isinstance(head := fields.get("head"), dict):
+        fields = {**fields, "head": {**BEFORE_FIELDS, **head}}
+    config = StreamConfig.from_dict({"network": "compact", **fields})
+    return config if isinstance(head, dict) else config.replace(**BEFORE_FIELDS)

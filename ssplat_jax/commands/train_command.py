@@ -9,7 +9,7 @@ from ssplat_jax.commands.options import ConfigChanges, LpipsHeads, QuietOption, 
 from ssplat_jax.config import preset
 from ssplat_jax.errors import InputError, require_positive
 
-MINUTES = {"tiny": 77, "stream": 15}
+MINUTES = {"tiny": 77, "stream": 15, "evidence": 15}
 """Time of recipes on two cores (docs/model_card.md)."""
 
 
@@ -24,9 +24,10 @@ class Train:
     """Folder of the log, the checkpoints and, at the end, weights.npz."""
     preset: str = "tiny"
     """Preset of the configuration."""
-    recipe: Literal["tiny", "stream", "paper"] = "tiny"
-    """tiny: trains depth from scratch, as for the shipped weights. stream: trains the stages after depth. paper: the
-    paper's loss and steps, for --preset paper or small and a GPU."""
+    recipe: Literal["tiny", "stream", "evidence", "paper"] = "tiny"
+    """tiny: trains depth from scratch, as for the shipped weights. evidence: trains the evidence head of --init-weights
+    on whole streams, as for the shipped weights. stream: trains the stages after depth. paper: the paper's loss and
+    steps, for --preset paper or small and a GPU."""
     scale_steps: float = 1.0
     """Factor of the number of steps of every phase."""
     seed: int = 0
@@ -54,6 +55,8 @@ class Train:
         from ssplat_jax.train.recipe import RECIPES
 
         require_positive(scale_steps=self.scale_steps, save_every=self.save_every, validate_every=self.validate_every)
+        if self.recipe == "evidence":
+            return self._run_evidence()
         config = apply_changes(preset(self.preset), self.set)
         recipe = dataclasses.replace(RECIPES[self.recipe].scaled(self.scale_steps), seed=self.seed)
         params = None
@@ -94,6 +97,45 @@ class Train:
         save_weights(self.out / "weights.npz", result.state.ema, config, provenance)
         print(f"wrote {self.out}/weights.npz after {result.step} steps")
         reporter.say(f"next: `ssplat run CAPTURE --weights {self.out}/weights.npz --out runs/mine` streams with them")
+        return 0
+
+    def _run_evidence(self) -> int:
+        """Trains the evidence head on whole streams. It takes minutes, so it starts anew after an interrupt."""
+        from ssplat_jax.checkpoint.weights import check_params, load_weights, save_weights
+        from ssplat_jax.console import Reporter
+        from ssplat_jax.storage.folder_lock import lock_folder
+        from ssplat_jax.storage.folders import make_writable
+        from ssplat_jax.streaming.streamsplat import StreamSplat
+        from ssplat_jax.train.evidence_training import EvidenceRecipe, train_evidence
+
+        unused = {"--shares": self.shares, "--lpips-vgg": self.lpips_vgg, "--lpips-heads": self.lpips_heads}
+        if given := [flag for flag, value in unused.items() if value]:
+            raise InputError(f"{given[0]}: --recipe evidence has no use for it; leave it out.")
+        if self.init_weights is None:
+            raise InputError("--recipe evidence: wanted --init-weights, whose evidence head it trains; got none.")
+        config = apply_changes(preset(self.preset), self.set)
+        params = load_weights(self.init_weights)[0]
+        check_params(params, config.replace(evidence=False), str(self.init_weights))  # the head starts anew
+        recipe = EvidenceRecipe(seed=self.seed)
+        recipe = dataclasses.replace(recipe, steps=max(1, round(recipe.steps * self.scale_steps)))
+        reporter = Reporter(self.quiet)
+        reporter.say(f"{recipe.steps} steps, about {MINUTES['evidence']} minutes on two cores with two captures")
+        make_writable(self.out)
+        with (
+            lock_folder(self.out),
+            reporter.progress("training", recipe.steps, waiting="streaming the scenes") as advance,
+        ):
+            trained, facts = train_evidence(
+                StreamSplat(config),
+                params,
+                self.captures,
+                recipe,
+                on_scene=lambda name: reporter.say(f"streamed {name}"),
+                on_step=lambda step, record: advance(step, f"psnr {record['shown_psnr']:.2f}"),
+            )
+        provenance = {"recipe": dataclasses.asdict(recipe), "init_weights": self.init_weights.name, **facts}
+        save_weights(self.out / "weights.npz", trained, config, provenance)
+        print(f"wrote {self.out}/weights.npz after {recipe.steps} steps")
         return 0
 
     def _opened(self, config, recipe):

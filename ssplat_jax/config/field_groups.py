@@ -124,10 +124,6 @@ class MemoryConfig(ConfigGroup):
     """Number of past chunks with a stored coarse depth map, which judges the tokens of later chunks (part of
     `carving`)."""
 
-    sightings: bool = True
-    """Pivots count how views saw them and how well their color fitted there, for the decoder (ours, part of
-    `carving`)."""
-
     def rules(self) -> tuple[tuple[str, str, bool], ...]:
         is_power = self.capacity >= 128 and not self.capacity & (self.capacity - 1)
         # Eviction compares the pivots of voxels.
@@ -160,6 +156,8 @@ class HeadConfig(ConfigGroup):
     1 - (1 - o)^n (`compound`, ours)."""
     grow_footprints: bool = True
     """Footprints of pivots grow with their members until they cover a voxel's face (ours)."""
+    evidence: bool = True
+    """Pivots keep how views saw them and how well their color fitted, and the decoder reads that (ours)."""
     max_scale: float = 1.0
     """Upper bound of scales, in stream units."""
 

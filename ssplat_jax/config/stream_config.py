@@ -153,13 +153,17 @@ PAPER = StreamConfig(
         min_confidence=0.3,
         voxel_size=0.04,
         carving=False,
-        sightings=False,
         num_witnesses=0,
         overflow="drop_new",
         capacity=1 << 18,
     ),
     head=HeadConfig(
-        gaussians_per_token=1, sh_degree=3, scale_mode="absolute", opacity_mode="head", grow_footprints=False
+        gaussians_per_token=1,
+        sh_degree=3,
+        scale_mode="absolute",
+        opacity_mode="head",
+        grow_footprints=False,
+        evidence=False,
     ),
     stream=StreamingConfig(scene_scale=1.0, chunk_step=0.0, match_exposure=False, causal=True),
 )

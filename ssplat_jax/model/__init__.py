@@ -7,6 +7,8 @@ from ssplat_jax.model.back_projection import back_project as back_project
 from ssplat_jax.model.back_projection import patch_colors as patch_colors
 from ssplat_jax.model.cgfi import inject_features as inject_features
 from ssplat_jax.model.decoder import decode_tokens as decode_tokens
+from ssplat_jax.model.evidence import Evidence as Evidence
+from ssplat_jax.model.evidence import apply_evidence as apply_evidence
 from ssplat_jax.model.exposure import estimate_exposures as estimate_exposures
 from ssplat_jax.model.hpda import anchor_depth as anchor_depth
 from ssplat_jax.model.layers import average_pool as average_pool

@@ -9,11 +9,12 @@ import jax.numpy as jnp
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.errors import InputError
 from ssplat_jax.model.cgfi import Aggregator, num_hints
+from ssplat_jax.model.evidence import EvidenceHead, num_features
 from ssplat_jax.model.hpda import AnchorStrength
 from ssplat_jax.model.network import network_of
 from ssplat_jax.model.types import GRID_STRIDE
 
-STAGES = ("encoder", "cost_volume", "hpda", "upsampler", "tokens", "cgfi", "mixer", "decoder")
+STAGES = ("encoder", "cost_volume", "hpda", "upsampler", "tokens", "cgfi", "mixer", "decoder", "evidence")
 """Names of the stages with parameters, in the order in which random keys are split among them."""
 
 
@@ -50,10 +51,15 @@ def _modules(config: StreamConfig) -> dict:
     """Linen module and example inputs of every stage."""
     v, side, c = 2, config.network.size_multiple // GRID_STRIDE, config.network.token_width
     grid = lambda channels: jnp.zeros((v, side, side, channels))  # noqa: E731
-    return network_of(config).stages(config) | {
-        "hpda": (AnchorStrength(config), ()),
-        "cgfi": (Aggregator(config), (grid(c), grid(num_hints(config)), jnp.ones(v, bool))),
-    }
+    evidence = {"evidence": (EvidenceHead(), (jnp.zeros((1, num_features())),))} if config.head.evidence else {}
+    return (
+        network_of(config).stages(config)
+        | evidence
+        | {
+            "hpda": (AnchorStrength(config), ()),
+            "cgfi": (Aggregator(config), (grid(c), grid(num_hints(config)), jnp.ones(v, bool))),
+        }
+    )
 
 
 def count_params(params: dict) -> int:

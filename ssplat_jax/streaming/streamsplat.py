@@ -31,6 +31,7 @@ from ssplat_jax.cache import (
     store_witness,
 )
 from ssplat_jax.cache.residuals import revise, unpack
+from ssplat_jax.cache.sightings import add_sightings, cells_of
 from ssplat_jax.cache.state import pivot_fields
 from ssplat_jax.chunk import Chunk, check_chunk
 from ssplat_jax.config import StreamConfig
@@ -156,11 +157,13 @@ class StreamSplat:
         with jax.named_scope("VACC"):
             cache = fuse(cache, tokens, self.config, axis=self.axis)
         with jax.named_scope("carve"):
-            colors = None
-            if self.config.memory.sightings:
-                colors = tokens.rgbs.reshape(*prediction.output.depths.shape, -1, 3).mean(axis=-2)
-            cache = carve(cache, *seen, self.config, colors)
-            return store_witness(cache, *seen, self.config)
+            cache = carve(cache, *seen, self.config)
+            cache = store_witness(cache, *seen, self.config)
+        if not self.config.head.evidence:
+            return cache
+        with jax.named_scope("sightings"):
+            cells = cells_of(*seen[1:], tokens.rgbs, self.config)
+            return add_sightings(cache, prediction.views.grid_camera, cells, self.config)
 
     def run(self, params: dict, cache: VoxelCache, chunks: Chunk) -> tuple[VoxelCache, ChunkOutput]:
         """`step` over stacked chunks (leading axis t) as one `lax.scan`.
@@ -198,12 +201,24 @@ class StreamSplat:
     ) -> Gaussians:
         """Gaussians of the pivots that `take` selects from a flat array of all pivots."""
         flat = lambda x: take(x.reshape(-1, *x.shape[2:]))  # noqa: E731
+        shapes, footprints = self._read_shapes(params, flat(cache.feats)), merged_footprints(cache, self.config)
+        if cache.sightings is not None:
+            evidence = stages.Evidence(
+                sightings=flat(cache.sightings),
+                confidences=flat(cache.confidences),
+                num_members=flat(cache.num_members).astype(jnp.float32),
+                num_pivots=flat(jnp.broadcast_to(cache.counts[:, None], cache.confidences.shape)).astype(jnp.float32),
+                footprints=flat(cache.footprints),
+                growth=flat(footprints / jnp.maximum(cache.footprints, 1e-12)),
+                rgbs=flat(cache.rgbs),
+            )
+            shapes = stages.apply_evidence(params["evidence"], shapes, evidence, self.config)
         gaussians = stages.decode_tokens(
-            self._read_shapes(params, flat(cache.feats)),
+            shapes,
             means=flat(cache.means),
             rgbs=flat(cache.rgbs),
             quats=flat(cache.quats),
-            footprints=flat(merged_footprints(cache, self.config)),
+            footprints=flat(footprints),
             num_members=flat(cache.num_members),
             config=self.config,
         )

@@ -1,0 +1,119 @@
+"""The evidence head starts at nothing, stays bounded, and is absent where it is not asked for."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ssplat_jax.cache import init_cache
+from ssplat_jax.cache.state import NUM_SIGHTINGS
+from ssplat_jax.config import PRESETS, preset
+from ssplat_jax.model.evidence import MAX_LOGIT_CHANGE, Evidence, EvidenceHead, apply_evidence, evidence_features
+from ssplat_jax.model.params import init_params
+from ssplat_jax.model.types import TokenShapes
+from ssplat_jax.pytree import replace
+from ssplat_jax.streaming.streamsplat import StreamSplat
+
+CONFIG = preset("tiny").replace(capacity=128)
+NUM = 5
+
+
+def shapes(num: int = NUM) -> TokenShapes:
+    """Shapes of pivots, all different."""
+    x = jnp.linspace(-1.0, 1.0, num)
+    return TokenShapes(
+        logit_opacities=x, raw_scales=x[:, None] * jnp.ones(3), quats=jnp.ones((num, 4)), sh=jnp.zeros((num, 1, 3))
+    )
+
+
+def evidence(value: float = 1.0, num: int = NUM) -> Evidence:
+    """Evidence whose fields all have one value."""
+    each = jnp.full(num, value)
+    return Evidence(jnp.full((num, NUM_SIGHTINGS), value), each, each, each, each, each, jnp.full((num, 12), value))
+
+
+def head_with(bias: float) -> dict:
+    """A head whose outputs are all `bias`."""
+    head = init_params(jax.random.key(0), CONFIG, only=("evidence",))["evidence"]
+    return {**head, "out": {**head["out"], "bias": jnp.full(3, bias)}}
+
+
+def cache_of_pivots(num: int = 6):
+    """A cache with pivots in its first rows."""
+    rng = np.random.default_rng(0)
+    cache = init_cache(CONFIG)
+    set_rows = lambda x, values: x.at[:num, 0].set(jnp.asarray(values, x.dtype))  # noqa: E731
+    return replace(
+        cache,
+        counts=cache.counts.at[:num].set(1),
+        num_voxels=jnp.asarray(num, jnp.int32),
+        means=set_rows(cache.means, rng.normal(size=(num, 3))),
+        feats=set_rows(cache.feats, rng.normal(size=(num, 64))),
+        confidences=set_rows(cache.confidences, np.full(num, 0.9)),
+        rgbs=set_rows(cache.rgbs, rng.uniform(size=(num, 12))),
+        quats=set_rows(cache.quats, rng.normal(size=(num, 4))),
+        footprints=set_rows(cache.footprints, np.full(num, 0.02)),
+        num_members=set_rows(cache.num_members, np.arange(1, num + 1)),
+        sightings=set_rows(cache.sightings, rng.uniform(0, 5, (num, NUM_SIGHTINGS))),
+    )
+
+
+def test_an_untrained_head_changes_nothing():
+    params = init_params(jax.random.key(0), CONFIG, only=("evidence",))["evidence"]
+    got = apply_evidence(params, shapes(), evidence(3.0), CONFIG)
+    jax.tree.map(np.testing.assert_array_equal, got, shapes())
+
+
+def test_the_untrained_scene_is_that_without_evidence():
+    off = CONFIG.replace(evidence=False)
+    params, cache = StreamSplat(CONFIG).init(jax.random.key(1)), cache_of_pivots()
+    with_evidence = StreamSplat(CONFIG).decode(params, cache)
+    without = StreamSplat(off).decode(params, replace(cache, sightings=None))
+    jax.tree.map(np.testing.assert_array_equal, with_evidence, without)
+
+
+@pytest.mark.parametrize("bias", [1e4, -1e4])
+def test_changes_of_the_opacity_are_bounded(bias):
+    got = apply_evidence(head_with(bias), shapes(), evidence(), CONFIG)
+    np.testing.assert_allclose(got.logit_opacities - shapes().logit_opacities, np.sign(bias) * MAX_LOGIT_CHANGE)
+
+
+def test_the_head_moves_opacity_and_scales_alone():
+    got = apply_evidence(head_with(0.1), shapes(), evidence(), CONFIG)
+    assert float(got.logit_opacities[0]) == pytest.approx(-1.0 + 0.1, abs=1e-3)
+    np.testing.assert_allclose(got.raw_scales - shapes().raw_scales, 0.1, rtol=1e-5)
+    np.testing.assert_array_equal(got.quats, shapes().quats)
+    np.testing.assert_array_equal(got.sh, shapes().sh)
+
+
+@pytest.mark.parametrize("value", [0.0, 1.0, 1e6])
+def test_value_and_gradient_are_finite_at_the_limits(value):
+    """Dead pivots hold zeros; confidences may be 1."""
+    assert jnp.isfinite(evidence_features(evidence(value), CONFIG)).all()
+    loss = lambda p: apply_evidence(p, shapes(), evidence(value), CONFIG).logit_opacities.sum()  # noqa: E731
+    assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(jax.grad(loss)(head_with(0.2))))
+
+
+def test_pivots_that_fit_and_pivots_that_do_not_differ_in_features():
+    good, bad = evidence(), evidence()
+    bad = replace(bad, sightings=bad.sightings.at[:, 3].mul(5.0))
+    assert not np.array_equal(evidence_features(good, CONFIG), evidence_features(bad, CONFIG))
+
+
+@pytest.mark.parametrize("name", sorted(PRESETS))
+def test_evidence_is_on_in_tiny_alone(name):
+    config = preset(name)
+    assert config.head.evidence == (name == "tiny")
+    small = config.replace(capacity=128)
+    assert (init_cache(small).sightings is not None) == (name == "tiny")
+    if name != "tiny":
+        assert "evidence" not in jax.eval_shape(lambda key: init_params(key, small), jax.random.key(0))
+
+
+def test_the_head_has_no_input_that_it_does_not_know():
+    params = init_params(jax.random.key(0), CONFIG, only=("evidence",))["evidence"]
+    assert params["hidden1"]["kernel"].shape[0] == evidence_features(evidence(), CONFIG).shape[1]
+    assert EvidenceHead().apply({"params": params}, evidence_features(evidence(), CONFIG)).shape == (NUM, 3)
+    assert {field.name for field in dataclasses.fields(Evidence)} >= {"sightings", "num_members"}

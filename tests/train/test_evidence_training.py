@@ -1,0 +1,110 @@
+"""Training of the evidence head: it moves that head alone, in the direction of better crops, the same way every time."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ssplat_jax.checkpoint.weights import load_params
+from ssplat_jax.config import preset
+from ssplat_jax.errors import InputError
+from ssplat_jax.gaussians import Gaussians
+from ssplat_jax.geometry.cameras import Camera
+from ssplat_jax.rasterizer import render
+from ssplat_jax.streaming.streamsplat import StreamSplat
+from ssplat_jax.train.evidence_training import EvidenceRecipe, crop_camera, train_evidence
+
+RECIPE = EvidenceRecipe(
+    steps=6, crop=(32, 48), width=64, procedural=("procedural:room?frames=12",), warmup_steps=1, learning_rate=0.02
+)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def standard_promotion():
+    """Allows type promotion: optax raises a float to an int32 power in Adam's bias correction."""
+    with jax.numpy_dtype_promotion("standard"):
+        yield
+
+
+@pytest.fixture(scope="module")
+def trained():
+    """(parameters before, parameters after, facts, records) of a short training on one small scene."""
+    params, records, names = load_params("tiny"), [], []
+    after, facts = train_evidence(
+        StreamSplat(preset("tiny")),
+        params,
+        [],
+        RECIPE,
+        on_scene=names.append,
+        on_step=lambda step, record: records.append((step, record)),
+    )
+    assert names == facts["scenes"]
+    return params, after, facts, records
+
+
+def test_it_moves_the_evidence_head_alone(trained):
+    before, after, _, _ = trained
+    for stage in before:
+        same = [np.array_equal(a, b) for a, b in zip(*map(jax.tree.leaves, (before[stage], after[stage])), strict=True)]
+        assert all(same) == (stage != "evidence")
+    assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(after))
+
+
+def test_it_names_its_scenes_and_reports_every_step(trained):
+    _, _, facts, records = trained
+    assert facts["scenes"] == ["procedural-room, stride 1"]
+    assert [step for step, _ in records] == list(range(1, RECIPE.steps + 1))
+    assert facts["shown_psnr"] == pytest.approx(records[-1][1]["shown_psnr"], abs=1e-3)
+    assert 15 < facts["black_psnr"] <= facts["shown_psnr"] + 1 < 45
+
+
+def test_an_untrained_head_is_what_it_starts_from(trained):
+    """The head that the parameters hold does not matter."""
+    before, after, _, _ = trained
+    noise = jax.tree.map(lambda x: x + 1.0, before["evidence"])
+    again, _ = train_evidence(StreamSplat(preset("tiny")), {**before, "evidence": noise}, [], RECIPE)
+    jax.tree.map(np.testing.assert_array_equal, again["evidence"], after["evidence"])
+
+
+def test_more_steps_give_better_crops():
+    """The mean PSNR over black of the last steps is above that of the first, on the same small scene."""
+    records = []
+    recipe = dataclasses.replace(RECIPE, steps=40, black_weight=1.0)
+    train_evidence(
+        StreamSplat(preset("tiny")),
+        load_params("tiny"),
+        [],
+        recipe,
+        on_step=lambda step, record: records.append(record["black_psnr"]),
+    )
+    assert np.mean(records[-10:]) > np.mean(records[:10]) + 0.3
+
+
+def test_a_crop_is_a_part_of_the_image():
+    key = jax.random.split(jax.random.key(0), 3)
+    gaussians = Gaussians(
+        means=jax.random.normal(key[0], (40, 3)) * 0.5 + jnp.array([0.0, 0.0, 3.0]),
+        quats=jnp.tile(jnp.array([1.0, 0.0, 0.0, 0.0]), (40, 1)),
+        scales=jnp.full((40, 3), 0.1),
+        opacities=jnp.full(40, 0.6),
+        sh=jax.random.normal(key[1], (40, 1, 3)),
+    )
+    K = jnp.array([[60.0, 0.0, 40.0], [0.0, 60.0, 30.0], [0.0, 0.0, 1.0]])
+    camera = Camera(viewmats=jnp.eye(4), Ks=K, width=80, height=60)
+    whole = render(gaussians, camera).color
+    part = render(gaussians, crop_camera(camera, jnp.asarray(7), jnp.asarray(13), 32, 48)).color
+    np.testing.assert_allclose(part, whole[7 : 7 + 32, 13 : 13 + 48], atol=1 / 255)  # tiles cut faint rims
+
+
+def test_a_configuration_without_evidence_is_refused():
+    model = StreamSplat(preset("tiny").replace(evidence=False))
+    with pytest.raises(InputError, match=r"head\.evidence"):
+        train_evidence(model, load_params("tiny"), [], RECIPE)
+
+
+def test_images_smaller_than_a_crop_are_refused():
+    recipe = dataclasses.replace(RECIPE, crop=(64, 48))
+    with pytest.raises(InputError, match="48x64 or more"):
+        train_evidence(StreamSplat(preset("tiny")), load_params("tiny"), [], recipe)
