@@ -66,7 +66,7 @@ class EvidenceRecipe:
     """Largest norm of the gradient."""
     weight_decay: float = 1e-3
     """Decoupled weight decay."""
-    black_weight: float = 0.5
+    black_weight: float = 0.4
     """Weight of the PSNR over black; the rest is the PSNR with holes filled."""
     ema_decay: float = 0.98
     """Decay of the moving average of the parameters, which is the result."""
@@ -80,7 +80,7 @@ class StreamedScene:
 
     name: str
     cache: VoxelCache
-    num_pivots: int  # shown, rounded up
+    num_pivots: int  # those that are shown
     key_views: KeyViews  # what was streamed
     max_pairs: int  # capacity for tile intersections of a crop
 
@@ -192,7 +192,7 @@ def _stream(model: StreamSplat, params: dict, capture: Capture, stride: int, rec
     return StreamedScene(
         name=f"{capture.name}, stride {stride}",
         cache=session.cache,
-        num_pivots=1 << max(0, num_shown - 1).bit_length(),
+        num_pivots=num_shown,
         key_views=key_views,
         max_pairs=round_up(2 * max(counts)),
     )
