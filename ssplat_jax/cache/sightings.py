@@ -57,7 +57,9 @@ def cells_of(
     )
 
 
-def add_sightings(cache: VoxelCache, camera: Camera, cells: Cells, config: StreamConfig) -> VoxelCache:
+def add_sightings(
+    cache: VoxelCache, camera: Camera, cells: Cells, config: StreamConfig, *, axis: str | None = None
+) -> VoxelCache:
     """`cache` with what the views of one chunk say about its pivots added to their sightings.
 
     Args:
@@ -65,6 +67,7 @@ def add_sightings(cache: VoxelCache, camera: Camera, cells: Cells, config: Strea
         camera: the chunk's views at grid resolution.
         cells: depths, confidences and colors of their cells.
         config: pivots below its `min_confidence` do not count as others in a cell.
+        axis: name of the mapped axis over which the cache is sharded by voxel; None if `cache` is the whole cache.
 
     Returns:
         The cache; only `sightings` differs.
@@ -83,6 +86,8 @@ def add_sightings(cache: VoxelCache, camera: Camera, cells: Cells, config: Strea
 
     zeros = jnp.zeros(num_cells)
     number, errors = jax.lax.fori_loop(0, num_blocks, crowd, (zeros, zeros))
+    if axis is not None:
+        number, errors = jax.lax.psum((number, errors), axis)
     means = errors / jnp.maximum(number, 1.0)
 
     def add(i, sightings):
@@ -130,6 +135,11 @@ def _read_block(cache: VoxelCache, camera: Camera, cells: Cells, first_row, num_
     keep = lambda x: jnp.where(is_seen, x, 0.0)  # noqa: E731
     offsets = (log_depths - read(cells.log_depths)) / ON_SURFACE
     return pairs, _Pairs(weights=weights, offsets=keep(offsets), errors=keep(errors), sizes=keep(sizes))
+
+
+def total_sightings(packed: Float[Array, "*n s"]) -> Float[Array, "*n"]:
+    """Weight of all cells that told something about a pivot: it grows whenever its sightings change."""
+    return packed[..., :3].sum(axis=-1)
 
 
 def features_of_sightings(packed: Float[Array, "n s"]) -> Float[Array, "n f"]:

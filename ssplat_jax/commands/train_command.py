@@ -101,7 +101,7 @@ class Train:
 
     def _run_evidence(self) -> int:
         """Trains the evidence head on whole streams. It takes minutes, so it starts anew after an interrupt."""
-        from ssplat_jax.checkpoint.weights import check_params, load_weights, save_weights
+        from ssplat_jax.checkpoint.weights import check_params, describe_weights, load_weights, save_weights
         from ssplat_jax.console import Reporter
         from ssplat_jax.storage.folder_lock import lock_folder
         from ssplat_jax.storage.folders import make_writable
@@ -133,7 +133,8 @@ class Train:
                 on_scene=lambda name: reporter.say(f"streamed {name}"),
                 on_step=lambda step, record: advance(step, f"psnr {record['shown_psnr']:.2f}"),
             )
-        provenance = {"recipe": dataclasses.asdict(recipe), "init_weights": self.init_weights.name, **facts}
+        start = {"init_weights": self.init_weights.name, "before": describe_weights(str(self.init_weights)).provenance}
+        provenance = {"recipe": dataclasses.asdict(recipe), **start, **facts}
         save_weights(self.out / "weights.npz", trained, config, provenance)
         print(f"wrote {self.out}/weights.npz after {recipe.steps} steps")
         return 0

@@ -6,8 +6,9 @@
         delta = feed.update(cache)          # decodes only the rows that changed
         scene = apply_delta(scene, delta)   # equals model.decode(params, cache)
 
-A voxel's Gaussians change when a token is written to it, which the cache records per pivot (`last_chunks`), or when
-views carve a pivot away or restore it, which the feed detects by comparing the shown pivots with the previous ones.
+A voxel's Gaussians change when a token is written to it, which the cache records per pivot (`last_chunks`); when views
+carve a pivot away or restore it; and, with evidence, when views see a shown pivot. The feed detects the last two by
+comparing the shown pivots and their sightings with the previous ones.
 """
 
 import dataclasses
@@ -18,6 +19,7 @@ import numpy as np
 from jaxtyping import Float32, Int32
 
 from ssplat_jax.cache import VoxelCache
+from ssplat_jax.cache.sightings import total_sightings
 from ssplat_jax.cache.state import require_single_cache
 from ssplat_jax.gaussians import Gaussians, mask_gaussians
 from ssplat_jax.streaming.streamsplat import StreamSplat, shown_pivots
@@ -34,7 +36,8 @@ class SceneDelta:
     gaussians: Gaussians  # [r * k], in the order of `rows`; k = pivots_per_voxel * gaussians_per_token
     capacity: int  # capacity of the cache: the scene has capacity * k Gaussians
     confidences: Float32[np.ndarray, " n"] | None = None
-    """Omega of the pivots behind `gaussians`, in their order. A change of it alone is no change of a row."""
+    """Omega of the pivots behind `gaussians`, in their order. Without evidence, a change of it alone is no change of a
+    row."""
 
 
 class SceneFeed:
@@ -49,8 +52,10 @@ class SceneFeed:
     def __init__(self, model: StreamSplat, params: dict, known: VoxelCache | None = None) -> None:
         self._params = params
         self._shown_pivots = jax.jit(lambda cache: shown_pivots(cache, model.config))
+        self._total_sightings = jax.jit(lambda cache: total_sightings(cache.sightings))
         self._decode_rows = jax.jit(model.decode_rows)
-        self._next_chunk, self._shown = 0, np.zeros((0, model.config.memory.pivots_per_voxel), bool)
+        shape = (0, model.config.memory.pivots_per_voxel)
+        self._next_chunk, self._shown, self._seen = 0, np.zeros(shape, bool), np.zeros(shape, np.float32)
         if known is not None:
             self._changed_rows(known)
 
@@ -76,12 +81,17 @@ class SceneFeed:
         )
 
     def _changed_rows(self, cache: VoxelCache) -> Int32[np.ndarray, " r"]:
-        """Rows written, carved or restored since the last call; updates the feed's record."""
+        """Rows written, carved, restored or, with evidence, seen since the last call; updates the feed's record."""
+        more = [(0, cache.capacity - len(self._shown)), (0, 0)]  # the cache may have grown
         shown = np.asarray(self._shown_pivots(cache))
-        known = np.pad(self._shown, [(0, cache.capacity - len(self._shown)), (0, 0)])  # the cache may have grown
-        is_written = np.asarray(cache.alive) & (np.asarray(cache.last_chunks) >= self._next_chunk)
+        is_changed = np.asarray(cache.alive) & (np.asarray(cache.last_chunks) >= self._next_chunk)
+        is_changed |= shown != np.pad(self._shown, more)
+        if cache.sightings is not None:
+            seen = np.asarray(self._total_sightings(cache))
+            is_changed |= shown & (seen != np.pad(self._seen, more))
+            self._seen = seen
         self._next_chunk, self._shown = int(cache.stats.num_chunks), shown
-        return np.flatnonzero((is_written | (shown != known)).any(axis=1)).astype(np.int32)
+        return np.flatnonzero(is_changed.any(axis=1)).astype(np.int32)
 
 
 def apply_confidences(known: Float32[np.ndarray, " m"] | None, delta: SceneDelta) -> Float32[np.ndarray, " m"] | None:

@@ -163,7 +163,7 @@ class StreamSplat:
             return cache
         with jax.named_scope("sightings"):
             cells = cells_of(*seen[1:], tokens.rgbs, self.config)
-            return add_sightings(cache, prediction.views.grid_camera, cells, self.config)
+            return add_sightings(cache, prediction.views.grid_camera, cells, self.config, axis=self.axis)
 
     def run(self, params: dict, cache: VoxelCache, chunks: Chunk) -> tuple[VoxelCache, ChunkOutput]:
         """`step` over stacked chunks (leading axis t) as one `lax.scan`.

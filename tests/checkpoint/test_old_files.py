@@ -32,19 +32,24 @@ NEW_FIELDS = ("network", "vit", "match_stride", "depth_range", "depth_space", "u
 OLDEST_CONFIG = {name: value for name, value in FLAT_CONFIG.items() if name not in NEW_FIELDS}
 """Configuration from before there was a second network, as in the weights that ship with the preset."""
 
+OLD = preset("tiny").replace(evidence=False)
+"""The preset as it was before pivots kept evidence."""
+
 FRAME = {"rotation": np.eye(3).tolist(), "origin": [0.0, 0.0, 1.0], "scale": 0.6, "near": 0.7, "far": 4.9}
 
 
-@pytest.mark.parametrize(
-    "fields", [FLAT_CONFIG, OLDEST_CONFIG, preset("tiny").to_dict()], ids=("flat", "oldest", "new")
-)
+@pytest.mark.parametrize("fields", [FLAT_CONFIG, OLDEST_CONFIG, OLD.to_dict()], ids=("flat", "oldest", "new"))
 def test_flat_configurations_are_read(fields):
-    assert config_from_header(fields) == preset("tiny")
+    assert config_from_header(fields) == OLD
+
+
+def test_a_configuration_with_every_field_is_read_as_it_is():
+    assert config_from_header(preset("tiny").to_dict()) == preset("tiny")
 
 
 ADDITIONS = {
     **{"history": {"cgfi_form": "residual", "unit_features": True}},
-    **{"head": {"opacity_mode": "compound", "grow_footprints": True}},
+    **{"head": {"opacity_mode": "compound", "grow_footprints": True, "evidence": False}},
 }
 """Fields that became switches, with what they did before."""
 
@@ -60,7 +65,7 @@ def test_fields_missing_in_a_saved_configuration_do_what_they_did(name):
 
 def test_changed_fields_of_flat_configurations_are_kept():
     config = config_from_header(FLAT_CONFIG | {"mixer_neighbours": 12, "voxel_size": 0.05})
-    assert config == preset("tiny").replace(mixer_neighbors=12, voxel_size=0.05)
+    assert config == OLD.replace(mixer_neighbors=12, voxel_size=0.05)
 
 
 def test_unknown_fields_of_flat_configurations_are_refused():
@@ -70,12 +75,12 @@ def test_unknown_fields_of_flat_configurations_are_refused():
 
 @pytest.mark.parametrize("fields", [FLAT_CONFIG, OLDEST_CONFIG], ids=("flat", "oldest"))
 def test_old_weights_files_are_read(fields, tmp_path):
-    params = load_params("tiny")
+    params = {stage: leaves for stage, leaves in load_params("tiny").items() if stage != "evidence"}
     leaves = jax.tree_util.tree_flatten_with_path(params)[0]
     arrays = {"/".join(key.key for key in keys): np.asarray(leaf, np.float16) for keys, leaf in leaves}
     save_arrays(tmp_path / "weights.npz", arrays, "weights", {"config": fields, "provenance": {"steps": 3400}})
     loaded, config = load_weights(tmp_path / "weights.npz")
-    assert config == preset("tiny")
+    assert config == OLD
     jax.tree.map(np.testing.assert_array_equal, loaded, params)
 
 
@@ -103,7 +108,7 @@ def test_old_stream_states_are_read(tmp_path):
     arrays, caller = state_arrays(), {"config": FLAT_CONFIG, "done": 24, "frame": FRAME}
     save_arrays(tmp_path / "state.npz", arrays, "stream state 3", {"capacity": 8, "caller": caller})
     cache, header = load_state(tmp_path / "state.npz")
-    assert header == caller and config_from_header(header["config"]) == preset("tiny")
+    assert header == caller and config_from_header(header["config"]) == OLD
     assert cache.capacity == 8 and int(cache.stats.num_evicted) == 8
     np.testing.assert_array_equal(cache.means[:1], arrays["means"])
     assert not np.asarray(cache.means[1:]).any()
@@ -127,8 +132,8 @@ def test_old_deltas_are_read(tmp_path):
 @pytest.mark.parametrize("fields", [FLAT_CONFIG, OLDEST_CONFIG], ids=("flat", "oldest"))
 def test_old_trainings_are_resumed(fields, tmp_path):
     (tmp_path / RECIPE_FILE).write_text(json.dumps({"config": fields, "recipe": {"seed": 0}}))
-    description = {"config": preset("tiny").to_dict(), "recipe": {"seed": 0}}
+    description = {"config": OLD.to_dict(), "recipe": {"seed": 0}}
     TrainingCheckpoints(tmp_path, description).close()
-    other = {"config": preset("tiny").replace(voxel_size=0.05).to_dict(), "recipe": {"seed": 0}}
+    other = {"config": OLD.replace(voxel_size=0.05).to_dict(), "recipe": {"seed": 0}}
     with pytest.raises(InputError, match=r"memory\.voxel_size = 0\.03, wanted 0\.05"):
         TrainingCheckpoints(tmp_path, other)

@@ -11,6 +11,7 @@ from ssplat_jax.cache import grow, init_cache
 from ssplat_jax.checkpoint.delta_files import load_delta, save_delta
 from ssplat_jax.errors import StorageError
 from ssplat_jax.model.compact.gaussian_head import GaussianHead
+from ssplat_jax.model.params import init_params
 from ssplat_jax.pytree import replace
 from ssplat_jax.streaming.scene_delta import SceneFeed, apply_confidences, apply_delta
 from ssplat_jax.streaming.streamsplat import StreamSplat
@@ -24,7 +25,9 @@ pytestmark = pytest.mark.usefixtures("compiled_plainly")
 def decoder_params(config):
     head = GaussianHead(config).init(jax.random.key(0), jnp.zeros((1, config.network.token_width)))["params"]
     kernel = jax.random.normal(jax.random.key(1), head["out"]["kernel"].shape)
-    return {"decoder": head | {"out": head["out"] | {"kernel": kernel}}}
+    evidence = init_params(jax.random.key(2), config, only=("evidence",))["evidence"]
+    evidence = jax.tree.map(lambda x: x + 0.1 * jax.random.normal(jax.random.key(3), x.shape), evidence)
+    return {"decoder": head | {"out": head["out"] | {"kernel": kernel}}, "evidence": evidence}
 
 
 def chunk(seed):
@@ -32,9 +35,14 @@ def chunk(seed):
 
 
 def carved(cache, rng, config):
-    """The cache after some pivots sank below the threshold and some came back."""
+    """The cache after views saw some pivots, which sank below the threshold or came back."""
     factor = rng.choice([0.5, 1.0, 1.0, 1.0, 2.0], cache.confidences.shape).astype(np.float32)
-    return replace(cache, confidences=jnp.clip(cache.confidences * factor, 0.0, 0.95))
+    told = rng.uniform(size=cache.sightings.shape) * ((factor != 1.0) & np.asarray(cache.alive))[..., None]
+    return replace(
+        cache,
+        confidences=jnp.clip(cache.confidences * factor, 0.0, 0.95),
+        sightings=cache.sightings + jnp.asarray(told, jnp.float32),
+    )
 
 
 def assert_same_scene(received, scene):
