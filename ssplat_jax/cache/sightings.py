@@ -18,6 +18,7 @@ from ssplat_jax.config import StreamConfig
 from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.numerics import safe_log
 from ssplat_jax.pytree import pytree, replace
+from ssplat_jax.xla_cpu import kept
 
 ON_SURFACE = math.log(1.03)
 """Largest distance in log depth at which a pivot lies on the surface of a cell."""
@@ -81,18 +82,17 @@ def add_sightings(
     def crowd(i, sums):
         pairs, seen = _read_block(cache, camera, cells, i * num_rows, num_rows)
         on = jnp.where(pairs.weights >= config.memory.min_confidence, _on(seen).reshape(-1), 0.0)
-        values = (on, on * seen.errors.reshape(-1))
-        return tuple(x.at[pairs.pixels].add(value, mode="drop") for x, value in zip(sums, values, strict=True))
+        return sums.at[pairs.pixels].add(jnp.stack([on, on * seen.errors.reshape(-1)], axis=-1), mode="drop")
 
-    zeros = jnp.zeros(num_cells)
-    number, errors = jax.lax.fori_loop(0, num_blocks, crowd, (zeros, zeros))
-    if axis is not None:
-        number, errors = jax.lax.psum((number, errors), axis)
-    means = errors / jnp.maximum(number, 1.0)
+    sums = jax.lax.fori_loop(0, num_blocks, crowd, jnp.zeros((num_cells, 2)))
+    number, errors = (sums if axis is None else jax.lax.psum(sums, axis)).T
+    number = jnp.maximum(number, 1.0)
+    table = jnp.stack([jnp.log(number), errors / number], axis=-1)
 
     def add(i, sightings):
         pairs, seen = _read_block(cache, camera, cells, i * num_rows, num_rows)
-        read = lambda x: x.at[pairs.pixels].get(mode="fill", fill_value=0.0).reshape(seen.weights.shape)  # noqa: E731
+        others = table.at[pairs.pixels].get(mode="fill", fill_value=0.0).reshape(*seen.weights.shape, 2)
+        others = kept(others, cache.num_voxels >= 0)
         on = seen.weights * _on(seen)
         before = jnp.where(seen.offsets < -1, seen.weights, 0.0)
         sums = (
@@ -102,8 +102,8 @@ def add_sightings(
             on * seen.errors,
             before * seen.errors,
             on * seen.offsets,
-            on * safe_log(jnp.maximum(read(number), 1.0)),
-            on * (seen.errors - read(means)),
+            on * others[..., 0],
+            on * (seen.errors - others[..., 1]),
             on * seen.sizes,
         )
         old = jax.lax.dynamic_slice_in_dim(sightings, i * num_rows, num_rows)
@@ -120,21 +120,23 @@ def _on(seen: _Pairs) -> Float[Array, "v n"]:
 
 def _read_block(cache: VoxelCache, camera: Camera, cells: Cells, first_row, num_rows: int) -> tuple[PixelPairs, _Pairs]:
     """Pairs of all views with the pivots of a block of rows, and what their cells hold; zeros for pivots not seen."""
-    num_views = len(camera.viewmats)
+    num_views, always = len(camera.viewmats), cache.num_voxels >= 0
     pairs = project_rows(cache, camera, first_row, num_rows)
-    by_view = lambda x: x.reshape(num_views, -1)  # noqa: E731
-    read = lambda x: by_view(x.at[pairs.pixels].get(mode="fill", fill_value=0.0))  # noqa: E731
+    table = jnp.concatenate([cells.weights[:, None], cells.log_depths[:, None], cells.colors], axis=1)
+    held = table.at[pairs.pixels].get(mode="fill", fill_value=0.0)
+    held, log_depths = kept((held.reshape(num_views, -1, 5), pairs.log_depths.reshape(num_views, -1)), always)
     block = lambda x: jax.lax.dynamic_slice_in_dim(x, first_row, num_rows).reshape(-1, *x.shape[2:])  # noqa: E731
-    colors = block(cache.rgbs)
-    colors = colors.reshape(len(colors), -1, 3).mean(axis=1)
-    log_depths, weights = by_view(pairs.log_depths), read(cells.weights)
-    is_seen = weights > 0
-    # One channel at a time: rows of three do not vectorize on a CPU.
-    errors = sum(jnp.abs(read(cells.colors[:, i]) - colors[:, i]) for i in range(3)) / 3
-    sizes = safe_log(block(cache.footprints)) - log_depths + jnp.log(camera.Ks[:, 0, 0])[:, None]
-    keep = lambda x: jnp.where(is_seen, x, 0.0)  # noqa: E731
-    offsets = (log_depths - read(cells.log_depths)) / ON_SURFACE
-    return pairs, _Pairs(weights=weights, offsets=keep(offsets), errors=keep(errors), sizes=keep(sizes))
+    rgbs = block(cache.rgbs)
+    colors = kept(rgbs.reshape(len(rgbs), -1, 3).mean(axis=1), always)
+    weights = held[..., 0]
+    keep = lambda x: jnp.where(weights > 0, x, 0.0)  # noqa: E731
+    seen = _Pairs(
+        weights=weights,
+        offsets=keep((log_depths - held[..., 1]) / ON_SURFACE),
+        errors=keep(jnp.abs(held[..., 2:] - colors).mean(axis=-1)),
+        sizes=keep(safe_log(block(cache.footprints)) - log_depths + jnp.log(camera.Ks[:, 0, 0])[:, None]),
+    )
+    return pairs, seen
 
 
 def total_sightings(packed: Float[Array, "*n s"]) -> Float[Array, "*n"]:

@@ -134,7 +134,7 @@ class Train:
                 on_step=lambda step, record: advance(step, f"psnr {record['shown_psnr']:.2f}"),
             )
         start = {"init_weights": self.init_weights.name, "before": describe_weights(str(self.init_weights)).provenance}
-        provenance = {"recipe": dataclasses.asdict(recipe), **start, **facts}
+        provenance = {"recipe": dataclasses.asdict(recipe), "steps": recipe.steps, **start, **facts}
         save_weights(self.out / "weights.npz", trained, config, provenance)
         print(f"wrote {self.out}/weights.npz after {recipe.steps} steps")
         return 0
