@@ -120,7 +120,7 @@ def test_growing_the_cache_is_not_timed(overflow, capacity, capture, monkeypatch
     frame = capture.stream_frame(config, (0, 1, 3, 4))
     milliseconds = measure_latency(session, [chunk], capture.camera(2, frame))
     assert capacities == [capacity] * 2 and session.cache.capacity == 128  # 4 x 8 x 8 tokens
-    assert 0 < milliseconds["step_ms"] < milliseconds["chunk_ms"]["median"]
+    assert 0 <= milliseconds["step_ms"] < milliseconds["chunk_ms"]["median"]
     assert 0 < milliseconds["render_ms"] < milliseconds["chunk_ms"]["median"]
 
 

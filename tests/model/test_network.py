@@ -173,4 +173,4 @@ def test_shipped_network_fulfils_the_protocol(config_type):
     feats = jnp.asarray(np.random.default_rng(0).normal(size=(1, 2, 2, 8)), jnp.float32)
     assert network.bound_history(feats).shape == feats.shape
     shapes = jax.eval_shape(StreamSplat(config).init, jax.random.key(0))
-    assert set(network.stages(config)) == set(shapes) - {"hpda", "cgfi"}
+    assert set(network.stages(config)) == set(shapes) - {"hpda", "cgfi", "evidence"}

@@ -21,6 +21,7 @@ from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.geometry.voxels import voxel_indices
 from ssplat_jax.metrics.psnr_ssim import psnr
 from ssplat_jax.model.compact.gaussian_head import GaussianHead
+from ssplat_jax.model.params import init_params
 from ssplat_jax.pytree import replace
 from ssplat_jax.rasterizer import render
 from ssplat_jax.refinement.online import nearest_pivots, online_refinement, revise_scene, views_of_round
@@ -46,7 +47,8 @@ SHIFTS = (0.0, 0.1, -0.1, 0.2)
 
 @functools.cache
 def params() -> dict:
-    return {"decoder": GaussianHead(CONFIG).init(jax.random.key(0), jnp.zeros((1, 4)))["params"]}
+    decoder = GaussianHead(CONFIG).init(jax.random.key(0), jnp.zeros((1, 4)))["params"]
+    return {"decoder": decoder, **init_params(jax.random.key(1), CONFIG, only=("evidence",))}
 
 
 def wall_colors(points: np.ndarray) -> np.ndarray:
@@ -303,7 +305,7 @@ def test_without_steps_the_programs_are_those_without_refinement():
         for model in (plain, default)
     ]
     assert texts[0] == texts[1] != ""
-    assert "residuals" not in texts[0] and len(jax.tree.leaves(default.init_cache())) == 26
+    assert "residuals" not in texts[0] and len(jax.tree.leaves(default.init_cache())) == 27
 
 
 def test_cameras_are_those_of_the_chunk():

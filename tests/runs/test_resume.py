@@ -30,6 +30,9 @@ def test_capacity_matters_only_if_tokens_may_be_dropped(tmp_path):
 
 def test_a_flat_saved_configuration_is_understood(tmp_path):
     flat = {"network": "compact", "preset": "tiny", "voxel_size": preset("tiny").memory.voxel_size}
-    _check_identity(FACTS | {"config": flat}, identity(), RunFolder(tmp_path))
+    now = identity(evidence=False)  # which came later
+    _check_identity(FACTS | {"config": flat}, now, RunFolder(tmp_path))
     with pytest.raises(InputError, match=r"config \(voxel_size: 0\.5 there"):
-        _check_identity(FACTS | {"config": flat | {"voxel_size": 0.5}}, identity(), RunFolder(tmp_path))
+        _check_identity(FACTS | {"config": flat | {"voxel_size": 0.5}}, now, RunFolder(tmp_path))
+    with pytest.raises(InputError, match=r"config \(evidence: False there, True now\)"):
+        _check_identity(FACTS | {"config": flat}, identity(), RunFolder(tmp_path))

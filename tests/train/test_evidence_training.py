@@ -1,13 +1,16 @@
-"""Training of the evidence head: it moves that head alone, in the direction of better crops, the same way every time."""
+"""Training of the evidence head: it moves that head alone, towards better crops, the same way every time."""
 
 import dataclasses
+from importlib import resources
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ssplat_jax.checkpoint.weights import load_params
+from ssplat_jax.checkpoint.weights import describe_weights, load_params, load_weights
+from ssplat_jax.commands.train_command import Train
 from ssplat_jax.config import preset
 from ssplat_jax.errors import InputError
 from ssplat_jax.gaussians import Gaussians
@@ -108,3 +111,27 @@ def test_images_smaller_than_a_crop_are_refused():
     recipe = dataclasses.replace(RECIPE, crop=(64, 48))
     with pytest.raises(InputError, match="48x64 or more"):
         train_evidence(StreamSplat(preset("tiny")), load_params("tiny"), [], recipe)
+
+
+SHIPPED = Path(str(resources.files("ssplat_jax") / "weights" / "tiny.npz"))
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [({}, "--init-weights"), ({"init_weights": SHIPPED, "shares": (0.5,), "captures": (Path("x"),)}, "--shares")],
+)
+def test_options_that_do_not_fit_the_recipe_are_refused(options, named, tmp_path):
+    with pytest.raises(InputError, match=named):
+        Train(out=tmp_path / "out", recipe="evidence", **options).run()
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_command_writes_weights_with_their_history(tmp_path, monkeypatch):
+    """The file tells the recipe, the scenes, and the training of the weights that it started from."""
+    monkeypatch.setattr("ssplat_jax.train.evidence_training.EvidenceRecipe", lambda seed: RECIPE)
+    assert Train(out=tmp_path, recipe="evidence", init_weights=SHIPPED, scale_steps=0.5, quiet=True).run() == 0
+    params, config = load_weights(tmp_path / "weights.npz")
+    provenance = describe_weights(str(tmp_path / "weights.npz")).provenance
+    assert config == preset("tiny") and "evidence" in params
+    assert provenance["steps"] == 3 and provenance["scenes"] == ["procedural-room, stride 1"]
+    assert provenance["before"] == describe_weights("tiny").provenance
