@@ -7,7 +7,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from ssplat_jax.cache import add_sightings
+from ssplat_jax.cache import add_sightings, init_cache
 from ssplat_jax.cache import numpy_reference as reference
 from ssplat_jax.cache.sightings import cells_of, features_of_sightings
 from ssplat_jax.cache.state import NUM_SIGHTINGS
@@ -25,7 +25,7 @@ from tests.cache.projection_scenes import (
     scene,
     with_pivots,
 )
-from tests.cache.streams import CAPACITY, CONFIG
+from tests.cache.streams import CAPACITY, CONFIG, Recipe, fuse, to_jax
 from tests.cache.test_carve import random_views
 
 ON, BEFORE, BEHIND, ERROR_ON, ERROR_BEFORE, OFFSET, CROWD, RELATIVE, SIZE = range(NUM_SIGHTINGS)
@@ -141,6 +141,21 @@ def test_views_add_up(seed):
         one = Camera(viewmats=camera.viewmats[i][None], Ks=camera.Ks[i][None], width=GRID_WIDTH, height=HEIGHT)
         one_by_one = seen(one_by_one, one, *(x[i][None] for x in views))
     np.testing.assert_allclose(together, one_by_one.sightings, rtol=1e-5, atol=1e-5)
+
+
+@SETTINGS
+@given(seed=SEED)
+def test_merges_keep_all_sightings(seed):
+    """New pivots have none and merged ones add theirs up, so the sum over all pivots stays."""
+    cache = init_cache(CONFIG)
+    for i in range(2):
+        cache = fuse(cache, to_jax(Recipe(seed + i, "one_voxel", "normal", "random").tokens()), CONFIG)
+        if i == 0:
+            told = np.random.default_rng(seed).uniform(size=cache.sightings.shape) * np.asarray(cache.alive)[..., None]
+            assert not np.asarray(cache.sightings).any() and int(cache.alive.sum()) == CONFIG.memory.pivots_per_voxel
+            cache = replace(cache, sightings=jnp.asarray(told, jnp.float32))
+    assert int(cache.stats.num_merged) > 0
+    np.testing.assert_allclose(cache.sightings.sum(axis=(0, 1)), told.sum(axis=(0, 1)), rtol=1e-5)
 
 
 @pytest.mark.parametrize("value", [0.0, 1.0, 1e6])
