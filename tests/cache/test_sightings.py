@@ -143,6 +143,24 @@ def test_views_add_up(seed):
     np.testing.assert_allclose(together, one_by_one.sightings, rtol=1e-5, atol=1e-5)
 
 
+@pytest.mark.parametrize("seed", [0, 2, 4])
+def test_shards_see_what_the_whole_cache_sees(seed):
+    """Pivots of other shards crowd a cell too."""
+    whole, camera = with_footprints(scene(seed, CAPACITY, 0.1), seed), cameras(seed)
+    depths, confidences = random_views(seed)
+    colors = random_colors(seed, depths.shape)
+    rgbs = jnp.tile(jnp.asarray(colors).reshape(-1, 3), (1, PARTS))
+    cells = cells_of(jnp.asarray(depths), jnp.asarray(confidences), rgbs, CONFIG)
+    half = CAPACITY // 2
+    rolled = [jax.tree.map(lambda x, i=i: jnp.roll(x, -i * half, axis=0) if x.ndim else x, whole) for i in range(2)]
+    parts = [replace(x, num_voxels=jnp.asarray(half), counts=x.counts.at[half:].set(0)) for x in rolled]
+    shards = jax.tree.map(lambda *x: jnp.stack(x), *parts)
+    got = jax.vmap(lambda cache: add_sightings(cache, camera, cells, CONFIG, axis="shards"), axis_name="shards")(shards)
+    wanted = add_sightings(whole, camera, cells, CONFIG).sightings
+    assert np.abs(wanted[..., CROWD]).max() > 0.1
+    np.testing.assert_allclose(got.sightings[:, :half].reshape(wanted.shape), wanted, rtol=1e-4, atol=1e-5)
+
+
 @SETTINGS
 @given(seed=SEED)
 def test_merges_keep_all_sightings(seed):

@@ -53,6 +53,7 @@ def test_it_moves_the_evidence_head_alone(trained):
         same = [np.array_equal(a, b) for a, b in zip(*map(jax.tree.leaves, (before[stage], after[stage])), strict=True)]
         assert all(same) == (stage != "evidence")
     assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(after))
+    assert float(jnp.abs(after["evidence"]["out"]["kernel"]).max()) > 1e-3  # zeros before training
 
 
 def test_it_names_its_scenes_and_reports_every_step(trained):
