@@ -26,8 +26,8 @@ class Train:
     """Preset of the configuration."""
     recipe: Literal["tiny", "stream", "evidence", "paper"] = "tiny"
     """tiny: trains depth from scratch, as for the shipped weights. evidence: trains the evidence head of --init-weights
-    on whole streams, as for the shipped weights. stream: trains the stages after depth. paper: the paper's loss and
-    steps, for --preset paper or small and a GPU."""
+    on whole streams, in one go. stream: trains the stages after depth. paper: the paper's loss and steps, for --preset
+    paper or small and a GPU."""
     scale_steps: float = 1.0
     """Factor of the number of steps of every phase."""
     seed: int = 0
@@ -108,7 +108,13 @@ class Train:
         from ssplat_jax.streaming.streamsplat import StreamSplat
         from ssplat_jax.train.evidence_training import EvidenceRecipe, train_evidence
 
-        unused = {"--shares": self.shares, "--lpips-vgg": self.lpips_vgg, "--lpips-heads": self.lpips_heads}
+        unused = {
+            "--shares": self.shares,
+            "--lpips-vgg": self.lpips_vgg,
+            "--lpips-heads": self.lpips_heads,
+            "--save-every": self.save_every != Train.save_every,
+            "--validate-every": self.validate_every != Train.validate_every,
+        }
         if given := [flag for flag, value in unused.items() if value]:
             raise InputError(f"{given[0]}: --recipe evidence has no use for it; leave it out.")
         if self.init_weights is None:

@@ -146,9 +146,10 @@ class StreamSplat:
         return self.update_cache(cache, prediction), prediction.output
 
     def update_cache(self, cache: VoxelCache, prediction: Prediction) -> VoxelCache:
-        """The cache after a chunk: tokens are judged and fused (VACC), then all pivots carved. No gradient flows.
+        """The cache after a chunk: tokens are judged and fused (VACC), all pivots carved and their sightings counted.
 
-        Carving includes the new pivots, so views of one chunk that disagree lower each other's confidences at once.
+        Carving includes the new pivots, so views of one chunk that disagree lower each other's confidences at once. No
+        gradient flows.
         """
         prediction = jax.lax.stop_gradient(prediction)
         seen = (prediction.views.grid_camera, prediction.output.depths, prediction.output.confidences)
@@ -159,7 +160,7 @@ class StreamSplat:
         with jax.named_scope("carve"):
             cache = carve(cache, *seen, self.config)
             cache = store_witness(cache, *seen, self.config)
-        if not self.config.head.evidence:
+        if cache.sightings is None:
             return cache
         with jax.named_scope("sightings"):
             cells = cells_of(*seen[1:], tokens.rgbs, self.config)

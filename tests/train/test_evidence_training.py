@@ -119,7 +119,11 @@ SHIPPED = Path(str(resources.files("ssplat_jax") / "weights" / "tiny.npz"))
 
 @pytest.mark.parametrize(
     ("options", "named"),
-    [({}, "--init-weights"), ({"init_weights": SHIPPED, "shares": (0.5,), "captures": (Path("x"),)}, "--shares")],
+    [
+        ({}, "--init-weights"),
+        ({"init_weights": SHIPPED, "shares": (0.5,), "captures": (Path("x"),)}, "--shares"),
+        ({"init_weights": SHIPPED, "save_every": 10}, "--save-every"),
+    ],
 )
 def test_options_that_do_not_fit_the_recipe_are_refused(options, named, tmp_path):
     with pytest.raises(InputError, match=named):
