@@ -72,6 +72,7 @@ def test_an_untrained_head_is_what_it_starts_from(trained):
     jax.tree.map(np.testing.assert_array_equal, again["evidence"], after["evidence"])
 
 
+@pytest.mark.slow
 def test_more_steps_give_better_crops():
     """The mean PSNR over black of the last steps is above that of the first, on the same small scene."""
     records = []
