@@ -23,7 +23,13 @@ def start(out, programs):
     command = (sys.executable, "-c", code, "experiment", "all", "--scale", "smoke", "--out", str(out), "--quiet")
     # Later lives take their programs from the disk, so that the kills spread over the measurements.
     environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": str(programs)}
-    return subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    with _log(out).open("w") as log:
+        return subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=log)
+
+
+def _log(out: Path) -> Path:
+    """File beside the results that takes what the last life said."""
+    return out.with_suffix(".log")
 
 
 def without_times(value):
@@ -46,7 +52,7 @@ def test_killed_experiments_end_with_the_same_files(tmp_path):
     programs = tmp_path / "programs"
     since = time.monotonic()
     whole = start(tmp_path / "whole", programs)
-    assert whole.wait() == 0, whole.stderr.read()
+    assert whole.wait() == 0, _log(tmp_path / "whole").read_text()
     took, rng = time.monotonic() - since, np.random.default_rng()
     kills = 0
     for delay in rng.uniform(3.0, 0.5 * took, NUM_KILLS):
@@ -59,6 +65,6 @@ def test_killed_experiments_end_with_the_same_files(tmp_path):
             life.wait()
             kills += 1
     last = start(tmp_path / "killed", programs)
-    assert last.wait() == 0, last.stderr.read()
+    assert last.wait() == 0, _log(tmp_path / "killed").read_text()
     assert kills > 0
     assert results(tmp_path / "killed") == results(tmp_path / "whole")
