@@ -101,7 +101,7 @@ def test_the_size_compares_the_footprint_with_the_cell():
 
 
 def test_pivots_of_one_cell_are_compared_with_each_other():
-    """Of two pivots on one surface, the one whose color fits has a negative relative error."""
+    """The pivot whose color fits has a negative relative error, the other one on the same surface a positive one."""
     cache = with_pivots([[0.0, 0.0, 2.0], [0.01, 0.0, 2.0]], confidences=[0.6, 0.6])
     cache = replace(cache, rgbs=cache.rgbs.at[0, 0].set(0.5).at[1, 0].set(0.9))
     shape = (1, HEIGHT, GRID_WIDTH)
