@@ -1,10 +1,10 @@
 """The entry point of the `ssplat` script: Ctrl-C ends every command with a line on stderr and exit code 130.
 
 jaxlib compiles on a thread of its own. An exception from the signal handler makes the waiting call return at once, and
-the thread goes on with data that the caller then frees, which ends in a segmentation fault (jaxlib 0.10.1). So an
-interrupt that comes while JAX works ends the process from the handler, before that call returns. Any other interrupt
-unwinds the command, flushes its output and leaves without taking the interpreter down: that would free the device
-under such a thread.
+the thread goes on with data that the caller then frees, which ends in a segmentation fault (jaxlib 0.10.1). While jaxlib is
+imported, its C++ code calls Python, and an exception there aborts the process. So an interrupt that comes while JAX
+works ends the process from the handler, without an exception. Any other interrupt unwinds the command, flushes its
+output and leaves without taking the interpreter down: that would free the device under such a thread.
 """
 
 import contextlib
@@ -58,7 +58,7 @@ class _Interrupt:
         self.received = False
 
     def receive(self, number: int, frame: FrameType | None) -> None:
-        if self.received or _is_of_jax(frame):
+        if self.received or _is_inside_jax(frame):
             _leave(EXIT_INTERRUPTED, MESSAGE)
         self.received = True
         # A callback out of compiled code may swallow the exception.
@@ -74,9 +74,13 @@ class _Interrupt:
         sys.__unraisablehook__(unraisable)
 
 
-def _is_of_jax(frame: FrameType | None) -> bool:
-    """True if the interrupted function is one of JAX, which may wait for a compilation."""
-    return frame is not None and str(frame.f_globals.get("__name__")).partition(".")[0] == "jax"
+def _is_inside_jax(frame: FrameType | None) -> bool:
+    """True if the interrupted function, or one that called it, belongs to JAX."""
+    while frame is not None:
+        if str(frame.f_globals.get("__name__")).partition(".")[0] in ("jax", "jaxlib"):
+            return True
+        frame = frame.f_back
+    return False
 
 
 def _leave(code: int, message: str = "") -> NoReturn:

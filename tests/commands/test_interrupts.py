@@ -119,6 +119,31 @@ def test_an_interrupt_in_a_destructor_ends_the_command_at_once():
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "ssplat: interrupted\n")
 
 
+CALLED_BY_JAX = """
+import os, signal, time
+import jax
+from ssplat_jax.commands import main, start
+
+def traced(x):
+    try:
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(5)
+    except KeyboardInterrupt:
+        print("an exception went up into JAX")
+        raise
+    return x
+
+main.main = lambda: exit(main.guarded(lambda: jax.jit(traced)(1.0)))
+start.PATIENCE = 60.0
+start.start()
+"""
+
+
+def test_no_interrupt_goes_up_as_an_exception_into_jax():
+    done = subprocess.run([sys.executable, "-c", CALLED_BY_JAX], capture_output=True, text=True, timeout=TIMEOUT)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "ssplat: interrupted\n")
+
+
 def test_ctrl_c_waits_only_where_there_is_work_to_save():
     with Interrupts(has_work=False) as interrupts:
         with pytest.raises(KeyboardInterrupt):
@@ -195,7 +220,8 @@ def interrupted(arguments: tuple[str, ...], delay: float) -> tuple[int, str, flo
 
 @pytest.mark.slow
 def test_fifty_interrupts_at_random_moments_end_with_130(tmp_path):
-    pytest.importorskip("viser")
+    for package in ("viser", "moderngl"):  # what `view` and `worlds` need
+        pytest.importorskip(package)
     lines, rng = command_lines(tmp_path), np.random.default_rng(int(os.environ.get("SSPLAT_SEED", "0")))
     assert set(lines) == set(COMMANDS)
     longest = dict.fromkeys(lines, 45.0)
