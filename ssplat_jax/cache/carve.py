@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ssplat_jax.cache.project import PixelPairs, project_points, project_rows, row_blocks
+from ssplat_jax.cache.pixel_pairs import PixelPairs, fold_pairs, places_of, project_points, rows_in_sight, rows_of
 from ssplat_jax.cache.state import Tokens, VoxelCache, Witnesses
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.geometry.cameras import Camera
@@ -73,15 +73,14 @@ def carve(
     nearest = _min_of_neighbors(jnp.where(is_witness, log_depths, -jnp.inf))
     weights = jnp.where(is_witness, confidences, 0.0)
     flat = (weights.reshape(-1), log_depths.reshape(-1), nearest.reshape(-1))
-    num_rows, num_blocks = row_blocks(cache)
+    in_sight = rows_in_sight(cache, camera)
 
-    def judge_block(i, revised):
-        block = jax.lax.dynamic_slice_in_dim(revised, i * num_rows, num_rows)
-        pairs = project_rows(replace(cache, confidences=revised), camera, i * num_rows, num_rows)
-        evidence = _evidence(pairs, *flat).reshape(len(camera.viewmats), *block.shape).sum(axis=0)
-        return jax.lax.dynamic_update_slice_in_dim(revised, _revise(block, evidence), i * num_rows, axis=0)
+    def judge_block(revised, pairs: PixelPairs, rows, is_row):
+        before = rows_of(cache.confidences, rows)
+        evidence = _evidence(pairs, *flat).reshape(len(camera.viewmats), *before.shape).sum(axis=0)
+        return revised.at[places_of(rows, is_row, cache)].set(_revise(before, evidence), mode="drop")
 
-    return replace(cache, confidences=jax.lax.fori_loop(0, num_blocks, judge_block, cache.confidences))
+    return replace(cache, confidences=fold_pairs(cache, camera, in_sight, judge_block, cache.confidences))
 
 
 def judge(witnesses: Witnesses, tokens: Tokens, config: StreamConfig) -> Tokens:

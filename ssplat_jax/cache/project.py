@@ -10,27 +10,22 @@ A plain mean would mix background into a fifth of the pixels. A window about the
 the camera, and the bias would feed back through the anchor into the cache. A pivot covers the one pixel that contains
 its projected center.
 
-The cost is proportional to the number of live pivots: rows are dense, so each pass visits blocks of rows up to
-`num_voxels`. Features are read only for the pairs (view, pivot) in a cluster. Sums run in row order, so on the CPU the
-result is the same to the last bit every time.
+Each pass visits the rows in sight (`pixel_pairs`). Features are read only for the pairs (view, pivot) in a cluster.
+Sums run in row order, so on the CPU the result is the same to the last bit every time.
 """
 
+import functools
 import math
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
+from ssplat_jax.cache.pixel_pairs import PixelPairs, fold_pairs, rows_in_sight
 from ssplat_jax.cache.state import VoxelCache
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.pytree import pytree
-
-NEAR = 0.01
-"""Near plane: pivots at or before this camera z (stream units) are invisible, as in the renderer."""
-
-ROWS_PER_BLOCK = 4096
-"""Most cache rows that a pass projects at a time."""
 
 PAIRS_PER_BLOCK = 4096
 """Most pairs whose features are gathered at a time."""
@@ -45,15 +40,6 @@ class ProjectedCache:
     feats: Float[Array, "v hf wf c"]  # F_H
     mask: Bool[Array, "v hf wf"]
     colors: Float[Array, "v hf wf 3"] | None  # averaged like F_H; None without `match_exposure`
-
-
-@pytree
-class PixelPairs:
-    """Pairs (view, point), flattened: the pixel and the depth at which the view sees the point."""
-
-    pixels: Int[Array, " p"]  # flat over all views; the number of pixels if the point is not seen
-    log_depths: Float[Array, " p"]
-    weights: Float[Array, " p"]  # 0 if the point is not seen
 
 
 def project(cache: VoxelCache, camera: Camera, config: StreamConfig, *, axis: str | None = None) -> ProjectedCache:
@@ -77,10 +63,13 @@ def project(cache: VoxelCache, camera: Camera, config: StreamConfig, *, axis: st
     cache, camera = jax.lax.stop_gradient((cache, camera))
     shape = (camera.viewmats.shape[0], camera.height, camera.width)
     with jax.named_scope("project"):
-        fronts = _fold_blocks(cache, camera, config, _min_log_depths, jnp.full((math.prod(shape),), jnp.inf))
-        fronts = _reduce_shards(jax.lax.pmin, fronts, axis)
-        centers = _front_means(cache, camera, config, fronts, axis)
-        sums = _cluster_sums(cache, camera, config, fronts, centers)
+        # Carved pivots must not occlude. Without carving no pivot is below tau: all were accepted at tau or more.
+        min_confidence = config.memory.min_confidence if config.memory.carving else 0.0
+        in_sight = rows_in_sight(cache, camera, min_confidence=min_confidence)
+        fold = functools.partial(fold_pairs, cache, camera, in_sight, min_confidence=min_confidence)
+        fronts = _reduce_shards(jax.lax.pmin, fold(_min_log_depths, jnp.full((math.prod(shape),), jnp.inf)), axis)
+        centers = _front_means(fold, config, fronts, axis)
+        sums = _cluster_sums(fold, cache, len(camera.viewmats), config, fronts, centers)
         weights, squares, offsets, values = _reduce_shards(jax.lax.psum, sums, axis)
     mask = weights > 0
     total = jnp.where(mask, weights, 1.0)
@@ -128,47 +117,28 @@ def _reduce_shards(reduce, partial, axis: str | None):
     return partial if axis is None else reduce(partial, axis)
 
 
-def row_blocks(cache: VoxelCache) -> tuple[int, Int[Array, ""]]:
-    """Number of rows in a block, and number of blocks that cover the occupied rows."""
-    num_rows = math.gcd(cache.capacity, ROWS_PER_BLOCK)
-    return num_rows, (cache.num_voxels + num_rows - 1) // num_rows
-
-
-def _fold_blocks(cache: VoxelCache, camera: Camera, config: StreamConfig, visit, start):
-    """Folds `visit(state, pairs, first_row)` over the blocks of occupied rows."""
-    num_rows, num_blocks = row_blocks(cache)
-    # Carved pivots must not occlude. Without carving no pivot is below tau: all were accepted at tau or more.
-    min_confidence = config.memory.min_confidence if config.memory.carving else 0.0
-
-    def step(i, state):
-        pairs = project_rows(cache, camera, i * num_rows, num_rows, min_confidence=min_confidence)
-        return visit(state, pairs, i * num_rows)
-
-    return jax.lax.fori_loop(0, num_blocks, step, start)
-
-
-def _min_log_depths(fronts, pairs: PixelPairs, first_row):
+def _min_log_depths(fronts, pairs: PixelPairs, rows, is_row):
     """Pass 1: log depth of the nearest pivot in each pixel."""
-    del first_row
+    del rows, is_row
     return fronts.at[pairs.pixels].min(pairs.log_depths, mode="drop")
 
 
-def _front_means(cache, camera, config, fronts, axis):
+def _front_means(fold, config, fronts, axis):
     """Pass 2: mean log depth of each pixel's front window, relative to its nearest pivot."""
     window = math.log(config.history.cluster_ratio)
 
-    def visit(sums, pairs: PixelPairs, first_row):
-        del first_row
+    def visit(sums, pairs: PixelPairs, rows, is_row):
+        del rows, is_row
         offsets = _offsets_from_front(pairs, fronts)
         weights = jnp.where(offsets <= window, pairs.weights, 0.0)
         return _scatter_add(sums, pairs.pixels, (weights, weights * offsets))
 
-    sums = _fold_blocks(cache, camera, config, visit, (jnp.zeros_like(fronts), jnp.zeros_like(fronts)))
+    sums = fold(visit, (jnp.zeros_like(fronts), jnp.zeros_like(fronts)))
     weights, offsets = _reduce_shards(jax.lax.psum, sums, axis)
     return offsets / jnp.where(weights > 0, weights, 1.0)
 
 
-def _cluster_sums(cache, camera, config, fronts, centers):
+def _cluster_sums(fold, cache, num_views, config, fronts, centers):
     """Pass 3: sums over each pixel's re-centered cluster: w, w^2, w times offset from the front, w times values."""
     window = math.log(config.history.cluster_ratio)
     pivots_per_row = cache.feats.shape[1]
@@ -183,21 +153,22 @@ def _cluster_sums(cache, camera, config, fronts, centers):
 
     num_values = jax.eval_shape(values_of, jnp.zeros(1, jnp.int32)).shape[1]
 
-    def visit(state, pairs: PixelPairs, first_row):
+    def visit(state, pairs: PixelPairs, rows, is_row):
+        del is_row
         scalars, sums = state
         offsets = _offsets_from_front(pairs, fronts)
         weights = jnp.where(jnp.abs(offsets - centers[pairs.pixels]) <= window, pairs.weights, 0.0)
         scalars = _scatter_add(scalars, pairs.pixels, (weights, weights * weights, weights * offsets))
-        first_pivot, num_views = first_row * pivots_per_row, len(camera.viewmats)
-        return scalars, _add_values(sums, values_of, pairs.pixels, weights, first_pivot, num_views)
+        pivots = (rows[:, None] * pivots_per_row + jnp.arange(pivots_per_row)).reshape(-1)
+        return scalars, _add_values(sums, values_of, pairs.pixels, weights, pivots, num_views)
 
     zeros = jnp.zeros_like(fronts)
     sums = jnp.zeros((fronts.shape[0], num_values))
-    scalars, sums = _fold_blocks(cache, camera, config, visit, ((zeros, zeros, zeros), sums))
+    scalars, sums = fold(visit, ((zeros, zeros, zeros), sums))
     return *scalars, sums
 
 
-def _add_values(sums, values_of, pixels, weights, first_pivot, num_views):
+def _add_values(sums, values_of, pixels, weights, pivots, num_views):
     """Adds w times value for the pairs of nonzero weight, which are compacted first: they are few."""
     num_pairs = pixels.shape[0]
     block = min(num_pairs, PAIRS_PER_BLOCK)
@@ -211,60 +182,11 @@ def _add_values(sums, values_of, pixels, weights, first_pivot, num_views):
         pairs = jax.lax.dynamic_slice(listed, (i * block,), (block,))
         is_pair = pairs < num_pairs
         pairs = jnp.minimum(pairs, num_pairs - 1)
-        pivots = first_pivot + pairs % (num_pairs // num_views)
-        values = values_of(pivots) * weights[pairs][:, None]
+        values = values_of(pivots[pairs % (num_pairs // num_views)]) * weights[pairs][:, None]
         return sums.at[jnp.where(is_pair, pixels[pairs], sums.shape[0])].add(values, mode="drop")
 
     num_blocks = (jnp.sum(has_weight, dtype=jnp.int32) + block - 1) // block
     return jax.lax.fori_loop(0, num_blocks, add_block, sums)
-
-
-def project_rows(
-    cache: VoxelCache, camera: Camera, first_row, num_rows: int, *, min_confidence: float = 0.0
-) -> PixelPairs:
-    """Pairs of all views with the pivots of a block of rows.
-
-    Args:
-        cache: holds the pivots; dead ones are not seen.
-        camera: a batch of views.
-        first_row: where the block begins (a traced integer).
-        num_rows: length of the block.
-        min_confidence: pivots below it are not seen.
-
-    Returns:
-        `v * num_rows * k` pairs, view-major.
-    """
-
-    def block(x):
-        return jax.lax.dynamic_slice_in_dim(x, first_row, num_rows).reshape(-1, *x.shape[2:])
-
-    k = cache.means.shape[1]
-    counts = jax.lax.dynamic_slice_in_dim(cache.counts, first_row, num_rows)
-    confidences = block(cache.confidences).reshape(-1, k)
-    is_visible = (jnp.arange(k) < counts[:, None]) & (confidences >= min_confidence)
-    return project_points(block(cache.means), jnp.where(is_visible, confidences, 0.0).reshape(-1), camera)
-
-
-def project_points(points: Float[Array, "n 3"], weights: Float[Array, " n"], camera: Camera) -> PixelPairs:
-    """Pairs of all views with `points`, view-major; points of weight 0 or NaN are not seen."""
-    # Written out per coordinate: three rows of products vectorize over the points, a 3 x 3 matrix product does not.
-    px, py, pz = jnp.moveaxis(points, -1, 0)
-    views = camera.viewmats[:, :3, :, None]
-    x, y, z = (views[:, i, 0] * px + views[:, i, 1] * py + views[:, i, 2] * pz + views[:, i, 3] for i in range(3))
-    in_front = (z > NEAR) & jnp.isfinite(z) & (weights > 0)
-    inverse_z = 1.0 / jnp.where(in_front, z, 1.0)
-    Ks = camera.Ks[:, :, :, None]
-    u = Ks[:, 0, 0] * x * inverse_z + Ks[:, 0, 2]
-    v = Ks[:, 1, 1] * y * inverse_z + Ks[:, 1, 2]
-    is_seen = in_front & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-    columns, rows = (jnp.where(is_seen, jnp.floor(c), 0.0).astype(jnp.int32) for c in (u, v))
-    first_pixel = jnp.arange(len(camera.viewmats), dtype=jnp.int32)[:, None] * (camera.height * camera.width)
-    num_pixels = len(camera.viewmats) * camera.height * camera.width
-    return PixelPairs(
-        pixels=jnp.where(is_seen, first_pixel + rows * camera.width + columns, num_pixels).reshape(-1),
-        log_depths=jnp.where(is_seen, jnp.log(jnp.where(is_seen, z, 1.0)), 0.0).reshape(-1),
-        weights=jnp.where(is_seen, weights, 0.0).reshape(-1),
-    )
 
 
 def _offsets_from_front(pairs: PixelPairs, fronts):

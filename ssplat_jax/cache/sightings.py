@@ -6,13 +6,14 @@ its color fits, and how many other pivots share the cell. The cache keeps the su
 the pivot was written. The decoder reads them (`model/evidence.py`).
 """
 
+import functools
 import math
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
-from ssplat_jax.cache.project import PixelPairs, project_rows, row_blocks
+from ssplat_jax.cache.pixel_pairs import PixelPairs, fold_pairs, places_of, rows_in_sight, rows_of
 from ssplat_jax.cache.state import VoxelCache
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.geometry.cameras import Camera
@@ -76,21 +77,22 @@ def add_sightings(
     Limits:
         Cells of weight 0 add nothing. Pivots that no trusted cell sees keep their sightings to the last bit.
     """
-    num_rows, num_blocks = row_blocks(cache)
-    num_cells = cells.weights.shape[0]
+    num_cells, in_sight = cells.weights.shape[0], rows_in_sight(cache, camera)
+    read = functools.partial(_read_cells, cache, camera, cells)
 
-    def crowd(i, sums):
-        pairs, seen = _read_block(cache, camera, cells, i * num_rows, num_rows)
+    def crowd(sums, pairs: PixelPairs, rows, is_row):
+        del is_row
+        seen = read(pairs, rows)
         on = jnp.where(pairs.weights >= config.memory.min_confidence, _on(seen).reshape(-1), 0.0)
         return sums.at[pairs.pixels].add(jnp.stack([on, on * seen.errors.reshape(-1)], axis=-1), mode="drop")
 
-    sums = jax.lax.fori_loop(0, num_blocks, crowd, jnp.zeros((num_cells, 2)))
-    number, errors = (sums if axis is None else jax.lax.psum(sums, axis)).T
-    number = jnp.maximum(number, 1.0)
-    table = jnp.stack([jnp.log(number), errors / number], axis=-1)
+    sums = fold_pairs(cache, camera, in_sight, crowd, jnp.zeros((num_cells, 2)))
+    others, errors = (sums if axis is None else jax.lax.psum(sums, axis)).T
+    others = jnp.maximum(others, 1.0)
+    table = jnp.stack([jnp.log(others), errors / others], axis=-1)
 
-    def add(i, sightings):
-        pairs, seen = _read_block(cache, camera, cells, i * num_rows, num_rows)
+    def add(sightings, pairs: PixelPairs, rows, is_row):
+        seen = read(pairs, rows)
         others = table.at[pairs.pixels].get(mode="fill", fill_value=0.0).reshape(*seen.weights.shape, 2)
         others = kept(others, cache.num_voxels >= 0)
         on = seen.weights * _on(seen)
@@ -106,11 +108,10 @@ def add_sightings(
             on * (seen.errors - others[..., 1]),
             on * seen.sizes,
         )
-        old = jax.lax.dynamic_slice_in_dim(sightings, i * num_rows, num_rows)
-        new = old + jnp.stack([x.sum(axis=0) for x in sums], axis=-1).reshape(old.shape)
-        return jax.lax.dynamic_update_slice_in_dim(sightings, new, i * num_rows, axis=0)
+        new = jnp.stack([x.sum(axis=0) for x in sums], axis=-1).reshape(len(rows), *sightings.shape[1:])
+        return sightings.at[places_of(rows, is_row, cache)].add(new, mode="drop")
 
-    return replace(cache, sightings=jax.lax.fori_loop(0, num_blocks, add, cache.sightings))
+    return replace(cache, sightings=fold_pairs(cache, camera, in_sight, add, cache.sightings))
 
 
 def _on(seen: _Pairs) -> Float[Array, "v n"]:
@@ -118,25 +119,23 @@ def _on(seen: _Pairs) -> Float[Array, "v n"]:
     return jnp.where((seen.weights > 0) & (jnp.abs(seen.offsets) <= 1), 1.0, 0.0)
 
 
-def _read_block(cache: VoxelCache, camera: Camera, cells: Cells, first_row, num_rows: int) -> tuple[PixelPairs, _Pairs]:
-    """Pairs of all views with the pivots of a block of rows, and what their cells hold; zeros for pivots not seen."""
+def _read_cells(cache: VoxelCache, camera: Camera, cells: Cells, pairs: PixelPairs, rows: Int[Array, " n"]) -> _Pairs:
+    """What the cells hold that `pairs`, all views with the pivots of `rows`, fall into; zeros for pivots not seen."""
     num_views, always = len(camera.viewmats), cache.num_voxels >= 0
-    pairs = project_rows(cache, camera, first_row, num_rows)
+    flat = lambda x: rows_of(x, rows).reshape(-1, *x.shape[2:])  # noqa: E731
     table = jnp.concatenate([cells.weights[:, None], cells.log_depths[:, None], cells.colors], axis=1)
     held = table.at[pairs.pixels].get(mode="fill", fill_value=0.0)
     held, log_depths = kept((held.reshape(num_views, -1, 5), pairs.log_depths.reshape(num_views, -1)), always)
-    block = lambda x: jax.lax.dynamic_slice_in_dim(x, first_row, num_rows).reshape(-1, *x.shape[2:])  # noqa: E731
-    rgbs = block(cache.rgbs)
+    rgbs = flat(cache.rgbs)
     colors = kept(rgbs.reshape(len(rgbs), -1, 3).mean(axis=1), always)
     weights = held[..., 0]
     keep = lambda x: jnp.where(weights > 0, x, 0.0)  # noqa: E731
-    seen = _Pairs(
+    return _Pairs(
         weights=weights,
         offsets=keep((log_depths - held[..., 1]) / ON_SURFACE),
         errors=keep(jnp.abs(held[..., 2:] - colors).mean(axis=-1)),
-        sizes=keep(safe_log(block(cache.footprints)) - log_depths + jnp.log(camera.Ks[:, 0, 0])[:, None]),
+        sizes=keep(safe_log(flat(cache.footprints)) - log_depths + jnp.log(camera.Ks[:, 0, 0])[:, None]),
     )
-    return pairs, seen
 
 
 def total_sightings(packed: Float[Array, "*n s"]) -> Float[Array, "*n"]:

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from ssplat_jax.cache.key_views import KeyViews, keep_views, usable
-from ssplat_jax.cache.project import NEAR
+from ssplat_jax.cache.pixel_pairs import NEAR
 from ssplat_jax.cache.residuals import Residuals, add, settle, unpack
 from ssplat_jax.cache.state import VoxelCache
 from ssplat_jax.chunk import Chunk

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from ssplat_jax.cache import coarsen, init_cache, project
+from ssplat_jax.cache import coarsen, init_cache, pixel_pairs, project
 from ssplat_jax.cache import numpy_reference as reference
 from ssplat_jax.pytree import replace
 from tests.cache.projection_scenes import (
@@ -113,7 +113,7 @@ def test_block_size_changes_nothing(monkeypatch):
     cache, camera = scene(7, CAPACITY - 3, 0.1), cameras(8)
     whole = jit_project(cache, camera, CONFIG)
     module = importlib.import_module("ssplat_jax.cache.project")  # the package's `project` is the function
-    monkeypatch.setattr(module, "ROWS_PER_BLOCK", 4)
+    monkeypatch.setattr(pixel_pairs, "ROWS_PER_BLOCK", 4)
     monkeypatch.setattr(module, "PAIRS_PER_BLOCK", 7)
     blocks = jax.jit(lambda *args: project(*args, CONFIG))(cache, camera)
     np.testing.assert_array_equal(whole.mask, blocks.mask)
