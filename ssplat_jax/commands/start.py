@@ -1,10 +1,10 @@
 """The entry point of the `ssplat` script: Ctrl-C ends every command with a line on stderr and exit code 130.
 
 jaxlib compiles on a thread of its own. An exception from the signal handler makes the waiting call return at once, and
-the thread goes on with data that the caller then frees, which ends in a segmentation fault (jaxlib 0.10.1). While jaxlib is
-imported, its C++ code calls Python, and an exception there aborts the process. So an interrupt that comes while JAX
-works ends the process from the handler, without an exception. Any other interrupt unwinds the command, flushes its
-output and leaves without taking the interpreter down: that would free the device under such a thread.
+the thread goes on with data that the caller then frees, which ends in a segmentation fault (jaxlib 0.10.1). While
+jaxlib is imported, its C++ code calls Python, and an exception there aborts the process. So an interrupt that comes
+while JAX works ends the process from the handler, without an exception. Any other interrupt unwinds the command,
+flushes its output and leaves without taking the interpreter down: that would free the device under such a thread.
 """
 
 import contextlib
