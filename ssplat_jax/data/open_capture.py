@@ -77,7 +77,8 @@ def open_capture(path: str | Path, *, size: tuple[int, int] | None = None) -> Ca
         listing = dataclasses.replace(listing, frames=frames if options else listing.frames)
         return capture_of_listing(listing, found.FORMAT, FilePixels(listing.frames), size, written)
     if not exists:
-        got, fix = "nothing of that name", "check the path"
+        got = "a link that leads nowhere" if folder.is_symlink() else "nothing of that name"
+        fix = "check the path"
     elif folder.is_dir() and not any(folder.iterdir()):
         got, fix = "an empty folder", "check the path"
     elif unposed := _unposed(folder):

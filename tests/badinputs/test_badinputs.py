@@ -40,6 +40,7 @@ def test_bad_capture_is_refused_in_one_line(tmp_path, case):
     ("path", "words"),
     [
         ("nowhere", "nothing of that name"),
+        ("loop", "a link that leads nowhere"),
         ("empty", "an empty folder"),
         ("full", "transforms.json, COLMAP"),
         ("file.txt", "none of these"),
@@ -49,6 +50,7 @@ def test_bad_capture_is_refused_in_one_line(tmp_path, case):
 def test_files_and_folders_without_a_capture_are_refused(tmp_path, path, words):
     (tmp_path / "empty").mkdir()
     (tmp_path / "full").mkdir()
+    (tmp_path / "loop").symlink_to("loop")
     (tmp_path / "full" / "a.txt").write_text("a")
     (tmp_path / "file.txt").write_text("a")
     (tmp_path / "other.json").write_text("{}")
