@@ -61,13 +61,21 @@ class RecordedRun:
         turns = np.arccos(np.clip(poses[:, :3, 2] @ camtoworld[:3, 2], -1.0, 1.0))
         return views[int(np.argmin(distances + turns))]
 
+    def middle(self) -> RecordedView | None:
+        """The view in the middle of the capture's order; None without records."""
+        views = self._in_order()
+        return views[len(views) // 2] if views else None
+
     def path(self) -> Float64[np.ndarray, "m 4 4"]:
         """Smooth path through the cameras in the order of the capture."""
-        views = sorted(self.views(), key=lambda view: view.frame)
+        views = self._in_order()
         if not views:
             return np.zeros((0, 4, 4))
         poses, Ks = np.stack([view.camtoworld for view in views]), np.stack([view.K for view in views])
         return camera_path(poses, Ks, PATH_STEPS)[0]
+
+    def _in_order(self) -> list[RecordedView]:
+        return sorted(self.views(), key=lambda view: view.frame)
 
 
 def figures(records: Sequence[ChunkRecord]) -> dict[str, tuple[np.ndarray, np.ndarray]]:

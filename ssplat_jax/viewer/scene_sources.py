@@ -17,7 +17,8 @@ from ssplat_jax.scene_files.formats import read_scene
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.streaming.scene_delta import apply_confidences, apply_delta
 from ssplat_jax.streaming.scene_exposure import at_first_exposure, scene_exposure
-from ssplat_jax.viewer.start_camera import StartCamera, first_camera
+from ssplat_jax.viewer.recorded_run import RecordedRun
+from ssplat_jax.viewer.start_camera import StartCamera, first_camera, turned_to
 from ssplat_jax.viewer.viewed_scene import ViewedScene
 
 
@@ -64,12 +65,23 @@ class SceneFile:
         return self._scene
 
     def start_camera(self) -> StartCamera | None:
-        """The first camera of the run that wrote the file; None if no metrics of a run are beside it."""
+        """The camera in the middle of the run that wrote the file; None if no metrics of a run are beside it.
+
+        Around the first camera a scene often ends: no other view has seen what lies behind. Runs of earlier versions
+        recorded no cameras, and have their first one alone.
+        """
         try:
             fields = json.loads(self.folder.metrics.read_bytes())["stream_frame"]
-            return first_camera(StreamFrame.from_dict(fields))
+            frame = StreamFrame.from_dict(fields)
         except (OSError, ValueError, TypeError, LookupError):  # another file of that name must not prevent viewing
             return None
+        run, first = RecordedRun(self.folder), first_camera(frame)
+        run.refresh()
+        if (middle := run.middle()) is None:
+            return first
+        pose = middle.camtoworld.copy()
+        pose[:3, 3] -= frame.offset
+        return turned_to(first, pose)
 
 
 class _Sum:

@@ -25,6 +25,13 @@ def first_camera(frame: StreamFrame) -> StartCamera:
     return StartCamera(position, position + depth * frame.rotation[:, 2], up=-frame.rotation[:, 1])
 
 
+def turned_to(start: StartCamera, camtoworld: Float64[np.ndarray, "4 4"]) -> StartCamera:
+    """A camera at a pose (OpenCV axes, scene units) that looks as far as `start` does."""
+    distance = np.linalg.norm(start.look_at - start.position)
+    position = camtoworld[:3, 3]
+    return StartCamera(position, position + distance * camtoworld[:3, 2], up=-camtoworld[:3, 1])
+
+
 def camera_before(scene: Gaussians) -> StartCamera | None:
     """A camera that sees a whole scene in which y points down and z forward; None if the scene is empty."""
     means = np.asarray(scene.means, np.float64)[np.asarray(scene.opacities) > 0]

@@ -14,6 +14,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import ssplat_jax as ss
+from ssplat_jax.checkpoint.chunk_records import ChunkRecord, RecordedView, save_chunk_record
 from ssplat_jax.checkpoint.delta_files import load_delta, save_delta
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.errors import InputError, StorageError
@@ -223,6 +224,25 @@ def test_viewing_starts_at_the_first_camera_of_the_run(tmp_path):
     for other in ("", "{", "[]", "{}", '{"stream_frame": null}', '{"stream_frame": {"rotation": 1}}', "\x00"):
         metrics.write_text(other)
         assert source.start_camera() is None
+
+
+def test_viewing_a_finished_run_starts_in_the_middle_of_its_path(tmp_path):
+    ss.save_ply(tmp_path / "scene.ply", scene(5))
+    far = frame((1e6, 2.0, 3.0))
+    assert far.offset[0] > 1e5
+    (tmp_path / "metrics.json").write_text(json.dumps({"stream_frame": far.to_dict()}))
+    rng, folder = np.random.default_rng(0), RunFolder(tmp_path)
+    poses = {number: np.eye(4) for number in (4, 0, 3, 1, 2)}  # in the order of streaming
+    for number, pose in poses.items():
+        pose[:3, :3] = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        pose[:3, 3] = [1e6 + number, 5.0, 6.0]
+    views = [RecordedView(number, pose, np.eye(3), np.ones(3), b"") for number, pose in poses.items()]
+    save_chunk_record(folder.chunk_record(5), ChunkRecord(5, (32, 24), tuple(views), 0.1, 0.5, 5, None))
+    camera = open_source(tmp_path).start_camera()
+    np.testing.assert_allclose(camera.position, np.array([1e6 + 2, 5.0, 6.0]) - far.offset)
+    distance = np.linalg.norm(first_camera(far).look_at - first_camera(far).position)
+    np.testing.assert_allclose(camera.look_at, camera.position + distance * poses[2][:3, 2])
+    np.testing.assert_allclose(camera.up, -poses[2][:3, 1])
 
 
 def test_a_browser_starts_at_the_first_camera_of_the_stream():
