@@ -47,7 +47,7 @@ START = "from ssplat_jax.commands.start import start; start()"
 
 REGISTERED = 0.9  # share of the chosen frames that get a pose
 PAGE_DB = 30.0  # of the page against our renderer at the browser's camera, whose principal point is in the middle
-PHOTO_DB = {"room": 28.0, "redkitchen": 17.0}  # of our renderer against the middle frame, at which browsers start
+PHOTO_DB = {"room": 28.0, "redkitchen": 18.0}  # of our renderer against the middle frame, at which browsers start
 WHITE_SHARE = 0.02  # of the page: holes
 LEAST_DETAIL = 0.4  # of the page against the video, in the scale below
 DETAIL_PIXELS = 3.0
@@ -137,10 +137,10 @@ def settled(page: Page) -> np.ndarray:
 @contextlib.contextmanager
 def viewed(command: list[str], folder):
     """A viewer's address while it runs; Ctrl-C ends it afterwards."""
+    code = f"import signal; signal.signal(signal.SIGINT, signal.default_int_handler); {START}"  # a background job ignores it
     process = subprocess.Popen(
-        [sys.executable, "-c", START, *command], cwd=folder, env=ENVIRONMENT, stdout=subprocess.PIPE, text=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
-    )  # fmt: skip
+        [sys.executable, "-c", code, *command], cwd=folder, env=ENVIRONMENT, stdout=subprocess.PIPE, text=True
+    )
     try:
         assert process.stdout is not None
         line = next(line for line in process.stdout if "http://" in line)
