@@ -137,7 +137,8 @@ def settled(page: Page) -> np.ndarray:
 @contextlib.contextmanager
 def viewed(command: list[str], folder):
     """A viewer's address while it runs; Ctrl-C ends it afterwards."""
-    code = f"import signal; signal.signal(signal.SIGINT, signal.default_int_handler); {START}"  # a background job ignores it
+    # A job in the background would ignore the signal.
+    code = f"import signal; signal.signal(signal.SIGINT, signal.default_int_handler); {START}"
     process = subprocess.Popen(
         [sys.executable, "-c", code, *command], cwd=folder, env=ENVIRONMENT, stdout=subprocess.PIPE, text=True
     )
