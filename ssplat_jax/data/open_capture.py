@@ -4,6 +4,7 @@ Opening a capture reads poses, intrinsics and image headers; images are decoded 
 """
 
 import dataclasses
+import shlex
 from pathlib import Path
 
 from ssplat_jax.data.capture import MAX_SIDE, Capture, capture_of_listing
@@ -38,7 +39,9 @@ READERS = (  # the first one that matches reads the capture
     realestate10k,
     splat_cameras,
 )
-IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".heic"})  # a folder of these lacks only its poses
+UNREADABLE_SUFFIXES = frozenset({".heic", ".heif"})  # what phones write and Pillow does not read
+IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp"}) | UNREADABLE_SUFFIXES
+"""Images in a folder of these lack only their poses."""
 VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".mkv", ".webm"})
 
 
@@ -84,7 +87,7 @@ def open_capture(path: str | Path, *, size: tuple[int, int] | None = None) -> Ca
     elif unposed := _unposed(folder):
         kind, source = unposed
         got = f"none of these, but {kind} without camera poses"
-        example = f"ssplat poses {source} --out {source.stem or 'my'}_capture"
+        example = shlex.join(["ssplat", "poses", str(source), "--out", f"{source.stem or 'my'}_capture"])
         fix = f"estimate the poses first: {example} (COLMAP by pycolmap), and give the folder that it writes"
     else:
         got, fix = "none of these", f"see --help of `ssplat inspect` for their files, or try {PROCEDURAL}:room"

@@ -8,12 +8,11 @@ from pathlib import Path
 from PIL import Image, ImageOps
 
 from ssplat_jax.data.images import ORIENTATION, UPRIGHT, image_size
-from ssplat_jax.data.open_capture import IMAGE_SUFFIXES
+from ssplat_jax.data.open_capture import IMAGE_SUFFIXES, UNREADABLE_SUFFIXES
 from ssplat_jax.errors import echo, refusal
 
 JPEG_QUALITY = 95
-UNREADABLE = frozenset({".heic", ".heif"})  # what phones write and Pillow does not read
-SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp"})
+SUFFIXES = IMAGE_SUFFIXES - UNREADABLE_SUFFIXES
 
 
 def list_photos(folder: Path) -> list[Path]:
@@ -27,11 +26,11 @@ def list_photos(folder: Path) -> list[Path]:
         photos = [file for file in files if file.suffix.lower() in SUFFIXES and file.is_file()]
         if len(photos) > 1:
             return photos
-        phone = [file for file in files if file.suffix.lower() in UNREADABLE]
+        phone = [file for file in files if file.suffix.lower() in UNREADABLE_SUFFIXES]
         if phone:
             fix = "convert them to JPEG first (the phone's camera settings call JPEG `most compatible`)"
             raise refusal(str(place), wanted="JPEG or PNG photos", got=f"{len(phone)} HEIC files", fix=fix)
-    kinds = ", ".join(sorted(SUFFIXES | IMAGE_SUFFIXES - UNREADABLE))
+    kinds = ", ".join(sorted(SUFFIXES))
     fix = f"give the folder that holds them ({kinds}), or a video file"
     raise refusal(str(folder), wanted="a folder of photos", got="fewer than two images", fix=fix)
 

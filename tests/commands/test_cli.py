@@ -6,6 +6,7 @@ import hashlib
 import importlib.metadata
 import json
 import re
+import shlex
 import shutil
 import signal
 import subprocess
@@ -402,22 +403,26 @@ def test_imported_weights_stream_a_capture(name, tmp_path, capsys):
     assert load_ply(out / "scene.ply").num_gaussians > 0
 
 
-@pytest.mark.parametrize(("name", "kind"), [("a.jpg", "images"), ("images/a.PNG", "images"), ("clip.mp4", "a video")])
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [("a.jpg", "images"), ("images/a.PNG", "images"), ("scan.TIF", "images"), ("my clip.mp4", "a video")],
+)
 def test_images_without_poses_are_told_how_to_get_them(name, kind, tmp_path, capsys, monkeypatch):
-    file = tmp_path / name
-    file.parent.mkdir(exist_ok=True)
+    folder = tmp_path / "my trip"
+    file = folder / name
+    file.parent.mkdir(parents=True)
     file.write_bytes(b"")
-    paths = [tmp_path] if kind == "images" else [tmp_path, file]
-    for path in paths:
-        assert run("inspect", str(path)) == 2
-        message = capsys.readouterr().err
-        assert f"but {kind} without camera poses" in message and message.count("\n") == 1
-        source = file if kind == "a video" else path
-        words = re.search(rf"ssplat (poses {re.escape(str(source))} --out \S+)", message)
+    for path in [folder] if kind == "images" else [folder, file]:
+        for command in (("inspect",), ("run", "--out", "x"), ("eval", "--out", "x")):
+            assert run(command[0], str(path), *command[1:]) == 2
+            message = capsys.readouterr().err
+            assert f"but {kind} without camera poses" in message and message.count("\n") == 1
+        words = re.search(r"ssplat (poses .+ --out .+) \(", message)
         assert words is not None
-        # The command that is named is one: it gets as far as the file, which is no picture.
+        # The command that is named is one, spaces or not: it gets as far as the file, which is no picture.
         monkeypatch.chdir(tmp_path)
-        assert run(*words[1].split(), "--quiet") == 2
+        assert run(*shlex.split(words[1]), "--quiet") == 2
+        source = file if kind == "a video" else path
         assert str(source) in capsys.readouterr().err and not any(tmp_path.glob("*_capture"))
 
 
