@@ -95,6 +95,10 @@ def render(
         raise InputError(f"render: max_pairs must be a whole number of at least 1, got {echo(max_pairs)}.")
     if not (_is_whole(tile) and tile in TILES):
         raise InputError(f"render: tile must be 8 or 16 pixels, got {echo(tile)}.")
+    # NumPy's integers, as of an image's shape, count as whole numbers, but have no `bit_length`.
+    tile, max_pairs = int(tile), None if max_pairs is None else int(max_pairs)
+    camera = replace(camera, width=int(camera.width), height=int(camera.height))
+    inputs = replace(inputs, camera=camera)
     # Inside jit every result is traced, even that of arrays which the function closes over.
     arrays = (*jax.tree.leaves(inputs), jnp.zeros(()))
     is_concrete = max_pairs is None and not any(isinstance(x, Tracer) for x in arrays)
@@ -166,29 +170,49 @@ def round_up(num_pairs: int) -> int:
 def _check(inputs: RenderInputs) -> None:
     """Refuses arrays of the wrong shape, and what is not an array."""
     camera, features = inputs.camera, inputs.features
+    for name, held in (("gaussians", Gaussians), ("camera", Camera), ("captured", Camera)):
+        given = getattr(inputs, name)
+        if not isinstance(given, held) and not (name == "captured" and given is None):
+            raise InputError(f"render: {name} must be {held.__name__}, got {type(given).__name__}.")
     check_gaussians(inputs.gaussians, "render")
-    arrays = {name: getattr(inputs, name) for name in ("features", "distortion", "exposures")}
-    for name, array in {"viewmats": camera.viewmats, "Ks": camera.Ks, **arrays}.items():
-        if array is not None and not hasattr(array, "shape"):
-            raise InputError(f"render: {name} must be an array, got {echo(array)}; wrap it in jnp.asarray.")
+    for name in ("features", "distortion", "exposures"):
+        if getattr(inputs, name) is not None:
+            _check_array(name, getattr(inputs, name))
+    _check_camera("camera", camera)
+    if inputs.captured is not None:
+        _check_camera("captured camera", inputs.captured)
     batch, rows = camera.viewmats.shape[:-2], inputs.gaussians.num_gaussians
-    if camera.viewmats.shape[-2:] != (4, 4) or camera.Ks.shape != (*batch, 3, 3):
-        raise InputError(
-            "render: the camera must have viewmats [*b 4 4] and Ks [*b 3 3], "
-            f"got {list(camera.viewmats.shape)} and {list(camera.Ks.shape)}."
-        )
     if 0 in batch:
         raise InputError(f"render: wanted at least one camera, got a batch of shape {list(batch)}.")
     if inputs.gaussians.sh.shape[1] not in (1, 4, 9, 16):
         raise InputError(f"render: sh must hold 1, 4, 9 or 16 terms a Gaussian, got {inputs.gaussians.sh.shape[1]}.")
-    if not all(_is_whole(side) and side >= 1 for side in (camera.width, camera.height)):
-        size = f"{echo(camera.width)}x{echo(camera.height)}"
-        raise InputError(f"render: the image must have whole numbers of pixels, at least 1x1, got {size}.")
     if features is not None and (features.ndim != 2 or features.shape[0] != rows):
         raise InputError(f"render: features must be [{rows} c], got {list(features.shape)}.")
     for name, array, tail in (("distortion", inputs.distortion, (5,)), ("exposures", inputs.exposures, (3, 4))):
         if array is not None and array.shape != (*batch, *tail):
             raise InputError(f"render: {name} must be {[*batch, *tail]}, got {list(array.shape)}.")
+
+
+def _check_camera(name: str, camera: Camera) -> None:
+    """Refuses cameras whose arrays have the wrong shape, and sizes that are no numbers of pixels."""
+    _check_array("viewmats", camera.viewmats)
+    _check_array("Ks", camera.Ks)
+    poses, intrinsics = camera.viewmats.shape, camera.Ks.shape
+    if poses[-2:] != (4, 4) or intrinsics != (*poses[:-2], 3, 3):
+        raise InputError(
+            f"render: the {name} must have viewmats [*b 4 4] and Ks [*b 3 3], got {list(poses)} and {list(intrinsics)}."
+        )
+    if not all(_is_whole(side) and side >= 1 for side in (camera.width, camera.height)):
+        size = f"{echo(camera.width)}x{echo(camera.height)}"
+        raise InputError(
+            f"render: the image of the {name} must have whole numbers of pixels, at least 1x1, got {size}."
+        )
+
+
+def _check_array(name: str, array: object) -> None:
+    """Refuses what is not an array."""
+    if not hasattr(array, "shape"):
+        raise InputError(f"render: {name} must be an array, got {echo(array)}; wrap it in jnp.asarray.")
 
 
 def _is_whole(number: object) -> bool:

@@ -24,9 +24,12 @@ NAMED = {
     "opacities=jnp.zeros(8)": "opacities of the Gaussians must be [9], got [8]",
     "sh=jnp.zeros((9, 3))": "sh of the Gaussians must be [9 k 3], got [9, 3]",
     "means=None": "means must be an array, got NoneType",
-    "width=80.5": "whole numbers of pixels, at least 1x1, got 80.5x64",
-    "Ks=jnp.eye(4)": "viewmats [*b 4 4] and Ks [*b 3 3], got [4, 4] and [4, 4]",
+    "width=80.5": "the image of the camera must have whole numbers of pixels, at least 1x1, got 80.5x64",
+    "Ks=jnp.eye(4)": "the camera must have viewmats [*b 4 4] and Ks [*b 3 3], got [4, 4] and [4, 4]",
     "Ks=[1, 2]": "Ks must be an array, got [1, 2]",
+    "viewmats=None": "viewmats must be an array, got None",
+    "captured=[1, 2]": "captured must be Camera, got list",
+    "captured=ss.Camera(jnp.eye(4), jnp.eye(4), 80, 64)": "the captured camera must have viewmats [*b 4 4] and Ks",
     "features=[1, 2]": "features must be an array, got [1, 2]",
     "features=jnp.zeros((8, 2))": "features must be [9 c], got [8, 2]",
     "tile=7": "tile must be 8 or 16 pixels, got 7",
@@ -35,9 +38,12 @@ NAMED = {
 }
 """The message of `render` for each wrong argument."""
 
+TAKEN = ("width=np.int64(80)", "tile=np.int32(8)", "max_pairs=np.uint32(64)")
+"""Arguments that are right: whole numbers of NumPy are whole numbers."""
+
 SCRIPT = """
 import dataclasses, sys
-import jax, jax.numpy as jnp
+import jax, jax.numpy as jnp, numpy as np
 import ssplat_jax as ss
 
 def draw(jit, **wrong):
@@ -57,16 +63,17 @@ for jit in (False, True):
         except ss.InputError as error:
             print(error)
         else:
-            print("nothing")
+            print("drawn")
 """
 
 
 def test_render_names_each_wrong_argument_inside_and_outside_jit():
     quiet = {**os.environ, "TF_CPP_MIN_LOG_LEVEL": "3"}
-    done = subprocess.run([sys.executable, "-c", SCRIPT, *NAMED], capture_output=True, text=True, env=quiet)
+    done = subprocess.run([sys.executable, "-c", SCRIPT, *NAMED, *TAKEN], capture_output=True, text=True, env=quiet)
     assert done.returncode == 0, done.stderr
-    for (case, wanted), line in zip([*NAMED.items()] * 2, done.stdout.splitlines(), strict=True):
-        assert line.startswith("render: ") and wanted in line, (case, line)
+    cases = [*((case, f"render: {words}") for case, words in NAMED.items()), *((case, "drawn") for case in TAKEN)]
+    for (case, wanted), line in zip(cases * 2, done.stdout.splitlines(), strict=True):
+        assert line.startswith(wanted), (case, line)
 
 
 def wrong(tree, **leaves):
