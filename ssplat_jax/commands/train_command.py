@@ -3,11 +3,14 @@
 import dataclasses
 import sys
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from ssplat_jax.commands.options import ConfigChanges, LpipsHeads, QuietOption, apply_changes, load_lpips_weights
 from ssplat_jax.config import preset
 from ssplat_jax.errors import InputError, require_positive
+
+if TYPE_CHECKING:
+    from ssplat_jax.console import Reporter
 
 MINUTES = {"tiny": 77, "stream": 15, "evidence": 15}
 """Time of recipes on two cores (docs/model_card.md)."""
@@ -95,9 +98,7 @@ class Train:
             "rendering_loss": "MSE + 0.05 LPIPS" if lpips_weights else "MSE + image gradients",
         }
         save_weights(self.out / "weights.npz", result.state.ema, config, provenance)
-        print(f"wrote {self.out}/weights.npz after {result.step} steps")
-        reporter.say(f"next: `ssplat run CAPTURE --weights {self.out}/weights.npz --out runs/mine` streams with them")
-        return 0
+        return self._end(result.step, reporter)
 
     def _run_evidence(self) -> int:
         """Trains the evidence head on whole streams. It takes minutes, so it starts anew after an interrupt."""
@@ -142,7 +143,12 @@ class Train:
         start = {"init_weights": self.init_weights.name, "before": describe_weights(str(self.init_weights)).provenance}
         provenance = {"recipe": dataclasses.asdict(recipe), "steps": recipe.steps, **start, **facts}
         save_weights(self.out / "weights.npz", trained, config, provenance)
-        print(f"wrote {self.out}/weights.npz after {recipe.steps} steps")
+        return self._end(recipe.steps, reporter)
+
+    def _end(self, num_steps: int, reporter: "Reporter") -> int:
+        """Says what was written and what to do next; returns the exit code of success."""
+        print(f"wrote {self.out}/weights.npz after {num_steps} steps")
+        reporter.say(f"next: `ssplat run CAPTURE --weights {self.out}/weights.npz --out runs/mine` streams with them")
         return 0
 
     def _opened(self, config, recipe):
