@@ -198,7 +198,7 @@ def open_source(path: Path, *, one_exposure: bool = False) -> Source:
         return GrowingScene(folder, one_exposure=one_exposure)
     if not file.is_file():
         raise InputError(
-            f"{path}: wanted a .ply, or the folder of an `ssplat run` that has ended or writes --deltas, found neither;"
-            " wait for its scene, or check the path."
+            f"{path}: wanted a scene file, or the folder of an `ssplat run` that has ended or writes --deltas, found"
+            " neither; wait for its scene, or check the path."
         )
     return SceneFile(file, one_exposure=one_exposure)

@@ -257,7 +257,7 @@ def test_a_browser_starts_at_the_first_camera_of_the_stream():
 @pytest.mark.parametrize("name", ["nowhere", "empty", "nowhere.ply"])
 def test_a_path_without_a_scene_is_refused(name, tmp_path):
     (tmp_path / "empty").mkdir()
-    with pytest.raises(InputError, match=r"wanted a \.ply, or the folder"):
+    with pytest.raises(InputError, match=r"wanted a scene file, or the folder"):
         open_source(tmp_path / name)
 
 
