@@ -213,6 +213,16 @@ def test_inspect_prints_json(capsys):
     assert facts["num_frames"] == 12 and facts["near"] < facts["far"]
 
 
+def test_inspect_prints_units_and_shows_that_it_works(capsys):
+    assert run("inspect", "procedural:orbit?frames=12&size=64x48") == 0
+    captured = capsys.readouterr()
+    facts = {line.split()[0]: line for line in captured.out.splitlines()}
+    for name in ("near", "far"):
+        assert facts[name].endswith(" stream units (capture units times scene_scale)")
+    assert facts["median_depth"].endswith(" capture units") and facts["num_depth_maps"].split()[1] == "12"
+    assert "matching" in captured.err and "12/12" in captured.err
+
+
 @pytest.mark.parametrize(
     ("change", "field", "value"),
     [
@@ -258,7 +268,11 @@ def test_run_stops_resumes_and_exports(tmp_path, capsys):
     metrics = json.loads((out / "metrics.json").read_text())
     assert metrics["cache"]["num_chunks"] == 3 and list(metrics["exposures"]) == [str(i) for i in range(12)]
     assert metrics["peak_memory_bytes"] >= metrics["step_memory_bytes"] > 0
+    capsys.readouterr()
     assert run("export", str(out), "--to", str(tmp_path / "again.ply")) == 0
+    # Rows of padding, which fill the arrays up to a power of two, are no Gaussians that were left out.
+    counts = [int(word) for word in re.findall(r"\d+", capsys.readouterr().out.split("again.ply")[1])]
+    assert sum(counts) == metrics["cache"]["decoded"]
     assert (tmp_path / "again.ply").read_bytes() == (out / "scene.ply").read_bytes()
     other = tmp_path / "other.npz"
     params, config = load_params("tiny"), preset("tiny")

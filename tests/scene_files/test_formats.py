@@ -20,6 +20,7 @@ from ssplat_jax.errors import InputError
 from ssplat_jax.gaussians import SH_C0, Gaussians
 from ssplat_jax.pytree import replace
 from ssplat_jax.rasterizer import render
+from ssplat_jax.scene_files.compressed_ply import is_compressed_ply
 from ssplat_jax.scene_files.formats import FORMATS, read_scene, save_gaussians
 from ssplat_jax.scene_files.ply import save_ply
 from tests.commands.test_cli import run
@@ -172,6 +173,8 @@ def test_any_format_is_exported_from_any_other(tmp_path, capsys):
     for source, to in itertools.pairwise(names):
         assert run("export", str(tmp_path / source), "--to", str(tmp_path / to)) == 0
         assert "100 Gaussians" in capsys.readouterr().out
+    # Readers go by the header, so an ordinary file of that name would be read too.
+    assert [name for name in names if is_compressed_ply(tmp_path / name)] == ["4.compressed.ply"]
     assert_draws(ss.load_scene(tmp_path / "7.ply"), gaussians, 30.0)  # the losses of four formats add up
 
 

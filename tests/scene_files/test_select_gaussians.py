@@ -149,6 +149,17 @@ def test_export_prints_what_it_left_out(tmp_path, capsys):
     assert "412 Gaussians\n" in capsys.readouterr().out
 
 
+def test_export_says_that_what_is_not_written_has_no_effect(tmp_path, capsys, monkeypatch):
+    """As a file of another maker may have it: ours hold visible Gaussians alone."""
+    with monkeypatch.context() as patch:
+        patch.setattr("ssplat_jax.scene_files.export_rows.MIN_OPACITY", 0.0)
+        faint = sheet(1, 7, [0, 0, 9.0])
+        faint = replace(faint, opacities=jnp.full(7, 0.001))
+        save_ply(tmp_path / "scene.ply", joined(sheet(5, 5, [0, 0, 0]), faint))
+    assert run("export", str(tmp_path / "scene.ply"), "--to", str(tmp_path / "less.ply")) == 0
+    assert "25 Gaussians (7 more have no visible effect and were not written)\n" in capsys.readouterr().out
+
+
 def test_no_splats_at_all_is_bad_usage(tmp_path, capsys):
     save_ply(tmp_path / "scene.ply", scene(0))
     to = tmp_path / "none.ply"
