@@ -27,6 +27,8 @@ from ssplat_jax.checkpoint.weights import load_params, load_weights, save_weight
 from ssplat_jax.commands.main import COMMANDS, guarded, main
 from ssplat_jax.commands.options import apply_changes
 from ssplat_jax.config import StreamConfig, preset
+from ssplat_jax.data import capture_summary
+from ssplat_jax.data.capture_summary import summarize
 from ssplat_jax.evaluation import latency
 from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.scene_files.ply import load_ply, save_ply
@@ -213,7 +215,9 @@ def test_inspect_prints_json(capsys):
     assert facts["num_frames"] == 12 and facts["near"] < facts["far"]
 
 
-def test_inspect_prints_units_and_shows_that_it_works(capsys):
+def test_inspect_prints_units_and_shows_that_it_works(capsys, monkeypatch):
+    given = []
+    monkeypatch.setattr(capture_summary, "summarize", lambda *options: given.append(options) or summarize(*options))
     assert run("inspect", "procedural:orbit?frames=12&size=64x48") == 0
     captured = capsys.readouterr()
     facts = {line.split()[0]: line for line in captured.out.splitlines()}
@@ -221,6 +225,8 @@ def test_inspect_prints_units_and_shows_that_it_works(capsys):
         assert facts[name].endswith(" stream units (capture units times scene_scale)")
     assert facts["median_depth"].endswith(" capture units") and facts["num_depth_maps"].split()[1] == "12"
     assert "matching" in captured.err and "12/12" in captured.err
+    ((_, _, advance),) = given  # without it the bar would stand still until all is done
+    assert callable(advance)
 
 
 @pytest.mark.parametrize(
