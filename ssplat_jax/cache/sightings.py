@@ -120,7 +120,7 @@ def _on(seen: _Pairs) -> Float[Array, "v n"]:
 
 
 def _read_cells(cache: VoxelCache, camera: Camera, cells: Cells, pairs: PixelPairs, rows: Int[Array, " n"]) -> _Pairs:
-    """What the cells hold that `pairs`, all views with the pivots of `rows`, fall into; zeros for pivots not seen."""
+    """Contents of the cells into which `pairs` fall, compared with the pivots of `rows`; zeros for pivots not seen."""
     num_views, always = len(camera.viewmats), cache.num_voxels >= 0
     flat = lambda x: rows_of(x, rows).reshape(-1, *x.shape[2:])  # noqa: E731
     table = jnp.concatenate([cells.weights[:, None], cells.log_depths[:, None], cells.colors], axis=1)

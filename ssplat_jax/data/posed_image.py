@@ -108,7 +108,7 @@ def pose_from_quat(wxyz: object, translation: object, where: str) -> Float64[np.
         InputError: a value is not finite, or the quaternion is shorter than 1e-6.
     """
     quat, translation = np.asarray(wxyz, np.float64), np.asarray(translation, np.float64)
-    length = float(np.linalg.norm(quat))
+    length = math.hypot(*quat)  # does not overflow before the length does
     if not (np.isfinite(quat).all() and np.isfinite(translation).all()):
         raise refusal(where, wanted="finite numbers", got="NaN or infinity", fix="drop the frame (tracking was lost)")
     if not 1e-6 <= length < math.inf:

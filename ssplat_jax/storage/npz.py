@@ -10,7 +10,9 @@
 import hashlib
 import io
 import json
+import struct
 import zipfile
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +25,12 @@ from ssplat_jax.storage.atomic import write_atomic
 SCHEMA = 2  # version of the layout above
 _HEADER = "header"  # name of the JSON member
 _DIGEST_LENGTH = 64  # hex digits of a sha256
+
+# A damaged archive surfaces as almost any of these.
+_DAMAGE_ERRORS = (
+    *(ValueError, LookupError, TypeError, OSError, EOFError, RuntimeError),
+    *(struct.error, zlib.error, zipfile.BadZipFile),
+)
 
 
 def save_arrays(
@@ -62,8 +70,7 @@ def load_arrays(path: Path, kind: str) -> tuple[dict[str, np.ndarray], dict[str,
         raise StorageError(f"{path}: cannot be read ({error.strerror or error}).") from error
     try:
         arrays, facts = _parse(contents)
-    # A damaged archive surfaces as almost anything: zlib, struct, UTF-8, JSON or key errors.
-    except (ValueError, KeyError, TypeError, OSError, EOFError, zipfile.BadZipFile) as error:
+    except _DAMAGE_ERRORS as error:
         raise StorageError(
             f"{path}: the file is corrupt ({error}); restore it from a backup or create it again."
         ) from error

@@ -70,12 +70,17 @@ _LITERALS = (
 
 
 def parse_pickle(file: io.BufferedReader | io.BytesIO) -> tuple[Any, dict[str, Storage]]:
-    """Returns the value of the next pickle in `file` and the storages that it refers to."""
+    """Returns the value of the next pickle in `file` and the storages that it refers to.
+
+    Raises:
+        ValueError: the pickle is cut off or longer than `MAX_PICKLE_BYTES`.
+    """
     reader, start = _Reader(), file.tell()
-    for opcode, argument, position in pickletools.genops(file):
-        if (position or 0) - start > MAX_PICKLE_BYTES:
-            raise ValueError("the table of tensors is too long")
+    # Read from memory: a damaged length would make a file allocate gigabytes before it finds its end.
+    pickled = io.BytesIO(file.read(MAX_PICKLE_BYTES))
+    for opcode, argument, _ in pickletools.genops(pickled):
         reader.step(opcode.name, argument)
+    file.seek(start + pickled.tell())
     return reader.stack.pop(), reader.storages
 
 

@@ -6,15 +6,21 @@ a few, since the tests of readers and scene files damage a hundred or more each.
 
 import contextlib
 import os
+import pickle
 import random
 import resource
 import signal
 import time
 import warnings
 
+import numpy as np
 import pytest
 
+from ssplat_jax.data.posed_image import pose_from_quat
+from ssplat_jax.data.readers import tum
 from ssplat_jax.errors import InputError, StorageError
+from ssplat_jax.storage.npz import load_arrays, save_arrays
+from ssplat_jax.storage.torch_pickle import parse_pickle
 from tests.badinputs.cases import mutant
 from tests.fuzzing.parsers import PARSERS
 
@@ -82,3 +88,46 @@ def test_the_bounds_hold():
             time.sleep(0.01)
     with pytest.raises(MemoryError), bounded():
         bytearray(2 * MAX_BYTES)
+
+
+def test_a_quaternion_of_huge_numbers_is_its_direction():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        pose = pose_from_quat([1e300, 0, 0, 1e300], [1, 2, 3], "here")
+    np.testing.assert_allclose(pose[:3, :3], [[0, -1, 0], [1, 0, 0], [0, 0, 1]], atol=1e-12)
+
+
+@pytest.mark.parametrize("bad", [np.inf, np.nan])
+@pytest.mark.parametrize("column", [1, 5])
+def test_poses_are_not_mixed_with_what_is_none(bad, column):
+    rows = np.array([[0.0, 0, 0, 0, 0, 0, 0, 1], [0.05, 0, 0, 0, 0, 0, 0, 1]])
+    rows[1, column] = bad
+    with warnings.catch_warnings(), pytest.raises(InputError, match="here: wanted finite numbers"):
+        warnings.simplefilter("error")
+        tum._pose_at(0.01, rows, "here")
+
+
+def test_an_archive_of_an_unknown_zip_version_is_damaged(tmp_path):
+    path = tmp_path / "a.npz"
+    save_arrays(path, {"x": np.zeros(3)}, "test 1", {})
+    contents = bytearray(path.read_bytes())
+    entry = contents.index(b"PK\x01\x02")
+    contents[entry + 6] = 211  # version needed to read the entry: 21.1
+    path.write_bytes(contents)
+    with pytest.raises(StorageError, match="corrupt"):
+        load_arrays(path, "test 1")
+
+
+def test_a_pickle_that_says_it_is_huge_takes_no_memory(tmp_path):
+    path = tmp_path / "a.pkl"
+    path.write_bytes(b"\x80\x02X" + (2**32 - 16).to_bytes(4, "little") + b"short")
+    with path.open("rb") as file, bounded(), pytest.raises(ValueError, match="remain"):
+        parse_pickle(file)
+
+
+def test_pickles_follow_each_other_in_a_file(tmp_path):
+    path = tmp_path / "a.pkl"
+    path.write_bytes(pickle.dumps(7, protocol=2) + pickle.dumps({"a": 8}, protocol=2) + b"rest")
+    with path.open("rb") as file:
+        assert [parse_pickle(file)[0] for _ in range(2)] == [7, {"a": 8}]
+        assert file.read() == b"rest"

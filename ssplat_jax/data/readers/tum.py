@@ -10,6 +10,7 @@ cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats. Both have the center of 
 added.
 """
 
+import math
 import re
 from pathlib import Path
 
@@ -101,7 +102,9 @@ def _pose_at(time: float, poses: Float64[np.ndarray, "n 8"], where: str) -> Floa
         return None
     a, b = poses[before], poses[after]
     share = (time - a[0]) / (b[0] - a[0]) if b[0] > a[0] else 0.0
-    quat_a, quat_b = a[[7, 4, 5, 6]], b[[7, 4, 5, 6]]  # wxyz
+    for pose in (a, b):
+        pose_from_quat(pose[[7, 4, 5, 6]], pose[1:4], where)  # refuses what is no pose, before it is mixed
+    quat_a, quat_b = (pose[[7, 4, 5, 6]] / math.hypot(*pose[4:]) for pose in (a, b))  # wxyz
     # Linear interpolation: within a tenth of a second it differs from the arc by some millionths.
     quat = (1 - share) * quat_a + share * np.copysign(1.0, quat_a @ quat_b) * quat_b
     return pose_from_quat(quat, (1 - share) * a[1:4] + share * b[1:4], where)
