@@ -114,7 +114,7 @@ def test_an_archive_of_an_unknown_zip_version_is_damaged(tmp_path):
     entry = contents.index(b"PK\x01\x02")
     contents[entry + 6] = 211  # version needed to read the entry: 21.1
     path.write_bytes(sealed(bytes(contents)))
-    with pytest.raises(StorageError, match="corrupt.*zip file version"):
+    with pytest.raises(StorageError, match=r"corrupt.*zip file version"):
         load_arrays(path, "test 1")
 
 
