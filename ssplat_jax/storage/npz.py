@@ -11,6 +11,7 @@ import hashlib
 import io
 import json
 import struct
+import tokenize
 import zipfile
 import zlib
 from pathlib import Path
@@ -29,7 +30,7 @@ _DIGEST_LENGTH = 64  # hex digits of a sha256
 # A damaged archive surfaces as almost any of these.
 _DAMAGE_ERRORS = (
     *(ValueError, LookupError, TypeError, OSError, EOFError, RuntimeError),
-    *(struct.error, zlib.error, zipfile.BadZipFile),
+    *(struct.error, tokenize.TokenError, zlib.error, zipfile.BadZipFile),
 )
 
 

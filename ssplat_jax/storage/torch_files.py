@@ -12,6 +12,7 @@ A file holds a small pickle that describes the tensors, and their data. `torch.l
 import io
 import math
 import struct
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Callable
@@ -32,7 +33,7 @@ _STATE_DICT_KEYS = ("state_dict", "model")  # keys under which training checkpoi
 # A damaged file can raise almost any of these while it is unpacked, decoded and indexed.
 _DAMAGE_ERRORS = (
     *(ValueError, TypeError, LookupError, ArithmeticError, AttributeError, EOFError, RuntimeError),
-    *(struct.error, zlib.error, zipfile.BadZipFile),
+    *(struct.error, tokenize.TokenError, zlib.error, zipfile.BadZipFile),
 )
 
 

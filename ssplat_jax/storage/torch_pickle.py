@@ -162,7 +162,7 @@ class _Reader:
         del self.stack[mark:]
         return taken
 
-    def _storage(self, identity: tuple) -> Storage:
+    def _storage(self, identity: Any) -> Storage:
         """Storage for the persistent id ("storage", type, key, device, length)."""
         kind, of_type, key, _, count, *views = identity
         if kind != "storage" or any(view is not None for view in views):
@@ -182,8 +182,10 @@ def _checked_global(name: str) -> _Global:
     return _Global(name)
 
 
-def _call_result(function: _Global, arguments: tuple) -> Any:
+def _call_result(function: Any, arguments: Any) -> Any:
     """Result of calling an allowed name, as plain data."""
+    if not isinstance(function, _Global) or not isinstance(arguments, tuple):
+        raise ValueError("the pickle calls what is no function")
     if function.text == "collections.OrderedDict":
         return _string_dict(arguments[0]) if arguments else {}
     if function.text in _PARAMETER_FACTORIES:
