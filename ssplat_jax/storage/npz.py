@@ -20,7 +20,7 @@ from typing import Any
 import ml_dtypes
 import numpy as np
 
-from ssplat_jax.errors import StorageError
+from ssplat_jax.errors import StorageError, echo
 from ssplat_jax.storage.atomic import write_atomic
 
 SCHEMA = 2  # version of the layout above
@@ -73,7 +73,7 @@ def load_arrays(path: Path, kind: str) -> tuple[dict[str, np.ndarray], dict[str,
         arrays, facts = _parse(contents)
     except _DAMAGE_ERRORS as error:
         raise StorageError(
-            f"{path}: the file is corrupt ({error}); restore it from a backup or create it again."
+            f"{path}: the file is corrupt ({echo(str(error))}); restore it from a backup or create it again."
         ) from error
     if facts["kind"] != kind:
         raise StorageError(

@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float32
 
-from ssplat_jax.errors import InputError
+from ssplat_jax.errors import InputError, echo
 from ssplat_jax.storage.torch_pickle import DTYPES, MAX_PICKLE_BYTES, REMEDY, Storage, Tensor, parse_pickle
 
 _LEGACY_MAGIC = 0x1950A86A20F9469CFC6C
@@ -70,7 +70,7 @@ def _read_file(path: Path, use: Callable[[dict[str, "_ArrayEntry"]], dict]) -> d
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     except _DAMAGE_ERRORS as error:
-        raise InputError(f"{path}: the file is damaged ({error}); fetch it again.") from error
+        raise InputError(f"{path}: the file is damaged ({echo(str(error))}); fetch it again.") from error
 
 
 class _ArrayEntry(NamedTuple):

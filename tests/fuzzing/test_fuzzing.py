@@ -119,6 +119,17 @@ def test_an_archive_of_an_unknown_zip_version_is_damaged(tmp_path):
         load_arrays(path, "test 1")
 
 
+def test_a_message_does_not_repeat_a_damaged_name(tmp_path):
+    path = tmp_path / "a.npz"
+    save_arrays(path, {"x": np.zeros(3)}, "test 1", {})
+    contents = bytearray(path.read_bytes())
+    contents[26:28] = (200).to_bytes(2, "little")  # length of the first file's name, which then has lines in it
+    path.write_bytes(sealed(bytes(contents)))
+    with pytest.raises(StorageError, match="corrupt") as refused:
+        load_arrays(path, "test 1")
+    assert "\n" not in str(refused.value) and len(str(refused.value)) < 400
+
+
 def test_a_pickle_that_says_it_is_huge_takes_no_memory(tmp_path):
     path = tmp_path / "a.pkl"
     path.write_bytes(b"\x80\x02X" + (2**32 - 16).to_bytes(4, "little") + b"short")
