@@ -1,7 +1,7 @@
 """Damaged files of every kind are read or refused: no other exception, no hang, no gigabyte.
 
-`FUZZ_FILES=5000 pytest tests/fuzzing` damages 5,000 files for each parser (eight minutes on two cores). CI takes 500 each,
-the default run a few, since the tests of readers and scene files damage a hundred or more.
+`FUZZ_FILES=5000 pytest tests/fuzzing` damages 5,000 files for each parser (eight minutes on two cores). CI takes
+500 each, the default run a few, since the tests of readers and scene files damage a hundred or more.
 """
 
 import contextlib
