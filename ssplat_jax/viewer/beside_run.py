@@ -23,8 +23,8 @@ from ssplat_jax.viewer.viser_viewer import check_address, import_viser
 
 HOST, MOST_GAUSSIANS = "127.0.0.1", 500_000
 
-LOWER_PRIORITY = 10
-"""Niceness of the viewer."""
+LOWER_PRIORITY = 19
+"""Niceness of the viewer: the least that there is."""
 
 
 class BesideRun:
