@@ -1,0 +1,246 @@
+"""Refinement on whole captures: after the stream, while streaming, and with poses that are wrong.
+
+    ssplat experiment refinement --captures path/to/captures --out runs/refinement
+
+Every scene streams its context views with the shipped weights and is scored on the same views that were never shown.
+
+* `stream`: the scene after the stream.
+* `offline`: then 100 gradient steps on the streamed views, as `ssplat eval --refine 100` takes them.
+* `online`: gradient steps after each chunk, as `--online-refine` takes them.
+* `wrong poses, ...`: all context cameras but the first are turned by 0.5 degrees and moved by 1 % of the depth, each
+  in a direction of its own. Targets keep their poses. `poses revised`: as `--revise poses`.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ssplat_experiments.captures import SETTINGS
+from ssplat_experiments.cases import Case, Row
+from ssplat_experiments.memory_curve import START_CAPACITY
+from ssplat_experiments.scenes import open_room
+from ssplat_experiments.stopwatch import Stopwatch
+from ssplat_experiments.study import Study, at_scale, run_study
+from ssplat_experiments.warm_sessions import new_session
+from ssplat_jax.config import StreamConfig, preset
+from ssplat_jax.console import Reporter
+from ssplat_jax.data.capture import Capture
+from ssplat_jax.data.open_capture import open_capture
+from ssplat_jax.data.split import Split, interleaved_split
+from ssplat_jax.data.stream_frame import StreamFrame
+from ssplat_jax.evaluation.scoring import score_targets
+from ssplat_jax.gaussians import Gaussians
+from ssplat_jax.refinement.refine_capture import refine_on_capture
+from ssplat_jax.streaming.feed import Exposures, feed_chunks
+
+TURN_DEGREES, SHIFT_OF_DEPTH = 0.5, 0.01
+"""Errors of the poses: the angle of a rotation, and the length of a shift as a fraction of the median depth."""
+
+STREAM, OFFLINE, ONLINE = "stream", "offline", "online"
+WRONG, WRONG_OFFLINE, REVISED = "wrong poses, stream", "wrong poses, offline", "wrong poses, poses revised"
+
+
+@dataclasses.dataclass(frozen=True)
+class Sizes:
+    """How much is streamed and refined."""
+
+    context: int | None
+    """Context views; None: as `captures.SETTINGS` says."""
+    size: tuple[int, int] | None
+    """(width, height); None: as `captures.SETTINGS` says."""
+    steps: int
+    """Gradient steps after the stream."""
+    per_chunk: int
+    """Gradient steps after each chunk."""
+
+
+SIZES = {"smoke": Sizes(8, (64, 48), 2, 1), "cpu": Sizes(None, None, 100, 6)}
+
+
+@dataclasses.dataclass(frozen=True)
+class _Scene:
+    capture: Capture
+    split: Split
+    frame: StreamFrame
+
+
+@dataclasses.dataclass(frozen=True)
+class _Streamed:
+    gaussians: Gaussians
+    exposures: Exposures
+    chunk_s: float  # median of a chunk, its online refinement included
+
+
+def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str:
+    """Measures the room and the captures that are there; `smoke` takes the room alone."""
+    return run_study(STUDY, captures, out, scale, reporter)
+
+
+def cases(captures: Path | None, scale: str) -> list[Case]:
+    """Three cases for each scene."""
+    sizes = at_scale(SIZES, scale)
+    config = preset("tiny").replace(**({"capacity": START_CAPACITY} if sizes.size else {}))
+    kinds: dict[str, tuple[StreamConfig, Callable[..., list[Row]]]] = {
+        OFFLINE: (config, measure_offline),
+        ONLINE: (config.replace(steps_per_chunk=sizes.per_chunk), measure_online),
+        WRONG: (config, measure_wrong_poses),
+    }
+    return [
+        Case(
+            name=f"{scene}, {kind}",
+            config=of_kind,
+            asked={"scene": scene, "kind": kind, **dataclasses.asdict(sizes)},
+            measure=functools.partial(measure, scene, open_scene, of_kind, sizes),
+        )
+        for scene, open_scene in _scenes(captures, sizes).items()
+        for kind, (of_kind, measure) in kinds.items()
+    ]
+
+
+def _scenes(captures: Path | None, sizes: Sizes) -> dict[str, Callable[[], _Scene]]:
+    """The available scenes by name, each not opened yet."""
+    scenes = {"room": functools.partial(_open_room, sizes)}
+    for name, stride, context, size in SETTINGS if sizes.size is None else ():
+        if captures is not None and (captures / name).is_dir():
+            scenes[f"{name} {stride}"] = functools.partial(_open, captures / name, stride, context, size)
+    return scenes
+
+
+def _open_room(sizes: Sizes) -> _Scene:
+    return _with_frame(*open_room(sizes.context or 64, sizes.size or (320, 240)))
+
+
+def _open(path: Path, stride: int, context: int, size: tuple[int, int] | None) -> _Scene:
+    capture = open_capture(path, size=size)
+    return _with_frame(capture, interleaved_split(len(capture), stride, context))
+
+
+def _with_frame(capture: Capture, split: Split) -> _Scene:
+    return _Scene(capture, split, capture.stream_frame(preset("tiny"), split.context))
+
+
+def measure_offline(name: str, open_scene: Callable[[], _Scene], config: StreamConfig, sizes: Sizes) -> list[Row]:
+    """The scene after the stream, and after the steps that follow it."""
+    scene = open_scene()
+    streamed = _stream(scene, scene.capture, config)
+    first = _row(name, STREAM, scene, streamed.gaussians, streamed.exposures) | {"chunk_s": streamed.chunk_s}
+    return [first, _refined(name, OFFLINE, scene, scene.capture, streamed, sizes.steps, ())]
+
+
+def measure_online(name: str, open_scene: Callable[[], _Scene], config: StreamConfig, sizes: Sizes) -> list[Row]:
+    """The scene after a stream that was refined chunk by chunk."""
+    scene = open_scene()
+    streamed = _stream(scene, scene.capture, config)
+    row = _row(name, ONLINE, scene, streamed.gaussians, streamed.exposures)
+    return [row | {"steps": sizes.per_chunk, "chunk_s": streamed.chunk_s}]
+
+
+def measure_wrong_poses(name: str, open_scene: Callable[[], _Scene], config: StreamConfig, sizes: Sizes) -> list[Row]:
+    """The scene of wrong poses: after the stream, refined, and refined with its poses."""
+    scene = open_scene()
+    depth = config.stream.median_depth / scene.frame.scale
+    wrong = with_wrong_poses(scene.capture, scene.split.context, depth)
+    streamed = _stream(scene, wrong, config)
+    return [
+        _row(name, WRONG, scene, streamed.gaussians, streamed.exposures),
+        _refined(name, WRONG_OFFLINE, scene, wrong, streamed, sizes.steps, ()),
+        _refined(name, REVISED, scene, wrong, streamed, sizes.steps, ("poses",)),
+    ]
+
+
+def with_wrong_poses(capture: Capture, indices: Sequence[int], depth: float, seed: int = 0) -> Capture:
+    """The capture with errors in the poses of the frames `indices` but the first: `TURN_DEGREES`, `SHIFT_OF_DEPTH`.
+
+    Args:
+        capture: the exact poses.
+        indices: frames whose poses get errors.
+        depth: median depth of the scene, in units of the capture.
+        seed: seed of the directions.
+    """
+    rng, frames = np.random.default_rng(seed), list(capture.frames)
+    for i in indices[1:]:
+        turn, shift = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
+        pose = frames[i].camtoworld.copy()
+        pose[:3, :3] = pose[:3, :3] @ Rotation.from_rotvec(np.radians(TURN_DEGREES) * turn).as_matrix()
+        pose[:3, 3] += SHIFT_OF_DEPTH * depth * shift
+        frames[i] = dataclasses.replace(frames[i], camtoworld=pose)
+    return dataclasses.replace(capture, frames=tuple(frames))
+
+
+def _stream(scene: _Scene, capture: Capture, config: StreamConfig) -> _Streamed:
+    session, exposures, seconds = new_session(config), {}, []
+    order = capture.stream_order(config, scene.split.context, scene.frame)
+    for fed in feed_chunks(session, capture, order, scene.frame):
+        exposures |= fed.exposures
+        seconds.append(fed.seconds)
+    return _Streamed(session.gaussians(), exposures, round(float(np.median(seconds)), 3))
+
+
+def _refined(
+    name: str,
+    method: str,
+    scene: _Scene,
+    capture: Capture,
+    streamed: _Streamed,
+    steps: int,
+    revise: Sequence[str],
+) -> Row:
+    """The row of the scene after gradient steps on the context views as `capture` has them."""
+    watch = Stopwatch()
+    with watch.running():
+        found = refine_on_capture(
+            streamed.gaussians,
+            capture,
+            scene.split.context,
+            scene.frame,
+            streamed.exposures,
+            steps=steps,
+            revise=revise,
+        )
+        jax.block_until_ready(found.gaussians.means)
+    taken = {"steps": found.report.num_steps, "refine_s": round(watch.seconds, 1)}
+    return _row(name, method, scene, found.gaussians, found.exposures) | taken
+
+
+def _row(name: str, method: str, scene: _Scene, gaussians: Gaussians, exposures: Exposures) -> dict[str, Any]:
+    scores = score_targets(gaussians, scene.capture, scene.split.targets, scene.frame, exposures)
+    row: dict[str, Any] = {"scene": name, "method": method, "steps": 0}
+    for column in ("literal", "shown"):
+        row |= {f"{column}_{metric}": round(scores[column][metric], 4) for metric in ("psnr", "ssim")}
+    return row
+
+
+def findings(rows: list[Row]) -> list[str]:
+    """What refinement gains on each scene, and how much of the loss by wrong poses their revision wins back."""
+    sentences = []
+    for scene in dict.fromkeys(row["scene"] for row in rows):
+        by = {row["method"]: row for row in rows if row["scene"] == scene}
+        if STREAM not in by:
+            continue
+        for method in (OFFLINE, ONLINE):
+            if method in by:
+                gains = [by[method][c] - by[STREAM][c] for c in ("shown_psnr", "literal_psnr")]
+                sentences.append(f"{scene}: {method} {gains[0]:+.2f} dB shown, {gains[1]:+.2f} dB literal.")
+        if ONLINE in by:
+            ratio = by[ONLINE]["chunk_s"] / by[STREAM]["chunk_s"]
+            sentences.append(f"{scene}: a chunk takes {ratio:.2f} times as long with online refinement.")
+        if REVISED in by:
+            lost, kept = (by[OFFLINE]["shown_psnr"] - by[m]["shown_psnr"] for m in (WRONG_OFFLINE, REVISED))
+            sentences.append(f"{scene}: wrong poses lose {lost:.2f} dB shown, {kept:.2f} dB with poses revised.")
+    return sentences
+
+
+STUDY = Study(
+    name="refinement",
+    text="""Refinement with the shipped weights, scored on views that were never shown. `offline`: gradient steps after
+the stream. `online`: `steps` after each chunk; `chunk s` is the median time of a chunk with them. `wrong poses`: the
+context cameras are turned by 0.5 degrees and moved by 1 % of the depth.""",
+    cases=cases,
+    findings=findings,
+)

@@ -1,0 +1,74 @@
+"""The experiment on refinement: errors of poses as large as it says, and sentences that follow from its rows."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from ssplat_experiments.refinement import (
+    OFFLINE,
+    ONLINE,
+    REVISED,
+    STREAM,
+    WRONG,
+    WRONG_OFFLINE,
+    cases,
+    findings,
+    run,
+    with_wrong_poses,
+)
+
+from ssplat_jax.console import Reporter
+from ssplat_jax.data.open_capture import open_capture
+
+
+def test_poses_get_errors_of_the_stated_size_in_directions_of_their_own():
+    exact = open_capture("procedural:room?frames=9", size=(32, 24))
+    wrong = with_wrong_poses(exact, (0, 2, 4, 6), depth=2.5)
+    poses = zip(exact.camtoworlds, wrong.camtoworlds, strict=True)
+    changes = [np.linalg.inv(a) @ b for a, b in poses]
+    turns = [Rotation.from_matrix(c[:3, :3]).as_rotvec(degrees=True) for c in changes]
+    shifts = [c[:3, 3] for c in changes]
+    expected = [0.0, 0.0, 1.0, 0.0, 1.0, 0.0, 1.0, 0.0, 0.0]  # the first context view and all targets stay
+    np.testing.assert_allclose(np.linalg.norm(turns, axis=1), np.multiply(0.5, expected), atol=1e-5)
+    np.testing.assert_allclose(np.linalg.norm(shifts, axis=1), np.multiply(0.025, expected), atol=1e-9)
+    assert np.linalg.norm(turns[2] - turns[4]) > 0.05 and np.linalg.norm(shifts[2] - shifts[4]) > 1e-3
+    np.testing.assert_array_equal(wrong.camtoworlds, with_wrong_poses(exact, (0, 2, 4, 6), depth=2.5).camtoworlds)
+
+
+def test_findings_name_gains_and_what_wrong_poses_lose():
+    def row(method, shown, literal, **more):
+        return {"scene": "room", "method": method, "shown_psnr": shown, "literal_psnr": literal} | more
+
+    rows = [
+        row(STREAM, 20.0, 15.0, chunk_s=0.5),
+        row(OFFLINE, 24.0, 18.5),
+        row(ONLINE, 22.0, 16.0, chunk_s=1.1),
+        row(WRONG, 18.0, 14.0),
+        row(WRONG_OFFLINE, 21.0, 16.0),
+        row(REVISED, 23.25, 17.0),
+    ]
+    assert findings(rows) == [
+        "room: offline +4.00 dB shown, +3.50 dB literal.",
+        "room: online +2.00 dB shown, +1.00 dB literal.",
+        "room: a chunk takes 2.20 times as long with online refinement.",
+        "room: wrong poses lose 3.00 dB shown, 0.75 dB with poses revised.",
+    ]
+    assert findings(rows[2:]) == []  # nothing to compare with yet
+
+
+def test_only_captures_that_are_there_are_measured(tmp_path):
+    (tmp_path / "fox").mkdir()
+    assert {case.asked["scene"] for case in cases(tmp_path, "cpu")} == {"room", "fox 1"}
+    online = [case.config.refine.steps_per_chunk for case in cases(None, "cpu")]
+    assert online == [0, 6, 0]
+
+
+@pytest.mark.slow
+def test_the_room_is_measured_in_small(tmp_path):
+    run(None, tmp_path, "smoke", Reporter(quiet=True))
+    rows = json.loads((tmp_path / "table.json").read_text())
+    assert [row["method"] for row in rows] == [STREAM, OFFLINE, ONLINE, WRONG, WRONG_OFFLINE, REVISED]
+    by = {row["method"]: row for row in rows}
+    assert by[OFFLINE]["steps"] == by[REVISED]["steps"] == 2 and by[ONLINE]["steps"] == 1
+    assert len({row["literal_psnr"] for row in rows}) == 6  # none is another's copy
