@@ -170,7 +170,8 @@ def test_merged_footprints_grow_until_they_cover_a_face(model, footprint, member
 
 
 def test_session_compiles_once_and_keeps_its_memory(model, params, chunks):
-    session = Session(model, params)
+    """A cache that may grow starts large enough for the first chunks, whatever capacity is configured."""
+    session = Session(StreamSplat(model.config.replace(capacity=128, overflow="grow")), params)
     memory = []
     for chunk in chunks:
         session.feed(chunk)
