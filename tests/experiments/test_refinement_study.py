@@ -14,6 +14,7 @@ from ssplat_experiments.refinement import (
     WRONG_OFFLINE,
     cases,
     findings,
+    own_gain_psnr,
     run,
     with_wrong_poses,
 )
@@ -62,6 +63,15 @@ def test_only_captures_that_are_there_are_measured(tmp_path):
     assert {case.asked["scene"] for case in cases(tmp_path, "cpu")} == {"room", "fox 1"}
     online = [case.config.refine.steps_per_chunk for case in cases(None, "cpu")]
     assert online == [0, 6, 0]
+
+
+def test_own_gain_takes_a_wrong_exposure_away_and_nothing_else():
+    target = np.random.default_rng(0).uniform(0.1, 0.9, (12, 16, 3)).astype(np.float32)
+    noise = np.random.default_rng(1).normal(0, 0.01, target.shape).astype(np.float32)
+    tinted = target * np.float32([0.5, 0.8, 1.1])
+    assert own_gain_psnr(tinted, target) > 100
+    assert own_gain_psnr(tinted + noise * np.float32([0.5, 0.8, 1.1]), target) == pytest.approx(40.0, abs=0.3)
+    assert own_gain_psnr(np.zeros_like(target), target) < 10
 
 
 @pytest.mark.slow
