@@ -72,7 +72,7 @@ def test_own_gain_takes_a_wrong_exposure_away_and_nothing_else():
     tinted = target * np.float32([0.5, 0.8, 1.1])
     assert own_gain_psnr(tinted, target) > 99
     noisy = tinted + noise * np.float32([0.5, 0.8, 1.1])
-    assert own_gain_psnr(noisy, target) == pytest.approx(psnr(target + noise, target), abs=0.1)
+    assert own_gain_psnr(noisy, target) == pytest.approx(psnr(target + noise, target), abs=0.2)
     assert own_gain_psnr(np.zeros_like(target), target) < 10
 
 
