@@ -88,6 +88,12 @@ def scale_colors(gaussians: Gaussians, factors: Float[Array, "3"]) -> Gaussians:
     return replace(gaussians, sh=jnp.concatenate([constant, gaussians.sh[:, 1:] * factors], axis=1))
 
 
+def with_sh_degree(gaussians: Gaussians, degree: int) -> Gaussians:
+    """`gaussians` with SH bands up to `degree`, the new ones zero: every image stays. Higher bands are kept."""
+    missing = max((degree + 1) ** 2 - gaussians.sh.shape[1], 0)
+    return replace(gaussians, sh=jnp.pad(gaussians.sh, ((0, 0), (0, missing), (0, 0)))) if missing else gaussians
+
+
 def mask_gaussians(gaussians: Gaussians, keep) -> Gaussians:
     """`gaussians` with the rows outside `keep` made absent: opacity 0, harmless shape, same size."""
     identity = jnp.array([1.0, 0.0, 0.0, 0.0], gaussians.quats.dtype)

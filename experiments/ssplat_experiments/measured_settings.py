@@ -22,6 +22,7 @@ from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.refinement import current_gaussians
 from ssplat_jax.refinement.refine import continue_refinement, start_refinement
 from ssplat_jax.refinement.refine_capture import key_views_of
+from ssplat_jax.refinement.refine_config import FOR_CAPTURES
 from ssplat_jax.runs.time_budget import reference_step_ms
 from ssplat_jax.streaming.feed import Exposures, feed_capture
 
@@ -74,8 +75,8 @@ def measure_refined(settings: Sequence[Setting], sizes: Sizes, opened: Opened) -
     by_steps = {setting.refine_steps: setting for setting in settings}
     with watch.running():
         given = key_views_of(scene.streamed, scene.split.context, scene.frame, scene.exposures)
-        progress, views = start_refinement(scene.gaussians, given)
-    for _ in watch.over(continue_refinement(progress, views, max(by_steps))):
+        progress, views = start_refinement(scene.gaussians, given, FOR_CAPTURES)
+    for _ in watch.over(continue_refinement(progress, views, max(by_steps), FOR_CAPTURES)):
         if progress.num_steps in by_steps:
             with watch.running():
                 refined = jax.block_until_ready(current_gaussians(progress.state))

@@ -44,6 +44,7 @@ from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.refinement import current_gaussians
 from ssplat_jax.refinement.refine import continue_refinement, start_refinement
 from ssplat_jax.refinement.refine_capture import key_views_of
+from ssplat_jax.refinement.refine_config import FOR_CAPTURES
 from ssplat_jax.streaming.feed import Exposures, feed_chunks
 
 CAPTURES = {"fox": 1, "redkitchen": 5}
@@ -200,9 +201,9 @@ def refine_offline(scene: _Scene, gaussians: Gaussians, exposures: Exposures, si
     curve.add(scene, gaussians, exposures, steps=0)
     with curve.watch.running():
         given = key_views_of(scene.capture, scene.split.context, scene.frame, exposures)
-        progress, views = start_refinement(gaussians, given)
+        progress, views = start_refinement(gaussians, given, FOR_CAPTURES)
     due = {round(sizes.steps / 2**k) for k in range(7)}
-    for _ in curve.watch.over(continue_refinement(progress, views, sizes.steps)):
+    for _ in curve.watch.over(continue_refinement(progress, views, sizes.steps, FOR_CAPTURES)):
         if progress.num_steps in due:
             with curve.watch.running():
                 refined = jax.block_until_ready(current_gaussians(progress.state))

@@ -43,8 +43,7 @@ def adam_step(
         "quats": config.quat_rate,
         "log_scales": config.log_scale_rate,
         "logit_opacities": config.logit_opacity_rate,
-        # Higher bands move a twentieth as far, as in 3D Gaussian Splatting.
-        "sh": (config.color_rate / SH_C0) * jnp.where(jnp.arange(bands) == 0, 1.0, 0.05)[None, :, None],
+        "sh": (config.color_rate / SH_C0) * jnp.where(jnp.arange(bands) == 0, 1.0, config.sh_rate)[None, :, None],
     }
 
     def moved(name: str) -> Array:

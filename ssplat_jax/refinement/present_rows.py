@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int
 
-from ssplat_jax.gaussians import Gaussians
+from ssplat_jax.gaussians import Gaussians, with_sh_degree
 from ssplat_jax.pytree import replace
 
 MIN_ROWS = 1 << 12
@@ -35,7 +35,8 @@ def only_present(gaussians: Gaussians, rows: Int[np.ndarray, " m"] | None) -> Ga
 
 
 def back_in_place(present: Gaussians, rows: Int[np.ndarray, " m"] | None, gaussians: Gaussians) -> Gaussians:
-    """`gaussians` with the rows of `present_rows` replaced by the first ones of `present`."""
+    """`gaussians` with the rows of `present_rows` replaced by the first ones of `present`, at its SH degree."""
     if rows is None:
         return present
+    gaussians = with_sh_degree(gaussians, present.sh_degree)
     return jax.tree.map(lambda x, new: x.at[rows].set(new[: len(rows)]), gaussians, present)

@@ -15,7 +15,7 @@ from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.refinement.choose_effects import EffectsChoice, effects_by_name, with_effects
 from ssplat_jax.refinement.refine import Refinement, continue_refinement, report_of, start_refinement
-from ssplat_jax.refinement.refine_config import RefineConfig
+from ssplat_jax.refinement.refine_config import FOR_CAPTURES, RefineConfig
 from ssplat_jax.streaming.feed import Exposures
 
 MAX_KEY_VIEWS = 128
@@ -53,7 +53,7 @@ def refine_on_capture(
         frame: the similarity between the capture's frame and the stream's.
         exposures: factor per streamed frame, as the stream estimated it.
         steps: most gradient steps.
-        config: learning rates and bounds.
+        config: learning rates, bounds and SH degree; default `FOR_CAPTURES`.
         revise: names of the effects that are on besides those of `config`, or `("auto",)` for those that the residuals
             call for.
         on_step: called with the number of steps done and the last loss.
@@ -65,7 +65,7 @@ def refine_on_capture(
         raise InputError(f"refine: steps must be at least 0, got {steps}.")
     given = key_views_of(capture, indices, frame, exposures)
     choice = effects_by_name(revise, gaussians, given)
-    config = with_effects(config or RefineConfig(), choice)
+    config = with_effects(config or FOR_CAPTURES, choice)
     progress, views = start_refinement(gaussians, given, config)
     for _ in continue_refinement(progress, views, steps, config):
         on_step(progress.num_steps, progress.losses[-1])

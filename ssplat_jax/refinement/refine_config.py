@@ -16,14 +16,18 @@ class RefineConfig:
 
     mean_rate: float = 0.04
     """Step of a mean, as a fraction of the Gaussian's own size (the mean of its two larger standard deviations)."""
-    log_scale_rate: float = 0.015
+    log_scale_rate: float = 0.02
     """Step of a log standard deviation."""
     quat_rate: float = 0.003
     """Step of a unit quaternion's entry."""
-    logit_opacity_rate: float = 0.1
+    logit_opacity_rate: float = 0.2
     """Step of an opacity's logit."""
     color_rate: float = 0.015
-    """Step of the constant color band, in units of color; higher bands take a twentieth."""
+    """Step of the constant color band, in units of color."""
+    sh_rate: float = 0.1
+    """Step of the higher SH bands, as a fraction of that of the constant band."""
+    sh_degree: int = 0
+    """SH degree that the scene gets, unless its own is higher: 0 adds no band."""
     final_rate: float = 0.3
     """Fraction of the learning rates that is left at the last planned step; they decay geometrically."""
     adam_b1: float = 0.9
@@ -46,10 +50,11 @@ class RefineConfig:
     """Parts of the key views that are revised too."""
 
     def __post_init__(self) -> None:
-        for name in ("mean_rate", "log_scale_rate", "quat_rate", "logit_opacity_rate", "color_rate"):
+        for name in ("mean_rate", "log_scale_rate", "quat_rate", "logit_opacity_rate", "color_rate", "sh_rate"):
             self._require(name, "finite and not negative", 0 <= getattr(self, name) < math.inf)
         for name in ("adam_b1", "adam_b2"):
             self._require(name, "in [0, 1)", 0 <= getattr(self, name) < 1)
+        self._require("sh_degree", "0 to 3", self.sh_degree in range(4))
         self._require("final_rate", "in (0, 1]", 0 < self.final_rate <= 1)
         self._require("views_per_step", "at least 1", self.views_per_step >= 1)
         self._require("shown_weight", "in [0, 1]", 0 <= self.shown_weight <= 1)
@@ -60,3 +65,7 @@ class RefineConfig:
     def _require(self, name: str, wanted: str, is_good: bool) -> None:
         if not is_good:
             raise InputError(f"refine: {name} must be {wanted}, got {getattr(self, name)!r}.")
+
+
+FOR_CAPTURES = RefineConfig(sh_degree=2)
+"""What the scene of a capture is refined with: colors of real surfaces depend on the direction of view."""

@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ssplat_jax.cache.key_views import KeyViews
 from ssplat_jax.errors import InputError
-from ssplat_jax.gaussians import Gaussians, mean_color
+from ssplat_jax.gaussians import Gaussians, mean_color, with_sh_degree
 from ssplat_jax.pytree import pytree, replace
 from ssplat_jax.rasterizer import Effects, fill_holes, render
 from ssplat_jax.refinement.adam import adam_step
@@ -48,8 +48,12 @@ class StepReport:
 def init_refinement(
     gaussians: Gaussians, key_views: KeyViews | None = None, config: RefineConfig | None = None
 ) -> RefineState:
-    """The state before the first step. Effects of `config` need the `key_views` that they revise."""
-    effects = (config or RefineConfig()).effects
+    """The state before the first step, with SH bands as `config` has them.
+
+    Effects of `config` need the `key_views` that they revise.
+    """
+    config = config or RefineConfig()
+    effects, gaussians = config.effects, with_sh_degree(gaussians, config.sh_degree)
     if effects.any and key_views is None:
         raise InputError(f"refine: the effects {', '.join(effects.names)} need the key views, got none.")
     return RefineState(

@@ -17,10 +17,11 @@ from ssplat_jax.errors import InputError, require_positive
 from ssplat_jax.evaluation.exposures import exposures_from_json
 from ssplat_jax.evaluation.scoring import score_targets
 from ssplat_jax.gaussians import Gaussians
-from ssplat_jax.refinement import KeyViews, RefineConfig
+from ssplat_jax.refinement import KeyViews
 from ssplat_jax.refinement.choose_effects import effects_by_name, with_effects
 from ssplat_jax.refinement.refine import Progress, continue_refinement, report_of, start_refinement
 from ssplat_jax.refinement.refine_capture import key_views_of, revised_exposures
+from ssplat_jax.refinement.refine_config import FOR_CAPTURES
 from ssplat_jax.runs.finish_run import NUM_PICTURES, save_scene
 from ssplat_jax.runs.refinement_state import load_refinement, save_refinement
 from ssplat_jax.storage.folder_lock import lock_folder
@@ -91,7 +92,7 @@ def refine_run(
         choice = effects_by_name(revise, run.gaussians, given)
         for reason in choice.reasons:
             reporter.say(reason)
-        config = with_effects(RefineConfig(), choice)
+        config = with_effects(FOR_CAPTURES, choice)
         identity = run.identity | {"steps": steps, "refine_config": dataclasses.asdict(config)}
         if folder.refinement_state.exists():
             progress, key_views = load_refinement(folder.refinement_state, run.gaussians, given, config, identity)
