@@ -17,7 +17,7 @@ from ssplat_jax.errors import InputError, require_positive
 from ssplat_jax.evaluation.exposures import exposures_from_json
 from ssplat_jax.evaluation.scoring import score_targets
 from ssplat_jax.gaussians import Gaussians
-from ssplat_jax.refinement import KeyViews
+from ssplat_jax.refinement import KeyViews, RefineConfig
 from ssplat_jax.refinement.choose_effects import effects_by_name, with_effects
 from ssplat_jax.refinement.refine import Progress, continue_refinement, report_of, start_refinement
 from ssplat_jax.refinement.refine_capture import key_views_of, revised_exposures
