@@ -29,21 +29,24 @@ class Chunk:
         return Camera(viewmats=self.viewmats, Ks=self.Ks, width=width, height=height)
 
 
-def check_chunk(chunk: Chunk, num_views: int) -> None:
-    """Checks the shapes of one chunk, of tracers too.
+def check_chunk(chunk: Chunk, num_views: int, *, stacked: bool = False) -> None:
+    """Checks the shapes of one chunk, or of several in one, of tracers too.
 
     Args:
-        chunk: without leading axes.
-        num_views: views that it must hold, padding included.
+        chunk: without leading axes, or with one if `stacked`.
+        num_views: views that a chunk must hold, padding included.
+        stacked: all fields have a leading axis, the same for all.
 
     Raises:
         InputError: naming the field of a wrong shape.
     """
-    v = num_views
+    v, leading = num_views, jnp.shape(chunk.images)[:1] if stacked else ()
     shapes = {"images": (v, "h", "w", 3), "viewmats": (v, 4, 4), "Ks": (v, 3, 3), "valid": (v,), "near": (), "far": ()}
-    for name, wanted in shapes.items():
-        got = jnp.shape(getattr(chunk, name))
+    fix = f" Chunks have {v} views (`stream.chunk_size`): pad a short one with views whose `valid` is False."
+    if stacked:
+        fix = " Stack chunks along a leading axis t, one for all fields."
+    for name, of_one in shapes.items():
+        got, wanted = jnp.shape(getattr(chunk, name)), (*leading, *of_one)
         if len(got) != len(wanted) or any(isinstance(w, int) and w != g for w, g in zip(wanted, got, strict=True)):
-            fix = f" Chunks have {v} views (`stream.chunk_size`): pad a short one with views whose `valid` is False."
-            sizes = " ".join(map(str, wanted))
+            sizes = " ".join(map(str, ("t", *of_one) if stacked else of_one))
             raise InputError(f"chunk: {name} must be [{sizes}], got {list(got)}.{fix if wanted else ''}")

@@ -170,7 +170,11 @@ class StreamSplat:
         """`step` over stacked chunks (leading axis t) as one `lax.scan`.
 
         The cache cannot grow inside the scan: give it the capacity for all chunks first (`ensure_capacity`).
+
+        Raises:
+            InputError: the chunks are not stacked, or have a wrong shape.
         """
+        check_chunk(chunks, self.config.stream.chunk_size, stacked=True)
         return jax.lax.scan(functools.partial(self.step, params), cache, chunks)
 
     def decode(self, params: dict, cache: VoxelCache) -> Gaussians:

@@ -98,6 +98,18 @@ def test_a_step_refuses_chunks_of_another_number_of_views():
         check_chunk(chunk(views=2), 3)
 
 
+def test_a_run_refuses_chunks_that_are_not_stacked():
+    right = jax.tree.map(lambda x: jnp.stack([x, x]), chunk())
+    check_chunk(right, 3, stacked=True)
+    with pytest.raises(
+        InputError, match=r"images must be \[t 3 h w 3\], got \[3, .*Stack chunks along a leading axis t"
+    ):
+        MODEL.run({}, MODEL.init_cache(), chunk())
+    for name, leaf in {"near": right.near[0], "valid": right.valid[:1], "Ks": right.Ks[:, :2]}.items():
+        with pytest.raises(InputError, match=f"chunk: {name} must be \\[t"):
+            MODEL.run({}, MODEL.init_cache(), wrong(right, **{name: leaf}))
+
+
 def test_shape_checks_pass_through_transforms():
     """vmap over scenes and cameras, and trees of anything but arrays."""
     camera = cameras(12, 10)
