@@ -87,6 +87,7 @@ def test_a_stopped_refinement_continues_to_the_same_bytes(finished, monkeypatch)
     assert report["num_steps"] == len(report["losses"]) == 4
     assert report["revised"] == ["poses", "exposures"] and report["num_left_out"] == 0
     assert len(read_ply(folder.refined_scene).gaussians.means) == len(read_ply(folder.scene).gaussians.means)
+    assert [read_ply(path).gaussians.sh_degree for path in (folder.scene, folder.refined_scene)] == [0, 2]
 
 
 def test_a_refinement_with_other_steps_is_refused(finished):
