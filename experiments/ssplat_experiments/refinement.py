@@ -50,7 +50,7 @@ WRONG, WRONG_OFFLINE, REVISED = "wrong poses, stream", "wrong poses, offline", "
 
 @dataclasses.dataclass(frozen=True)
 class Sizes:
-    """How much is streamed and refined."""
+    """Views, image size and gradient steps of a scale."""
 
     context: int | None
     """Context views; None: as `captures.SETTINGS` says."""
@@ -231,7 +231,7 @@ def own_gain_psnr(color: Float[np.ndarray, "h w 3"], target: Float[np.ndarray, "
 
 
 def findings(rows: list[Row]) -> list[str]:
-    """What refinement gains on each scene, and how much of the loss by wrong poses their revision wins back."""
+    """Sentences: gains of refinement on each scene, and losses by wrong poses with and without their revision."""
     sentences = []
     for scene in dict.fromkeys(row["scene"] for row in rows):
         by = {row["method"]: row for row in rows if row["scene"] == scene}

@@ -68,4 +68,4 @@ class RefineConfig:
 
 
 FOR_CAPTURES = RefineConfig(sh_degree=2)
-"""What the scene of a capture is refined with: colors of real surfaces depend on the direction of view."""
+"""Configuration for scenes of captures: colors of real surfaces depend on the direction of view."""
