@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int
+from jaxtyping import Bool, Float, Float32, Float64, Int
 from PIL import Image
 from skimage.feature import ORB
 
@@ -161,13 +161,27 @@ def match(
     search, with fewer false ones.
     """
     bits = descriptors_a.shape[1]
-    if min(allowed.shape) < 2:
-        return np.zeros(0, np.int64), np.zeros(0, np.int64)
     a, b = (2.0 * d.astype(np.float32) - 1.0 for d in (descriptors_a, descriptors_b))
     hamming = np.where(allowed, (bits - a @ b.T) / 2, bits)
-    rows, nearest = np.arange(len(a)), hamming.argmin(axis=1)
-    best, second = np.partition(hamming, 1, axis=1)[:, :2].T
-    keep = (hamming.argmin(axis=0)[nearest] == rows) & (best <= MAX_HAMMING) & (best < MAX_RATIO * second)
+    return mutual_nearest(hamming, MAX_HAMMING, MAX_RATIO)
+
+
+def mutual_nearest(
+    distances: Float[np.ndarray, "n m"], max_distance: float, max_ratio: float
+) -> tuple[Int[np.ndarray, " p"], Int[np.ndarray, " p"]]:
+    """Returns the rows and columns that are nearest to each other, near enough, and clearly nearer than the second.
+
+    Args:
+        distances: between descriptors.
+        max_distance: largest distance of a match.
+        max_ratio: largest ratio of a row's smallest to its second smallest distance (Lowe's test).
+    """
+    if min(distances.shape) < 2:
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    rows, nearest = np.arange(len(distances)), distances.argmin(axis=1)
+    best, second = np.partition(distances, 1, axis=1)[:, :2].T
+    is_mutual = distances.argmin(axis=0)[nearest] == rows
+    keep = is_mutual & (best <= max_distance) & (best < max_ratio * second)
     return rows[keep], nearest[keep]
 
 
