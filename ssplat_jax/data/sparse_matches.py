@@ -163,7 +163,7 @@ def match(
     bits = descriptors_a.shape[1]
     a, b = (2.0 * d.astype(np.float32) - 1.0 for d in (descriptors_a, descriptors_b))
     hamming = np.where(allowed, (bits - a @ b.T) / 2, bits)
-    return mutual_nearest(hamming, MAX_HAMMING, MAX_RATIO)
+    return mutual_nearest(hamming, float(MAX_HAMMING), MAX_RATIO)
 
 
 def mutual_nearest(
