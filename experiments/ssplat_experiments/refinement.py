@@ -8,7 +8,9 @@ Every scene streams its context views with the shipped weights and is scored on 
 * `offline`: then 100 gradient steps on the streamed views, as `ssplat eval --refine 100` takes them.
 * `online`: gradient steps after each chunk, as `--online-refine` takes them.
 * `wrong poses, ...`: all context cameras but the first are turned by 0.5 degrees and moved by 1 % of the depth, each
-  in a direction of its own. Targets keep their poses. `poses revised`: as `--revise poses`.
+  in a direction of its own. Targets keep their poses. `poses adjusted`: the context's poses are adjusted to its images
+  before the stream, as `--revise poses` does. `targets carried`: the same scene; each target is moved as adjustment
+  moved the two context views beside it from their exact poses.
 """
 
 import dataclasses
@@ -33,19 +35,22 @@ from ssplat_jax.config import StreamConfig, preset
 from ssplat_jax.console import Reporter
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.open_capture import open_capture
+from ssplat_jax.data.posed_image import invert_pose
 from ssplat_jax.data.split import Split, interleaved_split
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.evaluation.scoring import mean_scores, score_view
 from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.metrics.psnr_ssim import psnr
-from ssplat_jax.refinement.refine_capture import refine_on_capture
+from ssplat_jax.poses.adjust_poses import adjust_poses
+from ssplat_jax.refinement.refine_capture import CaptureRefinement, refine_on_capture
 from ssplat_jax.streaming.feed import Exposures, feed_chunks
 
 TURN_DEGREES, SHIFT_OF_DEPTH = 0.5, 0.01
 """Errors of the poses: the angle of a rotation, and the length of a shift as a fraction of the median depth."""
 
 STREAM, OFFLINE, ONLINE = "stream", "offline", "online"
-WRONG, WRONG_OFFLINE, REVISED = "wrong poses, stream", "wrong poses, offline", "wrong poses, poses revised"
+WRONG, WRONG_OFFLINE = "wrong poses, stream", "wrong poses, offline"
+ADJUSTED, ADJUSTED_OFFLINE, CARRIED = "poses adjusted, stream", "poses adjusted, offline", "targets carried, offline"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -132,7 +137,7 @@ def measure_offline(name: str, open_scene: Callable[[], _Scene], config: StreamC
     scene = open_scene()
     streamed = _stream(scene, scene.capture, config)
     first = _row(name, STREAM, scene, streamed.gaussians, streamed.exposures) | {"chunk_s": streamed.chunk_s}
-    return [first, _refined(name, OFFLINE, scene, scene.capture, streamed, sizes.steps, ())]
+    return [first, _row_of_refined(name, OFFLINE, scene, _refined(scene, scene.capture, streamed, sizes.steps))]
 
 
 def measure_online(name: str, open_scene: Callable[[], _Scene], config: StreamConfig, sizes: Sizes) -> list[Row]:
@@ -144,15 +149,25 @@ def measure_online(name: str, open_scene: Callable[[], _Scene], config: StreamCo
 
 
 def measure_wrong_poses(name: str, open_scene: Callable[[], _Scene], config: StreamConfig, sizes: Sizes) -> list[Row]:
-    """The scene of wrong poses: after the stream, refined, and refined with its poses."""
+    """The scene of wrong poses, after the stream and refined; and that of poses that were adjusted."""
     scene = open_scene()
     depth = config.stream.median_depth / scene.frame.scale
     wrong = with_wrong_poses(scene.capture, scene.split.context, depth)
     streamed = _stream(scene, wrong, config)
-    return [
+    rows = [
         _row(name, WRONG, scene, streamed.gaussians, streamed.exposures),
-        _refined(name, WRONG_OFFLINE, scene, wrong, streamed, sizes.steps, ()),
-        _refined(name, REVISED, scene, wrong, streamed, sizes.steps, ("poses",)),
+        _row_of_refined(name, WRONG_OFFLINE, scene, _refined(scene, wrong, streamed, sizes.steps)),
+    ]
+    del streamed
+    adjusted = adjust_poses(wrong, scene.split.context).capture
+    streamed = _stream(scene, adjusted, config)
+    refined = _refined(scene, adjusted, streamed, sizes.steps)
+    carried = dataclasses.replace(scene, capture=with_carried_targets(scene.capture, adjusted, scene.split))
+    return [
+        *rows,
+        _row(name, ADJUSTED, scene, streamed.gaussians, streamed.exposures),
+        _row_of_refined(name, ADJUSTED_OFFLINE, scene, refined),
+        _row_of_refined(name, CARRIED, carried, refined),
     ]
 
 
@@ -175,6 +190,25 @@ def with_wrong_poses(capture: Capture, indices: Sequence[int], depth: float, see
     return dataclasses.replace(capture, frames=tuple(frames))
 
 
+def with_carried_targets(exact: Capture, moved: Capture, split: Split) -> Capture:
+    """The exact capture with each target moved as its two nearest context frames are moved in `moved`, on average.
+
+    Adjusted poses agree with each other, and drift together by what images do not tell. A target at its exact pose is
+    then beside the scene by that drift, whatever the scene is like.
+    """
+    frames = list(exact.frames)
+    for i in split.targets:
+        near = sorted(split.context, key=lambda j: abs(j - i))[:2]
+        motions = [moved.frames[j].camtoworld @ invert_pose(exact.frames[j].camtoworld) for j in near]
+        pose = exact.frames[i].camtoworld
+        turn = Rotation.from_matrix(np.stack([motion[:3, :3] for motion in motions])).mean().as_matrix()
+        carried = np.eye(4)
+        carried[:3, :3] = turn @ pose[:3, :3]
+        carried[:3, 3] = np.mean([motion[:3, :3] @ pose[:3, 3] + motion[:3, 3] for motion in motions], axis=0)
+        frames[i] = dataclasses.replace(frames[i], camtoworld=carried)
+    return dataclasses.replace(exact, frames=tuple(frames))
+
+
 def _stream(scene: _Scene, capture: Capture, config: StreamConfig) -> _Streamed:
     session, exposures, seconds = new_session(config), {}, []
     order = capture.stream_order(config, scene.split.context, scene.frame)
@@ -184,30 +218,25 @@ def _stream(scene: _Scene, capture: Capture, config: StreamConfig) -> _Streamed:
     return _Streamed(session.gaussians(), exposures, round(float(np.median(seconds)), 3))
 
 
-def _refined(
-    name: str,
-    method: str,
-    scene: _Scene,
-    capture: Capture,
-    streamed: _Streamed,
-    steps: int,
-    revise: Sequence[str],
-) -> Row:
-    """The row of the scene after gradient steps on the context views as `capture` has them."""
+@dataclasses.dataclass(frozen=True)
+class _Refined:
+    found: CaptureRefinement
+    seconds: float
+
+
+def _refined(scene: _Scene, capture: Capture, streamed: _Streamed, steps: int) -> _Refined:
+    """The scene after gradient steps on the context views as `capture` has them."""
     watch = Stopwatch()
+    context = scene.split.context
     with watch.running():
-        found = refine_on_capture(
-            streamed.gaussians,
-            capture,
-            scene.split.context,
-            scene.frame,
-            streamed.exposures,
-            steps=steps,
-            revise=revise,
-        )
+        found = refine_on_capture(streamed.gaussians, capture, context, scene.frame, streamed.exposures, steps=steps)
         jax.block_until_ready(found.gaussians.means)
-    taken = {"steps": found.report.num_steps, "refine_s": round(watch.seconds, 1)}
-    return _row(name, method, scene, found.gaussians, found.exposures) | taken
+    return _Refined(found, watch.seconds)
+
+
+def _row_of_refined(name: str, method: str, scene: _Scene, refined: _Refined) -> Row:
+    taken = {"steps": refined.found.report.num_steps, "refine_s": round(refined.seconds, 1)}
+    return _row(name, method, scene, refined.found.gaussians, refined.found.exposures) | taken
 
 
 def _row(name: str, method: str, scene: _Scene, gaussians: Gaussians, exposures: Exposures) -> dict[str, Any]:
@@ -244,9 +273,13 @@ def findings(rows: list[Row]) -> list[str]:
         if ONLINE in by:
             ratio = by[ONLINE]["chunk_s"] / by[STREAM]["chunk_s"]
             sentences.append(f"{scene}: a chunk takes {ratio:.2f} times as long with online refinement.")
-        if REVISED in by:
-            lost, kept = (by[OFFLINE]["shown_psnr"] - by[m]["shown_psnr"] for m in (WRONG_OFFLINE, REVISED))
-            sentences.append(f"{scene}: wrong poses lose {lost:.2f} dB shown, {kept:.2f} dB with poses revised.")
+        if CARRIED in by:
+            methods = WRONG_OFFLINE, ADJUSTED_OFFLINE, CARRIED
+            lost, adjusted, carried = (by[OFFLINE]["shown_psnr"] - by[m]["shown_psnr"] for m in methods)
+            sentences.append(
+                f"{scene}: wrong poses lose {lost:.2f} dB shown; with poses adjusted {adjusted:.2f} dB are lost, and"
+                f" {carried:.2f} dB at carried targets."
+            )
     return sentences
 
 
@@ -254,7 +287,8 @@ STUDY = Study(
     name="refinement",
     text="""Refinement with the shipped weights, scored on views that were never shown. `offline`: gradient steps after
 the stream. `online`: `steps` after each chunk; `chunk s` is the median time of a chunk with them. `wrong poses`: the
-context cameras are turned by 0.5 degrees and moved by 1 % of the depth. `over black`: holes black, exposure carried
+context cameras are turned by 0.5 degrees and moved by 1 % of the depth. `poses adjusted`: before the stream. `targets
+carried`: the same scene, each target moved as the context views beside it. `over black`: holes black, exposure carried
 over. `own gain`: the shown image after a factor for each channel that is fitted to the target itself, so no score of a
 method; its distance from `shown` is what carrying the exposure over costs.""",
     cases=cases,

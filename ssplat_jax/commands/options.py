@@ -40,7 +40,8 @@ ConfigChanges = Annotated[tuple[str, ...], tyro.conf.arg(help="Changes to the co
 ReviseOption = Annotated[
     tuple[Literal["auto", "poses", "focal", "exposures", "white_balance"], ...],
     tyro.conf.arg(
-        help="Parts of the streamed views that refinement revises too: auto chooses those that the residuals call for."
+        help="Parts of the streamed views that are revised too: poses before the stream, the others by refinement; auto"
+        " chooses those that the images call for."
     ),
 ]
 QuietOption = Annotated[bool, tyro.conf.arg(help="Print only the closing line.")]
@@ -152,7 +153,7 @@ def check_refinement(steps: int, revise: tuple[str, ...], flag: str) -> None:
     """
     if steps < 0:
         raise InputError(f"{flag}: wanted a number of steps of at least 0, got {steps}.")
-    if revise and not steps:
+    if set(revise) - {"poses"} and not steps:
         raise InputError(f"--revise: wanted {flag} beside it, got 0 steps; for example {flag} 100.")
     if "auto" in revise and len(revise) > 1:
         raise InputError(f"--revise: wanted auto alone or effects by name, got {' '.join(revise)}.")

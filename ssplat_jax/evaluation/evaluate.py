@@ -20,6 +20,7 @@ from ssplat_jax.evaluation.scoring import Display, ViewScore, baselines, check_s
 from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.metrics.lpips import LpipsWeights, check_size
 from ssplat_jax.metrics.psnr_ssim import SSIM_ARGUMENTS
+from ssplat_jax.poses.adjust_poses import adjust_if_asked
 from ssplat_jax.refinement import CaptureRefinement, refine_on_capture
 from ssplat_jax.storage.atomic import write_atomic
 from ssplat_jax.storage.folders import make_writable
@@ -59,7 +60,8 @@ def evaluate(
         lpips_weights: with them LPIPS is scored too; without, the fields `lpips` are null.
         refine_steps: gradient steps on the context views before the targets are scored. With them the metrics have a
             block `refinement`: the steps done, their seconds, and the scores before.
-        revise: effects of the refinement, see `refine_on_capture`.
+        revise: effects of the refinement, see `refine_on_capture`. `poses` adjusts those of the context before it is
+            streamed, `auto` does if they are off (`poses.adjust_poses`); targets keep theirs.
         scene: name in `index.json`; by default the capture's.
         display: how pictures are made; the block `pictures` of the metrics holds it, and the mean PSNR of the pictures.
 
@@ -74,6 +76,10 @@ def evaluate(
     _check_inputs(capture, split, out, lpips_weights)
     make_writable(out)  # before the long part
     folder.clear_targets()  # they may be of another split
+    adjusted = adjust_if_asked(streamed, split.context, revise, reporter)
+    if adjusted is not None:  # poses of the context alone; gradients would then follow errors of the scene
+        capture, streamed = (dataclasses.replace(x, frames=adjusted.capture.frames) for x in (capture, streamed))
+        revise = [name for name in revise if name != "poses"]
     frame = streamed.stream_frame(session.model.config, split.context)
     reporter.warn_all(*capture.notes, frame.warning)
     reference = baselines(capture, split)
@@ -117,6 +123,7 @@ def evaluate(
         **mean_scores(scores),
         "pictures": dataclasses.asdict(display) | {"psnr": round(float(np.mean([*map(display.psnr, scores)])), 4)},
         "ssim_arguments": SSIM_ARGUMENTS,
+        "adjusted_poses": None if adjusted is None else adjusted.reason,
         **refinement,
         **timing,
         **cost,

@@ -13,6 +13,7 @@ from ssplat_jax.evaluation.scoring import check_scorable
 from ssplat_jax.runs.chunk_recorder import ChunkRecorder, hold_back
 from ssplat_jax.runs.finish_run import finish_run, finished_scene
 from ssplat_jax.runs.resume import RunState, resume_run, run_identity, save_run
+from ssplat_jax.runs.run_poses import capture_to_stream
 from ssplat_jax.storage.folder_lock import lock_folder
 from ssplat_jax.storage.interrupts import Interrupts
 from ssplat_jax.storage.run_folder import RunFolder
@@ -45,6 +46,7 @@ def run_capture(
     overwrite: bool,
     deltas: bool = False,
     num_held_back: int = 0,
+    revise: Sequence[str] = (),
     reporter: Reporter,
 ) -> RunResult:
     """Streams a capture into a folder, continuing the run that the folder holds.
@@ -62,6 +64,8 @@ def run_capture(
         overwrite: remove the run that `out` holds and start anew.
         deltas: also write what each chunk changed in the scene, in the stream frame (`checkpoint/delta_files.py`).
         num_held_back: frames, evenly spread, that are not streamed but scored every few chunks.
+        revise: `poses` or `auto` adjusts the poses before the stream, see `run_poses.capture_to_stream`; effects that
+            only a refinement revises are for `refine_run`.
         reporter: shows progress and warnings.
 
     Raises:
@@ -81,10 +85,11 @@ def run_capture(
     capture.check_output_folder(out)
     capture.verify([*indices, *held_back])
     folder = RunFolder(out)
-    recorder = ChunkRecorder(capture, folder, held_back)
     with lock_folder(out):
         if overwrite:
             folder.clear_run()
+        capture = capture_to_stream(capture, indices, revise, folder, reporter)
+        recorder = ChunkRecorder(capture, folder, held_back)
         identity = run_identity(model, params, capture, indices)
         run = resume_run(model, params, capture, identity, folder, reporter)
         reporter.warn_all(*capture.notes, run.frame.warning)

@@ -17,6 +17,7 @@ from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.posed_image import invert_pose
 from ssplat_jax.errors import InputError
+from ssplat_jax.runs.run_poses import with_poses_of_run
 from ssplat_jax.storage.atomic import write_atomic
 from ssplat_jax.storage.run_folder import RunFolder
 
@@ -53,7 +54,8 @@ def open_cameras(path: str, scene: Path, to: Path) -> SceneCameras:
         capture = open_capture(path)
         return SceneCameras(capture, range(len(capture)))
     _, header, _ = load_newest_state(folder.state)
-    capture, frames = open_capture(path, size=tuple(header["size"])), header["frames"]
+    capture = with_poses_of_run(open_capture(path, size=tuple(header["size"])), folder)
+    frames = header["frames"]
     if max(frames) >= len(capture) or capture.digest(frames) != header["poses"]:
         raise InputError(f"{path}: wanted the capture of the run in {scene}, got another; give that capture.")
     return SceneCameras(capture, sorted(map(int, header["exposures"])))

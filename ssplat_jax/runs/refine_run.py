@@ -24,6 +24,7 @@ from ssplat_jax.refinement.refine_capture import key_views_of, revised_exposures
 from ssplat_jax.refinement.refine_config import FOR_CAPTURES
 from ssplat_jax.runs.finish_run import NUM_PICTURES, save_scene
 from ssplat_jax.runs.refinement_state import load_refinement, save_refinement
+from ssplat_jax.runs.run_poses import has_adjusted_poses, with_poses_of_run
 from ssplat_jax.storage.folder_lock import lock_folder
 from ssplat_jax.storage.interrupts import Interrupts
 from ssplat_jax.storage.json_files import write_json
@@ -89,6 +90,10 @@ def refine_run(
         if overwrite:
             folder.clear_refinement()
         given = key_views_of(run.capture, run.indices, run.frame, run.exposures)
+        if has_adjusted_poses(folder):  # their gradients would follow errors of the scene
+            revise = [name for name in revise if name != "poses"]
+        elif "poses" in revise:
+            reporter.say("poses: `ssplat run --revise poses` adjusts them before the stream, which gains far more")
         choice = effects_by_name(revise, run.gaussians, given)
         for reason in choice.reasons:
             reporter.say(reason)
@@ -132,7 +137,7 @@ def _open_run(folder: RunFolder, path: str, params: dict, reporter: Reporter) ->
             f"{folder.path}: wanted a finished run, got one after {header['done']} of {len(frames)} views; finish it"
             " with `ssplat run`."
         )
-    capture = open_capture(path, size=tuple(header["size"]))
+    capture = with_poses_of_run(open_capture(path, size=tuple(header["size"])), folder)
     is_same = max(frames) < len(capture) and (capture.digest(frames), capture.images_digest(frames)) == (
         header["poses"],
         header["images"],

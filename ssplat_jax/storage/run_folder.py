@@ -39,6 +39,11 @@ class RunFolder:
         return self.path / "state.npz"
 
     @property
+    def adjusted_poses(self) -> Path:
+        """The poses that were adjusted before the stream, as JSON."""
+        return self.path / "adjusted_poses.json"
+
+    @property
     def metrics(self) -> Path:
         """The facts and scores of the run as JSON."""
         return self.path / "metrics.json"
@@ -121,7 +126,7 @@ class RunFolder:
 
     def clear_run(self) -> None:
         """Removes the run that the folder holds; files of the user stay."""
-        for stale in (self.state, previous_path(self.state), self.scene, self.metrics):
+        for stale in (self.state, previous_path(self.state), self.scene, self.metrics, self.adjusted_poses):
             stale.unlink(missing_ok=True)
         self.clear_refinement()
         self.clear_deltas()

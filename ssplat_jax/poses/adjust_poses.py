@@ -1,0 +1,137 @@
+"""`adjust_poses`: poses of a capture that fit its images, near the given ones and in their frame.
+
+frames, given poses -> tracks (keypoints seen by several cameras) -> bundle adjustment -> the capture, moved
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from ssplat_jax.console import Reporter
+from ssplat_jax.data.capture import Capture
+from ssplat_jax.data.depth_range import estimate_depths
+from ssplat_jax.data.posed_image import invert_pose
+from ssplat_jax.poses.bundle_adjustment import Adjustment, Observations, adjust, moved
+from ssplat_jax.poses.tracks import find_tracks
+
+ROTATION_DEVIATION = 0.005
+"""Weight of the given rotations, radians. Below the error that they may have, half a degree as phones have after some
+time, since the errors of neighboring matches are alike: thousands of them tell less than as many independent ones."""
+TRANSLATION_DEVIATION = 0.005
+"""The same for their places, in median depths of the scene."""
+SCALES_DEGREES = (0.4, 0.2)
+"""Scales of the robust loss, one round after another."""
+MIN_TRACKS = 100
+"""Points with fewer of which poses stay as they are."""
+SMALLEST_ERROR_DEGREES = 0.25
+"""Median distance of points from where they were seen, with the given poses, below which those are right."""
+SMALLEST_RATIO = 2.0
+"""That distance over the one with adjusted poses, below which other things than poses are wrong."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class AdjustedPoses:
+    """The result of `adjust_poses`."""
+
+    capture: Capture  # with adjusted poses
+    are_off: bool  # whether the given poses explain the images clearly worse than the adjusted ones
+    error_before: float  # median distance of points from where they were seen, degrees
+    error_after: float
+    turn: float  # median rotation, degrees
+    shift: float  # median translation, in median depths of the scene
+    num_points: int
+
+    @property
+    def reason(self) -> str:
+        """A sentence on what was found."""
+        if not self.num_points:
+            return "poses stay: too few points were found in several images"
+        return (
+            f"poses {'are off' if self.are_off else 'fit'}: points lie {self.error_before:.2f} degrees from where they"
+            f" were seen, and {self.error_after:.2f} after turning cameras by {self.turn:.2f} degrees and moving them"
+            f" by {100 * self.shift:.1f} % of the depth"
+        )
+
+
+def adjust_poses(
+    capture: Capture, indices: Sequence[int] | None = None, advance: Callable[[int], None] = lambda done: None
+) -> AdjustedPoses:
+    """Adjusts the poses of the frames `indices` (default: all) to the images; other frames keep theirs.
+
+    Poses stay near the given ones, within what `ROTATION_DEVIATION` and `TRANSLATION_DEVIATION` make likely, and keep
+    their frame and unit. Only the frames `indices` are looked at.
+
+    Args:
+        capture: images with poses.
+        indices: frames to adjust.
+        advance: called with the number of frames that are looked at.
+
+    Limits:
+        With fewer than `MIN_TRACKS` points the poses stay. Cameras without a point keep their pose.
+    """
+    used = list(range(len(capture)) if indices is None else indices)
+    stays = AdjustedPoses(capture, False, 0.0, 0.0, 0.0, 0.0, 0)
+    if len(used) < 2:
+        return stays
+    depth = estimate_depths(capture, used).median
+    tracks = find_tracks(capture, used, depth, advance)
+    given = np.stack([invert_pose(capture.frames[i].camtoworld) for i in used])
+    # The world's origin may be far away: lengths are taken from the first camera.
+    origin = capture.frames[used[0]].center
+    local = given.copy()
+    local[:, :3, 3] = (given[:, :3, 3] + given[:, :3, :3] @ origin) / depth
+    Ks = np.stack([capture.K(i) for i in used])
+    seen = Observations(local, Ks, tracks.views, tracks.points, tracks.pixels)
+    if seen.num_points < MIN_TRACKS:
+        return stays
+    focal = float(np.median(Ks[:, 0, 0]))
+    scales = [focal * np.radians(scale) for scale in SCALES_DEGREES]
+    deviations = ROTATION_DEVIATION, TRANSLATION_DEVIATION
+    before, after = (adjust(seen, scales, deviations, is_fixed=fixed) for fixed in (True, False))
+    error_before, error_after = (_degrees(result, focal) for result in (before, after))
+    return AdjustedPoses(
+        capture=_with_viewmats(capture, used, moved(local, after.twists), origin, depth),
+        are_off=error_before > max(SMALLEST_ERROR_DEGREES, SMALLEST_RATIO * error_after),
+        error_before=error_before,
+        error_after=error_after,
+        turn=float(np.degrees(np.median(np.linalg.norm(after.twists[:, :3], axis=1)))),
+        shift=float(np.median(np.linalg.norm(after.twists[:, 3:], axis=1))),
+        num_points=seen.num_points,
+    )
+
+
+def adjust_if_asked(
+    capture: Capture, indices: Sequence[int], revise: Sequence[str], reporter: Reporter
+) -> AdjustedPoses | None:
+    """The adjusted poses of a stream that has not begun, if `revise` asks for them; says what was found.
+
+    Args:
+        capture: images with poses.
+        indices: frames to stream.
+        revise: names of effects, as of a refinement: `poses` adjusts them, `auto` only those that are off.
+        reporter: shows progress.
+    """
+    if not {"poses", "auto"} & set(revise):
+        return None
+    with reporter.progress("poses", len(indices), waiting="") as advance:
+        found = adjust_poses(capture, indices, advance)
+    reporter.say(found.reason)
+    return found if found.are_off or "poses" in revise else None
+
+
+def _degrees(result: Adjustment, focal: float) -> float:
+    """Median error as an angle."""
+    return float(np.degrees(np.median(result.errors) / focal))
+
+
+def _with_viewmats(
+    capture: Capture, used: Sequence[int], local: np.ndarray, origin: np.ndarray, depth: float
+) -> Capture:
+    """The capture with other poses of the frames `used`, given from the first camera and in median depths."""
+    frames = list(capture.frames)
+    for i, viewmat in zip(used, local, strict=True):
+        camtoworld = invert_pose(viewmat)
+        camtoworld[:3, 3] = camtoworld[:3, 3] * depth + origin
+        frames[i] = dataclasses.replace(frames[i], camtoworld=camtoworld)
+    return dataclasses.replace(capture, frames=tuple(frames))

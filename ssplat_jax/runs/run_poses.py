@@ -1,0 +1,70 @@
+"""Poses of a run that were adjusted before the stream: found once, kept in the folder, used by all that follows."""
+
+import dataclasses
+import json
+from collections.abc import Sequence
+
+import numpy as np
+
+from ssplat_jax.console import Reporter
+from ssplat_jax.data.capture import Capture
+from ssplat_jax.errors import StorageError
+from ssplat_jax.poses.adjust_poses import adjust_if_asked
+from ssplat_jax.storage.json_files import write_json
+from ssplat_jax.storage.run_folder import RunFolder
+
+
+def capture_to_stream(
+    capture: Capture, indices: Sequence[int], revise: Sequence[str], folder: RunFolder, reporter: Reporter
+) -> Capture:
+    """The capture with the poses that a run streams: adjusted ones, if `revise` asks for them.
+
+    Args:
+        capture: the capture as it was opened.
+        indices: frames to stream.
+        revise: names of effects; see `poses.adjust_poses.adjust_if_asked`.
+        folder: where a run keeps its adjusted poses; a run that is continued finds them there.
+        reporter: shows progress.
+
+    Raises:
+        StorageError: the folder cannot be written, or the saved poses are damaged.
+    """
+    if not {"poses", "auto"} & set(revise):
+        return capture
+    if folder.adjusted_poses.exists():
+        return with_poses_of_run(capture, folder)
+    found = adjust_if_asked(capture, indices, revise, reporter)
+    frames = {} if found is None else {str(i): found.capture.frames[i].camtoworld.tolist() for i in indices}
+    write_json(
+        folder.adjusted_poses, {"capture": capture.digest(indices), "indices": list(indices), "camtoworlds": frames}
+    )
+    return with_poses_of_run(capture, folder)
+
+
+def with_poses_of_run(capture: Capture, folder: RunFolder) -> Capture:
+    """`capture` with the adjusted poses that `folder` keeps; as it is, if there are none or if they are of another.
+
+    Raises:
+        StorageError: the saved poses are damaged.
+    """
+    if not folder.adjusted_poses.exists():
+        return capture
+    try:
+        saved = json.loads(folder.adjusted_poses.read_text())
+        indices = [int(i) for i in saved["indices"]]
+        poses = {int(i): np.array(pose, np.float64).reshape(4, 4) for i, pose in saved["camtoworlds"].items()}
+        given = str(saved["capture"])
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise StorageError(f"{folder.adjusted_poses}: damaged; --overwrite starts the run anew.") from error
+    if max(indices, default=0) >= len(capture) or capture.digest(indices) != given:
+        return capture  # its digest differs from that of the run, which says so
+    frames = [
+        dataclasses.replace(frame, camtoworld=poses[i]) if i in poses else frame
+        for i, frame in enumerate(capture.frames)
+    ]
+    return dataclasses.replace(capture, frames=tuple(frames))
+
+
+def has_adjusted_poses(folder: RunFolder) -> bool:
+    """Whether the stream of the run had adjusted poses."""
+    return folder.adjusted_poses.exists() and bool(json.loads(folder.adjusted_poses.read_text())["camtoworlds"])
