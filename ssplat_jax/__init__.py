@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from ssplat_jax.errors import StorageError as StorageError
     from ssplat_jax.gaussians import Gaussians as Gaussians
     from ssplat_jax.geometry.cameras import Camera as Camera
+    from ssplat_jax.poses.adjust_poses import adjust_poses as adjust_poses
     from ssplat_jax.rasterizer import Effects as Effects
     from ssplat_jax.rasterizer import RenderOutput as RenderOutput
     from ssplat_jax.rasterizer import fill_holes as fill_holes
@@ -58,6 +59,7 @@ _MODULES = {
     "StreamFrame": "data.stream_frame",
     "StreamSplat": "streaming.streamsplat",
     "VoxelCache": "cache",
+    "adjust_poses": "poses.adjust_poses",
     "check_cache": "cache",
     "ensure_capacity": "cache",
     "fill_holes": "rasterizer",

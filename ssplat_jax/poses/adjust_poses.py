@@ -76,11 +76,10 @@ def adjust_poses(
         return stays
     depth = estimate_depths(capture, used).median
     tracks = find_tracks(capture, used, depth, advance)
-    given = np.stack([invert_pose(capture.frames[i].camtoworld) for i in used])
-    # The world's origin may be far away: lengths are taken from the first camera.
-    origin = capture.frames[used[0]].center
-    local = given.copy()
-    local[:, :3, 3] = (given[:, :3, 3] + given[:, :3, :3] @ origin) / depth
+    # In the first camera's frame: the world's origin may be far away, and its axes must not matter.
+    first = capture.frames[used[0]].camtoworld
+    local = np.stack([invert_pose(capture.frames[i].camtoworld) @ first for i in used])
+    local[:, :3, 3] /= depth
     Ks = np.stack([capture.K(i) for i in used])
     seen = Observations(local, Ks, tracks.views, tracks.points, tracks.pixels)
     if seen.num_points < MIN_TRACKS:
@@ -91,7 +90,7 @@ def adjust_poses(
     before, after = (adjust(seen, scales, deviations, is_fixed=fixed) for fixed in (True, False))
     error_before, error_after = (_degrees(result, focal) for result in (before, after))
     return AdjustedPoses(
-        capture=_with_viewmats(capture, used, moved(local, after.twists), origin, depth),
+        capture=_with_viewmats(capture, used, moved(local, after.twists), depth),
         are_off=error_before > max(SMALLEST_ERROR_DEGREES, SMALLEST_RATIO * error_after),
         error_before=error_before,
         error_after=error_after,
@@ -125,13 +124,11 @@ def _degrees(result: Adjustment, focal: float) -> float:
     return float(np.degrees(np.median(result.errors) / focal))
 
 
-def _with_viewmats(
-    capture: Capture, used: Sequence[int], local: np.ndarray, origin: np.ndarray, depth: float
-) -> Capture:
-    """The capture with other poses of the frames `used`, given from the first camera and in median depths."""
-    frames = list(capture.frames)
+def _with_viewmats(capture: Capture, used: Sequence[int], local: np.ndarray, depth: float) -> Capture:
+    """The capture with other poses of the frames `used`, given in the first one's frame and in median depths."""
+    frames, first = list(capture.frames), capture.frames[used[0]].camtoworld
     for i, viewmat in zip(used, local, strict=True):
         camtoworld = invert_pose(viewmat)
-        camtoworld[:3, 3] = camtoworld[:3, 3] * depth + origin
-        frames[i] = dataclasses.replace(frames[i], camtoworld=camtoworld)
+        camtoworld[:3, 3] *= depth
+        frames[i] = dataclasses.replace(frames[i], camtoworld=first @ camtoworld)
     return dataclasses.replace(capture, frames=tuple(frames))

@@ -70,6 +70,19 @@ def test_pivot_behind_the_near_plane_is_invisible(z):
     assert not np.any(jit_project(with_pivots([[0.0, 0.0, z]]), front_camera(), CONFIG).mask)
 
 
+@pytest.mark.parametrize(("place", "is_seen"), [((4.0, 0.0), True), ((8.0, 0.0), False), ((4.0, 6.0), False),
+                                                ((0.0, 3.0), True), ((4.0, -0.01), False)])  # fmt: skip
+def test_pixels_hold_their_left_and_upper_edges(place, is_seen):
+    """A pivot on the right or lower border of one view must not show in the next one."""
+    one = front_camera()
+    camera = jax.tree.map(lambda x: jnp.concatenate([x, x]), one)
+    K = np.asarray(one.Ks[0])
+    x, y = ((place[i] - K[i, 2]) / K[i, i] * 2.0 for i in (0, 1))
+    found = np.argwhere(np.asarray(jit_project(with_pivots([[x, y, 2.0]]), camera, CONFIG).mask)).tolist()
+    row, column = int(place[1]), int(place[0])
+    assert found == ([[0, row, column], [1, row, column]] if is_seen else [])
+
+
 def test_pivot_of_confidence_zero_occludes_nothing():
     cache = with_pivots([[0.0, 0.0, 1.0], [0.0, 0.0, 3.0]], confidences=[0.0, 0.5])
     assert jit_project(cache, front_camera(), CONFIG).depths[0, 3, 4] == pytest.approx(3.0, rel=VALUE_RTOL)

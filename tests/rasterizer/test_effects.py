@@ -13,7 +13,7 @@ from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.pytree import replace
 from ssplat_jax.rasterizer import Effects, effects_for, filter_3d, render
 from ssplat_jax.rasterizer.lens_distortion import distort
-from ssplat_jax.rasterizer.projection import project
+from ssplat_jax.rasterizer.projection import project, tangent_bounds
 from ssplat_jax.rasterizer.reference import render_reference
 from tests.rasterizer.scenes import cameras, cloud, concatenate
 
@@ -309,3 +309,20 @@ def test_effects_given_as_lists_are_hashable():
 def test_a_background_has_three_parts():
     with pytest.raises(InputError, match="three numbers"):
         Effects(background=(1.0, 0.0))
+
+
+@pytest.mark.parametrize("center", [32.0, 20.0, -8.0])
+def test_bounds_of_the_jacobian_widen_outwards_on_every_side(center):
+    """The bounds of a mirrored camera are the mirrored bounds, with and without a lens that sees farther."""
+    K = jnp.array([[40.0, 0, center], [0, 40, 24], [0, 0, 1]])
+    view, mirrored = (Camera(viewmats=jnp.eye(4)[None], Ks=k[None], width=64, height=48)
+                      for k in (K, K.at[0, 2].set(64 - center)))  # fmt: skip
+    for wider in (None, jnp.full((1, 1), 1.5)):
+        left, right, upper, lower = (float(x[0, 0]) for x in tangent_bounds(view, wider))
+        other_left, other_right, *_ = (float(x[0, 0]) for x in tangent_bounds(mirrored, wider))
+        assert (left, right, upper) == pytest.approx((-other_right, -other_left, -lower), rel=1e-6)
+    plain = [float(x[0, 0]) for x in tangent_bounds(view)]
+    wide = [left, right, upper, lower]
+    assert wide[0] <= plain[0] and wide[1] >= plain[1] and wide[2] < plain[2] and wide[3] > plain[3]
+    if center > 0:
+        assert wide[0] == pytest.approx(1.5 * plain[0]) and wide[1] == pytest.approx(1.5 * plain[1])

@@ -1,0 +1,114 @@
+"""Adjusted poses of a small room: wrong ones are found and put right, exact ones stay, and nothing else is touched."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from ssplat_jax.console import Reporter
+from ssplat_jax.data.capture import Capture
+from ssplat_jax.data.images import ArrayPixels
+from ssplat_jax.data.posed_image import Frame
+from ssplat_jax.poses import adjust_poses as module
+from ssplat_jax.poses.adjust_poses import adjust_if_asked, adjust_poses
+from tests.poses.room_fixture import HEIGHT, WIDTH, K, pictures, walk
+
+NUM = 8
+CONTEXT = [i for i in range(NUM) if i != 4]
+
+
+def capture_of(poses, images):
+    frames = tuple(Frame(f"{i}.png", pose, K, WIDTH, HEIGHT) for i, pose in enumerate(poses))
+    pixels = ArrayPixels(images, np.zeros(images.shape[:3], np.float32))
+    return Capture("room", "test", frames, pixels, WIDTH, HEIGHT)
+
+
+@pytest.fixture(scope="module")
+def exact():
+    poses = walk(NUM)
+    return capture_of(poses, np.stack(pictures(poses)).astype(np.float32) / 255)
+
+
+def with_wrong_poses(capture, seed=0):
+    rng, frames = np.random.default_rng(seed), list(capture.frames)
+    for i in CONTEXT[1:]:
+        turn, shift = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
+        pose = frames[i].camtoworld.copy()
+        pose[:3, :3] = pose[:3, :3] @ Rotation.from_rotvec(np.radians(0.5) * turn).as_matrix()
+        pose[:3, 3] += 0.02 * shift  # 1 % of the depth
+        frames[i] = dataclasses.replace(frames[i], camtoworld=pose)
+    return dataclasses.replace(capture, frames=tuple(frames))
+
+
+@pytest.fixture(scope="module")
+def wrong(exact):
+    return with_wrong_poses(exact)
+
+
+@pytest.fixture(scope="module")
+def adjusted(wrong):
+    return adjust_poses(wrong, CONTEXT)
+
+
+def turns(capture, exact):
+    """Degrees by which the motion from each context camera to the next differs from the exact one."""
+    R = [np.stack([c.frames[i].camtoworld[:3, :3] for i in CONTEXT]) for c in (capture, exact)]
+    steps = [r[1:].transpose(0, 2, 1) @ r[:-1] for r in R]
+    return np.degrees(Rotation.from_matrix(steps[0] @ steps[1].transpose(0, 2, 1)).magnitude())
+
+
+def test_wrong_poses_are_found_and_put_right(adjusted, wrong, exact):
+    assert adjusted.are_off and adjusted.error_before > 0.3
+    assert turns(adjusted.capture, exact).mean() < turns(wrong, exact).mean() / 3
+    assert adjusted.error_after < adjusted.error_before / 3
+    assert "are off" in adjusted.reason
+
+
+def test_exact_poses_are_not_called_off_and_hardly_move(exact):
+    found = adjust_poses(exact, CONTEXT)
+    assert not found.are_off and found.turn < 0.1 and "fit" in found.reason
+
+
+def test_frames_that_are_not_named_keep_their_pose_and_are_not_looked_at(adjusted, wrong):
+    assert adjusted.capture.frames[4] is wrong.frames[4]
+    images = np.stack([wrong.image(i) for i in range(NUM)])
+    images[4] = np.nan
+    blind = dataclasses.replace(wrong, pixels=ArrayPixels(images, np.zeros(images.shape[:3], np.float32)))
+    again = adjust_poses(blind, CONTEXT)
+    np.testing.assert_array_equal(again.capture.camtoworlds, adjusted.capture.camtoworlds)
+
+
+def test_the_frame_and_the_unit_of_the_poses_stay(adjusted, wrong):
+    """The capture in millimeters, 10 km away and turned, has the same adjustment."""
+    turn, scale, shift = Rotation.from_euler("xyz", [0.3, 1.0, -0.4]).as_matrix(), 1000.0, np.array([1e7, 2e6, -3e6])
+
+    def moved_to(pose):
+        out = pose.copy()
+        out[:3, :3], out[:3, 3] = turn @ pose[:3, :3], scale * turn @ pose[:3, 3] + shift
+        return out
+
+    frames = tuple(dataclasses.replace(f, camtoworld=moved_to(f.camtoworld)) for f in wrong.frames)
+    there = adjust_poses(dataclasses.replace(wrong, frames=frames), CONTEXT).capture.camtoworlds
+    here = np.stack([moved_to(pose) for pose in adjusted.capture.camtoworlds])
+    np.testing.assert_allclose(there[:, :3, :3], here[:, :3, :3], atol=1e-5)
+    np.testing.assert_allclose(there[:, :3, 3], here[:, :3, 3], atol=0.05)
+
+
+def test_a_capture_without_matches_keeps_its_poses(exact):
+    flat = ArrayPixels(np.full((NUM, HEIGHT, WIDTH, 3), 0.5, np.float32), np.zeros((NUM, HEIGHT, WIDTH), np.float32))
+    bare = dataclasses.replace(exact, pixels=flat)
+    found = adjust_poses(bare)
+    assert found.capture is bare and not found.are_off and "stay" in found.reason
+    assert adjust_poses(exact, [3]).capture is exact
+
+
+def test_effects_decide_whether_poses_are_adjusted(adjusted, wrong, monkeypatch):
+    quiet, found = Reporter(quiet=True), []
+    monkeypatch.setattr(module, "adjust_poses", lambda *given: found.pop())
+    fits = dataclasses.replace(adjusted, are_off=False)
+    assert adjust_if_asked(wrong, CONTEXT, (), quiet) is None
+    assert adjust_if_asked(wrong, CONTEXT, ("exposures",), quiet) is None
+    for revise, result, wanted in ((("auto",), fits, None), (("auto",), adjusted, adjusted), (("poses",), fits, fits)):
+        found.append(result)
+        assert adjust_if_asked(wrong, CONTEXT, revise, quiet) is wanted

@@ -1,0 +1,109 @@
+"""A run with adjusted poses: found once, kept in its folder, used by all that follows."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from ssplat_jax.checkpoint.weights import load_params
+from ssplat_jax.config import preset
+from ssplat_jax.console import Reporter
+from ssplat_jax.data.open_capture import open_capture
+from ssplat_jax.errors import InputError, StorageError
+from ssplat_jax.poses import adjust_poses as adjusting
+from ssplat_jax.poses.adjust_poses import AdjustedPoses
+from ssplat_jax.runs.capture_run import run_capture
+from ssplat_jax.runs.export_cameras import open_cameras
+from ssplat_jax.runs.refine_run import refine_run
+from ssplat_jax.runs.run_poses import capture_to_stream, with_poses_of_run
+from ssplat_jax.storage.run_folder import RunFolder
+from ssplat_jax.streaming.streamsplat import StreamSplat
+
+CAPTURE, SIZE = "procedural:room?frames=4", (64, 48)
+SHIFT = np.array([0.01, 0.0, 0.02])
+
+
+def moved(capture, indices, advance=None, are_off=True):
+    """An adjustment that moves every frame by the same shift."""
+    frames = list(capture.frames)
+    for i in indices:
+        pose = frames[i].camtoworld.copy()
+        pose[:3, 3] += SHIFT
+        frames[i] = dataclasses.replace(frames[i], camtoworld=pose)
+    return AdjustedPoses(dataclasses.replace(capture, frames=tuple(frames)), are_off, 0.5, 0.1, 0.4, 0.01, 500)
+
+
+def must_not_be_called(*given):
+    raise AssertionError("poses were adjusted again")
+
+
+def run(out, revise=("poses",), overwrite=False):
+    options = {"size": SIZE, "stride": 1, "max_views": None, "save_every": 8, "overwrite": overwrite, "revise": revise}
+    return run_capture(
+        StreamSplat(preset("tiny")), load_params("tiny"), CAPTURE, out, **options, reporter=Reporter(quiet=True)
+    )
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """Folder of a finished run of four small frames whose poses were moved."""
+    out = tmp_path_factory.mktemp("adjusted")
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(adjusting, "adjust_poses", moved)
+        run(out)
+    return out
+
+
+def test_the_stream_and_all_that_follows_see_the_adjusted_poses(finished, monkeypatch):
+    monkeypatch.setattr(adjusting, "adjust_poses", must_not_be_called)
+    given = open_capture(CAPTURE, size=SIZE)
+    wanted = moved(given, range(4)).capture.camtoworlds
+    assert run(finished).was_finished
+    cameras = open_cameras(CAPTURE, finished, finished / "scene.sog")
+    np.testing.assert_array_equal(cameras.capture.camtoworlds, wanted)
+    result = refine_run(
+        finished,
+        CAPTURE,
+        load_params("tiny"),
+        steps=1,
+        revise=("poses",),
+        save_every=1,
+        overwrite=True,
+        reporter=Reporter(quiet=True),
+    )
+    assert result.num_steps == 1
+    assert json.loads(RunFolder(finished).refinement.read_text())["revised"] == []  # no gradient moves them again
+
+
+def test_a_run_without_them_is_another_run(finished):
+    with pytest.raises(InputError, match="differs in its poses"):
+        run(finished, revise=())
+
+
+def test_poses_that_fit_are_kept_and_not_judged_twice(tmp_path, monkeypatch):
+    capture, quiet = open_capture(CAPTURE, size=SIZE), Reporter(quiet=True)
+    fits = lambda *given: moved(*given, are_off=False)  # noqa: E731
+    monkeypatch.setattr(adjusting, "adjust_poses", fits)
+    first = capture_to_stream(capture, range(4), ("auto",), RunFolder(tmp_path), quiet)
+    monkeypatch.setattr(adjusting, "adjust_poses", must_not_be_called)
+    second = capture_to_stream(capture, range(4), ("auto",), RunFolder(tmp_path), quiet)
+    for kept in (first, second):
+        np.testing.assert_array_equal(kept.camtoworlds, capture.camtoworlds)
+    assert capture_to_stream(capture, range(4), ("focal",), RunFolder(tmp_path), quiet) is capture
+
+
+def test_saved_poses_of_another_capture_are_not_used(finished):
+    other = open_capture("procedural:room?frames=4&seed=5", size=SIZE)
+    other = moved(other, [2]).capture
+    assert with_poses_of_run(other, RunFolder(finished)) is other
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"capture": "x", "indices": [0], "camtoworlds": {"0": [1, 2]}}'])
+def test_damaged_poses_are_named(tmp_path, text):
+    folder = RunFolder(tmp_path)
+    folder.adjusted_poses.write_text(text)
+    with pytest.raises(StorageError, match="adjusted_poses.json: damaged; --overwrite"):
+        with_poses_of_run(open_capture(CAPTURE, size=SIZE), folder)
+    folder.clear_run()
+    assert not folder.adjusted_poses.exists()
