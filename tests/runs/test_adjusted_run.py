@@ -103,7 +103,7 @@ def test_saved_poses_of_another_capture_are_not_used(finished):
 def test_damaged_poses_are_named(tmp_path, text):
     folder = RunFolder(tmp_path)
     folder.adjusted_poses.write_text(text)
-    with pytest.raises(StorageError, match="adjusted_poses.json: damaged; --overwrite"):
+    with pytest.raises(StorageError, match=r"adjusted_poses\.json: damaged; --overwrite"):
         with_poses_of_run(open_capture(CAPTURE, size=SIZE), folder)
     folder.clear_run()
     assert not folder.adjusted_poses.exists()
