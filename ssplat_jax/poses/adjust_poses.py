@@ -67,6 +67,12 @@ def adjust_poses(
         indices: frames to adjust.
         advance: called with the number of frames that are looked at.
 
+    Returns:
+        The capture with adjusted poses, and what was found.
+
+    Raises:
+        InputError: an image is damaged.
+
     Limits:
         With fewer than `MIN_TRACKS` points the poses stay. Cameras without a point keep their pose.
     """
@@ -110,6 +116,9 @@ def adjust_if_asked(
         indices: frames to stream.
         revise: names of effects, as of a refinement: `poses` adjusts them, `auto` only those that are off.
         reporter: shows progress.
+
+    Returns:
+        The adjusted poses; None if they are not asked for, or if `auto` finds that the given ones fit.
     """
     if not {"poses", "auto"} & set(revise):
         return None

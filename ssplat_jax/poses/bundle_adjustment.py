@@ -83,6 +83,9 @@ def adjust(
         deviations: standard deviations of the given poses: rotation in radians, translation in median depths.
         is_fixed: keep the cameras, and place the points alone.
 
+    Returns:
+        Twists of the cameras, places of the points, and the errors that are left.
+
     Limits:
         Cameras without an observation keep their pose. A point on nearly parallel rays is held at a finite depth.
     """

@@ -54,6 +54,8 @@ def with_poses_of_run(capture: Capture, folder: RunFolder) -> Capture:
         indices = [int(i) for i in saved["indices"]]
         poses = {int(i): np.array(pose, np.float64).reshape(4, 4) for i, pose in saved["camtoworlds"].items()}
         given = str(saved["capture"])
+        if not all(np.isfinite(pose).all() for pose in poses.values()):
+            raise ValueError("a pose is not finite")
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise StorageError(f"{folder.adjusted_poses}: damaged; --overwrite starts the run anew.") from error
     if max(indices, default=0) >= len(capture) or capture.digest(indices) != given:

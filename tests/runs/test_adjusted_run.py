@@ -99,7 +99,12 @@ def test_saved_poses_of_another_capture_are_not_used(finished):
     assert with_poses_of_run(other, RunFolder(finished)) is other
 
 
-@pytest.mark.parametrize("text", ["", "[]", "{}", '{"capture": "x", "indices": [0], "camtoworlds": {"0": [1, 2]}}'])
+NOT_FINITE = json.dumps({"capture": "x", "indices": [0], "camtoworlds": {"0": np.full((4, 4), np.nan).tolist()}})
+
+
+@pytest.mark.parametrize(
+    "text", ["", "[]", "{}", '{"capture": "x", "indices": [0], "camtoworlds": {"0": [1, 2]}}', NOT_FINITE]
+)
 def test_damaged_poses_are_named(tmp_path, text):
     folder = RunFolder(tmp_path)
     folder.adjusted_poses.write_text(text)
