@@ -30,9 +30,10 @@ from ssplat_jax.refinement.revision import sizes
 from ssplat_jax.streaming.session import Revise
 from ssplat_jax.streaming.streamsplat import ChunkOutput, StreamSplat, shown_pivots
 
-GAINS = {"means": 20.0, "quats": 1.0, "log_scales": 10.0, "logit_opacities": 30.0, "colors": 0.6}
+GAINS = {"means": 12.0, "quats": 0.2, "log_scales": 6.0, "logit_opacities": 6.0, "colors": 0.12}
 """Step of each part over its mean gradient in the pixels that a Gaussian fills. Newton's method would divide by the
-squared change of a pixel that the part causes; several Gaussians answer for a pixel, so the gains are smaller."""
+squared change of a pixel that the part causes. The gains are far smaller: several Gaussians answer for a pixel, and a
+Gaussian should follow the mean of its views, not the one that was shown last."""
 
 CAPS = {"means": 0.2, "quats": 0.02, "log_scales": 0.1, "logit_opacities": 0.5, "colors": 0.2}
 """Largest step of each part. Places are in units of the Gaussian's own size."""
