@@ -153,7 +153,7 @@ def check_refinement(steps: int, revise: tuple[str, ...], flag: str) -> None:
     """
     if steps < 0:
         raise InputError(f"{flag}: wanted a number of steps of at least 0, got {steps}.")
-    if set(revise) - {"poses"} and not steps:
+    if set(revise) - {"poses", "auto"} and not steps:  # poses are adjusted before the stream
         raise InputError(f"--revise: wanted {flag} beside it, got 0 steps; for example {flag} 100.")
     if "auto" in revise and len(revise) > 1:
         raise InputError(f"--revise: wanted auto alone or effects by name, got {' '.join(revise)}.")
