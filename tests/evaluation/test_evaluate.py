@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +12,7 @@ from ssplat_jax.cache import init_cache
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import Split
+from ssplat_jax.evaluation import evaluate as evaluation
 from ssplat_jax.evaluation import latency
 from ssplat_jax.evaluation.exposures import exposures_from_json, exposures_to_json
 from ssplat_jax.evaluation.latency import measure_latency
@@ -19,6 +21,7 @@ from ssplat_jax.evaluation.scoring import baselines, score_view
 from ssplat_jax.gaussians import Gaussians, mean_color
 from ssplat_jax.metrics.lpips import load_lpips, lpips
 from ssplat_jax.metrics.psnr_ssim import psnr, ssim
+from ssplat_jax.poses.adjust_poses import AdjustedPoses
 from ssplat_jax.streaming.session import Session
 from ssplat_jax.streaming.streamsplat import StreamSplat
 from tests.metrics.lpips_fixture import random_heads, random_vgg
@@ -144,3 +147,50 @@ def test_lpips_is_scored_if_and_only_if_weights_are_given(capture, compiled_plai
         assert given == pytest.approx(expected, rel=1e-5) and expected > 0.1
     plain = score_view(scene, capture, 2, frame, {}).score
     assert plain.shown.lpips is None and plain.literal.lpips is None
+
+
+class Stop(Exception):
+    """Ends an evaluation where the test has seen enough."""
+
+
+def test_adjusted_poses_are_streamed_and_targets_keep_theirs(tmp_path, monkeypatch):
+    capture, split = open_capture("procedural:room?frames=8&size=48x32"), Split("test", (0, 1, 2, 3, 5, 6, 7), (4,))
+    frames = [
+        dataclasses.replace(f, camtoworld=f.camtoworld + np.eye(4, k=3) * 0.01 * (i != 4))
+        for i, f in enumerate(capture.frames)
+    ]
+    moved = dataclasses.replace(capture, frames=tuple(frames))
+    seen = {}
+
+    def adjust(given, indices, revise, reporter):
+        assert given.camtoworlds.tolist() == capture.camtoworlds.tolist() and tuple(indices) == split.context
+        return AdjustedPoses(moved, True, 0.5, 0.1, 0.5, 0.01, 200) if "poses" in revise else None
+
+    def feed(session, streamed, *rest, **options):
+        seen["streamed"] = streamed.camtoworlds
+        return {i: np.ones(3) for i in split.context}, []
+
+    def refine(gaussians, streamed, context, frame, exposures, steps, revise, reporter):
+        seen["refined"], seen["revise"] = streamed.camtoworlds, list(revise)
+        raise Stop
+
+    monkeypatch.setattr(evaluation, "adjust_if_asked", adjust)
+    monkeypatch.setattr(evaluation, "feed_capture", feed)
+    monkeypatch.setattr(evaluation, "score_view", lambda *given: SimpleNamespace(score=None))
+    monkeypatch.setattr(evaluation, "_refine", refine)
+    session = SimpleNamespace(
+        model=SimpleNamespace(config=StreamConfig()),
+        compile_seconds=0.0,
+        num_compilations=0,
+        step_memory_bytes=0,
+        refine_memory_bytes=None,
+        cache_facts=lambda: {"decoded": 0},
+        gaussians=lambda: None,
+    )
+    for revise, wanted in ((("poses", "focal"), moved), (("focal",), capture)):
+        with pytest.raises(Stop):
+            evaluation.evaluate.__wrapped__(session, capture, split, tmp_path / "out", refine_steps=2, revise=revise)
+        np.testing.assert_array_equal(seen["streamed"], wanted.camtoworlds)
+        np.testing.assert_array_equal(seen["refined"], wanted.camtoworlds)
+        assert seen["revise"] == ["focal"]
+    np.testing.assert_array_equal(moved.camtoworlds[4], capture.camtoworlds[4])

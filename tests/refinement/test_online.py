@@ -11,12 +11,13 @@ import pytest
 from ssplat_jax.cache import Tokens, fuse, init_cache
 from ssplat_jax.cache.key_views import KeyViews
 from ssplat_jax.cache.residuals import WIDTH as RESIDUAL_WIDTH
-from ssplat_jax.cache.residuals import unpack
+from ssplat_jax.cache.residuals import Residuals, unpack
 from ssplat_jax.cache.state import with_refinement
 from ssplat_jax.checkpoint.stream_state import load_state, save_state
 from ssplat_jax.chunk import Chunk
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.errors import InputError
+from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.geometry.voxels import voxel_indices
 from ssplat_jax.metrics.psnr_ssim import psnr
@@ -24,7 +25,13 @@ from ssplat_jax.model.compact.gaussian_head import GaussianHead
 from ssplat_jax.model.params import init_params
 from ssplat_jax.pytree import replace
 from ssplat_jax.rasterizer import render
-from ssplat_jax.refinement.online import nearest_pivots, online_refinement, revise_scene, views_of_round
+from ssplat_jax.refinement.online import (
+    nearest_pivots,
+    online_refinement,
+    online_step,
+    revise_scene,
+    views_of_round,
+)
 from ssplat_jax.streaming.scene_delta import SceneFeed, apply_delta
 from ssplat_jax.streaming.session import Session
 from ssplat_jax.streaming.streamsplat import ChunkOutput, StreamSplat
@@ -313,3 +320,30 @@ def test_cameras_are_those_of_the_chunk():
     camera: Camera = views.camera(1)
     np.testing.assert_array_equal(camera.viewmats, chunk().viewmats[1])
     np.testing.assert_array_equal(views.images, np.round(np.asarray(chunk().images) * 255).astype(np.uint8))
+
+
+def test_a_gaussian_follows_the_mean_of_its_views():
+    """Two photographs of one place disagree: the color stays near their mean, whichever was shown last."""
+    base = Gaussians.from_rgb(
+        means=jnp.array([[0.0, 0.0, 2.0]]),
+        quats=jnp.array([[1.0, 0, 0, 0]]),
+        scales=jnp.full((1, 3), 4.0),
+        opacities=jnp.array([0.98]),
+        colors=jnp.full((1, 3), 0.3),
+    )
+    K = jnp.array([[FOCAL, 0, WIDE / 2], [0, FOCAL, HIGH / 2], [0, 0, 1]])
+    images = jnp.stack([jnp.full((HIGH, WIDE, 3), value) for value in (0.3, 0.7)])
+    views = KeyViews.of(Camera(viewmats=jnp.tile(jnp.eye(4), (2, 1, 1)), Ks=jnp.tile(K, (2, 1, 1)), width=WIDE,
+                               height=HIGH), images, None)  # fmt: skip
+    zeros = Residuals(*(jnp.zeros((1, n)) for n in (3, 4, 3)), jnp.zeros(1), jnp.zeros((1, 3)))
+    only_colors = lambda new: replace(zeros, colors=new.colors)  # noqa: E731
+
+    def step(residuals, view):
+        one = jax.tree.map(lambda x: x[view], views)
+        residuals = only_colors(online_step(base, residuals, one, max_pairs=4096, max_scale=10.0))
+        return residuals, residuals.colors[0, 0]
+
+    colors = 0.3 + np.asarray(jax.lax.scan(step, zeros, jnp.arange(120) % 2)[1])
+    settled = colors[-20:]
+    assert abs(settled.mean() - 0.5) < 0.03
+    assert np.abs(settled - settled.mean()).max() < 0.03
