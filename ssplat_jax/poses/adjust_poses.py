@@ -16,18 +16,19 @@ from ssplat_jax.poses.bundle_adjustment import Adjustment, Observations, adjust,
 from ssplat_jax.poses.tracks import find_tracks
 
 ROTATION_DEVIATION = 0.005
-"""Weight of the given rotations, radians. Below the error that they may have, half a degree as phones have after some
-time, since the errors of neighboring matches are alike: thousands of them tell less than as many independent ones."""
+"""Assumed error of the given rotations in radians. Real errors are larger, half a degree on phones after some time. The
+smaller value gives the given poses more weight: errors of neighboring matches are alike, and thousands of them tell
+less than as many independent ones."""
 TRANSLATION_DEVIATION = 0.005
-"""The same for their places, in median depths of the scene."""
+"""Assumed error of the given places, in median depths of the scene."""
 SCALES_DEGREES = (0.4, 0.2)
 """Scales of the robust loss, one round after another."""
 MIN_TRACKS = 100
-"""Points with fewer of which poses stay as they are."""
+"""Fewest points from which poses are adjusted."""
 SMALLEST_ERROR_DEGREES = 0.25
-"""Median distance of points from where they were seen, with the given poses, below which those are right."""
+"""Smallest error that calls poses off: median distance of points from where they were seen, with the given poses."""
 SMALLEST_RATIO = 2.0
-"""That distance over the one with adjusted poses, below which other things than poses are wrong."""
+"""Smallest ratio of that error to the one with adjusted poses that calls poses off; below, other things are wrong."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -29,7 +29,7 @@ FAR_WEIGHT = 1e-4
 MIN_DEPTH = 0.01
 """Depth before a camera, in median depths of the scene, below which a point has no residual but a constant cost."""
 HIDDEN_COST = float(np.log1p(100.0))
-"""That cost: of a residual of ten scales."""
+"""Loss of such a point: that of a residual of ten scales."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -17,21 +17,21 @@ from skimage.feature import SIFT
 from ssplat_jax.data.sparse_matches import PosedImages, epipolar_distances, mutual_nearest, pixel_rays
 
 LONG_SIDE = 640
-"""Pixels of the working image; larger images are reduced."""
+"""Longer side of the working image in pixels; larger images are reduced."""
 MIN_SIDE = 16
-"""Pixels; SIFT needs some octaves."""
+"""Shortest side of a working image in pixels: SIFT needs some octaves."""
 NUM_PARTNERS = 8
-"""Cameras most like each camera with which it is matched."""
+"""Cameras that each camera is matched with: those most like it."""
 MAX_AXIS_DEGREES = 40.0
-"""Between the optical axes of a pair."""
+"""Largest angle between the optical axes of a pair."""
 DEGREES_OF_DEPTH = 60.0
 """Angle between axes that makes cameras as unlike as a distance of one median depth does."""
 MAX_EPIPOLAR_DEGREES = 1.6
-"""From a match to its epipolar line: poses may be wrong by that much."""
+"""Largest distance of a match from its epipolar line: poses may be wrong by that much."""
 MAX_DISTANCE, MAX_RATIO = 0.7, 0.8
-"""Between descriptors of length 1: of a match, and over the second best."""
+"""Largest distance between the descriptors of a match, whose length is 1, and its ratio to the second smallest."""
 MIN_MATCHES = 10
-"""Of a pair; fewer are mostly false."""
+"""Fewest matches of a pair; fewer are mostly false."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
