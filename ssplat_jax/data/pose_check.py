@@ -23,6 +23,7 @@ from ssplat_jax.data.sparse_matches import (
     PosedImages,
     epipolar_distances,
     match,
+    motion_between,
     pixel_rays,
     triangulate,
 )
@@ -120,7 +121,7 @@ def fit_poses(
 
 def _num_consistent(pair: MatchedPair, a: Float64[np.ndarray, "4 4"], b: Float64[np.ndarray, "4 4"]) -> int:
     """Number of matches near their epipolar lines whose points are in front of the first camera."""
-    R, t = b[:3, :3].T @ a[:3, :3], b[:3, :3].T @ (a[:3, 3] - b[:3, 3])
+    R, t = motion_between(a, b)
     rays_a, rays_b = pair.rays
     if np.linalg.norm(t) == 0:
         return 0

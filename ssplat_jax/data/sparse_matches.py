@@ -77,8 +77,7 @@ def detect_keypoints(image: Float32[np.ndarray, "h w 3"]) -> Keypoints:
     size = (round(width / shrink), round(height / shrink))
     if min(size) < MIN_SIDE:
         return nothing
-    gray = Image.fromarray(np.ascontiguousarray(image @ np.array([0.299, 0.587, 0.114], np.float32)))
-    small = np.asarray(gray.resize(size, Image.Resampling.BICUBIC), np.float64)
+    small = gray_image(image, size)
     dark, bright = np.quantile(small, [0.01, 0.99])
     if bright - dark < FULL_CONTRAST:  # night or fog: corners are equally sharp, but faint
         small = (small - dark) * min(FULL_CONTRAST / max(bright - dark, 1e-9), MAX_STRETCH)
@@ -89,6 +88,12 @@ def detect_keypoints(image: Float32[np.ndarray, "h w 3"]) -> Keypoints:
         return nothing
     pixels = (detector.keypoints[:, ::-1] + 0.5) * np.array([width / size[0], height / size[1]])
     return Keypoints(pixels=pixels, descriptors=detector.descriptors.astype(bool), pixel=shrink)
+
+
+def gray_image(image: Float32[np.ndarray, "h w 3"], size: tuple[int, int]) -> Float64[np.ndarray, "h2 w2"]:
+    """Returns an image in gray at another size (width, height)."""
+    gray = Image.fromarray(np.ascontiguousarray(image @ np.array([0.299, 0.587, 0.114], np.float32)))
+    return np.asarray(gray.resize(size, Image.Resampling.BICUBIC), np.float64)
 
 
 def keypoints_of(capture: PosedImages) -> KeypointsOf:
@@ -109,7 +114,7 @@ def triangulate_pair(capture: PosedImages, i: int, j: int, keypoints: KeypointsO
         The points, with `close` empty, or None if there are fewer than `MIN_POINTS`.
     """
     a, b = capture.frames[i].camtoworld, capture.frames[j].camtoworld
-    R, t = b[:3, :3].T @ a[:3, :3], b[:3, :3].T @ (a[:3, 3] - b[:3, 3])  # camera i -> camera j
+    R, t = motion_between(a, b)
     ka, kb = keypoints(i), keypoints(j)
     rays_a, rays_b = pixel_rays(capture.K(i), ka.pixels), pixel_rays(capture.K(j), kb.pixels)
     near_line = epipolar_distances(rays_a, rays_b, R, t) < MAX_EPIPOLAR_PX * kb.pixel / capture.K(j)[0, 0]
@@ -121,6 +126,13 @@ def triangulate_pair(capture: PosedImages, i: int, j: int, keypoints: KeypointsO
     _, cell, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
     weights = 1 / counts[cell.ravel()]
     return CommonPoints(inverse_depths=inverse_depths, parallax=parallax, weights=weights, close=np.zeros(0))
+
+
+def motion_between(
+    a: Float64[np.ndarray, "4 4"], b: Float64[np.ndarray, "4 4"]
+) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, "3"]]:
+    """Returns rotation and translation from camera a to camera b, whose camera-to-world poses are given."""
+    return b[:3, :3].T @ a[:3, :3], b[:3, :3].T @ (a[:3, 3] - b[:3, 3])
 
 
 def pixel_rays(K: Float64[np.ndarray, "3 3"], pixels: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarray, "n 3"]:

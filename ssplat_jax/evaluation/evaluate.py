@@ -77,9 +77,8 @@ def evaluate(
     make_writable(out)  # before the long part
     folder.clear_targets()  # they may be of another split
     adjusted = adjust_if_asked(streamed, split.context, revise, reporter)
-    if adjusted is not None:  # poses of the context alone; gradients would then follow errors of the scene
+    if adjusted is not None:  # poses of the context alone
         capture, streamed = (dataclasses.replace(x, frames=adjusted.capture.frames) for x in (capture, streamed))
-        revise = [name for name in revise if name != "poses"]
     frame = streamed.stream_frame(session.model.config, split.context)
     reporter.warn_all(*capture.notes, frame.warning)
     reference = baselines(capture, split)
@@ -104,7 +103,17 @@ def evaluate(
     gaussians, refinement = session.gaussians(), {}
     if refine_steps:
         before = [score_view(gaussians, capture, i, frame, exposures, lpips_weights).score for i in split.targets]
-        refined, done = _refine(gaussians, streamed, split.context, frame, exposures, refine_steps, revise, reporter)
+        refined, done = _refine(
+            gaussians,
+            streamed,
+            split.context,
+            frame,
+            exposures,
+            refine_steps,
+            revise,
+            poses_stay=adjusted is not None,
+            reporter=reporter,
+        )
         gaussians, exposures = refined.gaussians, refined.exposures
         refinement = {"refinement": {**done, "before": mean_scores(before)}}
     middle = capture.camera(split.targets[len(split.targets) // 2], frame)
@@ -156,6 +165,8 @@ def _refine(
     exposures: Exposures,
     steps: int,
     revise: Sequence[str],
+    *,
+    poses_stay: bool,
     reporter: Reporter,
 ) -> tuple[CaptureRefinement, dict]:
     """The scene refined on its context views, and what that took."""
@@ -169,6 +180,7 @@ def _refine(
             exposures,
             steps=steps,
             revise=revise,
+            poses_stay=poses_stay,
             on_step=lambda step, loss: advance(step, f"loss {loss:.4f}"),
         )
     report = refined.report

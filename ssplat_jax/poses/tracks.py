@@ -11,10 +11,16 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int
-from PIL import Image
 from skimage.feature import SIFT
 
-from ssplat_jax.data.sparse_matches import PosedImages, epipolar_distances, mutual_nearest, pixel_rays
+from ssplat_jax.data.sparse_matches import (
+    PosedImages,
+    epipolar_distances,
+    gray_image,
+    motion_between,
+    mutual_nearest,
+    pixel_rays,
+)
 
 LONG_SIDE = 640
 """Longer side of the working image in pixels; larger images are reduced."""
@@ -82,10 +88,9 @@ def sift_keypoints(image: Float32[np.ndarray, "h w 3"]) -> SiftKeypoints:
     size = (round(width / shrink), round(height / shrink))
     if min(size) < MIN_SIDE:
         return nothing
-    gray = Image.fromarray(np.ascontiguousarray(image @ np.array([0.299, 0.587, 0.114], np.float32)))
     detector: Any = SIFT()
     try:
-        detector.detect_and_extract(np.asarray(gray.resize(size, Image.Resampling.BICUBIC), np.float64))
+        detector.detect_and_extract(gray_image(image, size))
     except RuntimeError:  # skimage raises it for an image without keypoints
         return nothing
     pixels = (detector.keypoints[:, ::-1] + 0.5) * np.array([width / size[0], height / size[1]])
@@ -129,8 +134,7 @@ def _match(
     nothing = Matches(pair, np.zeros((0, 2), np.int64), np.zeros(0, np.float32))
     if not (len(a.pixels) and len(b.pixels)):
         return nothing
-    first, second = capture.frames[i].camtoworld, capture.frames[j].camtoworld
-    R, t = second[:3, :3].T @ first[:3, :3], second[:3, :3].T @ (first[:3, 3] - second[:3, 3])
+    R, t = motion_between(capture.frames[i].camtoworld, capture.frames[j].camtoworld)
     lines = epipolar_distances(pixel_rays(capture.K(i), a.pixels), pixel_rays(capture.K(j), b.pixels), R, t)
     apart = np.sqrt(np.maximum(2 - 2 * a.descriptors @ b.descriptors.T, 0.0))
     apart = np.where(lines < np.radians(MAX_EPIPOLAR_DEGREES), apart, 2.0)

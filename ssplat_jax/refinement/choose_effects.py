@@ -74,17 +74,33 @@ def choose_effects(residuals: ViewResiduals) -> EffectsChoice:
     return EffectsChoice(effects, reasons)
 
 
-def effects_by_name(names: Sequence[str], gaussians: Gaussians, key_views: KeyViews) -> EffectsChoice:
+def effects_by_name(
+    names: Sequence[str], gaussians: Gaussians, key_views: KeyViews, *, poses_stay: bool = False
+) -> EffectsChoice:
     """The effects that a caller names: some of `poses`, `focal`, `exposures`, `white_balance`, or `auto` alone.
+
+    Args:
+        names: the effects.
+        gaussians: the scene, at which `auto` looks.
+        key_views: the views that are compared.
+        poses_stay: leave `poses` off: they were adjusted before the stream, and gradients would follow errors of the
+            scene.
 
     Raises:
         InputError: a name is unknown, or `auto` comes with others.
     """
     if tuple(names) == ("auto",):
-        return refine_effects_for(gaussians, key_views)
+        choice = refine_effects_for(gaussians, key_views)
+        return _without_poses(choice) if poses_stay else choice
     if unknown := [name for name in names if name not in NAMES]:
         raise InputError(f"refine: wanted effects among auto (alone), {', '.join(NAMES)}; got {unknown[0]!r}.")
-    return EffectsChoice(RefineEffects(**{name: True for name in names}), ())
+    choice = EffectsChoice(RefineEffects(**{name: True for name in names}), ())
+    return _without_poses(choice) if poses_stay else choice
+
+
+def _without_poses(choice: EffectsChoice) -> EffectsChoice:
+    reasons = tuple(reason for reason in choice.reasons if not reason.startswith("poses"))
+    return EffectsChoice(dataclasses.replace(choice.effects, poses=False), reasons)
 
 
 def with_effects(config: RefineConfig, choice: EffectsChoice) -> RefineConfig:

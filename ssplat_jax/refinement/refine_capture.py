@@ -42,6 +42,7 @@ def refine_on_capture(
     steps: int,
     config: RefineConfig | None = None,
     revise: Sequence[str] = (),
+    poses_stay: bool = False,
     on_step: Callable[[int, float], None] = lambda step, loss: None,
 ) -> CaptureRefinement:
     """The scene of a stream, revised on at most `MAX_KEY_VIEWS` of its own frames.
@@ -56,6 +57,7 @@ def refine_on_capture(
         config: learning rates, bounds and SH degree; default `FOR_CAPTURES`.
         revise: names of the effects that are on besides those of `config`, or `("auto",)` for those that the residuals
             call for.
+        poses_stay: poses were adjusted before the stream; `revise` then leaves them as they are.
         on_step: called with the number of steps done and the last loss.
 
     Raises:
@@ -64,7 +66,7 @@ def refine_on_capture(
     if steps < 0:
         raise InputError(f"refine: steps must be at least 0, got {steps}.")
     given = key_views_of(capture, indices, frame, exposures)
-    choice = effects_by_name(revise, gaussians, given)
+    choice = effects_by_name(revise, gaussians, given, poses_stay=poses_stay)
     config = with_effects(config or FOR_CAPTURES, choice)
     progress, views = start_refinement(gaussians, given, config)
     for _ in continue_refinement(progress, views, steps, config):

@@ -90,11 +90,10 @@ def refine_run(
         if overwrite:
             folder.clear_refinement()
         given = key_views_of(run.capture, run.indices, run.frame, run.exposures)
-        if has_adjusted_poses(folder):  # their gradients would follow errors of the scene
-            revise = [name for name in revise if name != "poses"]
-        elif "poses" in revise:
+        is_adjusted = has_adjusted_poses(folder)
+        if "poses" in revise and not is_adjusted:
             reporter.say("poses: `ssplat run --revise poses` adjusts them before the stream, which gains far more")
-        choice = effects_by_name(revise, run.gaussians, given)
+        choice = effects_by_name(revise, run.gaussians, given, poses_stay=is_adjusted)
         for reason in choice.reasons:
             reporter.say(reason)
         config = with_effects(FOR_CAPTURES, choice)

@@ -5,6 +5,7 @@ import json
 from collections.abc import Sequence
 
 import numpy as np
+from jaxtyping import Float64
 
 from ssplat_jax.console import Reporter
 from ssplat_jax.data.capture import Capture
@@ -47,26 +48,42 @@ def with_poses_of_run(capture: Capture, folder: RunFolder) -> Capture:
     Raises:
         StorageError: the saved poses are damaged.
     """
-    if not folder.adjusted_poses.exists():
-        return capture
-    try:
-        saved = json.loads(folder.adjusted_poses.read_text())
-        indices = [int(i) for i in saved["indices"]]
-        poses = {int(i): np.array(pose, np.float64).reshape(4, 4) for i, pose in saved["camtoworlds"].items()}
-        given = str(saved["capture"])
-        if not all(np.isfinite(pose).all() for pose in poses.values()):
-            raise ValueError("a pose is not finite")
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise StorageError(f"{folder.adjusted_poses}: damaged; --overwrite starts the run anew.") from error
-    if max(indices, default=0) >= len(capture) or capture.digest(indices) != given:
-        return capture  # its digest differs from that of the run, which says so
+    saved = _read(folder)
+    if saved is None or max(saved.indices, default=0) >= len(capture) or capture.digest(saved.indices) != saved.capture:
+        return capture  # if they are of another, its digest differs from that of the run, which says so
     frames = [
-        dataclasses.replace(frame, camtoworld=poses[i]) if i in poses else frame
+        dataclasses.replace(frame, camtoworld=saved.camtoworlds[i]) if i in saved.camtoworlds else frame
         for i, frame in enumerate(capture.frames)
     ]
     return dataclasses.replace(capture, frames=tuple(frames))
 
 
 def has_adjusted_poses(folder: RunFolder) -> bool:
-    """Whether the stream of the run had adjusted poses."""
-    return folder.adjusted_poses.exists() and bool(json.loads(folder.adjusted_poses.read_text())["camtoworlds"])
+    """True if the run in `folder` streamed adjusted poses.
+
+    Raises:
+        StorageError: the saved poses are damaged.
+    """
+    saved = _read(folder)
+    return saved is not None and bool(saved.camtoworlds)
+
+
+@dataclasses.dataclass(frozen=True)
+class _SavedPoses:
+    capture: str  # digest of the poses as given
+    indices: list[int]  # streamed frames
+    camtoworlds: dict[int, Float64[np.ndarray, "4 4"]]  # by frame; empty if the given ones were streamed
+
+
+def _read(folder: RunFolder) -> _SavedPoses | None:
+    """The poses that `folder` keeps, or None."""
+    if not folder.adjusted_poses.exists():
+        return None
+    try:
+        fields = json.loads(folder.adjusted_poses.read_text())
+        poses = {int(i): np.array(pose, np.float64).reshape(4, 4) for i, pose in fields["camtoworlds"].items()}
+        if not all(np.isfinite(pose).all() for pose in poses.values()):
+            raise ValueError("a pose is not finite")
+        return _SavedPoses(str(fields["capture"]), [int(i) for i in fields["indices"]], poses)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise StorageError(f"{folder.adjusted_poses}: damaged; --overwrite starts the run anew.") from error

@@ -170,8 +170,8 @@ def test_adjusted_poses_are_streamed_and_targets_keep_theirs(tmp_path, monkeypat
         seen["streamed"] = streamed.camtoworlds
         return {i: np.ones(3) for i in split.context}, []
 
-    def refine(gaussians, streamed, context, frame, exposures, steps, revise, reporter):
-        seen["refined"], seen["revise"] = streamed.camtoworlds, list(revise)
+    def refine(gaussians, streamed, *rest, poses_stay, reporter):
+        seen["refined"], seen["poses_stay"] = streamed.camtoworlds, poses_stay
         raise Stop
 
     monkeypatch.setattr(evaluation, "adjust_if_asked", adjust)
@@ -192,5 +192,5 @@ def test_adjusted_poses_are_streamed_and_targets_keep_theirs(tmp_path, monkeypat
             evaluation.evaluate.__wrapped__(session, capture, split, tmp_path / "out", refine_steps=2, revise=revise)
         np.testing.assert_array_equal(seen["streamed"], wanted.camtoworlds)
         np.testing.assert_array_equal(seen["refined"], wanted.camtoworlds)
-        assert seen["revise"] == ["focal"]
+        assert seen["poses_stay"] == (wanted is moved)
     np.testing.assert_array_equal(moved.camtoworlds[4], capture.camtoworlds[4])

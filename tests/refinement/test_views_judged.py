@@ -14,6 +14,7 @@ from ssplat_jax.metrics.psnr_ssim import psnr
 from ssplat_jax.pytree import replace
 from ssplat_jax.rasterizer import Effects, render
 from ssplat_jax.refinement import KeyViews, RefineConfig, RefineEffects, only_usable, refine, refine_effects_for
+from ssplat_jax.refinement import choose_effects as module
 from ssplat_jax.refinement.choose_effects import choose_effects, effects_by_name, with_effects
 from ssplat_jax.refinement.usable_views import contradicting, sound_views
 from ssplat_jax.refinement.view_residuals import _columns, view_residuals
@@ -223,6 +224,16 @@ def test_too_few_fits_ask_for_nothing():
     alone = replace(views(), valid=jnp.arange(NUM_VIEWS) < 2)
     choice = choose_effects(view_residuals(doubtful(), turned(alone, [1], 1.0)))
     assert not choice.effects.any and "got 2" in choice.reasons[0]
+
+
+@pytest.mark.parametrize("names", [("auto",), ("poses", "focal")])
+def test_adjusted_poses_stay_whoever_asks(names, monkeypatch):
+    both = module.EffectsChoice(RefineEffects(poses=True, focal=True), ("poses on: far off", "focal on: far off"))
+    monkeypatch.setattr(module, "refine_effects_for", lambda *given: both)
+    choice = effects_by_name(names, doubtful(), views(), poses_stay=True)
+    assert choice.effects == RefineEffects(focal=True)
+    assert not any(reason.startswith("poses") for reason in choice.reasons)
+    assert effects_by_name(names, doubtful(), views()).effects.poses
 
 
 def test_effects_by_name_are_taken_or_refused():
