@@ -91,14 +91,12 @@ def effects_by_name(
     """
     if tuple(names) == ("auto",):
         choice = refine_effects_for(gaussians, key_views)
-        return _without_poses(choice) if poses_stay else choice
-    if unknown := [name for name in names if name not in NAMES]:
+    elif unknown := [name for name in names if name not in NAMES]:
         raise InputError(f"refine: wanted effects among auto (alone), {', '.join(NAMES)}; got {unknown[0]!r}.")
-    choice = EffectsChoice(RefineEffects(**{name: True for name in names}), ())
-    return _without_poses(choice) if poses_stay else choice
-
-
-def _without_poses(choice: EffectsChoice) -> EffectsChoice:
+    else:
+        choice = EffectsChoice(RefineEffects(**{name: True for name in names}), ())
+    if not poses_stay:
+        return choice
     reasons = tuple(reason for reason in choice.reasons if not reason.startswith("poses"))
     return EffectsChoice(dataclasses.replace(choice.effects, poses=False), reasons)
 

@@ -68,9 +68,11 @@ class Front:
 def front_of(size: Sequence[int], points: Sequence[FrontPoint]) -> Front:
     """The points that no other point beats, the fastest first."""
     kept: list[FrontPoint] = []
+    best = -math.inf
     for point in sorted(points, key=lambda point: (point.steps_per_view, -point.shown)):
-        if not kept or point.shown > kept[-1].shown:
+        if point.shown > best:
             kept.append(point)
+            best = point.shown
     return Front((int(size[0]), int(size[1])), tuple(kept))
 
 
