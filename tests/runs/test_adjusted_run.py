@@ -16,7 +16,7 @@ from ssplat_jax.poses.adjust_poses import AdjustedPoses
 from ssplat_jax.runs.capture_run import run_capture
 from ssplat_jax.runs.export_cameras import open_cameras
 from ssplat_jax.runs.refine_run import refine_run
-from ssplat_jax.runs.run_poses import capture_to_stream, with_poses_of_run
+from ssplat_jax.runs.run_poses import capture_to_stream, has_adjusted_poses, with_poses_of_run
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.streaming.streamsplat import StreamSplat
 
@@ -60,6 +60,7 @@ def test_the_stream_and_all_that_follows_see_the_adjusted_poses(finished, monkey
     given = open_capture(CAPTURE, size=SIZE)
     wanted = moved(given, range(4)).capture.camtoworlds
     assert run(finished).was_finished
+    assert has_adjusted_poses(RunFolder(finished))
     cameras = open_cameras(CAPTURE, finished, finished / "scene.sog")
     np.testing.assert_array_equal(cameras.capture.camtoworlds, wanted)
     result = refine_run(
@@ -88,6 +89,7 @@ def test_poses_that_fit_are_kept_and_not_judged_twice(tmp_path, monkeypatch):
     first = capture_to_stream(capture, range(4), ("auto",), RunFolder(tmp_path), quiet)
     monkeypatch.setattr(adjusting, "adjust_poses", must_not_be_called)
     second = capture_to_stream(capture, range(4), ("auto",), RunFolder(tmp_path), quiet)
+    assert not has_adjusted_poses(RunFolder(tmp_path))  # so refinement may revise them
     for kept in (first, second):
         np.testing.assert_array_equal(kept.camtoworlds, capture.camtoworlds)
     assert capture_to_stream(capture, range(4), ("focal",), RunFolder(tmp_path), quiet) is capture
