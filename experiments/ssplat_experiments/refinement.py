@@ -5,8 +5,9 @@
 Every scene streams its context views with the shipped weights and is scored on the same views that were never shown.
 
 * `stream`: the scene after the stream.
-* `offline`: then 100 gradient steps on the streamed views, as `ssplat eval --refine 100` takes them.
-* `online`: gradient steps after each chunk, as `--online-refine` takes them.
+* `offline`: then 100 steps on the streamed views, as `ssplat eval --refine 100` takes them: learned passes first.
+* `learned passes`: the same, stopped after its learned passes; `gradient steps`: 100 steps without learned passes.
+* `online`: refinement after each chunk, as `--online-refine` asks for it.
 * `wrong poses, ...`: all context cameras but the first are turned by 0.5 degrees and moved by 1 % of the depth, each
   in a direction of its own. Targets keep their poses. `poses adjusted`: the context's poses are adjusted to its images
   before the stream, as `--revise poses` does. `targets carried`: the same scene; each target is moved as adjustment
@@ -42,13 +43,16 @@ from ssplat_jax.evaluation.scoring import mean_scores, score_view
 from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.metrics.psnr_ssim import psnr
 from ssplat_jax.poses.adjust_poses import adjust_poses
+from ssplat_jax.refinement.learned_pass import STEPS as STEPS_OF_PASS
 from ssplat_jax.refinement.refine_capture import CaptureRefinement, refine_on_capture
+from ssplat_jax.refinement.refine_config import FOR_CAPTURES, RefineConfig
 from ssplat_jax.streaming.feed import Exposures, feed_chunks
 
 TURN_DEGREES, SHIFT_OF_DEPTH = 0.5, 0.01
 """Errors of the poses: the angle of a rotation, and the length of a shift as a fraction of the median depth."""
 
 STREAM, OFFLINE, ONLINE = "stream", "offline", "online"
+PASSES, GRADIENT = "learned passes", "gradient steps"
 WRONG, WRONG_OFFLINE = "wrong poses, stream", "wrong poses, offline"
 ADJUSTED, ADJUSTED_OFFLINE, CARRIED = "poses adjusted, stream", "poses adjusted, offline", "targets carried, offline"
 
@@ -133,11 +137,19 @@ def _with_frame(capture: Capture, split: Split) -> _Scene:
 
 
 def measure_offline(name: str, open_scene: Callable[[], _Scene], config: StreamConfig, sizes: Sizes) -> list[Row]:
-    """The scene after the stream, and after the steps that follow it."""
+    """The scene after the stream, and after the steps that follow it, with learned passes, those alone, and without."""
     scene = open_scene()
     streamed = _stream(scene, scene.capture, config)
-    first = _row(name, STREAM, scene, streamed.gaussians, streamed.exposures) | {"chunk_s": streamed.chunk_s}
-    return [first, _row_of_refined(name, OFFLINE, scene, _refined(scene, scene.capture, streamed, sizes.steps))]
+    rows = [_row(name, STREAM, scene, streamed.gaussians, streamed.exposures) | {"chunk_s": streamed.chunk_s}]
+    passes = min(sizes.steps, FOR_CAPTURES.learned_passes * STEPS_OF_PASS)
+    alone = dataclasses.replace(FOR_CAPTURES, learned_passes=0)
+    for method, steps, refine in (
+        (PASSES, passes, FOR_CAPTURES),
+        (GRADIENT, sizes.steps, alone),
+        (OFFLINE, sizes.steps, FOR_CAPTURES),
+    ):
+        rows.append(_row_of_refined(name, method, scene, _refined(scene, scene.capture, streamed, steps, refine)))
+    return rows
 
 
 def measure_online(name: str, open_scene: Callable[[], _Scene], config: StreamConfig, sizes: Sizes) -> list[Row]:
@@ -226,12 +238,13 @@ class _Refined:
     seconds: float
 
 
-def _refined(scene: _Scene, capture: Capture, streamed: _Streamed, steps: int) -> _Refined:
-    """The scene after gradient steps on the context views as `capture` has them."""
-    watch = Stopwatch()
-    context = scene.split.context
+def _refined(
+    scene: _Scene, capture: Capture, streamed: _Streamed, steps: int, config: RefineConfig = FOR_CAPTURES
+) -> _Refined:
+    """The scene after steps on the context views as `capture` has them."""
+    watch, given = Stopwatch(), (capture, scene.split.context, scene.frame, streamed.exposures)
     with watch.running():
-        found = refine_on_capture(streamed.gaussians, capture, context, scene.frame, streamed.exposures, steps=steps)
+        found = refine_on_capture(streamed.gaussians, *given, steps=steps, config=config)
         jax.block_until_ready(found.gaussians.means)
     return _Refined(found, watch.seconds)
 
@@ -268,7 +281,7 @@ def findings(rows: list[Row]) -> list[str]:
         by = {row["method"]: row for row in rows if row["scene"] == scene}
         if STREAM not in by:
             continue
-        for method in (OFFLINE, ONLINE):
+        for method in (PASSES, GRADIENT, OFFLINE, ONLINE):
             if method in by:
                 gains = [by[method][c] - by[STREAM][c] for c in ("shown_psnr", "literal_psnr")]
                 sentences.append(f"{scene}: {method} {gains[0]:+.2f} dB shown, {gains[1]:+.2f} dB literal.")

@@ -9,7 +9,7 @@ from ssplat_experiments.cases import Row
 
 OPTIMIZED = "per-scene optimization"
 COLUMNS = {"literal": "literal_psnr", "shown": "shown_psnr"}
-TIMES = (1, 3, 10, 30, 60, 120)
+TIMES = (1, 3, 10, 30, 60, 150, 300, 600)
 """Seconds of the table of `at_times`."""
 
 COLORS = ("#30507a", "#c06030", "#3a8a5a", "#8a5a9a", "#b09030")

@@ -7,8 +7,8 @@ seen, on the same machine. Time is that of the work: compilation, scoring, the d
 points that per-scene optimization starts from are not in it. Needs an idle machine.
 
 * `stream`: the scene after each chunk.
-* `stream + offline`: then gradient steps on the streamed views (`ssplat refine`).
-* `stream + online M`: M gradient steps after each chunk (`--online-refine M`).
+* `stream + offline N`: then N steps of refinement on the streamed views (`ssplat refine --steps N`).
+* `stream + online M`: refinement after each chunk (`--online-refine M`).
 * `per-scene optimization`: 3D Gaussian Splatting from sparse points (`per_scene_optimization.py`), with the exposures
   of the views that the stream estimated, until three scores in a row are no better than the best before them.
 """
@@ -50,8 +50,7 @@ from ssplat_jax.streaming.feed import Exposures, feed_chunks
 CAPTURES = {"fox": 1, "redkitchen": 5}
 """Names of real captures, with the stride of their frames."""
 
-STREAM, OFFLINE = "stream", "stream + offline"
-ONLINE = "stream + online {}"
+STREAM, OFFLINE, ONLINE = "stream", "stream + offline {}", "stream + online {}"
 
 PATIENCE = 3
 """Scores in a row that are no better than the best before them, in either column, at which a method ends."""
@@ -70,16 +69,16 @@ class Sizes:
     targets: int
     seconds: float
     """Most seconds of per-scene optimization."""
-    steps: int
-    """Planned steps of offline refinement."""
+    steps: tuple[int, ...]
+    """Planned steps of offline refinement, a curve each."""
     online: tuple[int, ...]
-    """Numbers of online steps a chunk."""
+    """Values of --online-refine, a curve each."""
 
 
 SIZES = {
-    "smoke": Sizes(8, (64, 48), 2, 2.0, 4, (1,)),
-    "cpu": Sizes(32, (160, 120), 6, 150.0, 200, (4, 8)),
-    "gpu": Sizes(64, (320, 240), 9, 600.0, 400, (2, 4, 8)),
+    "smoke": Sizes(8, (64, 48), 2, 2.0, (10,), (1,)),
+    "cpu": Sizes(32, (160, 120), 6, 600.0, (200, 1600), (6,)),
+    "gpu": Sizes(64, (320, 240), 9, 600.0, (400,), (2, 4, 8)),
 }
 
 
@@ -93,16 +92,18 @@ def cases(captures: Path | None, scale: str) -> list[Case]:
     sizes = at_scale(SIZES, scale)
     scenes = ["room", *(name for name in CAPTURES if captures is not None and (captures / name).is_dir())]
     config = preset("tiny").replace(capacity=START_CAPACITY)
-    methods = {STREAM: config, OFFLINE: config, OPTIMIZED: config}
-    methods |= {ONLINE.format(steps): config.replace(steps_per_chunk=steps) for steps in sizes.online}
+    methods = {STREAM: (config, 0)}
+    methods |= {ONLINE.format(steps): (config.replace(steps_per_chunk=steps), 0) for steps in sizes.online}
+    methods |= {OFFLINE.format(steps): (config, steps) for steps in sizes.steps}
+    methods[OPTIMIZED] = config, 0
     return [
         Case(
             name=f"{scene}, {method}",
             config=config,
             asked={"scene": scene, "method": method, **dataclasses.asdict(sizes)},
-            measure=functools.partial(measured, scene, method, config, sizes, captures),
+            measure=functools.partial(measured, scene, method, config, offline, sizes, captures),
         )
-        for method, config in methods.items()
+        for method, (config, offline) in methods.items()
         for scene in scenes
     ]
 
@@ -130,12 +131,15 @@ def _open(name: str, sizes: Sizes, captures: Path | None) -> _Scene:
     return _Scene(name, capture, split, capture.stream_frame(preset("tiny"), split.context))
 
 
-def measured(name: str, method: str, config: StreamConfig, sizes: Sizes, captures: Path | None) -> list[Row]:
-    """The curve of a method on a scene."""
+def measured(
+    name: str, method: str, config: StreamConfig, offline: int, sizes: Sizes, captures: Path | None
+) -> list[Row]:
+    """The curve of a method on a scene; `offline` steps follow the stream."""
     scene, curve = _open(name, sizes, captures), Curve(name, method)
-    exposures, gaussians = stream(scene, config, curve, is_shown=method not in (OFFLINE, OPTIMIZED))
-    if method == OFFLINE:
-        refine_offline(scene, gaussians, exposures, sizes, curve)
+    is_shown = not offline and method != OPTIMIZED
+    exposures, gaussians = stream(scene, config, curve, is_shown=is_shown)
+    if offline:
+        refine_offline(scene, gaussians, exposures, offline, curve)
     if method == OPTIMIZED:
         curve = Curve(name, method)  # the stream lent its exposures, and its time does not count
         optimize_scene(scene, exposures, sizes, curve)
@@ -196,15 +200,16 @@ def _decoded(session, curve: Curve) -> Gaussians:
         return jax.block_until_ready(session.gaussians())
 
 
-def refine_offline(scene: _Scene, gaussians: Gaussians, exposures: Exposures, sizes: Sizes, curve: Curve) -> None:
-    """Gradient steps on the streamed views; a point whenever their number has about doubled."""
+def refine_offline(scene: _Scene, gaussians: Gaussians, exposures: Exposures, planned: int, curve: Curve) -> None:
+    """Refinement on the streamed views; a point after the first passes or steps, and whenever their number doubles."""
     curve.add(scene, gaussians, exposures, steps=0)
     with curve.watch.running():
         given = key_views_of(scene.capture, scene.split.context, scene.frame, exposures)
         progress, views = start_refinement(gaussians, given, FOR_CAPTURES)
-    due = {round(sizes.steps / 2**k) for k in range(7)}
-    for _ in curve.watch.over(continue_refinement(progress, views, sizes.steps, FOR_CAPTURES)):
-        if progress.num_steps in due:
+    due = 1
+    for _ in curve.watch.over(continue_refinement(progress, views, planned, FOR_CAPTURES)):
+        if progress.num_steps >= due or progress.num_steps == planned:
+            due = 2 * progress.num_steps
             with curve.watch.running():
                 refined = jax.block_until_ready(current_gaussians(progress.state))
             curve.add(scene, refined, exposures, steps=progress.num_steps)

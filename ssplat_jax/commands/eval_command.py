@@ -55,8 +55,8 @@ class Eval:
     """Image size WxH of the scored views; default the capture's own. --quality sets the streamed size."""
     quality: QualityOption = "accurate"
     refine: int = 0
-    """Gradient steps on the context views after the stream, default 0, with --quality best 100; the scores before are
-    reported too."""
+    """Steps of refinement on the context views after the stream, default 0, with --quality best 100; the scores before
+    are reported too."""
     revise: ReviseOption = ()
     online_refine: int = 0
     """Gradient steps on kept views after each chunk, while streaming; later chunks see the revised scene."""

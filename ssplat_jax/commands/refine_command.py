@@ -1,4 +1,4 @@
-"""`ssplat refine`: gradient steps on the scene of a finished run."""
+"""`ssplat refine`: learned passes and gradient steps on the scene of a finished run."""
 
 import dataclasses
 import sys
@@ -30,7 +30,7 @@ class Refine:
     """Folder of a finished `ssplat run`."""
     capture: CapturePath
     steps: int = 100
-    """Most gradient steps; each renders two views."""
+    """Most steps; each renders two views. The first 24 are three learned passes, where there are as many."""
     revise: ReviseOption = ()
     weights: WeightsOption = "tiny"
     save_every: int = 50

@@ -66,8 +66,8 @@ class Run:
     port: int = 8080
     """With --view: its port; the next free one if it is taken."""
     refine: int = 0
-    """Then take this many gradient steps on the streamed frames, as `ssplat refine` does, into refined.ply; default 0,
-    with --quality best 100."""
+    """Then take this many steps on the streamed frames, as `ssplat refine` does, into refined.ply; default 0, with
+    --quality best 100."""
     revise: ReviseOption = ()
     online_refine: int = 0
     """Gradient steps on kept views after each chunk, while streaming; later chunks see the revised scene."""

@@ -12,7 +12,7 @@ from ssplat_jax.errors import InputError, require_positive
 if TYPE_CHECKING:
     from ssplat_jax.console import Reporter
 
-MINUTES = {"tiny": 77, "stream": 15, "evidence": 15}
+MINUTES = {"tiny": 77, "stream": 15, "evidence": 15, "refiner": 15}
 """Time of recipes on two cores (docs/model_card.md)."""
 
 
@@ -24,12 +24,13 @@ class Train:
     """
 
     out: Path
-    """Folder of the log, the checkpoints and, at the end, weights.npz."""
+    """Folder of the log, the checkpoints and, at the end, weights.npz (refiner.npz)."""
     preset: str = "tiny"
     """Preset of the configuration."""
-    recipe: Literal["tiny", "stream", "evidence", "paper"] = "tiny"
+    recipe: Literal["tiny", "stream", "evidence", "refiner", "paper"] = "tiny"
     """tiny: trains depth from scratch, as for the shipped weights. evidence: trains the evidence head of --init-weights
-    on whole streams, in one go. stream: trains the stages after depth. paper: the paper's loss and steps, for --preset
+    on whole streams, in one go. refiner: trains the learned pass of refinement on whole streams of --init-weights, in
+    one go. stream: trains the stages after depth. paper: the paper's loss and steps, for --preset
     paper or small and a GPU."""
     scale_steps: float = 1.0
     """Factor of the number of steps of every phase."""
@@ -60,6 +61,8 @@ class Train:
         require_positive(scale_steps=self.scale_steps, save_every=self.save_every, validate_every=self.validate_every)
         if self.recipe == "evidence":
             return self._run_evidence()
+        if self.recipe == "refiner":
+            return self._run_refiner()
         config = apply_changes(preset(self.preset), self.set)
         recipe = dataclasses.replace(RECIPES[self.recipe].scaled(self.scale_steps), seed=self.seed)
         params = None
@@ -109,20 +112,10 @@ class Train:
         from ssplat_jax.streaming.streamsplat import StreamSplat
         from ssplat_jax.train.evidence_training import EvidenceRecipe, train_evidence
 
-        unused = {
-            "--shares": self.shares,
-            "--lpips-vgg": self.lpips_vgg,
-            "--lpips-heads": self.lpips_heads,
-            "--save-every": self.save_every != Train.save_every,
-            "--validate-every": self.validate_every != Train.validate_every,
-        }
-        if given := [flag for flag, value in unused.items() if value]:
-            raise InputError(f"{given[0]}: --recipe evidence has no use for it; leave it out.")
-        if self.init_weights is None:
-            raise InputError("--recipe evidence: wanted --init-weights, whose evidence head it trains; got none.")
+        init_weights = self._needed_weights("whose evidence head it trains")
         config = apply_changes(preset(self.preset), self.set)
-        params = load_weights(self.init_weights)[0]
-        check_params(params, config.replace(evidence=False), str(self.init_weights))  # the head starts anew
+        params = load_weights(init_weights)[0]
+        check_params(params, config.replace(evidence=False), str(init_weights))  # the head starts anew
         recipe = EvidenceRecipe(seed=self.seed)
         recipe = dataclasses.replace(recipe, steps=max(1, round(recipe.steps * self.scale_steps)))
         reporter = Reporter(self.quiet)
@@ -140,10 +133,61 @@ class Train:
                 on_scene=lambda name: reporter.say(f"streamed {name}"),
                 on_step=lambda step, record: advance(step, f"psnr {record['shown_psnr']:.2f}"),
             )
-        start = {"init_weights": self.init_weights.name, "before": describe_weights(str(self.init_weights)).provenance}
+        start = {"init_weights": init_weights.name, "before": describe_weights(str(init_weights)).provenance}
         provenance = {"recipe": dataclasses.asdict(recipe), "steps": recipe.steps, **start, **facts}
         save_weights(self.out / "weights.npz", trained, config, provenance)
         return self._end(recipe.steps, reporter)
+
+    def _run_refiner(self) -> int:
+        """Trains the network of the learned pass. It takes minutes, so it starts anew after an interrupt."""
+        from ssplat_jax.checkpoint.weights import check_params, load_weights
+        from ssplat_jax.console import Reporter
+        from ssplat_jax.refinement.refiner_weights import save_refiner
+        from ssplat_jax.storage.folder_lock import lock_folder
+        from ssplat_jax.storage.folders import make_writable
+        from ssplat_jax.streaming.streamsplat import StreamSplat
+        from ssplat_jax.train.refiner_training import RefinerRecipe, train_refiner
+
+        init_weights = self._needed_weights("whose streams it refines")
+        config = apply_changes(preset(self.preset), self.set)
+        params = load_weights(init_weights)[0]
+        check_params(params, config, str(init_weights))
+        recipe = RefinerRecipe(seed=self.seed)
+        recipe = dataclasses.replace(recipe, steps=max(1, round(recipe.steps * self.scale_steps)))
+        num_steps, reporter = recipe.rounds * recipe.steps, Reporter(self.quiet)
+        reporter.say(f"{num_steps} steps, about {MINUTES['refiner']} minutes on two cores with two captures")
+        make_writable(self.out)
+        with (
+            lock_folder(self.out),
+            reporter.progress("training", num_steps, waiting="streaming the scenes") as advance,
+        ):
+            trained, facts = train_refiner(
+                StreamSplat(config),
+                params,
+                self.captures,
+                recipe,
+                on_scene=lambda name: reporter.say(f"streamed {name}"),
+                on_step=lambda step, record: advance(step, f"psnr {record['shown_psnr']:.2f}"),
+            )
+        provenance = {"recipe": dataclasses.asdict(recipe), "init_weights": init_weights.name, **facts}
+        save_refiner(self.out / "refiner.npz", trained, provenance)
+        print(f"wrote {self.out}/refiner.npz after {num_steps} steps")
+        return 0
+
+    def _needed_weights(self, why: str) -> Path:
+        """--init-weights of a recipe that trains on whole streams; refuses options that it has no use for."""
+        unused = {
+            "--shares": self.shares,
+            "--lpips-vgg": self.lpips_vgg,
+            "--lpips-heads": self.lpips_heads,
+            "--save-every": self.save_every != Train.save_every,
+            "--validate-every": self.validate_every != Train.validate_every,
+        }
+        if given := [flag for flag, value in unused.items() if value]:
+            raise InputError(f"{given[0]}: --recipe {self.recipe} has no use for it; leave it out.")
+        if self.init_weights is None:
+            raise InputError(f"--recipe {self.recipe}: wanted --init-weights, {why}; got none.")
+        return self.init_weights
 
     def _end(self, num_steps: int, reporter: "Reporter") -> int:
         """Says what was written and what to do next; returns the exit code of success."""

@@ -20,6 +20,7 @@ from ssplat_jax.refinement.refine_step import StepReport as StepReport
 from ssplat_jax.refinement.refine_step import current_gaussians as current_gaussians
 from ssplat_jax.refinement.refine_step import init_refinement as init_refinement
 from ssplat_jax.refinement.refine_step import refine_step as refine_step
+from ssplat_jax.refinement.refiner_weights import load_refiner as load_refiner
 from ssplat_jax.refinement.usable_views import only_usable as only_usable
 from ssplat_jax.refinement.view_residuals import ViewResiduals as ViewResiduals
 from ssplat_jax.refinement.view_residuals import view_residuals as view_residuals

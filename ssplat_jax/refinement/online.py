@@ -25,8 +25,8 @@ from ssplat_jax.model import GRID_STRIDE
 from ssplat_jax.pytree import replace
 from ssplat_jax.rasterizer import fill_holes, render
 from ssplat_jax.rasterizer.render import round_up
-from ssplat_jax.refinement.refine_step import EFFECTS
 from ssplat_jax.refinement.revision import sizes
+from ssplat_jax.refinement.view_loss import EFFECTS
 from ssplat_jax.streaming.session import Revise
 from ssplat_jax.streaming.streamsplat import ChunkOutput, StreamSplat, shown_pivots
 

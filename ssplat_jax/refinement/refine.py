@@ -16,19 +16,22 @@ from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.rasterizer import render
 from ssplat_jax.rasterizer.render import round_up
+from ssplat_jax.refinement.learned_pass import STEPS, learned_pass
 from ssplat_jax.refinement.present_rows import back_in_place, only_present, present_rows, round_rows
 from ssplat_jax.refinement.refine_config import RefineConfig
 from ssplat_jax.refinement.refine_step import (
-    EFFECTS,
     RefineState,
+    StepReport,
     current_gaussians,
     init_refinement,
     refine_step,
-    views_of_step,
 )
+from ssplat_jax.refinement.refiner_weights import load_refiner
 from ssplat_jax.refinement.revision import apply_revision
 from ssplat_jax.refinement.seen_rows import seen_in_any
 from ssplat_jax.refinement.usable_views import only_usable
+from ssplat_jax.refinement.view_loss import EFFECTS
+from ssplat_jax.refinement.view_order import views_of_step
 from ssplat_jax.refinement.view_revision import revised_key_views
 
 PAIRS_MARGIN = 1.25
@@ -55,8 +58,15 @@ class Progress:
 
     @property
     def num_steps(self) -> int:
-        """Steps done."""
+        """Steps done; a learned pass counts as `learned_pass.STEPS`."""
         return len(self.losses)
+
+    def add(self, report: StepReport, seconds: float) -> None:
+        """Adds the measurements of a step, or of a learned pass."""
+        losses, held_back = np.ravel(report.loss).tolist(), np.ravel(report.held_back).tolist()
+        self.losses += losses
+        self.held_back += held_back
+        self.seconds += [seconds / len(losses)] * len(losses)
 
     def scene(self, given: Gaussians) -> Gaussians:
         """`given`, the scene that refinement started from, as it is now."""
@@ -68,7 +78,7 @@ class Refinement:
     """Report of a call of `refine`."""
 
     num_steps: int
-    num_skipped: int  # steps whose gradient was not finite
+    num_skipped: int  # steps whose gradient was not finite, and those of a learned pass that did not help
     losses: list[float]  # per step, on the pixels that are learned from
     held_back: list[float]  # per step, on the pixels that are not
     stopped_early: bool  # the held-back error had stopped falling
@@ -85,6 +95,7 @@ def refine(
     steps: int = 100,
     exposures: Float[Array, "_ 3"] | None = None,
     config: RefineConfig | None = None,
+    refiner: dict | None = None,
     on_step: Callable[[int, float], None] = lambda step, loss: None,
 ) -> tuple[Gaussians, Refinement]:
     """Gaussians revised by gradient descent on views that show the same scene.
@@ -96,9 +107,10 @@ def refine(
         cameras: one batch axis of poses and intrinsics, in the frame of the scene.
         images: what those cameras saw, in [0, 1].
         steps: most gradient steps; 0 returns `gaussians` as they are. Each renders `config.views_per_step`
-            views.
+            views. A learned pass of `config.learned_passes` takes the place of 8.
         exposures: factors from the scene's colors to each view's; default 1.
         config: learning rates and bounds.
+        refiner: parameters of the network of learned passes; default those that ship with the package.
         on_step: called with the number of steps done and the last loss.
 
     Returns:
@@ -113,7 +125,7 @@ def refine(
         return gaussians, Refinement(0, 0, [], [], False, 0.0)
     given = KeyViews.of(cameras, jnp.asarray(images), exposures)
     progress, key_views = start_refinement(gaussians, given, config)
-    for _ in continue_refinement(progress, key_views, steps, config):
+    for _ in continue_refinement(progress, key_views, steps, config, refiner):
         on_step(progress.num_steps, progress.losses[-1])
     return progress.scene(gaussians), report_of(progress, key_views, config)
 
@@ -136,9 +148,13 @@ def start_refinement(
 
 
 def continue_refinement(
-    progress: Progress, key_views: KeyViews, steps: int, config: RefineConfig | None = None
+    progress: Progress,
+    key_views: KeyViews,
+    steps: int,
+    config: RefineConfig | None = None,
+    refiner: dict | None = None,
 ) -> Iterator[None]:
-    """Updates `progress` in place, a step an iteration, until `steps` are done or they no longer help.
+    """Updates `progress` in place, a step or a learned pass an iteration, until `steps` are done or no longer help.
 
     The caller may save `progress` after any iteration. A refinement that continues from it takes the same steps.
 
@@ -147,6 +163,7 @@ def continue_refinement(
         key_views: the views to compare with; the same for all steps.
         steps: planned steps, those of `progress` included. They decide how fast the learning rates decay.
         config: learning rates and bounds.
+        refiner: parameters of the network of learned passes; default those that ship with the package.
     """
     config = config or RefineConfig()
     if progress.max_rows is None:
@@ -155,18 +172,27 @@ def continue_refinement(
         progress.held_back, _steps_per_round(key_views, config)
     ):
         start = time.perf_counter()
-        rate = jnp.float32(config.final_rate ** (progress.num_steps / steps))
-        progress.state, report = _step(config, progress.max_pairs, progress.max_rows)(progress.state, key_views, rate)
-        progress.losses.append(float(report.loss))
-        progress.held_back.append(float(report.held_back))
-        progress.seconds.append(time.perf_counter() - start)
-        if int(report.num_overflow):
+        if is_learned(progress.num_steps, steps, config) and not int(progress.state.num_skipped):
+            step = _learned_pass(config, progress.max_pairs)
+            progress.state, report = step(progress.state, key_views, refiner or load_refiner())
+        else:
+            rate = jnp.float32(config.final_rate ** (progress.num_steps / steps))
+            step = _step(config, progress.max_pairs, progress.max_rows)
+            progress.state, report = step(progress.state, key_views, rate)
+        num_overflow = int(np.max(report.num_overflow))
+        progress.add(report, time.perf_counter() - start)
+        if num_overflow:
             revised = apply_revision(progress.state.start, progress.state.revision)
             # The view that overflowed may not be among those that `_capacity` looks at.
-            needed = round_up(progress.max_pairs + int(report.num_overflow))
+            needed = round_up(progress.max_pairs + num_overflow)
             progress.max_pairs = max(_capacity(revised, key_views), needed)
             progress.max_rows = row_capacity(revised, key_views, range(progress.num_steps, steps), config)
         yield
+
+
+def is_learned(num_steps: int, steps: int, config: RefineConfig) -> bool:
+    """True if a learned pass may follow on `num_steps` of `steps`: passes come first, where enough steps are left."""
+    return num_steps < config.learned_passes * STEPS and num_steps + STEPS <= steps
 
 
 def _steps_per_round(key_views: KeyViews, config: RefineConfig) -> int:
@@ -201,6 +227,11 @@ def has_stopped_helping(held_back: list[float], steps_per_round: int) -> bool:
 def _step(config: RefineConfig, max_pairs: int, max_rows: int):
     step = functools.partial(refine_step, config=config, max_pairs=max_pairs, max_rows=max_rows)
     return jax.jit(step, donate_argnums=0)
+
+
+@functools.cache
+def _learned_pass(config: RefineConfig, max_pairs: int):
+    return jax.jit(functools.partial(learned_pass, config=config, max_pairs=max_pairs), donate_argnums=0)
 
 
 def _capacity(gaussians: Gaussians, key_views: KeyViews) -> int:

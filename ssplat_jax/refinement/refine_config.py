@@ -36,6 +36,9 @@ class RefineConfig:
     """Decay of the second moment: short, since a run has tens to hundreds of steps."""
     views_per_step: int = 2
     """Key views whose gradients a step averages: a Gaussian that few views show moves more often."""
+    learned_passes: int = 0
+    """Passes of a trained network before the gradient steps (`learned_pass.py`); each takes the place of 8 steps. The
+    network has learned from scenes of streams."""
     shown_weight: float = 0.7
     """Weight of the L1 error with holes filled; the rest is the L1 error over black."""
     max_shift: float = 4.0
@@ -57,6 +60,7 @@ class RefineConfig:
         self._require("sh_degree", "0 to 3", self.sh_degree in range(4))
         self._require("final_rate", "in (0, 1]", 0 < self.final_rate <= 1)
         self._require("views_per_step", "at least 1", self.views_per_step >= 1)
+        self._require("learned_passes", "at least 0", self.learned_passes >= 0)
         self._require("shown_weight", "in [0, 1]", 0 <= self.shown_weight <= 1)
         self._require("max_shift", "finite and not negative", 0 <= self.max_shift < math.inf)
         self._require("max_log_scale_change", "finite and not negative", 0 <= self.max_log_scale_change < math.inf)
@@ -67,5 +71,5 @@ class RefineConfig:
             raise InputError(f"refine: {name} must be {wanted}, got {getattr(self, name)!r}.")
 
 
-FOR_CAPTURES = RefineConfig(sh_degree=2)
-"""Configuration for scenes of captures: colors of real surfaces depend on the direction of view."""
+FOR_CAPTURES = RefineConfig(sh_degree=2, learned_passes=3)
+"""Configuration for scenes that a stream made of captures: colors of real surfaces depend on the direction of view."""

@@ -4,22 +4,19 @@ import functools
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from ssplat_jax.cache.key_views import KeyViews
 from ssplat_jax.errors import InputError
 from ssplat_jax.gaussians import Gaussians, mean_color, with_sh_degree
 from ssplat_jax.pytree import pytree, replace
-from ssplat_jax.rasterizer import Effects, fill_holes, render
 from ssplat_jax.refinement.adam import adam_step
 from ssplat_jax.refinement.refine_config import RefineConfig
 from ssplat_jax.refinement.revision import Revision, apply_revision, is_revised, no_revision
 from ssplat_jax.refinement.seen_rows import put_rows, seen_in_any, select_rows, take_rows
+from ssplat_jax.refinement.view_loss import view_loss
+from ssplat_jax.refinement.view_order import views_of_step
 from ssplat_jax.refinement.view_revision import ViewRevision, ViewState, init_view_state, revised_view, step_view_state
-
-EFFECTS = Effects(outputs=("color", "alpha"))
-BLOCK = 8
-"""Side of the pixel blocks that are held back together: neighbors of a pixel give its color away."""
 
 
 @pytree
@@ -31,18 +28,18 @@ class RefineState:
     first_moment: Revision
     second_moment: Revision
     num_steps: Int[Array, ""]
-    num_skipped: Int[Array, ""]  # steps whose gradient was not finite: they changed nothing
+    num_skipped: Int[Array, ""]  # steps that changed nothing: not finite, or of a learned pass that did not help
     views: ViewState | None = None  # revision of the key views, if an effect is on
 
 
 @pytree
 class StepReport:
-    """Measurements of one step, taken before its update; means over its views."""
+    """Measurements of a step, taken before its update; means over its views. A learned pass reports several steps."""
 
-    loss: Float[Array, ""]  # weighted L1 error of the pixels that are learned from
-    held_back: Float[Array, ""]  # the same error of the pixels that are not
-    views: Int[Array, " b"]  # slots of the key views
-    num_overflow: Int[Array, ""]  # most of its views; rows and tile intersections that found no space
+    loss: Float[Array, "*s"]  # weighted L1 error of the pixels that are learned from
+    held_back: Float[Array, "*s"]  # the same error of the pixels that are not
+    views: Int[Array, "*s b"]  # slots of the key views
+    num_overflow: Int[Array, "*s"]  # most of its views; rows and tile intersections that found no space
 
 
 def init_refinement(
@@ -106,7 +103,7 @@ def refine_step(
     current, pull = jax.vjp(functools.partial(apply_revision, state.start), state.revision)
     background, gaussians, selection = mean_color(current), current, None
     if max_rows is not None and max_rows < current.num_gaussians:
-        cameras = [_revised(state, _view_revision(state), key_views, view).camera(view) for view in views]
+        cameras = [with_revised_view(state, view_revision(state), key_views, view).camera(view) for view in views]
         selection = select_rows(seen_in_any(current, cameras), max_rows)
         gaussians = take_rows(current, selection)
         gaussians = replace(gaussians, opacities=jnp.where(selection.is_row, gaussians.opacities, 0.0))
@@ -138,11 +135,13 @@ def refine_step(
     return state, report
 
 
-def _view_revision(state: RefineState) -> ViewRevision | None:
+def view_revision(state: RefineState) -> ViewRevision | None:
     return None if state.views is None else state.views.revision
 
 
-def _revised(state: RefineState, revision: ViewRevision | None, key_views: KeyViews, view: Int[Array, ""]) -> KeyViews:
+def with_revised_view(
+    state: RefineState, revision: ViewRevision | None, key_views: KeyViews, view: Int[Array, ""]
+) -> KeyViews:
     """`key_views` with the one at slot `view` as `revision` changes it."""
     if state.views is None or revision is None:
         return key_views
@@ -161,73 +160,16 @@ def _slopes(
     """Mean gradient of `view_loss` over the step's views, by the Gaussians and by the view revision."""
 
     def loss(gaussians: Gaussians, revision: ViewRevision | None, view: Int[Array, ""]):
-        seen = _revised(state, revision, key_views, view)
+        seen = with_revised_view(state, revision, key_views, view)
         return view_loss(gaussians, background, seen, view, config, max_pairs)
 
     def add_view(total, view: Int[Array, ""]):
-        slopes, measured = jax.grad(loss, argnums=(0, 1), has_aux=True)(gaussians, _view_revision(state), view)
+        slopes, measured = jax.grad(loss, argnums=(0, 1), has_aux=True)(gaussians, view_revision(state), view)
         return jax.tree.map(jnp.add, total, slopes), measured
 
-    zeros = jax.tree.map(jnp.zeros_like, (gaussians, _view_revision(state)))
+    zeros = jax.tree.map(jnp.zeros_like, (gaussians, view_revision(state)))
     # A scan holds the intermediate arrays of one view at a time.
     total, (losses, errors, overflows) = jax.lax.scan(add_view, zeros, views)
     slopes, of_views = jax.tree.map(lambda x: x / config.views_per_step, total)
     report = StepReport(loss=jnp.mean(losses), held_back=jnp.mean(errors), views=views, num_overflow=jnp.max(overflows))
     return slopes, of_views, report
-
-
-def views_of_step(step: Int[Array, ""], valid: Bool[Array, " v"], config: RefineConfig) -> Int[Array, " b"]:
-    """Slots of the views that a step shows."""
-    places = step * config.views_per_step + jnp.arange(config.views_per_step)
-    return jax.vmap(lambda place: next_view(place, valid, config.seed))(places)
-
-
-def next_view(place: Int[Array, ""], valid: Bool[Array, " v"], seed: int) -> Int[Array, ""]:
-    """Slot of the view at `place` in the sequence of all steps' views.
-
-    Every valid view is shown once a round, in an order drawn anew for each round.
-    """
-    num_valid = jnp.maximum(jnp.sum(valid, dtype=jnp.int32), 1)
-    key = jax.random.fold_in(jax.random.key(seed), place // num_valid)
-    order = jnp.argsort(jnp.where(valid, jax.random.uniform(key, valid.shape), 2.0))
-    return order[place % num_valid].astype(jnp.int32)
-
-
-def held_back_pixels(size: tuple[int, int], view: Int[Array, ""], config: RefineConfig) -> Bool[Array, "h w"]:
-    """Pixels of a view that no gradient sees: the same blocks at every step."""
-    height, width = size
-    key = jax.random.fold_in(jax.random.key(config.seed + 1), view)
-    blocks = jax.random.uniform(key, (-(-height // BLOCK), -(-width // BLOCK))) < config.held_back
-    return jnp.repeat(jnp.repeat(blocks, BLOCK, axis=0), BLOCK, axis=1)[:height, :width]
-
-
-def view_loss(
-    gaussians: Gaussians,
-    background: Float[Array, "3"],
-    key_views: KeyViews,
-    view: Int[Array, ""],
-    config: RefineConfig,
-    max_pairs: int,
-) -> tuple[Float[Array, ""], tuple[Float[Array, ""], Float[Array, ""], Int[Array, ""]]]:
-    """L1 error of one key view at its exposure, with holes filled by `background` and over black.
-
-    Returns:
-        The loss, and the loss again, the error of the held-back pixels, and the tile intersections that did not fit.
-    """
-    height, width = key_views.images.shape[1:3]
-    held_back = held_back_pixels((height, width), view, config)
-    out = render(gaussians, key_views.camera(view), effects=EFFECTS, max_pairs=max_pairs)
-    assert out.color is not None and out.alpha is not None
-    filled = fill_holes(out.color, out.alpha, background)
-    target = key_views.images[view].astype(jnp.float32) / 255
-    exposure = key_views.exposures[view]
-    errors = config.shown_weight * jnp.abs(filled * exposure - target)
-    errors = errors + (1 - config.shown_weight) * jnp.abs(out.color * exposure - target)
-    errors = jnp.mean(errors, axis=-1)
-    loss = _mean_over(errors, ~held_back)
-    return loss, (loss, _mean_over(errors, held_back), out.num_overflow)
-
-
-def _mean_over(errors: Float[Array, "h w"], pixels: Bool[Array, "h w"]) -> Float[Array, ""]:
-    """Mean error of some pixels; 0 for none."""
-    return jnp.sum(jnp.where(pixels, errors, 0.0)) / jnp.maximum(jnp.sum(pixels, dtype=errors.dtype), 1.0)

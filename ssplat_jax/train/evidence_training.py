@@ -15,27 +15,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Int
 
 from ssplat_jax.cache import VoxelCache
 from ssplat_jax.cache.key_views import KeyViews
-from ssplat_jax.data.capture import Capture
-from ssplat_jax.data.open_capture import open_capture
-from ssplat_jax.data.split import choose_split
 from ssplat_jax.errors import InputError
 from ssplat_jax.gaussians import mean_color
 from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.pytree import pytree, replace
 from ssplat_jax.rasterizer import fill_holes, render
-from ssplat_jax.rasterizer.render import round_up
-from ssplat_jax.refinement.refine_capture import key_views_of
-from ssplat_jax.refinement.refine_step import EFFECTS
-from ssplat_jax.streaming.feed import feed_capture
-from ssplat_jax.streaming.session import Session
-from ssplat_jax.streaming.streamsplat import StreamSplat, shown_pivots
-
-MIN_MSE = 1e-4
-"""Added to squared errors before the logarithm, so that views that are nearly right do not count most."""
+from ssplat_jax.refinement.view_loss import EFFECTS
+from ssplat_jax.streaming.streamsplat import StreamSplat
+from ssplat_jax.train.streamed_scenes import StreamedScene, captures_of, negative_psnr, stream_scene
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,17 +63,6 @@ class EvidenceRecipe:
     """Decay of the moving average of the parameters, which is the result."""
     seed: int = 0
     """Seed of the first parameters and of the crops."""
-
-
-@dataclasses.dataclass
-class StreamedScene:
-    """A finished stream."""
-
-    name: str
-    cache: VoxelCache
-    num_pivots: int  # those that are shown
-    key_views: KeyViews  # what was streamed
-    max_pairs: int  # capacity for tile intersections of a crop
 
 
 @pytree
@@ -125,8 +105,8 @@ def train_evidence(
     head = model.init(jax.random.key(recipe.seed))["evidence"]
     params = {**params, "evidence": head}
     scenes = []
-    for capture, stride in _captures_of(captures, recipe):
-        scenes.append(_stream(model, params, capture, stride, recipe))
+    for capture, stride in captures_of(captures, recipe.procedural, recipe.strides, recipe.width, recipe.crop):
+        scenes.append(stream_scene(model, params, capture, stride))
         on_scene(scenes[-1].name)
     optimizer = _optimizer(recipe)
     state, mean = optimizer.init(head), head
@@ -165,39 +145,6 @@ def _learning_rate(recipe: EvidenceRecipe, step: int) -> float:
     return recipe.learning_rate * warmup * 0.5 * (1 + math.cos(math.pi * step / recipe.steps))
 
 
-def _captures_of(paths: Sequence[Path], recipe: EvidenceRecipe) -> list[tuple[Capture, int]]:
-    """All scenes to learn from, each with its stride; every capture at the recipe's width."""
-    opened = [(open_capture(spec, size=(recipe.width, recipe.width * 3 // 4)), 1) for spec in recipe.procedural]
-    for path in paths:
-        capture = open_capture(path)
-        height = round(capture.height * recipe.width / capture.width)
-        opened += [(open_capture(path, size=(recipe.width, height)), stride) for stride in recipe.strides]
-    for capture, _ in opened:
-        if capture.height < recipe.crop[0] or capture.width < recipe.crop[1]:
-            wanted = "x".join(map(str, reversed(recipe.crop)))
-            raise InputError(f"train: {capture.name}: wanted images of {wanted} or more at width {recipe.width}.")
-    return opened
-
-
-def _stream(model: StreamSplat, params: dict, capture: Capture, stride: int, recipe: EvidenceRecipe) -> StreamedScene:
-    """The finished stream of a capture; the targets of its interleaved split are not shown."""
-    context = choose_split("interleaved", len(capture), stride, None, None).context
-    session = Session(model, params)
-    frame = capture.stream_frame(model.config, context)
-    exposures, _ = feed_capture(session, capture, context, frame)
-    assert session.cache is not None
-    num_shown = int(jnp.sum(shown_pivots(session.cache, model.config)))
-    key_views = key_views_of(capture, context, frame, exposures)
-    counts = [int(render(session.gaussians(), key_views.camera(i), effects=EFFECTS).num_pairs) for i in (0, -1)]
-    return StreamedScene(
-        name=f"{capture.name}, stride {stride}",
-        cache=session.cache,
-        num_pivots=num_shown,
-        key_views=key_views,
-        max_pairs=round_up(2 * max(counts)),
-    )
-
-
 def _draw_crop(scene: StreamedScene, recipe: EvidenceRecipe, rng: np.random.Generator) -> _Crop:
     height, width = scene.key_views.images.shape[1:3]
     numbers = (
@@ -226,7 +173,7 @@ def _compiled(model: StreamSplat, num_pivots: int, max_pairs: int, recipe: Evide
         target, exposure = image.astype(jnp.float32) / 255, key_views.exposures[crop.view]
         assert out.color is not None and out.alpha is not None
         filled = fill_holes(out.color, out.alpha, mean_color(gaussians))
-        shown, black = (_negative_psnr(x * exposure, target) for x in (filled, out.color))
+        shown, black = (negative_psnr(x * exposure, target) for x in (filled, out.color))
         value = (1 - recipe.black_weight) * shown + recipe.black_weight * black
         return value, {"shown_psnr": -shown, "black_psnr": -black}
 
@@ -237,9 +184,3 @@ def crop_camera(camera: Camera, row, column, height: int, width: int) -> Camera:
     """The camera of a part of the image of `camera`, from (row, column) on."""
     x, y = (jnp.asarray(value, jnp.float32) for value in (column, row))
     return replace(camera, Ks=camera.Ks.at[0, 2].add(-x).at[1, 2].add(-y), height=height, width=width)
-
-
-def _negative_psnr(image: Float[Array, "h w 3"], target: Float[Array, "h w 3"]) -> Float[Array, ""]:
-    """Minus the PSNR in dB: in it, scenes that differ in difficulty count alike."""
-    mse = jnp.mean((jnp.clip(image, 0.0, 1.0) - target) ** 2)
-    return 10 / math.log(10) * jnp.log(mse + MIN_MSE)

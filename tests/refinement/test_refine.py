@@ -17,8 +17,9 @@ from ssplat_jax.pytree import replace
 from ssplat_jax.rasterizer import render
 from ssplat_jax.refinement import KeyViews, RefineConfig, current_gaussians, init_refinement, refine, refine_step
 from ssplat_jax.refinement.refine import has_stopped_helping
-from ssplat_jax.refinement.refine_step import EFFECTS, held_back_pixels, next_view
 from ssplat_jax.refinement.revision import sizes
+from ssplat_jax.refinement.view_loss import EFFECTS, held_back_pixels
+from ssplat_jax.refinement.view_order import next_view
 
 module = importlib.import_module("ssplat_jax.refinement.refine")  # the package has a function of that name
 NUM, WIDTH, HEIGHT, NUM_VIEWS, MAX_PAIRS = 48, 24, 16, 4, 1 << 12

@@ -13,7 +13,7 @@ from ssplat_jax.metrics.psnr_ssim import psnr
 from ssplat_jax.pytree import replace
 from ssplat_jax.rasterizer import render
 from ssplat_jax.refinement import RefineConfig, RefineEffects, init_refinement, refine, refine_step, revised_key_views
-from ssplat_jax.refinement.refine_step import view_loss
+from ssplat_jax.refinement.view_loss import view_loss
 from ssplat_jax.refinement.view_revision import (
     ViewRevision,
     bounded_views,

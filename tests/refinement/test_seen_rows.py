@@ -15,8 +15,8 @@ from ssplat_jax.rasterizer.effects import Effects
 from ssplat_jax.rasterizer.render import RenderInputs, prepare, tile_grid_of
 from ssplat_jax.rasterizer.tile_grid import tile_boxes
 from ssplat_jax.refinement import RefineConfig, RefineEffects, init_refinement, refine, refine_step
-from ssplat_jax.refinement.refine_step import views_of_step
 from ssplat_jax.refinement.seen_rows import may_be_seen, put_rows, select_rows, take_rows
+from ssplat_jax.refinement.view_order import views_of_step
 from tests.refinement.test_refine import CONFIG, MAX_PAIRS, NUM, cameras, doubtful, key_views, photographs
 
 host = importlib.import_module("ssplat_jax.refinement.refine")

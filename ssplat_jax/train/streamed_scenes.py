@@ -1,0 +1,82 @@
+"""Finished streams to learn from: recipes that train on what a stream ends with, without gradients through it."""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ssplat_jax.cache import VoxelCache
+from ssplat_jax.cache.key_views import KeyViews
+from ssplat_jax.data.capture import Capture
+from ssplat_jax.data.open_capture import open_capture
+from ssplat_jax.data.split import choose_split
+from ssplat_jax.errors import InputError
+from ssplat_jax.rasterizer import render
+from ssplat_jax.rasterizer.render import round_up
+from ssplat_jax.refinement.refine_capture import key_views_of
+from ssplat_jax.refinement.view_loss import EFFECTS
+from ssplat_jax.streaming.feed import feed_capture
+from ssplat_jax.streaming.session import Session
+from ssplat_jax.streaming.streamsplat import StreamSplat, shown_pivots
+
+MIN_MSE = 1e-4
+"""Added to squared errors before the logarithm, so that views that are nearly right do not count most."""
+
+
+@dataclasses.dataclass
+class StreamedScene:
+    """A finished stream."""
+
+    name: str
+    cache: VoxelCache
+    num_pivots: int  # those that are shown
+    key_views: KeyViews  # what was streamed
+    max_pairs: int  # capacity for tile intersections of a view
+
+
+def captures_of(
+    paths: Sequence[Path], procedural: Sequence[str], strides: Sequence[int], width: int, smallest: tuple[int, int]
+) -> list[tuple[Capture, int]]:
+    """All scenes to learn from, each with its stride; every capture at `width` pixels.
+
+    Raises:
+        InputError: an image is smaller than `smallest`, (height, width).
+    """
+    opened = [(open_capture(spec, size=(width, width * 3 // 4)), 1) for spec in procedural]
+    for path in paths:
+        capture = open_capture(path)
+        height = round(capture.height * width / capture.width)
+        opened += [(open_capture(path, size=(width, height)), stride) for stride in strides]
+    for capture, _ in opened:
+        if capture.height < smallest[0] or capture.width < smallest[1]:
+            wanted = "x".join(map(str, reversed(smallest)))
+            raise InputError(f"train: {capture.name}: wanted images of {wanted} or more at width {width}.")
+    return opened
+
+
+def stream_scene(model: StreamSplat, params: dict, capture: Capture, stride: int) -> StreamedScene:
+    """The finished stream of a capture; the targets of its interleaved split are not shown."""
+    context = choose_split("interleaved", len(capture), stride, None, None).context
+    session = Session(model, params)
+    frame = capture.stream_frame(model.config, context)
+    exposures, _ = feed_capture(session, capture, context, frame)
+    assert session.cache is not None
+    num_shown = int(jnp.sum(shown_pivots(session.cache, model.config)))
+    key_views = key_views_of(capture, context, frame, exposures)
+    counts = [int(render(session.gaussians(), key_views.camera(i), effects=EFFECTS).num_pairs) for i in (0, -1)]
+    return StreamedScene(
+        name=f"{capture.name}, stride {stride}",
+        cache=session.cache,
+        num_pivots=num_shown,
+        key_views=key_views,
+        max_pairs=round_up(2 * max(counts)),
+    )
+
+
+def negative_psnr(image: Float[Array, "h w 3"], target: Float[Array, "h w 3"]) -> Float[Array, ""]:
+    """Minus the PSNR in dB: in it, scenes that differ in difficulty count alike."""
+    mse = jnp.mean((jnp.clip(image, 0.0, 1.0) - target) ** 2)
+    return 10 / math.log(10) * jnp.log(mse + MIN_MSE)

@@ -1,0 +1,275 @@
+"""Laws of a learned pass, with the shipped network and with one that is drawn at random."""
+
+import dataclasses
+import functools
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ssplat_jax.errors import InputError, StorageError
+from ssplat_jax.gaussians import SH_C0, Gaussians, with_sh_degree
+from ssplat_jax.geometry.rotations import quats_to_matrices
+from ssplat_jax.pytree import replace
+from ssplat_jax.rasterizer import render
+from ssplat_jax.refinement import RefineConfig, current_gaussians, init_refinement, load_refiner, refine
+from ssplat_jax.refinement.learned_pass import (
+    LARGEST,
+    MIN_PIXELS,
+    STEPS,
+    add_view,
+    learned_change,
+    learned_pass,
+    no_errors,
+    refiner_features,
+)
+from ssplat_jax.refinement.refine import continue_refinement, is_learned, start_refinement
+from ssplat_jax.refinement.refiner_weights import init_refiner, save_refiner
+from ssplat_jax.refinement.revision import Revision, apply_revision, no_revision, sizes
+from ssplat_jax.refinement.view_loss import EFFECTS
+from tests.refinement.test_refine import (
+    CONFIG,
+    MAX_PAIRS,
+    NUM,
+    NUM_VIEWS,
+    assert_same_bits,
+    cameras,
+    doubtful,
+    key_views,
+    photographs,
+)
+
+PASSES = dataclasses.replace(CONFIG, learned_passes=3)
+PASS = jax.jit(learned_pass, static_argnames=("config", "max_pairs"))
+ADD = jax.jit(add_view, static_argnames=("config", "max_pairs"))
+
+
+@functools.cache
+def drawn() -> dict:
+    """A network whose last layers are random too, so that every output depends on every input."""
+    leaves, tree = jax.tree.flatten(init_refiner(3))
+    keys = jax.random.split(jax.random.key(4), len(leaves))
+    noisy = [x + 0.3 * jax.random.normal(key, x.shape) for x, key in zip(leaves, keys, strict=True)]
+    return jax.tree.unflatten(tree, noisy)
+
+
+def one_pass(gaussians, views=None, refiner=None, config=CONFIG):
+    state = init_refinement(gaussians, config=config)
+    views = key_views() if views is None else views
+    return PASS(state, views, load_refiner() if refiner is None else refiner, config=config, max_pairs=MAX_PAIRS)
+
+
+def seen_by(gaussians: Gaussians, views, order=range(NUM_VIEWS), config=CONFIG):
+    seen = no_errors(gaussians)
+    for view in order:
+        seen, _ = ADD(
+            seen, gaussians, no_revision(gaussians), views, jnp.int32(view), config=config, max_pairs=MAX_PAIRS
+        )
+    return seen
+
+
+def test_a_pass_that_does_not_help_is_taken_back():
+    """Blobs before black are unlike the scenes that the network has learned from."""
+    state, report = one_pass(doubtful())
+    assert_same_bits(current_gaussians(state), doubtful())
+    assert report.loss.shape == (STEPS,) and int(state.num_steps) == int(state.num_skipped) == STEPS
+    tried = learned_change(load_refiner(), doubtful(), seen_by(doubtful(), key_views()))
+    error = lambda g: float(jnp.abs(render(g, cameras(), max_pairs=MAX_PAIRS).color - photographs()).mean())  # noqa: E731
+    assert error(apply_revision(doubtful(), tried)) > error(doubtful())
+
+
+def test_a_pass_that_helps_is_kept():
+    """Before training the network goes a little against the gradient."""
+    state, report = one_pass(doubtful(), refiner=small_steps())
+    _, again = one_pass(current_gaussians(state), refiner=small_steps())
+    assert int(state.num_skipped) == 0 and float(again.loss.mean()) < float(report.loss.mean())
+
+
+def small_steps() -> dict:
+    """A network that changes colors alone, by small steps against the gradient."""
+    idle = jax.tree.map(jnp.zeros_like, init_refiner())
+    return {**idle, "gains": {**idle["gains"], "bias": idle["gains"]["bias"].at[8:11].set(0.02)}}
+
+
+def test_steps_go_on_where_passes_end():
+    _, report = refine(doubtful(), cameras(), photographs(), steps=4 * STEPS, config=PASSES, refiner=small_steps())
+    losses = np.array(report.losses).reshape(4, STEPS).mean(axis=1)
+    assert report.num_steps == 4 * STEPS and report.num_skipped == 0
+    assert losses[3] < losses[2] < losses[1] < losses[0]
+
+
+def test_no_pass_follows_on_one_that_was_taken_back():
+    progress, views = start_refinement(doubtful(), key_views(), PASSES)
+    counts = [progress.num_steps for _ in continue_refinement(progress, views, STEPS + 3, PASSES)]
+    assert counts == [STEPS, STEPS + 1, STEPS + 2, STEPS + 3] and int(progress.state.num_skipped) == STEPS
+
+
+def test_sums_over_all_gaussians_are_sums_over_pixels():
+    """What lies in a pixel is divided among its Gaussians by their weights, which add up to alpha."""
+    gaussians = doubtful()
+    seen = seen_by(gaussians, key_views())
+    out = render(gaussians, cameras(), effects=EFFECTS, max_pairs=MAX_PAIRS)
+    alpha = np.asarray(out.alpha, np.float64)
+    target = np.asarray(key_views().images, np.float64) / 255  # as stored: rounded to bytes
+    black = np.asarray(out.color, np.float64) - target
+    assert float(seen.pixels.sum()) == pytest.approx(alpha.sum(), rel=1e-4)
+    assert float(seen.errors.sum()) == pytest.approx((alpha * np.abs(black).mean(-1)).sum(), rel=1e-4)
+    assert float(seen.signed.sum()) == pytest.approx(
+        (alpha * np.clip(black / 0.1, -1, 1).mean(-1)).sum(), rel=1e-3, abs=1e-2
+    )
+
+
+def test_slopes_are_those_of_a_huber_error():
+    """Finite differences of the error in float64, by the place of one Gaussian and by its color."""
+    gaussians, views = doubtful(), key_views()
+    seen = seen_by(gaussians, views)
+    target = np.asarray(views.images, np.float64) / 255
+
+    def error(g: Gaussians) -> float:
+        color = np.asarray(render(g, cameras(), effects=EFFECTS, max_pairs=MAX_PAIRS).color, np.float64) - target
+        size = np.abs(color)
+        return float(np.where(size < 0.1, size**2 / 0.2, size - 0.05).sum())
+
+    row = int(np.argmax(np.asarray(seen.pixels)))
+    axes, size = np.asarray(quats_to_matrices(gaussians.quats[row])), float(sizes(gaussians)[row])
+    for axis in range(3):
+        move = jnp.asarray(axes[:, axis]) * size * 0.02
+        ahead, behind = (replace(gaussians, means=gaussians.means.at[row].add(s * move)) for s in (1, -1))
+        wanted = (error(ahead) - error(behind)) / 0.04
+        assert float(seen.slopes["means"][row, axis]) == pytest.approx(wanted, rel=0.1, abs=0.1)
+    ahead, behind = (replace(gaussians, sh=gaussians.sh.at[row, 0, 1].add(s * 0.01 / SH_C0)) for s in (1, -1))
+    wanted = (error(ahead) - error(behind)) / 0.02
+    assert float(seen.slopes["colors"][row, 1]) == pytest.approx(wanted, rel=0.02, abs=0.02)
+
+
+def test_the_order_of_views_does_not_matter():
+    a, b = (seen_by(doubtful(), key_views(), order) for order in ([0, 1, 2, 3], [2, 0, 3, 1]))
+    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        np.testing.assert_allclose(np.asarray(x), np.asarray(y), rtol=1e-4, atol=1e-4)
+
+
+def test_a_turned_world_gets_the_same_change_turned():
+    """The network sees places in each Gaussian's own axes: it has no notion of up."""
+    turn = np.asarray(quats_to_matrices(jnp.array([0.8, 0.3, -0.4, 0.2])), np.float64)
+    quat = jnp.array([0.8, 0.3, -0.4, 0.2]) / np.linalg.norm([0.8, 0.3, -0.4, 0.2])
+    given = doubtful()
+    w, x, y, z = quat
+    left = jnp.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
+    turned = replace(given, means=given.means @ jnp.asarray(turn.T, jnp.float32), quats=given.quats @ left.T)
+    views = key_views()
+    inverse = np.eye(4)
+    inverse[:3, :3] = turn.T
+    turned_views = replace(views, viewmats=views.viewmats @ jnp.asarray(inverse, jnp.float32))
+    plain = learned_change(drawn(), given, seen_by(given, views))
+    other = learned_change(drawn(), turned, seen_by(turned, turned_views))
+    assert float(jnp.abs(plain.means).max()) > 0.05
+    np.testing.assert_allclose(np.asarray(other.means), np.asarray(plain.means) @ turn.T, atol=5e-3)
+    for name in ("log_scales", "logit_opacities", "sh"):
+        np.testing.assert_allclose(getattr(other, name), getattr(plain, name), atol=2e-2, err_msg=name)
+
+
+def test_changes_are_bounded_and_hidden_gaussians_do_not_change():
+    hidden = replace(doubtful(), means=doubtful().means.at[:12, 2].multiply(-1))  # behind the cameras
+    change = learned_change(jax.tree.map(lambda x: 30 * x, drawn()), hidden, seen_by(hidden, key_views()))
+    stays = (np.arange(NUM) < 12) | (np.asarray(hidden.opacities) == 0)
+    assert all(not np.asarray(leaf)[stays].any() for leaf in jax.tree.leaves(change))
+    tops = {
+        "means": np.linalg.norm(np.asarray(change.means), axis=1).max() / np.sqrt(3),
+        "quats": np.abs(np.asarray(change.quats)).max(),
+        "log_scales": np.abs(np.asarray(change.log_scales)).max(),
+        "logit_opacities": np.abs(np.asarray(change.logit_opacities)).max(),
+        "colors": SH_C0 * np.abs(np.asarray(change.sh[:, 0])).max(),
+    }
+    for name, top in tops.items():
+        assert 0.1 * LARGEST[name] < top <= LARGEST[name] * (1 + 1e-5), name
+
+
+def test_a_pass_that_is_not_finite_changes_only_its_counts():
+    state, report = one_pass(doubtful(), key_views(exposures=jnp.full((NUM_VIEWS, 3), jnp.nan)))
+    assert_same_bits(current_gaussians(state), doubtful())
+    assert int(state.num_skipped) == int(state.num_steps) == STEPS
+    assert not np.isfinite(report.loss).any()
+
+
+def test_ten_thousand_extreme_gaussians_make_no_update_that_is_not_finite():
+    random, n = np.random.default_rng(0), 10_000
+    wide = lambda low, high, *shape: jnp.asarray(10 ** random.uniform(low, high, (n, *shape)), jnp.float32)  # noqa: E731
+    given = Gaussians(
+        means=jnp.asarray(random.normal(size=(n, 3)) * (1, 1, 0) + (0, 0, 1), jnp.float32) * wide(-3, 3, 1),
+        quats=jnp.asarray(random.normal(size=(n, 4)), jnp.float32) * wide(-6, 6, 1),
+        scales=wide(-8, -1, 3) * wide(0, 1, 1),
+        opacities=jnp.asarray(random.choice([0.0, 1e-6, 0.5, 1 - 1e-7, 1.0], n), jnp.float32),
+        sh=jnp.asarray(random.normal(size=(n, 4, 3)) * 10 ** random.uniform(-3, 3, (n, 1, 1)), jnp.float32),
+    )
+    config = dataclasses.replace(CONFIG, sh_degree=1)
+    seen = no_errors(given)
+    add = jax.jit(add_view, static_argnames=("config", "max_pairs"))
+    for view in range(2):
+        none = no_revision(given)
+        seen, _ = add(seen, given, none, key_views(), jnp.int32(view), config=config, max_pairs=1 << 20)
+    for refiner in (load_refiner(), drawn()):
+        change = learned_change(refiner, given, seen)
+        assert all(np.isfinite(np.asarray(leaf)).all() for leaf in jax.tree.leaves(change))
+    assert (np.asarray(seen.pixels) >= MIN_PIXELS).sum() > 20
+    features = refiner_features(given, seen, seen.slopes)
+    assert np.isfinite(np.asarray(features)).all() or not np.isfinite(np.asarray(seen.pixels)).all()
+
+
+def test_higher_bands_move_where_the_scene_has_them():
+    given = with_sh_degree(doubtful(), 1)
+    bands = np.asarray(learned_change(drawn(), given, seen_by(given, key_views())).sh[:, 1:])
+    assert bands.shape == (NUM, 3, 3) and 0 < np.abs(bands).max() * SH_C0 <= LARGEST["bands"] * (1 + 1e-5)
+
+
+def test_passes_come_first_and_count_as_their_steps():
+    progress, views = start_refinement(doubtful(), key_views(), PASSES)
+    steps = continue_refinement(progress, views, 2 * STEPS + 2, PASSES, small_steps())
+    counts = [progress.num_steps for _ in steps]
+    assert counts == [STEPS, 2 * STEPS, 2 * STEPS + 1, 2 * STEPS + 2]
+    assert len(progress.losses) == len(progress.held_back) == len(progress.seconds) == 2 * STEPS + 2
+    assert not is_learned(0, STEPS - 1, PASSES) and not is_learned(3 * STEPS, 100, PASSES)
+    assert is_learned(2 * STEPS, 100, PASSES) and not is_learned(0, 100, RefineConfig())
+
+
+def test_a_pass_shows_the_views_of_its_steps():
+    _, report = one_pass(doubtful())
+    shown = np.asarray(report.views)
+    assert shown.shape == (STEPS, CONFIG.views_per_step)
+    rounds = shown.reshape(-1, NUM_VIEWS)
+    assert (np.sort(rounds, axis=1) == np.arange(NUM_VIEWS)).all()
+
+
+def test_another_network_can_be_given():
+    """One without gains and changes leaves the scene alone."""
+    idle = jax.tree.map(jnp.zeros_like, load_refiner())
+    refined, report = refine(doubtful(), cameras(), photographs(), steps=STEPS, config=PASSES, refiner=idle)
+    assert_same_bits(refined, doubtful())
+    assert report.num_steps == STEPS
+
+
+def test_a_file_returns_what_was_saved(tmp_path):
+    save_refiner(tmp_path / "refiner.npz", drawn(), {"steps": 1})
+    jax.tree.map(np.testing.assert_array_equal, load_refiner(tmp_path / "refiner.npz"), drawn())
+
+
+def test_files_that_do_not_fit_are_refused(tmp_path):
+    wrong = {**drawn(), "gains": {**drawn()["gains"], "bias": jnp.zeros(3)}}
+    save_refiner(tmp_path / "wrong.npz", wrong, {})
+    with pytest.raises(InputError, match=r"gains/bias must be \(12,\), got \(3,\)"):
+        load_refiner(tmp_path / "wrong.npz")
+    with pytest.raises(StorageError):
+        load_refiner(Path(tmp_path / "missing.npz"))
+
+
+def test_absent_views_are_not_compared():
+    views = replace(key_views(), valid=jnp.arange(NUM_VIEWS) == 2)
+    _, report = one_pass(doubtful(), views)
+    assert (np.asarray(report.views) == 2).all()
+
+
+def test_no_change_where_nothing_was_seen():
+    change = learned_change(drawn(), doubtful(), no_errors(doubtful()))
+    assert isinstance(change, Revision)
+    assert all(not np.asarray(leaf).any() for leaf in jax.tree.leaves(change))
