@@ -55,6 +55,7 @@ class Progress:
     held_back: list[float] = dataclasses.field(default_factory=list)  # per step, on the pixels that are not
     seconds: list[float] = dataclasses.field(default_factory=list)  # per step; the first of a process compiles
     max_rows: int | None = None  # capacity for the rows that the views of a step may see; None before the first
+    num_learned: int = 0  # steps done whose place learned passes took
 
     @property
     def num_steps(self) -> int:
@@ -168,13 +169,12 @@ def continue_refinement(
     config = config or RefineConfig()
     if progress.max_rows is None:
         progress.max_rows = row_capacity(progress.state.start, key_views, range(steps), config)
-    while progress.num_steps < steps and not has_stopped_helping(
-        progress.held_back, _steps_per_round(key_views, config)
-    ):
+    while progress.num_steps < steps and not _has_stopped_helping(progress, key_views, config):
         start = time.perf_counter()
         if is_learned(progress.num_steps, steps, config) and not int(progress.state.num_skipped):
             step = _learned_pass(config, progress.max_pairs)
             progress.state, report = step(progress.state, key_views, refiner or load_refiner())
+            progress.num_learned += STEPS
         else:
             rate = jnp.float32(config.final_rate ** (progress.num_steps / steps))
             step = _step(config, progress.max_pairs, progress.max_rows)
@@ -195,9 +195,10 @@ def is_learned(num_steps: int, steps: int, config: RefineConfig) -> bool:
     return num_steps < config.learned_passes * STEPS and num_steps + STEPS <= steps
 
 
-def _steps_per_round(key_views: KeyViews, config: RefineConfig) -> int:
-    """Steps after which as many views were shown as there are."""
-    return -(-int(np.sum(np.asarray(key_views.valid))) // config.views_per_step)
+def _has_stopped_helping(progress: Progress, key_views: KeyViews, config: RefineConfig) -> bool:
+    """`has_stopped_helping` for the gradient steps; a learned pass shows several rounds of few views as they were."""
+    num_views = int(np.sum(np.asarray(key_views.valid)))
+    return has_stopped_helping(progress.held_back[progress.num_learned :], -(-num_views // config.views_per_step))
 
 
 def report_of(progress: Progress, key_views: KeyViews, config: RefineConfig | None = None) -> Refinement:
@@ -207,7 +208,7 @@ def report_of(progress: Progress, key_views: KeyViews, config: RefineConfig | No
         num_skipped=int(progress.state.num_skipped),
         losses=progress.losses,
         held_back=progress.held_back,
-        stopped_early=has_stopped_helping(progress.held_back, _steps_per_round(key_views, config or RefineConfig())),
+        stopped_early=_has_stopped_helping(progress, key_views, config or RefineConfig()),
         seconds_per_step=float(np.median(progress.seconds[1:])) if progress.num_steps > 1 else 0.0,
         num_left_out=int(np.sum(~np.asarray(key_views.valid))),
         key_views=revised_key_views(progress.state.views, key_views),

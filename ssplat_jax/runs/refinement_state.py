@@ -45,7 +45,8 @@ def save_refinement(path: Path, progress: Progress, key_views: KeyViews, identit
         }
     arrays |= {name: np.asarray(getattr(state, name)) for name in COUNTS}
     arrays["valid"] = np.asarray(key_views.valid)
-    measured = {name: getattr(progress, name) for name in ("max_pairs", "max_rows", "losses", "held_back", "seconds")}
+    names = ("max_pairs", "max_rows", "losses", "held_back", "seconds", "num_learned")
+    measured = {name: getattr(progress, name) for name in names}
     save_arrays(path, arrays, KIND, {"identity": identity, "measured": measured})
 
 

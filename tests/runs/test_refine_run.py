@@ -12,6 +12,7 @@ from ssplat_jax.console import Reporter
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.errors import InputError
 from ssplat_jax.evaluation.exposures import exposures_to_json
+from ssplat_jax.refinement.learned_pass import STEPS
 from ssplat_jax.runs import capture_run
 from ssplat_jax.runs import refine_run as module
 from ssplat_jax.runs.capture_run import run_capture
@@ -67,14 +68,7 @@ def test_a_stopped_refinement_continues_to_the_same_bytes(finished, monkeypatch)
     assert result.after["shown"]["psnr"] > result.before["shown"]["psnr"]
 
     folder.clear_refinement()
-    steps = module.continue_refinement
-
-    def stopped_after_one(progress, *arguments):
-        for _ in steps(progress, *arguments):
-            signal.raise_signal(signal.SIGINT)
-            yield
-
-    monkeypatch.setattr(module, "continue_refinement", stopped_after_one)
+    stop_after_each_step(monkeypatch)
     for taken in (1, 2):
         result = refine(finished, revise=revise)
         assert (result.num_steps, result.interrupted) == (taken, signal.SIGINT)
@@ -88,6 +82,32 @@ def test_a_stopped_refinement_continues_to_the_same_bytes(finished, monkeypatch)
     assert report["revised"] == ["poses", "exposures"] and report["num_left_out"] == 0
     assert len(read_ply(folder.refined_scene).gaussians.means) == len(read_ply(folder.scene).gaussians.means)
     assert [read_ply(path).gaussians.sh_degree for path in (folder.scene, folder.refined_scene)] == [0, 2]
+
+
+def stop_after_each_step(monkeypatch):
+    """Refinements get SIGINT after every step and every learned pass."""
+    steps = module.continue_refinement
+
+    def stopped_after_one(progress, *arguments):
+        for _ in steps(progress, *arguments):
+            signal.raise_signal(signal.SIGINT)
+            yield
+
+    monkeypatch.setattr(module, "continue_refinement", stopped_after_one)
+
+
+def test_a_stop_after_each_learned_pass_changes_no_byte(finished, monkeypatch):
+    folder, steps = RunFolder(finished), 2 * STEPS + 1
+    assert refine(finished, steps, overwrite=True).num_steps == steps
+    whole = folder.refined_scene.read_bytes()
+    folder.clear_refinement()
+    with monkeypatch.context() as patched:
+        stop_after_each_step(patched)
+        assert [refine(finished, steps).num_steps for _ in range(2)] == [STEPS, 2 * STEPS]
+    refine(finished, steps)
+    assert folder.refined_scene.read_bytes() == whole
+    report = json.loads(folder.refinement.read_text())
+    assert report["num_steps"] == len(report["losses"]) == steps and report["num_skipped"] == 0
 
 
 def test_a_refinement_with_other_steps_is_refused(finished):
