@@ -30,7 +30,7 @@ class Refine:
     """Folder of a finished `ssplat run`."""
     capture: CapturePath
     steps: int = 100
-    """Most steps; each renders two views. The first 24 are three learned passes, where there are as many."""
+    """Most steps; each renders two views. The first 40 are five learned passes, where there are as many."""
     revise: ReviseOption = ()
     weights: WeightsOption = "tiny"
     save_every: int = 50

@@ -71,5 +71,5 @@ class RefineConfig:
             raise InputError(f"refine: {name} must be {wanted}, got {getattr(self, name)!r}.")
 
 
-FOR_CAPTURES = RefineConfig(sh_degree=2, learned_passes=3)
+FOR_CAPTURES = RefineConfig(sh_degree=2, learned_passes=5)
 """Configuration for scenes that a stream made of captures: colors of real surfaces depend on the direction of view."""
