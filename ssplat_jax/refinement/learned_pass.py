@@ -84,7 +84,7 @@ def add_view(
     config: RefineConfig,
     max_pairs: int,
 ) -> tuple[SeenErrors, tuple[Float[Array, ""], Float[Array, ""], Int[Array, ""]]]:
-    """`seen` with one key view added, and its loss, its held-back error and its overflow, as `view_loss` has them.
+    """`seen` with one key view added, and the measurements of the view as `view_loss` has them.
 
     The error is a Huber loss: its gradient is linear in the difference of the colors up to `CLIPPED_ERROR`.
 
@@ -96,6 +96,9 @@ def add_view(
         view: slot of the view to add.
         config: weights of the error.
         max_pairs: capacity for tile intersections.
+
+    Returns:
+        The sums, and (loss, held-back error, overflow) of the view.
     """
     camera, exposure = key_views.camera(view), key_views.exposures[view]
     height, width = key_views.images.shape[1:3]
@@ -167,7 +170,7 @@ def learned_pass(
     revision = bounded(jax.tree.map(jnp.add, state.revision, change), config)
     checked = min(NUM_CHECKED, views.shape[0])
     after = _mean_loss(replace(state, revision=revision), key_views, views[:checked], config, max_pairs)
-    # A comparison with NaN is false. One of NaN in a Gaussian that no checked view shows is looked for as well.
+    # A loss of NaN does not help either. Gaussians that no checked view shows are looked at themselves.
     helps = after < jnp.mean(losses.reshape(-1)[:checked])
     for leaf in jax.tree.leaves(revision):
         helps = helps & jnp.all(jnp.isfinite(leaf))
