@@ -56,8 +56,8 @@ def test_the_command_writes_a_network_with_which_other_views_gain(tmp_path, monk
 
 
 def test_the_shipped_network_gains_on_a_room_that_it_has_not_seen():
-    capture = open_capture("procedural:room?frames=24&seed=11", size=(80, 60))
-    split = interleaved_split(len(capture), 1, 20)
+    capture = open_capture("procedural:room?frames=16&seed=11", size=(64, 48))
+    split = interleaved_split(len(capture), 1, 12)
     model, params = StreamSplat(preset("tiny")), load_params("tiny")
     session, frame = Session(model, params), capture.stream_frame(model.config, split.context)
     exposures, _ = feed_capture(session, capture, split.context, frame)
