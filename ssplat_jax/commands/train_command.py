@@ -12,7 +12,7 @@ from ssplat_jax.errors import InputError, require_positive
 if TYPE_CHECKING:
     from ssplat_jax.console import Reporter
 
-MINUTES = {"tiny": 77, "stream": 15, "evidence": 15, "refiner": 15}
+MINUTES = {"tiny": 77, "stream": 15, "evidence": 15, "refiner": 30}
 """Time of recipes on two cores (docs/model_card.md)."""
 
 

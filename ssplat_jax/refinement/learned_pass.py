@@ -46,7 +46,7 @@ MIN_PIXELS = 0.1
 
 @pytree
 class SeenErrors:
-    """What the views of a pass say about `n` Gaussians: sums over the views."""
+    """Errors that the views of a pass see in `n` Gaussians: sums over the views."""
 
     slopes: dict[str, Float[Array, "n _"]]  # gradients of the error by part, places in the Gaussian's own axes
     squares: dict[str, Float[Array, "n _"]]  # of the gradients of single views
@@ -236,7 +236,7 @@ def learned_change(refiner: dict, gaussians: Gaussians, seen: SeenErrors) -> Rev
 def refiner_features(
     gaussians: Gaussians, seen: SeenErrors, agreement: dict[str, Float[Array, "n _"]]
 ) -> Float[Array, "n f"]:
-    """What the network reads, as numbers of about unit size. No gradient flows through it.
+    """Inputs of the network, as numbers of about unit size. No gradient flows through them.
 
     Limits:
         Gaussians that no view shows, and absent ones, have finite features.

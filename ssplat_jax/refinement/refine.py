@@ -119,9 +119,12 @@ def refine(
         better for `PATIENCE` rounds of views.
 
     Raises:
-        InputError: shapes do not fit, `steps` is negative, or no view has a finite camera and exposure.
+        InputError: shapes do not fit, `steps` is negative, no view has a finite camera and exposure, or a `refiner` is
+            given without learned passes.
     """
     _check(cameras, images, exposures, steps)
+    if refiner is not None and not (config or RefineConfig()).learned_passes:
+        raise InputError("refine: a refiner needs config.learned_passes of at least 1, got 0; set it, or leave it out.")
     if steps == 0:
         return gaussians, Refinement(0, 0, [], [], False, 0.0)
     given = KeyViews.of(cameras, jnp.asarray(images), exposures)

@@ -136,6 +136,7 @@ def refine_step(
 
 
 def view_revision(state: RefineState) -> ViewRevision | None:
+    """The changes to the key views; None if no effect is on."""
     return None if state.views is None else state.views.revision
 
 

@@ -26,11 +26,11 @@ from ssplat_jax.pytree import pytree, replace
 from ssplat_jax.rasterizer import fill_holes, render
 from ssplat_jax.refinement.view_loss import EFFECTS
 from ssplat_jax.streaming.streamsplat import StreamSplat
-from ssplat_jax.train.streamed_scenes import StreamedScene, captures_of, negative_psnr, stream_scene
+from ssplat_jax.train.streamed_scenes import SceneSources, StreamedScene, captures_of, negative_psnr, stream_scene
 
 
 @dataclasses.dataclass(frozen=True)
-class EvidenceRecipe:
+class EvidenceRecipe(SceneSources):
     """Everything that decides the evidence head, besides the scenes and the other weights."""
 
     steps: int = 600
@@ -39,16 +39,6 @@ class EvidenceRecipe:
     """Crops whose gradients a step averages, each of another scene."""
     crop: tuple[int, int] = (128, 160)
     """Height and width of the rendered crops in pixels, at the full resolution of the views."""
-    width: int = 320
-    """Width of the streamed images in pixels; their height keeps the capture's shape."""
-    strides: tuple[int, ...] = (1, 2)
-    """A capture is streamed once with every frame, once with every second one, and so on."""
-    procedural: tuple[str, ...] = (
-        "procedural:room?frames=80&seed=3",
-        "procedural:corridor?frames=80&seed=1",
-        "procedural:orbit?frames=80&seed=2",
-    )
-    """Procedural scenes to learn from beside the captures."""
     learning_rate: float = 5e-3
     """Peak of the learning rate, from which it decays by a cosine."""
     warmup_steps: int = 20
@@ -105,7 +95,7 @@ def train_evidence(
     head = model.init(jax.random.key(recipe.seed))["evidence"]
     params = {**params, "evidence": head}
     scenes = []
-    for capture, stride in captures_of(captures, recipe.procedural, recipe.strides, recipe.width, recipe.crop):
+    for capture, stride in captures_of(captures, recipe, recipe.crop):
         scenes.append(stream_scene(model, params, capture, stride))
         on_scene(scenes[-1].name)
     optimizer = _optimizer(recipe)

@@ -30,17 +30,20 @@ from ssplat_jax.refinement.refiner_weights import init_refiner
 from ssplat_jax.refinement.revision import apply_revision, bounded
 from ssplat_jax.refinement.view_loss import EFFECTS
 from ssplat_jax.streaming.streamsplat import StreamSplat
-from ssplat_jax.train.streamed_scenes import captures_of, negative_psnr, stream_scene
+from ssplat_jax.train.streamed_scenes import SceneSources, captures_of, negative_psnr, stream_scene
 
 CONFIG = dataclasses.replace(FOR_CAPTURES, held_back=0.0)
 """Weights and bounds of the passes."""
+
+SMALLEST = (16, 16)
+"""Smallest height and width of images to learn from."""
 
 SCORED_VIEWS = 3
 """Views of each scene on which a round is scored."""
 
 
 @dataclasses.dataclass(frozen=True)
-class RefinerRecipe:
+class RefinerRecipe(SceneSources):
     """Everything that decides the refiner, besides the scenes and the weights of the stream."""
 
     rounds: int = 4
@@ -49,16 +52,6 @@ class RefinerRecipe:
     """Gradient steps of a round."""
     views: tuple[int, ...] = (16, 16, 8, 4)
     """Views that a scene is compared with: each scene draws one of these numbers in every round."""
-    width: int = 320
-    """Width of the images in pixels; their height keeps the capture's shape."""
-    strides: tuple[int, ...] = (1, 2)
-    """A capture is streamed once with every frame, once with every second one, and so on."""
-    procedural: tuple[str, ...] = (
-        "procedural:room?frames=80&seed=3",
-        "procedural:corridor?frames=80&seed=1",
-        "procedural:orbit?frames=80&seed=2",
-    )
-    """Procedural scenes to learn from beside the captures."""
     learning_rate: float = 4e-3
     """Peak of the learning rate, from which it decays by a cosine over all rounds."""
     warmup_steps: int = 20
@@ -115,7 +108,7 @@ def train_refiner(
     """
     rng = np.random.default_rng(recipe.seed)
     scenes, names, states = [], [], []
-    for capture, stride in captures_of(captures, recipe.procedural, recipe.strides, recipe.width, (16, 16)):
+    for capture, stride in captures_of(captures, recipe, SMALLEST):
         scene = stream_scene(model, params, capture, stride)
         gaussians = jax.jit(model.decode_shown, static_argnums=2)(params, scene.cache, scene.num_pivots)
         scenes.append((scene.key_views, scene.max_pairs))

@@ -26,6 +26,22 @@ MIN_MSE = 1e-4
 """Added to squared errors before the logarithm, so that views that are nearly right do not count most."""
 
 
+@dataclasses.dataclass(frozen=True)
+class SceneSources:
+    """Scenes that a recipe streams: the part that such recipes share."""
+
+    width: int = 320
+    """Width of the streamed images in pixels; their height keeps the capture's shape."""
+    strides: tuple[int, ...] = (1, 2)
+    """A capture is streamed once with every frame, once with every second one, and so on."""
+    procedural: tuple[str, ...] = (
+        "procedural:room?frames=80&seed=3",
+        "procedural:corridor?frames=80&seed=1",
+        "procedural:orbit?frames=80&seed=2",
+    )
+    """Procedural scenes to learn from beside the captures."""
+
+
 @dataclasses.dataclass
 class StreamedScene:
     """A finished stream."""
@@ -37,19 +53,18 @@ class StreamedScene:
     max_pairs: int  # capacity for tile intersections of a view
 
 
-def captures_of(
-    paths: Sequence[Path], procedural: Sequence[str], strides: Sequence[int], width: int, smallest: tuple[int, int]
-) -> list[tuple[Capture, int]]:
-    """All scenes to learn from, each with its stride; every capture at `width` pixels.
+def captures_of(paths: Sequence[Path], sources: SceneSources, smallest: tuple[int, int]) -> list[tuple[Capture, int]]:
+    """All scenes to learn from, each with its stride; every capture at the width of `sources`.
 
     Raises:
         InputError: an image is smaller than `smallest`, (height, width).
     """
-    opened = [(open_capture(spec, size=(width, width * 3 // 4)), 1) for spec in procedural]
+    width = sources.width
+    opened = [(open_capture(spec, size=(width, width * 3 // 4)), 1) for spec in sources.procedural]
     for path in paths:
         capture = open_capture(path)
         height = round(capture.height * width / capture.width)
-        opened += [(open_capture(path, size=(width, height)), stride) for stride in strides]
+        opened += [(open_capture(path, size=(width, height)), stride) for stride in sources.strides]
     for capture, _ in opened:
         if capture.height < smallest[0] or capture.width < smallest[1]:
             wanted = "x".join(map(str, reversed(smallest)))
