@@ -107,9 +107,6 @@ class Train:
         """Trains the evidence head on whole streams. It takes minutes, so it starts anew after an interrupt."""
         from ssplat_jax.checkpoint.weights import check_params, describe_weights, load_weights, save_weights
         from ssplat_jax.console import Reporter
-        from ssplat_jax.storage.folder_lock import lock_folder
-        from ssplat_jax.storage.folders import make_writable
-        from ssplat_jax.streaming.streamsplat import StreamSplat
         from ssplat_jax.train.evidence_training import EvidenceRecipe, train_evidence
 
         init_weights = self._needed_weights("whose evidence head it trains")
@@ -119,20 +116,7 @@ class Train:
         recipe = EvidenceRecipe(seed=self.seed)
         recipe = dataclasses.replace(recipe, steps=max(1, round(recipe.steps * self.scale_steps)))
         reporter = Reporter(self.quiet)
-        reporter.say(f"{recipe.steps} steps, about {MINUTES['evidence']} minutes on two cores with two captures")
-        make_writable(self.out)
-        with (
-            lock_folder(self.out),
-            reporter.progress("training", recipe.steps, waiting="streaming the scenes") as advance,
-        ):
-            trained, facts = train_evidence(
-                StreamSplat(config),
-                params,
-                self.captures,
-                recipe,
-                on_scene=lambda name: reporter.say(f"streamed {name}"),
-                on_step=lambda step, record: advance(step, f"psnr {record['shown_psnr']:.2f}"),
-            )
+        trained, facts = self._trained(train_evidence, config, params, recipe, recipe.steps, reporter)
         start = {"init_weights": init_weights.name, "before": describe_weights(str(init_weights)).provenance}
         provenance = {"recipe": dataclasses.asdict(recipe), "steps": recipe.steps, **start, **facts}
         save_weights(self.out / "weights.npz", trained, config, provenance)
@@ -143,9 +127,6 @@ class Train:
         from ssplat_jax.checkpoint.weights import check_params, load_weights
         from ssplat_jax.console import Reporter
         from ssplat_jax.refinement.refiner_weights import save_refiner
-        from ssplat_jax.storage.folder_lock import lock_folder
-        from ssplat_jax.storage.folders import make_writable
-        from ssplat_jax.streaming.streamsplat import StreamSplat
         from ssplat_jax.train.refiner_training import RefinerRecipe, train_refiner
 
         init_weights = self._needed_weights("whose streams it refines")
@@ -155,13 +136,25 @@ class Train:
         recipe = RefinerRecipe(seed=self.seed)
         recipe = dataclasses.replace(recipe, steps=max(1, round(recipe.steps * self.scale_steps)))
         num_steps, reporter = recipe.rounds * recipe.steps, Reporter(self.quiet)
-        reporter.say(f"{num_steps} steps, about {MINUTES['refiner']} minutes on two cores with two captures")
+        trained, facts = self._trained(train_refiner, config, params, recipe, num_steps, reporter)
+        provenance = {"recipe": dataclasses.asdict(recipe), "init_weights": init_weights.name, **facts}
+        save_refiner(self.out / "refiner.npz", trained, provenance)
+        print(f"wrote {self.out}/refiner.npz after {num_steps} steps")
+        return 0
+
+    def _trained(self, train, config, params: dict, recipe, num_steps: int, reporter: "Reporter") -> tuple[dict, dict]:
+        """Parameters and facts of `train`, a training on whole streams, with the folder locked and steps shown."""
+        from ssplat_jax.storage.folder_lock import lock_folder
+        from ssplat_jax.storage.folders import make_writable
+        from ssplat_jax.streaming.streamsplat import StreamSplat
+
+        reporter.say(f"{num_steps} steps, about {MINUTES[self.recipe]} minutes on two cores with two captures")
         make_writable(self.out)
         with (
             lock_folder(self.out),
             reporter.progress("training", num_steps, waiting="streaming the scenes") as advance,
         ):
-            trained, facts = train_refiner(
+            return train(
                 StreamSplat(config),
                 params,
                 self.captures,
@@ -169,10 +162,6 @@ class Train:
                 on_scene=lambda name: reporter.say(f"streamed {name}"),
                 on_step=lambda step, record: advance(step, f"psnr {record['shown_psnr']:.2f}"),
             )
-        provenance = {"recipe": dataclasses.asdict(recipe), "init_weights": init_weights.name, **facts}
-        save_refiner(self.out / "refiner.npz", trained, provenance)
-        print(f"wrote {self.out}/refiner.npz after {num_steps} steps")
-        return 0
 
     def _needed_weights(self, why: str) -> Path:
         """--init-weights of a recipe that trains on whole streams; refuses options that it has no use for."""
