@@ -41,7 +41,7 @@ def lane_sum(x: Float[Array, "*s n"]) -> Float[Array, "*s"]:
 
 
 def in_own_kernel(wanted: Bool[Array, ""], compute: Callable[[], Array]) -> Array:
-    """`compute()` where `wanted` is true, else zeros; XLA does not fuse it with the operations around it.
+    """`compute()` where `wanted` is true, else zeros; XLA's CPU backend does not fuse it with the operations around it.
 
     Why: the CPU compiler fuses a gather with every kernel that uses it, and each repeats it entry by entry
     (`lax.optimization_barrier` is removed before that). It does not fuse across the edge of a `lax.cond`. A loop
@@ -49,9 +49,15 @@ def in_own_kernel(wanted: Bool[Array, ""], compute: Callable[[], Array]) -> Arra
     of 350 (docs/performance.md).
     May go when `ssplat bench render` is as fast with a plain `compute()`. Where `wanted` is always true, it must be a
     value that the compiler does not know.
+    On other backends it is a select, since a branch makes a GPU wait for the host: `compute` must have finite gradients
+    there.
     """
     shape = jax.eval_shape(compute)
-    return lax.cond(wanted, compute, lambda: jnp.zeros(shape.shape, shape.dtype))
+    zero = jnp.zeros((), shape.dtype)
+    return lax.platform_dependent(
+        cpu=lambda: lax.cond(wanted, compute, lambda: jnp.zeros(shape.shape, shape.dtype)),
+        default=lambda: jnp.where(wanted, compute(), zero),
+    )
 
 
 def kept(arrays: Arrays, always: Bool[Array, ""]) -> Arrays:

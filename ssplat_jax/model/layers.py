@@ -109,7 +109,10 @@ class ResidualBlock(nn.Module):
         y = nn.relu(instance_norm(first(self.features, use_bias=False, name="conv1")(x)))
         y = nn.relu(instance_norm(Conv(self.features, use_bias=False, name="conv2")(y)))
         if x.shape[-1] != self.features or self.stride != 1:
-            x = instance_norm(nn.Dense(self.features, name=self.skip)(x[:, :: self.stride, :: self.stride]))
+            # Projected before it is subsampled: XLA's GPU backend aborts on a product of subsampled pixels
+            # (https://github.com/openxla/xla/issues/47381).
+            projected = nn.Dense(self.features, name=self.skip)(x)
+            x = instance_norm(projected[:, :: self.stride, :: self.stride])
         return nn.relu(x + y)
 
 

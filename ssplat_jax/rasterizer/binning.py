@@ -30,7 +30,7 @@ MIN_SHARED_CAPACITY = 1 << 16
 MAX_PAIRS = (1 << 31) - 1
 """Largest index; counts of pairs stop there."""
 
-READ_AHEAD = 8
+READ_AHEAD = 16
 """Entries behind the last pair that may be read."""
 
 KEY_BITS = 32
@@ -78,7 +78,10 @@ def intersect_tiles(
 
     def sorted_pairs(capacity: int):
         rows = _owners(ends, capacity)
-        rows, bounds = _sort_pairs(_tiles(table, images, ends, rows, grid), rows, grid.num_tiles, num_rows)
+        tiles = _tiles(table, images, ends, rows, grid)
+        in_pieces = lambda pieces: lambda: _sort_pairs(tiles, rows, grid.num_tiles, num_rows, pieces)  # noqa: E731
+        pieces = SORT_PIECES if capacity >= MIN_SHARED_CAPACITY else 1
+        rows, bounds = lax.platform_dependent(cpu=in_pieces(pieces), default=in_pieces(1))
         return jnp.pad(rows, (0, max_pairs - capacity + READ_AHEAD)), bounds
 
     shares = CAPACITY_SHARES if max_pairs >= MIN_SHARED_CAPACITY else CAPACITY_SHARES[-1:]
@@ -137,7 +140,7 @@ def _owners(ends: Int[Array, " m"], capacity: int) -> Int[Array, " p"]:
 
 
 def _sort_pairs(
-    tiles: Int[Array, " p"], rows: Int[Array, " p"], num_tiles: int, num_rows: int
+    tiles: Int[Array, " p"], rows: Int[Array, " p"], num_tiles: int, num_rows: int, pieces: int
 ) -> tuple[Int[Array, " p"], Int[Array, " tiles_and_one"]]:
     """Rows in order of (tile, row), and where each tile's rows begin.
 
@@ -146,13 +149,13 @@ def _sort_pairs(
         rows: the row of each pair, in ascending order with no row left out.
         num_tiles: number of tiles.
         num_rows: number of rows of the table.
+        pieces: number of arrays to sort side by side.
 
     Returns:
         The sorted rows, and bounds as in `TileIntersections`. Inside a piece, rows are counted from its first: that
         takes fewer bits, so that most keys fit in 32.
     """
     capacity = tiles.shape[0]
-    pieces = SORT_PIECES if capacity >= MIN_SHARED_CAPACITY else 1
     size = -(-capacity // pieces)
     padding = (0, pieces * size - capacity)
     max_row = min(size, num_rows) - 1

@@ -1,19 +1,21 @@
 """The fast path: tiles composited front to back in batches of similar load, with a gradient that recomputes.
 
-A step of the loop takes the next `STEP_SIZE` Gaussians of each of `BATCH_SIZE` tiles. Arrays are `[p u t]`: pixels of a
-tile, the step's Gaussians, the batch's tiles. Every kernel then runs over contiguous tiles with the pixel's offset as a
-constant, and sums over Gaussians or pixels are sums over a short middle axis (XLA's CPU backend vectorizes those; sums
-over the last or a long first axis cost five times as much). Nothing per sample is stored: the backward pass repeats the
-same steps, front to back, with the totals of the forward pass.
+A step of the loop takes the next Gaussians of each of many tiles; a `Schedule` says how many. Arrays are `[p u t]`:
+pixels of a tile, the step's Gaussians, the batch's tiles. Every kernel then runs over contiguous tiles with the pixel's
+offset as a constant, and sums over Gaussians or pixels are sums over a short middle axis (XLA's CPU backend vectorizes
+those; sums over the last or a long first axis cost five times as much). Nothing per sample is stored: the backward pass
+repeats the same steps, front to back, with the totals of the forward pass.
 
     w_i = a_i T_i,  T_{i+1} = T_i (1 - a_i)        out = sum_i w_i c_i
     dL/da_i = T_i s_i - tail_i / (1 - a_i)   with s_i = c_i . dL/dout and tail_i = sum_{j>i} w_j s_j
 """
 
+import dataclasses
 import functools
 import math
 import operator
 from collections.abc import Callable, Iterable
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +24,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from ssplat_jax.rasterizer import constants
-from ssplat_jax.rasterizer.binning import READ_AHEAD, TileIntersections
+from ssplat_jax.rasterizer.binning import TileIntersections
 from ssplat_jax.rasterizer.depth_sorted_table import (
     BOX,
     CHANNELS,
@@ -37,11 +39,24 @@ from ssplat_jax.rasterizer.depth_sorted_table import (
 from ssplat_jax.rasterizer.tile_grid import Grid
 from ssplat_jax.xla_cpu import in_own_kernel, short_exp
 
-STEP_SIZE = READ_AHEAD
-"""Gaussians of a tile in one step; the last step of a tile may read behind all of its pairs. 16 are not faster."""
+Results = TypeVar("Results")
 
-BATCH_SIZE = 128
-"""Tiles composited side by side. 256 are not faster."""
+
+@dataclasses.dataclass(frozen=True)
+class Schedule:
+    """The work of one step of the loop; results do not depend on it, except for rounding."""
+
+    step_size: int
+    """Gaussians of a tile in one step, at most `binning.READ_AHEAD`: a tile's last step may read behind all pairs."""
+    batch_size: int
+    """Tiles composited side by side."""
+
+
+ON_CPU = Schedule(step_size=8, batch_size=128)
+"""Neither twice as many Gaussians nor twice as many tiles are faster."""
+
+ON_ACCELERATOR = Schedule(step_size=16, batch_size=1 << 15)
+"""Few, wide steps: a GPU launches kernels and asks the host at every one. The limit on tiles bounds the memory."""
 
 LOG_ALPHA_MAX = math.log(constants.ALPHA_MAX)
 
@@ -68,10 +83,15 @@ def composite(
         Sums of weight times channel for each tile, channel and pixel. Gradients reach the table's shape and channels.
         Samples fainter than 1/255 or capped at 0.99 have no gradient by their opacity.
     """
-    return _forward(grid, with_alpha, table, intersections)
+    return _by_platform(functools.partial(_forward, grid, with_alpha, table, intersections))
 
 
-def _forward(grid: Grid, with_alpha: bool, table, intersections: TileIntersections):
+def _by_platform(compute: Callable[[Schedule], Results]) -> Results:
+    """`compute` with the schedule for the platform that the program is compiled for."""
+    return lax.platform_dependent(cpu=lambda: compute(ON_CPU), default=lambda: compute(ON_ACCELERATOR))
+
+
+def _forward(grid: Grid, with_alpha: bool, table, intersections: TileIntersections, schedule: Schedule):
     channels = num_channels(table) + with_alpha  # a channel of ones becomes alpha
 
     def batch(out, tiles):
@@ -80,19 +100,23 @@ def _forward(grid: Grid, with_alpha: bool, table, intersections: TileIntersectio
             return afters[-1], out + _total(weight * values[STEP_CHANNELS, None, u] for u, weight in enumerate(weights))
 
         start = jnp.zeros((channels, grid.tile**2, tiles.shape[0]), table.dtype)
-        drawn = _run_steps(grid, table, intersections, tiles, step, start, with_ones=with_alpha)
+        drawn = _run_steps(grid, table, intersections, tiles, schedule, step, start, with_ones=with_alpha)
         return out.at[tiles].set(jnp.moveaxis(drawn, -1, 0), mode="drop"), None
 
     out = jnp.zeros((grid.num_tiles, channels, grid.tile**2), table.dtype)
-    return lax.scan(batch, out, _batches(intersections.bounds, grid))[0]
+    return lax.scan(batch, out, _batches(intersections.bounds, grid, schedule))[0]
 
 
 def _composite_fwd(grid: Grid, with_alpha: bool, table, intersections: TileIntersections):
-    out = _forward(grid, with_alpha, table, intersections)
+    out = _by_platform(functools.partial(_forward, grid, with_alpha, table, intersections))
     return out, (table, intersections, out)
 
 
 def _composite_bwd(grid: Grid, with_alpha: bool, residuals, cotangents):
+    return _by_platform(functools.partial(_backward, grid, with_alpha, residuals, cotangents)), None
+
+
+def _backward(grid: Grid, with_alpha: bool, residuals, cotangents, schedule: Schedule):
     table, intersections, out = residuals
     tails = jnp.sum(out * cotangents, axis=1)
 
@@ -113,11 +137,11 @@ def _composite_bwd(grid: Grid, with_alpha: bool, residuals, cotangents):
             grads = grads.at[rows.T].add(grad_rows)  # rows read behind a tile's end add zeros
             return afters[-1], (tail, grads)
 
-        return _run_steps(grid, table, intersections, tiles, step, (tails[inside].T, grads))[1], None
+        return _run_steps(grid, table, intersections, tiles, schedule, step, (tails[inside].T, grads))[1], None
 
     grads = jnp.zeros_like(table[:, WITHOUT_BOX])
-    grads = lax.scan(batch, grads, _batches(intersections.bounds, grid))[0]
-    return jnp.pad(grads, ((0, 0), (0, table.shape[1] - grads.shape[1]))), None
+    grads = lax.scan(batch, grads, _batches(intersections.bounds, grid, schedule))[0]
+    return jnp.pad(grads, ((0, 0), (0, table.shape[1] - grads.shape[1])))
 
 
 composite.defvjp(_composite_fwd, _composite_bwd)
@@ -125,6 +149,10 @@ composite.defvjp(_composite_fwd, _composite_bwd)
 
 def median_rows(grid: Grid, table: Float[Array, "m f"], intersections: TileIntersections) -> Int[Array, "tiles p"]:
     """The table row whose sample brings each pixel's transmittance below one half, or -1; without a gradient."""
+    return _by_platform(functools.partial(_median_rows, grid, table, intersections))
+
+
+def _median_rows(grid: Grid, table, intersections: TileIntersections, schedule: Schedule):
     table = jnp.concatenate([table[:, SHAPE], table[:, BOX]], axis=1)
 
     def batch(tiles):
@@ -135,17 +163,17 @@ def median_rows(grid: Grid, table: Float[Array, "m f"], intersections: TileInter
             return afters[-1], found
 
         start = jnp.full((grid.tile**2, tiles.shape[0]), -1, jnp.int32)
-        return _run_steps(grid, table, intersections, tiles, step, start)
+        return _run_steps(grid, table, intersections, tiles, schedule, step, start)
 
-    batches = _batches(intersections.bounds, grid)
+    batches = _batches(intersections.bounds, grid, schedule)
     out = jnp.moveaxis(lax.map(batch, batches), -1, 1).reshape(-1, grid.tile**2)
     return jnp.full((grid.num_tiles, grid.tile**2), -1, jnp.int32).at[batches.reshape(-1)].set(out, mode="drop")
 
 
-def _batches(bounds: Int[Array, " tiles_and_one"], grid: Grid) -> Int[Array, "batches t"]:
+def _batches(bounds: Int[Array, " tiles_and_one"], grid: Grid, schedule: Schedule) -> Int[Array, "batches t"]:
     """Tiles in order of load, so that those of a batch end together; padded with `grid.num_tiles`, which is no tile."""
     order = jnp.argsort(bounds[1:] - bounds[:-1]).astype(jnp.int32)
-    size = min(BATCH_SIZE, grid.num_tiles)
+    size = min(schedule.batch_size, grid.num_tiles)
     padding = -grid.num_tiles % size
     order = jnp.concatenate([jnp.full((padding,), grid.num_tiles, jnp.int32), order])
     return order.reshape(-1, size)
@@ -162,6 +190,7 @@ def _run_steps(
     table,
     intersections: TileIntersections,
     tiles: Int[Array, " t"],
+    schedule: Schedule,
     step: Callable,
     state,
     *,
@@ -177,6 +206,7 @@ def _run_steps(
         table: from `sorted_table`.
         intersections: from `intersect_tiles`.
         tiles: the batch.
+        schedule: the size of a step.
         step: `step(rows, values, alphas, transmittance, state)` returns the transmittance and the state after it;
             `rows` are row numbers of `table`, `values` their columns.
         state: the state before the first step.
@@ -186,17 +216,18 @@ def _run_steps(
         The state. Steps go on while, in one of the tiles, Gaussians are left and a pixel is above the stop.
     """
     first, last = _ranges(intersections, tiles)
+    size = schedule.step_size
     has_any = intersections.num_pairs > 0
 
     def goes_on(carry):
         i, transmittance = carry[:2]
         clearest = jnp.max(transmittance, axis=0)
-        return jnp.any((clearest >= constants.TRANSMITTANCE_STOP) & (first + i * STEP_SIZE < last))
+        return jnp.any((clearest >= constants.TRANSMITTANCE_STOP) & (first + i * size < last))
 
     def body(carry):
         i, transmittance, state = carry
-        start = first + i * STEP_SIZE
-        rows = in_own_kernel(has_any, lambda: _next_rows(intersections.rows, start))
+        start = first + i * size
+        rows = in_own_kernel(has_any, lambda: _next_rows(intersections.rows, start, size))
         gaussians = in_own_kernel(has_any, lambda: table[rows][..., WITHOUT_BOX])
         values = in_own_kernel(has_any, lambda: _step_columns(grid, gaussians, tiles, start, last, with_ones))
         transmittance, state = step(rows, values, _alphas(grid, values), transmittance, state)
@@ -206,9 +237,9 @@ def _run_steps(
     return lax.while_loop(goes_on, body, (0, clear, state))[2]
 
 
-def _next_rows(rows: Array, start: Int[Array, " t"]) -> Array:
-    """`STEP_SIZE` consecutive rows from each start, `[t u]`, copied as blocks."""
-    return jax.vmap(lambda first: lax.dynamic_slice_in_dim(rows, first, STEP_SIZE))(start)
+def _next_rows(rows: Array, start: Int[Array, " t"], size: int) -> Array:
+    """`size` consecutive rows from each start, `[t u]`, copied as blocks."""
+    return jax.vmap(lambda first: lax.dynamic_slice_in_dim(rows, first, size))(start)
 
 
 def _step_columns(grid: Grid, gaussians: Float[Array, "t u f"], tiles, start, last, with_ones: bool):
@@ -217,7 +248,7 @@ def _step_columns(grid: Grid, gaussians: Float[Array, "t u f"], tiles, start, la
     within = tiles % (grid.rows * grid.columns)
     x = x - ((within % grid.columns).astype(x.dtype) + 0.5) * grid.tile
     y = y - ((within // grid.columns).astype(x.dtype) + 0.5) * grid.tile
-    is_own = start + jnp.arange(STEP_SIZE, dtype=jnp.int32)[:, None] < last
+    is_own = start + jnp.arange(gaussians.shape[1], dtype=jnp.int32)[:, None] < last
     ones = [jnp.ones_like(x)] * with_ones
     return jnp.stack([x, y, p, q, r, jnp.where(is_own, log_opacity, -jnp.inf), *channels, *ones])
 

@@ -13,7 +13,7 @@ import pytest
 from ssplat_jax.config import NETWORK_CONFIGS, CompactConfig, ResplatConfig, StreamConfig
 from ssplat_jax.errors import InputError
 from ssplat_jax.model import count_params
-from ssplat_jax.model.layers import average_pool, rms_normalize
+from ssplat_jax.model.layers import ResidualBlock, average_pool, rms_normalize
 from ssplat_jax.model.network import NETWORKS, Network, NetworkConfig, network_of, register_network
 from ssplat_jax.model.types import GRID_STRIDE, DepthDistribution, TokenShapes
 from ssplat_jax.streaming.streamsplat import StreamSplat
@@ -174,3 +174,13 @@ def test_shipped_network_fulfils_the_protocol(config_type):
     assert network.bound_history(feats).shape == feats.shape
     shapes = jax.eval_shape(StreamSplat(config).init, jax.random.key(0))
     assert set(network.stages(config)) == set(shapes) - {"hpda", "cgfi", "evidence"}
+
+
+def test_no_product_takes_subsampled_pixels():
+    """XLA's GPU backend aborts on one (https://github.com/openxla/xla/issues/47381)."""
+    block, x = ResidualBlock(8, stride=2), jnp.ones((1, 8, 8, 4))
+    program = jax.make_jaxpr(block.apply)(block.init(jax.random.key(0), x), x)
+    assert str(program).count("dot_general") > 0
+    taken = {v for e in program.eqns if e.primitive.name == "slice" and e.params["strides"] for v in e.outvars}
+    assert len(taken) == 1
+    assert not [e for e in program.eqns if e.primitive.name == "dot_general" and taken & set(e.invars)]

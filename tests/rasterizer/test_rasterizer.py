@@ -1,6 +1,7 @@
 """Images of the fast path and the reference against the NumPy oracle, and gradients against the reference's."""
 
 import functools
+import re
 
 import jax
 import jax.numpy as jnp
@@ -416,6 +417,44 @@ def test_sorting_in_pieces_equals_one_sort(monkeypatch):
         np.testing.assert_array_equal(got.bounds, wanted.bounds)
         np.testing.assert_array_equal(got.rows[:num_pairs], wanted.rows[:num_pairs])
     assert int(wanted.num_pairs) > capacity
+
+
+def test_the_schedule_of_an_accelerator_agrees(monkeypatch):
+    """In sizes that no other test has, since what is traced is kept; two of the accelerator's steps for each tile."""
+    gaussians, camera = cloud(200, degree=1, size=0.3), cameras(26, 35, batch=2)
+
+    @functools.partial(jax.jit, static_argnums=1)
+    def results(gaussians, max_pairs):
+        def loss(gaussians):
+            out = render(gaussians, camera, effects=ALL, max_pairs=max_pairs)
+            return jnp.sum((out.color - 0.3) ** 2) + jnp.sum(out.depth), out
+
+        return jax.value_and_grad(loss, has_aux=True)(gaussians)
+
+    (_, wanted), wanted_gradients = results(gaussians, 1 << 13)
+    monkeypatch.setattr(compositing, "ON_CPU", compositing.ON_ACCELERATOR)
+    (_, got), gradients = results(gaussians, 3 << 12)
+    num_tiles = 2 * -(-26 // 8) * -(-35 // 8)
+    assert compositing.ON_ACCELERATOR.step_size < int(wanted.num_pairs) / num_tiles
+    np.testing.assert_array_equal(got.median_depth, wanted.median_depth)
+    for name in ("color", "alpha", "depth"):
+        np.testing.assert_allclose(getattr(got, name), getattr(wanted, name), atol=FORWARD, err_msg=name)
+    for a, b in zip(jax.tree.leaves(gradients), jax.tree.leaves(wanted_gradients), strict=True):
+        assert np.linalg.norm(b) > 0 and relative(a, b) < 1e-5
+
+
+def test_programs_for_a_gpu_do_not_branch():
+    """A GPU asks the host at every branch; the loop over Gaussians would have three of them."""
+    traced = jax.jit(lambda g, c: render(g, c, max_pairs=1 << 12)).trace(cloud(50), cameras(12, 10))
+    assert num_branches(traced.lower(lowering_platforms=("cpu",)).as_text()) > 3
+    assert num_branches(traced.lower(lowering_platforms=("cuda",)).as_text()) == 0
+
+
+def num_branches(program: str) -> int:
+    """Branches on a value that only the running program knows; the choice of a platform is on a constant."""
+    branches = re.finditer(r'"stablehlo.case"\((%\w+)\)', program)
+    conditions = [program[: branch.start()].rpartition(f"{branch[1]} = ")[2] for branch in branches]
+    return sum(condition.startswith("stablehlo.convert") for condition in conditions)
 
 
 # Last: it empties the caches of compiled programs.
