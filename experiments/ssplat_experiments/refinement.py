@@ -71,7 +71,7 @@ class Sizes:
     """Gradient steps after each chunk."""
 
 
-SIZES = {"smoke": Sizes(8, (64, 48), 2, 1), "cpu": Sizes(None, None, 100, 6)}
+SIZES = {"smoke": Sizes(8, (64, 48), 2, 1), "cpu": Sizes(None, None, 100, 5)}
 
 
 @dataclasses.dataclass(frozen=True)

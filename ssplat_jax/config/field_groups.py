@@ -176,9 +176,9 @@ class OnlineRefineConfig(ConfigGroup):
     """Gradient steps after each chunk, each on one key view; 0 adds nothing to any program."""
     num_key_views: int = 64
     """Key views kept to compare the scene with; when all places are taken, one of the two most similar is replaced."""
-    pivots_per_cell: int = 12
-    """Pivots that are revised after a chunk, as a multiple of the grid cells of a view: the nearest before the key
-    views. It fixes time and memory of the steps."""
+    pivots_per_cell: int = 8
+    """Pivots that a step revises, as a multiple of the grid cells of its view: the least covered ones. It fixes time
+    and memory of a step."""
 
     def rules(self) -> tuple[tuple[str, str, bool], ...]:
         return (

@@ -1,8 +1,8 @@
-"""Refinement while streaming: after each chunk a few gradient steps on key views revise the pivots that they see.
+"""Refinement while streaming: after each chunk a few gradient steps on key views revise the pivots that they show.
 
-    step ─► cache ─► keep_views ─► key views of this round ─► nearest pivots before them ─► base Gaussians + residuals
-                                                                                                   │ refine_step x M
-                                                    cache' ◄─ settle, write back ◄─────────────────┘
+    step ─► cache ─► keep_views          for each view of the round: visible pivots ─► base Gaussians + residuals
+                         └─► views of this round ─►                                              │ online_step
+                                                       cache' ◄─ settle, write back ◄────────────┘
 
 All arrays have fixed sizes: a round costs the same after 10 chunks and after 10,000.
 """
@@ -11,24 +11,22 @@ import functools
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Int
 
 from ssplat_jax.cache.key_views import KeyViews, keep_views, usable
-from ssplat_jax.cache.pixel_pairs import NEAR
 from ssplat_jax.cache.residuals import Residuals, add, settle, unpack
 from ssplat_jax.cache.state import VoxelCache
 from ssplat_jax.chunk import Chunk
-from ssplat_jax.config import StreamConfig
 from ssplat_jax.gaussians import Gaussians, mean_color
 from ssplat_jax.geometry.cameras import Camera
-from ssplat_jax.model import GRID_STRIDE
 from ssplat_jax.pytree import replace
 from ssplat_jax.rasterizer import fill_holes, render
 from ssplat_jax.rasterizer.render import round_up
 from ssplat_jax.refinement.revision import sizes
 from ssplat_jax.refinement.view_loss import EFFECTS
+from ssplat_jax.refinement.visible_pivots import visible_pivots
 from ssplat_jax.streaming.session import Revise
-from ssplat_jax.streaming.streamsplat import ChunkOutput, StreamSplat, shown_pivots
+from ssplat_jax.streaming.streamsplat import ChunkOutput, StreamSplat
 
 GAINS = {"means": 12.0, "quats": 0.2, "log_scales": 6.0, "logit_opacities": 6.0, "colors": 0.12}
 """Step of each part over its mean gradient in the pixels that a Gaussian fills. Newton's method would divide by the
@@ -43,6 +41,9 @@ MIN_PIXELS = 0.3
 
 SHOWN_WEIGHT = 0.7
 """Weight of the error with holes filled; the rest is the error over black, as in `RefineConfig.shown_weight`."""
+
+GOLDEN = 2654435769
+"""2^32 over the golden ratio."""
 
 PAIRS_PER_GAUSSIAN = 3
 """Capacity for tile intersections; the farthest Gaussians of a view are left out beyond it."""
@@ -69,15 +70,22 @@ def revise_scene(model: StreamSplat, params: dict, cache: VoxelCache, chunk: Chu
     config = model.config
     assert cache.residuals is not None and cache.key_views is not None
     arrivals = replace(KeyViews.of(chunk.camera, chunk.images, output.exposures), valid=chunk.valid)
+    kept = keep_views(cache.key_views, arrivals, depth=config.stream.median_depth)
     views = views_of_round(cache.key_views, arrivals, cache.stats.num_chunks, config.refine.steps_per_chunk)
-    key_views = keep_views(cache.key_views, arrivals, depth=config.stream.median_depth)
-    cache = replace(cache, key_views=key_views)
-    pivots = nearest_pivots(cache, views, config)
+    cache = replace(cache, key_views=kept)
+    return jax.lax.scan(lambda cache, view: (_revise_view(model, params, cache, view), None), cache, views)[0]
+
+
+def _revise_view(model: StreamSplat, params: dict, cache: VoxelCache, view: KeyViews) -> VoxelCache:
+    """The cache after one step on a single view, which revises the pivots that the view shows."""
+    config = model.config
+    pivots = visible_pivots(cache, view, config)
     base = model.decode_pivots(params, replace(cache, residuals=None), pivots)
     taken = jnp.maximum(pivots, 0)
     flat = lambda x: x.reshape(-1, *x.shape[2:])  # noqa: E731
     means, packed = flat(cache.means)[taken], flat(cache.residuals)[taken]
-    revised = _run_steps(base, unpack(packed), views, config)
+    max_pairs = round_up(PAIRS_PER_GAUSSIAN * base.num_gaussians)
+    revised = online_step(base, unpack(packed), view, max_pairs=max_pairs, max_scale=config.head.max_scale)
     moved, settled = settle(means, revised, config.memory.voxel_size)
     is_changed = jnp.any(moved != means, axis=1) | jnp.any(settled != packed, axis=1)
     places = jnp.where(is_changed & (pivots >= 0), pivots, cache.alive.size)
@@ -92,50 +100,19 @@ def revise_scene(model: StreamSplat, params: dict, cache: VoxelCache, chunk: Chu
 
 
 def views_of_round(ring: KeyViews, arrivals: KeyViews, num_chunks: Int[Array, ""], num: int) -> KeyViews:
-    """The `num` views of a round: half of them new ones, the others kept ones, drawn anew for each chunk.
+    """The `num` kept views of a round; the chunk's own views where none has been kept yet.
 
-    Where there are too few of one kind, the other kind fills up; where there are too few of both, views repeat.
+    The i-th step of a stream takes the view at n x frac(i / golden ratio) of n usable ones, in order of their slots:
+    all views are taken about equally often, and steps that follow each other take views that arrived far apart.
     """
-    pool = jax.tree.map(lambda *x: jnp.concatenate(x), arrivals, ring)
-    pool = replace(pool, valid=usable(pool))
-    is_new = jnp.arange(pool.num_slots) < arrivals.num_slots
-    drawn = jax.random.uniform(jax.random.fold_in(jax.random.key(0), num_chunks), is_new.shape)
-    order = jnp.argsort(jnp.where(pool.valid, drawn, 2.0))
-    ranks = jnp.zeros_like(drawn).at[order].set(jnp.cumsum(is_new[order], dtype=drawn.dtype))
-    comes_first = is_new & (ranks <= (num + 1) // 2)
-    # New views that come first, then kept ones, then other new ones, then those that cannot be used.
-    group = jnp.where(comes_first, 0.0, jnp.where(is_new, 2.0, 1.0))
-    order = jnp.argsort(jnp.where(pool.valid, drawn + group, 4.0))
-    chosen = order[jnp.arange(num) % jnp.maximum(jnp.sum(pool.valid, dtype=jnp.int32), 1)]
-    return jax.tree.map(lambda x: x[chosen], pool)
-
-
-def nearest_pivots(cache: VoxelCache, views: KeyViews, config: StreamConfig) -> Int[Array, " m"]:
-    """Shown pivots before any of `views`, the nearest if there are more than there is space for; -1 after the last."""
-    height, width = views.images.shape[1:3]
-    cells = -(-height // GRID_STRIDE) * -(-width // GRID_STRIDE)
-    space = min(config.refine.pivots_per_cell * cells, cache.alive.size)
-    shown = shown_pivots(cache, config).reshape(-1)
-    px, py, pz = jnp.moveaxis(cache.means.reshape(-1, 3), -1, 0)
-
-    def nearer(depths: Float[Array, " n"], view: KeyViews):
-        rows = view.viewmats[:3, :, None]
-        x, y, z = (row[0] * px + row[1] * py + row[2] * pz + row[3] for row in rows)
-        is_seen = view.valid & shown & (z > NEAR)
-        u, v = view.Ks[0, 0] * x / z + view.Ks[0, 2], view.Ks[1, 1] * y / z + view.Ks[1, 2]
-        is_seen &= (u > -GRID_STRIDE) & (u < width + GRID_STRIDE) & (v > -GRID_STRIDE) & (v < height + GRID_STRIDE)
-        return jnp.minimum(depths, jnp.where(is_seen, z, jnp.inf)), None
-
-    depths = jax.lax.scan(nearer, jnp.full(shown.shape, jnp.inf), views)[0]
-    order = jnp.argsort(depths)[:space].astype(jnp.int32)
-    return jnp.where(depths[order] < jnp.inf, order, -1)
-
-
-def _run_steps(base: Gaussians, residuals: Residuals, views: KeyViews, config: StreamConfig) -> Residuals:
-    """`residuals` after one step on each of `views`."""
-    max_pairs = round_up(PAIRS_PER_GAUSSIAN * base.num_gaussians)
-    step = functools.partial(online_step, base, max_pairs=max_pairs, max_scale=config.head.max_scale)
-    return jax.lax.scan(lambda residuals, view: (step(residuals, view), None), residuals, views)[0]
+    is_kept, is_new = usable(ring), usable(arrivals) & ~jnp.any(usable(ring))
+    pool, is_usable = jax.tree.map(lambda *x: jnp.concatenate(x), (ring, is_kept), (arrivals, is_new))
+    order, number = jnp.argsort(~is_usable, stable=True), jnp.sum(is_usable, dtype=jnp.int32)
+    steps = (num_chunks * num + jnp.arange(num, dtype=jnp.int32)).astype(jnp.uint32)
+    fractions = (steps * jnp.uint32(GOLDEN)).astype(jnp.float32) / 2.0**32  # the product wraps around
+    places = jnp.minimum((fractions * number.astype(fractions.dtype)).astype(jnp.int32), jnp.maximum(number - 1, 0))
+    chosen = jax.tree.map(lambda x: x[order[places]], pool)
+    return replace(chosen, valid=is_usable[order[places]])
 
 
 def online_step(
