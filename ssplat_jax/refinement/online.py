@@ -24,6 +24,7 @@ from ssplat_jax.rasterizer import fill_holes, render
 from ssplat_jax.rasterizer.render import round_up
 from ssplat_jax.refinement.revision import sizes
 from ssplat_jax.refinement.view_loss import EFFECTS
+from ssplat_jax.refinement.view_order import golden_fractions
 from ssplat_jax.refinement.visible_pivots import visible_pivots
 from ssplat_jax.streaming.session import Revise
 from ssplat_jax.streaming.streamsplat import ChunkOutput, StreamSplat
@@ -41,9 +42,6 @@ MIN_PIXELS = 0.3
 
 SHOWN_WEIGHT = 0.7
 """Weight of the error with holes filled; the rest is the error over black, as in `RefineConfig.shown_weight`."""
-
-GOLDEN = 2654435769
-"""2^32 over the golden ratio."""
 
 PAIRS_PER_GAUSSIAN = 3
 """Capacity for tile intersections; the farthest Gaussians of a view are left out beyond it."""
@@ -108,8 +106,7 @@ def views_of_round(ring: KeyViews, arrivals: KeyViews, num_chunks: Int[Array, ""
     is_kept, is_new = usable(ring), usable(arrivals) & ~jnp.any(usable(ring))
     pool, is_usable = jax.tree.map(lambda *x: jnp.concatenate(x), (ring, is_kept), (arrivals, is_new))
     order, number = jnp.argsort(~is_usable, stable=True), jnp.sum(is_usable, dtype=jnp.int32)
-    steps = (num_chunks * num + jnp.arange(num, dtype=jnp.int32)).astype(jnp.uint32)
-    fractions = (steps * jnp.uint32(GOLDEN)).astype(jnp.float32) / 2.0**32  # the product wraps around
+    fractions = golden_fractions(num_chunks * num + jnp.arange(num, dtype=jnp.int32))
     places = jnp.minimum((fractions * number.astype(fractions.dtype)).astype(jnp.int32), jnp.maximum(number - 1, 0))
     chosen = jax.tree.map(lambda x: x[order[places]], pool)
     return replace(chosen, valid=is_usable[order[places]])

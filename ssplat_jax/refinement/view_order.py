@@ -2,9 +2,12 @@
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from ssplat_jax.refinement.refine_config import RefineConfig
+
+GOLDEN = 2654435769
+"""2^32 over the golden ratio."""
 
 
 def views_of_step(step: Int[Array, ""], valid: Bool[Array, " v"], config: RefineConfig) -> Int[Array, " b"]:
@@ -16,9 +19,16 @@ def views_of_step(step: Int[Array, ""], valid: Bool[Array, " v"], config: Refine
 def next_view(place: Int[Array, ""], valid: Bool[Array, " v"], seed: int) -> Int[Array, ""]:
     """Slot of the view at `place` in the sequence of all steps' views.
 
-    Every valid view is shown once a round, in an order drawn anew for each round.
+    Every valid view is shown once a round. Any few views in a row lie evenly among the valid ones, which are in the
+    order of the stream: each part of the scene is seen about equally often. A round begins at a place of its own.
     """
     num_valid = jnp.maximum(jnp.sum(valid, dtype=jnp.int32), 1)
-    key = jax.random.fold_in(jax.random.key(seed), place // num_valid)
-    order = jnp.argsort(jnp.where(valid, jax.random.uniform(key, valid.shape), 2.0))
+    begin = jax.random.uniform(jax.random.fold_in(jax.random.key(seed), place // num_valid))
+    ranks = jnp.cumsum(valid, dtype=jnp.int32) - 1
+    order = jnp.argsort(jnp.where(valid, (golden_fractions(ranks) + begin) % 1.0, 2.0))
     return order[place % num_valid].astype(jnp.int32)
+
+
+def golden_fractions(numbers: Int[Array, " n"]) -> Float[Array, " n"]:
+    """Fractional parts of numbers over the golden ratio: those of any few numbers in a row lie evenly in [0, 1]."""
+    return (numbers.astype(jnp.uint32) * jnp.uint32(GOLDEN)).astype(jnp.float32) / 2.0**32  # the product wraps around

@@ -1,7 +1,7 @@
 """Pivots that a view shows, found without rendering: those before which little of their grid cell is covered.
 
-A view of a large scene has most of its pivots in the frustum and shows a quarter of them. The others lie behind
-surfaces and cost a step as much as those that it revises.
+A view of a large scene has many more pivots in its frustum than it shows. Those behind surfaces would cost a step as
+much as those that it revises.
 """
 
 import jax
