@@ -83,7 +83,7 @@ def test_only_captures_that_are_there_are_measured(tmp_path):
     (tmp_path / "fox").mkdir()
     assert {case.asked["scene"] for case in cases(tmp_path, "cpu")} == {"room", "fox 1"}
     online = [case.config.refine.steps_per_chunk for case in cases(None, "cpu")]
-    assert online == [0, 6, 0]
+    assert online == [0, 5, 0]
 
 
 def test_own_gain_takes_a_wrong_exposure_away_and_nothing_else():

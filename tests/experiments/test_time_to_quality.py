@@ -101,5 +101,5 @@ def test_a_curve_ends_when_no_column_improves_any_more():
 def test_all_methods_are_measured_on_all_scenes():
     found = [case.name for case in cases(None, "cpu")]
     assert found[0] == "room, stream" and found[-1] == f"room, {OPTIMIZED}"
-    assert [name for name in found if "offline" in name] == [f"room, stream + offline {n}" for n in (200, 1600)]
-    assert [name for name in found if "online" in name] == ["room, stream + online 6"]
+    assert [name for name in found if "offline" in name] == [f"room, stream + offline {n}" for n in (200, 800)]
+    assert [name for name in found if "online" in name] == ["room, stream + online 5"]
