@@ -19,7 +19,7 @@ from ssplat_jax.rasterizer import constants
 from ssplat_jax.rasterizer.depth_sorted_table import BOX_COLUMNS, BOX_SIZE, SHAPE_COLUMNS
 from ssplat_jax.rasterizer.projection import Splats
 from ssplat_jax.rasterizer.tile_grid import Grid, tile_boxes
-from ssplat_jax.xla_cpu import SORT_PIECES, in_own_kernel, sort_pieces
+from ssplat_jax.xla_cpu import SORT_PIECES, by_platform, in_own_kernel, sort_pieces
 
 CAPACITY_SHARES = (17, 20, 24, 28, 32)
 """In 32nds of the capacity, a power of two: the smallest share that holds all pairs is sorted."""
@@ -81,7 +81,7 @@ def intersect_tiles(
         tiles = _tiles(table, images, ends, rows, grid)
         in_pieces = lambda pieces: lambda: _sort_pairs(tiles, rows, grid.num_tiles, num_rows, pieces)  # noqa: E731
         pieces = SORT_PIECES if capacity >= MIN_SHARED_CAPACITY else 1
-        rows, bounds = lax.platform_dependent(cpu=in_pieces(pieces), default=in_pieces(1))
+        rows, bounds = by_platform(cpu=in_pieces(pieces), other=in_pieces(1))
         return jnp.pad(rows, (0, max_pairs - capacity + READ_AHEAD)), bounds
 
     shares = CAPACITY_SHARES if max_pairs >= MIN_SHARED_CAPACITY else CAPACITY_SHARES[-1:]

@@ -37,7 +37,7 @@ from ssplat_jax.rasterizer.depth_sorted_table import (
     num_channels,
 )
 from ssplat_jax.rasterizer.tile_grid import Grid
-from ssplat_jax.xla_cpu import in_own_kernel, short_exp
+from ssplat_jax.xla_cpu import by_platform, in_own_kernel, short_exp
 
 Results = TypeVar("Results")
 
@@ -88,7 +88,7 @@ def composite(
 
 def _by_platform(compute: Callable[[Schedule], Results]) -> Results:
     """`compute` with the schedule for the platform that the program is compiled for."""
-    return lax.platform_dependent(cpu=lambda: compute(ON_CPU), default=lambda: compute(ON_ACCELERATOR))
+    return by_platform(cpu=lambda: compute(ON_CPU), other=lambda: compute(ON_ACCELERATOR))
 
 
 def _forward(grid: Grid, with_alpha: bool, table, intersections: TileIntersections, schedule: Schedule):
