@@ -4,7 +4,7 @@
                          └─► views of this round ─►                                              │ online_step
                                                        cache' ◄─ settle, write back ◄────────────┘
 
-All arrays have fixed sizes: a round costs the same after 10 chunks and after 10,000.
+All arrays have fixed sizes, so that neither time nor memory of a round grows without bound.
 """
 
 import functools
