@@ -42,6 +42,15 @@ def safe_log(x: Float[Array, "*s"], eps: float = 1e-12) -> Float[Array, "*s"]:
     return jnp.where(is_small, jnp.log(jnp.asarray(eps, x.dtype)), jnp.log(jnp.where(is_small, jnp.ones_like(x), x)))
 
 
+def clip_value(x: Float[Array, "*s"], low: float, high: float) -> Float[Array, "*s"]:
+    """`x` clipped to [low, high], with the gradient of the identity.
+
+    Limits:
+        Beyond the bounds the gradient is 1 too: descent can come back. Inside, the value is `x` bit for bit.
+    """
+    return x + lax.stop_gradient(jnp.clip(x, low, high) - x)
+
+
 def softplus_inverse(y: float) -> float:
     """The x with softplus(x) = y, for y > 0, in plain Python; for initial values."""
     return y + math.log(-math.expm1(-y))

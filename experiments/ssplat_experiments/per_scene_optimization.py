@@ -85,7 +85,8 @@ def view_space_lengths(
     """Lengths of the gradients by the place on the screen, in coordinates that run from -1 to 1 over the image.
 
     A step dx along the camera's x axis moves the place by focal / z dx pixels: the gradient by pixels is that by the
-    mean, turned into the camera, times z / focal. It holds the small part that comes through the shape of the splat.
+    mean, turned into the camera, times z / focal. The mean also changes the splat's shape; this small part of the
+    gradient is left in.
     """
     pose, K = views.viewmats[view], views.Ks[view]
     height, width = views.images.shape[1:3]

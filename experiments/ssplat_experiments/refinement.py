@@ -66,7 +66,7 @@ class Sizes:
     size: tuple[int, int] | None
     """(width, height); None: as `captures.SETTINGS` says."""
     steps: int
-    """Gradient steps after the stream."""
+    """Steps after the stream, those in the place of learned passes included."""
     per_chunk: int
     """Gradient steps after each chunk."""
 
@@ -300,12 +300,12 @@ def findings(rows: list[Row]) -> list[str]:
 
 STUDY = Study(
     name="refinement",
-    text="""Refinement with the shipped weights, scored on views that were never shown. `offline`: gradient steps after
-the stream. `online`: `steps` after each chunk; `chunk s` is the median time of a chunk with them. `wrong poses`: the
-context cameras are turned by 0.5 degrees and moved by 1 % of the depth. `poses adjusted`: before the stream. `targets
-carried`: the same scene, each target moved as the context views beside it. `over black`: holes black, exposure carried
-over. `own gain`: the shown image after a factor for each channel that is fitted to the target itself, so no score of a
-method; its distance from `shown` is what carrying the exposure over costs.""",
+    text="""Refinement with the shipped weights, scored on views that were never shown. `offline`: learned passes, then
+gradient steps, after the stream. `online`: `steps` gradient steps after each chunk; `chunk s` is the median time of a
+chunk with them. `wrong poses`: the context cameras are turned by 0.5 degrees and moved by 1 % of the depth. `poses
+adjusted`: before the stream. `targets carried`: the same scene, each target moved as the context views beside it. `over
+black`: holes black, exposure carried over. `own gain`: the shown image after a factor for each channel that is fitted
+to the target itself, so no score of a method; its distance from `shown` is what carrying the exposure over costs.""",
     cases=cases,
     findings=findings,
 )

@@ -40,7 +40,7 @@ def lead(rows: Sequence[Row], column: str) -> tuple[float | None, float, float]:
 
 
 def findings(rows: list[Row]) -> list[str]:
-    """Who is ahead, until when, and by how much, for each scene and column."""
+    """The table of `at_times`; then a line for each scene and column on who leads, until when and by how much."""
     lines = []
     for scene in dict.fromkeys(row["scene"] for row in rows):
         here = [row for row in rows if row["scene"] == scene]
@@ -61,14 +61,17 @@ def findings(rows: list[Row]) -> list[str]:
             lines.append(
                 f"* {scene}, {name}: {where}; ours has its first score, {first[column]:.2f} dB, after"
                 f" {first['seconds']:.1f} s and its best, {best[column]:.2f} dB ({best['method']}), after"
-                f" {best['seconds']:.1f} s; per-scene optimization its best, {theirs[column]:.2f} dB, after"
-                f" {theirs['seconds']:.1f} s, and at its end it is {gap:+.2f} dB from ours."
+                f" {best['seconds']:.1f} s; per-scene optimization has its best, {theirs[column]:.2f} dB, after"
+                f" {theirs['seconds']:.1f} s, and ends at {gap:+.2f} dB from ours."
             )
     return [at_times(rows), "\n".join(lines)] if lines else []
 
 
 def at_times(rows: Sequence[Row]) -> str:
-    """A Markdown table: the best of ours and of per-scene optimization that some times have reached, in dB."""
+    """A Markdown table: the best scores of ours and of per-scene optimization up to each of `TIMES`, in dB.
+
+    "(ended)" says that per-scene optimization had its last score before.
+    """
     names = [f"{seconds} s" for seconds in TIMES]
     lines = ["| scene | score | " + " | ".join(names) + " |", "|" + "---|" * (2 + len(names))]
     for scene in dict.fromkeys(row["scene"] for row in rows):

@@ -41,7 +41,6 @@ from ssplat_jax.data.split import Split, interleaved_split
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.evaluation.scoring import score_targets
 from ssplat_jax.gaussians import Gaussians
-from ssplat_jax.refinement import current_gaussians
 from ssplat_jax.refinement.refine import continue_refinement, start_refinement
 from ssplat_jax.refinement.refine_capture import key_views_of
 from ssplat_jax.refinement.refine_config import FOR_CAPTURES
@@ -53,7 +52,7 @@ CAPTURES = {"fox": 1, "redkitchen": 5}
 STREAM, OFFLINE, ONLINE = "stream", "stream + offline {}", "stream + online {}"
 
 PATIENCE = 3
-"""Scores in a row that are no better than the best before them, in either column, at which a method ends."""
+"""Number of scores in a row after which a method ends, if none is better than all before them, in any column."""
 
 GROWTH = 1.4
 """Factor between the times of two scores of per-scene optimization."""
@@ -175,7 +174,7 @@ class Curve:
 
     @property
     def has_ended(self) -> bool:
-        """True if the last `PATIENCE` scores are no better than the best before them, in either column."""
+        """True if none of the last `PATIENCE` scores is better than all scores before them, in any column."""
         return all(
             max((row[column] for row in self.rows[-PATIENCE:]), default=0.0)
             <= max((row[column] for row in self.rows[:-PATIENCE]), default=-np.inf)
@@ -201,18 +200,24 @@ def _decoded(session, curve: Curve) -> Gaussians:
 
 
 def refine_offline(scene: _Scene, gaussians: Gaussians, exposures: Exposures, planned: int, curve: Curve) -> None:
-    """Refinement on the streamed views; a point after the first passes or steps, and whenever their number doubles."""
+    """Refinement on the streamed views; a point when the number of steps has doubled, and at the end."""
     curve.add(scene, gaussians, exposures, steps=0)
     with curve.watch.running():
         given = key_views_of(scene.capture, scene.split.context, scene.frame, exposures)
         progress, views = start_refinement(gaussians, given, FOR_CAPTURES)
-    due = 1
+    due, scored = 1, 0
+
+    def score() -> None:
+        with curve.watch.running():
+            refined = jax.block_until_ready(progress.scene(gaussians))
+        curve.add(scene, refined, exposures, steps=progress.num_steps)
+
     for _ in curve.watch.over(continue_refinement(progress, views, planned, FOR_CAPTURES)):
-        if progress.num_steps >= due or progress.num_steps == planned:
-            due = 2 * progress.num_steps
-            with curve.watch.running():
-                refined = jax.block_until_ready(current_gaussians(progress.state))
-            curve.add(scene, refined, exposures, steps=progress.num_steps)
+        if progress.num_steps >= due:
+            due, scored = 2 * progress.num_steps, progress.num_steps
+            score()
+    if scored < progress.num_steps:  # it may end before the planned steps
+        score()
 
 
 def optimize_scene(scene: _Scene, exposures: Exposures, sizes: Sizes, curve: Curve) -> None:

@@ -4,6 +4,7 @@ import math
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from ssplat_jax.geometry.cameras import Camera
@@ -31,13 +32,19 @@ class KeyViews:
         return Camera(viewmats=self.viewmats[index], Ks=self.Ks[index], width=width, height=height)
 
     @staticmethod
-    def of(camera: Camera, images: Float[Array, "v h w 3"], exposures: Float[Array, "v 3"] | None = None) -> "KeyViews":
-        """Key views from a batch of cameras and images in [0, 1]; without `exposures` all are 1."""
+    def of(
+        camera: Camera,
+        images: Float[Array | np.ndarray, "v h w 3"] | UInt8[Array | np.ndarray, "v h w 3"],
+        exposures: Float[Array | np.ndarray, "v 3"] | None = None,
+    ) -> "KeyViews":
+        """Key views from a batch of cameras and images, floats in [0, 1] or uint8; without `exposures` all are 1."""
+        if images.dtype != jnp.uint8:
+            images = jnp.round(jnp.clip(images, 0.0, 1.0) * 255).astype(jnp.uint8)
         return KeyViews(
-            images=jnp.round(jnp.clip(images, 0.0, 1.0) * 255).astype(jnp.uint8),
-            viewmats=camera.viewmats,
-            Ks=camera.Ks,
-            exposures=jnp.ones((images.shape[0], 3)) if exposures is None else exposures,
+            images=jnp.asarray(images),
+            viewmats=jnp.asarray(camera.viewmats, jnp.float32),
+            Ks=jnp.asarray(camera.Ks, jnp.float32),
+            exposures=jnp.ones((images.shape[0], 3)) if exposures is None else jnp.asarray(exposures, jnp.float32),
             valid=jnp.ones(images.shape[0], bool),
         )
 

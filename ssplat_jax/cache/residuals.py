@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.gaussians import SH_C0, Gaussians
 from ssplat_jax.geometry.voxels import voxel_indices
+from ssplat_jax.numerics import clip_value
 from ssplat_jax.pytree import pytree
 
 WIDTH = 14
@@ -74,6 +75,7 @@ def add(gaussians: Gaussians, residuals: Residuals, *, max_scale: float) -> Gaus
     is_present = gaussians.opacities > 0
     opacities = jnp.clip(jnp.where(is_present, gaussians.opacities, 0.5), 1e-5, 1 - 1e-5)
     logits = jnp.log(opacities) - jnp.log1p(-opacities) + residuals.logit_opacities
+    logits = clip_value(logits, -MAX_LOGIT, MAX_LOGIT)  # a float32 opacity beyond it would have no gradient
     length = jnp.linalg.norm(gaussians.quats, axis=-1, keepdims=True)
     scales = gaussians.scales * jnp.exp(residuals.log_scales)
     return Gaussians(
@@ -119,7 +121,7 @@ def settle(
     low = jnp.minimum(faces + FACE_MARGIN * voxel_size, means)[:, None]
     high = jnp.maximum(faces + (1 - FACE_MARGIN) * voxel_size, means)[:, None]
     places = jnp.clip(means[:, None] + residuals.means.reshape(len(means), -1, 3), low, high)
-    moved = jnp.mean(places, axis=1)
+    moved = means + jnp.mean(places - means[:, None], axis=1)  # `means` itself where nothing has moved
     is_inside = jnp.all(voxel_indices(moved, voxel_size)[0] == cells, axis=1, keepdims=True)
     moved = jnp.where(is_inside, moved, means)  # far from the origin, rounding is coarser than the margin
     bounded = Residuals(

@@ -4,6 +4,7 @@ Orbax does not detect flipped bits in an array, so every checkpoint holds the sh
 """
 
 import hashlib
+import itertools
 import json
 import os
 from collections.abc import Callable
@@ -88,7 +89,7 @@ class TrainingCheckpoints:
     def restore_latest(self, like, warn: Callable[[str], None]):
         """Returns (step, state) of the newest intact checkpoint, or None if there is no checkpoint.
 
-        Newer, damaged checkpoints are renamed to `damaged-<step>`.
+        Newer, damaged checkpoints are renamed to `damaged-<step>`, or `damaged-<step>-2` if that exists, and so on.
 
         Args:
             like: a state of the same structure, shapes and types.
@@ -103,8 +104,7 @@ class TrainingCheckpoints:
                 continue
             for damaged in steps[:number]:
                 warn(f"{self.directory}: checkpoint {damaged} is damaged; continuing from step {step}.")
-                aside = self.directory / f"damaged-{damaged}"
-                os.replace(self._manager.directory / str(damaged), aside)
+                os.replace(self._manager.directory / str(damaged), self._free_name(f"damaged-{damaged}"))
             self._manager.reload()
             return step, state
         if steps:
@@ -113,6 +113,11 @@ class TrainingCheckpoints:
                 f"{self.directory}: checkpoints {found} are damaged or of another version; choose another --out."
             )
         return None
+
+    def _free_name(self, name: str) -> Path:
+        """A path in the directory that does not exist: `name`, or with the first free number."""
+        names = itertools.chain([name], (f"{name}-{number}" for number in itertools.count(2)))
+        return next(path for path in map(self.directory.joinpath, names) if not path.exists())
 
     def _restore(self, step: int, like):
         """State of checkpoint `step`, or None if it is damaged."""

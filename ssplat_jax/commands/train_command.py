@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from ssplat_jax.console import Reporter
 
 MINUTES = {"tiny": 77, "stream": 15, "evidence": 15, "refiner": 30}
-"""Time of recipes on two cores (docs/model_card.md)."""
+"""Rough time of recipes on two free cores; docs/model_card.md has measured times, some of them beside other work."""
 
 
 @dataclasses.dataclass(frozen=True)

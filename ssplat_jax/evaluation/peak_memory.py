@@ -25,6 +25,8 @@ class PeakMemory:
     step: int | None
     decode: int | None
     render: int | None
+    refine: int | None = 0
+    """Refinement of a chunk; 0 without it."""
     allocator: int | None = None
     """The largest number of bytes in use since the process began, by the allocator of the device; None on a CPU."""
 
@@ -33,7 +35,7 @@ class PeakMemory:
         """The allocator's peak where there is one, else the largest of the programs; None if one is unknown."""
         if self.allocator is not None:
             return self.allocator
-        parts = (self.step, self.decode, self.render)
+        parts = (self.step, self.decode, self.render, self.refine)
         return None if None in parts else max(part for part in parts if part is not None)
 
     def to_row(self) -> dict[str, int | str | None]:
@@ -65,6 +67,7 @@ def peak_memory(session: Session, camera: Camera) -> PeakMemory:
         step=session.step_memory_bytes,
         decode=_sum(held, added_bytes(session.decode_program())),
         render=_sum(held, live_bytes(gaussians), render_bytes(gaussians, camera)),
+        refine=session.refine_memory_bytes if session.model.config.refine.steps_per_chunk else 0,
         allocator=allocator_peak(),
     )
 

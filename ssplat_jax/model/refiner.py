@@ -19,7 +19,7 @@ GAINS = {"means": 3, "quats": 1, "log_scales": 3, "logit_opacities": 1, "colors"
 """Gains of each part of a Gaussian; one gain serves the whole quaternion and all higher SH bands."""
 
 SHIFTS = {"means": 3, "log_scales": 3, "logit_opacities": 1, "colors": 3}
-"""Parts that also get a change of their own, which needs no gradient."""
+"""Shifts of each part that has any: a shift moves the part even if its gradients are 0."""
 
 FIRST_GAIN = 0.1
 """Gain of all parts before training: a small step against the gradient."""

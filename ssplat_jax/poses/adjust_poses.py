@@ -26,9 +26,9 @@ SCALES_DEGREES = (0.4, 0.2)
 MIN_TRACKS = 100
 """Fewest points from which poses are adjusted."""
 SMALLEST_ERROR_DEGREES = 0.25
-"""Smallest error that calls poses off: median distance of points from where they were seen, with the given poses."""
+"""Error of the given poses above which `auto` adjusts them: median distance of points from where they were seen."""
 SMALLEST_RATIO = 2.0
-"""Smallest ratio of that error to the one with adjusted poses that calls poses off; below, other things are wrong."""
+"""Ratio of that error to the one after adjustment above which `auto` adjusts poses; below, other things are wrong."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

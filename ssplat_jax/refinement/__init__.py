@@ -1,8 +1,8 @@
-"""Gradient refinement: a finished scene is revised on the views that it was made from.
+"""Refinement of a finished scene on the views that it was made from: learned passes, if asked for, then gradient steps.
 
     gaussians, report = refine(gaussians, cameras, images, steps=100)
 
-`refine` is the loop on the host; `refine_step` is one step as a pure function, `lax.scan`-able.
+`refine` is the loop on the host; `refine_step` is one gradient step as a pure function, `lax.scan`-able.
 """
 
 from ssplat_jax.cache.key_views import KeyViews as KeyViews

@@ -31,6 +31,9 @@ def adam_step(
         num_steps: steps before this one.
         rate: factor of all learning rates.
         config: learning rates, decays and bounds.
+
+    Returns:
+        The revision inside its bounds, and the two moments.
     """
     step = (num_steps + 1).astype(jnp.float32)
     first = jax.tree.map(lambda m, g: config.adam_b1 * m + (1 - config.adam_b1) * g, moments[0], gradient)

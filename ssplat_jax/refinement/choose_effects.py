@@ -13,13 +13,13 @@ from ssplat_jax.refinement.refine_effects import NAMES, RefineEffects
 from ssplat_jax.refinement.view_residuals import ViewResiduals, view_residuals
 
 MOST_LOOKED_AT = 16
-"""Key views whose residuals are fitted, evenly spread: a fit renders its view and takes a moment."""
+"""Most key views whose residuals are fitted, evenly spread: each fit renders its view."""
 FEWEST_FITS = 3
 """Fits that a verdict needs; with fewer nothing is asked for."""
 SMALLEST_EXPLAINED = 0.05
 """Share of the squared residual that pose and focal length must explain for one of them to be revised."""
 ENOUGH_EXPLAINED = 0.8
-"""Share of that by both from which the focal length alone, or else poses alone, are the reason."""
+"""Fraction of what both explain: the focal length, or else the pose, is the only reason if it explains more."""
 SMALLEST_GAIN = 0.03
 """Spread of log exposures over views above which they are revised."""
 SMALLEST_TINT = 0.015
@@ -38,7 +38,15 @@ def refine_effects_for(gaussians: Gaussians, key_views: KeyViews) -> EffectsChoi
     """The fewest effects that explain why key views differ from the scene. Call it outside jit.
 
     Up to 16 key views are rendered, and the residual of each is fitted by a small motion of its camera, a focal length
-    and exposures (`view_residuals`). An effect is on if the typical fit is beyond what errors of the scene alone give.
+    and exposures (`view_residuals`). An effect is on if the median over these views is beyond a bound; errors of the
+    scene alone stay below it.
+
+    Args:
+        gaussians: the scene.
+        key_views: the views; those that are not valid are left out.
+
+    Returns:
+        The effects, with a reason for each.
     """
     slots = np.flatnonzero(np.asarray(key_views.valid))
     places = sorted({round(x) for x in np.linspace(0, len(slots) - 1, min(len(slots), MOST_LOOKED_AT))})
@@ -77,14 +85,17 @@ def choose_effects(residuals: ViewResiduals) -> EffectsChoice:
 def effects_by_name(
     names: Sequence[str], gaussians: Gaussians, key_views: KeyViews, *, poses_stay: bool = False
 ) -> EffectsChoice:
-    """The effects that a caller names: some of `poses`, `focal`, `exposures`, `white_balance`, or `auto` alone.
+    """The effects of the given names: some of `poses`, `focal`, `exposures`, `white_balance`, or `auto` alone.
 
     Args:
         names: the effects.
-        gaussians: the scene, at which `auto` looks.
-        key_views: the views that are compared.
-        poses_stay: leave `poses` off: they were adjusted before the stream, and gradients would follow errors of the
+        gaussians: the scene; only `auto` looks at it.
+        key_views: the views to compare with it; only `auto` looks at them.
+        poses_stay: leaves `poses` off: they were adjusted before the stream, and gradients would follow errors of the
             scene.
+
+    Returns:
+        The effects; reasons come with `auto` alone.
 
     Raises:
         InputError: a name is unknown, or `auto` comes with others.

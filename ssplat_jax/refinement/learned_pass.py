@@ -4,8 +4,8 @@
                                                    │ refiner_features
                               revision' ◄─ apply ◄─ Refiner
 
-A pass shows the views of the next `STEPS` gradient steps and takes about their time. ReSplat's recurrent refinement is
-the model: render, feed the error back, predict the change, with the same network in every pass.
+A pass takes the place of the next `STEPS` gradient steps and shows their views. ReSplat's recurrent refinement is the
+model: render, feed the error back, predict the change, with the same network in every pass.
 """
 
 import jax
@@ -35,7 +35,7 @@ CLIPPED_ERROR = 0.1
 """Error of a pixel beyond which it does not count more: occlusions and moving things."""
 
 LEAST_SLOPE = 1e-3
-"""Added to the length of the gradients of single views, where their agreement is a sum over their length."""
+"""Added to the divisor of the agreement, which is the views' summed gradients over the root of their summed squares."""
 
 NUM_CHECKED = 4
 """Views of a pass that are rendered once more, to see whether it helps."""
@@ -49,7 +49,7 @@ class SeenErrors:
     """Errors that the views of a pass see in `n` Gaussians: sums over the views."""
 
     slopes: dict[str, Float[Array, "n _"]]  # gradients of the error by part, places in the Gaussian's own axes
-    squares: dict[str, Float[Array, "n _"]]  # of the gradients of single views
+    squares: dict[str, Float[Array, "n _"]]  # squared gradients of the single views
     pixels: Float[Array, " n"]  # that it fills
     errors: Float[Array, " n"]  # absolute error of these pixels
     signed: Float[Array, " n"]  # their error over `CLIPPED_ERROR`, with its sign and at most 1
@@ -63,7 +63,7 @@ def no_errors(gaussians: Gaussians) -> SeenErrors:
 
 
 def slopes_by_part(gaussians: Gaussians, slopes: Revision) -> dict[str, Float[Array, "n _"]]:
-    """Gradients as the network has its parts: places in the axes of each Gaussian, SH bands in units of color."""
+    """Gradients by the network's parts: places in the axes of each Gaussian, SH bands in units of color."""
     frames = quats_to_matrices(gaussians.quats)
     return {
         "means": jnp.einsum("nji,nj->ni", frames, slopes.means),
@@ -142,7 +142,7 @@ def add_view(
 def learned_pass(
     state: RefineState, key_views: KeyViews, refiner: dict, *, config: RefineConfig, max_pairs: int
 ) -> tuple[RefineState, StepReport]:
-    """The state after a learned pass; donate `state`. The reports are those of its `STEPS` steps, stacked.
+    """The state after a learned pass, and the reports of the `STEPS` steps whose place it takes. Donate `state`.
 
     Args:
         state: the scene so far.
@@ -151,10 +151,13 @@ def learned_pass(
         config: weights and bounds (static).
         max_pairs: capacity for tile intersections (static); `StepReport.num_overflow` says what did not fit.
 
+    Returns:
+        The state, `STEPS` steps further, and a report with a leading axis of `STEPS`, measured before the change.
+
     Limits:
-        A pass after which its views look no better, or that meets a number that is not finite, changes nothing, and its
-        steps are counted in `num_skipped`. Gaussians that no view of the pass shows stay as they are. Bounds are those
-        of `refine_step`.
+        A pass changes nothing if the first `NUM_CHECKED` of its views look no better after it, or if it gives a number
+        that is not finite; its steps are then counted in `num_skipped`. Gaussians that no view of the pass shows stay
+        as they are. Bounds are those of `refine_step`.
     """
     places = state.num_steps * config.views_per_step + jnp.arange(STEPS * config.views_per_step)
     views = jax.vmap(lambda place: next_view(place, key_views.valid, config.seed))(places)
@@ -184,6 +187,7 @@ def learned_pass(
         loss=losses.mean(axis=1),
         held_back=held_back.mean(axis=1),
         views=views.reshape(STEPS, -1),
+        num_missing_rows=jnp.zeros((STEPS,), jnp.int32),
         num_overflow=overflows.max(axis=1),
     )
 
@@ -237,6 +241,11 @@ def refiner_features(
     gaussians: Gaussians, seen: SeenErrors, agreement: dict[str, Float[Array, "n _"]]
 ) -> Float[Array, "n f"]:
     """Inputs of the network, as numbers of about unit size. No gradient flows through them.
+
+    Args:
+        gaussians: the scene that the views saw.
+        seen: what they say about it.
+        agreement: by part, the views' summed gradients over the root of their summed squares.
 
     Limits:
         Gaussians that no view shows, and absent ones, have finite features.

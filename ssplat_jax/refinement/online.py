@@ -70,6 +70,7 @@ def revise_scene(model: StreamSplat, params: dict, cache: VoxelCache, chunk: Chu
     arrivals = replace(KeyViews.of(chunk.camera, chunk.images, output.exposures), valid=chunk.valid)
     kept = keep_views(cache.key_views, arrivals, depth=config.stream.median_depth)
     views = views_of_round(cache.key_views, arrivals, cache.stats.num_chunks, config.refine.steps_per_chunk)
+    views = replace(views, valid=views.valid & jnp.any(chunk.valid))  # a chunk of padding changes nothing
     cache = replace(cache, key_views=kept)
     return jax.lax.scan(lambda cache, view: (_revise_view(model, params, cache, view), None), cache, views)[0]
 
@@ -102,6 +103,15 @@ def views_of_round(ring: KeyViews, arrivals: KeyViews, num_chunks: Int[Array, ""
 
     The i-th step of a stream takes the view at n x frac(i / golden ratio) of n usable ones, in order of their slots:
     all views are taken about equally often, and steps that follow each other take views that arrived far apart.
+
+    Args:
+        ring: the views kept before the chunk.
+        arrivals: the views of the chunk.
+        num_chunks: chunks so far, this one included.
+        num: steps of a round (static).
+
+    Returns:
+        `num` views; those without a usable one to take are not valid.
     """
     is_kept, is_new = usable(ring), usable(arrivals) & ~jnp.any(usable(ring))
     pool, is_usable = jax.tree.map(lambda *x: jnp.concatenate(x), (ring, is_kept), (arrivals, is_new))
@@ -121,6 +131,13 @@ def online_step(
     Gaussian's gradient grows with the number of pixels that it fills. Divided by that number it is a mean error: the
     step of a color is the mean error of the pixels that show it, which is Jacobi's method for the linear part of the
     problem. Nothing has to be remembered from step to step.
+
+    Args:
+        base: the Gaussians as they are decoded, without residuals.
+        residuals: their residuals so far.
+        view: one view, without a batch axis; one that is not valid changes nothing.
+        max_pairs: capacity for tile intersections (static).
+        max_scale: bound of scales, stream units.
     """
     size = sizes(base)
     probe = jnp.zeros((base.num_gaussians, 1))

@@ -34,9 +34,33 @@ def only_present(gaussians: Gaussians, rows: Int[np.ndarray, " m"] | None) -> Ga
     return replace(taken, opacities=jnp.where(np.arange(len(padded)) < len(rows), taken.opacities, 0.0))
 
 
+def present_and_new(gaussians: Gaussians, new: Gaussians, num_new: int) -> tuple[Gaussians, Int[np.ndarray, " m"]]:
+    """The present rows of `gaussians`, then the first `num_new` of `new`, and absent ones up to the capacity for them.
+
+    Returns:
+        The scene, and the numbers of its rows in `gaussians`. New rows take the places of absent ones; those that find
+        none come after its last row.
+    """
+    is_present = np.asarray(gaussians.opacities) > 0
+    rows, num_given = np.flatnonzero(is_present), len(is_present)
+    places = np.concatenate([np.flatnonzero(~is_present), num_given + np.arange(num_new)])[:num_new]
+    num_absent = round_rows(len(rows) + num_new) - len(rows) - num_new
+
+    def join(given: jax.Array, added: jax.Array) -> jax.Array:
+        absent = jnp.zeros((num_absent, *given.shape[1:]), given.dtype)
+        return jnp.concatenate([given[rows], added[:num_new], absent])
+
+    return jax.tree.map(join, gaussians, new), np.concatenate([rows, places])
+
+
 def back_in_place(present: Gaussians, rows: Int[np.ndarray, " m"] | None, gaussians: Gaussians) -> Gaussians:
-    """`gaussians` with the rows of `present_rows` replaced by the first ones of `present`, at its SH degree."""
+    """`gaussians` with the rows of `present_rows` replaced by the first ones of `present`, at its SH degree.
+
+    It grows where `rows` has numbers beyond its last row.
+    """
     if rows is None:
         return present
     gaussians = with_sh_degree(gaussians, present.sh_degree)
+    num_missing = max(int(rows.max(initial=-1)) + 1 - gaussians.num_gaussians, 0)
+    gaussians = jax.tree.map(lambda x: jnp.pad(x, ((0, num_missing), *[(0, 0)] * (x.ndim - 1))), gaussians)
     return jax.tree.map(lambda x, new: x.at[rows].set(new[: len(rows)]), gaussians, present)

@@ -8,16 +8,24 @@ from collections.abc import Callable, Iterator
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, UInt8
 
 from ssplat_jax.cache.key_views import KeyViews
 from ssplat_jax.errors import InputError
-from ssplat_jax.gaussians import Gaussians
+from ssplat_jax.gaussians import Gaussians, mask_gaussians
 from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.rasterizer import render
+from ssplat_jax.rasterizer.constants import ALPHA_MIN
 from ssplat_jax.rasterizer.render import round_up
+from ssplat_jax.refinement.densify import compiled_densify
 from ssplat_jax.refinement.learned_pass import STEPS, learned_pass
-from ssplat_jax.refinement.present_rows import back_in_place, only_present, present_rows, round_rows
+from ssplat_jax.refinement.present_rows import (
+    back_in_place,
+    only_present,
+    present_and_new,
+    present_rows,
+    round_rows,
+)
 from ssplat_jax.refinement.refine_config import RefineConfig
 from ssplat_jax.refinement.refine_step import (
     RefineState,
@@ -33,6 +41,8 @@ from ssplat_jax.refinement.usable_views import only_usable
 from ssplat_jax.refinement.view_loss import EFFECTS
 from ssplat_jax.refinement.view_order import views_of_step
 from ssplat_jax.refinement.view_revision import revised_key_views
+
+Images = Float[Array | np.ndarray, "v h w 3"] | UInt8[Array | np.ndarray, "v h w 3"]
 
 PAIRS_MARGIN = 1.25
 """Capacity for tile intersections over what the fullest key view needs: Gaussians grow while they are refined."""
@@ -56,6 +66,7 @@ class Progress:
     seconds: list[float] = dataclasses.field(default_factory=list)  # per step; the first of a process compiles
     max_rows: int | None = None  # capacity for the rows that the views of a step may see; None before the first
     num_learned: int = 0  # steps done whose place learned passes took
+    num_new: int = 0  # Gaussians added before the first step: the last ones of `rows`
 
     @property
     def num_steps(self) -> int:
@@ -70,8 +81,8 @@ class Progress:
         self.seconds += [seconds / len(losses)] * len(losses)
 
     def scene(self, given: Gaussians) -> Gaussians:
-        """`given`, the scene that refinement started from, as it is now."""
-        return back_in_place(current_gaussians(self.state), self.rows, given)
+        """`given`, the scene that refinement started from, as it is now; Gaussians that became invisible are absent."""
+        return back_in_place(_without_faded(current_gaussians(self.state), self.state.start), self.rows, given)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,28 +96,31 @@ class Refinement:
     stopped_early: bool  # the held-back error had stopped falling
     seconds_per_step: float  # median, without compilation; 0 for fewer than two steps
     num_left_out: int = 0  # views that could not be learned from, see `only_usable`
+    num_new: int = 0  # Gaussians added in holes
     key_views: KeyViews | None = None  # as the effects revised them; views that were left out are not valid
 
 
 def refine(
     gaussians: Gaussians,
     cameras: Camera,
-    images: Float[Array, "v h w 3"],
+    images: Images,
     *,
     steps: int = 100,
-    exposures: Float[Array, "_ 3"] | None = None,
+    exposures: Float[Array | np.ndarray, "_ 3"] | None = None,
     config: RefineConfig | None = None,
     refiner: dict | None = None,
     on_step: Callable[[int, float], None] = lambda step, loss: None,
 ) -> tuple[Gaussians, Refinement]:
     """Gaussians revised by gradient descent on views that show the same scene.
 
-    Works on any Gaussians: a decoded cache, a loaded `.ply`. Rows keep their places, and absent rows stay absent.
+    Works on any Gaussians: a decoded cache, a loaded `.ply`. Rows keep their places, and absent rows stay absent. With
+    `config.max_new`, new Gaussians take the places of absent rows, and then places after the last row. A Gaussian that
+    became too faint to be drawn is absent.
 
     Args:
         gaussians: the scene.
         cameras: one batch axis of poses and intrinsics, in the frame of the scene.
-        images: what those cameras saw, in [0, 1].
+        images: what those cameras saw, floats in [0, 1] or uint8.
         steps: most gradient steps; 0 returns `gaussians` as they are. Each renders `config.views_per_step`
             views. A learned pass of `config.learned_passes` takes the place of 8.
         exposures: factors from the scene's colors to each view's; default 1.
@@ -119,8 +133,8 @@ def refine(
         better for `PATIENCE` rounds of views.
 
     Raises:
-        InputError: shapes do not fit, `steps` is negative, no view has a finite camera and exposure, or a `refiner` is
-            given without learned passes.
+        InputError: shapes do not fit, an image is out of range, `steps` is negative, no view has a finite camera and
+            exposure, or a `refiner` is given without learned passes.
     """
     _check(cameras, images, exposures, steps)
     if refiner is not None and not (config or RefineConfig()).learned_passes:
@@ -144,11 +158,19 @@ def start_refinement(
     Raises:
         InputError: no view is left.
     """
+    config = config or RefineConfig()
     rows = present_rows(gaussians)
-    gaussians = only_present(gaussians, rows)
-    max_pairs = _capacity(gaussians, key_views)
-    usable = only_usable(gaussians, key_views, max_pairs)
-    return Progress(init_refinement(gaussians, usable, config), rows, max_pairs), usable
+    present = only_present(gaussians, rows)
+    max_pairs = _capacity(present, key_views)
+    usable = only_usable(present, key_views, max_pairs)
+    max_new, num_new = int(config.max_new * np.sum(np.asarray(gaussians.opacities) > 0)), 0
+    if max_new:
+        new, count = compiled_densify(config, max_pairs, max_new)(present, usable)
+        num_new = int(count)
+    if num_new:
+        present, rows = present_and_new(gaussians, new, num_new)
+        max_pairs = _capacity(present, key_views)
+    return Progress(init_refinement(present, usable, config), rows, max_pairs, num_new=num_new), usable
 
 
 def continue_refinement(
@@ -182,15 +204,27 @@ def continue_refinement(
             rate = jnp.float32(config.final_rate ** (progress.num_steps / steps))
             step = _step(config, progress.max_pairs, progress.max_rows)
             progress.state, report = step(progress.state, key_views, rate)
-        num_overflow = int(np.max(report.num_overflow))
         progress.add(report, time.perf_counter() - start)
-        if num_overflow:
-            revised = apply_revision(progress.state.start, progress.state.revision)
-            # The view that overflowed may not be among those that `_capacity` looks at.
-            needed = round_up(progress.max_pairs + num_overflow)
-            progress.max_pairs = max(_capacity(revised, key_views), needed)
-            progress.max_rows = row_capacity(revised, key_views, range(progress.num_steps, steps), config)
+        _grow_capacities(progress, report, key_views, steps, config)
         yield
+
+
+def _grow_capacities(
+    progress: Progress, report: StepReport, key_views: KeyViews, steps: int, config: RefineConfig
+) -> None:
+    """Larger capacities for the steps that follow, if something found no space in the last one."""
+    num_pairs, num_rows = (int(np.max(x)) for x in (report.num_overflow, report.num_missing_rows))
+    if not num_pairs and not num_rows:
+        return
+    revised = apply_revision(progress.state.start, progress.state.revision)
+    views = revised_key_views(progress.state.views, key_views)
+    if num_pairs:
+        # The view that overflowed may not be among those that `_capacity` looks at.
+        progress.max_pairs = max(_capacity(revised, views), round_up(progress.max_pairs + num_pairs))
+    # Never less than the last step was short of: its cameras may have moved since.
+    needed = round_rows((progress.max_rows or 0) + num_rows)
+    measured = row_capacity(revised, views, range(progress.num_steps, steps), config)
+    progress.max_rows = min(max(measured, needed if num_rows else 0), revised.num_gaussians)
 
 
 def is_learned(num_steps: int, steps: int, config: RefineConfig) -> bool:
@@ -214,6 +248,7 @@ def report_of(progress: Progress, key_views: KeyViews, config: RefineConfig | No
         stopped_early=_has_stopped_helping(progress, key_views, config or RefineConfig()),
         seconds_per_step=float(np.median(progress.seconds[1:])) if progress.num_steps > 1 else 0.0,
         num_left_out=int(np.sum(~np.asarray(key_views.valid))),
+        num_new=progress.num_new,
         key_views=revised_key_views(progress.state.views, key_views),
     )
 
@@ -225,6 +260,12 @@ def has_stopped_helping(held_back: list[float], steps_per_round: int) -> bool:
         return False  # too early to say, or no pixel is held back
     rounds = np.reshape(held_back, (num_rounds, steps_per_round)).mean(axis=1)
     return float(rounds[-PATIENCE:].min()) >= float(rounds[:-PATIENCE].min())
+
+
+def _without_faded(gaussians: Gaussians, start: Gaussians) -> Gaussians:
+    """`gaussians` without those whose opacity fell below what is drawn; those that `start` has so faint stay."""
+    has_faded = (gaussians.opacities < ALPHA_MIN) & (start.opacities >= ALPHA_MIN)
+    return mask_gaussians(gaussians, ~has_faded) if bool(has_faded.any()) else gaussians
 
 
 @functools.cache
@@ -274,7 +315,13 @@ def _check(cameras: Camera, images, exposures, steps: int) -> None:
             f"refine: cameras must have one batch axis, viewmats [v 4 4], got {list(cameras.viewmats.shape)}."
         )
     wanted = (len(cameras.viewmats), cameras.height, cameras.width, 3)
-    if tuple(images.shape) != wanted:
+    if tuple(jnp.shape(images)) != wanted:
         raise InputError(f"refine: images must be {list(wanted)} like the cameras, got {list(images.shape)}.")
+    low, high = float(jnp.min(images)), float(jnp.max(images))
+    if images.dtype != jnp.uint8 and not (jnp.issubdtype(images.dtype, jnp.floating) and low >= 0 and high <= 1):
+        raise InputError(
+            f"refine: images must be floats in [0, 1] or uint8, got {images.dtype} from {low:g} to {high:g}; scale or"
+            " clip them."
+        )
     if exposures is not None and tuple(exposures.shape) != (wanted[0], 3):
         raise InputError(f"refine: exposures must be {[wanted[0], 3]}, got {list(exposures.shape)}.")

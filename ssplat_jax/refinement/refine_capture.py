@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float, UInt8
 
 from ssplat_jax.cache.key_views import KeyViews
 from ssplat_jax.data.capture import Capture
@@ -60,6 +61,9 @@ def refine_on_capture(
         poses_stay: poses were adjusted before the stream; `revise` then leaves them as they are.
         on_step: called with the number of steps done and the last loss.
 
+    Returns:
+        The refined scene, the exposures, the report and the effects that were on.
+
     Raises:
         InputError: `steps` is negative, a frame was not streamed, or an effect is unknown.
     """
@@ -81,7 +85,13 @@ def refine_on_capture(
 
 
 def revised_exposures(exposures: Exposures, indices: Sequence[int], key_views: KeyViews | None) -> Exposures:
-    """`exposures` with those of the valid key views, which are frames of `indices` as `key_frames` chooses them."""
+    """`exposures` with those of the valid key views put in.
+
+    Args:
+        exposures: factor per streamed frame.
+        indices: frame numbers that were streamed; `key_frames` chooses the key views among them.
+        key_views: the key views as they were revised; None changes nothing.
+    """
     if key_views is None:
         return exposures
     factors, valid = np.asarray(key_views.exposures), np.asarray(key_views.valid)
@@ -113,6 +123,12 @@ def key_views_of(capture: Capture, indices: Sequence[int], frame: StreamFrame, e
     views = [capture.camera(i, frame) for i in used]
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *views)
     cameras = Camera(viewmats=stacked.viewmats, Ks=stacked.Ks, width=capture.width, height=capture.height)
-    images = jnp.stack([jnp.asarray(capture.image(i)) for i in used])
+    # Frame by frame: as floats, all images would take four times the memory of the key views.
+    images = jnp.asarray(np.stack([_to_uint8(capture.image(i)) for i in used]))
     factors = jnp.asarray(np.stack([exposures[i] for i in used]), jnp.float32)
     return KeyViews.of(cameras, images, factors)
+
+
+def _to_uint8(image: Float[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+    """An image in [0, 1] as `KeyViews.of` stores it."""
+    return np.round(np.clip(image, 0.0, 1.0) * np.float32(255)).astype(np.uint8)

@@ -39,6 +39,9 @@ class RefineConfig:
     learned_passes: int = 0
     """Passes of a trained network before the gradient steps (`learned_pass.py`); each takes the place of 8 steps. The
     network has learned from scenes of streams."""
+    max_new: float = 0.0
+    """Most Gaussians that are added in holes before the first step (`densify.py`), as a fraction of those present.
+    0 adds none."""
     shown_weight: float = 0.7
     """Weight of the L1 error with holes filled; the rest is the L1 error over black."""
     max_shift: float = 4.0
@@ -61,6 +64,7 @@ class RefineConfig:
         self._require("final_rate", "in (0, 1]", 0 < self.final_rate <= 1)
         self._require("views_per_step", "at least 1", self.views_per_step >= 1)
         self._require("learned_passes", "at least 0", self.learned_passes >= 0)
+        self._require("max_new", "in [0, 1]", 0 <= self.max_new <= 1)
         self._require("shown_weight", "in [0, 1]", 0 <= self.shown_weight <= 1)
         self._require("max_shift", "finite and not negative", 0 <= self.max_shift < math.inf)
         self._require("max_log_scale_change", "finite and not negative", 0 <= self.max_log_scale_change < math.inf)
@@ -71,5 +75,6 @@ class RefineConfig:
             raise InputError(f"refine: {name} must be {wanted}, got {getattr(self, name)!r}.")
 
 
-FOR_CAPTURES = RefineConfig(sh_degree=2, learned_passes=5)
-"""Configuration for scenes that a stream made of captures: colors of real surfaces depend on the direction of view."""
+FOR_CAPTURES = RefineConfig(sh_degree=2, learned_passes=5, max_new=0.1)
+"""Configuration for scenes that a stream made of captures: colors of real surfaces depend on the direction of view, and
+a stream leaves holes where views did not match."""

@@ -41,7 +41,7 @@ class RefineEffects:
 
     @property
     def any(self) -> bool:
-        """Whether anything besides the Gaussians is revised."""
+        """True if anything besides the Gaussians is revised."""
         return self.poses or self.focal or self.exposures or self.white_balance
 
     @property

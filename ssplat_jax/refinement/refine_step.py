@@ -39,7 +39,8 @@ class StepReport:
     loss: Float[Array, "*s"]  # weighted L1 error of the pixels that are learned from
     held_back: Float[Array, "*s"]  # the same error of the pixels that are not
     views: Int[Array, "*s b"]  # slots of the key views
-    num_overflow: Int[Array, "*s"]  # most of its views; rows and tile intersections that found no space
+    num_missing_rows: Int[Array, "*s"]  # rows that the step's views see and that found no space
+    num_overflow: Int[Array, "*s"]  # largest number of tile intersections of one of its views that found no space
 
 
 def init_refinement(
@@ -47,7 +48,13 @@ def init_refinement(
 ) -> RefineState:
     """The state before the first step, with SH bands as `config` has them.
 
-    Effects of `config` need the `key_views` that they revise.
+    Args:
+        gaussians: the scene; its arrays are copied.
+        key_views: the views that are compared; needed by the effects of `config`, which revise them.
+        config: SH degree and effects; default `RefineConfig()`.
+
+    Raises:
+        InputError: an effect is on, and there are no key views.
     """
     config = config or RefineConfig()
     effects, gaussians = config.effects, with_sh_degree(gaussians, config.sh_degree)
@@ -110,7 +117,7 @@ def refine_step(
     slopes, of_views, report = _slopes(state, gaussians, background, key_views, views, config, max_pairs)
     if selection is not None:
         slopes = put_rows(slopes, selection, jax.tree.map(jnp.zeros_like, current))
-        report = replace(report, num_overflow=jnp.maximum(report.num_overflow, selection.num_overflow))
+        report = replace(report, num_missing_rows=selection.num_overflow)
     (gradient,) = pull(slopes)
 
     is_finite = jnp.isfinite(report.loss)
@@ -143,7 +150,14 @@ def view_revision(state: RefineState) -> ViewRevision | None:
 def with_revised_view(
     state: RefineState, revision: ViewRevision | None, key_views: KeyViews, view: Int[Array, ""]
 ) -> KeyViews:
-    """`key_views` with the one at slot `view` as `revision` changes it."""
+    """`key_views` with the one at slot `view` as `revision` changes it.
+
+    Args:
+        state: gives the units of the revision.
+        revision: changes to the key views; None if no effect is on.
+        key_views: the views as they were given.
+        view: slot of the view.
+    """
     if state.views is None or revision is None:
         return key_views
     return revised_view(state.views, revision, key_views, view)
@@ -172,5 +186,11 @@ def _slopes(
     # A scan holds the intermediate arrays of one view at a time.
     total, (losses, errors, overflows) = jax.lax.scan(add_view, zeros, views)
     slopes, of_views = jax.tree.map(lambda x: x / config.views_per_step, total)
-    report = StepReport(loss=jnp.mean(losses), held_back=jnp.mean(errors), views=views, num_overflow=jnp.max(overflows))
+    report = StepReport(
+        loss=jnp.mean(losses),
+        held_back=jnp.mean(errors),
+        views=views,
+        num_missing_rows=jnp.zeros((), jnp.int32),
+        num_overflow=jnp.max(overflows),
+    )
     return slopes, of_views, report

@@ -43,7 +43,6 @@ def save_refiner(path: Path, params: dict, provenance: dict[str, Any]) -> None:
     save_arrays(path, arrays, KIND, {"provenance": provenance})
 
 
-@functools.cache
 def load_refiner(path: Path | None = None) -> dict:
     """The parameters in a file; without one, those that ship with the package.
 
@@ -52,8 +51,7 @@ def load_refiner(path: Path | None = None) -> dict:
         StorageError: the file is missing, damaged or of another kind.
     """
     if path is None:
-        with resources.as_file(resources.files("ssplat_jax") / "weights" / "refiner.npz") as shipped:
-            return load_refiner(shipped)
+        return _shipped()
     arrays, _ = load_arrays(path, KIND)
     wanted = jax.eval_shape(init_refiner)
     for layer, part in wanted.items():
@@ -62,3 +60,9 @@ def load_refiner(path: Path | None = None) -> dict:
             if got != x.shape:
                 raise InputError(f"{path}: {layer}/{name} must be {x.shape}, got {got}; train it with this version.")
     return {layer: {name: jnp.asarray(arrays[f"{layer}/{name}"]) for name in part} for layer, part in wanted.items()}
+
+
+@functools.cache
+def _shipped() -> dict:
+    with resources.as_file(resources.files("ssplat_jax") / "weights" / "refiner.npz") as path:
+        return load_refiner(path)

@@ -5,11 +5,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ssplat_jax.gaussians import Gaussians
+from ssplat_jax.numerics import clip_value
 from ssplat_jax.pytree import pytree, replace
 from ssplat_jax.refinement.refine_config import RefineConfig
 
 MAX_LOGIT = 12.0
-"""Bound of opacity logits: beyond it a float32 opacity is 0 or 1 and its gradient is lost."""
+"""Bound of opacity logits and of their changes: beyond it a float32 opacity is 0 or 1 and its gradient is lost."""
 
 
 @pytree
@@ -38,11 +39,13 @@ def apply_revision(start: Gaussians, revision: Revision) -> Gaussians:
     """`start` moved by `revision`, differentiable in both.
 
     Limits:
-        An opacity of 0 stays 0 with a zero gradient; one of 1 counts as the largest below it.
+        An opacity of 0 stays 0 with a zero gradient; one of 1 counts as the largest below it. No other gradient of an
+        opacity is 0.
     """
     is_present = start.opacities > 0
     opacities = jnp.clip(jnp.where(is_present, start.opacities, 0.5), 1e-5, 1 - 1e-5)
     logits = jnp.log(opacities) - jnp.log1p(-opacities) + revision.logit_opacities
+    logits = clip_value(logits, -MAX_LOGIT, MAX_LOGIT)
     return Gaussians(
         means=start.means + sizes(start)[:, None] * revision.means,
         quats=_unit(start.quats) + revision.quats,

@@ -35,7 +35,7 @@ class SeenRows:
 
 
 def may_be_seen(gaussians: Gaussians, camera: Camera) -> Bool[Array, " n"]:
-    """Whether a Gaussian may change a pixel of one camera, without lens distortion.
+    """Mask of the Gaussians that may change a pixel of one camera, without lens distortion.
 
     The standard deviation on the screen is at most |J| times the largest one in the scene, where J is the row of the
     projection's Jacobian, and the filter adds at most `CLASSIC_VARIANCE`.
@@ -84,7 +84,13 @@ def take_rows(tree: Rows, selection: SeenRows) -> Rows:
 
 
 def put_rows(tree: Rows, selection: SeenRows, into: Rows) -> Rows:
-    """`into`, arrays `[n ...]`, with the selected rows replaced by those of arrays `[m ...]`."""
+    """`into` with the selected rows replaced.
+
+    Args:
+        tree: arrays `[m ...]`, the new rows in the order of `selection`.
+        selection: the rows.
+        into: arrays `[n ...]`.
+    """
     numbers = jnp.arange(selection.rows.shape[0], dtype=jnp.int32)
 
     def put(x: Array, old: Array) -> Array:

@@ -14,7 +14,7 @@ from ssplat_jax.pytree import replace
 from ssplat_jax.rasterizer import Effects, render
 
 WORSE_THAN_USUAL = 2.0
-"""A view whose error is this many times the median does not show this scene, or not from there."""
+"""Ratio to the median error above which a view counts as one of another scene, or of a wrong pose."""
 FEWEST_TO_JUDGE = 4
 """Views that a median needs to mean something."""
 MOST_LEFT_OUT = 0.25

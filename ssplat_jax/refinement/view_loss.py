@@ -15,7 +15,13 @@ BLOCK = 8
 
 
 def held_back_pixels(size: tuple[int, int], view: Int[Array, ""], config: RefineConfig) -> Bool[Array, "h w"]:
-    """Pixels of a view that no gradient sees: the same blocks at every step."""
+    """Pixels of a view that no gradient sees: the same blocks at every step.
+
+    Args:
+        size: height and width of the image.
+        view: slot of the view.
+        config: gives the fraction and the seed.
+    """
     height, width = size
     key = jax.random.fold_in(jax.random.key(config.seed + 1), view)
     blocks = jax.random.uniform(key, (-(-height // BLOCK), -(-width // BLOCK))) < config.held_back
@@ -31,6 +37,14 @@ def view_loss(
     max_pairs: int,
 ) -> tuple[Float[Array, ""], tuple[Float[Array, ""], Float[Array, ""], Int[Array, ""]]]:
     """L1 error of one key view at its exposure, with holes filled by `background` and over black.
+
+    Args:
+        gaussians: the scene.
+        background: color that fills holes, at the exposure of the scene.
+        key_views: the views to compare with.
+        view: slot of the view.
+        config: weights of both errors, and which pixels are held back.
+        max_pairs: capacity for tile intersections.
 
     Returns:
         The loss, and the loss again, the error of the held-back pixels, and the tile intersections that did not fit.

@@ -11,7 +11,13 @@ GOLDEN = 2654435769
 
 
 def views_of_step(step: Int[Array, ""], valid: Bool[Array, " v"], config: RefineConfig) -> Int[Array, " b"]:
-    """Slots of the views that a step shows."""
+    """Slots of the views that a step shows.
+
+    Args:
+        step: number of the step, from 0.
+        valid: slots that hold a view.
+        config: gives `views_per_step` and the seed.
+    """
     places = step * config.views_per_step + jnp.arange(config.views_per_step)
     return jax.vmap(lambda place: next_view(place, valid, config.seed))(places)
 
@@ -21,6 +27,11 @@ def next_view(place: Int[Array, ""], valid: Bool[Array, " v"], seed: int) -> Int
 
     Every valid view is shown once a round. Any few views in a row lie evenly among the valid ones, which are in the
     order of the stream: each part of the scene is seen about equally often. A round begins at a place of its own.
+
+    Args:
+        place: number of the view in the sequence, from 0.
+        valid: slots that hold a view.
+        seed: seed of the places at which rounds begin.
     """
     num_valid = jnp.maximum(jnp.sum(valid, dtype=jnp.int32), 1)
     begin = jax.random.uniform(jax.random.fold_in(jax.random.key(seed), place // num_valid))

@@ -35,7 +35,7 @@ class ViewResiduals:
 
     views: list[int]  # slots of the key views
     errors: Float[np.ndarray, " v"]  # mean absolute error over the covered pixels, in units of the target's color
-    explained: Float[np.ndarray, "v 3"]  # shares of the squared residual that focal length, pose, and both explain
+    explained: Float[np.ndarray, "v 3"]  # shares of the squared residual after gains that focal, pose and both explain
     log_gains: Float[np.ndarray, "v 3"]  # log of the factor that the view's exposure lacks
     twists: Float[np.ndarray, "v 6"]  # motion of the camera, as in `view_revision.moved_viewmat`
     log_focals: Float[np.ndarray, " v"]  # log of the factor that the focal length lacks
@@ -50,8 +50,8 @@ def view_residuals(gaussians: Gaussians, key_views: KeyViews, views: Sequence[in
         views: slots to look at; by default all valid ones.
     """
     chosen = [int(i) for i in np.flatnonzero(np.asarray(key_views.valid))] if views is None else list(views)
-    depths = np.asarray(median_depths(gaussians, key_views))
-    rows = [_fit_view(gaussians, key_views, i, float(depths[i])) for i in chosen]
+    depths = np.asarray(median_depths(gaussians, key_views.viewmats[np.array(chosen, int)]))
+    rows = [_fit_view(gaussians, key_views, i, float(d)) for i, d in zip(chosen, depths, strict=True)]
     columns = np.array(rows, np.float64).reshape(-1, 14)
     return ViewResiduals(
         views=chosen,
@@ -107,8 +107,9 @@ def _solve(columns: Float[np.ndarray, "m 3 10"], residual: Float[np.ndarray, "m 
     """Least squares, with a small ridge for what an image cannot tell apart.
 
     Returns:
-        Log gains and the log focal length of a fit without a pose, the twist of a fit without a focal length, and the
-        shares of what gains leave of the squared residual that focal length, pose, and both explain.
+        The solution: log gains of the fit of everything, the twist of a fit of gains and pose, and the log focal length
+        of a fit of gains and focal length. Then three shares of the squared residual that gains alone leave: those that
+        focal length, pose, and both together explain.
     """
     a, b = columns.reshape(-1, columns.shape[-1]), residual.reshape(-1)
     size = np.sqrt(np.mean(a * a, axis=0)) + 1e-12

@@ -35,7 +35,13 @@ class ViewState:
 
 
 def init_view_state(gaussians: Gaussians, key_views: KeyViews, effects: RefineEffects) -> ViewState | None:
-    """The state before the first step; `None` if no effect is on."""
+    """The state before the first step; `None` if no effect is on.
+
+    Args:
+        gaussians: the scene, which gives the unit of translations.
+        key_views: the views as they were given.
+        effects: parts that are revised.
+    """
     if not effects.any:
         return None
     num = key_views.num_slots
@@ -45,21 +51,30 @@ def init_view_state(gaussians: Gaussians, key_views: KeyViews, effects: RefineEf
         log_focal=jnp.zeros(()) if effects.focal else None,
         log_exposures=jnp.zeros((num, 3)) if has_exposures else None,
     )
-    depths = median_depths(gaussians, key_views)
+    depths = median_depths(gaussians, key_views.viewmats)
     return ViewState(zeros(), zeros(), zeros(), num_shown=jnp.zeros(num, jnp.int32), depths=depths)
 
 
-def median_depths(gaussians: Gaussians, key_views: KeyViews) -> Float[Array, " v"]:
+def median_depths(gaussians: Gaussians, viewmats: Float[Array, "v 4 4"]) -> Float[Array, " v"]:
     """Median depth of the Gaussians before each view; 1 where there is none."""
-    axes, shifts = key_views.viewmats[:, 2, :3], key_views.viewmats[:, 2, 3]
-    depths = jax.lax.map(lambda view: gaussians.means @ view[0] + view[1], (axes, shifts))
-    usable = (depths > 0) & (gaussians.opacities > 0)
-    medians = jnp.nanmedian(jnp.where(usable, depths, jnp.nan), axis=1)
+
+    def of_view(viewmat: Float[Array, "4 4"]) -> Float[Array, ""]:
+        depths = gaussians.means @ viewmat[2, :3] + viewmat[2, 3]
+        return jnp.nanmedian(jnp.where((depths > 0) & (gaussians.opacities > 0), depths, jnp.nan))
+
+    medians = jax.lax.map(of_view, viewmats)  # one view at a time: depths of all would take a scene's memory
     return jnp.where(jnp.isfinite(medians), medians, 1.0)
 
 
 def revised_view(state: ViewState, revision: ViewRevision, key_views: KeyViews, view: Int[Array, ""]) -> KeyViews:
-    """`key_views` with the one at slot `view` moved by `revision`, differentiable in it."""
+    """`key_views` with the one at slot `view` moved by `revision`, differentiable in it.
+
+    Args:
+        state: gives the unit of translations.
+        revision: changes to the key views; the focal length applies to all of them.
+        key_views: the views as they were given.
+        view: slot of the view.
+    """
     changes: dict[str, Array] = {}
     if revision.poses is not None:
         viewmat = moved_viewmat(key_views.viewmats[view], revision.poses[view], state.depths[view])
@@ -172,7 +187,13 @@ def _of_effects(slopes: Float[Array, "v 3"], effects: RefineEffects) -> Float[Ar
 
 
 def bounded_views(revision: ViewRevision, valid: Bool[Array, " v"], effects: RefineEffects) -> ViewRevision:
-    """`revision` inside its trust region, the exposures with a geometric mean of 1 over the valid views."""
+    """`revision` inside its trust region, the exposures with a geometric mean of 1 over the valid views.
+
+    Args:
+        revision: changes to the key views.
+        valid: slots that hold a view.
+        effects: bounds, and whether exposures may change the brightness.
+    """
     poses, log_focal, log_exposures = revision.poses, revision.log_focal, revision.log_exposures
     if poses is not None:
         turn, shift = _shortened(poses[:, :3], effects.max_rotation), _shortened(poses[:, 3:], effects.max_translation)

@@ -16,7 +16,7 @@ from ssplat_jax.model import GRID_STRIDE
 from ssplat_jax.streaming.streamsplat import merged_footprints, shown_pivots
 
 LISTED_PER_CELL = 64
-"""Most pivots of a view that are compared, as a multiple of its grid cells; those of the last rows are left out."""
+"""Most pivots of a view that are compared, as a multiple of its grid cells; beyond it, the last rows are left out."""
 
 
 def visible_pivots(cache: VoxelCache, view: KeyViews, config: StreamConfig) -> Int[Array, " m"]:
@@ -62,7 +62,8 @@ def areas_before(
 
     Args:
         cells: 0 to `num_cells`.
-        depths: positive. Nearly equal ones (24 bits of a float at a million entries) count in the order of the entries.
+        depths: positive. Nearly equal ones count in the order of the entries: 64 bits hold cell, depth and entry, which
+            leaves the depth all its 32 bits, or 31 at a million entries in 4,800 cells.
         areas: of each entry.
         num_cells: number of cells.
     """

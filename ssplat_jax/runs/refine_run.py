@@ -167,12 +167,14 @@ def _take_steps(
     """Takes the steps that are left, saving on the way; returns the signal that stopped them, if one did."""
     with Interrupts() as interrupts, reporter.progress("refining", steps) as advance:
         advance(progress.num_steps, WAITING)
+        num_saves = progress.num_steps // save_every
         for _ in continue_refinement(progress, key_views, steps, config):
             advance(progress.num_steps, f"loss {progress.losses[-1]:.4f}")
             stopped = interrupts.received  # read once: a signal may come at any time
             if stopped:
                 break
-            if progress.num_steps % save_every == 0:
+            if progress.num_steps // save_every > num_saves:  # a learned pass may step over a multiple
+                num_saves = progress.num_steps // save_every
                 save_refinement(folder.refinement_state, progress, key_views, identity)
         save_refinement(folder.refinement_state, progress, key_views, identity)
         return interrupts.received

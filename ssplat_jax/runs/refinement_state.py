@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from ssplat_jax.errors import InputError
-from ssplat_jax.gaussians import Gaussians
+from ssplat_jax.gaussians import Gaussians, with_sh_degree
 from ssplat_jax.pytree import replace
 from ssplat_jax.refinement import KeyViews, RefineConfig
-from ssplat_jax.refinement.present_rows import only_present, present_rows
+from ssplat_jax.refinement.present_rows import only_present, present_and_new, present_rows
 from ssplat_jax.refinement.refine import Progress
 from ssplat_jax.refinement.refine_step import init_refinement
 from ssplat_jax.refinement.revision import Revision
@@ -24,6 +24,8 @@ MOVING = ("revision", "first_moment", "second_moment")
 
 def save_refinement(path: Path, progress: Progress, key_views: KeyViews, identity: dict) -> None:
     """Saves a refinement, without the scene that it started from and without images: the run and its capture have them.
+
+    Gaussians that were added before the first step are saved as they were then.
 
     Args:
         path: the file.
@@ -45,7 +47,10 @@ def save_refinement(path: Path, progress: Progress, key_views: KeyViews, identit
         }
     arrays |= {name: np.asarray(getattr(state, name)) for name in COUNTS}
     arrays["valid"] = np.asarray(key_views.valid)
-    names = ("max_pairs", "max_rows", "losses", "held_back", "seconds", "num_learned")
+    if progress.num_new:  # they are in no other file
+        new = slice(len(progress.rows) - progress.num_new, len(progress.rows))
+        arrays |= {f"new.{name}": np.asarray(leaf[new]) for name, leaf in vars(state.start).items()}
+    names = ("max_pairs", "max_rows", "losses", "held_back", "seconds", "num_learned", "num_new")
     measured = {name: getattr(progress, name) for name in names}
     save_arrays(path, arrays, KIND, {"identity": identity, "measured": measured})
 
@@ -78,8 +83,14 @@ def load_refinement(
             )
     if "valid" in arrays:  # saved before views could be left out: all are valid
         key_views = replace(key_views, valid=jnp.asarray(arrays["valid"]))
-    rows = present_rows(gaussians)
-    fresh = init_refinement(only_present(gaussians, rows), key_views, config)
+    if "new.means" in arrays:
+        new = Gaussians(**_below(arrays, "new."))
+        given = with_sh_degree(gaussians, new.sh_degree)
+        present, rows = present_and_new(given, new, new.num_gaussians)
+    else:
+        rows = present_rows(gaussians)
+        present = only_present(gaussians, rows)
+    fresh = init_refinement(present, key_views, config)
     views = fresh.views
     if views is not None:
         taken = lambda part: replace(getattr(views, part), **_below(arrays, f"views.{part}."))  # noqa: E731

@@ -56,21 +56,26 @@ class LiveViews:
         self._images.append(pixels)
         self._frames.append(frame)
         self._num_views += 1
-        return self.rest() if len(self._frames) == self._config.stream.chunk_size else None
+        return self.rest() if len(self._frames) >= self._config.stream.chunk_size else None
 
     def rest(self) -> Chunk | None:
-        """The chunk of the views that wait, padded with invalid views; None if there are none."""
+        """The next chunk of the views that wait, padded with invalid views; None if there are none.
+
+        The views wait on if anything is raised or interrupts.
+        """
         if not self._frames:
             return None
-        images = np.stack(self._images)
+        size = self._config.stream.chunk_size
+        images = np.stack(self._images[:size])
         height, width = images.shape[1:3]
         depths = np.zeros(images.shape[:3], np.float32)
-        frames, pixels = tuple(self._frames), ArrayPixels(images=images, depths=depths)
+        frames, pixels = tuple(self._frames[:size]), ArrayPixels(images=images, depths=depths)
         capture = Capture(name="live", format="memory", frames=frames, pixels=pixels, width=width, height=height)
         if self.frame is None:
             self.frame = capture.stream_frame(self._config)
-        self._images, self._frames = [], []
-        return next(iter(capture.chunks(self._config, range(len(capture)), frame=self.frame)))
+        chunk = next(iter(capture.chunks(self._config, range(len(capture)), frame=self.frame)))
+        self._images, self._frames = self._images[size:], self._frames[size:]
+        return chunk
 
     def learn(self, output: ChunkOutput) -> None:
         """Moves near and far outward for later chunks if the last one contradicts them (`causal_range`)."""

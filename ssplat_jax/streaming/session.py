@@ -120,9 +120,15 @@ class Session:
     def flush(self) -> ChunkOutput | None:
         """Streams the views that wait for their chunk, however few, padded with invalid ones; None if none wait.
 
+        More than a chunk waits if an error or an interrupt came before an earlier one was made; the summary is that of
+        the last chunk.
+
         A view alone has no partner to match: its depth rests on the history. Views may be pushed afterwards.
         """
-        return self._feed_live(self._live.rest())
+        output = None
+        while (chunk := self._live.rest()) is not None:
+            output = self._feed_live(chunk)
+        return output
 
     def _feed_live(self, chunk: Chunk | None) -> ChunkOutput | None:
         if chunk is None:
@@ -147,11 +153,11 @@ class Session:
 
     def _decode_arguments(self) -> tuple[dict, VoxelCache, int]:
         """Parameters, cache and number of pivots to decode."""
-        if self.cache is None:
-            self.cache = self.model.init_cache()
-        num_shown = int(self._count_shown(self.cache))
-        num_pivots = min(max(MIN_DECODED_PIVOTS, 1 << max(num_shown - 1, 0).bit_length()), self.cache.alive.size)
-        return self.params, self.cache, num_pivots
+        # Before the first chunk the cache stays unset: `push` tells by it whether a stream is continued.
+        cache = self.model.init_cache() if self.cache is None else self.cache
+        num_shown = int(self._count_shown(cache))
+        num_pivots = min(max(MIN_DECODED_PIVOTS, 1 << max(num_shown - 1, 0).bit_length()), cache.alive.size)
+        return self.params, cache, num_pivots
 
     def decode_program(self) -> jax.stages.Compiled:
         """The compiled program of `gaussians` for the present cache."""

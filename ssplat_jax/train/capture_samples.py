@@ -31,7 +31,7 @@ MAX_STRIDE = 8
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class CaptureGroup:
-    """Captures that share a share of the training steps."""
+    """Captures that together get a share of the training steps."""
 
     name: str
     share: float
@@ -157,7 +157,15 @@ def validation_sample(
     size: tuple[int, int],
     config: StreamConfig,
 ) -> Sample:
-    """A sample whose one target is held out, between context views that are not. Arguments as in `capture_sample`.
+    """A sample whose one target is held out, between context views that are not.
+
+    Args:
+        mix: knows the depth range of `capture`.
+        capture: the capture.
+        seed: seed of the choice of frames.
+        num_chunks: chunks of context views.
+        size: height and width of the images.
+        config: gives the chunk size.
 
     Limits:
         Without a held-out frame between the context views, the nearest one beside them is taken.

@@ -171,6 +171,14 @@ def _compiled(model: StreamSplat, num_pivots: int, max_pairs: int, recipe: Evide
 
 
 def crop_camera(camera: Camera, row, column, height: int, width: int) -> Camera:
-    """The camera of a part of the image of `camera`, from (row, column) on."""
+    """The camera of a part of the image of `camera`.
+
+    Args:
+        camera: one camera.
+        row: first row of the part, pixels.
+        column: first column of the part, pixels.
+        height: height of the part, pixels.
+        width: width of the part, pixels.
+    """
     x, y = (jnp.asarray(value, jnp.float32) for value in (column, row))
     return replace(camera, Ks=camera.Ks.at[0, 2].add(-x).at[1, 2].add(-y), height=height, width=width)

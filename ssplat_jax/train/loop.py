@@ -98,7 +98,14 @@ class _Every:
 
 
 def describe_run(config: StreamConfig, recipe: Recipe, *, has_lpips: bool, mix: CaptureMix | None = None) -> dict:
-    """Facts that determine the weights of a run; a run with another description is not resumed."""
+    """Facts that determine the weights of a run, as JSON types; a run with another description is not resumed.
+
+    Args:
+        config: configuration of the model.
+        recipe: the recipe.
+        has_lpips: the rendering loss includes LPIPS.
+        mix: captures to learn from.
+    """
     description: dict = {"config": config.to_dict(), "recipe": dataclasses.asdict(recipe)}
     if has_lpips:
         description["rendering_loss"] = f"MSE + {recipe.lpips_weight} LPIPS"

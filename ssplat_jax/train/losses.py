@@ -51,6 +51,9 @@ def depth_loss(
         usable: cells that count.
         target_width: see `soft_targets`.
 
+    Returns:
+        The cross entropy and the L1.
+
     Limits:
         A true depth that is infinite (-inf is the logarithm of an unknown 0) or NaN is out of range and contributes
         nothing to value and gradient.

@@ -96,8 +96,8 @@ class Recipe:
     lpips_weight: float = 0.05
     """Weight of LPIPS beside the MSE, as in the paper (Eq. training_loss); used only when LPIPS weights are given."""
     gradient_weight: float = 0.02
-    """Weight of the L1 of image gradients beside the MSE, which replaces LPIPS when its weights are not given. Texture
-    finer than the Gaussians cannot be shown: a larger weight asks for it in vain, or for blur."""
+    """Weight of the L1 of image gradients beside the MSE, which replaces LPIPS when its weights are not given. The
+    Gaussians cannot show texture finer than themselves: a larger weight would not bring it out, but favor blur."""
     black_weight: float = 0.05
     """Fraction of the rendering loss computed over a black background. The rest fills holes with the colors around
     them, as in evaluation; alone, that would make all surfaces translucent, since holes would cost nothing."""
@@ -126,7 +126,11 @@ class Recipe:
         return sum(phase.steps for phase in self.phases)
 
     def phase_at(self, step: int) -> tuple[Phase, int]:
-        """The phase that contains `step`, and the position of `step` in it."""
+        """The phase that contains `step`, and the position of `step` in it.
+
+        Raises:
+            IndexError: the recipe has no such step.
+        """
         for phase in self.phases:
             if step < phase.steps:
                 return phase, step
@@ -178,7 +182,8 @@ TINY = Recipe(
         ),
     )
 )
-"""Trains the shipped `tiny` weights from scratch; docs/model_card.md has the command, time and machine."""
+"""Trains the depth of the shipped `tiny` weights from scratch; the recipe `evidence` adds the evidence head.
+docs/model_card.md has commands, times and machines."""
 
 STREAM = Recipe(
     phases=(

@@ -2,8 +2,9 @@
 
 Every scene is streamed once. In each round, some views of every scene are compared with it as a learned pass does, and
 the network learns the change that makes *other* views look right: a step renders one of them and moves the network.
-Then the round's scenes are revised by a pass with the new network, and the next round starts from there, so that the
-network learns from scenes that it has already revised, too. No gradient flows through the comparison.
+Half of the steps take a comparison of this round, the other half one of any round so far. Then a pass with the new
+network revises the scenes, and the next round starts from there, so that the network also learns from scenes that it
+has already revised. No gradient flows through the comparison.
 """
 
 import dataclasses
@@ -33,7 +34,7 @@ from ssplat_jax.streaming.streamsplat import StreamSplat
 from ssplat_jax.train.streamed_scenes import SceneSources, captures_of, negative_psnr, stream_scene
 
 CONFIG = dataclasses.replace(FOR_CAPTURES, held_back=0.0)
-"""Weights and bounds of the passes."""
+"""Configuration of the passes: that of captures, but no pixel is held back."""
 
 SMALLEST = (16, 16)
 """Smallest height and width of images to learn from."""

@@ -40,7 +40,7 @@ class Sample:
 
 
 def choose_targets(rng: np.random.Generator, num_views: int, num_targets: int) -> np.ndarray:
-    """Ascending positions of targets among `num_views` views. The first and the last view are never targets."""
+    """Ascending positions of `num_targets` targets, drawn among `num_views` views but the first and the last."""
     return np.sort(rng.choice(np.arange(1, num_views - 1), size=num_targets, replace=False))
 
 
@@ -179,6 +179,11 @@ def prefetched(
     """Yields (step, produce(step)) in order, computed up to `depth` steps ahead in a thread.
 
     An exception in `produce` is raised here.
+
+    Args:
+        produce: makes the sample of a step; called in the thread.
+        steps: numbers of the steps.
+        depth: most samples that wait.
     """
     ahead: queue.Queue = queue.Queue(maxsize=depth)
     stop = threading.Event()

@@ -71,6 +71,9 @@ def stream_chunks(model: StreamSplat, params: dict, sample: Sample, recipe: Reci
         sample: gives chunks and true depths.
         recipe: gives the width of depth targets; with `recipe.recompute`, the backward pass recomputes activations
             chunk by chunk, so that memory does not grow with the number of chunks.
+
+    Returns:
+        The cache, the tokens with one leading axis, and (cross entropy, L1).
     """
 
     def body(cache, chunk_and_truth):
@@ -103,6 +106,12 @@ def decode_accepted(model: StreamSplat, params: dict, cache: VoxelCache, tokens:
     """Gaussians of the tokens that inference would accept, without merging.
 
     Those are the tokens whose confidence, after the witnesses in `cache` judged it, is at least `min_confidence`.
+
+    Args:
+        model: the model.
+        params: its parameters.
+        cache: gives the witnesses; a constant.
+        tokens: tokens of all chunks.
     """
     gaussians = model.decode_tokens(params, tokens)
     judged = judge(*jax.lax.stop_gradient((cache.witnesses, tokens)), model.config)
@@ -127,6 +136,9 @@ def loss_fn(
         recipe: weights of the losses.
         form: frozen stages, and what is rendered.
         lpips_weights: weights of LPIPS, if there are any.
+
+    Returns:
+        The loss, and scalar metrics by name.
     """
     params = {name: jax.lax.stop_gradient(p) if name in form.frozen else p for name, p in params.items()}
     cache, tokens, (entropy, depth_l1) = stream_chunks(model, params, sample, recipe)
@@ -160,6 +172,9 @@ def target_loss(
         sample: gives target views and cameras.
         recipe: weights of the losses.
         lpips_weights: weights of LPIPS, if there are any.
+
+    Returns:
+        The loss, and scalar metrics by name.
     """
     output = render(gaussians, sample.target_camera, max_pairs=recipe.max_pairs)
     assert output.color is not None and output.alpha is not None
@@ -210,6 +225,9 @@ def train_step(
         recipe: optimizer and loss.
         form: frozen stages, and what is rendered.
         lpips_weights: weights of LPIPS, if there are any.
+
+    Returns:
+        The state, and scalar metrics by name.
 
     Limits:
         A gradient that is not finite changes only `step` and `num_skipped`.

@@ -34,7 +34,13 @@ def sample_for_step(step: int, recipe: Recipe, config: StreamConfig, mix: Captur
 
 
 def validation_samples(mix: CaptureMix, phase: Phase, config: StreamConfig) -> list[Sample]:
-    """Samples with a held-out target each, the same whenever they are made; of one size, so of one program."""
+    """Samples with a held-out target each, the same whenever they are made; of one size, so of one program.
+
+    Args:
+        mix: the captures; at most `NUM_VALIDATION` of them give a sample each.
+        phase: gives the number of chunks and the image size.
+        config: configuration of the model.
+    """
     return [
         validation_sample(mix, capture, [i, 19], num_chunks=phase.num_chunks, size=phase.sizes[0], config=config)
         for i, capture in enumerate(mix.validation_captures(NUM_VALIDATION))

@@ -56,6 +56,14 @@ class StreamedScene:
 def captures_of(paths: Sequence[Path], sources: SceneSources, smallest: tuple[int, int]) -> list[tuple[Capture, int]]:
     """All scenes to learn from, each with its stride; every capture at the width of `sources`.
 
+    Args:
+        paths: captures.
+        sources: width, strides and procedural scenes.
+        smallest: smallest height and width of an image.
+
+    Returns:
+        Pairs of capture and stride, the procedural scenes first.
+
     Raises:
         InputError: an image is smaller than `smallest`, (height, width).
     """
@@ -73,7 +81,14 @@ def captures_of(paths: Sequence[Path], sources: SceneSources, smallest: tuple[in
 
 
 def stream_scene(model: StreamSplat, params: dict, capture: Capture, stride: int) -> StreamedScene:
-    """The finished stream of a capture; the targets of its interleaved split are not shown."""
+    """The finished stream of a capture; the targets of its interleaved split are not shown.
+
+    Args:
+        model: the model.
+        params: its parameters.
+        capture: the capture.
+        stride: distance of consecutive frames.
+    """
     context = choose_split("interleaved", len(capture), stride, None, None).context
     session = Session(model, params)
     frame = capture.stream_frame(model.config, context)
@@ -92,6 +107,6 @@ def stream_scene(model: StreamSplat, params: dict, capture: Capture, stride: int
 
 
 def negative_psnr(image: Float[Array, "h w 3"], target: Float[Array, "h w 3"]) -> Float[Array, ""]:
-    """Minus the PSNR in dB: in it, scenes that differ in difficulty count alike."""
+    """Minus the PSNR in dB, in which easy and hard scenes count alike."""
     mse = jnp.mean((jnp.clip(image, 0.0, 1.0) - target) ** 2)
     return 10 / math.log(10) * jnp.log(mse + MIN_MSE)

@@ -28,7 +28,7 @@ class Validation:
     lpips_weights: LpipsWeights | None = None
 
     def scores(self, params: dict, phase: Phase) -> dict[str, float]:
-        """Mean scores of one held-out frame a capture, `validation_psnr` and so on; none of a phase without targets."""
+        """Means over a held-out frame of each capture, `validation_psnr` and so on; none in phases without targets."""
         if not phase.num_targets:
             return {}
         form = dataclasses.replace(phase.form, frozen=())  # decides gradients alone

@@ -207,3 +207,12 @@ def test_scales_above_the_limit_are_not_shrunk():
     large = dataclasses.replace(scene, scales=scene.scales + 1.0)
     residuals = dataclasses.replace(changes(0, 0.0, 4), log_scales=jnp.full((16, 3), 1.0))
     np.testing.assert_array_equal(revise(large, residuals, max_scale=0.5).scales, large.scales)
+
+
+@pytest.mark.parametrize("per_token", [1, 4, 9, 16])
+def test_residuals_of_zero_move_no_pivot_by_a_bit(per_token):
+    """Also where the sum of equal numbers is rounded."""
+    means = pivots(3, 300.0, 4096)
+    moved, packed = SETTLE(means, unpack(jnp.zeros((4096, per_token * WIDTH))), SIZE)
+    np.testing.assert_array_equal(moved, means)
+    assert not np.asarray(packed).any()

@@ -101,6 +101,17 @@ def test_training_continues_after_a_damaged_checkpoint(tmp_path):
     assert told == []
 
 
+def test_a_step_that_is_damaged_again_is_put_beside_the_first(tmp_path):
+    saved(tmp_path, 1, 2)
+    for _ in range(3):
+        files_of(tmp_path, 2)[0].write_bytes(b"")
+        checkpoints = TrainingCheckpoints(tmp_path, {})
+        assert_state(checkpoints.restore_latest(STATE, lambda _: None), 1)
+        checkpoints.save(2, state_of(2))
+        checkpoints.close()
+    assert all((tmp_path / name).is_dir() for name in ("damaged-2", "damaged-2-2", "damaged-2-3"))
+
+
 def test_an_error_is_raised_if_all_checkpoints_are_damaged(tmp_path):
     saved(tmp_path, 1, 2)
     for step in (1, 2):

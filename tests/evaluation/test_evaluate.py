@@ -17,6 +17,7 @@ from ssplat_jax.evaluation import latency
 from ssplat_jax.evaluation.exposures import exposures_from_json, exposures_to_json
 from ssplat_jax.evaluation.latency import measure_latency
 from ssplat_jax.evaluation.nearest_views import nearest_views
+from ssplat_jax.evaluation.peak_memory import PeakMemory
 from ssplat_jax.evaluation.scoring import baselines, score_view
 from ssplat_jax.gaussians import Gaussians, mean_color
 from ssplat_jax.metrics.lpips import load_lpips, lpips
@@ -194,3 +195,10 @@ def test_adjusted_poses_are_streamed_and_targets_keep_theirs(tmp_path, monkeypat
         np.testing.assert_array_equal(seen["refined"], wanted.camtoworlds)
         assert seen["poses_stay"] == (wanted is moved)
     np.testing.assert_array_equal(moved.camtoworlds[4], capture.camtoworlds[4])
+
+
+def test_the_largest_program_counts_that_of_refinement_too():
+    assert PeakMemory(step=3, decode=1, render=2).bytes == 3
+    assert PeakMemory(step=3, decode=1, render=2, refine=7).bytes == 7
+    assert PeakMemory(step=3, decode=1, render=2, refine=None).bytes is None
+    assert PeakMemory(step=3, decode=1, render=2, refine=None, allocator=5).bytes == 5

@@ -254,6 +254,8 @@ def test_another_network_can_be_given():
 def test_a_file_returns_what_was_saved(tmp_path):
     save_refiner(tmp_path / "refiner.npz", drawn(), {"steps": 1})
     jax.tree.map(np.testing.assert_array_equal, load_refiner(tmp_path / "refiner.npz"), drawn())
+    save_refiner(tmp_path / "refiner.npz", init_refiner(), {"steps": 2})
+    jax.tree.map(np.testing.assert_array_equal, load_refiner(tmp_path / "refiner.npz"), init_refiner())
 
 
 def test_files_that_do_not_fit_are_refused(tmp_path):

@@ -370,3 +370,11 @@ def test_a_gaussian_follows_the_mean_of_its_views():
     settled = colors[-20:]
     assert abs(settled.mean() - 0.5) < 0.03
     assert np.abs(settled - settled.mean()).max() < 0.03
+
+
+def test_a_chunk_of_padding_changes_nothing():
+    """Its round would belong to the chunk before, whose delta is out already."""
+    cache = revise(start(), chunk(), summary())
+    assert jnp.any(cache.key_views.valid) and jnp.any(cache.residuals != 0)
+    same = revise(cache, replace(chunk(), valid=jnp.zeros(4, bool)), summary())
+    jax.tree.map(np.testing.assert_array_equal, same, cache)

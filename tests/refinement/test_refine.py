@@ -17,7 +17,8 @@ from ssplat_jax.pytree import replace
 from ssplat_jax.rasterizer import render
 from ssplat_jax.refinement import KeyViews, RefineConfig, current_gaussians, init_refinement, refine, refine_step
 from ssplat_jax.refinement.refine import has_stopped_helping
-from ssplat_jax.refinement.revision import sizes
+from ssplat_jax.refinement.refine_effects import RefineEffects
+from ssplat_jax.refinement.revision import apply_revision, no_revision, sizes
 from ssplat_jax.refinement.view_loss import EFFECTS, held_back_pixels
 from ssplat_jax.refinement.view_order import next_view
 
@@ -258,3 +259,35 @@ def test_the_capacity_grows_for_a_view_that_was_not_looked_at(monkeypatch):
     needed = [int(render(doubtful(), views.camera(i), effects=EFFECTS).num_pairs) for i in range(NUM_VIEWS)]
     assert num_steps == 6 and max(needed) > 64
     assert progress.max_pairs >= max(needed)
+
+
+def test_bytes_are_taken_as_they_are():
+    images = jnp.round(jnp.clip(photographs(), 0, 1) * 255).astype(jnp.uint8)
+    wanted, _ = refine(doubtful(), cameras(), images.astype(jnp.float32) / 255, steps=2, config=CONFIG)
+    got, _ = refine(doubtful(), cameras(), images, steps=2, config=CONFIG)
+    jax.tree.map(np.testing.assert_array_equal, got, wanted)
+
+
+@pytest.mark.parametrize("change", [lambda x: 255 * x, lambda x: x - 0.5, lambda x: x * np.nan])
+def test_images_out_of_range_are_refused(change):
+    with pytest.raises(InputError, match=r"floats in \[0, 1\] or uint8, got"):
+        refine(doubtful(), cameras(), change(jnp.clip(photographs(), 0, 1)), steps=1, config=CONFIG)
+
+
+def test_arrays_of_numpy_do_as_well_as_those_of_jax():
+    config = dataclasses.replace(CONFIG, effects=RefineEffects(exposures=True, poses=True))
+    images, ones = jnp.clip(photographs(), 0, 1), jnp.ones((NUM_VIEWS, 3))
+    wanted, _ = refine(doubtful(), cameras(), images, steps=2, exposures=ones, config=config)
+    arrays = jax.tree.map(np.asarray, (cameras(), images, ones))
+    got, report = refine(doubtful(), arrays[0], arrays[1], steps=2, exposures=arrays[2], config=config)
+    jax.tree.map(np.testing.assert_array_equal, got, wanted)
+    assert report.key_views is not None
+
+
+def test_an_opacity_at_its_bound_can_come_back():
+    """At the largest logit the opacity still has a gradient by the change that led there, and moves by a step back."""
+    opaque = replace(scene(), opacities=jnp.where(scene().opacities > 0, 1 - 1e-5, 0.0))
+    change = replace(no_revision(opaque), logit_opacities=jnp.full(NUM, 7.0))
+    slope = jax.grad(lambda c: apply_revision(opaque, c).opacities.sum())(change).logit_opacities
+    is_present = np.asarray(opaque.opacities) > 0
+    assert (np.asarray(slope)[is_present] > 1e-7).all() and not np.asarray(slope)[~is_present].any()

@@ -98,7 +98,7 @@ def test_a_step_on_seen_rows_is_the_step_on_all(effects):
     given = {"config": config, "max_pairs": MAX_PAIRS}
     wanted, all_rows = step(init_refinement(wide(), views, config), views, jnp.float32(1), **given)
     got, report = step(init_refinement(wide(), views, config), views, jnp.float32(1), **given, max_rows=max_rows)
-    assert int(report.num_overflow) == 0
+    assert int(report.num_overflow) == int(report.num_missing_rows) == 0
     assert float(report.loss) == pytest.approx(float(all_rows.loss), rel=1e-6)
     for a, b in zip(jax.tree.leaves(got.first_moment), jax.tree.leaves(wanted.first_moment), strict=True):
         assert np.abs(b).max() > 0
@@ -109,7 +109,7 @@ def test_a_step_on_seen_rows_is_the_step_on_all(effects):
         for a, b in zip(*map(jax.tree.leaves, slopes), strict=True):
             np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-5 * np.abs(b).max())
     _, report = step(init_refinement(doubtful(), views, config), views, jnp.float32(1), **given, max_rows=max_rows)
-    assert int(report.num_overflow) > 0
+    assert int(report.num_missing_rows) > 0 == int(report.num_overflow)
 
 
 @pytest.mark.slow
@@ -152,3 +152,20 @@ def test_absent_rows_are_left_out_and_the_others_keep_their_places(monkeypatch):
 def test_capacities_hold_their_rows_and_are_few(num):
     assert num <= present_rows.round_rows(num) <= max(4096 * -(-max(num, 1) // 4096), num * 17 / 16)
     assert len({present_rows.round_rows(n) for n in range(262_145, 524_289, 64)}) <= 16
+
+
+@pytest.mark.parametrize("effects", [RefineEffects(), RefineEffects(focal=True)])
+def test_rows_that_find_no_space_get_it_and_nothing_else_grows(effects, monkeypatch):
+    """Also where revised cameras see more rows than the given ones."""
+    monkeypatch.setattr(present_rows, "MIN_ROWS", 1)
+    config = RefineConfig(held_back=0.0, effects=effects)
+    progress, views = host.start_refinement(wide(), key_views(), config)
+    max_pairs, too_few = progress.max_pairs, 3
+    progress.max_rows = too_few
+    steps = host.continue_refinement(progress, views, 4, config)
+    next(steps)
+    assert progress.max_rows > too_few and progress.max_pairs == max_pairs
+    grown = progress.max_rows
+    for _ in steps:
+        pass
+    assert (progress.max_rows, progress.max_pairs) == (grown, max_pairs)

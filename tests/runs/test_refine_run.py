@@ -80,7 +80,8 @@ def test_a_stopped_refinement_continues_to_the_same_bytes(finished, monkeypatch)
     report = json.loads(folder.refinement.read_text())
     assert report["num_steps"] == len(report["losses"]) == 4
     assert report["revised"] == ["poses", "exposures"] and report["num_left_out"] == 0
-    assert len(read_ply(folder.refined_scene).gaussians.means) == len(read_ply(folder.scene).gaussians.means)
+    sizes = [len(read_ply(path).gaussians.means) for path in (folder.scene, folder.refined_scene)]
+    assert 0 < report["num_new"] and sizes[1] <= sizes[0] + report["num_new"] <= 1.1 * sizes[0]
     assert [read_ply(path).gaussians.sh_degree for path in (folder.scene, folder.refined_scene)] == [0, 2]
 
 
@@ -108,6 +109,15 @@ def test_a_stop_after_each_learned_pass_changes_no_byte(finished, monkeypatch):
     assert folder.refined_scene.read_bytes() == whole
     report = json.loads(folder.refinement.read_text())
     assert report["num_steps"] == len(report["losses"]) == steps and report["num_skipped"] == 0
+
+
+def test_learned_passes_that_step_over_a_multiple_are_saved_too(finished, monkeypatch):
+    saves = []
+    monkeypatch.setattr(module, "save_refinement", lambda path, now, *rest: saves.append(now.num_steps))
+    reporter = Reporter(quiet=True)
+    options = {"steps": 2 * STEPS + 3, "save_every": STEPS - 3, "overwrite": True, "reporter": reporter}
+    refine_run(finished, CAPTURE, load_params("tiny"), **options)
+    assert saves == [STEPS, 2 * STEPS, 2 * STEPS + 3]
 
 
 def test_a_refinement_with_other_steps_is_refused(finished):

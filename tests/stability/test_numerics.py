@@ -7,7 +7,7 @@ import pytest
 
 from ssplat_jax.model.compact.sweep_matching import unit_features
 from ssplat_jax.model.layers import attend, attend_per_query, average_pool, instance_norm
-from ssplat_jax.numerics import columns, safe_log, safe_normalize, softplus_inverse
+from ssplat_jax.numerics import clip_value, columns, safe_log, safe_normalize, softplus_inverse
 from ssplat_jax.xla_cpu import in_own_kernel, lane_sum
 
 ULP = float(np.finfo(np.float32).eps)
@@ -73,6 +73,14 @@ def test_in_own_kernel_is_zero_in_value_and_gradient_if_unwanted(wanted):
     value, pull = jax.vjp(lambda x: gathered(x, jnp.array(wanted)), x)
     np.testing.assert_allclose(value, [-1 / 3, 0.5] if wanted else [0, 0], rtol=1e-6)
     np.testing.assert_allclose(pull(jnp.ones(2))[0], [-0.25, 0, -1 / 9] if wanted else [0, 0, 0], rtol=1e-6)
+
+
+def test_clip_value_clips_and_lets_the_gradient_pass():
+    inside = jnp.asarray(np.random.default_rng(0).uniform(-12, 12, 10_000), jnp.float32)
+    np.testing.assert_array_equal(clip_value(inside, -12.0, 12.0), inside)
+    x = jnp.array([-1e6, -13.0, 13.0, 1e6])
+    np.testing.assert_array_equal(clip_value(x, -12.0, 12.0), [-12, -12, 12, 12])
+    np.testing.assert_array_equal(jax.grad(lambda v: clip_value(v, -12.0, 12.0).sum())(x), 1)
 
 
 @pytest.mark.parametrize("y", [1e-9, 1e-3, 0.1, 1.0, 20.0, 500.0])

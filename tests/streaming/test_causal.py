@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.images import ArrayPixels
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.errors import InputError
@@ -171,3 +172,41 @@ def test_cells_below_the_threshold_have_no_say(capture):
     assert widen_range(frame, at_depths((1.0, 8.0)), CAUSAL.replace(min_confidence=0.95)).far == 8.0 * STEP
     doubtful = dataclasses.replace(at_depths((1.0, 8.0)), confidences=jnp.full((1, 1, 1000), 0.3))
     assert widen_range(frame, doubtful, CAUSAL.replace(min_confidence=0.5)) is frame
+
+
+def pushed(session, capture, indices):
+    """The summaries of the chunks that pushing some frames completes."""
+    outputs = []
+    for i in indices:
+        frame = capture.frames[i]
+        output = session.push(capture.image(i), frame.K, np.linalg.inv(frame.camtoworld))
+        outputs += [] if output is None else [output]
+    return outputs
+
+
+def test_a_session_can_be_decoded_before_its_first_chunk(capture, params):
+    session = Session(StreamSplat(CAUSAL), params)
+    assert not np.asarray(session.gaussians().opacities).any() and session.cache is None
+    assert pushed(session, capture, range(2)) == []
+    session.gaussians()
+    assert len(pushed(session, capture, range(2, 4))) == 1
+    assert np.asarray(session.gaussians().opacities).any()
+
+
+def test_an_interrupted_push_loses_no_view(capture, params, monkeypatch):
+    wanted = Session(StreamSplat(CAUSAL), params)
+    pushed(wanted, capture, range(5))
+    wanted.flush()
+    session, find = Session(StreamSplat(CAUSAL), params), Capture.stream_frame
+
+    def interrupted(*given, **more):
+        monkeypatch.setattr(Capture, "stream_frame", find)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Capture, "stream_frame", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        pushed(session, capture, range(4))
+    assert len(pushed(session, capture, range(4, 5))) == 1
+    session.flush()
+    assert_same_bits(session.cache, wanted.cache)
+    assert session.flush() is None
