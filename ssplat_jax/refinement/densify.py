@@ -151,10 +151,10 @@ def hides(points: Float[Array, "n 3"], cells: Cells, key_views: KeyViews) -> Boo
         cells: depths and light of all views.
         key_views: their cameras; those that are not valid do not count.
     """
-    shape = cells.light.shape[1:]
+    height, width = cells.light.shape[1:]
 
     def in_view(view: Int[Array, ""]) -> tuple[Array, Array]:
-        inside, rows, columns, z = _cells_of_points(points, key_views.camera(view), shape)
+        inside, rows, columns, z = _cells_of_points(points, key_views.camera(view), (height, width))
         inside &= key_views.valid[view]
         depth, light = cells.depths[view, rows, columns], cells.light[view, rows, columns]
         return inside, inside & (light < LEAST_LIGHT) & (z < IN_FRONT * depth)
@@ -190,7 +190,7 @@ def _pooled(values: Float[Array, "h w *c"]) -> Float[Array, "hc wc *c"]:
 
 
 def _surrounding(depths: Float[Array, "hc wc"]) -> Float[Array, "hc wc"]:
-    """Depths with those of the surroundings in cells of depth 0: their mean weighted by depth, which favors far ones."""
+    """Depths, in cells of depth 0 those around them: their mean weighted by depth, which favors far ones."""
     filled = depths
     for reach in REACHES:
         window = (2 * reach + 1, 2 * reach + 1)

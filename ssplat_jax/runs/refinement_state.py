@@ -47,7 +47,7 @@ def save_refinement(path: Path, progress: Progress, key_views: KeyViews, identit
         }
     arrays |= {name: np.asarray(getattr(state, name)) for name in COUNTS}
     arrays["valid"] = np.asarray(key_views.valid)
-    if progress.num_new:  # they are in no other file
+    if progress.rows is not None and progress.num_new:  # they are in no other file
         new = slice(len(progress.rows) - progress.num_new, len(progress.rows))
         arrays |= {f"new.{name}": np.asarray(leaf[new]) for name, leaf in vars(state.start).items()}
     names = ("max_pairs", "max_rows", "losses", "held_back", "seconds", "num_learned", "num_new")
