@@ -19,7 +19,6 @@ from ssplat_jax.evaluation.latency import measure_latency
 from ssplat_jax.evaluation.peak_memory import peak_memory
 from ssplat_jax.evaluation.scoring import score_targets
 from ssplat_jax.gaussians import Gaussians
-from ssplat_jax.refinement import current_gaussians
 from ssplat_jax.refinement.refine import continue_refinement, start_refinement
 from ssplat_jax.refinement.refine_capture import key_views_of
 from ssplat_jax.refinement.refine_config import FOR_CAPTURES
@@ -79,7 +78,7 @@ def measure_refined(settings: Sequence[Setting], sizes: Sizes, opened: Opened) -
     for _ in watch.over(continue_refinement(progress, views, max(by_steps), FOR_CAPTURES)):
         if progress.num_steps in by_steps:
             with watch.running():
-                refined = jax.block_until_ready(current_gaussians(progress.state))
+                refined = jax.block_until_ready(progress.scene(scene.gaussians))
             row = scene.row(by_steps[progress.num_steps], refined)
             added = 1e3 * watch.seconds / len(scene.split.context)
             row |= {"ms_per_view": round(row["ms_per_view"] + added, 2), "refine_s": round(watch.seconds, 2)}

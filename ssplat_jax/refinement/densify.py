@@ -110,7 +110,8 @@ def cells_of_view(
     assert out.alpha is not None and out.depth is not None
     learned = jnp.where(held_back_pixels((height, width), view, config), 0.0, 1.0)
     light = (1.0 - out.alpha) * learned
-    target = key_views.images[view].astype(jnp.float32) / 255 / key_views.exposures[view]
+    exposure = key_views.exposures[view]
+    target = key_views.images[view].astype(jnp.float32) / 255 / exposure
     lacking = light[..., None] * (target - out.color)
     squares, weight = _pooled(light * light), _pooled(learned)
     share = jnp.where(weight > 0, _pooled(light) / jnp.maximum(weight, 1.0), 0.0)
@@ -118,7 +119,7 @@ def cells_of_view(
     depths = jnp.where(covered > 0.5 * CELL * CELL, _pooled(out.alpha * out.depth) / jnp.maximum(covered, 1e-6), 0.0)
     return Cells(
         light=jnp.where(out.num_overflow > 0, 0.0, share),
-        colors=jnp.clip(_pooled(lacking) / jnp.maximum(squares, 1e-6)[..., None], 0.0, 1.0),
+        colors=jnp.clip(_pooled(lacking) / jnp.maximum(squares, 1e-6)[..., None], 0.0, 1.0 / exposure),
         depths=_surrounding(depths),
     )
 

@@ -41,7 +41,7 @@ class RefineConfig:
     network has learned from scenes of streams."""
     max_new: float = 0.0
     """Most Gaussians that are added in holes before the first step (`densify.py`), as a fraction of those present.
-    0 adds none."""
+    0 adds none. `refine` adds them; `refine_step` does not."""
     shown_weight: float = 0.7
     """Weight of the L1 error with holes filled; the rest is the L1 error over black."""
     max_shift: float = 4.0

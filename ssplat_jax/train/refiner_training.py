@@ -33,8 +33,8 @@ from ssplat_jax.refinement.view_loss import EFFECTS
 from ssplat_jax.streaming.streamsplat import StreamSplat
 from ssplat_jax.train.streamed_scenes import SceneSources, captures_of, negative_psnr, stream_scene
 
-CONFIG = dataclasses.replace(FOR_CAPTURES, held_back=0.0)
-"""Configuration of the passes: that of captures, but no pixel is held back."""
+CONFIG = dataclasses.replace(FOR_CAPTURES, held_back=0.0, max_new=0.0)
+"""Configuration of the passes: that of captures, but no pixel is held back and no Gaussian is added."""
 
 SMALLEST = (16, 16)
 """Smallest height and width of images to learn from."""

@@ -163,6 +163,9 @@ def test_exposures_are_taken_out_of_the_colors():
     usual = fill(TORN, views_of(WHOLE, (0.0,)))
     darker = fill(TORN, views_of(WHOLE, (0.0,), [[0.8, 0.5, 0.9]]))
     np.testing.assert_allclose(usual.sh, darker.sh, atol=0.06)
+    bright = replace(WHOLE, sh=jnp.full_like(WHOLE.sh, 1.0 / 0.28209479))  # a color of 1.5
+    new = fill(replace(TORN, sh=jnp.full_like(TORN.sh, 1.0 / 0.28209479)), views_of(bright, (0.0,), [[0.5, 0.5, 0.5]]))
+    np.testing.assert_allclose(0.5 + 0.28209479 * new.sh, 1.5, atol=0.1)
 
 
 @pytest.mark.parametrize("broken", ["invalid", "overflow", "not finite"])
