@@ -204,6 +204,7 @@ def continue_refinement(
             rate = jnp.float32(config.final_rate ** (progress.num_steps / steps))
             step = _step(config, progress.max_pairs, progress.max_rows)
             progress.state, report = step(progress.state, key_views, rate)
+        report = jax.block_until_ready(report)  # a step's time is that of its work
         progress.add(report, time.perf_counter() - start)
         _grow_capacities(progress, report, key_views, steps, config)
         yield
