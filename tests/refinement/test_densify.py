@@ -208,6 +208,7 @@ def test_new_rows_take_the_places_of_absent_ones_and_then_come_last():
         np.testing.assert_array_equal(getattr(scene, name)[space : given.num_gaussians], leaf)
 
 
+@pytest.mark.slow
 def test_refine_says_how_many_were_added_and_gains_by_them():
     views = views_of(WHOLE)
     cameras = Camera(views.viewmats, views.Ks, WIDTH, HEIGHT)
