@@ -2,10 +2,10 @@
 
     ssplat experiment ablation --captures path/to/captures --out runs/ablation
 
-Every variant starts from the shipped weights and trains all stages after the matcher for the same steps on the same
-samples, once per seed; then its decoded cache is scored on unseen views of `procedural:room` (and of redkitchen, where
-`--captures` has it). The variants with and without the memory are scored after more views too. `additions off` has the
-literal value of every field that the shipped weights can do without.
+Every variant starts from the shipped weights, with an untrained CGFI and mixer, and trains all stages after the matcher
+for the same steps on the same samples, once per seed; then its decoded cache is scored on unseen views of
+`procedural:room` (and of redkitchen, where `--captures` has it). The variants with and without the memory are scored
+after more views too. `additions off` has the literal value of every field that the shipped weights can do without.
 """
 
 import dataclasses
@@ -14,6 +14,8 @@ import statistics
 import tempfile
 from pathlib import Path
 from typing import Any
+
+import jax
 
 from ssplat_experiments.additions import additions
 from ssplat_experiments.cases import PICTURE, Case, Row
@@ -27,6 +29,7 @@ from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.split import Split
 from ssplat_jax.evaluation.peak_memory import peak_memory
 from ssplat_jax.evaluation.scoring import score_targets, score_view
+from ssplat_jax.model import complete_params
 from ssplat_jax.streaming.feed import feed_capture
 from ssplat_jax.streaming.session import Session
 from ssplat_jax.streaming.streamsplat import StreamSplat
@@ -34,12 +37,15 @@ from ssplat_jax.train.loop import train
 from ssplat_jax.train.recipe import Phase, PhaseForm, Recipe
 
 FULL = "full"
+ALL_PARTS: dict[str, Any] = {"cgfi": True, "mixer_blocks": 2}
+"""The stages that `tiny` leaves out; they start untrained."""
 VARIANTS: dict[str, dict[str, Any]] = {
     FULL: {},
     "baseline": {"vacc": "append", "hpda": False, "cgfi": False},
     "without VACC": {"vacc": "append"},
     "without HPDA": {"hpda": False},
     "without CGFI": {"cgfi": False},
+    "without mixer": {"mixer_blocks": 0},
 }
 ADDITIONS_OFF = "additions off"
 LONG = (FULL, "without VACC")
@@ -88,7 +94,7 @@ def config_of(variant: str) -> StreamConfig:
     changes = VARIANTS.get(variant)
     if changes is None:
         changes = {addition.field: addition.literal for addition in additions()}
-    return preset("tiny").replace(**changes, capacity=START_CAPACITY)
+    return preset("tiny").replace(**ALL_PARTS).replace(**changes, capacity=START_CAPACITY)
 
 
 def cases(captures: Path | None, scale: str) -> list[Case]:
@@ -113,7 +119,8 @@ def measured(variant: str, seed: int, budget: Budget, scenes: tuple[str, ...], c
     """Trains a variant and scores it on every scene."""
     config = config_of(variant)
     with tempfile.TemporaryDirectory() as folder:
-        trained = train(config, budget.recipe(seed), Path(folder), params=load_params("tiny"))
+        start = complete_params(jax.random.key(seed), config, load_params("tiny"))
+        trained = train(config, budget.recipe(seed), Path(folder), params=start)
     if trained.interrupted:
         raise KeyboardInterrupt
     session, rows = Session(StreamSplat(config), trained.state.ema), []
@@ -197,9 +204,9 @@ def gallery(rows: list[Row]) -> str:
 
 STUDY = Study(
     name="ablation",
-    text="""Every variant starts from the shipped weights and trains all stages after the matcher for the same steps on
-the same samples, once per seed; scores are of unseen views. `additions off` has the literal value of every field that
-the shipped weights can do without. LPIPS needs weights that are not shipped.""",
+    text="""Every variant starts from the shipped weights, with an untrained CGFI and mixer, and trains all stages after
+the matcher for the same steps on the same samples, once per seed; scores are of unseen views. `additions off` has the
+literal value of every field that the shipped weights can do without. LPIPS needs weights that are not shipped.""",
     cases=cases,
     finish=add_differences,
     findings=findings,

@@ -71,9 +71,9 @@ SETTINGS = (
     Setting(1.0, "chunks of 8", {"chunk_size": 8}),
     Setting(0.75, "chunks of 8", {"chunk_size": 8}),
     Setting(1.0, "no HPDA", {"hpda": False}),
-    Setting(1.0, "no CGFI", {"cgfi": False}),
+    Setting(1.0, "CGFI, untrained", {"cgfi": True}),
     Setting(1.0, "no carving", {"carving": False}),
-    Setting(1.0, "no mixer", {"mixer_blocks": 0}),
+    Setting(1.0, "mixer, untrained", {"mixer_blocks": 2}),
 )
 
 REFINED_FACTORS = (0.4, 0.5, 0.6, 0.75, 1.0, 1.25)

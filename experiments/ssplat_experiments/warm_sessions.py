@@ -2,8 +2,11 @@
 
 import functools
 
+import jax
+
 from ssplat_jax.checkpoint.weights import load_params
 from ssplat_jax.config import StreamConfig
+from ssplat_jax.model import complete_params
 from ssplat_jax.refinement import online_refinement
 from ssplat_jax.streaming.session import Session
 from ssplat_jax.streaming.streamsplat import StreamSplat
@@ -14,6 +17,8 @@ MAX_KEPT = 4
 
 def new_session(config: StreamConfig) -> Session:
     """A session with an empty cache and the shipped weights, whose programs may be compiled already.
+
+    Stages that the shipped weights lack are untrained.
 
     Two streams of one configuration must not be fed in turns: they are the same object.
     """
@@ -30,4 +35,5 @@ def forget() -> None:
 @functools.lru_cache(maxsize=MAX_KEPT)
 def _session(config: StreamConfig) -> Session:
     model = StreamSplat(config)
-    return Session(model, load_params("tiny"), revise=online_refinement(model))
+    params = complete_params(jax.random.key(0), config, load_params("tiny"))
+    return Session(model, params, revise=online_refinement(model))

@@ -37,7 +37,8 @@ class Train:
     seed: int = 0
     """Seed of the initial parameters and of the scenes."""
     init_weights: Path | None = None
-    """Start from a weights file instead of from random parameters."""
+    """Start from a weights file instead of from random parameters. Stages that --set adds, such as cgfi=true and
+    mixer_blocks=2 to tiny's, start at random."""
     captures: tuple[Path, ...] = ()
     """Captures to learn from too, or folders of captures as ssplat worlds writes. Every 8th frame is held out."""
     shares: tuple[float, ...] = ()
@@ -53,8 +54,11 @@ class Train:
     quiet: QuietOption = False
 
     def run(self) -> int:
+        import jax
+
         from ssplat_jax.checkpoint.weights import check_params, load_weights, save_weights
         from ssplat_jax.console import Reporter
+        from ssplat_jax.model import complete_params
         from ssplat_jax.train.loop import train
         from ssplat_jax.train.recipe import RECIPES
 
@@ -65,13 +69,15 @@ class Train:
             return self._run_refiner()
         config = apply_changes(preset(self.preset), self.set)
         recipe = dataclasses.replace(RECIPES[self.recipe].scaled(self.scale_steps), seed=self.seed)
-        params = None
+        reporter, params = Reporter(self.quiet), None
         if self.init_weights:
-            params = load_weights(self.init_weights)[0]
+            given = load_weights(self.init_weights)[0]
+            params = complete_params(jax.random.key(self.seed), config, given)
             check_params(params, config, str(self.init_weights))
+            if fresh := [name for name, stage in params.items() if stage and not given.get(name)]:
+                reporter.say(f"{self.init_weights} has no {', '.join(fresh)}: random at the start")
         recipe, mix = self._opened(config, recipe)
         lpips_weights = load_lpips_weights(self.lpips_vgg, self.lpips_heads)
-        reporter = Reporter(self.quiet)
         duration = ""
         if self.recipe in MINUTES:
             duration = f", about {max(1, round(MINUTES[self.recipe] * self.scale_steps))} minutes on two cores"

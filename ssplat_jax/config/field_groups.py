@@ -76,8 +76,8 @@ class HistoryConfig(ConfigGroup):
     """Increase of the standard deviation as confidence falls from 1 to 0."""
     gamma_init: float = 0.1
     """Initial value of the learnable gamma_d = softplus(raw)."""
-    cgfi: bool = True
-    """Injects cached features where the current views are uncertain."""
+    cgfi: bool = False
+    """Injects cached features where the current views are uncertain. Off in `tiny`, which gains nothing by it."""
     cgfi_form: Literal["concat", "residual"] = "residual"
     """`concat`: a U-Net of f and the attenuated F_H gives the new features (literal). `residual`: a U-Net that also
     sees Omega gives what is added to f (ours)."""

@@ -147,7 +147,12 @@ PAPER = StreamConfig(
     network=ResplatConfig(),
     depth=DepthConfig(depth_readout="metric", confidence="peak"),
     history=HistoryConfig(
-        cluster_ratio=math.inf, anchor_space="metric", cgfi_form="concat", cgfi_width=128, unit_features=False
+        cluster_ratio=math.inf,
+        anchor_space="metric",
+        cgfi=True,
+        cgfi_form="concat",
+        cgfi_width=128,
+        unit_features=False,
     ),
     memory=MemoryConfig(
         min_confidence=0.3,

@@ -13,6 +13,7 @@ from ssplat_jax.model.exposure import estimate_exposures as estimate_exposures
 from ssplat_jax.model.hpda import anchor_depth as anchor_depth
 from ssplat_jax.model.layers import average_pool as average_pool
 from ssplat_jax.model.network import network_of as network_of
+from ssplat_jax.model.params import complete_params as complete_params
 from ssplat_jax.model.params import count_params as count_params
 from ssplat_jax.model.params import init_params as init_params
 from ssplat_jax.model.types import GRID_STRIDE as GRID_STRIDE

@@ -16,8 +16,8 @@ START_SCALE = 0.43
 """Untrained sideways scale, as a fraction of a Gaussian's part of the cell: neighbors overlap to a closed surface."""
 START_THICKNESS = 0.05
 """Untrained scale along the viewing direction, as a fraction of the cell's footprint."""
-MAX_LOG_GAIN = 0.3
-"""Largest log factor that the head applies to a scale. Larger Gaussians would cover holes and hide what is behind."""
+MAX_LOG_GAIN = 0.6
+"""Bound of the log factor on a scale. Larger Gaussians would cover holes and hide what is behind."""
 MIN_SCALE = 1e-6
 """Smallest scale, in stream units."""
 

@@ -1,8 +1,9 @@
-"""Evidence head: opacity and scale of a pivot's Gaussians from how views saw the pivot (an addition to Sec. 3.6).
+"""Evidence head: opacity, scale and contrast of a pivot's Gaussians from how views saw it (an addition to Sec. 3.6).
 
 The decoder reads a pivot's feature, which was computed when its token was written. Later views tell more: how many of
 them saw the pivot, how well its color fitted there, and how many other pivots share its place. A small MLP reads these
-numbers and changes opacity and scales. Before training it changes nothing.
+numbers and changes opacity, scales and the differences between the colors of a pivot's Gaussians. Before training it
+changes nothing.
 """
 
 import flax.linen as nn
@@ -18,6 +19,8 @@ from ssplat_jax.pytree import pytree, replace
 
 MAX_LOGIT_CHANGE = 4.0
 """Bound of what is added to an opacity's logit."""
+MAX_LOG_CONTRAST = 1.0
+"""Bound of the log factor on the differences between the colors of a pivot's Gaussians."""
 
 WIDTH = 32
 """Channels of the hidden layers."""
@@ -37,16 +40,16 @@ class Evidence:
 
 
 class EvidenceHead(nn.Module):
-    """Maps evidence to changes of the opacity's logit and of the log scales, sideways and along the view.
+    """Maps evidence to changes of the opacity's logit, the log scales and the log contrast.
 
-    Before training all changes are 0.
+    Scales change sideways and along the view. Before training all changes are 0.
     """
 
     @nn.compact
-    def __call__(self, x: Float[Array, "m f"]) -> Float[Array, "m 3"]:
+    def __call__(self, x: Float[Array, "m f"]) -> Float[Array, "m 4"]:
         x = nn.gelu(nn.Dense(WIDTH, name="hidden1")(x))
         x = nn.gelu(nn.Dense(WIDTH, name="hidden2")(x))
-        return nn.Dense(3, kernel_init=nn.initializers.zeros, name="out")(x)
+        return nn.Dense(4, kernel_init=nn.initializers.zeros, name="out")(x)
 
 
 def num_features() -> int:
@@ -76,17 +79,40 @@ def evidence_features(evidence: Evidence, config: StreamConfig) -> Float[Array, 
     return jnp.concatenate([jnp.stack(features, axis=-1), features_of_sightings(evidence.sightings)], axis=-1)
 
 
-def apply_evidence(params, shapes: TokenShapes, evidence: Evidence, config: StreamConfig) -> TokenShapes:
-    """`shapes` of pivots with opacity and scales changed as the evidence asks for.
+def apply_evidence(
+    params, shapes: TokenShapes, evidence: Evidence, config: StreamConfig
+) -> tuple[TokenShapes, Float[Array, "m a"]]:
+    """Shapes and colors of pivots, changed as the evidence asks for.
+
+    A rendered surface is a mixture of Gaussians that overlap and of layers that do not lie exactly on each other, which
+    blurs it. So the colors of a pivot's Gaussians may be moved away from their mean, more where the evidence is good.
+
+    Args:
+        params: parameters of `EvidenceHead`.
+        shapes: what the decoder's own head predicts.
+        evidence: facts about the pivots, their colors among them.
+        config: model configuration.
+
+    Returns:
+        The shapes with other opacities and scales, and the colors, whose mean over a pivot stays as it is.
 
     Limits:
-        Logits change by at most `MAX_LOGIT_CHANGE`; the decoder bounds the scales.
+        Logits change by at most `MAX_LOGIT_CHANGE`, differences of colors by a factor of at most
+        exp(`MAX_LOG_CONTRAST`); the decoder bounds the scales. Colors may leave [0, 1].
     """
     out = EvidenceHead().apply({"params": params}, evidence_features(evidence, config))
-    logit, sideways, along = jnp.moveaxis(jnp.asarray(out), -1, 0)
+    logit, sideways, along, contrast = jnp.moveaxis(jnp.asarray(out), -1, 0)
     change = MAX_LOGIT_CHANGE * jnp.tanh(logit / MAX_LOGIT_CHANGE)
-    return replace(
+    shapes = replace(
         shapes,
         logit_opacities=shapes.logit_opacities + change,
         raw_scales=shapes.raw_scales + jnp.stack([sideways, sideways, along], axis=-1),
     )
+    return shapes, _with_contrast(evidence.rgbs, MAX_LOG_CONTRAST * jnp.tanh(contrast / MAX_LOG_CONTRAST))
+
+
+def _with_contrast(rgbs: Float[Array, "m a"], log_gains: Float[Array, " m"]) -> Float[Array, "m a"]:
+    """Colors whose differences from their mean over the pivot are multiplied by exp(`log_gains`); 0 changes no bit."""
+    colors = rgbs.reshape(len(rgbs), -1, 3)
+    differences = colors - colors.mean(axis=1, keepdims=True)
+    return rgbs + (jnp.expm1(log_gains)[:, None, None] * differences).reshape(rgbs.shape)

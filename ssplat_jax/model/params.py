@@ -24,7 +24,7 @@ def init_params(key: jax.Array, config: StreamConfig, only: Collection[str] | No
     Args:
         key: JAX random key.
         config: model configuration.
-        only: stages to return, with the values that they have among all stages; default all.
+        only: stages to return, with the values that they have among all stages; default all that are on.
 
     Raises:
         InputError: the network has a stage of an unknown name.
@@ -33,10 +33,9 @@ def init_params(key: jax.Array, config: StreamConfig, only: Collection[str] | No
     if unknown := sorted(modules.keys() - set(STAGES)):
         raise InputError(f"network {config.network.kind!r}: wanted stages among {', '.join(STAGES)}, got {unknown}.")
     names = [name for name in STAGES if name in modules]
-    keys = jax.random.split(key, len(names))
-    return {
-        name: _init_stage(k, config, name) for k, name in zip(keys, names, strict=True) if only is None or name in only
-    }
+    keys = jax.random.split(key, len(names))  # a stage that is off has its key too, so that the others start alike
+    wanted = set(names if only is None else only) - (set() if config.history.cgfi else {"cgfi"})
+    return {name: _init_stage(k, config, name) for k, name in zip(keys, names, strict=True) if name in wanted}
 
 
 # One program per stage: a single program for all stages of a large network takes 1.5 times as long to compile, and
@@ -60,6 +59,18 @@ def _modules(config: StreamConfig) -> dict:
             "cgfi": (Aggregator(config), (grid(c), grid(num_hints(config)), jnp.ones(v, bool))),
         }
     )
+
+
+def complete_params(key: jax.Array, config: StreamConfig, params: dict) -> dict:
+    """`params` with untrained parameters for each stage that `config` uses and that has none in them.
+
+    Args:
+        key: JAX random key; a stage gets the values that `init_params` gives it.
+        config: model configuration.
+        params: parameters of a model with fewer stages, such as `tiny` without CGFI and mixer.
+    """
+    untrained = init_params(key, config)
+    return untrained | {name: params[name] for name, stage in untrained.items() if stage and params.get(name)}
 
 
 def count_params(params: dict) -> int:

@@ -112,7 +112,9 @@ class StreamSplat:
             feats = network.regress_tokens(params["tokens"], features, distribution, depth, views, config)
         with jax.named_scope("CGFI"):
             omega, bound = depth.anchored_confidences, network.bound_history
-            feats = stages.inject_features(params["cgfi"], feats, history, omega, views, config, bound_history=bound)
+            feats = stages.inject_features(
+                params.get("cgfi"), feats, history, omega, views, config, bound_history=bound
+            )
         with jax.named_scope("mixer"):
             feats = network.mix_tokens(params["mixer"], feats, positions, views.inside, views.valid, config)
         confidences = jnp.where(views.inside, depth.matcher_confidences, 0.0)
@@ -207,6 +209,7 @@ class StreamSplat:
         """Gaussians of the pivots that `take` selects from a flat array of all pivots."""
         flat = lambda x: take(x.reshape(-1, *x.shape[2:]))  # noqa: E731
         shapes, footprints = self._read_shapes(params, flat(cache.feats)), merged_footprints(cache, self.config)
+        rgbs = flat(cache.rgbs)
         if cache.sightings is not None:
             evidence = stages.Evidence(
                 sightings=flat(cache.sightings),
@@ -215,13 +218,13 @@ class StreamSplat:
                 num_pivots=flat(jnp.broadcast_to(cache.counts[:, None], cache.confidences.shape)).astype(jnp.float32),
                 footprints=flat(cache.footprints),
                 growth=flat(footprints / jnp.maximum(cache.footprints, 1e-12)),
-                rgbs=flat(cache.rgbs),
+                rgbs=rgbs,
             )
-            shapes = stages.apply_evidence(params["evidence"], shapes, evidence, self.config)
+            shapes, rgbs = stages.apply_evidence(params["evidence"], shapes, evidence, self.config)
         gaussians = stages.decode_tokens(
             shapes,
             means=flat(cache.means),
-            rgbs=flat(cache.rgbs),
+            rgbs=rgbs,
             quats=flat(cache.quats),
             footprints=flat(footprints),
             num_members=flat(cache.num_members),

@@ -13,6 +13,7 @@ from ssplat_jax.checkpoint.training_state import RECIPE_FILE, TrainingCheckpoint
 from ssplat_jax.checkpoint.weights import load_params, load_weights
 from ssplat_jax.config import PRESETS, preset
 from ssplat_jax.errors import InputError
+from ssplat_jax.model import complete_params
 from ssplat_jax.storage.npz import save_arrays
 
 FLAT_CONFIG = {
@@ -32,8 +33,8 @@ NEW_FIELDS = ("network", "vit", "match_stride", "depth_range", "depth_space", "u
 OLDEST_CONFIG = {name: value for name, value in FLAT_CONFIG.items() if name not in NEW_FIELDS}
 """Configuration from before there was a second network, as in the weights that ship with the preset."""
 
-OLD = preset("tiny").replace(evidence=False)
-"""The preset as it was before pivots kept evidence."""
+OLD = preset("tiny").replace(evidence=False, cgfi=True, mixer_blocks=2)
+"""The preset as it was before pivots kept evidence, with the stages that it has left out since."""
 
 FRAME = {"rotation": np.eye(3).tolist(), "origin": [0.0, 0.0, 1.0], "scale": 0.6, "near": 0.7, "far": 4.9}
 
@@ -75,7 +76,8 @@ def test_unknown_fields_of_flat_configurations_are_refused():
 
 @pytest.mark.parametrize("fields", [FLAT_CONFIG, OLDEST_CONFIG], ids=("flat", "oldest"))
 def test_old_weights_files_are_read(fields, tmp_path):
-    params = {stage: leaves for stage, leaves in load_params("tiny").items() if stage != "evidence"}
+    params = complete_params(jax.random.key(0), OLD, load_params("tiny"))
+    params = jax.tree.map(lambda x: np.asarray(x, np.float16).astype(np.float32), params)
     leaves = jax.tree_util.tree_flatten_with_path(params)[0]
     arrays = {"/".join(key.key for key in keys): np.asarray(leaf, np.float16) for keys, leaf in leaves}
     save_arrays(tmp_path / "weights.npz", arrays, "weights", {"config": fields, "provenance": {"steps": 3400}})

@@ -10,7 +10,14 @@ import pytest
 from ssplat_jax.cache import init_cache
 from ssplat_jax.cache.state import NUM_SIGHTINGS
 from ssplat_jax.config import PRESETS, preset
-from ssplat_jax.model.evidence import MAX_LOGIT_CHANGE, Evidence, EvidenceHead, apply_evidence, evidence_features
+from ssplat_jax.model.evidence import (
+    MAX_LOG_CONTRAST,
+    MAX_LOGIT_CHANGE,
+    Evidence,
+    EvidenceHead,
+    apply_evidence,
+    evidence_features,
+)
 from ssplat_jax.model.params import init_params
 from ssplat_jax.model.types import TokenShapes
 from ssplat_jax.pytree import replace
@@ -37,7 +44,12 @@ def evidence(value: float = 1.0, num: int = NUM) -> Evidence:
 def head_with(bias: float) -> dict:
     """A head whose outputs are all `bias`."""
     head = init_params(jax.random.key(0), CONFIG, only=("evidence",))["evidence"]
-    return {**head, "out": {**head["out"], "bias": jnp.full(3, bias)}}
+    return {**head, "out": {**head["out"], "bias": jnp.full(4, bias)}}
+
+
+def different_colors() -> Evidence:
+    """Evidence of pivots whose four Gaussians differ in color."""
+    return replace(evidence(), rgbs=jax.random.uniform(jax.random.key(4), (NUM, 12)))
 
 
 def cache_of_pivots(num: int = 6):
@@ -62,8 +74,9 @@ def cache_of_pivots(num: int = 6):
 
 def test_an_untrained_head_changes_nothing():
     params = init_params(jax.random.key(0), CONFIG, only=("evidence",))["evidence"]
-    got = apply_evidence(params, shapes(), evidence(3.0), CONFIG)
+    got, rgbs = apply_evidence(params, shapes(), different_colors(), CONFIG)
     jax.tree.map(np.testing.assert_array_equal, got, shapes())
+    np.testing.assert_array_equal(rgbs, different_colors().rgbs)
 
 
 def test_the_untrained_scene_is_that_without_evidence():
@@ -76,12 +89,28 @@ def test_the_untrained_scene_is_that_without_evidence():
 
 @pytest.mark.parametrize("bias", [1e4, -1e4])
 def test_changes_of_the_opacity_are_bounded(bias):
-    got = apply_evidence(head_with(bias), shapes(), evidence(), CONFIG)
+    got, _ = apply_evidence(head_with(bias), shapes(), evidence(), CONFIG)
     np.testing.assert_allclose(got.logit_opacities - shapes().logit_opacities, np.sign(bias) * MAX_LOGIT_CHANGE)
 
 
-def test_the_head_moves_opacity_and_scales_alone():
-    got = apply_evidence(head_with(0.1), shapes(), evidence(), CONFIG)
+@pytest.mark.parametrize("bias", [0.2, 1e4, -1e4])
+def test_contrast_is_bounded_and_keeps_the_mean_color(bias):
+    before = np.asarray(different_colors().rgbs, np.float64).reshape(NUM, 4, 3)
+    _, rgbs = apply_evidence(head_with(bias), shapes(), different_colors(), CONFIG)
+    after = np.asarray(rgbs, np.float64).reshape(NUM, 4, 3)
+    gain = np.exp(MAX_LOG_CONTRAST * np.tanh(bias / MAX_LOG_CONTRAST))
+    mean = before.mean(axis=1, keepdims=True)
+    np.testing.assert_allclose(after, mean + gain * (before - mean), atol=1e-6)
+    assert np.exp(-MAX_LOG_CONTRAST) <= gain <= np.exp(MAX_LOG_CONTRAST)
+
+
+def test_one_gaussian_per_pivot_has_no_contrast():
+    one = replace(evidence(), rgbs=different_colors().rgbs[:, :3])
+    np.testing.assert_array_equal(apply_evidence(head_with(0.5), shapes(), one, CONFIG)[1], one.rgbs)
+
+
+def test_the_head_moves_opacity_scales_and_contrast_alone():
+    got, _ = apply_evidence(head_with(0.1), shapes(), evidence(), CONFIG)
     assert float(got.logit_opacities[0]) == pytest.approx(-1.0 + 0.1, abs=1e-3)
     np.testing.assert_allclose(got.raw_scales - shapes().raw_scales, 0.1, rtol=1e-5)
     np.testing.assert_array_equal(got.quats, shapes().quats)
@@ -92,7 +121,11 @@ def test_the_head_moves_opacity_and_scales_alone():
 def test_value_and_gradient_are_finite_at_the_limits(value):
     """Dead pivots hold zeros; confidences may be 1."""
     assert jnp.isfinite(evidence_features(evidence(value), CONFIG)).all()
-    loss = lambda p: apply_evidence(p, shapes(), evidence(value), CONFIG).logit_opacities.sum()  # noqa: E731
+
+    def loss(params):
+        got, rgbs = apply_evidence(params, shapes(), evidence(value), CONFIG)
+        return got.logit_opacities.sum() + got.raw_scales.sum() + rgbs.sum()
+
     assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(jax.grad(loss)(head_with(0.2))))
 
 
@@ -115,5 +148,5 @@ def test_evidence_is_on_in_tiny_alone(name):
 def test_the_head_has_no_input_that_it_does_not_know():
     params = init_params(jax.random.key(0), CONFIG, only=("evidence",))["evidence"]
     assert params["hidden1"]["kernel"].shape[0] == evidence_features(evidence(), CONFIG).shape[1]
-    assert EvidenceHead().apply({"params": params}, evidence_features(evidence(), CONFIG)).shape == (NUM, 3)
+    assert EvidenceHead().apply({"params": params}, evidence_features(evidence(), CONFIG)).shape == (NUM, 4)
     assert {field.name for field in dataclasses.fields(Evidence)} >= {"sightings", "num_members"}

@@ -93,14 +93,16 @@ def toy(monkeypatch) -> StreamConfig:
     monkeypatch.setitem(NETWORK_CONFIGS, "toy", ToyConfig)
     monkeypatch.delitem(NETWORK_CONFIGS, "toy")  # undone to absence, whatever the test does
     register_network(ToyConfig, ToyNetwork())
-    return StreamConfig().replace(network="toy", capacity=256, min_confidence=0.0, cgfi_width=8, chunk_size=3)
+    return StreamConfig().replace(
+        network="toy", capacity=256, min_confidence=0.0, cgfi=True, cgfi_width=8, chunk_size=3
+    )
 
 
 @pytest.mark.slow
 def test_registered_network_streams_and_decodes(toy):
     model = StreamSplat(toy)
     params = model.init(jax.random.key(0))
-    assert set(params) == {"encoder", "cost_volume", "hpda", "tokens", "cgfi", "mixer", "decoder"}
+    assert set(params) == {"encoder", "cost_volume", "hpda", "tokens", "cgfi", "mixer", "decoder", "evidence"}
     assert count_params(params["encoder"]) == 12
     step, cache = jax.jit(model.step), model.init_cache()
     for seed in range(2):  # the second chunk has a history

@@ -235,5 +235,6 @@ def test_scales_are_bounded_for_any_feature():
 
 def test_tiny_preset_has_its_stages_and_size():
     params = jax.eval_shape(lambda key: init_params(key, preset("tiny")), jax.random.key(0))
-    assert set(params) == {"encoder", "cost_volume", "hpda", "tokens", "cgfi", "mixer", "decoder", "evidence"}
+    assert set(params) == {"encoder", "cost_volume", "hpda", "tokens", "mixer", "decoder", "evidence"}
+    assert not params["mixer"]  # no blocks
     assert 1e6 < count_params(params) < 3e6

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from importlib import resources
 from pathlib import Path
 
 import jax
@@ -11,6 +12,8 @@ import pytest
 
 from ssplat_jax.cache import Tokens
 from ssplat_jax.checkpoint.training_state import TrainingCheckpoints
+from ssplat_jax.checkpoint.weights import load_params
+from ssplat_jax.commands.train_command import Train
 from ssplat_jax.config import preset
 from ssplat_jax.data.procedural import training_sample
 from ssplat_jax.errors import InputError
@@ -45,6 +48,7 @@ from tests.model.small import random_params
 from tests.streaming.narrow_model import NARROW
 
 RECIPE = smoke_recipe(4)
+SHIPPED = Path(str(resources.files("ssplat_jax") / "weights" / "tiny.npz"))
 WIDTH = RECIPE.depth_target_width
 
 
@@ -100,7 +104,7 @@ OLD_RUN = Path(__file__).with_name("recipe_0_1.json")  # written by version 0.1 
 def test_run_of_version_0_1_is_resumed(tmp_path):
     (tmp_path / "recipe.json").write_text(OLD_RUN.read_text())
     recipe = TINY.scaled(0.004)
-    config = training_config(preset("tiny").replace(evidence=False), recipe)
+    config = training_config(preset("tiny").replace(evidence=False, cgfi=True, mixer_blocks=2), recipe)
     description = loop.describe_run(config, recipe, has_lpips=False)
     TrainingCheckpoints(tmp_path, description, upgrade=loop.upgrade_description).close()
     for other in (dataclasses.replace(recipe, adam_b2=0.999), dataclasses.replace(recipe, weight_decay=0.02)):
@@ -375,3 +379,20 @@ def test_interrupted_run_ends_as_an_uninterrupted_one(tmp_path):
 
     with pytest.raises(InputError, match="another --out"):
         loop.train(NARROW, dataclasses.replace(RECIPE, seed=1), tmp_path / "whole")
+
+
+def test_the_command_starts_stages_that_the_weights_lack_at_random(tmp_path, monkeypatch, capsys):
+    seen = {}
+
+    def stopped_at_once(config, recipe, out, *, params, **others):
+        seen.update(config=config, params=params)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(loop, "train", stopped_at_once)
+    changes = ("cgfi=true", "mixer_blocks=1")
+    with pytest.raises(KeyboardInterrupt):
+        Train(out=tmp_path, recipe="stream", init_weights=SHIPPED, seed=3, set=changes).run()
+    assert "tiny.npz has no cgfi, mixer: random at the start" in capsys.readouterr().err
+    untrained, shipped = init_params(jax.random.key(3), seen["config"]), load_params("tiny")
+    for name, stage in seen["params"].items():
+        jax.tree.map(np.testing.assert_array_equal, stage, (untrained if name in ("cgfi", "mixer") else shipped)[name])
