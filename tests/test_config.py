@@ -104,6 +104,7 @@ def test_every_field_changes_the_hash(network):
         tuple: lambda x: (x[0] + 8, *x[1:]),
     }
     by_name = {"steps_per_chunk": 4, "scene_scale": 3.0, "sh_degree": 3, "depth_range": (0.5, 9.0), "mixer_radius": 7}
+    by_name |= {"mixer_blocks": 3}
     hashes = {base.hash, base.replace(preset="other").hash}
     num_fields = 1
     for group in base.groups():

@@ -150,3 +150,17 @@ def test_the_head_has_no_input_that_it_does_not_know():
     assert params["hidden1"]["kernel"].shape[0] == evidence_features(evidence(), CONFIG).shape[1]
     assert EvidenceHead().apply({"params": params}, evidence_features(evidence(), CONFIG)).shape == (NUM, 4)
     assert {field.name for field in dataclasses.fields(Evidence)} >= {"sightings", "num_members"}
+
+
+def test_the_scene_has_the_contrast_that_the_head_asks_for():
+    """Decoded colors of a pivot lie farther from their mean by one factor for the whole pivot."""
+    params, cache = StreamSplat(CONFIG).init(jax.random.key(1)), cache_of_pivots()
+    colors = lambda bias: np.asarray(  # noqa: E731
+        StreamSplat(CONFIG).decode({**params, "evidence": head_with(bias)}, cache).sh[:, 0], np.float64
+    ).reshape(-1, 4, 3)
+    before, after = colors(0.0), colors(0.5)
+    mean = before.mean(axis=1, keepdims=True)
+    alive = np.ptp(before, axis=(1, 2)) > 0.1
+    assert alive.sum() == 6
+    gain = np.exp(MAX_LOG_CONTRAST * np.tanh(0.5 / MAX_LOG_CONTRAST))
+    np.testing.assert_allclose((after - mean)[alive], gain * (before - mean)[alive], atol=2e-3)

@@ -79,7 +79,7 @@ def test_a_stopped_refinement_continues_to_the_same_bytes(finished, monkeypatch)
     assert folder.scene.read_bytes() == streamed != whole
     report = json.loads(folder.refinement.read_text())
     assert report["num_steps"] == len(report["losses"]) == 4
-    assert report["revised"] == ["poses", "exposures"] and report["num_left_out"] == 0
+    assert report["revised"] == ["poses", "exposures"] and report["num_left_out"] <= 1  # a quarter of the views at most
     sizes = [len(read_ply(path).gaussians.means) for path in (folder.scene, folder.refined_scene)]
     assert report["num_new"] > 0 and sizes[1] <= sizes[0] + report["num_new"] <= 1.1 * sizes[0]
     assert [read_ply(path).gaussians.sh_degree for path in (folder.scene, folder.refined_scene)] == [0, 2]
