@@ -27,11 +27,11 @@ class Train:
     """Folder of the log, the checkpoints and, at the end, weights.npz (refiner.npz)."""
     preset: str = "tiny"
     """Preset of the configuration."""
-    recipe: Literal["tiny", "stream", "evidence", "refiner", "paper"] = "tiny"
-    """tiny: trains depth from scratch, as for the shipped weights. evidence: trains the evidence head of --init-weights
-    on whole streams, in one go. refiner: trains the learned pass of refinement on whole streams of --init-weights, in
-    one go. stream: trains the stages after depth. paper: the paper's loss and steps, for --preset
-    paper or small and a GPU."""
+    recipe: Literal["tiny", "depth", "stream", "evidence", "refiner", "paper"] = "tiny"
+    """tiny: trains depth from scratch. depth: trains it on, in batches of larger images, for a GPU. evidence: trains
+    the evidence head of --init-weights on whole streams, in one go. refiner: trains the learned pass of refinement on
+    whole streams of --init-weights, in one go. stream: trains the stages after depth. paper: the paper's loss and
+    steps, for --preset paper or small and a GPU."""
     scale_steps: float = 1.0
     """Factor of the number of steps of every phase."""
     seed: int = 0

@@ -1,6 +1,8 @@
 """The training loop: draws samples ahead, steps, logs, saves, resumes, and stops cleanly on a signal."""
 
 import dataclasses
+import functools
+import os
 import time
 import warnings
 from collections.abc import Callable
@@ -21,7 +23,7 @@ from ssplat_jax.train.capture_samples import CaptureMix
 from ssplat_jax.train.recipe import Recipe, training_config, with_defaults
 from ssplat_jax.train.samples import prefetched
 from ssplat_jax.train.step import Trainer, TrainState, init_state, learning_rate
-from ssplat_jax.train.step_samples import sample_for_step
+from ssplat_jax.train.step_samples import batch_for_step
 from ssplat_jax.train.validation import Validation
 
 LOG_FILE = "log.jsonl"
@@ -125,15 +127,18 @@ def _run(model, recipe, state, start, mix, lpips_weights, checkpoints, log, ever
     trainer, interrupts = Trainer(model, recipe), Interrupts(has_work=False)
     validation = None if mix is None else Validation(model, recipe, mix, lpips_weights)
     step, stopped = start, None
-    samples = prefetched(lambda i: sample_for_step(i, recipe, model.config, mix), iter(range(start, recipe.num_steps)))
+    # A GPU leaves the cores free to make samples; without one, a thread makes them beside the steps.
+    workers = 1 if jax.default_backend() == "cpu" else max(1, (os.cpu_count() or 1) // 2)
+    produce = functools.partial(batch_for_step, recipe=recipe, config=model.config, mix=mix)
+    samples = prefetched(produce, range(start, recipe.num_steps), workers)
     with interrupts:
         try:
             before = time.perf_counter()
-            for i, sample in samples:
+            for i, batch in samples:
                 waited = time.perf_counter() - before
                 rate = jnp.asarray(learning_rate(recipe, i), jnp.float32)
                 phase = recipe.phase_at(i)[0]
-                state, metrics = trainer.step(state, sample, rate, form=phase.form, lpips_weights=lpips_weights)
+                state, metrics = trainer.step(state, batch, rate, form=phase.form, lpips_weights=lpips_weights)
                 interrupts.has_work = True
                 log.add(metrics, waited)
                 step = i + 1

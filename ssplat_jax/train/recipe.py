@@ -46,6 +46,8 @@ class Phase:
     form: PhaseForm = DEFAULT_FORM
     final_share: float = 0.1
     """Learning rate at the end of the phase, as a fraction of the peak."""
+    batch: int = 1
+    """Samples a step, over which it averages the loss."""
     steps_of_depth: tuple[float, float] = (0.005, 0.4)
     """Range of the distance between consecutive views in median depths: from hand-held video to photo sets."""
 
@@ -117,8 +119,9 @@ class Recipe:
 
     def __post_init__(self) -> None:
         for phase in self.phases:
-            if phase.steps < 1 or phase.num_chunks < 1 or phase.num_targets < 0 or not phase.sizes:
-                raise InputError(f"recipe: phase {phase.name!r} needs steps, num_chunks >= 1 and a size, got {phase}.")
+            if min(phase.steps, phase.num_chunks, phase.batch) < 1 or phase.num_targets < 0 or not phase.sizes:
+                wanted = "steps, num_chunks and batch of at least 1, and a size"
+                raise InputError(f"recipe: phase {phase.name!r} needs {wanted}, got {phase}.")
 
     @property
     def num_steps(self) -> int:
@@ -185,6 +188,25 @@ TINY = Recipe(
 """Trains the depth of the shipped `tiny` weights from scratch; the recipe `evidence` adds the evidence head.
 docs/model_card.md has commands, times and machines."""
 
+DEPTH = Recipe(
+    phases=(
+        Phase(
+            "depth",
+            4800,
+            num_chunks=1,
+            num_targets=0,
+            sizes=((224, 320), (320, 224)),
+            learning_rate=5e-4,
+            final_share=0.02,
+            batch=4,
+            steps_of_depth=(0.01, 0.4),
+        ),
+    ),
+    ema_decay=0.995,
+)
+"""Trains the depth of weights on, in batches of about the size of streamed images. It needs a GPU. The shipped weights do
+not include it; docs/model_card.md has its results."""
+
 STREAM = Recipe(
     phases=(
         Phase(
@@ -232,7 +254,7 @@ PAPER = Recipe(
 rendering loss over black alone. It needs LPIPS weights for the second term and a GPU, and starts from imported weights;
 the paper does not give the number of chunks and targets of a sample."""
 
-RECIPES = {"tiny": TINY, "stream": STREAM, "paper": PAPER}
+RECIPES = {"tiny": TINY, "depth": DEPTH, "stream": STREAM, "paper": PAPER}
 """Choices of `ssplat train --recipe`."""
 
 

@@ -1,8 +1,8 @@
 """Training samples: procedural views in the stream frame, split into chunks of context views and target views."""
 
-import queue
-import threading
-from collections.abc import Callable, Generator, Iterator
+import collections
+from collections.abc import Callable, Generator, Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
 
 import jax.numpy as jnp
 import numpy as np
@@ -174,46 +174,27 @@ def _stream_viewmats(camtoworlds, first: int, scale: float):
 
 
 def prefetched(
-    produce: Callable[[int], Sample], steps: Iterator[int], depth: int = 2
+    produce: Callable[[int], Sample], steps: Iterable[int], workers: int = 1
 ) -> Generator[tuple[int, Sample], None, None]:
-    """Yields (step, produce(step)) in order, computed up to `depth` steps ahead in a thread.
+    """Yields (step, produce(step)) in order, computed ahead in threads.
 
     An exception in `produce` is raised here.
 
     Args:
-        produce: makes the sample of a step; called in the thread.
+        produce: makes the samples of a step; called in the threads.
         steps: numbers of the steps.
-        depth: most samples that wait.
+        workers: threads. Each is at most two steps ahead.
     """
-    ahead: queue.Queue = queue.Queue(maxsize=depth)
-    stop = threading.Event()
-
-    def put(item) -> bool:
-        while not stop.is_set():
-            try:
-                ahead.put(item, timeout=0.1)
-                return True
-            except queue.Full:
-                continue
-        return False
-
-    def work():
+    ahead: collections.deque[tuple[int, Future]] = collections.deque()
+    with ThreadPoolExecutor(workers) as pool:
         try:
             for step in steps:
-                if not put((step, produce(step), None)):
-                    return
-            put(None)
-        except BaseException as error:  # passed to the consumer, which raises it
-            put((None, None, error))
-
-    thread = threading.Thread(target=work, daemon=True)
-    thread.start()
-    try:
-        while (item := ahead.get()) is not None:
-            step, sample, error = item
-            if error is not None:
-                raise error
-            yield step, sample
-    finally:
-        stop.set()
-        thread.join()
+                ahead.append((step, pool.submit(produce, step)))
+                if len(ahead) > 2 * workers:
+                    done, future = ahead.popleft()
+                    yield done, future.result()
+            while ahead:
+                done, future = ahead.popleft()
+                yield done, future.result()
+        finally:
+            pool.shutdown(cancel_futures=True)

@@ -1,4 +1,4 @@
-"""One training step, as a pure function of state and sample."""
+"""One training step, as a pure function of state and samples."""
 
 import dataclasses
 import functools
@@ -153,6 +153,26 @@ def loss_fn(
     return loss, metrics | {"loss": loss}
 
 
+def mean_loss(
+    params: dict,
+    model: StreamSplat,
+    batch: Sample,
+    recipe: Recipe,
+    form: PhaseForm,
+    lpips_weights: LpipsWeights | None = None,
+) -> tuple[Float[Array, ""], dict]:
+    """Means of `loss_fn` over a batch, whose samples have one more leading axis.
+
+    Samples without targets are computed side by side, those with targets one after the other: the rasterizer fills the
+    machine alone.
+    """
+    one = lambda sample: loss_fn(params, model, sample, recipe, form, lpips_weights)  # noqa: E731
+    if len(batch.log_depths) == 1:
+        return one(jax.tree.map(lambda x: x[0], batch))
+    results = jax.vmap(one)(batch) if batch.target_images.shape[1] == 0 else jax.lax.map(one, batch)
+    return jax.tree.map(jnp.mean, results)
+
+
 def _rendered_scene(model: StreamSplat, params: dict, cache: VoxelCache, tokens: Tokens, form: PhaseForm) -> Gaussians:
     """The Gaussians that a phase renders (`PhaseForm.decode`)."""
     if form.decode == "cache":
@@ -207,7 +227,7 @@ def scale_parts(updates: dict, factors: tuple[tuple[str, float], ...]) -> dict:
 
 def train_step(
     state: TrainState,
-    sample: Sample,
+    batch: Sample,
     rate: Float[Array, ""],
     *,
     model: StreamSplat,
@@ -219,7 +239,7 @@ def train_step(
 
     Args:
         state: state before the step.
-        sample: the step's sample.
+        batch: the step's samples, along one more leading axis.
         rate: learning rate.
         model: the model.
         recipe: optimizer and loss.
@@ -232,7 +252,7 @@ def train_step(
     Limits:
         A gradient that is not finite changes only `step` and `num_skipped`.
     """
-    gradients, metrics = jax.grad(loss_fn, has_aux=True)(state.params, model, sample, recipe, form, lpips_weights)
+    gradients, metrics = jax.grad(mean_loss, has_aux=True)(state.params, model, batch, recipe, form, lpips_weights)
     norm = optax.global_norm(gradients)
     is_finite = jnp.isfinite(norm)
     updates, opt_state = optimizer(recipe).update(gradients, state.opt_state, state.params)
@@ -263,6 +283,6 @@ class Trainer:
 
     @functools.cached_property
     def step(self):
-        """`(state, sample, rate, form=DEFAULT_FORM, lpips_weights=None) -> (state, metrics)`; `state` is donated."""
+        """`(state, batch, rate, form=DEFAULT_FORM, lpips_weights=None) -> (state, metrics)`; `state` is donated."""
         bound = functools.partial(train_step, model=self.model, recipe=self.recipe)
         return jax.jit(bound, donate_argnums=0, static_argnames="form")

@@ -1,5 +1,7 @@
 """The sample of each training step, procedural or of a capture, and the samples of a validation."""
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from ssplat_jax.config import StreamConfig
@@ -11,16 +13,20 @@ NUM_VALIDATION = 8
 """Most samples of a validation, one a capture."""
 
 
-def sample_for_step(step: int, recipe: Recipe, config: StreamConfig, mix: CaptureMix | None = None) -> Sample:
-    """Sample of a training step. It depends on the arguments alone, which makes resuming exact.
+def sample_for_step(
+    step: int, recipe: Recipe, config: StreamConfig, mix: CaptureMix | None = None, member: int = 0
+) -> Sample:
+    """A sample of a training step. It depends on the arguments alone, which makes resuming exact.
 
     Args:
         step: number of the step.
         recipe: gives the phase and the seed.
         config: configuration of the model.
         mix: captures to learn from; None, and the share of steps that it leaves, take procedural scenes.
+        member: place of the sample in the step's batch.
     """
     phase, position = recipe.phase_at(step)
+    number = step + member * recipe.num_steps
     form = {
         "num_chunks": phase.num_chunks,
         "num_targets": phase.num_targets,
@@ -28,9 +34,17 @@ def sample_for_step(step: int, recipe: Recipe, config: StreamConfig, mix: Captur
         "config": config,
         "range_jitter": recipe.range_jitter,
     }
-    if mix is not None and (capture := mix.draw(np.random.default_rng([recipe.seed, step, 13]))) is not None:
-        return capture_sample(mix, capture, [recipe.seed, step, 17], **form)
-    return make_sample(recipe.seed * 1_000_003 + step, steps_of_depth=phase.steps_of_depth, **form)
+    if mix is not None and (capture := mix.draw(np.random.default_rng([recipe.seed, number, 13]))) is not None:
+        return capture_sample(mix, capture, [recipe.seed, number, 17], **form)
+    return make_sample(recipe.seed * 1_000_003 + number, steps_of_depth=phase.steps_of_depth, **form)
+
+
+def batch_for_step(step: int, recipe: Recipe, config: StreamConfig, mix: CaptureMix | None = None) -> Sample:
+    """Samples of a training step, along one more leading axis; see `sample_for_step`. A CPU makes them."""
+    size = recipe.phase_at(step)[0].batch
+    with jax.default_device(jax.local_devices(backend="cpu")[0]):
+        samples = [sample_for_step(step, recipe, config, mix, member) for member in range(size)]
+        return jax.tree.map(lambda *parts: jnp.stack(parts), *samples)
 
 
 def validation_samples(mix: CaptureMix, phase: Phase, config: StreamConfig) -> list[Sample]:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import time
 from importlib import resources
 from pathlib import Path
 
@@ -21,9 +22,11 @@ from ssplat_jax.model import init_params
 from ssplat_jax.pytree import replace
 from ssplat_jax.streaming.streamsplat import StreamSplat
 from ssplat_jax.train import loop
+from ssplat_jax.train import step as train_step
 from ssplat_jax.train.losses import depth_loss, image_gradient_l1, soft_targets
 from ssplat_jax.train.recipe import (
     ALL_BUT_HEAD,
+    DEFAULT_FORM,
     RECIPES,
     TINY,
     Phase,
@@ -43,7 +46,7 @@ from ssplat_jax.train.step import (
     scale_parts,
     stream_chunks,
 )
-from ssplat_jax.train.step_samples import sample_for_step
+from ssplat_jax.train.step_samples import batch_for_step, sample_for_step
 from tests.model.small import random_params
 from tests.streaming.narrow_model import NARROW
 
@@ -136,7 +139,12 @@ def test_fields_missing_in_a_recipe_have_their_default():
 
 
 def test_prefetch_keeps_order_and_raises_errors():
-    assert [value for _, value in prefetched(lambda i: i * i, iter(range(5)))] == [0, 1, 4, 9, 16]
+    def slow_at_first(i):
+        time.sleep(0.05 * (i == 0))
+        return i * i
+
+    for workers in (1, 3):
+        assert list(prefetched(slow_at_first, range(9), workers)) == [(i, i * i) for i in range(9)]
 
     def fail(i):
         if i == 2:
@@ -144,7 +152,15 @@ def test_prefetch_keeps_order_and_raises_errors():
         return i
 
     with pytest.raises(ValueError, match="third"):
-        list(prefetched(fail, iter(range(5))))
+        list(prefetched(fail, range(5)))
+
+
+def test_prefetch_makes_no_more_than_two_steps_a_worker_ahead():
+    made = []
+    steps = prefetched(made.append, range(100), workers=2)
+    next(steps)
+    steps.close()
+    assert len(made) <= 5
 
 
 def test_soft_targets_and_loss_agree_on_the_truth():
@@ -308,6 +324,11 @@ def start(trainer):
     return init_state(trainer.model, DEPTH_RECIPE, random_params(trainer.model.config))
 
 
+def alone(sample):
+    """A batch of one sample."""
+    return jax.tree.map(lambda x: x[None], sample)
+
+
 def test_step_with_a_non_finite_gradient_is_only_counted(trainer):
     sample = sample_for_step(0, DEPTH_RECIPE, trainer.model.config)
     broken = dataclasses.replace(sample, log_depths=sample.log_depths.at[0, 0, 8, 8].set(jnp.nan))
@@ -315,10 +336,10 @@ def test_step_with_a_non_finite_gradient_is_only_counted(trainer):
         broken, chunks=dataclasses.replace(sample.chunks, images=sample.chunks.images * jnp.inf)
     )
     # After a good step momentum is not zero and the average differs from the parameters.
-    state, _ = trainer.step(start(trainer), sample, jnp.float32(1e-3), form=FROZEN_ENCODER)
+    state, _ = trainer.step(start(trainer), alone(sample), jnp.float32(1e-3), form=FROZEN_ENCODER)
     before = {name: flat(getattr(state, name)) for name in ("params", "ema", "opt_state")}
     assert any(np.any(a != b) for a, b in zip(before["params"], before["ema"], strict=True))
-    after, metrics = trainer.step(state, broken, jnp.float32(1e-3), form=FROZEN_ENCODER)
+    after, metrics = trainer.step(state, alone(broken), jnp.float32(1e-3), form=FROZEN_ENCODER)
     assert not np.isfinite(float(metrics["grad_norm"]))
     assert int(after.num_skipped) == 1 and int(after.step) == 2
     for name, held in before.items():
@@ -330,12 +351,46 @@ def test_frozen_stages_stay_and_the_others_move(trainer):
     state = start(trainer)
     before = jax.tree.map(np.asarray, state.params)
     sample = sample_for_step(0, DEPTH_RECIPE, trainer.model.config)
-    after, metrics = trainer.step(state, sample, jnp.float32(1e-3), form=FROZEN_ENCODER)
+    after, metrics = trainer.step(state, alone(sample), jnp.float32(1e-3), form=FROZEN_ENCODER)
     assert np.isfinite(float(metrics["loss"])) and int(after.num_skipped) == 0
     for a, b in zip(flat(after.params["encoder"]), flat(before["encoder"]), strict=True):
         np.testing.assert_array_equal(a, b)
     moved = zip(flat(after.params["cost_volume"]), flat(before["cost_volume"]), strict=True)
     assert any(not np.array_equal(a, b) for a, b in moved)
+
+
+def test_members_of_a_batch_are_samples_of_their_own():
+    phase = dataclasses.replace(DEPTH_RECIPE.phases[0], steps=2, batch=2)
+    recipe = dataclasses.replace(DEPTH_RECIPE, phases=(phase,))
+    batch = batch_for_step(1, recipe, NARROW)
+    for member in range(2):
+        sample = sample_for_step(1, recipe, NARROW, member=member)
+        jax.tree.map(lambda a, b: np.testing.assert_array_equal(a[member], b), batch, sample)  # noqa: B023
+    seen = [
+        sample_for_step(step, recipe, NARROW, member=member).log_depths.tobytes()
+        for step in range(recipe.num_steps)
+        for member in range(2)
+    ]
+    assert len(set(seen)) == len(seen)
+
+
+@pytest.mark.parametrize("targets", [0, 1])
+def test_loss_and_gradient_of_a_batch_are_means_over_its_samples(monkeypatch, targets):
+    samples = [make_sample(seed, num_chunks=1, num_targets=targets, size=(64, 64), config=NARROW) for seed in (1, 2, 3)]
+    batch = jax.tree.map(lambda *parts: jnp.stack(parts), *samples)
+
+    def loss(params, model, sample, *rest):
+        value = jnp.sum(params["a"] * jnp.nanmean(sample.log_depths)) ** 2
+        return value, {"loss": value, "views": jnp.float32(len(sample.target_images))}
+
+    monkeypatch.setattr(train_step, "loss_fn", loss)
+    of = jax.value_and_grad(train_step.mean_loss, has_aux=True)
+    params = {"a": jnp.array([1.5, -0.5])}
+    (value, metrics), gradient = of(params, StreamSplat(NARROW), batch, DEPTH_RECIPE, DEFAULT_FORM)
+    singles = [of(params, StreamSplat(NARROW), alone(sample), DEPTH_RECIPE, DEFAULT_FORM) for sample in samples]
+    np.testing.assert_allclose(value, np.mean([single[0][0] for single in singles]), rtol=1e-6)
+    np.testing.assert_allclose(gradient["a"], np.mean([single[1]["a"] for single in singles], axis=0), rtol=1e-6)
+    assert float(metrics["loss"]) == float(value) and float(metrics["views"]) == targets
 
 
 @pytest.mark.slow  # two programs of a whole training step
