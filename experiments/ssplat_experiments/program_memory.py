@@ -1,25 +1,16 @@
-"""`make_room`: drops compiled programs before a long experiment holds more of them than a process may."""
-
-import gc
-from pathlib import Path
-
-import jax
+"""`make_room`: drops compiled programs, of kept sessions too, before a long experiment holds too many of them."""
 
 from ssplat_experiments import joint_network, warm_sessions
-
-MAPS = Path("/proc/self/maps")
-
-MOST_MAPS = 25_000
-"""Memory maps of the process. XLA's CPU compiler takes some for every program, and Linux allows 65,530 by default."""
+from ssplat_jax import program_memory
+from ssplat_jax.program_memory import MOST_MAPS
 
 
 def make_room(most_maps: int = MOST_MAPS) -> None:
-    """Drops all compiled programs, of kept sessions too, if the process holds many memory maps, which Linux counts.
+    """`ssplat_jax.program_memory.make_room`, which first forgets the sessions and networks that experiments keep.
 
-    What is dropped is compiled again when it is needed. Measurements are warm in any case.
+    Measurements are warm in any case.
     """
-    if MAPS.exists() and len(MAPS.read_text().splitlines()) > most_maps:
+    if program_memory.holds_many_programs(most_maps):
         warm_sessions.forget()
         joint_network.forget()
-        jax.clear_caches()
-        gc.collect()
+        program_memory.make_room(most_maps)

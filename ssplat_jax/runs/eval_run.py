@@ -17,6 +17,7 @@ from ssplat_jax.errors import InputError, echo, refusal
 from ssplat_jax.evaluation.evaluate import evaluate
 from ssplat_jax.evaluation.scoring import Display
 from ssplat_jax.metrics.lpips import LpipsWeights
+from ssplat_jax.program_memory import make_room
 from ssplat_jax.refinement import online_refinement
 from ssplat_jax.runs.reports import report_eval
 from ssplat_jax.storage.json_files import write_json
@@ -145,6 +146,7 @@ def _eval_scenes(
     splits = {scene: split_of_scene(index, scene, len(capture)) for scene, capture in captures.items()}
     scored = {}
     for scene, capture in captures.items():
+        make_room()
         reporter.say(scene)
         scored[scene] = _evaluate(model, params, capture, splits[scene], out / scene, options, reporter, scene)
     metrics = scene_metrics(scored) | {"left_out": [scene for scene, split in index.items() if split is None]}

@@ -204,8 +204,8 @@ DEPTH = Recipe(
     ),
     ema_decay=0.995,
 )
-"""Trains the depth of weights on, in batches of about the size of streamed images. It needs a GPU. The shipped weights do
-not include it; docs/model_card.md has its results."""
+"""Trains the depth of weights on, in batches of about the size of streamed images. It needs a GPU. The shipped weights
+do not include it; docs/model_card.md has its results."""
 
 STREAM = Recipe(
     phases=(

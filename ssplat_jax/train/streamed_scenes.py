@@ -14,6 +14,7 @@ from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import choose_split
 from ssplat_jax.errors import InputError
+from ssplat_jax.program_memory import make_room
 from ssplat_jax.rasterizer import render
 from ssplat_jax.rasterizer.render import round_up
 from ssplat_jax.refinement.refine_capture import key_views_of
@@ -89,6 +90,7 @@ def stream_scene(model: StreamSplat, params: dict, capture: Capture, stride: int
         capture: the capture.
         stride: distance of consecutive frames.
     """
+    make_room()
     context = choose_split("interleaved", len(capture), stride, None, None).context
     session = Session(model, params)
     frame = capture.stream_frame(model.config, context)

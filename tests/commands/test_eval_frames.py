@@ -10,6 +10,7 @@ from PIL import Image
 
 from ssplat_jax.checkpoint.weights import save_weights
 from ssplat_jax.evaluation import latency
+from ssplat_jax.runs import eval_run
 from ssplat_jax.runs.eval_run import scene_metrics
 from ssplat_jax.streaming.streamsplat import StreamSplat
 from tests.commands.test_cli import few_pivots, make_capture, run  # noqa: F401
@@ -70,7 +71,10 @@ def spied(order):
     return spy
 
 
-def test_scenes_of_an_index_are_averaged_by_scene_and_by_view(tmp_path, narrow):
+def test_scenes_of_an_index_are_averaged_by_scene_and_by_view(tmp_path, narrow, monkeypatch):
+    made_room = []
+    scored = lambda: made_room.append(len(list(out.glob("*/metrics.json"))))  # noqa: E731
+    monkeypatch.setattr(eval_run, "make_room", scored)
     scenes, out = tmp_path / "scenes", tmp_path / "out"
     for name in ("a", "b"):
         make_capture(scenes / name, num_frames=8, size=SIZE)
@@ -81,6 +85,7 @@ def test_scenes_of_an_index_are_averaged_by_scene_and_by_view(tmp_path, narrow):
         "c": None,
     }))  # fmt: skip
     assert run("eval", str(scenes), "--index", str(index), "--out", str(out), *narrow) == 0
+    assert made_room == [0, 1]  # before each scene: programs of many would be too many for one process
     metrics, a, b = (read(out / name / "metrics.json") for name in ("", "a", "b"))
     assert metrics["left_out"] == ["c"] and read(out / "index.json") == read(index)
     for name in ("literal", "shown"):

@@ -3,10 +3,12 @@
 import jax
 import jax.numpy as jnp
 import pytest
-from ssplat_experiments import program_memory, warm_sessions
-from ssplat_experiments.program_memory import MAPS, make_room
+from ssplat_experiments import warm_sessions
+from ssplat_experiments.program_memory import make_room
 
+from ssplat_jax import program_memory
 from ssplat_jax.config import preset
+from ssplat_jax.program_memory import MAPS
 
 
 @pytest.mark.skipif(not MAPS.exists(), reason="only Linux counts memory maps there")

@@ -17,6 +17,7 @@ from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.rasterizer import render
 from ssplat_jax.streaming.streamsplat import StreamSplat
+from ssplat_jax.train import streamed_scenes
 from ssplat_jax.train.evidence_training import EvidenceRecipe, crop_camera, train_evidence
 
 RECIPE = EvidenceRecipe(
@@ -34,16 +35,19 @@ def standard_promotion():
 @pytest.fixture(scope="module")
 def trained():
     """(parameters before, parameters after, facts, records) of a short training on one small scene."""
-    params, records, names = load_params("tiny"), [], []
-    after, facts = train_evidence(
-        StreamSplat(preset("tiny")),
-        params,
-        [],
-        RECIPE,
-        on_scene=names.append,
-        on_step=lambda step, record: records.append((step, record)),
-    )
+    params, records, names, made_room = load_params("tiny"), [], [], []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(streamed_scenes, "make_room", lambda: made_room.append(list(names)))
+        after, facts = train_evidence(
+            StreamSplat(preset("tiny")),
+            params,
+            [],
+            RECIPE,
+            on_scene=names.append,
+            on_step=lambda step, record: records.append((step, record)),
+        )
     assert names == facts["scenes"]
+    assert made_room == [[]]  # before the scene: programs of many would be too many for one process
     return params, after, facts, records
 
 
