@@ -18,19 +18,24 @@ MOST_MAPS = 25_000
 
 
 def holds_many_programs(most_maps: int = MOST_MAPS) -> bool:
-    """Whether the process has more than `most_maps` memory maps; false where the system does not list them."""
+    """True if the process has more than `most_maps` memory maps; False where the system does not list them."""
     return MAPS.exists() and len(MAPS.read_text().splitlines()) > most_maps
 
 
 def make_room(most_maps: int = MOST_MAPS) -> None:
-    """Drops all compiled programs if the process holds many (`holds_many_programs`).
+    """Drops compiled programs if the process holds many (`holds_many_programs`).
 
-    Call it between scenes when one process handles many of them. What is dropped is compiled again, or read from JAX's
-    compilation cache, when it is next called.
+    Call it between scenes when one process handles many of them. A dropped program is compiled again, or read from
+    JAX's compilation cache, at its next call. Programs of a `Session` go with the session: `del` the last one first.
 
     Args:
         most_maps: memory maps that the process may have.
     """
     if holds_many_programs(most_maps):
-        jax.clear_caches()
-        gc.collect()
+        drop_programs()
+
+
+def drop_programs() -> None:
+    """Drops all compiled programs but those of sessions that are still in use."""
+    jax.clear_caches()
+    gc.collect()

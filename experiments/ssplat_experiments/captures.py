@@ -16,6 +16,7 @@ from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import interleaved_split
 from ssplat_jax.errors import InputError
 from ssplat_jax.evaluation.evaluate import evaluate
+from ssplat_jax.program_memory import make_room
 from ssplat_jax.storage.json_files import write_json
 from ssplat_jax.streaming.session import Session
 from ssplat_jax.streaming.streamsplat import StreamSplat
@@ -37,6 +38,7 @@ def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str
     model, params = StreamSplat(preset("tiny")), load_params("tiny")
     rows = []
     for name, stride, context, size in SETTINGS:
+        make_room()
         if not (captures / name).is_dir():
             reporter.warn(f"{name}: not in {captures}, left out")
             continue

@@ -24,6 +24,7 @@ from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.split import Split
 from ssplat_jax.errors import InputError
 from ssplat_jax.model import GRID_STRIDE
+from ssplat_jax.program_memory import make_room
 from ssplat_jax.storage.json_files import write_json
 from ssplat_jax.streaming.feed import feed_chunks
 from ssplat_jax.streaming.session import Session
@@ -45,6 +46,7 @@ def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str
         reporter.warn(f"{REDKITCHEN}: not under --captures, left out")
     rows: list[dict[str, Any]] = []
     for name, (capture, split) in scenes.items():
+        make_room()
         rows.append({"capture": name} | measure(capture, split))
     write_json(out / "table.json", rows)
     for row in rows:

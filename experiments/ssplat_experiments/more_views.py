@@ -19,6 +19,7 @@ from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import paper_split
 from ssplat_jax.errors import InputError
 from ssplat_jax.evaluation.evaluate import evaluate
+from ssplat_jax.program_memory import make_room
 from ssplat_jax.storage.atomic import write_atomic
 from ssplat_jax.storage.json_files import write_json
 from ssplat_jax.streaming.session import Session
@@ -35,6 +36,7 @@ def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str
     model, params = StreamSplat(preset("tiny")), load_params("tiny")
     rows = []
     for context in at_scale(COUNTS, scale):
+        make_room()
         split = paper_split(len(capture), context)
         metrics = evaluate(Session(model, params), capture, split, out / f"{context}_views", reporter)
         rows.append(

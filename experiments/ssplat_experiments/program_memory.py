@@ -13,4 +13,4 @@ def make_room(most_maps: int = MOST_MAPS) -> None:
     if program_memory.holds_many_programs(most_maps):
         warm_sessions.forget()
         joint_network.forget()
-        program_memory.make_room(most_maps)
+        program_memory.drop_programs()

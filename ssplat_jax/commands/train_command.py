@@ -28,7 +28,7 @@ class Train:
     preset: str = "tiny"
     """Preset of the configuration."""
     recipe: Literal["tiny", "depth", "stream", "evidence", "refiner", "paper"] = "tiny"
-    """tiny: trains depth from scratch. depth: trains it on, in batches of larger images, for a GPU. evidence: trains
+    """tiny: trains depth from scratch. depth: continues that in batches of larger images, for a GPU. evidence: trains
     the evidence head of --init-weights on whole streams, in one go. refiner: trains the learned pass of refinement on
     whole streams of --init-weights, in one go. stream: trains the stages after depth. paper: the paper's loss and
     steps, for --preset paper or small and a GPU."""

@@ -83,16 +83,18 @@ def open_mix(folders: Sequence[Path], shares: Sequence[float], config: StreamCon
         folders: captures, or folders of captures.
         shares: share of the steps of each folder; empty: half of the steps, equally.
         config: configuration of the model.
-        recipe: says how many views a sample has.
+        recipe: says how many views a sample has, and whether it renders any.
 
     Raises:
-        InputError: shares do not fit, a folder holds no capture, or a capture has too few frames for a sample.
+        InputError: shares do not fit, a folder holds no capture, or a capture cannot teach this recipe: it has too few
+            frames for a sample, or no depth map where the recipe renders no target view.
     """
     shares = list(shares) or [0.5 / len(folders)] * len(folders)
     if len(shares) != len(folders) or min(shares) <= 0 or sum(shares) > 1 + 1e-9:
         wanted = f"{len(folders)} numbers above 0 that add up to at most 1, one for each of --captures"
         raise refusal("--shares", wanted=wanted, got=" ".join(map(str, shares)), fix="give one share a folder")
     needed = max(p.num_chunks * config.stream.chunk_size + p.num_targets for p in recipe.phases)
+    renders_nothing = all(phase.num_targets == 0 for phase in recipe.phases)
     groups = []
     for folder, share in zip(folders, shares, strict=True):
         captures = tuple(open_capture(path, size=ESTIMATION_SIZE) for path in _captures_in(folder))
@@ -100,6 +102,10 @@ def open_mix(folders: Sequence[Path], shares: Sequence[float], config: StreamCon
             if (count := len(learned_frames(capture))) < needed:
                 wanted = f"at least {needed} frames besides those held out, as a sample of the recipe has"
                 raise refusal(f"--captures {capture.name}", wanted=wanted, got=str(count), fix="leave it out")
+            if renders_nothing and not any(map(capture.pixels.has_depth, learned_frames(capture))):
+                wanted = "depth maps, from which alone this recipe learns"
+                fix = "leave it out, or choose a recipe that renders target views, such as stream"
+                raise refusal(f"--captures {capture.name}", wanted=wanted, got="none", fix=fix)
         groups.append(CaptureGroup(folder.name, float(share), captures))
     return CaptureMix(tuple(groups), config)
 

@@ -128,7 +128,8 @@ def _run(model, recipe, state, start, mix, lpips_weights, checkpoints, log, ever
     validation = None if mix is None else Validation(model, recipe, mix, lpips_weights)
     step, stopped = start, None
     # A GPU leaves the cores free to make samples; without one, a thread makes them beside the steps.
-    workers = 1 if jax.default_backend() == "cpu" else max(1, (os.cpu_count() or 1) // 2)
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    workers = 1 if jax.default_backend() == "cpu" else max(1, cores // 2)
     produce = functools.partial(batch_for_step, recipe=recipe, config=model.config, mix=mix)
     samples = prefetched(produce, range(start, recipe.num_steps), workers)
     with interrupts:
@@ -171,7 +172,7 @@ class _Log:
         self._waited, self._since = 0.0, time.perf_counter()
 
     def add(self, metrics: dict, waited: float) -> None:
-        """Adds the metrics of a step, and the seconds for which it waited for its sample."""
+        """Adds the metrics of a step, and the seconds for which it waited for its samples."""
         self._metrics.append(metrics)
         self._waited += waited
 

@@ -47,7 +47,7 @@ class Phase:
     final_share: float = 0.1
     """Learning rate at the end of the phase, as a fraction of the peak."""
     batch: int = 1
-    """Samples a step, over which it averages the loss."""
+    """Samples per step; the loss is their mean."""
     steps_of_depth: tuple[float, float] = (0.005, 0.4)
     """Range of the distance between consecutive views in median depths: from hand-held video to photo sets."""
 
@@ -204,8 +204,8 @@ DEPTH = Recipe(
     ),
     ema_decay=0.995,
 )
-"""Trains the depth of weights on, in batches of about the size of streamed images. It needs a GPU. The shipped weights
-do not include it; docs/model_card.md has its results."""
+"""Continues the training of depth, in batches of images of about the streamed size. It needs a GPU. The shipped weights
+do not include it; docs/model_card.md says what most of its steps gave."""
 
 STREAM = Recipe(
     phases=(

@@ -2,7 +2,8 @@
 
 import collections
 from collections.abc import Callable, Generator, Iterable
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from typing import TypeVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -17,6 +18,8 @@ from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.model import GRID_STRIDE
 from ssplat_jax.pytree import pytree
 from ssplat_jax.train.recipe import Recipe
+
+Product = TypeVar("Product")
 
 MAX_LOG_STEP = 0.05
 """Log depths of neighboring pixels that differ by more belong to different surfaces."""
@@ -174,22 +177,25 @@ def _stream_viewmats(camtoworlds, first: int, scale: float):
 
 
 def prefetched(
-    produce: Callable[[int], Sample], steps: Iterable[int], workers: int = 1
-) -> Generator[tuple[int, Sample], None, None]:
+    produce: Callable[[int], Product], steps: Iterable[int], workers: int = 1
+) -> Generator[tuple[int, Product], None, None]:
     """Yields (step, produce(step)) in order, computed ahead in threads.
 
-    An exception in `produce` is raised here.
+    The first is computed alone, so that the others find in caches what all of them need. An exception in `produce` is
+    raised here.
 
     Args:
         produce: makes the samples of a step; called in the threads.
         steps: numbers of the steps.
-        workers: threads. Each is at most two steps ahead.
+        workers: threads. Together they are at most `2 * workers` steps ahead.
     """
     ahead: collections.deque[tuple[int, Future]] = collections.deque()
     with ThreadPoolExecutor(workers) as pool:
         try:
-            for step in steps:
+            for i, step in enumerate(steps):
                 ahead.append((step, pool.submit(produce, step)))
+                if i == 0:
+                    wait([ahead[0][1]])
                 if len(ahead) > 2 * workers:
                     done, future = ahead.popleft()
                     yield done, future.result()

@@ -161,10 +161,10 @@ def mean_loss(
     form: PhaseForm,
     lpips_weights: LpipsWeights | None = None,
 ) -> tuple[Float[Array, ""], dict]:
-    """Means of `loss_fn` over a batch, whose samples have one more leading axis.
+    """Means of `loss_fn` over the samples of a batch, which are along its leading axis.
 
-    Samples without targets are computed side by side, those with targets one after the other: the rasterizer fills the
-    machine alone.
+    Samples without targets are computed side by side, those with targets one after the other: the rasterizer keeps the
+    machine busy with one sample.
     """
     one = lambda sample: loss_fn(params, model, sample, recipe, form, lpips_weights)  # noqa: E731
     if len(batch.log_depths) == 1:

@@ -1,4 +1,4 @@
-"""The sample of each training step, procedural or of a capture, and the samples of a validation."""
+"""The samples of each training step, procedural or of a capture, and the samples of a validation."""
 
 import jax
 import jax.numpy as jnp
@@ -42,9 +42,17 @@ def sample_for_step(
 def batch_for_step(step: int, recipe: Recipe, config: StreamConfig, mix: CaptureMix | None = None) -> Sample:
     """Samples of a training step, along one more leading axis; see `sample_for_step`. A CPU makes them."""
     size = recipe.phase_at(step)[0].batch
-    with jax.default_device(jax.local_devices(backend="cpu")[0]):
+    with jax.default_device(_cpu()):
         samples = [sample_for_step(step, recipe, config, mix, member) for member in range(size)]
         return jax.tree.map(lambda *parts: jnp.stack(parts), *samples)
+
+
+def _cpu():
+    """The device that makes samples: the CPU, or JAX's default (None) where `JAX_PLATFORMS` leaves the CPU out."""
+    try:
+        return jax.local_devices(backend="cpu")[0]
+    except RuntimeError:
+        return None
 
 
 def validation_samples(mix: CaptureMix, phase: Phase, config: StreamConfig) -> list[Sample]:

@@ -151,6 +151,21 @@ def test_a_capture_needs_the_frames_of_a_sample(capture, monkeypatch):
     assert group.share == 0.5 and len(group.captures[0]) == 10
 
 
+def test_photographs_alone_are_refused_where_nothing_is_rendered(capture, monkeypatch):
+    class Photographs:
+        image = staticmethod(capture.pixels.image)
+        depth = staticmethod(lambda i: None)
+        has_depth = staticmethod(lambda i: False)
+
+    without = dataclasses.replace(capture, pixels=Photographs())
+    monkeypatch.setattr("ssplat_jax.train.capture_samples.open_capture", lambda path, size: without)
+    with pytest.raises(InputError, match=r"depth maps, .* got none; leave it out, or choose a recipe that renders"):
+        open_mix([Path("photographs")], [], NARROW, TINY)
+    open_mix([Path("photographs")], [], NARROW, smoke_recipe(4))
+    monkeypatch.setattr("ssplat_jax.train.capture_samples.open_capture", lambda path, size: capture)
+    open_mix([Path("with depth")], [], NARROW, TINY)
+
+
 def test_shares_need_captures(tmp_path):
     with pytest.raises(InputError, match="--captures beside it"):
         Train(out=tmp_path, shares=(0.5,)).run()

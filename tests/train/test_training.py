@@ -393,6 +393,21 @@ def test_loss_and_gradient_of_a_batch_are_means_over_its_samples(monkeypatch, ta
     assert float(metrics["loss"]) == float(value) and float(metrics["views"]) == targets
 
 
+@pytest.mark.slow  # programs of whole training steps
+@pytest.mark.parametrize("targets", [0, 1])
+def test_the_gradient_of_a_batch_is_the_mean_of_its_samples_gradients(targets):
+    samples = [make_sample(seed, num_chunks=1, num_targets=targets, size=(64, 64), config=NARROW) for seed in (1, 2)]
+    model = StreamSplat(training_config(NARROW, RECIPE))
+    gradient = jax.jit(lambda p, b: jax.grad(train_step.mean_loss, has_aux=True)(p, model, b, RECIPE, DEFAULT_FORM)[0])
+    params = random_params(NARROW)
+    found = gradient(params, jax.tree.map(lambda *parts: jnp.stack(parts), *samples))
+    singles = [gradient(params, alone(sample)) for sample in samples]
+    wanted = jax.tree.map(lambda a, b: (a + b) / 2, *singles)
+    largest = max(float(jnp.abs(x).max()) for x in jax.tree.leaves(wanted))
+    for a, b in zip(flat(found), flat(wanted), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-4 * largest, rtol=1e-3)
+
+
 @pytest.mark.slow  # two programs of a whole training step
 def test_rendering_the_cache_trains_the_head_alone():
     sample = sample_for_step(RECIPE.num_steps - 1, RECIPE, NARROW)
