@@ -162,8 +162,8 @@ def test_photographs_alone_are_refused_where_nothing_is_rendered(capture, monkey
     with pytest.raises(InputError, match=r"depth maps, .* got none; leave it out, or choose a recipe that renders"):
         open_mix([Path("photographs")], [], NARROW, TINY)
     open_mix([Path("photographs")], [], NARROW, smoke_recipe(4))
-    monkeypatch.setattr("ssplat_jax.train.capture_samples.open_capture", lambda path, size: capture)
-    open_mix([Path("with depth")], [], NARROW, TINY)
+    Photographs.has_depth = staticmethod(lambda i: i == 3)
+    open_mix([Path("one depth map")], [], NARROW, TINY)
 
 
 def test_shares_need_captures(tmp_path):
