@@ -71,6 +71,12 @@ def test_bad_value_is_refused_by_name_and_value(changes):
         bad.__post_init__()
 
 
+def test_recall_without_hpda_is_refused():
+    with pytest.raises(InputError, match="recall must be false without hpda, got True"):
+        StreamConfig().replace(recall=True, hpda=False)
+    assert StreamConfig().replace(recall=True).history.hpda
+
+
 def test_replacing_checks_what_it_builds():
     with pytest.raises(InputError, match="voxel_size"):
         StreamConfig().replace(voxel_size=-1.0)

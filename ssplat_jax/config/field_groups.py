@@ -76,6 +76,9 @@ class HistoryConfig(ConfigGroup):
     """Increase of the standard deviation as confidence falls from 1 to 0."""
     gamma_init: float = 0.1
     """Initial value of the learnable gamma_d = softplus(raw)."""
+    recall: bool = False
+    """Cells that the matcher is unsure of become tokens at the cache's depth, where the cache is sure (ours). It closes
+    weakly textured surfaces that the camera returns to."""
     cgfi: bool = False
     """Injects cached features where the current views are uncertain. Off in `tiny`, which gains nothing by it."""
     cgfi_form: Literal["concat", "residual"] = "residual"
@@ -94,6 +97,7 @@ class HistoryConfig(ConfigGroup):
             ("sigma0", "positive", is_positive(self.sigma0)),
             ("lambda_sigma", "not negative, and finite", 0 <= self.lambda_sigma < math.inf),
             ("cluster_ratio", "above 1", self.cluster_ratio > 1),
+            ("recall", "false without hpda", self.hpda or not self.recall),
         )
 
 

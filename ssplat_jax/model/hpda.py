@@ -8,7 +8,11 @@ from ssplat_jax.cache import ProjectedCache
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.model.types import AnchoredDepth, DepthDistribution, Views, from_candidate_space, to_candidate_space
 from ssplat_jax.numerics import safe_log, softplus_inverse
+from ssplat_jax.pytree import replace
 
+RECALL_MARGIN = 0.1
+"""Confidence of recalled tokens above `min_confidence`. Their history must be surer, so that a recalled depth is not
+recalled again before other views have confirmed it."""
 MIN_SIGMA = 1e-6
 """Smallest width of the anchor. A narrower one would select one candidate or none, and zero would divide by zero."""
 
@@ -90,6 +94,30 @@ def expected_log_depth(
     return from_candidate_space(jnp.einsum("...d,d->...", probs, candidates, precision="highest"), config)
 
 
+def recall_depth(
+    depth: AnchoredDepth, history: ProjectedCache, log_candidates: Float[Array, " d"], config: StreamConfig
+) -> AnchoredDepth:
+    """Depths, with those of the cache where the matcher is unsure and the cache is not (an addition to Sec. 3.5).
+
+    Without it, tokens of such cells are dropped, because their confidence is below `min_confidence`. With it they lie
+    on the cache's surface and have a confidence `RECALL_MARGIN` above that bound.
+
+    Limits:
+        Holes of the cache, cells of a history that is no surer than the new confidence or lies outside the candidates,
+        and cells that the matcher is sure of keep depth and confidence, bit for bit. A recalled depth has no gradient.
+    """
+    confidence = config.memory.min_confidence + RECALL_MARGIN
+    log_depths = safe_log(history.depths)
+    is_recalled = history.mask & (history.confidences > confidence)
+    is_recalled &= (log_depths >= log_candidates.min()) & (log_depths <= log_candidates.max())
+    is_recalled &= depth.matcher_confidences < config.memory.min_confidence
+    return replace(
+        depth,
+        log_depths=jnp.where(is_recalled, log_depths, depth.log_depths),
+        matcher_confidences=jnp.where(is_recalled, confidence, depth.matcher_confidences),
+    )
+
+
 def anchor_depth(
     params, distribution: DepthDistribution, history: ProjectedCache, views: Views, config: StreamConfig
 ) -> AnchoredDepth:
@@ -100,15 +128,16 @@ def anchor_depth(
         distribution: distribution P_i of the matcher, on the matching grid.
         history: the projected cache, on the matching grid.
         views: the chunk's views.
-        config: `history.hpda=False` leaves the matcher's distribution as it is.
+        config: `history.hpda=False` leaves the matcher's distribution as it is; `history.recall` adds `recall_depth`.
     """
     probs = distribution.probs
     if config.history.hpda:
         gamma = AnchorStrength(config).apply({"params": params})
         probs = inject_anchor(probs, cache_anchor(history, views.log_candidates, config), gamma)  # pyright: ignore[reportArgumentType]
-    return AnchoredDepth(
+    depth = AnchoredDepth(
         probs=probs,
         log_depths=expected_log_depth(probs, views.log_candidates, config),
         matcher_confidences=peak_confidence(distribution.probs, config),
         anchored_confidences=peak_confidence(probs, config),
     )
+    return recall_depth(depth, history, views.log_candidates, config) if config.history.recall else depth

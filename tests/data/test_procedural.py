@@ -9,12 +9,14 @@ from ssplat_jax.data.procedural import (
     SCENE_KINDS,
     clearance,
     procedural_capture_arrays,
+    raycast,
     raycast_depths,
     sample_path,
     sample_scene,
     training_sample,
 )
 from ssplat_jax.data.procedural.builder import Finish, SceneBuilder
+from ssplat_jax.data.procedural.scene import fade_scene
 from ssplat_jax.data.procedural.textures import texture_library
 from ssplat_jax.errors import InputError
 
@@ -132,7 +134,7 @@ def test_clearance_of_a_stretched_ball_is_a_lower_bound():
     assert (free > 0).all() and (free <= distances).all()
 
 
-@pytest.mark.parametrize("name", CAPTURES)
+@pytest.mark.parametrize("name", [name for name in CAPTURES if name != "revisit"])
 def test_captures_are_smooth_and_free(name):
     images, depths, poses, Ks = procedural_capture_arrays(name, 24, 24, 32)
     assert images.shape == (24, 24, 32, 3) and Ks.shape == (24, 3, 3)
@@ -142,6 +144,45 @@ def test_captures_are_smooth_and_free(name):
     steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=-1)
     assert steps.max() < 3 * steps.min()
     assert np.median(steps) < 0.4 * np.median(depths)  # with a third of the demo's frames
+
+
+def test_revisit_returns_to_places_that_it_saw_and_hardly_moves_there():
+    _, depths, poses, _ = procedural_capture_arrays("revisit", 48, 24, 32)
+    centers, gazes = poses[:, :3, 3], poses[:, :3, 2]
+    steps = np.linalg.norm(np.diff(centers, axis=0), axis=-1)
+    returns = np.arange(24, 47) % 6 != 5  # steps within one of the four places
+    assert steps[24:][returns[: len(steps[24:])]].max() < 0.02 * np.median(depths)
+    assert steps[:23].min() > 5 * np.median(steps[24:])
+    seen_before = (gazes[24:] @ gazes[:24].T).max(axis=1)
+    assert seen_before.min() > np.cos(np.radians(10)), "a later view looks where an earlier one looked"
+    assert np.median(depths[24:]) < np.median(depths[:24]), "and is nearer"
+    assert depths.min() > 0.3
+
+
+def test_faded_scene_has_weaker_textures():
+    scene = sample_scene(3, "room")
+    poses, Ks = sample_path(3, scene, "handheld", 4, 48, 64)
+
+    def detail(contrast):
+        images, _ = raycast(fade_scene(scene, contrast), np.linalg.inv(poses), Ks, 48, 64)
+        return np.median(np.abs(np.diff(np.asarray(images), axis=2)))
+
+    assert detail(0.2) < 0.4 * detail(1.0)
+
+
+def test_views_of_revisit_at_nearly_one_pose_differ_by_noise():
+    images = procedural_capture_arrays("revisit", 48, 24, 32)[0][30:32]
+    assert np.median(np.abs(images[1] - images[0])) > 0.005
+
+
+def test_fading_keeps_the_scene_or_takes_all_texture_away():
+    scene = sample_scene(3, "room")
+    np.testing.assert_array_equal(fade_scene(scene, 1.0).faces, scene.faces)
+    flat, half = fade_scene(scene, 0.0).faces, fade_scene(scene, 0.5).faces
+    assert (flat[..., 9:12] == 0).all()
+    np.testing.assert_allclose(half, (flat + scene.faces) / 2, atol=1e-6)
+    at_middle = scene.faces[..., 9:12] * 0.45 + scene.faces[..., 12:15]
+    np.testing.assert_allclose(flat[..., 12:15], at_middle, atol=1e-6)
 
 
 def test_unknown_kinds_are_refused():

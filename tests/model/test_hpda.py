@@ -6,8 +6,16 @@ import numpy as np
 import pytest
 
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.model.hpda import anchor_depth, cache_anchor, expected_log_depth, inject_anchor, peak_confidence
+from ssplat_jax.model.hpda import (
+    RECALL_MARGIN,
+    anchor_depth,
+    cache_anchor,
+    expected_log_depth,
+    inject_anchor,
+    peak_confidence,
+)
 from ssplat_jax.model.types import DepthDistribution, prepare_views
+from ssplat_jax.pytree import replace
 from tests.model.small import chunk, finite, history
 
 D = 24
@@ -186,3 +194,62 @@ def test_hpda_switched_off_keeps_the_distribution():
         {}, distribution, history(np.full(shape, 2.0), np.ones(shape)), views, config.replace(hpda=False)
     )
     np.testing.assert_array_equal(off.probs, distribution.probs)
+
+
+def recalling(recall: bool):
+    """Depth with a matcher and a history that are sure of some cells; every third cell of the history is a hole."""
+    views, distribution, config = views_and_distribution()
+    rng, shape = np.random.default_rng(7), views.inside.shape
+    distribution = replace(distribution, probs=jax.nn.softmax(2 * distribution.logits))
+    depths, confidences = np.exp(rng.uniform(-1, 3, shape)), rng.uniform(0.3, 0.95, shape)
+    depths[rng.uniform(size=shape) < 1 / 3] = 0
+    past = history(depths, np.where(depths > 0, confidences, 0))
+    config = config.replace(recall=recall, min_confidence=0.5)
+    return anchor_depth({"raw_gamma": jnp.float32(-2.0)}, distribution, past, views, config), past, config
+
+
+def test_recalled_cells_take_depth_and_confidence_from_the_history():
+    (plain, _, _), (recalled, past, config) = recalling(False), recalling(True)
+    tau, shape = config.memory.min_confidence, plain.log_depths.shape
+    wanted_depths, wanted_confidences = (np.array(x) for x in (plain.log_depths, plain.matcher_confidences))
+    low, high = np.exp(np.asarray(views_and_distribution()[0].log_candidates)[[0, -1]])
+    count = 0
+    for cell in np.ndindex(shape):
+        in_range = low <= float(past.depths[cell]) <= high
+        sure_of_it = float(past.confidences[cell]) > tau + RECALL_MARGIN and bool(past.mask[cell]) and in_range
+        if sure_of_it and wanted_confidences[cell] < tau:
+            wanted_depths[cell], wanted_confidences[cell] = np.log(past.depths[cell]), tau + RECALL_MARGIN
+            count += 1
+    assert 0.02 < count / np.prod(shape) < 0.5  # there is something to recall, and something to keep
+    np.testing.assert_allclose(recalled.log_depths, wanted_depths, rtol=1e-6)
+    np.testing.assert_allclose(recalled.matcher_confidences, wanted_confidences, rtol=1e-6)
+    kept = wanted_confidences == np.asarray(plain.matcher_confidences)
+    np.testing.assert_array_equal(np.asarray(recalled.log_depths)[kept], np.asarray(plain.log_depths)[kept])
+    np.testing.assert_array_equal(recalled.anchored_confidences, plain.anchored_confidences)
+
+
+def test_recalled_depth_is_not_recalled_again():
+    """The confidence that recalled tokens get is no history to recall from."""
+    views, distribution, config = views_and_distribution()
+    shape, config = views.inside.shape, config.replace(recall=True, min_confidence=0.5)
+    flat = replace(distribution, probs=jnp.full((*shape, D), 1 / D))
+    past = history(np.full(shape, 3.0), np.full(shape, np.float32(0.5 + RECALL_MARGIN)))
+    read = anchor_depth({"raw_gamma": jnp.float32(-2.0)}, flat, past, views, config)
+    assert (np.asarray(read.matcher_confidences) < 0.5).all()
+    assert (np.abs(np.asarray(read.log_depths) - np.log(3.0)) > 1e-3).any()
+
+
+def test_recalled_depth_has_no_gradient_and_others_keep_theirs():
+    views, distribution, config = views_and_distribution()
+    shape, config = views.inside.shape, config.replace(recall=True, min_confidence=0.5)
+    known = np.arange(np.prod(shape)).reshape(shape) % 2 == 0
+    past = history(np.where(known, 3.0, 0.0), np.where(known, 0.9, 0.0))
+
+    def total(logits):
+        given = replace(distribution, probs=jax.nn.softmax(logits))
+        return anchor_depth({"raw_gamma": jnp.float32(-2.0)}, given, past, views, config).log_depths.sum()
+
+    logits = jnp.zeros((*shape, D)).at[..., 3].set(0.5)
+    slopes = np.abs(np.asarray(jax.grad(total)(logits))).max(axis=-1)
+    assert np.isfinite(slopes).all()
+    assert (slopes[known] == 0).all() and (slopes[~known] > 0).all()

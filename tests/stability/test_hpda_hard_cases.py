@@ -25,8 +25,10 @@ MEAN = CONFIG.replace(depth_readout="mean", confidence="peak")
 WINDOW = CONFIG.replace(depth_readout="window", confidence="window")
 READOUTS = {"mean": MEAN, "window": WINDOW}
 NARROW = 1e-2  # a sigma far below the distance of candidates, 0.16
+OPTIONS = ("sigma0", "anchor_space", "anchor_norm", "recall", "min_confidence")
 CANDIDATES = jnp.linspace(jnp.log(1.0), jnp.log(6.0), D)
 
+RECALL = {"recall": True, "min_confidence": 0.5, "logits": jnp.zeros((*SHAPE, D))}
 ANCHORS = {}  # name -> (changes to the ordinary inputs, check of the result)
 
 
@@ -107,6 +109,11 @@ anchor_case(
 )
 anchor_case("sigma in scene units", anchor_space="metric", sigma0=1e-30, confidences=1.0, at=5, raw_gamma=1e6)
 anchor_case("anchor of mass 0", equals_matcher, anchor_norm="mass", sigma0=NARROW, depths=1e30, raw_gamma=1e6)
+anchor_case("recalled: all cells", has_depth_of(7, 1e-5), confidences=0.95, at=7, **RECALL)
+anchor_case(
+    "not recalled: history of 1e30", equals_matcher, confidences=0.95, depths=1e30, raw_gamma=ZERO_GAMMA, **RECALL
+)
+anchor_case("nothing to recall", equals_matcher, confidences=0.0, depths=0.0, raw_gamma=1e6, **RECALL)
 
 
 @functools.cache
@@ -132,7 +139,7 @@ def anchor_inputs(changes: dict, config) -> dict:
         "confidences": rng.uniform(0.1, 1, SHAPE),
         "log_candidates": CANDIDATES,
     } | changes
-    options = {name: given.pop(name) for name in ("sigma0", "anchor_space", "anchor_norm") if name in given}
+    options = {name: given.pop(name) for name in OPTIONS if name in given}
     if "at" in given:  # halfway between candidates too
         given["depths"] = np.exp(np.interp(given.pop("at"), np.arange(D), given["log_candidates"]))
     for name in ("depths", "confidences"):

@@ -1,11 +1,14 @@
 """Rendered procedural views: random samples for training and smooth captures for the demo."""
 
+import dataclasses
+from collections.abc import Callable
+
 import numpy as np
 from jaxtyping import Float
 
 from ssplat_jax.data.procedural.paths import look_at, sample_path
 from ssplat_jax.data.procedural.raycast import raycast, raycast_depths
-from ssplat_jax.data.procedural.scene import NUM_SOLIDS, Scene, clearance, scale_scene
+from ssplat_jax.data.procedural.scene import NUM_SOLIDS, Scene, clearance, fade_scene, scale_scene
 from ssplat_jax.data.procedural.scenes import SCENE_KINDS, SCENE_SHARES, sample_scene
 from ssplat_jax.errors import InputError
 
@@ -116,11 +119,15 @@ def _through_sensor(rng: np.random.Generator, scene: Scene, images: np.ndarray) 
 
 
 def procedural_capture_arrays(name: str, num_frames: int, height: int, width: int, seed: int = 0) -> Views:
-    """Returns the views of the capture `procedural:NAME`, a smooth path that covers its world evenly, in meters.
+    """Returns the views of the capture `procedural:NAME` in meters.
+
+    `room`, `orbit` and `corridor` are smooth paths that cover their world evenly. `revisit` has weak textures, noise
+    and a path that returns: half of its views go around a room, then the camera stands at four places, closer to what
+    it saw before, and hardly moves.
 
     Args:
         name: one of `CAPTURES`.
-        num_frames: number of views, evenly spread over the path.
+        num_frames: number of views along the path.
         height: image rows.
         width: image columns.
         seed: selects another world of the same kind.
@@ -135,18 +142,22 @@ def procedural_capture_arrays(name: str, num_frames: int, height: int, width: in
         raise InputError(f"procedural:{name}: no such capture; there is {', '.join(CAPTURES)}.")
     if num_frames < 1:
         raise InputError(f"procedural:{name}: num_frames must be at least 1, got {num_frames}.")
-    kind, route, first_seed = _ROUTES[name]
-    rng = np.random.default_rng([4, first_seed + seed])
+    route = _ROUTES[name]
+    rng = np.random.default_rng([4, route.first_seed + seed])
     while True:
-        scene = sample_scene(int(rng.integers(2**31)), kind)
-        poses = np.stack([route(scene, s) for s in (np.arange(num_frames) + 0.5) / num_frames]).astype(np.float32)
+        scene = fade_scene(sample_scene(int(rng.integers(2**31)), route.kind), route.contrast)
+        places = (np.arange(num_frames) + 0.5) / num_frames
+        poses = np.stack([route.pose(scene, place) for place in places]).astype(np.float32)
         if clearance(scene, poses[:, :3, 3]).min() > MIN_DEPTH:
             break
     focal = 0.8 * max(height, width)
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], np.float32)
     Ks = np.tile(K, (num_frames, 1, 1))
     images, depths = _cast(scene, poses, Ks, height, width)
-    return np.clip(images * np.float32(np.clip(images.mean(), 0.38, 0.55) / images.mean()), 0, 1), depths, poses, Ks
+    images = images * np.float32(np.clip(images.mean(), 0.38, 0.55) / images.mean())
+    if route.noise:
+        images = images + np.float32(route.noise) * rng.standard_normal(images.shape, np.float32)
+    return np.clip(images, 0, 1), depths, poses, Ks
 
 
 def _around_room(scene: Scene, s: float) -> np.ndarray:
@@ -171,9 +182,39 @@ def _along_corridor(scene: Scene, s: float) -> np.ndarray:
     return look_at(position, position + np.array([0.45 * np.sin(11 * s), 0.12, 1.0]))
 
 
-_ROUTES = {  # kind of world, path through it, and the seed of a representative world, which is added to the user's
-    "room": ("room", _around_room, 13),
-    "orbit": ("objects", _around_object, 3),
-    "corridor": ("corridor", _along_corridor, 8),
+_FIRST_LOOK = 0.5  # share of the views of `revisit` that go around the room
+_STEP_AHEAD = 0.6  # meters by which its later places are nearer
+_SWAY = 0.015  # meters to either side that the camera moves there
+
+
+def _back_in_room(scene: Scene, s: float) -> np.ndarray:
+    """Pose at `s` in [0, 1]: around the room, then at four places of that circle, nearer to the wall across."""
+    if s < _FIRST_LOOK:
+        return _around_room(scene, s / _FIRST_LOOK)
+    place, time = divmod(4 * (s - _FIRST_LOOK) / (1 - _FIRST_LOOK), 1)
+    pose = _around_room(scene, (place + 0.5) / 4)
+    pose[:3, 3] += _STEP_AHEAD * pose[:3, 2] + _SWAY * (np.sin(2 * np.pi * time) * pose[:3, 0])
+    return pose
+
+
+@dataclasses.dataclass(frozen=True)
+class _Route:
+    """A capture: the kind of world, the path through it, and how well its surfaces can be matched."""
+
+    kind: str
+    pose: Callable[[Scene, float], np.ndarray]
+    first_seed: int
+    """Seed of a representative world, which is added to the user's."""
+    contrast: float = 1.0
+    """Contrast of the textures, as a fraction."""
+    noise: float = 0.0
+    """Standard deviation of a pixel's noise."""
+
+
+_ROUTES = {
+    "room": _Route("room", _around_room, 13),
+    "orbit": _Route("objects", _around_object, 3),
+    "corridor": _Route("corridor", _along_corridor, 8),
+    "revisit": _Route("room", _back_in_room, 13, contrast=0.2, noise=0.01),
 }
 CAPTURES = tuple(_ROUTES)

@@ -14,6 +14,7 @@ from ssplat_jax.pytree import pytree, replace
 NUM_BOXES, NUM_BALLS, NUM_CYLINDERS = 32, 6, 10  # rows of each shape
 NUM_SOLIDS = NUM_BOXES + NUM_BALLS + NUM_CYLINDERS
 AWAY = 1e5  # position of unused solids, in scene units
+_MIDDLE_ALBEDO = 0.45  # of a texture without gain and bias
 
 AnyArray = np.ndarray | Array
 
@@ -60,6 +61,20 @@ def scale_scene(scene: Scene, factor: float) -> Scene:
         orbit_radius=np.asarray(scene.orbit_radius * f),
         eye=scene.eye * f,
     )
+
+
+def fade_scene(scene: Scene, contrast: float) -> Scene:
+    """Returns the scene with textures of less contrast: albedos move towards the middle gray of their face.
+
+    Args:
+        scene: the scene.
+        contrast: factor on the deviations from that gray; 1 keeps the scene, 0 leaves surfaces without texture.
+    """
+    faces = np.array(scene.faces)
+    gains, biases = faces[..., 9:12], faces[..., 12:15]
+    biases += (1 - contrast) * _MIDDLE_ALBEDO * gains
+    gains *= contrast
+    return replace(scene, faces=faces)
 
 
 def clearance(scene: Scene, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
