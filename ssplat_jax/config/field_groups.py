@@ -77,8 +77,8 @@ class HistoryConfig(ConfigGroup):
     gamma_init: float = 0.1
     """Initial value of the learnable gamma_d = softplus(raw)."""
     recall: bool = False
-    """Cells that the matcher is unsure of become tokens at the cache's depth, where the cache is sure (ours). It closes
-    weakly textured surfaces that the camera returns to."""
+    """Cells that the matcher is unsure of become tokens at the cache's depth, where the cache is sure and the matcher
+    does not contradict it (ours). It thickens weakly textured surfaces that the camera returns to."""
     cgfi: bool = False
     """Injects cached features where the current views are uncertain. Off in `tiny`, which gains nothing by it."""
     cgfi_form: Literal["concat", "residual"] = "residual"

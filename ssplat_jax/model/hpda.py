@@ -13,6 +13,10 @@ from ssplat_jax.pytree import replace
 RECALL_MARGIN = 0.1
 """Confidence of recalled tokens above `min_confidence`. Their history must be surer, so that a recalled depth is not
 recalled again before other views have confirmed it."""
+RECALL_WINDOW = 2
+"""Candidates on each side of the cache's depth that count as support for it."""
+RECALL_SUPPORT = 0.2
+"""Least probability that the matcher gives to the candidates around a recalled depth."""
 MIN_SIGMA = 1e-6
 """Smallest width of the anchor. A narrower one would select one candidate or none, and zero would divide by zero."""
 
@@ -95,21 +99,36 @@ def expected_log_depth(
 
 
 def recall_depth(
-    depth: AnchoredDepth, history: ProjectedCache, log_candidates: Float[Array, " d"], config: StreamConfig
+    depth: AnchoredDepth,
+    probs: Float[Array, "v hm wm d"],
+    history: ProjectedCache,
+    log_candidates: Float[Array, " d"],
+    config: StreamConfig,
 ) -> AnchoredDepth:
     """Depths, with those of the cache where the matcher is unsure and the cache is not (an addition to Sec. 3.5).
 
     Without it, tokens of such cells are dropped, because their confidence is below `min_confidence`. With it they lie
-    on the cache's surface and have a confidence `RECALL_MARGIN` above that bound.
+    on the cache's surface and have a confidence `RECALL_MARGIN` above that bound, if the matcher gives that depth
+    `RECALL_SUPPORT` at least.
+
+    Args:
+        depth: depths and confidences read from the anchored distribution.
+        probs: the matcher's distribution P_i.
+        history: the projected cache, on the matching grid.
+        log_candidates: log depths of the candidates.
+        config: model configuration.
 
     Limits:
-        Holes of the cache, cells of a history that is no surer than the new confidence or lies outside the candidates,
-        and cells that the matcher is sure of keep depth and confidence, bit for bit. A recalled depth has no gradient.
+        Holes of the cache, cells of a history that is no surer than the new confidence or has too little support, and
+        cells that the matcher is sure of keep depth and confidence, bit for bit. A recalled depth has no gradient.
     """
     confidence = config.memory.min_confidence + RECALL_MARGIN
     log_depths = safe_log(history.depths)
     is_recalled = history.mask & (history.confidences > confidence)
+    nearest = jnp.argmin(jnp.abs(log_candidates - log_depths[..., None]), axis=-1)
+    is_near = jnp.abs(jnp.arange(probs.shape[-1]) - nearest[..., None]) <= RECALL_WINDOW
     is_recalled &= (log_depths >= log_candidates.min()) & (log_depths <= log_candidates.max())
+    is_recalled &= jnp.where(is_near, probs, 0.0).sum(axis=-1) >= RECALL_SUPPORT
     is_recalled &= depth.matcher_confidences < config.memory.min_confidence
     return replace(
         depth,
@@ -140,4 +159,8 @@ def anchor_depth(
         matcher_confidences=peak_confidence(distribution.probs, config),
         anchored_confidences=peak_confidence(probs, config),
     )
-    return recall_depth(depth, history, views.log_candidates, config) if config.history.recall else depth
+    return (
+        recall_depth(depth, distribution.probs, history, views.log_candidates, config)
+        if config.history.recall
+        else depth
+    )

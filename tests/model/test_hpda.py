@@ -8,6 +8,8 @@ import pytest
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.model.hpda import (
     RECALL_MARGIN,
+    RECALL_SUPPORT,
+    RECALL_WINDOW,
     anchor_depth,
     cache_anchor,
     expected_log_depth,
@@ -205,22 +207,29 @@ def recalling(recall: bool):
     depths[rng.uniform(size=shape) < 1 / 3] = 0
     past = history(depths, np.where(depths > 0, confidences, 0))
     config = config.replace(recall=recall, min_confidence=0.5)
-    return anchor_depth({"raw_gamma": jnp.float32(-2.0)}, distribution, past, views, config), past, config
+    read = anchor_depth({"raw_gamma": jnp.float32(-2.0)}, distribution, past, views, config)
+    return read, distribution.probs, past, config
 
 
 def test_recalled_cells_take_depth_and_confidence_from_the_history():
-    (plain, _, _), (recalled, past, config) = recalling(False), recalling(True)
+    (plain, matched, _, _), (recalled, _, past, config) = recalling(False), recalling(True)
     tau, shape = config.memory.min_confidence, plain.log_depths.shape
     wanted_depths, wanted_confidences = (np.array(x) for x in (plain.log_depths, plain.matcher_confidences))
-    low, high = np.exp(np.asarray(views_and_distribution()[0].log_candidates)[[0, -1]])
-    count = 0
+    candidates, probs = np.asarray(views_and_distribution()[0].log_candidates, float), np.asarray(matched, float)
+    low, high = np.exp(candidates[[0, -1]])
+    count, contradicted = 0, 0
     for cell in np.ndindex(shape):
         in_range = low <= float(past.depths[cell]) <= high
         sure_of_it = float(past.confidences[cell]) > tau + RECALL_MARGIN and bool(past.mask[cell]) and in_range
-        if sure_of_it and wanted_confidences[cell] < tau:
+        if not (sure_of_it and wanted_confidences[cell] < tau):
+            continue
+        nearest = int(np.argmin(np.abs(candidates - np.log(float(past.depths[cell])))))
+        support = probs[cell][max(nearest - RECALL_WINDOW, 0) : nearest + RECALL_WINDOW + 1].sum()
+        contradicted += support < RECALL_SUPPORT
+        if support >= RECALL_SUPPORT:
             wanted_depths[cell], wanted_confidences[cell] = np.log(past.depths[cell]), tau + RECALL_MARGIN
             count += 1
-    assert 0.02 < count / np.prod(shape) < 0.5  # there is something to recall, and something to keep
+    assert count >= 3 and contradicted >= 3  # there is something to recall, and something to keep
     np.testing.assert_allclose(recalled.log_depths, wanted_depths, rtol=1e-6)
     np.testing.assert_allclose(recalled.matcher_confidences, wanted_confidences, rtol=1e-6)
     kept = wanted_confidences == np.asarray(plain.matcher_confidences)
