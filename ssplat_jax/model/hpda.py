@@ -105,7 +105,7 @@ def recall_depth(
     log_candidates: Float[Array, " d"],
     config: StreamConfig,
 ) -> AnchoredDepth:
-    """Depths, with those of the cache where the matcher is unsure and the cache is not (an addition to Sec. 3.5).
+    """`depth`, with the cache's depth where the matcher is unsure and the cache is sure (an addition to Sec. 3.5).
 
     Without it, tokens of such cells are dropped, because their confidence is below `min_confidence`. With it they lie
     on the cache's surface and have a confidence `RECALL_MARGIN` above that bound, if the matcher gives that depth
@@ -119,8 +119,9 @@ def recall_depth(
         config: model configuration.
 
     Limits:
-        Holes of the cache, cells of a history that is no surer than the new confidence or has too little support, and
-        cells that the matcher is sure of keep depth and confidence, bit for bit. A recalled depth has no gradient.
+        Holes of the cache, cells of a history that is no surer than the new confidence, lies outside the candidates or
+        has too little support, and cells that the matcher is sure of keep depth and confidence, bit for bit. A recalled
+        depth has no gradient.
     """
     confidence = config.memory.min_confidence + RECALL_MARGIN
     log_depths = safe_log(history.depths)
@@ -159,8 +160,6 @@ def anchor_depth(
         matcher_confidences=peak_confidence(distribution.probs, config),
         anchored_confidences=peak_confidence(probs, config),
     )
-    return (
-        recall_depth(depth, distribution.probs, history, views.log_candidates, config)
-        if config.history.recall
-        else depth
-    )
+    if config.history.recall:
+        return recall_depth(depth, distribution.probs, history, views.log_candidates, config)
+    return depth
