@@ -1,11 +1,11 @@
-"""Ablation of the paper's modules (its Table 3): each is switched off, trained for the same short budget and scored.
+"""Ablation of the model's parts (the paper's Table 3, and the evidence head), each variant trained anew.
 
     ssplat experiment ablation --captures path/to/captures --out runs/ablation
 
-Every variant starts from the shipped weights, with an untrained CGFI and mixer, and trains all stages after the matcher
-for the same steps on the same samples, once per seed; then its decoded cache is scored on unseen views of
-`procedural:room` (and of redkitchen, where `--captures` has it). The variants with and without the memory are scored
-after more views too. `additions off` has the literal value of every field that the shipped weights can do without.
+Every variant starts from the shipped matcher, with all other stages untrained. The stages after the matcher are
+trained by rendering, then the evidence head on whole streams, for the same steps on the same samples, once per seed.
+The decoded cache is scored on unseen views of `procedural:room`, of `procedural:revisit` (weak textures and revisits)
+and of the captures of the experiment `captures` that `--captures` has.
 """
 
 import dataclasses
@@ -17,39 +17,59 @@ from typing import Any
 
 import jax
 
-from ssplat_experiments.additions import additions
+from ssplat_experiments.captures import SETTINGS
 from ssplat_experiments.cases import PICTURE, Case, Row
-from ssplat_experiments.memory_curve import START_CAPACITY
-from ssplat_experiments.scenes import REDKITCHEN, open_redkitchen, open_room
+from ssplat_experiments.scenes import open_room
 from ssplat_experiments.study import PUBLIC_SCENES, Study, at_scale, run_study, side_by_side
 from ssplat_jax.checkpoint.weights import load_params
 from ssplat_jax.config import StreamConfig, preset
 from ssplat_jax.console import Reporter
 from ssplat_jax.data.capture import Capture
-from ssplat_jax.data.split import Split
+from ssplat_jax.data.open_capture import open_capture
+from ssplat_jax.data.split import Split, interleaved_split
 from ssplat_jax.evaluation.peak_memory import peak_memory
 from ssplat_jax.evaluation.scoring import score_targets, score_view
 from ssplat_jax.model import complete_params
 from ssplat_jax.streaming.feed import feed_capture
 from ssplat_jax.streaming.session import Session
 from ssplat_jax.streaming.streamsplat import StreamSplat
+from ssplat_jax.train.evidence_training import EvidenceRecipe, train_evidence
 from ssplat_jax.train.loop import train
-from ssplat_jax.train.recipe import Phase, PhaseForm, Recipe
+from ssplat_jax.train.recipe import MATCHER_STAGES, Phase, PhaseForm, Recipe
+
+LEARNED = ("hololens", "plush")
+"""Names of real captures that the evidence head learns from, where they are there: those of the shipped weights."""
+
+COLUMNS = ("shown", "literal")
+"""The two ways to score a view."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Variant:
+    """A model that lacks a part, or keeps it untrained."""
+
+    changes: dict[str, Any] = dataclasses.field(default_factory=dict)
+    """Changes of the full configuration."""
+    untrained: tuple[str, ...] = ()
+    """Stages after the matcher that stay at their start."""
+
 
 FULL = "full"
+"""The variant with all stages."""
+
 ALL_PARTS: dict[str, Any] = {"cgfi": True, "mixer_blocks": 2}
-"""The stages that `tiny` leaves out; they start untrained."""
-VARIANTS: dict[str, dict[str, Any]] = {
-    FULL: {},
-    "baseline": {"vacc": "append", "hpda": False, "cgfi": False},
-    "without VACC": {"vacc": "append"},
-    "without HPDA": {"hpda": False},
-    "without CGFI": {"cgfi": False},
-    "without mixer": {"mixer_blocks": 0},
+"""The stages that `tiny` leaves out."""
+VARIANTS = {
+    FULL: Variant(),
+    "without HPDA": Variant({"hpda": False}),
+    "without CGFI": Variant({"cgfi": False}),
+    "with recall": Variant({"recall": True}),
+    "append": Variant({"vacc": "append"}),
+    "baseline": Variant({"vacc": "append", "hpda": False, "cgfi": False}),
+    "without mixer": Variant({"mixer_blocks": 0}),
+    "untrained tokens": Variant(untrained=("tokens",)),
+    "constant head": Variant({"evidence": False}, untrained=("decoder",)),
 }
-ADDITIONS_OFF = "additions off"
-LONG = (FULL, "without VACC")
-"""Variants that are scored at every number of views; the others at the first."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,30 +77,66 @@ class Budget:
     """Training of a variant, and what it is scored on."""
 
     steps: int
+    """Steps that render the tokens of a few chunks."""
     num_chunks: int
     size: tuple[int, int]
-    """Training images, height and width."""
+    """Training images of these steps, height and width."""
     max_pairs: int
-    """Tile intersections while training."""
+    """Tile intersections of these steps."""
+    evidence: EvidenceRecipe
+    """Training of the evidence head; its seed is that of the variant."""
     seeds: tuple[int, ...]
-    views: tuple[int, ...]
-    """Numbers of streamed views."""
+    views: int
+    """Number of streamed views of procedural scenes."""
     scored: tuple[int, int]
-    """Scored images, width and height."""
+    """Scored images of procedural scenes, width and height; those of captures are as in `captures`."""
     variants: int | None = None
     """Number of variants that are measured; None: all."""
 
-    def recipe(self, seed: int) -> Recipe:
-        """The stream phase of the tiny recipe, shorter."""
-        form = PhaseForm(frozen=("encoder", "cost_volume"))
+    def recipe(self, seed: int, untrained: tuple[str, ...]) -> Recipe:
+        """The stream phase of the recipe `stream`, shorter."""
+        form = PhaseForm(frozen=(*MATCHER_STAGES, *untrained))
         phase = Phase("stream", self.steps, self.num_chunks, 2, (self.size,), learning_rate=3e-4, form=form)
         return Recipe(phases=(phase,), seed=seed, warmup_steps=min(10, self.steps), max_pairs=self.max_pairs)
 
 
+SCENES = ("procedural:room?frames=80&seed=3", "procedural:revisit?frames=73&seed=3")
+"""Procedural scenes that the evidence head learns from; none of them is scored."""
+
 BUDGETS = {
-    "smoke": Budget(1, 1, (32, 48), 1 << 14, (0,), (8,), (64, 48), variants=1),
-    "cpu": Budget(20, 2, (64, 96), 1 << 18, (0, 1, 2), (32, 64), (160, 120)),
-    "gpu": Budget(1000, 4, (256, 256), 1 << 21, (0, 1, 2), (256, 512), (320, 240)),
+    "smoke": Budget(
+        steps=1,
+        num_chunks=1,
+        size=(32, 48),
+        max_pairs=1 << 14,
+        evidence=EvidenceRecipe(
+            steps=1, views_per_step=1, crop=(32, 32), width=64, procedural=("procedural:room?frames=9",)
+        ),
+        seeds=(0,),
+        views=8,
+        scored=(64, 48),
+        variants=1,
+    ),
+    "cpu": Budget(
+        steps=20,
+        num_chunks=2,
+        size=(64, 96),
+        max_pairs=1 << 18,
+        evidence=EvidenceRecipe(steps=80, strides=(4,), procedural=SCENES),
+        seeds=(0, 1, 2),
+        views=64,
+        scored=(320, 240),
+    ),
+    "gpu": Budget(
+        steps=1000,
+        num_chunks=4,
+        size=(256, 256),
+        max_pairs=1 << 21,
+        evidence=EvidenceRecipe(procedural=SCENES),
+        seeds=(0, 1, 2),
+        views=64,
+        scored=(320, 240),
+    ),
 }
 
 
@@ -91,55 +147,85 @@ def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str
 
 def config_of(variant: str) -> StreamConfig:
     """Configuration of a variant."""
-    changes = VARIANTS.get(variant)
-    if changes is None:
-        changes = {addition.field: addition.literal for addition in additions()}
-    return preset("tiny").replace(**ALL_PARTS).replace(**changes, capacity=START_CAPACITY)
+    return preset("tiny").replace(**ALL_PARTS).replace(**VARIANTS[variant].changes)
 
 
 def cases(captures: Path | None, scale: str) -> list[Case]:
     """A case for each variant and seed, the seeds outermost: a study that is stopped early has the same for all."""
     budget = at_scale(BUDGETS, scale)
-    has_kitchen = captures is not None and (captures / REDKITCHEN).is_dir()
-    scenes = ("room", REDKITCHEN) if has_kitchen else ("room",)
+    scenes = scenes_of(captures)[: 1 if scale == "smoke" else None]
     asked = {name: value for name, value in dataclasses.asdict(budget).items() if name not in ("seeds", "variants")}
     return [
         Case(
             name=f"{variant}, seed {seed}",
             config=config_of(variant),
-            asked={"seed": seed, "scenes": scenes, **asked},
+            asked={"seed": seed, "scenes": scenes, "learned": learned_from(captures), "variant": variant, **asked},
             measure=functools.partial(measured, variant, seed, budget, scenes, captures),
         )
         for seed in budget.seeds
-        for variant in (*VARIANTS, ADDITIONS_OFF)[: budget.variants]
+        for variant in list(VARIANTS)[: budget.variants]
     ]
 
 
-def measured(variant: str, seed: int, budget: Budget, scenes: tuple[str, ...], captures: Path | None) -> list[Row]:
+def learned_from(captures: Path | None) -> list[str]:
+    """Names of the captures that the evidence head learns from."""
+    return [name for name in LEARNED if captures is not None and (captures / name).is_dir()]
+
+
+def scenes_of(captures: Path | None) -> list[str]:
+    """Names of the scored scenes."""
+    there = [row for row in SETTINGS if captures is not None and (captures / row[0]).is_dir()]
+    return ["room", "revisit", *(f"{name}, stride {stride}" for name, stride, *_ in there)]
+
+
+def measured(variant: str, seed: int, budget: Budget, scenes: list[str], captures: Path | None) -> list[Row]:
     """Trains a variant and scores it on every scene."""
     config = config_of(variant)
-    with tempfile.TemporaryDirectory() as folder:
-        start = complete_params(jax.random.key(seed), config, load_params("tiny"))
-        trained = train(config, budget.recipe(seed), Path(folder), params=start)
-    if trained.interrupted:
-        raise KeyboardInterrupt
-    session, rows = Session(StreamSplat(config), trained.state.ema), []
+    model, params = StreamSplat(config), trained(variant, config, seed, budget, captures)
+    session, rows = Session(model, params), []
     for scene in scenes:
-        for views in budget.views if variant in LONG else budget.views[:1]:
-            session.cache = None
-            capture, split = _open(scene, views, budget.scored, captures)
-            rows.append({"scene": scene, "variant": variant, "views": views, "seed": seed})
-            rows[-1] |= scored(session, capture, split)
-            if seed != budget.seeds[0]:
-                rows[-1].pop(PICTURE)  # one seed is enough to look at
+        session.cache = None
+        rows.append({"scene": scene, "variant": variant, "seed": seed})
+        rows[-1] |= scored(session, *open_scene(scene, seed, budget, captures))
+        if seed != budget.seeds[0]:
+            rows[-1].pop(PICTURE)  # one seed is enough to look at
     return rows
 
 
-@functools.lru_cache(maxsize=4)
-def _open(scene: str, views: int, size: tuple[int, int], captures: Path | None) -> tuple[Capture, Split]:
-    if scene == "room" or captures is None:
-        return open_room(views, size)
-    return open_redkitchen(captures, views, size)
+def trained(variant: str, config: StreamConfig, seed: int, budget: Budget, captures: Path | None) -> dict:
+    """Parameters of a variant after the training that all variants share.
+
+    Raises:
+        KeyboardInterrupt: a signal stopped it.
+    """
+    shipped = load_params("tiny")
+    start = complete_params(
+        jax.random.key(seed), config, {stage: shipped[stage] for stage in MATCHER_STAGES if stage in shipped}
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        done = train(config, budget.recipe(seed, VARIANTS[variant].untrained), Path(folder), params=start)
+    if done.interrupted:
+        raise KeyboardInterrupt
+    params = done.state.ema
+    if config.head.evidence:
+        learned = [] if captures is None else [captures / name for name in learned_from(captures)]
+        recipe = dataclasses.replace(budget.evidence, seed=seed)
+        params, _ = train_evidence(StreamSplat(config), params, learned, recipe)
+    return params
+
+
+@functools.lru_cache(maxsize=8)
+def open_scene(scene: str, seed: int, budget: Budget, captures: Path | None) -> tuple[Capture, Split]:
+    """A scene and its split. `procedural:revisit` has the seed of the training: each seed scores another one."""
+    if scene == "room":
+        return open_room(budget.views, budget.scored)
+    if scene == "revisit":
+        capture = open_capture(f"procedural:revisit?frames=73&seed={seed}", size=budget.scored)
+        return capture, interleaved_split(len(capture), 1, budget.views)
+    assert captures is not None
+    name, stride, views, size = next(row for row in SETTINGS if scene == f"{row[0]}, stride {row[1]}")
+    capture = open_capture(captures / name, size=size)
+    return capture, interleaved_split(len(capture), stride, views)
 
 
 def scored(session: Session, capture: Capture, split: Split) -> Row:
@@ -148,7 +234,7 @@ def scored(session: Session, capture: Capture, split: Split) -> Row:
     exposures, _ = feed_capture(session, capture, split.context, frame)
     gaussians, middle = session.gaussians(), split.targets[len(split.targets) // 2]
     scores = score_targets(gaussians, capture, split.targets, frame, exposures)
-    values = {f"{c}_{m}": scores[c][m] for c in ("shown", "literal") for m in ("psnr", "ssim", "lpips")}
+    values = {f"{c}_{m}": scores[c][m] for c in COLUMNS for m in ("psnr", "ssim")}
     return {
         **values,
         "peak_memory_bytes": peak_memory(session, capture.camera(middle, frame)).bytes,
@@ -158,31 +244,30 @@ def scored(session: Session, capture: Capture, split: Split) -> Row:
 
 
 def add_differences(rows: list[Row]) -> None:
-    """`full minus it`: what the full model with the same seed, scene and views has more, in dB as shown.
+    """Adds the PSNR that the full model with the same seed and scene has more, in dB, as shown and literal.
 
     A seed moves all variants alike, so differences vary less than scores.
     """
-    keys = ("scene", "views", "seed")
-    whole = {tuple(row[key] for key in keys): row["shown_psnr"] for row in rows if row["variant"] == FULL}
+    full = {(row["scene"], row["seed"]): row for row in rows if row["variant"] == FULL}
     for row in rows:
-        full = whole.get(tuple(row[key] for key in keys))
-        if row["variant"] != FULL and full is not None:
-            row["full_minus_it_db"] = round(full - row["shown_psnr"], 3)
+        if row["variant"] != FULL and (whole := full.get((row["scene"], row["seed"]))):
+            for column in COLUMNS:
+                row[f"full_minus_it_{column}_db"] = round(whole[f"{column}_psnr"] - row[f"{column}_psnr"], 3)
 
 
 def findings(rows: list[Row]) -> list[str]:
-    """Mean and standard deviation over seeds, by scene, variant and views."""
-    lines = [
-        "| scene | variant | views | shown PSNR dB | full, same seed, minus it | literal PSNR dB | Gaussians |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    for scene, variant, views in dict.fromkeys((row["scene"], row["variant"], row["views"]) for row in rows):
-        here = [row for row in rows if (row["scene"], row["variant"], row["views"]) == (scene, variant, views)]
-        shown, literal = (spread([row[f"{column}_psnr"] for row in here]) for column in ("shown", "literal"))
-        differences = [row["full_minus_it_db"] for row in here if "full_minus_it_db" in row]
-        gaussians = round(statistics.mean(row["gaussians"] for row in here))
-        difference = spread(differences) if differences else ""
-        lines.append(f"| {scene} | {variant} | {views} | {shown} | {difference} | {literal} | {gaussians} |")
+    """Mean and standard deviation over seeds, by scene and variant."""
+    difference = "full, same seed, minus it"
+    heads = ["scene", "variant", "shown PSNR dB", difference, "literal PSNR dB", difference, "Gaussians"]
+    lines = ["| " + " | ".join(heads) + " |", "|---" * len(heads) + "|"]
+    for scene, variant in dict.fromkeys((row["scene"], row["variant"]) for row in rows):
+        here = [row for row in rows if (row["scene"], row["variant"]) == (scene, variant)]
+        cells = [scene, variant]
+        for column in COLUMNS:
+            differences = [row[f"full_minus_it_{column}_db"] for row in here if f"full_minus_it_{column}_db" in row]
+            cells += [spread([row[f"{column}_psnr"] for row in here]), spread(differences) if differences else ""]
+        cells.append(str(round(statistics.mean(row["gaussians"] for row in here))))
+        lines.append("| " + " | ".join(cells) + " |")
     return ["\n".join(lines)]
 
 
@@ -196,17 +281,16 @@ def gallery(rows: list[Row]) -> str:
     """The variants side by side, a table for each procedural scene."""
     scenes = dict.fromkeys(row["scene"] for row in rows if row["scene"] in PUBLIC_SCENES)
     tables = [
-        side_by_side([row for row in rows if row["scene"] == scene], lambda row: f"{row['variant']}, {row['views']}")
-        for scene in scenes
+        side_by_side([row for row in rows if row["scene"] == scene], lambda row: row["variant"]) for scene in scenes
     ]
     return "\n\n".join(tables)
 
 
 STUDY = Study(
     name="ablation",
-    text="""Every variant starts from the shipped weights, with an untrained CGFI and mixer, and trains all stages after
-the matcher for the same steps on the same samples, once per seed; scores are of unseen views. `additions off` has the
-literal value of every field that the shipped weights can do without. LPIPS needs weights that are not shipped.""",
+    text="""Every variant starts from the shipped matcher, with all other stages untrained. The stages after it are
+trained by rendering, then the evidence head on whole streams, for the same steps on the same samples, once per seed.
+Scores are of unseen views; each seed has a `revisit` of its own.""",
     cases=cases,
     finish=add_differences,
     findings=findings,
