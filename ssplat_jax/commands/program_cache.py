@@ -13,6 +13,8 @@ import time
 from collections.abc import MutableMapping
 from pathlib import Path
 
+from ssplat_jax.cores import num_cores
+
 SWITCH = "SSPLAT_PROGRAM_CACHE"
 """Environment variable: `off`, or a folder in place of the user's cache folder."""
 
@@ -67,12 +69,7 @@ def _users_cache() -> Path:
 
 def _machine() -> str:
     """Letters for this kind of CPU and number of cores: compiled programs hold instructions and shares for them."""
-    described = f"{platform.machine()} {platform.processor()} {_num_cores()}"
+    described = f"{platform.machine()} {platform.processor()} {num_cores()}"
     with contextlib.suppress(OSError, StopIteration), open("/proc/cpuinfo") as file:
         described += next(line for line in file if line.startswith(("flags", "Features")))
     return hashlib.sha256(described.encode()).hexdigest()[:12]
-
-
-def _num_cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

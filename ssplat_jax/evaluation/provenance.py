@@ -2,7 +2,6 @@
 
 import datetime
 import functools
-import os
 import platform
 import subprocess
 from importlib.metadata import version
@@ -10,13 +9,15 @@ from pathlib import Path
 
 import jax
 
+from ssplat_jax.cores import num_cores
+
 
 @functools.cache
 def machine() -> str:
     """The device that JAX computes on, its processor's cores, and the version of JAX."""
     device = jax.devices()[0]
     kind = _processor() if device.platform == "cpu" else device.device_kind
-    return f"{kind}, {len(os.sched_getaffinity(0))} cores, jax {jax.__version__}"
+    return f"{kind}, {num_cores()} cores, jax {jax.__version__}"
 
 
 def _processor() -> str:

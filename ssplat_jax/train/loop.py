@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import os
 import time
 import warnings
 from collections.abc import Callable
@@ -14,6 +13,7 @@ import jax.numpy as jnp
 from ssplat_jax.checkpoint.saved_config import config_from_header
 from ssplat_jax.checkpoint.training_state import TrainingCheckpoints
 from ssplat_jax.config import StreamConfig
+from ssplat_jax.cores import num_cores
 from ssplat_jax.metrics.lpips import LpipsWeights
 from ssplat_jax.storage.folder_lock import lock_folder
 from ssplat_jax.storage.interrupts import Interrupts
@@ -128,8 +128,7 @@ def _run(model, recipe, state, start, mix, lpips_weights, checkpoints, log, ever
     validation = None if mix is None else Validation(model, recipe, mix, lpips_weights)
     step, stopped = start, None
     # A GPU leaves the cores free to make samples; without one, a thread makes them beside the steps.
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    workers = 1 if jax.default_backend() == "cpu" else max(1, cores // 2)
+    workers = 1 if jax.default_backend() == "cpu" else max(1, num_cores() // 2)
     produce = functools.partial(batch_for_step, recipe=recipe, config=model.config, mix=mix)
     samples = prefetched(produce, range(start, recipe.num_steps), workers)
     with interrupts:

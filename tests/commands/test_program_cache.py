@@ -101,7 +101,7 @@ def test_a_folder_that_is_set_already_holds():
 def test_each_kind_of_cpu_has_a_folder_of_its_own(tmp_path, monkeypatch):
     folders = set()
     for cores in (1, 2):
-        monkeypatch.setattr(program_cache, "_num_cores", lambda cores=cores: cores)
+        monkeypatch.setattr(program_cache, "num_cores", lambda cores=cores: cores)
         environment = {SWITCH: str(tmp_path)}
         keep_programs(environment)
         folders.add(environment[FOLDER])

@@ -6,7 +6,6 @@ import pytest
 from ssplat_experiments import warm_sessions
 from ssplat_experiments.program_memory import make_room
 
-from ssplat_jax import program_memory
 from ssplat_jax.config import preset
 from ssplat_jax.program_memory import MAPS
 
@@ -24,7 +23,6 @@ def test_programs_are_dropped_only_when_there_are_many():
     assert num_maps() <= before - len(held)
     assert warm_sessions.new_session(preset("tiny")) is not session
     assert float(held[7](jnp.zeros(3))[0]) == 0.0  # compiled again
-    assert program_memory.MOST_MAPS < 40_000
 
 
 def num_maps() -> int:
