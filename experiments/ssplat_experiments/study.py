@@ -24,7 +24,7 @@ SCALES = ("smoke", "cpu", "gpu")
 
 PAGE, PLOT = "page.md", "plot.png"
 
-PUBLIC_SCENES = ("room", "corridor", "orbit")
+PUBLIC_SCENES = ("room", "corridor", "orbit", "revisit")
 """Scenes whose pictures a page shows. Those of captures, whose licences may forbid it, lie in `cases/` only."""
 
 
