@@ -94,8 +94,8 @@ class Budget:
     """Number of streamed views of procedural scenes."""
     scored: tuple[int, int]
     """Scored images of procedural scenes, width and height; those of captures are as in `captures`."""
-    variants: int | None = None
-    """Number of variants that are measured; None: all."""
+    trainings: int | None = None
+    """Number of trainings that are made; None: all."""
 
     def recipe(self, seed: int, untrained: tuple[str, ...]) -> Recipe:
         """The stream phase of the recipe `stream`, shorter."""
@@ -104,8 +104,8 @@ class Budget:
         return Recipe(phases=(phase,), seed=seed, warmup_steps=min(10, self.steps), max_pairs=self.max_pairs)
 
 
-LEARNED_SCENE = "procedural:revisit?frames=73&seed=3"
-"""The procedural scene that the evidence head learns from; its seed is none of those that are scored."""
+LEARNED_SCENES = (*EvidenceRecipe().procedural, "procedural:revisit?frames=73&seed=3")
+"""Procedural scenes that the evidence head learns from; the seed of `revisit` is none of those that are scored."""
 
 BUDGETS = {
     "smoke": Budget(
@@ -119,14 +119,14 @@ BUDGETS = {
         seeds=(0,),
         views=8,
         scored=(64, 48),
-        variants=1,
+        trainings=1,
     ),
     "cpu": Budget(
-        steps=20,
+        steps=40,
         num_chunks=2,
         size=(64, 96),
         max_pairs=1 << 18,
-        evidence=EvidenceRecipe(steps=80, strides=(4,), procedural=(LEARNED_SCENE,)),
+        evidence=EvidenceRecipe(steps=100, strides=(2,), procedural=LEARNED_SCENES),
         seeds=(0, 1, 2),
         views=64,
         scored=(320, 240),
@@ -136,7 +136,7 @@ BUDGETS = {
         num_chunks=4,
         size=(256, 256),
         max_pairs=1 << 21,
-        evidence=EvidenceRecipe(procedural=(*EvidenceRecipe().procedural, LEARNED_SCENE)),
+        evidence=EvidenceRecipe(procedural=LEARNED_SCENES),
         seeds=(0, 1, 2),
         views=64,
         scored=(320, 240),
@@ -155,10 +155,10 @@ def config_of(variant: str) -> StreamConfig:
 
 
 def cases(captures: Path | None, scale: str) -> list[Case]:
-    """A case for each variant and seed, the seeds outermost: their variants can be compared before all are done."""
+    """A case for each variant and seed: first those of `REPEATED`, seed by seed, so that they can be compared early."""
     budget = at_scale(BUDGETS, scale)
     scenes = scenes_of(captures)
-    asked = {name: value for name, value in dataclasses.asdict(budget).items() if name not in ("seeds", "variants")}
+    asked = {name: value for name, value in dataclasses.asdict(budget).items() if name not in ("seeds", "trainings")}
     return [
         Case(
             name=f"{variant}, seed {seed}",
@@ -166,10 +166,15 @@ def cases(captures: Path | None, scale: str) -> list[Case]:
             asked={"seed": seed, "scenes": scenes, "learned": learned_from(captures), "variant": variant, **asked},
             measure=functools.partial(measured, variant, seed, budget, scenes, captures),
         )
-        for seed in budget.seeds
-        for variant in list(VARIANTS)[: budget.variants]
-        if seed == budget.seeds[0] or variant in REPEATED
+        for variant, seed in trainings(budget)
     ]
+
+
+def trainings(budget: Budget) -> list[tuple[str, int]]:
+    """Variants and seeds in the order in which they are trained."""
+    repeated = [(variant, seed) for seed in budget.seeds for variant in REPEATED]
+    once = [(variant, budget.seeds[0]) for variant in VARIANTS if variant not in REPEATED]
+    return [*repeated, *once][: budget.trainings]
 
 
 def learned_from(captures: Path | None) -> list[str]:
