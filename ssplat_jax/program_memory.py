@@ -26,7 +26,7 @@ def make_room(most_maps: int = MOST_MAPS) -> None:
     """Drops compiled programs if the process holds many (`holds_many_programs`).
 
     Call it between scenes when one process handles many of them. A dropped program is compiled again, or read from
-    JAX's compilation cache, at its next call. Programs of a `Session` go with the session: `del` the last one first.
+    JAX's compilation cache, at its next call. A `Session` keeps its compiled programs: delete the last one first.
 
     Args:
         most_maps: memory maps that the process may have.

@@ -44,7 +44,7 @@ class Eval:
     """interleaved: every 8th frame from the 5th on is a target. paper: targets uniform over the trajectory. scannet:
     paper's, thinned to 1088 frames, with 64 targets and 8 anchors first."""
     stride: int | None = None
-    """Use every STRIDE-th frame; default 1, or without --context the largest that leaves 73 frames (interleaved)."""
+    """Use every STRIDE-th frame; default 1, or without --context (interleaved) such that 73 to 145 frames are left."""
     targets: int | None = None
     """paper: number of targets, default 16; scannet: 64. interleaved: most targets to keep, evenly spread."""
     index: Path | None = None

@@ -144,7 +144,7 @@ def check_refinement(steps: int, revise: tuple[str, ...], flag: str) -> None:
     """Refuses options of a refinement that make no sense.
 
     Args:
-        steps: gradient steps, with `flag`.
+        steps: refinement steps, the value of `flag`.
         revise: effects, with --revise.
         flag: name of the option of the steps.
 

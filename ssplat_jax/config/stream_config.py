@@ -192,7 +192,7 @@ class Quality:
     scale: float
     """Factor by which images are resized before they are streamed."""
     refine_steps: int = 0
-    """Gradient steps on the streamed views after the stream."""
+    """Refinement steps on the streamed views after the stream."""
 
 
 QUALITIES: dict[str, Quality] = {

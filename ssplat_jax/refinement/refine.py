@@ -121,7 +121,7 @@ def refine(
         gaussians: the scene.
         cameras: one batch axis of poses and intrinsics, in the frame of the scene.
         images: what those cameras saw, floats in [0, 1] or uint8.
-        steps: most gradient steps; 0 returns `gaussians` as they are. Each renders `config.views_per_step`
+        steps: most steps; 0 returns `gaussians` as they are. Each renders `config.views_per_step`
             views. A learned pass of `config.learned_passes` takes the place of 8.
         exposures: factors from the scene's colors to each view's; default 1.
         config: learning rates and bounds.

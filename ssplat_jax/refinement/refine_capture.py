@@ -54,7 +54,7 @@ def refine_on_capture(
         indices: frame numbers that were streamed.
         frame: the similarity between the capture's frame and the stream's.
         exposures: factor per streamed frame, as the stream estimated it.
-        steps: most gradient steps.
+        steps: most refinement steps.
         config: learning rates, bounds and SH degree; default `FOR_CAPTURES`.
         revise: names of the effects that are on besides those of `config`, or `("auto",)` for those that the residuals
             call for.

@@ -73,7 +73,7 @@ def refine_run(
         run_dir: folder of a finished `ssplat run`.
         path: the capture of that run, as `open_capture` takes it.
         params: parameters of the run's model.
-        steps: most gradient steps, those of an earlier call included.
+        steps: most refinement steps, those of an earlier call included.
         revise: effects of the refinement, see `refine_on_capture`.
         save_every: steps between saved states.
         overwrite: remove the refinement that the folder holds and start anew.

@@ -20,7 +20,7 @@ SHOWN = "holes filled, at the exposure of the nearest streamed views"
 
 FILES = (
     ("scene.ply", "the scene, in the frame and units of the capture, at the middle exposure of its views"),
-    ("refined.ply", "the scene after gradient steps"),
+    ("refined.ply", "the refined scene"),
     ("metrics.json", "every figure of this page, and more"),
     ("contact_sheet.jpg", "the pictures on one sheet"),
     ("views", "pictures of streamed views"),
@@ -69,7 +69,7 @@ def report_run(folder: RunFolder, metrics: dict[str, Any], path: str) -> None:
         files=_files(folder),
         commands=[
             f"ssplat view {out}    # in a browser",
-            f"ssplat refine {out} {capture} --steps 100    # a better scene, by gradient steps",
+            f"ssplat refine {out} {capture} --steps 100    # a better scene: compares it with its views, step by step",
             f"ssplat render {out} {capture} --size {width}x{height} --film 8 --out {out}_film    # a film",
             f"ssplat export {out} --to scene.sog    # for other viewers, at an eighth of the size",
         ],
