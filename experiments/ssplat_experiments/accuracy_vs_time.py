@@ -177,8 +177,8 @@ STUDY = Study(
     text="""Every setting streams the same context views with the shipped weights and is scored on the same views at the
 same size. Time is chunk in, one novel view out, on the full cache. `front`: no other setting of the scene is both
 faster and at least as good. `reference ms` is the step that `ssplat run --budget-ms` times. Rows with steps are the
-second axis: gradient steps on the streamed views after the stream, their time (`refine s`, without compilation) spread
-over the views. One front holds all of them.""",
+second axis: refinement steps on the streamed views after the stream, their time (`refine s`, without compilation)
+spread over the views. One front holds all of them.""",
     cases=cases,
     finish=mark_fronts,
     plot=plot,

@@ -18,7 +18,7 @@ from ssplat_experiments import (
     long_context,
     memory_curve,
 )
-from ssplat_experiments.study import PAGE, Study, run_study
+from ssplat_experiments.study import PAGE, Study, command_of, run_study
 from ssplat_jax.console import Reporter
 from ssplat_jax.errors import StorageError
 from ssplat_jax.storage.atomic import write_atomic
@@ -41,18 +41,18 @@ def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str
         for done, study in enumerate(STUDIES):
             advance(done, study.name)
             reporter.say(run_study(study, captures, out / FOLDER / study.name, scale, Reporter(quiet=True)))
-            write_atomic(out / f"{FOLDER}.md", _page(STUDIES[: done + 1], out, scale).encode())
+            write_atomic(out / f"{FOLDER}.md", _page(STUDIES[: done + 1], out, scale, captures).encode())
         advance(len(STUDIES), "")
     return f"wrote {out}/{FOLDER}.md: {len(STUDIES)} experiments"
 
 
-def _page(finished: Sequence[Study], out: Path, scale: str) -> str:
+def _page(finished: Sequence[Study], out: Path, scale: str, captures: Path | None) -> str:
     """The pages of the finished studies below one heading, their pictures found from the folder `out`."""
     parts = [
         "# Results",
         "Tables and figures of the experiments, as this command wrote them. Beside each row stand the hash of its "
         "configuration, the commit (`+`: with changes), the date and the machine.",
-        f"    ssplat experiment all --scale {scale} --out runs/all",
+        command_of("all", scale, captures),
     ]
     for study in finished:
         folder = out / FOLDER / study.name

@@ -30,7 +30,7 @@ class Setting:
     label: str = ""
     changes: dict[str, Any] = dataclasses.field(default_factory=dict)
     refine_steps: int = 0
-    """Gradient steps on the streamed views after the stream."""
+    """Refinement steps on the streamed views after the stream."""
     quality: str = ""
     """Name of the `--quality` with this setting, or empty."""
 
@@ -77,7 +77,7 @@ SETTINGS = (
 )
 
 REFINED_FACTORS = (0.4, 0.5, 0.6, 0.75, 1.0, 1.25)
-REFINED_STEPS = (10, 25, 50, 100, 200)
+REFINED_STEPS = (8, 24, 50, 100, 200)  # a learned pass is 8 steps in one
 REFINED = tuple(
     Setting(factor, refine_steps=steps, quality="best" if (factor, steps) == (1.0, 100) else "")
     for factor in REFINED_FACTORS

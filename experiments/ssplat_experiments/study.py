@@ -76,9 +76,9 @@ def run_study(study: Study, captures: Path | None, out: Path, scale: str, report
     provenance.commit()  # read now and kept: the files may change while the experiment runs
     make_writable(out)
     cases = study.cases(captures, scale)
-    write = lambda so_far: _write(study, out, scale, _finished(study, so_far))  # noqa: E731
+    write = lambda so_far: _write(study, out, scale, captures, _finished(study, so_far))  # noqa: E731
     rows = measure_cases(study.name, cases, out / "cases", reporter, write)
-    _write(study, out, scale, rows := _finished(study, rows))
+    _write(study, out, scale, captures, rows := _finished(study, rows))
     for name, value in study.files(rows, scale).items():
         write_json(out / name, value)
     if study.plot is not None and (pyplot := import_pyplot()) is None:
@@ -106,11 +106,11 @@ def _finished(study: Study, rows: list[Row]) -> list[Row]:
     return rows
 
 
-def _write(study: Study, out: Path, scale: str, rows: list[Row]) -> None:
+def _write(study: Study, out: Path, scale: str, captures: Path | None, rows: list[Row]) -> None:
     """The table in both forms and the page."""
     write_json(out / "table.json", rows)
     write_atomic(out / "table.csv", csv_table(rows).encode())
-    write_atomic(out / PAGE, page(study, scale, rows).encode())
+    write_atomic(out / PAGE, page(study, scale, rows, captures).encode())
 
 
 def columns_of(rows: Sequence[Row]) -> list[str]:
@@ -156,10 +156,16 @@ def _cell(name: str, value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, float) and abs(value) < 1e4 else str(value).replace("|", "/")
 
 
-def page(study: Study, scale: str, rows: Sequence[Row]) -> str:
+def command_of(name: str, scale: str, captures: Path | None) -> str:
+    """The command of an experiment as a block of Markdown, with captures if it had any."""
+    given = "" if captures is None else "--captures path/to/captures "
+    return f"    ssplat experiment {name} --scale {scale} {given}--out runs/{name}"
+
+
+def page(study: Study, scale: str, rows: Sequence[Row], captures: Path | None = None) -> str:
     """The page of an experiment: what was done, the command, the table, what follows and the plot."""
     parts = [f"# {study.name}", study.text.strip()]
-    parts.append(f"    ssplat experiment {study.name} --scale {scale} --out runs/{study.name}")
+    parts.append(command_of(study.name, scale, captures))
     if rows:
         parts.append(markdown_table(rows).strip())
     parts += study.findings(list(rows))
