@@ -112,6 +112,9 @@ def _check_out(source: Path, out: Path) -> None:
     if source.is_dir() and (folder == place or folder.is_relative_to(place)):
         fix = "choose a folder beside it"
         raise refusal(f"--out {out}", wanted="a folder outside the photos", got="the folder of the photos", fix=fix)
+    if any(place.is_relative_to(folder / name) for name in OWN_FOLDERS):  # `_clear` would remove the source
+        fix = "choose another folder"
+        raise refusal(f"--out {out}", wanted="a folder that does not hold the photos", got="one that does", fix=fix)
     held = [name for name in (*OWN_FOLDERS, *OWN_FILES) if (folder / name).exists()]
     if held and not (folder / RECORD).exists():
         got, fix = f"one that holds {', '.join(held)} of another maker", "choose another --out"

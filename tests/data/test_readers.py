@@ -6,6 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from ssplat_jax.data.lens import FisheyeLens
 from ssplat_jax.data.open_capture import open_capture
+from ssplat_jax.errors import InputError
 from tests.data.capture_writers import (
     COLMAP_IMAGES,
     CX,
@@ -25,6 +26,7 @@ from tests.data.capture_writers import (
     write_colmap_text,
     write_depth,
     write_image,
+    write_llff,
     write_realestate,
     write_scannet,
     write_tum,
@@ -47,6 +49,25 @@ INTRINSICS = {  # of formats that cannot hold K
     "LLFF": [[FX, 0, WIDTH / 2], [0, FX, HEIGHT / 2], [0, 0, 1]],
 }
 WITH_DEPTH = ("ScanNet", "TUM RGB-D", "Polycam")
+
+
+def test_llff_images_have_the_poses_of_their_names_and_not_of_what_they_link_to(tmp_path):
+    write_llff(tmp_path)
+    (tmp_path / "raw").mkdir()
+    for i in range(NUM_FRAMES):
+        image = tmp_path / "images" / f"IMG_{i}.JPG"
+        image.rename(tmp_path / "raw" / f"{9 - i}.JPG")
+        image.symlink_to(tmp_path / "raw" / f"{9 - i}.JPG")
+    capture = open_capture(tmp_path)
+    assert tuple(frame.name for frame in capture.frames) == NAMES["LLFF"]
+    assert [frame.path.name for frame in capture.frames] == [f"{9 - i}.JPG" for i in range(NUM_FRAMES)]
+    np.testing.assert_allclose(capture.camtoworlds, poses(), atol=1e-12)
+    (tmp_path / "raw").rename(outside := tmp_path.with_name(f"{tmp_path.name}_raw"))
+    link = tmp_path / "images" / "IMG_2.JPG"
+    link.unlink()
+    link.symlink_to(outside / "7.JPG")
+    with pytest.raises(InputError, match=r"IMG_\d.JPG: wanted an image inside .* got a link that leads outside"):
+        open_capture(tmp_path)
 
 
 @pytest.mark.parametrize("kind", WRITERS)

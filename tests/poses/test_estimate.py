@@ -123,6 +123,18 @@ def test_a_folder_belongs_to_one_call(photos, estimated, tmp_path):
         estimate(photos, tmp_path)
 
 
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_a_source_inside_the_results_is_refused_and_stays(overwrite, tmp_path):
+    """Images of an earlier call, which --overwrite would remove, may be the only copy of a video's frames."""
+    (tmp_path / "images").mkdir()
+    write_json(tmp_path / "poses.json", {"request": {}})
+    for i, picture in enumerate(pictures(walk(2))):
+        Image.fromarray(picture).save(tmp_path / "images" / f"{i}.png")
+    with pytest.raises(InputError, match="wanted a folder that does not hold the photos"):
+        estimate(tmp_path / "images", tmp_path, overwrite)
+    assert len(list((tmp_path / "images").iterdir())) == 2
+
+
 def test_pictures_without_overlap_are_refused_and_leave_no_capture(tmp_path):
     rng = np.random.default_rng(0)
     (tmp_path / "in").mkdir()

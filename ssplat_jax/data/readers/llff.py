@@ -49,8 +49,8 @@ def read(path: Path) -> Listing:
         pose, deviation = check_camtoworld(np.stack([right, down, -backward, center], axis=1), where)
         size, shrink = stored_size(image, (width, height), where, "use the images that LLFF used")
         intrinsics = Intrinsics(fx=focal, fy=focal, cx=width / 2, cy=height / 2)
-        name = str(image.relative_to(root))
-        frames.append(make_frame(name, image, pose, intrinsics, size, where, pose_deviation=deviation, shrink=shrink))
+        name, file = str(image.relative_to(root)), image.resolve()
+        frames.append(make_frame(name, file, pose, intrinsics, size, where, pose_deviation=deviation, shrink=shrink))
     return order_frames(root.name, frames)
 
 
@@ -73,7 +73,10 @@ def _load_rows(file: Path) -> Float64[np.ndarray, "n 17"]:
 def _images(root: Path) -> list[Path]:
     """Images of the capture, in the order of names; those of the first folder that has any."""
     for folder in ("images", *SHRUNK_FOLDERS):
-        found = sorted(file.resolve() for file in (root / folder).glob("*") if file.suffix in EXTENSIONS[1:])
+        found = sorted(file for file in (root / folder).glob("*") if file.suffix in EXTENSIONS[1:])
+        if outside := next((file for file in found if not file.resolve().is_relative_to(root)), None):
+            fix = "copy the images into the capture's folder"
+            raise refusal(str(outside), wanted=f"an image inside {root}", got="a link that leads outside", fix=fix)
         if found:
             return found
     return []
