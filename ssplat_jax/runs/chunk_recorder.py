@@ -24,10 +24,12 @@ def hold_back(indices: Sequence[int], count: int) -> tuple[list[int], list[int]]
     Raises:
         InputError: fewer than two frames would be left to stream.
     """
+    if count == 0:  # one frame alone may be streamed
+        return list(indices), []
     if not 0 <= count <= len(indices) - 2:
         wanted, fix = f"0 to {max(len(indices) - 2, 0)} of the {len(indices)} frames", "hold back fewer"
         raise refusal("--hold-back", wanted=wanted, got=str(count), fix=fix)
-    places = {round((k + 0.5) * len(indices) / count - 0.5) for k in range(count)} if count else set()
+    places = {round((k + 0.5) * len(indices) / count - 0.5) for k in range(count)}
     return [i for k, i in enumerate(indices) if k not in places], [indices[k] for k in sorted(places)]
 
 

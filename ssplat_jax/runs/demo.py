@@ -37,16 +37,18 @@ def run_demo(scene: str, out: Path, reporter: Reporter, quality: Quality = QUALI
         scene: name of the procedural scene.
         out: folder of the scene, the pictures and the metrics.
         reporter: shows progress and the table.
-        quality: size at which images are streamed (they are scored at full size), and the gradient steps afterwards,
+        quality: size at which images are streamed (they are scored at full size), and the refinement steps afterwards,
             which add a row.
 
     Returns:
         The metrics as written.
 
     Raises:
+        InputError: `out` holds a run.
         StorageError: `out` cannot be written.
     """
     folder, since = RunFolder(out), time.perf_counter()
+    folder.check_no_run()
     make_writable(out)  # before the long part
     folder.clear_refinement()  # of an earlier demo
     model, params = StreamSplat(preset("tiny")), load_params("tiny")

@@ -51,7 +51,7 @@ def open_cameras(path: str, scene: Path, to: Path) -> SceneCameras:
             raise InputError(f"{held}: wanted a place for the cameras, a file is in the way; choose another folder.")
     folder = RunFolder(scene)
     if not folder.has_state():
-        capture = open_capture(path)
+        capture = with_poses_of_run(open_capture(path), RunFolder(scene.parent))
         return SceneCameras(capture, range(len(capture)))
     _, header, _ = load_newest_state(folder.state)
     capture = with_poses_of_run(open_capture(path, size=tuple(header["size"])), folder)

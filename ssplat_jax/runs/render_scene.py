@@ -18,6 +18,7 @@ from ssplat_jax.gaussians import mean_color
 from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.rasterizer import Effects, fill_holes, render
 from ssplat_jax.runs.film import KINDS, FilmOptions, depth_range, film_path, write_film
+from ssplat_jax.runs.run_poses import with_poses_of_run
 from ssplat_jax.scene_files.formats import read_scene
 from ssplat_jax.scene_files.splat_file import SplatFile
 from ssplat_jax.storage.folder_lock import lock_folder
@@ -51,7 +52,7 @@ def render_scene(
 
     Args:
         scene: a scene file in the capture's frame, or the folder of a run.
-        path: the capture, as `open_capture` takes it.
+        path: the capture, as `open_capture` takes it; the cameras of a run that adjusted its poses have those.
         out: folder of the results.
         size: (width, height) of the pictures; by default the capture's own.
         stride: every `stride`-th camera is used.
@@ -79,7 +80,8 @@ def render_scene(
     if one_exposure:
         gaussians = at_first_exposure(splats.gaussians, scene_exposure(scene))
         splats = dataclasses.replace(splats, gaussians=gaussians)
-    capture, folder = open_capture(path, size=size), RunFolder(out)
+    run = RunFolder(scene if scene.is_dir() else scene.parent)
+    capture, folder = with_poses_of_run(open_capture(path, size=size), run), RunFolder(out)
     capture.check_output_folder(out)
     indices = range(0, len(capture), stride)[:max_views]
     size = (capture.width, capture.height)

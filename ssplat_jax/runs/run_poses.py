@@ -9,7 +9,7 @@ from jaxtyping import Float64
 
 from ssplat_jax.console import Reporter
 from ssplat_jax.data.capture import Capture
-from ssplat_jax.errors import StorageError
+from ssplat_jax.errors import StorageError, refusal
 from ssplat_jax.poses.adjust_poses import adjust_if_asked
 from ssplat_jax.storage.json_files import write_json
 from ssplat_jax.storage.run_folder import RunFolder
@@ -28,18 +28,32 @@ def capture_to_stream(
         reporter: shows progress.
 
     Raises:
+        InputError: the folder holds a run whose poses were not adjusted.
         StorageError: the folder cannot be written, or the saved poses are damaged.
     """
-    if not {"poses", "auto"} & set(revise):
+    asked = [name for name in ("poses", "auto") if name in revise]
+    if not folder.has_state() and not _has_poses_for(folder, capture, indices, asked):
+        folder.adjusted_poses.unlink(missing_ok=True)  # of a run that stopped before its first save
+    if not asked:
         return capture
-    if folder.adjusted_poses.exists():
-        return with_poses_of_run(capture, folder)
-    found = adjust_if_asked(capture, indices, revise, reporter)
-    frames = {} if found is None else {str(i): found.capture.frames[i].camtoworld.tolist() for i in indices}
-    write_json(
-        folder.adjusted_poses, {"capture": capture.digest(indices), "indices": list(indices), "camtoworlds": frames}
-    )
+    saved = _read(folder)
+    if folder.has_state() and (saved is None or ("poses" in asked and not saved.camtoworlds)):
+        got, fix = "one with the given poses", "leave it out, or start anew with --overwrite"
+        raise refusal(f"--revise {asked[0]}", wanted="a run that began with it", got=got, fix=fix)
+    if saved is None:
+        found = adjust_if_asked(capture, indices, revise, reporter)
+        frames = {} if found is None else {str(i): found.capture.frames[i].camtoworld.tolist() for i in indices}
+        described = {"capture": capture.digest(indices), "indices": list(indices), "camtoworlds": frames}
+        write_json(folder.adjusted_poses, described)
     return with_poses_of_run(capture, folder)
+
+
+def _has_poses_for(folder: RunFolder, capture: Capture, indices: Sequence[int], asked: Sequence[str]) -> bool:
+    """True if the folder keeps poses of the same frames of the same capture that do what is asked."""
+    saved = _read(folder)
+    if saved is None or not asked or saved.indices != list(indices):
+        return False
+    return saved.capture == capture.digest(indices) and (bool(saved.camtoworlds) or "poses" not in asked)
 
 
 def with_poses_of_run(capture: Capture, folder: RunFolder) -> Capture:

@@ -22,7 +22,7 @@ from ssplat_jax.chunk import Chunk
 from ssplat_jax.config import preset
 from ssplat_jax.console import Reporter
 from ssplat_jax.data.open_capture import open_capture
-from ssplat_jax.errors import InputError
+from ssplat_jax.errors import InputError, refusal
 from ssplat_jax.storage.folder_lock import lock_folder
 from ssplat_jax.storage.json_files import write_json
 from ssplat_jax.storage.run_folder import RunFolder
@@ -127,14 +127,19 @@ def setting_for_run(
         reporter: says what was chosen.
 
     Raises:
-        InputError: see `choose` and `open_capture`; the capture lies in `out`, or another process writes to it.
+        InputError: see `choose` and `open_capture`; the capture lies in `out`, `out` holds a run that did not begin
+            with this budget and size, or another process writes to it.
         StorageError: `out` cannot be written.
     """
-    capture, file = open_capture(path, size=size), RunFolder(out).budget
+    capture, folder = open_capture(path, size=size), RunFolder(out)
     capture.check_output_folder(out)
     asked = {"budget_ms": budget_ms, "size": [capture.width, capture.height]}
-    if not overwrite and (held := _read_choice(file, asked)) is not None:
+    if not overwrite and (held := _read_choice(folder.budget, asked)) is not None:
         return held
+    if not overwrite and folder.has_state():  # its choice stays, so that it can continue
+        fix = "repeat its options, or start anew with --overwrite"
+        got = f"{budget_ms:g} at {capture.width}x{capture.height}"
+        raise refusal("--budget-ms", wanted=f"what the run in {out} began with", got=got, fix=fix)
     # A larger image than the capture has would cost time and show nothing more; a procedural one has any size.
     stored = [open_capture(path)] if path.startswith("procedural:") else capture.frames
     max_factor = max(1.0, min(min(image.width / capture.width, image.height / capture.height) for image in stored))
@@ -143,7 +148,7 @@ def setting_for_run(
     reporter.say(f"--budget-ms {budget_ms:g}: {point.setting}, about {ms:.0f} ms a view on this machine")
     expected = {"expected_ms": round(ms, 1), "reference_ms": round(reference_ms, 2)}
     with lock_folder(out):
-        write_json(file, asked | expected | {"point": dataclasses.asdict(point)})
+        write_json(folder.budget, asked | expected | {"point": dataclasses.asdict(point)})
     return point
 
 

@@ -13,6 +13,7 @@ from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.errors import InputError, StorageError
 from ssplat_jax.poses import adjust_poses as adjusting
 from ssplat_jax.poses.adjust_poses import AdjustedPoses
+from ssplat_jax.runs import render_scene
 from ssplat_jax.runs.capture_run import run_capture
 from ssplat_jax.runs.export_cameras import open_cameras
 from ssplat_jax.runs.refine_run import refine_run
@@ -80,6 +81,59 @@ def test_the_stream_and_all_that_follows_see_the_adjusted_poses(finished, monkey
 def test_a_run_without_them_is_another_run(finished):
     with pytest.raises(InputError, match="differs in its poses"):
         run(finished, revise=())
+
+
+def test_a_finished_run_with_given_poses_takes_no_adjusted_ones_and_stays_usable(tmp_path, monkeypatch):
+    folder, capture = RunFolder(tmp_path), open_capture(CAPTURE, size=SIZE)
+    monkeypatch.setattr(adjusting, "adjust_poses", must_not_be_called)
+    folder.state.write_bytes(b"of a run that began without")
+    for revise in (("poses",), ("auto",)):
+        with pytest.raises(InputError, match=f"--revise {revise[0]}: wanted a run that began with it"):
+            capture_to_stream(capture, range(4), revise, folder, Reporter(quiet=True))
+    assert not folder.adjusted_poses.exists()
+    assert capture_to_stream(capture, range(4), (), folder, Reporter(quiet=True)) is capture
+
+
+def test_poses_that_fitted_are_no_adjusted_ones(tmp_path, monkeypatch):
+    folder, capture = RunFolder(tmp_path), open_capture(CAPTURE, size=SIZE)
+    monkeypatch.setattr(adjusting, "adjust_poses", lambda *given: moved(*given, are_off=False))
+    capture_to_stream(capture, range(4), ("auto",), folder, Reporter(quiet=True))
+    folder.state.write_bytes(b"of the run")
+    with pytest.raises(InputError, match="--revise poses: wanted a run that began with it"):
+        capture_to_stream(capture, range(4), ("poses",), folder, Reporter(quiet=True))
+
+
+@pytest.mark.parametrize(
+    "earlier, indices", [(CAPTURE, (0, 2)), ("procedural:room?frames=4&seed=5", range(4))], ids=["frames", "capture"]
+)
+def test_poses_that_a_stopped_run_left_for_another_stream_are_found_anew(earlier, indices, tmp_path, monkeypatch):
+    folder, quiet = RunFolder(tmp_path), Reporter(quiet=True)
+    monkeypatch.setattr(adjusting, "adjust_poses", moved)
+    capture_to_stream(open_capture(earlier, size=SIZE), indices, ("poses",), folder, quiet)
+    given = open_capture(CAPTURE, size=SIZE)
+    streamed = capture_to_stream(given, range(4), ("poses",), folder, quiet)
+    np.testing.assert_array_equal(streamed.camtoworlds, moved(given, range(4)).capture.camtoworlds)
+    assert capture_to_stream(given, range(4), (), folder, quiet) is given
+    assert not folder.adjusted_poses.exists()  # no later command takes them for those of the run
+
+
+def test_pictures_and_cameras_of_a_run_have_its_adjusted_poses(finished, tmp_path, monkeypatch):
+    given = open_capture(CAPTURE, size=SIZE)
+    wanted = moved(given, range(4)).capture.camtoworlds
+    path = f"{CAPTURE}&size={SIZE[0]}x{SIZE[1]}"
+    cameras = open_cameras(path, finished / "scene.ply", tmp_path / "scene.ply")
+    np.testing.assert_array_equal(cameras.capture.camtoworlds, wanted)
+    drawn = []
+
+    def draw(splats, camtoworld, K, **given):
+        drawn.append(camtoworld)
+        return np.zeros((SIZE[1], SIZE[0], 3)), np.zeros((SIZE[1], SIZE[0]))
+
+    monkeypatch.setattr(render_scene, "_render_picture", draw)
+    for scene in (finished, finished / "scene.ply"):
+        options = {"size": SIZE, "stride": 1, "max_views": None, "over_black": False, "film": None}
+        render_scene.render_scene(scene, CAPTURE, tmp_path / "out", **options, reporter=Reporter(quiet=True))
+    np.testing.assert_array_equal(drawn, [*wanted, *wanted])
 
 
 def test_poses_that_fit_are_kept_and_not_judged_twice(tmp_path, monkeypatch):

@@ -91,7 +91,7 @@ def test_every_shipped_point_runs_with_the_shipped_weights():
 
 
 def test_a_run_that_continues_keeps_its_setting(tmp_path, monkeypatch):
-    speeds = iter([1.0, 100.0, 1.0])
+    speeds = iter([1.0, 100.0, 1.0, 1.0])
     monkeypatch.setattr(time_budget, "reference_step_ms", lambda: next(speeds))
     monkeypatch.setattr(
         time_budget,
@@ -110,6 +110,11 @@ def test_a_run_that_continues_keeps_its_setting(tmp_path, monkeypatch):
         chosen(7.0)
     assert json.loads((tmp_path / "budget.json").read_text())["expected_ms"] == 5.0
     assert chosen(4.0, overwrite=True) == "1.0 steps"
+    (tmp_path / "state.npz").write_bytes(b"of a run that has begun")
+    with pytest.raises(InputError, match=r"--budget-ms: wanted what the run in .* began with, got 6 at 64x48"):
+        chosen(6.0)
+    assert chosen(4.0) == "1.0 steps"  # so that it can go on
+    assert chosen(6.0, overwrite=True) == "two"
 
 
 @pytest.mark.slow
