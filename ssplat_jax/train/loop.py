@@ -12,6 +12,7 @@ import jax.numpy as jnp
 
 from ssplat_jax.checkpoint.saved_config import config_from_header
 from ssplat_jax.checkpoint.training_state import TrainingCheckpoints
+from ssplat_jax.checkpoint.weights import params_digest
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.cores import num_cores
 from ssplat_jax.metrics.lpips import LpipsWeights
@@ -59,7 +60,7 @@ def train(
         config: model configuration; `training_config` changes cache and exposure.
         recipe: phases, optimizer and loss.
         out: directory of `log.jsonl`, `recipe.json` and `checkpoints/`.
-        params: initial parameters; default random ones from the recipe's seed. Ignored when a run is resumed.
+        params: initial parameters; default random ones from the recipe's seed. A run is resumed with the same ones.
         mix: captures to learn from, beside procedural scenes.
         lpips_weights: weights of LPIPS, which the rendering loss then includes.
         save_every: steps between checkpoints. SIGINT and SIGTERM save one too.
@@ -72,13 +73,14 @@ def train(
         The state after the last step.
 
     Raises:
-        InputError: `out` holds a run of another recipe or configuration, or another process is training in it.
+        InputError: `out` holds a run of another recipe, configuration or start, or another process is training in it.
         StorageError: a checkpoint cannot be written or read.
     """
     model = StreamSplat(training_config(config, recipe))
     with lock_folder(out):
-        description = describe_run(model.config, recipe, has_lpips=lpips_weights is not None, mix=mix)
-        checkpoints = TrainingCheckpoints(out, description, upgrade=upgrade_description)
+        description = describe_run(model.config, recipe, params, has_lpips=lpips_weights is not None, mix=mix)
+        upgrade = functools.partial(upgrade_description, init_weights=description["init_weights"])
+        checkpoints = TrainingCheckpoints(out, description, upgrade=upgrade)
         try:
             state, start = init_state(model, recipe, params), 0
             if (restored := checkpoints.restore_latest(state, warn)) is not None:
@@ -99,16 +101,23 @@ class _Every:
     validate: int
 
 
-def describe_run(config: StreamConfig, recipe: Recipe, *, has_lpips: bool, mix: CaptureMix | None = None) -> dict:
+def describe_run(
+    config: StreamConfig, recipe: Recipe, params: dict | None, *, has_lpips: bool, mix: CaptureMix | None = None
+) -> dict:
     """Facts that determine the weights of a run, as JSON types; a run with another description is not resumed.
 
     Args:
         config: configuration of the model.
         recipe: the recipe.
+        params: initial parameters; None for random ones.
         has_lpips: the rendering loss includes LPIPS.
         mix: captures to learn from.
     """
-    description: dict = {"config": config.to_dict(), "recipe": dataclasses.asdict(recipe)}
+    description: dict = {
+        "config": config.to_dict(),
+        "recipe": dataclasses.asdict(recipe),
+        "init_weights": "random" if params is None else params_digest(params),
+    }
     if has_lpips:
         description["rendering_loss"] = f"MSE + {recipe.lpips_weight} LPIPS"
     if mix is not None:
@@ -116,10 +125,19 @@ def describe_run(config: StreamConfig, recipe: Recipe, *, has_lpips: bool, mix: 
     return description
 
 
-def upgrade_description(description: dict) -> dict:
-    """Description of a run, as read from JSON, with the fields that older versions did not write."""
+def upgrade_description(description: dict, init_weights: str = "random") -> dict:
+    """Description of a run, as read from JSON, with the fields that older versions did not write.
+
+    Args:
+        description: as `describe_run` gives it.
+        init_weights: the initial parameters of a run that does not name its own.
+    """
     config = config_from_header(description["config"]).to_dict()
-    return description | {"config": config, "recipe": with_defaults(description.get("recipe", {}))}
+    return (
+        {"init_weights": init_weights}
+        | description
+        | {"config": config, "recipe": with_defaults(description.get("recipe", {}))}
+    )
 
 
 def _run(model, recipe, state, start, mix, lpips_weights, checkpoints, log, every: _Every) -> TrainResult:
