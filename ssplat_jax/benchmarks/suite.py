@@ -23,6 +23,9 @@ from ssplat_jax.refinement import online_refinement
 from ssplat_jax.streaming.session import Session, tokens_per_chunk
 from ssplat_jax.streaming.streamsplat import StreamSplat
 
+BENCHMARKS = ("render", "refine", "stream")
+"""Names of the benchmarks."""
+
 NUM_FRAMES = 40
 """Frames of the walk that a benchmark's stream repeats."""
 
@@ -41,8 +44,15 @@ def run_benchmark(
         The machine, date and commit, and rows of name, value and unit.
 
     Raises:
-        InputError: `name` is no benchmark, or `against` cannot be timed.
+        InputError: `name` is no benchmark or has no use for an argument, or `against` cannot be timed.
     """
+    for option, is_given, users in (
+        ("--scaling", scaling, ("render",)),
+        ("--full-hd", full_hd, ("render",)),
+        ("--against", against is not None, ("render", "refine")),
+    ):
+        if is_given and name in BENCHMARKS and name not in users:
+            raise InputError(f"{option}: bench {name} has no use for it; leave it out.")
     if name == "render":
         rows = bench_render(against, scaling=scaling, full_hd=full_hd)
     elif name == "refine":
@@ -50,7 +60,7 @@ def run_benchmark(
     elif name == "stream":
         rows = [dataclasses.asdict(row) for row in (*bench_cache(preset("tiny")), *bench_step(), *bench_online())]
     else:
-        raise InputError(f"bench: wanted render, refine or stream, got {name!r}; choose one of them.")
+        raise InputError(f"bench: wanted one of {', '.join(BENCHMARKS)}, got {name!r}.")
     return {"machine": machine(), "date": today(), "commit": commit(), "rows": rows}
 
 

@@ -6,6 +6,8 @@ from typing import Annotated
 
 import tyro
 
+from ssplat_jax.errors import InputError
+
 
 @dataclasses.dataclass(frozen=True)
 class Export:
@@ -39,10 +41,11 @@ class Export:
         reporter = Reporter(quiet=False)
         folder, selection = RunFolder(self.scene), Selection(self.prune, self.max_splats)
         cameras = None if self.cameras is None else open_cameras(self.cameras, self.scene, self.to)
-        if self.scene.is_file():
-            report = convert_scene(self.scene, self.to, selection)
-        elif not folder.has_state() and folder.scene.exists():  # a folder of `ssplat demo`
-            report = convert_scene(folder.scene, self.to, selection)
+        file = self.scene if self.scene.is_file() else folder.scene  # the latter in a folder of `ssplat demo`
+        if file.exists() and not folder.has_state():
+            if self.weights != Export.weights:
+                raise InputError(f"--weights: wanted the folder of a run, got {self.scene}, which is decoded already.")
+            report = convert_scene(file, self.to, selection)
         else:
             report = export_run(self.scene, self.to, load_params(self.weights), reporter, selection)
         if cameras is not None:

@@ -104,8 +104,8 @@ class Run:
         check_refinement(self.refine_steps, self.revise, "--refine")
         if self.quiet_seconds != Run.quiet_seconds and not self.watch:
             raise InputError("--quiet-seconds: wanted --watch beside it, which it is for; got none.")
-        if self.watch and "poses" in self.revise:
-            raise InputError("--revise poses: wanted a capture that is complete, got --watch; leave one out.")
+        if self.watch and (early := [name for name in ("poses", "auto") if name in self.revise]):
+            raise InputError(f"--revise {early[0]}: wanted a capture that is complete, got --watch; leave one out.")
         if self.watch and (self.axes or self.poses):
             raise InputError("--watch: wanted poses as transforms.json has them, got --axes or --poses; leave one out.")
         if self.hold_back and self.watch:

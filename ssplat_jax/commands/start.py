@@ -16,7 +16,7 @@ from types import FrameType
 from typing import NoReturn
 
 EXIT_INTERRUPTED, MESSAGE = 130, "ssplat: interrupted\n"
-EXIT_BROKEN_PIPE = 128 + signal.SIGPIPE
+EXIT_BROKEN_PIPE = 128 + getattr(signal, "SIGPIPE", 13)
 
 PATIENCE = 5.0
 """Seconds that a command has to unwind after Ctrl-C; then the process ends where it stands, as after a kill."""
@@ -24,6 +24,9 @@ PATIENCE = 5.0
 
 def start() -> None:
     """Runs the command line of this process and exits with its code."""
+    if sys.platform == "win32":  # no locks of folders, and no flushing of them
+        print("ssplat: wanted Linux or macOS, got Windows; use the Windows Subsystem for Linux.", file=sys.stderr)
+        sys.exit(2)
     interrupt = _Interrupt()
     try:
         if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # a background job may ignore the signal

@@ -78,6 +78,10 @@ class Train:
                 reporter.say(f"{self.init_weights} has no {', '.join(fresh)}: random at the start")
         recipe, mix = self._opened(config, recipe)
         lpips_weights = load_lpips_weights(self.lpips_vgg, self.lpips_heads)
+        if lpips_weights and not any(phase.num_targets for phase in recipe.phases):
+            raise InputError(
+                f"--lpips-vgg: --recipe {self.recipe} has no use for it, it renders nothing; leave it out."
+            )
         duration = ""
         if self.recipe in MINUTES:
             duration = f", about {max(1, round(MINUTES[self.recipe] * self.scale_steps))} minutes on two cores"
@@ -197,6 +201,8 @@ class Train:
         if not self.captures:
             if self.shares:
                 raise InputError("--shares: wanted --captures beside it, which it divides; got none.")
+            if self.validate_every != Train.validate_every:
+                raise InputError("--validate-every: wanted --captures beside it, which it scores; got none.")
             return recipe, None
         return dataclasses.replace(recipe, fit_gains=True), open_mix(self.captures, self.shares, config, recipe)
 

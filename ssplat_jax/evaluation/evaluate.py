@@ -58,7 +58,7 @@ def evaluate(
         reporter: shows progress and warnings; by default warnings only.
         streamed: the same capture at the size that is streamed; by default `capture`.
         lpips_weights: with them LPIPS is scored too; without, the fields `lpips` are null.
-        refine_steps: gradient steps on the context views before the targets are scored. With them the metrics have a
+        refine_steps: refinement steps on the context views before the targets are scored. With them the metrics have a
             block `refinement`: the steps done, their seconds, and the scores before.
         revise: effects of the refinement, see `refine_on_capture`. `poses` adjusts those of the context before it is
             streamed, `auto` does if they are off (`poses.adjust_poses`); targets keep theirs.
@@ -69,10 +69,11 @@ def evaluate(
         The metrics as written.
 
     Raises:
-        InputError: a frame is damaged or too small to be scored, or the capture lies in `out`.
+        InputError: a frame is damaged or too small to be scored, the capture lies in `out`, or `out` holds a run.
         StorageError: `out` cannot be written.
     """
     folder, streamed, reporter = RunFolder(out), streamed or capture, reporter or Reporter(quiet=True)
+    folder.check_no_run()
     _check_inputs(capture, split, out, lpips_weights)
     make_writable(out)  # before the long part
     folder.clear_targets()  # they may be of another split

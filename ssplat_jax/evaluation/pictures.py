@@ -74,7 +74,7 @@ def save_image(path: Path, image: Float[np.ndarray, "h w 3"]) -> None:
         StorageError: the file cannot be written.
     """
     encoded = io.BytesIO()
-    Image.fromarray(eight_bits(image)).save(encoded, Image.registered_extensions()[path.suffix])
+    Image.fromarray(eight_bits(image)).save(encoded, Image.registered_extensions()[path.suffix.lower()])
     write_atomic(path, encoded.getvalue())
 
 

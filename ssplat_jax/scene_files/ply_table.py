@@ -146,7 +146,7 @@ def _ascii_columns(path: Path, body: memoryview, before: list[Element], element:
         numbers = np.array(words[offset : offset + size], dtype=np.float64)
     except ValueError as error:
         raise InputError(f"{path}: element {element.name}: wanted numbers ({error}); write the file again.") from error
-    return dict(zip(element.properties, numbers.reshape(element.count, -1).T, strict=True))
+    return dict(zip(element.properties, numbers.reshape(element.count, len(element.properties)).T, strict=True))
 
 
 def _check_size(path: Path, element: Element, wanted: int, came: int, unit: str) -> None:

@@ -3,8 +3,12 @@
 import dataclasses
 from pathlib import Path
 
+from ssplat_jax.errors import refusal
 from ssplat_jax.storage.atomic import previous_path
 from ssplat_jax.storage.folders import remove_numbered
+
+NUMBER = "[0-9]" * 6
+"""Pattern of the numbers of views in file names; other files in a run's folders are the user's."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,7 +106,7 @@ class RunFolder:
 
     def chunk_record_files(self) -> list[Path]:
         """All chunk records in stream order; the list is empty if there is no such folder."""
-        return sorted(self.chunk_records.glob("*.json"))
+        return sorted(self.chunk_records.glob(f"{NUMBER}.json"))
 
     def view(self, i: int) -> Path:
         """The picture of frame `i`."""
@@ -116,13 +120,23 @@ class RunFolder:
         """Whether a state, the newest or the one before it, is saved here."""
         return self.state.exists() or previous_path(self.state).exists()
 
+    def check_no_run(self) -> None:
+        """Checks that no run is saved here, for commands whose results would replace its files.
+
+        Raises:
+            InputError: there is one.
+        """
+        if self.has_state():
+            fix = "choose another folder"
+            raise refusal(f"--out {self.path}", wanted="a folder without a run", got="that of a run", fix=fix)
+
     def has_deltas(self) -> bool:
         """Whether at least one delta is saved here."""
-        return any(self.deltas.glob("*.npz"))
+        return bool(self.delta_files())
 
     def delta_files(self) -> list[Path]:
         """All deltas in stream order; the list is empty if there is no such folder."""
-        return sorted(self.deltas.glob("*.npz"))
+        return sorted(self.deltas.glob(f"{NUMBER}.npz"))
 
     def clear_run(self) -> None:
         """Removes the run that the folder holds; files of the user stay."""

@@ -40,6 +40,8 @@ class SceneFile:
     def changed(self) -> ViewedScene | None:
         """The scene if it has changed since the last call, else None.
 
+        A file that was a scene before and is none now is being written: the scene that was read from it stays.
+
         Raises:
             InputError: the file is not a scene, or its exposure is wanted and unknown.
         """
@@ -48,7 +50,12 @@ class SceneFile:
         if self._stamp is not None and stamp in (None, self._stamp):
             return None
         self._stamp = stamp
-        file = read_scene(self.path)
+        try:
+            file = read_scene(self.path)
+        except InputError:
+            if self._scene is None:
+                raise
+            return None
         gaussians, exposure = file.gaussians, np.ones(3)
         if self._one_exposure:
             gaussians = at_first_exposure(gaussians, scene_exposure(self.path))

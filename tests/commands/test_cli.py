@@ -24,8 +24,10 @@ from ssplat_jax.checkpoint.delta_files import load_delta, load_delta_header
 from ssplat_jax.checkpoint.published_weights import as_published, published_tensors
 from ssplat_jax.checkpoint.stream_state import load_state
 from ssplat_jax.checkpoint.weights import load_params, load_weights, save_weights
+from ssplat_jax.commands import train_command
 from ssplat_jax.commands.main import COMMANDS, guarded, main
 from ssplat_jax.commands.options import apply_changes
+from ssplat_jax.commands.start import start
 from ssplat_jax.config import StreamConfig, preset
 from ssplat_jax.data import capture_summary
 from ssplat_jax.data.capture_summary import summarize
@@ -186,6 +188,11 @@ def test_results_among_the_captures_own_images_are_refused(command, place, tmp_p
         (("eval", "procedural:room", "--context", "8", "--weights", "no.npz", "--out", "x"), "no.npz"),
         (("eval", "procedural:room", "--context", "8", "--lpips-vgg", "vgg.pth", "--out", "x"), "--lpips-heads"),
         (("train", "--lpips-vgg", "no.pth", "--lpips-heads", "heads.pth", "--out", "x"), "no.pth"),
+        (("train", "--validate-every", "5", "--out", "x"), "--validate-every: wanted --captures"),
+        (("run", "x", "--watch", "--revise", "auto", "--refine", "5", "--out", "x"), "--revise auto: wanted a capture"),
+        (("bench", "stream", "--scaling"), "--scaling: bench stream has no use for it"),
+        (("bench", "refine", "--full-hd"), "--full-hd: bench refine has no use for it"),
+        (("bench", "stream", "--against", "x"), "--against: bench stream has no use for it"),
         (("run", "procedural:room?frames=2&size=32x24", "--stride", "0", "--out", "x"), "--stride"),
         (("run", "procedural:room?frames=2&size=32x24", "--save-every", "0", "--out", "x"), "--save-every"),
         (("run", "procedural:room?frames=2&size=32x24", "--max-views", "-1", "--out", "x"), "--max-views"),
@@ -207,6 +214,37 @@ def test_bad_usage_is_one_line_and_exit_2(arguments, named, capsys, tmp_path, mo
     lines = [line for line in capsys.readouterr().err.splitlines() if line.strip()]
     assert len(lines) == 1 and named in lines[0]
     assert not any(tmp_path.iterdir())
+
+
+def test_lpips_weights_are_refused_where_nothing_is_rendered(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(train_command, "load_lpips_weights", lambda vgg, heads: object())
+    assert run("train", "--recipe", "depth", "--out", str(tmp_path / "x")) == 2
+    assert "--lpips-vgg: --recipe depth has no use for it" in capsys.readouterr().err
+    assert not (tmp_path / "x").exists()
+
+
+@pytest.mark.parametrize("command", ["demo", "eval"])
+def test_files_of_a_run_are_not_replaced_by_other_commands(command, tmp_path, capsys):
+    for name in ("state.npz", "scene.ply", "metrics.json", "refined.ply"):
+        (tmp_path / name).write_text("of a run")
+    capture = ("procedural:room?frames=12&size=32x24",) if command == "eval" else ()
+    assert run(command, *capture, "--out", str(tmp_path)) == 2
+    assert "wanted a folder without a run" in capsys.readouterr().err
+    assert [file.read_text() for file in tmp_path.iterdir()] == 4 * ["of a run"]
+
+
+def test_weights_are_refused_for_a_scene_that_is_decoded(tmp_path, capsys):
+    (tmp_path / "scene.ply").write_text("ply")
+    for scene in (tmp_path, tmp_path / "scene.ply"):
+        assert run("export", str(scene), "--to", str(tmp_path / "x.splat"), "--weights", "other.npz") == 2
+        assert "--weights: wanted the folder of a run" in capsys.readouterr().err
+
+
+def test_another_system_is_named(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "platform", "win32")
+    with pytest.raises(SystemExit) as ended:
+        start()
+    assert ended.value.code == 2 and "wanted Linux or macOS, got Windows" in capsys.readouterr().err
 
 
 def test_inspect_prints_json(capsys):

@@ -29,6 +29,7 @@ def test_held_back_frames_are_spread_and_the_others_stay_in_order():
     streamed, held = hold_back(range(0, 40, 2), 3)
     assert held == [6, 20, 32] and streamed == [i for i in range(0, 40, 2) if i not in held]
     assert hold_back([4, 5, 6], 0) == ([4, 5, 6], []) and hold_back([4, 5, 6], 1) == ([4, 6], [5])
+    assert hold_back([4], 0) == ([4], []) and hold_back([], 0) == ([], [])
     for count in range(1, 19):
         assert len(hold_back(range(20), count)[1]) == count
 
@@ -43,6 +44,11 @@ def test_a_record_is_read_as_it_was_written_up_to_a_damaged_one(tmp_path):
     folder = RunFolder(tmp_path)
     for k in (4, 8, 12):
         save_chunk_record(folder.chunk_record(k), record(k, 20.0))
+    for name in ("notes.json", "._000004.json", "0000041.json"):  # of the user, or of another system
+        (folder.chunk_records / name).write_text("{}")
+        (folder.deltas).mkdir(exist_ok=True)
+        (folder.deltas / name).with_suffix(".npz").write_bytes(b"")
+    assert not folder.has_deltas()
     found = load_chunk_records(folder.chunk_record_files())
     assert [r.num_views for r in found] == [4, 8, 12]
     assert found[1].to_dict() == record(8, 20.0).to_dict()

@@ -46,6 +46,8 @@ def with_columns(table, names, dtype="f4"):
 def test_every_encoding_is_the_same_scene(good, form, dtype):
     other = rewritten(good, lambda t: with_columns(t, t.dtype.names, dtype), **form)
     assert_same_scene(load_ply(other), load_ply(good))
+    empty = rewritten(good, lambda t: with_columns(t, t.dtype.names, dtype)[:0], **form)
+    assert load_ply(empty).num_gaussians == 0
 
 
 def test_properties_are_found_by_name_among_unknown_ones(good):

@@ -205,6 +205,11 @@ def test_a_scene_file_is_read_again_when_it_is_written_again(tmp_path):
     assert source.changed().gaussians.num_gaussians == 5 and source.changed() is None
     ss.save_ply(file, scene(7))
     assert source.changed().gaussians.num_gaussians == 7
+    whole = file.read_bytes()
+    file.write_bytes(whole[: len(whole) // 2])  # by a program that is still writing
+    assert source.changed() is None and source.at(1).gaussians.num_gaussians == 7
+    ss.save_ply(file, scene(6))
+    assert source.changed().gaussians.num_gaussians == 6
     file.unlink()
     assert source.changed() is None  # shown on
 
