@@ -8,7 +8,7 @@ from ssplat_jax.checkpoint.delta_files import save_delta
 from ssplat_jax.console import WAITING, Reporter
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.open_capture import open_capture
-from ssplat_jax.errors import require_positive
+from ssplat_jax.errors import refusal, require_positive
 from ssplat_jax.evaluation.scoring import check_scorable
 from ssplat_jax.runs.chunk_recorder import ChunkRecorder, hold_back
 from ssplat_jax.runs.finish_run import finish_run, finished_scene
@@ -69,8 +69,8 @@ def run_capture(
         reporter: shows progress and warnings.
 
     Raises:
-        InputError: the capture is unusable or lies in `out`, too many frames are held back, `out` holds a run of
-            another capture or configuration, or another process is writing to it.
+        InputError: the capture is unusable or lies in `out`, fewer than two frames are to be streamed, too many frames
+            are held back, `out` holds a run of another capture or configuration, or another process is writing to it.
         StorageError: `out` cannot be written or its state is corrupt.
     """
     require_positive(stride=stride, save_every=save_every)
@@ -81,7 +81,11 @@ def run_capture(
         scaled = capture.scaled(scale)
         capture = open_capture(path, size=(scaled.width, scaled.height))
     check_scorable(capture)
-    indices, held_back = hold_back(list(range(0, len(capture), stride))[:max_views], num_held_back)
+    taken = list(range(0, len(capture), stride))[:max_views]
+    if len(taken) < 2:
+        fix = "depth needs views from different places"
+        raise refusal(str(path), wanted="two frames or more to stream", got=str(len(taken)), fix=fix)
+    indices, held_back = hold_back(taken, num_held_back)
     capture.check_output_folder(out)
     capture.verify([*indices, *held_back])
     folder = RunFolder(out)

@@ -24,7 +24,7 @@ def hold_back(indices: Sequence[int], count: int) -> tuple[list[int], list[int]]
     Raises:
         InputError: fewer than two frames would be left to stream.
     """
-    if count == 0:  # one frame alone may be streamed
+    if count == 0:
         return list(indices), []
     if not 0 <= count <= len(indices) - 2:
         wanted, fix = f"0 to {max(len(indices) - 2, 0)} of the {len(indices)} frames", "hold back fewer"

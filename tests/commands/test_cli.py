@@ -197,6 +197,8 @@ def test_results_among_the_captures_own_images_are_refused(command, place, tmp_p
         (("run", "procedural:room?frames=2&size=32x24", "--save-every", "0", "--out", "x"), "--save-every"),
         (("run", "procedural:room?frames=2&size=32x24", "--max-views", "-1", "--out", "x"), "--max-views"),
         (("run", "procedural:room?frames=2&size=10x10", "--out", "x"), "11 pixels"),
+        (("run", "procedural:room?frames=1&size=32x24", "--out", "x"), "wanted two frames or more to stream, got 1"),
+        (("run", "procedural:room?frames=9&size=32x24", "--max-views", "1", "--out", "x"), "two frames or more"),
         (("train", "--scale-steps", "0", "--out", "x"), "--scale-steps"),
         (("run", "procedural:room", "--set", "capacity=65536.0", "--out", "x"), "capacity"),
         (("run", "procedural:room", "--set", "chunk_size=4.5", "--out", "x"), "chunk_size"),

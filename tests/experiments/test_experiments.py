@@ -17,6 +17,8 @@ from ssplat_jax.commands.experiment_command import Experiment
 from ssplat_jax.commands.main import guarded
 from ssplat_jax.commands.options import QualityName
 from ssplat_jax.config import QUALITIES
+from ssplat_jax.refinement.learned_pass import STEPS
+from ssplat_jax.refinement.refine_config import FOR_CAPTURES
 
 
 def row(ms, psnr):
@@ -48,6 +50,8 @@ def test_settings_are_many_and_differ():
 def test_the_second_axis_has_thirty_points_at_sizes_that_are_measured_without_steps_too():
     assert len({setting.name for setting in (*SETTINGS, *REFINED)}) == len(SETTINGS) + len(REFINED) >= 57
     assert {s.factor for s in REFINED} <= {s.factor for s in SETTINGS if not s.changes} and len(REFINED) == 30
+    after_passes = FOR_CAPTURES.learned_passes * STEPS
+    assert all(s.refine_steps % STEPS == 0 or s.refine_steps >= after_passes for s in REFINED)  # a pass is 8 in one
     names = [case.name for case in settings_cases(None, "cpu")]
     assert len(set(names)) == len(names) == len(SETTINGS) + 6
     assert not any("refined" in case.name for case in settings_cases(None, "smoke"))
