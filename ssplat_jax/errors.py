@@ -1,5 +1,7 @@
 """Errors that users can cause. The command line prints each as one line and exits with its code."""
 
+import math
+
 
 class InputError(ValueError):
     """Input from outside is unusable: a capture, an image, a camera, an option. Exit code 2.
@@ -33,14 +35,24 @@ def refusal(where: str, *, wanted: str, got: object, fix: str) -> InputError:
 
 
 def require_positive(**numbers: int | float) -> None:
-    """Checks that options, given by their names, are above 0.
+    """Checks that options, given by their names, are finite and above 0.
 
     Raises:
-        InputError: naming the first number that is not positive.
+        InputError: naming the first number that is not.
     """
     for name, value in numbers.items():
-        if not value > 0:
+        if not 0 < value < math.inf:
             raise InputError(f"--{name.replace('_', '-')}: wanted a number above 0, got {value}.")
+
+
+def require_seed(seed: int) -> None:
+    """Checks that the option --seed is one that NumPy and JAX take.
+
+    Raises:
+        InputError: it is not.
+    """
+    if not 0 <= seed < 2**31:
+        raise InputError(f"--seed: wanted a number from 0 to {2**31 - 1}, got {seed}.")
 
 
 def echo(value: object) -> str:

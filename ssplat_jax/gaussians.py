@@ -75,10 +75,15 @@ def mean_color(gaussians: Gaussians) -> Float[Array, "3"]:
     """Mean constant color of the Gaussians, weighted by opacity; black for an empty scene.
 
     It serves as the background of `fill_holes`.
+
+    Limits:
+        Rows with a color or opacity that is not finite count as absent, as in a render.
     """
-    colors = jnp.maximum(0.5 + SH_C0 * gaussians.sh[:, 0], 0.0)
-    total = jnp.sum(gaussians.opacities)
-    return jnp.sum(gaussians.opacities[:, None] * colors, axis=0) / jnp.where(total > 0, total, 1.0)
+    is_finite = jnp.isfinite(gaussians.sh[:, 0]).all(axis=-1) & jnp.isfinite(gaussians.opacities)
+    weights = jnp.where(is_finite, gaussians.opacities, 0.0)
+    colors = jnp.maximum(0.5 + SH_C0 * jnp.where(is_finite[:, None], gaussians.sh[:, 0], 0.0), 0.0)
+    total = jnp.sum(weights)
+    return jnp.sum(weights[:, None] * colors, axis=0) / jnp.where(total > 0, total, 1.0)
 
 
 def scale_colors(gaussians: Gaussians, factors: Float[Array, "3"]) -> Gaussians:

@@ -94,7 +94,8 @@ def differing_fields() -> list[Addition]:
 @functools.cache
 def additions() -> list[Addition]:
     """The additions that the shipped weights can do without."""
-    return [addition for addition in differing_fields() if _fits(addition)]
+    shipped = load_params("tiny")
+    return [addition for addition in differing_fields() if _fits(addition, shipped)]
 
 
 def unmeasured() -> list[Addition]:
@@ -102,9 +103,9 @@ def unmeasured() -> list[Addition]:
     return [addition for addition in differing_fields() if addition not in additions()]
 
 
-def _fits(addition: Addition) -> bool:
+def _fits(addition: Addition, shipped: dict) -> bool:
     try:
-        check_params(load_params("tiny"), preset("tiny").replace(**{addition.field: addition.literal}), "tiny")
+        check_params(shipped, preset("tiny").replace(**{addition.field: addition.literal}), "tiny")
     except InputError:
         return False
     return True

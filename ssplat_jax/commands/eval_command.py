@@ -54,7 +54,7 @@ class Eval:
     size: str | None = None
     """Image size WxH of the scored views; default the capture's own. --quality sets the streamed size."""
     quality: QualityOption = "accurate"
-    refine: int = 0
+    refine: int | None = None
     """Steps of refinement on the context views after the stream, default 0, with --quality best 100; the scores before
     are reported too."""
     revise: ReviseOption = ()

@@ -4,7 +4,7 @@ import json
 import math
 import re
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args, get_type_hints
 
 import tyro
 
@@ -90,12 +90,18 @@ def apply_changes(config: StreamConfig, changes: tuple[str, ...]) -> StreamConfi
         value = tuple(value) if isinstance(value, list) else value
         held = config.preset if name == "preset" else config.get(name)
         # A field that takes a word or a number (scene_scale) holds a word by default; the configuration checks both.
-        if not isinstance(held, str):
+        if not isinstance(held, str) and not (value is None and _admits_none(config, name)):
             value = float(value) if isinstance(held, float) and type(value) is int else value
             if held is not None and type(value) is not type(held):
                 raise InputError(f"--set {name}: wanted a value like {held!r}, got {text!r}.")
         parsed[name] = value
     return config.replace(**parsed)
+
+
+def _admits_none(config: StreamConfig, name: str) -> bool:
+    """True if None is a value of the field."""
+    group, field = config.find(name)
+    return type(None) in get_args(get_type_hints(type(getattr(config, group)))[field])
 
 
 def causal_changes(changes: tuple[str, ...], causal: bool) -> tuple[str, ...]:
@@ -159,9 +165,9 @@ def check_refinement(steps: int, revise: tuple[str, ...], flag: str) -> None:
         raise InputError(f"--revise: wanted auto alone or effects by name, got {' '.join(revise)}.")
 
 
-def refinement_steps(quality: QualityName, steps: int) -> int:
-    """Gradient steps after the stream: those asked for with --refine, else those of --quality."""
-    return steps or QUALITIES[quality].refine_steps
+def refinement_steps(quality: QualityName, steps: int | None) -> int:
+    """Refinement steps after the stream: those asked for with --refine, else those of --quality."""
+    return QUALITIES[quality].refine_steps if steps is None else steps
 
 
 def load_lpips_weights(vgg: Path | None, heads: Path | None):

@@ -1,6 +1,7 @@
 """`ssplat poses`: camera poses for a video or for photos."""
 
 import dataclasses
+import shlex
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -8,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from ssplat_jax.commands.options import QuietOption
-from ssplat_jax.errors import require_positive
+from ssplat_jax.errors import InputError, require_positive
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,6 +39,8 @@ class Poses:
         from ssplat_jax.poses.verdict import verdict
 
         require_positive(frames=self.frames, max_side=self.max_side)
+        if self.source.is_dir() and self.frames != Poses.frames:
+            raise InputError(f"--frames: wanted a video, got the folder {self.source}, all of whose photos are used.")
         options = PoseOptions(max_frames=self.frames, max_side=self.max_side, is_fisheye=self.fisheye)
         try:
             found = estimate_poses(self.source, self.out, options, self.overwrite, Reporter(self.quiet))
@@ -47,7 +50,8 @@ class Poses:
             raise
         print(f"{self.out}: " + "\n".join(verdict(found)))
         size = _small_size(self.out / "images" / found.parts[0][0])
-        print(f"next: ssplat run {self.out} --size {size} --out runs/{self.out.resolve().name}")
+        place, run = shlex.quote(str(self.out)), shlex.quote(f"runs/{self.out.resolve().name}")
+        print(f"next: ssplat run {place} --size {size} --out {run}")
         return 0
 
 

@@ -65,7 +65,7 @@ class Run:
     """Open a viewer beside the run, which shows the scene while it grows; implies --deltas (extra `viewer`)."""
     port: int = 8080
     """With --view: its port; the next free one if it is taken."""
-    refine: int = 0
+    refine: int | None = None
     """Then take this many steps on the streamed frames, as `ssplat refine` does, into refined.ply; default 0, with
     --quality best 100."""
     revise: ReviseOption = ()
@@ -83,7 +83,7 @@ class Run:
 
     @property
     def refine_steps(self) -> int:
-        """Gradient steps after the stream."""
+        """Refinement steps after the stream."""
         return refinement_steps(self.quality, self.refine)
 
     def run(self) -> int:

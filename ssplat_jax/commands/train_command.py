@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Literal
 
 from ssplat_jax.commands.options import ConfigChanges, LpipsHeads, QuietOption, apply_changes, load_lpips_weights
 from ssplat_jax.config import preset
-from ssplat_jax.errors import InputError, require_positive
+from ssplat_jax.errors import InputError, require_positive, require_seed
 
 if TYPE_CHECKING:
     from ssplat_jax.console import Reporter
@@ -63,6 +63,7 @@ class Train:
         from ssplat_jax.train.recipe import RECIPES
 
         require_positive(scale_steps=self.scale_steps, save_every=self.save_every, validate_every=self.validate_every)
+        require_seed(self.seed)
         if self.recipe == "evidence":
             return self._run_evidence()
         if self.recipe == "refiner":
@@ -204,6 +205,8 @@ class Train:
             if self.validate_every != Train.validate_every:
                 raise InputError("--validate-every: wanted --captures beside it, which it scores; got none.")
             return recipe, None
+        if self.validate_every != Train.validate_every and not any(phase.num_targets for phase in recipe.phases):
+            raise InputError(f"--validate-every: --recipe {self.recipe} renders nothing to score; leave it out.")
         return dataclasses.replace(recipe, fit_gains=True), open_mix(self.captures, self.shares, config, recipe)
 
 

@@ -1,4 +1,4 @@
-"""Usage errors in one line with a suggestion: no command, a misspelt command or option, a missing or bad value."""
+"""Usage errors in one line with a suggestion: no command, a misspelt or repeated option, a missing or bad value."""
 
 import contextlib
 import dataclasses
@@ -23,7 +23,7 @@ def check_usage(arguments: Sequence[str], commands: Mapping[str, type]) -> None:
         commands: all commands, dataclasses, by name.
 
     Raises:
-        InputError: there is no command, or a command or an option that does not exist.
+        InputError: there is no command, a command or an option that does not exist, or an option twice.
     """
     names = ", ".join(commands)
     if not arguments:
@@ -37,12 +37,16 @@ def check_usage(arguments: Sequence[str], commands: Mapping[str, type]) -> None:
         hint = _nearest(name, commands) or "see `ssplat --help`"
         raise InputError(f"wanted a command ({names}), got {echo(name)}; {hint}.")
     options = [f"--{field.name.replace('_', '-')}" for field in dataclasses.fields(commands[name])]
+    given = set()
     for word in arguments[1:]:
         option = word.partition("=")[0].replace("_", "-")
         # A single hyphen may begin a number.
         if option.startswith("--") and option not in (*options, *HELP):
             hint = _nearest(option, options) or f"see `ssplat {name} --help`"
             raise InputError(f"{name}: there is no option {echo(word.partition('=')[0])}; {hint}.")
+        if option in options and option in given:  # the parser would take the last one alone
+            raise InputError(f"{name}: wanted {option} once, got it twice; several values go behind one {option}.")
+        given.add(option)
 
 
 def parse_in_one_line(parse: Callable[[], Any], name: str) -> Any:

@@ -4,7 +4,7 @@ import dataclasses
 from pathlib import Path
 
 from ssplat_jax.commands.options import parse_size
-from ssplat_jax.errors import require_positive
+from ssplat_jax.errors import require_positive, require_seed
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,13 +28,11 @@ class Worlds:
     def run(self) -> int:
         from ssplat_jax.console import Reporter
         from ssplat_jax.data.worlds.world_capture import write_worlds
-        from ssplat_jax.errors import InputError
 
         size = parse_size(self.size)
         assert size is not None
         require_positive(count=self.count, frames=self.frames, size=min(size))
-        if self.seed < 0:
-            raise InputError(f"--seed: wanted a number from 0, got {self.seed}.")
+        require_seed(self.seed)
         with Reporter().progress("worlds", self.count, waiting="") as advance:
             rendered = write_worlds(self.out, self.count, self.seed, size, self.frames, advance)
         print(f"{self.out}: {self.count} worlds, {rendered} of them new")

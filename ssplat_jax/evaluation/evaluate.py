@@ -20,7 +20,7 @@ from ssplat_jax.evaluation.scoring import Display, ViewScore, baselines, check_s
 from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.metrics.lpips import LpipsWeights, check_size
 from ssplat_jax.metrics.psnr_ssim import SSIM_ARGUMENTS
-from ssplat_jax.poses.adjust_poses import adjust_if_asked
+from ssplat_jax.poses.adjust_poses import adjust_if_asked, check_look_ahead
 from ssplat_jax.refinement import CaptureRefinement, refine_on_capture
 from ssplat_jax.storage.atomic import write_atomic
 from ssplat_jax.storage.folders import make_writable
@@ -69,11 +69,13 @@ def evaluate(
         The metrics as written.
 
     Raises:
-        InputError: a frame is damaged or too small to be scored, the capture lies in `out`, or `out` holds a run.
+        InputError: a frame is damaged or too small to be scored, the capture lies in `out`, `out` holds a run, or poses
+            of a causal stream are to be adjusted.
         StorageError: `out` cannot be written.
     """
     folder, streamed, reporter = RunFolder(out), streamed or capture, reporter or Reporter(quiet=True)
     folder.check_no_run()
+    check_look_ahead(revise, is_causal=session.model.config.stream.causal)
     _check_inputs(capture, split, out, lpips_weights)
     make_writable(out)  # before the long part
     folder.clear_targets()  # they may be of another split

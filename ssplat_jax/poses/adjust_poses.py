@@ -12,6 +12,7 @@ from ssplat_jax.console import Reporter
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.depth_range import estimate_depths
 from ssplat_jax.data.posed_image import invert_pose
+from ssplat_jax.errors import refusal
 from ssplat_jax.poses.bundle_adjustment import Adjustment, Observations, adjust, moved
 from ssplat_jax.poses.tracks import find_tracks
 
@@ -105,6 +106,17 @@ def adjust_poses(
         shift=float(np.median(np.linalg.norm(after.twists[:, 3:], axis=1))),
         num_points=seen.num_points,
     )
+
+
+def check_look_ahead(revise: Sequence[str], *, is_causal: bool) -> None:
+    """Checks that no causal stream is asked to adjust its poses, which looks at all frames.
+
+    Raises:
+        InputError: it is.
+    """
+    if is_causal and (early := [name for name in ("poses", "auto") if name in revise]):
+        got, fix = "a causal one (--causal, or stream.causal=true)", "leave one out"
+        raise refusal(f"--revise {early[0]}", wanted="a stream that may look ahead", got=got, fix=fix)
 
 
 def adjust_if_asked(

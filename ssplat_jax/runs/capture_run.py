@@ -10,6 +10,7 @@ from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.errors import refusal, require_positive
 from ssplat_jax.evaluation.scoring import check_scorable
+from ssplat_jax.poses.adjust_poses import check_look_ahead
 from ssplat_jax.runs.chunk_recorder import ChunkRecorder, hold_back
 from ssplat_jax.runs.finish_run import finish_run, finished_scene
 from ssplat_jax.runs.resume import RunState, resume_run, run_identity, save_run
@@ -70,10 +71,12 @@ def run_capture(
 
     Raises:
         InputError: the capture is unusable or lies in `out`, fewer than two frames are to be streamed, too many frames
-            are held back, `out` holds a run of another capture or configuration, or another process is writing to it.
+            are held back, poses of a causal stream are to be adjusted, `out` holds a run of another capture or
+            configuration, or another process is writing to it.
         StorageError: `out` cannot be written or its state is corrupt.
     """
     require_positive(stride=stride, save_every=save_every)
+    check_look_ahead(revise, is_causal=model.config.stream.causal)
     if max_views is not None:
         require_positive(max_views=max_views)
     capture = open_capture(path, size=size)

@@ -128,6 +128,7 @@ def _eval_scenes(
     written: dict[str, str],
 ) -> dict[str, Any]:
     """The metrics of every scene of an index; all are opened before the first is streamed."""
+    RunFolder(out).check_no_run()
     if unsafe := [scene for scene in index if not (folder / scene).resolve().is_relative_to(folder.resolve())]:
         got, fix = echo(unsafe[0]), "name scenes after folders"
         raise refusal("--index", wanted=f"scenes below {folder}", got=got, fix=fix)

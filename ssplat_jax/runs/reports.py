@@ -1,5 +1,6 @@
 """The reports of `ssplat run` and `ssplat eval`: a page and a contact sheet of what their folder holds."""
 
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -58,7 +59,7 @@ def report_run(folder: RunFolder, metrics: dict[str, Any], path: str) -> None:
         facts.append(("of the cache in use", f"{records[-1].occupancy:.0%}"))
     if held_back := [r.held_back_psnr for r in records if r.held_back_psnr is not None]:
         facts.append(("held-back views as shown", f"{held_back[-1]:.2f} dB"))
-    out, capture = folder.path, _quoted(path)
+    out, capture, film = map(shlex.quote, (str(folder.path), path, f"{folder.path}_film"))
     report = Report(
         title=metrics["capture"],
         summary=f"A scene of 3D Gaussians from {metrics['views']} views of {width} x {height} pixels, streamed once.",
@@ -70,7 +71,7 @@ def report_run(folder: RunFolder, metrics: dict[str, Any], path: str) -> None:
         commands=[
             f"ssplat view {out}    # in a browser",
             f"ssplat refine {out} {capture} --steps 100    # a better scene: compares it with its views, step by step",
-            f"ssplat render {out} {capture} --size {width}x{height} --film 8 --out {out}_film    # a film",
+            f"ssplat render {out} {capture} --size {width}x{height} --film 8 --out {film}    # a film",
             f"ssplat export {out} --to scene.sog    # for other viewers, at an eighth of the size",
         ],
         details=_details(metrics),
@@ -179,8 +180,3 @@ def _details(metrics: dict[str, Any]) -> list[tuple[str, str]]:
     if frame.get("warning"):
         rows.append(("warning", frame["warning"]))
     return rows
-
-
-def _quoted(path: str) -> str:
-    """A path as one word of a shell."""
-    return f"'{path}'" if set(path) & set(" ?&*()") else path

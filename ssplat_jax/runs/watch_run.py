@@ -128,6 +128,8 @@ class _Watch:
             if old != new:
                 fix = "name frames so that new ones come last, and leave old ones as they are"
                 raise refusal(str(self.path), wanted="frames added at the end", got="changes to earlier ones", fix=fix)
+        if self.capture is None or len(capture) > len(self.capture):  # also frames that `stride` leaves out
+            self.last_change = time.monotonic()
         self.capture = capture
         for i in list(range(0, len(capture), self.options.stride))[len(self.indices) : self.options.max_views]:
             try:

@@ -90,14 +90,14 @@ def open_mix(folders: Sequence[Path], shares: Sequence[float], config: StreamCon
             frames for a sample, or no depth map where the recipe renders no target view.
     """
     shares = list(shares) or [0.5 / len(folders)] * len(folders)
-    if len(shares) != len(folders) or min(shares) <= 0 or sum(shares) > 1 + 1e-9:
+    if len(shares) != len(folders) or not all(share > 0 for share in shares) or sum(shares) > 1 + 1e-9:
         wanted = f"{len(folders)} numbers above 0 that add up to at most 1, one for each of --captures"
         raise refusal("--shares", wanted=wanted, got=" ".join(map(str, shares)), fix="give one share a folder")
     needed = max(p.num_chunks * config.stream.chunk_size + p.num_targets for p in recipe.phases)
     renders_nothing = all(phase.num_targets == 0 for phase in recipe.phases)
     groups = []
     for folder, share in zip(folders, shares, strict=True):
-        captures = tuple(open_capture(path, size=ESTIMATION_SIZE) for path in _captures_in(folder))
+        captures = tuple(open_capture(path, size=ESTIMATION_SIZE) for path in captures_in(folder))
         for capture in captures:
             if (count := len(learned_frames(capture))) < needed:
                 wanted = f"at least {needed} frames besides those held out, as a sample of the recipe has"
@@ -110,7 +110,7 @@ def open_mix(folders: Sequence[Path], shares: Sequence[float], config: StreamCon
     return CaptureMix(tuple(groups), config)
 
 
-def _captures_in(folder: Path) -> list[Path]:
+def captures_in(folder: Path) -> list[Path]:
     """`folder` if it is a capture (or nothing that a reader knows, which `open_capture` explains), else those in it."""
     if is_capture(folder) or not folder.is_dir():
         return [folder]

@@ -1,6 +1,7 @@
 """Finished streams to learn from: recipes that train on what a stream ends with, without gradients through it."""
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,6 +23,7 @@ from ssplat_jax.refinement.view_loss import EFFECTS
 from ssplat_jax.streaming.feed import feed_capture
 from ssplat_jax.streaming.session import Session
 from ssplat_jax.streaming.streamsplat import StreamSplat, shown_pivots
+from ssplat_jax.train.capture_samples import captures_in
 
 MIN_MSE = 1e-4
 """Added to squared errors before the logarithm, so that views that are nearly right do not count most."""
@@ -58,7 +60,7 @@ def captures_of(paths: Sequence[Path], sources: SceneSources, smallest: tuple[in
     """All scenes to learn from, each with its stride; every capture at the width of `sources`.
 
     Args:
-        paths: captures.
+        paths: captures, or folders of captures.
         sources: width, strides and procedural scenes.
         smallest: smallest height and width of an image.
 
@@ -70,7 +72,7 @@ def captures_of(paths: Sequence[Path], sources: SceneSources, smallest: tuple[in
     """
     width = sources.width
     opened = [(open_capture(spec, size=(width, width * 3 // 4)), 1) for spec in sources.procedural]
-    for path in paths:
+    for path in itertools.chain.from_iterable(map(captures_in, paths)):
         capture = open_capture(path)
         height = round(capture.height * width / capture.width)
         opened += [(open_capture(path, size=(width, height)), stride) for stride in sources.strides]

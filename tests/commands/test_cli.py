@@ -31,6 +31,7 @@ from ssplat_jax.commands.start import start
 from ssplat_jax.config import StreamConfig, preset
 from ssplat_jax.data import capture_summary
 from ssplat_jax.data.capture_summary import summarize
+from ssplat_jax.errors import InputError
 from ssplat_jax.evaluation import latency
 from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.scene_files.ply import load_ply, save_ply
@@ -208,6 +209,14 @@ def test_results_among_the_captures_own_images_are_refused(command, place, tmp_p
         (("import-weights", "no.pth", "--out", "x.npz"), "no.pth: cannot be read"),
         (("run", "procedural:room", "--weights", "small", "--out", "x"), "none ship with the preset 'small'"),
         (("inspect", "procedural:castle"), "castle"),
+        (("run", "x", "--out", "y", "--set", "a=1", "--revise", "poses", "--set", "b=2"), "wanted --set once, got it"),
+        (("run", "procedural:room", "--causal", "--revise", "poses", "--out", "x"), "--revise poses: wanted a stream"),
+        (("eval", "procedural:room?size=32x24", "--causal", "--revise", "auto", "--out", "x"), "--revise auto: wanted"),
+        (("train", "--seed", "-1", "--out", "x"), "--seed: wanted a number from 0"),
+        (("train", "--seed", str(2**63), "--out", "x"), "--seed: wanted a number from 0"),
+        (("train", "--scale-steps", "inf", "--out", "x"), "--scale-steps: wanted a number above 0"),
+        (("worlds", "--count", "1", "--seed", "-1", "--out", "x"), "--seed: wanted a number from 0"),
+        (("poses", ".", "--frames", "20", "--out", "x"), "--frames: wanted a video"),
     ],
 )
 def test_bad_usage_is_one_line_and_exit_2(arguments, named, capsys, tmp_path, monkeypatch):
@@ -225,14 +234,20 @@ def test_lpips_weights_are_refused_where_nothing_is_rendered(tmp_path, capsys, m
     assert not (tmp_path / "x").exists()
 
 
-@pytest.mark.parametrize("command", ["demo", "eval"])
+@pytest.mark.parametrize("command", ["demo", "eval", "eval --index"])
 def test_files_of_a_run_are_not_replaced_by_other_commands(command, tmp_path, capsys):
+    out = tmp_path / "out"
+    out.mkdir()
     for name in ("state.npz", "scene.ply", "metrics.json", "refined.ply"):
-        (tmp_path / name).write_text("of a run")
-    capture = ("procedural:room?frames=12&size=32x24",) if command == "eval" else ()
-    assert run(command, *capture, "--out", str(tmp_path)) == 2
+        (out / name).write_text("of a run")
+    arguments = {"demo": (), "eval": ("procedural:room?frames=12&size=32x24",)}.get(command)
+    if arguments is None:  # eval of scenes
+        make_capture(tmp_path / "scenes" / "wall", num_frames=3)
+        (tmp_path / "index.json").write_text(json.dumps({"wall": {"context": [0, 2], "target": [1]}}))
+        arguments = (str(tmp_path / "scenes"), "--index", str(tmp_path / "index.json"))
+    assert run(command.split()[0], *arguments, "--out", str(out)) == 2
     assert "wanted a folder without a run" in capsys.readouterr().err
-    assert [file.read_text() for file in tmp_path.iterdir()] == 4 * ["of a run"]
+    assert [file.read_text() for file in out.iterdir()] == 4 * ["of a run"]
 
 
 def test_weights_are_refused_for_a_scene_that_is_decoded(tmp_path, capsys):
@@ -284,6 +299,12 @@ def test_set_takes_what_the_field_holds(change, field, value):
     changed = apply_changes(preset("tiny"), (change,))
     assert changed.get(field) == value and type(changed.get(field)) is type(value)
     hash(changed)
+
+
+def test_set_takes_null_where_a_field_may_be_empty():
+    assert apply_changes(preset("small"), ("depth_range=null",)).network.depth_range is None
+    with pytest.raises(InputError, match=r"--set voxel_size: wanted a value like 0\.\d+, got 'null'"):
+        apply_changes(preset("tiny"), ("voxel_size=null",))
 
 
 def assert_deltas_give_the_scene(out, *names):

@@ -11,8 +11,8 @@ from ssplat_jax.errors import InputError
 
 def test_steps_that_are_asked_for_go_before_those_of_the_quality():
     assert QUALITIES["best"].refine_steps == 100 and QUALITIES["best"].scale == 1.0
-    assert [refinement_steps("best", steps) for steps in (0, 30)] == [100, 30]
-    assert [refinement_steps("accurate", steps) for steps in (0, 30)] == [0, 30]
+    assert [refinement_steps("best", steps) for steps in (None, 0, 30)] == [100, 0, 30]
+    assert [refinement_steps("accurate", steps) for steps in (None, 0, 30)] == [0, 0, 30]
 
 
 def test_best_refines_after_the_stream(monkeypatch, tmp_path):

@@ -11,6 +11,9 @@ import jax
 import pytest
 
 from ssplat_jax.checkpoint.weights import save_weights
+from ssplat_jax.console import Reporter
+from ssplat_jax.runs import watch_run
+from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.streaming.streamsplat import StreamSplat
 from tests.commands.test_cli import few_pivots, make_capture, run  # noqa: F401
 from tests.streaming.narrow_model import NARROW
@@ -57,6 +60,22 @@ def test_a_growing_folder_gives_the_scene_of_the_whole_one(tmp_path, narrow):
         assert (outs[1] / name).read_bytes() == (outs[0] / name).read_bytes(), name
     # The finished folder is the causal run of the finished capture.
     assert run("run", str(growing), "--causal", "--out", str(outs[1]), *narrow) == 0
+
+
+def test_frames_that_are_left_out_are_signs_of_life_too(tmp_path, monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr(watch_run.time, "monotonic", lambda: now[0])
+    whole = make_capture(tmp_path / "whole", num_frames=9, size=SIZE)
+    facts = json.loads((whole / "transforms.json").read_text())
+    options = watch_run.WatchOptions(stride=8, quiet_seconds=1.0)
+    model = StreamSplat(NARROW)
+    watch = watch_run._Watch(model, {}, whole, RunFolder(tmp_path), options, Reporter(quiet=True))
+    for count in range(1, 9):
+        now[0] += 0.9
+        (whole / "transforms.json").write_text(json.dumps(facts | {"frames": facts["frames"][:count]}))
+        assert not watch.look() and watch.indices == [0]
+    now[0] += 1.1
+    assert watch.look()
 
 
 def test_it_ends_after_quiet_seconds_and_goes_on_later(tmp_path, narrow, capsys):

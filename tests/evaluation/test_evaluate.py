@@ -4,6 +4,7 @@ import dataclasses
 import json
 from types import SimpleNamespace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -44,6 +45,19 @@ def test_mean_color_weighs_by_opacity_and_leaves_absent_rows_out():
     scene = gaussians([[1, 0, 0], [0, 1, 0], [0, 0, 1]], [0.3, 0.9, 0.0])
     np.testing.assert_allclose(mean_color(scene), [0.25, 0.75, 0], atol=1e-6)
     np.testing.assert_array_equal(mean_color(gaussians([[0.2, 0.3, 0.4]], [0.0])), 0)
+
+
+@pytest.mark.parametrize("bad", [jnp.nan, jnp.inf, -jnp.inf])
+@pytest.mark.parametrize("opacity", [0.0, 0.9])
+def test_rows_that_are_not_finite_give_no_color(bad, opacity):
+    good = gaussians([[1, 0, 0], [0, 1, 0]], [0.3, 0.9])
+    for scene in (
+        gaussians([[1, 0, 0], [0, 1, 0], [0.5, bad, 0.5]], [0.3, 0.9, opacity]),
+        gaussians([[1, 0, 0], [0, 1, 0], [0.5, 0.5, 0.5]], [0.3, 0.9, bad]),
+    ):
+        np.testing.assert_array_equal(mean_color(scene), mean_color(good))
+        slope = jax.grad(lambda scene: mean_color(scene).sum())(scene)
+        assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(slope))
 
 
 @pytest.fixture(scope="module")

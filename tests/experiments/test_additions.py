@@ -30,6 +30,7 @@ def test_each_step_changes_one_field():
     assert differing(path[-1], preset("tiny")) == ["memory.capacity"]  # the memory starts small
 
 
+@pytest.mark.slow  # traces the network for every field
 def test_no_differing_field_is_forgotten():
     listed = [a.field for a in (*additions(), *unmeasured())]
     assert sorted(listed) == sorted(a.field for a in differing_fields())

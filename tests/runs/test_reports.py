@@ -4,6 +4,7 @@ import base64
 import html
 import io
 import re
+import shlex
 from html.parser import HTMLParser
 
 import numpy as np
@@ -122,6 +123,17 @@ def test_the_report_of_a_run_holds_its_pictures_and_figures(folder):
         assert -10 * np.log10(np.mean((images[place] - smooth_picture(k)) ** 2)) > JPEG_DB
     titles = re.findall(r'class="title" >([^<]*)<', text)
     assert titles == ["Time of a chunk", "Cache in use", "Views that are held back", "Scene", "Exposure"]
+
+
+def test_printed_commands_are_words_of_a_shell(tmp_path):
+    folder, path = RunFolder(tmp_path / "my kitchen"), "it's $HOME; x"
+    folder.path.mkdir()
+    report_run(folder, COMMON | {"views": 4, "ply": {"num_written": 5}, "seen_views": [score(0)]}, path)
+    commands = [shlex.split(line, comments=True) for line in Page(folder.report.read_text()).text.splitlines()
+                if line.strip().startswith("ssplat ")]  # fmt: skip
+    assert [words[1] for words in commands] == ["view", "refine", "render", "export"]
+    assert all(words[2] == str(folder.path) for words in commands)
+    assert commands[1][3] == commands[2][3] == path and commands[2][-1] == f"{folder.path}_film"
 
 
 def test_the_report_of_a_run_without_records_or_pictures_is_whole(folder):

@@ -134,6 +134,7 @@ def test_procedural_steps_stay_those_of_a_run_without_captures(mix, capture):
         (["here"], [0.7, 0.1], r"--shares: wanted 1 numbers .* got 0\.7 0\.1"),
         (["here", "there"], [0.7, 0.4], "add up to at most 1"),
         (["here"], [0.0], "above 0"),
+        (["here"], [float("nan")], "above 0"),
         (["no/such/folder"], [], "nothing of that name"),
     ],
 )

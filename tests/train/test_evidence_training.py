@@ -19,6 +19,8 @@ from ssplat_jax.rasterizer import render
 from ssplat_jax.streaming.streamsplat import StreamSplat
 from ssplat_jax.train import streamed_scenes
 from ssplat_jax.train.evidence_training import EvidenceRecipe, crop_camera, train_evidence
+from ssplat_jax.train.streamed_scenes import SceneSources, captures_of
+from tests.commands.test_cli import make_capture
 
 RECIPE = EvidenceRecipe(
     steps=6, crop=(32, 48), width=64, procedural=("procedural:room?frames=12",), warmup_steps=1, learning_rate=0.02
@@ -111,6 +113,15 @@ def test_a_configuration_without_evidence_is_refused():
     model = StreamSplat(preset("tiny").replace(evidence=False))
     with pytest.raises(InputError, match=r"head\.evidence"):
         train_evidence(model, load_params("tiny"), [], RECIPE)
+
+
+def test_a_folder_of_captures_is_those_in_it(tmp_path):
+    for name in ("a", "b"):
+        make_capture(tmp_path / name, num_frames=2, size=(64, 48))
+    (tmp_path / "notes").mkdir()
+    sources = SceneSources(width=64, strides=(1, 2), procedural=())
+    found = captures_of([tmp_path], sources, (16, 16))
+    assert [(capture.name, stride) for capture, stride in found] == [("a", 1), ("a", 2), ("b", 1), ("b", 2)]
 
 
 def test_images_smaller_than_a_crop_are_refused():
