@@ -42,7 +42,7 @@ def require_positive(**numbers: int | float) -> None:
     """
     for name, value in numbers.items():
         if not 0 < value < math.inf:
-            raise InputError(f"--{name.replace('_', '-')}: wanted a number above 0, got {value}.")
+            raise InputError(f"--{name.replace('_', '-')}: wanted a finite number above 0, got {value}.")
 
 
 def require_seed(seed: int) -> None:

@@ -77,7 +77,7 @@ def mean_color(gaussians: Gaussians) -> Float[Array, "3"]:
     It serves as the background of `fill_holes`.
 
     Limits:
-        Rows with a color or opacity that is not finite count as absent, as in a render.
+        Rows whose color or opacity is not finite are left out.
     """
     is_finite = jnp.isfinite(gaussians.sh[:, 0]).all(axis=-1) & jnp.isfinite(gaussians.opacities)
     weights = jnp.where(is_finite, gaussians.opacities, 0.0)

@@ -3,9 +3,10 @@
     ssplat experiment ablation --captures path/to/captures --out runs/ablation
 
 Every variant starts from the shipped matcher, with all other stages untrained. The stages after the matcher are
-trained by rendering, then the evidence head on whole streams, for the same steps on the same samples, once per seed.
-The decoded cache is scored on unseen views of `procedural:revisit` (weak textures and revisits) and of the captures of
-the experiment `captures` that `--captures` has.
+trained by rendering, then the evidence head on whole streams, for the same steps on the same samples: the variants of
+`REPEATED` with every seed, the others with the first. The decoded cache is scored on unseen views of
+`procedural:revisit` (weak textures and revisits) and of the captures of the experiment `captures` that `--captures`
+has.
 """
 
 import dataclasses
@@ -48,7 +49,7 @@ COLUMNS = ("shown", "literal")
 
 @dataclasses.dataclass(frozen=True)
 class Variant:
-    """A model that lacks a part, or keeps it untrained."""
+    """Changes that make a variant of the full model."""
 
     changes: dict[str, Any] = dataclasses.field(default_factory=dict)
     """Changes of the full configuration."""
@@ -145,7 +146,7 @@ BUDGETS = {
 
 
 def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str:
-    """Trains and scores every variant for every seed."""
+    """Trains and scores the variants."""
     return run_study(STUDY, captures, out, scale, reporter)
 
 
@@ -157,13 +158,19 @@ def config_of(variant: str) -> StreamConfig:
 def cases(captures: Path | None, scale: str) -> list[Case]:
     """A case for each variant and seed: first those of `REPEATED`, seed by seed, so that they can be compared early."""
     budget = at_scale(BUDGETS, scale)
-    scenes = scenes_of(captures)
+    scenes = scenes_of(captures if scale != "smoke" else None)
     asked = {name: value for name, value in dataclasses.asdict(budget).items() if name not in ("seeds", "trainings")}
     return [
         Case(
             name=f"{variant}, seed {seed}",
             config=config_of(variant),
-            asked={"seed": seed, "scenes": scenes, "learned": learned_from(captures), "variant": variant, **asked},
+            asked={
+                "seed": seed,
+                "scenes": scenes,
+                "learned": learned_from(captures),
+                "untrained": VARIANTS[variant].untrained,
+                **asked,
+            },
             measure=functools.partial(measured, variant, seed, budget, scenes, captures),
         )
         for variant, seed in trainings(budget)
@@ -203,7 +210,7 @@ def measured(variant: str, seed: int, budget: Budget, scenes: list[str], capture
 
 
 def trained(variant: str, config: StreamConfig, seed: int, budget: Budget, captures: Path | None) -> dict:
-    """Parameters of a variant after the training that all variants share.
+    """Parameters of a variant after its training; one without an evidence head trains none.
 
     Raises:
         KeyboardInterrupt: a signal stopped it.
@@ -298,8 +305,8 @@ def gallery(rows: list[Row]) -> str:
 STUDY = Study(
     name="ablation",
     text="""Every variant starts from the shipped matcher, with all other stages untrained. The stages after it are
-trained by rendering, then the evidence head on whole streams, for the same steps on the same samples, once per seed.
-Scores are of unseen views; each seed has a `revisit` of its own.""",
+trained by rendering, then the evidence head on whole streams, for the same steps on the same samples; `constant head`
+has no evidence head to train. Scores are of unseen views; each seed has a `revisit` of its own.""",
     cases=cases,
     finish=add_differences,
     findings=findings,

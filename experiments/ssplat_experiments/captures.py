@@ -35,6 +35,8 @@ def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str
     """Evaluates the captures that are there and writes the table; `smoke` takes 8 context views of each."""
     if captures is None:
         raise InputError("experiment captures: wanted --captures, a folder with captures by their names.")
+    if not any((captures / name).is_dir() for name, *_ in SETTINGS):
+        raise InputError(f"experiment captures: {captures} holds none of {', '.join(s[0] for s in SETTINGS)}.")
     model, params = StreamSplat(preset("tiny")), load_params("tiny")
     rows = []
     for name, stride, context, size in SETTINGS:
@@ -61,8 +63,6 @@ def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str
             "chunk_ms": metrics["chunk_ms"]["median"],
         }
         rows.append(row)
-    if not rows:
-        raise InputError(f"experiment captures: {captures} holds none of {', '.join(s[0] for s in SETTINGS)}.")
     reporter.table("novel views of real captures", tuple(rows[0]), [tuple(row.values()) for row in rows])
     write_json(out / "table.json", rows)
     return f"wrote {out}/table.json and pictures beside it"

@@ -60,7 +60,7 @@ def run_benchmark(
     elif name == "stream":
         rows = [dataclasses.asdict(row) for row in (*bench_cache(preset("tiny")), *bench_step(), *bench_online())]
     else:
-        raise InputError(f"bench: wanted one of {', '.join(BENCHMARKS)}, got {name!r}.")
+        raise InputError(f"bench: wanted one of {', '.join(BENCHMARKS)}, got {name!r}; choose one.")
     return {"machine": machine(), "date": today(), "commit": commit(), "rows": rows}
 
 

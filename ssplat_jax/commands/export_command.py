@@ -40,11 +40,11 @@ class Export:
 
         reporter = Reporter(quiet=False)
         folder, selection = RunFolder(self.scene), Selection(self.prune, self.max_splats)
-        cameras = None if self.cameras is None else open_cameras(self.cameras, self.scene, self.to)
+        cameras = None if self.cameras is None else open_cameras(self.cameras, self.scene, self.to, reporter)
         file = self.scene if self.scene.is_file() else folder.scene  # the latter in a folder of `ssplat demo`
         if file.exists() and not folder.has_state():
             if self.weights != Export.weights:
-                raise InputError(f"--weights: wanted the folder of a run, got {self.scene}, which is decoded already.")
+                raise InputError(f"--weights: wanted a run, got {self.scene}, which is decoded already; leave it out.")
             report = convert_scene(file, self.to, selection)
         else:
             report = export_run(self.scene, self.to, load_params(self.weights), reporter, selection)

@@ -40,7 +40,7 @@ class Poses:
 
         require_positive(frames=self.frames, max_side=self.max_side)
         if self.source.is_dir() and self.frames != Poses.frames:
-            raise InputError(f"--frames: wanted a video, got the folder {self.source}, all of whose photos are used.")
+            raise InputError(f"--frames: wanted a video, got photos ({self.source}), which are all used; leave it out.")
         options = PoseOptions(max_frames=self.frames, max_side=self.max_side, is_fisheye=self.fisheye)
         try:
             found = estimate_poses(self.source, self.out, options, self.overwrite, Reporter(self.quiet))

@@ -104,8 +104,9 @@ class Run:
         check_refinement(self.refine_steps, self.revise, "--refine")
         if self.quiet_seconds != Run.quiet_seconds and not self.watch:
             raise InputError("--quiet-seconds: wanted --watch beside it, which it is for; got none.")
-        if self.watch and (early := [name for name in ("poses", "auto") if name in self.revise]):
-            raise InputError(f"--revise {early[0]}: wanted a capture that is complete, got --watch; leave one out.")
+        for name in {"poses", "auto"} & set(self.revise):  # before the stream, they look at all frames
+            if self.watch:
+                raise InputError(f"--revise {name}: wanted a capture that is complete, got --watch; leave one out.")
         if self.watch and (self.axes or self.poses):
             raise InputError("--watch: wanted poses as transforms.json has them, got --axes or --poses; leave one out.")
         if self.hold_back and self.watch:
@@ -168,11 +169,12 @@ class Run:
 
         reporter, size, scale = Reporter(self.quiet), parse_size(self.size), QUALITIES[self.quality].scale
         changes: tuple[str, ...] = ()
+        on_accept = None
         if self.budget_ms is not None:
             path = capture_path(self.capture, self.axes, self.poses)
-            point = setting_for_run(self.budget_ms, path, size, self.out, overwrite=self.overwrite, reporter=reporter)
-            scale = point.factor
-            changes = tuple(f"{name}={json.dumps(value)}" for name, value in point.changes.items())
+            choice = setting_for_run(self.budget_ms, path, size, self.out, overwrite=self.overwrite, reporter=reporter)
+            scale, on_accept = choice.point.factor, choice.save
+            changes = tuple(f"{name}={json.dumps(value)}" for name, value in choice.point.changes.items())
         changes = online_changes((*changes, *self.set), self.online_refine)
         model, params = load_model(self.weights, causal_changes(changes, self.causal))
         return run_capture(
@@ -190,6 +192,7 @@ class Run:
             num_held_back=self.hold_back,
             revise=self.revise,
             reporter=reporter,
+            on_accept=on_accept,
         )
 
     def _watch(self) -> "RunResult":

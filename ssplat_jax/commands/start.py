@@ -24,7 +24,7 @@ PATIENCE = 5.0
 
 def start() -> None:
     """Runs the command line of this process and exits with its code."""
-    if sys.platform == "win32":  # no locks of folders, and no flushing of them
+    if sys.platform == "win32":  # it can neither lock nor flush a folder as we do
         print("ssplat: wanted Linux or macOS, got Windows; use the Windows Subsystem for Linux.", file=sys.stderr)
         sys.exit(2)
     interrupt = _Interrupt()

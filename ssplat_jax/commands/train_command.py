@@ -56,7 +56,7 @@ class Train:
     def run(self) -> int:
         import jax
 
-        from ssplat_jax.checkpoint.weights import check_params, load_weights, save_weights
+        from ssplat_jax.checkpoint.weights import check_params, load_weights, params_digest, save_weights
         from ssplat_jax.console import Reporter
         from ssplat_jax.model import complete_params
         from ssplat_jax.train.loop import train
@@ -70,19 +70,18 @@ class Train:
             return self._run_refiner()
         config = apply_changes(preset(self.preset), self.set)
         recipe = dataclasses.replace(RECIPES[self.recipe].scaled(self.scale_steps), seed=self.seed)
-        reporter, params = Reporter(self.quiet), None
+        reporter, params, name = Reporter(self.quiet), None, None
         if self.init_weights:
             given = load_weights(self.init_weights)[0]
+            name = params_digest(given)  # not of the stages that are added, whose last bits depend on the device
             params = complete_params(jax.random.key(self.seed), config, given)
             check_params(params, config, str(self.init_weights))
             if fresh := [name for name, stage in params.items() if stage and not given.get(name)]:
                 reporter.say(f"{self.init_weights} has no {', '.join(fresh)}: random at the start")
         recipe, mix = self._opened(config, recipe)
         lpips_weights = load_lpips_weights(self.lpips_vgg, self.lpips_heads)
-        if lpips_weights and not any(phase.num_targets for phase in recipe.phases):
-            raise InputError(
-                f"--lpips-vgg: --recipe {self.recipe} has no use for it, it renders nothing; leave it out."
-            )
+        if lpips_weights and not recipe.renders:
+            raise InputError(f"--lpips-vgg: --recipe {self.recipe} renders nothing to compare; leave it out.")
         duration = ""
         if self.recipe in MINUTES:
             duration = f", about {max(1, round(MINUTES[self.recipe] * self.scale_steps))} minutes on two cores"
@@ -94,6 +93,7 @@ class Train:
                 recipe,
                 self.out,
                 params=params,
+                init_weights=name,
                 mix=mix,
                 lpips_weights=lpips_weights,
                 save_every=self.save_every,
@@ -205,7 +205,7 @@ class Train:
             if self.validate_every != Train.validate_every:
                 raise InputError("--validate-every: wanted --captures beside it, which it scores; got none.")
             return recipe, None
-        if self.validate_every != Train.validate_every and not any(phase.num_targets for phase in recipe.phases):
+        if self.validate_every != Train.validate_every and not recipe.renders:
             raise InputError(f"--validate-every: --recipe {self.recipe} renders nothing to score; leave it out.")
         return dataclasses.replace(recipe, fit_gains=True), open_mix(self.captures, self.shares, config, recipe)
 

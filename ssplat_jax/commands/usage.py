@@ -1,4 +1,4 @@
-"""Usage errors in one line with a suggestion: no command, a misspelt or repeated option, a missing or bad value."""
+"""Usage errors in one line with a suggestion: an unknown command or option, a repeated one, a missing or bad value."""
 
 import contextlib
 import dataclasses
@@ -45,7 +45,7 @@ def check_usage(arguments: Sequence[str], commands: Mapping[str, type]) -> None:
             hint = _nearest(option, options) or f"see `ssplat {name} --help`"
             raise InputError(f"{name}: there is no option {echo(word.partition('=')[0])}; {hint}.")
         if option in options and option in given:  # the parser would take the last one alone
-            raise InputError(f"{name}: wanted {option} once, got it twice; several values go behind one {option}.")
+            raise InputError(f"{name}: wanted {option} once, got it twice; list several values behind one.")
         given.add(option)
 
 

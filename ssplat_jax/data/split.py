@@ -152,7 +152,7 @@ def choose_split(
         protocol: "interleaved", "paper" or "scannet".
         num_frames: number of frames of the capture.
         stride: every `stride`-th frame is used. By default 1; without `context` and with `interleaved`, the number
-            of frames over 73, rounded down, so that 73 frames or more are left.
+            of frames divided by 73, rounded down, but at least 1: 73 frames or more are left.
         context: number of context views; by default 64, or as many as there are.
         targets: for "paper", the number of targets (default 16, or a quarter of a short capture); for "scannet" too
             (default 64); for "interleaved", the largest number of targets that are kept, evenly spaced (default: all).

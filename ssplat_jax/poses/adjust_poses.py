@@ -108,15 +108,20 @@ def adjust_poses(
     )
 
 
+def pose_effects(revise: Sequence[str]) -> list[str]:
+    """The names among `revise` that may adjust poses before a stream: `poses` and `auto`."""
+    return [name for name in revise if name in ("poses", "auto")]
+
+
 def check_look_ahead(revise: Sequence[str], *, is_causal: bool) -> None:
     """Checks that no causal stream is asked to adjust its poses, which looks at all frames.
 
     Raises:
         InputError: it is.
     """
-    if is_causal and (early := [name for name in ("poses", "auto") if name in revise]):
+    if is_causal and (asked := pose_effects(revise)):
         got, fix = "a causal one (--causal, or stream.causal=true)", "leave one out"
-        raise refusal(f"--revise {early[0]}", wanted="a stream that may look ahead", got=got, fix=fix)
+        raise refusal(f"--revise {asked[0]}", wanted="a stream that may look ahead", got=got, fix=fix)
 
 
 def adjust_if_asked(
@@ -133,7 +138,7 @@ def adjust_if_asked(
     Returns:
         The adjusted poses; None if they are not asked for, or if `auto` finds that the given ones fit.
     """
-    if not {"poses", "auto"} & set(revise):
+    if not pose_effects(revise):
         return None
     with reporter.progress("poses", len(indices), waiting="") as advance:
         found = adjust_poses(capture, indices, advance)

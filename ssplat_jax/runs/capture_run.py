@@ -1,7 +1,7 @@
 """`ssplat run`: streams a capture into a scene, and saves the stream every few chunks so that it can be continued."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from ssplat_jax.checkpoint.delta_files import save_delta
@@ -49,6 +49,7 @@ def run_capture(
     num_held_back: int = 0,
     revise: Sequence[str] = (),
     reporter: Reporter,
+    on_accept: Callable[[], None] | None = None,
 ) -> RunResult:
     """Streams a capture into a folder, continuing the run that the folder holds.
 
@@ -68,6 +69,7 @@ def run_capture(
         revise: `poses` or `auto` adjusts the poses before the stream, see `run_poses.capture_to_stream`; effects that
             only a refinement revises are for `refine_run`.
         reporter: shows progress and warnings.
+        on_accept: called when nothing is left to refuse, before the first chunk.
 
     Raises:
         InputError: the capture is unusable or lies in `out`, fewer than two frames are to be streamed, too many frames
@@ -85,9 +87,7 @@ def run_capture(
         capture = open_capture(path, size=(scaled.width, scaled.height))
     check_scorable(capture)
     taken = list(range(0, len(capture), stride))[:max_views]
-    if len(taken) < 2:
-        fix = "depth needs views from different places"
-        raise refusal(str(path), wanted="two frames or more to stream", got=str(len(taken)), fix=fix)
+    check_num_frames(len(taken), str(path))
     indices, held_back = hold_back(taken, num_held_back)
     capture.check_output_folder(out)
     capture.verify([*indices, *held_back])
@@ -99,6 +99,8 @@ def run_capture(
         recorder = ChunkRecorder(capture, folder, held_back)
         identity = run_identity(model, params, capture, indices)
         run = resume_run(model, params, capture, identity, folder, reporter)
+        if on_accept is not None:
+            on_accept()
         reporter.warn_all(*capture.notes, run.frame.warning)
         writer = start_deltas(run, len(indices), folder, deltas)
         if run.num_views == len(indices) and (num_written := finished_scene(folder, len(indices))) is not None:
@@ -108,6 +110,17 @@ def run_capture(
             return RunResult(run.num_views, int(run.session.cache_facts()["decoded"]), stopped)
         report = finish_run(run, capture, path, indices, folder, reporter)
     return RunResult(run.num_views, report.num_written, None)
+
+
+def check_num_frames(count: int, path: str) -> None:
+    """Refuses a stream of one frame, which tells no depth.
+
+    Raises:
+        InputError: `count` is below 2; the message names `path`, the capture.
+    """
+    if count < 2:
+        fix = "add frames, or choose a smaller --stride or a larger --max-views"
+        raise refusal(path, wanted="two frames or more to stream", got=str(count), fix=fix)
 
 
 class DeltaWriter:

@@ -64,7 +64,8 @@ def eval_path(
         The metrics of the capture (`evaluate`), or of the scenes (`scene_metrics`), as written to metrics.json.
 
     Raises:
-        InputError: a capture or the index is unusable, or options contradict each other.
+        InputError: a capture or the index is unusable, options contradict each other, `out` holds a run, or poses of a
+            causal stream are to be adjusted.
         StorageError: `out` cannot be written.
     """
     if options.index is None:
@@ -128,7 +129,6 @@ def _eval_scenes(
     written: dict[str, str],
 ) -> dict[str, Any]:
     """The metrics of every scene of an index; all are opened before the first is streamed."""
-    RunFolder(out).check_no_run()
     if unsafe := [scene for scene in index if not (folder / scene).resolve().is_relative_to(folder.resolve())]:
         got, fix = echo(unsafe[0]), "name scenes after folders"
         raise refusal("--index", wanted=f"scenes below {folder}", got=got, fix=fix)
@@ -142,6 +142,8 @@ def _eval_scenes(
     }
     if not captures:
         raise refusal("--index", wanted="a scene that is not null", got="none", fix="choose frames for one")
+    for folder_of_results in (out, *(out / scene for scene in captures)):
+        RunFolder(folder_of_results).check_no_run()
     for capture in captures.values():
         capture.check_output_folder(out)
     splits = {scene: split_of_scene(index, scene, len(capture)) for scene, capture in captures.items()}

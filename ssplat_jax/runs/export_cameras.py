@@ -13,11 +13,12 @@ from pathlib import Path
 from scipy.spatial.transform import Rotation
 
 from ssplat_jax.checkpoint.stream_state import load_newest_state
+from ssplat_jax.console import Reporter
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.posed_image import invert_pose
 from ssplat_jax.errors import InputError
-from ssplat_jax.runs.run_poses import with_poses_of_run
+from ssplat_jax.runs.run_poses import open_capture_of_scene, with_poses_of_run
 from ssplat_jax.storage.atomic import write_atomic
 from ssplat_jax.storage.run_folder import RunFolder
 
@@ -33,17 +34,18 @@ class SceneCameras:
     indices: Sequence[int]  # frames
 
 
-def open_cameras(path: str, scene: Path, to: Path) -> SceneCameras:
+def open_cameras(path: str, scene: Path, to: Path, reporter: Reporter) -> SceneCameras:
     """The cameras of a capture: those that a run streamed, or all if the scene is a file.
 
     Args:
         path: the capture, as `open_capture` takes it.
         scene: folder of a run, or a scene file.
         to: the scene file to write, beside which the cameras will be.
+        reporter: shows warnings.
 
     Raises:
         InputError: the capture is unusable or not that of the run, or files of other makers are in the way.
-        StorageError: the run's state is corrupt.
+        StorageError: the run's state or its adjusted poses are corrupt.
     """
     for name in FILES:
         held = to.parent / name
@@ -51,7 +53,7 @@ def open_cameras(path: str, scene: Path, to: Path) -> SceneCameras:
             raise InputError(f"{held}: wanted a place for the cameras, a file is in the way; choose another folder.")
     folder = RunFolder(scene)
     if not folder.has_state():
-        capture = with_poses_of_run(open_capture(path), RunFolder(scene.parent))
+        capture = open_capture_of_scene(scene, path, None, reporter)
         return SceneCameras(capture, range(len(capture)))
     _, header, _ = load_newest_state(folder.state)
     capture = with_poses_of_run(open_capture(path, size=tuple(header["size"])), folder)

@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Float, Float64
 
 from ssplat_jax.console import Reporter
-from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.errors import InputError, require_positive
 from ssplat_jax.evaluation.pictures import save_image
@@ -18,7 +17,7 @@ from ssplat_jax.gaussians import mean_color
 from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.rasterizer import Effects, fill_holes, render
 from ssplat_jax.runs.film import KINDS, FilmOptions, depth_range, film_path, write_film
-from ssplat_jax.runs.run_poses import with_poses_of_run
+from ssplat_jax.runs.run_poses import open_capture_of_scene
 from ssplat_jax.scene_files.formats import read_scene
 from ssplat_jax.scene_files.splat_file import SplatFile
 from ssplat_jax.storage.folder_lock import lock_folder
@@ -69,7 +68,7 @@ def render_scene(
     Raises:
         InputError: the scene or the capture is unusable, the capture lies in `out`, a film is wanted without PyAV, or
             one exposure of a scene whose run is unknown.
-        StorageError: `out` cannot be written.
+        StorageError: `out` cannot be written, or adjusted poses of the scene's run are damaged.
     """
     require_positive(stride=stride)
     if max_views is not None:
@@ -80,8 +79,7 @@ def render_scene(
     if one_exposure:
         gaussians = at_first_exposure(splats.gaussians, scene_exposure(scene))
         splats = dataclasses.replace(splats, gaussians=gaussians)
-    run = RunFolder(scene if scene.is_dir() else scene.parent)
-    capture, folder = with_poses_of_run(open_capture(path, size=size), run), RunFolder(out)
+    capture, folder = open_capture_of_scene(scene, path, size, reporter), RunFolder(out)
     capture.check_output_folder(out)
     indices = range(0, len(capture), stride)[:max_views]
     size = (capture.width, capture.height)

@@ -70,7 +70,7 @@ def report_run(folder: RunFolder, metrics: dict[str, Any], path: str) -> None:
         files=_files(folder),
         commands=[
             f"ssplat view {out}    # in a browser",
-            f"ssplat refine {out} {capture} --steps 100    # a better scene: compares it with its views, step by step",
+            f"ssplat refine {out} {capture} --steps 100    # revises the scene until it fits its views better",
             f"ssplat render {out} {capture} --size {width}x{height} --film 8 --out {film}    # a film",
             f"ssplat export {out} --to scene.sog    # for other viewers, at an eighth of the size",
         ],

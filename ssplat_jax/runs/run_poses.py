@@ -3,14 +3,16 @@
 import dataclasses
 import json
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64
 
 from ssplat_jax.console import Reporter
 from ssplat_jax.data.capture import Capture
+from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.errors import StorageError, refusal
-from ssplat_jax.poses.adjust_poses import adjust_if_asked
+from ssplat_jax.poses.adjust_poses import adjust_if_asked, pose_effects
 from ssplat_jax.storage.json_files import write_json
 from ssplat_jax.storage.run_folder import RunFolder
 
@@ -31,45 +33,62 @@ def capture_to_stream(
         InputError: the folder holds a run whose poses were not adjusted.
         StorageError: the folder cannot be written, or the saved poses are damaged.
     """
-    asked = [name for name in ("poses", "auto") if name in revise]
-    if not folder.has_state() and not _has_poses_for(folder, capture, indices, asked):
-        folder.adjusted_poses.unlink(missing_ok=True)  # of a run that stopped before its first save
+    asked = pose_effects(revise)
     if not asked:
+        forget_poses_without_run(folder)
         return capture
     saved = _read(folder)
-    if folder.has_state() and (saved is None or ("poses" in asked and not saved.camtoworlds)):
-        got, fix = "one with the given poses", "leave it out, or start anew with --overwrite"
-        raise refusal(f"--revise {asked[0]}", wanted="a run that began with it", got=got, fix=fix)
-    if saved is None:
+    if folder.has_state():
+        if saved is None or ("poses" in asked and not saved.camtoworlds):
+            got, fix = "one with the given poses", "leave it out, or start anew with --overwrite"
+            raise refusal(f"--revise {asked[0]}", wanted="a run that began with it", got=got, fix=fix)
+    elif saved is None or (saved.asked, saved.capture) != (asked, capture.digest(indices)):
+        # None, or those of a run that was stopped before its first save and had another request.
         found = adjust_if_asked(capture, indices, revise, reporter)
-        frames = {} if found is None else {str(i): found.capture.frames[i].camtoworld.tolist() for i in indices}
-        described = {"capture": capture.digest(indices), "indices": list(indices), "camtoworlds": frames}
-        write_json(folder.adjusted_poses, described)
-    return with_poses_of_run(capture, folder)
+        frames = {} if found is None else {i: found.capture.frames[i].camtoworld for i in indices}
+        saved = _SavedPoses(capture.digest(indices), list(indices), asked, frames)
+        _write(folder, saved)
+    return _with_poses(capture, saved) or capture
 
 
-def _has_poses_for(folder: RunFolder, capture: Capture, indices: Sequence[int], asked: Sequence[str]) -> bool:
-    """True if the folder keeps poses of the same frames of the same capture that do what is asked."""
-    saved = _read(folder)
-    if saved is None or not asked:
-        return False
-    return saved.capture == capture.digest(indices) and (bool(saved.camtoworlds) or "poses" not in asked)
+def forget_poses_without_run(folder: RunFolder) -> None:
+    """Removes adjusted poses that a run left behind which was stopped before its first save."""
+    if not folder.has_state():
+        folder.adjusted_poses.unlink(missing_ok=True)
 
 
 def with_poses_of_run(capture: Capture, folder: RunFolder) -> Capture:
-    """`capture` with the adjusted poses that `folder` keeps; as it is, if there are none or if they are of another.
+    """`capture` with the adjusted poses that `folder` keeps; as it is, if there are none or those of another capture.
+
+    The digest of another capture differs from that of the run, which whoever continues the run compares.
 
     Raises:
         StorageError: the saved poses are damaged.
     """
     saved = _read(folder)
-    if saved is None or max(saved.indices, default=0) >= len(capture) or capture.digest(saved.indices) != saved.capture:
-        return capture  # if they are of another, its digest differs from that of the run, which says so
-    frames = [
-        dataclasses.replace(frame, camtoworld=saved.camtoworlds[i]) if i in saved.camtoworlds else frame
-        for i, frame in enumerate(capture.frames)
-    ]
-    return dataclasses.replace(capture, frames=tuple(frames))
+    return capture if saved is None else _with_poses(capture, saved) or capture
+
+
+def open_capture_of_scene(scene: Path, path: str, size: tuple[int, int] | None, reporter: Reporter) -> Capture:
+    """The capture at `path`, with the adjusted poses of the run that a scene belongs to.
+
+    Args:
+        scene: a scene file, or the folder of a run.
+        path: the capture, as `open_capture` takes it.
+        size: (width, height) of its images; by default its own.
+        reporter: warns if the run kept adjusted poses of another capture, or of this one at another size.
+
+    Raises:
+        InputError: the capture is unusable.
+        StorageError: the saved poses are damaged.
+    """
+    folder, capture = RunFolder(scene if scene.is_dir() else scene.parent), open_capture(path, size=size)
+    saved = _read(folder)
+    if saved is None or not saved.camtoworlds:
+        return capture
+    if (adjusted := _with_poses(capture, saved)) is None:
+        reporter.warn(f"{folder.adjusted_poses} is of another capture: the cameras have the poses of {path}.")
+    return adjusted or capture
 
 
 def has_adjusted_poses(folder: RunFolder) -> bool:
@@ -86,7 +105,24 @@ def has_adjusted_poses(folder: RunFolder) -> bool:
 class _SavedPoses:
     capture: str  # digest of the poses as given
     indices: list[int]  # streamed frames
+    asked: list[str]  # names of effects that asked for them
     camtoworlds: dict[int, Float64[np.ndarray, "4 4"]]  # by frame; empty if the given ones were streamed
+
+
+def _with_poses(capture: Capture, saved: _SavedPoses) -> Capture | None:
+    """The capture with saved poses; None if they are those of another capture."""
+    if max(saved.indices, default=0) >= len(capture) or capture.digest(saved.indices) != saved.capture:
+        return None
+    frames = [
+        dataclasses.replace(frame, camtoworld=saved.camtoworlds[i]) if i in saved.camtoworlds else frame
+        for i, frame in enumerate(capture.frames)
+    ]
+    return dataclasses.replace(capture, frames=tuple(frames))
+
+
+def _write(folder: RunFolder, saved: _SavedPoses) -> None:
+    camtoworlds = {str(i): pose.tolist() for i, pose in saved.camtoworlds.items()}
+    write_json(folder.adjusted_poses, dataclasses.asdict(saved) | {"camtoworlds": camtoworlds})
 
 
 def _read(folder: RunFolder) -> _SavedPoses | None:
@@ -98,6 +134,7 @@ def _read(folder: RunFolder) -> _SavedPoses | None:
         poses = {int(i): np.array(pose, np.float64).reshape(4, 4) for i, pose in fields["camtoworlds"].items()}
         if not all(np.isfinite(pose).all() for pose in poses.values()):
             raise ValueError("a pose is not finite")
-        return _SavedPoses(str(fields["capture"]), [int(i) for i in fields["indices"]], poses)
+        asked = [str(name) for name in fields.get("asked", [])]  # earlier versions did not write it
+        return _SavedPoses(str(fields["capture"]), [int(i) for i in fields["indices"]], asked, poses)
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise StorageError(f"{folder.adjusted_poses}: damaged; --overwrite starts the run anew.") from error

@@ -23,7 +23,6 @@ from ssplat_jax.config import preset
 from ssplat_jax.console import Reporter
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.errors import InputError, refusal
-from ssplat_jax.storage.folder_lock import lock_folder
 from ssplat_jax.storage.json_files import write_json
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.streaming.session import Session
@@ -111,9 +110,27 @@ def choose(
     return max(fitting, key=lambda found: found[0].shown)
 
 
+@dataclasses.dataclass(frozen=True)
+class Choice:
+    """The setting of a run with a budget."""
+
+    point: FrontPoint
+    file: Path
+    record: dict[str, Any]
+    """Contents of the file."""
+
+    def save(self) -> None:
+        """Writes the choice, when the run has been accepted: what is refused changes no file.
+
+        Raises:
+            StorageError: it cannot be written.
+        """
+        write_json(self.file, self.record)
+
+
 def setting_for_run(
     budget_ms: float, path: str, size: tuple[int, int] | None, out: Path, *, overwrite: bool, reporter: Reporter
-) -> FrontPoint:
+) -> Choice:
     """The setting of a run with a budget; a run that continues keeps the one that it started with.
 
     Times of a machine vary, and a run cannot change its setting on the way: `budget.json` in `out` holds the choice.
@@ -128,8 +145,7 @@ def setting_for_run(
 
     Raises:
         InputError: see `choose` and `open_capture`; the capture lies in `out`, `out` holds a run that did not begin
-            with this budget and size, or another process writes to it.
-        StorageError: `out` cannot be written.
+            with this budget and size.
     """
     capture, folder = open_capture(path, size=size), RunFolder(out)
     capture.check_output_folder(out)
@@ -147,16 +163,14 @@ def setting_for_run(
     point, ms = choose(load_front(), budget_ms, (capture.width, capture.height), reference_ms, max_factor=max_factor)
     reporter.say(f"--budget-ms {budget_ms:g}: {point.setting}, about {ms:.0f} ms a view on this machine")
     expected = {"expected_ms": round(ms, 1), "reference_ms": round(reference_ms, 2)}
-    with lock_folder(out):
-        write_json(folder.budget, asked | expected | {"point": dataclasses.asdict(point)})
-    return point
+    return Choice(point, folder.budget, asked | expected | {"point": dataclasses.asdict(point)})
 
 
-def _read_choice(file: Path, asked: dict[str, Any]) -> FrontPoint | None:
+def _read_choice(file: Path, asked: dict[str, Any]) -> Choice | None:
     """The choice that an earlier run with the same budget and size has made; None if there is none."""
     try:
         held = json.loads(file.read_text())
-        return FrontPoint(**held["point"]) if asked.items() <= held.items() else None
+        return Choice(FrontPoint(**held["point"]), file, held) if asked.items() <= held.items() else None
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None
 

@@ -1,8 +1,8 @@
 """`ssplat run --watch`: streams a folder that is still being written, chunk by chunk as its images become complete.
 
 The stream is causal. Frames are taken in the order of the capture; a frame that cannot be read yet holds back those
-after it. The run ends when the folder holds a file `done`, or when no frame has become ready for some seconds; the last
-chunk is then padded. What cannot be read at the end is left out, with a warning.
+after it. The run ends when the folder holds a file `done`, or when for some seconds no frame has been listed and none
+has become complete; the last chunk is then padded. What cannot be read at the end is left out, with a warning.
 """
 
 import dataclasses
@@ -15,10 +15,11 @@ from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.growing_capture import is_done, open_growing
 from ssplat_jax.errors import InputError, refusal, require_positive
 from ssplat_jax.evaluation.scoring import check_scorable
-from ssplat_jax.runs.capture_run import DeltaWriter, RunResult, start_deltas
+from ssplat_jax.runs.capture_run import DeltaWriter, RunResult, check_num_frames, start_deltas
 from ssplat_jax.runs.chunk_recorder import ChunkRecorder
 from ssplat_jax.runs.finish_run import finish_run, finished_scene
 from ssplat_jax.runs.resume import RunState, resume_run, run_identity, save_run
+from ssplat_jax.runs.run_poses import forget_poses_without_run
 from ssplat_jax.storage.folder_lock import lock_folder
 from ssplat_jax.storage.interrupts import Interrupts
 from ssplat_jax.storage.run_folder import RunFolder
@@ -144,7 +145,7 @@ class _Watch:
         """Waits for a first chunk of frames, and for all that the saved run has had; returns whether no more will come.
 
         Raises:
-            InputError: none came.
+            InputError: none came, or one alone.
         """
         needed = max(self.model.config.stream.chunk_size, 0 if self.options.overwrite else self.num_saved())
         self.reporter.say(f"waiting for frames in {self.path}")
@@ -157,12 +158,14 @@ class _Watch:
             raise refusal(
                 str(self.path), wanted="a frame that can be read", got=got, fix="see that it is written there"
             )
+        check_num_frames(len(self.indices), str(self.path))
         check_scorable(self.known())
         self.known().check_output_folder(self.folder.path)
         return ended
 
     def begin(self) -> RunState:
         """The run that the folder holds, or a new one."""
+        forget_poses_without_run(self.folder)
         first = self.indices[: self.num_saved() or self.model.config.stream.chunk_size]
         identity = run_identity(self.model, self.params, self.known(), first)
         run = resume_run(self.model, self.params, self.known(), identity, self.folder, self.reporter)

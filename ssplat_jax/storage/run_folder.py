@@ -140,12 +140,13 @@ class RunFolder:
 
     def clear_run(self) -> None:
         """Removes the run that the folder holds; files of the user stay."""
-        for stale in (self.state, previous_path(self.state), self.scene, self.metrics, self.adjusted_poses):
+        files = (self.state, previous_path(self.state), self.scene, self.metrics, self.adjusted_poses, self.budget)
+        for stale in files:
             stale.unlink(missing_ok=True)
         self.clear_refinement()
         self.clear_deltas()
         self.clear_report()
-        remove_numbered(self.chunk_records, "######.json")
+        remove_numbered(self.chunk_records, f"{NUMBER}.json")
         self.clear_views()
 
     def clear_refinement(self) -> None:
@@ -155,7 +156,7 @@ class RunFolder:
 
     def clear_deltas(self) -> None:
         """Removes all deltas."""
-        remove_numbered(self.deltas, "######.npz")
+        remove_numbered(self.deltas, f"{NUMBER}.npz")
 
     def clear_report(self) -> None:
         """Removes the report and the contact sheet."""

@@ -94,7 +94,6 @@ def open_mix(folders: Sequence[Path], shares: Sequence[float], config: StreamCon
         wanted = f"{len(folders)} numbers above 0 that add up to at most 1, one for each of --captures"
         raise refusal("--shares", wanted=wanted, got=" ".join(map(str, shares)), fix="give one share a folder")
     needed = max(p.num_chunks * config.stream.chunk_size + p.num_targets for p in recipe.phases)
-    renders_nothing = all(phase.num_targets == 0 for phase in recipe.phases)
     groups = []
     for folder, share in zip(folders, shares, strict=True):
         captures = tuple(open_capture(path, size=ESTIMATION_SIZE) for path in captures_in(folder))
@@ -102,7 +101,7 @@ def open_mix(folders: Sequence[Path], shares: Sequence[float], config: StreamCon
             if (count := len(learned_frames(capture))) < needed:
                 wanted = f"at least {needed} frames besides those held out, as a sample of the recipe has"
                 raise refusal(f"--captures {capture.name}", wanted=wanted, got=str(count), fix="leave it out")
-            if renders_nothing and not any(map(capture.pixels.has_depth, learned_frames(capture))):
+            if not recipe.renders and not any(map(capture.pixels.has_depth, learned_frames(capture))):
                 wanted = "depth maps, from which alone this recipe learns"
                 fix = "leave it out, or choose a recipe that renders target views, such as stream"
                 raise refusal(f"--captures {capture.name}", wanted=wanted, got="none", fix=fix)
@@ -111,7 +110,14 @@ def open_mix(folders: Sequence[Path], shares: Sequence[float], config: StreamCon
 
 
 def captures_in(folder: Path) -> list[Path]:
-    """`folder` if it is a capture (or nothing that a reader knows, which `open_capture` explains), else those in it."""
+    """The captures at a path: itself, or else those in it.
+
+    Args:
+        folder: a capture, or a folder of captures.
+
+    Returns:
+        Their paths; `folder` where no reader knows any, which `open_capture` explains.
+    """
     if is_capture(folder) or not folder.is_dir():
         return [folder]
     return sorted(path for path in folder.iterdir() if path.is_dir() and is_capture(path)) or [folder]

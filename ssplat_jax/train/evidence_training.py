@@ -78,7 +78,7 @@ def train_evidence(
     Args:
         model: its configuration keeps evidence.
         params: parameters to start from. An evidence head among them is replaced by an untrained one.
-        captures: captures to learn from, besides the recipe's procedural scenes.
+        captures: captures, or folders of them, to learn from besides the recipe's procedural scenes.
         recipe: steps, rates and scenes.
         on_scene: called with the name of each scene when it has been streamed.
         on_step: called after each step with the number of steps done and the mean PSNR of its crops, `shown_psnr` and

@@ -30,6 +30,9 @@ from ssplat_jax.train.validation import Validation
 LOG_FILE = "log.jsonl"
 """Name of the log in the output directory: one JSON object per line."""
 
+RANDOM = "random"
+"""Name of random initial parameters, which follow from the recipe's seed."""
+
 
 @dataclasses.dataclass(frozen=True)
 class TrainResult:
@@ -46,6 +49,7 @@ def train(
     out: Path,
     *,
     params: dict | None = None,
+    init_weights: str | None = None,
     mix: CaptureMix | None = None,
     lpips_weights: LpipsWeights | None = None,
     save_every: int = 200,
@@ -61,6 +65,7 @@ def train(
         recipe: phases, optimizer and loss.
         out: directory of `log.jsonl`, `recipe.json` and `checkpoints/`.
         params: initial parameters; default random ones from the recipe's seed. A run is resumed with the same ones.
+        init_weights: name of `params` in the description of the run; default their digest.
         mix: captures to learn from, beside procedural scenes.
         lpips_weights: weights of LPIPS, which the rendering loss then includes.
         save_every: steps between checkpoints. SIGINT and SIGTERM save one too.
@@ -78,8 +83,9 @@ def train(
     """
     model = StreamSplat(training_config(config, recipe))
     with lock_folder(out):
-        description = describe_run(model.config, recipe, params, has_lpips=lpips_weights is not None, mix=mix)
-        upgrade = functools.partial(upgrade_description, init_weights=description["init_weights"])
+        init_weights = init_weights or (RANDOM if params is None else params_digest(params))
+        description = describe_run(model.config, recipe, init_weights, has_lpips=lpips_weights is not None, mix=mix)
+        upgrade = functools.partial(upgrade_description, init_weights=init_weights)
         checkpoints = TrainingCheckpoints(out, description, upgrade=upgrade)
         try:
             state, start = init_state(model, recipe, params), 0
@@ -102,21 +108,21 @@ class _Every:
 
 
 def describe_run(
-    config: StreamConfig, recipe: Recipe, params: dict | None, *, has_lpips: bool, mix: CaptureMix | None = None
+    config: StreamConfig, recipe: Recipe, init_weights: str, *, has_lpips: bool, mix: CaptureMix | None = None
 ) -> dict:
     """Facts that determine the weights of a run, as JSON types; a run with another description is not resumed.
 
     Args:
         config: configuration of the model.
         recipe: the recipe.
-        params: initial parameters; None for random ones.
+        init_weights: name of the initial parameters, `RANDOM` for random ones.
         has_lpips: the rendering loss includes LPIPS.
         mix: captures to learn from.
     """
     description: dict = {
         "config": config.to_dict(),
         "recipe": dataclasses.asdict(recipe),
-        "init_weights": "random" if params is None else params_digest(params),
+        "init_weights": init_weights,
     }
     if has_lpips:
         description["rendering_loss"] = f"MSE + {recipe.lpips_weight} LPIPS"
@@ -125,12 +131,12 @@ def describe_run(
     return description
 
 
-def upgrade_description(description: dict, init_weights: str = "random") -> dict:
+def upgrade_description(description: dict, init_weights: str) -> dict:
     """Description of a run, as read from JSON, with the fields that older versions did not write.
 
     Args:
         description: as `describe_run` gives it.
-        init_weights: the initial parameters of a run that does not name its own.
+        init_weights: name of the initial parameters for a description that holds none.
     """
     config = config_from_header(description["config"]).to_dict()
     return (

@@ -124,6 +124,11 @@ class Recipe:
                 raise InputError(f"recipe: phase {phase.name!r} needs {wanted}, got {phase}.")
 
     @property
+    def renders(self) -> bool:
+        """Whether any phase renders target views."""
+        return any(phase.num_targets for phase in self.phases)
+
+    @property
     def num_steps(self) -> int:
         """Number of steps of all phases."""
         return sum(phase.steps for phase in self.phases)

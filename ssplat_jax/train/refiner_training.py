@@ -94,7 +94,7 @@ def train_refiner(
     Args:
         model: the model whose scenes are refined.
         params: its parameters.
-        captures: captures to learn from, besides the recipe's procedural scenes.
+        captures: captures, or folders of them, to learn from besides the recipe's procedural scenes.
         recipe: rounds, steps, rates and scenes.
         on_scene: called with the name of each scene when it has been streamed.
         on_step: called after each step with the number of steps done and the PSNR of its view, `shown_psnr` and

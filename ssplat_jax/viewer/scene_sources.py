@@ -33,29 +33,32 @@ class SceneFile:
     num_chunks = 1
 
     def __init__(self, path: Path, *, one_exposure: bool = False) -> None:
-        self._stamp, self._one_exposure = None, one_exposure
+        self._stamp = self._unreadable = None  # of the file when it was last read, and when it last could not be
+        self._one_exposure = one_exposure
         self._scene: ViewedScene | None = None
         self.path, self.folder = path, RunFolder(path.parent)
 
     def changed(self) -> ViewedScene | None:
         """The scene if it has changed since the last call, else None.
 
-        A file that was a scene before and is none now is being written: the scene that was read from it stays.
+        While a program rewrites the file, it cannot be read: the last scene stays.
 
         Raises:
-            InputError: the file is not a scene, or its exposure is wanted and unknown.
+            InputError: the file is not a scene and has not changed since the last call, or there was no scene before;
+                or its exposure is wanted and unknown.
         """
         stat = self.path.stat() if self.path.exists() else None
         stamp = None if stat is None else (stat.st_mtime_ns, stat.st_size)
         if self._stamp is not None and stamp in (None, self._stamp):
             return None
-        self._stamp = stamp
         try:
             file = read_scene(self.path)
         except InputError:
-            if self._scene is None:
+            if self._scene is None or stamp == self._unreadable:
                 raise
+            self._unreadable = stamp
             return None
+        self._stamp = stamp
         gaussians, exposure = file.gaussians, np.ones(3)
         if self._one_exposure:
             gaussians = at_first_exposure(gaussians, scene_exposure(self.path))

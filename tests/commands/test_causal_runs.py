@@ -39,6 +39,7 @@ def deltas_of(out):
     return {path.name: path.read_bytes() for path in sorted((out / "deltas").glob("*.npz"))}
 
 
+@pytest.mark.slow  # streaming/test_causal.py has the law
 def test_a_replaced_future_changes_no_earlier_output(tmp_path, weights):
     written = []
     for name in ("here", "there"):

@@ -214,7 +214,7 @@ def test_results_among_the_captures_own_images_are_refused(command, place, tmp_p
         (("eval", "procedural:room?size=32x24", "--causal", "--revise", "auto", "--out", "x"), "--revise auto: wanted"),
         (("train", "--seed", "-1", "--out", "x"), "--seed: wanted a number from 0"),
         (("train", "--seed", str(2**63), "--out", "x"), "--seed: wanted a number from 0"),
-        (("train", "--scale-steps", "inf", "--out", "x"), "--scale-steps: wanted a number above 0"),
+        (("train", "--scale-steps", "inf", "--out", "x"), "--scale-steps: wanted a finite number above 0"),
         (("worlds", "--count", "1", "--seed", "-1", "--out", "x"), "--seed: wanted a number from 0"),
         (("poses", ".", "--frames", "20", "--out", "x"), "--frames: wanted a video"),
     ],
@@ -230,7 +230,7 @@ def test_bad_usage_is_one_line_and_exit_2(arguments, named, capsys, tmp_path, mo
 def test_lpips_weights_are_refused_where_nothing_is_rendered(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(train_command, "load_lpips_weights", lambda vgg, heads: object())
     assert run("train", "--recipe", "depth", "--out", str(tmp_path / "x")) == 2
-    assert "--lpips-vgg: --recipe depth has no use for it" in capsys.readouterr().err
+    assert "--lpips-vgg: --recipe depth renders nothing" in capsys.readouterr().err
     assert not (tmp_path / "x").exists()
 
 
@@ -254,7 +254,7 @@ def test_weights_are_refused_for_a_scene_that_is_decoded(tmp_path, capsys):
     (tmp_path / "scene.ply").write_text("ply")
     for scene in (tmp_path, tmp_path / "scene.ply"):
         assert run("export", str(scene), "--to", str(tmp_path / "x.splat"), "--weights", "other.npz") == 2
-        assert "--weights: wanted the folder of a run" in capsys.readouterr().err
+        assert "--weights: wanted a run" in capsys.readouterr().err
 
 
 def test_another_system_is_named(monkeypatch, capsys):
@@ -399,7 +399,7 @@ def test_a_run_continues_with_a_larger_capacity(tmp_path):
     out, capture = tmp_path / "run", str(make_capture(tmp_path / "capture", num_frames=8, size=(64, 48)))
     assert run("run", capture, "--out", str(out), "--set", "overflow=error", "--quiet") == 0
     scene = (out / "scene.ply").read_bytes()
-    more = ("--set", "capacity=65536", "--set", "overflow=grow")
+    more = ("--set", "capacity=65536", "overflow=grow")
     assert run("run", capture, "--out", str(out), *more, "--quiet") == 0
     assert load_state(out / "state.npz")[0].num_voxels > 0 and (out / "scene.ply").read_bytes() == scene
 

@@ -1,6 +1,7 @@
 """`--over-black` and `--one-exposure` of `render` and `view`: together they give the image of the literal score."""
 
 import json
+import shutil
 
 import jax
 import jax.numpy as jnp
@@ -24,19 +25,30 @@ MIDDLE = [0.5, 0.8, 1.6]
 LEVEL = 1 / 255
 
 
-@pytest.fixture
-def finished(tmp_path):
-    """A run whose scene is stored at another exposure than that of its first views; the capture; the stored PSNRs."""
-    weights, out = tmp_path / "narrow.npz", tmp_path / "out"
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Folder of a capture and its run, and the PSNRs of the run."""
+    folder = tmp_path_factory.mktemp("finished")
+    weights, out = folder / "narrow.npz", folder / "out"
     save_weights(weights, StreamSplat(NARROW).init(jax.random.key(0)), NARROW, {})
-    capture = make_capture(tmp_path / "capture", num_frames=8, size=SIZE)
-    assert run("run", str(capture), "--out", str(out), "--deltas", "--weights", str(weights), "--quiet") == 0
+    capture = make_capture(folder / "capture", num_frames=8, size=SIZE)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("ssplat_jax.streaming.session.MIN_DECODED_PIVOTS", 1 << 11)
+        assert run("run", str(capture), "--out", str(out), "--deltas", "--weights", str(weights), "--quiet") == 0
     metrics = json.loads((out / "metrics.json").read_text())
     before = np.array(metrics["scene_exposure"])
     stored = scale_colors(load_scene(out / "scene.ply"), jnp.asarray(np.array(MIDDLE) / before, jnp.float32))
     save_gaussians(out / "scene.ply", stored)
     (out / "metrics.json").write_text(json.dumps(metrics | {"scene_exposure": MIDDLE}))
-    return out, capture, metrics["seen_views"]
+    return folder, metrics["seen_views"]
+
+
+@pytest.fixture
+def finished(folder, tmp_path):
+    """A run whose scene is stored at another exposure than that of its first views; the capture; the stored PSNRs."""
+    held, scores = folder
+    shutil.copytree(held, tmp_path / "held")
+    return tmp_path / "held" / "out", tmp_path / "held" / "capture", scores
 
 
 def pixels(path):

@@ -36,6 +36,7 @@ def read(path):
     return json.loads(path.read_text())
 
 
+@pytest.mark.slow
 def test_a_short_capture_needs_no_option(tmp_path, narrow):
     capture, out = make_capture(tmp_path / "capture", num_frames=7, size=SIZE), tmp_path / "out"
     assert run("eval", str(capture), "--out", str(out), *narrow) == 0

@@ -78,6 +78,7 @@ def test_frames_that_are_left_out_are_signs_of_life_too(tmp_path, monkeypatch):
     assert watch.look()
 
 
+@pytest.mark.slow
 def test_it_ends_after_quiet_seconds_and_goes_on_later(tmp_path, narrow, capsys):
     whole, growing = make_capture(tmp_path / "whole" / "c", num_frames=9, size=SIZE), tmp_path / "growing" / "c"
     shutil.copytree(whole, growing)
@@ -134,7 +135,10 @@ def test_frames_that_were_streamed_may_not_change(tmp_path, narrow, capsys):
     """A frame that sorts before the streamed ones would move them."""
     capture, out = make_capture(tmp_path / "c", num_frames=8, size=SIZE), tmp_path / "out"
     (capture / "done").touch()
+    out.mkdir()
+    RunFolder(out).adjusted_poses.write_text("{")  # left by a run that was stopped before its first save
     assert run("run", str(capture), "--watch", "--out", str(out), *narrow) == 0
+    assert not RunFolder(out).adjusted_poses.exists()
     facts = json.loads((capture / "transforms.json").read_text())
     facts["frames"][2]["transform_matrix"][0][3] += 0.01
     (capture / "transforms.json").write_text(json.dumps(facts))

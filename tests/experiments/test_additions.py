@@ -3,6 +3,7 @@
 import itertools
 
 import pytest
+from ssplat_experiments import additions as additions_experiment
 from ssplat_experiments.additions import KEPT, add_gains, additions, differing_fields, findings, unmeasured, variants
 
 from ssplat_jax.config import preset
@@ -61,7 +62,8 @@ def test_gains_along_the_path_add_up():
         ({"literal_ssim": 0.61}, "not earned here"),
     ],
 )
-def test_an_addition_is_judged_by_what_its_absence_costs(without, verdict):
+def test_an_addition_is_judged_by_what_its_absence_costs(without, verdict, monkeypatch):
+    monkeypatch.setattr(additions_experiment, "unmeasured", lambda: [])
     ours = {"literal_psnr": 20.0, "shown_psnr": 25.0, "literal_ssim": 0.6, "shown_ssim": 0.7}
     rows = [
         {"scene": scene, "path": path, "step": step, "chunk_ms": 1.0, "peak_memory_bytes": None} | ours | scores
@@ -73,5 +75,6 @@ def test_an_addition_is_judged_by_what_its_absence_costs(without, verdict):
     assert "on 2 scenes" in findings(rows)[0]
 
 
+@pytest.mark.slow  # traces the network for every field
 def test_what_is_kept_for_another_reason_is_an_addition():
     assert KEPT.keys() <= {a.field for a in additions()}

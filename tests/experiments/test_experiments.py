@@ -3,22 +3,28 @@
 from importlib.metadata import entry_points
 from typing import get_args
 
+import jax
 import numpy as np
 import pytest
 from ssplat_experiments.ablation import BUDGETS as ABLATION_BUDGETS
-from ssplat_experiments.ablation import VARIANTS, add_differences, findings, learned_from, scenes_of
+from ssplat_experiments.ablation import VARIANTS, add_differences, config_of, findings, learned_from, scenes_of
 from ssplat_experiments.ablation import cases as ablation_cases
 from ssplat_experiments.accuracy_vs_time import cases as settings_cases
 from ssplat_experiments.accuracy_vs_time import front_file, mark_front
 from ssplat_experiments.depth_error import cell_depths, summary
 from ssplat_experiments.settings import REFINED, SETTINGS
 
+from ssplat_jax.checkpoint.weights import load_params
 from ssplat_jax.commands.experiment_command import Experiment
 from ssplat_jax.commands.main import guarded
 from ssplat_jax.commands.options import QualityName
 from ssplat_jax.config import QUALITIES
+from ssplat_jax.data.open_capture import open_capture
+from ssplat_jax.model import complete_params
+from ssplat_jax.model.params import STAGES
 from ssplat_jax.refinement.learned_pass import STEPS
 from ssplat_jax.refinement.refine_config import FOR_CAPTURES
+from ssplat_jax.streaming.streamsplat import StreamSplat
 
 
 def row(ms, psnr):
@@ -120,7 +126,20 @@ def test_every_variant_of_the_ablation_is_another_model_or_another_training():
     budget, asked = ABLATION_BUDGETS["cpu"], ablation_cases(None, "cpu")
     assert len(asked) == 9 + 2 * 4 and len({case.hash for case in asked}) == len(asked)
     assert len({case.config.hash for case in asked}) == 8  # the one with untrained tokens is the full model
-    assert "tokens" in budget.recipe(0, VARIANTS["untrained tokens"].untrained).phases[0].form.frozen
+    for variant in VARIANTS.values():
+        assert set(variant.untrained) <= set(STAGES)
+        assert set(variant.untrained) <= set(budget.recipe(0, variant.untrained).phases[0].form.frozen)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_every_variant_of_the_ablation_steps(variant):
+    config = config_of(variant).replace(capacity=128)
+    model = StreamSplat(config)
+    params = jax.eval_shape(lambda key: complete_params(key, config, load_params("tiny")), jax.random.key(0))
+    capture = open_capture("procedural:room?frames=4&size=64x48")
+    chunk = next(iter(capture.chunks(config)))
+    jax.eval_shape(model.step, params, model.init_cache(), chunk)
 
 
 def test_the_ablation_learns_from_no_scene_that_it_scores(tmp_path):

@@ -171,6 +171,7 @@ def test_stream_fills_the_cache_and_depths_stay_in_range():
     assert np.abs(np.asarray(later.depths - out.depths)).max() > 1e-4
 
 
+@pytest.mark.slow
 def test_a_padded_view_changes_nothing():
     valid = jnp.array([True, True, False])
     images = views().images

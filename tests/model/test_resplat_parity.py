@@ -136,6 +136,7 @@ RESPLAT_TAPS = (
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", RESPLAT_TAPS)
 def test_resplat_computes_what_the_authors_code_computes(name):
     wanted, came = resplat_values()[name]

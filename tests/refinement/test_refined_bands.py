@@ -79,6 +79,7 @@ def test_a_rate_of_zero_changes_no_bit_of_the_given_bands():
     np.testing.assert_array_equal(current_gaussians(state).sh, turning().sh)
 
 
+@pytest.mark.slow
 def test_scenes_of_captures_get_bands():
     capture = open_capture("procedural:room?frames=4", size=(24, 16))
     frame = capture.stream_frame(StreamConfig())

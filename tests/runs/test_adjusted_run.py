@@ -17,7 +17,12 @@ from ssplat_jax.runs import render_scene
 from ssplat_jax.runs.capture_run import run_capture
 from ssplat_jax.runs.export_cameras import open_cameras
 from ssplat_jax.runs.refine_run import refine_run
-from ssplat_jax.runs.run_poses import capture_to_stream, has_adjusted_poses, with_poses_of_run
+from ssplat_jax.runs.run_poses import (
+    capture_to_stream,
+    has_adjusted_poses,
+    open_capture_of_scene,
+    with_poses_of_run,
+)
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.streaming.streamsplat import StreamSplat
 
@@ -62,7 +67,7 @@ def test_the_stream_and_all_that_follows_see_the_adjusted_poses(finished, monkey
     wanted = moved(given, range(4)).capture.camtoworlds
     assert run(finished).was_finished
     assert has_adjusted_poses(RunFolder(finished))
-    cameras = open_cameras(CAPTURE, finished, finished / "scene.sog")
+    cameras = open_cameras(CAPTURE, finished, finished / "scene.sog", Reporter(quiet=True))
     np.testing.assert_array_equal(cameras.capture.camtoworlds, wanted)
     result = refine_run(
         finished,
@@ -104,7 +109,7 @@ def test_poses_that_fitted_are_no_adjusted_ones(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "earlier, indices", [(CAPTURE, (0, 2)), ("procedural:room?frames=4&seed=5", range(4))], ids=["frames", "capture"]
+    "earlier, indices", [(CAPTURE, (0, 2)), ("procedural:corridor?frames=4", range(4))], ids=["frames", "capture"]
 )
 def test_poses_that_a_stopped_run_left_for_another_stream_are_found_anew(earlier, indices, tmp_path, monkeypatch):
     folder, quiet = RunFolder(tmp_path), Reporter(quiet=True)
@@ -121,7 +126,7 @@ def test_pictures_and_cameras_of_a_run_have_its_adjusted_poses(finished, tmp_pat
     given = open_capture(CAPTURE, size=SIZE)
     wanted = moved(given, range(4)).capture.camtoworlds
     path = f"{CAPTURE}&size={SIZE[0]}x{SIZE[1]}"
-    cameras = open_cameras(path, finished / "scene.ply", tmp_path / "scene.ply")
+    cameras = open_cameras(path, finished / "scene.ply", tmp_path / "scene.ply", Reporter(quiet=True))
     np.testing.assert_array_equal(cameras.capture.camtoworlds, wanted)
     drawn = []
 
@@ -134,6 +139,34 @@ def test_pictures_and_cameras_of_a_run_have_its_adjusted_poses(finished, tmp_pat
         options = {"size": SIZE, "stride": 1, "max_views": None, "over_black": False, "film": None}
         render_scene.render_scene(scene, CAPTURE, tmp_path / "out", **options, reporter=Reporter(quiet=True))
     np.testing.assert_array_equal(drawn, [*wanted, *wanted])
+
+
+@pytest.mark.parametrize("other", ["procedural:corridor?frames=4", "procedural:room?frames=3"])
+def test_pictures_of_another_capture_have_its_poses_and_a_warning_says_so(other, finished, capsys):
+    capture = open_capture_of_scene(finished, other, SIZE, Reporter(quiet=True))
+    np.testing.assert_array_equal(capture.camtoworlds, open_capture(other, size=SIZE).camtoworlds)
+    assert "adjusted_poses.json is of another capture" in capsys.readouterr().err
+
+
+def test_poses_that_a_stopped_run_adjusted_anyway_are_judged_for_auto(tmp_path, monkeypatch):
+    folder, capture, quiet = RunFolder(tmp_path), open_capture(CAPTURE, size=SIZE), Reporter(quiet=True)
+    monkeypatch.setattr(adjusting, "adjust_poses", lambda *given: moved(*given, are_off=False))
+    capture_to_stream(capture, range(4), ("poses",), folder, quiet)
+    assert has_adjusted_poses(folder)
+    streamed = capture_to_stream(capture, range(4), ("auto",), folder, quiet)
+    np.testing.assert_array_equal(streamed.camtoworlds, capture.camtoworlds)
+    assert not has_adjusted_poses(folder)
+
+
+def test_poses_without_a_run_are_removed_even_if_they_are_damaged(tmp_path):
+    folder, capture = RunFolder(tmp_path), open_capture(CAPTURE, size=SIZE)
+    folder.adjusted_poses.write_text("{")
+    folder.state.write_bytes(b"of the run")
+    assert capture_to_stream(capture, range(4), (), folder, Reporter(quiet=True)) is capture
+    assert folder.adjusted_poses.exists()  # what belongs to a run stays
+    folder.state.unlink()
+    assert capture_to_stream(capture, range(4), (), folder, Reporter(quiet=True)) is capture
+    assert not folder.adjusted_poses.exists()
 
 
 def test_poses_that_fit_are_kept_and_not_judged_twice(tmp_path, monkeypatch):

@@ -97,6 +97,7 @@ def stop_after_each_step(monkeypatch):
     monkeypatch.setattr(module, "continue_refinement", stopped_after_one)
 
 
+@pytest.mark.slow
 def test_a_stop_after_each_learned_pass_changes_no_byte(finished, monkeypatch):
     folder, steps = RunFolder(finished), 2 * STEPS + 1
     assert refine(finished, steps, overwrite=True).num_steps == steps

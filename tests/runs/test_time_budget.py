@@ -50,8 +50,8 @@ def test_no_image_is_streamed_larger_than_the_capture_has_it(tmp_path, monkeypat
     monkeypatch.setattr(time_budget, "load_front", lambda: front)
     width, height = map(int, size.split("x"))
     path = "procedural:room?frames=8"  # 128 x 96 by itself
-    point = setting_for_run(1e6, path, (width, height), tmp_path, overwrite=False, reporter=QUIET)
-    assert point.setting == chosen
+    choice = setting_for_run(1e6, path, (width, height), tmp_path, overwrite=False, reporter=QUIET)
+    assert choice.point.setting == chosen
 
 
 def test_images_of_several_sizes_need_a_size_alone(tmp_path, monkeypatch):
@@ -65,7 +65,10 @@ def test_images_of_several_sizes_need_a_size_alone(tmp_path, monkeypatch):
     monkeypatch.setattr(time_budget, "load_front", lambda: front)
     for size, chosen in (((32, 24), "large"), ((64, 48), "plain")):
         out = tmp_path / chosen
-        assert setting_for_run(1e6, str(capture), size, out, overwrite=False, reporter=QUIET).setting == chosen
+        choice = setting_for_run(1e6, str(capture), size, out, overwrite=False, reporter=QUIET)
+        assert not out.exists() and choice.point.setting == chosen
+        out.mkdir()
+        choice.save()
         assert json.loads((out / "budget.json").read_text())["point"]["setting"] == chosen
     with pytest.raises(InputError, match="images"):
         setting_for_run(1e6, str(capture), (32, 24), capture / "images", overwrite=False, reporter=QUIET)
@@ -91,7 +94,7 @@ def test_every_shipped_point_runs_with_the_shipped_weights():
 
 
 def test_a_run_that_continues_keeps_its_setting(tmp_path, monkeypatch):
-    speeds = iter([1.0, 100.0, 1.0, 1.0])
+    speeds = iter([1.0, 100.0, 1.0, 1.0, 1.0])
     monkeypatch.setattr(time_budget, "reference_step_ms", lambda: next(speeds))
     monkeypatch.setattr(
         time_budget,
@@ -99,10 +102,13 @@ def test_a_run_that_continues_keeps_its_setting(tmp_path, monkeypatch):
         lambda: Front((64, 48), (point(1.0, 20.0), FrontPoint("two", 0.5, {"hpda": False}, 5.0, 22.0))),
     )
 
-    def chosen(budget, overwrite=False):
-        return setting_for_run(
+    def chosen(budget, overwrite=False, accept=True):
+        choice = setting_for_run(
             budget, "procedural:room?frames=8", (64, 48), tmp_path, overwrite=overwrite, reporter=QUIET
-        ).setting
+        )
+        if accept:
+            choice.save()
+        return choice.point.setting
 
     assert chosen(6.0) == "two"
     assert chosen(6.0) == "two"  # not timed again
@@ -113,6 +119,7 @@ def test_a_run_that_continues_keeps_its_setting(tmp_path, monkeypatch):
     (tmp_path / "state.npz").write_bytes(b"of a run that has begun")
     with pytest.raises(InputError, match=r"--budget-ms: wanted what the run in .* began with, got 6 at 64x48"):
         chosen(6.0)
+    assert chosen(6.0, overwrite=True, accept=False) == "two"  # and then the run is refused for another reason
     assert chosen(4.0) == "1.0 steps"  # so that it can go on
     assert chosen(6.0, overwrite=True) == "two"
 

@@ -174,7 +174,7 @@ def test_shares_need_captures(tmp_path):
 
 def test_a_run_with_other_captures_is_not_continued(mix, capture):
     descriptions = [
-        loop.describe_run(NARROW, TINY, None, has_lpips=False, mix=m)
+        loop.describe_run(NARROW, TINY, loop.RANDOM, has_lpips=False, mix=m)
         for m in (None, mix, CaptureMix((CaptureGroup("room", 0.5, (capture,)),), NARROW))
     ]
     assert "captures" not in descriptions[0]  # as runs were described before there were captures

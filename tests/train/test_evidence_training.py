@@ -17,7 +17,7 @@ from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.rasterizer import render
 from ssplat_jax.streaming.streamsplat import StreamSplat
-from ssplat_jax.train import streamed_scenes
+from ssplat_jax.train import evidence_training, streamed_scenes
 from ssplat_jax.train.evidence_training import EvidenceRecipe, crop_camera, train_evidence
 from ssplat_jax.train.streamed_scenes import SceneSources, captures_of
 from tests.commands.test_cli import make_capture
@@ -36,10 +36,16 @@ def standard_promotion():
 
 @pytest.fixture(scope="module")
 def trained():
-    """(parameters before, parameters after, facts, records) of a short training on one small scene."""
-    params, records, names, made_room = load_params("tiny"), [], [], []
+    """(parameters before, parameters after, facts, records, streams) of a short training on one small scene."""
+    params, records, names, made_room, streams = load_params("tiny"), [], [], [], []
+
+    def streamed(*given):
+        streams.append(streamed_scenes.stream_scene(*given))
+        return streams[-1]
+
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(streamed_scenes, "make_room", lambda: made_room.append(list(names)))
+        patch.setattr(evidence_training, "stream_scene", streamed)
         after, facts = train_evidence(
             StreamSplat(preset("tiny")),
             params,
@@ -50,11 +56,11 @@ def trained():
         )
     assert names == facts["scenes"]
     assert made_room == [[]]  # before the scene: programs of many would be too many for one process
-    return params, after, facts, records
+    return params, after, facts, records, streams
 
 
 def test_it_moves_the_evidence_head_alone(trained):
-    before, after, _, _ = trained
+    before, after, _, _, _ = trained
     for stage in before:
         same = [np.array_equal(a, b) for a, b in zip(*map(jax.tree.leaves, (before[stage], after[stage])), strict=True)]
         assert all(same) == (stage != "evidence")
@@ -63,16 +69,17 @@ def test_it_moves_the_evidence_head_alone(trained):
 
 
 def test_it_names_its_scenes_and_reports_every_step(trained):
-    _, _, facts, records = trained
+    _, _, facts, records, _ = trained
     assert facts["scenes"] == ["procedural-room, stride 1"]
     assert [step for step, _ in records] == list(range(1, RECIPE.steps + 1))
     assert facts["shown_psnr"] == pytest.approx(records[-1][1]["shown_psnr"], abs=1e-3)
     assert 15 < facts["black_psnr"] <= facts["shown_psnr"] + 1 < 45
 
 
-def test_an_untrained_head_is_what_it_starts_from(trained):
+def test_an_untrained_head_is_what_it_starts_from(trained, monkeypatch):
     """The head that the parameters hold does not matter."""
-    before, after, _, _ = trained
+    before, after, _, _, streams = trained
+    monkeypatch.setattr(evidence_training, "stream_scene", lambda *given: streams[0])
     noise = jax.tree.map(lambda x: x + 1.0, before["evidence"])
     again, _ = train_evidence(StreamSplat(preset("tiny")), {**before, "evidence": noise}, [], RECIPE)
     jax.tree.map(np.testing.assert_array_equal, again["evidence"], after["evidence"])

@@ -42,6 +42,7 @@ def standard_promotion():
         yield
 
 
+@pytest.mark.slow
 def test_the_command_writes_a_network_with_which_other_views_gain(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("ssplat_jax.train.refiner_training.RefinerRecipe", lambda seed: RECIPE)
     assert Train(out=tmp_path, recipe="refiner", init_weights=SHIPPED, scale_steps=0.5).run() == 0

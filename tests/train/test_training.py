@@ -1,6 +1,7 @@
 """Training with the smallest recipe: it is reproducible and resumable."""
 
 import dataclasses
+import functools
 import json
 import time
 from importlib import resources
@@ -13,7 +14,7 @@ import pytest
 
 from ssplat_jax.cache import Tokens
 from ssplat_jax.checkpoint.training_state import TrainingCheckpoints
-from ssplat_jax.checkpoint.weights import load_params
+from ssplat_jax.checkpoint.weights import load_params, params_digest
 from ssplat_jax.commands.train_command import Train
 from ssplat_jax.config import preset
 from ssplat_jax.data.procedural import training_sample
@@ -101,6 +102,7 @@ def test_other_recipe_is_refused_by_its_first_difference(tmp_path):
         TrainingCheckpoints(tmp_path, other)
 
 
+UPGRADE = functools.partial(loop.upgrade_description, init_weights=loop.RANDOM)
 OLD_RUN = Path(__file__).with_name("recipe_0_1.json")  # written by version 0.1 for `ssplat train --scale-steps 0.004`
 
 
@@ -108,45 +110,42 @@ def test_run_of_version_0_1_is_resumed(tmp_path):
     (tmp_path / "recipe.json").write_text(OLD_RUN.read_text())
     recipe = TINY.scaled(0.004)
     config = training_config(preset("tiny").replace(evidence=False, cgfi=True, mixer_blocks=2), recipe)
-    description = loop.describe_run(config, recipe, None, has_lpips=False)
-    TrainingCheckpoints(tmp_path, description, upgrade=loop.upgrade_description).close()
+    description = loop.describe_run(config, recipe, loop.RANDOM, has_lpips=False)
+    TrainingCheckpoints(tmp_path, description, upgrade=UPGRADE).close()
     for other in (dataclasses.replace(recipe, adam_b2=0.999), dataclasses.replace(recipe, weight_decay=0.02)):
-        description = loop.describe_run(config, other, None, has_lpips=False)
+        description = loop.describe_run(config, other, loop.RANDOM, has_lpips=False)
         with pytest.raises(InputError, match=r"holds a run with recipe\.(adam_b2|weight_decay)"):
-            TrainingCheckpoints(tmp_path, description, upgrade=loop.upgrade_description)
-    description = loop.describe_run(config.replace(token_width=32), recipe, None, has_lpips=False)
+            TrainingCheckpoints(tmp_path, description, upgrade=UPGRADE)
+    description = loop.describe_run(config.replace(token_width=32), recipe, loop.RANDOM, has_lpips=False)
     with pytest.raises(InputError, match=r"config\.network\.token_width = 64, wanted 32"):
-        TrainingCheckpoints(tmp_path, description, upgrade=loop.upgrade_description)
+        TrainingCheckpoints(tmp_path, description, upgrade=UPGRADE)
 
 
 def test_a_run_that_began_with_other_weights_is_refused(tmp_path):
     config = training_config(NARROW, RECIPE)
     first, other = ({"encoder": {"kernel": jnp.full((2, 2), x)}} for x in (1.0, 2.0))
-    described = [loop.describe_run(config, RECIPE, params, has_lpips=False) for params in (first, other, None)]
-    TrainingCheckpoints(tmp_path, described[0], upgrade=loop.upgrade_description).close()
-    TrainingCheckpoints(tmp_path, described[0], upgrade=loop.upgrade_description).close()
-    for different in described[1:]:
+    held = loop.describe_run(config, RECIPE, params_digest(first), has_lpips=False)
+    TrainingCheckpoints(tmp_path, held).close()
+    for params in (other, None):
         with pytest.raises(InputError, match="holds a run with init_weights = "):
-            TrainingCheckpoints(tmp_path, different, upgrade=loop.upgrade_description)
-    with pytest.raises(InputError, match="holds a run with init_weights = "):
-        loop.train(NARROW, RECIPE, tmp_path, params=other)
+            loop.train(NARROW, RECIPE, tmp_path, params=params)
+    with pytest.raises(InputError, match=f"{params_digest(first)}', wanted 'mine'"):
+        loop.train(NARROW, RECIPE, tmp_path, params=first, init_weights="mine")
 
 
 def test_a_run_of_a_version_that_did_not_write_its_start_is_resumed(tmp_path):
-    description = loop.describe_run(NARROW, RECIPE, {"encoder": jnp.ones(2)}, has_lpips=False)
-    old = json.loads(json.dumps(description))
-    del old["init_weights"]
-    assert loop.upgrade_description(old, init_weights=description["init_weights"]) == json.loads(
-        json.dumps(description)
-    )
+    description = json.loads(json.dumps(loop.describe_run(NARROW, RECIPE, "mine", has_lpips=False)))
+    old = {name: value for name, value in description.items() if name != "init_weights"}
+    assert loop.upgrade_description(old, init_weights="mine") == description
+    assert loop.upgrade_description(description, init_weights="another") == description
 
 
 def test_run_without_the_switches_of_additions_is_resumed(tmp_path):
-    description = loop.describe_run(NARROW, RECIPE, None, has_lpips=False)
+    description = loop.describe_run(NARROW, RECIPE, loop.RANDOM, has_lpips=False)
     old = json.loads(json.dumps(description))
     del old["config"]["history"]["cgfi_form"], old["config"]["head"]["opacity_mode"]
     (tmp_path / "recipe.json").write_text(json.dumps(old))
-    TrainingCheckpoints(tmp_path, description, upgrade=loop.upgrade_description).close()
+    TrainingCheckpoints(tmp_path, description, upgrade=UPGRADE).close()
 
 
 def test_fields_missing_in_a_recipe_have_their_default():

@@ -208,6 +208,8 @@ def test_a_scene_file_is_read_again_when_it_is_written_again(tmp_path):
     whole = file.read_bytes()
     file.write_bytes(whole[: len(whole) // 2])  # by a program that is still writing
     assert source.changed() is None and source.at(1).gaussians.num_gaussians == 7
+    with pytest.raises(InputError):  # nobody has gone on writing
+        source.changed()
     ss.save_ply(file, scene(6))
     assert source.changed().gaussians.num_gaussians == 6
     file.unlink()
