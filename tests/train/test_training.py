@@ -131,6 +131,9 @@ def test_a_run_that_began_with_other_weights_is_refused(tmp_path):
             loop.train(NARROW, RECIPE, tmp_path, params=params)
     with pytest.raises(InputError, match=f"{params_digest(first)}', wanted 'mine'"):
         loop.train(NARROW, RECIPE, tmp_path, params=first, init_weights="mine")
+    TrainingCheckpoints(tmp_path / "2", loop.describe_run(config, RECIPE, loop.RANDOM, has_lpips=False)).close()
+    with pytest.raises(InputError, match=f"init_weights = 'random', wanted '{params_digest(first)}'"):
+        loop.train(NARROW, RECIPE, tmp_path / "2", params=first)
 
 
 def test_a_run_of_a_version_that_did_not_write_its_start_is_resumed(tmp_path):
