@@ -157,8 +157,8 @@ def config_of(variant: str) -> StreamConfig:
 
 def cases(captures: Path | None, scale: str) -> list[Case]:
     """A case for each variant and seed: first those of `REPEATED`, seed by seed, so that they can be compared early."""
-    budget = at_scale(BUDGETS, scale)
-    scenes = scenes_of(captures if scale != "smoke" else None)
+    budget, captures = at_scale(BUDGETS, scale), None if scale == "smoke" else captures
+    scenes = scenes_of(captures)
     asked = {name: value for name, value in dataclasses.asdict(budget).items() if name not in ("seeds", "trainings")}
     return [
         Case(
