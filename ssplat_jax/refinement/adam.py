@@ -28,7 +28,8 @@ def adam_step(
         revision: the changes so far.
         moments: first and second moment.
         gradient: of the loss by the revision.
-        num_steps: steps before this one.
+        num_steps: steps before this one, those of learned passes included. The moments are zero after passes, so the
+            bias correction of later steps makes the first ones shorter than the rates: a warm-up.
         rate: factor of all learning rates.
         config: learning rates, decays and bounds.
 
