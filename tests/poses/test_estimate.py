@@ -187,7 +187,9 @@ def test_a_call_killed_among_its_images_continues(photos, estimated, tmp_path, m
         with pytest.raises(MemoryError):
             estimate(photos, killed)
     assert (killed / "images").is_dir()
-    assert estimate(photos, killed) == estimated[1]
+    found, wanted = estimate(photos, killed), estimated[1]
+    assert (found.names, found.parts) == (wanted.names, wanted.parts)
+    assert found.num_points == pytest.approx(wanted.num_points, rel=0.05)  # COLMAP's threads decide about a few
 
 
 def _only_once(function):

@@ -154,9 +154,10 @@ def test_options_that_do_not_fit_the_recipe_are_refused(options, named, tmp_path
     assert not (tmp_path / "out").exists()
 
 
-def test_the_command_writes_weights_with_their_history(tmp_path, monkeypatch, capsys):
+def test_the_command_writes_weights_with_their_history(trained, tmp_path, monkeypatch, capsys):
     """The file tells the recipe, the scenes, and the training of the weights that it started from."""
     monkeypatch.setattr("ssplat_jax.train.evidence_training.EvidenceRecipe", lambda seed: RECIPE)
+    monkeypatch.setattr(evidence_training, "stream_scene", lambda *given: trained[-1][0])
     assert Train(out=tmp_path, recipe="evidence", init_weights=SHIPPED, scale_steps=0.5).run() == 0
     said = capsys.readouterr().err
     assert "minutes on two cores" in said and f"next: `ssplat run CAPTURE --weights {tmp_path}/weights.npz" in said
