@@ -46,7 +46,7 @@ CLOSE_QUANTILE = 0.9  # of the inverse depths of a nearest partner's points; fal
 # Guesses
 GUESSED_SPREAD = 4.0  # median over the 1 % quantile, and 99 % quantile over the median, where they are not measured
 BASELINE_DEPTH = 5.0  # median depth over the median step between frames, where nothing matches
-# From quantiles to the depth range
+# Factors that widen the quantiles to the depth range
 NEAR_FACTOR = 0.55  # near over the 1 % quantile; the nearest surfaces may have no keypoints
 FAR_FACTOR = 1.8  # far over the 99 % quantile, for the same reason
 MIN_RANGE, MAX_RANGE = 4.0, 60.0  # far / near

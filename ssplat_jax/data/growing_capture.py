@@ -32,5 +32,5 @@ def open_growing(path: Path, *, size: tuple[int, int] | None) -> tuple[Capture |
 
 
 def is_done(path: Path) -> bool:
-    """Whether the writer of a capture has said that nothing more will come."""
+    """True if the writer of a capture has said that nothing more will come."""
     return (path / DONE).exists()

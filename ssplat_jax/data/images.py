@@ -38,7 +38,7 @@ class Pixels(Protocol):
         ...
 
     def has_depth(self, i: int) -> bool:
-        """Whether frame `i` has a depth map; does not decode it."""
+        """True if frame `i` has a depth map; does not decode it."""
         ...
 
 
@@ -220,7 +220,7 @@ class Crop:
 
     @property
     def is_identity(self) -> bool:
-        """Whether the delivered image equals the stored one."""
+        """True if the delivered image equals the stored one."""
         return (self.scale, self.left, self.top) == (1.0, 0.0, 0.0)
 
     def intrinsics(self, K: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, "3 3"]:

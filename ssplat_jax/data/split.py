@@ -44,7 +44,7 @@ class Split:
 
     @property
     def keeps_order(self) -> bool:
-        """Whether chunks take the context in its order, without interleaving."""
+        """True if chunks take the context in its order, without interleaving."""
         return self.protocol in ("scannet", "index")
 
     def to_json(self) -> str:

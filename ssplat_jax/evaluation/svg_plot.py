@@ -47,7 +47,7 @@ def line_plot(title: str, x_label: str, y_label: str, lines: Sequence[Line]) -> 
 
 @dataclasses.dataclass(frozen=True)
 class _Scale:
-    """From values to pixels; the first and last ticks are the ends of the axes."""
+    """Map of values to pixels; the first and last ticks are the ends of the axes."""
 
     x_ticks: list[float]
     y_ticks: list[float]

@@ -173,7 +173,7 @@ def _adjust(model: Any) -> None:
 
 
 def is_plausible(camera: Any) -> bool:
-    """Whether a camera has nearly square pixels and its principal point near the center of its images."""
+    """True if a camera has nearly square pixels and its principal point near the center of its images."""
     x, y = camera.principal_point_x / camera.width - 0.5, camera.principal_point_y / camera.height - 0.5
     aspect = camera.focal_length_x / camera.focal_length_y
     return max(abs(x), abs(y)) <= MAX_CENTER_SHIFT and abs(aspect - 1) <= MAX_ASPECT

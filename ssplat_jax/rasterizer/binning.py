@@ -115,7 +115,7 @@ def _tiles(table, images: Int[Array, " m"], ends: Int[Array, " m"], rows: Int[Ar
 
 
 def _reaches(low, shape, tile: int):
-    """Whether a Gaussian's ellipse of alpha = 1/255 reaches the pixel centers of a tile: a quarter of a box's do not.
+    """True if a Gaussian's ellipse of alpha = 1/255 reaches the pixel centers of a tile: a quarter of a box's do not.
 
     The least exponent over the tile is on an edge that faces the mean (or is 0 inside). The rounding error of float32,
     which is large for needles, is subtracted, so that no pair is missed.

@@ -88,7 +88,7 @@ class Effects:
 
     @property
     def needs_alpha(self) -> bool:
-        """Whether alpha is composited: asked for, or needed by depth or background."""
+        """True if alpha is composited: asked for, or needed by depth or background."""
         return bool({"alpha", "depth"} & set(self.outputs)) or self.background is not None
 
 
@@ -133,7 +133,7 @@ def _used_degree(sh: np.ndarray) -> int:
 
 
 def _differ(exposures: np.ndarray) -> bool:
-    """Whether frames differ in exposure; a single one is compared with no correction."""
+    """True if frames differ in exposure; a single one is compared with no correction."""
     flat = exposures.reshape(-1, 12)
     usual = flat[:1] if len(flat) > 1 else np.eye(3, 4).reshape(1, 12)
     return bool(np.any(np.abs(flat - usual) > 1e-6))

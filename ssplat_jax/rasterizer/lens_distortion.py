@@ -25,7 +25,7 @@ def distort(
 
 
 def is_folded(derivatives: tuple[Float[Array, "b n"], ...]) -> Array:
-    """Whether the polynomial falls with the radius, outside the lens's field of view: such points are culled.
+    """True if the polynomial falls with the radius, outside the lens's field of view: such points are culled.
 
     It may rise again farther out. Points outside its first maximum, which `lens_field` finds, are culled too.
     """

@@ -45,7 +45,7 @@ class Splats:
 
 
 def _finite_rows(gaussians: Gaussians) -> Bool[Array, " n"]:
-    """Whether all entries of a row are finite and at most `constants.MAX_MAGNITUDE` in magnitude."""
+    """True if all entries of a row are finite and at most `constants.MAX_MAGNITUDE` in magnitude."""
     rows = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities[:, None], gaussians.sh)
     small = [jnp.abs(x) <= constants.MAX_MAGNITUDE for x in rows]  # False for NaN too
     return jnp.stack([jnp.all(s.reshape(s.shape[0], -1), axis=1) for s in small]).all(axis=0)

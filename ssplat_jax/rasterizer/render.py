@@ -216,7 +216,7 @@ def _check_array(name: str, array: object) -> None:
 
 
 def _is_whole(number: object) -> bool:
-    """Whether it is a Python or NumPy integer."""
+    """True if it is a Python or NumPy integer."""
     return isinstance(number, int | np.integer) and not isinstance(number, bool)
 
 

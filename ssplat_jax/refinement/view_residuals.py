@@ -75,7 +75,7 @@ def _fit_view(gaussians: Gaussians, key_views: KeyViews, view: int, depth: float
     covered = (alpha > COVERED) & (z > 0)
     if covered.mean() < SMALLEST_SHARE:
         return [np.nan] * 14
-    # Where a little light is missing the color is completed, so that thin cover does not read as a dark exposure.
+    # The color is completed if a little light is missing, so that thin cover does not read as a dark exposure.
     color = color / np.where(covered, alpha, 1.0)[..., None]
     residual = np.asarray(key_views.images[view], np.float64) / 255 / exposure - color
     columns = _columns(color, z, np.asarray(camera.Ks, np.float64), depth)

@@ -15,7 +15,7 @@ from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.storage.video import VideoWriter
 
 KINDS = ("color", "depth", "normals")
-"""What a film can show."""
+"""Kinds of pictures that a film can show."""
 
 PATHS = ("spline", "orbit")
 """The paths that a film can take."""

@@ -27,7 +27,7 @@ from ssplat_jax.streaming.feed import feed_chunks
 from ssplat_jax.streaming.streamsplat import StreamSplat
 
 POLL_SECONDS = 0.25
-"""Between two looks at the folder."""
+"""Seconds between two looks at the folder."""
 
 
 @dataclasses.dataclass(frozen=True)

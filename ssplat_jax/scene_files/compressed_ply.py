@@ -134,7 +134,7 @@ def _pack_rotations(quats: Float64[np.ndarray, "n 4"]) -> UInt32[np.ndarray, " n
 
 
 def is_compressed_ply(path: str | os.PathLike) -> bool:
-    """Whether a file that can be read names the properties of a compressed .ply in its header."""
+    """True if a file that can be read names the properties of a compressed .ply in its header."""
     try:
         with open(path, "rb") as file:
             header = file.read(MAX_HEADER_BYTES)

@@ -27,7 +27,7 @@ UNIFORM = 1e-4
 """Relative difference up to which the scales of a node count as one."""
 ROUNDING = 1e-12
 AXIS_FLIP = np.diag([-1.0, -1.0, 1.0])
-"""From the axes of glTF, y up, to those of a .ply: the inverse of the writer's half turn."""
+"""Rotation of the axes of glTF, y up, to those of a .ply: the inverse of the writer's half turn."""
 
 
 def read_gltf(path: str | os.PathLike) -> SplatFile:

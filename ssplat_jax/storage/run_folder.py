@@ -117,7 +117,7 @@ class RunFolder:
         return self.path / f"view_{i:05d}.png"
 
     def has_state(self) -> bool:
-        """Whether a state, the newest or the one before it, is saved here."""
+        """True if a state, the newest or the one before it, is saved here."""
         return self.state.exists() or previous_path(self.state).exists()
 
     def check_no_run(self) -> None:
@@ -131,7 +131,7 @@ class RunFolder:
             raise refusal(f"--out {self.path}", wanted="a folder without a run", got="that of a run", fix=fix)
 
     def has_deltas(self) -> bool:
-        """Whether at least one delta is saved here."""
+        """True if at least one delta is saved here."""
         return bool(self.delta_files())
 
     def delta_files(self) -> list[Path]:

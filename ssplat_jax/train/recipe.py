@@ -125,7 +125,7 @@ class Recipe:
 
     @property
     def renders(self) -> bool:
-        """Whether any phase renders target views."""
+        """True if any phase renders target views."""
         return any(phase.num_targets for phase in self.phases)
 
     @property

@@ -26,7 +26,7 @@ class BrowserCamera:
         return np.array([[fx, 0.0, width / 2], [0.0, fy, height / 2], [0.0, 0.0, 1.0]])
 
     def is_same(self, other: "BrowserCamera") -> bool:
-        """Whether both show the same."""
+        """True if both show the same."""
         same_window = (self.fov, self.aspect) == (other.fov, other.aspect)
         return same_window and np.array_equal(self.camtoworld, other.camtoworld)
 

@@ -45,7 +45,7 @@ class Panel:
 
     @property
     def shows_cameras(self) -> bool:
-        """Whether streamed cameras are wanted."""
+        """True if streamed cameras are wanted."""
         return self._cameras.value
 
     @property

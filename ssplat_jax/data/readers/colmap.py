@@ -79,7 +79,7 @@ class CameraEntry(NamedTuple):
 
 
 def matches(path: Path) -> bool:
-    """Whether `path` is a folder with a reconstruction."""
+    """True if `path` is a folder with a reconstruction."""
     return _model_folder(path) is not None
 
 
@@ -122,7 +122,7 @@ def _model_folder(path: Path) -> Path | None:
 
 
 def _is_model(folder: Path) -> bool:
-    """Whether a folder holds a reconstruction."""
+    """True if a folder holds a reconstruction."""
     return any((folder / f"images.{kind}").is_file() for kind in ("bin", "txt"))
 
 

@@ -24,7 +24,7 @@ IMAGES = frozenset({".png", ".jpg"})
 
 
 def matches(path: Path) -> bool:
-    """Whether `path` is a sequence: a folder with `calib.txt` and a folder of images."""
+    """True if `path` is a sequence: a folder with `calib.txt` and a folder of images."""
     return (path / "calib.txt").is_file() and _camera(path) is not None
 
 

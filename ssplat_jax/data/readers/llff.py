@@ -30,7 +30,7 @@ FIX = "write it again with LLFF's imgs2poses.py"
 
 
 def matches(path: Path) -> bool:
-    """Whether `path` is a folder with a poses_bounds.npy."""
+    """True if `path` is a folder with a poses_bounds.npy."""
     return (path / FILE).is_file()
 
 

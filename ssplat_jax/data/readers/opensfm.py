@@ -33,7 +33,7 @@ FIX = "write it again with OpenSfM"
 
 
 def matches(path: Path) -> bool:
-    """Whether `path` is a folder with a reconstruction.json, also in `opensfm`."""
+    """True if `path` is a folder with a reconstruction.json, also in `opensfm`."""
     return any((path / place).is_file() for place in PLACES)
 
 

@@ -21,7 +21,7 @@ IMAGES = frozenset({".jpg", ".jpeg", ".png"})
 
 
 def matches(path: Path) -> bool:
-    """Whether `path` is a folder with `keyframes/`, or that folder, with images and cameras in it."""
+    """True if `path` is a folder with `keyframes/`, or that folder, with images and cameras in it."""
     return _keyframes(path) is not None
 
 

@@ -23,7 +23,7 @@ COLUMNS = 19  # numbers per line
 
 
 def matches(path: Path) -> bool:
-    """Whether `path` is a file of cameras, or a folder that holds exactly one."""
+    """True if `path` is a file of cameras, or a folder that holds exactly one."""
     return _cameras_file(path) is not None
 
 
@@ -79,7 +79,7 @@ def _cameras_file(path: Path) -> Path | None:
 
 
 def _starts_with_address(file: Path) -> bool:
-    """Whether the first line of a file may be the address of a video."""
+    """True if the first line of a file may be the address of a video."""
     if not file.is_file():
         return False
     with file.open("rb") as opened:

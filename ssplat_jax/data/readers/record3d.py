@@ -21,7 +21,7 @@ FIX = "export the recording again"
 
 
 def matches(path: Path) -> bool:
-    """Whether `path` is a folder with Record3D's metadata and a folder of images."""
+    """True if `path` is a folder with Record3D's metadata and a folder of images."""
     return _metadata(path) is not None and any((path / folder).is_dir() for folder in FOLDERS)
 
 

@@ -20,7 +20,7 @@ IMAGES = (".jpg", ".jpeg", ".png")  # extensions of color images
 
 
 def matches(path: Path) -> bool:
-    """Whether `path` is a folder with `color/` and `pose/`."""
+    """True if `path` is a folder with `color/` and `pose/`."""
     return (path / "color").is_dir() and (path / "pose").is_dir()
 
 

@@ -28,7 +28,7 @@ FORMAT = "cameras.json"
 
 
 def matches(path: Path) -> bool:
-    """Whether `path` is a folder with a cameras.json that holds a list, or that file."""
+    """True if `path` is a folder with a cameras.json that holds a list, or that file."""
     file = path if path.name == FORMAT else path / FORMAT
     if not file.is_file():
         return False

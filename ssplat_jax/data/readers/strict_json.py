@@ -92,7 +92,7 @@ class JsonFields:
         self._fields, self.where = fields, where
 
     def has(self, name: str) -> bool:
-        """Whether there is a value of that name that is not null."""
+        """True if there is a value of that name that is not null."""
         return self._fields.get(name) is not None
 
     def number(self, name: str, default: float | None = None) -> float:

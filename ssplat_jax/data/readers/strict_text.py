@@ -74,7 +74,7 @@ def load_rows(path: Path, num_columns: int, lines: list[tuple[int, str]] | None 
 
 
 def _is_number(word: str) -> bool:
-    """Whether `float` accepts a word."""
+    """True if `float` accepts a word."""
     try:
         float(word)
     except ValueError:

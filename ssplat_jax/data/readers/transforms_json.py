@@ -41,7 +41,7 @@ FISHEYE_MODELS = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 
 
 def matches(path: Path) -> bool:
-    """Whether `path` is a folder with a transforms.json, also in `nerfstudio`, or a .json file of an object."""
+    """True if `path` is a folder with a transforms.json, also in `nerfstudio`, or a .json file of an object."""
     if path.is_file():
         return path.suffix == ".json" and not splat_cameras.matches(path)
     return any((path / name).is_file() for name in PLACES)

@@ -37,7 +37,7 @@ CALIBRATIONS = {  # fx fy cx cy k1 k2 p1 p2 k3
 
 
 def matches(path: Path) -> bool:
-    """Whether `path` is a folder with `rgb.txt` and `groundtruth.txt`."""
+    """True if `path` is a folder with `rgb.txt` and `groundtruth.txt`."""
     return (path / "rgb.txt").is_file() and (path / "groundtruth.txt").is_file()
 
 

@@ -45,7 +45,7 @@ def _light(points, normals, world, lights, ambient) -> np.ndarray:
 
 
 def _blocked(points, rays, low, high) -> np.ndarray:
-    """Whether the segment to a light passes through the middle of an object's box."""
+    """True if the segment to a light passes through the middle of an object's box."""
     shrink = 0.1 * (high - low)
     inverse = 1 / np.where(np.abs(rays) < 1e-9, 1e-9, rays)[:, None]
     t0, t1 = (low + shrink - points[:, None]) * inverse, (high - shrink - points[:, None]) * inverse

@@ -120,7 +120,7 @@ def _good_walk(renderer, world, rng, frames, focal) -> np.ndarray:
 
 
 def is_bad(image: np.ndarray, depth: np.ndarray) -> bool:
-    """Whether a view is too close to a surface, too flat in depth, or almost without texture."""
+    """True if a view is too close to a surface, too flat in depth, or almost without texture."""
     seen = depth[depth > 0]
     if seen.size < 0.4 * depth.size:
         return True
