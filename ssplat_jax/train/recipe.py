@@ -50,6 +50,9 @@ class Phase:
     """Samples per step; the loss is their mean."""
     steps_of_depth: tuple[float, float] = (0.005, 0.4)
     """Range of the distance between consecutive views in median depths: from hand-held video to photo sets."""
+    kinds: tuple[str, ...] = ()
+    """Kinds of procedural worlds, of which each sample draws one; repeated ones are more likely. Empty: all kinds but
+    yards, with the shares of `data/procedural/scenes.py`."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -190,27 +193,41 @@ TINY = Recipe(
         ),
     )
 )
-"""Trains the depth of the shipped `tiny` weights from scratch; the recipe `evidence` adds the evidence head.
+"""Trains the depth of the shipped `tiny` weights from scratch; `depth` continues it, and `evidence` adds the head.
 docs/model_card.md has commands, times and machines."""
+
+OUTDOORS = (*("room",) * 4, "corridor", *("street",) * 2, *("objects",) * 3, *("clutter",) * 2, *("yard",) * 4)
+"""Kinds of worlds, of which about half are under a sky."""
 
 DEPTH = Recipe(
     phases=(
         Phase(
             "depth",
-            4800,
+            4200,
             num_chunks=1,
             num_targets=0,
-            sizes=((224, 320), (320, 224)),
+            sizes=((224, 320),),
+            learning_rate=5e-4,
+            batch=4,
+            steps_of_depth=(0.01, 0.4),
+        ),
+        Phase(
+            "outdoors",
+            4600,
+            num_chunks=1,
+            num_targets=0,
+            sizes=((224, 320),),
             learning_rate=5e-4,
             final_share=0.02,
             batch=4,
             steps_of_depth=(0.01, 0.4),
+            kinds=OUTDOORS,
         ),
     ),
     ema_decay=0.995,
 )
 """Continues the training of depth, in batches of images of about the streamed size. It needs a GPU. The shipped weights
-do not include it; docs/model_card.md says what most of its steps gave."""
+took these steps in pieces; docs/model_card.md lists them."""
 
 STREAM = Recipe(
     phases=(

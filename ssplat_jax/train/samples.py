@@ -23,6 +23,8 @@ Product = TypeVar("Product")
 
 MAX_LOG_STEP = 0.05
 """Log depths of neighboring pixels that differ by more belong to different surfaces."""
+NEARLY = 1 - 1e-4
+"""Factor on the farthest depth that gives one within the range."""
 
 
 @pytree
@@ -55,6 +57,7 @@ def make_sample(
     size: tuple[int, int],
     config: StreamConfig,
     steps_of_depth: tuple[float, float] = STEP_RANGE,
+    kinds: tuple[str, ...] = (),
     range_jitter: float = Recipe.range_jitter,
 ) -> Sample:
     """Sample number `seed`, the same for the same arguments.
@@ -66,6 +69,7 @@ def make_sample(
         size: height and width of the images.
         config: gives chunk size and median depth.
         steps_of_depth: see `Phase`.
+        kinds: see `Phase`.
         range_jitter: see `Recipe`.
 
     Raises:
@@ -77,19 +81,21 @@ def make_sample(
     if num_targets and num_context < 2:
         raise InputError("training: wanted context views around targets, got a context of one view; use no targets.")
     num_views = num_context + num_targets
-    arrays = training_sample(seed, num_views, height, width, steps=steps_of_depth)
+    arrays = training_sample(seed, num_views, height, width, steps=steps_of_depth, kinds=kinds)
     images, depths, camtoworlds, Ks = (np.asarray(a) for a in arrays)
     is_target = np.zeros(num_views, bool)
     if num_targets:
         is_target[choose_targets(rng, num_views, num_targets)] = True
     context = np.flatnonzero(~is_target)
 
-    scale = config.stream.median_depth / np.median(depths[context]) * np.exp(rng.uniform(-range_jitter, range_jitter))
+    seen = depths[context][np.isfinite(depths[context])]
+    scale = config.stream.median_depth / np.median(seen) * np.exp(rng.uniform(-range_jitter, range_jitter))
     viewmats = _stream_viewmats(camtoworlds.astype(np.float64), int(context[0]), float(scale))
-    depths = depths * scale
-    low, high = np.quantile(depths[context], [0.01, 0.99])
+    low, high = np.quantile(seen * scale, [0.01, 0.99])
     near = NEAR_FACTOR * low * np.exp(rng.uniform(-range_jitter, range_jitter))
     far = FAR_FACTOR * high * np.exp(rng.uniform(-range_jitter, range_jitter))
+    # No candidate is as far as the sky. The last one stands for it, which draws it behind everything else.
+    depths = np.where(np.isfinite(depths), depths * scale, NEARLY * far)
 
     return sample_of_views(
         images=images,

@@ -36,7 +36,8 @@ def sample_for_step(
     }
     if mix is not None and (capture := mix.draw(np.random.default_rng([recipe.seed, number, 13]))) is not None:
         return capture_sample(mix, capture, [recipe.seed, number, 17], **form)
-    return make_sample(recipe.seed * 1_000_003 + number, steps_of_depth=phase.steps_of_depth, **form)
+    own = {"steps_of_depth": phase.steps_of_depth, "kinds": phase.kinds}
+    return make_sample(recipe.seed * 1_000_003 + number, **own, **form)
 
 
 def batch_for_step(step: int, recipe: Recipe, config: StreamConfig, mix: CaptureMix | None = None) -> Sample:

@@ -53,6 +53,49 @@ def test_parallax_of_training_samples(samples):
     assert ratios.min() < 1.5 and ratios.max() > 2  # even paths and irregular ones
 
 
+@pytest.fixture(scope="module")
+def yards():
+    return [training_sample(seed, 6, 24, 32, kinds=("yard",)) for seed in range(12)]
+
+
+def test_the_sky_of_yards_is_infinitely_far_and_does_not_count_as_a_surface(yards):
+    shares = []
+    for _, depths, _, _ in yards:
+        shares.append(np.isinf(depths).mean())
+        surfaces = depths[np.isfinite(depths)]
+        assert 1.2 / 1.1 < np.median(surfaces) < 3.5 * 1.1
+        # The probe of few pixels can miss the ground near the horizon.
+        assert surfaces.min() > 0.3 / MARGIN and np.quantile(surfaces, 0.98) < 15.0 * MARGIN
+    # The sky is in most of them, and fills the smaller part of each.
+    assert np.mean(np.array(shares) > 0.02) > 0.6 and max(shares) < 0.6
+
+
+def test_bright_skies_are_white(yards):
+    """Where the sky shows, some photographs are overexposed, and some are not."""
+    white = [
+        (images[np.isinf(depths)].min(axis=-1) > 0.99).mean()
+        for images, depths, _, _ in yards
+        if np.isinf(depths).any()
+    ]
+    assert max(white) > 0.9 and min(white) < 0.1
+
+
+def test_worlds_without_yards_have_no_sky_but_a_dome(samples):
+    """The usual shares leave yards out, so that a sample of theirs is the same with and without that kind."""
+    assert all(np.isfinite(depths).all() for _, depths, _, _ in samples)
+
+
+def test_samples_are_of_the_kinds_asked_for():
+    """Indoors no ray leaves the room; every yard shows surfaces beyond any room."""
+    rooms = [training_sample(seed, 4, 24, 32, kinds=("room", "corridor")) for seed in range(6)]
+    assert all(np.isfinite(depths).all() for _, depths, _, _ in rooms)
+    again = training_sample(3, 4, 24, 32, kinds=("room", "corridor"))
+    np.testing.assert_array_equal(rooms[3][0], again[0])
+    assert not np.array_equal(rooms[3][0], training_sample(3, 4, 24, 32)[0])
+    with pytest.raises(InputError, match=r"kind must be one of room, .*, yard, got 'garden'"):
+        training_sample(3, 4, 24, 32, kinds=("garden",))
+
+
 def test_training_images_are_well_exposed(samples):
     for images, _, _, _ in samples:
         assert images.min() >= 0 and images.max() <= 1 and images.dtype == np.float32
@@ -212,4 +255,4 @@ def test_every_ray_ends():
         scene = sample_scene(seed, kind)
         poses, Ks = sample_path(seed, scene, "pan", 8, 24, 32)
         depths = np.asarray(raycast_depths(scene, np.linalg.inv(poses), Ks, 24, 32))
-        assert np.isfinite(depths).all() and depths.max() < 100
+        assert np.isfinite(depths).all() and depths.max() < (1300 if kind == "yard" else 100)

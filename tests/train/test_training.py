@@ -17,6 +17,7 @@ from ssplat_jax.checkpoint.training_state import TrainingCheckpoints
 from ssplat_jax.checkpoint.weights import load_params, params_digest
 from ssplat_jax.commands.train_command import Train
 from ssplat_jax.config import preset
+from ssplat_jax.data.depth_range import FAR_FACTOR
 from ssplat_jax.data.procedural import training_sample
 from ssplat_jax.errors import InputError
 from ssplat_jax.model import init_params
@@ -332,6 +333,34 @@ def test_views_step_as_far_as_the_phase_says():
             _, depths, poses, _ = training_sample(int(seed), 8, 24, 32, steps=(low, high))
             step = np.median(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=-1)) / np.median(depths)
             assert low / 2 < step < 2 * high
+
+
+def test_the_sky_stands_at_the_last_candidate_and_changes_no_scale():
+    """Depths of the sky are those of the farthest candidate; median and range are those of the surfaces."""
+    size = (32, 48)
+    for seed in range(4):
+        _, depths, _, _ = training_sample(seed, 4, *size, kinds=("yard",))
+        sample = make_sample(
+            seed, num_chunks=1, num_targets=0, size=size, config=NARROW, kinds=("yard",), range_jitter=0.0
+        )
+        far = float(sample.chunks.far[0])
+        cells = np.exp(np.asarray(sample.log_depths))
+        is_sky = np.isclose(cells, far, rtol=1e-3)
+        assert cells[is_sky].max(initial=0.0) < far
+        surfaces = depths[np.isfinite(depths)]
+        scale = NARROW.stream.median_depth / np.median(surfaces)
+        assert far == pytest.approx(FAR_FACTOR * scale * np.quantile(surfaces, 0.99), rel=1e-5)
+        assert is_sky.mean() == pytest.approx(np.isinf(depths).mean(), abs=0.1)
+
+
+def test_a_phase_says_what_its_worlds_are():
+    phase = dataclasses.replace(DEPTH_RECIPE.phases[0], kinds=("yard",))
+    drawn = sample_for_step(0, dataclasses.replace(DEPTH_RECIPE, phases=(phase,)), NARROW)
+    yard = make_sample(
+        DEPTH_RECIPE.seed * 1_000_003, num_chunks=1, num_targets=0, size=(64, 64), config=NARROW, kinds=("yard",)
+    )
+    np.testing.assert_array_equal(drawn.chunks.images, yard.chunks.images)
+    assert not np.array_equal(drawn.chunks.images, sample_for_step(0, DEPTH_RECIPE, NARROW).chunks.images)
 
 
 FROZEN_ENCODER = PhaseForm(frozen=("encoder",))

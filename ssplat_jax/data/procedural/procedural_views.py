@@ -9,7 +9,7 @@ from jaxtyping import Float
 from ssplat_jax.data.procedural.paths import look_at, sample_path
 from ssplat_jax.data.procedural.raycast import raycast, raycast_depths
 from ssplat_jax.data.procedural.scene import NUM_SOLIDS, Scene, clearance, fade_scene, scale_scene
-from ssplat_jax.data.procedural.scenes import SCENE_KINDS, SCENE_SHARES, sample_scene
+from ssplat_jax.data.procedural.scenes import SCENE_KINDS, SCENE_SHARES, SKY_DISTANCE, sample_scene
 from ssplat_jax.errors import InputError
 
 Views = tuple[
@@ -29,16 +29,24 @@ _PATHS = {  # suitable paths by kind of world; repeated ones are more likely
     "street": ("forward", "handheld", "sideways", "pan"),
     "objects": ("orbit", "orbit", "orbit", "gazing"),
     "clutter": ("handheld", "sideways", "forward", "pan", "orbit"),
+    "yard": ("sideways", "sideways", "gazing", "orbit", "handheld", "forward"),
 }
 
 
 def training_sample(
-    seed: int, num_views: int, height: int, width: int, supersample: int = 1, *, steps: tuple[float, float] = STEP_RANGE
+    seed: int,
+    num_views: int,
+    height: int,
+    width: int,
+    supersample: int = 1,
+    *,
+    steps: tuple[float, float] = STEP_RANGE,
+    kinds: tuple[str, ...] = (),
 ) -> Views:
     """Returns rendered views of a random path through a random world.
 
     The units of a sample are such that the median depth is between 1.2 and 3.5 and all surfaces are between about 0.3
-    and 15 away.
+    and 15 away, but for the sky.
 
     Args:
         seed: the same arguments give the same sample.
@@ -48,31 +56,41 @@ def training_sample(
         supersample: color rays per pixel. One ray costs a third of captures' two; training runs on the same cores.
         steps: range of the typical distance between consecutive views over the median depth, log-uniform. Single steps
             are up to three times as long.
+        kinds: kinds of worlds, of which one is drawn; repeated ones are more likely. Empty: all, with their shares.
 
     Returns:
-        Images in [0, 1], z-depths, camera-to-world poses and intrinsics in pixels.
+        Images in [0, 1], z-depths (infinite beyond `SKY_DISTANCE`), camera-to-world poses and intrinsics in pixels.
+
+    Raises:
+        InputError: an unknown kind.
     """
     rng = np.random.default_rng([3, seed])
     found = None
     while found is None:
-        kind = str(rng.choice(SCENE_KINDS, p=SCENE_SHARES))
+        kind = str(rng.choice(kinds)) if kinds else str(rng.choice(SCENE_KINDS, p=SCENE_SHARES))
         scene = sample_scene(int(rng.integers(2**31)), kind)
         found = _scaled_path(rng, scene, _PATHS[kind], num_views, height, width, steps)
-    scene, poses, Ks = found
+    scene, poses, Ks, factor = found
     images, depths = _cast(scene, poses, Ks, height, width, supersample)
+    depths = np.where(depths < factor * SKY_DISTANCE, depths, np.inf).astype(np.float32)
     return _through_sensor(rng, scene, images), depths, poses, Ks
 
 
 def _scaled_path(rng, scene: Scene, kinds: tuple[str, ...], num_views: int, height: int, width: int, steps):
-    """Scene, poses and intrinsics in the units of the sample; None if the path is unsuitable."""
+    """Scene, poses, intrinsics and length of a meter in the units of the sample; None if the path is unsuitable."""
     kind = kinds[rng.integers(len(kinds))]
     seed = int(rng.integers(2**31))
     step = np.exp(rng.uniform(*np.log(steps)))
     # A few views measure the median depth, which determines the steps of the whole path.
     poses, Ks = sample_path(seed, scene, kind, _FIRST_STEPS, height, width, step=step * float(scene.orbit_radius) * 1.5)
-    median = float(np.median(_probe(scene, poses, Ks, height, width)))
+    depths = _probe(scene, poses, Ks, height, width)
+    if not len(depths):
+        return None
+    median = float(np.median(depths))
     poses, Ks = sample_path(seed, scene, kind, num_views, height, width, step=step * median)
     depths = _probe(scene, poses, Ks, height, width)
+    if not len(depths):
+        return None
     median = float(np.median(depths))
     target = rng.uniform(*MEDIANS)
     factor = min(max(target / median, 1.1 * MIN_DEPTH / float(depths.min())), 0.9 * MAX_DEPTH / float(depths.max()))
@@ -84,14 +102,16 @@ def _scaled_path(rng, scene: Scene, kinds: tuple[str, ...], num_views: int, heig
     if is_flat or (num_views > 1 and not BASELINES[0] <= np.median(baselines) <= BASELINES[1]):
         return None
     poses[:, :3, 3] *= np.float32(factor)
-    return scale_scene(scene, factor), poses, Ks
+    return scale_scene(scene, factor), poses, Ks, factor
 
 
 def _probe(scene: Scene, poses: np.ndarray, Ks: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Low-resolution depths of all views."""
+    """Depths of all views at a low resolution, without those of the sky; none if most of the pixels show it."""
     rows, cols = max(height // _PROBE, 12), max(width // _PROBE, 12)
     coarse = Ks * np.array([cols / width, rows / height, 1], np.float32)[:, None]
-    return np.asarray(raycast_depths(scene, _inverted(poses), coarse, rows, cols))
+    depths = np.asarray(raycast_depths(scene, _inverted(poses), coarse, rows, cols))
+    nearer = depths[depths < SKY_DISTANCE]
+    return nearer if 2 * len(nearer) > depths.size else nearer[:0]
 
 
 def _cast(scene: Scene, poses: np.ndarray, Ks: np.ndarray, height: int, width: int, supersample: int = 2):

@@ -1,8 +1,9 @@
-"""Random worlds: rooms, corridors, streets, piles of objects and clutter, in meters.
+"""Random worlds: rooms, corridors, streets, piles of objects, clutter and yards, in meters.
 
 Each kind is a function `SceneBuilder -> Scene` in a registry; furniture has a registry of its own.
 """
 
+import dataclasses
 from collections.abc import Callable
 
 import numpy as np
@@ -219,9 +220,10 @@ def _corridor(b: SceneBuilder) -> Scene:
     return b.build(focus=[0, -1, 0], orbit_radius=half_x * 1.2, eye=eye, sensor=b.rng.random() < 0.3)
 
 
-def _outdoors(b: SceneBuilder, radius: float, ground: Finish) -> None:
-    """Ground plane and sky."""
+def _outdoors(b: SceneBuilder, radius: float, ground: Finish, brightness: float = 1.0) -> None:
+    """Ground plane and sky, whose brightness is a factor; a bright one is white in most of a photograph."""
     sky = b.finish("sky", tile=radius * b.rng.uniform(1.0, 2.0), tint=0.1, glow=1.0, is_centered=True)
+    sky = dataclasses.replace(sky, gain=tuple(brightness * gain for gain in sky.gain))
     b.dome(radius, sky)
     b.shell([0, -2 * radius, 0], [2 * radius, 2 * radius, 2 * radius], sky, ground, sky)
 
@@ -315,12 +317,58 @@ def _clutter(b: SceneBuilder) -> Scene:
     return b.build(focus=[0, 0, 0], orbit_radius=0.8, eye=[0, 0, 0], sensor=b.rng.random() < 0.3)
 
 
+SKY_DISTANCE = 30.0
+"""Surfaces of a world that are farther away, in meters, are sky or the ground near the horizon. Of all kinds, only
+yards have them."""
+
+
+def _yard(b: SceneBuilder) -> Scene:
+    """Buildings behind lawns, hedges and trees, under a sky that is far away, as in photographs taken outdoors."""
+    ground = b.finish("noise", "leaves", "floor", "photo", tile=b.rng.uniform(0.8, 3.0))
+    _outdoors(b, b.rng.uniform(80.0, 300.0), ground, brightness=np.exp(b.rng.uniform(0.0, 1.5)))
+    distance = b.rng.uniform(4.5, 12.0)
+    _building(b, b.rng.uniform(-2, 2), distance, b.rng.uniform(-0.4, 0.4))
+    if b.rng.random() < 0.6:
+        side = b.rng.choice([-1, 1])
+        _building(b, side * b.rng.uniform(9, 13), distance * b.rng.uniform(0.3, 1.3), -side * b.rng.uniform(0.5, 1.4))
+    for _ in range(b.rng.integers(1, 4)):
+        _hedge(b, b.rng.uniform(-5, 5), distance * b.rng.uniform(0.2, 0.75))
+    for _ in range(b.rng.integers(1, 4)):
+        _roadside(b, b.rng.uniform(-6, 6), distance * b.rng.uniform(0.1, 0.8))
+    eye = [b.rng.uniform(-2, 2), -b.rng.uniform(1.3, 2.0), -b.rng.uniform(0.0, 3.0)]
+    return b.build(focus=[0, -1.5, distance * 0.7], orbit_radius=distance * 0.7, eye=eye, sensor=b.rng.random() < 0.5)
+
+
+def _building(b: SceneBuilder, x: float, z: float, yaw: float) -> None:
+    """House with a plinth, columns or a porch, whose front is at (x, z); the back is away from the origin."""
+    half = np.array([b.rng.uniform(3.0, 8.0), b.rng.uniform(1.6, 5.0), 2.0])
+    c, s = np.cos(yaw), np.sin(yaw)
+    at = lambda right, up, ahead: [x + c * right + s * ahead, -up, z - s * right + c * ahead]  # noqa: E731
+    b.box(at(0, half[1], half[2]), half, b.finish("facade", "floor", "pattern", "photo", tile=b.rng.uniform(1, 3)), yaw)
+    b.box(at(0, 0.3, -0.05), [half[0], 0.3, 0.1], b.finish("wall", "noise", "floor"), yaw)
+    trim = b.finish("wall", "noise", "wall", tile=2.0)
+    for right in np.linspace(-0.8, 0.8, b.rng.integers(0, 5)) * half[0]:
+        b.box(at(right, half[1], -0.15), [0.2, half[1], 0.25], trim, yaw)
+    b.box(at(0, 2 * half[1], half[2]), [half[0] + 0.4, 0.15, half[2] + 0.5], trim, yaw)
+
+
+def _hedge(b: SceneBuilder, x: float, z: float) -> None:
+    """Overlapping boxes of leaves, each turned a little."""
+    leaves = b.finish("leaves", "noise", "leaves", "photo", tile=b.rng.uniform(0.4, 1.2), is_turned=True)
+    half = np.array([b.rng.uniform(0.3, 0.6), b.rng.uniform(0.2, 0.8), b.rng.uniform(0.25, 0.6)])
+    for i in range(int(b.rng.integers(2, 6))):
+        extent = half * b.rng.uniform(0.8, 1.2, 3)
+        b.box([x + 1.6 * i * half[0], -extent[1], z + b.rng.normal(0, 0.1)], extent, leaves, b.rng.normal(0, 0.3))
+
+
 _RECIPES: dict[str, Callable[[SceneBuilder], Scene]] = {
     "room": _room,
     "corridor": _corridor,
     "street": _street,
     "objects": _objects,
     "clutter": _clutter,
+    "yard": _yard,
 }
 SCENE_KINDS = tuple(_RECIPES)
-SCENE_SHARES = (0.32, 0.12, 0.12, 0.26, 0.18)  # probabilities of the kinds, in their order
+SCENE_SHARES = (0.32, 0.12, 0.12, 0.26, 0.18, 0.0)
+"""Probabilities of the kinds, in their order, where none are asked for."""
