@@ -113,7 +113,7 @@ class MemoryConfig(ConfigGroup):
     """K: pivots that a voxel can hold."""
     min_confidence: float = 0.3
     """tau: tokens of lower confidence do not enter the cache, and pivots of lower confidence are not decoded. The
-    paper's value is for `confidence="peak"`; windows give larger confidences, so that more tokens enter."""
+    paper's value is for `confidence="peak"`; windows give larger confidences, so more tokens enter."""
     capacity: int = 1 << 15
     """Voxels that the cache can hold, a power of two; `overflow="grow"` doubles it outside jit."""
     overflow: Literal["grow", "drop_new", "evict_lowest", "error"] = "grow"

@@ -227,7 +227,7 @@ DEPTH = Recipe(
     ema_decay=0.995,
 )
 """Continues the training of depth, in batches of images of about the streamed size. It needs a GPU. The shipped weights
-took these steps in pieces; docs/model_card.md lists them."""
+took about as many steps, in pieces that docs/model_card.md lists."""
 
 STREAM = Recipe(
     phases=(

@@ -42,7 +42,7 @@ def copy_of_tree(folder: Path) -> None:
 
 
 def is_killed(folder: Path, mutant: Mutant) -> tuple[bool, str]:
-    """Whether the mutant's tests fail, and the last line that pytest prints."""
+    """True if the mutant's tests fail, and the last line that pytest prints."""
     file = folder / "ssplat_jax" / mutant.file
     source = file.read_text()
     file.write_text(source.replace(mutant.old, mutant.new))

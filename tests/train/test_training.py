@@ -337,7 +337,7 @@ def test_views_step_as_far_as_the_phase_says():
 
 def test_the_sky_stands_at_the_last_candidate_and_changes_no_scale():
     """Depths of the sky are those of the farthest candidate; median and range are those of the surfaces."""
-    size = (32, 48)
+    size, shares = (32, 48), []
     for seed in range(4):
         _, depths, _, _ = training_sample(seed, 4, *size, kinds=("yard",))
         sample = make_sample(
@@ -350,7 +350,9 @@ def test_the_sky_stands_at_the_last_candidate_and_changes_no_scale():
         surfaces = depths[np.isfinite(depths)]
         scale = NARROW.stream.median_depth / np.median(surfaces)
         assert far == pytest.approx(FAR_FACTOR * scale * np.quantile(surfaces, 0.99), rel=1e-5)
-        assert is_sky.mean() == pytest.approx(np.isinf(depths).mean(), abs=0.1)
+        assert is_sky.mean() == pytest.approx(np.isinf(depths).mean(), abs=0.05)
+        shares.append(is_sky.mean())
+    assert max(shares) > 0.1
 
 
 def test_a_phase_says_what_its_worlds_are():

@@ -56,10 +56,12 @@ def training_sample(
         supersample: color rays per pixel. One ray costs a third of captures' two; training runs on the same cores.
         steps: range of the typical distance between consecutive views over the median depth, log-uniform. Single steps
             are up to three times as long.
-        kinds: kinds of worlds, of which one is drawn; repeated ones are more likely. Empty: all, with their shares.
+        kinds: kinds of worlds, of which one is drawn; repeated ones are more likely. Empty: all but yards, with their
+            shares.
 
     Returns:
-        Images in [0, 1], z-depths (infinite beyond `SKY_DISTANCE`), camera-to-world poses and intrinsics in pixels.
+        Images in [0, 1], z-depths (of yards, infinite beyond `SKY_DISTANCE`), camera-to-world poses and intrinsics in
+        pixels.
 
     Raises:
         InputError: an unknown kind.
@@ -69,26 +71,27 @@ def training_sample(
     while found is None:
         kind = str(rng.choice(kinds)) if kinds else str(rng.choice(SCENE_KINDS, p=SCENE_SHARES))
         scene = sample_scene(int(rng.integers(2**31)), kind)
-        found = _scaled_path(rng, scene, _PATHS[kind], num_views, height, width, steps)
+        sky = SKY_DISTANCE if kind == "yard" else np.inf
+        found = _scaled_path(rng, scene, _PATHS[kind], num_views, height, width, steps, sky)
     scene, poses, Ks, factor = found
     images, depths = _cast(scene, poses, Ks, height, width, supersample)
-    depths = np.where(depths < factor * SKY_DISTANCE, depths, np.inf).astype(np.float32)
+    depths = np.where(depths < factor * sky, depths, np.inf).astype(np.float32)
     return _through_sensor(rng, scene, images), depths, poses, Ks
 
 
-def _scaled_path(rng, scene: Scene, kinds: tuple[str, ...], num_views: int, height: int, width: int, steps):
+def _scaled_path(rng, scene: Scene, kinds: tuple[str, ...], num_views: int, height: int, width: int, steps, sky: float):
     """Scene, poses, intrinsics and length of a meter in the units of the sample; None if the path is unsuitable."""
     kind = kinds[rng.integers(len(kinds))]
     seed = int(rng.integers(2**31))
     step = np.exp(rng.uniform(*np.log(steps)))
     # A few views measure the median depth, which determines the steps of the whole path.
     poses, Ks = sample_path(seed, scene, kind, _FIRST_STEPS, height, width, step=step * float(scene.orbit_radius) * 1.5)
-    depths = _probe(scene, poses, Ks, height, width)
+    depths = _probe(scene, poses, Ks, height, width, sky)
     if not len(depths):
         return None
     median = float(np.median(depths))
     poses, Ks = sample_path(seed, scene, kind, num_views, height, width, step=step * median)
-    depths = _probe(scene, poses, Ks, height, width)
+    depths = _probe(scene, poses, Ks, height, width, sky)
     if not len(depths):
         return None
     median = float(np.median(depths))
@@ -105,12 +108,12 @@ def _scaled_path(rng, scene: Scene, kinds: tuple[str, ...], num_views: int, heig
     return scale_scene(scene, factor), poses, Ks, factor
 
 
-def _probe(scene: Scene, poses: np.ndarray, Ks: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Depths of all views at a low resolution, without those of the sky; none if most of the pixels show it."""
+def _probe(scene: Scene, poses: np.ndarray, Ks: np.ndarray, height: int, width: int, sky: float) -> np.ndarray:
+    """Depths below `sky` of all views, at a low resolution; none if most of the pixels are farther."""
     rows, cols = max(height // _PROBE, 12), max(width // _PROBE, 12)
     coarse = Ks * np.array([cols / width, rows / height, 1], np.float32)[:, None]
     depths = np.asarray(raycast_depths(scene, _inverted(poses), coarse, rows, cols))
-    nearer = depths[depths < SKY_DISTANCE]
+    nearer = depths[depths < sky]
     return nearer if 2 * len(nearer) > depths.size else nearer[:0]
 
 

@@ -22,7 +22,7 @@ def sample_scene(seed: int, kind: str | None = None, textures: TextureLibrary | 
 
     Args:
         seed: any non-negative integer.
-        kind: one of `SCENE_KINDS`; None draws one.
+        kind: one of `SCENE_KINDS`; None draws one, but no yard.
         textures: by default `texture_library()`.
 
     Raises:
@@ -221,7 +221,7 @@ def _corridor(b: SceneBuilder) -> Scene:
 
 
 def _outdoors(b: SceneBuilder, radius: float, ground: Finish, brightness: float = 1.0) -> None:
-    """Ground plane and sky, whose brightness is a factor; a bright one is white in most of a photograph."""
+    """Ground plane and sky. `brightness` multiplies the colors of the sky; a bright one is overexposed."""
     sky = b.finish("sky", tile=radius * b.rng.uniform(1.0, 2.0), tint=0.1, glow=1.0, is_centered=True)
     sky = dataclasses.replace(sky, gain=tuple(brightness * gain for gain in sky.gain))
     b.dome(radius, sky)
@@ -318,8 +318,7 @@ def _clutter(b: SceneBuilder) -> Scene:
 
 
 SKY_DISTANCE = 30.0
-"""Surfaces of a world that are farther away, in meters, are sky or the ground near the horizon. Of all kinds, only
-yards have them."""
+"""Surfaces of a yard that are farther away, in meters, are sky or the ground near the horizon."""
 
 
 def _yard(b: SceneBuilder) -> Scene:
@@ -330,7 +329,7 @@ def _yard(b: SceneBuilder) -> Scene:
     _building(b, b.rng.uniform(-2, 2), distance, b.rng.uniform(-0.4, 0.4))
     if b.rng.random() < 0.6:
         side = b.rng.choice([-1, 1])
-        _building(b, side * b.rng.uniform(9, 13), distance * b.rng.uniform(0.3, 1.3), -side * b.rng.uniform(0.5, 1.4))
+        _building(b, side * b.rng.uniform(9, 13), distance * b.rng.uniform(0.3, 1.3), side * b.rng.uniform(0.5, 1.4))
     for _ in range(b.rng.integers(1, 4)):
         _hedge(b, b.rng.uniform(-5, 5), distance * b.rng.uniform(0.2, 0.75))
     for _ in range(b.rng.integers(1, 4)):
