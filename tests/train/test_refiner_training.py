@@ -56,20 +56,25 @@ def test_the_command_writes_a_network_with_which_other_views_gain(tmp_path, monk
     assert all(after[name] > before[name] + 0.1 for name in ("shown_psnr", "black_psnr"))
 
 
-def test_the_shipped_network_gains_on_a_room_that_it_has_not_seen():
-    capture = open_capture("procedural:room?frames=16&seed=11", size=(64, 48))
-    split = interleaved_split(len(capture), 1, 12)
+def test_the_shipped_network_gains_on_rooms_that_it_has_not_seen():
+    """Twelve views of 64 x 48 leave holes: the literal score gains in every room, the shown one in the mean."""
     model, params = StreamSplat(preset("tiny")), load_params("tiny")
-    session, frame = Session(model, params), capture.stream_frame(model.config, split.context)
-    exposures, _ = feed_capture(session, capture, split.context, frame)
-    streamed = session.gaussians()
-    refined = refine_on_capture(streamed, capture, split.context, frame, exposures, steps=STEPS)
-    assert refined.report.num_steps == STEPS and refined.report.num_skipped == 0
-    before, after = (
-        score_targets(scene, capture, split.targets, frame, exposures) for scene in (streamed, refined.gaussians)
-    )
-    for column in ("literal", "shown"):
-        assert after[column]["psnr"] > before[column]["psnr"] + 0.3
+    gains = []
+    for seed in (11, 12, 14):
+        capture = open_capture(f"procedural:room?frames=16&seed={seed}", size=(64, 48))
+        split = interleaved_split(len(capture), 1, 12)
+        session, frame = Session(model, params), capture.stream_frame(model.config, split.context)
+        exposures, _ = feed_capture(session, capture, split.context, frame)
+        streamed = session.gaussians()
+        refined = refine_on_capture(streamed, capture, split.context, frame, exposures, steps=STEPS)
+        assert refined.report.num_steps == STEPS and refined.report.num_skipped == 0
+        before, after = (
+            score_targets(scene, capture, split.targets, frame, exposures) for scene in (streamed, refined.gaussians)
+        )
+        gains.append([after[column]["psnr"] - before[column]["psnr"] for column in ("literal", "shown")])
+    literal, shown = np.transpose(gains)
+    assert literal.min() > 1.0
+    assert shown.min() > 0 and shown.mean() > 0.3
 
 
 @pytest.mark.parametrize(
