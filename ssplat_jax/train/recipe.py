@@ -199,30 +199,21 @@ docs/model_card.md has commands, times and machines."""
 OUTDOORS = (*("room",) * 4, "corridor", *("street",) * 2, *("objects",) * 3, *("clutter",) * 2, *("yard",) * 4)
 """Kinds of worlds, of which about half are under a sky."""
 
+_LARGE_BATCHES = Phase(
+    "depth",
+    4200,
+    num_chunks=1,
+    num_targets=0,
+    sizes=((224, 320),),
+    learning_rate=5e-4,
+    batch=4,
+    steps_of_depth=(0.01, 0.4),
+)
+
 DEPTH = Recipe(
     phases=(
-        Phase(
-            "depth",
-            4200,
-            num_chunks=1,
-            num_targets=0,
-            sizes=((224, 320),),
-            learning_rate=5e-4,
-            batch=4,
-            steps_of_depth=(0.01, 0.4),
-        ),
-        Phase(
-            "outdoors",
-            4600,
-            num_chunks=1,
-            num_targets=0,
-            sizes=((224, 320),),
-            learning_rate=5e-4,
-            final_share=0.02,
-            batch=4,
-            steps_of_depth=(0.01, 0.4),
-            kinds=OUTDOORS,
-        ),
+        _LARGE_BATCHES,
+        dataclasses.replace(_LARGE_BATCHES, name="outdoors", steps=4600, final_share=0.02, kinds=OUTDOORS),
     ),
     ema_decay=0.995,
 )
