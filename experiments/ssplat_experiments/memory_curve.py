@@ -167,8 +167,8 @@ STUDY = Study(
     text="""Peak memory of step, decode and rendering together, against the number of views, in MiB. `ours` merges
 tokens by voxel, `append-all` keeps every token, `joint` runs the same network over all views at once. `ours` and
 `append-all` stream one walk again and again, so the scene stays as it is; `ours, new views` and `joint` see new views
-all the time, and the memory of `ours, new views` grows with the scene. The memories of `ours` and `append-all` double
-when they are full. While a step runs, its parameters, cache, images and temporaries count.""",
+all the time. The cache starts with space for four chunks of tokens and doubles whenever it is full. While a step runs,
+its parameters, cache, images and temporaries count.""",
     cases=cases,
     plot=plot,
     findings=findings,

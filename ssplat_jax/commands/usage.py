@@ -80,7 +80,7 @@ def _first_part(box: str) -> str:
     """The complaint in a box, whose parts are what is wrong, help on the argument, and where to read on."""
     lines = [line.strip("│").rstrip() for line in box.splitlines() if line[:1] not in ("╭", "╰")]
     rules = [k for k, line in enumerate(lines) if line.strip() and set(line.strip()) <= set("─-")]
-    # Where the terminal's encoding has no lines to draw, the title is a part of its own.
+    # The title is a part of its own if the terminal's encoding has no lines to draw.
     begin, end = (0, rules[0]) if box.startswith("╭") else (rules[0] + 1, rules[1])
     problem = textwrap.dedent("\n".join(lines[begin:end])).splitlines()
     if problem[0].startswith("Missing from"):

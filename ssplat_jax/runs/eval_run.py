@@ -31,7 +31,7 @@ SCORES = ("literal", "shown", "psnr_over_black", "psnr_one_exposure")
 
 @dataclasses.dataclass(frozen=True)
 class EvalOptions:
-    """What is scored, and how."""
+    """Options of an evaluation: frames, sizes, refinement and display."""
 
     size: tuple[int, int] | None = None  # (width, height) of the scored views; None for the capture's own
     scale: float = 1.0  # of the streamed images relative to the scored ones
