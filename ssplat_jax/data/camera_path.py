@@ -39,10 +39,19 @@ SWAY_RADIUS = 0.08
 """Radius of a sway, as a share of the distance looked at."""
 
 
-def looked_at(camtoworlds: Float64[np.ndarray, "n 4 4"]) -> Float64[np.ndarray, "3"] | None:
+MIN_SHARE = 0.01
+"""Smallest distance of a camera from the point that all look at, as a share of the distance of what it sees."""
+
+
+def looked_at(camtoworlds: Float64[np.ndarray, "n 4 4"], distance: float) -> Float64[np.ndarray, "3"] | None:
     """The point nearest to the optical axes of all cameras, by least squares.
 
-    None if a camera has it behind, or if the axes are parallel to about a degree: such cameras look at no common point.
+    None if the axes are parallel to about a degree, or if a camera has the point behind it or at its own place, as all
+    cameras that turn about one place have: such cameras look at no common point.
+
+    Args:
+        camtoworlds: the cameras, with OpenCV axes.
+        distance: of what the cameras see, in the units of the poses.
     """
     centers, axes = camtoworlds[:, :3, 3], camtoworlds[:, :3, 2]
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # distance from an axis
@@ -50,19 +59,23 @@ def looked_at(camtoworlds: Float64[np.ndarray, "n 4 4"]) -> Float64[np.ndarray, 
     if np.linalg.eigvalsh(total)[0] < 3e-4 * len(axes):
         return None
     point = np.linalg.solve(total, np.einsum("nij,nj->i", across, centers))
-    return point if (np.einsum("ni,ni->n", point - centers, axes) > 0).all() else None
+    return point if (np.einsum("ni,ni->n", point - centers, axes) > MIN_SHARE * distance).all() else None
 
 
 def upward(camtoworlds: Float64[np.ndarray, "n 4 4"]) -> Float64[np.ndarray, "3"] | None:
     """The up direction of cameras that are held level: perpendicular to their images' rows, by least squares.
 
-    Where rows do not tell, because all are parallel, it is the mean of the images' up directions; None if that is 0.
+    Rows that point up or down, as those of images do that lie on their side, do not count. Where rows do not tell,
+    because all are parallel, it is the mean of the images' up directions; None if that is 0.
     """
     mean = -camtoworlds[:, :3, 1].mean(axis=0)
     if np.linalg.norm(mean) < 0.1:
         return None
-    shares, axes = np.linalg.eigh(np.einsum("ni,nj->ij", camtoworlds[:, :3, 0], camtoworlds[:, :3, 0]))
-    axis = axes[:, 0] if shares[1] > 1e-2 * len(camtoworlds) else mean / np.linalg.norm(mean)
+    mean /= np.linalg.norm(mean)
+    rows = camtoworlds[:, :3, 0]
+    rows = rows[np.abs(rows @ mean) < np.sqrt(0.5)]
+    shares, axes = np.linalg.eigh(np.einsum("ni,nj->ij", rows, rows))
+    axis = axes[:, 0] if shares[1] > 1e-2 * len(camtoworlds) else mean
     return axis if axis @ mean > 0 else -axis
 
 
@@ -83,7 +96,7 @@ def orbit_path(
     """
     middle = camtoworlds[len(camtoworlds) // 2]
     turns = 2 * np.pi * np.arange(num_cameras) / num_cameras
-    target, up = looked_at(camtoworlds), upward(camtoworlds)
+    target, up = looked_at(camtoworlds, distance), upward(camtoworlds)
     if target is None or up is None:
         target, up = middle[:3, 3] + distance * middle[:3, 2], -middle[:3, 1]
         circle = np.cos(turns)[:, None] * middle[:3, 0] + np.sin(turns)[:, None] * middle[:3, 1]

@@ -155,7 +155,8 @@ def _warnings(capture: Capture, depths: DepthStatistics, steps: np.ndarray) -> l
     """Likely problems of the capture, each with a remedy."""
     if len(capture) == 1:
         return ["One frame: no parallax, so its depth is a guess; add frames from other places."]
-    if not (steps > same_place_distance(capture)).any():
+    same_place = same_place_distance(capture, range(len(capture)))
+    if not (steps > same_place).any():
         return ["All cameras stand in one place: no parallax, so depth is a guess; add frames from other places."]
     found = []
     step = float(np.median(steps)) / depths.median
@@ -173,7 +174,7 @@ def _warnings(capture: Capture, depths: DepthStatistics, steps: np.ndarray) -> l
         )
     elif step > HIGH_STEP:
         found.append(f"Wide steps: {step:.0%} of the median depth; neighbors hardly overlap, so add frames between.")
-    moved = steps[steps > same_place_distance(capture)]
+    moved = steps[steps > same_place]
     if (steps > JUMP_RATIO * np.median(moved)).any():
         i = int(steps.argmax())
         found.append(

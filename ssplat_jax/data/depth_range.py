@@ -118,13 +118,17 @@ def estimate_depths(
         if inverse_depth > 0:
             return _guess(1 / inverse_depth, "poor parallax", pairs)
     steps = np.linalg.norm(np.diff(np.stack([capture.frames[i].center for i in indices]), axis=0), axis=-1)
-    steps = steps[steps > same_place_distance(capture)]
+    steps = steps[steps > same_place_distance(capture, indices)]
     return _guess(BASELINE_DEPTH * float(np.median(steps)) if steps.size else 1.0, "baselines", [])
 
 
-def same_place_distance(capture: PosedImages) -> float:
-    """Returns the largest distance at which cameras count as being in the same place, since poses are rounded."""
-    return POSE_ROUNDING * max(1.0, *(float(np.abs(frame.center).max()) for frame in capture.frames))
+def same_place_distance(capture: PosedImages, indices: Sequence[int]) -> float:
+    """Returns the largest distance at which cameras count as being in the same place, since poses are rounded.
+
+    It follows from the median camera of the frames `indices`: a camera that diverged must not make all others one.
+    """
+    reaches = [float(np.abs(capture.frames[i].center).max()) for i in indices]
+    return POSE_ROUNDING * max(1.0, float(np.median(reaches)))
 
 
 def stream_scale(depths: DepthStatistics, config: StreamConfig) -> tuple[float, float, float]:
@@ -229,7 +233,7 @@ def _partners(capture: PosedImages, i: int, others: Sequence[int]) -> tuple[list
     axes = np.stack([capture.frames[j].camtoworld[:3, 2] for j in others])
     distances = np.linalg.norm(offsets, axis=-1)
     is_partner = (axes @ frame.camtoworld[:3, 2] > math.cos(math.radians(MAX_AXIS_DEGREES))) & (
-        distances > same_place_distance(capture)
+        distances > same_place_distance(capture, [i, *others])
     )
     order = [int(k) for k in np.argsort(distances, kind="stable") if is_partner[k]]
     return [others[k] for k in order], distances[order]

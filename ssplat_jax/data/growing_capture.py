@@ -5,6 +5,7 @@ from pathlib import Path
 from ssplat_jax.data.capture import Capture, capture_of_listing
 from ssplat_jax.data.images import FilePixels
 from ssplat_jax.data.readers import transforms_json
+from ssplat_jax.data.readers.frame_list import in_stream_order
 from ssplat_jax.errors import InputError
 
 DONE = "done"
@@ -24,6 +25,7 @@ def open_growing(path: Path, *, size: tuple[int, int] | None) -> tuple[Capture |
     """
     try:
         listing, problem = transforms_json.read_complete(path)
+        listing = in_stream_order(listing)
         pixels, convention = FilePixels(listing.frames), transforms_json.CONVENTION
         capture = capture_of_listing(listing, transforms_json.FORMAT, pixels, size, convention)
     except InputError as error:  # missing, or being written

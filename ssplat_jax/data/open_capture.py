@@ -24,6 +24,7 @@ from ssplat_jax.data.readers import (
     transforms_json,
     tum,
 )
+from ssplat_jax.data.readers.frame_list import in_stream_order
 from ssplat_jax.errors import echo, refusal
 
 READERS = (  # the first one that matches reads the capture
@@ -77,7 +78,7 @@ def open_capture(path: str | Path, *, size: tuple[int, int] | None = None) -> Ca
         written = dataclasses.replace(usual, **options)
         listing = found.read(folder)
         frames = tuple(reinterpreted(frame, usual, written) for frame in listing.frames)
-        listing = dataclasses.replace(listing, frames=frames if options else listing.frames)
+        listing = in_stream_order(dataclasses.replace(listing, frames=frames if options else listing.frames))
         return capture_of_listing(listing, found.FORMAT, FilePixels(listing.frames), size, written)
     if not exists:
         got = "a link that leads nowhere" if folder.is_symlink() else "nothing of that name"

@@ -75,10 +75,7 @@ def check_camtoworld(matrix: object, where: str) -> tuple[Float64[np.ndarray, "4
         transposed = np.array_equal(pose[:, 3], [0.0, 0.0, 0.0, 1.0])
         fix = "transpose the matrix" if transposed else "give a rigid camera-to-world transform"
         raise refusal(where, wanted="a last row of 0 0 0 1", got=echo(pose[3].tolist()), fix=fix)
-    if np.abs(pose[:3, 3]).max() > MAX_COORDINATE:
-        got = f"{np.abs(pose[:3, 3]).max():.2g}"
-        fix = "drop the frame or choose a larger unit"
-        raise refusal(where, wanted=f"coordinates up to {MAX_COORDINATE:.0e}", got=got, fix=fix)
+    _check_coordinates(pose[:3, 3], where)
     rotation = pose[:3, :3]
     # Huge entries overflow in the product: an infinite deviation is refused like any other.
     with np.errstate(over="ignore", invalid="ignore"):
@@ -96,6 +93,14 @@ def check_camtoworld(matrix: object, where: str) -> tuple[Float64[np.ndarray, "4
     return pose, deviation
 
 
+def _check_coordinates(translation: Float64[np.ndarray, "3"], where: str) -> None:
+    """Checks that a camera is not absurdly far away, as one is whose reconstruction diverged."""
+    if np.abs(translation).max() > MAX_COORDINATE:
+        got = f"{np.abs(translation).max():.2g}"
+        fix = "drop the frame or choose a larger unit"
+        raise refusal(where, wanted=f"coordinates up to {MAX_COORDINATE:.0e}", got=got, fix=fix)
+
+
 def pose_from_quat(wxyz: object, translation: object, where: str) -> Float64[np.ndarray, "4 4"]:
     """Returns the rigid transform of a quaternion, which is normalized, and a translation.
 
@@ -105,12 +110,13 @@ def pose_from_quat(wxyz: object, translation: object, where: str) -> Float64[np.
         where: location of the values for error messages.
 
     Raises:
-        InputError: a value is not finite, or the quaternion is shorter than 1e-6.
+        InputError: a value is not finite, a coordinate is too large, or the quaternion is shorter than 1e-6.
     """
     quat, translation = np.asarray(wxyz, np.float64), np.asarray(translation, np.float64)
     length = math.hypot(*quat)  # does not overflow before the length does
     if not (np.isfinite(quat).all() and np.isfinite(translation).all()):
         raise refusal(where, wanted="finite numbers", got="NaN or infinity", fix="drop the frame (tracking was lost)")
+    _check_coordinates(translation, where)
     if not 1e-6 <= length < math.inf:
         got = f"a quaternion of length {length:.2g}"
         raise refusal(where, wanted="a rotation", got=got, fix="drop the frame or write a unit quaternion")

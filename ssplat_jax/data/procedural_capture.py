@@ -26,7 +26,10 @@ def open_procedural(spec: str, size: tuple[int, int] | None) -> Capture:
         InputError: the scene or an option is unknown.
     """
     name, _, query = spec.removeprefix(f"{PROCEDURAL}:").partition("?")
-    options = dict(parse_qsl(query, keep_blank_values=True))
+    given = parse_qsl(query, keep_blank_values=True)
+    options = dict(given)
+    if len(options) < len(given):
+        raise refusal(spec, wanted="every option once", got="one twice", fix="drop one of the two")
     if unknown := sorted(set(options) - {"frames", "size", "seed"}):
         fix = f"write {PROCEDURAL}:{name}?frames={PROCEDURAL_FRAMES}&size=128x96&seed=0"
         raise refusal(spec, wanted="the options frames, size, seed", got=echo(unknown[0]), fix=fix)

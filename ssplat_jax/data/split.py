@@ -24,6 +24,7 @@ FIRST_TARGET, TARGET_STEP = 4, 8  # first position and spacing of the interleave
 USUAL_CONTEXT = 64  # context views where none are given, if there are as many
 USUAL_FRAMES = 73  # those context views and the interleaved targets between them
 PAPER_TARGETS = 16
+MIN_FRAMES = FIRST_TARGET + 2  # of a split without a given context: a target between context views
 MAX_TARGET_SHARE = 0.25  # of the frames that become targets of `paper` where their number is not given
 SCANNET_FRAMES, SCANNET_TARGETS, SCANNET_ANCHORS = 1088, 64, 8
 PROTOCOLS = ("interleaved", "paper", "scannet")
@@ -193,8 +194,8 @@ def _choose_interleaved(num_frames: int, stride: int, context: int | None, targe
         num_taken = len(range(0, num_frames, stride))
         num_targets = len(range(FIRST_TARGET, num_taken, TARGET_STEP))
         context = _usual_context(num_taken, num_targets, None)
-        if num_taken <= FIRST_TARGET + 1:
-            wanted = f"at least {FIRST_TARGET + 2} frames for a target between context views"
+        if num_taken < MIN_FRAMES:
+            wanted = f"at least {MIN_FRAMES} frames for a target between context views"
             raise refusal("eval", wanted=wanted, got=f"{num_taken}", fix="use a longer capture or a smaller --stride")
     split = interleaved_split(num_frames, stride, context)
     if targets is None:

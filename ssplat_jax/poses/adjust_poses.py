@@ -136,14 +136,15 @@ def adjust_if_asked(
         reporter: shows progress.
 
     Returns:
-        The adjusted poses; None if they are not asked for, or if `auto` finds that the given ones fit.
+        The adjusted poses; None if they are not asked for, if `auto` finds that the given ones fit, or if too few
+        points were found to adjust them by.
     """
     if not pose_effects(revise):
         return None
     with reporter.progress("poses", len(indices), waiting="") as advance:
         found = adjust_poses(capture, indices, advance)
     reporter.say(found.reason)
-    return found if found.are_off or "poses" in revise else None
+    return found if found.num_points > 0 and (found.are_off or "poses" in revise) else None
 
 
 def _degrees(result: Adjustment, focal: float) -> float:

@@ -73,6 +73,7 @@ def estimate_poses(source: Path, out: Path, options: PoseOptions, overwrite: boo
     _check_out(source, out)
     with lock_folder(out):
         if overwrite and (out / RECORD).exists():
+            _held_record(out)  # refuses a file of another maker
             _clear(out)
         record = _read_record(out, request) or {"request": request}
         if "names" not in record:
@@ -102,8 +103,12 @@ def _request(source: Path, options: PoseOptions) -> dict[str, Any]:
     else:
         fix = f"give a folder, or a video file ({', '.join(sorted(VIDEO_SUFFIXES))})"
         raise refusal(str(source), wanted="a video or a folder of photos", got=echo(source.name), fix=fix)
-    digest = hashlib.sha256(json.dumps([[file.name, file.stat().st_size] for file in files]).encode()).hexdigest()
-    return {"source": source.name, "digest": digest[:12], **dataclasses.asdict(options)}
+    digest = hashlib.sha256()
+    for file in files:
+        with file.open("rb") as stream:
+            content = hashlib.file_digest(stream, "sha256").hexdigest()
+        digest.update(json.dumps([file.name, content]).encode())
+    return {"source": source.name, "digest": digest.hexdigest()[:12], **dataclasses.asdict(options)}
 
 
 def _check_out(source: Path, out: Path) -> None:
@@ -131,19 +136,31 @@ def _clear(out: Path) -> None:
 
 def _read_record(out: Path, request: dict[str, Any]) -> dict[str, Any] | None:
     """Result of an earlier call with the same request, or None."""
-    file = out / RECORD
-    if not file.exists():
+    if not (out / RECORD).exists():
         return None
-    try:
-        record = json.loads(file.read_text())
-        held = record["request"]
-    except (ValueError, KeyError, TypeError):
-        fix = "start anew with --overwrite"
-        raise refusal(str(file), wanted="the record of an earlier call", got="a damaged file", fix=fix) from None
+    record = _held_record(out)
+    held = record["request"]
     if held != request:
         changed = ", ".join(name for name in request if held.get(name) != request[name])
         fix = "repeat it, start anew with --overwrite, or choose another --out"
         raise refusal(str(out), wanted="a folder of this call", got=f"one of another call ({changed})", fix=fix)
+    return record
+
+
+def _held_record(out: Path) -> dict[str, Any]:
+    """The record of an earlier call.
+
+    Raises:
+        InputError: the file of that name is of another maker, whose images must not be removed.
+    """
+    file = out / RECORD
+    try:
+        record = json.loads(file.read_text())
+        if not isinstance(record["request"], dict):
+            raise TypeError
+    except (ValueError, KeyError, TypeError):
+        got, fix = "a file of another maker, or a damaged one", "choose another --out, or remove the folder"
+        raise refusal(str(file), wanted="the record of an earlier call", got=got, fix=fix) from None
     return record
 
 

@@ -5,13 +5,24 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
-from PIL import Image, ImageOps
+import numpy as np
+from PIL import Image
 
-from ssplat_jax.data.images import ORIENTATION, UPRIGHT, image_size
+from ssplat_jax.data.images import DEPTH_MODES, ORIENTATION, UPRIGHT, image_size
 from ssplat_jax.data.open_capture import IMAGE_SUFFIXES, UNREADABLE_SUFFIXES
 from ssplat_jax.errors import echo, refusal
 
 JPEG_QUALITY = 95
+TURNS = {
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_270,
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_90,
+}
+"""Transpositions that bring photos upright, by the EXIF orientation."""
 SUFFIXES = IMAGE_SUFFIXES - UNREADABLE_SUFFIXES
 
 
@@ -19,17 +30,19 @@ def list_photos(folder: Path) -> list[Path]:
     """Returns the photos in a folder, or in its `images/`, in the order of names in which digits count as numbers.
 
     Raises:
-        InputError: there are fewer than two, or they are of a kind that is not read.
+        InputError: there are fewer than two, or one is of a kind that is not read and has no readable copy beside it.
     """
     for place in (folder, folder / "images"):
         files = sorted(place.iterdir(), key=_natural) if place.is_dir() else []
         photos = [file for file in files if file.suffix.lower() in SUFFIXES and file.is_file()]
+        readable = {file.stem for file in photos}
+        phone = [f for f in files if f.suffix.lower() in UNREADABLE_SUFFIXES and f.stem not in readable]
+        if phone:
+            got = f"{len(phone)} HEIC files" + (f" beside {len(photos)} others" if photos else "")
+            fix = "convert them to JPEG first (the phone's camera settings call JPEG `most compatible`)"
+            raise refusal(str(place), wanted="JPEG or PNG photos", got=got, fix=fix)
         if len(photos) > 1:
             return photos
-        phone = [file for file in files if file.suffix.lower() in UNREADABLE_SUFFIXES]
-        if phone:
-            fix = "convert them to JPEG first (the phone's camera settings call JPEG `most compatible`)"
-            raise refusal(str(place), wanted="JPEG or PNG photos", got=f"{len(phone)} HEIC files", fix=fix)
     kinds = ", ".join(sorted(SUFFIXES))
     fix = f"give the folder that holds them ({kinds}), or a video file"
     raise refusal(str(folder), wanted="a folder of photos", got="fewer than two images", fix=fix)
@@ -56,7 +69,8 @@ def copy_photos(photos: list[Path], folder: Path, max_side: int, advance: Callab
         name = re.sub(r"\s", "_", photo.name)
         with Image.open(photo) as picture:
             _load(picture, photo)
-            is_upright = picture.getexif().get(ORIENTATION, UPRIGHT) == UPRIGHT
+            orientation, exif = _exif_of(picture)
+            is_upright = orientation == UPRIGHT
             if not (is_upright and max(size) <= max_side):
                 name = Path(name).stem + ".jpg"
             if name in names:
@@ -66,11 +80,26 @@ def copy_photos(photos: list[Path], folder: Path, max_side: int, advance: Callab
             if is_upright and max(size) <= max_side:
                 shutil.copyfile(photo, folder / name)
             else:
-                upright = ImageOps.exif_transpose(picture)
-                # Structure from motion reads the focal length in the EXIF data.
-                save_upright(upright, folder / name, max_side, exif=upright.getexif().tobytes())
+                upright = picture if is_upright else picture.transpose(TURNS[orientation])
+                save_upright(upright, folder / name, max_side, exif=exif)
         advance(len(names))
     return names
+
+
+def _exif_of(picture: Image.Image) -> tuple[int, bytes]:
+    """Orientation of a photo, and its EXIF data without it, in which structure from motion reads the focal length.
+
+    Malformed data, as some cameras write them, are upright and empty.
+    """
+    orientation = UPRIGHT
+    try:
+        exif = picture.getexif()
+        if exif.get(ORIENTATION) in TURNS:
+            orientation = exif[ORIENTATION]
+        exif.pop(ORIENTATION, None)
+        return orientation, exif.tobytes()
+    except Exception:  # Pillow's parser raises nearly anything on damaged data
+        return orientation, b""
 
 
 def _load(picture: Image.Image, photo: Path) -> None:
@@ -83,7 +112,9 @@ def _load(picture: Image.Image, photo: Path) -> None:
 
 
 def save_upright(picture: Image.Image, path: Path, max_side: int, *, exif: bytes = b"") -> None:
-    """Saves a picture as JPEG, reduced to a longer side of `max_side` pixels if it is larger."""
+    """Saves a picture as JPEG, reduced to a longer side of `max_side` pixels if it is larger; 16-bit gray is scaled."""
+    if picture.mode in DEPTH_MODES:
+        picture = Image.fromarray((np.asarray(picture, np.uint32) // 257).clip(0, 255).astype(np.uint8))
     picture = picture.convert("RGB")
     picture.thumbnail((max_side, max_side), Image.Resampling.LANCZOS)
     picture.save(path, "JPEG", quality=JPEG_QUALITY, subsampling=0, exif=exif)

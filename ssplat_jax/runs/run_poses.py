@@ -39,7 +39,7 @@ def capture_to_stream(
         return capture
     saved = _read(folder)
     if folder.has_state():
-        if saved is None or ("poses" in asked and not saved.camtoworlds):
+        if saved is None or ("poses" in asked and not (saved.camtoworlds or "poses" in saved.asked)):
             got, fix = "one with the given poses", "leave it out, or start anew with --overwrite"
             raise refusal(f"--revise {asked[0]}", wanted="a run that began with it", got=got, fix=fix)
     elif saved is None or (saved.asked, saved.capture) != (asked, capture.digest(indices)):

@@ -37,7 +37,8 @@ def save_spz(path: str | os.PathLike, gaussians: Gaussians, *, antialiased: bool
 
     Limits:
         Those of `scene_rows`. Standard deviations are quantized in steps of 6 % and clipped to [4.5e-5, 377] units,
-        f_rest to [-1, 1], f_dc to [-3.3, 3.3]. The error of a position is at most 2^-23 of the largest coordinate.
+        f_rest to [-1, 1], f_dc to [-3.3, 3.3]. The error of a position is at most 2^-23 of the largest coordinate, or
+        2^-24 units if that is more.
 
     Raises:
         InputError: a Gaussian lies 2^23 units or farther from the origin.

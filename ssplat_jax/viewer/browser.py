@@ -127,7 +127,15 @@ class Browser:
         return draw(scene, kind, placed, size, over_black=self._stage.over_black, exposure=exposure)
 
     def start_at(self, position: np.ndarray, target: np.ndarray, up: np.ndarray, fov: float | None) -> None:
-        """Moves the camera to where the stage starts; without an angle of view it keeps its own."""
+        """Moves the camera to where the stage starts; without an angle of view it keeps its own.
+
+        The stage may have other units than before, so splats and cameras are sent anew and motions end.
+        """
+        self._playback = None
+        self._frusta.show([], (1, 1))
+        if self._node is not None:
+            self._node.remove()
+        self._node, self._shown, self._noted = None, (), ()
         with self._client.atomic():
             if fov is not None:
                 self._client.camera.fov = fov
@@ -172,5 +180,5 @@ class Browser:
             return
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "scene.ply"
-            save_gaussians(file, scene.gaussians, offset=scene.offset)
+            save_gaussians(file, scene.gaussians, render_mode=scene.render_mode, offset=scene.offset)
             self._client.send_file_download(file.name, file.read_bytes(), save_immediately=True)

@@ -33,7 +33,8 @@ class SceneFile:
     num_chunks = 1
 
     def __init__(self, path: Path, *, one_exposure: bool = False) -> None:
-        self._stamp = self._unreadable = None  # of the file when it was last read, and when it last could not be
+        # Of scene and metrics when they were last read, and when the scene last could not be.
+        self._stamp = self._unreadable = None
         self._one_exposure = one_exposure
         self._scene: ViewedScene | None = None
         self.path, self.folder = path, RunFolder(path.parent)
@@ -41,16 +42,18 @@ class SceneFile:
     def changed(self) -> ViewedScene | None:
         """The scene if it has changed since the last call, else None.
 
-        While a program rewrites the file, it cannot be read: the last scene stays.
+        While a program rewrites the file, it cannot be read: the last scene stays. It also stays while a run that ends
+        again has removed its metrics and not yet written the new ones, which come last.
 
         Raises:
             InputError: the file is not a scene and has not changed since the last call, or there was no scene before;
                 or its exposure is wanted and unknown.
         """
-        stat = self.path.stat() if self.path.exists() else None
-        stamp = None if stat is None else (stat.st_mtime_ns, stat.st_size)
-        if self._stamp is not None and stamp in (None, self._stamp):
-            return None
+        stamp = scene, metrics = _stamp(self.path), _stamp(self.folder.metrics)
+        if self._stamp is not None:
+            is_ending = metrics is None and self._stamp[1] is not None
+            if scene is None or stamp == self._stamp or is_ending:
+                return None
         try:
             file = read_scene(self.path)
         except InputError:
@@ -65,8 +68,7 @@ class SceneFile:
         else:
             with contextlib.suppress(InputError):  # of no run: the exposures of views are not known either
                 exposure = scene_exposure(self.path)
-        antialias = "classic" if file.render_mode == "default" else "mip"
-        self._scene = ViewedScene(gaussians, file.offset, exposure, antialias=antialias)
+        self._scene = ViewedScene(gaussians, file.offset, exposure, render_mode=file.render_mode)
         return self._scene
 
     def at(self, num_chunks: int) -> ViewedScene:
@@ -74,16 +76,20 @@ class SceneFile:
         assert self._scene is not None
         return self._scene
 
+    def frame(self) -> StreamFrame | None:
+        """The frame of the stream of the run that wrote the file; None if no metrics of a run are beside it."""
+        try:
+            return StreamFrame.from_dict(json.loads(self.folder.metrics.read_bytes())["stream_frame"])
+        except (OSError, ValueError, TypeError, LookupError):  # another file of that name must not prevent viewing
+            return None
+
     def start_camera(self) -> StartCamera | None:
         """The camera in the middle of the run that wrote the file; None if no metrics of a run are beside it.
 
         Around the first camera a scene often ends: no other view has seen what lies behind. Runs of earlier versions
         recorded no cameras, and have their first one alone.
         """
-        try:
-            fields = json.loads(self.folder.metrics.read_bytes())["stream_frame"]
-            frame = StreamFrame.from_dict(fields)
-        except (OSError, ValueError, TypeError, LookupError):  # another file of that name must not prevent viewing
+        if (frame := self.frame()) is None:
             return None
         run, first = RecordedRun(self.folder), first_camera(frame)
         run.refresh()
@@ -92,6 +98,15 @@ class SceneFile:
         pose = middle.camtoworld.copy()
         pose[:3, 3] -= frame.offset
         return turned_to(first, pose)
+
+
+def _stamp(path: Path) -> tuple[int, int] | None:
+    """Time and size of a file, which change when it is written again; None if there is none."""
+    try:
+        stat = path.stat()
+    except OSError:
+        return None
+    return stat.st_mtime_ns, stat.st_size
 
 
 class _Sum:
@@ -185,6 +200,10 @@ class GrowingScene:
         for name, stamp in wanted[len(self._past.applied) :]:
             self._past.apply(self.folder.deltas / name, stamp)
         return self._past.viewed(one_exposure=self._one_exposure)
+
+    def frame(self) -> StreamFrame | None:
+        """The frame of the stream; None before the first delta."""
+        return self._newest.frame
 
     def start_camera(self) -> StartCamera | None:
         """The first camera of the stream; None before the first delta."""

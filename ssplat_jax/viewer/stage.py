@@ -30,6 +30,8 @@ class Stage:
         self.version, self.records_version = 0, 0  # numbers of changes so far
         self.unit, self.distance = 1.0, 1.0  # scene units per unit of splats, and per unit of the browser
         self.start: StartCamera | None = None
+        self.num_starts = 0  # start cameras so far: a run of other poses brings another one, and other units
+        self._place: tuple | None = None  # of the stream, when the start camera was set
         self._newest: ViewedScene | None = None
         self._packed: tuple[ViewedScene, Splats] | None = None  # of the scene packed last
 
@@ -42,12 +44,23 @@ class Stage:
         self.records_version += self.run.refresh()
         if (changed := self.source.changed()) is None:
             return False
-        if self.start is None and (start := self.source.start_camera() or camera_before(changed.gaussians)) is not None:
-            self.start = start
-            self.unit = median_size(changed.gaussians)
-            self.distance = float(np.linalg.norm(start.look_at - start.position)) or 1.0
+        self._set_start(changed)
         self._newest, self.version = changed, self.version + 1
         return True
+
+    def _set_start(self, scene: ViewedScene) -> None:
+        """Sets start camera and units by the first scene of a stream.
+
+        A stream is told by its first camera and its scale; a causal one may widen its depth range.
+        """
+        frame = self.source.frame()
+        place = None if frame is None else (frame.rotation.tolist(), frame.origin.tolist(), frame.scale)
+        if self.start is not None and place in (None, self._place):
+            return
+        if (start := self.source.start_camera() or camera_before(scene.gaussians)) is not None:
+            self.start, self._place, self.num_starts = start, place, self.num_starts + 1
+            self.unit = median_size(scene.gaussians)
+            self.distance = float(np.linalg.norm(start.look_at - start.position)) or 1.0
 
     @property
     def num_chunks(self) -> int:

@@ -17,4 +17,9 @@ class ViewedScene:
     exposure: Float[np.ndarray, "3"] = dataclasses.field(default_factory=lambda: np.ones(3))
     """RGB factor from the exposure of the run's first views to that of the colors."""
     confidences: Float[np.ndarray, " n"] | None = None  # of the pivots behind the Gaussians; None where unknown
-    antialias: str = "mip"  # the filter that the scene was made for
+    render_mode: str = "mip"  # the renderer that the scene was made for, see `save_ply`
+
+    @property
+    def antialias(self) -> str:
+        """The rasterizer's filter for the scene."""
+        return "classic" if self.render_mode == "default" else "mip"

@@ -48,7 +48,7 @@ class Viewer:
         with contextlib.redirect_stdout(io.StringIO()):  # viser's banner; `show_source` says the address
             self._server: Any = viser.ViserServer(host=host, port=port, label="ssplat", verbose=False)
         self._server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
-        self._has_camera = False
+        self._num_starts = 0  # start cameras of the stage that were set
         self._server.on_client_connect(self._welcome)
         self._server.on_client_disconnect(lambda client: self._browsers.pop(client.client_id, None))
         name = "localhost" if host in (*LOCAL_HOSTS, "0.0.0.0", "::") else f"[{host}]" if ":" in host else host
@@ -59,10 +59,10 @@ class Viewer:
         self._browsers[client.client_id] = Browser(client, self._stage)
 
     def _set_start_camera(self) -> None:
-        """Sets the camera with which browsers start, as soon as there is one; those that wait for it are moved."""
-        if self._has_camera or (start := self._stage.start) is None:
+        """Sets the camera with which browsers start, whenever the stage has a new one, and moves all browsers to it."""
+        if self._num_starts == self._stage.num_starts or (start := self._stage.start) is None:
             return
-        self._has_camera = True
+        self._num_starts = self._stage.num_starts
         position, target = start.position / self._stage.distance, start.look_at / self._stage.distance
         self._server.scene.set_up_direction(start.up)
         self._server.initial_camera.position, self._server.initial_camera.look_at = position, target

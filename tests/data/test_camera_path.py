@@ -79,13 +79,13 @@ def inward(num_cameras, height=0.4, radius=2.0, target=(1.0, -2.0, 3.0)):
 
 
 def test_the_point_looked_at_is_where_the_axes_meet():
-    np.testing.assert_allclose(looked_at(inward(9)), [1.0, -2.0, 3.0], atol=1e-9)
+    np.testing.assert_allclose(looked_at(inward(9), 2.0), [1.0, -2.0, 3.0], atol=1e-9)
     outward = inward(9)
     outward[:, :3, [0, 2]] *= -1  # turned about: the same axes, behind
-    assert looked_at(outward) is None
+    assert looked_at(outward, 2.0) is None
     parallel = np.tile(np.eye(4), (5, 1, 1))
     parallel[:, 0, 3] = np.arange(5)
-    assert looked_at(parallel) is None and looked_at(parallel[:1]) is None
+    assert looked_at(parallel, 2.0) is None and looked_at(parallel[:1], 2.0) is None
 
 
 def test_an_orbit_is_a_circle_through_cameras_that_look_at_one_point():
@@ -127,3 +127,26 @@ def test_up_is_where_level_cameras_have_it():
     given[:, :3, :2] *= -1  # all rolled by half a turn
     np.testing.assert_allclose(upward(given), [0, 0, -1], atol=1e-9)
     np.testing.assert_allclose(upward(np.tile(np.eye(4), (3, 1, 1))), [0, -1, 0])
+
+
+@pytest.mark.parametrize("share", [0.3, 0.4])
+def test_up_is_that_of_level_cameras_though_some_lie_on_a_side(share):
+    angles = np.linspace(0, 2 * np.pi, 40, endpoint=False)
+    up = np.array([0.0, 0.0, 1.0])
+    given = np.stack([look_at(np.array([np.cos(a), np.sin(a), 0.0]), np.zeros(3), up) for a in angles])
+    quarter_turn = Rotation.from_euler("z", 90, degrees=True).as_matrix()
+    given[: round(share * 40), :3, :3] @= quarter_turn
+    found = upward(given)
+    assert found is not None and np.degrees(np.arccos(min(1.0, found @ up))) < 1.0
+
+
+def test_cameras_that_turn_about_one_place_look_at_no_point():
+    """Their axes meet at their own place, which rounding puts in front of all of them now and then."""
+    for seed in range(50):
+        rng = np.random.default_rng(seed)
+        turning = poses(rng.normal(size=(3, 3)) * 0.4, np.tile(rng.normal(size=3), (3, 1)))
+        assert looked_at(turning, 2.0) is None
+        path, _ = orbit_path(turning, K, 2.0, 8)
+        assert np.isfinite(path).all()
+        radii = np.linalg.norm(path[:, :3, 3] - turning[1, :3, 3], axis=1)
+        np.testing.assert_allclose(radii, SWAY_RADIUS * 2.0)

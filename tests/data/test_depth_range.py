@@ -12,6 +12,7 @@ from ssplat_jax.data.capture_summary import summarize
 from ssplat_jax.data.depth_range import DepthStatistics, estimate_depths, stream_scale
 from ssplat_jax.data.images import ArrayPixels
 from ssplat_jax.data.open_capture import open_capture
+from ssplat_jax.data.posed_image import MAX_COORDINATE
 from ssplat_jax.data.sparse_matches import CommonPoints
 from ssplat_jax.data.split import interleaved_split
 from tests.data.planes_fixture import two_planes
@@ -92,6 +93,18 @@ def test_only_the_given_frames_are_used():
     assert isinstance(capture.pixels, ArrayPixels)
     capture.pixels.images[4] = capture.pixels.images[8:] = np.nan
     assert estimate_depths(capture, used) == before
+
+
+def test_a_diverged_camera_leaves_the_other_places_apart():
+    """Given or not; where it is not given, it changes nothing at all."""
+    capture, config = two_planes(12, 0.05), StreamConfig()
+    before = capture.stream_frame(config, range(11)).to_dict()
+    capture.frames[11].camtoworld[:3, 3] = MAX_COORDINATE
+    assert capture.stream_frame(config, range(11)).to_dict() == before
+    depths = estimate_depths(capture, range(12))
+    truth = np.median(true_depths(capture, range(12)))
+    assert depths.source == "matches" and 1 / MEDIAN_TOLERANCE < depths.median / truth < MEDIAN_TOLERANCE
+    assert not any("one place" in warning for warning in summarize(capture, config).warnings)
 
 
 def test_depths_of_frames_in_random_order():

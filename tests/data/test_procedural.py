@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.procedural import (
     CAPTURES,
     PATH_KINDS,
@@ -269,3 +270,8 @@ def test_every_ray_ends():
         poses, Ks = sample_path(seed, scene, "pan", 8, 24, 32)
         depths = np.asarray(raycast_depths(scene, np.linalg.inv(poses), Ks, 24, 32))
         assert np.isfinite(depths).all() and depths.max() < (620 if kind == "yard" else 100)
+
+
+def test_an_option_of_a_procedural_path_given_twice_is_refused():
+    with pytest.raises(InputError, match="wanted every option once, got one twice; drop one"):
+        open_capture("procedural:room?frames=4&frames=9")

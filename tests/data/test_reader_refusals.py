@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from ssplat_jax.data.open_capture import open_capture
+from ssplat_jax.data.posed_image import MAX_COORDINATE, pose_from_quat
 from ssplat_jax.errors import InputError
 from tests.badinputs.cases import mutant
 from tests.data.capture_writers import (
@@ -217,3 +218,10 @@ def test_mutants_are_read_or_refused_and_never_crash(kind, file, tmp_path):
             assert "\n" not in str(error)
             num_refused += 1
     assert num_refused > NUM_MUTANTS // 20  # enough mutants reach the checks
+
+
+def test_a_pose_of_a_quaternion_may_not_be_absurdly_far():
+    turn = [1.0, 0.0, 0.0, 0.0]
+    assert pose_from_quat(turn, [0.0, -MAX_COORDINATE, 0.0], "here")[1, 3] == -MAX_COORDINATE
+    with pytest.raises(InputError, match=r"^here: wanted coordinates up to 1e\+12, got 2e\+12; drop the frame"):
+        pose_from_quat(turn, [0.0, 0.0, -2e12], "here")

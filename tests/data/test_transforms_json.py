@@ -1,12 +1,15 @@
 """The transforms.json reader: conventions, defaults, odd files, notes for the user."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from ssplat_jax.data.open_capture import open_capture
+from ssplat_jax.data.pose_conventions import Convention
 from ssplat_jax.data.posed_image import check_camtoworld
 from ssplat_jax.errors import InputError
 from tests.badinputs.cases import HEIGHT, WIDTH, make_capture, rotated
@@ -186,6 +189,25 @@ def test_names_without_an_order_keep_the_order_of_the_file(tmp_path):
     told = open_capture(make_capture(tmp_path / "d", rename))
     assert names(told) == list("cadb")
     assert any("file's order" in note for note in told.notes)
+
+
+def test_frames_are_ordered_by_poses_in_their_own_convention(tmp_path):
+    """An orbit with random names: read as camera-to-world, all of it stands in one place."""
+    names, written = "qcxamzbktrdyovfjsgpe", Convention("opengl", "world-to-camera")
+
+    def rename(root, meta):
+        first = meta["frames"][0]["file_path"]
+        meta["frames"] = []
+        for i, name in enumerate(names):
+            shutil.copyfile(root / first, root / "images" / f"{name}.jpg")
+            pose = np.eye(4)
+            pose[:3, :3] = Rotation.from_euler("y", 18 * i, degrees=True).as_matrix()
+            pose[:3, 3] = -3 * pose[:3, 2]
+            entry = {"file_path": f"images/{name}.jpg", "transform_matrix": written.from_opencv(pose).tolist()}
+            meta["frames"].append(entry)
+
+    capture = open_capture(f"{make_capture(tmp_path / 'c', rename)}?poses=world-to-camera")
+    assert [frame.name[7] for frame in capture.frames] == list(names)
 
 
 def test_rotations_of_three_decimals_are_rotations():

@@ -18,7 +18,7 @@ import ssplat_jax as ss
 from ssplat_jax.commands import main as command_line
 from ssplat_jax.config import CompactConfig
 from ssplat_jax.data import open_capture as captures
-from ssplat_jax.data.readers.frame_list import Intrinsics, make_frame, order_frames
+from ssplat_jax.data.readers.frame_list import Intrinsics, list_frames, make_frame
 from ssplat_jax.model.compact import CompactNetwork
 from ssplat_jax.model.network import register_network
 from tests.docs.pages import ROOT, tables
@@ -125,7 +125,7 @@ def toy_reader() -> SimpleNamespace:
             pose = np.eye(4)
             pose[0, 3] = x
             frames.append(make_frame(name, path / name, pose, intrinsics, (32, 24), str(path / "toy.json")))
-        return order_frames(path.name, frames)
+        return list_frames(path.name, frames)
 
     return SimpleNamespace(FORMAT="toy", matches=lambda path: (path / "toy.json").is_file(), read=read)
 

@@ -12,7 +12,7 @@ from ssplat_jax.console import Reporter
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.errors import InputError
 from ssplat_jax.poses import requirements, sfm
-from ssplat_jax.poses.estimate import PoseOptions, estimate_poses
+from ssplat_jax.poses.estimate import PoseOptions, _request, estimate_poses
 from ssplat_jax.storage.json_files import write_json
 from tests.poses.room_fixture import FOCAL, K, pictures, walk
 
@@ -119,7 +119,7 @@ def test_a_folder_belongs_to_one_call(photos, estimated, tmp_path):
     with pytest.raises(InputError, match="images of another maker"):
         estimate(photos, tmp_path)
     (tmp_path / "poses.json").write_text("{")
-    with pytest.raises(InputError, match=r"poses\.json.*damaged.*--overwrite"):
+    with pytest.raises(InputError, match=r"poses\.json.*damaged.*another --out"):
         estimate(photos, tmp_path)
 
 
@@ -178,6 +178,28 @@ def test_files_of_another_maker_are_left_alone(name, photos, tmp_path):
         with pytest.raises(InputError, match="of another maker"):
             estimate(photos, tmp_path / "capture", overwrite)
     assert held.read_text() == "mine"
+
+
+@pytest.mark.parametrize("text", ['{"poses": []}', "[1]", '{"request": "mine"}', "no JSON"])
+def test_overwrite_removes_nothing_of_another_maker(text, photos, tmp_path):
+    (tmp_path / "images").mkdir()
+    for name in ("poses.json", "transforms.json", "images/1.png"):
+        (tmp_path / name).write_text(text)
+    with pytest.raises(InputError, match=r"poses\.json.*of another maker.*another --out"):
+        estimate(photos, tmp_path, overwrite=True)
+    for name in ("poses.json", "transforms.json", "images/1.png"):
+        assert (tmp_path / name).read_text() == text
+
+
+def test_other_pixels_in_as_many_bytes_are_another_request(tmp_path):
+    Image.new("RGB", (40, 30), (10, 20, 30)).save(tmp_path / "1.bmp")
+    Image.new("RGB", (40, 30)).save(tmp_path / "2.bmp")
+    before, size = _request(tmp_path, PoseOptions()), (tmp_path / "1.bmp").stat().st_size
+    assert _request(tmp_path, PoseOptions()) == before
+    Image.new("RGB", (40, 30), (10, 20, 31)).save(tmp_path / "1.bmp")
+    assert (tmp_path / "1.bmp").stat().st_size == size
+    after = _request(tmp_path, PoseOptions())
+    assert [name for name in before if after[name] != before[name]] == ["digest"]
 
 
 def test_a_call_killed_among_its_images_continues(photos, estimated, tmp_path, monkeypatch):

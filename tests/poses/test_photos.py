@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageOps
 
 from ssplat_jax.errors import InputError
 from ssplat_jax.poses.photos import copy_photos, list_photos
@@ -69,3 +69,58 @@ def test_unusable_photos_are_refused_by_name(tmp_path):
     (tmp_path / "in" / "c.jpg").write_bytes(whole[: len(whole) * 2 // 3])
     with pytest.raises(InputError, match=r"c\.jpg.*damaged data"):
         copy(tmp_path)
+
+
+def test_photos_beside_unreadable_ones_must_be_their_copies(tmp_path):
+    for name in ("1.jpg", "2.JPG", "3.png"):
+        save(tmp_path / name)
+    for name in ("1.heic", "4.HEIC", "5.heif"):
+        (tmp_path / name).write_bytes(b"x")
+    with pytest.raises(InputError, match="2 HEIC files beside 3 others; convert"):
+        list_photos(tmp_path)
+    for name in ("4.jpg", "5.jpg"):
+        save(tmp_path / name)
+    assert [photo.name for photo in list_photos(tmp_path)] == ["1.jpg", "2.JPG", "3.png", "4.jpg", "5.jpg"]
+
+
+def test_reduced_gray_of_16_bits_keeps_its_mean(tmp_path):
+    ramp = np.tile(np.linspace(0, 65535, 400).astype(np.uint16), (300, 1))
+    (tmp_path / "in").mkdir()
+    for name in ("1.png", "2.tif"):
+        Image.fromarray(ramp).save(tmp_path / "in" / name)
+    for name in copy(tmp_path, max_side=100):
+        with Image.open(tmp_path / "out" / name) as picture:
+            assert picture.size == (100, 75)
+            assert np.asarray(picture).mean() / 255 == pytest.approx(0.5, abs=0.02)
+
+
+@pytest.mark.parametrize("exif", [b"Exif\0\0MM\0\0\0\0\0\x08", b"Exif\0\0MM\0*\0\0"], ids=["no TIFF", "cut off"])
+def test_large_photos_with_malformed_exif_data_are_reduced(exif, tmp_path):
+    (tmp_path / "in").mkdir()
+    for name in ("1.jpg", "2.jpg"):
+        Image.new("RGB", (400, 300), (200, 30, 30)).save(tmp_path / "in" / name, exif=exif)
+    assert copy(tmp_path, max_side=100) == ["1.jpg", "2.jpg"]
+    with Image.open(tmp_path / "out" / "1.jpg") as picture:
+        assert picture.size == (100, 75) and abs(np.asarray(picture)[0, 0, 0] - 200.0) < 5
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_reduced_photos_are_upright_even_if_their_exif_data_cannot_be_written(orientation, tmp_path, monkeypatch):
+    """Pillow's own transposition, which needs to write the data, is the reference."""
+    (tmp_path / "in").mkdir()
+    exif = Image.Exif()
+    exif[ORIENTATION] = orientation
+    quarters = np.kron([[0, 80], [160, 240]], np.ones((30, 40))).astype(np.uint8)
+    for name in ("1.png", "2.png"):
+        Image.fromarray(quarters).save(tmp_path / "in" / name, exif=exif)
+    with Image.open(tmp_path / "in" / "1.png") as picture:
+        wanted = np.asarray(ImageOps.exif_transpose(picture))
+
+    def broken(self, *given):
+        raise TypeError("a tag of another type")
+
+    monkeypatch.setattr(Image.Exif, "tobytes", broken)
+    assert copy(tmp_path, max_side=79) == ["1.jpg", "2.jpg"]
+    with Image.open(tmp_path / "out" / "1.jpg") as picture:
+        found = np.asarray(picture.convert("L").resize(wanted.shape[::-1]), np.float64)
+    assert np.median(np.abs(found - wanted)) < 3

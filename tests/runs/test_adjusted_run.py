@@ -108,6 +108,16 @@ def test_poses_that_fitted_are_no_adjusted_ones(tmp_path, monkeypatch):
         capture_to_stream(capture, range(4), ("poses",), folder, Reporter(quiet=True))
 
 
+def test_a_run_whose_poses_could_not_be_adjusted_goes_on(tmp_path, monkeypatch):
+    folder, capture = RunFolder(tmp_path), open_capture(CAPTURE, size=SIZE)
+    monkeypatch.setattr(adjusting, "adjust_poses", lambda *given: dataclasses.replace(moved(*given), num_points=0))
+    for state in (None, b"of the run"):
+        if state:
+            folder.state.write_bytes(state)
+        assert capture_to_stream(capture, range(4), ("poses",), folder, Reporter(quiet=True)).frames == capture.frames
+        assert not has_adjusted_poses(folder)  # a refinement may revise them
+
+
 @pytest.mark.parametrize(
     "earlier, indices", [(CAPTURE, (0, 2)), ("procedural:corridor?frames=4", range(4))], ids=["frames", "capture"]
 )

@@ -159,6 +159,14 @@ def test_spz_positions_are_as_fine_as_24_bits_allow(tmp_path, reach, bits):
     assert np.asarray(held.means)[0] == pytest.approx([0, reach, -reach / 3], abs=0.51 * 2.0**-bits)
 
 
+def test_spz_positions_of_a_tiny_scene_are_off_by_half_a_step(tmp_path):
+    means = np.random.default_rng(0).uniform(-5e-4, 5e-4, (500, 3)).astype(np.float32)
+    save_spz(tmp_path / "a.spz", replace(scene(n=500), means=jnp.asarray(means)))
+    held, _ = read_spz(tmp_path / "a.spz")
+    error = np.abs(np.asarray(held.means, np.float64) * [1, -1, -1] - means).max()
+    assert 2.0**-23 * np.abs(means).max() < error <= 2.0**-24  # more than the share of larger scenes
+
+
 def test_spz_refuses_what_its_positions_cannot_hold(tmp_path):
     with pytest.raises(InputError, match=r"8388607 units.*write a \.ply"):
         save_spz(tmp_path / "a.spz", one(means=jnp.array([[0.0, 0.0, 9e6]])))

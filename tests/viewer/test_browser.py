@@ -13,6 +13,7 @@ from ssplat_jax.checkpoint.chunk_records import ChunkRecord, RecordedView, make_
 from ssplat_jax.checkpoint.delta_files import save_delta
 from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.pytree import replace
+from ssplat_jax.scene_files.formats import read_scene
 from ssplat_jax.scene_files.ply import load_ply
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.viewer import browser as browser_module
@@ -324,6 +325,17 @@ def test_downloads_hold_the_scene_and_the_picture_in_sight(run, tmp_path):
         np.testing.assert_array_equal(np.asarray(image), run.client.scene.backgrounds[-1])
 
 
+@pytest.mark.parametrize("mode", ["default", "mip"])
+def test_a_downloaded_scene_keeps_its_renderer(mode, tmp_path):
+    ss.save_ply(tmp_path / "scene.ply", scene(5), render_mode=mode)
+    stage, client = Stage(open_source(tmp_path), max_gaussians=10), FakeClient()
+    stage.refresh()
+    Browser(client, stage).update()
+    client.gui.controls["Download scene"].click()
+    (tmp_path / "got.ply").write_bytes(client.downloads["scene.ply"])
+    assert read_scene(tmp_path / "got.ply").render_mode == mode
+
+
 def test_a_scene_of_a_file_has_no_slider_and_no_figures(tmp_path):
     ss.save_ply(tmp_path / "scene.ply", replace(scene(5), opacities=jnp.full(5, 0.5)))
     stage, client = Stage(open_source(tmp_path), max_gaussians=3), FakeClient()
@@ -356,3 +368,43 @@ def test_browsers_start_with_the_first_cameras_angle_of_view(tmp_path):
     finally:
         viewer.close()
     assert RecordedRun(RunFolder(tmp_path / "none")).fov is None
+
+
+def restarted(folder, stream, *, size=1.0):
+    """Writes the first chunk of a run, in place of what the run wrote before."""
+    for path in folder.deltas.glob("*"):
+        path.unlink()
+    part = delta([0, 1], 1)
+    gaussians = replace(part.gaussians, scales=size * part.gaussians.scales)
+    save_delta(folder.delta(2), type(part)(part.rows, gaussians, part.capacity), {"frame": stream.to_dict()})
+
+
+def test_a_run_of_other_poses_is_seen_from_its_own_start(tmp_path):
+    pytest.importorskip("viser")
+    folder, first = RunFolder(tmp_path), frame()
+    restarted(folder, first)
+    stage = Stage(open_source(tmp_path), max_gaussians=1000)
+    stage.refresh()
+    viewer, client = Viewer(stage, host="127.0.0.1", port=free_port()), FakeClient()
+    try:
+        viewer._welcome(client)
+        viewer.update()
+        node, start, units = client.scene.nodes["/scene"], stage.start, (stage.unit, stage.distance)
+        client.camera.position = np.array([9.0, 9.0, 9.0])
+        restarted(folder, dataclasses.replace(first, far=9.0), size=0.5)  # the same place, a wider range
+        assert stage.refresh() and stage.num_starts == 1
+        viewer.update()
+        assert client.scene.nodes["/scene"] is node and not hasattr(node, "removed") and node.num_updates == 1
+        assert stage.start is start and (stage.unit, stage.distance) == units
+        np.testing.assert_array_equal(client.camera.position, 9.0)
+        other = dataclasses.replace(first, origin=np.array([1.0, 2.0, 3.0]), far=32.0)
+        restarted(folder, other, size=0.5)
+        assert stage.refresh() and stage.num_starts == 2
+        viewer.update()
+        sent = client.scene.nodes["/scene"]
+        assert node.removed and sent is not node
+        assert stage.unit == pytest.approx(units[0] / 2) and stage.distance == pytest.approx(2 * units[1])
+        assert sent.scale == pytest.approx(stage.unit / stage.distance) and sent.scale == pytest.approx(node.scale / 4)
+        np.testing.assert_allclose(client.camera.position * stage.distance, [1.0, 2.0, 3.0])
+    finally:
+        viewer.close()

@@ -216,6 +216,26 @@ def test_a_scene_file_is_read_again_when_it_is_written_again(tmp_path):
     assert source.changed() is None  # shown on
 
 
+def test_a_scene_stays_until_the_next_metrics_are_there(tmp_path):
+    """A run that ends again removes its metrics, writes its scene, and then writes its metrics."""
+    file, metrics = tmp_path / "scene.ply", tmp_path / "metrics.json"
+    ss.save_ply(file, scene(5))
+    metrics.write_text(json.dumps({"scene_exposure": [2.0, 1.0, 1.0]}))
+    source, shown = open_source(tmp_path, one_exposure=True), SceneFile(file)
+    first = source.changed().gaussians
+    assert shown.changed().exposure[0] == 2.0
+    metrics.unlink()
+    assert source.changed() is None
+    ss.save_ply(file, scene(7))
+    assert source.changed() is None and shown.changed() is None
+    assert source.at(1).gaussians is first
+    metrics.write_text(json.dumps({"scene_exposure": [4.0, 2.0, 1.0]}))
+    literal, exposed = source.changed().gaussians, shown.changed()
+    np.testing.assert_array_equal(exposed.exposure, [4.0, 2.0, 1.0])
+    colors = [0.5 + 0.28209479 * np.asarray(x.sh[:, 0], np.float64) for x in (literal, exposed.gaussians)]
+    np.testing.assert_allclose(colors[0] * [4.0, 2.0, 1.0], colors[1], atol=1e-6)
+
+
 @pytest.mark.parametrize("suffix", [".compressed.ply", ".sog", ".spz", ".glb", ".splat"])
 def test_a_scene_file_of_any_format_is_shown(tmp_path, suffix):
     save_gaussians(tmp_path / f"a{suffix}", scene(5))

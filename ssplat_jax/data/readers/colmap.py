@@ -22,8 +22,8 @@ from ssplat_jax.data.readers.frame_list import (
     SHRUNK_FOLDERS,
     Intrinsics,
     file_named,
+    list_frames,
     make_frame,
-    order_frames,
     stored_size,
 )
 from ssplat_jax.data.readers.strict_text import load_lines, parse_numbers
@@ -105,7 +105,7 @@ def read(path: Path) -> Listing:
             got = f"{echo(entry.name)} twice"
             raise refusal(entry.where, wanted="every image once", got=got, fix="remove one of the two")
         frames.append(frame)
-    return order_frames(root.name, frames)
+    return list_frames(root.name, frames)
 
 
 def _model_folder(path: Path) -> Path | None:

@@ -1,4 +1,4 @@
-"""Steps that all readers share: finding files, checking a frame, and ordering the frames."""
+"""Steps that all readers share: finding files, checking a frame, and listing and ordering the frames."""
 
 import dataclasses
 import errno
@@ -209,32 +209,35 @@ def make_frame(
     )
 
 
-def order_frames(name: str, frames: list[Frame], notes: Sequence[str] = (), *, is_in_time: bool = False) -> Listing:
-    """Returns the frames in the order of streaming, with notes for the user.
-
-    Frames are sorted by name in natural order ("9.jpg" before "10.jpg"). The given order is kept if it is the order of
-    time, or if it makes the path of the camera less than half as long, as with random names or several cameras.
+def list_frames(name: str, frames: list[Frame], notes: Sequence[str] = (), *, is_in_time: bool = False) -> Listing:
+    """Returns the listing of a reader, with notes for the user about poses, sizes and intrinsics.
 
     Args:
         name: name of the capture.
         frames: frames in the order of the file.
-        notes: messages for the user.
-        is_in_time: whether `frames` are in the order of time.
-
-    Returns:
-        The listing.
+        notes: further messages for the user.
+        is_in_time: True if `frames` are in the order of time.
     """
-    notes = (*notes, *_notes(frames))
-    if is_in_time:
-        return Listing(name=name, frames=tuple(frames), notes=notes)
-    ordered = sorted(frames, key=lambda frame: _natural(frame.name))
-    if _path_length(frames) < SHORTER_PATH_RATIO * _path_length(ordered):
+    return Listing(name=name, frames=tuple(frames), notes=(*notes, *_notes(frames)), is_in_time=is_in_time)
+
+
+def in_stream_order(listing: Listing) -> Listing:
+    """Returns a listing with its frames in the order of streaming.
+
+    Frames are sorted by name in natural order ("9.jpg" before "10.jpg"). The order of the file is kept if it is the
+    order of time, or if it makes the path of the camera less than half as long, as with random names or several
+    cameras. So poses have to be in the convention in which they were written.
+    """
+    if listing.is_in_time:
+        return listing
+    ordered = tuple(sorted(listing.frames, key=lambda frame: _natural(frame.name)))
+    if _path_length(listing.frames) < SHORTER_PATH_RATIO * _path_length(ordered):
         note = "Frames are streamed in the file's order: by name, the camera path would be more than twice as long."
-        return Listing(name=name, frames=tuple(frames), notes=(*notes, note))
-    return Listing(name=name, frames=tuple(ordered), notes=notes)
+        return dataclasses.replace(listing, notes=(*listing.notes, note))
+    return dataclasses.replace(listing, frames=ordered)
 
 
-def _path_length(frames: list[Frame]) -> float:
+def _path_length(frames: Sequence[Frame]) -> float:
     """Length of the camera path."""
     return sum((math.dist(a.center, b.center) for a, b in itertools.pairwise(frames)), 0.0)
 

@@ -14,7 +14,7 @@ from jaxtyping import Float64
 from ssplat_jax.data.images import image_size
 from ssplat_jax.data.posed_image import check_camtoworld
 from ssplat_jax.data.readers import Listing
-from ssplat_jax.data.readers.frame_list import Intrinsics, make_frame, order_frames
+from ssplat_jax.data.readers.frame_list import Intrinsics, list_frames, make_frame
 from ssplat_jax.data.readers.strict_text import load_lines, load_rows, parse_numbers
 from ssplat_jax.errors import echo, refusal
 
@@ -61,7 +61,7 @@ def read(path: Path) -> Listing:
         raise refusal(str(path), wanted="images with poses", got=got, fix=fix)
     num_lost = len(images) - len(frames)
     lost = [f"{num_lost} of {len(images)} images are skipped: they have no pose."] if num_lost else []
-    return order_frames(root.name, frames, lost)
+    return list_frames(root.name, frames, lost)
 
 
 def _camera(path: Path) -> int | None:

@@ -16,8 +16,8 @@ from ssplat_jax.data.readers.frame_list import (
     EXTENSIONS,
     SHRUNK_FOLDERS,
     Intrinsics,
+    list_frames,
     make_frame,
-    order_frames,
     stored_size,
 )
 from ssplat_jax.errors import refusal
@@ -51,7 +51,7 @@ def read(path: Path) -> Listing:
         intrinsics = Intrinsics(fx=focal, fy=focal, cx=width / 2, cy=height / 2)
         name, file = str(image.relative_to(root)), image.resolve()
         frames.append(make_frame(name, file, pose, intrinsics, size, where, pose_deviation=deviation, shrink=shrink))
-    return order_frames(root.name, frames)
+    return list_frames(root.name, frames)
 
 
 def _load_rows(file: Path) -> Float64[np.ndarray, "n 17"]:

@@ -19,8 +19,8 @@ from ssplat_jax.data.readers.frame_list import (
     SHRUNK_FOLDERS,
     Intrinsics,
     file_named,
+    list_frames,
     make_frame,
-    order_frames,
     stored_size,
 )
 from ssplat_jax.data.readers.strict_json import JsonFields, load_json_list
@@ -59,7 +59,7 @@ def read(path: Path) -> Listing:
         frames.append(make_frame(name, image, pose, intrinsics, size, fields.where, shrink=shrink))
     num_left = sum(sizes) - len(frames)
     left = [f"{num_left} images of smaller reconstructions, which are not connected, are skipped."] if num_left else []
-    return order_frames(root.name, frames, left)
+    return list_frames(root.name, frames, left)
 
 
 def _object(value: object, where: str) -> dict[str, Any]:

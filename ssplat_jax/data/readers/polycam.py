@@ -11,7 +11,7 @@ from ssplat_jax.data.images import check_depth_header
 from ssplat_jax.data.pose_conventions import Convention
 from ssplat_jax.data.posed_image import check_camtoworld
 from ssplat_jax.data.readers import Listing
-from ssplat_jax.data.readers.frame_list import Intrinsics, find_file, make_frame, order_frames, stored_size
+from ssplat_jax.data.readers.frame_list import Intrinsics, find_file, list_frames, make_frame, stored_size
 from ssplat_jax.data.readers.strict_json import JsonFields, load_json
 from ssplat_jax.errors import refusal
 
@@ -64,7 +64,7 @@ def read(path: Path) -> Listing:
         raise refusal(str(keyframes), wanted="images with cameras", got=got, fix=fix)
     num_lost = len(images) - len(frames)
     lost = [f"{num_lost} of {len(images)} images are skipped: they have no camera."] if num_lost else []
-    return order_frames(path.resolve().name, frames, lost)
+    return list_frames(path.resolve().name, frames, lost)
 
 
 def _keyframes(path: Path) -> tuple[Path, str] | None:

@@ -13,7 +13,7 @@ from ssplat_jax.data.images import image_size
 from ssplat_jax.data.pose_conventions import Convention
 from ssplat_jax.data.posed_image import check_camtoworld
 from ssplat_jax.data.readers import Listing
-from ssplat_jax.data.readers.frame_list import EXTENSIONS, Intrinsics, find_file, make_frame, order_frames
+from ssplat_jax.data.readers.frame_list import EXTENSIONS, Intrinsics, find_file, list_frames, make_frame
 from ssplat_jax.data.readers.strict_text import load_lines, load_rows
 from ssplat_jax.errors import echo, refusal
 
@@ -67,7 +67,7 @@ def read(path: Path) -> Listing:
         raise refusal(str(file), wanted="images of its frames", got=got, fix=fix)
     num_missing = len(lines) - len(frames)
     missing = [f"{num_missing} of {len(lines)} frames are skipped: their images are missing."] if num_missing else []
-    return order_frames(file.stem, frames, missing)
+    return list_frames(file.stem, frames, missing)
 
 
 def _cameras_file(path: Path) -> Path | None:

@@ -10,7 +10,7 @@ from pathlib import Path
 from ssplat_jax.data.pose_conventions import Convention
 from ssplat_jax.data.posed_image import pose_from_quat
 from ssplat_jax.data.readers import Listing
-from ssplat_jax.data.readers.frame_list import Intrinsics, find_file, make_frame, order_frames, stored_size
+from ssplat_jax.data.readers.frame_list import Intrinsics, find_file, list_frames, make_frame, stored_size
 from ssplat_jax.data.readers.strict_json import JsonFields, load_json
 from ssplat_jax.errors import echo, refusal
 
@@ -53,7 +53,7 @@ def read(path: Path) -> Listing:
         raise refusal(str(path), wanted="images rgb/0.jpg, ...", got=f"none for {len(poses)} poses", fix=FIX)
     num_lost = len(poses) - len(frames)
     lost = [f"{num_lost} of {len(poses)} frames are skipped: their images are missing."] if num_lost else []
-    return order_frames(root.name, frames, lost)
+    return list_frames(root.name, frames, lost)
 
 
 def _metadata(path: Path) -> Path | None:

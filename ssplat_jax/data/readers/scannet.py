@@ -11,7 +11,7 @@ import numpy as np
 from ssplat_jax.data.images import check_depth_header, image_size
 from ssplat_jax.data.posed_image import check_camtoworld
 from ssplat_jax.data.readers import Listing
-from ssplat_jax.data.readers.frame_list import Intrinsics, file_named, find_file, make_frame, order_frames
+from ssplat_jax.data.readers.frame_list import Intrinsics, file_named, find_file, list_frames, make_frame
 from ssplat_jax.data.readers.strict_text import load_rows
 from ssplat_jax.errors import refusal
 
@@ -52,7 +52,7 @@ def read(path: Path) -> Listing:
         got = f"{len(images)} images, none of them with a finite pose"
         raise refusal(str(path), wanted="tracked frames", got=got, fix="export color/ and pose/ again")
     lost = [f"{num_lost} of {len(images)} frames are skipped: tracking was lost."] if num_lost else []
-    return order_frames(root.name, frames, lost)
+    return list_frames(root.name, frames, lost)
 
 
 def _matrix(file: Path) -> np.ndarray:

@@ -17,8 +17,8 @@ from ssplat_jax.data.readers.frame_list import (
     Intrinsics,
     check_once,
     file_named,
+    list_frames,
     make_frame,
-    order_frames,
     stored_size,
 )
 from ssplat_jax.data.readers.strict_json import JsonFields, load_json_list
@@ -60,4 +60,4 @@ def read(path: Path) -> Listing:
         )
     if not frames:
         raise refusal(str(file), wanted="cameras", got="an empty list", fix="write the file again")
-    return order_frames(root.name, frames)
+    return list_frames(root.name, frames)

@@ -7,7 +7,7 @@ stored image, or camera_angle_x in radians. Defaults are fl_y = fl_x, the center
 image file. Distortion (k1 to k4, p1, p2) follows the Brown-Conrady model, or with `camera_model` OPENCV_FISHEYE or
 `is_fisheye` the fish-eye model (k1 to k4), and is removed when images are delivered.
 DL3DV keeps the file and its images in a folder `nerfstudio`, which is opened with the folder around it.
-Frames are streamed in the natural order of `file_path`, with the exception in `frame_list.order_frames`.
+Frames are streamed in the natural order of `file_path`, with the exception in `frame_list.in_stream_order`.
 """
 
 import dataclasses
@@ -26,8 +26,8 @@ from ssplat_jax.data.readers.frame_list import (
     Intrinsics,
     file_named,
     in_images,
+    list_frames,
     make_frame,
-    order_frames,
     stored_size,
 )
 from ssplat_jax.data.readers.strict_json import load_json
@@ -99,7 +99,7 @@ def _read(path: Path, problems: list[str] | None) -> Listing:
             got = f"{echo(frame.name)} in both {first.split(': ')[-1]} and frames[{i}]"
             raise refusal(f"{where}.file_path", wanted="every image once", got=got, fix="drop one of the two frames")
         frames.append(frame)
-    return order_frames(root.name, frames)
+    return list_frames(root.name, frames)
 
 
 def _read_frame(root: Path, meta: dict[str, Any], entry: dict[str, Any], where: str) -> Frame:

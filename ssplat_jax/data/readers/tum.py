@@ -21,7 +21,7 @@ from ssplat_jax.data.images import check_depth_header, image_size
 from ssplat_jax.data.lens import Lens
 from ssplat_jax.data.posed_image import pose_from_quat
 from ssplat_jax.data.readers import Listing
-from ssplat_jax.data.readers.frame_list import Intrinsics, file_named, make_frame, order_frames
+from ssplat_jax.data.readers.frame_list import Intrinsics, file_named, list_frames, make_frame
 from ssplat_jax.data.readers.strict_text import load_lines, load_rows, parse_numbers
 from ssplat_jax.errors import echo, refusal
 
@@ -69,7 +69,7 @@ def read(path: Path) -> Listing:
     num_lost = len(images) - len(frames)
     lost = [f"{num_lost} of {len(images)} frames are skipped: there is no pose at their time."] if num_lost else []
     again = [f"{num_again} lines of rgb.txt list an image again; its first time counts."] if num_again else []
-    return order_frames(root.name, frames, [*lost, *again], is_in_time=True)
+    return list_frames(root.name, frames, [*lost, *again], is_in_time=True)
 
 
 def _each_once(files: list[tuple[float, Path]]) -> tuple[list[tuple[float, Path]], int]:
