@@ -25,10 +25,18 @@ def start_of(config: StreamConfig, provenance: dict) -> dict:
 
     Args:
         config: configuration of the model.
-        provenance: of a weights file that `ssplat train` wrote; without the recipe's seed, seed 0 is taken.
+        provenance: of a weights file that `ssplat train` wrote; without a seed, seed 0 is taken.
     """
-    seed = provenance.get("recipe", {}).get("seed", 0)
+    recipe = first_provenance(provenance).get("recipe")
+    seed = recipe.get("seed", 0) if isinstance(recipe, dict) else 0
     return init_params(jax.random.key(seed), config)
+
+
+def first_provenance(provenance: dict) -> dict:
+    """The provenance of the first training, or of the import, from which later trainings went on."""
+    while isinstance(before := provenance.get("before"), dict):
+        provenance = before
+    return provenance
 
 
 def stage_changes(params: dict, start: dict) -> list[StageChange]:

@@ -50,6 +50,9 @@ class Experiment:
             if (backend := jax.default_backend()) != "gpu":
                 raise InputError(f"--scale gpu: wanted a GPU, JAX found {backend}; use --scale cpu.")
         run = found[self.name].load()
+        # For `score` it is a capture, which may be procedural.
+        if self.captures is not None and self.name != "score" and not self.captures.is_dir():
+            raise InputError(f"--captures: wanted a folder of captures, got {self.captures}, which is none; check it.")
         more = {}
         if self.renders is not None:
             if "renders" not in inspect.signature(run).parameters:

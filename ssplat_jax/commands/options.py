@@ -76,9 +76,10 @@ def apply_changes(config: StreamConfig, changes: tuple[str, ...]) -> StreamConfi
     """`config` with changes given as "field=value"; a value is JSON, or else plain text.
 
     Raises:
-        InputError: no such field, or a value that the field does not take.
+        InputError: no such field, a value that the field does not take, or two values of one field, as by `voxel_size`
+            and `memory.voxel_size`, or by --set and an option such as --causal.
     """
-    parsed = {}
+    parsed, given = {}, {}
     for change in changes:
         name, equals, text = change.partition("=")
         if not equals:
@@ -94,6 +95,10 @@ def apply_changes(config: StreamConfig, changes: tuple[str, ...]) -> StreamConfi
             value = float(value) if isinstance(held, float) and type(value) is int else value
             if held is not None and type(value) is not type(held):
                 raise InputError(f"--set {name}: wanted a value like {held!r}, got {text!r}.")
+        place = name if name in ("preset", *config.groups()) else ".".join(config.find(name))
+        before, first = given.setdefault(place, (value, change))
+        if before != value:
+            raise InputError(f"--set: wanted one value of {place}, got {first} and {change}; drop one of the two.")
         parsed[name] = value
     return config.replace(**parsed)
 
@@ -120,12 +125,13 @@ def online_changes(changes: tuple[str, ...], steps: int) -> tuple[str, ...]:
     return (*changes, f"refine.steps_per_chunk={steps}") if steps else changes
 
 
-def load_model(weights: str, changes: tuple[str, ...]):
+def load_model(weights: str, changes: tuple[str, ...], defaults: tuple[str, ...] = ()):
     """(model, params) of a preset's shipped weights, or of a weights file.
 
     Args:
         weights: name of a preset, or path of a weights file.
         changes: changes to the configuration, as "field=value".
+        defaults: changes that `changes` may replace.
 
     Raises:
         InputError: no such weights, a bad change, or a change that does not fit the weights.
@@ -140,7 +146,7 @@ def load_model(weights: str, changes: tuple[str, ...]):
         params, config = load_weights(Path(weights))
     else:
         params, config = load_params(weights), preset("tiny")
-    changed = apply_changes(config, changes)
+    changed = apply_changes(apply_changes(config, defaults), changes)
     if changed != config:
         check_params(params, changed, weights)
     return StreamSplat(changed), params

@@ -168,15 +168,15 @@ class Run:
         from ssplat_jax.runs.time_budget import setting_for_run
 
         reporter, size, scale = Reporter(self.quiet), parse_size(self.size), QUALITIES[self.quality].scale
-        changes: tuple[str, ...] = ()
+        of_budget: tuple[str, ...] = ()
         on_accept = None
         if self.budget_ms is not None:
             path = capture_path(self.capture, self.axes, self.poses)
             choice = setting_for_run(self.budget_ms, path, size, self.out, overwrite=self.overwrite, reporter=reporter)
             scale, on_accept = choice.point.factor, choice.save
-            changes = tuple(f"{name}={json.dumps(value)}" for name, value in choice.point.changes.items())
-        changes = online_changes((*changes, *self.set), self.online_refine)
-        model, params = load_model(self.weights, causal_changes(changes, self.causal))
+            of_budget = tuple(f"{name}={json.dumps(value)}" for name, value in choice.point.changes.items())
+        changes = causal_changes(online_changes(self.set, self.online_refine), self.causal)
+        model, params = load_model(self.weights, changes, of_budget)
         return run_capture(
             model,
             params,

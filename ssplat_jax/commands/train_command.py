@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from ssplat_jax.commands.options import ConfigChanges, LpipsHeads, QuietOption, apply_changes, load_lpips_weights
-from ssplat_jax.config import preset
+from ssplat_jax.config import StreamConfig, preset
 from ssplat_jax.errors import InputError, require_positive, require_seed
 
 if TYPE_CHECKING:
@@ -25,8 +25,8 @@ class Train:
 
     out: Path
     """Folder of the log, the checkpoints and, at the end, weights.npz (refiner.npz)."""
-    preset: str = "tiny"
-    """Preset of the configuration."""
+    preset: str | None = None
+    """Preset of the configuration. Default: the configuration of --init-weights; without that, tiny."""
     recipe: Literal["tiny", "depth", "stream", "evidence", "refiner", "paper"] = "tiny"
     """tiny: trains depth from scratch. depth: continues that in batches of larger images, for a GPU. evidence: trains
     the evidence head of --init-weights on whole streams, in one go. refiner: trains the learned pass of refinement on
@@ -40,7 +40,8 @@ class Train:
     """Start from a weights file instead of from random parameters. Stages that --set adds, such as cgfi=true and
     mixer_blocks=2 to tiny's, start at random."""
     captures: tuple[Path, ...] = ()
-    """Captures to learn from too, or folders of captures as ssplat worlds writes. Every 8th frame is held out."""
+    """Captures to learn from too, or folders of captures as ssplat worlds writes. Every 8th frame is held out;
+    evidence and refiner, which log no scores, hold none out."""
     shares: tuple[float, ...] = ()
     """Share of the steps of each of --captures; the rest is procedural. Default: half of the steps, equally."""
     validate_every: int = 200
@@ -56,7 +57,7 @@ class Train:
     def run(self) -> int:
         import jax
 
-        from ssplat_jax.checkpoint.weights import check_params, load_weights, params_digest, save_weights
+        from ssplat_jax.checkpoint.weights import check_params, describe_weights, params_digest, save_weights
         from ssplat_jax.console import Reporter
         from ssplat_jax.model import complete_params
         from ssplat_jax.train.loop import train
@@ -68,11 +69,10 @@ class Train:
             return self._run_evidence()
         if self.recipe == "refiner":
             return self._run_refiner()
-        config = apply_changes(preset(self.preset), self.set)
-        recipe = dataclasses.replace(RECIPES[self.recipe].scaled(self.scale_steps), seed=self.seed)
         reporter, params, name = Reporter(self.quiet), None, None
-        if self.init_weights:
-            given = load_weights(self.init_weights)[0]
+        config, given = self._start(reporter)
+        recipe = dataclasses.replace(RECIPES[self.recipe].scaled(self.scale_steps), seed=self.seed)
+        if given is not None:
             name = params_digest(given)  # not of the stages that are added, whose last bits depend on the device
             params = complete_params(jax.random.key(self.seed), config, given)
             check_params(params, config, str(self.init_weights))
@@ -111,22 +111,23 @@ class Train:
             "captures": {group.name: group.share for group in mix.groups} if mix else {},
             "rendering_loss": "MSE + 0.05 LPIPS" if lpips_weights else "MSE + image gradients",
         }
+        if self.init_weights:
+            provenance["before"] = describe_weights(str(self.init_weights)).provenance
         save_weights(self.out / "weights.npz", result.state.ema, config, provenance)
         return self._end(result.step, reporter)
 
     def _run_evidence(self) -> int:
         """Trains the evidence head on whole streams. It takes minutes, so it starts anew after an interrupt."""
-        from ssplat_jax.checkpoint.weights import check_params, describe_weights, load_weights, save_weights
+        from ssplat_jax.checkpoint.weights import check_params, describe_weights, save_weights
         from ssplat_jax.console import Reporter
         from ssplat_jax.train.evidence_training import EvidenceRecipe, train_evidence
 
-        init_weights = self._needed_weights("whose evidence head it trains")
-        config = apply_changes(preset(self.preset), self.set)
-        params = load_weights(init_weights)[0]
+        init_weights, reporter = self._needed_weights("whose evidence head it trains"), Reporter(self.quiet)
+        config, params = self._start(reporter)
+        assert params is not None
         check_params(params, config.replace(evidence=False), str(init_weights))  # the head starts anew
         recipe = EvidenceRecipe(seed=self.seed)
         recipe = dataclasses.replace(recipe, steps=max(1, round(recipe.steps * self.scale_steps)))
-        reporter = Reporter(self.quiet)
         trained, facts = self._trained(train_evidence, config, params, recipe, recipe.steps, reporter)
         start = {"init_weights": init_weights.name, "before": describe_weights(str(init_weights)).provenance}
         provenance = {"recipe": dataclasses.asdict(recipe), "steps": recipe.steps, **start, **facts}
@@ -135,23 +136,42 @@ class Train:
 
     def _run_refiner(self) -> int:
         """Trains the network of the learned pass. It takes minutes, so it starts anew after an interrupt."""
-        from ssplat_jax.checkpoint.weights import check_params, load_weights
+        from ssplat_jax.checkpoint.weights import check_params
         from ssplat_jax.console import Reporter
         from ssplat_jax.refinement.refiner_weights import save_refiner
         from ssplat_jax.train.refiner_training import RefinerRecipe, train_refiner
 
-        init_weights = self._needed_weights("whose streams it refines")
-        config = apply_changes(preset(self.preset), self.set)
-        params = load_weights(init_weights)[0]
+        init_weights, reporter = self._needed_weights("whose streams it refines"), Reporter(self.quiet)
+        config, params = self._start(reporter)
+        assert params is not None
         check_params(params, config, str(init_weights))
         recipe = RefinerRecipe(seed=self.seed)
         recipe = dataclasses.replace(recipe, steps=max(1, round(recipe.steps * self.scale_steps)))
-        num_steps, reporter = recipe.rounds * recipe.steps, Reporter(self.quiet)
+        num_steps = recipe.rounds * recipe.steps
         trained, facts = self._trained(train_refiner, config, params, recipe, num_steps, reporter)
         provenance = {"recipe": dataclasses.asdict(recipe), "init_weights": init_weights.name, **facts}
         save_refiner(self.out / "refiner.npz", trained, provenance)
         print(f"wrote {self.out}/refiner.npz after {num_steps} steps")
         return 0
+
+    def _start(self, reporter: "Reporter") -> tuple[StreamConfig, dict | None]:
+        """The configuration, and the parameters of --init-weights; says what of these the configuration replaces."""
+        import jax
+
+        from ssplat_jax.checkpoint.weights import load_weights
+        from ssplat_jax.model import init_params
+
+        if self.init_weights is None:
+            return apply_changes(preset(self.preset or "tiny"), self.set), None
+        given, held = load_weights(self.init_weights)
+        config = apply_changes(preset(self.preset) if self.preset else held, self.set)
+        if self.preset and (differing := _differing_fields(held, preset(self.preset))):
+            named = ", ".join(differing)
+            reporter.say(f"--preset {self.preset} replaces the configuration of {self.init_weights}: {named}")
+        wanted = jax.eval_shape(lambda: init_params(jax.random.key(0), config))
+        if dropped := [name for name, stage in given.items() if stage and not wanted.get(name)]:
+            reporter.warn(f"{self.init_weights}: {', '.join(dropped)} dropped, which the configuration leaves out")
+        return config, {name: stage for name, stage in given.items() if name not in dropped}
 
     def _trained(self, train, config, params: dict, recipe, num_steps: int, reporter: "Reporter") -> tuple[dict, dict]:
         """Parameters and facts of `train`, a training on whole streams, with the folder locked and steps shown."""
@@ -208,6 +228,14 @@ class Train:
         if self.validate_every != Train.validate_every and not recipe.renders:
             raise InputError(f"--validate-every: --recipe {self.recipe} renders nothing to score; leave it out.")
         return dataclasses.replace(recipe, fit_gains=True), open_mix(self.captures, self.shares, config, recipe)
+
+
+def _differing_fields(held: StreamConfig, config: StreamConfig) -> list[str]:
+    """Fields with another value in `config` than in `held`, with the value held; of another network, its kind alone."""
+    if held.network.kind != config.network.kind:
+        return [f"network={held.network.kind}"]
+    names = [f"{group}.{field.name}" for group in held.groups() for field in dataclasses.fields(getattr(held, group))]
+    return [f"{name}={held.get(name)}" for name in names if held.get(name) != config.get(name)]
 
 
 def _describe_record(record: dict) -> str:

@@ -95,7 +95,7 @@ def effects_by_name(
             scene.
 
     Returns:
-        The effects; reasons come with `auto` alone.
+        The effects; reasons come with `auto`, and with `poses` if they stay.
 
     Raises:
         InputError: a name is unknown, or `auto` comes with others.
@@ -109,6 +109,8 @@ def effects_by_name(
     if not poses_stay:
         return choice
     reasons = tuple(reason for reason in choice.reasons if not reason.startswith("poses"))
+    if "poses" in names:
+        reasons += ("poses stay: they were adjusted before the stream",)
     return EffectsChoice(dataclasses.replace(choice.effects, poses=False), reasons)
 
 

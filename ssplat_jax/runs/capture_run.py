@@ -101,6 +101,8 @@ def run_capture(
         run = resume_run(model, params, capture, identity, folder, reporter)
         if on_accept is not None:
             on_accept()
+        if run.num_views == 0:
+            folder.metrics.unlink(missing_ok=True)  # of another run, whose scene must not pass for this one's
         reporter.warn_all(*capture.notes, run.frame.warning)
         writer = start_deltas(run, len(indices), folder, deltas)
         if run.num_views == len(indices) and (num_written := finished_scene(folder, len(indices))) is not None:

@@ -2,6 +2,8 @@
 
 import dataclasses
 import functools
+import json
+import math
 import time
 import warnings
 from collections.abc import Callable
@@ -16,6 +18,7 @@ from ssplat_jax.checkpoint.weights import params_digest
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.cores import num_cores
 from ssplat_jax.metrics.lpips import LpipsWeights
+from ssplat_jax.storage.atomic import write_atomic
 from ssplat_jax.storage.folder_lock import lock_folder
 from ssplat_jax.storage.interrupts import Interrupts
 from ssplat_jax.storage.json_files import json_text
@@ -91,7 +94,7 @@ def train(
             state, start = init_state(model, recipe, params), 0
             if (restored := checkpoints.restore_latest(state, warn)) is not None:
                 start, state = restored
-            log = _Log(out / LOG_FILE, recipe, report)
+            log = _Log(out / LOG_FILE, recipe, report, start)
             every = _Every(save_every, log_every, validate_every)
             return _run(model, recipe, state, start, mix, lpips_weights, checkpoints, log, every)
         finally:
@@ -184,10 +187,20 @@ def _run(model, recipe, state, start, mix, lpips_weights, checkpoints, log, ever
 
 
 class _Log:
-    """Metrics since the last record, and the file that records are appended to."""
+    """Metrics since the last record, and the file that records are appended to.
 
-    def __init__(self, path: Path, recipe: Recipe, report: Callable[[dict], None]) -> None:
+    Args:
+        path: the file. Records of steps after `start`, which will be taken again, are removed.
+        recipe: the recipe.
+        report: called with every record.
+        start: steps that are done.
+    """
+
+    def __init__(self, path: Path, recipe: Recipe, report: Callable[[dict], None], start: int) -> None:
         self._path, self._recipe, self._report = path, recipe, report
+        if path.exists():
+            kept = [line for line in path.read_text().splitlines() if _step_of(line) <= start]
+            write_atomic(path, "".join(f"{line}\n" for line in kept).encode())
         self._start()
 
     def _start(self) -> None:
@@ -228,3 +241,11 @@ class _Log:
         with self._path.open("a") as file:
             file.write(json_text(record, indent=None) + "\n")
         self._report(record)
+
+
+def _step_of(line: str) -> float:
+    """The step of a record; infinity for a line that a kill cut short."""
+    try:
+        return float(json.loads(line)["step"])
+    except (ValueError, KeyError, TypeError):
+        return math.inf

@@ -20,7 +20,7 @@ class PhaseForm:
     decode: Literal["all_tokens", "tokens", "cache"] = "tokens"
     """Scene that is rendered: the tokens of all chunks, through which gradients flow (`all_tokens`, the paper); those
     that the cache would accept (`tokens`); or the decoded cache, as in inference. The cache holds constants, so `cache`
-    trains the Gaussian head alone."""
+    trains the Gaussian head and the evidence head alone."""
 
 
 DEFAULT_FORM = PhaseForm()
@@ -175,7 +175,7 @@ MATCHER_STAGES = ("encoder", "cost_volume", "upsampler")
 """Stages that end in the depth map. A network without an upsampler ignores that name."""
 
 ALL_BUT_HEAD = (*MATCHER_STAGES, "hpda", "tokens", "cgfi", "mixer")
-"""Stages that get no gradient when the cache is rendered."""
+"""Stages that get no gradient when the cache is rendered; decoder and evidence head do."""
 
 TINY = Recipe(
     phases=(

@@ -25,10 +25,10 @@ from ssplat_jax.pytree import replace
 from ssplat_jax.rasterizer import fill_holes, render
 from ssplat_jax.refinement.learned_pass import SeenErrors, add_view, learned_change, no_errors
 from ssplat_jax.refinement.present_rows import only_present, present_rows
-from ssplat_jax.refinement.refine_config import FOR_CAPTURES, RefineConfig
+from ssplat_jax.refinement.refine_config import FOR_CAPTURES
 from ssplat_jax.refinement.refine_step import RefineState, init_refinement
 from ssplat_jax.refinement.refiner_weights import init_refiner
-from ssplat_jax.refinement.revision import apply_revision, bounded
+from ssplat_jax.refinement.revision import Revision, apply_revision, bounded
 from ssplat_jax.refinement.view_loss import EFFECTS
 from ssplat_jax.streaming.streamsplat import StreamSplat
 from ssplat_jax.train.streamed_scenes import SceneSources, captures_of, negative_psnr, stream_scene
@@ -183,20 +183,23 @@ def _add_view(max_pairs: int):
 
 
 def _after_pass(refiner: dict, lesson: _Lesson) -> RefineState:
-    """The lesson's state after a pass on what its views say."""
-    return jax.jit(_moved)(refiner, lesson.state, lesson.seen)
+    """The lesson's state after a pass on what its views say.
+
+    The program returns the revision alone: a whole state would be a copy of the scene for every round.
+    """
+    return replace(lesson.state, revision=jax.jit(_moved)(refiner, lesson.state, lesson.seen))
 
 
-def _moved(refiner: dict, state: RefineState, seen: SeenErrors, config: RefineConfig = CONFIG) -> RefineState:
+def _moved(refiner: dict, state: RefineState, seen: SeenErrors) -> Revision:
+    """The revision after a pass."""
     change = learned_change(refiner, apply_revision(state.start, state.revision), seen)
-    return replace(state, revision=bounded(jax.tree.map(jnp.add, state.revision, change), config))
+    return bounded(jax.tree.map(jnp.add, state.revision, change), CONFIG)
 
 
 @functools.lru_cache(maxsize=64)
 def _compiled(max_pairs: int, black_weight: float):
     def loss(refiner: dict, state: RefineState, seen: SeenErrors, key_views: KeyViews, view: Int[Array, ""]):
-        moved = _moved(refiner, state, seen)
-        gaussians: Gaussians = apply_revision(moved.start, moved.revision)
+        gaussians: Gaussians = apply_revision(state.start, _moved(refiner, state, seen))
         out = render(gaussians, key_views.camera(view), effects=EFFECTS, max_pairs=max_pairs)
         target, exposure = key_views.images[view].astype(jnp.float32) / 255, key_views.exposures[view]
         assert out.color is not None and out.alpha is not None

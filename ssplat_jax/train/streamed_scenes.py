@@ -13,7 +13,7 @@ from ssplat_jax.cache import VoxelCache
 from ssplat_jax.cache.key_views import KeyViews
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.open_capture import open_capture
-from ssplat_jax.data.split import choose_split
+from ssplat_jax.data.split import MIN_FRAMES, choose_split
 from ssplat_jax.errors import InputError
 from ssplat_jax.program_memory import make_room
 from ssplat_jax.rasterizer import render
@@ -36,7 +36,7 @@ class SceneSources:
     width: int = 320
     """Width of the streamed images in pixels; their height keeps the capture's shape."""
     strides: tuple[int, ...] = (1, 2)
-    """A capture is streamed once with every frame, once with every second one, and so on."""
+    """A capture is streamed once with every frame, once with every second one, and so on; up to 64 views each."""
     procedural: tuple[str, ...] = (
         "procedural:room?frames=80&seed=3",
         "procedural:corridor?frames=80&seed=1",
@@ -57,7 +57,10 @@ class StreamedScene:
 
 
 def captures_of(paths: Sequence[Path], sources: SceneSources, smallest: tuple[int, int]) -> list[tuple[Capture, int]]:
-    """All scenes to learn from, each with its stride; every capture at the width of `sources`.
+    """All scenes to learn from, each with its stride.
+
+    Every capture has the width of `sources` and the shape of its first image. Strides that leave fewer than
+    `MIN_FRAMES` frames of a capture are left out.
 
     Args:
         paths: captures, or folders of captures.
@@ -68,14 +71,17 @@ def captures_of(paths: Sequence[Path], sources: SceneSources, smallest: tuple[in
         Pairs of capture and stride, the procedural scenes first.
 
     Raises:
-        InputError: an image is smaller than `smallest`, (height, width).
+        InputError: an image is smaller than `smallest`, (height, width), or a capture has too few frames.
     """
     width = sources.width
     opened = [(open_capture(spec, size=(width, width * 3 // 4)), 1) for spec in sources.procedural]
     for path in itertools.chain.from_iterable(map(captures_in, paths)):
-        capture = open_capture(path)
-        height = round(capture.height * width / capture.width)
-        opened += [(open_capture(path, size=(width, height)), stride) for stride in sources.strides]
+        shape = open_capture(path, size=(width, width)).frames[0]
+        capture = open_capture(path, size=(width, round(shape.height * width / shape.width)))
+        if len(capture) < MIN_FRAMES * sources.strides[0]:
+            wanted = f"at least {MIN_FRAMES * sources.strides[0]} frames"
+            raise InputError(f"train: {capture.name}: wanted {wanted}, got {len(capture)}; leave it out.")
+        opened += [(capture, stride) for stride in sources.strides if len(capture) >= MIN_FRAMES * stride]
     for capture, _ in opened:
         if capture.height < smallest[0] or capture.width < smallest[1]:
             wanted = "x".join(map(str, reversed(smallest)))

@@ -26,7 +26,7 @@ from ssplat_jax.checkpoint.stream_state import load_state
 from ssplat_jax.checkpoint.weights import load_params, load_weights, save_weights
 from ssplat_jax.commands import train_command
 from ssplat_jax.commands.main import COMMANDS, guarded, main
-from ssplat_jax.commands.options import apply_changes
+from ssplat_jax.commands.options import apply_changes, causal_changes, load_model
 from ssplat_jax.commands.start import start
 from ssplat_jax.config import StreamConfig, preset
 from ssplat_jax.data import capture_summary
@@ -299,6 +299,28 @@ def test_set_takes_what_the_field_holds(change, field, value):
     changed = apply_changes(preset("tiny"), (change,))
     assert changed.get(field) == value and type(changed.get(field)) is type(value)
     hash(changed)
+
+
+def test_two_values_of_one_field_are_refused():
+    for twice in (("voxel_size=0.02", "memory.voxel_size=0.05"), ("voxel_size=0.02", "voxel_size=0.03")):
+        with pytest.raises(InputError, match=r"wanted one value of memory\.voxel_size, got voxel_size=0\.02 and"):
+            apply_changes(preset("tiny"), twice)
+    with pytest.raises(InputError, match=r"one value of stream\.causal"):  # --causal beside --set
+        apply_changes(preset("tiny"), causal_changes(("causal=false",), causal=True))
+    assert apply_changes(preset("tiny"), ("causal=true", "stream.causal=true")).stream.causal
+
+
+def test_set_replaces_what_a_budget_chose():
+    model, _ = load_model("tiny", ("voxel_size=0.02",), ("memory.voxel_size=0.05", "min_confidence=0.4"))
+    assert (model.config.memory.voxel_size, model.config.memory.min_confidence) == (0.02, 0.4)
+
+
+def test_a_folder_of_captures_that_is_none_is_refused(tmp_path, capsys):
+    asked = ["experiment", "refinement", "--captures", str(tmp_path / "typo"), "--out", str(tmp_path / "out")]
+    with pytest.raises(SystemExit) as stop:
+        main(asked)
+    assert stop.value.code == 2 and not (tmp_path / "out").exists()
+    assert "--captures: wanted a folder of captures" in capsys.readouterr().err
 
 
 def test_set_takes_null_where_a_field_may_be_empty():

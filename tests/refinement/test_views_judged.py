@@ -232,7 +232,8 @@ def test_adjusted_poses_stay_whoever_asks(names, monkeypatch):
     monkeypatch.setattr(module, "refine_effects_for", lambda *given: both)
     choice = effects_by_name(names, doubtful(), views(), poses_stay=True)
     assert choice.effects == RefineEffects(focal=True)
-    assert not any(reason.startswith("poses") for reason in choice.reasons)
+    said = [reason for reason in choice.reasons if reason.startswith("poses")]
+    assert said == (["poses stay: they were adjusted before the stream"] if "poses" in names else [])
     assert effects_by_name(names, doubtful(), views()).effects.poses
 
 

@@ -124,11 +124,20 @@ def test_a_configuration_without_evidence_is_refused():
 
 def test_a_folder_of_captures_is_those_in_it(tmp_path):
     for name in ("a", "b"):
-        make_capture(tmp_path / name, num_frames=2, size=(64, 48))
+        make_capture(tmp_path / name, num_frames=12, size=(64, 48))
     (tmp_path / "notes").mkdir()
     sources = SceneSources(width=64, strides=(1, 2), procedural=())
     found = captures_of([tmp_path], sources, (16, 16))
     assert [(capture.name, stride) for capture, stride in found] == [("a", 1), ("a", 2), ("b", 1), ("b", 2)]
+
+
+def test_strides_for_which_a_capture_is_too_short_are_left_out(tmp_path):
+    make_capture(tmp_path / "short", num_frames=11, size=(64, 48))
+    sources = SceneSources(width=64, strides=(1, 2), procedural=())
+    assert [stride for _, stride in captures_of([tmp_path / "short"], sources, (16, 16))] == [1]
+    make_capture(tmp_path / "shorter", num_frames=5, size=(64, 48))
+    with pytest.raises(InputError, match="train: shorter: wanted at least 6 frames, got 5; leave it out"):
+        captures_of([tmp_path / "shorter"], sources, (16, 16))
 
 
 def test_images_smaller_than_a_crop_are_refused():

@@ -6,6 +6,7 @@ import json
 import time
 from importlib import resources
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -13,8 +14,9 @@ import numpy as np
 import pytest
 
 from ssplat_jax.cache import Tokens
+from ssplat_jax.checkpoint.stage_changes import stage_changes, start_of
 from ssplat_jax.checkpoint.training_state import TrainingCheckpoints
-from ssplat_jax.checkpoint.weights import load_params, params_digest
+from ssplat_jax.checkpoint.weights import describe_weights, load_params, params_digest, save_weights
 from ssplat_jax.commands.train_command import Train
 from ssplat_jax.config import preset
 from ssplat_jax.data.depth_range import FAR_FACTOR
@@ -502,13 +504,23 @@ def test_interrupted_run_ends_as_an_uninterrupted_one(tmp_path):
     for a, b in zip(flat(parts.state), flat(whole.state), strict=True):
         np.testing.assert_array_equal(a, b)
     records = [json.loads(line) for line in (tmp_path / "parts" / "log.jsonl").read_text().splitlines()]
-    assert records[-1]["step"] == RECIPE.num_steps and records[-1]["skipped"] == 0
+    assert [record["step"] for record in records] == list(range(1, RECIPE.num_steps + 1))
+    assert records[-1]["skipped"] == 0
 
     with pytest.raises(InputError, match="another --out"):
         loop.train(NARROW, dataclasses.replace(RECIPE, seed=1), tmp_path / "whole")
 
 
-def test_the_command_starts_stages_that_the_weights_lack_at_random(tmp_path, monkeypatch, capsys):
+def test_records_of_steps_that_are_taken_again_are_removed(tmp_path):
+    log = tmp_path / "log.jsonl"
+    log.write_text('{"step": 10}\n{"step": 20, "psnr": 1}\n{"step": 20}\n{"step": 30}\n{"ste')
+    loop._Log(log, RECIPE, lambda record: None, start=20)
+    assert log.read_text() == '{"step": 10}\n{"step": 20, "psnr": 1}\n{"step": 20}\n'
+
+
+@pytest.fixture
+def started(monkeypatch):
+    """What the command gives to a training, which stops at once."""
     seen = {}
 
     def stopped_at_once(config, recipe, out, *, params, **others):
@@ -516,9 +528,44 @@ def test_the_command_starts_stages_that_the_weights_lack_at_random(tmp_path, mon
         raise KeyboardInterrupt
 
     monkeypatch.setattr(loop, "train", stopped_at_once)
+    return seen
+
+
+def test_the_command_goes_on_with_the_configuration_of_the_weights(tmp_path, started, capsys):
+    """Unless --preset asks for another one; what is lost by that is said."""
+    held = preset("tiny").replace(cgfi=True, voxel_size=0.02)
+    save_weights(tmp_path / "w.npz", init_params(jax.random.key(0), held), held, {"steps": 7})
+    asked = {"out": tmp_path / "out", "recipe": "stream", "init_weights": tmp_path / "w.npz"}
+    with pytest.raises(KeyboardInterrupt):
+        Train(**asked, set=("min_confidence=0.25",)).run()
+    assert started["config"] == held.replace(min_confidence=0.25) and started["params"]["cgfi"]
+    assert "dropped" not in capsys.readouterr().err
+    with pytest.raises(KeyboardInterrupt):
+        Train(**asked, preset="tiny").run()
+    said = capsys.readouterr().err
+    assert "cgfi dropped" in said and "memory.voxel_size=0.02" in said and "cgfi" not in started["params"]
+
+
+def test_a_training_keeps_the_history_of_the_weights_that_it_started_from(tmp_path, monkeypatch):
+    save_weights(tmp_path / "w.npz", init_params(jax.random.key(5), NARROW), NARROW, {"recipe": {"seed": 5}})
+
+    def done(config, recipe, out, *, params, **others):
+        out.mkdir()
+        return SimpleNamespace(state=SimpleNamespace(ema=params), step=1, interrupted=None)
+
+    monkeypatch.setattr(loop, "train", done)
+    asked = {"recipe": "stream", "init_weights": tmp_path / "w.npz", "seed": 6, "quiet": True}
+    assert Train(out=tmp_path / "out", **asked).run() == 0
+    facts = describe_weights(str(tmp_path / "out" / "weights.npz"))
+    assert facts.provenance["before"] == {"recipe": {"seed": 5}}
+    start = start_of(facts.config, facts.provenance)  # of seed 5: nothing has moved since
+    assert max(c.distance for c in stage_changes(load_params(str(tmp_path / "w.npz")), start)) < 1e-3
+
+
+def test_the_command_starts_stages_that_the_weights_lack_at_random(tmp_path, started, capsys):
     with pytest.raises(KeyboardInterrupt):
         Train(out=tmp_path, recipe="stream", init_weights=SHIPPED, seed=3, set=("cgfi=true",)).run()
     assert "tiny.npz has no cgfi: random at the start" in capsys.readouterr().err  # the mixer has no blocks here
-    untrained, shipped = init_params(jax.random.key(3), seen["config"]), load_params("tiny")
-    for name, stage in seen["params"].items():
+    untrained, shipped = init_params(jax.random.key(3), started["config"]), load_params("tiny")
+    for name, stage in started["params"].items():
         jax.tree.map(np.testing.assert_array_equal, stage, (untrained if name == "cgfi" else shipped)[name])
