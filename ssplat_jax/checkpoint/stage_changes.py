@@ -21,22 +21,32 @@ class StageChange:
 
 
 def start_of(config: StreamConfig, provenance: dict) -> dict:
-    """The random parameters that a training began with.
+    """The random parameters that stages began with: those of the first training, or of the one that added a stage.
 
     Args:
         config: configuration of the model.
         provenance: of a weights file that `ssplat train` wrote; without a seed, seed 0 is taken.
     """
-    recipe = first_provenance(provenance).get("recipe")
-    seed = recipe.get("seed", 0) if isinstance(recipe, dict) else 0
-    return init_params(jax.random.key(seed), config)
+    first, *later = trainings(provenance)
+    start = init_params(jax.random.key(_seed_of(first)), config)
+    for training in later:
+        if added := [name for name in training.get("fresh", ()) if name in start]:
+            start |= init_params(jax.random.key(_seed_of(training)), config, only=added)
+    return start
 
 
-def first_provenance(provenance: dict) -> dict:
-    """The provenance of the first training, or of the import, from which later trainings went on."""
-    while isinstance(before := provenance.get("before"), dict):
-        provenance = before
-    return provenance
+def trainings(provenance: dict) -> list[dict]:
+    """The provenance of each training, or import, that led to weights, the first one first."""
+    found = [provenance]
+    while isinstance(before := found[0].get("before"), dict):
+        found.insert(0, before)
+    return found
+
+
+def _seed_of(provenance: dict) -> int:
+    """The recipe's seed; 0 if it holds none."""
+    recipe = provenance.get("recipe")
+    return recipe.get("seed", 0) if isinstance(recipe, dict) else 0
 
 
 def stage_changes(params: dict, start: dict) -> list[StageChange]:

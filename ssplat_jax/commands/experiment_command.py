@@ -50,14 +50,13 @@ class Experiment:
             if (backend := jax.default_backend()) != "gpu":
                 raise InputError(f"--scale gpu: wanted a GPU, JAX found {backend}; use --scale cpu.")
         run = found[self.name].load()
-        # For `score` it is a capture, which may be procedural.
-        if self.captures is not None and self.name != "score" and not self.captures.is_dir():
-            raise InputError(f"--captures: wanted a folder of captures, got {self.captures}, which is none; check it.")
         more = {}
         if self.renders is not None:
             if "renders" not in inspect.signature(run).parameters:
                 raise InputError(f"--renders: only `experiment score` reads a folder of renders, not {self.name}.")
             more = {"renders": self.renders}
+        elif self.captures is not None and not self.captures.is_dir():  # with renders, it is a capture
+            raise InputError(f"--captures: wanted a folder of captures, got {self.captures}, which is none; check it.")
         self.out.mkdir(parents=True, exist_ok=True)
         print(run(self.captures, self.out, self.scale, Reporter(self.quiet), **more))
         return 0

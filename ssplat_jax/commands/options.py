@@ -98,7 +98,10 @@ def apply_changes(config: StreamConfig, changes: tuple[str, ...]) -> StreamConfi
         place = name if name in ("preset", *config.groups()) else ".".join(config.find(name))
         before, first = given.setdefault(place, (value, change))
         if before != value:
-            raise InputError(f"--set: wanted one value of {place}, got {first} and {change}; drop one of the two.")
+            raise InputError(
+                f"--set: wanted one value of {place}, got {first} and {change}: drop one; --causal and"
+                f" --watch set stream.causal, --online-refine sets refine.steps_per_chunk."
+            )
         parsed[name] = value
     return config.replace(**parsed)
 

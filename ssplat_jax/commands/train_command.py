@@ -31,7 +31,7 @@ class Train:
     """tiny: trains depth from scratch. depth: continues that in batches of larger images, for a GPU. evidence: trains
     the evidence head of --init-weights on whole streams, in one go. refiner: trains the learned pass of refinement on
     whole streams of --init-weights, in one go. stream: trains the stages after depth. paper: the paper's loss and
-    steps, for --preset paper or small and a GPU."""
+    steps, for imported weights or --preset paper, and a GPU."""
     scale_steps: float = 1.0
     """Factor of the number of steps of every phase."""
     seed: int = 0
@@ -57,7 +57,7 @@ class Train:
     def run(self) -> int:
         import jax
 
-        from ssplat_jax.checkpoint.weights import check_params, describe_weights, params_digest, save_weights
+        from ssplat_jax.checkpoint.weights import check_params, params_digest, save_weights
         from ssplat_jax.console import Reporter
         from ssplat_jax.model import complete_params
         from ssplat_jax.train.loop import train
@@ -69,14 +69,14 @@ class Train:
             return self._run_evidence()
         if self.recipe == "refiner":
             return self._run_refiner()
-        reporter, params, name = Reporter(self.quiet), None, None
-        config, given = self._start(reporter)
+        reporter, params, name, fresh = Reporter(self.quiet), None, None, []
+        config, given, before = self._start(reporter)
         recipe = dataclasses.replace(RECIPES[self.recipe].scaled(self.scale_steps), seed=self.seed)
         if given is not None:
             name = params_digest(given)  # not of the stages that are added, whose last bits depend on the device
             params = complete_params(jax.random.key(self.seed), config, given)
             check_params(params, config, str(self.init_weights))
-            if fresh := [name for name, stage in params.items() if stage and not given.get(name)]:
+            if fresh := [stage for stage in params if params[stage] and not given.get(stage)]:
                 reporter.say(f"{self.init_weights} has no {', '.join(fresh)}: random at the start")
         recipe, mix = self._opened(config, recipe)
         lpips_weights = load_lpips_weights(self.lpips_vgg, self.lpips_heads)
@@ -112,24 +112,26 @@ class Train:
             "rendering_loss": "MSE + 0.05 LPIPS" if lpips_weights else "MSE + image gradients",
         }
         if self.init_weights:
-            provenance["before"] = describe_weights(str(self.init_weights)).provenance
+            provenance |= {"fresh": fresh, "before": before}
         save_weights(self.out / "weights.npz", result.state.ema, config, provenance)
         return self._end(result.step, reporter)
 
     def _run_evidence(self) -> int:
         """Trains the evidence head on whole streams. It takes minutes, so it starts anew after an interrupt."""
-        from ssplat_jax.checkpoint.weights import check_params, describe_weights, save_weights
+        from ssplat_jax.checkpoint.weights import check_params, save_weights
         from ssplat_jax.console import Reporter
         from ssplat_jax.train.evidence_training import EvidenceRecipe, train_evidence
 
         init_weights, reporter = self._needed_weights("whose evidence head it trains"), Reporter(self.quiet)
-        config, params = self._start(reporter)
-        assert params is not None
+        config, given, before = self._start(reporter)
+        assert given is not None
+        config = config.replace(evidence=True)  # weights of before the head have it off
+        params = _used(given, config)
         check_params(params, config.replace(evidence=False), str(init_weights))  # the head starts anew
         recipe = EvidenceRecipe(seed=self.seed)
         recipe = dataclasses.replace(recipe, steps=max(1, round(recipe.steps * self.scale_steps)))
         trained, facts = self._trained(train_evidence, config, params, recipe, recipe.steps, reporter)
-        start = {"init_weights": init_weights.name, "before": describe_weights(str(init_weights)).provenance}
+        start = {"init_weights": init_weights.name, "fresh": ["evidence"], "before": before}
         provenance = {"recipe": dataclasses.asdict(recipe), "steps": recipe.steps, **start, **facts}
         save_weights(self.out / "weights.npz", trained, config, provenance)
         return self._end(recipe.steps, reporter)
@@ -142,7 +144,7 @@ class Train:
         from ssplat_jax.train.refiner_training import RefinerRecipe, train_refiner
 
         init_weights, reporter = self._needed_weights("whose streams it refines"), Reporter(self.quiet)
-        config, params = self._start(reporter)
+        config, params, _ = self._start(reporter)
         assert params is not None
         check_params(params, config, str(init_weights))
         recipe = RefinerRecipe(seed=self.seed)
@@ -154,24 +156,19 @@ class Train:
         print(f"wrote {self.out}/refiner.npz after {num_steps} steps")
         return 0
 
-    def _start(self, reporter: "Reporter") -> tuple[StreamConfig, dict | None]:
-        """The configuration, and the parameters of --init-weights; says what of these the configuration replaces."""
-        import jax
-
-        from ssplat_jax.checkpoint.weights import load_weights
-        from ssplat_jax.model import init_params
+    def _start(self, reporter: "Reporter") -> tuple[StreamConfig, dict | None, dict]:
+        """The configuration, and parameters and provenance of --init-weights; says what of these is replaced."""
+        from ssplat_jax.checkpoint.weights import describe_weights, load_weights
 
         if self.init_weights is None:
-            return apply_changes(preset(self.preset or "tiny"), self.set), None
+            return apply_changes(preset(self.preset or "tiny"), self.set), None, {}
         given, held = load_weights(self.init_weights)
         config = apply_changes(preset(self.preset) if self.preset else held, self.set)
-        if self.preset and (differing := _differing_fields(held, preset(self.preset))):
-            named = ", ".join(differing)
-            reporter.say(f"--preset {self.preset} replaces the configuration of {self.init_weights}: {named}")
-        wanted = jax.eval_shape(lambda: init_params(jax.random.key(0), config))
-        if dropped := [name for name, stage in given.items() if stage and not wanted.get(name)]:
-            reporter.warn(f"{self.init_weights}: {', '.join(dropped)} dropped, which the configuration leaves out")
-        return config, {name: stage for name, stage in given.items() if name not in dropped}
+        if self.preset and (changes := _differences(held, config)):
+            reporter.say(f"--preset {self.preset} changes the configuration of {self.init_weights}: {changes}")
+        if unused := [name for name in given if given[name] and name not in _used(given, config)]:
+            reporter.warn(f"{self.init_weights}: leaves out {', '.join(unused)}, which the configuration does not use")
+        return config, given, describe_weights(str(self.init_weights)).provenance
 
     def _trained(self, train, config, params: dict, recipe, num_steps: int, reporter: "Reporter") -> tuple[dict, dict]:
         """Parameters and facts of `train`, a training on whole streams, with the folder locked and steps shown."""
@@ -230,12 +227,23 @@ class Train:
         return dataclasses.replace(recipe, fit_gains=True), open_mix(self.captures, self.shares, config, recipe)
 
 
-def _differing_fields(held: StreamConfig, config: StreamConfig) -> list[str]:
-    """Fields with another value in `config` than in `held`, with the value held; of another network, its kind alone."""
+def _differences(held: StreamConfig, config: StreamConfig) -> str:
+    """The fields whose values differ, with both; of another network, its kind alone."""
     if held.network.kind != config.network.kind:
-        return [f"network={held.network.kind}"]
+        return f"network {held.network.kind} -> {config.network.kind}"
     names = [f"{group}.{field.name}" for group in held.groups() for field in dataclasses.fields(getattr(held, group))]
-    return [f"{name}={held.get(name)}" for name in names if held.get(name) != config.get(name)]
+    pairs = [(name, held.get(name), config.get(name)) for name in names]
+    return ", ".join(f"{name} {before} -> {after}" for name, before, after in pairs if before != after)
+
+
+def _used(params: dict, config: StreamConfig) -> dict:
+    """The stages of `params` that a configuration uses."""
+    import jax
+
+    from ssplat_jax.model import init_params
+
+    wanted = jax.eval_shape(lambda: init_params(jax.random.key(0), config))
+    return {name: stage for name, stage in params.items() if wanted.get(name)}
 
 
 def _describe_record(record: dict) -> str:

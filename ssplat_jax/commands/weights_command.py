@@ -20,7 +20,7 @@ class Weights:
     """Preset with shipped weights, or a weights file."""
 
     def run(self) -> int:
-        from ssplat_jax.checkpoint.stage_changes import first_provenance, stage_changes, start_of
+        from ssplat_jax.checkpoint.stage_changes import stage_changes, start_of, trainings
         from ssplat_jax.checkpoint.weights import describe_weights, load_params
 
         params = load_params(self.name)
@@ -28,7 +28,7 @@ class Weights:
         print(
             f"{self.name}: preset {facts.config.preset!r}, {facts.num_bytes / 1e6:.1f} MB{_training(facts.provenance)}"
         )
-        if "imported_from" in first_provenance(facts.provenance):
+        if "imported_from" in trainings(facts.provenance)[0]:
             print("imported weights have no random start to compare with")
             return 0
         print(f"{'stage':<12}{'parameters':>12}{'distance':>10}{'turn':>8}")

@@ -46,8 +46,8 @@ MIN_SHARE = 0.01
 def looked_at(camtoworlds: Float64[np.ndarray, "n 4 4"], distance: float) -> Float64[np.ndarray, "3"] | None:
     """The point nearest to the optical axes of all cameras, by least squares.
 
-    None if the axes are parallel to about a degree, or if a camera has the point behind it or at its own place, as all
-    cameras that turn about one place have: such cameras look at no common point.
+    None if the axes are parallel to about a degree, if the point lies behind a camera, or if it lies at a camera's own
+    place, as it does if all turn about one place.
 
     Args:
         camtoworlds: the cameras, with OpenCV axes.
@@ -65,8 +65,8 @@ def looked_at(camtoworlds: Float64[np.ndarray, "n 4 4"], distance: float) -> Flo
 def upward(camtoworlds: Float64[np.ndarray, "n 4 4"]) -> Float64[np.ndarray, "3"] | None:
     """The up direction of cameras that are held level: perpendicular to their images' rows, by least squares.
 
-    Rows that point up or down, as those of images do that lie on their side, do not count. Where rows do not tell,
-    because all are parallel, it is the mean of the images' up directions; None if that is 0.
+    Rows of images that lie on their side point up or down, and do not count. Where rows do not tell, because all are
+    parallel, it is the mean of the images' up directions; None if that is 0.
     """
     mean = -camtoworlds[:, :3, 1].mean(axis=0)
     if np.linalg.norm(mean) < 0.1:
@@ -91,7 +91,7 @@ def orbit_path(
     Args:
         camtoworlds: the cameras, with OpenCV axes.
         K: intrinsics of the path, pixels.
-        distance: of the point that a sway looks at from the middle camera, in the units of the poses.
+        distance: of what the cameras see, in the units of the poses; a sway looks at a point so far ahead.
         num_cameras: cameras on the path, the first of which is not repeated.
     """
     middle = camtoworlds[len(camtoworlds) // 2]

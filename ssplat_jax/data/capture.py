@@ -39,7 +39,7 @@ MAX_SIDE = 16384  # pixels of a delivered image
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Capture:
-    """Posed images of one size, in the order of the reader. Poses and intrinsics are float64, with OpenCV axes."""
+    """Posed images of one size, in the order of streaming. Poses and intrinsics are float64, with OpenCV axes."""
 
     name: str
     format: str
@@ -150,13 +150,7 @@ class Capture:
         used = _indices(self, indices)
         if config.stream.causal:
             used = used[: config.stream.chunk_size]
-            # Other frames must not even bound the rounding of poses.
-            alone = dataclasses.replace(
-                self, frames=tuple(self.frames[i] for i in used), pixels=_Some(self.pixels, used)
-            )
-            depths = estimate_depths(alone, range(len(used)))
-        else:
-            depths = estimate_depths(self, used)
+        depths = estimate_depths(self, used)
         scale, near, far = stream_scale(depths, config)
         first = self.frames[used[0]].camtoworld
         return StreamFrame.at_camera(first, scale=scale, near=near, far=far, warning=depths.warning)
@@ -238,23 +232,6 @@ class Capture:
             images[row], Ks[row] = self.image(i), self.K(i)
         viewmats[: len(group)] = frame.viewmats(np.stack([self.frames[i].camtoworld for i in group]))
         return images, viewmats, Ks, np.arange(chunk_size) < len(group)
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class _Some:
-    """The images of some frames, by their place in `indices`."""
-
-    pixels: Pixels
-    indices: Sequence[int]
-
-    def image(self, i: int) -> Float32[np.ndarray, "h w 3"]:
-        return self.pixels.image(self.indices[i])
-
-    def depth(self, i: int) -> Float32[np.ndarray, "h w"] | None:
-        return self.pixels.depth(self.indices[i])
-
-    def has_depth(self, i: int) -> bool:
-        return self.pixels.has_depth(self.indices[i])
 
 
 def capture_of_listing(

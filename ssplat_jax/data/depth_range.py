@@ -125,7 +125,8 @@ def estimate_depths(
 def same_place_distance(capture: PosedImages, indices: Sequence[int]) -> float:
     """Returns the largest distance at which cameras count as being in the same place, since poses are rounded.
 
-    It follows from the median camera of the frames `indices`: a camera that diverged must not make all others one.
+    It follows from the median camera of the frames `indices`: one diverged camera must not make all other
+    places count as one.
     """
     reaches = [float(np.abs(capture.frames[i].center).max()) for i in indices]
     return POSE_ROUNDING * max(1.0, float(np.median(reaches)))

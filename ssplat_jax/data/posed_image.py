@@ -94,7 +94,7 @@ def check_camtoworld(matrix: object, where: str) -> tuple[Float64[np.ndarray, "4
 
 
 def _check_coordinates(translation: Float64[np.ndarray, "3"], where: str) -> None:
-    """Checks that a camera is not absurdly far away, as one is whose reconstruction diverged."""
+    """Refuses a camera that is absurdly far away: its reconstruction diverged."""
     if np.abs(translation).max() > MAX_COORDINATE:
         got = f"{np.abs(translation).max():.2g}"
         fix = "drop the frame or choose a larger unit"

@@ -48,7 +48,7 @@ class AdjustedPoses:
     def reason(self) -> str:
         """A sentence on what was found."""
         if not self.num_points:
-            return "poses stay: too few points were found in several images"
+            return "poses are not adjusted before the stream: too few points were found in several images"
         return (
             f"poses {'are off' if self.are_off else 'fit'}: points lie {self.error_before:.2f} degrees from where they"
             f" were seen, and {self.error_after:.2f} after turning cameras by {self.turn:.2f} degrees and moving them"

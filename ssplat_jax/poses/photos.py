@@ -89,7 +89,7 @@ def copy_photos(photos: list[Path], folder: Path, max_side: int, advance: Callab
 def _exif_of(picture: Image.Image) -> tuple[int, bytes]:
     """Orientation of a photo, and its EXIF data without it, in which structure from motion reads the focal length.
 
-    Malformed data, as some cameras write them, are upright and empty.
+    Malformed data, as some cameras write them, count as none; an orientation that can be read is kept.
     """
     orientation = UPRIGHT
     try:

@@ -29,7 +29,7 @@ def adam_step(
         moments: first and second moment.
         gradient: of the loss by the revision.
         num_steps: steps before this one, those of learned passes included. The moments are zero after passes, but the
-            bias correction counts the steps of passes: under a gradient of constant sign, steps are 0.6 of the rate at
+            bias correction counts the steps of passes: under a constant gradient, steps are 0.6 of the rate at
             first, up to 1.4 of it after 20 steps, and fall towards it.
         rate: factor of all learning rates.
         config: learning rates, decays and bounds.

@@ -12,7 +12,7 @@ from ssplat_jax.errors import refusal, require_positive
 from ssplat_jax.evaluation.scoring import check_scorable
 from ssplat_jax.poses.adjust_poses import check_look_ahead
 from ssplat_jax.runs.chunk_recorder import ChunkRecorder, hold_back
-from ssplat_jax.runs.finish_run import finish_run, finished_scene
+from ssplat_jax.runs.finish_run import finish_run, finished_scene, forget_other_run
 from ssplat_jax.runs.resume import RunState, resume_run, run_identity, save_run
 from ssplat_jax.runs.run_poses import capture_to_stream
 from ssplat_jax.storage.folder_lock import lock_folder
@@ -101,8 +101,7 @@ def run_capture(
         run = resume_run(model, params, capture, identity, folder, reporter)
         if on_accept is not None:
             on_accept()
-        if run.num_views == 0:
-            folder.metrics.unlink(missing_ok=True)  # of another run, whose scene must not pass for this one's
+        forget_other_run(run, folder)
         reporter.warn_all(*capture.notes, run.frame.warning)
         writer = start_deltas(run, len(indices), folder, deltas)
         if run.num_views == len(indices) and (num_written := finished_scene(folder, len(indices))) is not None:

@@ -79,6 +79,12 @@ def finish_run(
     return report
 
 
+def forget_other_run(run: RunState, folder: RunFolder) -> None:
+    """Removes the metrics of another run from the folder of one that begins: its scene must not pass for this one's."""
+    if run.num_views == 0:
+        folder.metrics.unlink(missing_ok=True)
+
+
 def finished_scene(folder: RunFolder, num_views: int) -> int | None:
     """Gaussians in the scene that a finished run of `num_views` views left in `folder`; None if there is no such run.
 

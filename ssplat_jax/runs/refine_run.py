@@ -24,7 +24,7 @@ from ssplat_jax.refinement.refine_capture import key_views_of, revised_exposures
 from ssplat_jax.refinement.refine_config import FOR_CAPTURES
 from ssplat_jax.runs.finish_run import NUM_PICTURES, save_scene
 from ssplat_jax.runs.refinement_state import load_refinement, save_refinement
-from ssplat_jax.runs.run_poses import has_adjusted_poses, with_poses_of_run
+from ssplat_jax.runs.run_poses import has_adjusted_poses, were_poses_asked, with_poses_of_run
 from ssplat_jax.storage.folder_lock import lock_folder
 from ssplat_jax.storage.interrupts import Interrupts
 from ssplat_jax.storage.json_files import write_json
@@ -91,7 +91,7 @@ def refine_run(
             folder.clear_refinement()
         given = key_views_of(run.capture, run.indices, run.frame, run.exposures)
         is_adjusted = has_adjusted_poses(folder)
-        if "poses" in revise and not is_adjusted:
+        if "poses" in revise and not is_adjusted and not were_poses_asked(folder):
             reporter.say("poses: `ssplat run --revise poses` adjusts them before the stream, which gains far more")
         choice = effects_by_name(revise, run.gaussians, given, poses_stay=is_adjusted)
         for reason in choice.reasons:

@@ -101,6 +101,16 @@ def has_adjusted_poses(folder: RunFolder) -> bool:
     return saved is not None and bool(saved.camtoworlds)
 
 
+def were_poses_asked(folder: RunFolder) -> bool:
+    """True if the run in `folder` began with `--revise poses`, even if too few points were found to adjust them by.
+
+    Raises:
+        StorageError: the saved poses are damaged.
+    """
+    saved = _read(folder)
+    return saved is not None and "poses" in saved.asked
+
+
 @dataclasses.dataclass(frozen=True)
 class _SavedPoses:
     capture: str  # digest of the poses as given

@@ -17,7 +17,7 @@ from ssplat_jax.errors import InputError, refusal, require_positive
 from ssplat_jax.evaluation.scoring import check_scorable
 from ssplat_jax.runs.capture_run import DeltaWriter, RunResult, check_num_frames, start_deltas
 from ssplat_jax.runs.chunk_recorder import ChunkRecorder
-from ssplat_jax.runs.finish_run import finish_run, finished_scene
+from ssplat_jax.runs.finish_run import finish_run, finished_scene, forget_other_run
 from ssplat_jax.runs.resume import RunState, resume_run, run_identity, save_run
 from ssplat_jax.runs.run_poses import forget_poses_without_run
 from ssplat_jax.storage.folder_lock import lock_folder
@@ -169,6 +169,7 @@ class _Watch:
         first = self.indices[: self.num_saved() or self.model.config.stream.chunk_size]
         identity = run_identity(self.model, self.params, self.known(), first)
         run = resume_run(self.model, self.params, self.known(), identity, self.folder, self.reporter)
+        forget_other_run(run, self.folder)
         self.reporter.warn_all(*self.known().notes, run.frame.warning)
         return run
 

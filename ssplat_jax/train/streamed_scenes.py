@@ -76,12 +76,14 @@ def captures_of(paths: Sequence[Path], sources: SceneSources, smallest: tuple[in
     width = sources.width
     opened = [(open_capture(spec, size=(width, width * 3 // 4)), 1) for spec in sources.procedural]
     for path in itertools.chain.from_iterable(map(captures_in, paths)):
-        shape = open_capture(path, size=(width, width)).frames[0]
-        capture = open_capture(path, size=(width, round(shape.height * width / shape.width)))
-        if len(capture) < MIN_FRAMES * sources.strides[0]:
-            wanted = f"at least {MIN_FRAMES * sources.strides[0]} frames"
+        capture = open_capture(path, size=(width, width * 3 // 4))
+        first = capture.frames[0]
+        capture = dataclasses.replace(capture, height=round(first.height * width / first.width))
+        strides = [stride for stride in sources.strides if len(range(0, len(capture), stride)) >= MIN_FRAMES]
+        if not strides:
+            wanted = f"at least {MIN_FRAMES} frames"
             raise InputError(f"train: {capture.name}: wanted {wanted}, got {len(capture)}; leave it out.")
-        opened += [(capture, stride) for stride in sources.strides if len(capture) >= MIN_FRAMES * stride]
+        opened += [(capture, stride) for stride in strides]
     for capture, _ in opened:
         if capture.height < smallest[0] or capture.width < smallest[1]:
             wanted = "x".join(map(str, reversed(smallest)))

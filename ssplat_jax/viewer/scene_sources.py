@@ -33,7 +33,7 @@ class SceneFile:
     num_chunks = 1
 
     def __init__(self, path: Path, *, one_exposure: bool = False) -> None:
-        # Of scene and metrics when they were last read, and when the scene last could not be.
+        # Stamps of scene and metrics: at the last reading, and at the last one that failed.
         self._stamp = self._unreadable = None
         self._one_exposure = one_exposure
         self._scene: ViewedScene | None = None

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from ssplat_jax.checkpoint.stage_changes import stage_changes, start_of
+from ssplat_jax.checkpoint.stage_changes import stage_changes, start_of, trainings
 from ssplat_jax.checkpoint.weights import describe_weights, load_params, save_weights
 from ssplat_jax.config import preset
 from ssplat_jax.model import init_params
@@ -47,6 +47,14 @@ def test_the_start_is_that_of_the_recipes_seed(tmp_path):
     assert max(change.distance for change in changes) < 1e-3  # float16 on disk
     other = stage_changes(params, start_of(NARROW, {}))  # seed 0
     assert min(c.distance for c in other if c.num_params > 1) > 0.5
+
+
+def test_a_stage_that_a_later_training_added_is_compared_with_its_own_start():
+    first, later = init_params(jax.random.key(3), NARROW), init_params(jax.random.key(7), NARROW)
+    provenance = {"recipe": {"seed": 7}, "fresh": ["cgfi"], "before": {"recipe": {"seed": 3}}}
+    changes = stage_changes(first | {"cgfi": later["cgfi"]}, start_of(NARROW, provenance))
+    assert len(changes) > 3 and max(change.distance for change in changes) == 0
+    assert trainings(provenance) == [{"recipe": {"seed": 3}}, provenance]
 
 
 def test_matcher_and_evidence_head_of_the_shipped_weights_are_trained_and_other_stages_are_not():

@@ -52,6 +52,10 @@ def test_a_growing_folder_gives_the_scene_of_the_whole_one(tmp_path, narrow):
     writer = threading.Thread(target=write_slowly, args=(whole, growing))
     writer.start()
     outs = tmp_path / "straight", tmp_path / "watched"
+    for out in outs:  # the scene of another run of as many views, whose state was removed, must not pass for this one's
+        out.mkdir()
+        (out / "scene.ply").write_bytes(b"of another run")
+        (out / "metrics.json").write_text(json.dumps({"views": 10, "ply": {"num_written": 5}}))
     watching = ("--watch", "--quiet-seconds", "60", "--deltas", "--save-every", "1")
     assert run("run", str(growing), "--out", str(outs[1]), *watching, *narrow) == 0
     writer.join()

@@ -132,7 +132,7 @@ def test_a_folder_of_captures_is_those_in_it(tmp_path):
 
 
 def test_strides_for_which_a_capture_is_too_short_are_left_out(tmp_path):
-    make_capture(tmp_path / "short", num_frames=11, size=(64, 48))
+    make_capture(tmp_path / "short", num_frames=10, size=(64, 48))
     sources = SceneSources(width=64, strides=(1, 2), procedural=())
     assert [stride for _, stride in captures_of([tmp_path / "short"], sources, (16, 16))] == [1]
     make_capture(tmp_path / "shorter", num_frames=5, size=(64, 48))

@@ -520,7 +520,7 @@ def test_records_of_steps_that_are_taken_again_are_removed(tmp_path):
 
 @pytest.fixture
 def started(monkeypatch):
-    """What the command gives to a training, which stops at once."""
+    """Arguments that the command gives to a training, which stops at once."""
     seen = {}
 
     def stopped_at_once(config, recipe, out, *, params, **others):
@@ -539,11 +539,11 @@ def test_the_command_goes_on_with_the_configuration_of_the_weights(tmp_path, sta
     with pytest.raises(KeyboardInterrupt):
         Train(**asked, set=("min_confidence=0.25",)).run()
     assert started["config"] == held.replace(min_confidence=0.25) and started["params"]["cgfi"]
-    assert "dropped" not in capsys.readouterr().err
+    assert "leaves out" not in capsys.readouterr().err
     with pytest.raises(KeyboardInterrupt):
         Train(**asked, preset="tiny").run()
     said = capsys.readouterr().err
-    assert "cgfi dropped" in said and "memory.voxel_size=0.02" in said and "cgfi" not in started["params"]
+    assert "leaves out cgfi" in said and "memory.voxel_size 0.02 -> 0.03" in said and "cgfi" not in started["params"]
 
 
 def test_a_training_keeps_the_history_of_the_weights_that_it_started_from(tmp_path, monkeypatch):
@@ -557,7 +557,7 @@ def test_a_training_keeps_the_history_of_the_weights_that_it_started_from(tmp_pa
     asked = {"recipe": "stream", "init_weights": tmp_path / "w.npz", "seed": 6, "quiet": True}
     assert Train(out=tmp_path / "out", **asked).run() == 0
     facts = describe_weights(str(tmp_path / "out" / "weights.npz"))
-    assert facts.provenance["before"] == {"recipe": {"seed": 5}}
+    assert facts.provenance["before"] == {"recipe": {"seed": 5}} and facts.provenance["fresh"] == []
     start = start_of(facts.config, facts.provenance)  # of seed 5: nothing has moved since
     assert max(c.distance for c in stage_changes(load_params(str(tmp_path / "w.npz")), start)) < 1e-3
 

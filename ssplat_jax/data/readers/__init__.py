@@ -15,6 +15,6 @@ class Listing:
     """Frames of a capture, as a reader found them."""
 
     name: str
-    frames: tuple[Frame, ...]  # in the order of the file
+    frames: tuple[Frame, ...]  # in the order of the file; of streaming after `in_stream_order`
     notes: tuple[str, ...] = ()  # messages for the user, one sentence each
     is_in_time: bool = False  # True if that is known to be the order of time

@@ -226,7 +226,7 @@ def in_stream_order(listing: Listing) -> Listing:
 
     Frames are sorted by name in natural order ("9.jpg" before "10.jpg"). The order of the file is kept if it is the
     order of time, or if it makes the path of the camera less than half as long, as with random names or several
-    cameras. So poses have to be in the convention in which they were written.
+    cameras. The path needs true centers: call it after `reinterpreted`.
     """
     if listing.is_in_time:
         return listing
