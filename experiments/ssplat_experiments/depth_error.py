@@ -5,7 +5,8 @@
 Streams captures that have depth maps with the shipped weights and compares the depth of every token with the median of
 its cell's map, after one scale for the whole capture (the median ratio over accepted tokens). Writes `table.json`:
 accepted fraction, median relative error of accepted tokens, and the error by confidence; confidence is
-calibrated if the error falls as it rises. docs/model_card.md holds the numbers to expect.
+calibrated if the error falls as it rises. Weights whose confidences differ are compared at equal shares of the tokens,
+the surest ones. docs/model_card.md holds the numbers to expect.
 """
 
 import itertools
@@ -34,6 +35,7 @@ SIZE = (320, 240)
 CONTEXT = {"cpu": 64, "smoke": 8}
 EDGE = 1.05  # depth ratio within a cell above which it shows two surfaces
 BIN_EDGES = (0.0, 0.3, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)  # bins of confidence
+SHARES = (0.25, 0.5, 0.75, 0.85, 1.0)  # of all tokens, the surest ones
 
 
 def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str:
@@ -54,6 +56,11 @@ def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str
             f"{row['capture']}: {row['accepted']:.0%} accepted, median error {row['median_error']:.1%}",
             ("confidence", "tokens", "median error"),
             [(entry["confidence"], entry["tokens"], entry["median_error"]) for entry in row["by_confidence"]],
+        )
+        reporter.table(
+            f"{row['capture']}: the surest tokens",
+            ("share of all", "median error"),
+            [(f"{entry['share']:.0%}", entry["median_error"]) for entry in row["by_share"]],
         )
     return f"wrote {out}/table.json: " + ", ".join(f"{r['capture']} {r['median_error']:.1%}" for r in rows)
 
@@ -99,7 +106,7 @@ def cell_depths(depth: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "hf wf"]:
 
 
 def summary(ratios: Float[np.ndarray, " m"], confidences: Float[np.ndarray, " m"], tau: float) -> dict[str, Any]:
-    """Errors of accepted tokens and by confidence, after one global scale."""
+    """Errors of accepted tokens, by confidence, and of the surest tokens, after one global scale."""
     accepted = confidences >= tau
     scale = float(np.median(ratios[accepted]))
     errors = np.abs(ratios / scale - 1.0)
@@ -113,4 +120,13 @@ def summary(ratios: Float[np.ndarray, " m"], confidences: Float[np.ndarray, " m"
         "global_scale": round(scale, 4),
         "median_error": round(float(np.median(errors[accepted])), 4),
         "by_confidence": bins,
+        "by_share": [
+            {"share": share, "median_error": round(_surest(errors, confidences, share), 4)} for share in SHARES
+        ],
     }
+
+
+def _surest(errors: Float[np.ndarray, " m"], confidences: Float[np.ndarray, " m"], share: float) -> float:
+    """Median error of a share of the tokens, the most confident ones."""
+    order = np.argsort(-confidences, kind="stable")
+    return float(np.median(errors[order[: max(1, round(share * len(order)))]]))
