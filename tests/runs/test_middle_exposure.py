@@ -23,7 +23,7 @@ from tests.scene_files.scene_fixture import camera, scene
 
 SHADE = 1 / 3
 NUM_VIEWS = 24
-MOST_LOST_DB = 0.5
+MOST_LOST_DB = 1.0
 GAIN_RANGE = (0.9, 1.1)
 
 
