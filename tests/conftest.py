@@ -1,6 +1,7 @@
 """Set-up of all tests: shapes and types checked at every call, strict dtypes, and the folders of real data."""
 
 import atexit
+import gc
 import importlib.metadata
 import os
 import shutil
@@ -30,8 +31,15 @@ install_import_hook("ssplat_jax", "beartype.beartype")
 import jax  # noqa: E402
 import pytest  # noqa: E402
 
+from ssplat_jax.program_memory import drop_programs  # noqa: E402
+
 # An int32 array that meets a float32 array is an oversight; Python scalars stay welcome.
 jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+# Traced programs are millions of objects that stay: to look through them as often as Python does by default takes a
+# tenth of the run.
+gc.freeze()
+gc.set_threshold(50_000, 20, 50)
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 
@@ -39,8 +47,11 @@ SHARED = Path(__file__).resolve().parents[2] / "shared"
 # Workers take whole files, in this order: the long ones first, so that no worker ends long after the others.
 LONG_FILES = (
     "tests/train/",
+    "tests/refinement/",
+    "tests/runs/",
     "tests/streaming/",
     "tests/commands/",
+    "tests/evaluation/",
     "tests/model/test_predict.py",
 )
 
@@ -56,6 +67,13 @@ def interruptible():
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def programs_end_with_their_file():
+    """Compiled programs are dropped after a file: those of all files together took 8 GB in each worker."""
+    yield
+    drop_programs()
 
 
 def _shared(name: str) -> Path:

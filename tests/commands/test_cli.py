@@ -430,8 +430,8 @@ def test_eval_writes_every_promised_field(tmp_path, monkeypatch):
     monkeypatch.setattr(latency, "NUM_REPEATS", 1)  # how often it times is not what is tested
     out = tmp_path / "eval"
     capture = make_capture(tmp_path / "capture", num_frames=12, size=(128, 96))
-    arguments = ("eval", str(capture), "--context", "8", "--quiet")
-    assert run(*arguments, "--quality", "fast", "--out", str(out)) == 0
+    arguments = ("eval", str(capture), "--context", "8", "--quality", "fast", "--refine", "3", "--quiet")
+    assert run(*arguments, "--out", str(out)) == 0
     metrics = json.loads((out / "metrics.json").read_text())
     promised = {
         "literal", "shown", "psnr_over_black", "psnr_one_exposure", "per_view", "context_views", "target_views",
@@ -445,18 +445,16 @@ def test_eval_writes_every_promised_field(tmp_path, monkeypatch):
     assert {"nearest_view_psnr", "mean_color_psnr"} <= metrics["baselines"].keys()
     assert metrics["context_views"] == 8 and metrics["target_views"] == len(metrics["per_view"]) == 1
     per_token = preset("tiny").head.gaussians_per_token
-    assert per_token * metrics["cache"]["pivots"] >= metrics["cache"]["decoded"] == metrics["num_gaussians"] > 0
+    assert per_token * metrics["cache"]["pivots"] >= metrics["cache"]["decoded"] > 0
+    assert metrics["num_gaussians"] >= metrics["cache"]["decoded"]
     assert hashlib.sha256((out / "split.json").read_bytes()).hexdigest() == metrics["split_sha256"]
     # Streamed at half the size, scored at the whole.
     assert (metrics["streamed_size"], metrics["size"]) == ([64, 48], [128, 96])
     with Image.open(out / "view_00004.png") as picture:
         assert picture.size == (3 * 128, 96)
-    refined = tmp_path / "refined"
-    assert run(*arguments, "--quality", "fast", "--refine", "3", "--out", str(refined)) == 0
-    after = json.loads((refined / "metrics.json").read_text())
-    assert after["refinement"]["steps"] == 3 and after["refinement"]["skipped_steps"] == 0
-    assert all(after["refinement"]["before"][name] == metrics[name] for name in ("literal", "shown"))
-    assert after["shown"]["psnr"] != metrics["shown"]["psnr"]
+    refinement = metrics["refinement"]
+    assert refinement["steps"] == 3 and refinement["skipped_steps"] == 0
+    assert all(0 < abs(metrics[name]["psnr"] - refinement["before"][name]["psnr"]) < 3 for name in ("literal", "shown"))
 
 
 def test_negative_refinement_steps_are_bad_usage(tmp_path, capsys):

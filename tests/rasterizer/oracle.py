@@ -63,7 +63,7 @@ def splat(row: dict, viewmat: np.ndarray, K: np.ndarray, width: int, height: int
 
 
 def render(gaussians, viewmat, K, width: int, height: int, antialias: str = "mip"):
-    """Color, alpha, expected and median depth, pixel by pixel."""
+    """Color, alpha, expected and median depth: each Gaussian over all pixels, front to back."""
     fields = ("means", "quats", "scales", "opacities", "sh")
     arrays = {name: np.asarray(getattr(gaussians, name), np.float64) for name in fields}
     viewmat, K = np.asarray(viewmat, np.float64), np.asarray(K, np.float64)
@@ -72,21 +72,18 @@ def render(gaussians, viewmat, K, width: int, height: int, antialias: str = "mip
     rows = sorted((r for r in rows if r is not None), key=lambda r: r[3])
     color, alpha = np.zeros((height, width, 3)), np.zeros((height, width))
     depth, median = np.zeros((height, width)), np.zeros((height, width))
-    for i in range(height):
-        for j in range(width):
-            light = 1.0
-            for mean, conic, opacity, z, rgb in rows:
-                offset = np.array([j + 0.5, i + 0.5]) - mean
-                a = opacity * math.exp(-0.5 * min(offset @ conic @ offset, 1400.0))
-                if a < ALPHA_MIN:
-                    continue
-                a = min(a, ALPHA_MAX)
-                if light * (1 - a) < STOP:
-                    break
-                color[i, j] += light * a * rgb
-                alpha[i, j] += light * a
-                depth[i, j] += light * a * z
-                if light >= 0.5 > light * (1 - a):
-                    median[i, j] = z
-                light *= 1 - a
+    light, stopped = np.ones((height, width)), np.zeros((height, width), bool)
+    pixels = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), -1)
+    for mean, conic, opacity, z, rgb in rows:
+        offsets = pixels - mean
+        a = opacity * np.exp(-0.5 * np.minimum((offsets @ conic * offsets).sum(-1), 1400.0))
+        seen = ~stopped & (a >= ALPHA_MIN)
+        a = np.minimum(a, ALPHA_MAX)
+        stopped |= seen & (light * (1 - a) < STOP)
+        a = np.where(seen & ~stopped, a, 0)
+        color += (light * a)[..., None] * rgb
+        alpha += light * a
+        depth += light * a * z
+        median[(light >= 0.5) & (light * (1 - a) < 0.5)] = z
+        light *= 1 - a
     return color, alpha, np.where(alpha > 0, depth / np.where(alpha > 0, alpha, 1), 0), median

@@ -81,11 +81,12 @@ def test_a_pass_between_rounds_keeps_no_second_copy_of_the_scene():
     assert not np.array_equal(after.revision.logit_opacities, state.revision.logit_opacities)
 
 
-def test_the_shipped_network_gains_on_rooms_that_it_has_not_seen():
+@pytest.mark.parametrize("seeds", [(12,), pytest.param((11, 12, 14), marks=pytest.mark.slow)])
+def test_the_shipped_network_gains_on_rooms_that_it_has_not_seen(seeds):
     """Twelve views of 64 x 48 leave holes: the literal score gains in every room, the shown one in the mean."""
     model, params = StreamSplat(preset("tiny")), load_params("tiny")
     gains = []
-    for seed in (11, 12, 14):
+    for seed in seeds:
         capture = open_capture(f"procedural:room?frames=16&seed={seed}", size=(64, 48))
         split = interleaved_split(len(capture), 1, 12)
         session, frame = Session(model, params), capture.stream_frame(model.config, split.context)
