@@ -44,7 +44,9 @@ class KeyViews:
             images=jnp.asarray(images),
             viewmats=jnp.asarray(camera.viewmats, jnp.float32),
             Ks=jnp.asarray(camera.Ks, jnp.float32),
-            exposures=jnp.ones((images.shape[0], 3)) if exposures is None else jnp.asarray(exposures, jnp.float32),
+            exposures=jnp.ones((images.shape[0], 3), jnp.float32)
+            if exposures is None
+            else jnp.asarray(exposures, jnp.float32),
             valid=jnp.ones(images.shape[0], bool),
         )
 

@@ -11,6 +11,7 @@ from ssplat_jax.errors import InputError, require_positive, require_seed
 
 if TYPE_CHECKING:
     from ssplat_jax.console import Reporter
+    from ssplat_jax.train.recipe import Recipe
 
 MINUTES = {"tiny": 77, "stream": 15, "evidence": 15, "refiner": 30}
 """Rough time of recipes on two free cores; docs/model_card.md has measured times, some of them beside other work."""
@@ -109,7 +110,7 @@ class Train:
             "steps": result.step,
             "init_weights": self.init_weights and self.init_weights.name,
             "captures": {group.name: group.share for group in mix.groups} if mix else {},
-            "rendering_loss": "MSE + 0.05 LPIPS" if lpips_weights else "MSE + image gradients",
+            "rendering_loss": _rendering_loss(recipe, lpips_weights is not None),
         }
         if self.init_weights:
             provenance |= {"fresh": fresh, "before": before}
@@ -244,6 +245,14 @@ def _used(params: dict, config: StreamConfig) -> dict:
 
     wanted = jax.eval_shape(lambda: init_params(jax.random.key(0), config))
     return {name: stage for name, stage in params.items() if wanted.get(name)}
+
+
+def _rendering_loss(recipe: "Recipe", has_lpips: bool) -> str | None:
+    """Name of the loss of rendered images; None if the recipe renders none."""
+    if not recipe.renders:
+        return None
+    plain = "MSE + image gradients" if recipe.gradient_weight else "MSE"
+    return f"MSE + {recipe.lpips_weight:g} LPIPS" if has_lpips else plain
 
 
 def _describe_record(record: dict) -> str:

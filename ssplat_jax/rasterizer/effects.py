@@ -157,5 +157,5 @@ def _sampling_rates(means: np.ndarray, camera: Camera) -> np.ndarray:
         z = np.where(z > constants.NEAR, z, np.inf)
         u, v = K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
         inside = (u >= 0) & (u <= camera.width) & (v >= 0) & (v <= camera.height)
-        rates = np.maximum(rates, np.where(inside, K[0, 0] / z, 0.0))
+        rates = np.maximum(rates, np.where(inside, np.abs(K[0, 0]) / z, 0.0))
     return rates

@@ -26,7 +26,7 @@ def sampling_rates(means: Float[Array, "n 3"], captured: Camera) -> Float[Array,
         inside = (jnp.abs(u / captured.width - 0.5) <= 0.5 + margin) & (
             jnp.abs(v / captured.height - 0.5) <= 0.5 + margin
         )
-        return jnp.maximum(rates, jnp.where(in_front & inside, K[0, 0] / z, 0.0)), None
+        return jnp.maximum(rates, jnp.where(in_front & inside, jnp.abs(K[0, 0]) / z, 0.0)), None
 
     cameras = (
         captured.viewmats.reshape(-1, 4, 4).astype(means.dtype),

@@ -203,8 +203,9 @@ def tangent_bounds(camera: Camera, wider: Float[Array, "b 1"] | None = None) -> 
     bounds = []
     for axis, size in ((0, camera.width), (1, camera.height)):
         focal, center = camera.Ks[:, axis, axis, None], camera.Ks[:, axis, 2, None]
-        margin = constants.FRUSTUM_MARGIN * 0.5 * size / focal
-        low, high = -center / focal - margin, (size - center) / focal + margin
+        margin = constants.FRUSTUM_MARGIN * 0.5 * size / jnp.abs(focal)
+        ends = -center / focal, (size - center) / focal  # a negative focal length, of a mirrored image, turns them
+        low, high = jnp.minimum(*ends) - margin, jnp.maximum(*ends) + margin
         if wider is not None:
             low, high = jnp.minimum(low, wider * low), jnp.maximum(high, wider * high)
         bounds += [low, high]

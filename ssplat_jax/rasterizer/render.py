@@ -68,7 +68,8 @@ def render(
 
     Args:
         gaussians: the scene, in the world frame of the camera; rows of opacity 0 are absent.
-        camera: poses (world to camera, OpenCV axes), intrinsics and the image size, of one camera or a batch.
+        camera: poses (world to camera, OpenCV axes), intrinsics and the image size, of one camera or a batch; a
+            negative focal length mirrors the image.
         effects: filter, background and outputs; `effects_for` finds what a scene needs.
         features: further channels, composited like colors.
         captured: the cameras that the scene was made from, for the 3D smoothing filter.

@@ -114,7 +114,7 @@ def add_view(
         return (filled * exposure - target, out.color * exposure - target, out.features), out.num_overflow
 
     # Channels of zeros show nothing; their gradients sum up what lies in the pixels that each Gaussian fills.
-    probe = jnp.zeros((start.num_gaussians, 3))
+    probe = jnp.zeros((start.num_gaussians, 3), start.means.dtype)
     (filled, black, features), pull, overflow = jax.vjp(images, revision, probe, has_aux=True)
     held_back = held_back_pixels((height, width), view, config)
     learned = ~held_back[..., None]
@@ -159,7 +159,7 @@ def learned_pass(
         that is not finite; its steps are then counted in `num_skipped`. Gaussians that no view of the pass shows stay
         as they are. Bounds are those of `refine_step`.
     """
-    places = state.num_steps * config.views_per_step + jnp.arange(STEPS * config.views_per_step)
+    places = state.num_steps * config.views_per_step + jnp.arange(STEPS * config.views_per_step, dtype=jnp.int32)
     views = jax.vmap(lambda place: next_view(place, key_views.valid, config.seed))(places)
 
     def body(seen: SeenErrors, view: Int[Array, ""]):
@@ -203,7 +203,7 @@ def _mean_loss(
         shown = with_revised_view(state, view_revision(state), key_views, view)
         return total + view_loss(current, background, shown, view, config, max_pairs)[0], None
 
-    return jax.lax.scan(body, jnp.zeros(()), views)[0] / views.shape[0]
+    return jax.lax.scan(body, jnp.zeros((), current.means.dtype), views)[0] / views.shape[0]
 
 
 def learned_change(refiner: dict, gaussians: Gaussians, seen: SeenErrors) -> Revision:

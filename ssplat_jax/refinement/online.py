@@ -140,7 +140,7 @@ def online_step(
         max_scale: bound of scales, stream units.
     """
     size = sizes(base)
-    probe = jnp.zeros((base.num_gaussians, 1))
+    probe = jnp.zeros((base.num_gaussians, 1), base.means.dtype)
     gradient, filled = jax.grad(_loss, argnums=(1, 2))(base, residuals, probe, view, max_pairs, max_scale)
     # Units in which a step is the same for Gaussians of all sizes.
     units = {"means": size[:, None], "quats": 1.0, "log_scales": 1.0, "logit_opacities": 1.0, "colors": 1.0}

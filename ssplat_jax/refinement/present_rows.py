@@ -54,7 +54,7 @@ def present_and_new(gaussians: Gaussians, new: Gaussians, num_new: int) -> tuple
 
 
 def back_in_place(present: Gaussians, rows: Int[np.ndarray, " m"] | None, gaussians: Gaussians) -> Gaussians:
-    """`gaussians` with the rows of `present_rows` replaced by the first ones of `present`, at its SH degree.
+    """`gaussians` with the rows of `present_rows` replaced by the first ones of `present`, at its SH degree and dtype.
 
     It grows where `rows` has numbers beyond its last row.
     """
@@ -62,5 +62,6 @@ def back_in_place(present: Gaussians, rows: Int[np.ndarray, " m"] | None, gaussi
         return present
     gaussians = with_sh_degree(gaussians, present.sh_degree)
     num_missing = max(int(rows.max(initial=-1)) + 1 - gaussians.num_gaussians, 0)
-    gaussians = jax.tree.map(lambda x: jnp.pad(x, ((0, num_missing), *[(0, 0)] * (x.ndim - 1))), gaussians)
-    return jax.tree.map(lambda x, new: x.at[rows].set(new[: len(rows)]), gaussians, present)
+    padded = lambda x: jnp.pad(x, ((0, num_missing), *[(0, 0)] * (x.ndim - 1)))  # noqa: E731
+    put = lambda x, new: padded(x).astype(new.dtype).at[rows].set(new[: len(rows)])  # noqa: E731
+    return jax.tree.map(put, gaussians, present)

@@ -54,7 +54,7 @@ def refine_on_capture(
         indices: frame numbers that were streamed.
         frame: the similarity between the capture's frame and the stream's.
         exposures: factor per streamed frame, as the stream estimated it.
-        steps: most refinement steps.
+        steps: most refinement steps; with 0 the scene comes back as it is.
         config: learning rates, bounds and SH degree; default `FOR_CAPTURES`.
         revise: names of the effects that are on besides those of `config`, or `("auto",)` for those that the residuals
             call for.
@@ -71,6 +71,8 @@ def refine_on_capture(
         raise InputError(f"refine: steps must be at least 0, got {steps}.")
     given = key_views_of(capture, indices, frame, exposures)
     choice = effects_by_name(revise, gaussians, given, poses_stay=poses_stay)
+    if steps == 0:
+        return CaptureRefinement(gaussians, exposures, Refinement(0, 0, [], [], False, 0.0), choice)
     config = with_effects(config or FOR_CAPTURES, choice)
     progress, views = start_refinement(gaussians, given, config)
     for _ in continue_refinement(progress, views, steps, config):

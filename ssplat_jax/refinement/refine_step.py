@@ -46,10 +46,10 @@ class StepReport:
 def init_refinement(
     gaussians: Gaussians, key_views: KeyViews | None = None, config: RefineConfig | None = None
 ) -> RefineState:
-    """The state before the first step, with SH bands as `config` has them.
+    """The state before the first step, with SH bands as `config` has them, in float32 or float64.
 
     Args:
-        gaussians: the scene; its arrays are copied.
+        gaussians: the scene; its arrays are copied. Half precision becomes float32: in it, Adam's moments would vanish.
         key_views: the views that are compared; needed by the effects of `config`, which revise them.
         config: SH degree and effects; default `RefineConfig()`.
 
@@ -58,6 +58,8 @@ def init_refinement(
     """
     config = config or RefineConfig()
     effects, gaussians = config.effects, with_sh_degree(gaussians, config.sh_degree)
+    if jnp.finfo(gaussians.means.dtype).bits < 32:
+        gaussians = jax.tree.map(lambda x: x.astype(jnp.float32), gaussians)
     if effects.any and key_views is None:
         raise InputError(f"refine: the effects {', '.join(effects.names)} need the key views, got none.")
     return RefineState(

@@ -18,7 +18,7 @@ def views_of_step(step: Int[Array, ""], valid: Bool[Array, " v"], config: Refine
         valid: slots that hold a view.
         config: gives `views_per_step` and the seed.
     """
-    places = step * config.views_per_step + jnp.arange(config.views_per_step)
+    places = step * config.views_per_step + jnp.arange(config.views_per_step, dtype=jnp.int32)
     return jax.vmap(lambda place: next_view(place, valid, config.seed))(places)
 
 
@@ -34,7 +34,7 @@ def next_view(place: Int[Array, ""], valid: Bool[Array, " v"], seed: int) -> Int
         seed: seed of the places at which rounds begin.
     """
     num_valid = jnp.maximum(jnp.sum(valid, dtype=jnp.int32), 1)
-    begin = jax.random.uniform(jax.random.fold_in(jax.random.key(seed), place // num_valid))
+    begin = jax.random.uniform(jax.random.fold_in(jax.random.key(seed), place // num_valid), dtype=jnp.float32)
     ranks = jnp.cumsum(valid, dtype=jnp.int32) - 1
     order = jnp.argsort(jnp.where(valid, (golden_fractions(ranks) + begin) % 1.0, 2.0))
     return order[place % num_valid].astype(jnp.int32)

@@ -45,8 +45,9 @@ def splat(row: dict, viewmat: np.ndarray, K: np.ndarray, width: int, height: int
         return None
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     margin = 0.15
-    tx = np.clip(x / z, -cx / fx - margin * width / fx, (width - cx) / fx + margin * width / fx)
-    ty = np.clip(y / z, -cy / fy - margin * height / fy, (height - cy) / fy + margin * height / fy)
+    left, right = sorted([(-margin * width - cx) / fx, ((1 + margin) * width - cx) / fx])
+    upper, lower = sorted([(-margin * height - cy) / fy, ((1 + margin) * height - cy) / fy])
+    tx, ty = np.clip(x / z, left, right), np.clip(y / z, upper, lower)
     jacobian = np.array([[fx / z, 0, -fx * tx / z], [0, fy / z, -fy * ty / z]])
     root = jacobian @ viewmat[:3, :3] @ rotation(row["quats"]) @ np.diag(row["scales"])
     covariance = root @ root.T

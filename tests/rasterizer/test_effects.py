@@ -12,6 +12,7 @@ from ssplat_jax.gaussians import Gaussians, mask_gaussians
 from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.pytree import replace
 from ssplat_jax.rasterizer import Effects, effects_for, filter_3d, render
+from ssplat_jax.rasterizer.filter_3d import sampling_rates
 from ssplat_jax.rasterizer.lens_distortion import distort
 from ssplat_jax.rasterizer.projection import project, tangent_bounds
 from ssplat_jax.rasterizer.reference import render_reference
@@ -326,3 +327,15 @@ def test_bounds_of_the_jacobian_widen_outwards_on_every_side(center):
     assert wide[0] <= plain[0] and wide[1] >= plain[1] and wide[2] < plain[2] and wide[3] > plain[3]
     if center > 0:
         assert wide[0] == pytest.approx(1.5 * plain[0]) and wide[1] == pytest.approx(1.5 * plain[1])
+
+
+def test_the_3d_filter_knows_mirrored_cameras():
+    view = cameras(21, 30)
+    K = np.array(view.Ks)
+    K[0, 0], K[0, 2] = -K[0, 0], 21 - K[0, 2]
+    mirrored = replace(view, Ks=jnp.asarray(K))
+    means = cloud(20).means
+    plain, turned = (np.asarray(sampling_rates(means, camera)) for camera in (view, mirrored))
+    assert plain.max() > 0
+    np.testing.assert_allclose(turned, plain, rtol=1e-5)
+    assert effects_for(cloud(20), mirrored, captured=view) == effects_for(cloud(20), view, captured=view)

@@ -85,6 +85,18 @@ def test_gradients_equal_the_reference_in_float64():
         assert cosine > 0.99999, jax.tree_util.keystr(path)
 
 
+def test_a_negative_focal_length_mirrors_the_image(scene):
+    """The Gaussians are large, so their shape shows where the Jacobian is taken."""
+    gaussians, camera = cloud(20, size=0.3), scene[1]
+    K = np.array(camera.Ks)
+    K[1, 1], K[1, 2] = -K[1, 1], 30 - K[1, 2]
+    mirrored = replace(camera, Ks=jnp.asarray(K))
+    color, flipped = (np.asarray(render(gaussians, c).color) for c in (camera, mirrored))
+    np.testing.assert_allclose(flipped[::-1], color, atol=FORWARD)
+    wanted = oracle.render(gaussians, mirrored.viewmats, mirrored.Ks, 21, 30)[0]
+    np.testing.assert_allclose(flipped, wanted, atol=FORWARD)
+
+
 @pytest.mark.slow  # the test above, against the reference, runs always
 def test_gradients_equal_finite_differences_in_float64():
     # Few, wide, faint Gaussians: no alpha threshold is crossed by a step of 1e-6.

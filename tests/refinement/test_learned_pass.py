@@ -31,6 +31,7 @@ from ssplat_jax.refinement.revision import Revision, apply_revision, no_revision
 from ssplat_jax.refinement.view_loss import EFFECTS
 from tests.refinement.test_refine import (
     CONFIG,
+    FIELDS,
     MAX_PAIRS,
     NUM,
     NUM_VIEWS,
@@ -277,3 +278,14 @@ def test_no_change_where_nothing_was_seen():
     change = learned_change(drawn(), doubtful(), no_errors(doubtful()))
     assert isinstance(change, Revision)
     assert all(not np.asarray(leaf).any() for leaf in jax.tree.leaves(change))
+
+
+def test_a_pass_on_float32_is_the_same_under_enable_x64():
+    given = doubtful(), key_views(), small_steps()
+    wanted, _ = one_pass(*given)
+    with jax.enable_x64(True):
+        got, _ = one_pass(*given)
+    for name in FIELDS:
+        found = getattr(current_gaussians(got), name)
+        assert found.dtype == jnp.float32
+        np.testing.assert_allclose(found, getattr(current_gaussians(wanted), name), rtol=1e-6, atol=1e-6)

@@ -16,7 +16,15 @@ from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.metrics.psnr_ssim import psnr
 from ssplat_jax.pytree import replace
 from ssplat_jax.rasterizer import render
-from ssplat_jax.refinement import KeyViews, RefineConfig, current_gaussians, init_refinement, refine, refine_step
+from ssplat_jax.refinement import (
+    KeyViews,
+    RefineConfig,
+    current_gaussians,
+    init_refinement,
+    present_rows,
+    refine,
+    refine_step,
+)
 from ssplat_jax.refinement.refine import has_stopped_helping
 from ssplat_jax.refinement.refine_effects import RefineEffects
 from ssplat_jax.refinement.revision import apply_revision, no_revision, sizes
@@ -304,3 +312,19 @@ def test_the_seconds_of_the_steps_are_those_of_their_work():
     jax.block_until_ready(progress.state)
     elapsed = time.perf_counter() - begin
     assert 0.5 * elapsed < sum(progress.seconds[1:]) <= elapsed
+
+
+@pytest.mark.parametrize("dtype", [jnp.float16, jnp.bfloat16])
+def test_a_scene_of_half_precision_is_refined_in_float32(dtype, monkeypatch):
+    """In float16 the squares of small gradients vanish, and a step divides by them."""
+    monkeypatch.setattr(present_rows, "MIN_ROWS", 1)  # absent rows are left out of the steps
+    half = jax.tree.map(lambda x: x.astype(dtype), doubtful())
+    assert present_rows.present_rows(half) is not None
+    refined, report = refine(half, cameras(), photographs(), steps=8, config=CONFIG)
+    single = jax.tree.map(lambda x: x.astype(jnp.float32), half)
+    wanted, _ = refine(single, cameras(), photographs(), steps=8, config=CONFIG)
+    assert np.mean(report.losses[4:]) < np.mean(report.losses[:4])
+    for name in FIELDS:
+        found = getattr(refined, name)
+        assert found.dtype == jnp.float32
+        np.testing.assert_allclose(found, getattr(wanted, name), rtol=1e-5, atol=1e-5)

@@ -16,7 +16,16 @@ from ssplat_jax.rasterizer import render
 from ssplat_jax.refinement import RefineConfig, current_gaussians, init_refinement, refine, refine_on_capture
 from ssplat_jax.refinement import present_rows as rows
 from ssplat_jax.refinement.refine_config import FOR_CAPTURES
-from tests.refinement.test_refine import CONFIG, NUM, cameras, key_views, photographs, scene, step
+from tests.refinement.test_refine import (
+    CONFIG,
+    NUM,
+    assert_same_bits,
+    cameras,
+    key_views,
+    photographs,
+    scene,
+    step,
+)
 
 LINEAR = dataclasses.replace(CONFIG, sh_degree=1, sh_rate=0.5)
 
@@ -94,3 +103,11 @@ def test_scenes_of_captures_get_bands():
 def test_a_degree_that_there_is_not_is_refused(degree):
     with pytest.raises(InputError, match="sh_degree must be 0 to 3"):
         RefineConfig(sh_degree=degree)
+
+
+def test_no_steps_on_a_capture_return_the_scene_bit_for_bit():
+    capture = open_capture("procedural:room?frames=4", size=(24, 16))
+    exposures = {i: np.ones(3, np.float32) for i in range(4)}
+    found = refine_on_capture(scene(), capture, range(4), capture.stream_frame(StreamConfig()), exposures, steps=0)
+    assert found.gaussians.sh_degree == 0 and found.report.num_steps == 0 and found.exposures == exposures
+    assert_same_bits(found.gaussians, scene())

@@ -17,7 +17,7 @@ from ssplat_jax.cache import Tokens
 from ssplat_jax.checkpoint.stage_changes import stage_changes, start_of
 from ssplat_jax.checkpoint.training_state import TrainingCheckpoints
 from ssplat_jax.checkpoint.weights import describe_weights, load_params, params_digest, save_weights
-from ssplat_jax.commands.train_command import Train
+from ssplat_jax.commands.train_command import Train, _rendering_loss
 from ssplat_jax.config import preset
 from ssplat_jax.data.depth_range import FAR_FACTOR
 from ssplat_jax.data.procedural import training_sample
@@ -569,3 +569,17 @@ def test_the_command_starts_stages_that_the_weights_lack_at_random(tmp_path, sta
     untrained, shipped = init_params(jax.random.key(3), started["config"]), load_params("tiny")
     for name, stage in started["params"].items():
         jax.tree.map(np.testing.assert_array_equal, stage, (untrained if name == "cgfi" else shipped)[name])
+
+
+@pytest.mark.parametrize(
+    ("recipe", "has_lpips", "wanted"),
+    [
+        ("tiny", False, None),
+        ("depth", False, None),
+        ("stream", False, "MSE + image gradients"),
+        ("paper", False, "MSE"),
+        ("paper", True, "MSE + 0.05 LPIPS"),
+    ],
+)
+def test_weights_tell_the_loss_of_their_training(recipe, has_lpips, wanted):
+    assert _rendering_loss(RECIPES[recipe], has_lpips) == wanted
