@@ -61,6 +61,7 @@ def save_compressed_ply(
         steps of 1/32.
 
     Raises:
+        InputError: an array of the scene has a wrong shape.
         StorageError: the file cannot be written.
     """
     rows = scene_rows(gaussians)

@@ -5,7 +5,11 @@ import dataclasses
 import numpy as np
 from jaxtyping import Bool, Float64, UInt8
 
+from ssplat_jax.errors import InputError
 from ssplat_jax.gaussians import Gaussians, check_gaussians
+
+SH_TERMS = (1, 4, 9, 16)
+"""Numbers of SH terms that files hold, those of degree 0 to 3."""
 
 MIN_OPACITY = 1.0 / 255.0
 """Gaussians below this opacity are invisible in every renderer and are not written (absent rows have opacity 0)."""
@@ -35,7 +39,7 @@ class ExportReport:
     def warning(self) -> str | None:
         """Note for the user who opens the file, or None."""
         far = "the capture lies far from its origin; positions are counted from"
-        return f"{far} {list(self.offset)}." if any(self.offset) else None
+        return f"{far} {[float(x) for x in self.offset]}." if any(self.offset) else None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,9 +64,11 @@ def scene_rows(gaussians: Gaussians) -> SceneRows:
         Opacities are clamped to [1e-6, 1 - 1e-6], scales to [e^-20, e^20]; a zero quaternion becomes the identity.
 
     Raises:
-        InputError: an array of the scene has a wrong shape.
+        InputError: an array of the scene has a wrong shape, or the number of SH terms is none of 1, 4, 9 and 16.
     """
     check_gaussians(gaussians, "scene")
+    if (terms := gaussians.sh.shape[1]) not in SH_TERMS:
+        raise InputError(f"scene: sh must hold 1, 4, 9 or 16 terms for each Gaussian, got {terms}.")
     fields = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
     means, quats, scales, opacities, sh = (np.asarray(field, np.float64) for field in fields)
     keep = is_writable(gaussians)

@@ -84,7 +84,7 @@ def save_gaussians(
         Counts of written and dropped Gaussians, and `offset`.
 
     Raises:
-        InputError: an unknown extension, or positions outside the range of the format.
+        InputError: an unknown extension, positions outside the range of the format, or an array of a wrong shape.
         StorageError: the file cannot be written.
     """
     report = FORMATS[check_format(path)].save(path, gaussians, render_mode, offset)
@@ -139,7 +139,7 @@ def save_selected(
         Counts of written, dropped and left out Gaussians, and `offset`.
 
     Raises:
-        InputError: an unknown extension, or positions outside the range of the format.
+        InputError: an unknown extension, positions outside the range of the format, or an array of a wrong shape.
         StorageError: the file cannot be written.
     """
     check_format(path)

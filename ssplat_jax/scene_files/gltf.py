@@ -55,12 +55,14 @@ def save_gltf(
         Those of `scene_rows`.
 
     Raises:
+        InputError: an array of the scene has a wrong shape.
         StorageError: the file cannot be written.
     """
     rows = scene_rows(gaussians)
     columns = _columns(rows)
     document, buffer = _document(columns, len(rows))
-    document["asset"]["extras"] = {"SplatRenderMode": render_mode} | ({"offset": list(offset)} if any(offset) else {})
+    extras = {"offset": [float(x) for x in offset]} if any(offset) else {}
+    document["asset"]["extras"] = {"SplatRenderMode": render_mode} | extras
     if str(path).endswith(".gltf"):
         document["buffers"][0]["uri"] = EMBEDDED + base64.b64encode(buffer).decode("ascii")
         data = json.dumps(document, indent=1).encode("ascii")

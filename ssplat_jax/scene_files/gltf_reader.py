@@ -7,6 +7,7 @@ import json
 import os
 import struct
 from pathlib import Path
+from urllib.parse import unquote
 
 import numpy as np
 from jaxtyping import Float, Float64
@@ -185,7 +186,7 @@ class _Document:
                 return base64.b64decode(uri.partition(",")[2], validate=True)
             except binascii.Error as error:
                 raise ValueError(f"buffer {number}: {error}") from error
-        beside = (self.path.parent / uri).resolve()
+        beside = (self.path.parent / unquote(uri)).resolve()
         if not beside.is_relative_to(self.path.parent.resolve()):
             raise ValueError(f"buffer {number}: {uri!r} lies outside of the file's folder")
         return read_scene_bytes(beside, f"the buffer of {self.path.name}")
@@ -225,4 +226,6 @@ def _placed(
     turned = Rotation.from_matrix(rotation) * Rotation.from_quat(unit_quats(columns["quats"]), scalar_first=True)
     degree = round(columns["sh"].shape[1] ** 0.5) - 1
     sh = np.einsum("kl,nlc->nkc", sh_rotation(rotation, degree), columns["sh"])
-    return columns | moved | {"quats": turned.as_quat(scalar_first=True), "sh": sh}
+    quats = turned.as_quat(scalar_first=True)
+    quats[~np.isfinite(columns["quats"]).all(axis=1)] = np.nan  # `unit_quats` hides it; NaN is refused later
+    return columns | moved | {"quats": quats, "sh": sh}

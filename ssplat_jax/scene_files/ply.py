@@ -57,7 +57,7 @@ def save_ply(
         Counts of written and dropped Gaussians (`scene_rows`), and `offset`.
 
     Raises:
-        InputError: an unknown render mode.
+        InputError: an unknown render mode, or an array of the scene has a wrong shape.
         StorageError: the file cannot be written.
     """
     if render_mode not in RENDER_MODES:
@@ -91,7 +91,7 @@ def _header(num_rows: int, sh_degree: int, render_mode: str, offset: tuple[float
 
 def offset_comment(offset: tuple[float, float, float]) -> list[str]:
     """Header line of an offset; none if it is zero."""
-    return [f"comment offset {' '.join(map(repr, offset))}"] if any(offset) else []
+    return [f"comment offset {' '.join(repr(float(x)) for x in offset)}"] if any(offset) else []
 
 
 def _table(rows: SceneRows) -> np.ndarray:

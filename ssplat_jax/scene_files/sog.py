@@ -47,6 +47,7 @@ def save_sog(path: str | os.PathLike, gaussians: Gaussians, *, antialiased: bool
         values fitted to the scene, entries of quaternions 256; f_rest shares one of at most 65,536 palette entries.
 
     Raises:
+        InputError: an array of the scene has a wrong shape.
         StorageError: the file cannot be written.
     """
     rows = scene_rows(gaussians)

@@ -21,7 +21,18 @@ MAX_BYTES = 1 << 30
 """Most bytes of one file of the archive when it is unpacked."""
 SPARE_PIXELS = 1 << 16
 """Pixels that an image may have beyond twice the wanted number, before anything of its size is allocated."""
-SPOILED = (zipfile.BadZipFile, zlib.error, RuntimeError, LookupError, TypeError, ValueError, OSError, EOFError)
+SPOILED = (
+    zipfile.BadZipFile,
+    zlib.error,
+    Image.DecompressionBombError,
+    RuntimeError,
+    LookupError,
+    TypeError,
+    ValueError,
+    ArithmeticError,
+    OSError,
+    EOFError,
+)
 """Errors that a damaged archive, JSON or image leads to."""
 MAX_LOG_POSITION = 60.0
 """Bound of a position on its logarithmic axis: 1e26 units."""

@@ -26,6 +26,7 @@ def save_splat(path: str | os.PathLike, gaussians: Gaussians) -> ExportReport:
         Those of `scene_rows`. Colors are clipped to [0, 1]; SH bands above the constant one are dropped.
 
     Raises:
+        InputError: an array of the scene has a wrong shape.
         StorageError: the file cannot be written.
     """
     rows = scene_rows(gaussians)

@@ -41,7 +41,7 @@ def save_spz(path: str | os.PathLike, gaussians: Gaussians, *, antialiased: bool
         2^-24 units if that is more.
 
     Raises:
-        InputError: a Gaussian lies 2^23 units or farther from the origin.
+        InputError: a Gaussian lies 2^23 units or farther from the origin, or an array of the scene has a wrong shape.
         StorageError: the file cannot be written.
     """
     rows = scene_rows(gaussians)

@@ -78,6 +78,9 @@ class Browser:
         splats = self._stage.splats(scene)
         fields = {field.name: getattr(splats, field.name) for field in dataclasses.fields(splats)}
         if len(splats.centers) == 0:
+            if self._node is not None:
+                self._node.remove()
+                self._node = None
             return
         if self._node is None:
             scale = self._stage.unit / self._stage.distance

@@ -106,10 +106,11 @@ def test_the_renderer_of_a_scene_is_told_where_the_format_can(tmp_path, suffix):
 
 @pytest.mark.parametrize("suffix", [".ply", ".compressed.ply", ".glb", ".gltf"])
 def test_the_offset_of_a_far_scene_is_kept(tmp_path, suffix):
-    offset = (4.5e6, -0.1, 3.0)
+    offset = tuple(np.array([4.5e6, -0.1, 3.0]))  # numbers of NumPy, as a pose gives them
     report = save_gaussians(tmp_path / f"a{suffix}", scene_for(suffix), offset=offset)
     found = read_scene(tmp_path / f"a{suffix}")
-    assert report.offset == found.offset == offset
+    assert report.offset == found.offset == (4.5e6, -0.1, 3.0)
+    assert "[4500000.0, -0.1, 3.0]" in report.warning
     assert_draws(found.gaussians, scene_for(suffix), least_db(suffix))
 
 
@@ -301,3 +302,28 @@ def test_we_read_what_splat_transform_writes(tmp_path, splat_transform, suffix):
 def test_a_compressed_file_and_its_plain_decoder_agree(tmp_path):
     save_gaussians(tmp_path / "a.compressed.ply", scene(3, n=100))
     assert_draws(ss.load_scene(tmp_path / "a.compressed.ply"), of_compressed_ply(tmp_path / "a.compressed.ply"), 100.0)
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+@pytest.mark.parametrize("terms", [0, 2, 3, 25])
+def test_sh_of_no_degree_that_files_hold_is_refused(tmp_path, suffix, terms):
+    spoiled = replace(scene(0, n=5), sh=jnp.zeros((5, terms, 3)))
+    with pytest.raises(InputError, match=f"1, 4, 9 or 16 terms for each Gaussian, got {terms}"):
+        save_gaussians(tmp_path / f"a{suffix}", spoiled)
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_sog_file_with_a_huge_image_or_number_is_refused(tmp_path, monkeypatch):
+    save_gaussians(tmp_path / "a.sog", scene(0, n=5))
+    with zipfile.ZipFile(tmp_path / "a.sog") as archive:
+        files = {name: archive.read(name) for name in archive.namelist()}
+    meta = json.loads(files["meta.json"])
+    meta["means"]["mins"][0] = 10**400
+    with zipfile.ZipFile(tmp_path / "b.sog", "w") as archive:
+        for name, data in (files | {"meta.json": json.dumps(meta).encode()}).items():
+            archive.writestr(name, data)
+    with pytest.raises(InputError, match=r"b\.sog: cannot use"):
+        read_scene(tmp_path / "b.sog")
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 1)  # as if the small images were beyond PIL's limit
+    with pytest.raises(InputError, match=r"a\.sog: cannot use"):
+        read_scene(tmp_path / "a.sog")

@@ -125,6 +125,7 @@ BAD = {
     "zero stride": (lambda d: d["bufferViews"][0].update(byteStride=0), "beyond its buffer"),
     "different lengths": (lambda d: d["accessors"][2].update(count=99), "different lengths"),
     "unknown component": (lambda d: d["accessors"][0].update(componentType=1), "cannot use its glTF"),
+    "encoded outside": (lambda d: d["buffers"][0].update(uri="%2e%2e/passwd"), "outside"),
     "outside": (lambda d: d["buffers"][0].update(uri="../../etc/passwd"), "outside"),
     "broken base64": (lambda d: d["buffers"][0].update(uri="data:,*"), "cannot use its glTF"),
     "a list": (lambda d: d.update(nodes=7), "cannot use its glTF"),
@@ -141,11 +142,24 @@ def test_a_spoiled_document_is_refused_in_one_line(tmp_path, document, name):
     assert words in str(caught.value) and "b.gltf" in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_a_buffer_beside_the_file_is_read(tmp_path, document):
-    uri = document["buffers"][0]["uri"]
-    (tmp_path / "data.bin").write_bytes(base64.b64decode(uri.partition(",")[2]))
-    document["buffers"][0]["uri"] = "data.bin"
+@pytest.mark.parametrize(("name", "uri"), [("data.bin", "data.bin"), ("my scene%.bin", "my%20scene%25.bin")])
+def test_a_buffer_beside_the_file_is_read(tmp_path, document, name, uri):
+    """Names in URIs are percent-encoded."""
+    embedded = document["buffers"][0]["uri"]
+    (tmp_path / name).write_bytes(base64.b64decode(embedded.partition(",")[2]))
+    document["buffers"][0]["uri"] = uri
     assert read(tmp_path, document).num_gaussians == 100
+
+
+@pytest.mark.parametrize("is_turned", [False, True])
+def test_a_rotation_that_is_not_finite_is_refused(tmp_path, document, is_turned):
+    quats = np.tile(np.float32([0, 0, 0, 1]), (100, 1))
+    quats[7, 2] = np.nan
+    with_attribute(document, "ROTATION", quats, 5126)
+    if is_turned:  # without our half turn, the columns are turned
+        document["nodes"][0].pop("rotation")
+    with pytest.raises(InputError, match="finite"):
+        read(tmp_path, document)
 
 
 def test_deep_json_is_refused(tmp_path):

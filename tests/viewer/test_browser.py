@@ -23,7 +23,7 @@ from ssplat_jax.viewer.drawn_view import draw
 from ssplat_jax.viewer.playback import ORBIT_SECONDS, Orbit, PathPlayback
 from ssplat_jax.viewer.recorded_run import PATH_STEPS, RecordedRun, figures
 from ssplat_jax.viewer.scene_sources import open_source
-from ssplat_jax.viewer.splats import visible_splats
+from ssplat_jax.viewer.splats import Splats, visible_splats
 from ssplat_jax.viewer.stage import Stage
 from ssplat_jax.viewer.viewed_scene import ViewedScene
 from ssplat_jax.viewer.viser_viewer import Viewer
@@ -128,6 +128,19 @@ def test_a_browser_follows_the_run_until_an_earlier_chunk_is_chosen(run):
     run.choose("Chunk", 4)
     run.grow()
     assert run.sent() == 12 and run.controls["Chunk"].value == 5
+
+
+def test_a_scene_without_gaussians_leaves_none_in_sight(run):
+    run.grow()
+    run.grow()
+    shown, visible = run.splats, run.stage.splats
+    assert run.sent() == 6
+    run.stage.splats = lambda scene: Splats(**{name: x[:0] for name, x in vars(visible(scene)).items()})
+    run.choose("Chunk", 1)
+    assert shown.removed
+    run.stage.splats = visible
+    run.choose("Chunk", 2)
+    assert run.sent() == 6 and run.splats is not shown
 
 
 def test_the_past_of_a_run_that_is_being_started_anew_gives_way_to_its_newest_scene(run):
