@@ -36,8 +36,7 @@ from ssplat_jax.program_memory import drop_programs  # noqa: E402
 # An int32 array that meets a float32 array is an oversight; Python scalars stay welcome.
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
-# Traced programs are millions of objects that stay: to look through them as often as Python does by default takes a
-# tenth of the run.
+# Traced programs are millions of objects that stay. At Python's thresholds, collecting them takes a tenth of a run.
 gc.freeze()
 gc.set_threshold(50_000, 20, 50)
 

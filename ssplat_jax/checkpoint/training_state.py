@@ -45,6 +45,7 @@ class TrainingCheckpoints:
 
     Raises:
         InputError: the directory holds another run.
+        StorageError: its recipe.json is damaged.
     """
 
     def __init__(
@@ -62,10 +63,16 @@ class TrainingCheckpoints:
         if not path.exists():
             write_atomic(path, json.dumps(description, indent=1, sort_keys=True).encode())
             return
-        held_description = json.loads(path.read_text())
-        if "chunk_size" in held_description.get("config", {}):  # flat, as before 0.1.0
-            held_description["config"] = config_from_header(held_description["config"]).to_dict()
-        if (found := first_difference(upgrade(held_description), description)) is not None:
+        try:
+            held_description = json.loads(path.read_text())
+            if "chunk_size" in held_description.get("config", {}):  # flat, as before 0.1.0
+                held_description["config"] = config_from_header(held_description["config"]).to_dict()
+            held_description = upgrade(held_description)
+        except InputError:
+            raise
+        except (ValueError, LookupError, TypeError, AttributeError) as error:
+            raise StorageError(f"{path}: damaged; restore it or choose another --out.") from error
+        if (found := first_difference(held_description, description)) is not None:
             name, held, wanted = found
             raise InputError(
                 f"{path}: this directory holds a run with {name} = {held!r}, wanted {wanted!r}; choose another --out"

@@ -50,7 +50,7 @@ class Run:
     quality: QualityOption = "accurate"
     budget_ms: float | None = None
     """Time this machine, then choose the most accurate size and settings that take at most this many ms a view. Needs
-    the weights tiny; --set is applied afterwards and changes the time."""
+    the weights tiny and no --online-refine; --set is applied afterwards and changes the time."""
     weights: WeightsOption = "tiny"
     set: ConfigChanges = ()
     save_every: int = 8
@@ -157,6 +157,7 @@ class Run:
             ("--quality", self.quality != "accurate"),
             ("--weights", self.weights != "tiny"),
             ("--watch", self.watch),
+            ("--online-refine", self.online_refine > 0),
         ):
             if is_given:
                 raise InputError(f"--budget-ms: wanted it without {option}, got both; leave one out.")

@@ -66,7 +66,7 @@ class Capture:
         """Digest (12 hex digits) of the poses, intrinsics, lenses and file names of the frames `indices`."""
         digest = hashlib.sha256()
         for frame in (self.frames[i] for i in indices):
-            digest.update(f"{frame.name}\n".encode())
+            digest.update(f"{frame.name}\n".encode(errors="surrogateescape"))  # names are bytes on Linux
             digest.update(frame.camtoworld.tobytes() + frame.K.tobytes())
             if frame.lens is not None:
                 digest.update(repr(frame.lens).encode())

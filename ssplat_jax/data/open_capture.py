@@ -25,7 +25,7 @@ from ssplat_jax.data.readers import (
     tum,
 )
 from ssplat_jax.data.readers.frame_list import in_stream_order
-from ssplat_jax.errors import echo, refusal
+from ssplat_jax.errors import InputError, echo, refusal
 
 READERS = (  # the first one that matches reads the capture
     transforms_json,
@@ -67,12 +67,12 @@ def open_capture(path: str | Path, *, size: tuple[int, int] | None = None) -> Ca
     if str(path).startswith(f"{PROCEDURAL}:"):
         return open_procedural(str(path), size)
     path, options = split_options(str(path))
+    folder = without_tilde(path)
     try:
-        folder = Path(path).expanduser()
         found = next((reader for reader in READERS if reader.matches(folder)), None)
         exists = folder.exists()
-    except (OSError, RuntimeError, ValueError) as error:  # unknown user, name too long, no permission
-        raise refusal(str(path)[:80], wanted="a path", got=str(error)[:200], fix="check the path") from None
+    except (OSError, ValueError) as error:  # name too long, no permission
+        raise _no_path(path, error) from None
     if found is not None:
         usual = getattr(found, "CONVENTION", USUAL)
         written = dataclasses.replace(usual, **options)
@@ -94,6 +94,22 @@ def open_capture(path: str | Path, *, size: tuple[int, int] | None = None) -> Ca
         got, fix = "none of these", f"see --help of `ssplat inspect` for their files, or try {PROCEDURAL}:room"
     formats = ", ".join(reader.FORMAT for reader in READERS)
     raise refusal(str(path), wanted=f"a posed capture ({formats})", got=got, fix=fix)
+
+
+def without_tilde(path: str) -> Path:
+    """`path` with the home folder in place of a leading `~` or `~user`.
+
+    Raises:
+        InputError: there is no such user.
+    """
+    try:
+        return Path(path).expanduser()
+    except (RuntimeError, ValueError) as error:
+        raise _no_path(path, error) from None
+
+
+def _no_path(path: str, error: Exception) -> InputError:
+    return refusal(str(path)[:80], wanted="a path", got=str(error)[:200], fix="check the path")
 
 
 def is_capture(path: Path) -> bool:

@@ -74,7 +74,7 @@ def save_report(path: Path, report: Report) -> None:
     Raises:
         StorageError: the file cannot be written.
     """
-    write_atomic(path, page_text(report).encode())
+    write_atomic(path, page_text(report).encode(errors="replace"))
 
 
 def page_text(report: Report) -> str:

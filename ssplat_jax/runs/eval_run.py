@@ -10,7 +10,7 @@ import numpy as np
 from ssplat_jax.console import Reporter
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.index_files import Index, index_to_json, read_index, split_of_scene
-from ssplat_jax.data.open_capture import is_capture, open_capture
+from ssplat_jax.data.open_capture import is_capture, open_capture, without_tilde
 from ssplat_jax.data.pose_conventions import split_options, with_options
 from ssplat_jax.data.split import Split, choose_split
 from ssplat_jax.errors import InputError, echo, refusal
@@ -81,7 +81,7 @@ def eval_path(
     index, notes = read_index(options.index)
     reporter.warn_all(*notes)
     root, written = split_options(path)
-    folder = Path(root).expanduser()
+    folder = without_tilde(root)
     if options.scene is None and folder.is_dir() and not is_capture(folder):
         return _eval_scenes(model, params, folder, out, index, options, reporter, written)
     capture = open_capture(path, size=options.size)

@@ -93,4 +93,4 @@ def save_cameras(folder: Path, cameras: SceneCameras, offset: tuple[float, float
         ["# no points"],
     )
     for name, content in zip(FILES, contents, strict=True):
-        write_atomic(folder / name, "\n".join([TITLE, *content, ""]).encode("utf-8"))
+        write_atomic(folder / name, "\n".join([TITLE, *content, ""]).encode(errors="surrogateescape"))

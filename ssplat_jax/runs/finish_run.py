@@ -8,6 +8,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
+from ssplat_jax.checkpoint.weights import load_params, params_digest
 from ssplat_jax.console import Reporter
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.stream_frame import StreamFrame
@@ -74,15 +75,17 @@ def finish_run(
         "stream_frame": frame.to_dict(),
         "config_hash": run.session.model.config.hash,
     }
-    report_run(folder, metrics, path)
+    is_shipped = params_digest(run.session.params) == params_digest(load_params("tiny"))
+    report_run(folder, metrics, path, weights="" if is_shipped else " --weights WEIGHTS")
     write_json(folder.metrics, metrics)
     return report
 
 
 def forget_other_run(run: RunState, folder: RunFolder) -> None:
-    """Removes the metrics of another run from the folder of one that begins: its scene must not pass for this one's."""
+    """Removes the metrics and the refinement of an earlier run from the folder of a run that begins."""
     if run.num_views == 0:
         folder.metrics.unlink(missing_ok=True)
+        folder.clear_refinement()
 
 
 def finished_scene(folder: RunFolder, num_views: int) -> int | None:

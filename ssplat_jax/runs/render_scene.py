@@ -66,8 +66,8 @@ def render_scene(
         The number of pictures, without those of the film.
 
     Raises:
-        InputError: the scene or the capture is unusable, the capture lies in `out`, a film is wanted without PyAV, or
-            one exposure of a scene whose run is unknown.
+        InputError: the scene or the capture is unusable, the capture lies in `out`, `out` holds a run, a film is wanted
+            without PyAV, or one exposure of a scene whose run is unknown.
         StorageError: `out` cannot be written, or adjusted poses of the scene's run are damaged.
     """
     require_positive(stride=stride)
@@ -81,6 +81,7 @@ def render_scene(
         splats = dataclasses.replace(splats, gaussians=gaussians)
     capture, folder = open_capture_of_scene(scene, path, size, reporter), RunFolder(out)
     capture.check_output_folder(out)
+    folder.check_no_run()
     indices = range(0, len(capture), stride)[:max_views]
     size = (capture.width, capture.height)
     writers = {kind: VideoWriter(*size) for kind in (film.shows if film else ())}

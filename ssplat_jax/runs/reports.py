@@ -33,13 +33,14 @@ FILES = (
 )
 
 
-def report_run(folder: RunFolder, metrics: dict[str, Any], path: str) -> None:
+def report_run(folder: RunFolder, metrics: dict[str, Any], path: str, weights: str = "") -> None:
     """Writes the report and the contact sheet of a run.
 
     Args:
         folder: the folder of the run, complete but for these.
         metrics: its metrics.
         path: the capture, as the user gave it.
+        weights: text to add to commands that need the weights, such as ` --weights WEIGHTS`; empty for `tiny`.
 
     Raises:
         StorageError: a file cannot be written.
@@ -70,9 +71,9 @@ def report_run(folder: RunFolder, metrics: dict[str, Any], path: str) -> None:
         files=_files(folder),
         commands=[
             f"ssplat view {out}    # in a browser",
-            f"ssplat refine {out} {capture} --steps 100    # revises the scene until it fits its views better",
+            f"ssplat refine {out} {capture} --steps 100{weights}    # revises the scene until it fits its views better",
             f"ssplat render {out} {capture} --size {width}x{height} --film 8 --out {film}    # a film",
-            f"ssplat export {out} --to scene.sog    # for other viewers, at an eighth of the size",
+            f"ssplat export {out} --to scene.sog{weights}    # for other viewers, at an eighth of the size",
         ],
         details=_details(metrics),
     )

@@ -150,19 +150,21 @@ def setting_for_run(
     capture, folder = open_capture(path, size=size), RunFolder(out)
     capture.check_output_folder(out)
     asked = {"budget_ms": budget_ms, "size": [capture.width, capture.height]}
-    if not overwrite and (held := _read_choice(folder.budget, asked)) is not None:
+    # A larger image than the capture has would cost time and show nothing more; a procedural one has any size.
+    stored = [open_capture(path)] if path.startswith("procedural:") else capture.frames
+    max_factor = max(1.0, min(min(image.width / capture.width, image.height / capture.height) for image in stored))
+    held = None if overwrite else _read_choice(folder.budget, asked)
+    # Without a saved state, the choice may be that of another capture.
+    if held is not None and (folder.has_state() or held.record.get("max_factor") == max_factor):
         return held
     if not overwrite and folder.has_state():  # its choice stays, so that it can continue
         fix = "repeat its options, or start anew with --overwrite"
         got = f"{budget_ms:g} at {capture.width}x{capture.height}"
         raise refusal("--budget-ms", wanted=f"what the run in {out} began with", got=got, fix=fix)
-    # A larger image than the capture has would cost time and show nothing more; a procedural one has any size.
-    stored = [open_capture(path)] if path.startswith("procedural:") else capture.frames
-    max_factor = max(1.0, min(min(image.width / capture.width, image.height / capture.height) for image in stored))
     reference_ms = reference_step_ms()
     point, ms = choose(load_front(), budget_ms, (capture.width, capture.height), reference_ms, max_factor=max_factor)
     reporter.say(f"--budget-ms {budget_ms:g}: {point.setting}, about {ms:.0f} ms a view on this machine")
-    expected = {"expected_ms": round(ms, 1), "reference_ms": round(reference_ms, 2)}
+    expected = {"expected_ms": round(ms, 1), "reference_ms": round(reference_ms, 2), "max_factor": max_factor}
     return Choice(point, folder.budget, asked | expected | {"point": dataclasses.asdict(point)})
 
 

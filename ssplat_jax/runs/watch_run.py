@@ -13,6 +13,8 @@ from ssplat_jax.checkpoint.stream_state import load_newest_state
 from ssplat_jax.console import Reporter
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.growing_capture import is_done, open_growing
+from ssplat_jax.data.open_capture import without_tilde
+from ssplat_jax.data.readers.transforms_json import num_listed
 from ssplat_jax.errors import InputError, refusal, require_positive
 from ssplat_jax.evaluation.scoring import check_scorable
 from ssplat_jax.runs.capture_run import DeltaWriter, RunResult, check_num_frames, start_deltas
@@ -68,7 +70,7 @@ def watch_capture(
         got, fix = str(options.quiet_seconds), "give a number of seconds"
         raise refusal("--quiet-seconds", wanted="a positive time", got=got, fix=fix)
     assert model.config.stream.causal
-    watch = _Watch(model, params, Path(path).expanduser(), RunFolder(out), options, reporter)
+    watch = _Watch(model, params, without_tilde(path), RunFolder(out), options, reporter)
     with Interrupts(has_work=False) as interrupts:
         ended = watch.wait_for_frames(interrupts)
         if interrupts.received:
@@ -102,6 +104,7 @@ class _Watch:
     capture: Capture | None = None
     indices: list[int] = dataclasses.field(default_factory=list)  # frames whose images are complete, in their order
     problem: str | None = None  # why no more frames are complete
+    num_listed: int = 0  # frames that the listing has, complete or not
     last_change: float = dataclasses.field(default_factory=time.monotonic)
 
     def known(self) -> Capture:
@@ -116,6 +119,9 @@ class _Watch:
     def look(self) -> bool:
         """Looks at the folder; returns whether nothing more is to be expected."""
         said_so = is_done(self.path)  # before the look: what was written before the file counts
+        listed = num_listed(self.path)
+        if listed > self.num_listed:
+            self.num_listed, self.last_change = listed, time.monotonic()
         capture, self.problem = open_growing(self.path, size=self.options.size)
         if capture is not None:
             self._take(capture.scaled(self.options.scale))
@@ -190,10 +196,11 @@ class _Watch:
                 break
             else:
                 time.sleep(POLL_SECONDS)
-            ended = self.look() or ended
+            ended = ended or self.look()  # what comes after the end is for the next call
         if num_chunks % self.options.save_every or interrupts.received:
             self._save(run)
-        if not interrupts.received and self.problem is not None:
+        has_all = len(self.indices) == self.options.max_views
+        if not interrupts.received and self.problem is not None and not has_all:
             self.reporter.warn(f"{self.problem} It and the frames after it are left out.")
 
     def _feed(self, run: RunState, group: list[int], writer: DeltaWriter | None, recorder: ChunkRecorder) -> None:

@@ -119,3 +119,10 @@ def test_an_error_is_raised_if_all_checkpoints_are_damaged(tmp_path):
     with pytest.raises(StorageError, match="checkpoints 2, 1 are damaged"):
         restored(tmp_path)
     assert sorted(p.name for p in (tmp_path / "checkpoints").iterdir() if p.is_dir()) == ["1", "2"]
+
+
+@pytest.mark.parametrize("contents", ["{", "[]", "{}"])
+def test_a_damaged_description_is_named(tmp_path, contents):
+    (tmp_path / "recipe.json").write_text(contents)
+    with pytest.raises(StorageError, match=r"recipe\.json: damaged"):
+        TrainingCheckpoints(tmp_path, {"seed": 0}, upgrade=lambda held: {"seed": held["seed"]})

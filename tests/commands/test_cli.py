@@ -39,6 +39,7 @@ from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.streaming.scene_delta import apply_delta
 from ssplat_jax.streaming.streamsplat import StreamSplat
 from tests.model.resplat_fixture import named_tensor
+from tests.scene_files import scene_fixture
 
 
 @pytest.fixture(autouse=True)
@@ -212,6 +213,7 @@ def test_results_among_the_captures_own_images_are_refused(command, place, tmp_p
         (("run", "x", "--out", "y", "--set", "a=1", "--revise", "poses", "--set", "b=2"), "wanted --set once, got it"),
         (("run", "procedural:room", "--causal", "--revise", "poses", "--out", "x"), "--revise poses: wanted a stream"),
         (("eval", "procedural:room?size=32x24", "--causal", "--revise", "auto", "--out", "x"), "--revise auto: wanted"),
+        (("run", "x", "--budget-ms", "9", "--online-refine", "5", "--out", "x"), "wanted it without --online-refine"),
         (("train", "--seed", "-1", "--out", "x"), "--seed: wanted a number from 0"),
         (("train", "--seed", str(2**63), "--out", "x"), "--seed: wanted a number from 0"),
         (("train", "--scale-steps", "inf", "--out", "x"), "--scale-steps: wanted a finite number above 0"),
@@ -234,13 +236,16 @@ def test_lpips_weights_are_refused_where_nothing_is_rendered(tmp_path, capsys, m
     assert not (tmp_path / "x").exists()
 
 
-@pytest.mark.parametrize("command", ["demo", "eval", "eval --index"])
+@pytest.mark.parametrize("command", ["demo", "eval", "eval --index", "render"])
 def test_files_of_a_run_are_not_replaced_by_other_commands(command, tmp_path, capsys):
     out = tmp_path / "out"
     out.mkdir()
     for name in ("state.npz", "scene.ply", "metrics.json", "refined.ply"):
         (out / name).write_text("of a run")
-    arguments = {"demo": (), "eval": ("procedural:room?frames=12&size=32x24",)}.get(command)
+    room = "procedural:room?frames=12&size=32x24"
+    arguments = {"demo": (), "eval": (room,), "render": (str(tmp_path / "a.ply"), room)}.get(command)
+    if command == "render":
+        save_ply(tmp_path / "a.ply", scene_fixture.scene(0, n=5))
     if arguments is None:  # eval of scenes
         make_capture(tmp_path / "scenes" / "wall", num_frames=3)
         (tmp_path / "index.json").write_text(json.dumps({"wall": {"context": [0, 2], "target": [1]}}))

@@ -1,17 +1,20 @@
 """`ssplat run --watch`: a folder that grows gives what the finished folder gives."""
 
+import dataclasses
 import json
 import os
 import shutil
 import signal
 import threading
 import time
+from types import SimpleNamespace
 
 import jax
 import pytest
 
 from ssplat_jax.checkpoint.weights import save_weights
 from ssplat_jax.console import Reporter
+from ssplat_jax.data.growing_capture import is_done
 from ssplat_jax.runs import watch_run
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.streaming.streamsplat import StreamSplat
@@ -56,22 +59,28 @@ def test_a_growing_folder_gives_the_scene_of_the_whole_one(tmp_path, narrow):
         out.mkdir()
         (out / "scene.ply").write_bytes(b"of another run")
         (out / "metrics.json").write_text(json.dumps({"views": 10, "ply": {"num_written": 5}}))
+        (out / "refined.ply").write_bytes(b"of another run")
     watching = ("--watch", "--quiet-seconds", "60", "--deltas", "--save-every", "1")
     assert run("run", str(growing), "--out", str(outs[1]), *watching, *narrow) == 0
     writer.join()
     assert run("run", str(whole), "--causal", "--deltas", "--out", str(outs[0]), *narrow) == 0
     for name in ("scene.ply", *(f"deltas/{views:06d}.npz" for views in (4, 8, 10))):
         assert (outs[1] / name).read_bytes() == (outs[0] / name).read_bytes(), name
+        assert (outs[1] / "report.html").read_text().count("--weights WEIGHTS") == 2
+    assert not any((out / "refined.ply").exists() for out in outs)
     # The finished folder is the causal run of the finished capture.
     assert run("run", str(growing), "--causal", "--out", str(outs[1]), *narrow) == 0
 
 
-def test_frames_that_are_left_out_are_signs_of_life_too(tmp_path, monkeypatch):
+@pytest.mark.parametrize("stride", [8, 1])
+def test_frames_that_are_only_listed_are_signs_of_life_too(stride, tmp_path, monkeypatch):
     now = [0.0]
     monkeypatch.setattr(watch_run.time, "monotonic", lambda: now[0])
     whole = make_capture(tmp_path / "whole", num_frames=9, size=SIZE)
+    if stride == 1:
+        (whole / "images" / "1.png").unlink()  # still on its way, while others are listed
     facts = json.loads((whole / "transforms.json").read_text())
-    options = watch_run.WatchOptions(stride=8, quiet_seconds=1.0)
+    options = watch_run.WatchOptions(stride=stride, quiet_seconds=1.0)
     model = StreamSplat(NARROW)
     watch = watch_run._Watch(model, {}, whole, RunFolder(tmp_path), options, Reporter(quiet=True))
     for count in range(1, 9):
@@ -80,6 +89,71 @@ def test_frames_that_are_left_out_are_signs_of_life_too(tmp_path, monkeypatch):
         assert not watch.look() and watch.indices == [0]
     now[0] += 1.1
     assert watch.look()
+
+
+@dataclasses.dataclass
+class Fed:
+    """A run that is fed without a model."""
+
+    num_views: int = 0
+
+
+def watched(whole, tmp_path, monkeypatch, **options):
+    """A watch that feeds no model, the run that it feeds, and the sizes of the chunks."""
+    monkeypatch.setattr(watch_run, "start_deltas", lambda *given: None)
+    monkeypatch.setattr(watch_run.ChunkRecorder, "start", lambda self, run: None)
+    monkeypatch.setattr(watch_run._Watch, "_save", lambda self, run: None)
+    given = watch_run.WatchOptions(**options)
+    watch = watch_run._Watch(StreamSplat(NARROW), {}, whole, RunFolder(tmp_path / "out"), given, Reporter())
+    fed, sizes = Fed(), []
+
+    def feed(self, run, group, *more):
+        sizes.append(len(group))
+        run.num_views += len(group)
+
+    monkeypatch.setattr(watch_run._Watch, "_feed", feed)
+    return watch, fed, sizes
+
+
+def test_frames_that_come_after_the_end_are_for_the_next_call(tmp_path, monkeypatch):
+    """Otherwise every later frame would be a chunk of its own, padded."""
+    whole = make_capture(tmp_path / "whole", num_frames=8, size=SIZE)
+    facts = json.loads((whole / "transforms.json").read_text())
+    write = lambda n: (whole / "transforms.json").write_text(json.dumps(facts | {"frames": facts["frames"][:n]}))  # noqa: E731
+    write(6)
+    watch, fed, sizes = watched(whole, tmp_path, monkeypatch)
+    watch.look()
+    feed = watch_run._Watch._feed
+    monkeypatch.setattr(watch_run._Watch, "_feed", lambda *given: (write(8), feed(*given)))
+    watch_run._Watch.stream.__wrapped__(watch, fed, SimpleNamespace(received=None), True)
+    assert sizes == [4, 2] and fed.num_views == 6
+
+
+def test_a_frame_beyond_those_asked_for_is_not_missed(tmp_path, monkeypatch, capsys):
+    whole = make_capture(tmp_path / "whole", num_frames=9, size=SIZE)
+    (whole / "images" / "8.png").unlink()
+    for max_views, words in ((8, ""), (None, "left out")):
+        watch, fed, sizes = watched(whole, tmp_path, monkeypatch, max_views=max_views)
+        watch.look()
+        watch_run._Watch.stream.__wrapped__(watch, fed, SimpleNamespace(received=None), True)
+        assert sizes == [4, 4] and words in (told := capsys.readouterr().err) and bool(words) == bool(told)
+
+
+def test_the_file_done_is_found_from_the_listing_too(tmp_path):
+    capture = make_capture(tmp_path / "c", num_frames=2, size=SIZE)
+    for path in (capture, capture / "transforms.json"):
+        assert not is_done(path)
+    (capture / "done").touch()
+    for path in (capture, capture / "transforms.json"):
+        assert is_done(path)
+
+
+@pytest.mark.parametrize("command", ["run --watch", "eval --index"])
+def test_a_user_that_there_is_not_is_named(command, tmp_path, narrow, capsys):
+    (tmp_path / "i.json").write_text('{"a": {"context": [0], "target": [1]}}')
+    options = {"run --watch": ("--watch",), "eval --index": ("--index", str(tmp_path / "i.json"))}[command]
+    assert run(command.split()[0], "~nosuchuser/c", *options, "--out", str(tmp_path / "out"), *narrow) == 2
+    assert "~nosuchuser/c: wanted a path" in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -1,5 +1,7 @@
 """Captures: digests, cameras and chunks. Refusals are tested in tests/badinputs."""
 
+import dataclasses
+
 import jax
 import numpy as np
 import pytest
@@ -27,7 +29,7 @@ def test_image_digests_depend_on_the_given_frames_and_bytes(tmp_path):
     assert capture.images_digest([0, 1]) != before
 
 
-@pytest.mark.parametrize("path", ["~nosuchuser/capture", "a" * 300, "a\0b"])
+@pytest.mark.parametrize("path", ["~nosuchuser/capture", "~a\0b", "a" * 300, "a\0b"])
 def test_invalid_paths_are_refused(path):
     with pytest.raises(InputError, match=r"wanted a p(ath|osed capture)"):
         open_capture(path)
@@ -137,3 +139,11 @@ def test_a_scene_file_is_seen_from_the_cameras_of_its_capture():
 
     seen = pixels(capture.camera(0), points)
     np.testing.assert_allclose(seen, pixels(capture.camera(0, frame), frame.points_to_stream(points)), atol=1e-3)
+
+
+def test_names_that_are_not_utf8_have_digests():
+    """Names on Linux are bytes; Python keeps the others as surrogates."""
+    capture = open_capture("procedural:room?frames=2")
+    named = lambda name: dataclasses.replace(capture, frames=(dataclasses.replace(capture.frames[0], name=name),))  # noqa: E731
+    digests = [named(name).digest([0]) for name in ("caf\udce9.jpg", "caf\udcea.jpg", "caf.jpg")]
+    assert len(set(digests)) == 3

@@ -1,5 +1,6 @@
 """`ssplat export --cameras`: a COLMAP model beside the scene whose cameras see the scene as the capture's do."""
 
+import dataclasses
 import json
 import shutil
 
@@ -10,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 import ssplat_jax as ss
 from ssplat_jax.gaussians import Gaussians
+from ssplat_jax.runs.export_cameras import SceneCameras, save_cameras
 from ssplat_jax.scene_files.ply import save_ply
 from tests.commands.test_cli import make_capture, run
 from tests.scene_files.scene_fixture import scene
@@ -111,3 +113,12 @@ def test_missing_captures_are_refused_before_anything_is_written(tmp_path, capsy
     to = tmp_path / "to" / "scene.ply"
     assert run("export", str(tmp_path / "scene.ply"), "--to", str(to), "--cameras", str(tmp_path / "no")) == 2
     assert capsys.readouterr().err.count("\n") == 1 and not to.parent.exists()
+
+
+def test_names_that_are_not_utf8_are_written_as_their_bytes(tmp_path):
+    """Names on Linux are bytes; Python keeps the others as surrogates."""
+    opened = ss.open_capture("procedural:room?frames=2")
+    frames = [dataclasses.replace(frame, name=f"caf\udce9{i}.jpg") for i, frame in enumerate(opened.frames)]
+    cameras = SceneCameras(dataclasses.replace(opened, frames=tuple(frames)), [0, 1])
+    save_cameras(tmp_path, cameras, (0.0, 0.0, 0.0))
+    assert b" caf\xe91.jpg\n" in (tmp_path / "images.txt").read_bytes()

@@ -134,6 +134,22 @@ def test_printed_commands_are_words_of_a_shell(tmp_path):
     assert [words[1] for words in commands] == ["view", "refine", "render", "export"]
     assert all(words[2] == str(folder.path) for words in commands)
     assert commands[1][3] == commands[2][3] == path and commands[2][-1] == f"{folder.path}_film"
+    assert not any("--weights" in words for words in commands)
+
+
+def test_commands_of_a_run_with_other_weights_ask_for_them(folder):
+    metrics = COMMON | {"views": 4, "ply": {"num_written": 5}, "seen_views": [score(0)]}
+    report_run(folder, metrics, "x", weights=" --weights WEIGHTS")
+    lines = [line.split("#")[0].strip() for line in Page(folder.report.read_text()).text.splitlines()]
+    wanted = [line.split()[1] for line in lines if line.startswith("ssplat ") and line.endswith(" --weights WEIGHTS")]
+    assert wanted == ["refine", "export"]
+
+
+def test_a_name_that_is_not_utf8_ends_no_run(folder):
+    """Names on Linux are bytes; Python keeps the others as surrogates."""
+    metrics = COMMON | {"views": 4, "ply": {"num_written": 5}, "seen_views": [score(0)], "capture": "caf\udce9"}
+    report_run(folder, metrics, "caf\udce9")
+    assert "caf?" in folder.report.read_text()
 
 
 def test_the_report_of_a_run_without_records_or_pictures_is_whole(folder):

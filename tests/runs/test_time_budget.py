@@ -54,6 +54,20 @@ def test_no_image_is_streamed_larger_than_the_capture_has_it(tmp_path, monkeypat
     assert choice.point.setting == chosen
 
 
+def test_the_choice_for_another_capture_is_not_taken(tmp_path, monkeypatch):
+    """A run that was stopped before its first save leaves its choice; it does not fit a smaller or larger capture."""
+    front = Front((64, 48), (FrontPoint("plain", 1.0, {}, 1.0, 20.0), FrontPoint("large", 1.5, {}, 2.0, 22.0)))
+    monkeypatch.setattr(time_budget, "reference_step_ms", lambda: 1.0)
+    monkeypatch.setattr(time_budget, "load_front", lambda: front)
+    large, small = "procedural:room?frames=8", str(make_capture(tmp_path / "small", num_frames=4, size=(64, 48)))
+    out = tmp_path / "out"
+    out.mkdir()
+    for path, setting in ((large, "large"), (small, "plain"), (large, "large")):
+        choice = setting_for_run(1e6, path, (64, 48), out, overwrite=False, reporter=QUIET)
+        assert choice.point.setting == setting
+        choice.save()
+
+
 def test_images_of_several_sizes_need_a_size_alone(tmp_path, monkeypatch):
     capture = make_capture(tmp_path / "c", num_frames=4, size=(64, 48))
     facts = json.loads((capture / "transforms.json").read_text())

@@ -73,6 +73,15 @@ def read_complete(path: Path) -> tuple[Listing, str | None]:
     return listing, problems[0] if problems else None
 
 
+def num_listed(path: Path) -> int:
+    """Number of frames that the file lists, readable or not; 0 while the file itself cannot be read."""
+    try:
+        entries = load_json(_file(path)).get("frames")
+    except InputError:
+        return 0
+    return len(entries) if isinstance(entries, list) else 0
+
+
 def _read(path: Path, problems: list[str] | None) -> Listing:
     """The frames of a capture; with `problems`, those before the first problem, which is added to the list."""
     file = _file(path)
