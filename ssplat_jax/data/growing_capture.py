@@ -34,5 +34,5 @@ def open_growing(path: Path, *, size: tuple[int, int] | None) -> tuple[Capture |
 
 
 def is_done(path: Path) -> bool:
-    """True if a file `done` lies in the folder of a capture, which `path` or its transforms.json names."""
+    """True if a file `done` lies in the folder `path`, or beside the file `path`."""
     return ((path.parent if path.is_file() else path) / DONE).exists()

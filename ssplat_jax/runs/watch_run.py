@@ -104,7 +104,7 @@ class _Watch:
     capture: Capture | None = None
     indices: list[int] = dataclasses.field(default_factory=list)  # frames whose images are complete, in their order
     problem: str | None = None  # why no more frames are complete
-    num_listed: int = 0  # frames that the listing has, complete or not
+    most_listed: int = 0  # frames that the listing has had, complete or not
     last_change: float = dataclasses.field(default_factory=time.monotonic)
 
     def known(self) -> Capture:
@@ -120,8 +120,8 @@ class _Watch:
         """Looks at the folder; returns whether nothing more is to be expected."""
         said_so = is_done(self.path)  # before the look: what was written before the file counts
         listed = num_listed(self.path)
-        if listed > self.num_listed:
-            self.num_listed, self.last_change = listed, time.monotonic()
+        if listed > self.most_listed:
+            self.most_listed, self.last_change = listed, time.monotonic()
         capture, self.problem = open_growing(self.path, size=self.options.size)
         if capture is not None:
             self._take(capture.scaled(self.options.scale))
