@@ -101,13 +101,15 @@ class Run:
 
     def _check(self) -> None:
         """Refuses options that contradict each other."""
+        from ssplat_jax.data.pose_conventions import split_options
+
         check_refinement(self.refine_steps, self.revise, "--refine")
         if self.quiet_seconds != Run.quiet_seconds and not self.watch:
             raise InputError("--quiet-seconds: wanted --watch beside it, which it is for; got none.")
         for name in {"poses", "auto"} & set(self.revise):  # before the stream, they look at all frames
             if self.watch:
                 raise InputError(f"--revise {name}: wanted a capture that is complete, got --watch; leave one out.")
-        if self.watch and (self.axes or self.poses):
+        if self.watch and (self.axes or self.poses or split_options(self.capture)[1]):
             raise InputError("--watch: wanted poses as transforms.json has them, got --axes or --poses; leave one out.")
         if self.hold_back and self.watch:
             raise InputError("--hold-back: wanted a capture that is complete; got --watch. Leave one out.")

@@ -62,7 +62,7 @@ class FilePixels:
         if frame.lens is None:
             return depth
         sizes = np.array([depth.shape[1] / frame.width, depth.shape[0] / frame.height, 1.0])
-        return undistort(depth, frame.lens, np.diag(sizes) @ frame.K, order=0)
+        return undistort(depth, frame.lens, np.diag(sizes) @ frame.K, order=0, outside=0.0)
 
     def has_depth(self, i: int) -> bool:
         return self.frames[i].depth_path is not None

@@ -104,7 +104,12 @@ def check_lens(lens: Lens, K: Float64[np.ndarray, "3 3"], width: int, height: in
 
 
 def undistort(
-    image: Float32[np.ndarray, "h w *c"], lens: Lens, K: Float64[np.ndarray, "3 3"], *, order: int = 1
+    image: Float32[np.ndarray, "h w *c"],
+    lens: Lens,
+    K: Float64[np.ndarray, "3 3"],
+    *,
+    order: int = 1,
+    outside: float | None = None,
 ) -> Float32[np.ndarray, "h w *c"]:
     """Returns the image that a pinhole camera would have taken.
 
@@ -113,15 +118,17 @@ def undistort(
         lens: its distortion.
         K: intrinsics of both images, in pixels.
         order: 1 samples linearly, 0 takes the nearest pixel (for depth maps).
+        outside: value of pixels that the stored image does not show; by default they repeat its border.
 
     Returns:
-        The undistorted image; pixels outside the stored image repeat its border.
+        The undistorted image.
     """
+    mode, fill = ("edge", 0.0) if outside is None else ("constant", outside)
     rows, columns = np.mgrid[: image.shape[0], : image.shape[1]]
     pixels = lens.pixels(K, np.stack([columns, rows], axis=-1) + 0.5) - 0.5
     at = np.moveaxis(pixels[..., ::-1], -1, 0)
     planes = [
-        warp(plane, at, order=order, mode="edge", preserve_range=True).astype(np.float32)
+        warp(plane, at, order=order, mode=mode, cval=fill, preserve_range=True).astype(np.float32)
         for plane in np.moveaxis(image.reshape(*image.shape[:2], -1), -1, 0)
     ]
     return np.stack(planes, axis=-1).reshape(image.shape)

@@ -37,6 +37,8 @@ from ssplat_jax.storage.folder_lock import lock_folder
 from ssplat_jax.storage.json_files import write_json
 
 RECORD = "poses.json"
+MIN_READ_SHARE = 0.95
+"""Share of the announced frames of a video below which a warning says that it could not be read to its end."""
 OWN_FOLDERS = ("images", "images.partial", "sparse", "sparse.partial")
 OWN_FILES = (RECORD, "transforms.json", "database.db", "database.db-shm", "database.db-wal", "database.pairs.txt")
 
@@ -187,8 +189,14 @@ def _copy_photos(source: Path, folder: Path, options: PoseOptions, reporter: Rep
 
 
 def _choose_from_video(source: Path, folder: Path, options: PoseOptions, reporter: Reporter) -> list[str]:
-    with reporter.progress("looking at the video", count_frames(source), waiting="") as advance:
+    announced = count_frames(source)
+    with reporter.progress("looking at the video", announced, waiting="") as advance:
         scan = scan_video(source, advance)
+    if (found := len(scan.motion)) < MIN_READ_SHARE * announced:
+        reporter.warn(
+            f"{source}: {found} of about {announced} frames can be read; the rest is left out. If the video plays to its"
+            " end, convert it with `ffmpeg -i INPUT output.mp4`"
+        )
     chosen = choose_frames(scan.motion, scan.sharpnesses, options.max_frames)
     with reporter.progress("frames", len(chosen), waiting="") as advance:
         return write_frames(source, chosen.tolist(), folder, options.max_side, advance)

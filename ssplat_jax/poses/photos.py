@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image
+from PIL.ExifTags import IFD, Base
 
 from ssplat_jax.data.images import DEPTH_MODES, ORIENTATION, UPRIGHT, image_size
 from ssplat_jax.data.open_capture import IMAGE_SUFFIXES, UNREADABLE_SUFFIXES
@@ -23,6 +24,18 @@ TURNS = {
     8: Image.Transpose.ROTATE_90,
 }
 """Transpositions that bring photos upright, by the EXIF orientation."""
+MAX_EXIF_BYTES = 65_533
+"""Longest EXIF data of a JPEG file."""
+FOCAL_TAGS = (
+    Base.FocalLength,
+    Base.FocalLengthIn35mmFilm,
+    Base.FocalPlaneXResolution,
+    Base.FocalPlaneYResolution,
+    Base.FocalPlaneResolutionUnit,
+    Base.ExifImageWidth,
+    Base.ExifImageHeight,
+)
+"""EXIF tags from which COLMAP takes the focal length."""
 SUFFIXES = IMAGE_SUFFIXES - UNREADABLE_SUFFIXES
 
 
@@ -58,15 +71,16 @@ def copy_photos(photos: list[Path], folder: Path, max_side: int, advance: Callab
         advance: called with the number of files so far.
 
     Returns:
-        The names of the copies, without spaces.
+        The names of the copies. An underscore stands for each space, for a `#` at the start, which would begin a comment
+        in COLMAP's lists, and for what is not UTF-8.
 
     Raises:
-        InputError: a file is no readable image, or two names differ in spaces alone.
+        InputError: a file is no readable image, or two names differ in these characters alone.
     """
     names: list[str] = []
     for photo in photos:
         size = image_size(photo)
-        name = re.sub(r"\s", "_", photo.name)
+        name = re.sub(r"\s|^#|[\ud800-\udfff]", "_", photo.name)  # Python writes other bytes as surrogates
         with Image.open(photo) as picture:
             _load(picture, photo)
             orientation, exif = _exif_of(picture)
@@ -97,9 +111,18 @@ def _exif_of(picture: Image.Image) -> tuple[int, bytes]:
         if exif.get(ORIENTATION) in TURNS:
             orientation = exif[ORIENTATION]
         exif.pop(ORIENTATION, None)
-        return orientation, exif.tobytes()
+        choices = (exif.tobytes(), _camera_tags(exif).tobytes(), b"")
+        return orientation, next(data for data in choices if len(data) <= MAX_EXIF_BYTES)
     except Exception:  # Pillow's parser raises nearly anything on damaged data
         return orientation, b""
+
+
+def _camera_tags(exif: Image.Exif) -> Image.Exif:
+    """The camera's name and focal length of EXIF data that are too long for a JPEG file."""
+    kept, inner = Image.Exif(), exif.get_ifd(IFD.Exif)
+    kept.update({tag: exif[tag] for tag in (Base.Make, Base.Model) if tag in exif})
+    kept[IFD.Exif] = {tag: inner[tag] for tag in FOCAL_TAGS if tag in inner}
+    return kept
 
 
 def _load(picture: Image.Image, photo: Path) -> None:

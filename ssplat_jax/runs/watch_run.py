@@ -2,7 +2,8 @@
 
 The stream is causal. Frames are taken in the order of the capture; a frame that cannot be read yet holds back those
 after it. The run ends when the folder holds a file `done`, or when for some seconds no frame has been listed and none
-has become complete; the last chunk is then padded. What cannot be read at the end is left out, with a warning.
+has become complete; the last chunk is then padded. Frames that cannot be read at the end are left out, with a
+warning.
 """
 
 import dataclasses

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from ssplat_jax.data.lens import FisheyeLens, Lens, check_lens, undistort
 from ssplat_jax.data.open_capture import open_capture
@@ -85,6 +86,28 @@ def test_no_distortion_changes_nothing():
 def test_depth_is_not_mixed_across_edges():
     depth = np.where(centers()[..., 0] < 70, 1.0, 5.0).astype(np.float32)
     assert set(np.unique(undistort(depth, LENSES[0], K, order=0))) == {1.0, 5.0}
+
+
+def test_depth_maps_of_another_size_are_undistorted_and_unknown_outside(tmp_path):
+    """Each pixel shows what the published formula finds in the stored map, and 0 beyond its border."""
+    high, wide = HEIGHT // 2, WIDTH // 4
+    stored = np.arange(1000, 1000 + high * wide, dtype=np.uint16).reshape(high, wide)
+
+    def bend(root, meta):
+        meta.update(k1=0.4)
+        Image.fromarray(stored).save(root / "depth.png")
+        meta["frames"][0]["depth_file_path"] = "depth.png"
+
+    capture = open_capture(make_capture(tmp_path / "c", bend))
+    (fx, _, cx), (_, fy, cy), _ = capture.frames[0].K * [[1 / 4], [1 / 2], [1]]
+    rows, columns = np.mgrid[:high, :wide] + 0.5
+    x, y = (columns - cx) / fx, (rows - cy) / fy
+    factor = 1 + 0.4 * (x * x + y * y)
+    columns, rows = (np.floor(v).astype(int) for v in (fx * factor * x + cx, fy * factor * y + cy))
+    inside = (rows >= 0) & (rows < high) & (columns >= 0) & (columns < wide)
+    expected = np.where(inside, stored[rows.clip(0, high - 1), columns.clip(0, wide - 1)] / 1000, 0.0)
+    assert 0.02 < np.mean(expected == 0) < 0.5
+    np.testing.assert_allclose(capture.pixels.depth(0), expected, rtol=1e-6)
 
 
 @pytest.mark.parametrize("lens", [Lens(k1=-3.0), Lens(k1=1e308), Lens(k1=50.0), Lens(p1=5.0)], ids=str)

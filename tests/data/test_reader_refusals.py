@@ -47,6 +47,10 @@ def remove(file):
     return lambda root: (root / file).unlink()
 
 
+def empty(folder):
+    return lambda root: [file.unlink() for file in (root / folder).rglob("*.jpg")]
+
+
 def _edit_json(file, change):
     contents = json.loads(file.read_text())
     change(contents)
@@ -75,7 +79,7 @@ BAD = {
         write("sparse/0/cameras.bin", struct.pack("<Q", 1) + camera_bytes(1, (FX, FY, CX, CY), camera=2)),
         ("camera 1, which is missing",),
     ),
-    "image missing": ("COLMAP", remove("images/9.jpg"), ("9.jpg", "does not exist")),
+    "images missing": ("COLMAP", empty("images"), ("10.jpg", "does not exist")),
     "image of another size": (
         "COLMAP",
         lambda root: write_image(root / "images" / "9.jpg", 0, (WIDTH, WIDTH)),

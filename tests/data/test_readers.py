@@ -1,5 +1,8 @@
 """Readers: one capture is the same in every format."""
 
+import json
+import shutil
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -28,6 +31,7 @@ from tests.data.capture_writers import (
     write_image,
     write_llff,
     write_realestate,
+    write_record3d,
     write_scannet,
     write_tum,
 )
@@ -304,3 +308,72 @@ def test_shrunk_images_stand_in_for_missing_ones(kind, tmp_path):
         write_image(tmp_path / "images_2" / file.name, i, (WIDTH // 2, HEIGHT // 2))
     (tmp_path / "images").rename(tmp_path / "elsewhere")
     np.testing.assert_allclose(open_capture(tmp_path).K(0)[:2], whole[:2] / 2, rtol=1e-12)
+
+
+def test_record3d_images_may_have_intrinsics_of_their_own(tmp_path):
+    write_record3d(tmp_path)
+    file = tmp_path / "metadata.json"
+    meta = json.loads(file.read_text())
+    rows = [[FX + i, FY - i, CX + 0.5 * i, CY - 0.25 * i] for i in range(NUM_FRAMES)]
+    file.write_text(json.dumps(meta | {"perFrameIntrinsicCoeffs": rows}))
+    capture = open_capture(tmp_path)
+    for i, (fx, fy, cx, cy) in enumerate(rows):
+        np.testing.assert_array_equal(capture.K(i), [[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    file.write_text(json.dumps(meta | {"perFrameIntrinsicCoeffs": rows[1:]}))
+    with pytest.raises(InputError, match="perFrameIntrinsicCoeffs: wanted 4 x 4 finite numbers"):
+        open_capture(tmp_path)
+
+
+def test_a_larger_colmap_model_beside_the_one_that_is_read_is_named(tmp_path):
+    write_colmap_text(tmp_path)
+    (tmp_path / "sparse" / "0").rename(tmp_path / "sparse" / "1")
+    lines = (tmp_path / "sparse" / "1" / "images.txt").read_text().splitlines()
+    (tmp_path / "sparse" / "0").mkdir()
+    (tmp_path / "sparse" / "0" / "images.txt").write_text("\n".join(lines[:4]) + "\n")  # of two lines an image
+    cameras = (tmp_path / "sparse" / "1" / "cameras.txt").read_text()
+    (tmp_path / "sparse" / "0" / "cameras.txt").write_text(cameras)
+    capture = open_capture(tmp_path)
+    assert len(capture) == 1
+    assert capture.notes == (
+        "3 images in images/ are left out: COLMAP did not register them.",
+        "sparse/1 holds 4 images, sparse/0, which is read, 1; swap them to read it.",
+    )
+    (tmp_path / "sparse" / "1" / "images.txt").write_text("\n".join(lines[:4]) + "\n")  # as many
+    assert len(open_capture(tmp_path).notes) == 1
+
+
+def test_colmap_images_whose_files_are_missing_are_counted(tmp_path):
+    write_colmap_binary(tmp_path)
+    (tmp_path / "images" / "9.jpg").unlink()
+    capture = open_capture(tmp_path)
+    assert tuple(frame.name for frame in capture.frames) == ("10.jpg", "b 0.jpg", "c/1.jpg")
+    assert capture.notes == ("1 of 4 registered images are skipped: their files are missing.",)
+
+
+def test_tum_files_that_are_missing_are_counted(tmp_path):
+    write_tum(tmp_path)
+    sorted((tmp_path / "rgb").iterdir())[1].unlink()
+    (tmp_path / "depth" / "3.png").unlink()
+    capture = open_capture(tmp_path)
+    assert tuple(frame.name for frame in capture.frames) == tuple(NAMES["TUM RGB-D"][i] for i in (0, 2, 3))
+    assert [capture.pixels.has_depth(i) for i in range(3)] == [True, True, False]
+    assert capture.notes == tuple(f"1 files of {name}.txt are missing and left out." for name in ("rgb", "depth"))
+    for file in (tmp_path / "rgb").iterdir():
+        file.unlink()
+    with pytest.raises(InputError, match=r"rgb\.txt: line 2: wanted an existing file"):
+        open_capture(tmp_path)
+
+
+@pytest.mark.parametrize(("kind", "image"), [("ScanNet", "color/9"), ("Polycam", "keyframes/images/7000")])
+def test_an_image_in_two_formats_is_no_second_view(kind, image, tmp_path):
+    WRITERS[kind](tmp_path)
+    shutil.copy(tmp_path / f"{image}.jpg", tmp_path / f"{image}.png")
+    with pytest.raises(InputError, match="wanted every image once"):
+        open_capture(tmp_path)
+
+
+def test_a_number_of_kitti_is_one_image(tmp_path):
+    WRITERS["KITTI"](tmp_path)
+    shutil.copy(tmp_path / "image_2" / "000001.png", tmp_path / "image_2" / "1.jpg")
+    with pytest.raises(InputError, match="wanted every image once"):
+        open_capture(tmp_path)

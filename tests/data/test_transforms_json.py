@@ -46,6 +46,18 @@ def test_a_frames_own_intrinsics_come_first(tmp_path):
     np.testing.assert_array_equal(capture.K(1), [[50, 0, 31], [0, 51, 25], [0, 0, 1]])
 
 
+def test_a_frames_own_angle_of_view_comes_before_the_focal_length_of_the_file(tmp_path):
+    angle = {"camera_angle_x": 2 * np.arctan(0.5), "camera_angle_y": 2 * np.arctan(0.5)}
+    capture = open_capture(make_capture(tmp_path / "c", lambda root, meta: meta["frames"][2].update(angle)))
+    np.testing.assert_allclose(capture.K(2), [[WIDTH, 0, 31], [0, HEIGHT, 25], [0, 0, 1]], rtol=1e-14)
+    np.testing.assert_array_equal(capture.K(1), [[50, 0, 31], [0, 51, 25], [0, 0, 1]])
+
+
+def test_masks_are_said_to_be_unused(tmp_path):
+    capture = open_capture(make_capture(tmp_path / "c", lambda root, meta: meta["frames"][1].update(mask_path="m.png")))
+    assert capture.notes == ("1 frames have masks (mask_path), which are not used: all pixels count.",)
+
+
 def test_blender_angles_and_missing_extensions_are_read(tmp_path):
     def change(root, meta):
         for name in ("fl_x", "fl_y", "cx", "cy", "w", "h"):

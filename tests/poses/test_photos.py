@@ -1,5 +1,7 @@
 """Copies of photos: upright, of bounded size, with their focal length, under names without spaces."""
 
+import os
+
 import numpy as np
 import pytest
 from PIL import Image, ImageOps
@@ -7,7 +9,7 @@ from PIL import Image, ImageOps
 from ssplat_jax.errors import InputError
 from ssplat_jax.poses.photos import copy_photos, list_photos
 
-FOCAL_LENGTH_35MM, EXIF_BLOCK, ORIENTATION = 0xA405, 0x8769, 274
+FOCAL_LENGTH_35MM, EXIF_BLOCK, ORIENTATION, MAKE, EDITOR = 0xA405, 0x8769, 274, 271, 37724
 
 
 def save(path, size=(40, 30), orientation=None):
@@ -92,6 +94,27 @@ def test_reduced_gray_of_16_bits_keeps_its_mean(tmp_path):
         with Image.open(tmp_path / "out" / name) as picture:
             assert picture.size == (100, 75)
             assert np.asarray(picture).mean() / 255 == pytest.approx(0.5, abs=0.02)
+
+
+def test_exif_data_too_long_for_a_jpeg_keep_the_focal_length(tmp_path):
+    """A TIFF's tags are all EXIF data, such as those of an editor, which no JPEG file has room for."""
+    exif = Image.Exif()
+    exif[MAKE], exif[EDITOR] = "Maker", b"x" * 70_000
+    exif.get_ifd(EXIF_BLOCK)[FOCAL_LENGTH_35MM] = 26
+    (tmp_path / "in").mkdir()
+    for name in ("1.png", "2.png"):
+        Image.new("RGB", (400, 300)).save(tmp_path / "in" / name, exif=exif)
+    assert copy(tmp_path, max_side=100) == ["1.jpg", "2.jpg"]
+    with Image.open(tmp_path / "out" / "1.jpg") as picture:
+        kept = picture.getexif()
+        assert kept[MAKE] == "Maker" and EDITOR not in kept
+        assert kept.get_ifd(EXIF_BLOCK)[FOCAL_LENGTH_35MM] == 26
+
+
+def test_names_that_colmap_cannot_list_get_underscores(tmp_path):
+    for name in ("#1 a.jpg", os.fsdecode(b"\xe9.jpg"), "b#.jpg"):
+        save(tmp_path / "in" / name)
+    assert sorted(copy(tmp_path)) == ["_.jpg", "_1_a.jpg", "b#.jpg"]
 
 
 @pytest.mark.parametrize("exif", [b"Exif\0\0MM\0\0\0\0\0\x08", b"Exif\0\0MM\0*\0\0"], ids=["no TIFF", "cut off"])

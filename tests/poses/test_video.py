@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from ssplat_jax.console import Reporter
 from ssplat_jax.errors import InputError
+from ssplat_jax.poses import estimate
 from ssplat_jax.poses.video import count_frames, quarter_turns, scan_video, write_frames
 
 av = pytest.importorskip("av", reason="videos need PyAV: pip install -e '.[poses]'")
@@ -74,6 +76,15 @@ def test_a_recording_that_was_cut_off_is_read_as_far_as_it_goes(video, tmp_path)
     data = whole.read_bytes()
     (tmp_path / "cut.ts").write_bytes(data[: len(data) * 2 // 3])
     assert 2 <= len(scan_video(tmp_path / "cut.ts", lambda n: None).motion) < NUM_FRAMES
+
+
+def test_a_video_that_ends_early_is_warned_of(video, tmp_path, monkeypatch, capsys):
+    for announced, said in ((NUM_FRAMES, ""), (100, f"{NUM_FRAMES} of about 100 frames can be read")):
+        monkeypatch.setattr(estimate, "count_frames", lambda path, number=announced: number)
+        names = estimate._choose_from_video(video, tmp_path, estimate.PoseOptions(max_frames=3), Reporter(quiet=True))
+        assert len(names) == 3
+        warned = capsys.readouterr().err
+        assert said in warned and bool(warned) == bool(said)
 
 
 def test_files_without_moving_pictures_are_refused(tmp_path):

@@ -1,16 +1,16 @@
 """Reader of COLMAP reconstructions: `sparse/0/`, `sparse/` or `colmap/sparse/0/` with `cameras` and `images`.
 
-Where there is no `sparse/0`, the reconstruction of the lowest number is read.
+Where there is no `sparse/0`, the reconstruction of the lowest number is read; a note names a larger one beside it.
 
 Poses are world-to-camera with OpenCV axes, in COLMAP's world; pixel centers are at +0.5. Images are in `images/` (or
-downscaled in `images_2`, `images_4`, `images_8`), else in the folder of the capture; images that COLMAP did not
-register are ignored. Perspective and fish-eye camera models are supported (`MODELS`), FULL_OPENCV only without its
+downscaled in `images_2`, `images_4`, `images_8`), else in the folder of the capture. Images that COLMAP did not
+register, and registered ones whose file is missing, are left out and counted. Perspective and fish-eye camera models are supported (`MODELS`), FULL_OPENCV only without its
 denominator (k4 to k6); cameras that no image uses may be of any model. If there are binary and text files, the binary
 ones are read. Format: colmap.github.io/format.html.
 """
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,13 +21,15 @@ from ssplat_jax.data.readers import Listing
 from ssplat_jax.data.readers.frame_list import (
     SHRUNK_FOLDERS,
     Intrinsics,
+    EXTENSIONS,
     file_named,
+    find_named,
     list_frames,
     make_frame,
     stored_size,
 )
 from ssplat_jax.data.readers.strict_text import load_lines, parse_numbers
-from ssplat_jax.errors import echo, refusal
+from ssplat_jax.errors import InputError, echo, refusal
 
 FORMAT = "COLMAP"
 CONVENTION = Convention(poses="world-to-camera")
@@ -87,10 +89,7 @@ def read(path: Path) -> Listing:
     """Reads the registered images of the reconstruction in the folder `path`."""
     model, root = _model_folder(path), path.resolve()
     assert model is not None  # `matches` is true
-    if (model / "images.bin").is_file():
-        cameras, entries = _binary_cameras(model / "cameras.bin"), list(_binary_images(model / "images.bin"))
-    else:
-        cameras, entries = _text_cameras(model / "cameras.txt"), list(_text_images(model / "images.txt"))
+    cameras, entries = _contents(model)
     if not entries:
         fix = "run the reconstruction again: no image was registered"
         raise refusal(str(model), wanted="registered images", got="none", fix=fix)
@@ -98,14 +97,53 @@ def read(path: Path) -> Listing:
     if folder and all(entry.name.startswith(folder) for entry in entries):
         folder = ""  # COLMAP ran on the parent folder, so the names include images/
     seen: dict[Path | None, str] = {}
-    frames = []
-    for entry in entries:
+    frames, num_registered = [], len(entries)
+    there = [entry for entry in entries if find_named(root, folder + entry.name, entry.where, folders=SHRUNK_FOLDERS)]
+    for entry in there or entries:  # if all are missing, the first is refused
         frame = _frame(root, folder, entry, cameras)
         if seen.setdefault(frame.path, entry.where) is not entry.where:
             got = f"{echo(entry.name)} twice"
             raise refusal(entry.where, wanted="every image once", got=got, fix="remove one of the two")
         frames.append(frame)
-    return list_frames(root.name, frames)
+    num_missing, num_unposed = num_registered - len(frames), _num_others(root / "images", seen)
+    missing = f"{num_missing} of {num_registered} registered images are skipped: their files are missing."
+    unposed = f"{num_unposed} images in images/ are left out: COLMAP did not register them."
+    notes = [note for note, number in ((missing, num_missing), (unposed, num_unposed)) if number]
+    return list_frames(root.name, frames, [*notes, *_larger_models(path, model, num_registered)])
+
+
+def _contents(model: Path) -> tuple[dict[int, CameraEntry], list[ImageEntry]]:
+    """Cameras by id and images of the reconstruction in a folder."""
+    if (model / "images.bin").is_file():
+        return _binary_cameras(model / "cameras.bin"), list(_binary_images(model / "images.bin"))
+    return _text_cameras(model / "cameras.txt"), list(_text_images(model / "images.txt"))
+
+
+def _num_others(images: Path, seen: Collection[Path | None]) -> int:
+    """Number of the image files in the folder `images` that are not in `seen`; 0 if none of those is in the folder."""
+    suffixes = {extension.lower() for extension in EXTENSIONS if extension}
+    if not any(path is not None and path.is_relative_to(images) for path in seen):
+        return 0
+    files = {file.resolve() for file in images.rglob("*") if file.suffix.lower() in suffixes and file.is_file()}
+    return len(files - set(seen))
+
+
+def _larger_models(path: Path, model: Path, num_registered: int) -> list[str]:
+    """A note about the reconstruction beside `model` with the most images, if it has more than `num_registered`."""
+    if not model.name.isdecimal():
+        return []
+    counts = {}
+    for folder in model.parent.glob("[0-9]*"):
+        if folder != model and _is_model(folder):
+            try:
+                counts[folder] = len(_contents(folder)[1])
+            except InputError:  # a damaged reconstruction that is not read
+                continue
+    largest = max(counts, key=lambda folder: counts[folder], default=None)
+    if largest is None or counts[largest] <= num_registered:
+        return []
+    names = [str(folder.relative_to(path)) for folder in (largest, model)]
+    return [f"{names[0]} holds {counts[largest]} images, {names[1]}, which is read, {num_registered}; swap them to read it."]
 
 
 def _model_folder(path: Path) -> Path | None:

@@ -58,7 +58,23 @@ def find_file(root: Path, names: Sequence[str], where: str) -> Path | None:
 def file_named(
     root: Path, name: object, where: str, extensions: tuple[str, ...] = ("",), folders: tuple[str, ...] = ()
 ) -> Path:
-    """Returns the path of the file `name` of the capture.
+    """Returns the path of the file `name` of the capture; `find_named` has the arguments.
+
+    Raises:
+        InputError: there is no such file, or it is outside `root`.
+    """
+    path = find_named(root, name, where, extensions, folders)
+    if path is None:
+        names = _names_of(str(name), folders)
+        got = f"{echo(name)}, which {_missing(root, names, extensions)}"
+        raise refusal(where, wanted="an existing file", got=got, fix="add the file or drop the frame")
+    return path
+
+
+def find_named(
+    root: Path, name: object, where: str, extensions: tuple[str, ...] = ("",), folders: tuple[str, ...] = ()
+) -> Path | None:
+    """Returns the path of the file `name` of the capture, or None if there is no such file.
 
     Args:
         root: folder of the capture.
@@ -68,23 +84,25 @@ def file_named(
         folders: folders to try in place of images/; there, any of `EXTENSIONS` may stand in place of the name's own.
 
     Returns:
-        The resolved path.
+        The resolved path, or None.
 
     Raises:
-        InputError: there is no such file, or it is outside `root`.
+        InputError: `name` is no path, or leads outside `root`.
     """
     if not isinstance(name, str) or not name or "\0" in name:
         raise refusal(where, wanted="the path of a file", got=echo(name), fix="give it relative to the capture")
-    below = in_images(name)
-    names = [name, *(f"{folder}/{below}" for folder in folders if below is not None)]
+    names = _names_of(name, folders)
     path = find_file(root, [n + extension for n in names for extension in extensions], where)
     if path is None:
         stems = [n[: len(n) - len(posixpath.splitext(n)[1])] for n in names[1:]]
         path = find_file(root, [stem + extension for stem in stems for extension in EXTENSIONS[1:]], where)
-    if path is None:
-        got = f"{echo(name)}, which {_missing(root, names, extensions)}"
-        raise refusal(where, wanted="an existing file", got=got, fix="add the file or drop the frame")
     return path
+
+
+def _names_of(name: str, folders: Sequence[str]) -> list[str]:
+    """The name, and its places in `folders` if it is in images/."""
+    below = in_images(name)
+    return [name, *(f"{folder}/{below}" for folder in folders if below is not None)]
 
 
 def _missing(root: Path, names: Sequence[str], extensions: Sequence[str]) -> str:

@@ -14,7 +14,7 @@ from jaxtyping import Float64
 from ssplat_jax.data.images import image_size
 from ssplat_jax.data.posed_image import check_camtoworld
 from ssplat_jax.data.readers import Listing
-from ssplat_jax.data.readers.frame_list import Intrinsics, list_frames, make_frame
+from ssplat_jax.data.readers.frame_list import Intrinsics, check_once, list_frames, make_frame
 from ssplat_jax.data.readers.strict_text import load_lines, load_rows, parse_numbers
 from ssplat_jax.errors import echo, refusal
 
@@ -41,12 +41,13 @@ def read(path: Path) -> Listing:
     file = _poses_file(root)
     poses = load_rows(file, 12)
     images = [image for image in sorted((root / f"image_{camera}").iterdir()) if image.suffix.lower() in IMAGES]
-    frames = []
+    frames, seen = [], dict[Path, str]()
     for image in images:
         if not (image.stem.isascii() and image.stem.isdigit() and len(image.stem) < 12):
             fix = "name images by their number, 000000.png"
             raise refusal(str(image), wanted="a number", got=echo(image.stem), fix=fix)
         number = int(image.stem)
+        check_once(seen, image.with_name(str(number)), image.name, f"{image.parent}: {image.name}")
         if number >= len(poses):
             continue
         where = f"{file}: pose {number}"

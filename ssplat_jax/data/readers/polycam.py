@@ -11,7 +11,14 @@ from ssplat_jax.data.images import check_depth_header
 from ssplat_jax.data.pose_conventions import Convention
 from ssplat_jax.data.posed_image import check_camtoworld
 from ssplat_jax.data.readers import Listing
-from ssplat_jax.data.readers.frame_list import Intrinsics, find_file, list_frames, make_frame, stored_size
+from ssplat_jax.data.readers.frame_list import (
+    Intrinsics,
+    check_once,
+    find_file,
+    list_frames,
+    make_frame,
+    stored_size,
+)
 from ssplat_jax.data.readers.strict_json import JsonFields, load_json
 from ssplat_jax.errors import refusal
 
@@ -31,8 +38,9 @@ def read(path: Path) -> Listing:
     assert found is not None  # `matches` is true
     keyframes, prefix = found
     images = sorted(file for file in (keyframes / f"{prefix}images").glob("*") if file.suffix.lower() in IMAGES)
-    frames = []
+    frames, seen = [], dict[Path, str]()
     for image in images:
+        check_once(seen, image.with_suffix(""), image.name, f"{image.parent}: {image.name}")
         file = find_file(keyframes, [f"{prefix}cameras/{image.stem}.json"], str(image))
         if file is None:
             continue

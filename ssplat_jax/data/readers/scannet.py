@@ -11,7 +11,14 @@ import numpy as np
 from ssplat_jax.data.images import check_depth_header, image_size
 from ssplat_jax.data.posed_image import check_camtoworld
 from ssplat_jax.data.readers import Listing
-from ssplat_jax.data.readers.frame_list import Intrinsics, file_named, find_file, list_frames, make_frame
+from ssplat_jax.data.readers.frame_list import (
+    Intrinsics,
+    check_once,
+    file_named,
+    find_file,
+    list_frames,
+    make_frame,
+)
 from ssplat_jax.data.readers.strict_text import load_rows
 from ssplat_jax.errors import refusal
 
@@ -31,8 +38,9 @@ def read(path: Path) -> Listing:
     K = _matrix(file)
     intrinsics = Intrinsics(fx=K[0, 0], fy=K[1, 1], cx=K[0, 2], cy=K[1, 2])
     images = [image for image in sorted((root / "color").iterdir()) if image.suffix.lower() in IMAGES]
-    frames, num_lost = [], 0
+    frames, num_lost, seen = [], 0, dict[Path, str]()
     for image in images:
+        check_once(seen, image.with_suffix(""), image.name, f"{image.parent}: {image.name}")
         pose_file = find_file(root, [f"pose/{image.stem}.txt"], str(image))
         matrix = None if pose_file is None else _matrix(pose_file)
         if matrix is None or not np.isfinite(matrix).all():

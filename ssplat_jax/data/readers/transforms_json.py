@@ -108,7 +108,9 @@ def _read(path: Path, problems: list[str] | None) -> Listing:
             got = f"{echo(frame.name)} in both {first.split(': ')[-1]} and frames[{i}]"
             raise refusal(f"{where}.file_path", wanted="every image once", got=got, fix="drop one of the two frames")
         frames.append(frame)
-    return list_frames(root.name, frames)
+    masked = sum(entry.get("mask_path") is not None for entry in entries if isinstance(entry, dict))
+    unused = [f"{masked} frames have masks (mask_path), which are not used: all pixels count."] if masked else []
+    return list_frames(root.name, frames, unused)
 
 
 def _read_frame(root: Path, meta: dict[str, Any], entry: dict[str, Any], where: str) -> Frame:
@@ -151,6 +153,11 @@ class _Fields:
     def get(self, name: str) -> Any:
         """Returns the value of a field, or None."""
         return self._entry.get(name, self._meta.get(name))
+
+    def first_of(self, *names: str) -> str | None:
+        """Returns the first of the names that the frame has, else the first that the file has, or None."""
+        held = (name for values in (self._entry, self._meta) for name in names if values.get(name) is not None)
+        return next(held, None)
 
     def number(self, name: str, default: float) -> float:
         """Returns a field as float, or `default` if it is missing or null."""
@@ -199,10 +206,11 @@ def _focal(fields: _Fields, width: float, height: float) -> tuple[float, float]:
     """Focal lengths in pixels, from fl_x and fl_y or the fields of view camera_angle_x and camera_angle_y."""
     focals = {}
     for axis, extent in (("x", width), ("y", height)):
-        if fields.get(f"fl_{axis}") is not None:
-            focals[axis] = fields.number(f"fl_{axis}", 0.0)
-        elif fields.get(f"camera_angle_{axis}") is not None:
-            angle = fields.number(f"camera_angle_{axis}", 0.0)
+        name = fields.first_of(f"fl_{axis}", f"camera_angle_{axis}")
+        if name == f"fl_{axis}":
+            focals[axis] = fields.number(name, 0.0)
+        elif name is not None:
+            angle = fields.number(name, 0.0)
             if not (0 < angle < math.pi and math.tan(angle / 2) > 0):
                 where = f"{fields.where}.camera_angle_{axis}"
                 raise refusal(where, wanted="an angle in (0, pi)", got=echo(angle), fix="give it in radians")

@@ -2,7 +2,7 @@
 
 `rgb.txt` and `depth.txt` list times and files, `groundtruth.txt` camera-to-world poses (time, tx ty tz, qx qy qz qw).
 The pose of an image is interpolated between its neighbors in time; images between poses more than `MAX_POSE_GAP` apart
-are skipped, and an image that is listed at several times counts once, at the first. Depth maps are in units of 1/5000
+are skipped, as are listed files that do not exist; an image that is listed at several times counts once, at the first. Depth maps are in units of 1/5000
 m; an image gets the nearest one within `MAX_DEPTH_GAP`.
 Intrinsics are read from `calibration.txt` (fx fy cx cy, optionally k1 k2 p1 p2 k3). Without it, `freiburg1` to
 `freiburg3` in the name of the folder selects those of the color camera from
@@ -21,7 +21,7 @@ from ssplat_jax.data.images import check_depth_header, image_size
 from ssplat_jax.data.lens import Lens
 from ssplat_jax.data.posed_image import pose_from_quat
 from ssplat_jax.data.readers import Listing
-from ssplat_jax.data.readers.frame_list import Intrinsics, file_named, list_frames, make_frame
+from ssplat_jax.data.readers.frame_list import Intrinsics, file_named, find_named, list_frames, make_frame
 from ssplat_jax.data.readers.strict_text import load_lines, load_rows, parse_numbers
 from ssplat_jax.errors import echo, refusal
 
@@ -47,8 +47,10 @@ def read(path: Path) -> Listing:
     intrinsics, calibration = _intrinsics(root)
     poses = load_rows(root / "groundtruth.txt", 8)
     poses = poses[np.argsort(poses[:, 0], kind="stable")]
-    images, num_again = _each_once(_files(root, "rgb.txt"))
-    depths = _files(root, "depth.txt") if (root / "depth.txt").is_file() else []
+    (listed, num_gone), (depths, depths_gone) = (
+        _files(root, name) if (root / name).is_file() else ([], 0) for name in ("rgb.txt", "depth.txt")
+    )
+    images, num_again = _each_once(listed)
     frames = []
     for time, image in images:
         where = f"{root / 'groundtruth.txt'} at {time:.6f}"
@@ -69,7 +71,12 @@ def read(path: Path) -> Listing:
     num_lost = len(images) - len(frames)
     lost = [f"{num_lost} of {len(images)} frames are skipped: there is no pose at their time."] if num_lost else []
     again = [f"{num_again} lines of rgb.txt list an image again; its first time counts."] if num_again else []
-    return list_frames(root.name, frames, [*lost, *again], is_in_time=True)
+    gone = [
+        f"{number} files of {name} are missing and left out."
+        for name, number in (("rgb.txt", num_gone), ("depth.txt", depths_gone))
+        if number
+    ]
+    return list_frames(root.name, frames, [*lost, *again, *gone], is_in_time=True)
 
 
 def _each_once(files: list[tuple[float, Path]]) -> tuple[list[tuple[float, Path]], int]:
@@ -80,9 +87,9 @@ def _each_once(files: list[tuple[float, Path]]) -> tuple[list[tuple[float, Path]
     return [(time, file) for file, time in first.items()], len(files) - len(first)
 
 
-def _files(root: Path, name: str) -> list[tuple[float, Path]]:
-    """(time, file) of a list of files, in the order of time."""
-    found = []
+def _files(root: Path, name: str) -> tuple[list[tuple[float, Path]], int]:
+    """(time, file) of a list of files, in the order of time, and the number of listed files that do not exist."""
+    found, missing = [], []
     for number, line in load_lines(root / name):
         if not line:
             continue
@@ -90,8 +97,14 @@ def _files(root: Path, name: str) -> list[tuple[float, Path]]:
         if len(words) != 2:
             raise refusal(where, wanted="a time and a file", got=echo(line), fix="write the file again")
         (time,) = parse_numbers(words[:1], where)
-        found.append((time, file_named(root, words[1], where)))
-    return sorted(found)
+        file = find_named(root, words[1], where)
+        if file is None:
+            missing.append((words[1], where))
+        else:
+            found.append((time, file))
+    if missing and not found:
+        file_named(root, *missing[0])  # refuses it
+    return sorted(found), len(missing)
 
 
 def _pose_at(time: float, poses: Float64[np.ndarray, "n 8"], where: str) -> Float64[np.ndarray, "4 4"] | None:
