@@ -1,11 +1,13 @@
 """Cases of an experiment: each is measured once and kept in one file, so that a stopped experiment continues."""
 
 import dataclasses
+import functools
 import hashlib
 import json
 import re
 import time
 from collections.abc import Callable, Sequence
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -37,8 +39,9 @@ class Case:
 
     @property
     def request(self) -> dict[str, Any]:
-        """All that decides the result, as JSON holds it."""
-        return json.loads(json_text({"asked": self.asked, "config": self.config and self.config.to_dict()}))
+        """All that decides the result, as JSON holds it; a model has the shipped weights."""
+        request: dict[str, Any] = {"asked": self.asked, "config": self.config and self.config.to_dict()}
+        return json.loads(json_text(request | ({} if self.config is None else {"weights": shipped_weights()})))
 
     @property
     def hash(self) -> str:
@@ -48,6 +51,14 @@ class Case:
     def path(self, folder: Path) -> Path:
         """The file of the case."""
         return folder / (re.sub(r"[^a-z0-9.]+", "_", self.name.lower()).strip("_") + ".json")
+
+
+@functools.cache
+def shipped_weights() -> dict[str, str]:
+    """Digests (12 hex digits) of the weights files of the package."""
+    folder = resources.files("ssplat_jax") / "weights"
+    names = ("tiny.npz", "refiner.npz")
+    return {name: hashlib.sha256((folder / name).read_bytes()).hexdigest()[:12] for name in names}
 
 
 def measure_cases(

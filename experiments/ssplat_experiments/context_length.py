@@ -52,6 +52,8 @@ class Sizes:
     targets: int = NUM_TARGETS
     joint: int = 128
     """Most views of the joint network, whose memory grows with them."""
+    label: str = ""
+    """End of the names of the suites, where a table has the same scene at another size."""
 
 
 SIZES = {
@@ -79,7 +81,8 @@ def suite_cases(captures: Path | None, sizes: Sizes) -> list[Case]:
     paths += [str(path) for path in folders if len(open_capture(path, size=sizes.size)) >= num_frames]
     config = preset("tiny").replace(capacity=START_CAPACITY)  # so that memory is what the scene needs
     methods = {OURS: config, APPEND: config.replace(vacc="append")}
-    asked = {name: value for name, value in dataclasses.asdict(sizes).items() if name not in ("suites", "joint")}
+    not_asked = ("suites", "joint", "label")
+    asked = {name: value for name, value in dataclasses.asdict(sizes).items() if name not in not_asked}
     streams = [
         Case(
             name=f"{_suite(path)}, {method}",
@@ -121,7 +124,7 @@ def measured(path: str, method: str, config: StreamConfig, sizes: Sizes) -> list
     for fed, count in itertools.pairwise((0, *sizes.counts)):
         found, recent = feed_capture(session, capture, split.context[fed:count], frame, num_recent=NUM_TIMED)
         exposures |= found
-        place = {"suite": _short(path), "views": count}
+        place = {"suite": _short(path) + sizes.label, "views": count}
         seen = split.context[:count] if method == OURS else ()
         scored = _scores(session.gaussians(), capture, split.targets, frame, exposures, seen)
         memory, latency = peak_memory(session, middle), measure_latency(session, recent, middle)
@@ -149,7 +152,7 @@ def measured_joint(path: str, count: int, config: StreamConfig, sizes: Sizes) ->
     scored = _scores(gaussians, capture, split.targets, frame, {}, ())["scene"]
     middle = capture.camera(split.targets[len(split.targets) // 2], frame)
     cost = {"gaussians": int((gaussians.opacities > 0).sum()), **network.peak_memory(middle).to_row()}
-    return [{"suite": _short(path), "views": count, "method": JOINT, **scored, **cost}]
+    return [{"suite": _short(path) + sizes.label, "views": count, "method": JOINT, **scored, **cost}]
 
 
 def _opened(path: str, config: StreamConfig, sizes: Sizes) -> tuple[Capture, Split, StreamFrame]:
@@ -217,7 +220,7 @@ def findings(rows: list[Row]) -> list[str]:
 
 def gallery(rows: list[Row]) -> str:
     """One target of each procedural suite, from few views to many."""
-    suites = dict.fromkeys(row["suite"] for row in rows if row["suite"] in PUBLIC_SCENES)
+    suites = dict.fromkeys(row["suite"] for row in rows if row["suite"].partition(",")[0] in PUBLIC_SCENES)
     strips = [
         side_by_side(
             [row for row in rows if row["suite"] == suite], lambda row: f"{row['suite']}, {row['views']} views"

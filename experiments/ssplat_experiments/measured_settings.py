@@ -68,21 +68,30 @@ def measure_refined(settings: Sequence[Setting], sizes: Sizes, opened: Opened) -
     """A row for each setting of one streamed size, which differ in the number of refinement steps alone.
 
     The steps are those of one refinement that is planned for the most of them: fewer steps have higher rates at their
-    end than a refinement of their own would have. Their time is spread over the streamed views.
+    end than a refinement of their own would have. Where it ends early, settings of more steps get the scene at its end.
+    Their time is spread over the streamed views.
     """
     scene, watch, rows = _stream(settings[0], sizes, opened), Stopwatch(), []
     by_steps = {setting.refine_steps: setting for setting in settings}
     with watch.running():
         given = key_views_of(scene.streamed, scene.split.context, scene.frame, scene.exposures)
         progress, views = start_refinement(scene.gaussians, given, FOR_CAPTURES)
-    for _ in watch.over(continue_refinement(progress, views, max(by_steps), FOR_CAPTURES)):
-        if progress.num_steps in by_steps:
-            with watch.running():
-                refined = jax.block_until_ready(progress.scene(scene.gaussians))
-            row = scene.row(by_steps[progress.num_steps], refined)
-            added = 1e3 * watch.seconds / len(scene.split.context)
+
+    def add_rows(reached: list[Setting]) -> None:
+        """Adds a row of the present scene for each setting."""
+        with watch.running():
+            refined = jax.block_until_ready(progress.scene(scene.gaussians))
+        added = 1e3 * watch.seconds / len(scene.split.context)
+        for setting in reached:
+            row = scene.row(setting, refined) | {"gaussians": int((refined.opacities > 0).sum())}
             row |= {"ms_per_view": round(row["ms_per_view"] + added, 2), "refine_s": round(watch.seconds, 2)}
             rows.append(row)
+
+    for _ in watch.over(continue_refinement(progress, views, max(by_steps), FOR_CAPTURES)):
+        if progress.num_steps in by_steps:
+            add_rows([by_steps[progress.num_steps]])
+    if later := [setting for steps, setting in by_steps.items() if steps > progress.num_steps]:
+        add_rows(later)
     return rows
 
 

@@ -48,21 +48,21 @@ def findings(rows: list[Row]) -> list[str]:
         if OPTIMIZED not in methods or len(methods) < 2:
             continue
         for name, column in COLUMNS.items():
-            crossing, end, gap = lead(here, column)
+            crossing, end, _ = lead(here, column)
             first = min((row for row in here if row["method"] != OPTIMIZED), key=lambda row: row["seconds"])
             ours = [row for row in here if row["method"] != OPTIMIZED]
             best = max(ours, key=lambda row: row[column])
             theirs = max((row for row in here if row["method"] == OPTIMIZED), key=lambda row: row[column])
             where = (
-                f"the curves do not cross up to {end:.0f} s"
+                f"per-scene optimization is not ahead at its end, after {end:.0f} s"
                 if crossing is None
                 else f"per-scene optimization leads from {crossing:.1f} s on"
             )
             lines.append(
                 f"* {scene}, {name}: {where}; ours has its first score, {first[column]:.2f} dB, after"
                 f" {first['seconds']:.1f} s and its best, {best[column]:.2f} dB ({best['method']}), after"
-                f" {best['seconds']:.1f} s; per-scene optimization has its best, {theirs[column]:.2f} dB, after"
-                f" {theirs['seconds']:.1f} s, and ends at {gap:+.2f} dB from ours."
+                f" {best['seconds']:.1f} s; per-scene optimization has its best, {theirs[column]:.2f} dB"
+                f" ({theirs[column] - best[column]:+.2f} dB against the best of ours), after {theirs['seconds']:.1f} s."
             )
     return [at_times(rows), "\n".join(lines)] if lines else []
 

@@ -112,8 +112,8 @@ def _shipped(preset_name: str) -> Traversable:
     return resources.files("ssplat_jax") / "weights" / f"{preset_name}.npz"
 
 
-def params_digest(params: dict) -> str:
-    """Digest of the parameters (12 hex digits), which identifies them in saved states."""
+def params_digest(params: Any) -> str:
+    """Digest of a tree of parameters (12 hex digits), which identifies them in saved states."""
     digest = hashlib.sha256()
     for leaf in jax.tree.leaves(params):  # jax.tree traverses dicts in the order of their keys
         digest.update(np.ascontiguousarray(leaf).tobytes())

@@ -2,7 +2,8 @@
 
 A command is a dataclass, in a file of its own, whose fields are the options and whose `run` returns the exit code.
 Commands import JAX when they run, so that `ssplat --help` answers at once. Exit codes: 0 success, 2 bad input or usage,
-3 storage, 4 out of memory on the device or a full cache, 130 and 143 interrupted, 141 a closed pipe. The script's entry point is `commands/start.py`.
+3 storage, 4 out of memory on the device or a full cache, 130 and 143 interrupted, 141 a closed pipe. The script's entry
+point is `commands/start.py`.
 """
 
 import functools

@@ -110,7 +110,8 @@ class Run:
             if self.watch:
                 raise InputError(f"--revise {name}: wanted a capture that is complete, got --watch; leave one out.")
         if self.watch and (self.axes or self.poses or split_options(self.capture)[1]):
-            raise InputError("--watch: wanted poses as transforms.json has them, got --axes or --poses; leave one out.")
+            got = "--axes or --poses" if self.axes or self.poses else "?axes= or ?poses= behind the capture"
+            raise InputError(f"--watch: wanted poses as transforms.json has them, got {got}; leave one out.")
         if self.hold_back and self.watch:
             raise InputError("--hold-back: wanted a capture that is complete; got --watch. Leave one out.")
         if self.port != Run.port and not self.view:

@@ -118,6 +118,7 @@ def evaluate(
             reporter=reporter,
         )
         gaussians, exposures = refined.gaussians, refined.exposures
+        cost["num_gaussians"] = int((gaussians.opacities > 0).sum())
         refinement = {"refinement": {**done, "before": mean_scores(before)}}
     middle = capture.camera(split.targets[len(split.targets) // 2], frame)
     cost["peak_memory_bytes"] = peak_memory(session, middle).bytes

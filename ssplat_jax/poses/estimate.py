@@ -194,8 +194,8 @@ def _choose_from_video(source: Path, folder: Path, options: PoseOptions, reporte
         scan = scan_video(source, advance)
     if (found := len(scan.motion)) < MIN_READ_SHARE * announced:
         reporter.warn(
-            f"{source}: {found} of about {announced} frames can be read; the rest is left out. If the video plays to its"
-            " end, convert it with `ffmpeg -i INPUT output.mp4`"
+            f"{source}: {found} of about {announced} frames can be read; the rest is left out. If the video plays to"
+            " its end, convert it with `ffmpeg -i INPUT output.mp4`"
         )
     chosen = choose_frames(scan.motion, scan.sharpnesses, options.max_frames)
     with reporter.progress("frames", len(chosen), waiting="") as advance:

@@ -71,8 +71,8 @@ def copy_photos(photos: list[Path], folder: Path, max_side: int, advance: Callab
         advance: called with the number of files so far.
 
     Returns:
-        The names of the copies. An underscore stands for each space, for a `#` at the start, which would begin a comment
-        in COLMAP's lists, and for what is not UTF-8.
+        The names of the copies. An underscore stands for each space, for a `#` at the start, which would begin a
+        comment in COLMAP's lists, and for what is not UTF-8.
 
     Raises:
         InputError: a file is no readable image, or two names differ in these characters alone.
@@ -111,8 +111,10 @@ def _exif_of(picture: Image.Image) -> tuple[int, bytes]:
         if exif.get(ORIENTATION) in TURNS:
             orientation = exif[ORIENTATION]
         exif.pop(ORIENTATION, None)
-        choices = (exif.tobytes(), _camera_tags(exif).tobytes(), b"")
-        return orientation, next(data for data in choices if len(data) <= MAX_EXIF_BYTES)
+        data = exif.tobytes()
+        if len(data) > MAX_EXIF_BYTES:
+            data = _camera_tags(exif).tobytes()
+        return orientation, data if len(data) <= MAX_EXIF_BYTES else b""
     except Exception:  # Pillow's parser raises nearly anything on damaged data
         return orientation, b""
 

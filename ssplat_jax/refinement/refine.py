@@ -94,7 +94,7 @@ class Refinement:
     losses: list[float]  # per step, on the pixels that are learned from
     held_back: list[float]  # per step, on the pixels that are not
     stopped_early: bool  # the held-back error had stopped falling
-    seconds_per_step: float  # median, without compilation; 0 for fewer than two steps
+    seconds_per_step: float  # median, without the first step of each kind, which compiles; 0 where there is no other
     num_left_out: int = 0  # views that could not be learned from, see `only_usable`
     num_new: int = 0  # Gaussians added in holes
     key_views: KeyViews | None = None  # as the effects revised them; views that were left out are not valid
@@ -247,11 +247,18 @@ def report_of(progress: Progress, key_views: KeyViews, config: RefineConfig | No
         losses=progress.losses,
         held_back=progress.held_back,
         stopped_early=_has_stopped_helping(progress, key_views, config or RefineConfig()),
-        seconds_per_step=float(np.median(progress.seconds[1:])) if progress.num_steps > 1 else 0.0,
+        seconds_per_step=_seconds_per_step(progress),
         num_left_out=int(np.sum(~np.asarray(key_views.valid))),
         num_new=progress.num_new,
         key_views=revised_key_views(progress.state.views, key_views),
     )
+
+
+def _seconds_per_step(progress: Progress) -> float:
+    """Median time of a step that compiled nothing, or 0 if there was none."""
+    learned, taken = progress.seconds[: progress.num_learned], progress.seconds[progress.num_learned :]
+    timed = learned[STEPS:] + taken[1:]
+    return float(np.median(timed)) if timed else 0.0
 
 
 def has_stopped_helping(held_back: list[float], steps_per_round: int) -> bool:
@@ -282,7 +289,7 @@ def _learned_pass(config: RefineConfig, max_pairs: int):
 
 def _capacity(gaussians: Gaussians, key_views: KeyViews) -> int:
     """Capacity for the tile intersections of a key view, from a few of them; a step counts what does not fit."""
-    counts = [int(render(gaussians, key_views.camera(i), effects=EFFECTS).num_pairs) for i in _spread(key_views)]
+    counts = [int(render(gaussians, key_views.camera(i), effects=EFFECTS).num_pairs) for i in spread_views(key_views)]
     return round_up(int(PAIRS_MARGIN * max(counts)))
 
 
@@ -303,7 +310,7 @@ def _most_rows_seen(gaussians: Gaussians, key_views: KeyViews, views: Int[Array,
     return jnp.max(jax.lax.map(num_seen, views))
 
 
-def _spread(key_views: KeyViews, most: int = 8) -> list[int]:
+def spread_views(key_views: KeyViews, most: int = 8) -> list[int]:
     """A few views, evenly spread, from which the capacity is estimated."""
     return sorted({round(i) for i in np.linspace(0, key_views.num_slots - 1, most)})
 

@@ -6,6 +6,7 @@ show it neither as context nor as target, and `validation_sample` shows it as ta
 
 import dataclasses
 import functools
+import hashlib
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -40,7 +41,22 @@ class CaptureGroup:
     def describe(self) -> dict:
         """Facts that identify the group in a run, as JSON types."""
         digests = [capture.digest(range(len(capture))) for capture in self.captures]
-        return {"name": self.name, "share": self.share, "captures": digests}
+        files = {f"{i} {capture.name}": _files_digest(capture) for i, capture in enumerate(self.captures)}
+        return {"name": self.name, "share": self.share, "captures": digests, "files": files}
+
+
+def _files_digest(capture: Capture) -> str:
+    """Digest (12 hex digits) of the names and sizes of a capture's depth maps and the sizes of its images.
+
+    Sizes stand for contents: a data set may be too large to be read at every start.
+    """
+    digest = hashlib.sha256()
+    for frame in capture.frames:
+        for path in (frame.path, frame.depth_path):
+            digest.update(b"none\n" if path is None else f"{path.stat().st_size}\n".encode())
+        depth = None if frame.depth_path is None else frame.depth_path.name
+        digest.update(f"{depth} {frame.depth_unit}\n".encode(errors="surrogateescape"))
+    return digest.hexdigest()[:12]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

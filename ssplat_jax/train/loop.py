@@ -81,14 +81,15 @@ def train(
         The state after the last step.
 
     Raises:
-        InputError: `out` holds a run of another recipe, configuration or start, or another process is training in it.
+        InputError: `out` holds a run of another recipe, configuration, start or LPIPS weights, or of captures with
+            other files, or another process is training in it.
         StorageError: a checkpoint cannot be written or read.
     """
     model = StreamSplat(training_config(config, recipe))
     with lock_folder(out):
         init_weights = init_weights or (RANDOM if params is None else params_digest(params))
-        description = describe_run(model.config, recipe, init_weights, has_lpips=lpips_weights is not None, mix=mix)
-        upgrade = functools.partial(upgrade_description, init_weights=init_weights)
+        description = describe_run(model.config, recipe, init_weights, lpips_weights=lpips_weights, mix=mix)
+        upgrade = functools.partial(upgrade_description, wanted=description)
         checkpoints = TrainingCheckpoints(out, description, upgrade=upgrade)
         try:
             state, start = init_state(model, recipe, params), 0
@@ -111,7 +112,12 @@ class _Every:
 
 
 def describe_run(
-    config: StreamConfig, recipe: Recipe, init_weights: str, *, has_lpips: bool, mix: CaptureMix | None = None
+    config: StreamConfig,
+    recipe: Recipe,
+    init_weights: str,
+    *,
+    lpips_weights: LpipsWeights | None = None,
+    mix: CaptureMix | None = None,
 ) -> dict:
     """Facts that determine the weights of a run, as JSON types; a run with another description is not resumed.
 
@@ -119,7 +125,7 @@ def describe_run(
         config: configuration of the model.
         recipe: the recipe.
         init_weights: name of the initial parameters, `RANDOM` for random ones.
-        has_lpips: the rendering loss includes LPIPS.
+        lpips_weights: weights of LPIPS, if the rendering loss includes it.
         mix: captures to learn from.
     """
     description: dict = {
@@ -127,26 +133,32 @@ def describe_run(
         "recipe": dataclasses.asdict(recipe),
         "init_weights": init_weights,
     }
-    if has_lpips:
+    if lpips_weights is not None:
         description["rendering_loss"] = f"MSE + {recipe.lpips_weight} LPIPS"
+        description["lpips_weights"] = params_digest(lpips_weights)
     if mix is not None:
         description["captures"] = mix.describe()
     return description
 
 
-def upgrade_description(description: dict, init_weights: str) -> dict:
+def upgrade_description(description: dict, wanted: dict) -> dict:
     """Description of a run, as read from JSON, with the fields that older versions did not write.
 
     Args:
         description: as `describe_run` gives it.
-        init_weights: name of the initial parameters for a description that holds none.
+        wanted: description of the run that continues it. Initial parameters, weights of LPIPS and files of captures are
+            taken to be the same where `description` does not hold them.
     """
-    config = config_from_header(description["config"]).to_dict()
-    return (
-        {"init_weights": init_weights}
-        | description
-        | {"config": config, "recipe": with_defaults(description.get("recipe", {}))}
-    )
+    upgraded = {"init_weights": wanted["init_weights"]} | description
+    upgraded["config"] = config_from_header(description["config"]).to_dict()
+    upgraded["recipe"] = with_defaults(description.get("recipe", {}))
+    if "rendering_loss" in description and "lpips_weights" in wanted:
+        upgraded = {"lpips_weights": wanted["lpips_weights"]} | upgraded
+    groups = description.get("captures", [])
+    if groups and len(groups) == len(wanted.get("captures", [])):
+        pairs = zip(groups, wanted["captures"], strict=True)
+        upgraded["captures"] = [{"files": now["files"]} | held for held, now in pairs]
+    return upgraded
 
 
 def _run(model, recipe, state, start, mix, lpips_weights, checkpoints, log, every: _Every) -> TrainResult:

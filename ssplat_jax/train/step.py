@@ -7,7 +7,7 @@ import math
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from ssplat_jax.cache import Tokens, VoxelCache, judge
 from ssplat_jax.gaussians import Gaussians, mask_gaussians, mean_color
@@ -251,18 +251,20 @@ def train_step(
 
     Limits:
         A gradient that is not finite changes only `step` and `num_skipped`.
+        A stage that is frozen, or whose gradient is 0 throughout, keeps its parameters to the bit.
     """
     gradients, metrics = jax.grad(mean_loss, has_aux=True)(state.params, model, batch, recipe, form, lpips_weights)
     norm = optax.global_norm(gradients)
     is_finite = jnp.isfinite(norm)
     updates, opt_state = optimizer(recipe).update(gradients, state.opt_state, state.params)
-    # Without this, momentum and weight decay would move frozen parameters.
-    updates = {name: jax.tree.map(jnp.zeros_like, u) if name in form.frozen else u for name, u in updates.items()}  # pyright: ignore[reportAttributeAccessIssue]
+    # Without this, momentum and weight decay would move frozen parameters, and those that the loss does not reach.
+    is_reached = {name: name not in form.frozen and _is_any_nonzero(part) for name, part in gradients.items()}
+    updates = {name: jax.tree.map(lambda u, r=is_reached[name]: jnp.where(r, u, 0), u) for name, u in updates.items()}  # pyright: ignore[reportAttributeAccessIssue]
     updates = scale_parts(updates, recipe.part_rates)
     params = jax.tree.map(lambda p, u: p - rate * u, state.params, updates)
     step = state.step.astype(jnp.float32)
     decay = jnp.minimum(recipe.ema_decay, (1.0 + step) / (recipe.ema_warmup_steps + step))
-    ema = jax.tree.map(lambda e, p: decay * e + (1 - decay) * p, state.ema, params)
+    ema = jax.tree.map(lambda e, p: e + (1 - decay) * (p - e), state.ema, params)  # exact where p = e
     keep = functools.partial(jax.tree.map, lambda new, old: jnp.where(is_finite, new, old))
     new_state = TrainState(
         params=keep(params, state.params),
@@ -272,6 +274,11 @@ def train_step(
         num_skipped=state.num_skipped + (~is_finite).astype(jnp.int32),
     )
     return new_state, metrics | {"grad_norm": norm}
+
+
+def _is_any_nonzero(tree: dict) -> Bool[Array, ""]:
+    """True if an entry of the arrays is not 0."""
+    return jax.tree.reduce(lambda found, leaf: found | jnp.any(leaf != 0), tree, jnp.array(False))
 
 
 @dataclasses.dataclass(frozen=True)

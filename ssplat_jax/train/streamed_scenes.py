@@ -18,6 +18,8 @@ from ssplat_jax.errors import InputError
 from ssplat_jax.program_memory import make_room
 from ssplat_jax.rasterizer import render
 from ssplat_jax.rasterizer.render import round_up
+from ssplat_jax.refinement import online_refinement
+from ssplat_jax.refinement.refine import spread_views
 from ssplat_jax.refinement.refine_capture import key_views_of
 from ssplat_jax.refinement.view_loss import EFFECTS
 from ssplat_jax.streaming.feed import feed_capture
@@ -102,19 +104,20 @@ def stream_scene(model: StreamSplat, params: dict, capture: Capture, stride: int
     """
     make_room()
     context = choose_split("interleaved", len(capture), stride, None, None).context
-    session = Session(model, params)
+    session = Session(model, params, revise=online_refinement(model))
     frame = capture.stream_frame(model.config, context)
     exposures, _ = feed_capture(session, capture, context, frame)
     assert session.cache is not None
     num_shown = int(jnp.sum(shown_pivots(session.cache, model.config)))
     key_views = key_views_of(capture, context, frame, exposures)
-    counts = [int(render(session.gaussians(), key_views.camera(i), effects=EFFECTS).num_pairs) for i in (0, -1)]
+    gaussians, looked_at = session.gaussians(), spread_views(key_views)
+    counts = [int(render(gaussians, key_views.camera(i), effects=EFFECTS).num_pairs) for i in looked_at]
     return StreamedScene(
         name=f"{capture.name}, stride {stride}",
         cache=session.cache,
         num_pivots=num_shown,
         key_views=key_views,
-        max_pairs=round_up(2 * max(counts)),
+        max_pairs=round_up(2 * max(counts)),  # views between those may have more, and training changes the scene
     )
 
 

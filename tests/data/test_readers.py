@@ -336,10 +336,21 @@ def test_a_larger_colmap_model_beside_the_one_that_is_read_is_named(tmp_path):
     assert len(capture) == 1
     assert capture.notes == (
         "3 images in images/ are left out: COLMAP did not register them.",
-        "sparse/1 holds 4 images, sparse/0, which is read, 1; swap them to read it.",
+        "sparse/1 holds 4 images; sparse/0, which is read, holds 1. Swap the folders' names to read the larger one.",
     )
+    (tmp_path / "sparse" / "1").rename(tmp_path / "sparse" / "1_old")  # never read, whatever it holds
+    assert len(open_capture(tmp_path).notes) == 1
+    (tmp_path / "sparse" / "1_old").rename(tmp_path / "sparse" / "1")
     (tmp_path / "sparse" / "1" / "images.txt").write_text("\n".join(lines[:4]) + "\n")  # as many
     assert len(open_capture(tmp_path).notes) == 1
+
+
+def test_a_capture_with_a_number_for_a_name_has_no_others_beside_it(tmp_path):
+    write_colmap_text(tmp_path / "24", sparse=".")
+    write_colmap_text(tmp_path / "25", sparse=".")
+    lines = (tmp_path / "24" / "images.txt").read_text().splitlines()
+    (tmp_path / "24" / "images.txt").write_text("\n".join(lines[:4]) + "\n")
+    assert len(open_capture(tmp_path / "24")) == 1
 
 
 def test_colmap_images_whose_files_are_missing_are_counted(tmp_path):
@@ -362,6 +373,14 @@ def test_tum_files_that_are_missing_are_counted(tmp_path):
         file.unlink()
     with pytest.raises(InputError, match=r"rgb\.txt: line 2: wanted an existing file"):
         open_capture(tmp_path)
+
+
+def test_tum_needs_no_depth_map(tmp_path):
+    write_tum(tmp_path)
+    shutil.rmtree(tmp_path / "depth")
+    capture = open_capture(tmp_path)
+    assert len(capture) == NUM_FRAMES and not capture.pixels.has_depth(0)
+    assert capture.notes == ("4 files of depth.txt are missing and left out.",)
 
 
 @pytest.mark.parametrize(("kind", "image"), [("ScanNet", "color/9"), ("Polycam", "keyframes/images/7000")])

@@ -47,9 +47,15 @@ def test_a_frames_own_intrinsics_come_first(tmp_path):
 
 
 def test_a_frames_own_angle_of_view_comes_before_the_focal_length_of_the_file(tmp_path):
-    angle = {"camera_angle_x": 2 * np.arctan(0.5), "camera_angle_y": 2 * np.arctan(0.5)}
-    capture = open_capture(make_capture(tmp_path / "c", lambda root, meta: meta["frames"][2].update(angle)))
+    """One angle gives both focal lengths, two give one each; the other frames keep those of the file."""
+
+    def change(root, meta):
+        meta["frames"][2].update(camera_angle_x=2 * np.arctan(0.5), camera_angle_y=2 * np.arctan(0.5))
+        meta["frames"][3].update(camera_angle_x=2 * np.arctan(0.5))
+
+    capture = open_capture(make_capture(tmp_path / "c", change))
     np.testing.assert_allclose(capture.K(2), [[WIDTH, 0, 31], [0, HEIGHT, 25], [0, 0, 1]], rtol=1e-14)
+    np.testing.assert_allclose(capture.K(3), [[WIDTH, 0, 31], [0, WIDTH, 25], [0, 0, 1]], rtol=1e-14)
     np.testing.assert_array_equal(capture.K(1), [[50, 0, 31], [0, 51, 25], [0, 0, 1]])
 
 

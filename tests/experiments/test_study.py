@@ -6,8 +6,8 @@ import json
 import numpy as np
 import pytest
 from PIL import Image
-from ssplat_experiments import ablation, context_length
-from ssplat_experiments.cases import PICTURE, Case
+from ssplat_experiments import ablation, context_length, long_context
+from ssplat_experiments.cases import PICTURE, Case, shipped_weights
 from ssplat_experiments.study import Study, at_scale, run_study, side_by_side
 
 from ssplat_jax.config import preset
@@ -71,6 +71,29 @@ def test_results_of_another_configuration_are_refused(tmp_path):
     with pytest.raises(InputError, match=r"asked\.scale: 'smoke', wanted now 'cpu'"):
         run_study(counting_study(calls), None, tmp_path, "cpu", QUIET)
     assert calls == [] and files_of(tmp_path) == held
+
+
+def test_results_of_other_weights_are_refused(tmp_path, monkeypatch):
+    run_study(counting_study([]), None, tmp_path, "smoke", QUIET)
+    monkeypatch.setattr("ssplat_experiments.cases.shipped_weights", lambda: {**shipped_weights(), "tiny.npz": "other"})
+    with pytest.raises(InputError, match=r"weights\.tiny\.npz: '[0-9a-f]{12}', wanted now 'other'"):
+        run_study(counting_study([]), None, tmp_path, "smoke", QUIET)
+
+
+@pytest.mark.parametrize("scale", long_context.SIZES)
+def test_a_scene_at_another_size_is_a_suite_of_its_own(scale):
+    names = [suite + sizes.label for sizes in long_context.SIZES[scale] for suite in sizes.suites]
+    assert len(set(names)) == len(names)
+    costs = {"step_ms": 1.0, "chunk_ms": 1.0, "peak_memory_bytes": 1, PICTURE: "a.png", "method": context_length.OURS}
+    rows = [
+        {"suite": name, "views": views, **costs}
+        | {f"{c}_{m}": k + views / 100 for c in ("literal", "shown") for m in ("psnr", "ssim")}
+        for k, name in enumerate(names)
+        for views in (24, 224)
+    ]
+    (text,) = context_length.findings(rows)
+    assert text.count("24 to 224 views: +2.00 dB literal, +2.00 dB shown (PSNR and SSIM rise") == len(names)
+    assert context_length.gallery(rows).count("a.png") == len(rows)
 
 
 def test_a_damaged_case_is_named(tmp_path):

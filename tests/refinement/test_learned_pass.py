@@ -25,7 +25,7 @@ from ssplat_jax.refinement.learned_pass import (
     no_errors,
     refiner_features,
 )
-from ssplat_jax.refinement.refine import continue_refinement, is_learned, start_refinement
+from ssplat_jax.refinement.refine import continue_refinement, is_learned, report_of, start_refinement
 from ssplat_jax.refinement.refiner_weights import init_refiner, save_refiner
 from ssplat_jax.refinement.revision import Revision, apply_revision, no_revision, sizes
 from ssplat_jax.refinement.view_loss import EFFECTS
@@ -232,6 +232,20 @@ def test_passes_come_first_and_count_as_their_steps():
     assert len(progress.losses) == len(progress.held_back) == len(progress.seconds) == 2 * STEPS + 2
     assert not is_learned(0, STEPS - 1, PASSES) and not is_learned(3 * STEPS, 100, PASSES)
     assert is_learned(2 * STEPS, 100, PASSES) and not is_learned(0, 100, RefineConfig())
+
+
+@pytest.mark.parametrize(
+    ("learned", "taken", "expected"),
+    [([9.0], [], 0.0), ([9.0, 1.0], [7.0, 3.0, 4.0], 1.0), ([], [7.0, 3.0, 4.0], 3.5), ([], [7.0], 0.0)],
+    ids=str,
+)
+def test_the_time_of_a_step_leaves_out_the_first_of_each_kind(learned, taken, expected):
+    """The first pass and the first gradient step compile; a pass counts as its steps."""
+    progress, views = start_refinement(doubtful(), key_views(), PASSES)
+    progress.num_learned = STEPS * len(learned)
+    progress.seconds = [second for second in learned for _ in range(STEPS)] + taken
+    progress.losses = progress.held_back = [0.1] * len(progress.seconds)
+    assert report_of(progress, views).seconds_per_step == expected
 
 
 def test_a_pass_shows_the_views_of_its_steps():

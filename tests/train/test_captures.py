@@ -9,9 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from ssplat_jax.checkpoint.training_state import first_difference
 from ssplat_jax.commands.train_command import Train
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.errors import InputError
+from ssplat_jax.metrics.lpips import LpipsWeights
 from ssplat_jax.train import loop
 from ssplat_jax.train.capture_samples import (
     CaptureGroup,
@@ -25,6 +27,8 @@ from ssplat_jax.train.losses import MAX_GAIN, fitted_gains
 from ssplat_jax.train.recipe import TINY, Phase, Recipe, smoke_recipe
 from ssplat_jax.train.samples import log_depths_at_cells
 from ssplat_jax.train.step_samples import sample_for_step, validation_samples
+from tests.badinputs.cases import make_capture
+from tests.data.capture_writers import write_depth
 from tests.streaming.narrow_model import NARROW
 
 NUM_FRAMES, SIZE = 22, (64, 96)  # height and width
@@ -174,11 +178,51 @@ def test_shares_need_captures(tmp_path):
 
 def test_a_run_with_other_captures_is_not_continued(mix, capture):
     descriptions = [
-        loop.describe_run(NARROW, TINY, loop.RANDOM, has_lpips=False, mix=m)
+        loop.describe_run(NARROW, TINY, loop.RANDOM, mix=m)
         for m in (None, mix, CaptureMix((CaptureGroup("room", 0.5, (capture,)),), NARROW))
     ]
     assert "captures" not in descriptions[0]  # as runs were described before there were captures
     assert descriptions[1] != descriptions[2] and json.loads(json.dumps(descriptions[1])) is not None
+
+
+@pytest.mark.parametrize("spoiled", ["images/2.jpg", "depth/2.png", "transforms.json"])
+def test_a_run_with_other_files_of_a_capture_is_not_continued(spoiled, tmp_path):
+    def described():
+        group = CaptureGroup("one", 1.0, (open_capture(tmp_path / "c"),))
+        mix = CaptureMix((group,), NARROW)
+        return json.loads(json.dumps(loop.describe_run(NARROW, TINY, loop.RANDOM, mix=mix)))
+
+    def with_depth(root, meta):
+        for frame in meta["frames"][1:]:
+            number = Path(frame["file_path"]).stem
+            frame["depth_file_path"] = f"depth/{number}.png"
+            write_depth(root / "depth" / f"{number}.png", 1500)
+
+    make_capture(tmp_path / "c", with_depth)
+    before = described()
+    assert described() == before
+    old = before | {"captures": [{k: v for k, v in before["captures"][0].items() if k != "files"}]}
+    assert loop.upgrade_description(old, wanted=before) == before
+    file = tmp_path / "c" / spoiled
+    if spoiled == "transforms.json":  # a frame more has a depth map
+        file.write_text(file.read_text().replace('"file_path"', '"depth_file_path": "depth/2.png", "file_path"', 1))
+    else:
+        file.write_bytes(file.read_bytes() + b"\0")
+    now = described()
+    assert first_difference(before, now)[0] == "captures[0].files.0 c"
+    assert loop.upgrade_description(before, wanted=now) == before
+
+
+def test_a_run_with_other_lpips_weights_is_not_continued():
+    first, second = (LpipsWeights((), (), (jnp.full(3, x),)) for x in (1.0, 2.0))
+    described = [loop.describe_run(NARROW, TINY, loop.RANDOM, lpips_weights=w) for w in (first, second)]
+    assert first_difference(*described)[0] == "lpips_weights"
+    old = {name: value for name, value in described[0].items() if name != "lpips_weights"}
+    without = json.loads(json.dumps(loop.describe_run(NARROW, TINY, loop.RANDOM)))
+    wanted = json.loads(json.dumps(described[1]))
+    upgraded = [loop.upgrade_description(json.loads(json.dumps(old)), wanted=w) for w in (wanted, without)]
+    assert first_difference(upgraded[0], wanted) is None
+    assert first_difference(upgraded[1], without)[0] == "rendering_loss"
 
 
 def test_fitted_gains_undo_exposures_and_stay_bounded():

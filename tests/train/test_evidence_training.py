@@ -12,6 +12,7 @@ import pytest
 from ssplat_jax.checkpoint.weights import describe_weights, load_params, load_weights
 from ssplat_jax.commands.train_command import Train
 from ssplat_jax.config import preset
+from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.errors import InputError
 from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.geometry.cameras import Camera
@@ -83,6 +84,22 @@ def test_an_untrained_head_is_what_it_starts_from(trained, monkeypatch):
     noise = jax.tree.map(lambda x: x + 1.0, before["evidence"])
     again, _ = train_evidence(StreamSplat(preset("tiny")), {**before, "evidence": noise}, [], RECIPE)
     jax.tree.map(np.testing.assert_array_equal, again["evidence"], after["evidence"])
+
+
+@pytest.mark.parametrize("steps", [0, 2])
+def test_a_stream_that_refines_is_refined_for_training_too(steps, monkeypatch):
+    class Begun(Exception):
+        """Ends the stream at its beginning."""
+
+    def session(model, params, *, revise):
+        assert (revise is None) == (steps == 0)
+        raise Begun
+
+    monkeypatch.setattr(streamed_scenes, "Session", session)
+    monkeypatch.setattr(streamed_scenes, "make_room", lambda: None)
+    model = StreamSplat(preset("tiny").replace(steps_per_chunk=steps))
+    with pytest.raises(Begun):
+        streamed_scenes.stream_scene(model, {}, open_capture("procedural:room?frames=12&size=64x48"), 1)
 
 
 @pytest.mark.slow

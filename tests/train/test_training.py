@@ -31,6 +31,7 @@ from ssplat_jax.train.losses import depth_loss, image_gradient_l1, soft_targets
 from ssplat_jax.train.recipe import (
     ALL_BUT_HEAD,
     DEFAULT_FORM,
+    MATCHER_STAGES,
     RECIPES,
     TINY,
     Phase,
@@ -105,7 +106,7 @@ def test_other_recipe_is_refused_by_its_first_difference(tmp_path):
         TrainingCheckpoints(tmp_path, other)
 
 
-UPGRADE = functools.partial(loop.upgrade_description, init_weights=loop.RANDOM)
+UPGRADE = functools.partial(loop.upgrade_description, wanted={"init_weights": loop.RANDOM})
 OLD_RUN = Path(__file__).with_name("recipe_0_1.json")  # written by version 0.1 for `ssplat train --scale-steps 0.004`
 
 
@@ -114,13 +115,13 @@ def test_run_of_version_0_1_is_resumed(tmp_path):
     recipe = TINY.scaled(0.004)
     then = preset("tiny").replace(evidence=False, cgfi=True, mixer_blocks=2, min_confidence=0.5)
     config = training_config(then, recipe)
-    description = loop.describe_run(config, recipe, loop.RANDOM, has_lpips=False)
+    description = loop.describe_run(config, recipe, loop.RANDOM)
     TrainingCheckpoints(tmp_path, description, upgrade=UPGRADE).close()
     for other in (dataclasses.replace(recipe, adam_b2=0.999), dataclasses.replace(recipe, weight_decay=0.02)):
-        description = loop.describe_run(config, other, loop.RANDOM, has_lpips=False)
+        description = loop.describe_run(config, other, loop.RANDOM)
         with pytest.raises(InputError, match=r"holds a run with recipe\.(adam_b2|weight_decay)"):
             TrainingCheckpoints(tmp_path, description, upgrade=UPGRADE)
-    description = loop.describe_run(config.replace(token_width=32), recipe, loop.RANDOM, has_lpips=False)
+    description = loop.describe_run(config.replace(token_width=32), recipe, loop.RANDOM)
     with pytest.raises(InputError, match=r"config\.network\.token_width = 64, wanted 32"):
         TrainingCheckpoints(tmp_path, description, upgrade=UPGRADE)
 
@@ -128,27 +129,27 @@ def test_run_of_version_0_1_is_resumed(tmp_path):
 def test_a_run_that_began_with_other_weights_is_refused(tmp_path):
     config = training_config(NARROW, RECIPE)
     first, other = ({"encoder": {"kernel": jnp.full((2, 2), x)}} for x in (1.0, 2.0))
-    held = loop.describe_run(config, RECIPE, params_digest(first), has_lpips=False)
+    held = loop.describe_run(config, RECIPE, params_digest(first))
     TrainingCheckpoints(tmp_path, held).close()
     for params in (other, None):
         with pytest.raises(InputError, match="holds a run with init_weights = "):
             loop.train(NARROW, RECIPE, tmp_path, params=params)
     with pytest.raises(InputError, match=f"{params_digest(first)}', wanted 'mine'"):
         loop.train(NARROW, RECIPE, tmp_path, params=first, init_weights="mine")
-    TrainingCheckpoints(tmp_path / "2", loop.describe_run(config, RECIPE, loop.RANDOM, has_lpips=False)).close()
+    TrainingCheckpoints(tmp_path / "2", loop.describe_run(config, RECIPE, loop.RANDOM)).close()
     with pytest.raises(InputError, match=f"init_weights = 'random', wanted '{params_digest(first)}'"):
         loop.train(NARROW, RECIPE, tmp_path / "2", params=first)
 
 
 def test_a_run_of_a_version_that_did_not_write_its_start_is_resumed(tmp_path):
-    description = json.loads(json.dumps(loop.describe_run(NARROW, RECIPE, "mine", has_lpips=False)))
+    description = json.loads(json.dumps(loop.describe_run(NARROW, RECIPE, "mine")))
     old = {name: value for name, value in description.items() if name != "init_weights"}
-    assert loop.upgrade_description(old, init_weights="mine") == description
-    assert loop.upgrade_description(description, init_weights="another") == description
+    assert loop.upgrade_description(old, wanted={"init_weights": "mine"}) == description
+    assert loop.upgrade_description(description, wanted={"init_weights": "another"}) == description
 
 
 def test_run_without_the_switches_of_additions_is_resumed(tmp_path):
-    description = loop.describe_run(NARROW, RECIPE, loop.RANDOM, has_lpips=False)
+    description = loop.describe_run(NARROW, RECIPE, loop.RANDOM)
     old = json.loads(json.dumps(description))
     del old["config"]["history"]["cgfi_form"], old["config"]["head"]["opacity_mode"]
     (tmp_path / "recipe.json").write_text(json.dumps(old))
@@ -263,12 +264,22 @@ def test_targets_need_context_views_around_them():
 
 
 @pytest.mark.slow  # a program of its own
-def test_padded_sizes_train():
+def test_padding_does_not_count_in_the_loss(monkeypatch):
     """72 rows are padded to 96: the truth is padded like the images, and padding does not count in the loss."""
     sample = make_sample(0, num_chunks=1, num_targets=0, size=(72, 64), config=NARROW)
     model = StreamSplat(training_config(NARROW, RECIPE))
-    params = jax.eval_shape(model.init, jax.random.key(0))
-    jax.eval_shape(lambda p, s: stream_chunks(model, p, s, RECIPE), params, sample)
+    params = model.init(jax.random.key(0))
+
+    def losses(shown, hidden):
+        """Losses with the truth of the image moved by `shown` and that of the padding by `hidden`."""
+        moved = lambda truth, like: pad_like(truth + shown, like).at[:, 18:].add(hidden - shown)  # noqa: E731
+        with monkeypatch.context() as patched:
+            patched.setattr("ssplat_jax.train.step.pad_like", moved)
+            return np.asarray(stream_chunks(model, params, sample, RECIPE)[2])
+
+    as_it_is = losses(0.0, 0.0)
+    np.testing.assert_array_equal(losses(0.0, 0.2), as_it_is)
+    assert np.abs(losses(0.2, 0.0) - as_it_is).min() > 0.01
     truth = np.asarray(sample.log_depths[0])
     padded = np.asarray(pad_like(jnp.asarray(truth), jnp.zeros((4, 24, 16))))
     assert truth.shape == (4, 18, 16)
@@ -416,6 +427,22 @@ def test_frozen_stages_stay_and_the_others_move(trainer):
         np.testing.assert_array_equal(a, b)
     moved = zip(flat(after.params["cost_volume"]), flat(before["cost_volume"]), strict=True)
     assert any(not np.array_equal(a, b) for a, b in moved)
+
+
+def test_stages_that_the_loss_does_not_reach_stay_whatever_moved_them_before(trainer):
+    """A sample without targets and with one chunk teaches depth alone: nothing else decays or follows old momentum."""
+    state = start(trainer)
+    moments = jax.tree.map(lambda x: x + 0.1 if jnp.issubdtype(x.dtype, jnp.floating) else x, state.opt_state)
+    later = [name for name in state.params if name not in MATCHER_STAGES]
+    before = {name: [np.asarray(x) for x in flat(state.params[name])] for name in later}
+    assert sum(map(len, before.values())) > 8
+    sample = sample_for_step(0, DEPTH_RECIPE, trainer.model.config)
+    state = dataclasses.replace(state, opt_state=moments)
+    after, _ = trainer.step(state, alone(sample), jnp.float32(1e-3), form=FROZEN_ENCODER)
+    for name, held in before.items():
+        for tree in (after.params, after.ema):
+            for a, b in zip(flat(tree[name]), held, strict=True):
+                np.testing.assert_array_equal(a, b, err_msg=name)
 
 
 def test_members_of_a_batch_are_samples_of_their_own():

@@ -4,9 +4,9 @@ Where there is no `sparse/0`, the reconstruction of the lowest number is read; a
 
 Poses are world-to-camera with OpenCV axes, in COLMAP's world; pixel centers are at +0.5. Images are in `images/` (or
 downscaled in `images_2`, `images_4`, `images_8`), else in the folder of the capture. Images that COLMAP did not
-register, and registered ones whose file is missing, are left out and counted. Perspective and fish-eye camera models are supported (`MODELS`), FULL_OPENCV only without its
-denominator (k4 to k6); cameras that no image uses may be of any model. If there are binary and text files, the binary
-ones are read. Format: colmap.github.io/format.html.
+register, and registered ones whose file is missing, are left out and counted. Perspective and fish-eye camera models
+are supported (`MODELS`), FULL_OPENCV only without its denominator (k4 to k6); cameras that no image uses may be of any
+model. If there are binary and text files, the binary ones are read. Format: colmap.github.io/format.html.
 """
 
 import struct
@@ -19,9 +19,9 @@ from ssplat_jax.data.pose_conventions import Convention
 from ssplat_jax.data.posed_image import Frame, pose_from_quat
 from ssplat_jax.data.readers import Listing
 from ssplat_jax.data.readers.frame_list import (
+    EXTENSIONS,
     SHRUNK_FOLDERS,
     Intrinsics,
-    EXTENSIONS,
     file_named,
     find_named,
     list_frames,
@@ -89,7 +89,7 @@ def read(path: Path) -> Listing:
     """Reads the registered images of the reconstruction in the folder `path`."""
     model, root = _model_folder(path), path.resolve()
     assert model is not None  # `matches` is true
-    cameras, entries = _contents(model)
+    cameras, entries = _cameras(model), _images(model)
     if not entries:
         fix = "run the reconstruction again: no image was registered"
         raise refusal(str(model), wanted="registered images", got="none", fix=fix)
@@ -98,13 +98,17 @@ def read(path: Path) -> Listing:
         folder = ""  # COLMAP ran on the parent folder, so the names include images/
     seen: dict[Path | None, str] = {}
     frames, num_registered = [], len(entries)
-    there = [entry for entry in entries if find_named(root, folder + entry.name, entry.where, folders=SHRUNK_FOLDERS)]
-    for entry in there or entries:  # if all are missing, the first is refused
-        frame = _frame(root, folder, entry, cameras)
+    for entry in entries:
+        path_of_image = find_named(root, folder + entry.name, entry.where, folders=SHRUNK_FOLDERS)
+        if path_of_image is None:
+            continue
+        frame = _frame(path_of_image, entry, cameras)
         if seen.setdefault(frame.path, entry.where) is not entry.where:
             got = f"{echo(entry.name)} twice"
             raise refusal(entry.where, wanted="every image once", got=got, fix="remove one of the two")
         frames.append(frame)
+    if not frames:
+        file_named(root, folder + entries[0].name, entries[0].where, folders=SHRUNK_FOLDERS)  # refuses it
     num_missing, num_unposed = num_registered - len(frames), _num_others(root / "images", seen)
     missing = f"{num_missing} of {num_registered} registered images are skipped: their files are missing."
     unposed = f"{num_unposed} images in images/ are left out: COLMAP did not register them."
@@ -112,11 +116,18 @@ def read(path: Path) -> Listing:
     return list_frames(root.name, frames, [*notes, *_larger_models(path, model, num_registered)])
 
 
-def _contents(model: Path) -> tuple[dict[int, CameraEntry], list[ImageEntry]]:
-    """Cameras by id and images of the reconstruction in a folder."""
+def _cameras(model: Path) -> dict[int, CameraEntry]:
+    """Cameras by id of the reconstruction in a folder."""
     if (model / "images.bin").is_file():
-        return _binary_cameras(model / "cameras.bin"), list(_binary_images(model / "images.bin"))
-    return _text_cameras(model / "cameras.txt"), list(_text_images(model / "images.txt"))
+        return _binary_cameras(model / "cameras.bin")
+    return _text_cameras(model / "cameras.txt")
+
+
+def _images(model: Path) -> list[ImageEntry]:
+    """Registered images of the reconstruction in a folder."""
+    if (model / "images.bin").is_file():
+        return list(_binary_images(model / "images.bin"))
+    return list(_text_images(model / "images.txt"))
 
 
 def _num_others(images: Path, seen: Collection[Path | None]) -> int:
@@ -130,20 +141,21 @@ def _num_others(images: Path, seen: Collection[Path | None]) -> int:
 
 def _larger_models(path: Path, model: Path, num_registered: int) -> list[str]:
     """A note about the reconstruction beside `model` with the most images, if it has more than `num_registered`."""
-    if not model.name.isdecimal():
+    if model == path or not model.name.isdecimal():
         return []
     counts = {}
     for folder in model.parent.glob("[0-9]*"):
-        if folder != model and _is_model(folder):
+        if folder != model and folder.name.isdecimal() and _is_model(folder):
             try:
-                counts[folder] = len(_contents(folder)[1])
+                counts[folder] = len(_images(folder))
             except InputError:  # a damaged reconstruction that is not read
                 continue
     largest = max(counts, key=lambda folder: counts[folder], default=None)
     if largest is None or counts[largest] <= num_registered:
         return []
-    names = [str(folder.relative_to(path)) for folder in (largest, model)]
-    return [f"{names[0]} holds {counts[largest]} images, {names[1]}, which is read, {num_registered}; swap them to read it."]
+    other, read = (folder.relative_to(path) for folder in (largest, model))
+    found = f"{other} holds {counts[largest]} images; {read}, which is read, holds {num_registered}"
+    return [f"{found}. Swap the folders' names to read the larger one."]
 
 
 def _model_folder(path: Path) -> Path | None:
@@ -164,13 +176,12 @@ def _is_model(folder: Path) -> bool:
     return any((folder / f"images.{kind}").is_file() for kind in ("bin", "txt"))
 
 
-def _frame(root: Path, folder: str, entry: ImageEntry, cameras: dict[int, CameraEntry]) -> Frame:
-    """Checked frame of a registered image."""
+def _frame(path: Path, entry: ImageEntry, cameras: dict[int, CameraEntry]) -> Frame:
+    """Checked frame of a registered image, whose file is `path`."""
     if entry.camera not in cameras:
         got = f"camera {entry.camera}, which is missing"
         raise refusal(entry.where, wanted="a camera of the reconstruction", got=got, fix=COPY_AGAIN)
     camera = cameras[entry.camera]
-    path = file_named(root, folder + entry.name, entry.where, folders=SHRUNK_FOLDERS)
     fix = "use the images that COLMAP used"
     size, shrink = stored_size(path, camera.size, entry.where, fix)
     return make_frame(

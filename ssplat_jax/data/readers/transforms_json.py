@@ -36,6 +36,7 @@ from ssplat_jax.errors import InputError, echo, refusal
 FORMAT = "transforms.json"
 CONVENTION = Convention(axes="opengl")
 PLACES = ("transforms.json", "nerfstudio/transforms.json")
+FOCAL_FIELDS = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y")
 PINHOLE_MODELS = (None, "OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 FISHEYE_MODELS = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 
@@ -150,14 +151,9 @@ class _Fields:
     def __init__(self, meta: dict[str, Any], entry: dict[str, Any], where: str) -> None:
         self._meta, self._entry, self.where = meta, entry, where
 
-    def get(self, name: str) -> Any:
-        """Returns the value of a field, or None."""
-        return self._entry.get(name, self._meta.get(name))
-
-    def first_of(self, *names: str) -> str | None:
-        """Returns the first of the names that the frame has, else the first that the file has, or None."""
-        held = (name for values in (self._entry, self._meta) for name in names if values.get(name) is not None)
-        return next(held, None)
+    def get(self, name: str, *, own: bool = False) -> Any:
+        """Returns the value of a field, with `own` that of the frame alone, or None."""
+        return self._entry.get(name, None if own else self._meta.get(name))
 
     def number(self, name: str, default: float) -> float:
         """Returns a field as float, or `default` if it is missing or null."""
@@ -204,13 +200,13 @@ def _lens(fields: _Fields) -> Lens:
 
 def _focal(fields: _Fields, width: float, height: float) -> tuple[float, float]:
     """Focal lengths in pixels, from fl_x and fl_y or the fields of view camera_angle_x and camera_angle_y."""
-    focals = {}
+    focals, own = {}, {name for name in FOCAL_FIELDS if fields.get(name, own=True) is not None}
+    only_angles = bool(own) and own.isdisjoint(("fl_x", "fl_y"))  # of the frame, whatever the file gives
     for axis, extent in (("x", width), ("y", height)):
-        name = fields.first_of(f"fl_{axis}", f"camera_angle_{axis}")
-        if name == f"fl_{axis}":
-            focals[axis] = fields.number(name, 0.0)
-        elif name is not None:
-            angle = fields.number(name, 0.0)
+        if not only_angles and fields.get(f"fl_{axis}") is not None:
+            focals[axis] = fields.number(f"fl_{axis}", 0.0)
+        elif fields.get(f"camera_angle_{axis}", own=only_angles) is not None:
+            angle = fields.number(f"camera_angle_{axis}", 0.0)
             if not (0 < angle < math.pi and math.tan(angle / 2) > 0):
                 where = f"{fields.where}.camera_angle_{axis}"
                 raise refusal(where, wanted="an angle in (0, pi)", got=echo(angle), fix="give it in radians")

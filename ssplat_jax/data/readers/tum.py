@@ -2,8 +2,8 @@
 
 `rgb.txt` and `depth.txt` list times and files, `groundtruth.txt` camera-to-world poses (time, tx ty tz, qx qy qz qw).
 The pose of an image is interpolated between its neighbors in time; images between poses more than `MAX_POSE_GAP` apart
-are skipped, as are listed files that do not exist; an image that is listed at several times counts once, at the first. Depth maps are in units of 1/5000
-m; an image gets the nearest one within `MAX_DEPTH_GAP`.
+are skipped, as are listed files that do not exist; an image that is listed at several times counts once, at the first.
+Depth maps are in units of 1/5000 m; an image gets the nearest one within `MAX_DEPTH_GAP`.
 Intrinsics are read from `calibration.txt` (fx fy cx cy, optionally k1 k2 p1 p2 k3). Without it, `freiburg1` to
 `freiburg3` in the name of the folder selects those of the color camera from
 cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats. Both have the center of the first pixel at 0, so half a pixel is
@@ -47,10 +47,9 @@ def read(path: Path) -> Listing:
     intrinsics, calibration = _intrinsics(root)
     poses = load_rows(root / "groundtruth.txt", 8)
     poses = poses[np.argsort(poses[:, 0], kind="stable")]
-    (listed, num_gone), (depths, depths_gone) = (
-        _files(root, name) if (root / name).is_file() else ([], 0) for name in ("rgb.txt", "depth.txt")
-    )
+    listed, num_gone = _files(root, "rgb.txt", needed=True)
     images, num_again = _each_once(listed)
+    depths, depths_gone = _files(root, "depth.txt") if (root / "depth.txt").is_file() else ([], 0)
     frames = []
     for time, image in images:
         where = f"{root / 'groundtruth.txt'} at {time:.6f}"
@@ -87,8 +86,12 @@ def _each_once(files: list[tuple[float, Path]]) -> tuple[list[tuple[float, Path]
     return [(time, file) for file, time in first.items()], len(files) - len(first)
 
 
-def _files(root: Path, name: str) -> tuple[list[tuple[float, Path]], int]:
-    """(time, file) of a list of files, in the order of time, and the number of listed files that do not exist."""
+def _files(root: Path, name: str, *, needed: bool = False) -> tuple[list[tuple[float, Path]], int]:
+    """(time, file) of a list of files, in the order of time, and the number of listed files that do not exist.
+
+    Raises:
+        InputError: a line is damaged, or none of the files exists although they are `needed`.
+    """
     found, missing = [], []
     for number, line in load_lines(root / name):
         if not line:
@@ -102,7 +105,7 @@ def _files(root: Path, name: str) -> tuple[list[tuple[float, Path]], int]:
             missing.append((words[1], where))
         else:
             found.append((time, file))
-    if missing and not found:
+    if needed and missing and not found:
         file_named(root, *missing[0])  # refuses it
     return sorted(found), len(missing)
 
