@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ssplat_jax.errors import InputError
+from ssplat_jax.errors import InputError, refusal
 from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.pytree import pytree
 
@@ -30,7 +30,7 @@ class Chunk:
 
 
 def check_chunk(chunk: Chunk, num_views: int, *, stacked: bool = False) -> None:
-    """Checks the shapes of one chunk, or of several in one, of tracers too.
+    """Checks precision, shapes and type of images of one chunk, or of several in one, of tracers too.
 
     Args:
         chunk: without leading axes, or with one if `stacked`.
@@ -38,8 +38,14 @@ def check_chunk(chunk: Chunk, num_views: int, *, stacked: bool = False) -> None:
         stacked: all fields have a leading axis, the same for all.
 
     Raises:
-        InputError: naming the field of a wrong shape.
+        InputError: naming the field of a wrong shape; images are not floats, or JAX computes in float64.
     """
+    if jnp.result_type(float) != jnp.float32:
+        fix = "stream inside `with jax.enable_x64(False):`"
+        raise refusal("chunk", wanted="JAX's default, float32", got="float64 (jax_enable_x64)", fix=fix)
+    if not jnp.issubdtype(jnp.result_type(chunk.images), jnp.floating):
+        got, fix = str(jnp.result_type(chunk.images)), "divide bytes by 255"
+        raise refusal("chunk: images", wanted="floats in [0, 1]", got=got, fix=fix)
     v, leading = num_views, jnp.shape(chunk.images)[:1] if stacked else ()
     shapes = {"images": (v, "h", "w", 3), "viewmats": (v, 4, 4), "Ks": (v, 3, 3), "valid": (v,), "near": (), "far": ()}
     fix = f" Chunks have {v} views (`stream.chunk_size`): pad a short one with views whose `valid` is False."

@@ -42,6 +42,16 @@ def safe_log(x: Float[Array, "*s"], eps: float = 1e-12) -> Float[Array, "*s"]:
     return jnp.where(is_small, jnp.log(jnp.asarray(eps, x.dtype)), jnp.log(jnp.where(is_small, jnp.ones_like(x), x)))
 
 
+def safe_sqrt(x: Float[Array, "*s"]) -> Float[Array, "*s"]:
+    """Square root.
+
+    Limits:
+        x <= 0 gives 0, with a zero gradient.
+    """
+    is_small = x <= 0
+    return jnp.where(is_small, jnp.zeros_like(x), jnp.sqrt(jnp.where(is_small, jnp.ones_like(x), x)))
+
+
 def clip_value(x: Float[Array, "*s"], low: float, high: float) -> Float[Array, "*s"]:
     """`x` clipped to [low, high], with the gradient of the identity.
 

@@ -10,6 +10,7 @@ from typing import ClassVar, Literal, get_args, get_origin
 import pytest
 
 from ssplat_jax.config import PRESETS, CompactConfig, StreamConfig, preset
+from ssplat_jax.config.config_group import ConfigGroup
 from ssplat_jax.errors import InputError
 
 BAD = [
@@ -183,3 +184,13 @@ def test_all_public_names_exist():
     assert callable(ssplat_jax.render)
     with pytest.raises(AttributeError, match="no attribute 'renders'"):
         _ = ssplat_jax.renders
+
+
+def test_lists_in_a_configuration_are_tuples():
+    """A group of one's own has no type checks, as the package's have none outside of tests."""
+
+    @dataclasses.dataclass(frozen=True)
+    class Group(ConfigGroup):
+        widths: tuple[int, ...] = (8, 16)
+
+    assert Group([4, 2]) == Group((4, 2)) and hash(Group([4, 2])) == hash(Group((4, 2)))

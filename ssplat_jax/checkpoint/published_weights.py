@@ -136,7 +136,9 @@ def import_params(path: Path, config: StreamConfig, seed: int = 0, *, depth_only
         )
     arrays = read_arrays(path, {names_in_file[t.name]: t.shape for t in tensors.values() if t.name in available})
     incomplete = {p.partition("/")[0] for p, t in tensors_by_place.items() if t is None or t.name not in available}
-    params = init_params(jax.random.key(seed), config, incomplete)
+    key = jax.random.key(seed)
+    stages = jax.eval_shape(lambda: init_params(key, config))  # those without parameters too
+    params = {name: {} for name in stages} | init_params(key, config, incomplete)
     for place, tensor in tensors.items():
         if tensor.name in available:
             _insert(params, place, jnp.asarray(tensor.to_parameter(arrays[names_in_file[tensor.name]])))

@@ -24,13 +24,16 @@ def are_widths(value: Any) -> bool:
 
 
 class ConfigGroup:
-    """Base of the groups of fields; `__post_init__` checks every field."""
+    """Base of the groups of fields; `__post_init__` checks every field. Lists become tuples, which have a hash."""
 
     def rules(self) -> tuple[tuple[str, str, bool], ...]:
         """Rules beyond the options of a field: (field, wanted, whether its value is good)."""
         return ()
 
     def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):  # pyright: ignore[reportArgumentType]
+            if isinstance(value := getattr(self, field.name), list):
+                object.__setattr__(self, field.name, tuple(value))
         for name, wanted, is_good in self.rules():
             if not is_good:
                 raise InputError(f"config: {name} must be {wanted}, got {getattr(self, name)!r}.")

@@ -14,7 +14,7 @@ from ssplat_jax.cache.sightings import features_of_sightings
 from ssplat_jax.cache.state import NUM_SIGHTINGS
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.model.types import TokenShapes
-from ssplat_jax.numerics import safe_log
+from ssplat_jax.numerics import safe_log, safe_sqrt
 from ssplat_jax.pytree import pytree, replace
 
 MAX_LOGIT_CHANGE = 4.0
@@ -63,7 +63,8 @@ def evidence_features(evidence: Evidence, config: StreamConfig) -> Float[Array, 
     """Evidence as numbers of about unit size.
 
     Limits:
-        Confidences of 0 and 1, zero sightings and zero footprints, as dead pivots have them, give finite features.
+        Confidences of 0 and 1, zero sightings and zero footprints, as dead pivots have them, and equal colors give
+        finite features with finite gradients.
     """
     omega = jnp.clip(evidence.confidences, 1e-3, 0.96)
     colors = evidence.rgbs.reshape(len(evidence.rgbs), -1, 3)
@@ -73,7 +74,7 @@ def evidence_features(evidence: Evidence, config: StreamConfig) -> Float[Array, 
         safe_log(jnp.maximum(evidence.footprints, 1e-6) / config.memory.voxel_size),
         evidence.num_pivots - 2.5,
         safe_log(jnp.maximum(evidence.growth, 1.0)),
-        10 * jnp.std(colors, axis=1).mean(axis=-1) - 0.5,
+        10 * safe_sqrt(jnp.var(colors, axis=1)).mean(axis=-1) - 0.5,
         2 * colors.mean(axis=(1, 2)) - 1.0,
     )
     return jnp.concatenate([jnp.stack(features, axis=-1), features_of_sightings(evidence.sightings)], axis=-1)

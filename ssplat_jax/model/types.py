@@ -73,13 +73,19 @@ def repeat_cells(x: Array, factor: int) -> Array:
 def prepare_views(chunk: Chunk, config: StreamConfig) -> Views:
     """Views of `chunk`: images edge-padded to the network's multiple, and the depth candidates.
 
+    Padding views become black images of identity cameras, whatever they hold: 0 times NaN would be NaN.
+
     Limits:
-        A single candidate lies at `near`.
+        A single candidate lies at `near`, in inverse depth at `far`.
     """
+    is_valid = lambda x: chunk.valid.reshape(-1, *(1,) * (x.ndim - 1))  # noqa: E731
+    images = jnp.where(is_valid(chunk.images), chunk.images, 0)
+    viewmats = jnp.where(is_valid(chunk.viewmats), chunk.viewmats, jnp.eye(4, dtype=chunk.viewmats.dtype))
+    Ks = jnp.where(is_valid(chunk.Ks), chunk.Ks, jnp.eye(3, dtype=chunk.Ks.dtype))
     height, width = chunk.images.shape[1:3]
     multiple = config.network.size_multiple
     pad_h, pad_w = -height % multiple, -width % multiple
-    images = jnp.pad(chunk.images, ((0, 0), (0, pad_h), (0, pad_w), (0, 0)), mode="edge")
+    images = jnp.pad(images, ((0, 0), (0, pad_h), (0, pad_w), (0, 0)), mode="edge")
     centers = pixel_grid(height + pad_h, width + pad_w, GRID_STRIDE)
     in_image = (centers[..., 0] < width) & (centers[..., 1] < height)
     near, far = (
@@ -87,8 +93,8 @@ def prepare_views(chunk: Chunk, config: StreamConfig) -> Views:
     )
     return Views(
         images=images,
-        viewmats=chunk.viewmats,
-        Ks=chunk.Ks,
+        viewmats=viewmats,
+        Ks=Ks,
         valid=chunk.valid,
         inside=in_image[None] & chunk.valid[:, None, None],
         log_candidates=_log_candidates(near, far, config),

@@ -105,8 +105,8 @@ def render(
     is_concrete = max_pairs is None and not any(isinstance(x, Tracer) for x in arrays)
     # Views of one scene need about the same capacity: a pass that only counts costs a third of a render.
     known = (inputs.gaussians.num_gaussians, camera.viewmats.shape, camera.width, camera.height, tile)
-    if is_concrete and known in _CAPACITIES:
-        max_pairs = _CAPACITIES[known]
+    if is_concrete:
+        max_pairs = _CAPACITIES.get(known)  # at once: another thread may forget it
     if max_pairs is None:
         # Under `jax.grad` alone the primal values are concrete: without tangents, the pairs can be counted.
         counted = _count(jax.lax.stop_gradient(inputs), effects, tile)
@@ -131,8 +131,8 @@ def _remember_capacity(kind: tuple, num_pairs: int) -> None:
     """Remembers the capacity for `num_pairs`; a larger one is kept down to a quarter, as it is compiled already."""
     needed, held = _capacity_for(num_pairs), _CAPACITIES.pop(kind, 0)
     _CAPACITIES[kind] = held if needed <= held <= 4 * needed else needed
-    if len(_CAPACITIES) > MAX_REMEMBERED:
-        del _CAPACITIES[next(iter(_CAPACITIES))]
+    while len(_CAPACITIES) > MAX_REMEMBERED:
+        _CAPACITIES.pop(next(iter(_CAPACITIES.copy())), None)
 
 
 def _capacity_for(num_pairs: int) -> int:

@@ -26,7 +26,8 @@ class LiveViews:
     """
 
     def __init__(self, config: StreamConfig, frame: StreamFrame | None = None) -> None:
-        self._config, self.frame = config.replace(causal=True), frame
+        self._config, self._frame = config.replace(causal=True), frame
+        self._output: ChunkOutput | None = None  # of the last chunk, if the frame has not learned from it yet
         self._images: list[Float32[np.ndarray, "h w 3"]] = []
         self._frames: list[Frame] = []
         self._num_views = 0
@@ -61,7 +62,7 @@ class LiveViews:
     def rest(self) -> Chunk | None:
         """The next chunk of the views that wait, padded with invalid views; None if there are none.
 
-        The views wait on if anything is raised or interrupts.
+        The views wait on until `drop` is called.
         """
         if not self._frames:
             return None
@@ -72,15 +73,24 @@ class LiveViews:
         frames, pixels = tuple(self._frames[:size]), ArrayPixels(images=images, depths=depths)
         capture = Capture(name="live", format="memory", frames=frames, pixels=pixels, width=width, height=height)
         if self.frame is None:
-            self.frame = capture.stream_frame(self._config)
-        chunk = next(iter(capture.chunks(self._config, range(len(capture)), frame=self.frame)))
-        self._images, self._frames = self._images[size:], self._frames[size:]
-        return chunk
+            self._frame = capture.stream_frame(self._config)
+        return next(iter(capture.chunks(self._config, range(len(capture)), frame=self.frame)))
 
-    def learn(self, output: ChunkOutput) -> None:
-        """Moves near and far outward for later chunks if the last one contradicts them (`causal_range`)."""
-        assert self.frame is not None
-        self.frame = widen_range(self.frame, output, self._config)
+    def drop(self, output: ChunkOutput) -> None:
+        """Forgets the views of the chunk that `rest` gave last, which is streamed with that output."""
+        size = self._config.stream.chunk_size
+        self._images, self._frames, self._output = self._images[size:], self._frames[size:], output
+
+    @property
+    def frame(self) -> StreamFrame | None:
+        """The frame of the next chunk: near and far moved outward where the last one contradicts them (`causal_range`).
+
+        Computed when it is needed, since the step of the last chunk may still run; None before the first chunk.
+        """
+        if self._output is not None and self._frame is not None:
+            self._frame = widen_range(self._frame, self._output, self._config)
+            self._output = None
+        return self._frame
 
 
 def _checked_image(image: object) -> Float32[np.ndarray, "h w 3"]:

@@ -12,11 +12,12 @@ comparing the shown pivots and their sightings with the previous ones.
 """
 
 import dataclasses
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float32, Int32
+from jaxtyping import Bool, Float32, Int32
 
 from ssplat_jax.cache import VoxelCache
 from ssplat_jax.cache.sightings import total_sightings
@@ -40,6 +41,14 @@ class SceneDelta:
     row."""
 
 
+class _Record(NamedTuple):
+    """State of a cache at the last delta."""
+
+    next_chunk: int
+    shown: Bool[np.ndarray, "n k"]
+    seen: Float32[np.ndarray, "n k"]  # total sightings
+
+
 class SceneFeed:
     """The source of deltas of one stream. Call `update` after any number of chunks.
 
@@ -55,9 +64,9 @@ class SceneFeed:
         self._total_sightings = jax.jit(lambda cache: total_sightings(cache.sightings))
         self._decode_rows = jax.jit(model.decode_rows)
         shape = (0, model.config.memory.pivots_per_voxel)
-        self._next_chunk, self._shown, self._seen = 0, np.zeros(shape, bool), np.zeros(shape, np.float32)
+        self._record = _Record(0, np.zeros(shape, bool), np.zeros(shape, np.float32))
         if known is not None:
-            self._changed_rows(known)
+            self._record = self._changes(known)[1]
 
     def update(self, cache: VoxelCache) -> SceneDelta:
         """The changes since the last call.
@@ -66,32 +75,35 @@ class SceneFeed:
             InputError: `cache` holds several caches, of streams or shards.
         """
         require_single_cache(cache, "SceneFeed.update")
-        rows = self._changed_rows(cache)
+        rows, record = self._changes(cache)
         num_padded = max(MIN_DECODED_ROWS, 1 << max(len(rows) - 1, 0).bit_length())
         padded = np.pad(rows, (0, num_padded - len(rows)), constant_values=-1)
         gaussians = self._decode_rows(self._params, cache, jnp.asarray(padded))
         num_gaussians = gaussians.num_gaussians // num_padded * len(rows)
         confidences = np.asarray(cache.confidences, np.float32)[rows].reshape(-1)
         repeats = num_gaussians // max(confidences.size, 1)
-        return SceneDelta(
+        delta = SceneDelta(
             rows,
             jax.tree.map(lambda x: x[:num_gaussians], gaussians),
             cache.capacity,
             np.repeat(confidences, repeats),
         )
+        jax.block_until_ready(delta.gaussians)
+        self._record = record  # last: after an error or an interrupt the changes are found again
+        return delta
 
-    def _changed_rows(self, cache: VoxelCache) -> Int32[np.ndarray, " r"]:
-        """Rows written, carved, restored or, with evidence, seen since the last call; updates the feed's record."""
-        more = [(0, cache.capacity - len(self._shown)), (0, 0)]  # the cache may have grown
-        shown = np.asarray(self._shown_pivots(cache))
-        is_changed = np.asarray(cache.alive) & (np.asarray(cache.last_chunks) >= self._next_chunk)
-        is_changed |= shown != np.pad(self._shown, more)
+    def _changes(self, cache: VoxelCache) -> tuple[Int32[np.ndarray, " r"], _Record]:
+        """Rows written, carved, restored or, with evidence, seen since the last call, and the record after them."""
+        last = self._record
+        more = [(0, cache.capacity - len(last.shown)), (0, 0)]  # the cache may have grown
+        shown, seen = np.asarray(self._shown_pivots(cache)), last.seen
+        is_changed = np.asarray(cache.alive) & (np.asarray(cache.last_chunks) >= last.next_chunk)
+        is_changed |= shown != np.pad(last.shown, more)
         if cache.sightings is not None:
             seen = np.asarray(self._total_sightings(cache))
-            is_changed |= shown & (seen != np.pad(self._seen, more))
-            self._seen = seen
-        self._next_chunk, self._shown = int(cache.stats.num_chunks), shown
-        return np.flatnonzero(is_changed.any(axis=1)).astype(np.int32)
+            is_changed |= shown & (seen != np.pad(last.seen, more))
+        rows = np.flatnonzero(is_changed.any(axis=1)).astype(np.int32)
+        return rows, _Record(int(cache.stats.num_chunks), shown, seen)
 
 
 def apply_confidences(known: Float32[np.ndarray, " m"] | None, delta: SceneDelta) -> Float32[np.ndarray, " m"] | None:

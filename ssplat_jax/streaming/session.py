@@ -72,18 +72,30 @@ class Session:
             CacheError: tokens were dropped although the overflow policy forbids it.
             InputError: the configuration asks for refinement and `revise` is not given, or the reverse.
         """
+        return self._run(self._step_for(chunk), chunk)
+
+    def _step_for(self, chunk: Chunk) -> jax.stages.Compiled:
+        """The compiled step for a chunk, after the cache has grown to hold its tokens."""
         config, num_tokens = self.model.config, tokens_per_chunk(chunk, self.model.config.network.size_multiple)
         if self.cache is None:
             self.cache = init_cache(config, starting_capacity(config, num_tokens))
         self.cache = ensure_capacity(self.cache, config, num_tokens)
         self.cache = self._with_key_views(self.cache, chunk)
-        step = self._last_program = self._program("step", self.model.step, chunk)
-        self.cache, out = jax.block_until_ready(step(self.params, self.cache, chunk))
-        check_cache(self.cache, config)
+        return self._program("step", self.model.step, chunk)
+
+    def _run(self, step: jax.stages.Compiled, chunk: Chunk, is_live: bool = False) -> ChunkOutput:
+        """Runs a compiled step, then the refinement; the views of a live chunk are dropped once it is on its way."""
+        # A program takes the old cache when it starts: the new one is kept first, then waited for, so that an interrupt
+        # leaves a cache.
+        self._last_program = step
+        self.cache, out = step(self.params, self.cache, chunk)
+        if is_live:
+            self._live.drop(out)
+        check_cache(jax.block_until_ready(self.cache), self.model.config)
         if self._revise is not None:
             refine = self._refine_program = self._program("refine", self._revise, chunk, out)
-            self.cache = jax.block_until_ready(refine(self.params, self.cache, chunk, out))
-        return out
+            self.cache = refine(self.params, self.cache, chunk, out)
+        return jax.block_until_ready((out, self.cache))[0]
 
     def _with_key_views(self, cache: VoxelCache, chunk: Chunk) -> VoxelCache:
         """`cache` with what refinement keeps in it, which a cache from before has not yet."""
@@ -133,9 +145,7 @@ class Session:
     def _feed_live(self, chunk: Chunk | None) -> ChunkOutput | None:
         if chunk is None:
             return None
-        output = self.feed(chunk)
-        self._live.learn(output)
-        return output
+        return self._run(self._step_for(chunk), chunk, is_live=True)
 
     @property
     def frame(self) -> StreamFrame | None:

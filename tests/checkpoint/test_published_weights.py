@@ -163,3 +163,8 @@ def test_a_preset_without_shipped_weights_says_how_to_get_them():
         InputError, match=r"none ship with the preset 'small'; convert ReSplat's \(ssplat import-weights"
     ):
         load_params("small")
+
+
+def test_a_stage_without_parameters_is_imported_as_one(depth_network):
+    config = CONFIG.replace(mixer_blocks=0)
+    assert import_params(depth_network, config).params["mixer"] == {}

@@ -129,6 +129,16 @@ def test_value_and_gradient_are_finite_at_the_limits(value):
     assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(jax.grad(loss)(head_with(0.2))))
 
 
+def test_the_gradient_by_colors_is_finite_where_all_are_equal():
+    features = lambda rgbs: evidence_features(replace(different_colors(), rgbs=rgbs), CONFIG)  # noqa: E731
+    rgbs = different_colors().rgbs.at[0].set(0.5)
+    np.testing.assert_allclose(features(rgbs)[1:], features(different_colors().rgbs)[1:], rtol=1e-6)
+    slopes = np.asarray(jax.grad(lambda x: features(x).sum())(rgbs))
+    assert np.isfinite(slopes).all()
+    np.testing.assert_allclose(slopes[0], slopes[0][0])  # of the mean color alone
+    assert np.ptp(slopes[1]) > 0.1
+
+
 def test_pivots_that_fit_and_pivots_that_do_not_differ_in_features():
     good, bad = evidence(), evidence()
     bad = replace(bad, sightings=bad.sightings.at[:, 3].mul(5.0))

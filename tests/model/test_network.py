@@ -126,6 +126,19 @@ def test_registering_twice_is_one_network(toy):
     assert network_of(toy) is other
 
 
+def test_a_network_that_replaces_another_has_its_own_parameters(toy):
+    class Wider(ToyNetwork):
+        def stages(self, config):
+            return super().stages(config) | {"encoder": (Linear(5), (jnp.zeros((1, 1, 1, 3)),))}
+
+    def num_params():
+        return count_params(jax.eval_shape(StreamSplat(toy).init, jax.random.key(0))["encoder"])
+
+    assert num_params() == 12
+    register_network(ToyConfig, Wider())
+    assert num_params() == 20
+
+
 def test_taken_kind_is_refused(toy):
     @dataclasses.dataclass(frozen=True)
     class Impostor(ToyConfig):

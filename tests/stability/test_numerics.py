@@ -7,7 +7,7 @@ import pytest
 
 from ssplat_jax.model.compact.sweep_matching import unit_features
 from ssplat_jax.model.layers import attend, attend_per_query, average_pool, instance_norm
-from ssplat_jax.numerics import clip_value, columns, safe_log, safe_normalize, softplus_inverse
+from ssplat_jax.numerics import clip_value, columns, safe_log, safe_normalize, safe_sqrt, softplus_inverse
 from ssplat_jax.xla_cpu import in_own_kernel, lane_sum
 
 ULP = float(np.finfo(np.float32).eps)
@@ -49,6 +49,16 @@ def test_safe_log_below_its_floor_has_a_zero_gradient():
     np.testing.assert_allclose(safe_log(x), np.log(1e-12), rtol=1e-6)
     np.testing.assert_array_equal(jax.grad(lambda v: safe_log(v).sum())(x), 0)
     np.testing.assert_allclose(safe_log(x, eps=0.1), np.log(0.1), rtol=1e-6)
+
+
+def test_safe_sqrt_is_the_root_and_flat_at_and_below_zero():
+    x = np.array([1e-30, 1e-6, 0.25, 1e30])
+    np.testing.assert_allclose(safe_sqrt(jnp.asarray(x, jnp.float32)), np.sqrt(x), rtol=1e-6)
+    slopes = jax.grad(lambda v: safe_sqrt(v).sum())(jnp.asarray(x, jnp.float32))
+    np.testing.assert_allclose(slopes, 0.5 / np.sqrt(x), rtol=1e-5)
+    small = jnp.array([0.0, -0.0, -1e-3, -jnp.inf])
+    np.testing.assert_array_equal(safe_sqrt(small), 0)
+    np.testing.assert_array_equal(jax.grad(lambda v: safe_sqrt(v).sum())(small), 0)
 
 
 def test_columns_are_the_entries_and_gradients_return_to_them():

@@ -210,3 +210,26 @@ def test_an_interrupted_push_loses_no_view(capture, params, monkeypatch):
     session.flush()
     assert_same_bits(session.cache, wanted.cache)
     assert session.flush() is None
+
+
+@pytest.mark.parametrize("place", ["compiling", "waiting"])
+def test_an_interrupt_of_a_step_loses_nothing(place, capture, params, monkeypatch):
+    """While a step compiles, its views wait on; while it runs, the session keeps the cache that it will return."""
+    wanted = Session(StreamSplat(CAUSAL), params)
+    pushed(wanted, capture, range(5))
+    wanted.flush()
+    session = Session(StreamSplat(CAUSAL), params)
+    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+
+        def interrupted(*given):
+            raise KeyboardInterrupt
+
+        if place == "compiling":
+            patched.setattr(session, "_program", interrupted)
+        else:
+            patched.setattr("ssplat_jax.streaming.session.jax.block_until_ready", interrupted)
+        pushed(session, capture, range(4))
+    assert len(pushed(session, capture, range(4, 5))) == (place == "compiling")
+    session.flush()
+    assert_same_bits(session.cache, wanted.cache)
+    assert session.flush() is None

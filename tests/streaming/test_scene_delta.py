@@ -104,6 +104,20 @@ def test_feed_from_a_known_cache_gives_the_rest():
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=HEAD_TOL, atol=HEAD_TOL), received, whole)
 
 
+def test_a_failed_update_is_made_up_for(monkeypatch):
+    model, params = StreamSplat(CONFIG), decoder_params(CONFIG)
+    feed = SceneFeed(model, params)
+    cache, rows = fuse_with_rows(init_cache(CONFIG, CAPACITY), chunk(1), CONFIG)
+    with monkeypatch.context() as patched, pytest.raises(MemoryError):
+
+        def fails(*given):
+            raise MemoryError
+
+        patched.setattr(feed, "_decode_rows", fails)
+        feed.update(cache)
+    assert set(feed.update(cache).rows) == rows and len(feed.update(cache).rows) == 0
+
+
 def test_deltas_follow_a_cache_that_grows():
     model, params = StreamSplat(CONFIG), decoder_params(CONFIG)
     feed, cache = SceneFeed(model, params), init_cache(CONFIG, CAPACITY)

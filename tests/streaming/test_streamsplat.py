@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from ssplat_jax.data.open_capture import open_capture
+from ssplat_jax.errors import InputError
 from ssplat_jax.pytree import replace
 from ssplat_jax.streaming.session import Session
 from ssplat_jax.streaming.streamsplat import StreamSplat, merged_footprints
@@ -194,3 +195,30 @@ def test_odd_and_portrait_sizes_stream(model, params, width, height, compiled_pl
         if x < width and y < height
     )
     assert int(session.cache.stats.num_seen) == 5 * cells
+
+
+def test_padding_views_may_hold_anything(model, params, chunks, step):
+    """NaN times a weight of 0 would be NaN."""
+    valid = chunks[0].valid.at[3].set(False)
+    results = []
+    for value in (0.5, jnp.nan, jnp.inf):
+        fields = {name: getattr(chunks[0], name).at[3].set(value) for name in ("images", "viewmats", "Ks")}
+        results.append(step(params, model.init_cache(), replace(chunks[0], valid=valid, **fields)))
+    assert int(results[0][0].num_voxels) > 0
+    for cache, output in results[1:]:
+        assert_same_bits(cache, results[0][0])
+        assert_same_bits(output, results[0][1])
+
+
+def test_bytes_are_no_images_of_a_chunk(model, params, chunks):
+    chunk = replace(chunks[0])
+    # Past the type checks of the tests, which users do not have.
+    object.__setattr__(chunk, "images", (255 * chunk.images).astype(jnp.uint8))
+    with pytest.raises(InputError, match=r"chunk: images: wanted floats in \[0, 1\], got uint8; divide bytes by 255"):
+        jax.eval_shape(model.step, params, model.init_cache(), chunk)
+
+
+def test_streaming_in_float64_is_refused(model, params, chunks):
+    cache = model.init_cache()
+    with jax.enable_x64(True), pytest.raises(InputError, match=r"wanted JAX's default, float32.*enable_x64\(False\)"):
+        jax.eval_shape(model.step, params, cache, chunks[0])
