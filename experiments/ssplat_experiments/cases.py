@@ -26,6 +26,10 @@ PICTURE = "picture"
 """Column of an image. `measure` returns it in [0, 1], height x width x 3; the row that is kept holds its file."""
 
 
+WITH_REFINER = ("tiny.npz", "refiner.npz")
+"""Weights files behind the result of a case that refines scenes by learned passes."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Case:
     """One measurement that is made as a whole."""
@@ -36,12 +40,15 @@ class Case:
     asked: dict[str, Any]
     """Everything besides the configuration that decides the result, as JSON types."""
     measure: Callable[[], Sequence[Row]]
+    weights: tuple[str, ...] = ("tiny.npz",)
+    """Weights files of the package that the result depends on, where there is a configuration."""
 
     @property
     def request(self) -> dict[str, Any]:
-        """All that decides the result, as JSON holds it; a model has the shipped weights."""
+        """All that decides the result, as JSON holds it."""
         request: dict[str, Any] = {"asked": self.asked, "config": self.config and self.config.to_dict()}
-        return json.loads(json_text(request | ({} if self.config is None else {"weights": shipped_weights()})))
+        weights = {} if self.config is None else {"weights": {name: weights_digest(name) for name in self.weights}}
+        return json.loads(json_text(request | weights))
 
     @property
     def hash(self) -> str:
@@ -54,11 +61,9 @@ class Case:
 
 
 @functools.cache
-def shipped_weights() -> dict[str, str]:
-    """Digests (12 hex digits) of the weights files of the package."""
-    folder = resources.files("ssplat_jax") / "weights"
-    names = ("tiny.npz", "refiner.npz")
-    return {name: hashlib.sha256((folder / name).read_bytes()).hexdigest()[:12] for name in names}
+def weights_digest(name: str) -> str:
+    """Digest (12 hex digits) of a weights file of the package."""
+    return hashlib.sha256((resources.files("ssplat_jax") / "weights" / name).read_bytes()).hexdigest()[:12]
 
 
 def measure_cases(

@@ -26,7 +26,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from ssplat_experiments.captures import SETTINGS
-from ssplat_experiments.cases import Case, Row
+from ssplat_experiments.cases import WITH_REFINER, Case, Row
 from ssplat_experiments.memory_curve import START_CAPACITY
 from ssplat_experiments.scenes import open_room
 from ssplat_experiments.stopwatch import Stopwatch
@@ -108,6 +108,7 @@ def cases(captures: Path | None, scale: str) -> list[Case]:
             config=of_kind,
             asked={"scene": scene, "kind": kind, **dataclasses.asdict(sizes)},
             measure=functools.partial(measure, scene, open_scene, of_kind, sizes),
+            weights=WITH_REFINER,
         )
         for scene, open_scene in _scenes(captures, sizes).items()
         for kind, (of_kind, measure) in kinds.items()

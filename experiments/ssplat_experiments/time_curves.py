@@ -20,23 +20,18 @@ def best_at(rows: Sequence[Row], seconds: float, column: str) -> float:
     return max((row[column] for row in rows if row["seconds"] <= seconds), default=-np.inf)
 
 
-def lead(rows: Sequence[Row], column: str) -> tuple[float | None, float, float]:
-    """Time at which per-scene optimization comes to lead, and its lead or lag at the end, in dB.
+def lead(rows: Sequence[Row], column: str) -> float | None:
+    """The first time from which per-scene optimization leads to the end of all curves, or None if it does not.
 
     Rows are those of one scene. Each curve counts with the best that it has reached so far.
-
-    Returns:
-        The first time from which per-scene optimization is ahead to the end (None if it is not), the last time that
-        it was measured, and its score there minus the best of the others.
     """
     theirs = [row for row in rows if row["method"] == OPTIMIZED]
     ours = [row for row in rows if row["method"] != OPTIMIZED]
     times = sorted({row["seconds"] for row in rows})
-    end = max(row["seconds"] for row in theirs)
     leads = [best_at(theirs, t, column) - best_at(ours, t, column) for t in times]
     behind = [t for t, gap in zip(times, leads, strict=True) if not gap > 0]
     after = [t for t in times if not behind or t > behind[-1]]
-    return (after[0] if after else None), end, best_at(theirs, end, column) - best_at(ours, end, column)
+    return after[0] if after else None
 
 
 def findings(rows: list[Row]) -> list[str]:
@@ -48,13 +43,13 @@ def findings(rows: list[Row]) -> list[str]:
         if OPTIMIZED not in methods or len(methods) < 2:
             continue
         for name, column in COLUMNS.items():
-            crossing, end, _ = lead(here, column)
+            crossing = lead(here, column)
             first = min((row for row in here if row["method"] != OPTIMIZED), key=lambda row: row["seconds"])
             ours = [row for row in here if row["method"] != OPTIMIZED]
             best = max(ours, key=lambda row: row[column])
             theirs = max((row for row in here if row["method"] == OPTIMIZED), key=lambda row: row[column])
             where = (
-                f"per-scene optimization is not ahead at its end, after {end:.0f} s"
+                "per-scene optimization does not lead in the end"
                 if crossing is None
                 else f"per-scene optimization leads from {crossing:.1f} s on"
             )

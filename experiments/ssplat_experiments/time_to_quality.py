@@ -23,7 +23,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from ssplat_experiments.cases import Case, Row
+from ssplat_experiments.cases import WITH_REFINER, Case, Row
 from ssplat_experiments.memory_curve import START_CAPACITY
 from ssplat_experiments.per_scene_optimization import optimize
 from ssplat_experiments.scene_state import scene_of
@@ -101,6 +101,7 @@ def cases(captures: Path | None, scale: str) -> list[Case]:
             config=config,
             asked={"scene": scene, "method": method, **dataclasses.asdict(sizes)},
             measure=functools.partial(measured, scene, method, config, offline, sizes, captures),
+            weights=WITH_REFINER,
         )
         for method, (config, offline) in methods.items()
         for scene in scenes

@@ -75,8 +75,8 @@ class TrainingCheckpoints:
         if (found := first_difference(held_description, description)) is not None:
             name, held, wanted = found
             raise InputError(
-                f"{path}: this directory holds a run with {name} = {held!r}, wanted {wanted!r}; choose another --out"
-                " or repeat the old options."
+                f"{path}: this directory holds a run with {name} = {held!r}, wanted {wanted!r}; choose another --out,"
+                " or repeat the old options with the old files."
             )
 
     def save(self, step: int, state) -> None:

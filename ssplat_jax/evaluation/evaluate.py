@@ -197,6 +197,7 @@ def _refine(
         "seconds": round(time.perf_counter() - start, 2),
         "seconds_per_step": round(report.seconds_per_step, 4),
         "views_left_out": report.num_left_out,
+        "new_gaussians": report.num_new,
         "revised": list(refined.choice.effects.names),
         "reasons": list(refined.choice.reasons),
     }

@@ -2,7 +2,9 @@
 
 import functools
 from collections.abc import Collection
+from typing import Any
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
@@ -11,7 +13,7 @@ from ssplat_jax.errors import InputError
 from ssplat_jax.model.cgfi import Aggregator, num_hints
 from ssplat_jax.model.evidence import EvidenceHead, num_features
 from ssplat_jax.model.hpda import AnchorStrength
-from ssplat_jax.model.network import Network, network_of
+from ssplat_jax.model.network import network_of
 from ssplat_jax.model.types import GRID_STRIDE
 
 STAGES = ("encoder", "cost_volume", "hpda", "upsampler", "tokens", "cgfi", "mixer", "decoder", "evidence")
@@ -35,17 +37,15 @@ def init_params(key: jax.Array, config: StreamConfig, only: Collection[str] | No
     names = [name for name in STAGES if name in modules]
     keys = jax.random.split(key, len(names))  # a stage that is off has its key too, so that the others start alike
     wanted = set(names if only is None else only) - (set() if config.history.cgfi else {"cgfi"})
-    network = network_of(config)
-    return {name: _init_stage(k, config, name, network) for k, name in zip(keys, names, strict=True) if name in wanted}
+    return {name: _init_stage(k, *modules[name]) for k, name in zip(keys, names, strict=True) if name in wanted}
 
 
 # One program per stage: a single program for all stages of a large network takes 1.5 times as long to compile, and
 # eager initialization compiles every operation of every layer by itself.
-@functools.partial(jax.jit, static_argnums=(1, 2, 3))
-def _init_stage(key: jax.Array, config: StreamConfig, name: str, network: Network) -> dict:
-    del network  # that of `config`; another may be registered under its kind later
-    module, inputs = _modules(config)[name]
-    return module.init(key, *inputs).get("params", {})
+@functools.partial(jax.jit, static_argnums=1)
+def _init_stage(key: jax.Array, module: nn.Module, inputs: tuple) -> dict:
+    variables: Any = module.init(key, *inputs)
+    return variables.get("params", {})
 
 
 def _modules(config: StreamConfig) -> dict:

@@ -73,15 +73,13 @@ def repeat_cells(x: Array, factor: int) -> Array:
 def prepare_views(chunk: Chunk, config: StreamConfig) -> Views:
     """Views of `chunk`: images edge-padded to the network's multiple, and the depth candidates.
 
-    Padding views become black images of identity cameras, whatever they hold: 0 times NaN would be NaN.
+    Padding views become black images of the first valid view's camera, whatever they hold: 0 times NaN would be NaN.
 
     Limits:
         A single candidate lies at `near`, in inverse depth at `far`.
     """
-    is_valid = lambda x: chunk.valid.reshape(-1, *(1,) * (x.ndim - 1))  # noqa: E731
-    images = jnp.where(is_valid(chunk.images), chunk.images, 0)
-    viewmats = jnp.where(is_valid(chunk.viewmats), chunk.viewmats, jnp.eye(4, dtype=chunk.viewmats.dtype))
-    Ks = jnp.where(is_valid(chunk.Ks), chunk.Ks, jnp.eye(3, dtype=chunk.Ks.dtype))
+    images = jnp.where(chunk.valid[:, None, None, None], chunk.images, 0)
+    viewmats, Ks = (_of_valid(matrices, chunk.valid) for matrices in (chunk.viewmats, chunk.Ks))
     height, width = chunk.images.shape[1:3]
     multiple = config.network.size_multiple
     pad_h, pad_w = -height % multiple, -width % multiple
@@ -101,6 +99,13 @@ def prepare_views(chunk: Chunk, config: StreamConfig) -> Views:
         height=height,
         width=width,
     )
+
+
+def _of_valid(matrices: Float[Array, "v n n"], valid: Bool[Array, " v"]) -> Float[Array, "v n n"]:
+    """`matrices` with that of the first valid view, or the identity if none is valid, in place of those of padding."""
+    identity = jnp.eye(matrices.shape[-1], dtype=matrices.dtype)
+    first = jnp.where(valid.any(), matrices[jnp.argmax(valid)], identity)
+    return jnp.where(valid[:, None, None], matrices, first)
 
 
 def _log_candidates(near, far, config: StreamConfig) -> Float[Array, " d"]:

@@ -255,7 +255,7 @@ def report_of(progress: Progress, key_views: KeyViews, config: RefineConfig | No
 
 
 def _seconds_per_step(progress: Progress) -> float:
-    """Median time of a step that compiled nothing, or 0 if there was none."""
+    """Median time of a step, without the first of each kind; 0 if there was no other."""
     learned, taken = progress.seconds[: progress.num_learned], progress.seconds[progress.num_learned :]
     timed = learned[STEPS:] + taken[1:]
     return float(np.median(timed)) if timed else 0.0

@@ -68,34 +68,43 @@ class Session:
     def feed(self, chunk: Chunk) -> ChunkOutput:
         """Streams one chunk into the cache and waits until it is done.
 
+        After an interrupt the cache is that of before, or holds the chunk already.
+
         Raises:
             CacheError: tokens were dropped although the overflow policy forbids it.
-            InputError: the configuration asks for refinement and `revise` is not given, or the reverse.
+            InputError: the configuration asks for refinement and `revise` is not given, or the reverse; or the chunk
+                cannot be streamed, see `StreamSplat.step`.
         """
-        return self._run(self._step_for(chunk), chunk)
+        return self._stream(chunk)
 
-    def _step_for(self, chunk: Chunk) -> jax.stages.Compiled:
-        """The compiled step for a chunk, after the cache has grown to hold its tokens."""
+    def _stream(self, chunk: Chunk, is_live: bool = False) -> ChunkOutput:
+        """Streams a chunk; the views of a live one are dropped once it is on its way."""
         config, num_tokens = self.model.config, tokens_per_chunk(chunk, self.model.config.network.size_multiple)
         if self.cache is None:
             self.cache = init_cache(config, starting_capacity(config, num_tokens))
         self.cache = ensure_capacity(self.cache, config, num_tokens)
         self.cache = self._with_key_views(self.cache, chunk)
-        return self._program("step", self.model.step, chunk)
-
-    def _run(self, step: jax.stages.Compiled, chunk: Chunk, is_live: bool = False) -> ChunkOutput:
-        """Runs a compiled step, then the refinement; the views of a live chunk are dropped once it is on its way."""
-        # A program takes the old cache when it starts: the new one is kept first, then waited for, so that an interrupt
-        # leaves a cache.
-        self._last_program = step
+        step, refine = self._program("step", self.model.step, chunk), self._refinement_for(chunk)
+        # Nothing waits before all is on its way. A program takes the old cache when it starts, so the new one is kept
+        # at once: an interrupt of the wait costs nothing.
+        self._last_program, self._refine_program = step, refine
         self.cache, out = step(self.params, self.cache, chunk)
         if is_live:
             self._live.drop(out)
-        check_cache(jax.block_until_ready(self.cache), self.model.config)
-        if self._revise is not None:
-            refine = self._refine_program = self._program("refine", self._revise, chunk, out)
+        if refine is not None:
             self.cache = refine(self.params, self.cache, chunk, out)
-        return jax.block_until_ready((out, self.cache))[0]
+        check_cache(jax.block_until_ready(self.cache), config)
+        return jax.block_until_ready(out)
+
+    def _refinement_for(self, chunk: Chunk) -> jax.stages.Compiled | None:
+        """The compiled refinement after a chunk, or None; compiled before the step runs, as an interrupt may come."""
+        assert self.cache is not None
+        if self._revise is None:
+            return None
+        if (program := self._programs.get(self._key("refine", chunk))) is not None:
+            return program
+        _, out = jax.eval_shape(self.model.step, self.params, self.cache, chunk)
+        return self._program("refine", self._revise, chunk, out)
 
     def _with_key_views(self, cache: VoxelCache, chunk: Chunk) -> VoxelCache:
         """`cache` with what refinement keeps in it, which a cache from before has not yet."""
@@ -145,7 +154,7 @@ class Session:
     def _feed_live(self, chunk: Chunk | None) -> ChunkOutput | None:
         if chunk is None:
             return None
-        return self._run(self._step_for(chunk), chunk, is_live=True)
+        return self._stream(chunk, is_live=True)
 
     @property
     def frame(self) -> StreamFrame | None:
@@ -203,10 +212,15 @@ class Session:
             **stats,
         }
 
+    def _key(self, name: str, chunk: Chunk) -> tuple:
+        """Key of a program: what it computes, and the shapes that it is compiled for."""
+        assert self.cache is not None
+        return (name, self.cache.capacity, chunk.images.shape)
+
     def _program(self, name: str, function: Callable, chunk: Chunk, *more: ChunkOutput) -> jax.stages.Compiled:
         """`function` compiled for the shapes of `chunk` and the cache, which it consumes."""
         assert self.cache is not None
-        key = (name, self.cache.capacity, chunk.images.shape)
+        key = self._key(name, chunk)
         if key not in self._programs:
             since = time.perf_counter()
             arguments = (self.params, self.cache, chunk, *more)

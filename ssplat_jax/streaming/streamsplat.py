@@ -142,7 +142,7 @@ class StreamSplat:
             before the step and `check_cache` after it. No gradient flows through the cache.
 
         Raises:
-            InputError: a shape of `chunk` is wrong.
+            InputError: a shape of `chunk` is wrong, its images are not floats, or JAX computes in float64.
         """
         prediction = self.predict(params, cache, chunk)
         return self.update_cache(cache, prediction), prediction.output
@@ -174,7 +174,7 @@ class StreamSplat:
         The cache cannot grow inside the scan: give it the capacity for all chunks first (`ensure_capacity`).
 
         Raises:
-            InputError: the chunks are not stacked, or have a wrong shape.
+            InputError: the chunks are not stacked, or cannot be streamed, see `step`.
         """
         check_chunk(chunks, self.config.stream.chunk_size, stacked=True)
         return jax.lax.scan(functools.partial(self.step, params), cache, chunks)

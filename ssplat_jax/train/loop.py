@@ -147,7 +147,7 @@ def upgrade_description(description: dict, wanted: dict) -> dict:
     Args:
         description: as `describe_run` gives it.
         wanted: description of the run that continues it. Initial parameters, weights of LPIPS and files of captures are
-            taken to be the same where `description` does not hold them.
+            taken to be the same where `description` does not hold them: runs of older versions go on, unguarded.
     """
     upgraded = {"init_weights": wanted["init_weights"]} | description
     upgraded["config"] = config_from_header(description["config"]).to_dict()

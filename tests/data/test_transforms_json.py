@@ -52,9 +52,11 @@ def test_a_frames_own_angle_of_view_comes_before_the_focal_length_of_the_file(tm
     def change(root, meta):
         meta["frames"][2].update(camera_angle_x=2 * np.arctan(0.5), camera_angle_y=2 * np.arctan(0.5))
         meta["frames"][3].update(camera_angle_x=2 * np.arctan(0.5))
+        meta["frames"][0].update(camera_angle_x=2 * np.arctan(0.5), fl_y=70.0)
 
     capture = open_capture(make_capture(tmp_path / "c", change))
     np.testing.assert_allclose(capture.K(2), [[WIDTH, 0, 31], [0, HEIGHT, 25], [0, 0, 1]], rtol=1e-14)
+    np.testing.assert_allclose(capture.K(0), [[WIDTH, 0, 31], [0, 70, 25], [0, 0, 1]], rtol=1e-14)
     np.testing.assert_allclose(capture.K(3), [[WIDTH, 0, 31], [0, WIDTH, 25], [0, 0, 1]], rtol=1e-14)
     np.testing.assert_array_equal(capture.K(1), [[50, 0, 31], [0, 51, 25], [0, 0, 1]])
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from ssplat_experiments import ablation, context_length, long_context
-from ssplat_experiments.cases import PICTURE, Case, shipped_weights
+from ssplat_experiments.cases import PICTURE, Case
 from ssplat_experiments.study import Study, at_scale, run_study, side_by_side
 
 from ssplat_jax.config import preset
@@ -75,7 +75,7 @@ def test_results_of_another_configuration_are_refused(tmp_path):
 
 def test_results_of_other_weights_are_refused(tmp_path, monkeypatch):
     run_study(counting_study([]), None, tmp_path, "smoke", QUIET)
-    monkeypatch.setattr("ssplat_experiments.cases.shipped_weights", lambda: {**shipped_weights(), "tiny.npz": "other"})
+    monkeypatch.setattr("ssplat_experiments.cases.weights_digest", lambda name: "other")
     with pytest.raises(InputError, match=r"weights\.tiny\.npz: '[0-9a-f]{12}', wanted now 'other'"):
         run_study(counting_study([]), None, tmp_path, "smoke", QUIET)
 

@@ -201,11 +201,14 @@ def _lens(fields: _Fields) -> Lens:
 def _focal(fields: _Fields, width: float, height: float) -> tuple[float, float]:
     """Focal lengths in pixels, from fl_x and fl_y or the fields of view camera_angle_x and camera_angle_y."""
     focals, own = {}, {name for name in FOCAL_FIELDS if fields.get(name, own=True) is not None}
-    only_angles = bool(own) and own.isdisjoint(("fl_x", "fl_y"))  # of the frame, whatever the file gives
+    # The frame's own fields come first. If these are angles alone, a focal length of the file is of another camera.
+    sources = (True,) if own and own.isdisjoint(("fl_x", "fl_y")) else (True, False)
     for axis, extent in (("x", width), ("y", height)):
-        if not only_angles and fields.get(f"fl_{axis}") is not None:
+        kinds = [(kind, own) for own in sources for kind in ("fl", "camera_angle")]
+        kind = next((kind for kind, own in kinds if fields.get(f"{kind}_{axis}", own=own) is not None), None)
+        if kind == "fl":
             focals[axis] = fields.number(f"fl_{axis}", 0.0)
-        elif fields.get(f"camera_angle_{axis}", own=only_angles) is not None:
+        elif kind is not None:
             angle = fields.number(f"camera_angle_{axis}", 0.0)
             if not (0 < angle < math.pi and math.tan(angle / 2) > 0):
                 where = f"{fields.where}.camera_angle_{axis}"
