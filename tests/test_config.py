@@ -74,8 +74,8 @@ def test_bad_value_is_refused_by_name_and_value(changes):
 
 def test_recall_without_hpda_is_refused():
     with pytest.raises(InputError, match="recall must be false without hpda, got True"):
-        StreamConfig().replace(recall=True, hpda=False)
-    assert StreamConfig().replace(recall=True).history.hpda
+        StreamConfig().replace(recall=True)
+    assert StreamConfig().replace(recall=True, hpda=True).history.recall
 
 
 def test_replacing_checks_what_it_builds():
@@ -103,7 +103,7 @@ def test_presets_are_the_same_after_json(name):
 
 @pytest.mark.parametrize("network", ["compact", "resplat"])
 def test_every_field_changes_the_hash(network):
-    base = StreamConfig().replace(network=network)
+    base = StreamConfig().replace(network=network, hpda=True)  # without it, recall is refused
     change = {
         bool: lambda x: not x,
         int: lambda x: 2 * x,

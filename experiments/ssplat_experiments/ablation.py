@@ -60,7 +60,7 @@ class Variant:
 FULL = "full"
 """The variant with all stages."""
 
-ALL_PARTS: dict[str, Any] = {"cgfi": True, "mixer_blocks": 2}
+ALL_PARTS: dict[str, Any] = {"hpda": True, "cgfi": True, "mixer_blocks": 2}
 """The stages that `tiny` leaves out."""
 VARIANTS = {
     FULL: Variant(),

@@ -70,7 +70,7 @@ SETTINGS = (
     Setting(1.0, "chunks of 2", {"chunk_size": 2}),
     Setting(1.0, "chunks of 8", {"chunk_size": 8}),
     Setting(0.75, "chunks of 8", {"chunk_size": 8}),
-    Setting(1.0, "no HPDA", {"hpda": False}),
+    Setting(1.0, "HPDA", {"hpda": True}),
     Setting(1.0, "CGFI, untrained", {"cgfi": True}),
     Setting(1.0, "no carving", {"carving": False}),
     Setting(1.0, "mixer, untrained", {"mixer_blocks": 2}),

@@ -64,8 +64,8 @@ class HistoryConfig(ConfigGroup):
 
     cluster_ratio: float = 1.15
     """Largest ratio of depths within the front cluster of pivots that a cell averages; `inf` averages all (literal)."""
-    hpda: bool = True
-    """Anchors depth distributions to cached geometry."""
+    hpda: bool = False
+    """Anchors depth distributions to cached geometry. Off in `tiny`, which gains nothing by it but on revisits."""
     anchor_space: Literal["log", "metric"] = "log"
     """Unit of sigma: log depth, or stream units (`metric`, literal)."""
     anchor_norm: Literal["none", "mass"] = "none"

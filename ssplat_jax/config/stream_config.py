@@ -148,6 +148,7 @@ PAPER = StreamConfig(
     depth=DepthConfig(depth_readout="metric", confidence="peak"),
     history=HistoryConfig(
         cluster_ratio=math.inf,
+        hpda=True,
         anchor_space="metric",
         cgfi=True,
         cgfi_form="concat",

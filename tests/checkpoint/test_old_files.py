@@ -33,7 +33,7 @@ NEW_FIELDS = ("network", "vit", "match_stride", "depth_range", "depth_space", "u
 OLDEST_CONFIG = {name: value for name, value in FLAT_CONFIG.items() if name not in NEW_FIELDS}
 """Configuration from before there was a second network, as in the weights that ship with the preset."""
 
-OLD = preset("tiny").replace(evidence=False, cgfi=True, mixer_blocks=2, min_confidence=0.5)
+OLD = preset("tiny").replace(evidence=False, hpda=True, cgfi=True, mixer_blocks=2, min_confidence=0.5)
 """The preset as it was before pivots kept evidence, with the stages that it has left out since and the τ of then."""
 
 FRAME = {"rotation": np.eye(3).tolist(), "origin": [0.0, 0.0, 1.0], "scale": 0.6, "near": 0.7, "far": 4.9}

@@ -22,6 +22,7 @@ CONFIG = StreamConfig().replace(
     match_width=8,
     unet_width=8,
     token_width=16,
+    hpda=True,
     cgfi=True,
     cgfi_width=8,
     mixer_blocks=1,

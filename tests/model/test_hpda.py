@@ -22,7 +22,7 @@ from tests.model.small import chunk, finite, history
 
 D = 24
 LOG_CANDIDATES = jnp.linspace(jnp.log(0.5), jnp.log(10.0), D)
-CONFIG = StreamConfig().replace(num_depths=D, depth_readout="mean")
+CONFIG = StreamConfig().replace(num_depths=D, depth_readout="mean", hpda=True)
 SHAPE = (2, 3, 4)
 FLOAT32 = 1e-5
 

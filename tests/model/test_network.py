@@ -94,7 +94,7 @@ def toy(monkeypatch) -> StreamConfig:
     monkeypatch.delitem(NETWORK_CONFIGS, "toy")  # undone to absence, whatever the test does
     register_network(ToyConfig, ToyNetwork())
     return StreamConfig().replace(
-        network="toy", capacity=256, min_confidence=0.0, cgfi=True, cgfi_width=8, chunk_size=3
+        network="toy", capacity=256, min_confidence=0.0, hpda=True, cgfi=True, cgfi_width=8, chunk_size=3
     )
 
 

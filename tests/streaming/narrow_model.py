@@ -14,6 +14,7 @@ NARROW = StreamConfig().replace(
     num_depths=16,
     unet_width=16,
     token_width=16,
+    hpda=True,
     cgfi=True,
     cgfi_width=16,
     mixer_blocks=1,

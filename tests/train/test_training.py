@@ -113,7 +113,7 @@ OLD_RUN = Path(__file__).with_name("recipe_0_1.json")  # written by version 0.1 
 def test_run_of_version_0_1_is_resumed(tmp_path):
     (tmp_path / "recipe.json").write_text(OLD_RUN.read_text())
     recipe = TINY.scaled(0.004)
-    then = preset("tiny").replace(evidence=False, cgfi=True, mixer_blocks=2, min_confidence=0.5)
+    then = preset("tiny").replace(evidence=False, hpda=True, cgfi=True, mixer_blocks=2, min_confidence=0.5)
     config = training_config(then, recipe)
     description = loop.describe_run(config, recipe, loop.RANDOM)
     TrainingCheckpoints(tmp_path, description, upgrade=UPGRADE).close()
