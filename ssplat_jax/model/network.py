@@ -6,6 +6,7 @@ HPDA, CGFI, exposure, decoding and memory are shared by all networks.
 """
 
 import dataclasses
+from collections.abc import Hashable
 from typing import Any, Protocol, runtime_checkable
 
 from jaxtyping import Array, Bool, Float
@@ -139,7 +140,7 @@ def register_network(config_type: type, network: Network) -> None:
     Args:
         config_type: frozen dataclass with a default for every field and the members of `NetworkConfig`. `kind` must be
             a class variable.
-        network: object with the methods of `Network`.
+        network: object with the methods of `Network` and a hash, as objects have and frozen dataclasses.
 
     Raises:
         InputError: `config_type` or `network` lacks something, or another network has that kind.
@@ -149,6 +150,8 @@ def register_network(config_type: type, network: Network) -> None:
         raise InputError(
             f"register_network: wanted a dataclass with the members of NetworkConfig, got {config_type.__name__}."
         )
+    if not isinstance(network, Hashable):
+        raise InputError(f"register_network: wanted an object with a hash, got {type(network).__name__}; freeze it.")
     if not isinstance(network, Network):
         raise InputError(
             f"register_network: wanted an object with the methods of Network, got {type(network).__name__}."

@@ -2,9 +2,7 @@
 
 import functools
 from collections.abc import Collection
-from typing import Any
 
-import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
@@ -13,7 +11,7 @@ from ssplat_jax.errors import InputError
 from ssplat_jax.model.cgfi import Aggregator, num_hints
 from ssplat_jax.model.evidence import EvidenceHead, num_features
 from ssplat_jax.model.hpda import AnchorStrength
-from ssplat_jax.model.network import network_of
+from ssplat_jax.model.network import Network, network_of
 from ssplat_jax.model.types import GRID_STRIDE
 
 STAGES = ("encoder", "cost_volume", "hpda", "upsampler", "tokens", "cgfi", "mixer", "decoder", "evidence")
@@ -31,30 +29,31 @@ def init_params(key: jax.Array, config: StreamConfig, only: Collection[str] | No
     Raises:
         InputError: the network has a stage of an unknown name.
     """
-    modules = _modules(config)
+    network = network_of(config)
+    modules = _modules(config, network)
     if unknown := sorted(modules.keys() - set(STAGES)):
         raise InputError(f"network {config.network.kind!r}: wanted stages among {', '.join(STAGES)}, got {unknown}.")
     names = [name for name in STAGES if name in modules]
     keys = jax.random.split(key, len(names))  # a stage that is off has its key too, so that the others start alike
     wanted = set(names if only is None else only) - (set() if config.history.cgfi else {"cgfi"})
-    return {name: _init_stage(k, *modules[name]) for k, name in zip(keys, names, strict=True) if name in wanted}
+    return {name: _init_stage(k, config, name, network) for k, name in zip(keys, names, strict=True) if name in wanted}
 
 
 # One program per stage: a single program for all stages of a large network takes 1.5 times as long to compile, and
 # eager initialization compiles every operation of every layer by itself.
-@functools.partial(jax.jit, static_argnums=1)
-def _init_stage(key: jax.Array, module: nn.Module, inputs: tuple) -> dict:
-    variables: Any = module.init(key, *inputs)
-    return variables.get("params", {})
+@functools.partial(jax.jit, static_argnums=(1, 2, 3))
+def _init_stage(key: jax.Array, config: StreamConfig, name: str, network: Network) -> dict:
+    module, inputs = _modules(config, network)[name]
+    return module.init(key, *inputs).get("params", {})
 
 
-def _modules(config: StreamConfig) -> dict:
+def _modules(config: StreamConfig, network: Network) -> dict:
     """Linen module and example inputs of every stage."""
     v, side, c = 2, config.network.size_multiple // GRID_STRIDE, config.network.token_width
     grid = lambda channels: jnp.zeros((v, side, side, channels))  # noqa: E731
     evidence = {"evidence": (EvidenceHead(), (jnp.zeros((1, num_features())),))} if config.head.evidence else {}
     return (
-        network_of(config).stages(config)
+        network.stages(config)
         | evidence
         | {
             "hpda": (AnchorStrength(config), ()),
