@@ -161,7 +161,7 @@ def start_refinement(
     config = config or RefineConfig()
     rows = present_rows(gaussians)
     present = only_present(gaussians, rows)
-    max_pairs = _capacity(present, key_views)
+    max_pairs = pairs_capacity(present, key_views)
     usable = only_usable(present, key_views, max_pairs)
     max_new, num_new = int(config.max_new * np.sum(np.asarray(gaussians.opacities) > 0)), 0
     if max_new:
@@ -169,7 +169,7 @@ def start_refinement(
         num_new = int(count)
     if num_new:
         present, rows = present_and_new(gaussians, new, num_new)
-        max_pairs = _capacity(present, key_views)
+        max_pairs = pairs_capacity(present, key_views)
     return Progress(init_refinement(present, usable, config), rows, max_pairs, num_new=num_new), usable
 
 
@@ -221,7 +221,7 @@ def _grow_capacities(
     views = revised_key_views(progress.state.views, key_views)
     if num_pairs:
         # The view that overflowed may not be among those that `_capacity` looks at.
-        progress.max_pairs = max(_capacity(revised, views), round_up(progress.max_pairs + num_pairs))
+        progress.max_pairs = max(pairs_capacity(revised, views), round_up(progress.max_pairs + num_pairs))
     # Never less than the last step was short of: its cameras may have moved since.
     needed = round_rows((progress.max_rows or 0) + num_rows)
     measured = row_capacity(revised, views, range(progress.num_steps, steps), config)
@@ -287,10 +287,10 @@ def _learned_pass(config: RefineConfig, max_pairs: int):
     return jax.jit(functools.partial(learned_pass, config=config, max_pairs=max_pairs), donate_argnums=0)
 
 
-def _capacity(gaussians: Gaussians, key_views: KeyViews) -> int:
+def pairs_capacity(gaussians: Gaussians, key_views: KeyViews, margin: float = PAIRS_MARGIN) -> int:
     """Capacity for the tile intersections of a key view, from a few of them; a step counts what does not fit."""
-    counts = [int(render(gaussians, key_views.camera(i), effects=EFFECTS).num_pairs) for i in spread_views(key_views)]
-    return round_up(int(PAIRS_MARGIN * max(counts)))
+    counts = [int(render(gaussians, key_views.camera(i), effects=EFFECTS).num_pairs) for i in _spread(key_views)]
+    return round_up(int(margin * max(counts)))
 
 
 def row_capacity(gaussians: Gaussians, key_views: KeyViews, steps: range, config: RefineConfig) -> int:
@@ -310,7 +310,7 @@ def _most_rows_seen(gaussians: Gaussians, key_views: KeyViews, views: Int[Array,
     return jnp.max(jax.lax.map(num_seen, views))
 
 
-def spread_views(key_views: KeyViews, most: int = 8) -> list[int]:
+def _spread(key_views: KeyViews, most: int = 8) -> list[int]:
     """A few views, evenly spread, from which the capacity is estimated."""
     return sorted({round(i) for i in np.linspace(0, key_views.num_slots - 1, most)})
 

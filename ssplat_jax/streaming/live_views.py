@@ -26,8 +26,9 @@ class LiveViews:
     """
 
     def __init__(self, config: StreamConfig, frame: StreamFrame | None = None) -> None:
-        self._config, self._frame = config.replace(causal=True), frame
-        self._output: ChunkOutput | None = None  # of the last chunk, if the frame has not learned from it yet
+        self._config = config.replace(causal=True)
+        # The frame, and the output of the last chunk if the frame has not learned from it yet; replaced together.
+        self._learned: tuple[StreamFrame | None, ChunkOutput | None] = frame, None
         self._images: list[Float32[np.ndarray, "h w 3"]] = []
         self._frames: list[Frame] = []
         self._num_views = 0
@@ -73,13 +74,13 @@ class LiveViews:
         frames, pixels = tuple(self._frames[:size]), ArrayPixels(images=images, depths=depths)
         capture = Capture(name="live", format="memory", frames=frames, pixels=pixels, width=width, height=height)
         if self.frame is None:
-            self._frame = capture.stream_frame(self._config)
+            self._learned = capture.stream_frame(self._config), None
         return next(iter(capture.chunks(self._config, range(len(capture)), frame=self.frame)))
 
     def drop(self, output: ChunkOutput) -> None:
         """Forgets the views of the chunk that `rest` gave last, which is streamed with that output."""
         size = self._config.stream.chunk_size
-        self._images, self._frames, self._output = self._images[size:], self._frames[size:], output
+        self._images, self._frames, self._learned = self._images[size:], self._frames[size:], (self.frame, output)
 
     @property
     def frame(self) -> StreamFrame | None:
@@ -87,10 +88,10 @@ class LiveViews:
 
         Computed when it is needed, since the step of the last chunk may still run; None before the first chunk.
         """
-        if self._output is not None and self._frame is not None:
-            self._frame = widen_range(self._frame, self._output, self._config)
-            self._output = None
-        return self._frame
+        frame, output = self._learned
+        if frame is not None and output is not None:
+            self._learned = widen_range(frame, output, self._config), None
+        return self._learned[0]
 
 
 def _checked_image(image: object) -> Float32[np.ndarray, "h w 3"]:

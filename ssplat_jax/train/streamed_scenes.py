@@ -16,12 +16,9 @@ from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import MIN_FRAMES, choose_split
 from ssplat_jax.errors import InputError
 from ssplat_jax.program_memory import make_room
-from ssplat_jax.rasterizer import render
-from ssplat_jax.rasterizer.render import round_up
 from ssplat_jax.refinement import online_refinement
-from ssplat_jax.refinement.refine import spread_views
+from ssplat_jax.refinement.refine import pairs_capacity
 from ssplat_jax.refinement.refine_capture import key_views_of
-from ssplat_jax.refinement.view_loss import EFFECTS
 from ssplat_jax.streaming.feed import feed_capture
 from ssplat_jax.streaming.session import Session
 from ssplat_jax.streaming.streamsplat import StreamSplat, shown_pivots
@@ -110,14 +107,12 @@ def stream_scene(model: StreamSplat, params: dict, capture: Capture, stride: int
     assert session.cache is not None
     num_shown = int(jnp.sum(shown_pivots(session.cache, model.config)))
     key_views = key_views_of(capture, context, frame, exposures)
-    gaussians, looked_at = session.gaussians(), spread_views(key_views)
-    counts = [int(render(gaussians, key_views.camera(i), effects=EFFECTS).num_pairs) for i in looked_at]
     return StreamedScene(
         name=f"{capture.name}, stride {stride}",
         cache=session.cache,
         num_pivots=num_shown,
         key_views=key_views,
-        max_pairs=round_up(2 * max(counts)),  # views between those may have more, and training changes the scene
+        max_pairs=pairs_capacity(session.gaussians(), key_views, margin=2.0),  # training changes the scene
     )
 
 

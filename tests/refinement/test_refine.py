@@ -260,7 +260,7 @@ def test_config_out_of_range_is_refused_by_name(changes):
 
 def test_the_capacity_grows_for_a_view_that_was_not_looked_at(monkeypatch):
     """The estimate looks at a few views; one of the others may need more."""
-    monkeypatch.setattr(module, "_capacity", lambda *arguments: 64)
+    monkeypatch.setattr(module, "pairs_capacity", lambda *arguments: 64)
     progress, views = module.start_refinement(doubtful(), key_views())
     num_steps = 0
     for _ in module.continue_refinement(progress, views, 6):

@@ -130,6 +130,12 @@ def _images(model: Path) -> list[ImageEntry]:
     return list(_text_images(model / "images.txt"))
 
 
+def _num_images(model: Path) -> int:
+    """Number of registered images of the reconstruction in a folder."""
+    file = model / "images.bin"
+    return _Binary(file).count(IMAGE_BYTES) if file.is_file() else len(_images(model))
+
+
 def _num_others(images: Path, seen: Collection[Path | None]) -> int:
     """Number of the image files in the folder `images` that are not in `seen`; 0 if none of those is in the folder."""
     suffixes = {extension.lower() for extension in EXTENSIONS if extension}
@@ -147,7 +153,7 @@ def _larger_models(path: Path, model: Path, num_registered: int) -> list[str]:
     for folder in model.parent.glob("[0-9]*"):
         if folder != model and folder.name.isdecimal() and _is_model(folder):
             try:
-                counts[folder] = len(_images(folder))
+                counts[folder] = _num_images(folder)
             except InputError:  # a damaged reconstruction that is not read
                 continue
     largest = max(counts, key=lambda folder: counts[folder], default=None)
