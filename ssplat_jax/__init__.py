@@ -20,17 +20,17 @@ if TYPE_CHECKING:
     from ssplat_jax.cache import VoxelCache as VoxelCache
     from ssplat_jax.cache import check_cache as check_cache
     from ssplat_jax.cache import ensure_capacity as ensure_capacity
-    from ssplat_jax.checkpoint.weights import load_params as load_params
-    from ssplat_jax.chunk import Chunk as Chunk
     from ssplat_jax.config import StreamConfig as StreamConfig
     from ssplat_jax.config import preset as preset
+    from ssplat_jax.core.cameras import Camera as Camera
+    from ssplat_jax.core.chunk import Chunk as Chunk
+    from ssplat_jax.core.errors import CacheError as CacheError
+    from ssplat_jax.core.errors import InputError as InputError
+    from ssplat_jax.core.errors import StorageError as StorageError
+    from ssplat_jax.core.gaussians import Gaussians as Gaussians
     from ssplat_jax.data.open_capture import open_capture as open_capture
     from ssplat_jax.data.stream_frame import StreamFrame as StreamFrame
-    from ssplat_jax.errors import CacheError as CacheError
-    from ssplat_jax.errors import InputError as InputError
-    from ssplat_jax.errors import StorageError as StorageError
-    from ssplat_jax.gaussians import Gaussians as Gaussians
-    from ssplat_jax.geometry.cameras import Camera as Camera
+    from ssplat_jax.model.streamsplat import StreamSplat as StreamSplat
     from ssplat_jax.poses.adjust_poses import adjust_poses as adjust_poses
     from ssplat_jax.rasterizer import Effects as Effects
     from ssplat_jax.rasterizer import RenderOutput as RenderOutput
@@ -43,27 +43,27 @@ if TYPE_CHECKING:
     from ssplat_jax.scene_files.ply import save_ply as save_ply
     from ssplat_jax.scene_files.splat import save_splat as save_splat
     from ssplat_jax.scene_files.spz import save_spz as save_spz
-    from ssplat_jax.streaming.streamsplat import StreamSplat as StreamSplat
+    from ssplat_jax.storage.weights import load_params as load_params
 
 # Public name -> module that defines it.
 _MODULES = {
-    "CacheError": "errors",
-    "Camera": "geometry.cameras",
-    "Chunk": "chunk",
+    "CacheError": "core.errors",
+    "Camera": "core.cameras",
+    "Chunk": "core.chunk",
     "Effects": "rasterizer",
-    "Gaussians": "gaussians",
-    "InputError": "errors",
+    "Gaussians": "core.gaussians",
+    "InputError": "core.errors",
     "RenderOutput": "rasterizer",
-    "StorageError": "errors",
+    "StorageError": "core.errors",
     "StreamConfig": "config",
     "StreamFrame": "data.stream_frame",
-    "StreamSplat": "streaming.streamsplat",
+    "StreamSplat": "model.streamsplat",
     "VoxelCache": "cache",
     "adjust_poses": "poses.adjust_poses",
     "check_cache": "cache",
     "ensure_capacity": "cache",
     "fill_holes": "rasterizer",
-    "load_params": "checkpoint.weights",
+    "load_params": "storage.weights",
     "load_ply": "scene_files.ply",
     "load_scene": "scene_files.formats",
     "online_refinement": "refinement",

@@ -11,7 +11,7 @@ import pytest
 
 from ssplat_jax.config import PRESETS, CompactConfig, StreamConfig, preset
 from ssplat_jax.config.config_group import ConfigGroup
-from ssplat_jax.errors import InputError
+from ssplat_jax.core.errors import InputError
 
 BAD = [
     {"chunk_size": 0},
@@ -170,7 +170,7 @@ def test_presets_have_their_name_and_unknown_are_refused():
 def test_help_needs_no_jax():
     """The package, its configuration, recipes and errors are imported without JAX, so that `--help` is fast."""
     code = (
-        "import sys, ssplat_jax, ssplat_jax.config, ssplat_jax.errors, ssplat_jax.train.recipe; "
+        "import sys, ssplat_jax, ssplat_jax.config, ssplat_jax.core.errors, ssplat_jax.training.recipe; "
         "sys.exit('jax' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], timeout=60).returncode == 0

@@ -12,22 +12,22 @@ import numpy as np
 import pytest
 
 from ssplat_jax.cache import ProjectedCache, Tokens, project
-from ssplat_jax.chunk import Chunk
 from ssplat_jax.config import preset
+from ssplat_jax.core.cameras import Camera
+from ssplat_jax.core.chunk import Chunk
+from ssplat_jax.core.numerics import softplus_inverse
+from ssplat_jax.core.pytree import replace
+from ssplat_jax.core.rotations import quats_to_matrices
 from ssplat_jax.data.open_capture import open_capture
-from ssplat_jax.geometry.cameras import Camera
-from ssplat_jax.geometry.rotations import quats_to_matrices
-from ssplat_jax.metrics.lpips import LpipsWeights
+from ssplat_jax.evaluation.lpips import LpipsWeights
 from ssplat_jax.model import anchor_depth, inject_features, network_of
 from ssplat_jax.model.cgfi import Aggregator, num_hints
+from ssplat_jax.model.streamsplat import ChunkOutput, Prediction, StreamSplat
 from ssplat_jax.model.types import DepthDistribution, Views, prepare_views
-from ssplat_jax.numerics import softplus_inverse
-from ssplat_jax.pytree import replace
-from ssplat_jax.streaming.streamsplat import ChunkOutput, Prediction, StreamSplat
-from ssplat_jax.train import losses
-from ssplat_jax.train import step as train_step
-from ssplat_jax.train.recipe import DEFAULT_FORM, RECIPES
-from ssplat_jax.train.samples import Sample
+from ssplat_jax.training import losses
+from ssplat_jax.training import step as train_step
+from ssplat_jax.training.recipe import DEFAULT_FORM, RECIPES
+from ssplat_jax.training.samples import Sample
 
 PAPER = preset("paper")
 SLIM = PAPER.replace(token_width=8, num_depths=24, cgfi_width=8, capacity=128)

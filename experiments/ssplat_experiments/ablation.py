@@ -21,21 +21,21 @@ import jax
 from ssplat_experiments.captures import SETTINGS
 from ssplat_experiments.cases import PICTURE, Case, Row
 from ssplat_experiments.study import PUBLIC_SCENES, Study, at_scale, run_study, side_by_side
-from ssplat_jax.checkpoint.weights import load_params
 from ssplat_jax.config import StreamConfig, preset
-from ssplat_jax.console import Reporter
+from ssplat_jax.core.console import Reporter
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import Split, interleaved_split
 from ssplat_jax.evaluation.peak_memory import peak_memory
 from ssplat_jax.evaluation.scoring import score_targets, score_view
 from ssplat_jax.model import complete_params
+from ssplat_jax.model.streamsplat import StreamSplat
+from ssplat_jax.storage.weights import load_params
 from ssplat_jax.streaming.feed import feed_capture
 from ssplat_jax.streaming.session import Session
-from ssplat_jax.streaming.streamsplat import StreamSplat
-from ssplat_jax.train.evidence_training import EvidenceRecipe, train_evidence
-from ssplat_jax.train.loop import train
-from ssplat_jax.train.recipe import MATCHER_STAGES, Phase, PhaseForm, Recipe
+from ssplat_jax.training.evidence_training import EvidenceRecipe, train_evidence
+from ssplat_jax.training.loop import train
+from ssplat_jax.training.recipe import MATCHER_STAGES, Phase, PhaseForm, Recipe
 
 REVISIT = "revisit"
 """Name of the procedural scene that is scored."""

@@ -22,7 +22,7 @@ from ssplat_experiments.measured_settings import Opened, config_of, measure, mea
 from ssplat_experiments.scenes import REDKITCHEN, open_redkitchen, open_room
 from ssplat_experiments.settings import REFINED, REFINED_FACTORS, SETTINGS, SIZES, Setting, Sizes
 from ssplat_experiments.study import Study, at_scale, run_study
-from ssplat_jax.console import Reporter
+from ssplat_jax.core.console import Reporter
 from ssplat_jax.runs.time_budget import FrontPoint, front_of
 
 

@@ -21,16 +21,16 @@ from ssplat_experiments.memory_curve import START_CAPACITY
 from ssplat_experiments.scenes import open_room
 from ssplat_experiments.study import Study, at_scale, run_study
 from ssplat_experiments.warm_sessions import new_session
-from ssplat_jax.checkpoint.weights import check_params, load_params
 from ssplat_jax.config import StreamConfig, preset
-from ssplat_jax.console import Reporter
+from ssplat_jax.core.console import Reporter
+from ssplat_jax.core.errors import InputError
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import Split, interleaved_split
-from ssplat_jax.errors import InputError
 from ssplat_jax.evaluation.latency import measure_latency
 from ssplat_jax.evaluation.peak_memory import peak_memory
 from ssplat_jax.evaluation.scoring import score_targets
+from ssplat_jax.storage.weights import check_params, load_params
 from ssplat_jax.streaming.feed import feed_capture
 
 CAPTURES = {"redkitchen": (5, 128), "fox": (1, 40), "south_building": (1, 112)}

@@ -9,17 +9,17 @@ the numbers to expect.
 
 from pathlib import Path
 
-from ssplat_jax.checkpoint.weights import load_params
 from ssplat_jax.config import preset
-from ssplat_jax.console import Reporter
+from ssplat_jax.core.console import Reporter
+from ssplat_jax.core.errors import InputError
+from ssplat_jax.core.program_memory import make_room
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import interleaved_split
-from ssplat_jax.errors import InputError
 from ssplat_jax.evaluation.evaluate import evaluate
-from ssplat_jax.program_memory import make_room
+from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.storage.json_files import write_json
+from ssplat_jax.storage.weights import load_params
 from ssplat_jax.streaming.session import Session
-from ssplat_jax.streaming.streamsplat import StreamSplat
 
 SETTINGS: tuple[
     tuple[str, int, int, tuple[int, int] | None], ...

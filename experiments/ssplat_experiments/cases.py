@@ -13,8 +13,8 @@ from typing import Any
 
 from ssplat_experiments.program_memory import make_room
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.console import Reporter
-from ssplat_jax.errors import InputError
+from ssplat_jax.core.console import Reporter
+from ssplat_jax.core.errors import InputError
 from ssplat_jax.evaluation import provenance
 from ssplat_jax.evaluation.pictures import save_image
 from ssplat_jax.storage.json_files import json_text, write_json

@@ -23,9 +23,9 @@ from ssplat_experiments.joint_network import JointNetwork, joint_config, one_chu
 from ssplat_experiments.memory_curve import START_CAPACITY
 from ssplat_experiments.study import PUBLIC_SCENES, Study, at_scale, run_study, side_by_side
 from ssplat_experiments.warm_sessions import new_session
-from ssplat_jax.checkpoint.weights import load_params
 from ssplat_jax.config import StreamConfig, preset
-from ssplat_jax.console import Reporter
+from ssplat_jax.core.console import Reporter
+from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import Split, paper_split
@@ -33,7 +33,7 @@ from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.evaluation.latency import measure_latency
 from ssplat_jax.evaluation.peak_memory import peak_memory
 from ssplat_jax.evaluation.scoring import ImageScore, score_view
-from ssplat_jax.gaussians import Gaussians
+from ssplat_jax.storage.weights import load_params
 from ssplat_jax.streaming.feed import Exposures, feed_capture
 
 OURS, APPEND, JOINT = "ours", "append-all", "joint"

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 
 from ssplat_experiments.scene_state import Parameters, SceneState
 from ssplat_experiments.splatting_config import SplattingConfig
-from ssplat_jax.pytree import replace
+from ssplat_jax.core.pytree import replace
 
 
 def maintained(

@@ -18,18 +18,18 @@ from jaxtyping import Float
 
 from ssplat_experiments.scenes import REDKITCHEN, open_redkitchen, open_room
 from ssplat_experiments.study import at_scale
-from ssplat_jax.checkpoint.weights import load_params
 from ssplat_jax.config import preset
-from ssplat_jax.console import Reporter
+from ssplat_jax.core.console import Reporter
+from ssplat_jax.core.errors import InputError
+from ssplat_jax.core.program_memory import make_room
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.split import Split
-from ssplat_jax.errors import InputError
 from ssplat_jax.model import GRID_STRIDE
-from ssplat_jax.program_memory import make_room
+from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.storage.json_files import write_json
+from ssplat_jax.storage.weights import load_params
 from ssplat_jax.streaming.feed import feed_chunks
 from ssplat_jax.streaming.session import Session
-from ssplat_jax.streaming.streamsplat import StreamSplat
 
 SIZE = (320, 240)
 CONTEXT = {"cpu": 64, "smoke": 8}

@@ -22,18 +22,18 @@ from ssplat_experiments.captures import SETTINGS
 from ssplat_experiments.cases import Case, Row
 from ssplat_experiments.scenes import open_room
 from ssplat_experiments.study import Study, at_scale, run_study
-from ssplat_jax.checkpoint.weights import load_params
 from ssplat_jax.config import preset
-from ssplat_jax.console import Reporter
+from ssplat_jax.core.console import Reporter
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import Split, interleaved_split
+from ssplat_jax.evaluation.psnr_ssim import psnr
 from ssplat_jax.evaluation.scoring import score_view
-from ssplat_jax.metrics.psnr_ssim import psnr
+from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.rasterizer import Effects, render
+from ssplat_jax.storage.weights import load_params
 from ssplat_jax.streaming.feed import feed_capture
 from ssplat_jax.streaming.session import Session
-from ssplat_jax.streaming.streamsplat import StreamSplat
 
 BANDS = (1, 2, 4, 8)
 """Widths of the blurs between two bands: standard deviations, pixels."""

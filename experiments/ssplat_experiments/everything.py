@@ -19,9 +19,9 @@ from ssplat_experiments import (
     memory_curve,
 )
 from ssplat_experiments.study import PAGE, Study, command_of, run_study
-from ssplat_jax.console import Reporter
-from ssplat_jax.errors import StorageError
-from ssplat_jax.storage.atomic import write_atomic
+from ssplat_jax.core.atomic import write_atomic
+from ssplat_jax.core.console import Reporter
+from ssplat_jax.core.errors import StorageError
 
 STUDIES: tuple[Study, ...] = (
     context_length.STUDY,

@@ -14,20 +14,20 @@ import numpy as np
 
 from ssplat_experiments.scenes import REDKITCHEN, open_redkitchen, open_room
 from ssplat_experiments.study import at_scale
-from ssplat_jax.checkpoint.weights import load_params
 from ssplat_jax.config import preset
-from ssplat_jax.console import Reporter
+from ssplat_jax.core.console import Reporter
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import Split, interleaved_split
 from ssplat_jax.evaluation.scoring import score_targets
+from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.runs.export_run import members_of_gaussians
 from ssplat_jax.scene_files.export_rows import is_writable
 from ssplat_jax.scene_files.select_gaussians import Selection, select_gaussians
 from ssplat_jax.storage.json_files import write_json
+from ssplat_jax.storage.weights import load_params
 from ssplat_jax.streaming.feed import feed_capture
 from ssplat_jax.streaming.session import Session
-from ssplat_jax.streaming.streamsplat import StreamSplat
 
 SIZE = (320, 240)
 CONTEXT = {"cpu": 40, "smoke": 8}

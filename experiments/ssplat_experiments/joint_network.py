@@ -7,8 +7,10 @@ import jax
 import jax.numpy as jnp
 
 from ssplat_jax.cache import init_cache
-from ssplat_jax.chunk import Chunk
 from ssplat_jax.config import StreamConfig
+from ssplat_jax.core.cameras import Camera
+from ssplat_jax.core.chunk import Chunk
+from ssplat_jax.core.gaussians import Gaussians, mask_gaussians
 from ssplat_jax.evaluation.peak_memory import (
     PeakMemory,
     abstract,
@@ -17,9 +19,7 @@ from ssplat_jax.evaluation.peak_memory import (
     live_bytes,
     render_bytes,
 )
-from ssplat_jax.gaussians import Gaussians, mask_gaussians
-from ssplat_jax.geometry.cameras import Camera
-from ssplat_jax.streaming.streamsplat import StreamSplat
+from ssplat_jax.model.streamsplat import StreamSplat
 
 SMALLEST_CAPACITY = 128
 

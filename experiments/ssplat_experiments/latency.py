@@ -26,13 +26,13 @@ from ssplat_experiments.study import Study, at_scale, run_study
 from ssplat_experiments.warm_sessions import new_session
 from ssplat_jax import model as stages
 from ssplat_jax.cache import project
-from ssplat_jax.chunk import Chunk
 from ssplat_jax.config import StreamConfig, preset
-from ssplat_jax.console import Reporter
+from ssplat_jax.core.cameras import Camera
+from ssplat_jax.core.chunk import Chunk
+from ssplat_jax.core.console import Reporter
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.evaluation.latency import measure_latency
 from ssplat_jax.evaluation.peak_memory import peak_memory
-from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.rasterizer import render
 from ssplat_jax.streaming.feed import feed_capture
 from ssplat_jax.streaming.session import Session

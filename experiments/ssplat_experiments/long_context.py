@@ -12,7 +12,7 @@ from ssplat_experiments import context_length
 from ssplat_experiments.cases import Case
 from ssplat_experiments.context_length import Sizes, suite_cases
 from ssplat_experiments.study import at_scale, run_study
-from ssplat_jax.console import Reporter
+from ssplat_jax.core.console import Reporter
 
 SIZES = {
     "smoke": (Sizes((8, 24), ("corridor",), (64, 48), targets=3, joint=8),),

@@ -12,13 +12,13 @@ from ssplat_experiments.settings import Setting, Sizes
 from ssplat_experiments.stopwatch import Stopwatch
 from ssplat_experiments.warm_sessions import new_session
 from ssplat_jax.config import StreamConfig, preset
+from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.split import Split
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.evaluation.latency import measure_latency
 from ssplat_jax.evaluation.peak_memory import peak_memory
 from ssplat_jax.evaluation.scoring import score_targets
-from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.refinement.refine import continue_refinement, start_refinement
 from ssplat_jax.refinement.refine_capture import key_views_of
 from ssplat_jax.refinement.refine_config import FOR_CAPTURES

@@ -20,12 +20,12 @@ from ssplat_experiments.cases import Case, Row
 from ssplat_experiments.joint_network import JointNetwork, joint_config, one_chunk
 from ssplat_experiments.study import Study, at_scale, run_study
 from ssplat_experiments.warm_sessions import new_session
-from ssplat_jax.checkpoint.weights import load_params
 from ssplat_jax.config import StreamConfig, preset
-from ssplat_jax.console import Reporter
+from ssplat_jax.core.console import Reporter
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.evaluation.peak_memory import peak_memory
+from ssplat_jax.storage.weights import load_params
 from ssplat_jax.streaming.feed import feed_chunks
 
 START_CAPACITY = 128

@@ -33,15 +33,15 @@ from ssplat_experiments.stopwatch import Stopwatch
 from ssplat_experiments.study import Study, at_scale, run_study
 from ssplat_experiments.warm_sessions import new_session
 from ssplat_jax.config import StreamConfig, preset
-from ssplat_jax.console import Reporter
+from ssplat_jax.core.console import Reporter
+from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.posed_image import invert_pose
 from ssplat_jax.data.split import Split, interleaved_split
 from ssplat_jax.data.stream_frame import StreamFrame
+from ssplat_jax.evaluation.psnr_ssim import psnr
 from ssplat_jax.evaluation.scoring import mean_scores, score_view
-from ssplat_jax.gaussians import Gaussians
-from ssplat_jax.metrics.psnr_ssim import psnr
 from ssplat_jax.poses.adjust_poses import adjust_poses
 from ssplat_jax.refinement.learned_pass import STEPS as STEPS_OF_PASS
 from ssplat_jax.refinement.refine_capture import CaptureRefinement, refine_on_capture

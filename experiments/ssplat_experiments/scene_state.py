@@ -5,8 +5,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ssplat_experiments.splatting_config import SplattingConfig
-from ssplat_jax.gaussians import Gaussians
-from ssplat_jax.pytree import pytree
+from ssplat_jax.core.gaussians import Gaussians
+from ssplat_jax.core.pytree import pytree
 
 
 @pytree

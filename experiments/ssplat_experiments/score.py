@@ -20,11 +20,11 @@ from PIL import Image, UnidentifiedImageError
 
 from ssplat_experiments.cases import Case, Row
 from ssplat_experiments.study import Study, run_study
-from ssplat_jax.console import Reporter
+from ssplat_jax.core.console import Reporter
+from ssplat_jax.core.errors import InputError, echo
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import Split
-from ssplat_jax.errors import InputError, echo
 from ssplat_jax.evaluation.nearest_views import nearest_views
 from ssplat_jax.evaluation.scoring import check_scorable, score_image
 

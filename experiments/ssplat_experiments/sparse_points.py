@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import KDTree
 
+from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.sparse_matches import (
     MAX_EPIPOLAR_PX,
@@ -23,7 +24,6 @@ from ssplat_jax.data.sparse_matches import (
     triangulate,
 )
 from ssplat_jax.data.stream_frame import StreamFrame
-from ssplat_jax.gaussians import Gaussians
 
 NUM_PARTNERS = 6
 """Views whose keypoints are matched with those of a view: the nearest ones that look about the same way."""

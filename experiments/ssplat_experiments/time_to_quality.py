@@ -34,13 +34,13 @@ from ssplat_experiments.study import Study, at_scale, run_study
 from ssplat_experiments.time_curves import OPTIMIZED, findings, plot
 from ssplat_experiments.warm_sessions import new_session
 from ssplat_jax.config import StreamConfig, preset
-from ssplat_jax.console import Reporter
+from ssplat_jax.core.console import Reporter
+from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import Split, interleaved_split
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.evaluation.scoring import score_targets
-from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.refinement.refine import continue_refinement, start_refinement
 from ssplat_jax.refinement.refine_capture import key_views_of
 from ssplat_jax.refinement.refine_config import FOR_CAPTURES

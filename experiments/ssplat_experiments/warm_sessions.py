@@ -4,12 +4,12 @@ import functools
 
 import jax
 
-from ssplat_jax.checkpoint.weights import load_params
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.model import complete_params
+from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.refinement import online_refinement
+from ssplat_jax.storage.weights import load_params
 from ssplat_jax.streaming.session import Session
-from ssplat_jax.streaming.streamsplat import StreamSplat
 
 MAX_KEPT = 4
 """Configurations whose programs are kept; the one that was used longest ago goes first."""

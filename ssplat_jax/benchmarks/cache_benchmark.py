@@ -20,8 +20,8 @@ from ssplat_jax.cache.hash_table import insert_rows
 from ssplat_jax.cache.project import project
 from ssplat_jax.cache.state import Tokens, VoxelCache, init_cache
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.geometry.cameras import Camera
-from ssplat_jax.pytree import replace
+from ssplat_jax.core.cameras import Camera
+from ssplat_jax.core.pytree import replace
 
 NUM_PATCH_VOXELS = 2048
 """Voxels into which the tokens of the fused chunk fall."""

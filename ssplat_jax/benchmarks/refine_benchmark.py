@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from ssplat_jax.errors import InputError
+from ssplat_jax.core.errors import InputError
 
 WORKER = Path(__file__).with_name("refine_worker.py")
 OWN = Path(__file__).parents[2]

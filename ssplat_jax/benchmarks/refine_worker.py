@@ -10,8 +10,8 @@ import time
 import jax.numpy as jnp
 import numpy as np
 
-from ssplat_jax.gaussians import Gaussians
-from ssplat_jax.geometry.cameras import Camera
+from ssplat_jax.core.cameras import Camera
+from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.refinement import RefineConfig, refine
 
 PRESENT = 0.904

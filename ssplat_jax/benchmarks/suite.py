@@ -13,15 +13,15 @@ import jax.numpy as jnp
 from ssplat_jax.benchmarks.cache_benchmark import Row, bench_cache
 from ssplat_jax.benchmarks.rasterizer_benchmark import bench_render
 from ssplat_jax.benchmarks.refine_benchmark import bench_refine
-from ssplat_jax.checkpoint.weights import load_params
-from ssplat_jax.chunk import Chunk
 from ssplat_jax.config import preset
+from ssplat_jax.core.chunk import Chunk
+from ssplat_jax.core.errors import InputError
 from ssplat_jax.data.open_capture import open_capture
-from ssplat_jax.errors import InputError
 from ssplat_jax.evaluation.provenance import commit, machine, today
+from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.refinement import online_refinement
+from ssplat_jax.storage.weights import load_params
 from ssplat_jax.streaming.session import Session, tokens_per_chunk
-from ssplat_jax.streaming.streamsplat import StreamSplat
 
 BENCHMARKS = ("render", "refine", "stream")
 """Names of the benchmarks."""

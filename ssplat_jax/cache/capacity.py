@@ -20,8 +20,8 @@ from jaxtyping import Array, Int
 from ssplat_jax.cache.hash_table import build_table
 from ssplat_jax.cache.state import VoxelCache, pivot_fields
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.errors import CacheError, InputError
-from ssplat_jax.pytree import replace
+from ssplat_jax.core.errors import CacheError, InputError
+from ssplat_jax.core.pytree import replace
 
 
 def ensure_capacity(cache: VoxelCache, config: StreamConfig, num_new_tokens: int) -> VoxelCache:

@@ -25,9 +25,9 @@ from jaxtyping import Array, Bool, Float, Int
 from ssplat_jax.cache.pixel_pairs import PixelPairs, fold_pairs, places_of, project_points, rows_in_sight, rows_of
 from ssplat_jax.cache.state import Tokens, VoxelCache, Witnesses
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.geometry.cameras import Camera
-from ssplat_jax.numerics import safe_log
-from ssplat_jax.pytree import replace
+from ssplat_jax.core.cameras import Camera
+from ssplat_jax.core.numerics import safe_log
+from ssplat_jax.core.pytree import replace
 
 CONTRADICTION_LOG_ODDS, AGREEMENT_LOG_ODDS = 2.0, 0.5
 """Log odds that a witness of confidence 1 takes away or adds."""

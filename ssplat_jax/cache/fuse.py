@@ -23,9 +23,9 @@ from jaxtyping import Array, Bool, Int
 from ssplat_jax.cache.capacity import evict
 from ssplat_jax.cache.hash_table import build_table, find_rows, group_equal, insert_rows, shards_of
 from ssplat_jax.cache.state import PIVOT_FIELDS, CacheStats, Tokens, VoxelCache, pivot_fields, saturating_add
+from ssplat_jax.cache.voxels import voxel_indices
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.geometry.voxels import voxel_indices
-from ssplat_jax.pytree import pytree, replace
+from ssplat_jax.core.pytree import pytree, replace
 
 MERGE_BLOCKS = ((512, 64), (16, 1))
 """Pairs (voxels merged at a time, least number of voxels in a round for which that block size pays)."""

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from ssplat_jax.geometry.voxels import hash_voxels
+from ssplat_jax.cache.voxels import hash_voxels
 
 SLOTS_PER_ROW = 4
 """Table slots per cache row: the table is at most a quarter full, so a search ends after a few probes."""

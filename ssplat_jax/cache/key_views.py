@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
-from ssplat_jax.geometry.cameras import Camera
-from ssplat_jax.pytree import pytree
+from ssplat_jax.core.cameras import Camera
+from ssplat_jax.core.pytree import pytree
 
 
 @pytree

@@ -14,8 +14,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ssplat_jax.cache.state import VoxelCache
-from ssplat_jax.geometry.cameras import Camera
-from ssplat_jax.pytree import pytree
+from ssplat_jax.core.cameras import Camera
+from ssplat_jax.core.pytree import pytree
 
 NEAR = 0.01
 """Near plane: pivots at or before this camera z (stream units) are invisible, as in the renderer."""

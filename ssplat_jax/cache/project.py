@@ -24,8 +24,8 @@ from jaxtyping import Array, Bool, Float
 from ssplat_jax.cache.pixel_pairs import PixelPairs, fold_pairs, rows_in_sight
 from ssplat_jax.cache.state import VoxelCache
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.geometry.cameras import Camera
-from ssplat_jax.pytree import pytree
+from ssplat_jax.core.cameras import Camera
+from ssplat_jax.core.pytree import pytree
 
 PAIRS_PER_BLOCK = 4096
 """Most pairs whose features are gathered at a time."""

@@ -10,11 +10,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ssplat_jax.cache.voxels import voxel_indices
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.gaussians import SH_C0, Gaussians
-from ssplat_jax.geometry.voxels import voxel_indices
-from ssplat_jax.numerics import clip_value
-from ssplat_jax.pytree import pytree
+from ssplat_jax.core.gaussians import SH_C0, Gaussians
+from ssplat_jax.core.numerics import clip_value
+from ssplat_jax.core.pytree import pytree
 
 WIDTH = 14
 """Numbers for each Gaussian."""

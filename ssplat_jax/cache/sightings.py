@@ -16,10 +16,10 @@ from jaxtyping import Array, Float, Int
 from ssplat_jax.cache.pixel_pairs import PixelPairs, fold_pairs, places_of, rows_in_sight, rows_of
 from ssplat_jax.cache.state import VoxelCache
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.geometry.cameras import Camera
-from ssplat_jax.numerics import safe_log
-from ssplat_jax.pytree import pytree, replace
-from ssplat_jax.xla_cpu import kept
+from ssplat_jax.core.cameras import Camera
+from ssplat_jax.core.numerics import safe_log
+from ssplat_jax.core.pytree import pytree, replace
+from ssplat_jax.core.xla_cpu import kept
 
 ON_SURFACE = math.log(1.03)
 """Largest distance in log depth at which a pivot lies on the surface of a cell."""

@@ -7,8 +7,8 @@ from ssplat_jax.cache.hash_table import SLOTS_PER_ROW
 from ssplat_jax.cache.key_views import KeyViews, empty_key_views
 from ssplat_jax.cache.residuals import empty_residuals
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.errors import InputError
-from ssplat_jax.pytree import pytree, replace
+from ssplat_jax.core.errors import InputError
+from ssplat_jax.core.pytree import pytree, replace
 
 
 def saturating_add(counter: Int[Array, ""], more: Int[Array, ""]) -> Int[Array, ""]:

@@ -24,7 +24,7 @@ class Demo:
     quiet: QuietOption = False
 
     def run(self) -> int:
-        from ssplat_jax.console import Reporter
+        from ssplat_jax.core.console import Reporter
         from ssplat_jax.runs.demo import run_demo
         from ssplat_jax.storage.folder_lock import lock_folder
 

@@ -76,7 +76,7 @@ class Eval:
     quiet: QuietOption = False
 
     def run(self) -> int:
-        from ssplat_jax.console import Reporter
+        from ssplat_jax.core.console import Reporter
         from ssplat_jax.evaluation.scoring import Display
         from ssplat_jax.runs.eval_run import EvalOptions, eval_path
         from ssplat_jax.storage.folder_lock import lock_folder

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import tyro
 
 from ssplat_jax.commands.options import QuietOption
-from ssplat_jax.errors import InputError
+from ssplat_jax.core.errors import InputError
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Experiment:
         import inspect
         from importlib.metadata import entry_points
 
-        from ssplat_jax.console import Reporter
+        from ssplat_jax.core.console import Reporter
 
         # The library does not import experiments: ours and others' register as entry points of this group.
         found = {point.name: point for point in entry_points(group="ssplat_jax.experiments")}

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import tyro
 
-from ssplat_jax.errors import InputError
+from ssplat_jax.core.errors import InputError
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,13 +30,13 @@ class Export:
     """Weights of the run: a preset with shipped weights, or a weights file."""
 
     def run(self) -> int:
-        from ssplat_jax.checkpoint.weights import load_params
-        from ssplat_jax.console import Reporter
+        from ssplat_jax.core.console import Reporter
         from ssplat_jax.runs.export_cameras import open_cameras, save_cameras
         from ssplat_jax.runs.export_run import export_run
         from ssplat_jax.scene_files.formats import convert_scene
         from ssplat_jax.scene_files.select_gaussians import Selection
         from ssplat_jax.storage.run_folder import RunFolder
+        from ssplat_jax.storage.weights import load_params
 
         reporter = Reporter(quiet=False)
         folder, selection = RunFolder(self.scene), Selection(self.prune, self.max_splats)

@@ -9,7 +9,7 @@ import tyro
 
 from ssplat_jax.commands.options import AxesOption, PosesOption, capture_path, parse_size
 from ssplat_jax.config import preset
-from ssplat_jax.errors import InputError
+from ssplat_jax.core.errors import InputError
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Inspect:
     poses: PosesOption = None
 
     def run(self) -> int:
-        from ssplat_jax.console import Reporter, print_facts
+        from ssplat_jax.core.console import Reporter, print_facts
         from ssplat_jax.data.capture_summary import UNITS, summarize
         from ssplat_jax.data.coverage_map import draw_coverage
         from ssplat_jax.data.depth_range import NUM_REFERENCES

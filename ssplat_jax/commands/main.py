@@ -33,7 +33,7 @@ from ssplat_jax.commands.usage import VERSION, check_usage, parse_in_one_line
 from ssplat_jax.commands.view_command import View
 from ssplat_jax.commands.weights_command import Weights
 from ssplat_jax.commands.worlds_command import Worlds
-from ssplat_jax.errors import CacheError, InputError, StorageError
+from ssplat_jax.core.errors import CacheError, InputError, StorageError
 
 EXIT_INPUT, EXIT_STORAGE, EXIT_MEMORY = 2, 3, 4
 

@@ -9,7 +9,7 @@ from typing import Annotated, Literal, get_args, get_type_hints
 import tyro
 
 from ssplat_jax.config import QUALITIES, StreamConfig, preset
-from ssplat_jax.errors import InputError
+from ssplat_jax.core.errors import InputError
 
 QualityName = Literal["fast", "balanced", "accurate", "best"]
 
@@ -139,9 +139,9 @@ def load_model(weights: str, changes: tuple[str, ...], defaults: tuple[str, ...]
     Raises:
         InputError: no such weights, a bad change, or a change that does not fit the weights.
     """
-    from ssplat_jax.checkpoint.weights import check_params, load_params, load_weights
     from ssplat_jax.config import PRESETS
-    from ssplat_jax.streaming.streamsplat import StreamSplat
+    from ssplat_jax.model.streamsplat import StreamSplat
+    from ssplat_jax.storage.weights import check_params, load_params, load_weights
 
     if weights in PRESETS:
         config, params = preset(weights), load_params(weights)
@@ -190,6 +190,6 @@ def load_lpips_weights(vgg: Path | None, heads: Path | None):
     if vgg is None or heads is None:
         missing, given = ("--lpips-vgg", "--lpips-heads") if vgg is None else ("--lpips-heads", "--lpips-vgg")
         raise InputError(f"{given}: wanted {missing} beside it, LPIPS needs both files; got one.")
-    from ssplat_jax.metrics.lpips import load_lpips
+    from ssplat_jax.evaluation.lpips import load_lpips
 
     return load_lpips(vgg, heads)

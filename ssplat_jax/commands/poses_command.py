@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from ssplat_jax.commands.options import QuietOption
-from ssplat_jax.errors import InputError, require_positive
+from ssplat_jax.core.errors import InputError, require_positive
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Poses:
     quiet: QuietOption = False
 
     def run(self) -> int:
-        from ssplat_jax.console import Reporter
+        from ssplat_jax.core.console import Reporter
         from ssplat_jax.poses.estimate import PoseOptions, estimate_poses
         from ssplat_jax.poses.verdict import verdict
 

@@ -42,9 +42,9 @@ class Refine:
     quiet: QuietOption = False
 
     def run(self) -> int:
-        from ssplat_jax.checkpoint.weights import load_params
-        from ssplat_jax.console import Reporter
+        from ssplat_jax.core.console import Reporter
         from ssplat_jax.runs.refine_run import refine_run
+        from ssplat_jax.storage.weights import load_params
 
         check_refinement(self.steps, self.revise, "--steps")
         result = refine_run(

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import tyro
 
 from ssplat_jax.commands.options import AxesOption, CapturePath, PosesOption, QuietOption, capture_path, parse_size
-from ssplat_jax.errors import InputError
+from ssplat_jax.core.errors import InputError
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Render:
     quiet: QuietOption = False
 
     def run(self) -> int:
-        from ssplat_jax.console import Reporter
+        from ssplat_jax.core.console import Reporter
         from ssplat_jax.runs.film import FilmOptions
         from ssplat_jax.runs.render_scene import render_scene
         from ssplat_jax.storage.run_folder import RunFolder

@@ -25,7 +25,7 @@ from ssplat_jax.commands.options import (
 )
 from ssplat_jax.commands.refine_command import Refine
 from ssplat_jax.config import QUALITIES
-from ssplat_jax.errors import InputError
+from ssplat_jax.core.errors import InputError
 
 if TYPE_CHECKING:
     from ssplat_jax.runs.capture_run import RunResult
@@ -167,7 +167,7 @@ class Run:
 
     def _stream(self) -> "RunResult":
         """Streams a capture that is complete."""
-        from ssplat_jax.console import Reporter
+        from ssplat_jax.core.console import Reporter
         from ssplat_jax.runs.capture_run import run_capture
         from ssplat_jax.runs.time_budget import setting_for_run
 
@@ -201,7 +201,7 @@ class Run:
 
     def _watch(self) -> "RunResult":
         """Streams a capture while it is written."""
-        from ssplat_jax.console import Reporter
+        from ssplat_jax.core.console import Reporter
         from ssplat_jax.runs.watch_run import WatchOptions, watch_capture
 
         changes = online_changes(self.set, self.online_refine)

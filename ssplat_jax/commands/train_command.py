@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Literal
 
 from ssplat_jax.commands.options import ConfigChanges, LpipsHeads, QuietOption, apply_changes, load_lpips_weights
 from ssplat_jax.config import StreamConfig, preset
-from ssplat_jax.errors import InputError, require_positive, require_seed
+from ssplat_jax.core.errors import InputError, require_positive, require_seed
 
 if TYPE_CHECKING:
-    from ssplat_jax.console import Reporter
-    from ssplat_jax.train.recipe import Recipe
+    from ssplat_jax.core.console import Reporter
+    from ssplat_jax.training.recipe import Recipe
 
 MINUTES = {"tiny": 77, "stream": 15, "evidence": 15, "refiner": 30}
 """Rough time of recipes on two free cores; docs/model_card.md has measured times, some of them beside other work."""
@@ -58,11 +58,11 @@ class Train:
     def run(self) -> int:
         import jax
 
-        from ssplat_jax.checkpoint.weights import check_params, params_digest, save_weights
-        from ssplat_jax.console import Reporter
+        from ssplat_jax.core.console import Reporter
         from ssplat_jax.model import complete_params
-        from ssplat_jax.train.loop import train
-        from ssplat_jax.train.recipe import RECIPES
+        from ssplat_jax.storage.weights import check_params, params_digest, save_weights
+        from ssplat_jax.training.loop import train
+        from ssplat_jax.training.recipe import RECIPES
 
         require_positive(scale_steps=self.scale_steps, save_every=self.save_every, validate_every=self.validate_every)
         require_seed(self.seed)
@@ -119,9 +119,9 @@ class Train:
 
     def _run_evidence(self) -> int:
         """Trains the evidence head on whole streams. It takes minutes, so it starts anew after an interrupt."""
-        from ssplat_jax.checkpoint.weights import check_params, save_weights
-        from ssplat_jax.console import Reporter
-        from ssplat_jax.train.evidence_training import EvidenceRecipe, train_evidence
+        from ssplat_jax.core.console import Reporter
+        from ssplat_jax.storage.weights import check_params, save_weights
+        from ssplat_jax.training.evidence_training import EvidenceRecipe, train_evidence
 
         init_weights, reporter = self._needed_weights("whose evidence head it trains"), Reporter(self.quiet)
         config, given, before = self._start(reporter)
@@ -139,10 +139,10 @@ class Train:
 
     def _run_refiner(self) -> int:
         """Trains the network of the learned pass. It takes minutes, so it starts anew after an interrupt."""
-        from ssplat_jax.checkpoint.weights import check_params
-        from ssplat_jax.console import Reporter
+        from ssplat_jax.core.console import Reporter
         from ssplat_jax.refinement.refiner_weights import save_refiner
-        from ssplat_jax.train.refiner_training import RefinerRecipe, train_refiner
+        from ssplat_jax.storage.weights import check_params
+        from ssplat_jax.training.refiner_training import RefinerRecipe, train_refiner
 
         init_weights, reporter = self._needed_weights("whose streams it refines"), Reporter(self.quiet)
         config, params, _ = self._start(reporter)
@@ -159,7 +159,7 @@ class Train:
 
     def _start(self, reporter: "Reporter") -> tuple[StreamConfig, dict | None, dict]:
         """The configuration, and parameters and provenance of --init-weights; says what of these is replaced."""
-        from ssplat_jax.checkpoint.weights import describe_weights, load_weights
+        from ssplat_jax.storage.weights import describe_weights, load_weights
 
         if self.init_weights is None:
             return apply_changes(preset(self.preset or "tiny"), self.set), None, {}
@@ -173,9 +173,9 @@ class Train:
 
     def _trained(self, train, config, params: dict, recipe, num_steps: int, reporter: "Reporter") -> tuple[dict, dict]:
         """Parameters and facts of `train`, a training on whole streams, with the folder locked and steps shown."""
+        from ssplat_jax.model.streamsplat import StreamSplat
         from ssplat_jax.storage.folder_lock import lock_folder
         from ssplat_jax.storage.folders import make_writable
-        from ssplat_jax.streaming.streamsplat import StreamSplat
 
         reporter.say(f"{num_steps} steps, about {MINUTES[self.recipe]} minutes on two cores with two captures")
         make_writable(self.out)
@@ -215,7 +215,7 @@ class Train:
 
     def _opened(self, config, recipe):
         """The recipe and the captures to learn from, None without --captures."""
-        from ssplat_jax.train.capture_samples import open_mix
+        from ssplat_jax.training.capture_samples import open_mix
 
         if not self.captures:
             if self.shares:

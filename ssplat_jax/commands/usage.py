@@ -9,7 +9,7 @@ import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from ssplat_jax.errors import InputError, echo
+from ssplat_jax.core.errors import InputError, echo
 
 HELP, VERSION = ("-h", "--help"), "--version"
 NAME_INDENT = 4  # of the names of missing options, in the parser's box; help on them is indented by 8

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import tyro
 
-from ssplat_jax.errors import require_positive
+from ssplat_jax.core.errors import require_positive
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,7 +31,7 @@ class View:
     """Show a run's scene at the exposure of its first views instead of the middle one of all."""
 
     def run(self) -> int:
-        from ssplat_jax.console import Reporter
+        from ssplat_jax.core.console import Reporter
         from ssplat_jax.viewer.view_scene import view_scene
 
         require_positive(port=self.port, most=self.most)

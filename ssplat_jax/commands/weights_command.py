@@ -20,8 +20,8 @@ class Weights:
     """Preset with shipped weights, or a weights file."""
 
     def run(self) -> int:
-        from ssplat_jax.checkpoint.stage_changes import stage_changes, start_of, trainings
-        from ssplat_jax.checkpoint.weights import describe_weights, load_params
+        from ssplat_jax.storage.stage_changes import stage_changes, start_of, trainings
+        from ssplat_jax.storage.weights import describe_weights, load_params
 
         params = load_params(self.name)
         facts = describe_weights(self.name)

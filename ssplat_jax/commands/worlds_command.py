@@ -4,7 +4,7 @@ import dataclasses
 from pathlib import Path
 
 from ssplat_jax.commands.options import parse_size
-from ssplat_jax.errors import require_positive, require_seed
+from ssplat_jax.core.errors import require_positive, require_seed
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Worlds:
     """Images a world."""
 
     def run(self) -> int:
-        from ssplat_jax.console import Reporter
+        from ssplat_jax.core.console import Reporter
         from ssplat_jax.data.worlds.world_capture import write_worlds
 
         size = parse_size(self.size)

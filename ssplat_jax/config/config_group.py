@@ -4,7 +4,7 @@ import dataclasses
 import math
 from typing import Any, Literal, get_args, get_origin
 
-from ssplat_jax.errors import InputError
+from ssplat_jax.core.errors import InputError
 
 
 def is_positive(value: Any) -> bool:

@@ -4,7 +4,7 @@ import dataclasses
 from typing import Any, ClassVar, Literal
 
 from ssplat_jax.config.config_group import ConfigGroup, are_widths, is_range
-from ssplat_jax.errors import InputError
+from ssplat_jax.core.errors import InputError
 
 
 @dataclasses.dataclass(frozen=True)

@@ -15,7 +15,7 @@ from ssplat_jax.config.field_groups import (
     StreamingConfig,
 )
 from ssplat_jax.config.network_configs import NETWORK_CONFIGS, CompactConfig, ResplatConfig, network_config
-from ssplat_jax.errors import InputError
+from ssplat_jax.core.errors import InputError
 
 RENAMED_FIELDS = {"mixer_neighbours": "mixer_neighbors"}
 """Current names of fields that files written before 0.1.0 call differently."""

@@ -14,8 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from ssplat_jax.chunk import Chunk
 from ssplat_jax.config import StreamConfig
+from ssplat_jax.core.cameras import Camera
+from ssplat_jax.core.chunk import Chunk
+from ssplat_jax.core.errors import echo, refusal
 from ssplat_jax.data.depth_range import estimate_depths, stream_scale
 from ssplat_jax.data.images import (
     Crop,
@@ -31,8 +33,6 @@ from ssplat_jax.data.readers import (
     Listing,
 )
 from ssplat_jax.data.stream_frame import StreamFrame
-from ssplat_jax.errors import echo, refusal
-from ssplat_jax.geometry.cameras import Camera
 
 MAX_SIDE = 16384  # pixels of a delivered image
 

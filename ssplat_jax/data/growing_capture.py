@@ -2,11 +2,11 @@
 
 from pathlib import Path
 
+from ssplat_jax.core.errors import InputError
 from ssplat_jax.data.capture import Capture, capture_of_listing
 from ssplat_jax.data.images import FilePixels
 from ssplat_jax.data.readers import transforms_json
 from ssplat_jax.data.readers.frame_list import in_stream_order
-from ssplat_jax.errors import InputError
 
 DONE = "done"
 """A file of this name in the capture's folder says that nothing more will come."""

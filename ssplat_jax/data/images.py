@@ -15,9 +15,9 @@ import numpy as np
 from jaxtyping import Float32, Float64
 from PIL import Image
 
+from ssplat_jax.core.errors import refusal
 from ssplat_jax.data.lens import undistort
 from ssplat_jax.data.posed_image import Frame
-from ssplat_jax.errors import refusal
 
 IMAGE_FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "PPM")
 MAX_PIXELS = 64_000_000  # larger images are refused before anything is decoded

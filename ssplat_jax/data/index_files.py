@@ -9,9 +9,9 @@ Indices of videos list every frame as a target. A target that is streamed too is
 from pathlib import Path
 from typing import Any
 
+from ssplat_jax.core.errors import echo, refusal
 from ssplat_jax.data.readers.strict_json import load_json
 from ssplat_jax.data.split import Split
-from ssplat_jax.errors import echo, refusal
 
 Index = dict[str, Split | None]
 """The split of each scene; None for a scene that is left out."""

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 from skimage.transform import warp
 
-from ssplat_jax.errors import refusal
+from ssplat_jax.core.errors import refusal
 
 IGNORED_PX = 0.5  # images with a smaller displacement by distortion are not undistorted
 

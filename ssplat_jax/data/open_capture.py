@@ -7,6 +7,7 @@ import dataclasses
 import shlex
 from pathlib import Path
 
+from ssplat_jax.core.errors import InputError, echo, refusal
 from ssplat_jax.data.capture import MAX_SIDE, Capture, capture_of_listing
 from ssplat_jax.data.images import MAX_PIXELS, FilePixels
 from ssplat_jax.data.pose_conventions import USUAL, reinterpreted, split_options
@@ -25,7 +26,6 @@ from ssplat_jax.data.readers import (
     tum,
 )
 from ssplat_jax.data.readers.frame_list import in_stream_order
-from ssplat_jax.errors import InputError, echo, refusal
 
 READERS = (  # the first one that matches reads the capture
     transforms_json,

@@ -11,8 +11,8 @@ from typing import Literal, get_args
 import numpy as np
 from jaxtyping import Float64
 
+from ssplat_jax.core.errors import refusal
 from ssplat_jax.data.posed_image import OPENGL_TO_OPENCV, Frame, invert_pose
-from ssplat_jax.errors import refusal
 
 Axes = Literal["opencv", "opengl"]
 """Axes of a camera: +y down and +z forward (opencv), or +y up and +z backward (opengl)."""

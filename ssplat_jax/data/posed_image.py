@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
+from ssplat_jax.core.errors import echo, refusal
 from ssplat_jax.data.lens import Lens
-from ssplat_jax.errors import echo, refusal
 
 ROTATION_TOLERANCE = 5e-3  # largest |R^T R - I| that rounding to three decimals explains; larger ones are refused
 ROTATION_ROUNDING = 1e-5  # deviations above this are reported to the user

@@ -4,11 +4,11 @@ from urllib.parse import parse_qsl
 
 import numpy as np
 
+from ssplat_jax.core.errors import echo, refusal
 from ssplat_jax.data.capture import MAX_SIDE, Capture, capture_of_listing
 from ssplat_jax.data.images import ArrayPixels
 from ssplat_jax.data.posed_image import Frame, check_camtoworld, check_intrinsics
 from ssplat_jax.data.readers import Listing
-from ssplat_jax.errors import echo, refusal
 
 PROCEDURAL = "procedural"  # scheme of the paths of procedural captures
 PROCEDURAL_FRAMES = 73  # 64 context views and the 9 interleaved targets between them

@@ -18,7 +18,7 @@ import json
 
 import numpy as np
 
-from ssplat_jax.errors import refusal
+from ssplat_jax.core.errors import refusal
 
 FIRST_TARGET, TARGET_STEP = 4, 8  # first position and spacing of the interleaved targets
 USUAL_CONTEXT = 64  # context views where none are given, if there are as many

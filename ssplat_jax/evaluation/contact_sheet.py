@@ -7,7 +7,7 @@ from pathlib import Path
 
 from PIL import Image, ImageDraw, ImageFont
 
-from ssplat_jax.storage.atomic import write_atomic
+from ssplat_jax.core.atomic import write_atomic
 
 MAX_PICTURES = 24
 """Pictures on a sheet; of more, evenly spread ones are taken."""

@@ -7,22 +7,22 @@ from pathlib import Path
 
 import numpy as np
 
-from ssplat_jax.console import Reporter
+from ssplat_jax.core.atomic import write_atomic
+from ssplat_jax.core.console import Reporter
+from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.index_files import index_to_json
 from ssplat_jax.data.split import Split
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.evaluation import latency
 from ssplat_jax.evaluation.exposures import exposures_to_json
+from ssplat_jax.evaluation.lpips import LpipsWeights, check_size
 from ssplat_jax.evaluation.peak_memory import peak_memory
 from ssplat_jax.evaluation.pictures import save_comparison
+from ssplat_jax.evaluation.psnr_ssim import SSIM_ARGUMENTS
 from ssplat_jax.evaluation.scoring import Display, ViewScore, baselines, check_scorable, mean_scores, score_view
-from ssplat_jax.gaussians import Gaussians
-from ssplat_jax.metrics.lpips import LpipsWeights, check_size
-from ssplat_jax.metrics.psnr_ssim import SSIM_ARGUMENTS
 from ssplat_jax.poses.adjust_poses import adjust_if_asked, check_look_ahead
 from ssplat_jax.refinement import CaptureRefinement, refine_on_capture
-from ssplat_jax.storage.atomic import write_atomic
 from ssplat_jax.storage.folders import make_writable
 from ssplat_jax.storage.json_files import write_json
 from ssplat_jax.storage.run_folder import RunFolder

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from ssplat_jax.cache import ensure_capacity
-from ssplat_jax.chunk import Chunk
-from ssplat_jax.geometry.cameras import Camera
+from ssplat_jax.core.cameras import Camera
+from ssplat_jax.core.chunk import Chunk
 from ssplat_jax.rasterizer import render
 from ssplat_jax.streaming.session import Session, tokens_per_chunk
 

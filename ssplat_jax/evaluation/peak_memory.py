@@ -11,8 +11,8 @@ from typing import Any
 
 import jax
 
-from ssplat_jax.gaussians import Gaussians
-from ssplat_jax.geometry.cameras import Camera
+from ssplat_jax.core.cameras import Camera
+from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.rasterizer import render
 from ssplat_jax.rasterizer.render import render_program, round_up
 from ssplat_jax.streaming.session import Session

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image
 
-from ssplat_jax.storage.atomic import write_atomic
+from ssplat_jax.core.atomic import write_atomic
 
 _DEPTH_COLORS = np.array(  # near to far, perceptually even, readable in print
     [(0.99, 0.91, 0.62), (0.97, 0.60, 0.32), (0.80, 0.27, 0.37), (0.47, 0.13, 0.48), (0.13, 0.07, 0.33)], np.float32

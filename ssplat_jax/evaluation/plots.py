@@ -4,7 +4,7 @@ import io
 from pathlib import Path
 from typing import Any
 
-from ssplat_jax.storage.atomic import write_atomic
+from ssplat_jax.core.atomic import write_atomic
 
 
 def import_pyplot() -> Any | None:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from ssplat_jax.storage.atomic import write_atomic
+from ssplat_jax.core.atomic import write_atomic
 
 STYLE = """
 :root { color-scheme: light dark; --paper: #fbfbf9; --ink: #23282e; --soft: #6b727b; --line: #e2e2dd; --card: #fff; }

@@ -9,15 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from ssplat_jax.core.errors import InputError
+from ssplat_jax.core.gaussians import Gaussians, mean_color
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.split import Split
 from ssplat_jax.data.stream_frame import StreamFrame
-from ssplat_jax.errors import InputError
 from ssplat_jax.evaluation.exposures import exposure_for
+from ssplat_jax.evaluation.lpips import LpipsWeights, lpips
 from ssplat_jax.evaluation.nearest_views import nearest_views
-from ssplat_jax.gaussians import Gaussians, mean_color
-from ssplat_jax.metrics.lpips import LpipsWeights, lpips
-from ssplat_jax.metrics.psnr_ssim import SSIM_ARGUMENTS, psnr, ssim
+from ssplat_jax.evaluation.psnr_ssim import SSIM_ARGUMENTS, psnr, ssim
 from ssplat_jax.rasterizer import fill_holes, render
 from ssplat_jax.streaming.feed import Exposures
 

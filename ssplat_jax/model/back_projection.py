@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.geometry.cameras import invert_poses, pixel_grid, transform_points, unproject
+from ssplat_jax.core.cameras import invert_poses, pixel_grid, transform_points, unproject
 from ssplat_jax.model.layers import average_pool
 from ssplat_jax.model.types import GRID_STRIDE, Views
 

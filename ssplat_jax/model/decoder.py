@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.gaussians import SH_C0, Gaussians
-from ssplat_jax.geometry.rotations import multiply_quats, quats_to_matrices
+from ssplat_jax.core.gaussians import SH_C0, Gaussians
+from ssplat_jax.core.rotations import multiply_quats, quats_to_matrices
 from ssplat_jax.model.types import TokenShapes
 
 START_SCALE = 0.43

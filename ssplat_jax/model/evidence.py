@@ -13,9 +13,9 @@ from jaxtyping import Array, Float
 from ssplat_jax.cache.sightings import features_of_sightings
 from ssplat_jax.cache.state import NUM_SIGHTINGS
 from ssplat_jax.config import StreamConfig
+from ssplat_jax.core.numerics import safe_log, safe_sqrt
+from ssplat_jax.core.pytree import pytree, replace
 from ssplat_jax.model.types import TokenShapes
-from ssplat_jax.numerics import safe_log, safe_sqrt
-from ssplat_jax.pytree import pytree, replace
 
 MAX_LOGIT_CHANGE = 4.0
 """Bound of what is added to an opacity's logit."""

@@ -6,9 +6,9 @@ from jaxtyping import Array, Float
 
 from ssplat_jax.cache import ProjectedCache
 from ssplat_jax.config import StreamConfig
+from ssplat_jax.core.numerics import safe_log, softplus_inverse
+from ssplat_jax.core.pytree import replace
 from ssplat_jax.model.types import AnchoredDepth, DepthDistribution, Views, from_candidate_space, to_candidate_space
-from ssplat_jax.numerics import safe_log, softplus_inverse
-from ssplat_jax.pytree import replace
 
 RECALL_MARGIN = 0.1
 """Confidence of recalled tokens above `min_confidence`. Their history must be surer, so that a recalled depth is not

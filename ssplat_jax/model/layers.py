@@ -5,8 +5,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from ssplat_jax.core.xla_cpu import lane_sum
 from ssplat_jax.model.convolution import Conv, HalvingConv
-from ssplat_jax.xla_cpu import lane_sum
 
 IMAGE_MEAN, IMAGE_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 """Mean and standard deviation of ImageNet, RGB."""

@@ -12,7 +12,7 @@ from typing import Any, Protocol, runtime_checkable
 from jaxtyping import Array, Bool, Float
 
 from ssplat_jax.config import NETWORK_CONFIGS, StreamConfig
-from ssplat_jax.errors import InputError
+from ssplat_jax.core.errors import InputError
 from ssplat_jax.model.compact import CompactNetwork
 from ssplat_jax.model.resplat import ResplatNetwork
 from ssplat_jax.model.types import AnchoredDepth, DepthDistribution, TokenShapes, Views

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.errors import InputError
+from ssplat_jax.core.errors import InputError
 from ssplat_jax.model.cgfi import Aggregator, num_hints
 from ssplat_jax.model.evidence import EvidenceHead, num_features
 from ssplat_jax.model.hpda import AnchorStrength

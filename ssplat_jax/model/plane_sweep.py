@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ssplat_jax.geometry.cameras import invert_poses, pixel_grid, unproject
+from ssplat_jax.core.cameras import invert_poses, pixel_grid, unproject
 from ssplat_jax.model.types import Views
 
 MIN_SOURCE_DEPTH = 1e-3

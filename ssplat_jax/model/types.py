@@ -3,10 +3,10 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ssplat_jax.chunk import Chunk
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.geometry.cameras import Camera, pixel_grid
-from ssplat_jax.pytree import pytree, static
+from ssplat_jax.core.cameras import Camera, pixel_grid
+from ssplat_jax.core.chunk import Chunk
+from ssplat_jax.core.pytree import pytree, static
 
 GRID_STRIDE = 4
 """Pixels per side of a grid cell: one token per 4 x 4 patch (Sec. 3.3, M = N H W / 16)."""

@@ -8,11 +8,11 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from ssplat_jax.console import Reporter
+from ssplat_jax.core.console import Reporter
+from ssplat_jax.core.errors import refusal
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.depth_range import estimate_depths
 from ssplat_jax.data.posed_image import invert_pose
-from ssplat_jax.errors import refusal
 from ssplat_jax.poses.bundle_adjustment import Adjustment, Observations, adjust, moved
 from ssplat_jax.poses.tracks import find_tracks
 

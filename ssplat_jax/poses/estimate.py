@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from ssplat_jax.console import Reporter
+from ssplat_jax.core.console import Reporter
+from ssplat_jax.core.errors import echo, refusal
 from ssplat_jax.data.open_capture import VIDEO_SUFFIXES
-from ssplat_jax.errors import echo, refusal
 from ssplat_jax.poses import sfm
 from ssplat_jax.poses.capture_files import write_sparse, write_transforms
 from ssplat_jax.poses.frame_choice import choose_frames

@@ -9,9 +9,9 @@ import numpy as np
 from PIL import Image
 from PIL.ExifTags import IFD, Base
 
+from ssplat_jax.core.errors import echo, refusal
 from ssplat_jax.data.images import DEPTH_MODES, ORIENTATION, UPRIGHT, image_size
 from ssplat_jax.data.open_capture import IMAGE_SUFFIXES, UNREADABLE_SUFFIXES
-from ssplat_jax.errors import echo, refusal
 
 JPEG_QUALITY = 95
 TURNS = {

@@ -3,7 +3,7 @@
 import importlib
 from typing import Any
 
-from ssplat_jax.errors import InputError
+from ssplat_jax.core.errors import InputError
 
 INSTALL = 'pip install -e ".[poses]"'
 

@@ -4,7 +4,7 @@ import dataclasses
 import itertools
 from collections.abc import Sequence
 
-from ssplat_jax.errors import InputError
+from ssplat_jax.core.errors import InputError
 
 MIN_REGISTERED = 4  # images: one chunk
 MIN_SHARE = 0.25  # of the images; fewer registered ones are no result

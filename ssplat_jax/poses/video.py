@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 from PIL import Image
 
-from ssplat_jax.errors import refusal
+from ssplat_jax.core.errors import refusal
 from ssplat_jax.poses.frame_choice import MotionMeter, sharpness
 from ssplat_jax.poses.photos import save_upright
 from ssplat_jax.poses.requirements import require

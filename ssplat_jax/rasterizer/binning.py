@@ -13,13 +13,13 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from ssplat_jax.numerics import columns
-from ssplat_jax.pytree import pytree
+from ssplat_jax.core.numerics import columns
+from ssplat_jax.core.pytree import pytree
+from ssplat_jax.core.xla_cpu import SORT_PIECES, by_platform, in_own_kernel, sort_pieces
 from ssplat_jax.rasterizer import constants
 from ssplat_jax.rasterizer.depth_sorted_table import BOX_COLUMNS, BOX_SIZE, SHAPE_COLUMNS
 from ssplat_jax.rasterizer.projection import Splats
 from ssplat_jax.rasterizer.tile_grid import Grid, tile_boxes
-from ssplat_jax.xla_cpu import SORT_PIECES, by_platform, in_own_kernel, sort_pieces
 
 CAPACITY_SHARES = (17, 20, 24, 28, 32)
 """In 32nds of the capacity, a power of two: the smallest share that holds all pairs is sorted."""

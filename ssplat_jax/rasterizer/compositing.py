@@ -23,6 +23,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from ssplat_jax.core.xla_cpu import by_platform, in_own_kernel, short_exp
 from ssplat_jax.rasterizer import constants
 from ssplat_jax.rasterizer.binning import TileIntersections
 from ssplat_jax.rasterizer.depth_sorted_table import (
@@ -37,7 +38,6 @@ from ssplat_jax.rasterizer.depth_sorted_table import (
     num_channels,
 )
 from ssplat_jax.rasterizer.tile_grid import Grid
-from ssplat_jax.xla_cpu import by_platform, in_own_kernel, short_exp
 
 Results = TypeVar("Results")
 

@@ -16,11 +16,11 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from ssplat_jax.numerics import safe_log
+from ssplat_jax.core.numerics import safe_log
+from ssplat_jax.core.xla_cpu import in_own_kernel
 from ssplat_jax.rasterizer import constants
 from ssplat_jax.rasterizer.projection import Splats
 from ssplat_jax.rasterizer.tile_grid import Grid, tile_boxes
-from ssplat_jax.xla_cpu import in_own_kernel
 
 MEAN_X, MEAN_Y, LOG_OPACITY = 0, 1, 5
 FACTORS = slice(2, 5)

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Array, Float
 
-from ssplat_jax.errors import InputError
-from ssplat_jax.gaussians import Gaussians
-from ssplat_jax.geometry.cameras import Camera
+from ssplat_jax.core.cameras import Camera
+from ssplat_jax.core.errors import InputError
+from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.rasterizer import constants
 
 OUTPUTS = ("color", "alpha", "depth", "median_depth")

@@ -3,10 +3,10 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from ssplat_jax.gaussians import Gaussians
-from ssplat_jax.geometry.cameras import Camera
-from ssplat_jax.numerics import safe_normalize
-from ssplat_jax.pytree import pytree
+from ssplat_jax.core.cameras import Camera
+from ssplat_jax.core.gaussians import Gaussians
+from ssplat_jax.core.numerics import safe_normalize
+from ssplat_jax.core.pytree import pytree
 from ssplat_jax.rasterizer.effects import Effects
 from ssplat_jax.rasterizer.projection import Splats
 from ssplat_jax.rasterizer.sh import sh_colors

@@ -21,14 +21,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ssplat_jax.gaussians import Gaussians
-from ssplat_jax.geometry.cameras import Camera
-from ssplat_jax.numerics import columns
-from ssplat_jax.pytree import replace
+from ssplat_jax.core.cameras import Camera
+from ssplat_jax.core.gaussians import Gaussians
+from ssplat_jax.core.numerics import columns
+from ssplat_jax.core.pytree import replace
+from ssplat_jax.core.xla_cpu import kept
 from ssplat_jax.rasterizer import constants
 from ssplat_jax.rasterizer.effects import Effects
 from ssplat_jax.rasterizer.projection import FILTER_VARIANCES, Splats, camera_points, project, tangent_bounds
-from ssplat_jax.xla_cpu import kept
 
 Entries = Sequence[Float[Array, "b n"]]
 Pair = Sequence[Entries]

@@ -11,11 +11,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ssplat_jax.gaussians import Gaussians
-from ssplat_jax.geometry.cameras import Camera
-from ssplat_jax.geometry.rotations import matrix_entries
-from ssplat_jax.numerics import columns
-from ssplat_jax.pytree import pytree, replace
+from ssplat_jax.core.cameras import Camera
+from ssplat_jax.core.gaussians import Gaussians
+from ssplat_jax.core.numerics import columns
+from ssplat_jax.core.pytree import pytree, replace
+from ssplat_jax.core.rotations import matrix_entries
 from ssplat_jax.rasterizer import constants
 from ssplat_jax.rasterizer.effects import Effects
 from ssplat_jax.rasterizer.lens_distortion import distort, is_folded, lens_field

@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from ssplat_jax.gaussians import Gaussians
-from ssplat_jax.geometry.cameras import Camera
-from ssplat_jax.pytree import replace
+from ssplat_jax.core.cameras import Camera
+from ssplat_jax.core.gaussians import Gaussians
+from ssplat_jax.core.pytree import replace
 from ssplat_jax.rasterizer import constants
 from ssplat_jax.rasterizer.effects import Effects
 from ssplat_jax.rasterizer.filter_3d import filter_3d

@@ -8,10 +8,10 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Num
 
-from ssplat_jax.errors import InputError, echo
-from ssplat_jax.gaussians import Gaussians, check_gaussians
-from ssplat_jax.geometry.cameras import Camera
-from ssplat_jax.pytree import pytree, replace
+from ssplat_jax.core.cameras import Camera
+from ssplat_jax.core.errors import InputError, echo
+from ssplat_jax.core.gaussians import Gaussians, check_gaussians
+from ssplat_jax.core.pytree import pytree, replace
 from ssplat_jax.rasterizer.binning import count_intersections, intersect_tiles
 from ssplat_jax.rasterizer.compositing import composite, median_rows
 from ssplat_jax.rasterizer.depth_sorted_table import sorted_table

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ssplat_jax.gaussians import SH_C0
+from ssplat_jax.core.gaussians import SH_C0
 
 _C1 = 0.4886025119029199
 _C2 = (1.0925484305920792, 1.0925484305920792, 0.31539156525252005, 1.0925484305920792, 0.5462742152960396)

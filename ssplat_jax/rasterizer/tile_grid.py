@@ -3,8 +3,8 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from ssplat_jax.numerics import columns
-from ssplat_jax.pytree import pytree, static
+from ssplat_jax.core.numerics import columns
+from ssplat_jax.core.pytree import pytree, static
 
 
 @pytree

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from ssplat_jax.gaussians import SH_C0
+from ssplat_jax.core.gaussians import SH_C0
 from ssplat_jax.refinement.refine_config import RefineConfig
 from ssplat_jax.refinement.revision import Revision, bounded
 

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from ssplat_jax.cache.key_views import KeyViews
-from ssplat_jax.errors import InputError
-from ssplat_jax.gaussians import Gaussians
+from ssplat_jax.core.errors import InputError
+from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.refinement.refine_config import RefineConfig
 from ssplat_jax.refinement.refine_effects import NAMES, RefineEffects
 from ssplat_jax.refinement.view_residuals import ViewResiduals, view_residuals

@@ -12,8 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ssplat_jax.cache.key_views import KeyViews
-from ssplat_jax.gaussians import Gaussians
-from ssplat_jax.geometry.cameras import (
+from ssplat_jax.core.cameras import (
     Camera,
     invert_poses,
     pixel_grid,
@@ -21,8 +20,9 @@ from ssplat_jax.geometry.cameras import (
     transform_points,
     unproject,
 )
-from ssplat_jax.geometry.rotations import matrices_to_quats
-from ssplat_jax.pytree import pytree
+from ssplat_jax.core.gaussians import Gaussians
+from ssplat_jax.core.pytree import pytree
+from ssplat_jax.core.rotations import matrices_to_quats
 from ssplat_jax.rasterizer import Effects, render
 from ssplat_jax.refinement.refine_config import RefineConfig
 from ssplat_jax.refinement.view_loss import held_back_pixels

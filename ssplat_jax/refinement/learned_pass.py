@@ -13,11 +13,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from ssplat_jax.cache.key_views import KeyViews
-from ssplat_jax.gaussians import SH_C0, Gaussians, mean_color
-from ssplat_jax.geometry.rotations import quats_to_matrices
+from ssplat_jax.core.gaussians import SH_C0, Gaussians, mean_color
+from ssplat_jax.core.numerics import safe_log
+from ssplat_jax.core.pytree import pytree, replace
+from ssplat_jax.core.rotations import quats_to_matrices
 from ssplat_jax.model.refiner import Refiner, gains_and_shifts
-from ssplat_jax.numerics import safe_log
-from ssplat_jax.pytree import pytree, replace
 from ssplat_jax.rasterizer import fill_holes, render
 from ssplat_jax.refinement.refine_config import RefineConfig
 from ssplat_jax.refinement.refine_step import RefineState, StepReport, view_revision, with_revised_view

@@ -16,10 +16,11 @@ from jaxtyping import Array, Int
 from ssplat_jax.cache.key_views import KeyViews, keep_views, usable
 from ssplat_jax.cache.residuals import Residuals, add, settle, unpack
 from ssplat_jax.cache.state import VoxelCache
-from ssplat_jax.chunk import Chunk
-from ssplat_jax.gaussians import Gaussians, mean_color
-from ssplat_jax.geometry.cameras import Camera
-from ssplat_jax.pytree import replace
+from ssplat_jax.core.cameras import Camera
+from ssplat_jax.core.chunk import Chunk
+from ssplat_jax.core.gaussians import Gaussians, mean_color
+from ssplat_jax.core.pytree import replace
+from ssplat_jax.model.streamsplat import ChunkOutput, StreamSplat
 from ssplat_jax.rasterizer import fill_holes, render
 from ssplat_jax.rasterizer.render import round_up
 from ssplat_jax.refinement.revision import sizes
@@ -27,7 +28,6 @@ from ssplat_jax.refinement.view_loss import EFFECTS
 from ssplat_jax.refinement.view_order import golden_fractions
 from ssplat_jax.refinement.visible_pivots import visible_pivots
 from ssplat_jax.streaming.session import Revise
-from ssplat_jax.streaming.streamsplat import ChunkOutput, StreamSplat
 
 GAINS = {"means": 12.0, "quats": 0.2, "log_scales": 6.0, "logit_opacities": 6.0, "colors": 0.12}
 """Step of each part over its mean gradient in the pixels that a Gaussian fills. Newton's method would divide by the

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int
 
-from ssplat_jax.gaussians import Gaussians, with_sh_degree
-from ssplat_jax.pytree import replace
+from ssplat_jax.core.gaussians import Gaussians, with_sh_degree
+from ssplat_jax.core.pytree import replace
 
 MIN_ROWS = 1 << 12
 """Capacities for rows are multiples of this, or of a 32nd of a larger power of two: few programs are compiled."""

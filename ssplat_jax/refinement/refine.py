@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Array, Float, Int, UInt8
 
 from ssplat_jax.cache.key_views import KeyViews
-from ssplat_jax.errors import InputError
-from ssplat_jax.gaussians import Gaussians, mask_gaussians
-from ssplat_jax.geometry.cameras import Camera
+from ssplat_jax.core.cameras import Camera
+from ssplat_jax.core.errors import InputError
+from ssplat_jax.core.gaussians import Gaussians, mask_gaussians
 from ssplat_jax.rasterizer import render
 from ssplat_jax.rasterizer.constants import ALPHA_MIN
 from ssplat_jax.rasterizer.render import round_up

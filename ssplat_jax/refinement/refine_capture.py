@@ -9,11 +9,11 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from ssplat_jax.cache.key_views import KeyViews
+from ssplat_jax.core.cameras import Camera
+from ssplat_jax.core.errors import InputError
+from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.stream_frame import StreamFrame
-from ssplat_jax.errors import InputError
-from ssplat_jax.gaussians import Gaussians
-from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.refinement.choose_effects import EffectsChoice, effects_by_name, with_effects
 from ssplat_jax.refinement.refine import Refinement, continue_refinement, report_of, start_refinement
 from ssplat_jax.refinement.refine_config import FOR_CAPTURES, RefineConfig

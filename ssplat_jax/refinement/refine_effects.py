@@ -3,7 +3,7 @@
 import dataclasses
 import math
 
-from ssplat_jax.errors import InputError
+from ssplat_jax.core.errors import InputError
 
 
 @dataclasses.dataclass(frozen=True)

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from ssplat_jax.cache.key_views import KeyViews
-from ssplat_jax.errors import InputError
-from ssplat_jax.gaussians import Gaussians, mean_color, with_sh_degree
-from ssplat_jax.pytree import pytree, replace
+from ssplat_jax.core.errors import InputError
+from ssplat_jax.core.gaussians import Gaussians, mean_color, with_sh_degree
+from ssplat_jax.core.pytree import pytree, replace
 from ssplat_jax.refinement.adam import adam_step
 from ssplat_jax.refinement.refine_config import RefineConfig
 from ssplat_jax.refinement.revision import Revision, apply_revision, is_revised, no_revision

@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ssplat_jax.errors import InputError
-from ssplat_jax.gaussians import Gaussians
+from ssplat_jax.core.errors import InputError
+from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.model.refiner import Refiner
 from ssplat_jax.refinement.learned_pass import no_errors, refiner_features
 from ssplat_jax.storage.npz import load_arrays, save_arrays

@@ -4,9 +4,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ssplat_jax.gaussians import Gaussians
-from ssplat_jax.numerics import clip_value
-from ssplat_jax.pytree import pytree, replace
+from ssplat_jax.core.gaussians import Gaussians
+from ssplat_jax.core.numerics import clip_value
+from ssplat_jax.core.pytree import pytree, replace
 from ssplat_jax.refinement.refine_config import RefineConfig
 
 MAX_LOGIT = 12.0

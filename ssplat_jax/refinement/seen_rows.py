@@ -13,10 +13,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from ssplat_jax.gaussians import Gaussians
-from ssplat_jax.geometry.cameras import Camera
-from ssplat_jax.numerics import columns
-from ssplat_jax.pytree import pytree
+from ssplat_jax.core.cameras import Camera
+from ssplat_jax.core.gaussians import Gaussians
+from ssplat_jax.core.numerics import columns
+from ssplat_jax.core.pytree import pytree
 from ssplat_jax.rasterizer import constants
 
 Rows = TypeVar("Rows")

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ssplat_jax.cache.key_views import KeyViews
-from ssplat_jax.gaussians import Gaussians
+from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.rasterizer import Effects, fill_holes, render
 from ssplat_jax.refinement.refine_config import RefineConfig
 

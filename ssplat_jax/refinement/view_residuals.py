@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ssplat_jax.cache.key_views import KeyViews
-from ssplat_jax.gaussians import Gaussians
+from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.rasterizer import Effects, render
 from ssplat_jax.refinement.view_revision import median_depths
 

@@ -5,9 +5,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ssplat_jax.cache.key_views import KeyViews
-from ssplat_jax.gaussians import Gaussians
-from ssplat_jax.geometry.rotations import quats_to_matrices
-from ssplat_jax.pytree import pytree, replace
+from ssplat_jax.core.gaussians import Gaussians
+from ssplat_jax.core.pytree import pytree, replace
+from ssplat_jax.core.rotations import quats_to_matrices
 from ssplat_jax.refinement.refine_effects import RefineEffects
 
 ADAM_B1, ADAM_B2, ADAM_EPSILON = 0.7, 0.99, 1e-15

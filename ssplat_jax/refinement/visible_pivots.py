@@ -13,7 +13,7 @@ from ssplat_jax.cache.pixel_pairs import NEAR
 from ssplat_jax.cache.state import VoxelCache
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.model import GRID_STRIDE
-from ssplat_jax.streaming.streamsplat import merged_footprints, shown_pivots
+from ssplat_jax.model.streamsplat import merged_footprints, shown_pivots
 
 LISTED_PER_CELL = 64
 """Most pivots of a view that are compared, as a multiple of its grid cells; beyond it, the last rows are left out."""

@@ -4,23 +4,23 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from ssplat_jax.checkpoint.delta_files import save_delta
-from ssplat_jax.console import WAITING, Reporter
+from ssplat_jax.core.console import WAITING, Reporter
+from ssplat_jax.core.errors import refusal, require_positive
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.open_capture import open_capture
-from ssplat_jax.errors import refusal, require_positive
 from ssplat_jax.evaluation.scoring import check_scorable
+from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.poses.adjust_poses import check_look_ahead
 from ssplat_jax.runs.chunk_recorder import ChunkRecorder, hold_back
 from ssplat_jax.runs.finish_run import finish_run, finished_scene, forget_other_run
 from ssplat_jax.runs.resume import RunState, resume_run, run_identity, save_run
 from ssplat_jax.runs.run_poses import capture_to_stream
+from ssplat_jax.storage.delta_files import save_delta
 from ssplat_jax.storage.folder_lock import lock_folder
 from ssplat_jax.storage.interrupts import Interrupts
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.streaming.feed import feed_chunks, middle_exposure
 from ssplat_jax.streaming.scene_delta import SceneFeed
-from ssplat_jax.streaming.streamsplat import StreamSplat
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,7 +64,7 @@ def run_capture(
         max_views: stop after this many frames.
         save_every: chunks between saved states.
         overwrite: remove the run that `out` holds and start anew.
-        deltas: also write what each chunk changed in the scene, in the stream frame (`checkpoint/delta_files.py`).
+        deltas: also write what each chunk changed in the scene, in the stream frame (`storage/delta_files.py`).
         num_held_back: frames, evenly spread, that are not streamed but scored every few chunks.
         revise: `poses` or `auto` adjusts the poses before the stream, see `run_poses.capture_to_stream`; effects that
             only a refinement revises are for `refine_run`.

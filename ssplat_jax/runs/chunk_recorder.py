@@ -6,11 +6,11 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from ssplat_jax.checkpoint.chunk_records import ChunkRecord, RecordedView, make_thumbnail, save_chunk_record
+from ssplat_jax.core.errors import refusal
 from ssplat_jax.data.capture import Capture
-from ssplat_jax.errors import refusal
 from ssplat_jax.evaluation.scoring import score_view
 from ssplat_jax.runs.resume import RunState
+from ssplat_jax.storage.chunk_records import ChunkRecord, RecordedView, make_thumbnail, save_chunk_record
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.streaming.feed import FedChunk
 

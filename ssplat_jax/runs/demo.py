@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ssplat_jax.checkpoint.weights import load_params
 from ssplat_jax.config import QUALITIES, Quality, preset
-from ssplat_jax.console import Reporter
+from ssplat_jax.core.console import Reporter
+from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import Split, interleaved_split
@@ -16,15 +16,15 @@ from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.evaluation.pictures import save_comparison, save_image
 from ssplat_jax.evaluation.plots import import_pyplot, save_figure
 from ssplat_jax.evaluation.scoring import ScoredView, mean_scores, score_view
-from ssplat_jax.gaussians import Gaussians
+from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.refinement import CaptureRefinement, refine_on_capture
 from ssplat_jax.runs.finish_run import save_scene
 from ssplat_jax.storage.folders import make_writable
 from ssplat_jax.storage.json_files import write_json
 from ssplat_jax.storage.run_folder import RunFolder
+from ssplat_jax.storage.weights import load_params
 from ssplat_jax.streaming.feed import Exposures, feed_chunks
 from ssplat_jax.streaming.session import Session
-from ssplat_jax.streaming.streamsplat import StreamSplat
 
 STAGES = (4, 8, 16, 32, 64)
 """Numbers of streamed views after which the scene is decoded and scored."""

@@ -7,23 +7,23 @@ from typing import Any
 
 import numpy as np
 
-from ssplat_jax.console import Reporter
+from ssplat_jax.core.console import Reporter
+from ssplat_jax.core.errors import InputError, echo, refusal
+from ssplat_jax.core.program_memory import make_room
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.index_files import Index, index_to_json, read_index, split_of_scene
 from ssplat_jax.data.open_capture import is_capture, open_capture, without_tilde
 from ssplat_jax.data.pose_conventions import split_options, with_options
 from ssplat_jax.data.split import Split, choose_split
-from ssplat_jax.errors import InputError, echo, refusal
 from ssplat_jax.evaluation.evaluate import evaluate
+from ssplat_jax.evaluation.lpips import LpipsWeights
 from ssplat_jax.evaluation.scoring import Display
-from ssplat_jax.metrics.lpips import LpipsWeights
-from ssplat_jax.program_memory import make_room
+from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.refinement import online_refinement
 from ssplat_jax.runs.reports import report_eval
 from ssplat_jax.storage.json_files import write_json
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.streaming.session import Session
-from ssplat_jax.streaming.streamsplat import StreamSplat
 
 SCORES = ("literal", "shown", "psnr_over_black", "psnr_one_exposure")
 """Scores of a scene that are averaged over scenes."""

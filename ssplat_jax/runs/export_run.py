@@ -6,20 +6,20 @@ import jax
 import numpy as np
 from jaxtyping import Int
 
-from ssplat_jax.checkpoint.saved_config import config_from_header
-from ssplat_jax.checkpoint.stream_state import load_newest_state
-from ssplat_jax.checkpoint.weights import params_digest
-from ssplat_jax.console import Reporter
+from ssplat_jax.core.console import Reporter
+from ssplat_jax.core.errors import InputError
 from ssplat_jax.data.stream_frame import StreamFrame
-from ssplat_jax.errors import InputError
 from ssplat_jax.evaluation.exposures import exposures_from_json
+from ssplat_jax.model.streamsplat import StreamSplat, shown_pivots
 from ssplat_jax.runs.finish_run import scene_to_show
 from ssplat_jax.scene_files.export_rows import ExportReport
 from ssplat_jax.scene_files.formats import check_format, save_selected
 from ssplat_jax.scene_files.select_gaussians import EVERYTHING, Selection
 from ssplat_jax.storage.run_folder import RunFolder
+from ssplat_jax.storage.saved_config import config_from_header
+from ssplat_jax.storage.stream_state import load_newest_state
+from ssplat_jax.storage.weights import params_digest
 from ssplat_jax.streaming.session import Session
-from ssplat_jax.streaming.streamsplat import StreamSplat, shown_pivots
 
 
 def export_run(

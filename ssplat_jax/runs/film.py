@@ -6,9 +6,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from jaxtyping import Float, Float64, UInt8
 
-from ssplat_jax.console import Reporter
+from ssplat_jax.core.console import Reporter
+from ssplat_jax.core.errors import refusal, require_positive
 from ssplat_jax.data.camera_path import camera_path, orbit_path
-from ssplat_jax.errors import refusal, require_positive
 from ssplat_jax.evaluation.pictures import color_depth, color_normals, eight_bits, scale_ends
 from ssplat_jax.scene_files.splat_file import SplatFile
 from ssplat_jax.storage.run_folder import RunFolder

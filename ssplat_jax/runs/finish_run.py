@@ -8,21 +8,21 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
-from ssplat_jax.checkpoint.weights import load_params, params_digest
-from ssplat_jax.console import Reporter
+from ssplat_jax.core.console import Reporter
+from ssplat_jax.core.gaussians import Gaussians, scale_colors
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.evaluation.exposures import exposures_to_json
 from ssplat_jax.evaluation.peak_memory import peak_memory
 from ssplat_jax.evaluation.pictures import save_comparison
 from ssplat_jax.evaluation.scoring import score_view
-from ssplat_jax.gaussians import Gaussians, scale_colors
 from ssplat_jax.runs.reports import report_run
 from ssplat_jax.runs.resume import RunState
 from ssplat_jax.scene_files.export_rows import ExportReport
 from ssplat_jax.scene_files.formats import save_gaussians
 from ssplat_jax.storage.json_files import write_json
 from ssplat_jax.storage.run_folder import RunFolder
+from ssplat_jax.storage.weights import load_params, params_digest
 from ssplat_jax.streaming.feed import Exposures, middle_exposure
 
 NUM_PICTURES = 8

@@ -6,17 +6,15 @@ from pathlib import Path
 
 import numpy as np
 
-from ssplat_jax.checkpoint.saved_config import config_from_header
-from ssplat_jax.checkpoint.stream_state import load_newest_state
-from ssplat_jax.checkpoint.weights import params_digest
-from ssplat_jax.console import WAITING, Reporter
+from ssplat_jax.core.console import WAITING, Reporter
+from ssplat_jax.core.errors import InputError, require_positive
+from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.stream_frame import StreamFrame
-from ssplat_jax.errors import InputError, require_positive
 from ssplat_jax.evaluation.exposures import exposures_from_json
 from ssplat_jax.evaluation.scoring import score_targets
-from ssplat_jax.gaussians import Gaussians
+from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.refinement import KeyViews, RefineConfig
 from ssplat_jax.refinement.choose_effects import effects_by_name, with_effects
 from ssplat_jax.refinement.refine import Progress, continue_refinement, report_of, start_refinement
@@ -29,9 +27,11 @@ from ssplat_jax.storage.folder_lock import lock_folder
 from ssplat_jax.storage.interrupts import Interrupts
 from ssplat_jax.storage.json_files import write_json
 from ssplat_jax.storage.run_folder import RunFolder
+from ssplat_jax.storage.saved_config import config_from_header
+from ssplat_jax.storage.stream_state import load_newest_state
+from ssplat_jax.storage.weights import params_digest
 from ssplat_jax.streaming.feed import Exposures
 from ssplat_jax.streaming.session import Session
-from ssplat_jax.streaming.streamsplat import StreamSplat
 
 
 @dataclasses.dataclass(frozen=True)

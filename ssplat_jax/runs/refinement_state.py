@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ssplat_jax.errors import InputError
-from ssplat_jax.gaussians import Gaussians, with_sh_degree
-from ssplat_jax.pytree import replace
+from ssplat_jax.core.errors import InputError
+from ssplat_jax.core.gaussians import Gaussians, with_sh_degree
+from ssplat_jax.core.pytree import replace
 from ssplat_jax.refinement import KeyViews, RefineConfig
 from ssplat_jax.refinement.present_rows import only_present, present_and_new, present_rows
 from ssplat_jax.refinement.refine import Progress

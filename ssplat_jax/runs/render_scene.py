@@ -9,12 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Float64
 
-from ssplat_jax.console import Reporter
+from ssplat_jax.core.cameras import Camera
+from ssplat_jax.core.console import Reporter
+from ssplat_jax.core.errors import InputError, require_positive
+from ssplat_jax.core.gaussians import mean_color
 from ssplat_jax.data.stream_frame import StreamFrame
-from ssplat_jax.errors import InputError, require_positive
 from ssplat_jax.evaluation.pictures import save_image
-from ssplat_jax.gaussians import mean_color
-from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.rasterizer import Effects, fill_holes, render
 from ssplat_jax.runs.film import KINDS, FilmOptions, depth_range, film_path, write_film
 from ssplat_jax.runs.run_poses import open_capture_of_scene

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from ssplat_jax.checkpoint.chunk_records import ChunkRecord, load_chunk_records
 from ssplat_jax.evaluation.contact_sheet import evenly_spread, save_contact_sheet
 from ssplat_jax.evaluation.report_page import Report, save_report
 from ssplat_jax.evaluation.svg_plot import Line, line_plot
+from ssplat_jax.storage.chunk_records import ChunkRecord, load_chunk_records
 from ssplat_jax.storage.run_folder import RunFolder
 
 MOST_PICTURES = 12

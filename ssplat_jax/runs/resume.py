@@ -4,20 +4,20 @@ import dataclasses
 from collections.abc import Sequence
 
 from ssplat_jax.cache import grow
-from ssplat_jax.checkpoint.saved_config import config_from_header
-from ssplat_jax.checkpoint.stream_state import load_newest_state, restore_previous, save_state
-from ssplat_jax.checkpoint.weights import params_digest
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.console import Reporter
+from ssplat_jax.core.console import Reporter
+from ssplat_jax.core.errors import InputError, StorageError
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.stream_frame import StreamFrame
-from ssplat_jax.errors import InputError, StorageError
 from ssplat_jax.evaluation.exposures import exposures_from_json, exposures_to_json
+from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.refinement import online_refinement
 from ssplat_jax.storage.run_folder import RunFolder
+from ssplat_jax.storage.saved_config import config_from_header
+from ssplat_jax.storage.stream_state import load_newest_state, restore_previous, save_state
+from ssplat_jax.storage.weights import params_digest
 from ssplat_jax.streaming.feed import Exposures
 from ssplat_jax.streaming.session import Session
-from ssplat_jax.streaming.streamsplat import StreamSplat
 
 
 @dataclasses.dataclass

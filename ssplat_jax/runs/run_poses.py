@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from ssplat_jax.console import Reporter
+from ssplat_jax.core.console import Reporter
+from ssplat_jax.core.errors import StorageError, refusal
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.open_capture import open_capture
-from ssplat_jax.errors import StorageError, refusal
 from ssplat_jax.poses.adjust_poses import adjust_if_asked, pose_effects
 from ssplat_jax.storage.json_files import write_json
 from ssplat_jax.storage.run_folder import RunFolder

@@ -17,16 +17,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ssplat_jax.checkpoint.weights import load_params
-from ssplat_jax.chunk import Chunk
 from ssplat_jax.config import preset
-from ssplat_jax.console import Reporter
+from ssplat_jax.core.chunk import Chunk
+from ssplat_jax.core.console import Reporter
+from ssplat_jax.core.errors import InputError, refusal
 from ssplat_jax.data.open_capture import open_capture
-from ssplat_jax.errors import InputError, refusal
+from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.storage.json_files import write_json
 from ssplat_jax.storage.run_folder import RunFolder
+from ssplat_jax.storage.weights import load_params
 from ssplat_jax.streaming.session import Session
-from ssplat_jax.streaming.streamsplat import StreamSplat
 
 FRONT_FILE = Path(__file__).parent / "front.json"
 

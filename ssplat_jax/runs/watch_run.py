@@ -10,14 +10,14 @@ import dataclasses
 import time
 from pathlib import Path
 
-from ssplat_jax.checkpoint.stream_state import load_newest_state
-from ssplat_jax.console import Reporter
+from ssplat_jax.core.console import Reporter
+from ssplat_jax.core.errors import InputError, refusal, require_positive
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.growing_capture import is_done, open_growing
 from ssplat_jax.data.open_capture import without_tilde
 from ssplat_jax.data.readers.transforms_json import num_listed
-from ssplat_jax.errors import InputError, refusal, require_positive
 from ssplat_jax.evaluation.scoring import check_scorable
+from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.runs.capture_run import DeltaWriter, RunResult, check_num_frames, start_deltas
 from ssplat_jax.runs.chunk_recorder import ChunkRecorder
 from ssplat_jax.runs.finish_run import finish_run, finished_scene, forget_other_run
@@ -26,8 +26,8 @@ from ssplat_jax.runs.run_poses import forget_poses_without_run
 from ssplat_jax.storage.folder_lock import lock_folder
 from ssplat_jax.storage.interrupts import Interrupts
 from ssplat_jax.storage.run_folder import RunFolder
+from ssplat_jax.storage.stream_state import load_newest_state
 from ssplat_jax.streaming.feed import feed_chunks
-from ssplat_jax.streaming.streamsplat import StreamSplat
 
 POLL_SECONDS = 0.25
 """Seconds between two looks at the folder."""

@@ -15,15 +15,15 @@ import os
 import numpy as np
 from jaxtyping import Float, Float64, UInt32
 
-from ssplat_jax.errors import InputError
-from ssplat_jax.gaussians import SH_C0, Gaussians
+from ssplat_jax.core.atomic import write_atomic
+from ssplat_jax.core.errors import InputError
+from ssplat_jax.core.gaussians import SH_C0, Gaussians
 from ssplat_jax.scene_files.export_rows import LOG_SCALE_LIMIT, ExportReport, scene_rows, to_bytes
 from ssplat_jax.scene_files.morton import morton_order
 from ssplat_jax.scene_files.ply import offset_comment, offset_of, render_mode_of
 from ssplat_jax.scene_files.ply_table import MAX_HEADER_BYTES, read_tables
 from ssplat_jax.scene_files.smallest_three import HALF_RANGE, drop_largest, restore_largest
 from ssplat_jax.scene_files.splat_file import SplatFile, gaussians_of_columns, widened
-from ssplat_jax.storage.atomic import write_atomic
 
 CHUNK = 256
 VECTOR_BITS = (11, 10, 11)

@@ -5,8 +5,8 @@ import dataclasses
 import numpy as np
 from jaxtyping import Bool, Float64, UInt8
 
-from ssplat_jax.errors import InputError
-from ssplat_jax.gaussians import Gaussians, check_gaussians
+from ssplat_jax.core.errors import InputError
+from ssplat_jax.core.gaussians import Gaussians, check_gaussians
 
 SH_TERMS = (1, 4, 9, 16)
 """Numbers of SH terms that files hold, those of degree 0 to 3."""

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Int
 
-from ssplat_jax.errors import InputError
-from ssplat_jax.gaussians import Gaussians
+from ssplat_jax.core.errors import InputError
+from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.scene_files.compressed_ply import is_compressed_ply, read_compressed_ply, save_compressed_ply
 from ssplat_jax.scene_files.export_rows import ExportReport
 from ssplat_jax.scene_files.gltf import save_gltf

@@ -18,9 +18,9 @@ import struct
 import numpy as np
 from jaxtyping import Float64
 
-from ssplat_jax.gaussians import SH_C0, Gaussians
+from ssplat_jax.core.atomic import write_atomic
+from ssplat_jax.core.gaussians import SH_C0, Gaussians
 from ssplat_jax.scene_files.export_rows import ExportReport, SceneRows, scene_rows
-from ssplat_jax.storage.atomic import write_atomic
 
 EXTENSION = "KHR_gaussian_splatting"
 MAGIC, VERSION = b"glTF", 2

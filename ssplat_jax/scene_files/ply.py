@@ -16,12 +16,12 @@ import os
 import jax.numpy as jnp
 import numpy as np
 
-from ssplat_jax.errors import InputError
-from ssplat_jax.gaussians import Gaussians
+from ssplat_jax.core.atomic import write_atomic
+from ssplat_jax.core.errors import InputError
+from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.scene_files.export_rows import LOG_SCALE_LIMIT, ExportReport, SceneRows, scene_rows, unit_quats
 from ssplat_jax.scene_files.ply_table import read_vertices
 from ssplat_jax.scene_files.splat_file import SplatFile, widened
-from ssplat_jax.storage.atomic import write_atomic
 
 RENDER_MODES = ("default", "mip", "2dgs")
 """Values of the comment `SplatRenderMode`: 3DGS, 3DGS with the 2D Mip filter (ours), and 2D Gaussian Splatting."""

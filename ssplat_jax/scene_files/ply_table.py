@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ssplat_jax.errors import InputError
+from ssplat_jax.core.errors import InputError
 from ssplat_jax.scene_files.splat_file import read_scene_bytes
 
 MAX_HEADER_BYTES = 1 << 16  # headers of splat files take a few kilobytes

@@ -9,8 +9,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from ssplat_jax.errors import InputError
-from ssplat_jax.gaussians import Gaussians
+from ssplat_jax.core.errors import InputError
+from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.scene_files.export_rows import is_writable
 from ssplat_jax.scene_files.morton import morton_order
 

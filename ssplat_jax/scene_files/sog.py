@@ -21,12 +21,12 @@ import numpy as np
 from jaxtyping import Float64, UInt8
 from PIL import Image
 
-from ssplat_jax.gaussians import Gaussians
+from ssplat_jax.core.atomic import write_atomic
+from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.scene_files.codebook import fit_codebook, nearest_codes, palette
 from ssplat_jax.scene_files.export_rows import ExportReport, SceneRows, scene_rows, to_bytes
 from ssplat_jax.scene_files.morton import morton_order
 from ssplat_jax.scene_files.smallest_three import HALF_RANGE, drop_largest
-from ssplat_jax.storage.atomic import write_atomic
 
 VERSION = 2
 FIRST_MODE = 252

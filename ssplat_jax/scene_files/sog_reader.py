@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float64, UInt8
 from PIL import Image, UnidentifiedImageError
 
-from ssplat_jax.errors import InputError
+from ssplat_jax.core.errors import InputError
 from ssplat_jax.scene_files.smallest_three import HALF_RANGE, restore_largest
 from ssplat_jax.scene_files.sog import FIRST_MODE, PALETTE_COLUMNS, VERSION
 from ssplat_jax.scene_files.splat_file import SplatFile, gaussians_of_columns, read_scene_bytes

@@ -10,11 +10,11 @@ import os
 
 import numpy as np
 
-from ssplat_jax.errors import InputError
-from ssplat_jax.gaussians import SH_C0, Gaussians
+from ssplat_jax.core.atomic import write_atomic
+from ssplat_jax.core.errors import InputError
+from ssplat_jax.core.gaussians import SH_C0, Gaussians
 from ssplat_jax.scene_files.export_rows import LOG_SCALE_LIMIT, ExportReport, scene_rows, to_bytes
 from ssplat_jax.scene_files.splat_file import SplatFile, gaussians_of_columns, read_scene_bytes, widened
-from ssplat_jax.storage.atomic import write_atomic
 
 ROW = np.dtype([("mean", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 

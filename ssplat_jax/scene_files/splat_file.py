@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Float64
 
-from ssplat_jax.errors import InputError
-from ssplat_jax.gaussians import Gaussians
+from ssplat_jax.core.errors import InputError
+from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.scene_files.export_rows import LOG_SCALE_LIMIT, unit_quats
 
 

@@ -16,10 +16,10 @@ import struct
 import numpy as np
 from jaxtyping import Float64, UInt8, UInt32
 
-from ssplat_jax.errors import InputError
-from ssplat_jax.gaussians import Gaussians
+from ssplat_jax.core.atomic import write_atomic
+from ssplat_jax.core.errors import InputError
+from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.scene_files.export_rows import ExportReport, scene_rows, to_bytes
-from ssplat_jax.storage.atomic import write_atomic
 
 MAGIC, VERSION = b"NGSP", 3
 ANTIALIASED = 1  # flag: made for a renderer with the 2D Mip filter

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64, UInt8
 
-from ssplat_jax.errors import InputError
+from ssplat_jax.core.errors import InputError
 from ssplat_jax.scene_files.smallest_three import HALF_RANGE, restore_largest
 from ssplat_jax.scene_files.splat_file import SplatFile, gaussians_of_columns, read_scene_bytes
 from ssplat_jax.scene_files.spz import ANTIALIASED, COLOR_STEP, HALF_TURN, MAGIC, POSITION_BITS, SH_SIGNS

@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-from ssplat_jax.errors import InputError, StorageError
+from ssplat_jax.core.errors import InputError, StorageError
 from ssplat_jax.storage.folders import make_writable
 
 

@@ -4,7 +4,7 @@ import contextlib
 import tempfile
 from pathlib import Path
 
-from ssplat_jax.errors import StorageError
+from ssplat_jax.core.errors import StorageError
 
 
 def make_writable(folder: Path) -> None:

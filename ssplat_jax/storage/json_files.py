@@ -5,7 +5,7 @@ import math
 import os
 from typing import Any
 
-from ssplat_jax.storage.atomic import write_atomic
+from ssplat_jax.core.atomic import write_atomic
 
 
 def json_text(value: Any, indent: int | None = 1) -> str:

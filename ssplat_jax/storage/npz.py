@@ -20,8 +20,8 @@ from typing import Any
 import ml_dtypes
 import numpy as np
 
-from ssplat_jax.errors import StorageError, echo
-from ssplat_jax.storage.atomic import write_atomic
+from ssplat_jax.core.atomic import write_atomic
+from ssplat_jax.core.errors import StorageError, echo
 
 SCHEMA = 2  # version of the layout above
 _HEADER = "header"  # name of the JSON member

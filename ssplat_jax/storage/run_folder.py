@@ -3,8 +3,8 @@
 import dataclasses
 from pathlib import Path
 
-from ssplat_jax.errors import refusal
-from ssplat_jax.storage.atomic import previous_path
+from ssplat_jax.core.atomic import previous_path
+from ssplat_jax.core.errors import refusal
 from ssplat_jax.storage.folders import remove_numbered
 
 NUMBER = "[0-9]" * 6

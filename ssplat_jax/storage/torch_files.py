@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float32
 
-from ssplat_jax.errors import InputError, echo
+from ssplat_jax.core.errors import InputError, echo
 from ssplat_jax.storage.torch_pickle import DTYPES, MAX_PICKLE_BYTES, REMEDY, Storage, Tensor, parse_pickle
 
 _LEGACY_MAGIC = 0x1950A86A20F9469CFC6C

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import ml_dtypes
 import numpy as np
 
-from ssplat_jax.errors import InputError
+from ssplat_jax.core.errors import InputError
 
 REMEDY = (
     "Convert it where PyTorch is: numpy.savez('weights.npz',"

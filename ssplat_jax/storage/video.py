@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
-from ssplat_jax.errors import InputError
-from ssplat_jax.storage.atomic import write_atomic
+from ssplat_jax.core.atomic import write_atomic
+from ssplat_jax.core.errors import InputError
 
 FRAMES_PER_SECOND = 24
 BT709 = 1  # color space; players assume it when a file names none, and ours names it

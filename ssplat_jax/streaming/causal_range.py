@@ -13,7 +13,7 @@ import numpy as np
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.data.depth_range import MAX_RANGE
 from ssplat_jax.data.stream_frame import StreamFrame
-from ssplat_jax.streaming.streamsplat import ChunkOutput
+from ssplat_jax.model.streamsplat import ChunkOutput
 
 END_SHARE = 1 / 32
 """Share of the range of inverse depths that counts as its end."""

@@ -8,13 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ssplat_jax.chunk import Chunk
+from ssplat_jax.core.chunk import Chunk
+from ssplat_jax.core.pytree import replace
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.stream_frame import StreamFrame
-from ssplat_jax.pytree import replace
+from ssplat_jax.model.streamsplat import ChunkOutput
 from ssplat_jax.streaming.causal_range import widen_range
 from ssplat_jax.streaming.session import Session
-from ssplat_jax.streaming.streamsplat import ChunkOutput
 
 Exposures = dict[int, Float[np.ndarray, "3"]]
 """RGB factor per streamed frame that takes the scene's colors to the colors of that frame."""

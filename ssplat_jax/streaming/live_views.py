@@ -3,15 +3,15 @@
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from ssplat_jax.chunk import Chunk
 from ssplat_jax.config import StreamConfig
+from ssplat_jax.core.chunk import Chunk
+from ssplat_jax.core.errors import echo, refusal
 from ssplat_jax.data.capture import MAX_SIDE, Capture
 from ssplat_jax.data.images import ArrayPixels
 from ssplat_jax.data.posed_image import Frame, check_camtoworld, check_intrinsics, invert_pose
 from ssplat_jax.data.stream_frame import StreamFrame
-from ssplat_jax.errors import echo, refusal
+from ssplat_jax.model.streamsplat import ChunkOutput
 from ssplat_jax.streaming.causal_range import widen_range
-from ssplat_jax.streaming.streamsplat import ChunkOutput
 
 WHERE = "push"
 """Start of the messages about a view."""

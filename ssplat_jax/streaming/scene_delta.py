@@ -22,8 +22,8 @@ from jaxtyping import Bool, Float32, Int32
 from ssplat_jax.cache import VoxelCache
 from ssplat_jax.cache.sightings import total_sightings
 from ssplat_jax.cache.state import require_single_cache
-from ssplat_jax.gaussians import Gaussians, mask_gaussians
-from ssplat_jax.streaming.streamsplat import StreamSplat, shown_pivots
+from ssplat_jax.core.gaussians import Gaussians, mask_gaussians
+from ssplat_jax.model.streamsplat import StreamSplat, shown_pivots
 
 MIN_DECODED_ROWS = 256
 """Decoded rows are padded to a power of two of at least this number, so that few programs are compiled."""

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ssplat_jax.errors import refusal
-from ssplat_jax.gaussians import Gaussians, scale_colors
+from ssplat_jax.core.errors import refusal
+from ssplat_jax.core.gaussians import Gaussians, scale_colors
 from ssplat_jax.storage.run_folder import RunFolder
 
 

@@ -9,14 +9,14 @@ import jax.numpy as jnp
 
 from ssplat_jax.cache import VoxelCache, check_cache, ensure_capacity
 from ssplat_jax.cache.state import init_cache, with_refinement
-from ssplat_jax.chunk import Chunk
 from ssplat_jax.config import StreamConfig
+from ssplat_jax.core.chunk import Chunk
+from ssplat_jax.core.errors import refusal
+from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.data.stream_frame import StreamFrame
-from ssplat_jax.errors import refusal
-from ssplat_jax.gaussians import Gaussians
 from ssplat_jax.model import GRID_STRIDE
+from ssplat_jax.model.streamsplat import ChunkOutput, StreamSplat, shown_pivots
 from ssplat_jax.streaming.live_views import LiveViews
-from ssplat_jax.streaming.streamsplat import ChunkOutput, StreamSplat, shown_pivots
 
 INITIAL_CHUNKS = 4
 """A new cache has capacity for this many chunks in which every token opens a voxel: few captures make it grow."""

@@ -24,11 +24,11 @@ from jaxtyping import PyTree
 
 from ssplat_jax.cache import VoxelCache, grow
 from ssplat_jax.cache.capacity import check_dropped, required_capacity
-from ssplat_jax.chunk import Chunk
-from ssplat_jax.errors import InputError
-from ssplat_jax.gaussians import Gaussians
-from ssplat_jax.pytree import replace
-from ssplat_jax.streaming.streamsplat import ChunkOutput, StreamSplat
+from ssplat_jax.core.chunk import Chunk
+from ssplat_jax.core.errors import InputError
+from ssplat_jax.core.gaussians import Gaussians
+from ssplat_jax.core.pytree import replace
+from ssplat_jax.model.streamsplat import ChunkOutput, StreamSplat
 
 
 @dataclasses.dataclass(frozen=True)

@@ -13,8 +13,8 @@ from collections.abc import Iterator
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
-from ssplat_jax.console import Reporter
-from ssplat_jax.errors import InputError, StorageError
+from ssplat_jax.core.console import Reporter
+from ssplat_jax.core.errors import InputError, StorageError
 from ssplat_jax.storage.interrupts import Interrupts
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.viewer.scene_sources import GrowingScene

@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from ssplat_jax.core.cameras import Camera
+from ssplat_jax.core.gaussians import mean_color
 from ssplat_jax.evaluation.pictures import color_depth, color_normals, color_share, eight_bits, scale_ends
-from ssplat_jax.gaussians import mean_color
-from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.rasterizer import Effects, fill_holes, render
 from ssplat_jax.viewer.browser_camera import BrowserCamera
 from ssplat_jax.viewer.viewed_scene import ViewedScene

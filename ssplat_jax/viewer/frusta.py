@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from ssplat_jax.checkpoint.chunk_records import RecordedView, open_thumbnail
+from ssplat_jax.storage.chunk_records import RecordedView, open_thumbnail
 from ssplat_jax.viewer.browser_camera import wxyz_of
 
 SIZE = 0.06

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float64
 
-from ssplat_jax.checkpoint.chunk_records import ChunkRecord, RecordedView, load_chunk_records
 from ssplat_jax.data.camera_path import camera_path
+from ssplat_jax.storage.chunk_records import ChunkRecord, RecordedView, load_chunk_records
 from ssplat_jax.storage.run_folder import RunFolder
 
 PATH_STEPS = 12

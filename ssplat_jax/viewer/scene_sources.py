@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float32
 
-from ssplat_jax.checkpoint.delta_files import load_delta, load_delta_header
+from ssplat_jax.core.errors import InputError, StorageError
+from ssplat_jax.core.gaussians import Gaussians, scale_colors
 from ssplat_jax.data.stream_frame import StreamFrame
-from ssplat_jax.errors import InputError, StorageError
-from ssplat_jax.gaussians import Gaussians, scale_colors
 from ssplat_jax.scene_files.formats import read_scene
+from ssplat_jax.storage.delta_files import load_delta, load_delta_header
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.streaming.scene_delta import apply_confidences, apply_delta
 from ssplat_jax.streaming.scene_exposure import at_first_exposure, scene_exposure

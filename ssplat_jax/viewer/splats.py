@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ssplat_jax.gaussians import SH_C0, Gaussians
-from ssplat_jax.geometry.rotations import quats_to_matrices
+from ssplat_jax.core.gaussians import SH_C0, Gaussians
+from ssplat_jax.core.rotations import quats_to_matrices
 from ssplat_jax.scene_files.export_rows import MIN_OPACITY
 
 MAX_SIGMA = 250.0

@@ -7,7 +7,7 @@ first camera looks at a point at distance 1.
 import numpy as np
 from jaxtyping import Float64
 
-from ssplat_jax.errors import StorageError
+from ssplat_jax.core.errors import StorageError
 from ssplat_jax.viewer.recorded_run import RecordedRun
 from ssplat_jax.viewer.scene_sources import Source
 from ssplat_jax.viewer.splats import Splats, median_size, visible_splats

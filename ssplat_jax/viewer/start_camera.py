@@ -5,8 +5,8 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float64
 
+from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.data.stream_frame import StreamFrame
-from ssplat_jax.gaussians import Gaussians
 
 
 @dataclasses.dataclass(frozen=True)

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from ssplat_jax.console import Reporter
+from ssplat_jax.core.console import Reporter
 from ssplat_jax.storage.interrupts import Interrupts
 from ssplat_jax.viewer.scene_sources import Source, open_source
 from ssplat_jax.viewer.stage import Stage

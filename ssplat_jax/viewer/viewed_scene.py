@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
-from ssplat_jax.gaussians import Gaussians
+from ssplat_jax.core.gaussians import Gaussians
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -5,7 +5,7 @@ import io
 import socket
 from typing import Any
 
-from ssplat_jax.errors import InputError
+from ssplat_jax.core.errors import InputError
 from ssplat_jax.viewer.browser import Browser
 from ssplat_jax.viewer.stage import Stage
 

@@ -5,8 +5,8 @@ import random
 
 import pytest
 
+from ssplat_jax.core.errors import InputError
 from ssplat_jax.data.open_capture import open_capture
-from ssplat_jax.errors import InputError
 from tests.badinputs.cases import CASES, make_capture, mutant
 
 NUM_MUTANTS = 125  # per file; seeded, so that failures can be repeated

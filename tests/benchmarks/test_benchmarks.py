@@ -6,7 +6,7 @@ import pytest
 from ssplat_jax.benchmarks import rasterizer_benchmark as bench
 from ssplat_jax.benchmarks import suite as benchmarks
 from ssplat_jax.benchmarks.cache_benchmark import Row
-from ssplat_jax.errors import InputError
+from ssplat_jax.core.errors import InputError
 
 pytestmark = pytest.mark.slow
 

@@ -6,8 +6,8 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 
 from ssplat_jax.cache import VoxelCache, init_cache
-from ssplat_jax.geometry.cameras import Camera
-from ssplat_jax.pytree import replace
+from ssplat_jax.core.cameras import Camera
+from ssplat_jax.core.pytree import replace
 from tests.cache.streams import CAPACITY, CONFIG, WIDTH
 
 HEIGHT, GRID_WIDTH = 6, 8

@@ -15,7 +15,7 @@ from ssplat_jax.cache.residuals import WIDTH as RESIDUAL_WIDTH
 from ssplat_jax.cache.residuals import settle, unpack
 from ssplat_jax.cache.state import pivot_fields
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.pytree import replace
+from ssplat_jax.core.pytree import replace
 
 WIDTH = 4  # feature channels
 NUM_TOKENS = 48  # per chunk

@@ -8,8 +8,8 @@ import pytest
 from ssplat_jax.cache import check_cache, ensure_capacity, grow, init_cache
 from ssplat_jax.cache.hash_table import find_rows
 from ssplat_jax.cache.state import saturating_add
-from ssplat_jax.errors import CacheError, InputError
-from ssplat_jax.pytree import replace
+from ssplat_jax.core.errors import CacheError, InputError
+from ssplat_jax.core.pytree import replace
 from ssplat_jax.streaming.session import starting_capacity
 from tests.cache.streams import CONFIG, EVICT, NUM_TOKENS, Recipe, assert_same_cache, fuse, to_jax
 

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from ssplat_jax.cache import carve, init_cache, judge, store_witness
 from ssplat_jax.cache import numpy_reference as reference
 from ssplat_jax.cache.state import WITNESS_CELLS
-from ssplat_jax.geometry.cameras import Camera
-from ssplat_jax.pytree import replace
+from ssplat_jax.core.cameras import Camera
+from ssplat_jax.core.pytree import replace
 from tests.cache.projection_scenes import (
     DECISION_MARGIN,
     DEPTHS,

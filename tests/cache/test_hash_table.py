@@ -7,7 +7,7 @@ import pytest
 
 from ssplat_jax.cache.fuse import _stable_order
 from ssplat_jax.cache.hash_table import build_table, find_rows, group_equal, insert_rows
-from ssplat_jax.geometry.voxels import INDEX_LIMIT, hash_voxels, voxel_indices
+from ssplat_jax.cache.voxels import INDEX_LIMIT, hash_voxels, voxel_indices
 
 RNG = np.random.default_rng(0)
 

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from ssplat_jax.cache import PIVOT_FIELDS, Tokens, VoxelCache, init_cache
 from ssplat_jax.cache import fuse as plain_fuse
 from ssplat_jax.cache import numpy_reference as reference
-from ssplat_jax.geometry.voxels import voxel_indices
-from ssplat_jax.pytree import replace
+from ssplat_jax.cache.voxels import voxel_indices
+from ssplat_jax.core.pytree import replace
 from tests.cache.streams import (
     CAPACITY,
     CONFIG,

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from ssplat_jax.cache.key_views import KeyViews, camera_distances, empty_key_views, keep_views, usable
-from ssplat_jax.geometry.cameras import Camera
-from ssplat_jax.pytree import replace
+from ssplat_jax.core.cameras import Camera
+from ssplat_jax.core.pytree import replace
 
 HEIGHT, WIDTH, SLOTS = 2, 3, 4
 KEEP = jax.jit(lambda ring, arrivals: keep_views(ring, arrivals, depth=2.0))

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from ssplat_jax.cache import coarsen, init_cache, pixel_pairs, project
 from ssplat_jax.cache import numpy_reference as reference
-from ssplat_jax.pytree import replace
+from ssplat_jax.core.pytree import replace
 from tests.cache.projection_scenes import (
     DECISION_MARGIN,
     DEPTHS,

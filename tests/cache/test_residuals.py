@@ -21,8 +21,8 @@ from ssplat_jax.cache.residuals import (
     settle,
     unpack,
 )
-from ssplat_jax.gaussians import SH_C0, Gaussians
-from ssplat_jax.geometry.voxels import voxel_indices
+from ssplat_jax.cache.voxels import voxel_indices
+from ssplat_jax.core.gaussians import SH_C0, Gaussians
 from tests.cache.streams import CAPACITY, CONFIG, EVICT, Recipe, fuse, revised, to_jax
 
 SIZE = CONFIG.memory.voxel_size

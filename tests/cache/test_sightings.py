@@ -11,8 +11,8 @@ from ssplat_jax.cache import add_sightings, init_cache
 from ssplat_jax.cache import numpy_reference as reference
 from ssplat_jax.cache.sightings import cells_of, features_of_sightings
 from ssplat_jax.cache.state import NUM_SIGHTINGS
-from ssplat_jax.geometry.cameras import Camera
-from ssplat_jax.pytree import replace
+from ssplat_jax.core.cameras import Camera
+from ssplat_jax.core.pytree import replace
 from tests.cache.projection_scenes import (
     DECISION_MARGIN,
     DEPTHS,

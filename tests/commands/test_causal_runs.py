@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from ssplat_jax.checkpoint.stream_state import load_state
-from ssplat_jax.checkpoint.weights import save_weights
-from ssplat_jax.storage.atomic import previous_path
-from ssplat_jax.streaming.streamsplat import StreamSplat
+from ssplat_jax.core.atomic import previous_path
+from ssplat_jax.model.streamsplat import StreamSplat
+from ssplat_jax.storage.stream_state import load_state
+from ssplat_jax.storage.weights import save_weights
 from tests.commands.test_cli import few_pivots, make_capture, run  # noqa: F401
 from tests.streaming.narrow_model import NARROW, assert_same_bits
 

@@ -20,25 +20,25 @@ import pytest
 from PIL import Image
 
 from ssplat_jax import __version__
-from ssplat_jax.checkpoint.delta_files import load_delta, load_delta_header
-from ssplat_jax.checkpoint.published_weights import as_published, published_tensors
-from ssplat_jax.checkpoint.stream_state import load_state
-from ssplat_jax.checkpoint.weights import load_params, load_weights, save_weights
 from ssplat_jax.commands import train_command
 from ssplat_jax.commands.main import COMMANDS, guarded, main
 from ssplat_jax.commands.options import apply_changes, causal_changes, load_model
 from ssplat_jax.commands.start import start
 from ssplat_jax.config import StreamConfig, preset
+from ssplat_jax.core.errors import InputError
+from ssplat_jax.core.gaussians import Gaussians, mask_gaussians
 from ssplat_jax.data import capture_summary
 from ssplat_jax.data.capture_summary import summarize
-from ssplat_jax.errors import InputError
 from ssplat_jax.evaluation import evaluate, latency
-from ssplat_jax.gaussians import Gaussians, mask_gaussians
+from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.refinement import refine_on_capture
 from ssplat_jax.scene_files.ply import load_ply, save_ply
+from ssplat_jax.storage.delta_files import load_delta, load_delta_header
+from ssplat_jax.storage.published_weights import as_published, published_tensors
 from ssplat_jax.storage.run_folder import RunFolder
+from ssplat_jax.storage.stream_state import load_state
+from ssplat_jax.storage.weights import load_params, load_weights, save_weights
 from ssplat_jax.streaming.scene_delta import apply_delta
-from ssplat_jax.streaming.streamsplat import StreamSplat
 from tests.model.resplat_fixture import named_tensor
 from tests.scene_files import scene_fixture
 

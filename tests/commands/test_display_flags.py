@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from ssplat_jax.checkpoint.stream_state import load_state
-from ssplat_jax.checkpoint.weights import save_weights
+from ssplat_jax.core.errors import InputError
+from ssplat_jax.core.gaussians import SH_C0, scale_colors
 from ssplat_jax.data.stream_frame import StreamFrame
-from ssplat_jax.errors import InputError
-from ssplat_jax.gaussians import SH_C0, scale_colors
+from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.scene_files.formats import load_scene, save_gaussians
-from ssplat_jax.streaming.streamsplat import StreamSplat
+from ssplat_jax.storage.stream_state import load_state
+from ssplat_jax.storage.weights import save_weights
 from ssplat_jax.viewer.scene_sources import open_source
 from tests.commands.test_cli import few_pivots, make_capture, run  # noqa: F401
 from tests.streaming.narrow_model import NARROW

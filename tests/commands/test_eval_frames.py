@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from ssplat_jax.checkpoint.weights import save_weights
 from ssplat_jax.evaluation import latency
+from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.runs import eval_run
 from ssplat_jax.runs.eval_run import scene_metrics
-from ssplat_jax.streaming.streamsplat import StreamSplat
+from ssplat_jax.storage.weights import save_weights
 from tests.commands.test_cli import few_pivots, make_capture, run  # noqa: F401
 from tests.streaming.narrow_model import NARROW
 

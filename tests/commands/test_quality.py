@@ -6,7 +6,7 @@ from ssplat_jax.commands.eval_command import Eval
 from ssplat_jax.commands.options import refinement_steps
 from ssplat_jax.commands.run_command import Run
 from ssplat_jax.config import QUALITIES
-from ssplat_jax.errors import InputError
+from ssplat_jax.core.errors import InputError
 
 
 def test_steps_that_are_asked_for_go_before_those_of_the_quality():

@@ -8,9 +8,9 @@ import pytest
 from PIL import Image
 
 import ssplat_jax as ss
+from ssplat_jax.core.gaussians import mean_color
+from ssplat_jax.core.pytree import replace
 from ssplat_jax.data.stream_frame import StreamFrame
-from ssplat_jax.gaussians import mean_color
-from ssplat_jax.pytree import replace
 from ssplat_jax.rasterizer import Effects, fill_holes
 from ssplat_jax.scene_files.formats import save_gaussians
 from tests.commands.test_cli import make_capture, run

@@ -12,12 +12,12 @@ from types import SimpleNamespace
 import jax
 import pytest
 
-from ssplat_jax.checkpoint.weights import save_weights
-from ssplat_jax.console import Reporter
+from ssplat_jax.core.console import Reporter
 from ssplat_jax.data.growing_capture import is_done
+from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.runs import watch_run
 from ssplat_jax.storage.run_folder import RunFolder
-from ssplat_jax.streaming.streamsplat import StreamSplat
+from ssplat_jax.storage.weights import save_weights
 from tests.commands.test_cli import few_pivots, make_capture, run  # noqa: F401
 from tests.streaming.narrow_model import NARROW
 

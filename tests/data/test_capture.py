@@ -8,10 +8,10 @@ import pytest
 from PIL import Image
 
 from ssplat_jax.config import StreamConfig
+from ssplat_jax.core.cameras import project_points, transform_points
+from ssplat_jax.core.errors import InputError
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.stream_frame import StreamFrame
-from ssplat_jax.errors import InputError
-from ssplat_jax.geometry.cameras import project_points, transform_points
 from tests.badinputs.cases import HEIGHT, WIDTH, make_capture
 from tests.data.capture_fixture import frame_of, resized, smooth_capture
 from tests.data.planes_fixture import two_planes

@@ -4,8 +4,8 @@ import json
 
 import pytest
 
+from ssplat_jax.core.errors import InputError
 from ssplat_jax.data.index_files import index_to_json, read_index, split_of_scene
-from ssplat_jax.errors import InputError
 
 PUBLISHED = {
     "1214f2a11a9fc1ed": {"context": [36, 87], "target": [46, 58, 82], "overlap": 0.63},

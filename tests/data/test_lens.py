@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from ssplat_jax.core.errors import InputError
 from ssplat_jax.data.lens import FisheyeLens, Lens, check_lens, undistort
 from ssplat_jax.data.open_capture import open_capture
-from ssplat_jax.errors import InputError
 from tests.badinputs.cases import HEIGHT, WIDTH, make_capture
 
 WIDE, HIGH = 160, 120

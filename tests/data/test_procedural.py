@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from ssplat_jax.core.errors import InputError
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.procedural import (
     CAPTURES,
@@ -20,7 +21,6 @@ from ssplat_jax.data.procedural import (
 from ssplat_jax.data.procedural.builder import Finish, SceneBuilder
 from ssplat_jax.data.procedural.scene import fade_scene
 from ssplat_jax.data.procedural.textures import texture_library
-from ssplat_jax.errors import InputError
 
 NUM_SEEDS = 30
 MARGIN = 1.02  # the low-resolution probe slightly misses the nearest and farthest points

@@ -7,9 +7,9 @@ import struct
 import numpy as np
 import pytest
 
+from ssplat_jax.core.errors import InputError
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.posed_image import MAX_COORDINATE, pose_from_quat
-from ssplat_jax.errors import InputError
 from tests.badinputs.cases import mutant
 from tests.data.capture_writers import (
     CX,

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from ssplat_jax.core.errors import InputError
 from ssplat_jax.data.lens import FisheyeLens
 from ssplat_jax.data.open_capture import open_capture
-from ssplat_jax.errors import InputError
 from tests.data.capture_writers import (
     COLMAP_IMAGES,
     CX,

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ssplat_jax.core.errors import InputError
 from ssplat_jax.data.split import Split, choose_split, interleaved_split, paper_split
-from ssplat_jax.errors import InputError
 
 
 def test_interleaved_first_indices():

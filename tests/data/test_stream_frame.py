@@ -4,11 +4,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from ssplat_jax.core.cameras import project_points, transform_points
+from ssplat_jax.core.gaussians import Gaussians
+from ssplat_jax.core.rotations import quats_to_matrices
+from ssplat_jax.core.sh_rotation import sh_rotation
 from ssplat_jax.data.stream_frame import StreamFrame
-from ssplat_jax.gaussians import Gaussians
-from ssplat_jax.geometry.cameras import project_points, transform_points
-from ssplat_jax.geometry.rotations import quats_to_matrices
-from ssplat_jax.geometry.sh_rotation import sh_rotation
 
 FLOAT64_ROUNDING = 1e-12
 FLOAT32_PIXELS = 2e-3  # 1000 pixels x float32's 1e-7 x a dozen operations

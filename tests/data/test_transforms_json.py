@@ -8,10 +8,10 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from ssplat_jax.core.errors import InputError
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.pose_conventions import Convention
 from ssplat_jax.data.posed_image import check_camtoworld
-from ssplat_jax.errors import InputError
 from tests.badinputs.cases import HEIGHT, WIDTH, make_capture, rotated
 
 

@@ -8,7 +8,7 @@ import tomllib
 import pytest
 
 from ssplat_jax.config import NETWORK_CONFIGS, StreamConfig
-from ssplat_jax.errors import InputError
+from ssplat_jax.core.errors import InputError
 from tests.docs.pages import INLINE_CODE, PAGES, ROOT, page_name, prose
 
 METHOD_PAGE = ROOT / "docs" / "algorithm.md"
@@ -90,7 +90,7 @@ def test_unknown_names_are_found():
     assert unresolved({"ssplat_jax.model.hpda.no_such_function"})
     assert unresolved({"ssplat_jax.no_such_module.cache_anchor"})
     assert unresolved(named_functions("| 1 | `no_such_function` | `ssplat_jax/model/hpda.py` |"))
-    assert not unresolved({"ssplat_jax.model.hpda.cache_anchor", "ssplat_jax.streaming.streamsplat.StreamSplat.step"})
+    assert not unresolved({"ssplat_jax.model.hpda.cache_anchor", "ssplat_jax.model.streamsplat.StreamSplat.step"})
     assert CONFIG_FIELD.findall("`memory.no_such_field`, `stream.py`") == ["memory.no_such_field"]
     assert not has_field("memory.no_such_field")
     assert has_field("network.vit")

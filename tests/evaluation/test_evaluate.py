@@ -11,22 +11,22 @@ import pytest
 
 from ssplat_jax.cache import init_cache
 from ssplat_jax.config import StreamConfig
+from ssplat_jax.core.gaussians import Gaussians, mean_color
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import Split
 from ssplat_jax.evaluation import evaluate as evaluation
 from ssplat_jax.evaluation import latency
 from ssplat_jax.evaluation.exposures import exposures_from_json, exposures_to_json
 from ssplat_jax.evaluation.latency import measure_latency
+from ssplat_jax.evaluation.lpips import load_lpips, lpips
 from ssplat_jax.evaluation.nearest_views import nearest_views
 from ssplat_jax.evaluation.peak_memory import PeakMemory
+from ssplat_jax.evaluation.psnr_ssim import psnr, ssim
 from ssplat_jax.evaluation.scoring import baselines, score_view
-from ssplat_jax.gaussians import Gaussians, mean_color
-from ssplat_jax.metrics.lpips import load_lpips, lpips
-from ssplat_jax.metrics.psnr_ssim import psnr, ssim
+from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.poses.adjust_poses import AdjustedPoses
 from ssplat_jax.streaming.session import Session
-from ssplat_jax.streaming.streamsplat import StreamSplat
-from tests.metrics.lpips_fixture import random_heads, random_vgg
+from tests.evaluation.lpips_fixture import random_heads, random_vgg
 
 
 def gaussians(colors, opacities, depth: float = -5.0) -> Gaussians:

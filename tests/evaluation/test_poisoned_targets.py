@@ -12,8 +12,8 @@ from ssplat_jax.data.split import interleaved_split
 from ssplat_jax.evaluation import evaluate as evaluation
 from ssplat_jax.evaluation import latency
 from ssplat_jax.evaluation.scoring import score_view
+from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.streaming.session import Session
-from ssplat_jax.streaming.streamsplat import StreamSplat
 from tests.streaming.narrow_model import NARROW, assert_same_bits
 
 SPLIT = interleaved_split(14, 1, 10)

@@ -14,7 +14,6 @@ from ssplat_experiments.accuracy_vs_time import front_file, mark_front
 from ssplat_experiments.depth_error import cell_depths, summary
 from ssplat_experiments.settings import REFINED, SETTINGS
 
-from ssplat_jax.checkpoint.weights import load_params
 from ssplat_jax.commands.experiment_command import Experiment
 from ssplat_jax.commands.main import guarded
 from ssplat_jax.commands.options import QualityName
@@ -22,9 +21,10 @@ from ssplat_jax.config import QUALITIES
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.model import complete_params
 from ssplat_jax.model.params import STAGES
+from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.refinement.learned_pass import STEPS
 from ssplat_jax.refinement.refine_config import FOR_CAPTURES
-from ssplat_jax.streaming.streamsplat import StreamSplat
+from ssplat_jax.storage.weights import load_params
 
 
 def row(ms, psnr):

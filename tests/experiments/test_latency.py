@@ -6,7 +6,7 @@ import jax
 import pytest
 from ssplat_experiments.latency import STAGES, median_ms, stage_times
 
-from ssplat_jax.geometry.cameras import Camera
+from ssplat_jax.core.cameras import Camera
 from ssplat_jax.streaming.session import Session
 from tests.model import small
 

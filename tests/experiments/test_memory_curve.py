@@ -10,9 +10,9 @@ from ssplat_experiments.memory_curve import METHODS, REPEATING, growth
 
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.evaluation.peak_memory import added_bytes, live_bytes, peak_memory
+from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.streaming.feed import feed_capture
 from ssplat_jax.streaming.session import Session
-from ssplat_jax.streaming.streamsplat import StreamSplat
 from tests.model import small
 
 CONFIG = small.CONFIG.replace(chunk_size=4, capacity=1 << 11, min_confidence=0.05)

@@ -15,11 +15,11 @@ from ssplat_experiments.splatting_config import SplattingConfig
 
 from ssplat_jax.cache.key_views import KeyViews
 from ssplat_jax.config import preset
+from ssplat_jax.core.cameras import Camera
+from ssplat_jax.core.gaussians import SH_C0, Gaussians
+from ssplat_jax.core.pytree import replace
 from ssplat_jax.data.open_capture import open_capture
-from ssplat_jax.gaussians import SH_C0, Gaussians
-from ssplat_jax.geometry.cameras import Camera
-from ssplat_jax.metrics.psnr_ssim import psnr
-from ssplat_jax.pytree import replace
+from ssplat_jax.evaluation.psnr_ssim import psnr
 from ssplat_jax.rasterizer import render
 
 CONFIG = SplattingConfig(capacity=64, first_rows=16)

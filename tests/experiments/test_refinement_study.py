@@ -23,10 +23,10 @@ from ssplat_experiments.refinement import (
     with_wrong_poses,
 )
 
-from ssplat_jax.console import Reporter
+from ssplat_jax.core.console import Reporter
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import Split
-from ssplat_jax.metrics.psnr_ssim import psnr
+from ssplat_jax.evaluation.psnr_ssim import psnr
 
 
 def test_poses_get_errors_of_the_stated_size_in_directions_of_their_own():

@@ -11,7 +11,7 @@ from ssplat_experiments.score import run
 
 from ssplat_jax.commands.experiment_command import Experiment
 from ssplat_jax.commands.main import guarded
-from ssplat_jax.console import Reporter
+from ssplat_jax.core.console import Reporter
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import interleaved_split
 

@@ -11,8 +11,8 @@ from ssplat_experiments.cases import PICTURE, Case
 from ssplat_experiments.study import Study, at_scale, run_study, side_by_side
 
 from ssplat_jax.config import preset
-from ssplat_jax.console import Reporter
-from ssplat_jax.errors import InputError
+from ssplat_jax.core.console import Reporter
+from ssplat_jax.core.errors import InputError
 from ssplat_jax.evaluation.pictures import eight_bits
 
 QUIET = Reporter(quiet=True)

@@ -12,20 +12,20 @@ from PIL import Image
 
 import ssplat_jax as ss
 from ssplat_jax.cache import init_cache
-from ssplat_jax.checkpoint.delta_files import load_delta, save_delta
-from ssplat_jax.checkpoint.stream_state import load_state, save_state
-from ssplat_jax.checkpoint.weights import load_weights, save_weights
 from ssplat_jax.data.index_files import read_index
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.scene_files.formats import FORMATS, save_gaussians
+from ssplat_jax.storage.delta_files import load_delta, save_delta
 from ssplat_jax.storage.npz import _DIGEST_LENGTH, _hex_digest
+from ssplat_jax.storage.stream_state import load_state, save_state
 from ssplat_jax.storage.torch_files import read_arrays
+from ssplat_jax.storage.weights import load_weights, save_weights
 from ssplat_jax.streaming.scene_delta import SceneDelta
 from ssplat_jax.streaming.scene_exposure import scene_exposure
 from tests.badinputs.cases import make_capture
 from tests.data.capture_writers import WRITERS
 from tests.data.test_reader_refusals import FILES as CAPTURE_FILES
-from tests.metrics.lpips_fixture import FOLDER, small_dict
+from tests.evaluation.lpips_fixture import FOLDER, small_dict
 from tests.scene_files.scene_fixture import scene
 from tests.streaming.narrow_model import NARROW
 

@@ -17,9 +17,9 @@ import warnings
 import numpy as np
 import pytest
 
+from ssplat_jax.core.errors import InputError, StorageError
 from ssplat_jax.data.posed_image import pose_from_quat
 from ssplat_jax.data.readers import tum
-from ssplat_jax.errors import InputError, StorageError
 from ssplat_jax.storage.npz import load_arrays, save_arrays
 from ssplat_jax.storage.torch_pickle import parse_pickle
 from tests.badinputs.cases import mutant

@@ -7,10 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from ssplat_jax.cache import ProjectedCache
-from ssplat_jax.chunk import Chunk
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.pytree import replace
-from ssplat_jax.streaming.streamsplat import StreamSplat
+from ssplat_jax.core.chunk import Chunk
+from ssplat_jax.core.pytree import replace
+from ssplat_jax.model.streamsplat import StreamSplat
 
 CONFIG = StreamConfig().replace(
     chunk_size=3,

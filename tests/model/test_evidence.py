@@ -10,6 +10,7 @@ import pytest
 from ssplat_jax.cache import init_cache
 from ssplat_jax.cache.state import NUM_SIGHTINGS
 from ssplat_jax.config import PRESETS, preset
+from ssplat_jax.core.pytree import replace
 from ssplat_jax.model.evidence import (
     MAX_LOG_CONTRAST,
     MAX_LOGIT_CHANGE,
@@ -19,9 +20,8 @@ from ssplat_jax.model.evidence import (
     evidence_features,
 )
 from ssplat_jax.model.params import init_params
+from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.model.types import TokenShapes
-from ssplat_jax.pytree import replace
-from ssplat_jax.streaming.streamsplat import StreamSplat
 
 CONFIG = preset("tiny").replace(capacity=128)
 NUM = 5

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from ssplat_jax.core.pytree import replace
 from ssplat_jax.model import estimate_exposures, prepare_views
 from ssplat_jax.model.exposure import MIN_CELLS
-from ssplat_jax.pytree import replace
 from tests.model.small import CONFIG, chunk, history
 
 TRUSTING = CONFIG.replace(min_confidence=0.5)

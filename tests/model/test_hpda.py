@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from ssplat_jax.config import StreamConfig
+from ssplat_jax.core.pytree import replace
 from ssplat_jax.model.hpda import (
     RECALL_MARGIN,
     RECALL_SUPPORT,
@@ -17,7 +18,6 @@ from ssplat_jax.model.hpda import (
     peak_confidence,
 )
 from ssplat_jax.model.types import DepthDistribution, prepare_views
-from ssplat_jax.pytree import replace
 from tests.model.small import chunk, finite, history
 
 D = 24

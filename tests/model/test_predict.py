@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ssplat_jax.pytree import replace
-from ssplat_jax.streaming.streamsplat import StreamSplat
-from tests.geometry.test_rotations import rodrigues
+from ssplat_jax.core.pytree import replace
+from ssplat_jax.model.streamsplat import StreamSplat
+from tests.core.test_rotations import rodrigues
 from tests.model.small import (
     CONFIG,
     MODEL,

@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 
 from ssplat_jax.config import StreamConfig, preset
-from ssplat_jax.errors import InputError
+from ssplat_jax.core.errors import InputError
+from ssplat_jax.core.pytree import replace
 from ssplat_jax.model import count_params, init_params, inject_features, prepare_views, resplat
 from ssplat_jax.model.hpda import expected_log_depth
 from ssplat_jax.model.resplat.cost_volume import plane_sweep
 from ssplat_jax.model.resplat.encoder import Transformer
 from ssplat_jax.model.resplat.torch_layers import EdgePaddedConv, TransposedConv, resize
 from ssplat_jax.model.resplat.vit import POSITIONS_SIDE, grid_size, resampled_positions
+from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.model.types import to_candidate_space
 from ssplat_jax.model.windows import same_region_mask
-from ssplat_jax.pytree import replace
-from ssplat_jax.streaming.streamsplat import StreamSplat
-from ssplat_jax.train.losses import soft_targets
+from ssplat_jax.training.losses import soft_targets
 from tests.model.small import chunk, history, random_params
 
 CONFIG = preset("small").replace(mixer_blocks=1, num_depths=32, min_confidence=0.0, capacity=1 << 11, chunk_size=3)

@@ -11,11 +11,10 @@ import numpy as np
 import pytest
 
 from ssplat_jax import model as stages
-from ssplat_jax.checkpoint.published_weights import as_published
-from ssplat_jax.chunk import Chunk
 from ssplat_jax.config import preset
-from ssplat_jax.gaussians import Gaussians
-from ssplat_jax.geometry.rotations import matrices_to_quats, quats_to_matrices
+from ssplat_jax.core.chunk import Chunk
+from ssplat_jax.core.gaussians import Gaussians
+from ssplat_jax.core.rotations import matrices_to_quats, quats_to_matrices
 from ssplat_jax.model import resplat
 from ssplat_jax.model.convolution import pixel_unshuffle
 from ssplat_jax.model.hpda import expected_log_depth
@@ -24,8 +23,9 @@ from ssplat_jax.model.resplat.head import GaussianHead
 from ssplat_jax.model.resplat.tokens import token_context
 from ssplat_jax.model.resplat.torch_layers import resize
 from ssplat_jax.model.resplat.upsampler import Upsampler
+from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.model.types import AnchoredDepth, prepare_views, to_candidate_space
-from ssplat_jax.streaming.streamsplat import StreamSplat
+from ssplat_jax.storage.published_weights import as_published
 from tests.model.resplat_fixture import load_golden, named_params, tap_error
 
 TOLERANCE = 2e-4

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from ssplat_jax.console import Reporter
+from ssplat_jax.core.console import Reporter
+from ssplat_jax.core.errors import InputError
 from ssplat_jax.data.open_capture import open_capture
-from ssplat_jax.errors import InputError
 from ssplat_jax.poses import requirements, sfm
 from ssplat_jax.poses.estimate import PoseOptions, _request, estimate_poses
 from ssplat_jax.storage.json_files import write_json

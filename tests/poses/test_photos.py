@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image, ImageOps
 
-from ssplat_jax.errors import InputError
+from ssplat_jax.core.errors import InputError
 from ssplat_jax.poses.photos import copy_photos, list_photos
 
 FOCAL_LENGTH_35MM, EXIF_BLOCK, ORIENTATION, MAKE, EDITOR = 0xA405, 0x8769, 274, 271, 37724

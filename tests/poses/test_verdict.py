@@ -2,7 +2,7 @@
 
 import pytest
 
-from ssplat_jax.errors import InputError
+from ssplat_jax.core.errors import InputError
 from ssplat_jax.poses.verdict import Findings, check_registered, ranges, verdict
 
 NAMES = tuple(f"{i}.jpg" for i in range(120))

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from ssplat_jax.console import Reporter
-from ssplat_jax.errors import InputError
+from ssplat_jax.core.console import Reporter
+from ssplat_jax.core.errors import InputError
 from ssplat_jax.poses import estimate
 from ssplat_jax.poses.video import count_frames, quarter_turns, scan_video, write_frames
 

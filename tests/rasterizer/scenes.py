@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ssplat_jax.gaussians import Gaussians
-from ssplat_jax.geometry.cameras import Camera
+from ssplat_jax.core.cameras import Camera
+from ssplat_jax.core.gaussians import Gaussians
 
 
 def cloud(num: int = 60, *, degree: int = 1, size: float = 0.08, seed: int = 0, dtype=np.float32) -> Gaussians:

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ssplat_jax.gaussians import Gaussians
-from ssplat_jax.geometry.cameras import Camera
+from ssplat_jax.core.cameras import Camera
+from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.rasterizer import Effects, render
 from ssplat_jax.rasterizer.binning import intersect_tiles
 from ssplat_jax.rasterizer.constants import ALPHA_MIN

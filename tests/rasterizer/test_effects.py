@@ -7,10 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ssplat_jax.errors import InputError
-from ssplat_jax.gaussians import Gaussians, mask_gaussians
-from ssplat_jax.geometry.cameras import Camera
-from ssplat_jax.pytree import replace
+from ssplat_jax.core.cameras import Camera
+from ssplat_jax.core.errors import InputError
+from ssplat_jax.core.gaussians import Gaussians, mask_gaussians
+from ssplat_jax.core.pytree import replace
 from ssplat_jax.rasterizer import Effects, effects_for, filter_3d, render
 from ssplat_jax.rasterizer.filter_3d import sampling_rates
 from ssplat_jax.rasterizer.lens_distortion import distort

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ssplat_jax.gaussians import Gaussians
-from ssplat_jax.pytree import replace
+from ssplat_jax.core.gaussians import Gaussians
+from ssplat_jax.core.pytree import replace
 from ssplat_jax.rasterizer import Effects, constants
 from ssplat_jax.rasterizer.pinhole_projection import project_pinhole
 from ssplat_jax.rasterizer.projection import project

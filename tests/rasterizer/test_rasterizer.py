@@ -8,10 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ssplat_jax.errors import InputError
-from ssplat_jax.gaussians import Gaussians, mask_gaussians
-from ssplat_jax.geometry.cameras import Camera
-from ssplat_jax.pytree import replace
+from ssplat_jax.core.cameras import Camera
+from ssplat_jax.core.errors import InputError
+from ssplat_jax.core.gaussians import Gaussians, mask_gaussians
+from ssplat_jax.core.pytree import replace
+from ssplat_jax.core.xla_cpu import short_exp
 from ssplat_jax.rasterizer import Effects, binning, compositing, constants, render
 from ssplat_jax.rasterizer.binning import TileIntersections, intersect_tiles
 from ssplat_jax.rasterizer.depth_sorted_table import BOX_SIZE, CHANNELS, sorted_table
@@ -19,7 +20,6 @@ from ssplat_jax.rasterizer.projection import Splats, project
 from ssplat_jax.rasterizer.reference import render_reference
 from ssplat_jax.rasterizer.render import default_max_pairs
 from ssplat_jax.rasterizer.tile_grid import Grid
-from ssplat_jax.xla_cpu import short_exp
 from tests.rasterizer import oracle
 from tests.rasterizer.scenes import cameras, cloud, concatenate
 

@@ -9,20 +9,20 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from ssplat_jax.checkpoint.weights import load_params
 from ssplat_jax.config import preset
+from ssplat_jax.core.cameras import Camera
+from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import interleaved_split
-from ssplat_jax.gaussians import Gaussians
-from ssplat_jax.geometry.cameras import Camera
+from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.rasterizer import Effects, render
 from ssplat_jax.rasterizer.outputs import splat_channels
 from ssplat_jax.rasterizer.projection import cull_non_finite, project
 from ssplat_jax.rasterizer.reference import sample_weights
 from ssplat_jax.runs.demo import STAGES
 from ssplat_jax.scene_files.ply import load_ply
+from ssplat_jax.storage.weights import load_params
 from ssplat_jax.streaming.session import Session
-from ssplat_jax.streaming.streamsplat import StreamSplat
 
 pytestmark = pytest.mark.slow
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ssplat_jax.pytree import replace
+from ssplat_jax.core.pytree import replace
 from ssplat_jax.rasterizer import render
 from tests.rasterizer.scenes import cameras, cloud
 

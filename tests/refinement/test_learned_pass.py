@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ssplat_jax.errors import InputError, StorageError
-from ssplat_jax.gaussians import SH_C0, Gaussians, with_sh_degree
-from ssplat_jax.geometry.rotations import quats_to_matrices
-from ssplat_jax.pytree import replace
+from ssplat_jax.core.errors import InputError, StorageError
+from ssplat_jax.core.gaussians import SH_C0, Gaussians, with_sh_degree
+from ssplat_jax.core.pytree import replace
+from ssplat_jax.core.rotations import quats_to_matrices
 from ssplat_jax.rasterizer import render
 from ssplat_jax.refinement import RefineConfig, current_gaussians, init_refinement, load_refiner, refine
 from ssplat_jax.refinement.learned_pass import (

@@ -13,23 +13,23 @@ from ssplat_jax.cache.key_views import KeyViews
 from ssplat_jax.cache.residuals import WIDTH as RESIDUAL_WIDTH
 from ssplat_jax.cache.residuals import Residuals, unpack
 from ssplat_jax.cache.state import with_refinement
-from ssplat_jax.checkpoint.stream_state import load_state, save_state
-from ssplat_jax.chunk import Chunk
+from ssplat_jax.cache.voxels import voxel_indices
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.errors import InputError
-from ssplat_jax.gaussians import Gaussians
-from ssplat_jax.geometry.cameras import Camera
-from ssplat_jax.geometry.voxels import voxel_indices
-from ssplat_jax.metrics.psnr_ssim import psnr
+from ssplat_jax.core.cameras import Camera
+from ssplat_jax.core.chunk import Chunk
+from ssplat_jax.core.errors import InputError
+from ssplat_jax.core.gaussians import Gaussians
+from ssplat_jax.core.pytree import replace
+from ssplat_jax.evaluation.psnr_ssim import psnr
 from ssplat_jax.model.compact.gaussian_head import GaussianHead
 from ssplat_jax.model.params import init_params
-from ssplat_jax.pytree import replace
+from ssplat_jax.model.streamsplat import ChunkOutput, StreamSplat
 from ssplat_jax.rasterizer import render
 from ssplat_jax.refinement.online import online_refinement, online_step, revise_scene, views_of_round
 from ssplat_jax.refinement.visible_pivots import areas_before, visible_pivots
+from ssplat_jax.storage.stream_state import load_state, save_state
 from ssplat_jax.streaming.scene_delta import SceneFeed, apply_delta
 from ssplat_jax.streaming.session import Session
-from ssplat_jax.streaming.streamsplat import ChunkOutput, StreamSplat
 
 pytestmark = pytest.mark.usefixtures("compiled_plainly")
 

@@ -10,11 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ssplat_jax.errors import InputError
-from ssplat_jax.gaussians import Gaussians, mask_gaussians
-from ssplat_jax.geometry.cameras import Camera
-from ssplat_jax.metrics.psnr_ssim import psnr
-from ssplat_jax.pytree import replace
+from ssplat_jax.core.cameras import Camera
+from ssplat_jax.core.errors import InputError
+from ssplat_jax.core.gaussians import Gaussians, mask_gaussians
+from ssplat_jax.core.pytree import replace
+from ssplat_jax.evaluation.psnr_ssim import psnr
 from ssplat_jax.rasterizer import render
 from ssplat_jax.refinement import (
     KeyViews,

@@ -7,10 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ssplat_jax.errors import InputError
-from ssplat_jax.gaussians import mean_color
-from ssplat_jax.metrics.psnr_ssim import psnr
-from ssplat_jax.pytree import replace
+from ssplat_jax.core.errors import InputError
+from ssplat_jax.core.gaussians import mean_color
+from ssplat_jax.core.pytree import replace
+from ssplat_jax.evaluation.psnr_ssim import psnr
 from ssplat_jax.rasterizer import render
 from ssplat_jax.refinement import RefineConfig, RefineEffects, init_refinement, refine, refine_step, revised_key_views
 from ssplat_jax.refinement.view_loss import view_loss

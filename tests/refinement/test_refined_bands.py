@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from ssplat_jax.config import StreamConfig
+from ssplat_jax.core.errors import InputError
+from ssplat_jax.core.gaussians import Gaussians, with_sh_degree
+from ssplat_jax.core.pytree import replace
 from ssplat_jax.data.open_capture import open_capture
-from ssplat_jax.errors import InputError
-from ssplat_jax.gaussians import Gaussians, with_sh_degree
-from ssplat_jax.metrics.psnr_ssim import psnr
-from ssplat_jax.pytree import replace
+from ssplat_jax.evaluation.psnr_ssim import psnr
 from ssplat_jax.rasterizer import render
 from ssplat_jax.refinement import RefineConfig, current_gaussians, init_refinement, refine, refine_on_capture
 from ssplat_jax.refinement import present_rows as rows

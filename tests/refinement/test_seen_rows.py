@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ssplat_jax.gaussians import Gaussians
-from ssplat_jax.geometry.cameras import Camera
-from ssplat_jax.pytree import replace
+from ssplat_jax.core.cameras import Camera
+from ssplat_jax.core.gaussians import Gaussians
+from ssplat_jax.core.pytree import replace
 from ssplat_jax.rasterizer.effects import Effects
 from ssplat_jax.rasterizer.render import RenderInputs, prepare, tile_grid_of
 from ssplat_jax.rasterizer.tile_grid import tile_boxes

@@ -6,11 +6,11 @@ import json
 import numpy as np
 import pytest
 
-from ssplat_jax.checkpoint.weights import load_params
 from ssplat_jax.config import preset
-from ssplat_jax.console import Reporter
+from ssplat_jax.core.console import Reporter
+from ssplat_jax.core.errors import InputError, StorageError
 from ssplat_jax.data.open_capture import open_capture
-from ssplat_jax.errors import InputError, StorageError
+from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.poses import adjust_poses as adjusting
 from ssplat_jax.poses.adjust_poses import AdjustedPoses
 from ssplat_jax.runs import render_scene
@@ -24,7 +24,7 @@ from ssplat_jax.runs.run_poses import (
     with_poses_of_run,
 )
 from ssplat_jax.storage.run_folder import RunFolder
-from ssplat_jax.streaming.streamsplat import StreamSplat
+from ssplat_jax.storage.weights import load_params
 
 CAPTURE, SIZE = "procedural:room?frames=4", (64, 48)
 SHIFT = np.array([0.01, 0.0, 0.02])

@@ -5,16 +5,16 @@ import json
 import numpy as np
 import pytest
 
-from ssplat_jax.checkpoint.chunk_records import (
+from ssplat_jax.core.errors import InputError
+from ssplat_jax.data.open_capture import open_capture
+from ssplat_jax.runs.chunk_recorder import CHUNKS_PER_SCORE, hold_back
+from ssplat_jax.storage.chunk_records import (
     THUMBNAIL_SIDE,
     load_chunk_records,
     make_thumbnail,
     open_thumbnail,
     save_chunk_record,
 )
-from ssplat_jax.data.open_capture import open_capture
-from ssplat_jax.errors import InputError
-from ssplat_jax.runs.chunk_recorder import CHUNKS_PER_SCORE, hold_back
 from ssplat_jax.storage.run_folder import RunFolder
 from tests.commands.test_cli import make_capture, run
 from tests.runs.test_reports import record, smooth_picture

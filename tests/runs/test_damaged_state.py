@@ -4,17 +4,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ssplat_jax.checkpoint.weights import load_params
 from ssplat_jax.config import preset
-from ssplat_jax.console import Reporter
+from ssplat_jax.core.atomic import previous_path
+from ssplat_jax.core.console import Reporter
+from ssplat_jax.core.errors import StorageError
+from ssplat_jax.core.pytree import replace
 from ssplat_jax.data.open_capture import open_capture
-from ssplat_jax.errors import StorageError
-from ssplat_jax.pytree import replace
+from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.runs.resume import RunState, resume_run, run_identity, save_run
-from ssplat_jax.storage.atomic import previous_path
 from ssplat_jax.storage.run_folder import RunFolder
+from ssplat_jax.storage.weights import load_params
 from ssplat_jax.streaming.session import Session
-from ssplat_jax.streaming.streamsplat import StreamSplat
 
 
 def test_the_damaged_state_is_kept_aside_and_the_one_before_takes_its_place(tmp_path, capsys):

@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import ssplat_jax as ss
-from ssplat_jax.gaussians import Gaussians
+from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.runs.export_cameras import SceneCameras, save_cameras
 from ssplat_jax.scene_files.ply import save_ply
 from tests.commands.test_cli import make_capture, run

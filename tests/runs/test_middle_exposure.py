@@ -6,19 +6,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ssplat_jax.checkpoint.weights import load_params
 from ssplat_jax.config import preset
+from ssplat_jax.core.gaussians import Gaussians, scale_colors
+from ssplat_jax.core.pytree import replace
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.stream_frame import StreamFrame
-from ssplat_jax.gaussians import Gaussians, scale_colors
-from ssplat_jax.metrics.psnr_ssim import psnr
-from ssplat_jax.pytree import replace
+from ssplat_jax.evaluation.psnr_ssim import psnr
+from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.rasterizer import render
 from ssplat_jax.runs.finish_run import save_scene, scene_to_show
 from ssplat_jax.scene_files.ply import load_ply
+from ssplat_jax.storage.weights import load_params
 from ssplat_jax.streaming.feed import middle_exposure
 from ssplat_jax.streaming.session import Session
-from ssplat_jax.streaming.streamsplat import StreamSplat
 from tests.scene_files.scene_fixture import camera, scene
 
 SHADE = 1 / 3

@@ -6,12 +6,12 @@ from unittest.mock import Mock
 
 import pytest
 
-from ssplat_jax.checkpoint.weights import load_params
 from ssplat_jax.config import preset
-from ssplat_jax.console import Reporter
+from ssplat_jax.core.console import Reporter
+from ssplat_jax.core.errors import InputError
 from ssplat_jax.data.open_capture import open_capture
-from ssplat_jax.errors import InputError
 from ssplat_jax.evaluation.exposures import exposures_to_json
+from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.refinement.learned_pass import STEPS
 from ssplat_jax.runs import capture_run
 from ssplat_jax.runs import refine_run as module
@@ -20,7 +20,7 @@ from ssplat_jax.runs.refine_run import refine_run
 from ssplat_jax.runs.resume import RunState
 from ssplat_jax.scene_files.ply import read_ply
 from ssplat_jax.storage.run_folder import RunFolder
-from ssplat_jax.streaming.streamsplat import StreamSplat
+from ssplat_jax.storage.weights import load_params
 
 CAPTURE = "procedural:room?frames=4"
 REFINED = ("refined.ply", "refinement.json", "refinement.npz")

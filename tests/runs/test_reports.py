@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from ssplat_jax.checkpoint.chunk_records import ChunkRecord, RecordedView, make_thumbnail, save_chunk_record
 from ssplat_jax.evaluation.contact_sheet import GAP, LINE, MAX_PICTURES, evenly_spread, save_contact_sheet
 from ssplat_jax.evaluation.pictures import save_image
 from ssplat_jax.evaluation.report_page import Report, page_text
 from ssplat_jax.evaluation.svg_plot import BOTTOM, HEIGHT, LEFT, RIGHT, TOP, WIDTH, Line, line_plot
 from ssplat_jax.runs.reports import MOST_PICTURES, report_eval, report_run
+from ssplat_jax.storage.chunk_records import ChunkRecord, RecordedView, make_thumbnail, save_chunk_record
 from ssplat_jax.storage.run_folder import RunFolder
 
 JPEG_DB = 30.0  # of a smooth picture

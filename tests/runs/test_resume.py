@@ -5,7 +5,7 @@ import copy
 import pytest
 
 from ssplat_jax.config import preset
-from ssplat_jax.errors import InputError
+from ssplat_jax.core.errors import InputError
 from ssplat_jax.runs.resume import _check_identity
 from ssplat_jax.storage.run_folder import RunFolder
 

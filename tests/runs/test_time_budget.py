@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from ssplat_jax.checkpoint.weights import check_params, load_params
 from ssplat_jax.config import preset
-from ssplat_jax.console import Reporter
-from ssplat_jax.errors import InputError
+from ssplat_jax.core.console import Reporter
+from ssplat_jax.core.errors import InputError
 from ssplat_jax.runs import time_budget
 from ssplat_jax.runs.time_budget import Front, FrontPoint, choose, front_of, load_front, setting_for_run
+from ssplat_jax.storage.weights import check_params, load_params
 from tests.commands.test_cli import make_capture
 
 QUIET = Reporter(quiet=True)

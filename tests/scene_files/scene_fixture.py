@@ -3,8 +3,8 @@
 import jax.numpy as jnp
 import numpy as np
 
-from ssplat_jax.gaussians import Gaussians
-from ssplat_jax.geometry.cameras import Camera
+from ssplat_jax.core.cameras import Camera
+from ssplat_jax.core.gaussians import Gaussians
 
 ROUND_TRIP = 3e-6  # relative; exponential of a float32 logarithm of up to 20
 

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from plyfile import PlyData, PlyElement
 
-from ssplat_jax.errors import InputError
-from ssplat_jax.gaussians import SH_C0, Gaussians
-from ssplat_jax.pytree import replace
+from ssplat_jax.core.errors import InputError
+from ssplat_jax.core.gaussians import SH_C0, Gaussians
+from ssplat_jax.core.pytree import replace
 from ssplat_jax.rasterizer import render
 from ssplat_jax.scene_files.compressed_ply import read_compressed_ply, save_compressed_ply
 from tests.scene_files.scene_fixture import camera, decibels, scene

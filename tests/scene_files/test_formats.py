@@ -16,9 +16,9 @@ import pytest
 from PIL import Image
 
 import ssplat_jax as ss
-from ssplat_jax.errors import InputError
-from ssplat_jax.gaussians import SH_C0, Gaussians
-from ssplat_jax.pytree import replace
+from ssplat_jax.core.errors import InputError
+from ssplat_jax.core.gaussians import SH_C0, Gaussians
+from ssplat_jax.core.pytree import replace
 from ssplat_jax.rasterizer import render
 from ssplat_jax.scene_files.compressed_ply import is_compressed_ply
 from ssplat_jax.scene_files.formats import FORMATS, read_scene, save_gaussians

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from ssplat_jax.errors import InputError
-from ssplat_jax.gaussians import Gaussians
-from ssplat_jax.geometry.cameras import Camera
-from ssplat_jax.pytree import replace
+from ssplat_jax.core.cameras import Camera
+from ssplat_jax.core.errors import InputError
+from ssplat_jax.core.gaussians import Gaussians
+from ssplat_jax.core.pytree import replace
 from ssplat_jax.rasterizer import render
 from ssplat_jax.scene_files.gltf import save_gltf
 from ssplat_jax.scene_files.gltf_reader import read_gltf

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from plyfile import PlyData
 
-from ssplat_jax.errors import InputError, StorageError
-from ssplat_jax.gaussians import SH_C0, Gaussians
-from ssplat_jax.pytree import replace
+from ssplat_jax.core.errors import InputError, StorageError
+from ssplat_jax.core.gaussians import SH_C0, Gaussians
+from ssplat_jax.core.pytree import replace
 from ssplat_jax.rasterizer import render
 from ssplat_jax.scene_files.ply import load_ply, property_names, save_ply
 from tests.scene_files.scene_fixture import ROUND_TRIP, camera, decibels, scene

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from plyfile import PlyData, PlyElement
 
-from ssplat_jax.errors import InputError
+from ssplat_jax.core.errors import InputError
 from ssplat_jax.scene_files.ply import BASE_PROPERTIES, load_ply, save_ply
 from tests.scene_files.scene_fixture import ROUND_TRIP, scene
 

@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ssplat_jax.errors import InputError
-from ssplat_jax.gaussians import Gaussians
-from ssplat_jax.pytree import replace
+from ssplat_jax.core.errors import InputError
+from ssplat_jax.core.gaussians import Gaussians
+from ssplat_jax.core.pytree import replace
 from ssplat_jax.scene_files.ply import load_ply, save_ply
 from ssplat_jax.scene_files.select_gaussians import (
     FLOATER,

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ssplat_jax.errors import InputError
-from ssplat_jax.gaussians import SH_C0, Gaussians
-from ssplat_jax.pytree import replace
+from ssplat_jax.core.errors import InputError
+from ssplat_jax.core.gaussians import SH_C0, Gaussians
+from ssplat_jax.core.pytree import replace
 from ssplat_jax.rasterizer import render
 from ssplat_jax.rasterizer.sh import sh_basis
 from ssplat_jax.scene_files.ply import load_ply, save_ply

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from ssplat_jax.cache import VoxelCache, carve, init_cache, judge, project, store_witness
-from ssplat_jax.geometry.cameras import Camera
-from ssplat_jax.pytree import replace
+from ssplat_jax.core.cameras import Camera
+from ssplat_jax.core.pytree import replace
 from tests.cache import streams
 from tests.cache.projection_scenes import front_camera, with_pivots
 from tests.cache.streams import assert_same_cache, tokens_at

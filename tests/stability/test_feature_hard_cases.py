@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 from ssplat_jax import model as stages
+from ssplat_jax.core.pytree import replace
 from ssplat_jax.model import compact
 from ssplat_jax.model.compact.compact_features import CompactFeatures
 from ssplat_jax.model.compact.sweep_matching import plane_sweep
 from ssplat_jax.model.types import Views, prepare_views
-from ssplat_jax.pytree import replace
-from tests.geometry.test_rotations import rodrigues
+from tests.core.test_rotations import rodrigues
 from tests.model.small import CONFIG, chunk, finite, history, params, random_params
 from tests.stability.stage_checks import FLOAT32, ZERO_GAMMA, check_depths, check_distribution, wave
 

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from ssplat_jax import model as stages
+from ssplat_jax.core.numerics import softplus_inverse
+from ssplat_jax.core.pytree import replace
 from ssplat_jax.model.types import DepthDistribution, prepare_views
-from ssplat_jax.numerics import softplus_inverse
-from ssplat_jax.pytree import replace
 from tests.model.small import CONFIG, chunk, finite, history
 from tests.stability.stage_checks import FLOAT32, ZERO_GAMMA, check_depths, wave
 

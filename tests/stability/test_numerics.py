@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from ssplat_jax.core.numerics import clip_value, columns, safe_log, safe_normalize, safe_sqrt, softplus_inverse
+from ssplat_jax.core.xla_cpu import in_own_kernel, lane_sum
 from ssplat_jax.model.compact.sweep_matching import unit_features
 from ssplat_jax.model.layers import attend, attend_per_query, average_pool, instance_norm
-from ssplat_jax.numerics import clip_value, columns, safe_log, safe_normalize, safe_sqrt, softplus_inverse
-from ssplat_jax.xla_cpu import in_own_kernel, lane_sum
 
 ULP = float(np.finfo(np.float32).eps)
 

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ssplat_jax.chunk import check_chunk
-from ssplat_jax.errors import InputError
-from ssplat_jax.gaussians import check_gaussians
+from ssplat_jax.core.chunk import check_chunk
+from ssplat_jax.core.errors import InputError
+from ssplat_jax.core.gaussians import check_gaussians
 from ssplat_jax.rasterizer import render
 from tests.model.small import MODEL, chunk
 from tests.rasterizer.scenes import cameras, cloud

@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ssplat_jax.geometry.cameras import transform_points
-from ssplat_jax.geometry.rotations import quats_to_matrices
+from ssplat_jax.core.cameras import transform_points
+from ssplat_jax.core.rotations import quats_to_matrices
 
 SIZES = range(1, 36)  # past two widths of 16 lanes, every remainder twice
 FLOAT32 = 5e-6

@@ -17,15 +17,15 @@ from scipy.spatial import cKDTree
 
 from ssplat_jax.cache import init_cache
 from ssplat_jax.config import StreamConfig
+from ssplat_jax.core.gaussians import Gaussians
+from ssplat_jax.core.rotations import quats_to_matrices
+from ssplat_jax.core.sh_rotation import sh_rotation
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.stream_frame import StreamFrame
-from ssplat_jax.gaussians import Gaussians
-from ssplat_jax.geometry.rotations import quats_to_matrices
-from ssplat_jax.geometry.sh_rotation import sh_rotation
+from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.scene_files.ply import load_ply, save_ply
-from ssplat_jax.streaming.streamsplat import StreamSplat
-from tests.geometry.test_rotations import rodrigues
+from tests.core.test_rotations import rodrigues
 from tests.model import small
 from tests.model.small import random_params
 from tests.model.test_plane_sweep import WALL, texture

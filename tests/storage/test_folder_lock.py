@@ -10,7 +10,7 @@ import pytest
 from ssplat_jax.commands.demo_command import Demo
 from ssplat_jax.commands.eval_command import Eval
 from ssplat_jax.commands.main import main
-from ssplat_jax.errors import InputError, StorageError
+from ssplat_jax.core.errors import InputError, StorageError
 from ssplat_jax.storage.folder_lock import lock_folder
 from ssplat_jax.storage.folders import remove_numbered
 

@@ -12,9 +12,9 @@ import ml_dtypes
 import numpy as np
 import pytest
 
-from ssplat_jax.errors import InputError
+from ssplat_jax.core.errors import InputError
 from ssplat_jax.storage.torch_files import read_arrays, read_shapes
-from tests.metrics.lpips_fixture import FOLDER, small_dict
+from tests.evaluation.lpips_fixture import FOLDER, small_dict
 
 FILES = {"zip": FOLDER / "zip.pth", "legacy": FOLDER / "legacy.pth"}
 SHAPES = {name: x.shape for name, (x, _) in small_dict().items()}

@@ -21,8 +21,8 @@ from jax.sharding import NamedSharding  # noqa: E402
 from jax.sharding import PartitionSpec as P  # noqa: E402
 
 from ssplat_jax.cache import fuse, init_cache, project  # noqa: E402
+from ssplat_jax.model.streamsplat import StreamSplat  # noqa: E402
 from ssplat_jax.streaming.sharded import ShardedStream  # noqa: E402
-from ssplat_jax.streaming.streamsplat import StreamSplat  # noqa: E402
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 

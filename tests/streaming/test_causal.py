@@ -7,15 +7,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from ssplat_jax.core.errors import InputError
+from ssplat_jax.core.rotations import quats_to_matrices
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.images import ArrayPixels
 from ssplat_jax.data.open_capture import open_capture
-from ssplat_jax.errors import InputError
-from ssplat_jax.geometry.rotations import quats_to_matrices
+from ssplat_jax.model.streamsplat import ChunkOutput, StreamSplat
 from ssplat_jax.streaming.causal_range import STEP, widen_range
 from ssplat_jax.streaming.feed import feed_chunks
 from ssplat_jax.streaming.session import Session
-from ssplat_jax.streaming.streamsplat import ChunkOutput, StreamSplat
 from tests.streaming.narrow_model import NARROW, assert_same_bits
 
 CAUSAL = NARROW.replace(causal=True)

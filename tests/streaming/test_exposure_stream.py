@@ -4,13 +4,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ssplat_jax.checkpoint.weights import load_params
 from ssplat_jax.config import preset
+from ssplat_jax.core.gaussians import mean_color
+from ssplat_jax.core.pytree import replace
 from ssplat_jax.data.open_capture import open_capture
-from ssplat_jax.gaussians import mean_color
-from ssplat_jax.pytree import replace
+from ssplat_jax.model.streamsplat import StreamSplat
+from ssplat_jax.storage.weights import load_params
 from ssplat_jax.streaming.session import Session
-from ssplat_jax.streaming.streamsplat import StreamSplat
 
 TINT = np.array([0.6, 0.75, 0.9])
 

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from ssplat_jax.cache import grow, init_cache
-from ssplat_jax.checkpoint.delta_files import load_delta, save_delta
-from ssplat_jax.errors import StorageError
+from ssplat_jax.core.errors import StorageError
+from ssplat_jax.core.pytree import replace
 from ssplat_jax.model.compact.gaussian_head import GaussianHead
 from ssplat_jax.model.params import init_params
-from ssplat_jax.pytree import replace
+from ssplat_jax.model.streamsplat import StreamSplat
+from ssplat_jax.storage.delta_files import load_delta, save_delta
 from ssplat_jax.streaming.scene_delta import SceneFeed, apply_confidences, apply_delta
-from ssplat_jax.streaming.streamsplat import StreamSplat
 from tests.cache.streams import CAPACITY, CONFIG, PLACES, VARIANTS, Recipe, fuse, fuse_with_rows, to_jax
 
 HEAD_TOL = 1e-5  # relative and absolute: programs for different numbers of rows may round differently

@@ -12,9 +12,9 @@ import pytest
 
 from ssplat_jax.cache import Tokens, fuse, init_cache, project
 from ssplat_jax.cache.hash_table import shards_of
+from ssplat_jax.cache.voxels import hash_voxels, voxel_indices
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.geometry.voxels import hash_voxels, voxel_indices
-from ssplat_jax.pytree import replace
+from ssplat_jax.core.pytree import replace
 from tests.cache.projection_scenes import cameras
 from tests.cache.streams import CONFIG, FEATURES, PLACES, Recipe
 from tests.streaming.narrow_model import assert_same_bits

@@ -4,9 +4,9 @@ import jax
 import numpy as np
 import pytest
 
-from ssplat_jax.errors import CacheError, InputError
+from ssplat_jax.core.errors import CacheError, InputError
+from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.streaming.sharded import ShardedStream, _from_first_shard
-from ssplat_jax.streaming.streamsplat import StreamSplat
 from tests.streaming.narrow_model import NARROW
 
 

@@ -5,11 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from ssplat_jax.core.errors import InputError
+from ssplat_jax.core.pytree import replace
 from ssplat_jax.data.open_capture import open_capture
-from ssplat_jax.errors import InputError
-from ssplat_jax.pytree import replace
+from ssplat_jax.model.streamsplat import StreamSplat, merged_footprints
 from ssplat_jax.streaming.session import Session
-from ssplat_jax.streaming.streamsplat import StreamSplat, merged_footprints
 from tests.model.small import random_params
 from tests.streaming.narrow_model import NARROW, assert_same_bits, leaves_with_names
 

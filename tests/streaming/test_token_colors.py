@@ -4,9 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ssplat_jax.core.pytree import replace
 from ssplat_jax.model import patch_colors, prepare_views
-from ssplat_jax.pytree import replace
-from ssplat_jax.streaming.streamsplat import _flatten_tokens
+from ssplat_jax.model.streamsplat import _flatten_tokens
 from tests.model.small import CONFIG, chunk
 
 GAINS = np.array([[0.5, 0.7, 1.0], [1.0, 1.0, 1.0], [2.0, 1.5, 1.25]], np.float32)

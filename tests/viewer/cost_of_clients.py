@@ -11,7 +11,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from ssplat_jax.checkpoint.chunk_records import load_chunk_records
+from ssplat_jax.storage.chunk_records import load_chunk_records
 from ssplat_jax.storage.run_folder import RunFolder
 from tests.viewer.chromium import wait_for
 from tests.viewer.test_viewer import free_port

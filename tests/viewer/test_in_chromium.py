@@ -16,15 +16,15 @@ import pytest
 from PIL import Image
 
 import ssplat_jax as ss
-from ssplat_jax.checkpoint.chunk_records import ChunkRecord, RecordedView, make_thumbnail, save_chunk_record
-from ssplat_jax.checkpoint.delta_files import save_delta
+from ssplat_jax.core.cameras import Camera
+from ssplat_jax.core.pytree import replace
 from ssplat_jax.data.posed_image import invert_pose, pose_from_quat
 from ssplat_jax.evaluation.pictures import save_image
-from ssplat_jax.geometry.cameras import Camera
-from ssplat_jax.pytree import replace
 from ssplat_jax.rasterizer import Effects
 from ssplat_jax.runs.reports import report_run
 from ssplat_jax.scene_files.ply import load_ply
+from ssplat_jax.storage.chunk_records import ChunkRecord, RecordedView, make_thumbnail, save_chunk_record
+from ssplat_jax.storage.delta_files import save_delta
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.viewer.browser_camera import camera_of
 from ssplat_jax.viewer.drawn_view import FINE

@@ -21,10 +21,10 @@ import pytest
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 
+from ssplat_jax.core.cameras import Camera
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.posed_image import invert_pose
-from ssplat_jax.geometry.cameras import Camera
 from ssplat_jax.rasterizer import Effects, render
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.viewer.scene_sources import open_source

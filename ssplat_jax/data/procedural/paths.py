@@ -10,8 +10,8 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
+from ssplat_jax.core.errors import InputError
 from ssplat_jax.data.procedural.scene import Scene, clearance
-from ssplat_jax.errors import InputError
 
 UP = np.array([0.0, -1.0, 0.0])
 MAX_IRREGULARITY = 0.7  # largest deviation of the log of a path's steps; the smallest, 0.1, is an even walk

@@ -6,11 +6,11 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float
 
+from ssplat_jax.core.errors import InputError
 from ssplat_jax.data.procedural.paths import look_at, sample_path
 from ssplat_jax.data.procedural.raycast import raycast, raycast_depths
 from ssplat_jax.data.procedural.scene import NUM_SOLIDS, Scene, clearance, fade_scene, scale_scene
 from ssplat_jax.data.procedural.scenes import SCENE_KINDS, SCENE_SHARES, SKY_DISTANCE, sample_scene
-from ssplat_jax.errors import InputError
 
 Views = tuple[
     Float[np.ndarray, "v h w 3"], Float[np.ndarray, "v h w"], Float[np.ndarray, "v 4 4"], Float[np.ndarray, "v 3 3"]

@@ -9,7 +9,7 @@ their intersection, so every ray ends.
 import numpy as np
 from jaxtyping import Array, Float, Int, UInt32
 
-from ssplat_jax.pytree import pytree, replace
+from ssplat_jax.core.pytree import pytree, replace
 
 NUM_BOXES, NUM_BALLS, NUM_CYLINDERS = 32, 6, 10  # rows of each shape
 NUM_SOLIDS = NUM_BOXES + NUM_BALLS + NUM_CYLINDERS

@@ -8,10 +8,10 @@ from collections.abc import Callable
 
 import numpy as np
 
+from ssplat_jax.core.errors import InputError
 from ssplat_jax.data.procedural.builder import Finish, SceneBuilder, random_rotation, yaw_rotation
 from ssplat_jax.data.procedural.scene import Scene
 from ssplat_jax.data.procedural.textures import TextureLibrary, texture_library
-from ssplat_jax.errors import InputError
 
 # Texture groups for objects of any kind.
 _EVERYTHING = ("photo", "floor", "pattern", "noise", "facade", "leaves", "photo")

@@ -14,6 +14,7 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from ssplat_jax.core.errors import InputError, echo, refusal
 from ssplat_jax.data.lens import FisheyeLens, Lens
 from ssplat_jax.data.pose_conventions import Convention
 from ssplat_jax.data.posed_image import Frame, pose_from_quat
@@ -29,7 +30,6 @@ from ssplat_jax.data.readers.frame_list import (
     stored_size,
 )
 from ssplat_jax.data.readers.strict_text import load_lines, parse_numbers
-from ssplat_jax.errors import InputError, echo, refusal
 
 FORMAT = "COLMAP"
 CONVENTION = Convention(poses="world-to-camera")

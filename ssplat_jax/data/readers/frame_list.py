@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
+from ssplat_jax.core.errors import echo, refusal
 from ssplat_jax.data.images import image_size
 from ssplat_jax.data.lens import IGNORED_PX, PINHOLE, Lens, check_lens
 from ssplat_jax.data.posed_image import MILLIMETER, ROTATION_ROUNDING, Frame, check_intrinsics
 from ssplat_jax.data.readers import Listing
-from ssplat_jax.errors import echo, refusal
 
 SHORTER_PATH_RATIO = 0.5  # camera path in the file's order over that by name, below which the file's order is used
 MAX_CENTER_OFFSET = 0.2  # of a side; a principal point farther from the center is reported

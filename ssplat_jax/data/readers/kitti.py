@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
+from ssplat_jax.core.errors import echo, refusal
 from ssplat_jax.data.images import image_size
 from ssplat_jax.data.posed_image import check_camtoworld
 from ssplat_jax.data.readers import Listing
 from ssplat_jax.data.readers.frame_list import Intrinsics, check_once, list_frames, make_frame
 from ssplat_jax.data.readers.strict_text import load_lines, load_rows, parse_numbers
-from ssplat_jax.errors import echo, refusal
 
 FORMAT = "KITTI"
 CAMERAS = (2, 3, 0, 1)  # in the order of search

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
+from ssplat_jax.core.errors import refusal
 from ssplat_jax.data.posed_image import check_camtoworld
 from ssplat_jax.data.readers import Listing
 from ssplat_jax.data.readers.frame_list import (
@@ -20,7 +21,6 @@ from ssplat_jax.data.readers.frame_list import (
     make_frame,
     stored_size,
 )
-from ssplat_jax.errors import refusal
 
 FORMAT = "LLFF"
 FILE = "poses_bounds.npy"

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
+from ssplat_jax.core.errors import echo, refusal
 from ssplat_jax.data.lens import FisheyeLens, Lens
 from ssplat_jax.data.pose_conventions import Convention
 from ssplat_jax.data.posed_image import pose_from_quat
@@ -24,7 +25,6 @@ from ssplat_jax.data.readers.frame_list import (
     stored_size,
 )
 from ssplat_jax.data.readers.strict_json import JsonFields, load_json_list
-from ssplat_jax.errors import echo, refusal
 
 FORMAT = "OpenSfM"
 CONVENTION = Convention(poses="world-to-camera")

@@ -7,6 +7,7 @@ are in pixels. Depth maps hold millimeters and have their own resolution.
 
 from pathlib import Path
 
+from ssplat_jax.core.errors import refusal
 from ssplat_jax.data.images import check_depth_header
 from ssplat_jax.data.pose_conventions import Convention
 from ssplat_jax.data.posed_image import check_camtoworld
@@ -20,7 +21,6 @@ from ssplat_jax.data.readers.frame_list import (
     stored_size,
 )
 from ssplat_jax.data.readers.strict_json import JsonFields, load_json
-from ssplat_jax.errors import refusal
 
 FORMAT = "Polycam"
 CONVENTION = Convention(axes="opengl")

@@ -9,13 +9,13 @@ from pathlib import Path
 
 import numpy as np
 
+from ssplat_jax.core.errors import echo, refusal
 from ssplat_jax.data.images import image_size
 from ssplat_jax.data.pose_conventions import Convention
 from ssplat_jax.data.posed_image import check_camtoworld
 from ssplat_jax.data.readers import Listing
 from ssplat_jax.data.readers.frame_list import EXTENSIONS, Intrinsics, find_file, list_frames, make_frame
 from ssplat_jax.data.readers.strict_text import load_lines, load_rows
-from ssplat_jax.errors import echo, refusal
 
 FORMAT = "RealEstate10K"
 CONVENTION = Convention(poses="world-to-camera")

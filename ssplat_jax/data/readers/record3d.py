@@ -8,12 +8,12 @@ floating-point EXR or compressed.
 
 from pathlib import Path
 
+from ssplat_jax.core.errors import echo, refusal
 from ssplat_jax.data.pose_conventions import Convention
 from ssplat_jax.data.posed_image import pose_from_quat
 from ssplat_jax.data.readers import Listing
 from ssplat_jax.data.readers.frame_list import Intrinsics, find_file, list_frames, make_frame, stored_size
 from ssplat_jax.data.readers.strict_json import JsonFields, load_json
-from ssplat_jax.errors import echo, refusal
 
 FORMAT = "Record3D"
 CONVENTION = Convention(axes="opengl")

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ssplat_jax.core.errors import refusal
 from ssplat_jax.data.images import check_depth_header, image_size
 from ssplat_jax.data.posed_image import check_camtoworld
 from ssplat_jax.data.readers import Listing
@@ -20,7 +21,6 @@ from ssplat_jax.data.readers.frame_list import (
     make_frame,
 )
 from ssplat_jax.data.readers.strict_text import load_rows
-from ssplat_jax.errors import refusal
 
 FORMAT = "ScanNet"
 IMAGES = (".jpg", ".jpeg", ".png")  # extensions of color images

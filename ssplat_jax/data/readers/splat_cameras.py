@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ssplat_jax.core.errors import refusal
 from ssplat_jax.data.posed_image import check_camtoworld
 from ssplat_jax.data.readers import Listing
 from ssplat_jax.data.readers.frame_list import (
@@ -22,7 +23,6 @@ from ssplat_jax.data.readers.frame_list import (
     stored_size,
 )
 from ssplat_jax.data.readers.strict_json import JsonFields, load_json_list
-from ssplat_jax.errors import refusal
 
 FORMAT = "cameras.json"
 

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
+from ssplat_jax.core.errors import echo, refusal
 from ssplat_jax.data.readers.strict_text import read_text
-from ssplat_jax.errors import echo, refusal
 
 MAX_BYTES = 256 << 20  # files of real captures take a few megabytes
 

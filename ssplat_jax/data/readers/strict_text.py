@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from ssplat_jax.errors import echo, refusal
+from ssplat_jax.core.errors import echo, refusal
 
 MAX_BYTES = 1 << 30
 COMMENT = "#"  # first character of a comment line

@@ -15,6 +15,7 @@ import math
 from pathlib import Path
 from typing import Any
 
+from ssplat_jax.core.errors import InputError, echo, refusal
 from ssplat_jax.data.images import check_depth_header, image_size
 from ssplat_jax.data.lens import FisheyeLens, Lens
 from ssplat_jax.data.pose_conventions import Convention
@@ -31,7 +32,6 @@ from ssplat_jax.data.readers.frame_list import (
     stored_size,
 )
 from ssplat_jax.data.readers.strict_json import load_json
-from ssplat_jax.errors import InputError, echo, refusal
 
 FORMAT = "transforms.json"
 CONVENTION = Convention(axes="opengl")

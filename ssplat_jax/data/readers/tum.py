@@ -17,13 +17,13 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
+from ssplat_jax.core.errors import echo, refusal
 from ssplat_jax.data.images import check_depth_header, image_size
 from ssplat_jax.data.lens import Lens
 from ssplat_jax.data.posed_image import pose_from_quat
 from ssplat_jax.data.readers import Listing
 from ssplat_jax.data.readers.frame_list import Intrinsics, file_named, find_named, list_frames, make_frame
 from ssplat_jax.data.readers.strict_text import load_lines, load_rows, parse_numbers
-from ssplat_jax.errors import echo, refusal
 
 FORMAT = "TUM RGB-D"
 MAX_POSE_GAP = 0.1  # seconds between the two poses around an image

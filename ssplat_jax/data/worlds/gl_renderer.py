@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from ssplat_jax.core.errors import InputError
 from ssplat_jax.data.worlds.meshes import Mesh
-from ssplat_jax.errors import InputError
 
 NEAR, FAR = 0.05, 200.0  # meters
 

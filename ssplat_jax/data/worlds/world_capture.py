@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from ssplat_jax.core.errors import refusal
 from ssplat_jax.data.worlds.gl_renderer import GlRenderer, open_context
 from ssplat_jax.data.worlds.lighting import bake
 from ssplat_jax.data.worlds.rooms import make_world
 from ssplat_jax.data.worlds.textures import make_textures
 from ssplat_jax.data.worlds.walks import num_blocked, sample_walk
-from ssplat_jax.errors import refusal
 from ssplat_jax.storage.folders import make_writable
 from ssplat_jax.storage.json_files import write_json
 

@@ -2,7 +2,7 @@
 
 from jaxtyping import Array, Float
 
-from ssplat_jax.pytree import pytree
+from ssplat_jax.core.pytree import pytree
 
 
 @pytree

@@ -6,13 +6,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.geometry.sampling import bilinear_taps, correlate_warped
+from ssplat_jax.core.numerics import safe_normalize
+from ssplat_jax.core.sampling import bilinear_taps, correlate_warped
 from ssplat_jax.model.compact.compact_features import CompactFeatures
 from ssplat_jax.model.convolution import Conv
 from ssplat_jax.model.layers import UNet, average_pool
 from ssplat_jax.model.plane_sweep import sweep_pixels
 from ssplat_jax.model.types import GRID_STRIDE, DepthDistribution, Views, nearest_sources
-from ssplat_jax.numerics import safe_normalize
 
 
 def unit_features(x: Float[Array, "*b c"]) -> Float[Array, "*b c"]:

@@ -6,8 +6,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.geometry.cameras import invert_poses, pixel_grid, unproject
-from ssplat_jax.geometry.sampling import bilinear_taps, correlate_warped
+from ssplat_jax.core.cameras import invert_poses, pixel_grid, unproject
+from ssplat_jax.core.sampling import bilinear_taps, correlate_warped
 from ssplat_jax.model.convolution import Conv, HalvingConv
 from ssplat_jax.model.layers import attend
 from ssplat_jax.model.plane_sweep import MIN_SOURCE_DEPTH, sweep_pixels

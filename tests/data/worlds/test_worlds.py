@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ssplat_jax.core.errors import InputError
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.worlds.gl_renderer import GlRenderer, open_context
 from ssplat_jax.data.worlds.meshes import box, patch
 from ssplat_jax.data.worlds.world_capture import write_worlds
-from ssplat_jax.errors import InputError
 
 
 def test_box_normals_point_outward():

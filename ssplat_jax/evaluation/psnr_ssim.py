@@ -1,0 +1,58 @@
+"""PSNR and SSIM, computed on the host.
+
+Images are float RGB `[h w 3]`, clipped to [0, 1]. SSIM depends on its window and weights, so results are published with
+`SSIM_ARGUMENTS`.
+"""
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from skimage.metrics import structural_similarity
+
+from ssplat_jax.core.errors import InputError
+
+MIN_MSE = 1e-10
+"""Lower bound of the mean squared error: PSNR is at most 100 dB, a finite number that JSON can hold."""
+
+SSIM_ARGUMENTS: dict[str, Any] = {"win_size": 11, "gaussian_weights": True, "data_range": 1.0, "channel_axis": -1}
+"""Arguments of scikit-image's `structural_similarity`; its Gaussian has a standard deviation of 1.5 pixels."""
+
+
+def psnr(image: Float[np.ndarray, "_ _ 3"], target: Float[np.ndarray, "_ _ 3"]) -> float:
+    """Peak signal-to-noise ratio in dB, over all pixels and channels.
+
+    Limits:
+        Equal images give 100 dB (`MIN_MSE`).
+        NaN gives NaN.
+
+    Raises:
+        InputError: the images differ in size or have no pixels.
+    """
+    image, target = _checked(image, target, 1)
+    return float(-10 * np.log10(np.maximum(np.mean((image - target) ** 2), MIN_MSE)))
+
+
+def ssim(image: Float[np.ndarray, "_ _ 3"], target: Float[np.ndarray, "_ _ 3"]) -> float:
+    """Mean structural similarity over pixels and channels; 1 for equal images.
+
+    Limits:
+        NaN gives NaN.
+
+    Raises:
+        InputError: the images differ in size, or have a side shorter than the window, 11 pixels.
+    """
+    image, target = _checked(image, target, SSIM_ARGUMENTS["win_size"])
+    return float(structural_similarity(image, target, **SSIM_ARGUMENTS))  # pyright: ignore[reportArgumentType]
+
+
+def _checked(image, target, min_side: int):
+    """Both images in float64, clipped to [0, 1]."""
+    if image.shape != target.shape:
+        raise InputError(f"metrics: wanted two images of one size, got {image.shape} and {target.shape}; resize one.")
+    if min(image.shape[:2]) < min_side:
+        raise InputError(
+            f"metrics: wanted images of at least {min_side} pixels a side, got {image.shape[1]}x{image.shape[0]}; "
+            "render larger ones."
+        )
+    return np.clip(image.astype(np.float64), 0.0, 1.0), np.clip(target.astype(np.float64), 0.0, 1.0)

@@ -1,0 +1,294 @@
+"""`StreamSplat`: the model as pure functions of parameters and cache. `step` has the signature of a `lax.scan` body.
+
+chunk (4 images + cameras)          cache H_{t-1}
+  │                                   │ project
+  ▼                                   ▼
+encode ─► match ─► P_i ──────────► anchor_depth (HPDA) ─► refine_depth ─► back_project ─► p
+  │                                   │                                                   │
+  └─► regress_tokens ─► f ─► inject_features (CGFI) ─► mix_tokens ─► f                    │
+                                                        └──────► fuse (VACC) ◄────────────┘ ─► cache H_t ─► decode
+"""
+
+import dataclasses
+import functools
+import math
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from ssplat_jax import model as stages
+from ssplat_jax.cache import (
+    Tokens,
+    VoxelCache,
+    carve,
+    coarsen,
+    fuse,
+    init_cache,
+    judge,
+    project,
+    store_witness,
+)
+from ssplat_jax.cache.residuals import revise, unpack
+from ssplat_jax.cache.sightings import add_sightings, cells_of
+from ssplat_jax.cache.state import pivot_fields
+from ssplat_jax.config import StreamConfig
+from ssplat_jax.core.chunk import Chunk, check_chunk
+from ssplat_jax.core.gaussians import Gaussians, mask_gaussians
+from ssplat_jax.core.pytree import pytree, replace
+from ssplat_jax.core.rotations import matrices_to_quats
+from ssplat_jax.model.types import TokenShapes, Views
+
+VOXEL_COVERAGE = 1.2
+"""Share of a voxel's face that its pivots cover together: above 1, because pivots gather in the middle of the voxel."""
+
+
+@pytree
+class ChunkOutput:
+    """Summary of one step, on the 1/4 grid of the padded images."""
+
+    depths: Float[Array, "*t v hf wf"]  # camera z, stream units
+    confidences: Float[Array, "*t v hf wf"]  # omega of VACC; 0 outside the image and in padded views
+    history: Float[Array, "*t v hf wf"]  # Omega_H of the cache before this chunk; 0 in its holes
+    exposures: Float[Array, "*t v 3"]  # factors from the scene's colors to each view's; 1 without `match_exposure`
+
+
+@pytree
+class Prediction:
+    """All results of the network for one chunk. Training losses use all of them; `step` returns only `output`."""
+
+    tokens: Tokens
+    logits: Float[Array, "v hf wf d"]  # logits of P_i
+    log_depths: Float[Array, "v hf wf"]  # expectation under P^v
+    views: Views
+    output: ChunkOutput
+
+
+@dataclasses.dataclass(frozen=True)
+class StreamSplat:
+    """The model for one configuration. It holds no arrays: parameters and cache are arguments and results.
+
+    Example:
+        >>> model = StreamSplat(ss.preset("tiny"))
+        >>> params, cache = model.init(jax.random.key(0)), model.init_cache()
+        >>> step = jax.jit(model.step, donate_argnums=1)
+        >>> for chunk in chunks:
+        ...     cache = ss.ensure_capacity(cache, model.config, num_tokens)  # one per 4 x 4 pixels of the chunk
+        ...     cache, out = step(params, cache, chunk)
+        >>> gaussians = model.decode(params, cache)
+    """
+
+    config: StreamConfig
+    axis: str | None = None
+    """Name of the mapped axis over which the cache is sharded by voxel (`sharded.py`); None for a single cache."""
+
+    def init(self, key: jax.Array) -> dict:
+        """Untrained parameters, a nested dict; `ssplat_jax.load_params` loads trained ones."""
+        return stages.init_params(key, self.config)
+
+    def init_cache(self) -> VoxelCache:
+        """An empty cache of the configuration's capacity."""
+        return init_cache(self.config)
+
+    def predict(self, params: dict, cache: VoxelCache, chunk: Chunk) -> Prediction:
+        """Tokens of a chunk, given the cache before it (Secs. 3.3 to 3.6); no gradient flows to the cache."""
+        config, network = self.config, stages.network_of(self.config)
+        check_chunk(chunk, config.stream.chunk_size)
+        views = stages.prepare_views(chunk, config)
+        factor = config.network.match_stride // stages.GRID_STRIDE
+        with jax.named_scope("project"):
+            history = project(jax.lax.stop_gradient(cache), views.grid_camera, config, axis=self.axis)
+        with jax.named_scope("encode"):
+            features = network.encode(params["encoder"], views, config)
+        with jax.named_scope("match"):
+            distribution = network.match(params["cost_volume"], features, views, config)
+        with jax.named_scope("HPDA"):
+            depth = stages.anchor_depth(params["hpda"], distribution, coarsen(history, factor), views, config)
+        with jax.named_scope("refine"):
+            depth = network.refine_depth(params.get("upsampler"), features, depth, views, config)
+        with jax.named_scope("tokens"):
+            positions, footprints = stages.back_project(depth.log_depths, views)
+            feats = network.regress_tokens(params["tokens"], features, distribution, depth, views, config)
+        with jax.named_scope("CGFI"):
+            omega, bound = depth.anchored_confidences, network.bound_history
+            feats = stages.inject_features(
+                params.get("cgfi"), feats, history, omega, views, config, bound_history=bound
+            )
+        with jax.named_scope("mixer"):
+            feats = network.mix_tokens(params["mixer"], feats, positions, views.inside, views.valid, config)
+        confidences = jnp.where(views.inside, depth.matcher_confidences, 0.0)
+        with jax.named_scope("exposure"):
+            exposures = stages.estimate_exposures(history, depth.log_depths, confidences, views, config)
+        tokens = _flatten_tokens(positions, feats, confidences, footprints, exposures, views, config)
+        logits = stages.repeat_cells(distribution.logits, factor)
+        output = ChunkOutput(jnp.exp(depth.log_depths), confidences, history.confidences, exposures)
+        return Prediction(tokens, logits, depth.log_depths, views, output)
+
+    def step(self, params: dict, cache: VoxelCache, chunk: Chunk) -> tuple[VoxelCache, ChunkOutput]:
+        """The cache after one chunk, and a summary of the chunk. Pure; the cache comes first, as the carry of a scan.
+
+        Args:
+            params: parameters, from `init` or `load_params`.
+            cache: the cache before the chunk; may be donated.
+            chunk: `stream.chunk_size` views in the stream frame, without leading axes. Images may have any size: they
+                are padded at the right and bottom.
+
+        Returns:
+            The updated cache, and depths, confidences and exposures of the views.
+
+        Limits:
+            Tokens that find no space are dropped and counted in `cache.stats.num_dropped`: call `ensure_capacity`
+            before the step and `check_cache` after it. No gradient flows through the cache.
+
+        Raises:
+            InputError: a shape of `chunk` is wrong, its images are not floats, or JAX computes in float64.
+        """
+        prediction = self.predict(params, cache, chunk)
+        return self.update_cache(cache, prediction), prediction.output
+
+    def update_cache(self, cache: VoxelCache, prediction: Prediction) -> VoxelCache:
+        """The cache after a chunk: tokens are judged and fused (VACC), all pivots carved and their sightings counted.
+
+        Carving includes the new pivots, so views of one chunk that disagree lower each other's confidences at once. No
+        gradient flows.
+        """
+        prediction = jax.lax.stop_gradient(prediction)
+        seen = (prediction.views.grid_camera, prediction.output.depths, prediction.output.confidences)
+        with jax.named_scope("judge"):
+            tokens = judge(cache.witnesses, prediction.tokens, self.config)
+        with jax.named_scope("VACC"):
+            cache = fuse(cache, tokens, self.config, axis=self.axis)
+        with jax.named_scope("carve"):
+            cache = carve(cache, *seen, self.config)
+            cache = store_witness(cache, *seen, self.config)
+        if cache.sightings is None:
+            return cache
+        with jax.named_scope("sightings"):
+            cells = cells_of(*seen[1:], tokens.rgbs, self.config)
+            return add_sightings(cache, prediction.views.grid_camera, cells, self.config, axis=self.axis)
+
+    def run(self, params: dict, cache: VoxelCache, chunks: Chunk) -> tuple[VoxelCache, ChunkOutput]:
+        """`step` over stacked chunks (leading axis t) as one `lax.scan`.
+
+        The cache cannot grow inside the scan: give it the capacity for all chunks first (`ensure_capacity`).
+
+        Raises:
+            InputError: the chunks are not stacked, or cannot be streamed, see `step`.
+        """
+        check_chunk(chunks, self.config.stream.chunk_size, stacked=True)
+        return jax.lax.scan(functools.partial(self.step, params), cache, chunks)
+
+    def decode(self, params: dict, cache: VoxelCache) -> Gaussians:
+        """The scene so far, in the stream frame: `gaussians_per_token` Gaussians for each pivot, pivot by pivot.
+
+        Gaussians of dead and carved pivots have opacity 0.
+        """
+        return self._decode_pivots(params, cache, shown_pivots(cache, self.config).reshape(-1), lambda x: x)
+
+    def decode_shown(self, params: dict, cache: VoxelCache, num_pivots: int) -> Gaussians:
+        """The Gaussians that `decode` shows, in the same order but without gaps, at the cost of `num_pivots`.
+
+        Limits:
+            If fewer pivots are shown, the last rows have opacity 0; if more are shown, the last of them are omitted.
+        """
+        is_shown = shown_pivots(cache, self.config).reshape(-1)
+        places = jnp.nonzero(is_shown, size=num_pivots, fill_value=is_shown.size)[0]
+        last = is_shown.size - 1
+        return self._decode_pivots(params, cache, places <= last, lambda x: x[jnp.minimum(places, last)])
+
+    def decode_pivots(self, params: dict, cache: VoxelCache, pivots: Int[Array, " m"]) -> Gaussians:
+        """The Gaussians that `decode` shows for some pivots, numbered row by row; a pivot of -1 has opacity 0."""
+        taken = jnp.maximum(pivots, 0)
+        is_shown = (pivots >= 0) & shown_pivots(cache, self.config).reshape(-1)[taken]
+        return self._decode_pivots(params, cache, is_shown, lambda x: x[taken])
+
+    def _decode_pivots(
+        self, params: dict, cache: VoxelCache, is_shown: Bool[Array, " m"], take: Callable[[Array], Array]
+    ) -> Gaussians:
+        """Gaussians of the pivots that `take` selects from a flat array of all pivots."""
+        flat = lambda x: take(x.reshape(-1, *x.shape[2:]))  # noqa: E731
+        shapes, footprints = self._read_shapes(params, flat(cache.feats)), merged_footprints(cache, self.config)
+        rgbs = flat(cache.rgbs)
+        if cache.sightings is not None:
+            evidence = stages.Evidence(
+                sightings=flat(cache.sightings),
+                confidences=flat(cache.confidences),
+                num_members=flat(cache.num_members).astype(jnp.float32),
+                num_pivots=flat(jnp.broadcast_to(cache.counts[:, None], cache.confidences.shape)).astype(jnp.float32),
+                footprints=flat(cache.footprints),
+                growth=flat(footprints / jnp.maximum(cache.footprints, 1e-12)),
+                rgbs=rgbs,
+            )
+            shapes, rgbs = stages.apply_evidence(params["evidence"], shapes, evidence, self.config)
+        gaussians = stages.decode_tokens(
+            shapes,
+            means=flat(cache.means),
+            rgbs=rgbs,
+            quats=flat(cache.quats),
+            footprints=flat(footprints),
+            num_members=flat(cache.num_members),
+            config=self.config,
+        )
+        if cache.residuals is not None:
+            gaussians = revise(gaussians, unpack(flat(cache.residuals)), max_scale=self.config.head.max_scale)
+        return mask_gaussians(gaussians, self.repeat_per_gaussian(is_shown))
+
+    def decode_rows(self, params: dict, cache: VoxelCache, rows: Int[Array, " r"]) -> Gaussians:
+        """Gaussians that `decode` gives for the voxels `rows`, k pivots each; rows of -1 have opacity 0."""
+        part = {name: getattr(cache, name)[rows] for name in ("voxels", *pivot_fields(cache))}
+        return self.decode(params, replace(cache, counts=jnp.where(rows >= 0, cache.counts[rows], 0), **part))
+
+    def decode_tokens(self, params: dict, tokens: Tokens) -> Gaussians:
+        """Gaussians of tokens that are not in a cache, as training renders them (Sec. 3.7)."""
+        gaussians = stages.decode_tokens(
+            self._read_shapes(params, tokens.feats),
+            means=tokens.means,
+            rgbs=tokens.rgbs,
+            quats=tokens.quats,
+            footprints=tokens.footprints,
+            config=self.config,
+        )
+        return mask_gaussians(gaussians, self.repeat_per_gaussian(tokens.valid))
+
+    def _read_shapes(self, params: dict, feats: Float[Array, "m c"]) -> TokenShapes:
+        return stages.network_of(self.config).read_shapes(params["decoder"], feats, self.config)
+
+    def repeat_per_gaussian(self, mask: Bool[Array, " m"]) -> Bool[Array, " n"]:
+        """A mask of tokens or pivots as a mask of their Gaussians."""
+        return jnp.repeat(mask, self.config.head.gaussians_per_token)
+
+
+def shown_pivots(cache: VoxelCache, config: StreamConfig) -> Bool[Array, "capacity k"]:
+    """Mask of the pivots that `decode` shows: alive and not carved away."""
+    return cache.alive & (cache.confidences >= config.memory.min_confidence)
+
+
+def merged_footprints(cache: VoxelCache, config: StreamConfig) -> Float[Array, "capacity k"]:
+    """Footprints of pivots, grown with the number of members until K pivots cover a voxel's face.
+
+    A pivot stores the footprint of its best member. Where grid cells are much finer than voxels, many tokens merge into
+    K pivots, whose stored footprints would leave cracks between them. `head.grow_footprints=False` leaves them as they
+    are stored.
+    """
+    if not config.head.grow_footprints:
+        return cache.footprints
+    share = VOXEL_COVERAGE * config.memory.voxel_size / math.sqrt(config.memory.pivots_per_voxel)
+    grown = cache.footprints * jnp.sqrt(cache.num_members.astype(jnp.float32))
+    return jnp.minimum(grown, jnp.maximum(cache.footprints, share))
+
+
+def _flatten_tokens(positions, feats, confidences, footprints, exposures, views: Views, config: StreamConfig) -> Tokens:
+    """Maps flattened to tokens in order of insertion: view-major, row-major. Colors are at the scene's exposure."""
+    v, hf, wf, _ = positions.shape
+    colors = stages.patch_colors(views.images, config).reshape(v, hf, wf, -1, 3) / exposures[:, None, None, None]
+    quats = matrices_to_quats(jnp.swapaxes(views.viewmats[:, :3, :3], -1, -2))
+    return Tokens(
+        means=positions.reshape(-1, 3),
+        feats=feats.reshape(v * hf * wf, -1),
+        confidences=confidences.reshape(-1),
+        rgbs=colors.reshape(v * hf * wf, -1),
+        quats=jnp.repeat(quats, hf * wf, axis=0),
+        footprints=footprints.reshape(-1),
+        valid=views.inside.reshape(-1),
+    )

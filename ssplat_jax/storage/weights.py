@@ -1,0 +1,150 @@
+"""Weights files: parameters by path, stored as float16 (imported ones as float32) and loaded as float32."""
+
+import dataclasses
+import hashlib
+from collections.abc import Mapping
+from importlib import resources
+from importlib.resources.abc import Traversable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ssplat_jax.config import PRESETS, StreamConfig, preset
+from ssplat_jax.core.errors import InputError, StorageError
+from ssplat_jax.model import init_params
+from ssplat_jax.storage.npz import load_arrays, save_arrays
+from ssplat_jax.storage.saved_config import config_from_header
+
+KIND = "weights"  # kind of the file
+
+
+def save_weights(
+    path: Path, params: dict, config: StreamConfig, provenance: dict, dtype: type[np.floating] = np.float16
+) -> None:
+    """Writes the parameters of a model and its configuration to a weights file.
+
+    Args:
+        path: the file to write.
+        params: parameters, as nested dicts.
+        config: the configuration of the model.
+        provenance: JSON-serializable facts about the training (steps, data, scores).
+        dtype: type of the parameters on disk.
+
+    Raises:
+        StorageError: a value is not finite or too large for `dtype`, or the file cannot be written.
+    """
+    leaves = _by_path(params)
+    with np.errstate(over="ignore"):  # values that overflow become infinite and are refused below
+        arrays = {name: np.asarray(leaf, dtype) for name, leaf in leaves.items()}
+    if bad := [name for name, x in arrays.items() if not np.isfinite(x).all()]:
+        raise StorageError(f"{path}: {bad[0]} has values beyond {np.dtype(dtype)} or not finite; not saved.")
+    save_arrays(path, arrays, KIND, {"config": config.to_dict(), "provenance": provenance})
+
+
+def load_weights(path: Path) -> tuple[dict, StreamConfig]:
+    """Reads (params, config) from a weights file.
+
+    Raises:
+        StorageError: the file is missing, damaged or of another kind.
+        InputError: the parameters do not have the shapes of the file's configuration.
+    """
+    arrays, header = load_arrays(path, KIND)
+    config = config_from_header(header["config"])
+    return _restore(path, arrays, config), config
+
+
+@dataclasses.dataclass(frozen=True)
+class WeightsFacts:
+    """A weights file without its parameters."""
+
+    config: StreamConfig
+    provenance: dict  # JSON facts about the training, as `save_weights` got them
+    num_bytes: int  # of the file
+
+
+def describe_weights(name: str) -> WeightsFacts:
+    """Facts about the weights that ship with the preset `name`, or about the weights file `name`.
+
+    Raises:
+        InputError: there is no such preset or file, or no weights ship with the preset.
+        StorageError: the file is damaged.
+    """
+    with resources.as_file(_source(name)) as path:
+        _, header = load_arrays(path, KIND)
+        config = preset(name) if name in PRESETS else config_from_header(header["config"])
+        return WeightsFacts(config, dict(header.get("provenance") or {}), path.stat().st_size)
+
+
+def load_params(name: str = "tiny") -> dict:
+    """Returns trained parameters: those shipped with the preset `name`, or those of the weights file `name`.
+
+    Raises:
+        InputError: there is no such preset or file, no weights ship with the preset, or the shapes do not match.
+        StorageError: the file is damaged.
+    """
+    if name not in PRESETS:
+        return load_weights(Path(str(_source(name))))[0]
+    with resources.as_file(_source(name)) as path:
+        arrays, _ = load_arrays(path, KIND)
+        return _restore(path, arrays, preset(name))
+
+
+def _source(name: str) -> Traversable:
+    """The file of the weights `name`; see `load_params`."""
+    if name not in PRESETS:
+        if not Path(name).is_file():
+            known = ", ".join(preset for preset in sorted(PRESETS) if _shipped(preset).is_file())
+            raise InputError(f"weights: wanted a preset with shipped weights ({known}) or a file, got {name!r}.")
+        return Path(name)
+    if not (shipped := _shipped(name)).is_file():
+        raise InputError(
+            f"weights: none ship with the preset {name!r}; convert ReSplat's (ssplat import-weights) or train"
+            f" (ssplat train --preset {name}), and give the file."
+        )
+    return shipped
+
+
+def _shipped(preset_name: str) -> Traversable:
+    """Location of the weights that ship with a preset; the file may not exist."""
+    return resources.files("ssplat_jax") / "weights" / f"{preset_name}.npz"
+
+
+def params_digest(params: Any) -> str:
+    """Digest of a tree of parameters (12 hex digits), which identifies them in saved states."""
+    digest = hashlib.sha256()
+    for leaf in jax.tree.leaves(params):  # jax.tree traverses dicts in the order of their keys
+        digest.update(np.ascontiguousarray(leaf).tobytes())
+    return digest.hexdigest()[:12]
+
+
+def check_params(params: dict, config: StreamConfig, origin: str) -> None:
+    """Checks that `params` has the parameters of a model with `config`; additional ones are allowed.
+
+    Raises:
+        InputError: a parameter is missing or has another shape; the message names `origin`, the source of `params`.
+    """
+    _restore(origin, _by_path(params), config)
+
+
+def _by_path(params: dict) -> dict[str, Any]:
+    """Leaves of the parameter tree by their path, such as `encoder/conv1/kernel`."""
+    return {"/".join(k.key for k in keys): leaf for keys, leaf in jax.tree_util.tree_flatten_with_path(params)[0]}
+
+
+def _restore(path: Path | str, arrays: Mapping[str, Any], config: StreamConfig) -> dict:
+    """Builds the parameter tree of a model with `config` from arrays by path, and checks their shapes."""
+    wanted = jax.eval_shape(lambda key: init_params(key, config), jax.random.key(0))
+
+    def leaf(keys, shape):
+        name = "/".join(k.key for k in keys)
+        if name not in arrays or arrays[name].shape != shape.shape:
+            came = arrays[name].shape if name in arrays else "nothing"
+            raise InputError(
+                f"{path}: {name} must be {shape.shape}, got {came}; the weights belong to another configuration."
+            )
+        return jnp.asarray(arrays[name], jnp.float32)
+
+    return jax.tree_util.tree_map_with_path(leaf, wanted)

@@ -1,0 +1,210 @@
+"""Training of the refiner, the network of the learned pass, on finished streams.
+
+Every scene is streamed once. In each round, some views of every scene are compared with it as a learned pass does, and
+the network learns the change that makes *other* views look right: a step renders one of them and moves the network.
+Half of the steps take a comparison of this round, the other half one of any round so far. Then a pass with the new
+network revises the scenes, and the next round starts from there, so that the network also learns from scenes that it
+has already revised. No gradient flows through the comparison.
+"""
+
+import dataclasses
+import functools
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array, Int
+
+from ssplat_jax.cache.key_views import KeyViews
+from ssplat_jax.core.gaussians import Gaussians, mean_color
+from ssplat_jax.core.pytree import replace
+from ssplat_jax.model.streamsplat import StreamSplat
+from ssplat_jax.rasterizer import fill_holes, render
+from ssplat_jax.refinement.learned_pass import SeenErrors, add_view, learned_change, no_errors
+from ssplat_jax.refinement.present_rows import only_present, present_rows
+from ssplat_jax.refinement.refine_config import FOR_CAPTURES
+from ssplat_jax.refinement.refine_step import RefineState, init_refinement
+from ssplat_jax.refinement.refiner_weights import init_refiner
+from ssplat_jax.refinement.revision import Revision, apply_revision, bounded
+from ssplat_jax.refinement.view_loss import EFFECTS
+from ssplat_jax.training.streamed_scenes import SceneSources, captures_of, negative_psnr, stream_scene
+
+CONFIG = dataclasses.replace(FOR_CAPTURES, held_back=0.0, max_new=0.0)
+"""Configuration of the passes: that of captures, but no pixel is held back and no Gaussian is added."""
+
+SMALLEST = (16, 16)
+"""Smallest height and width of images to learn from."""
+
+SCORED_VIEWS = 3
+"""Views of each scene on which a round is scored."""
+
+
+@dataclasses.dataclass(frozen=True)
+class RefinerRecipe(SceneSources):
+    """Everything that decides the refiner, besides the scenes and the weights of the stream."""
+
+    rounds: int = 4
+    """Rounds; the scenes of a round have been revised by as many passes as there were rounds before it."""
+    steps: int = 250
+    """Gradient steps of a round."""
+    views: tuple[int, ...] = (16, 16, 8, 4)
+    """Views that a scene is compared with: each scene draws one of these numbers in every round."""
+    learning_rate: float = 4e-3
+    """Peak of the learning rate, from which it decays by a cosine over all rounds."""
+    warmup_steps: int = 20
+    """Steps of linear warm-up."""
+    clip_norm: float = 1.0
+    """Largest norm of the gradient."""
+    weight_decay: float = 1e-3
+    """Decoupled weight decay."""
+    black_weight: float = 0.4
+    """Weight of the PSNR over black; the rest is the PSNR with holes filled."""
+    ema_decay: float = 0.98
+    """Decay of the moving average of the parameters, which revises the scenes and is the result."""
+    seed: int = 0
+    """Seed of the first parameters and of the views."""
+
+
+@dataclasses.dataclass
+class _Lesson:
+    """A scene in one round: its state, what some views say about it, and the other views."""
+
+    key_views: KeyViews
+    max_pairs: int
+    state: RefineState
+    seen: SeenErrors
+    others: list[int]
+
+
+def train_refiner(
+    model: StreamSplat,
+    params: dict,
+    captures: Sequence[Path],
+    recipe: RefinerRecipe,
+    *,
+    on_scene: Callable[[str], None] = lambda name: None,
+    on_step: Callable[[int, dict[str, float]], None] = lambda step, record: None,
+) -> tuple[dict, dict]:
+    """Parameters of a trained refiner, and facts about the training.
+
+    Args:
+        model: the model whose scenes are refined.
+        params: its parameters.
+        captures: captures, or folders of them, to learn from besides the recipe's procedural scenes.
+        recipe: rounds, steps, rates and scenes.
+        on_scene: called with the name of each scene when it has been streamed.
+        on_step: called after each step with the number of steps done and the PSNR of its view, `shown_psnr` and
+            `black_psnr`, in dB.
+
+    Returns:
+        The parameters, and JSON facts: the scenes, and for each round the mean PSNRs of views that were not compared,
+        before and after the pass.
+
+    Raises:
+        InputError: a capture is unusable.
+    """
+    rng = np.random.default_rng(recipe.seed)
+    scenes, names, states = [], [], []
+    for capture, stride in captures_of(captures, recipe, SMALLEST):
+        scene = stream_scene(model, params, capture, stride)
+        gaussians = jax.jit(model.decode_shown, static_argnums=2)(params, scene.cache, scene.num_pivots)
+        scenes.append((scene.key_views, scene.max_pairs))
+        names.append(scene.name)
+        states.append(init_refinement(only_present(gaussians, present_rows(gaussians)), config=CONFIG))
+        on_scene(scene.name)
+    refiner = mean = init_refiner(recipe.seed)
+    idle = jax.tree.map(jnp.zeros_like, refiner)  # it changes nothing
+    optimizer = optax.chain(
+        optax.clip_by_global_norm(recipe.clip_norm),
+        optax.scale_by_adam(),
+        optax.add_decayed_weights(recipe.weight_decay),
+    )
+    moments, lessons, step, rounds = optimizer.init(refiner), [], 0, []
+    for _ in range(recipe.rounds):
+        fresh = [_lesson(*scene, state, recipe, rng) for scene, state in zip(scenes, states, strict=True)]
+        lessons += fresh
+        for _ in range(recipe.steps):
+            # Half of the steps learn from this round's scenes, the others from those of all rounds.
+            lesson = (fresh if step % 2 else lessons)[rng.integers(len(fresh if step % 2 else lessons))]
+            view = jnp.asarray(rng.choice(lesson.others), jnp.int32)
+            slope = _compiled(lesson.max_pairs, recipe.black_weight)
+            gradient, record = slope(refiner, lesson.state, lesson.seen, lesson.key_views, view)
+            if all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(gradient)):
+                updates, moments = optimizer.update(gradient, moments, refiner)
+                rate = _learning_rate(recipe, step)
+                refiner = jax.tree.map(lambda x, change, rate=rate: x - rate * change, refiner, updates)
+                mean = jax.tree.map(lambda m, x: recipe.ema_decay * m + (1 - recipe.ema_decay) * x, mean, refiner)
+            step += 1
+            on_step(step, {name: float(value) for name, value in record.items()})
+        rounds.append({"before": _scores(idle, fresh, recipe), "after": _scores(mean, fresh, recipe)})
+        states = [_after_pass(mean, lesson) for lesson in fresh]
+    return mean, {"scenes": names, "rounds": rounds}
+
+
+def _scores(refiner: dict, lessons: list[_Lesson], recipe: RefinerRecipe) -> dict[str, float]:
+    """Mean PSNRs after a pass with `refiner` on the first views that each lesson was not compared with."""
+    found = []
+    for lesson in lessons:
+        slope = _compiled(lesson.max_pairs, recipe.black_weight)
+        for view in lesson.others[:SCORED_VIEWS]:
+            found.append(slope(refiner, lesson.state, lesson.seen, lesson.key_views, jnp.asarray(view, jnp.int32))[1])
+    return {name: round(float(np.mean([scores[name] for scores in found])), 3) for name in found[0]}
+
+
+def _learning_rate(recipe: RefinerRecipe, step: int) -> float:
+    """Learning rate of a step: linear warm-up, times a cosine from the peak to a twentieth of it."""
+    warmup = min(1.0, (step + 1) / recipe.warmup_steps)
+    share = 0.05 + 0.95 * 0.5 * (1 + math.cos(math.pi * step / (recipe.rounds * recipe.steps)))
+    return recipe.learning_rate * warmup * share
+
+
+def _lesson(
+    key_views: KeyViews, max_pairs: int, state: RefineState, recipe: RefinerRecipe, rng: np.random.Generator
+) -> _Lesson:
+    """A scene, compared with some of its views."""
+    order = rng.permutation(key_views.num_slots)
+    num_seen = min(int(rng.choice(recipe.views)), key_views.num_slots // 2)
+    seen = no_errors(state.start)
+    for view in order[:num_seen]:
+        seen = _add_view(max_pairs)(seen, state, key_views, jnp.asarray(view, jnp.int32))
+    return _Lesson(key_views, max_pairs, state, seen, [int(view) for view in order[num_seen:]])
+
+
+@functools.lru_cache(maxsize=64)
+def _add_view(max_pairs: int):
+    def add(seen: SeenErrors, state: RefineState, key_views: KeyViews, view: Int[Array, ""]) -> SeenErrors:
+        return add_view(seen, state.start, state.revision, key_views, view, CONFIG, max_pairs)[0]
+
+    return jax.jit(add)
+
+
+def _after_pass(refiner: dict, lesson: _Lesson) -> RefineState:
+    """The lesson's state after a pass on what its views say.
+
+    The program returns the revision alone: a whole state would be a copy of the scene for every round.
+    """
+    return replace(lesson.state, revision=jax.jit(_moved)(refiner, lesson.state, lesson.seen))
+
+
+def _moved(refiner: dict, state: RefineState, seen: SeenErrors) -> Revision:
+    """The revision after a pass."""
+    change = learned_change(refiner, apply_revision(state.start, state.revision), seen)
+    return bounded(jax.tree.map(jnp.add, state.revision, change), CONFIG)
+
+
+@functools.lru_cache(maxsize=64)
+def _compiled(max_pairs: int, black_weight: float):
+    def loss(refiner: dict, state: RefineState, seen: SeenErrors, key_views: KeyViews, view: Int[Array, ""]):
+        gaussians: Gaussians = apply_revision(state.start, _moved(refiner, state, seen))
+        out = render(gaussians, key_views.camera(view), effects=EFFECTS, max_pairs=max_pairs)
+        target, exposure = key_views.images[view].astype(jnp.float32) / 255, key_views.exposures[view]
+        assert out.color is not None and out.alpha is not None
+        filled = fill_holes(out.color, out.alpha, mean_color(gaussians))
+        shown, black = (negative_psnr(x * exposure, target) for x in (filled, out.color))
+        return (1 - black_weight) * shown + black_weight * black, {"shown_psnr": -shown, "black_psnr": -black}
+
+    return jax.jit(jax.grad(loss, has_aux=True))

@@ -1,0 +1,124 @@
+"""Cameras against float64: frames, projection, and pixel centers; and voxel indices."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ssplat_jax.cache.voxels import INDEX_LIMIT, hash_voxels, voxel_indices
+from ssplat_jax.core.cameras import Camera, invert_poses, pixel_grid, project_points, transform_points, unproject
+from tests.core.test_rotations import rodrigues
+
+PIXELS = 2e-3  # float32 of pixel coordinates up to a few thousand, after a handful of operations
+RELATIVE = 2e-6
+
+
+def poses(num: int, reach: float, seed: int = 0) -> np.ndarray:
+    """Random rigid transforms in float64 with translations up to `reach`."""
+    rng = np.random.default_rng(seed)
+    out = np.tile(np.eye(4), (num, 1, 1))
+    for pose in out:
+        pose[:3, :3] = rodrigues(rng.normal(size=3), rng.uniform(-3, 3))
+        pose[:3, 3] = rng.uniform(-reach, reach, 3)
+    return out
+
+
+def intrinsics(num: int, seed: int = 0) -> np.ndarray:
+    """Random intrinsics with different focal lengths and an off-center principal point."""
+    rng = np.random.default_rng(seed)
+    Ks = np.tile(np.eye(3), (num, 1, 1))
+    Ks[:, 0, 0], Ks[:, 1, 1] = rng.uniform(200, 900, (2, num))
+    Ks[:, 0, 2], Ks[:, 1, 2] = rng.uniform(50, 400, (2, num))
+    return Ks
+
+
+def f32(x):
+    return jnp.asarray(x, jnp.float32)
+
+
+def test_inverse_of_poses():
+    for reach in (1.0, 1000.0):
+        matrices = poses(20, reach)
+        np.testing.assert_allclose(invert_poses(f32(matrices)), np.linalg.inv(matrices), atol=RELATIVE * max(1, reach))
+        back = invert_poses(invert_poses(f32(matrices)))
+        np.testing.assert_allclose(back, matrices, atol=RELATIVE * max(1, reach))
+
+
+def test_camera_center_is_the_translation_of_camtoworld():
+    camtoworlds = poses(7, 5.0)
+    camera = Camera(viewmats=f32(np.linalg.inv(camtoworlds)), Ks=f32(intrinsics(7)), width=10, height=8)
+    np.testing.assert_allclose(camera.centers, camtoworlds[:, :3, 3], atol=1e-5)
+    np.testing.assert_allclose(camera.camtoworlds, camtoworlds, atol=1e-5)
+
+
+def test_transform_is_rotation_then_translation():
+    matrices, points = poses(6, 3.0), np.random.default_rng(1).normal(size=(6, 11, 3))
+    wanted = np.einsum("bij,bnj->bni", matrices[:, :3, :3], points) + matrices[:, None, :3, 3]
+    np.testing.assert_allclose(transform_points(f32(matrices), f32(points)), wanted, atol=1e-5)
+
+
+def test_projection_undoes_unprojection():
+    rng = np.random.default_rng(2)
+    Ks, pixels = intrinsics(5), rng.uniform(-100, 2000, (5, 40, 2))
+    depths = np.exp(rng.uniform(np.log(0.01), np.log(1e4), (5, 40)))
+    points = unproject(f32(pixels), f32(depths), f32(Ks))
+    again, z = project_points(points, f32(Ks))
+    np.testing.assert_allclose(again, pixels, atol=PIXELS)
+    np.testing.assert_array_equal(z, f32(depths))
+
+
+def test_axes_are_right_down_forward():
+    K = f32([[100.0, 0, 32], [0, 100, 24], [0, 0, 1]])
+    pixels, depths = project_points(f32([[0.1, 0, 1], [0, 0.1, 1], [0, 0, 1]]), K)
+    np.testing.assert_allclose(pixels, [[42, 24], [32, 34], [32, 24]], atol=1e-5)
+    np.testing.assert_array_equal(depths, 1)
+
+
+def test_pixel_centers_are_at_half():
+    grid = pixel_grid(3, 5)
+    np.testing.assert_array_equal(grid[0, 0], [0.5, 0.5])
+    np.testing.assert_array_equal(grid[2, 4], [4.5, 2.5])  # (x, y) of row 2, column 4
+    coarse = pixel_grid(8, 12, 4)
+    assert coarse.shape == (2, 3, 2)
+    np.testing.assert_array_equal(coarse[1, 2], [10, 6])
+    # A cell's center is the mean of its pixels' centers.
+    np.testing.assert_array_equal(coarse[1, 2], pixel_grid(8, 12)[4:8, 8:12].mean(axis=(0, 1)))
+
+
+def test_points_behind_the_camera_project_to_finite_pixels():
+    points = f32([[1.0, 1, 0], [1, 1, -2], [1e3, -1e3, 1e-9], [0, 0, 0]])
+    K = f32([[500.0, 0, 32], [0, 500, 24], [0, 0, 1]])
+    pixels, depths = project_points(points, K, min_depth=1e-3)
+    np.testing.assert_array_equal(depths, points[:, 2])
+    np.testing.assert_allclose(pixels[1], [500 / 1e-3 + 32, 500 / 1e-3 + 24], rtol=1e-6)  # divided as min_depth
+    gradient = jax.grad(lambda p: jnp.sum(project_points(p, K, min_depth=1e-3)[0]))(points)
+    assert np.isfinite(pixels).all() and np.isfinite(gradient).all()
+
+
+def test_voxel_is_the_floor_and_out_of_range_is_marked():
+    points = f32([[0.0, 0.039, 0.041], [-0.001, -0.04, 1.0], [np.nan, 0, 0], [0, np.inf, 0], [0, 0, -1e30]])
+    voxels, in_range = voxel_indices(points, 0.04)
+    np.testing.assert_array_equal(voxels[:2], [[0, 0, 1], [-1, -1, 25]])
+    np.testing.assert_array_equal(in_range, [True, True, False, False, False])
+    np.testing.assert_array_equal(voxels[2:], 0)
+    edge = f32([[INDEX_LIMIT - 1, 0, 0], [INDEX_LIMIT, 0, 0], [1 - INDEX_LIMIT, 0, 0], [-INDEX_LIMIT, 0, 0]])
+    np.testing.assert_array_equal(voxel_indices(edge, 1.0)[1], [True, False, True, False])
+
+
+def test_a_point_between_two_points_of_a_voxel_is_in_that_voxel():
+    rng = np.random.default_rng(3)
+    a = f32(rng.uniform(-50, 50, (4000, 3)))
+    b = a + f32(rng.uniform(-0.02, 0.02, (4000, 3)))
+    va, vb = voxel_indices(a, 0.04)[0], voxel_indices(b, 0.04)[0]
+    same = np.asarray((va == vb).all(-1))
+    between = voxel_indices(jnp.clip(0.3 * a + 0.7 * b, jnp.minimum(a, b), jnp.maximum(a, b)), 0.04)[0]
+    assert same.sum() > 100
+    np.testing.assert_array_equal(between[same], va[same])
+
+
+def test_hashes_of_near_voxels_spread_over_the_low_bits():
+    side = np.arange(-16, 16)
+    voxels = jnp.asarray(np.stack(np.meshgrid(side, side, side), -1).reshape(-1, 3), jnp.int32)
+    hashes = np.asarray(hash_voxels(voxels))
+    assert len(np.unique(hashes)) > 0.999 * len(hashes)
+    buckets = np.bincount(hashes & 1023, minlength=1024)  # 32 a bucket; Poisson's deviation is 5.7
+    assert buckets.max() < 32 + 6 * 5.7 and buckets.min() > 0

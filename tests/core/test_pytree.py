@@ -1,0 +1,117 @@
+"""The pytree decorator: checked when built by hand, transparent to every transform."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jaxtyping import Array, Float, TypeCheckError
+
+from ssplat_jax.cache import init_cache
+from ssplat_jax.config import preset
+from ssplat_jax.core.cameras import Camera
+from ssplat_jax.core.gaussians import Gaussians, mask_gaussians
+from ssplat_jax.core.pytree import pytree, replace, static
+from ssplat_jax.data.open_capture import open_capture
+
+
+@pytree
+class Body:
+    mass: Float[Array, "*b"]
+    speed: Float[Array, "*b 3"]
+    name: str = static(default="ball")
+
+
+def body(n: int = 4, name: str = "ball") -> Body:
+    return Body(mass=jnp.arange(n, dtype=jnp.float32), speed=jnp.ones((n, 3)), name=name)
+
+
+def gaussians(n: int) -> Gaussians:
+    return Gaussians.from_rgb(
+        means=jnp.ones((n, 3)),
+        quats=jnp.ones((n, 4)),
+        scales=jnp.ones((n, 3)),
+        opacities=jnp.linspace(0.1, 0.9, n),
+        colors=jnp.full((n, 3), 0.5),
+    )
+
+
+def test_leaves_are_the_arrays_in_order_with_readable_paths():
+    paths = [jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_flatten_with_path(body())[0]]
+    assert paths == [".mass", ".speed"]
+
+
+def test_only_a_change_of_statics_recompiles():
+    traces = []
+
+    @jax.jit
+    def momentum(b):
+        traces.append(b.name)
+        return b.mass[:, None] * b.speed
+
+    momentum(body())
+    momentum(replace(body(), mass=jnp.zeros(4)))
+    assert traces == ["ball"]
+    momentum(body(name="brick"))
+    assert traces == ["ball", "brick"]
+    assert jax.tree.structure(body()) != jax.tree.structure(body(name="brick"))
+
+
+def test_transforms_rebuild_it():
+    def energy(b):
+        return jnp.sum(b.mass[..., None] * b.speed**2)
+
+    gradient = jax.grad(energy)(body())
+    assert isinstance(gradient, Body) and gradient.name == "ball"
+    np.testing.assert_allclose(gradient.speed, 2 * body().mass[:, None] * body().speed)
+    np.testing.assert_allclose(jax.vmap(energy)(body()), 3 * body().mass)
+    carried, _ = jax.lax.scan(lambda b, _: (replace(b, mass=b.mass + 1.0), None), body(), length=3)
+    np.testing.assert_allclose(carried.mass, body().mass + 3)
+    assert jax.eval_shape(lambda b: b, body()).speed.shape == (4, 3)
+    assert jax.tree.map(lambda _: None, body()).mass is None
+
+
+def test_it_is_frozen():
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        body().mass = jnp.zeros(4)  # pyright: ignore[reportAttributeAccessIssue]
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"opacities": jnp.zeros(5)},  # another number of rows
+        {"quats": jnp.zeros((4, 3))},  # another width
+        {"means": jnp.zeros((4, 3), jnp.int32)},  # another type
+    ],
+    ids=str,
+)
+def test_building_by_hand_is_checked(fields):
+    with pytest.raises(TypeCheckError):
+        replace(gaussians(4), **fields)
+
+
+def test_a_camera_of_a_batch():
+    viewmats = jnp.stack([jnp.eye(4).at[0, 3].set(float(i)) for i in range(3)])
+    cameras = Camera(viewmats=viewmats, Ks=jnp.broadcast_to(jnp.eye(3), (3, 3, 3)), width=5, height=4)
+    assert cameras[1].viewmats[0, 3] == 1 and (cameras[1].width, cameras[1].height) == (5, 4)
+    np.testing.assert_array_equal(cameras[1:].centers[:, 0], [-1, -2])
+
+
+def test_masked_gaussians_are_absent_and_harmless():
+    spoiled = replace(gaussians(3), means=gaussians(3).means.at[1].set(jnp.nan), scales=jnp.full((3, 3), jnp.inf))
+    masked = mask_gaussians(spoiled, jnp.array([True, False, False]))
+    np.testing.assert_array_equal(masked.opacities[1:], 0)
+    assert np.isfinite(masked.means).all() and np.isfinite(masked.scales[1:]).all()
+    np.testing.assert_array_equal(masked.quats[1:], [[1, 0, 0, 0]] * 2)
+    assert np.isinf(masked.scales[0]).all()  # what is kept is kept as it is
+
+
+def test_printed_arrays_are_dtype_and_shape():
+    camera = Camera(viewmats=jnp.eye(4), Ks=jnp.eye(3), width=8, height=6)
+    assert repr(camera) == "Camera(viewmats=float32[4, 4], Ks=float32[3, 3], width=8, height=6)"
+    assert repr(jax.tree.map(lambda x: None, camera)) == "Camera(viewmats=None, Ks=None, width=8, height=6)"
+    cache = repr(init_cache(preset("tiny").replace(capacity=128)))
+    assert len(cache) < 1200 and "stats=CacheStats(" in cache
+    capture = open_capture("procedural:room?frames=2&size=32x24")
+    assert repr(capture) == "Capture('procedural-room', procedural, 2 frames of 32x24)"

@@ -1,0 +1,101 @@
+"""Rotations against Rodrigues' formula in float64, also where formulas could divide by zero."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ssplat_jax.core.rotations import matrices_to_quats, multiply_quats, quats_to_matrices
+
+FLOAT32 = 1e-6  # a few roundings of numbers up to 1
+AXES = np.array(
+    [
+        [1, 0, 0],
+        [0, 1, 0],
+        [0, 0, 1],
+        [1, 1, 0],
+        [0, 1, 1],
+        [1, 0, 1],
+        [1, 1, 1],
+        [-1, 2, 3],
+        [1, -1, 0],
+        [1e-4, 1, 1e-5],
+    ],
+    float,
+)
+ANGLES = np.array([0.0, 1e-8, 1e-4, 0.3, np.pi / 2, 2 * np.pi / 3, 3.0, np.pi - 1e-3, np.pi - 1e-6, np.pi])
+
+
+def rodrigues(axis, angle):
+    """Rodrigues' formula, R = I + sin(a) K + (1 - cos(a)) K^2, in float64."""
+    x, y, z = axis / np.linalg.norm(axis)
+    K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K
+
+
+def cases():
+    """Quaternions and matrices of every axis and angle, in float64."""
+    quats, matrices = [], []
+    for axis in AXES:
+        for angle in np.r_[ANGLES, -ANGLES]:
+            unit = axis / np.linalg.norm(axis)
+            quats.append(np.r_[np.cos(angle / 2), np.sin(angle / 2) * unit])
+            matrices.append(rodrigues(axis, angle))
+    return np.array(quats), np.array(matrices)
+
+
+def test_quaternions_are_the_rotations_of_rodrigues():
+    quats, matrices = cases()
+    np.testing.assert_allclose(quats_to_matrices(jnp.asarray(quats, jnp.float32)), matrices, atol=FLOAT32)
+
+
+@pytest.mark.parametrize("length", [1e-9, 1e-3, 7.0, 1e20])
+def test_length_and_sign_of_a_quaternion_do_not_matter(length):
+    quats, matrices = cases()
+    for sign in (1, -1):
+        got = quats_to_matrices(jnp.asarray(sign * length * quats, jnp.float32))
+        np.testing.assert_allclose(got, matrices, atol=FLOAT32)
+
+
+def test_matrices_to_quats_gives_unit_quats_of_the_rotation():
+    _, matrices = cases()
+    quats = np.asarray(matrices_to_quats(jnp.asarray(matrices, jnp.float32)), np.float64)
+    np.testing.assert_allclose(np.linalg.norm(quats, axis=-1), 1.0, atol=FLOAT32)
+    assert (quats[:, 0] >= 0).all()
+    np.testing.assert_allclose(quats_to_matrices(jnp.asarray(quats, jnp.float32)), matrices, atol=2 * FLOAT32)
+
+
+def test_quat_to_matrix_and_back_is_the_quat_up_to_sign():
+    quats, _ = cases()
+    got = np.asarray(matrices_to_quats(quats_to_matrices(jnp.asarray(quats, jnp.float32))), np.float64)
+    np.testing.assert_allclose(np.abs(np.sum(got * quats, axis=-1)), 1.0, atol=FLOAT32)
+
+
+def test_the_product_is_the_composition():
+    quats, matrices = cases()
+    order = np.random.default_rng(0).permutation(len(quats))
+    product = multiply_quats(jnp.asarray(quats, jnp.float32), jnp.asarray(quats[order], jnp.float32))
+    np.testing.assert_allclose(quats_to_matrices(product), matrices @ matrices[order], atol=2 * FLOAT32)
+
+
+def test_batches_of_any_rank_are_the_rows_one_by_one():
+    quats, matrices = cases()
+    got = quats_to_matrices(jnp.asarray(quats.reshape(10, 4, 5, 4), jnp.float32))
+    np.testing.assert_allclose(got, matrices.reshape(10, 4, 5, 3, 3), atol=FLOAT32)
+    assert matrices_to_quats(got).shape == (10, 4, 5, 4)
+
+
+def test_zero_quaternions_are_the_identity_with_a_zero_gradient():
+    tiny = jnp.array([[0.0, 0, 0, 0], [1e-13, 0, -1e-13, 0]])
+    np.testing.assert_array_equal(quats_to_matrices(tiny), np.broadcast_to(np.eye(3), (2, 3, 3)))
+    gradient = jax.grad(lambda q: jnp.sum(quats_to_matrices(q) * jnp.arange(9.0).reshape(3, 3)))(tiny)
+    np.testing.assert_array_equal(gradient, 0)
+
+
+def test_gradients_are_finite_at_every_angle():
+    quats, matrices = cases()
+    weight = jnp.arange(9.0).reshape(3, 3)
+    gradient = jax.grad(lambda q: jnp.sum(quats_to_matrices(q) * weight))(jnp.asarray(quats, jnp.float32))
+    assert np.isfinite(gradient).all() and np.abs(gradient).max() > 1
+    gradient = jax.grad(lambda m: jnp.sum(matrices_to_quats(m) * jnp.arange(4.0)))(jnp.asarray(matrices, jnp.float32))
+    assert np.isfinite(gradient).all() and np.abs(gradient).max() > 0.1

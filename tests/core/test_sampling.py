@@ -1,0 +1,126 @@
+"""Warped correlation and its gradients against an oracle in float64 that warps first and then correlates."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ssplat_jax.core.sampling import bilinear_taps, correlate_warped, neighbor_offsets
+
+FLOAT32 = 2e-5  # sums of a dozen products of unit normals
+HEIGHT, WIDTH, CHANNELS = 5, 7, 6
+
+
+def coordinates(seed: int = 0) -> np.ndarray:
+    """Positions (x, y) `[d n 2]` inside the map, on samples, on the border and outside."""
+    rng = np.random.default_rng(seed)
+    coords = rng.uniform([-2, -2], [WIDTH + 1, HEIGHT + 1], (4, 15, 2))
+    coords[0, :3] = [[0, 0], [WIDTH - 1, HEIGHT - 1], [3, 2]]
+    return coords
+
+
+def arrays(seed: int = 0):
+    rng = np.random.default_rng(seed)
+    return rng.normal(size=(15, CHANNELS)), rng.normal(size=(HEIGHT, WIDTH, CHANNELS))
+
+
+def warp_then_correlate(reference, image, coords):
+    """Bilinear interpolation point by point, clamped at the border, then dot products."""
+    out = np.zeros(coords.shape[:2])
+    for d, n in np.ndindex(*out.shape):
+        x, y = np.clip(coords[d, n], 0, [WIDTH - 1, HEIGHT - 1])
+        column, row = min(int(x), WIDTH - 2), min(int(y), HEIGHT - 2)
+        fx, fy = x - column, y - row
+        top = (1 - fx) * image[row, column] + fx * image[row, column + 1]
+        bottom = (1 - fx) * image[row + 1, column] + fx * image[row + 1, column + 1]
+        out[d, n] = ((1 - fy) * top + fy * bottom) @ reference[n]
+    return out
+
+
+def f32(x):
+    return jnp.asarray(x, jnp.float32)
+
+
+def taps_at(coords):
+    x, y = np.moveaxis(np.asarray(coords, np.float32), -1, 0)
+    return bilinear_taps(jnp.asarray(x), jnp.asarray(y), HEIGHT, WIDTH)
+
+
+def read(values, at):
+    """Values of a map at the taps `at`, from the four samples and weights."""
+    to_right, to_below = neighbor_offsets(*values.shape)
+    flat = values.reshape(-1)
+    above, below = (
+        (1 - at.right) * flat[at.corners + step] + at.right * flat[at.corners + step + to_right]
+        for step in (0, to_below)
+    )
+    return (1 - at.down) * above + at.down * below
+
+
+@pytest.mark.parametrize("channels", [6, 16, 48, 1])
+def test_correlation_is_that_of_the_warped_map(channels):
+    rng = np.random.default_rng(5)
+    reference, source = rng.normal(size=(15, channels)), rng.normal(size=(HEIGHT, WIDTH, channels))
+    got = correlate_warped(f32(reference), f32(source), taps_at(coordinates()))
+    np.testing.assert_allclose(got, warp_then_correlate(reference, source, coordinates()), atol=FLOAT32)
+
+
+def test_gradients_are_those_of_the_plain_sum():
+    reference, source = map(f32, arrays(1))
+    at = taps_at(coordinates(1))
+    cotangent = f32(np.random.default_rng(2).normal(size=(4, 15)))
+
+    def plain(reference, source):
+        warped = jax.vmap(lambda channel: read(channel, at), in_axes=-1, out_axes=-1)(source)
+        return jnp.sum(cotangent * jnp.sum(warped * reference, axis=-1))
+
+    def fast(reference, source):
+        return jnp.sum(cotangent * correlate_warped(reference, source, at))
+
+    wanted, got = jax.grad(plain, (0, 1))(reference, source), jax.jit(jax.grad(fast, (0, 1)))(reference, source)
+    for w, g in zip(wanted, got, strict=True):
+        np.testing.assert_allclose(g, w, atol=FLOAT32)
+
+
+def test_gradient_is_the_finite_difference_of_the_oracle():
+    """The function is bilinear, so difference quotients are exact for any step."""
+    (reference, source), coords = arrays(3), coordinates(3)
+    total = lambda r, s: jnp.sum(correlate_warped(r, s, taps_at(coords)))  # noqa: E731
+    by_reference, by_source = jax.grad(total, (0, 1))(f32(reference), f32(source))
+    rng = np.random.default_rng(4)
+    step_reference, step_source = rng.normal(size=reference.shape), rng.normal(size=source.shape)
+    oracle = lambda r, s: warp_then_correlate(r, s, coords).sum()  # noqa: E731
+    difference = oracle(reference + step_reference, source) - oracle(reference, source)
+    assert np.sum(np.asarray(by_reference) * step_reference) == pytest.approx(difference, abs=1e-3)
+    difference = oracle(reference, source + step_source) - oracle(reference, source)
+    assert np.sum(np.asarray(by_source) * step_source) == pytest.approx(difference, abs=1e-3)
+
+
+VALUES = jnp.arange(HEIGHT * WIDTH, dtype=jnp.float32).reshape(HEIGHT, WIDTH)
+
+
+def test_sampling_at_a_sample_reads_that_sample():
+    ys, xs = np.meshgrid(np.arange(HEIGHT), np.arange(WIDTH), indexing="ij")
+    np.testing.assert_array_equal(read(VALUES, taps_at(np.stack([xs, ys], -1))), VALUES)
+
+
+def test_positions_outside_read_the_nearest_border_sample():
+    at = taps_at([[-5, 2], [1e30, -1e30], [np.inf, -np.inf], [np.nan, np.nan], [3, 99]])
+    nearest = [2 * WIDTH, WIDTH - 1, WIDTH - 1, 0, (HEIGHT - 1) * WIDTH + 3]
+    np.testing.assert_array_equal(read(VALUES, at), nearest)
+    # All four samples lie in the map.
+    assert ((at.corners >= 0) & (at.corners + sum(neighbor_offsets(HEIGHT, WIDTH)) < HEIGHT * WIDTH)).all()
+    for share in (at.right, at.down):
+        assert ((share >= 0) & (share <= 1)).all()
+
+
+@pytest.mark.parametrize(("height", "width"), [(1, 1), (1, 3), (3, 1)])
+def test_maps_with_a_side_of_one_sample(height, width):
+    rng = np.random.default_rng(0)
+    source, x, y = rng.normal(size=(height, width, 4)), rng.uniform(-1, 4, (2, 5)), rng.uniform(-1, 4, (2, 5))
+    at = bilinear_taps(f32(x), f32(y), height, width)
+    assert ((at.corners >= 0) & (at.corners + sum(neighbor_offsets(height, width)) < height * width)).all()
+    got = correlate_warped(jnp.ones((5, 4)), f32(source), at)
+    along = source.sum(axis=-1).reshape(-1)
+    wanted = np.interp(x if width > 1 else y, np.arange(len(along)), along)
+    np.testing.assert_allclose(got, wanted, atol=FLOAT32)

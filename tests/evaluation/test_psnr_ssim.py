@@ -1,0 +1,183 @@
+"""PSNR and SSIM against their definitions in float64, and the SSIM in JAX against that on the host."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ssplat_jax.core.errors import InputError
+from ssplat_jax.evaluation import differentiable_ssim
+from ssplat_jax.evaluation.psnr_ssim import SSIM_ARGUMENTS, psnr, ssim
+
+ROUNDING = 1e-9  # float64 sums in another order
+SSIM_SIGMA = 1.5
+SSIM_PARITY = 1e-5  # float32 against float64
+
+
+def image(seed: int, height: int = 24, width: int = 31) -> np.ndarray:
+    """Blocky noise in [0, 1], with structure at the scale of the window."""
+    rng = np.random.default_rng(seed)
+    coarse = rng.uniform(size=(height // 4 + 2, width // 4 + 2, 3))
+    return np.repeat(np.repeat(coarse, 4, axis=0), 4, axis=1)[:height, :width].astype(np.float32)
+
+
+def ssim_by_definition(a: np.ndarray, b: np.ndarray) -> float:
+    """SSIM window by window: Gaussian weights, sample covariances, windows inside the image."""
+    side = SSIM_ARGUMENTS["win_size"]
+    taps = np.exp(-0.5 * ((np.arange(side) - side // 2) / SSIM_SIGMA) ** 2)
+    weights = np.outer(taps, taps) / np.outer(taps, taps).sum()
+    unbias = side**2 / (side**2 - 1)
+    c1, c2 = 0.01**2, 0.03**2
+    values = []
+    for row in range(a.shape[0] - side + 1):
+        for column in range(a.shape[1] - side + 1):
+            x, y = (z[row : row + side, column : column + side].astype(np.float64) for z in (a, b))
+            mx, my = (np.einsum("ij,ijc->c", weights, z) for z in (x, y))
+            vx, vy, vxy = (
+                unbias * (np.einsum("ij,ijc->c", weights, p * q) - mp * mq)
+                for p, q, mp, mq in ((x, x, mx, mx), (y, y, my, my), (x, y, mx, my))
+            )
+            values.append((2 * mx * my + c1) * (2 * vxy + c2) / ((mx**2 + my**2 + c1) * (vx + vy + c2)))
+    return float(np.mean(values))
+
+
+def test_psnr_of_a_constant_error_is_its_logarithm():
+    dark = np.full((5, 7, 3), 0.25)
+    assert psnr(dark, dark + 0.1) == pytest.approx(20.0, abs=ROUNDING)
+    assert psnr(dark, dark + 0.01) == pytest.approx(40.0, abs=ROUNDING)
+
+
+def test_psnr_averages_squared_errors_over_all_pixels():
+    half_wrong = np.zeros((2, 2, 3))
+    half_wrong[0] = 0.2
+    assert psnr(half_wrong, np.zeros((2, 2, 3))) == pytest.approx(-10 * np.log10(0.02), abs=ROUNDING)
+
+
+def test_equal_images_score_100_db_and_one():
+    a = image(0)
+    assert psnr(a, a) == 100.0 and ssim(a, a) == pytest.approx(1.0, abs=ROUNDING)
+    assert json.loads(json.dumps(psnr(a, a), allow_nan=False)) == 100.0
+
+
+def test_ssim_is_the_published_definition():
+    a, b = image(1), image(2)
+    for other in (b, np.clip(a + 0.1, 0, 1), 0.5 * a + 0.5 * b):
+        assert ssim(a, other) == pytest.approx(ssim_by_definition(a, other), abs=1e-6)
+
+
+@pytest.mark.parametrize("score", [psnr, ssim])
+def test_values_outside_the_range_count_as_its_ends(score):
+    a, b = image(3), image(4)
+    beyond = np.where(b > 0.5, b + 3.0, b - 3.0)
+    assert score(a, beyond) == pytest.approx(score(a, (b > 0.5).astype(np.float32)), abs=ROUNDING)
+
+
+@pytest.mark.parametrize("score", [psnr, ssim])
+def test_nan_gives_nan(score):
+    a = image(5)
+    spoiled = a.copy()
+    spoiled[3, 4, 1] = np.nan
+    assert np.isnan(score(a, spoiled))
+
+
+@pytest.mark.parametrize("score", [psnr, ssim])
+def test_images_of_two_sizes_are_refused(score):
+    # NumPy would broadcast (1, 1, 3).
+    with pytest.raises(InputError, match="one size"):
+        score(image(6), image(6)[:1, :1])
+
+
+def test_the_smallest_image_is_eleven_pixels():
+    assert ssim(image(7, 11, 11), image(7, 11, 11)) == pytest.approx(1.0)
+    with pytest.raises(InputError, match="11 pixels a side, got 31x10"):
+        ssim(image(7, 10, 31), image(7, 10, 31))
+    with pytest.raises(InputError, match="at least 1"):
+        psnr(np.zeros((0, 4, 3)), np.zeros((0, 4, 3)))
+
+
+# -- SSIM in JAX ------------------------------------------------------------------------------------------------------
+
+
+def noise(seed: int, height: int, width: int) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(size=(height, width, 3)).astype(np.float32)
+
+
+def flat(value: float, height: int = 24, width: int = 31) -> np.ndarray:
+    return np.full((height, width, 3), value, np.float32)
+
+
+def halves(low: float, high: float) -> np.ndarray:
+    """Two flat halves."""
+    x = flat(low)
+    x[:, 15:] = high
+    return x
+
+
+SSIM_PAIRS = {
+    "noise": (noise(10, 24, 31), noise(11, 24, 31)),
+    "structure": (image(12), np.clip(image(12) + 0.1 * noise(13, 24, 31), 0, 1)),
+    "portrait": (image(14, 41, 13), image(15, 41, 13)),
+    "smallest": (noise(16, 11, 11), noise(17, 11, 11)),
+    "two grays": (flat(0.9), flat(0.8)),
+    "black and white": (flat(0.0), flat(1.0)),
+    "halves": (halves(0.05, 0.97), halves(0.06, 0.96)),
+    "flat against noise": (flat(0.7), noise(18, 24, 31)),
+    "nearly flat": (flat(0.93) + 1e-3 * noise(19, 24, 31), flat(0.93) + 1e-3 * noise(20, 24, 31)),
+}
+
+
+jax_ssim = jax.jit(differentiable_ssim.ssim)
+plainly = pytest.mark.usefixtures("compiled_plainly")
+
+
+@plainly
+@pytest.mark.parametrize("pair", SSIM_PAIRS)
+def test_ssim_in_jax_is_scikit_images(pair):
+    a, b = SSIM_PAIRS[pair]
+    assert float(jax_ssim(jnp.asarray(a), jnp.asarray(b))) == pytest.approx(ssim(a, b), abs=SSIM_PARITY)
+
+
+@plainly
+def test_ssim_in_jax_takes_leading_axes():
+    a, b = (np.stack([SSIM_PAIRS[name][i] for name in ("noise", "structure", "halves")])[:, None] for i in (0, 1))
+    scores = jax_ssim(jnp.asarray(a), jnp.asarray(b))
+    assert scores.shape == (3, 1)
+    wanted = [ssim(x[0], y[0]) for x, y in zip(a, b, strict=True)]
+    np.testing.assert_allclose(scores[:, 0], wanted, atol=SSIM_PARITY)
+
+
+ssim_gradient = jax.jit(jax.grad(differentiable_ssim.ssim))
+
+
+@plainly
+def test_ssim_gradient_is_finite_and_zero_at_equal_images():
+    for name in ("noise", "two grays", "black and white", "halves"):
+        a, b = map(jnp.asarray, SSIM_PAIRS[name])
+        assert np.isfinite(ssim_gradient(a, b)).all(), name
+        np.testing.assert_allclose(ssim_gradient(a, a), 0, atol=1e-7, err_msg=name)
+
+
+@plainly
+def test_ssim_gradient_is_the_finite_difference():
+    a, b = (x.astype(np.float64) for x in SSIM_PAIRS["structure"])
+    direction = np.random.default_rng(21).normal(size=a.shape)
+    step = 1e-5
+    inside = 0.02 + 0.96 * a  # the SSIM on the host clips
+    slope = (ssim(inside + step * direction, b) - ssim(inside - step * direction, b)) / (2 * step)
+    gradient = ssim_gradient(jnp.asarray(inside, jnp.float32), jnp.asarray(b, jnp.float32))
+    assert float((np.asarray(gradient, np.float64) * direction).sum()) == pytest.approx(slope, rel=1e-3)
+
+
+@plainly
+def test_ssim_in_jax_does_not_clip():
+    # A gradient must bring colors back into the range.
+    a, white, beyond = (jnp.asarray(flat(value)) for value in (0.9, 1.0, 1.5))
+    assert float(jax_ssim(a, beyond)) < 0.95 < float(jax_ssim(a, white))
+
+
+def test_ssim_in_jax_refuses_images_smaller_than_the_window():
+    small = jnp.zeros((10, 31, 3))
+    with pytest.raises(InputError, match="11 pixels a side, got 31x10"):
+        differentiable_ssim.ssim(small, small)

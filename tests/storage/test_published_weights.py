@@ -1,0 +1,170 @@
+"""Import of ReSplat's checkpoints: every tensor has its place, and other files are refused."""
+
+import jax
+import numpy as np
+import pytest
+
+from ssplat_jax.config import StreamConfig, preset
+from ssplat_jax.core.errors import InputError
+from ssplat_jax.model import init_params
+from ssplat_jax.storage.published_weights import (
+    DEPTH,
+    as_published,
+    import_params,
+    published_tensor,
+    published_tensors,
+)
+from ssplat_jax.storage.weights import load_params
+from tests.model.resplat_fixture import listed_tensors
+
+CONFIG = preset("small").replace(mixer_blocks=1)
+HEAD = "encoder.gaussian_head."
+
+
+@pytest.fixture(scope="module")
+def tensors() -> dict[str, np.ndarray]:
+    """Checkpoint in which every tensor has its own constant value."""
+    shapes = {t.name: t.shape for t in published_tensors(CONFIG).values() if t is not None}
+    return {name: np.full(shape, i, np.float32) for i, (name, shape) in enumerate(shapes.items())}
+
+
+@pytest.fixture(scope="module")
+def depth_network(tensors, tmp_path_factory):
+    """File of the depth network alone, without the prefix of the model around it."""
+    path = tmp_path_factory.mktemp("upstream") / "depth.npz"
+    np.savez(path, **{name.removeprefix(DEPTH): x for name, x in tensors.items() if name.startswith(DEPTH)})
+    return path
+
+
+@pytest.mark.parametrize("name", ["paper", "small", "base"])
+def test_imported_weights_are_run_as_their_code_ran_them(name):
+    config, before = as_published(preset(name)), preset(name)
+    assert config.network.upstream_compat and config.depth.depth_readout == "mean"
+    assert config.replace(upstream_compat=False, depth_readout=before.depth.depth_readout) == before
+    assert {path.split("/")[0] for path, tensor in published_tensors(config).items() if tensor is None} == {
+        "hpda",
+        "cgfi",
+    }
+
+
+def test_every_published_tensor_has_a_place_and_a_shape():
+    ours = {t.name: t.shape for t in published_tensors(preset("small")).values() if t is not None}
+    assert ours == listed_tensors("resplat_small")
+
+
+@pytest.mark.parametrize(
+    ("place", "shape", "name", "theirs"),
+    [
+        (
+            "encoder/backbone/layer1_0/conv1/kernel",
+            (3, 3, 5, 7),
+            f"{DEPTH}backbone.layer1.0.conv1.weight",
+            (7, 5, 3, 3),
+        ),
+        (
+            "encoder/backbone/layer2_0/downsample_0/kernel",
+            (5, 7),
+            f"{DEPTH}backbone.layer2.0.downsample.0.weight",
+            (7, 5, 1, 1),
+        ),
+        ("encoder/pretrained/blocks_11/ls1/gamma", (5,), f"{DEPTH}pretrained.blocks.11.ls1.gamma", (5,)),
+        (
+            "cost_volume/regressor_0_3/input_blocks_5_1/qkv/kernel",
+            (5, 7),
+            f"{DEPTH}regressor.0.3.input_blocks.5.1.qkv.weight",
+            (7, 5, 1),
+        ),
+        ("upsampler/resize_layers_1/kernel", (2, 2, 5, 7), f"{DEPTH}upsampler.resize_layers.1.weight", (5, 7, 2, 2)),
+        ("upsampler/resize_layers_3/kernel", (3, 3, 5, 7), f"{DEPTH}upsampler.resize_layers.3.weight", (7, 5, 3, 3)),
+        ("mixer/blocks_0/norm1/scale", (5,), "encoder.pt.blocks.0.norm1.weight", (5,)),
+        ("decoder/gaussian_head_2/kernel", (5, 7), f"{HEAD}2.weight", (7, 5)),
+    ],
+)
+def test_a_parameter_is_found_by_its_name(place, shape, name, theirs):
+    tensor = published_tensor(tuple(place.split("/")), shape)
+    assert tensor is not None and (tensor.name, tensor.shape) == (name, theirs)
+    x = np.random.default_rng(0).normal(size=theirs)
+    came = tensor.to_parameter(x)
+    assert came.shape == shape
+    if len(shape) > 1:  # entry (in 2, out 4); the order differs for transposed convolutions
+        index = (2, 4) if theirs[0] == 5 else (4, 2)
+        np.testing.assert_array_equal(came[..., 2, 4].reshape(-1), x[index].reshape(-1))
+
+
+def test_hpda_and_cgfi_have_no_published_tensor():
+    assert published_tensor(("hpda", "raw_gamma"), ()) is None
+    assert published_tensor(("cgfi", "enter", "kernel"), (3, 3, 5, 7)) is None
+
+
+@pytest.mark.slow
+def test_a_depth_network_leaves_other_parts_initialized(depth_network, tensors):
+    imported = import_params(depth_network, CONFIG, seed=5)
+    assert imported.initialized_parts == ("gaussian_regressor", "pt", "gaussian_head")
+    assert imported.num_imported == sum(name.startswith(DEPTH) for name in tensors) and imported.num_unused == 0
+    wanted = jax.eval_shape(lambda key: init_params(key, CONFIG), jax.random.key(0))
+    shapes = lambda tree: jax.tree.map(lambda x: (x.shape, x.dtype), tree)  # noqa: E731
+    assert shapes(imported.params) == shapes(wanted)
+    for place, tensor in published_tensors(CONFIG).items():
+        if tensor is not None and tensor.name.startswith(DEPTH):
+            leaf = imported.params
+            for name in place.split("/"):
+                leaf = leaf[name]
+            assert float(leaf.reshape(-1)[0]) == tensors[tensor.name].reshape(-1)[0], place
+    fresh = init_params(jax.random.key(5), CONFIG, ("hpda", "tokens", "cgfi", "mixer", "decoder"))
+    for name, stage in fresh.items():
+        jax.tree.map(np.testing.assert_array_equal, imported.params[name], stage)
+
+
+@pytest.mark.slow
+def test_the_depth_network_of_depthsplat_can_be_imported(tmp_path, tensors):
+    path = tmp_path / "depthsplat.ckpt.npz"
+    other = {f"{HEAD}0.weight": np.zeros((37, 64, 3, 3), np.float32), "encoder.feature_upsampler.x": np.zeros(3)}
+    pretrained = {name: x for name, x in tensors.items() if ".pretrained." in name or ".backbone." in name}
+    np.savez(path, **pretrained, **other)
+    with pytest.raises(InputError, match=r"encoder\.gaussian_head"):
+        import_params(path, CONFIG)
+    imported = import_params(path, CONFIG, depth_only=True)
+    assert imported.num_imported == len(pretrained) and imported.num_unused == 2
+    assert {"transformer", "upsampler", "regressor", "gaussian_head"} <= set(imported.initialized_parts)
+    assert not {"backbone", "pretrained"} & set(imported.initialized_parts)
+    name = f"{DEPTH}backbone.conv1.weight"
+    assert float(imported.params["encoder"]["backbone"]["conv1"]["kernel"][0, 0, 0, 0]) == tensors[name].flat[0]
+
+
+def saved(path, **arrays):
+    np.savez(path, **arrays)
+    return path
+
+
+def test_files_of_other_networks_are_refused(tmp_path, tensors):
+    head = {name: x for name, x in tensors.items() if name.startswith(HEAD)}
+    path = tmp_path / "a.npz"
+    with pytest.raises(InputError, match=r"wanted a preset of ReSplat's network \(paper, small, base\), got 'tiny'"):
+        import_params(saved(path, **head), StreamConfig())
+    with pytest.raises(InputError, match=r"a\.npz: wanted weights of ReSplat, .* none of their \d+ tensors"):
+        import_params(saved(path, **{"encoder.other.weight": np.zeros(3, np.float32)}), CONFIG)
+    lacking = {name: x for name, x in head.items() if not name.endswith("2.bias")}
+    with pytest.raises(InputError, match=r"a\.npz: wanted an array encoder\.gaussian_head\.2\.bias, the file has none"):
+        import_params(saved(path, **lacking), CONFIG)
+    other = head | {f"{HEAD}2.bias": np.zeros(37, np.float32)}
+    with pytest.raises(InputError, match=r"wanted encoder\.gaussian_head\.2\.bias of shape \(58,\), got \(37,\)"):
+        import_params(saved(path, **other), CONFIG)
+    with pytest.raises(InputError, match="cannot be read"):
+        import_params(tmp_path / "nothing.pth", CONFIG)
+
+
+def test_errors_list_only_presets_with_shipped_weights():
+    with pytest.raises(InputError, match=r"a preset with shipped weights \(tiny\) or a file, got 'huge'"):
+        load_params("huge")
+
+
+def test_a_preset_without_shipped_weights_says_how_to_get_them():
+    with pytest.raises(
+        InputError, match=r"none ship with the preset 'small'; convert ReSplat's \(ssplat import-weights"
+    ):
+        load_params("small")
+
+
+def test_a_stage_without_parameters_is_imported_as_one(depth_network):
+    config = CONFIG.replace(mixer_blocks=0)
+    assert import_params(depth_network, config).params["mixer"] == {}

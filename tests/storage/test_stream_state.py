@@ -1,0 +1,159 @@
+"""Stream states on disk are read back exactly, or refused by name."""
+
+import contextlib
+import json
+import resource
+import shutil
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ssplat_jax.cache import init_cache
+from ssplat_jax.core.atomic import previous_path
+from ssplat_jax.core.errors import InputError, StorageError
+from ssplat_jax.core.pytree import replace
+from ssplat_jax.storage.stream_state import load_newest_state, load_state, save_state
+from tests.cache.streams import CAPACITY, CONFIG, Recipe, fuse, to_jax
+
+HEADER = {"config": CONFIG.to_dict(), "chunks": 3, "note": "ω"}
+PREVIOUS_HEADER = HEADER | {"chunks": 2}
+CHUNKS = [to_jax(Recipe(seed, "few", "normal", "random").tokens()) for seed in range(4)]
+
+
+def stream(chunks):
+    cache = init_cache(CONFIG, CAPACITY)
+    for tokens in chunks:
+        cache = fuse(cache, tokens, CONFIG)
+    return cache
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory):
+    path = tmp_path_factory.mktemp("state") / "state.npz"
+    save_state(path, stream(CHUNKS[:3]), HEADER)
+    return path
+
+
+@pytest.fixture(scope="module")
+def previous(tmp_path_factory):
+    path = tmp_path_factory.mktemp("state") / "previous.npz"
+    save_state(path, stream(CHUNKS[:2]), PREVIOUS_HEADER)
+    return path
+
+
+def assert_identical(a, b):
+    jax.tree.map(np.testing.assert_array_equal, a, b)
+    assert jax.tree.map(lambda x: x.dtype, a) == jax.tree.map(lambda x: x.dtype, b)
+
+
+def test_state_is_read_back_to_the_last_bit(saved):
+    cache, header = load_state(saved)
+    assert header == HEADER
+    assert_identical(cache, stream(CHUNKS[:3]))
+
+
+def test_batches_of_caches_are_refused_and_not_written(saved, tmp_path):
+    caches = jax.tree.map(lambda x: jnp.stack([x, x])[None], load_state(saved)[0])
+    with pytest.raises(InputError, match=r"\[1, 2\].*one at a time"):
+        save_state(tmp_path / "state.npz", caches, HEADER)
+    assert not list(tmp_path.iterdir())
+
+
+def test_saving_mid_stream_gives_the_same_continuation(saved):
+    cache, _ = load_state(saved)
+    cache = fuse(cache, CHUNKS[3], CONFIG)
+    assert_identical(cache, stream(CHUNKS))
+
+
+def test_empty_and_bfloat16_caches_are_read_back(tmp_path):
+    cache = init_cache(CONFIG, CAPACITY)
+    cache = replace(cache, feats=cache.feats.astype(jnp.bfloat16))
+    save_state(tmp_path / "empty.npz", cache, {})
+    assert_identical(load_state(tmp_path / "empty.npz")[0], cache)
+
+
+def test_saving_twice_gives_the_same_bytes(saved, tmp_path):
+    save_state(tmp_path / "again.npz", stream(CHUNKS[:3]), HEADER)
+    assert (tmp_path / "again.npz").read_bytes() == saved.read_bytes()
+
+
+def test_any_reader_of_npz_can_open_it(saved):
+    with np.load(saved) as arrays:
+        facts = json.loads(arrays["header"].tobytes())
+        assert len(arrays["means"]) == int(arrays["num_voxels"])
+    assert facts["header"]["caller"] == HEADER and set(facts["leaves"]["means"]) == {"dtype", "sha256"}
+
+
+def refuse_but_load_previous(damaged, previous):
+    """Checks that a damaged file is refused by name, and that a good previous one is loaded instead."""
+    with pytest.raises(StorageError, match=r"damaged\.npz"):
+        load_state(damaged)
+    shutil.copy(previous, previous_path(damaged))
+    _, header, error = load_newest_state(damaged)
+    assert header == PREVIOUS_HEADER and "damaged.npz: the file is corrupt" in str(error)
+
+
+def test_no_flipped_bit_is_loaded(saved, previous, tmp_path):
+    contents, rng = bytearray(saved.read_bytes()), np.random.default_rng(0)
+    damaged = tmp_path / "damaged.npz"
+    ends = [*range(64), *range(len(contents) - 100, len(contents))]  # records of the zip format, and the checksum
+    for byte in [*rng.integers(0, len(contents), 300), *ends]:
+        flipped = contents.copy()
+        flipped[byte] ^= 1 << rng.integers(8)
+        damaged.write_bytes(flipped)
+        refuse_but_load_previous(damaged, previous)
+
+
+def test_no_truncated_file_is_loaded(saved, previous, tmp_path):
+    contents, damaged = saved.read_bytes(), tmp_path / "damaged.npz"
+    for length in [*np.linspace(0, len(contents) - 1, 10).astype(int), len(contents) - 64, len(contents) - 65]:
+        damaged.write_bytes(contents[:length])
+        refuse_but_load_previous(damaged, previous)
+
+
+def test_foreign_and_missing_files_are_refused(tmp_path):
+    np.savez(tmp_path / "foreign.npz", x=np.zeros(3))
+    for name in ("foreign.npz", "absent.npz"):
+        with pytest.raises(StorageError, match=name):
+            load_state(tmp_path / name)
+
+
+def test_the_previous_state_is_used_when_the_newest_is_corrupt(tmp_path):
+    path, old, new = tmp_path / "state.npz", stream(CHUNKS[:1]), stream(CHUNKS[:2])
+    save_state(path, old, {"chunks": 1})
+    save_state(path, new, {"chunks": 2})
+    assert load_newest_state(path)[1:] == ({"chunks": 2}, None)
+    path.write_bytes(path.read_bytes()[:-1])
+    cache, header, error = load_newest_state(path)
+    assert header == {"chunks": 1} and "state.npz" in str(error)
+    assert_identical(cache, old)
+    previous_path(path).unlink()
+    with pytest.raises(StorageError, match="corrupt"):
+        load_newest_state(path)
+    previous_path(path).write_bytes(b"damaged too")
+    with pytest.raises(StorageError, match=r"state\.npz: the file is corrupt"):
+        load_newest_state(path)
+
+
+@contextlib.contextmanager
+def full_disk(size):
+    """Limits the size of files; use it only around the call, since it affects the log of the tests too."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.3, 0.6, 0.9, 0.999])
+def test_a_full_disk_leaves_the_previous_state(tmp_path, share):
+    path, old = tmp_path / "state.npz", stream(CHUNKS[:3])
+    save_state(path, old, {})
+    new, size = stream(CHUNKS), int(share * path.stat().st_size)
+    with pytest.raises(StorageError, match=r"state\.npz"), full_disk(size):
+        save_state(path, new, {})
+    assert [p.name for p in tmp_path.iterdir()] == ["state.npz"]
+    assert_identical(load_state(path)[0], old)
