@@ -32,7 +32,6 @@ from ssplat_jax.commands.train_command import Train
 from ssplat_jax.commands.usage import VERSION, check_usage, parse_in_one_line
 from ssplat_jax.commands.view_command import View
 from ssplat_jax.commands.weights_command import Weights
-from ssplat_jax.commands.worlds_command import Worlds
 from ssplat_jax.core.errors import CacheError, InputError, StorageError
 
 EXIT_INPUT, EXIT_STORAGE, EXIT_MEMORY = 2, 3, 4
@@ -52,7 +51,6 @@ COMMANDS = {
     "weights": Weights,
     "bench": Bench,
     "experiment": Experiment,
-    "worlds": Worlds,
 }
 """All commands by name, in the order of `ssplat --help`."""
 

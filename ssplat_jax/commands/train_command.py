@@ -41,7 +41,7 @@ class Train:
     """Start from a weights file instead of from random parameters. Stages that --set adds, such as cgfi=true and
     mixer_blocks=2 to tiny's, start at random."""
     captures: tuple[Path, ...] = ()
-    """Captures to learn from too, or folders of captures as ssplat worlds writes. Every 8th frame is held out;
+    """Captures to learn from too, or folders of captures. Every 8th frame is held out;
     evidence and refiner, which log no scores, hold none out."""
     shares: tuple[float, ...] = ()
     """Share of the steps of each of --captures; the rest is procedural. Default: half of the steps, equally."""

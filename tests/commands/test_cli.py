@@ -220,7 +220,6 @@ def test_results_among_the_captures_own_images_are_refused(command, place, tmp_p
         (("train", "--seed", "-1", "--out", "x"), "--seed: wanted a number from 0"),
         (("train", "--seed", str(2**63), "--out", "x"), "--seed: wanted a number from 0"),
         (("train", "--scale-steps", "inf", "--out", "x"), "--scale-steps: wanted a finite number above 0"),
-        (("worlds", "--count", "1", "--seed", "-1", "--out", "x"), "--seed: wanted a number from 0"),
         (("poses", ".", "--frames", "20", "--out", "x"), "--frames: wanted a video"),
     ],
 )

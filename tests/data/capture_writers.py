@@ -184,24 +184,6 @@ def write_kitti(root):
     (root / "poses.txt").write_text("\n".join(rows))
 
 
-def write_opensfm(root):
-    shots = {}
-    for i, pose in enumerate(poses()):
-        write_image(root / "images" / f"{i}.jpg", i)
-        worldtocam = np.linalg.inv(pose)
-        rotation = Rotation.from_matrix(worldtocam[:3, :3]).as_rotvec().tolist()
-        shots[f"{i}.jpg"] = {"camera": "phone", "rotation": rotation, "translation": worldtocam[:3, 3].tolist()}
-    camera = {
-        "projection_type": "brown",
-        "width": WIDTH,
-        "height": HEIGHT,
-        "focal_x": FX / WIDTH,
-        "focal_y": FY / WIDTH,
-    }
-    camera |= {"c_x": (CX - WIDTH / 2) / WIDTH, "c_y": (CY - HEIGHT / 2) / WIDTH, "k1": 0.0, "k2": 0.0}
-    (root / "reconstruction.json").write_text(json.dumps([{"cameras": {"phone": camera}, "shots": shots}]))
-
-
 WRITERS = {
     "COLMAP": write_colmap_binary,
     "COLMAP text": write_colmap_text,
@@ -213,5 +195,4 @@ WRITERS = {
     "Record3D": write_record3d,
     "LLFF": write_llff,
     "KITTI": write_kitti,
-    "OpenSfM": write_opensfm,
 }

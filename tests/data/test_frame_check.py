@@ -8,7 +8,6 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from ssplat_jax.data.capture import Capture
-from ssplat_jax.data.coverage_map import _colors, draw_coverage, ground_axes, views_per_cell
 from ssplat_jax.data.frame_check import frame_warnings, image_warnings, order_warnings, turn_warnings
 from ssplat_jax.data.images import ArrayPixels
 from ssplat_jax.data.open_capture import open_capture
@@ -100,35 +99,6 @@ def test_a_long_capture_is_looked_at_in_pairs(room):
     images[1] = gaussian_filter(images[1], (2.5, 2.5, 0))  # frames 0 and 1 are the first pair
     (warning,) = image_warnings(changed(long, images))
     assert "1 images of the 64 looked at are blurred" in warning
-
-
-def test_cells_count_the_frustums_they_meet():
-    """Two cameras that look at each other: between them both see, behind each only the other."""
-    plane = np.array([[1.0, 0, 0], [0, 0, 1.0]])
-    near, far = 1.0, 3.0
-    ahead = np.array(
-        [[1, 0, 0.5, 0], [-1, 0, 0.5, 0], [0, 1, 0.5, 0], [0, -1, 0.5, 0], [0, 0, 1, -near], [0, 0, -1, far]]
-    )
-    back = ahead.copy()
-    back[:, 2] *= -1
-    back[:, 3] += ahead[:, 2] * 4.0  # at z = 4, looking along -z
-    x, z = np.meshgrid(np.linspace(-2, 2, 9), np.linspace(-1, 5, 25))
-    counts = views_per_cell(np.stack([x, z], axis=-1), plane, [ahead, back])
-    first = (np.abs(x) <= 0.5 * z) & (z >= near) & (z <= far)
-    second = (np.abs(x) <= 0.5 * (4 - z)) & (4 - z >= near) & (4 - z <= far)
-    np.testing.assert_array_equal(counts, first.astype(int) + second)
-
-
-def test_the_picture_is_level_and_shows_the_path(room):
-    plane = ground_axes(room.camtoworlds)
-    np.testing.assert_allclose(plane @ plane.T, np.eye(2), atol=1e-9)
-    up = np.cross(plane[1], plane[0])  # right and down
-    assert up @ -room.camtoworlds[:, :3, 1].mean(axis=0) > 0.9
-    picture = draw_coverage(room, 1.0, 4.0)
-    assert picture.shape[1] <= 900 and picture.min() >= 0 and picture.max() <= 1
-    path = (picture > 0.99).all(axis=-1).sum()
-    seen = (np.abs(picture - _colors(np.array([[20]]))[0, 0]).max(axis=-1) < 0.01).mean()
-    assert path > 200 and seen > 0.02
 
 
 @pytest.mark.slow  # decodes 64 images each

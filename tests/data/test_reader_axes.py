@@ -63,17 +63,6 @@ def kitti(root):
     return sequence
 
 
-def opensfm(root):
-    write_image(root / "images" / "a.png", 0, SIZE)
-    # World to camera takes x, y, z to z, -x, -y: a turn by 120 degrees about (1, -1, 1).
-    angle = 2 * np.pi / 3 / np.sqrt(3)
-    shot = {"camera": "c", "rotation": [angle, -angle, angle], "translation": [2, 3, -1]}
-    camera = {"projection_type": "perspective", "width": 64, "height": 48, "focal": FOCAL / 64}
-    model = {"cameras": {"c": camera}, "shots": {"a.png": shot}}
-    (root / "opensfm").mkdir()
-    (root / "opensfm" / "reconstruction.json").write_text(json.dumps([{"cameras": {}, "shots": {}}, model]))
-
-
 def colmap(root):
     write_image(root / "images" / "a.png", 0, SIZE)
     (root / "sparse" / "1").mkdir(parents=True)
@@ -81,7 +70,7 @@ def colmap(root):
     (root / "sparse" / "1" / "images.txt").write_text("1 0.5 0.5 -0.5 0.5 2 3 -1 1 a.png\n\n")
 
 
-@pytest.mark.parametrize("write", [transforms, splat_cameras, polycam, record3d, llff, kitti, opensfm, colmap])
+@pytest.mark.parametrize("write", [transforms, splat_cameras, polycam, record3d, llff, kitti, colmap])
 def test_a_camera_sees_points_where_its_axes_say(write, tmp_path):
     capture = open_capture(write(tmp_path) or tmp_path)
     viewmat = np.linalg.inv(capture.camtoworlds[0])

@@ -169,13 +169,6 @@ BAD = {
     "no line P2": ("KITTI", write("calib.txt", b"P0: 1\n"), ("calib.txt", "P2")),
     "eleven numbers": ("KITTI", replace("calib.txt", "P2: 50.0", "P2:"), ("line 3", "12 numbers")),
     "no poses": ("KITTI", remove("poses.txt"), ("poses.txt", "download")),
-    # OpenSfM
-    "unknown projection": (
-        "OpenSfM",
-        replace("reconstruction.json", '"brown"', '"dual"'),
-        ("projection_type", "'dual'", "perspective"),
-    ),
-    "camera missing": ("OpenSfM", replace("reconstruction.json", '"phone": {', '"other": {'), ("camera", "nothing")),
     "intrinsics in pixels": ("RealEstate10K", replace("0a1b.txt", f" {FX / WIDTH} ", " -1 "), ("line 2", "focal")),
 }
 
@@ -205,7 +198,6 @@ FILES = {
     "Record3D": ("metadata.json",),
     "LLFF": ("poses_bounds.npy",),
     "KITTI": ("calib.txt", "poses.txt"),
-    "OpenSfM": ("reconstruction.json",),
 }
 
 

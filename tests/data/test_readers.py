@@ -46,7 +46,6 @@ NAMES = {  # in the order of streaming
     "Record3D": tuple(f"rgb/{i}.jpg" for i in range(4)),
     "LLFF": tuple(f"images/IMG_{i}.JPG" for i in range(4)),
     "KITTI": tuple(f"image_2/{i:06d}.png" for i in range(4)),
-    "OpenSfM": tuple(f"{i}.jpg" for i in range(4)),
 }
 INTRINSICS = {  # of formats that cannot hold K
     "cameras.json": [[FX, 0, WIDTH / 2], [0, FY, HEIGHT / 2], [0, 0, 1]],
@@ -299,7 +298,7 @@ def test_shrunk_images_may_have_another_extension(tmp_path):
     np.testing.assert_allclose(shrunk.K(0)[:2], K[:2] / 4)
 
 
-@pytest.mark.parametrize("kind", ["cameras.json", "LLFF", "OpenSfM"])
+@pytest.mark.parametrize("kind", ["cameras.json", "LLFF"])
 def test_shrunk_images_stand_in_for_missing_ones(kind, tmp_path):
     WRITERS[kind](tmp_path)
     whole = open_capture(tmp_path).K(0)
