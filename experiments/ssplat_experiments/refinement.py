@@ -44,7 +44,7 @@ from ssplat_jax.evaluation.psnr_ssim import psnr
 from ssplat_jax.evaluation.scoring import mean_scores, score_view
 from ssplat_jax.poses.adjust_poses import adjust_poses
 from ssplat_jax.refinement.learned_pass import STEPS as STEPS_OF_PASS
-from ssplat_jax.refinement.refine_capture import CaptureRefinement, refine_on_capture
+from ssplat_jax.refinement.refine_capture import refine_on_capture
 from ssplat_jax.refinement.refine_config import FOR_CAPTURES, RefineConfig
 from ssplat_jax.streaming.feed import Exposures, feed_chunks
 
@@ -235,7 +235,9 @@ def _stream(scene: _Scene, capture: Capture, config: StreamConfig) -> _Streamed:
 
 @dataclasses.dataclass(frozen=True)
 class _Refined:
-    found: CaptureRefinement
+    gaussians: Gaussians
+    exposures: Exposures
+    steps: int
     seconds: float
 
 
@@ -245,14 +247,14 @@ def _refined(
     """The scene after steps on the context views as `capture` has them."""
     watch, given = Stopwatch(), (capture, scene.split.context, scene.frame, streamed.exposures)
     with watch.running():
-        found = refine_on_capture(streamed.gaussians, *given, steps=steps, config=config)
-        jax.block_until_ready(found.gaussians.means)
-    return _Refined(found, watch.seconds)
+        refined, report = refine_on_capture(streamed.gaussians, *given, steps=steps, config=config)
+        jax.block_until_ready(refined.means)
+    return _Refined(refined, streamed.exposures, report.num_steps, watch.seconds)
 
 
 def _row_of_refined(name: str, method: str, scene: _Scene, refined: _Refined) -> Row:
-    taken = {"steps": refined.found.report.num_steps, "refine_s": round(refined.seconds, 1)}
-    return _row(name, method, scene, refined.found.gaussians, refined.found.exposures) | taken
+    taken = {"steps": refined.steps, "refine_s": round(refined.seconds, 1)}
+    return _row(name, method, scene, refined.gaussians, refined.exposures) | taken
 
 
 def _row(name: str, method: str, scene: _Scene, gaussians: Gaussians, exposures: Exposures) -> dict[str, Any]:

@@ -57,7 +57,7 @@ class Eval:
     refine: int | None = None
     """Steps of refinement on the context views after the stream, default 0, with --quality best 100; the scores before
     are reported too."""
-    revise: ReviseOption = ()
+    revise: ReviseOption = None
     online_refine: int = 0
     """Gradient steps on kept views after each chunk, while streaming; later chunks see the revised scene."""
     over_black: bool = False
@@ -82,7 +82,7 @@ class Eval:
         from ssplat_jax.storage.folder_lock import lock_folder
 
         refine_steps = refinement_steps(self.quality, self.refine)
-        check_refinement(refine_steps, self.revise, "--refine")
+        check_refinement(refine_steps, "--refine")
         lpips_weights = load_lpips_weights(self.lpips_vgg, self.lpips_heads)
         changes = online_changes(causal_changes(self.set, self.causal), self.online_refine)
         model, params = load_model(self.weights, changes)

@@ -38,11 +38,8 @@ QualityOption = Annotated[
 WeightsOption = Annotated[str, tyro.conf.arg(help="Preset with shipped weights, or a weights file.")]
 ConfigChanges = Annotated[tuple[str, ...], tyro.conf.arg(help="Changes to the configuration, as field=value.")]
 ReviseOption = Annotated[
-    tuple[Literal["auto", "poses", "focal", "exposures", "white_balance"], ...],
-    tyro.conf.arg(
-        help="Parts of the streamed views that are revised too: poses before the stream, the others by refinement; auto"
-        " chooses those that the images call for."
-    ),
+    Literal["poses", "auto"] | None,
+    tyro.conf.arg(help="Adjust the poses to the images before the stream; auto: only if they are off."),
 ]
 QuietOption = Annotated[bool, tyro.conf.arg(help="Print only the closing line.")]
 LpipsHeads = Annotated[
@@ -155,23 +152,18 @@ def load_model(weights: str, changes: tuple[str, ...], defaults: tuple[str, ...]
     return StreamSplat(changed), params
 
 
-def check_refinement(steps: int, revise: tuple[str, ...], flag: str) -> None:
-    """Refuses options of a refinement that make no sense.
+def check_refinement(steps: int, flag: str) -> None:
+    """Refuses a negative number of refinement steps.
 
     Args:
         steps: refinement steps, the value of `flag`.
-        revise: effects, with --revise.
         flag: name of the option of the steps.
 
     Raises:
-        InputError: `steps` is negative, or --revise has nothing to revise or names auto among others.
+        InputError: `steps` is negative.
     """
     if steps < 0:
         raise InputError(f"{flag}: wanted a number of steps of at least 0, got {steps}.")
-    if set(revise) - {"poses", "auto"} and not steps:  # poses are adjusted before the stream
-        raise InputError(f"--revise: wanted {flag} beside it, got 0 steps; for example {flag} 100.")
-    if "auto" in revise and len(revise) > 1:
-        raise InputError(f"--revise: wanted auto alone or effects by name, got {' '.join(revise)}.")
 
 
 def refinement_steps(quality: QualityName, steps: int | None) -> int:

@@ -12,7 +12,6 @@ from ssplat_jax.commands.options import (
     CapturePath,
     PosesOption,
     QuietOption,
-    ReviseOption,
     WeightsOption,
     capture_path,
     check_refinement,
@@ -31,7 +30,6 @@ class Refine:
     capture: CapturePath
     steps: int = 100
     """Most steps; each renders two views. The first 40 are five learned passes, where there are as many."""
-    revise: ReviseOption = ()
     weights: WeightsOption = "tiny"
     save_every: int = 50
     """Steps between saved states."""
@@ -46,13 +44,12 @@ class Refine:
         from ssplat_jax.runs.refine_run import refine_run
         from ssplat_jax.storage.weights import load_params
 
-        check_refinement(self.steps, self.revise, "--steps")
+        check_refinement(self.steps, "--steps")
         result = refine_run(
             self.folder,
             capture_path(self.capture, self.axes, self.poses),
             load_params(self.weights),
             steps=self.steps,
-            revise=self.revise,
             save_every=self.save_every,
             overwrite=self.overwrite,
             reporter=Reporter(self.quiet),

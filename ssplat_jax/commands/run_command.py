@@ -68,7 +68,7 @@ class Run:
     refine: int | None = None
     """Then take this many steps on the streamed frames, as `ssplat refine` does, into refined.ply; default 0, with
     --quality best 100."""
-    revise: ReviseOption = ()
+    revise: ReviseOption = None
     online_refine: int = 0
     """Gradient steps on kept views after each chunk, while streaming; later chunks see the revised scene."""
     causal: bool = False
@@ -103,12 +103,11 @@ class Run:
         """Refuses options that contradict each other."""
         from ssplat_jax.data.pose_conventions import split_options
 
-        check_refinement(self.refine_steps, self.revise, "--refine")
+        check_refinement(self.refine_steps, "--refine")
         if self.quiet_seconds != Run.quiet_seconds and not self.watch:
             raise InputError("--quiet-seconds: wanted --watch beside it, which it is for; got none.")
-        for name in {"poses", "auto"} & set(self.revise):  # before the stream, they look at all frames
-            if self.watch:
-                raise InputError(f"--revise {name}: wanted a capture that is complete, got --watch; leave one out.")
+        if self.watch and self.revise:  # before the stream, poses are adjusted to all frames
+            raise InputError(f"--revise {self.revise}: wanted a capture that is complete, got --watch; leave one out.")
         if self.watch and (self.axes or self.poses or split_options(self.capture)[1]):
             got = "--axes or --poses" if self.axes or self.poses else "?axes= or ?poses= behind the capture"
             raise InputError(f"--watch: wanted poses as transforms.json has them, got {got}; leave one out.")
@@ -141,7 +140,6 @@ class Run:
                 self.out,
                 self.capture,
                 self.refine_steps,
-                self.revise,
                 self.weights,
                 overwrite=self.overwrite,
                 axes=self.axes,

@@ -22,7 +22,7 @@ from ssplat_jax.evaluation.pictures import save_comparison
 from ssplat_jax.evaluation.psnr_ssim import SSIM_ARGUMENTS
 from ssplat_jax.evaluation.scoring import Display, ViewScore, baselines, check_scorable, mean_scores, score_view
 from ssplat_jax.poses.adjust_poses import adjust_if_asked, check_look_ahead
-from ssplat_jax.refinement import CaptureRefinement, refine_on_capture
+from ssplat_jax.refinement import refine_on_capture
 from ssplat_jax.storage.folders import make_writable
 from ssplat_jax.storage.json_files import write_json
 from ssplat_jax.storage.run_folder import RunFolder
@@ -40,7 +40,7 @@ def evaluate(
     streamed: Capture | None = None,
     lpips_weights: LpipsWeights | None = None,
     refine_steps: int = 0,
-    revise: Sequence[str] = (),
+    revise: str | None = None,
     scene: str | None = None,
     display: Display | None = None,
 ) -> dict:
@@ -60,8 +60,8 @@ def evaluate(
         lpips_weights: with them LPIPS is scored too; without, the fields `lpips` are null.
         refine_steps: refinement steps on the context views before the targets are scored. With them the metrics have a
             block `refinement`: the steps done, their seconds, and the scores before.
-        revise: effects of the refinement, see `refine_on_capture`. `poses` adjusts those of the context before it is
-            streamed, `auto` does if they are off (`poses.adjust_poses`); targets keep theirs.
+        revise: `poses` adjusts those of the context before it is streamed, `auto` does if they are off
+            (`poses.adjust_poses`); targets keep theirs.
         scene: name in `index.json`; by default the capture's.
         display: how pictures are made; the block `pictures` of the metrics holds it, and the mean PSNR of the pictures.
 
@@ -106,18 +106,7 @@ def evaluate(
     gaussians, refinement = session.gaussians(), {}
     if refine_steps:
         before = [score_view(gaussians, capture, i, frame, exposures, lpips_weights).score for i in split.targets]
-        refined, done = _refine(
-            gaussians,
-            streamed,
-            split.context,
-            frame,
-            exposures,
-            refine_steps,
-            revise,
-            poses_stay=adjusted is not None,
-            reporter=reporter,
-        )
-        gaussians, exposures = refined.gaussians, refined.exposures
+        gaussians, done = _refine(gaussians, streamed, split.context, frame, exposures, refine_steps, reporter)
         cost["num_gaussians"] = int((gaussians.opacities > 0).sum())
         refinement = {"refinement": {**done, "before": mean_scores(before)}}
     middle = capture.camera(split.targets[len(split.targets) // 2], frame)
@@ -168,28 +157,20 @@ def _refine(
     frame: StreamFrame,
     exposures: Exposures,
     steps: int,
-    revise: Sequence[str],
-    *,
-    poses_stay: bool,
     reporter: Reporter,
-) -> tuple[CaptureRefinement, dict]:
+) -> tuple[Gaussians, dict]:
     """The scene refined on its context views, and what that took."""
     start = time.perf_counter()
     with reporter.progress("refining", steps) as advance:
-        refined = refine_on_capture(
+        refined, report = refine_on_capture(
             gaussians,
             streamed,
             context,
             frame,
             exposures,
             steps=steps,
-            revise=revise,
-            poses_stay=poses_stay,
             on_step=lambda step, loss: advance(step, f"loss {loss:.4f}"),
         )
-    report = refined.report
-    for reason in refined.choice.reasons:
-        reporter.say(reason)
     done = {
         "steps": report.num_steps,
         "stopped_early": report.stopped_early,
@@ -198,8 +179,6 @@ def _refine(
         "seconds_per_step": round(report.seconds_per_step, 4),
         "views_left_out": report.num_left_out,
         "new_gaussians": report.num_new,
-        "revised": list(refined.choice.effects.names),
-        "reasons": list(refined.choice.reasons),
     }
     return refined, done
 

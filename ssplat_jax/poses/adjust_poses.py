@@ -108,43 +108,38 @@ def adjust_poses(
     )
 
 
-def pose_effects(revise: Sequence[str]) -> list[str]:
-    """The names among `revise` that may adjust poses before a stream: `poses` and `auto`."""
-    return [name for name in revise if name in ("poses", "auto")]
-
-
-def check_look_ahead(revise: Sequence[str], *, is_causal: bool) -> None:
+def check_look_ahead(revise: str | None, *, is_causal: bool) -> None:
     """Checks that no causal stream is asked to adjust its poses, which looks at all frames.
 
     Raises:
         InputError: it is.
     """
-    if is_causal and (asked := pose_effects(revise)):
+    if is_causal and revise:
         got, fix = "a causal one (--causal, or stream.causal=true)", "leave one out"
-        raise refusal(f"--revise {asked[0]}", wanted="a stream that may look ahead", got=got, fix=fix)
+        raise refusal(f"--revise {revise}", wanted="a stream that may look ahead", got=got, fix=fix)
 
 
 def adjust_if_asked(
-    capture: Capture, indices: Sequence[int], revise: Sequence[str], reporter: Reporter
+    capture: Capture, indices: Sequence[int], revise: str | None, reporter: Reporter
 ) -> AdjustedPoses | None:
     """The adjusted poses of a stream that has not begun, if `revise` asks for them; says what was found.
 
     Args:
         capture: images with poses.
         indices: frames to stream.
-        revise: names of effects, as of a refinement: `poses` adjusts them, `auto` only those that are off.
+        revise: `poses` adjusts them, `auto` only if they are off; None asks for nothing.
         reporter: shows progress.
 
     Returns:
         The adjusted poses; None if they are not asked for, if `auto` finds that the given ones fit, or if too few
         points were found to adjust them by.
     """
-    if not pose_effects(revise):
+    if revise is None:
         return None
     with reporter.progress("poses", len(indices), waiting="") as advance:
         found = adjust_poses(capture, indices, advance)
     reporter.say(found.reason)
-    return found if found.num_points > 0 and (found.are_off or "poses" in revise) else None
+    return found if found.num_points > 0 and (found.are_off or revise == "poses") else None
 
 
 def _degrees(result: Adjustment, focal: float) -> float:

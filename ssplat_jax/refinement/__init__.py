@@ -6,15 +6,11 @@
 """
 
 from ssplat_jax.cache.key_views import KeyViews as KeyViews
-from ssplat_jax.refinement.choose_effects import EffectsChoice as EffectsChoice
-from ssplat_jax.refinement.choose_effects import refine_effects_for as refine_effects_for
 from ssplat_jax.refinement.online import online_refinement as online_refinement
 from ssplat_jax.refinement.refine import Refinement as Refinement
 from ssplat_jax.refinement.refine import refine as refine
-from ssplat_jax.refinement.refine_capture import CaptureRefinement as CaptureRefinement
 from ssplat_jax.refinement.refine_capture import refine_on_capture as refine_on_capture
 from ssplat_jax.refinement.refine_config import RefineConfig as RefineConfig
-from ssplat_jax.refinement.refine_effects import RefineEffects as RefineEffects
 from ssplat_jax.refinement.refine_step import RefineState as RefineState
 from ssplat_jax.refinement.refine_step import StepReport as StepReport
 from ssplat_jax.refinement.refine_step import current_gaussians as current_gaussians
@@ -22,7 +18,3 @@ from ssplat_jax.refinement.refine_step import init_refinement as init_refinement
 from ssplat_jax.refinement.refine_step import refine_step as refine_step
 from ssplat_jax.refinement.refiner_weights import load_refiner as load_refiner
 from ssplat_jax.refinement.usable_views import only_usable as only_usable
-from ssplat_jax.refinement.view_residuals import ViewResiduals as ViewResiduals
-from ssplat_jax.refinement.view_residuals import view_residuals as view_residuals
-from ssplat_jax.refinement.view_revision import ViewState as ViewState
-from ssplat_jax.refinement.view_revision import revised_key_views as revised_key_views

@@ -20,7 +20,7 @@ from ssplat_jax.core.rotations import quats_to_matrices
 from ssplat_jax.model.refiner import Refiner, gains_and_shifts
 from ssplat_jax.rasterizer import fill_holes, render
 from ssplat_jax.refinement.refine_config import RefineConfig
-from ssplat_jax.refinement.refine_step import RefineState, StepReport, view_revision, with_revised_view
+from ssplat_jax.refinement.refine_step import RefineState, StepReport
 from ssplat_jax.refinement.revision import Revision, apply_revision, bounded, no_revision, sizes
 from ssplat_jax.refinement.view_loss import EFFECTS, held_back_pixels, mean_over, view_loss
 from ssplat_jax.refinement.view_order import next_view
@@ -163,8 +163,7 @@ def learned_pass(
     views = jax.vmap(lambda place: next_view(place, key_views.valid, config.seed))(places)
 
     def body(seen: SeenErrors, view: Int[Array, ""]):
-        shown = with_revised_view(state, view_revision(state), key_views, view)
-        return add_view(seen, state.start, state.revision, shown, view, config, max_pairs)
+        return add_view(seen, state.start, state.revision, key_views, view, config, max_pairs)
 
     current = apply_revision(state.start, state.revision)
     seen, measured = jax.lax.scan(body, no_errors(current), views)
@@ -200,8 +199,7 @@ def _mean_loss(
     background = mean_color(current)
 
     def body(total: Float[Array, ""], view: Int[Array, ""]):
-        shown = with_revised_view(state, view_revision(state), key_views, view)
-        return total + view_loss(current, background, shown, view, config, max_pairs)[0], None
+        return total + view_loss(current, background, key_views, view, config, max_pairs)[0], None
 
     return jax.lax.scan(body, jnp.zeros((), current.means.dtype), views)[0] / views.shape[0]
 

@@ -40,7 +40,6 @@ from ssplat_jax.refinement.seen_rows import seen_in_any
 from ssplat_jax.refinement.usable_views import only_usable
 from ssplat_jax.refinement.view_loss import EFFECTS
 from ssplat_jax.refinement.view_order import views_of_step
-from ssplat_jax.refinement.view_revision import revised_key_views
 
 Images = Float[Array | np.ndarray, "v h w 3"] | UInt8[Array | np.ndarray, "v h w 3"]
 
@@ -97,7 +96,6 @@ class Refinement:
     seconds_per_step: float  # median, without the first step of each kind, which compiles; 0 where there is no other
     num_left_out: int = 0  # views that could not be learned from, see `only_usable`
     num_new: int = 0  # Gaussians added in holes
-    key_views: KeyViews | None = None  # as the effects revised them; views that were left out are not valid
 
 
 def refine(
@@ -170,7 +168,7 @@ def start_refinement(
     if num_new:
         present, rows = present_and_new(gaussians, new, num_new)
         max_pairs = pairs_capacity(present, key_views)
-    return Progress(init_refinement(present, usable, config), rows, max_pairs, num_new=num_new), usable
+    return Progress(init_refinement(present, config), rows, max_pairs, num_new=num_new), usable
 
 
 def continue_refinement(
@@ -218,13 +216,11 @@ def _grow_capacities(
     if not num_pairs and not num_rows:
         return
     revised = apply_revision(progress.state.start, progress.state.revision)
-    views = revised_key_views(progress.state.views, key_views)
     if num_pairs:
         # The view that overflowed may not be among those that `_capacity` looks at.
-        progress.max_pairs = max(pairs_capacity(revised, views), round_up(progress.max_pairs + num_pairs))
-    # Never less than the last step was short of: its cameras may have moved since.
+        progress.max_pairs = max(pairs_capacity(revised, key_views), round_up(progress.max_pairs + num_pairs))
     needed = round_rows((progress.max_rows or 0) + num_rows)
-    measured = row_capacity(revised, views, range(progress.num_steps, steps), config)
+    measured = row_capacity(revised, key_views, range(progress.num_steps, steps), config)
     progress.max_rows = min(max(measured, needed if num_rows else 0), revised.num_gaussians)
 
 
@@ -250,7 +246,6 @@ def report_of(progress: Progress, key_views: KeyViews, config: RefineConfig | No
         seconds_per_step=_seconds_per_step(progress),
         num_left_out=int(np.sum(~np.asarray(key_views.valid))),
         num_new=progress.num_new,
-        key_views=revised_key_views(progress.state.views, key_views),
     )
 
 

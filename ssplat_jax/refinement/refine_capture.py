@@ -1,6 +1,5 @@
 """Refinement of a stream's scene on the frames that were streamed."""
 
-import dataclasses
 from collections.abc import Callable, Sequence
 
 import jax
@@ -14,23 +13,12 @@ from ssplat_jax.core.errors import InputError
 from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.stream_frame import StreamFrame
-from ssplat_jax.refinement.choose_effects import EffectsChoice, effects_by_name, with_effects
 from ssplat_jax.refinement.refine import Refinement, continue_refinement, report_of, start_refinement
 from ssplat_jax.refinement.refine_config import FOR_CAPTURES, RefineConfig
 from ssplat_jax.streaming.feed import Exposures
 
 MAX_KEY_VIEWS = 128
 """Most frames that are kept for refinement, evenly spread over the stream: their memory does not grow with it."""
-
-
-@dataclasses.dataclass(frozen=True)
-class CaptureRefinement:
-    """The refined scene of a stream."""
-
-    gaussians: Gaussians  # in the stream frame
-    exposures: Exposures  # factor per streamed frame; those of key views as the effects revised them
-    report: Refinement
-    choice: EffectsChoice  # effects that were on
 
 
 def refine_on_capture(
@@ -42,10 +30,8 @@ def refine_on_capture(
     *,
     steps: int,
     config: RefineConfig | None = None,
-    revise: Sequence[str] = (),
-    poses_stay: bool = False,
     on_step: Callable[[int, float], None] = lambda step, loss: None,
-) -> CaptureRefinement:
+) -> tuple[Gaussians, Refinement]:
     """The scene of a stream, revised on at most `MAX_KEY_VIEWS` of its own frames.
 
     Args:
@@ -56,49 +42,24 @@ def refine_on_capture(
         exposures: factor per streamed frame, as the stream estimated it.
         steps: most refinement steps; with 0 the scene comes back as it is.
         config: learning rates, bounds and SH degree; default `FOR_CAPTURES`.
-        revise: names of the effects that are on besides those of `config`, or `("auto",)` for those that the residuals
-            call for.
-        poses_stay: poses were adjusted before the stream; `revise` then leaves them as they are.
         on_step: called with the number of steps done and the last loss.
 
     Returns:
-        The refined scene, the exposures, the report and the effects that were on.
+        The refined scene in the stream frame, and the report.
 
     Raises:
-        InputError: `steps` is negative, a frame was not streamed, or an effect is unknown.
+        InputError: `steps` is negative, or a frame was not streamed.
     """
     if steps < 0:
         raise InputError(f"refine: steps must be at least 0, got {steps}.")
     given = key_views_of(capture, indices, frame, exposures)
-    choice = effects_by_name(revise, gaussians, given, poses_stay=poses_stay)
     if steps == 0:
-        return CaptureRefinement(gaussians, exposures, Refinement(0, 0, [], [], False, 0.0), choice)
-    config = with_effects(config or FOR_CAPTURES, choice)
+        return gaussians, Refinement(0, 0, [], [], False, 0.0)
+    config = config or FOR_CAPTURES
     progress, views = start_refinement(gaussians, given, config)
     for _ in continue_refinement(progress, views, steps, config):
         on_step(progress.num_steps, progress.losses[-1])
-    report = report_of(progress, views, config)
-    return CaptureRefinement(
-        gaussians=progress.scene(gaussians),
-        exposures=revised_exposures(exposures, indices, report.key_views),
-        report=report,
-        choice=choice,
-    )
-
-
-def revised_exposures(exposures: Exposures, indices: Sequence[int], key_views: KeyViews | None) -> Exposures:
-    """`exposures` with those of the valid key views put in.
-
-    Args:
-        exposures: factor per streamed frame.
-        indices: frame numbers that were streamed; `key_frames` chooses the key views among them.
-        key_views: the key views as they were revised; None changes nothing.
-    """
-    if key_views is None:
-        return exposures
-    factors, valid = np.asarray(key_views.exposures), np.asarray(key_views.valid)
-    used = key_frames(indices)
-    return {**exposures, **{i: factors[slot] for slot, i in enumerate(used) if valid[slot]}}
+    return progress.scene(gaussians), report_of(progress, views, config)
 
 
 def key_frames(indices: Sequence[int]) -> list[int]:

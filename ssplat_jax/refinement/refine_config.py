@@ -4,7 +4,6 @@ import dataclasses
 import math
 
 from ssplat_jax.core.errors import InputError
-from ssplat_jax.refinement.refine_effects import RefineEffects
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,8 +51,6 @@ class RefineConfig:
     """Fraction of 8 x 8 pixel blocks that no gradient sees; their error says whether refinement still helps."""
     seed: int = 0
     """Seed of the order of views."""
-    effects: RefineEffects = dataclasses.field(default_factory=RefineEffects)
-    """Parts of the key views that are revised too."""
 
     def __post_init__(self) -> None:
         for name in ("mean_rate", "log_scale_rate", "quat_rate", "logit_opacity_rate", "color_rate", "sh_rate"):

@@ -7,7 +7,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from ssplat_jax.cache.key_views import KeyViews
-from ssplat_jax.core.errors import InputError
 from ssplat_jax.core.gaussians import Gaussians, mean_color, with_sh_degree
 from ssplat_jax.core.pytree import pytree, replace
 from ssplat_jax.refinement.adam import adam_step
@@ -16,7 +15,6 @@ from ssplat_jax.refinement.revision import Revision, apply_revision, is_revised,
 from ssplat_jax.refinement.seen_rows import put_rows, seen_in_any, select_rows, take_rows
 from ssplat_jax.refinement.view_loss import view_loss
 from ssplat_jax.refinement.view_order import views_of_step
-from ssplat_jax.refinement.view_revision import ViewRevision, ViewState, init_view_state, revised_view, step_view_state
 
 
 @pytree
@@ -29,7 +27,6 @@ class RefineState:
     second_moment: Revision
     num_steps: Int[Array, ""]
     num_skipped: Int[Array, ""]  # steps that changed nothing: not finite, or of a learned pass that did not help
-    views: ViewState | None = None  # revision of the key views, if an effect is on
 
 
 @pytree
@@ -43,25 +40,16 @@ class StepReport:
     num_overflow: Int[Array, "*s"]  # largest number of tile intersections of one of its views that found no space
 
 
-def init_refinement(
-    gaussians: Gaussians, key_views: KeyViews | None = None, config: RefineConfig | None = None
-) -> RefineState:
+def init_refinement(gaussians: Gaussians, config: RefineConfig | None = None) -> RefineState:
     """The state before the first step, with SH bands as `config` has them, in float32 or float64.
 
     Args:
         gaussians: the scene; its arrays are copied. Half precision becomes float32: in it, Adam's moments would vanish.
-        key_views: the views that are compared; needed by the effects of `config`, which revise them.
-        config: SH degree and effects; default `RefineConfig()`.
-
-    Raises:
-        InputError: an effect is on, and there are no key views.
+        config: SH degree; default `RefineConfig()`.
     """
-    config = config or RefineConfig()
-    effects, gaussians = config.effects, with_sh_degree(gaussians, config.sh_degree)
+    gaussians = with_sh_degree(gaussians, (config or RefineConfig()).sh_degree)
     if jnp.finfo(gaussians.means.dtype).bits < 32:
         gaussians = jax.tree.map(lambda x: x.astype(jnp.float32), gaussians)
-    if effects.any and key_views is None:
-        raise InputError(f"refine: the effects {', '.join(effects.names)} need the key views, got none.")
     return RefineState(
         start=jax.tree.map(jnp.copy, gaussians),  # the step consumes its state; the caller's arrays stay
         revision=no_revision(gaussians),
@@ -69,7 +57,6 @@ def init_refinement(
         second_moment=no_revision(gaussians),
         num_steps=jnp.zeros((), jnp.int32),
         num_skipped=jnp.zeros((), jnp.int32),
-        views=None if key_views is None else init_view_state(gaussians, key_views, effects),
     )
 
 
@@ -112,26 +99,22 @@ def refine_step(
     current, pull = jax.vjp(functools.partial(apply_revision, state.start), state.revision)
     background, gaussians, selection = mean_color(current), current, None
     if max_rows is not None and max_rows < current.num_gaussians:
-        cameras = [with_revised_view(state, view_revision(state), key_views, view).camera(view) for view in views]
+        cameras = [key_views.camera(view) for view in views]
         selection = select_rows(seen_in_any(current, cameras), max_rows)
         gaussians = take_rows(current, selection)
         gaussians = replace(gaussians, opacities=jnp.where(selection.is_row, gaussians.opacities, 0.0))
-    slopes, of_views, report = _slopes(state, gaussians, background, key_views, views, config, max_pairs)
+    slopes, report = _slopes(gaussians, background, key_views, views, config, max_pairs)
     if selection is not None:
         slopes = put_rows(slopes, selection, jax.tree.map(jnp.zeros_like, current))
         report = replace(report, num_missing_rows=selection.num_overflow)
     (gradient,) = pull(slopes)
 
     is_finite = jnp.isfinite(report.loss)
-    for leaf in jax.tree.leaves((gradient, of_views)):
+    for leaf in jax.tree.leaves(gradient):
         is_finite = is_finite & jnp.all(jnp.isfinite(leaf))
     keep = lambda new, old: jnp.where(is_finite, new, old)  # noqa: E731
     before = state.revision, (state.first_moment, state.second_moment)
     revision, moments = jax.tree.map(keep, adam_step(*before, gradient, state.num_steps, rate, config), before)
-    moved_views = state.views
-    if state.views is not None and of_views is not None:
-        moved_views = step_view_state(state.views, of_views, views, key_views.valid, rate, config.effects)
-        moved_views = jax.tree.map(keep, moved_views, state.views)
     state = RefineState(
         start=state.start,
         revision=revision,
@@ -139,55 +122,27 @@ def refine_step(
         second_moment=moments[1],
         num_steps=state.num_steps + 1,
         num_skipped=state.num_skipped + (~is_finite).astype(jnp.int32),
-        views=moved_views,
     )
     return state, report
 
 
-def view_revision(state: RefineState) -> ViewRevision | None:
-    """The changes to the key views; None if no effect is on."""
-    return None if state.views is None else state.views.revision
-
-
-def with_revised_view(
-    state: RefineState, revision: ViewRevision | None, key_views: KeyViews, view: Int[Array, ""]
-) -> KeyViews:
-    """`key_views` with the one at slot `view` as `revision` changes it.
-
-    Args:
-        state: gives the units of the revision.
-        revision: changes to the key views; None if no effect is on.
-        key_views: the views as they were given.
-        view: slot of the view.
-    """
-    if state.views is None or revision is None:
-        return key_views
-    return revised_view(state.views, revision, key_views, view)
-
-
 def _slopes(
-    state: RefineState,
     gaussians: Gaussians,
     background: Float[Array, "3"],
     key_views: KeyViews,
     views: Int[Array, " b"],
     config: RefineConfig,
     max_pairs: int,
-) -> tuple[Gaussians, ViewRevision | None, StepReport]:
-    """Mean gradient of `view_loss` over the step's views, by the Gaussians and by the view revision."""
-
-    def loss(gaussians: Gaussians, revision: ViewRevision | None, view: Int[Array, ""]):
-        seen = with_revised_view(state, revision, key_views, view)
-        return view_loss(gaussians, background, seen, view, config, max_pairs)
+) -> tuple[Gaussians, StepReport]:
+    """Mean gradient of `view_loss` over the step's views, and what they measured."""
 
     def add_view(total, view: Int[Array, ""]):
-        slopes, measured = jax.grad(loss, argnums=(0, 1), has_aux=True)(gaussians, view_revision(state), view)
+        slopes, measured = jax.grad(view_loss, has_aux=True)(gaussians, background, key_views, view, config, max_pairs)
         return jax.tree.map(jnp.add, total, slopes), measured
 
-    zeros = jax.tree.map(jnp.zeros_like, (gaussians, view_revision(state)))
     # A scan holds the intermediate arrays of one view at a time.
+    zeros = jax.tree.map(jnp.zeros_like, gaussians)
     total, (losses, errors, overflows) = jax.lax.scan(add_view, zeros, views)
-    slopes, of_views = jax.tree.map(lambda x: x / config.views_per_step, total)
     report = StepReport(
         loss=jnp.mean(losses),
         held_back=jnp.mean(errors),
@@ -195,4 +150,4 @@ def _slopes(
         num_missing_rows=jnp.zeros((), jnp.int32),
         num_overflow=jnp.max(overflows),
     )
-    return slopes, of_views, report
+    return jax.tree.map(lambda x: x / config.views_per_step, total), report

@@ -47,7 +47,7 @@ def run_capture(
     overwrite: bool,
     deltas: bool = False,
     num_held_back: int = 0,
-    revise: Sequence[str] = (),
+    revise: str | None = None,
     reporter: Reporter,
     on_accept: Callable[[], None] | None = None,
 ) -> RunResult:
@@ -66,8 +66,7 @@ def run_capture(
         overwrite: remove the run that `out` holds and start anew.
         deltas: also write what each chunk changed in the scene, in the stream frame (`storage/delta_files.py`).
         num_held_back: frames, evenly spread, that are not streamed but scored every few chunks.
-        revise: `poses` or `auto` adjusts the poses before the stream, see `run_poses.capture_to_stream`; effects that
-            only a refinement revises are for `refine_run`.
+        revise: `poses` or `auto` adjusts the poses before the stream, see `run_poses.capture_to_stream`.
         reporter: shows progress and warnings.
         on_accept: called when nothing is left to refuse, before the first chunk.
 

@@ -42,7 +42,7 @@ class EvalOptions:
     index: Path | None = None  # an index file, instead of protocol, stride, context and targets
     scene: str | None = None  # its scene; None for the name of the capture
     refine_steps: int = 0
-    revise: tuple[str, ...] = ()  # effects of the refinement
+    revise: str | None = None  # `poses` or `auto`: adjusted before the stream
     lpips_weights: LpipsWeights | None = None
     display: Display = dataclasses.field(default_factory=Display)
 

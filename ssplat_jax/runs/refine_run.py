@@ -1,7 +1,6 @@
 """`ssplat refine`: the scene of a finished run, revised on the frames that it was made from."""
 
 import dataclasses
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,13 +15,12 @@ from ssplat_jax.evaluation.exposures import exposures_from_json
 from ssplat_jax.evaluation.scoring import score_targets
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.refinement import KeyViews, RefineConfig
-from ssplat_jax.refinement.choose_effects import effects_by_name, with_effects
 from ssplat_jax.refinement.refine import Progress, continue_refinement, report_of, start_refinement
-from ssplat_jax.refinement.refine_capture import key_views_of, revised_exposures
+from ssplat_jax.refinement.refine_capture import key_views_of
 from ssplat_jax.refinement.refine_config import FOR_CAPTURES
 from ssplat_jax.runs.finish_run import NUM_PICTURES, save_scene
 from ssplat_jax.runs.refinement_state import load_refinement, save_refinement
-from ssplat_jax.runs.run_poses import has_adjusted_poses, were_poses_asked, with_poses_of_run
+from ssplat_jax.runs.run_poses import with_poses_of_run
 from ssplat_jax.storage.folder_lock import lock_folder
 from ssplat_jax.storage.interrupts import Interrupts
 from ssplat_jax.storage.json_files import write_json
@@ -62,7 +60,6 @@ def refine_run(
     params: dict,
     *,
     steps: int,
-    revise: Sequence[str] = (),
     save_every: int,
     overwrite: bool,
     reporter: Reporter,
@@ -74,7 +71,6 @@ def refine_run(
         path: the capture of that run, as `open_capture` takes it.
         params: parameters of the run's model.
         steps: most refinement steps, those of an earlier call included.
-        revise: effects of the refinement, see `refine_on_capture`.
         save_every: steps between saved states.
         overwrite: remove the refinement that the folder holds and start anew.
         reporter: shows progress and warnings.
@@ -90,13 +86,7 @@ def refine_run(
         if overwrite:
             folder.clear_refinement()
         given = key_views_of(run.capture, run.indices, run.frame, run.exposures)
-        is_adjusted = has_adjusted_poses(folder)
-        if "poses" in revise and not is_adjusted and not were_poses_asked(folder):
-            reporter.say("poses: `ssplat run --revise poses` adjusts them before the stream, which gains far more")
-        choice = effects_by_name(revise, run.gaussians, given, poses_stay=is_adjusted)
-        for reason in choice.reasons:
-            reporter.say(reason)
-        config = with_effects(FOR_CAPTURES, choice)
+        config = FOR_CAPTURES
         identity = run.identity | {"steps": steps, "refine_config": dataclasses.asdict(config)}
         if folder.refinement_state.exists():
             progress, key_views = load_refinement(folder.refinement_state, run.gaussians, given, config, identity)
@@ -106,16 +96,12 @@ def refine_run(
         if stopped:
             return RefineResult(progress.num_steps, {}, {}, stopped)
         refined, done = progress.scene(run.gaussians), report_of(progress, key_views, config)
-        exposures = revised_exposures(run.exposures, run.indices, done.key_views)
         save_scene(folder.refined_scene, refined, run.frame, run.exposures)  # at the exposure of scene.ply
         shown = tuple(sorted({run.indices[round(i)] for i in np.linspace(0, len(run.indices) - 1, NUM_PICTURES)}))
         before, after = (
-            score_targets(scene, run.capture, shown, run.frame, factors)
-            for scene, factors in ((run.gaussians, run.exposures), (refined, exposures))
+            score_targets(scene, run.capture, shown, run.frame, run.exposures) for scene in (run.gaussians, refined)
         )
-        report = {name: value for name, value in vars(done).items() if name != "key_views"}
-        report |= {"revised": list(choice.effects.names), "reasons": list(choice.reasons)}
-        write_json(folder.refinement, report | {"seen_views_before": before, "seen_views_after": after})
+        write_json(folder.refinement, vars(done) | {"seen_views_before": before, "seen_views_after": after})
     return RefineResult(progress.num_steps, before, after, None)
 
 

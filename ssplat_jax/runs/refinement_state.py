@@ -37,14 +37,6 @@ def save_refinement(path: Path, progress: Progress, key_views: KeyViews, identit
     arrays = {
         f"{part}.{name}": np.asarray(leaf) for part in MOVING for name, leaf in vars(getattr(state, part)).items()
     }
-    if state.views is not None:
-        arrays |= {f"views.{name}": np.asarray(getattr(state.views, name)) for name in ("num_shown", "depths")}
-        arrays |= {
-            f"views.{part}.{name}": np.asarray(leaf)
-            for part in MOVING
-            for name, leaf in vars(getattr(state.views, part)).items()
-            if leaf is not None
-        }
     arrays |= {name: np.asarray(getattr(state, name)) for name in COUNTS}
     arrays["valid"] = np.asarray(key_views.valid)
     if progress.rows is not None and progress.num_new:  # they are in no other file
@@ -90,14 +82,9 @@ def load_refinement(
     else:
         rows = present_rows(gaussians)
         present = only_present(gaussians, rows)
-    fresh = init_refinement(present, key_views, config)
-    views = fresh.views
-    if views is not None:
-        taken = lambda part: replace(getattr(views, part), **_below(arrays, f"views.{part}."))  # noqa: E731
-        counts = {name: jnp.asarray(arrays[f"views.{name}"]) for name in ("num_shown", "depths")}
-        views = replace(views, **{part: taken(part) for part in MOVING}, **counts)
+    fresh = init_refinement(present, config)
     moving = {part: Revision(**_below(arrays, f"{part}.")) for part in MOVING}
-    state = replace(fresh, **moving, **{name: jnp.asarray(arrays[name]) for name in COUNTS}, views=views)
+    state = replace(fresh, **moving, **{name: jnp.asarray(arrays[name]) for name in COUNTS})
     return Progress(state, rows, **header["measured"]), key_views
 
 

@@ -12,20 +12,20 @@ from ssplat_jax.core.console import Reporter
 from ssplat_jax.core.errors import StorageError, refusal
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.open_capture import open_capture
-from ssplat_jax.poses.adjust_poses import adjust_if_asked, pose_effects
+from ssplat_jax.poses.adjust_poses import adjust_if_asked
 from ssplat_jax.storage.json_files import write_json
 from ssplat_jax.storage.run_folder import RunFolder
 
 
 def capture_to_stream(
-    capture: Capture, indices: Sequence[int], revise: Sequence[str], folder: RunFolder, reporter: Reporter
+    capture: Capture, indices: Sequence[int], revise: str | None, folder: RunFolder, reporter: Reporter
 ) -> Capture:
     """The capture with the poses that a run streams: adjusted ones, if `revise` asks for them.
 
     Args:
         capture: the capture as it was opened.
         indices: frames to stream.
-        revise: names of effects; see `poses.adjust_poses.adjust_if_asked`.
+        revise: `poses`, `auto` or None; see `poses.adjust_poses.adjust_if_asked`.
         folder: where a run keeps its adjusted poses; a run that is continued finds them there.
         reporter: shows progress.
 
@@ -33,20 +33,19 @@ def capture_to_stream(
         InputError: the folder holds a run whose poses were not adjusted.
         StorageError: the folder cannot be written, or the saved poses are damaged.
     """
-    asked = pose_effects(revise)
-    if not asked:
+    if revise is None:
         forget_poses_without_run(folder)
         return capture
     saved = _read(folder)
     if folder.has_state():
-        if saved is None or ("poses" in asked and not (saved.camtoworlds or "poses" in saved.asked)):
+        if saved is None or (revise == "poses" and not (saved.camtoworlds or saved.asked == "poses")):
             got, fix = "one with the given poses", "leave it out, or start anew with --overwrite"
-            raise refusal(f"--revise {asked[0]}", wanted="a run that began with it", got=got, fix=fix)
-    elif saved is None or (saved.asked, saved.capture) != (asked, capture.digest(indices)):
+            raise refusal(f"--revise {revise}", wanted="a run that began with it", got=got, fix=fix)
+    elif saved is None or (saved.asked, saved.capture) != (revise, capture.digest(indices)):
         # None, or those of a run that was stopped before its first save and had another request.
         found = adjust_if_asked(capture, indices, revise, reporter)
         frames = {} if found is None else {i: found.capture.frames[i].camtoworld for i in indices}
-        saved = _SavedPoses(capture.digest(indices), list(indices), asked, frames)
+        saved = _SavedPoses(capture.digest(indices), list(indices), revise, frames)
         _write(folder, saved)
     return _with_poses(capture, saved) or capture
 
@@ -101,21 +100,11 @@ def has_adjusted_poses(folder: RunFolder) -> bool:
     return saved is not None and bool(saved.camtoworlds)
 
 
-def were_poses_asked(folder: RunFolder) -> bool:
-    """True if the run in `folder` began with `--revise poses`, even if too few points were found to adjust them by.
-
-    Raises:
-        StorageError: the saved poses are damaged.
-    """
-    saved = _read(folder)
-    return saved is not None and "poses" in saved.asked
-
-
 @dataclasses.dataclass(frozen=True)
 class _SavedPoses:
     capture: str  # digest of the poses as given
     indices: list[int]  # streamed frames
-    asked: list[str]  # names of effects that asked for them
+    asked: str  # `poses` or `auto`
     camtoworlds: dict[int, Float64[np.ndarray, "4 4"]]  # by frame; empty if the given ones were streamed
 
 
@@ -144,7 +133,6 @@ def _read(folder: RunFolder) -> _SavedPoses | None:
         poses = {int(i): np.array(pose, np.float64).reshape(4, 4) for i, pose in fields["camtoworlds"].items()}
         if not all(np.isfinite(pose).all() for pose in poses.values()):
             raise ValueError("a pose is not finite")
-        asked = [str(name) for name in fields.get("asked", [])]  # earlier versions did not write it
-        return _SavedPoses(str(fields["capture"]), [int(i) for i in fields["indices"]], asked, poses)
+        return _SavedPoses(str(fields["capture"]), [int(i) for i in fields["indices"]], str(fields["asked"]), poses)
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise StorageError(f"{folder.adjusted_poses}: damaged; --overwrite starts the run anew.") from error

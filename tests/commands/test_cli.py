@@ -482,11 +482,6 @@ def test_negative_refinement_steps_are_bad_usage(tmp_path, capsys):
     capture = make_capture(tmp_path / "capture", num_frames=12, size=(128, 96))
     assert run("eval", str(capture), "--context", "8", "--out", str(tmp_path / "out"), "--refine", "-1") == 2
     assert "--refine: wanted a number of steps of at least 0, got -1" in capsys.readouterr().err
-    assert run("eval", str(capture), "--out", str(tmp_path / "out"), "--revise", "focal") == 2
-    assert "--revise: wanted --refine beside it, got 0 steps" in capsys.readouterr().err
-    options = ("--refine", "5", "--revise", "auto", "poses")
-    assert run("eval", str(capture), "--out", str(tmp_path / "out"), *options) == 2
-    assert "--revise: wanted auto alone or effects by name, got auto poses" in capsys.readouterr().err
     assert run("run", str(capture), "--out", str(tmp_path / "out"), "--refine", "-1") == 2
     assert "--refine: wanted a number of steps of at least 0, got -1" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()

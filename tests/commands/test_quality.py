@@ -1,12 +1,9 @@
 """`--quality` and `--refine`: the steps after the stream."""
 
-import pytest
-
 from ssplat_jax.commands.eval_command import Eval
 from ssplat_jax.commands.options import refinement_steps
 from ssplat_jax.commands.run_command import Run
 from ssplat_jax.config import QUALITIES
-from ssplat_jax.core.errors import InputError
 
 
 def test_steps_that_are_asked_for_go_before_those_of_the_quality():
@@ -21,7 +18,7 @@ def test_best_refines_after_the_stream(monkeypatch, tmp_path):
         "ssplat_jax.runs.eval_run.eval_path",
         lambda *a: asked.update(steps=a[4].refine_steps) or {"scenes": {}, "over_scenes": SCORES},
     )
-    Eval("procedural:room", tmp_path, quality="best", revise=("exposures",), quiet=True).run()
+    Eval("procedural:room", tmp_path, quality="best", quiet=True).run()
     assert asked == {"steps": 100}
 
     class Result:
@@ -41,9 +38,3 @@ def test_best_refines_after_the_stream(monkeypatch, tmp_path):
 
 
 SCORES = {name: {"psnr": 20.0, "ssim": 0.5} for name in ("shown", "literal")}
-
-
-@pytest.mark.parametrize("command", [Run, Eval])
-def test_effects_need_steps(command, tmp_path):
-    with pytest.raises(InputError, match="--revise"):
-        command("procedural:room", tmp_path, quality="accurate", revise=("exposures",)).run()

@@ -109,8 +109,8 @@ def test_effects_decide_whether_poses_are_adjusted(adjusted, wrong, monkeypatch)
     fits = dataclasses.replace(adjusted, are_off=False)
     assert adjust_if_asked(wrong, CONTEXT, (), quiet) is None
     assert adjust_if_asked(wrong, CONTEXT, ("exposures",), quiet) is None
-    for revise, result, wanted in ((("auto",), fits, None), (("auto",), adjusted, adjusted), (("poses",), fits, fits)):
+    for revise, result, wanted in (("auto", fits, None), ("auto", adjusted, adjusted), ("poses", fits, fits)):
         found.append(result)
         assert adjust_if_asked(wrong, CONTEXT, revise, quiet) is wanted
     found.append(dataclasses.replace(adjusted, num_points=0))  # too few to adjust poses by
-    assert adjust_if_asked(wrong, CONTEXT, ("poses",), quiet) is None
+    assert adjust_if_asked(wrong, CONTEXT, "poses", quiet) is None

@@ -44,7 +44,7 @@ def must_not_be_called(*given):
     raise AssertionError("poses were adjusted again")
 
 
-def run(out, revise=("poses",), overwrite=False):
+def run(out, revise="poses", overwrite=False):
     options = {"size": SIZE, "stride": 1, "max_views": None, "save_every": 8, "overwrite": overwrite, "revise": revise}
     return run_capture(
         StreamSplat(preset("tiny")), load_params("tiny"), CAPTURE, out, **options, reporter=Reporter(quiet=True)
@@ -74,38 +74,36 @@ def test_the_stream_and_all_that_follows_see_the_adjusted_poses(finished, monkey
         CAPTURE,
         load_params("tiny"),
         steps=1,
-        revise=("poses",),
         save_every=1,
         overwrite=True,
         reporter=Reporter(quiet=True),
     )
     assert result.num_steps == 1
-    assert json.loads(RunFolder(finished).refinement.read_text())["revised"] == []  # no gradient moves them again
 
 
 def test_a_run_without_them_is_another_run(finished):
     with pytest.raises(InputError, match="differs in its poses"):
-        run(finished, revise=())
+        run(finished, revise=None)
 
 
 def test_a_finished_run_with_given_poses_takes_no_adjusted_ones_and_stays_usable(tmp_path, monkeypatch):
     folder, capture = RunFolder(tmp_path), open_capture(CAPTURE, size=SIZE)
     monkeypatch.setattr(adjusting, "adjust_poses", must_not_be_called)
     folder.state.write_bytes(b"of a run that began without")
-    for revise in (("poses",), ("auto",)):
-        with pytest.raises(InputError, match=f"--revise {revise[0]}: wanted a run that began with it"):
+    for revise in ("poses", "auto"):
+        with pytest.raises(InputError, match=f"--revise {revise}: wanted a run that began with it"):
             capture_to_stream(capture, range(4), revise, folder, Reporter(quiet=True))
     assert not folder.adjusted_poses.exists()
-    assert capture_to_stream(capture, range(4), (), folder, Reporter(quiet=True)) is capture
+    assert capture_to_stream(capture, range(4), None, folder, Reporter(quiet=True)) is capture
 
 
 def test_poses_that_fitted_are_no_adjusted_ones(tmp_path, monkeypatch):
     folder, capture = RunFolder(tmp_path), open_capture(CAPTURE, size=SIZE)
     monkeypatch.setattr(adjusting, "adjust_poses", lambda *given: moved(*given, are_off=False))
-    capture_to_stream(capture, range(4), ("auto",), folder, Reporter(quiet=True))
+    capture_to_stream(capture, range(4), "auto", folder, Reporter(quiet=True))
     folder.state.write_bytes(b"of the run")
     with pytest.raises(InputError, match="--revise poses: wanted a run that began with it"):
-        capture_to_stream(capture, range(4), ("poses",), folder, Reporter(quiet=True))
+        capture_to_stream(capture, range(4), "poses", folder, Reporter(quiet=True))
 
 
 def test_a_run_whose_poses_could_not_be_adjusted_goes_on(tmp_path, monkeypatch):
@@ -114,8 +112,8 @@ def test_a_run_whose_poses_could_not_be_adjusted_goes_on(tmp_path, monkeypatch):
     for state in (None, b"of the run"):
         if state:
             folder.state.write_bytes(state)
-        assert capture_to_stream(capture, range(4), ("poses",), folder, Reporter(quiet=True)).frames == capture.frames
-        assert not has_adjusted_poses(folder)  # a refinement may revise them
+        assert capture_to_stream(capture, range(4), "poses", folder, Reporter(quiet=True)).frames == capture.frames
+        assert not has_adjusted_poses(folder)
 
 
 @pytest.mark.parametrize(
@@ -124,11 +122,11 @@ def test_a_run_whose_poses_could_not_be_adjusted_goes_on(tmp_path, monkeypatch):
 def test_poses_that_a_stopped_run_left_for_another_stream_are_found_anew(earlier, indices, tmp_path, monkeypatch):
     folder, quiet = RunFolder(tmp_path), Reporter(quiet=True)
     monkeypatch.setattr(adjusting, "adjust_poses", moved)
-    capture_to_stream(open_capture(earlier, size=SIZE), indices, ("poses",), folder, quiet)
+    capture_to_stream(open_capture(earlier, size=SIZE), indices, "poses", folder, quiet)
     given = open_capture(CAPTURE, size=SIZE)
-    streamed = capture_to_stream(given, range(4), ("poses",), folder, quiet)
+    streamed = capture_to_stream(given, range(4), "poses", folder, quiet)
     np.testing.assert_array_equal(streamed.camtoworlds, moved(given, range(4)).capture.camtoworlds)
-    assert capture_to_stream(given, range(4), (), folder, quiet) is given
+    assert capture_to_stream(given, range(4), None, folder, quiet) is given
     assert not folder.adjusted_poses.exists()  # no later command takes them for those of the run
 
 
@@ -161,9 +159,9 @@ def test_pictures_of_another_capture_have_its_poses_and_a_warning_says_so(other,
 def test_poses_that_a_stopped_run_adjusted_anyway_are_judged_for_auto(tmp_path, monkeypatch):
     folder, capture, quiet = RunFolder(tmp_path), open_capture(CAPTURE, size=SIZE), Reporter(quiet=True)
     monkeypatch.setattr(adjusting, "adjust_poses", lambda *given: moved(*given, are_off=False))
-    capture_to_stream(capture, range(4), ("poses",), folder, quiet)
+    capture_to_stream(capture, range(4), "poses", folder, quiet)
     assert has_adjusted_poses(folder)
-    streamed = capture_to_stream(capture, range(4), ("auto",), folder, quiet)
+    streamed = capture_to_stream(capture, range(4), "auto", folder, quiet)
     np.testing.assert_array_equal(streamed.camtoworlds, capture.camtoworlds)
     assert not has_adjusted_poses(folder)
 
@@ -172,10 +170,10 @@ def test_poses_without_a_run_are_removed_even_if_they_are_damaged(tmp_path):
     folder, capture = RunFolder(tmp_path), open_capture(CAPTURE, size=SIZE)
     folder.adjusted_poses.write_text("{")
     folder.state.write_bytes(b"of the run")
-    assert capture_to_stream(capture, range(4), (), folder, Reporter(quiet=True)) is capture
+    assert capture_to_stream(capture, range(4), None, folder, Reporter(quiet=True)) is capture
     assert folder.adjusted_poses.exists()  # what belongs to a run stays
     folder.state.unlink()
-    assert capture_to_stream(capture, range(4), (), folder, Reporter(quiet=True)) is capture
+    assert capture_to_stream(capture, range(4), None, folder, Reporter(quiet=True)) is capture
     assert not folder.adjusted_poses.exists()
 
 
@@ -183,13 +181,12 @@ def test_poses_that_fit_are_kept_and_not_judged_twice(tmp_path, monkeypatch):
     capture, quiet = open_capture(CAPTURE, size=SIZE), Reporter(quiet=True)
     fits = lambda *given: moved(*given, are_off=False)  # noqa: E731
     monkeypatch.setattr(adjusting, "adjust_poses", fits)
-    first = capture_to_stream(capture, range(4), ("auto",), RunFolder(tmp_path), quiet)
+    first = capture_to_stream(capture, range(4), "auto", RunFolder(tmp_path), quiet)
     monkeypatch.setattr(adjusting, "adjust_poses", must_not_be_called)
-    second = capture_to_stream(capture, range(4), ("auto",), RunFolder(tmp_path), quiet)
-    assert not has_adjusted_poses(RunFolder(tmp_path))  # so refinement may revise them
+    second = capture_to_stream(capture, range(4), "auto", RunFolder(tmp_path), quiet)
+    assert not has_adjusted_poses(RunFolder(tmp_path))
     for kept in (first, second):
         np.testing.assert_array_equal(kept.camtoworlds, capture.camtoworlds)
-    assert capture_to_stream(capture, range(4), ("focal",), RunFolder(tmp_path), quiet) is capture
 
 
 def test_saved_poses_of_another_capture_are_not_used(finished):

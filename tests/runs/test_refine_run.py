@@ -10,7 +10,6 @@ from ssplat_jax.config import preset
 from ssplat_jax.core.console import Reporter
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.data.open_capture import open_capture
-from ssplat_jax.evaluation.exposures import exposures_to_json
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.refinement.learned_pass import STEPS
 from ssplat_jax.runs import capture_run
@@ -26,10 +25,10 @@ CAPTURE = "procedural:room?frames=4"
 REFINED = ("refined.ply", "refinement.json", "refinement.npz")
 
 
-def refine(path, steps=4, capture=CAPTURE, overwrite=False, revise=()):
+def refine(path, steps=4, capture=CAPTURE, overwrite=False):
     reporter = Reporter(quiet=True)
     params = load_params("tiny")
-    options = {"steps": steps, "revise": revise, "save_every": 2, "overwrite": overwrite}
+    options = {"steps": steps, "save_every": 2, "overwrite": overwrite}
     return refine_run(path, capture, params, **options, reporter=reporter)
 
 
@@ -55,31 +54,24 @@ def finished(tmp_path_factory):
 def test_a_stopped_refinement_continues_to_the_same_bytes(finished, monkeypatch):
     folder = RunFolder(finished)
     streamed = folder.scene.read_bytes()
-    revise = ("poses", "exposures")
-    written = []
-    with monkeypatch.context() as patched:
-        save_scene = module.save_scene
-        patched.setattr(module, "save_scene", lambda *given: (written.append(given[3]), save_scene(*given)))
-        result = refine(finished, overwrite=True, revise=revise)
+    result = refine(finished, overwrite=True)
     whole, left_out = folder.refined_scene.read_bytes(), json.loads(folder.refinement.read_text())["num_left_out"]
-    # The refined scene is at the exposure that metrics.json names, whatever was revised.
-    assert exposures_to_json(written[0]) == json.loads(folder.metrics.read_text())["exposures"]
     assert result.num_steps == 4 and result.interrupted is None
     assert result.after["shown"]["psnr"] > result.before["shown"]["psnr"]
 
     folder.clear_refinement()
     stop_after_each_step(monkeypatch)
     for taken in (1, 2):
-        result = refine(finished, revise=revise)
+        result = refine(finished)
         assert (result.num_steps, result.interrupted) == (taken, signal.SIGINT)
         assert not folder.refined_scene.exists()
     monkeypatch.undo()
-    refine(finished, revise=revise)
+    refine(finished)
     assert folder.refined_scene.read_bytes() == whole
     assert folder.scene.read_bytes() == streamed != whole
     report = json.loads(folder.refinement.read_text())
     assert report["num_steps"] == len(report["losses"]) == 4
-    assert report["revised"] == ["poses", "exposures"] and report["num_left_out"] == left_out
+    assert report["num_left_out"] == left_out
     sizes = [len(read_ply(path).gaussians.means) for path in (folder.scene, folder.refined_scene)]
     assert report["num_new"] > 0 and sizes[1] <= sizes[0] + report["num_new"] <= 1.1 * sizes[0]
     assert [read_ply(path).gaussians.sh_degree for path in (folder.scene, folder.refined_scene)] == [0, 2]
@@ -125,8 +117,6 @@ def test_a_refinement_with_other_steps_is_refused(finished):
     refine(finished, steps=2, overwrite=True)
     with pytest.raises(InputError, match="differs in its steps"):
         refine(finished, steps=3)
-    with pytest.raises(InputError, match="differs in its refine_config"):
-        refine(finished, steps=2, revise=("focal",))
 
 
 def test_another_capture_than_the_runs_is_refused(finished):
