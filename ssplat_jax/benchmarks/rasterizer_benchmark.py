@@ -24,13 +24,11 @@ from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.core.gaussians import SH_C0, Gaussians
 from ssplat_jax.rasterizer import constants
-from ssplat_jax.rasterizer.binning import intersect_tiles
+from ssplat_jax.rasterizer.binning import Grid, intersect_tiles, sorted_table
 from ssplat_jax.rasterizer.compositing import composite
-from ssplat_jax.rasterizer.depth_sorted_table import sorted_table
 from ssplat_jax.rasterizer.effects import Effects
 from ssplat_jax.rasterizer.outputs import splat_channels
 from ssplat_jax.rasterizer.render import TILE, RenderInputs, prepare, render, round_up
-from ssplat_jax.rasterizer.tile_grid import Grid
 
 EFFECTS = Effects(antialias="classic")  # as in the prototype that it was first compared with
 SIZES = ((65_536, 256), (262_144, 512))  # Gaussians, side of the image

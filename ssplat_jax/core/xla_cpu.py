@@ -2,7 +2,7 @@
 
 Measured with jax 0.10.1 on two CPU cores; docs/performance.md and docs/decisions.md
 have the machines. Two more stand where they are used: the kernel gradient of `model/convolution.py`, and sort keys
-packed into one integer (`rasterizer/depth_sorted_table.py`, `rasterizer/binning.py`, `cache/fuse.py`).
+packed into one integer (`rasterizer/binning.py`, `rasterizer/binning.py`, `cache/fuse.py`).
 """
 
 import functools

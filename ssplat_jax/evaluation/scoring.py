@@ -110,7 +110,6 @@ def score_view(
         InputError: the image is damaged.
     """
     out = render(gaussians, capture.camera(i, frame))
-    assert out.color is not None and out.alpha is not None
     exposure = exposure_for(capture, i, exposures)
     filled = np.asarray(_jitted_fill_holes(out.color, out.alpha, mean_color(gaussians)))
     over_black = np.asarray(out.color)

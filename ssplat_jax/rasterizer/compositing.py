@@ -25,8 +25,7 @@ from jaxtyping import Array, Float, Int
 
 from ssplat_jax.core.xla_cpu import by_platform, in_own_kernel, short_exp
 from ssplat_jax.rasterizer import constants
-from ssplat_jax.rasterizer.binning import TileIntersections
-from ssplat_jax.rasterizer.depth_sorted_table import (
+from ssplat_jax.rasterizer.binning import (
     BOX,
     CHANNELS,
     FACTORS,
@@ -35,9 +34,10 @@ from ssplat_jax.rasterizer.depth_sorted_table import (
     MEAN_Y,
     SHAPE,
     WITHOUT_BOX,
+    Grid,
+    TileIntersections,
     num_channels,
 )
-from ssplat_jax.rasterizer.tile_grid import Grid
 
 Results = TypeVar("Results")
 
@@ -130,8 +130,8 @@ def _backward(grid: Grid, with_alpha: bool, residuals, cotangents, schedule: Sch
             weights, afters = _weights(alphas, transmittance)
             weights = jnp.stack(weights, axis=1)
             channels = values[STEP_CHANNELS]
-            slopes = sum((c[:, None] * value for c, value in zip(by_channel, channels, strict=True)), by_alpha)
-            tail, exponents = _exponent_gradients(alphas, weights, weights * slopes, tail)
+            dots = sum((c[:, None] * value for c, value in zip(by_channel, channels, strict=True)), by_alpha)
+            tail, exponents = _exponent_gradients(alphas, weights, weights * dots, tail)
             grad_channels = [_sum_pixels(grid, weights * c[:, None]) for c in by_channel]
             grad_rows = jnp.stack([*_shape_gradients(grid, exponents, values), *grad_channels], axis=-1)
             grads = grads.at[rows.T].add(grad_rows)  # rows read behind a tile's end add zeros
@@ -171,7 +171,7 @@ def _median_rows(grid: Grid, table, intersections: TileIntersections, schedule: 
 
 
 def _batches(bounds: Int[Array, " tiles_and_one"], grid: Grid, schedule: Schedule) -> Int[Array, "batches t"]:
-    """Tiles in order of load, so that those of a batch end together; padded with `grid.num_tiles`, which is no tile."""
+    """Tiles in order of load, so that those of a batch end together; padded with `grid.num_tiles`, an invalid index."""
     order = jnp.argsort(bounds[1:] - bounds[:-1]).astype(jnp.int32)
     size = min(schedule.batch_size, grid.num_tiles)
     padding = -grid.num_tiles % size

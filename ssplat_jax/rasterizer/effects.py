@@ -4,12 +4,15 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.core.gaussians import Gaussians
+from ssplat_jax.core.pytree import replace
 from ssplat_jax.rasterizer import constants
 
 OUTPUTS = ("color", "alpha", "depth", "median_depth")
@@ -141,21 +144,99 @@ def _differ(exposures: np.ndarray) -> bool:
 
 def _sampling_ratio(gaussians: Gaussians, camera: Camera, captured: Camera) -> float:
     """Ratio of the sampling rate (f / z) of present Gaussians to that of the captured cameras: 99 % quantile."""
-    present = np.asarray(gaussians.opacities) > 0
-    means = np.asarray(gaussians.means, np.float64)[present]
-    ours, theirs = _sampling_rates(means, camera), _sampling_rates(means, captured)
-    seen = (ours > 0) & (theirs > 0)
+    ours, theirs = (np.asarray(sampling_rates(gaussians.means, one)) for one in (camera, captured))
+    seen = (np.asarray(gaussians.opacities) > 0) & (ours > 0) & (theirs > 0)
     return float(np.quantile(ours[seen] / theirs[seen], 0.99)) if seen.any() else 0.0
 
 
-def _sampling_rates(means: np.ndarray, camera: Camera) -> np.ndarray:
-    """Pixels per scene unit at each mean in the camera that samples it most finely; 0 where none sees it."""
-    rates = np.zeros(means.shape[0])
-    viewmats = np.asarray(camera.viewmats, np.float64).reshape(-1, 4, 4)
-    for viewmat, K in zip(viewmats, np.asarray(camera.Ks, np.float64).reshape(-1, 3, 3), strict=True):
-        x, y, z = (means @ viewmat[:3, :3].T + viewmat[:3, 3]).T
-        z = np.where(z > constants.NEAR, z, np.inf)
+def sampling_rates(means: Float[Array, "n 3"], captured: Camera) -> Float[Array, " n"]:
+    """Pixels per scene unit, f / z, in the captured camera that samples each mean most finely; 0 where none sees it.
+
+    A camera sees means in front of it and inside its image, enlarged by 15 % on each side.
+    """
+
+    def see(rates, one):
+        viewmat, K = one
+        x, y, z = (sum(viewmat[i, j] * means[:, j] for j in range(3)) + viewmat[i, 3] for i in range(3))
+        in_front = z > constants.NEAR
+        z = jnp.where(in_front, z, 1.0)
         u, v = K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
-        inside = (u >= 0) & (u <= camera.width) & (v >= 0) & (v <= camera.height)
-        rates = np.maximum(rates, np.where(inside, np.abs(K[0, 0]) / z, 0.0))
-    return rates
+        margin = constants.CAPTURE_MARGIN
+        inside = (jnp.abs(u / captured.width - 0.5) <= 0.5 + margin) & (
+            jnp.abs(v / captured.height - 0.5) <= 0.5 + margin
+        )
+        return jnp.maximum(rates, jnp.where(in_front & inside, jnp.abs(K[0, 0]) / z, 0.0)), None
+
+    cameras = (
+        captured.viewmats.reshape(-1, 4, 4).astype(means.dtype),
+        captured.Ks.reshape(-1, 3, 3).astype(means.dtype),
+    )
+    return jax.lax.scan(see, jnp.zeros_like(means[:, 0]), cameras)[0]
+
+
+def filter_3d(gaussians: Gaussians, captured: Camera) -> Gaussians:
+    """`gaussians` convolved with a Gaussian of variance 0.2 squared sampling intervals, mass preserved.
+
+    Gaussians that no captured camera sees get the widest filter of the others. The filter is a constant to the
+    gradient; scales and opacities are differentiable through it.
+
+    Limits:
+        No camera sees anything: the Gaussians are returned unchanged.
+        Scale 0: opacity 0 (a point has no mass), gradient finite.
+    """
+    rates = jax.lax.stop_gradient(sampling_rates(gaussians.means, captured))
+    lowest = jnp.min(jnp.where((rates > 0) & (gaussians.opacities > 0), rates, jnp.inf))
+    rates = jnp.where(rates > 0, rates, lowest)
+    variances = constants.FILTER_3D_VARIANCE / (rates * rates)  # 0 where no Gaussian is seen
+    squares = gaussians.scales**2 + variances[:, None]
+    scales = jnp.sqrt(jnp.maximum(squares, jnp.finfo(squares.dtype).tiny))
+    kept = jnp.prod(jnp.minimum(jnp.abs(gaussians.scales) / scales, 1.0), axis=-1)
+    return replace(gaussians, scales=scales, opacities=gaussians.opacities * kept)
+
+
+TANGENTS = np.tan(np.radians(np.linspace(0.0, 89.4, 2048)))
+"""Radii at which the polynomial is examined: from the axis to an angle that no such lens sees."""
+
+
+def distort(
+    x: Float[Array, "b n"], y: Float[Array, "b n"], coefficients: Float[Array, "b 5"]
+) -> tuple[tuple[Float[Array, "b n"], ...], tuple[Float[Array, "b n"], ...]]:
+    """Distorted (x, y), and their derivatives (dx/dx, dx/dy, dy/dx, dy/dy) by the undistorted coordinates."""
+    k1, k2, p1, p2, k3 = (coefficients[:, i, None] for i in range(5))
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    rate = 2 * (k1 + r2 * (2 * k2 + 3 * r2 * k3))  # d radial / dx = rate x
+    distorted_x = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    distorted_y = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    cross = rate * x * y + 2 * p1 * x + 2 * p2 * y
+    along_x = radial + rate * x * x + 2 * p1 * y + 6 * p2 * x
+    along_y = radial + rate * y * y + 6 * p1 * y + 2 * p2 * x
+    return (distorted_x, distorted_y), (along_x, cross, cross, along_y)
+
+
+def is_folded(derivatives: tuple[Float[Array, "b n"], ...]) -> Array:
+    """True if the polynomial falls with the radius, outside the lens's field of view: such points are culled.
+
+    It may rise again farther out. Points outside its first maximum, which `lens_field` finds, are culled too.
+    """
+    xx, xy, yx, yy = derivatives
+    return ~((xx * yy - xy * yx > 0) & (jnp.minimum(xx, yy) > 0))
+
+
+def lens_field(
+    coefficients: Float[Array, "b 5"], corner: Float[Array, " b"]
+) -> tuple[Float[Array, " b"], Float[Array, " b"]]:
+    """The field of view of a lens by its radial terms, as undistorted radii (tangents of the angle to the axis).
+
+    Returns:
+        The radius of the polynomial's first maximum (at most that of 89.4 degrees), and the radius that is seen at the
+        distorted radius `corner`, or the former where `corner` is not reached.
+    """
+    k1, k2, k3 = (coefficients[:, i, None] for i in (0, 1, 4))
+    radii = jnp.asarray(TANGENTS, coefficients.dtype)
+    squares = radii * radii
+    rises = 1 + squares * (3 * k1 + squares * (5 * k2 + squares * 7 * k3)) > 0
+    maximum = jnp.where(rises.all(axis=1), radii[-1], radii[jnp.argmin(rises, axis=1)])
+    distorted = radii * (1 + squares * (k1 + squares * (k2 + squares * k3)))
+    is_outside = (distorted >= corner[:, None]) | (radii >= maximum[:, None])
+    return maximum, radii[jnp.argmax(is_outside, axis=1)]

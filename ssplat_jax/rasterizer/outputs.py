@@ -1,29 +1,58 @@
-"""The render output, and the steps before and after compositing that both renderers share."""
+"""The render output: colors before compositing, images after it, and holes filled for people to look at."""
 
+import math
+
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ssplat_jax.core.cameras import Camera
-from ssplat_jax.core.gaussians import Gaussians
+from ssplat_jax.core.gaussians import SH_C0, Gaussians
 from ssplat_jax.core.numerics import safe_normalize
 from ssplat_jax.core.pytree import pytree
 from ssplat_jax.rasterizer.effects import Effects
 from ssplat_jax.rasterizer.projection import Splats
-from ssplat_jax.rasterizer.sh import sh_colors
 
 
 @pytree
 class RenderOutput:
-    """Images of one camera or a batch, and counts of what was left out."""
+    """Images of one camera or a batch, and counts of what was left out.
+
+    Reading an output that was not asked for raises an InputError that names it.
+    """
 
     color: Float[Array, "*b h w 3"]  # RGB, background included; may exceed 1 (SH), never below 0
-    alpha: Float[Array, "*b h w"] | None  # 1 - transmittance
-    depth: Float[Array, "*b h w"] | None  # expected camera z, sum(w z) / sum(w); 0 where alpha is 0
-    median_depth: Float[Array, "*b h w"] | None  # camera z where the transmittance falls below 1/2; 0 where it does not
-    features: Float[Array, "*b h w c"] | None  # sum(w f), not normalized
+    others: dict[str, Array]  # the other outputs that were asked for, by name
     num_pairs: Int[Array, ""]  # tile intersections, (tile, Gaussian) pairs, of all images
     num_overflow: Int[Array, ""]  # pairs above `max_pairs`; the image is wrong unless 0
     num_non_finite: Int[Array, ""]  # rows culled for entries that are NaN, infinite or above 1e12
+
+    @property
+    def alpha(self) -> Float[Array, "*b h w"]:
+        """1 - transmittance."""
+        return self._asked("alpha")
+
+    @property
+    def depth(self) -> Float[Array, "*b h w"]:
+        """Expected camera z, sum(w z) / sum(w); 0 where alpha is 0."""
+        return self._asked("depth")
+
+    @property
+    def median_depth(self) -> Float[Array, "*b h w"]:
+        """Camera z where the transmittance falls below 1/2; 0 where it does not."""
+        return self._asked("median_depth")
+
+    @property
+    def features(self) -> Float[Array, "*b h w c"]:
+        """sum(w f), not normalized."""
+        return self._asked("features")
+
+    def _asked(self, name: str) -> Array:
+        if name not in self.others:
+            how = "pass features" if name == "features" else f"add {name!r} to Effects.outputs"
+            raise InputError(f"render: {name} was not computed; {how}.")
+        return self.others[name]
 
 
 def splat_channels(
@@ -89,23 +118,24 @@ def finish(
     """
     batch = camera.viewmats.shape[:-2]
     images = composited.reshape(*batch, *composited.shape[1:])
-    color, rest, alpha, depth = images[..., :3], images[..., 3:], None, None
+    color, rest, others = images[..., :3], images[..., 3:], {}
     if effects.needs_alpha:
-        rest, alpha = rest[..., :-1], rest[..., -1]
-    if effects.background is not None and alpha is not None:
-        color = color + (1.0 - alpha)[..., None] * jnp.array(effects.background, color.dtype)
+        rest, others["alpha"] = rest[..., :-1], rest[..., -1]
+    if effects.background is not None:
+        color = color + (1.0 - others["alpha"])[..., None] * jnp.array(effects.background, color.dtype)
     if effects.exposure and exposures is not None:
         color = apply_exposures(color, exposures.astype(color.dtype))
-    if "depth" in effects.outputs and alpha is not None:
-        seen = alpha > 0
-        depth = jnp.where(seen, rest[..., 0] / jnp.where(seen, alpha, 1.0), 0.0)
+    if "depth" in effects.outputs:
+        seen = others["alpha"] > 0
+        others["depth"] = jnp.where(seen, rest[..., 0] / jnp.where(seen, others["alpha"], 1.0), 0.0)
         rest = rest[..., 1:]
+    if median_depth is not None:
+        others["median_depth"] = median_depth.reshape(*batch, *median_depth.shape[1:])
+    if rest.shape[-1]:
+        others["features"] = rest
     return RenderOutput(
         color=color,
-        alpha=alpha,
-        depth=depth,
-        median_depth=None if median_depth is None else median_depth.reshape(*batch, *median_depth.shape[1:]),
-        features=rest if rest.shape[-1] else None,
+        others=others,
         num_pairs=num_pairs,
         num_overflow=num_overflow,
         num_non_finite=num_non_finite,
@@ -117,3 +147,117 @@ def apply_exposures(color: Float[Array, "*b h w 3"], exposures: Float[Array, "*b
     matrices = exposures[..., None, None, :, :]
     corrected = sum(matrices[..., i] * color[..., i, None] for i in range(3)) + matrices[..., 3]
     return jnp.maximum(corrected, 0.0)
+
+
+_C1 = 0.4886025119029199
+_C2 = (1.0925484305920792, 1.0925484305920792, 0.31539156525252005, 1.0925484305920792, 0.5462742152960396)
+_C3 = (
+    0.5900435899266435,
+    2.890611442640554,
+    0.4570457994644658,
+    0.3731763325901154,
+    0.4570457994644658,
+    1.445305721320277,
+    0.5900435899266435,
+)
+
+
+def sh_basis(directions: Float[Array, "*s 3"], degree: int) -> Float[Array, "*s k"]:
+    """The (degree + 1)^2 basis functions at unit `directions`.
+
+    Limits:
+        Polynomials of the components: finite and smooth everywhere, the poles included.
+    """
+    x, y, z = (directions[..., i] for i in range(3))
+    terms = [jnp.full_like(x, SH_C0)]
+    if degree >= 1:
+        terms += [-_C1 * y, _C1 * z, -_C1 * x]
+    if degree >= 2:
+        xx, yy, zz = x * x, y * y, z * z
+        terms += [
+            _C2[0] * x * y,
+            -_C2[1] * y * z,
+            _C2[2] * (2 * zz - xx - yy),
+            -_C2[3] * x * z,
+            _C2[4] * (xx - yy),
+        ]
+        if degree >= 3:
+            terms += [
+                -_C3[0] * y * (3 * xx - yy),
+                _C3[1] * x * y * z,
+                -_C3[2] * y * (4 * zz - xx - yy),
+                _C3[3] * z * (2 * zz - 3 * xx - 3 * yy),
+                -_C3[4] * x * (4 * zz - xx - yy),
+                _C3[5] * z * (xx - yy),
+                -_C3[6] * x * (xx - 3 * yy),
+            ]
+    return jnp.stack(terms, axis=-1)
+
+
+def sh_colors(
+    sh: Float[Array, "n k 3"], directions: Float[Array, "*b n 3"] | None, degree: int
+) -> Float[Array, "*b n 3"]:
+    """Colors max(0.5 + sum, 0) along unit `directions` (camera to Gaussian), from the bands up to `degree`.
+
+    At degree 0, `directions` is not used and may be None; the colors are then `[n 3]`.
+
+    Limits:
+        0.5 + sum < 0 gives 0, with a zero gradient; at exactly 0 the gradient is halved.
+    """
+    if degree == 0 or directions is None:
+        return jnp.maximum(0.5 + SH_C0 * sh[:, 0, :], 0.0)
+    basis = sh_basis(directions, degree)
+    # A sum of products: a dot product would have the platform's matmul precision.
+    return jnp.maximum(0.5 + jnp.sum(basis[..., None] * sh[:, : basis.shape[-1], :], axis=-2), 0.0)
+
+
+SIGMA = 2.0
+"""Standard deviation of the blur, pixels: half a cell of the streamed images."""
+
+BACKGROUND_WEIGHT = 1e-3
+"""Opacity that the background has everywhere: it shows where nothing else is near."""
+
+
+def fill_holes(
+    color: Float[Array, "*b h w 3"],
+    alpha: Float[Array, "*b h w"],
+    background: Float[Array, "3"],
+    *,
+    sigma: float = SIGMA,
+) -> Float[Array, "*b h w 3"]:
+    """Rendered images with the blurred colors of the surroundings behind them, instead of black.
+
+        C + (1 - A) G(C + eps background) / G(A + eps)        G: a Gaussian of `sigma` pixels
+
+    (Knutsson and Westin, Normalized and Differential Convolution, CVPR 1993.) Over black, a hole would be as wrong as
+    it can be, and half transparent surfaces would be dark.
+
+    Args:
+        color: RGB premultiplied by alpha, as `render` returns it without a background.
+        alpha: 1 - transmittance.
+        background: RGB to show where nothing is near.
+        sigma: standard deviation of the blur, pixels.
+
+    Returns:
+        Opaque RGB.
+
+    Limits:
+        Alpha 1 everywhere: `color` itself. Alpha 0 for more than three sigma around: `background`. In between, every
+        value is within the range of the surrounding colors C / A and `background`; gradients are finite throughout.
+    """
+    radius = math.ceil(3 * sigma)
+    taps = np.exp(-0.5 * (np.arange(-radius, radius + 1) / sigma) ** 2)
+    weighted = jnp.concatenate([color + BACKGROUND_WEIGHT * background, alpha[..., None] + BACKGROUND_WEIGHT], axis=-1)
+    for axis in (-3, -2):
+        weighted = _blur(weighted, taps / taps.sum(), axis)
+    return color + (1.0 - alpha)[..., None] * weighted[..., :3] / weighted[..., 3:]
+
+
+def _blur(values: Float[Array, "*b h w c"], taps: np.ndarray, axis: int) -> Float[Array, "*b h w c"]:
+    """Weighted sums of neighbors along `axis`; zero outside the border."""
+    radius, length = len(taps) // 2, values.shape[axis]
+    padding = [(0, 0)] * values.ndim
+    padding[axis % values.ndim] = (radius, radius)
+    padded = jnp.pad(values, padding)
+    take = lambda k: jax.lax.slice_in_dim(padded, k, k + length, axis=axis % values.ndim)  # noqa: E731
+    return sum((float(t) * take(k) for k, t in enumerate(taps)), jnp.zeros_like(values))

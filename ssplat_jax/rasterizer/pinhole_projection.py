@@ -1,6 +1,6 @@
 """The projection without lens distortion, with its gradient in closed form.
 
-The chain rule by hand. Below, D x is the slope of the loss by x, for a row and a camera:
+The chain rule by hand. Below, D x denotes dL/dx, for a Gaussian and a camera:
 
     det = |c|^2, c = u x v                      u, v: the rows of M = J W R S, in pixels
     a, b, d, e                                  D of u.u, u.v, v.v and det, from D of the conic and of the compensation
@@ -23,8 +23,9 @@ from jaxtyping import Array, Bool, Float
 
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.gaussians import Gaussians
-from ssplat_jax.core.numerics import columns
+from ssplat_jax.core.numerics import columns, safe_normalize
 from ssplat_jax.core.pytree import replace
+from ssplat_jax.core.rotations import matrix_entries
 from ssplat_jax.core.xla_cpu import kept
 from ssplat_jax.rasterizer import constants
 from ssplat_jax.rasterizer.effects import Effects
@@ -61,41 +62,41 @@ def _project_fwd(gaussians: Gaussians, camera: Camera, effects: Effects):
     return splats, (gaussians, camera, splats)
 
 
-def _project_bwd(effects: Effects, residuals, slopes: Splats) -> tuple[Gaussians, Camera]:
+def _project_bwd(effects: Effects, residuals, grads: Splats) -> tuple[Gaussians, Camera]:
     gaussians, camera, splats = residuals
     visible = splats.visible
-    slopes = replace(
-        slopes,
-        means2d=jnp.where(visible[..., None], slopes.means2d, 0.0),
-        conic_factors=jnp.where(visible[..., None], slopes.conic_factors, 0.0),
-        opacities=jnp.where(visible, slopes.opacities, 0.0),
+    grads = replace(
+        grads,
+        means2d=jnp.where(visible[..., None], grads.means2d, 0.0),
+        conic_factors=jnp.where(visible[..., None], grads.conic_factors, 0.0),
+        opacities=jnp.where(visible, grads.opacities, 0.0),
         visible=visible,
     )
     sight = _sight(gaussians, camera, visible)
-    axes, scales = _axes(gaussians.quats), columns(gaussians.scales)
+    axes, scales = matrix_entries(gaussians.quats), columns(gaussians.scales)
     scales = [jnp.where(visible, scale, 0.0) for scale in scales]  # infinity times zero is kept out
-    always = jnp.any(visible)  # where it is false, all slopes below are 0
+    always = jnp.any(visible)  # where it is false, all gradients below are 0
     unscaled = [[sum(row[j] * axes[j][k] for j in range(3)) for k in range(3)] for row in sight.rows]
     unscaled = kept(unscaled, always)
     roots = [[root * scale for root, scale in zip(part, scales, strict=True)] for part in unscaled]
-    shape_slopes = kept(_shape_slopes(gaussians, splats, slopes, roots, effects), always)
-    root_slopes = kept(_root_slopes(roots, shape_slopes), always)
-    scaled = [[slope * scale for slope, scale in zip(part, scales, strict=True)] for part in root_slopes]
-    row_slopes = [[sum(axes[j][k] * part[k] for k in range(3)) for j in range(3)] for part in scaled]
-    row_slopes = kept(row_slopes, always)
-    scale_slopes = [sum(root_slopes[i][k] * unscaled[i][k] for i in (0, 1)) for k in range(3)]
-    point_slopes, clipped_slopes = _point_slopes(sight, camera, row_slopes, slopes)
-    turns = [_cross(slope, row) for slope, row in zip(row_slopes, sight.rows, strict=True)]
+    shape_grads = kept(_shape_grads(gaussians, splats, grads, roots, effects), always)
+    root_grads = kept(_root_grads(roots, shape_grads), always)
+    scaled = [[grad * scale for grad, scale in zip(part, scales, strict=True)] for part in root_grads]
+    row_grads = [[sum(axes[j][k] * part[k] for k in range(3)) for j in range(3)] for part in scaled]
+    row_grads = kept(row_grads, always)
+    scale_grads = [sum(root_grads[i][k] * unscaled[i][k] for i in (0, 1)) for k in range(3)]
+    point_grads, clipped_grads = _point_grads(sight, camera, row_grads, grads)
+    turns = [_cross(grad, row) for grad, row in zip(row_grads, sight.rows, strict=True)]
     turn = [jnp.sum(a + b, axis=0) for a, b in zip(*turns, strict=True)]
     world = camera.viewmats[:, :3, :3, None]
     by_gaussian = Gaussians(
-        means=_stacked(sum(world[:, i, j] * point_slopes[i] for i in range(3)) for j in range(3)),
-        quats=_quat_slopes(gaussians.quats, turn),
-        scales=_stacked(scale_slopes),
-        opacities=jnp.sum(slopes.opacities * _compensation(gaussians, splats), axis=0),
+        means=_stacked(sum(world[:, i, j] * point_grads[i] for i in range(3)) for j in range(3)),
+        quats=_quat_grads(gaussians.quats, turn),
+        scales=_stacked(scale_grads),
+        opacities=jnp.sum(grads.opacities * _compensation(gaussians, splats), axis=0),
         sh=jnp.zeros_like(gaussians.sh),
     )
-    return by_gaussian, _camera_slopes(gaussians, camera, sight, slopes, row_slopes, point_slopes, clipped_slopes)
+    return by_gaussian, _camera_grads(gaussians, camera, sight, grads, row_grads, point_grads, clipped_grads)
 
 
 _project.defvjp(_project_fwd, _project_bwd)
@@ -132,22 +133,11 @@ def _sight(gaussians: Gaussians, camera: Camera, visible: Bool[Array, "b n"]) ->
 
 def _unit_quats(quats: Float[Array, "n 4"]):
     """Entries of the unit quaternions, the identity for zero, and the inverse lengths, 0 for zero."""
-    entries = columns(quats)
-    is_zero = functools.reduce(jnp.maximum, (jnp.abs(entry) for entry in entries)) <= 1e-12
-    square = sum(entry * entry for entry in entries)
-    inverse = 1.0 / jnp.sqrt(jnp.where(is_zero, 1.0, square))
-    unit = [jnp.where(is_zero, one, entry * inverse) for one, entry in zip((1.0, 0.0, 0.0, 0.0), entries, strict=True)]
-    return unit, jnp.where(is_zero, 0.0, inverse)
-
-
-def _axes(quats: Float[Array, "n 4"]):
-    """Entries of the rotation matrices, row by row."""
-    (w, x, y, z), _ = _unit_quats(quats)
-    return (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
+    unit = columns(safe_normalize(quats))
+    length = jnp.sqrt(sum(entry * entry for entry in columns(quats)))
+    is_zero = functools.reduce(jnp.maximum, (jnp.abs(entry) for entry in unit)) == 0
+    unit = [jnp.where(is_zero, one, entry) for one, entry in zip((1.0, 0.0, 0.0, 0.0), unit, strict=True)]
+    return unit, jnp.where(is_zero, 0.0, 1.0 / jnp.where(is_zero, 1.0, length))
 
 
 def _compensation(gaussians: Gaussians, splats: Splats) -> Float[Array, "b n"]:
@@ -155,13 +145,13 @@ def _compensation(gaussians: Gaussians, splats: Splats) -> Float[Array, "b n"]:
     return jnp.where(splats.visible, splats.opacities / jnp.where(splats.visible, gaussians.opacities, 1.0), 0.0)
 
 
-def _shape_slopes(gaussians: Gaussians, splats: Splats, slopes: Splats, roots, effects: Effects):
-    """Slopes a, b, d, e by u.u (twice), u.v, v.v (twice) and det (twice).
+def _shape_grads(gaussians: Gaussians, splats: Splats, grads: Splats, roots, effects: Effects):
+    """Gradients a, b, d, e with respect to u.u (twice), u.v, v.v (twice) and det (twice).
 
     The filtered v.v is 1 / (2 r^2) and the filtered determinant 1 / (4 p^2 r^2): all is in the factors already.
     """
     p, q, r = columns(splats.conic_factors)
-    by_p, by_q, by_r = columns(slopes.conic_factors)
+    by_p, by_q, by_r = columns(grads.conic_factors)
     kernel = FILTER_VARIANCES[effects.antialias]
     if kernel < constants.MIN_RELATIVE_VARIANCE * constants.MAX_SCREEN_SIGMA**2:  # large rows have a larger one
         largest = sum(jnp.abs(jax.lax.stop_gradient(root)) for part in roots for root in part)
@@ -170,8 +160,8 @@ def _shape_slopes(gaussians: Gaussians, splats: Splats, slopes: Splats, roots, e
     by_compensation = over_compensation = 0.0  # times the compensation, and divided by it
     if effects.antialias == "mip":
         compensation = jnp.where(splats.visible, _compensation(gaussians, splats), 1.0)
-        by_compensation = slopes.opacities * splats.opacities
-        over_compensation = slopes.opacities * gaussians.opacities / compensation
+        by_compensation = grads.opacities * splats.opacities
+        over_compensation = grads.opacities * gaussians.opacities / compensation
     weight, squared_r = 2 * p * p * r * r, r * r
     total = along_p + by_compensation
     a = -2 * kernel * weight * total
@@ -179,55 +169,55 @@ def _shape_slopes(gaussians: Gaussians, splats: Splats, slopes: Splats, roots, e
     return a, -2 * by_q * p * squared_r, d, 2 * weight * (over_compensation - total)
 
 
-def _root_slopes(roots, shape_slopes):
-    """Slopes by u and v."""
-    (u, v), (a, b, d, e) = roots, shape_slopes
+def _root_grads(roots, shape_grads):
+    """Gradients with respect to u and v."""
+    (u, v), (a, b, d, e) = roots, shape_grads
     cross = _cross(u, v)
     by_u = [a * x + b * y + e * side for x, y, side in zip(u, v, _cross(v, cross), strict=True)]
     by_v = [d * y + b * x + e * side for x, y, side in zip(u, v, _cross(cross, u), strict=True)]
     return by_u, by_v
 
 
-def _point_slopes(sight: _Sight, camera: Camera, row_slopes, slopes: Splats):
-    """Slopes by x, y and z in the camera, and those by the clipped tangents alone."""
+def _point_grads(sight: _Sight, camera: Camera, row_grads, grads: Splats):
+    """Gradients with respect to x, y and z in the camera, and those of the clipped tangents alone."""
     world = camera.viewmats[:, :3, :3, None]
     focal = [camera.Ks[:, i, i, None] for i in (0, 1)]
     behind = [world[:, 2, j] for j in range(3)]
-    clipped = [-focal[i] * _dot(row_slopes[i], behind) / sight.depths for i in (0, 1)]
+    clipped = [-focal[i] * _dot(row_grads[i], behind) / sight.depths for i in (0, 1)]
     inside = [~(low | high) for low, high in zip(sight.is_low, sight.is_high, strict=True)]
-    pixels = columns(slopes.means2d)
+    pixels = columns(grads.means2d)
     tangents = [focal[i] * pixels[i] + jnp.where(inside[i], clipped[i], 0.0) for i in (0, 1)]
-    shrink = sum(_dot(row_slopes[i], sight.rows[i]) + tangents[i] * sight.tangents[i] for i in (0, 1))
-    by_depth = jnp.where(sight.in_front, slopes.depths, 0.0) - shrink / sight.depths
+    shrink = sum(_dot(row_grads[i], sight.rows[i]) + tangents[i] * sight.tangents[i] for i in (0, 1))
+    by_depth = jnp.where(sight.in_front, grads.depths, 0.0) - shrink / sight.depths
     return [*(tangent / sight.depths for tangent in tangents), by_depth], clipped
 
 
-def _quat_slopes(quats: Float[Array, "n 4"], turn) -> Float[Array, "n 4"]:
-    """Slopes by quaternions of any length, from those by a small rotation about the axes of the world."""
+def _quat_grads(quats: Float[Array, "n 4"], turn) -> Float[Array, "n 4"]:
+    """Gradients of quaternions of any length, from those of a small rotation about the axes of the world."""
     (w, *axis), inverse = _unit_quats(quats)
     side = _cross(turn, axis)
     entries = [-_dot(turn, axis), *(w * a + b for a, b in zip(turn, side, strict=True))]
     return jnp.stack([2 * inverse * entry for entry in entries], axis=-1)
 
 
-def _camera_slopes(gaussians, camera: Camera, sight: _Sight, slopes: Splats, row_slopes, point_slopes, clipped_slopes):
-    """Slopes by the cameras, sums over the rows; XLA drops them where nobody asks."""
+def _camera_grads(gaussians, camera: Camera, sight: _Sight, grads: Splats, row_grads, point_grads, clipped_grads):
+    """Camera gradients, summed over Gaussians; removed by XLA if unused."""
     total = lambda x: jnp.sum(x, axis=1)  # noqa: E731
     means, focal = columns(gaussians.means), [camera.Ks[:, i, i, None] for i in (0, 1)]
-    world = [[total(point_slopes[i] * means[j]) for j in range(3)] for i in range(3)]
+    world = [[total(point_grads[i] * means[j]) for j in range(3)] for i in range(3)]
     for j in range(3):
-        across = [focal[i] * row_slopes[i][j] / sight.depths for i in (0, 1)]
+        across = [focal[i] * row_grads[i][j] / sight.depths for i in (0, 1)]
         world[0][j] += total(across[0])
         world[1][j] += total(across[1])
-        world[2][j] -= total(sum(clipped * slope for clipped, slope in zip(sight.clipped, across, strict=True)))
-    rows = [jnp.stack([*world[i], total(point_slopes[i])], axis=-1) for i in range(3)]
-    pixels, zero = columns(slopes.means2d), jnp.zeros_like(focal[0][:, 0])
-    by_focal = [total(pixels[i] * sight.tangents[i] + _dot(row_slopes[i], sight.unfocused[i])) for i in (0, 1)]
+        world[2][j] -= total(sum(clipped * grad for clipped, grad in zip(sight.clipped, across, strict=True)))
+    rows = [jnp.stack([*world[i], total(point_grads[i])], axis=-1) for i in range(3)]
+    pixels, zero = columns(grads.means2d), jnp.zeros_like(focal[0][:, 0])
+    by_focal = [total(pixels[i] * sight.tangents[i] + _dot(row_grads[i], sight.unfocused[i])) for i in (0, 1)]
     intrinsics = [(by_focal[0], zero, total(pixels[0])), (zero, by_focal[1], total(pixels[1])), (zero, zero, zero)]
     by_bounds = []
     for i in (0, 1):
         for is_clipped in (sight.is_low[i], sight.is_high[i]):
-            by_bounds.append(total(jnp.where(is_clipped, clipped_slopes[i], 0.0))[:, None])
+            by_bounds.append(total(jnp.where(is_clipped, clipped_grads[i], 0.0))[:, None])
     (by_margin,) = jax.vjp(tangent_bounds, camera)[1](tuple(by_bounds))
     return replace(
         camera,

@@ -17,8 +17,7 @@ from ssplat_jax.core.numerics import columns
 from ssplat_jax.core.pytree import pytree, replace
 from ssplat_jax.core.rotations import matrix_entries
 from ssplat_jax.rasterizer import constants
-from ssplat_jax.rasterizer.effects import Effects
-from ssplat_jax.rasterizer.lens_distortion import distort, is_folded, lens_field
+from ssplat_jax.rasterizer.effects import Effects, distort, is_folded, lens_field
 
 FILTER_VARIANCES = {
     "mip": constants.MIP_VARIANCE,

@@ -12,8 +12,7 @@ from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.rasterizer import constants
-from ssplat_jax.rasterizer.effects import Effects
-from ssplat_jax.rasterizer.filter_3d import filter_3d
+from ssplat_jax.rasterizer.effects import Effects, filter_3d
 from ssplat_jax.rasterizer.outputs import RenderOutput, finish, splat_channels
 from ssplat_jax.rasterizer.projection import Splats, cull_non_finite, project
 

@@ -12,15 +12,12 @@ from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.errors import InputError, echo
 from ssplat_jax.core.gaussians import Gaussians, check_gaussians
 from ssplat_jax.core.pytree import pytree, replace
-from ssplat_jax.rasterizer.binning import count_intersections, intersect_tiles
+from ssplat_jax.rasterizer.binning import Grid, count_intersections, intersect_tiles, sorted_table
 from ssplat_jax.rasterizer.compositing import composite, median_rows
-from ssplat_jax.rasterizer.depth_sorted_table import sorted_table
-from ssplat_jax.rasterizer.effects import Effects
-from ssplat_jax.rasterizer.filter_3d import filter_3d
+from ssplat_jax.rasterizer.effects import Effects, filter_3d
 from ssplat_jax.rasterizer.outputs import RenderOutput, finish, splat_channels
 from ssplat_jax.rasterizer.pinhole_projection import project_pinhole
 from ssplat_jax.rasterizer.projection import cull_cameras, cull_non_finite, project
-from ssplat_jax.rasterizer.tile_grid import Grid
 
 TILE = 8
 """Default side of a tile, pixels."""

@@ -107,7 +107,6 @@ def cells_of_view(
     height, width = key_views.images.shape[1:3]
     effects = Effects(outputs=("color", "alpha", "depth"))
     out = render(gaussians, key_views.camera(view), effects=effects, max_pairs=max_pairs)
-    assert out.alpha is not None and out.depth is not None
     learned = jnp.where(held_back_pixels((height, width), view, config), 0.0, 1.0)
     light = (1.0 - out.alpha) * learned
     exposure = key_views.exposures[view]

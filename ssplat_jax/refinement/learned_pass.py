@@ -109,7 +109,6 @@ def add_view(
     def images(revision: Revision, probe: Float[Array, "n 3"]):
         gaussians = apply_revision(start, revision)
         out = render(gaussians, camera, effects=EFFECTS, features=probe, max_pairs=max_pairs)
-        assert out.color is not None and out.alpha is not None and out.features is not None
         filled = fill_holes(out.color, out.alpha, background)
         return (filled * exposure - target, out.color * exposure - target, out.features), out.num_overflow
 

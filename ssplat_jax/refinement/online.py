@@ -162,7 +162,6 @@ def _loss(base, residuals, probe, view: KeyViews, max_pairs: int, max_scale: flo
     camera = Camera(viewmats=view.viewmats, Ks=view.Ks, width=width, height=height)
     gaussians = add(base, residuals, max_scale=max_scale)
     out = render(gaussians, camera, effects=EFFECTS, features=probe, max_pairs=max_pairs)
-    assert out.color is not None and out.alpha is not None and out.features is not None
     filled = fill_holes(out.color, out.alpha, jax.lax.stop_gradient(mean_color(gaussians)))
     target = view.images.astype(jnp.float32) / 255 / view.exposures
     error = SHOWN_WEIGHT * (filled - target) ** 2 + (1 - SHOWN_WEIGHT) * (out.color - target) ** 2

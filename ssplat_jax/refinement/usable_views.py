@@ -70,7 +70,6 @@ def contradicting(errors: Float[np.ndarray, " v"]) -> Int[np.ndarray, " b"]:
 def _view_error(gaussians: Gaussians, key_views: KeyViews, view: Int[Array, ""], max_pairs: int) -> Float[Array, ""]:
     """Mean absolute error of a view over what the scene covers of it; NaN if it covers next to nothing."""
     out = render(gaussians, key_views.camera(view), effects=Effects(outputs=("color", "alpha")), max_pairs=max_pairs)
-    assert out.color is not None and out.alpha is not None
     target = key_views.images[view].astype(jnp.float32) / 255
     # The uncovered share of a pixel is compared with nothing.
     errors = jnp.mean(jnp.abs(out.color * key_views.exposures[view] - out.alpha[..., None] * target), axis=-1)

@@ -52,7 +52,6 @@ def view_loss(
     height, width = key_views.images.shape[1:3]
     held_back = held_back_pixels((height, width), view, config)
     out = render(gaussians, key_views.camera(view), effects=EFFECTS, max_pairs=max_pairs)
-    assert out.color is not None and out.alpha is not None
     filled = fill_holes(out.color, out.alpha, background)
     target = key_views.images[view].astype(jnp.float32) / 255
     exposure = key_views.exposures[view]

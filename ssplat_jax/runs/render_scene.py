@@ -139,6 +139,5 @@ def _render_picture(
     )
     effects = Effects(antialias=ANTIALIAS[splats.render_mode], outputs=("color", "alpha", "depth"))
     out = render(splats.gaussians, camera, effects=effects)
-    assert out.color is not None and out.alpha is not None
     color = out.color if background is None else _jitted_fill_holes(out.color, out.alpha, background)
     return np.asarray(color), np.asarray(out.depth)

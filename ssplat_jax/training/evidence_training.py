@@ -161,7 +161,6 @@ def _compiled(model: StreamSplat, num_pivots: int, max_pairs: int, recipe: Evide
         out = render(gaussians, camera, effects=EFFECTS, max_pairs=max_pairs)
         image = jax.lax.dynamic_slice(key_views.images[crop.view], (crop.row, crop.column, 0), (height, width, 3))
         target, exposure = image.astype(jnp.float32) / 255, key_views.exposures[crop.view]
-        assert out.color is not None and out.alpha is not None
         filled = fill_holes(out.color, out.alpha, mean_color(gaussians))
         shown, black = (negative_psnr(x * exposure, target) for x in (filled, out.color))
         value = (1 - recipe.black_weight) * shown + recipe.black_weight * black

@@ -202,7 +202,6 @@ def _compiled(max_pairs: int, black_weight: float):
         gaussians: Gaussians = apply_revision(state.start, _moved(refiner, state, seen))
         out = render(gaussians, key_views.camera(view), effects=EFFECTS, max_pairs=max_pairs)
         target, exposure = key_views.images[view].astype(jnp.float32) / 255, key_views.exposures[view]
-        assert out.color is not None and out.alpha is not None
         filled = fill_holes(out.color, out.alpha, mean_color(gaussians))
         shown, black = (negative_psnr(x * exposure, target) for x in (filled, out.color))
         return (1 - black_weight) * shown + black_weight * black, {"shown_psnr": -shown, "black_psnr": -black}

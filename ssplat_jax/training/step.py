@@ -197,7 +197,6 @@ def target_loss(
         The loss, and scalar metrics by name.
     """
     output = render(gaussians, sample.target_camera, max_pairs=recipe.max_pairs)
-    assert output.color is not None and output.alpha is not None
     filled = fill_holes(output.color, output.alpha, jax.lax.stop_gradient(mean_color(gaussians)))
     gains = fitted_gains(filled, sample.target_images) if recipe.fit_gains else 1.0
     rendering, over_black = (

@@ -52,14 +52,13 @@ def draw(
     if kind == "confidence" and scene.confidences is not None:
         features = jnp.asarray(scene.confidences)[:, None]
     out = render(scene.gaussians, view, effects=Effects(antialias=scene.antialias), features=features)
-    assert out.color is not None and out.alpha is not None and out.depth is not None
     depth, alpha = np.asarray(out.depth), np.asarray(out.alpha)
     if kind == "depth":
         return eight_bits(color_depth(depth, *scale_ends(depth[depth > 0])))
     if kind == "normals":
         return eight_bits(color_normals(depth, K))
     if kind == "confidence":
-        share = alpha if out.features is None else np.asarray(out.features)[..., 0] / np.maximum(alpha, 1e-6)
+        share = alpha if features is None else np.asarray(out.features)[..., 0] / np.maximum(alpha, 1e-6)
         return eight_bits(np.where(alpha[..., None] > 0.5, color_share(share), 0.0))
     color = np.asarray(
         out.color if over_black else _jitted_fill_holes(out.color, out.alpha, mean_color(scene.gaussians))

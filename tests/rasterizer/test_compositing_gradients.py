@@ -4,8 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from ssplat_jax.rasterizer.binning import Grid
 from ssplat_jax.rasterizer.compositing import _shape_gradients
-from ssplat_jax.rasterizer.tile_grid import Grid
 
 
 def in_float64(grid: Grid, exponents: np.ndarray, values: np.ndarray) -> np.ndarray:

@@ -8,11 +8,9 @@ import pytest
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.rasterizer import Effects, render
-from ssplat_jax.rasterizer.binning import intersect_tiles
+from ssplat_jax.rasterizer.binning import Grid, intersect_tiles, sorted_table
 from ssplat_jax.rasterizer.constants import ALPHA_MIN
-from ssplat_jax.rasterizer.depth_sorted_table import sorted_table
 from ssplat_jax.rasterizer.projection import project
-from ssplat_jax.rasterizer.tile_grid import Grid
 
 WIDTH, HEIGHT, TILE = 28, 20, 8  # no multiple of a tile
 GRID = Grid(num_images=1, height=HEIGHT, width=WIDTH, tile=TILE)

@@ -12,8 +12,7 @@ from ssplat_jax.core.errors import InputError
 from ssplat_jax.core.gaussians import Gaussians, mask_gaussians
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.rasterizer import Effects, effects_for, filter_3d, render
-from ssplat_jax.rasterizer.filter_3d import sampling_rates
-from ssplat_jax.rasterizer.lens_distortion import distort
+from ssplat_jax.rasterizer.effects import distort, sampling_rates
 from ssplat_jax.rasterizer.projection import project, tangent_bounds
 from ssplat_jax.rasterizer.reference import render_reference
 from tests.rasterizer.scenes import cameras, cloud, concatenate

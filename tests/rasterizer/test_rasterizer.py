@@ -14,12 +14,10 @@ from ssplat_jax.core.gaussians import Gaussians, mask_gaussians
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.core.xla_cpu import short_exp
 from ssplat_jax.rasterizer import Effects, binning, compositing, constants, render
-from ssplat_jax.rasterizer.binning import TileIntersections, intersect_tiles
-from ssplat_jax.rasterizer.depth_sorted_table import BOX_SIZE, CHANNELS, sorted_table
+from ssplat_jax.rasterizer.binning import BOX_SIZE, CHANNELS, Grid, TileIntersections, intersect_tiles, sorted_table
 from ssplat_jax.rasterizer.projection import Splats, project
 from ssplat_jax.rasterizer.reference import render_reference
 from ssplat_jax.rasterizer.render import default_max_pairs
-from ssplat_jax.rasterizer.tile_grid import Grid
 from tests.rasterizer import oracle
 from tests.rasterizer.scenes import cameras, cloud, concatenate
 
@@ -164,7 +162,10 @@ def test_overflow_is_counted_inside_jit_and_retried_outside(scene):
 @plainly
 def test_only_requested_outputs_are_returned(scene):
     out = render(*scene, effects=Effects(outputs=("color",)), max_pairs=1 << 12)
-    assert out.alpha is None and out.depth is None and out.median_depth is None and out.features is None
+    assert not out.others
+    for name in ("alpha", "depth", "median_depth", "features"):
+        with pytest.raises(InputError, match=name):
+            getattr(out, name)
     np.testing.assert_allclose(out.color, render(*scene, max_pairs=1 << 12).color, atol=1e-6)
 
 

@@ -54,7 +54,6 @@ def cameras(shifts) -> Camera:
 
 def views_of(scene: Gaussians, shifts=(0.0, 0.2, -0.2), exposures=None) -> KeyViews:
     color = render(scene, cameras(shifts), max_pairs=1 << 17).color
-    assert color is not None
     factors = jnp.ones((len(shifts), 3)) if exposures is None else jnp.asarray(exposures, jnp.float32)
     return KeyViews.of(cameras(shifts), color * factors[:, None, None], factors)
 

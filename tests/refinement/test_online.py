@@ -129,7 +129,6 @@ def score(cache, shift: float = 0.05) -> float:
     """PSNR of a view that no chunk has shown."""
     view = chunk((shift,))
     color = render(decode(cache), view.camera, max_pairs=1 << 12).color
-    assert color is not None
     return psnr(np.clip(np.asarray(color[0]), 0, 1), np.asarray(view.images[0]))
 
 

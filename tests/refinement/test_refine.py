@@ -63,7 +63,6 @@ def cameras(shifts=(0.0, 0.15, -0.15, 0.3)) -> Camera:
 def photographs():
     """Images of the true scene from `cameras`."""
     color = render(scene(), cameras(), max_pairs=MAX_PAIRS).color
-    assert color is not None
     return color
 
 

@@ -11,9 +11,9 @@ import pytest
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.core.pytree import replace
+from ssplat_jax.rasterizer.binning import tile_boxes
 from ssplat_jax.rasterizer.effects import Effects
 from ssplat_jax.rasterizer.render import RenderInputs, prepare, tile_grid_of
-from ssplat_jax.rasterizer.tile_grid import tile_boxes
 from ssplat_jax.refinement import RefineConfig, init_refinement, refine, refine_step
 from ssplat_jax.refinement.seen_rows import may_be_seen, put_rows, select_rows, take_rows
 from ssplat_jax.refinement.view_order import views_of_step

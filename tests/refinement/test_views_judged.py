@@ -54,7 +54,6 @@ def cameras(shifts) -> Camera:
 def photographs():
     """The wall as the cameras of `views` see it."""
     color = render(wall(), views_cameras(), effects=Effects(outputs=("color",)), max_pairs=MAX_PAIRS).color
-    assert color is not None
     return color
 
 

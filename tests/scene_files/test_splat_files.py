@@ -12,7 +12,7 @@ from ssplat_jax.core.errors import InputError
 from ssplat_jax.core.gaussians import SH_C0, Gaussians
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.rasterizer import render
-from ssplat_jax.rasterizer.sh import sh_basis
+from ssplat_jax.rasterizer.outputs import sh_basis
 from ssplat_jax.scene_files.ply import load_ply, save_ply
 from ssplat_jax.scene_files.splat import save_splat
 from ssplat_jax.scene_files.spz import save_spz
