@@ -9,9 +9,9 @@ from typing import ClassVar, Literal, get_args, get_origin
 
 import pytest
 
-from ssplat_jax.config import PRESETS, CompactConfig, StreamConfig, preset
-from ssplat_jax.config.config_group import ConfigGroup
+from ssplat_jax.config import LITERAL, PRESETS, StreamConfig, preset
 from ssplat_jax.core.errors import InputError
+from ssplat_jax.network_configs import CompactConfig, ConfigGroup
 
 BAD = [
     {"chunk_size": 0},
@@ -30,31 +30,20 @@ BAD = [
     {"token_width": 30},
     {"cgfi_width": 4},
     {"mixer_blocks": -1},
-    {"gamma_init": 0.0},
-    {"gamma_init": float("inf")},
-    {"median_depth": 0.0},
-    {"median_depth": -2.0},
     {"voxel_size": float("inf")},
     {"scene_scale": float("inf")},
-    {"readout_window": -1},
-    {"confidence_window": -1},
     {"mixer_neighbors": 0},
     {"attention_ffn": 0},
     {"encoder_widths": ("a", 1)},
     {"encoder_widths": (32, 63)},
     {"chunk_step": float("inf")},
-    {"lambda_sigma": float("inf")},
     {"min_confidence": 1.5},
     {"min_confidence": 0.96},  # carving keeps confidences below 0.95
     {"min_confidence": float("nan")},
-    {"sigma0": 0.0},
-    {"lambda_sigma": -0.1},
-    {"cluster_ratio": 1.0},
     {"sh_degree": 4},
     {"scene_scale": 0.0},
     {"scene_scale": "big"},
     {"overflow": "grwo"},
-    {"anchor_space": "linear"},
     {"depth_readout": ""},
 ]
 
@@ -72,12 +61,6 @@ def test_bad_value_is_refused_by_name_and_value(changes):
         bad.__post_init__()
 
 
-def test_recall_without_hpda_is_refused():
-    with pytest.raises(InputError, match="recall must be false without hpda, got True"):
-        StreamConfig().replace(recall=True)
-    assert StreamConfig().replace(recall=True, hpda=True).history.recall
-
-
 def test_replacing_checks_what_it_builds():
     with pytest.raises(InputError, match="voxel_size"):
         StreamConfig().replace(voxel_size=-1.0)
@@ -89,21 +72,20 @@ def test_unknown_field_is_refused_with_the_known_ones():
 
 
 def test_dictionary_and_back_is_the_same_configuration():
-    config = StreamConfig().replace(encoder_widths=(8, 16), scene_scale=0.5, overflow="error")
+    config = StreamConfig().replace(encoder_widths=(8, 16), scene_scale=0.5, overflow="drop_new")
     again = StreamConfig.from_dict(config.to_dict())
     assert again == config and again.hash == config.hash and hash(again) == hash(config)
 
 
 @pytest.mark.parametrize("name", PRESETS)
 def test_presets_are_the_same_after_json(name):
-    """As JSON has it: `paper` has an infinite cluster ratio."""
     text = json.dumps(preset(name).to_dict(), allow_nan=False)
     assert StreamConfig.from_dict(json.loads(text)) == preset(name)
 
 
 @pytest.mark.parametrize("network", ["compact", "resplat"])
 def test_every_field_changes_the_hash(network):
-    base = StreamConfig().replace(network=network, hpda=True)  # without it, recall is refused
+    base = StreamConfig().replace(network=network)
     change = {
         bool: lambda x: not x,
         int: lambda x: 2 * x,
@@ -133,16 +115,6 @@ def test_full_and_short_names_are_the_same_field():
         assert StreamConfig().replace(**{name: value}) == StreamConfig().replace(**{name.split(".")[1]: value})
 
 
-def test_flat_dictionary_of_version_0_1_is_read():
-    flat = {"preset": "tiny", "network": "compact", "vit": "s", "match_stride": 4, "depth_range": None}
-    flat |= {"mixer_neighbours": 9, "voxel_size": 0.05, "encoder_widths": [8, 16]}
-    config = StreamConfig().replace(mixer_neighbors=9, voxel_size=0.05, encoder_widths=(8, 16))
-    assert StreamConfig.from_dict(flat) == config
-    resplat = {"preset": "small", "network": "resplat", "match_stride": 4, "unet_width": 64, "token_width": 128}
-    wanted = StreamConfig().replace(preset="small", network="resplat").replace(match_stride=4, token_width=128)
-    assert StreamConfig.from_dict(resplat) == wanted
-
-
 def test_field_of_another_network_is_refused():
     with pytest.raises(InputError, match="no field 'vit' with network 'compact'"):
         StreamConfig().replace(vit="b")
@@ -158,6 +130,13 @@ def test_short_name_that_two_groups_share_is_refused(monkeypatch):
     with pytest.raises(InputError, match=r"'voxel_size' could be network.voxel_size or memory.voxel_size"):
         config.replace(voxel_size=0.5)
     assert config.replace(**{"network.voxel_size": 0.5}).get("network.voxel_size") == 0.5
+
+
+def test_paper_has_no_additions_and_shared_fields_are_few():
+    assert preset("paper").additions == LITERAL
+    assert {x for x in dataclasses.asdict(LITERAL).values() if x is not False} == {"metric"}
+    groups = (getattr(StreamConfig(), name) for name in StreamConfig().groups() if name != "network")
+    assert sum(len(dataclasses.fields(group)) for group in groups) <= 26
 
 
 def test_presets_have_their_name_and_unknown_are_refused():

@@ -115,7 +115,7 @@ def test_attenuated_feature_is_concatenated_and_nothing_else():
     feats, omega, history = f32(rng.normal(size=(*GRID, c))), f32(rng.uniform(size=GRID)), remembered(rng)
     zeros = jnp.zeros((*GRID, c))
     params = jax.jit(Aggregator(SLIM).init)(jax.random.key(0), zeros, zeros, jnp.ones(2, bool))["params"]
-    assert num_hints(SLIM) == c and params["leave"]["kernel"].shape[2] == 2 * c + SLIM.history.cgfi_width
+    assert num_hints(SLIM) == c and params["leave"]["kernel"].shape[2] == 2 * c + SLIM.network.cgfi_width
     copies = jnp.zeros_like(params["leave"]["kernel"]).at[1, 1, jnp.arange(c), jnp.arange(c)].set(2.0)
     copies = copies.at[1, 1, c + jnp.arange(c), jnp.arange(c)].set(-3.0)
     params = params | {"leave": params["leave"] | {"kernel": copies}}

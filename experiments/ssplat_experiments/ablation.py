@@ -66,14 +66,13 @@ VARIANTS = {
     FULL: Variant(),
     "without HPDA": Variant({"hpda": False}),
     "without CGFI": Variant({"cgfi": False}),
-    "with recall": Variant({"recall": True}),
     "append": Variant({"vacc": "append"}),
     "baseline": Variant({"vacc": "append", "hpda": False, "cgfi": False}),
     "without mixer": Variant({"mixer_blocks": 0}),
     "untrained tokens": Variant(untrained=("tokens",)),
     "constant head": Variant({"evidence": False}, untrained=("decoder",)),
 }
-REPEATED = (FULL, "without HPDA", "without CGFI", "with recall")
+REPEATED = (FULL, "without HPDA", "without CGFI")
 """The variants that are trained with every seed; the others with the first."""
 
 

@@ -44,9 +44,8 @@ EARNED = {"psnr": 0.02, "ssim": 0.002}
 """Smaller differences, in dB and in units of SSIM, count as none."""
 
 KEPT = {
-    "history.unit_features": "it bounds what returns through CGFI chunk after chunk (docs/stability.md)",
-    "head.grow_footprints": "cells finer than voxels show it, from about 320 x 240 (docs/decisions.md)",
-    "head.opacity_mode": "pivots of many members show it, from about 320 x 240 (docs/decisions.md)",
+    "additions.unit_features": "it bounds what returns through CGFI chunk after chunk (docs/stability.md)",
+    "additions.merged_coverage": "pivots of many members show it, from about 320 x 240 (docs/decisions.md)",
     "stream.scene_scale": "captures come in any unit, and these are in metres or near it",
 }
 """Additions of `tiny` that need not earn their place at the size of this experiment, and why."""

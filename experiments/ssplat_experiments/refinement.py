@@ -32,7 +32,7 @@ from ssplat_experiments.scenes import open_room
 from ssplat_experiments.stopwatch import Stopwatch
 from ssplat_experiments.study import Study, at_scale, run_study
 from ssplat_experiments.warm_sessions import new_session
-from ssplat_jax.config import StreamConfig, preset
+from ssplat_jax.config import MEDIAN_DEPTH, StreamConfig, preset
 from ssplat_jax.core.console import Reporter
 from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.data.capture import Capture
@@ -166,7 +166,7 @@ def measure_online(name: str, open_scene: Callable[[], _Scene], config: StreamCo
 def measure_wrong_poses(name: str, open_scene: Callable[[], _Scene], config: StreamConfig, sizes: Sizes) -> list[Row]:
     """The scene of wrong poses, after the stream and refined; and that of poses that were adjusted."""
     scene = open_scene()
-    depth = config.stream.median_depth / scene.frame.scale
+    depth = MEDIAN_DEPTH / scene.frame.scale
     wrong = with_wrong_poses(scene.capture, scene.split.context, depth)
     streamed = _stream(scene, wrong, config)
     rows = [

@@ -1,9 +1,7 @@
 """Overflow policies: what happens when the cache is full (`config.memory.overflow`).
 
-    grow          the host doubles the capacity before a step that might not fit (`ensure_capacity`)
-    drop_new      tokens that open a new voxel are dropped and counted
-    evict_lowest  the voxels of lowest confidence are evicted; among equals, those written longest ago
-    error         as drop_new; `check_cache` raises
+    grow      the host doubles the capacity before a step that might not fit (`ensure_capacity`)
+    drop_new  tokens that open a new voxel are dropped and counted
 
 Nothing raises inside jit: losses are counted in `cache.stats`, and `check_cache` reads the counters on the host:
 
@@ -15,7 +13,6 @@ Nothing raises inside jit: losses are counted in `cache.stats`, and `check_cache
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int
 
 from ssplat_jax.cache.hash_table import build_table
 from ssplat_jax.cache.state import VoxelCache, pivot_fields
@@ -90,7 +87,7 @@ def check_cache(cache: VoxelCache, config: StreamConfig) -> None:
     """Raises if the cache lost tokens that its overflow policy promises to keep. Call it outside jit.
 
     Raises:
-        CacheError: tokens were dropped under `overflow` "grow" or "error".
+        CacheError: tokens were dropped under `overflow="grow"`.
     """
     check_dropped(int(np.asarray(cache.stats.num_dropped)), cache.capacity, config)
 
@@ -106,43 +103,3 @@ def check_dropped(num_dropped: int, capacity: int, config: StreamConfig) -> None
             f"cache: wanted to keep every token, but {num_dropped} did not fit in {capacity} voxels; "
             "call cache.ensure_capacity(cache, config, num_new_tokens) before each step."
         )
-    if num_dropped and config.memory.overflow == "error":
-        raise CacheError(
-            f"cache: wanted to keep every token, but {num_dropped} did not fit in {capacity} voxels; raise capacity to "
-            f"{2 * capacity} or voxel_size above {config.memory.voxel_size}, or choose overflow='grow'."
-        )
-
-
-def evict(
-    cache: VoxelCache, touched_rows: Int[Array, " m"], num_needed: Int[Array, ""]
-) -> tuple[VoxelCache, Int[Array, " m"], Int[Array, ""]]:
-    """Empties `num_needed` rows, or as many as there are beside `touched_rows` (-1: none).
-
-    Voxels go in order of the confidence of their best pivot, lowest first; among equals the one written longest ago
-    goes first, then the lowest row. The ranking sorts the whole capacity, in the steps that overflow only.
-
-    Returns:
-        The cache with those rows zeroed but their table entries left in place, the evicted rows (-1 after the last),
-        and the number of pivots lost.
-    """
-    m, capacity = touched_rows.shape[0], cache.capacity
-
-    def rank():
-        is_kept = (
-            jnp.zeros((capacity,), jnp.int32)
-            .at[jnp.where(touched_rows < 0, capacity, touched_rows)]
-            .set(1, mode="drop")
-        )
-        rows = jnp.arange(capacity, dtype=jnp.int32)
-        is_kept = jnp.where(rows < cache.num_voxels, is_kept, 1)
-        keys = (is_kept, jnp.max(cache.confidences, axis=1), jnp.max(cache.last_chunks, axis=1), rows)
-        ranked = jax.lax.sort(keys, num_keys=4, is_stable=False)[3]
-        num_victims = jnp.minimum(num_needed, capacity - jnp.sum(is_kept))
-        ranked = jnp.pad(ranked[:m], (0, max(m - capacity, 0)), constant_values=-1)
-        return jnp.where(jnp.arange(m) < num_victims, ranked, -1)
-
-    victims = jax.lax.cond(num_needed > 0, rank, lambda: jnp.full((m,), -1, jnp.int32))
-    places = jnp.where(victims < 0, capacity, victims)
-    num_lost = jnp.sum(jnp.where(victims < 0, 0, cache.counts[victims]), dtype=jnp.int32)
-    emptied = {name: getattr(cache, name).at[places].set(0, mode="drop") for name in ("counts", *pivot_fields(cache))}
-    return replace(cache, **emptied), victims, num_lost

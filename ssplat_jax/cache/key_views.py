@@ -10,6 +10,10 @@ from jaxtyping import Array, Bool, Float, Int, UInt8
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.pytree import pytree
 
+NUM_KEY_VIEWS = 64
+"""Views that a stream keeps to compare the scene with; when all places are taken, one of the two most similar is
+replaced."""
+
 
 @pytree
 class KeyViews:

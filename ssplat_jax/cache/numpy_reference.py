@@ -19,7 +19,7 @@ SAME_DIRECTION = 1.0 - 1e-6  # similarities above it are ties
 
 def empty(capacity: int) -> dict:
     """An empty cache: `rows` is a list of (voxel, list of pivots), and a pivot is a dict."""
-    names = "chunks seen accepted merged low_confidence non_finite out_of_range dropped evicted"
+    names = "chunks seen accepted merged low_confidence non_finite out_of_range dropped"
     return {"capacity": capacity, "rows": [], "stats": {f"num_{name}": 0 for name in names.split()}}
 
 
@@ -45,7 +45,7 @@ def fuse(cache: dict, tokens: dict, config: StreamConfig) -> dict:
             pivot |= {"seeds": pivot["feats"], "num_members": 1, "last_chunks": chunk}
             if config.head.evidence:
                 pivot["sightings"] = np.zeros(9)
-            if config.refine.steps_per_chunk:
+            if config.stream.steps_per_chunk:
                 pivot["residuals"] = np.zeros(14 * config.head.gaussians_per_token)
             accepted.append((voxel, pivot))
     if config.memory.vacc == "append":
@@ -77,18 +77,11 @@ def voxel_of(point: np.ndarray, voxel_size: float) -> tuple[int, ...] | None:
 def _insert_all(cache, accepted, config):
     rows, stats = cache["rows"], cache["stats"]
     row_of = {voxel: row for row, (voxel, _) in enumerate(rows) if voxel is not None}
-    victims = _victims(cache, {voxel for voxel, _ in accepted}, config)
     for voxel, pivot in accepted:
         if voxel not in row_of:
             if len(rows) < cache["capacity"]:
                 rows.append((voxel, []))
                 row_of[voxel] = len(rows) - 1
-            elif config.memory.overflow == "evict_lowest" and victims:
-                row = victims.pop(0)
-                stats["num_evicted"] += len(rows[row][1])
-                del row_of[rows[row][0]]
-                rows[row] = (voxel, [])
-                row_of[voxel] = row
             else:
                 stats["num_dropped"] += 1
                 continue
@@ -98,7 +91,7 @@ def _insert_all(cache, accepted, config):
             pivots.append(pivot)
         else:
             stats["num_merged"] += 1
-            merge_closest(pivots, pivot, config)
+            merge_closest(pivots, pivot)
 
 
 def _append_all(cache, accepted, config):
@@ -113,29 +106,16 @@ def _append_all(cache, accepted, config):
         rows[-1][1].append(pivot)
 
 
-def _victims(cache, touched, config):
-    """Rows that may be evicted for new voxels of this chunk, in order of eviction."""
-
-    def rank(row):
-        _, pivots = cache["rows"][row]
-        return max(p["confidences"] for p in pivots), max(p["last_chunks"] for p in pivots), row
-
-    if config.memory.overflow != "evict_lowest":
-        return []
-    return sorted((row for row, (voxel, _) in enumerate(cache["rows"]) if voxel not in touched), key=rank)
-
-
-def merge_closest(pivots: list, new: dict, config: StreamConfig) -> None:
+def merge_closest(pivots: list, new: dict) -> None:
     """Adds `new` to the full list `pivots` and merges the closest pair, in place."""
-    key = {"seed": "seeds", "feature": "feats"}[config.memory.merge_key]
     candidates = [*pivots, new]
     best, best_score = (0, 1), -math.inf
     for i, j in itertools.combinations(range(len(candidates)), 2):
-        score = similarity(candidates[i][key], candidates[j][key])
+        score = similarity(candidates[i]["seeds"], candidates[j]["seeds"])
         if score > best_score:
             best, best_score = (i, j), score
     i, j = best
-    merged = merge(candidates[i], candidates[j], config)
+    merged = merge(candidates[i], candidates[j])
     if j < len(pivots):
         pivots[j] = new
     pivots[i] = merged
@@ -148,12 +128,10 @@ def similarity(a: np.ndarray, b: np.ndarray) -> float:
     return 1.0 if score > SAME_DIRECTION else score
 
 
-def merge(older: dict, newer: dict, config: StreamConfig) -> dict:
+def merge(older: dict, newer: dict) -> dict:
     """The pivot that replaces two; `older` is the one in the lower slot."""
     weights = [float(x["confidences"]) for x in (older, newer)]
     best = newer if weights[1] > weights[0] else older
-    if config.memory.merge_weight == "count":
-        weights = [w * x["num_members"] for w, x in zip(weights, (older, newer), strict=True)]
     if sum(weights) == 0:
         weights = [0.5, 0.5]
     mean = {
@@ -183,7 +161,7 @@ def project(cache: dict, viewmats, Ks, height: int, width: int, config: StreamCo
         Ks: intrinsics in pixels of the maps, `[v, 3, 3]`.
         height: of the maps.
         width: of the maps.
-        config: `cluster_ratio`, and with `carving` also `min_confidence`.
+        config: `front_cluster`, and with `carving` also `min_confidence`.
 
     Returns:
         Depths, confidences, features, mask and colors of each view, and the margin of the closest decision in pixels
@@ -197,7 +175,7 @@ def project(cache: dict, viewmats, Ks, height: int, width: int, config: StreamCo
     for v in range(len(viewmats)):
         viewmat, K = np.asarray(viewmats[v], np.float64), np.asarray(Ks[v], np.float64)
         for (row, column), pairs in _on_pixels(pivots, viewmat, K, height, width, margins).items():
-            cluster = _front_cluster(pairs, math.log(config.history.cluster_ratio), margins)
+            cluster = _front_cluster(pairs, math.log(1.15) if config.additions.front_cluster else math.inf, margins)
             total = sum(p["confidences"] for _, p in cluster)
             at = (v, row, column)
             mask[at] = True

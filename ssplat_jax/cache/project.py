@@ -27,6 +27,10 @@ from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.pytree import pytree
 
+CLUSTER_RATIO = 1.15
+"""Largest ratio of depths within the front cluster of a pixel. A mean over all its pivots mixes foreground and
+background."""
+
 PAIRS_PER_BLOCK = 4096
 """Most pairs whose features are gathered at a time."""
 
@@ -48,7 +52,7 @@ def project(cache: VoxelCache, camera: Camera, config: StreamConfig, *, axis: st
     Args:
         cache: what is projected.
         camera: a batch of views at grid resolution.
-        config: its `cluster_ratio` is the depth ratio that a pixel's front cluster spans.
+        config: `front_cluster`; `carving` leaves out the pivots below `min_confidence`.
         axis: name of the mapped axis over which the cache is sharded by voxel; None if `cache` is the whole cache.
 
     Returns:
@@ -112,6 +116,11 @@ def coarsen(history: ProjectedCache, factor: int) -> ProjectedCache:
     )
 
 
+def _front_window(config: StreamConfig) -> float:
+    """Span of a front cluster in log depth; without `front_cluster` all pivots of a pixel are averaged."""
+    return math.log(CLUSTER_RATIO) if config.additions.front_cluster else math.inf
+
+
 def _reduce_shards(reduce, partial, axis: str | None):
     """`partial` reduced over all shards; `partial` itself without an axis."""
     return partial if axis is None else reduce(partial, axis)
@@ -125,7 +134,7 @@ def _min_log_depths(fronts, pairs: PixelPairs, rows, is_row):
 
 def _front_means(fold, config, fronts, axis):
     """Pass 2: mean log depth of each pixel's front window, relative to its nearest pivot."""
-    window = math.log(config.history.cluster_ratio)
+    window = _front_window(config)
 
     def visit(sums, pairs: PixelPairs, rows, is_row):
         del rows, is_row
@@ -140,7 +149,7 @@ def _front_means(fold, config, fronts, axis):
 
 def _cluster_sums(fold, cache, num_views, config, fronts, centers):
     """Pass 3: sums over each pixel's re-centered cluster: w, w^2, w times offset from the front, w times values."""
-    window = math.log(config.history.cluster_ratio)
+    window = _front_window(config)
     pivots_per_row = cache.feats.shape[1]
     flat = lambda x: x.reshape(-1, x.shape[-1])  # noqa: E731
 

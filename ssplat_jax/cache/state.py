@@ -4,7 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ssplat_jax.cache.hash_table import SLOTS_PER_ROW
-from ssplat_jax.cache.key_views import KeyViews, empty_key_views
+from ssplat_jax.cache.key_views import NUM_KEY_VIEWS, KeyViews, empty_key_views
 from ssplat_jax.cache.residuals import empty_residuals
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.errors import InputError
@@ -31,7 +31,6 @@ class CacheStats:
     num_non_finite: Int[Array, ""]  # rejected: NaN or infinite
     num_out_of_range: Int[Array, ""]  # rejected: voxel index outside +-2^20
     num_dropped: Int[Array, ""]  # rejected: no free row for a new voxel (overflow)
-    num_evicted: Int[Array, ""]  # pivots lost to overflow="evict_lowest"
 
 
 @pytree
@@ -75,7 +74,7 @@ class VoxelCache:
     witnesses: Witnesses
     stats: CacheStats
     sightings: Float[Array, "capacity k s"] | None = None  # what views say about the pivot (sightings.py); sums
-    # Fields of refinement while streaming (`config.refine`); None without it, so that the program has no trace of them.
+    # Fields of refinement while streaming; None without it, so that the program has no trace of them.
     residuals: Float[Array, "capacity k r"] | None = None  # changes to each of the pivot's Gaussians (residuals.py)
     key_views: KeyViews | None = None  # views that the scene is compared with; None before the first chunk
 
@@ -132,9 +131,13 @@ WITNESS_CELLS = 32
 """Coarse cells of a witness along each side of its view."""
 
 
+NUM_WITNESSES = 32
+"""Past chunks of which a coarse depth map is kept, to judge the tokens of later chunks while views carve."""
+
+
 def init_witnesses(config: StreamConfig) -> Witnesses:
-    """Empty witnesses, as many as the config asks for; none without carving."""
-    w = config.memory.num_witnesses if config.memory.carving else 0
+    """Empty witnesses; none without carving."""
+    w = NUM_WITNESSES if config.memory.carving else 0
     cells = (w, WITNESS_CELLS, WITNESS_CELLS)
     return Witnesses(
         viewmats=jnp.zeros((w, 4, 4)),
@@ -183,9 +186,9 @@ def init_cache(config: StreamConfig, capacity: int | None = None) -> VoxelCache:
         num_members=jnp.zeros((capacity, k), jnp.int32),
         last_chunks=jnp.zeros((capacity, k), jnp.int32),
         witnesses=init_witnesses(config),
-        stats=CacheStats(*(zero() for _ in range(9))),
+        stats=CacheStats(*(zero() for _ in range(8))),
         sightings=jnp.zeros((capacity, k, NUM_SIGHTINGS)) if config.head.evidence else None,
-        residuals=empty_residuals(capacity, config) if config.refine.steps_per_chunk else None,
+        residuals=empty_residuals(capacity, config) if config.stream.steps_per_chunk else None,
     )
 
 
@@ -195,7 +198,7 @@ def with_refinement(cache: VoxelCache, config: StreamConfig, height: int, width:
     Raises:
         InputError: it has key views of another size or number.
     """
-    slots = (config.refine.num_key_views, height, width, 3)
+    slots = (NUM_KEY_VIEWS, height, width, 3)
     residuals, key_views = cache.residuals, cache.key_views
     if residuals is None:
         residuals = empty_residuals(cache.capacity, config)
@@ -203,5 +206,5 @@ def with_refinement(cache: VoxelCache, config: StreamConfig, height: int, width:
         key_views = empty_key_views(*slots[:3])
     if key_views.images.shape != slots:
         wanted, got = "x".join(map(str, key_views.images.shape)), "x".join(map(str, slots))
-        raise InputError(f"cache: wanted key views of {wanted} as before, got {got}; keep size and num_key_views.")
+        raise InputError(f"cache: wanted key views of {wanted} as before, got {got}; keep the size.")
     return replace(cache, residuals=residuals, key_views=key_views)

@@ -97,7 +97,7 @@ def apply_changes(config: StreamConfig, changes: tuple[str, ...]) -> StreamConfi
         if before != value:
             raise InputError(
                 f"--set: wanted one value of {place}, got {first} and {change}: drop one; --causal and"
-                f" --watch set stream.causal, --online-refine sets refine.steps_per_chunk."
+                f" --watch set stream.causal, --online-refine sets stream.steps_per_chunk."
             )
         parsed[name] = value
     return config.replace(**parsed)
@@ -122,7 +122,7 @@ def online_changes(changes: tuple[str, ...], steps: int) -> tuple[str, ...]:
     """
     if steps < 0:
         raise InputError(f"--online-refine: wanted a number of steps of at least 0, got {steps}.")
-    return (*changes, f"refine.steps_per_chunk={steps}") if steps else changes
+    return (*changes, f"stream.steps_per_chunk={steps}") if steps else changes
 
 
 def load_model(weights: str, changes: tuple[str, ...], defaults: tuple[str, ...] = ()):

@@ -17,7 +17,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from jaxtyping import Float64
 
-from ssplat_jax.config import StreamConfig
+from ssplat_jax.config import MEDIAN_DEPTH, StreamConfig
 from ssplat_jax.data.sparse_matches import (
     MIN_POINTS,
     CommonPoints,
@@ -138,11 +138,7 @@ def stream_scale(depths: DepthStatistics, config: StreamConfig) -> tuple[float, 
     far / near is kept in [4, 60]. Too narrow a range is widened to both sides; too wide a range is cut at the near end
     up to an eighth of the median, and then at the far end.
     """
-    scale = (
-        config.stream.median_depth / depths.median
-        if config.stream.scene_scale == "auto"
-        else float(config.stream.scene_scale)
-    )
+    scale = MEDIAN_DEPTH / depths.median if config.stream.scene_scale == "auto" else float(config.stream.scene_scale)
     near, far = NEAR_FACTOR * depths.q01, FAR_FACTOR * depths.q99
     widen = max(1.0, math.sqrt(MIN_RANGE * near / far))
     near, far = near / widen, far * widen

@@ -32,10 +32,8 @@ def measure_latency(session: Session, chunks: list[Chunk], camera: Camera) -> di
     totals, steps, renders = [], [], []
     cache, config = session.cache, session.model.config
     assert cache is not None
-    # Growing happens a few times in a stream's life and is not part of a chunk's cost. Under the policy `error`, too,
-    # the cache grows here: the chunks are fed a second time, which must not fail a stream that fitted.
-    policy = config.replace(overflow="grow") if config.memory.overflow == "error" else config
-    grown = ensure_capacity(cache, policy, tokens_per_chunk(chunks[0], config.network.size_multiple))
+    # Growing happens a few times in a stream's life and is not part of a chunk's cost.
+    grown = ensure_capacity(cache, config, tokens_per_chunk(chunks[0], config.network.size_multiple))
     for chunk in chunks:
         for repeat in range(NUM_REPEATS + 1):
             session.cache = jax.block_until_ready(jax.tree.map(jnp.copy, grown))

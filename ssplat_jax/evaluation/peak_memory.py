@@ -67,7 +67,7 @@ def peak_memory(session: Session, camera: Camera) -> PeakMemory:
         step=session.step_memory_bytes,
         decode=_sum(held, added_bytes(session.decode_program())),
         render=_sum(held, live_bytes(gaussians), render_bytes(gaussians, camera)),
-        refine=session.refine_memory_bytes if session.model.config.refine.steps_per_chunk else 0,
+        refine=session.refine_memory_bytes if session.model.config.stream.steps_per_chunk else 0,
         allocator=allocator_peak(),
     )
 

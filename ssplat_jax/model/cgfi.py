@@ -22,10 +22,11 @@ def _copy_first(key, shape, dtype=jnp.float32) -> Array:
 
 
 class Aggregator(nn.Module):
-    """Phi_agg: a U-Net of f and its hints. Untrained it is the identity in both forms (`history.cgfi_form`).
+    """Phi_agg: a U-Net of f and its hints. Untrained it is the identity, with `residual_cgfi` and without.
 
-    The last layer of `concat` sees the input beside the U-Net's output, as an outermost skip, and starts as a copy of
-    f. That of `residual` starts at zero, and f is added to it.
+    The paper's last layer sees the input beside the U-Net's output, as an outermost skip, and starts as a copy of f.
+    That of `residual_cgfi` starts at zero, and f is added to it. So weights that were trained without CGFI keep their
+    meaning in both.
     """
 
     config: StreamConfig
@@ -35,16 +36,16 @@ class Aggregator(nn.Module):
         self, feats: Float[Array, "v hf wf c"], history: Float[Array, "v hf wf ch"], view_valid: Bool[Array, " v"]
     ) -> Float[Array, "v hf wf c"]:
         seen = jnp.concatenate([feats, history], axis=-1)
-        x = Conv(self.config.history.cgfi_width, name="enter")(seen)
-        x = UNet(self.config.history.cgfi_width, name="unet")(x, view_valid)
-        if self.config.history.cgfi_form == "residual":
+        x = Conv(self.config.network.cgfi_width, name="enter")(seen)
+        x = UNet(self.config.network.cgfi_width, name="unet")(x, view_valid)
+        if self.config.additions.residual_cgfi:
             return feats + Conv(feats.shape[-1], kernel_init=nn.initializers.zeros, name="leave")(x)
         return Conv(feats.shape[-1], kernel_init=_copy_first, name="leave")(jnp.concatenate([seen, x], axis=-1))
 
 
 def num_hints(config: StreamConfig) -> int:
     """Channels that `Aggregator` sees beside f."""
-    return config.network.token_width + (config.history.cgfi_form == "residual")
+    return config.network.token_width + config.additions.residual_cgfi
 
 
 def inject_features(
@@ -58,7 +59,7 @@ def inject_features(
 ) -> Float[Array, "v hf wf c"]:
     """Token features with history injected (Eqs. cache_feature_attenuation, token_regressor_input).
 
-    With `cgfi_form="residual"` the U-Net sees Omega besides (1 - omega) F_H, because a zero feature does not tell a
+    With `residual_cgfi` the U-Net sees Omega besides (1 - omega) F_H, because a zero feature does not tell a
     hole from a feature.
 
     Args:
@@ -68,7 +69,7 @@ def inject_features(
         confidences: omega of the anchored depth.
         views: the chunk's views.
         config: `history.cgfi=False` returns `feats` unchanged.
-        bound_history: maps F_H to a bounded size with `history.unit_features`; see `Network.bound_history`.
+        bound_history: maps F_H to a bounded size with `unit_features`; see `Network.bound_history`.
 
     Returns:
         Features in float32. Where omega = 1 everywhere they do not depend on F_H.
@@ -77,9 +78,9 @@ def inject_features(
         return feats
     feats = feats.astype(jnp.float32)
     remembered = history.feats.astype(jnp.float32)
-    if config.history.unit_features:
+    if config.additions.unit_features:
         remembered = bound_history(remembered)
     hints = (1 - confidences)[..., None] * remembered
-    if config.history.cgfi_form == "residual":
+    if config.additions.residual_cgfi:
         hints = jnp.concatenate([hints, history.confidences[..., None]], axis=-1)
     return Aggregator(config).apply({"params": params}, feats, hints, views.valid)  # pyright: ignore[reportReturnType]

@@ -20,17 +20,19 @@ MAX_LOG_GAIN = 0.6
 """Bound of the log factor on a scale. Larger Gaussians would cover holes and hide what is behind."""
 MIN_SCALE = 1e-6
 """Smallest scale, in stream units."""
+MAX_SCALE = 1.0
+"""Largest scale, in stream units: ReSplat's bound."""
 
 
 def token_scales(raw: Float[Array, "m 3"], footprints: Float[Array, " m"], config: StreamConfig) -> Float[Array, "m 3"]:
     """Standard deviations of each token's Gaussians in stream units, along the axes of the token's camera."""
     side = math.isqrt(config.head.gaussians_per_token)
-    if config.head.scale_mode == "absolute":
+    if not config.additions.footprint_scales:
         scales = nn.softplus(raw - 4.0) / jnp.array([side, side, 1.0])
     else:
         start = jnp.array([START_SCALE / side, START_SCALE / side, START_THICKNESS])
         scales = footprints[:, None] * start * jnp.exp(MAX_LOG_GAIN * jnp.tanh(raw / MAX_LOG_GAIN))
-    return jnp.clip(scales, MIN_SCALE, config.head.max_scale)
+    return jnp.clip(scales, MIN_SCALE, MAX_SCALE)
 
 
 def decode_tokens(
@@ -45,7 +47,7 @@ def decode_tokens(
 ) -> Gaussians:
     """Gaussians of tokens or pivots: `gaussians_per_token` each, in a square over the cell, row by row.
 
-    The Gaussians of a token share shape and opacity and differ in position and color. With `opacity_mode="compound"` a
+    The Gaussians of a token share shape and opacity and differ in position and color. With `merged_coverage` a
     pivot of n members is as opaque as n Gaussians of opacity o at one place, 1 - (1 - o)^n.
 
     Args:
@@ -61,7 +63,7 @@ def decode_tokens(
     Returns:
         Gaussians token by token, stream frame.
     """
-    layers = jnp.asarray(num_members, jnp.float32) if config.head.opacity_mode == "compound" else 1.0
+    layers = jnp.asarray(num_members, jnp.float32) if config.additions.merged_coverage else 1.0
     optical_depths = layers * nn.softplus(shapes.logit_opacities)
     each = lambda x: jnp.repeat(x, config.head.gaussians_per_token, axis=0)  # noqa: E731
     return Gaussians(

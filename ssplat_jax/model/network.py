@@ -11,11 +11,12 @@ from typing import Any, Protocol, runtime_checkable
 
 from jaxtyping import Array, Bool, Float
 
-from ssplat_jax.config import NETWORK_CONFIGS, StreamConfig
+from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.model.compact import CompactNetwork
 from ssplat_jax.model.resplat import ResplatNetwork
 from ssplat_jax.model.types import AnchoredDepth, DepthDistribution, TokenShapes, Views
+from ssplat_jax.network_configs import NETWORK_CONFIGS
 
 
 @runtime_checkable
@@ -55,6 +56,11 @@ class NetworkConfig(Protocol):
     @property
     def token_width(self) -> int:
         """Channels of a token's feature, as stored in the cache."""
+        ...
+
+    @property
+    def cgfi_width(self) -> int:
+        """Channels inside the aggregation U-Net of CGFI, a multiple of 8."""
         ...
 
 
@@ -104,7 +110,7 @@ class Network(Protocol):
         """Projected cache features, bounded in size.
 
         Injected features are stored and come back with the next chunk. A network whose `mix_tokens` does not end in a
-        norm must bound them here, or they grow from chunk to chunk. Called only with `history.unit_features`.
+        norm must bound them here, or they grow from chunk to chunk. Called only with `additions.unit_features`.
         """
         ...
 

@@ -38,6 +38,7 @@ from ssplat_jax.core.chunk import Chunk, check_chunk
 from ssplat_jax.core.gaussians import Gaussians, mask_gaussians
 from ssplat_jax.core.pytree import pytree, replace
 from ssplat_jax.core.rotations import matrices_to_quats
+from ssplat_jax.model.decoder import MAX_SCALE
 from ssplat_jax.model.types import TokenShapes, Views
 
 VOXEL_COVERAGE = 1.2
@@ -231,7 +232,7 @@ class StreamSplat:
             config=self.config,
         )
         if cache.residuals is not None:
-            gaussians = revise(gaussians, unpack(flat(cache.residuals)), max_scale=self.config.head.max_scale)
+            gaussians = revise(gaussians, unpack(flat(cache.residuals)), max_scale=MAX_SCALE)
         return mask_gaussians(gaussians, self.repeat_per_gaussian(is_shown))
 
     def decode_rows(self, params: dict, cache: VoxelCache, rows: Int[Array, " r"]) -> Gaussians:
@@ -268,10 +269,10 @@ def merged_footprints(cache: VoxelCache, config: StreamConfig) -> Float[Array, "
     """Footprints of pivots, grown with the number of members until K pivots cover a voxel's face.
 
     A pivot stores the footprint of its best member. Where grid cells are much finer than voxels, many tokens merge into
-    K pivots, whose stored footprints would leave cracks between them. `head.grow_footprints=False` leaves them as they
+    K pivots, whose stored footprints would leave cracks between them. `merged_coverage=False` leaves them as they
     are stored.
     """
-    if not config.head.grow_footprints:
+    if not config.additions.merged_coverage:
         return cache.footprints
     share = VOXEL_COVERAGE * config.memory.voxel_size / math.sqrt(config.memory.pivots_per_voxel)
     grown = cache.footprints * jnp.sqrt(cache.num_members.astype(jnp.float32))

@@ -16,10 +16,12 @@ from jaxtyping import Array, Int
 from ssplat_jax.cache.key_views import KeyViews, keep_views, usable
 from ssplat_jax.cache.residuals import Residuals, add, settle, unpack
 from ssplat_jax.cache.state import VoxelCache
+from ssplat_jax.config import MEDIAN_DEPTH
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.chunk import Chunk
 from ssplat_jax.core.gaussians import Gaussians, mean_color
 from ssplat_jax.core.pytree import replace
+from ssplat_jax.model.decoder import MAX_SCALE
 from ssplat_jax.model.streamsplat import ChunkOutput, StreamSplat
 from ssplat_jax.rasterizer import fill_holes, render
 from ssplat_jax.rasterizer.render import round_up
@@ -49,7 +51,7 @@ PAIRS_PER_GAUSSIAN = 3
 
 def online_refinement(model: StreamSplat) -> Revise | None:
     """The `revise` of a `Session` with this model; None if its configuration asks for no refinement."""
-    return functools.partial(revise_scene, model) if model.config.refine.steps_per_chunk else None
+    return functools.partial(revise_scene, model) if model.config.stream.steps_per_chunk else None
 
 
 def revise_scene(model: StreamSplat, params: dict, cache: VoxelCache, chunk: Chunk, output: ChunkOutput) -> VoxelCache:
@@ -68,8 +70,8 @@ def revise_scene(model: StreamSplat, params: dict, cache: VoxelCache, chunk: Chu
     config = model.config
     assert cache.residuals is not None and cache.key_views is not None
     arrivals = replace(KeyViews.of(chunk.camera, chunk.images, output.exposures), valid=chunk.valid)
-    kept = keep_views(cache.key_views, arrivals, depth=config.stream.median_depth)
-    views = views_of_round(cache.key_views, arrivals, cache.stats.num_chunks, config.refine.steps_per_chunk)
+    kept = keep_views(cache.key_views, arrivals, depth=MEDIAN_DEPTH)
+    views = views_of_round(cache.key_views, arrivals, cache.stats.num_chunks, config.stream.steps_per_chunk)
     views = replace(views, valid=views.valid & jnp.any(chunk.valid))  # a chunk of padding changes nothing
     cache = replace(cache, key_views=kept)
     return jax.lax.scan(lambda cache, view: (_revise_view(model, params, cache, view), None), cache, views)[0]
@@ -84,7 +86,7 @@ def _revise_view(model: StreamSplat, params: dict, cache: VoxelCache, view: KeyV
     flat = lambda x: x.reshape(-1, *x.shape[2:])  # noqa: E731
     means, packed = flat(cache.means)[taken], flat(cache.residuals)[taken]
     max_pairs = round_up(PAIRS_PER_GAUSSIAN * base.num_gaussians)
-    revised = online_step(base, unpack(packed), view, max_pairs=max_pairs, max_scale=config.head.max_scale)
+    revised = online_step(base, unpack(packed), view, max_pairs=max_pairs, max_scale=MAX_SCALE)
     moved, settled = settle(means, revised, config.memory.voxel_size)
     is_changed = jnp.any(moved != means, axis=1) | jnp.any(settled != packed, axis=1)
     places = jnp.where(is_changed & (pivots >= 0), pivots, cache.alive.size)

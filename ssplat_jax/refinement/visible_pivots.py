@@ -15,6 +15,10 @@ from ssplat_jax.config import StreamConfig
 from ssplat_jax.model import GRID_STRIDE
 from ssplat_jax.model.streamsplat import merged_footprints, shown_pivots
 
+PIVOTS_PER_CELL = 8
+"""Pivots that a step revises, as a multiple of the grid cells of its view: the least covered ones. It fixes time and
+memory of a step."""
+
 LISTED_PER_CELL = 64
 """Most pivots of a view that are compared, as a multiple of its grid cells; beyond it, the last rows are left out."""
 
@@ -28,7 +32,7 @@ def visible_pivots(cache: VoxelCache, view: KeyViews, config: StreamConfig) -> I
     Args:
         cache: the scene.
         view: one view, without a batch axis; one that is not valid sees nothing.
-        config: `refine.pivots_per_cell` times the cells of the view is the number of places.
+        config: `min_confidence` decides which pivots are shown.
 
     Returns:
         Numbers of pivots, row by row, from the least covered one; -1 after the last.
@@ -51,7 +55,7 @@ def visible_pivots(cache: VoxelCache, view: KeyViews, config: StreamConfig) -> I
     sides = merged_footprints(cache, config).reshape(-1)[taken] * view.Ks[0, 0] / (z[taken] * GRID_STRIDE)
     covers = areas_before(cells, z[taken], jnp.where(is_listed, jnp.minimum(sides * sides, 1.0), 0.0), num_cells)
 
-    order = _argsort(jnp.where(is_listed, covers, jnp.inf))[: min(config.refine.pivots_per_cell * num_cells, size)]
+    order = _argsort(jnp.where(is_listed, covers, jnp.inf))[: min(PIVOTS_PER_CELL * num_cells, size)]
     return jnp.where(is_listed[order], listed[order], -1)
 
 

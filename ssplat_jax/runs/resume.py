@@ -119,11 +119,10 @@ def _check_identity(header: dict, identity: dict, folder: RunFolder) -> None:
 def _relevant_fields(config: StreamConfig) -> dict:
     """Config fields that affect the result.
 
-    Capacity is excluded where no token is dropped for lack of it (`grow`, `error`), so that a run that stopped with a
-    full cache can continue with a larger one.
+    Capacity is excluded where no token is dropped for lack of it (`grow`).
     """
     fields = config.to_dict()
-    if config.memory.overflow in ("grow", "error"):
+    if config.memory.overflow == "grow":
         fields["memory"] = {k: v for k, v in fields["memory"].items() if k not in ("overflow", "capacity")}
     return fields
 

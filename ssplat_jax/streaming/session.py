@@ -109,9 +109,9 @@ class Session:
     def _with_key_views(self, cache: VoxelCache, chunk: Chunk) -> VoxelCache:
         """`cache` with what refinement keeps in it, which a cache from before has not yet."""
         config = self.model.config
-        if bool(config.refine.steps_per_chunk) != (self._revise is not None):
-            wanted = "Session(..., revise=online_refinement(model)) with refine.steps_per_chunk above 0, or neither"
-            got = f"steps_per_chunk={config.refine.steps_per_chunk} and revise={self._revise}"
+        if bool(config.stream.steps_per_chunk) != (self._revise is not None):
+            wanted = "Session(..., revise=online_refinement(model)) with stream.steps_per_chunk above 0, or neither"
+            got = f"steps_per_chunk={config.stream.steps_per_chunk} and revise={self._revise}"
             raise refusal("Session", wanted=wanted, got=got, fix="call online_refinement with the session's model")
         return cache if self._revise is None else with_refinement(cache, config, *chunk.images.shape[1:3])
 

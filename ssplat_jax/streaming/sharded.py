@@ -49,7 +49,7 @@ class ShardedStream:
         Given the same tokens, a voxel holds the same pivots as in a single cache, to the last bit; only the order of
         the rows differs. The projection adds up in another order, so steps agree with those of one device to float32
         rounding, and a token on the face between two voxels may fall on the other side.
-        A full shard drops tokens, or evicts its own lowest voxels, even if other shards have free or lower rows.
+        A full shard drops tokens even if other shards have free rows.
 
     Raises:
         InputError: `mesh` lacks one of the two axes, or the config asks for refinement while streaming.
@@ -71,10 +71,10 @@ class ShardedStream:
     voxels: str = "voxels"
 
     def __post_init__(self) -> None:
-        if self.model.config.refine.steps_per_chunk:
+        if self.model.config.stream.steps_per_chunk:
             raise InputError(
-                "sharded stream: wanted refine.steps_per_chunk=0, which only a Session carries out, got "
-                f"{self.model.config.refine.steps_per_chunk}; set it to 0 and refine the finished scene with ss.refine."
+                "sharded stream: wanted stream.steps_per_chunk=0, which only a Session carries out, got "
+                f"{self.model.config.stream.steps_per_chunk}; set it to 0 and refine the finished scene with ss.refine."
             )
         axes = {self.streams, self.voxels}
         if len(axes) < 2 or not axes <= set(self.mesh.axis_names):
@@ -144,7 +144,7 @@ class ShardedStream:
         """Raises if a cache lost tokens that its overflow policy promises to keep; see `cache.check_cache`.
 
         Raises:
-            CacheError: tokens were dropped under `overflow` "grow" or "error".
+            CacheError: tokens were dropped under `overflow="grow"`.
         """
         check_dropped(int(jnp.sum(caches.stats.num_dropped)), caches.voxels.shape[2], self.model.config)
 

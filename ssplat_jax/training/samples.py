@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ssplat_jax.config import StreamConfig
+from ssplat_jax.config import MEDIAN_DEPTH, StreamConfig
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.chunk import Chunk
 from ssplat_jax.core.errors import InputError
@@ -89,7 +89,7 @@ def make_sample(
     context = np.flatnonzero(~is_target)
 
     seen = depths[context][np.isfinite(depths[context])]
-    scale = config.stream.median_depth / np.median(seen) * np.exp(rng.uniform(-range_jitter, range_jitter))
+    scale = MEDIAN_DEPTH / np.median(seen) * np.exp(rng.uniform(-range_jitter, range_jitter))
     viewmats = _stream_viewmats(camtoworlds.astype(np.float64), int(context[0]), float(scale))
     low, high = np.quantile(seen * scale, [0.01, 0.99])
     near = NEAR_FACTOR * low * np.exp(rng.uniform(-range_jitter, range_jitter))

@@ -32,8 +32,8 @@ _jit_insert = jax.jit(_insert, static_argnums=2, donate_argnums=0)
 CONFIG = StreamConfig().replace(
     token_width=WIDTH, capacity=128, voxel_size=0.25, min_confidence=0.3, overflow="drop_new"
 )
-EVICT = CONFIG.replace(overflow="evict_lowest", pivots_per_voxel=2)
-VARIANTS = {"voxel": CONFIG, "evict": EVICT, "append": CONFIG.replace(vacc="append")}
+PAIRS = CONFIG.replace(pivots_per_voxel=2)
+VARIANTS = {"voxel": CONFIG, "append": CONFIG.replace(vacc="append")}
 """Every way in which rows are assigned."""
 
 
@@ -203,6 +203,6 @@ def run_both(recipes, config, capacity=CAPACITY):
         cache = fuse(cache, to_jax(tokens), config)
         reference.fuse(expected, tokens, config)
         assert_equal_to_reference(cache, expected)
-        if config.refine.steps_per_chunk:
+        if config.stream.steps_per_chunk:
             cache = revised(cache, rng, config)
             revise_reference(expected, cache)

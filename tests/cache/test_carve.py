@@ -183,8 +183,9 @@ def test_tokens_are_judged_by_views_of_earlier_chunks():
     assert np.isnan(judged([0, 0, 1.0], confidence=np.nan))
 
 
-def test_best_view_is_stored_and_the_oldest_chunk_replaced():
-    config = CONFIG.replace(num_witnesses=2)
+def test_best_view_is_stored_and_the_oldest_chunk_replaced(monkeypatch):
+    monkeypatch.setattr("ssplat_jax.cache.state.NUM_WITNESSES", 2)
+    config = CONFIG
     cache = init_cache(config, CAPACITY)
     camera = cameras(3)
     for chunk in range(3):
@@ -197,14 +198,14 @@ def test_best_view_is_stored_and_the_oldest_chunk_replaced():
 
 
 def test_padding_displaces_no_witness():
-    config = CONFIG.replace(num_witnesses=1)
+    config = CONFIG
     before = after_chunk(init_cache(config, CAPACITY), front_camera(), *seen(2.0), config)
     after = jit_bear_witness(before, front_camera(), *seen(3.0, 0.0), config)
     jax.tree.map(np.testing.assert_array_equal, after, before)
 
 
-@pytest.mark.parametrize("off", [CONFIG.replace(carving=False), CONFIG.replace(num_witnesses=0)])
-def test_without_witnesses_nothing_is_judged(off):
+def test_without_carving_nothing_is_judged():
+    off = CONFIG.replace(carving=False)
     assert judged([0, 0, 1.0], config=off) == np.float32(0.6)
     cache, token = init_cache(off, CAPACITY), tokens_at([[0, 0, 1.0]], [0.6])
     assert cache.witnesses.weights.size == 0

@@ -10,7 +10,7 @@ from ssplat_jax.cache import numpy_reference as reference
 from ssplat_jax.cache.fuse import MERGE_BLOCKS
 from tests.cache.streams import (
     CONFIG,
-    EVICT,
+    PAIRS,
     VARIANTS,
     WIDTH,
     assert_equal_to_reference,
@@ -21,10 +21,8 @@ from tests.cache.streams import (
 )
 
 CONFIGS = VARIANTS | {
-    "count": CONFIG.replace(merge_weight="count", pivots_per_voxel=3),
-    "feature": CONFIG.replace(merge_key="feature"),
     "single": CONFIG.replace(pivots_per_voxel=1),
-    "refined": EVICT.replace(steps_per_chunk=1),
+    "refined": PAIRS.replace(steps_per_chunk=1),
 }
 streams = st.lists(recipes, min_size=1, max_size=3)
 QUICK = settings(max_examples=40, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))

@@ -26,7 +26,7 @@ from tests.cache.projection_scenes import (
 from tests.cache.streams import CAPACITY, CONFIG, VALUE_RTOL, WIDTH
 
 jit_project = jax.jit(project, static_argnums=2)
-PLAIN_MEAN = CONFIG.replace(cluster_ratio=float("inf"))
+PLAIN_MEAN = CONFIG.replace(front_cluster=False)
 
 
 def assert_equal_to_reference(cache, camera, config):

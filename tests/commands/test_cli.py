@@ -294,7 +294,6 @@ def test_inspect_prints_units_and_shows_that_it_works(capsys, monkeypatch):
 @pytest.mark.parametrize(
     ("change", "field", "value"),
     [
-        ("cluster_ratio=inf", "cluster_ratio", float("inf")),
         ("voxel_size=1", "voxel_size", 1.0),
         ("encoder_widths=[16, 32]", "encoder_widths", (16, 32)),
         ("scene_scale=2.5", "scene_scale", 2.5),

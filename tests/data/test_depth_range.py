@@ -214,7 +214,7 @@ def test_range_is_bounded_and_scales(median, spread_near, spread_far):
         parallax_degrees=4.0,
         source="matches",
     )
-    scale, near, far = stream_scale(depths, StreamConfig().replace(median_depth=2.0))
+    scale, near, far = stream_scale(depths, StreamConfig())
     np.testing.assert_allclose(scale * median, 2.0, rtol=1e-12)
     assert depth_range.MIN_RANGE * (1 - 1e-9) <= far / near <= depth_range.MAX_RANGE * (1 + 1e-9)
     assert near <= max(scale * depths.q01, 2.0 / 8) * (1 + 1e-9)

@@ -4,8 +4,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from ssplat_jax.config import NETWORK_CONFIGS
 from ssplat_jax.model.network import NETWORKS
+from ssplat_jax.network_configs import NETWORK_CONFIGS
 
 
 @pytest.fixture

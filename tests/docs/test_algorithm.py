@@ -7,8 +7,9 @@ import tomllib
 
 import pytest
 
-from ssplat_jax.config import NETWORK_CONFIGS, StreamConfig
+from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.errors import InputError
+from ssplat_jax.network_configs import NETWORK_CONFIGS
 from tests.docs.pages import INLINE_CODE, PAGES, ROOT, page_name, prose
 
 METHOD_PAGE = ROOT / "docs" / "algorithm.md"

@@ -16,11 +16,11 @@ from PIL import Image
 
 import ssplat_jax as ss
 from ssplat_jax.commands import main as command_line
-from ssplat_jax.config import CompactConfig
 from ssplat_jax.data import open_capture as captures
 from ssplat_jax.data.readers.frame_list import Intrinsics, list_frames, make_frame
 from ssplat_jax.model.compact import CompactNetwork
 from ssplat_jax.model.network import register_network
+from ssplat_jax.network_configs import CompactConfig
 from tests.docs.pages import ROOT, tables
 from tests.model import small
 

@@ -51,6 +51,6 @@ def test_the_heading_names_the_presets():
 
 def test_the_additions_are_off_in_small_and_base_too():
     """They differ from `paper` only in what captures of any length, and published weights, need."""
-    usable = {"depth.depth_readout", "memory.capacity", "memory.overflow", "stream.causal"}
+    usable = {"additions.depth_readout", "memory.capacity", "memory.overflow", "stream.causal"}
     assert differing("paper", "small") == differing("paper", "base") == usable
     assert preset("paper").network == preset("small").network

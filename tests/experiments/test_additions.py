@@ -35,7 +35,7 @@ def test_each_step_changes_one_field():
 def test_no_differing_field_is_forgotten():
     listed = [a.field for a in (*additions(), *unmeasured())]
     assert sorted(listed) == sorted(a.field for a in differing_fields())
-    assert {"memory.voxel_size", "depth.confidence"} <= set(listed)
+    assert {"memory.voxel_size", "additions.depth_readout"} <= set(listed)
     assert all(preset("tiny").get(a.field) == a.ours != a.literal for a in differing_fields())
 
 

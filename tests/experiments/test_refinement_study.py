@@ -82,7 +82,7 @@ def test_findings_name_gains_and_what_wrong_poses_lose():
 def test_only_captures_that_are_there_are_measured(tmp_path):
     (tmp_path / "fox").mkdir()
     assert {case.asked["scene"] for case in cases(tmp_path, "cpu")} == {"room", "fox 1"}
-    online = [case.config.refine.steps_per_chunk for case in cases(None, "cpu")]
+    online = [case.config.stream.steps_per_chunk for case in cases(None, "cpu")]
     assert online == [0, 5, 0]
 
 

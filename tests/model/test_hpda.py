@@ -6,11 +6,7 @@ import numpy as np
 import pytest
 
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.core.pytree import replace
 from ssplat_jax.model.hpda import (
-    RECALL_MARGIN,
-    RECALL_SUPPORT,
-    RECALL_WINDOW,
     anchor_depth,
     cache_anchor,
     expected_log_depth,
@@ -46,12 +42,12 @@ def gamma(value) -> jax.Array:
 @pytest.mark.parametrize("space", ["log", "metric"])
 def test_anchor_is_the_gaussian_of_the_paper(space):
     past, hole = memories()
-    config = CONFIG.replace(anchor_space=space, sigma0=0.2, lambda_sigma=0.7)
+    config = CONFIG.replace(log_anchor=space == "log")
     omega, depths = np.asarray(past.confidences, float)[..., None], np.asarray(past.depths, float)[..., None]
     candidates = np.asarray(LOG_CANDIDATES, float)
     with np.errstate(divide="ignore"):
         offsets = candidates - np.log(depths) if space == "log" else np.exp(candidates) - depths
-    wanted = omega * np.exp(-(offsets**2) / (2 * (0.2 + 0.7 * (1 - omega)) ** 2))
+    wanted = omega * np.exp(-(offsets**2) / (2 * (0.1 + 0.5 * (1 - omega)) ** 2))
     got = cache_anchor(past, LOG_CANDIDATES, config)
     np.testing.assert_allclose(got, np.where(hole[..., None], 0, wanted), atol=FLOAT32)
 
@@ -67,12 +63,10 @@ def test_hole_keeps_the_distribution_bit_for_bit(strength):
 
 
 @pytest.mark.parametrize("strength", [0.0, 1e-6, 0.1, 10.0, 1e6])
-@pytest.mark.parametrize(
-    "options", [{}, {"anchor_space": "metric"}, {"anchor_norm": "mass"}, {"sigma0": 1e-9}], ids=str
-)
-def test_mixture_is_a_distribution_with_finite_gradients(strength, options):
+@pytest.mark.parametrize("in_log_depth", [True, False])
+def test_mixture_is_a_distribution_with_finite_gradients(strength, in_log_depth):
     past, _ = memories()
-    config = CONFIG.replace(**options)
+    config = CONFIG.replace(log_anchor=in_log_depth)
 
     def mix(logits, g):
         return inject_anchor(jax.nn.softmax(logits), cache_anchor(past, LOG_CANDIDATES, config), g)
@@ -108,15 +102,6 @@ def test_gamma_zero_is_no_anchor_bit_for_bit():
         np.testing.assert_array_equal(mixed, distributions())
 
 
-def test_sigma_to_zero_is_one_candidate_or_none():
-    on, between = float(jnp.exp(LOG_CANDIDATES[5])), float(jnp.exp(0.5 * (LOG_CANDIDATES[5] + LOG_CANDIDATES[6])))
-    past = history([[[on, between]]], [[[1.0, 1.0]]])
-    probs = jnp.full((1, 1, 2, D), 1.0 / D)
-    mixed = inject_anchor(probs, cache_anchor(past, LOG_CANDIDATES, CONFIG.replace(sigma0=1e-5)), gamma(1e6))
-    assert mixed[0, 0, 0, 5] > 0.999
-    np.testing.assert_array_equal(mixed[0, 0, 1], probs[0, 0, 1])  # history fits no candidate: bit for bit
-
-
 def test_less_confident_history_is_wider_and_lower():
     sure, unsure = (cache_anchor(history([[[2.0]]], [[[w]]]), LOG_CANDIDATES, CONFIG)[0, 0, 0] for w in (1.0, 0.3))
     assert sure.max() > unsure.max()
@@ -124,21 +109,12 @@ def test_less_confident_history_is_wider_and_lower():
     assert width(unsure) > 2 * width(sure)
 
 
-def test_mass_norm_makes_gamma_the_odds_of_history():
-    past = history(np.full(SHAPE, 2.0), np.full(SHAPE, 0.6))
-    anchor = cache_anchor(past, LOG_CANDIDATES, CONFIG.replace(anchor_norm="mass"))
-    np.testing.assert_allclose(anchor.sum(-1), 0.6, atol=FLOAT32)
-
-
-@pytest.mark.parametrize("half_width", [0, 1, 3])
-def test_window_confidence_is_the_largest_mass_of_neighbors(half_width):
-    config = CONFIG.replace(confidence="window", confidence_window=half_width)
+@pytest.mark.parametrize(("readout", "half_width"), [("metric", 0), ("mean", 0), ("window", 1)])
+def test_confidence_is_the_peak_or_the_largest_mass_of_neighbors(readout, half_width):
     probs = np.asarray(distributions(3), np.float64)
     sums = [probs[..., max(0, i - half_width) : i + half_width + 1].sum(-1) for i in range(D)]
-    np.testing.assert_allclose(peak_confidence(distributions(3), config), np.max(sums, axis=0), atol=FLOAT32)
-    if half_width == 0:
-        peak = peak_confidence(distributions(3), CONFIG.replace(confidence="peak"))
-        np.testing.assert_allclose(peak, np.max(sums, axis=0), atol=FLOAT32)
+    got = peak_confidence(distributions(3), CONFIG.replace(depth_readout=readout))
+    np.testing.assert_allclose(got, np.max(sums, axis=0), atol=FLOAT32)
 
 
 def test_window_readout_does_not_mix_two_surfaces():
@@ -196,69 +172,3 @@ def test_hpda_switched_off_keeps_the_distribution():
         {}, distribution, history(np.full(shape, 2.0), np.ones(shape)), views, config.replace(hpda=False)
     )
     np.testing.assert_array_equal(off.probs, distribution.probs)
-
-
-def recalling(recall: bool):
-    """Depth with a matcher and a history that are sure of some cells; every third cell of the history is a hole."""
-    views, distribution, config = views_and_distribution()
-    rng, shape = np.random.default_rng(7), views.inside.shape
-    distribution = replace(distribution, probs=jax.nn.softmax(2 * distribution.logits))
-    depths, confidences = np.exp(rng.uniform(-1, 3, shape)), rng.uniform(0.3, 0.95, shape)
-    depths[rng.uniform(size=shape) < 1 / 3] = 0
-    past = history(depths, np.where(depths > 0, confidences, 0))
-    config = config.replace(recall=recall, min_confidence=0.5)
-    read = anchor_depth({"raw_gamma": jnp.float32(-2.0)}, distribution, past, views, config)
-    return read, distribution.probs, past, config
-
-
-def test_recalled_cells_take_depth_and_confidence_from_the_history():
-    (plain, matched, _, _), (recalled, _, past, config) = recalling(False), recalling(True)
-    tau, shape = config.memory.min_confidence, plain.log_depths.shape
-    wanted_depths, wanted_confidences = (np.array(x) for x in (plain.log_depths, plain.matcher_confidences))
-    candidates, probs = np.asarray(views_and_distribution()[0].log_candidates, float), np.asarray(matched, float)
-    low, high = np.exp(candidates[[0, -1]])
-    count, contradicted = 0, 0
-    for cell in np.ndindex(shape):
-        in_range = low <= float(past.depths[cell]) <= high
-        sure_of_it = float(past.confidences[cell]) > tau + RECALL_MARGIN and bool(past.mask[cell]) and in_range
-        if not (sure_of_it and wanted_confidences[cell] < tau):
-            continue
-        nearest = int(np.argmin(np.abs(candidates - np.log(float(past.depths[cell])))))
-        support = probs[cell][max(nearest - RECALL_WINDOW, 0) : nearest + RECALL_WINDOW + 1].sum()
-        contradicted += support < RECALL_SUPPORT
-        if support >= RECALL_SUPPORT:
-            wanted_depths[cell], wanted_confidences[cell] = np.log(past.depths[cell]), tau + RECALL_MARGIN
-            count += 1
-    assert count >= 3 and contradicted >= 3  # there is something to recall, and something to keep
-    np.testing.assert_allclose(recalled.log_depths, wanted_depths, rtol=1e-6)
-    np.testing.assert_allclose(recalled.matcher_confidences, wanted_confidences, rtol=1e-6)
-    kept = wanted_confidences == np.asarray(plain.matcher_confidences)
-    np.testing.assert_array_equal(np.asarray(recalled.log_depths)[kept], np.asarray(plain.log_depths)[kept])
-    np.testing.assert_array_equal(recalled.anchored_confidences, plain.anchored_confidences)
-
-
-def test_recalled_depth_is_not_recalled_again():
-    """The confidence that recalled tokens get is no history to recall from."""
-    views, distribution, config = views_and_distribution()
-    shape, config = views.inside.shape, config.replace(recall=True, min_confidence=0.5)
-    flat = replace(distribution, probs=jnp.full((*shape, D), 1 / D))
-    past = history(np.full(shape, 3.0), np.full(shape, np.float32(0.5 + RECALL_MARGIN)))
-    read = anchor_depth({"raw_gamma": jnp.float32(-2.0)}, flat, past, views, config)
-    assert (np.asarray(read.matcher_confidences) < 0.5).all()
-    assert (np.abs(np.asarray(read.log_depths) - np.log(3.0)) > 1e-3).any()
-
-
-def test_recalled_depth_has_no_gradient_and_others_keep_theirs():
-    views, distribution, config = views_and_distribution()
-    shape, config = views.inside.shape, config.replace(recall=True, min_confidence=0.5)
-    known = np.arange(np.prod(shape)).reshape(shape) % 2 == 0
-    past = history(np.where(known, 3.0, 0.0), np.where(known, 0.9, 0.0))
-
-    def total(logits):
-        given = replace(distribution, probs=jax.nn.softmax(logits))
-        return anchor_depth({"raw_gamma": jnp.float32(-2.0)}, given, past, views, config).log_depths.sum()
-
-    logits = jnp.zeros((*shape, D)).at[..., 3].set(0.5)
-    slopes = np.abs(np.asarray(jax.grad(total)(logits))).max(axis=-1)
-    assert np.isfinite(slopes).all()
-    assert (slopes[known] == 0).all() and (slopes[~known] > 0).all()

@@ -31,7 +31,7 @@ def views():
     return prepare_views(chunk(), CONFIG)
 
 
-CONCAT = CONFIG.replace(cgfi_form="concat")
+CONCAT = CONFIG.replace(residual_cgfi=False)
 
 
 def inject(weights, feats, past, confidences, config=CONFIG):

@@ -10,13 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ssplat_jax.config import NETWORK_CONFIGS, CompactConfig, ResplatConfig, StreamConfig
+from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.model import count_params
 from ssplat_jax.model.layers import ResidualBlock, average_pool, rms_normalize
 from ssplat_jax.model.network import NETWORKS, Network, NetworkConfig, network_of, register_network
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.model.types import GRID_STRIDE, DepthDistribution, TokenShapes
+from ssplat_jax.network_configs import NETWORK_CONFIGS, CompactConfig, ResplatConfig
 from tests.model.small import chunk, finite
 
 
@@ -30,6 +31,7 @@ class ToyConfig:
 
     num_depths: int = 6
     token_width: int = 8
+    cgfi_width: int = 8
     brightness: float = 2.0
     """A field that no other network has."""
 
@@ -93,9 +95,7 @@ def toy(monkeypatch) -> StreamConfig:
     monkeypatch.setitem(NETWORK_CONFIGS, "toy", ToyConfig)
     monkeypatch.delitem(NETWORK_CONFIGS, "toy")  # undone to absence, whatever the test does
     register_network(ToyConfig, ToyNetwork())
-    return StreamConfig().replace(
-        network="toy", capacity=256, min_confidence=0.0, hpda=True, cgfi=True, cgfi_width=8, chunk_size=3
-    )
+    return StreamConfig().replace(network="toy", capacity=256, min_confidence=0.0, hpda=True, cgfi=True, chunk_size=3)
 
 
 @pytest.mark.slow

@@ -15,7 +15,7 @@ from ssplat_jax.core.rotations import matrices_to_quats, quats_to_matrices
 from ssplat_jax.model import GRID_STRIDE, back_project, count_params, decode_tokens, init_params, patch_colors
 from ssplat_jax.model.compact.cnn_encoder import Encoder
 from ssplat_jax.model.compact.gaussian_head import START_OPACITY, read_shapes
-from ssplat_jax.model.decoder import MIN_SCALE, START_SCALE, START_THICKNESS, token_scales
+from ssplat_jax.model.decoder import MAX_SCALE, MIN_SCALE, START_SCALE, START_THICKNESS, token_scales
 from ssplat_jax.model.types import nearest_sources, prepare_views
 from ssplat_jax.model.windows import from_windows, sine_positions, to_windows
 from tests.core.test_cameras import poses
@@ -159,7 +159,7 @@ def test_untrained_head_gives_a_disc_of_the_patch_color():
 
 def test_members_do_not_change_an_opacity_that_comes_from_the_head_alone():
     members = jnp.array([0, 1, 17, 2**31 - 1], jnp.int32)
-    gaussians, _ = decoded(4, num_members=members, gaussians_per_token=1, opacity_mode="head")
+    gaussians, _ = decoded(4, num_members=members, gaussians_per_token=1, merged_coverage=False)
     np.testing.assert_allclose(gaussians.opacities, 1 / (1 + np.exp(-START_OPACITY)), rtol=1e-6)
 
 
@@ -221,16 +221,12 @@ def hidden_layers():
 
 def test_scales_are_bounded_for_any_feature():
     raw = jnp.array([[1e30, -1e30, 0.0], [jnp.inf, -jnp.inf, 3.0]])
-    for mode in ("footprint", "absolute"):
-        config = CONFIG.replace(scale_mode=mode, max_scale=2.0)
-        scales = token_scales(raw, jnp.array([0.1, 1e9]), config)
-        assert (scales >= MIN_SCALE).all() and (scales <= 2.0).all()
-    literal = token_scales(
-        jnp.array([[0.0, 1.0, 5.0]]),
-        jnp.ones(1),
-        CONFIG.replace(scale_mode="absolute", max_scale=9.0, gaussians_per_token=1),
-    )
-    np.testing.assert_allclose(literal[0], np.log1p(np.exp([-4.0, -3.0, 1.0])), rtol=1e-5)
+    for by_footprint in (True, False):
+        scales = token_scales(raw, jnp.array([0.1, 1e9]), CONFIG.replace(footprint_scales=by_footprint))
+        assert (scales >= MIN_SCALE).all() and (scales <= MAX_SCALE).all()
+    literal = CONFIG.replace(footprint_scales=False, gaussians_per_token=1)
+    scales = token_scales(jnp.array([[0.0, 1.0, 4.0]]), jnp.ones(1), literal)
+    np.testing.assert_allclose(scales[0], np.log1p(np.exp([-4.0, -3.0, 0.0])), rtol=1e-5)
 
 
 def test_tiny_preset_has_its_stages_and_size():

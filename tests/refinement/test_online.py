@@ -39,11 +39,17 @@ CONFIG = StreamConfig().replace(
     capacity=128,
     min_confidence=0.3,
     steps_per_chunk=3,
-    num_key_views=4,
     overflow="drop_new",
     voxel_size=0.3,
 )
 MODEL = StreamSplat(CONFIG)
+
+
+@pytest.fixture(autouse=True)
+def four_key_views(monkeypatch):
+    monkeypatch.setattr("ssplat_jax.cache.state.NUM_KEY_VIEWS", 4)
+
+
 SHIFTS = (0.0, 0.1, -0.1, 0.2)
 
 
@@ -264,7 +270,7 @@ def test_the_first_round_takes_the_new_views():
     assert places_of_round(none_kept, none_new, 0, 6) == []
 
 
-def test_the_least_covered_pivots_are_taken_where_there_is_space_for_few():
+def test_the_least_covered_pivots_are_taken_where_there_is_space_for_few(monkeypatch):
     """The right half of the wall is far away; behind the near left half there is another, nearer than the right one."""
     front, is_left = tokens(), np.asarray(tokens().means[:, :1] < 0)
     front = replace(front, means=jnp.where(is_left, front.means, 2 * front.means))
@@ -279,13 +285,13 @@ def test_the_least_covered_pivots_are_taken_where_there_is_space_for_few():
     in_sight = alive & (depths > 0)
     is_hidden = in_sight & (depths > 1.07 * DEPTH) & (depths < 1.5 * DEPTH)
     num_visible = int((in_sight & ~is_hidden).sum())
-    few = CONFIG.replace(pivots_per_cell=1)
-    pivots = np.asarray(visible_pivots(cache, view, few))
+    many = np.asarray(visible_pivots(cache, view, CONFIG))
+    monkeypatch.setattr("ssplat_jax.refinement.visible_pivots.PIVOTS_PER_CELL", 1)
+    pivots = np.asarray(visible_pivots(cache, view, CONFIG))
     assert is_hidden.sum() > 15 and 40 < num_visible <= len(pivots) == 48
     assert np.isin(np.flatnonzero(in_sight & ~is_hidden), pivots).mean() > 0.95
-    many = np.asarray(visible_pivots(cache, view, CONFIG))
     assert sorted(many[many >= 0].tolist()) == np.flatnonzero(in_sight).tolist() and (many == -1).any()
-    assert (np.asarray(visible_pivots(cache, invalid, few)) == -1).all()
+    assert (np.asarray(visible_pivots(cache, invalid, CONFIG)) == -1).all()
 
 
 def test_areas_before_equal_sums_in_numpy():
@@ -324,17 +330,10 @@ def test_a_stream_from_before_gets_empty_residuals_and_key_views():
     assert not np.any(ready.residuals) and not np.any(ready.key_views.valid)
 
 
-def test_without_steps_the_programs_are_those_without_refinement():
-    """No other field of the group leaves a trace either: the text of the programs is the same."""
-    plain = StreamSplat(CONFIG.replace(steps_per_chunk=0, num_key_views=7, pivots_per_cell=3))
-    default = StreamSplat(CONFIG.replace(steps_per_chunk=0))
-    texts = [
-        jax.jit(model.decode).lower(params(), model.init_cache()).as_text()
-        + jax.jit(fuse, static_argnums=2).lower(model.init_cache(), tokens(), model.config).as_text()
-        for model in (plain, default)
-    ]
-    assert texts[0] == texts[1] != ""
-    assert "residuals" not in texts[0] and len(jax.tree.leaves(default.init_cache())) == 27
+def test_without_steps_the_program_has_no_trace_of_refinement():
+    model = StreamSplat(CONFIG.replace(steps_per_chunk=0))
+    text = jax.jit(model.decode).lower(params(), model.init_cache()).as_text()
+    assert "residuals" not in text != "" and len(jax.tree.leaves(model.init_cache())) == 26
 
 
 def test_cameras_are_those_of_the_chunk():

@@ -21,18 +21,8 @@ def test_a_run_with_equal_facts_may_be_continued(tmp_path):
 
 
 def test_capacity_matters_only_if_tokens_may_be_dropped(tmp_path):
-    held = identity(overflow="error", capacity=1024)
+    held = identity(overflow="grow", capacity=1024)
     _check_identity(held, identity(overflow="grow", capacity=4096), RunFolder(tmp_path))
     held = identity(overflow="drop_new", capacity=1024)
     with pytest.raises(InputError, match=r"config \(capacity: 1024 there, 4096 now\)"):
         _check_identity(held, identity(overflow="drop_new", capacity=4096), RunFolder(tmp_path))
-
-
-def test_a_flat_saved_configuration_is_understood(tmp_path):
-    flat = {"network": "compact", "preset": "tiny", "voxel_size": preset("tiny").memory.voxel_size}
-    now = identity(evidence=False)  # which came later
-    _check_identity(FACTS | {"config": flat}, now, RunFolder(tmp_path))
-    with pytest.raises(InputError, match=r"config \(voxel_size: 0\.5 there"):
-        _check_identity(FACTS | {"config": flat | {"voxel_size": 0.5}}, now, RunFolder(tmp_path))
-    with pytest.raises(InputError, match=r"config \(evidence: False there, True now\)"):
-        _check_identity(FACTS | {"config": flat}, identity(), RunFolder(tmp_path))

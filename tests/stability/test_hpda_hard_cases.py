@@ -21,14 +21,12 @@ pytestmark = pytest.mark.usefixtures("compiled_plainly")
 
 D = CONFIG.network.num_depths
 SHAPE = (1, 2, 4)
-MEAN = CONFIG.replace(depth_readout="mean", confidence="peak")
-WINDOW = CONFIG.replace(depth_readout="window", confidence="window")
+MEAN = CONFIG.replace(depth_readout="mean")
+WINDOW = CONFIG.replace(depth_readout="window")
 READOUTS = {"mean": MEAN, "window": WINDOW}
-NARROW = 1e-2  # a sigma far below the distance of candidates, 0.16
-OPTIONS = ("sigma0", "anchor_space", "anchor_norm", "recall", "min_confidence")
+OPTIONS = ("log_anchor",)
 CANDIDATES = jnp.linspace(jnp.log(1.0), jnp.log(6.0), D)
 
-RECALL = {"recall": True, "min_confidence": 0.5, "logits": jnp.zeros((*SHAPE, D))}
 ANCHORS = {}  # name -> (changes to the ordinary inputs, check of the result)
 
 
@@ -48,7 +46,7 @@ def equals_matcher(given, matched, result):
 def equals_anchor(given, matched, result):
     omega = np.asarray(given["confidences"], np.float64)[..., None]
     offsets = np.asarray(CANDIDATES, np.float64) - np.log(np.asarray(given["depths"], np.float64))[..., None]
-    anchor = omega * np.exp(-0.5 * (offsets / (CONFIG.history.sigma0 + CONFIG.history.lambda_sigma * (1 - omega))) ** 2)
+    anchor = omega * np.exp(-0.5 * (offsets / (0.1 + 0.5 * (1 - omega))) ** 2)
     np.testing.assert_allclose(result.probs, anchor / anchor.sum(-1, keepdims=True), atol=FLOAT32)
 
 
@@ -64,7 +62,7 @@ def has_depth_of(k: int, tolerance: float = 0.0):
 
 def has_matcher_confidence(confidence):
     def limit(given, matched, result):
-        wanted = confidence(1 if given["config"].depth.confidence == "peak" else 3)
+        wanted = confidence(3 if given["config"].additions.depth_readout == "window" else 1)
         np.testing.assert_allclose(result.matcher_confidences, wanted, rtol=1e-6)
 
     return limit
@@ -78,21 +76,16 @@ anchor_case("all holes", equals_matcher, depths=0.0, confidences=0.0, raw_gamma=
 anchor_case("omega of history 0", equals_matcher, confidences=0.0, raw_gamma=1e6)
 anchor_case("omega of history 1", equals_anchor, confidences=1.0, raw_gamma=1e6)
 anchor_case("equal confidences", equals_anchor, confidences=0.5, raw_gamma=1e6)
-anchor_case("sigma to 0, on a candidate", has_depth_of(5, 1e-4), sigma0=1e-30, confidences=1.0, at=5, raw_gamma=1e6)
-anchor_case("sigma to 0, beside them", equals_matcher, sigma0=1e-30, confidences=1.0, at=5.4, raw_gamma=1e6)
-# Here two roundings cancel: without a lower bound sigma would be 0.
-anchor_case("omega an ulp above 1", has_depth_of(5, 1e-4), sigma0=2**-24, confidences=1 + 2**-23, at=5, raw_gamma=1e6)
-anchor_case("history at the near end", has_depth_of(0, FLOAT32), sigma0=NARROW, confidences=1.0, at=0, raw_gamma=1e6)
-anchor_case(
-    "history at the far end", has_depth_of(D - 1, FLOAT32), sigma0=NARROW, confidences=1.0, at=D - 1, raw_gamma=1e6
-)
-anchor_case("history before the near end", equals_matcher, sigma0=NARROW, confidences=1.0, depths=1e-30, raw_gamma=1e6)
-anchor_case("history beyond the far end", equals_matcher, sigma0=NARROW, confidences=1.0, depths=1e30, raw_gamma=1e6)
+anchor_case("omega an ulp above 1", equals_anchor, confidences=1 + 2**-23, at=5, raw_gamma=1e6)
+anchor_case("history at the near end", equals_anchor, confidences=1.0, at=0, raw_gamma=1e6)
+anchor_case("history at the far end", equals_anchor, confidences=1.0, at=D - 1, raw_gamma=1e6)
+anchor_case("history before the near end", equals_matcher, confidences=1.0, depths=1e-30, raw_gamma=1e6)
+anchor_case("history beyond the far end", equals_matcher, confidences=1.0, depths=1e30, raw_gamma=1e6)
 anchor_case("matched at the near end", has_depth_of(0), logits=sure(0), raw_gamma=ZERO_GAMMA)
 anchor_case("matched at the far end", has_depth_of(D - 1), logits=sure(D - 1), raw_gamma=ZERO_GAMMA)
 anchor_case("matcher sure: omega 1", has_matcher_confidence(lambda width: 1.0), logits=sure(4))
 anchor_case("matcher knows nothing", has_matcher_confidence(lambda width: width / D), logits=jnp.zeros((*SHAPE, D)))
-anchor_case("matcher sure, history elsewhere", logits=sure(2), confidences=1.0, at=9, sigma0=NARROW, raw_gamma=1e6)
+anchor_case("matcher sure, history elsewhere", logits=sure(2), confidences=1.0, at=9, raw_gamma=1e6)
 anchor_case(
     "logits of 1e30", has_matcher_confidence(lambda width: 1.0), logits=1e30 * jnp.eye(D)[3] * jnp.ones((*SHAPE, 1))
 )
@@ -107,13 +100,7 @@ anchor_case(
     confidences=1.0,
     raw_gamma=1e6,
 )
-anchor_case("sigma in scene units", anchor_space="metric", sigma0=1e-30, confidences=1.0, at=5, raw_gamma=1e6)
-anchor_case("anchor of mass 0", equals_matcher, anchor_norm="mass", sigma0=NARROW, depths=1e30, raw_gamma=1e6)
-anchor_case("recalled: all cells", has_depth_of(7, 1e-5), confidences=0.95, at=7, **RECALL)
-anchor_case(
-    "not recalled: history of 1e30", equals_matcher, confidences=0.95, depths=1e30, raw_gamma=ZERO_GAMMA, **RECALL
-)
-anchor_case("nothing to recall", equals_matcher, confidences=0.0, depths=0.0, raw_gamma=1e6, **RECALL)
+anchor_case("sigma in scene units", log_anchor=False, confidences=1.0, at=5, raw_gamma=1e6)
 
 
 @functools.cache
@@ -162,15 +149,6 @@ def test_hard_anchor(name, readout):
         limit(given, matched, result)
     if given["logits"].shape[-1] == 1:  # nothing to choose between
         np.testing.assert_array_equal(gradients[0], 0)
-
-
-def test_sigma_to_zero_in_scene_units_selects_one_candidate():
-    changes, _ = ANCHORS["sigma in scene units"]
-    given = anchor_inputs(changes, MEAN)
-    on_candidate = jnp.full(SHAPE, jnp.exp(CANDIDATES)[5])
-    inputs = (given["logits"], jnp.float32(given["raw_gamma"]), CANDIDATES, history(on_candidate, given["confidences"]))
-    (_, (_, result)), _ = anchoring(given["config"])(*inputs)
-    assert (result.probs[..., 5] > 1 - 1e-4).all()
 
 
 def test_gradient_of_gamma_equals_finite_differences():

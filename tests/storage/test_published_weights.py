@@ -39,8 +39,8 @@ def depth_network(tensors, tmp_path_factory):
 @pytest.mark.parametrize("name", ["paper", "small", "base"])
 def test_imported_weights_are_run_as_their_code_ran_them(name):
     config, before = as_published(preset(name)), preset(name)
-    assert config.network.upstream_compat and config.depth.depth_readout == "mean"
-    assert config.replace(upstream_compat=False, depth_readout=before.depth.depth_readout) == before
+    assert config.network.upstream_compat and config.additions.depth_readout == "mean"
+    assert config.replace(upstream_compat=False, depth_readout=before.additions.depth_readout) == before
     assert {path.split("/")[0] for path, tensor in published_tensors(config).items() if tensor is None} == {
         "hpda",
         "cgfi",

@@ -57,7 +57,7 @@ def assert_same_scene(received, scene):
         )
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n == "evict" else n for n in VARIANTS])
+@pytest.mark.parametrize("name", VARIANTS)
 def test_deltas_put_together_equal_the_scene(name):
     config = VARIANTS[name]
     model, params, rng = StreamSplat(config), decoder_params(config), np.random.default_rng(0)

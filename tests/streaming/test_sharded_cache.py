@@ -47,11 +47,11 @@ AMPLE = CONFIG.memory.capacity * 8
 FUSED: dict[str, tuple[StreamConfig, int, int]] = {
     "voxels": (CONFIG, 8, AMPLE),
     "append": (CONFIG.replace(vacc="append"), 8, AMPLE),
-    "evict_lowest": (CONFIG.replace(overflow="evict_lowest"), 3, 32),
+    "drop_new": (CONFIG, 3, 32),
 }
 """Configuration, number of shards, and capacity of each shard."""
 
-COUNTERS = ("seen", "accepted", "merged", "low_confidence", "non_finite", "out_of_range", "dropped", "evicted")
+COUNTERS = ("seen", "accepted", "merged", "low_confidence", "non_finite", "out_of_range", "dropped")
 
 
 @functools.cache
@@ -151,13 +151,13 @@ def test_appended_pivots_equal_those_of_a_single_cache(fused):
 
 @pytest.mark.slow
 def test_full_shard_equals_a_full_cache_of_its_own_tokens(tmp_path):
-    config, num_shards, capacity = FUSED["evict_lowest"]
-    results = Worker(tmp_path, {"fused": fuse_job("evict_lowest")}, num_devices=num_shards).results()
+    config, num_shards, capacity = FUSED["drop_new"]
+    results = Worker(tmp_path, {"fused": fuse_job("drop_new")}, num_devices=num_shards).results()
     shards = each_of(results["fused"][0])
     owners = np.asarray(shards_of(voxel_indices(jnp.asarray(TOKENS.means), config.memory.voxel_size)[0], num_shards))
     for i, shard in enumerate(shards):
         cache, _ = fuse_alone(config, capacity, TOKENS.valid & (owners == i))
-        assert int(cache.num_voxels) == capacity and int(cache.stats.num_evicted) > 20
+        assert int(cache.num_voxels) == capacity and int(cache.stats.num_dropped) > 20
         assert_same_bits(shard, cache)
 
 

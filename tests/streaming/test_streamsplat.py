@@ -166,7 +166,7 @@ def test_merged_footprints_grow_until_they_cover_a_face(model, footprint, member
         num_members=cache.num_members.at[0, 0].set(members),
     )
     assert float(merged_footprints(cache, model.config)[0, 0]) == pytest.approx(wanted, rel=1e-6)
-    stored = merged_footprints(cache, model.config.replace(grow_footprints=False))
+    stored = merged_footprints(cache, model.config.replace(merged_coverage=False))
     assert float(stored[0, 0]) == pytest.approx(footprint, rel=1e-6)
 
 

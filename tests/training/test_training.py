@@ -15,7 +15,7 @@ import pytest
 
 from ssplat_jax.cache import Tokens
 from ssplat_jax.commands.train_command import Train, _rendering_loss
-from ssplat_jax.config import preset
+from ssplat_jax.config import MEDIAN_DEPTH, preset
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.data.depth_range import FAR_FACTOR
@@ -146,14 +146,6 @@ def test_a_run_of_a_version_that_did_not_write_its_start_is_resumed(tmp_path):
     old = {name: value for name, value in description.items() if name != "init_weights"}
     assert loop.upgrade_description(old, wanted={"init_weights": "mine"}) == description
     assert loop.upgrade_description(description, wanted={"init_weights": "another"}) == description
-
-
-def test_run_without_the_switches_of_additions_is_resumed(tmp_path):
-    description = loop.describe_run(NARROW, RECIPE, loop.RANDOM)
-    old = json.loads(json.dumps(description))
-    del old["config"]["history"]["cgfi_form"], old["config"]["head"]["opacity_mode"]
-    (tmp_path / "recipe.json").write_text(json.dumps(old))
-    TrainingCheckpoints(tmp_path, description, upgrade=UPGRADE).close()
 
 
 def test_fields_missing_in_a_recipe_have_their_default():
@@ -362,7 +354,7 @@ def test_the_sky_stands_at_the_last_candidate_and_changes_no_scale():
         is_sky = np.isclose(cells, far, rtol=1e-3)
         assert cells[is_sky].max(initial=0.0) < far
         surfaces = depths[np.isfinite(depths)]
-        scale = NARROW.stream.median_depth / np.median(surfaces)
+        scale = MEDIAN_DEPTH / np.median(surfaces)
         assert far == pytest.approx(FAR_FACTOR * scale * np.quantile(surfaces, 0.99), rel=1e-5)
         assert is_sky.mean() == pytest.approx(np.isinf(depths).mean(), abs=0.05)
         shares.append(is_sky.mean())

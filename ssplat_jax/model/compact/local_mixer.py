@@ -91,13 +91,13 @@ def mix_tokens(
     view_valid: Bool[Array, " v"],
     config: StreamConfig,
 ) -> Float[Array, "v hf wf c"]:
-    """Mixed token features, for the head and the cache; of unit RMS with `history.unit_features`.
+    """Mixed token features, for the head and the cache; of unit RMS with `additions.unit_features`.
 
     Stored features come back through CGFI with the next chunk. Without a bound they grow from chunk to chunk: trained
     on four chunks, they reached 1e18 by the ninth. The input is brought to unit RMS too, because nothing else bounds
     what CGFI adds, and large features would outweigh the output of the blocks.
     """
-    bound = rms_normalize if config.history.unit_features else lambda x: x
+    bound = rms_normalize if config.additions.unit_features else lambda x: x
     feats = bound(feats.astype(jnp.float32))
     mixed = Mixer(config).apply({"params": params}, feats, positions, inside, view_valid)
     return bound(mixed)  # pyright: ignore[reportArgumentType, reportReturnType]

@@ -36,7 +36,7 @@ def regress_tokens(
     views: Views,
     config: StreamConfig,
 ) -> Float[Array, "v hf wf c"]:
-    """Token features f^v(u) of the current views; of unit RMS with `history.unit_features`.
+    """Token features f^v(u) of the current views; of unit RMS with `additions.unit_features`.
 
     The following stages are residual and end in a norm, so nothing else would bound f, and large features would
     outweigh what CGFI and the mixer add. The inputs have about unit size too: colors and confidence are few channels
@@ -50,4 +50,4 @@ def regress_tokens(
     patches = 4.0 * pixel_unshuffle(views.images - 0.5, GRID_STRIDE)
     context, decoder = (rms_normalize(x.astype(jnp.float32)) for x in (features.context, distribution.decoder))
     feats = TokenRegressor(config).apply({"params": params}, patches, relative, match, context, decoder)
-    return rms_normalize(feats) if config.history.unit_features else feats  # pyright: ignore
+    return rms_normalize(feats) if config.additions.unit_features else feats  # pyright: ignore

@@ -1,0 +1,318 @@
+"""Configuration of a stream: the static values, whose change recompiles the program.
+
+Defaults are those of the preset `tiny`. `preset("paper")` reads the paper to the letter: what it does not have is
+marked "ours", and what it has otherwise is the group `Additions`, all off in `paper`. A value that nobody should set is
+no field but a constant beside the code that uses it. This module does not import JAX, so that `ssplat --help` answers
+at once.
+"""
+
+import dataclasses
+import hashlib
+import json
+import math
+from typing import Any, Literal
+
+from ssplat_jax.core.errors import InputError
+from ssplat_jax.network_configs import (
+    CompactConfig,
+    ConfigGroup,
+    ResplatConfig,
+    Rule,
+    at_least,
+    is_positive,
+    network_config,
+)
+
+MEDIAN_DEPTH = 2.0
+"""Median depth of a capture in stream units with `scene_scale="auto"`: lengths such as `voxel_size` are tuned to it."""
+
+
+@dataclasses.dataclass(frozen=True)
+class StreamingConfig(ConfigGroup):
+    """How images become chunks, and what is done after each: size, scale, order, exposure and refinement."""
+
+    chunk_size: int = 4
+    """Views per chunk."""
+    scene_scale: float | Literal["auto"] = "auto"
+    """Stream units per capture unit; `auto` scales the median depth of the capture to `MEDIAN_DEPTH`."""
+    # Consecutive frames of hand-held video step 0.4 % of the depth, too little for four of them to determine depth.
+    chunk_step: float = 0.03
+    """Video is interleaved until consecutive views of a chunk are this fraction of the median depth apart (ours); 0
+    keeps the order of frames."""
+    match_exposure: bool = True
+    """Stores colors at the exposure of the first views and estimates the exposures of the others (ours)."""
+    causal: bool = False
+    """Nothing depends on later frames: near, far and scale come from the first chunk, frames keep their order, and
+    later chunks only move near and far outward (`streaming/causal_range.py`)."""
+    steps_per_chunk: int = 0
+    """Gradient steps of refinement after each chunk, each on one key view (ours); 0 adds nothing to any program."""
+
+    def rules(self) -> tuple[Rule, ...]:
+        is_scale = self.scene_scale == "auto" or is_positive(self.scene_scale)
+        return (
+            *at_least(1, self, "chunk_size"),
+            *at_least(0, self, "steps_per_chunk"),
+            ("chunk_step", "not negative, and finite", 0 <= self.chunk_step < math.inf),
+            ("scene_scale", "'auto' or a positive factor", is_scale),
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class HistoryConfig(ConfigGroup):
+    """How the cache informs the next chunk; both are off in `tiny`."""
+
+    # In three pairs of trainings that differ in it alone, captures lose 0.02 to 0.06 dB by it and revisits gain 0.05.
+    hpda: bool = False
+    """Anchors depth distributions to cached geometry. Scenes with plain walls that the camera returns to gain by it."""
+    # Trained for a short budget it moves no scene by more than 0.04 dB; longer training of all later stages lost.
+    cgfi: bool = False
+    """Injects cached features where the current views are uncertain."""
+
+
+@dataclasses.dataclass(frozen=True)
+class MemoryConfig(ConfigGroup):
+    """The voxel cache (VACC; Eqs. vacc_capacity_update and vacc_pair_selection_and_merge)."""
+
+    vacc: Literal["voxel", "append"] = "voxel"
+    """`voxel` merges tokens by voxel; `append` keeps every accepted token (the paper's ablation)."""
+    # Four pivots per voxel are the detail that is left of a surface: 0.04 (the paper's) costs 0.23 dB on fox.
+    voxel_size: float = 0.03
+    """Side of a voxel in stream units."""
+    pivots_per_voxel: int = 4
+    """K: pivots that a voxel can hold."""
+    # 0.5 would drop much of the sky; 0.2 gives the same within 0.13 dB and takes 3 to 5 % more Gaussians.
+    min_confidence: float = 0.3
+    """tau: tokens of lower confidence do not enter the cache, and pivots of lower confidence are not decoded. The
+    paper's value is for a peak; the mass of a window (`depth_readout="window"`) is larger, so more tokens enter."""
+    capacity: int = 1 << 15
+    """Voxels that the cache can hold, a power of two; `overflow="grow"` doubles it outside jit."""
+    overflow: Literal["grow", "drop_new"] = "grow"
+    """Treatment of tokens of new voxels when the cache is full."""
+    # VACC never forgets a wrong pivot. Without carving redkitchen has 23.46 dB instead of 24.13.
+    carving: bool = True
+    """Views lower the confidence of pivots in free space that they see, and raise that of pivots on surfaces (ours)."""
+
+    def rules(self) -> tuple[Rule, ...]:
+        is_power = self.capacity >= 128 and not self.capacity & (self.capacity - 1)
+        return (
+            ("voxel_size", "a positive length", is_positive(self.voxel_size)),
+            *at_least(1, self, "pivots_per_voxel"),
+            ("capacity", "a power of two of at least 128", is_power),
+            ("min_confidence", "in [0, 1]", 0.0 <= self.min_confidence <= 1.0),
+            # Carved confidences stay below 0.95 (`cache.carve.MAX_REVISED`): a higher tau rejects confirmed pivots.
+            ("min_confidence", "at most 0.95 while views carve", not self.carving or self.min_confidence <= 0.95),
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class HeadConfig(ConfigGroup):
+    """Gaussians of a token."""
+
+    # One color per patch of 4 x 4 pixels left a quarter of the squared error within patches: 22.83 instead of 24.13 dB.
+    gaussians_per_token: Literal[1, 4, 16] = 4
+    """Gaussians in a square over the token's cell, each with the mean color of its part of the patch (ours; 1 is
+    literal)."""
+    sh_degree: int = 0
+    """Degree of the spherical harmonics of colors."""
+    # A feature that was written with its token does not know which pivots later views confirm: 0.76 dB more.
+    evidence: bool = True
+    """Pivots keep how views saw them and how well their color fitted, and the decoder reads that (ours)."""
+
+    def rules(self) -> tuple[Rule, ...]:
+        return (("sh_degree", "0 to 3", 0 <= self.sh_degree <= 3),)
+
+
+@dataclasses.dataclass(frozen=True)
+class Additions(ConfigGroup):
+    """Where `tiny` does otherwise than the paper prints. Each reads literally when it is off ("metric" or False)."""
+
+    # The expectation over all candidates puts a token between two modes, where no surface is, and HPDA's anchor is such
+    # a second mode. The peak of one candidate depends on where the depth falls between two: the mass of three does not.
+    depth_readout: Literal["metric", "mean", "window"] = "window"
+    """`metric`: depth is the expectation of the depths of all candidates, confidence the largest probability (literal).
+    `mean`: the expectation in the space in which candidates are uniform, as the published networks read it. `window`:
+    the expectation near the peak in that space, and the mass of neighboring candidates (ours)."""
+    front_cluster: bool = True
+    """The projection averages the front cluster of the pivots in a cell, instead of all of them."""
+    log_anchor: bool = True
+    """The anchor of HPDA has its width in log depth, instead of stream units."""
+    # A zero feature alone does not tell a hole from a feature.
+    residual_cgfi: bool = True
+    """CGFI's U-Net also sees Omega and gives what is added to f, instead of the new features."""
+    # Stored features return through CGFI and are stored again; without a bound this loop grows until they are NaN.
+    unit_features: bool = True
+    """Features that come back from the cache have unit RMS: the compact network stores them so, ReSplat's reads them
+    so."""
+    # A fused feature then need not remember depth and focal length.
+    footprint_scales: bool = True
+    """Scales are relative to the token's footprint, depth x cell / focal length, instead of in stream units."""
+    # Training renders the tokens themselves; a decoded cache should show what they would have shown, without cracks.
+    merged_coverage: bool = True
+    """A pivot of n members is as opaque as n Gaussians in one place, 1 - (1 - o)^n, and its footprint grows until the
+    pivots of a voxel cover its face, instead of showing as one token."""
+
+
+LITERAL = Additions(
+    depth_readout="metric",
+    front_cluster=False,
+    log_anchor=False,
+    residual_cgfi=False,
+    unit_features=False,
+    footprint_scales=False,
+    merged_coverage=False,
+)
+"""No additions: the paper as it is printed."""
+
+
+@dataclasses.dataclass(frozen=True)
+class StreamConfig:
+    """Configuration of model, cache and stream: a group of fields for each. Frozen and hashable.
+
+    Example:
+        >>> config = preset("tiny").replace(voxel_size=0.02)
+        >>> config.memory.voxel_size
+        0.02
+    """
+
+    preset: str = "tiny"
+    """Name of the preset that this configuration started from."""
+    network: Any = dataclasses.field(default_factory=CompactConfig)
+    """`CompactConfig`, `ResplatConfig`, or that of a registered network (`model.network.NetworkConfig`)."""
+    history: HistoryConfig = dataclasses.field(default_factory=HistoryConfig)
+    memory: MemoryConfig = dataclasses.field(default_factory=MemoryConfig)
+    head: HeadConfig = dataclasses.field(default_factory=HeadConfig)
+    stream: StreamingConfig = dataclasses.field(default_factory=StreamingConfig)
+    additions: Additions = dataclasses.field(default_factory=Additions)
+
+    def replace(self, **changes: Any) -> "StreamConfig":
+        """Copy with changed values.
+
+        Args:
+            **changes: values by short name, `voxel_size=0.02`, by full name, `**{"memory.voxel_size": 0.02}`, or of a
+                whole group, `memory=MemoryConfig()`. `network="resplat"` selects that network with its defaults.
+
+        Raises:
+            InputError: a name is unknown or ambiguous, or a value is not allowed.
+        """
+        whole = {name: changes.pop(name) for name in ("preset", *self.groups()) if name in changes}
+        if isinstance(kind := whole.get("network"), str):
+            whole["network"] = network_config(kind)
+        config = dataclasses.replace(self, **whole)
+        by_group: dict[str, dict[str, Any]] = {}
+        for name, value in changes.items():
+            group, field = config.find(name)
+            by_group.setdefault(group, {})[field] = value
+        return dataclasses.replace(
+            config, **{name: dataclasses.replace(getattr(config, name), **part) for name, part in by_group.items()}
+        )
+
+    def groups(self) -> tuple[str, ...]:
+        """Names of the groups."""
+        return tuple(field.name for field in dataclasses.fields(self) if field.name != "preset")
+
+    def find(self, name: str) -> tuple[str, str]:
+        """Group and field of a full name, `memory.voxel_size`, or a short one, `voxel_size`.
+
+        Raises:
+            InputError: the name is unknown or ambiguous.
+        """
+        known = [(g, field.name) for g in self.groups() for field in dataclasses.fields(getattr(self, g))]
+        found = [(g, f) for g, f in known if name in (f, f"{g}.{f}")]
+        if len(found) == 1:
+            return found[0]
+        if found:
+            options = " or ".join(f"{g}.{f}" for g, f in found)
+            raise InputError(f"config: {name!r} could be {options}; give the full name.")
+        listed = ", ".join(sorted(f"{g}.{f}" for g, f in known))
+        raise InputError(f"config: no field {name!r} with network {self.network.kind!r}; known fields: {listed}.")
+
+    def get(self, name: str) -> Any:
+        """Value of a field by its full or short name.
+
+        Raises:
+            InputError: see `find`.
+        """
+        group, field = self.find(name)
+        return getattr(getattr(self, group), field)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Dictionary of plain JSON types, with a dictionary per group."""
+        fields = dataclasses.asdict(self)
+        fields["network"] = {"kind": self.network.kind, **fields["network"]}
+        return json.loads(json.dumps(fields))
+
+    @staticmethod
+    def from_dict(fields: dict[str, Any]) -> "StreamConfig":
+        """Configuration from `to_dict`; fields that are missing have their defaults.
+
+        Raises:
+            InputError: a field is unknown or its value is not allowed.
+        """
+        changes: dict[str, Any] = {}
+        for name, value in fields.items():
+            if not isinstance(value, dict):
+                changes[name] = value
+                continue
+            changes |= {f"{name}.{field}": x for field, x in value.items() if field != "kind"}
+            if name == "network":
+                changes["network"] = value["kind"]
+        return StreamConfig().replace(**changes)
+
+    @property
+    def hash(self) -> str:
+        """Hash of 12 hexadecimal digits, which identifies the configuration in results and saved states."""
+        return hashlib.sha256(json.dumps(self.to_dict(), sort_keys=True).encode()).hexdigest()[:12]
+
+
+PAPER = StreamConfig(
+    preset="paper",
+    network=ResplatConfig(),
+    history=HistoryConfig(hpda=True, cgfi=True),
+    memory=MemoryConfig(voxel_size=0.04, carving=False, overflow="drop_new", capacity=1 << 18),
+    head=HeadConfig(gaussians_per_token=1, sh_degree=3, evidence=False),
+    stream=StreamingConfig(scene_scale=1.0, chunk_step=0.0, match_exposure=False, causal=True),
+    additions=LITERAL,
+)
+"""The paper to the letter, with ReSplat's network; docs/algorithm.md lists every field."""
+
+# Carving or unit norms on top of weights that were trained without them would change what the weights mean, so these
+# differ from `paper` only in what long captures and published weights need.
+SMALL = PAPER.replace(preset="small", depth_readout="mean", causal=False, overflow="grow", capacity=1 << 15)
+"""The paper's method for captures of any length, with depth read as the published networks read it."""
+
+PRESETS: dict[str, StreamConfig] = {
+    "tiny": StreamConfig(),
+    "paper": PAPER,
+    "small": SMALL,
+    "base": SMALL.replace(preset="base", vit="b", token_width=512),
+}
+
+
+def preset(name: str) -> StreamConfig:
+    """Configuration of the preset `name`.
+
+    Raises:
+        InputError: there is no such preset.
+    """
+    if name not in PRESETS:
+        raise InputError(f"no preset {name!r}; there is {', '.join(sorted(PRESETS))}.")
+    return PRESETS[name]
+
+
+@dataclasses.dataclass(frozen=True)
+class Quality:
+    """A trade-off between accuracy and time (`ssplat experiment accuracy_vs_time`, docs/performance.md)."""
+
+    scale: float
+    """Factor by which images are resized before they are streamed."""
+    refine_steps: int = 0
+    """Refinement steps on the streamed views after the stream."""
+
+
+QUALITIES: dict[str, Quality] = {
+    "fast": Quality(0.5),
+    "balanced": Quality(0.75),
+    "accurate": Quality(1.0),
+    "best": Quality(1.0, refine_steps=100),
+}
+"""Choices of `--quality`."""
