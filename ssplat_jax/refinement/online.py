@@ -58,7 +58,7 @@ def revise_scene(model: StreamSplat, params: dict, cache: VoxelCache, chunk: Chu
     """The cache after a round of refinement that follows `model.step` on `chunk`.
 
     Args:
-        model: the stream's model; `config.refine` says how much is done.
+        model: the stream's model; its `steps_per_chunk` says how much is done.
         params: the model's parameters.
         cache: the cache after the step, with residuals and key views.
         chunk: the chunk of the step.

@@ -17,7 +17,7 @@ from ssplat_jax.evaluation.pictures import save_comparison, save_image
 from ssplat_jax.evaluation.plots import import_pyplot, save_figure
 from ssplat_jax.evaluation.scoring import ScoredView, mean_scores, score_view
 from ssplat_jax.model.streamsplat import StreamSplat
-from ssplat_jax.refinement import CaptureRefinement, refine_on_capture
+from ssplat_jax.refinement import Refinement, refine_on_capture
 from ssplat_jax.runs.finish_run import save_scene
 from ssplat_jax.storage.folders import make_writable
 from ssplat_jax.storage.json_files import write_json
@@ -71,10 +71,10 @@ def run_demo(scene: str, out: Path, reporter: Reporter, quality: Quality = QUALI
     save_scene(folder.scene, session.gaussians(), frame, exposures)
     refined = {}
     if quality.refine_steps:
-        done = _refine(session.gaussians(), streamed, split, frame, exposures, quality.refine_steps, reporter)
-        save_scene(folder.refined_scene, done.gaussians, frame, done.exposures)
-        views = [score_view(done.gaussians, capture, i, frame, done.exposures) for i in split.targets]
-        refined = {"refined": {"steps": done.report.num_steps, **_table_row(views, len(exposures), session)}}
+        better, report = _refine(session.gaussians(), streamed, split, frame, exposures, quality.refine_steps, reporter)
+        save_scene(folder.refined_scene, better, frame, exposures)
+        views = [score_view(better, capture, i, frame, exposures) for i in split.targets]
+        refined = {"refined": {"steps": report.num_steps, **_table_row(views, len(exposures), session)}}
     for view in views:  # of the finished scene
         save_comparison(folder.target(view.score.frame), view.target, view.color, view.depth, (frame.near, frame.far))
     strip.append(views[len(views) // 2].target)
@@ -112,7 +112,7 @@ def _refine(
     exposures: Exposures,
     steps: int,
     reporter: Reporter,
-) -> CaptureRefinement:
+) -> tuple[Gaussians, Refinement]:
     """The scene refined on its context views, with a progress bar."""
     with reporter.progress("refining", steps) as advance:
         on_step = lambda step, loss: advance(step, f"loss {loss:.4f}")  # noqa: E731

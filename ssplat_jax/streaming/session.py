@@ -38,7 +38,7 @@ class Session:
         cache: the cache to continue from; by default an empty one with capacity for a few chunks.
         causal: the model's configuration with `stream.causal`: no result depends on a later frame.
         frame: stream frame of `cache`, for `push`; by default that of the first chunk that is pushed.
-        revise: what refines the scene after each chunk, as `config.refine` asks
+        revise: what refines the scene after each chunk, as `steps_per_chunk` asks
             (`ssplat_jax.refinement.online_refinement`); None where it asks for nothing.
     """
 
