@@ -4,14 +4,12 @@
 
 Every setting streams the same context views of `procedural:room` (and of redkitchen, where `--captures` has it) with
 the shipped weights, no retraining, and is scored on the same targets at the same size, whatever size it streamed at.
-Time is chunk in -> one novel view out on the full cache, warm. Writes `table.json`, `table.csv`, `page.md`, `plot.png`
-and `front.json`, the front over all scenes, from which `ssplat run --budget-ms` chooses; what `--out` holds is not
-measured again. Needs an idle machine.
+Time is chunk in -> one novel view out on the full cache, warm. Writes `table.json`, `table.csv`, `page.md` and
+`plot.png`; what `--out` holds is not measured again. Needs an idle machine.
 """
 
 import dataclasses
 import functools
-import statistics
 from pathlib import Path
 from typing import Any
 
@@ -23,11 +21,10 @@ from ssplat_experiments.scenes import REDKITCHEN, open_redkitchen, open_room
 from ssplat_experiments.settings import REFINED, REFINED_FACTORS, SETTINGS, SIZES, Setting, Sizes
 from ssplat_experiments.study import Study, at_scale, run_study
 from ssplat_jax.core.console import Reporter
-from ssplat_jax.runs.time_budget import FrontPoint, front_of
 
 
 def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str:
-    """Measures every setting on every available scene, and writes the front; `smoke` takes two settings."""
+    """Measures every setting on every available scene; `smoke` takes two settings."""
     if captures is None or not (captures / REDKITCHEN).is_dir():
         reporter.warn("no redkitchen under --captures: the procedural scene stands alone")
     return run_study(STUDY, captures, out, scale, reporter)
@@ -100,25 +97,6 @@ def _label(row: dict[str, Any]) -> str:
     return f"{row['setting']} ({quality})" if quality else row["setting"]
 
 
-def front_file(rows: list[Row], scale: str) -> dict[str, Any]:
-    """`front.json`: the front of the means over scenes, of the settings that all scenes have.
-
-    Settings with refinement are not among them: `ssplat run --budget-ms` bounds the time of a chunk, and they come
-    after the last.
-    """
-    num_scenes, by_name = len({row["scene"] for row in rows}), {setting.name: setting for setting in SETTINGS}
-    points = []
-    for name in dict.fromkeys(row["setting"] for row in rows if row["setting"] in by_name):
-        here = [row for row in rows if row["setting"] == name]
-        if len(here) == num_scenes:
-            steps = statistics.mean(row["ms_per_view"] / row["reference_ms"] for row in here)
-            shown = statistics.mean(row["shown"] for row in here)
-            setting = by_name[name]
-            points.append(FrontPoint(name, setting.factor, setting.changes, round(steps, 3), round(shown, 3)))
-    origin = {name: rows[0][name] for name in ("machine", "date", "commit")}
-    return {"front.json": front_of(at_scale(SIZES, scale).scored, points).to_dict() | origin}
-
-
 def plot(pyplot: Any, rows: list[Row]) -> Any:
     """A panel per scene, the front as a line, the qualities ringed, memory as color, refined scenes as triangles."""
     scenes = list(dict.fromkeys(row["scene"] for row in rows))
@@ -177,11 +155,9 @@ STUDY = Study(
     name="accuracy_vs_time",
     text="""Every setting streams the same context views with the shipped weights and is scored on the same views at the
 same size. Time is chunk in, one novel view out, on the full cache. `front`: no other setting of the scene is both
-faster and at least as good. `reference ms` is the step that `ssplat run --budget-ms` times. Rows with steps are the
-second axis: refinement steps on the streamed views after the stream, their time (`refine s`, without compilation)
-spread over the views. One front holds all of them.""",
+faster and at least as good. Rows with steps are the second axis: refinement steps on the streamed views after the
+stream, their time (`refine s`, without compilation) spread over the views. One front holds all of them.""",
     cases=cases,
     finish=mark_fronts,
     plot=plot,
-    files=front_file,
 )

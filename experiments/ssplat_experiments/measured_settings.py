@@ -1,7 +1,6 @@
 """Measurement of one setting of `accuracy_vs_time`: quality, time and memory, without and with refinement."""
 
 import dataclasses
-import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -22,7 +21,6 @@ from ssplat_jax.evaluation.scoring import score_targets
 from ssplat_jax.refinement.refine import continue_refinement, start_refinement
 from ssplat_jax.refinement.refine_capture import key_views_of
 from ssplat_jax.refinement.refine_config import FOR_CAPTURES
-from ssplat_jax.runs.time_budget import reference_step_ms
 from ssplat_jax.streaming.feed import Exposures, feed_capture
 
 Opened = Callable[[tuple[int, int]], tuple[Capture, Split]]
@@ -108,15 +106,8 @@ def _stream(setting: Setting, sizes: Sizes, opened: Opened) -> _Streamed:
         "ms_per_view": round(latency["chunk_ms"]["median"] / session.model.config.stream.chunk_size, 2),
         "chunk_ms": latency["chunk_ms"]["median"],
         "render_ms": latency["render_ms"],
-        "reference_ms": round(reference_ms(), 3),
         "compile_s": round(session.compile_seconds - compiled, 1),
         "gaussians": session.cache_facts()["decoded"],
         "peak_memory_bytes": peak_memory(session, camera).bytes,
     }
     return _Streamed(session.gaussians(), capture, scored, split, frame, exposures, cost)
-
-
-@functools.cache
-def reference_ms() -> float:
-    """The reference step of `ssplat run --budget-ms` on this machine, timed once a process."""
-    return reference_step_ms()

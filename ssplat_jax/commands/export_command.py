@@ -20,8 +20,6 @@ class Export:
     """Folder of an `ssplat run` or `ssplat demo`, or a scene file."""
     to: Path
     """File to write: .ply; .compressed.ply, .spz or .sog, 4 to 8 times smaller; .glb or .gltf; .splat."""
-    prune: bool = False
-    """Leave out specks, and floaters that one view alone made; their number is printed."""
     max_splats: int | None = None
     """Write at most so many Gaussians: opaque ones first, everywhere alike; the number of the others is printed."""
     cameras: str | None = None
@@ -39,7 +37,7 @@ class Export:
         from ssplat_jax.storage.weights import load_params
 
         reporter = Reporter(quiet=False)
-        folder, selection = RunFolder(self.scene), Selection(self.prune, self.max_splats)
+        folder, selection = RunFolder(self.scene), Selection(max_splats=self.max_splats)
         cameras = None if self.cameras is None else open_cameras(self.cameras, self.scene, self.to, reporter)
         file = self.scene if self.scene.is_file() else folder.scene  # the latter in a folder of `ssplat demo`
         if file.exists() and not folder.has_state():
@@ -59,7 +57,6 @@ class Export:
 def _left_out(report) -> str:
     """The counts of Gaussians that were not written, in words."""
     counts = (
-        (report.num_pruned, "specks and floaters were pruned"),
         (report.num_cut, "beyond --max-splats were left out"),
         (report.num_dropped, "more have no visible effect and were not written"),
     )

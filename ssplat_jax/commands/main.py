@@ -10,6 +10,7 @@ import functools
 import operator
 import platform
 import sys
+from collections.abc import Callable
 from importlib import metadata
 from typing import Annotated
 
@@ -29,10 +30,9 @@ from ssplat_jax.commands.refine_command import Refine
 from ssplat_jax.commands.render_command import Render
 from ssplat_jax.commands.run_command import Run
 from ssplat_jax.commands.train_command import Train
-from ssplat_jax.commands.usage import VERSION, check_usage, parse_in_one_line
 from ssplat_jax.commands.view_command import View
 from ssplat_jax.commands.weights_command import Weights
-from ssplat_jax.core.errors import CacheError, InputError, StorageError
+from ssplat_jax.core.errors import CacheError, InputError
 
 EXIT_INPUT, EXIT_STORAGE, EXIT_MEMORY = 2, 3, 4
 
@@ -58,37 +58,32 @@ COMMANDS = {
 def main(arguments: list[str] | None = None) -> None:
     """Runs the command in `arguments` (default: those of the process) and exits with its code."""
     arguments = sys.argv[1:] if arguments is None else arguments
-    if arguments == [VERSION]:
+    if arguments == ["--version"]:
         print(_version())
         sys.exit(0)
-    try:
-        command = _parse(arguments)
-    except InputError as error:
-        sys.exit(_refuse(error, EXIT_INPUT))
+    command = _parse(arguments)
     if not isinstance(command, Bench | Experiment):  # which measure what compiling costs
         keep_programs()
     sys.exit(guarded(command.run))
 
 
 def _parse(arguments: list[str]):
-    """The command that `arguments` name, with its options.
-
-    Raises:
-        InputError: no such command or option, or a value that the option does not take.
-    """
-    check_usage(arguments, COMMANDS)
+    """The command that `arguments` name, with its options; exits with 2 if there is no such command or option."""
+    options = [word.partition("=")[0] for word in arguments if word.startswith("--")]
+    if repeated := [option for option in options if options.count(option) > 1]:  # the last one would hold alone
+        sys.exit(_refuse(f"wanted {repeated[0]} once, got it twice; list several values behind one.", EXIT_INPUT))
+    config = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff)
+    if arguments and arguments[0] in COMMANDS:  # alone, so that hints name options of this command only
+        name, *rest = arguments
+        return tyro.cli(COMMANDS[name], prog=f"ssplat {name}", args=rest, config=config)
     commands = [Annotated[command, tyro.conf.subcommand(name)] for name, command in COMMANDS.items()]
-    return parse_in_one_line(
-        functools.partial(
-            tyro.cli,
-            functools.reduce(operator.or_, commands),  # pyright: ignore[reportCallIssue, reportArgumentType]
-            prog="ssplat",
-            description="StreamSplat in JAX: a calibrated image stream becomes a 3D Gaussian scene, chunk by chunk."
-            " `ssplat --version` prints versions.",
-            args=arguments,
-            config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
-        ),
-        arguments[0],
+    return tyro.cli(
+        functools.reduce(operator.or_, commands),  # pyright: ignore[reportCallIssue, reportArgumentType]
+        prog="ssplat",
+        description="StreamSplat in JAX: a calibrated image stream becomes a 3D Gaussian scene, chunk by chunk."
+        " `ssplat --version` prints versions.",
+        args=arguments,
+        config=config,
     )
 
 
@@ -98,15 +93,15 @@ def _version() -> str:
     return f"ssplat {__version__} ({packages}, Python {platform.python_version()}, {platform.platform()})"
 
 
-def guarded(run) -> int:
+def guarded(run: Callable[[], int]) -> int:
     """Calls `run` and returns its exit code; errors that users can cause become one line on stderr and a code."""
     try:
         return run()
-    except InputError as error:
+    except (InputError, FileNotFoundError, IsADirectoryError, NotADirectoryError) as error:  # a name that was given
         return _refuse(error, EXIT_INPUT)
     except BrokenPipeError:  # nobody reads the output any more, which is no matter of storage
         raise
-    except (StorageError, OSError) as error:
+    except OSError as error:
         return _refuse(error, EXIT_STORAGE)
     except CacheError as error:
         return _refuse(error, EXIT_MEMORY)
@@ -119,12 +114,6 @@ def guarded(run) -> int:
         raise
 
 
-def _refuse(message, code: int) -> int:
+def _refuse(message: object, code: int) -> int:
     print(f"ssplat: {' '.join(str(message).split())}", file=sys.stderr)
     return code
-
-
-if __name__ == "__main__":
-    from ssplat_jax.commands.start import start
-
-    start()

@@ -125,13 +125,12 @@ def online_changes(changes: tuple[str, ...], steps: int) -> tuple[str, ...]:
     return (*changes, f"stream.steps_per_chunk={steps}") if steps else changes
 
 
-def load_model(weights: str, changes: tuple[str, ...], defaults: tuple[str, ...] = ()):
+def load_model(weights: str, changes: tuple[str, ...]):
     """(model, params) of a preset's shipped weights, or of a weights file.
 
     Args:
         weights: name of a preset, or path of a weights file.
         changes: changes to the configuration, as "field=value".
-        defaults: changes that `changes` may replace.
 
     Raises:
         InputError: no such weights, a bad change, or a change that does not fit the weights.
@@ -146,7 +145,7 @@ def load_model(weights: str, changes: tuple[str, ...], defaults: tuple[str, ...]
         params, config = load_weights(Path(weights))
     else:
         params, config = load_params(weights), preset("tiny")
-    changed = apply_changes(apply_changes(config, defaults), changes)
+    changed = apply_changes(config, changes)
     if changed != config:
         check_params(params, changed, weights)
     return StreamSplat(changed), params

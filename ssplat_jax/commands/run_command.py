@@ -1,7 +1,6 @@
 """`ssplat run`: a capture streamed into a scene."""
 
 import dataclasses
-import json
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -48,9 +47,6 @@ class Run:
     size: str | None = None
     """Image size WxH; default the capture's own."""
     quality: QualityOption = "accurate"
-    budget_ms: float | None = None
-    """Time this machine, then choose the most accurate size and settings that take at most this many ms a view. Needs
-    the weights tiny and no --online-refine; --set is applied afterwards and changes the time."""
     weights: WeightsOption = "tiny"
     set: ConfigChanges = ()
     save_every: int = 8
@@ -115,8 +111,6 @@ class Run:
             raise InputError("--hold-back: wanted a capture that is complete; got --watch. Leave one out.")
         if self.port != Run.port and not self.view:
             raise InputError("--port: wanted --view beside it, which it is for; got none.")
-        if self.budget_ms is not None:
-            self._check_budget()
 
     def _run(self) -> int:
         """Streams, tells what came of it, and refines if that is wanted; returns the exit code."""
@@ -148,44 +142,20 @@ class Run:
             ).run()
         return 0
 
-    def _check_budget(self) -> None:
-        """Refuses options that contradict --budget-ms.
-
-        Raises:
-            InputError: naming the first of them.
-        """
-        for option, is_given in (
-            ("--quality", self.quality != "accurate"),
-            ("--weights", self.weights != "tiny"),
-            ("--watch", self.watch),
-            ("--online-refine", self.online_refine > 0),
-        ):
-            if is_given:
-                raise InputError(f"--budget-ms: wanted it without {option}, got both; leave one out.")
-
     def _stream(self) -> "RunResult":
         """Streams a capture that is complete."""
         from ssplat_jax.core.console import Reporter
         from ssplat_jax.runs.capture_run import run_capture
-        from ssplat_jax.runs.time_budget import setting_for_run
 
-        reporter, size, scale = Reporter(self.quiet), parse_size(self.size), QUALITIES[self.quality].scale
-        of_budget: tuple[str, ...] = ()
-        on_accept = None
-        if self.budget_ms is not None:
-            path = capture_path(self.capture, self.axes, self.poses)
-            choice = setting_for_run(self.budget_ms, path, size, self.out, overwrite=self.overwrite, reporter=reporter)
-            scale, on_accept = choice.point.factor, choice.save
-            of_budget = tuple(f"{name}={json.dumps(value)}" for name, value in choice.point.changes.items())
         changes = causal_changes(online_changes(self.set, self.online_refine), self.causal)
-        model, params = load_model(self.weights, changes, of_budget)
+        model, params = load_model(self.weights, changes)
         return run_capture(
             model,
             params,
             capture_path(self.capture, self.axes, self.poses),
             self.out,
-            size=size,
-            scale=scale,
+            size=parse_size(self.size),
+            scale=QUALITIES[self.quality].scale,
             stride=self.stride,
             max_views=self.max_views,
             save_every=self.save_every,
@@ -193,8 +163,7 @@ class Run:
             deltas=self.deltas or self.view,
             num_held_back=self.hold_back,
             revise=self.revise,
-            reporter=reporter,
-            on_accept=on_accept,
+            reporter=Reporter(self.quiet),
         )
 
     def _watch(self) -> "RunResult":

@@ -99,3 +99,7 @@ def _leave(code: int, message: str = "") -> NoReturn:
         shown = "\x1b[?25h" if os.isatty(2) else ""  # a progress bar may have hidden the cursor
         os.write(2, f"{shown}{message}".encode())
     os._exit(code)
+
+
+if __name__ == "__main__":
+    start()

@@ -1,7 +1,7 @@
 """`ssplat run`: streams a capture into a scene, and saves the stream every few chunks so that it can be continued."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from ssplat_jax.core.console import WAITING, Reporter
@@ -49,7 +49,6 @@ def run_capture(
     num_held_back: int = 0,
     revise: str | None = None,
     reporter: Reporter,
-    on_accept: Callable[[], None] | None = None,
 ) -> RunResult:
     """Streams a capture into a folder, continuing the run that the folder holds.
 
@@ -68,7 +67,6 @@ def run_capture(
         num_held_back: frames, evenly spread, that are not streamed but scored every few chunks.
         revise: `poses` or `auto` adjusts the poses before the stream, see `run_poses.capture_to_stream`.
         reporter: shows progress and warnings.
-        on_accept: called when nothing is left to refuse, before the first chunk.
 
     Raises:
         InputError: the capture is unusable or lies in `out`, fewer than two frames are to be streamed, too many frames
@@ -98,8 +96,6 @@ def run_capture(
         recorder = ChunkRecorder(capture, folder, held_back)
         identity = run_identity(model, params, capture, indices)
         run = resume_run(model, params, capture, identity, folder, reporter)
-        if on_accept is not None:
-            on_accept()
         forget_other_run(run, folder)
         reporter.warn_all(*capture.notes, run.frame.warning)
         writer = start_deltas(run, len(indices), folder, deltas)

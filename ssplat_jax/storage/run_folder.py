@@ -53,11 +53,6 @@ class RunFolder:
         return self.path / "metrics.json"
 
     @property
-    def budget(self) -> Path:
-        """The setting that `ssplat run --budget-ms` has chosen."""
-        return self.path / "budget.json"
-
-    @property
     def split(self) -> Path:
         """The context and target frames of an evaluation."""
         return self.path / "split.json"
@@ -140,7 +135,7 @@ class RunFolder:
 
     def clear_run(self) -> None:
         """Removes the run that the folder holds; files of the user stay."""
-        files = (self.state, previous_path(self.state), self.scene, self.metrics, self.adjusted_poses, self.budget)
+        files = (self.state, previous_path(self.state), self.scene, self.metrics, self.adjusted_poses)
         for stale in files:
             stale.unlink(missing_ok=True)
         self.clear_refinement()

@@ -22,7 +22,7 @@ from PIL import Image
 from ssplat_jax import __version__
 from ssplat_jax.commands import train_command
 from ssplat_jax.commands.main import COMMANDS, guarded, main
-from ssplat_jax.commands.options import apply_changes, causal_changes, load_model
+from ssplat_jax.commands.options import apply_changes, causal_changes
 from ssplat_jax.commands.start import start
 from ssplat_jax.config import StreamConfig, preset
 from ssplat_jax.core.errors import InputError
@@ -89,7 +89,7 @@ def test_help_does_not_import_jax_and_shows_an_example(command):
 @pytest.mark.slow
 def test_help_answers_within_a_second():
     since = time.perf_counter()
-    subprocess.run([sys.executable, "-m", "ssplat_jax.commands.main", "--help"], capture_output=True, check=True)
+    subprocess.run([sys.executable, "-m", "ssplat_jax.commands.start", "--help"], capture_output=True, check=True)
     assert time.perf_counter() - since < 1.0
 
 
@@ -172,15 +172,22 @@ def test_results_among_the_captures_own_images_are_refused(command, place, tmp_p
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
-        ((), "ssplat demo"),
+        ((), "Expected one of {demo"),
         (("rnu",), "run"),
-        (("--version", "run"), "--version: wanted nothing beside it, got 'run'"),
         (("run", "x", "--out", "y", "--szie", "3"), "--size"),
-        (("run", "x", "--out", "y", "--stride", "x"), "whole number"),
         (("run", "x", "--out", "y", "--quality", "superb"), "balanced"),
-        (("run",), "CAPTURE, --out PATH"),
-        (("run", "x", "y", "--out", "z"), "run: Unrecognized options: y"),
-        (("run", "x", "--out"), "--out"),
+        (("run",), "CAPTURE"),
+    ],
+)
+def test_usage_that_does_not_parse_is_short_and_exit_2(arguments, named, capsys):
+    assert run(*arguments) == 2
+    told = capsys.readouterr().err
+    assert named in told and len(told.splitlines()) < 14
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
         (("inspect", "no/such/folder"), "no/such/folder"),
         (("inspect", "procedural:room", "--size", "100000x100000"), "16384"),
         (("inspect", "procedural:room", "--size", "9000x9000"), "64,000,000"),
@@ -216,14 +223,13 @@ def test_results_among_the_captures_own_images_are_refused(command, place, tmp_p
         (("run", "x", "--out", "y", "--set", "a=1", "--revise", "poses", "--set", "b=2"), "wanted --set once, got it"),
         (("run", "procedural:room", "--causal", "--revise", "poses", "--out", "x"), "--revise poses: wanted a stream"),
         (("eval", "procedural:room?size=32x24", "--causal", "--revise", "auto", "--out", "x"), "--revise auto: wanted"),
-        (("run", "x", "--budget-ms", "9", "--online-refine", "5", "--out", "x"), "wanted it without --online-refine"),
         (("train", "--seed", "-1", "--out", "x"), "--seed: wanted a number from 0"),
         (("train", "--seed", str(2**63), "--out", "x"), "--seed: wanted a number from 0"),
         (("train", "--scale-steps", "inf", "--out", "x"), "--scale-steps: wanted a finite number above 0"),
         (("poses", ".", "--frames", "20", "--out", "x"), "--frames: wanted a video"),
     ],
 )
-def test_bad_usage_is_one_line_and_exit_2(arguments, named, capsys, tmp_path, monkeypatch):
+def test_bad_values_are_one_line_and_exit_2(arguments, named, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert run(*arguments) == 2
     lines = [line for line in capsys.readouterr().err.splitlines() if line.strip()]
@@ -314,11 +320,6 @@ def test_two_values_of_one_field_are_refused():
     with pytest.raises(InputError, match=r"one value of stream\.causal"):  # --causal beside --set
         apply_changes(preset("tiny"), causal_changes(("causal=false",), causal=True))
     assert apply_changes(preset("tiny"), ("causal=true", "stream.causal=true")).stream.causal
-
-
-def test_set_replaces_what_a_budget_chose():
-    model, _ = load_model("tiny", ("voxel_size=0.02",), ("memory.voxel_size=0.05", "min_confidence=0.4"))
-    assert (model.config.memory.voxel_size, model.config.memory.min_confidence) == (0.02, 0.4)
 
 
 def test_a_folder_of_captures_that_is_none_is_refused(tmp_path, capsys):

@@ -58,7 +58,7 @@ def test_a_run_with_kept_programs_writes_the_same_bytes(tmp_path):
     compile_seconds, written = [], []
     for number, where in enumerate(("off", tmp_path / "programs", tmp_path / "programs")):
         out = tmp_path / f"run{number}"
-        command = [sys.executable, "-m", "ssplat_jax.commands.main", "run", "procedural:room?frames=16&size=96x64"]
+        command = [sys.executable, "-m", "ssplat_jax.commands.start", "run", "procedural:room?frames=16&size=96x64"]
         done = subprocess.run(
             [*command, "--out", str(out), "--quiet"], capture_output=True, text=True, env=plain_environment(where)
         )

@@ -10,7 +10,7 @@ from ssplat_experiments.ablation import BUDGETS as ABLATION_BUDGETS
 from ssplat_experiments.ablation import VARIANTS, add_differences, config_of, findings, learned_from, scenes_of
 from ssplat_experiments.ablation import cases as ablation_cases
 from ssplat_experiments.accuracy_vs_time import cases as settings_cases
-from ssplat_experiments.accuracy_vs_time import front_file, mark_front
+from ssplat_experiments.accuracy_vs_time import mark_front
 from ssplat_experiments.depth_error import cell_depths, summary
 from ssplat_experiments.settings import REFINED, SETTINGS
 
@@ -61,26 +61,6 @@ def test_the_second_axis_has_thirty_points_at_sizes_that_are_measured_without_st
     names = [case.name for case in settings_cases(None, "cpu")]
     assert len(set(names)) == len(names) == len(SETTINGS) + 6
     assert not any("refined" in case.name for case in settings_cases(None, "smoke"))
-
-
-def test_the_front_file_holds_means_in_reference_steps():
-    origin = {"machine": "m", "date": "d", "commit": "c"}
-    measured = [
-        ("room", "preset", 200.0, 20.0, 10.0), ("kitchen", "preset", 300.0, 10.0, 12.0),
-        ("room", "size x 0.5", 100.0, 19.0, 10.0), ("kitchen", "size x 0.5", 100.0, 9.0, 10.0),
-        ("room", "size x 0.75", 50.0, 30.0, 10.0),  # measured on one scene alone
-        ("room", "100 steps", 900.0, 40.0, 10.0), ("kitchen", "100 steps", 900.0, 40.0, 10.0),  # not within a chunk
-    ]  # fmt: skip
-    rows = [
-        {"scene": s, "setting": n, "ms_per_view": ms, "shown": psnr, "reference_ms": ref} | origin
-        for s, n, ms, psnr, ref in measured
-    ]
-    held = front_file(rows, "cpu")["front.json"]
-    assert [(p["setting"], p["steps_per_view"], p["shown"]) for p in held["points"]] == [
-        ("size x 0.5", 10.0, 14.0),
-        ("preset", 22.5, 15.0),
-    ]
-    assert held["points"][0]["factor"] == 0.5 and held["machine"] == "m"
 
 
 def test_depth_errors_ignore_scale_and_are_binned():
