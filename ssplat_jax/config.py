@@ -43,7 +43,7 @@ class StreamingConfig(ConfigGroup):
     """Stores colors at the exposure of the first views and estimates the exposures of the others (ours)."""
     causal: bool = False
     """Nothing depends on later frames: near, far and scale come from the first chunk, frames keep their order, and
-    later chunks only move near and far outward (`streaming/causal_range.py`)."""
+    later chunks only move near and far outward (`streaming/live_views.py`)."""
     steps_per_chunk: int = 0
     """Gradient steps of refinement after each chunk, each on one key view (ours); 0 adds nothing to any program."""
 

@@ -12,7 +12,7 @@ from jaxtyping import Float, Float64
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.console import Reporter
 from ssplat_jax.core.errors import InputError, require_positive
-from ssplat_jax.core.gaussians import mean_color
+from ssplat_jax.core.gaussians import mean_color, scale_colors
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.evaluation.pictures import save_image
 from ssplat_jax.rasterizer import Effects, fill_holes, render
@@ -21,9 +21,8 @@ from ssplat_jax.runs.run_poses import open_capture_of_scene
 from ssplat_jax.scene_files.formats import read_scene
 from ssplat_jax.scene_files.splat_file import SplatFile
 from ssplat_jax.storage.folder_lock import lock_folder
-from ssplat_jax.storage.run_folder import RunFolder
+from ssplat_jax.storage.run_folder import RunFolder, scene_exposure
 from ssplat_jax.storage.video import VideoWriter
-from ssplat_jax.streaming.scene_exposure import at_first_exposure, scene_exposure
 
 ANTIALIAS = {"mip": "mip", "default": "classic"}
 """Antialiasing filter for each render mode that a scene file may name."""
@@ -77,7 +76,8 @@ def render_scene(
         film.check()
     splats = _read_scene(scene)
     if one_exposure:
-        gaussians = at_first_exposure(splats.gaussians, scene_exposure(scene))
+        factors = jnp.asarray(1.0 / scene_exposure(scene), jnp.float32)  # as the literal scores show the scene
+        gaussians = scale_colors(splats.gaussians, factors)
         splats = dataclasses.replace(splats, gaussians=gaussians)
     capture, folder = open_capture_of_scene(scene, path, size, reporter), RunFolder(out)
     capture.check_output_folder(out)

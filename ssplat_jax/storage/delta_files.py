@@ -21,9 +21,8 @@ def save_delta(path: Path, delta: SceneDelta, header: dict[str, Any] | None = No
         StorageError: the file cannot be written.
     """
     arrays = {field.name: np.asarray(getattr(delta.gaussians, field.name)) for field in dataclasses.fields(Gaussians)}
-    if delta.confidences is not None:
-        arrays["confidences"] = delta.confidences
-    save_arrays(path, arrays | {"rows": delta.rows}, KIND, {"capacity": delta.capacity, "caller": header or {}})
+    arrays |= {"rows": delta.rows, "confidences": delta.confidences}
+    save_arrays(path, arrays, KIND, {"capacity": delta.capacity, "caller": header or {}})
 
 
 def load_delta(path: Path) -> SceneDelta:
@@ -33,7 +32,7 @@ def load_delta(path: Path) -> SceneDelta:
         StorageError: the file is missing, of another kind, or damaged.
     """
     arrays, facts = load_arrays(path, KIND)
-    rows, confidences = arrays.pop("rows"), arrays.pop("confidences", None)  # earlier versions wrote no confidences
+    rows, confidences = arrays.pop("rows"), arrays.pop("confidences")
     gaussians = Gaussians(**{name: jnp.asarray(x) for name, x in arrays.items()})
     return SceneDelta(rows, gaussians, facts["capacity"], confidences)
 

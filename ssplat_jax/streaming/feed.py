@@ -13,7 +13,7 @@ from ssplat_jax.core.pytree import replace
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.model.streamsplat import ChunkOutput
-from ssplat_jax.streaming.causal_range import widen_range
+from ssplat_jax.streaming.live_views import widen_range
 from ssplat_jax.streaming.session import Session
 
 Exposures = dict[int, Float[np.ndarray, "3"]]
@@ -51,7 +51,7 @@ class FedChunk:
 def feed_chunks(session: Session, capture: Capture, order: Sequence[int], frame: StreamFrame) -> Iterator[FedChunk]:
     """Feeds frames of a capture to a session and yields after each chunk.
 
-    With `causal`, near and far of a chunk follow from the chunks before it (`streaming.causal_range`).
+    With `causal`, near and far of a chunk follow from the chunks before it (`streaming.live_views`).
 
     Args:
         session: the stream; its cache grows in place.

@@ -36,7 +36,7 @@ class SceneDelta:
     rows: Int32[np.ndarray, " r"]  # ascending
     gaussians: Gaussians  # [r * k], in the order of `rows`; k = pivots_per_voxel * gaussians_per_token
     capacity: int  # capacity of the cache: the scene has capacity * k Gaussians
-    confidences: Float32[np.ndarray, " n"] | None = None
+    confidences: Float32[np.ndarray, " n"]
     """Omega of the pivots behind `gaussians`, in their order. Without evidence, a change of it alone is no change of a
     row."""
 
@@ -79,14 +79,13 @@ class SceneFeed:
         num_padded = max(MIN_DECODED_ROWS, 1 << max(len(rows) - 1, 0).bit_length())
         padded = np.pad(rows, (0, num_padded - len(rows)), constant_values=-1)
         gaussians = self._decode_rows(self._params, cache, jnp.asarray(padded))
-        num_gaussians = gaussians.num_gaussians // num_padded * len(rows)
-        confidences = np.asarray(cache.confidences, np.float32)[rows].reshape(-1)
-        repeats = num_gaussians // max(confidences.size, 1)
+        per_row = gaussians.num_gaussians // num_padded
+        confidences = np.asarray(cache.confidences, np.float32)[rows]
         delta = SceneDelta(
-            rows,
-            jax.tree.map(lambda x: x[:num_gaussians], gaussians),
-            cache.capacity,
-            np.repeat(confidences, repeats),
+            rows=rows,
+            gaussians=jax.tree.map(lambda x: x[: per_row * len(rows)], gaussians),
+            capacity=cache.capacity,
+            confidences=np.repeat(confidences.reshape(-1), per_row // confidences.shape[1]),
         )
         jax.block_until_ready(delta.gaussians)
         self._record = record  # last: after an error or an interrupt the changes are found again
@@ -106,43 +105,28 @@ class SceneFeed:
         return rows, _Record(int(cache.stats.num_chunks), shown, seen)
 
 
-def apply_confidences(known: Float32[np.ndarray, " m"] | None, delta: SceneDelta) -> Float32[np.ndarray, " m"] | None:
-    """`known` confidences with those of `delta`, one for each Gaussian of `apply_delta`; absent Gaussians have 0.
-
-    None where a delta has none: earlier versions wrote none.
-    """
-    if delta.confidences is None or (num_rows := len(delta.rows)) == 0:
-        return known
-    k = len(delta.confidences) // num_rows
-    merged = np.zeros(max(delta.capacity * k, 0 if known is None else len(known)), np.float32)
-    if known is not None:
-        merged[: len(known)] = known
-    merged[(delta.rows[:, None] * k + np.arange(k)).reshape(-1)] = delta.confidences
-    return merged
-
-
 def apply_delta(scene: Gaussians | None, delta: SceneDelta) -> Gaussians:
     """`scene` with the changes of `delta`: row for row what `decode` gives, once a delta was not empty.
 
     `scene` is None before the first delta.
     """
-    num_rows = len(delta.rows)
-    k = delta.gaussians.num_gaussians // num_rows if num_rows else 1
-    places = (delta.rows[:, None] * k + np.arange(k)).reshape(-1)
-    if scene is None:
-        scene = _absent(delta.gaussians, 0)
-    missing = max(delta.capacity * k - scene.num_gaussians, 0) if num_rows else 0
-    grown = jax.tree.map(lambda a, b: np.concatenate([a, b]), scene, _absent(delta.gaussians, missing))
-    return jax.tree.map(lambda x, new: _with_rows(x, places, new), grown, delta.gaussians)
+    scene = jax.tree.map(lambda x: x[:0], delta.gaussians) if scene is None else scene
+    one = jax.tree.map(lambda x: jnp.zeros((1, *x.shape[1:]), x.dtype), delta.gaussians)
+    absent = mask_gaussians(one, jnp.zeros((1,), bool))  # as `decode` writes it
+    return jax.tree.map(lambda x, new, empty: _with_rows(x, delta, new, empty), scene, delta.gaussians, absent)
 
 
-def _absent(like: Gaussians, num_rows: int) -> Gaussians:
-    """`num_rows` absent Gaussians (opacity 0), as `decode` writes them."""
-    empty = jax.tree.map(lambda x: jnp.zeros((num_rows, *x.shape[1:]), x.dtype), like)
-    return jax.tree.map(np.asarray, mask_gaussians(empty, jnp.zeros((num_rows,), bool)))
+def apply_confidences(known: Float32[np.ndarray, " m"] | None, delta: SceneDelta) -> Float32[np.ndarray, " m"]:
+    """`known` confidences with those of `delta`, one for each Gaussian of `apply_delta`; absent Gaussians have 0."""
+    return _with_rows(delta.confidences[:0] if known is None else known, delta, delta.confidences, np.zeros(1))
 
 
-def _with_rows(x: np.ndarray, rows: np.ndarray, values) -> np.ndarray:
-    x = np.array(x)
-    x[rows] = np.asarray(values)
-    return x
+def _with_rows(known, delta: SceneDelta, values, absent) -> np.ndarray:
+    """`known`, filled up with `absent` to the capacity of `delta`, with `values` in the delta's rows."""
+    if not len(delta.rows):
+        return np.asarray(known)
+    per_row = len(values) // len(delta.rows)
+    merged = np.repeat(np.asarray(absent, values.dtype), max(delta.capacity * per_row, len(known)), axis=0)
+    merged[: len(known)] = known
+    merged.reshape(-1, per_row, *merged.shape[1:])[delta.rows] = values.reshape(-1, per_row, *merged.shape[1:])
+    return merged

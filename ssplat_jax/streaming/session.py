@@ -38,7 +38,7 @@ class Session:
         cache: the cache to continue from; by default an empty one with capacity for a few chunks.
         causal: the model's configuration with `stream.causal`: no result depends on a later frame.
         frame: stream frame of `cache`, for `push`; by default that of the first chunk that is pushed.
-        revise: what refines the scene after each chunk, as `steps_per_chunk` asks
+        revise: what refines the scene after each chunk, as `stream.steps_per_chunk` asks
             (`ssplat_jax.refinement.online_refinement`); None where it asks for nothing.
     """
 
@@ -56,70 +56,30 @@ class Session:
             model = dataclasses.replace(model, config=model.config.replace(causal=True))
         self.model, self.params, self.cache = model, params, cache
         self._live, self._revise = LiveViews(model.config, frame), revise
-        self.compile_seconds = 0.0
-        self.num_compilations = 0
+        self.compile_seconds, self.num_compilations = 0.0, 0
+        # Programs by what they compute and the shapes that they are compiled for; those of the last chunk.
         self._programs: dict[tuple, jax.stages.Compiled] = {}
-        self._decode_programs: dict[tuple, jax.stages.Compiled] = {}
+        self._step: jax.stages.Compiled | None = None
+        self._refine: jax.stages.Compiled | None = None
         self._count_shown = jax.jit(lambda cache: jnp.sum(shown_pivots(cache, model.config), dtype=jnp.int32))
-        self._decode_shown = jax.jit(model.decode_shown, static_argnums=2)
-        self._last_program: jax.stages.Compiled | None = None  # the step that ran last
-        self._refine_program: jax.stages.Compiled | None = None
 
     def feed(self, chunk: Chunk) -> ChunkOutput:
         """Streams one chunk into the cache and waits until it is done.
 
-        After an interrupt the cache is that of before, or holds the chunk already.
+        If interrupted, the cache is either unchanged or fully updated.
 
         Raises:
             CacheError: tokens were dropped although the overflow policy forbids it.
             InputError: the configuration asks for refinement and `revise` is not given, or the reverse; or the chunk
                 cannot be streamed, see `StreamSplat.step`.
         """
-        return self._stream(chunk)
-
-    def _stream(self, chunk: Chunk, is_live: bool = False) -> ChunkOutput:
-        """Streams a chunk; the views of a live one are dropped once it is on its way."""
-        config, num_tokens = self.model.config, tokens_per_chunk(chunk, self.model.config.network.size_multiple)
-        if self.cache is None:
-            self.cache = init_cache(config, starting_capacity(config, num_tokens))
-        self.cache = ensure_capacity(self.cache, config, num_tokens)
-        self.cache = self._with_key_views(self.cache, chunk)
-        step, refine = self._program("step", self.model.step, chunk), self._refinement_for(chunk)
-        # Nothing waits before all is on its way. A program takes the old cache when it starts, so the new one is kept
-        # at once: an interrupt of the wait costs nothing.
-        self._last_program, self._refine_program = step, refine
-        self.cache, out = step(self.params, self.cache, chunk)
-        if is_live:
-            self._live.drop(out)
-        if refine is not None:
-            self.cache = refine(self.params, self.cache, chunk, out)
-        check_cache(jax.block_until_ready(self.cache), config)
-        return jax.block_until_ready(out)
-
-    def _refinement_for(self, chunk: Chunk) -> jax.stages.Compiled | None:
-        """The compiled refinement after a chunk, or None; compiled before the step runs, as an interrupt may come."""
-        assert self.cache is not None
-        if self._revise is None:
-            return None
-        if (program := self._programs.get(self._key("refine", chunk))) is not None:
-            return program
-        _, out = jax.eval_shape(self.model.step, self.params, self.cache, chunk)
-        return self._program("refine", self._revise, chunk, out)
-
-    def _with_key_views(self, cache: VoxelCache, chunk: Chunk) -> VoxelCache:
-        """`cache` with what refinement keeps in it, which a cache from before has not yet."""
-        config = self.model.config
-        if bool(config.stream.steps_per_chunk) != (self._revise is not None):
-            wanted = "Session(..., revise=online_refinement(model)) with stream.steps_per_chunk above 0, or neither"
-            got = f"steps_per_chunk={config.stream.steps_per_chunk} and revise={self._revise}"
-            raise refusal("Session", wanted=wanted, got=got, fix="call online_refinement with the session's model")
-        return cache if self._revise is None else with_refinement(cache, config, *chunk.images.shape[1:3])
+        return self._stream(chunk, is_live=False)
 
     def push(self, image: object, K: object, viewmat: object) -> ChunkOutput | None:
         """Takes one view of a live source, and streams a chunk when enough views have come.
 
         Near, far and scale come from the first chunk, as with `causal`; `frame` then holds them. A later chunk that
-        contradicts near or far moves them outward for the chunks after it (`streaming.causal_range`).
+        contradicts near or far moves them outward for the chunks after it (`streaming.live_views`).
 
         Args:
             image: RGB, height x width x 3, as float in [0, 1] or as uint8.
@@ -136,25 +96,58 @@ class Session:
         if self.cache is not None and self.frame is None:
             fix = "give Session(..., frame=StreamFrame) too, or push all views"
             raise refusal("push", wanted="the stream frame of the cache that is continued", got="none", fix=fix)
-        return self._feed_live(self._live.add(image, K, viewmat))
+        chunk = self._live.add(image, K, viewmat)
+        return None if chunk is None else self._stream(chunk, is_live=True)
 
     def flush(self) -> ChunkOutput | None:
         """Streams the views that wait for their chunk, however few, padded with invalid ones; None if none wait.
 
         More than a chunk waits if an error or an interrupt came before an earlier one was made; the summary is that of
-        the last chunk.
-
-        A view alone has no partner to match: its depth rests on the history. Views may be pushed afterwards.
+        the last chunk. A single view cannot be matched; its depth comes from the cache alone. Views may be pushed
+        afterwards.
         """
         output = None
         while (chunk := self._live.rest()) is not None:
-            output = self._feed_live(chunk)
+            output = self._stream(chunk, is_live=True)
         return output
 
-    def _feed_live(self, chunk: Chunk | None) -> ChunkOutput | None:
-        if chunk is None:
-            return None
-        return self._stream(chunk, is_live=True)
+    def _stream(self, chunk: Chunk, *, is_live: bool) -> ChunkOutput:
+        """Streams a chunk; the views of a live one no longer wait once it is on its way."""
+        config, num_tokens = self.model.config, tokens_per_chunk(chunk, self.model.config.network.size_multiple)
+        cache = init_cache(config, starting_capacity(config, num_tokens)) if self.cache is None else self.cache
+        cache = ensure_capacity(cache, config, num_tokens)
+        if bool(config.stream.steps_per_chunk) != (self._revise is not None):
+            wanted = "Session(..., revise=online_refinement(model)) with stream.steps_per_chunk above 0, or neither"
+            got = f"steps_per_chunk={config.stream.steps_per_chunk} and revise={self._revise}"
+            raise refusal("Session", wanted=wanted, got=got, fix="call online_refinement with the session's model")
+        if self._revise is not None:  # adds the key-view buffers if the cache lacks them
+            cache = with_refinement(cache, config, *chunk.images.shape[1:3])
+        self.cache = cache
+        step, refine = self._program("step", self.model.step, cache, chunk), None
+        if self._revise is not None:
+            summary = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), step.out_info[1])
+            refine = self._program("refine", self._revise, cache, chunk, summary)
+        # Dispatch every program before blocking on a result. A program takes the old cache when it starts, so the new
+        # one is kept at once: an interrupt of the wait costs nothing.
+        self._step, self._refine = step, refine
+        self.cache, out = step(self.params, cache, chunk)
+        if is_live:
+            self._live.drop(out)
+        if refine is not None:
+            self.cache = refine(self.params, self.cache, chunk, out)
+        check_cache(jax.block_until_ready(self.cache), config)
+        return jax.block_until_ready(out)
+
+    def _program(self, name: str, function: Callable, cache: VoxelCache, chunk: Chunk, *more) -> jax.stages.Compiled:
+        """`function` compiled for the shapes of `cache`, which it consumes, and of `chunk`."""
+        key = (name, cache.capacity, chunk.images.shape)
+        if key not in self._programs:
+            since = time.perf_counter()
+            jitted = jax.jit(function, donate_argnums=1)
+            self._programs[key] = jitted.lower(self.params, cache, chunk, *more).compile()
+            self.compile_seconds += time.perf_counter() - since
+            self.num_compilations += 1
+        return self._programs[key]
 
     @property
     def frame(self) -> StreamFrame | None:
@@ -162,45 +155,42 @@ class Session:
         return self._live.frame
 
     def gaussians(self) -> Gaussians:
-        """The scene so far, in the stream frame: the Gaussians of `model.decode`, then padding rows of opacity 0.
-
-        Only shown pivots are decoded, because a cache has capacity for many more than it holds. Their number is rounded
-        up to a power of two, so that few programs are compiled.
-        """
-        params, cache, _ = self._decode_arguments()
-        return self.decode_program()(params, cache)
-
-    def _decode_arguments(self) -> tuple[dict, VoxelCache, int]:
-        """Parameters, cache and number of pivots to decode."""
-        # Before the first chunk the cache stays unset: `push` tells by it whether a stream is continued.
-        cache = self.model.init_cache() if self.cache is None else self.cache
-        num_shown = int(self._count_shown(cache))
-        num_pivots = min(max(MIN_DECODED_PIVOTS, 1 << max(num_shown - 1, 0).bit_length()), cache.alive.size)
-        return self.params, cache, num_pivots
+        """The scene so far, in the stream frame: the Gaussians of `model.decode`, then padding rows of opacity 0."""
+        return self.decode_program()(self.params, self._present_cache())
 
     def decode_program(self) -> jax.stages.Compiled:
-        """The compiled program of `gaussians` for the present cache."""
-        params, cache, num_pivots = self._decode_arguments()
+        """The compiled program of `gaussians` for the present cache.
+
+        Only shown pivots are decoded, because a cache has capacity for many more than it holds. Their number is rounded
+        up to a power of two, so that a growing scene rarely compiles.
+        """
+        cache = self._present_cache()
+        num_shown = int(self._count_shown(cache))
+        num_pivots = min(max(MIN_DECODED_PIVOTS, 1 << max(num_shown - 1, 0).bit_length()), cache.alive.size)
         leaves, structure = jax.tree.flatten(cache)
-        key = (num_pivots, structure, *((leaf.shape, leaf.dtype) for leaf in leaves))
-        if key not in self._decode_programs:
-            self._decode_programs[key] = self._decode_shown.lower(params, cache, num_pivots).compile()
-        return self._decode_programs[key]
+        key = ("decode", num_pivots, structure, *((leaf.shape, leaf.dtype) for leaf in leaves))
+        if key not in self._programs:
+            decode = jax.jit(self.model.decode_shown, static_argnums=2)
+            self._programs[key] = decode.lower(self.params, cache, num_pivots).compile()
+        return self._programs[key]
+
+    def _present_cache(self) -> VoxelCache:
+        """The cache, or an empty one before the first chunk: `push` tells by an unset cache that nothing came yet."""
+        return self.model.init_cache() if self.cache is None else self.cache
 
     @property
     def step_memory_bytes(self) -> int | None:
         """Memory of the compiled step, by XLA's analysis: arguments, results and temporaries; None if unknown."""
-        return _memory_bytes(self._last_program)
+        return _memory_bytes(self._step)
 
     @property
     def refine_memory_bytes(self) -> int | None:
         """Memory of the compiled refinement of a chunk, as `step_memory_bytes`; None without refinement."""
-        return _memory_bytes(self._refine_program)
+        return _memory_bytes(self._refine)
 
     def cache_facts(self) -> dict[str, int | float]:
         """Occupancy and counters of the cache; `decoded` is the number of Gaussians that are shown."""
-        cache, config = self.cache, self.model.config
-        assert cache is not None
+        cache, config = self._present_cache(), self.model.config
         stats = {field.name: int(getattr(cache.stats, field.name)) for field in dataclasses.fields(cache.stats)}
         return {
             "voxels": int(cache.num_voxels),
@@ -212,34 +202,12 @@ class Session:
             **stats,
         }
 
-    def _key(self, name: str, chunk: Chunk) -> tuple:
-        """Key of a program: what it computes, and the shapes that it is compiled for."""
-        assert self.cache is not None
-        return (name, self.cache.capacity, chunk.images.shape)
-
-    def _program(self, name: str, function: Callable, chunk: Chunk, *more: ChunkOutput) -> jax.stages.Compiled:
-        """`function` compiled for the shapes of `chunk` and the cache, which it consumes."""
-        assert self.cache is not None
-        key = self._key(name, chunk)
-        if key not in self._programs:
-            since = time.perf_counter()
-            arguments = (self.params, self.cache, chunk, *more)
-            self._programs[key] = jax.jit(function, donate_argnums=1).lower(*arguments).compile()
-            self.compile_seconds += time.perf_counter() - since
-            self.num_compilations += 1
-        return self._programs[key]
-
 
 def _memory_bytes(program: jax.stages.Compiled | None) -> int | None:
-    """Memory of a program by XLA's analysis: arguments, results and temporaries."""
     if program is None or (memory := program.memory_analysis()) is None:
         return None
-    return (
-        memory.argument_size_in_bytes
-        + memory.output_size_in_bytes
-        + memory.temp_size_in_bytes
-        - memory.alias_size_in_bytes
-    )
+    held = memory.argument_size_in_bytes + memory.output_size_in_bytes + memory.temp_size_in_bytes
+    return held - memory.alias_size_in_bytes  # a donated cache is counted once
 
 
 def tokens_per_chunk(chunk: Chunk, size_multiple: int) -> int:

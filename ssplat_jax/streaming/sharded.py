@@ -12,7 +12,6 @@ all shards of a stream; the other counters add up.
 """
 
 import dataclasses
-import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -97,31 +96,29 @@ class ShardedStream:
         def create() -> VoxelCache:
             return jax.tree.map(lambda x: jnp.broadcast_to(x, (num_streams, shards, *x.shape)), self.model.init_cache())
 
-        return jax.jit(create, out_shardings=NamedSharding(self._devices, self._cache_spec))()
+        return jax.jit(create, out_shardings=NamedSharding(_auto(self.mesh), self._cache_spec))()
 
     def step(self, params: dict, caches: VoxelCache, chunks: Chunk) -> tuple[VoxelCache, ChunkOutput]:
         """`StreamSplat.step` for one chunk of every stream (leading axis); the caches come first, as a scan's carry."""
         model = dataclasses.replace(self.model, axis=self.voxels)
 
-        def step_stream(params: dict, cache: VoxelCache, chunk: Chunk) -> tuple[VoxelCache, ChunkOutput]:
+        def step_stream(params: dict, shard: VoxelCache, chunk: Chunk) -> tuple[VoxelCache, ChunkOutput]:
+            cache = _without_axis(shard)
             prediction = model.predict(params, cache, chunk)
             tokens, output = _from_first_shard((prediction.tokens, prediction.output), self.voxels)
-            return model.update_cache(cache, replace(prediction, tokens=tokens, output=output)), output
+            return _with_axis(model.update_cache(cache, replace(prediction, tokens=tokens, output=output))), output
 
-        def step_device(params, caches, chunks):
-            caches, output = jax.lax.map(lambda x: step_stream(params, *x), (_drop_shard_axis(caches), chunks))
-            return _add_shard_axis(caches), output
+        def step_device(params, shards, chunks):
+            return jax.lax.map(lambda x: step_stream(params, *x), (shards, chunks))
 
-        on_devices = self._map(
-            step_device, (P(), self._cache_spec, P(self.streams)), (self._cache_spec, P(self.streams))
-        )
-        return on_devices(params, caches, chunks)
+        given, results = (P(), self._cache_spec, P(self.streams)), (self._cache_spec, P(self.streams))
+        return self._map(step_device, given, results)(params, caches, chunks)
 
     def decode(self, params: dict, caches: VoxelCache) -> Gaussians:
         """The scenes so far, as `StreamSplat.decode`: `[streams, shards * capacity * k]`, shard after shard."""
 
-        def decode_device(params, caches):
-            return jax.lax.map(functools.partial(self.model.decode, params), _drop_shard_axis(caches))
+        def decode_device(params, shards):
+            return jax.lax.map(lambda shard: self.model.decode(params, _without_axis(shard)), shards)
 
         return self._map(decode_device, (P(), self._cache_spec), self._cache_spec)(params, caches)
 
@@ -134,9 +131,8 @@ class ShardedStream:
         if wanted == capacity:
             return caches
 
-        def grow_device(caches):
-            grown = jax.lax.map(functools.partial(grow, capacity=wanted), _drop_shard_axis(caches))
-            return _add_shard_axis(grown)
+        def grow_device(shards):
+            return jax.lax.map(lambda shard: _with_axis(grow(_without_axis(shard), wanted)), shards)
 
         return jax.jit(self._map(grow_device, (self._cache_spec,), self._cache_spec))(caches)
 
@@ -147,11 +143,6 @@ class ShardedStream:
             CacheError: tokens were dropped under `overflow="grow"`.
         """
         check_dropped(int(jnp.sum(caches.stats.num_dropped)), caches.voxels.shape[2], self.model.config)
-
-    @property
-    def _devices(self) -> Mesh:
-        """The mesh without the explicit axes of `jax.make_mesh`, which would require arguments already placed."""
-        return Mesh(self.mesh.devices, self.mesh.axis_names)
 
     @property
     def _cache_spec(self) -> P:
@@ -165,17 +156,21 @@ class ShardedStream:
     def _map(self, function: Callable, in_specs: PyTree, out_specs: PyTree) -> Callable[..., Any]:
         """`function`, written for the part on one device, mapped over all devices."""
         # check_vma is off because it takes the constants from which the cache's loops start to be replicated.
-        return jax.shard_map(function, mesh=self._devices, in_specs=in_specs, out_specs=out_specs, check_vma=False)
+        return jax.shard_map(function, mesh=_auto(self.mesh), in_specs=in_specs, out_specs=out_specs, check_vma=False)
 
 
-def _drop_shard_axis(caches: VoxelCache) -> VoxelCache:
-    """A device's caches `[streams, ...]` from its block `[streams, 1, ...]`."""
-    return jax.tree.map(lambda x: x[:, 0], caches)
+def _auto(mesh: Mesh) -> Mesh:
+    """`mesh` without the explicit axes of `jax.make_mesh`, which would require arguments already placed."""
+    return Mesh(mesh.devices, mesh.axis_names)
 
 
-def _add_shard_axis(caches: VoxelCache) -> VoxelCache:
-    """A device's block `[streams, 1, ...]` from its caches; the inverse of `_drop_shard_axis`."""
-    return jax.tree.map(lambda x: x[:, None], caches)
+def _without_axis(shard: VoxelCache) -> VoxelCache:
+    """The cache of a stream on one device, from its block `[1, ...]` of the shards."""
+    return jax.tree.map(lambda x: x[0], shard)
+
+
+def _with_axis(cache: VoxelCache) -> VoxelCache:
+    return jax.tree.map(lambda x: x[None], cache)
 
 
 def _from_first_shard(tree: PyTree, axis: str) -> PyTree:

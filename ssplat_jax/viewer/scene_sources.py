@@ -14,9 +14,8 @@ from ssplat_jax.core.gaussians import Gaussians, scale_colors
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.scene_files.formats import read_scene
 from ssplat_jax.storage.delta_files import load_delta, load_delta_header
-from ssplat_jax.storage.run_folder import RunFolder
+from ssplat_jax.storage.run_folder import RunFolder, scene_exposure
 from ssplat_jax.streaming.scene_delta import apply_confidences, apply_delta
-from ssplat_jax.streaming.scene_exposure import at_first_exposure, scene_exposure
 from ssplat_jax.viewer.recorded_run import RecordedRun
 from ssplat_jax.viewer.start_camera import StartCamera, first_camera, turned_to
 from ssplat_jax.viewer.viewed_scene import ViewedScene
@@ -64,7 +63,7 @@ class SceneFile:
         self._stamp = stamp
         gaussians, exposure = file.gaussians, np.ones(3)
         if self._one_exposure:
-            gaussians = at_first_exposure(gaussians, scene_exposure(self.path))
+            gaussians = scale_colors(gaussians, jnp.asarray(1.0 / scene_exposure(self.path), jnp.float32))
         else:
             with contextlib.suppress(InputError):  # of no run: the exposures of views are not known either
                 exposure = scene_exposure(self.path)

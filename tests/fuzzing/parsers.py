@@ -17,11 +17,11 @@ from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.scene_files.formats import FORMATS, save_gaussians
 from ssplat_jax.storage.delta_files import load_delta, save_delta
 from ssplat_jax.storage.npz import _DIGEST_LENGTH, _hex_digest
+from ssplat_jax.storage.run_folder import scene_exposure
 from ssplat_jax.storage.stream_state import load_state, save_state
 from ssplat_jax.storage.torch_files import read_arrays
 from ssplat_jax.storage.weights import load_weights, save_weights
 from ssplat_jax.streaming.scene_delta import SceneDelta
-from ssplat_jax.streaming.scene_exposure import scene_exposure
 from tests.badinputs.cases import make_capture
 from tests.data.capture_writers import WRITERS
 from tests.data.test_reader_refusals import FILES as CAPTURE_FILES
@@ -93,7 +93,8 @@ def write_state(root: Path) -> Path:
 
 
 def write_delta(root: Path) -> Path:
-    save_delta(root / "000004.npz", SceneDelta(np.arange(12, dtype=np.int32), scene(0, n=12), 128))
+    confidences = np.full(12, 0.5, np.float32)
+    save_delta(root / "000004.npz", SceneDelta(np.arange(12, dtype=np.int32), scene(0, n=12), 128, confidences))
     return root / "000004.npz"
 
 

@@ -13,8 +13,8 @@ from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.images import ArrayPixels
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.model.streamsplat import ChunkOutput, StreamSplat
-from ssplat_jax.streaming.causal_range import STEP, widen_range
 from ssplat_jax.streaming.feed import feed_chunks
+from ssplat_jax.streaming.live_views import STEP, widen_range
 from ssplat_jax.streaming.session import Session
 from tests.streaming.narrow_model import NARROW, assert_same_bits
 
@@ -215,7 +215,7 @@ def test_an_interrupted_push_loses_no_view(capture, params, monkeypatch):
 @pytest.mark.parametrize("place", ["compiling", "waiting"])
 def test_an_interrupt_of_a_step_loses_nothing(place, capture, params, monkeypatch):
     """While a step compiles, its views wait on; while it runs, the session keeps what it will return."""
-    monkeypatch.setattr("ssplat_jax.streaming.causal_range.MAX_END_SHARE", -1.0)  # every chunk moves near and far
+    monkeypatch.setattr("ssplat_jax.streaming.live_views.MAX_END_SHARE", -1.0)  # every chunk moves near and far
     wanted = Session(StreamSplat(CAUSAL), params)
     pushed(wanted, capture, range(5))
     wanted.flush()

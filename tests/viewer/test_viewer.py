@@ -137,6 +137,7 @@ def delta(rows, seed):
         np.asarray(rows, np.int32),
         replace(gaussians, opacities=jnp.asarray(rng.uniform(0.2, 0.9, 2 * len(rows)), jnp.float32)),
         8,
+        rng.uniform(0.2, 0.9, 2 * len(rows)).astype(np.float32),
     )
 
 
