@@ -1,5 +1,6 @@
 """Exposure over a whole stream: darker or tinted views do not change the colors of the scene."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -8,9 +9,11 @@ from ssplat_jax.config import preset
 from ssplat_jax.core.gaussians import mean_color
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.data.open_capture import open_capture
-from ssplat_jax.model.streamsplat import StreamSplat
+from ssplat_jax.model import patch_colors, prepare_views
+from ssplat_jax.model.streamsplat import StreamSplat, _flatten_tokens
 from ssplat_jax.storage.weights import load_params
 from ssplat_jax.streaming.session import Session
+from tests.model.small import CONFIG, chunk
 
 TINT = np.array([0.6, 0.75, 0.9])
 
@@ -38,3 +41,27 @@ def test_tint_is_estimated_and_kept_out_of_the_scene():
     unmatched_exposures, unmatched_color = streamed(TINT, match_exposure=False)
     np.testing.assert_array_equal(unmatched_exposures, 1.0)
     assert np.all(unmatched_color < 0.97 * color)
+
+
+GAINS = np.array([[0.5, 0.7, 1.0], [1.0, 1.0, 1.0], [2.0, 1.5, 1.25]], np.float32)
+
+
+@jax.jit
+def token_colors(images, exposures):
+    views = prepare_views(replace(chunk(), images=images), CONFIG)
+    v, hf, wf = views.inside.shape
+    maps = jnp.zeros((v, hf, wf))
+    feats = jnp.zeros((v, hf, wf, CONFIG.network.token_width))
+    tokens = _flatten_tokens(jnp.zeros((v, hf, wf, 3)), feats, maps, maps, exposures, views, CONFIG)
+    return tokens.rgbs, patch_colors(views.images, CONFIG)
+
+
+def test_colors_are_divided_by_their_views_exposure():
+    images = chunk().images
+    as_seen, patches = token_colors(images, jnp.ones((3, 3)))
+    np.testing.assert_array_equal(as_seen, patches.reshape(as_seen.shape))  # view-major, row-major
+    brighter, _ = token_colors(images * GAINS[:, None, None], jnp.asarray(GAINS))
+    np.testing.assert_allclose(brighter, as_seen, rtol=1e-5)
+    darkened, _ = token_colors(images, jnp.asarray(GAINS))
+    cells = as_seen.reshape(3, -1, as_seen.shape[1] // 3, 3)
+    np.testing.assert_allclose(darkened.reshape(cells.shape), cells / GAINS[:, None, None], rtol=1e-5)

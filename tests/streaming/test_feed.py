@@ -20,8 +20,7 @@ class CountingSession(Session):
         v = len(chunk.valid)
         numbers = np.arange(self.num_views + 1, self.num_views + v + 1, dtype=np.float32)
         self.num_views += int(chunk.valid.sum())
-        maps = jnp.zeros((v, 1, 1))
-        exposures = jnp.asarray(np.repeat(numbers[:, None], 3, axis=1))
+        maps, exposures = jnp.zeros((v, 1, 1)), jnp.asarray(np.repeat(numbers[:, None], 3, axis=1))
         return ChunkOutput(depths=maps, confidences=maps, history=maps, exposures=exposures)
 
 
@@ -42,10 +41,7 @@ def test_chunks_carry_their_own_frames_and_exposures(session, capture):
     assert [chunk.frames for chunk in fed] == [[6, 0, 3, 1], [5, 2]]
     numbers = [chunk.exposures for chunk in fed]
     assert [{i: float(e[0]) for i, e in part.items()} for part in numbers] == [{6: 1, 0: 2, 3: 3, 1: 4}, {5: 5, 2: 6}]
-
-
-def test_no_frames_feed_no_chunk(session, capture):
-    assert list(feed_chunks(session, capture, [], capture.stream_frame(StreamConfig(), [0, 1]))) == []
+    assert list(feed_chunks(session, capture, [], frame)) == []
 
 
 @pytest.mark.parametrize(("num_recent", "num_kept"), [(0, 0), (1, 1), (5, 2)])

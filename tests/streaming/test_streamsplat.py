@@ -26,7 +26,7 @@ def params(model):
 
 @pytest.fixture(scope="module")
 def chunks(model):
-    return list(open_capture("procedural:room?frames=16&size=64x64").chunks(model.config))
+    return list(open_capture("procedural:room?frames=12&size=64x64").chunks(model.config))
 
 
 @pytest.fixture(scope="module")
@@ -58,23 +58,11 @@ def test_one_compilation_for_the_whole_stream(looped):
     assert looped[2] == 1
 
 
-def test_cache_fills_within_its_bounds(model, chunks, looped):
-    cache = looped[0]
-    config = model.config
-    occupied = int(cache.num_voxels)
-    assert 0 < occupied <= config.memory.capacity
-    assert int(cache.counts.max()) <= config.memory.pivots_per_voxel
-    corners = np.asarray(cache.voxels[:occupied]) * config.memory.voxel_size
-    alive = np.asarray(cache.alive[:occupied])
-    offsets = np.asarray(cache.means[:occupied]) - corners[:, None]
-    # A few ulp of the coordinates: the voxel of a mean is found by one float32 division.
-    slack = 1e-5 * (1 + np.abs(corners).max())
-    assert (offsets[alive] >= -slack).all() and (offsets[alive] <= config.memory.voxel_size + slack).all()
-    assert int(cache.stats.num_chunks) == len(chunks)
-    seen = int(cache.stats.num_seen)
-    rejected = sum(int(getattr(cache.stats, f"num_{why}")) for why in ("low_confidence", "non_finite", "out_of_range"))
-    assert seen == sum(chunk.images.shape[0] for chunk in chunks) * 16 * 16
-    assert int(cache.stats.num_accepted) == seen - rejected - int(cache.stats.num_dropped)
+def test_every_token_is_counted(model, chunks, looped):
+    stats = jax.tree.map(int, looped[0].stats)
+    assert stats.num_chunks == len(chunks) and stats.num_seen == sum(len(chunk.valid) for chunk in chunks) * 16 * 16
+    rejected = stats.num_low_confidence + stats.num_non_finite + stats.num_out_of_range + stats.num_dropped
+    assert 0 < stats.num_accepted == stats.num_seen - rejected
 
 
 def test_stored_features_stay_bounded(model, params, chunks, step):
@@ -91,29 +79,10 @@ def test_stored_features_stay_bounded(model, params, chunks, step):
         assert np.sqrt((feats[alive] ** 2).mean(axis=-1)).max() <= 1.0 + 1e-4
 
 
-def test_future_chunks_do_not_change_the_past(model, params, chunks, step, looped):
-    altered = [*chunks[:2], replace(chunks[2], images=1.0 - chunks[2].images)]
-    cache = model.init_cache()
-    for chunk, expected in zip(altered[:2], looped[1], strict=False):
-        cache, out = step(params, cache, chunk)
-        np.testing.assert_array_equal(np.asarray(out.depths), np.asarray(expected.depths))
-    _, changed = step(params, cache, altered[2])
-    assert not np.array_equal(np.asarray(changed.depths), np.asarray(looped[1][2].depths))
-
-
 def test_padding_leaves_the_cache_unchanged(params, chunks, step, looped):
     padding = replace(chunks[0], valid=jnp.zeros(4, bool))
     cache, _ = step(params, jax.tree.map(jnp.copy, looped[0]), padding)
     assert_same_bits(cache, looped[0], except_fields=("num_chunks",))
-
-
-def test_pixels_of_a_padded_view_change_nothing(model, params, chunks, step):
-    valid = jnp.array([True, True, True, False])
-    plain = replace(chunks[0], valid=valid)
-    noisy = replace(plain, images=plain.images.at[3].set(0.7))
-    first, _ = step(params, model.init_cache(), plain)
-    second, _ = step(params, model.init_cache(), noisy)
-    assert_same_bits(first, second)
 
 
 def test_history_is_used_from_the_second_chunk_on(looped):
@@ -181,20 +150,15 @@ def test_session_compiles_once_and_keeps_its_memory(model, params, chunks):
     assert memory[0] is not None and len(set(memory)) == 1
 
 
-@pytest.mark.slow  # compiles a program for each size
-@pytest.mark.parametrize(("width", "height"), [(50, 71), (71, 45)])
-def test_odd_and_portrait_sizes_stream(model, params, width, height, compiled_plainly):
+@pytest.mark.slow  # compiles another program
+def test_odd_sizes_stream(model, params, compiled_plainly):
+    width, height = 50, 71
     capture = open_capture(f"procedural:room?frames=5&size={width}x{height}")
     session = Session(model, params)
     for chunk in capture.chunks(model.config):
         session.feed(chunk)
-    cells = sum(
-        1
-        for y in range(2, 4 * (height // 4 + 1), 4)
-        for x in range(2, 4 * (width // 4 + 1), 4)
-        if x < width and y < height
-    )
-    assert int(session.cache.stats.num_seen) == 5 * cells
+    num_cells = len(range(2, width, 4)) * len(range(2, height, 4))  # whose center lies in the image
+    assert int(session.cache.stats.num_seen) == 5 * num_cells
 
 
 def test_padding_views_may_hold_anything(model, params, chunks, step):

@@ -1,0 +1,197 @@
+"""A sharded stream equals streams on one device: the cache's voxels to the last bit, whole steps to rounding.
+
+The shards are on the devices of two other processes (`sharded_worker`), because this process has one device.
+"""
+
+import functools
+import pickle
+import socket
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ssplat_jax.cache import PIVOT_FIELDS, Tokens, fuse, grow, init_cache, project
+from ssplat_jax.cache.hash_table import shards_of
+from ssplat_jax.core.errors import InputError
+from ssplat_jax.data.open_capture import open_capture
+from ssplat_jax.model.streamsplat import StreamSplat
+from ssplat_jax.streaming.sharded import ShardedStream
+from tests.cache.projection_scenes import cameras
+from tests.cache.streams import CONFIG, FEATURES, PLACES, Recipe
+from tests.model.small import random_params
+from tests.streaming.narrow_model import NARROW, assert_same_bits
+
+SUM_RTOL = 1e-6  # of the largest value: sums of about ten terms in another order; one float32 rounding is 6e-8
+STEP_RTOL = 1e-4  # of the largest value: rounding of the sums, which passes through the network with every chunk
+FLIPPED = 0.005  # share of voxels or pivots that such rounding may place or pair differently
+MODEL_CONFIG = NARROW.replace(capacity=4096, voxel_size=0.3)  # voxels so large that many tokens merge
+PADDED_STEP = 2  # the step of the first stream that is padding
+TIMEOUT = 300  # seconds; a run usually takes some twenty
+
+
+def on_two_processes(folder, jobs):
+    """Results of the jobs, by name, on four devices of two processes."""
+    (folder / "jobs.pkl").write_bytes(pickle.dumps(jobs))
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        port = free.getsockname()[1]
+    command = [sys.executable, "-m", "tests.streaming.sharded_worker", str(folder), "2"]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    processes = [subprocess.Popen([*command, str(process), "2", str(port)], **pipes) for process in range(2)]
+    try:
+        for process in processes:
+            log, _ = process.communicate(timeout=TIMEOUT)
+            assert process.returncode == 0, log
+    finally:
+        for process in processes:
+            process.kill()
+    results = pickle.loads((folder / "results.pkl").read_bytes())
+    assert results.pop("devices") == 4
+    return results
+
+
+def part(tree, *place):
+    return jax.tree.map(lambda x: x[place], tree)
+
+
+def stacked(trees):
+    return jax.tree.map(lambda *x: np.stack(x), *trees)
+
+
+def sorted_voxels(shards):
+    """Voxels and pivots of all shards, sorted by voxel index."""
+    fields = {
+        name: np.concatenate([np.asarray(getattr(cache, name))[: int(cache.num_voxels)] for cache in shards])
+        for name in ("voxels", "counts", *PIVOT_FIELDS)
+    }
+    order = np.lexsort(fields["voxels"].T)
+    return {name: x[order] for name, x in fields.items()}
+
+
+# The cache ------------------------------------------------------------------------------------------------------------
+
+
+def token_chunks(num_chunks=4, num_recipes=12) -> Tokens:
+    """Chunks `[t, m, ...]` with all kinds of hard tokens; in each, many voxels get more tokens than pivots."""
+
+    def chunk(t):
+        parts = []
+        for i in range(num_recipes):
+            places = ("few", *PLACES)[i % 6]
+            recipe = Recipe(100 * t + i, places, FEATURES[i % 4], ("random", "at_tau")[i % 2], num_valid=44, num_bad=3)
+            tokens = recipe.tokens()
+            if places == "few":
+                tokens["means"][:, 0] += 4 * CONFIG.memory.voxel_size * i
+            parts.append(tokens)
+        return Tokens(**{name: jnp.asarray(np.concatenate([x[name] for x in parts])) for name in parts[0]})
+
+    return stacked([chunk(t) for t in range(num_chunks)])
+
+
+def test_shards_together_hold_and_show_what_a_single_cache_does(tmp_path):
+    tokens, camera, capacity = token_chunks(), jax.tree.map(np.asarray, cameras(5, num_views=3)), 1024
+    job = dict(config=CONFIG, capacity=capacity, tokens=tokens, camera=camera)
+    found = on_two_processes(tmp_path, {"fuse_and_project": job})["fuse_and_project"]
+    shards, projections = ([part(x, i) for i in range(4)] for x in found)
+    insert, alone = jax.jit(functools.partial(fuse, config=CONFIG)), init_cache(CONFIG, capacity)
+    for t in range(len(tokens.valid)):
+        alone = insert(alone, jax.tree.map(jnp.asarray, part(tokens, t)))
+    wanted = sorted_voxels([alone])
+    assert len(wanted["voxels"]) > 300 and int(alone.stats.num_merged) > 300
+    for name, values in sorted_voxels(shards).items():
+        np.testing.assert_array_equal(values, wanted[name], err_msg=name)
+    # Each token is counted by one shard, each chunk by all.
+    for name, count in vars(alone.stats).items():
+        totals = [int(getattr(shard.stats, name)) for shard in shards]
+        assert (totals == 4 * [int(count)]) if name == "num_chunks" else sum(totals) == int(count), name
+        assert int(count) > 0 or name == "num_dropped"
+    seen = project(alone, camera, CONFIG)
+    assert seen.mask.mean() > 0.3
+    for projected in projections:
+        assert_same_bits(projected, projections[0])
+    np.testing.assert_array_equal(projections[0].mask, seen.mask)
+    for name in ("depths", "confidences", "feats"):
+        x, y = getattr(projections[0], name), np.asarray(getattr(seen, name))
+        np.testing.assert_allclose(x, y, rtol=0, atol=SUM_RTOL * np.abs(y).max(), err_msg=name)
+
+
+@pytest.mark.parametrize("num_shards", [2, 3, 100])
+def test_voxels_are_split_evenly_over_shards(num_shards):
+    side = jnp.arange(-16, 16, dtype=jnp.int32)
+    voxels = jnp.stack(jnp.meshgrid(side, side, side), axis=-1).reshape(-1, 3)
+    counts = np.bincount(np.asarray(shards_of(voxels, num_shards)), minlength=num_shards)
+    expected = len(voxels) / num_shards
+    # Five standard deviations of a random split.
+    assert len(counts) == num_shards and np.abs(counts - expected).max() < 5 * np.sqrt(expected)
+
+
+# Steps ----------------------------------------------------------------------------------------------------------------
+
+
+def assert_close(found, wanted, name):
+    wrong = np.abs(found.astype(np.float64) - wanted) > STEP_RTOL * np.abs(wanted).max()
+    assert wrong.mean() <= FLIPPED, f"{name}: {wrong.sum()} of {wrong.size}"
+
+
+def assert_close_cache(shards, cache):
+    found, wanted = sorted_voxels(shards), sorted_voxels([cache])
+    places = {tuple(row): i for i, row in enumerate(found["voxels"])}
+    rows = [(places[tuple(row)], i) for i, row in enumerate(wanted["voxels"]) if tuple(row) in places]
+    assert len(rows) >= (1 - FLIPPED) * max(len(found["voxels"]), len(wanted["voxels"])) > 50
+    in_found, in_wanted = np.array(rows).T
+    for name in found:
+        assert_close(found[name][in_found], wanted[name][in_wanted], name)
+    for name in ("num_seen", "num_accepted"):
+        assert sum(int(getattr(shard.stats, name)) for shard in shards) == int(getattr(cache.stats, name))
+
+
+@pytest.mark.slow  # two networks compiled in two processes
+def test_streams_together_equal_each_stream_alone(tmp_path):
+    """Two streams, one interrupted by padding and one in reverse order, on four devices of two processes."""
+    captured = list(open_capture("procedural:room?frames=12&size=64x64").chunks(MODEL_CONFIG))
+    captured = jax.tree.map(np.asarray, captured)
+    padding = jax.tree.map(np.copy, captured[0])
+    padding.valid[:] = False
+    streams = [[*captured[:PADDED_STEP], padding, captured[2]], [*captured[::-1], captured[0]]]
+    params = jax.tree.map(np.asarray, random_params(MODEL_CONFIG, seed=1))
+    chunks = stacked([stacked(pair) for pair in zip(*streams, strict=True)])
+    capacity = 8 * MODEL_CONFIG.memory.capacity
+    job = dict(config=MODEL_CONFIG, params=params, chunks=chunks, num_new_tokens=capacity // 2)
+    history, num_compilations, scenes, grown = on_two_processes(tmp_path, {"steps": job})["steps"]
+    assert num_compilations == 1
+    model = StreamSplat(MODEL_CONFIG)
+    step = jax.jit(model.step, compiler_options={"xla_backend_optimization_level": 0})
+    for stream, inputs in enumerate(streams):
+        cache = model.init_cache()
+        for t, chunk in enumerate(inputs):
+            caches, output = history[t]
+            shards = [part(caches, stream, shard) for shard in range(2)]
+            if (stream, t) == (0, PADDED_STEP):
+                assert_same_bits(part(caches, 0), part(history[t - 1][0], 0))  # padding changes nothing
+                continue
+            cache, expected = step(params, cache, chunk)
+            for name in ("depths", "confidences", "history"):
+                assert_close(getattr(output, name)[stream], np.asarray(getattr(expected, name)), name)
+            assert_close_cache(shards, cache)
+            assert_same_bits(shards[0].witnesses, shards[1].witnesses)
+        assert int(cache.stats.num_merged) > 100
+        opacities = scenes.opacities[stream]
+        np.testing.assert_allclose(opacities.sum(), model.decode(params, cache).opacities.sum(), rtol=STEP_RTOL)
+        for i, shard in enumerate(shards):
+            assert_same_bits(part(grown, stream, i), grow(jax.tree.map(jnp.asarray, shard), capacity))
+
+
+# Meshes ---------------------------------------------------------------------------------------------------------------
+
+
+def test_a_mesh_without_the_axes_is_refused():
+    mesh = jax.sharding.Mesh(np.array(jax.devices()[:1]).reshape(1, 1), ("data", "voxels"))
+    with pytest.raises(InputError, match=r"'streams' and 'voxels', got \('data', 'voxels'\)"):
+        ShardedStream(StreamSplat(NARROW), mesh)
+    two_rows = jax.sharding.Mesh(np.array(jax.devices()[:1] * 2).reshape(2, 1), ("data", "voxels"))
+    with pytest.raises(InputError, match="multiple of the mesh's 2, got 3"):
+        ShardedStream(StreamSplat(NARROW), two_rows, streams="data").init_cache(3)
