@@ -99,7 +99,7 @@ class MemoryConfig(ConfigGroup):
             *at_least(1, self, "pivots_per_voxel"),
             ("capacity", "a power of two of at least 128", is_power),
             ("min_confidence", "in [0, 1]", 0.0 <= self.min_confidence <= 1.0),
-            # Carved confidences stay below 0.95 (`cache.carve.MAX_REVISED`): a higher tau rejects confirmed pivots.
+            # Carved confidences stay below 0.95 (`cache.votes.MAX_REVISED`): a higher tau rejects confirmed pivots.
             ("min_confidence", "at most 0.95 while views carve", not self.carving or self.min_confidence <= 0.95),
         )
 

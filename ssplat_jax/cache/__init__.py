@@ -1,21 +1,29 @@
-"""VACC, the Voxel-Aligned Causal Cache (Sec. 3.4): `fuse` writes tokens, `project` reads views, `carve` revises."""
+"""VACC, the Voxel-Aligned Causal Cache (Sec. 3.4): `fuse` writes tokens, `project` shows them, `carve` revises."""
 
-from ssplat_jax.cache.capacity import check_cache, ensure_capacity, grow
-from ssplat_jax.cache.carve import SAME_SURFACE_MARGIN, carve, judge, store_witness
 from ssplat_jax.cache.fuse import fuse
+from ssplat_jax.cache.observations import observe, seen_cells
 from ssplat_jax.cache.project import ProjectedCache, coarsen, project
-from ssplat_jax.cache.sightings import add_sightings
-from ssplat_jax.cache.state import PIVOT_FIELDS, CacheStats, Tokens, VoxelCache, Witnesses, init_cache
+from ssplat_jax.cache.state import (
+    PIVOT_FIELDS,
+    CacheStats,
+    StoredDepths,
+    Tokens,
+    VoxelCache,
+    check_cache,
+    ensure_capacity,
+    grow,
+    init_cache,
+)
+from ssplat_jax.cache.votes import SAME_SURFACE_MARGIN, carve, store_depths, vote
 
 __all__ = [
     "PIVOT_FIELDS",
     "SAME_SURFACE_MARGIN",
     "CacheStats",
     "ProjectedCache",
+    "StoredDepths",
     "Tokens",
     "VoxelCache",
-    "Witnesses",
-    "add_sightings",
     "carve",
     "check_cache",
     "coarsen",
@@ -23,7 +31,9 @@ __all__ = [
     "fuse",
     "grow",
     "init_cache",
-    "judge",
+    "observe",
     "project",
-    "store_witness",
+    "seen_cells",
+    "store_depths",
+    "vote",
 ]

@@ -20,9 +20,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int
 
-from ssplat_jax.cache.hash_table import find_rows, group_equal, insert_rows, shards_of
-from ssplat_jax.cache.state import PIVOT_FIELDS, CacheStats, Tokens, VoxelCache, pivot_fields, saturating_add
-from ssplat_jax.cache.voxels import voxel_indices
+from ssplat_jax.cache.hash_table import find_rows, group_equal, insert_rows, shards_of, voxel_indices
+from ssplat_jax.cache.state import PIVOT_FIELDS, CacheStats, Tokens, VoxelCache, pivot_fields
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.pytree import pytree, replace
 
@@ -63,7 +62,7 @@ def fuse(cache: VoxelCache, tokens: Tokens, config: StreamConfig, *, axis: str |
 
     Limits:
         A new pivot has residuals of 0; those of merged pivots are averaged with the weights of their means.
-        A new pivot has sightings of 0; those of merged pivots add up.
+        A new pivot has observations of 0; those of merged pivots add up.
         Feature norms in [1e-9, 1e9]: outside, and for zero features, a pair counts as orthogonal.
         Two members of confidence 0 are averaged with equal weights.
         A merged mean lies between its members, to the last bit, and so in their voxel.
@@ -99,6 +98,11 @@ def _insert(cache: VoxelCache, tokens: Tokens, config: StreamConfig) -> tuple[Vo
         num_dropped=saturating_add(stats.num_dropped, jnp.sum(accepted, dtype=jnp.int32) - num_placed),
     )
     return replace(cache, counts=counts, stats=stats, **pivots), plan
+
+
+def saturating_add(counter: Int[Array, ""], more: Int[Array, ""]) -> Int[Array, ""]:
+    """`counter + more` for numbers that are not negative; stops at the largest integer instead of overflowing."""
+    return counter + jnp.minimum(more, jnp.iinfo(counter.dtype).max - counter)
 
 
 def _classify(
@@ -154,7 +158,6 @@ def _place_at_end(
     cache: VoxelCache, voxels: Int[Array, "m 3"], accepted: Bool[Array, " m"], config: StreamConfig
 ) -> tuple[VoxelCache, Plan]:
     """The ablation `vacc="append"`: tokens fill the rows one slot after another, whatever their voxel."""
-    del voxels
     k = config.memory.pivots_per_voxel
     last = jnp.maximum(cache.num_voxels - 1, 0)
     num_pivots = last * k + cache.counts[last]
@@ -168,17 +171,15 @@ def _place_at_end(
 
 def _add_rows(cache, voxels, rows, is_new):
     """Gives a row to each voxel that `is_new`, in order of their first tokens, until the capacity is used up."""
-    capacity = cache.capacity
     new_rows = cache.num_voxels + jnp.cumsum(is_new, dtype=jnp.int32) - 1
-    num_wanted = cache.num_voxels + jnp.sum(is_new, dtype=jnp.int32)
-    has_row = is_new & (new_rows < capacity)
+    has_row = is_new & (new_rows < cache.capacity)
     cache = replace(
         cache,
-        voxels=cache.voxels.at[jnp.where(has_row, new_rows, capacity)].set(voxels, mode="drop"),
-        num_voxels=jnp.minimum(num_wanted, capacity),
+        voxels=cache.voxels.at[jnp.where(has_row, new_rows, cache.capacity)].set(voxels, mode="drop"),
+        num_voxels=jnp.minimum(cache.num_voxels + jnp.sum(is_new, dtype=jnp.int32), cache.capacity),
+        table=insert_rows(cache.table, voxels, new_rows, has_row),
     )
-    table = insert_rows(cache.table, voxels, new_rows, has_row)
-    return replace(cache, table=table), jnp.where(has_row, new_rows, rows)
+    return cache, jnp.where(has_row, new_rows, rows)
 
 
 def _new_pivots(tokens: Tokens, cache: VoxelCache) -> dict[str, Array]:
@@ -280,7 +281,7 @@ def _merge_pair(older: dict[str, Array], newer: dict[str, Array]) -> dict[str, A
     merged = {name: average(name) for name in ("means", "feats", "rgbs", "residuals") if name in older}
     best = ("seeds", "confidences", "quats", "footprints")
     merged |= {name: _select(newer_is_best, newer[name], older[name]) for name in best}
-    merged |= {name: older[name] + newer[name] for name in ("sightings",) if name in older}
+    merged |= {name: older[name] + newer[name] for name in ("observations",) if name in older}
     return merged | {
         "num_members": older["num_members"] + newer["num_members"],
         "last_chunks": jnp.maximum(older["last_chunks"], newer["last_chunks"]),

@@ -1,16 +1,54 @@
-"""Hash table from voxel index to row: open addressing with linear probing, verified against the stored indices.
+"""Voxel indices of points, and the hash table from voxel index to row of the cache.
 
-Entries are rows, -1 where empty. Single entries are never deleted: a table is rebuilt when rows change their voxels.
+The index triple identifies a voxel. Its hash only says where to look for it, by open addressing with linear probing; a
+lookup compares the triple. Entries are rows, -1 where empty. Single entries are never deleted.
 """
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, UInt32
 
-from ssplat_jax.cache.voxels import hash_voxels
+INDEX_LIMIT = 1 << 20
+"""Upper bound of the magnitude of a voxel index: 42 km at 4 cm, and exact in float32."""
 
 SLOTS_PER_ROW = 4
-"""Table slots per cache row: the table is at most a quarter full, so a search ends after a few probes."""
+"""Table slots per cache row. The table is at most a quarter full, so a search ends after a few probes: a cache 90 %
+full fuses as fast as one 1 % full."""
+
+
+def voxel_indices(points: Float[Array, "*s 3"], voxel_size: float) -> tuple[Int[Array, "*s 3"], Bool[Array, "*s"]]:
+    """Voxel index of each point, floor(p / voxel_size), and whether it is in range.
+
+    Limits:
+        Indices of magnitude 2^20 or more, infinities and NaN give index 0 and False.
+    """
+    # Multiplied by the float32 reciprocal, which every backend rounds the same way. The product is monotone: a point
+    # between two points of a voxel lies in that voxel.
+    cells = jnp.floor(points * float(np.float32(1.0 / voxel_size)))
+    in_range = jnp.all(jnp.abs(cells) < INDEX_LIMIT, axis=-1)
+    return jnp.where(in_range[..., None], cells, 0.0).astype(jnp.int32), in_range
+
+
+def hash_voxels(voxels: Int[Array, "*s 3"]) -> UInt32[Array, "*s"]:
+    """32-bit hashes of voxel indices, mixed by the finalizer of MurmurHash3."""
+    x, y, z = (voxels[..., axis].astype(jnp.uint32) for axis in range(3))
+    mixed = _mix(x + jnp.uint32(0x9E3779B9))
+    mixed = _mix(mixed ^ (y + jnp.uint32(0x7F4A7C15)))
+    return _mix(mixed ^ (z + jnp.uint32(0x94D049BB)))
+
+
+def _mix(bits):
+    bits = (bits ^ (bits >> 16)) * jnp.uint32(0x85EBCA6B)
+    bits = (bits ^ (bits >> 13)) * jnp.uint32(0xC2B2AE35)
+    return bits ^ (bits >> 16)
+
+
+def shards_of(voxels: Int[Array, "*s 3"], num_shards: int) -> Int[Array, "*s"]:
+    """Number of the cache, of `num_shards` (at most 2^16), that holds each voxel: an even split by hash."""
+    # The highest bits, because the hash table uses the lowest: voxels of one shard must still differ in those.
+    high_bits = hash_voxels(voxels) >> 16
+    return (high_bits * jnp.uint32(num_shards) >> 16).astype(jnp.int32)
 
 
 def find_rows(
@@ -19,16 +57,13 @@ def find_rows(
     wanted: Int[Array, "m 3"],
     active: Bool[Array, " m"],
 ) -> Int[Array, " m"]:
-    """Rows of the voxels `wanted`.
+    """Rows of the voxels `wanted`; -1 for those that are not stored or not `active`.
 
     Args:
         table: hash table over the rows.
         voxels: index of the voxel in each row.
         wanted: indices to look up.
         active: which of them to look up.
-
-    Returns:
-        Rows; -1 for voxels that are not stored or not active.
     """
 
     def probe(state):
@@ -46,18 +81,9 @@ def find_rows(
 def insert_rows(
     table: Int[Array, " slots"], voxels: Int[Array, "m 3"], rows: Int[Array, " m"], active: Bool[Array, " m"]
 ) -> Int[Array, " slots"]:
-    """`table` with new voxels entered.
+    """`table`, which holds none of the active voxels, with these entered; they must be distinct.
 
     All voxels claim their slots in parallel; the highest row wins an empty slot, and the others probe on.
-
-    Args:
-        table: hash table that holds none of the active voxels.
-        voxels: indices, distinct where active.
-        rows: row of each voxel.
-        active: which voxels to enter.
-
-    Returns:
-        The hash table.
     """
     num_slots = table.shape[0]
 
@@ -70,6 +96,13 @@ def insert_rows(
 
     start = (table, _first_slots(table, voxels), active)
     return jax.lax.while_loop(lambda state: jnp.any(state[2]), claim, start)[0]
+
+
+def build_table(voxels: Int[Array, "capacity 3"], num_voxels: Int[Array, ""]) -> Int[Array, " slots"]:
+    """A new hash table of the first `num_voxels` rows."""
+    rows = jnp.arange(voxels.shape[0], dtype=jnp.int32)
+    empty = jnp.full((SLOTS_PER_ROW * voxels.shape[0],), -1, jnp.int32)
+    return insert_rows(empty, voxels, rows, rows < num_voxels)
 
 
 def group_equal(voxels: Int[Array, "m 3"], active: Bool[Array, " m"]) -> Int[Array, " m"]:
@@ -94,23 +127,5 @@ def group_equal(voxels: Int[Array, "m 3"], active: Bool[Array, " m"]) -> Int[Arr
     return jax.lax.while_loop(lambda state: jnp.any(state[3]), claim, start)[2]
 
 
-def build_table(voxels: Int[Array, "capacity 3"], num_voxels: Int[Array, ""]) -> Int[Array, " slots"]:
-    """A new hash table of the first `num_voxels` rows."""
-    rows = jnp.arange(voxels.shape[0], dtype=jnp.int32)
-    empty = jnp.full((SLOTS_PER_ROW * voxels.shape[0],), -1, jnp.int32)
-    return insert_rows(empty, voxels, rows, rows < num_voxels)
-
-
 def _first_slots(table, voxels):
     return (hash_voxels(voxels) & jnp.uint32(table.shape[0] - 1)).astype(jnp.int32)
-
-
-def shards_of(voxels: Int[Array, "*s 3"], num_shards: int) -> Int[Array, "*s"]:
-    """Number of the cache, of `num_shards`, that holds each voxel: an even split by hash.
-
-    Limits:
-        Up to 2^16 shards.
-    """
-    # The highest bits, because the hash table uses the lowest: voxels of one shard must still differ in those.
-    high_bits = hash_voxels(voxels) >> 16
-    return (high_bits * jnp.uint32(num_shards) >> 16).astype(jnp.int32)

@@ -1,6 +1,6 @@
 """VACC's read: the projection P of the cache into views (Eq. cache_projection).
 
-Each pixel reads its front cluster in log depth. With ell = ln z, w = confidence and window = ln(cluster_ratio):
+Each pixel reads its front cluster in log depth. With ell = ln z, w = confidence and window = ln(CLUSTER_RATIO):
 
     pass 1   L0 = min ell                            over the pivots that fall on the pixel
     pass 2   mu = sum w ell / sum w                  over ell <= L0 + window
@@ -10,29 +10,35 @@ A plain mean would mix background into a fifth of the pixels. A window about the
 the camera, and the bias would feed back through the anchor into the cache. A pivot covers the one pixel that contains
 its projected center.
 
-Each pass visits the rows in sight (`pixel_pairs`). Features are read only for the pairs (view, pivot) in a cluster.
-Sums run in row order, so on the CPU the result is the same to the last bit every time.
+The passes, and the votes and observations of views, fold over pairs of a view and a pivot. A view sees a small part of
+a large scene, so the rows that some view sees are listed first, and only they are read again: all but the listing takes
+time in proportion to the pivots in sight. Sums run in row order, so on the CPU they are the same to the last bit.
 """
 
 import functools
 import math
+from collections.abc import Callable
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
-from ssplat_jax.cache.pixel_pairs import PixelPairs, fold_pairs, rows_in_sight
 from ssplat_jax.cache.state import VoxelCache
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.pytree import pytree
 
-CLUSTER_RATIO = 1.15
-"""Largest ratio of depths within the front cluster of a pixel. A mean over all its pivots mixes foreground and
-background."""
+NEAR = 0.01
+"""Near plane: pivots at or before this camera z (stream units) are invisible, as in the renderer."""
 
-PAIRS_PER_BLOCK = 4096
-"""Most pairs whose features are gathered at a time."""
+CLUSTER_RATIO = 1.15
+"""Largest ratio of depths within the front cluster of a pixel."""
+
+ROWS_PER_BLOCK, PAIRS_PER_BLOCK = 4096, 4096
+"""Most cache rows that are projected at a time, and most pairs whose features are gathered at a time."""
+
+State = TypeVar("State")
 
 
 @pytree
@@ -66,15 +72,21 @@ def project(cache: VoxelCache, camera: Camera, config: StreamConfig, *, axis: st
     """
     cache, camera = jax.lax.stop_gradient((cache, camera))
     shape = (camera.viewmats.shape[0], camera.height, camera.width)
+    window = math.log(CLUSTER_RATIO) if config.additions.front_cluster else math.inf
+    over_shards = lambda reduce, x: x if axis is None else reduce(x, axis)  # noqa: E731
     with jax.named_scope("project"):
-        # Carved pivots must not occlude. Without carving no pivot is below tau: all were accepted at tau or more.
+        # Carved pivots must not occlude: in front of a good surface they would be all that HPDA and CGFI see. Without
+        # carving no pivot is below tau: all were accepted at tau or more.
         min_confidence = config.memory.min_confidence if config.memory.carving else 0.0
         in_sight = rows_in_sight(cache, camera, min_confidence=min_confidence)
         fold = functools.partial(fold_pairs, cache, camera, in_sight, min_confidence=min_confidence)
-        fronts = _reduce_shards(jax.lax.pmin, fold(_min_log_depths, jnp.full((math.prod(shape),), jnp.inf)), axis)
-        centers = _front_means(fold, config, fronts, axis)
-        sums = _cluster_sums(fold, cache, len(camera.viewmats), config, fronts, centers)
-        weights, squares, offsets, values = _reduce_shards(jax.lax.psum, sums, axis)
+        start = jnp.full((math.prod(shape),), jnp.inf)
+        nearest = lambda x, pairs, rows, is_row: x.at[pairs.pixels].min(pairs.log_depths, mode="drop")  # noqa: E731
+        fronts = over_shards(jax.lax.pmin, fold(nearest, start))
+        weights, offsets = over_shards(jax.lax.psum, _front_sums(fold, window, fronts))
+        centers = offsets / jnp.where(weights > 0, weights, 1.0)
+        sums = _cluster_sums(fold, window, cache, len(camera.viewmats), config, fronts, centers)
+        weights, squares, offsets, values = over_shards(jax.lax.psum, sums)
     mask = weights > 0
     total = jnp.where(mask, weights, 1.0)
     means = (values / total[:, None]).reshape(*shape, -1)
@@ -92,8 +104,6 @@ def project(cache: VoxelCache, camera: Camera, config: StreamConfig, *, axis: st
 def coarsen(history: ProjectedCache, factor: int) -> ProjectedCache:
     """`history` on a grid coarser by `factor`: each coarse cell takes all values of its nearest fine cell.
 
-    Cells are not averaged, since the mean of a front and a back surface lies on neither.
-
     Limits:
         A coarse cell without a filled fine cell is a hole.
     """
@@ -105,51 +115,25 @@ def coarsen(history: ProjectedCache, factor: int) -> ProjectedCache:
         x = x.reshape(v, h // factor, factor, w // factor, factor, -1).swapaxes(2, 3)
         return x.reshape(v, h // factor, w // factor, factor * factor, -1)
 
+    # Cells are not averaged, since the mean of a front and a back surface lies on neither.
     nearest = jnp.argmin(patches(jnp.where(history.mask, history.depths, jnp.inf)), axis=3, keepdims=True)
-    take = lambda x: jnp.take_along_axis(patches(x), nearest, axis=3)[..., 0, :]  # noqa: E731
-    return ProjectedCache(
-        depths=take(history.depths)[..., 0],
-        confidences=take(history.confidences)[..., 0],
-        feats=take(history.feats),
-        mask=take(history.mask)[..., 0],
-        colors=None if history.colors is None else take(history.colors),
-    )
+    take = lambda x: jnp.take_along_axis(patches(x), nearest, axis=3).reshape(v, h // factor, w // factor, *x.shape[3:])  # noqa: E731
+    return jax.tree.map(take, history)
 
 
-def _front_window(config: StreamConfig) -> float:
-    """Span of a front cluster in log depth; without `front_cluster` all pivots of a pixel are averaged."""
-    return math.log(CLUSTER_RATIO) if config.additions.front_cluster else math.inf
-
-
-def _reduce_shards(reduce, partial, axis: str | None):
-    """`partial` reduced over all shards; `partial` itself without an axis."""
-    return partial if axis is None else reduce(partial, axis)
-
-
-def _min_log_depths(fronts, pairs: PixelPairs, rows, is_row):
-    """Pass 1: log depth of the nearest pivot in each pixel."""
-    del rows, is_row
-    return fronts.at[pairs.pixels].min(pairs.log_depths, mode="drop")
-
-
-def _front_means(fold, config, fronts, axis):
-    """Pass 2: mean log depth of each pixel's front window, relative to its nearest pivot."""
-    window = _front_window(config)
+def _front_sums(fold, window, fronts):
+    """Pass 2: sums over each pixel's front window: w, and w times log depth relative to its nearest pivot."""
 
     def visit(sums, pairs: PixelPairs, rows, is_row):
-        del rows, is_row
         offsets = _offsets_from_front(pairs, fronts)
         weights = jnp.where(offsets <= window, pairs.weights, 0.0)
         return _scatter_add(sums, pairs.pixels, (weights, weights * offsets))
 
-    sums = fold(visit, (jnp.zeros_like(fronts), jnp.zeros_like(fronts)))
-    weights, offsets = _reduce_shards(jax.lax.psum, sums, axis)
-    return offsets / jnp.where(weights > 0, weights, 1.0)
+    return fold(visit, (jnp.zeros_like(fronts), jnp.zeros_like(fronts)))
 
 
-def _cluster_sums(fold, cache, num_views, config, fronts, centers):
+def _cluster_sums(fold, window, cache, num_views, config, fronts, centers):
     """Pass 3: sums over each pixel's re-centered cluster: w, w^2, w times offset from the front, w times values."""
-    window = _front_window(config)
     pivots_per_row = cache.feats.shape[1]
     flat = lambda x: x.reshape(-1, x.shape[-1])  # noqa: E731
 
@@ -160,10 +144,7 @@ def _cluster_sums(fold, cache, num_views, config, fronts, centers):
         colors = flat(cache.rgbs)[pivots].reshape(len(pivots), -1, 3).mean(axis=1)
         return jnp.concatenate([feats, colors], axis=1)
 
-    num_values = jax.eval_shape(values_of, jnp.zeros(1, jnp.int32)).shape[1]
-
     def visit(state, pairs: PixelPairs, rows, is_row):
-        del is_row
         scalars, sums = state
         offsets = _offsets_from_front(pairs, fronts)
         weights = jnp.where(jnp.abs(offsets - centers[pairs.pixels]) <= window, pairs.weights, 0.0)
@@ -172,8 +153,8 @@ def _cluster_sums(fold, cache, num_views, config, fronts, centers):
         return scalars, _add_values(sums, values_of, pairs.pixels, weights, pivots, num_views)
 
     zeros = jnp.zeros_like(fronts)
-    sums = jnp.zeros((fronts.shape[0], num_values))
-    scalars, sums = fold(visit, ((zeros, zeros, zeros), sums))
+    num_values = jax.eval_shape(values_of, jnp.zeros(1, jnp.int32)).shape[1]
+    scalars, sums = fold(visit, ((zeros, zeros, zeros), jnp.zeros((fronts.shape[0], num_values))))
     return *scalars, sums
 
 
@@ -198,10 +179,117 @@ def _add_values(sums, values_of, pixels, weights, pivots, num_views):
     return jax.lax.fori_loop(0, num_blocks, add_block, sums)
 
 
-def _offsets_from_front(pairs: PixelPairs, fronts):
+def _offsets_from_front(pairs, fronts):
     """Log depth relative to the pixel's nearest pivot; 0 for points not seen."""
     return jnp.where(pairs.weights > 0, pairs.log_depths - fronts[pairs.pixels], 0.0)
 
 
 def _scatter_add(sums, pixels, values):
     return tuple(s.at[pixels].add(x, mode="drop") for s, x in zip(sums, values, strict=True))
+
+
+# Pairs of a view and a pivot ------------------------------------------------------------------------------------------
+
+
+@pytree
+class PixelPairs:
+    """Pairs (view, point), flattened: the pixel and the depth at which the view sees the point."""
+
+    pixels: Int[Array, " p"]  # flat over all views; the number of pixels if the point is not seen
+    log_depths: Float[Array, " p"]
+    weights: Float[Array, " p"]  # 0 if the point is not seen
+
+
+@pytree
+class RowsInSight:
+    """Cache rows with a pivot that a view sees, in their order."""
+
+    rows: Int[Array, " c"]  # 0 where there is no further one
+    number: Int[Array, ""]
+
+
+def rows_in_sight(cache: VoxelCache, camera: Camera, *, min_confidence: float = 0.0) -> RowsInSight:
+    """The rows of `cache` with a pivot of at least `min_confidence` whose center falls into a view of `camera`."""
+    block = math.gcd(cache.capacity, ROWS_PER_BLOCK)
+
+    def mark(i, marks):
+        pivots = (cache.means, cache.confidences, cache.counts)
+        pairs = _pairs(*(jax.lax.dynamic_slice_in_dim(x, i * block, block) for x in pivots), camera, min_confidence)
+        is_seen = (pairs.weights > 0).reshape(len(camera.viewmats), block, -1).any(axis=(0, 2))
+        return jax.lax.dynamic_update_slice_in_dim(marks, is_seen, i * block, axis=0)
+
+    num_blocks = (cache.num_voxels + block - 1) // block  # the occupied rows are the first ones
+    marks = jax.lax.fori_loop(0, num_blocks, mark, jnp.zeros(cache.capacity, bool))
+    ends, numbers = jnp.cumsum(marks, dtype=jnp.int32), jnp.arange(cache.capacity, dtype=jnp.int32)
+    rows = jnp.zeros_like(numbers).at[jnp.where(marks, ends - 1, cache.capacity)].set(numbers, mode="drop")
+    return RowsInSight(rows=rows, number=ends[-1])
+
+
+def fold_pairs(
+    cache: VoxelCache,
+    camera: Camera,
+    in_sight: RowsInSight,
+    visit: Callable[[State, PixelPairs, Int[Array, " n"], Bool[Array, " n"]], State],
+    start: State,
+    *,
+    min_confidence: float = 0.0,
+) -> State:
+    """Folds `visit(state, pairs, rows, is_row)` over blocks of the rows in sight.
+
+    Args:
+        cache: holds the pivots.
+        camera: a batch of views.
+        in_sight: the rows that are visited, of the same cache and views.
+        visit: takes the state, the `v * n * k` pairs of a block of n rows, view-major, the numbers of the rows, and
+            which of them are rows: the last block is filled up with row 0, whose pairs are then not seen.
+        start: the state before the first block.
+        min_confidence: pivots below it are not seen.
+    """
+    block = math.gcd(cache.capacity, ROWS_PER_BLOCK)
+
+    def step(i, state):
+        rows = jax.lax.dynamic_slice_in_dim(in_sight.rows, i * block, block)
+        is_row = i * block + jnp.arange(block, dtype=jnp.int32) < in_sight.number
+        means, confidences, counts = (rows_of(x, rows) for x in (cache.means, cache.confidences, cache.counts))
+        pairs = _pairs(means, confidences, jnp.where(is_row, counts, 0), camera, min_confidence)
+        return visit(state, pairs, rows, is_row)
+
+    return jax.lax.fori_loop(0, (in_sight.number + block - 1) // block, step, start)
+
+
+def rows_of(x: Array, rows: Int[Array, " n"]) -> Array:
+    """`x[rows]` for row numbers that are valid."""
+    return x.at[rows].get(mode="promise_in_bounds")
+
+
+def places_of(rows: Int[Array, " n"], is_row: Bool[Array, " n"], cache: VoxelCache) -> Int[Array, " n"]:
+    """`rows` as targets of a scatter that drops those that are no rows."""
+    return jnp.where(is_row, rows, cache.capacity)
+
+
+def _pairs(means, confidences, counts, camera: Camera, min_confidence: float) -> PixelPairs:
+    """Pairs of all views with the pivots of some rows: `means` [n k 3], `confidences` [n k], `counts` [n]."""
+    is_visible = (jnp.arange(means.shape[1]) < counts[:, None]) & (confidences >= min_confidence)
+    return project_points(means.reshape(-1, 3), jnp.where(is_visible, confidences, 0.0).reshape(-1), camera)
+
+
+def project_points(points: Float[Array, "n 3"], weights: Float[Array, " n"], camera: Camera) -> PixelPairs:
+    """Pairs of all views with `points`, view-major; points of weight 0 or NaN are not seen."""
+    # Written out per coordinate: three rows of products vectorize over the points, a 3 x 3 matrix product does not.
+    px, py, pz = jnp.moveaxis(points, -1, 0)
+    views = camera.viewmats[:, :3, :, None]
+    x, y, z = (views[:, i, 0] * px + views[:, i, 1] * py + views[:, i, 2] * pz + views[:, i, 3] for i in range(3))
+    in_front = (z > NEAR) & jnp.isfinite(z) & (weights > 0)
+    inverse_z = 1.0 / jnp.where(in_front, z, 1.0)
+    Ks = camera.Ks[:, :, :, None]
+    u = Ks[:, 0, 0] * x * inverse_z + Ks[:, 0, 2]
+    v = Ks[:, 1, 1] * y * inverse_z + Ks[:, 1, 2]
+    is_seen = in_front & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    columns, rows = (jnp.where(is_seen, jnp.floor(c), 0.0).astype(jnp.int32) for c in (u, v))
+    first_pixel = jnp.arange(len(camera.viewmats), dtype=jnp.int32)[:, None] * (camera.height * camera.width)
+    num_pixels = len(camera.viewmats) * camera.height * camera.width
+    return PixelPairs(
+        pixels=jnp.where(is_seen, first_pixel + rows * camera.width + columns, num_pixels).reshape(-1),
+        log_depths=jnp.where(is_seen, jnp.log(jnp.where(is_seen, z, 1.0)), 0.0).reshape(-1),
+        weights=jnp.where(is_seen, weights, 0.0).reshape(-1),
+    )

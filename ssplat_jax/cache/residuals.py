@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ssplat_jax.cache.voxels import voxel_indices
+from ssplat_jax.cache.hash_table import voxel_indices
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.gaussians import SH_C0, Gaussians
 from ssplat_jax.core.numerics import clip_value

@@ -1,41 +1,57 @@
-"""`VoxelCache`: the stream's only memory, a pytree of fixed size (Sec. 3.4, VACC)."""
+"""`VoxelCache`: the stream's only memory, a pytree of fixed size (Sec. 3.4, VACC), and how it grows between steps.
 
+When the cache is full, `config.memory.overflow` decides:
+
+    grow      the host doubles the capacity before a step that might not fit (`ensure_capacity`)
+    drop_new  tokens that open a new voxel are dropped and counted
+
+Nothing raises inside jit: losses are counted in `cache.stats`, and `check_cache` reads the counters on the host:
+
+    cache = ensure_capacity(cache, config, num_new_tokens)
+    cache, out = step(params, cache, chunk)
+    check_cache(cache, config)
+"""
+
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ssplat_jax.cache.hash_table import SLOTS_PER_ROW
+from ssplat_jax.cache.hash_table import SLOTS_PER_ROW, build_table
 from ssplat_jax.cache.key_views import NUM_KEY_VIEWS, KeyViews, empty_key_views
 from ssplat_jax.cache.residuals import empty_residuals
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.core.errors import InputError
+from ssplat_jax.core.errors import CacheError, InputError
 from ssplat_jax.core.pytree import pytree, replace
 
+NUM_OBSERVED = 9
+"""Numbers that a pivot's observations hold (`observations.py`)."""
 
-def saturating_add(counter: Int[Array, ""], more: Int[Array, ""]) -> Int[Array, ""]:
-    """`counter + more` for numbers that are not negative; stops at the largest integer instead of overflowing."""
-    return counter + jnp.minimum(more, jnp.iinfo(counter.dtype).max - counter)
+NUM_STORED, STORED_CELLS = 32, 32
+"""Past chunks of which a coarse depth map is kept while views carve, to vote on the tokens of later chunks, and the
+cells of such a map along each side."""
 
 
 @pytree
 class CacheStats:
     """Counters over the whole stream, to be read outside jit (`check_cache`).
 
-    They stop at 2^31 - 1 (`saturating_add`), which tokens of 4 views at 1080p reach after 4000 chunks.
+    They stop at 2^31 - 1 , which tokens of 4 views at 1080p reach after 4000 chunks.
     """
 
     num_chunks: Int[Array, ""]
     num_seen: Int[Array, ""]  # tokens of valid views offered to the cache
     num_accepted: Int[Array, ""]  # appended or merged
     num_merged: Int[Array, ""]  # accepted by a merge, which leaves the number of pivots unchanged
-    num_low_confidence: Int[Array, ""]  # rejected: below tau_conf, as predicted or after `judge`
+    num_low_confidence: Int[Array, ""]  # rejected: below tau_conf, as predicted or after `vote`
     num_non_finite: Int[Array, ""]  # rejected: NaN or infinite
     num_out_of_range: Int[Array, ""]  # rejected: voxel index outside +-2^20
     num_dropped: Int[Array, ""]  # rejected: no free row for a new voxel (overflow)
 
 
 @pytree
-class Witnesses:
-    """Coarse depth maps of one view from each of the last `w` chunks, against which later tokens are judged.
+class StoredDepths:
+    """Coarse depth maps of one view from each of the last `w` chunks, which vote on later tokens.
 
     A ring buffer: chunk `n` writes entry `n % w`. A coarse cell holds its nearest surface if all fine cells in it were
     trusted.
@@ -71,9 +87,9 @@ class VoxelCache:
     footprints: Float[Array, "capacity k"]  # width of a grid cell at the most confident member, stream units
     num_members: Int[Array, "capacity k"]  # tokens merged into the pivot
     last_chunks: Int[Array, "capacity k"]  # chunk that last wrote the pivot
-    witnesses: Witnesses
+    stored_depths: StoredDepths
     stats: CacheStats
-    sightings: Float[Array, "capacity k s"] | None = None  # what views say about the pivot (sightings.py); sums
+    observations: Float[Array, "capacity k s"] | None = None  # what views say about the pivot (observations.py); sums
     # Fields of refinement while streaming; None without it, so that the program has no trace of them.
     residuals: Float[Array, "capacity k r"] | None = None  # changes to each of the pivot's Gaussians (residuals.py)
     key_views: KeyViews | None = None  # views that the scene is compared with; None before the first chunk
@@ -86,26 +102,17 @@ class VoxelCache:
     @property
     def capacity(self) -> int:
         """Number of voxels that the cache can hold."""
-        return self.voxels.shape[0]
+        return self.voxels.shape[-2]
 
 
+# fmt: off
 PIVOT_FIELDS = (
-    "means",
-    "feats",
-    "seeds",
-    "confidences",
-    "rgbs",
-    "quats",
-    "footprints",
-    "num_members",
-    "last_chunks",
+    "means", "feats", "seeds", "confidences", "rgbs", "quats", "footprints", "num_members", "last_chunks",
 )
+# fmt: on
 """Fields of every `VoxelCache` with one entry per pivot, `[capacity, k, ...]`."""
 
-NUM_SIGHTINGS = 9
-"""Numbers that a pivot's sightings hold (`sightings.py`)."""
-
-OPTIONAL_PIVOT_FIELDS = ("sightings", "residuals")
+OPTIONAL_PIVOT_FIELDS = ("observations", "residuals")
 """Further such fields, None where the configuration does not ask for them."""
 
 
@@ -125,26 +132,6 @@ class Tokens:
     quats: Float[Array, "m 4"]  # orientation of the camera that saw the token, camera-to-world, wxyz
     footprints: Float[Array, " m"]
     valid: Bool[Array, " m"]  # False for padding, which is neither used nor counted
-
-
-WITNESS_CELLS = 32
-"""Coarse cells of a witness along each side of its view."""
-
-
-NUM_WITNESSES = 32
-"""Past chunks of which a coarse depth map is kept, to judge the tokens of later chunks while views carve."""
-
-
-def init_witnesses(config: StreamConfig) -> Witnesses:
-    """Empty witnesses; none without carving."""
-    w = NUM_WITNESSES if config.memory.carving else 0
-    cells = (w, WITNESS_CELLS, WITNESS_CELLS)
-    return Witnesses(
-        viewmats=jnp.zeros((w, 4, 4)),
-        Ks=jnp.zeros((w, 3, 3)),
-        log_depths=jnp.zeros(cells),
-        weights=jnp.zeros(cells),
-    )
 
 
 def require_single_cache(cache: VoxelCache, caller: str) -> None:
@@ -170,6 +157,7 @@ def init_cache(config: StreamConfig, capacity: int | None = None) -> VoxelCache:
     if capacity < 1 or capacity & (capacity - 1):
         raise InputError(f"cache: capacity must be a power of two, got {capacity}.")
     k, c = config.memory.pivots_per_voxel, config.network.token_width
+    w = NUM_STORED if config.memory.carving else 0
     zero = lambda: jnp.zeros((), jnp.int32)  # noqa: E731 - one fresh buffer per counter, so that all can be donated
     return VoxelCache(
         voxels=jnp.zeros((capacity, 3), jnp.int32),
@@ -185,9 +173,14 @@ def init_cache(config: StreamConfig, capacity: int | None = None) -> VoxelCache:
         footprints=jnp.zeros((capacity, k)),
         num_members=jnp.zeros((capacity, k), jnp.int32),
         last_chunks=jnp.zeros((capacity, k), jnp.int32),
-        witnesses=init_witnesses(config),
+        stored_depths=StoredDepths(
+            viewmats=jnp.zeros((w, 4, 4)),
+            Ks=jnp.zeros((w, 3, 3)),
+            log_depths=jnp.zeros((w, STORED_CELLS, STORED_CELLS)),
+            weights=jnp.zeros((w, STORED_CELLS, STORED_CELLS)),
+        ),
         stats=CacheStats(*(zero() for _ in range(8))),
-        sightings=jnp.zeros((capacity, k, NUM_SIGHTINGS)) if config.head.evidence else None,
+        observations=jnp.zeros((capacity, k, NUM_OBSERVED)) if config.head.evidence else None,
         residuals=empty_residuals(capacity, config) if config.stream.steps_per_chunk else None,
     )
 
@@ -208,3 +201,67 @@ def with_refinement(cache: VoxelCache, config: StreamConfig, height: int, width:
         wanted, got = "x".join(map(str, key_views.images.shape)), "x".join(map(str, slots))
         raise InputError(f"cache: wanted key views of {wanted} as before, got {got}; keep the size.")
     return replace(cache, residuals=residuals, key_views=key_views)
+
+
+# Capacity -------------------------------------------------------------------------------------------------------------
+
+
+def ensure_capacity(cache: VoxelCache, config: StreamConfig, num_new_tokens: int) -> VoxelCache:
+    """`cache`, doubled as often as needed to hold `num_new_tokens` more even if each opens a new voxel.
+
+    Call it outside jit. Only `overflow="grow"` changes the cache. Rows keep their numbers, so the stream continues
+    exactly as if the cache had had the new capacity from the start. The step is compiled again for a new capacity;
+    doubling limits the number of compilations to log2 of the final size.
+
+    Args:
+        cache: the cache before a step.
+        config: its `overflow` decides, and its `vacc` how many rows new tokens can fill.
+        num_new_tokens: tokens of the coming chunk, one per 4 x 4 pixels of the padded images
+            (`ssplat_jax.streaming.session.tokens_per_chunk`).
+
+    Returns:
+        The cache itself, or a larger copy.
+    """
+    capacity = required_capacity(cache, config, num_new_tokens)
+    return cache if capacity == cache.capacity else grow(cache, capacity)
+
+
+def required_capacity(caches: VoxelCache, config: StreamConfig, num_new_tokens: int) -> int:
+    """The capacity to which `ensure_capacity` enlarges a cache, or caches with leading axes, alike."""
+    new_rows = num_new_tokens if config.memory.vacc == "voxel" else -(-num_new_tokens // config.memory.pivots_per_voxel)
+    capacity, num_voxels = caches.capacity, int(jnp.max(caches.num_voxels))
+    while config.memory.overflow == "grow" and capacity < num_voxels + new_rows:
+        capacity *= 2
+    return capacity
+
+
+def grow(cache: VoxelCache, capacity: int) -> VoxelCache:
+    """`cache` enlarged to `capacity` voxels, a power of two.
+
+    Raises:
+        InputError: `capacity` is below the present one or no power of two.
+    """
+    extra = capacity - cache.capacity
+    if extra < 0 or capacity & (capacity - 1):
+        raise InputError(f"cache: capacity must be a power of two of at least {cache.capacity}, got {capacity}.")
+    rows = {name: getattr(cache, name) for name in ("voxels", "counts", *pivot_fields(cache))}
+    rows = {name: jnp.pad(x, [(0, extra)] + [(0, 0)] * (x.ndim - 1)) for name, x in rows.items()}
+    # With vacc="append" the table is empty: rows have no voxel of their own to be entered by.
+    num_entered = jnp.where(jnp.any(cache.table >= 0), cache.num_voxels, 0)
+    return replace(cache, table=jax.jit(build_table)(rows["voxels"], num_entered), **rows)
+
+
+def check_cache(caches: VoxelCache, config: StreamConfig) -> None:
+    """Raises if a cache, or one of several with leading axes, lost tokens that its overflow policy promises to keep.
+
+    Call it outside jit.
+
+    Raises:
+        CacheError: tokens were dropped under `overflow="grow"`.
+    """
+    num_dropped = int(np.sum(caches.stats.num_dropped))
+    if num_dropped and config.memory.overflow == "grow":
+        raise CacheError(
+            f"cache: wanted to keep every token, but {num_dropped} did not fit in {caches.capacity} voxels; "
+            "call cache.ensure_capacity(cache, config, num_new_tokens) before each step."
+        )

@@ -10,8 +10,8 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ssplat_jax.cache.sightings import features_of_sightings
-from ssplat_jax.cache.state import NUM_SIGHTINGS
+from ssplat_jax.cache.observations import observation_features
+from ssplat_jax.cache.state import NUM_OBSERVED
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.numerics import safe_log, safe_sqrt
 from ssplat_jax.core.pytree import pytree, replace
@@ -30,7 +30,7 @@ WIDTH = 32
 class Evidence:
     """Facts about `m` pivots in the cache, besides their features."""
 
-    sightings: Float[Array, "m s"]
+    observations: Float[Array, "m s"]
     confidences: Float[Array, " m"]
     num_members: Float[Array, " m"]
     num_pivots: Float[Array, " m"]  # in the same voxel
@@ -55,7 +55,7 @@ class EvidenceHead(nn.Module):
 def num_features() -> int:
     """Number of inputs of the evidence head."""
     one = jnp.ones(1)
-    evidence = Evidence(jnp.zeros((1, NUM_SIGHTINGS)), one, one, one, one, one, jnp.zeros((1, 3)))
+    evidence = Evidence(jnp.zeros((1, NUM_OBSERVED)), one, one, one, one, one, jnp.zeros((1, 3)))
     return evidence_features(evidence, StreamConfig()).shape[1]
 
 
@@ -63,7 +63,7 @@ def evidence_features(evidence: Evidence, config: StreamConfig) -> Float[Array, 
     """Evidence as numbers of about unit size.
 
     Limits:
-        Confidences of 0 and 1, zero sightings and zero footprints, as dead pivots have them, and equal colors give
+        Confidences of 0 and 1, zero observations and zero footprints, as dead pivots have them, and equal colors give
         finite features with finite gradients.
     """
     omega = jnp.clip(evidence.confidences, 1e-3, 0.96)
@@ -77,7 +77,7 @@ def evidence_features(evidence: Evidence, config: StreamConfig) -> Float[Array, 
         10 * safe_sqrt(jnp.var(colors, axis=1)).mean(axis=-1) - 0.5,
         2 * colors.mean(axis=(1, 2)) - 1.0,
     )
-    return jnp.concatenate([jnp.stack(features, axis=-1), features_of_sightings(evidence.sightings)], axis=-1)
+    return jnp.concatenate([jnp.stack(features, axis=-1), observation_features(evidence.observations)], axis=-1)
 
 
 def apply_evidence(

@@ -26,12 +26,12 @@ from ssplat_jax.cache import (
     coarsen,
     fuse,
     init_cache,
-    judge,
     project,
-    store_witness,
+    store_depths,
+    vote,
 )
+from ssplat_jax.cache.observations import observe, seen_cells
 from ssplat_jax.cache.residuals import revise, unpack
-from ssplat_jax.cache.sightings import add_sightings, cells_of
 from ssplat_jax.cache.state import pivot_fields
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.chunk import Chunk, check_chunk
@@ -149,25 +149,25 @@ class StreamSplat:
         return self.update_cache(cache, prediction), prediction.output
 
     def update_cache(self, cache: VoxelCache, prediction: Prediction) -> VoxelCache:
-        """The cache after a chunk: tokens are judged and fused (VACC), all pivots carved and their sightings counted.
+        """The cache after a chunk: stored depths vote on its tokens, which are fused (VACC), and views on all pivots.
 
         Carving includes the new pivots, so views of one chunk that disagree lower each other's confidences at once. No
         gradient flows.
         """
         prediction = jax.lax.stop_gradient(prediction)
         seen = (prediction.views.grid_camera, prediction.output.depths, prediction.output.confidences)
-        with jax.named_scope("judge"):
-            tokens = judge(cache.witnesses, prediction.tokens, self.config)
+        with jax.named_scope("votes"):
+            tokens = vote(cache.stored_depths, prediction.tokens, self.config)
         with jax.named_scope("VACC"):
             cache = fuse(cache, tokens, self.config, axis=self.axis)
         with jax.named_scope("carve"):
             cache = carve(cache, *seen, self.config)
-            cache = store_witness(cache, *seen, self.config)
-        if cache.sightings is None:
+            cache = store_depths(cache, *seen, self.config)
+        if cache.observations is None:
             return cache
-        with jax.named_scope("sightings"):
-            cells = cells_of(*seen[1:], tokens.rgbs, self.config)
-            return add_sightings(cache, prediction.views.grid_camera, cells, self.config, axis=self.axis)
+        with jax.named_scope("observations"):
+            cells = seen_cells(*seen[1:], tokens.rgbs, self.config)
+            return observe(cache, prediction.views.grid_camera, cells, self.config, axis=self.axis)
 
     def run(self, params: dict, cache: VoxelCache, chunks: Chunk) -> tuple[VoxelCache, ChunkOutput]:
         """`step` over stacked chunks (leading axis t) as one `lax.scan`.
@@ -211,9 +211,9 @@ class StreamSplat:
         flat = lambda x: take(x.reshape(-1, *x.shape[2:]))  # noqa: E731
         shapes, footprints = self._read_shapes(params, flat(cache.feats)), merged_footprints(cache, self.config)
         rgbs = flat(cache.rgbs)
-        if cache.sightings is not None:
+        if cache.observations is not None:
             evidence = stages.Evidence(
-                sightings=flat(cache.sightings),
+                observations=flat(cache.observations),
                 confidences=flat(cache.confidences),
                 num_members=flat(cache.num_members).astype(jnp.float32),
                 num_pivots=flat(jnp.broadcast_to(cache.counts[:, None], cache.confidences.shape)).astype(jnp.float32),

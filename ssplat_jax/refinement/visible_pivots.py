@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from ssplat_jax.cache.key_views import KeyViews
-from ssplat_jax.cache.pixel_pairs import NEAR
+from ssplat_jax.cache.project import NEAR
 from ssplat_jax.cache.state import VoxelCache
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.model import GRID_STRIDE

@@ -17,8 +17,8 @@ from ssplat_jax.cache.state import (
     OPTIONAL_PIVOT_FIELDS,
     PIVOT_FIELDS,
     CacheStats,
+    StoredDepths,
     VoxelCache,
-    Witnesses,
     require_single_cache,
 )
 from ssplat_jax.core.atomic import previous_path
@@ -28,7 +28,7 @@ from ssplat_jax.storage.npz import load_arrays, save_arrays
 KIND = "stream state 3"  # version 2 added witnesses; version 3 colors per part of a patch, at one exposure
 _ROW_FIELDS = ("voxels", "counts", *PIVOT_FIELDS, *OPTIONAL_PIVOT_FIELDS)  # arrays with one row per voxel
 
-_GROUPS = {"stats": CacheStats, "witnesses": Witnesses, "key_views": KeyViews}  # parts with fields of their own
+_GROUPS = {"stats": CacheStats, "stored_depths": StoredDepths, "key_views": KeyViews}  # parts with fields of their own
 
 
 def save_state(path: Path, cache: VoxelCache, header: dict[str, Any]) -> None:

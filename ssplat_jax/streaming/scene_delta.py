@@ -8,7 +8,7 @@
 
 A voxel's Gaussians change when a token is written to it, which the cache records per pivot (`last_chunks`); when views
 carve a pivot away or restore it; and, with evidence, when views see a shown pivot. The feed detects the last two by
-comparing the shown pivots and their sightings with the previous ones.
+comparing the shown pivots and their observations with the previous ones.
 """
 
 import dataclasses
@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int32
 
 from ssplat_jax.cache import VoxelCache
-from ssplat_jax.cache.sightings import total_sightings
+from ssplat_jax.cache.observations import total_weight
 from ssplat_jax.cache.state import require_single_cache
 from ssplat_jax.core.gaussians import Gaussians, mask_gaussians
 from ssplat_jax.model.streamsplat import StreamSplat, shown_pivots
@@ -46,7 +46,7 @@ class _Record(NamedTuple):
 
     next_chunk: int
     shown: Bool[np.ndarray, "n k"]
-    seen: Float32[np.ndarray, "n k"]  # total sightings
+    seen: Float32[np.ndarray, "n k"]  # total weight of the observations
 
 
 class SceneFeed:
@@ -61,7 +61,7 @@ class SceneFeed:
     def __init__(self, model: StreamSplat, params: dict, known: VoxelCache | None = None) -> None:
         self._params = params
         self._shown_pivots = jax.jit(lambda cache: shown_pivots(cache, model.config))
-        self._total_sightings = jax.jit(lambda cache: total_sightings(cache.sightings))
+        self._total_weight = jax.jit(lambda cache: total_weight(cache.observations))
         self._decode_rows = jax.jit(model.decode_rows)
         shape = (0, model.config.memory.pivots_per_voxel)
         self._record = _Record(0, np.zeros(shape, bool), np.zeros(shape, np.float32))
@@ -98,8 +98,8 @@ class SceneFeed:
         shown, seen = np.asarray(self._shown_pivots(cache)), last.seen
         is_changed = np.asarray(cache.alive) & (np.asarray(cache.last_chunks) >= last.next_chunk)
         is_changed |= shown != np.pad(last.shown, more)
-        if cache.sightings is not None:
-            seen = np.asarray(self._total_sightings(cache))
+        if cache.observations is not None:
+            seen = np.asarray(self._total_weight(cache))
             is_changed |= shown & (seen != np.pad(last.seen, more))
         rows = np.flatnonzero(is_changed.any(axis=1)).astype(np.int32)
         return rows, _Record(int(cache.stats.num_chunks), shown, seen)

@@ -7,8 +7,8 @@
 A voxel lies entirely in the shard that its hash selects. Every shard receives all tokens and fuses and counts those of
 its own voxels, so nothing moves between caches. Only the projection communicates: it sums over the shards.
 
-Caches are a `VoxelCache` with two leading axes, streams and shards. The witnesses and `stats.num_chunks` are equal on
-all shards of a stream; the other counters add up.
+Caches are a `VoxelCache` with two leading axes, streams and shards. The stored depths and `stats.num_chunks` are equal
+on all shards of a stream; the other counters add up.
 """
 
 import dataclasses
@@ -21,8 +21,8 @@ from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 from jaxtyping import PyTree
 
-from ssplat_jax.cache import VoxelCache, grow
-from ssplat_jax.cache.capacity import check_dropped, required_capacity
+from ssplat_jax.cache import VoxelCache, check_cache, grow
+from ssplat_jax.cache.state import required_capacity
 from ssplat_jax.core.chunk import Chunk
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.core.gaussians import Gaussians
@@ -124,11 +124,8 @@ class ShardedStream:
 
     def ensure_capacity(self, caches: VoxelCache, num_new_tokens: int) -> VoxelCache:
         """`caches`, all grown alike if any might not hold `num_new_tokens` more; see `cache.ensure_capacity`."""
-        config, capacity = self.model.config, caches.voxels.shape[2]
-        if config.memory.overflow != "grow":
-            return caches
-        wanted = required_capacity(capacity, int(jnp.max(caches.num_voxels)), num_new_tokens, config)
-        if wanted == capacity:
+        wanted = required_capacity(caches, self.model.config, num_new_tokens)
+        if wanted == caches.capacity:
             return caches
 
         def grow_device(shards):
@@ -142,7 +139,7 @@ class ShardedStream:
         Raises:
             CacheError: tokens were dropped under `overflow="grow"`.
         """
-        check_dropped(int(jnp.sum(caches.stats.num_dropped)), caches.voxels.shape[2], self.model.config)
+        check_cache(caches, self.model.config)
 
     @property
     def _cache_spec(self) -> P:

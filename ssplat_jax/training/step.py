@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int
 
-from ssplat_jax.cache import Tokens, VoxelCache, judge
+from ssplat_jax.cache import Tokens, VoxelCache, vote
 from ssplat_jax.core.gaussians import Gaussians, mask_gaussians, mean_color
 from ssplat_jax.core.pytree import pytree
 from ssplat_jax.evaluation.lpips import LpipsWeights
@@ -105,17 +105,17 @@ def pad_like(truth: Float[Array, "v h w"], predicted: Float[Array, "v hf wf"]) -
 def decode_accepted(model: StreamSplat, params: dict, cache: VoxelCache, tokens: Tokens) -> Gaussians:
     """Gaussians of the tokens that inference would accept, without merging.
 
-    Those are the tokens whose confidence, after the witnesses in `cache` judged it, is at least `min_confidence`.
+    Those are the tokens whose confidence, after the votes of depths stored in `cache`, is at least `min_confidence`.
 
     Args:
         model: the model.
         params: its parameters.
-        cache: gives the witnesses; a constant.
+        cache: gives the stored depths; a constant.
         tokens: tokens of all chunks.
     """
     gaussians = model.decode_tokens(params, tokens)
-    judged = judge(*jax.lax.stop_gradient((cache.witnesses, tokens)), model.config)
-    is_accepted = tokens.valid & (judged.confidences >= model.config.memory.min_confidence)
+    revised = vote(*jax.lax.stop_gradient((cache.stored_depths, tokens)), model.config)
+    is_accepted = tokens.valid & (revised.confidences >= model.config.memory.min_confidence)
     return mask_gaussians(gaussians, model.repeat_per_gaussian(is_accepted))
 
 

@@ -6,8 +6,15 @@ import numpy as np
 import pytest
 
 from ssplat_jax.cache.fuse import _stable_order
-from ssplat_jax.cache.hash_table import build_table, find_rows, group_equal, insert_rows
-from ssplat_jax.cache.voxels import INDEX_LIMIT, hash_voxels, voxel_indices
+from ssplat_jax.cache.hash_table import (
+    INDEX_LIMIT,
+    build_table,
+    find_rows,
+    group_equal,
+    hash_voxels,
+    insert_rows,
+    voxel_indices,
+)
 
 RNG = np.random.default_rng(0)
 
@@ -21,17 +28,12 @@ def test_voxel_is_the_floor_of_one_float32_product(voxel_size):
     assert np.all(np.asarray(in_range))
 
 
-@pytest.mark.parametrize("cell", [INDEX_LIMIT, -INDEX_LIMIT, 1e30, np.inf, -np.inf, np.nan])
-def test_out_of_range_gives_index_zero_and_false(cell):
-    voxels, in_range = voxel_indices(jnp.array([[0.0, cell * 0.25, 1.0]]), 0.25)
-    assert not bool(in_range[0]) and not np.any(np.asarray(voxels))
-
-
-def test_last_voxels_in_range_are_kept():
-    cells = np.array([[INDEX_LIMIT - 1, 1 - INDEX_LIMIT, 0]])
-    voxels, in_range = voxel_indices(jnp.asarray((cells + 0.5) * 0.25, jnp.float32), 0.25)
-    assert bool(in_range[0])
-    np.testing.assert_array_equal(voxels, cells)
+def test_indices_out_of_range_are_zero():
+    cells = jnp.array([INDEX_LIMIT, -INDEX_LIMIT, 1e30, jnp.inf, -jnp.inf, jnp.nan, INDEX_LIMIT - 0.5, 1 - INDEX_LIMIT])
+    points = jnp.stack([jnp.zeros(8), cells * 0.25, jnp.ones(8)], axis=-1)
+    voxels, in_range = voxel_indices(points, 0.25)
+    assert np.asarray(in_range).tolist() == [False] * 6 + [True] * 2 and not np.any(np.asarray(voxels)[:6])
+    np.testing.assert_array_equal(voxels[6:, 1], [INDEX_LIMIT - 1, 1 - INDEX_LIMIT])
 
 
 def test_hash_spreads_a_plane_of_voxels_like_random_keys():

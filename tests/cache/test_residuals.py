@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from ssplat_jax.cache import grow, init_cache
+from ssplat_jax.cache.hash_table import voxel_indices
 from ssplat_jax.cache.residuals import (
     FACE_MARGIN,
     MAX_COLOR,
@@ -21,7 +22,6 @@ from ssplat_jax.cache.residuals import (
     settle,
     unpack,
 )
-from ssplat_jax.cache.voxels import voxel_indices
 from ssplat_jax.core.gaussians import SH_C0, Gaussians
 from tests.cache.streams import CAPACITY, CONFIG, PAIRS, Recipe, fuse, revised, to_jax
 

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ssplat_jax.cache.voxels import INDEX_LIMIT, hash_voxels, voxel_indices
+from ssplat_jax.cache.hash_table import INDEX_LIMIT, hash_voxels, voxel_indices
 from ssplat_jax.core.cameras import Camera, invert_poses, pixel_grid, project_points, transform_points, unproject
 from tests.core.test_rotations import rodrigues
 

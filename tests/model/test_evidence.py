@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ssplat_jax.cache import init_cache
-from ssplat_jax.cache.state import NUM_SIGHTINGS
+from ssplat_jax.cache.state import NUM_OBSERVED
 from ssplat_jax.config import PRESETS, preset
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.model.evidence import (
@@ -38,7 +38,7 @@ def shapes(num: int = NUM) -> TokenShapes:
 def evidence(value: float = 1.0, num: int = NUM) -> Evidence:
     """Evidence whose fields all have one value."""
     each = jnp.full(num, value)
-    return Evidence(jnp.full((num, NUM_SIGHTINGS), value), each, each, each, each, each, jnp.full((num, 12), value))
+    return Evidence(jnp.full((num, NUM_OBSERVED), value), each, each, each, each, each, jnp.full((num, 12), value))
 
 
 def head_with(bias: float) -> dict:
@@ -68,7 +68,7 @@ def cache_of_pivots(num: int = 6):
         quats=set_rows(cache.quats, rng.normal(size=(num, 4))),
         footprints=set_rows(cache.footprints, np.full(num, 0.02)),
         num_members=set_rows(cache.num_members, np.arange(1, num + 1)),
-        sightings=set_rows(cache.sightings, rng.uniform(0, 5, (num, NUM_SIGHTINGS))),
+        observations=set_rows(cache.observations, rng.uniform(0, 5, (num, NUM_OBSERVED))),
     )
 
 
@@ -83,7 +83,7 @@ def test_the_untrained_scene_is_that_without_evidence():
     off = CONFIG.replace(evidence=False)
     params, cache = StreamSplat(CONFIG).init(jax.random.key(1)), cache_of_pivots()
     with_evidence = StreamSplat(CONFIG).decode(params, cache)
-    without = StreamSplat(off).decode(params, replace(cache, sightings=None))
+    without = StreamSplat(off).decode(params, replace(cache, observations=None))
     jax.tree.map(np.testing.assert_array_equal, with_evidence, without)
 
 
@@ -141,7 +141,7 @@ def test_the_gradient_by_colors_is_finite_where_all_are_equal():
 
 def test_pivots_that_fit_and_pivots_that_do_not_differ_in_features():
     good, bad = evidence(), evidence()
-    bad = replace(bad, sightings=bad.sightings.at[:, 3].mul(5.0))
+    bad = replace(bad, observations=bad.observations.at[:, 3].mul(5.0))
     assert not np.array_equal(evidence_features(good, CONFIG), evidence_features(bad, CONFIG))
 
 
@@ -150,7 +150,7 @@ def test_evidence_is_on_in_tiny_alone(name):
     config = preset(name)
     assert config.head.evidence == (name == "tiny")
     small = config.replace(capacity=128)
-    assert (init_cache(small).sightings is not None) == (name == "tiny")
+    assert (init_cache(small).observations is not None) == (name == "tiny")
     assert ("evidence" in init_params(jax.random.key(0), small, only=("evidence",))) == (name == "tiny")
 
 
@@ -158,7 +158,7 @@ def test_the_head_has_no_input_that_it_does_not_know():
     params = init_params(jax.random.key(0), CONFIG, only=("evidence",))["evidence"]
     assert params["hidden1"]["kernel"].shape[0] == evidence_features(evidence(), CONFIG).shape[1]
     assert EvidenceHead().apply({"params": params}, evidence_features(evidence(), CONFIG)).shape == (NUM, 4)
-    assert {field.name for field in dataclasses.fields(Evidence)} >= {"sightings", "num_members"}
+    assert {field.name for field in dataclasses.fields(Evidence)} >= {"observations", "num_members"}
 
 
 def test_the_scene_has_the_contrast_that_the_head_asks_for():

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from ssplat_jax.cache import Tokens, fuse, init_cache
+from ssplat_jax.cache.hash_table import voxel_indices
 from ssplat_jax.cache.key_views import KeyViews
 from ssplat_jax.cache.residuals import WIDTH as RESIDUAL_WIDTH
 from ssplat_jax.cache.residuals import Residuals, unpack
 from ssplat_jax.cache.state import with_refinement
-from ssplat_jax.cache.voxels import voxel_indices
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.chunk import Chunk

@@ -2,7 +2,7 @@
 
 A capture on disk and copies of it with all poses moved, turned or scaled are streamed from `open_capture` to Gaussians
 in the capture's frame. The stream frame stands at the first camera, so all copies are the same stream to float64
-rounding, voxels included. A stream frame elsewhere shows what this alignment prevents.
+rounding, voxels included.
 """
 
 import dataclasses
@@ -47,20 +47,14 @@ CONFIG = small.CONFIG.replace(
 
 EARTH = np.array([4.2e6, -2.7e6, 4.0e6]) + 0.123  # 6.4e6 from the origin, and no number that float32 could hold
 TURN = rodrigues([0.3, -0.8, 0.52], 2.0)
-SOMEWHERE = np.array([3.0, -7.0, 2.0])
 
 MOTIONS = {  # scale, rotation, translation of the world
     "shifted by 6.4e6": (1.0, np.eye(3), EARTH),
-    "turned and shifted": (1.0, TURN, SOMEWHERE),
     "turned and shifted by 6.4e6": (1.0, TURN, EARTH),
-    "in millimeters": (1000.0, np.eye(3), np.zeros(3)),
-    "in another unit, turned and shifted": (0.013, TURN, SOMEWHERE),
+    "in another unit, turned and shifted": (0.013, TURN, np.array([3.0, -7.0, 2.0])),
 }
 
-
-@pytest.fixture(autouse=True)
-def _compiled_plainly(compiled_plainly):
-    pass
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("compiled_plainly")]
 
 
 @functools.cache
@@ -81,13 +75,6 @@ def scene():
     return np.stack(images), poses, K
 
 
-def moved_poses(scale, rotation, translation):
-    poses = scene()[1].copy()
-    poses[:, :3, :3] = rotation @ poses[:, :3, :3]
-    poses[:, :3, 3] = scale * poses[:, :3, 3] @ rotation.T + translation
-    return poses
-
-
 @pytest.fixture(scope="module")
 def open_moved(tmp_path_factory):
     """The capture of `scene()` in a moved world, written to disk and opened."""
@@ -96,7 +83,10 @@ def open_moved(tmp_path_factory):
     def opened(name: str | None) -> Capture:
         images, poses, K = scene()
         if name is not None:
-            poses = moved_poses(*MOTIONS[name])
+            scale, rotation, translation = MOTIONS[name]
+            poses = poses.copy()
+            poses[:, :3, :3] = rotation @ poses[:, :3, :3]
+            poses[:, :3, 3] = scale * poses[:, :3, 3] @ rotation.T + translation
         folder = tmp_path_factory.mktemp("capture")
         frames = []
         for i, (image, pose) in enumerate(zip(images, poses, strict=True)):
@@ -111,11 +101,10 @@ def open_moved(tmp_path_factory):
 
 
 @functools.cache
-def programs(vacc: str):
-    """`predict`, `update_cache` and `decode`, jitted. `predict` does not depend on `vacc` and is compiled once."""
-    model = StreamSplat(CONFIG.replace(vacc=vacc))
-    predict = programs("voxel")[0] if vacc == "append" else jax.jit(model.predict)
-    return predict, jax.jit(model.update_cache), jax.jit(model.decode)
+def programs():
+    """`step` and `decode`, jitted."""
+    model = StreamSplat(CONFIG)
+    return jax.jit(model.step), jax.jit(model.decode)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -132,14 +121,13 @@ class Streamed:
 
 
 @functools.cache
-def stream(capture: Capture, vacc: str, frame: StreamFrame | None = None, num_frames: int = FRAMES) -> Streamed:
-    """Streams the capture from images to Gaussians; `frame` defaults to the capture's own."""
-    predict, update_cache, decode = programs(vacc)
-    frame = frame or capture.stream_frame(CONFIG)
+def stream(capture: Capture) -> Streamed:
+    """Streams the capture from images to Gaussians in its own frame."""
+    (step, decode), frame = programs(), capture.stream_frame(CONFIG)
     params, cache = random_params(CONFIG, seed=1), init_cache(CONFIG)
-    for chunk in capture.chunks(CONFIG, range(num_frames), frame=frame):
-        cache = update_cache(cache, predict(params, cache, chunk))
-    assert (int(cache.stats.num_merged) > 0) == (vacc == "voxel") and int(cache.stats.num_dropped) == 0
+    for chunk in capture.chunks(CONFIG, range(FRAMES), frame=frame):
+        cache, _ = step(params, cache, chunk)
+    assert int(cache.stats.num_merged) > 0 and int(cache.stats.num_dropped) == 0
     in_stream = decode(params, cache)
     gaussians = frame.gaussians_to_capture(in_stream)
     rows = np.asarray(in_stream.opacities) > 0
@@ -154,18 +142,11 @@ def stream(capture: Capture, vacc: str, frame: StreamFrame | None = None, num_fr
     )
 
 
-def pairs(points, others):
-    """Distance of each point to the nearest of the others, and its index."""
-    return cKDTree(others).query(points)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("vacc", ["voxel", "append"])
 @pytest.mark.parametrize("name", MOTIONS)
-def test_moving_the_world_moves_the_gaussians(open_moved, name, vacc):
+def test_moving_the_world_moves_the_gaussians(open_moved, name):
     scale, rotation, translation = MOTIONS[name]
-    a, b = stream(open_moved(None), vacc), stream(open_moved(name), vacc)
-    distances, nearest = pairs(a.means, (b.means - translation) @ rotation / scale)
+    a, b = stream(open_moved(None)), stream(open_moved(name))
+    distances, nearest = cKDTree((b.means - translation) @ rotation / scale).query(a.means)
     is_same = distances < UNSHIFTED
     # A turned pose rounds differently to float32, which can move a token across a voxel face. A shifted pose does not.
     share = 1.0 if np.array_equal(rotation, np.eye(3)) else SHARE
@@ -183,68 +164,28 @@ def test_moving_the_world_moves_the_gaussians(open_moved, name, vacc):
         assert np.quantile(np.abs(deviation).reshape(len(nearest), -1).max(axis=1), share) < UNSHIFTED
 
 
-@pytest.mark.slow  # a whole stream
-def test_ply_of_a_far_capture_is_relative_to_an_offset(open_moved, tmp_path):
+def test_the_ply_of_a_far_capture_is_relative_to_an_offset(open_moved, tmp_path):
     """At 6.4e6 float32 has a spacing of 0.5; relative to the file's offset the scene is as fine as at the origin."""
-    far = stream(open_moved("shifted by 6.4e6"), "voxel")
+    far = stream(open_moved("shifted by 6.4e6"))
     offset = far.frame.offset
-    assert np.abs(np.asarray(offset) - far.frame.origin).max() <= 0.5 and stream(
-        open_moved(None), "voxel"
-    ).frame.offset == (0, 0, 0)
-    report = save_ply(
-        tmp_path / "scene.ply", far.frame.gaussians_to_capture(far.in_stream, offset=offset), offset=offset
-    )
-    assert report.num_written == len(far.means)
+    assert np.abs(np.asarray(offset) - far.frame.origin).max() <= 0.5
+    assert stream(open_moved(None)).frame.offset == (0, 0, 0)
+    save_ply(tmp_path / "scene.ply", far.frame.gaussians_to_capture(far.in_stream, offset=offset), offset=offset)
     header = (tmp_path / "scene.ply").read_bytes().split(b"end_header")[0].decode()
     (comment,) = [line for line in header.splitlines() if line.startswith("comment offset")]
     written = np.asarray(load_ply(tmp_path / "scene.ply").means, np.float64) + [float(x) for x in comment.split()[2:]]
     np.testing.assert_allclose(written, far.means, rtol=0, atol=UNSHIFTED / 100)
 
 
-def elsewhere(frame: StreamFrame) -> StreamFrame:
-    """`frame` with the same scale and depth range, but axes and an origin that no camera has."""
-    return dataclasses.replace(frame, rotation=TURN @ frame.rotation, origin=frame.origin + SOMEWHERE / 7)
-
-
-@pytest.mark.slow
-def test_unaligned_tokens_still_move_with_the_world(open_moved):
-    """The network sees relative poses only. One token in a hundred may fall into another pixel by rounding."""
-    aligned = stream(open_moved(None), "append")
-    turned = stream(open_moved(None), "append", elsewhere(aligned.frame))
-    for name in ("means", "axes"):
-        errors = np.abs(getattr(turned, name) - getattr(aligned, name))
-        assert np.quantile(errors.reshape(len(errors), -1).max(axis=1), SHARE) < UNSHIFTED
-
-
-@pytest.mark.slow
-def test_unaligned_voxels_differ_but_cover_the_same_places(open_moved):
-    """One chunk only, because later chunks are anchored to the pivots of the first.
-
-    A token and its pivot share a voxel in either frame, so a pivot is within two diagonals of one of the other frame.
-    """
-    aligned = stream(open_moved(None), "voxel", num_frames=4)
-    turned = stream(open_moved(None), "voxel", elsewhere(aligned.frame), num_frames=4)
-    diagonal = np.sqrt(3) * VOXEL / aligned.frame.scale
-    for distances, _ in (pairs(aligned.means, turned.means), pairs(turned.means, aligned.means)):
-        assert distances.max() < 2 * diagonal
-        assert np.quantile(distances, 0.95) < diagonal
-        assert (distances > UNSHIFTED).mean() > 0.02  # alignment makes a difference
-
-
-@pytest.mark.slow
 def test_depth_range_and_scale_of_matched_captures_move_along():
     """These images are large enough for keypoints; in the other tests the scale is estimated from the steps."""
     capture = open_capture("procedural:room?frames=4&size=160x120")
-    frame = capture.stream_frame(CONFIG)
-    for name in ("turned and shifted by 6.4e6", "in another unit, turned and shifted"):
-        scale, rotation, translation = MOTIONS[name]
-        frames = []
-        for posed in capture.frames:
-            pose = posed.camtoworld.copy()
-            pose[:3, :3] = rotation @ pose[:3, :3]
-            pose[:3, 3] = scale * rotation @ pose[:3, 3] + translation
-            frames.append(dataclasses.replace(posed, camtoworld=pose))
-        moved = dataclasses.replace(capture, frames=tuple(frames)).stream_frame(CONFIG)
-        # float64 resolves a pose at 6.4e6 to 1e-9; triangulation at small parallax amplifies that.
-        got, wanted = (scale * moved.scale, moved.near, moved.far), (frame.scale, frame.near, frame.far)
-        np.testing.assert_allclose(got, wanted, rtol=1e-5)
+    frame, (scale, rotation, translation) = capture.stream_frame(CONFIG), MOTIONS["in another unit, turned and shifted"]
+    frames = []
+    for posed in capture.frames:
+        pose = posed.camtoworld.copy()
+        pose[:3, :3], pose[:3, 3] = rotation @ pose[:3, :3], scale * rotation @ pose[:3, 3] + translation
+        frames.append(dataclasses.replace(posed, camtoworld=pose))
+    moved = dataclasses.replace(capture, frames=tuple(frames)).stream_frame(CONFIG)
+    got, wanted = (scale * moved.scale, moved.near, moved.far), (frame.scale, frame.near, frame.far)
+    np.testing.assert_allclose(got, wanted, rtol=1e-5)  # triangulation at small parallax amplifies float64's rounding

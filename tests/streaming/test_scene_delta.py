@@ -37,11 +37,11 @@ def chunk(seed):
 def carved(cache, rng, config):
     """The cache after views saw some pivots, which sank below the threshold or came back."""
     factor = rng.choice([0.5, 1.0, 1.0, 1.0, 2.0], cache.confidences.shape).astype(np.float32)
-    told = rng.uniform(size=cache.sightings.shape) * ((factor != 1.0) & np.asarray(cache.alive))[..., None]
+    told = rng.uniform(size=cache.observations.shape) * ((factor != 1.0) & np.asarray(cache.alive))[..., None]
     return replace(
         cache,
         confidences=jnp.clip(cache.confidences * factor, 0.0, 0.95),
-        sightings=cache.sightings + jnp.asarray(told, jnp.float32),
+        observations=cache.observations + jnp.asarray(told, jnp.float32),
     )
 
 

@@ -177,7 +177,7 @@ def test_streams_together_equal_each_stream_alone(tmp_path):
             for name in ("depths", "confidences", "history"):
                 assert_close(getattr(output, name)[stream], np.asarray(getattr(expected, name)), name)
             assert_close_cache(shards, cache)
-            assert_same_bits(shards[0].witnesses, shards[1].witnesses)
+            assert_same_bits(shards[0].stored_depths, shards[1].stored_depths)
         assert int(cache.stats.num_merged) > 100
         opacities = scenes.opacities[stream]
         np.testing.assert_allclose(opacities.sum(), model.decode(params, cache).opacities.sum(), rtol=STEP_RTOL)

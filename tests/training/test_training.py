@@ -295,17 +295,17 @@ def test_learning_rate_warms_up_and_decays_in_every_phase():
     assert learning_rate(quiet, 199) == pytest.approx(0.02 * quiet.phases[0].learning_rate, rel=0.01)
 
 
-def test_tokens_that_a_witness_looked_through_are_not_rendered():
+def test_tokens_that_a_stored_view_looked_through_are_not_rendered():
     model = StreamSplat(NARROW)
     params, cache = random_params(NARROW), model.init_cache()
-    side = cache.witnesses.weights.shape[-1]
-    # One witness at the origin saw a wall at depth 2.
-    witnesses = replace(
-        cache.witnesses,
-        viewmats=cache.witnesses.viewmats.at[0].set(jnp.eye(4)),
-        Ks=cache.witnesses.Ks.at[0].set(jnp.array([[side, 0, side / 2], [0, side, side / 2], [0, 0, 1.0]])),
-        log_depths=cache.witnesses.log_depths.at[0].set(np.log(2.0)),
-        weights=cache.witnesses.weights.at[0].set(1.0),
+    side = cache.stored_depths.weights.shape[-1]
+    # One view at the origin saw a wall at depth 2.
+    stored = replace(
+        cache.stored_depths,
+        viewmats=cache.stored_depths.viewmats.at[0].set(jnp.eye(4)),
+        Ks=cache.stored_depths.Ks.at[0].set(jnp.array([[side, 0, side / 2], [0, side, side / 2], [0, 0, 1.0]])),
+        log_depths=cache.stored_depths.log_depths.at[0].set(np.log(2.0)),
+        weights=cache.stored_depths.weights.at[0].set(1.0),
     )
     depths = jnp.array([1.0, 2.0, 3.0, 2.0])  # a floater, the wall, a hidden token, one of low confidence
     tokens = Tokens(
@@ -318,7 +318,7 @@ def test_tokens_that_a_witness_looked_through_are_not_rendered():
         valid=jnp.ones(4, bool),
     )
     config = NARROW.replace(min_confidence=0.5)
-    shown = decode_accepted(StreamSplat(config), params, replace(cache, witnesses=witnesses), tokens).opacities > 0
+    shown = decode_accepted(StreamSplat(config), params, replace(cache, stored_depths=stored), tokens).opacities > 0
     np.testing.assert_array_equal(shown.reshape(4, -1).T, [[False, True, True, False]] * 4)
 
 

@@ -1,0 +1,272 @@
+"""The parallel fuse equals the sequential reference, and keeps the laws of the cache."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from ssplat_jax.cache import PIVOT_FIELDS, Tokens, VoxelCache, init_cache
+from ssplat_jax.cache import fuse as plain_fuse
+from ssplat_jax.cache import numpy_reference as reference
+from ssplat_jax.cache.fuse import MERGE_BLOCKS
+from ssplat_jax.cache.hash_table import voxel_indices
+from ssplat_jax.core.pytree import replace
+from tests.cache.streams import (
+    CAPACITY,
+    CONFIG,
+    NUM_TOKENS,
+    PAIRS,
+    PLACES,
+    VALUE_RTOL,
+    VARIANTS,
+    WIDTH,
+    Recipe,
+    assert_equal_to_reference,
+    assert_same_cache,
+    fuse,
+    fuse_with_rows,
+    recipes,
+    run_both,
+    to_jax,
+)
+
+CONFIGS = VARIANTS | {"single": CONFIG.replace(pivots_per_voxel=1), "refined": PAIRS.replace(steps_per_chunk=1)}
+SETTINGS = settings(max_examples=25, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+EMPTY = init_cache(CONFIG, CAPACITY)
+
+
+def run(stream, config=CONFIG, capacity=CAPACITY) -> VoxelCache:
+    cache = init_cache(config, capacity)
+    for recipe in stream:
+        cache = fuse(cache, to_jax(recipe.tokens()), config)
+    return cache
+
+
+def fused(tokens: Tokens, config=CONFIG) -> VoxelCache:
+    return fuse(jax.tree.map(jnp.copy, EMPTY), tokens, config)
+
+
+# The reference --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+@SETTINGS
+@given(st.lists(recipes, min_size=1, max_size=3))
+def test_fuse_equals_the_reference(name, stream):
+    run_both(stream, CONFIGS[name])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CONFIGS)
+@settings(SETTINGS, max_examples=500)
+@given(st.lists(recipes, min_size=1, max_size=3))
+def test_fuse_equals_the_reference_on_many_streams(name, stream):
+    run_both(stream, CONFIGS[name])
+
+
+def test_merge_rounds_of_every_size_equal_the_reference():
+    """One chunk whose rounds have more voxels than the largest block, fewer than the smallest, and all between."""
+    rng = np.random.default_rng(0)
+    repeats = np.concatenate([np.full(MERGE_BLOCKS[0][0] + 64, 5), [7, 9] * 20, [30] * 5, [60]])
+    columns = rng.permutation(np.repeat(np.arange(len(repeats)), repeats))
+    m = len(columns)
+    tokens = {
+        "means": (np.stack([columns, 0 * columns, 0 * columns], axis=-1) + rng.uniform(0.1, 0.9, (m, 3))) / 4,
+        "feats": rng.integers(-2, 3, (m, WIDTH)),
+        "confidences": rng.choice([0.2, 0.5, 0.5, 1.0], m),
+        "rgbs": rng.uniform(size=(m, 3 * CONFIG.head.gaussians_per_token)),
+        "quats": rng.normal(size=(m, 4)),
+        "footprints": rng.uniform(size=m),
+    }
+    tokens = {name: x.astype(np.float32) for name, x in tokens.items()} | {"valid": np.ones(m, bool)}
+    cache = fuse(init_cache(CONFIG, 1024), to_jax(tokens), CONFIG)
+    assert_equal_to_reference(cache, reference.fuse(reference.empty(1024), tokens, CONFIG))
+
+
+# Laws -----------------------------------------------------------------------------------------------------------------
+
+
+@SETTINGS
+@given(st.lists(recipes, min_size=1, max_size=4))
+def test_pivots_are_bounded_inside_their_voxels_findable_and_counted(stream):
+    cache = jax.tree.map(np.asarray, run(stream))
+    rows = np.arange(CAPACITY) < cache.num_voxels
+    assert np.all(cache.counts[rows] >= 1) and np.all(cache.counts[~rows] == 0)
+    assert np.all(cache.counts <= CONFIG.memory.pivots_per_voxel) and cache.num_voxels <= CAPACITY
+    for name in PIVOT_FIELDS:
+        assert not np.any(getattr(cache, name)[~cache.alive]), f"dead pivots hold zeros: {name}"
+    voxels, in_range = voxel_indices(jnp.asarray(cache.means), CONFIG.memory.voxel_size)
+    where = np.broadcast_to(cache.voxels[:, None], voxels.shape)
+    np.testing.assert_array_equal(np.asarray(voxels)[cache.alive], where[cache.alive])
+    assert np.all(np.asarray(in_range)[cache.alive])
+    assert len({tuple(v) for v in cache.voxels[rows]}) == cache.num_voxels
+    assert sorted(cache.table[cache.table >= 0]) == list(range(cache.num_voxels))
+    stats = jax.tree.map(int, cache.stats)
+    left_out = stats.num_low_confidence + stats.num_non_finite + stats.num_out_of_range + stats.num_dropped
+    assert stats.num_seen == sum(r.num_valid for r in stream) == stats.num_accepted + left_out
+
+
+@SETTINGS
+@given(st.lists(recipes, min_size=1, max_size=3), st.integers(1, NUM_TOKENS - 1))
+def test_splitting_a_chunk_changes_nothing(stream, at):
+    whole, split = init_cache(CONFIG, CAPACITY), init_cache(CONFIG, CAPACITY)
+    for recipe in stream:
+        tokens = to_jax(recipe.tokens())
+        head = jnp.arange(NUM_TOKENS) < at
+        whole = fuse(whole, tokens, CONFIG)
+        split = fuse(split, replace(tokens, valid=tokens.valid & head), CONFIG)
+        split = fuse(split, replace(tokens, valid=tokens.valid & ~head), CONFIG)
+    means = ("means", "feats", "rgbs")
+    assert_same_cache(whole, split, except_fields=("table", "last_chunks", *means))
+    for name in means:
+        a, b = np.asarray(getattr(whole, name)), np.asarray(getattr(split, name))
+        np.testing.assert_allclose(a, b, rtol=0, atol=VALUE_RTOL * np.abs(a).max(initial=1e-30))
+    for name in ("num_seen", "num_accepted", "num_merged", "num_dropped"):
+        assert int(getattr(whole.stats, name)) == int(getattr(split.stats, name))
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "counter"),
+    [
+        ("confidences", np.nextafter(np.float32(0.3), np.float32(0)), "num_low_confidence"),
+        ("means", np.nan, "num_non_finite"),
+        ("feats", -np.inf, "num_non_finite"),
+        ("confidences", np.nan, "num_non_finite"),
+        ("footprints", np.nan, "num_non_finite"),
+        ("means", np.float32(-(1 << 20) * 0.25), "num_out_of_range"),
+    ],
+)
+def test_rejected_tokens_change_only_their_counter(name, value, counter):
+    tokens = Recipe(seed=2, places="few", features="normal", confidences="tied").tokens()
+    before = run([Recipe(seed=3, places="few", features="normal", confidences="tied")])
+    tokens["confidences"][:] = np.float32(0.3)  # tau itself is accepted
+    accepted = fuse(jax.tree.map(jnp.copy, before), to_jax(tokens), CONFIG)
+    assert int(accepted.stats.num_accepted - before.stats.num_accepted) == NUM_TOKENS
+    tokens[name] = np.full_like(tokens[name], value)
+    after, rows = fuse_with_rows(jax.tree.map(jnp.copy, before), to_jax(tokens), CONFIG)
+    assert_same_cache(before, after)
+    added = jax.tree.map(lambda a, b: int(a) - int(b), after.stats, before.stats)
+    assert not rows and getattr(added, counter) == NUM_TOKENS == added.num_seen and added.num_accepted == 0
+
+
+@pytest.mark.parametrize("places", PLACES)
+def test_padding_is_the_identity(places):
+    before = run([Recipe(seed=5, places=places, features="normal", confidences="random")])
+    padding = to_jax(Recipe(6, places, "normal", "random", num_valid=0, num_bad=5).tokens())
+    after, rows = fuse_with_rows(jax.tree.map(jnp.copy, before), padding, CONFIG)
+    jax.tree.map(np.testing.assert_array_equal, before, after)
+    assert not rows
+
+
+def test_shifting_the_world_by_whole_voxels_shifts_the_pivots():
+    """Voxel size and positions are dyadic, so the shift itself does not round."""
+    tokens = Recipe(seed=7, places="few", features="integers", confidences="tied").tokens()
+    tokens["means"] = np.round(tokens["means"] * 1024) / 1024
+    shift = np.array([3, -5, 2]) * CONFIG.memory.voxel_size
+    a, b = (fused(to_jax(tokens | {"means": (tokens["means"] + x).astype(np.float32)})) for x in (0, shift))
+    assert int(a.stats.num_merged) > 0
+    assert_same_cache(a, b, except_fields=("table", "means", "voxels"))
+    expected = np.where(np.asarray(a.alive)[..., None], np.asarray(a.means) + shift.astype(np.float32), 0)
+    np.testing.assert_allclose(b.means, expected, rtol=0, atol=2e-7)
+
+
+def test_no_gradient_passes_the_cache():
+    tokens = to_jax(Recipe(seed=9, places="one_voxel", features="normal", confidences="tied").tokens())
+
+    def loss(feats, means):
+        cache = plain_fuse(EMPTY, replace(tokens, feats=feats, means=means), CONFIG)
+        return jnp.sum(cache.feats) + jnp.sum(cache.means)
+
+    grads = jax.jit(jax.grad(loss, argnums=(0, 1)))(tokens.feats, tokens.means)
+    assert not any(np.any(np.asarray(g)) for g in grads)
+
+
+@pytest.mark.parametrize("name", VARIANTS)
+def test_fuse_runs_in_place_with_memory_free_of_capacity(name):
+    def analysis(capacity):
+        config = VARIANTS[name].replace(capacity=capacity)
+        cache = jax.eval_shape(lambda: init_cache(config))
+        tokens = jax.eval_shape(lambda: to_jax(Recipe(0, "few", "normal", "random").tokens()))
+        compiled = jax.jit(plain_fuse, static_argnums=2, donate_argnums=0).lower(cache, tokens, config).compile()
+        return sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(cache)), compiled.memory_analysis()
+
+    (small_size, small), (size, large) = analysis(128), analysis(1024)
+    assert small.alias_size_in_bytes >= small_size and large.alias_size_in_bytes >= size
+    per_row = {"voxel": 0, "append": 4}[name]  # "append" copies the counts
+    assert large.temp_size_in_bytes <= small.temp_size_in_bytes + 64 + per_row * (1024 - 128)
+
+
+@pytest.mark.parametrize("name", VARIANTS)
+def test_rows_without_a_token_stay_unchanged_and_one_program_serves_all_chunks(name):
+    """A copy that takes over only the rows written by each chunk equals the cache."""
+    config, before = VARIANTS[name], fuse._cache_size()
+    cache = init_cache(config, CAPACITY)
+    copy = {name: np.zeros(getattr(cache, name).shape) for name in ("counts", *PIVOT_FIELDS)}
+    for seed, places in enumerate(("few", "many", "one_voxel", "many", "edges")):
+        recipe = Recipe(seed, places, "normal", "random", num_valid=24)
+        cache, written = fuse_with_rows(cache, to_jax(recipe.tokens()), config)
+        rows = sorted(written)
+        for name, x in copy.items():
+            x[rows] = np.asarray(getattr(cache, name))[rows]
+            np.testing.assert_array_equal(x, getattr(cache, name), name)
+    assert fuse._cache_size() <= before + 1
+
+
+@pytest.mark.slow
+def test_counters_of_a_long_stream_add_up():
+    stream = [Recipe(seed, PLACES[seed % 5], "normal", "random", num_bad=5).tokens() for seed in range(50)]
+    cache, chunks, once = init_cache(PAIRS, CAPACITY), [to_jax(tokens) for tokens in stream], reference.empty(CAPACITY)
+    for i in range(10_000):
+        cache = fuse(cache, chunks[i % 50], PAIRS)
+    for tokens in stream:
+        reference.fuse(once, tokens, PAIRS)
+    stats = jax.tree.map(int, cache.stats)
+    assert (stats.num_chunks, stats.num_seen) == (10_000, 10_000 * NUM_TOKENS)
+    for name in ("num_low_confidence", "num_non_finite", "num_out_of_range"):  # of a token alone, whatever is cached
+        assert getattr(stats, name) == 200 * once["stats"][name] > 0, name
+    assert int(jnp.sum(cache.counts)) == stats.num_accepted - stats.num_merged <= 2 * CAPACITY
+
+
+# Limits stated by `fuse` ----------------------------------------------------------------------------------------------
+
+
+def one_voxel(feats, confidences, means=None) -> Tokens:
+    tokens = Recipe(seed=10, places="one_voxel", features="normal", confidences="random").tokens()
+    n = len(confidences)
+    tokens["feats"][:n], tokens["confidences"][:n] = feats, confidences
+    if means is not None:
+        tokens["means"][:n] = means
+    tokens["valid"] = np.arange(NUM_TOKENS) < n
+    return to_jax(tokens)
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-9, 1e9, 1e12, 3e38])
+def test_features_of_any_size_give_finite_pivots(size):
+    """Eight of the twelve tokens merge. Within the limits of norms the closest pair does."""
+    feats = size * np.random.default_rng(0).uniform(-1, 1, (12, 4))
+    cache = fused(one_voxel(feats, np.linspace(0.3, 1.0, 12)))
+    assert all(np.all(np.isfinite(np.asarray(getattr(cache, name)))) for name in PIVOT_FIELDS)
+    assert int(cache.stats.num_merged) == 8
+    if 1e-9 <= size <= 1e9:
+        axes = size * np.eye(4)
+        cache = fused(one_voxel(np.stack([*axes, axes[2] + 0.1 * axes[3]]), np.full(5, 0.5)))
+        assert np.asarray(cache.num_members)[0].tolist() == [1, 1, 2, 1]
+
+
+def test_zero_features_are_orthogonal_to_everything():
+    cache = fused(one_voxel(np.concatenate([np.zeros((4, 4)), np.ones((1, 4))]), np.full(5, 0.5)))
+    assert np.asarray(cache.num_members)[0].tolist() == [2, 1, 1, 1]  # all tied at 0: the lowest pair
+
+
+def test_merged_means_stay_between_their_members():
+    """Hundreds of merges next to a voxel's upper corner, where rounding up would leave the voxel."""
+    edge = np.nextafter(np.float32(0.25), np.float32(0))
+    cache, rng = init_cache(CONFIG, CAPACITY), np.random.default_rng(0)
+    for _ in range(20):
+        confidences = rng.uniform(0.3, 1.0, NUM_TOKENS)
+        tokens = one_voxel(rng.normal(size=(NUM_TOKENS, 4)), confidences, np.full((NUM_TOKENS, 3), edge))
+        cache = fuse(cache, tokens, CONFIG)
+    np.testing.assert_array_equal(np.asarray(cache.means)[0], edge)
+    assert int(cache.num_voxels) == 1 and int(cache.stats.num_merged) > 900

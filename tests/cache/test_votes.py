@@ -1,0 +1,194 @@
+"""Votes equal the NumPy reference, and views vote within their limits."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from ssplat_jax.cache import carve, init_cache, store_depths, vote
+from ssplat_jax.cache import numpy_reference as reference
+from ssplat_jax.cache.state import STORED_CELLS
+from ssplat_jax.core.cameras import Camera
+from ssplat_jax.core.pytree import replace
+from tests.cache.projection_scenes import (
+    DECISION_MARGIN,
+    DEPTHS,
+    GRID_WIDTH,
+    HEIGHT,
+    SEED,
+    SETTINGS,
+    cameras,
+    front_camera,
+    random_views,
+    scene,
+    with_pivots,
+)
+from tests.cache.streams import CAPACITY, CONFIG, tokens_at
+
+jit_carve = jax.jit(carve, static_argnums=4)
+jit_vote = jax.jit(vote, static_argnums=2)
+jit_store = jax.jit(store_depths, static_argnums=4)
+EMPTY = init_cache(CONFIG, CAPACITY)
+SHAPE = (1, HEIGHT, GRID_WIDTH)
+TAU = float(np.float32(CONFIG.memory.min_confidence))
+
+
+def seen(depth: float, confidence: float = 0.8):
+    """Depths and confidences of the front camera, the same in every cell."""
+    return jnp.full(SHAPE, depth), jnp.full(SHAPE, confidence)
+
+
+def after_chunk(cache, camera, depths, confidences):
+    """The cache after a chunk was counted and its depths stored."""
+    stats = replace(cache.stats, num_chunks=cache.stats.num_chunks + 1)
+    return jit_store(replace(cache, stats=stats), camera, depths, confidences, CONFIG)
+
+
+def confidence_after(pivot_depth: float, *views, start: float = 0.6) -> float:
+    """Confidence of one pivot on the axis of the front camera after `views` (depths, confidences)."""
+    cache = with_pivots([[0.0, 0.0, pivot_depth]], confidences=[start])
+    for depths, confidences in views:
+        cache = jit_carve(cache, front_camera(), depths, confidences, CONFIG)
+    return float(cache.confidences[0, 0])
+
+
+def voted(mean, *view, confidence=0.6, valid=True) -> float:
+    """Confidence of a token after one chunk whose view saw a wall, at depth 2 by default."""
+    cache = after_chunk(EMPTY, front_camera(), *(view or seen(2.0)))
+    token = tokens_at([mean], [confidence], valid=[valid])
+    return float(jit_vote(cache.stored_depths, token, CONFIG).confidences[0])
+
+
+@SETTINGS
+@given(scene_seed=SEED, camera_seed=SEED, num_voxels=st.integers(0, CAPACITY), depth_spread=DEPTHS)
+def test_carving_equals_the_reference(scene_seed, camera_seed, num_voxels, depth_spread):
+    cache, camera = scene(scene_seed, num_voxels, depth_spread), cameras(camera_seed)
+    depths, confidences = random_views(camera_seed)
+    wanted = reference.from_arrays(cache)
+    margin = reference.carve(wanted, camera.viewmats, camera.Ks, depths, confidences, CONFIG)
+    assume(margin > DECISION_MARGIN)
+    got = jit_carve(cache, camera, jnp.asarray(depths), jnp.asarray(confidences), CONFIG)
+    for row, (_, pivots) in enumerate(wanted["rows"]):
+        expected = [pivot["confidences"] for pivot in pivots]
+        np.testing.assert_allclose(got.confidences[row, : len(pivots)], expected, rtol=2e-6)
+    jax.tree.map(np.testing.assert_array_equal, replace(got, confidences=cache.confidences), cache)
+
+
+@settings(SETTINGS, max_examples=6)  # two chunks each, also in the slow reference
+@given(seed=SEED, camera_seed=SEED, size=st.sampled_from([(HEIGHT, GRID_WIDTH), (40, 33)]))
+def test_votes_on_tokens_equal_the_reference(seed, camera_seed, size):
+    height, width = size
+    cache, views, rng = EMPTY, [], np.random.default_rng(seed)
+    for chunk in range(2):
+        camera = cameras(camera_seed + chunk)
+        scale = jnp.array([width / GRID_WIDTH, height / HEIGHT, 1.0])[:, None]
+        camera = Camera(viewmats=camera.viewmats, Ks=camera.Ks * scale, width=width, height=height)
+        depths, confidences = random_views(seed + chunk, height, width)
+        cache = after_chunk(cache, camera, depths, confidences)
+        views.append(reference.stored_depths(camera.viewmats, camera.Ks, depths, confidences, STORED_CELLS, CONFIG))
+        viewmat, K, nearest, _, weights = views[-1]
+        stored = jax.tree.map(lambda x, chunk=chunk: x[chunk], cache.stored_depths)
+        np.testing.assert_array_equal(stored.viewmats, viewmat)
+        np.testing.assert_allclose(stored.Ks, K, rtol=1e-6)
+        np.testing.assert_allclose(stored.weights, weights, rtol=1e-6)
+        np.testing.assert_allclose(stored.log_depths[weights > 0], nearest[weights > 0], atol=1e-6)
+    tokens = tokens_at(
+        rng.uniform(-1, 1, (200, 3)), rng.choice([0.2, 0.4, 0.6, 0.9], 200), valid=rng.uniform(size=200) < 0.9
+    )
+    arrays = {name: np.asarray(getattr(tokens, name)) for name in ("means", "confidences", "valid")}
+    wanted, margin = reference.vote(views, arrays, CONFIG)
+    assume(margin > DECISION_MARGIN / 4)  # smaller than elsewhere: 400 pairs hardly ever keep the full margin
+    got = jit_vote(cache.stored_depths, tokens, CONFIG)
+    np.testing.assert_allclose(got.confidences, wanted, rtol=2e-5)
+    jax.tree.map(np.testing.assert_array_equal, replace(got, confidences=tokens.confidences), tokens)
+
+
+def test_free_space_sinks_seen_rises_hidden_stays():
+    against, agreed = confidence_after(1.0, seen(2.0)), confidence_after(2.0, seen(2.0))
+    assert against < 0.6 < agreed and confidence_after(3.0, seen(2.0)) == np.float32(0.6)
+    # Votes against weigh more, and both weigh as much as the cell's confidence.
+    assert 0.6 - against > agreed - 0.6
+    assert confidence_after(1.0, seen(2.0, 0.6)) > against and confidence_after(2.0, seen(2.0, 0.6)) < agreed
+
+
+def test_the_order_of_votes_does_not_matter():
+    # Far enough from both bounds: a clipped confidence forgets how far outside it would have been.
+    views = (seen(2.0, 0.7), seen(1.0, 0.5), seen(2.0, 0.5))
+    assert confidence_after(1.0, *views) == pytest.approx(confidence_after(1.0, *views[::-1]), rel=1e-5)
+
+
+def test_confidences_stay_revisable():
+    sunk = [seen(2.0, 1.0)] * 50
+    assert confidence_after(1.0, *sunk) == pytest.approx(0.02)
+    assert confidence_after(1.0, *sunk, *[seen(1.0, 1.0)] * 20) > 0.5
+    assert confidence_after(1.0, *[seen(1.0, 1.0)] * 50) == pytest.approx(0.95)
+
+
+def test_an_untrusted_neighbor_forbids_carving_but_not_agreement():
+    depths, confidences = seen(2.0)
+    for row, column in ((2, 3), (3, 5), (4, 4)):
+        views = (depths, confidences.at[0, row, column].set(0.1))
+        assert confidence_after(1.0, views) == np.float32(0.6)
+        assert confidence_after(2.0, views) > 0.6
+
+
+def test_tokens_are_revised_as_pivots_are():
+    assert voted([0, 0, 1.9]) < 0.6 < voted([0, 0, 1.99]) and voted([0, 0, 2.1]) > 0.6
+    unchanged = np.float32(0.6)
+    for mean in ([0, 0, 3.0], [0, 0, -1.0], [5.0, 0, 1.0], [0, 0, np.nan], [0, np.inf, 1.0]):  # hidden or unseen
+        assert voted(mean) == unchanged
+    assert voted([0, 0, 1.0], valid=False) == unchanged
+    assert voted([0, 0, 1.0], confidence=0.2) == np.float32(0.2)  # below tau: it never enters the cache
+    assert np.isnan(voted([0, 0, 1.0], confidence=np.nan))
+
+
+@pytest.mark.parametrize(
+    ("confidence", "depth", "weight", "wanted"),
+    [
+        (0.0, 2.0, 1.0, None),
+        (1.0, 2.0, 1.0, 0.72),  # held to 0.95, then odds / e^2
+        (1.0, 1.0, 1.0, 0.95),
+        (1e-37, 1.0, 1.0, 0.0326),  # held to 0.02, then odds x e^0.5
+        (0.6, 2.0, 0.0, None),
+        (0.6, 2.0, np.nextafter(np.float32(TAU), np.float32(0)), None),
+        (0.6, 2.0, np.nan, None),
+        (0.6, 2.0, TAU, 0.4515),
+        (0.6, 1e-30, 1.0, None),  # hidden behind a surface on the camera
+        (0.6, np.inf, 1.0, None),
+        (0.6, np.nan, 1.0, None),
+        (0.6, -1.0, 1.0, None),
+        (0.6, 1e30, 1.0, 0.1687),
+    ],
+)
+def test_hard_votes_on_a_pivot_and_a_token_at_depth_1(confidence, depth, weight, wanted):
+    pivot = confidence_after(1.0, seen(depth, weight), start=confidence)
+    token = voted([0, 0, 1.0], *seen(depth, weight), confidence=confidence)
+    unchanged = float(np.float32(confidence))
+    assert pivot == (unchanged if wanted is None else pytest.approx(wanted, rel=2e-3))
+    assert token == (unchanged if wanted is None or confidence < TAU else pytest.approx(wanted, rel=2e-3))
+
+
+def test_the_best_view_is_stored_and_the_oldest_chunk_replaced(monkeypatch):
+    monkeypatch.setattr("ssplat_jax.cache.state.NUM_STORED", 2)
+    cache, camera = init_cache(CONFIG, CAPACITY), cameras(3)
+    for chunk in range(3):
+        depths = np.full((2, HEIGHT, GRID_WIDTH), 2.0 + chunk, np.float32)
+        confidences = np.full_like(depths, 0.8)
+        confidences[1 - chunk % 2, 0, 0] = 0.0  # so that the other view has one trusted cell more
+        cache = after_chunk(cache, camera, depths, confidences)
+        np.testing.assert_array_equal(cache.stored_depths.viewmats[chunk % 2], camera.viewmats[chunk % 2])
+    np.testing.assert_allclose(np.exp(cache.stored_depths.log_depths.max(axis=(1, 2))), [4.0, 3.0], rtol=1e-6)
+    after = after_chunk(cache, front_camera(), *seen(3.0, 0.0))  # as padding: it displaces nothing
+    jax.tree.map(np.testing.assert_array_equal, after.stored_depths, cache.stored_depths)
+
+
+def test_without_carving_nothing_is_computed():
+    off = CONFIG.replace(carving=False)
+    cache, token = init_cache(off, CAPACITY), tokens_at([[0, 0, 1.0]], [0.6])
+    views = (front_camera(), *seen(2.0))
+    assert cache.stored_depths.weights.size == 0
+    assert not jax.make_jaxpr(lambda *args: carve(*args, off))(cache, *views).eqns
+    assert not jax.make_jaxpr(lambda *args: vote(*args, off))(cache.stored_depths, token).eqns
+    assert not jax.make_jaxpr(lambda *args: store_depths(*args, off))(cache, *views).eqns
