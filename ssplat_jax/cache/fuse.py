@@ -18,7 +18,7 @@ import math
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Int
 
 from ssplat_jax.cache.hash_table import find_rows, group_equal, insert_rows, shards_of, voxel_indices
 from ssplat_jax.cache.state import PIVOT_FIELDS, CacheStats, Tokens, VoxelCache, pivot_fields
@@ -30,6 +30,9 @@ MERGE_BLOCKS = ((512, 64), (16, 1))
 
 SAME_DIRECTION = 1.0 - 1e-6
 """Signed squared cosines above this are ties: if a frame is given twice, rounding must not choose the pair."""
+
+Fields = dict[str, Array]
+"""Fields of pivots by name, of a whole cache `[capacity, k, ...]` or of a list of pivots."""
 
 
 @pytree
@@ -105,14 +108,11 @@ def saturating_add(counter: Int[Array, ""], more: Int[Array, ""]) -> Int[Array, 
     return counter + jnp.minimum(more, jnp.iinfo(counter.dtype).max - counter)
 
 
-def _classify(
-    stats: CacheStats, tokens: Tokens, config: StreamConfig
-) -> tuple[CacheStats, Int[Array, "m 3"], Bool[Array, " m"]]:
-    """Voxels of all tokens and which are accepted; counts each rejected token under one reason."""
+def _classify(stats: CacheStats, tokens: Tokens, config: StreamConfig):
+    """Counts each rejected token under one reason; also the voxels of all tokens, and which are accepted."""
     voxels, in_range = voxel_indices(tokens.means, config.memory.voxel_size)
-    floats = (tokens.means, tokens.feats, tokens.rgbs, tokens.quats)
     finite = jnp.isfinite(tokens.confidences) & jnp.isfinite(tokens.footprints)
-    for x in floats:
+    for x in (tokens.means, tokens.feats, tokens.rgbs, tokens.quats):
         finite &= jnp.all(jnp.isfinite(x), axis=-1)
     confident = tokens.confidences >= config.memory.min_confidence
     accepted = tokens.valid & finite & confident & in_range
@@ -128,16 +128,22 @@ def _classify(
     return stats, voxels, accepted
 
 
-def _place_in_voxels(
-    cache: VoxelCache, voxels: Int[Array, "m 3"], accepted: Bool[Array, " m"], config: StreamConfig
-) -> tuple[VoxelCache, Plan]:
-    """Finds or creates the row of every token's voxel."""
+def _place_in_voxels(cache, voxels, accepted, config) -> tuple[VoxelCache, Plan]:
+    """Finds or creates the row of every token's voxel; new rows go to voxels in order of their first tokens."""
     tokens = jnp.arange(accepted.shape[0], dtype=jnp.int32)
     leaders = group_equal(voxels, accepted)
     is_leader = accepted & (leaders == tokens)
     rows = find_rows(cache.table, cache.voxels, voxels, is_leader)
-    cache, rows = _add_rows(cache, voxels, rows, is_leader & (rows < 0))
-    rows = jnp.where(accepted, rows[leaders], -1)
+    is_new = is_leader & (rows < 0)
+    new_rows = cache.num_voxels + jnp.cumsum(is_new, dtype=jnp.int32) - 1
+    has_row = is_new & (new_rows < cache.capacity)  # a full cache drops the others
+    cache = replace(
+        cache,
+        voxels=cache.voxels.at[jnp.where(has_row, new_rows, cache.capacity)].set(voxels, mode="drop"),
+        num_voxels=jnp.minimum(cache.num_voxels + jnp.sum(is_new, dtype=jnp.int32), cache.capacity),
+        table=insert_rows(cache.table, voxels, new_rows, has_row),
+    )
+    rows = jnp.where(accepted, jnp.where(has_row, new_rows, rows)[leaders], -1)
     order = _stable_order(jnp.where(accepted, leaders, tokens.shape[0]))
     ranks = tokens - jax.lax.cummax(jnp.where(is_leader[order], tokens, 0))
     ranks = jnp.zeros_like(ranks).at[order].set(ranks, unique_indices=True)
@@ -154,9 +160,7 @@ def _stable_order(keys: Int[Array, " m"]) -> Int[Array, " m"]:
     return jax.lax.sort((keys, indices.astype(jnp.int32)), num_keys=2, is_stable=False)[1]
 
 
-def _place_at_end(
-    cache: VoxelCache, voxels: Int[Array, "m 3"], accepted: Bool[Array, " m"], config: StreamConfig
-) -> tuple[VoxelCache, Plan]:
+def _place_at_end(cache, voxels, accepted, config) -> tuple[VoxelCache, Plan]:
     """The ablation `vacc="append"`: tokens fill the rows one slot after another, whatever their voxel."""
     k = config.memory.pivots_per_voxel
     last = jnp.maximum(cache.num_voxels - 1, 0)
@@ -169,20 +173,7 @@ def _place_at_end(
     return replace(cache, num_voxels=num_voxels), plan
 
 
-def _add_rows(cache, voxels, rows, is_new):
-    """Gives a row to each voxel that `is_new`, in order of their first tokens, until the capacity is used up."""
-    new_rows = cache.num_voxels + jnp.cumsum(is_new, dtype=jnp.int32) - 1
-    has_row = is_new & (new_rows < cache.capacity)
-    cache = replace(
-        cache,
-        voxels=cache.voxels.at[jnp.where(has_row, new_rows, cache.capacity)].set(voxels, mode="drop"),
-        num_voxels=jnp.minimum(cache.num_voxels + jnp.sum(is_new, dtype=jnp.int32), cache.capacity),
-        table=insert_rows(cache.table, voxels, new_rows, has_row),
-    )
-    return cache, jnp.where(has_row, new_rows, rows)
-
-
-def _new_pivots(tokens: Tokens, cache: VoxelCache) -> dict[str, Array]:
+def _new_pivots(tokens: Tokens, cache: VoxelCache) -> Fields:
     """Every token as a pivot of its own, in the precision of the cache."""
     m = tokens.means.shape[0]
     values = {name: getattr(tokens, name) for name in PIVOT_FIELDS if hasattr(tokens, name)} | {
@@ -190,13 +181,12 @@ def _new_pivots(tokens: Tokens, cache: VoxelCache) -> dict[str, Array]:
         "num_members": jnp.ones((m,), jnp.int32),
         "last_chunks": jnp.broadcast_to(cache.stats.num_chunks, (m,)),
     }
-    values |= {
-        name: jnp.zeros((m, getattr(cache, name).shape[-1])) for name in pivot_fields(cache) if name not in values
-    }
-    return {name: x.astype(getattr(cache, name).dtype) for name, x in values.items()}
+    for name in set(pivot_fields(cache)) - set(values):  # nothing observed or changed yet
+        values[name] = jnp.zeros((m, getattr(cache, name).shape[-1]))
+    return {name: values[name].astype(getattr(cache, name).dtype) for name in pivot_fields(cache)}
 
 
-def _merge_all(pivots: dict[str, Array], new: dict[str, Array], plan: Plan, config: StreamConfig) -> dict[str, Array]:
+def _merge_all(pivots: Fields, new: Fields, plan: Plan, config: StreamConfig) -> Fields:
     """Merges the surplus tokens: round r takes the r-th one of every voxel, voxels with most of them first."""
     m, k = plan.order.shape[0], config.memory.pivots_per_voxel
     is_surplus = (plan.rows >= 0) & (plan.slots >= k)
@@ -228,9 +218,7 @@ def _merge_all(pivots: dict[str, Array], new: dict[str, Array], plan: Plan, conf
     return state[0]
 
 
-def _merge_closest(
-    pivots: dict[str, Array], new: dict[str, Array], rows: Int[Array, " b"], config: StreamConfig
-) -> dict[str, Array]:
+def _merge_closest(pivots: Fields, new: Fields, rows: Int[Array, " b"], config: StreamConfig) -> Fields:
     """Inserts one token into each of the full voxels `rows` by merging the closest pair (-1: no voxel)."""
     k = config.memory.pivots_per_voxel
     first, second = _closest_pair(jnp.concatenate([pivots["seeds"][rows], new["seeds"][:, None]], axis=1))
@@ -265,7 +253,7 @@ def _closest_pair(keys: Array) -> tuple[Int[Array, " b"], Int[Array, " b"]]:
     return firsts[best], seconds[best]
 
 
-def _merge_pair(older: dict[str, Array], newer: dict[str, Array]) -> dict[str, Array]:
+def _merge_pair(older: Fields, newer: Fields) -> Fields:
     """Merged pivots (Eq. vacc_pair_selection_and_merge); `older` holds those of the lower slot."""
     weight_older, weight_newer = older["confidences"], newer["confidences"]
     newer_is_best = weight_newer > weight_older
@@ -288,9 +276,7 @@ def _merge_pair(older: dict[str, Array], newer: dict[str, Array]) -> dict[str, A
     }
 
 
-def _write(
-    pivots: dict[str, Array], rows: Int[Array, "*b"], slots: Int[Array, "*b"], values: dict[str, Array]
-) -> dict[str, Array]:
+def _write(pivots: Fields, rows: Int[Array, "*b"], slots: Int[Array, "*b"], values: Fields) -> Fields:
     """`pivots` with `values` at distinct places; rows of -1 are skipped."""
     return {
         name: x.at[_drop_negative(rows, x.shape[0]), slots].set(values[name].astype(x.dtype), mode="drop")

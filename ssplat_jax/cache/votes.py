@@ -18,7 +18,7 @@ import math
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from ssplat_jax.cache.project import PixelPairs, fold_pairs, places_of, project_points, rows_in_sight, rows_of
 from ssplat_jax.cache.state import StoredDepths, Tokens, VoxelCache
@@ -150,16 +150,13 @@ def is_trusted(depths: Float[Array, "*s"], confidences: Float[Array, "*s"], conf
 
 def _min_per_part(values: Float[Array, "hf wf"], side: int) -> Float[Array, "side side"]:
     """Minimum over the cells that each of `side` x `side` equal parts of the view touches."""
-    for axis in (0, 1):
-        values = jnp.take(values, _cells_of_parts(values.shape[axis], side), axis=axis).min(axis=axis + 1)
-    return values
-
-
-def _cells_of_parts(num_cells: int, side: int) -> Int[np.ndarray, "side most"]:
-    """Numbers of the cells that each of `side` equal parts of a line of cells touches; the last one is repeated."""
     parts = np.arange(side)
-    first, last = parts * num_cells // side, -(-(parts + 1) * num_cells // side) - 1
-    return np.minimum(first[:, None] + np.arange((last - first).max() + 1), last[:, None])
+    for axis in (0, 1):
+        num_cells = values.shape[axis]
+        first, last = parts * num_cells // side, -(-(parts + 1) * num_cells // side) - 1
+        touched = np.minimum(first[:, None] + np.arange((last - first).max() + 1), last[:, None])
+        values = jnp.take(values, touched, axis=axis).min(axis=axis + 1)
+    return values
 
 
 def _votes(pairs: PixelPairs, weights, log_depths, nearest) -> Float[Array, " p"]:

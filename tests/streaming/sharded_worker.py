@@ -1,47 +1,23 @@
-"""A process of a sharded run, with devices of its own, that works together with others.
+"""A process with two devices that steps a sharded stream together with others; started by test_sharded.py.
 
-    python -m tests.streaming.sharded_worker FOLDER NUM_DEVICES PROCESS NUM_PROCESSES PORT
-
-Runs the jobs in FOLDER/jobs.pkl, functions of this file by name; process 0 writes the results to FOLDER/results.pkl.
+python -m tests.streaming.sharded_worker FOLDER PROCESS NUM_PROCESSES PORT
 """
 
 import pickle
 import sys
 from pathlib import Path
 
-from jaxtyping import install_import_hook
+import jax
+import numpy as np
+from jax.sharding import NamedSharding
+from jax.sharding import PartitionSpec as P
 
-install_import_hook("ssplat_jax", "beartype.beartype")
-
-import jax  # noqa: E402
-import numpy as np  # noqa: E402
-from jax.sharding import NamedSharding  # noqa: E402
-from jax.sharding import PartitionSpec as P  # noqa: E402
-
-from ssplat_jax.cache import fuse, init_cache, project  # noqa: E402
-from ssplat_jax.model.streamsplat import StreamSplat  # noqa: E402
-from ssplat_jax.streaming.sharded import ShardedStream  # noqa: E402
-
-jax.config.update("jax_numpy_dtype_promotion", "strict")
+from ssplat_jax.model.streamsplat import StreamSplat
+from ssplat_jax.streaming.sharded import ShardedStream
 
 
-def fuse_and_project(config, capacity, tokens, camera):
-    """The shards after fusing the chunks `tokens` `[t, m, ...]`, and the projection as each of them computed it."""
-    mesh = jax.sharding.Mesh(np.array(jax.devices()), ("voxels",))
-
-    def of_shard(tokens):
-        cache = init_cache(config, capacity)
-        cache, _ = jax.lax.scan(lambda c, t: (fuse(c, t, config, axis="voxels"), None), cache, tokens)
-        projected = project(cache, camera, config, axis="voxels")
-        return jax.tree.map(lambda x: x[None], (cache, projected))
-
-    run = jax.shard_map(of_shard, mesh=mesh, in_specs=P(), out_specs=P("voxels"), check_vma=False)
-    return everywhere(mesh, jax.jit(run)(on_mesh(mesh, P(), tokens)))
-
-
-def steps(config, params, chunks, num_new_tokens):
+def steps(mesh, config, params, chunks, num_new_tokens):
     """Caches and outputs of every step over `chunks` `[t, streams, ...]`, the last scenes, and the grown caches."""
-    mesh = jax.make_mesh((2, 2), ("streams", "voxels"))
     sharded = ShardedStream(StreamSplat(config), mesh)
     params, step = on_mesh(mesh, P(), params), jax.jit(sharded.step, donate_argnums=1)
     caches, history = sharded.init_cache(chunks.valid.shape[1]), []
@@ -71,18 +47,15 @@ def unchanged(tree):
     return tree
 
 
-def main(folder, num_devices, process, num_processes, port):
-    jax.config.update("jax_num_cpu_devices", num_devices)
+def main(folder, process, num_processes, port):
+    jax.config.update("jax_num_cpu_devices", 2)
     jax.config.update("jax_cpu_collectives_implementation", "gloo")
+    jax.config.update("jax_disable_most_optimizations", True)  # they take longer than the steps
     jax.distributed.initialize(f"localhost:{port}", num_processes, process)
-    jobs = pickle.loads((folder / "jobs.pkl").read_bytes())
-    results = {}
-    for name, arguments in jobs.items():
-        # The network's programs take longer to optimize than to run, so LLVM's optimizations are off.
-        jax.config.update("jax_disable_most_optimizations", name == "steps")
-        results[name] = globals()[name](**arguments)
+    mesh = jax.make_mesh((2, num_processes), ("streams", "voxels"))
+    results = steps(mesh, **pickle.loads((folder / "job.pkl").read_bytes()))
     if process == 0:
-        (folder / "results.pkl").write_bytes(pickle.dumps(results | {"devices": jax.device_count()}))
+        (folder / "results.pkl").write_bytes(pickle.dumps(results))
 
 
 if __name__ == "__main__":
