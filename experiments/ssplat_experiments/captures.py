@@ -17,7 +17,7 @@ from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import interleaved_split
 from ssplat_jax.evaluation.evaluate import evaluate
 from ssplat_jax.model.streamsplat import StreamSplat
-from ssplat_jax.storage.json_files import write_json
+from ssplat_jax.storage.files import write_json
 from ssplat_jax.storage.weights import load_params
 from ssplat_jax.streaming.session import Session
 

@@ -17,7 +17,7 @@ from ssplat_jax.core.console import Reporter
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.evaluation import provenance
 from ssplat_jax.evaluation.pictures import save_image
-from ssplat_jax.storage.json_files import json_text, write_json
+from ssplat_jax.storage.files import json_text, write_json
 
 Row = dict[str, Any]
 """A line of a table: numbers and words by column."""

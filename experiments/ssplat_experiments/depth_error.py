@@ -26,7 +26,7 @@ from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.split import Split
 from ssplat_jax.model import GRID_STRIDE
 from ssplat_jax.model.streamsplat import StreamSplat
-from ssplat_jax.storage.json_files import write_json
+from ssplat_jax.storage.files import write_json
 from ssplat_jax.storage.weights import load_params
 from ssplat_jax.streaming.feed import feed_chunks
 from ssplat_jax.streaming.session import Session

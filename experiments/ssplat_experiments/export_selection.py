@@ -24,7 +24,7 @@ from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.runs.export_run import members_of_gaussians
 from ssplat_jax.scene_files.export_rows import is_writable
 from ssplat_jax.scene_files.select_gaussians import Selection, select_gaussians
-from ssplat_jax.storage.json_files import write_json
+from ssplat_jax.storage.files import write_json
 from ssplat_jax.storage.weights import load_params
 from ssplat_jax.streaming.feed import feed_capture
 from ssplat_jax.streaming.session import Session

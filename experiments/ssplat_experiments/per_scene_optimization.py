@@ -17,12 +17,12 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ssplat_experiments.densification import fitted, maintained
+from ssplat_experiments.differentiable_ssim import ssim
 from ssplat_experiments.scene_state import Parameters, SceneState, scene_of, start_state
 from ssplat_experiments.splatting_config import SplattingConfig
 from ssplat_jax.cache.key_views import KeyViews
 from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.core.pytree import replace
-from ssplat_jax.evaluation.differentiable_ssim import ssim
 from ssplat_jax.rasterizer import Effects, render
 from ssplat_jax.rasterizer.render import round_up
 

@@ -13,9 +13,9 @@ from ssplat_experiments.cases import PICTURE, Case, Row, measure_cases
 from ssplat_jax.core.atomic import write_atomic
 from ssplat_jax.core.console import Reporter
 from ssplat_jax.evaluation import provenance
-from ssplat_jax.evaluation.plots import import_pyplot, save_figure
-from ssplat_jax.storage.folders import make_writable
-from ssplat_jax.storage.json_files import write_json
+from ssplat_jax.evaluation.pictures import import_pyplot, save_figure
+from ssplat_jax.storage.files import write_json
+from ssplat_jax.storage.run_folder import make_writable
 
 T = TypeVar("T")
 

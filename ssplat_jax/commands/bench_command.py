@@ -35,7 +35,7 @@ class Bench:
         for row in result["rows"]:
             print(f"{row['name']:<44} {row['value']:>14.6g} {row['unit']}")
         if self.json is not None:
-            from ssplat_jax.storage.json_files import write_json
+            from ssplat_jax.storage.files import write_json
 
             write_json(self.json, result)
         return 0

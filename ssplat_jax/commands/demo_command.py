@@ -26,7 +26,7 @@ class Demo:
     def run(self) -> int:
         from ssplat_jax.core.console import Reporter
         from ssplat_jax.runs.demo import run_demo
-        from ssplat_jax.storage.folder_lock import lock_folder
+        from ssplat_jax.storage.run_folder import lock_folder
 
         reporter = Reporter(self.quiet)
         reporter.say("one to two minutes on two cores, most of it for compiling")

@@ -68,7 +68,7 @@ class Eval:
     """No look-ahead: near, far and scale come from the first chunk, and frames keep their order."""
     weights: WeightsOption = "tiny"
     lpips_vgg: Path | None = None
-    """torchvision's vgg16 state dict (.pth or .npz): with --lpips-heads, LPIPS is scored too."""
+    """torchvision's vgg16 weights (.safetensors or .npz): with --lpips-heads, LPIPS is scored too."""
     lpips_heads: LpipsHeads = None
     set: ConfigChanges = ()
     axes: AxesOption = None
@@ -79,7 +79,7 @@ class Eval:
         from ssplat_jax.core.console import Reporter
         from ssplat_jax.evaluation.scoring import Display
         from ssplat_jax.runs.eval_run import EvalOptions, eval_path
-        from ssplat_jax.storage.folder_lock import lock_folder
+        from ssplat_jax.storage.run_folder import lock_folder
 
         refine_steps = refinement_steps(self.quality, self.refine)
         check_refinement(refine_steps, "--refine")

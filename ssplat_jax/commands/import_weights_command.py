@@ -12,16 +12,19 @@ from ssplat_jax.config import preset
 
 @dataclasses.dataclass(frozen=True)
 class ImportWeights:
-    """Convert weights that ReSplat's PyTorch code saved, without PyTorch. Missing ones are initialized.
+    """Convert weights that ReSplat published, from a .safetensors or .npz file. Missing ones are initialized.
+
+    A .pth becomes such a file where PyTorch is installed: numpy.savez("resplat-small.npz",
+    **{name: x.float().numpy() for name, x in torch.load("resplat-small.pth", weights_only=True).items()}).
 
     DepthSplat's depth network needs the settings it was trained with, for RealEstate10K: --depth-only
     --set depth_space=inverse match_stride=4 depth_range=[0.5,100].
 
-    Example: ssplat import-weights resplat-small.pth --out small.npz
+    Example: ssplat import-weights resplat-small.npz --out small.npz
     """
 
     checkpoint: Annotated[Path, tyro.conf.Positional]
-    """The full model, its depth network or Depth Anything V2: a file of torch.save, or an .npz with the same names."""
+    """The full model, its depth network or Depth Anything V2, under PyTorch's names: .safetensors or .npz."""
     out: Path
     """Weights file to write, for `ssplat run --weights`."""
     preset: Literal["paper", "small", "base"] = "small"

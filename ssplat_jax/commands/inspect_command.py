@@ -34,7 +34,7 @@ class Inspect:
         from ssplat_jax.data.capture_summary import UNITS, summarize
         from ssplat_jax.data.depth_range import NUM_REFERENCES
         from ssplat_jax.data.open_capture import open_capture
-        from ssplat_jax.storage.json_files import json_text
+        from ssplat_jax.storage.files import json_text
 
         path = capture_path(self.capture, self.axes, self.poses)
         capture = open_capture(path, size=parse_size(self.size))

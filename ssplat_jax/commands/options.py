@@ -44,7 +44,7 @@ ReviseOption = Annotated[
 QuietOption = Annotated[bool, tyro.conf.arg(help="Print only the closing line.")]
 LpipsHeads = Annotated[
     Path | None,
-    tyro.conf.arg(help="VGG16 heads of the `lpips` package (its weights/v0.1/vgg.pth, or .npz)."),
+    tyro.conf.arg(help="VGG16 heads of the `lpips` package (its weights/v0.1/vgg.pth as .safetensors or .npz)."),
 ]
 
 

@@ -48,7 +48,7 @@ class Train:
     validate_every: int = 200
     """Steps between scores of held-out frames of --captures, in the log."""
     lpips_vgg: Path | None = None
-    """torchvision's vgg16 state dict (.pth or .npz): with --lpips-heads, the rendering loss is MSE + 0.05 LPIPS."""
+    """torchvision's vgg16 (.safetensors or .npz): with --lpips-heads, the rendering loss is MSE + 0.05 LPIPS."""
     lpips_heads: LpipsHeads = None
     save_every: int = 200
     """Steps between checkpoints."""
@@ -174,8 +174,7 @@ class Train:
     def _trained(self, train, config, params: dict, recipe, num_steps: int, reporter: "Reporter") -> tuple[dict, dict]:
         """Parameters and facts of `train`, a training on whole streams, with the folder locked and steps shown."""
         from ssplat_jax.model.streamsplat import StreamSplat
-        from ssplat_jax.storage.folder_lock import lock_folder
-        from ssplat_jax.storage.folders import make_writable
+        from ssplat_jax.storage.run_folder import lock_folder, make_writable
 
         reporter.say(f"{num_steps} steps, about {MINUTES[self.recipe]} minutes on two cores with two captures")
         make_writable(self.out)

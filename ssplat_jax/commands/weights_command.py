@@ -1,4 +1,4 @@
-"""`ssplat weights`: what is in a weights file, and how far training moved each stage."""
+"""`ssplat weights`: what is in a weights file, and how far training turned each stage."""
 
 import dataclasses
 from typing import Annotated
@@ -8,10 +8,10 @@ import tyro
 
 @dataclasses.dataclass(frozen=True)
 class Weights:
-    """Show a weights file: its training, and for each stage the distance from its random start.
+    """Show a weights file: its training, and for each stage how far that turned it from its random start.
 
-    distance is |weights - start| / |start|. turn is the sine of the angle between both: a stage that weight decay alone
-    has changed is shorter but not turned.
+    turn is the sine of the angle between a stage's weights and its start: a stage that weight decay alone has changed
+    is shorter but not turned.
 
     Example: ssplat weights tiny
     """
@@ -20,8 +20,9 @@ class Weights:
     """Preset with shipped weights, or a weights file."""
 
     def run(self) -> int:
-        from ssplat_jax.storage.stage_changes import stage_changes, start_of, trainings
-        from ssplat_jax.storage.weights import describe_weights, load_params
+        import jax
+
+        from ssplat_jax.storage.weights import describe_weights, load_params, stage_turns, trainings
 
         params = load_params(self.name)
         facts = describe_weights(self.name)
@@ -31,9 +32,10 @@ class Weights:
         if "imported_from" in trainings(facts.provenance)[0]:
             print("imported weights have no random start to compare with")
             return 0
-        print(f"{'stage':<12}{'parameters':>12}{'distance':>10}{'turn':>8}")
-        for change in stage_changes(params, start_of(facts.config, facts.provenance)):
-            print(f"{change.name:<12}{change.num_params:>12,}{change.distance:>10.3f}{change.turn:>8.3f}")
+        print(f"{'stage':<12}{'parameters':>12}{'turn':>8}")
+        for stage, turn in stage_turns(params, facts).items():
+            num_params = sum(leaf.size for leaf in jax.tree.leaves(params[stage]))
+            print(f"{stage:<12}{num_params:>12,}{turn:>8.3f}")
         return 0
 
 

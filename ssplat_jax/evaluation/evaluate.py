@@ -23,9 +23,8 @@ from ssplat_jax.evaluation.psnr_ssim import SSIM_ARGUMENTS
 from ssplat_jax.evaluation.scoring import Display, ViewScore, baselines, check_scorable, mean_scores, score_view
 from ssplat_jax.poses.adjust_poses import adjust_if_asked, check_look_ahead
 from ssplat_jax.refinement import refine_on_capture
-from ssplat_jax.storage.folders import make_writable
-from ssplat_jax.storage.json_files import write_json
-from ssplat_jax.storage.run_folder import RunFolder
+from ssplat_jax.storage.files import write_json
+from ssplat_jax.storage.run_folder import RunFolder, make_writable
 from ssplat_jax.streaming.feed import Exposures, feed_capture
 from ssplat_jax.streaming.session import Session
 

@@ -1,7 +1,7 @@
 """LPIPS, the learned perceptual distance (Zhang et al. 2018), version 0.1 on VGG16, as PyTorch's `lpips` computes it.
 
-The trained weights cannot be shipped. The user provides torchvision's `vgg16` file and the package's heads (`vgg.pth`),
-or `.npz` files with the same names.
+The trained weights cannot be shipped. The user provides torchvision's `vgg16` and the package's heads (`vgg.pth`), both
+as `.safetensors` or `.npz` under the same names.
 
     image in [0, 1] -> [-1, 1] -> shift and scale -> VGG16 -> relu1_2, relu2_2, relu3_3, relu4_3, relu5_3
     per layer: features of unit length per pixel, squared difference, head's weights over channels, mean over pixels
@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.core.pytree import pytree
-from ssplat_jax.storage.torch_files import read_arrays
+from ssplat_jax.storage.files import check_tensors, read_tensors
 
 MIN_SIDE = 16
 """Smallest side of an image in pixels, of which four halvings leave one for the last layer."""
@@ -46,11 +46,11 @@ class LpipsWeights:
 
 
 def load_lpips(vgg_path: Path, heads_path: Path) -> LpipsWeights:
-    """LPIPS weights from two files, which are read as data: no code in them is executed.
+    """LPIPS weights from two files.
 
     Args:
-        vgg_path: torchvision's `vgg16` state dict, `.pth` or `.npz`; only the names `features.*` are read.
-        heads_path: heads of the `lpips` package for VGG16 (`lin0.model.1.weight` to `lin4`), `.pth` or `.npz`.
+        vgg_path: torchvision's `vgg16` state dict; only the names `features.*` are read.
+        heads_path: heads of the `lpips` package for VGG16 (`lin0.model.1.weight` to `lin4`).
 
     Raises:
         InputError: a file cannot be read, lacks an array, or has one of another shape or with non-finite values.
@@ -60,13 +60,14 @@ def load_lpips(vgg_path: Path, heads_path: Path) -> LpipsWeights:
         shapes[f"features.{i}.weight"] = (channels_out, channels_in, 3, 3)
         shapes[f"features.{i}.bias"] = (channels_out,)
         channels_in = channels_out
-    vgg = [jnp.asarray(x) for x in read_arrays(Path(vgg_path), shapes).values()]
     head_shapes = {f"lin{k}.model.1.weight": (1, stage[-1][1], 1, 1) for k, stage in enumerate(_STAGES)}
-    heads = read_arrays(Path(heads_path), head_shapes).values()
+    vgg, heads = read_tensors(vgg_path), read_tensors(heads_path)
+    check_tensors(vgg_path, vgg, shapes)
+    check_tensors(heads_path, heads, head_shapes)
     return LpipsWeights(
-        kernels=tuple(x.transpose(2, 3, 1, 0) for x in vgg[::2]),
-        biases=tuple(vgg[1::2]),
-        heads=tuple(jnp.asarray(x).reshape(-1) for x in heads),
+        kernels=tuple(jnp.asarray(vgg[name]).transpose(2, 3, 1, 0) for name in shapes if name.endswith("weight")),
+        biases=tuple(jnp.asarray(vgg[name]) for name in shapes if name.endswith("bias")),
+        heads=tuple(jnp.asarray(heads[name]).reshape(-1) for name in head_shapes),
     )
 
 

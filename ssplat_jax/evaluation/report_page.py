@@ -1,4 +1,4 @@
-"""The report: one HTML page that holds its pictures and plots, and loads nothing from elsewhere."""
+"""The report: one HTML page that holds its pictures and figures, and loads nothing from elsewhere."""
 
 import base64
 import dataclasses
@@ -25,15 +25,9 @@ h2 { font-size: 1.05rem; font-weight: 600; margin: 44px 0 14px; }
 .summary, .note { color: var(--soft); margin: 0; }
 .note { font-size: 0.85rem; margin-bottom: 12px; }
 .facts { display: grid; grid-template-columns: repeat(auto-fit, minmax(150px, 1fr)); gap: 12px; margin-top: 28px; }
-.fact, .plots > div { background: var(--card); border: 1px solid var(--line); border-radius: 8px; padding: 14px 16px; }
+.fact { background: var(--card); border: 1px solid var(--line); border-radius: 8px; padding: 14px 16px; }
 .fact b { display: block; font-size: 1.35rem; font-weight: 600; font-variant-numeric: tabular-nums; }
 .fact span { color: var(--soft); font-size: 0.82rem; }
-.plots { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 420px), 1fr)); gap: 12px; }
-.plot { display: block; width: 100%; }
-.plot text { fill: currentColor; font: 11px system-ui, sans-serif; }
-.plot .title { font-size: 13px; font-weight: 600; }
-.plot .tick { fill: var(--soft); }
-.plot .grid { stroke: var(--line); }
 figure { margin: 0 0 6px; }
 .pairs { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(100%, 440px), 1fr)); gap: 12px; }
 figure img { display: block; width: 100%; border-radius: 6px; background: #000; }
@@ -60,7 +54,7 @@ class Report:
     title: str
     summary: str  # one sentence
     facts: Sequence[tuple[str, str]]  # label and value with its unit
-    plots: Sequence[str] = ()  # SVG elements (`svg_plot.line_plot`)
+    stream: Sequence[Sequence[str]] = ()  # rows of the table over the stream, the first its header
     pictures: Sequence[tuple[Path, str]] = ()  # image files and captions; missing files are left out
     pictures_note: str = ""  # how the pictures were made
     files: Sequence[tuple[str, str]] = ()  # path relative to the page, and its content
@@ -87,7 +81,7 @@ def page_text(report: Report) -> str:
         f"<h1>{html.escape(report.title)}</h1>",
         f'<p class="summary">{html.escape(report.summary)}</p>',
         f'<div class="facts">{facts}</div>',
-        _section("Over the stream", "".join(f"<div>{plot}</div>" for plot in report.plots), "plots"),
+        _section("Over the stream", _table([[html.escape(cell) for cell in row] for row in report.stream])),
         _section("Pictures", "\n".join(itertools.starmap(_figure, found)), kind, report.pictures_note),
         _section("Where everything is", _table(files)),
         _section("Next", f"<pre>{html.escape(chr(10).join(report.commands))}</pre>" if report.commands else ""),
@@ -114,9 +108,10 @@ def _fact(label: str, value: str) -> str:
     return f'<div class="fact"><b>{html.escape(value)}</b><span>{html.escape(label)}</span></div>'
 
 
-def _table(rows: Sequence[tuple[str, str]]) -> str:
-    """Rows of HTML; nothing without rows."""
-    return "<table>" + "".join(f"<tr><td>{a}</td><td>{b}</td></tr>" for a, b in rows) + "</table>" if rows else ""
+def _table(rows: Sequence[Sequence[str]]) -> str:
+    """A table of cells of HTML; nothing without rows."""
+    lines = ["<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>" for row in rows]
+    return f"<table>{''.join(lines)}</table>" if rows else ""
 
 
 def _link(name: str) -> str:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ssplat_jax.data.posed_image import OPENGL_TO_OPENCV, invert_pose
-from ssplat_jax.storage.json_files import write_json
+from ssplat_jax.storage.files import write_json
 
 LENS_PARAMETERS = {"OPENCV": ("k1", "k2", "p1", "p2"), "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4")}
 

@@ -33,8 +33,8 @@ from ssplat_jax.poses.photos import copy_photos, list_photos
 from ssplat_jax.poses.requirements import require
 from ssplat_jax.poses.verdict import Findings, check_registered
 from ssplat_jax.poses.video import count_frames, scan_video, write_frames
-from ssplat_jax.storage.folder_lock import lock_folder
-from ssplat_jax.storage.json_files import write_json
+from ssplat_jax.storage.files import write_json
+from ssplat_jax.storage.run_folder import lock_folder
 
 RECORD = "poses.json"
 MIN_READ_SHARE = 0.95

@@ -13,7 +13,7 @@ from ssplat_jax.core.errors import InputError
 from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.model.refiner import Refiner
 from ssplat_jax.refinement.learned_pass import no_errors, refiner_features
-from ssplat_jax.storage.npz import load_arrays, save_arrays
+from ssplat_jax.storage.files import load_arrays, save_arrays
 
 KIND = "refiner"  # kind of the file
 

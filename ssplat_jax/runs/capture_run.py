@@ -15,10 +15,9 @@ from ssplat_jax.runs.chunk_recorder import ChunkRecorder, hold_back
 from ssplat_jax.runs.finish_run import finish_run, finished_scene, forget_other_run
 from ssplat_jax.runs.resume import RunState, resume_run, run_identity, save_run
 from ssplat_jax.runs.run_poses import capture_to_stream
-from ssplat_jax.storage.delta_files import save_delta
-from ssplat_jax.storage.folder_lock import lock_folder
+from ssplat_jax.storage.chunk_records import save_delta
 from ssplat_jax.storage.interrupts import Interrupts
-from ssplat_jax.storage.run_folder import RunFolder
+from ssplat_jax.storage.run_folder import RunFolder, lock_folder
 from ssplat_jax.streaming.feed import feed_chunks, middle_exposure
 from ssplat_jax.streaming.scene_delta import SceneFeed
 

@@ -13,15 +13,13 @@ from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import Split, interleaved_split
 from ssplat_jax.data.stream_frame import StreamFrame
-from ssplat_jax.evaluation.pictures import save_comparison, save_image
-from ssplat_jax.evaluation.plots import import_pyplot, save_figure
+from ssplat_jax.evaluation.pictures import import_pyplot, save_comparison, save_figure, save_image
 from ssplat_jax.evaluation.scoring import ScoredView, mean_scores, score_view
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.refinement import Refinement, refine_on_capture
 from ssplat_jax.runs.finish_run import save_scene
-from ssplat_jax.storage.folders import make_writable
-from ssplat_jax.storage.json_files import write_json
-from ssplat_jax.storage.run_folder import RunFolder
+from ssplat_jax.storage.files import write_json
+from ssplat_jax.storage.run_folder import RunFolder, make_writable
 from ssplat_jax.storage.weights import load_params
 from ssplat_jax.streaming.feed import Exposures, feed_chunks
 from ssplat_jax.streaming.session import Session
@@ -92,7 +90,7 @@ def run_demo(scene: str, out: Path, reporter: Reporter, quality: Quality = QUALI
         "stream_frame": frame.to_dict(),
     }
     write_json(folder.metrics, metrics)
-    _plot(out / "quality.png", rows)
+    _plot(out / "quality.png", rows, reporter)
     header = ("views", "shown dB", "SSIM", "literal dB", "SSIM", "covered", "Gaussians")
     reporter.table(f"{scene}: quality of unseen views", header, [tuple(row.values()) for row in rows])
     if refined:
@@ -133,9 +131,10 @@ def _table_row(views: Sequence[ScoredView], num_streamed: int, session: Session)
     }
 
 
-def _plot(path: Path, rows: list[dict]) -> None:
-    """Plots PSNR against views; does nothing without matplotlib (extra `plots`)."""
+def _plot(path: Path, rows: list[dict], reporter: Reporter) -> None:
+    """Plots PSNR against views, where matplotlib is installed."""
     if (pyplot := import_pyplot()) is None:
+        reporter.say(f"no {path.name} without matplotlib; pip install 'ssplat-jax[plots]'")
         return
     figure, axes = pyplot.subplots(figsize=(5, 3.2), layout="constrained")
     axes.plot([r["views"] for r in rows], [r["shown_psnr"] for r in rows], marker="o", color="#30507a", label="shown")

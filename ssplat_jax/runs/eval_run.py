@@ -21,7 +21,7 @@ from ssplat_jax.evaluation.scoring import Display
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.refinement import online_refinement
 from ssplat_jax.runs.reports import report_eval
-from ssplat_jax.storage.json_files import write_json
+from ssplat_jax.storage.files import write_json
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.streaming.session import Session
 

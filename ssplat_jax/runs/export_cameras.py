@@ -20,7 +20,7 @@ from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.posed_image import invert_pose
 from ssplat_jax.runs.run_poses import open_capture_of_scene, with_poses_of_run
 from ssplat_jax.storage.run_folder import RunFolder
-from ssplat_jax.storage.stream_state import load_newest_state
+from ssplat_jax.storage.saved_states import load_newest_state
 
 TITLE = "# Cameras of a scene, written by ssplat export"
 FILES = ("cameras.txt", "images.txt", "points3D.txt")

@@ -6,6 +6,7 @@ import jax
 import numpy as np
 from jaxtyping import Int
 
+from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.console import Reporter
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.data.stream_frame import StreamFrame
@@ -16,8 +17,7 @@ from ssplat_jax.scene_files.export_rows import ExportReport
 from ssplat_jax.scene_files.formats import check_format, save_selected
 from ssplat_jax.scene_files.select_gaussians import EVERYTHING, Selection
 from ssplat_jax.storage.run_folder import RunFolder
-from ssplat_jax.storage.saved_config import config_from_header
-from ssplat_jax.storage.stream_state import load_newest_state
+from ssplat_jax.storage.saved_states import load_newest_state
 from ssplat_jax.storage.weights import params_digest
 from ssplat_jax.streaming.session import Session
 
@@ -52,7 +52,7 @@ def export_run(
         reporter.warn(f"{damage} Exporting the state saved before it, after {header['done']} views.")
     if header.get("weights") != params_digest(params):
         raise InputError(f"{run_dir}: was streamed with other weights than these; give the run's own with --weights.")
-    session = Session(StreamSplat(config_from_header(header["config"])), params, cache)
+    session = Session(StreamSplat(StreamConfig.from_dict(header["config"])), params, cache)
     members = members_of_gaussians(session)
     # The rows after these are padding, of which a person need not be told.
     gaussians = jax.tree.map(lambda x: x[: len(members)], session.gaussians())

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.console import WAITING, Reporter
 from ssplat_jax.core.errors import InputError, require_positive
 from ssplat_jax.core.gaussians import Gaussians
@@ -21,12 +22,10 @@ from ssplat_jax.refinement.refine_config import FOR_CAPTURES
 from ssplat_jax.runs.finish_run import NUM_PICTURES, save_scene
 from ssplat_jax.runs.refinement_state import load_refinement, save_refinement
 from ssplat_jax.runs.run_poses import with_poses_of_run
-from ssplat_jax.storage.folder_lock import lock_folder
+from ssplat_jax.storage.files import write_json
 from ssplat_jax.storage.interrupts import Interrupts
-from ssplat_jax.storage.json_files import write_json
-from ssplat_jax.storage.run_folder import RunFolder
-from ssplat_jax.storage.saved_config import config_from_header
-from ssplat_jax.storage.stream_state import load_newest_state
+from ssplat_jax.storage.run_folder import RunFolder, lock_folder
+from ssplat_jax.storage.saved_states import load_newest_state
 from ssplat_jax.storage.weights import params_digest
 from ssplat_jax.streaming.feed import Exposures
 from ssplat_jax.streaming.session import Session
@@ -129,7 +128,7 @@ def _open_run(folder: RunFolder, path: str, params: dict, reporter: Reporter) ->
     )
     if not is_same:
         raise InputError(f"{path}: wanted the capture of the run in {folder.path}, got another; give that capture.")
-    session = Session(StreamSplat(config_from_header(header["config"])), params, cache)
+    session = Session(StreamSplat(StreamConfig.from_dict(header["config"])), params, cache)
     return _Run(
         gaussians=session.gaussians(),
         capture=capture,

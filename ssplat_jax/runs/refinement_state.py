@@ -15,7 +15,7 @@ from ssplat_jax.refinement.present_rows import only_present, present_and_new, pr
 from ssplat_jax.refinement.refine import Progress
 from ssplat_jax.refinement.refine_step import init_refinement
 from ssplat_jax.refinement.revision import Revision
-from ssplat_jax.storage.npz import load_arrays, save_arrays
+from ssplat_jax.storage.files import load_arrays, save_arrays
 
 KIND = "refinement state 2"
 COUNTS = ("num_steps", "num_skipped")

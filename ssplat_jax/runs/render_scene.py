@@ -20,9 +20,8 @@ from ssplat_jax.runs.film import KINDS, FilmOptions, depth_range, film_path, wri
 from ssplat_jax.runs.run_poses import open_capture_of_scene
 from ssplat_jax.scene_files.formats import read_scene
 from ssplat_jax.scene_files.splat_file import SplatFile
-from ssplat_jax.storage.folder_lock import lock_folder
-from ssplat_jax.storage.run_folder import RunFolder, scene_exposure
-from ssplat_jax.storage.video import VideoWriter
+from ssplat_jax.storage.run_folder import RunFolder, lock_folder, scene_exposure
+from ssplat_jax.storage.video_writer import VideoWriter
 
 ANTIALIAS = {"mip": "mip", "default": "classic"}
 """Antialiasing filter for each render mode that a scene file may name."""

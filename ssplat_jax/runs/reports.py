@@ -2,19 +2,20 @@
 
 import shlex
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ssplat_jax.evaluation.contact_sheet import evenly_spread, save_contact_sheet
+from ssplat_jax.evaluation.pictures import evenly_spread, save_contact_sheet
 from ssplat_jax.evaluation.report_page import Report, save_report
-from ssplat_jax.evaluation.svg_plot import Line, line_plot
 from ssplat_jax.storage.chunk_records import ChunkRecord, load_chunk_records
 from ssplat_jax.storage.run_folder import RunFolder
 
 MOST_PICTURES = 12
 """Pictures on a page; of more, evenly spread ones are shown, and the contact sheet has more of them."""
+
+MOST_CHUNKS = 10
+"""Chunks in the table of the stream; of more, evenly spread ones are shown."""
 
 NOTE = "Left to right: the photograph, the rendered view, its depth (light near, dark far)."
 SHOWN = "holes filled, at the exposure of the nearest streamed views"
@@ -65,8 +66,8 @@ def report_run(folder: RunFolder, metrics: dict[str, Any], path: str, weights: s
         title=metrics["capture"],
         summary=f"A scene of 3D Gaussians from {metrics['views']} views of {width} x {height} pixels, streamed once.",
         facts=facts,
-        plots=stream_plots(records),
-        pictures=_some(pictures),
+        stream=_stream_rows(records),
+        pictures=[pictures[k] for k in evenly_spread(len(pictures), MOST_PICTURES)],
         pictures_note=f"{NOTE} Scores of views that the scene was made from, {SHOWN}.",
         files=_files(folder),
         commands=[
@@ -93,8 +94,6 @@ def report_eval(folder: RunFolder, metrics: dict[str, Any]) -> None:
     scores, shown, literal = metrics["per_view"], metrics["shown"], metrics["literal"]
     pictures = [(folder.target(score["frame"]), _caption(score, "unseen")) for score in scores]
     save_contact_sheet(folder.contact_sheet, pictures)
-    frames = [score["frame"] for score in scores]
-    psnrs = [Line(name, frames, [score[name]["psnr"] for score in scores]) for name in ("shown", "literal")]
     facts = [
         ("PSNR as shown", f"{shown['psnr']:.2f} dB"),
         ("SSIM as shown", f"{shown['ssim']:.3f}"),
@@ -110,8 +109,7 @@ def report_eval(folder: RunFolder, metrics: dict[str, Any]) -> None:
         summary=f"{metrics['target_views']} views that were never streamed, rendered from a scene of"
         f" {metrics['context_views']} other views.",
         facts=facts,
-        plots=[line_plot("PSNR of unseen views", "frame", "dB", psnrs), *_exposure_plot(metrics["exposures"])],
-        pictures=_some(pictures),
+        pictures=[pictures[k] for k in evenly_spread(len(pictures), MOST_PICTURES)],
         pictures_note=f"{NOTE} Shown: {SHOWN}. Literal: over black, at the exposure of the first views.",
         files=_files(folder),
         details=[("protocol", metrics["protocol"]), *_details(metrics)],
@@ -119,33 +117,16 @@ def report_eval(folder: RunFolder, metrics: dict[str, Any]) -> None:
     save_report(folder.report, report)
 
 
-def stream_plots(records: Sequence[ChunkRecord]) -> list[str]:
-    """Plots of time, occupancy, scene size and held-back scores over the views streamed."""
-    if not records:
-        return []
-    views = [r.num_views for r in records]
-    plots = [
-        line_plot("Time of a chunk", "views streamed", "s", [Line("time", views, [r.seconds for r in records])]),
-        line_plot("Cache in use", "views streamed", "%", [Line("use", views, [100 * r.occupancy for r in records])]),
-    ]
-    scored = [r for r in records if r.held_back_psnr is not None]
-    if scored:
-        line = Line("PSNR", [r.num_views for r in scored], [r.held_back_psnr or np.nan for r in scored])
-        plots.append(line_plot("Views that are held back", "views streamed", "PSNR as shown, dB", [line]))
-    sizes = Line("Gaussians", views, [r.num_gaussians / 1000 for r in records])
-    plots.append(line_plot("Scene", "views streamed", "thousand Gaussians", [sizes]))
-    return [*plots, *_exposure_plot({str(v.frame): v.exposure.tolist() for r in records for v in r.views})]
-
-
-def _exposure_plot(exposures: dict[str, list[float]]) -> list[str]:
-    """The exposures over the frames, if they vary by more than a percent."""
-    frames = sorted(map(int, exposures))
-    values = np.array([exposures[str(i)] for i in frames]).reshape(-1, 3)
-    if len(frames) < 2 or np.ptp(values, axis=0).max() < 0.01:
-        return []
-    names = ("red", "green", "blue")
-    lines = [Line(name, frames, values[:, channel].tolist()) for channel, name in enumerate(names)]
-    return [line_plot("Exposure", "frame", "factor", lines)]
+def _stream_rows(records: Sequence[ChunkRecord]) -> list[tuple[str, ...]]:
+    """Time, occupancy, scene size and held-back score over the views streamed, below a header; empty without chunks."""
+    rows = [("views", "time of a chunk", "cache in use", "Gaussians", "held-back views as shown", "exposure (RGB)")]
+    for k in evenly_spread(len(records), MOST_CHUNKS):
+        r = records[k]
+        psnr = "" if r.held_back_psnr is None else f"{r.held_back_psnr:.2f} dB"
+        exposure = " ".join(f"{factor:.2f}" for factor in np.mean([view.exposure for view in r.views], axis=0))
+        figures = (f"{r.num_views}", f"{r.seconds:.2f} s", f"{r.occupancy:.0%}", f"{r.num_gaussians:,}")
+        rows.append((*figures, psnr, exposure))
+    return rows if records else []
 
 
 def _caption(score: dict[str, Any], kind: str) -> str:
@@ -155,10 +136,6 @@ def _caption(score: dict[str, Any], kind: str) -> str:
         f"{kind} frame {score['frame']} · shown {shown['psnr']:.2f} dB, SSIM {shown['ssim']:.3f}"
         f" · literal {literal['psnr']:.2f} dB"
     )
-
-
-def _some(pictures: Sequence[tuple[Path, str]]) -> list[tuple[Path, str]]:
-    return [pictures[k] for k in evenly_spread(len(pictures), MOST_PICTURES)]
 
 
 def _files(folder: RunFolder) -> list[tuple[str, str]]:

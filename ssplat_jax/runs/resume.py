@@ -13,8 +13,7 @@ from ssplat_jax.evaluation.exposures import exposures_from_json, exposures_to_js
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.refinement import online_refinement
 from ssplat_jax.storage.run_folder import RunFolder
-from ssplat_jax.storage.saved_config import config_from_header
-from ssplat_jax.storage.stream_state import load_newest_state, restore_previous, save_state
+from ssplat_jax.storage.saved_states import load_newest_state, restore_previous, save_state
 from ssplat_jax.storage.weights import params_digest
 from ssplat_jax.streaming.feed import Exposures
 from ssplat_jax.streaming.session import Session
@@ -108,7 +107,7 @@ def _check_identity(header: dict, identity: dict, folder: RunFolder) -> None:
     for name, wanted in identity.items():
         held = header.get(name)
         if name == "config":
-            held, wanted = (_relevant_fields(config_from_header(fields or {})) for fields in (held, wanted))
+            held, wanted = (_relevant_fields(StreamConfig.from_dict(fields or {})) for fields in (held, wanted))
         if held != wanted:
             raise InputError(
                 f"{folder.path}: holds a run that differs in its {name} ({_difference(held, wanted)}); choose another"

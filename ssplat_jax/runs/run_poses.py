@@ -13,7 +13,7 @@ from ssplat_jax.core.errors import StorageError, refusal
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.poses.adjust_poses import adjust_if_asked
-from ssplat_jax.storage.json_files import write_json
+from ssplat_jax.storage.files import write_json
 from ssplat_jax.storage.run_folder import RunFolder
 
 

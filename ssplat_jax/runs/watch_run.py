@@ -23,10 +23,9 @@ from ssplat_jax.runs.chunk_recorder import ChunkRecorder
 from ssplat_jax.runs.finish_run import finish_run, finished_scene, forget_other_run
 from ssplat_jax.runs.resume import RunState, resume_run, run_identity, save_run
 from ssplat_jax.runs.run_poses import forget_poses_without_run
-from ssplat_jax.storage.folder_lock import lock_folder
 from ssplat_jax.storage.interrupts import Interrupts
-from ssplat_jax.storage.run_folder import RunFolder
-from ssplat_jax.storage.stream_state import load_newest_state
+from ssplat_jax.storage.run_folder import RunFolder, lock_folder
+from ssplat_jax.storage.saved_states import load_newest_state
 from ssplat_jax.streaming.feed import feed_chunks
 
 POLL_SECONDS = 0.25

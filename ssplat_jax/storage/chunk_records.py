@@ -1,4 +1,8 @@
-"""Chunk records: what a run notes after each chunk, one small JSON file each. The viewer and the report read them."""
+"""What a run keeps of each chunk: a record as a small JSON file, and the changes of the scene as an `.npz`.
+
+The viewer and the report read the records. The viewer of a growing run reads both, so that the stream waits for no
+browser and viewers may come and go.
+"""
 
 import base64
 import dataclasses
@@ -8,13 +12,16 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Float64, UInt8
 from PIL import Image
 
-from ssplat_jax.storage.json_files import write_json
+from ssplat_jax.core.gaussians import Gaussians
+from ssplat_jax.storage.files import load_arrays, save_arrays, write_json
+from ssplat_jax.streaming.scene_delta import SceneDelta
 
-KIND = "chunk record 1"  # kind and version of the file
+RECORD_KIND, DELTA_KIND = "chunk record 1", "scene delta 1"  # kind and version of the files
 
 THUMBNAIL_SIDE = 160
 """Longest side of a thumbnail, pixels."""
@@ -56,7 +63,7 @@ class ChunkRecord:
             }
             for view in self.views
         ]
-        return {"kind": KIND} | fields | {"views": views}
+        return {"kind": RECORD_KIND} | fields | {"views": views}
 
     @staticmethod
     def from_dict(fields: dict[str, Any]) -> "ChunkRecord":
@@ -65,8 +72,8 @@ class ChunkRecord:
         Raises:
             LookupError, TypeError, ValueError: they are of another kind or incomplete.
         """
-        if fields["kind"] != KIND:
-            raise ValueError(f"wanted {KIND}, got {fields['kind']}")
+        if fields["kind"] != RECORD_KIND:
+            raise ValueError(f"wanted {RECORD_KIND}, got {fields['kind']}")
         views = tuple(
             RecordedView(
                 frame=view["frame"],
@@ -115,3 +122,35 @@ def open_thumbnail(encoded: bytes) -> UInt8[np.ndarray, "h w 3"]:
     """The pixels of a thumbnail."""
     with Image.open(io.BytesIO(encoded)) as picture:
         return np.asarray(picture.convert("RGB"))
+
+
+def save_delta(path: Path, delta: SceneDelta, header: dict[str, Any] | None = None) -> None:
+    """Writes one delta and the caller's JSON-serializable `header` to an `.npz` file, atomically.
+
+    Raises:
+        StorageError: the file cannot be written.
+    """
+    arrays = {field.name: np.asarray(getattr(delta.gaussians, field.name)) for field in dataclasses.fields(Gaussians)}
+    arrays |= {"rows": delta.rows, "confidences": delta.confidences}
+    save_arrays(path, arrays, DELTA_KIND, {"capacity": delta.capacity, "caller": header or {}})
+
+
+def load_delta(path: Path) -> SceneDelta:
+    """Reads a delta that `save_delta` wrote.
+
+    Raises:
+        StorageError: the file is missing, of another kind, or damaged.
+    """
+    arrays, facts = load_arrays(path, DELTA_KIND)
+    rows, confidences = arrays.pop("rows"), arrays.pop("confidences")
+    gaussians = Gaussians(**{name: jnp.asarray(x) for name, x in arrays.items()})
+    return SceneDelta(rows, gaussians, facts["capacity"], confidences)
+
+
+def load_delta_header(path: Path) -> dict[str, Any]:
+    """Reads the caller's header of a delta.
+
+    Raises:
+        StorageError: the file is missing, of another kind, or damaged.
+    """
+    return load_arrays(path, DELTA_KIND)[1]["caller"]

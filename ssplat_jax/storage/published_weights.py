@@ -1,4 +1,4 @@
-"""Import of the weights that ReSplat's PyTorch code saved, as parameters of `network="resplat"`.
+"""Import of the weights that ReSplat published, as parameters of `network="resplat"`.
 
 Parameters have the names of their PyTorch modules, so a rule maps one name to the other:
 
@@ -22,7 +22,7 @@ import numpy as np
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.model import init_params
-from ssplat_jax.storage.torch_files import read_arrays, read_shapes
+from ssplat_jax.storage.files import check_tensors, read_tensors
 
 DEPTH = "encoder.depth_predictor."
 """Prefix of the depth network's tensors."""
@@ -101,7 +101,7 @@ def as_published(config: StreamConfig) -> StreamConfig:
 
 
 def import_params(path: Path, config: StreamConfig, seed: int = 0, *, depth_only: bool = False) -> ImportedParams:
-    """Imports parameters from a PyTorch checkpoint (`.pth`, `.ckpt`) or an `.npz` with the same names.
+    """Imports parameters from a `.safetensors` or `.npz` file that has PyTorch's names.
 
     Args:
         path: the file.
@@ -113,36 +113,37 @@ def import_params(path: Path, config: StreamConfig, seed: int = 0, *, depth_only
         The parameters and what the file provided.
 
     Raises:
-        InputError: `config` has another network, or the file is not a state dict, is damaged, has no tensors of this
+        InputError: `config` has another network, or the file is of another kind, is damaged, has no tensors of this
             network, has only some tensors of a part, or has tensors of other shapes.
     """
     if config.network.kind != "resplat":
         raise InputError(
             f"import-weights: wanted a preset of ReSplat's network (paper, small, base), got {config.preset!r}."
         )
-    shapes = read_shapes(path)
+    in_file = read_tensors(path)
     # A depth network on its own is saved without the prefix of the model around it.
-    missing_prefix = "" if any(name.startswith("encoder.") for name in shapes) else DEPTH
+    missing_prefix = "" if any(name.startswith("encoder.") for name in in_file) else DEPTH
     tensors_by_place = published_tensors(config)
     tensors = {place: t for place, t in tensors_by_place.items() if t is not None}
     names_in_file = {t.name: t.name.removeprefix(missing_prefix) for t in tensors.values()}
     wanted = {name for name in names_in_file if name.startswith(DEPTH) or not depth_only}
-    available = {name for name, in_file in names_in_file.items() if name in wanted and in_file in shapes}
+    available = {name for name, there in names_in_file.items() if name in wanted and there in in_file}
     initialized_parts = _initialized_parts(path, names_in_file, available)
     if not available:
         raise InputError(
             f"{path}: wanted weights of ReSplat, its depth network or Depth Anything V2; the file has none of their"
             f" {len(tensors)} tensors."
         )
-    arrays = read_arrays(path, {names_in_file[t.name]: t.shape for t in tensors.values() if t.name in available})
+    shapes = {names_in_file[t.name]: t.shape for t in tensors.values() if t.name in available}
+    check_tensors(path, in_file, shapes)
     incomplete = {p.partition("/")[0] for p, t in tensors_by_place.items() if t is None or t.name not in available}
     key = jax.random.key(seed)
     stages = jax.eval_shape(lambda: init_params(key, config))  # those without parameters too
     params = {name: {} for name in stages} | init_params(key, config, incomplete)
     for place, tensor in tensors.items():
         if tensor.name in available:
-            _insert(params, place, jnp.asarray(tensor.to_parameter(arrays[names_in_file[tensor.name]])))
-    return ImportedParams(params, len(arrays), len(shapes) - len(arrays), initialized_parts)
+            _insert(params, place, jnp.asarray(tensor.to_parameter(in_file[names_in_file[tensor.name]])))
+    return ImportedParams(params, len(shapes), len(in_file) - len(shapes), initialized_parts)
 
 
 def _initialized_parts(path: Path, names_in_file: dict[str, str], available: set[str]) -> tuple[str, ...]:
@@ -152,8 +153,8 @@ def _initialized_parts(path: Path, names_in_file: dict[str, str], available: set
         of_part = [name for name in names_in_file if name.startswith(part)]
         absent = [name for name in of_part if name not in available]
         if 0 < len(absent) < len(of_part):
-            in_file = names_in_file[absent[0]]
-            raise InputError(f"{path}: wanted an array {in_file}, the file has none; is it another network's?")
+            missing = names_in_file[absent[0]]
+            raise InputError(f"{path}: wanted an array {missing}, the file has none; is it another network's?")
         if absent:
             first = part if isinstance(part, str) else part[0]
             initialized.append(first.removeprefix(DEPTH).removeprefix("encoder.").strip("."))

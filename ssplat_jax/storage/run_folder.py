@@ -1,103 +1,57 @@
-"""Paths of the files in a result folder. Their names are written here and nowhere else."""
+"""Result folders: the names of their files, which are written here and nowhere else, and the lock on a folder."""
 
-import dataclasses
+import contextlib
+import fcntl
 import json
+import os
+import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
 from ssplat_jax.core.atomic import previous_path
-from ssplat_jax.core.errors import refusal
-from ssplat_jax.storage.folders import remove_numbered
-
-NUMBER = "[0-9]" * 6
-"""Pattern of the numbers of views in file names; other files in a run's folders are the user's."""
+from ssplat_jax.core.errors import InputError, StorageError, refusal
 
 
-@dataclasses.dataclass(frozen=True)
 class RunFolder:
-    """The result folder of `ssplat run`, `demo`, `eval` or `render`; each writes some of these files."""
+    """The result folder of `ssplat run`, `demo`, `eval` or `render`; each writes some of these files.
 
-    path: Path
+    Only files of these names are ever removed; others in the folder are the user's.
 
-    @property
-    def scene(self) -> Path:
-        """The scene, in the capture's frame."""
-        return self.path / "scene.ply"
+    Args:
+        path: the folder; it may be missing.
+    """
 
-    @property
-    def refined_scene(self) -> Path:
-        """The refined scene, in the capture's frame; `scene` stays as it was streamed."""
-        return self.path / "refined.ply"
-
-    @property
-    def refinement(self) -> Path:
-        """The losses and scores of the refinement as JSON."""
-        return self.path / "refinement.json"
-
-    @property
-    def refinement_state(self) -> Path:
-        """The saved refinement, from which a stopped one continues."""
-        return self.path / "refinement.npz"
-
-    @property
-    def state(self) -> Path:
-        """The saved stream state, from which a stopped run continues."""
-        return self.path / "state.npz"
-
-    @property
-    def adjusted_poses(self) -> Path:
-        """The poses that were adjusted before the stream, as JSON."""
-        return self.path / "adjusted_poses.json"
-
-    @property
-    def metrics(self) -> Path:
-        """The facts and scores of the run as JSON."""
-        return self.path / "metrics.json"
-
-    @property
-    def split(self) -> Path:
-        """The context and target frames of an evaluation."""
-        return self.path / "split.json"
-
-    @property
-    def index(self) -> Path:
-        """The frames of an evaluation as an index file."""
-        return self.path / "index.json"
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.scene = path / "scene.ply"  # as it was streamed, in the capture's frame
+        self.refined_scene = path / "refined.ply"  # the refined scene, in the capture's frame
+        self.refinement = path / "refinement.json"  # losses and scores of the refinement
+        self.refinement_state = path / "refinement.npz"  # from which a stopped refinement continues
+        self.state = path / "state.npz"  # the saved stream, from which a stopped run continues
+        self.adjusted_poses = path / "adjusted_poses.json"  # the poses that were adjusted before the stream
+        self.metrics = path / "metrics.json"  # facts and scores
+        self.split = path / "split.json"  # the context and target frames of an evaluation
+        self.index = path / "index.json"  # the same frames as an index file
+        self.deltas = path / "deltas"  # folder with one file of scene changes per chunk
+        self.chunk_records = path / "chunks"  # folder with one record per chunk
+        self.report = path / "report.html"  # the report as one page
+        self.contact_sheet = path / "contact_sheet.jpg"  # all pictures on one sheet
+        self.views = path / "views"  # folder with one picture per rendered frame
 
     def film(self, kind: str = "color") -> Path:
         """The film of a kind that `ssplat render --film` writes: color, depth or normals."""
         return self.path / ("film.mp4" if kind == "color" else f"film_{kind}.mp4")
 
-    @property
-    def deltas(self) -> Path:
-        """The folder with one file of scene changes per chunk."""
-        return self.path / "deltas"
-
-    @property
-    def chunk_records(self) -> Path:
-        """The folder with one record per chunk."""
-        return self.path / "chunks"
-
-    @property
-    def report(self) -> Path:
-        """The report as one HTML page."""
-        return self.path / "report.html"
-
-    @property
-    def contact_sheet(self) -> Path:
-        """All pictures on one sheet."""
-        return self.path / "contact_sheet.jpg"
-
-    @property
-    def views(self) -> Path:
-        """The folder with one picture per rendered frame."""
-        return self.path / "views"
-
     def delta(self, num_views: int) -> Path:
         """The scene changes of the chunk that brought the stream to `num_views` views."""
         return self.deltas / f"{num_views:06d}.npz"
+
+    def delta_files(self) -> list[Path]:
+        """All deltas in stream order; the list is empty if there is no such folder."""
+        return _numbered(self.deltas, "######.npz")
 
     def chunk_record(self, num_views: int) -> Path:
         """The record of the chunk that brought the stream to `num_views` views."""
@@ -105,7 +59,7 @@ class RunFolder:
 
     def chunk_record_files(self) -> list[Path]:
         """All chunk records in stream order; the list is empty if there is no such folder."""
-        return sorted(self.chunk_records.glob(f"{NUMBER}.json"))
+        return _numbered(self.chunk_records, "######.json")
 
     def view(self, i: int) -> Path:
         """The picture of frame `i`."""
@@ -129,38 +83,26 @@ class RunFolder:
             fix = "choose another folder"
             raise refusal(f"--out {self.path}", wanted="a folder without a run", got="that of a run", fix=fix)
 
-    def has_deltas(self) -> bool:
-        """True if at least one delta is saved here."""
-        return bool(self.delta_files())
-
-    def delta_files(self) -> list[Path]:
-        """All deltas in stream order; the list is empty if there is no such folder."""
-        return sorted(self.deltas.glob(f"{NUMBER}.npz"))
-
     def clear_run(self) -> None:
-        """Removes the run that the folder holds; files of the user stay."""
-        files = (self.state, previous_path(self.state), self.scene, self.metrics, self.adjusted_poses)
-        for stale in files:
-            stale.unlink(missing_ok=True)
+        """Removes the run that the folder holds."""
+        self._remove(self.state, previous_path(self.state), self.scene, self.metrics, self.adjusted_poses)
+        self._remove(self.report, self.contact_sheet)
         self.clear_refinement()
         self.clear_deltas()
-        self.clear_report()
-        remove_numbered(self.chunk_records, f"{NUMBER}.json")
+        remove_numbered(self.chunk_records, "######.json")
         self.clear_views()
+
+    def _remove(self, *files: Path) -> None:
+        for file in files:
+            file.unlink(missing_ok=True)
 
     def clear_refinement(self) -> None:
         """Removes the refinement; the streamed scene stays."""
-        for stale in (self.refinement_state, self.refined_scene, self.refinement):
-            stale.unlink(missing_ok=True)
+        self._remove(self.refinement_state, self.refined_scene, self.refinement)
 
     def clear_deltas(self) -> None:
         """Removes all deltas."""
-        remove_numbered(self.deltas, f"{NUMBER}.npz")
-
-    def clear_report(self) -> None:
-        """Removes the report and the contact sheet."""
-        for stale in (self.report, self.contact_sheet):
-            stale.unlink(missing_ok=True)
+        remove_numbered(self.deltas, "######.npz")
 
     def clear_views(self) -> None:
         """Removes the pictures in `views`."""
@@ -191,3 +133,78 @@ def scene_exposure(scene: Path) -> Float[np.ndarray, "3"]:
         got, fix = f"none for {scene}", "give the folder of a finished `ssplat run`, or leave the flag out"
         raise refusal("--one-exposure", wanted="the exposure of the scene in metrics.json", got=got, fix=fix)
     return factors
+
+
+def _numbered(folder: Path, name: str) -> list[Path]:
+    """The files of a folder, in order, whose name is `name` with a digit for every `#`."""
+    return sorted(folder.glob(name.replace("#", "[0-9]")))
+
+
+def remove_numbered(folder: Path, name: str, *, and_folder: bool = True) -> None:
+    """Removes numbered files from `folder`, and by default the folder itself if it is empty afterwards.
+
+    Args:
+        folder: the folder to clear; it may be missing.
+        name: file name in which each `#` stands for one digit, such as `#####.png`.
+        and_folder: remove an empty folder too.
+
+    Raises:
+        StorageError: a file cannot be removed.
+    """
+    try:
+        for path in _numbered(folder, name):
+            path.unlink()
+    except OSError as error:
+        raise StorageError(f"{folder}: cannot be cleared ({error.strerror or error}); choose another place.") from error
+    if and_folder:
+        _remove_if_empty(folder)
+
+
+def make_writable(folder: Path) -> None:
+    """Creates `folder` if it is missing and checks that files can be created in it.
+
+    Raises:
+        StorageError: the folder cannot be created or written to.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise StorageError(f"{folder}: cannot be written ({error.strerror or error}); choose another place.") from error
+
+
+@contextlib.contextmanager
+def lock_folder(folder: Path) -> Iterator[None]:
+    """Holds an exclusive lock on `folder`, which is created if missing: one process at a time writes to it.
+
+    The lock is the operating system's (`flock`) on the folder itself: it needs no lock file, and it ends with the
+    process even if that is killed. A folder that was created here and is still empty at the end is removed.
+
+    Raises:
+        InputError: another process holds the lock.
+        StorageError: the folder cannot be created or written to, or its file system does not support locks.
+    """
+    is_new = not folder.exists()
+    make_writable(folder)
+    with contextlib.ExitStack() as stack:
+        try:
+            descriptor = os.open(folder, os.O_RDONLY)
+            stack.callback(os.close, descriptor)  # releases the lock, so it comes last
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise InputError(
+                f"{folder}: another process is writing to it; wait until it ends, or choose another --out."
+            ) from error
+        except OSError as error:
+            raise StorageError(
+                f"{folder}: cannot be locked ({error.strerror or error}); choose another place."
+            ) from error
+        if is_new:
+            stack.callback(_remove_if_empty, folder)
+        yield
+
+
+def _remove_if_empty(folder: Path) -> None:
+    with contextlib.suppress(OSError):  # missing, or not empty
+        folder.rmdir()

@@ -11,14 +11,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 
 from ssplat_jax.config import PRESETS, StreamConfig, preset
 from ssplat_jax.core.errors import InputError, StorageError
 from ssplat_jax.model import init_params
-from ssplat_jax.storage.npz import load_arrays, save_arrays
-from ssplat_jax.storage.saved_config import config_from_header
+from ssplat_jax.storage.files import load_arrays, save_arrays
 
-KIND = "weights"  # kind of the file
+KIND = "weights 1"
 
 
 def save_weights(
@@ -52,7 +52,7 @@ def load_weights(path: Path) -> tuple[dict, StreamConfig]:
         InputError: the parameters do not have the shapes of the file's configuration.
     """
     arrays, header = load_arrays(path, KIND)
-    config = config_from_header(header["config"])
+    config = StreamConfig.from_dict(header["config"])
     return _restore(path, arrays, config), config
 
 
@@ -74,7 +74,7 @@ def describe_weights(name: str) -> WeightsFacts:
     """
     with resources.as_file(_source(name)) as path:
         _, header = load_arrays(path, KIND)
-        config = preset(name) if name in PRESETS else config_from_header(header["config"])
+        config = preset(name) if name in PRESETS else StreamConfig.from_dict(header["config"])
         return WeightsFacts(config, dict(header.get("provenance") or {}), path.stat().st_size)
 
 
@@ -110,6 +110,36 @@ def _source(name: str) -> Traversable:
 def _shipped(preset_name: str) -> Traversable:
     """Location of the weights that ship with a preset; the file may not exist."""
     return resources.files("ssplat_jax") / "weights" / f"{preset_name}.npz"
+
+
+def trainings(provenance: dict) -> list[dict]:
+    """The provenance of each training, or import, that led to weights, the first one first."""
+    before = provenance.get("before")
+    return [*(trainings(before) if isinstance(before, dict) else ()), provenance]
+
+
+def stage_turns(params: dict, facts: WeightsFacts) -> dict[str, float]:
+    """How far training turned the parameters of each stage from their random start: the sine of the angle between both.
+
+    Weight decay alone shortens the vector of a stage's parameters and does not turn it.
+
+    Limits:
+        Stages without parameters are left out. A stage that starts at zero has 0 if it stayed there, else 1.
+    """
+    start: dict = {}
+    for training in trainings(facts.provenance):
+        seed = (training.get("recipe") or {}).get("seed", 0)
+        # A later training began with the stages of the one before, and drew only those that were missing.
+        fresh = training.get("fresh", ()) if start else None
+        start |= init_params(jax.random.key(seed), facts.config, only=fresh)
+    turns = {}
+    for stage, part in start.items():
+        if jax.tree.leaves(part):
+            before, after = (np.asarray(ravel_pytree(x)[0], np.float64) for x in (part, params[stage]))
+            # What is left of `after` without its part along the start: 1 - cos^2 would cancel for small angles.
+            across = after - (after @ before) / max(before @ before, 1e-300) * before
+            turns[stage] = float(np.linalg.norm(across) / max(np.linalg.norm(after), 1e-300))
+    return turns
 
 
 def params_digest(params: Any) -> str:

@@ -17,14 +17,13 @@ from ssplat_jax.core.atomic import write_atomic
 from ssplat_jax.core.cores import num_cores
 from ssplat_jax.evaluation.lpips import LpipsWeights
 from ssplat_jax.model.streamsplat import StreamSplat
-from ssplat_jax.storage.folder_lock import lock_folder
+from ssplat_jax.storage.files import json_text
 from ssplat_jax.storage.interrupts import Interrupts
-from ssplat_jax.storage.json_files import json_text
-from ssplat_jax.storage.saved_config import config_from_header
-from ssplat_jax.storage.training_state import TrainingCheckpoints
+from ssplat_jax.storage.run_folder import lock_folder
+from ssplat_jax.storage.saved_states import TrainingCheckpoints
 from ssplat_jax.storage.weights import params_digest
 from ssplat_jax.training.capture_samples import CaptureMix
-from ssplat_jax.training.recipe import Recipe, training_config, with_defaults
+from ssplat_jax.training.recipe import Recipe, training_config
 from ssplat_jax.training.samples import prefetched
 from ssplat_jax.training.step import Trainer, TrainState, init_state, learning_rate
 from ssplat_jax.training.step_samples import batch_for_step
@@ -66,7 +65,7 @@ def train(
     Args:
         config: model configuration; `training_config` changes cache and exposure.
         recipe: phases, optimizer and loss.
-        out: directory of `log.jsonl`, `recipe.json` and `checkpoints/`.
+        out: directory of `log.jsonl`, `recipe.json` and `training.npz`.
         params: initial parameters; default random ones from the recipe's seed. A run is resumed with the same ones.
         init_weights: name of `params` in the description of the run; default their digest.
         mix: captures to learn from, beside procedural scenes.
@@ -89,17 +88,13 @@ def train(
     with lock_folder(out):
         init_weights = init_weights or (RANDOM if params is None else params_digest(params))
         description = describe_run(model.config, recipe, init_weights, lpips_weights=lpips_weights, mix=mix)
-        upgrade = functools.partial(upgrade_description, wanted=description)
-        checkpoints = TrainingCheckpoints(out, description, upgrade=upgrade)
-        try:
-            state, start = init_state(model, recipe, params), 0
-            if (restored := checkpoints.restore_latest(state, warn)) is not None:
-                start, state = restored
-            log = _Log(out / LOG_FILE, recipe, report, start)
-            every = _Every(save_every, log_every, validate_every)
-            return _run(model, recipe, state, start, mix, lpips_weights, checkpoints, log, every)
-        finally:
-            checkpoints.close()
+        checkpoints = TrainingCheckpoints(out, description)
+        state, start = init_state(model, recipe, params), 0
+        if (restored := checkpoints.restore_latest(state, warn)) is not None:
+            start, state = restored
+        log = _Log(out / LOG_FILE, recipe, report, start)
+        every = _Every(save_every, log_every, validate_every)
+        return _run(model, recipe, state, start, mix, lpips_weights, checkpoints, log, every)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -139,26 +134,6 @@ def describe_run(
     if mix is not None:
         description["captures"] = mix.describe()
     return description
-
-
-def upgrade_description(description: dict, wanted: dict) -> dict:
-    """Description of a run, as read from JSON, with the fields that older versions did not write.
-
-    Args:
-        description: as `describe_run` gives it.
-        wanted: description of the run that continues it. Initial parameters, weights of LPIPS and files of captures are
-            taken to be the same where `description` does not hold them: runs of older versions go on, unguarded.
-    """
-    upgraded = {"init_weights": wanted["init_weights"]} | description
-    upgraded["config"] = config_from_header(description["config"]).to_dict()
-    upgraded["recipe"] = with_defaults(description.get("recipe", {}))
-    if "rendering_loss" in description and "lpips_weights" in wanted:
-        upgraded = {"lpips_weights": wanted["lpips_weights"]} | upgraded
-    groups = description.get("captures", [])
-    if groups and len(groups) == len(wanted.get("captures", [])):
-        pairs = zip(groups, wanted["captures"], strict=True)
-        upgraded["captures"] = [{"files": now["files"]} | held for held, now in pairs]
-    return upgraded
 
 
 def _run(model, recipe, state, start, mix, lpips_weights, checkpoints, log, every: _Every) -> TrainResult:

@@ -13,7 +13,7 @@ from ssplat_jax.core.errors import InputError, StorageError
 from ssplat_jax.core.gaussians import Gaussians, scale_colors
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.scene_files.formats import read_scene
-from ssplat_jax.storage.delta_files import load_delta, load_delta_header
+from ssplat_jax.storage.chunk_records import load_delta, load_delta_header
 from ssplat_jax.storage.run_folder import RunFolder, scene_exposure
 from ssplat_jax.streaming.scene_delta import apply_confidences, apply_delta
 from ssplat_jax.viewer.recorded_run import RecordedRun

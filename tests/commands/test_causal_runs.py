@@ -9,7 +9,7 @@ from PIL import Image
 
 from ssplat_jax.core.atomic import previous_path
 from ssplat_jax.model.streamsplat import StreamSplat
-from ssplat_jax.storage.stream_state import load_state
+from ssplat_jax.storage.saved_states import load_state
 from ssplat_jax.storage.weights import save_weights
 from tests.commands.test_cli import few_pivots, make_capture, run  # noqa: F401
 from tests.streaming.narrow_model import NARROW, assert_same_bits

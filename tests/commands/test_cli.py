@@ -33,10 +33,10 @@ from ssplat_jax.evaluation import evaluate, latency
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.refinement import refine_on_capture
 from ssplat_jax.scene_files.ply import load_ply, save_ply
-from ssplat_jax.storage.delta_files import load_delta, load_delta_header
+from ssplat_jax.storage.chunk_records import load_delta, load_delta_header
 from ssplat_jax.storage.published_weights import as_published, published_tensors
 from ssplat_jax.storage.run_folder import RunFolder
-from ssplat_jax.storage.stream_state import load_state
+from ssplat_jax.storage.saved_states import load_state
 from ssplat_jax.storage.weights import load_params, load_weights, save_weights
 from ssplat_jax.streaming.scene_delta import apply_delta
 from tests.model.resplat_fixture import named_tensor

@@ -14,7 +14,7 @@ from ssplat_jax.core.gaussians import SH_C0, scale_colors
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.scene_files.formats import load_scene, save_gaussians
-from ssplat_jax.storage.stream_state import load_state
+from ssplat_jax.storage.saved_states import load_state
 from ssplat_jax.storage.weights import save_weights
 from ssplat_jax.viewer.scene_sources import open_source
 from tests.commands.test_cli import few_pivots, make_capture, run  # noqa: F401

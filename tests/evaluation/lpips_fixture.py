@@ -1,7 +1,7 @@
 """Random VGG16 weights, heads and image pairs, and the results of PyTorch's `lpips` package on them.
 
-Tests draw the same numbers again; only the results are stored, in lpips_data: lpips.json, and two small files written
-by `torch.save`. To write them again (PyTorch is not a dependency of the project):
+Tests draw the same numbers again; only the results are stored, in lpips.json.
+To write it again (PyTorch is not a dependency of the project):
 
     python -m venv lpips_env && lpips_env/bin/pip install torch torchvision lpips
     lpips_env/bin/python tests/evaluation/lpips_fixture.py
@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-FOLDER = Path(__file__).with_name("lpips_data")
+RESULTS = Path(__file__).with_name("lpips.json")
 
 # (index in torchvision's `vgg16().features`, channels in, channels out)
 CONVOLUTIONS = (
@@ -56,18 +56,6 @@ def image_pairs() -> dict[str, tuple[np.ndarray, np.ndarray]]:
     }
 
 
-def small_dict() -> dict[str, tuple[np.ndarray, str]]:
-    """Arrays in the small files, and their dtypes there."""
-    return {
-        "plain": (uniform(400, 3, 4), "float32"),
-        "transposed": (uniform(401, 4, 3), "float32"),
-        "tail": (uniform(402, 3), "bfloat16"),
-        "half": (uniform(403, 2, 2), "float16"),
-        "double": (uniform(404, 2), "float64"),
-        "scalar": (uniform(405, 1)[0], "float32"),
-    }
-
-
 def package_result(model, a: np.ndarray, b: np.ndarray) -> dict:
     """Total and layers of the `lpips` package, and its gradient at the center pixel of `a`."""
     import torch
@@ -77,17 +65,6 @@ def package_result(model, a: np.ndarray, b: np.ndarray) -> dict:
     total.sum().backward()
     center = x.grad[0, :, a.shape[0] // 2, a.shape[1] // 2]
     return {"total": total.item(), "layers": [layer.item() for layer in layers], "gradient": center.tolist()}
-
-
-def save_small_files() -> None:
-    """Writes `small_dict` in both formats of `torch.save`, with views: a transpose, and the end of a longer storage."""
-    import torch
-
-    held = {name: torch.tensor(x).to(getattr(torch, dtype)) for name, (x, dtype) in small_dict().items()}
-    held["transposed"] = held["transposed"].t().contiguous().t()
-    held["tail"] = torch.cat([torch.zeros(2, dtype=torch.bfloat16), held["tail"]])[2:]
-    torch.save(held, FOLDER / "zip.pth")
-    torch.save(held, FOLDER / "legacy.pth", _use_new_zipfile_serialization=False)
 
 
 def main() -> None:
@@ -101,11 +78,9 @@ def main() -> None:
     left_out = set(model.load_state_dict(held, strict=False).missing_keys)
     # The package keeps its heads under two names.
     assert all(name.startswith(("lins.", "scaling_layer.")) for name in left_out), left_out
-    FOLDER.mkdir(exist_ok=True)
     results = {name: package_result(model, a, b) for name, (a, b) in image_pairs().items()}
     versions = {name: version(name) for name in ("torch", "lpips")}
-    (FOLDER / "lpips.json").write_text(json.dumps({"versions": versions, "pairs": results}, indent=1) + "\n")
-    save_small_files()
+    RESULTS.write_text(json.dumps({"versions": versions, "pairs": results}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

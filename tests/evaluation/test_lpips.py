@@ -9,9 +9,9 @@ import pytest
 
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.evaluation.lpips import LpipsWeights, load_lpips, lpips, lpips_layers
-from tests.evaluation.lpips_fixture import FOLDER, image_pairs, random_heads, random_vgg, uniform
+from tests.evaluation.lpips_fixture import RESULTS, image_pairs, random_heads, random_vgg, uniform
 
-PACKAGE = json.loads((FOLDER / "lpips.json").read_text())["pairs"]
+PACKAGE = json.loads(RESULTS.read_text())["pairs"]
 PARITY = 1e-5  # relative; both sides are float32
 GRADIENT_PARITY = 1e-4  # of the largest component; thirteen layers of float32 each way
 

@@ -1,7 +1,6 @@
 """Every parser of the package with a good file for it, to be damaged."""
 
 import json
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -15,17 +14,15 @@ from ssplat_jax.cache import init_cache
 from ssplat_jax.data.index_files import read_index
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.scene_files.formats import FORMATS, save_gaussians
-from ssplat_jax.storage.delta_files import load_delta, save_delta
-from ssplat_jax.storage.npz import _DIGEST_LENGTH, _hex_digest
+from ssplat_jax.storage.chunk_records import load_delta, save_delta
+from ssplat_jax.storage.files import read_tensors
 from ssplat_jax.storage.run_folder import scene_exposure
-from ssplat_jax.storage.stream_state import load_state, save_state
-from ssplat_jax.storage.torch_files import read_arrays
+from ssplat_jax.storage.saved_states import load_state, save_state
 from ssplat_jax.storage.weights import load_weights, save_weights
 from ssplat_jax.streaming.scene_delta import SceneDelta
 from tests.badinputs.cases import make_capture
 from tests.data.capture_writers import WRITERS
 from tests.data.test_reader_refusals import FILES as CAPTURE_FILES
-from tests.evaluation.lpips_fixture import FOLDER, small_dict
 from tests.scene_files.scene_fixture import scene
 from tests.streaming.narrow_model import NARROW
 
@@ -33,13 +30,6 @@ from tests.streaming.narrow_model import NARROW
 class Parser(NamedTuple):
     write: Callable[[Path], Path]  # writes good files to a folder; returns the one to damage
     read: Callable[[Path], object]  # reads it again
-    finish: Callable[[bytes], bytes] = bytes  # applied to the damaged bytes
-
-
-def sealed(data: bytes) -> bytes:
-    """The bytes of an .npz with a checksum that fits, so that damage reaches what is read behind it."""
-    body = data[:-_DIGEST_LENGTH]
-    return body + _hex_digest(body)
 
 
 def read_capture(path: Path) -> None:
@@ -112,12 +102,26 @@ def write_json(name: str, value: object) -> Callable[[Path], Path]:
     return write
 
 
-def copy(name: str) -> Callable[[Path], Path]:
-    return lambda root: Path(shutil.copy(FOLDER / name, root / name))
+TENSORS = {"conv.weight": np.arange(12, dtype=np.float32).reshape(3, 4), "bn.gamma": np.ones(2, np.float16)}
+
+
+def write_npz(root: Path) -> Path:
+    np.savez(root / "a.npz", **TENSORS)
+    return root / "a.npz"
+
+
+def write_safetensors(root: Path) -> Path:
+    facts, body = {"__metadata__": {"format": "pt"}}, b""
+    for name, x in TENSORS.items():
+        ends = [len(body), len(body) + x.nbytes]
+        facts[name] = {"dtype": {4: "F32", 2: "F16"}[x.itemsize], "shape": x.shape, "data_offsets": ends}
+        body += x.tobytes()
+    text = json.dumps(facts).encode()
+    (root / "a.safetensors").write_bytes(len(text).to_bytes(8, "little") + text + body)
+    return root / "a.safetensors"
 
 
 INDEX = {"room": {"context": [0, 2, 4], "target": [1, 3]}, "hall": None}
-SHAPES = {name: x.shape for name, (x, _) in small_dict().items()}
 IMAGES = ("transforms.json", "images/2.jpg", "images/2.png", "images/2.webp", "d.png")
 
 PARSERS = (
@@ -130,14 +134,13 @@ PARSERS = (
     | {suffix: Parser(write_scene(suffix), ss.load_scene) for suffix in FORMATS}
     | {
         "stream state": Parser(write_state, load_state),
-        "stream state, sealed": Parser(write_state, load_state, sealed),
-        "delta, sealed": Parser(write_delta, load_delta, sealed),
-        "weights, sealed": Parser(write_weights, load_weights, sealed),
+        "delta": Parser(write_delta, load_delta),
+        "weights": Parser(write_weights, load_weights),
         "index": Parser(write_json("index.json", INDEX), read_index),
         "metrics": Parser(
             write_json("metrics.json", {"scene_exposure": [1.0, 0.9, 1.1]}), lambda p: scene_exposure(p.parent)
         ),
-        "torch zip": Parser(copy("zip.pth"), lambda path: read_arrays(path, SHAPES)),
-        "torch legacy": Parser(copy("legacy.pth"), lambda path: read_arrays(path, SHAPES)),
+        "npz of tensors": Parser(write_npz, read_tensors),
+        "safetensors": Parser(write_safetensors, read_tensors),
     }
 )

@@ -13,7 +13,7 @@ from ssplat_jax.core.errors import InputError
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.poses import requirements, sfm
 from ssplat_jax.poses.estimate import PoseOptions, _request, estimate_poses
-from ssplat_jax.storage.json_files import write_json
+from ssplat_jax.storage.files import write_json
 from tests.poses.room_fixture import FOCAL, K, pictures, walk
 
 pytest.importorskip("pycolmap", reason="poses need pycolmap: pip install -e '.[poses]'")

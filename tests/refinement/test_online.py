@@ -27,7 +27,7 @@ from ssplat_jax.model.streamsplat import ChunkOutput, StreamSplat
 from ssplat_jax.rasterizer import render
 from ssplat_jax.refinement.online import online_refinement, online_step, revise_scene, views_of_round
 from ssplat_jax.refinement.visible_pivots import areas_before, visible_pivots
-from ssplat_jax.storage.stream_state import load_state, save_state
+from ssplat_jax.storage.saved_states import load_state, save_state
 from ssplat_jax.streaming.scene_delta import SceneFeed, apply_delta
 from ssplat_jax.streaming.session import Session
 

@@ -11,10 +11,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from ssplat_jax.evaluation.contact_sheet import GAP, LINE, MAX_PICTURES, evenly_spread, save_contact_sheet
-from ssplat_jax.evaluation.pictures import save_image
+from ssplat_jax.evaluation.pictures import GAP, LINE, MAX_PICTURES, evenly_spread, save_contact_sheet, save_image
 from ssplat_jax.evaluation.report_page import Report, page_text
-from ssplat_jax.evaluation.svg_plot import BOTTOM, HEIGHT, LEFT, RIGHT, TOP, WIDTH, Line, line_plot
 from ssplat_jax.runs.reports import MOST_PICTURES, report_eval, report_run
 from ssplat_jax.storage.chunk_records import ChunkRecord, RecordedView, make_thumbnail, save_chunk_record
 from ssplat_jax.storage.run_folder import RunFolder
@@ -121,8 +119,7 @@ def test_the_report_of_a_run_holds_its_pictures_and_figures(folder):
     assert len(images) == MOST_PICTURES
     for place, k in ((0, 0), (-1, 30)):
         assert -10 * np.log10(np.mean((images[place] - smooth_picture(k)) ** 2)) > JPEG_DB
-    titles = re.findall(r'class="title" >([^<]*)<', text)
-    assert titles == ["Time of a chunk", "Cache in use", "Views that are held back", "Scene", "Exposure"]
+    assert text.count("<tr><td>4</td>") == text.count("<tr><td>8</td>") == text.count("<tr><td>12</td>") == 1
 
 
 def test_printed_commands_are_words_of_a_shell(tmp_path):
@@ -186,35 +183,6 @@ def test_text_is_escaped():
         assert html.escape(raw) in text
         assert raw in Page(text).text
     assert not {"i", "u", "s", "c"} & {tag for tag, _ in Page(text).tags}
-
-
-def coordinates(svg):
-    """Points of the lines of a plot."""
-    return [np.array([p.split() for p in d[1:].split("L")], float) for d in re.findall(r'round" d="([^"]*)"', svg)]
-
-
-def test_a_plot_puts_points_where_its_axes_say():
-    (line,) = coordinates(line_plot("t", "x", "y", [Line("a", [0, 10, 40], [1.0, 3.0, 2.0])]))
-    inner = WIDTH - LEFT - RIGHT
-    np.testing.assert_allclose(line[:, 0], [LEFT, LEFT + inner / 4, WIDTH - RIGHT], atol=0.01)
-    # The y axis goes from 1 to 3 in steps of a half.
-    np.testing.assert_allclose(line[:, 1], [HEIGHT - BOTTOM, TOP, (HEIGHT - BOTTOM + TOP) / 2], atol=0.01)
-
-
-@pytest.mark.parametrize("values", [(0.0, 1e-9), (5.0, 5.0), (-3.2, 7.9), (1e6, 1.00001e6), (0.0, 0.0), (0.013, 0.97)])
-def test_a_plot_shows_any_range_inside_its_frame(values):
-    svg = line_plot("t", "x", "y", [Line("a", [1, 2], values)])
-    (line,) = coordinates(svg)
-    assert (line[:, 0] >= LEFT).all() and (line[:, 0] <= WIDTH - RIGHT).all()
-    assert (line[:, 1] >= TOP - 0.01).all() and (line[:, 1] <= HEIGHT - BOTTOM + 0.01).all()
-    assert 2 <= svg.count('class="grid"') <= 7
-
-
-def test_a_plot_leaves_out_what_is_not_finite_and_says_if_nothing_is():
-    svg = line_plot("t", "x", "y", [Line("a", [0, 1, 2, 3], [1.0, np.nan, None, 2.0]), Line("b", [0], [np.inf])])
-    (line,) = coordinates(svg)
-    assert len(line) == 2
-    assert "nothing to show" in line_plot("t", "x", "y", [Line("b", [], [])])
 
 
 def test_a_contact_sheet_has_pictures_in_order_and_no_more_than_fit(tmp_path):

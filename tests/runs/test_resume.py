@@ -1,4 +1,4 @@
-"""Saved runs that may be continued, including those of version 0.1, which saved a flat configuration."""
+"""Saved runs that may be continued."""
 
 import copy
 

@@ -18,7 +18,7 @@ from PIL import Image
 
 from ssplat_jax.core.atomic import previous_path
 from ssplat_jax.data.procedural import procedural_capture_arrays
-from ssplat_jax.storage.stream_state import load_newest_state
+from ssplat_jax.storage.saved_states import load_newest_state
 
 ROOT = Path(__file__).resolve().parents[2]
 NUM_CHUNKS, CHUNK_SIZE = 64, 4

@@ -11,8 +11,7 @@ from ssplat_jax.commands.demo_command import Demo
 from ssplat_jax.commands.eval_command import Eval
 from ssplat_jax.commands.main import main
 from ssplat_jax.core.errors import InputError, StorageError
-from ssplat_jax.storage.folder_lock import lock_folder
-from ssplat_jax.storage.folders import remove_numbered
+from ssplat_jax.storage.run_folder import lock_folder, remove_numbered
 
 
 def test_a_second_process_is_refused_until_the_first_ends(tmp_path):
@@ -49,7 +48,7 @@ def test_only_numbered_files_are_removed(tmp_path):
 
 def test_the_lock_ends_with_a_killed_process(tmp_path):
     hold = (
-        "import sys, time; from pathlib import Path; from ssplat_jax.storage.folder_lock import lock_folder\n"
+        "import sys, time; from pathlib import Path; from ssplat_jax.storage.run_folder import lock_folder\n"
         "with lock_folder(Path(sys.argv[1])): print('held', flush=True); time.sleep(60)"
     )
     with subprocess.Popen([sys.executable, "-c", hold, str(tmp_path)], stdout=subprocess.PIPE, text=True) as holder:

@@ -21,7 +21,7 @@ from ssplat_jax.commands import run_command
 from ssplat_jax.commands.main import main
 from ssplat_jax.core.atomic import previous_path, write_atomic
 from ssplat_jax.core.errors import StorageError
-from ssplat_jax.storage.stream_state import load_newest_state
+from ssplat_jax.storage.saved_states import load_newest_state
 from ssplat_jax.streaming.session import Session
 from tests.commands.test_cli import make_capture
 

@@ -3,7 +3,7 @@
 import json
 import math
 
-from ssplat_jax.storage.json_files import json_text, write_json
+from ssplat_jax.storage.files import json_text, write_json
 
 
 def refuse(name: str):

@@ -14,7 +14,7 @@ from ssplat_jax.cache import init_cache
 from ssplat_jax.core.atomic import previous_path
 from ssplat_jax.core.errors import InputError, StorageError
 from ssplat_jax.core.pytree import replace
-from ssplat_jax.storage.stream_state import load_newest_state, load_state, save_state
+from ssplat_jax.storage.saved_states import load_newest_state, load_state, save_state
 from tests.cache.streams import CAPACITY, CONFIG, Recipe, fuse, to_jax
 
 HEADER = {"config": CONFIG.to_dict(), "chunks": 3, "note": "ω"}

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ssplat_jax.core.errors import StorageError
-from ssplat_jax.storage.training_state import TrainingCheckpoints
+from ssplat_jax.storage.saved_states import TrainingCheckpoints
 
 # Orbax leaves unfinished tasks behind when it reads a damaged file.
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")

@@ -13,7 +13,7 @@ from ssplat_jax.core.pytree import replace
 from ssplat_jax.model.compact.gaussian_head import GaussianHead
 from ssplat_jax.model.params import init_params
 from ssplat_jax.model.streamsplat import StreamSplat
-from ssplat_jax.storage.delta_files import load_delta, save_delta
+from ssplat_jax.storage.chunk_records import load_delta, save_delta
 from ssplat_jax.streaming.scene_delta import SceneFeed, apply_confidences, apply_delta
 from tests.cache.streams import CAPACITY, CONFIG, PLACES, VARIANTS, Recipe, fuse, fuse_with_rows, to_jax
 

@@ -22,7 +22,7 @@ from ssplat_jax.refinement import refine_on_capture
 from ssplat_jax.refinement.learned_pass import STEPS, no_errors
 from ssplat_jax.refinement.refine_step import init_refinement
 from ssplat_jax.refinement.refiner_weights import KIND, init_refiner, load_refiner
-from ssplat_jax.storage.npz import load_arrays
+from ssplat_jax.storage.files import load_arrays
 from ssplat_jax.storage.weights import load_params
 from ssplat_jax.streaming.feed import feed_capture
 from ssplat_jax.streaming.session import Session

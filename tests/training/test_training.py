@@ -1,7 +1,6 @@
 """Training with the smallest recipe: it is reproducible and resumable."""
 
 import dataclasses
-import functools
 import json
 import time
 from importlib import resources
@@ -22,9 +21,8 @@ from ssplat_jax.data.depth_range import FAR_FACTOR
 from ssplat_jax.data.procedural import training_sample
 from ssplat_jax.model import init_params
 from ssplat_jax.model.streamsplat import StreamSplat
-from ssplat_jax.storage.stage_changes import stage_changes, start_of
-from ssplat_jax.storage.training_state import TrainingCheckpoints
-from ssplat_jax.storage.weights import describe_weights, load_params, params_digest, save_weights
+from ssplat_jax.storage.saved_states import TrainingCheckpoints
+from ssplat_jax.storage.weights import describe_weights, load_params, params_digest, save_weights, stage_turns
 from ssplat_jax.training import loop
 from ssplat_jax.training import step as train_step
 from ssplat_jax.training.losses import depth_loss, image_gradient_l1, soft_targets
@@ -33,12 +31,10 @@ from ssplat_jax.training.recipe import (
     DEFAULT_FORM,
     MATCHER_STAGES,
     RECIPES,
-    TINY,
     Phase,
     PhaseForm,
     smoke_recipe,
     training_config,
-    with_defaults,
 )
 from ssplat_jax.training.samples import log_depths_at_cells, make_sample, prefetched
 from ssplat_jax.training.step import (
@@ -100,63 +96,25 @@ def test_true_depth_of_a_cell_is_that_at_its_center():
 
 def test_other_recipe_is_refused_by_its_first_difference(tmp_path):
     description = {"config": {"width": 8}, "recipe": {"phases": [{"steps": 5}], "seed": 0}}
-    TrainingCheckpoints(tmp_path, description).close()
+    TrainingCheckpoints(tmp_path, description)
     other = {"config": {"width": 8}, "recipe": {"phases": [{"steps": 6}], "seed": 0}}
     with pytest.raises(InputError, match=r"recipe\.phases\[0\]\.steps = 5, wanted 6"):
         TrainingCheckpoints(tmp_path, other)
-
-
-UPGRADE = functools.partial(loop.upgrade_description, wanted={"init_weights": loop.RANDOM})
-OLD_RUN = Path(__file__).with_name("recipe_0_1.json")  # written by version 0.1 for `ssplat train --scale-steps 0.004`
-
-
-def test_run_of_version_0_1_is_resumed(tmp_path):
-    (tmp_path / "recipe.json").write_text(OLD_RUN.read_text())
-    recipe = TINY.scaled(0.004)
-    then = preset("tiny").replace(evidence=False, hpda=True, cgfi=True, mixer_blocks=2, min_confidence=0.5)
-    config = training_config(then, recipe)
-    description = loop.describe_run(config, recipe, loop.RANDOM)
-    TrainingCheckpoints(tmp_path, description, upgrade=UPGRADE).close()
-    for other in (dataclasses.replace(recipe, adam_b2=0.999), dataclasses.replace(recipe, weight_decay=0.02)):
-        description = loop.describe_run(config, other, loop.RANDOM)
-        with pytest.raises(InputError, match=r"holds a run with recipe\.(adam_b2|weight_decay)"):
-            TrainingCheckpoints(tmp_path, description, upgrade=UPGRADE)
-    description = loop.describe_run(config.replace(token_width=32), recipe, loop.RANDOM)
-    with pytest.raises(InputError, match=r"config\.network\.token_width = 64, wanted 32"):
-        TrainingCheckpoints(tmp_path, description, upgrade=UPGRADE)
 
 
 def test_a_run_that_began_with_other_weights_is_refused(tmp_path):
     config = training_config(NARROW, RECIPE)
     first, other = ({"encoder": {"kernel": jnp.full((2, 2), x)}} for x in (1.0, 2.0))
     held = loop.describe_run(config, RECIPE, params_digest(first))
-    TrainingCheckpoints(tmp_path, held).close()
+    TrainingCheckpoints(tmp_path, held)
     for params in (other, None):
         with pytest.raises(InputError, match="holds a run with init_weights = "):
             loop.train(NARROW, RECIPE, tmp_path, params=params)
     with pytest.raises(InputError, match=f"{params_digest(first)}', wanted 'mine'"):
         loop.train(NARROW, RECIPE, tmp_path, params=first, init_weights="mine")
-    TrainingCheckpoints(tmp_path / "2", loop.describe_run(config, RECIPE, loop.RANDOM)).close()
+    TrainingCheckpoints(tmp_path / "2", loop.describe_run(config, RECIPE, loop.RANDOM))
     with pytest.raises(InputError, match=f"init_weights = 'random', wanted '{params_digest(first)}'"):
         loop.train(NARROW, RECIPE, tmp_path / "2", params=first)
-
-
-def test_a_run_of_a_version_that_did_not_write_its_start_is_resumed(tmp_path):
-    description = json.loads(json.dumps(loop.describe_run(NARROW, RECIPE, "mine")))
-    old = {name: value for name, value in description.items() if name != "init_weights"}
-    assert loop.upgrade_description(old, wanted={"init_weights": "mine"}) == description
-    assert loop.upgrade_description(description, wanted={"init_weights": "another"}) == description
-
-
-def test_fields_missing_in_a_recipe_have_their_default():
-    whole = json.loads(json.dumps(dataclasses.asdict(RECIPE)))
-    assert with_defaults(whole) == whole
-    partial = json.loads(json.dumps(whole))
-    for name in ("adam_b1", "lpips_weight", "ema_warmup_steps", "range_jitter"):
-        del partial[name]
-    del partial["phases"][0]["form"], partial["phases"][1]["form"]["frozen"]
-    assert with_defaults(partial) == whole
-    assert with_defaults(partial | {"adam_b1": 0.8})["adam_b1"] == 0.8
 
 
 def test_prefetch_keeps_order_and_raises_errors():
@@ -577,8 +535,7 @@ def test_a_training_keeps_the_history_of_the_weights_that_it_started_from(tmp_pa
     assert Train(out=tmp_path / "out", **asked).run() == 0
     facts = describe_weights(str(tmp_path / "out" / "weights.npz"))
     assert facts.provenance["before"] == {"recipe": {"seed": 5}} and facts.provenance["fresh"] == []
-    start = start_of(facts.config, facts.provenance)  # of seed 5: nothing has moved since
-    assert max(c.distance for c in stage_changes(load_params(str(tmp_path / "w.npz")), start)) < 1e-3
+    assert max(stage_turns(load_params(str(tmp_path / "w.npz")), facts).values()) < 1e-3  # since seed 5
 
 
 def test_the_command_starts_stages_that_the_weights_lack_at_random(tmp_path, started, capsys):

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from ssplat_jax.storage.delta_files import load_delta
+from ssplat_jax.storage.chunk_records import load_delta
 from ssplat_jax.storage.run_folder import RunFolder
 from tests.commands.test_cli import make_capture, run
 from tests.viewer.chromium import wait_for

@@ -13,8 +13,7 @@ from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.scene_files.formats import read_scene
 from ssplat_jax.scene_files.ply import load_ply
-from ssplat_jax.storage.chunk_records import ChunkRecord, RecordedView, make_thumbnail, save_chunk_record
-from ssplat_jax.storage.delta_files import save_delta
+from ssplat_jax.storage.chunk_records import ChunkRecord, RecordedView, make_thumbnail, save_chunk_record, save_delta
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.viewer import browser as browser_module
 from ssplat_jax.viewer.browser import Browser

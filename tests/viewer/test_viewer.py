@@ -20,8 +20,7 @@ from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.scene_files.formats import save_gaussians
-from ssplat_jax.storage.chunk_records import ChunkRecord, RecordedView, save_chunk_record
-from ssplat_jax.storage.delta_files import load_delta, save_delta
+from ssplat_jax.storage.chunk_records import ChunkRecord, RecordedView, load_delta, save_chunk_record, save_delta
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.streaming.scene_delta import SceneDelta, apply_delta
 from ssplat_jax.viewer.scene_sources import GrowingScene, SceneFile, open_source
