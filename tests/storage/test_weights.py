@@ -1,13 +1,23 @@
 """Weights files are read back exactly, or refused."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.flatten_util import ravel_pytree
 
 from ssplat_jax.config import preset
 from ssplat_jax.core.errors import InputError, StorageError
 from ssplat_jax.model import init_params
-from ssplat_jax.storage.weights import check_params, load_params, load_weights, save_weights
+from ssplat_jax.storage.weights import (
+    WeightsFacts,
+    check_params,
+    describe_weights,
+    load_params,
+    load_weights,
+    save_weights,
+    stage_turns,
+)
 from tests.model.small import random_params
 from tests.streaming.narrow_model import NARROW
 
@@ -72,3 +82,32 @@ def test_overflowing_weights_are_not_saved(params, tmp_path):
 def test_a_name_that_is_no_preset_or_file_is_refused():
     with pytest.raises(InputError, match="tiny"):
         load_params("absent.npz")
+
+
+def test_training_turns_a_stage_and_decay_does_not(tmp_path):
+    start = init_params(jax.random.key(3), NARROW)
+    params = jax.tree.map(lambda x: 0.9 * x, start)
+    across = np.random.default_rng(0).normal(size=start["encoder"]["conv1"]["kernel"].shape)
+    params["encoder"]["conv1"]["kernel"] += across
+    turns = stage_turns(params, WeightsFacts(NARROW, {"recipe": {"seed": 3}}, 0))
+    first, last = (ravel_pytree(tree["encoder"])[0] for tree in (start, params))
+    cosine = float(first @ last / jnp.linalg.norm(first) / jnp.linalg.norm(last))
+    assert turns.pop("encoder") == pytest.approx(np.sqrt(1 - cosine**2), rel=1e-4)
+    assert max(turns.values()) < 1e-6
+
+
+def test_a_stage_that_a_later_training_added_is_compared_with_its_own_start():
+    first, later = init_params(jax.random.key(3), NARROW), init_params(jax.random.key(7), NARROW)
+    provenance = {"recipe": {"seed": 7}, "fresh": ["cgfi"], "before": {"recipe": {"seed": 3}}}
+    turns = stage_turns(first | {"cgfi": later["cgfi"]}, WeightsFacts(NARROW, provenance, 0))
+    assert len(turns) > 3 and max(turns.values()) < 1e-6
+    assert stage_turns(later, WeightsFacts(NARROW, provenance, 0))["encoder"] > 0.5
+
+
+def test_matcher_and_evidence_head_of_the_shipped_weights_are_trained_and_other_stages_are_not():
+    facts = describe_weights("tiny")
+    assert facts.config == preset("tiny") and facts.num_bytes < 8e6
+    turns = stage_turns(load_params("tiny"), facts)
+    trained = ("encoder", "cost_volume", "evidence")
+    assert min(turns[name] for name in trained) > 0.3
+    assert max(turns[name] for name in turns if name not in trained) < 0.01
