@@ -50,7 +50,7 @@ LpipsHeads = Annotated[
 
 def capture_path(path: str, axes: str | None, poses: str | None) -> str:
     """Path of a capture as `open_capture` takes it, with the options --axes and --poses."""
-    from ssplat_jax.data.pose_conventions import with_options
+    from ssplat_jax.data.posed_image import with_options
 
     return with_options(path, axes=axes, poses=poses)
 

@@ -97,7 +97,7 @@ class Run:
 
     def _check(self) -> None:
         """Refuses options that contradict each other."""
-        from ssplat_jax.data.pose_conventions import split_options
+        from ssplat_jax.data.posed_image import split_options
 
         check_refinement(self.refine_steps, "--refine")
         if self.quiet_seconds != Run.quiet_seconds and not self.watch:

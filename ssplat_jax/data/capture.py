@@ -1,6 +1,8 @@
 """`Capture`: posed images whose poses, intrinsics and headers are checked, and whose pixels are decoded on request.
 
-`verify` decodes the images that a run will use, so that damaged files are found before anything is written.
+    Frame (checked) + Pixels -> depth range -> StreamFrame -> chunks
+
+A damaged image is found when it is decoded: the `InputError` comes from the iterator of chunks, at its chunk.
 """
 
 import dataclasses
@@ -9,6 +11,7 @@ import math
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Protocol, runtime_checkable
 
 import jax.numpy as jnp
 import numpy as np
@@ -19,22 +22,85 @@ from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.chunk import Chunk
 from ssplat_jax.core.errors import echo, refusal
 from ssplat_jax.data.depth_range import estimate_depths, stream_scale
-from ssplat_jax.data.images import (
-    Crop,
-    Pixels,
-    decode_all,
-    resize_depth,
-    resize_image,
-)
-from ssplat_jax.data.interleave import interleave
-from ssplat_jax.data.pose_conventions import USUAL, Convention
-from ssplat_jax.data.posed_image import Frame
-from ssplat_jax.data.readers import (
-    Listing,
-)
+from ssplat_jax.data.images import Crop, decode_depth, decode_image, undistort
+from ssplat_jax.data.posed_image import USUAL, Convention, Frame
+from ssplat_jax.data.readers.frame_list import Listing
+from ssplat_jax.data.split import interleave
 from ssplat_jax.data.stream_frame import StreamFrame
 
 MAX_SIDE = 16384  # pixels of a delivered image
+KEPT_BYTES = 256 << 20  # of decoded images that wait for their second use
+
+
+@runtime_checkable
+class Pixels(Protocol):
+    """Source of a capture's images and depth maps, by the index of the frame."""
+
+    def image(self, i: int, crop: Crop) -> Float32[np.ndarray, "h w 3"]:
+        """Returns image `i` as RGB in [0, 1], at the size of `crop`."""
+        ...
+
+    def depth(self, i: int) -> Float32[np.ndarray, "h w"] | None:
+        """Returns depth map `i` as stored (camera z in capture units, 0 where unknown), or None if there is none."""
+        ...
+
+    def has_depth(self, i: int) -> bool:
+        """True if frame `i` has a depth map; does not decode it."""
+        ...
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class FilePixels:
+    """Images and depth maps that are decoded from files and undistorted.
+
+    A decoded image is kept until it is asked for again: the depth range looks at some images before they stream.
+    """
+
+    frames: Sequence[Frame]
+    kept: dict[tuple[int, Crop], Float32[np.ndarray, "h w 3"]] = dataclasses.field(default_factory=dict)
+
+    def image(self, i: int, crop: Crop) -> Float32[np.ndarray, "h w 3"]:
+        kept = self.kept.pop((i, crop), None)
+        if kept is not None:
+            return kept
+        frame = self.frames[i]
+        assert frame.path is not None  # readers of files always set it
+        image = decode_image(frame.path, (frame.width, frame.height))
+        image = crop.image(image if frame.lens is None else undistort(image, frame.lens, frame.K))
+        if (len(self.kept) + 1) * image.nbytes <= KEPT_BYTES:
+            image.flags.writeable = False
+            self.kept[i, crop] = image
+        return image
+
+    def depth(self, i: int) -> Float32[np.ndarray, "h w"] | None:
+        frame = self.frames[i]
+        if frame.depth_path is None:
+            return None
+        depth = decode_depth(frame.depth_path, frame.depth_unit)
+        if frame.lens is None:
+            return depth
+        sizes = np.array([depth.shape[1] / frame.width, depth.shape[0] / frame.height, 1.0])
+        return undistort(depth, frame.lens, np.diag(sizes) @ frame.K, order=0, outside=0.0)
+
+    def has_depth(self, i: int) -> bool:
+        return self.frames[i].depth_path is not None
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ArrayPixels:
+    """Images and depth maps held in memory."""
+
+    images: Float32[np.ndarray, "v h w 3"]
+    depths: Float32[np.ndarray, "v h w"]
+
+    def image(self, i: int, crop: Crop) -> Float32[np.ndarray, "h w 3"]:
+        return crop.image(self.images[i])
+
+    def depth(self, i: int) -> Float32[np.ndarray, "h w"] | None:
+        return self.depths[i]
+
+    def has_depth(self, i: int) -> bool:
+        return True
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -105,15 +171,12 @@ class Capture:
         Raises:
             InputError: the file is damaged.
         """
-        image, crop = self.pixels.image(i), self.crop(i)
-        return image if crop.is_identity else resize_image(image, crop)
+        return self.pixels.image(i, self.crop(i))
 
     def depth(self, i: int) -> Float32[np.ndarray, "h w"] | None:
         """Returns depth map `i` (camera z in capture units, 0 where unknown), or None if the frame has none."""
-        depth, frame, crop = self.pixels.depth(i), self.frames[i], self.crop(i)
-        if depth is None or (crop.is_identity and depth.shape == (self.height, self.width)):
-            return depth
-        return resize_depth(depth, crop, (frame.width, frame.height))
+        depth, frame = self.pixels.depth(i), self.frames[i]
+        return None if depth is None else self.crop(i).depth(depth, (frame.width, frame.height))
 
     def check_output_folder(self, out: Path) -> None:
         """Checks that results do not mix with the capture's files: a run overwrites and clears files of its folder.
@@ -132,14 +195,14 @@ class Capture:
                     raise refusal(str(out), wanted="a folder for results alone", got=got, fix=fix)
 
     def verify(self, indices: Sequence[int] | None = None) -> None:
-        """Decodes the images and depth maps of the frames `indices` (default: all) to find damaged files.
-
-        Decoding uses all cores and takes about 1 ms per image of 480x360 pixels.
+        """Decodes the images of the frames `indices` (default: all), to find damaged files; uses all cores.
 
         Raises:
             InputError: a file is damaged; the message names the first one.
         """
-        decode_all(self.pixels, range(len(self)) if indices is None else indices)
+        with ThreadPoolExecutor() as pool:  # Pillow decodes outside the interpreter lock
+            for _ in pool.map(self.image, range(len(self)) if indices is None else indices):
+                pass
 
     def stream_frame(self, config: StreamConfig, indices: Sequence[int] | None = None) -> StreamFrame:
         """Returns the stream frame of a run over the frames `indices` (default: all).
@@ -175,7 +238,7 @@ class Capture:
         return Camera(viewmats=jnp.asarray(viewmat), Ks=jnp.asarray(K), width=self.width, height=self.height)
 
     def stream_order(self, config: StreamConfig, indices: Sequence[int] | None, frame: StreamFrame) -> list[int]:
-        """Returns `indices` (default: all) in the order of streaming, with slow video interleaved (`data.interleave`).
+        """Returns `indices` (default: all) in the order of streaming, with slow video interleaved (`interleave`).
 
         The typical depth is taken to be the geometric mean of `near` and `far`. With `causal`, frames keep their order.
         """
@@ -183,12 +246,8 @@ class Capture:
         if config.stream.causal:
             return used
         centers = np.stack([self.frames[i].center for i in used])
-        return interleave(
-            centers,
-            used,
-            config.stream.chunk_size,
-            config.stream.chunk_step * math.sqrt(frame.near * frame.far) / frame.scale,
-        )
+        step = config.stream.chunk_step * math.sqrt(frame.near * frame.far) / frame.scale
+        return interleave(centers, used, config.stream.chunk_size, step)
 
     def chunks(
         self, config: StreamConfig, indices: Sequence[int] | None = None, *, frame: StreamFrame | None = None
@@ -237,7 +296,7 @@ class Capture:
 def capture_of_listing(
     listing: Listing, format: str, pixels: Pixels, size: tuple[int, int] | None, convention: Convention = USUAL
 ) -> Capture:
-    """Capture of a listing whose images all have one size; `size` is that of the delivered ones (`open_capture`)."""
+    """Returns the capture of a listing whose images all have one size; `size` is that of the delivered ones."""
     if size is None:
         first = listing.frames[0]
         size = (first.width, first.height)

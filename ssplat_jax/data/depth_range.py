@@ -52,6 +52,13 @@ FAR_FACTOR = 1.8  # far over the 99 % quantile, for the same reason
 MIN_RANGE, MAX_RANGE = 4.0, 60.0  # far / near
 MIN_NEAR = 1 / 8  # of the median; too wide a range is first cut up to this at the near end, then at the far end
 
+WARNINGS = {  # by the source of the depths
+    "baselines": "Hardly any matches between frames: depth, near, far and scale are guessed from the steps between"
+    " cameras; check poses and axes, or set the scene scale.",
+    "poor parallax": "Low parallax: near and far are guessed around the median depth; take frames farther apart"
+    " (--stride).",
+}
+
 
 @dataclasses.dataclass(frozen=True)
 class DepthStatistics:
@@ -68,16 +75,7 @@ class DepthStatistics:
     @property
     def warning(self) -> str | None:
         """Message for the user about a failed measurement, or None."""
-        if self.source == "baselines":
-            return (
-                "Hardly any matches between frames: depth, near, far and scale are guessed from the steps between"
-                " cameras; check poses and axes, or set the scene scale."
-            )
-        if self.source == "poor parallax":
-            return (
-                "Low parallax: near and far are guessed around the median depth; take frames farther apart (--stride)."
-            )
-        return None
+        return WARNINGS.get(self.source)
 
 
 def estimate_depths(
@@ -158,6 +156,8 @@ def _statistics(pairs: list[CommonPoints]) -> DepthStatistics:
     if reached.size < MIN_FAR_PARALLAX_SHARE * inverse.size or len(pairs) < MIN_PAIRS:
         reach = max(reach, MIN_REACH / middle)
     least = _least_inverse_depth(pairs)
+    # A background without parallax, surely beyond the points that have some, must lie before far: otherwise the matcher
+    # puts confident floaters in between.
     if least < 1 / (FAR_FACTOR * reach):
         farthest = MAX_RANGE * NEAR_FACTOR / (FAR_FACTOR * nearest)
         reach = max(reach, min(1 / least, farthest))
@@ -216,8 +216,8 @@ def _best_pair(
     if nearest is None:
         return best
     close = nearest.inverse_depths[nearest.parallax >= FAR_PARALLAX_DEGREES]
-    is_some = close.size >= max(MIN_POINTS, CLOSE_SHARE * nearest.parallax.size)
-    return dataclasses.replace(best, close=close) if is_some else best
+    is_enough = close.size >= max(MIN_POINTS, CLOSE_SHARE * nearest.parallax.size)
+    return dataclasses.replace(best, close=close) if is_enough else best
 
 
 def _partners(capture: PosedImages, i: int, others: Sequence[int]) -> tuple[list[int], Float64[np.ndarray, " n"]]:
@@ -254,12 +254,11 @@ def _least_inverse_depth(pairs: list[CommonPoints]) -> float:
 
     Points that lie behind the camera even with their error are false matches and are ignored.
     """
-    bounds = [p.inverse_depths + _error(p) for p in pairs]
-    return _quantile_by_area(pairs, [np.where(b > 0, b, np.inf) for b in bounds], BEYOND_FAR_SHARE)
-
-
-def _error(points: CommonPoints) -> Float64[np.ndarray, " n"]:
-    """Errors of inverse depths; they are large near the direction of motion, where parallax is small."""
-    moved = points.parallax != 0
-    slopes = np.abs(points.inverse_depths / np.where(moved, points.parallax, 1.0))
-    return np.where(moved, PARALLAX_ERROR * slopes, np.inf)
+    bounds = []
+    for p in pairs:
+        # Errors are large near the direction of motion, where parallax is small.
+        moved = p.parallax != 0
+        per_degree = np.abs(p.inverse_depths / np.where(moved, p.parallax, 1.0))
+        bound = p.inverse_depths + np.where(moved, PARALLAX_ERROR * per_degree, np.inf)
+        bounds.append(np.where(bound > 0, bound, np.inf))
+    return _quantile_by_area(pairs, bounds, BEYOND_FAR_SHARE)

@@ -1,4 +1,4 @@
-"""Image files: cheap checks of headers, full decoding, and resizing with matching intrinsics.
+"""Image files: cheap checks of headers, decoding, resizing with matching intrinsics, and undistortion.
 
 An EXIF orientation is not applied, because the intrinsics of every capture format refer to the stored pixels. Gray
 becomes RGB, transparent pixels are composited over black, and 16-bit gray is scaled instead of clipped.
@@ -6,130 +6,21 @@ becomes RGB, transparent pixels are composited over black, and 16-bit gray is sc
 
 import dataclasses
 import warnings
-from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float32, Float64
 from PIL import Image
+from skimage.transform import warp
 
 from ssplat_jax.core.errors import refusal
-from ssplat_jax.data.lens import undistort
-from ssplat_jax.data.posed_image import Frame
+from ssplat_jax.data.parsing import reading
 
 IMAGE_FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "PPM")
 MAX_PIXELS = 64_000_000  # larger images are refused before anything is decoded
 DEPTH_MODES = ("I;16", "I;16B", "I")  # Pillow's modes of 16-bit images
 ORIENTATION, UPRIGHT = 274, 1  # EXIF tag, and its value for images that need no rotation
-
-
-@runtime_checkable
-class Pixels(Protocol):
-    """Source of a capture's images and depth maps, by the index of the frame."""
-
-    def image(self, i: int) -> Float32[np.ndarray, "h w 3"]:
-        """Returns image `i` as RGB in [0, 1], at the stored size."""
-        ...
-
-    def depth(self, i: int) -> Float32[np.ndarray, "h w"] | None:
-        """Returns depth map `i` (camera z in capture units, 0 where unknown), or None if there is none."""
-        ...
-
-    def has_depth(self, i: int) -> bool:
-        """True if frame `i` has a depth map; does not decode it."""
-        ...
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class FilePixels:
-    """Images and depth maps that are decoded from files at each call and undistorted."""
-
-    frames: Sequence[Frame]
-
-    def image(self, i: int) -> Float32[np.ndarray, "h w 3"]:
-        frame = self.frames[i]
-        assert frame.path is not None  # readers of files always set it
-        image = decode_image(frame.path, (frame.width, frame.height))
-        return image if frame.lens is None else undistort(image, frame.lens, frame.K)
-
-    def depth(self, i: int) -> Float32[np.ndarray, "h w"] | None:
-        frame = self.frames[i]
-        if frame.depth_path is None:
-            return None
-        depth = decode_depth(frame.depth_path, frame.depth_unit)
-        if frame.lens is None:
-            return depth
-        sizes = np.array([depth.shape[1] / frame.width, depth.shape[0] / frame.height, 1.0])
-        return undistort(depth, frame.lens, np.diag(sizes) @ frame.K, order=0, outside=0.0)
-
-    def has_depth(self, i: int) -> bool:
-        return self.frames[i].depth_path is not None
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class ArrayPixels:
-    """Images and depth maps held in memory."""
-
-    images: Float32[np.ndarray, "v h w 3"]
-    depths: Float32[np.ndarray, "v h w"]
-
-    def image(self, i: int) -> Float32[np.ndarray, "h w 3"]:
-        return self.images[i]
-
-    def depth(self, i: int) -> Float32[np.ndarray, "h w"] | None:
-        return self.depths[i]
-
-    def has_depth(self, i: int) -> bool:
-        return True
-
-
-def _open(path: Path, what: str) -> Image.Image:
-    """Opens an image file without decoding it, and checks its size and kind.
-
-    Args:
-        path: the file.
-        what: description of the wanted file for error messages.
-    """
-    if not path.is_file():
-        got = "a folder" if path.is_dir() else "no such file"
-        raise refusal(str(path), wanted=what, got=got, fix="add the file or drop its frame from the capture")
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", Image.DecompressionBombWarning)
-            image = Image.open(path, formats=IMAGE_FORMATS)
-    except (Image.DecompressionBombError, Image.DecompressionBombWarning):
-        fix = "scale the images down"
-        raise refusal(str(path), wanted=f"at most {MAX_PIXELS:,} pixels", got="far more", fix=fix) from None
-    except Exception as error:  # Pillow's parsers raise nearly anything on damaged headers
-        got = f"{path.stat().st_size} bytes that are no readable image ({type(error).__name__})"
-        fix = f"replace the file (formats read: {', '.join(IMAGE_FORMATS)})"
-        raise refusal(str(path), wanted=what, got=got, fix=fix) from None
-    if image.width * image.height > MAX_PIXELS:
-        size = f"{image.width}x{image.height}"
-        image.close()
-        raise refusal(str(path), wanted=f"at most {MAX_PIXELS:,} pixels", got=size, fix="scale the images down")
-    is_tiff = image.format == "TIFF"
-    if image.mode == "F" or (is_tiff and image.mode == "I"):
-        image.close()
-        got, fix = "floats or 32-bit integers, whose value for white is unknown", "store 8 or 16 bits per channel"
-        raise refusal(str(path), wanted=what, got=got, fix=fix)
-    if is_tiff and image.getexif().get(ORIENTATION, UPRIGHT) != UPRIGHT:  # Pillow applies it to TIFFs only
-        image.close()
-        fix = "rotate the pixels and drop the tag, and see that the intrinsics are those of the rotated image"
-        raise refusal(str(path), wanted=what, got="a TIFF with an orientation tag", fix=fix)
-    return image
-
-
-def _load(image: Image.Image, path: Path) -> None:
-    """Decodes all pixels of the file."""
-    try:
-        image.load()
-    except Exception as error:  # as above
-        got = f"damaged data ({' '.join(str(error).split()) or type(error).__name__})"
-        fix = "replace the file: it is truncated or corrupt"
-        raise refusal(str(path), wanted="a complete image", got=got, fix=fix) from None
+REPLACE = f"replace the file (formats read: {', '.join(IMAGE_FORMATS)})"
 
 
 def image_size(path: Path) -> tuple[int, int]:
@@ -138,7 +29,7 @@ def image_size(path: Path) -> tuple[int, int]:
     Raises:
         InputError: the file is missing, is not a readable image, or is too large.
     """
-    with _open(path, "an image") as image:
+    with _open(path) as image:
         return image.size
 
 
@@ -148,7 +39,7 @@ def check_depth_header(path: Path) -> None:
     Raises:
         InputError: it is not.
     """
-    with _open(path, "a depth image") as image:
+    with _open(path) as image:
         if image.mode not in DEPTH_MODES:
             fix = "store depth as 16-bit PNG"
             raise refusal(str(path), wanted="one channel of 16 bits", got=f"mode {image.mode}", fix=fix)
@@ -160,12 +51,13 @@ def decode_image(path: Path, size: tuple[int, int]) -> Float32[np.ndarray, "h w 
     Raises:
         InputError: the file is truncated or damaged, or its size has changed since the capture was opened.
     """
-    with _open(path, "an image") as image:
+    with _open(path) as image:
         if image.size != size:
-            got = f"{image.width}x{image.height}"
+            wanted, got = (f"{width}x{height}" for width, height in (size, image.size))
             fix = "do not change the files while a run reads them"
-            raise refusal(str(path), wanted=f"{size[0]}x{size[1]} as when opened", got=got, fix=fix)
-        _load(image, path)
+            raise refusal(str(path), wanted=f"{wanted} as when opened", got=got, fix=fix)
+        with reading(path, REPLACE):
+            image.load()
         if image.mode in DEPTH_MODES:
             gray = np.asarray(image, dtype=np.float32) / np.float32(65535)
             return np.repeat(np.clip(gray, 0, 1)[..., None], 3, axis=-1)
@@ -177,25 +69,33 @@ def decode_image(path: Path, size: tuple[int, int]) -> Float32[np.ndarray, "h w 
 
 def decode_depth(path: Path, unit: float) -> Float32[np.ndarray, "h w"]:
     """Decodes a 16-bit depth image whose values count steps of `unit`; 0 means unknown."""
-    with _open(path, "a depth image") as image:
-        _load(image, path)
+    with _open(path) as image:
+        with reading(path, REPLACE):
+            image.load()
         return np.asarray(image, dtype=np.float32) * np.float32(unit)
 
 
-def decode_all(pixels: Pixels, indices: Sequence[int]) -> None:
-    """Decodes the frames `indices` and discards the result, to find damaged files before anything is written.
+def _open(path: Path) -> Image.Image:
+    """Opens an image file without decoding it, and checks its size and kind."""
+    with reading(path, REPLACE), warnings.catch_warnings():
+        warnings.simplefilter("error", Image.DecompressionBombWarning)
+        image = Image.open(path, formats=IMAGE_FORMATS)
+    wanted = got = fix = ""
+    is_tiff = image.format == "TIFF"
+    if image.width * image.height > MAX_PIXELS:
+        wanted, got, fix = f"{MAX_PIXELS:,} pixels at most", f"{image.width}x{image.height}", "scale the images down"
+    elif image.mode == "F" or (is_tiff and image.mode == "I"):  # the value of white is unknown
+        wanted, got, fix = "8 or 16 bits per channel", "floats or 32-bit integers", "convert the images"
+    elif is_tiff and image.getexif().get(ORIENTATION, UPRIGHT) != UPRIGHT:  # Pillow applies it to TIFFs only
+        wanted, got = "an upright image", "a TIFF with an orientation tag"
+        fix = "rotate the pixels, drop the tag, and see that the intrinsics are those of the rotated image"
+    if wanted:
+        image.close()
+        raise refusal(str(path), wanted=wanted, got=got, fix=fix)
+    return image
 
-    Raises:
-        InputError: a file is damaged.
-    """
 
-    def decode(i: int) -> None:
-        pixels.image(i)
-        pixels.depth(i)
-
-    with ThreadPoolExecutor() as pool:  # Pillow decodes outside the interpreter lock
-        for _ in pool.map(decode, indices):
-            pass
+# -- size -------------------------------------------------------------------------------------------------------------
 
 
 @dataclasses.dataclass(frozen=True)
@@ -227,26 +127,156 @@ class Crop:
         """Converts intrinsics of the stored image to those of the delivered one."""
         return np.diag([self.scale, self.scale, 1.0]) @ (K - np.array([[0, 0, self.left], [0, 0, self.top], [0, 0, 0]]))
 
-    def apply(
-        self, channel: Float32[np.ndarray, "h w"], stored: tuple[int, int], resample: Image.Resampling
-    ) -> Float32[np.ndarray, "hc wc"]:
-        """Crops and resizes one channel, which may have another resolution than the (width, height) `stored`."""
+    def image(self, image: Float32[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "hc wc 3"]:
+        """Crops and resizes an image with a Lanczos filter in float32, and clips it to [0, 1]."""
+        if self.is_identity:
+            return image
+        stored = (image.shape[1], image.shape[0])
+        channels = [self._resized(image[..., c], stored, Image.Resampling.LANCZOS) for c in range(3)]
+        return np.clip(np.stack(channels, axis=-1), 0, 1)
+
+    def depth(self, depth: Float32[np.ndarray, "h w"], stored: tuple[int, int]) -> Float32[np.ndarray, "hc wc"]:
+        """Crops and resizes a depth map of any resolution of the (width, height) `stored` image.
+
+        Sampling is that of the nearest neighbor, since a mean of two depths lies on no surface.
+        """
+        if self.is_identity and depth.shape == stored[::-1]:
+            return depth
+        return self._resized(depth, stored, Image.Resampling.NEAREST)
+
+    def _resized(self, channel: np.ndarray, stored: tuple[int, int], resample: Image.Resampling) -> np.ndarray:
         sx, sy = channel.shape[1] / stored[0], channel.shape[0] / stored[1]
         right, bottom = self.left + self.width / self.scale, self.top + self.height / self.scale
         # Rounding may place the box one ulp outside the image, which Pillow refuses.
         box = (max(self.left, 0) * sx, max(self.top, 0) * sy, min(right, stored[0]) * sx, min(bottom, stored[1]) * sy)
-        return np.asarray(Image.fromarray(channel).resize((self.width, self.height), resample, box=box))
+        image = Image.fromarray(np.ascontiguousarray(channel))
+        return np.asarray(image.resize((self.width, self.height), resample, box=box))
 
 
-def resize_image(image: Float32[np.ndarray, "h w 3"], crop: Crop) -> Float32[np.ndarray, "hc wc 3"]:
-    """Crops and resizes an image with a Lanczos filter in float32, and clips it to [0, 1]."""
-    stored = (image.shape[1], image.shape[0])
-    channels = [crop.apply(np.ascontiguousarray(image[..., c]), stored, Image.Resampling.LANCZOS) for c in range(3)]
-    return np.clip(np.stack(channels, axis=-1), 0, 1)
+# -- lens -------------------------------------------------------------------------------------------------------------
+# The lens model exists twice: here in float64 on the host, to sample stored images, and in the rasterizer, traced and
+# differentiable, to draw.
+
+IGNORED_PX = 0.5  # images with a smaller displacement by distortion are not undistorted
 
 
-def resize_depth(
-    depth: Float32[np.ndarray, "h w"], crop: Crop, stored: tuple[int, int]
-) -> Float32[np.ndarray, "hc wc"]:
-    """Crops and resizes a depth map with nearest-neighbor sampling, since a mean of two depths lies on no surface."""
-    return crop.apply(depth, stored, Image.Resampling.NEAREST)
+@dataclasses.dataclass(frozen=True)
+class Lens:
+    """Distortion coefficients: x_d = x (1 + k1 r^2 + k2 r^4 + k3 r^6 + k4 r^8) + 2 p1 x y + p2 (r^2 + 2 x^2)."""
+
+    k1: float = 0.0
+    k2: float = 0.0
+    k3: float = 0.0
+    k4: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+
+    def distorted(self, points: Float64[np.ndarray, "*n 2"]) -> Float64[np.ndarray, "*n 2"]:
+        """Maps points on the plane z = 1 of the pinhole camera to their distorted positions."""
+        x, y = points[..., 0], points[..., 1]
+        with np.errstate(over="ignore", invalid="ignore"):
+            r2 = x * x + y * y
+            radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * (self.k3 + r2 * self.k4)))
+            return np.stack(
+                [
+                    x * radial + 2 * self.p1 * x * y + self.p2 * (r2 + 2 * x * x),
+                    y * radial + self.p1 * (r2 + 2 * y * y) + 2 * self.p2 * x * y,
+                ],
+                axis=-1,
+            )
+
+    def pixels(self, K: Float64[np.ndarray, "3 3"], points: Float64[np.ndarray, "*n 2"]) -> Float64[np.ndarray, "*n 2"]:
+        """Maps pixels of the pinhole image to pixels of the distorted one; both have the intrinsics `K`."""
+        center, focal = K[:2, 2], np.diag(K)[:2]
+        with np.errstate(over="ignore", invalid="ignore"):
+            return self.distorted((points - center) / focal) * focal + center
+
+
+@dataclasses.dataclass(frozen=True)
+class FisheyeLens(Lens):
+    """Fish-eye lens: a ray at the angle a to the axis is seen at r = a (1 + k1 a^2 + k2 a^4 + k3 a^6 + k4 a^8).
+
+    This is COLMAP's OPENCV_FISHEYE, and without coefficients an equidistant lens. `p1` and `p2` have no meaning here.
+
+    Limits:
+        Rays at 90 degrees and more to the axis have no place in a pinhole image and are not delivered.
+        On the axis the lens is the identity.
+    """
+
+    def distorted(self, points: Float64[np.ndarray, "*n 2"]) -> Float64[np.ndarray, "*n 2"]:
+        """Maps points on the plane z = 1 of the pinhole camera to their distorted positions."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            radius = np.linalg.norm(points, axis=-1, keepdims=True)
+            a2 = np.square(np.arctan(radius))
+            series = 1 + a2 * (self.k1 + a2 * (self.k2 + a2 * (self.k3 + a2 * self.k4)))
+            shrink = np.where(radius > 1e-9, np.arctan(radius) / np.maximum(radius, 1e-9), 1.0)
+            return points * shrink * series
+
+
+PINHOLE = Lens()  # no distortion
+
+
+def check_lens(lens: Lens, K: Float64[np.ndarray, "3 3"], width: int, height: int, where: str) -> float:
+    """Returns the largest displacement by distortion on the border of the image, in pixels.
+
+    Args:
+        lens: the distortion.
+        K: intrinsics in pixels.
+        width: image width in pixels.
+        height: image height in pixels.
+        where: location of the coefficients for messages.
+
+    Returns:
+        The displacement in pixels; exactly 0 without distortion.
+
+    Raises:
+        InputError: the distortion folds the image or moves pixels by more than the image size, so the coefficients
+            probably belong to another model.
+    """
+    t = np.linspace(0.0, 1.0, 9)
+    edge = np.concatenate([np.stack(np.broadcast_arrays(t, s), -1) for s in (0.0, 1.0)])
+    border = np.concatenate([edge, edge[:, ::-1]]) * (width, height)
+    # Lines from the principal point to the border.
+    spokes = K[:2, 2] + np.linspace(0.0, 1.0, 33)[:, None, None] * (border - K[:2, 2])
+    moved = lens.pixels(K, spokes)
+    with np.errstate(over="ignore", invalid="ignore"):
+        rays = (border - K[:2, 2]) / np.diag(K)[:2]
+        shift = np.linalg.norm((lens.distorted(rays) - rays) * np.diag(K)[:2], axis=-1)  # exactly 0 without distortion
+        shift = float(np.nan_to_num(shift.max(), nan=np.inf))
+        outwards = np.einsum("ksi,ksi->ks", np.diff(moved, axis=0), np.diff(spokes, axis=0))
+    if shift > max(width, height) or not (outwards[:, np.linalg.norm(spokes[-1] - spokes[0], axis=-1) > 0] > 0).all():
+        shown = ", ".join(f"{name}={value:.3g}" for name, value in dataclasses.asdict(lens).items() if value != 0)
+        fix = "check the coefficients, or undistort first (COLMAP: `colmap image_undistorter`) and set k1..p2 to 0"
+        raise refusal(where, wanted="a lens that does not fold the image", got=shown, fix=fix)
+    return shift
+
+
+def undistort(
+    image: Float32[np.ndarray, "h w *c"],
+    lens: Lens,
+    K: Float64[np.ndarray, "3 3"],
+    *,
+    order: int = 1,
+    outside: float | None = None,
+) -> Float32[np.ndarray, "h w *c"]:
+    """Returns the image that a pinhole camera would have taken.
+
+    Args:
+        image: the distorted image, or a depth map.
+        lens: its distortion.
+        K: intrinsics of both images, in pixels.
+        order: 1 samples linearly, 0 takes the nearest pixel (for depth maps).
+        outside: value of pixels that the stored image does not show; by default they repeat its border.
+
+    Returns:
+        The undistorted image.
+    """
+    mode, fill = ("edge", 0.0) if outside is None else ("constant", outside)
+    rows, columns = np.mgrid[: image.shape[0], : image.shape[1]]
+    pixels = lens.pixels(K, np.stack([columns, rows], axis=-1) + 0.5) - 0.5
+    at = np.moveaxis(pixels[..., ::-1], -1, 0)
+    planes = [
+        warp(plane, at, order=order, mode=mode, cval=fill, preserve_range=True).astype(np.float32)
+        for plane in np.moveaxis(image.reshape(*image.shape[:2], -1), -1, 0)
+    ]
+    return np.stack(planes, axis=-1).reshape(image.shape)

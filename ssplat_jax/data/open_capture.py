@@ -6,12 +6,15 @@ Opening a capture reads poses, intrinsics and image headers; images are decoded 
 import dataclasses
 import shlex
 from pathlib import Path
+from urllib.parse import parse_qsl
+
+import numpy as np
 
 from ssplat_jax.core.errors import InputError, echo, refusal
-from ssplat_jax.data.capture import MAX_SIDE, Capture, capture_of_listing
-from ssplat_jax.data.images import MAX_PIXELS, FilePixels
-from ssplat_jax.data.pose_conventions import USUAL, reinterpreted, split_options
-from ssplat_jax.data.procedural_capture import PROCEDURAL, open_procedural
+from ssplat_jax.data.capture import MAX_SIDE, ArrayPixels, Capture, FilePixels, capture_of_listing
+from ssplat_jax.data.images import MAX_PIXELS
+from ssplat_jax.data.parsing import reading
+from ssplat_jax.data.posed_image import USUAL, Frame, check_camtoworld, reinterpreted, split_options
 from ssplat_jax.data.readers import (
     colmap,
     kitti,
@@ -24,7 +27,7 @@ from ssplat_jax.data.readers import (
     transforms_json,
     tum,
 )
-from ssplat_jax.data.readers.frame_list import in_stream_order
+from ssplat_jax.data.readers.frame_list import Listing, in_stream_order
 
 READERS = (  # the first one that matches reads the capture
     transforms_json,
@@ -42,6 +45,11 @@ UNREADABLE_SUFFIXES = frozenset({".heic", ".heif"})  # what phones write and Pil
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp"}) | UNREADABLE_SUFFIXES
 """Images in a folder of these lack only their poses."""
 VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".mkv", ".webm"})
+PROCEDURAL = "procedural"  # scheme of the paths of procedural captures
+PROCEDURAL_FRAMES = 73  # 64 context views and the 9 interleaved targets between them
+PROCEDURAL_SIZE = (128, 96)  # (width, height); the demo takes less than two minutes on two cores at this size
+DONE = "done"
+"""A file of this name in the folder of a growing capture says that nothing more will come."""
 
 
 def open_capture(path: str | Path, *, size: tuple[int, int] | None = None) -> Capture:
@@ -57,32 +65,50 @@ def open_capture(path: str | Path, *, size: tuple[int, int] | None = None) -> Ca
     Raises:
         InputError: there is no capture at `path`, or a file or field of it is unusable; the message names it.
     """
-    if size is not None and not all(1 <= side <= MAX_SIDE for side in size):
-        raise refusal("size", wanted=f"sides of 1 to {MAX_SIDE}", got=echo(size), fix="give WIDTHxHEIGHT in pixels")
-    if size is not None and size[0] * size[1] > MAX_PIXELS:
-        wanted = f"at most {MAX_PIXELS:,} pixels"
-        raise refusal("size", wanted=wanted, got=f"{size[0]}x{size[1]}", fix="ask for a smaller one")
+    if size is not None and not (all(1 <= side <= MAX_SIDE for side in size) and size[0] * size[1] <= MAX_PIXELS):
+        wanted = f"sides of 1 to {MAX_SIDE} and at most {MAX_PIXELS:,} pixels"
+        raise refusal("size", wanted=wanted, got=echo(size), fix="give WIDTHxHEIGHT in pixels")
     if str(path).startswith(f"{PROCEDURAL}:"):
-        return open_procedural(str(path), size)
+        return _open_procedural(str(path), size)
     path, options = split_options(str(path))
     folder = without_tilde(path)
-    try:
+    with reading(path[:80], "check the path"):  # name too long, no permission
         found = next((reader for reader in READERS if reader.matches(folder)), None)
         exists = folder.exists()
-    except (OSError, ValueError) as error:  # name too long, no permission
-        raise _no_path(path, error) from None
-    if found is not None:
-        usual = getattr(found, "CONVENTION", USUAL)
-        written = dataclasses.replace(usual, **options)
-        listing = found.read(folder)
+    if found is None:
+        raise _no_capture(path, folder, exists=exists)
+    usual = getattr(found, "CONVENTION", USUAL)
+    written = dataclasses.replace(usual, **options)
+    listing = found.read(folder)
+    if options:
         frames = tuple(reinterpreted(frame, usual, written) for frame in listing.frames)
-        listing = in_stream_order(dataclasses.replace(listing, frames=frames if options else listing.frames))
-        return capture_of_listing(listing, found.FORMAT, FilePixels(listing.frames), size, written)
+        listing = dataclasses.replace(listing, frames=frames)
+    listing = in_stream_order(listing)
+    return capture_of_listing(listing, found.FORMAT, FilePixels(listing.frames), size, written)
+
+
+def without_tilde(path: str) -> Path:
+    """Returns `path` with the home folder in place of a leading `~` or `~user`.
+
+    Raises:
+        InputError: there is no such user.
+    """
+    with reading(path[:80], "check the path"):
+        return Path(path).expanduser()
+
+
+def is_capture(path: Path) -> bool:
+    """True if a reader takes `path`: it looks like a capture, which may still be damaged."""
+    return any(reader.matches(path) for reader in READERS)
+
+
+def _no_capture(path: str, folder: Path, *, exists: bool) -> InputError:
+    """The refusal of a path that no reader takes, with what is there in place of a capture."""
+    fix = "check the path"
     if not exists:
         got = "a link that leads nowhere" if folder.is_symlink() else "nothing of that name"
-        fix = "check the path"
     elif folder.is_dir() and not any(folder.iterdir()):
-        got, fix = "an empty folder", "check the path"
+        got = "an empty folder"
     elif unposed := _unposed(folder):
         kind, source = unposed
         got = f"none of these, but {kind} without camera poses"
@@ -91,28 +117,7 @@ def open_capture(path: str | Path, *, size: tuple[int, int] | None = None) -> Ca
     else:
         got, fix = "none of these", f"see --help of `ssplat inspect` for their files, or try {PROCEDURAL}:room"
     formats = ", ".join(reader.FORMAT for reader in READERS)
-    raise refusal(str(path), wanted=f"a posed capture ({formats})", got=got, fix=fix)
-
-
-def without_tilde(path: str) -> Path:
-    """`path` with the home folder in place of a leading `~` or `~user`.
-
-    Raises:
-        InputError: there is no such user.
-    """
-    try:
-        return Path(path).expanduser()
-    except (RuntimeError, ValueError) as error:
-        raise _no_path(path, error) from None
-
-
-def _no_path(path: str, error: Exception) -> InputError:
-    return refusal(str(path)[:80], wanted="a path", got=str(error)[:200], fix="check the path")
-
-
-def is_capture(path: Path) -> bool:
-    """True if a reader takes `path`: it looks like a capture, which may still be damaged."""
-    return any(reader.matches(path) for reader in READERS)
+    return refusal(path, wanted=f"a posed capture ({formats})", got=got, fix=fix)
 
 
 def _unposed(path: Path) -> tuple[str, Path] | None:
@@ -123,3 +128,76 @@ def _unposed(path: Path) -> tuple[str, Path] | None:
     if any(file.suffix.lower() in IMAGE_SUFFIXES for file in files):
         return "images", path
     return next((("a video", file) for file in files if file.suffix.lower() in VIDEO_SUFFIXES), None)
+
+
+# -- captures that are still being written ----------------------------------------------------------------------------
+
+
+def open_growing(path: Path, *, size: tuple[int, int] | None) -> tuple[Capture | None, str | None]:
+    """Opens what is there of a capture: a transforms.json that grows, and images that may not be complete.
+
+    Args:
+        path: folder that holds, or will hold, a transforms.json.
+        size: (width, height) of delivered images; by default that of the stored ones.
+
+    Returns:
+        The capture of the frames before the first whose image or fields cannot be read, None if there is no such frame;
+        and why no more of them can be read, None if all can. An image is complete when it can be decoded.
+    """
+    try:
+        listing, problem = transforms_json.read_complete(path)
+        listing = in_stream_order(listing)
+        pixels, convention = FilePixels(listing.frames), transforms_json.CONVENTION
+        return capture_of_listing(listing, transforms_json.FORMAT, pixels, size, convention), problem
+    except InputError as error:  # missing, or being written
+        return None, str(error)
+
+
+def is_done(path: Path) -> bool:
+    """True if a file `done` lies in the folder `path`, or beside the file `path`."""
+    return ((path.parent if path.is_file() else path) / DONE).exists()
+
+
+# -- procedural scenes ------------------------------------------------------------------------------------------------
+
+
+def _open_procedural(spec: str, size: tuple[int, int] | None) -> Capture:
+    """The procedural capture of a path, rendered immediately.
+
+    Args:
+        spec: the path, such as `procedural:room?frames=73&size=128x96&seed=0`.
+        size: (width, height) of the images where `spec` has none.
+    """
+    name, _, query = spec.removeprefix(f"{PROCEDURAL}:").partition("?")
+    given = parse_qsl(query, keep_blank_values=True)
+    options = dict(given)
+    if len(options) < len(given) or not options.keys() <= {"frames", "size", "seed"}:
+        fix = f"write {PROCEDURAL}:{name}?frames={PROCEDURAL_FRAMES}&size=128x96&seed=0"
+        raise refusal(spec, wanted="the options frames, size, seed, each once", got=echo(query), fix=fix)
+    num_frames = _whole(spec, "frames", options.get("frames", str(PROCEDURAL_FRAMES)), 1, 100_000)
+    seed = _whole(spec, "seed", options.get("seed", "0"), 0, 2**31 - 1)
+    width, height = size or PROCEDURAL_SIZE
+    if "size" in options:
+        sides = options["size"].lower().split("x")
+        if len(sides) != 2:
+            raise refusal(f"{spec}: size", wanted="WIDTHxHEIGHT", got=echo(options["size"]), fix="write 128x96")
+        width, height = (_whole(spec, "size", side, 8, MAX_SIDE) for side in sides)
+    # Imported here because the scenes load their textures, which no other capture needs.
+    from ssplat_jax.data.procedural import procedural_capture_arrays
+
+    images, depths, camtoworlds, Ks = procedural_capture_arrays(name, num_frames, height, width, seed=seed)
+    frames = tuple(
+        Frame(f"{name}/{i:05d}", check_camtoworld(pose, spec)[0], K.astype(np.float64), width, height)
+        for i, (pose, K) in enumerate(zip(camtoworlds, Ks, strict=True))
+    )
+    pixels = ArrayPixels(images=np.asarray(images, np.float32), depths=np.asarray(depths, np.float32))
+    title = f"{PROCEDURAL}-{name}" + (f"-seed{seed}" if seed else "")
+    return capture_of_listing(Listing(name=title, frames=frames), PROCEDURAL, pixels, size)
+
+
+def _whole(spec: str, option: str, text: str, low: int, high: int) -> int:
+    """Parses an option of a procedural path as a whole number in [low, high]."""
+    if text.isascii() and text.isdigit() and len(text) < 12 and low <= int(text) <= high:
+        return int(text)
+    wanted = f"a whole number in [{low}, {high}]"
+    raise refusal(f"{spec}: {option}", wanted=wanted, got=echo(text), fix="change the option")

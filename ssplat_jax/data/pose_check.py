@@ -15,8 +15,7 @@ from jaxtyping import Float64
 from skimage.measure import ransac
 from skimage.transform import FundamentalMatrixTransform
 
-from ssplat_jax.data.pose_conventions import CONVENTIONS, Convention
-from ssplat_jax.data.posed_image import Frame
+from ssplat_jax.data.posed_image import CONVENTIONS, Convention, Frame
 from ssplat_jax.data.sparse_matches import (
     MAX_EPIPOLAR_PX,
     KeypointsOf,

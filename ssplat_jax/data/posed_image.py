@@ -1,17 +1,22 @@
-"""`Frame`, one posed image of a capture, and the checks of poses and intrinsics that all readers use.
+"""`Frame`, one posed image of a capture; the checks of poses and intrinsics; and the conventions of poses in files.
 
 Poses and intrinsics are float64, because float32 has a spacing of 0.5 m at earth-centered coordinates.
+
+Readers know which convention their format prescribes. Files that follow another one are read with the options `axes`
+and `poses` at the end of the capture's path, such as `scene?axes=opencv&poses=world-to-camera`.
 """
 
 import dataclasses
 import math
+import re
 from pathlib import Path
+from typing import Literal, get_args
 
 import numpy as np
 from jaxtyping import Float64
 
 from ssplat_jax.core.errors import echo, refusal
-from ssplat_jax.data.lens import Lens
+from ssplat_jax.data.images import Lens
 
 ROTATION_TOLERANCE = 5e-3  # largest |R^T R - I| that rounding to three decimals explains; larger ones are refused
 ROTATION_ROUNDING = 1e-5  # deviations above this are reported to the user
@@ -50,7 +55,7 @@ def check_camtoworld(matrix: object, where: str) -> tuple[Float64[np.ndarray, "4
 
     Args:
         matrix: untrusted values.
-        where: location of the matrix for error messages.
+        where: location of the matrix for messages.
 
     Returns:
         The rigid transform, and the deviation |R^T R - I| of the given rotation.
@@ -62,15 +67,13 @@ def check_camtoworld(matrix: object, where: str) -> tuple[Float64[np.ndarray, "4
     try:
         pose = np.array(matrix, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
-        raise refusal(
-            where, wanted="a 4x4 matrix of numbers", got=echo(matrix), fix="write four rows of four"
-        ) from None
+        pose = np.zeros(0)
     if pose.shape == (3, 4):
         pose = np.vstack([pose, [0.0, 0.0, 0.0, 1.0]])
     if pose.shape != (4, 4):
-        raise refusal(where, wanted="a 4x4 matrix", got=f"shape {pose.shape}", fix="write four rows of four numbers")
-    if not np.isfinite(pose).all():
-        raise refusal(where, wanted="finite numbers", got="NaN or infinity", fix="drop the frame (tracking was lost)")
+        got = f"shape {pose.shape}" if pose.ndim and pose.size else echo(matrix)
+        raise refusal(where, wanted="a 4x4 matrix of numbers", got=got, fix="write four rows of four numbers")
+    _check_finite(pose, where)
     if not np.allclose(pose[3], [0.0, 0.0, 0.0, 1.0], rtol=0, atol=1e-6):
         transposed = np.array_equal(pose[:, 3], [0.0, 0.0, 0.0, 1.0])
         fix = "transpose the matrix" if transposed else "give a rigid camera-to-world transform"
@@ -82,9 +85,7 @@ def check_camtoworld(matrix: object, where: str) -> tuple[Float64[np.ndarray, "4
         deviation = float(np.nan_to_num(np.abs(rotation.T @ rotation - np.eye(3)).max(), nan=np.inf))
     if deviation > ROTATION_TOLERANCE:
         got = f"R^T R that differs from the identity by {deviation:.2g}"
-        raise refusal(
-            where, wanted="a rotation (no scale, no shear)", got=got, fix="divide the scale out of the matrix"
-        )
+        raise refusal(where, wanted="a rotation (no scale, no shear)", got=got, fix="divide the scale out of it")
     if np.linalg.det(rotation) < 0:
         fix = "flip one axis of the camera or undo the mirroring of the world"
         raise refusal(where, wanted="a rotation with determinant 1", got="determinant -1 (a reflection)", fix=fix)
@@ -93,12 +94,17 @@ def check_camtoworld(matrix: object, where: str) -> tuple[Float64[np.ndarray, "4
     return pose, deviation
 
 
+def _check_finite(values: np.ndarray, where: str) -> None:
+    if not np.isfinite(values).all():
+        raise refusal(where, wanted="finite numbers", got="NaN or infinity", fix="drop the frame (tracking was lost)")
+
+
 def _check_coordinates(translation: Float64[np.ndarray, "3"], where: str) -> None:
     """Refuses a camera that is absurdly far away: its reconstruction diverged."""
-    if np.abs(translation).max() > MAX_COORDINATE:
-        got = f"{np.abs(translation).max():.2g}"
+    farthest = np.abs(translation).max()
+    if farthest > MAX_COORDINATE:
         fix = "drop the frame or choose a larger unit"
-        raise refusal(where, wanted=f"coordinates up to {MAX_COORDINATE:.0e}", got=got, fix=fix)
+        raise refusal(where, wanted=f"coordinates up to {MAX_COORDINATE:.0e}", got=f"{farthest:.2g}", fix=fix)
 
 
 def pose_from_quat(wxyz: object, translation: object, where: str) -> Float64[np.ndarray, "4 4"]:
@@ -107,16 +113,15 @@ def pose_from_quat(wxyz: object, translation: object, where: str) -> Float64[np.
     Args:
         wxyz: untrusted quaternion.
         translation: untrusted vector.
-        where: location of the values for error messages.
+        where: location of the values for messages.
 
     Raises:
         InputError: a value is not finite, a coordinate is too large, or the quaternion is shorter than 1e-6.
     """
     quat, translation = np.asarray(wxyz, np.float64), np.asarray(translation, np.float64)
-    length = math.hypot(*quat)  # does not overflow before the length does
-    if not (np.isfinite(quat).all() and np.isfinite(translation).all()):
-        raise refusal(where, wanted="finite numbers", got="NaN or infinity", fix="drop the frame (tracking was lost)")
+    _check_finite(np.concatenate([quat, translation]), where)
     _check_coordinates(translation, where)
+    length = math.hypot(*quat)  # does not overflow before the length does
     if not 1e-6 <= length < math.inf:
         got = f"a quaternion of length {length:.2g}"
         raise refusal(where, wanted="a rotation", got=got, fix="drop the frame or write a unit quaternion")
@@ -151,26 +156,91 @@ def check_intrinsics(
         cy: principal point in y, pixels.
         width: image width, pixels.
         height: image height, pixels.
-        where: location of the values for error messages.
-
-    Returns:
-        The 3x3 matrix K.
+        where: location of the values for messages.
 
     Raises:
         InputError: a focal length is not positive or not in pixels, or the principal point is outside the image.
     """
+    longest = MAX_FOCAL_SIDES * max(width, height)
     for name, focal in (("fl_x", fx), ("fl_y", fy)):
-        if not (math.isfinite(focal) and focal > 0):
-            fix = "give the focal length in pixels"
-            raise refusal(f"{where}.{name}", wanted="a focal length above 0", got=echo(focal), fix=fix)
-        if focal < MIN_FOCAL_PX:
-            fix = f"multiply it by the image's {'width' if name == 'fl_x' else 'height'} if it is normalized"
-            raise refusal(f"{where}.{name}", wanted="a focal length in pixels", got=echo(focal), fix=fix)
-        if focal > MAX_FOCAL_SIDES * max(width, height):
-            wanted = f"a focal length of at most {MAX_FOCAL_SIDES:g} image sides"
-            raise refusal(f"{where}.{name}", wanted=wanted, got=echo(focal), fix="give the focal length in pixels")
+        if not MIN_FOCAL_PX <= focal <= longest:  # true for NaN too
+            wanted, fix = f"a focal length in [{MIN_FOCAL_PX:g}, {longest:g}] pixels", "give it in pixels"
+            if 0 < focal < MIN_FOCAL_PX:
+                fix = "multiply it by the image's width or height if it is normalized"
+            raise refusal(f"{where}.{name}", wanted=wanted, got=echo(focal), fix=fix)
     for name, center, extent in (("cx", cx, width), ("cy", cy, height)):
-        if not 0 <= center <= extent:  # false for NaN too
+        if not 0 <= center <= extent:
             fix = "give the principal point in pixels of the stored image"
             raise refusal(f"{where}.{name}", wanted=f"a value in [0, {extent}]", got=echo(center), fix=fix)
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+
+# -- conventions ------------------------------------------------------------------------------------------------------
+
+Axes = Literal["opencv", "opengl"]
+"""Axes of a camera: +y down and +z forward (opencv), or +y up and +z backward (opengl)."""
+Direction = Literal["camera-to-world", "world-to-camera"]
+"""Direction of the matrices or vectors that a file gives."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Convention:
+    """Convention in which a file writes poses."""
+
+    axes: Axes = "opencv"
+    poses: Direction = "camera-to-world"
+
+    def to_opencv(self, written: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "4 4"]:
+        """Returns the camera-to-world pose with OpenCV axes of a matrix in this convention."""
+        camtoworld = written if self.poses == "camera-to-world" else invert_pose(written)
+        return camtoworld if self.axes == "opencv" else camtoworld @ OPENGL_TO_OPENCV
+
+    def from_opencv(self, camtoworld: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "4 4"]:
+        """Returns the matrix in this convention of a camera-to-world pose with OpenCV axes."""
+        camtoworld = camtoworld if self.axes == "opencv" else camtoworld @ OPENGL_TO_OPENCV
+        return camtoworld if self.poses == "camera-to-world" else invert_pose(camtoworld)
+
+    def options(self, usual: "Convention") -> dict[str, str]:
+        """Returns the options that ask for this convention in place of the usual one."""
+        return {name: getattr(self, name) for name in ("axes", "poses") if getattr(self, name) != getattr(usual, name)}
+
+
+USUAL = Convention()
+"""The convention of captures in memory, and of formats that do not say otherwise."""
+
+CONVENTIONS = tuple(Convention(axes, poses) for axes in get_args(Axes) for poses in get_args(Direction))
+
+_OPTIONS = re.compile(r"\?((?:axes|poses)=[^&?/]*(?:&(?:axes|poses)=[^&?/]*)*)$")
+
+
+def split_options(path: str) -> tuple[str, dict[str, str]]:
+    """Splits `path?axes=...&poses=...` into the path and its options; there may be none.
+
+    Raises:
+        InputError: an option has an unknown value or is given twice.
+    """
+    found = _OPTIONS.search(path)
+    if found is None:
+        return path, {}
+    options: dict[str, str] = {}
+    allowed = {"axes": get_args(Axes), "poses": get_args(Direction)}
+    for part in found[1].split("&"):
+        name, _, value = part.partition("=")
+        if value not in allowed[name] or name in options:
+            got = "it twice" if name in options else value or "nothing"
+            wanted = " or ".join(allowed[name])
+            raise refusal(f"{path[: found.start()]}: {name}", wanted=wanted, got=got, fix="change the option")
+        options[name] = value
+    return path[: found.start()], options
+
+
+def with_options(path: str, *, axes: str | None = None, poses: str | None = None) -> str:
+    """Returns `path` with the options that are not None, which replace those that it has."""
+    path, options = split_options(path)
+    options |= {name: value for name, value in (("axes", axes), ("poses", poses)) if value is not None}
+    return path + ("?" if options else "") + "&".join(f"{name}={value}" for name, value in options.items())
+
+
+def reinterpreted(frame: Frame, usual: Convention, written: Convention) -> Frame:
+    """Returns a frame that was read in the `usual` convention as if its file were `written` in another one."""
+    return dataclasses.replace(frame, camtoworld=written.to_opencv(usual.from_opencv(frame.camtoworld)))

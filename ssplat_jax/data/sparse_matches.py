@@ -33,17 +33,9 @@ class PosedImages(Protocol):
     """Part of a `Capture` that matching needs."""
 
     @property
-    def frames(self) -> Sequence[Frame]:
-        """The stored images, before they are resized."""
-        ...
-
-    def K(self, i: int) -> Float64[np.ndarray, "3 3"]:
-        """Intrinsics of delivered image `i`, in pixels."""
-        ...
-
-    def image(self, i: int) -> Float32[np.ndarray, "h w 3"]:
-        """Delivered image `i` as RGB in [0, 1]."""
-        ...
+    def frames(self) -> Sequence[Frame]: ...
+    def K(self, i: int) -> Float64[np.ndarray, "3 3"]: ...
+    def image(self, i: int) -> Float32[np.ndarray, "h w 3"]: ...
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -90,10 +82,14 @@ def detect_keypoints(image: Float32[np.ndarray, "h w 3"]) -> Keypoints:
     return Keypoints(pixels=pixels, descriptors=detector.descriptors.astype(bool), pixel=shrink)
 
 
-def gray_image(image: Float32[np.ndarray, "h w 3"], size: tuple[int, int]) -> Float64[np.ndarray, "h2 w2"]:
+def gray_image(
+    image: Float32[np.ndarray, "h w 3"],
+    size: tuple[int, int],
+    resample: Image.Resampling = Image.Resampling.BICUBIC,
+) -> Float64[np.ndarray, "h2 w2"]:
     """Returns an image in gray at another size (width, height)."""
     gray = Image.fromarray(np.ascontiguousarray(image @ np.array([0.299, 0.587, 0.114], np.float32)))
-    return np.asarray(gray.resize(size, Image.Resampling.BICUBIC), np.float64)
+    return np.asarray(gray.resize(size, resample), np.float64)
 
 
 def keypoints_of(capture: PosedImages) -> KeypointsOf:
@@ -102,17 +98,7 @@ def keypoints_of(capture: PosedImages) -> KeypointsOf:
 
 
 def triangulate_pair(capture: PosedImages, i: int, j: int, keypoints: KeypointsOf) -> CommonPoints | None:
-    """Triangulates the points that two frames have in common.
-
-    Args:
-        capture: the frames and intrinsics.
-        i: frame whose camera the depths refer to.
-        j: the other frame.
-        keypoints: function that returns the keypoints of a frame.
-
-    Returns:
-        The points, with `close` empty, or None if there are fewer than `MIN_POINTS`.
-    """
+    """Triangulates the points that two frames have in common, as seen by frame `i`; None if they are few."""
     a, b = capture.frames[i].camtoworld, capture.frames[j].camtoworld
     R, t = motion_between(a, b)
     ka, kb = keypoints(i), keypoints(j)
@@ -148,14 +134,7 @@ def epipolar_distances(
 ) -> Float64[np.ndarray, "n m"]:
     """Returns the distance of each ray of camera b from the epipolar line of each ray of camera a.
 
-    Args:
-        rays_a: rays of camera a with z = 1.
-        rays_b: rays of camera b with z = 1.
-        R: rotation from camera a to camera b.
-        t: translation from camera a to camera b.
-
-    Returns:
-        Distances in the plane z = 1 of camera b.
+    Rays have z = 1, and distances are in that plane of camera b; R and t lead from camera a to camera b.
     """
     lines = np.cross(t, rays_a @ R.T)
     return np.abs(lines @ rays_b.T) / np.maximum(np.linalg.norm(lines[:, :2], axis=-1), 1e-300)[:, None]
@@ -181,12 +160,9 @@ def match(
 def mutual_nearest(
     distances: Float[np.ndarray, "n m"], max_distance: float, max_ratio: float
 ) -> tuple[Int[np.ndarray, " p"], Int[np.ndarray, " p"]]:
-    """Returns the rows and columns that are nearest to each other, near enough, and clearly nearer than the second.
+    """Returns the rows and columns that are nearest to each other and at most `max_distance` apart.
 
-    Args:
-        distances: between descriptors.
-        max_distance: largest distance of a match.
-        max_ratio: largest ratio of a row's smallest to its second smallest distance (Lowe's test).
+    A row's smallest distance must be less than `max_ratio` of its second smallest (Lowe's test).
     """
     if min(distances.shape) < 2:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
@@ -203,17 +179,10 @@ def triangulate(
     R: Float64[np.ndarray, "3 3"],
     t: Float64[np.ndarray, "3"],
 ) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
-    """Triangulates pairs of rays.
+    """Returns the inverse depths in camera a where pairs of rays come closest, and the angles between them in degrees.
 
-    Args:
-        rays_a: rays of camera a with z = 1, so that lengths along them are depths.
-        rays_b: rays of camera b with z = 1.
-        R: rotation from camera a to camera b.
-        t: translation from camera a to camera b.
-
-    Returns:
-        The inverse depths in camera a at the points of closest approach, and the angles between the rays in degrees.
-        Both are 0 for parallel rays, and negative for rays that meet behind camera a.
+    Both are 0 for parallel rays, and negative for rays that meet behind camera a. Rays have z = 1, so that lengths
+    along them are depths; R and t lead from camera a to camera b.
     """
     along = rays_a @ R.T
     bb, ab = (rays_b * rays_b).sum(-1), (along * rays_b).sum(-1)

@@ -1,4 +1,6 @@
-"""Split of a capture's frames into context views and targets; a function of counts only, so splits are reproducible.
+"""Split of a capture's frames into context views and targets, the order of the context, and index files of splits.
+
+A split is a function of counts only, so it is reproducible:
 
 interleaved   Of every `stride`-th frame, those at positions 4, 12, 20, ... are targets, and the first V others are
               context. Targets outside the span of the context are dropped, since they show unseen space.
@@ -7,7 +9,7 @@ paper         The protocol of StreamSplat's appendix: targets are uniform over t
 scannet       The same with 64 targets: the trajectory is thinned to 1088 frames, and 8 anchors, spread over it, come
               first. Chunks take the context in that order. A trajectory of fewer frames is used whole; one without room
               for all targets and V other frames is refused.
-index         Context and targets of an index file (`index_files.py`); chunks take the context in its order.
+index         Context and targets of an index file (`read_index`); chunks take the context in its order.
 
 Counts that are not given fit the capture: see `choose_split`.
 """
@@ -15,10 +17,15 @@ Counts that are not given fit the capture: see `choose_split`.
 import dataclasses
 import hashlib
 import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from jaxtyping import Float64
 
-from ssplat_jax.core.errors import refusal
+from ssplat_jax.core.errors import echo, refusal
+from ssplat_jax.data.parsing import load_json
 
 FIRST_TARGET, TARGET_STEP = 4, 8  # first position and spacing of the interleaved targets
 USUAL_CONTEXT = 64  # context views where none are given, if there are as many
@@ -203,3 +210,126 @@ def _choose_interleaved(num_frames: int, stride: int, context: int | None, targe
     _check_counts(targets=targets)
     kept = tuple(split.targets[p] for p in _uniform(len(split.targets), targets))
     return dataclasses.replace(split, targets=kept)
+
+
+# -- order ------------------------------------------------------------------------------------------------------------
+
+
+MAX_INTERLEAVED_CHUNKS = 8
+"""Largest number of chunks interleaved at a time: with chunks of 4, 32 frames or about a second of video."""
+
+
+def interleave(centers: Float64[np.ndarray, "n 3"], indices: Sequence[int], chunk_size: int, step: float) -> list[int]:
+    """Orders the frames of slow video so that consecutive views of a chunk are about `step` apart.
+
+    Frames of a video are often less than a hundredth of the depth apart, and four consecutive ones have too little
+    parallax. Interleaved over `s` chunks, frames 0, s, 2s, 3s form the first chunk, 1, s + 1, ... the second, and so
+    on: every frame is used, and none is delayed by more than a block of `chunk_size * s` frames. The order depends on
+    poses only, so it is known before an image is read.
+
+    Args:
+        centers: camera centers of the frames `indices`, in any unit.
+        indices: frames in the order of the stream.
+        chunk_size: views of a chunk.
+        step: wanted distance between consecutive views of a chunk, in the unit of `centers`; 0 keeps the order.
+
+    Returns:
+        A permutation of `indices`. Blocks of `chunk_size * s` frames are interleaved one after the other, with s from 1
+        to `MAX_INTERLEAVED_CHUNKS`. Frames that are `step` apart already and frames that do not move keep their order.
+    """
+    steps = np.linalg.norm(np.diff(centers, axis=0), axis=-1)
+    order: list[int] = []
+    while len(order) < len(indices):
+        first = len(order)
+        ahead = steps[first : first + chunk_size * MAX_INTERLEAVED_CHUNKS - 1]
+        typical = float(np.median(ahead)) if ahead.size else 0.0
+        num_chunks = int(np.clip(round(step / typical), 1, MAX_INTERLEAVED_CHUNKS)) if typical > 0 else 1
+        block = list(indices[first : first + chunk_size * num_chunks])
+        num_chunks = -(-len(block) // chunk_size)
+        for chunk in range(num_chunks):
+            order += block[chunk::num_chunks]
+    return order
+
+
+# -- index files ------------------------------------------------------------------------------------------------------
+
+
+Index = dict[str, Split | None]
+"""The split of each scene; None for a scene that is left out."""
+
+NUM_NAMED = 3
+"""Scenes of an index that a message names."""
+
+
+def read_index(path: Path) -> tuple[Index, tuple[str, ...]]:
+    """Reads an index file: the context and target frames of scenes, as DepthSplat, ReSplat and pixelSplat publish them.
+
+        {"scene": {"context": [0, 8, 16], "target": [4, 12]}, "a scene that is left out": null}
+
+    Other fields (pixelSplat's `overlap`, for example) are not used. Indices of videos list every frame as a target. A
+    target that is streamed too is not scored, and a note counts them.
+
+    Returns:
+        The splits of its scenes, and notes for the user.
+
+    Raises:
+        InputError: the file is missing or is no index; the message names the scene and the field.
+    """
+    scenes = load_json(path)
+    if not scenes:
+        raise refusal(str(path), wanted="a scene at least", got="none", fix='write {"scene": {"context", "target"}}')
+    index: Index = {name: _read_scene(fields, f"{path}: {echo(name)}") for name, fields in scenes.items()}
+    num_listed = sum(len(scenes[name]["target"]) for name, split in index.items() if split is not None)
+    num_kept = sum(len(split.targets) for split in index.values() if split is not None)
+    note = f"{path}: {num_listed - num_kept} of {num_listed} targets are context frames too; they are not scored."
+    return index, (note,) if num_kept < num_listed else ()
+
+
+def _read_scene(fields: Any, where: str) -> Split | None:
+    if fields is None:
+        return None
+    if not isinstance(fields, dict):
+        fix = "give the lists context and target"
+        raise refusal(where, wanted="an object or null", got=echo(fields), fix=fix)
+    lists = {}
+    for name in ("context", "target"):
+        value, fix = fields.get(name), "list the numbers of frames, from 0"
+        if not isinstance(value, list) or not value or not all(type(i) is int and i >= 0 for i in value):
+            raise refusal(f"{where}.{name}", wanted="frame numbers", got=echo(value), fix=fix)
+        if len(set(value)) != len(value):
+            raise refusal(f"{where}.{name}", wanted="every frame once", got=echo(value), fix="drop the repeated ones")
+        lists[name] = tuple(value)
+    targets = tuple(i for i in lists["target"] if i not in set(lists["context"]))
+    if not targets:
+        fix = "list a frame that is not in context"
+        raise refusal(f"{where}.target", wanted="a frame that is not streamed", got=echo(lists["target"]), fix=fix)
+    return Split(protocol="index", context=lists["context"], targets=targets)
+
+
+def split_of_scene(index: Index, scene: str, num_frames: int) -> Split:
+    """The split of one scene of an index.
+
+    Raises:
+        InputError: the index does not hold the scene or leaves it out, or the capture has no frame of that number.
+    """
+    if scene not in index:
+        named = ", ".join(list(index)[:NUM_NAMED]) + (" ..." if len(index) > NUM_NAMED else "")
+        fix = "name one of them with --scene"
+        raise refusal("--index", wanted=f"the scene {echo(scene)}", got=f"{len(index)} others ({named})", fix=fix)
+    split = index[scene]
+    if split is None:
+        got, fix = "null: the index leaves the scene out", "score another scene"
+        raise refusal("--index", wanted=f"frames for {echo(scene)}", got=got, fix=fix)
+    last = max(*split.context, *split.targets)
+    if last >= num_frames:
+        fix = "use the capture that the index was made for"
+        raise refusal("--index", wanted=f"frame {last}", got=f"a capture of {num_frames} frames", fix=fix)
+    return split
+
+
+def index_to_json(index: Index) -> dict[str, Any]:
+    """An index as plain JSON types; the inverse is `read_index`, but for the name of the protocol."""
+    return {
+        name: None if split is None else {"context": list(split.context), "target": list(split.targets)}
+        for name, split in index.items()
+    }

@@ -38,26 +38,8 @@ class StreamFrame:
     def at_camera(
         camtoworld: Float64[np.ndarray, "4 4"], *, scale: float, near: float, far: float, warning: str | None = None
     ) -> "StreamFrame":
-        """Returns the stream frame whose origin is a camera of the capture.
-
-        Args:
-            camtoworld: pose of the camera in the capture frame.
-            scale: stream units per capture unit.
-            near: nearest depth candidate, stream units.
-            far: farthest depth candidate, stream units.
-            warning: reason why scale, near and far may be wrong.
-
-        Returns:
-            The stream frame.
-        """
-        return StreamFrame(
-            rotation=camtoworld[:3, :3].copy(),
-            origin=camtoworld[:3, 3].copy(),
-            scale=scale,
-            near=near,
-            far=far,
-            warning=warning,
-        )
+        """Returns the stream frame whose origin is a camera of the capture, with the other fields as given."""
+        return StreamFrame(camtoworld[:3, :3].copy(), camtoworld[:3, 3].copy(), scale, near, far, warning)
 
     @staticmethod
     def at_point(point: tuple[float, float, float]) -> "StreamFrame":
@@ -68,26 +50,13 @@ class StreamFrame:
 
     def to_dict(self) -> dict[str, Any]:
         """Returns the fields as plain JSON types; the inverse is `from_dict`."""
-        return {
-            "rotation": self.rotation.tolist(),
-            "origin": self.origin.tolist(),
-            "scale": self.scale,
-            "near": self.near,
-            "far": self.far,
-            "warning": self.warning,
-        }
+        fields = dataclasses.asdict(self)
+        return fields | {"rotation": self.rotation.tolist(), "origin": self.origin.tolist()}
 
     @staticmethod
     def from_dict(fields: dict[str, Any]) -> "StreamFrame":
         """Returns the stream frame of the fields that `to_dict` gave."""
-        return StreamFrame(
-            rotation=np.array(fields["rotation"]),
-            origin=np.array(fields["origin"]),
-            scale=fields["scale"],
-            near=fields["near"],
-            far=fields["far"],
-            warning=fields.get("warning"),
-        )
+        return StreamFrame(**fields | {name: np.array(fields[name]) for name in ("rotation", "origin")})
 
     def points_to_stream(self, points: Float64[np.ndarray, "*n 3"]) -> Float64[np.ndarray, "*n 3"]:
         """Transforms points from the capture frame to the stream frame."""
@@ -121,8 +90,8 @@ class StreamFrame:
     def offset(self) -> tuple[float, float, float]:
         """Point of the capture frame to which exported positions are relative.
 
-        It is zero unless float32 is too coarse for the capture's coordinates. Then it is the origin of the stream,
-        rounded to whole units, or to more decimals if the scene is smaller than a unit.
+        It is zero unless float32 is too coarse for the capture's coordinates: viewers add no offset. Then it is the
+        origin of the stream, rounded to whole units, or to more decimals if the scene is smaller than a unit.
         """
         spacing = float(np.spacing(np.float32(np.abs(self.origin).max())))
         is_coarse = spacing * self.scale > MAX_COORDINATE_SPACING

@@ -11,8 +11,7 @@ from ssplat_jax.core.atomic import write_atomic
 from ssplat_jax.core.console import Reporter
 from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.data.capture import Capture
-from ssplat_jax.data.index_files import index_to_json
-from ssplat_jax.data.split import Split
+from ssplat_jax.data.split import Split, index_to_json
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.evaluation import latency
 from ssplat_jax.evaluation.exposures import exposures_to_json
@@ -46,7 +45,7 @@ def evaluate(
     """Streams, scores and times; writes metrics, split, index and a picture per target into `out`.
 
     A picture is target | render | depth. `split.json` holds the frames used; its SHA-256 is in the metrics.
-    `index.json` holds them as an index file (`data.index_files`). Every frame is decoded once before anything is
+    `index.json` holds them as an index file (`read_index`). Every frame is decoded once before anything is
     written, so that a damaged one leaves no partial result.
 
     Args:

@@ -11,10 +11,9 @@ from ssplat_jax.core.console import Reporter
 from ssplat_jax.core.errors import InputError, echo, refusal
 from ssplat_jax.core.program_memory import make_room
 from ssplat_jax.data.capture import Capture
-from ssplat_jax.data.index_files import Index, index_to_json, read_index, split_of_scene
 from ssplat_jax.data.open_capture import is_capture, open_capture, without_tilde
-from ssplat_jax.data.pose_conventions import split_options, with_options
-from ssplat_jax.data.split import Split, choose_split
+from ssplat_jax.data.posed_image import split_options, with_options
+from ssplat_jax.data.split import Index, Split, choose_split, index_to_json, read_index, split_of_scene
 from ssplat_jax.evaluation.evaluate import evaluate
 from ssplat_jax.evaluation.lpips import LpipsWeights
 from ssplat_jax.evaluation.scoring import Display

@@ -13,8 +13,7 @@ from pathlib import Path
 from ssplat_jax.core.console import Reporter
 from ssplat_jax.core.errors import InputError, refusal, require_positive
 from ssplat_jax.data.capture import Capture
-from ssplat_jax.data.growing_capture import is_done, open_growing
-from ssplat_jax.data.open_capture import without_tilde
+from ssplat_jax.data.open_capture import is_done, open_growing, without_tilde
 from ssplat_jax.data.readers.transforms_json import num_listed
 from ssplat_jax.evaluation.scoring import check_scorable
 from ssplat_jax.model.streamsplat import StreamSplat

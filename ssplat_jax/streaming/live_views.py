@@ -13,9 +13,8 @@ from jaxtyping import Float32
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.chunk import Chunk
 from ssplat_jax.core.errors import echo, refusal
-from ssplat_jax.data.capture import MAX_SIDE, Capture
+from ssplat_jax.data.capture import MAX_SIDE, ArrayPixels, Capture
 from ssplat_jax.data.depth_range import MAX_RANGE
-from ssplat_jax.data.images import ArrayPixels
 from ssplat_jax.data.posed_image import Frame, check_camtoworld, check_intrinsics, invert_pose
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.model.streamsplat import ChunkOutput

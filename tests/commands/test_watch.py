@@ -13,7 +13,7 @@ import jax
 import pytest
 
 from ssplat_jax.core.console import Reporter
-from ssplat_jax.data.growing_capture import is_done
+from ssplat_jax.data.open_capture import is_done
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.runs import watch_run
 from ssplat_jax.storage.run_folder import RunFolder

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from ssplat_jax.data.capture import Capture
-from ssplat_jax.data.images import ArrayPixels
+from ssplat_jax.data.capture import ArrayPixels, Capture
 from ssplat_jax.data.posed_image import Frame
 from ssplat_jax.data.stream_frame import StreamFrame
 from tests.badinputs.cases import rotated

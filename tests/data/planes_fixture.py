@@ -4,8 +4,7 @@ import numpy as np
 from skimage.filters import gaussian
 from skimage.transform import resize
 
-from ssplat_jax.data.capture import Capture
-from ssplat_jax.data.images import ArrayPixels
+from ssplat_jax.data.capture import ArrayPixels, Capture
 from ssplat_jax.data.posed_image import Frame
 
 HEIGHT, WIDTH, FOCAL = 120, 160, 140.0

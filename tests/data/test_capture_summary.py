@@ -2,13 +2,28 @@
 
 import dataclasses
 import json
+import shutil
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.data.capture_summary import UNITS, Summary, _depth_map_warnings, _warnings, summarize
+from ssplat_jax.data.capture import ArrayPixels, Capture
+from ssplat_jax.data.capture_summary import (
+    UNITS,
+    Summary,
+    _depth_map_warnings,
+    _depth_warnings,
+    frame_warnings,
+    image_warnings,
+    order_warnings,
+    summarize,
+    turn_warnings,
+)
 from ssplat_jax.data.depth_range import DepthStatistics
+from ssplat_jax.data.open_capture import open_capture
+from tests.badinputs.cases import make_capture
 from tests.data.planes_fixture import two_planes
 
 
@@ -63,7 +78,7 @@ def test_depth_maps_of_another_unit_are_reported():
 def test_a_small_median_parallax_is_reported():
     capture, steps = two_planes(8, 0.2), np.full(7, 0.2)
     for parallax, wanted in ((1.1, "Little parallax: 1.1 degrees"), (4.0, None)):
-        found = _warnings(capture, DepthStatistics(1.0, 2.0, 4.0, 100, 12, parallax, "matches"), steps)
+        found = _depth_warnings(capture, DepthStatistics(1.0, 2.0, 4.0, 100, 12, parallax, "matches"), steps)
         assert [w.startswith(wanted) for w in found] == [True] if wanted else found == []
 
 
@@ -74,3 +89,105 @@ def test_every_length_of_a_summary_has_its_unit():
     calls = []
     summarize(two_planes(8, 0.2), StreamConfig(), calls.append)
     assert calls == list(range(8))
+
+
+# -- frames -----------------------------------------------------------------------------------------------------------
+
+CAPTURES = ("fox", "hololens", "plush", "redkitchen", "south_building")
+
+
+@pytest.fixture(scope="module")
+def room() -> Capture:
+    return two_planes(24, 0.01, spin=0.2, forward=0.005)
+
+
+def changed(capture: Capture, images=None, frames=None) -> Capture:
+    assert isinstance(capture.pixels, ArrayPixels)
+    images = capture.pixels.images if images is None else images
+    pixels = ArrayPixels(images=images, depths=np.zeros(images.shape[:3], np.float32))
+    return dataclasses.replace(capture, pixels=pixels, frames=capture.frames if frames is None else tuple(frames))
+
+
+def reordered(capture: Capture, order) -> Capture:
+    return changed(capture, capture.pixels.images[list(order)], [capture.frames[i] for i in order])
+
+
+def test_a_good_capture_has_no_findings(room):
+    assert frame_warnings(room) == []
+
+
+def test_shuffled_frames_are_found(room):
+    (warning,) = order_warnings(reordered(room, np.random.default_rng(0).permutation(len(room))))
+    assert "not in the order of a path" in warning and "name the images" in warning
+    assert order_warnings(reordered(room, range(len(room))[::-1])) == []  # backwards is a path too
+
+
+def test_a_frame_out_of_order_is_found(room):
+    order = [i for i in range(24) if i != 20]
+    order.insert(5, 20)
+    (warning,) = order_warnings(reordered(room, order))
+    assert "frames 5)" in warning and "out of order" in warning
+
+
+def test_copies_are_found_in_memory_and_in_files(room, tmp_path):
+    images = room.pixels.images.copy()
+    images[[7, 12]] = images[[6, 3]]
+    warnings = [w for w in frame_warnings(changed(room, images)) if "copies" in w]
+    assert len(warnings) == 1 and warnings[0].startswith("2 images") and "frames 7, 12)" in warnings[0]
+    root = make_capture(tmp_path / "capture")
+    shutil.copy(root / "images" / "0.jpg", root / "images" / "3.jpg")
+    assert [w for w in frame_warnings(open_capture(root)) if "1 images are copies" in w and "frames 3)" in w]
+
+
+def test_a_turn_without_overlap_is_found(room):
+    frames = list(room.frames)
+    half = np.diag([-1.0, 1.0, -1.0, 1.0])
+    frames[15:] = [dataclasses.replace(f, camtoworld=f.camtoworld @ half) for f in frames[15:]]
+    (warning,) = turn_warnings(changed(room, frames=frames))
+    assert warning.startswith("1 turn of") and "(after frames 14)" in warning
+
+
+@pytest.mark.parametrize("i", [0, 11, 23])
+def test_a_blurred_image_is_found(i, room):
+    images = room.pixels.images.copy()
+    images[i] = gaussian_filter(images[i], (2.5, 2.5, 0))
+    (warning,) = image_warnings(changed(room, images))
+    assert warning.startswith("1 images are blurred") and f"frames {i})" in warning
+
+
+@pytest.mark.parametrize("gain", [0.6, 1.6])
+def test_a_jump_of_exposure_is_found(gain, room):
+    images = np.clip(room.pixels.images * 0.6, 0, 1)
+    images[10:] *= gain
+    (warning,) = image_warnings(changed(room, images))
+    assert (
+        warning.startswith("1 jumps of exposure")
+        and "(after frames 9)" in warning
+        and "1.6 times" in warning.replace("1.7", "1.6")
+    )
+
+
+def test_slow_drift_of_exposure_is_no_jump(room):
+    images = room.pixels.images * np.geomspace(0.5, 1.0, 24, dtype=np.float32)[:, None, None, None]
+    assert image_warnings(changed(room, images)) == []
+
+
+def test_a_long_capture_is_looked_at_in_pairs(room):
+    long = reordered(room, np.repeat(np.arange(24), 5))
+    images = long.pixels.images.copy()
+    images[1] = gaussian_filter(images[1], (2.5, 2.5, 0))  # frames 0 and 1 are the first pair
+    (warning,) = image_warnings(changed(long, images))
+    assert "1 images of the 64 looked at are blurred" in warning
+
+
+@pytest.mark.slow  # decodes 64 images each
+@pytest.mark.parametrize("name", CAPTURES)
+def test_real_captures_have_only_true_findings(name, captures):
+    """Copies in redkitchen are equal to the byte; plush and South Building turn by 71 and 130 degrees once."""
+    words = {
+        "redkitchen": ["90 images are copies"],
+        "plush": ["1 turn of up to 71"],
+        "south_building": ["1 turn of up to 130"],
+    }
+    found = frame_warnings(open_capture(captures / name))
+    assert [w.startswith(p) for w, p in zip(found, words.get(name, []), strict=True)] == [True] * len(found)

@@ -7,10 +7,9 @@ from hypothesis import strategies as st
 
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.data import depth_range
-from ssplat_jax.data.capture import Capture
+from ssplat_jax.data.capture import ArrayPixels, Capture
 from ssplat_jax.data.capture_summary import summarize
 from ssplat_jax.data.depth_range import DepthStatistics, estimate_depths, stream_scale
-from ssplat_jax.data.images import ArrayPixels
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.posed_image import MAX_COORDINATE
 from ssplat_jax.data.sparse_matches import CommonPoints

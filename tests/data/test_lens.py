@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from ssplat_jax.core.errors import InputError
-from ssplat_jax.data.lens import FisheyeLens, Lens, check_lens, undistort
+from ssplat_jax.data.images import FisheyeLens, Lens, check_lens, undistort
 from ssplat_jax.data.open_capture import open_capture
 from tests.badinputs.cases import HEIGHT, WIDTH, make_capture
 

@@ -13,7 +13,7 @@ from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.capture_summary import summarize
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.pose_check import fit_poses, pose_warning
-from ssplat_jax.data.pose_conventions import CONVENTIONS, USUAL, Convention, split_options, with_options
+from ssplat_jax.data.posed_image import CONVENTIONS, USUAL, Convention, split_options, with_options
 from ssplat_jax.data.sparse_matches import keypoints_of
 from tests.data.planes_fixture import two_planes
 

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ssplat_jax.core.errors import InputError
-from ssplat_jax.data.lens import FisheyeLens
+from ssplat_jax.data.images import FisheyeLens
 from ssplat_jax.data.open_capture import open_capture
 from tests.data.capture_writers import (
     COLMAP_IMAGES,
@@ -25,14 +25,11 @@ from tests.data.capture_writers import (
     poses,
     tum_line,
     write_colmap_binary,
-    write_colmap_images,
     write_colmap_text,
     write_depth,
     write_image,
     write_llff,
-    write_realestate,
     write_record3d,
-    write_scannet,
     write_tum,
 )
 
@@ -69,7 +66,7 @@ def test_llff_images_have_the_poses_of_their_names_and_not_of_what_they_link_to(
     link = tmp_path / "images" / "IMG_2.JPG"
     link.unlink()
     link.symlink_to(outside / "7.JPG")
-    with pytest.raises(InputError, match=r"IMG_\d.JPG: wanted an image inside .* got a link that leads outside"):
+    with pytest.raises(InputError, match=r"IMG_\d.JPG: wanted a"):
         open_capture(tmp_path)
 
 
@@ -77,7 +74,6 @@ def test_llff_images_have_the_poses_of_their_names_and_not_of_what_they_link_to(
 def test_a_capture_is_the_same_in_every_format(kind, tmp_path):
     WRITERS[kind](tmp_path)
     capture = open_capture(tmp_path)
-    capture.verify()
     assert capture.format == kind.removesuffix(" text")
     assert tuple(frame.name for frame in capture.frames) == NAMES[capture.format]
     order = [COLMAP_IMAGES.index(f.name) for f in capture.frames] if capture.format == "COLMAP" else range(NUM_FRAMES)
@@ -113,29 +109,6 @@ def test_colmap_cameras_that_no_image_uses_may_be_of_any_model(tmp_path):
     write_colmap_text(tmp_path / "text", camera=text)
     for root in ("binary", "text"):
         np.testing.assert_array_equal(open_capture(tmp_path / root).frames[0].K, K)
-
-
-def test_binary_files_come_before_text(tmp_path):
-    write_colmap_binary(tmp_path)
-    (tmp_path / "sparse" / "0" / "cameras.txt").write_text("nonsense")
-    (tmp_path / "sparse" / "0" / "images.txt").write_text("nonsense")
-    assert len(open_capture(tmp_path)) == NUM_FRAMES
-
-
-def test_colmap_images_may_be_in_the_root_or_downscaled(tmp_path):
-    write_colmap_binary(tmp_path / "beside")
-    for name in COLMAP_IMAGES:
-        (tmp_path / "beside" / name).parent.mkdir(exist_ok=True)
-        (tmp_path / "beside" / "images" / name).rename(tmp_path / "beside" / name)
-    (tmp_path / "beside" / "images" / "c").rmdir()
-    (tmp_path / "beside" / "images").rmdir()
-    assert open_capture(tmp_path / "beside").frames[0].path == tmp_path / "beside" / "9.jpg"
-    write_colmap_binary(tmp_path / "shrunk")
-    (tmp_path / "shrunk" / "images").rename(tmp_path / "full")
-    write_colmap_images(tmp_path / "shrunk", "images_2", (WIDTH // 2, HEIGHT // 2))
-    shrunk = open_capture(tmp_path / "shrunk")
-    np.testing.assert_allclose(shrunk.K(0)[:2], K[:2] / 2)
-    assert "0.5 times" in shrunk.notes[0]
 
 
 @pytest.mark.parametrize(
@@ -174,15 +147,6 @@ def test_colmap_camera_models_give_their_intrinsics(model, name, params, wanted,
         found = {} if frame.lens is None else {k: v for k, v in vars(frame.lens).items() if v}
         assert found == wanted
         assert isinstance(frame.lens, FisheyeLens) == ("FISHEYE" in name)
-
-
-def test_scannet_frames_without_tracking_are_skipped(tmp_path):
-    write_scannet(tmp_path)
-    (tmp_path / "pose" / "10.txt").write_text("-inf -inf -inf -inf\n" * 4)
-    (tmp_path / "pose" / "12.txt").unlink()
-    capture = open_capture(tmp_path)
-    assert [frame.name for frame in capture.frames] == ["color/9.jpg", "color/11.jpg"]
-    assert "2 of 4 frames" in capture.notes[0]
 
 
 def test_tum_poses_are_interpolated_in_time(tmp_path):
@@ -242,16 +206,6 @@ def test_tum_depth_maps_are_those_nearest_in_time(tmp_path):
     assert chosen == [f"before{i}.png" for i in range(len(lines))]  # 3 ms away; the others 10 and 14
 
 
-def test_tum_images_without_poses_near_in_time_are_skipped(tmp_path):
-    write_tum(tmp_path)
-    lines = (tmp_path / "groundtruth.txt").read_text().splitlines()
-    kept = sorted(lines[1:])[:2]
-    late = "1305031103.000000 0 0 0 0 0 0 1"
-    (tmp_path / "groundtruth.txt").write_text("\n".join([*kept, late]))
-    capture = open_capture(tmp_path)
-    assert len(capture) == 2 and "2 of 4 frames" in capture.notes[0]
-
-
 def test_tum_calibration_follows_from_the_folder_name(tmp_path):
     root = tmp_path / "rgbd_dataset_freiburg1_desk"
     write_tum(root)
@@ -264,19 +218,6 @@ def test_tum_calibration_follows_from_the_folder_name(tmp_path):
     assert frame.lens is not None and (frame.lens.k1, frame.lens.p1, frame.lens.k3) == (0.2624, -0.0054, 1.1633)
 
 
-def test_realestate_frames_without_images_are_skipped(tmp_path):
-    write_realestate(tmp_path)
-    (tmp_path / "0a1b" / "90000.png").unlink()
-    capture = open_capture(tmp_path / "0a1b.txt")
-    assert len(capture) == 3 and "1 of 4 frames" in capture.notes[0] and capture.name == "0a1b"
-
-
-def test_realestate_cameras_may_lie_beside_other_text_files(tmp_path):
-    write_realestate(tmp_path)
-    (tmp_path / "README.txt").write_text("Frames of one video.\n")
-    assert len(open_capture(tmp_path)) == NUM_FRAMES
-
-
 def test_tum_images_listed_at_several_times_count_once(tmp_path):
     write_tum(tmp_path)
     lines = (tmp_path / "rgb.txt").read_text().splitlines()
@@ -285,28 +226,6 @@ def test_tum_images_listed_at_several_times_count_once(tmp_path):
     capture = open_capture(tmp_path)
     np.testing.assert_allclose(capture.camtoworlds, poses(), atol=2e-6)
     assert capture.notes == ("1 lines of rgb.txt list an image again; its first time counts.",)
-
-
-def test_shrunk_images_may_have_another_extension(tmp_path):
-    write_colmap_binary(tmp_path)
-    (tmp_path / "images").rename(tmp_path / "full")
-    write_colmap_images(tmp_path, "images_4", (WIDTH // 4, HEIGHT // 4))
-    for file in [file for file in (tmp_path / "images_4").rglob("*.jpg")]:
-        file.rename(file.with_suffix(".png"))
-    shrunk = open_capture(tmp_path)
-    assert shrunk.frames[0].path == tmp_path / "images_4" / "9.png"
-    np.testing.assert_allclose(shrunk.K(0)[:2], K[:2] / 4)
-
-
-@pytest.mark.parametrize("kind", ["cameras.json", "LLFF"])
-def test_shrunk_images_stand_in_for_missing_ones(kind, tmp_path):
-    WRITERS[kind](tmp_path)
-    whole = open_capture(tmp_path).K(0)
-    (tmp_path / "images_2").mkdir()
-    for i, file in enumerate(sorted((tmp_path / "images").iterdir())):
-        write_image(tmp_path / "images_2" / file.name, i, (WIDTH // 2, HEIGHT // 2))
-    (tmp_path / "images").rename(tmp_path / "elsewhere")
-    np.testing.assert_allclose(open_capture(tmp_path).K(0)[:2], whole[:2] / 2, rtol=1e-12)
 
 
 def test_record3d_images_may_have_intrinsics_of_their_own(tmp_path):
@@ -352,14 +271,6 @@ def test_a_capture_with_a_number_for_a_name_has_no_others_beside_it(tmp_path):
     assert len(open_capture(tmp_path / "24")) == 1
 
 
-def test_colmap_images_whose_files_are_missing_are_counted(tmp_path):
-    write_colmap_binary(tmp_path)
-    (tmp_path / "images" / "9.jpg").unlink()
-    capture = open_capture(tmp_path)
-    assert tuple(frame.name for frame in capture.frames) == ("10.jpg", "b 0.jpg", "c/1.jpg")
-    assert capture.notes == ("1 of 4 registered images are skipped: their files are missing.",)
-
-
 def test_tum_files_that_are_missing_are_counted(tmp_path):
     write_tum(tmp_path)
     sorted((tmp_path / "rgb").iterdir())[1].unlink()
@@ -374,24 +285,139 @@ def test_tum_files_that_are_missing_are_counted(tmp_path):
         open_capture(tmp_path)
 
 
-def test_tum_needs_no_depth_map(tmp_path):
-    write_tum(tmp_path)
-    shutil.rmtree(tmp_path / "depth")
-    capture = open_capture(tmp_path)
-    assert len(capture) == NUM_FRAMES and not capture.pixels.has_depth(0)
-    assert capture.notes == ("4 files of depth.txt are missing and left out.",)
+def lost(*names):
+    return lambda root: [(root / name).unlink() for name in names]
 
 
-@pytest.mark.parametrize(("kind", "image"), [("ScanNet", "color/9"), ("Polycam", "keyframes/images/7000")])
-def test_an_image_in_two_formats_is_no_second_view(kind, image, tmp_path):
+def untracked(root):
+    (root / "pose" / "10.txt").write_text("-inf -inf -inf -inf\n" * 4)
+    (root / "pose" / "12.txt").unlink()
+
+
+def few_poses(root):
+    lines = (root / "groundtruth.txt").read_text().splitlines()
+    (root / "groundtruth.txt").write_text("\n".join([*sorted(lines[1:])[:2], "1305031103.000000 0 0 0 0 0 0 1"]))
+
+
+@pytest.mark.parametrize(
+    ("kind", "spoil", "kept", "note"),
+    [
+        ("COLMAP", lost("images/9.jpg"), (1, 2, 3), "1 of 4 frames are skipped: their file is missing."),
+        ("ScanNet", untracked, (0, 2), "2 of 4 frames are skipped: their finite pose is missing."),
+        ("TUM RGB-D", few_poses, (0, 1), "2 of 4 frames are skipped: their pose at their time is missing."),
+        ("Polycam", lost("keyframes/cameras/7001.json"), (0, 2, 3), "1 of 4 frames are skipped"),
+        ("Record3D", lost("rgb/0.jpg"), (1, 2, 3), "1 of 4 frames are skipped"),
+        ("RealEstate10K", lost("0a1b/90000.png"), (1, 2, 3), "1 of 4 frames are skipped"),
+        ("TUM RGB-D", lost(*(f"depth/{i}.png" for i in range(4))), (0, 1, 2, 3), "4 files of depth.txt are missing"),
+    ],
+)
+def test_frames_without_a_pose_or_image_are_left_out_and_counted(kind, spoil, kept, note, tmp_path):
     WRITERS[kind](tmp_path)
-    shutil.copy(tmp_path / f"{image}.jpg", tmp_path / f"{image}.png")
+    spoil(tmp_path)
+    capture = open_capture(tmp_path)
+    assert tuple(frame.name for frame in capture.frames) == tuple(NAMES[kind][i] for i in kept)
+    assert len(capture.notes) == 1 and capture.notes[0].startswith(note)
+
+
+@pytest.mark.parametrize("kind", ["COLMAP", "cameras.json", "LLFF"])
+def test_shrunk_images_stand_in_for_missing_ones(kind, tmp_path):
+    """Also with another extension; their intrinsics shrink with them."""
+    WRITERS[kind](tmp_path)
+    whole = open_capture(tmp_path).K(0)
+    for i, file in enumerate(sorted(file for file in (tmp_path / "images").rglob("*") if file.is_file())):
+        name = file.relative_to(tmp_path / "images").with_suffix(".png")
+        write_image(tmp_path / "images_2" / name, i, (WIDTH // 2, HEIGHT // 2))
+    (tmp_path / "images").rename(tmp_path / "elsewhere")
+    shrunk = open_capture(tmp_path)
+    np.testing.assert_allclose(shrunk.K(0)[:2], whole[:2] / 2, rtol=1e-12)
+    assert "0.5 times" in shrunk.notes[0]
+
+
+@pytest.mark.parametrize(
+    ("kind", "image", "other"),
+    [
+        ("ScanNet", "color/9.jpg", "color/9.png"),
+        ("Polycam", "keyframes/images/7000.jpg", "keyframes/images/7000.png"),
+        ("KITTI", "image_2/000001.png", "image_2/1.jpg"),
+    ],
+)
+def test_an_image_in_two_formats_is_no_second_view(kind, image, other, tmp_path):
+    WRITERS[kind](tmp_path)
+    shutil.copy(tmp_path / image, tmp_path / other)
     with pytest.raises(InputError, match="wanted every image once"):
         open_capture(tmp_path)
 
 
-def test_a_number_of_kitti_is_one_image(tmp_path):
-    WRITERS["KITTI"](tmp_path)
-    shutil.copy(tmp_path / "image_2" / "000001.png", tmp_path / "image_2" / "1.jpg")
-    with pytest.raises(InputError, match="wanted every image once"):
-        open_capture(tmp_path)
+# -- axes -------------------------------------------------------------------------------------------------------------
+# A camera written by hand in each format sees known points where it must. It is at (1, 2, 3) and looks along the
+# world's x axis, with the world's z axis up; its right is thus -y. Pixels follow from that sentence alone, so a
+# convention that the writers and readers shared would be found.
+
+SIZE, FOCAL = (64, 48), 40.0
+AHEAD, BELOW, RIGHT = (5.0, 2.0, 3.0), (5.0, 2.0, 2.0), (5.0, 1.0, 3.0)  # at depth 4
+LOOK = {"fx": FOCAL, "fy": FOCAL, "cx": 32, "cy": 24, "width": 64, "height": 48}
+
+
+def transforms(root):
+    matrix = [[0, 0, -1, 1], [-1, 0, 0, 2], [0, 1, 0, 3], [0, 0, 0, 1]]  # columns: right, up, backward, center
+    write_image(root / "nerfstudio" / "images" / "a.png", 0, SIZE)
+    frame = {"file_path": "images/a.png", "transform_matrix": matrix}
+    (root / "nerfstudio" / "transforms.json").write_text(json.dumps({"fl_x": FOCAL, "frames": [frame]}))
+
+
+def splat_cameras(root):
+    write_image(root / "images" / "a.png", 0, SIZE)
+    entry = {"img_name": "a", "position": [1, 2, 3], "rotation": [[0, 0, 1], [-1, 0, 0], [0, -1, 0]], **LOOK}
+    (root / "cameras.json").write_text(json.dumps([entry]))
+
+
+def polycam(root):
+    for prefix in ("", "corrected_"):  # the corrected camera is read, the other one looks elsewhere
+        write_image(root / "keyframes" / f"{prefix}images" / "9.jpg", 0, SIZE)
+        (root / "keyframes" / f"{prefix}cameras").mkdir()
+        rows = [[0, 0, -1, 1], [-1, 0, 0, 2], [0, 1, 0, 3]] if prefix else np.eye(4)[:3].tolist()
+        fields = {f"t_{i}{j}": rows[i][j] for i in range(3) for j in range(4)}
+        (root / "keyframes" / f"{prefix}cameras" / "9.json").write_text(json.dumps({**LOOK, **fields}))
+
+
+def record3d(root):
+    write_image(root / "rgbd" / "0.jpg", 0, SIZE)
+    # The camera's x, y (up), z (backward) axes become -y, z, -x: a turn by 120 degrees about (1, -1, -1).
+    meta = {"w": 64, "h": 48, "K": [FOCAL, 0, 0, 0, FOCAL, 0, 32, 24, 1], "poses": [[0.5, -0.5, -0.5, 0.5, 1, 2, 3]]}
+    (root / "metadata").write_text(json.dumps(meta))
+
+
+def llff(root):
+    write_image(root / "images" / "a.png", 0, SIZE)
+    # Columns: down, right, backward, center, (height, width, focal length).
+    row = [0, 0, -1, 1, 48, 0, -1, 0, 2, 64, -1, 0, 0, 3, FOCAL, 1, 9]
+    np.save(root / "poses_bounds.npy", np.array([row], float))
+
+
+def kitti(root):
+    """The odometry data set's own folders; camera 2 is half a meter to the right of camera 0, which has the pose."""
+    sequence = root / "sequences" / "04"
+    write_image(sequence / "image_2" / "000000.png", 0, SIZE)
+    (sequence / "calib.txt").write_text(f"P2: {FOCAL} 0 31.5 {-0.5 * FOCAL} 0 {FOCAL} 23.5 0 0 0 1 0")
+    (root / "poses").mkdir()
+    (root / "poses" / "04.txt").write_text("0 0 1 1 -1 0 0 2.5 0 -1 0 3\n")
+    return sequence
+
+
+def colmap(root):
+    write_image(root / "images" / "a.png", 0, SIZE)
+    (root / "sparse" / "1").mkdir(parents=True)
+    (root / "sparse" / "1" / "cameras.txt").write_text(f"1 SIMPLE_PINHOLE 64 48 {FOCAL} 32 24\n")
+    (root / "sparse" / "1" / "images.txt").write_text("1 0.5 0.5 -0.5 0.5 2 3 -1 1 a.png\n\n")
+
+
+@pytest.mark.parametrize("write", [transforms, splat_cameras, polycam, record3d, llff, kitti, colmap])
+def test_a_camera_sees_points_where_its_axes_say(write, tmp_path):
+    capture = open_capture(write(tmp_path) or tmp_path)
+    viewmat = np.linalg.inv(capture.camtoworlds[0])
+    points = np.array([AHEAD, BELOW, RIGHT]) @ viewmat[:3, :3].T + viewmat[:3, 3]
+    np.testing.assert_allclose(points[:, 2], 4, atol=1e-9)
+    pixels = points @ capture.K(0).T
+    shift = FOCAL / 4  # one unit at depth 4
+    wanted = [(32, 24), (32, 24 + shift), (32 + shift, 24)]
+    np.testing.assert_allclose(pixels[:, :2] / pixels[:, 2:], wanted, atol=1e-9)

@@ -17,7 +17,7 @@ from PIL import Image
 import ssplat_jax as ss
 from ssplat_jax.commands import main as command_line
 from ssplat_jax.data import open_capture as captures
-from ssplat_jax.data.readers.frame_list import Intrinsics, list_frames, make_frame
+from ssplat_jax.data.readers.frame_list import FrameList, Intrinsics, stored_size
 from ssplat_jax.model.compact import CompactNetwork
 from ssplat_jax.model.network import register_network
 from ssplat_jax.network_configs import CompactConfig
@@ -120,12 +120,13 @@ def toy_reader() -> SimpleNamespace:
     def read(path):
         facts = json.loads((path / "toy.json").read_text())
         intrinsics = Intrinsics(fx=40.0, fy=40.0, cx=16.0, cy=12.0)
-        frames = []
+        frames = FrameList(path)
         for name, x in facts.items():
             pose = np.eye(4)
             pose[0, 3] = x
-            frames.append(make_frame(name, path / name, pose, intrinsics, (32, 24), str(path / "toy.json")))
-        return list_frames(path.name, frames)
+            where = f"{path / 'toy.json'}: {name}"
+            frames.add(name, path / name, (pose, 0.0), intrinsics, stored_size(path / name, None, where), where)
+        return frames.listing(len(facts), "image")
 
     return SimpleNamespace(FORMAT="toy", matches=lambda path: (path / "toy.json").is_file(), read=read)
 

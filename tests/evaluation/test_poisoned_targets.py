@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from ssplat_jax.data.images import ArrayPixels
+from ssplat_jax.data.capture import ArrayPixels
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import interleaved_split
 from ssplat_jax.evaluation import evaluate as evaluation

@@ -8,7 +8,7 @@ from ssplat_experiments.image_baselines import baseline_scores, warp
 
 from ssplat_jax.config import preset
 from ssplat_jax.core.cameras import Camera
-from ssplat_jax.data.images import ArrayPixels
+from ssplat_jax.data.capture import ArrayPixels
 from ssplat_jax.data.open_capture import open_capture
 
 K = np.array([[32.0, 0.0, 16.0], [0.0, 32.0, 12.0], [0.0, 0.0, 1.0]], np.float32)

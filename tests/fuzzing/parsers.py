@@ -11,8 +11,8 @@ from PIL import Image
 
 import ssplat_jax as ss
 from ssplat_jax.cache import init_cache
-from ssplat_jax.data.index_files import read_index
 from ssplat_jax.data.open_capture import open_capture
+from ssplat_jax.data.split import read_index
 from ssplat_jax.scene_files.formats import FORMATS, save_gaussians
 from ssplat_jax.storage.chunk_records import load_delta, save_delta
 from ssplat_jax.storage.files import read_tensors
@@ -22,7 +22,6 @@ from ssplat_jax.storage.weights import load_weights, save_weights
 from ssplat_jax.streaming.scene_delta import SceneDelta
 from tests.badinputs.cases import make_capture
 from tests.data.capture_writers import WRITERS
-from tests.data.test_reader_refusals import FILES as CAPTURE_FILES
 from tests.scene_files.scene_fixture import scene
 from tests.streaming.narrow_model import NARROW
 
@@ -35,9 +34,8 @@ class Parser(NamedTuple):
 def read_capture(path: Path) -> None:
     """Opens the capture of the folder and decodes everything in it."""
     capture = open_capture(path)
-    capture.verify()
     for i in range(len(capture)):
-        capture.K(i), capture.depth(i)
+        capture.K(i), capture.image(i), capture.depth(i)
 
 
 def above(num_folders: int) -> Callable[[Path], None]:
@@ -121,6 +119,18 @@ def write_safetensors(root: Path) -> Path:
     return root / "a.safetensors"
 
 
+CAPTURE_FILES = {
+    "COLMAP": ("sparse/0/cameras.bin", "sparse/0/images.bin"),
+    "COLMAP text": ("sparse/0/cameras.txt", "sparse/0/images.txt"),
+    "ScanNet": ("pose/9.txt", "intrinsic/intrinsic_color.txt"),
+    "TUM RGB-D": ("rgb.txt", "depth.txt", "groundtruth.txt", "calibration.txt"),
+    "RealEstate10K": ("0a1b.txt",),
+    "cameras.json": ("cameras.json",),
+    "Polycam": ("keyframes/cameras/7000.json",),
+    "Record3D": ("metadata.json",),
+    "LLFF": ("poses_bounds.npy",),
+    "KITTI": ("calib.txt", "poses.txt"),
+}
 INDEX = {"room": {"context": [0, 2, 4], "target": [1, 3]}, "hall": None}
 IMAGES = ("transforms.json", "images/2.jpg", "images/2.png", "images/2.webp", "d.png")
 

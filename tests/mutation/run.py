@@ -1,7 +1,7 @@
 """Runs the mutants of mutants.toml: `python -m tests.mutation.run` prints which of them the default tests notice.
 
 Each mutant is applied to a copy of the tree in a temporary folder, where its tests run until the first failure.
-Arguments are parts of `file: old`, such as `cache data/lens.py`; without any, all mutants run (an hour on two cores).
+Arguments are parts of `file: old`, such as `cache data/images.py`; without any, all mutants run (an hour on two cores).
 """
 
 import collections

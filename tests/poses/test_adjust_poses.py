@@ -7,8 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ssplat_jax.core.console import Reporter
-from ssplat_jax.data.capture import Capture
-from ssplat_jax.data.images import ArrayPixels
+from ssplat_jax.data.capture import ArrayPixels, Capture
 from ssplat_jax.data.posed_image import Frame
 from ssplat_jax.poses import adjust_poses as module
 from ssplat_jax.poses.adjust_poses import adjust_if_asked, adjust_poses

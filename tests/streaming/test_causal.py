@@ -9,8 +9,7 @@ import pytest
 
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.core.rotations import quats_to_matrices
-from ssplat_jax.data.capture import Capture
-from ssplat_jax.data.images import ArrayPixels
+from ssplat_jax.data.capture import ArrayPixels, Capture
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.model.streamsplat import ChunkOutput, StreamSplat
 from ssplat_jax.streaming.feed import feed_chunks

@@ -8,63 +8,41 @@ floating-point EXR or compressed.
 
 from pathlib import Path
 
-from ssplat_jax.core.errors import echo, refusal
-from ssplat_jax.data.pose_conventions import Convention
-from ssplat_jax.data.posed_image import pose_from_quat
-from ssplat_jax.data.readers import Listing
-from ssplat_jax.data.readers.frame_list import Intrinsics, find_file, list_frames, make_frame, stored_size
-from ssplat_jax.data.readers.strict_json import JsonFields, load_json
+from ssplat_jax.data.parsing import Fields, load_json
+from ssplat_jax.data.posed_image import Convention, pose_from_quat
+from ssplat_jax.data.readers.frame_list import FrameList, Intrinsics, Listing, find_file, stored_size
 
 FORMAT = "Record3D"
 CONVENTION = Convention(axes="opengl")
 FOLDERS = ("rgb", "rgbd")
-FIX = "export the recording again"
+FILES = ("metadata.json", "metadata")
 
 
 def matches(path: Path) -> bool:
     """True if `path` is a folder with Record3D's metadata and a folder of images."""
-    return _metadata(path) is not None and any((path / folder).is_dir() for folder in FOLDERS)
+    return any((path / name).is_file() for name in FILES) and any((path / folder).is_dir() for folder in FOLDERS)
 
 
 def read(path: Path) -> Listing:
     """Reads the images that exist; image `i.jpg` has pose `i`."""
-    root, file = path.resolve(), _metadata(path)
-    assert file is not None  # `matches` is true
-    meta = load_json(file)
-    fields, poses = JsonFields(meta, str(file)), meta.get("poses")
-    if not isinstance(poses, list) or not poses:
-        got = "nothing" if poses is None else echo(poses)
-        raise refusal(f"{file}.poses", wanted="a list of poses", got=got, fix=FIX)
-    intrinsics = _intrinsics(fields, meta.get("perFrameIntrinsicCoeffs"), len(poses))
-    described = (fields.number("w"), fields.number("h"))
-    frames = []
-    for i, entry in enumerate(poses):
+    root, file = path.resolve(), next(path / name for name in FILES if (path / name).is_file())
+    meta = Fields(load_json(file), str(file))
+    poses = meta.entries("poses")
+    if meta.get("perFrameIntrinsicCoeffs") is None:
+        K = meta.numbers("K", (9,)).reshape(3, 3).T
+        coefficients = [(K[0, 0], K[1, 1], K[0, 2], K[1, 2])] * len(poses)
+    else:
+        coefficients = meta.numbers("perFrameIntrinsicCoeffs", (len(poses), 4))
+    described = (meta.number("w"), meta.number("h"))
+    frames = FrameList(root, CONVENTION)
+    for i, (entry, (fx, fy, cx, cy)) in enumerate(zip(poses, coefficients, strict=True)):
         where = f"{file}: poses[{i}]"
         names = [f"{folder}/{i}.{suffix}" for folder in FOLDERS for suffix in ("jpg", "png")]
         image = find_file(root, names, where)
-        if image is None:
-            continue
-        x, y, z, w, *center = JsonFields({"pose": entry}, where).numbers("pose", (7,))
-        opengl = pose_from_quat((w, x, y, z), center, where)
-        size, shrink = stored_size(image, described, f"{file}: w, h", FIX)
-        name = str(image.relative_to(root))
-        frames.append(make_frame(name, image, CONVENTION.to_opencv(opengl), intrinsics[i], size, where, shrink=shrink))
-    if not frames:
-        raise refusal(str(path), wanted="images rgb/0.jpg, ...", got=f"none for {len(poses)} poses", fix=FIX)
-    num_lost = len(poses) - len(frames)
-    lost = [f"{num_lost} of {len(poses)} frames are skipped: their images are missing."] if num_lost else []
-    return list_frames(root.name, frames, lost)
-
-
-def _intrinsics(fields: JsonFields, per_frame: object, num_frames: int) -> list[Intrinsics]:
-    """Intrinsics of each image: its own row of `per_frame`, or `K` where there are no such rows."""
-    if per_frame is None:
-        K = fields.numbers("K", (9,)).reshape(3, 3).T
-        return [Intrinsics(fx=K[0, 0], fy=K[1, 1], cx=K[0, 2], cy=K[1, 2])] * num_frames
-    rows = fields.numbers("perFrameIntrinsicCoeffs", (num_frames, 4))
-    return [Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy) for fx, fy, cx, cy in rows]
-
-
-def _metadata(path: Path) -> Path | None:
-    """File of the metadata in the folder `path`, or None."""
-    return next((path / name for name in ("metadata.json", "metadata") if (path / name).is_file()), None)
+        if image is not None:
+            x, y, z, w, *center = Fields({"pose": entry}, where).numbers("pose", (7,))
+            pose = (pose_from_quat((w, x, y, z), center, where), 0.0)
+            sized = stored_size(image, described, f"{file}: w, h")
+            name = str(image.relative_to(root))
+            frames.add(name, image, pose, Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy), sized, where)
+    return frames.listing(len(poses), "image")

@@ -9,20 +9,17 @@ from pathlib import Path
 
 import numpy as np
 
-from ssplat_jax.core.errors import refusal
+from ssplat_jax.data.parsing import Fields, load_json
 from ssplat_jax.data.posed_image import check_camtoworld
-from ssplat_jax.data.readers import Listing
 from ssplat_jax.data.readers.frame_list import (
-    EXTENSIONS,
-    SHRUNK_FOLDERS,
+    SUFFIXES,
+    FrameList,
     Intrinsics,
-    check_once,
+    Listing,
     file_named,
-    list_frames,
-    make_frame,
+    images_folder,
     stored_size,
 )
-from ssplat_jax.data.readers.strict_json import JsonFields, load_json_list
 
 FORMAT = "cameras.json"
 
@@ -40,24 +37,15 @@ def read(path: Path) -> Listing:
     """Reads the frames of the capture in the folder `path`, or of the file `path`."""
     file = path if path.is_file() else path / FORMAT
     root = file.parent.resolve()
-    folder = "images/" if any((root / name).is_dir() for name in ("images", *SHRUNK_FOLDERS)) else ""
-    frames, seen = [], {}
-    for i, entry in enumerate(load_json_list(file)):
-        fields = JsonFields(entry, f"{file}: [{i}]")
+    folder, entries = images_folder(root), load_json(file, list)
+    frames = FrameList(root)
+    for i, entry in enumerate(entries):
+        fields = Fields(entry, f"{file}: [{i}]")
         name = fields.text("img_name")
-        image = file_named(root, folder + name, f"{fields.where}.img_name", EXTENSIONS, SHRUNK_FOLDERS)
-        check_once(seen, image, name, fields.where)
-        matrix = np.eye(4)
-        matrix[:3, :3], matrix[:3, 3] = fields.numbers("rotation", (3, 3)), fields.numbers("position", (3,))
-        pose, deviation = check_camtoworld(matrix, f"{fields.where}.rotation")
-        described = (fields.number("width"), fields.number("height"))
-        fix = "use the images that the scene was made from"
-        size, shrink = stored_size(image, described, f"{fields.where}: width, height", fix)
-        fx, fy = fields.number("fx"), fields.number("fy")
-        intrinsics = Intrinsics(fx=fx, fy=fy, cx=described[0] / 2, cy=described[1] / 2)
-        frames.append(
-            make_frame(name, image, pose, intrinsics, size, fields.where, pose_deviation=deviation, shrink=shrink)
-        )
-    if not frames:
-        raise refusal(str(file), wanted="cameras", got="an empty list", fix="write the file again")
-    return list_frames(root.name, frames)
+        image = file_named(root, folder + name, f"{fields.where}.img_name", ("", *SUFFIXES))
+        matrix = np.column_stack([fields.numbers("rotation", (3, 3)), fields.numbers("position", (3,))])
+        width, height = fields.number("width"), fields.number("height")
+        intrinsics = Intrinsics(fx=fields.number("fx"), fy=fields.number("fy"), cx=width / 2, cy=height / 2)
+        sized = stored_size(image, (width, height), f"{fields.where}: width, height")
+        frames.add(name, image, check_camtoworld(matrix, fields.where), intrinsics, sized, fields.where)
+    return frames.listing(len(entries), "image")

@@ -16,29 +16,27 @@ from pathlib import Path
 from typing import Any
 
 from ssplat_jax.core.errors import InputError, echo, refusal
-from ssplat_jax.data.images import check_depth_header, image_size
-from ssplat_jax.data.lens import FisheyeLens, Lens
-from ssplat_jax.data.pose_conventions import Convention
-from ssplat_jax.data.posed_image import Frame, check_camtoworld
-from ssplat_jax.data.readers import Listing, splat_cameras
+from ssplat_jax.data.images import FisheyeLens, Lens, image_size
+from ssplat_jax.data.parsing import Fields, load_json
+from ssplat_jax.data.posed_image import Convention, check_camtoworld
+from ssplat_jax.data.readers import splat_cameras
 from ssplat_jax.data.readers.frame_list import (
-    EXTENSIONS,
     SHRUNK_FOLDERS,
+    SUFFIXES,
+    FrameList,
     Intrinsics,
+    Listing,
     file_named,
     in_images,
-    list_frames,
-    make_frame,
     stored_size,
 )
-from ssplat_jax.data.readers.strict_json import load_json
 
 FORMAT = "transforms.json"
 CONVENTION = Convention(axes="opengl")
 PLACES = ("transforms.json", "nerfstudio/transforms.json")
-FOCAL_FIELDS = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y")
 PINHOLE_MODELS = (None, "OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 FISHEYE_MODELS = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
+UNDISTORT = "undistort the images to a pinhole camera first (COLMAP: `colmap image_undistorter`)"
 
 
 def matches(path: Path) -> bool:
@@ -46,13 +44,6 @@ def matches(path: Path) -> bool:
     if path.is_file():
         return path.suffix == ".json" and not splat_cameras.matches(path)
     return any((path / name).is_file() for name in PLACES)
-
-
-def _file(path: Path) -> Path:
-    """The file at `path` or in the folder `path`."""
-    if path.is_file():
-        return path
-    return next((path / name for name in PLACES if (path / name).is_file()), path / PLACES[0])
 
 
 def read(path: Path) -> Listing:
@@ -77,143 +68,95 @@ def read_complete(path: Path) -> tuple[Listing, str | None]:
 def num_listed(path: Path) -> int:
     """Number of frames that the file lists, readable or not; 0 while the file itself cannot be read."""
     try:
-        entries = load_json(_file(path)).get("frames")
+        return len(Fields(load_json(_file(path)), "").entries("frames"))
     except InputError:
         return 0
-    return len(entries) if isinstance(entries, list) else 0
+
+
+def _file(path: Path) -> Path:
+    """The file at `path` or in the folder `path`."""
+    if path.is_file():
+        return path
+    return next((path / name for name in PLACES if (path / name).is_file()), path / PLACES[0])
 
 
 def _read(path: Path, problems: list[str] | None) -> Listing:
     """The frames of a capture; with `problems`, those before the first problem, which is added to the list."""
     file = _file(path)
-    root = file.parent.resolve()
     meta = load_json(file)
-    entries = meta.get("frames")
-    if not isinstance(entries, list) or not entries:
-        got = "nothing" if "frames" not in meta else echo(entries)
-        raise refusal(f"{file}: frames", wanted="a list of frames", got=got, fix="list one object per image")
-    frames, fields_of = [], {}
+    entries = Fields(meta, str(file)).entries("frames")
+    frames = FrameList(file.parent.resolve(), CONVENTION)
     for i, entry in enumerate(entries):
-        where = f"{file}: frames[{i}]"
-        if not isinstance(entry, dict):
-            raise refusal(where, wanted="an object", got=echo(entry), fix="give file_path and transform_matrix")
         try:
-            frame = _read_frame(root, meta, entry, where)
+            _add_frame(frames, meta, entry, f"{file}: frames[{i}]")
         except InputError as error:
-            if problems is None or not frames:
+            if problems is None or not frames.frames:
                 raise
             problems.append(str(error))
             break
-        first = fields_of.setdefault(frame.path, where)
-        if first is not where:
-            got = f"{echo(frame.name)} in both {first.split(': ')[-1]} and frames[{i}]"
-            raise refusal(f"{where}.file_path", wanted="every image once", got=got, fix="drop one of the two frames")
-        frames.append(frame)
-    masked = sum(entry.get("mask_path") is not None for entry in entries if isinstance(entry, dict))
-    unused = [f"{masked} frames have masks (mask_path), which are not used: all pixels count."] if masked else []
-    return list_frames(root.name, frames, unused)
+    masked = sum(isinstance(entry, dict) and entry.get("mask_path") is not None for entry in entries)
+    notes = [f"{masked} frames have masks (mask_path), which are not used: all pixels count."] if masked else []
+    return frames.listing(len(frames.frames), "image", notes)
 
 
-def _read_frame(root: Path, meta: dict[str, Any], entry: dict[str, Any], where: str) -> Frame:
-    """Checked frame of one entry of the list `frames`."""
-    name = entry.get("file_path")
-    path = file_named(root, name, f"{where}.file_path", EXTENSIONS, SHRUNK_FOLDERS)
-    depth_path = None
-    if entry.get("depth_file_path") is not None:
-        depth_path = file_named(root, entry["depth_file_path"], f"{where}.depth_file_path")
-        check_depth_header(depth_path)
-    if "transform_matrix" not in entry:
-        fix = "give the camera-to-world matrix of the frame"
-        raise refusal(f"{where}.transform_matrix", wanted="a 4x4 matrix", got="nothing", fix=fix)
-    opengl, deviation = check_camtoworld(entry["transform_matrix"], f"{where}.transform_matrix")
-    fields = _Fields(meta, entry, where)
-    is_shrunk = path.relative_to(root).parts[0] in SHRUNK_FOLDERS and in_images(str(name)) is not None
-    (width, height), shrink = _check_size(fields, path, is_shrunk=is_shrunk)
-    fx, fy = _focal(fields, width / shrink, height / shrink)
-    cx, cy = (fields.number(name, side / shrink / 2) for name, side in (("cx", width), ("cy", height)))
-    lens = _lens(fields)
-    return make_frame(
-        str(name),
-        path,
-        CONVENTION.to_opencv(opengl),
-        Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, lens=lens),
-        (width, height),
-        where,
-        pose_deviation=deviation,
-        shrink=shrink,
-        depth_path=depth_path,
-    )
-
-
-class _Fields:
-    """Fields of a frame; its own values come before the global ones."""
-
-    def __init__(self, meta: dict[str, Any], entry: dict[str, Any], where: str) -> None:
-        self._meta, self._entry, self.where = meta, entry, where
-
-    def get(self, name: str, *, own: bool = False) -> Any:
-        """Returns the value of a field, with `own` that of the frame alone, or None."""
-        return self._entry.get(name, None if own else self._meta.get(name))
-
-    def number(self, name: str, default: float) -> float:
-        """Returns a field as float, or `default` if it is missing or null."""
-        value = self.get(name)
-        if value is None:
-            return float(default)
-        try:
-            if isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
-                return float(value)
-        except OverflowError:  # an integer too large for float64
-            pass
-        fix = "write a plain JSON number"
-        raise refusal(f"{self.where}.{name}", wanted="a finite number", got=echo(value), fix=fix)
-
-
-def _check_size(fields: _Fields, path: Path, *, is_shrunk: bool) -> tuple[tuple[int, int], float]:
-    """Returns (width, height) of the stored image, and its size relative to the w and h of the intrinsics."""
-    width, height = image_size(path)
-    in_pixels = any(fields.get(name) is not None for name in ("fl_x", "fl_y", "cx", "cy"))
-    if is_shrunk and in_pixels and None in (fields.get("w"), fields.get("h")):
-        got = f"none, and {path.parent.name}/{path.name} of {width}x{height} in its place"
+def _add_frame(frames: FrameList, meta: dict[str, Any], entry: Any, where: str) -> None:
+    """Adds one entry of the list `frames`, whose own values come before the global ones of `meta`."""
+    own = Fields(entry, where)
+    fields = Fields(meta | entry, where)
+    name = own.get("file_path")
+    image = file_named(frames.root, name, f"{where}.file_path", ("", *SUFFIXES))
+    depth = None
+    if own.get("depth_file_path") is not None:
+        depth = file_named(frames.root, own.get("depth_file_path"), f"{where}.depth_file_path")
+    pose = check_camtoworld(own.get("transform_matrix"), f"{where}.transform_matrix")
+    is_shrunk = image.relative_to(frames.root).parts[0] in SHRUNK_FOLDERS and in_images(str(name)) is not None
+    has_size = fields.get("w") is not None and fields.get("h") is not None
+    if is_shrunk and not has_size and any(fields.get(field) is not None for field in ("fl_x", "fl_y", "cx", "cy")):
+        got = f"none, and {image.parent.name}/{image.name} in its place"
         fix = "add w and h, so that the intrinsics can be shrunk too"
-        raise refusal(f"{fields.where}: w, h", wanted="the size of the image that is described", got=got, fix=fix)
-    wanted = (fields.number("w", float(width)), fields.number("h", float(height)))
-    fix = "set w and h to the stored size and scale fl_x, fl_y, cx, cy with them"
-    return stored_size(path, wanted, f"{fields.where}: w, h", fix)
+        raise refusal(f"{where}: w, h", wanted="the size of the image that is described", got=got, fix=fix)
+    stored = (0, 0) if has_size else image_size(image)
+    described = (fields.number("w", stored[0]), fields.number("h", stored[1]))
+    (width, height), shrink = sized = stored_size(image, described, f"{where}: w, h")
+    fx, fy = _focal(fields, own, width / shrink, height / shrink)
+    cx, cy = (fields.number(field, side / shrink / 2) for field, side in (("cx", width), ("cy", height)))
+    frames.add(str(name), image, pose, Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, lens=_lens(fields)), sized, where,
+               depth=depth)  # fmt: skip
 
 
-def _lens(fields: _Fields) -> Lens:
+def _lens(fields: Fields) -> Lens:
     """Distortion by the camera's model; models without one of OpenCV's two lenses are refused."""
-    model, where = fields.get("camera_model"), f"{fields.where}: camera_model"
-    flag = fields.get("is_fisheye")
+    model, flag, where = fields.get("camera_model"), fields.get("is_fisheye"), f"{fields.where}: camera_model"
     if flag not in (None, True, False):
         raise refusal(f"{fields.where}.is_fisheye", wanted="true or false", got=echo(flag), fix="write a JSON boolean")
     is_fisheye = model in FISHEYE_MODELS or bool(flag)
-    coefficients = {field.name: fields.number(field.name, 0.0) for field in dataclasses.fields(Lens)}
-    fix = "undistort the images to a pinhole camera first (COLMAP: `colmap image_undistorter`)"
     if not is_fisheye and model not in PINHOLE_MODELS:
-        raise refusal(where, wanted="OPENCV, PINHOLE or OPENCV_FISHEYE", got=echo(model), fix=fix)
+        raise refusal(where, wanted="OPENCV, PINHOLE or OPENCV_FISHEYE", got=echo(model), fix=UNDISTORT)
+    coefficients = {field.name: fields.number(field.name, 0.0) for field in dataclasses.fields(Lens)}
     if is_fisheye and (coefficients["p1"] or coefficients["p2"]):
-        raise refusal(where, wanted="a fish-eye lens with k1 to k4 alone", got="p1 or p2 beside them", fix=fix)
+        got = "p1 or p2 beside them"
+        raise refusal(where, wanted="a fish-eye lens with k1 to k4 alone", got=got, fix=UNDISTORT)
     return FisheyeLens(**coefficients) if is_fisheye else Lens(**coefficients)
 
 
-def _focal(fields: _Fields, width: float, height: float) -> tuple[float, float]:
+def _focal(fields: Fields, own: Fields, width: float, height: float) -> tuple[float, float]:
     """Focal lengths in pixels, from fl_x and fl_y or the fields of view camera_angle_x and camera_angle_y."""
-    focals, own = {}, {name for name in FOCAL_FIELDS if fields.get(name, own=True) is not None}
-    # The frame's own fields come first. If these are angles alone, a focal length of the file is of another camera.
-    sources = (True,) if own and own.isdisjoint(("fl_x", "fl_y")) else (True, False)
+    # If the frame's own fields are angles alone, a focal length of the file is of another camera.
+    is_own = {kind: any(own.get(f"{kind}_{axis}") is not None for axis in "xy") for kind in ("fl", "camera_angle")}
+    sources = (own,) if is_own["camera_angle"] and not is_own["fl"] else (own, fields)
+    focals = {}
     for axis, extent in (("x", width), ("y", height)):
-        kinds = [(kind, own) for own in sources for kind in ("fl", "camera_angle")]
-        kind = next((kind for kind, own in kinds if fields.get(f"{kind}_{axis}", own=own) is not None), None)
-        if kind == "fl":
-            focals[axis] = fields.number(f"fl_{axis}", 0.0)
-        elif kind is not None:
-            angle = fields.number(f"camera_angle_{axis}", 0.0)
-            if not (0 < angle < math.pi and math.tan(angle / 2) > 0):
-                where = f"{fields.where}.camera_angle_{axis}"
-                raise refusal(where, wanted="an angle in (0, pi)", got=echo(angle), fix="give it in radians")
-            focals[axis] = extent / (2 * math.tan(angle / 2))
+        kinds = [(kind, source) for source in sources for kind in ("fl", "camera_angle")]
+        found = next(((k, s) for k, s in kinds if s.get(f"{k}_{axis}") is not None), None)
+        if found is not None:
+            kind, source = found
+            value = source.number(f"{kind}_{axis}")
+            if kind == "camera_angle":
+                if not (0 < value < math.pi and math.tan(value / 2) > 0):
+                    where = f"{fields.where}.camera_angle_{axis}"
+                    raise refusal(where, wanted="an angle in (0, pi)", got=echo(value), fix="give it in radians")
+                value = extent / (2 * math.tan(value / 2))
+            focals[axis] = value
     if not focals:
         fix = "give fl_x in pixels or camera_angle_x in radians"
         raise refusal(f"{fields.where}.fl_x", wanted="a focal length", got="nothing", fix=fix)
