@@ -89,7 +89,6 @@ def test_a_file_of_any_name_and_odd_file_names_are_read(tmp_path):
     assert len(capture) == 4 and capture.name == "c" and capture.format == "transforms.json"
 
 
-
 def test_byte_order_mark_and_crlf_are_read(tmp_path):
     root = make_capture(tmp_path / "c")
     text = json.dumps(json.loads((root / "transforms.json").read_text()), indent=1)
