@@ -183,7 +183,7 @@ def _open_procedural(spec: str, size: tuple[int, int] | None) -> Capture:
             raise refusal(f"{spec}: size", wanted="WIDTHxHEIGHT", got=echo(options["size"]), fix="write 128x96")
         width, height = (_whole(spec, "size", side, 8, MAX_SIDE) for side in sides)
     # Imported here because the scenes load their textures, which no other capture needs.
-    from ssplat_jax.data.procedural import procedural_capture_arrays
+    from ssplat_jax.data.procedural.procedural_views import procedural_capture_arrays
 
     images, depths, camtoworlds, Ks = procedural_capture_arrays(name, num_frames, height, width, seed=seed)
     frames = tuple(

@@ -15,7 +15,7 @@ from ssplat_jax.core.chunk import Chunk
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.core.pytree import pytree
 from ssplat_jax.data.depth_range import FAR_FACTOR, NEAR_FACTOR
-from ssplat_jax.data.procedural import STEP_RANGE, training_sample
+from ssplat_jax.data.procedural.procedural_views import STEP_RANGE, training_sample
 from ssplat_jax.model import GRID_STRIDE
 from ssplat_jax.training.recipe import Recipe
 

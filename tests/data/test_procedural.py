@@ -5,21 +5,12 @@ import pytest
 
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.data.open_capture import open_capture
-from ssplat_jax.data.procedural import (
-    CAPTURES,
-    PATH_KINDS,
-    SCENE_KINDS,
-    clearance,
-    procedural_capture_arrays,
-    procedural_views,
-    raycast,
-    raycast_depths,
-    sample_path,
-    sample_scene,
-    training_sample,
-)
-from ssplat_jax.data.procedural.builder import Finish, SceneBuilder
-from ssplat_jax.data.procedural.scene import fade_scene
+from ssplat_jax.data.procedural import procedural_views
+from ssplat_jax.data.procedural.paths import PATH_KINDS, sample_path
+from ssplat_jax.data.procedural.procedural_views import CAPTURES, procedural_capture_arrays, training_sample
+from ssplat_jax.data.procedural.raycast import raycast, raycast_depths
+from ssplat_jax.data.procedural.scene import Finish, SceneBuilder, clearance, fade_scene
+from ssplat_jax.data.procedural.scenes import SCENE_KINDS, sample_scene
 from ssplat_jax.data.procedural.textures import texture_library
 
 NUM_SEEDS = 30

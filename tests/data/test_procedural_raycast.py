@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from ssplat_jax.data.procedural import raycast, raycast_depths, sample_path, sample_scene, scale_scene
-from ssplat_jax.data.procedural.builder import Finish, SceneBuilder, random_rotation
-from ssplat_jax.data.procedural.paths import look_at
+from ssplat_jax.data.procedural.paths import look_at, sample_path
+from ssplat_jax.data.procedural.raycast import raycast, raycast_depths
+from ssplat_jax.data.procedural.scene import Finish, SceneBuilder, random_rotation, scale_scene
+from ssplat_jax.data.procedural.scenes import sample_scene
 from ssplat_jax.data.procedural.textures import TextureLibrary, pack_pyramids
 
 HEIGHT, WIDTH = 48, 64

@@ -17,7 +17,7 @@ import pytest
 from PIL import Image
 
 from ssplat_jax.core.atomic import previous_path
-from ssplat_jax.data.procedural import procedural_capture_arrays
+from ssplat_jax.data.procedural.procedural_views import procedural_capture_arrays
 from ssplat_jax.storage.saved_states import load_newest_state
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -18,7 +18,7 @@ from ssplat_jax.config import MEDIAN_DEPTH, preset
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.data.depth_range import FAR_FACTOR
-from ssplat_jax.data.procedural import training_sample
+from ssplat_jax.data.procedural.procedural_views import training_sample
 from ssplat_jax.model import init_params
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.storage.saved_states import TrainingCheckpoints

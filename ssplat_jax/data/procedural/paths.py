@@ -40,23 +40,17 @@ def sample_path(
     step: float | None = None,
     min_clearance: float = 0.45,
 ) -> tuple[Float[np.ndarray, "v 4 4"], Float[np.ndarray, "v 3 3"]]:
-    """Returns a random camera path through a scene.
+    """Returns the camera-to-world poses of a random path through a scene, and the intrinsics that they share.
 
     Args:
         seed: the same seed gives the same path.
-        scene: the world; the path keeps clear of its surfaces.
+        scene: the world.
         kind: one of `PATH_KINDS`; None draws one.
         num_views: number of poses.
-        height: image rows; with `width` they determine the intrinsics, which all views share.
+        height: image rows.
         width: image columns.
         step: typical distance between consecutive views; None takes 1 to 10 % of the orbit radius.
         min_clearance: distance to all surfaces, where the path can keep it.
-
-    Returns:
-        Camera-to-world poses (OpenCV axes, in units of the scene) and intrinsics in pixels.
-
-    Raises:
-        InputError: an unknown kind.
     """
     if kind is not None and kind not in _STYLES:
         raise InputError(f"procedural path: kind must be one of {', '.join(PATH_KINDS)}, got {kind!r}.")

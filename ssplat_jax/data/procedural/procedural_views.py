@@ -53,7 +53,7 @@ def training_sample(
         num_views: number of views, in the order of time.
         height: image rows.
         width: image columns.
-        supersample: color rays per pixel. One ray costs a third of captures' two; training runs on the same cores.
+        supersample: color rays per pixel. One costs a third of captures' two, and training runs on the same cores.
         steps: range of the typical distance between consecutive views over the median depth, log-uniform. Single steps
             are up to three times as long.
         kinds: kinds of worlds, of which one is drawn; repeated ones are more likely. Empty: all but yards, with their
@@ -89,8 +89,7 @@ def _scaled_path(rng, scene: Scene, kinds: tuple[str, ...], num_views: int, heig
     depths = _probe(scene, poses, Ks, height, width, sky)
     if not len(depths):
         return None
-    median = float(np.median(depths))
-    poses, Ks = sample_path(seed, scene, kind, num_views, height, width, step=step * median)
+    poses, Ks = sample_path(seed, scene, kind, num_views, height, width, step=step * float(np.median(depths)))
     depths = _probe(scene, poses, Ks, height, width, sky)
     if not len(depths):
         return None
@@ -146,17 +145,7 @@ def procedural_capture_arrays(name: str, num_frames: int, height: int, width: in
 
     `room`, `orbit` and `corridor` are smooth paths that cover their world evenly. `revisit` has weak textures, noise
     and a path that returns: half of its views go around a room, then the camera stands at four places, closer to what
-    it saw before, and hardly moves.
-
-    Args:
-        name: one of `CAPTURES`.
-        num_frames: number of views along the path.
-        height: image rows.
-        width: image columns.
-        seed: selects another world of the same kind.
-
-    Returns:
-        Images in [0, 1], z-depths, camera-to-world poses and intrinsics in pixels.
+    it saw before, and hardly moves. Another `seed` selects another world of the same kind.
 
     Raises:
         InputError: an unknown capture, or no frames.
@@ -226,12 +215,9 @@ class _Route:
 
     kind: str
     pose: Callable[[Scene, float], np.ndarray]
-    first_seed: int
-    """Seed of a representative world, which is added to the user's."""
-    contrast: float = 1.0
-    """Contrast of the textures, as a fraction."""
-    noise: float = 0.0
-    """Standard deviation of a pixel's noise."""
+    first_seed: int  # of a representative world, which is added to the user's
+    contrast: float = 1.0  # of the textures, as a fraction
+    noise: float = 0.0  # standard deviation of a pixel's noise
 
 
 _ROUTES = {

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ssplat_jax.data.procedural.scene import NUM_BALLS, NUM_BOXES, NUM_SOLIDS, AnyArray, Scene
+from ssplat_jax.data.procedural.scene import FIRST_ROWS, NUM_BALLS, NUM_BOXES, NUM_SOLIDS, AnyArray, Scene
 from ssplat_jax.data.procedural.textures import LEVEL_OFFSETS, NUM_LEVELS, NUM_TEXELS, SIZE
 
 _TINY = 1e-9  # smallest denominator, and smallest depth of a hit
@@ -32,18 +32,7 @@ def raycast(
     width: int,
     supersample: int = 2,
 ) -> tuple[Float[Array, "v h w 3"], Float[Array, "v h w"]]:
-    """Renders images and depths of a scene.
-
-    Args:
-        scene: the world.
-        viewmats: world-to-camera matrices.
-        Ks: intrinsics in pixels.
-        height: image rows.
-        width: image columns.
-        supersample: color rays per pixel.
-
-    Returns:
-        Images in [0, 1] and z-depths in units of the scene.
+    """Renders images in [0, 1], with `supersample` color rays per pixel, and z-depths in units of the scene.
 
     Limits:
         Cameras outside the shell or inside a solid look through it; keep `clearance` positive.
@@ -67,18 +56,7 @@ def raycast(
 def raycast_depths(
     scene: Scene, viewmats: Float[AnyArray, "v 4 4"], Ks: Float[AnyArray, "v 3 3"], height: int, width: int
 ) -> Float[Array, "v h w"]:
-    """Renders the depths of a scene without its colors.
-
-    Args:
-        scene: the world.
-        viewmats: world-to-camera matrices.
-        Ks: intrinsics in pixels.
-        height: image rows.
-        width: image columns.
-
-    Returns:
-        Z-depths in units of the scene, equal to those of `raycast`.
-    """
+    """Renders the z-depths of a scene without its colors; they are equal to those of `raycast`."""
 
     def render_view(camera):
         viewmat, K = camera
@@ -151,11 +129,6 @@ def _box_interval(start, steps):
     return functools.reduce(jnp.maximum, [s[0] for s in slabs]), functools.reduce(jnp.minimum, [s[1] for s in slabs])
 
 
-def _ball_interval(start, steps):
-    """Depths at which a ray enters and leaves the unit ball."""
-    return _quadric(start, steps)
-
-
 def _cylinder_interval(start, steps):
     """Depths at which a ray enters and leaves the unit cylinder along y."""
     enter, leave = _quadric([start[0], start[2]], [steps[0], steps[2]])
@@ -166,10 +139,10 @@ def _cylinder_interval(start, steps):
 def _nearest_hits(scene: Scene, origin: Array, rays: Rays) -> tuple[Float[Array, "s h w"], Int[Array, "s h w"]]:
     """Z-depth and row index of the first surface along each ray; the box and dome of the shell follow the solids."""
     _, box_exit = _box_interval(*_to_unit(scene.frames[NUM_SOLIDS], origin, rays))
-    _, dome_exit = _ball_interval(*_to_unit(scene.frames[NUM_SOLIDS + 1], origin, rays))
+    _, dome_exit = _quadric(*_to_unit(scene.frames[NUM_SOLIDS + 1], origin, rays))
     t = jnp.minimum(box_exit, dome_exit)
     solid_idx = jnp.where(dome_exit < box_exit, NUM_SOLIDS + 1, NUM_SOLIDS).astype(jnp.int32)
-    for (first, end), interval in zip(_ranges(scene), (_box_interval, _ball_interval, _cylinder_interval), strict=True):
+    for (first, end), interval in zip(_ranges(scene), (_box_interval, _quadric, _cylinder_interval), strict=True):
 
         def closer(i, best, interval=interval):
             t, solid_idx = best
@@ -183,7 +156,7 @@ def _nearest_hits(scene: Scene, origin: Array, rays: Rays) -> tuple[Float[Array,
 
 def _ranges(scene: Scene) -> list[tuple[int, Array]]:
     """Ranges of the used rows of boxes, balls and cylinders."""
-    return [(first, first + scene.counts[i]) for i, first in enumerate((0, NUM_BOXES, NUM_BOXES + NUM_BALLS))]
+    return [(first, first + scene.counts[i]) for i, first in enumerate(FIRST_ROWS.values())]
 
 
 # -- shading ----------------------------------------------------------------------------------------------------------

@@ -9,8 +9,7 @@ from collections.abc import Callable
 import numpy as np
 
 from ssplat_jax.core.errors import InputError
-from ssplat_jax.data.procedural.builder import Finish, SceneBuilder, random_rotation, yaw_rotation
-from ssplat_jax.data.procedural.scene import Scene
+from ssplat_jax.data.procedural.scene import Finish, Scene, SceneBuilder, random_rotation, yaw_rotation
 from ssplat_jax.data.procedural.textures import TextureLibrary, texture_library
 
 # Texture groups for objects of any kind.
