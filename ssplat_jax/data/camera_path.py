@@ -3,6 +3,9 @@
 import numpy as np
 from jaxtyping import Float64
 
+SWAY_RADIUS = 0.08  # of a sway, as a share of the distance looked at
+MIN_SHARE = 0.01  # smallest distance of a camera from the point that all look at, over the distance of what it sees
+
 
 def camera_path(
     camtoworlds: Float64[np.ndarray, "n 4 4"], Ks: Float64[np.ndarray, "n 3 3"], steps: int
@@ -22,11 +25,9 @@ def camera_path(
     places = np.arange((n - 1) * steps + 1) / steps
     before = np.minimum(places.astype(int), n - 2)
     t = (places - before)[:, None, None]
-    first, last = (
-        2 * camtoworlds[0] - camtoworlds[1],
-        2 * camtoworlds[-1] - camtoworlds[-2],
-    )  # extrapolated control points before the first and after the last camera
-    points = np.concatenate([first[None], camtoworlds, last[None]])
+    # Control points before the first and after the last camera are extrapolated.
+    first, last = 2 * camtoworlds[:1] - camtoworlds[1:2], 2 * camtoworlds[-1:] - camtoworlds[-2:-1]
+    points = np.concatenate([first, camtoworlds, last])
     a, b, c, d = (points[before + i] for i in range(4))
     path = b + 0.5 * t * (c - a + t * (2 * a - 5 * b + 4 * c - d + t * (3 * (b - c) + d - a)))
     u, _, vt = np.linalg.svd(path[:, :3, :3])
@@ -35,23 +36,11 @@ def camera_path(
     return path, (1 - t) * Ks[before] + t * Ks[before + 1]
 
 
-SWAY_RADIUS = 0.08
-"""Radius of a sway, as a share of the distance looked at."""
-
-
-MIN_SHARE = 0.01
-"""Smallest distance of a camera from the point that all look at, as a share of the distance of what it sees."""
-
-
 def looked_at(camtoworlds: Float64[np.ndarray, "n 4 4"], distance: float) -> Float64[np.ndarray, "3"] | None:
     """The point nearest to the optical axes of all cameras, by least squares.
 
     None if the axes are parallel to about a degree, if the point lies behind a camera, or if it lies at a camera's own
-    place, as it does if all turn about one place.
-
-    Args:
-        camtoworlds: the cameras, with OpenCV axes.
-        distance: of what the cameras see, in the units of the poses.
+    place, as it does if all turn about one place. `distance` is that of what the cameras see, in units of the poses.
     """
     centers, axes = camtoworlds[:, :3, 3], camtoworlds[:, :3, 2]
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # distance from an axis

@@ -8,7 +8,7 @@ are. Poses that fit in no convention, though the matches agree on some motion, b
 """
 
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from jaxtyping import Float64
@@ -45,8 +45,8 @@ class MatchedPair:
     frames: tuple[Frame, Frame]
     rays: tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]  # points at depth 1
     pixels: tuple[Float64[np.ndarray, "n 2"], Float64[np.ndarray, "n 2"]]  # in the delivered images
-    tolerance: float  # in the plane z = 1 of the second camera
-    tolerance_px: float  # the same in pixels of the delivered image
+    tolerance_px: float  # of a match's distance from its epipolar line, pixels of the delivered image
+    focal: float  # of the second image, pixels
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,34 +79,16 @@ def _matched(capture: PosedImages, i: int, j: int, keypoints: KeypointsOf) -> Ma
         return None
     if np.median(np.linalg.norm(pixels[1] - pixels[0], axis=1)) < MIN_MOTION_PX * b.pixel:
         return None
-    tolerance_px = MAX_EPIPOLAR_PX * b.pixel
-    return MatchedPair(
-        frames=(capture.frames[i], capture.frames[j]),
-        rays=(pixel_rays(capture.K(i), pixels[0]), pixel_rays(capture.K(j), pixels[1])),
-        pixels=pixels,
-        tolerance=tolerance_px / capture.K(j)[0, 0],
-        tolerance_px=tolerance_px,
-    )
+    rays = pixel_rays(capture.K(i), pixels[0]), pixel_rays(capture.K(j), pixels[1])
+    frames = capture.frames[i], capture.frames[j]
+    return MatchedPair(frames, rays, pixels, MAX_EPIPOLAR_PX * b.pixel, capture.K(j)[0, 0])
 
 
-def fit_poses(
-    capture: PosedImages,
-    convention: Convention,
-    keypoints: KeypointsOf,
-    advance: Callable[[int], None] = lambda done: None,
-) -> PoseFit | None:
-    """Returns how well the poses fit the images in each convention; None if too few matches move.
-
-    Args:
-        capture: the frames.
-        convention: the convention in which the poses were read.
-        keypoints: function that returns the keypoints of a frame.
-        advance: called with the number of pairs that are done.
-    """
+def fit_poses(capture: PosedImages, convention: Convention, keypoints: KeypointsOf) -> PoseFit | None:
+    """Returns how well poses that were read in `convention` fit the images in each; None if too few matches move."""
     counts = dict.fromkeys(CONVENTIONS, 0)
     total = coherent = 0
-    for done, pair in enumerate(matched_pairs(capture, range(len(capture.frames)), keypoints)):
-        advance(done + 1)
+    for pair in matched_pairs(capture, range(len(capture.frames)), keypoints):
         total += len(pair.rays[0])
         coherent += _num_coherent(pair)
         for other in CONVENTIONS:
@@ -127,19 +109,13 @@ def _num_consistent(pair: MatchedPair, a: Float64[np.ndarray, "4 4"], b: Float64
     distances = np.diagonal(epipolar_distances(rays_a, rays_b, R, t))
     inverse_depths, parallax = triangulate(rays_a, rays_b, R, t)
     in_front = (inverse_depths > 0) | (np.abs(parallax) < CLEAR_PARALLAX_DEGREES)
-    return int(np.sum((distances < pair.tolerance) & in_front))
+    return int(np.sum((distances < pair.tolerance_px / pair.focal) & in_front))
 
 
 def _num_coherent(pair: MatchedPair) -> int:
     """Number of matches that agree on one fundamental matrix, found by random sampling with a fixed seed."""
-    _, inliers = ransac(
-        pair.pixels,
-        FundamentalMatrixTransform,
-        min_samples=8,
-        residual_threshold=pair.tolerance_px,
-        max_trials=100,
-        rng=0,
-    )
+    options = {"min_samples": 8, "residual_threshold": pair.tolerance_px, "max_trials": 100, "rng": 0}
+    _, inliers = ransac(pair.pixels, FundamentalMatrixTransform, **options)
     return 0 if inliers is None else int(np.sum(inliers))
 
 
@@ -150,16 +126,9 @@ def pose_warning(fit: PoseFit | None, convention: Convention) -> str | None:
     given, best = fit.shares[convention], max(CONVENTIONS, key=lambda other: fit.shares[other])
     better = fit.shares[best]
     if better >= GOOD_SHARE * fit.coherent_share and better >= BETTER_RATIO * given:
-        wrong = " and ".join(
-            text
-            for name, text in (("axes", "the axes of the cameras are turned"), ("poses", "the poses are inverted"))
-            if getattr(best, name) != getattr(convention, name)
-        )
         flags = " ".join(f"--{name} {value}" for name, value in best.options(convention).items())
-        return (
-            f"Images and poses disagree: {given:.0%} of the matches are consistent, and {better:.0%} would be with"
-            f" {flags}: {wrong}."
-        )
+        shares = f"{given:.0%} of the matches are consistent, and {better:.0%} would be"
+        return f"Images and poses disagree: {shares} with {flags}; read the capture with them."
     if given < POOR_SHARE * fit.coherent_share and fit.coherent_share >= GOOD_SHARE:
         return (
             f"Poses do not fit the images: {given:.0%} of the matches are consistent with them, and"

@@ -25,7 +25,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from ssplat_jax.core.errors import echo, refusal
-from ssplat_jax.data.parsing import load_json
+from ssplat_jax.data.parsing import Fields, load_json
 
 FIRST_TARGET, TARGET_STEP = 4, 8  # first position and spacing of the interleaved targets
 USUAL_CONTEXT = 64  # context views where none are given, if there are as many
@@ -65,6 +65,55 @@ class Split:
         return hashlib.sha256(self.to_json().encode()).hexdigest()
 
 
+def choose_split(
+    protocol: str, num_frames: int, stride: int | None, context: int | None, targets: int | None = None
+) -> Split:
+    """Returns the split for the options of the command line.
+
+    Args:
+        protocol: "interleaved", "paper" or "scannet".
+        num_frames: number of frames of the capture.
+        stride: every `stride`-th frame is used. By default 1; without `context` and with `interleaved`, the number
+            of frames divided by 73, rounded down, but at least 1: 73 frames or more are left.
+        context: number of context views; by default 64, or as many as the targets leave.
+        targets: for "paper", the number of targets (default 16, or a quarter of a short capture); for "scannet" too
+            (default 64); for "interleaved", the largest number of targets that are kept, evenly spaced (default: all).
+
+    Raises:
+        InputError: the protocol is unknown, or there are too few frames.
+    """
+    if protocol not in PROTOCOLS:
+        raise refusal("protocol", wanted=" or ".join(PROTOCOLS), got=repr(protocol), fix="choose one of them")
+    if stride is None:
+        stride = max(1, num_frames // USUAL_FRAMES) if protocol == "interleaved" and context is None else 1
+    _check_counts(stride=stride, **({} if targets is None else {"targets": targets}))
+    taken = range(0, num_frames, stride)
+    usual = {
+        "interleaved": len(range(FIRST_TARGET, len(taken), TARGET_STEP)),
+        "paper": min(PAPER_TARGETS, max(1, int(MAX_TARGET_SHARE * len(taken)))) if context is None else PAPER_TARGETS,
+        "scannet": SCANNET_TARGETS,
+    }
+    num_targets = usual[protocol] if targets is None or protocol == "interleaved" else targets
+    num_context = max(1, min(USUAL_CONTEXT, len(taken) - num_targets)) if context is None else context
+    if protocol == "interleaved":
+        if context is None and len(taken) < MIN_FRAMES:
+            wanted, fix = f"at least {MIN_FRAMES} frames", "use a longer capture or a smaller --stride"
+            raise refusal("eval", wanted=f"{wanted} for a target between context views", got=str(len(taken)), fix=fix)
+        split = interleaved_split(num_frames, stride, num_context)
+        places = _uniform(len(split.targets), len(split.targets) if targets is None else targets)
+        return dataclasses.replace(split, targets=tuple(split.targets[p] for p in places))
+    options = {}
+    if protocol == "scannet":
+        if len(taken) < num_targets + num_context:
+            got, fix = f"{len(taken)} frames", "leave the scene out (null in an index file), or ask for fewer"
+            wanted = f"{num_targets} targets and {num_context} other frames"
+            raise refusal("scannet", wanted=wanted, got=got, fix=fix)
+        options = {"anchors": min(SCANNET_ANCHORS, num_context), "thin_to": SCANNET_FRAMES}
+    split = paper_split(len(taken), num_context, targets=num_targets, **options)
+    context_frames, target_frames = (tuple(taken[p] for p in places) for places in (split.context, split.targets))
+    return Split(protocol=protocol, context=context_frames, targets=target_frames)
+
+
 def interleaved_split(num_frames: int, stride: int, context: int) -> Split:
     """Returns the interleaved split: every 8th strided frame is a target, the first `context` others are context.
 
@@ -73,19 +122,18 @@ def interleaved_split(num_frames: int, stride: int, context: int) -> Split:
     """
     _check_counts(stride=stride, context=context)
     taken = range(0, num_frames, stride)
-    is_target = [p % TARGET_STEP == FIRST_TARGET for p in range(len(taken))]
-    pool = [i for i, target in zip(taken, is_target, strict=True) if not target]
-    chosen = _first(pool, context, num_frames, f"with stride {stride}")
-    targets = [i for i, target in zip(taken, is_target, strict=True) if target and chosen[0] < i < chosen[-1]]
+    at_target = set(taken[FIRST_TARGET::TARGET_STEP])
+    chosen = _first([i for i in taken if i not in at_target], context, num_frames, f"with stride {stride}")
+    targets = tuple(i for i in taken if i in at_target and chosen[0] < i < chosen[-1])
     if not targets:
         got = f"{context} (the first target is at position {FIRST_TARGET})"
         fix = f"ask for at least {FIRST_TARGET + 1}"
         raise refusal("context", wanted="enough views to span a target", got=got, fix=fix)
-    return Split(protocol="interleaved", context=tuple(chosen), targets=tuple(targets))
+    return Split(protocol="interleaved", context=tuple(chosen), targets=targets)
 
 
 def paper_split(
-    num_frames: int, context: int, *, targets: int = 16, anchors: int = 0, thin_to: int | None = None
+    num_frames: int, context: int, *, targets: int = PAPER_TARGETS, anchors: int = 0, thin_to: int | None = None
 ) -> Split:
     """Returns the split of the paper's appendix; the defaults are those for DL3DV and RE10K.
 
@@ -96,19 +144,13 @@ def paper_split(
         anchors: number of context views (ScanNet: 8) that are spread over the trajectory and come first.
         thin_to: number of frames to which the trajectory is thinned first (ScanNet: 1088); None keeps all.
 
-    Returns:
-        The split.
-
     Raises:
         InputError: the trajectory is too short, or a count is not positive.
     """
     _check_counts(context=context, targets=targets)
     if not 0 <= anchors <= context:
         raise refusal("anchors", wanted=f"0 to {context} (the context views)", got=str(anchors), fix="ask for fewer")
-    trajectory = list(range(num_frames))
-    if thin_to is not None:
-        _check_counts(thin_to=thin_to)
-        trajectory = [trajectory[p] for p in _uniform(num_frames, thin_to)]
+    trajectory = _uniform(num_frames, num_frames if thin_to is None else thin_to)
     chosen_targets = [trajectory[p] for p in _uniform(len(trajectory), targets)]
     pool = [i for i in trajectory if i not in set(chosen_targets)]
     anchored = [pool[p] for p in _uniform(len(pool), anchors)]
@@ -136,84 +178,7 @@ def _check_counts(**counts: int) -> None:
             raise refusal(name, wanted="at least 1", got=str(count), fix="ask for a positive number")
 
 
-def scannet_split(num_frames: int, context: int, targets: int = SCANNET_TARGETS) -> Split:
-    """Returns the split of the paper's appendix for ScanNet; `protocol` is "scannet".
-
-    Raises:
-        InputError: the trajectory has no room for that many targets and context views.
-    """
-    if num_frames < targets + context:
-        got, fix = f"{num_frames} frames", "leave the scene out (null in an index file), or ask for fewer"
-        raise refusal("scannet", wanted=f"{targets} targets and {context} other frames", got=got, fix=fix)
-    split = paper_split(
-        num_frames, context, targets=targets, anchors=min(SCANNET_ANCHORS, context), thin_to=SCANNET_FRAMES
-    )
-    return dataclasses.replace(split, protocol="scannet")
-
-
-def choose_split(
-    protocol: str, num_frames: int, stride: int | None, context: int | None, targets: int | None = None
-) -> Split:
-    """Returns the split for the options of the command line.
-
-    Args:
-        protocol: "interleaved", "paper" or "scannet".
-        num_frames: number of frames of the capture.
-        stride: every `stride`-th frame is used. By default 1; without `context` and with `interleaved`, the number
-            of frames divided by 73, rounded down, but at least 1: 73 frames or more are left.
-        context: number of context views; by default 64, or as many as there are.
-        targets: for "paper", the number of targets (default 16, or a quarter of a short capture); for "scannet" too
-            (default 64); for "interleaved", the largest number of targets that are kept, evenly spaced (default: all).
-
-    Returns:
-        The split.
-
-    Raises:
-        InputError: the protocol is unknown, or there are too few frames.
-    """
-    if protocol not in PROTOCOLS:
-        raise refusal("protocol", wanted=" or ".join(PROTOCOLS), got=repr(protocol), fix="choose one of them")
-    if stride is None:
-        stride = max(1, num_frames // USUAL_FRAMES) if protocol == "interleaved" and context is None else 1
-    _check_counts(stride=stride)
-    taken = range(0, num_frames, stride)
-    if protocol == "interleaved":
-        return _choose_interleaved(num_frames, stride, context, targets)
-    if protocol == "scannet":
-        num_targets = SCANNET_TARGETS if targets is None else targets
-        split = scannet_split(len(taken), _usual_context(len(taken), num_targets, context), num_targets)
-    else:
-        few = max(1, int(MAX_TARGET_SHARE * len(taken))) if context is None else PAPER_TARGETS
-        num_targets = min(PAPER_TARGETS, few) if targets is None else targets
-        split = paper_split(len(taken), _usual_context(len(taken), num_targets, context), targets=num_targets)
-    at = lambda positions: tuple(taken[p] for p in positions)  # noqa: E731
-    return dataclasses.replace(split, context=at(split.context), targets=at(split.targets))
-
-
-def _usual_context(num_frames: int, targets: int, context: int | None) -> int:
-    """The number of context views: as asked for, or the usual one, or as many as the targets leave."""
-    return max(1, min(USUAL_CONTEXT, num_frames - targets)) if context is None else context
-
-
-def _choose_interleaved(num_frames: int, stride: int, context: int | None, targets: int | None) -> Split:
-    """The interleaved split, with at most `targets` targets."""
-    if context is None:
-        num_taken = len(range(0, num_frames, stride))
-        num_targets = len(range(FIRST_TARGET, num_taken, TARGET_STEP))
-        context = _usual_context(num_taken, num_targets, None)
-        if num_taken < MIN_FRAMES:
-            wanted = f"at least {MIN_FRAMES} frames for a target between context views"
-            raise refusal("eval", wanted=wanted, got=f"{num_taken}", fix="use a longer capture or a smaller --stride")
-    split = interleaved_split(num_frames, stride, context)
-    if targets is None:
-        return split
-    _check_counts(targets=targets)
-    kept = tuple(split.targets[p] for p in _uniform(len(split.targets), targets))
-    return dataclasses.replace(split, targets=kept)
-
-
 # -- order ------------------------------------------------------------------------------------------------------------
-
 
 MAX_INTERLEAVED_CHUNKS = 8
 """Largest number of chunks interleaved at a time: with chunks of 4, 32 frames or about a second of video."""
@@ -222,10 +187,10 @@ MAX_INTERLEAVED_CHUNKS = 8
 def interleave(centers: Float64[np.ndarray, "n 3"], indices: Sequence[int], chunk_size: int, step: float) -> list[int]:
     """Orders the frames of slow video so that consecutive views of a chunk are about `step` apart.
 
-    Frames of a video are often less than a hundredth of the depth apart, and four consecutive ones have too little
-    parallax. Interleaved over `s` chunks, frames 0, s, 2s, 3s form the first chunk, 1, s + 1, ... the second, and so
-    on: every frame is used, and none is delayed by more than a block of `chunk_size * s` frames. The order depends on
-    poses only, so it is known before an image is read.
+    Frames of hand-held video are often 0.4 % of the depth apart, and four consecutive ones have too little parallax to
+    determine depth. Interleaved over `s` chunks, frames 0, s, 2s, 3s form the first chunk, 1, s + 1, ... the second,
+    and so on: every frame is used, and none is delayed by more than a block of `chunk_size * s` frames. The order
+    depends on poses only, so it is known before an image is read.
 
     Args:
         centers: camera centers of the frames `indices`, in any unit.
@@ -253,12 +218,8 @@ def interleave(centers: Float64[np.ndarray, "n 3"], indices: Sequence[int], chun
 
 # -- index files ------------------------------------------------------------------------------------------------------
 
-
 Index = dict[str, Split | None]
 """The split of each scene; None for a scene that is left out."""
-
-NUM_NAMED = 3
-"""Scenes of an index that a message names."""
 
 
 def read_index(path: Path) -> tuple[Index, tuple[str, ...]]:
@@ -278,44 +239,41 @@ def read_index(path: Path) -> tuple[Index, tuple[str, ...]]:
     scenes = load_json(path)
     if not scenes:
         raise refusal(str(path), wanted="a scene at least", got="none", fix='write {"scene": {"context", "target"}}')
-    index: Index = {name: _read_scene(fields, f"{path}: {echo(name)}") for name, fields in scenes.items()}
-    num_listed = sum(len(scenes[name]["target"]) for name, split in index.items() if split is not None)
-    num_kept = sum(len(split.targets) for split in index.values() if split is not None)
+    index: Index = {}
+    num_listed = num_kept = 0
+    for name, fields in scenes.items():
+        index[name] = None
+        if fields is not None:
+            where = f"{path}: {echo(name)}"
+            context, listed = (_frame_numbers(fields, where, kind) for kind in ("context", "target"))
+            targets = tuple(i for i in listed if i not in set(context))
+            if not targets:
+                got, fix = echo(list(listed)), "list a frame that is not in context"
+                raise refusal(f"{where}.target", wanted="a frame that is not streamed", got=got, fix=fix)
+            index[name] = Split(protocol="index", context=context, targets=targets)
+            num_listed, num_kept = num_listed + len(listed), num_kept + len(targets)
     note = f"{path}: {num_listed - num_kept} of {num_listed} targets are context frames too; they are not scored."
     return index, (note,) if num_kept < num_listed else ()
 
 
-def _read_scene(fields: Any, where: str) -> Split | None:
-    if fields is None:
-        return None
-    if not isinstance(fields, dict):
-        fix = "give the lists context and target"
-        raise refusal(where, wanted="an object or null", got=echo(fields), fix=fix)
-    lists = {}
-    for name in ("context", "target"):
-        value, fix = fields.get(name), "list the numbers of frames, from 0"
-        if not isinstance(value, list) or not value or not all(type(i) is int and i >= 0 for i in value):
-            raise refusal(f"{where}.{name}", wanted="frame numbers", got=echo(value), fix=fix)
-        if len(set(value)) != len(value):
-            raise refusal(f"{where}.{name}", wanted="every frame once", got=echo(value), fix="drop the repeated ones")
-        lists[name] = tuple(value)
-    targets = tuple(i for i in lists["target"] if i not in set(lists["context"]))
-    if not targets:
-        fix = "list a frame that is not in context"
-        raise refusal(f"{where}.target", wanted="a frame that is not streamed", got=echo(lists["target"]), fix=fix)
-    return Split(protocol="index", context=lists["context"], targets=targets)
+def _frame_numbers(fields: Any, where: str, name: str) -> tuple[int, ...]:
+    """The frame numbers of one list of a scene."""
+    numbers = Fields(fields, where).entries(name)
+    if not all(type(i) is int and i >= 0 for i in numbers) or len(set(numbers)) < len(numbers):
+        fix = "list the numbers of frames, from 0"
+        raise refusal(f"{where}.{name}", wanted="frame numbers, each once", got=echo(numbers), fix=fix)
+    return tuple(numbers)
 
 
 def split_of_scene(index: Index, scene: str, num_frames: int) -> Split:
-    """The split of one scene of an index.
+    """Returns the split of one scene of an index.
 
     Raises:
         InputError: the index does not hold the scene or leaves it out, or the capture has no frame of that number.
     """
     if scene not in index:
-        named = ", ".join(list(index)[:NUM_NAMED]) + (" ..." if len(index) > NUM_NAMED else "")
-        fix = "name one of them with --scene"
-        raise refusal("--index", wanted=f"the scene {echo(scene)}", got=f"{len(index)} others ({named})", fix=fix)
+        got, fix = f"{len(index)} others, such as {echo(next(iter(index), ''))}", "name one of them with --scene"
+        raise refusal("--index", wanted=f"the scene {echo(scene)}", got=got, fix=fix)
     split = index[scene]
     if split is None:
         got, fix = "null: the index leaves the scene out", "score another scene"
@@ -328,7 +286,7 @@ def split_of_scene(index: Index, scene: str, num_frames: int) -> Split:
 
 
 def index_to_json(index: Index) -> dict[str, Any]:
-    """An index as plain JSON types; the inverse is `read_index`, but for the name of the protocol."""
+    """Returns an index as plain JSON types; the inverse is `read_index`, but for the name of the protocol."""
     return {
         name: None if split is None else {"context": list(split.context), "target": list(split.targets)}
         for name, split in index.items()

@@ -114,4 +114,4 @@ def test_real_captures_in_any_convention(name, written, captures):
         fit_poses(dataclasses.replace(capture, frames=tuple(turned)), right, keypoints_of(capture)), right
     )
     wanted = " ".join(f"--{name} {value}" for name, value in written.options(right).items())
-    assert warning is None if written == right else f"with {wanted}:" in warning
+    assert warning is None if written == right else f"with {wanted};" in warning

@@ -115,7 +115,7 @@ def _add_frame(frames: FrameList, meta: dict[str, Any], entry: Any, where: str) 
         got = f"none, and {image.parent.name}/{image.name} in its place"
         fix = "add w and h, so that the intrinsics can be shrunk too"
         raise refusal(f"{where}: w, h", wanted="the size of the image that is described", got=got, fix=fix)
-    stored = (0, 0) if has_size else image_size(image)
+    stored = [0.0, 0.0] if has_size else [float(side) for side in image_size(image)]
     described = (fields.number("w", stored[0]), fields.number("h", stored[1]))
     (width, height), shrink = sized = stored_size(image, described, f"{where}: w, h")
     fx, fy = _focal(fields, own, width / shrink, height / shrink)
