@@ -25,8 +25,7 @@ from ssplat_jax.model.cgfi import Aggregator, num_hints
 from ssplat_jax.model.streamsplat import ChunkOutput, Prediction, StreamSplat
 from ssplat_jax.model.types import DepthDistribution, Views, prepare_views
 from ssplat_jax.training import losses
-from ssplat_jax.training import step as train_step
-from ssplat_jax.training.recipe import DEFAULT_FORM, RECIPES
+from ssplat_jax.training.recipe import RECIPES
 from ssplat_jax.training.samples import Sample
 
 PAPER = preset("paper")
@@ -256,35 +255,38 @@ def test_inference_decodes_the_fused_token_by_the_head_alone():
 
 def test_loss_is_the_sum_of_squared_errors_and_perceptual_distances(monkeypatch):
     """Eq. training_loss, with lambda = 0.05 and a stand-in for LPIPS."""
-    monkeypatch.setattr(losses, "lpips", lambda weights, a, b: 2.0 * jnp.abs(a - b).max(axis=(1, 2, 3)))
+    monkeypatch.setattr(losses, "lpips_distance", lambda weights, a, b: 2.0 * jnp.abs(a - b).max(axis=(1, 2, 3)))
     stand_in = LpipsWeights((), (), ())
     rng = np.random.default_rng(6)
     images, targets = (f32(rng.uniform(size=(3, 8, 8, 3))) for _ in range(2))
-    got = losses.rendering_loss(images, targets, RECIPES["paper"], stand_in)
+    loss, samples = RECIPES["paper"].phases[0].loss, RECIPES["paper"].phases[0].samples
+    mean = loss.of_images(images, targets, stand_in)[0]
     a, b = f64(images), f64(targets)
     wanted = sum(((a[r] - b[r]) ** 2).mean() + 0.05 * 2.0 * np.abs(a[r] - b[r]).max() for r in range(3))
-    assert float(got.total) == pytest.approx(wanted, rel=1e-5)
-    mean = losses.rendering_loss(images, targets, RECIPES["tiny"], stand_in)
-    assert 3 * float(mean.total) == pytest.approx(wanted, rel=1e-5)
+    assert 3 * float(mean) == pytest.approx(wanted, rel=1e-5) and loss.weight == samples.num_targets
 
 
 def test_training_follows_the_rendering_loss_of_all_tokens_over_black(monkeypatch):
     """The whole loss of a sample is Eq. training_loss; tokens below tau are rendered too."""
-    recipe, (phase,) = RECIPES["paper"], RECIPES["paper"].phases
-    assert (phase.steps, phase.learning_rate, phase.form.frozen) == (100_000, 1e-4, ())
+    (phase,) = RECIPES["paper"].phases
+    assert (phase.steps, phase.learning_rate) == (100_000, 1e-4)
+    assert {"encoder", "cost_volume", "hpda", "tokens", "cgfi", "mixer", "decoder"} <= set(phase.stages)
     rng = np.random.default_rng(7)
     tokens = replace(draw_tokens(rng, rng.uniform(-1, 1, (9, 3))), confidences=jnp.full(9, 0.01))
     scenes = []
-    monkeypatch.setattr(train_step, "stream_chunks", lambda *args: (MODEL.init_cache(), tokens, (f32(7.0), f32(5.0))))
-    monkeypatch.setattr(train_step, "target_loss", lambda scene, *rest: (scenes.append(scene) or f32(3.0), {}))
+    streamed = (MODEL.init_cache(), tokens, f32(17.0), {})
+    monkeypatch.setattr(losses.DepthLoss, "of_stream", lambda *args: streamed)
+    monkeypatch.setattr(
+        losses.RenderingLoss, "of_scene", lambda self, scene, *rest: (scenes.append(scene) or f32(3.0), {})
+    )
     zeros = jnp.zeros
     chunks = Chunk(
         zeros((1, 2, 8, 8, 3)), zeros((1, 2, 4, 4)), zeros((1, 2, 3, 3)), zeros((1, 2), bool), *zeros((2, 1))
     )
-    sample = Sample(chunks, zeros((1, 2, 2, 2)), zeros((2, 8, 8, 3)), zeros((2, 4, 4)), zeros((2, 3, 3)))
-    params = {"decoder": HEAD}
-    loss, _ = train_step.loss_fn(params, MODEL, sample, recipe, phase.form)
-    assert float(loss) == 3.0 and recipe.black_weight == 1.0
+    camera = Camera(zeros((2, 4, 4)), zeros((2, 3, 3)), 8, 8)
+    sample = Sample(chunks, zeros((1, 2, 2, 2)), zeros((2, 8, 8, 3)), camera)
+    batch, params = jax.tree.map(lambda x: x[None], sample), {"decoder": HEAD}
+    assert float(phase.loss(MODEL, params, batch)[0]) == 4 * 3.0 and phase.loss.black_weight == 1.0
     assert (np.asarray(scenes[0].opacities) > 0).all()
-    train_step.loss_fn(params, MODEL, sample, recipe, DEFAULT_FORM)
+    losses.RenderingLoss()(MODEL, params, batch)
     assert not np.asarray(scenes[1].opacities).any()

@@ -33,9 +33,12 @@ from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.storage.weights import load_params
 from ssplat_jax.streaming.feed import feed_capture
 from ssplat_jax.streaming.session import Session
-from ssplat_jax.training.evidence_training import EvidenceRecipe, train_evidence
+from ssplat_jax.training.capture_mix import CaptureMix, open_mix
+from ssplat_jax.training.crops import Crops
 from ssplat_jax.training.loop import train
-from ssplat_jax.training.recipe import MATCHER_STAGES, Phase, PhaseForm, Recipe
+from ssplat_jax.training.losses import RenderingLoss
+from ssplat_jax.training.recipe import AFTER_MATCHER, EVIDENCE, MATCHER, Phase, Recipe, learning
+from ssplat_jax.training.samples import Views
 
 REVISIT = "revisit"
 """Name of the procedural scene that is scored."""
@@ -87,7 +90,7 @@ class Budget:
     """Training images of these steps, height and width."""
     max_pairs: int
     """Tile intersections of these steps."""
-    evidence: EvidenceRecipe
+    evidence: Recipe
     """Training of the evidence head; its seed is that of the variant."""
     seeds: tuple[int, ...]
     views: int
@@ -99,12 +102,25 @@ class Budget:
 
     def recipe(self, seed: int, untrained: tuple[str, ...]) -> Recipe:
         """The stream phase of the recipe `stream`, shorter."""
-        form = PhaseForm(frozen=(*MATCHER_STAGES, *untrained))
-        phase = Phase("stream", self.steps, self.num_chunks, 2, (self.size,), learning_rate=3e-4, form=form)
-        return Recipe(phases=(phase,), seed=seed, warmup_steps=min(10, self.steps), max_pairs=self.max_pairs)
+        phase = Phase(
+            "stream",
+            self.steps,
+            Views(self.num_chunks, (self.size,), num_targets=2),
+            RenderingLoss(max_pairs=self.max_pairs),
+            learning(*(stage for stage in AFTER_MATCHER if stage not in untrained)),
+            learning_rate=3e-4,
+            warmup_steps=10,
+        )
+        return Recipe(phases=(phase,), seed=seed)
 
 
-LEARNED_SCENES = (*EvidenceRecipe().procedural, "procedural:revisit?frames=73&seed=3")
+def evidence_recipe(steps: int, crops: Crops) -> Recipe:
+    """The recipe `evidence` with other steps and samples."""
+    phase = dataclasses.replace(EVIDENCE.phases[0], steps=steps, samples=crops)
+    return dataclasses.replace(EVIDENCE, phases=(phase,))
+
+
+LEARNED_SCENES = (*Crops().procedural, "procedural:revisit?frames=73&seed=3")
 """Procedural scenes that the evidence head learns from; the seed of `revisit` is none of those that are scored."""
 
 BUDGETS = {
@@ -113,8 +129,8 @@ BUDGETS = {
         num_chunks=1,
         size=(32, 48),
         max_pairs=1 << 14,
-        evidence=EvidenceRecipe(
-            steps=1, views_per_step=1, crop=(32, 32), width=64, procedural=("procedural:revisit?frames=9&seed=3",)
+        evidence=evidence_recipe(
+            1, Crops(procedural=("procedural:revisit?frames=9&seed=3",), width=64, size=(32, 32), batch=1)
         ),
         seeds=(0,),
         views=8,
@@ -126,7 +142,7 @@ BUDGETS = {
         num_chunks=2,
         size=(64, 96),
         max_pairs=1 << 18,
-        evidence=EvidenceRecipe(steps=100, strides=(2,), procedural=LEARNED_SCENES),
+        evidence=evidence_recipe(100, Crops(procedural=LEARNED_SCENES, strides=(2,))),
         seeds=(0, 1, 2),
         views=64,
         scored=(320, 240),
@@ -136,7 +152,7 @@ BUDGETS = {
         num_chunks=4,
         size=(256, 256),
         max_pairs=1 << 21,
-        evidence=EvidenceRecipe(procedural=LEARNED_SCENES),
+        evidence=evidence_recipe(600, Crops(procedural=LEARNED_SCENES)),
         seeds=(0, 1, 2),
         views=64,
         scored=(320, 240),
@@ -216,18 +232,27 @@ def trained(variant: str, config: StreamConfig, seed: int, budget: Budget, captu
     """
     shipped = load_params("tiny")
     start = complete_params(
-        jax.random.key(seed), config, {stage: shipped[stage] for stage in MATCHER_STAGES if stage in shipped}
+        jax.random.key(seed), config, {stage: shipped[stage] for stage in MATCHER if stage in shipped}
     )
+    params = trained_by(config, budget.recipe(seed, VARIANTS[variant].untrained), start)
+    if params.get("evidence"):
+        learned = [] if captures is None else [captures / name for name in learned_from(captures)]
+        mix = open_mix(learned, (), config) if learned else None
+        params = trained_by(config, dataclasses.replace(budget.evidence, seed=seed), params, mix)
+    return params
+
+
+def trained_by(config: StreamConfig, recipe: Recipe, params: dict, mix: CaptureMix | None = None) -> dict:
+    """Parameters after a training.
+
+    Raises:
+        KeyboardInterrupt: a signal stopped it.
+    """
     with tempfile.TemporaryDirectory() as folder:
-        done = train(config, budget.recipe(seed, VARIANTS[variant].untrained), Path(folder), params=start)
+        done = train(config, recipe, Path(folder), params=params, mix=mix)
     if done.interrupted:
         raise KeyboardInterrupt
-    params = done.state.ema
-    if config.head.evidence:
-        learned = [] if captures is None else [captures / name for name in learned_from(captures)]
-        recipe = dataclasses.replace(budget.evidence, seed=seed)
-        params, _ = train_evidence(StreamSplat(config), params, learned, recipe)
-    return params
+    return done.params
 
 
 @functools.lru_cache(maxsize=8)

@@ -1,20 +1,26 @@
-"""The training loop: draws samples ahead, steps, logs, saves, resumes, and stops cleanly on a signal."""
+"""The training loop of all recipes: it draws samples ahead, steps, logs, saves, resumes, and stops on a signal."""
 
+import collections
 import dataclasses
 import functools
 import json
-import math
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+import optax
 
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.atomic import write_atomic
 from ssplat_jax.core.cores import num_cores
+from ssplat_jax.core.errors import InputError
+from ssplat_jax.core.pytree import pytree
 from ssplat_jax.evaluation.lpips import LpipsWeights
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.storage.files import json_text
@@ -22,27 +28,132 @@ from ssplat_jax.storage.interrupts import Interrupts
 from ssplat_jax.storage.run_folder import lock_folder
 from ssplat_jax.storage.saved_states import TrainingCheckpoints
 from ssplat_jax.storage.weights import params_digest
-from ssplat_jax.training.capture_samples import CaptureMix
-from ssplat_jax.training.recipe import Recipe, training_config
-from ssplat_jax.training.samples import prefetched
-from ssplat_jax.training.step import Trainer, TrainState, init_state, learning_rate
-from ssplat_jax.training.step_samples import batch_for_step
-from ssplat_jax.training.validation import Validation
+from ssplat_jax.training.capture_mix import CaptureMix, PhaseStart
+from ssplat_jax.training.recipe import Loss, Phase, Recipe, describe
 
-LOG_FILE = "log.jsonl"
-"""Name of the log in the output directory: one JSON object per line."""
+T = TypeVar("T")
 
-RANDOM = "random"
-"""Name of random initial parameters, which follow from the recipe's seed."""
+SCORES = ("psnr", "psnr_over_black", "lpips")
+"""Metrics of a step that are reported of held-out frames too."""
+ALWAYS = 2**30
+"""Steps in a row that may have a gradient that is not finite: all of them are skipped, and counted in the log."""
+
+
+@pytree
+class TrainState:
+    """What learns, and everything else that a resumed run needs besides its recipe."""
+
+    params: dict  # stages of which a part learns in some phase
+    average: optax.EmaState  # moving average of `params`, see `averaged`
+    optimizer: tuple  # state of `optimizer`
 
 
 @dataclasses.dataclass(frozen=True)
 class TrainResult:
-    """State of a run when `train` returns."""
+    """What a run has when `train` returns."""
 
+    params: dict  # of all stages; averaged, as they are evaluated and shipped
     state: TrainState
     step: int  # steps done
     interrupted: int | None  # number of the signal that stopped the run, if one did
+
+
+def optimizer(recipe: Recipe, params: dict) -> optax.GradientTransformationExtraArgs:
+    """Clipping by the global norm, and AdamW at the rates of the phases. To try another optimizer, change it here.
+
+    It serves all phases: where a part is a constant its rate is 0, which moves nothing.
+    """
+    factors = {}  # of the learning rate in each phase, by their text: the labels of a tree cannot be tuples
+
+    def label(path, _) -> str:
+        found = tuple(phase.rate("/".join(key.key for key in path)) for phase in recipe.phases)
+        factors[str(found)] = found
+        return str(found)
+
+    labels = jax.tree_util.tree_map_with_path(label, params)
+    rates = {name: optax.scale_by_schedule(schedule(recipe, found)) for name, found in factors.items()}
+    adamw = optax.adamw(1.0, b2=recipe.adam_b2, weight_decay=recipe.weight_decay)
+    direction = optax.apply_if_finite(optax.chain(optax.clip_by_global_norm(recipe.clip_norm), adamw), ALWAYS)
+    return optax.chain(direction, optax.multi_transform(rates, labels))
+
+
+def schedule(recipe: Recipe, factors: tuple[float, ...]) -> optax.Schedule:
+    """Learning rate by step of a part with a factor in each phase: every phase warms up, and decays by a cosine."""
+    pieces = []
+    for phase, factor in zip(recipe.phases, factors, strict=True):
+        warmup, peak = min(phase.warmup_steps, phase.steps) - 1, factor * phase.learning_rate
+        first, last = peak / (warmup + 1), peak * phase.final_share
+        pieces.append(optax.warmup_cosine_decay_schedule(first, peak, warmup, phase.steps, last))
+    return optax.join_schedules(pieces, np.cumsum([phase.steps for phase in recipe.phases])[:-1].tolist())
+
+
+def init_state(recipe: Recipe, params: dict) -> TrainState:
+    """State before the first step.
+
+    Raises:
+        InputError: a phase has nothing to train in `params`.
+    """
+    for phase in recipe.phases:
+        if not any(params.get(stage) for stage in phase.stages):
+            wanted = " or ".join(phase.stages)
+            raise InputError(f"train: phase {phase.name!r}: wanted a configuration with {wanted}, which it trains.")
+    stages = {stage for phase in recipe.phases for stage in phase.stages}
+    # A copy: a step donates its state, and the caller keeps its arrays.
+    learning = {name: jax.tree.map(jnp.copy, stage) for name, stage in params.items() if name in stages}
+    average: Any = optax.ema(recipe.ema_decay).init(learning)
+    opt_state: Any = optimizer(recipe, learning).init(learning)
+    return TrainState(learning, average, opt_state)
+
+
+def averaged(recipe: Recipe, state: TrainState) -> dict:
+    """The moving average of what learns, in which every step counts `ema_decay` times as much as the next one."""
+    if int(state.average.count) == 0:
+        return jax.tree.map(jnp.copy, state.params)
+    return optax.tree.bias_correction(state.average.ema, recipe.ema_decay, state.average.count)
+
+
+@functools.partial(jax.jit, static_argnames=("model", "recipe", "phase"), donate_argnums=0)
+def train_step(
+    state: TrainState,
+    constants: dict,
+    batch: Any,
+    lpips_weights: LpipsWeights | None,
+    *,
+    model: StreamSplat,
+    recipe: Recipe,
+    phase: Phase,
+) -> tuple[TrainState, dict]:
+    """State after one update by the loss of `phase`, and metrics to log. `state` is donated.
+
+    `constants` are parameters of the stages that learn in no phase.
+
+    Limits:
+        A gradient that is not finite moves no parameter and no moment, and is counted.
+        Stages that do not learn in `phase` keep their parameters to the bit.
+    """
+
+    def loss(params: dict):
+        params = {name: p if name in phase.stages else jax.lax.stop_gradient(p) for name, p in params.items()}
+        return phase.loss(model, constants | params, batch, lpips_weights)
+
+    gradients, metrics = jax.grad(loss, has_aux=True)(state.params)
+    updates, opt_state = optimizer(recipe, state.params).update(gradients, state.optimizer, state.params)
+    params: Any = optax.apply_updates(state.params, updates)
+    average: Any = optax.ema(recipe.ema_decay).update(params, state.average)[1]
+    return TrainState(params, average, opt_state), metrics | {"grad_norm": optax.global_norm(gradients)}
+
+
+def describe_run(
+    config: StreamConfig, recipe: Recipe, init_weights: str, mix: CaptureMix | None, lpips_weights: LpipsWeights | None
+) -> dict:
+    """Facts that determine the weights of a run, as JSON types; a run with another description is not resumed."""
+    return {
+        "config": config.to_dict(),
+        "recipe": describe(recipe),
+        "init_weights": init_weights,
+        "captures": None if mix is None else mix.describe(),
+        "lpips_weights": None if lpips_weights is None else params_digest(lpips_weights),
+    }
 
 
 def train(
@@ -58,181 +169,152 @@ def train(
     validate_every: int = 200,
     log_every: int = 10,
     report: Callable[[dict], None] = lambda record: None,
+    say: Callable[[str], None] = lambda message: None,
     warn: Callable[[str], None] = warnings.warn,
 ) -> TrainResult:
     """Trains until the recipe is done or a signal arrives. A run in `out` is resumed.
 
     Args:
-        config: model configuration; `training_config` changes cache and exposure.
-        recipe: phases, optimizer and loss.
+        config: model configuration.
+        recipe: phases and optimizer.
         out: directory of `log.jsonl`, `recipe.json` and `training.npz`.
         params: initial parameters; default random ones from the recipe's seed. A run is resumed with the same ones.
         init_weights: name of `params` in the description of the run; default their digest.
         mix: captures to learn from, beside procedural scenes.
-        lpips_weights: weights of LPIPS, which the rendering loss then includes.
+        lpips_weights: weights of LPIPS, which rendering losses then include.
         save_every: steps between checkpoints. SIGINT and SIGTERM save one too.
-        validate_every: steps between records of the scores of held-out frames of the captures.
-        log_every: steps between log records, which hold means over these steps.
-        report: called with every log record.
-        warn: called with a message for each damaged checkpoint.
-
-    Returns:
-        The state after the last step.
+        validate_every: steps between scores of held-out frames of the captures.
+        log_every: steps between log records, which hold means over these steps, and with which `report` is called.
+        report, say, warn: called with records, with messages while samples are prepared, and with warnings.
 
     Raises:
         InputError: `out` holds a run of another recipe, configuration, start or LPIPS weights, or of captures with
-            other files, or another process is training in it.
+            other files, another process trains in it, or configuration or captures do not fit the recipe.
         StorageError: a checkpoint cannot be written or read.
     """
-    model = StreamSplat(training_config(config, recipe))
-    with lock_folder(out):
-        init_weights = init_weights or (RANDOM if params is None else params_digest(params))
-        description = describe_run(model.config, recipe, init_weights, lpips_weights=lpips_weights, mix=mix)
-        checkpoints = TrainingCheckpoints(out, description)
-        state, start = init_state(model, recipe, params), 0
+    for phase in recipe.phases if mix else ():
+        phase.samples.check(mix, config, renders=phase.loss.renders)
+    model, name = StreamSplat(config), init_weights or ("random" if params is None else params_digest(params))
+    params = model.init(jax.random.key(recipe.seed)) if params is None else params
+    state, done, stopped = init_state(recipe, params), 0, None
+    constants = {stage: part for stage, part in params.items() if stage not in state.params}
+    update = functools.partial(train_step, model=model, recipe=recipe)
+
+    def current() -> dict:
+        return constants | averaged(recipe, state)
+
+    def begin(phase: Phase) -> Callable[[int, int], Any]:
+        return phase.samples.open(PhaseStart(model, current(), mix, recipe.seed, recipe.num_steps, say))
+
+    @functools.cache
+    def held_out(phase: Phase) -> list:
+        return phase.samples.held_out(mix) if mix and phase.loss.renders else []
+
+    with lock_folder(out), Interrupts(has_work=False) as interrupts:
+        checkpoints = TrainingCheckpoints(out, describe_run(config, recipe, name, mix, lpips_weights))
         if (restored := checkpoints.restore_latest(state, warn)) is not None:
-            start, state = restored
-        log = _Log(out / LOG_FILE, recipe, report, start)
-        every = _Every(save_every, log_every, validate_every)
-        return _run(model, recipe, state, start, mix, lpips_weights, checkpoints, log, every)
+            done, state = restored
+        log = _Log(out / "log.jsonl", report, done)
+        for phase, step, batch in log.waiting(batches(recipe, done, begin)):
+            state, metrics = update(state, constants, batch, lpips_weights, phase=phase)
+            log.metrics.append(metrics)
+            interrupts.has_work, done, is_last = True, step + 1, step + 1 == recipe.num_steps
+            is_scored = (done % validate_every == 0 or is_last) and held_out(phase)
+            if done % log_every == 0 or is_scored or is_last:
+                record = log.record(done, phase, state)
+                if is_scored:
+                    record |= scores(model, current(), phase.loss, held_out(phase), lpips_weights)
+                log.write(record)
+            stopped = interrupts.received  # read once, since a signal may arrive at any time
+            if done % save_every == 0 or is_last or stopped:
+                checkpoints.save(done, state)
+            if stopped:
+                break
+    return TrainResult(current(), state, done, stopped if done < recipe.num_steps else None)
 
 
-@dataclasses.dataclass(frozen=True)
-class _Every:
-    """Steps between events of the loop."""
-
-    save: int
-    log: int
-    validate: int
-
-
-def describe_run(
-    config: StreamConfig,
-    recipe: Recipe,
-    init_weights: str,
-    *,
-    lpips_weights: LpipsWeights | None = None,
-    mix: CaptureMix | None = None,
-) -> dict:
-    """Facts that determine the weights of a run, as JSON types; a run with another description is not resumed.
-
-    Args:
-        config: configuration of the model.
-        recipe: the recipe.
-        init_weights: name of the initial parameters, `RANDOM` for random ones.
-        lpips_weights: weights of LPIPS, if the rendering loss includes it.
-        mix: captures to learn from.
-    """
-    description: dict = {
-        "config": config.to_dict(),
-        "recipe": dataclasses.asdict(recipe),
-        "init_weights": init_weights,
-    }
-    if lpips_weights is not None:
-        description["rendering_loss"] = f"MSE + {recipe.lpips_weight} LPIPS"
-        description["lpips_weights"] = params_digest(lpips_weights)
-    if mix is not None:
-        description["captures"] = mix.describe()
-    return description
-
-
-def _run(model, recipe, state, start, mix, lpips_weights, checkpoints, log, every: _Every) -> TrainResult:
-    """Steps from `start` to the end of the recipe or to a signal."""
-    trainer, interrupts = Trainer(model, recipe), Interrupts(has_work=False)
-    validation = None if mix is None else Validation(model, recipe, mix, lpips_weights)
-    step, stopped = start, None
+def batches(
+    recipe: Recipe, done: int, begin: Callable[[Phase], Callable[[int, int], Any]]
+) -> Iterator[tuple[Phase, int, Any]]:
+    """Phase, number and batch of every step after the first `done`; `begin` gives the function that makes batches."""
     # A GPU leaves the cores free to make samples; without one, a thread makes them beside the steps.
     workers = 1 if jax.default_backend() == "cpu" else max(1, num_cores() // 2)
-    produce = functools.partial(batch_for_step, recipe=recipe, config=model.config, mix=mix)
-    samples = prefetched(produce, range(start, recipe.num_steps), workers)
-    with interrupts:
+    first = 0
+    for phase in recipe.phases:
+        if steps := range(max(done, first), first + phase.steps):
+            make = begin(phase)
+            for step, batch in prefetched(lambda i, make=make, first=first: make(i, i - first), steps, workers):
+                yield phase, step, batch
+        first += phase.steps
+
+
+def prefetched(produce: Callable[[int], T], steps: Iterable[int], workers: int = 1) -> Iterator[tuple[int, T]]:
+    """Yields (step, produce(step)) in order, made in `workers` threads that are at most two steps each ahead."""
+    ahead = collections.deque()
+    with ThreadPoolExecutor(workers) as pool:
         try:
-            before = time.perf_counter()
-            for i, batch in samples:
-                waited = time.perf_counter() - before
-                rate = jnp.asarray(learning_rate(recipe, i), jnp.float32)
-                phase = recipe.phase_at(i)[0]
-                state, metrics = trainer.step(state, batch, rate, form=phase.form, lpips_weights=lpips_weights)
-                interrupts.has_work = True
-                log.add(metrics, waited)
-                step = i + 1
-                is_last = step == recipe.num_steps
-                if step % every.log == 0 or is_last:
-                    jax.block_until_ready(metrics)  # steps are dispatched asynchronously
-                    log.write(step, state)
-                if validation is not None and (step % every.validate == 0 or is_last):
-                    log.write_scores(step, validation.scores(state.ema, phase))
-                stopped = interrupts.received  # read once, since a signal may arrive at any time
-                if step % every.save == 0 or is_last or stopped:
-                    checkpoints.save(step, state)
-                if stopped:
-                    break
-                before = time.perf_counter()
+            for step in (*steps, *[None] * 2 * workers):
+                if step is not None:
+                    ahead.append((step, pool.submit(produce, step)))
+                    if len(ahead) == 1:  # alone, so that the others find in caches what all of them need
+                        wait([ahead[0][1]])
+                if ahead and (step is None or len(ahead) > 2 * workers):
+                    made, future = ahead.popleft()
+                    yield made, future.result()
         finally:
-            samples.close()
-    return TrainResult(state=state, step=step, interrupted=stopped if step < recipe.num_steps else None)
+            pool.shutdown(cancel_futures=True)
+
+
+def scores(model: StreamSplat, params: dict, loss: Loss, samples: list, lpips: LpipsWeights | None) -> dict[str, float]:
+    """Means of the loss's metrics over held-out samples, as `validation_psnr` and so on."""
+    rows = [jax.device_get(_metrics(params, sample, lpips, model, loss)) for sample in samples]
+    means = {name: float(np.mean([row[name] for row in rows])) for name in SCORES if name in rows[0]}
+    return {f"validation_{name}": round(mean, 4) for name, mean in means.items()}
+
+
+@functools.partial(jax.jit, static_argnums=(3, 4))
+def _metrics(params: dict, batch: Any, lpips: LpipsWeights | None, model: StreamSplat, loss: Loss) -> dict:
+    return loss(model, params, batch, lpips)[1]
 
 
 class _Log:
     """Metrics since the last record, and the file that records are appended to.
 
-    Args:
-        path: the file. Records of steps after `start`, which will be taken again, are removed.
-        recipe: the recipe.
-        report: called with every record.
-        start: steps that are done.
+    Records of steps after the first `done`, which will be taken again, are removed from the file.
     """
 
-    def __init__(self, path: Path, recipe: Recipe, report: Callable[[dict], None], start: int) -> None:
-        self._path, self._recipe, self._report = path, recipe, report
-        if path.exists():
-            kept = [line for line in path.read_text().splitlines() if _step_of(line) <= start]
-            write_atomic(path, "".join(f"{line}\n" for line in kept).encode())
-        self._start()
+    def __init__(self, path: Path, report: Callable[[dict], None], done: int) -> None:
+        self._path, self._report = path, report
+        lines = path.read_text().splitlines() if path.exists() else []
+        # A line that a kill cut short has no end.
+        kept = [line for line in lines if line.endswith("}") and json.loads(line)["step"] <= done]
+        write_atomic(path, "".join(f"{line}\n" for line in kept).encode())
+        self._begin()
 
-    def _start(self) -> None:
-        self._metrics: list[dict] = []
+    def _begin(self) -> None:
+        self.metrics: list[dict] = []
         self._waited, self._since = 0.0, time.perf_counter()
 
-    def add(self, metrics: dict, waited: float) -> None:
-        """Adds the metrics of a step, and the seconds for which it waited for its samples."""
-        self._metrics.append(metrics)
-        self._waited += waited
+    def waiting(self, steps: Iterable[T]) -> Iterator[T]:
+        """The steps; counts the seconds for which each of them waits for its batch."""
+        before = time.perf_counter()
+        for step in steps:
+            self._waited += time.perf_counter() - before
+            yield step
+            before = time.perf_counter()
 
-    def write(self, step: int, state: TrainState) -> None:
-        """Writes and reports a record: means of the metrics and timings since the last one."""
+    def record(self, done: int, phase: Phase, state: TrainState) -> dict:
+        """Means of the metrics, and timings, since the last record."""
+        rows = jax.device_get(self.metrics)  # waits: steps are dispatched asynchronously
         elapsed = time.perf_counter() - self._since
-        means: dict = {}
-        for name in self._metrics[-1]:
-            values = [float(metrics[name]) for metrics in self._metrics if name in metrics]
-            means[name] = round(sum(values) / len(values), 5)
-        record = {
-            "step": step,
-            "phase": self._recipe.phase_at(step - 1)[0].name,
-            **means,
-            "skipped": int(state.num_skipped),
-            "seconds_per_step": round(elapsed / len(self._metrics), 4),
-            "data_share": round(self._waited / elapsed, 4),
-        }
-        self._append(record)
-        self._start()
+        means = {name: round(float(np.mean([row[name] for row in rows if name in row])), 5) for name in rows[-1]}
+        timings = {"seconds_per_step": round(elapsed / len(rows), 4), "data_share": round(self._waited / elapsed, 4)}
+        skipped = int(state.optimizer[0].total_notfinite)
+        return {"step": done, "phase": phase.name, **means, "skipped": skipped, **timings}
 
-    def write_scores(self, step: int, scores: dict[str, float]) -> None:
-        """Writes and reports the scores of held-out frames, if there are any, as a record of their own."""
-        if scores:
-            rounded = {name: round(value, 4) for name, value in scores.items()}
-            self._append({"step": step, "phase": self._recipe.phase_at(step - 1)[0].name, **rounded})
-        self._since = time.perf_counter() if not self._metrics else self._since
-
-    def _append(self, record: dict) -> None:
+    def write(self, record: dict) -> None:
+        """Appends a record to the file and reports it."""
         with self._path.open("a") as file:
             file.write(json_text(record, indent=None) + "\n")
         self._report(record)
-
-
-def _step_of(line: str) -> float:
-    """The step of a record; infinity for a line that a kill cut short."""
-    try:
-        return float(json.loads(line)["step"])
-    except (ValueError, KeyError, TypeError):
-        return math.inf
+        self._begin()

@@ -1,16 +1,218 @@
-"""Losses: rendering (Eq. training_loss), and depth, which procedural scenes provide (ours)."""
+"""Losses of training phases: depth, which procedural scenes provide (ours), rendering (Eq. training_loss), and crops.
 
-from typing import NamedTuple
+The loss of a phase is a frozen dataclass, whose fields are its weights and whose call is
+
+    loss(model, params, batch, lpips weights or None) -> (value, metrics to log)
+
+`renders` says whether it renders the target views of `Sample`. To try another loss, write it here and name it in a
+phase of `recipe.py`.
+"""
+
+import dataclasses
+import functools
+import math
+from collections.abc import Callable
+from typing import Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ssplat_jax.evaluation.lpips import LpipsWeights, lpips
-from ssplat_jax.training.recipe import Recipe
+from ssplat_jax.cache import Tokens, VoxelCache, vote
+from ssplat_jax.core.gaussians import Gaussians, mask_gaussians, mean_color
+from ssplat_jax.evaluation.lpips import LpipsWeights
+from ssplat_jax.evaluation.lpips import lpips as lpips_distance
+from ssplat_jax.model.streamsplat import StreamSplat
+from ssplat_jax.rasterizer import fill_holes, render
+from ssplat_jax.refinement.view_loss import EFFECTS
+from ssplat_jax.training.crops import Crop
+from ssplat_jax.training.samples import Sample
+
+Scalar = Float[Array, ""]
+Metrics = dict[str, Array]
+Lpips = LpipsWeights | None
 
 MIN_STEP = 1e-6
 """Smallest step of log depth between candidates that is divided by; steps are 0 where near = far."""
+MAX_GAIN = 2.0
+"""Largest gain between a scene and a photograph that training divides out; its reciprocal is the smallest. Exposure
+drifts by a factor of two in captures."""
+MIN_MSE = 1e-4
+"""Added to squared errors before the logarithm, so that views that are nearly right do not count most."""
+
+
+@dataclasses.dataclass(frozen=True)
+class DepthLoss:
+    """Loss of the depth maps of all streamed views: cross entropy + l1_weight x L1."""
+
+    l1_weight: float = 2.0
+    """Weight of the L1 of log depth beside the cross entropy of the depth distribution."""
+    target_width: float = 0.6
+    """Width of the target distribution around the true depth: the standard deviation in steps between candidates."""
+    capacity: int = 1 << 14
+    """Voxels of the cache of a sample."""
+    recompute: bool = False
+    """Recomputes the activations of each chunk in the backward pass: less memory, more time."""
+    renders: ClassVar[bool] = False
+
+    def __call__(self, model: StreamSplat, params: dict, batch: Sample, lpips: Lpips = None) -> tuple[Scalar, Metrics]:
+        """Mean loss of the samples along the leading axis of `batch`."""
+        # Side by side, to keep a GPU busy.
+        return _mean_over(lambda sample: self.of_stream(model, params, sample)[2:], batch, along=jax.vmap)
+
+    def of_stream(self, model: StreamSplat, params: dict, sample: Sample) -> tuple[VoxelCache, Tokens, Scalar, Metrics]:
+        """Cache and tokens (on one axis) of a sample's chunks, their loss and metrics.
+
+        The backward pass goes chunk by chunk, so that memory does not grow with the number of chunks.
+        """
+        # jit cannot let a cache grow. Exposures are not matched, because those of the targets are not estimated.
+        config = model.config.replace(capacity=self.capacity, overflow="drop_new", match_exposure=False)
+        model = StreamSplat(config)
+
+        def body(cache, chunk_and_truth):
+            chunk, truth = chunk_and_truth
+            prediction = model.predict(params, cache, chunk)
+            cache = model.update_cache(cache, prediction)
+            losses = depth_loss(
+                prediction.logits,
+                prediction.log_depths,
+                pad_like(truth, prediction.log_depths),
+                prediction.views.log_candidates,
+                prediction.views.inside,
+                target_width=self.target_width,
+            )
+            return cache, (prediction.tokens, losses)
+
+        body = jax.checkpoint(body) if self.recompute else body
+        cache, (tokens, losses) = jax.lax.scan(body, model.init_cache(), (sample.chunks, sample.log_depths))
+        tokens = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), tokens)
+        entropy, l1 = jax.tree.map(jnp.mean, losses)
+        loss = entropy + self.l1_weight * l1
+        accepted = jnp.mean((tokens.confidences >= config.memory.min_confidence).astype(jnp.float32))
+        return cache, tokens, loss, {"depth_entropy": entropy, "depth_l1": l1, "accepted": accepted, "loss": loss}
+
+
+@dataclasses.dataclass(frozen=True)
+class RenderingLoss:
+    """Loss of rendered target views, and of depth beside it.
+
+    rendering = MSE + lpips_weight x LPIPS, or MSE + gradient_weight x L1 of image gradients
+    loss      = depth_weight x depth + weight x rendering
+    """
+
+    depth: DepthLoss = DepthLoss()
+    """Loss of the streamed views."""
+    depth_weight: float = 0.1
+    """Weight of the depth loss (ours: procedural scenes have known depth)."""
+    weight: float = 10.0
+    """Weight of the rendering loss, the mean over the target views."""
+    tokens: Literal["all", "accepted"] = "accepted"
+    """Tokens that are rendered: all of them (the paper), or those that the cache would accept, so that layers carry the
+    same opacity as at inference."""
+    lpips_weight: float = 0.05
+    """Weight of LPIPS beside the MSE, as in the paper (Eq. training_loss); used only when LPIPS weights are given."""
+    gradient_weight: float = 0.02
+    """Weight of the L1 of image gradients beside the MSE, which replaces LPIPS when its weights are not given: they
+    cannot be shipped. The Gaussians cannot show texture finer than themselves: a larger weight would favor blur."""
+    black_weight: float = 0.05
+    """Fraction of the rendering loss computed over a black background. The rest fills holes with the colors around
+    them, as in evaluation; alone, that would make all surfaces translucent, since holes would cost nothing."""
+    fit_gains: bool = False
+    """Compares each target view at the gain per channel with which the rendered one is nearest to it (ours):
+    photographs differ in exposure. `ssplat train --captures` sets it."""
+    max_pairs: int = 1 << 20
+    """Tile intersections that the rasterizer may use per batch of targets; overflow is logged."""
+    renders: ClassVar[bool] = True
+
+    def __call__(self, model: StreamSplat, params: dict, batch: Sample, lpips: Lpips = None) -> tuple[Scalar, Metrics]:
+        """Mean loss of the samples along the leading axis of `batch`."""
+
+        def of_sample(sample: Sample):
+            cache, tokens, depth, metrics = self.depth.of_stream(model, params, sample)
+            if self.tokens == "all":
+                gaussians = model.decode_tokens(params, tokens)
+            else:
+                gaussians = decode_accepted(model, params, cache, tokens)
+            rendering, more = self.of_scene(gaussians, sample, lpips)
+            loss = self.depth_weight * depth + self.weight * rendering
+            return loss, metrics | more | {"loss": loss}
+
+        # One after the other: the rasterizer keeps the machine busy with one sample.
+        return _mean_over(of_sample, batch, along=lambda one: functools.partial(jax.lax.map, one))
+
+    def of_scene(self, gaussians: Gaussians, sample: Sample, lpips: Lpips = None) -> tuple[Scalar, Metrics]:
+        """Rendering loss of the target views of `sample` in a scene, and metrics."""
+        output = render(gaussians, sample.target_camera, max_pairs=self.max_pairs)
+        filled = fill_holes(output.color, output.alpha, jax.lax.stop_gradient(mean_color(gaussians)))
+        gains = fitted_gains(filled, sample.target_images) if self.fit_gains else 1.0
+        shown, black = (self.of_images(x * gains, sample.target_images, lpips) for x in (filled, output.color))
+        total = (1 - self.black_weight) * shown[0] + self.black_weight * black[0]
+        return total, {
+            **({} if lpips is None else {"lpips": shown[2]}),
+            "psnr": -10 * jnp.log10(shown[1] + 1e-10),
+            "psnr_over_black": -10 * jnp.log10(black[1] + 1e-10),
+            "alpha": output.alpha.mean(),
+            "overflow": output.num_overflow.astype(jnp.float32),
+        }
+
+    def of_images(
+        self, images: Float[Array, "s h w 3"], targets: Float[Array, "s h w 3"], lpips: Lpips = None
+    ) -> tuple[Scalar, Scalar, Scalar]:
+        """Loss of rendered views, RGB in [0, 1], and its parts: MSE, and LPIPS or the L1 of image gradients."""
+        mse = jnp.mean((images - targets) ** 2)
+        if lpips is None:
+            other, weight = image_gradient_l1(images, targets), self.gradient_weight
+        else:
+            other, weight = lpips_distance(lpips, images, targets).mean(), self.lpips_weight
+        return mse + weight * other, mse, other
+
+
+@dataclasses.dataclass(frozen=True)
+class CropLoss:
+    """Minus the PSNR of crops of the decoded cache, which is what is scored: scenes of any difficulty count alike."""
+
+    black_weight: float = 0.4
+    """Weight of the PSNR over black; the rest is the PSNR with holes filled."""
+    renders: ClassVar[bool] = False
+
+    def __call__(
+        self, model: StreamSplat, params: dict, batch: tuple[Crop, ...], lpips: Lpips = None
+    ) -> tuple[Scalar, Metrics]:
+        """Mean over the crops of `batch`, and their PSNRs in dB."""
+        shown = black = jnp.zeros(())
+        for crop in batch:
+            gaussians = model.decode_shown(params, crop.cache, crop.num_pivots)
+            out = render(gaussians, crop.camera, effects=EFFECTS, max_pairs=crop.max_pairs)
+            filled = fill_holes(out.color, out.alpha, mean_color(gaussians))
+            target = crop.image.astype(jnp.float32) / 255
+            shown += negative_psnr(filled * crop.exposure, target) / len(batch)
+            black += negative_psnr(out.color * crop.exposure, target) / len(batch)
+        loss = (1 - self.black_weight) * shown + self.black_weight * black
+        return loss, {"psnr": -shown, "psnr_over_black": -black, "loss": loss}
+
+
+def _mean_over(one: Callable[[Any], tuple], batch: Any, *, along: Callable) -> tuple:
+    """Means of `one` over the leading axis of `batch`, which `along` maps over it."""
+    if len(batch.log_depths) == 1:
+        return one(jax.tree.map(lambda x: x[0], batch))
+    return jax.tree.map(jnp.mean, along(one)(batch))
+
+
+def pad_like(truth: Float[Array, "v h w"], predicted: Float[Array, "v hf wf"]) -> Float[Array, "v hf wf"]:
+    """`truth` edge-padded to the shape of `predicted`, as images are padded. Losses skip the padding by `inside`."""
+    return jnp.pad(truth, [(0, n - m) for m, n in zip(truth.shape, predicted.shape, strict=True)], mode="edge")
+
+
+def decode_accepted(model: StreamSplat, params: dict, cache: VoxelCache, tokens: Tokens) -> Gaussians:
+    """Gaussians of the tokens that inference would accept, without merging.
+
+    Those are the tokens whose confidence, after the votes of depths stored in `cache`, is at least `min_confidence`.
+    The cache is a constant.
+    """
+    gaussians = model.decode_tokens(params, tokens)
+    revised = vote(*jax.lax.stop_gradient((cache.stored_depths, tokens)), model.config)
+    is_accepted = tokens.valid & (revised.confidences >= model.config.memory.min_confidence)
+    return mask_gaussians(gaussians, model.repeat_per_gaussian(is_accepted))
 
 
 def soft_targets(
@@ -18,10 +220,7 @@ def soft_targets(
 ) -> Float[Array, "*b d"]:
     """Target distribution over the candidates: a normalized Gaussian around the true depth.
 
-    Args:
-        log_depths: natural logarithms of the true depths.
-        log_candidates: natural logarithms of the candidates.
-        width: standard deviation in steps between candidates.
+    Its standard deviation is `width` steps between candidates.
 
     Limits:
         A single candidate has probability 1; candidates at one depth have equal probabilities.
@@ -40,7 +239,7 @@ def depth_loss(
     usable: Bool[Array, "v hf wf"],
     *,
     target_width: float,
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
+) -> tuple[Scalar, Scalar]:
     """Cross entropy of P_i and L1 of the anchored log depth: means over usable cells with a true depth in range.
 
     Args:
@@ -50,9 +249,6 @@ def depth_loss(
         log_candidates: natural logarithms of the candidates, which give the range.
         usable: cells that count.
         target_width: see `soft_targets`.
-
-    Returns:
-        The cross entropy and the L1.
 
     Limits:
         A true depth that is infinite (-inf is the logarithm of an unknown 0) or NaN is out of range and contributes
@@ -66,49 +262,12 @@ def depth_loss(
     return jnp.sum(weight * entropy), jnp.sum(weight * jnp.abs(predicted - truth))
 
 
-def image_gradient_l1(a: Float[Array, "s h w 3"], b: Float[Array, "s h w 3"]) -> Float[Array, ""]:
+def image_gradient_l1(a: Float[Array, "s h w 3"], b: Float[Array, "s h w 3"]) -> Scalar:
     """L1 distance of the horizontal and vertical pixel differences of two images."""
     difference = a - b
     horizontal = jnp.abs(difference[:, :, 1:] - difference[:, :, :-1]).mean()
     vertical = jnp.abs(difference[:, 1:] - difference[:, :-1]).mean()
     return horizontal + vertical
-
-
-MAX_GAIN = 2.0
-"""Largest gain between a scene and a photograph that training divides out; its reciprocal is the smallest."""
-
-
-class RenderingLoss(NamedTuple):
-    """Loss of rendered views, and its parts."""
-
-    total: Float[Array, ""]
-    mse: Float[Array, ""]
-    lpips: Float[Array, ""] | None  # None without LPIPS weights
-
-
-def rendering_loss(
-    images: Float[Array, "s h w 3"],
-    targets: Float[Array, "s h w 3"],
-    recipe: Recipe,
-    lpips_weights: LpipsWeights | None = None,
-) -> RenderingLoss:
-    """MSE and LPIPS (Eq. training_loss), or MSE and the L1 of image gradients without LPIPS weights.
-
-    The mean over the views, or with `recipe.sum_views` their sum; the parts are means in either case.
-
-    Args:
-        images: rendered views, RGB.
-        targets: true views, RGB in [0, 1].
-        recipe: gives the weights of the terms.
-        lpips_weights: weights of LPIPS, if there are any.
-    """
-    num_views = len(images) if recipe.sum_views else 1
-    mse = jnp.mean((images - targets) ** 2)
-    if lpips_weights is None:
-        total = mse + recipe.gradient_weight * image_gradient_l1(images, targets)
-        return RenderingLoss(num_views * total, mse, None)
-    distance = lpips(lpips_weights, images, targets).mean()
-    return RenderingLoss(num_views * (mse + recipe.lpips_weight * distance), mse, distance)
 
 
 def fitted_gains(images: Float[Array, "s h w 3"], targets: Float[Array, "s h w 3"]) -> Float[Array, "s 1 1 3"]:
@@ -123,3 +282,9 @@ def fitted_gains(images: Float[Array, "s h w 3"], targets: Float[Array, "s h w 3
     energy = jnp.sum(images * images, axis=(1, 2), keepdims=True)
     gains = jnp.sum(images * targets, axis=(1, 2), keepdims=True) / jnp.where(energy > 0, energy, 1.0)
     return jnp.where(energy > 0, jnp.clip(gains, 1 / MAX_GAIN, MAX_GAIN), 1.0)
+
+
+def negative_psnr(image: Float[Array, "h w 3"], target: Float[Array, "h w 3"]) -> Scalar:
+    """Minus the PSNR in dB, whose gradient is as large for an easy scene as for a hard one."""
+    mse = jnp.mean((jnp.clip(image, 0.0, 1.0) - target) ** 2)
+    return 10 / math.log(10) * jnp.log(mse + MIN_MSE)

@@ -10,8 +10,7 @@ has already revised. No gradient flows through the comparison.
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Sequence
-from pathlib import Path
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -31,22 +30,26 @@ from ssplat_jax.refinement.refine_step import RefineState, init_refinement
 from ssplat_jax.refinement.refiner_weights import init_refiner
 from ssplat_jax.refinement.revision import Revision, apply_revision, bounded
 from ssplat_jax.refinement.view_loss import EFFECTS
-from ssplat_jax.training.streamed_scenes import SceneSources, captures_of, negative_psnr, stream_scene
+from ssplat_jax.training.capture_mix import CaptureMix
+from ssplat_jax.training.crops import Crops, stream_scene
+from ssplat_jax.training.losses import negative_psnr
 
 CONFIG = dataclasses.replace(FOR_CAPTURES, held_back=0.0, max_new=0.0)
 """Configuration of the passes: that of captures, but no pixel is held back and no Gaussian is added."""
 
-SMALLEST = (16, 16)
-"""Smallest height and width of images to learn from."""
+SCENES = Crops(size=(16, 16))
+"""Scenes of the recipe; no image may be smaller."""
 
 SCORED_VIEWS = 3
 """Views of each scene on which a round is scored."""
 
 
 @dataclasses.dataclass(frozen=True)
-class RefinerRecipe(SceneSources):
-    """Everything that decides the refiner, besides the scenes and the weights of the stream."""
+class RefinerRecipe:
+    """Everything that decides the refiner, besides captures and the weights of the stream."""
 
+    scenes: Crops = SCENES
+    """Procedural scenes, and how they and captures are streamed; of images smaller than `size` nothing is learned."""
     rounds: int = 4
     """Rounds; the scenes of a round have been revised by as many passes as there were rounds before it."""
     steps: int = 250
@@ -70,8 +73,8 @@ class RefinerRecipe(SceneSources):
 
 
 @dataclasses.dataclass
-class _Lesson:
-    """A scene in one round: its state, what some views say about it, and the other views."""
+class TrainingScene:
+    """One training sample: a scene, its observed errors, and held-out views."""
 
     key_views: KeyViews
     max_pairs: int
@@ -83,7 +86,7 @@ class _Lesson:
 def train_refiner(
     model: StreamSplat,
     params: dict,
-    captures: Sequence[Path],
+    mix: CaptureMix | None,
     recipe: RefinerRecipe,
     *,
     on_scene: Callable[[str], None] = lambda name: None,
@@ -94,7 +97,7 @@ def train_refiner(
     Args:
         model: the model whose scenes are refined.
         params: its parameters.
-        captures: captures, or folders of them, to learn from besides the recipe's procedural scenes.
+        mix: captures to learn from besides the recipe's procedural scenes.
         recipe: rounds, steps, rates and scenes.
         on_scene: called with the name of each scene when it has been streamed.
         on_step: called after each step with the number of steps done and the PSNR of its view, `shown_psnr` and
@@ -109,30 +112,30 @@ def train_refiner(
     """
     rng = np.random.default_rng(recipe.seed)
     scenes, names, states = [], [], []
-    for capture, stride in captures_of(captures, recipe, SMALLEST):
-        scene = stream_scene(model, params, capture, stride)
-        gaussians = jax.jit(model.decode_shown, static_argnums=2)(params, scene.cache, scene.num_pivots)
-        scenes.append((scene.key_views, scene.max_pairs))
-        names.append(scene.name)
+    for capture, stride in recipe.scenes.scenes(mix):
+        cache, key_views, num_pivots, max_pairs = stream_scene(model, params, capture, stride)
+        gaussians = jax.jit(model.decode_shown, static_argnums=2)(params, cache, num_pivots)
+        scenes.append((key_views, max_pairs))
+        names.append(f"{capture.name}, stride {stride}")
         states.append(init_refinement(only_present(gaussians, present_rows(gaussians)), config=CONFIG))
-        on_scene(scene.name)
+        on_scene(names[-1])
     refiner = mean = init_refiner(recipe.seed)
-    idle = jax.tree.map(jnp.zeros_like, refiner)  # it changes nothing
+    zero_params = jax.tree.map(jnp.zeros_like, refiner)  # baseline: predicts no change
     optimizer = optax.chain(
         optax.clip_by_global_norm(recipe.clip_norm),
         optax.scale_by_adam(),
         optax.add_decayed_weights(recipe.weight_decay),
     )
-    moments, lessons, step, rounds = optimizer.init(refiner), [], 0, []
+    moments, samples, step, rounds = optimizer.init(refiner), [], 0, []
     for _ in range(recipe.rounds):
-        fresh = [_lesson(*scene, state, recipe, rng) for scene, state in zip(scenes, states, strict=True)]
-        lessons += fresh
+        fresh = [_compared(*scene, state, recipe, rng) for scene, state in zip(scenes, states, strict=True)]
+        samples += fresh
         for _ in range(recipe.steps):
             # Half of the steps learn from this round's scenes, the others from those of all rounds.
-            lesson = (fresh if step % 2 else lessons)[rng.integers(len(fresh if step % 2 else lessons))]
-            view = jnp.asarray(rng.choice(lesson.others), jnp.int32)
-            slope = _compiled(lesson.max_pairs, recipe.black_weight)
-            gradient, record = slope(refiner, lesson.state, lesson.seen, lesson.key_views, view)
+            sample = (fresh if step % 2 else samples)[rng.integers(len(fresh if step % 2 else samples))]
+            view = jnp.asarray(rng.choice(sample.others), jnp.int32)
+            gradient_of = _compiled(sample.max_pairs, recipe.black_weight)
+            gradient, record = gradient_of(refiner, sample.state, sample.seen, sample.key_views, view)
             if all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(gradient)):
                 updates, moments = optimizer.update(gradient, moments, refiner)
                 rate = _learning_rate(recipe, step)
@@ -140,18 +143,20 @@ def train_refiner(
                 mean = jax.tree.map(lambda m, x: recipe.ema_decay * m + (1 - recipe.ema_decay) * x, mean, refiner)
             step += 1
             on_step(step, {name: float(value) for name, value in record.items()})
-        rounds.append({"before": _scores(idle, fresh, recipe), "after": _scores(mean, fresh, recipe)})
-        states = [_after_pass(mean, lesson) for lesson in fresh]
+        rounds.append({"before": _scores(zero_params, fresh, recipe), "after": _scores(mean, fresh, recipe)})
+        states = [_after_pass(mean, sample) for sample in fresh]
     return mean, {"scenes": names, "rounds": rounds}
 
 
-def _scores(refiner: dict, lessons: list[_Lesson], recipe: RefinerRecipe) -> dict[str, float]:
-    """Mean PSNRs after a pass with `refiner` on the first views that each lesson was not compared with."""
+def _scores(refiner: dict, samples: list[TrainingScene], recipe: RefinerRecipe) -> dict[str, float]:
+    """Mean PSNRs after a pass with `refiner` on the first views that each sample was not compared with."""
     found = []
-    for lesson in lessons:
-        slope = _compiled(lesson.max_pairs, recipe.black_weight)
-        for view in lesson.others[:SCORED_VIEWS]:
-            found.append(slope(refiner, lesson.state, lesson.seen, lesson.key_views, jnp.asarray(view, jnp.int32))[1])
+    for sample in samples:
+        gradient_of = _compiled(sample.max_pairs, recipe.black_weight)
+        for view in sample.others[:SCORED_VIEWS]:
+            found.append(
+                gradient_of(refiner, sample.state, sample.seen, sample.key_views, jnp.asarray(view, jnp.int32))[1]
+            )
     return {name: round(float(np.mean([scores[name] for scores in found])), 3) for name in found[0]}
 
 
@@ -162,16 +167,16 @@ def _learning_rate(recipe: RefinerRecipe, step: int) -> float:
     return recipe.learning_rate * warmup * share
 
 
-def _lesson(
+def _compared(
     key_views: KeyViews, max_pairs: int, state: RefineState, recipe: RefinerRecipe, rng: np.random.Generator
-) -> _Lesson:
-    """A scene, compared with some of its views."""
+) -> TrainingScene:
+    """A scene, compared with some of its views; the others are held out."""
     order = rng.permutation(key_views.num_slots)
     num_seen = min(int(rng.choice(recipe.views)), key_views.num_slots // 2)
     seen = no_errors(state.start)
     for view in order[:num_seen]:
         seen = _add_view(max_pairs)(seen, state, key_views, jnp.asarray(view, jnp.int32))
-    return _Lesson(key_views, max_pairs, state, seen, [int(view) for view in order[num_seen:]])
+    return TrainingScene(key_views, max_pairs, state, seen, [int(view) for view in order[num_seen:]])
 
 
 @functools.lru_cache(maxsize=64)
@@ -182,12 +187,12 @@ def _add_view(max_pairs: int):
     return jax.jit(add)
 
 
-def _after_pass(refiner: dict, lesson: _Lesson) -> RefineState:
-    """The lesson's state after a pass on what its views say.
+def _after_pass(refiner: dict, sample: TrainingScene) -> RefineState:
+    """The sample's state after a pass on what its views say.
 
     The program returns the revision alone: a whole state would be a copy of the scene for every round.
     """
-    return replace(lesson.state, revision=jax.jit(_moved)(refiner, lesson.state, lesson.seen))
+    return replace(sample.state, revision=jax.jit(_moved)(refiner, sample.state, sample.seen))
 
 
 def _moved(refiner: dict, state: RefineState, seen: SeenErrors) -> Revision:

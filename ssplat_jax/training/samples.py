@@ -1,30 +1,37 @@
-"""Training samples: procedural views in the stream frame, split into chunks of context views and target views."""
+"""Samples of streamed views, procedural or of a capture: chunks of context views with true depths, and target views.
 
-import collections
-from collections.abc import Callable, Generator, Iterable
-from concurrent.futures import Future, ThreadPoolExecutor, wait
-from typing import TypeVar
+`Views` says what the samples of a phase are.
+"""
 
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from ssplat_jax.config import MEDIAN_DEPTH, StreamConfig
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.chunk import Chunk
-from ssplat_jax.core.errors import InputError
+from ssplat_jax.core.errors import InputError, refusal
 from ssplat_jax.core.pytree import pytree
+from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.depth_range import FAR_FACTOR, NEAR_FACTOR
 from ssplat_jax.data.procedural.procedural_views import STEP_RANGE, training_sample
+from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.model import GRID_STRIDE
-from ssplat_jax.training.recipe import Recipe
-
-Product = TypeVar("Product")
+from ssplat_jax.training.capture_mix import CaptureMix, PhaseStart, held_out_frames, learned_frames
 
 MAX_LOG_STEP = 0.05
 """Log depths of neighboring pixels that differ by more belong to different surfaces."""
 NEARLY = 1 - 1e-4
 """Factor on the farthest depth that gives one within the range."""
+MAX_STRIDE = 8
+"""Largest distance of consecutive frames of a sample, in frames that may be learned from."""
+NUM_HELD_OUT = 8
+"""Most samples of a validation, one a capture."""
 
 
 @pytree
@@ -34,129 +41,217 @@ class Sample:
     chunks: Chunk  # leading axis t
     log_depths: Float[Array, "t v hf wf"]  # true ln z at the centers of cells
     target_images: Float[Array, "s h w 3"]
-    target_viewmats: Float[Array, "s 4 4"]
-    target_Ks: Float[Array, "s 3 3"]
-
-    @property
-    def target_camera(self) -> Camera:
-        """Cameras of the target views, as one batch."""
-        height, width = self.target_images.shape[1:3]
-        return Camera(viewmats=self.target_viewmats, Ks=self.target_Ks, width=width, height=height)
+    target_camera: Camera  # leading axis s
 
 
-def choose_targets(rng: np.random.Generator, num_views: int, num_targets: int) -> np.ndarray:
-    """Ascending positions of `num_targets` targets, drawn among `num_views` views but the first and the last."""
-    return np.sort(rng.choice(np.arange(1, num_views - 1), size=num_targets, replace=False))
+@dataclasses.dataclass(frozen=True)
+class Views:
+    """Samples of a phase that streams views anew in every step, so that gradients flow through the network."""
+
+    num_chunks: int
+    """Chunks streamed through the cache per sample."""
+    sizes: tuple[tuple[int, int], ...]
+    """Image sizes (height, width), used alternately; one program is compiled per size."""
+    num_targets: int = 0
+    """Novel views per sample."""
+    batch: int = 1
+    """Samples per step; the loss is their mean."""
+    steps_of_depth: tuple[float, float] = STEP_RANGE
+    """Range of the distance between consecutive procedural views in median depths: from hand-held video to photo sets.
+    Some samples cannot be matched at all, so that confidence learns to say so."""
+    kinds: tuple[str, ...] = ()
+    """Kinds of procedural worlds, of which each sample draws one; repeated ones are more likely. Empty: all kinds but
+    yards, with the shares of `data/procedural/scenes.py`."""
+    range_jitter: float = 0.25
+    """Largest error of scene scale, near and far (log of a factor), for robustness to estimated ones."""
+
+    def __post_init__(self) -> None:
+        if min(self.num_chunks, self.batch) < 1 or self.num_targets < 0 or not self.sizes:
+            raise InputError(f"recipe: wanted num_chunks and batch of at least 1 and an image size, got {self}.")
+
+    def check(self, mix: CaptureMix, config: StreamConfig, *, renders: bool) -> None:
+        """Refuses captures that cannot teach the phase; without `renders` it learns from depth maps alone."""
+        needed = self.num_chunks * config.stream.chunk_size + self.num_targets
+        for capture in mix.captures:
+            learned = learned_frames(capture)
+            if len(learned) < needed:
+                wanted = f"at least {needed} frames besides those held out, as a sample of the recipe has"
+                raise refusal(f"--captures {capture.name}", wanted=wanted, got=len(learned), fix="leave it out")
+            if not renders and not any(map(capture.pixels.has_depth, learned)):
+                wanted = "depth maps, from which alone this recipe learns"
+                fix = "leave it out, or choose a recipe that renders target views, such as stream"
+                raise refusal(f"--captures {capture.name}", wanted=wanted, got="none", fix=fix)
+
+    def open(self, start: PhaseStart) -> Callable[[int, int], Sample]:
+        """Makes the samples of a step, stacked, from its number and its place in the phase, and from nothing else."""
+        mix, seed = start.mix, start.seed
+
+        def sample(number: int, size: tuple[int, int]) -> Sample:
+            if mix is not None and (capture := mix.draw(np.random.default_rng([seed, number, 13]))) is not None:
+                return capture_sample(self, mix, capture, [seed, number, 17], size)
+            return procedural_sample(self, seed * 1_000_003 + number, size, start.model.config)
+
+        def batch(step: int, place: int) -> Sample:
+            numbers = range(step, step + self.batch * start.num_steps, start.num_steps)
+            size = self.sizes[place % len(self.sizes)]
+            with jax.default_device(_cpu()):
+                return jax.tree.map(lambda *parts: jnp.stack(parts), *[sample(number, size) for number in numbers])
+
+        return batch
+
+    def held_out(self, mix: CaptureMix) -> list[Sample]:
+        """Batches of one sample with a held-out target each; of one size, so of one program."""
+        every = mix.captures
+        places = np.unique(np.linspace(0, len(every) - 1, NUM_HELD_OUT).round().astype(int))
+        samples = [held_out_sample(self, mix, every[place], [i, 19]) for i, place in enumerate(places)]
+        return [jax.tree.map(lambda x: x[None], sample) for sample in samples]
 
 
-def make_sample(
-    seed: int,
-    *,
-    num_chunks: int,
-    num_targets: int,
-    size: tuple[int, int],
-    config: StreamConfig,
-    steps_of_depth: tuple[float, float] = STEP_RANGE,
-    kinds: tuple[str, ...] = (),
-    range_jitter: float = Recipe.range_jitter,
-) -> Sample:
-    """Sample number `seed`, the same for the same arguments.
+def _cpu():
+    """The device that makes samples: the CPU, or JAX's default (None) where `JAX_PLATFORMS` leaves the CPU out."""
+    try:
+        return jax.local_devices(backend="cpu")[0]
+    except RuntimeError:
+        return None
 
-    Args:
-        seed: number of the sample.
-        num_chunks: chunks of context views.
-        num_targets: target views.
-        size: height and width of the images.
-        config: gives chunk size and median depth.
-        steps_of_depth: see `Phase`.
-        kinds: see `Phase`.
-        range_jitter: see `Recipe`.
+
+def procedural_sample(views: Views, seed: int, size: tuple[int, int], config: StreamConfig) -> Sample:
+    """A sample of a procedural world, at `size` (height, width); the same for the same arguments.
 
     Raises:
         InputError: there are targets, but only one context view.
     """
     rng = np.random.default_rng([seed, 7])
-    height, width = size
-    num_context = num_chunks * config.stream.chunk_size
-    if num_targets and num_context < 2:
+    num_context = views.num_chunks * config.stream.chunk_size
+    if views.num_targets and num_context < 2:
         raise InputError("training: wanted context views around targets, got a context of one view; use no targets.")
-    num_views = num_context + num_targets
-    arrays = training_sample(seed, num_views, height, width, steps=steps_of_depth, kinds=kinds)
+    num_views = num_context + views.num_targets
+    arrays = training_sample(seed, num_views, *size, steps=views.steps_of_depth, kinds=views.kinds)
     images, depths, camtoworlds, Ks = (np.asarray(a) for a in arrays)
-    is_target = np.zeros(num_views, bool)
-    if num_targets:
-        is_target[choose_targets(rng, num_views, num_targets)] = True
-    context = np.flatnonzero(~is_target)
+    targets = _choose_targets(rng, num_views, views.num_targets)
+    context = np.setdiff1d(np.arange(num_views), targets)
 
-    seen = depths[context][np.isfinite(depths[context])]
-    scale = MEDIAN_DEPTH / np.median(seen) * np.exp(rng.uniform(-range_jitter, range_jitter))
-    viewmats = _stream_viewmats(camtoworlds.astype(np.float64), int(context[0]), float(scale))
+    seen, jitter = depths[context][np.isfinite(depths[context])], views.range_jitter
+    scale = float(MEDIAN_DEPTH / np.median(seen) * np.exp(rng.uniform(-jitter, jitter)))
     low, high = np.quantile(seen * scale, [0.01, 0.99])
-    near = NEAR_FACTOR * low * np.exp(rng.uniform(-range_jitter, range_jitter))
-    far = FAR_FACTOR * high * np.exp(rng.uniform(-range_jitter, range_jitter))
-    # No candidate is as far as the sky. The last one stands for it, which draws it behind everything else.
-    depths = np.where(np.isfinite(depths), depths * scale, NEARLY * far)
-
-    return sample_of_views(
+    near = NEAR_FACTOR * low * np.exp(rng.uniform(-jitter, jitter))
+    far = FAR_FACTOR * high * np.exp(rng.uniform(-jitter, jitter))
+    relative = np.linalg.inv(camtoworlds.astype(np.float64)[context[0]]) @ camtoworlds.astype(np.float64)
+    relative[:, :3, 3] *= scale
+    return _sample_of_views(
         images=images,
-        depths=depths,
-        viewmats=viewmats,
+        # No candidate is as far as the sky. The last one stands for it, which draws it behind everything else, where
+        # its error shows least.
+        depths=np.where(np.isfinite(depths), depths * scale, NEARLY * far),
+        viewmats=np.linalg.inv(relative).astype(np.float32),
         Ks=Ks,
         context=context,
-        targets=np.flatnonzero(is_target),
+        targets=targets,
         near=near,
         far=far,
         config=config,
     )
 
 
-def sample_of_views(
-    *,
-    images: Float[np.ndarray, "n h w 3"],
-    depths: Float[np.ndarray, "n h w"],
-    viewmats: Float[np.ndarray, "n 4 4"],
-    Ks: Float[np.ndarray, "n 3 3"],
-    context: Int[np.ndarray, " m"],
-    targets: Int[np.ndarray, " s"],
-    near: float,
-    far: float,
-    config: StreamConfig,
-) -> Sample:
-    """Sample of the views `context`, chunk by chunk in their order, and `targets`.
+def _choose_targets(rng: np.random.Generator, num_views: int, num_targets: int) -> np.ndarray:
+    """Ascending positions of `num_targets` targets, drawn among `num_views` views but the first and the last."""
+    if not num_targets:
+        return np.zeros(0, int)
+    return np.sort(rng.choice(np.arange(1, num_views - 1), size=num_targets, replace=False))
 
-    Args:
-        images: RGB in [0, 1].
-        depths: camera z, stream units; NaN where unknown.
-        viewmats: world to camera, stream frame.
-        Ks: intrinsics, pixels.
-        context: places of the context views, a multiple of the chunk size.
-        targets: places of the target views.
-        near: nearest depth candidate, stream units.
-        far: farthest depth candidate, stream units.
-        config: gives the chunk size.
+
+def capture_sample(
+    views: Views, mix: CaptureMix, capture: Capture, seed: Sequence[int], size: tuple[int, int]
+) -> Sample:
+    """A sample of frames that may be learned from, at `size` (height, width); the same for the same arguments."""
+    rng = np.random.default_rng(seed)
+    num_views = views.num_chunks * mix.config.stream.chunk_size + views.num_targets
+    frames = _window(rng, learned_frames(capture), num_views)
+    chosen = set(_choose_targets(rng, num_views, views.num_targets).tolist())
+    context = [i for place, i in enumerate(frames) if place not in chosen]
+    targets = [i for place, i in enumerate(frames) if place in chosen]
+    return _sample_of_frames(mix, capture, context, targets, size, rng, views.range_jitter)
+
+
+def held_out_sample(views: Views, mix: CaptureMix, capture: Capture, seed: Sequence[int]) -> Sample:
+    """A sample whose one target is held out, between context views that are not; see `capture_sample`.
+
+    Limits:
+        Without a held-out frame between the context views, the nearest one beside them is taken.
     """
+    rng = np.random.default_rng(seed)
+    context = _window(rng, learned_frames(capture), views.num_chunks * mix.config.stream.chunk_size)
+    middle = (context[0] + context[-1]) / 2
+    target = min(held_out_frames(capture), key=lambda i: abs(i - middle))
+    return _sample_of_frames(mix, capture, context, [target], views.sizes[0], rng, 0.0)
+
+
+def _window(rng: np.random.Generator, frames: list[int], count: int) -> list[int]:
+    """`count` frames at equal distances, the distance drawn log-uniformly and the place uniformly."""
+    widest = min(MAX_STRIDE, (len(frames) - 1) // max(count - 1, 1))
+    stride = round(math.exp(rng.uniform(0.0, math.log(widest)))) if widest > 1 else 1
+    first = int(rng.integers(len(frames) - stride * (count - 1)))
+    return frames[first : first + stride * (count - 1) + 1 : stride]
+
+
+def _sample_of_frames(mix: CaptureMix, capture: Capture, context, targets, size, rng, range_jitter: float) -> Sample:
+    """The sample of these frames; context views in the order of streaming."""
+    height, width = size
+    delivered = dataclasses.replace(capture, height=height, width=width)
+    known = mix.frame_of(capture)
+    context = delivered.stream_order(mix.config, context, known)
+    scale, near, far = np.exp(rng.uniform(-range_jitter, range_jitter, 3))
+    frame = StreamFrame.at_camera(
+        capture.frames[context[0]].camtoworld,
+        scale=known.scale * scale,
+        near=known.near * scale * near,
+        far=known.far * scale * far,
+    )
+    frames = [*context, *targets]
+    return _sample_of_views(
+        images=np.stack([delivered.image(i) for i in frames]),
+        depths=np.stack([frame.scale * _depth(delivered, i) for i in frames]),
+        viewmats=frame.viewmats(capture.camtoworlds[frames]),
+        Ks=np.stack([delivered.K(i) for i in frames]),
+        context=np.arange(len(context)),
+        targets=np.arange(len(context), len(frames)),
+        near=frame.near,
+        far=frame.far,
+        config=mix.config,
+    )
+
+
+def _depth(capture: Capture, i: int) -> np.ndarray:
+    """Depth map of a frame, capture units, NaN where unknown: losses leave such cells out."""
+    depth = capture.depth(i)
+    if depth is None:
+        return np.full((capture.height, capture.width), np.nan, np.float32)
+    return np.where(depth > 0, depth, np.nan)
+
+
+def _sample_of_views(*, images, depths, viewmats, Ks, context, targets, near, far, config: StreamConfig) -> Sample:
+    """Sample of the views at the places `context`, chunk by chunk, and `targets`; NumPy arrays, stream units."""
     num_chunks = len(context) // config.stream.chunk_size
-    chunked = lambda x: x[context].reshape(num_chunks, config.stream.chunk_size, *x.shape[1:])  # noqa: E731
+    chunked = lambda x: jnp.asarray(x[context].reshape(num_chunks, config.stream.chunk_size, *x.shape[1:]))  # noqa: E731
+    height, width = images.shape[1:3]
+    Ks = Ks.astype(np.float32)
     return Sample(
         chunks=Chunk(
-            images=jnp.asarray(chunked(images)),
-            viewmats=jnp.asarray(chunked(viewmats)),
-            Ks=jnp.asarray(chunked(Ks.astype(np.float32))),
+            images=chunked(images),
+            viewmats=chunked(viewmats),
+            Ks=chunked(Ks),
             valid=jnp.ones((num_chunks, config.stream.chunk_size), bool),
             near=jnp.full(num_chunks, near, jnp.float32),
             far=jnp.full(num_chunks, far, jnp.float32),
         ),
-        log_depths=jnp.asarray(log_depths_at_cells(chunked(depths))),
+        log_depths=chunked(log_depths_at_cells(depths)),
         target_images=jnp.asarray(images[targets]),
-        target_viewmats=jnp.asarray(viewmats[targets]),
-        target_Ks=jnp.asarray(Ks[targets].astype(np.float32)),
+        target_camera=Camera(jnp.asarray(viewmats[targets]), jnp.asarray(Ks[targets]), width, height),
     )
 
 
 def log_depths_at_cells(depths: Float[np.ndarray, "*b h w"]) -> Float[np.ndarray, "*b hf wf"]:
-    """Log depths at the centers of cells: means over the four pixels around.
-
-    Where the four differ by more than `MAX_LOG_STEP`, their mean is on no surface, and one of the four is taken.
+    """Log depths at the centers of cells, the common corners of four pixels: means over the four.
 
     Limits:
         NaN where one of the four is NaN.
@@ -164,49 +259,8 @@ def log_depths_at_cells(depths: Float[np.ndarray, "*b h w"]) -> Float[np.ndarray
     before = GRID_STRIDE // 2 - 1
     # Cells whose center is on the edge of the image are left out: they have pixels on one side only.
     rows, cols = ((side - before - 2) // GRID_STRIDE + 1 for side in depths.shape[-2:])
-    around = np.log(
-        [
-            depths[..., y::GRID_STRIDE, x::GRID_STRIDE][..., :rows, :cols]
-            for y in (before, before + 1)
-            for x in (before, before + 1)
-        ]
-    )
+    corners = [(y, x) for y in (before, before + 1) for x in (before, before + 1)]
+    around = np.log([depths[..., y::GRID_STRIDE, x::GRID_STRIDE][..., :rows, :cols] for y, x in corners])
+    # At an edge of depth the mean of the four would lie on no surface: one of them is taken.
     is_edge = np.ptp(around, axis=0) > MAX_LOG_STEP
     return np.where(is_edge, around[-1], around.mean(axis=0)).astype(np.float32)
-
-
-def _stream_viewmats(camtoworlds, first: int, scale: float):
-    """World-to-camera matrices with view `first` at the origin and lengths multiplied by `scale`, from float64."""
-    relative = np.linalg.inv(camtoworlds[first]) @ camtoworlds
-    relative[:, :3, 3] *= scale
-    return np.linalg.inv(relative).astype(np.float32)
-
-
-def prefetched(
-    produce: Callable[[int], Product], steps: Iterable[int], workers: int = 1
-) -> Generator[tuple[int, Product], None, None]:
-    """Yields (step, produce(step)) in order, computed ahead in threads.
-
-    The first is computed alone, so that the others find in caches what all of them need. An exception in `produce` is
-    raised here.
-
-    Args:
-        produce: makes the samples of a step; called in the threads.
-        steps: numbers of the steps.
-        workers: threads. Together they are at most `2 * workers` steps ahead.
-    """
-    ahead: collections.deque[tuple[int, Future]] = collections.deque()
-    with ThreadPoolExecutor(workers) as pool:
-        try:
-            for i, step in enumerate(steps):
-                ahead.append((step, pool.submit(produce, step)))
-                if i == 0:
-                    wait([ahead[0][1]])
-                if len(ahead) > 2 * workers:
-                    done, future = ahead.popleft()
-                    yield done, future.result()
-            while ahead:
-                done, future = ahead.popleft()
-                yield done, future.result()
-        finally:
-            pool.shutdown(cancel_futures=True)

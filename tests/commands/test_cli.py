@@ -239,8 +239,8 @@ def test_bad_values_are_one_line_and_exit_2(arguments, named, capsys, tmp_path, 
 
 def test_lpips_weights_are_refused_where_nothing_is_rendered(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(train_command, "load_lpips_weights", lambda vgg, heads: object())
-    assert run("train", "--recipe", "depth", "--out", str(tmp_path / "x")) == 2
-    assert "--lpips-vgg: --recipe depth renders nothing" in capsys.readouterr().err
+    assert run("train", "--recipe", "depth", "--lpips-vgg", "vgg.npz", "--out", str(tmp_path / "x")) == 2
+    assert "--lpips-vgg: --recipe depth has no use for it" in capsys.readouterr().err
     assert not (tmp_path / "x").exists()
 
 

@@ -41,7 +41,7 @@ def test_demo_says_how_long_it_takes_and_what_is_next(quiet, tmp_path, monkeypat
 
 
 def test_train_says_how_long_it_takes_and_what_is_next(tmp_path, monkeypatch, capsys):
-    finished = types.SimpleNamespace(interrupted=None, step=1700, state=types.SimpleNamespace(ema={}))
+    finished = types.SimpleNamespace(interrupted=None, step=1700, params={})
     monkeypatch.setattr("ssplat_jax.training.loop.train", lambda *_, **__: finished)
     monkeypatch.setattr("ssplat_jax.storage.weights.save_weights", lambda *_: None)
     run("train", "--out", str(tmp_path), "--scale-steps", "0.5")

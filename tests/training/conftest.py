@@ -1,8 +1,16 @@
-"""Compiles the programs of these tests without LLVM's optimizations; see `compiled_plainly`."""
+"""How the programs of these tests are compiled."""
 
+import jax
 import pytest
 
 
 @pytest.fixture(autouse=True)
 def _compiled_plainly(compiled_plainly):
     pass
+
+
+@pytest.fixture(scope="module", autouse=True)
+def standard_promotion():
+    """Allows type promotion: optax raises a float to an int32 power in Adam's bias correction."""
+    with jax.numpy_dtype_promotion("standard"):
+        yield

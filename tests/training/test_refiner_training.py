@@ -26,25 +26,18 @@ from ssplat_jax.storage.files import load_arrays
 from ssplat_jax.storage.weights import load_params
 from ssplat_jax.streaming.feed import feed_capture
 from ssplat_jax.streaming.session import Session
-from ssplat_jax.training.refiner_training import CONFIG, RefinerRecipe, _after_pass, _Lesson
+from ssplat_jax.training.crops import Crops
+from ssplat_jax.training.refiner_training import CONFIG, RefinerRecipe, TrainingScene, _after_pass
 
 SHIPPED = Path(str(resources.files("ssplat_jax") / "weights" / "tiny.npz"))
 RECIPE = RefinerRecipe(
     rounds=1,
     steps=40,
     views=(4,),
-    width=64,
-    procedural=("procedural:room?frames=12",),
+    scenes=Crops(procedural=("procedural:room?frames=12",), width=64, size=(16, 16)),
     learning_rate=0.01,
     ema_decay=0.5,
 )
-
-
-@pytest.fixture(scope="module", autouse=True)
-def standard_promotion():
-    """Allows type promotion: optax raises a float to an int32 power in Adam's bias correction."""
-    with jax.numpy_dtype_promotion("standard"):
-        yield
 
 
 @pytest.mark.slow
@@ -64,7 +57,7 @@ def test_the_command_writes_a_network_with_which_other_views_gain(tmp_path, monk
 
 
 def test_a_pass_between_rounds_keeps_no_second_copy_of_the_scene():
-    """A lesson of every round is kept: with a copy each, scenes of captures took 23 GB."""
+    """A sample of every round is kept: with a copy each, scenes of captures took 23 GB."""
     gaussians = Gaussians(
         means=jnp.zeros((5, 3)), quats=jnp.ones((5, 4)), scales=jnp.ones((5, 3)), opacities=jnp.full(5, 0.5),
         sh=jnp.zeros((5, 1, 3)),
@@ -72,9 +65,9 @@ def test_a_pass_between_rounds_keeps_no_second_copy_of_the_scene():
     state = init_refinement(gaussians, config=CONFIG)
     seen = no_errors(state.start)
     seen = replace(seen, num_views=seen.num_views + 4, pixels=seen.pixels + 9, signed=seen.signed + 3)
-    lesson = _Lesson(empty_key_views(1, 2, 2), 0, state, seen, [])
+    sample = TrainingScene(empty_key_views(1, 2, 2), 0, state, seen, [])
     network = jax.tree.map(lambda x: x + 0.1, init_refiner(0))
-    after = _after_pass(network, lesson)
+    after = _after_pass(network, sample)
     kept = [a is b for a, b in zip(*map(jax.tree.leaves, (after, state)), strict=True)]
     revised = [a is b for a, b in zip(*map(jax.tree.leaves, (after.revision, state.revision)), strict=True)]
     assert not any(revised) and sum(kept) == len(kept) - len(revised)

@@ -1,0 +1,256 @@
+"""The training loop: its optimizer against the formulas in NumPy, and runs that are stopped, killed and resumed."""
+
+import dataclasses
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ssplat_jax.config import preset
+from ssplat_jax.core.errors import InputError
+from ssplat_jax.model import init_params
+from ssplat_jax.model.streamsplat import StreamSplat
+from ssplat_jax.training import loop
+from ssplat_jax.training.recipe import RECIPES, Recipe, learning
+from tests.model.small import random_params
+from tests.streaming.narrow_model import NARROW
+from tests.training.problems import (
+    DEPTH_PHASE,
+    FIRST,
+    QUADRATIC,
+    STREAM_PHASE,
+    Numbers,
+    assert_equal,
+    flat,
+    flat_names,
+    start_params,
+    train_quadratic,
+)
+
+FLOAT32 = 2e-6  # relative rounding of a few dozen operations
+
+
+def scheduled(phase, place):
+    """Learning rate of a step of a phase, by its formula."""
+    warmup = phase.warmup_steps - 1
+    if place < warmup:
+        return phase.learning_rate * (1 + place) / phase.warmup_steps
+    cosine = 0.5 * (1 + math.cos(math.pi * (place - warmup) / (phase.steps - warmup)))
+    return phase.learning_rate * (phase.final_share + (1 - phase.final_share) * cosine)
+
+
+def formulas(recipe):
+    """Parameters, their average and skipped steps of the quadratic problem: clipping, AdamW and average in float64."""
+    x = {name: np.asarray(value, np.float64) for name, value in flat_names(start_params()).items()}
+    mean, square, average = ({name: np.zeros(3) for name in x} for _ in range(3))
+    steps = [(phase, place) for phase in recipe.phases for place in range(phase.steps)]
+    updates = 0
+    for step, (phase, place) in enumerate(steps):
+        numbers = np.float64(phase.samples.open(SimpleNamespace(seed=recipe.seed))(step, place))
+        paths = {name: name.strip("[]'").replace("']['", "/") for name in x}
+        learns = {name: paths[name].split("/")[0] in phase.stages for name in x}
+        gradients = {name: 2 * phase.loss.weight * (x[name] - numbers) * learns[name] for name in x}
+        norm = math.sqrt(sum((gradient**2).sum() for gradient in gradients.values()))
+        if math.isfinite(norm):
+            updates += 1
+            for name, gradient in gradients.items():
+                clipped = gradient * min(1.0, recipe.clip_norm / norm)
+                mean[name] = 0.9 * mean[name] + (1 - 0.9) * clipped
+                square[name] = recipe.adam_b2 * square[name] + (1 - recipe.adam_b2) * clipped**2
+                unbiased = mean[name] / (1 - 0.9**updates)
+                root = np.sqrt(square[name] / (1 - recipe.adam_b2**updates))
+                rate = scheduled(phase, place) * phase.rate(paths[name])
+                x[name] = x[name] - rate * (unbiased / (root + 1e-8) + recipe.weight_decay * x[name])
+        average = {name: recipe.ema_decay * average[name] + (1 - recipe.ema_decay) * x[name] for name in x}
+    average = {name: value / (1 - recipe.ema_decay ** len(steps)) for name, value in average.items()}
+    return x, average, len(steps) - updates
+
+
+def test_steps_follow_the_formulas(tmp_path):
+    """Clipping, AdamW, schedule, rates of parts, average, and a skipped step, through two phases."""
+    done = train_quadratic(tmp_path)
+    params, average, num_skipped = formulas(QUADRATIC)
+    assert int(done.state.optimizer[0].total_notfinite) == num_skipped == 1
+    for name, value in flat_names(done.state.params).items():
+        np.testing.assert_allclose(value, params[name], rtol=FLOAT32, atol=FLOAT32, err_msg=name)
+        np.testing.assert_allclose(flat_names(done.params)[name], average[name], rtol=FLOAT32, atol=FLOAT32)
+    assert "hpda" not in done.state.params
+    assert_equal(done.params["hpda"], start_params()["hpda"])
+    records = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    assert [(r["step"], r["phase"], r["skipped"]) for r in records] == [(10, "second", 1), (16, "second", 1)]
+
+
+def test_each_phase_moves_its_own_parts(tmp_path):
+    """A part that does not learn in a phase stays to the bit, whatever its moments are."""
+    phases, states = QUADRATIC.phases, []
+    for recipe in (Recipe(phases[:1]), QUADRATIC):
+        scheduled_alike = dataclasses.replace(QUADRATIC, phases=recipe.phases)
+        states.append(train_quadratic(tmp_path / str(len(states)), scheduled_alike).state.params)
+    after_first, after_both = states
+    assert_equal(after_first["encoder"]["cnn"], after_both["encoder"]["cnn"])
+    assert not np.array_equal(after_first["encoder"]["pretrained"]["w"], after_both["encoder"]["pretrained"]["w"])
+    assert "decoder" not in after_first
+
+
+def test_losses_fall(tmp_path):
+    recipe = Recipe((dataclasses.replace(FIRST, steps=60, samples=Numbers()),), clip_norm=10.0)
+    records = []
+    train_quadratic(tmp_path, recipe, report=records.append)
+    losses = [record["loss"] for record in records]
+    assert len(losses) == 6 and losses[-1] < 0.85 * losses[0]
+
+
+def test_a_step_with_a_gradient_that_is_not_finite_is_only_counted():
+    model, recipe = StreamSplat(NARROW), Recipe((DEPTH_PHASE,))
+    params = random_params(NARROW)
+    make = DEPTH_PHASE.samples.open(loop.PhaseStart(model, params, None, 0, 2, print))
+    state = loop.init_state(recipe, params)
+    constants = {name: stage for name, stage in params.items() if name not in state.params}
+    step = lambda state, batch: loop.train_step(  # noqa: E731
+        state, constants, batch, None, model=model, recipe=recipe, phase=DEPTH_PHASE
+    )
+    # After a good step momentum is not zero.
+    state, metrics = step(state, make(0, 0))
+    assert np.isfinite(float(metrics["loss"])) and not np.array_equal(
+        flat(state.params)[0], flat(params["cost_volume"])[0]
+    )
+    before, moments = flat(state.params), flat(state.optimizer[0].inner_state)
+    batch = make(1, 1)
+    broken = dataclasses.replace(batch, chunks=dataclasses.replace(batch.chunks, images=batch.chunks.images * jnp.inf))
+    after, metrics = step(state, broken)
+    assert not np.isfinite(float(metrics["grad_norm"])) and int(after.optimizer[0].total_notfinite) == 1
+    assert_equal(flat(after.params), before)
+    assert_equal(flat(after.optimizer[0].inner_state), moments)
+
+
+class Stop(Exception):
+    """Ends a run in its middle."""
+
+
+def test_an_interrupted_run_ends_as_an_uninterrupted_one(tmp_path):
+    whole = train_quadratic(tmp_path / "whole")
+
+    def fail(record):
+        if record["step"] == 5:
+            raise Stop
+
+    def interrupt(record):
+        if record["step"] == 9:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    every = {"save_every": 2, "log_every": 1}
+    with pytest.raises(Stop):
+        train_quadratic(tmp_path / "parts", report=fail, **every)
+    stopped = train_quadratic(tmp_path / "parts", report=interrupt, **every)
+    assert (stopped.step, stopped.interrupted) == (9, signal.SIGTERM)
+    parts = train_quadratic(tmp_path / "parts", **every)
+    assert (parts.step, parts.interrupted) == (16, None)
+    assert_equal(parts.state, whole.state)
+    assert_equal(parts.params, whole.params)
+    records = [json.loads(line) for line in (tmp_path / "parts" / "log.jsonl").read_text().splitlines()]
+    assert [record["step"] for record in records] == list(range(1, 17))
+    assert_equal(train_quadratic(tmp_path / "parts").params, whole.params)  # a finished run is only read
+
+
+@pytest.mark.slow  # processes that load JAX
+def test_runs_of_one_seed_are_bit_equal_even_if_killed(tmp_path):
+    def start(out):
+        command = [sys.executable, "-m", "tests.training.problems", str(out)]
+        root = Path(__file__).resolve().parents[2]
+        environment = os.environ | {"JAX_NUMPY_DTYPE_PROMOTION": "standard"}
+        return subprocess.Popen(command, cwd=root, env=environment, stdout=subprocess.PIPE, text=True)
+
+    def finish(out):
+        with start(out) as process:
+            assert [int(line) for line in process.stdout][-1] == 200
+        assert process.returncode == 0
+        with np.load(out / "final.npz") as arrays:
+            return dict(arrays)
+
+    whole = finish(tmp_path / "whole")
+    for step in np.sort(np.random.default_rng(0).choice(np.arange(5, 195), 4, replace=False)):
+        with start(tmp_path / "killed") as process:
+            next(line for line in process.stdout if int(line) >= step)
+            process.kill()  # during a save or between two
+        assert process.returncode == -signal.SIGKILL
+    killed = finish(tmp_path / "killed")
+    assert whole.keys() == killed.keys()
+    assert_equal(whole, killed)
+
+
+@pytest.mark.slow  # compiles a whole step that renders
+def test_a_rendering_phase_moves_all_its_stages(tmp_path):
+    params = random_params(NARROW)
+    done = loop.train(NARROW, Recipe((STREAM_PHASE,)), tmp_path, params=params)
+    assert done.step == 2 and all(np.isfinite(x).all() for x in flat(done.params))
+    for name in filter(params.get, done.state.params):
+        pairs = zip(flat(params[name]), flat(done.params[name]), strict=True)
+        assert any(not np.array_equal(a, b) for a, b in pairs), name
+
+
+def test_another_run_is_refused_by_its_first_difference(tmp_path):
+    train_quadratic(tmp_path)
+    for changes, named in (
+        ({"recipe": dataclasses.replace(QUADRATIC, seed=1)}, r"recipe\.seed = 0, wanted 1.* choose another --out"),
+        ({"recipe": dataclasses.replace(QUADRATIC, phases=(FIRST,))}, r"recipe\.phases"),
+        ({"init_weights": "mine"}, "wanted 'mine'"),
+    ):
+        with pytest.raises(InputError, match=named):
+            train_quadratic(tmp_path, **changes)
+    with pytest.raises(InputError, match=r"init_weights = .*, wanted 'random'"):
+        loop.train(NARROW, QUADRATIC, tmp_path)
+
+
+def test_a_phase_without_anything_to_train_is_refused(tmp_path):
+    recipe = Recipe((dataclasses.replace(FIRST, rates=learning("evidence")),))
+    with pytest.raises(InputError, match="wanted a configuration with evidence"):
+        train_quadratic(tmp_path / "out", recipe)
+    assert not (tmp_path / "out").exists()
+
+
+def test_parts_of_the_paper_recipe_exist():
+    """The path of the vision transformer, which learns slowly, is one of the network's."""
+    (phase,) = RECIPES["paper"].phases
+    assert phase.rate("encoder/pretrained/x") == 0.01 and phase.rate("encoder/cnn") == phase.rate("decoder") == 1.0
+    assert phase.rate("evidence") == phase.rate("encoders") == 0.0
+    shapes = jax.eval_shape(lambda key: init_params(key, preset("small"), ["encoder"]), jax.random.key(0))
+    assert "pretrained" in shapes["encoder"]
+
+
+def test_records_of_steps_that_are_taken_again_are_removed(tmp_path):
+    log = tmp_path / "log.jsonl"
+    log.write_text('{"step": 10}\n{"step": 20, "psnr": 1}\n{"step": 20}\n{"step": 30}\n{"ste')
+    loop._Log(log, print, done=20)
+    assert log.read_text() == '{"step": 10}\n{"step": 20, "psnr": 1}\n{"step": 20}\n'
+
+
+def test_prefetch_keeps_order_raises_errors_and_is_two_steps_a_worker_ahead():
+    def slow_at_first(i):
+        time.sleep(0.05 * (i == 0))
+        return i * i
+
+    for workers in (1, 3):
+        assert list(loop.prefetched(slow_at_first, range(9), workers)) == [(i, i * i) for i in range(9)]
+
+    def fail(i):
+        if i == 2:
+            raise ValueError("third")
+
+    with pytest.raises(ValueError, match="third"):
+        list(loop.prefetched(fail, range(5)))
+    made = []
+    steps = loop.prefetched(made.append, range(100), workers=2)
+    next(steps)
+    time.sleep(0.2)  # time for the threads to go further than they may
+    assert len(made) <= 5
+    steps.close()

@@ -1,0 +1,237 @@
+"""Losses of training: their values by hand, what does not count in them, and gradients against finite differences."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ssplat_jax.cache import Tokens
+from ssplat_jax.core.cameras import Camera
+from ssplat_jax.core.gaussians import Gaussians
+from ssplat_jax.core.pytree import replace
+from ssplat_jax.evaluation.lpips import LpipsWeights
+from ssplat_jax.model.streamsplat import StreamSplat
+from ssplat_jax.rasterizer import render
+from ssplat_jax.training import loop, losses
+from ssplat_jax.training.crops import crop_camera
+from ssplat_jax.training.losses import (
+    MAX_GAIN,
+    DepthLoss,
+    RenderingLoss,
+    decode_accepted,
+    depth_loss,
+    fitted_gains,
+    image_gradient_l1,
+    negative_psnr,
+    pad_like,
+    soft_targets,
+)
+from ssplat_jax.training.recipe import RECIPES
+from ssplat_jax.training.samples import Views, procedural_sample
+from tests.model.small import random_params
+from tests.streaming.narrow_model import NARROW
+from tests.training.problems import NARROW_DEPTH, STREAM_PHASE, flat
+
+WIDTH = DepthLoss.target_width
+
+
+def test_soft_targets_and_loss_agree_on_the_truth():
+    candidates = jnp.linspace(0.0, 2.0, 21)
+    truth = jnp.full((1, 2, 2), 0.7)
+    target = soft_targets(truth, candidates, WIDTH)
+    np.testing.assert_allclose(np.asarray(target.sum(-1)), 1.0, atol=1e-6)
+    assert int(jnp.argmax(target[0, 0, 0])) == 7
+    usable = jnp.ones((1, 2, 2), bool)
+
+    def at(k):
+        logits = 20.0 * jax.nn.one_hot(jnp.full((1, 2, 2), k), 21)
+        return float(depth_loss(logits, truth, truth, candidates, usable, target_width=WIDTH)[0])
+
+    assert at(7) < at(6) < at(5)
+
+
+def test_unusable_cells_have_neither_value_nor_gradient_in_the_depth_loss():
+    rng = np.random.default_rng(0)
+    candidates, truth = jnp.linspace(0.0, 1.0, 5), jnp.asarray(rng.uniform(0.1, 0.9, (1, 2, 3)), jnp.float32)
+    logits = jnp.asarray(rng.normal(size=(1, 2, 3, 5)), jnp.float32)
+    predicted, usable = truth + 0.2, jnp.array([[[True, False, True], [False, True, True]]])
+
+    def loss(logits, predicted, truth, usable):
+        return sum(depth_loss(logits, predicted, truth, candidates, usable, target_width=WIDTH))
+
+    value, gradients = jax.value_and_grad(loss, argnums=(0, 1))(logits, predicted, truth, usable)
+    # As if those cells did not exist: the mean is over the others.
+    kept = np.asarray(usable)
+    alone = loss(*(x[kept][None, None] for x in (logits, predicted, truth, usable)))
+    np.testing.assert_allclose(value, alone, rtol=1e-6)
+    for gradient in gradients:
+        assert not np.asarray(gradient)[~kept].any() and np.asarray(gradient)[kept].all()
+
+
+@pytest.mark.parametrize("unknown", [-np.inf, np.inf, np.nan, 3.0])
+@pytest.mark.parametrize("candidates", [np.linspace(0.0, 1.0, 5), np.zeros(1)], ids=["five", "one"])
+def test_cells_of_unknown_depth_leave_the_loss_finite(candidates, unknown):
+    candidates = jnp.asarray(candidates, jnp.float32)
+    truth, usable = jnp.array([[[0.5, unknown]]]), jnp.ones((1, 1, 2), bool)
+    logits = jnp.zeros((1, 1, 2, len(candidates)))
+    loss = lambda x, y: sum(depth_loss(x, y, truth, candidates, usable, target_width=WIDTH))  # noqa: E731
+    value, gradients = jax.value_and_grad(loss, argnums=(0, 1))(logits, jnp.full((1, 1, 2), 0.2))
+    assert np.isfinite(value) and all(np.isfinite(g).all() for g in gradients)
+    assert not any(np.asarray(g)[0, 0, 1].any() for g in gradients)
+
+
+def test_gradients_of_losses_are_finite_differences():
+    """In float64, along a random direction of every argument."""
+    rng = np.random.default_rng(1)
+    with jax.enable_x64(True):
+        truth = jnp.asarray(rng.uniform(0.1, 0.9, (1, 2, 3)))
+        candidates, usable = jnp.linspace(0.0, 1.0, 5), jnp.ones((1, 2, 3), bool)
+        images, targets = (jnp.asarray(rng.uniform(0.1, 0.9, (2, 4, 5, 3))) for _ in range(2))
+        depth = lambda logits, z: sum(depth_loss(logits, z, truth, candidates, usable, target_width=WIDTH))  # noqa: E731
+        mse, edges = (lambda x: ((x - targets) ** 2).mean()), lambda x: image_gradient_l1(x, targets)
+        cases = [
+            (depth, (jnp.asarray(rng.normal(size=(1, 2, 3, 5))), truth + 0.05)),
+            (lambda x: RenderingLoss.gradient_weight * edges(x) + mse(x), (images,)),
+            (lambda x: negative_psnr(x[0], targets[0]), (images,)),
+        ]
+        for loss, arguments in cases:
+            directions = tuple(jnp.asarray(rng.normal(size=x.shape)) for x in arguments)
+            _, found = jax.jvp(loss, arguments, directions)
+            at = lambda h: loss(*(x + h * d for x, d in zip(arguments, directions, strict=True)))  # noqa: E731, B023
+            assert float(found) == pytest.approx(float(at(1e-6) - at(-1e-6)) / 2e-6, rel=1e-5)
+
+
+def test_image_losses_are_the_sum_of_their_terms(monkeypatch):
+    monkeypatch.setattr(losses, "lpips_distance", lambda weights, a, b: 3.0 * jnp.abs(a - b).mean(axis=(1, 2, 3)))
+    rng = np.random.default_rng(2)
+    a, b = rng.uniform(size=(2, 2, 4, 5, 3))
+    images, targets = jnp.asarray(a, jnp.float32), jnp.asarray(b, jnp.float32)
+    edges = sum(np.abs(np.diff(a - b, axis=axis)).mean() for axis in (1, 2))
+    loss = RenderingLoss(gradient_weight=0.5, lpips_weight=0.2)
+    wanted = ((a - b) ** 2).mean() + 0.5 * edges
+    assert float(loss.of_images(images, targets)[0]) == pytest.approx(wanted, rel=1e-5)
+    wanted = ((a - b) ** 2).mean() + 0.2 * 3.0 * np.abs(a - b).mean()
+    assert float(loss.of_images(images, targets, LpipsWeights((), (), ()))[0]) == pytest.approx(wanted, rel=1e-5)
+    assert float(image_gradient_l1(images, images + 0.25)) < 1e-6
+
+
+def test_fitted_gains_undo_exposures_and_stay_bounded():
+    rng = np.random.default_rng(0)
+    images = jnp.asarray(rng.uniform(0.1, 0.9, (3, 6, 5, 3)), jnp.float32)
+    true = np.array([[0.7, 1.0, 1.4], [5.0, 0.01, 1.2]], np.float32)
+    targets = jnp.concatenate([images[:2] * true[:, None, None], images[2:]])
+    images = images.at[2].set(0.0)
+    gains = np.asarray(fitted_gains(images, targets))[:, 0, 0]
+    np.testing.assert_allclose(gains[0], true[0], rtol=1e-5)
+    np.testing.assert_allclose(gains[1], [MAX_GAIN, 1 / MAX_GAIN, 1.2], rtol=1e-5)
+    np.testing.assert_array_equal(gains[2], 1.0)  # nothing rendered
+    gradient = jax.grad(lambda x: fitted_gains(x, targets).sum())(images)
+    np.testing.assert_array_equal(np.asarray(gradient), 0.0)
+
+
+@pytest.mark.slow  # a program of its own
+def test_padding_does_not_count_in_the_loss(monkeypatch):
+    """72 rows are padded to 96: the truth is padded like the images, and padding does not count in the loss."""
+    sample = procedural_sample(Views(1, ((72, 64),)), 0, (72, 64), NARROW)
+    model = StreamSplat(NARROW)
+    params = model.init(jax.random.key(0))
+
+    def loss(shown, hidden):
+        """Loss with the truth of the image moved by `shown` and that of the padding by `hidden`."""
+        moved = lambda truth, like: pad_like(truth + shown, like).at[:, 18:].add(hidden - shown)  # noqa: E731
+        with monkeypatch.context() as patched:
+            patched.setattr(losses, "pad_like", moved)
+            return float(NARROW_DEPTH.of_stream(model, params, sample)[2])
+
+    as_it_is = loss(0.0, 0.0)
+    assert loss(0.0, 0.2) == as_it_is and abs(loss(0.2, 0.0) - as_it_is) > 0.01
+    padded = np.asarray(pad_like(sample.log_depths[0], jnp.zeros((4, 24, 16))))
+    np.testing.assert_array_equal(padded[:, 18:], np.repeat(np.asarray(sample.log_depths[0])[:, -1:], 6, axis=1))
+
+
+def test_tokens_that_a_stored_view_looked_through_are_not_rendered():
+    config = NARROW.replace(min_confidence=0.5)
+    model = StreamSplat(config)
+    params, cache = random_params(NARROW), model.init_cache()
+    side = cache.stored_depths.weights.shape[-1]
+    # One view at the origin saw a wall at depth 2.
+    stored = replace(
+        cache.stored_depths,
+        viewmats=cache.stored_depths.viewmats.at[0].set(jnp.eye(4)),
+        Ks=cache.stored_depths.Ks.at[0].set(jnp.array([[side, 0, side / 2], [0, side, side / 2], [0, 0, 1.0]])),
+        log_depths=cache.stored_depths.log_depths.at[0].set(np.log(2.0)),
+        weights=cache.stored_depths.weights.at[0].set(1.0),
+    )
+    depths = jnp.array([1.0, 2.0, 3.0, 2.0])  # a floater, the wall, a hidden token, one of low confidence
+    tokens = Tokens(
+        means=jnp.array([[0.01, 0.01, 1.0]]) * depths[:, None],
+        feats=jnp.ones((4, NARROW.network.token_width)),
+        confidences=jnp.array([0.6, 0.6, 0.6, 0.2]),
+        rgbs=jnp.full((4, 12), 0.5),
+        quats=jnp.tile(jnp.array([1.0, 0, 0, 0]), (4, 1)),
+        footprints=jnp.full(4, 0.02),
+        valid=jnp.ones(4, bool),
+    )
+    shown = decode_accepted(model, params, replace(cache, stored_depths=stored), tokens).opacities > 0
+    np.testing.assert_array_equal(shown.reshape(4, -1).T, [[False, True, True, False]] * 4)
+
+
+@pytest.mark.parametrize("loss", [NARROW_DEPTH, STREAM_PHASE.loss], ids=["depth", "rendering"])
+def test_loss_and_gradient_of_a_batch_are_means_over_its_samples(monkeypatch, loss):
+    views = Views(1, ((32, 32),), num_targets=int(loss.renders))
+    samples = [procedural_sample(views, seed, (32, 32), NARROW) for seed in (1, 2, 3)]
+    batch = jax.tree.map(lambda *parts: jnp.stack(parts), *samples)
+
+    def of_stream(self, model, params, sample):
+        value = jnp.sum(params["a"] * jnp.nanmean(sample.log_depths)) ** 2
+        return None, None, value, {"depth_l1": value}
+
+    of_scene = lambda self, scene, sample, lpips: (jnp.mean(sample.target_images) * scene, {})  # noqa: E731
+    monkeypatch.setattr(DepthLoss, "of_stream", of_stream)
+    monkeypatch.setattr(RenderingLoss, "of_scene", of_scene)
+    monkeypatch.setattr(losses, "decode_accepted", lambda model, params, cache, tokens: params["a"][0])
+    of = jax.value_and_grad(lambda params, x: loss(StreamSplat(NARROW), params, x), has_aux=True)
+    params = {"a": jnp.array([1.5, -0.5])}
+    (value, metrics), gradient = of(params, batch)
+    singles = [of(params, jax.tree.map(lambda x: x[None], sample)) for sample in samples]
+    np.testing.assert_allclose(value, np.mean([single[0][0] for single in singles]), rtol=1e-6)
+    np.testing.assert_allclose(gradient["a"], np.mean([single[1]["a"] for single in singles], axis=0), rtol=1e-6)
+    mean = np.mean([single[0][1]["depth_l1"] for single in singles])
+    assert float(metrics["depth_l1"]) == pytest.approx(mean, rel=1e-6)
+
+
+@pytest.mark.slow  # programs of whole training steps
+@pytest.mark.parametrize("loss", [NARROW_DEPTH, STREAM_PHASE.loss], ids=["depth", "rendering"])
+def test_the_gradient_of_a_batch_is_the_mean_of_its_samples_gradients(loss):
+    views = Views(1, ((64, 64),), num_targets=int(loss.renders))
+    samples = [procedural_sample(views, seed, (64, 64), NARROW) for seed in (1, 2)]
+    model, params = StreamSplat(NARROW), random_params(NARROW)
+    gradient = jax.jit(lambda p, x: jax.grad(lambda p: loss(model, p, x)[0])(p))
+    found = gradient(params, jax.tree.map(lambda *parts: jnp.stack(parts), *samples))
+    singles = [gradient(params, jax.tree.map(lambda x: x[None], sample)) for sample in samples]
+    wanted = jax.tree.map(lambda a, b: (a + b) / 2, *singles)
+    largest = max(float(jnp.abs(x).max()) for x in jax.tree.leaves(wanted))
+    for a, b in zip(flat(found), flat(wanted), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-4 * largest, rtol=1e-3)
+
+
+def test_a_crop_is_a_part_of_the_image():
+    key = jax.random.split(jax.random.key(0), 3)
+    gaussians = Gaussians(
+        means=jax.random.normal(key[0], (40, 3)) * 0.5 + jnp.array([0.0, 0.0, 3.0]),
+        quats=jnp.tile(jnp.array([1.0, 0.0, 0.0, 0.0]), (40, 1)),
+        scales=jnp.full((40, 3), 0.1),
+        opacities=jnp.full(40, 0.6),
+        sh=jax.random.normal(key[1], (40, 1, 3)),
+    )
+    K = jnp.array([[60.0, 0.0, 40.0], [0.0, 60.0, 30.0], [0.0, 0.0, 1.0]])
+    camera = Camera(viewmats=jnp.eye(4), Ks=K, width=80, height=60)
+    whole = render(gaussians, camera).color
+    part = render(gaussians, crop_camera(camera, 7, 13, 32, 48)).color
+    np.testing.assert_allclose(part, whole[7 : 7 + 32, 13 : 13 + 48], atol=1 / 255)  # tiles cut faint rims
+
+
+def test_other_lpips_weights_are_another_run():
+    first, second = (LpipsWeights((), (), (jnp.full(3, x),)) for x in (1.0, 2.0))
+    described = [loop.describe_run(NARROW, RECIPES["tiny"], "random", None, w) for w in (first, second, None)]
+    assert len({run["lpips_weights"] for run in described}) == 3

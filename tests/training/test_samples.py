@@ -1,0 +1,288 @@
+"""Samples to learn from, procedural and of captures: what they show, what is held out, and how steps are shared."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ssplat_jax.config import MEDIAN_DEPTH
+from ssplat_jax.core.errors import InputError
+from ssplat_jax.data.depth_range import FAR_FACTOR
+from ssplat_jax.data.open_capture import open_capture
+from ssplat_jax.data.procedural.procedural_views import training_sample
+from ssplat_jax.model.streamsplat import StreamSplat
+from ssplat_jax.storage.saved_states import first_difference
+from ssplat_jax.training import loop
+from ssplat_jax.training.capture_mix import CaptureGroup, CaptureMix, PhaseStart, learned_frames, open_mix
+from ssplat_jax.training.recipe import RECIPES, Phase, Recipe, learning
+from ssplat_jax.training.samples import Views, capture_sample, held_out_sample, log_depths_at_cells, procedural_sample
+from tests.badinputs.cases import make_capture
+from tests.data.capture_writers import write_depth
+from tests.streaming.narrow_model import NARROW
+from tests.training.problems import STREAM_PHASE, assert_equal
+
+NUM_FRAMES, SIZE = 22, (64, 96)  # height and width
+VIEWS = Views(num_chunks=2, sizes=(SIZE,), num_targets=3)
+SMALL = Views(num_chunks=1, sizes=((32, 48),))
+
+
+@pytest.fixture(scope="module")
+def capture():
+    return open_capture(f"procedural:room?frames={NUM_FRAMES}&size=96x64")
+
+
+@pytest.fixture(scope="module")
+def mix(capture):
+    return mix_of(capture)
+
+
+def mix_of(capture, share=1.0):
+    return CaptureMix((CaptureGroup("room", share, (capture,)),), NARROW)
+
+
+def opened(views, mix=None, num_steps=4):
+    """The function that makes the batches of a training with these samples."""
+    return views.open(PhaseStart(StreamSplat(NARROW), {}, mix, 0, num_steps, print))
+
+
+def test_a_procedural_sample_is_a_function_of_its_seed():
+    views = dataclasses.replace(VIEWS, num_targets=1)
+    assert_equal(procedural_sample(views, 3, (64, 64), NARROW), procedural_sample(views, 3, (64, 64), NARROW))
+    images = [np.asarray(procedural_sample(views, seed, (64, 64), NARROW).target_images) for seed in (3, 4)]
+    assert not np.array_equal(*images)
+
+
+def test_a_procedural_sample_starts_at_the_origin_with_depths_in_range():
+    sample = procedural_sample(dataclasses.replace(VIEWS, num_targets=2), 5, (64, 64), NARROW)
+    np.testing.assert_allclose(np.asarray(sample.chunks.viewmats[0, 0]), np.eye(4), atol=1e-6)
+    depths = np.exp(np.asarray(sample.log_depths))
+    inside = (depths > float(sample.chunks.near[0])) & (depths < float(sample.chunks.far[0]))
+    assert inside.mean() > 0.97  # the margins exclude at most the tails beyond the 1 % quantiles
+
+
+def test_views_step_as_far_as_the_phase_says():
+    for low, high in ((0.01, 0.02), (0.2, 0.3)):
+        for seed in (7, 640, 511):
+            _, depths, poses, _ = training_sample(seed, 8, 24, 32, steps=(low, high))
+            step = np.median(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=-1)) / np.median(depths)
+            assert low / 2 < step < 2 * high
+
+
+def test_the_sky_stands_at_the_last_candidate_and_changes_no_scale():
+    """Depths of the sky are those of the farthest candidate; median and range are those of the surfaces."""
+    views, shares = dataclasses.replace(SMALL, kinds=("yard",), range_jitter=0.0), []
+    for seed in range(4):
+        _, depths, _, _ = training_sample(seed, 4, *SMALL.sizes[0], kinds=("yard",))
+        sample = procedural_sample(views, seed, SMALL.sizes[0], NARROW)
+        far = float(sample.chunks.far[0])
+        cells = np.exp(np.asarray(sample.log_depths))
+        is_sky = np.isclose(cells, far, rtol=1e-3)
+        assert cells[is_sky].max(initial=0.0) < far
+        surfaces = depths[np.isfinite(depths)]
+        scale = MEDIAN_DEPTH / np.median(surfaces)
+        assert far == pytest.approx(FAR_FACTOR * scale * np.quantile(surfaces, 0.99), rel=1e-5)
+        assert is_sky.mean() == pytest.approx(np.isinf(depths).mean(), abs=0.05)
+        shares.append(is_sky.mean())
+    assert max(shares) > 0.1
+
+
+def test_a_phase_says_what_its_worlds_and_sizes_are():
+    yards = dataclasses.replace(SMALL, kinds=("yard",), sizes=((32, 48), (48, 32)))
+    for place, size in enumerate(yards.sizes):
+        (images,) = opened(yards)(2, place).chunks.images
+        np.testing.assert_array_equal(images, procedural_sample(yards, 2, size, NARROW).chunks.images)
+    assert not np.array_equal(opened(SMALL)(2, 0).chunks.images, opened(yards)(2, 0).chunks.images)
+
+
+def test_members_of_a_batch_are_samples_of_their_own():
+    make = opened(dataclasses.replace(SMALL, batch=2), num_steps=2)
+    seen = [make(step, step).log_depths[member].tobytes() for step in range(2) for member in range(2)]
+    assert len(set(seen)) == len(seen)
+
+
+def test_targets_need_context_views_around_them():
+    with pytest.raises(InputError, match="a context of one view"):
+        procedural_sample(dataclasses.replace(SMALL, num_targets=1), 0, (16, 16), NARROW.replace(chunk_size=1))
+
+
+def test_true_depth_of_a_cell_is_that_at_its_center():
+    # A plane in log depth: a cell's center is the common corner of its pixels 1 and 2, at (2, 2).
+    y, x = np.mgrid[0:8, 0:12] + 0.5
+    logs = 0.01 * y - 0.005 * x
+    centers_y, centers_x = np.mgrid[0:2, 0:3] * 4.0 + 2.0
+    found = log_depths_at_cells(np.exp(logs))
+    np.testing.assert_allclose(found, 0.01 * centers_y - 0.005 * centers_x, atol=1e-6)
+    # A depth edge through the center: one of the two surfaces, never a depth between them.
+    logs[:, 6:] += 1.0
+    assert np.abs(log_depths_at_cells(np.exp(logs))[:, 1] - found[:, 1] - 1.0).max() < 0.02
+
+
+@pytest.mark.parametrize("rows", range(5, 13))
+def test_only_cells_with_centers_in_the_image_have_depth(rows):
+    log_depths = np.linspace(0.0, 0.01 * rows, rows)[:, None] * np.ones((1, 8))
+    found = log_depths_at_cells(np.exp(log_depths))
+    centers = 4 * np.arange((rows + 1) // 4) + 2  # of cells, in pixels; between pixels 1 and 2 of each
+    assert centers[-1] < rows <= centers[-1] + 4
+    np.testing.assert_allclose(found[:, 0], (log_depths[centers - 1, 0] + log_depths[centers, 0]) / 2, atol=1e-6)
+
+
+def frames_of(images, capture):
+    """Frame numbers of images, each found by its pixels."""
+    every = np.stack([capture.image(i) for i in range(len(capture))])
+    return [int(np.argmin(np.abs(every - np.asarray(image)).sum(axis=(1, 2, 3)))) for image in images]
+
+
+def context_frames(sample, capture):
+    return frames_of(np.asarray(sample.chunks.images).reshape(-1, *SIZE, 3), capture)
+
+
+def test_samples_show_each_frame_once_and_none_that_is_held_out(mix, capture):
+    seen = set()
+    for seed in range(12):
+        sample = capture_sample(VIEWS, mix, capture, [seed], SIZE)
+        context, targets = context_frames(sample, capture), frames_of(sample.target_images, capture)
+        used = context + targets
+        assert len(set(used)) == len(used) == 2 * NARROW.stream.chunk_size + 3
+        assert min(context) < min(targets) and max(targets) < max(context)
+        seen |= set(used)
+    held_out = {4, 12, 20}
+    assert held_out == set(range(NUM_FRAMES)) - set(learned_frames(capture))
+    assert not seen & held_out and len(seen) > NUM_FRAMES / 2
+
+
+def test_a_validation_shows_a_held_out_frame_between_others(mix, capture):
+    for seed in range(4):
+        sample = held_out_sample(VIEWS, mix, capture, [seed])
+        context, (target,) = context_frames(sample, capture), frames_of(sample.target_images, capture)
+        assert target in (4, 12, 20) and min(context) < target < max(context)
+        assert not set(context) & {4, 12, 20}
+    assert_equal(held_out_sample(VIEWS, mix, capture, [3]), sample)
+    (batch,) = VIEWS.held_out(mix)  # one a capture
+    assert batch.target_images.shape == (1, 1, *SIZE, 3)
+
+
+def test_poses_and_depths_of_a_sample_have_one_scale(mix, capture):
+    sample = capture_sample(VIEWS, mix, capture, [5], SIZE)
+    np.testing.assert_allclose(np.asarray(sample.chunks.viewmats[0, 0]), np.eye(4), atol=1e-6)
+    context = context_frames(sample, capture)
+    centers = np.linalg.inv(np.asarray(sample.chunks.viewmats, np.float64).reshape(-1, 4, 4))[:, :3, 3]
+    true = capture.camtoworlds[context][:, :3, 3]
+    scales = np.linalg.norm(centers[1:], axis=1) / np.linalg.norm(true[1:] - true[0], axis=1)
+    np.testing.assert_allclose(scales, scales[0], rtol=1e-4)
+    depths = log_depths_at_cells(np.stack([scales[0] * capture.depth(i) for i in context]))
+    found = np.asarray(sample.log_depths).reshape(depths.shape)
+    np.testing.assert_allclose(found, depths, atol=1e-4)
+    near, far = float(sample.chunks.near[0]), float(sample.chunks.far[0])
+    assert np.mean((np.exp(found) > near) & (np.exp(found) < far)) > 0.9
+    # Scale and range are a little wrong, as estimated ones are, each by a factor of its own.
+    known = mix.frame_of(capture)
+    errors = np.log([scales[0] / known.scale, near / scales[0] / (known.near / known.scale)])
+    assert np.all(np.abs(errors) <= VIEWS.range_jitter + 1e-4) and np.abs(errors).min() > 1e-3
+
+
+def with_depth_maps(capture, has_depth):
+    """The capture, with the depth maps of the frames of which `has_depth` is true alone."""
+
+    class Pixels:
+        image = staticmethod(capture.pixels.image)
+        depth = staticmethod(lambda i: capture.pixels.depth(i) if has_depth(i) else None)
+
+    Pixels.has_depth = staticmethod(has_depth)
+    return dataclasses.replace(capture, pixels=Pixels())
+
+
+def test_frames_without_depth_have_unknown_depths(mix, capture):
+    sample = capture_sample(VIEWS, mix, with_depth_maps(capture, lambda i: False), [5], SIZE)
+    assert np.isnan(np.asarray(sample.log_depths)).all()
+    assert np.isfinite(np.asarray(sample.chunks.images)).all()
+
+
+def test_steps_are_shared_as_asked(capture):
+    other = dataclasses.replace(capture)
+    groups = (CaptureGroup("a", 0.2, (capture,)), CaptureGroup("b", 0.5, (other,)))
+    drawn = [CaptureMix(groups, NARROW).draw(np.random.default_rng([0, step])) for step in range(3000)]
+    rates = [np.mean([x is source for x in drawn]) for source in (capture, other, None)]
+    np.testing.assert_allclose(rates, (0.2, 0.5, 0.3), atol=0.03)
+
+
+def test_procedural_steps_stay_those_of_a_run_without_captures(mix, capture):
+    views = dataclasses.replace(SMALL, num_targets=1)
+    rarely, without, always = opened(views, mix_of(capture, 1e-9)), opened(views), opened(views, mix)
+    for step in (0, 3):
+        assert_equal(rarely(step, step), without(step, step))
+    assert always(3, 3).chunks.images.shape == without(3, 3).chunks.images.shape  # one program serves both
+    assert not np.array_equal(always(3, 3).target_images, without(3, 3).target_images)
+
+
+@pytest.mark.parametrize(
+    ("folders", "shares", "message"),
+    [
+        (["here"], [0.7, 0.1], r"--shares: wanted 1 numbers .* got 0\.7 0\.1"),
+        (["here", "there"], [0.7, 0.4], "add up to at most 1"),
+        (["here"], [0.0], "above 0"),
+        (["here"], [float("nan")], "above 0"),
+        (["no/such/folder"], [], "nothing of that name"),
+    ],
+)
+def test_captures_that_cannot_be_opened_are_refused(folders, shares, message):
+    with pytest.raises(InputError, match=message):
+        open_mix([Path(folder) for folder in folders], shares, NARROW)
+
+
+def test_a_capture_needs_the_frames_of_a_sample_and_depth_where_nothing_is_rendered(capture, tmp_path):
+    views = STREAM_PHASE.samples
+    short = [dataclasses.replace(capture, frames=capture.frames[:count]) for count in (9, 10)]
+    with pytest.raises(InputError, match=r"at least 9 frames besides .* got 8"):
+        views.check(mix_of(short[0]), NARROW, renders=True)
+    views.check(mix_of(short[1]), NARROW, renders=True)
+    photographs, one = (with_depth_maps(capture, has) for has in (lambda i: False, lambda i: i == 3))
+    with pytest.raises(InputError, match=r"depth maps, .* got none; leave it out, or choose a recipe that renders"):
+        loop.train(NARROW, RECIPES["tiny"], tmp_path / "out", mix=mix_of(photographs))
+    assert not (tmp_path / "out").exists()
+    views.check(mix_of(photographs), NARROW, renders=True)
+    views.check(mix_of(one), NARROW, renders=False)
+
+
+def test_a_folder_of_captures_is_those_in_it(tmp_path):
+    for name in ("a", "b"):
+        make_capture(tmp_path / name)
+    (tmp_path / "notes").mkdir()
+    (group,) = open_mix([tmp_path], [], NARROW).groups
+    assert [capture.name for capture in group.captures] == ["a", "b"] and group.share == 0.5
+
+
+@pytest.mark.parametrize("spoiled", ["images/2.jpg", "depth/2.png", "transforms.json"])
+def test_a_run_with_other_files_of_a_capture_is_another_run(spoiled, tmp_path):
+    def described():
+        return loop.describe_run(NARROW, RECIPES["tiny"], "random", mix_of(open_capture(tmp_path / "c")), None)
+
+    def with_depth(root, meta):
+        for frame in meta["frames"][1:]:
+            number = Path(frame["file_path"]).stem
+            frame["depth_file_path"] = f"depth/{number}.png"
+            write_depth(root / "depth" / f"{number}.png", 1500)
+
+    make_capture(tmp_path / "c", with_depth)
+    before = described()
+    assert described() == before
+    file = tmp_path / "c" / spoiled
+    if spoiled == "transforms.json":  # a frame more has a depth map
+        file.write_text(file.read_text().replace('"file_path"', '"depth_file_path": "depth/2.png", "file_path"', 1))
+    else:
+        file.write_bytes(file.read_bytes() + b"\0")
+    runs = [json.loads(json.dumps(run)) for run in (before, described())]
+    assert first_difference(*runs)[0].startswith("captures[0][2][0]")
+
+
+@pytest.mark.slow  # compiles a step that renders, and the validation
+def test_training_on_a_capture_logs_held_out_scores(mix, tmp_path):
+    phase = Phase("depth", 1, SMALL, STREAM_PHASE.loss.depth, learning("cost_volume"), 1e-3)
+    records = []
+    recipe = Recipe((phase, dataclasses.replace(STREAM_PHASE, steps=1))).for_captures()
+    assert recipe.phases[1].loss.fit_gains
+    loop.train(NARROW, recipe, tmp_path, mix=mix, validate_every=1, report=records.append)
+    scored = [record for record in records if "validation_psnr" in record]
+    assert [record["step"] for record in scored] == [2]  # the phase of depth renders nothing
+    assert 3 < scored[0]["validation_psnr"] < 60 and "validation_psnr_over_black" in scored[0]

@@ -1,0 +1,174 @@
+"""`ssplat train`: what it starts from, what it refuses and what it writes, and the evidence head on whole streams."""
+
+import dataclasses
+from importlib import resources
+from pathlib import Path
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ssplat_jax.commands.train_command import Train
+from ssplat_jax.config import preset
+from ssplat_jax.core.errors import InputError
+from ssplat_jax.data.open_capture import open_capture
+from ssplat_jax.model import init_params
+from ssplat_jax.model.streamsplat import StreamSplat
+from ssplat_jax.storage.weights import describe_weights, load_params, load_weights, save_weights
+from ssplat_jax.training import crops, loop, recipe
+from ssplat_jax.training.capture_mix import open_mix
+from ssplat_jax.training.crops import Crops
+from ssplat_jax.training.recipe import EVIDENCE
+from tests.commands.test_cli import make_capture
+from tests.streaming.narrow_model import NARROW
+from tests.training.problems import assert_equal, flat
+
+SHIPPED = Path(str(resources.files("ssplat_jax") / "weights" / "tiny.npz"))
+CROPS = Crops(procedural=("procedural:room?frames=12",), width=64, size=(32, 48))
+
+
+def evidence_recipe(steps, **changes):
+    phase = dataclasses.replace(EVIDENCE.phases[0], steps=steps, samples=CROPS, warmup_steps=1, learning_rate=0.02)
+    return dataclasses.replace(EVIDENCE, phases=(dataclasses.replace(phase, **changes),))
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """Folder of a command that trained the evidence head on one small scene, and what was streamed."""
+    out, streams, made_room = tmp_path_factory.mktemp("evidence"), [], []
+
+    def streamed(*given):
+        streams.append(stream_scene(*given))
+        return streams[-1]
+
+    stream_scene = crops.stream_scene
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(crops, "make_room", lambda: made_room.append(len(streams)))
+        patch.setattr(crops, "stream_scene", streamed)
+        patch.setitem(recipe.RECIPES, "evidence", evidence_recipe(12))
+        assert Train(out=out, recipe="evidence", init_weights=SHIPPED, scale_steps=0.5, quiet=True).run() == 0
+    assert made_room == [0]  # before the scene: programs of many would be too many for one process
+    return out, streams
+
+
+def test_the_evidence_head_learns_alone(trained):
+    before, (after, config) = load_params("tiny"), load_weights(trained[0] / "weights.npz")
+    assert config == preset("tiny")
+    for stage in before:
+        same = [np.array_equal(a, b) for a, b in zip(flat(before[stage]), flat(after[stage]), strict=True)]
+        assert all(same) == (stage != "evidence")
+    assert all(np.isfinite(x).all() for x in flat(after))
+    assert np.abs(after["evidence"]["out"]["kernel"]).max() > 1e-3  # zeros before training
+
+
+def test_weights_tell_their_history(trained):
+    """The recipe, and the training of the weights that it started from."""
+    provenance = describe_weights(str(trained[0] / "weights.npz")).provenance
+    assert provenance["steps"] == 6 and provenance["fresh"] == ["evidence"] and not provenance["lpips"]
+    (phase,) = provenance["recipe"]["phases"]
+    assert (phase["loss"]["kind"], phase["samples"]["kind"], phase["steps"]) == ("CropLoss", "Crops", 6)
+    assert provenance["init_weights"] == "tiny.npz"
+    assert provenance["before"] == describe_weights("tiny").provenance
+
+
+@pytest.mark.slow  # compiles the step of another loss
+def test_more_steps_give_better_crops(trained, tmp_path, monkeypatch):
+    monkeypatch.setattr(crops, "stream_scene", lambda *given: trained[1][0])
+    black = evidence_recipe(40, loss=dataclasses.replace(EVIDENCE.phases[0].loss, black_weight=1.0))
+    config, records = preset("tiny"), []
+    params = load_params("tiny") | {"evidence": StreamSplat(config).init(jax.random.key(0))["evidence"]}
+    loop.train(config, black, tmp_path, params=params, report=records.append)
+    scores = [record["psnr_over_black"] for record in records]  # means of ten steps
+    assert len(scores) == 4 and scores[-1] > scores[0] + 0.3
+
+
+@pytest.mark.parametrize("steps", [0, 2])
+def test_a_stream_that_refines_is_refined_for_training_too(steps, monkeypatch):
+    class Begun(Exception):
+        """Ends the stream at its beginning."""
+
+    def session(model, params, *, revise):
+        assert (revise is None) == (steps == 0)
+        raise Begun
+
+    monkeypatch.setattr(crops, "Session", session)
+    monkeypatch.setattr(crops, "make_room", lambda: None)
+    model = StreamSplat(preset("tiny").replace(steps_per_chunk=steps))
+    with pytest.raises(Begun):
+        crops.stream_scene(model, {}, open_capture("procedural:room?frames=12&size=64x48"), 1)
+
+
+def test_strides_for_which_a_capture_is_too_short_are_left_out(tmp_path):
+    sources = Crops(procedural=(), width=64, size=(16, 16))
+
+    def strides(name, num_frames):
+        make_capture(tmp_path / name, num_frames=num_frames, size=(64, 48))
+        return [stride for _, stride in sources.scenes(open_mix([tmp_path / name], [], NARROW))]
+
+    assert (strides("long", 12), strides("short", 10)) == ([1, 2], [1])
+    with pytest.raises(InputError, match="train: shorter: wanted at least 6 frames, got 5; leave it out"):
+        strides("shorter", 5)
+    with pytest.raises(InputError, match="48x64 or more"):
+        dataclasses.replace(CROPS, size=(64, 48)).scenes(None)
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        ({"recipe": "evidence"}, "--init-weights"),
+        ({"recipe": "evidence", "init_weights": SHIPPED, "shares": (0.5,), "captures": (Path("x"),)}, "--shares"),
+        ({"recipe": "evidence", "init_weights": SHIPPED, "lpips_vgg": Path("x")}, "--lpips-vgg"),
+        ({"recipe": "depth", "captures": (Path("x"),), "validate_every": 10}, "--validate-every"),
+        ({"shares": (0.5,)}, "--captures beside"),
+    ],
+)
+def test_options_that_do_not_fit_the_recipe_are_refused(options, named, tmp_path):
+    with pytest.raises(InputError, match=named):
+        Train(out=tmp_path / "out", **options).run()
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.fixture
+def started(monkeypatch):
+    """Arguments that the command gives to a training, which ends at once."""
+    seen = {}
+
+    def ends_at_once(config, recipe, out, *, params, **others):
+        seen.update(config=config, params=params)
+        out.mkdir(exist_ok=True)
+        return SimpleNamespace(params=params, step=1, interrupted=None)
+
+    monkeypatch.setattr(loop, "train", ends_at_once)
+    return seen
+
+
+def test_the_command_goes_on_with_the_configuration_of_the_weights(tmp_path, started, capsys):
+    """Unless --preset asks for another one; what is lost by that is said."""
+    held = preset("tiny").replace(cgfi=True, voxel_size=0.02)
+    save_weights(tmp_path / "w.npz", init_params(jax.random.key(0), held), held, {"steps": 7})
+    asked = {"out": tmp_path / "out", "recipe": "stream", "init_weights": tmp_path / "w.npz"}
+    Train(**asked, set=("min_confidence=0.25",)).run()
+    assert started["config"] == held.replace(min_confidence=0.25) and started["params"]["cgfi"]
+    assert "leaves out" not in capsys.readouterr().err
+    facts = describe_weights(str(tmp_path / "out" / "weights.npz"))
+    assert facts.provenance["before"] == {"steps": 7} and facts.provenance["fresh"] == []
+    Train(**asked, preset="tiny").run()
+    said = capsys.readouterr().err
+    assert "leaves out cgfi" in said and "memory.voxel_size 0.02 -> 0.03" in said and "cgfi" not in started["params"]
+
+
+def test_the_command_starts_stages_that_the_weights_lack_at_random(tmp_path, started, capsys):
+    Train(out=tmp_path, recipe="stream", init_weights=SHIPPED, seed=3, set=("cgfi=true",)).run()
+    assert "tiny.npz gives no cgfi: random at the start" in capsys.readouterr().err  # the mixer has no blocks here
+    untrained, shipped = init_params(jax.random.key(3), started["config"]), load_params("tiny")
+    for name, stage in started["params"].items():
+        assert_equal(stage, (untrained if name == "cgfi" else shipped)[name])
+
+
+def test_the_head_that_the_weights_have_does_not_matter(tmp_path, started):
+    noise = jax.tree.map(lambda x: jnp.asarray(x) + 1.0, load_params("tiny"))
+    save_weights(tmp_path / "w.npz", noise, preset("tiny"), {})
+    Train(out=tmp_path, recipe="evidence", init_weights=tmp_path / "w.npz", seed=5).run()
+    assert_equal(started["params"]["evidence"], init_params(jax.random.key(5), preset("tiny"))["evidence"])
