@@ -253,7 +253,8 @@ class StreamConfig:
             if not isinstance(value, dict):
                 changes[name] = value
                 continue
-            changes |= {f"{name}.{field}": x for field, x in value.items() if field != "kind"}
+            values = {k: tuple(x) if isinstance(x, list) else x for k, x in value.items() if k != "kind"}
+            changes |= {f"{name}.{field}": x for field, x in values.items()}
             if name == "network":
                 changes["network"] = value["kind"]
         return StreamConfig().replace(**changes)

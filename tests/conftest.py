@@ -31,7 +31,7 @@ install_import_hook("ssplat_jax", "beartype.beartype")
 import jax  # noqa: E402
 import pytest  # noqa: E402
 
-from ssplat_jax.core.program_memory import drop_programs  # noqa: E402
+from ssplat_jax.core.cpu_backend import drop_programs  # noqa: E402
 
 # An int32 array that meets a float32 array is an oversight; Python scalars stay welcome.
 jax.config.update("jax_numpy_dtype_promotion", "strict")

@@ -20,10 +20,11 @@ from ssplat_jax.core.pytree import replace
 from ssplat_jax.core.rotations import quats_to_matrices
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.evaluation.lpips import LpipsWeights
-from ssplat_jax.model import anchor_depth, inject_features, network_of
-from ssplat_jax.model.cgfi import Aggregator, num_hints
+from ssplat_jax.model.cgfi import Aggregator, inject_features, num_hints
+from ssplat_jax.model.hpda import anchor_depth
+from ssplat_jax.model.network import network_of
 from ssplat_jax.model.streamsplat import ChunkOutput, Prediction, StreamSplat
-from ssplat_jax.model.types import DepthDistribution, Views, prepare_views
+from ssplat_jax.model.views import DepthDistribution, Views, prepare_views
 from ssplat_jax.training import losses
 from ssplat_jax.training.recipe import RECIPES
 from ssplat_jax.training.samples import Sample

@@ -11,8 +11,8 @@ from pathlib import Path
 
 from ssplat_jax.config import preset
 from ssplat_jax.core.console import Reporter
+from ssplat_jax.core.cpu_backend import make_room
 from ssplat_jax.core.errors import InputError
-from ssplat_jax.core.program_memory import make_room
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import interleaved_split
 from ssplat_jax.evaluation.evaluate import evaluate

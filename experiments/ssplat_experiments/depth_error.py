@@ -20,12 +20,12 @@ from ssplat_experiments.scenes import REDKITCHEN, open_redkitchen, open_room
 from ssplat_experiments.study import at_scale
 from ssplat_jax.config import preset
 from ssplat_jax.core.console import Reporter
+from ssplat_jax.core.cpu_backend import make_room
 from ssplat_jax.core.errors import InputError
-from ssplat_jax.core.program_memory import make_room
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.split import Split
-from ssplat_jax.model import GRID_STRIDE
 from ssplat_jax.model.streamsplat import StreamSplat
+from ssplat_jax.model.views import GRID_STRIDE
 from ssplat_jax.storage.files import write_json
 from ssplat_jax.storage.weights import load_params
 from ssplat_jax.streaming.feed import feed_chunks

@@ -24,7 +24,6 @@ from ssplat_experiments.cases import Case, Row
 from ssplat_experiments.memory_curve import START_CAPACITY
 from ssplat_experiments.study import Study, at_scale, run_study
 from ssplat_experiments.warm_sessions import new_session
-from ssplat_jax import model as stages
 from ssplat_jax.cache import project
 from ssplat_jax.config import StreamConfig, preset
 from ssplat_jax.core.cameras import Camera
@@ -33,6 +32,7 @@ from ssplat_jax.core.console import Reporter
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.evaluation.latency import measure_latency
 from ssplat_jax.evaluation.peak_memory import peak_memory
+from ssplat_jax.model.views import prepare_views
 from ssplat_jax.rasterizer import render
 from ssplat_jax.streaming.feed import feed_capture
 from ssplat_jax.streaming.session import Session
@@ -117,7 +117,7 @@ def stage_times(session: Session, chunk: Chunk, camera: Camera, repeats: int) ->
     """
     model, params, cache = session.model, session.params, session.cache
     assert cache is not None
-    views = jax.jit(lambda chunk: stages.prepare_views(chunk, model.config))(chunk)
+    views = jax.jit(lambda chunk: prepare_views(chunk, model.config))(chunk)
     look = jax.jit(lambda cache, views: project(cache, views.grid_camera, model.config))
     predict, update = jax.jit(model.predict), jax.jit(model.update_cache, donate_argnums=0)
     received = jax.tree.map(np.asarray, chunk)

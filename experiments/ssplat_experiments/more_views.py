@@ -14,8 +14,8 @@ from ssplat_experiments.study import at_scale
 from ssplat_jax.config import preset
 from ssplat_jax.core.atomic import write_atomic
 from ssplat_jax.core.console import Reporter
+from ssplat_jax.core.cpu_backend import make_room
 from ssplat_jax.core.errors import InputError
-from ssplat_jax.core.program_memory import make_room
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import paper_split

@@ -2,11 +2,11 @@
 
 from ssplat_experiments import joint_network, warm_sessions
 from ssplat_jax.core import program_memory
-from ssplat_jax.core.program_memory import MOST_MAPS
+from ssplat_jax.core.cpu_backend import MOST_MAPS
 
 
 def make_room(most_maps: int = MOST_MAPS) -> None:
-    """`ssplat_jax.core.program_memory.make_room`, which first forgets the sessions and networks that experiments keep.
+    """`ssplat_jax.core.cpu_backend.make_room`, which first forgets the sessions and networks that experiments keep.
 
     Measurements are warm in any case.
     """

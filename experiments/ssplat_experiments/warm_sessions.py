@@ -5,7 +5,7 @@ import functools
 import jax
 
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.model import complete_params
+from ssplat_jax.model.network import complete_params
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.refinement import online_refinement
 from ssplat_jax.storage.weights import load_params

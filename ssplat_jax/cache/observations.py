@@ -19,9 +19,9 @@ from ssplat_jax.cache.state import VoxelCache
 from ssplat_jax.cache.votes import is_trusted
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.cameras import Camera
+from ssplat_jax.core.cpu_backend import kept
 from ssplat_jax.core.numerics import safe_log
 from ssplat_jax.core.pytree import pytree, replace
-from ssplat_jax.core.xla_cpu import kept
 
 ON_SURFACE = math.log(1.03)
 """Largest distance in log depth at which a pivot lies on the surface of a cell."""

@@ -13,7 +13,7 @@ import time
 from collections.abc import MutableMapping
 from pathlib import Path
 
-from ssplat_jax.core.cores import num_cores
+from ssplat_jax.core.cpu_backend import num_cores
 
 SWITCH = "SSPLAT_PROGRAM_CACHE"
 """Environment variable: `off`, or a folder in place of the user's cache folder."""

@@ -131,7 +131,7 @@ class Train:
         """Configuration, what is used of --init-weights, and first parameters; says what of the weights is replaced."""
         import jax
 
-        from ssplat_jax.model import complete_params
+        from ssplat_jax.model.network import complete_params
         from ssplat_jax.storage.weights import check_params, load_weights
 
         if self.init_weights is None:

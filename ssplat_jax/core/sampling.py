@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from ssplat_jax.core.cpu_backend import lane_sum
 from ssplat_jax.core.pytree import pytree
-from ssplat_jax.core.xla_cpu import lane_sum
 
 
 @pytree

@@ -16,8 +16,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from ssplat_jax.core.gaussians import Gaussians
-from ssplat_jax.core.rotations import matrices_to_quats, multiply_quats
-from ssplat_jax.core.sh_rotation import sh_rotation
+from ssplat_jax.core.rotations import matrices_to_quats, multiply_quats, sh_rotation
 
 MAX_COORDINATE_SPACING = 1e-4
 """Largest float32 spacing, in stream units, at which positions are stored without an offset."""

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import jax
 
-from ssplat_jax.core.cores import num_cores
+from ssplat_jax.core.cpu_backend import num_cores
 
 
 @functools.cache

@@ -8,9 +8,8 @@ from jaxtyping import Array, Bool, Float
 
 from ssplat_jax.cache import ProjectedCache
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.model.convolution import Conv
-from ssplat_jax.model.layers import UNet
-from ssplat_jax.model.types import Views
+from ssplat_jax.model.layers import Conv, UNet
+from ssplat_jax.model.views import Views
 
 
 def _copy_first(key, shape, dtype=jnp.float32) -> Array:
@@ -68,14 +67,12 @@ def inject_features(
         history: the projected cache: F_H and Omega.
         confidences: omega of the anchored depth.
         views: the chunk's views.
-        config: `history.cgfi=False` returns `feats` unchanged.
+        config: model configuration.
         bound_history: maps F_H to a bounded size with `unit_features`; see `Network.bound_history`.
 
     Returns:
         Features in float32. Where omega = 1 everywhere they do not depend on F_H.
     """
-    if not config.history.cgfi:
-        return feats
     feats = feats.astype(jnp.float32)
     remembered = history.feats.astype(jnp.float32)
     if config.additions.unit_features:

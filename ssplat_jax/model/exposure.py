@@ -16,7 +16,7 @@ from ssplat_jax.cache import SAME_SURFACE_MARGIN, ProjectedCache
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.numerics import safe_log
 from ssplat_jax.model.layers import average_pool
-from ssplat_jax.model.types import GRID_STRIDE, Views
+from ssplat_jax.model.views import GRID_STRIDE, Views
 
 MIN_COLOR, MAX_COLOR = 0.03, 0.97
 """Range of colors that are about proportional to exposure: darker cells are noise, brighter ones are clipped."""

@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 from ssplat_jax.cache import ProjectedCache
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.numerics import safe_log, softplus_inverse
-from ssplat_jax.model.types import AnchoredDepth, DepthDistribution, Views, from_candidate_space, to_candidate_space
+from ssplat_jax.model.views import AnchoredDepth, DepthDistribution, Views, from_candidate_space, to_candidate_space
 
 GAMMA_INIT = 0.1
 """Untrained gamma_d, for which the paper gives no value."""
@@ -24,8 +24,6 @@ but lies halfway between two candidates, has a peak of only 0.5."""
 
 class AnchorStrength(nn.Module):
     """gamma_d = softplus(raw), the one learnable scalar of HPDA."""
-
-    config: StreamConfig
 
     @nn.compact
     def __call__(self) -> Float[Array, ""]:
@@ -110,7 +108,7 @@ def anchor_depth(
     """
     probs = distribution.probs
     if config.history.hpda:
-        gamma = AnchorStrength(config).apply({"params": params})
+        gamma = AnchorStrength().apply({"params": params})
         probs = inject_anchor(probs, cache_anchor(history, views.log_candidates, config), gamma)  # pyright: ignore[reportArgumentType]
     return AnchoredDepth(
         probs=probs,

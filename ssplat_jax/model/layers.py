@@ -1,12 +1,118 @@
-"""Layers that several stages share. Norms and softmax are computed in float32."""
+"""Layers that several stages share: convolutions, norms, attention, windows, neighbors in 3D, and the small U-Net.
+
+Norms and softmax are computed in float32.
+"""
+
+import functools
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
 
-from ssplat_jax.core.xla_cpu import lane_sum
-from ssplat_jax.model.convolution import Conv, HalvingConv
+from ssplat_jax.core.cpu_backend import lane_sum
+
+# -- Convolutions -----------------------------------------------------------------------------------------------------
+
+Pads = tuple[tuple[int, int], tuple[int, int]]
+"""Zero padding ((top, bottom), (left, right))."""
+DIMENSIONS = ("NHWC", "HWIO", "NHWC")
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
+def conv2d(x: Float[Array, "v h w c"], kernel: Float[Array, "kh kw c o"], pads: Pads) -> Float[Array, "v ho wo o"]:
+    """Cross-correlation of `x`, zero-padded by `pads`, with `kernel` at stride 1.
+
+    The backward pass is written out: the input gradient is a convolution with the flipped kernel, the kernel gradient
+    one matrix product per tap. Inside a `lax.scan`, XLA's CPU backend computes kernel gradients with a generic
+    algorithm (https://github.com/jax-ml/jax/issues/12868), 15 times slower.
+    """
+    return jax.lax.conv_general_dilated(x, kernel, (1, 1), pads, dimension_numbers=DIMENSIONS)
+
+
+def _conv2d_forward(x, kernel, pads):
+    return conv2d(x, kernel, pads), (x, kernel)
+
+
+def _conv2d_backward(pads, residuals, cotangent):
+    x, kernel = residuals
+    kh, kw = kernel.shape[:2]
+    flipped = jnp.flip(kernel, axis=(0, 1)).swapaxes(2, 3)
+    (top, bottom), (left, right) = pads
+    back_pads = ((kh - 1 - top, kh - 1 - bottom), (kw - 1 - left, kw - 1 - right))
+    x_gradient = jax.lax.conv_general_dilated(cotangent, flipped, (1, 1), back_pads, dimension_numbers=DIMENSIONS)
+    padded = jnp.pad(x, ((0, 0), *pads, (0, 0)))
+    height, width = cotangent.shape[1:3]
+    flat = cotangent.reshape(-1, cotangent.shape[-1])
+    taps = [
+        padded[:, i : i + height, j : j + width].reshape(-1, x.shape[-1]).T @ flat for i in range(kh) for j in range(kw)
+    ]
+    return x_gradient, jnp.stack(taps).reshape(kernel.shape)
+
+
+conv2d.defvjp(_conv2d_forward, _conv2d_backward)
+
+
+class Conv(nn.Module):
+    """Convolution with an odd square kernel, stride 1 and symmetric zero padding, as in PyTorch. Keeps the size."""
+
+    features: int
+    kernel: int = 3
+    use_bias: bool = True
+    kernel_init: nn.initializers.Initializer = nn.initializers.lecun_normal()
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "v h w c"]) -> Float[Array, "v h w o"]:
+        kernel = self.param("kernel", self.kernel_init, (self.kernel, self.kernel, x.shape[-1], self.features))
+        pad = self.kernel // 2
+        y = conv2d(x, kernel, ((pad, pad), (pad, pad)))
+        return y + self.param("bias", nn.initializers.zeros, (self.features,)) if self.use_bias else y  # pyright: ignore
+
+
+class HalvingConv(nn.Module):
+    """Convolution with an odd square kernel and stride 2, computed at stride 1 on 2 x 2 patches moved into channels.
+
+    The parameter is the ordinary kernel. The gradient of a strided convolution is a dilated convolution, for which
+    XLA's CPU backend has no fast path.
+    """
+
+    features: int
+    kernel: int = 3
+    use_bias: bool = True
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "v h w c"]) -> Float[Array, "v hf wf o"]:
+        c, reach = x.shape[-1], self.kernel // 2
+        kernel = self.param("kernel", nn.initializers.lecun_normal(), (self.kernel, self.kernel, c, self.features))
+        # Kernel offset o in [-reach, reach] is o = 2 m + r: tap m in [-before, reach // 2] of patch pixel r.
+        before = (reach + 1) // 2
+        taps = before + reach // 2 + 1
+        front = 2 * before - reach
+        back = 2 * taps - self.kernel - front
+        kernel = jnp.pad(kernel, ((front, back), (front, back), (0, 0), (0, 0)))
+        kernel = kernel.reshape(taps, 2, taps, 2, c, self.features).transpose(0, 2, 4, 1, 3, 5)
+        kernel = kernel.reshape(taps, taps, 4 * c, self.features)
+        pad = (before, taps - 1 - before)
+        y = conv2d(pixel_unshuffle(x, 2), kernel, (pad, pad))
+        return y + self.param("bias", nn.initializers.zeros, (self.features,)) if self.use_bias else y  # pyright: ignore
+
+
+def pixel_unshuffle(x: Float[Array, "v h w c"], factor: int) -> Float[Array, "v hf wf cf"]:
+    """Map with `factor` x `factor` patches moved into channels, in PyTorch's order (channel, row, column)."""
+    v, h, w, c = x.shape
+    x = x.reshape(v, h // factor, factor, w // factor, factor, c)
+    return x.transpose(0, 1, 3, 5, 2, 4).reshape(v, h // factor, w // factor, c * factor * factor)
+
+
+def pixel_shuffle(x: Float[Array, "v hf wf cf"], factor: int) -> Float[Array, "v h w c"]:
+    """Inverse of `pixel_unshuffle`."""
+    v, h, w, c = x.shape
+    x = x.reshape(v, h, w, c // factor**2, factor, factor)
+    return x.transpose(0, 1, 4, 2, 5, 3).reshape(v, h * factor, w * factor, c // factor**2)
+
+
+# -- Norms and pooling ------------------------------------------------------------------------------------------------
 
 IMAGE_MEAN, IMAGE_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 """Mean and standard deviation of ImageNet, RGB."""
@@ -34,6 +140,18 @@ def average_pool(x: Float[Array, "v h w c"], factor: int) -> Float[Array, "v hf 
     return x.reshape(v, h // factor, factor, w // factor, factor, c).mean(axis=(2, 4))
 
 
+def rms_normalize(x: Float[Array, "*b c"], eps: float = 1e-6) -> Float[Array, "*b c"]:
+    """Features scaled to a root mean square of 1.
+
+    Limits:
+        Zero gives zeros. Below an RMS of about 1e-3 the result shrinks with its input; gradients stay finite.
+    """
+    return x * jax.lax.rsqrt(jnp.mean(x * x, axis=-1, keepdims=True) + eps)
+
+
+# -- Attention --------------------------------------------------------------------------------------------------------
+
+
 def attend(
     queries: Float[Array, "*b q heads c"],
     keys: Float[Array, "*b k heads c"],
@@ -42,14 +160,8 @@ def attend(
 ) -> Float[Array, "*b q heads c"]:
     """Scaled dot-product attention, softmax in float32.
 
-    Args:
-        queries: query features.
-        keys: key features.
-        values: value features, one per key.
-        allowed: which keys each query attends to; None for all.
-
     Limits:
-        A query without an allowed key gives zeros.
+        A query without an `allowed` key gives zeros.
     """
     # Heads come first because XLA's CPU backend multiplies matrices in that layout twice as fast.
     queries, keys, values = (jnp.moveaxis(x, -2, -3) for x in (queries, keys, values))
@@ -72,27 +184,115 @@ def attend_per_query(
 
     `attend` would compute products of one-row matrices, which are four times slower on a CPU.
 
-    Args:
-        queries: query features.
-        keys: the k keys of each query.
-        values: the values of those keys.
-        allowed: which of its keys a query attends to.
-
     Limits:
-        A query without an allowed key gives zeros.
+        A query without an `allowed` key gives zeros.
     """
     scores = lane_sum(queries[:, None] * keys).astype(jnp.float32) * queries.shape[-1] ** -0.5
     weights = jax.nn.softmax(jnp.where(allowed, scores, -1e9), axis=-1) * allowed.astype(jnp.float32)
     return jnp.sum(weights.astype(values.dtype)[..., None] * values, axis=-2)
 
 
-def rms_normalize(x: Float[Array, "*b c"], eps: float = 1e-6) -> Float[Array, "*b c"]:
-    """Features scaled to a root mean square of 1.
+# -- Windows for attention (Swin Transformer, Liu et al. 2021) --------------------------------------------------------
 
-    Limits:
-        Zero gives zeros. Below an RMS of about 1e-3 the result shrinks with its input; gradients stay finite.
+
+def sine_positions(height: int, width: int, features: int) -> Float[np.ndarray, "h w c"]:
+    """Sine position code of a window, normalized to 2 pi as in DETR: half of the channels for y, half for x."""
+    half = features // 2
+    rates = 10000.0 ** (2 * (np.arange(half) // 2) / half)
+
+    def along(n):
+        phases = (np.arange(n) + 1)[:, None] / n * 2 * np.pi / rates
+        return np.where(np.arange(half) % 2 == 0, np.sin(phases), np.cos(phases)).astype(np.float32)
+
+    shape = (height, width, half)
+    rows, columns = along(height)[:, None], along(width)[None, :]
+    return np.concatenate([np.broadcast_to(rows, shape), np.broadcast_to(columns, shape)], axis=-1)
+
+
+def to_windows(x: Float[Array, "v h w c"], side: tuple[int, int]) -> Float[Array, "v windows cells c"]:
+    """Map cut into windows of `side` = (height, width) cells."""
+    v, h, w, c = x.shape
+    x = x.reshape(v, h // side[0], side[0], w // side[1], side[1], c).transpose(0, 1, 3, 2, 4, 5)
+    return x.reshape(v, (h // side[0]) * (w // side[1]), side[0] * side[1], c)
+
+
+def from_windows(
+    x: Float[Array, "v windows cells c"], side: tuple[int, int], height: int, width: int
+) -> Float[Array, "v h w c"]:
+    """Inverse of `to_windows`."""
+    v, c = x.shape[0], x.shape[-1]
+    x = x.reshape(v, height // side[0], width // side[1], *side, c).transpose(0, 1, 3, 2, 4, 5)
+    return x.reshape(v, height, width, c)
+
+
+def same_region_mask(
+    height: int, width: int, side: tuple[int, int], shift: tuple[int, int]
+) -> Bool[Array, "1 windows cells cells"]:
+    """Pairs of cells in one window that may attend to each other, in a map rolled by `-shift`.
+
+    Rolling brings cells from opposite borders of the map into one window; such pairs are False.
     """
-    return x * jax.lax.rsqrt(jnp.mean(x * x, axis=-1, keepdims=True) + eps)
+    rows, columns = (np.arange(n) >= n - s for n, s in zip((height, width), shift, strict=True))
+    regions = jnp.asarray((2 * rows[:, None] + columns)[None, :, :, None], jnp.float32)
+    cells = to_windows(regions, side)[..., 0]
+    return cells[..., :, None] == cells[..., None, :]
+
+
+# -- Neighbors in 3D, for the mixers (as in ReSplat) ------------------------------------------------------------------
+
+SEARCH_BLOCK = 1024
+"""Queries per block of the global search, which bounds the size of its distance matrix."""
+
+
+def nearest_tokens(
+    positions: Float[Array, "v hf wf 3"], inside: Bool[Array, "v hf wf"], num_neighbors: int, radius: int
+) -> Int[Array, "m k"]:
+    """Flat indices of each token's nearest tokens in 3D, the token itself first.
+
+    Args:
+        positions: token positions, stream frame.
+        inside: tokens in the image. Others are chosen last.
+        num_neighbors: neighbors per token, the token itself included; fewer where there are not so many candidates.
+        radius: candidates are the (2 r + 1)^2 cells around a token in its own view; 0 for all tokens of all views.
+    """
+    if radius == 0:
+        return _nearest_of_all(positions.reshape(-1, 3), inside.reshape(-1), num_neighbors)
+    v, hf, wf, _ = positions.shape
+    side = 2 * radius + 1
+    flat = jnp.arange(v * hf * wf).reshape(v, hf, wf)
+    rows = jnp.arange(hf)[:, None] + jnp.arange(side) - radius
+    columns = jnp.arange(wf)[:, None] + jnp.arange(side) - radius
+    in_rows, in_columns = (rows >= 0) & (rows < hf), (columns >= 0) & (columns < wf)
+    in_grid = in_rows[:, None, :, None] & in_columns[None, :, None, :]
+    in_grid = jnp.broadcast_to(in_grid, (v, *in_grid.shape)).reshape(v * hf * wf, side * side)
+    rows, columns = jnp.clip(rows, 0, hf - 1), jnp.clip(columns, 0, wf - 1)
+    candidates = flat[:, rows[:, None, :, None], columns[None, :, None, :]].reshape(v * hf * wf, side * side)
+    points, usable = positions.reshape(-1, 3), inside.reshape(-1)
+    offsets = points[candidates] - points[:, None]
+    # At the border of the grid, clipped candidates repeat border cells: only cells inside the grid count.
+    distances = jnp.where(usable[candidates] & in_grid, jnp.sum(offsets**2, axis=-1), jnp.inf)
+    distances = distances.at[:, side * side // 2].set(-1.0)  # the token itself
+    _, best = jax.lax.top_k(-distances, min(num_neighbors, side * side))
+    return jnp.take_along_axis(candidates, best, axis=1)
+
+
+def _nearest_of_all(points, usable, k):
+    m = points.shape[0]
+    padded = jnp.pad(points, ((0, -m % SEARCH_BLOCK), (0, 0)))
+    own = jnp.pad(jnp.arange(m), (0, -m % SEARCH_BLOCK), constant_values=-1)
+
+    def search(block):
+        queries, idx = block
+        distances = sum((queries[:, None, i] - points[None, :, i]) ** 2 for i in range(3))
+        distances = jnp.where(usable[None], distances, jnp.inf)
+        distances = jnp.where(idx[:, None] == jnp.arange(m)[None], -1.0, distances)
+        return jax.lax.top_k(-distances, min(k, m))[1]
+
+    blocks = (padded.reshape(-1, SEARCH_BLOCK, 3), own.reshape(-1, SEARCH_BLOCK))
+    return jax.lax.map(search, blocks).reshape(padded.shape[0], -1)[:m]
+
+
+# -- Blocks, and the U-Net of the compact network and of CGFI ---------------------------------------------------------
 
 
 class ResidualBlock(nn.Module):

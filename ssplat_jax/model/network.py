@@ -1,4 +1,4 @@
-"""Protocol of a network: what `StreamSplat` needs in order to run one.
+"""Stages of the model, and the protocol of a network: what `StreamSplat` needs in order to run one.
 
 A network has a configuration, a frozen dataclass with the fields of `NetworkConfig`, and an object with the methods of
 `Network`. The shipped networks are folders beside this file; `register_network` adds another. Projection of the cache,
@@ -6,62 +6,58 @@ HPDA, CGFI, exposure, decoding and memory are shared by all networks.
 """
 
 import dataclasses
-from collections.abc import Hashable
+import functools
+from collections.abc import Collection, Hashable
 from typing import Any, Protocol, runtime_checkable
 
+import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.errors import InputError
+from ssplat_jax.model.cgfi import Aggregator, num_hints
 from ssplat_jax.model.compact import CompactNetwork
+from ssplat_jax.model.decoder import EvidenceHead, num_features
+from ssplat_jax.model.hpda import AnchorStrength
 from ssplat_jax.model.resplat import ResplatNetwork
-from ssplat_jax.model.types import AnchoredDepth, DepthDistribution, TokenShapes, Views
+from ssplat_jax.model.views import GRID_STRIDE, AnchoredDepth, DepthDistribution, TokenShapes, Views
 from ssplat_jax.network_configs import NETWORK_CONFIGS
+
+STAGES = (
+    "encoder",
+    "cost_volume",
+    "hpda",  # one scalar; without `history.hpda` it is there and not used
+    "upsampler",  # absent in networks that match on the feature grid, as the compact one
+    "tokens",
+    "cgfi",  # absent without `history.cgfi`
+    "mixer",  # empty with `mixer_blocks=0`
+    "decoder",
+    "evidence",  # absent without `head.evidence`
+)
+"""Names of the stages with parameters, in the order in which random keys are split among them."""
 
 
 @runtime_checkable
 class NetworkConfig(Protocol):
     """Members of a network's configuration that shared stages read. Other fields are the network's own."""
 
-    @property
-    def kind(self) -> str:
-        """Name of the network in configurations and files."""
-        ...
-
-    @property
-    def size_multiple(self) -> int:
-        """Images are padded to a multiple of this: a multiple of `match_stride`, and of 16 for CGFI's U-Net."""
-        ...
-
-    @property
-    def match_stride(self) -> int:
-        """Pixels per side of a cell of the matching grid, a multiple of `GRID_STRIDE`."""
-        ...
-
-    @property
-    def depth_range(self) -> tuple[float, float] | None:
-        """Nearest and farthest depth candidate in stream units; None takes the chunk's near and far."""
-        ...
-
-    @property
-    def depth_space(self) -> str:
-        """Space in which candidates are uniform: `log` or `inverse`."""
-        ...
-
-    @property
-    def num_depths(self) -> int:
-        """Number of depth candidates."""
-        ...
-
-    @property
-    def token_width(self) -> int:
-        """Channels of a token's feature, as stored in the cache."""
-        ...
-
-    @property
-    def cgfi_width(self) -> int:
-        """Channels inside the aggregation U-Net of CGFI, a multiple of 8."""
-        ...
+    kind: str
+    """Name of the network in configurations and files."""
+    size_multiple: int
+    """Images are padded to a multiple of this: a multiple of `match_stride`, and of 16 for CGFI's U-Net."""
+    match_stride: int
+    """Pixels per side of a cell of the matching grid, a multiple of `GRID_STRIDE`."""
+    depth_range: tuple[float, float] | None
+    """Nearest and farthest depth candidate in stream units; None takes the chunk's near and far."""
+    depth_space: str
+    """Space in which candidates are uniform: `log` or `inverse`."""
+    num_depths: int
+    """Number of depth candidates."""
+    token_width: int
+    """Channels of a token's feature, as stored in the cache."""
+    cgfi_width: int
+    """Channels inside the aggregation U-Net of CGFI, a multiple of 8."""
 
 
 @runtime_checkable
@@ -73,10 +69,9 @@ class Network(Protocol):
     """
 
     def stages(self, config: StreamConfig) -> dict[str, tuple[Any, tuple]]:
-        """Linen module and example inputs of every stage, by name; used to initialize parameters.
+        """Linen module and example inputs of every stage that is the network's own (`STAGES`), to initialize it.
 
-        The names are `encoder`, `cost_volume`, `tokens`, `mixer`, `decoder` and, where depth is refined, `upsampler`. A
-        stage may have no parameters, but its module must be there.
+        A stage may have no parameters, but its module must be there.
         """
         ...
 
@@ -107,10 +102,10 @@ class Network(Protocol):
         ...
 
     def bound_history(self, feats: Float[Array, "v hf wf c"]) -> Float[Array, "v hf wf c"]:
-        """Projected cache features, bounded in size.
+        """Projected cache features, bounded in size; called only with `additions.unit_features`.
 
         Injected features are stored and come back with the next chunk. A network whose `mix_tokens` does not end in a
-        norm must bound them here, or they grow from chunk to chunk. Called only with `additions.unit_features`.
+        norm must bound them here, or they grow from chunk to chunk.
         """
         ...
 
@@ -151,19 +146,78 @@ def register_network(config_type: type, network: Network) -> None:
     Raises:
         InputError: `config_type` or `network` lacks something, or another network has that kind.
     """
-    config: Any = config_type()
-    if not dataclasses.is_dataclass(config) or not isinstance(config, NetworkConfig):
-        raise InputError(
-            f"register_network: wanted a dataclass with the members of NetworkConfig, got {config_type.__name__}."
-        )
-    if not isinstance(network, Hashable):
-        raise InputError(f"register_network: wanted an object with a hash, got {type(network).__name__}; freeze it.")
-    if not isinstance(network, Network):
-        raise InputError(
-            f"register_network: wanted an object with the methods of Network, got {type(network).__name__}."
-        )
-    kind = config.kind
+    is_config = dataclasses.is_dataclass(config_type) and isinstance(config_type(), NetworkConfig)
+    for given, wanted, is_good in (
+        (config_type, "a dataclass with the members of NetworkConfig", is_config),
+        (type(network), "an object with a hash", isinstance(network, Hashable)),
+        (type(network), "an object with the methods of Network", isinstance(network, Network)),
+    ):
+        if not is_good:
+            raise InputError(f"register_network: wanted {wanted}, got {given.__name__}.")
+    kind: str = config_type.kind  # pyright: ignore[reportAttributeAccessIssue]
     if kind in NETWORKS and NETWORK_CONFIGS[kind] is not config_type:
         raise InputError(f"register_network: wanted a new kind, got {kind!r}, which is taken; choose another.")
     NETWORK_CONFIGS[kind] = config_type
     NETWORKS[kind] = network
+
+
+# -- Parameters: nested dicts, whose names are part of the weights file format ----------------------------------------
+
+
+def init_params(key: jax.Array, config: StreamConfig, only: Collection[str] | None = None) -> dict:
+    """Random parameters for `config`. Their shapes depend on the configuration alone, not on the image size.
+
+    Args:
+        key: JAX random key.
+        config: model configuration.
+        only: stages to return, with the values that they have among all stages; default all that are on.
+
+    Raises:
+        InputError: the network has a stage of an unknown name.
+    """
+    network = network_of(config)
+    modules = _modules(config, network)
+    if unknown := sorted(modules.keys() - set(STAGES)):
+        raise InputError(f"network {config.network.kind!r}: wanted stages among {', '.join(STAGES)}, got {unknown}.")
+    names = [name for name in STAGES if name in modules]
+    keys = jax.random.split(key, len(names))  # CGFI has its key also where it is off, so that the others start alike
+    wanted = set(names if only is None else only) - (set() if config.history.cgfi else {"cgfi"})
+    return {name: _init_stage(k, config, name, network) for k, name in zip(keys, names, strict=True) if name in wanted}
+
+
+# One program per stage: a single program for all stages of a large network takes 1.5 times as long to compile, and
+# eager initialization compiles every operation of every layer by itself.
+@functools.partial(jax.jit, static_argnums=(1, 2, 3))
+def _init_stage(key: jax.Array, config: StreamConfig, name: str, network: Network) -> dict:
+    module, inputs = _modules(config, network)[name]
+    return module.init(key, *inputs).get("params", {})
+
+
+def _modules(config: StreamConfig, network: Network) -> dict:
+    """Linen module and example inputs of every stage."""
+    v, side, c = 2, config.network.size_multiple // GRID_STRIDE, config.network.token_width
+    grid = lambda channels: jnp.zeros((v, side, side, channels))  # noqa: E731
+    shared: dict = {
+        "hpda": (AnchorStrength(), ()),
+        "cgfi": (Aggregator(config), (grid(c), grid(num_hints(config)), jnp.ones(v, bool))),
+    }
+    if config.head.evidence:
+        shared["evidence"] = (EvidenceHead(), (jnp.zeros((1, num_features())),))
+    return network.stages(config) | shared
+
+
+def complete_params(key: jax.Array, config: StreamConfig, params: dict) -> dict:
+    """`params` with untrained parameters for each stage that `config` uses and that has none in them.
+
+    Args:
+        key: JAX random key; a stage gets the values that `init_params` gives it.
+        config: model configuration.
+        params: parameters of a model with fewer stages, such as `tiny` without CGFI and mixer.
+    """
+    untrained = init_params(key, config)
+    return untrained | {name: params[name] for name, stage in untrained.items() if stage and params.get(name)}
+
+
+def count_params(params: dict) -> int:
+    """Number of scalars in `params`."""
+    return sum(leaf.size for leaf in jax.tree.leaves(params))

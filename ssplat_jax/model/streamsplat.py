@@ -7,42 +7,40 @@ encode ─► match ─► P_i ──────────► anchor_depth (H
   │                                   │                                                   │
   └─► regress_tokens ─► f ─► inject_features (CGFI) ─► mix_tokens ─► f                    │
                                                         └──────► fuse (VACC) ◄────────────┘ ─► cache H_t ─► decode
+
+`network.STAGES` says which of these may be absent.
 """
 
 import dataclasses
 import functools
-import math
 from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ssplat_jax import model as stages
-from ssplat_jax.cache import (
-    Tokens,
-    VoxelCache,
-    carve,
-    coarsen,
-    fuse,
-    init_cache,
-    project,
-    store_depths,
-    vote,
-)
+from ssplat_jax.cache import Tokens, VoxelCache, carve, coarsen, fuse, init_cache, project, store_depths, vote
 from ssplat_jax.cache.observations import observe, seen_cells
 from ssplat_jax.cache.residuals import revise, unpack
-from ssplat_jax.cache.state import pivot_fields
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.chunk import Chunk, check_chunk
 from ssplat_jax.core.gaussians import Gaussians, mask_gaussians
-from ssplat_jax.core.pytree import pytree, replace
+from ssplat_jax.core.pytree import pytree
 from ssplat_jax.core.rotations import matrices_to_quats
-from ssplat_jax.model.decoder import MAX_SCALE
-from ssplat_jax.model.types import TokenShapes, Views
-
-VOXEL_COVERAGE = 1.2
-"""Share of a voxel's face that its pivots cover together: above 1, because pivots gather in the middle of the voxel."""
+from ssplat_jax.model.cgfi import inject_features
+from ssplat_jax.model.decoder import MAX_SCALE, Evidence, apply_evidence, decode_tokens, grown_footprints
+from ssplat_jax.model.exposure import estimate_exposures
+from ssplat_jax.model.hpda import anchor_depth
+from ssplat_jax.model.network import init_params, network_of
+from ssplat_jax.model.views import (
+    GRID_STRIDE,
+    TokenShapes,
+    Views,
+    back_project,
+    patch_colors,
+    prepare_views,
+    repeat_cells,
+)
 
 
 @pytree
@@ -86,7 +84,7 @@ class StreamSplat:
 
     def init(self, key: jax.Array) -> dict:
         """Untrained parameters, a nested dict; `ssplat_jax.load_params` loads trained ones."""
-        return stages.init_params(key, self.config)
+        return init_params(key, self.config)
 
     def init_cache(self) -> VoxelCache:
         """An empty cache of the configuration's capacity."""
@@ -94,10 +92,10 @@ class StreamSplat:
 
     def predict(self, params: dict, cache: VoxelCache, chunk: Chunk) -> Prediction:
         """Tokens of a chunk, given the cache before it (Secs. 3.3 to 3.6); no gradient flows to the cache."""
-        config, network = self.config, stages.network_of(self.config)
+        config, network = self.config, network_of(self.config)
         check_chunk(chunk, config.stream.chunk_size)
-        views = stages.prepare_views(chunk, config)
-        factor = config.network.match_stride // stages.GRID_STRIDE
+        views = prepare_views(chunk, config)
+        factor = config.network.match_stride // GRID_STRIDE
         with jax.named_scope("project"):
             history = project(jax.lax.stop_gradient(cache), views.grid_camera, config, axis=self.axis)
         with jax.named_scope("encode"):
@@ -105,24 +103,23 @@ class StreamSplat:
         with jax.named_scope("match"):
             distribution = network.match(params["cost_volume"], features, views, config)
         with jax.named_scope("HPDA"):
-            depth = stages.anchor_depth(params["hpda"], distribution, coarsen(history, factor), views, config)
+            depth = anchor_depth(params["hpda"], distribution, coarsen(history, factor), views, config)
         with jax.named_scope("refine"):
             depth = network.refine_depth(params.get("upsampler"), features, depth, views, config)
         with jax.named_scope("tokens"):
-            positions, footprints = stages.back_project(depth.log_depths, views)
+            positions, footprints = back_project(depth.log_depths, views)
             feats = network.regress_tokens(params["tokens"], features, distribution, depth, views, config)
-        with jax.named_scope("CGFI"):
-            omega, bound = depth.anchored_confidences, network.bound_history
-            feats = stages.inject_features(
-                params.get("cgfi"), feats, history, omega, views, config, bound_history=bound
-            )
+        if config.history.cgfi:
+            with jax.named_scope("CGFI"):
+                omega, bound = depth.anchored_confidences, network.bound_history
+                feats = inject_features(params["cgfi"], feats, history, omega, views, config, bound_history=bound)
         with jax.named_scope("mixer"):
             feats = network.mix_tokens(params["mixer"], feats, positions, views.inside, views.valid, config)
         confidences = jnp.where(views.inside, depth.matcher_confidences, 0.0)
         with jax.named_scope("exposure"):
-            exposures = stages.estimate_exposures(history, depth.log_depths, confidences, views, config)
+            exposures = estimate_exposures(history, depth.log_depths, confidences, views, config)
         tokens = _flatten_tokens(positions, feats, confidences, footprints, exposures, views, config)
-        logits = stages.repeat_cells(distribution.logits, factor)
+        logits = repeat_cells(distribution.logits, factor)
         output = ChunkOutput(jnp.exp(depth.log_depths), confidences, history.confidences, exposures)
         return Prediction(tokens, logits, depth.log_depths, views, output)
 
@@ -151,8 +148,7 @@ class StreamSplat:
     def update_cache(self, cache: VoxelCache, prediction: Prediction) -> VoxelCache:
         """The cache after a chunk: stored depths vote on its tokens, which are fused (VACC), and views on all pivots.
 
-        Carving includes the new pivots, so views of one chunk that disagree lower each other's confidences at once. No
-        gradient flows.
+        No gradient flows.
         """
         prediction = jax.lax.stop_gradient(prediction)
         seen = (prediction.views.grid_camera, prediction.output.depths, prediction.output.confidences)
@@ -160,6 +156,7 @@ class StreamSplat:
             tokens = vote(cache.stored_depths, prediction.tokens, self.config)
         with jax.named_scope("VACC"):
             cache = fuse(cache, tokens, self.config, axis=self.axis)
+        # After fusion, so that views of one chunk that disagree lower the confidence of each other's pivots at once.
         with jax.named_scope("carve"):
             cache = carve(cache, *seen, self.config)
             cache = store_depths(cache, *seen, self.config)
@@ -185,64 +182,57 @@ class StreamSplat:
 
         Gaussians of dead and carved pivots have opacity 0.
         """
-        return self._decode_pivots(params, cache, shown_pivots(cache, self.config).reshape(-1), lambda x: x)
-
-    def decode_shown(self, params: dict, cache: VoxelCache, num_pivots: int) -> Gaussians:
-        """The Gaussians that `decode` shows, in the same order but without gaps, at the cost of `num_pivots`.
-
-        Limits:
-            If fewer pivots are shown, the last rows have opacity 0; if more are shown, the last of them are omitted.
-        """
         is_shown = shown_pivots(cache, self.config).reshape(-1)
-        places = jnp.nonzero(is_shown, size=num_pivots, fill_value=is_shown.size)[0]
-        last = is_shown.size - 1
-        return self._decode_pivots(params, cache, places <= last, lambda x: x[jnp.minimum(places, last)])
+        return self._decode(params, cache, is_shown, lambda x: x.reshape(-1, *x.shape[2:]))
 
-    def decode_pivots(self, params: dict, cache: VoxelCache, pivots: Int[Array, " m"]) -> Gaussians:
-        """The Gaussians that `decode` shows for some pivots, numbered row by row; a pivot of -1 has opacity 0."""
-        taken = jnp.maximum(pivots, 0)
-        is_shown = (pivots >= 0) & shown_pivots(cache, self.config).reshape(-1)[taken]
-        return self._decode_pivots(params, cache, is_shown, lambda x: x[taken])
+    def decode_rows(self, params: dict, cache: VoxelCache, pivots: Int[Array, " m"]) -> Gaussians:
+        """The Gaussians that `decode` gives for some pivots, at the cost of these alone.
 
-    def _decode_pivots(
+        Args:
+            params: the model's parameters.
+            cache: the scene.
+            pivots: numbers of pivots, voxel by voxel: pivot `k` of row `r` is `r * pivots_per_voxel + k`. The
+                Gaussians of -1 have opacity 0.
+        """
+        take = lambda x: x.reshape(-1, *x.shape[2:])[pivots]  # noqa: E731
+        is_shown = (pivots >= 0) & take(shown_pivots(cache, self.config))
+        return self._decode(params, cache, is_shown, take)
+
+    def _decode(
         self, params: dict, cache: VoxelCache, is_shown: Bool[Array, " m"], take: Callable[[Array], Array]
     ) -> Gaussians:
-        """Gaussians of the pivots that `take` selects from a flat array of all pivots."""
-        flat = lambda x: take(x.reshape(-1, *x.shape[2:]))  # noqa: E731
-        shapes, footprints = self._read_shapes(params, flat(cache.feats)), merged_footprints(cache, self.config)
-        rgbs = flat(cache.rgbs)
+        """Gaussians of the pivots that `take` selects."""
+        rgbs, stored, num_members = take(cache.rgbs), take(cache.footprints), take(cache.num_members)
+        footprints = grown_footprints(stored, num_members, self.config)
+        shapes = self._read_shapes(params, take(cache.feats))
         if cache.observations is not None:
-            evidence = stages.Evidence(
-                observations=flat(cache.observations),
-                confidences=flat(cache.confidences),
-                num_members=flat(cache.num_members).astype(jnp.float32),
-                num_pivots=flat(jnp.broadcast_to(cache.counts[:, None], cache.confidences.shape)).astype(jnp.float32),
-                footprints=flat(cache.footprints),
-                growth=flat(footprints / jnp.maximum(cache.footprints, 1e-12)),
+            num_pivots = jnp.broadcast_to(cache.counts[:, None], cache.confidences.shape)
+            evidence = Evidence(
+                observations=take(cache.observations),
+                confidences=take(cache.confidences),
+                num_members=num_members.astype(jnp.float32),
+                num_pivots=take(num_pivots).astype(jnp.float32),
+                footprints=stored,
+                growth=footprints / jnp.maximum(stored, 1e-12),
                 rgbs=rgbs,
             )
-            shapes, rgbs = stages.apply_evidence(params["evidence"], shapes, evidence, self.config)
-        gaussians = stages.decode_tokens(
+            shapes, rgbs = apply_evidence(params["evidence"], shapes, evidence, self.config)
+        gaussians = decode_tokens(
             shapes,
-            means=flat(cache.means),
+            means=take(cache.means),
             rgbs=rgbs,
-            quats=flat(cache.quats),
-            footprints=flat(footprints),
-            num_members=flat(cache.num_members),
+            quats=take(cache.quats),
+            footprints=footprints,
+            num_members=num_members,
             config=self.config,
         )
         if cache.residuals is not None:
-            gaussians = revise(gaussians, unpack(flat(cache.residuals)), max_scale=MAX_SCALE)
+            gaussians = revise(gaussians, unpack(take(cache.residuals)), max_scale=MAX_SCALE)
         return mask_gaussians(gaussians, self.repeat_per_gaussian(is_shown))
-
-    def decode_rows(self, params: dict, cache: VoxelCache, rows: Int[Array, " r"]) -> Gaussians:
-        """Gaussians that `decode` gives for the voxels `rows`, k pivots each; rows of -1 have opacity 0."""
-        part = {name: getattr(cache, name)[rows] for name in ("voxels", *pivot_fields(cache))}
-        return self.decode(params, replace(cache, counts=jnp.where(rows >= 0, cache.counts[rows], 0), **part))
 
     def decode_tokens(self, params: dict, tokens: Tokens) -> Gaussians:
         """Gaussians of tokens that are not in a cache, as training renders them (Sec. 3.7)."""
-        gaussians = stages.decode_tokens(
+        gaussians = decode_tokens(
             self._read_shapes(params, tokens.feats),
             means=tokens.means,
             rgbs=tokens.rgbs,
@@ -253,7 +243,7 @@ class StreamSplat:
         return mask_gaussians(gaussians, self.repeat_per_gaussian(tokens.valid))
 
     def _read_shapes(self, params: dict, feats: Float[Array, "m c"]) -> TokenShapes:
-        return stages.network_of(self.config).read_shapes(params["decoder"], feats, self.config)
+        return network_of(self.config).read_shapes(params["decoder"], feats, self.config)
 
     def repeat_per_gaussian(self, mask: Bool[Array, " m"]) -> Bool[Array, " n"]:
         """A mask of tokens or pivots as a mask of their Gaussians."""
@@ -265,24 +255,15 @@ def shown_pivots(cache: VoxelCache, config: StreamConfig) -> Bool[Array, "capaci
     return cache.alive & (cache.confidences >= config.memory.min_confidence)
 
 
-def merged_footprints(cache: VoxelCache, config: StreamConfig) -> Float[Array, "capacity k"]:
-    """Footprints of pivots, grown with the number of members until K pivots cover a voxel's face.
-
-    A pivot stores the footprint of its best member. Where grid cells are much finer than voxels, many tokens merge into
-    K pivots, whose stored footprints would leave cracks between them. `merged_coverage=False` leaves them as they
-    are stored.
-    """
-    if not config.additions.merged_coverage:
-        return cache.footprints
-    share = VOXEL_COVERAGE * config.memory.voxel_size / math.sqrt(config.memory.pivots_per_voxel)
-    grown = cache.footprints * jnp.sqrt(cache.num_members.astype(jnp.float32))
-    return jnp.minimum(grown, jnp.maximum(cache.footprints, share))
+def shown_rows(cache: VoxelCache, config: StreamConfig, num: int) -> Int[Array, " m"]:
+    """Numbers of the first `num` pivots that `decode` shows, for `decode_rows`; -1 after the last."""
+    return jnp.nonzero(shown_pivots(cache, config).reshape(-1), size=num, fill_value=-1)[0]
 
 
 def _flatten_tokens(positions, feats, confidences, footprints, exposures, views: Views, config: StreamConfig) -> Tokens:
     """Maps flattened to tokens in order of insertion: view-major, row-major. Colors are at the scene's exposure."""
     v, hf, wf, _ = positions.shape
-    colors = stages.patch_colors(views.images, config).reshape(v, hf, wf, -1, 3) / exposures[:, None, None, None]
+    colors = patch_colors(views.images, config).reshape(v, hf, wf, -1, 3) / exposures[:, None, None, None]
     quats = matrices_to_quats(jnp.swapaxes(views.viewmats[:, :3, :3], -1, -2))
     return Tokens(
         means=positions.reshape(-1, 3),

@@ -12,7 +12,7 @@ Columns, in this order:
 Tiles are numbered camera-major, then row-major. A pair's key is `tile << bits | row`, so that a sort of plain integers
 gives the exact order. XLA's CPU backend sorts single integers five times faster than (key, payload) tuples, hence the
 packing. Pairs are found from near to far, so pieces of them that are sorted separately only need to be joined tile by
-tile (`xla_cpu.sort_pieces`).
+tile (`cpu_backend.sort_pieces`).
 """
 
 import functools
@@ -22,9 +22,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from ssplat_jax.core.cpu_backend import SORT_PIECES, by_platform, in_own_kernel, sort_pieces
 from ssplat_jax.core.numerics import columns, safe_log
 from ssplat_jax.core.pytree import pytree, static
-from ssplat_jax.core.xla_cpu import SORT_PIECES, by_platform, in_own_kernel, sort_pieces
 from ssplat_jax.rasterizer import constants
 from ssplat_jax.rasterizer.projection import Splats
 

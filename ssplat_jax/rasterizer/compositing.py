@@ -23,7 +23,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from ssplat_jax.core.xla_cpu import by_platform, in_own_kernel, short_exp
+from ssplat_jax.core.cpu_backend import by_platform, in_own_kernel, short_exp
 from ssplat_jax.rasterizer import constants
 from ssplat_jax.rasterizer.binning import (
     BOX,

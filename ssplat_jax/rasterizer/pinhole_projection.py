@@ -10,7 +10,7 @@ The chain rule by hand. Below, D x denotes dL/dx, for a Gaussian and a camera:
     D turn = D row_u x row_u + D row_v x row_v  by a small rotation; D quat = 2 (0, D turn) quat / |quat|
 
 The automatic gradient takes ten times as long as the projection itself: XLA fuses every entry of the result with all
-that leads to it, so each repeats most of the work. Here the results of each line are kept (`xla_cpu.kept`).
+that leads to it, so each repeats most of the work. Here the results of each line are kept (`cpu_backend.kept`).
 """
 
 import functools
@@ -22,11 +22,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from ssplat_jax.core.cameras import Camera
+from ssplat_jax.core.cpu_backend import kept
 from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.core.numerics import columns, safe_normalize
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.core.rotations import matrix_entries
-from ssplat_jax.core.xla_cpu import kept
 from ssplat_jax.rasterizer import constants
 from ssplat_jax.rasterizer.effects import Effects
 from ssplat_jax.rasterizer.projection import FILTER_VARIANCES, Splats, camera_points, project, tangent_bounds

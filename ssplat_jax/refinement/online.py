@@ -81,7 +81,7 @@ def _revise_view(model: StreamSplat, params: dict, cache: VoxelCache, view: KeyV
     """The cache after one step on a single view, which revises the pivots that the view shows."""
     config = model.config
     pivots = visible_pivots(cache, view, config)
-    base = model.decode_pivots(params, replace(cache, residuals=None), pivots)
+    base = model.decode_rows(params, replace(cache, residuals=None), pivots)
     taken = jnp.maximum(pivots, 0)
     flat = lambda x: x.reshape(-1, *x.shape[2:])  # noqa: E731
     means, packed = flat(cache.means)[taken], flat(cache.residuals)[taken]

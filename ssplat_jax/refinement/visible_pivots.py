@@ -12,8 +12,9 @@ from ssplat_jax.cache.key_views import KeyViews
 from ssplat_jax.cache.project import NEAR
 from ssplat_jax.cache.state import VoxelCache
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.model import GRID_STRIDE
-from ssplat_jax.model.streamsplat import merged_footprints, shown_pivots
+from ssplat_jax.model.decoder import grown_footprints
+from ssplat_jax.model.streamsplat import shown_pivots
+from ssplat_jax.model.views import GRID_STRIDE
 
 PIVOTS_PER_CELL = 8
 """Pivots that a step revises, as a multiple of the grid cells of its view: the least covered ones. It fixes time and
@@ -52,7 +53,8 @@ def visible_pivots(cache: VoxelCache, view: KeyViews, config: StreamConfig) -> I
     is_listed, taken = listed < num_pivots, jnp.minimum(listed, num_pivots - 1)
     cell_of = lambda place, count: jnp.clip(place[taken], 0, count - 1).astype(jnp.int32)  # noqa: E731
     cells = jnp.where(is_listed, cell_of(row, rows) * columns + cell_of(column, columns), num_cells)
-    sides = merged_footprints(cache, config).reshape(-1)[taken] * view.Ks[0, 0] / (z[taken] * GRID_STRIDE)
+    stored, num_members = (x.reshape(-1)[taken] for x in (cache.footprints, cache.num_members))
+    sides = grown_footprints(stored, num_members, config) * view.Ks[0, 0] / (z[taken] * GRID_STRIDE)
     covers = areas_before(cells, z[taken], jnp.where(is_listed, jnp.minimum(sides * sides, 1.0), 0.0), num_cells)
 
     order = _argsort(jnp.where(is_listed, covers, jnp.inf))[: min(PIVOTS_PER_CELL * num_cells, size)]

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from ssplat_jax.core.console import Reporter
+from ssplat_jax.core.cpu_backend import make_room
 from ssplat_jax.core.errors import InputError, echo, refusal
-from ssplat_jax.core.program_memory import make_room
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.open_capture import is_capture, open_capture, without_tilde
 from ssplat_jax.data.posed_image import split_options, with_options

@@ -14,7 +14,7 @@ from jaxtyping import Float, Float64
 from scipy.spatial.transform import Rotation
 
 from ssplat_jax.core.errors import InputError
-from ssplat_jax.core.sh_rotation import sh_rotation
+from ssplat_jax.core.rotations import sh_rotation
 from ssplat_jax.scene_files.export_rows import LOG_SCALE_LIMIT, unit_quats
 from ssplat_jax.scene_files.gltf import BINARY_CHUNK, EXTENSION, JSON_CHUNK, MAGIC, TYPES, VERSION, sh_names
 from ssplat_jax.scene_files.ply import RENDER_MODES

@@ -21,7 +21,7 @@ import numpy as np
 
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.errors import InputError
-from ssplat_jax.model import init_params
+from ssplat_jax.model.network import init_params
 from ssplat_jax.storage.files import check_tensors, read_tensors
 
 DEPTH = "encoder.depth_predictor."

@@ -15,7 +15,7 @@ from jax.flatten_util import ravel_pytree
 
 from ssplat_jax.config import PRESETS, StreamConfig, preset
 from ssplat_jax.core.errors import InputError, StorageError
-from ssplat_jax.model import init_params
+from ssplat_jax.model.network import init_params
 from ssplat_jax.storage.files import load_arrays, save_arrays
 
 KIND = "weights 1"

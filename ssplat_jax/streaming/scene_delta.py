@@ -17,7 +17,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float32, Int32
+from jaxtyping import Array, Bool, Float32, Int, Int32
 
 from ssplat_jax.cache import VoxelCache
 from ssplat_jax.cache.observations import total_weight
@@ -59,12 +59,11 @@ class SceneFeed:
     """
 
     def __init__(self, model: StreamSplat, params: dict, known: VoxelCache | None = None) -> None:
-        self._params = params
+        self._params, k = params, model.config.memory.pivots_per_voxel
         self._shown_pivots = jax.jit(lambda cache: shown_pivots(cache, model.config))
         self._total_weight = jax.jit(lambda cache: total_weight(cache.observations))
-        self._decode_rows = jax.jit(model.decode_rows)
-        shape = (0, model.config.memory.pivots_per_voxel)
-        self._record = _Record(0, np.zeros(shape, bool), np.zeros(shape, np.float32))
+        self._decode_rows = jax.jit(lambda params, cache, rows: model.decode_rows(params, cache, _pivots_of(rows, k)))
+        self._record = _Record(0, np.zeros((0, k), bool), np.zeros((0, k), np.float32))
         if known is not None:
             self._record = self._changes(known)[1]
 
@@ -103,6 +102,11 @@ class SceneFeed:
             is_changed |= shown & (seen != np.pad(last.seen, more))
         rows = np.flatnonzero(is_changed.any(axis=1)).astype(np.int32)
         return rows, _Record(int(cache.stats.num_chunks), shown, seen)
+
+
+def _pivots_of(rows: Int[Array, " r"], k: int) -> Int[Array, " m"]:
+    """Numbers of all pivots of the voxels `rows`, -1 for a row of -1."""
+    return jnp.where(rows[:, None] >= 0, rows[:, None] * k + jnp.arange(k), -1).reshape(-1)
 
 
 def apply_delta(scene: Gaussians | None, delta: SceneDelta) -> Gaussians:

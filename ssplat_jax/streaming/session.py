@@ -14,8 +14,8 @@ from ssplat_jax.core.chunk import Chunk
 from ssplat_jax.core.errors import refusal
 from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.data.stream_frame import StreamFrame
-from ssplat_jax.model import GRID_STRIDE
-from ssplat_jax.model.streamsplat import ChunkOutput, StreamSplat, shown_pivots
+from ssplat_jax.model.streamsplat import ChunkOutput, StreamSplat, shown_pivots, shown_rows
+from ssplat_jax.model.views import GRID_STRIDE
 from ssplat_jax.streaming.live_views import LiveViews
 
 INITIAL_CHUNKS = 4
@@ -170,8 +170,11 @@ class Session:
         leaves, structure = jax.tree.flatten(cache)
         key = ("decode", num_pivots, structure, *((leaf.shape, leaf.dtype) for leaf in leaves))
         if key not in self._programs:
-            decode = jax.jit(self.model.decode_shown, static_argnums=2)
-            self._programs[key] = decode.lower(self.params, cache, num_pivots).compile()
+            model = self.model
+            decode = lambda params, cache: model.decode_rows(  # noqa: E731
+                params, cache, shown_rows(cache, model.config, num_pivots)
+            )
+            self._programs[key] = jax.jit(decode).lower(self.params, cache).compile()
         return self._programs[key]
 
     def _present_cache(self) -> VoxelCache:

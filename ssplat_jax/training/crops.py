@@ -15,8 +15,8 @@ from ssplat_jax.cache import VoxelCache
 from ssplat_jax.cache.key_views import KeyViews
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.cameras import Camera
+from ssplat_jax.core.cpu_backend import make_room
 from ssplat_jax.core.errors import refusal
-from ssplat_jax.core.program_memory import make_room
 from ssplat_jax.core.pytree import pytree, replace, static
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.open_capture import open_capture

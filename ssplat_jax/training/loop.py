@@ -18,7 +18,7 @@ import optax
 
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.atomic import write_atomic
-from ssplat_jax.core.cores import num_cores
+from ssplat_jax.core.cpu_backend import num_cores
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.core.pytree import pytree
 from ssplat_jax.evaluation.lpips import LpipsWeights

@@ -22,7 +22,7 @@ from ssplat_jax.cache import Tokens, VoxelCache, vote
 from ssplat_jax.core.gaussians import Gaussians, mask_gaussians, mean_color
 from ssplat_jax.evaluation.lpips import LpipsWeights
 from ssplat_jax.evaluation.lpips import lpips as lpips_distance
-from ssplat_jax.model.streamsplat import StreamSplat
+from ssplat_jax.model.streamsplat import StreamSplat, shown_rows
 from ssplat_jax.rasterizer import fill_holes, render
 from ssplat_jax.refinement.view_loss import EFFECTS
 from ssplat_jax.training.crops import Crop
@@ -181,7 +181,7 @@ class CropLoss:
         """Mean over the crops of `batch`, and their PSNRs in dB."""
         shown = black = jnp.zeros(())
         for crop in batch:
-            gaussians = model.decode_shown(params, crop.cache, crop.num_pivots)
+            gaussians = model.decode_rows(params, crop.cache, shown_rows(crop.cache, model.config, crop.num_pivots))
             out = render(gaussians, crop.camera, effects=EFFECTS, max_pairs=crop.max_pairs)
             filled = fill_holes(out.color, out.alpha, mean_color(gaussians))
             target = crop.image.astype(jnp.float32) / 255

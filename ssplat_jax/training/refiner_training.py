@@ -21,7 +21,7 @@ from jaxtyping import Array, Int
 from ssplat_jax.cache.key_views import KeyViews
 from ssplat_jax.core.gaussians import Gaussians, mean_color
 from ssplat_jax.core.pytree import replace
-from ssplat_jax.model.streamsplat import StreamSplat
+from ssplat_jax.model.streamsplat import StreamSplat, shown_rows
 from ssplat_jax.rasterizer import fill_holes, render
 from ssplat_jax.refinement.learned_pass import SeenErrors, add_view, learned_change, no_errors
 from ssplat_jax.refinement.present_rows import only_present, present_rows
@@ -114,7 +114,7 @@ def train_refiner(
     scenes, names, states = [], [], []
     for capture, stride in recipe.scenes.scenes(mix):
         cache, key_views, num_pivots, max_pairs = stream_scene(model, params, capture, stride)
-        gaussians = jax.jit(model.decode_shown, static_argnums=2)(params, cache, num_pivots)
+        gaussians = jax.jit(model.decode_rows)(params, cache, shown_rows(cache, model.config, num_pivots))
         scenes.append((key_views, max_pairs))
         names.append(f"{capture.name}, stride {stride}")
         states.append(init_refinement(only_present(gaussians, present_rows(gaussians)), config=CONFIG))

@@ -21,7 +21,7 @@ from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.depth_range import FAR_FACTOR, NEAR_FACTOR
 from ssplat_jax.data.procedural.procedural_views import STEP_RANGE, training_sample
 from ssplat_jax.data.stream_frame import StreamFrame
-from ssplat_jax.model import GRID_STRIDE
+from ssplat_jax.model.views import GRID_STRIDE
 from ssplat_jax.training.capture_mix import CaptureMix, PhaseStart, held_out_frames, learned_frames
 
 MAX_LOG_STEP = 0.05

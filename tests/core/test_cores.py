@@ -2,7 +2,7 @@
 
 import os
 
-from ssplat_jax.core.cores import num_cores
+from ssplat_jax.core.cpu_backend import num_cores
 
 
 def test_it_is_the_cores_of_the_process_or_else_of_the_machine(monkeypatch):

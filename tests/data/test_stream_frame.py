@@ -6,8 +6,7 @@ import pytest
 
 from ssplat_jax.core.cameras import project_points, transform_points
 from ssplat_jax.core.gaussians import Gaussians
-from ssplat_jax.core.rotations import quats_to_matrices
-from ssplat_jax.core.sh_rotation import sh_rotation
+from ssplat_jax.core.rotations import quats_to_matrices, sh_rotation
 from ssplat_jax.data.stream_frame import StreamFrame
 
 FLOAT64_ROUNDING = 1e-12

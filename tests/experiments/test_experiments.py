@@ -19,8 +19,7 @@ from ssplat_jax.commands.main import guarded
 from ssplat_jax.commands.options import QualityName
 from ssplat_jax.config import QUALITIES
 from ssplat_jax.data.open_capture import open_capture
-from ssplat_jax.model import complete_params
-from ssplat_jax.model.params import STAGES
+from ssplat_jax.model.network import STAGES, complete_params
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.refinement.learned_pass import STEPS
 from ssplat_jax.refinement.refine_config import FOR_CAPTURES

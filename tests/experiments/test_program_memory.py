@@ -7,7 +7,7 @@ from ssplat_experiments import warm_sessions
 from ssplat_experiments.program_memory import make_room
 
 from ssplat_jax.config import preset
-from ssplat_jax.core.program_memory import MAPS
+from ssplat_jax.core.cpu_backend import MAPS
 
 
 @pytest.mark.skipif(not MAPS.exists(), reason="only Linux counts memory maps there")

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ssplat_jax.model.convolution import DIMENSIONS, Conv, HalvingConv, conv2d, pixel_shuffle, pixel_unshuffle
+from ssplat_jax.model.layers import DIMENSIONS, Conv, HalvingConv, conv2d, pixel_shuffle, pixel_unshuffle
 
 FLOAT32 = 2e-4  # sums of a few hundred products of unit normals, in another order
 

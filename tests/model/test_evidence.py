@@ -11,7 +11,7 @@ from ssplat_jax.cache import init_cache
 from ssplat_jax.cache.state import NUM_OBSERVED
 from ssplat_jax.config import PRESETS, preset
 from ssplat_jax.core.pytree import replace
-from ssplat_jax.model.evidence import (
+from ssplat_jax.model.decoder import (
     MAX_LOG_CONTRAST,
     MAX_LOGIT_CHANGE,
     Evidence,
@@ -19,9 +19,9 @@ from ssplat_jax.model.evidence import (
     apply_evidence,
     evidence_features,
 )
-from ssplat_jax.model.params import init_params
+from ssplat_jax.model.network import init_params
 from ssplat_jax.model.streamsplat import StreamSplat
-from ssplat_jax.model.types import TokenShapes
+from ssplat_jax.model.views import TokenShapes
 
 CONFIG = preset("tiny").replace(capacity=128)
 NUM = 5

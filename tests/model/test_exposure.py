@@ -10,8 +10,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from ssplat_jax.core.pytree import replace
-from ssplat_jax.model import estimate_exposures, prepare_views
-from ssplat_jax.model.exposure import MIN_CELLS
+from ssplat_jax.model.exposure import MIN_CELLS, estimate_exposures
+from ssplat_jax.model.views import prepare_views
 from tests.model.small import CONFIG, chunk, history
 
 TRUSTING = CONFIG.replace(min_confidence=0.5)

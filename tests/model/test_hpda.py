@@ -13,7 +13,7 @@ from ssplat_jax.model.hpda import (
     inject_anchor,
     peak_confidence,
 )
-from ssplat_jax.model.types import DepthDistribution, prepare_views
+from ssplat_jax.model.views import DepthDistribution, prepare_views
 from tests.model.small import chunk, finite, history
 
 D = 24

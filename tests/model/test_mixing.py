@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 
 from ssplat_jax.core.pytree import replace
-from ssplat_jax.model import inject_features
-from ssplat_jax.model.cgfi import Aggregator, num_hints
-from ssplat_jax.model.compact.local_mixer import mix_tokens
-from ssplat_jax.model.layers import rms_normalize
-from ssplat_jax.model.nearest_tokens import nearest_tokens
-from ssplat_jax.model.types import prepare_views
+from ssplat_jax.model.cgfi import Aggregator, inject_features, num_hints
+from ssplat_jax.model.compact.compact_tokens import mix_tokens
+from ssplat_jax.model.layers import nearest_tokens, rms_normalize
+from ssplat_jax.model.views import prepare_views
 from tests.model.small import CONFIG, chunk, history, params
 
 C = CONFIG.network.token_width

@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from ssplat_jax.model import complete_params, init_params
+from ssplat_jax.model.network import complete_params, init_params
 from tests.streaming.narrow_model import NARROW
 
 KEY = jax.random.key(7)

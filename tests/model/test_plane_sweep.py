@@ -8,10 +8,9 @@ from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.chunk import Chunk
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.model.compact.cnn_encoder import encode
-from ssplat_jax.model.compact.compact_features import CompactFeatures
+from ssplat_jax.model.compact.compact_layers import CompactFeatures
 from ssplat_jax.model.compact.sweep_matching import plane_sweep
-from ssplat_jax.model.plane_sweep import sweep_pixels
-from ssplat_jax.model.types import prepare_views
+from ssplat_jax.model.views import prepare_views, sweep_pixels
 from tests.model.small import random_params
 
 CONFIG = StreamConfig().replace(

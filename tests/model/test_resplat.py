@@ -10,15 +10,16 @@ import pytest
 from ssplat_jax.config import StreamConfig, preset
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.core.pytree import replace
-from ssplat_jax.model import count_params, init_params, inject_features, prepare_views, resplat
+from ssplat_jax.model import resplat
+from ssplat_jax.model.cgfi import inject_features
 from ssplat_jax.model.hpda import expected_log_depth
+from ssplat_jax.model.layers import same_region_mask
+from ssplat_jax.model.network import count_params, init_params
 from ssplat_jax.model.resplat.cost_volume import plane_sweep
-from ssplat_jax.model.resplat.encoder import Transformer
+from ssplat_jax.model.resplat.encoder import POSITIONS_SIDE, Transformer, grid_size, resampled_positions
 from ssplat_jax.model.resplat.torch_layers import EdgePaddedConv, TransposedConv, resize
-from ssplat_jax.model.resplat.vit import POSITIONS_SIDE, grid_size, resampled_positions
 from ssplat_jax.model.streamsplat import StreamSplat
-from ssplat_jax.model.types import to_candidate_space
-from ssplat_jax.model.windows import same_region_mask
+from ssplat_jax.model.views import prepare_views, to_candidate_space
 from ssplat_jax.training.losses import soft_targets
 from tests.model.small import chunk, history, random_params
 

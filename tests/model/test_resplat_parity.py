@@ -10,21 +10,20 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ssplat_jax import model as stages
 from ssplat_jax.config import preset
 from ssplat_jax.core.chunk import Chunk
 from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.core.rotations import matrices_to_quats, quats_to_matrices
 from ssplat_jax.model import resplat
-from ssplat_jax.model.convolution import pixel_unshuffle
+from ssplat_jax.model.decoder import decode_tokens
 from ssplat_jax.model.hpda import expected_log_depth
-from ssplat_jax.model.params import init_params
-from ssplat_jax.model.resplat.head import GaussianHead
-from ssplat_jax.model.resplat.tokens import token_context
+from ssplat_jax.model.layers import pixel_unshuffle
+from ssplat_jax.model.network import init_params
+from ssplat_jax.model.resplat.resplat_tokens import GaussianHead, token_context
 from ssplat_jax.model.resplat.torch_layers import resize
 from ssplat_jax.model.resplat.upsampler import Upsampler
 from ssplat_jax.model.streamsplat import StreamSplat
-from ssplat_jax.model.types import AnchoredDepth, prepare_views, to_candidate_space
+from ssplat_jax.model.views import AnchoredDepth, back_project, patch_colors, prepare_views, to_candidate_space
 from ssplat_jax.storage.published_weights import as_published
 from tests.model.resplat_fixture import load_golden, named_params, tap_error
 
@@ -81,15 +80,15 @@ def resplat_values() -> dict[str, tuple[np.ndarray, np.ndarray]]:
         match = depth.matcher_confidences[..., None]
         regressed = [pixel_unshuffle(views.images, 4), jnp.exp(depth.log_depths)[..., None], match, context]
         feats = resplat.regress_tokens(params["tokens"], features, distribution, depth, views, config)
-        positions, footprints = stages.back_project(depth.log_depths, views)
+        positions, footprints = back_project(depth.log_depths, views)
         mixed = resplat.mix_tokens(params["mixer"], feats, positions, views.inside, views.valid, config)
         flat = mixed.reshape(-1, config.network.token_width)
         shapes = resplat.read_shapes(params["decoder"], flat, config)
         quats = matrices_to_quats(jnp.swapaxes(views.viewmats[:, :3, :3], -1, -2))
-        gaussians = stages.decode_tokens(
+        gaussians = decode_tokens(
             shapes,
             means=positions.reshape(-1, 3),
-            rgbs=stages.patch_colors(views.images, config).reshape(-1, 3),
+            rgbs=patch_colors(views.images, config).reshape(-1, 3),
             quats=jnp.repeat(quats, height * width // 16, axis=0),
             footprints=footprints.reshape(-1),
             config=config,

@@ -4,10 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ssplat_jax.model import prepare_views
-from ssplat_jax.model.compact.compact_features import CompactFeatures
-from ssplat_jax.model.compact.token_regressor import regress_tokens
-from ssplat_jax.model.types import AnchoredDepth, DepthDistribution
+from ssplat_jax.model.compact.compact_layers import CompactFeatures
+from ssplat_jax.model.compact.compact_tokens import regress_tokens
+from ssplat_jax.model.views import AnchoredDepth, DepthDistribution, prepare_views
 from tests.model.small import CONFIG, chunk, params
 
 

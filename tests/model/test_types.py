@@ -12,12 +12,12 @@ from ssplat_jax.core.cameras import pixel_grid, project_points, transform_points
 from ssplat_jax.core.gaussians import SH_C0
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.core.rotations import matrices_to_quats, quats_to_matrices
-from ssplat_jax.model import GRID_STRIDE, back_project, count_params, decode_tokens, init_params, patch_colors
 from ssplat_jax.model.compact.cnn_encoder import Encoder
-from ssplat_jax.model.compact.gaussian_head import START_OPACITY, read_shapes
-from ssplat_jax.model.decoder import MAX_SCALE, MIN_SCALE, START_SCALE, START_THICKNESS, token_scales
-from ssplat_jax.model.types import nearest_sources, prepare_views
-from ssplat_jax.model.windows import from_windows, sine_positions, to_windows
+from ssplat_jax.model.compact.compact_tokens import START_OPACITY, read_shapes
+from ssplat_jax.model.decoder import MAX_SCALE, MIN_SCALE, START_SCALE, START_THICKNESS, decode_tokens, token_scales
+from ssplat_jax.model.layers import from_windows, sine_positions, to_windows
+from ssplat_jax.model.network import count_params, init_params
+from ssplat_jax.model.views import GRID_STRIDE, back_project, nearest_sources, patch_colors, prepare_views
 from tests.core.test_cameras import poses
 from tests.model.small import CONFIG, HEIGHT, WIDTH, chunk, params
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from ssplat_jax.core.cameras import Camera
+from ssplat_jax.core.cpu_backend import short_exp
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.core.gaussians import Gaussians, mask_gaussians
 from ssplat_jax.core.pytree import replace
-from ssplat_jax.core.xla_cpu import short_exp
 from ssplat_jax.rasterizer import Effects, binning, compositing, constants, render
 from ssplat_jax.rasterizer.binning import BOX_SIZE, CHANNELS, Grid, TileIntersections, intersect_tiles, sorted_table
 from ssplat_jax.rasterizer.projection import Splats, project

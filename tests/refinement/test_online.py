@@ -21,8 +21,8 @@ from ssplat_jax.core.errors import InputError
 from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.evaluation.psnr_ssim import psnr
-from ssplat_jax.model.compact.gaussian_head import GaussianHead
-from ssplat_jax.model.params import init_params
+from ssplat_jax.model.compact.compact_tokens import GaussianHead
+from ssplat_jax.model.network import init_params
 from ssplat_jax.model.streamsplat import ChunkOutput, StreamSplat
 from ssplat_jax.rasterizer import render
 from ssplat_jax.refinement.online import online_refinement, online_step, revise_scene, views_of_round
@@ -318,7 +318,7 @@ def test_a_session_refuses_half_of_a_request():
 
 
 def test_key_views_of_another_size_are_refused():
-    with pytest.raises(InputError, match="keep size"):
+    with pytest.raises(InputError, match="keep the size"):
         with_refinement(start(), CONFIG, HIGH, WIDE + 1)
 
 

@@ -11,12 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ssplat_jax import model as stages
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.model import compact
-from ssplat_jax.model.compact.compact_features import CompactFeatures
+from ssplat_jax.model.cgfi import inject_features
+from ssplat_jax.model.compact.compact_layers import CompactFeatures
 from ssplat_jax.model.compact.sweep_matching import plane_sweep
-from ssplat_jax.model.types import Views, prepare_views
+from ssplat_jax.model.decoder import decode_tokens
+from ssplat_jax.model.hpda import anchor_depth
+from ssplat_jax.model.views import Views, back_project, patch_colors, prepare_views
 from tests.core.test_rotations import rodrigues
 from tests.model.small import CONFIG, chunk, finite, history, params, random_params
 from tests.stability.stage_checks import FLOAT32, ZERO_GAMMA, check_depths, check_distribution, wave
@@ -56,15 +58,15 @@ def tokens_and_gaussians():
     def run(params, features, viewmats, views: Views, past):
         views = replace(views, viewmats=viewmats)
         distribution = compact.match(params["cost_volume"], features, views, CONFIG)
-        depth = stages.anchor_depth(params["hpda"], distribution, past, views, CONFIG)
-        positions, footprints = stages.back_project(depth.log_depths, views)
+        depth = anchor_depth(params["hpda"], distribution, past, views, CONFIG)
+        positions, footprints = back_project(depth.log_depths, views)
         regressed = compact.regress_tokens(params["tokens"], features, distribution, depth, views, CONFIG)
-        injected = stages.inject_features(params["cgfi"], regressed, past, depth.anchored_confidences, views, CONFIG)
+        injected = inject_features(params["cgfi"], regressed, past, depth.anchored_confidences, views, CONFIG)
         mixed = compact.mix_tokens(params["mixer"], injected, positions, views.inside, views.valid, CONFIG)
-        gaussians = stages.decode_tokens(
+        gaussians = decode_tokens(
             compact.read_shapes(params["decoder"], mixed.reshape(-1, CONFIG.network.token_width).astype(HALF), CONFIG),
             means=positions.reshape(-1, 3),
-            rgbs=stages.patch_colors(views.images, CONFIG).reshape(footprints.size, -1),
+            rgbs=patch_colors(views.images, CONFIG).reshape(footprints.size, -1),
             quats=jnp.ones((footprints.size, 4)),
             footprints=footprints.reshape(-1),
             config=CONFIG,

@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ssplat_jax import model as stages
 from ssplat_jax.core.numerics import softplus_inverse
 from ssplat_jax.core.pytree import replace
-from ssplat_jax.model.types import DepthDistribution, prepare_views
+from ssplat_jax.model.hpda import anchor_depth
+from ssplat_jax.model.views import DepthDistribution, prepare_views
 from tests.model.small import CONFIG, chunk, finite, history
 from tests.stability.stage_checks import FLOAT32, ZERO_GAMMA, check_depths, wave
 
@@ -111,7 +111,7 @@ def anchoring(config):
         probs = jax.nn.softmax(logits)
         distribution = DepthDistribution(probs=probs, logits=logits, decoder=jnp.zeros((*SHAPE, 8)))
         here = replace(views, log_candidates=log_candidates)
-        result = stages.anchor_depth({"raw_gamma": raw_gamma}, distribution, past, here, config)
+        result = anchor_depth({"raw_gamma": raw_gamma}, distribution, past, here, config)
         return wave(result), (probs, result)
 
     return jax.jit(jax.value_and_grad(run, argnums=(0, 1, 2), has_aux=True))

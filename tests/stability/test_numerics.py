@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from ssplat_jax.core.cpu_backend import in_own_kernel, lane_sum
 from ssplat_jax.core.numerics import clip_value, columns, safe_log, safe_normalize, safe_sqrt, softplus_inverse
-from ssplat_jax.core.xla_cpu import in_own_kernel, lane_sum
 from ssplat_jax.model.compact.sweep_matching import unit_features
 from ssplat_jax.model.layers import attend, attend_per_query, average_pool, instance_norm
 

@@ -18,8 +18,7 @@ from scipy.spatial import cKDTree
 from ssplat_jax.cache import init_cache
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.gaussians import Gaussians
-from ssplat_jax.core.rotations import quats_to_matrices
-from ssplat_jax.core.sh_rotation import sh_rotation
+from ssplat_jax.core.rotations import quats_to_matrices, sh_rotation
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.stream_frame import StreamFrame

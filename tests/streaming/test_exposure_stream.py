@@ -9,8 +9,8 @@ from ssplat_jax.config import preset
 from ssplat_jax.core.gaussians import mean_color
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.data.open_capture import open_capture
-from ssplat_jax.model import patch_colors, prepare_views
 from ssplat_jax.model.streamsplat import StreamSplat, _flatten_tokens
+from ssplat_jax.model.views import patch_colors, prepare_views
 from ssplat_jax.storage.weights import load_params
 from ssplat_jax.streaming.session import Session
 from tests.model.small import CONFIG, chunk

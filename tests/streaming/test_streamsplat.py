@@ -8,7 +8,8 @@ import pytest
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.data.open_capture import open_capture
-from ssplat_jax.model.streamsplat import StreamSplat, merged_footprints
+from ssplat_jax.model.decoder import grown_footprints
+from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.streaming.session import Session
 from tests.model.small import random_params
 from tests.streaming.narrow_model import NARROW, assert_same_bits, leaves_with_names
@@ -107,16 +108,12 @@ def test_a_session_decodes_shown_rows_padded_to_a_power_of_two(model, params, lo
     assert not np.asarray(shown.opacities)[num_shown:].any()
 
 
-def test_merged_footprints_grow_until_they_cover_a_face(model):
+def test_footprints_of_merged_pivots_grow_until_they_cover_a_face(model):
+    """Voxels measure 0.04 and have 4 pivots: 1.2 times a share of 0.02."""
     footprints, members = jnp.array([0.01, 0.01, 0.01, 0.05]), jnp.array([1, 2, 100, 100])
-    cache = model.init_cache()  # voxel_size 0.04, 4 pivots: 1.2 times a share of 0.02
-    cache = replace(
-        cache, footprints=cache.footprints.at[0].set(footprints), num_members=cache.num_members.at[0].set(members)
-    )
-    grown = merged_footprints(cache, model.config)[0]
+    grown = grown_footprints(footprints, members, model.config)
     np.testing.assert_allclose(grown, [0.01, 0.01 * 2**0.5, 0.024, 0.05], rtol=1e-6)
-    stored = merged_footprints(cache, model.config.replace(merged_coverage=False))
-    np.testing.assert_array_equal(stored, cache.footprints)
+    assert grown_footprints(footprints, members, model.config.replace(merged_coverage=False)) is footprints
 
 
 def test_session_compiles_once_and_keeps_its_memory(model, params, chunks):

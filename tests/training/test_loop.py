@@ -18,7 +18,7 @@ import pytest
 
 from ssplat_jax.config import preset
 from ssplat_jax.core.errors import InputError
-from ssplat_jax.model import init_params
+from ssplat_jax.model.network import init_params
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.training import loop
 from ssplat_jax.training.recipe import RECIPES, Recipe, learning

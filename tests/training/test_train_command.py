@@ -14,7 +14,7 @@ from ssplat_jax.commands.train_command import Train
 from ssplat_jax.config import preset
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.data.open_capture import open_capture
-from ssplat_jax.model import init_params
+from ssplat_jax.model.network import init_params
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.storage.weights import describe_weights, load_params, load_weights, save_weights
 from ssplat_jax.training import crops, loop, recipe

@@ -1,15 +1,20 @@
-"""The compact network, small enough for a CPU. One stage per file."""
+"""The compact network, small enough for a CPU: its stages put together."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.model.compact.cnn_encoder import Encoder, encode
-from ssplat_jax.model.compact.gaussian_head import GaussianHead, read_shapes
-from ssplat_jax.model.compact.local_mixer import Mixer, mix_tokens
+from ssplat_jax.model.compact.compact_tokens import (
+    GaussianHead,
+    Mixer,
+    TokenRegressor,
+    mix_tokens,
+    read_shapes,
+    regress_tokens,
+)
 from ssplat_jax.model.compact.sweep_matching import CostVolume, match
-from ssplat_jax.model.compact.token_regressor import TokenRegressor, regress_tokens
-from ssplat_jax.model.types import AnchoredDepth
+from ssplat_jax.model.views import AnchoredDepth
 
 
 def refine_depth(params, features, depth: AnchoredDepth, views, config: StreamConfig) -> AnchoredDepth:

@@ -5,32 +5,19 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.model.compact.compact_features import CompactFeatures
-from ssplat_jax.model.convolution import Conv, HalvingConv
-from ssplat_jax.model.layers import ResidualBlock, attend, instance_norm, normalize_images
-from ssplat_jax.model.types import Views, nearest_sources
-from ssplat_jax.model.windows import from_windows, same_region_mask, sine_positions, to_windows
-
-
-class AttentionLayer(nn.Module):
-    """Residual one-head attention in windows, with an optional feed-forward layer on [input, message]."""
-
-    ffn_ratio: int = 0
-    """Ratio of the feed-forward width to the feature width; 0 for no feed-forward layer."""
-
-    @nn.compact
-    def __call__(self, x, context, allowed=None):
-        c = x.shape[-1]
-        q = nn.Dense(c, use_bias=False, name="q")(x)
-        k = nn.Dense(c, use_bias=False, name="k")(context)
-        v = nn.Dense(c, use_bias=False, name="v")(context)
-        message = attend(q[..., None, :], k[..., None, :], v[..., None, :], allowed)[..., 0, :]
-        message = nn.LayerNorm(name="norm1")(nn.Dense(c, use_bias=False, name="merge")(message))
-        if self.ffn_ratio:
-            hidden = nn.Dense(self.ffn_ratio * c, use_bias=False, name="ffn1")(jnp.concatenate([x, message], axis=-1))
-            message = nn.Dense(c, use_bias=False, name="ffn2")(nn.gelu(hidden, approximate=False))
-            message = nn.LayerNorm(name="norm2")(message)
-        return x + message
+from ssplat_jax.model.compact.compact_layers import AttentionLayer, CompactFeatures
+from ssplat_jax.model.layers import (
+    Conv,
+    HalvingConv,
+    ResidualBlock,
+    from_windows,
+    instance_norm,
+    normalize_images,
+    same_region_mask,
+    sine_positions,
+    to_windows,
+)
+from ssplat_jax.model.views import Views, nearest_sources
 
 
 class Encoder(nn.Module):

@@ -8,11 +8,9 @@ from jaxtyping import Array, Bool, Float
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.numerics import safe_normalize
 from ssplat_jax.core.sampling import bilinear_taps, correlate_warped
-from ssplat_jax.model.compact.compact_features import CompactFeatures
-from ssplat_jax.model.convolution import Conv
-from ssplat_jax.model.layers import UNet, average_pool
-from ssplat_jax.model.plane_sweep import sweep_pixels
-from ssplat_jax.model.types import GRID_STRIDE, DepthDistribution, Views, nearest_sources
+from ssplat_jax.model.compact.compact_layers import CompactFeatures
+from ssplat_jax.model.layers import Conv, UNet, average_pool
+from ssplat_jax.model.views import GRID_STRIDE, DepthDistribution, Views, mean_over_sources, sweep_pixels
 
 
 def unit_features(x: Float[Array, "*b c"]) -> Float[Array, "*b c"]:
@@ -36,7 +34,6 @@ def plane_sweep(features: CompactFeatures, views: Views, config: StreamConfig) -
         fine = unit_features(features.fine)
         # A cell's center is the common corner of 2 x 2 fine pixels: their mean is the bilinear sample there.
         maps.append((GRID_STRIDE // 2, unit_features(average_pool(features.fine, 2)), fine))
-    sources, source_valid = nearest_sources(views.viewmats, views.valid, config.network.num_sources)
 
     def correlate_pair(pair):
         reference, source, is_valid = pair
@@ -48,15 +45,9 @@ def plane_sweep(features: CompactFeatures, views: Views, config: StreamConfig) -
             flat_reference = reference_map[reference].reshape(-1, reference_map.shape[-1])
             score = correlate_warped(flat_reference, source_map[source], taps)
             scores.append(jnp.where(seen, score, 0.0))
-        return jnp.stack(scores), seen.astype(jnp.float32)
+        return jnp.stack(scores), seen
 
-    num_sources = sources.shape[1]
-    pairs = (jnp.repeat(jnp.arange(v), num_sources), sources.reshape(-1), source_valid.reshape(-1))
-    scores, seen = jax.lax.map(correlate_pair, pairs)
-    scores = scores.reshape(v, num_sources, len(maps), config.network.num_depths, hf, wf).sum(axis=1)
-    counts = seen.reshape(v, num_sources, 1, config.network.num_depths, hf, wf).sum(axis=1)
-    mean = scores / jnp.maximum(counts, 1.0)
-    return mean.reshape(v, -1, hf, wf).transpose(0, 2, 3, 1)
+    return mean_over_sources(correlate_pair, views, config).reshape(v, -1, hf, wf).transpose(0, 2, 3, 1)
 
 
 class CostVolume(nn.Module):

@@ -1,4 +1,4 @@
-"""ReSplat's network, which the paper builds on. One stage per file; parameters are named as its PyTorch modules."""
+"""ReSplat's network, which the paper builds on: with parameters named as its PyTorch modules."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -6,13 +6,17 @@ from jaxtyping import Array, Float
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.model.layers import rms_normalize
 from ssplat_jax.model.resplat.cost_volume import CostVolume, match
-from ssplat_jax.model.resplat.encoder import WIDTHS, Encoder, encode
-from ssplat_jax.model.resplat.head import GaussianHead, read_shapes
-from ssplat_jax.model.resplat.mixer import Mixer, mix_tokens
-from ssplat_jax.model.resplat.resplat_features import ReSplatFeatures
-from ssplat_jax.model.resplat.tokens import TokenRegressor, regress_tokens
+from ssplat_jax.model.resplat.encoder import VITS, WIDTHS, Encoder, encode, grid_size
+from ssplat_jax.model.resplat.resplat_tokens import (
+    GaussianHead,
+    Mixer,
+    TokenRegressor,
+    mix_tokens,
+    read_shapes,
+    regress_tokens,
+)
+from ssplat_jax.model.resplat.torch_layers import ReSplatFeatures
 from ssplat_jax.model.resplat.upsampler import Upsampler, refine_depth
-from ssplat_jax.model.resplat.vit import VITS, grid_size
 
 
 def stages(config: StreamConfig) -> dict:

@@ -8,12 +8,9 @@ from jaxtyping import Array, Bool, Float
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.cameras import invert_poses, pixel_grid, unproject
 from ssplat_jax.core.sampling import bilinear_taps, correlate_warped
-from ssplat_jax.model.convolution import Conv, HalvingConv
-from ssplat_jax.model.layers import attend
-from ssplat_jax.model.plane_sweep import MIN_SOURCE_DEPTH, sweep_pixels
-from ssplat_jax.model.resplat.resplat_features import ReSplatFeatures
-from ssplat_jax.model.resplat.torch_layers import EdgePaddedConv, group_norm, resize
-from ssplat_jax.model.types import DepthDistribution, Views, nearest_sources
+from ssplat_jax.model.layers import Conv, HalvingConv, attend
+from ssplat_jax.model.resplat.torch_layers import EdgePaddedConv, ReSplatFeatures, group_norm, resize
+from ssplat_jax.model.views import MIN_SOURCE_DEPTH, DepthDistribution, Views, mean_over_sources, sweep_pixels
 
 WIDTH = 128
 """Channels of the U-Net."""
@@ -53,7 +50,6 @@ def plane_sweep(features: ReSplatFeatures, views: Views, config: StreamConfig) -
         Without parallax (equal centers, a pure rotation), a pair of views gives all candidates that it sees one score.
     """
     v, hm, wm, c = features.multiview.shape
-    sources, source_valid = nearest_sources(views.viewmats, views.valid, config.network.num_sources)
     # Samples outside the map are interpolated with zeros.
     padded = jnp.pad(features.multiview, ((0, 0), (1, 1), (1, 1), (0, 0)))
 
@@ -69,12 +65,7 @@ def plane_sweep(features: ReSplatFeatures, views: Views, config: StreamConfig) -
         seen = seen & is_valid
         return jnp.where(seen, correlate_warped(flat_reference, features.multiview[source], taps), 0.0), seen
 
-    num_sources = sources.shape[1]
-    pairs = (jnp.repeat(jnp.arange(v), num_sources), sources.reshape(-1), source_valid.reshape(-1))
-    scores, seen = jax.lax.map(correlate_pair, pairs)
-    shape = (v, num_sources, config.network.num_depths, hm, wm)
-    counts = seen.astype(jnp.float32).reshape(shape).sum(axis=1)
-    mean = scores.reshape(shape).sum(axis=1) / jnp.maximum(counts, 1.0)
+    mean = mean_over_sources(correlate_pair, views, config).reshape(v, -1, hm, wm)
     return mean.transpose(0, 2, 3, 1) * c**-0.5
 
 

@@ -6,13 +6,20 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.model.convolution import Conv, HalvingConv
-from ssplat_jax.model.layers import ResidualBlock, attend, instance_norm, normalize_images
-from ssplat_jax.model.resplat.resplat_features import ReSplatFeatures
-from ssplat_jax.model.resplat.torch_layers import layer_norm
-from ssplat_jax.model.resplat.vit import VisionTransformer
-from ssplat_jax.model.types import Views, nearest_sources
-from ssplat_jax.model.windows import from_windows, same_region_mask, sine_positions, to_windows
+from ssplat_jax.model.layers import (
+    Conv,
+    HalvingConv,
+    ResidualBlock,
+    attend,
+    from_windows,
+    instance_norm,
+    normalize_images,
+    same_region_mask,
+    sine_positions,
+    to_windows,
+)
+from ssplat_jax.model.resplat.torch_layers import Mlp, ReSplatFeatures, layer_norm, resize
+from ssplat_jax.model.views import Views, nearest_sources
 
 WIDTHS = (64, 96, 128)
 """Channels of the three CNN levels."""
@@ -20,6 +27,23 @@ NUM_BLOCKS = 6
 """Blocks of the multi-view transformer."""
 FFN_RATIO = 4
 """Ratio of the feed-forward width to the width of [input, message]."""
+
+PIXELS_PER_VIT_CELL = 14
+"""Side of a patch."""
+POSITIONS_SIDE = 37
+"""Cells per side of the trained position code, which is resampled to other grids."""
+MAX_SIDE = 560
+"""Longer side, in pixels, to which larger images are resized."""
+CUBIC_A = -0.75
+"""Parameter of PyTorch's bicubic kernel; JAX's is -0.5."""
+
+VITS = {
+    # width, blocks, heads, indices of the blocks whose maps are returned
+    "s": (384, 12, 6, (2, 5, 8, 11)),
+    "b": (768, 12, 12, (2, 5, 8, 11)),
+    "l": (1024, 24, 16, (4, 11, 17, 23)),
+}
+"""Layout by size of the vision transformer."""
 
 
 class Backbone(nn.Module):
@@ -107,6 +131,114 @@ class Transformer(nn.Module):
 def num_windows(width: int) -> int:
     """Windows along each side of a map of that width (ReSplat's rule)."""
     return 2 if width <= 96 else 4 if width <= 192 else 8
+
+
+# -- Monocular branch: a DINOv2 vision transformer, as trained by Depth Anything V2 -----------------------------------
+
+
+def grid_size(height: int, width: int) -> tuple[int, int]:
+    """Rows and columns of ViT cells for an image of that size."""
+    scale = min(1.0, MAX_SIDE / max(height, width))
+    cells = lambda side: max(1, int(side * scale) // PIXELS_PER_VIT_CELL)  # noqa: E731
+    return cells(height), cells(width)
+
+
+def resampled_positions(codes: Float[Array, "1 n c"], height: int, width: int) -> Float[Array, "1 m c"]:
+    """Position code resampled to a grid of `height` x `width` cells, without the class token's.
+
+    DINOv2 gives PyTorch the scale factor (size + 0.1) / 37 instead of the size; sample positions follow the factor.
+    """
+    if (height, width) == (POSITIONS_SIDE, POSITIONS_SIDE):
+        return codes[:, 1:]
+    rows, columns = _cubic_weights(height), _cubic_weights(width)
+    grid = codes[0, 1:].reshape(POSITIONS_SIDE, POSITIONS_SIDE, -1)
+    return jnp.einsum("ph,hwc,qw->pqc", rows, grid, columns, precision="highest").reshape(1, height * width, -1)
+
+
+def _cubic_weights(size: int) -> np.ndarray:
+    """Bicubic weights of the trained samples along one axis for `size` resampled ones, with edge padding."""
+    positions = (np.arange(size) + 0.5) * POSITIONS_SIDE / (size + 0.1) - 0.5
+    weights = np.zeros((size, POSITIONS_SIDE), np.float32)
+    for tap in range(-1, 3):
+        sample = np.floor(positions) + tap
+        t = np.abs(positions - sample)
+        inner = (CUBIC_A + 2) * t**3 - (CUBIC_A + 3) * t**2 + 1
+        outer = CUBIC_A * (t**3 - 5 * t**2 + 8 * t - 4)
+        column = np.clip(sample, 0, POSITIONS_SIDE - 1).astype(int)
+        np.add.at(weights, (np.arange(size), column), np.where(t <= 1, inner, outer))
+    return weights
+
+
+class Attention(nn.Module):
+    """Self-attention among the tokens of each view."""
+
+    heads: int
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "v n c"]) -> Float[Array, "v n c"]:
+        v, n, c = x.shape
+        qkv = nn.Dense(3 * c, name="qkv")(x).reshape(v, n, 3, self.heads, c // self.heads)
+        return nn.Dense(c, name="proj")(attend(qkv[:, :, 0], qkv[:, :, 1], qkv[:, :, 2]).reshape(v, n, c))
+
+
+class LayerScale(nn.Module):
+    """Learned factor per channel."""
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "*b c"]) -> Float[Array, "*b c"]:
+        return x * self.param("gamma", nn.initializers.constant(1e-5), (x.shape[-1],))  # pyright: ignore
+
+
+class Block(nn.Module):
+    """Pre-norm transformer block."""
+
+    heads: int
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "v n c"]) -> Float[Array, "v n c"]:
+        norm = lambda name: layer_norm(name, epsilon=1e-6)  # noqa: E731
+        x = x + LayerScale(name="ls1")(Attention(self.heads, name="attn")(norm("norm1")(x)))
+        return x + LayerScale(name="ls2")(Mlp(name="mlp")(norm("norm2")(x)))
+
+
+class PatchEmbed(nn.Module):
+    """Projection of each 14 x 14 patch to a token."""
+
+    features: int
+
+    @nn.compact
+    def __call__(self, images: Float[Array, "v h w 3"]) -> Float[Array, "v n c"]:
+        side = PIXELS_PER_VIT_CELL
+        conv = nn.Conv(self.features, (side, side), strides=(side, side), padding="VALID", name="proj")
+        return conv(images).reshape(images.shape[0], -1, self.features)
+
+
+class VisionTransformer(nn.Module):
+    """Maps normalized images to the outputs of four blocks."""
+
+    size: str
+
+    @nn.compact
+    def __call__(self, images: Float[Array, "v h w 3"]) -> tuple[Float[Array, "v hp wp c"], ...]:
+        width, num_blocks, heads, read = VITS[self.size]
+        rows, columns = grid_size(*images.shape[1:3])
+        small = resize(images, rows * PIXELS_PER_VIT_CELL, columns * PIXELS_PER_VIT_CELL)
+        start = nn.initializers.normal(0.02)
+        class_token = self.param("cls_token", start, (1, 1, width))
+        codes = self.param("pos_embed", start, (1, 1 + POSITIONS_SIDE**2, width))
+        x = PatchEmbed(width, name="patch_embed")(small) + resampled_positions(codes, rows, columns)  # pyright: ignore
+        first = jnp.broadcast_to(class_token + codes[:, :1], (x.shape[0], 1, width))  # pyright: ignore
+        x = jnp.concatenate([first, x], axis=1)
+        norm = layer_norm("norm", epsilon=1e-6)
+        maps = []
+        for i in range(num_blocks):
+            x = Block(heads, name=f"blocks_{i}")(x)
+            if i in read:
+                maps.append(norm(x)[:, 1:].reshape(-1, rows, columns, width))
+        return tuple(maps)
+
+
+# -- All branches -----------------------------------------------------------------------------------------------------
 
 
 class Encoder(nn.Module):

@@ -1,11 +1,21 @@
-"""Layers that only ReSplat's network has, computed as in PyTorch."""
+"""Features and layers that the stages of ReSplat's network share, computed as in PyTorch."""
 
 import flax.linen as nn
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ssplat_jax.model.convolution import conv2d, pixel_shuffle
+from ssplat_jax.core.pytree import pytree
+from ssplat_jax.model.layers import conv2d, pixel_shuffle
+
+
+@pytree
+class ReSplatFeatures:
+    """Output of the encoder's three branches."""
+
+    cnn: tuple[Float[Array, "v h2 w2 c1"], Float[Array, "v h3 w3 c2"], Float[Array, "v hm wm c3"]]
+    multiview: Float[Array, "v hm wm c3"]  # after cross-view attention; the plane sweep correlates these
+    mono: tuple[Float[Array, "v hp wp c4"], ...]  # maps of four ViT blocks; `hp wp` are the cells of the ViT
 
 
 def layer_norm(name: str, epsilon: float = 1e-5) -> nn.LayerNorm:

@@ -5,10 +5,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.model.convolution import Conv, HalvingConv
-from ssplat_jax.model.resplat.resplat_features import ReSplatFeatures
-from ssplat_jax.model.resplat.torch_layers import EdgePaddedConv, TransposedConv, resize
-from ssplat_jax.model.types import (
+from ssplat_jax.model.layers import Conv, HalvingConv
+from ssplat_jax.model.resplat.torch_layers import EdgePaddedConv, ReSplatFeatures, TransposedConv, resize
+from ssplat_jax.model.views import (
     GRID_STRIDE,
     AnchoredDepth,
     Views,

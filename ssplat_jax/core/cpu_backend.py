@@ -1,13 +1,16 @@
-"""Forms that exist only because of XLA's CPU backend, each with its measurement and when it may go.
+"""What exists only for XLA's CPU backend: cores and memory maps of the process, and forms of arithmetic.
 
-Measured with jax 0.10.1 on two CPU cores; docs/performance.md and docs/decisions.md
-have the machines. Two more stand where they are used: the kernel gradient of `model/convolution.py`, and sort keys
-packed into one integer (`rasterizer/binning.py`, `rasterizer/binning.py`, `cache/fuse.py`).
+Each form has its measurement and when it may go, with jax 0.10.1 on two CPU cores; docs/performance.md has the
+machines. Two more stand where they are used: the kernel gradient in `model/layers.py`, and sort keys packed into one
+integer (`rasterizer/binning.py`, `cache/fuse.py`).
 """
 
 import functools
+import gc
 import math
+import os
 from collections.abc import Callable
+from pathlib import Path
 from typing import TypeVar
 
 import jax
@@ -27,6 +30,42 @@ SORT_PIECES = 16
 EXP_SQUARINGS = 3
 """Times that `short_exp` squares its polynomial, which covers a 2^3th of the range."""
 
+MAPS = Path("/proc/self/maps")
+"""File with a line for each memory map of the process, where the system has one."""
+
+MOST_MAPS = 25_000
+"""Memory maps above which programs are dropped. A compiled program takes some tens of them, a scene that is streamed,
+refined and scored thousands, and Linux ends a process that has 65,530 (`vm.max_map_count`)."""
+
+
+def num_cores() -> int:
+    """Cores that this process may use; all of the machine where the system does not say (macOS)."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def holds_many_programs(most_maps: int = MOST_MAPS) -> bool:
+    """True if the process has more than `most_maps` memory maps; False where the system does not list them."""
+    return MAPS.exists() and len(MAPS.read_text().splitlines()) > most_maps
+
+
+def make_room(most_maps: int = MOST_MAPS) -> None:
+    """Drops compiled programs if the process holds many (`holds_many_programs`).
+
+    Call it between scenes when one process handles many of them. A dropped program is compiled again, or read from
+    JAX's compilation cache, at its next call. A `Session` keeps its compiled programs: delete the last one first.
+
+    Args:
+        most_maps: memory maps that the process may have.
+    """
+    if holds_many_programs(most_maps):
+        drop_programs()
+
+
+def drop_programs() -> None:
+    """Drops all compiled programs but those of sessions that are still in use."""
+    jax.clear_caches()
+    gc.collect()
+
 
 def by_platform(*, cpu: Callable[[], Arrays], other: Callable[[], Arrays]) -> Arrays:
     """`cpu()` in programs for a CPU, `other()` in those for other platforms.
@@ -42,7 +81,7 @@ def lane_sum(x: Float[Array, "*s n"]) -> Float[Array, "*s"]:
 
     Why: XLA's CPU backend vectorizes a sum over a major axis but not one over the minor, and leaves what it fuses with
     it unvectorized too. The plane sweep takes 2.4 and 4.6 ms at its two scales, where an einsum of gathered samples
-    took 19 and 20; attention to a few own keys takes 3 ms instead of 13 (docs/decisions.md).
+    took 19 and 20; attention to a few own keys takes 3 ms instead of 13.
     May go when `jnp.sum(x, axis=-1)` is as fast there.
     """
     lanes = math.gcd(x.shape[-1], LANES)
@@ -55,7 +94,7 @@ def in_own_kernel(wanted: Bool[Array, ""], compute: Callable[[], Array]) -> Arra
     Why: the CPU compiler fuses a gather with every kernel that uses it, and each repeats it entry by entry
     (`lax.optimization_barrier` is removed before that). It does not fuse across the edge of a `lax.cond`. A loop
     would do as well, but XLA first fills its result with zeros. At 262,144 Gaussians, compositing takes 200 ms instead
-    of 350 (docs/performance.md).
+    of 350.
     May go when `ssplat bench render` is as fast with a plain `compute()`. Where `wanted` is always true, it must be a
     value that the compiler does not know.
     On other backends it is a select, since a branch makes a GPU wait for the host: `compute` must have finite gradients
@@ -74,7 +113,7 @@ def kept(arrays: Arrays, always: Bool[Array, ""]) -> Arrays:
 
     Why: the CPU compiler repeats sums and products, with all that leads to them, in every kernel that reads them. A
     division it does not repeat, so they are divided by a one that it does not know. The gradient of the projection of
-    262,144 Gaussians takes 44 ms of a core's time instead of 153 (docs/performance.md).
+    262,144 Gaussians takes 44 ms of a core's time instead of 153.
     May go when `ssplat bench refine` is as fast without.
 
     Args:
@@ -89,7 +128,7 @@ def sort_pieces(keys: UInt[Array, "s n"]) -> UInt[Array, "s n"]:
     """Each row sorted, by an operation of its own.
 
     Why: the CPU runtime sorts one array on one core, but several arrays on all cores. 1.3 million keys in
-    `SORT_PIECES` rows take 50 ms instead of 113 (docs/performance.md).
+    `SORT_PIECES` rows take 50 ms instead of 113.
     May go when one sort runs on all cores: sort the keys as one array, then.
     """
     return jnp.stack([lax.sort(piece) for piece in keys])
@@ -100,7 +139,7 @@ def short_exp(x: Float[Array, "*s"], low: float) -> Float[Array, "*s"]:
     """e^x for x from `low` to 0 to a relative 3e-6 (float64: exactly), and 0 for minus infinity.
 
     Why: on a short range, a polynomial of an eighth of x and three squarings take two thirds of the time of XLA's
-    exponential, and compositing 0.86 of its time (docs/decisions.md; `low` = log(1/255)). It ends in a division because
+    exponential, and compositing 0.86 of its time (`low` = log(1/255)). It ends in a division because
     the CPU compiler keeps the result of one, as it does for an exponential: otherwise every kernel that reads the
     result would compute it again.
     May go when `jnp.exp` is as fast.

@@ -1,13 +1,20 @@
-"""Arrays that the stages of one step exchange."""
+"""The views of a chunk, and the arrays that stages exchange: how a cell of a view becomes pixels, points and colors."""
 
+import math
+from collections.abc import Callable
+
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.core.cameras import Camera, pixel_grid
+from ssplat_jax.core.cameras import Camera, invert_poses, pixel_grid, transform_points, unproject
 from ssplat_jax.core.chunk import Chunk
 from ssplat_jax.core.pytree import pytree, static
+from ssplat_jax.model.layers import average_pool
 
+MIN_SOURCE_DEPTH = 1e-3
+"""Smallest depth in a source camera, relative to the candidate's depth, at which the source sees a candidate."""
 GRID_STRIDE = 4
 """Pixels per side of a grid cell: one token per 4 x 4 patch (Sec. 3.3, M = N H W / 16)."""
 
@@ -126,6 +133,9 @@ def from_candidate_space(x: Float[Array, "*b"], config: StreamConfig) -> Float[A
     return -jnp.log(x) if config.network.depth_space == "inverse" else x
 
 
+# -- The plane sweep: where the cells of a view lie in its source views, at every candidate depth ---------------------
+
+
 def nearest_sources(
     viewmats: Float[Array, "v 4 4"], valid: Bool[Array, " v"], num_sources: int
 ) -> tuple[Int[Array, "v s"], Bool[Array, "v s"]]:
@@ -141,3 +151,83 @@ def nearest_sources(
     # Sorting by (distance, is_self) puts the view itself last, even after invalid views.
     order = jnp.lexsort((jnp.eye(v, dtype=jnp.int32), distances), axis=-1)[:, : min(num_sources, v - 1)]
     return order, jnp.take_along_axis(jnp.isfinite(distances), order, axis=1)
+
+
+def sweep_pixels(
+    views: Views, reference, source, stride: int
+) -> tuple[Float[Array, "d n"], Float[Array, "d n"], Bool[Array, "d n"]]:
+    """Pixels in view `source` of the cells of view `reference`, at every candidate depth.
+
+    Args:
+        views: the chunk's views.
+        reference: index of the view whose cells are projected.
+        source: index of the view that they are projected into.
+        stride: pixels per side of a cell.
+
+    Returns:
+        x and y in pixels of the padded image, and whether the source image contains them, by candidate and cell.
+    """
+    height, width = views.images.shape[1:3]
+    cells = pixel_grid(height, width, stride).reshape(-1, 2)
+    rays = unproject(cells, jnp.ones(cells.shape[0]), views.Ks[reference])
+    exact = jax.lax.Precision.HIGHEST
+    pose = jnp.matmul(views.viewmats[source], invert_poses(views.viewmats[reference]), precision=exact)
+    # A point at depth d on the ray r projects to K R r + K t / d: rays are rotated once, and without parallax every
+    # depth gives the same pixel to the last bit.
+    a = jnp.einsum("ij,jk,nk->in", views.Ks[source], pose[:3, :3], rays, precision=exact)
+    b = jnp.einsum("ij,j->i", views.Ks[source], pose[:3, 3], precision=exact)
+    nearness = jnp.exp(-views.log_candidates)[:, None]
+    x, y, w = (a[i] + nearness * b[i] for i in range(3))
+    in_front = w > MIN_SOURCE_DEPTH * nearness
+    w = jnp.where(in_front, w, 1.0)
+    x, y = x / w, y / w
+    return x, y, in_front & (x >= 0) & (x <= views.width) & (y >= 0) & (y <= views.height)
+
+
+def mean_over_sources(
+    correlate: Callable[[tuple], tuple[Array, Array]], views: Views, config: StreamConfig
+) -> Float[Array, "v ld n"]:
+    """Scores of the cells of each view at every candidate: the mean over the sources that see the candidate.
+
+    Args:
+        correlate: maps (view, source view, whether it is valid) to scores `[levels d n]`, 0 where they are not seen,
+            and whether the source sees the candidate, `[d n]`. It is called once per pair, one after the other.
+        views: the chunk's views.
+        config: model configuration.
+
+    Limits:
+        A candidate that no source sees scores 0.
+    """
+    sources, source_valid = nearest_sources(views.viewmats, views.valid, config.network.num_sources)
+    v, num_sources = sources.shape
+    pairs = (jnp.repeat(jnp.arange(v), num_sources), sources.reshape(-1), source_valid.reshape(-1))
+    scores, seen = jax.lax.map(correlate, pairs)
+    num_cells = scores.shape[-1]
+    scores = scores.reshape(v, num_sources, -1, config.network.num_depths, num_cells).sum(axis=1)
+    counts = seen.astype(jnp.float32).reshape(v, num_sources, 1, config.network.num_depths, num_cells).sum(axis=1)
+    return (scores / jnp.maximum(counts, 1.0)).reshape(v, -1, num_cells)
+
+
+# -- Tokens of a cell: where they lie and how they look (Sec. 3.3) ----------------------------------------------------
+
+
+def patch_colors(images: Float[Array, "v h w 3"], config: StreamConfig) -> Float[Array, "v hf wf a"]:
+    """Appearance anchors: mean colors of the `gaussians_per_token` parts of each token's patch, row by row."""
+    side = math.isqrt(config.head.gaussians_per_token)
+    parts = average_pool(images, GRID_STRIDE // side)
+    v, h, w, _ = parts.shape
+    parts = parts.reshape(v, h // side, side, w // side, side, 3).swapaxes(2, 3)
+    return parts.reshape(v, h // side, w // side, 3 * side * side)
+
+
+def back_project(
+    log_depths: Float[Array, "v hf wf"], views: Views
+) -> tuple[Float[Array, "v hf wf 3"], Float[Array, "v hf wf"]]:
+    """World positions p_j of the cells at their depths, and their footprints: the side of a cell at that depth."""
+    v, hf, wf = log_depths.shape
+    cells = pixel_grid(hf * GRID_STRIDE, wf * GRID_STRIDE, GRID_STRIDE).reshape(-1, 2)
+    depths = jnp.exp(log_depths).reshape(v, -1)
+    points = unproject(jnp.broadcast_to(cells, (v, *cells.shape)), depths, views.Ks)
+    world = transform_points(invert_poses(views.viewmats), points)
+    focal = 0.5 * (views.Ks[:, 0, 0] + views.Ks[:, 1, 1])
+    return world.reshape(v, hf, wf, 3), (depths * GRID_STRIDE / focal[:, None]).reshape(v, hf, wf)
