@@ -36,7 +36,7 @@ cells of such a map along each side."""
 class CacheStats:
     """Counters over the whole stream, to be read outside jit (`check_cache`).
 
-    They stop at 2^31 - 1 , which tokens of 4 views at 1080p reach after 4000 chunks.
+    They stop at 2^31 - 1, which tokens of 4 views at 1080p reach after 4000 chunks.
     """
 
     num_chunks: Int[Array, ""]

@@ -27,7 +27,7 @@ FEATURES = ("integers", "normal", "duplicates", "zeros")
 CONFIDENCES = ("random", "tied", "at_tau")
 
 fuse = jax.jit(plain_fuse, static_argnums=2, donate_argnums=0)
-_jit_insert = jax.jit(_insert, static_argnums=2, donate_argnums=0)
+insert = jax.jit(_insert, static_argnums=2, donate_argnums=0)
 
 CONFIG = StreamConfig().replace(
     token_width=WIDTH, capacity=128, voxel_size=0.25, min_confidence=0.3, overflow="drop_new"
@@ -131,7 +131,7 @@ def tokens_at(means, confidences=0.5, feats=1.0, valid=True, **changes) -> Token
 
 def fuse_with_rows(cache: VoxelCache, tokens: Tokens, config: StreamConfig) -> tuple[VoxelCache, set[int]]:
     """`fuse`, and the rows that it wrote."""
-    cache, plan = _jit_insert(cache, tokens, config)
+    cache, plan = insert(cache, tokens, config)
     return cache, set(np.asarray(plan.rows).tolist()) - {-1}
 
 

@@ -75,7 +75,7 @@ def test_a_pivot_on_before_and_behind_the_surface():
     for numbers, place in ((on, ON), (before, BEFORE), (behind, BEHIND)):
         np.testing.assert_allclose(numbers[:3], 0.8 * np.eye(3)[place], rtol=1e-6)
     # Errors count where the pivot should show.
-    assert on[ERROR_ON] == before[ERROR_BEFORE] == pytest.approx(0.8 * 0.25, rel=1e-5)
+    assert [on[ERROR_ON], before[ERROR_BEFORE]] == pytest.approx([0.8 * 0.25] * 2, rel=1e-5)
     assert behind[[ERROR_ON, ERROR_BEFORE]].tolist() == [0, 0]
     # A pivot of 0.5 at depth 2 fills 2 cells of a camera of 8 cells focal length.
     assert on[SIZE] == pytest.approx(0.8 * np.log(0.5 / (2.0 / 8.0)), rel=1e-5)

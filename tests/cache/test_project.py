@@ -33,15 +33,15 @@ MODULE = importlib.import_module("ssplat_jax.cache.project")  # the package's `p
 
 
 def assert_equal_to_reference(cache, camera, config):
-    *maps, margin = reference.project(
+    depths, confidences, feats, mask, colors, margin = reference.project(
         reference.from_arrays(cache), camera.viewmats, camera.Ks, camera.height, camera.width, config
     )
     assume(margin > DECISION_MARGIN)
     result = jit_project(cache, camera, config)
-    for name, wanted in zip(("depths", "confidences", "feats", "mask", "colors"), maps, strict=True):
+    for name, wanted in (("depths", depths), ("confidences", confidences), ("feats", feats), ("colors", colors)):
         scale = np.abs(wanted).max(initial=1e-30)
         np.testing.assert_allclose(getattr(result, name) / scale, wanted / scale, rtol=0, atol=VALUE_RTOL, err_msg=name)
-    np.testing.assert_array_equal(result.mask, maps[3])
+    np.testing.assert_array_equal(result.mask, mask)
 
 
 @pytest.mark.parametrize("config", [CONFIG, PLAIN_MEAN], ids=["cluster", "plain_mean"])
