@@ -46,7 +46,7 @@ def from_arrays(cache: VoxelCache) -> dict:
 
 def fuse(cache: dict, tokens: dict, config: StreamConfig) -> dict:
     """Inserts `tokens` (arrays named as the fields of `Tokens`) one after another, in place."""
-    stats = cache["stats"]
+    stats, pivots_of = cache["stats"], {voxel: pivots for voxel, pivots in cache["rows"]}
     chunk = stats["num_chunks"]
     stats["num_chunks"] += bool(np.any(tokens["valid"]))
     for j in np.flatnonzero(tokens["valid"]):
@@ -65,7 +65,7 @@ def fuse(cache: dict, tokens: dict, config: StreamConfig) -> dict:
                 pivot["observations"] = np.zeros(9)
             if config.stream.steps_per_chunk:
                 pivot["residuals"] = np.zeros(14 * config.head.gaussians_per_token)
-            _insert(cache, voxel, pivot, config)
+            _insert(cache, pivots_of, voxel, pivot, config)
     return cache
 
 
@@ -76,18 +76,17 @@ def voxel_of(point: np.ndarray, voxel_size: float) -> tuple[int, ...] | None:
     return tuple(int(c) for c in cells) if np.all(np.abs(cells) < INDEX_LIMIT) else None
 
 
-def _insert(cache, voxel, pivot, config):
+def _insert(cache, pivots_of, voxel, pivot, config):
     """Inserts a pivot into its voxel; with `vacc="append"` into the last row, whatever its voxel."""
     rows, stats, k = cache["rows"], cache["stats"], config.memory.pivots_per_voxel
-    if config.memory.vacc == "append":
-        voxel, pivots = None, next((p for _, p in rows[-1:] if len(p) < k), None)
-    else:
-        pivots = next((p for v, p in rows if v == voxel), None)
-    if pivots is None:
+    is_appended = config.memory.vacc == "append"
+    voxel = None if is_appended else voxel
+    pivots = pivots_of.get(voxel)
+    if pivots is None or (is_appended and len(pivots) == k):
         if len(rows) == cache["capacity"]:
             stats["num_dropped"] += 1
             return
-        pivots = []
+        pivots = pivots_of[voxel] = []
         rows.append((voxel, pivots))
     stats["num_accepted"] += 1
     if len(pivots) < k:
