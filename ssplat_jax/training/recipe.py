@@ -149,75 +149,46 @@ def learning(*parts: str) -> Rates:
 
 
 _depth = functools.partial(Phase, loss=DepthLoss(), rates=learning(*MATCHER))
+# Closer to the size of streamed images, and portrait too. Streamed video is interleaved until views are 3 % of the
+# depth apart or more.
+_LARGER = Views(1, ((160, 224), (224, 160)), steps_of_depth=(0.02, 0.4))
 
 TINY = Recipe(
     phases=(
-        _depth("depth", 3000, Views(num_chunks=1, sizes=((96, 128),)), learning_rate=1e-3),
-        # Closer to the size of streamed images, and portrait too. Streamed video is interleaved until views are 3 % of
-        # the depth apart or more.
-        _depth(
-            "larger",
-            400,
-            Views(num_chunks=1, sizes=((160, 224), (224, 160)), steps_of_depth=(0.02, 0.4)),
-            learning_rate=5e-4,
-            final_share=0.02,
-        ),
+        _depth("depth", 3000, Views(1, ((96, 128),)), learning_rate=1e-3),
+        _depth("larger", 400, _LARGER, learning_rate=5e-4, final_share=0.02),
     )
 )
 """Trains the depth of the shipped `tiny` weights from scratch; `depth` continues it, and `evidence` adds the head.
 docs/model_card.md has commands, times and machines."""
 
-OUTDOORS = (*("room",) * 4, "corridor", *("street",) * 2, *("objects",) * 3, *("clutter",) * 2, *("yard",) * 4)
-"""Kinds of worlds, of which about half are under a sky."""
-_LARGE_BATCHES = Views(num_chunks=1, sizes=((224, 320),), batch=4, steps_of_depth=(0.01, 0.4))
+_BATCHES = Views(1, ((224, 320),), batch=4, steps_of_depth=(0.01, 0.4))
+# Kinds of worlds, of which about half are under a sky.
+_OUTDOORS = (*("room",) * 4, "corridor", *("street",) * 2, *("objects",) * 3, *("clutter",) * 2, *("yard",) * 4)
+_OUTDOOR_BATCHES = dataclasses.replace(_BATCHES, kinds=_OUTDOORS)
 
 DEPTH = Recipe(
     phases=(
-        _depth("depth", 4200, _LARGE_BATCHES, learning_rate=5e-4),
-        _depth(
-            "outdoors",
-            4600,
-            dataclasses.replace(_LARGE_BATCHES, kinds=OUTDOORS),
-            learning_rate=5e-4,
-            final_share=0.02,
-        ),
+        _depth("depth", 4200, _BATCHES, learning_rate=5e-4),
+        _depth("outdoors", 4600, _OUTDOOR_BATCHES, learning_rate=5e-4, final_share=0.02),
     ),
     ema_decay=0.995,
 )
 """Continues the training of depth, in batches of images of about the streamed size. It needs a GPU. The shipped weights
 took about as many steps, in pieces that docs/model_card.md lists."""
 
+_FOUR_CHUNKS = Views(4, ((96, 128),), num_targets=4, steps_of_depth=(0.01, 0.15))
+
+# The matcher is trained by then. Without its backward pass a step costs a third, and rendering would teach it less
+# about depth than depth supervision did.
 STREAM = Recipe(
-    phases=(
-        Phase(
-            "stream",
-            400,
-            Views(num_chunks=4, num_targets=4, sizes=((96, 128),), steps_of_depth=(0.01, 0.15)),
-            RenderingLoss(),
-            # The matcher is trained by then. Without its backward pass a step costs a third, and rendering would teach
-            # it less about depth than depth supervision did.
-            learning(*AFTER_MATCHER),
-            learning_rate=1e-3,
-            final_share=0.02,
-        ),
-    )
+    phases=(Phase("stream", 400, _FOUR_CHUNKS, RenderingLoss(), learning(*AFTER_MATCHER), 1e-3, final_share=0.02),)
 )
 """Trains the stages behind a trained matcher. The shipped weights do not include it, because it lowered the score of a
 capture by 0.4 dB; docs/model_card.md has the command."""
 
 EVIDENCE = Recipe(
-    phases=(
-        Phase(
-            "evidence",
-            600,
-            Crops(),
-            CropLoss(),
-            learning("evidence"),
-            learning_rate=5e-3,
-            final_share=0.0,
-            warmup_steps=20,
-        ),
-    ),
+    phases=(Phase("evidence", 600, Crops(), CropLoss(), learning("evidence"), 5e-3, final_share=0.0, warmup_steps=20),),
     adam_b2=0.999,
     weight_decay=1e-3,
     clip_norm=3.0,
@@ -226,31 +197,24 @@ EVIDENCE = Recipe(
 )
 """Trains the evidence head of weights whose other stages stay as they are."""
 
-PAPER = Recipe(
-    phases=(
-        Phase(
-            "paper",
-            100_000,
-            Views(num_chunks=4, num_targets=4, sizes=((256, 256),)),
-            RenderingLoss(
-                depth=DepthLoss(capacity=1 << 16, recompute=True),
-                depth_weight=0.0,
-                weight=4.0,  # the paper adds up the losses of the target views
-                tokens="all",
-                gradient_weight=0.0,
-                black_weight=1.0,
-                max_pairs=1 << 22,
-            ),
-            # The vision transformer learns slowly, as DepthSplat trains it.
-            (*learning(*MATCHER, *AFTER_MATCHER), ("encoder/pretrained", 0.01)),
-            learning_rate=1e-4,
-        ),
-    ),
-    adam_b2=0.999,
+# The paper renders all tokens over black alone and adds up the losses of the target views.
+_PAPER_LOSS = RenderingLoss(
+    depth=DepthLoss(capacity=1 << 16, recompute=True),
+    depth_weight=0.0,
+    weight=4.0,
+    tokens="all",
+    gradient_weight=0.0,
+    black_weight=1.0,
+    max_pairs=1 << 22,
 )
-"""The paper's training: 100,000 steps of AdamW at 1e-4 with one sample each, through all stages and all tokens, by the
-rendering loss over black alone. It needs LPIPS weights for the second term and a GPU, and starts from imported weights;
-the paper does not give the number of chunks and targets of a sample."""
+_PAPER_VIEWS = Views(4, ((256, 256),), num_targets=4)
+# The vision transformer learns slowly, as DepthSplat trains it.
+_PAPER_RATES = (*learning(*MATCHER, *AFTER_MATCHER), ("encoder/pretrained", 0.01))
+
+PAPER = Recipe(phases=(Phase("paper", 100_000, _PAPER_VIEWS, _PAPER_LOSS, _PAPER_RATES, 1e-4),), adam_b2=0.999)
+"""The paper's training: 100,000 steps of AdamW at 1e-4 with one sample each, through all stages. It needs LPIPS weights
+for the second term and a GPU, and starts from imported weights; the paper does not give the number of chunks and
+targets of a sample."""
 
 RECIPES = {"tiny": TINY, "depth": DEPTH, "stream": STREAM, "evidence": EVIDENCE, "paper": PAPER}
 """Choices of `ssplat train --recipe`."""

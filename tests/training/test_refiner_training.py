@@ -97,8 +97,7 @@ def test_the_shipped_network_gains_on_rooms_that_it_has_not_seen(seeds):
 
 
 @pytest.mark.parametrize(
-    ("options", "named"),
-    [({}, "--init-weights"), ({"init_weights": SHIPPED, "save_every": 10}, "--save-every")],
+    ("options", "named"), [({}, "--init-weights"), ({"init_weights": SHIPPED, "save_every": 10}, "--save-every")]
 )
 def test_options_that_do_not_fit_the_recipe_are_refused(options, named, tmp_path):
     with pytest.raises(InputError, match=named):
