@@ -23,14 +23,13 @@ from ssplat_jax.training.losses import (
     fitted_gains,
     image_gradient_l1,
     negative_psnr,
-    pad_like,
     soft_targets,
 )
 from ssplat_jax.training.recipe import RECIPES
 from ssplat_jax.training.samples import Views, procedural_sample
 from tests.model.small import random_params
 from tests.streaming.narrow_model import NARROW
-from tests.training.problems import NARROW_DEPTH, STREAM_PHASE, flat
+from tests.training.problems import NARROW_DEPTH, STREAM_PHASE
 
 WIDTH = DepthLoss.target_width
 
@@ -129,26 +128,6 @@ def test_fitted_gains_undo_exposures_and_stay_bounded():
     np.testing.assert_array_equal(np.asarray(gradient), 0.0)
 
 
-@pytest.mark.slow  # a program of its own
-def test_padding_does_not_count_in_the_loss(monkeypatch):
-    """72 rows are padded to 96: the truth is padded like the images, and padding does not count in the loss."""
-    sample = procedural_sample(Views(1, ((72, 64),)), 0, (72, 64), NARROW)
-    model = StreamSplat(NARROW)
-    params = model.init(jax.random.key(0))
-
-    def loss(shown, hidden):
-        """Loss with the truth of the image moved by `shown` and that of the padding by `hidden`."""
-        moved = lambda truth, like: pad_like(truth + shown, like).at[:, 18:].add(hidden - shown)  # noqa: E731
-        with monkeypatch.context() as patched:
-            patched.setattr(losses, "pad_like", moved)
-            return float(NARROW_DEPTH.of_stream(model, params, sample)[2])
-
-    as_it_is = loss(0.0, 0.0)
-    assert loss(0.0, 0.2) == as_it_is and abs(loss(0.2, 0.0) - as_it_is) > 0.01
-    padded = np.asarray(pad_like(sample.log_depths[0], jnp.zeros((4, 24, 16))))
-    np.testing.assert_array_equal(padded[:, 18:], np.repeat(np.asarray(sample.log_depths[0])[:, -1:], 6, axis=1))
-
-
 def test_tokens_that_a_stored_view_looked_through_are_not_rendered():
     config = NARROW.replace(min_confidence=0.5)
     model = StreamSplat(config)
@@ -198,21 +177,6 @@ def test_loss_and_gradient_of_a_batch_are_means_over_its_samples(monkeypatch, lo
     np.testing.assert_allclose(gradient["a"], np.mean([single[1]["a"] for single in singles], axis=0), rtol=1e-6)
     mean = np.mean([single[0][1]["depth_l1"] for single in singles])
     assert float(metrics["depth_l1"]) == pytest.approx(mean, rel=1e-6)
-
-
-@pytest.mark.slow  # programs of whole training steps
-@pytest.mark.parametrize("loss", [NARROW_DEPTH, STREAM_PHASE.loss], ids=["depth", "rendering"])
-def test_the_gradient_of_a_batch_is_the_mean_of_its_samples_gradients(loss):
-    views = Views(1, ((64, 64),), num_targets=int(loss.renders))
-    samples = [procedural_sample(views, seed, (64, 64), NARROW) for seed in (1, 2)]
-    model, params = StreamSplat(NARROW), random_params(NARROW)
-    gradient = jax.jit(lambda p, x: jax.grad(lambda p: loss(model, p, x)[0])(p))
-    found = gradient(params, jax.tree.map(lambda *parts: jnp.stack(parts), *samples))
-    singles = [gradient(params, jax.tree.map(lambda x: x[None], sample)) for sample in samples]
-    wanted = jax.tree.map(lambda a, b: (a + b) / 2, *singles)
-    largest = max(float(jnp.abs(x).max()) for x in jax.tree.leaves(wanted))
-    for a, b in zip(flat(found), flat(wanted), strict=True):
-        np.testing.assert_allclose(a, b, atol=1e-4 * largest, rtol=1e-3)
 
 
 def test_a_crop_is_a_part_of_the_image():

@@ -13,7 +13,6 @@ import pytest
 from ssplat_jax.commands.train_command import Train
 from ssplat_jax.config import preset
 from ssplat_jax.core.errors import InputError
-from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.model.network import init_params
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.storage.weights import describe_weights, load_params, load_weights, save_weights
@@ -82,22 +81,6 @@ def test_more_steps_give_better_crops(trained, tmp_path, monkeypatch):
     loop.train(config, black, tmp_path, params=params, report=records.append)
     scores = [record["psnr_over_black"] for record in records]  # means of ten steps
     assert len(scores) == 4 and scores[-1] > scores[0] + 0.3
-
-
-@pytest.mark.parametrize("steps", [0, 2])
-def test_a_stream_that_refines_is_refined_for_training_too(steps, monkeypatch):
-    class Begun(Exception):
-        """Ends the stream at its beginning."""
-
-    def session(model, params, *, revise):
-        assert (revise is None) == (steps == 0)
-        raise Begun
-
-    monkeypatch.setattr(crops, "Session", session)
-    monkeypatch.setattr(crops, "make_room", lambda: None)
-    model = StreamSplat(preset("tiny").replace(steps_per_chunk=steps))
-    with pytest.raises(Begun):
-        crops.stream_scene(model, {}, open_capture("procedural:room?frames=12&size=64x48"), 1)
 
 
 def test_strides_for_which_a_capture_is_too_short_are_left_out(tmp_path):
