@@ -44,7 +44,7 @@ from ssplat_jax.evaluation.psnr_ssim import psnr
 from ssplat_jax.evaluation.scoring import mean_scores, score_view
 from ssplat_jax.poses.adjust_poses import adjust_poses
 from ssplat_jax.refinement.learned_pass import STEPS as STEPS_OF_PASS
-from ssplat_jax.refinement.refine_capture import refine_on_capture
+from ssplat_jax.refinement.refine import refine_on_capture
 from ssplat_jax.refinement.refine_config import FOR_CAPTURES, RefineConfig
 from ssplat_jax.streaming.feed import Exposures, feed_chunks
 

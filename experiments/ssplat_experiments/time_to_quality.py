@@ -41,8 +41,7 @@ from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import Split, interleaved_split
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.evaluation.scoring import score_targets
-from ssplat_jax.refinement.refine import continue_refinement, start_refinement
-from ssplat_jax.refinement.refine_capture import key_views_of
+from ssplat_jax.refinement.refine import continue_refinement, key_views_of, start_refinement
 from ssplat_jax.refinement.refine_config import FOR_CAPTURES
 from ssplat_jax.streaming.feed import Exposures, feed_chunks
 

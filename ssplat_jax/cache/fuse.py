@@ -64,7 +64,7 @@ def fuse(cache: VoxelCache, tokens: Tokens, config: StreamConfig, *, axis: str |
         `num_chunks`, which every shard counts.
 
     Limits:
-        A new pivot has residuals of 0; those of merged pivots are averaged with the weights of their means.
+        A new pivot has changes of 0; those of merged pivots are averaged with the weights of their means.
         A new pivot has observations of 0; those of merged pivots add up.
         Feature norms in [1e-9, 1e9]: outside, and for zero features, a pair counts as orthogonal.
         Two members of confidence 0 are averaged with equal weights.
@@ -266,7 +266,7 @@ def _merge_pair(older: Fields, newer: Fields) -> Fields:
         a, b = older[name].astype(jnp.float32), newer[name].astype(jnp.float32)
         return jnp.clip(a + share[:, None] * (b - a), jnp.minimum(a, b), jnp.maximum(a, b))
 
-    merged = {name: average(name) for name in ("means", "feats", "rgbs", "residuals") if name in older}
+    merged = {name: average(name) for name in ("means", "feats", "rgbs", "changes") if name in older}
     best = ("seeds", "confidences", "quats", "footprints")
     merged |= {name: _select(newer_is_best, newer[name], older[name]) for name in best}
     merged |= {name: older[name] + newer[name] for name in ("observations",) if name in older}

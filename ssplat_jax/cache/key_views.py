@@ -1,6 +1,7 @@
 """Views that refinement compares the scene with, and the ring in which a stream keeps them."""
 
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -30,9 +31,13 @@ class KeyViews:
         """Views that there is space for, empty slots included."""
         return self.images.shape[0]
 
-    def camera(self, index) -> Camera:
-        """Camera of the view at `index`, which may be traced."""
-        height, width = self.images.shape[1:3]
+    def at(self, slot) -> "KeyViews":
+        """The view in one slot, which may be traced, without a batch axis."""
+        return jax.tree.map(lambda x: x[slot], self)
+
+    def camera(self, index: Any = ...) -> Camera:
+        """Camera of the view at `index`, which may be traced; by default of all views, or of a view without an axis."""
+        height, width = self.images.shape[-3:-1]
         return Camera(viewmats=self.viewmats[index], Ks=self.Ks[index], width=width, height=height)
 
     @staticmethod

@@ -64,7 +64,7 @@ def fuse(cache: dict, tokens: dict, config: StreamConfig) -> dict:
             if config.head.evidence:
                 pivot["observations"] = np.zeros(9)
             if config.stream.steps_per_chunk:
-                pivot["residuals"] = np.zeros(14 * config.head.gaussians_per_token)
+                pivot["changes"] = np.zeros(14 * config.head.gaussians_per_token)
             _insert(cache, pivots_of, voxel, pivot, config)
     return cache
 
@@ -121,7 +121,7 @@ def merge(older: dict, newer: dict) -> dict:
     if w + x == 0:
         w = x = 0.5
     merged = {name: best[name] for name in ("seeds", "confidences", "quats", "footprints")}
-    for name in ("means", "feats", "rgbs", "residuals"):
+    for name in ("means", "feats", "rgbs", "changes"):
         if name in older:
             merged[name] = (w * older[name] + x * newer[name]) / (w + x)
     for name in ("num_members", "observations"):

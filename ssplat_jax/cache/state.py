@@ -17,9 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from ssplat_jax.cache.changes import empty_changes
 from ssplat_jax.cache.hash_table import SLOTS_PER_ROW, build_table
 from ssplat_jax.cache.key_views import NUM_KEY_VIEWS, KeyViews, empty_key_views
-from ssplat_jax.cache.residuals import empty_residuals
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.errors import CacheError, InputError
 from ssplat_jax.core.pytree import pytree, replace
@@ -91,7 +91,7 @@ class VoxelCache:
     stats: CacheStats
     observations: Float[Array, "capacity k s"] | None = None  # what views say about the pivot (observations.py); sums
     # Fields of refinement while streaming; None without it, so that the program has no trace of them.
-    residuals: Float[Array, "capacity k r"] | None = None  # changes to each of the pivot's Gaussians (residuals.py)
+    changes: Float[Array, "capacity k r"] | None = None  # to each of the pivot's Gaussians (changes.py)
     key_views: KeyViews | None = None  # views that the scene is compared with; None before the first chunk
 
     @property
@@ -112,7 +112,7 @@ PIVOT_FIELDS = (
 # fmt: on
 """Fields of every `VoxelCache` with one entry per pivot, `[capacity, k, ...]`."""
 
-OPTIONAL_PIVOT_FIELDS = ("observations", "residuals")
+OPTIONAL_PIVOT_FIELDS = ("observations", "changes")
 """Further such fields, None where the configuration does not ask for them."""
 
 
@@ -181,26 +181,26 @@ def init_cache(config: StreamConfig, capacity: int | None = None) -> VoxelCache:
         ),
         stats=CacheStats(*(zero() for _ in range(8))),
         observations=jnp.zeros((capacity, k, NUM_OBSERVED)) if config.head.evidence else None,
-        residuals=empty_residuals(capacity, config) if config.stream.steps_per_chunk else None,
+        changes=empty_changes(capacity, config) if config.stream.steps_per_chunk else None,
     )
 
 
 def with_refinement(cache: VoxelCache, config: StreamConfig, height: int, width: int) -> VoxelCache:
-    """`cache` with residuals and empty key views for images of one size, where it has none yet.
+    """`cache` with empty changes and key views for images of one size, where it has none yet.
 
     Raises:
         InputError: it has key views of another size or number.
     """
     slots = (NUM_KEY_VIEWS, height, width, 3)
-    residuals, key_views = cache.residuals, cache.key_views
-    if residuals is None:
-        residuals = empty_residuals(cache.capacity, config)
+    changes, key_views = cache.changes, cache.key_views
+    if changes is None:
+        changes = empty_changes(cache.capacity, config)
     if key_views is None:
         key_views = empty_key_views(*slots[:3])
     if key_views.images.shape != slots:
         wanted, got = "x".join(map(str, key_views.images.shape)), "x".join(map(str, slots))
         raise InputError(f"cache: wanted key views of {wanted} as before, got {got}; keep the size.")
-    return replace(cache, residuals=residuals, key_views=key_views)
+    return replace(cache, changes=changes, key_views=key_views)
 
 
 # Capacity -------------------------------------------------------------------------------------------------------------

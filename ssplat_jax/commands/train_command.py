@@ -153,7 +153,7 @@ class Train:
         """Trains the network of the learned pass. It takes minutes, so it starts anew after an interrupt."""
         from ssplat_jax.core.console import Reporter
         from ssplat_jax.model.streamsplat import StreamSplat
-        from ssplat_jax.refinement.refiner_weights import save_refiner
+        from ssplat_jax.refinement.learned_pass import save_refiner
         from ssplat_jax.storage.run_folder import lock_folder, make_writable
         from ssplat_jax.training.capture_mix import open_mix
         from ssplat_jax.training.recipe import TINY

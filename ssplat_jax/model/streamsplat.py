@@ -20,8 +20,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ssplat_jax.cache import Tokens, VoxelCache, carve, coarsen, fuse, init_cache, project, store_depths, vote
+from ssplat_jax.cache.changes import changed_gaussians, unpack
 from ssplat_jax.cache.observations import observe, seen_cells
-from ssplat_jax.cache.residuals import revise, unpack
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.chunk import Chunk, check_chunk
 from ssplat_jax.core.gaussians import Gaussians, mask_gaussians
@@ -226,8 +226,8 @@ class StreamSplat:
             num_members=num_members,
             config=self.config,
         )
-        if cache.residuals is not None:
-            gaussians = revise(gaussians, unpack(take(cache.residuals)), max_scale=MAX_SCALE)
+        if cache.changes is not None:
+            gaussians = changed_gaussians(gaussians, unpack(take(cache.changes)), max_scale=MAX_SCALE)
         return mask_gaussians(gaussians, self.repeat_per_gaussian(is_shown))
 
     def decode_tokens(self, params: dict, tokens: Tokens) -> Gaussians:

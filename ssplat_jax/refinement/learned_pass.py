@@ -1,54 +1,52 @@
-"""A learned pass: several key views are compared with the scene, then a network revises all Gaussians at once.
+"""A learned pass: several key views are compared with the scene, then a network changes all Gaussians at once.
 
     scene ─► render each view ─► error ─► gradients, pixels and errors of each Gaussian, summed over the views
                                                    │ refiner_features
-                              revision' ◄─ apply ◄─ Refiner
+                                change' ◄─ apply ◄─ Refiner
 
-A pass takes the place of the next `STEPS` gradient steps and shows their views. ReSplat's recurrent refinement is the
-model: render, feed the error back, predict the change, with the same network in every pass.
+Adam's first steps all have full size, whatever the error is, so it needs tens of small ones; the network has learned
+how far to go. It reads gradients in each Gaussian's own axes, so it works for the Gaussians of any scene. A pass takes
+the place of the next `STEPS` gradient steps and shows their views. ReSplat's recurrent refinement is the model: render,
+feed the error back, predict the change, with the same network in every pass.
 """
+
+import functools
+from importlib import resources
+from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
+from ssplat_jax.cache.changes import Change, apply_change, no_change
 from ssplat_jax.cache.key_views import KeyViews
 from ssplat_jax.core.gaussians import SH_C0, Gaussians, mean_color
 from ssplat_jax.core.numerics import safe_log
 from ssplat_jax.core.pytree import pytree, replace
 from ssplat_jax.core.rotations import quats_to_matrices
 from ssplat_jax.model.refiner import Refiner, gains_and_shifts
-from ssplat_jax.rasterizer import fill_holes, render
+from ssplat_jax.refinement.compared_views import errors_of_view, held_back_pixels, mean_over, view_loss, views_of_step
 from ssplat_jax.refinement.refine_config import RefineConfig
-from ssplat_jax.refinement.refine_step import RefineState, StepReport
-from ssplat_jax.refinement.revision import Revision, apply_revision, bounded, no_revision, sizes
-from ssplat_jax.refinement.view_loss import EFFECTS, held_back_pixels, mean_over, view_loss
-from ssplat_jax.refinement.view_order import next_view
+from ssplat_jax.refinement.refine_step import RefineState, StepReport, bounded, sizes, units
+from ssplat_jax.storage.files import load_arrays, save_arrays
 
-STEPS = 8
-"""Gradient steps whose place a pass takes: it shows as many views."""
-
+STEPS = 8  # gradient steps whose place a pass takes: it shows as many views
 LARGEST = {"means": 0.5, "quats": 0.05, "log_scales": 0.5, "logit_opacities": 2.0, "colors": 0.2, "bands": 0.05}
 """Largest change of each part in a pass; places in units of the Gaussian's own size, `colors` and `bands` of color."""
-
-CLIPPED_ERROR = 0.1
-"""Error of a pixel beyond which it does not count more: occlusions and moving things."""
-
-LEAST_SLOPE = 1e-3
-"""Added to the divisor of the agreement, which is the views' summed gradients over the root of their summed squares."""
-
-NUM_CHECKED = 4
-"""Views of a pass that are rendered once more, to see whether it helps."""
-
-MIN_PIXELS = 0.1
-"""Pixels that a Gaussian must fill in the views of a pass, or it stays as it is."""
+CLIPPED_ERROR = 0.1  # error of a pixel beyond which it does not count more: occlusions and moving things
+MIN_GRADIENT = 1e-3  # added to the divisor of the agreement of views
+NUM_CHECKED = 4  # views of a pass that are rendered once more, to see whether it helps
+MIN_PIXELS = 0.1  # that a Gaussian must fill in the views of a pass, or it stays as it is
+KIND = "refiner"  # of the file with the network's parameters
 
 
 @pytree
 class SeenErrors:
     """Errors that the views of a pass see in `n` Gaussians: sums over the views."""
 
-    slopes: dict[str, Float[Array, "n _"]]  # gradients of the error by part, places in the Gaussian's own axes
+    gradients: dict[str, Float[Array, "n _"]]  # of the error by part, places in the Gaussian's own axes
     squares: dict[str, Float[Array, "n _"]]  # squared gradients of the single views
     pixels: Float[Array, " n"]  # that it fills
     errors: Float[Array, " n"]  # absolute error of these pixels
@@ -58,75 +56,54 @@ class SeenErrors:
 
 def no_errors(gaussians: Gaussians) -> SeenErrors:
     """The sums over no view."""
-    zeros, none = slopes_by_part(gaussians, no_revision(gaussians)), jnp.zeros_like(gaussians.opacities)
-    return SeenErrors(slopes=zeros, squares=zeros, pixels=none, errors=none, signed=none, num_views=none)
+    zeros, none = gradients_by_part(gaussians, no_change(gaussians)), jnp.zeros_like(gaussians.opacities)
+    return SeenErrors(gradients=zeros, squares=zeros, pixels=none, errors=none, signed=none, num_views=none)
 
 
-def slopes_by_part(gaussians: Gaussians, slopes: Revision) -> dict[str, Float[Array, "n _"]]:
-    """Gradients by the network's parts: places in the axes of each Gaussian, SH bands in units of color."""
-    frames = quats_to_matrices(gaussians.quats)
-    return {
-        "means": jnp.einsum("nji,nj->ni", frames, slopes.means),
-        "quats": slopes.quats,
-        "log_scales": slopes.log_scales,
-        "logit_opacities": slopes.logit_opacities[:, None],
-        "colors": slopes.sh[:, 0] / SH_C0,
-        "bands": slopes.sh[:, 1:].reshape(len(slopes.sh), -1) / SH_C0,
-    }
+def gradients_by_part(gaussians: Gaussians, gradient: Change) -> dict[str, Float[Array, "n _"]]:
+    """Gradients by the network's parts, in `units`: places in the axes of each Gaussian, SH bands in units of color."""
+    in_units = {name: unit * getattr(gradient, name) for name, unit in units(gaussians).items()}
+    sh, opacities = in_units.pop("sh"), in_units.pop("logit_opacities")
+    means = jnp.einsum("nji,nj->ni", quats_to_matrices(gaussians.quats), in_units["means"])
+    own = {"means": means, "logit_opacities": opacities[:, None]}
+    return in_units | own | {"colors": sh[:, 0], "bands": sh[:, 1:].reshape(len(sh), -1)}
 
 
 def add_view(
     seen: SeenErrors,
     start: Gaussians,
-    revision: Revision,
+    change: Change,
     key_views: KeyViews,
-    view: Int[Array, ""],
+    slot: Int[Array, ""],
     config: RefineConfig,
     max_pairs: int,
 ) -> tuple[SeenErrors, tuple[Float[Array, ""], Float[Array, ""], Int[Array, ""]]]:
-    """`seen` with one key view added, and the measurements of the view as `view_loss` has them.
+    """`seen` with one key view added, and the loss, held-back error and overflow of the view as in `view_loss`.
 
-    The error is a Huber loss: its gradient is linear in the difference of the colors up to `CLIPPED_ERROR`.
-
-    Args:
-        seen: the sums over the views before.
-        start: the scene that `revision` revises.
-        revision: the changes so far; gradients are taken by it.
-        key_views: the views to compare with.
-        view: slot of the view to add.
-        config: weights of the error.
-        max_pairs: capacity for tile intersections.
-
-    Returns:
-        The sums, and (loss, held-back error, overflow) of the view.
+    The error is a Huber loss: its gradient is linear in the difference of the colors up to `CLIPPED_ERROR`. One
+    backward pass gives all that the network reads: three channels of zeros are rendered beside the colors, and their
+    gradients are the pixels that a Gaussian fills and the errors in them.
     """
-    camera, exposure = key_views.camera(view), key_views.exposures[view]
-    height, width = key_views.images.shape[1:3]
-    current = apply_revision(start, revision)
+    current, view, weight = apply_change(start, change), key_views.at(slot), config.shown_weight
     background = mean_color(current)
-    target = key_views.images[view].astype(jnp.float32) / 255
 
-    def images(revision: Revision, probe: Float[Array, "n 3"]):
-        gaussians = apply_revision(start, revision)
-        out = render(gaussians, camera, effects=EFFECTS, features=probe, max_pairs=max_pairs)
-        filled = fill_holes(out.color, out.alpha, background)
-        return (filled * exposure - target, out.color * exposure - target, out.features), out.num_overflow
+    def images(change: Change, probe: Float[Array, "n 3"]):
+        gaussians = apply_change(start, change)
+        filled, black, out = errors_of_view(gaussians, background, view, max_pairs=max_pairs, probe=probe)
+        return (filled, black, out.features), out.num_overflow
 
-    # Channels of zeros show nothing; their gradients sum up what lies in the pixels that each Gaussian fills.
     probe = jnp.zeros((start.num_gaussians, 3), start.means.dtype)
-    (filled, black, features), pull, overflow = jax.vjp(images, revision, probe, has_aux=True)
-    held_back = held_back_pixels((height, width), view, config)
+    (filled, black, features), pull, overflow = jax.vjp(images, change, probe, has_aux=True)
+    held_back = held_back_pixels(black.shape[:2], slot, config)
     learned = ~held_back[..., None]
     clipped = lambda error: jnp.where(learned, jnp.clip(error / CLIPPED_ERROR, -1.0, 1.0), 0.0)  # noqa: E731
-    absolute = jnp.abs(black).mean(axis=-1, keepdims=True)
-    told = jnp.concatenate([jnp.ones_like(absolute), absolute, clipped(black).mean(axis=-1, keepdims=True)], axis=-1)
-    told = jnp.where(learned, told, 0.0).astype(features.dtype)
-    weight = config.shown_weight
-    slopes, sums = pull((weight * clipped(filled), (1 - weight) * clipped(black), told))
-    by_part = slopes_by_part(current, slopes)
+    told = [jnp.ones(black.shape[:2]), jnp.abs(black).mean(axis=-1), clipped(black).mean(axis=-1)]
+    told = jnp.where(learned, jnp.stack(told, axis=-1), 0.0).astype(features.dtype)
+    gradient, sums = pull((weight * clipped(filled), (1 - weight) * clipped(black), told))
+    by_part = gradients_by_part(current, gradient)
     pixels, errors, signed = jnp.moveaxis(sums, -1, 0)
     added = SeenErrors(
-        slopes=by_part,
+        gradients=by_part,
         squares=jax.tree.map(jnp.square, by_part),
         pixels=pixels,
         errors=errors,
@@ -138,121 +115,90 @@ def add_view(
     return jax.tree.map(jnp.add, seen, added), measured
 
 
+def is_learned(num_steps: int, steps: int, config: RefineConfig) -> bool:
+    """True if a learned pass may follow on `num_steps` of `steps`: passes come first, where enough steps are left."""
+    return num_steps < config.learned_passes * STEPS and num_steps + STEPS <= steps
+
+
 def learned_pass(
     state: RefineState, key_views: KeyViews, refiner: dict, *, config: RefineConfig, max_pairs: int
 ) -> tuple[RefineState, StepReport]:
     """The state after a learned pass, and the reports of the `STEPS` steps whose place it takes. Donate `state`.
 
-    Args:
-        state: the scene so far.
-        key_views: the views to compare with, at least one of them valid.
-        refiner: parameters of the network (`load_refiner`).
-        config: weights and bounds (static).
-        max_pairs: capacity for tile intersections (static); `StepReport.num_overflow` says what did not fit.
-
-    Returns:
-        The state, `STEPS` steps further, and a report with a leading axis of `STEPS`, measured before the change.
+    Arguments are those of `refine_step`, with the network's parameters in the place of the rate.
 
     Limits:
         A pass changes nothing if the first `NUM_CHECKED` of its views look no better after it, or if it gives a number
         that is not finite; its steps are then counted in `num_skipped`. Gaussians that no view of the pass shows stay
         as they are. Bounds are those of `refine_step`.
     """
-    places = state.num_steps * config.views_per_step + jnp.arange(STEPS * config.views_per_step, dtype=jnp.int32)
-    views = jax.vmap(lambda place: next_view(place, key_views.valid, config.seed))(places)
-
-    def body(seen: SeenErrors, view: Int[Array, ""]):
-        return add_view(seen, state.start, state.revision, key_views, view, config, max_pairs)
-
-    current = apply_revision(state.start, state.revision)
-    seen, measured = jax.lax.scan(body, no_errors(current), views)
-    losses, held_back, overflows = (x.reshape(STEPS, config.views_per_step) for x in measured)
-    change = learned_change(refiner, current, seen)
-    revision = bounded(jax.tree.map(jnp.add, state.revision, change), config)
-    checked = min(NUM_CHECKED, views.shape[0])
-    after = _mean_loss(replace(state, revision=revision), key_views, views[:checked], config, max_pairs)
+    steps = state.num_steps + jnp.arange(STEPS, dtype=jnp.int32)
+    views = jax.vmap(lambda step: views_of_step(step, key_views.valid, config))(steps)
+    current = apply_change(state.start, state.change)
+    seen, measured = jax.lax.scan(
+        lambda seen, slot: add_view(seen, state.start, state.change, key_views, slot, config, max_pairs),
+        no_errors(current),
+        views.reshape(-1),
+    )
+    losses, held_back, overflows = (x.reshape(views.shape) for x in measured)
+    change = jax.tree.map(jnp.add, state.change, learned_change(refiner, current, seen))
+    change = bounded(change, state.start)
+    after, checked = apply_change(state.start, change), views.reshape(-1)[:NUM_CHECKED]
+    background = mean_color(after)
+    loss = lambda slot: view_loss(after, background, key_views.at(slot), slot, config, max_pairs)[0]  # noqa: E731
     # A loss of NaN does not help either. Gaussians that no checked view shows are looked at themselves.
-    helps = after < jnp.mean(losses.reshape(-1)[:checked])
-    for leaf in jax.tree.leaves(revision):
+    helps = jnp.mean(jax.lax.map(loss, checked)) < jnp.mean(losses.reshape(-1)[:NUM_CHECKED])
+    for leaf in jax.tree.leaves(change):
         helps = helps & jnp.all(jnp.isfinite(leaf))
     moved = replace(
         state,
-        revision=jax.tree.map(lambda new, old: jnp.where(helps, new, old), revision, state.revision),
+        change=jax.tree.map(lambda new, old: jnp.where(helps, new, old), change, state.change),
+        # Adam counts the steps but its moments stay zero, so that its first own step has 0.6 of the full size: a scene
+        # that is nearly right changes little.
+        adam=state.adam._replace(count=state.adam.count + STEPS),
         num_steps=state.num_steps + STEPS,
         num_skipped=state.num_skipped + STEPS * (~helps).astype(jnp.int32),
     )
-    return moved, StepReport(
-        loss=losses.mean(axis=1),
-        held_back=held_back.mean(axis=1),
-        views=views.reshape(STEPS, -1),
-        num_missing_rows=jnp.zeros((STEPS,), jnp.int32),
-        num_overflow=overflows.max(axis=1),
-    )
+    measured = losses.mean(axis=1), held_back.mean(axis=1), views, jnp.zeros_like(steps), overflows.max(axis=1)
+    return moved, StepReport(*measured)
 
 
-def _mean_loss(
-    state: RefineState, key_views: KeyViews, views: Int[Array, " b"], config: RefineConfig, max_pairs: int
-) -> Float[Array, ""]:
-    """Mean of `view_loss` over some views."""
-    current = apply_revision(state.start, state.revision)
-    background = mean_color(current)
-
-    def body(total: Float[Array, ""], view: Int[Array, ""]):
-        return total + view_loss(current, background, key_views, view, config, max_pairs)[0], None
-
-    return jax.lax.scan(body, jnp.zeros((), current.means.dtype), views)[0] / views.shape[0]
-
-
-def learned_change(refiner: dict, gaussians: Gaussians, seen: SeenErrors) -> Revision:
-    """The change of all Gaussians that the network predicts, differentiable in its parameters.
-
-    Args:
-        refiner: parameters of the network.
-        gaussians: the scene that the views saw.
-        seen: what they say about it.
+def learned_change(refiner: dict, gaussians: Gaussians, seen: SeenErrors) -> Change:
+    """The change of all Gaussians that the network predicts from what views say, differentiable in its parameters.
 
     Limits:
         Parts change by at most `LARGEST`. Absent Gaussians, and those below `MIN_PIXELS`, change by 0.
     """
-    agreement = {name: seen.slopes[name] / (jnp.sqrt(seen.squares[name]) + LEAST_SLOPE) for name in LARGEST}
-    features = refiner_features(gaussians, seen, agreement)
-    out = gains_and_shifts(jnp.asarray(Refiner().apply({"params": refiner}, features)))
-    is_seen = (seen.pixels >= MIN_PIXELS) & (gaussians.opacities > 0)
-
-    def change(name: str) -> Array:
-        gain, shift = out[name]
-        step = LARGEST[name] * jnp.tanh(shift - gain * agreement[name])
-        return jnp.where(is_seen[:, None], step, 0.0)
-
-    bands = change("bands").reshape(len(is_seen), -1, 3)
-    return Revision(
-        means=jnp.einsum("nij,nj->ni", quats_to_matrices(gaussians.quats), change("means")),
-        quats=change("quats"),
-        log_scales=change("log_scales"),
-        logit_opacities=change("logit_opacities")[:, 0],
-        sh=jnp.concatenate([change("colors")[:, None], bands], axis=1) / SH_C0,
+    agreement = {name: seen.gradients[name] / (jnp.sqrt(seen.squares[name]) + MIN_GRADIENT) for name in LARGEST}
+    out = Refiner().apply({"params": refiner}, refiner_features(gaussians, seen, agreement))
+    is_seen = ((seen.pixels >= MIN_PIXELS) & (gaussians.opacities > 0))[:, None]
+    step = {
+        name: jnp.where(is_seen, LARGEST[name] * jnp.tanh(shift - gain * agreement[name]), 0.0)
+        for name, (gain, shift) in gains_and_shifts(jnp.asarray(out)).items()
+    }
+    unit, bands = units(gaussians), step["bands"].reshape(len(is_seen), -1, 3)
+    return Change(
+        means=unit["means"] * jnp.einsum("nij,nj->ni", quats_to_matrices(gaussians.quats), step["means"]),
+        quats=step["quats"],
+        log_scales=step["log_scales"],
+        logit_opacities=step["logit_opacities"][:, 0],
+        sh=unit["sh"] * jnp.concatenate([step["colors"][:, None], bands], axis=1),
     )
 
 
 def refiner_features(
     gaussians: Gaussians, seen: SeenErrors, agreement: dict[str, Float[Array, "n _"]]
 ) -> Float[Array, "n f"]:
-    """Inputs of the network, as numbers of about unit size. No gradient flows through them.
+    """Inputs of the network, as numbers of about unit size; finite for absent and hidden Gaussians, without gradient.
 
-    Args:
-        gaussians: the scene that the views saw.
-        seen: what they say about it.
-        agreement: by part, the views' summed gradients over the root of their summed squares.
-
-    Limits:
-        Gaussians that no view shows, and absent ones, have finite features.
+    `agreement` is by part the views' summed gradients over the root of their summed squares.
     """
     pixels, num_views = seen.pixels[:, None], seen.num_views[:, None]
     opacities = jnp.clip(gaussians.opacities, 1e-4, 1 - 1e-4)[:, None]
     told = ("means", "log_scales", "logit_opacities", "colors")
     features = (
         *(agreement[name] for name in told),
-        *(jnp.clip(seen.slopes[name] / (pixels + 1.0), -3.0, 3.0) for name in told),
+        *(jnp.clip(seen.gradients[name] / (pixels + 1.0), -3.0, 3.0) for name in told),
         jnp.log1p(pixels) - 2.0,
         jnp.log1p(num_views) - 1.0,
         jnp.log1p(pixels / jnp.maximum(num_views, 1.0)) - 1.0,
@@ -263,3 +209,26 @@ def refiner_features(
         jnp.clip(safe_log(gaussians.scales / jnp.maximum(sizes(gaussians), 1e-12)[:, None]), -4.0, 1.0),
     )
     return jax.lax.stop_gradient(jnp.concatenate(features, axis=-1))
+
+
+def init_refiner(seed: int = 0) -> dict:
+    """Parameters before training: every step goes a little against the gradient."""
+    one, none = jnp.ones((1, 3)), jnp.zeros(1)
+    gaussians = Gaussians(means=one, quats=jnp.ones((1, 4)), scales=one, opacities=none, sh=one[:, None])
+    seen = no_errors(gaussians)
+    return dict(Refiner().init(jax.random.key(seed), refiner_features(gaussians, seen, seen.gradients))["params"])
+
+
+def save_refiner(path: Path, params: dict, provenance: dict[str, Any]) -> None:
+    """Writes the parameters and JSON facts about their training; StorageError if the file cannot be written."""
+    arrays = {f"{layer}/{name}": np.asarray(x) for layer, part in params.items() for name, x in part.items()}
+    save_arrays(path, arrays, KIND, {"provenance": provenance})
+
+
+@functools.cache
+def load_refiner(path: Path | None = None) -> dict:
+    """The parameters in a file; without one, those that ship with the package."""
+    with resources.as_file(resources.files("ssplat_jax") / "weights" / "refiner.npz") as shipped:
+        arrays, _ = load_arrays(path or shipped, KIND)
+    named = lambda where, _: jnp.asarray(arrays["/".join(key.key for key in where)])  # noqa: E731
+    return jax.tree.map_with_path(named, jax.eval_shape(init_refiner))

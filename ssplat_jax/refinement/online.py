@@ -1,8 +1,11 @@
-"""Refinement while streaming: after each chunk a few gradient steps on key views revise the pivots that they show.
+"""Refinement while streaming: after each chunk a few gradient steps on key views change the pivots that they show.
 
-    step ─► cache ─► keep_views          for each view of the round: visible pivots ─► base Gaussians + residuals
+    step ─► cache ─► keep_views          for each view of the round: visible pivots ─► base Gaussians, their change
                          └─► views of this round ─►                                              │ online_step
                                                        cache' ◄─ settle, write back ◄────────────┘
+
+It sits above the stream: `model.step` has no part in it. A step changes no more pivots than its view shows, which
+bounds the time and the memory of a chunk, however long the stream is.
 
 All arrays have fixed sizes, so that neither time nor memory of a round grows without bound.
 """
@@ -11,33 +14,30 @@ import functools
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Int
+from jaxtyping import Array, Float, Int
 
+from ssplat_jax.cache.changes import Change, apply_change, settle, unpack
 from ssplat_jax.cache.key_views import KeyViews, keep_views, usable
-from ssplat_jax.cache.residuals import Residuals, add, settle, unpack
 from ssplat_jax.cache.state import VoxelCache
 from ssplat_jax.config import MEDIAN_DEPTH
-from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.chunk import Chunk
 from ssplat_jax.core.gaussians import Gaussians, mean_color
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.model.decoder import MAX_SCALE
 from ssplat_jax.model.streamsplat import ChunkOutput, StreamSplat
-from ssplat_jax.rasterizer import fill_holes, render
 from ssplat_jax.rasterizer.render import round_up
-from ssplat_jax.refinement.revision import sizes
-from ssplat_jax.refinement.view_loss import EFFECTS
-from ssplat_jax.refinement.view_order import golden_fractions
+from ssplat_jax.refinement.compared_views import errors_of_view, golden_fractions
+from ssplat_jax.refinement.refine_step import units
 from ssplat_jax.refinement.visible_pivots import visible_pivots
 from ssplat_jax.streaming.session import Revise
 
-GAINS = {"means": 12.0, "quats": 0.2, "log_scales": 6.0, "logit_opacities": 6.0, "colors": 0.12}
-"""Step of each part over its mean gradient in the pixels that a Gaussian fills. Newton's method would divide by the
-squared change of a pixel that the part causes. The gains are far smaller: several Gaussians answer for a pixel, and a
-Gaussian should follow the mean of its views, not the one that was shown last."""
+GAINS = {"means": 12.0, "quats": 0.2, "log_scales": 6.0, "logit_opacities": 6.0, "sh": 0.12}
+"""Step of each part in `units` over its mean gradient in the pixels that a Gaussian fills. Newton's method would divide
+by the squared change of a pixel that the part causes. The gains are far smaller: several Gaussians answer for a pixel,
+and a Gaussian should follow the mean of its views, not the one that was shown last."""
 
-CAPS = {"means": 0.2, "quats": 0.02, "log_scales": 0.1, "logit_opacities": 0.5, "colors": 0.2}
-"""Largest step of each part. Places are in units of the Gaussian's own size."""
+CAPS = {"means": 0.2, "quats": 0.02, "log_scales": 0.1, "logit_opacities": 0.5, "sh": 0.2}
+"""Largest step of each part, in `units`."""
 
 MIN_PIXELS = 0.3
 """Added to the pixels that a Gaussian fills: one that hardly shows learns little from them."""
@@ -51,43 +51,42 @@ PAIRS_PER_GAUSSIAN = 3
 
 def online_refinement(model: StreamSplat) -> Revise | None:
     """The `revise` of a `Session` with this model; None if its configuration asks for no refinement."""
-    return functools.partial(revise_scene, model) if model.config.stream.steps_per_chunk else None
+    return functools.partial(refine_scene, model) if model.config.stream.steps_per_chunk else None
 
 
-def revise_scene(model: StreamSplat, params: dict, cache: VoxelCache, chunk: Chunk, output: ChunkOutput) -> VoxelCache:
+def refine_scene(model: StreamSplat, params: dict, cache: VoxelCache, chunk: Chunk, output: ChunkOutput) -> VoxelCache:
     """The cache after a round of refinement that follows `model.step` on `chunk`.
 
     Args:
         model: the stream's model; its `steps_per_chunk` says how much is done.
         params: the model's parameters.
-        cache: the cache after the step, with residuals and key views.
+        cache: the cache after the step, with changes and key views.
         chunk: the chunk of the step.
         output: the step's summary, which holds the exposures.
 
     Returns:
-        The cache. Only `means`, `residuals`, `last_chunks` and `key_views` differ.
+        The cache. Only `means`, `changes`, `last_chunks` and `key_views` differ.
     """
     config = model.config
-    assert cache.residuals is not None and cache.key_views is not None
     arrivals = replace(KeyViews.of(chunk.camera, chunk.images, output.exposures), valid=chunk.valid)
     kept = keep_views(cache.key_views, arrivals, depth=MEDIAN_DEPTH)
     views = views_of_round(cache.key_views, arrivals, cache.stats.num_chunks, config.stream.steps_per_chunk)
     views = replace(views, valid=views.valid & jnp.any(chunk.valid))  # a chunk of padding changes nothing
     cache = replace(cache, key_views=kept)
-    return jax.lax.scan(lambda cache, view: (_revise_view(model, params, cache, view), None), cache, views)[0]
+    return jax.lax.scan(lambda cache, view: (_refine_view(model, params, cache, view), None), cache, views)[0]
 
 
-def _revise_view(model: StreamSplat, params: dict, cache: VoxelCache, view: KeyViews) -> VoxelCache:
-    """The cache after one step on a single view, which revises the pivots that the view shows."""
+def _refine_view(model: StreamSplat, params: dict, cache: VoxelCache, view: KeyViews) -> VoxelCache:
+    """The cache after one step on a single view, which changes the pivots that the view shows."""
     config = model.config
     pivots = visible_pivots(cache, view, config)
-    base = model.decode_rows(params, replace(cache, residuals=None), pivots)
+    base = model.decode_rows(params, replace(cache, changes=None), pivots)
     taken = jnp.maximum(pivots, 0)
     flat = lambda x: x.reshape(-1, *x.shape[2:])  # noqa: E731
-    means, packed = flat(cache.means)[taken], flat(cache.residuals)[taken]
+    means, packed = flat(cache.means)[taken], flat(cache.changes)[taken]
     max_pairs = round_up(PAIRS_PER_GAUSSIAN * base.num_gaussians)
-    revised = online_step(base, unpack(packed), view, max_pairs=max_pairs, max_scale=MAX_SCALE)
-    moved, settled = settle(means, revised, config.memory.voxel_size)
+    change = online_step(base, unpack(packed), view, max_pairs=max_pairs)
+    moved, settled = settle(means, change, config.memory.voxel_size)
     is_changed = jnp.any(moved != means, axis=1) | jnp.any(settled != packed, axis=1)
     places = jnp.where(is_changed & (pivots >= 0), pivots, cache.alive.size)
     put = lambda x, new: flat(x).at[places].set(new, mode="drop").reshape(x.shape)  # noqa: E731
@@ -95,7 +94,7 @@ def _revise_view(model: StreamSplat, params: dict, cache: VoxelCache, view: KeyV
     return replace(
         cache,
         means=put(cache.means, moved),
-        residuals=put(cache.residuals, settled),
+        changes=put(cache.changes, settled),
         last_chunks=put(cache.last_chunks, last_chunk),
     )
 
@@ -124,47 +123,39 @@ def views_of_round(ring: KeyViews, arrivals: KeyViews, num_chunks: Int[Array, ""
     return replace(chosen, valid=is_usable[order[places]])
 
 
-def online_step(
-    base: Gaussians, residuals: Residuals, view: KeyViews, *, max_pairs: int, max_scale: float
-) -> Residuals:
-    """`residuals` after one step on a single view: gradients over the pixels that each Gaussian fills.
+def online_step(base: Gaussians, change: Change, view: KeyViews, *, max_pairs: int) -> Change:
+    """`change` after one step on a single view: gradients over the pixels that each Gaussian fills.
 
     The squared error of a pixel is a sum over its Gaussians, weighted by how much of the pixel each fills, and so a
     Gaussian's gradient grows with the number of pixels that it fills. Divided by that number it is a mean error: the
     step of a color is the mean error of the pixels that show it, which is Jacobi's method for the linear part of the
-    problem. Nothing has to be remembered from step to step.
+    problem. Nothing has to be remembered from step to step: Adam's moments would have to be stored for every pivot, and
+    started anew in each round they move every Gaussian at full speed in the direction of its noise.
 
     Args:
-        base: the Gaussians as they are decoded, without residuals.
-        residuals: their residuals so far.
+        base: the Gaussians as they are decoded.
+        change: their change so far.
         view: one view, without a batch axis; one that is not valid changes nothing.
         max_pairs: capacity for tile intersections (static).
-        max_scale: bound of scales, stream units.
     """
-    size = sizes(base)
+
+    def loss(change: Change, probe: Float[Array, "n 1"]) -> Float[Array, ""]:
+        """Half the squared error at the scene's exposure, summed over pixels and channels.
+
+        The probe is zero and shows nothing; its gradient is the number of pixels that each Gaussian fills.
+        """
+        gaussians = apply_change(base, change, max_scale=MAX_SCALE)
+        background = jax.lax.stop_gradient(mean_color(gaussians))
+        filled, black, out = errors_of_view(gaussians, background, view, max_pairs=max_pairs, probe=probe)
+        error = (SHOWN_WEIGHT * filled**2 + (1 - SHOWN_WEIGHT) * black**2) / view.exposures**2
+        return 0.5 * jnp.sum(error) + jnp.sum(out.features)
+
     probe = jnp.zeros((base.num_gaussians, 1), base.means.dtype)
-    gradient, filled = jax.grad(_loss, argnums=(1, 2))(base, residuals, probe, view, max_pairs, max_scale)
-    # Units in which a step is the same for Gaussians of all sizes.
-    units = {"means": size[:, None], "quats": 1.0, "log_scales": 1.0, "logit_opacities": 1.0, "colors": 1.0}
+    gradient, filled = jax.grad(loss, argnums=(0, 1))(change, probe)
     new: dict[str, Array] = {}
-    for name, unit in units.items():
-        slope = getattr(gradient, name) * unit
-        pixels = (filled[:, 0] + MIN_PIXELS).reshape(-1, *[1] * (slope.ndim - 1))
-        move = jnp.clip(GAINS[name] * slope / pixels, -CAPS[name], CAPS[name])
-        new[name] = getattr(residuals, name) - unit * jnp.where(view.valid & jnp.isfinite(move), move, 0.0)
-    return Residuals(**new)
-
-
-def _loss(base, residuals, probe, view: KeyViews, max_pairs: int, max_scale: float):
-    """Half the squared error of a view, summed over pixels and channels.
-
-    `probe` is a channel of zeros: it shows nothing, and its gradient says how many pixels each Gaussian fills.
-    """
-    height, width = view.images.shape[:2]
-    camera = Camera(viewmats=view.viewmats, Ks=view.Ks, width=width, height=height)
-    gaussians = add(base, residuals, max_scale=max_scale)
-    out = render(gaussians, camera, effects=EFFECTS, features=probe, max_pairs=max_pairs)
-    filled = fill_holes(out.color, out.alpha, jax.lax.stop_gradient(mean_color(gaussians)))
-    target = view.images.astype(jnp.float32) / 255 / view.exposures
-    error = SHOWN_WEIGHT * (filled - target) ** 2 + (1 - SHOWN_WEIGHT) * (out.color - target) ** 2
-    return 0.5 * jnp.sum(error) + jnp.sum(out.features)
+    for name, unit in units(base).items():
+        in_units = getattr(gradient, name) * unit
+        pixels = (filled[:, 0] + MIN_PIXELS).reshape(-1, *[1] * (in_units.ndim - 1))
+        move = jnp.clip(GAINS[name] * in_units / pixels, -CAPS[name], CAPS[name])
+        new[name] = getattr(change, name) - unit * jnp.where(view.valid & jnp.isfinite(move), move, 0.0)
+    return Change(**new)

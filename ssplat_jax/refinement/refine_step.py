@@ -1,30 +1,46 @@
-"""One refinement step as a pure function: render key views, compare, move every Gaussian by Adam inside its bounds."""
+"""One refinement step as a pure function: render key views, compare, move every Gaussian by Adam inside its bounds.
 
-import functools
+start, change ─► apply_change ─► render ─► L1 error ─► gradient with respect to the change
+                      change' ◄─ bounded ◄─ rates x units ◄─ optax.scale_by_adam ◄─┘
+"""
 
 import jax
 import jax.numpy as jnp
+import optax
 from jaxtyping import Array, Float, Int
 
+from ssplat_jax.cache.changes import MAX_LOGIT, Change, apply_change, no_change
 from ssplat_jax.cache.key_views import KeyViews
-from ssplat_jax.core.gaussians import Gaussians, mean_color, with_sh_degree
+from ssplat_jax.core.gaussians import SH_C0, Gaussians, mean_color, with_sh_degree
 from ssplat_jax.core.pytree import pytree, replace
-from ssplat_jax.refinement.adam import adam_step
+from ssplat_jax.refinement.compared_views import view_loss, views_of_step
 from ssplat_jax.refinement.refine_config import RefineConfig
-from ssplat_jax.refinement.revision import Revision, apply_revision, is_revised, no_revision
-from ssplat_jax.refinement.seen_rows import put_rows, seen_in_any, select_rows, take_rows
-from ssplat_jax.refinement.view_loss import view_loss
-from ssplat_jax.refinement.view_order import views_of_step
+from ssplat_jax.refinement.scene_rows import seen_rows
+
+RATES = {"means": 0.04, "quats": 0.003, "log_scales": 0.02, "logit_opacities": 0.2, "sh": 0.015}
+"""Adam's learning rates in `units`: about the change per step of a parameter whose gradient keeps its sign."""
+
+HIGHER_BANDS = 0.1
+"""Rate of the higher SH bands as a fraction of that of the constant band: fewer views tell about each of them."""
+
+ADAM = optax.scale_by_adam(b1=0.9, b2=0.99, eps=1e-15)
+"""`b2` is short, since a run has tens to hundreds of steps. `eps` is below any gradient that a visible Gaussian has in
+a mean over pixels; 1e-8 would stop most of them."""
+
+MAX_SHIFT = 4.0
+"""Largest distance of a mean from where it started, in units of the Gaussian's own size."""
+
+MAX_LOG_SCALE_CHANGE = 1.5
+"""Largest change of a log standard deviation."""
 
 
 @pytree
 class RefineState:
-    """The scene that refinement started from, its revision, and Adam's moments at the same capacity."""
+    """The scene that refinement started from, its change, and Adam's moments at the same capacity."""
 
     start: Gaussians
-    revision: Revision
-    first_moment: Revision
-    second_moment: Revision
+    change: Change
+    adam: optax.ScaleByAdamState
     num_steps: Int[Array, ""]
     num_skipped: Int[Array, ""]  # steps that changed nothing: not finite, or of a learned pass that did not help
 
@@ -52,24 +68,11 @@ def init_refinement(gaussians: Gaussians, config: RefineConfig | None = None) ->
         gaussians = jax.tree.map(lambda x: x.astype(jnp.float32), gaussians)
     return RefineState(
         start=jax.tree.map(jnp.copy, gaussians),  # the step consumes its state; the caller's arrays stay
-        revision=no_revision(gaussians),
-        first_moment=no_revision(gaussians),
-        second_moment=no_revision(gaussians),
+        change=no_change(gaussians),
+        adam=ADAM.init(no_change(gaussians)),
         num_steps=jnp.zeros((), jnp.int32),
         num_skipped=jnp.zeros((), jnp.int32),
     )
-
-
-def current_gaussians(state: RefineState) -> Gaussians:
-    """The revised scene.
-
-    Limits:
-        A row without a revision is the row of `state.start`, bit for bit, and absent rows stay absent.
-    """
-    revised = apply_revision(state.start, state.revision)
-    is_new = is_revised(state.revision) & (state.start.opacities > 0)
-    keep = lambda new, old: jnp.where(is_new.reshape(-1, *[1] * (new.ndim - 1)), new, old)  # noqa: E731
-    return jax.tree.map(keep, revised, state.start)
 
 
 def refine_step(
@@ -87,7 +90,7 @@ def refine_step(
         state: the scene so far.
         key_views: the views to compare with, at least one of them valid.
         rate: factor of all learning rates; 0 changes nothing but the moments.
-        config: learning rates, weights and bounds (static).
+        config: weights of the loss (static).
         max_pairs: capacity for tile intersections (static); `StepReport.num_overflow` says what did not fit.
         max_rows: capacity for the rows that the step's views may see (static): all but Adam is done for them alone. By
             default, and where it holds every row, nothing is selected. The result is the same.
@@ -96,58 +99,95 @@ def refine_step(
         The state after the step, and what was measured before it.
     """
     views = views_of_step(state.num_steps, key_views.valid, config)
-    current, pull = jax.vjp(functools.partial(apply_revision, state.start), state.revision)
-    background, gaussians, selection = mean_color(current), current, None
+    current = apply_change(state.start, state.change)
+    background, start, change, rows = mean_color(current), state.start, state.change, None
+    num_missing = jnp.zeros((), jnp.int32)
     if max_rows is not None and max_rows < current.num_gaussians:
-        cameras = [key_views.camera(view) for view in views]
-        selection = select_rows(seen_in_any(current, cameras), max_rows)
-        gaussians = take_rows(current, selection)
-        gaussians = replace(gaussians, opacities=jnp.where(selection.is_row, gaussians.opacities, 0.0))
-    slopes, report = _slopes(gaussians, background, key_views, views, config, max_pairs)
-    if selection is not None:
-        slopes = put_rows(slopes, selection, jax.tree.map(jnp.zeros_like, current))
-        report = replace(report, num_missing_rows=selection.num_overflow)
-    (gradient,) = pull(slopes)
+        is_seen = seen_rows(current, key_views, views)
+        num_missing = jnp.maximum(jnp.sum(is_seen, dtype=jnp.int32) - max_rows, 0)
+        # Places without a row get an opacity of 0, and their gradient is dropped.
+        rows = jnp.nonzero(is_seen, size=max_rows, fill_value=is_seen.size)[0]
+        start, change = jax.tree.map(lambda x: x.at[rows].get(mode="fill", fill_value=0), (start, change))
 
-    is_finite = jnp.isfinite(report.loss)
+    def loss(change: Change, slot: Int[Array, ""]):
+        return view_loss(apply_change(start, change), background, key_views.at(slot), slot, config, max_pairs)
+
+    def add_view(total: Change, slot: Int[Array, ""]):
+        gradient, measured = jax.grad(loss, has_aux=True)(change, slot)
+        return jax.tree.map(jnp.add, total, gradient), measured
+
+    # A scan holds the intermediate arrays of one view at a time.
+    total, (losses, held_back, overflows) = jax.lax.scan(add_view, jax.tree.map(jnp.zeros_like, change), views)
+    gradient = jax.tree.map(lambda x: x / config.views_per_step, total)
+    if rows is not None:
+        zeros = no_change(state.start)
+        gradient = jax.tree.map(lambda zero, x: zero.at[rows].set(x, mode="drop"), zeros, gradient)
+    report = StepReport(
+        loss=jnp.mean(losses),
+        held_back=jnp.mean(held_back),
+        views=views,
+        num_missing_rows=num_missing,
+        num_overflow=jnp.max(overflows),
+    )
+    return _moved(state, gradient, report.loss, rate), report
+
+
+def _moved(state: RefineState, gradient: Change, loss: Float[Array, ""], rate: Float[Array, ""]) -> RefineState:
+    """The state after one step of Adam; as it was, if a gradient or the loss is not finite.
+
+    A Gaussian that no view of the step shows goes on moving by its moments, which decay: if it stood still and kept
+    them, it would move less at the same rates, and eight steps reach a loss that is 1 % higher.
+    """
+    is_finite = jnp.isfinite(loss)
     for leaf in jax.tree.leaves(gradient):
-        is_finite = is_finite & jnp.all(jnp.isfinite(leaf))
+        is_finite &= jnp.all(jnp.isfinite(leaf))
+    with jax.numpy_dtype_promotion("standard"):  # optax takes a float to the power of an integer
+        direction, adam = ADAM.update(gradient, state.adam)
+    is_constant = (jnp.arange(state.change.sh.shape[1]) == 0)[:, None]
+    factors = units(state.start) | {"sh": jnp.where(is_constant, 1.0, HIGHER_BANDS) / SH_C0}
+    moved = {
+        name: old - rate * RATES[name] * factors[name] * getattr(direction, name)
+        for name, old in vars(state.change).items()
+    }
+    change = bounded(Change(**moved), state.start)
     keep = lambda new, old: jnp.where(is_finite, new, old)  # noqa: E731
-    before = state.revision, (state.first_moment, state.second_moment)
-    revision, moments = jax.tree.map(keep, adam_step(*before, gradient, state.num_steps, rate, config), before)
-    state = RefineState(
-        start=state.start,
-        revision=revision,
-        first_moment=moments[0],
-        second_moment=moments[1],
+    change, adam = jax.tree.map(keep, (change, adam), (state.change, state.adam))
+    return replace(
+        state,
+        change=change,
+        adam=adam,
         num_steps=state.num_steps + 1,
         num_skipped=state.num_skipped + (~is_finite).astype(jnp.int32),
     )
-    return state, report
 
 
-def _slopes(
-    gaussians: Gaussians,
-    background: Float[Array, "3"],
-    key_views: KeyViews,
-    views: Int[Array, " b"],
-    config: RefineConfig,
-    max_pairs: int,
-) -> tuple[Gaussians, StepReport]:
-    """Mean gradient of `view_loss` over the step's views, and what they measured."""
+def units(gaussians: Gaussians) -> dict[str, Array | float]:
+    """Units of each part of a `Change` in which a step is the same for Gaussians of all sizes.
 
-    def add_view(total, view: Int[Array, ""]):
-        slopes, measured = jax.grad(view_loss, has_aux=True)(gaussians, background, key_views, view, config, max_pairs)
-        return jax.tree.map(jnp.add, total, slopes), measured
+    They are the Gaussian's own size for places, and a color of 1 for SH bands.
+    """
+    return {
+        "means": sizes(gaussians)[:, None],
+        "quats": 1.0,
+        "log_scales": 1.0,
+        "logit_opacities": 1.0,
+        "sh": 1.0 / SH_C0,
+    }
 
-    # A scan holds the intermediate arrays of one view at a time.
-    zeros = jax.tree.map(jnp.zeros_like, gaussians)
-    total, (losses, errors, overflows) = jax.lax.scan(add_view, zeros, views)
-    report = StepReport(
-        loss=jnp.mean(losses),
-        held_back=jnp.mean(errors),
-        views=views,
-        num_missing_rows=jnp.zeros((), jnp.int32),
-        num_overflow=jnp.max(overflows),
+
+def sizes(gaussians: Gaussians) -> Float[Array, " n"]:
+    """Mean of the two larger standard deviations: the extent of a flat Gaussian in its plane."""
+    smallest = jnp.min(gaussians.scales, axis=-1)
+    return (jnp.sum(gaussians.scales, axis=-1) - smallest) / 2
+
+
+def bounded(change: Change, start: Gaussians) -> Change:
+    """`change` inside its trust region around `start`."""
+    distance = jnp.linalg.norm(change.means, axis=-1, keepdims=True)
+    shrink = jnp.minimum(1.0, MAX_SHIFT * sizes(start)[:, None] / jnp.maximum(distance, 1e-30))
+    return replace(
+        change,
+        means=change.means * shrink,
+        log_scales=jnp.clip(change.log_scales, -MAX_LOG_SCALE_CHANGE, MAX_LOG_SCALE_CHANGE),
+        logit_opacities=jnp.clip(change.logit_opacities, -MAX_LOGIT, MAX_LOGIT),
     )
-    return jax.tree.map(lambda x: x / config.views_per_step, total), report

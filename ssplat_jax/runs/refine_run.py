@@ -16,8 +16,7 @@ from ssplat_jax.evaluation.exposures import exposures_from_json
 from ssplat_jax.evaluation.scoring import score_targets
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.refinement import KeyViews, RefineConfig
-from ssplat_jax.refinement.refine import Progress, continue_refinement, report_of, start_refinement
-from ssplat_jax.refinement.refine_capture import key_views_of
+from ssplat_jax.refinement.refine import Progress, continue_refinement, key_views_of, report_of, start_refinement
 from ssplat_jax.refinement.refine_config import FOR_CAPTURES
 from ssplat_jax.runs.finish_run import NUM_PICTURES, save_scene
 from ssplat_jax.runs.refinement_state import load_refinement, save_refinement
@@ -87,10 +86,9 @@ def refine_run(
         given = key_views_of(run.capture, run.indices, run.frame, run.exposures)
         config = FOR_CAPTURES
         identity = run.identity | {"steps": steps, "refine_config": dataclasses.asdict(config)}
+        progress, key_views = start_refinement(run.gaussians, given, config)
         if folder.refinement_state.exists():
-            progress, key_views = load_refinement(folder.refinement_state, run.gaussians, given, config, identity)
-        else:
-            progress, key_views = start_refinement(run.gaussians, given, config)
+            load_refinement(folder.refinement_state, progress, identity)
         stopped = _take_steps(progress, key_views, steps, config, save_every, identity, folder, reporter)
         if stopped:
             return RefineResult(progress.num_steps, {}, {}, stopped)
@@ -160,6 +158,6 @@ def _take_steps(
                 break
             if progress.num_steps // save_every > num_saves:  # a learned pass may step over a multiple
                 num_saves = progress.num_steps // save_every
-                save_refinement(folder.refinement_state, progress, key_views, identity)
-        save_refinement(folder.refinement_state, progress, key_views, identity)
+                save_refinement(folder.refinement_state, progress, identity)
+        save_refinement(folder.refinement_state, progress, identity)
         return interrupts.received

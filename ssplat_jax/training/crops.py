@@ -23,8 +23,7 @@ from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import MIN_FRAMES, choose_split
 from ssplat_jax.model.streamsplat import StreamSplat, shown_pivots
 from ssplat_jax.refinement import online_refinement
-from ssplat_jax.refinement.refine import pairs_capacity
-from ssplat_jax.refinement.refine_capture import key_views_of
+from ssplat_jax.refinement.refine import key_views_of, pairs_capacity
 from ssplat_jax.streaming.feed import feed_capture
 from ssplat_jax.streaming.session import Session
 from ssplat_jax.training.capture_mix import CaptureMix, PhaseStart

@@ -24,7 +24,7 @@ from ssplat_jax.evaluation.lpips import LpipsWeights
 from ssplat_jax.evaluation.lpips import lpips as lpips_distance
 from ssplat_jax.model.streamsplat import StreamSplat, shown_rows
 from ssplat_jax.rasterizer import fill_holes, render
-from ssplat_jax.refinement.view_loss import EFFECTS
+from ssplat_jax.refinement.compared_views import EFFECTS
 from ssplat_jax.training.crops import Crop
 from ssplat_jax.training.samples import Sample
 

@@ -18,18 +18,17 @@ import numpy as np
 import optax
 from jaxtyping import Array, Int
 
+from ssplat_jax.cache.changes import Change, apply_change
 from ssplat_jax.cache.key_views import KeyViews
 from ssplat_jax.core.gaussians import Gaussians, mean_color
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.model.streamsplat import StreamSplat, shown_rows
 from ssplat_jax.rasterizer import fill_holes, render
-from ssplat_jax.refinement.learned_pass import SeenErrors, add_view, learned_change, no_errors
-from ssplat_jax.refinement.present_rows import only_present, present_rows
+from ssplat_jax.refinement.compared_views import EFFECTS
+from ssplat_jax.refinement.learned_pass import SeenErrors, add_view, init_refiner, learned_change, no_errors
 from ssplat_jax.refinement.refine_config import FOR_CAPTURES
-from ssplat_jax.refinement.refine_step import RefineState, init_refinement
-from ssplat_jax.refinement.refiner_weights import init_refiner
-from ssplat_jax.refinement.revision import Revision, apply_revision, bounded
-from ssplat_jax.refinement.view_loss import EFFECTS
+from ssplat_jax.refinement.refine_step import RefineState, bounded, init_refinement
+from ssplat_jax.refinement.scene_rows import without_padding
 from ssplat_jax.training.capture_mix import CaptureMix
 from ssplat_jax.training.crops import Crops, stream_scene
 from ssplat_jax.training.losses import negative_psnr
@@ -117,7 +116,7 @@ def train_refiner(
         gaussians = jax.jit(model.decode_rows)(params, cache, shown_rows(cache, model.config, num_pivots))
         scenes.append((key_views, max_pairs))
         names.append(f"{capture.name}, stride {stride}")
-        states.append(init_refinement(only_present(gaussians, present_rows(gaussians)), config=CONFIG))
+        states.append(init_refinement(without_padding(gaussians), CONFIG))
         on_scene(names[-1])
     refiner = mean = init_refiner(recipe.seed)
     zero_params = jax.tree.map(jnp.zeros_like, refiner)  # baseline: predicts no change
@@ -182,7 +181,7 @@ def _compared(
 @functools.lru_cache(maxsize=64)
 def _add_view(max_pairs: int):
     def add(seen: SeenErrors, state: RefineState, key_views: KeyViews, view: Int[Array, ""]) -> SeenErrors:
-        return add_view(seen, state.start, state.revision, key_views, view, CONFIG, max_pairs)[0]
+        return add_view(seen, state.start, state.change, key_views, view, CONFIG, max_pairs)[0]
 
     return jax.jit(add)
 
@@ -190,21 +189,21 @@ def _add_view(max_pairs: int):
 def _after_pass(refiner: dict, sample: TrainingScene) -> RefineState:
     """The sample's state after a pass on what its views say.
 
-    The program returns the revision alone: a whole state would be a copy of the scene for every round.
+    The program returns the change alone: a whole state would be a copy of the scene for every round.
     """
-    return replace(sample.state, revision=jax.jit(_moved)(refiner, sample.state, sample.seen))
+    return replace(sample.state, change=jax.jit(_moved)(refiner, sample.state, sample.seen))
 
 
-def _moved(refiner: dict, state: RefineState, seen: SeenErrors) -> Revision:
-    """The revision after a pass."""
-    change = learned_change(refiner, apply_revision(state.start, state.revision), seen)
-    return bounded(jax.tree.map(jnp.add, state.revision, change), CONFIG)
+def _moved(refiner: dict, state: RefineState, seen: SeenErrors) -> Change:
+    """The change after a pass."""
+    change = learned_change(refiner, apply_change(state.start, state.change), seen)
+    return bounded(jax.tree.map(jnp.add, state.change, change), state.start)
 
 
 @functools.lru_cache(maxsize=64)
 def _compiled(max_pairs: int, black_weight: float):
     def loss(refiner: dict, state: RefineState, seen: SeenErrors, key_views: KeyViews, view: Int[Array, ""]):
-        gaussians: Gaussians = apply_revision(state.start, _moved(refiner, state, seen))
+        gaussians: Gaussians = apply_change(state.start, _moved(refiner, state, seen))
         out = render(gaussians, key_views.camera(view), effects=EFFECTS, max_pairs=max_pairs)
         target, exposure = key_views.images[view].astype(jnp.float32) / 255, key_views.exposures[view]
         filled = fill_holes(out.color, out.alpha, mean_color(gaussians))

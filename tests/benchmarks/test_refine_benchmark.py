@@ -9,7 +9,7 @@ import pytest
 from ssplat_jax.benchmarks.refine_benchmark import bench_refine
 from ssplat_jax.benchmarks.refine_worker import NUM_VIEWS, scene
 from ssplat_jax.core.errors import InputError
-from ssplat_jax.refinement.seen_rows import may_be_seen
+from ssplat_jax.refinement.scene_rows import may_be_seen
 
 ROOT = Path(__file__).resolve().parents[2]
 

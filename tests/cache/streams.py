@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from ssplat_jax.cache import PIVOT_FIELDS, Tokens, VoxelCache, init_cache
 from ssplat_jax.cache import fuse as plain_fuse
 from ssplat_jax.cache import numpy_reference as reference
+from ssplat_jax.cache.changes import WIDTH as CHANGE_WIDTH
+from ssplat_jax.cache.changes import settle, unpack
 from ssplat_jax.cache.fuse import _insert
-from ssplat_jax.cache.residuals import WIDTH as RESIDUAL_WIDTH
-from ssplat_jax.cache.residuals import settle, unpack
 from ssplat_jax.cache.state import pivot_fields
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.pytree import replace
@@ -159,7 +159,7 @@ def assert_equal_to_reference(cache: VoxelCache, expected: dict) -> None:
         for row, (_, pivots) in enumerate(rows):
             for k, pivot in enumerate(pivots):
                 wanted[row, k] = pivot[name]
-        if name in ("means", "feats", "rgbs", "residuals"):
+        if name in ("means", "feats", "rgbs", "changes"):
             scale = np.abs(wanted).max(axis=-1, keepdims=True, initial=1e-30)
             np.testing.assert_allclose(getattr(arrays, name) / scale, wanted / scale, rtol=0, atol=VALUE_RTOL)
         else:
@@ -171,25 +171,25 @@ _settle = jax.jit(lambda means, packed, size: settle(means, unpack(packed), size
 
 def revised(cache: VoxelCache, rng: np.random.Generator, config: StreamConfig) -> VoxelCache:
     """The cache after a refinement that moves and changes every alive pivot at random, by up to twice its voxel."""
-    capacity, k, width = cache.residuals.shape
-    changes = rng.normal(size=(capacity * k, width // RESIDUAL_WIDTH, RESIDUAL_WIDTH))
+    capacity, k, width = cache.changes.shape
+    changes = rng.normal(size=(capacity * k, width // CHANGE_WIDTH, CHANGE_WIDTH))
     changes[..., :3] *= config.memory.voxel_size
-    packed = cache.residuals + changes.reshape(cache.residuals.shape).astype(np.float32)
+    packed = cache.changes + changes.reshape(cache.changes.shape).astype(np.float32)
     means, packed = _settle(cache.means.reshape(-1, 3), packed.reshape(-1, width), config.memory.voxel_size)
     alive = cache.alive[..., None]
     return replace(
         cache,
         means=jnp.where(alive, means.reshape(cache.means.shape), cache.means),
-        residuals=jnp.where(alive, packed.reshape(cache.residuals.shape), cache.residuals),
+        changes=jnp.where(alive, packed.reshape(cache.changes.shape), cache.changes),
     )
 
 
 def revise_reference(expected: dict, cache: VoxelCache) -> None:
-    """Gives the pivots of the reference the places and residuals of those of `cache`, in place."""
-    means, residuals = np.asarray(cache.means, np.float64), np.asarray(cache.residuals, np.float64)
+    """Gives the pivots of the reference the places and changes of those of `cache`, in place."""
+    means, changes = np.asarray(cache.means, np.float64), np.asarray(cache.changes, np.float64)
     for row, (_, pivots) in enumerate(expected["rows"]):
         for k in range(len(pivots)):
-            pivots[k] = pivots[k] | {"means": means[row, k], "residuals": residuals[row, k]}
+            pivots[k] = pivots[k] | {"means": means[row, k], "changes": changes[row, k]}
 
 
 def run_both(recipes, config, capacity=CAPACITY):

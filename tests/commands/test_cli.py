@@ -439,10 +439,10 @@ NUM_FADED = 7
 
 def some_fade(*given, **more):
     """`refine_on_capture` by which some Gaussians disappear, as more steps let some."""
-    refined = refine_on_capture(*given, **more)
-    is_present = np.asarray(refined.gaussians.opacities) > 0
+    refined, report = refine_on_capture(*given, **more)
+    is_present = np.asarray(refined.opacities) > 0
     is_kept = ~(is_present & (np.cumsum(is_present) <= NUM_FADED))
-    return dataclasses.replace(refined, gaussians=mask_gaussians(refined.gaussians, jnp.asarray(is_kept)))
+    return mask_gaussians(refined, jnp.asarray(is_kept)), report
 
 
 def test_eval_writes_every_promised_field(tmp_path, monkeypatch):

@@ -1,7 +1,6 @@
 """Laws of the new Gaussians that fill holes: their place, their color, their number, and what they must not hide."""
 
 import dataclasses
-import functools
 
 import jax
 import jax.numpy as jnp
@@ -9,15 +8,13 @@ import numpy as np
 import pytest
 
 from ssplat_jax.core.cameras import Camera
-from ssplat_jax.core.errors import InputError
 from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.rasterizer import render
-from ssplat_jax.rasterizer.constants import ALPHA_MIN
-from ssplat_jax.refinement import KeyViews, RefineConfig, current_gaussians, refine
-from ssplat_jax.refinement.densify import CELL, LEAST_LIGHT, MOST_HIDING, Cells, densify, hides
-from ssplat_jax.refinement.refine import continue_refinement, start_refinement
-from ssplat_jax.refinement.view_loss import held_back_pixels
+from ssplat_jax.refinement import KeyViews, RefineConfig, refine
+from ssplat_jax.refinement.compared_views import held_back_pixels
+from ssplat_jax.refinement.densify import CELL, MAX_HIDING, MIN_LIGHT, Cells, _densify, hides
+from ssplat_jax.refinement.refine import start_refinement
 
 WIDTH, HEIGHT, FOCAL, MAX_PAIRS, MAX_NEW = 64, 48, 48.0, 1 << 15, 256
 FAR, NEAR = 3.0, 1.5
@@ -63,14 +60,9 @@ TORN = wall(FAR, lambda x, y: np.maximum(abs(x), abs(y)) > 0.3)
 """The wall with a hole of three tenths of its sides."""
 
 
-@functools.partial(jax.jit, static_argnames=("config", "max_pairs", "max_new"))
-def _fill(gaussians, key_views, config, max_pairs, max_new):
-    return densify(gaussians, key_views, config=config, max_pairs=max_pairs, max_new=max_new)
-
-
 def fill(gaussians, key_views, config=CONFIG, max_pairs=MAX_PAIRS, max_new=MAX_NEW) -> Gaussians:
     """The new Gaussians that are present."""
-    new, num_new = _fill(gaussians, key_views, config, max_pairs, max_new)
+    new, num_new = _densify(gaussians, key_views, config, max_pairs, max_new)
     assert np.all(np.asarray(new.opacities[: int(num_new)]) > 0)
     assert np.all(np.asarray(new.opacities[int(num_new) :]) == 0)
     return jax.tree.map(lambda x: x[: int(num_new)], new)
@@ -143,9 +135,9 @@ def test_what_would_hide_a_surface_from_other_views_is_not_added():
         row = np.floor((FOCAL * at[1] / at[2] + HEIGHT / 2) / CELL).astype(int)
         sees = (column >= 0) & (column < shape[1]) & (row >= 0) & (row < shape[0])
         row, column = np.clip(row, 0, shape[0] - 1), np.clip(column, 0, shape[1] - 1)
-        hidden = (at[2] < 0.9 * depths[view, row, column]) & (light[view, row, column] < LEAST_LIGHT)
+        hidden = (at[2] < 0.9 * depths[view, row, column]) & (light[view, row, column] < MIN_LIGHT)
         inside, before = inside + sees, before + (sees & hidden)
-    wanted = before > MOST_HIDING * inside
+    wanted = before > MAX_HIDING * inside
     assert 30 < wanted.sum() < 270
     np.testing.assert_array_equal(hides(jnp.asarray(points), cells, views), wanted)
 
@@ -220,29 +212,3 @@ def test_refine_says_how_many_were_added_and_gains_by_them():
         assert (report.num_new > 0) == (share > 0)
         errors[share] = l1(refined, views)
     assert errors[0.5] < 0.6 * errors[0.0]
-
-
-def test_gaussians_that_fade_are_removed_and_no_image_changes():
-    ghosts = replace(WHOLE, opacities=jnp.full(WHOLE.num_gaussians, 0.006), means=0.6 * WHOLE.means, sh=-WHOLE.sh - 1)
-    faint = replace(ghosts, opacities=jnp.full(WHOLE.num_gaussians, 0.5 * ALPHA_MIN))
-    given = joined(WHOLE, ghosts, faint)
-    views = views_of(WHOLE)
-    progress, usable = start_refinement(given, views, CONFIG)
-    for _ in continue_refinement(progress, usable, 12, CONFIG):
-        pass
-    whole, scene = current_gaussians(progress.state), progress.scene(given)
-    num = WHOLE.num_gaussians
-    removed = np.asarray((scene.opacities == 0) & (given.opacities > 0))
-    assert removed[num : 2 * num].sum() > 20
-    assert not removed[2 * num :].any()  # faint from the start: as given
-    assert np.all(np.asarray(whole.opacities)[removed] < ALPHA_MIN)
-    for image, wanted in zip(
-        *(render(g, cameras((0.0,)), max_pairs=1 << 17).color for g in (scene, whole)), strict=True
-    ):
-        np.testing.assert_array_equal(image, wanted)
-
-
-@pytest.mark.parametrize("share", [-0.1, 1.5, float("nan")])
-def test_a_share_that_makes_no_sense_is_refused(share):
-    with pytest.raises(InputError, match="max_new"):
-        RefineConfig(max_new=share)

@@ -2,33 +2,36 @@
 
 import dataclasses
 import functools
-from pathlib import Path
+import importlib
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ssplat_jax.core.errors import InputError, StorageError
+from ssplat_jax.cache.changes import Change, apply_change, no_change
 from ssplat_jax.core.gaussians import SH_C0, Gaussians, with_sh_degree
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.core.rotations import quats_to_matrices
 from ssplat_jax.rasterizer import render
-from ssplat_jax.refinement import RefineConfig, current_gaussians, init_refinement, load_refiner, refine
+from ssplat_jax.refinement import RefineConfig, init_refinement, refine
+from ssplat_jax.refinement.compared_views import EFFECTS
 from ssplat_jax.refinement.learned_pass import (
     LARGEST,
     MIN_PIXELS,
     STEPS,
     add_view,
+    init_refiner,
+    is_learned,
     learned_change,
     learned_pass,
+    load_refiner,
     no_errors,
     refiner_features,
+    save_refiner,
 )
-from ssplat_jax.refinement.refine import continue_refinement, is_learned, report_of, start_refinement
-from ssplat_jax.refinement.refiner_weights import init_refiner, save_refiner
-from ssplat_jax.refinement.revision import Revision, apply_revision, no_revision, sizes
-from ssplat_jax.refinement.view_loss import EFFECTS
+from ssplat_jax.refinement.refine import continue_refinement, report_of, start_refinement
+from ssplat_jax.refinement.refine_step import sizes
 from tests.refinement.test_refine import (
     CONFIG,
     FIELDS,
@@ -37,11 +40,13 @@ from tests.refinement.test_refine import (
     NUM_VIEWS,
     assert_same_bits,
     cameras,
+    current,
     doubtful,
     key_views,
     photographs,
 )
 
+module = importlib.import_module("ssplat_jax.refinement.refine")
 PASSES = dataclasses.replace(CONFIG, learned_passes=3)
 PASS = jax.jit(learned_pass, static_argnames=("config", "max_pairs"))
 ADD = jax.jit(add_view, static_argnames=("config", "max_pairs"))
@@ -57,7 +62,7 @@ def drawn() -> dict:
 
 
 def one_pass(gaussians, views=None, refiner=None, config=CONFIG):
-    state = init_refinement(gaussians, config=config)
+    state = init_refinement(gaussians, config)
     views = key_views() if views is None else views
     return PASS(state, views, load_refiner() if refiner is None else refiner, config=config, max_pairs=MAX_PAIRS)
 
@@ -65,26 +70,24 @@ def one_pass(gaussians, views=None, refiner=None, config=CONFIG):
 def seen_by(gaussians: Gaussians, views, order=range(NUM_VIEWS), config=CONFIG):
     seen = no_errors(gaussians)
     for view in order:
-        seen, _ = ADD(
-            seen, gaussians, no_revision(gaussians), views, jnp.int32(view), config=config, max_pairs=MAX_PAIRS
-        )
+        seen, _ = ADD(seen, gaussians, no_change(gaussians), views, jnp.int32(view), config=config, max_pairs=MAX_PAIRS)
     return seen
 
 
 def test_a_pass_that_does_not_help_is_taken_back():
     """Blobs before black are unlike the scenes that the network has learned from."""
     state, report = one_pass(doubtful())
-    assert_same_bits(current_gaussians(state), doubtful())
+    assert_same_bits(current(state), doubtful())
     assert report.loss.shape == (STEPS,) and int(state.num_steps) == int(state.num_skipped) == STEPS
     tried = learned_change(load_refiner(), doubtful(), seen_by(doubtful(), key_views()))
     error = lambda g: float(jnp.abs(render(g, cameras(), max_pairs=MAX_PAIRS).color - photographs()).mean())  # noqa: E731
-    assert error(apply_revision(doubtful(), tried)) > error(doubtful())
+    assert error(apply_change(doubtful(), tried)) > error(doubtful())
 
 
 def test_a_pass_that_helps_is_kept():
     """Before training the network goes a little against the gradient."""
     state, report = one_pass(doubtful(), refiner=small_steps())
-    _, again = one_pass(current_gaussians(state), refiner=small_steps())
+    _, again = one_pass(current(state), refiner=small_steps())
     assert int(state.num_skipped) == 0 and float(again.loss.mean()) < float(report.loss.mean())
 
 
@@ -94,8 +97,9 @@ def small_steps() -> dict:
     return {**idle, "gains": {**idle["gains"], "bias": idle["gains"]["bias"].at[8:11].set(0.02)}}
 
 
-def test_steps_go_on_where_passes_end():
-    _, report = refine(doubtful(), cameras(), photographs(), steps=4 * STEPS, config=PASSES, refiner=small_steps())
+def test_steps_go_on_where_passes_end(monkeypatch):
+    monkeypatch.setattr(module, "load_refiner", small_steps)
+    _, report = refine(doubtful(), cameras(), photographs(), steps=4 * STEPS, config=PASSES)
     losses = np.array(report.losses).reshape(4, STEPS).mean(axis=1)
     assert report.num_steps == 4 * STEPS and report.num_skipped == 0
     assert losses[3] < losses[2] < losses[1] < losses[0]
@@ -122,7 +126,7 @@ def test_sums_over_all_gaussians_are_sums_over_pixels():
     )
 
 
-def test_slopes_are_those_of_a_huber_error():
+def test_gradients_are_those_of_a_huber_error():
     """Finite differences of the error in float64, by the place of one Gaussian and by its color."""
     gaussians, views = doubtful(), key_views()
     seen = seen_by(gaussians, views)
@@ -139,10 +143,10 @@ def test_slopes_are_those_of_a_huber_error():
         move = jnp.asarray(axes[:, axis]) * size * 0.02
         ahead, behind = (replace(gaussians, means=gaussians.means.at[row].add(s * move)) for s in (1, -1))
         wanted = (error(ahead) - error(behind)) / 0.04
-        assert float(seen.slopes["means"][row, axis]) == pytest.approx(wanted, rel=0.1, abs=0.1)
+        assert float(seen.gradients["means"][row, axis]) == pytest.approx(wanted, rel=0.1, abs=0.1)
     ahead, behind = (replace(gaussians, sh=gaussians.sh.at[row, 0, 1].add(s * 0.01 / SH_C0)) for s in (1, -1))
     wanted = (error(ahead) - error(behind)) / 0.02
-    assert float(seen.slopes["colors"][row, 1]) == pytest.approx(wanted, rel=0.02, abs=0.02)
+    assert float(seen.gradients["colors"][row, 1]) == pytest.approx(wanted, rel=0.02, abs=0.02)
 
 
 def test_the_order_of_views_does_not_matter():
@@ -165,7 +169,7 @@ def test_a_turned_world_gets_the_same_change_turned():
     turned_views = replace(views, viewmats=views.viewmats @ jnp.asarray(inverse, jnp.float32))
     plain = learned_change(drawn(), given, seen_by(given, views))
     other = learned_change(drawn(), turned, seen_by(turned, turned_views))
-    assert float(jnp.abs(plain.means).max()) > 0.05
+    assert float(jnp.abs(plain.means).max()) > 0.01
     np.testing.assert_allclose(np.asarray(other.means), np.asarray(plain.means) @ turn.T, atol=5e-3)
     for name in ("log_scales", "logit_opacities", "sh"):
         np.testing.assert_allclose(getattr(other, name), getattr(plain, name), atol=2e-2, err_msg=name)
@@ -177,7 +181,7 @@ def test_changes_are_bounded_and_hidden_gaussians_do_not_change():
     stays = (np.arange(NUM) < 12) | (np.asarray(hidden.opacities) == 0)
     assert all(not np.asarray(leaf)[stays].any() for leaf in jax.tree.leaves(change))
     tops = {
-        "means": np.linalg.norm(np.asarray(change.means), axis=1).max() / np.sqrt(3),
+        "means": np.nanmax(np.linalg.norm(np.asarray(change.means), axis=1) / np.sqrt(3) / np.asarray(sizes(hidden))),
         "quats": np.abs(np.asarray(change.quats)).max(),
         "log_scales": np.abs(np.asarray(change.log_scales)).max(),
         "logit_opacities": np.abs(np.asarray(change.logit_opacities)).max(),
@@ -189,7 +193,7 @@ def test_changes_are_bounded_and_hidden_gaussians_do_not_change():
 
 def test_a_pass_that_is_not_finite_changes_only_its_counts():
     state, report = one_pass(doubtful(), key_views(exposures=jnp.full((NUM_VIEWS, 3), jnp.nan)))
-    assert_same_bits(current_gaussians(state), doubtful())
+    assert_same_bits(current(state), doubtful())
     assert int(state.num_skipped) == int(state.num_steps) == STEPS
     assert not np.isfinite(report.loss).any()
 
@@ -208,13 +212,13 @@ def test_ten_thousand_extreme_gaussians_make_no_update_that_is_not_finite():
     seen = no_errors(given)
     add = jax.jit(add_view, static_argnames=("config", "max_pairs"))
     for view in range(2):
-        none = no_revision(given)
+        none = no_change(given)
         seen, _ = add(seen, given, none, key_views(), jnp.int32(view), config=config, max_pairs=1 << 20)
     for refiner in (load_refiner(), drawn()):
         change = learned_change(refiner, given, seen)
         assert all(np.isfinite(np.asarray(leaf)).all() for leaf in jax.tree.leaves(change))
     assert (np.asarray(seen.pixels) >= MIN_PIXELS).sum() > 20
-    features = refiner_features(given, seen, seen.slopes)
+    features = refiner_features(given, seen, seen.gradients)
     assert np.isfinite(np.asarray(features)).all()
 
 
@@ -224,9 +228,10 @@ def test_higher_bands_move_where_the_scene_has_them():
     assert bands.shape == (NUM, 3, 3) and 0 < np.abs(bands).max() * SH_C0 <= LARGEST["bands"] * (1 + 1e-5)
 
 
-def test_passes_come_first_and_count_as_their_steps():
+def test_passes_come_first_and_count_as_their_steps(monkeypatch):
+    monkeypatch.setattr(module, "load_refiner", small_steps)
     progress, views = start_refinement(doubtful(), key_views(), PASSES)
-    steps = continue_refinement(progress, views, 2 * STEPS + 2, PASSES, small_steps())
+    steps = continue_refinement(progress, views, 2 * STEPS + 2, PASSES)
     counts = [progress.num_steps for _ in steps]
     assert counts == [STEPS, 2 * STEPS, 2 * STEPS + 1, 2 * STEPS + 2]
     assert len(progress.losses) == len(progress.held_back) == len(progress.seconds) == 2 * STEPS + 2
@@ -256,30 +261,9 @@ def test_a_pass_shows_the_views_of_its_steps():
     assert (np.sort(rounds, axis=1) == np.arange(NUM_VIEWS)).all()
 
 
-def test_another_network_can_be_given():
-    """One without gains and changes leaves the scene alone."""
-    idle = jax.tree.map(jnp.zeros_like, load_refiner())
-    refined, report = refine(doubtful(), cameras(), photographs(), steps=STEPS, config=PASSES, refiner=idle)
-    assert_same_bits(refined, doubtful())
-    assert report.num_steps == STEPS
-    with pytest.raises(InputError, match="learned_passes of at least 1"):
-        refine(doubtful(), cameras(), photographs(), steps=STEPS, refiner=idle)
-
-
 def test_a_file_returns_what_was_saved(tmp_path):
     save_refiner(tmp_path / "refiner.npz", drawn(), {"steps": 1})
     jax.tree.map(np.testing.assert_array_equal, load_refiner(tmp_path / "refiner.npz"), drawn())
-    save_refiner(tmp_path / "refiner.npz", init_refiner(), {"steps": 2})
-    jax.tree.map(np.testing.assert_array_equal, load_refiner(tmp_path / "refiner.npz"), init_refiner())
-
-
-def test_files_that_do_not_fit_are_refused(tmp_path):
-    wrong = {**drawn(), "gains": {**drawn()["gains"], "bias": jnp.zeros(3)}}
-    save_refiner(tmp_path / "wrong.npz", wrong, {})
-    with pytest.raises(InputError, match=r"gains/bias must be \(12,\), got \(3,\)"):
-        load_refiner(tmp_path / "wrong.npz")
-    with pytest.raises(StorageError):
-        load_refiner(Path(tmp_path / "missing.npz"))
 
 
 def test_absent_views_are_not_compared():
@@ -290,7 +274,7 @@ def test_absent_views_are_not_compared():
 
 def test_no_change_where_nothing_was_seen():
     change = learned_change(drawn(), doubtful(), no_errors(doubtful()))
-    assert isinstance(change, Revision)
+    assert isinstance(change, Change)
     assert all(not np.asarray(leaf).any() for leaf in jax.tree.leaves(change))
 
 
@@ -300,6 +284,6 @@ def test_a_pass_on_float32_is_the_same_under_enable_x64():
     with jax.enable_x64(True):
         got, _ = one_pass(*given)
     for name in FIELDS:
-        found = getattr(current_gaussians(got), name)
+        found = getattr(current(got), name)
         assert found.dtype == jnp.float32
-        np.testing.assert_allclose(found, getattr(current_gaussians(wanted), name), rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(found, getattr(current(wanted), name), rtol=1e-6, atol=1e-6)

@@ -9,23 +9,23 @@ import numpy as np
 import pytest
 
 from ssplat_jax.cache import Tokens, fuse, init_cache
+from ssplat_jax.cache.changes import WIDTH as CHANGE_WIDTH
+from ssplat_jax.cache.changes import no_change, unpack
 from ssplat_jax.cache.hash_table import voxel_indices
 from ssplat_jax.cache.key_views import KeyViews
-from ssplat_jax.cache.residuals import WIDTH as RESIDUAL_WIDTH
-from ssplat_jax.cache.residuals import Residuals, unpack
 from ssplat_jax.cache.state import with_refinement
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.chunk import Chunk
 from ssplat_jax.core.errors import InputError
-from ssplat_jax.core.gaussians import Gaussians
+from ssplat_jax.core.gaussians import SH_C0, Gaussians
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.evaluation.psnr_ssim import psnr
 from ssplat_jax.model.compact.compact_tokens import GaussianHead
 from ssplat_jax.model.network import init_params
 from ssplat_jax.model.streamsplat import ChunkOutput, StreamSplat
 from ssplat_jax.rasterizer import render
-from ssplat_jax.refinement.online import online_refinement, online_step, revise_scene, views_of_round
+from ssplat_jax.refinement.online import online_refinement, online_step, refine_scene, views_of_round
 from ssplat_jax.refinement.visible_pivots import areas_before, visible_pivots
 from ssplat_jax.storage.saved_states import load_state, save_state
 from ssplat_jax.streaming.scene_delta import SceneFeed, apply_delta
@@ -111,7 +111,7 @@ def tokens(seed: int = 0, behind: bool = False) -> Tokens:
 
 
 FUSE = jax.jit(fuse, static_argnums=2)
-_REVISE = jax.jit(functools.partial(revise_scene, MODEL))
+_REVISE = jax.jit(functools.partial(refine_scene, MODEL))
 _DECODE = jax.jit(MODEL.decode)
 
 
@@ -149,13 +149,13 @@ def test_views_never_shown_gain():
     assert score(after) > score(before) + 1.0 and score(again) > score(after)
 
 
-def test_only_places_residuals_and_key_views_differ():
+def test_only_places_changes_and_key_views_differ():
     before = start()
     after = revise(before, chunk(), summary())
     changed = {
         f.name for f in dataclasses.fields(before) if bits(getattr(before, f.name)) != bits(getattr(after, f.name))
     }
-    assert changed == {"means", "residuals", "key_views"}  # the first chunk wrote every pivot: last_chunks is 0 already
+    assert changed == {"means", "changes", "key_views"}  # the first chunk wrote every pivot: last_chunks is 0 already
     cells = lambda cache: np.asarray(voxel_indices(cache.means, CONFIG.memory.voxel_size)[0])  # noqa: E731
     np.testing.assert_array_equal(cells(after), cells(before))
 
@@ -164,12 +164,12 @@ def test_pivots_that_no_key_view_sees_keep_every_bit():
     before = start(tokens(3, behind=True))
     after = revise(before, chunk(), summary())
     is_behind = np.asarray(before.means[..., 2] < 0)
-    for name in ("means", "residuals", "last_chunks"):
+    for name in ("means", "changes", "last_chunks"):
         np.testing.assert_array_equal(
             np.asarray(getattr(after, name))[is_behind], np.asarray(getattr(before, name))[is_behind]
         )
     is_seen = np.asarray(after.alive) & ~is_behind
-    assert np.asarray(after.residuals)[is_seen].any(axis=-1).mean() > 0.9
+    assert np.asarray(after.changes)[is_seen].any(axis=-1).mean() > 0.9
     assert (np.asarray(after.last_chunks)[is_seen] == 1).mean() > 0.9 and (
         np.asarray(before.last_chunks)[is_seen] == 0
     ).all()
@@ -232,12 +232,12 @@ def test_any_key_views_leave_a_finite_bounded_scene(views):
     before = cache = start()
     for _ in range(4):
         cache = revise(cache, *views())
-    assert all(np.isfinite(x).all() for x in jax.tree.leaves((decode(cache), cache.means, cache.residuals)))
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves((decode(cache), cache.means, cache.changes)))
     cells = lambda cache: np.asarray(voxel_indices(cache.means, CONFIG.memory.voxel_size)[0])  # noqa: E731
     np.testing.assert_array_equal(cells(cache), cells(before))
-    residuals = unpack(cache.residuals.reshape(-1, cache.residuals.shape[-1]))
-    assert float(jnp.abs(residuals.means).max()) <= CONFIG.memory.voxel_size
-    assert float(jnp.abs(residuals.log_scales).max()) <= 1.5 and float(jnp.abs(residuals.colors).max()) <= 2.0
+    change = unpack(cache.changes.reshape(-1, cache.changes.shape[-1]))
+    assert float(jnp.abs(change.means).max()) <= CONFIG.memory.voxel_size
+    assert float(jnp.abs(change.log_scales).max()) <= 1.5 and SH_C0 * float(jnp.abs(change.sh).max()) <= 2.0001
     if views is no_view:
         assert bits(replace(cache, key_views=None)) == bits(replace(before, key_views=None))
     elif views is not black:
@@ -322,18 +322,18 @@ def test_key_views_of_another_size_are_refused():
         with_refinement(start(), CONFIG, HIGH, WIDE + 1)
 
 
-def test_a_stream_from_before_gets_empty_residuals_and_key_views():
+def test_a_stream_from_before_gets_empty_changes_and_key_views():
     plain = init_cache(CONFIG.replace(steps_per_chunk=0))
     ready = with_refinement(plain, CONFIG, HIGH, WIDE)
-    assert ready.residuals is not None and ready.key_views is not None
-    assert ready.residuals.shape[-1] == CONFIG.head.gaussians_per_token * RESIDUAL_WIDTH
-    assert not np.any(ready.residuals) and not np.any(ready.key_views.valid)
+    assert ready.changes is not None and ready.key_views is not None
+    assert ready.changes.shape[-1] == CONFIG.head.gaussians_per_token * CHANGE_WIDTH
+    assert not np.any(ready.changes) and not np.any(ready.key_views.valid)
 
 
 def test_without_steps_the_program_has_no_trace_of_refinement():
     model = StreamSplat(CONFIG.replace(steps_per_chunk=0))
     text = jax.jit(model.decode).lower(params(), model.init_cache()).as_text()
-    assert "residuals" not in text != "" and len(jax.tree.leaves(model.init_cache())) == 26
+    assert text and len(jax.tree.leaves(model.init_cache())) == 26
 
 
 def test_cameras_are_those_of_the_chunk():
@@ -356,13 +356,11 @@ def test_a_gaussian_follows_the_mean_of_its_views():
     images = jnp.stack([jnp.full((HIGH, WIDE, 3), value) for value in (0.3, 0.7)])
     views = KeyViews.of(Camera(viewmats=jnp.tile(jnp.eye(4), (2, 1, 1)), Ks=jnp.tile(K, (2, 1, 1)), width=WIDE,
                                height=HIGH), images, None)  # fmt: skip
-    zeros = Residuals(*(jnp.zeros((1, n)) for n in (3, 4, 3)), jnp.zeros(1), jnp.zeros((1, 3)))
-    only_colors = lambda new: replace(zeros, colors=new.colors)  # noqa: E731
+    zeros = no_change(base)
 
-    def step(residuals, view):
-        one = jax.tree.map(lambda x: x[view], views)
-        residuals = only_colors(online_step(base, residuals, one, max_pairs=4096, max_scale=10.0))
-        return residuals, residuals.colors[0, 0]
+    def step(change, view):
+        change = replace(zeros, sh=online_step(base, change, views.at(view), max_pairs=4096).sh)  # colors alone
+        return change, SH_C0 * change.sh[0, 0, 0]
 
     colors = 0.3 + np.asarray(jax.lax.scan(step, zeros, jnp.arange(120) % 2)[1])
     settled = colors[-20:]
@@ -373,6 +371,6 @@ def test_a_gaussian_follows_the_mean_of_its_views():
 def test_a_chunk_of_padding_changes_nothing():
     """Its round would belong to the chunk before, whose delta is out already."""
     cache = revise(start(), chunk(), summary())
-    assert jnp.any(cache.key_views.valid) and jnp.any(cache.residuals != 0)
+    assert jnp.any(cache.key_views.valid) and jnp.any(cache.changes != 0)
     same = revise(cache, replace(chunk(), valid=jnp.zeros(4, bool)), summary())
     jax.tree.map(np.testing.assert_array_equal, same, cache)

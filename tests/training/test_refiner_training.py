@@ -19,9 +19,8 @@ from ssplat_jax.data.split import interleaved_split
 from ssplat_jax.evaluation.scoring import score_targets
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.refinement import refine_on_capture
-from ssplat_jax.refinement.learned_pass import STEPS, no_errors
+from ssplat_jax.refinement.learned_pass import KIND, STEPS, init_refiner, load_refiner, no_errors
 from ssplat_jax.refinement.refine_step import init_refinement
-from ssplat_jax.refinement.refiner_weights import KIND, init_refiner, load_refiner
 from ssplat_jax.storage.files import load_arrays
 from ssplat_jax.storage.weights import load_params
 from ssplat_jax.streaming.feed import feed_capture
@@ -69,9 +68,9 @@ def test_a_pass_between_rounds_keeps_no_second_copy_of_the_scene():
     network = jax.tree.map(lambda x: x + 0.1, init_refiner(0))
     after = _after_pass(network, sample)
     kept = [a is b for a, b in zip(*map(jax.tree.leaves, (after, state)), strict=True)]
-    revised = [a is b for a, b in zip(*map(jax.tree.leaves, (after.revision, state.revision)), strict=True)]
+    revised = [a is b for a, b in zip(*map(jax.tree.leaves, (after.change, state.change)), strict=True)]
     assert not any(revised) and sum(kept) == len(kept) - len(revised)
-    assert not np.array_equal(after.revision.logit_opacities, state.revision.logit_opacities)
+    assert not np.array_equal(after.change.logit_opacities, state.change.logit_opacities)
 
 
 @pytest.mark.parametrize("seeds", [(12,), pytest.param((11, 12, 14), marks=pytest.mark.slow)])

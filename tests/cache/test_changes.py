@@ -1,4 +1,4 @@
-"""Laws of residuals: they change Gaussians only where they are not 0, and moved pivots stay in their voxels."""
+"""Laws of changes: Gaussians differ only where theirs is not 0, and moved pivots stay in their voxels."""
 
 import dataclasses
 
@@ -8,21 +8,10 @@ import numpy as np
 import pytest
 
 from ssplat_jax.cache import grow, init_cache
+from ssplat_jax.cache.changes import BOUNDS, FACE_MARGIN, WIDTH, Change, changed_gaussians, pack, settle, unpack
 from ssplat_jax.cache.hash_table import voxel_indices
-from ssplat_jax.cache.residuals import (
-    FACE_MARGIN,
-    MAX_COLOR,
-    MAX_LOG_SCALE,
-    MAX_LOGIT,
-    MAX_QUAT,
-    WIDTH,
-    Residuals,
-    pack,
-    revise,
-    settle,
-    unpack,
-)
 from ssplat_jax.core.gaussians import SH_C0, Gaussians
+from ssplat_jax.core.pytree import replace
 from tests.cache.streams import CAPACITY, CONFIG, PAIRS, Recipe, fuse, revised, to_jax
 
 SIZE = CONFIG.memory.voxel_size
@@ -39,7 +28,7 @@ def pivots(seed: int, span: float, count: int = 256) -> jax.Array:
     return jnp.asarray(means, jnp.float32)
 
 
-def changes(seed: int, scale: float, count: int = 256) -> Residuals:
+def changes(seed: int, scale: float, count: int = 256) -> Change:
     packed = np.random.default_rng(seed).normal(size=(count, PER_TOKEN * WIDTH)) * scale
     return unpack(jnp.asarray(packed, jnp.float32))
 
@@ -48,16 +37,12 @@ def cells(means) -> np.ndarray:
     return np.asarray(voxel_indices(means, SIZE)[0])
 
 
-def same_bits(a, b) -> None:
-    jax.tree.map(np.testing.assert_array_equal, a, b)
-
-
 def test_packing_keeps_every_number_in_its_place():
-    residuals = changes(0, 1.0)
-    same_bits(unpack(pack(residuals, 256)), residuals)
-    first = pack(residuals, 256)[0, :WIDTH]
-    parts = (*residuals.means[0], *residuals.quats[0], *residuals.log_scales[0], residuals.logit_opacities[0])
-    np.testing.assert_array_equal(first, np.array([*parts, *residuals.colors[0]]))
+    change = changes(0, 1.0)
+    jax.tree.map(np.testing.assert_array_equal, unpack(pack(change, 256)), change)
+    first = pack(change, 256)[0, :WIDTH]
+    parts = (*change.means[0], *change.quats[0], *change.log_scales[0], change.logit_opacities[0])
+    np.testing.assert_array_equal(first, np.array([*parts, *change.sh[0, 0]]))
 
 
 @pytest.mark.parametrize("span", [2.0, 300.0, 1e5, 1e6])
@@ -73,24 +58,16 @@ def test_moved_pivots_stay_in_their_voxels(span, scale):
 
 
 def test_what_settles_is_bounded_and_has_no_common_move():
-    residuals = unpack(SETTLE(pivots(1, 4.0), changes(2, 100.0), SIZE)[1])
-    bounds = {"quats": MAX_QUAT, "log_scales": MAX_LOG_SCALE, "logit_opacities": MAX_LOGIT, "colors": MAX_COLOR}
-    for name, bound in bounds.items():
-        assert float(jnp.abs(getattr(residuals, name)).max()) == bound, name
-    assert float(jnp.abs(residuals.means.reshape(-1, PER_TOKEN, 3).mean(axis=1)).max()) < 1e-6 * SIZE
-
-
-def test_no_residual_settles_to_the_same_bits():
-    means = pivots(3, 50.0)
-    moved, packed = SETTLE(means, changes(0, 0.0), SIZE)
-    np.testing.assert_array_equal(moved, means)
-    assert not np.any(packed)
+    change = unpack(SETTLE(pivots(1, 4.0), changes(2, 100.0), SIZE)[1])
+    for name, bound in BOUNDS.items():
+        assert float(jnp.abs(getattr(change, name)).max()) == pytest.approx(bound), name
+    assert float(jnp.abs(change.means.reshape(-1, PER_TOKEN, 3).mean(axis=1)).max()) < 1e-6 * SIZE
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-def test_residuals_that_are_not_finite_become_zero(bad):
-    residuals = jax.tree.map(lambda x: x.at[0].set(bad), changes(4, 0.01))
-    moved, packed = SETTLE(pivots(5, 4.0), residuals, SIZE)
+def test_changes_that_are_not_finite_become_zero(bad):
+    change = jax.tree.map(lambda x: x.at[0].set(bad), changes(4, 0.01))
+    moved, packed = SETTLE(pivots(5, 4.0), change, SIZE)
     assert np.isfinite(moved).all() and np.isfinite(packed).all()
     assert not np.any(packed[0, 3:WIDTH])
 
@@ -103,7 +80,7 @@ def test_settling_twice_changes_nothing_more():
     np.testing.assert_allclose(repacked, packed, atol=2 * FACE_MARGIN * SIZE)
 
 
-def test_merges_of_revised_pivots_stay_in_their_voxels():
+def test_merges_of_changed_pivots_stay_in_their_voxels():
     """Several tokens fall into each of few voxels, and all pivots are moved as far as they may after every chunk."""
     cache, rng = init_cache(REFINED, CAPACITY), np.random.default_rng(0)
     for seed in range(6):
@@ -113,7 +90,7 @@ def test_merges_of_revised_pivots_stay_in_their_voxels():
             REFINED,
         )
         alive = np.asarray(cache.alive)
-        places = cache.means[:, :, None] + unpack(cache.residuals.reshape(-1, PER_TOKEN * WIDTH)).means.reshape(
+        places = cache.means[:, :, None] + unpack(cache.changes.reshape(-1, PER_TOKEN * WIDTH)).means.reshape(
             *alive.shape, PER_TOKEN, 3
         )
         voxels = np.asarray(cache.voxels)[:, None]
@@ -125,31 +102,31 @@ def test_merges_of_revised_pivots_stay_in_their_voxels():
     assert int(cache.stats.num_merged) > 20
 
 
-def test_dead_and_new_pivots_have_no_residuals():
+def test_dead_and_new_pivots_have_no_change():
     config = PAIRS.replace(steps_per_chunk=1)
     cache, rng = init_cache(config, CAPACITY), np.random.default_rng(0)
     for seed in range(6):
         cache = revised(fuse(cache, to_jax(Recipe(seed, "many", "normal", "random").tokens()), config), rng, config)
     cache = fuse(cache, to_jax(Recipe(7, "many", "normal", "random", num_valid=8).tokens()), config)
-    residuals = np.asarray(cache.residuals)
+    kept = np.asarray(cache.changes)
     is_new = np.asarray(cache.num_members == 1) & np.asarray(cache.last_chunks == 6)
-    assert not residuals[~np.asarray(cache.alive)].any() and not residuals[is_new].any() and residuals.any()
+    assert not kept[~np.asarray(cache.alive)].any() and not kept[is_new].any() and kept.any()
 
 
-def test_a_grown_cache_keeps_its_residuals():
+def test_a_grown_cache_keeps_its_changes():
     cache = revised(
         fuse(init_cache(REFINED, CAPACITY), to_jax(Recipe(0, "few", "normal", "random").tokens()), REFINED),
         np.random.default_rng(0),
         REFINED,
     )
     grown = grow(cache, 2 * CAPACITY)
-    np.testing.assert_array_equal(grown.residuals[:CAPACITY], cache.residuals)
-    assert not np.any(grown.residuals[CAPACITY:])
+    np.testing.assert_array_equal(grown.changes[:CAPACITY], cache.changes)
+    assert not np.any(grown.changes[CAPACITY:])
 
 
 def test_without_refinement_a_cache_has_no_trace_of_it():
     cache = init_cache(CONFIG, CAPACITY)
-    assert cache.residuals is None and cache.key_views is None
+    assert cache.changes is None and cache.key_views is None
     assert len(jax.tree.leaves(init_cache(REFINED, CAPACITY))) == len(jax.tree.leaves(cache)) + 1
 
 
@@ -168,48 +145,45 @@ def gaussians(count: int) -> Gaussians:
     )
 
 
-def test_gaussians_without_a_residual_keep_their_bits():
-    scene, residuals = gaussians(256 * PER_TOKEN), changes(9, 0.1)
-    some = jax.tree.map(lambda x: x.at[::2].set(0.0), residuals)
-    revised_scene = jax.jit(lambda: revise(scene, some, max_scale=1.0))()
+def test_gaussians_without_a_change_keep_their_bits():
+    scene = gaussians(256 * PER_TOKEN)
+    half = jax.tree.map(lambda x: x.at[::2].set(0.0), changes(9, 0.1))
+    new_scene = jax.jit(lambda: changed_gaussians(scene, half, max_scale=1.0))()
     for field in dataclasses.fields(scene):
-        old, new = np.asarray(getattr(scene, field.name)), np.asarray(getattr(revised_scene, field.name))
+        old, new = np.asarray(getattr(scene, field.name)), np.asarray(getattr(new_scene, field.name))
         np.testing.assert_array_equal(new[::2], old[::2], field.name)
-    assert not np.any(np.asarray(revised_scene.opacities)[np.asarray(scene.opacities) == 0])
+    assert not np.any(np.asarray(new_scene.opacities)[np.asarray(scene.opacities) == 0])
 
 
-def test_each_part_of_a_residual_changes_what_it_names():
+def test_each_part_of_a_change_changes_what_it_names():
     count = 64
     scene, zero = gaussians(count), jax.tree.map(jnp.zeros_like, changes(0, 0.0, count // PER_TOKEN))
-    one = {
-        "means": (jnp.full((count, 3), 0.5), lambda g: np.testing.assert_allclose(g.means, scene.means + 0.5)),
-        "log_scales": (
-            jnp.full((count, 3), np.log(2.0)),
-            lambda g: np.testing.assert_allclose(g.scales, np.minimum(2 * scene.scales, 0.12), rtol=1e-6),
-        ),
-        "colors": (
-            jnp.full((count, 3), 0.25),
-            lambda g: np.testing.assert_allclose(SH_C0 * (g.sh - scene.sh)[:, 0], 0.25, rtol=1e-5),
-        ),
+    is_present = np.asarray(scene.opacities) > 0
+    parts = {
+        "means": jnp.full((count, 3), 0.5),
+        "log_scales": jnp.full((count, 3), np.log(2.0)),
+        "sh": jnp.full((count, 1, 3), 0.25 / SH_C0),
+        "logit_opacities": jnp.full(count, -1.0),
     }
-    for name, (value, check) in one.items():
-        check(revise(scene, dataclasses.replace(zero, **{name: value}), max_scale=0.12))
-    present = np.asarray(scene.opacities) > 0
+    new = {name: changed_gaussians(scene, replace(zero, **{name: x}), max_scale=0.12) for name, x in parts.items()}
+    old = jax.tree.map(lambda x: np.asarray(x)[is_present], scene)
+    new = {name: jax.tree.map(lambda x: np.asarray(x)[is_present], g) for name, g in new.items()}
+    np.testing.assert_allclose(new["means"].means, old.means + 0.5)
+    np.testing.assert_allclose(new["log_scales"].scales, np.minimum(2 * old.scales, 0.12), rtol=1e-6)
+    np.testing.assert_allclose(SH_C0 * (new["sh"].sh - old.sh)[:, 0], 0.25, rtol=1e-5)
     logits = lambda o: np.log(o) - np.log1p(-o)  # noqa: E731
-    faint = revise(scene, dataclasses.replace(zero, logit_opacities=jnp.full(count, -1.0)), max_scale=1.0)
-    before, after = np.asarray(scene.opacities)[present], np.asarray(faint.opacities)[present]
-    np.testing.assert_allclose(logits(after), logits(before) - 1, atol=1e-3)
+    np.testing.assert_allclose(logits(new["logit_opacities"].opacities), logits(old.opacities) - 1, atol=1e-3)
 
 
 def test_scales_above_the_limit_are_not_shrunk():
     scene = gaussians(16)
     large = dataclasses.replace(scene, scales=scene.scales + 1.0)
-    residuals = dataclasses.replace(changes(0, 0.0, 4), log_scales=jnp.full((16, 3), 1.0))
-    np.testing.assert_array_equal(revise(large, residuals, max_scale=0.5).scales, large.scales)
+    change = dataclasses.replace(changes(0, 0.0, 4), log_scales=jnp.full((16, 3), 1.0))
+    np.testing.assert_array_equal(changed_gaussians(large, change, max_scale=0.5).scales, large.scales)
 
 
 @pytest.mark.parametrize("per_token", [1, 4, 9, 16])
-def test_residuals_of_zero_move_no_pivot_by_a_bit(per_token):
+def test_a_change_of_zero_moves_no_pivot_by_a_bit(per_token):
     """Also where the sum of equal numbers is rounded."""
     means = pivots(3, 300.0, 4096)
     moved, packed = SETTLE(means, unpack(jnp.zeros((4096, per_token * WIDTH))), SIZE)

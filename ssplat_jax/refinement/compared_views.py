@@ -1,0 +1,189 @@
+"""Key views that a scene is compared with: their errors, their order, and which of them can be learned from."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from ssplat_jax.cache.key_views import KeyViews, usable
+from ssplat_jax.core.errors import InputError
+from ssplat_jax.core.gaussians import Gaussians
+from ssplat_jax.core.pytree import replace
+from ssplat_jax.rasterizer import Effects, RenderOutput, fill_holes, render
+from ssplat_jax.refinement.refine_config import RefineConfig
+
+EFFECTS = Effects(outputs=("color", "alpha"))
+BLOCK = 8
+"""Side of the pixel blocks that are held back together: neighbors of a pixel give its color away."""
+
+GOLDEN = 2654435769
+"""2^32 over the golden ratio."""
+
+WORSE_THAN_USUAL = 2.0
+"""Ratio to the median error above which a view counts as one of another scene, or of a wrong pose."""
+MIN_COMPARED = 4
+"""Views that a median needs to mean something."""
+MAX_LEFT_OUT = 0.25
+"""Share of the views that may be left out for their error: beyond it the scene is wrong, not the views."""
+
+
+# Errors -------------------------------------------------------------------------------------------------------------
+
+
+def errors_of_view(
+    gaussians: Gaussians,
+    background: Float[Array, "3"],
+    view: KeyViews,
+    *,
+    max_pairs: int,
+    probe: Float[Array, "n c"] | None = None,
+) -> tuple[Float[Array, "h w 3"], Float[Array, "h w 3"], RenderOutput]:
+    """Differences between the render of a view and its photograph, at the photograph's exposure.
+
+    Args:
+        gaussians: the scene.
+        background: color that fills holes, at the exposure of the scene.
+        view: one view, without a batch axis.
+        max_pairs: capacity for tile intersections.
+        probe: channels that are rendered beside the colors.
+
+    Returns:
+        The difference with holes filled, the difference over black, and the render.
+    """
+    out = render(gaussians, view.camera(), effects=EFFECTS, features=probe, max_pairs=max_pairs)
+    target = view.images.astype(jnp.float32) / 255
+    filled = fill_holes(out.color, out.alpha, background)
+    return filled * view.exposures - target, out.color * view.exposures - target, out
+
+
+def view_loss(
+    gaussians: Gaussians,
+    background: Float[Array, "3"],
+    view: KeyViews,
+    slot: Int[Array, ""],
+    config: RefineConfig,
+    max_pairs: int,
+) -> tuple[Float[Array, ""], tuple[Float[Array, ""], Float[Array, ""], Int[Array, ""]]]:
+    """L1 error of a key view with holes filled and over black, on the pixels that are not held back.
+
+    Args:
+        gaussians: the scene.
+        background: color that fills holes, at the exposure of the scene.
+        view: one view, without a batch axis.
+        slot: its slot, which decides the pixels that are held back.
+        config: weights of both errors, and how many pixels are held back.
+        max_pairs: capacity for tile intersections.
+
+    Returns:
+        The loss, and the loss again, the error of the held-back pixels, and the tile intersections that did not fit.
+    """
+    filled, black, out = errors_of_view(gaussians, background, view, max_pairs=max_pairs)
+    errors = jnp.mean(config.shown_weight * jnp.abs(filled) + (1 - config.shown_weight) * jnp.abs(black), axis=-1)
+    held_back = held_back_pixels(errors.shape, slot, config)
+    loss = mean_over(errors, ~held_back)
+    return loss, (loss, mean_over(errors, held_back), out.num_overflow)
+
+
+def held_back_pixels(size: tuple[int, ...], slot: Int[Array, ""], config: RefineConfig) -> Bool[Array, "h w"]:
+    """Pixels of a view that no gradient sees: the same blocks at every step.
+
+    Args:
+        size: height and width of the image.
+        slot: slot of the view.
+        config: gives the fraction and the seed.
+    """
+    height, width = size
+    key = jax.random.fold_in(jax.random.key(config.seed + 1), slot)
+    blocks = jax.random.uniform(key, (-(-height // BLOCK), -(-width // BLOCK))) < config.held_back
+    return jnp.repeat(jnp.repeat(blocks, BLOCK, axis=0), BLOCK, axis=1)[:height, :width]
+
+
+def mean_over(errors: Float[Array, "h w"], pixels: Bool[Array, "h w"]) -> Float[Array, ""]:
+    """Mean error of some pixels; 0 for none."""
+    return jnp.sum(jnp.where(pixels, errors, 0.0)) / jnp.maximum(jnp.sum(pixels, dtype=errors.dtype), 1.0)
+
+
+# Order --------------------------------------------------------------------------------------------------------------
+
+
+def views_of_step(step: Int[Array, ""], valid: Bool[Array, " v"], config: RefineConfig) -> Int[Array, " b"]:
+    """Slots of the `config.views_per_step` views that a step shows; `valid` marks the slots that hold a view."""
+    places = step * config.views_per_step + jnp.arange(config.views_per_step, dtype=jnp.int32)
+    return jax.vmap(lambda place: next_view(place, valid, config.seed))(places)
+
+
+def next_view(place: Int[Array, ""], valid: Bool[Array, " v"], seed: int) -> Int[Array, ""]:
+    """Slot of the view at `place` in the sequence of all steps' views.
+
+    Every valid view is shown once a round. Any few views in a row lie evenly among the valid ones, which are in the
+    order of the stream: in an order drawn by chance they do not, and what no view shows for a while stays as it was.
+    A round begins at a place of its own.
+
+    Args:
+        place: number of the view in the sequence, from 0.
+        valid: slots that hold a view.
+        seed: seed of the places at which rounds begin.
+    """
+    num_valid = jnp.maximum(jnp.sum(valid, dtype=jnp.int32), 1)
+    begin = jax.random.uniform(jax.random.fold_in(jax.random.key(seed), place // num_valid), dtype=jnp.float32)
+    ranks = jnp.cumsum(valid, dtype=jnp.int32) - 1
+    order = jnp.argsort(jnp.where(valid, (golden_fractions(ranks) + begin) % 1.0, 2.0))
+    return order[place % num_valid].astype(jnp.int32)
+
+
+def golden_fractions(numbers: Int[Array, " n"]) -> Float[Array, " n"]:
+    """Fractional parts of numbers over the golden ratio: those of any few numbers in a row lie evenly in [0, 1]."""
+    return (numbers.astype(jnp.uint32) * jnp.uint32(GOLDEN)).astype(jnp.float32) / 2.0**32  # the product wraps around
+
+
+# Usable views -------------------------------------------------------------------------------------------------------
+
+
+def only_usable(gaussians: Gaussians, key_views: KeyViews, max_pairs: int) -> KeyViews:
+    """`key_views` whose unusable views are not valid. It looks at values: call it outside jit.
+
+    A view is unusable if its exposure is not finite and positive, if its camera is not finite, or if its error is more
+    than twice the median of all views: a black frame, another scene, a pose that is far off. At most a quarter of the
+    views is left out for the error, the worst first, and none of fewer than four views. The error is the mean over
+    what the scene covers, so a view of little known places stays.
+
+    Args:
+        gaussians: the scene before refinement.
+        key_views: the views.
+        max_pairs: capacity for tile intersections.
+
+    Raises:
+        InputError: no view is left.
+    """
+    is_usable = np.array(usable(key_views))
+    slots = np.flatnonzero(is_usable)
+    errors = np.array([float(_covered_error(gaussians, key_views.at(int(slot)), max_pairs)) for slot in slots])
+    is_usable[slots[contradicting(errors)]] = False
+    if not is_usable.any():
+        raise InputError(
+            "refine: wanted at least one view with a finite camera and a positive, finite exposure, got none of"
+            f" {key_views.num_slots}."
+        )
+    return replace(key_views, valid=jnp.asarray(is_usable))
+
+
+def contradicting(errors: Float[np.ndarray, " v"]) -> Int[np.ndarray, " b"]:
+    """Places of the errors that are too large beside the others, see `only_usable`; NaN is never too large."""
+    is_known = np.isfinite(errors)
+    if is_known.sum() < MIN_COMPARED:
+        return np.zeros(0, int)
+    worst_first = np.argsort(-np.where(is_known, errors, -1.0), kind="stable")[: int(MAX_LEFT_OUT * is_known.sum())]
+    return worst_first[errors[worst_first] > WORSE_THAN_USUAL * np.median(errors[is_known])]
+
+
+@functools.partial(jax.jit, static_argnames="max_pairs")
+def _covered_error(gaussians: Gaussians, view: KeyViews, max_pairs: int) -> Float[Array, ""]:
+    """Mean absolute error of a view over what the scene covers of it; NaN if it covers next to nothing."""
+    out = render(gaussians, view.camera(), effects=EFFECTS, max_pairs=max_pairs)
+    target = view.images.astype(jnp.float32) / 255
+    # The uncovered share of a pixel is compared with nothing.
+    errors = jnp.mean(jnp.abs(out.color * view.exposures - out.alpha[..., None] * target), axis=-1)
+    cover = jnp.sum(out.alpha)
+    return jnp.where(cover > 0.01 * out.alpha.size, jnp.sum(errors) / jnp.maximum(cover, 1.0), jnp.nan)
