@@ -1,7 +1,6 @@
 """Rotations: quaternions (wxyz), matrices, and what they do to spherical harmonics.
 
-Leading axes broadcast. There is no vmap here: jax 0.10.2 miscompiles vmapped 3-vector arithmetic on the CPU
-(tests/stability/test_vmap_three_vectors.py).
+Leading axes broadcast. There is no vmap here: jax 0.10.2 miscompiles vmapped 3-vector arithmetic on the CPU.
 """
 
 import jax.numpy as jnp

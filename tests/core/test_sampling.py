@@ -65,23 +65,6 @@ def test_correlation_is_that_of_the_warped_map(channels):
     np.testing.assert_allclose(got, warp_then_correlate(reference, source, coordinates()), atol=FLOAT32)
 
 
-def test_gradients_are_those_of_the_plain_sum():
-    reference, source = map(f32, arrays(1))
-    at = taps_at(coordinates(1))
-    cotangent = f32(np.random.default_rng(2).normal(size=(4, 15)))
-
-    def plain(reference, source):
-        warped = jax.vmap(lambda channel: read(channel, at), in_axes=-1, out_axes=-1)(source)
-        return jnp.sum(cotangent * jnp.sum(warped * reference, axis=-1))
-
-    def fast(reference, source):
-        return jnp.sum(cotangent * correlate_warped(reference, source, at))
-
-    wanted, got = jax.grad(plain, (0, 1))(reference, source), jax.jit(jax.grad(fast, (0, 1)))(reference, source)
-    for w, g in zip(wanted, got, strict=True):
-        np.testing.assert_allclose(g, w, atol=FLOAT32)
-
-
 def test_gradient_is_the_finite_difference_of_the_oracle():
     """The function is bilinear, so difference quotients are exact for any step."""
     (reference, source), coords = arrays(3), coordinates(3)
@@ -97,11 +80,6 @@ def test_gradient_is_the_finite_difference_of_the_oracle():
 
 
 VALUES = jnp.arange(HEIGHT * WIDTH, dtype=jnp.float32).reshape(HEIGHT, WIDTH)
-
-
-def test_sampling_at_a_sample_reads_that_sample():
-    ys, xs = np.meshgrid(np.arange(HEIGHT), np.arange(WIDTH), indexing="ij")
-    np.testing.assert_array_equal(read(VALUES, taps_at(np.stack([xs, ys], -1))), VALUES)
 
 
 def test_positions_outside_read_the_nearest_border_sample():

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ssplat_jax.model.layers import DIMENSIONS, Conv, HalvingConv, conv2d, pixel_shuffle, pixel_unshuffle
+from ssplat_jax.model.layers import DIMENSIONS, Conv, HalvingConv, conv2d, pixel_unshuffle
 
 FLOAT32 = 2e-4  # sums of a few hundred products of unit normals, in another order
 
@@ -75,9 +75,3 @@ def test_pixel_unshuffle_has_pytorch_channel_order():
     assert got.shape == (2, 2, 3, 12)
     for channel, row, column in np.ndindex(3, 2, 2):
         np.testing.assert_array_equal(got[..., channel * 4 + row * 2 + column], x[:, row::2, column::2, channel])
-
-
-@pytest.mark.parametrize("factor", [1, 2, 4])
-def test_pixel_shuffle_undoes_pixel_unshuffle(factor):
-    x = normal(10, 2, 8, 12, 3)
-    np.testing.assert_array_equal(pixel_shuffle(pixel_unshuffle(x, factor), factor), x)

@@ -1,7 +1,5 @@
 """The evidence head starts at nothing, stays bounded, and is absent where it is not asked for."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,13 +7,12 @@ import pytest
 
 from ssplat_jax.cache import init_cache
 from ssplat_jax.cache.state import NUM_OBSERVED
-from ssplat_jax.config import PRESETS, preset
+from ssplat_jax.config import preset
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.model.decoder import (
     MAX_LOG_CONTRAST,
     MAX_LOGIT_CHANGE,
     Evidence,
-    EvidenceHead,
     apply_evidence,
     evidence_features,
 )
@@ -79,14 +76,6 @@ def test_an_untrained_head_changes_nothing():
     np.testing.assert_array_equal(rgbs, different_colors().rgbs)
 
 
-def test_the_untrained_scene_is_that_without_evidence():
-    off = CONFIG.replace(evidence=False)
-    params, cache = StreamSplat(CONFIG).init(jax.random.key(1)), cache_of_pivots()
-    with_evidence = StreamSplat(CONFIG).decode(params, cache)
-    without = StreamSplat(off).decode(params, replace(cache, observations=None))
-    jax.tree.map(np.testing.assert_array_equal, with_evidence, without)
-
-
 @pytest.mark.parametrize("bias", [1e4, -1e4])
 def test_changes_of_the_opacity_are_bounded(bias):
     got, _ = apply_evidence(head_with(bias), shapes(), evidence(), CONFIG)
@@ -102,11 +91,6 @@ def test_contrast_is_bounded_and_keeps_the_mean_color(bias):
     mean = before.mean(axis=1, keepdims=True)
     np.testing.assert_allclose(after, mean + gain * (before - mean), atol=1e-6)
     assert np.exp(-MAX_LOG_CONTRAST) <= gain <= np.exp(MAX_LOG_CONTRAST)
-
-
-def test_one_gaussian_per_pivot_has_no_contrast():
-    one = replace(evidence(), rgbs=different_colors().rgbs[:, :3])
-    np.testing.assert_array_equal(apply_evidence(head_with(0.5), shapes(), one, CONFIG)[1], one.rgbs)
 
 
 def test_the_head_moves_opacity_scales_and_contrast_alone():
@@ -137,28 +121,6 @@ def test_the_gradient_by_colors_is_finite_where_all_are_equal():
     assert np.isfinite(slopes).all()
     np.testing.assert_allclose(slopes[0], slopes[0][0])  # of the mean color alone
     assert np.ptp(slopes[1]) > 0.1
-
-
-def test_pivots_that_fit_and_pivots_that_do_not_differ_in_features():
-    good, bad = evidence(), evidence()
-    bad = replace(bad, observations=bad.observations.at[:, 3].mul(5.0))
-    assert not np.array_equal(evidence_features(good, CONFIG), evidence_features(bad, CONFIG))
-
-
-@pytest.mark.parametrize("name", sorted(PRESETS))
-def test_evidence_is_on_in_tiny_alone(name):
-    config = preset(name)
-    assert config.head.evidence == (name == "tiny")
-    small = config.replace(capacity=128)
-    assert (init_cache(small).observations is not None) == (name == "tiny")
-    assert ("evidence" in init_params(jax.random.key(0), small, only=("evidence",))) == (name == "tiny")
-
-
-def test_the_head_has_no_input_that_it_does_not_know():
-    params = init_params(jax.random.key(0), CONFIG, only=("evidence",))["evidence"]
-    assert params["hidden1"]["kernel"].shape[0] == evidence_features(evidence(), CONFIG).shape[1]
-    assert EvidenceHead().apply({"params": params}, evidence_features(evidence(), CONFIG)).shape == (NUM, 4)
-    assert {field.name for field in dataclasses.fields(Evidence)} >= {"observations", "num_members"}
 
 
 def test_the_scene_has_the_contrast_that_the_head_asks_for():

@@ -83,30 +83,6 @@ def test_estimate_equals_the_loop(seed, agreeing, spread):
     np.testing.assert_allclose(got, wanted, rtol=2e-6)
 
 
-def test_gains_are_found_among_noise_and_outliers():
-    rng = np.random.default_rng(1)
-    remembered, depths = scene()
-    colors = remembered * GAINS[:, None, None] * np.exp(0.1 * rng.normal(size=remembered.shape))
-    colors[:, :5] = rng.uniform(0.1, 0.9, colors[:, :5].shape)  # a third has unrelated colors
-    np.testing.assert_allclose(exposures(remembered, colors, depths), GAINS, rtol=0.05)
-
-
-def test_cells_of_another_surface_are_not_compared():
-    """One view sees red things before the cached wall; its exposure is the mean of the views that see the wall."""
-    remembered, depths = scene()
-    colors, nearer = remembered * 0.5, depths.copy()
-    colors[1], nearer[1] = [0.9, 0.1, 0.1], 0.8 * depths[1]
-    np.testing.assert_allclose(exposures(remembered, colors, depths, seen_depths=nearer), 0.5, rtol=1e-5)
-
-
-def test_clipped_and_black_cells_are_not_compared():
-    remembered, depths = scene()
-    colors = np.clip(remembered * 2.0, 0, 1)
-    assert (colors.max(axis=-1) > 0.97).mean() > 0.2
-    np.testing.assert_allclose(exposures(remembered, colors, depths), 2.0, rtol=1e-5)
-    np.testing.assert_array_equal(exposures(remembered, remembered * 0.01, depths), 1.0)
-
-
 @pytest.mark.parametrize(("num_cells", "is_known"), [(MIN_CELLS, True), (MIN_CELLS - 1, False)])
 def test_view_with_too_few_cells_has_the_mean_of_the_others(num_cells, is_known):
     remembered, depths = scene()
@@ -121,12 +97,6 @@ def test_view_with_too_few_cells_has_the_mean_of_the_others(num_cells, is_known)
         mask=mask,
     )
     np.testing.assert_allclose(got[:, 0], [0.5, 0.8 if is_known else 1.0, 2.0], rtol=1e-5)
-
-
-def test_empty_history_gives_exposure_one():
-    remembered, depths = scene()
-    nothing = np.zeros(depths.shape, bool)
-    np.testing.assert_array_equal(exposures(remembered, remembered * 0.5, depths, mask=nothing), 1.0)
 
 
 def test_padded_view_has_the_mean_of_the_others():

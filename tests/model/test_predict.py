@@ -9,17 +9,14 @@ import numpy as np
 import pytest
 
 from ssplat_jax.core.pytree import replace
-from ssplat_jax.model.streamsplat import StreamSplat
 from tests.core.test_rotations import rodrigues
 from tests.model.small import (
-    CONFIG,
     MODEL,
     chunk,
     finite,
     gradients,
     params,
     predict,
-    random_params,
     step,
     warm_cache,
     with_gamma,
@@ -125,15 +122,6 @@ def test_gamma_zero_gives_the_depths_of_an_empty_cache():
     assert float(jnp.abs(strong.log_depths - blank.log_depths).max()) > 1e-3
 
 
-def test_gamma_gets_a_gradient_only_where_there_is_history():
-    def slope(cache):
-        return float(gradients()(cache, chunk())[1][0]["hpda"]["raw_gamma"])
-
-    assert slope(warm_cache()) != 0
-    assert slope(MODEL.init_cache()) == 0
-    assert slope(remembering(confidences=0.0)()) == 0
-
-
 def test_no_gradient_reaches_the_cache():
     _, (*_, remembered) = gradients()(warm_cache(), chunk())
     for gradient in remembered:
@@ -170,43 +158,9 @@ def test_padded_view_does_not_change_the_valid_ones(padded):
     assert float(jnp.abs(c.tokens.feats[rows] - d.tokens.feats[rows]).max()) > 1e-3
 
 
-def test_padding_gives_no_valid_tokens():
-    prediction = predict()(params(), warm_cache(), replace(chunk(), valid=jnp.array([True, True, False])))
-    np.testing.assert_array_equal(prediction.tokens.valid, prediction.views.inside.reshape(-1))
-    np.testing.assert_array_equal(np.asarray(prediction.tokens.confidences)[~np.asarray(prediction.tokens.valid)], 0)
-
-
 def test_chunk_of_padding_does_not_change_the_cache():
     empty = replace(chunk(3), valid=jnp.zeros(3, bool))
     after, output = step()(params(), warm_cache(), empty)
     np.testing.assert_array_equal(output.confidences, 0)
     for name in ("voxels", "counts", "num_voxels", "means", "feats", "confidences", "num_members"):
         np.testing.assert_array_equal(getattr(after, name), getattr(warm_cache(), name))
-
-
-def test_history_comes_from_the_cache():
-    assert int(warm_cache().num_voxels) > 0
-    history = predict()(params(), warm_cache(), chunk()).output.history
-    assert float((history > 0).mean()) > 0.05
-    blank = predict()(params(), MODEL.init_cache(), chunk())
-    np.testing.assert_array_equal(blank.output.history, 0)
-
-
-@pytest.mark.parametrize(
-    "changes",
-    [
-        pytest.param({"num_depths": 1}, marks=pytest.mark.slow),
-        pytest.param({"chunk_size": 1}, marks=pytest.mark.slow),
-        pytest.param({"num_sources": 1, "fine_matching": False}, marks=pytest.mark.slow),
-    ],
-    ids=str,
-)
-def test_smallest_configurations_run(changes):
-    config = CONFIG.replace(**changes)
-    model = StreamSplat(config)
-    weights = random_params(config)
-    cache, output = jax.jit(model.step)(weights, model.init_cache(), chunk(views=config.stream.chunk_size))
-    assert finite((cache, output)) and int(cache.num_voxels) > 0
-    assert finite(model.decode(weights, cache))
-    if config.network.num_depths == 1:
-        np.testing.assert_allclose(output.depths, chunk().near, rtol=1e-6)

@@ -7,17 +7,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ssplat_jax.config import StreamConfig, preset
-from ssplat_jax.core.errors import InputError
+from ssplat_jax.config import preset
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.model import resplat
 from ssplat_jax.model.cgfi import inject_features
 from ssplat_jax.model.hpda import expected_log_depth
 from ssplat_jax.model.layers import same_region_mask
 from ssplat_jax.model.network import count_params, init_params
-from ssplat_jax.model.resplat.cost_volume import plane_sweep
-from ssplat_jax.model.resplat.encoder import POSITIONS_SIDE, Transformer, grid_size, resampled_positions
-from ssplat_jax.model.resplat.torch_layers import EdgePaddedConv, TransposedConv, resize
+from ssplat_jax.model.resplat.encoder import POSITIONS_SIDE, Transformer, resampled_positions
+from ssplat_jax.model.resplat.torch_layers import TransposedConv, resize
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.model.views import prepare_views, to_candidate_space
 from ssplat_jax.training.losses import soft_targets
@@ -33,14 +31,6 @@ def test_presets_have_the_published_number_of_parameters(name, millions):
     ours = ("hpda", "cgfi")  # stages that ReSplat does not have
     counted = count_params({stage: p for stage, p in params.items() if stage not in ours})
     assert round(counted / 1e6, 1) == millions
-
-
-@pytest.mark.slow
-def test_single_stage_is_initialized_as_among_all():
-    config = StreamConfig().replace(token_width=8, cgfi_width=8, mixer_blocks=1)
-    whole, part = (init_params(jax.random.key(3), config, only) for only in (None, ("hpda", "decoder")))
-    assert set(part) == {"hpda", "decoder"}
-    jax.tree.map(np.testing.assert_array_equal, part, {name: whole[name] for name in part})
 
 
 def test_resize_keeps_corners_and_interpolates_linearly():
@@ -63,12 +53,6 @@ def test_transposed_conv_makes_a_patch_of_every_sample():
     for i, j in np.ndindex(4, 6):
         wanted = x[0, i // 2, j // 2] @ kernel[i % 2, j % 2] + bias
         np.testing.assert_allclose(np.asarray(y)[0, i, j], wanted, rtol=1e-5, atol=1e-5)
-
-
-def test_edge_padded_conv_keeps_constants_constant():
-    kernel = jnp.asarray(np.random.default_rng(0).normal(size=(3, 3, 2, 4)), jnp.float32)
-    y = EdgePaddedConv(4).apply({"params": {"kernel": kernel, "bias": jnp.zeros(4)}}, jnp.ones((1, 4, 5, 2)))
-    np.testing.assert_allclose(y, np.broadcast_to(kernel.sum(axis=(0, 1, 2)), (1, 4, 5, 4)), rtol=1e-5, atol=1e-5)
 
 
 def test_position_codes_are_resampled_as_by_dinov2():
@@ -96,12 +80,6 @@ def keys_kernel(t: float, a: float = -0.75) -> float:
     return a * (t**3 - 5 * t**2 + 8 * t - 4) if t < 2 else 0.0
 
 
-def test_vit_grid_is_bounded():
-    assert grid_size(128, 192) == (9, 13)
-    assert grid_size(512, 768) == (26, 40)
-    assert grid_size(4, 8) == (1, 1)
-
-
 def test_keys_of_all_sources_are_masked_alike():
     together = same_region_mask(4, 6, (4, 6), (2, 3))
     keys = Transformer(upstream_compat=False).source_mask(together, 2)
@@ -110,15 +88,6 @@ def test_keys_of_all_sources_are_masked_alike():
     one = Transformer(upstream_compat=True)
     np.testing.assert_array_equal(one.source_mask(together, 1), together)  # one source: the same order
     assert (np.asarray(one.source_mask(together, 2)) != np.asarray(keys)).any()
-
-
-def test_options_of_the_other_network_are_refused():
-    with pytest.raises(InputError, match="no field 'match_stride' with network 'compact'"):
-        StreamConfig().replace(match_stride=8)
-    with pytest.raises(InputError, match="depth_range must be two depths, the nearer first"):
-        preset("small").replace(depth_range=(2.0, 1.0))
-    with pytest.raises(InputError, match="no field 'depth_space' with network 'compact'"):
-        StreamConfig().replace(depth_space="inverse")
 
 
 def test_depths_are_averaged_in_the_space_of_candidates():
@@ -170,30 +139,6 @@ def test_stream_fills_the_cache_and_depths_stay_in_range():
     _, later = step()(params(), cache, views())
     assert (later.history > 0).mean() > 0.2
     assert np.abs(np.asarray(later.depths - out.depths)).max() > 1e-4
-
-
-@pytest.mark.slow
-def test_a_padded_view_changes_nothing():
-    valid = jnp.array([True, True, False])
-    images = views().images
-    outs = [step()(params(), MODEL.init_cache(), views(valid=valid, images=images.at[2].set(x)))[1] for x in (0.0, 0.7)]
-    for name in ("depths", "confidences"):
-        first, second = (np.asarray(getattr(out, name))[:2] for out in outs)
-        np.testing.assert_array_equal(first, second)
-    assert not np.asarray(outs[0].confidences)[2].any()
-
-
-def test_single_view_has_zero_cost_and_stays_finite():
-    one = chunk(0, views=1, height=40, width=56)
-
-    def see(params):
-        here = prepare_views(one, CONFIG)
-        features = resplat.encode(params["encoder"], here, CONFIG)
-        return plane_sweep(features, here, CONFIG), resplat.match(params["cost_volume"], features, here, CONFIG)
-
-    cost, distribution = jax.jit(see)(params())
-    assert not np.asarray(cost).any()
-    np.testing.assert_allclose(distribution.probs.sum(axis=-1), 1.0, atol=1e-5)
 
 
 def test_injected_history_is_bounded_for_large_features():

@@ -20,7 +20,7 @@ from ssplat_jax.model.decoder import decode_tokens
 from ssplat_jax.model.hpda import anchor_depth
 from ssplat_jax.model.views import Views, back_project, patch_colors, prepare_views
 from tests.core.test_rotations import rodrigues
-from tests.model.small import CONFIG, chunk, finite, history, params, random_params
+from tests.model.small import CONFIG, chunk, finite, history, params
 from tests.stability.stage_checks import FLOAT32, ZERO_GAMMA, check_depths, check_distribution, wave
 
 pytestmark = pytest.mark.usefixtures("compiled_plainly")
@@ -230,16 +230,6 @@ def _(given):
     return given, limit
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("k", [0, D - 1])
-def test_matched_at_an_end_of_the_candidates(k):
-    given = certain_of(ordinary(), k)
-    (_, (_, depth, *_)), gradients = run_stages(given)
-    assert finite(gradients)
-    wanted = np.full(GRID, given["views"].log_candidates[k])
-    np.testing.assert_array_equal(depth.log_depths, wanted)
-
-
 @stage_case("omega of history 0")
 def _(given):
     given["past"] = replace(given["past"], confidences=jnp.zeros(GRID))
@@ -279,23 +269,3 @@ def test_hard_features(name):
     assert ((gaussians.opacities >= 0) & (gaussians.opacities <= 1)).all() and (gaussians.scales > 0).all()
     if limit is not None:
         limit(*results)
-
-
-@pytest.mark.slow
-def test_one_candidate_is_certain():
-    """D = 1 through the matcher; test_hpda_hard_cases.py has the depths read from it."""
-    config = CONFIG.replace(num_depths=1, fine_matching=False)
-    given = ordinary()
-    views = prepare_views(chunk(), config)
-    np.testing.assert_array_equal(views.log_candidates, np.log(chunk().near))
-
-    def total(weights, features):
-        distribution = compact.match(weights, features, views, config)
-        return wave(distribution), distribution
-
-    weights = random_params(config)["cost_volume"]
-    (_, distribution), gradients = jax.jit(jax.value_and_grad(total, argnums=(0, 1), has_aux=True))(
-        weights, given["features"]
-    )
-    assert finite(gradients)
-    np.testing.assert_array_equal(distribution.probs, 1)

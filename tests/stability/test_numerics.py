@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from ssplat_jax.core.cpu_backend import in_own_kernel, lane_sum
-from ssplat_jax.core.numerics import clip_value, columns, safe_log, safe_normalize, safe_sqrt, softplus_inverse
+from ssplat_jax.core.numerics import clip_value, safe_log, safe_normalize, safe_sqrt
 from ssplat_jax.model.compact.sweep_matching import unit_features
-from ssplat_jax.model.layers import attend, attend_per_query, average_pool, instance_norm
+from ssplat_jax.model.layers import attend, attend_per_query, instance_norm
 
 ULP = float(np.finfo(np.float32).eps)
 
@@ -29,13 +29,6 @@ def test_safe_normalize_length_is_one_within_four_ulp(size, width):
     unit = np.asarray(safe_normalize(jnp.asarray(x, jnp.float32)), np.float64)
     assert np.abs(np.linalg.norm(unit, axis=-1) - 1).max() < 4 * ULP
     np.testing.assert_allclose(unit, x / np.linalg.norm(x, axis=-1, keepdims=True), atol=4 * ULP)
-
-
-def test_safe_normalize_gradient_is_perpendicular():
-    x = np.array([0.3, -0.4, 1.2])
-    unit, length = x / np.linalg.norm(x), np.linalg.norm(x)
-    got = jax.jacobian(safe_normalize)(jnp.asarray(x, jnp.float32))
-    np.testing.assert_allclose(got, (np.eye(3) - np.outer(unit, unit)) / length, atol=1e-6)
 
 
 def test_safe_log_is_the_logarithm_above_its_floor():
@@ -61,16 +54,6 @@ def test_safe_sqrt_is_the_root_and_flat_at_and_below_zero():
     np.testing.assert_array_equal(jax.grad(lambda v: safe_sqrt(v).sum())(small), 0)
 
 
-def test_columns_are_the_entries_and_gradients_return_to_them():
-    x = jax.random.normal(jax.random.key(0), (5, 3))
-    values, pull = jax.vjp(columns, x)
-    for i, value in enumerate(values):
-        np.testing.assert_array_equal(value, x[:, i])
-    weights = np.arange(3, dtype=np.float32)
-    (gradient,) = pull(tuple(weight * value for weight, value in zip(weights, values, strict=True)))
-    np.testing.assert_array_equal(gradient, weights * x)
-
-
 @pytest.mark.parametrize("wanted", [True, False])
 def test_in_own_kernel_is_zero_in_value_and_gradient_if_unwanted(wanted):
     x = jnp.array([2.0, 0.0, -3.0])
@@ -93,23 +76,10 @@ def test_clip_value_clips_and_lets_the_gradient_pass():
     np.testing.assert_array_equal(jax.grad(lambda v: clip_value(v, -12.0, 12.0).sum())(x), 1)
 
 
-@pytest.mark.parametrize("y", [1e-9, 1e-3, 0.1, 1.0, 20.0, 500.0])
-def test_softplus_inverse(y):
-    x = softplus_inverse(y)
-    assert np.logaddexp(0.0, x) == pytest.approx(y, rel=1e-9)
-
-
 def test_instance_norm_of_a_constant_channel_is_zero():
     x = jnp.ones((2, 4, 4, 3)).at[..., 1].set(7e3)
     np.testing.assert_array_equal(instance_norm(x), 0)
     assert np.isfinite(jax.grad(lambda v: jnp.sum(instance_norm(v) ** 2 + instance_norm(v)))(x)).all()
-
-
-def test_instance_norm_has_zero_mean_and_unit_variance():
-    x = np.random.default_rng(0).normal(3.0, 5.0, (2, 6, 5, 4))
-    got = np.asarray(instance_norm(jnp.asarray(x, jnp.float32)), np.float64)
-    np.testing.assert_allclose(got.mean((1, 2)), 0, atol=1e-6)
-    np.testing.assert_allclose(got.var((1, 2)), 1, atol=1e-5)
 
 
 def attention_arrays(seed=0):
@@ -165,20 +135,8 @@ def test_a_sum_in_lanes_is_the_sum(n):
     np.testing.assert_array_equal(jax.grad(lambda x: lane_sum(x).sum())(x), np.ones((3, 2, n)))
 
 
-def test_attention_of_huge_scores_is_finite():
-    q, k, v = attention_arrays()
-    out = attend(1e15 * q, 1e15 * k, v)
-    assert np.isfinite(out).all() and np.abs(out).max() <= np.abs(v).max() * (1 + 1e-6)
-
-
 def test_unit_features_have_unit_length_and_zero_stays_zero():
     x = jnp.asarray(np.random.default_rng(0).normal(size=(9, 5)) * 1e4, jnp.float32).at[3].set(0.0)
     unit = unit_features(x)
     np.testing.assert_array_equal(unit[3], 0)
     np.testing.assert_allclose(np.delete(np.linalg.norm(unit, axis=-1), 3), 1, atol=1e-6)
-
-
-def test_average_pool_is_the_mean_of_patches():
-    x = np.random.default_rng(0).normal(size=(2, 4, 6, 3)).astype(np.float32)
-    wanted = [[x[:, 2 * i : 2 * i + 2, 2 * j : 2 * j + 2].mean((1, 2)) for j in range(3)] for i in range(2)]
-    np.testing.assert_allclose(average_pool(jnp.asarray(x), 2), np.moveaxis(np.array(wanted), 2, 0), atol=1e-6)
