@@ -116,8 +116,7 @@ class Capture:
     notes: tuple[str, ...] = ()  # messages of the reader for the user
     convention: Convention = USUAL  # of the poses in the files
 
-    def __repr__(self) -> str:
-        """Name, format, and number and size of the images; poses and pixels are too long to print."""
+    def __repr__(self) -> str:  # poses and pixels are too long to print
         return f"Capture({self.name!r}, {self.format}, {len(self)} frames of {self.width}x{self.height})"
 
     def __len__(self) -> int:
@@ -143,14 +142,10 @@ class Capture:
 
         Images without a file are ignored: procedural images follow from the name of the capture.
         """
-
-        def digest_file(path: Path) -> bytes:
-            with path.open("rb") as file:
-                return hashlib.file_digest(file, "sha256").digest()
-
         paths = [path for path in (self.frames[i].path for i in indices) if path is not None]
         with ThreadPoolExecutor() as pool:
-            return hashlib.sha256(b"".join(pool.map(digest_file, paths))).hexdigest()[:12]
+            digests = pool.map(lambda path: hashlib.sha256(path.read_bytes()).digest(), paths)
+            return hashlib.sha256(b"".join(digests)).hexdigest()[:12]
 
     def scaled(self, factor: float) -> "Capture":
         """Returns the same capture with images `factor` times as large, at least one pixel."""
@@ -185,14 +180,10 @@ class Capture:
             InputError: an image or depth map lies in `out` or below it, or `out` lies below a folder of such files.
         """
         folder = out.resolve()
-        for frame in self.frames:
-            for path in (frame.path, frame.depth_path):
-                if path is None:
-                    continue
-                file = path.resolve()
-                if file.is_relative_to(folder) or folder.is_relative_to(file.parent):
-                    got, fix = "the folder of the capture's own images", "choose another --out"
-                    raise refusal(str(out), wanted="a folder for results alone", got=got, fix=fix)
+        files = [path.resolve() for f in self.frames for path in (f.path, f.depth_path) if path is not None]
+        if any(file.is_relative_to(folder) or folder.is_relative_to(file.parent) for file in files):
+            got, fix = "the folder of the capture's own images", "choose another --out"
+            raise refusal(str(out), wanted="a folder for results alone", got=got, fix=fix)
 
     def verify(self, indices: Sequence[int] | None = None) -> None:
         """Decodes the images of the frames `indices` (default: all), to find damaged files; uses all cores.
@@ -221,12 +212,9 @@ class Capture:
     def camera(
         self, i: int, frame: StreamFrame | None = None, *, offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     ) -> Camera:
-        """Returns the camera of frame `i`: in the capture frame, in which scene files are, or in a stream frame.
+        """Returns the camera of frame `i`: in a stream frame, or else in the capture frame, in which scene files are.
 
-        Args:
-            i: the number of the frame.
-            frame: a stream frame (`stream_frame`); None gives the camera in the capture frame.
-            offset: point of the capture frame to which a scene's positions are relative, if `frame` is None.
+        In the capture frame, `offset` is the point of it to which the scene's positions are relative.
 
         Raises:
             InputError: there is no such frame.
@@ -270,27 +258,22 @@ class Capture:
         with ThreadPoolExecutor(1) as reader:
             ahead = reader.submit(self._views, groups[0], config.stream.chunk_size, frame)
             for following in (*groups[1:], None):
-                images, viewmats, Ks, valid = ahead.result()
+                arrays = ahead.result()
                 if following is not None:
                     ahead = reader.submit(self._views, following, config.stream.chunk_size, frame)
-                yield Chunk(
-                    images=jnp.asarray(images),
-                    viewmats=jnp.asarray(viewmats),
-                    Ks=jnp.asarray(Ks),
-                    valid=jnp.asarray(valid),
-                    near=jnp.float32(frame.near),
-                    far=jnp.float32(frame.far),
-                )
+                near, far = jnp.float32(frame.near), jnp.float32(frame.far)
+                yield Chunk(**{name: jnp.asarray(x) for name, x in arrays.items()}, near=near, far=far)
 
-    def _views(self, group: Sequence[int], chunk_size: int, frame: StreamFrame) -> tuple[np.ndarray, ...]:
-        """Images, viewmats, Ks and validity of one padded chunk."""
+    def _views(self, group: Sequence[int], chunk_size: int, frame: StreamFrame) -> dict[str, np.ndarray]:
+        """Arrays of one padded chunk."""
         images = np.zeros((chunk_size, self.height, self.width, 3), np.float32)
         viewmats = np.tile(np.eye(4, dtype=np.float32), (chunk_size, 1, 1))
         Ks = np.tile(self.K(group[0]).astype(np.float32), (chunk_size, 1, 1))
         for row, i in enumerate(group):
             images[row], Ks[row] = self.image(i), self.K(i)
         viewmats[: len(group)] = frame.viewmats(np.stack([self.frames[i].camtoworld for i in group]))
-        return images, viewmats, Ks, np.arange(chunk_size) < len(group)
+        valid = np.arange(chunk_size) < len(group)
+        return {"images": images, "viewmats": viewmats, "Ks": Ks, "valid": valid}
 
 
 def capture_of_listing(
@@ -304,16 +287,7 @@ def capture_of_listing(
             if (frame.width, frame.height) != size:
                 got = f"{size[0]}x{size[1]} ({echo(first.name)}) and {frame.width}x{frame.height} ({echo(frame.name)})"
                 raise refusal(listing.name, wanted="images of one size", got=got, fix="ask for one with --size WxH")
-    return Capture(
-        name=listing.name,
-        format=format,
-        frames=listing.frames,
-        pixels=pixels,
-        width=size[0],
-        height=size[1],
-        notes=listing.notes,
-        convention=convention,
-    )
+    return Capture(listing.name, format, listing.frames, pixels, *size, notes=listing.notes, convention=convention)
 
 
 def _indices(capture: Capture, indices: Sequence[int] | None) -> list[int]:

@@ -90,13 +90,7 @@ class Summary:
 def summarize(capture: Capture, config: StreamConfig, advance: Callable[[int], None] = lambda done: None) -> Summary:
     """Returns the summary of a capture for a run with `config`.
 
-    Args:
-        capture: the capture.
-        config: the configuration that a run would have.
-        advance: called with the number of frames, of at most `NUM_REFERENCES`, that have been matched.
-
-    Raises:
-        InputError: an image or depth map that the estimates use is damaged.
+    `advance` is called with the number of frames, of at most `NUM_REFERENCES`, that have been matched.
     """
     keypoints = keypoints_of(capture)
     depths = estimate_depths(capture, range(len(capture)), advance, keypoints)
@@ -196,11 +190,7 @@ def _depth_warnings(capture: Capture, depths: DepthStatistics, steps: np.ndarray
 
 
 def frame_warnings(capture: Capture) -> list[str]:
-    """Returns the findings about the frames of `capture`, one sentence with a remedy each.
-
-    Raises:
-        InputError: an image that is looked at is damaged.
-    """
+    """Returns the findings about the frames of `capture`, one sentence with a remedy each."""
     return [*copy_warnings(capture), *order_warnings(capture), *turn_warnings(capture), *image_warnings(capture)]
 
 

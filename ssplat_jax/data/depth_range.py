@@ -86,11 +86,7 @@ def estimate_depths(
 ) -> DepthStatistics:
     """Estimates the quantiles of depth in the frames `indices`.
 
-    Args:
-        capture: the frames.
-        indices: those to use.
-        advance: called with the number of references, of at most `NUM_REFERENCES`, that are done.
-        keypoints: function that returns the keypoints of a frame; by default they are detected.
+    `advance` is called with the number of references, of at most `NUM_REFERENCES`, that are done.
 
     Limits:
         With a median parallax below 0.5 degrees only the median is measured, and the range is 4 times to both sides.
@@ -161,28 +157,16 @@ def _statistics(pairs: list[CommonPoints]) -> DepthStatistics:
     if least < 1 / (FAR_FACTOR * reach):
         farthest = MAX_RANGE * NEAR_FACTOR / (FAR_FACTOR * nearest)
         reach = max(reach, min(1 / least, farthest))
-    return DepthStatistics(
-        q01=float(1 / nearest),
-        median=float(1 / middle),
-        q99=float(reach),
-        num_points=inverse.size,
-        num_pairs=len(pairs),
-        parallax_degrees=float(np.median(parallax)),
-        source="matches",
-    )
+    quantiles = float(1 / nearest), float(1 / middle), float(reach)
+    return DepthStatistics(*quantiles, inverse.size, len(pairs), float(np.median(parallax)), "matches")
 
 
 def _guess(median: float, source: str, pairs: list[CommonPoints]) -> DepthStatistics:
     """Quantiles at a fixed ratio to a median, where the range is not measured."""
-    return DepthStatistics(
-        q01=median / GUESSED_SPREAD,
-        median=median,
-        q99=median * GUESSED_SPREAD,
-        num_points=sum(p.parallax.size for p in pairs),
-        num_pairs=len(pairs),
-        parallax_degrees=float(np.median(np.concatenate([p.parallax for p in pairs]))) if pairs else 0.0,
-        source=source,
-    )
+    parallax = np.concatenate([p.parallax for p in pairs]) if pairs else np.zeros(1)
+    num_points = sum(p.parallax.size for p in pairs)
+    quantiles = median / GUESSED_SPREAD, median, median * GUESSED_SPREAD
+    return DepthStatistics(*quantiles, num_points, len(pairs), float(np.median(parallax)), source)
 
 
 def _best_pair(
@@ -200,15 +184,11 @@ def _best_pair(
     best = None
     for rank in ladder[start:]:
         points = triangulate_pair(capture, i, partners[rank], keypoints)
-        if points is None:
-            break
-        best = points
-        if np.median(points.parallax) >= GOOD_PARALLAX_DEGREES:
+        best = best if points is None else points
+        if points is None or np.median(points.parallax) >= GOOD_PARALLAX_DEGREES:
             break
     for rank in reversed(ladder[:start]):
-        if best is not None:
-            break
-        best = triangulate_pair(capture, i, partners[rank], keypoints)
+        best = triangulate_pair(capture, i, partners[rank], keypoints) if best is None else best
     if best is None:
         return None
     # Close surfaces leave the view first: over a wide baseline only the background would match and determine near.

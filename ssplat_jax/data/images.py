@@ -24,21 +24,13 @@ REPLACE = f"replace the file (formats read: {', '.join(IMAGE_FORMATS)})"
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Returns (width, height) from the header of an image file.
-
-    Raises:
-        InputError: the file is missing, is not a readable image, or is too large.
-    """
+    """Returns (width, height) from the header of an image file, which is refused if that cannot be read."""
     with _open(path) as image:
         return image.size
 
 
 def check_depth_header(path: Path) -> None:
-    """Checks that a file is a 16-bit depth image.
-
-    Raises:
-        InputError: it is not.
-    """
+    """Refuses a file that is no 16-bit depth image."""
     with _open(path) as image:
         if image.mode not in DEPTH_MODES:
             fix = "store depth as 16-bit PNG"
@@ -217,17 +209,7 @@ PINHOLE = Lens()  # no distortion
 
 
 def check_lens(lens: Lens, K: Float64[np.ndarray, "3 3"], width: int, height: int, where: str) -> float:
-    """Returns the largest displacement by distortion on the border of the image, in pixels.
-
-    Args:
-        lens: the distortion.
-        K: intrinsics in pixels.
-        width: image width in pixels.
-        height: image height in pixels.
-        where: location of the coefficients for messages.
-
-    Returns:
-        The displacement in pixels; exactly 0 without distortion.
+    """Returns the largest displacement by distortion on the border of the image, in pixels; exactly 0 without any.
 
     Raises:
         InputError: the distortion folds the image or moves pixels by more than the image size, so the coefficients
@@ -259,17 +241,14 @@ def undistort(
     order: int = 1,
     outside: float | None = None,
 ) -> Float32[np.ndarray, "h w *c"]:
-    """Returns the image that a pinhole camera would have taken.
+    """Returns the image (or depth map) that a pinhole camera of the same intrinsics would have taken.
 
     Args:
-        image: the distorted image, or a depth map.
+        image: the distorted image.
         lens: its distortion.
-        K: intrinsics of both images, in pixels.
+        K: intrinsics, pixels.
         order: 1 samples linearly, 0 takes the nearest pixel (for depth maps).
         outside: value of pixels that the stored image does not show; by default they repeat its border.
-
-    Returns:
-        The undistorted image.
     """
     mode, fill = ("edge", 0.0) if outside is None else ("constant", outside)
     rows, columns = np.mgrid[: image.shape[0], : image.shape[1]]

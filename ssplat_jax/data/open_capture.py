@@ -88,11 +88,7 @@ def open_capture(path: str | Path, *, size: tuple[int, int] | None = None) -> Ca
 
 
 def without_tilde(path: str) -> Path:
-    """Returns `path` with the home folder in place of a leading `~` or `~user`.
-
-    Raises:
-        InputError: there is no such user.
-    """
+    """Returns `path` with the home folder in place of a leading `~` or `~user`, which must exist."""
     with reading(path[:80], "check the path"):
         return Path(path).expanduser()
 
@@ -162,12 +158,7 @@ def is_done(path: Path) -> bool:
 
 
 def _open_procedural(spec: str, size: tuple[int, int] | None) -> Capture:
-    """The procedural capture of a path, rendered immediately.
-
-    Args:
-        spec: the path, such as `procedural:room?frames=73&size=128x96&seed=0`.
-        size: (width, height) of the images where `spec` has none.
-    """
+    """The procedural capture of a path, rendered immediately; `size` is that of images where `spec` has none."""
     name, _, query = spec.removeprefix(f"{PROCEDURAL}:").partition("?")
     given = parse_qsl(query, keep_blank_values=True)
     options = dict(given)

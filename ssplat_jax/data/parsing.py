@@ -86,12 +86,7 @@ def _unique(pairs: list[tuple[str, Any]], path: Path) -> dict[str, Any]:
 
 
 class Fields:
-    """Fields of an untrusted JSON object, each checked when it is read.
-
-    Args:
-        fields: the object.
-        where: its location for messages.
-    """
+    """Fields of an untrusted JSON object at the place `where`, each checked when it is read."""
 
     def __init__(self, fields: Any, where: str) -> None:
         if not isinstance(fields, dict):

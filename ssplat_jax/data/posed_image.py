@@ -51,18 +51,14 @@ class Frame:
 
 
 def check_camtoworld(matrix: object, where: str) -> tuple[Float64[np.ndarray, "4 4"], float]:
-    """Checks a camera-to-world matrix, 4x4 or 3x4, and replaces its rotation by the nearest one.
-
-    Args:
-        matrix: untrusted values.
-        where: location of the matrix for messages.
+    """Checks an untrusted camera-to-world matrix, 4x4 or 3x4, and replaces its rotation by the nearest one.
 
     Returns:
         The rigid transform, and the deviation |R^T R - I| of the given rotation.
 
     Raises:
         InputError: the matrix is not of numbers or of another shape, |R^T R - I| is above `ROTATION_TOLERANCE`, or
-            the rotation is a reflection.
+            the rotation is a reflection; the message starts with `where`.
     """
     try:
         pose = np.array(matrix, dtype=np.float64)
@@ -108,12 +104,7 @@ def _check_coordinates(translation: Float64[np.ndarray, "3"], where: str) -> Non
 
 
 def pose_from_quat(wxyz: object, translation: object, where: str) -> Float64[np.ndarray, "4 4"]:
-    """Returns the rigid transform of a quaternion, which is normalized, and a translation.
-
-    Args:
-        wxyz: untrusted quaternion.
-        translation: untrusted vector.
-        where: location of the values for messages.
+    """Returns the rigid transform of an untrusted quaternion, which is normalized, and a translation.
 
     Raises:
         InputError: a value is not finite, a coordinate is too large, or the quaternion is shorter than 1e-6.
@@ -147,16 +138,7 @@ def invert_pose(pose: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "4 4"]:
 def check_intrinsics(
     *, fx: float, fy: float, cx: float, cy: float, width: int, height: int, where: str
 ) -> Float64[np.ndarray, "3 3"]:
-    """Returns the intrinsics matrix of checked values.
-
-    Args:
-        fx: focal length in x, pixels.
-        fy: focal length in y, pixels.
-        cx: principal point in x, pixels; the center of the first pixel is 0.5.
-        cy: principal point in y, pixels.
-        width: image width, pixels.
-        height: image height, pixels.
-        where: location of the values for messages.
+    """Returns the intrinsics matrix of checked values in pixels; the center of the first pixel is (0.5, 0.5).
 
     Raises:
         InputError: a focal length is not positive or not in pixels, or the principal point is outside the image.
@@ -214,11 +196,7 @@ _OPTIONS = re.compile(r"\?((?:axes|poses)=[^&?/]*(?:&(?:axes|poses)=[^&?/]*)*)$"
 
 
 def split_options(path: str) -> tuple[str, dict[str, str]]:
-    """Splits `path?axes=...&poses=...` into the path and its options; there may be none.
-
-    Raises:
-        InputError: an option has an unknown value or is given twice.
-    """
+    """Splits `path?axes=...&poses=...` into the path and its options; unknown and repeated values are refused."""
     found = _OPTIONS.search(path)
     if found is None:
         return path, {}

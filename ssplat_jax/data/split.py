@@ -192,15 +192,10 @@ def interleave(centers: Float64[np.ndarray, "n 3"], indices: Sequence[int], chun
     and so on: every frame is used, and none is delayed by more than a block of `chunk_size * s` frames. The order
     depends on poses only, so it is known before an image is read.
 
-    Args:
-        centers: camera centers of the frames `indices`, in any unit.
-        indices: frames in the order of the stream.
-        chunk_size: views of a chunk.
-        step: wanted distance between consecutive views of a chunk, in the unit of `centers`; 0 keeps the order.
-
     Returns:
-        A permutation of `indices`. Blocks of `chunk_size * s` frames are interleaved one after the other, with s from 1
-        to `MAX_INTERLEAVED_CHUNKS`. Frames that are `step` apart already and frames that do not move keep their order.
+        A permutation of `indices`, whose cameras are at `centers`. Blocks of `chunk_size * s` frames are interleaved
+        one after the other, with s from 1 to `MAX_INTERLEAVED_CHUNKS`. Frames that are `step` apart already and frames
+        that do not move keep their order.
     """
     steps = np.linalg.norm(np.diff(centers, axis=0), axis=-1)
     order: list[int] = []
@@ -266,11 +261,7 @@ def _frame_numbers(fields: Any, where: str, name: str) -> tuple[int, ...]:
 
 
 def split_of_scene(index: Index, scene: str, num_frames: int) -> Split:
-    """Returns the split of one scene of an index.
-
-    Raises:
-        InputError: the index does not hold the scene or leaves it out, or the capture has no frame of that number.
-    """
+    """Returns the split of one scene of an index for a capture of `num_frames`."""
     if scene not in index:
         got, fix = f"{len(index)} others, such as {echo(next(iter(index), ''))}", "name one of them with --scene"
         raise refusal("--index", wanted=f"the scene {echo(scene)}", got=got, fix=fix)

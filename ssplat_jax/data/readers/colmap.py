@@ -60,22 +60,21 @@ COPY_AGAIN = "copy the reconstruction again"
 
 
 class ImageEntry(NamedTuple):
-    """Registered image."""
+    """Registered image, with its location in the file for messages."""
 
     name: str
-    quat: tuple[float, ...]  # world-to-camera, wxyz
-    translation: tuple[float, ...]
+    pose: list[float]  # world-to-camera: quaternion wxyz, translation
     camera: int  # id
-    where: str  # location in the file for messages
+    where: str
 
 
 class CameraEntry(NamedTuple):
-    """Camera as its file gives it; images that use it need a supported model."""
+    """Camera as its file gives it, with its location for messages; images that use it need a supported model."""
 
     model: str
     size: tuple[float, float]  # (width, height) of the images that COLMAP used
-    params: tuple[float, ...]
-    where: str  # location in the file for messages
+    params: list[float]
+    where: str
 
 
 def matches(path: Path) -> bool:
@@ -98,10 +97,9 @@ def read(path: Path) -> Listing:
                 got = f"camera {entry.camera}, which is missing"
                 raise refusal(entry.where, wanted="a camera of the reconstruction", got=got, fix=COPY_AGAIN)
             camera = cameras[entry.camera]
-            pose = (pose_from_quat(entry.quat, entry.translation, entry.where), 0.0)
+            pose = (pose_from_quat(entry.pose[:4], entry.pose[4:], entry.where), 0.0)
             sized = stored_size(image, camera.size, entry.where)
-            where = f"{entry.where}, camera {entry.camera}"
-            frames.add(entry.name, image, pose, _intrinsics(camera), sized, where)
+            frames.add(entry.name, image, pose, _intrinsics(camera), sized, f"{entry.where}, camera {entry.camera}")
     if entries and not frames.frames:
         file_named(root, folder + entries[0].name, entries[0].where)  # refuses it
     notes = _larger_models(path, model, len(entries))
@@ -211,7 +209,7 @@ def _binary_cameras(path: Path) -> dict[int, CameraEntry]:
                 known = ", ".join(name for name, _, _ in MODELS)
                 raise refusal(where, wanted=f"one of {known}", got=f"'model {model}'", fix=UNDISTORT)
             name, params, _ = MODELS[model]
-            values = file.take(f"{len(params.split())}d")
+            values = list(file.take(f"{len(params.split())}d"))
             cameras[camera] = CameraEntry(name, (float(width), float(height)), values, where)
     return cameras
 
@@ -223,7 +221,7 @@ def _binary_images(path: Path) -> list[ImageEntry]:
         file = _Binary(path)
         for _ in range(*file.take("Q")):
             image, *pose, camera = file.take("I7dI")
-            images.append(ImageEntry(file.text(), tuple(pose[:4]), tuple(pose[4:]), camera, f"{path}: image {image}"))
+            images.append(ImageEntry(file.text(), pose, camera, f"{path}: image {image}"))
             (num_points,) = file.take("Q")
             file.skip(struct.calcsize("<ddq") * num_points)
     return images
@@ -237,7 +235,7 @@ def _text_cameras(path: Path) -> dict[int, CameraEntry]:
             with reading(where, COPY_AGAIN):
                 camera, model, width, height, *params = line.split()
                 size = (float(int(width)), float(int(height)))
-                cameras[int(camera)] = CameraEntry(model, size, tuple(parse_numbers(params, where)), where)
+                cameras[int(camera)] = CameraEntry(model, size, parse_numbers(params, where), where)
     return cameras
 
 
@@ -248,10 +246,8 @@ def _text_images(path: Path) -> list[ImageEntry]:
         if line:
             with reading(where, COPY_AGAIN):
                 _, *words, camera, name = line.split(maxsplit=9)
-                entry = ImageEntry(name, (), (), int(camera), where)
-            pose = parse_numbers(words, where, 7)
+                images.append(ImageEntry(name, parse_numbers(words, where, 7), int(camera), where))
             points = next(lines, ("", ""))[1].split()
             if len(points) % 3 or (points and not points[-1].lstrip("-").isdigit()):
                 raise refusal(where, wanted="a line of 2D points below", got="another line", fix=COPY_AGAIN)
-            images.append(entry._replace(quat=tuple(pose[:4]), translation=tuple(pose[4:])))
     return images

@@ -43,12 +43,7 @@ class Intrinsics:
 
 
 class FrameList:
-    """Frames of a capture, checked one by one as a reader adds them.
-
-    Args:
-        root: folder of the capture, resolved.
-        convention: in which its poses are written.
-    """
+    """Frames of a capture with the resolved folder `root`, checked one by one as a reader adds them."""
 
     def __init__(self, root: Path, convention: Convention = USUAL) -> None:
         self.root, self.convention = root, convention
@@ -80,10 +75,6 @@ class FrameList:
             key: what only one frame may have; by default the image.
             depth: 16-bit depth image.
             depth_unit: capture units per step of the depth image.
-
-        Raises:
-            InputError: another frame has that image, the intrinsics are implausible, the distortion folds the image,
-                or the depth map is no 16-bit image.
         """
         key = image if key is None else key
         if key in self._seen:
@@ -95,19 +86,9 @@ class FrameList:
         fx, fy, cx, cy = (shrink * x for x in (intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy))
         K = check_intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height, where=where)
         distortion_px = check_lens(intrinsics.lens, K, width, height, where)
+        camtoworld, lens = self.convention.to_opencv(pose[0]), intrinsics.lens if distortion_px > IGNORED_PX else None
         frame = Frame(
-            name=name,
-            camtoworld=self.convention.to_opencv(pose[0]),
-            K=K,
-            width=width,
-            height=height,
-            path=image,
-            depth_path=depth,
-            depth_unit=depth_unit,
-            pose_deviation=pose[1],
-            shrink=shrink,
-            lens=intrinsics.lens if distortion_px > IGNORED_PX else None,
-            distortion_px=distortion_px,
+            name, camtoworld, K, width, height, image, depth, depth_unit, pose[1], shrink, lens, distortion_px
         )
         self.frames.append(frame)
 
@@ -116,7 +97,7 @@ class FrameList:
     ) -> Listing:
         """Returns the listing, with notes for the user about what was left out and about poses, sizes and intrinsics.
 
-        Captures of these formats usually have some frames without a pose or image, so they are only counted.
+        Captures usually have some frames without a pose or image, so these are counted, and refused only if all are so.
 
         Args:
             num_listed: number of frames in the file, of which some may not have been added.
@@ -124,9 +105,6 @@ class FrameList:
             notes: further messages for the user.
             name: of the capture; by default that of its folder.
             is_in_time: True if frames were added in the order of time.
-
-        Raises:
-            InputError: no frame was added.
         """
         lost = num_listed - len(self.frames)
         if not self.frames:
@@ -191,8 +169,7 @@ def _notes(frames: list[Frame]) -> list[str]:
 def find_file(root: Path, names: Sequence[str], where: str) -> Path | None:
     """Returns the first of `names` that is a file in the folder `root`, after symbolic links are resolved, or None.
 
-    Raises:
-        InputError: a name leads outside `root`; a capture from elsewhere must not make us read other files.
+    Names that lead outside `root` are refused: a capture from elsewhere must not make us read other files.
     """
     for name in names:
         try:
@@ -211,17 +188,8 @@ def find_file(root: Path, names: Sequence[str], where: str) -> Path | None:
 def find_image(root: Path, name: object, where: str, suffixes: Sequence[str] = ("",)) -> Path | None:
     """Returns the path of the image `name` of the capture, or None if there is no such file.
 
-    A downscaled copy (images_2, ...) stands in for an image that is missing in images/; any of `SUFFIXES` may stand in
-    place of its own there.
-
-    Args:
-        root: folder of the capture.
-        name: path relative to `root`, not yet checked.
-        where: location of the name for messages.
-        suffixes: tried behind `name`.
-
-    Raises:
-        InputError: `name` is no path, or leads outside `root`.
+    The `suffixes` are tried behind the name. A downscaled copy (images_2, ...) stands in for an image that is missing
+    in images/; any of `SUFFIXES` may stand in place of its own there.
     """
     if not isinstance(name, str) or not name or "\0" in name:
         raise refusal(where, wanted="the path of a file", got=echo(name), fix="give it relative to the capture")
@@ -232,11 +200,7 @@ def find_image(root: Path, name: object, where: str, suffixes: Sequence[str] = (
 
 
 def file_named(root: Path, name: object, where: str, suffixes: Sequence[str] = ("",)) -> Path:
-    """Returns the path that `find_image` finds.
-
-    Raises:
-        InputError: there is no such file, or `name` is no path or leads outside `root`.
-    """
+    """Returns the path that `find_image` finds; there must be one."""
     path = find_image(root, name, where, suffixes)
     if path is None:
         got = f"{echo(name)}, where there is none"
@@ -264,15 +228,8 @@ def stored_size(image: Path, described: tuple[float, float] | None, where: str) 
     """Returns (width, height) of a stored image, and its size relative to the described one.
 
     Downscaled copies (images_2, images_4) are described by the intrinsics of the full size. An image counts as such a
-    copy if both sides are smaller by the same factor, to a pixel.
-
-    Args:
-        image: the file.
-        described: (width, height) in the capture's files, or None if they do not say.
-        where: location of that size for messages.
-
-    Raises:
-        InputError: the image is neither of the described size nor a downscaled copy.
+    copy if both sides are smaller by the same factor, to a pixel; others are refused. `described` is None if the
+    capture does not say a size.
     """
     size = image_size(image)
     if described in (None, size):
