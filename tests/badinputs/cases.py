@@ -23,11 +23,10 @@ class Case(NamedTuple):
     where: str
 
 
-def good_capture(root: Path) -> dict[str, Any]:
-    """Writes the images of a good capture and returns the contents of its transforms.json."""
-    rng = np.random.default_rng(0)
+def make_capture(root: Path, change: Callable[[Path, dict[str, Any]], Any] = lambda root, meta: None) -> Path:
+    """Writes a good capture to the folder `root`, changed by `change`, and returns the folder."""
+    rng, frames = np.random.default_rng(0), []
     (root / "images").mkdir(parents=True)
-    frames = []
     for i in range(NUM_FRAMES):
         pixels = rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
         Image.fromarray(pixels).save(root / "images" / f"{i}.jpg", quality=95)
@@ -35,21 +34,10 @@ def good_capture(root: Path) -> dict[str, Any]:
         pose[0, 3] = 0.1 * i
         frames.append({"file_path": f"images/{i}.jpg", "transform_matrix": pose.tolist()})
     intrinsics = {"fl_x": 50.0, "fl_y": 51.0, "cx": 31.0, "cy": 25.0, "w": WIDTH, "h": HEIGHT}
-    return {"camera_model": "OPENCV", **intrinsics, "frames": frames}
-
-
-def write_capture(root: Path, meta: dict[str, Any]) -> None:
-    """Writes transforms.json unless it exists."""
-    file = root / "transforms.json"
-    if not file.exists():
-        file.write_text(json.dumps(meta))
-
-
-def make_capture(root: Path, change: Callable[[Path, dict[str, Any]], Any] = lambda root, meta: None) -> Path:
-    """Writes a good capture to the folder `root`, changed by `change`, and returns the folder."""
-    meta = good_capture(root)
+    meta = {"camera_model": "OPENCV", **intrinsics, "frames": frames}
     change(root, meta)
-    write_capture(root, meta)
+    if not (root / "transforms.json").exists():
+        (root / "transforms.json").write_text(json.dumps(meta))
     return root
 
 
@@ -77,23 +65,24 @@ def mutant(data: bytes, rng: random.Random) -> bytes:
 
 def top(**fields):
     """Sets global fields; None removes a field."""
-    return lambda root, meta: [meta.pop(k, None) if v is None else meta.update({k: v}) for k, v in fields.items()]
+    return lambda root, meta: _update(meta, fields)
 
 
 def frame(i, **fields):
     """Sets fields of frame `i`; None removes a field."""
-    return lambda root, meta: [
-        meta["frames"][i].pop(k, None) if v is None else meta["frames"][i].update({k: v}) for k, v in fields.items()
-    ]
+    return lambda root, meta: _update(meta["frames"][i], fields)
+
+
+def _update(target, fields):
+    for name, value in fields.items():
+        target.pop(name, None) if value is None else target.update({name: value})
 
 
 def pose(change):
     """Applies `change` to the matrix of frame 2, a NumPy array."""
-
-    def spoil(root, meta):
-        meta["frames"][2]["transform_matrix"] = change(np.array(meta["frames"][2]["transform_matrix"])).tolist()
-
-    return spoil
+    return lambda root, meta: frame(
+        2, transform_matrix=change(np.array(meta["frames"][2]["transform_matrix"])).tolist()
+    )(root, meta)
 
 
 def entry(row, column, value):
@@ -107,6 +96,17 @@ def text(content: str | bytes):
     return lambda root, meta: (root / "transforms.json").write_bytes(data)
 
 
+def image(make):
+    """Replaces image 2 by some bytes, or by what a function writes to its path."""
+
+    def spoil(root, meta):
+        file = root / "images" / "2.jpg"
+        file.unlink()
+        file.write_bytes(make) if isinstance(make, bytes) else make(file)
+
+    return spoil
+
+
 def truncated(fraction):
     """Truncates image 2."""
 
@@ -117,33 +117,26 @@ def truncated(fraction):
     return spoil
 
 
-def image(data: bytes):
-    """Replaces the bytes of image 2."""
-    return lambda root, meta: (root / "images" / "2.jpg").write_bytes(data)
-
-
-def bomb(root, meta):
-    """Replaces image 2 by a small PNG of 20000 x 20000 pixels."""
-    Image.new("1", (20000, 20000)).save(root / "images" / "2.jpg", format="PNG")
-
-
-def bomb_below_pillows_limit(root, meta):
-    """Replaces image 2 by a PNG of 80 million pixels, which Pillow itself would decode."""
-    Image.new("1", (10000, 8000)).save(root / "images" / "2.jpg", format="PNG")
-
-
-def without_image(root, meta):
-    (root / "images" / "2.jpg").unlink()
-
-
-def folder_as_image(root, meta):
-    without_image(root, meta)
-    (root / "images" / "2.jpg").mkdir()
-
-
-def other_size(width, height, *, format="JPEG"):
+def picture(mode, *size, format="JPEG"):
     """Replaces image 2 by a black image."""
-    return lambda root, meta: Image.new("RGB", (width, height)).save(root / "images" / "2.jpg", format=format)
+    return image(lambda file: Image.new(mode, size).save(file, format=format))
+
+
+def tiff(pixels, **options):
+    """Replaces image 2 by a TIFF."""
+    return image(lambda file: Image.fromarray(pixels).save(file, format="TIFF", **options))
+
+
+def damaged_png(change):
+    """Replaces image 2 by a PNG whose bytes `change` damages."""
+
+    def make(file):
+        Image.fromarray(np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)).save(
+            file, format="PNG"
+        )
+        file.write_bytes(change(file.read_bytes()))
+
+    return image(make)
 
 
 def both(*spoilers):
@@ -156,20 +149,9 @@ def shrunk_without_a_size(root, meta):
     top(w=None, h=None)(root, meta)
 
 
-def tiff(pixels, **options):
-    """Replaces image 2 by a TIFF."""
-    return lambda root, meta: Image.fromarray(pixels).save(root / "images" / "2.jpg", format="TIFF", **options)
-
-
 def linked_outside(root, meta):
-    outside = root.parent / "outside.jpg"
-    (root / "images" / "2.jpg").rename(outside)
-    (root / "images" / "2.jpg").symlink_to(outside)
-
-
-def link_loop(root, meta):
-    (root / "images" / "2.jpg").unlink()
-    (root / "images" / "2.jpg").symlink_to(root / "images" / "2.jpg")
+    (root / "images" / "2.jpg").rename(root.parent / "outside.jpg")
+    (root / "images" / "2.jpg").symlink_to(root.parent / "outside.jpg")
 
 
 def outside(path):
@@ -182,19 +164,7 @@ def outside(path):
     return spoil
 
 
-def depth_file(mode, *, cut=None):
-    """Gives frame 2 a depth image of Pillow mode `mode`, truncated to `cut` bytes."""
-
-    def spoil(root, meta):
-        Image.new(mode, (WIDTH, HEIGHT), 1000 if mode.startswith("I") else 100).save(root / "d.png")
-        if cut is not None:
-            (root / "d.png").write_bytes((root / "d.png").read_bytes()[:cut])
-        meta["frames"][2]["depth_file_path"] = "d.png"
-
-    return spoil
-
-
-def depth_at(make):
+def depth(make):
     """Gives frame 2 the depth map d.png, which `make` puts there."""
 
     def spoil(root, meta):
@@ -204,18 +174,14 @@ def depth_at(make):
     return spoil
 
 
-def damaged_png(change):
-    """Replaces image 2 by a PNG whose bytes `change` damages."""
+def gray(mode):
+    """Gives frame 2 a depth image of Pillow mode `mode`."""
+    return depth(lambda file: Image.new(mode, (WIDTH, HEIGHT), 100).save(file))
 
-    def spoil(root, meta):
-        file, pixels = (
-            root / "images" / "2.jpg",
-            np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8),
-        )
-        Image.fromarray(pixels).save(file, format="PNG")
-        file.write_bytes(change(file.read_bytes()))
 
-    return spoil
+def cut(file):
+    Image.new("I;16", (WIDTH, HEIGHT), 1000).save(file)
+    file.write_bytes(file.read_bytes()[:60])
 
 
 def rotated(degrees):
@@ -229,7 +195,7 @@ IMAGE, FILE = "2.jpg", "frames[2].depth_file_path"
 # One line per case, however long.
 CASES = (
     # images
-    Case("missing image", without_image, PATH),
+    Case("missing image", image(lambda file: None), PATH),
     Case("empty image", image(b""), IMAGE),
     Case("garbage image", image(b"not an image at all" * 9), IMAGE),
     Case("image cut to its first byte", truncated(0.0005), IMAGE),
@@ -237,11 +203,11 @@ CASES = (
     Case("JPEG cut at 50 %", truncated(0.5), IMAGE),
     Case("JPEG cut at 90 %", truncated(0.9), IMAGE),
     Case("JPEG cut at 99 %", truncated(0.99), IMAGE),
-    Case("folder in place of an image", folder_as_image, PATH),
-    Case("bomb", bomb, IMAGE),
-    Case("bomb below Pillow's limit", bomb_below_pillows_limit, IMAGE),
-    Case("an image of another size", other_size(10, 10), "frames[2]: w, h"),
-    Case("an image on its side", other_size(HEIGHT, WIDTH), "frames[2]: w, h"),
+    Case("folder in place of an image", image(Path.mkdir), PATH),
+    Case("bomb", picture("1", 20000, 20000, format="PNG"), IMAGE),
+    Case("bomb below Pillow's limit", picture("1", 10000, 8000, format="PNG"), IMAGE),
+    Case("an image of another size", picture("RGB", 10, 10), "frames[2]: w, h"),
+    Case("an image on its side", picture("RGB", HEIGHT, WIDTH), "frames[2]: w, h"),
     Case("intrinsics of another size", top(w=128, h=90), "frames[0]: w, h"),
     Case("intrinsics of a pixel", top(w=1, h=1), "frames[0]: w, h"),
     Case("intrinsics of nothing", top(w=0, h=96), "frames[0]: w, h"),
@@ -251,14 +217,14 @@ CASES = (
     Case("32-bit integers in a TIFF", tiff(np.ones((HEIGHT, WIDTH), np.int32)), IMAGE),
     Case("a TIFF on its side", tiff(np.zeros((WIDTH, HEIGHT, 3), np.uint8), tiffinfo={274: 6}), IMAGE),
     Case("a TIFF upside down", tiff(np.zeros((HEIGHT, WIDTH, 3), np.uint8), tiffinfo={274: 3}), IMAGE),
-    Case("two sizes", both(top(w=None, h=None), other_size(70, 48)), "capture"),
-    Case("a format that is not read", other_size(WIDTH, HEIGHT, format="TGA"), IMAGE),
-    Case("a GIF", other_size(WIDTH, HEIGHT, format="GIF"), IMAGE),
+    Case("two sizes", both(top(w=None, h=None), picture("RGB", 70, 48)), "capture"),
+    Case("a format that is not read", picture("RGB", WIDTH, HEIGHT, format="TGA"), IMAGE),
+    Case("a GIF", picture("RGB", WIDTH, HEIGHT, format="GIF"), IMAGE),
     Case("PNG cut short", damaged_png(lambda data: data[:-400]), IMAGE),
     Case("PNG with a wrong checksum", damaged_png(lambda d: d[:3000] + b"\0\0\0\0" + d[3004:]), IMAGE),
     Case("a page that says 404", image(b"<html>404 not found</html>"), IMAGE),
     Case("a pointer of git-lfs", image(b"version https://git-lfs.github.com/spec/v1\n"), IMAGE),
-    Case("an image of one pixel", other_size(1, 1), "frames[2]"),
+    Case("an image of one pixel", picture("RGB", 1, 1), "frames[2]"),
     # poses
     Case("a word in place of a pose", frame(2, transform_matrix="identity"), MATRIX),
     Case("a list of poses", pose(lambda m: m[None]), MATRIX),
@@ -330,7 +296,7 @@ CASES = (
     Case("path outside without extension", outside("../secret"), PATH),
     Case("absolute path outside", outside("{parent}/secret.jpg"), PATH),
     Case("link outside", linked_outside, PATH),
-    Case("link to itself", link_loop, PATH),
+    Case("link to itself", image(lambda file: file.symlink_to(file)), PATH),
     Case("path of a secret of the system", frame(2, file_path="../../../../../../../../etc/passwd"), PATH),
     Case("no path", frame(2, file_path=None), PATH),
     Case("path a number", frame(2, file_path=7), PATH),
@@ -343,14 +309,14 @@ CASES = (
     # depth
     Case("missing depth", frame(2, depth_file_path="nowhere.png"), "frames[2].depth_file_path"),
     Case("depth outside", frame(2, depth_file_path="../d.png"), "frames[2].depth_file_path"),
-    Case("depth of 8 bits", depth_file("L"), "d.png"),
-    Case("depth in color", depth_file("RGB"), "d.png"),
-    Case("depth cut short", depth_file("I;16", cut=60), "d.png"),
+    Case("depth of 8 bits", gray("L"), "d.png"),
+    Case("depth in color", gray("RGB"), "d.png"),
+    Case("depth cut short", depth(cut), "d.png"),
     Case("depth is a JPEG", frame(2, depth_file_path="images/1.jpg"), "1.jpg"),
     Case("depth path a number", frame(2, depth_file_path=3), FILE),
-    Case("depth a folder", depth_at(lambda file: file.mkdir()), FILE),
-    Case("depth empty", depth_at(lambda file: file.write_bytes(b"")), "d.png"),
-    Case("depth links to itself", depth_at(lambda file: file.symlink_to(file)), FILE),
+    Case("depth a folder", depth(lambda file: file.mkdir()), FILE),
+    Case("depth empty", depth(lambda file: file.write_bytes(b"")), "d.png"),
+    Case("depth links to itself", depth(lambda file: file.symlink_to(file)), FILE),
     # the container
     Case("comma at the end", text('{"frames": [],}'), JSON),
     Case("a comment", text('{"frames": [] // none'), JSON),
