@@ -55,21 +55,6 @@ def test_every_pose_on_the_path_is_rigid_and_the_path_is_smooth():
     assert np.abs(velocities).max() > 1.0
 
 
-def test_cameras_looking_apart_are_joined_by_rotations():
-    angle = np.radians(120)
-    path, _ = camera_path(poses([[0, 0, 0], [0, angle, 0]], np.zeros((2, 3))), np.tile(K, (2, 1, 1)), 30)
-    turns = Rotation.from_matrix(path[:, :3, :3]).as_rotvec()
-    assert np.abs(turns[:, [0, 2]]).max() < 1e-9
-    assert (np.diff(turns[:, 1]) > 0).all() and turns[-1, 1] == pytest.approx(angle)
-
-
-def test_one_camera_is_its_own_path():
-    given = wandering(1)
-    path, Ks = camera_path(given, K[None], 5)
-    np.testing.assert_array_equal(path, given)
-    np.testing.assert_array_equal(Ks, K[None])
-
-
 def inward(num_cameras, height=0.4, radius=2.0, target=(1.0, -2.0, 3.0)):
     """Cameras on half a circle about z, which look at a point from above it; each a little off its place."""
     angles = np.linspace(0, np.pi, num_cameras)
@@ -112,13 +97,6 @@ def test_cameras_that_look_outward_sway_about_the_middle_one():
     np.testing.assert_allclose(path[:, :3, 2], toward / np.linalg.norm(toward, axis=1, keepdims=True), atol=1e-12)
     np.testing.assert_allclose(np.linalg.det(path[:, :3, :3]), 1.0)
     assert (np.einsum("nj,j->n", path[:, :3, 1], given[4, :3, 1]) > 0.9).all()  # upright
-
-
-def test_cameras_with_opposite_ups_sway_too():
-    given = inward(2)
-    given[1, :3, [0, 1]] *= -1  # rolled by half a turn
-    path, _ = orbit_path(given, K, 5.0, 4)
-    assert np.isfinite(path).all()
 
 
 def test_up_is_where_level_cameras_have_it():

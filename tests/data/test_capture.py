@@ -5,28 +5,16 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
-from PIL import Image
 
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.cameras import project_points, transform_points
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.data.open_capture import open_capture
-from ssplat_jax.data.stream_frame import StreamFrame
-from tests.badinputs.cases import HEIGHT, WIDTH, make_capture
+from tests.badinputs.cases import make_capture
 from tests.data.capture_fixture import frame_of, resized, smooth_capture
 from tests.data.planes_fixture import two_planes
 
 FLOAT32_PIXELS = 1e-3
-
-
-def test_image_digests_depend_on_the_given_frames_and_bytes(tmp_path):
-    capture = open_capture(make_capture(tmp_path))
-    before = capture.images_digest([0, 1])
-    assert before != capture.images_digest([1, 0]) != capture.images_digest([1])
-    Image.new("RGB", (WIDTH, HEIGHT), (1, 2, 3)).save(capture.frames[2].path)
-    assert capture.images_digest([0, 1]) == before
-    Image.new("RGB", (WIDTH, HEIGHT), (1, 2, 3)).save(capture.frames[1].path)
-    assert capture.images_digest([0, 1]) != before
 
 
 def test_points_keep_their_pixel_after_resizing_and_transform():
@@ -112,20 +100,6 @@ def test_a_camera_without_a_frame_is_in_the_frame_of_the_capture():
     for i in (3, -1):
         with pytest.raises(InputError, match=r"frame numbers in \[0, 2\]"):
             capture.camera(i)
-
-
-def test_a_scene_file_is_seen_from_the_cameras_of_its_capture():
-    """The scene in the capture's frame, from `camera(i)`, is what the stream's scene is from `camera(i, frame)`."""
-    capture = two_planes(2, 0.2, spin=10.0)
-    frame = StreamFrame.at_camera(capture.frames[1].camtoworld, scale=0.5, near=1.0, far=3.0)
-    points = np.random.default_rng(0).uniform([-1, -1, 2], [1, 1, 4], (50, 3))
-
-    def pixels(camera, points):
-        x = points @ np.asarray(camera.viewmats)[:3, :3].T + np.asarray(camera.viewmats)[:3, 3]
-        return x[:, :2] / x[:, 2:] * np.diag(camera.Ks)[:2] + np.asarray(camera.Ks)[:2, 2]
-
-    seen = pixels(capture.camera(0), points)
-    np.testing.assert_allclose(seen, pixels(capture.camera(0, frame), frame.points_to_stream(points)), atol=1e-3)
 
 
 def test_names_that_are_not_utf8_have_digests():

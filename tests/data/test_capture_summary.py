@@ -12,7 +12,6 @@ from ssplat_jax.config import StreamConfig
 from ssplat_jax.data.capture import ArrayPixels, Capture
 from ssplat_jax.data.capture_summary import (
     UNITS,
-    Summary,
     _depth_map_warnings,
     _depth_warnings,
     frame_warnings,
@@ -53,13 +52,6 @@ def test_warnings_name_a_remedy(capture, words):
     assert any(words in warning for warning in warnings), warnings
 
 
-def test_a_jump_in_the_stream_is_reported():
-    capture = two_planes(8, 0.1)
-    for frame in capture.frames[5:]:
-        frame.camtoworld[0, 3] += 10.0
-    assert any("jump" in w and "frames 4 and 5" in w for w in summarize(capture, StreamConfig()).warnings)
-
-
 def test_depth_maps_are_measured_and_named():
     capture = two_planes(8, 0.2)
     summary = summarize(capture, StreamConfig())
@@ -80,15 +72,6 @@ def test_a_small_median_parallax_is_reported():
     for parallax, wanted in ((1.1, "Little parallax: 1.1 degrees"), (4.0, None)):
         found = _depth_warnings(capture, DepthStatistics(1.0, 2.0, 4.0, 100, 12, parallax, "matches"), steps)
         assert [w.startswith(wanted) for w in found] == [True] if wanted else found == []
-
-
-def test_every_length_of_a_summary_has_its_unit():
-    names = {field.name for field in dataclasses.fields(Summary)}
-    assert set(UNITS) <= names
-    assert all("stream units" in UNITS[name] for name in ("near", "far", "scene_scale"))
-    calls = []
-    summarize(two_planes(8, 0.2), StreamConfig(), calls.append)
-    assert calls == list(range(8))
 
 
 # -- frames -----------------------------------------------------------------------------------------------------------
@@ -165,19 +148,6 @@ def test_a_jump_of_exposure_is_found(gain, room):
         and "(after frames 9)" in warning
         and "1.6 times" in warning.replace("1.7", "1.6")
     )
-
-
-def test_slow_drift_of_exposure_is_no_jump(room):
-    images = room.pixels.images * np.geomspace(0.5, 1.0, 24, dtype=np.float32)[:, None, None, None]
-    assert image_warnings(changed(room, images)) == []
-
-
-def test_a_long_capture_is_looked_at_in_pairs(room):
-    long = reordered(room, np.repeat(np.arange(24), 5))
-    images = long.pixels.images.copy()
-    images[1] = gaussian_filter(images[1], (2.5, 2.5, 0))  # frames 0 and 1 are the first pair
-    (warning,) = image_warnings(changed(long, images))
-    assert "1 images of the 64 looked at are blurred" in warning
 
 
 @pytest.mark.slow  # decodes 64 images each

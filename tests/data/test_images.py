@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from ssplat_jax.data.images import Crop
 from ssplat_jax.data.open_capture import open_capture
 from tests.badinputs.cases import HEIGHT, WIDTH, make_capture
 from tests.data.capture_fixture import resized, smooth_capture
@@ -82,14 +81,6 @@ def test_a_point_moves_to_where_its_color_moves(size):
     depth = small.depth(0)
     assert depth is not None and depth.shape == image.shape[:2]
     np.testing.assert_allclose(depth, 1 + stored[..., 0] / 64, rtol=0, atol=0.51 / 64 * (1 + 1e-5))
-
-
-@pytest.mark.parametrize("size", SIZES)
-def test_the_crop_is_centered_and_covers_the_size(size):
-    crop = Crop.cover((64, 48), size)
-    corners = [crop.left, crop.top, crop.left + size[0] / crop.scale, crop.top + size[1] / crop.scale]
-    np.testing.assert_allclose([corners[0] + corners[2], corners[1] + corners[3]], [64, 48], rtol=1e-14)
-    assert corners[0] >= -1e-12 and corners[1] >= -1e-12 and min(crop.left, crop.top) < 1e-12
 
 
 def test_the_stored_size_leaves_pixels_unchanged(tmp_path):

@@ -77,12 +77,6 @@ def test_distortion_is_the_published_formula():
     np.testing.assert_allclose(lens.distorted(np.array([0.5, -0.3])), [0.66622, -0.324932], atol=1e-12)
 
 
-def test_no_distortion_changes_nothing():
-    image = scene(centers()).astype(np.float32)
-    np.testing.assert_allclose(undistort(image, Lens(), K), image, atol=1e-6)
-    assert check_lens(Lens(), K, WIDE, HIGH, "here") == 0
-
-
 def test_depth_is_not_mixed_across_edges():
     depth = np.where(centers()[..., 0] < 70, 1.0, 5.0).astype(np.float32)
     assert set(np.unique(undistort(depth, LENSES[0], K, order=0))) == {1.0, 5.0}

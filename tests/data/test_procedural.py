@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 
 from ssplat_jax.core.errors import InputError
-from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.procedural import procedural_views
 from ssplat_jax.data.procedural.paths import PATH_KINDS, sample_path
-from ssplat_jax.data.procedural.procedural_views import CAPTURES, procedural_capture_arrays, training_sample
-from ssplat_jax.data.procedural.raycast import raycast, raycast_depths
+from ssplat_jax.data.procedural.procedural_views import procedural_capture_arrays, training_sample
+from ssplat_jax.data.procedural.raycast import raycast_depths
 from ssplat_jax.data.procedural.scene import Finish, SceneBuilder, clearance, fade_scene
 from ssplat_jax.data.procedural.scenes import SCENE_KINDS, sample_scene
 from ssplat_jax.data.procedural.textures import texture_library
@@ -101,13 +100,6 @@ def test_samples_are_of_the_kinds_asked_for(monkeypatch):
         training_sample(3, 4, 24, 32, kinds=("garden",))
 
 
-def test_training_images_are_well_exposed(samples):
-    for images, _, _, _ in samples:
-        assert images.min() >= 0 and images.max() <= 1 and images.dtype == np.float32
-        assert 0.2 < images.mean() < 0.7
-    assert np.median([images.std() for images, _, _, _ in samples]) > 0.1
-
-
 def test_training_cameras_are_varied_and_rigid(samples):
     poses = np.concatenate([poses for _, _, poses, _ in samples]).astype(np.float64)
     gram = np.einsum("vij,vkj->vik", poses[:, :3, :3], poses[:, :3, :3])
@@ -117,25 +109,11 @@ def test_training_cameras_are_varied_and_rigid(samples):
     assert 0.6 <= focals.min() < 0.8 and 1.05 < focals.max() <= 1.3
 
 
-def test_cameras_stand_upright(samples):
-    """The camera's +y axis points roughly along the world's +y axis, down."""
-    for _, _, poses, _ in samples:
-        assert poses[:, 1, 1].min() > 0.2
-
-
 def test_same_seed_same_sample(samples):
     again = training_sample(7, 6, 24, 32)
     for a, b in zip(samples[7], again, strict=True):
         np.testing.assert_array_equal(a, b)
     assert not np.array_equal(samples[7][1], samples[8][1])
-
-
-@pytest.mark.parametrize("kind", SCENE_KINDS)
-def test_same_seed_same_scene(kind):
-    a, b, other = sample_scene(11, kind), sample_scene(11, kind), sample_scene(12, kind)
-    np.testing.assert_array_equal(a.frames, b.frames)
-    np.testing.assert_array_equal(a.faces, b.faces)
-    assert not np.array_equal(a.frames, other.frames)
 
 
 @pytest.mark.parametrize("kind", SCENE_KINDS)
@@ -165,35 +143,6 @@ def test_clearance_is_the_distance_to_analytic_solids():
     np.testing.assert_allclose(clearance(scene, points), wanted, atol=1e-6)
 
 
-def test_clearance_of_a_stretched_ball_is_a_lower_bound():
-    b = SceneBuilder(np.random.default_rng(0), texture_library())
-    b.shell([0, 0, 0], [9, 9, 9], Finish((0,)), Finish((0,)), Finish((0,)))
-    b.dome(100.0, Finish((0,)))
-    half = np.array([1.0, 0.4, 2.0])
-    b.add("ball", [0, 0, 0], half, Finish((0,)))
-    scene = b.build(focus=[0, 0, 0], orbit_radius=1.0, eye=[0, 0, 0])
-    rng = np.random.default_rng(1)
-    surface = rng.standard_normal((20000, 3))
-    surface = surface / np.linalg.norm(surface, axis=-1, keepdims=True) * half
-    points = rng.uniform(-4, 4, (40, 3))
-    points = points[np.linalg.norm(points / half, axis=-1) > 1]
-    distances = np.linalg.norm(points[:, None] - surface, axis=-1).min(axis=1)
-    free = clearance(scene, points)
-    assert (free > 0).all() and (free <= distances).all()
-
-
-@pytest.mark.parametrize("name", [name for name in CAPTURES if name != "revisit"])
-def test_captures_are_smooth_and_free(name):
-    images, depths, poses, Ks = procedural_capture_arrays(name, 24, 24, 32)
-    assert images.shape == (24, 24, 32, 3) and Ks.shape == (24, 3, 3)
-    assert depths.min() > 0.3
-    turns = np.einsum("vi,vi->v", poses[1:, :3, 2], poses[:-1, :3, 2])
-    assert turns.min() > np.cos(np.radians(25))
-    steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=-1)
-    assert steps.max() < 3 * steps.min()
-    assert np.median(steps) < 0.4 * np.median(depths)  # with a third of the demo's frames
-
-
 def test_revisit_returns_to_places_that_it_saw_and_hardly_moves_there():
     _, depths, poses, _ = procedural_capture_arrays("revisit", 48, 24, 32)
     centers, gazes = poses[:, :3, 3], poses[:, :3, 2]
@@ -205,17 +154,6 @@ def test_revisit_returns_to_places_that_it_saw_and_hardly_moves_there():
     assert seen_before.min() > np.cos(np.radians(10)), "a later view looks where an earlier one looked"
     assert np.median(depths[24:]) < np.median(depths[:24]), "and is nearer"
     assert depths.min() > 0.3
-
-
-def test_faded_scene_has_weaker_textures():
-    scene = sample_scene(3, "room")
-    poses, Ks = sample_path(3, scene, "handheld", 4, 48, 64)
-
-    def detail(contrast):
-        images, _ = raycast(fade_scene(scene, contrast), np.linalg.inv(poses), Ks, 48, 64)
-        return np.median(np.abs(np.diff(np.asarray(images), axis=2)))
-
-    assert detail(0.2) < 0.4 * detail(1.0)
 
 
 def test_views_of_revisit_at_nearly_one_pose_differ_by_noise():
@@ -233,36 +171,9 @@ def test_fading_keeps_the_scene_or_takes_all_texture_away():
     np.testing.assert_allclose(flat[..., 12:15], at_middle, atol=1e-6)
 
 
-def test_unknown_kinds_are_refused():
-    scene = sample_scene(0)
-    with pytest.raises(InputError, match="nowhere"):
-        sample_scene(0, "nowhere")
-    with pytest.raises(InputError, match="teleport"):
-        sample_path(0, scene, "teleport", 2, 24, 32)
-    with pytest.raises(InputError, match="nowhere"):
-        procedural_capture_arrays("nowhere", 2, 24, 32)
-    with pytest.raises(InputError, match="at least 1"):
-        procedural_capture_arrays("room", 0, 24, 32)
-
-
-def test_orbit_keeps_its_object_in_view():
-    scene = sample_scene(5, "objects")
-    poses, Ks = sample_path(5, scene, "orbit", 12, 24, 32)
-    local = np.einsum("vji,vj->vi", poses[:, :3, :3], scene.focus - poses[:, :3, 3])
-    pixels = np.einsum("vij,vj->vi", Ks, local)
-    pixels = pixels[:, :2] / pixels[:, 2:]
-    assert (local[:, 2] > 0).all()
-    assert (np.abs(pixels - [16, 12]) < [12, 10]).all()
-
-
 def test_every_ray_ends():
     for seed, kind in enumerate(SCENE_KINDS):
         scene = sample_scene(seed, kind)
         poses, Ks = sample_path(seed, scene, "pan", 8, 24, 32)
         depths = np.asarray(raycast_depths(scene, np.linalg.inv(poses), Ks, 24, 32))
         assert np.isfinite(depths).all() and depths.max() < (620 if kind == "yard" else 100)
-
-
-def test_an_option_of_a_procedural_path_given_twice_is_refused():
-    with pytest.raises(InputError, match="wanted every option once, got one twice; drop one"):
-        open_capture("procedural:room?frames=4&frames=9")

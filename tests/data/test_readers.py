@@ -93,15 +93,6 @@ def test_a_colmap_model_is_found_in_its_usual_places(sparse, tmp_path):
     assert len(open_capture(tmp_path)) == NUM_FRAMES
 
 
-def test_of_several_colmap_models_the_first_is_read(tmp_path):
-    """The number counts, not the name: 2 comes before 10, and 0 before both."""
-    write_colmap_binary(tmp_path, [camera_bytes(1, (99.0, FY, CX, CY))], sparse="sparse/10")
-    write_colmap_binary(tmp_path, sparse="sparse/2")
-    assert open_capture(tmp_path).frames[0].K[0, 0] == FX
-    write_colmap_binary(tmp_path, [camera_bytes(1, (77.0, FY, CX, CY))])
-    assert open_capture(tmp_path).frames[0].K[0, 0] == 77
-
-
 def test_colmap_cameras_that_no_image_uses_may_be_of_any_model(tmp_path):
     cameras = [camera_bytes(7, (FX, FY, CX, CY, 0.9), camera=5), camera_bytes(1, (FX, FY, CX, CY))]
     write_colmap_binary(tmp_path / "binary", [*cameras, camera_bytes(17, (WIDTH, HEIGHT), camera=8)])
@@ -216,16 +207,6 @@ def test_tum_calibration_follows_from_the_folder_name(tmp_path):
     frame = open_capture(root).frames[0]
     np.testing.assert_allclose(frame.K, [[517.3, 0, 319.1], [0, 516.5, 255.8], [0, 0, 1]])
     assert frame.lens is not None and (frame.lens.k1, frame.lens.p1, frame.lens.k3) == (0.2624, -0.0054, 1.1633)
-
-
-def test_tum_images_listed_at_several_times_count_once(tmp_path):
-    write_tum(tmp_path)
-    lines = (tmp_path / "rgb.txt").read_text().splitlines()
-    again = f"1305031102.500000 {lines[1].split()[1]}"
-    (tmp_path / "rgb.txt").write_text("\n".join([again, *lines]))
-    capture = open_capture(tmp_path)
-    np.testing.assert_allclose(capture.camtoworlds, poses(), atol=2e-6)
-    assert capture.notes == ("1 lines of rgb.txt list an image again; its first time counts.",)
 
 
 def test_record3d_images_may_have_intrinsics_of_their_own(tmp_path):
