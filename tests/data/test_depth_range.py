@@ -150,15 +150,6 @@ def test_far_is_widened_if_either_pairs_or_parallax_are_few(num_frames, far_shar
     assert depths.q99 == pytest.approx(depths.median * (depth_range.MIN_REACH if is_widened else 1.0), rel=0.03)
 
 
-def test_depth_of_bare_walls_is_a_guess_from_the_steps():
-    capture = two_planes(6, 0.2)
-    assert isinstance(capture.pixels, ArrayPixels)
-    capture.pixels.images[:] = 0.5
-    depths = estimate_depths(capture, range(6))
-    assert depths.source == "baselines"
-    np.testing.assert_allclose(depths.median, 5 * 0.2, rtol=1e-12)
-
-
 @settings(max_examples=100, deadline=None)
 @given(st.floats(1e-6, 1e6), st.floats(1, 100), st.floats(1, 100))
 def test_range_is_bounded_and_scales(median, spread_near, spread_far):

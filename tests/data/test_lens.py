@@ -64,13 +64,6 @@ def test_fisheye_radius_is_the_angle_times_its_series(degrees):
     np.testing.assert_allclose(bent, radius * direction, rtol=1e-12, atol=1e-15)
 
 
-@pytest.mark.parametrize("fields", [{"camera_model": "OPENCV_FISHEYE"}, {"is_fisheye": True}])
-def test_a_fisheye_capture_is_undistorted(fields, tmp_path):
-    capture = open_capture(make_capture(tmp_path, lambda root, meta: meta.update(k1=0.03, k3=-0.01, **fields)))
-    assert {frame.lens for frame in capture.frames} == {FisheyeLens(k1=0.03, k3=-0.01)}
-    assert any("undone" in note for note in capture.notes)
-
-
 def test_distortion_is_the_published_formula():
     """Worked by hand for (0.5, -0.3): r^2 = 0.34, radial 1.05644, tangential (-0.03 + 0.168, 0.052 - 0.06)."""
     lens = Lens(k1=0.2, k2=-0.1, p1=0.1, p2=0.2)

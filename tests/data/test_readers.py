@@ -62,11 +62,9 @@ def test_llff_images_have_the_poses_of_their_names_and_not_of_what_they_link_to(
     assert tuple(frame.name for frame in capture.frames) == NAMES["LLFF"]
     assert [frame.path.name for frame in capture.frames] == [f"{9 - i}.JPG" for i in range(NUM_FRAMES)]
     np.testing.assert_allclose(capture.camtoworlds, poses(), atol=1e-12)
-    (tmp_path / "raw").rename(outside := tmp_path.with_name(f"{tmp_path.name}_raw"))
-    link = tmp_path / "images" / "IMG_2.JPG"
-    link.unlink()
-    link.symlink_to(outside / "7.JPG")
-    with pytest.raises(InputError, match=r"IMG_\d.JPG: wanted a"):
+    (tmp_path / "images" / "IMG_0.JPG").unlink()
+    (tmp_path / "images" / "IMG_0.JPG").symlink_to(__file__)
+    with pytest.raises(InputError, match=r"IMG_0\.JPG: wanted a path inside"):
         open_capture(tmp_path)
 
 
@@ -102,32 +100,23 @@ def test_colmap_cameras_that_no_image_uses_may_be_of_any_model(tmp_path):
         np.testing.assert_array_equal(open_capture(tmp_path / root).frames[0].K, K)
 
 
-@pytest.mark.parametrize(
-    ("model", "name", "params", "wanted"),
-    [
-        (0, "SIMPLE_PINHOLE", (FX, CX, CY), {}),
-        (1, "PINHOLE", (FX, FY, CX, CY), {}),
-        (2, "SIMPLE_RADIAL", (FX, CX, CY, 0.11), {"k1": 0.11}),
-        (3, "RADIAL", (FX, CX, CY, 0.11, 0.02), {"k1": 0.11, "k2": 0.02}),
-        (4, "OPENCV", (FX, FY, CX, CY, 0.11, 0.02, 0.01, 0.03), {"k1": 0.11, "k2": 0.02, "p1": 0.01, "p2": 0.03}),
-        (
-            5,
-            "OPENCV_FISHEYE",
-            (FX, FY, CX, CY, 0.11, 0.02, 0.01, 0.03),
-            {"k1": 0.11, "k2": 0.02, "k3": 0.01, "k4": 0.03},
-        ),
-        (8, "SIMPLE_RADIAL_FISHEYE", (FX, CX, CY, 0.11), {"k1": 0.11}),
-        (9, "RADIAL_FISHEYE", (FX, CX, CY, 0.11, 0.02), {"k1": 0.11, "k2": 0.02}),
-        (15, "FISHEYE", (FX, FY, CX, CY), {}),
-        (
-            6,
-            "FULL_OPENCV",
-            (FX, FY, CX, CY, 0.11, 0.02, 0.01, 0.03, 0.04, 0, 0, 0),
-            {"k1": 0.11, "k2": 0.02, "p1": 0.01, "p2": 0.03, "k3": 0.04},
-        ),
-    ],
+LENS = (0.11, 0.02, 0.01, 0.03)
+MODELS = (
+    (0, "SIMPLE_PINHOLE", (FX, CX, CY), ""),
+    (1, "PINHOLE", (FX, FY, CX, CY), ""),
+    (2, "SIMPLE_RADIAL", (FX, CX, CY, 0.11), "k1"),
+    (3, "RADIAL", (FX, CX, CY, 0.11, 0.02), "k1 k2"),
+    (4, "OPENCV", (FX, FY, CX, CY, *LENS), "k1 k2 p1 p2"),
+    (5, "OPENCV_FISHEYE", (FX, FY, CX, CY, *LENS), "k1 k2 k3 k4"),
+    (6, "FULL_OPENCV", (FX, FY, CX, CY, *LENS, 0.04, 0, 0, 0), "k1 k2 p1 p2 k3"),
+    (8, "SIMPLE_RADIAL_FISHEYE", (FX, CX, CY, 0.11), "k1"),
+    (9, "RADIAL_FISHEYE", (FX, CX, CY, 0.11, 0.02), "k1 k2"),
+    (15, "FISHEYE", (FX, FY, CX, CY), ""),
 )
-def test_colmap_camera_models_give_their_intrinsics(model, name, params, wanted, tmp_path):
+
+
+@pytest.mark.parametrize(("model", "name", "params", "coefficients"), MODELS)
+def test_colmap_camera_models_give_their_intrinsics(model, name, params, coefficients, tmp_path):
     write_colmap_binary(tmp_path / "binary", [camera_bytes(model, params)])
     text = f"1 {name} {WIDTH} {HEIGHT} " + " ".join(map(str, params))
     write_colmap_text(tmp_path / "text", camera=text)
@@ -136,7 +125,7 @@ def test_colmap_camera_models_give_their_intrinsics(model, name, params, wanted,
         assert (frame.K[0, 0], frame.K[1, 1]) == (FX, FX if params[1] == CX else FY)
         assert (frame.K[0, 2], frame.K[1, 2]) == (CX, CY)
         found = {} if frame.lens is None else {k: v for k, v in vars(frame.lens).items() if v}
-        assert found == wanted
+        assert found == dict(zip(coefficients.split(), (*LENS, 0.04), strict=False))
         assert isinstance(frame.lens, FisheyeLens) == ("FISHEYE" in name)
 
 
@@ -250,20 +239,6 @@ def test_a_capture_with_a_number_for_a_name_has_no_others_beside_it(tmp_path):
     lines = (tmp_path / "24" / "images.txt").read_text().splitlines()
     (tmp_path / "24" / "images.txt").write_text("\n".join(lines[:4]) + "\n")
     assert len(open_capture(tmp_path / "24")) == 1
-
-
-def test_tum_files_that_are_missing_are_counted(tmp_path):
-    write_tum(tmp_path)
-    sorted((tmp_path / "rgb").iterdir())[1].unlink()
-    (tmp_path / "depth" / "3.png").unlink()
-    capture = open_capture(tmp_path)
-    assert tuple(frame.name for frame in capture.frames) == tuple(NAMES["TUM RGB-D"][i] for i in (0, 2, 3))
-    assert [capture.pixels.has_depth(i) for i in range(3)] == [True, True, False]
-    assert capture.notes == tuple(f"1 files of {name}.txt are missing and left out." for name in ("rgb", "depth"))
-    for file in (tmp_path / "rgb").iterdir():
-        file.unlink()
-    with pytest.raises(InputError, match=r"rgb\.txt: line 2: wanted an existing file"):
-        open_capture(tmp_path)
 
 
 def lost(*names):
