@@ -40,8 +40,7 @@ class Inspect:
         capture = open_capture(path, size=parse_size(self.size))
         num_steps = min(NUM_REFERENCES, len(capture))
         with Reporter().progress("matching", num_steps, waiting="") as advance:
-            summary = summarize(capture, preset("tiny"), advance)
+            facts = summarize(capture, preset("tiny"), advance)
             advance(num_steps)
-        facts = summary.to_dict()
         print(json_text(facts)) if self.json else print_facts(facts, UNITS)
         return 0

@@ -75,13 +75,8 @@ def orbit_path(
 
     Around a common point (`looked_at`) it is a circle about the cameras' up axis (`upward`), at their mean distance
     from it and their mean height. Cameras that look outward have no such point, and from outside a room shows its walls
-    only: the path is then a sway, a small circle about the middle camera, which looks at a point straight ahead.
-
-    Args:
-        camtoworlds: the cameras, with OpenCV axes.
-        K: intrinsics of the path, pixels.
-        distance: of what the cameras see, in the units of the poses; a sway looks at a point so far ahead.
-        num_cameras: cameras on the path, the first of which is not repeated.
+    only: the path is then a sway, a small circle about the middle camera, which looks at a point straight ahead at the
+    `distance` of what the cameras see, in units of the poses.
     """
     middle = camtoworlds[len(camtoworlds) // 2]
     turns = 2 * np.pi * np.arange(num_cameras) / num_cameras

@@ -228,7 +228,8 @@ class Capture:
     def stream_order(self, config: StreamConfig, indices: Sequence[int] | None, frame: StreamFrame) -> list[int]:
         """Returns `indices` (default: all) in the order of streaming, with slow video interleaved (`interleave`).
 
-        The typical depth is taken to be the geometric mean of `near` and `far`. With `causal`, frames keep their order.
+        The typical depth is taken to be the geometric mean of near and far. A causal stream keeps the order of frames,
+        since it would have to wait for a second of video.
         """
         used = _indices(self, indices)
         if config.stream.causal:

@@ -4,7 +4,6 @@ Warnings about frames tell of copies, disorder, gaps in the motion, blur and jum
 all frames; images, which must be decoded, in all frames of a short capture and in evenly spread pairs of a long one.
 """
 
-import dataclasses
 import hashlib
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -41,8 +40,12 @@ SHUFFLED_RANK = 0.15  # of the number of frames; median rank of the next camera 
 ASIDE_RATIO = 5.0  # steps to and from a frame over the median step, and over the step from its neighbor to the other
 MAX_TURN_SHARE = 0.8  # of the field of view, turned between neighbors, above which they hardly overlap
 
-_LENGTHS = ("path_length", "extent", "median_step", "median_depth", "depth_maps_median")
-UNITS = dict.fromkeys(_LENGTHS, "capture units") | {
+UNITS = {
+    "path_length": "capture units",
+    "extent": "capture units",
+    "median_step": "capture units",
+    "median_depth": "capture units",
+    "depth_maps_median": "capture units",
     "num_depth_maps": "(a run does not need them; its depths come from the images)",
     "near": "stream units (capture units times scene_scale)",
     "far": "stream units (capture units times scene_scale)",
@@ -55,40 +58,10 @@ UNITS = dict.fromkeys(_LENGTHS, "capture units") | {
 """Units of the facts, or what else a reader needs to know, by their names."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Summary:
-    """Facts about a capture; `UNITS` has their units."""
-
-    name: str
-    format: str
-    num_frames: int
-    num_depth_maps: int
-    size: tuple[int, int]  # (width, height) of delivered images
-    stored_size: tuple[int, int]  # of the first frame
-    focal: tuple[float, float]  # pixels of the first delivered image
-    fov_degrees: tuple[float, float]
-    path_length: float
-    extent: float  # diagonal of the camera centers' bounding box
-    median_step: float  # between frames in stream order
-    step_over_depth: float  # median step over median depth
-    median_depth: float
-    depth_maps_median: float | None  # of known depths in some depth maps; None without depth maps
-    depth_source: str
-    num_matches: int
-    parallax_degrees: float
-    scene_scale: float
-    near: float
-    far: float
-    voxel_in_capture_units: float
-    warnings: tuple[str, ...]
-
-    def to_dict(self) -> dict[str, Any]:
-        """Returns the fields as plain JSON types."""
-        return {k: list(v) if isinstance(v, tuple) else v for k, v in dataclasses.asdict(self).items()}
-
-
-def summarize(capture: Capture, config: StreamConfig, advance: Callable[[int], None] = lambda done: None) -> Summary:
-    """Returns the summary of a capture for a run with `config`.
+def summarize(
+    capture: Capture, config: StreamConfig, advance: Callable[[int], None] = lambda done: None
+) -> dict[str, Any]:
+    """Returns facts about a capture for a run with `config`, by name, as plain JSON types; `UNITS` has their units.
 
     `advance` is called with the number of frames, of at most `NUM_REFERENCES`, that have been matched.
     """
@@ -105,30 +78,30 @@ def summarize(capture: Capture, config: StreamConfig, advance: Callable[[int], N
         warnings = [wrong_poses]
     else:
         warnings = [*_depth_warnings(capture, depths, steps), *_depth_map_warnings(depths, measured)]
-    return Summary(
-        name=capture.name,
-        format=capture.format,
-        num_frames=len(capture),
-        num_depth_maps=sum(map(capture.pixels.has_depth, range(len(capture)))),
-        size=(capture.width, capture.height),
-        stored_size=(first.width, first.height),
-        focal=(float(K[0, 0]), float(K[1, 1])),
-        fov_degrees=(_field(capture.width, K[0, 0]), _field(capture.height, K[1, 1])),
-        path_length=float(steps.sum()),
-        extent=float(np.linalg.norm(np.ptp(centers, axis=0))),
-        median_step=median_step,
-        step_over_depth=median_step / depths.median,
-        median_depth=depths.median,
-        depth_maps_median=measured,
-        depth_source=depths.source,
-        num_matches=depths.num_points,
-        parallax_degrees=depths.parallax_degrees,
-        scene_scale=scale,
-        near=near,
-        far=far,
-        voxel_in_capture_units=config.memory.voxel_size / scale,
-        warnings=(*capture.notes, *warnings, *frame_warnings(capture)),
-    )
+    return {
+        "name": capture.name,
+        "format": capture.format,
+        "num_frames": len(capture),
+        "num_depth_maps": sum(map(capture.pixels.has_depth, range(len(capture)))),
+        "size": [capture.width, capture.height],  # of delivered images
+        "stored_size": [first.width, first.height],
+        "focal": [float(K[0, 0]), float(K[1, 1])],
+        "fov_degrees": [_field(capture.width, K[0, 0]), _field(capture.height, K[1, 1])],
+        "path_length": float(steps.sum()),
+        "extent": float(np.linalg.norm(np.ptp(centers, axis=0))),  # diagonal of the camera centers' bounding box
+        "median_step": median_step,  # in stream order
+        "step_over_depth": median_step / depths.median,
+        "median_depth": depths.median,
+        "depth_maps_median": measured,
+        "depth_source": depths.source,
+        "num_matches": depths.num_points,
+        "parallax_degrees": depths.parallax_degrees,
+        "scene_scale": scale,
+        "near": near,
+        "far": far,
+        "voxel_in_capture_units": config.memory.voxel_size / scale,
+        "warnings": [*capture.notes, *warnings, *frame_warnings(capture)],
+    }
 
 
 def _field(extent: int, focal: float) -> float:

@@ -42,15 +42,8 @@ def sample_path(
 ) -> tuple[Float[np.ndarray, "v 4 4"], Float[np.ndarray, "v 3 3"]]:
     """Returns the camera-to-world poses of a random path through a scene, and the intrinsics that they share.
 
-    Args:
-        seed: the same seed gives the same path.
-        scene: the world.
-        kind: one of `PATH_KINDS`; None draws one.
-        num_views: number of poses.
-        height: image rows.
-        width: image columns.
-        step: typical distance between consecutive views; None takes 1 to 10 % of the orbit radius.
-        min_clearance: distance to all surfaces, where the path can keep it.
+    `step` is the typical distance between consecutive views (None: 1 to 10 % of the orbit radius), `min_clearance` that
+    to all surfaces, where the path can keep it. `kind` is one of `PATH_KINDS`; None draws one.
     """
     if kind is not None and kind not in _STYLES:
         raise InputError(f"procedural path: kind must be one of {', '.join(PATH_KINDS)}, got {kind!r}.")
@@ -62,14 +55,11 @@ def sample_path(
     wobble, irregularity = rng.uniform(0.0, 0.03), rng.uniform(0.1, MAX_IRREGULARITY)
     poses = []
     for _ in range(num_views):
-        poses.append(_pose(rng, walker, wobble))
-        _advance(rng, scene, walker, style, typical * _step_factor(rng, irregularity), min_clearance)
+        forward = _unit(walker.gaze + wobble * rng.standard_normal(3))
+        poses.append(look_along(walker.position, forward, walker.roll))
+        factor = np.clip(np.exp(irregularity * rng.standard_normal()), 1 / MAX_STEP_FACTOR, MAX_STEP_FACTOR)
+        _advance(rng, scene, walker, style, typical * float(factor), min_clearance)
     return np.stack(poses).astype(np.float32), _intrinsics(rng, num_views, height, width)
-
-
-def _step_factor(rng: np.random.Generator, irregularity: float) -> float:
-    """Ratio of a step to the typical one: log-normal, clipped to `MAX_STEP_FACTOR`."""
-    return float(np.clip(np.exp(irregularity * rng.standard_normal()), 1 / MAX_STEP_FACTOR, MAX_STEP_FACTOR))
 
 
 def _intrinsics(rng: np.random.Generator, num_views: int, height: int, width: int) -> np.ndarray:
@@ -127,12 +117,6 @@ def _free_heading(rng, scene: Scene, walker: _Walker, wish: np.ndarray, distance
     free = clearance(scene, points.reshape(-1, 3)).reshape(2, -1).min(axis=0)
     ok = np.flatnonzero(free > min_clearance)
     return options[ok[0] if len(ok) else int(np.argmax(free))]
-
-
-def _pose(rng: np.random.Generator, walker: _Walker, wobble: float) -> np.ndarray:
-    """Pose of the walker's camera with a random error of `wobble` radians."""
-    forward = _unit(walker.gaze + wobble * rng.standard_normal(3))
-    return look_along(walker.position, forward, walker.roll)
 
 
 def look_along(position: np.ndarray, forward: np.ndarray, roll: float = 0.0) -> Float[np.ndarray, "4 4"]:

@@ -62,9 +62,6 @@ def training_sample(
     Returns:
         Images in [0, 1], z-depths (of yards, infinite beyond `SKY_DISTANCE`), camera-to-world poses and intrinsics in
         pixels.
-
-    Raises:
-        InputError: an unknown kind.
     """
     rng = np.random.default_rng([3, seed])
     found = None

@@ -9,6 +9,7 @@ ray caster is bound by gathers.
 import functools
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import UInt8, UInt32
@@ -27,17 +28,11 @@ _PHOTOS = (
 )  # fmt: skip
 
 
-class TextureLibrary:
-    """Mip pyramids of all textures, and their groups.
+class TextureLibrary(NamedTuple):
+    """Mip pyramids of all textures, and their groups."""
 
-    Attributes:
-        pyramids: packed texels, level 0 first, each level row by row.
-        groups: texture indices by topic: photo, wall, floor, pattern, noise, facade, sky, leaves.
-    """
-
-    def __init__(self, pyramids: UInt32[np.ndarray, "n texels"], groups: dict[str, np.ndarray]) -> None:
-        self.pyramids = pyramids
-        self.groups = groups
+    pyramids: UInt32[np.ndarray, "n texels"]  # packed texels, level 0 first, each level row by row
+    groups: dict[str, np.ndarray]  # texture indices by topic: photo, wall, floor, pattern, noise, facade, sky, leaves
 
 
 @functools.lru_cache(maxsize=1)
