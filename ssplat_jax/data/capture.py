@@ -34,19 +34,15 @@ KEPT_BYTES = 256 << 20  # of decoded images that wait for their second use
 
 @runtime_checkable
 class Pixels(Protocol):
-    """Source of a capture's images and depth maps, by the index of the frame."""
+    """Source of a capture's images and depth maps, by the index of the frame.
 
-    def image(self, i: int, crop: Crop) -> Float32[np.ndarray, "h w 3"]:
-        """Returns image `i` as RGB in [0, 1], at the size of `crop`."""
-        ...
+    `image` delivers RGB in [0, 1] at the size of `crop`; `depth` the stored map (camera z in capture units, 0 where
+    unknown), or None if there is none, which `has_depth` tells without decoding it.
+    """
 
-    def depth(self, i: int) -> Float32[np.ndarray, "h w"] | None:
-        """Returns depth map `i` as stored (camera z in capture units, 0 where unknown), or None if there is none."""
-        ...
-
-    def has_depth(self, i: int) -> bool:
-        """True if frame `i` has a depth map; does not decode it."""
-        ...
+    def image(self, i: int, crop: Crop) -> Float32[np.ndarray, "h w 3"]: ...
+    def depth(self, i: int) -> Float32[np.ndarray, "h w"] | None: ...
+    def has_depth(self, i: int) -> bool: ...
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -250,6 +246,9 @@ class Capture:
             config: the configuration of the model.
             indices: frames in the order of streaming; by default all frames, in `stream_order`.
             frame: by default `stream_frame(config, indices)`.
+
+        Raises:
+            InputError: an image is damaged; it comes when that image's chunk is asked for.
         """
         used = _indices(self, indices)
         frame = frame or self.stream_frame(config, used)

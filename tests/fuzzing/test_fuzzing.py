@@ -21,7 +21,7 @@ from ssplat_jax.data.readers import tum
 from tests.badinputs.cases import mutant
 from tests.fuzzing.parsers import PARSERS
 
-NUM_FILES = int(os.environ.get("FUZZ_FILES", "20"))  # for each parser; seeded, so that failures can be repeated
+NUM_FILES = int(os.environ.get("FUZZ_FILES", "40"))  # for each parser; seeded, so that failures can be repeated
 MAX_SECONDS = 5
 MAX_BYTES = 1 << 30
 
