@@ -39,7 +39,6 @@ def assert_right(capture, indices, tolerance=MEDIAN_TOLERANCE):
 @pytest.mark.parametrize(
     "motion",
     [
-        {"step": 0.03},
         {"step": 0.1},
         {"step": 0.002},  # 0.05 % of the depth per frame
         {"step": 0.03, "spin": 1.0},
@@ -48,8 +47,8 @@ def assert_right(capture, indices, tolerance=MEDIAN_TOLERANCE):
     ids=str,
 )
 def test_depths_of_a_known_scene(motion):
-    capture = two_planes(16, **motion)
-    assert_right(capture, range(16), tolerance=2.0 if motion["step"] < 0.01 else MEDIAN_TOLERANCE)
+    capture = two_planes(10, **motion)
+    assert_right(capture, range(10), tolerance=2.0 if motion["step"] < 0.01 else MEDIAN_TOLERANCE)
 
 
 def share_outside(capture):
@@ -89,14 +88,13 @@ def test_only_the_given_frames_are_used():
 
 def test_a_diverged_camera_leaves_the_other_places_apart():
     """Given or not; where it is not given, it changes nothing at all."""
-    capture, config = two_planes(12, 0.05), StreamConfig()
-    before = capture.stream_frame(config, range(11)).to_dict()
-    capture.frames[11].camtoworld[:3, 3] = MAX_COORDINATE
-    assert capture.stream_frame(config, range(11)).to_dict() == before
-    depths = estimate_depths(capture, range(12))
-    truth = np.median(true_depths(capture, range(12)))
+    capture = two_planes(9, 0.05)
+    before = estimate_depths(capture, range(8))
+    capture.frames[8].camtoworld[:3, 3] = MAX_COORDINATE
+    assert estimate_depths(capture, range(8)) == before
+    depths = estimate_depths(capture, range(9))
+    truth = np.median(true_depths(capture, range(9)))
     assert depths.source == "matches" and 1 / MEDIAN_TOLERANCE < depths.median / truth < MEDIAN_TOLERANCE
-    assert not any("one place" in warning for warning in summarize(capture, config)["warnings"])
 
 
 @pytest.mark.parametrize("num_frames", [1, 3])
@@ -175,11 +173,10 @@ def test_range_is_bounded_and_scales(median, spread_near, spread_far):
 # -- real captures ----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("stride", "context"), [(1, 24), (5, 8)])
-def test_kinect_depths_of_a_hand_held_video(stride, context, captures):
+def test_kinect_depths_of_a_hand_held_video(captures):
     """The median is within 35 % of the Kinect's over the same frames, whose depths are inside [near, far]."""
     capture = open_capture(captures / "redkitchen", size=(320, 240))
-    used = interleaved_split(len(capture), stride, context).context
+    used = interleaved_split(len(capture), 5, 8).context
     depths = estimate_depths(capture, used)
     truth = true_depths(capture, range(used[0], used[-1] + 1))
     assert depths.source == "matches"
