@@ -50,52 +50,14 @@ class ChunkRecord:
     num_gaussians: int  # shown
     held_back_psnr: float | None = None  # dB, mean of the shown scores; None where none was taken
 
-    def to_dict(self) -> dict[str, Any]:
-        """The fields as plain JSON types; the inverse is `from_dict`."""
-        fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        views = [
-            {
-                "frame": view.frame,
-                "camtoworld": view.camtoworld.tolist(),
-                "K": view.K.tolist(),
-                "exposure": view.exposure.tolist(),
-                "thumbnail": base64.b64encode(view.thumbnail).decode(),
-            }
-            for view in self.views
-        ]
-        return {"kind": RECORD_KIND} | fields | {"views": views}
-
-    @staticmethod
-    def from_dict(fields: dict[str, Any]) -> "ChunkRecord":
-        """The record of the fields that `to_dict` gave.
-
-        Raises:
-            LookupError, TypeError, ValueError: they are of another kind or incomplete.
-        """
-        if fields["kind"] != RECORD_KIND:
-            raise ValueError(f"wanted {RECORD_KIND}, got {fields['kind']}")
-        views = tuple(
-            RecordedView(
-                frame=view["frame"],
-                camtoworld=np.array(view["camtoworld"], np.float64).reshape(4, 4),
-                K=np.array(view["K"], np.float64).reshape(3, 3),
-                exposure=np.array(view["exposure"], np.float64).reshape(3),
-                thumbnail=base64.b64decode(view["thumbnail"]),
-            )
-            for view in fields["views"]
-        )
-        rest = {name: fields[name] for name in ("num_views", "seconds", "occupancy", "num_gaussians", "held_back_psnr")}
-        width, height = fields["size"]
-        return ChunkRecord(size=(width, height), views=views, **rest)
-
 
 def save_chunk_record(path: Path, record: ChunkRecord) -> None:
-    """Writes a record, atomically.
-
-    Raises:
-        StorageError: the file cannot be written.
-    """
-    write_json(path, record.to_dict())
+    """Writes a record, atomically."""
+    fields = dataclasses.asdict(record)
+    for view in fields["views"]:
+        view |= {name: view[name].tolist() for name in ("camtoworld", "K", "exposure")}
+        view["thumbnail"] = base64.b64encode(view["thumbnail"]).decode()
+    write_json(path, {"kind": RECORD_KIND} | fields)
 
 
 def load_chunk_records(paths: Sequence[Path]) -> list[ChunkRecord]:
@@ -103,10 +65,27 @@ def load_chunk_records(paths: Sequence[Path]) -> list[ChunkRecord]:
     records = []
     for path in paths:
         try:
-            records.append(ChunkRecord.from_dict(json.loads(path.read_bytes())))
+            records.append(_parse_record(json.loads(path.read_bytes())))
         except (OSError, LookupError, TypeError, ValueError, AttributeError):
             break  # a run that is being started anew, or a file of another program: pictures of it are a luxury
     return records
+
+
+def _parse_record(fields: dict[str, Any]) -> ChunkRecord:
+    if fields.pop("kind") != RECORD_KIND:
+        raise ValueError("a file of another kind")
+    views = tuple(
+        RecordedView(
+            frame=view["frame"],
+            camtoworld=np.array(view["camtoworld"], np.float64).reshape(4, 4),
+            K=np.array(view["K"], np.float64).reshape(3, 3),
+            exposure=np.array(view["exposure"], np.float64).reshape(3),
+            thumbnail=base64.b64decode(view["thumbnail"]),
+        )
+        for view in fields.pop("views")
+    )
+    width, height = fields.pop("size")
+    return ChunkRecord(size=(width, height), views=views, **fields)
 
 
 def make_thumbnail(image: Float[np.ndarray, "h w 3"]) -> bytes:
@@ -125,22 +104,14 @@ def open_thumbnail(encoded: bytes) -> UInt8[np.ndarray, "h w 3"]:
 
 
 def save_delta(path: Path, delta: SceneDelta, header: dict[str, Any] | None = None) -> None:
-    """Writes one delta and the caller's JSON-serializable `header` to an `.npz` file, atomically.
-
-    Raises:
-        StorageError: the file cannot be written.
-    """
+    """Writes one delta and the caller's JSON-serializable `header` to an `.npz` file, atomically."""
     arrays = {field.name: np.asarray(getattr(delta.gaussians, field.name)) for field in dataclasses.fields(Gaussians)}
     arrays |= {"rows": delta.rows, "confidences": delta.confidences}
     save_arrays(path, arrays, DELTA_KIND, {"capacity": delta.capacity, "caller": header or {}})
 
 
 def load_delta(path: Path) -> SceneDelta:
-    """Reads a delta that `save_delta` wrote.
-
-    Raises:
-        StorageError: the file is missing, of another kind, or damaged.
-    """
+    """Reads a delta that `save_delta` wrote."""
     arrays, facts = load_arrays(path, DELTA_KIND)
     rows, confidences = arrays.pop("rows"), arrays.pop("confidences")
     gaussians = Gaussians(**{name: jnp.asarray(x) for name, x in arrays.items()})
@@ -148,9 +119,5 @@ def load_delta(path: Path) -> SceneDelta:
 
 
 def load_delta_header(path: Path) -> dict[str, Any]:
-    """Reads the caller's header of a delta.
-
-    Raises:
-        StorageError: the file is missing, of another kind, or damaged.
-    """
+    """Reads the caller's header of a delta."""
     return load_arrays(path, DELTA_KIND)[1]["caller"]

@@ -5,6 +5,9 @@ A file of `save_arrays` is an `.npz` without pickles, which `numpy.load` reads t
     header          JSON bytes: the kind and version of the file, and the caller's own header
     <name>          one array each; bfloat16, which `.npy` has no name for, is stored as uint16
     archive comment sha256 of all bytes before it, which detects any change of the file
+
+What writes raises `StorageError` where the file cannot be written, what reads such a file where it is missing, damaged
+or of another kind.
 """
 
 import hashlib
@@ -41,11 +44,7 @@ def _finite(value: Any) -> Any:
 
 
 def write_json(path: str | os.PathLike, value: Any) -> None:
-    """Writes `value` to `path` as indented JSON, atomically.
-
-    Raises:
-        StorageError: the file cannot be written.
-    """
+    """Writes `value` to `path` as indented JSON, atomically."""
     write_atomic(path, (json_text(value) + "\n").encode())
 
 
@@ -65,11 +64,7 @@ def save_arrays(
         arrays: arrays by name.
         kind: the kind of file, with its version ("stream state 1"); `load_arrays` refuses other kinds.
         header: facts of the caller.
-        keep_previous: keep the old file at `previous_path(path)`.
-
-    Raises:
-        StorageError: the folder cannot be written or the disk is full.
-    """
+        keep_previous: keep the old file at `previous_path(path)`."""
     unnamed = {name: str(x.dtype) for name, x in arrays.items() if x.dtype.isbuiltin != 1}
     bits = {name: x.view(f"u{x.dtype.itemsize}") if name in unnamed else x for name, x in arrays.items()}
     text = json.dumps({"kind": kind, "dtypes": unnamed, "header": header}, sort_keys=True)
@@ -82,11 +77,7 @@ def save_arrays(
 
 
 def load_arrays(path: Path, kind: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Reads (arrays, header) from a file that `save_arrays` wrote.
-
-    Raises:
-        StorageError: the file is missing, of another kind, or damaged.
-    """
+    """Reads (arrays, header) from a file that `save_arrays` wrote."""
     try:
         contents = Path(path).read_bytes()
     except OSError as error:
@@ -131,13 +122,15 @@ def read_tensors(path: Path) -> dict[str, Float32[np.ndarray, "..."]]:
         data = Path(path).read_bytes()
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error}).") from error
-    is_zip, is_safetensors = data[:4] == b"PK\x03\x04", data[8:9] == b"{"
     try:
         with np.errstate(all="ignore"):  # what is not finite in float32 is refused by `check_tensors`
-            if is_zip and not any(name.endswith(".pkl") for name in zipfile.ZipFile(io.BytesIO(data)).namelist()):
-                return _npz_tensors(data)
-            if is_safetensors:
-                return _safetensors_tensors(data)
+            if data[8:9] == b"{":
+                return _parse_safetensors(data)
+            if data[:4] == b"PK\x03\x04" and not any(
+                ".pkl" in name for name in zipfile.ZipFile(io.BytesIO(data)).namelist()
+            ):
+                with np.load(io.BytesIO(data), allow_pickle=False) as archive:
+                    return {name: x.astype(np.float32) for name, x in archive.items() if x.dtype.kind == "f"}
     except _DAMAGE_ERRORS as error:
         raise InputError(f"{path}: the file is damaged ({echo(str(error))}); fetch it again.") from error
     raise InputError(  # torch.save writes pickles, which can run any code
@@ -146,20 +139,14 @@ def read_tensors(path: Path) -> dict[str, Float32[np.ndarray, "..."]]:
     )
 
 
-def _npz_tensors(data: bytes) -> dict[str, np.ndarray]:
-    with np.load(io.BytesIO(data), allow_pickle=False) as archive:
-        return {name: x.astype(np.float32) for name, x in archive.items() if x.dtype.kind == "f"}
-
-
-def _safetensors_tensors(data: bytes) -> dict[str, np.ndarray]:
-    """The tensors of a safetensors file: the length of a JSON header, the header, the bytes of all tensors."""
+def _parse_safetensors(data: bytes) -> dict[str, np.ndarray]:
+    """Tensors behind the length of a JSON header, and the header, which has the place of each among the bytes."""
     start = 8 + int.from_bytes(data[:8], "little")
-    facts, body = json.loads(data[8:start]), memoryview(data)[start:]
     tensors = {}
-    for name, fact in facts.items():
+    for name, fact in json.loads(data[8:start]).items():
         if name != "__metadata__" and fact["dtype"] in _SAFETENSORS_DTYPES:
-            first, last = fact["data_offsets"]
-            tensor = np.frombuffer(body[first:last], _SAFETENSORS_DTYPES[fact["dtype"]]).reshape(fact["shape"])
+            first, last = (start + offset for offset in fact["data_offsets"])
+            tensor = np.frombuffer(data[first:last], _SAFETENSORS_DTYPES[fact["dtype"]]).reshape(fact["shape"])
             tensors[name] = tensor.astype(np.float32)
     return tensors
 

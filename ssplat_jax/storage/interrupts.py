@@ -7,14 +7,11 @@ import threading
 class Interrupts:
     """Context manager that records the first SIGINT or SIGTERM, so that the caller can save its state and exit.
 
-    Args:
-        has_work: False if there is nothing to save yet: Ctrl-C then has its usual effect at once, instead of after a
-            compilation that may take a minute. Set the attribute when the first step is done.
-
     Attributes:
         received: number of the signal, or None. Always None outside the main thread, where Python does not allow
             signal handlers.
-        has_work: whether Ctrl-C waits for the caller.
+        has_work: False while there is nothing to save: Ctrl-C then has its usual effect at once, instead of after a
+            compilation that may take a minute. The caller sets it when the first step is done.
     """
 
     def __init__(self, *, has_work: bool = True) -> None:

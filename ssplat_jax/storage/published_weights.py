@@ -10,8 +10,9 @@ Files of the depth network alone lack the prefix `encoder.depth_predictor.`; a f
 CGFI, which ReSplat does not have.
 """
 
+import functools
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import NamedTuple
 
@@ -37,23 +38,13 @@ PREFIXES = {
 }
 """Prefix of the PyTorch names by the first module of a parameter's path."""
 
-PARTS = (
-    *(f"{DEPTH}{part}." for part in ("backbone", "transformer", "pretrained", "upsampler")),
-    (f"{DEPTH}regressor.", f"{DEPTH}regressor_residual.", f"{DEPTH}depth_head."),
-    ("encoder.gaussian_regressor.", "encoder.proj."),
-    "encoder.pt.",
-    "encoder.gaussian_head.",
-)
-"""Prefixes of the parts of the network; a file must have all tensors of a part or none."""
-
 
 class PublishedTensor(NamedTuple):
     """PyTorch tensor that a parameter is imported from."""
 
     name: str
     shape: tuple[int, ...]
-    to_parameter: Callable[[np.ndarray], np.ndarray]
-    """Converts the tensor to the layout of the parameter."""
+    to_parameter: Callable[[np.ndarray], np.ndarray]  # from the tensor's layout to the parameter's
 
 
 class ImportedParams(NamedTuple):
@@ -62,12 +53,11 @@ class ImportedParams(NamedTuple):
     params: dict
     num_imported: int
     num_unused: int
-    initialized_parts: tuple[str, ...]
-    """Parts that the file does not have, each named by its first module."""
+    initialized_parts: list[str]  # of which the file has nothing, such as `encoder/pretrained` or `mixer`
 
 
 def published_tensor(path: tuple[str, ...], shape: tuple[int, ...]) -> PublishedTensor | None:
-    """Returns the PyTorch tensor of the parameter at `path`, or None if ReSplat has no such tensor."""
+    """The PyTorch tensor of the parameter at `path`, or None if ReSplat has no such tensor."""
     if path[0] not in PREFIXES:
         return None
     *modules, leaf = path[1:]
@@ -86,10 +76,10 @@ def published_tensor(path: tuple[str, ...], shape: tuple[int, ...]) -> Published
 
 
 def published_tensors(config: StreamConfig) -> dict[str, PublishedTensor | None]:
-    """Returns the PyTorch tensor, or None, of every parameter of a model with `config`, by the parameter's path."""
+    """The PyTorch tensor, or None, of every parameter of a model with `config`, by the parameter's path."""
     wanted = jax.eval_shape(lambda key: init_params(key, config), jax.random.key(0))
-    leaves = jax.tree_util.tree_flatten_with_path(wanted)[0]
-    return {"/".join(k.key for k in keys): published_tensor(tuple(k.key for k in keys), x.shape) for keys, x in leaves}
+    paths = [(tuple(k.key for k in keys), x.shape) for keys, x in jax.tree_util.tree_flatten_with_path(wanted)[0]]
+    return {"/".join(path): published_tensor(path, shape) for path, shape in paths}
 
 
 def as_published(config: StreamConfig) -> StreamConfig:
@@ -100,17 +90,13 @@ def as_published(config: StreamConfig) -> StreamConfig:
     return config.replace(upstream_compat=True, depth_readout="mean")
 
 
-def import_params(path: Path, config: StreamConfig, seed: int = 0, *, depth_only: bool = False) -> ImportedParams:
+def import_params(path: Path, config: StreamConfig, *, depth_only: bool = False) -> ImportedParams:
     """Imports parameters from a `.safetensors` or `.npz` file that has PyTorch's names.
 
     Args:
         path: the file.
         config: configuration of a model with ReSplat's network.
-        seed: seed of the parameters that the file does not have.
         depth_only: import the depth network only, as from a checkpoint of DepthSplat, whose later stages differ.
-
-    Returns:
-        The parameters and what the file provided.
 
     Raises:
         InputError: `config` has another network, or the file is of another kind, is damaged, has no tensors of this
@@ -120,50 +106,42 @@ def import_params(path: Path, config: StreamConfig, seed: int = 0, *, depth_only
         raise InputError(
             f"import-weights: wanted a preset of ReSplat's network (paper, small, base), got {config.preset!r}."
         )
-    in_file = read_tensors(path)
-    # A depth network on its own is saved without the prefix of the model around it.
-    missing_prefix = "" if any(name.startswith("encoder.") for name in in_file) else DEPTH
-    tensors_by_place = published_tensors(config)
-    tensors = {place: t for place, t in tensors_by_place.items() if t is not None}
-    names_in_file = {t.name: t.name.removeprefix(missing_prefix) for t in tensors.values()}
-    wanted = {name for name in names_in_file if name.startswith(DEPTH) or not depth_only}
-    available = {name for name, there in names_in_file.items() if name in wanted and there in in_file}
-    initialized_parts = _initialized_parts(path, names_in_file, available)
-    if not available:
+    found = read_tensors(path)
+    if not any(name.startswith("encoder.") for name in found):  # a depth network without the model around it
+        found = {DEPTH + name: x for name, x in found.items()}
+    by_place = published_tensors(config)
+    shapes = {t.name: t.shape for t in by_place.values() if t is not None}
+    usable = {name: shapes[name] for name in shapes if name in found and (name.startswith(DEPTH) or not depth_only)}
+    initialized_parts = _initialized_parts(path, by_place, usable)
+    if not usable:
         raise InputError(
             f"{path}: wanted weights of ReSplat, its depth network or Depth Anything V2; the file has none of their"
-            f" {len(tensors)} tensors."
+            f" {len(shapes)} tensors."
         )
-    shapes = {names_in_file[t.name]: t.shape for t in tensors.values() if t.name in available}
-    check_tensors(path, in_file, shapes)
-    incomplete = {p.partition("/")[0] for p, t in tensors_by_place.items() if t is None or t.name not in available}
-    key = jax.random.key(seed)
-    stages = jax.eval_shape(lambda: init_params(key, config))  # those without parameters too
-    params = {name: {} for name in stages} | init_params(key, config, incomplete)
+    check_tensors(path, found, usable)
+    incomplete = {place.partition("/")[0] for place, t in by_place.items() if t is None or t.name not in usable}
+    fresh = init_params(jax.random.key(0), config, incomplete)
+
+    def parameter(keys, _) -> jax.Array:
+        tensor = by_place["/".join(k.key for k in keys)]
+        if tensor is not None and tensor.name in usable:
+            return jnp.asarray(tensor.to_parameter(found[tensor.name]))
+        return functools.reduce(lambda tree, k: tree[k.key], keys, fresh)
+
+    stages = jax.eval_shape(lambda key: init_params(key, config), jax.random.key(0))
+    params = jax.tree_util.tree_map_with_path(parameter, stages)
+    return ImportedParams(params, len(usable), len(found) - len(usable), initialized_parts)
+
+
+def _initialized_parts(path: Path, tensors: dict[str, PublishedTensor | None], usable: Collection[str]) -> list[str]:
+    """Parts of the network of which the file has nothing; a part of which it has only some tensors is refused."""
+    parts: dict[str, list[str]] = {}
     for place, tensor in tensors.items():
-        if tensor.name in available:
-            _insert(params, place, jnp.asarray(tensor.to_parameter(in_file[names_in_file[tensor.name]])))
-    return ImportedParams(params, len(shapes), len(in_file) - len(shapes), initialized_parts)
-
-
-def _initialized_parts(path: Path, names_in_file: dict[str, str], available: set[str]) -> tuple[str, ...]:
-    """Parts that the file does not have; a part of which it has only some tensors is refused."""
-    initialized = []
-    for part in PARTS:
-        of_part = [name for name in names_in_file if name.startswith(part)]
-        absent = [name for name in of_part if name not in available]
-        if 0 < len(absent) < len(of_part):
-            missing = names_in_file[absent[0]]
-            raise InputError(f"{path}: wanted an array {missing}, the file has none; is it another network's?")
-        if absent:
-            first = part if isinstance(part, str) else part[0]
-            initialized.append(first.removeprefix(DEPTH).removeprefix("encoder.").strip("."))
-    return tuple(initialized)
-
-
-def _insert(params: dict, place: str, value: jax.Array) -> None:
-    """Sets the parameter at the path `place`, such as `encoder/backbone/conv1/kernel`."""
-    *folders, leaf = place.split("/")
-    for name in folders:
-        params = params.setdefault(name, {})
-    params[leaf] = value
+        if tensor is not None:
+            part = "/".join(place.split("/")[: 2 if place.startswith("encoder/") else 1])
+            parts.setdefault(part, []).append(tensor.name)
+    for names in parts.values():
+        absent = [name for name in names if name not in usable]
+        if 0 < len(absent) < len(names):
+            raise InputError(f"{path}: wanted an array {absent[0]}, the file has none; is it another network's?")
+    return [part for part, names in parts.items() if names[0] not in usable]

@@ -19,9 +19,6 @@ class RunFolder:
     """The result folder of `ssplat run`, `demo`, `eval` or `render`; each writes some of these files.
 
     Only files of these names are ever removed; others in the folder are the user's.
-
-    Args:
-        path: the folder; it may be missing.
     """
 
     def __init__(self, path: Path) -> None:
@@ -136,26 +133,18 @@ def scene_exposure(scene: Path) -> Float[np.ndarray, "3"]:
 
 
 def _numbered(folder: Path, name: str) -> list[Path]:
-    """The files of a folder, in order, whose name is `name` with a digit for every `#`."""
     return sorted(folder.glob(name.replace("#", "[0-9]")))
 
 
 def remove_numbered(folder: Path, name: str, *, and_folder: bool = True) -> None:
-    """Removes numbered files from `folder`, and by default the folder itself if it is empty afterwards.
-
-    Args:
-        folder: the folder to clear; it may be missing.
-        name: file name in which each `#` stands for one digit, such as `#####.png`.
-        and_folder: remove an empty folder too.
+    """Removes files whose name is `name` with a digit for every `#`, and by default a folder that is empty then.
 
     Raises:
         StorageError: a file cannot be removed.
     """
-    try:
+    with _storage_errors(folder, "cleared"):
         for path in _numbered(folder, name):
             path.unlink()
-    except OSError as error:
-        raise StorageError(f"{folder}: cannot be cleared ({error.strerror or error}); choose another place.") from error
     if and_folder:
         _remove_if_empty(folder)
 
@@ -166,12 +155,10 @@ def make_writable(folder: Path) -> None:
     Raises:
         StorageError: the folder cannot be created or written to.
     """
-    try:
+    with _storage_errors(folder, "written"):
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
-    except OSError as error:
-        raise StorageError(f"{folder}: cannot be written ({error.strerror or error}); choose another place.") from error
 
 
 @contextlib.contextmanager
@@ -188,21 +175,25 @@ def lock_folder(folder: Path) -> Iterator[None]:
     is_new = not folder.exists()
     make_writable(folder)
     with contextlib.ExitStack() as stack:
-        try:
+        with _storage_errors(folder, "locked"):
             descriptor = os.open(folder, os.O_RDONLY)
             stack.callback(os.close, descriptor)  # releases the lock, so it comes last
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise InputError(
-                f"{folder}: another process is writing to it; wait until it ends, or choose another --out."
-            ) from error
-        except OSError as error:
-            raise StorageError(
-                f"{folder}: cannot be locked ({error.strerror or error}); choose another place."
-            ) from error
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                message = f"{folder}: another process is writing to it; wait until it ends, or choose another --out."
+                raise InputError(message) from None
         if is_new:
             stack.callback(_remove_if_empty, folder)
         yield
+
+
+@contextlib.contextmanager
+def _storage_errors(folder: Path, done: str) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise StorageError(f"{folder}: cannot be {done} ({error.strerror or error}); choose another place.") from error
 
 
 def _remove_if_empty(folder: Path) -> None:

@@ -53,30 +53,20 @@ def save_state(path: Path, cache: VoxelCache, header: dict[str, Any]) -> None:
 
 
 def load_state(path: Path) -> tuple[VoxelCache, dict[str, Any]]:
-    """Reads the cache and the header that `save_state` wrote.
-
-    Raises:
-        StorageError: the file is missing, of another kind, or damaged.
-    """
+    """Reads the cache and the header that `save_state` wrote."""
     leaves, facts = load_arrays(path, STREAM_KIND)
-    return _build_cache(leaves, facts["capacity"]), facts["caller"]
-
-
-def _build_cache(leaves: dict[str, np.ndarray], capacity: int) -> VoxelCache:
-    """Cache of the leaves by path, row arrays padded with zeros to `capacity`."""
     fields: dict[str, Any] = {}
     groups: dict[str, dict[str, Any]] = {}
     for name, leaf in leaves.items():
-        if name in _ROW_FIELDS:
-            full = np.zeros((capacity, *leaf.shape[1:]), leaf.dtype)
-            full[: len(leaf)] = leaf
-            leaf = full
+        if name in _ROW_FIELDS:  # as long as the capacity again
+            leaf = np.pad(leaf, [(0, facts["capacity"] - len(leaf)), *[(0, 0)] * (leaf.ndim - 1)])
         *owner, field = name.split(".")
         (groups.setdefault(owner[0], {}) if owner else fields)[field] = jnp.asarray(leaf)
-    return VoxelCache(**fields, **{name: _GROUPS[name](**leaves) for name, leaves in groups.items()})
+    cache = VoxelCache(**fields, **{name: _GROUPS[name](**leaves) for name, leaves in groups.items()})
+    return cache, facts["caller"]
 
 
-def load_newest_state(path: Path) -> tuple[VoxelCache, dict[str, Any], StorageError | None]:
+def load_newest_state(path: Path, load: Callable = load_state) -> tuple[Any, dict[str, Any], StorageError | None]:
     """Reads the newest state, or the previous one if the newest is missing or damaged.
 
     Returns:
@@ -85,11 +75,6 @@ def load_newest_state(path: Path) -> tuple[VoxelCache, dict[str, Any], StorageEr
     Raises:
         StorageError: neither file can be read; the message is about the newest.
     """
-    return _load_newest(path, load_state)
-
-
-def _load_newest(path: Path, load: Callable[[Path], tuple[Any, Any]]) -> tuple[Any, Any, StorageError | None]:
-    """What `load` gives of the newest file or else of the previous one, and the error of the newest in that case."""
     try:
         return *load(path), None
     except StorageError as error:
@@ -147,11 +132,7 @@ class TrainingCheckpoints:
             )
 
     def save(self, step: int, state: Any) -> None:
-        """Saves a pytree of arrays as the state after `step`; the state before it is kept too.
-
-        Raises:
-            StorageError: it cannot be written.
-        """
+        """Saves a pytree of arrays as the state after `step`; the state before it is kept too."""
         leaves = {f"{i:04d}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(state))}
         save_arrays(self.state, leaves, TRAINING_KIND, {"step": step}, keep_previous=True)
 
@@ -167,7 +148,7 @@ class TrainingCheckpoints:
         """
         if not self.state.exists() and not previous_path(self.state).exists():
             return None
-        arrays, header, damage = _load_newest(self.state, lambda path: load_arrays(path, TRAINING_KIND))
+        arrays, header, damage = load_newest_state(self.state, lambda path: load_arrays(path, TRAINING_KIND))
         wanted, treedef = jax.tree.flatten(like)
         leaves = [arrays[name] for name in sorted(arrays)]
         if [(x.shape, x.dtype) for x in leaves] != [(x.shape, x.dtype) for x in wanted]:

@@ -24,16 +24,20 @@ class VideoWriter:
     """
 
     def __init__(self, width: int, height: int) -> None:
-        av = _av()
+        try:
+            import av
+        except ImportError as error:
+            raise InputError(
+                'video: wanted the package av, which is not installed; run: pip install "ssplat-jax[video]"'
+            ) from error
         self._encoded, self._frame_of = io.BytesIO(), av.VideoFrame.from_ndarray
         self._container: Any = av.open(self._encoded, "w", format="mp4")
         self._stream = self._container.add_stream("libx264", Fraction(FRAMES_PER_SECOND), options={"crf": QUALITY})
         # Chroma is stored per 2x2 pixels, so the last pixel of an odd side is cropped.
         self._stream.width, self._stream.height = width // 2 * 2, height // 2 * 2
         self._stream.pix_fmt = "yuv420p"
-        self._stream.codec_context.colorspace = BT709
-        self._stream.codec_context.color_primaries = BT709
-        self._stream.codec_context.color_trc = BT709
+        context = self._stream.codec_context
+        context.colorspace = context.color_primaries = context.color_trc = BT709
 
     def add(self, image: UInt8[np.ndarray, "h w 3"]) -> None:
         """Appends one RGB frame."""
@@ -50,13 +54,3 @@ class VideoWriter:
         self._container.mux(self._stream.encode())
         self._container.close()
         write_atomic(path, self._encoded.getvalue())
-
-
-def _av() -> Any:
-    try:
-        import av
-    except ImportError as error:
-        raise InputError(
-            'video: wanted the package av, which is not installed; run: pip install "ssplat-jax[video]"'
-        ) from error
-    return av

@@ -1,10 +1,8 @@
-"""Weights files: parameters by path, stored as float16 (imported ones as float32) and loaded as float32."""
+"""Weights files: parameters by path (`encoder/conv1/kernel`), stored as float16 or float32 and loaded as float32."""
 
 import dataclasses
 import hashlib
 from collections.abc import Mapping
-from importlib import resources
-from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +18,10 @@ from ssplat_jax.storage.files import load_arrays, save_arrays
 
 KIND = "weights 1"
 
+SHIPPED = Path(__file__).parents[1] / "weights"
+"""Folder of the weights that ship with presets: 3 MB, because nothing is downloaded at install time. Every clone keeps
+each replacement, so they are replaced only when scores move."""
+
 
 def save_weights(
     path: Path, params: dict, config: StreamConfig, provenance: dict, dtype: type[np.floating] = np.float16
@@ -31,7 +33,7 @@ def save_weights(
         params: parameters, as nested dicts.
         config: the configuration of the model.
         provenance: JSON-serializable facts about the training (steps, data, scores).
-        dtype: type of the parameters on disk.
+        dtype: type of the parameters on disk; float16 halves the file, imported weights keep their float32.
 
     Raises:
         StorageError: a value is not finite or too large for `dtype`, or the file cannot be written.
@@ -44,18 +46,6 @@ def save_weights(
     save_arrays(path, arrays, KIND, {"config": config.to_dict(), "provenance": provenance})
 
 
-def load_weights(path: Path) -> tuple[dict, StreamConfig]:
-    """Reads (params, config) from a weights file.
-
-    Raises:
-        StorageError: the file is missing, damaged or of another kind.
-        InputError: the parameters do not have the shapes of the file's configuration.
-    """
-    arrays, header = load_arrays(path, KIND)
-    config = StreamConfig.from_dict(header["config"])
-    return _restore(path, arrays, config), config
-
-
 @dataclasses.dataclass(frozen=True)
 class WeightsFacts:
     """A weights file without its parameters."""
@@ -65,17 +55,15 @@ class WeightsFacts:
     num_bytes: int  # of the file
 
 
-def describe_weights(name: str) -> WeightsFacts:
-    """Facts about the weights that ship with the preset `name`, or about the weights file `name`.
+def load_weights(path: Path) -> tuple[dict, StreamConfig]:
+    """(params, config) of a weights file, whose parameters must have the shapes of its configuration."""
+    arrays, facts = _read(path)
+    return _restore(path, arrays, facts.config), facts.config
 
-    Raises:
-        InputError: there is no such preset or file, or no weights ship with the preset.
-        StorageError: the file is damaged.
-    """
-    with resources.as_file(_source(name)) as path:
-        _, header = load_arrays(path, KIND)
-        config = preset(name) if name in PRESETS else StreamConfig.from_dict(header["config"])
-        return WeightsFacts(config, dict(header.get("provenance") or {}), path.stat().st_size)
+
+def describe_weights(name: str) -> WeightsFacts:
+    """Facts about the weights that ship with the preset `name`, or about the weights file `name`."""
+    return _read(_path_of(name))[1]
 
 
 def load_params(name: str = "tiny") -> dict:
@@ -85,31 +73,29 @@ def load_params(name: str = "tiny") -> dict:
         InputError: there is no such preset or file, no weights ship with the preset, or the shapes do not match.
         StorageError: the file is damaged.
     """
-    if name not in PRESETS:
-        return load_weights(Path(str(_source(name))))[0]
-    with resources.as_file(_source(name)) as path:
-        arrays, _ = load_arrays(path, KIND)
-        return _restore(path, arrays, preset(name))
+    path = _path_of(name)
+    arrays, facts = _read(path)
+    return _restore(path, arrays, preset(name) if name in PRESETS else facts.config)
 
 
-def _source(name: str) -> Traversable:
+def _path_of(name: str) -> Path:
     """The file of the weights `name`; see `load_params`."""
-    if name not in PRESETS:
-        if not Path(name).is_file():
-            known = ", ".join(preset for preset in sorted(PRESETS) if _shipped(preset).is_file())
-            raise InputError(f"weights: wanted a preset with shipped weights ({known}) or a file, got {name!r}.")
-        return Path(name)
-    if not (shipped := _shipped(name)).is_file():
+    file = SHIPPED / f"{name}.npz" if name in PRESETS else Path(name)
+    if file.is_file():
+        return file
+    if name in PRESETS:
         raise InputError(
             f"weights: none ship with the preset {name!r}; convert ReSplat's (ssplat import-weights) or train"
             f" (ssplat train --preset {name}), and give the file."
         )
-    return shipped
+    known = ", ".join(preset for preset in sorted(PRESETS) if (SHIPPED / f"{preset}.npz").is_file())
+    raise InputError(f"weights: wanted a preset with shipped weights ({known}) or a file, got {name!r}.")
 
 
-def _shipped(preset_name: str) -> Traversable:
-    """Location of the weights that ship with a preset; the file may not exist."""
-    return resources.files("ssplat_jax") / "weights" / f"{preset_name}.npz"
+def _read(path: Path) -> tuple[dict[str, np.ndarray], WeightsFacts]:
+    arrays, header = load_arrays(path, KIND)
+    config = StreamConfig.from_dict(header["config"])
+    return arrays, WeightsFacts(config, header["provenance"], path.stat().st_size)
 
 
 def trainings(provenance: dict) -> list[dict]:
