@@ -27,8 +27,7 @@ from ssplat_jax.core.errors import InputError
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import Split, interleaved_split
-from ssplat_jax.evaluation.latency import measure_latency
-from ssplat_jax.evaluation.peak_memory import peak_memory
+from ssplat_jax.evaluation.cost import measure_latency, peak_memory
 from ssplat_jax.evaluation.scoring import score_targets
 from ssplat_jax.storage.weights import check_params, load_params
 from ssplat_jax.streaming.feed import feed_capture

@@ -9,9 +9,7 @@ from scipy.ndimage import map_coordinates
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.stream_frame import StreamFrame
-from ssplat_jax.evaluation.exposures import exposure_for
-from ssplat_jax.evaluation.nearest_views import nearest_views
-from ssplat_jax.evaluation.scoring import ImageScore, score_image
+from ssplat_jax.evaluation.scoring import ImageScore, exposure_for, nearest_views, score_image
 from ssplat_jax.streaming.feed import Exposures
 
 BASELINES = ("copy nearest", "mean color", "warp nearest")

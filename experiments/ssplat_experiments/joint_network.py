@@ -11,7 +11,7 @@ from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.chunk import Chunk
 from ssplat_jax.core.gaussians import Gaussians, mask_gaussians
-from ssplat_jax.evaluation.peak_memory import (
+from ssplat_jax.evaluation.cost import (
     PeakMemory,
     abstract,
     added_bytes,

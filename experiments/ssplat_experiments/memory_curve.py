@@ -6,7 +6,7 @@ Three methods take in the same views of `procedural:room`: ours, ours with a mem
 (`vacc="append"`), and the same network over all views at once, which is what a fixed-view method does. The streams walk
 through `Sizes.loop` views again and again, so that the stream grows and the scene does not. `ours, new views` and
 `joint` see new views all the time: a joint network that sees a view twice finds no parallax between the two. On a CPU
-the bytes are those of XLA's analysis (`ssplat_jax/evaluation/peak_memory.py`); on a GPU each number of views runs in a
+the bytes are those of XLA's analysis (`ssplat_jax/evaluation/cost.py`); on a GPU each number of views runs in a
 process of its own, and its allocator counts.
 """
 
@@ -24,7 +24,7 @@ from ssplat_jax.config import StreamConfig, preset
 from ssplat_jax.core.console import Reporter
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.open_capture import open_capture
-from ssplat_jax.evaluation.peak_memory import peak_memory
+from ssplat_jax.evaluation.cost import peak_memory
 from ssplat_jax.storage.weights import load_params
 from ssplat_jax.streaming.feed import feed_chunks
 

@@ -25,8 +25,7 @@ from ssplat_jax.core.errors import InputError, echo
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import Split
-from ssplat_jax.evaluation.nearest_views import nearest_views
-from ssplat_jax.evaluation.scoring import check_scorable, score_image
+from ssplat_jax.evaluation.scoring import check_scorable, nearest_views, score_image
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
 SPLIT, METRICS = "split.json", "metrics.json"

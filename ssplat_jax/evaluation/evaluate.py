@@ -13,13 +13,18 @@ from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.split import Split, index_to_json
 from ssplat_jax.data.stream_frame import StreamFrame
-from ssplat_jax.evaluation import latency
-from ssplat_jax.evaluation.exposures import exposures_to_json
-from ssplat_jax.evaluation.lpips import LpipsWeights, check_size
-from ssplat_jax.evaluation.peak_memory import peak_memory
+from ssplat_jax.evaluation.cost import NUM_CHUNKS, measure_latency, peak_memory
+from ssplat_jax.evaluation.lpips import LpipsWeights
 from ssplat_jax.evaluation.pictures import save_comparison
 from ssplat_jax.evaluation.psnr_ssim import SSIM_ARGUMENTS
-from ssplat_jax.evaluation.scoring import Display, ViewScore, baselines, check_scorable, mean_scores, score_view
+from ssplat_jax.evaluation.scoring import (
+    Display,
+    baselines,
+    check_scorable,
+    exposures_to_json,
+    mean_scores,
+    score_view,
+)
 from ssplat_jax.poses.adjust_poses import adjust_if_asked, check_look_ahead
 from ssplat_jax.refinement import refine_on_capture
 from ssplat_jax.storage.files import write_json
@@ -44,9 +49,9 @@ def evaluate(
 ) -> dict:
     """Streams, scores and times; writes metrics, split, index and a picture per target into `out`.
 
-    A picture is target | render | depth. `split.json` holds the frames used; its SHA-256 is in the metrics.
-    `index.json` holds them as an index file (`read_index`). Every frame is decoded once before anything is
-    written, so that a damaged one leaves no partial result.
+    A picture is target | render | depth. `split.json` holds the frames used, whose SHA-256 is in the metrics, and
+    `index.json` holds them as an index file. Every frame is decoded once before anything is written, so that a damaged
+    one leaves no partial result.
 
     Args:
         session: a new session with the model and its parameters.
@@ -74,7 +79,9 @@ def evaluate(
     folder, streamed, reporter = RunFolder(out), streamed or capture, reporter or Reporter(quiet=True)
     folder.check_no_run()
     check_look_ahead(revise, is_causal=session.model.config.stream.causal)
-    _check_inputs(capture, split, out, lpips_weights)
+    check_scorable(capture, with_lpips=lpips_weights is not None)
+    capture.check_output_folder(out)
+    capture.verify((*split.context, *split.targets))
     make_writable(out)  # before the long part
     folder.clear_targets()  # they may be of another split
     adjusted = adjust_if_asked(streamed, split.context, revise, reporter)
@@ -90,7 +97,7 @@ def evaluate(
             split.context,
             frame,
             keep_order=split.keeps_order,
-            num_recent=latency.NUM_CHUNKS,
+            num_recent=NUM_CHUNKS,
             on_chunk=advance,
         )
     cost = {  # before the latency is measured, for which the cache may grow and a step be compiled
@@ -110,8 +117,12 @@ def evaluate(
     middle = capture.camera(split.targets[len(split.targets) // 2], frame)
     cost["peak_memory_bytes"] = peak_memory(session, middle).bytes
     display = display or Display()
-    scores = _score_targets(gaussians, capture, split, frame, exposures, lpips_weights, display, folder)
-    timing = latency.measure_latency(session, recent, middle)
+    scores = []
+    for i in split.targets:
+        view = score_view(gaussians, capture, i, frame, exposures, lpips_weights, display)
+        save_comparison(folder.target(i), view.target, view.color, view.depth, (frame.near, frame.far))
+        scores.append(view.score)
+    timing = measure_latency(session, recent, middle)
     metrics = {
         "capture": capture.name,
         "size": [capture.width, capture.height],
@@ -139,15 +150,6 @@ def evaluate(
     return metrics
 
 
-def _check_inputs(capture: Capture, split: Split, out: Path, lpips_weights: LpipsWeights | None) -> None:
-    """Refuses captures that cannot be scored, and results among their images."""
-    check_scorable(capture)
-    if lpips_weights is not None:
-        check_size(capture.height, capture.width)
-    capture.check_output_folder(out)
-    capture.verify((*split.context, *split.targets))
-
-
 def _refine(
     gaussians: Gaussians,
     streamed: Capture,
@@ -160,14 +162,9 @@ def _refine(
     """The scene refined on its context views, and what that took."""
     start = time.perf_counter()
     with reporter.progress("refining", steps) as advance:
+        on_step = lambda step, loss: advance(step, f"loss {loss:.4f}")  # noqa: E731
         refined, report = refine_on_capture(
-            gaussians,
-            streamed,
-            context,
-            frame,
-            exposures,
-            steps=steps,
-            on_step=lambda step, loss: advance(step, f"loss {loss:.4f}"),
+            gaussians, streamed, context, frame, exposures, steps=steps, on_step=on_step
         )
     done = {
         "steps": report.num_steps,
@@ -179,22 +176,3 @@ def _refine(
         "new_gaussians": report.num_new,
     }
     return refined, done
-
-
-def _score_targets(
-    gaussians: Gaussians,
-    capture: Capture,
-    split: Split,
-    frame: StreamFrame,
-    exposures: Exposures,
-    lpips_weights: LpipsWeights | None,
-    display: Display,
-    folder: RunFolder,
-) -> list[ViewScore]:
-    """Scores of the targets, whose pictures are written."""
-    scores = []
-    for i in split.targets:
-        view = score_view(gaussians, capture, i, frame, exposures, lpips_weights, display)
-        save_comparison(folder.target(i), view.target, view.color, view.depth, (frame.near, frame.far))
-        scores.append(view.score)
-    return scores

@@ -7,6 +7,7 @@ as `.safetensors` or `.npz` under the same names.
     per layer: features of unit length per pixel, squared difference, head's weights over channels, mean over pixels
 """
 
+import functools
 from pathlib import Path
 
 import jax
@@ -95,7 +96,10 @@ def lpips_layers(
         InputError: a side has fewer than 16 pixels.
     """
     *batch, height, width, _ = a.shape
-    check_size(height, width)
+    if min(height, width) < MIN_SIDE:
+        raise InputError(
+            f"lpips: wanted images of at least {MIN_SIDE} pixels a side, got {width}x{height}; render larger ones."
+        )
     both = jnp.concatenate([x.reshape(-1, height, width, 3) for x in (a, b)])
     parts = []
     for features, head in zip(vgg_features(weights, both), weights.heads, strict=True):
@@ -106,37 +110,26 @@ def lpips_layers(
     return jnp.stack(parts, axis=-1).reshape(*batch, len(parts))
 
 
-def check_size(height: int, width: int) -> None:
-    """Checks that images are large enough for VGG16.
-
-    Raises:
-        InputError: a side has fewer than 16 pixels.
-    """
-    if min(height, width) < MIN_SIDE:
-        raise InputError(
-            f"lpips: wanted images of at least {MIN_SIDE} pixels a side, got {width}x{height}; render larger ones."
-        )
-
-
 def vgg_features(weights: LpipsWeights, images: Float[Array, "b h w 3"]) -> list[Float[Array, "b _ _ _"]]:
     """Layers relu1_2 to relu5_3 of images in [0, 1]."""
     x = (2 * images - 1 - jnp.asarray(_SHIFT, images.dtype)) / jnp.asarray(_SCALE, images.dtype)
     layers = iter(zip(weights.kernels, weights.biases, strict=True))
+    # By default, accelerators multiply float32 at lower precision; published scores should not depend on that.
+    convolve = functools.partial(
+        jax.lax.conv_general_dilated,
+        window_strides=(1, 1),
+        padding="SAME",
+        dimension_numbers=("NHWC", "HWIO", "NHWC"),
+        precision=jax.lax.Precision.HIGHEST,
+    )
     outputs = []
     for stage in _STAGES:
         if outputs:
             x = jax.lax.reduce_window(x, -jnp.inf, jax.lax.max, (1, 2, 2, 1), (1, 2, 2, 1), "VALID")
         for kernel, bias in (next(layers) for _ in stage):
-            x = jax.nn.relu(_convolve(x, kernel) + bias)
+            x = jax.nn.relu(convolve(x, kernel) + bias)
         outputs.append(x)
     return outputs
-
-
-def _convolve(x, kernel):
-    # By default, accelerators multiply float32 at lower precision; published scores should not depend on that.
-    return jax.lax.conv_general_dilated(
-        x, kernel, (1, 1), "SAME", dimension_numbers=("NHWC", "HWIO", "NHWC"), precision=jax.lax.Precision.HIGHEST
-    )
 
 
 def _unit_features(x: Float[Array, "b _ _ c"]) -> Float[Array, "b _ _ c"]:

@@ -23,8 +23,7 @@ def psnr(image: Float[np.ndarray, "_ _ 3"], target: Float[np.ndarray, "_ _ 3"]) 
     """Peak signal-to-noise ratio in dB, over all pixels and channels.
 
     Limits:
-        Equal images give 100 dB (`MIN_MSE`).
-        NaN gives NaN.
+        Equal images give 100 dB (`MIN_MSE`); NaN gives NaN.
 
     Raises:
         InputError: the images differ in size or have no pixels.

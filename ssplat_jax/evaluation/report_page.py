@@ -43,9 +43,6 @@ a { color: inherit; }
 
 JPEG_QUALITY = 88
 
-PAIRED_WIDTH = 700
-"""Pictures narrower than this, in pixels, stand side by side."""
-
 
 @dataclasses.dataclass(frozen=True)
 class Report:
@@ -73,19 +70,18 @@ def save_report(path: Path, report: Report) -> None:
 
 def page_text(report: Report) -> str:
     """The page as HTML."""
-    files = [(_link(name), html.escape(text)) for name, text in report.files]
+    files = [(f'<a href="{name}"><code>{name}</code></a>', text) for name, text in _escaped(report.files)]
     found = [(file, caption) for file, caption in report.pictures if file.is_file()]
-    kind = "pairs" if found and _width(found[0][0]) < PAIRED_WIDTH else ""
-    facts = "".join(_fact(label, value) for label, value in report.facts)
+    facts = [f'<div class="fact"><b>{value}</b><span>{label}</span></div>' for label, value in _escaped(report.facts)]
     body = [
         f"<h1>{html.escape(report.title)}</h1>",
         f'<p class="summary">{html.escape(report.summary)}</p>',
-        f'<div class="facts">{facts}</div>',
-        _section("Over the stream", _table([[html.escape(cell) for cell in row] for row in report.stream])),
-        _section("Pictures", "\n".join(itertools.starmap(_figure, found)), kind, report.pictures_note),
+        f'<div class="facts">{"".join(facts)}</div>',
+        _section("Over the stream", _table(_escaped(report.stream))),
+        _section("Pictures", "\n".join(itertools.starmap(_figure, found)), "pairs", report.pictures_note),
         _section("Where everything is", _table(files)),
         _section("Next", f"<pre>{html.escape(chr(10).join(report.commands))}</pre>" if report.commands else ""),
-        _section("Details", _table([(html.escape(a), html.escape(b)) for a, b in report.details])),
+        _section("Details", _table(_escaped(report.details))),
     ]
     return (
         '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
@@ -98,14 +94,8 @@ def page_text(report: Report) -> str:
 
 def _section(heading: str, content: str, kind: str = "", note: str = "") -> str:
     """A heading and its content; nothing without content."""
-    if not content:
-        return ""
     note = f'<p class="note">{html.escape(note)}</p>' if note else ""
-    return f'<h2>{heading}</h2>\n{note}<div class="{kind}">{content}</div>'
-
-
-def _fact(label: str, value: str) -> str:
-    return f'<div class="fact"><b>{html.escape(value)}</b><span>{html.escape(label)}</span></div>'
+    return f'<h2>{heading}</h2>\n{note}<div class="{kind}">{content}</div>' if content else ""
 
 
 def _table(rows: Sequence[Sequence[str]]) -> str:
@@ -114,13 +104,8 @@ def _table(rows: Sequence[Sequence[str]]) -> str:
     return f"<table>{''.join(lines)}</table>" if rows else ""
 
 
-def _link(name: str) -> str:
-    return f'<a href="{html.escape(name)}"><code>{html.escape(name)}</code></a>'
-
-
-def _width(file: Path) -> int:
-    with Image.open(file) as picture:
-        return picture.width
+def _escaped(rows: Sequence[Sequence[str]]) -> list[list[str]]:
+    return [[html.escape(cell) for cell in row] for row in rows]
 
 
 def _figure(file: Path, caption: str) -> str:

@@ -1,4 +1,10 @@
-"""Scores of rendered views against their images, and the baselines to compare them with."""
+"""Scores of rendered views against their images, and the baselines to compare them with.
+
+Every view is scored twice: `literal` as the paper's words define, over black at the exposure of the scene, and `shown`
+as a person sees it, at about the exposure that a camera there would have had, with holes filled. In most scenes black is
+far from the true color, so a score over black rewards a method that covers holes with blobs. The filling uses nothing
+but the rendered image, its alpha and the scene's mean color.
+"""
 
 import dataclasses
 from collections.abc import Sequence
@@ -14,12 +20,13 @@ from ssplat_jax.core.gaussians import Gaussians, mean_color
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.split import Split
 from ssplat_jax.data.stream_frame import StreamFrame
-from ssplat_jax.evaluation.exposures import exposure_for
-from ssplat_jax.evaluation.lpips import LpipsWeights, lpips
-from ssplat_jax.evaluation.nearest_views import nearest_views
+from ssplat_jax.evaluation.lpips import MIN_SIDE, LpipsWeights, lpips
 from ssplat_jax.evaluation.psnr_ssim import SSIM_ARGUMENTS, psnr, ssim
 from ssplat_jax.rasterizer import fill_holes, render
 from ssplat_jax.streaming.feed import Exposures
+
+NUM_AVERAGED = 3
+"""Streamed frames whose exposures are averaged for a novel view."""
 
 _jitted_lpips, _jitted_fill_holes = jax.jit(lpips), jax.jit(fill_holes)
 
@@ -69,17 +76,50 @@ class ScoredView:
     depth: Float[np.ndarray, "h w"]  # stream units, 0 where nothing is
 
 
-def check_scorable(capture: Capture) -> None:
-    """Refuses images that are smaller than SSIM's window.
+def check_scorable(capture: Capture, *, with_lpips: bool = False) -> None:
+    """Refuses images that are smaller than SSIM's window, or than LPIPS needs.
 
     Raises:
-        InputError: a side is below 11 pixels.
+        InputError: a side is below 11 pixels, or below 16.
     """
-    if min(capture.width, capture.height) < (min_side := SSIM_ARGUMENTS["win_size"]):
+    min_side = MIN_SIDE if with_lpips else SSIM_ARGUMENTS["win_size"]
+    if min(capture.width, capture.height) < min_side:
         raise InputError(
             f"{capture.name}: wanted images of at least {min_side} pixels a side, got {capture.width}x{capture.height};"
             " give a larger --size."
         )
+
+
+def nearest_views(capture: Capture, i: int, candidates: Sequence[int]) -> list[int]:
+    """The frames `candidates`, nearest to frame `i` first.
+
+    The distance is that of the centers, as a fraction of the candidates' extent, plus the angle between the optical
+    axes in radians.
+    """
+    poses = capture.camtoworlds
+    centers = poses[list(candidates), :3, 3]
+    extent = max(float(np.linalg.norm(centers.max(axis=0) - centers.min(axis=0))), 1e-12)
+    distances = np.linalg.norm(centers - poses[i, :3, 3], axis=1) / extent
+    cosines = np.einsum("vi,i->v", poses[list(candidates), :3, 2], poses[i, :3, 2])
+    return [candidates[j] for j in np.argsort(distances + np.arccos(np.clip(cosines, -1, 1)), kind="stable")]
+
+
+def exposures_to_json(exposures: Exposures) -> dict[str, list[float]]:
+    """Exposures of streamed frames as results and saved states hold them; exact."""
+    return {str(i): np.asarray(exposures[i], np.float64).tolist() for i in sorted(exposures)}
+
+
+def exposures_from_json(fields: dict[str, list[float]]) -> Exposures:
+    """The inverse of `exposures_to_json`."""
+    return {int(i): np.array(exposure, np.float32) for i, exposure in fields.items()}
+
+
+def exposure_for(capture: Capture, i: int, exposures: Exposures) -> Float[np.ndarray, "3"]:
+    """The exposure to show frame `i` at: its own if it was streamed, else the geometric mean of the nearest frames'."""
+    if not exposures:
+        return np.ones(3)
+    nearest = [i] if i in exposures else nearest_views(capture, i, tuple(exposures))[:NUM_AVERAGED]
+    return np.exp(np.mean([np.log(np.asarray(exposures[j], np.float64)) for j in nearest], axis=0))
 
 
 def score_view(
@@ -92,10 +132,6 @@ def score_view(
     display: Display | None = None,
 ) -> ScoredView:
     """Renders frame `i` of a capture and scores it.
-
-    The literal scores compare the render over black at the exposure of the scene. The shown ones compare the image at
-    the exposure of the nearest streamed views (`exposure_for`), about what a camera there would have had, with holes
-    filled by the colors around them (`fill_holes`) or by the scene's mean color (docs/decisions.md).
 
     Args:
         gaussians: the scene, in the stream frame.
@@ -149,39 +185,24 @@ def mean_scores(scores: Sequence[ViewScore]) -> dict[str, Any]:
         `{"literal": {"psnr", "ssim", "lpips"}, "shown": {...}, "psnr_over_black", "psnr_one_exposure"}`;
         `lpips` is None without weights.
     """
-    blocks = {name: _mean_image_score([getattr(s, name) for s in scores]) for name in ("literal", "shown")}
-    between = {name: _mean([getattr(s, name) for s in scores]) for name in ("psnr_over_black", "psnr_one_exposure")}
-    return blocks | between
 
+    def mean(values: Sequence[float | None]) -> float | None:
+        found = [value for value in values if value is not None]
+        return round(float(np.mean(found)), 4) if found else None
 
-def _mean_image_score(scores: Sequence[ImageScore]) -> dict[str, float | None]:
-    distances = [s.lpips for s in scores if s.lpips is not None]
-    return {
-        "psnr": _mean([s.psnr for s in scores]),
-        "ssim": _mean([s.ssim for s in scores]),
-        "lpips": _mean(distances) if distances else None,
+    blocks = {
+        name: {kind: mean([getattr(getattr(s, name), kind) for s in scores]) for kind in ("psnr", "ssim", "lpips")}
+        for name in ("literal", "shown")
     }
-
-
-def _mean(values: Sequence[float]) -> float:
-    return round(float(np.mean(values)), 4)
+    return blocks | {
+        name: mean([getattr(s, name) for s in scores]) for name in ("psnr_over_black", "psnr_one_exposure")
+    }
 
 
 def score_targets(
     gaussians: Gaussians, capture: Capture, targets: tuple[int, ...], frame: StreamFrame, exposures: Exposures
 ) -> dict[str, Any]:
-    """Mean scores of the target views.
-
-    Args:
-        gaussians: the scene, in the stream frame.
-        capture: the capture with the target images.
-        targets: frame numbers to score.
-        frame: the similarity between the capture's frame and the stream's.
-        exposures: exposures of the streamed frames.
-
-    Returns:
-        See `mean_scores`.
-    """
+    """`mean_scores` of the frames `targets`, scored by `score_view`."""
     return mean_scores([score_view(gaussians, capture, i, frame, exposures).score for i in targets])
 
 

@@ -10,7 +10,7 @@ from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.console import Reporter
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.data.stream_frame import StreamFrame
-from ssplat_jax.evaluation.exposures import exposures_from_json
+from ssplat_jax.evaluation.scoring import exposures_from_json
 from ssplat_jax.model.streamsplat import StreamSplat, shown_pivots
 from ssplat_jax.runs.finish_run import scene_to_show
 from ssplat_jax.scene_files.export_rows import ExportReport

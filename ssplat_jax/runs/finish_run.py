@@ -12,10 +12,9 @@ from ssplat_jax.core.console import Reporter
 from ssplat_jax.core.gaussians import Gaussians, scale_colors
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.stream_frame import StreamFrame
-from ssplat_jax.evaluation.exposures import exposures_to_json
-from ssplat_jax.evaluation.peak_memory import peak_memory
+from ssplat_jax.evaluation.cost import peak_memory
 from ssplat_jax.evaluation.pictures import save_comparison
-from ssplat_jax.evaluation.scoring import score_view
+from ssplat_jax.evaluation.scoring import exposures_to_json, score_view
 from ssplat_jax.runs.reports import report_run
 from ssplat_jax.runs.resume import RunState
 from ssplat_jax.scene_files.export_rows import ExportReport

@@ -12,8 +12,7 @@ from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.stream_frame import StreamFrame
-from ssplat_jax.evaluation.exposures import exposures_from_json
-from ssplat_jax.evaluation.scoring import score_targets
+from ssplat_jax.evaluation.scoring import exposures_from_json, score_targets
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.refinement import KeyViews, RefineConfig
 from ssplat_jax.refinement.refine import Progress, continue_refinement, key_views_of, report_of, start_refinement

@@ -9,7 +9,7 @@ from ssplat_jax.core.console import Reporter
 from ssplat_jax.core.errors import InputError, StorageError
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.stream_frame import StreamFrame
-from ssplat_jax.evaluation.exposures import exposures_from_json, exposures_to_json
+from ssplat_jax.evaluation.scoring import exposures_from_json, exposures_to_json
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.refinement import online_refinement
 from ssplat_jax.storage.run_folder import RunFolder

@@ -29,7 +29,7 @@ from ssplat_jax.core.errors import InputError
 from ssplat_jax.core.gaussians import Gaussians, mask_gaussians
 from ssplat_jax.data import capture_summary
 from ssplat_jax.data.capture_summary import summarize
-from ssplat_jax.evaluation import evaluate, latency
+from ssplat_jax.evaluation import cost, evaluate
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.refinement import refine_on_capture
 from ssplat_jax.scene_files.ply import load_ply, save_ply
@@ -446,7 +446,7 @@ def some_fade(*given, **more):
 
 
 def test_eval_writes_every_promised_field(tmp_path, monkeypatch):
-    monkeypatch.setattr(latency, "NUM_REPEATS", 1)  # how often it times is not what is tested
+    monkeypatch.setattr(cost, "NUM_REPEATS", 1)  # how often it times is not what is tested
     monkeypatch.setattr(evaluate, "refine_on_capture", some_fade)
     out = tmp_path / "eval"
     capture = make_capture(tmp_path / "capture", num_frames=12, size=(128, 96))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from ssplat_jax.evaluation import latency
+from ssplat_jax.evaluation import cost
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.runs import eval_run
 from ssplat_jax.runs.eval_run import scene_metrics
@@ -21,7 +21,7 @@ SIZE = (64, 48)
 
 @pytest.fixture(autouse=True)
 def timed_once(monkeypatch):
-    monkeypatch.setattr(latency, "NUM_REPEATS", 1)
+    monkeypatch.setattr(cost, "NUM_REPEATS", 1)
 
 
 @pytest.fixture

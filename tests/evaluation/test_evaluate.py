@@ -14,15 +14,12 @@ from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.gaussians import Gaussians, mean_color
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import Split
+from ssplat_jax.evaluation import cost
 from ssplat_jax.evaluation import evaluate as evaluation
-from ssplat_jax.evaluation import latency
-from ssplat_jax.evaluation.exposures import exposures_from_json, exposures_to_json
-from ssplat_jax.evaluation.latency import measure_latency
+from ssplat_jax.evaluation.cost import PeakMemory, measure_latency
 from ssplat_jax.evaluation.lpips import load_lpips, lpips
-from ssplat_jax.evaluation.nearest_views import nearest_views
-from ssplat_jax.evaluation.peak_memory import PeakMemory
 from ssplat_jax.evaluation.psnr_ssim import psnr, ssim
-from ssplat_jax.evaluation.scoring import baselines, score_view
+from ssplat_jax.evaluation.scoring import baselines, exposures_from_json, exposures_to_json, nearest_views, score_view
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.poses.adjust_poses import AdjustedPoses
 from ssplat_jax.streaming.session import Session
@@ -121,7 +118,7 @@ def test_the_baselines_copy_the_nearest_view_and_show_the_mean_color(capture):
 @pytest.mark.parametrize(("overflow", "capacity"), [("grow", 256), ("drop_new", 128)])
 def test_growing_the_cache_is_not_timed(overflow, capacity, capture, monkeypatch):
     """A cache that the next chunk might not fit is doubled before the clock starts, and given back as it was."""
-    monkeypatch.setattr(latency, "NUM_REPEATS", 1)
+    monkeypatch.setattr(cost, "NUM_REPEATS", 1)
 
     capacities = []
 

@@ -9,8 +9,8 @@ import pytest
 from ssplat_jax.data.capture import ArrayPixels
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import interleaved_split
+from ssplat_jax.evaluation import cost
 from ssplat_jax.evaluation import evaluate as evaluation
-from ssplat_jax.evaluation import latency
 from ssplat_jax.evaluation.scoring import score_view
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.streaming.session import Session
@@ -59,7 +59,7 @@ def evaluated(capture, params, causal, out, monkeypatch):
 
     monkeypatch.setattr(evaluation, "score_view", watched)
     monkeypatch.setattr(evaluation, "baselines", lambda capture, split: {})
-    monkeypatch.setattr(latency, "NUM_REPEATS", 1)
+    monkeypatch.setattr(cost, "NUM_REPEATS", 1)
     session = Session(StreamSplat(NARROW), params, causal=causal)
     metrics = evaluation.evaluate(session, capture, SPLIT, out)
     facts = {name: metrics[name] for name in ("stream_frame", "exposures", "cache", "num_gaussians", "split_sha256")}
@@ -85,7 +85,7 @@ def test_a_poisoned_context_view_is_noticed(capture, params, tmp_path, monkeypat
 
 @pytest.mark.slow
 def test_the_scores_do_see_their_targets(capture, params, tmp_path, monkeypatch):
-    monkeypatch.setattr(latency, "NUM_REPEATS", 1)
+    monkeypatch.setattr(cost, "NUM_REPEATS", 1)
     clean, noisy = (
         evaluation.evaluate(Session(StreamSplat(NARROW), params), c, SPLIT, tmp_path / name)
         for name, c in (("clean", capture), ("noise", poisoned(capture, SPLIT.targets, noise)))

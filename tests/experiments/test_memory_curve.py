@@ -9,7 +9,7 @@ from ssplat_experiments.joint_network import JointNetwork, one_chunk
 from ssplat_experiments.memory_curve import METHODS, REPEATING, growth
 
 from ssplat_jax.data.open_capture import open_capture
-from ssplat_jax.evaluation.peak_memory import added_bytes, live_bytes, peak_memory
+from ssplat_jax.evaluation.cost import added_bytes, live_bytes, peak_memory
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.streaming.feed import feed_capture
 from ssplat_jax.streaming.session import Session

@@ -1,0 +1,149 @@
+"""Time from a chunk to a novel view, and peak memory over step, decode and rendering together.
+
+On a CPU the memory is that of the largest program, by XLA's analysis: parameters, cache and inputs, temporaries, and
+results that are not written over inputs. On a GPU the allocator counts, from the start of the process.
+"""
+
+import dataclasses
+import functools
+import time
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ssplat_jax.cache import ensure_capacity
+from ssplat_jax.core.cameras import Camera
+from ssplat_jax.core.chunk import Chunk
+from ssplat_jax.core.gaussians import Gaussians
+from ssplat_jax.rasterizer import render
+from ssplat_jax.rasterizer.render import render_program, round_up
+from ssplat_jax.streaming.session import Session, tokens_per_chunk
+
+NUM_CHUNKS = 4
+"""The last chunks of a stream that an evaluation feeds again to the full cache to time them."""
+
+NUM_REPEATS = 3
+"""Measurements per chunk."""
+
+
+def measure_latency(session: Session, chunks: list[Chunk], camera: Camera) -> dict:
+    """Milliseconds from a chunk to a novel view on the full cache, and of the step and the rendering in it.
+
+    The step takes the same time at every length of a stream; decoding and rendering grow with the scene.
+
+    Everything is compiled before it is timed, and every result is waited for. The session keeps its cache.
+
+    Returns:
+        `chunk_ms`, with `median` and `p99`, and the medians `step_ms` and `render_ms`.
+    """
+    totals, steps, renders = [], [], []
+    cache, config = session.cache, session.model.config
+    # Growing happens a few times in a stream's life and is not part of a chunk's cost.
+    grown = ensure_capacity(cache, config, tokens_per_chunk(chunks[0], config.network.size_multiple))
+    for chunk in chunks:
+        for repeat in range(NUM_REPEATS + 1):
+            session.cache = jax.block_until_ready(jax.tree.map(jnp.copy, grown))
+            since = time.perf_counter()
+            session.feed(chunk)
+            jax.block_until_ready(session.cache)
+            stepped = time.perf_counter()
+            gaussians = jax.block_until_ready(session.gaussians())
+            decoded = time.perf_counter()
+            jax.block_until_ready(render(gaussians, camera).color)
+            done = time.perf_counter()
+            if repeat:  # the first may compile the renderer for this number of pairs
+                totals.append(1e3 * (done - since))
+                steps.append(1e3 * (stepped - since))
+                renders.append(1e3 * (done - decoded))
+    session.cache = cache
+    return {
+        "chunk_ms": {"median": round(float(np.median(totals)), 1), "p99": round(float(np.quantile(totals, 0.99)), 1)},
+        "step_ms": round(float(np.median(steps)), 1),
+        "render_ms": round(float(np.median(renders)), 1),
+    }
+
+
+@dataclasses.dataclass(frozen=True)
+class PeakMemory:
+    """Bytes in use while each program runs; a program whose memory XLA does not tell has None."""
+
+    step: int | None
+    decode: int | None
+    render: int | None
+    refine: int | None = 0  # of a chunk; 0 without it
+    allocator: int | None = None  # the most bytes since the process began, by the device's allocator; None on a CPU
+
+    @property
+    def bytes(self) -> int | None:
+        """The allocator's peak where there is one, else the largest of the programs; None if one is unknown."""
+        if self.allocator is not None:
+            return self.allocator
+        parts = [part for part in (self.step, self.decode, self.render, self.refine) if part is not None]
+        return max(parts) if len(parts) == 4 else None
+
+    def to_row(self) -> dict[str, int | str | None]:
+        """Columns of a table."""
+        return {
+            "peak_memory_bytes": self.bytes,
+            "step_bytes": self.step,
+            "decode_bytes": self.decode,
+            "render_bytes": self.render,
+            "measured_by": "XLA" if self.allocator is None else "allocator",
+        }
+
+
+def peak_memory(session: Session, camera: Camera) -> PeakMemory:
+    """Memory of a session that takes in a chunk, decodes its cache and renders a view; it keeps its cache.
+
+    Args:
+        session: a stream that has taken in at least one chunk; `step` is that of the last.
+        camera: the view to render, in the stream frame. Its program is compiled once more to be analyzed.
+    """
+    held = live_bytes((session.params, session.cache))
+    gaussians = session.gaussians()
+    added, rendering = added_bytes(session.decode_program()), render_bytes(gaussians, camera)
+    return PeakMemory(
+        step=session.step_memory_bytes,
+        decode=None if added is None else held + added,
+        render=None if rendering is None else held + live_bytes(gaussians) + rendering,
+        refine=session.refine_memory_bytes if session.model.config.stream.steps_per_chunk else 0,
+        allocator=allocator_peak(),
+    )
+
+
+def live_bytes(arrays: Any) -> int:
+    """Bytes of all arrays of a pytree."""
+    return sum(leaf.nbytes for leaf in jax.tree.leaves(arrays))
+
+
+def added_bytes(program: jax.stages.Compiled) -> int | None:
+    """Bytes that a program needs beside its inputs: temporaries, and results that are not written over inputs."""
+    if (memory := program.memory_analysis()) is None:
+        return None
+    return memory.temp_size_in_bytes + memory.output_size_in_bytes - memory.alias_size_in_bytes
+
+
+def render_bytes(gaussians: Gaussians, camera: Camera) -> int | None:
+    """Bytes that rendering a view needs beside the Gaussians, with the capacity for pairs that `render` chooses."""
+    num_pairs = round_up(int(render(gaussians, camera).num_pairs))
+    return added_bytes(_render_program(num_pairs, *abstract((gaussians, camera))))
+
+
+@functools.lru_cache(maxsize=8)  # compiling takes longer than a stream's chunk
+def _render_program(max_pairs: int, structure: Any, leaves: tuple) -> jax.stages.Compiled:
+    gaussians, camera = structure.unflatten(leaves)
+    return render_program(gaussians, camera, max_pairs)
+
+
+def abstract(arrays: Any) -> tuple[Any, tuple[jax.ShapeDtypeStruct, ...]]:
+    """Structure and leaves of a pytree with shapes in place of arrays; both are hashable."""
+    leaves, structure = jax.tree.flatten(arrays)
+    return structure, tuple(jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in leaves)
+
+
+def allocator_peak() -> int | None:
+    """The most bytes in use since the process began, by the device's allocator; None where it does not count."""
+    counters = jax.local_devices()[0].memory_stats()
+    return None if counters is None else counters.get("peak_bytes_in_use")
