@@ -1,9 +1,9 @@
 """Scores of rendered views against their images, and the baselines to compare them with.
 
 Every view is scored twice: `literal` as the paper's words define, over black at the exposure of the scene, and `shown`
-as a person sees it, at about the exposure that a camera there would have had, with holes filled. In most scenes black is
-far from the true color, so a score over black rewards a method that covers holes with blobs. The filling uses nothing
-but the rendered image, its alpha and the scene's mean color.
+as a person sees it, at about the exposure that a camera there would have had, with holes filled. In most scenes black
+is far from the true color, so a score over black rewards a method that covers holes with blobs. The filling uses
+nothing but the rendered image, its alpha and the scene's mean color.
 """
 
 import dataclasses
