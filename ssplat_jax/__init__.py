@@ -38,11 +38,11 @@ if TYPE_CHECKING:
     from ssplat_jax.rasterizer import render as render
     from ssplat_jax.refinement import online_refinement as online_refinement
     from ssplat_jax.refinement import refine as refine
+    from ssplat_jax.scene_files.formats import load_ply as load_ply
     from ssplat_jax.scene_files.formats import load_scene as load_scene
-    from ssplat_jax.scene_files.ply import load_ply as load_ply
-    from ssplat_jax.scene_files.ply import save_ply as save_ply
-    from ssplat_jax.scene_files.splat import save_splat as save_splat
-    from ssplat_jax.scene_files.spz import save_spz as save_spz
+    from ssplat_jax.scene_files.formats import save_ply as save_ply
+    from ssplat_jax.scene_files.formats import save_splat as save_splat
+    from ssplat_jax.scene_files.formats import save_spz as save_spz
     from ssplat_jax.storage.weights import load_params as load_params
 
 # Public name -> module that defines it.
@@ -64,16 +64,16 @@ _MODULES = {
     "ensure_capacity": "cache",
     "fill_holes": "rasterizer",
     "load_params": "storage.weights",
-    "load_ply": "scene_files.ply",
+    "load_ply": "scene_files.formats",
     "load_scene": "scene_files.formats",
     "online_refinement": "refinement",
     "open_capture": "data.open_capture",
     "preset": "config",
     "refine": "refinement",
     "render": "rasterizer",
-    "save_ply": "scene_files.ply",
-    "save_splat": "scene_files.splat",
-    "save_spz": "scene_files.spz",
+    "save_ply": "scene_files.formats",
+    "save_splat": "scene_files.formats",
+    "save_spz": "scene_files.formats",
 }
 __version__ = "0.1.0"
 __all__ = sorted(_MODULES)

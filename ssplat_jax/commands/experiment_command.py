@@ -21,8 +21,8 @@ class Experiment:
     """all: the first seven, on one page. context_length, long_context: quality against the number of views (the paper's
     Tables 1 and 2). ablation: the effect of each module (Table 3). memory_curve: Figure 1. latency: time of each stage.
     additions: the effect of each addition to the paper. accuracy_vs_time, time_to_quality: quality against time.
-    refinement: after the stream, while streaming, with wrong poses. captures, more_views, depth_error, error_bands,
-    export_selection: real captures. score: another method's renders."""
+    refinement: after the stream, while streaming, with wrong poses. captures, more_views, depth_error, error_bands:
+    real captures. score: another method's renders."""
     out: Path
     """Folder of the tables, plots and pictures."""
     captures: Path | None = None

@@ -19,7 +19,7 @@ class Export:
     scene: Annotated[Path, tyro.conf.Positional]
     """Folder of an `ssplat run` or `ssplat demo`, or a scene file."""
     to: Path
-    """File to write: .ply; .compressed.ply, .spz or .sog, 4 to 8 times smaller; .glb or .gltf; .splat."""
+    """File to write: .ply or .glb; .spz or .sog, 4 to 8 times smaller; .splat."""
     max_splats: int | None = None
     """Write at most so many Gaussians: opaque ones first, everywhere alike; the number of the others is printed."""
     cameras: str | None = None
@@ -32,20 +32,19 @@ class Export:
         from ssplat_jax.runs.export_cameras import open_cameras, save_cameras
         from ssplat_jax.runs.export_run import export_run
         from ssplat_jax.scene_files.formats import convert_scene
-        from ssplat_jax.scene_files.select_gaussians import Selection
         from ssplat_jax.storage.run_folder import RunFolder
         from ssplat_jax.storage.weights import load_params
 
         reporter = Reporter(quiet=False)
-        folder, selection = RunFolder(self.scene), Selection(max_splats=self.max_splats)
+        folder = RunFolder(self.scene)
         cameras = None if self.cameras is None else open_cameras(self.cameras, self.scene, self.to, reporter)
         file = self.scene if self.scene.is_file() else folder.scene  # the latter in a folder of `ssplat demo`
         if file.exists() and not folder.has_state():
             if self.weights != Export.weights:
                 raise InputError(f"--weights: wanted a run, got {self.scene}, which is decoded already; leave it out.")
-            report = convert_scene(file, self.to, selection)
+            report = convert_scene(file, self.to, self.max_splats)
         else:
-            report = export_run(self.scene, self.to, load_params(self.weights), reporter, selection)
+            report = export_run(self.scene, self.to, load_params(self.weights), reporter, self.max_splats)
         if cameras is not None:
             save_cameras(self.to.parent, cameras, report.offset)
         if report.warning is not None:

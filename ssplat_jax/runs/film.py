@@ -10,7 +10,7 @@ from ssplat_jax.core.console import Reporter
 from ssplat_jax.core.errors import refusal, require_positive
 from ssplat_jax.data.camera_path import camera_path, orbit_path
 from ssplat_jax.evaluation.pictures import color_depth, color_normals, eight_bits, scale_ends
-from ssplat_jax.scene_files.splat_file import SplatFile
+from ssplat_jax.scene_files.formats import SplatFile
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.storage.video_writer import VideoWriter
 

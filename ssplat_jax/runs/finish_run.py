@@ -17,8 +17,7 @@ from ssplat_jax.evaluation.pictures import save_comparison
 from ssplat_jax.evaluation.scoring import exposures_to_json, score_view
 from ssplat_jax.runs.reports import report_run
 from ssplat_jax.runs.resume import RunState
-from ssplat_jax.scene_files.export_rows import ExportReport
-from ssplat_jax.scene_files.formats import save_gaussians
+from ssplat_jax.scene_files.formats import ExportReport, save_gaussians
 from ssplat_jax.storage.files import write_json
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.storage.weights import load_params, params_digest

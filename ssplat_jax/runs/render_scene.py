@@ -18,8 +18,7 @@ from ssplat_jax.evaluation.pictures import save_image
 from ssplat_jax.rasterizer import Effects, fill_holes, render
 from ssplat_jax.runs.film import KINDS, FilmOptions, depth_range, film_path, write_film
 from ssplat_jax.runs.run_poses import open_capture_of_scene
-from ssplat_jax.scene_files.formats import read_scene
-from ssplat_jax.scene_files.splat_file import SplatFile
+from ssplat_jax.scene_files.formats import SplatFile, read_scene
 from ssplat_jax.storage.run_folder import RunFolder, lock_folder, scene_exposure
 from ssplat_jax.storage.video_writer import VideoWriter
 

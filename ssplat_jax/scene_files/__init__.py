@@ -1,1 +1,1 @@
-"""Scene files (.ply, .compressed.ply, .spz, .sog, glTF, .splat); tests read what is written with other readers, too."""
+"""Scene files (.ply, .compressed.ply, .spz, .sog, .glb, .splat); the tests read what is written with other readers."""

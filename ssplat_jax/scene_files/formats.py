@@ -1,165 +1,166 @@
-"""Reads and writes scenes in the format given by the file extension."""
+"""Reads and writes scenes in the format given by the file's name: the one boundary for files that are damaged."""
 
 import dataclasses
 import os
-from collections.abc import Callable
+import struct
+import zipfile
+import zlib
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Int
+from PIL import Image
 
-from ssplat_jax.core.errors import InputError
+from ssplat_jax.core.atomic import write_atomic
+from ssplat_jax.core.errors import InputError, refusal
 from ssplat_jax.core.gaussians import Gaussians
-from ssplat_jax.scene_files.compressed_ply import is_compressed_ply, read_compressed_ply, save_compressed_ply
-from ssplat_jax.scene_files.export_rows import ExportReport
-from ssplat_jax.scene_files.gltf import save_gltf
-from ssplat_jax.scene_files.gltf_reader import read_gltf
-from ssplat_jax.scene_files.ply import read_ply, save_ply
-from ssplat_jax.scene_files.select_gaussians import EVERYTHING, Selection, select_gaussians
-from ssplat_jax.scene_files.sog import save_sog
-from ssplat_jax.scene_files.sog_reader import read_sog
-from ssplat_jax.scene_files.splat import read_splat, save_splat
-from ssplat_jax.scene_files.splat_file import SplatFile
-from ssplat_jax.scene_files.spz import save_spz
-from ssplat_jax.scene_files.spz_reader import read_spz
+from ssplat_jax.scene_files.glb import decode_glb, encode_glb
+from ssplat_jax.scene_files.ply import decode_ply, encode_ply
+from ssplat_jax.scene_files.sog import decode_sog, encode_sog
+from ssplat_jax.scene_files.splat import encode_splat
+from ssplat_jax.scene_files.splat_rows import RENDER_MODES, SplatRows, gaussians_of_rows, rows_to_write
+from ssplat_jax.scene_files.spz import decode_spz, encode_spz
+
+FilePath = str | os.PathLike
+Offset = tuple[float, float, float]
+ORIGIN: Offset = (0.0, 0.0, 0.0)
+# By the end of the file's name. A .ply may be a compressed one, whatever its name.
+WRITERS: dict[str, Callable[[SplatRows], bytes]] = {".ply": encode_ply, ".spz": encode_spz, ".sog": encode_sog}
+WRITERS |= {".glb": encode_glb, ".splat": encode_splat}
+READERS: dict[str, Callable[[bytes], SplatRows]] = {".compressed.ply": decode_ply, ".ply": decode_ply}
+READERS |= {".spz": decode_spz, ".sog": decode_sog, ".glb": decode_glb}
+DAMAGE = (
+    *(ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RuntimeError, OSError, EOFError),
+    *(struct.error, zlib.error, zipfile.BadZipFile, Image.DecompressionBombError),
+)
+"""What struct, JSON, zip, gzip, PIL and NumPy raise for bytes that are no scene."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Format:
-    """A format of scene files."""
+class SplatFile:
+    """Contents of a scene file: the Gaussians and the facts beside them."""
 
-    save: Callable[[Path, Gaussians, str, tuple[float, float, float]], ExportReport]
-    """Writes Gaussians; the last arguments are the render mode (`save_ply`) and the offset."""
-    read: Callable[[Path], SplatFile]
-
-
-FORMATS = {
-    ".compressed.ply": Format(
-        lambda path, scene, mode, offset: save_compressed_ply(path, scene, render_mode=mode, offset=offset),
-        read_compressed_ply,
-    ),
-    ".ply": Format(lambda path, scene, mode, offset: save_ply(path, scene, render_mode=mode, offset=offset), read_ply),
-    ".spz": Format(lambda path, scene, mode, _: save_spz(path, scene, antialiased=mode == "mip"), read_spz),
-    ".sog": Format(lambda path, scene, mode, _: save_sog(path, scene, antialiased=mode == "mip"), read_sog),
-    ".glb": Format(
-        lambda path, scene, mode, offset: save_gltf(path, scene, render_mode=mode, offset=offset), read_gltf
-    ),
-    ".gltf": Format(
-        lambda path, scene, mode, offset: save_gltf(path, scene, render_mode=mode, offset=offset), read_gltf
-    ),
-    ".splat": Format(lambda path, scene, *_: save_splat(path, scene), read_splat),
-}
-"""Formats by the end of the file's name; the first that fits is meant."""
+    gaussians: Gaussians
+    render_mode: str  # one of `RENDER_MODES`
+    offset: Offset  # to add to the positions
 
 
-def check_format(path: Path, option: str = "--to") -> str:
-    """The key of `FORMATS` that the name of a file ends with.
+@dataclasses.dataclass(frozen=True)
+class ExportReport:
+    """Counts of written and dropped Gaussians, and the offset of the positions in the file."""
 
-    Raises:
-        InputError: there is none.
-    """
-    for suffix in FORMATS:
-        if path.name.endswith(suffix):
-            return suffix
-    raise InputError(f"{option}: wanted a file named *{', *'.join(FORMATS)}, got {path.name!r}; choose one of these.")
+    num_written: int
+    num_dropped: int  # with non-finite entries, a negative scale, or an opacity below 1/255 (absent rows included)
+    offset: Offset = ORIGIN  # to add to the positions in the file
+    num_cut: int = 0  # left out because there were more than wanted
+
+    @property
+    def warning(self) -> str | None:
+        """Note for the user who opens the file, or None."""
+        far = "the capture lies far from its origin; positions are counted from"
+        return f"{far} {[float(x) for x in self.offset]}." if any(self.offset) else None
+
+
+def check_format(path: FilePath, option: str = "--to", formats: Iterable[str] = WRITERS) -> str:
+    """The end of a file's name, which must be one of `formats`."""
+    name = Path(path).name
+    # Nothing writes a .compressed.ply, though its name ends with .ply.
+    suffix = next((suffix for suffix in (".compressed.ply", *READERS, *WRITERS) if name.endswith(suffix)), None)
+    if suffix not in formats:
+        raise refusal(option, wanted=f"a file named *{', *'.join(formats)}", got=repr(name), fix="choose one of these")
+    return suffix
 
 
 def save_gaussians(
-    path: Path,
+    path: FilePath,
     gaussians: Gaussians,
     *,
     render_mode: str = "mip",
-    offset: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    offset: Offset = ORIGIN,
+    max_splats: int | None = None,
 ) -> ExportReport:
-    """Writes `gaussians` to `path` in the format of its extension.
+    """Writes `gaussians` to `path` atomically, in the format of its extension; the same Gaussians give the same bytes.
 
     Args:
-        path: the file to write; its name ends as one of `FORMATS`.
-        gaussians: the scene.
-        render_mode: the renderer that the scene is made for, see `save_ply`; a .spz and a .sog store only whether it is
-            "mip", a .splat nothing.
+        path: the file to write; its name ends as one of `WRITERS`. Missing folders are created.
+        gaussians: the scene, in the frame of the file.
+        render_mode: the renderer that the scene is made for, one of `RENDER_MODES`; a .spz and a .sog store only
+            whether it is "mip", a .splat nothing.
         offset: origin of `gaussians` in the frame of the capture; a .spz, .sog or .splat does not store it.
-
-    Returns:
-        Counts of written and dropped Gaussians, and `offset`.
+        max_splats: most Gaussians to write; opaque ones are kept first, everywhere alike.
 
     Raises:
-        InputError: an unknown extension, positions outside the range of the format, or an array of a wrong shape.
+        InputError: an unknown extension or render mode, positions outside the range of the format, a wrong shape.
         StorageError: the file cannot be written.
     """
-    report = FORMATS[check_format(path)].save(path, gaussians, render_mode, offset)
-    return dataclasses.replace(report, offset=offset)
+    return _save(path, gaussians, WRITERS[check_format(path)], render_mode, offset, max_splats)
 
 
-def read_scene(path: str | os.PathLike) -> SplatFile:
-    """Reads a scene file in any of `FORMATS`; a .ply may be a compressed one, whatever its name.
+def save_ply(
+    path: FilePath, gaussians: Gaussians, *, render_mode: str = "mip", offset: Offset = ORIGIN
+) -> ExportReport:
+    """Writes a 3DGS .ply, whatever the file's name; see `save_gaussians`."""
+    return _save(path, gaussians, encode_ply, render_mode, offset)
+
+
+def save_spz(path: FilePath, gaussians: Gaussians, *, antialiased: bool = True) -> ExportReport:
+    """Writes a .spz; `antialiased` marks it as made for a renderer with the 2D Mip filter. See `save_gaussians`."""
+    return _save(path, gaussians, encode_spz, "mip" if antialiased else "default")
+
+
+def save_splat(path: FilePath, gaussians: Gaussians) -> ExportReport:
+    """Writes a .splat; see `save_gaussians`."""
+    return _save(path, gaussians, encode_splat)
+
+
+def _save(path, gaussians, encode, render_mode="mip", offset=ORIGIN, max_splats=None) -> ExportReport:
+    if render_mode not in RENDER_MODES:
+        raise refusal("render_mode", wanted=f"one of {', '.join(RENDER_MODES)}", got=repr(render_mode), fix="use one")
+    if max_splats is not None and max_splats < 1:
+        raise refusal("--max-splats", wanted="at least 1", got=max_splats, fix="leave it out to write all")
+    rows, num_cut = rows_to_write(gaussians, max_splats)
+    write_atomic(path, encode(dataclasses.replace(rows, render_mode=render_mode, offset=offset)))
+    return ExportReport(len(rows), gaussians.num_gaussians - len(rows) - num_cut, offset, num_cut)
+
+
+def read_scene(path: FilePath) -> SplatFile:
+    """Reads a scene file in any of `READERS`.
+
+    An offset is not added to the positions, so that float32 stays exact.
 
     Raises:
         InputError: an unknown extension, or the file is damaged or of another format than its name says.
     """
-    path = Path(path)
-    suffix = check_format(path, "scene")
-    if suffix == ".ply" and is_compressed_ply(path):
-        suffix = ".compressed.ply"
-    return FORMATS[suffix].read(path)
+    return _read(path, check_format(path, "scene", READERS))
 
 
-def load_scene(path: str | os.PathLike) -> Gaussians:
-    """Reads the Gaussians of a scene file: .ply, .compressed.ply, .spz, .sog, .glb, .gltf or .splat.
-
-    Limits:
-        As `load_ply`; positions of a .ply with a comment `offset x y z` stay relative to that offset.
-
-    Raises:
-        InputError: an unknown extension, or the file is damaged or of another format than its name says.
-    """
+def load_scene(path: FilePath) -> Gaussians:
+    """The Gaussians of a scene file: .ply, .compressed.ply, .spz, .sog or .glb; see `read_scene`."""
     return read_scene(path).gaussians
 
 
-def save_selected(
-    path: Path,
-    gaussians: Gaussians,
-    selection: Selection,
-    num_members: Int[np.ndarray, " n"] | None = None,
-    *,
-    render_mode: str = "mip",
-    offset: tuple[float, float, float] = (0.0, 0.0, 0.0),
-) -> ExportReport:
-    """Selects Gaussians and writes them as `save_gaussians` does.
-
-    Args:
-        path: the file to write.
-        gaussians: the scene.
-        selection: the Gaussians to leave out.
-        num_members: number of tokens that each Gaussian was merged from, if it is known.
-        render_mode: see `save_gaussians`.
-        offset: see `save_gaussians`.
-
-    Returns:
-        Counts of written, dropped and left out Gaussians, and `offset`.
-
-    Raises:
-        InputError: an unknown extension, positions outside the range of the format, or an array of a wrong shape.
-        StorageError: the file cannot be written.
-    """
-    check_format(path)
-    selected = select_gaussians(gaussians, selection, num_members)
-    report = save_gaussians(path, selected.gaussians, render_mode=render_mode, offset=offset)
-    return dataclasses.replace(report, num_pruned=selected.num_pruned, num_cut=selected.num_cut)
+def load_ply(path: FilePath) -> Gaussians:
+    """The Gaussians of a .ply, compressed or not, whatever the file's name; see `read_scene`."""
+    return _read(path, ".ply").gaussians
 
 
-def convert_scene(scene: Path, to: Path, selection: Selection = EVERYTHING) -> ExportReport:
-    """Converts the scene file `scene` to the format given by the extension of `to`.
+def _read(path: FilePath, suffix: str) -> SplatFile:
+    try:
+        data = Path(path).read_bytes()
+    except OSError as error:
+        came = f"one that cannot be read ({error.strerror})"
+        raise refusal(str(path), wanted=f"a {suffix} file", got=came, fix="check the path") from error
+    try:
+        with np.errstate(all="ignore"):  # infinities and NaNs are refused by what they mean
+            rows = READERS[suffix](data)
+            return SplatFile(gaussians_of_rows(rows), rows.render_mode, rows.offset)
+    except DAMAGE as error:
+        cause = " ".join((str(error) if type(error) is ValueError else repr(error)).split())
+        raise InputError(f"{path}: cannot be used as a {suffix} file: {cause:.300}; write it again.") from error
 
-    Args:
-        scene: a file of one of `FORMATS`.
-        to: the file to write.
-        selection: the Gaussians to leave out.
 
-    Raises:
-        InputError: `scene` is no scene file, `to` has an unknown extension, or positions are out of range.
-        StorageError: the file cannot be written.
-    """
+def convert_scene(scene: Path, to: Path, max_splats: int | None = None) -> ExportReport:
+    """Writes the scene file `scene` in the format given by the name of `to`; see `read_scene` and `save_gaussians`."""
     check_format(to)
-    splats = read_scene(scene)
-    return save_selected(to, splats.gaussians, selection, render_mode=splats.render_mode, offset=splats.offset)
+    file = read_scene(scene)
+    return save_gaussians(to, file.gaussians, render_mode=file.render_mode, offset=file.offset, max_splats=max_splats)

@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from ssplat_jax.core.gaussians import SH_C0, Gaussians
 from ssplat_jax.core.rotations import quats_to_matrices
-from ssplat_jax.scene_files.export_rows import MIN_OPACITY
+from ssplat_jax.scene_files.splat_rows import MIN_OPACITY
 
 MAX_SIGMA = 250.0
 """Largest standard deviation that is sent: the square of 256 overflows a 16-bit float."""

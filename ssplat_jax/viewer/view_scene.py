@@ -34,7 +34,7 @@ def view_scene(
     """Shows a scene and its changes until Ctrl-C.
 
     Args:
-        path: a scene file (any of `scene_files.formats.FORMATS`) or the folder of a run.
+        path: a scene file (any of `scene_files.formats.READERS`) or the folder of a run.
         host: address to listen on.
         port: port to listen on; the next free one if it is taken.
         max_gaussians: most Gaussians sent to a browser.

@@ -32,7 +32,7 @@ from ssplat_jax.data.capture_summary import summarize
 from ssplat_jax.evaluation import cost, evaluate
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.refinement import refine_on_capture
-from ssplat_jax.scene_files.ply import load_ply, save_ply
+from ssplat_jax.scene_files.formats import load_ply, save_ply
 from ssplat_jax.storage.chunk_records import load_delta, load_delta_header
 from ssplat_jax.storage.published_weights import as_published, published_tensors
 from ssplat_jax.storage.run_folder import RunFolder

@@ -13,7 +13,7 @@ import ssplat_jax as ss
 from ssplat_jax.cache import init_cache
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import read_index
-from ssplat_jax.scene_files.formats import FORMATS, save_gaussians
+from ssplat_jax.scene_files.formats import READERS, save_gaussians
 from ssplat_jax.storage.chunk_records import load_delta, save_delta
 from ssplat_jax.storage.files import read_tensors
 from ssplat_jax.storage.run_folder import scene_exposure
@@ -22,7 +22,7 @@ from ssplat_jax.storage.weights import load_weights, save_weights
 from ssplat_jax.streaming.scene_delta import SceneDelta
 from tests.badinputs.cases import make_capture
 from tests.data.capture_writers import WRITERS
-from tests.scene_files.scene_fixture import scene
+from tests.scene_files.scene_fixture import compressed_ply, scene
 from tests.streaming.narrow_model import NARROW
 
 
@@ -69,7 +69,10 @@ def with_format(kind: str, file: str) -> Callable[[Path], Path]:
 
 def write_scene(suffix: str) -> Callable[[Path], Path]:
     def write(root: Path) -> Path:
-        save_gaussians(root / f"a{suffix}", scene(0 if suffix == ".splat" else 1, n=12))
+        if suffix == ".compressed.ply":
+            (root / f"a{suffix}").write_bytes(compressed_ply(n=12))
+        else:
+            save_gaussians(root / f"a{suffix}", scene(1, n=12))
         return root / f"a{suffix}"
 
     return write
@@ -141,7 +144,7 @@ PARSERS = (
         for kind, files in CAPTURE_FILES.items()
         for file in files
     }
-    | {suffix: Parser(write_scene(suffix), ss.load_scene) for suffix in FORMATS}
+    | {suffix: Parser(write_scene(suffix), ss.load_scene) for suffix in READERS}
     | {
         "stream state": Parser(write_state, load_state),
         "delta": Parser(write_delta, load_delta),

@@ -20,7 +20,7 @@ from ssplat_jax.rasterizer.outputs import splat_channels
 from ssplat_jax.rasterizer.projection import cull_non_finite, project
 from ssplat_jax.rasterizer.reference import sample_weights
 from ssplat_jax.runs.demo import STAGES
-from ssplat_jax.scene_files.ply import load_ply
+from ssplat_jax.scene_files.formats import load_ply
 from ssplat_jax.storage.weights import load_params
 from ssplat_jax.streaming.session import Session
 

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 import ssplat_jax as ss
 from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.runs.export_cameras import SceneCameras, save_cameras
-from ssplat_jax.scene_files.ply import save_ply
+from ssplat_jax.scene_files.formats import save_ply
 from tests.commands.test_cli import make_capture, run
 from tests.scene_files.scene_fixture import scene
 

@@ -15,7 +15,7 @@ from ssplat_jax.evaluation.psnr_ssim import psnr
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.rasterizer import render
 from ssplat_jax.runs.finish_run import save_scene, scene_to_show
-from ssplat_jax.scene_files.ply import load_ply
+from ssplat_jax.scene_files.formats import load_ply
 from ssplat_jax.storage.weights import load_params
 from ssplat_jax.streaming.feed import middle_exposure
 from ssplat_jax.streaming.session import Session

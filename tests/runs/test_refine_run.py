@@ -17,7 +17,7 @@ from ssplat_jax.runs import refine_run as module
 from ssplat_jax.runs.capture_run import run_capture
 from ssplat_jax.runs.refine_run import refine_run
 from ssplat_jax.runs.resume import RunState
-from ssplat_jax.scene_files.ply import read_ply
+from ssplat_jax.scene_files.formats import read_scene
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.storage.weights import load_params
 
@@ -72,9 +72,9 @@ def test_a_stopped_refinement_continues_to_the_same_bytes(finished, monkeypatch)
     report = json.loads(folder.refinement.read_text())
     assert report["num_steps"] == len(report["losses"]) == 4
     assert report["num_left_out"] == left_out
-    sizes = [len(read_ply(path).gaussians.means) for path in (folder.scene, folder.refined_scene)]
+    sizes = [len(read_scene(path).gaussians.means) for path in (folder.scene, folder.refined_scene)]
     assert report["num_new"] > 0 and sizes[1] <= sizes[0] + report["num_new"] <= 1.1 * sizes[0]
-    assert [read_ply(path).gaussians.sh_degree for path in (folder.scene, folder.refined_scene)] == [0, 2]
+    assert [read_scene(path).gaussians.sh_degree for path in (folder.scene, folder.refined_scene)] == [0, 2]
 
 
 def stop_after_each_step(monkeypatch):

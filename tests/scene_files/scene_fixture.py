@@ -1,4 +1,4 @@
-"""Small random scene, cameras in front of it, and the PSNR between two images."""
+"""Small random scenes, cameras in front of them, and the PSNR between two images."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -6,7 +6,7 @@ import numpy as np
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.gaussians import Gaussians
 
-ROUND_TRIP = 3e-6  # relative; exponential of a float32 logarithm of up to 20
+FIELDS = ("means", "quats", "scales", "opacities", "sh")
 
 
 def scene(degree: int = 2, n: int = 60, seed: int = 0) -> Gaussians:
@@ -20,6 +20,21 @@ def scene(degree: int = 2, n: int = 60, seed: int = 0) -> Gaussians:
         opacities=jnp.asarray(rng.uniform(0.05, 1.0, n), jnp.float32),
         sh=jnp.asarray(rng.normal(size=(n, (degree + 1) ** 2, 3)) * 0.3, jnp.float32),
     )
+
+
+def compressed_ply(degree: int = 1, n: int = 300) -> bytes:
+    """A compressed .ply of random words, all of which are valid."""
+    rng, num_rest = np.random.default_rng(0), 3 * ((degree + 1) ** 2 - 1)
+    limits = [f"{end}_{axis}" for axes in ("x y z", "scale_x scale_y scale_z", "r g b") for end in ("min", "max")
+              for axis in axes.split()]  # fmt: skip
+    header = ["ply", "format binary_little_endian 1.0", f"element chunk {-(-n // 256)}"]
+    header += [f"property float {name}" for name in limits] + [f"element vertex {n}"]
+    header += [f"property uint packed_{name}" for name in ("position", "rotation", "scale", "color")]
+    header += [f"element sh {n}"] * (num_rest > 0) + [f"property uchar f_rest_{i}" for i in range(num_rest)]
+    chunks = rng.uniform([-1] * 3 + [1] * 3 + [-4] * 3 + [-1] * 3 + [0] * 3 + [1] * 3, size=(-(-n // 256), 18))
+    words, rest = rng.integers(1 << 32, size=(n, 4)).astype("<u4"), rng.integers(256, size=(n, num_rest))
+    parts = chunks.astype("<f4").tobytes(), words.tobytes(), rest.astype(np.uint8).tobytes()
+    return "\n".join([*header, "end_header\n"]).encode() + b"".join(parts)
 
 
 def camera(x: float = 0.0) -> Camera:

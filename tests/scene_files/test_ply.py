@@ -1,48 +1,19 @@
-"""PLY files: an independent reader gets the scene that was written."""
+"""PLY files: layout, every valid form of other writers, real scenes, and one clear message for what is none."""
 
-import os
+import random
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from plyfile import PlyData
+from plyfile import PlyData, PlyElement
 
-from ssplat_jax.core.errors import InputError, StorageError
+from ssplat_jax.core.errors import InputError
 from ssplat_jax.core.gaussians import SH_C0, Gaussians
-from ssplat_jax.core.pytree import replace
-from ssplat_jax.rasterizer import render
-from ssplat_jax.scene_files.ply import load_ply, property_names, save_ply
-from tests.scene_files.scene_fixture import ROUND_TRIP, camera, decibels, scene
+from ssplat_jax.scene_files.formats import load_ply, load_scene, save_ply
+from ssplat_jax.scene_files.ply import property_names
+from tests.scene_files.scene_fixture import FIELDS, compressed_ply, scene
 
-RENDER_DB = 60.0  # root mean square of 0.001, far below a step of 8 bits
-
-
-def independent_gaussians(path) -> Gaussians:
-    """Gaussians of a file, read with plyfile and the formulas of the format."""
-    v = PlyData.read(str(path))["vertex"].data
-    stack = lambda *names: np.stack([v[name].astype(np.float64) for name in names], -1)  # noqa: E731
-    rest = [name for name in v.dtype.names if name.startswith("f_rest_")]
-    k = len(rest) // 3
-    sh = np.stack(
-        [stack(f"f_dc_{c}", *(f"f_rest_{c * k + i}" for i in range(k))) for c in range(3)], axis=-1
-    )  # the k coefficients of red, then of green, then of blue
-    return Gaussians(
-        means=jnp.asarray(stack("x", "y", "z"), jnp.float32),
-        quats=jnp.asarray(stack("rot_0", "rot_1", "rot_2", "rot_3"), jnp.float32),
-        scales=jnp.asarray(np.exp(stack("scale_0", "scale_1", "scale_2")), jnp.float32),
-        opacities=jnp.asarray(1 / (1 + np.exp(-stack("opacity")[:, 0])), jnp.float32),
-        sh=jnp.asarray(sh, jnp.float32),
-    )
-
-
-def test_export_roundtrip_render(tmp_path):
-    gaussians = scene(degree=3)
-    save_ply(tmp_path / "a.ply", gaussians)
-    for view in (camera(), camera(0.4)):
-        drawn = render(gaussians, view).color
-        assert float(drawn.std()) > 0.05  # the image shows the scene
-        assert decibels(drawn, render(independent_gaussians(tmp_path / "a.ply"), view).color) >= RENDER_DB
-        assert decibels(drawn, render(load_ply(tmp_path / "a.ply"), view).color) >= RENDER_DB
+BASE = [name for name in property_names(0) if not name.startswith("n")]
 
 
 def test_rows_hold_the_raw_values_of_the_format(tmp_path):
@@ -58,133 +29,183 @@ def test_rows_hold_the_raw_values_of_the_format(tmp_path):
     ply = PlyData.read(str(tmp_path / "a.ply"))
     row = ply["vertex"].data[0]
     assert ply.byte_order == "<" and not ply.text
-    assert list(ply["vertex"].data.dtype.names) == property_names(1)
     assert ply.comments == ["SplatRenderMode: mip", "SH degree: 1"]
-    get = lambda *names: [float(row[name]) for name in names]  # noqa: E731
-    assert get("x", "y", "z", "nx", "ny", "nz") == [1, -2, 3, 0, 0, 0]
-    assert get("rot_0", "rot_1", "rot_2", "rot_3") == pytest.approx([0, 0.6, 0, 0.8])
-    assert get("scale_0", "scale_1", "scale_2") == pytest.approx([-np.log(2), 0, np.log(2)])
-    assert get("opacity") == pytest.approx([np.log(4)])
-    assert get("f_dc_0", "f_dc_1", "f_dc_2") == pytest.approx(sh[0, 0])
-    assert get(*(f"f_rest_{i}" for i in range(9))) == pytest.approx(sh[0, 1:].T.reshape(-1))  # R R R G G G B B B
+    rest = sh[0, 1:].T.reshape(-1)  # R R R G G G B B B
+    values = [1, -2, 3, 0, 0, 0, *sh[0, 0], *rest, np.log(4), -np.log(2), 0, np.log(2), 0, 0.6, 0, 0.8]
+    assert list(map(float, row)) == pytest.approx(values)
+    assert list(row.dtype.names) == property_names(9)
 
 
-def test_color_is_the_constant_band(tmp_path):
-    one = Gaussians.from_rgb(
-        means=jnp.zeros((1, 3)),
-        quats=jnp.array([[1.0, 0, 0, 0]]),
-        scales=jnp.ones((1, 3)),
-        opacities=jnp.ones(1),
-        colors=jnp.array([[0.9, 0.5, 0.1]]),
+def assert_same_scene(a, b):
+    for name in FIELDS:
+        np.testing.assert_allclose(getattr(a, name), getattr(b, name), rtol=3e-6, atol=1e-6)
+
+
+@pytest.fixture
+def good(tmp_path):
+    """Valid file of SH degree 1."""
+    save_ply(tmp_path / "good.ply", scene(1, n=12))
+    return tmp_path / "good.ply"
+
+
+def rewritten(good, change, **form):
+    """The good file with a changed table, written by plyfile in another form, between other elements."""
+    table = change(PlyData.read(str(good))["vertex"].data.copy())
+    camera, faces = np.zeros(3, [("id", "i4"), ("focal", "f8")]), np.array([([0, 1, 2],)], [("vertex_indices", "O")])
+    parts = [(camera, "camera"), (table, "vertex"), (faces, "face")]
+    path = good.with_name("other.ply")
+    PlyData([PlyElement.describe(x, name) for x, name in parts], **form).write(str(path))
+    return path
+
+
+@pytest.mark.parametrize("form", [{"byte_order": ">"}, {"byte_order": "<"}, {"text": True}], ids=str)
+@pytest.mark.parametrize("dtype", ["f4", "f8"])
+def test_every_encoding_is_the_same_scene(good, form, dtype):
+    def shuffled(table):
+        """In any order, without normals, among unknown properties."""
+        names = [name for name in table.dtype.names if name not in ("nx", "ny", "nz")]
+        random.Random(0).shuffle(names)
+        out = np.full(len(table), 7, [("label", "u1"), *((name, dtype) for name in names), ("extra", "i2")])
+        for name in names:
+            out[name] = table[name]
+        return out
+
+    assert_same_scene(load_ply(rewritten(good, shuffled, **form)), load_ply(good))
+    assert load_ply(rewritten(good, lambda t: shuffled(t)[:0], **form)).num_gaussians == 0
+
+
+def test_windows_line_ends_in_the_header(good):
+    head, body = good.read_bytes().split(b"end_header\n", 1)
+    good.with_name("crlf.ply").write_bytes(head.replace(b"\n", b"\r\n") + b"end_header\r\n" + body)
+    assert_same_scene(load_ply(good.with_name("crlf.ply")), load_ply(good))
+
+
+def test_infinite_logits_huge_scales_and_zero_quaternions_have_a_meaning(good):
+    def spoil(table):
+        table["opacity"][:3] = np.inf, -np.inf, 500.0
+        table["scale_0"][:2] = 300.0, -300.0
+        for i in range(4):
+            table[f"rot_{i}"][2] = 0
+            table[f"rot_{i}"][3] *= 1e25
+        return table
+
+    read, untouched = load_ply(rewritten(good, spoil, byte_order="<")), load_ply(good)
+    np.testing.assert_array_equal(read.opacities[:3], [1.0, 0.0, 1.0])
+    np.testing.assert_allclose(read.scales[:2, 0], [np.exp(20), np.exp(-20)], rtol=1e-6)
+    np.testing.assert_array_equal(read.quats[2], [1, 0, 0, 0])
+    np.testing.assert_allclose(read.quats[3], untouched.quats[3], atol=1e-6)
+
+
+def of_ply(path) -> Gaussians:
+    """Read with plyfile, after the formulas of the format."""
+    v = PlyData.read(str(path))["vertex"].data
+    stack = lambda *names: jnp.asarray(np.stack([v[name].astype(np.float64) for name in names], -1), jnp.float32)  # noqa: E731
+    k = sum(name.startswith("f_rest_") for name in v.dtype.names) // 3
+    # The k coefficients of red, then of green, then of blue.
+    sh = jnp.stack([stack(f"f_dc_{c}", *(f"f_rest_{c * k + i}" for i in range(k))) for c in range(3)], axis=-1)
+    quats = stack("rot_0", "rot_1", "rot_2", "rot_3")
+    return Gaussians(
+        means=stack(*"xyz"),
+        quats=quats / jnp.linalg.norm(quats, axis=1, keepdims=True),
+        scales=jnp.exp(stack("scale_0", "scale_1", "scale_2")),
+        opacities=1 / (1 + jnp.exp(-stack("opacity")[:, 0])),
+        sh=sh,
     )
-    save_ply(tmp_path / "a.ply", one)
-    row = PlyData.read(str(tmp_path / "a.ply"))["vertex"].data[0]
-    assert [0.5 + SH_C0 * float(row[f"f_dc_{i}"]) for i in range(3)] == pytest.approx([0.9, 0.5, 0.1], abs=1e-6)
-
-
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_written_scenes_are_read_back(tmp_path, degree):
-    gaussians = scene(degree)
-    report = save_ply(tmp_path / "a.ply", gaussians)
-    again = load_ply(tmp_path / "a.ply")
-    assert (report.num_written, report.num_dropped) == (60, 0) and again.sh_degree == degree
-    unit = gaussians.quats / jnp.linalg.norm(gaussians.quats, axis=-1, keepdims=True)
-    for name, wanted in (("means", gaussians.means), ("quats", unit), ("scales", gaussians.scales)):
-        np.testing.assert_allclose(getattr(again, name), wanted, rtol=ROUND_TRIP, atol=1e-6)
-    np.testing.assert_allclose(again.opacities, gaussians.opacities, atol=2e-6)  # opacities near 1 are clamped
-    np.testing.assert_array_equal(again.sh, gaussians.sh)
-
-
-def test_files_are_deterministic_and_survive_a_round_trip(tmp_path):
-    save_ply(tmp_path / "a.ply", scene())
-    save_ply(tmp_path / "b.ply", scene())
-    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
-    save_ply(tmp_path / "c.ply", load_ply(tmp_path / "a.ply"))
-    a, c = independent_gaussians(tmp_path / "a.ply"), independent_gaussians(tmp_path / "c.ply")
-    for name in ("means", "quats", "scales", "opacities", "sh"):
-        np.testing.assert_allclose(getattr(a, name), getattr(c, name), rtol=ROUND_TRIP, atol=1e-6)
-
-
-def test_invisible_rows_are_dropped_and_counted(tmp_path):
-    good = scene(1, n=9)
-    bad = replace(
-        good,
-        means=good.means.at[0, 1].set(jnp.nan),
-        quats=good.quats.at[1, 0].set(jnp.inf),
-        scales=good.scales.at[2, 2].set(-0.1).at[7, 0].set(jnp.inf),
-        opacities=good.opacities.at[3].set(0.0).at[4].set(0.9 / 255).at[5].set(jnp.nan),
-        sh=good.sh.at[6, 3, 0].set(-jnp.inf),
-    )
-    report = save_ply(tmp_path / "a.ply", bad)
-    assert (report.num_written, report.num_dropped) == (1, 8)
-    np.testing.assert_array_equal(load_ply(tmp_path / "a.ply").means, good.means[8:])
-
-
-def test_every_written_number_is_finite(tmp_path):
-    gaussians = replace(
-        scene(0, n=4),
-        opacities=jnp.array([1.0, 1.0, 1.0 / 254.0, 1.0]),
-        scales=jnp.array([[0.0, 1e-30, 1.0], [1e30, 1.0, 1.0], [1.0, 1.0, 1.0], [1.0, 1.0, 1.0]]),
-        quats=jnp.array([[0.0, 0, 0, 0], [1e-30, 0, 0, 0], [1e30, 0, 0, 0], [0, 1e-10, 0, 0]]),
-    )
-    assert save_ply(tmp_path / "a.ply", gaussians).num_written == 4
-    rows = PlyData.read(str(tmp_path / "a.ply"))["vertex"].data
-    numbers = np.stack([rows[name] for name in rows.dtype.names])
-    assert np.isfinite(numbers).all()
-    assert rows["opacity"].max() == pytest.approx(np.log(1e6), rel=1e-6)
-    assert rows["scale_0"][0] == -20 and rows["scale_1"][0] == -20 and rows["scale_0"][1] == 20
-    quats = np.stack([rows[f"rot_{i}"] for i in range(4)], -1)
-    np.testing.assert_array_equal(quats, [[1, 0, 0, 0], [1, 0, 0, 0], [1, 0, 0, 0], [0, 1, 0, 0]])
-
-
-def test_empty_scenes_are_written_and_read(tmp_path):
-    empty = replace(scene(1), opacities=jnp.zeros(60))
-    report = save_ply(tmp_path / "a.ply", empty)
-    assert (report.num_written, report.num_dropped) == (0, 60)
-    again = load_ply(tmp_path / "a.ply")
-    assert again.num_gaussians == 0 and again.sh_degree == 1
 
 
 def test_a_trained_scene_agrees_with_an_independent_reader(scenes):
-    path = scenes / "kacytran_iter7000.ply"
-    ours, theirs = load_ply(path), independent_gaussians(path)
+    ours, theirs = (read(scenes / "kacytran_iter7000.ply") for read in (load_ply, of_ply))
     assert ours.num_gaussians == 9080 and ours.sh_degree == 3
-    unit = theirs.quats / jnp.linalg.norm(theirs.quats, axis=-1, keepdims=True)
     np.testing.assert_array_equal(ours.means, theirs.means)
     np.testing.assert_array_equal(ours.sh, theirs.sh)
-    np.testing.assert_allclose(ours.scales, theirs.scales, rtol=ROUND_TRIP)
-    np.testing.assert_allclose(ours.opacities, theirs.opacities, atol=1e-6)
-    np.testing.assert_allclose(ours.quats, unit, atol=1e-6)
+    assert_same_scene(ours, theirs)
 
 
-def test_a_compressed_scene_is_refused_as_such(scenes):
-    with pytest.raises(InputError, match="it is compressed"):
-        load_ply(scenes / "guitar.compressed.ply")
+def test_another_writers_compressed_file_is_decoded_as_it_was_meant(scenes):
+    found, wanted = load_scene(scenes / "guitar.compressed.ply"), np.load(scenes / "guitar_decoded.npz")
+    np.testing.assert_allclose(found.means, wanted["means"], atol=1e-6)
+    np.testing.assert_allclose(np.log(found.scales), wanted["log_scales"], atol=1e-5)
+    np.testing.assert_allclose(found.opacities, wanted["opacity"], atol=1e-6)
+    np.testing.assert_allclose(0.5 + SH_C0 * found.sh[:, 0], wanted["rgb"], atol=1e-6)
+    unit = wanted["quats_wxyz"] / np.linalg.norm(wanted["quats_wxyz"], axis=1, keepdims=True)
+    np.testing.assert_allclose(np.abs(np.sum(found.quats * unit, axis=1)), 1.0, atol=1e-6)
 
 
-def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch):
-    path = tmp_path / "a.ply"
-    save_ply(path, scene(0))
-    before = path.read_bytes()
-
-    def no_space(descriptor):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(os, "fsync", no_space)
-    with pytest.raises(StorageError, match=r"a\.ply.*No space left"):
-        save_ply(path, scene(3))
-    assert path.read_bytes() == before and os.listdir(tmp_path) == ["a.ply"]
+def test_sh_of_a_compressed_file_are_bytes_by_channel(tmp_path):
+    path = tmp_path / "plain_name.ply"  # it is known by its header
+    path.write_bytes(compressed_ply(2))
+    levels = np.frombuffer(path.read_bytes()[-300 * 24 :], np.uint8).reshape(300, 3, 8).transpose(0, 2, 1)
+    np.testing.assert_allclose(load_ply(path).sh[:, 1:], ((levels + 0.5) / 256 - 0.5) * 8, atol=1e-6)
 
 
-def test_a_folder_that_cannot_be_made_is_a_storage_error(tmp_path):
-    (tmp_path / "file").write_text("in the way")
-    with pytest.raises(StorageError, match="cannot be written"):
-        save_ply(tmp_path / "file" / "a.ply", scene(0))
+def test_compressed_files_without_ranges_of_colors_are_read(tmp_path):
+    ranges = b"".join(f"property float {end}_{c}\n".encode() for end in ("min", "max") for c in "rgb")
+    header, body = compressed_ply(0, 3).replace(ranges, b"").split(b"end_header\n")
+    (tmp_path / "a.ply").write_bytes(header + b"end_header\n" + body[:48] + body[72:])
+    levels = np.frombuffer(body[72:], "<u4").reshape(3, 4)[:, 3] >> np.array([[24], [16], [8]]) & 255
+    colors = 0.5 + SH_C0 * np.asarray(load_ply(tmp_path / "a.ply").sh[:, 0])
+    np.testing.assert_allclose(colors, levels.T / 255, atol=1e-6)
 
 
-def test_render_modes_are_written_and_unknown_ones_refused(tmp_path):
-    save_ply(tmp_path / "a.ply", scene(0), render_mode="default")
-    assert "SplatRenderMode: default" in PlyData.read(str(tmp_path / "a.ply")).comments
-    with pytest.raises(InputError, match="render_mode"):
-        save_ply(tmp_path / "b.ply", scene(0), render_mode="antialiased")
-    assert not (tmp_path / "b.ply").exists()
+def header(count=1, names=BASE, form="binary_little_endian 1.0", kind="float"):
+    lines = ["ply", f"format {form}", f"element vertex {count}", *(f"property {kind} {n}" for n in names)]
+    return "\n".join([*lines, "end_header\n"]).encode()
+
+
+ROW = np.zeros(len(BASE), "<f4")
+without = lambda name: [n for n in BASE if n != name]  # noqa: E731
+rest = lambda n: [*BASE, *(f"f_rest_{i}" for i in range(n))]  # noqa: E731
+spoiled = lambda name, value: np.where(np.array(BASE) == name, value, ROW).astype("<f4").tobytes()  # noqa: E731
+
+BAD_FILES = {
+    "empty": (b"", "'ply'"),
+    "no end of header": (header()[:-12], "end_header"),
+    "endless header": (b"ply\n" + b"comment x\n" * 10000, "end_header"),
+    "no format": (b"ply\nelement vertex 0\nproperty float x\nend_header\n", "format"),
+    "unknown format": (header(form="binary_middle_endian 1.0") + ROW.tobytes(), "binary_middle_endian"),
+    "unknown version": (header(form="ascii 2.0") + ROW.tobytes(), "ascii 2.0"),
+    "unknown type": (header(kind="half") + ROW.tobytes(), "half"),
+    "negative count": (header(count=-1) + ROW.tobytes(), "element vertex -1"),
+    "count of words": (header(count="many") + ROW.tobytes(), "many"),
+    "property twice": (header(names=(*BASE, "x")) + bytes(60), "property float x"),
+    "property before any element": (b"ply\nformat ascii 1.0\nproperty float x\nend_header\n", "property float x"),
+    "no vertices": (b"ply\nformat ascii 1.0\nelement face 1\nproperty float x\nend_header\n1\n", "'vertex'"),
+    "vertices of lists": (
+        b"ply\nformat ascii 1.0\nelement vertex 1\nproperty list uchar int x\nend_header\n1 1\n",
+        "'vertex'",
+    ),
+    "cut off": (header(count=2) + ROW.tobytes() + ROW.tobytes()[:-1], "cut off"),
+    "lying count": (header(count=4_000_000_000) + ROW.tobytes(), "4000000000 rows"),
+    "absurd count": (header(count="9" * 400) + ROW.tobytes(), "999"),
+    "lying count in ascii": (header(count=10**12, form="ascii 1.0") + b"0 " * 14, "1000000000000 rows"),
+    "words in ascii": (header(form="ascii 1.0") + b"zero " * 14, "zero"),
+    "no position": (header(names=without("y")) + ROW.tobytes(), "'y'"),
+    "no opacity": (header(names=without("opacity")) + ROW.tobytes(), "'opacity'"),
+    "a mesh": (header(names=("x", "y", "z", "red", "green", "blue")) + ROW.tobytes(), "'f_dc_0'"),
+    "f_rest of no degree": (header(names=rest(10)) + bytes(400), "got 10"),
+    "f_rest with a gap": (header(names=(*rest(8), "f_rest_9")) + bytes(400), "'f_rest_8'"),
+    "NaN": (header() + spoiled("scale_1", np.nan), "log_scales, row 0: wanted finite numbers, got nan"),
+    "NaN opacity": (header() + spoiled("opacity", np.nan), "opacities"),
+    "infinite position": (header() + spoiled("z", -np.inf), "got -inf"),
+    "beyond float32": (header(form="ascii 1.0") + b"1e60 " + b"0 " * 13, "got 1e+60"),
+    "an offset of words": (header().replace(b"element", b"comment offset a b c\nelement") + ROW.tobytes(), "'a'"),
+    "compressed, without scales": (compressed_ply().replace(b"packed_scale", b"packed_stale"), "'packed_scale'"),
+    "compressed, without a limit": (compressed_ply().replace(b"max_z", b"max_a"), "'max_z'"),
+    "compressed, a chunk too few": (compressed_ply().replace(b"chunk 2", b"chunk 1"), "a chunk for every 256"),
+    "compressed, fewer SH": (compressed_ply().replace(b"sh 300", b"sh 299"), "reshape"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_FILES)
+def test_bad_file_is_refused_in_one_line(tmp_path, name):
+    content, words = BAD_FILES[name]
+    (tmp_path / "bad.ply").write_bytes(content)
+    with pytest.raises(InputError) as caught:
+        load_ply(tmp_path / "bad.ply")
+    message = str(caught.value)
+    assert words in message and "bad.ply" in message and "\n" not in message and len(message) < 600
+
+
+def test_the_unchanged_file_of_the_cases_is_good(tmp_path):
+    (tmp_path / "good.ply").write_bytes(header() + ROW.tobytes())
+    assert load_ply(tmp_path / "good.ply").num_gaussians == 1

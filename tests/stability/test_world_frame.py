@@ -20,7 +20,7 @@ from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.model.streamsplat import StreamSplat
-from ssplat_jax.scene_files.ply import load_ply, save_ply
+from ssplat_jax.scene_files.formats import load_ply, save_ply
 from tests.core.test_rotations import rodrigues
 from tests.model import small
 from tests.model.small import random_params

@@ -11,8 +11,7 @@ from PIL import Image
 import ssplat_jax as ss
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.pytree import replace
-from ssplat_jax.scene_files.formats import read_scene
-from ssplat_jax.scene_files.ply import load_ply
+from ssplat_jax.scene_files.formats import load_ply, read_scene
 from ssplat_jax.storage.chunk_records import ChunkRecord, RecordedView, make_thumbnail, save_chunk_record, save_delta
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.viewer import browser as browser_module

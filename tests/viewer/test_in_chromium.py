@@ -22,7 +22,7 @@ from ssplat_jax.data.posed_image import invert_pose, pose_from_quat
 from ssplat_jax.evaluation.pictures import save_image
 from ssplat_jax.rasterizer import Effects
 from ssplat_jax.runs.reports import report_run
-from ssplat_jax.scene_files.ply import load_ply
+from ssplat_jax.scene_files.formats import load_ply
 from ssplat_jax.storage.chunk_records import ChunkRecord, RecordedView, make_thumbnail, save_chunk_record, save_delta
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.viewer.browser_camera import camera_of

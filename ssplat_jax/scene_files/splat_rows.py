@@ -1,0 +1,165 @@
+"""`SplatRows`: Gaussians as files hold them, and everything that is checked of values on the way to and from a file.
+
+save   Gaussians -> rows_to_write -> encode_* -> bytes
+load   bytes -> decode_* -> gaussians_of_rows -> Gaussians
+"""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Float64, Int, UInt8
+
+from ssplat_jax.core.errors import InputError
+from ssplat_jax.core.gaussians import Gaussians, check_gaussians
+
+RENDER_MODES = ("default", "mip", "2dgs")
+"""Renderers that scenes are made for: 3DGS, 3DGS with the 2D Mip filter (ours), and 2D Gaussian Splatting."""
+SH_TERMS = (1, 4, 9, 16)  # numbers of SH terms that files hold, those of degree 0 to 3
+MIN_OPACITY = 1.0 / 255.0  # below it every renderer shows nothing, and nothing is written (absent rows have 0)
+OPACITY_GUARD = 1e-6  # opacities are clamped this far from 0 and 1, where the logit is infinite
+LOG_SCALE_LIMIT = 20.0
+"""|ln sigma| is clamped to this, 2e-9 to 5e8 units: the range of the compressed formats that are made from a .ply."""
+ROUNDING = 1e-9
+HALF_RANGE = np.sqrt(0.5)  # upper bound of the magnitude of every entry of a unit quaternion but the largest
+MORTON_BITS = 21  # of each coordinate: three of them fit a 64-bit key
+SPREADING = {32: 0x1F00000000FFFF, 16: 0x1F0000FF0000FF, 8: 0x100F00F00F00F00F}
+SPREADING |= {4: 0x10C30C30C30C30C3, 2: 0x1249249249249249}  # shifts and masks that put two zeros between bits
+
+
+@dataclasses.dataclass(frozen=True)
+class SplatRows:
+    """Gaussians in float64, in the axes of a .ply (those of the capture), and the facts beside them."""
+
+    means: Float64[np.ndarray, "n 3"]
+    quats: Float64[np.ndarray, "n 4"]  # wxyz
+    log_scales: Float64[np.ndarray, "n 3"]  # ln of standard deviations
+    opacities: Float64[np.ndarray, " n"]
+    sh: Float64[np.ndarray, "n k 3"]
+    render_mode: str = "default"
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+
+def rows_to_write(gaussians: Gaussians, max_splats: int | None = None) -> tuple[SplatRows, int]:
+    """The visible Gaussians, in their order, with every entry in the range that files can hold.
+
+    Returns:
+        The rows, at most `max_splats` of them (`thinned_mask`), and how many more it left out.
+
+    Limits:
+        Gaussians with a non-finite entry, a negative scale or an opacity below 1/255 are dropped.
+        Opacities are clamped to [1e-6, 1 - 1e-6], scales to [e^-20, e^20]; a zero quaternion becomes the identity.
+
+    Raises:
+        InputError: an array of the scene has a wrong shape, or the number of SH terms is none of 1, 4, 9 and 16.
+    """
+    check_gaussians(gaussians, "scene")
+    if (terms := gaussians.sh.shape[1]) not in SH_TERMS:
+        raise InputError(f"scene: sh must hold 1, 4, 9 or 16 terms for each Gaussian, got {terms}.")
+    fields = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
+    means, quats, scales, opacities, sh = (np.asarray(field, np.float64) for field in fields)
+    entries = np.concatenate([means, quats, scales, opacities[:, None], sh.reshape(len(sh), 3 * terms)], axis=1)
+    keep = np.isfinite(entries).all(axis=1) & (scales >= 0).all(axis=1) & (opacities >= MIN_OPACITY)
+    num_visible = int(keep.sum())
+    # Nothing is pruned: leaving out specks and floaters raised no score on three captures.
+    if max_splats is not None and num_visible > max_splats:
+        keep[keep] = thinned_mask(means[keep], opacities[keep], max_splats)
+    rows = SplatRows(
+        means=means[keep],
+        quats=unit_quats(quats[keep]),
+        log_scales=np.log(np.clip(scales[keep], np.exp(-LOG_SCALE_LIMIT), np.exp(LOG_SCALE_LIMIT))),
+        opacities=np.clip(opacities[keep], OPACITY_GUARD, 1 - OPACITY_GUARD),
+        sh=sh[keep],
+    )
+    return rows, num_visible - len(rows)
+
+
+def thinned_mask(
+    means: Float64[np.ndarray, "n 3"], opacities: Float64[np.ndarray, " n"], num_kept: int
+) -> Bool[np.ndarray, " n"]:
+    """Mask of exactly `num_kept` of more Gaussians that stand for all of them: opaque ones first, everywhere alike.
+
+    A Gaussian is kept with a frequency proportional to the square of its opacity, at most 1. Along the Morton order the
+    frequencies are added up, and one is kept whenever the sum passes a half: no region loses more than its share, so
+    that a scene keeps its surfaces. The largest opacity times area would keep mostly the background: half of the
+    Gaussians of a capture then showed 20.28 dB instead of 23.15.
+    """
+    weights = np.square(opacities)
+    largest_first = np.sort(weights)[::-1]
+    rest = np.cumsum(largest_first[::-1])[::-1]  # sum of each weight and the smaller ones
+    certain = np.arange(num_kept)
+    factors = (num_kept - certain) / rest[:num_kept]  # if so many of the largest are kept for certain
+    factor = factors[np.argmax(factors * largest_first[:num_kept] <= 1.0 + ROUNDING)]
+    order = morton_order(means)
+    sums = np.floor(np.cumsum(np.minimum(factor * weights[order], 1.0)) + 0.5)
+    mask = np.zeros(len(weights), bool)
+    mask[order] = np.diff(sums, prepend=0.0) > 0
+    return mask
+
+
+def gaussians_of_rows(rows: SplatRows) -> Gaussians:
+    """Gaussians of decoded rows: scales are clamped, quaternions normalized, a zero one becomes the identity.
+
+    Raises:
+        ValueError: an entry is not finite in float32.
+    """
+    for name in ("means", "quats", "log_scales", "opacities", "sh", "offset"):
+        column = np.asarray(getattr(rows, name), np.float64)
+        bad = ~(np.abs(column) <= np.finfo(np.float32).max)
+        if bad.any():
+            raise ValueError(f"{name}, row {np.argwhere(bad)[0, 0]}: wanted finite numbers, got {column[bad].flat[0]}")
+    fields = {
+        "means": rows.means,
+        "quats": unit_quats(rows.quats),
+        "scales": np.exp(np.clip(rows.log_scales, -LOG_SCALE_LIMIT, LOG_SCALE_LIMIT)),
+        "opacities": np.clip(rows.opacities, 0.0, 1.0),
+        "sh": rows.sh,
+    }
+    return Gaussians(**{name: jnp.asarray(field, jnp.float32) for name, field in fields.items()})
+
+
+def unit_quats(quats: Float64[np.ndarray, "n 4"]) -> Float64[np.ndarray, "n 4"]:
+    """Normalizes quaternions; those with all entries within 1e-12 of 0 become the identity, as in the renderer."""
+    largest = np.abs(quats).max(axis=1, keepdims=True, initial=0.0)
+    quats = np.where(largest > 1e-12, quats, np.array([1.0, 0.0, 0.0, 0.0]))
+    quats = quats / np.abs(quats).max(axis=1, keepdims=True, initial=0.0)
+    return quats / np.linalg.norm(quats, axis=1, keepdims=True)
+
+
+def to_bytes(values: Float64[np.ndarray, "*n"]) -> UInt8[np.ndarray, "*n"]:
+    """Rounds to the nearest integer in [0, 255]."""
+    return np.clip(np.round(values), 0, 255).astype(np.uint8)
+
+
+def morton_order(means: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
+    """Order of the positions along a Z curve through their bounding box; ties stay in their order."""
+    if len(means) == 0:
+        return np.zeros(0, np.int64)
+    low, high = means.min(axis=0), means.max(axis=0)
+    size = np.where(high > low, high - low, 1.0)
+    cells = ((means - low) / size * ((1 << MORTON_BITS) - 1)).astype(np.uint64)
+    for shift, mask in SPREADING.items():
+        cells = (cells | cells << np.uint64(shift)) & np.uint64(mask)
+    keys = cells[:, 0] | cells[:, 1] << np.uint64(1) | cells[:, 2] << np.uint64(2)
+    return np.argsort(keys, kind="stable")
+
+
+def drop_largest(quats: Float64[np.ndarray, "n 4"]) -> tuple[Int[np.ndarray, " n"], Float64[np.ndarray, "n 3"]]:
+    """Index of the largest entry of each unit quaternion, and the others, signed so that the largest is positive."""
+    largest = np.abs(quats).argmax(axis=1)
+    rows = np.arange(len(quats))
+    quats = quats * np.copysign(1.0, quats[rows, largest])[:, None]
+    return largest, quats[np.arange(4) != largest[:, None]].reshape(-1, 3)
+
+
+def with_largest(largest: Int[np.ndarray, " n"], others: Float[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 4"]:
+    """The unit quaternions of `drop_largest`."""
+    quats = np.zeros((len(others), 4))
+    is_largest = np.arange(4) == largest[:, None]
+    quats[~is_largest] = others.reshape(-1)
+    # Rounding can make the three longer than 1.
+    quats[is_largest] = np.sqrt(np.maximum(1.0 - np.sum(np.square(others, dtype=np.float64), axis=1), 0.0))
+    return quats
