@@ -31,7 +31,7 @@ class Train:
     recipe: Literal["tiny", "depth", "stream", "evidence", "refiner", "paper"] = "tiny"
     """tiny: trains depth from scratch. depth: continues that in batches of larger images, for a GPU. evidence: trains
     the evidence head of --init-weights on whole streams. refiner: trains the learned pass of refinement on whole
-    streams of --init-weights, in one go. stream: trains the stages after depth. paper: the paper's loss and steps, for
+    streams of --init-weights. stream: trains the stages after depth. paper: the paper's loss and steps, for
     imported weights or --preset paper, and a GPU."""
     scale_steps: float = 1.0
     """Factor of the number of steps of every phase."""
@@ -56,6 +56,7 @@ class Train:
 
     def run(self) -> int:
         from ssplat_jax.core.console import Reporter
+        from ssplat_jax.refinement.learned_pass import save_refiner
         from ssplat_jax.storage.weights import describe_weights, params_digest, save_weights
         from ssplat_jax.training.capture_mix import open_mix
         from ssplat_jax.training.loop import train
@@ -63,8 +64,6 @@ class Train:
 
         require_positive(scale_steps=self.scale_steps, save_every=self.save_every, validate_every=self.validate_every)
         require_seed(self.seed)
-        if self.recipe == "refiner":
-            return self._run_refiner()
         recipe = dataclasses.replace(RECIPES[self.recipe].scaled(self.scale_steps), seed=self.seed)
         self._refuse_unused(recipe)
         reporter = Reporter(self.quiet)
@@ -105,6 +104,10 @@ class Train:
             before = describe_weights(str(self.init_weights)).provenance
             fresh = [name for name, stage in result.params.items() if stage and name not in given]
             provenance |= {"init_weights": self.init_weights.name, "fresh": fresh, "before": before}
+        if "refiner" in result.params:
+            save_refiner(self.out / "refiner.npz", result.params["refiner"], provenance)
+            print(f"wrote {self.out}/refiner.npz after {result.step} steps")
+            return 0
         save_weights(self.out / "weights.npz", result.params, config, provenance)
         print(f"wrote {self.out}/weights.npz after {result.step} steps")
         reporter.say(f"next: `ssplat run CAPTURE --weights {self.out}/weights.npz --out runs/mine` streams with them")
@@ -132,6 +135,7 @@ class Train:
         import jax
 
         from ssplat_jax.model.network import complete_params
+        from ssplat_jax.refinement.learned_pass import init_refiner
         from ssplat_jax.storage.weights import check_params, load_weights
 
         if self.init_weights is None:
@@ -143,49 +147,13 @@ class Train:
             reporter.say(f"--preset {self.preset} changes the configuration of {self.init_weights}: {changes}")
         params = complete_params(jax.random.key(self.seed), config, given)
         check_params(params, config, str(self.init_weights))
+        if "refiner" in recipe.untrained:
+            params["refiner"] = init_refiner(self.seed)
         if unused := [name for name in given if not params.get(name)]:
             reporter.warn(f"{self.init_weights}: leaves out {', '.join(unused)}, which the configuration does not use")
         if fresh := [name for name, stage in params.items() if stage and name not in given]:
             reporter.say(f"{self.init_weights} gives no {', '.join(fresh)}: random at the start")
         return config, given, params
-
-    def _run_refiner(self) -> int:
-        """Trains the network of the learned pass. It takes minutes, so it starts anew after an interrupt."""
-        from ssplat_jax.core.console import Reporter
-        from ssplat_jax.model.streamsplat import StreamSplat
-        from ssplat_jax.refinement.learned_pass import save_refiner
-        from ssplat_jax.storage.run_folder import lock_folder, make_writable
-        from ssplat_jax.training.capture_mix import open_mix
-        from ssplat_jax.training.recipe import TINY
-        from ssplat_jax.training.refiner_training import RefinerRecipe, train_refiner
-
-        used = ("out", "preset", "recipe", "scale_steps", "seed", "init_weights", "captures", "set", "quiet")
-        for field in dataclasses.fields(self):
-            if field.name not in used and getattr(self, field.name) != field.default:
-                flag = field.name.replace("_", "-")
-                raise InputError(f"--{flag}: --recipe refiner has no use for it; leave it out.")
-        if self.init_weights is None:
-            raise InputError("--recipe refiner: wanted --init-weights, whose streams it refines; got none.")
-        reporter = Reporter(self.quiet)
-        config, _, params = self._start(TINY, reporter)
-        recipe = RefinerRecipe(seed=self.seed)
-        recipe = dataclasses.replace(recipe, steps=max(1, round(recipe.steps * self.scale_steps)))
-        num_steps = recipe.rounds * recipe.steps
-        mix = open_mix(self.captures, (), config) if self.captures else None
-        make_writable(self.out)
-        with lock_folder(self.out), reporter.progress("training", num_steps, waiting="streaming") as advance:
-            trained, facts = train_refiner(
-                StreamSplat(config),
-                params or {},
-                mix,
-                recipe,
-                on_scene=lambda name: reporter.say(f"streamed {name}"),
-                on_step=lambda step, record: advance(step, f"psnr {record['shown_psnr']:.2f}"),
-            )
-        provenance = {"recipe": dataclasses.asdict(recipe), "init_weights": self.init_weights.name, **facts}
-        save_refiner(self.out / "refiner.npz", trained, provenance)
-        print(f"wrote {self.out}/refiner.npz after {num_steps} steps")
-        return 0
 
 
 def _differences(held: StreamConfig, config: StreamConfig) -> str:

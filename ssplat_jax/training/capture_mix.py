@@ -79,11 +79,14 @@ class PhaseStart:
     """What the samples of a phase are made from when it begins."""
 
     model: StreamSplat
-    params: dict  # of all stages
+    params: dict  # of all stages, averaged
     mix: CaptureMix | None
     seed: int  # of the recipe
     num_steps: int  # of the recipe
     say: Callable[[str], None]  # called with messages while scenes are prepared
+    shared: dict = dataclasses.field(
+        default_factory=dict
+    )  # what the phases of a training share, such as streamed scenes
 
 
 def open_mix(folders: Sequence[Path], shares: Sequence[float], config: StreamConfig) -> CaptureMix:

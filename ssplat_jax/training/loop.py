@@ -20,7 +20,7 @@ from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.atomic import write_atomic
 from ssplat_jax.core.cpu_backend import num_cores
 from ssplat_jax.core.errors import InputError
-from ssplat_jax.core.pytree import pytree
+from ssplat_jax.core.pytree import pytree, replace
 from ssplat_jax.evaluation.lpips import LpipsWeights
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.storage.files import json_text
@@ -46,6 +46,7 @@ class TrainState:
     params: dict  # stages of which a part learns in some phase
     average: optax.EmaState  # moving average of `params`, see `averaged`
     optimizer: tuple  # state of `optimizer`
+    begin: dict  # the average when the phase began, of which its samples may be made
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,7 +103,7 @@ def init_state(recipe: Recipe, params: dict) -> TrainState:
     learning = {name: jax.tree.map(jnp.copy, stage) for name, stage in params.items() if name in stages}
     average: Any = optax.ema(recipe.ema_decay).init(learning)
     opt_state: Any = optimizer(recipe, learning).init(learning)
-    return TrainState(learning, average, opt_state)
+    return TrainState(learning, average, opt_state, jax.tree.map(jnp.copy, learning))
 
 
 def averaged(recipe: Recipe, state: TrainState) -> dict:
@@ -140,7 +141,7 @@ def train_step(
     updates, opt_state = optimizer(recipe, state.params).update(gradients, state.optimizer, state.params)
     params: Any = optax.apply_updates(state.params, updates)
     average: Any = optax.ema(recipe.ema_decay).update(params, state.average)[1]
-    return TrainState(params, average, opt_state), metrics | {"grad_norm": optax.global_norm(gradients)}
+    return TrainState(params, average, opt_state, state.begin), metrics | {"grad_norm": optax.global_norm(gradients)}
 
 
 def describe_run(
@@ -196,15 +197,18 @@ def train(
         phase.samples.check(mix, config, renders=phase.loss.renders)
     model, name = StreamSplat(config), init_weights or ("random" if params is None else params_digest(params))
     params = model.init(jax.random.key(recipe.seed)) if params is None else params
-    state, done, stopped = init_state(recipe, params), 0, None
+    state, done, stopped, shared = init_state(recipe, params), 0, None, {}
     constants = {stage: part for stage, part in params.items() if stage not in state.params}
     update = functools.partial(train_step, model=model, recipe=recipe)
 
     def current() -> dict:
         return constants | averaged(recipe, state)
 
-    def begin(phase: Phase) -> Callable[[int, int], Any]:
-        return phase.samples.open(PhaseStart(model, current(), mix, recipe.seed, recipe.num_steps, say))
+    def begin(phase: Phase, is_resumed: bool) -> Callable[[int, int], Any]:
+        nonlocal state
+        state = state if is_resumed else replace(state, begin=averaged(recipe, state))
+        params = constants | jax.tree.map(jnp.copy, state.begin)
+        return phase.samples.open(PhaseStart(model, params, mix, recipe.seed, recipe.num_steps, say, shared))
 
     @functools.cache
     def held_out(phase: Phase) -> list:
@@ -234,15 +238,18 @@ def train(
 
 
 def batches(
-    recipe: Recipe, done: int, begin: Callable[[Phase], Callable[[int, int], Any]]
+    recipe: Recipe, done: int, begin: Callable[[Phase, bool], Callable[[int, int], Any]]
 ) -> Iterator[tuple[Phase, int, Any]]:
-    """Phase, number and batch of every step after the first `done`; `begin` gives the function that makes batches."""
+    """Phase, number and batch of every step after the first `done`.
+
+    `begin(phase, is_resumed)` gives the function that makes the batches of a phase.
+    """
     # A GPU leaves the cores free to make samples; without one, a thread makes them beside the steps.
     workers = 1 if jax.default_backend() == "cpu" else max(1, num_cores() // 2)
     first = 0
     for phase in recipe.phases:
         if steps := range(max(done, first), first + phase.steps):
-            make = begin(phase)
+            make = begin(phase, done > first)
             for step, batch in prefetched(lambda i, make=make, first=first: make(i, i - first), steps, workers):
                 yield phase, step, batch
         first += phase.steps

@@ -22,7 +22,7 @@ from tests.streaming.narrow_model import NARROW
 
 @dataclasses.dataclass(frozen=True)
 class Numbers:
-    """Samples of random numbers; those of the steps `spoiled` are NaN."""
+    """Samples of random numbers, which depend on the parameters at the start; those of the steps `spoiled` are NaN."""
 
     spoiled: tuple[int, ...] = ()
 
@@ -30,9 +30,11 @@ class Numbers:
         pass
 
     def open(self, start):
+        shift = 0.1 * np.asarray(start.params["encoder"]["cnn"])
+
         def batch(step, place):
-            numbers = np.random.default_rng([start.seed, step, place]).normal(1.0, 0.1, 3).astype(np.float32)
-            return jnp.asarray(numbers * np.nan if step in self.spoiled else numbers)
+            numbers = shift + np.random.default_rng([start.seed, step, place]).normal(1.0, 0.1, 3)
+            return jnp.asarray(numbers * np.nan if step in self.spoiled else numbers, jnp.float32)
 
         return batch
 

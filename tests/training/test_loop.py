@@ -56,7 +56,10 @@ def formulas(recipe):
     steps = [(phase, place) for phase in recipe.phases for place in range(phase.steps)]
     updates = 0
     for step, (phase, place) in enumerate(steps):
-        numbers = np.float64(phase.samples.open(SimpleNamespace(seed=recipe.seed))(step, place))
+        if place == 0:  # samples may depend on the average when the phase begins
+            cnn = average["['encoder']['cnn']"] / (1 - recipe.ema_decay**step) if step else x["['encoder']['cnn']"]
+            make = phase.samples.open(SimpleNamespace(seed=recipe.seed, params={"encoder": {"cnn": cnn}}))
+        numbers = np.float64(make(step, place))
         paths = {name: name.strip("[]'").replace("']['", "/") for name in x}
         learns = {name: paths[name].split("/")[0] in phase.stages for name in x}
         gradients = {name: 2 * phase.loss.weight * (x[name] - numbers) * learns[name] for name in x}
