@@ -144,7 +144,7 @@ def test_frames_that_step_far_enough_stay_in_order(step):
     assert interleave(along_a_line([0.03] * 19), list(range(20)), 4, step) == list(range(20))
 
 
-def test_speed_is_judged_block_by_block():
+def test_speed_is_measured_block_by_block():
     """A slow part is interleaved, a fast part after it is not."""
     order = interleave(along_a_line([0.01] * 36 + [0.05] * 35), list(range(72)), 4, 0.03)
     assert order[:4] == [0, 3, 6, 9] and order[-16:] == list(range(56, 72))

@@ -148,7 +148,7 @@ def _turned(direction: np.ndarray, angle: float) -> np.ndarray:
 
 
 def _level(direction: np.ndarray) -> np.ndarray:
-    """Unit vector of `direction` with half its slope."""
+    """Unit vector of `direction` at half its steepness."""
     return _unit(direction * [1.0, 0.5, 1.0])
 
 

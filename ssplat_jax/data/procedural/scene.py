@@ -145,7 +145,7 @@ class SceneBuilder:
         self.faces = np.zeros((rows, 6, 16))
         self.face_textures = np.zeros((rows, 6), np.int32)
         self._next = dict(FIRST_ROWS)
-        self._end = {"box": NUM_BOXES, "ball": NUM_BOXES + NUM_BALLS, "cylinder": NUM_SOLIDS}
+        self._limits = {"box": NUM_BOXES, "ball": NUM_BOXES + NUM_BALLS, "cylinder": NUM_SOLIDS}
 
     def finish(self, *groups: str, tile: float = 1.0, same: bool = True, tint: float = 0.15, **options) -> Finish:
         """Returns a random finish from one of the texture `groups`, with other fields of `Finish` as `options`.
@@ -178,7 +178,7 @@ class SceneBuilder:
     def add(self, shape: str, center, half, finish: Finish, rotation: np.ndarray | None = None) -> None:
         """Adds a "box", "ball" or "cylinder" (along its y axis) of the given half extents along its own axes."""
         row = self._next[shape]
-        if row == self._end[shape]:
+        if row == self._limits[shape]:
             return
         self._next[shape] += 1
         self._place(row, center, half, finish, np.eye(3) if rotation is None else rotation)
