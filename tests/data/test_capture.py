@@ -9,6 +9,7 @@ import pytest
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.cameras import project_points, transform_points
 from ssplat_jax.core.errors import InputError
+from ssplat_jax.data import capture as capture_module
 from ssplat_jax.data.open_capture import open_capture
 from tests.badinputs.cases import make_capture
 from tests.data.capture_fixture import frame_of, resized, smooth_capture
@@ -79,6 +80,15 @@ def test_reading_ahead_raises_at_the_damaged_chunk(tmp_path):
     next(chunks)
     with pytest.raises(ValueError, match=r"2\.jpg"):
         next(chunks)
+
+
+def test_an_image_is_decoded_once_for_depth_range_and_stream(tmp_path, monkeypatch):
+    decoded = []
+    decode = capture_module.decode_image
+    monkeypatch.setattr(capture_module, "decode_image", lambda path, size: decoded.append(path) or decode(path, size))
+    capture = open_capture(make_capture(tmp_path / "c"), size=(32, 24))
+    assert sum(int(chunk.valid.sum()) for chunk in capture.chunks(StreamConfig())) == 4
+    assert sorted(decoded) == [frame.path for frame in capture.frames]
 
 
 @pytest.mark.parametrize("indices", [[], [4], [-1]])
