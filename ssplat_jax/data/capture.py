@@ -157,11 +157,7 @@ class Capture:
         return self.crop(i).intrinsics(self.frames[i].K)
 
     def image(self, i: int) -> Float32[np.ndarray, "h w 3"]:
-        """Returns image `i` as RGB in [0, 1], at the size of the capture.
-
-        Raises:
-            InputError: the file is damaged.
-        """
+        """Returns image `i` as RGB in [0, 1], at the size of the capture."""
         return self.pixels.image(i, self.crop(i))
 
     def depth(self, i: int) -> Float32[np.ndarray, "h w"] | None:
@@ -170,11 +166,7 @@ class Capture:
         return None if depth is None else self.crop(i).depth(depth, (frame.width, frame.height))
 
     def check_output_folder(self, out: Path) -> None:
-        """Checks that results do not mix with the capture's files: a run overwrites and clears files of its folder.
-
-        Raises:
-            InputError: an image or depth map lies in `out` or below it, or `out` lies below a folder of such files.
-        """
+        """Refuses `out` where results would mix with the capture's files: a run overwrites and clears its folder."""
         folder = out.resolve()
         files = [path.resolve() for f in self.frames for path in (f.path, f.depth_path) if path is not None]
         if any(file.is_relative_to(folder) or folder.is_relative_to(file.parent) for file in files):
@@ -182,11 +174,7 @@ class Capture:
             raise refusal(str(out), wanted="a folder for results alone", got=got, fix=fix)
 
     def verify(self, indices: Sequence[int] | None = None) -> None:
-        """Decodes the images of the frames `indices` (default: all), to find damaged files; uses all cores.
-
-        Raises:
-            InputError: a file is damaged; the message names the first one.
-        """
+        """Decodes the images of the frames `indices` (default: all), to find damaged files; uses all cores."""
         with ThreadPoolExecutor() as pool:  # Pillow decodes outside the interpreter lock
             for _ in pool.map(self.image, range(len(self)) if indices is None else indices):
                 pass
@@ -211,9 +199,6 @@ class Capture:
         """Returns the camera of frame `i`: in a stream frame, or else in the capture frame, in which scene files are.
 
         In the capture frame, `offset` is the point of it to which the scene's positions are relative.
-
-        Raises:
-            InputError: there is no such frame.
         """
         _indices(self, [i])
         frame = frame or StreamFrame.at_point(offset)

@@ -38,11 +38,7 @@ def check_depth_header(path: Path) -> None:
 
 
 def decode_image(path: Path, size: tuple[int, int]) -> Float32[np.ndarray, "h w 3"]:
-    """Decodes an image file of (width, height) `size` to RGB in [0, 1].
-
-    Raises:
-        InputError: the file is truncated or damaged, or its size has changed since the capture was opened.
-    """
+    """Decodes an image file, which must still have the (width, height) `size`, to RGB in [0, 1]."""
     with _open(path) as image:
         if image.size != size:
             wanted, got = (f"{width}x{height}" for width, height in (size, image.size))
@@ -211,9 +207,7 @@ PINHOLE = Lens()  # no distortion
 def check_lens(lens: Lens, K: Float64[np.ndarray, "3 3"], width: int, height: int, where: str) -> float:
     """Returns the largest displacement by distortion on the border of the image, in pixels; exactly 0 without any.
 
-    Raises:
-        InputError: the distortion folds the image or moves pixels by more than the image size, so the coefficients
-            probably belong to another model.
+    Distortion that folds the image is refused: its coefficients probably belong to another model.
     """
     t = np.linspace(0.0, 1.0, 9)
     edge = np.concatenate([np.stack(np.broadcast_arrays(t, s), -1) for s in (0.0, 1.0)])

@@ -78,9 +78,6 @@ def choose_split(
         context: number of context views; by default 64, or as many as the targets leave.
         targets: for "paper", the number of targets (default 16, or a quarter of a short capture); for "scannet" too
             (default 64); for "interleaved", the largest number of targets that are kept, evenly spaced (default: all).
-
-    Raises:
-        InputError: the protocol is unknown, or there are too few frames.
     """
     if protocol not in PROTOCOLS:
         raise refusal("protocol", wanted=" or ".join(PROTOCOLS), got=repr(protocol), fix="choose one of them")
@@ -115,11 +112,7 @@ def choose_split(
 
 
 def interleaved_split(num_frames: int, stride: int, context: int) -> Split:
-    """Returns the interleaved split: every 8th strided frame is a target, the first `context` others are context.
-
-    Raises:
-        InputError: too few frames for `context` views and one target between them.
-    """
+    """Returns the interleaved split: every 8th strided frame is a target, the first `context` others are context."""
     _check_counts(stride=stride, context=context)
     taken = range(0, num_frames, stride)
     at_target = set(taken[FIRST_TARGET::TARGET_STEP])
@@ -143,9 +136,6 @@ def paper_split(
         targets: number of targets (ScanNet: 64), uniform over the trajectory.
         anchors: number of context views (ScanNet: 8) that are spread over the trajectory and come first.
         thin_to: number of frames to which the trajectory is thinned first (ScanNet: 1088); None keeps all.
-
-    Raises:
-        InputError: the trajectory is too short, or a count is not positive.
     """
     _check_counts(context=context, targets=targets)
     if not 0 <= anchors <= context:
@@ -227,9 +217,6 @@ def read_index(path: Path) -> tuple[Index, tuple[str, ...]]:
 
     Returns:
         The splits of its scenes, and notes for the user.
-
-    Raises:
-        InputError: the file is missing or is no index; the message names the scene and the field.
     """
     scenes = load_json(path)
     if not scenes:

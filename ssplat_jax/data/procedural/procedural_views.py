@@ -143,9 +143,6 @@ def procedural_capture_arrays(name: str, num_frames: int, height: int, width: in
     `room`, `orbit` and `corridor` are smooth paths that cover their world evenly. `revisit` has weak textures, noise
     and a path that returns: half of its views go around a room, then the camera stands at four places, closer to what
     it saw before, and hardly moves. Another `seed` selects another world of the same kind.
-
-    Raises:
-        InputError: an unknown capture, or no frames.
     """
     if name not in CAPTURES:
         raise InputError(f"procedural:{name}: no such capture; there is {', '.join(CAPTURES)}.")

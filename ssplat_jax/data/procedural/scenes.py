@@ -23,9 +23,6 @@ def sample_scene(seed: int, kind: str | None = None, textures: TextureLibrary | 
         seed: any non-negative integer.
         kind: one of `SCENE_KINDS`; None draws one, but no yard.
         textures: by default `texture_library()`.
-
-    Raises:
-        InputError: an unknown kind.
     """
     if kind is not None and kind not in _RECIPES:
         raise InputError(f"procedural scene: kind must be one of {', '.join(SCENE_KINDS)}, got {kind!r}.")
