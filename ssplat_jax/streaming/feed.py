@@ -59,13 +59,11 @@ def feed_chunks(session: Session, capture: Capture, order: Sequence[int], frame:
         order: frame numbers in stream order (`Capture.stream_order`); may be empty.
         frame: the similarity between the capture's frame and the stream's.
     """
-    config = session.model.config
+    config, size = session.model.config, session.model.config.stream.chunk_size
     if len(order) == 0:
         return
-    num_fed = 0
-    for chunk in capture.chunks(config, order, frame=frame):
-        frames = list(order[num_fed : num_fed + config.stream.chunk_size])
-        num_fed += len(frames)
+    for number, chunk in enumerate(capture.chunks(config, order, frame=frame)):
+        frames = list(order[number * size : (number + 1) * size])
         if config.stream.causal:
             chunk = replace(chunk, near=jnp.float32(frame.near), far=jnp.float32(frame.far))
         since, compiled = time.perf_counter(), session.compile_seconds

@@ -6,9 +6,10 @@
         delta = feed.update(cache)          # decodes only the rows that changed
         scene = apply_delta(scene, delta)   # equals model.decode(params, cache)
 
-A voxel's Gaussians change when a token is written to it, which the cache records per pivot (`last_chunks`); when views
-carve a pivot away or restore it; and, with evidence, when views see a shown pivot. The feed detects the last two by
-comparing the shown pivots and their observations with the previous ones.
+A step does not report what it touched, so that streams without a follower pay nothing. A voxel's Gaussians change
+when a token is written to it, which the cache records per pivot (`last_chunks`); when views carve a pivot away or
+restore it; and, with evidence, when views see a shown pivot. The feed detects the last two by comparing the shown
+pivots and their observations with the previous ones.
 """
 
 import dataclasses
@@ -36,9 +37,8 @@ class SceneDelta:
     rows: Int32[np.ndarray, " r"]  # ascending
     gaussians: Gaussians  # [r * k], in the order of `rows`; k = pivots_per_voxel * gaussians_per_token
     capacity: int  # capacity of the cache: the scene has capacity * k Gaussians
+    # Omega of the pivots behind `gaussians`. Without evidence, a change of it alone is no change of a row.
     confidences: Float32[np.ndarray, " n"]
-    """Omega of the pivots behind `gaussians`, in their order. Without evidence, a change of it alone is no change of a
-    row."""
 
 
 class _Record(NamedTuple):
