@@ -24,7 +24,6 @@ INITIAL_CHUNKS = 4
 MIN_DECODED_PIVOTS = 1 << 15
 """Lower limit of the pivots decoded at once: with fewer, compiling for a growing scene costs more than it saves."""
 
-
 Revise = Callable[[dict, VoxelCache, Chunk, ChunkOutput], VoxelCache]
 """Refinement after a chunk: parameters, the cache after the step, the chunk, the step's summary -> the cache."""
 
