@@ -7,12 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ssplat_jax.cache import grow, init_cache
+from ssplat_jax.cache import init_cache
 from ssplat_jax.cache.changes import BOUNDS, FACE_MARGIN, WIDTH, Change, changed_gaussians, pack, settle, unpack
 from ssplat_jax.cache.hash_table import voxel_indices
 from ssplat_jax.core.gaussians import SH_C0, Gaussians
 from ssplat_jax.core.pytree import replace
-from tests.cache.streams import CAPACITY, CONFIG, PAIRS, Recipe, fuse, revised, to_jax
+from tests.cache.streams import CAPACITY, CONFIG, Recipe, fuse, revised, to_jax
 
 SIZE = CONFIG.memory.voxel_size
 PER_TOKEN = CONFIG.head.gaussians_per_token
@@ -100,28 +100,6 @@ def test_merges_of_changed_pivots_stay_in_their_voxels():
         )
         cache = revised(cache, rng, REFINED)
     assert int(cache.stats.num_merged) > 20
-
-
-def test_dead_and_new_pivots_have_no_change():
-    config = PAIRS.replace(steps_per_chunk=1)
-    cache, rng = init_cache(config, CAPACITY), np.random.default_rng(0)
-    for seed in range(6):
-        cache = revised(fuse(cache, to_jax(Recipe(seed, "many", "normal", "random").tokens()), config), rng, config)
-    cache = fuse(cache, to_jax(Recipe(7, "many", "normal", "random", num_valid=8).tokens()), config)
-    kept = np.asarray(cache.changes)
-    is_new = np.asarray(cache.num_members == 1) & np.asarray(cache.last_chunks == 6)
-    assert not kept[~np.asarray(cache.alive)].any() and not kept[is_new].any() and kept.any()
-
-
-def test_a_grown_cache_keeps_its_changes():
-    cache = revised(
-        fuse(init_cache(REFINED, CAPACITY), to_jax(Recipe(0, "few", "normal", "random").tokens()), REFINED),
-        np.random.default_rng(0),
-        REFINED,
-    )
-    grown = grow(cache, 2 * CAPACITY)
-    np.testing.assert_array_equal(grown.changes[:CAPACITY], cache.changes)
-    assert not np.any(grown.changes[CAPACITY:])
 
 
 def test_without_refinement_a_cache_has_no_trace_of_it():

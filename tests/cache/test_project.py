@@ -1,6 +1,5 @@
 """The projection equals the NumPy reference and sees the front surface of each pixel."""
 
-import functools
 import importlib
 
 import jax
@@ -25,7 +24,7 @@ from tests.cache.projection_scenes import (
     scene,
     with_pivots,
 )
-from tests.cache.streams import CAPACITY, CONFIG, VALUE_RTOL, WIDTH
+from tests.cache.streams import CAPACITY, CONFIG, VALUE_RTOL
 
 jit_project = jax.jit(project, static_argnums=2)
 PLAIN_MEAN = CONFIG.replace(front_cluster=False)
@@ -97,13 +96,6 @@ def test_recentering_removes_the_bias_towards_the_camera():
 def test_an_empty_cache_projects_to_nothing():
     result = jit_project(init_cache(CONFIG, CAPACITY), cameras(0), CONFIG)
     assert not any(np.any(np.asarray(x)) for x in jax.tree.leaves(result))
-
-
-def test_colors_are_projected_only_to_match_exposure():
-    cache, camera = with_pivots([[0.0, 0.0, 2.0]]), front_camera()
-    for matched in (True, False):
-        program = jax.jit(functools.partial(project, config=CONFIG.replace(match_exposure=matched)))
-        assert matched == (f"x{WIDTH + 3}xf32" in program.lower(cache, camera).as_text())
 
 
 def test_no_gradient_passes_the_projection():
