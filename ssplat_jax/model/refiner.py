@@ -1,28 +1,23 @@
 """Refiner: the change of a Gaussian from the error that views see in it (an addition to the paper).
 
-Gradient descent needs tens of small steps, since a gradient says where to go and not how far. This network has
-learned how far: it reads how a Gaussian's gradients agree between views, how much of the images the Gaussian fills and
-how large the error is there, and sets the step of each of its parameters. `refinement/learned_pass.py` computes what it
-reads and applies what it says.
+It reads how a Gaussian's gradients agree between views, how much of the images it fills and how large the error
+is there, and sets the step of each of its parameters. `refinement/learned_pass.py` computes what it reads and applies
+what it says.
 """
-
-import itertools
 
 import flax.linen as nn
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-WIDTH = 48
-"""Channels of the hidden layers."""
+WIDTH = 48  # channels of the hidden layers
+FIRST_GAIN = 0.1  # of all parts before training: a small step against the gradient
 
 GAINS = {"means": 3, "quats": 1, "log_scales": 3, "logit_opacities": 1, "colors": 3, "bands": 1}
 """Gains of each part of a Gaussian; one gain serves the whole quaternion and all higher SH bands."""
 
 SHIFTS = {"means": 3, "log_scales": 3, "logit_opacities": 1, "colors": 3}
 """Shifts of each part that has any: a shift moves the part even if its gradients are 0."""
-
-FIRST_GAIN = 0.1
-"""Gain of all parts before training: a small step against the gradient."""
 
 NUM_GAINS, NUM_SHIFTS = sum(GAINS.values()), sum(SHIFTS.values())
 
@@ -50,5 +45,4 @@ def gains_and_shifts(out: Float[Array, "n c"]) -> dict[str, tuple[Float[Array, "
 
 
 def _split(x: Float[Array, "n c"], widths: dict[str, int]) -> dict[str, Float[Array, "n _"]]:
-    ends = [int(end) for end in itertools.accumulate(widths.values())]
-    return {name: x[:, end - widths[name] : end] for name, end in zip(widths, ends, strict=True)}
+    return dict(zip(widths, jnp.split(x, np.cumsum([*widths.values()])[:-1], axis=1), strict=True))

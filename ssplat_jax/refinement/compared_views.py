@@ -15,21 +15,11 @@ from ssplat_jax.rasterizer import Effects, RenderOutput, fill_holes, render
 from ssplat_jax.refinement.refine_config import RefineConfig
 
 EFFECTS = Effects(outputs=("color", "alpha"))
-BLOCK = 8
-"""Side of the pixel blocks that are held back together: neighbors of a pixel give its color away."""
-
-GOLDEN = 2654435769
-"""2^32 over the golden ratio."""
-
-WORSE_THAN_USUAL = 2.0
-"""Ratio to the median error above which a view counts as one of another scene, or of a wrong pose."""
-MIN_COMPARED = 4
-"""Views that a median needs to mean something."""
-MAX_LEFT_OUT = 0.25
-"""Share of the views that may be left out for their error: beyond it the scene is wrong, not the views."""
-
-
-# Errors -------------------------------------------------------------------------------------------------------------
+BLOCK = 8  # side of the pixel blocks that are held back together: neighbors of a pixel give its color away
+GOLDEN = 2654435769  # 2^32 over the golden ratio
+WORSE_THAN_USUAL = 2.0  # ratio to the median error above which a view is one of another scene, or of a wrong pose
+MIN_COMPARED = 4  # views that a median needs to mean something
+MAX_LEFT_OUT = 0.25  # share of the views that may be left out for their error: beyond it the scene is wrong
 
 
 def errors_of_view(
@@ -46,7 +36,7 @@ def errors_of_view(
         gaussians: the scene.
         background: color that fills holes, at the exposure of the scene.
         view: one view, without a batch axis.
-        max_pairs: capacity for tile intersections.
+        max_pairs: capacity for tile intersections (static).
         probe: channels that are rendered beside the colors.
 
     Returns:
@@ -66,15 +56,7 @@ def view_loss(
     config: RefineConfig,
     max_pairs: int,
 ) -> tuple[Float[Array, ""], tuple[Float[Array, ""], Float[Array, ""], Int[Array, ""]]]:
-    """L1 error of a key view with holes filled and over black, on the pixels that are not held back.
-
-    Args:
-        gaussians: the scene.
-        background: color that fills holes, at the exposure of the scene.
-        view: one view, without a batch axis.
-        slot: its slot, which decides the pixels that are held back.
-        config: weights of both errors, and how many pixels are held back.
-        max_pairs: capacity for tile intersections.
+    """L1 error of the key view in `slot` with holes filled and over black, on the pixels that are not held back.
 
     Returns:
         The loss, and the loss again, the error of the held-back pixels, and the tile intersections that did not fit.
@@ -87,13 +69,7 @@ def view_loss(
 
 
 def held_back_pixels(size: tuple[int, ...], slot: Int[Array, ""], config: RefineConfig) -> Bool[Array, "h w"]:
-    """Pixels of a view that no gradient sees: the same blocks at every step.
-
-    Args:
-        size: height and width of the image.
-        slot: slot of the view.
-        config: gives the fraction and the seed.
-    """
+    """Pixels of the view in `slot` that no gradient sees, by height and width: the same blocks at every step."""
     height, width = size
     key = jax.random.fold_in(jax.random.key(config.seed + 1), slot)
     blocks = jax.random.uniform(key, (-(-height // BLOCK), -(-width // BLOCK))) < config.held_back
@@ -103,9 +79,6 @@ def held_back_pixels(size: tuple[int, ...], slot: Int[Array, ""], config: Refine
 def mean_over(errors: Float[Array, "h w"], pixels: Bool[Array, "h w"]) -> Float[Array, ""]:
     """Mean error of some pixels; 0 for none."""
     return jnp.sum(jnp.where(pixels, errors, 0.0)) / jnp.maximum(jnp.sum(pixels, dtype=errors.dtype), 1.0)
-
-
-# Order --------------------------------------------------------------------------------------------------------------
 
 
 def views_of_step(step: Int[Array, ""], valid: Bool[Array, " v"], config: RefineConfig) -> Int[Array, " b"]:
@@ -119,12 +92,7 @@ def next_view(place: Int[Array, ""], valid: Bool[Array, " v"], seed: int) -> Int
 
     Every valid view is shown once a round. Any few views in a row lie evenly among the valid ones, which are in the
     order of the stream: in an order drawn by chance they do not, and what no view shows for a while stays as it was.
-    A round begins at a place of its own.
-
-    Args:
-        place: number of the view in the sequence, from 0.
-        valid: slots that hold a view.
-        seed: seed of the places at which rounds begin.
+    A round begins at a place of its own, drawn by `seed`.
     """
     num_valid = jnp.maximum(jnp.sum(valid, dtype=jnp.int32), 1)
     begin = jax.random.uniform(jax.random.fold_in(jax.random.key(seed), place // num_valid), dtype=jnp.float32)
@@ -138,9 +106,6 @@ def golden_fractions(numbers: Int[Array, " n"]) -> Float[Array, " n"]:
     return (numbers.astype(jnp.uint32) * jnp.uint32(GOLDEN)).astype(jnp.float32) / 2.0**32  # the product wraps around
 
 
-# Usable views -------------------------------------------------------------------------------------------------------
-
-
 def only_usable(gaussians: Gaussians, key_views: KeyViews, max_pairs: int) -> KeyViews:
     """`key_views` whose unusable views are not valid. It looks at values: call it outside jit.
 
@@ -148,11 +113,6 @@ def only_usable(gaussians: Gaussians, key_views: KeyViews, max_pairs: int) -> Ke
     than twice the median of all views: a black frame, another scene, a pose that is far off. At most a quarter of the
     views is left out for the error, the worst first, and none of fewer than four views. The error is the mean over
     what the scene covers, so a view of little known places stays.
-
-    Args:
-        gaussians: the scene before refinement.
-        key_views: the views.
-        max_pairs: capacity for tile intersections.
 
     Raises:
         InputError: no view is left.

@@ -123,9 +123,7 @@ def is_learned(num_steps: int, steps: int, config: RefineConfig) -> bool:
 def learned_pass(
     state: RefineState, key_views: KeyViews, refiner: dict, *, config: RefineConfig, max_pairs: int
 ) -> tuple[RefineState, StepReport]:
-    """The state after a learned pass, and the reports of the `STEPS` steps whose place it takes. Donate `state`.
-
-    Arguments are those of `refine_step`, with the network's parameters in the place of the rate.
+    """The state after a learned pass, and the reports of the `STEPS` steps whose place it takes, as of `refine_step`.
 
     Limits:
         A pass changes nothing if the first `NUM_CHECKED` of its views look no better after it, or if it gives a number

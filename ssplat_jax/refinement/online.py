@@ -18,17 +18,18 @@ from jaxtyping import Array, Float, Int
 
 from ssplat_jax.cache.changes import Change, apply_change, settle, unpack
 from ssplat_jax.cache.key_views import KeyViews, keep_views, usable
+from ssplat_jax.cache.project import NEAR
 from ssplat_jax.cache.state import VoxelCache
-from ssplat_jax.config import MEDIAN_DEPTH
+from ssplat_jax.config import MEDIAN_DEPTH, StreamConfig
 from ssplat_jax.core.chunk import Chunk
 from ssplat_jax.core.gaussians import Gaussians, mean_color
 from ssplat_jax.core.pytree import replace
-from ssplat_jax.model.decoder import MAX_SCALE
-from ssplat_jax.model.streamsplat import ChunkOutput, StreamSplat
+from ssplat_jax.model.decoder import MAX_SCALE, grown_footprints
+from ssplat_jax.model.streamsplat import ChunkOutput, StreamSplat, shown_pivots
+from ssplat_jax.model.views import GRID_STRIDE
 from ssplat_jax.rasterizer.render import round_up
 from ssplat_jax.refinement.compared_views import errors_of_view, golden_fractions
 from ssplat_jax.refinement.refine_step import units
-from ssplat_jax.refinement.visible_pivots import visible_pivots
 from ssplat_jax.streaming.session import Revise
 
 GAINS = {"means": 12.0, "quats": 0.2, "log_scales": 6.0, "logit_opacities": 6.0, "sh": 0.12}
@@ -36,17 +37,12 @@ GAINS = {"means": 12.0, "quats": 0.2, "log_scales": 6.0, "logit_opacities": 6.0,
 by the squared change of a pixel that the part causes. The gains are far smaller: several Gaussians answer for a pixel,
 and a Gaussian should follow the mean of its views, not the one that was shown last."""
 
-CAPS = {"means": 0.2, "quats": 0.02, "log_scales": 0.1, "logit_opacities": 0.5, "sh": 0.2}
-"""Largest step of each part, in `units`."""
-
-MIN_PIXELS = 0.3
-"""Added to the pixels that a Gaussian fills: one that hardly shows learns little from them."""
-
-SHOWN_WEIGHT = 0.7
-"""Weight of the error with holes filled; the rest is the error over black, as in `RefineConfig.shown_weight`."""
-
-PAIRS_PER_GAUSSIAN = 3
-"""Capacity for tile intersections; the farthest Gaussians of a view are left out beyond it."""
+CAPS = {"means": 0.2, "quats": 0.02, "log_scales": 0.1, "logit_opacities": 0.5, "sh": 0.2}  # largest step, in `units`
+MIN_PIXELS = 0.3  # added to the pixels that a Gaussian fills: one that hardly shows learns little from them
+SHOWN_WEIGHT = 0.7  # of the error with holes filled; the rest is the error over black
+PIVOTS_PER_CELL = 8  # pivots that a step changes over the grid cells of its view, which bounds its time and memory
+LISTED_PER_CELL = 64  # most pivots of a view that are compared, over its grid cells; the last rows are left out
+PAIRS_PER_GAUSSIAN = 3  # capacity for tile intersections; the farthest Gaussians of a view are left out beyond it
 
 
 def online_refinement(model: StreamSplat) -> Revise | None:
@@ -55,17 +51,10 @@ def online_refinement(model: StreamSplat) -> Revise | None:
 
 
 def refine_scene(model: StreamSplat, params: dict, cache: VoxelCache, chunk: Chunk, output: ChunkOutput) -> VoxelCache:
-    """The cache after a round of refinement that follows `model.step` on `chunk`.
+    """The cache after a round of refinement that follows `model.step` on `chunk` and gave `output`.
 
-    Args:
-        model: the stream's model; its `steps_per_chunk` says how much is done.
-        params: the model's parameters.
-        cache: the cache after the step, with changes and key views.
-        chunk: the chunk of the step.
-        output: the step's summary, which holds the exposures.
-
-    Returns:
-        The cache. Only `means`, `changes`, `last_chunks` and `key_views` differ.
+    Only `means`, `changes`, `last_chunks` and `key_views` differ. A changed pivot counts as written (`last_chunks`), so
+    that deltas report it.
     """
     config = model.config
     arrivals = replace(KeyViews.of(chunk.camera, chunk.images, output.exposures), valid=chunk.valid)
@@ -103,7 +92,8 @@ def views_of_round(ring: KeyViews, arrivals: KeyViews, num_chunks: Int[Array, ""
     """The `num` kept views of a round; the chunk's own views where none has been kept yet.
 
     The i-th step of a stream takes the view at n x frac(i / golden ratio) of n usable ones, in order of their slots:
-    all views are taken about equally often, and steps that follow each other take views that arrived far apart.
+    all views are taken about equally often, and steps that follow each other take views that arrived far apart. Scenes
+    gained less if the chunk's own views took part at once.
 
     Args:
         ring: the views kept before the chunk.
@@ -159,3 +149,69 @@ def online_step(base: Gaussians, change: Change, view: KeyViews, *, max_pairs: i
         move = jnp.clip(GAINS[name] * in_units / pixels, -CAPS[name], CAPS[name])
         new[name] = getattr(change, name) - unit * jnp.where(view.valid & jnp.isfinite(move), move, 0.0)
     return Change(**new)
+
+
+def visible_pivots(cache: VoxelCache, view: KeyViews, config: StreamConfig) -> Int[Array, " m"]:
+    """Numbers of the shown pivots in a view, found without rendering; -1 after the last.
+
+    Most pivots in the frustum of a large scene lie behind surfaces, and would cost a step as much as those that it
+    changes. So the least covered ones come first, and `PIVOTS_PER_CELL` times the cells are taken. A pivot is covered
+    by the area of the pivots before it in its cell: their squared footprints, at most one cell each. Where that is 3
+    cells, about a twentieth of the light is left. (The nearest pivots instead would leave surfaces in front to be bent
+    until they show what lies behind them.) A view that is not valid sees nothing.
+    """
+    height, width = view.images.shape[:2]
+    rows, columns = -(-height // GRID_STRIDE), -(-width // GRID_STRIDE)
+    num_cells = rows * columns
+    points = cache.means.reshape(-1, 3).T
+    x, y, z = (r[0] * points[0] + r[1] * points[1] + r[2] * points[2] + r[3] for r in view.viewmats[:3])
+    column, row = ((view.Ks[i, i] * along / z + view.Ks[i, 2]) / GRID_STRIDE for i, along in enumerate((x, y)))
+    is_seen = view.valid & shown_pivots(cache, config).reshape(-1) & (z > NEAR)
+    is_seen &= (column > -1) & (column < columns + 1) & (row > -1) & (row < rows + 1)
+
+    num_pivots = is_seen.shape[0]
+    size = min(LISTED_PER_CELL * num_cells, num_pivots)
+    listed = jnp.nonzero(is_seen, size=size, fill_value=num_pivots)[0].astype(jnp.int32)
+    is_listed, taken = listed < num_pivots, jnp.minimum(listed, num_pivots - 1)
+    cell_of = lambda place, count: jnp.clip(place[taken], 0, count - 1).astype(jnp.int32)  # noqa: E731
+    cells = jnp.where(is_listed, cell_of(row, rows) * columns + cell_of(column, columns), num_cells)
+    stored, num_members = (x.reshape(-1)[taken] for x in (cache.footprints, cache.num_members))
+    sides = grown_footprints(stored, num_members, config) * view.Ks[0, 0] / (z[taken] * GRID_STRIDE)
+    covers = areas_before(cells, z[taken], jnp.where(is_listed, jnp.minimum(sides * sides, 1.0), 0.0), num_cells)
+
+    order = _argsort(jnp.where(is_listed, covers, jnp.inf))[: min(PIVOTS_PER_CELL * num_cells, size)]
+    return jnp.where(is_listed[order], listed[order], -1)
+
+
+def areas_before(
+    cells: Int[Array, " n"], depths: Float[Array, " n"], areas: Float[Array, " n"], num_cells: int
+) -> Float[Array, " n"]:
+    """For each entry the summed areas of the nearer entries of its cell, 0 to `num_cells`.
+
+    One integer of 64 bits holds cell, depth and entry: XLA's CPU backend sorts it seven times as fast as three keys. It
+    leaves the depth, which must be positive, all its 32 bits, or 31 at a million entries in 4,800 cells.
+    """
+    slot_bits, cell_bits = len(cells).bit_length(), num_cells.bit_length()
+    depth_bits = min(32, 64 - slot_bits - cell_bits)
+    with jax.enable_x64(True):
+        slots = jnp.arange(len(cells), dtype=jnp.uint64)
+        depths_first = _bits(depths) >> jnp.uint64(32 - depth_bits)
+        keys = (cells.astype(jnp.uint64) << jnp.uint64(depth_bits)) | depths_first
+        keys = jnp.sort((keys << jnp.uint64(slot_bits)) | slots)
+        order = (keys & jnp.uint64((1 << slot_bits) - 1)).astype(jnp.int32)
+    own, cell = areas[order], cells[order]
+    before = jnp.cumsum(own) - own
+    begins = jax.lax.cummax(jnp.where(jnp.append(True, cell[1:] != cell[:-1]), before, 0.0))
+    return jnp.zeros_like(areas).at[order].set(jnp.maximum(before - begins, 0.0), unique_indices=True)
+
+
+def _argsort(values: Float[Array, " n"]) -> Int[Array, " n"]:
+    """The order of values that are not negative."""
+    with jax.enable_x64(True):
+        keys = jnp.sort((_bits(values) << jnp.uint64(32)) | jnp.arange(len(values), dtype=jnp.uint64))
+        return (keys & jnp.uint64(0xFFFFFFFF)).astype(jnp.int32)
+
+
+def _bits(values: Float[Array, " n"]) -> Array:
+    """Integers in the order of values that are not negative."""
+    return jax.lax.bitcast_convert_type(values, jnp.uint32).astype(jnp.uint64)

@@ -35,20 +35,11 @@ from ssplat_jax.streaming.feed import Exposures
 
 Images = Float[Array | np.ndarray, "v h w 3"] | UInt8[Array | np.ndarray, "v h w 3"]
 
-FINAL_RATE = 0.3
-"""Fraction of the learning rates that is left at the last planned step; they decay geometrically."""
-
-PATIENCE = 3
-"""Rounds of views without a better held-back error after which refinement ends: few pixels are held back."""
-
-PAIRS_MARGIN = 1.25
-"""Capacity for tile intersections over what the fullest key view needs: Gaussians grow while they are refined."""
-
-ROWS_MARGIN = 1.02
-"""Capacity for rows over what the views of a step may see at most: Gaussians move while they are refined."""
-
-MAX_KEY_VIEWS = 128
-"""Most frames of a stream that are kept for refinement, evenly spread: their memory does not grow with the stream."""
+FINAL_RATE = 0.3  # fraction of the learning rates that is left at the last planned step; they decay geometrically
+PATIENCE = 3  # rounds of views without a better held-back error that end refinement: few pixels are held back
+PAIRS_MARGIN = 1.25  # capacity for tile intersections over what the fullest view needs: Gaussians grow
+ROWS_MARGIN = 1.02  # capacity for rows over what the views of a step may see at most: Gaussians move
+MAX_KEY_VIEWS = 128  # most frames of a stream that are compared: their memory does not grow with the stream
 
 
 @dataclasses.dataclass
@@ -71,10 +62,9 @@ class Progress:
 
     def add(self, report: StepReport, seconds: float) -> None:
         """Adds the measurements of a step, or of a learned pass."""
-        losses, held_back = np.ravel(report.loss).tolist(), np.ravel(report.held_back).tolist()
-        self.losses += losses
-        self.held_back += held_back
-        self.seconds += [seconds / len(losses)] * len(losses)
+        self.losses += np.ravel(report.loss).tolist()
+        self.held_back += np.ravel(report.held_back).tolist()
+        self.seconds += [seconds / np.size(report.loss)] * np.size(report.loss)
 
     def scene(self, given: Gaussians) -> Gaussians:
         """`given`, the scene that refinement started from, as it is now.
@@ -137,7 +127,7 @@ def refine(
     Raises:
         InputError: shapes do not fit, `steps` is negative, images are out of range, or no view can be learned from.
     """
-    _check(cameras, images, exposures, steps)
+    _check(cameras, images, exposures)
     return _refined(gaussians, KeyViews.of(cameras, images, exposures), steps, config or RefineConfig(), on_step)
 
 
@@ -152,26 +142,10 @@ def refine_on_capture(
     config: RefineConfig = FOR_CAPTURES,
     on_step: Callable[[int, float], None] = lambda step, loss: None,
 ) -> tuple[Gaussians, Refinement]:
-    """The scene of a stream, changed to fit at most `MAX_KEY_VIEWS` of its own frames.
+    """The decoded scene of a stream, in the stream frame, changed to fit its own frames.
 
-    Args:
-        gaussians: the decoded scene, in the stream frame.
-        capture: where the images come from, at the size that is compared.
-        indices: frame numbers that were streamed.
-        frame: the similarity between the capture's frame and the stream's.
-        exposures: factor per streamed frame, as the stream estimated it.
-        steps: most refinement steps; with 0 the scene comes back as it is.
-        config: SH degree, loss and held-back pixels.
-        on_step: called with the number of steps done and the last loss.
-
-    Returns:
-        The refined scene in the stream frame, and the report.
-
-    Raises:
-        InputError: `steps` is negative, or a frame was not streamed.
+    Arguments are those of `key_views_of` and `refine`, with a configuration for captures.
     """
-    if steps < 0:
-        raise InputError(f"refine: steps must be at least 0, got {steps}.")
     return _refined(gaussians, key_views_of(capture, indices, frame, exposures), steps, config, on_step)
 
 
@@ -182,6 +156,8 @@ def _refined(
     config: RefineConfig,
     on_step: Callable[[int, float], None],
 ) -> tuple[Gaussians, Refinement]:
+    if steps < 0:
+        raise InputError(f"refine: steps must be at least 0, got {steps}.")
     if steps == 0:
         return gaussians, Refinement()
     progress, key_views = start_refinement(gaussians, key_views, config)
@@ -196,11 +172,6 @@ def start_refinement(
     """Progress before the first step, and the key views without those that cannot be learned from.
 
     The same arguments give the same result: a refinement that was stopped starts again and takes over its saved state.
-
-    Args:
-        gaussians: the scene, absent rows included.
-        key_views: the views to compare with.
-        config: SH degree and new Gaussians; default `RefineConfig()`.
 
     Raises:
         InputError: no view can be learned from.
@@ -328,9 +299,7 @@ def key_views_of(capture: Capture, indices: Sequence[int], frame: StreamFrame, e
     return KeyViews.of(cameras, np.stack(images), factors)
 
 
-def _check(cameras: Camera, images, exposures, steps: int) -> None:
-    if steps < 0:
-        raise InputError(f"refine: steps must be at least 0, got {steps}.")
+def _check(cameras: Camera, images, exposures) -> None:
     if cameras.viewmats.ndim != 3 or not len(cameras.viewmats):
         raise InputError(
             f"refine: cameras must have one batch axis, viewmats [v 4 4], got {list(cameras.viewmats.shape)}."

@@ -20,18 +20,14 @@ from ssplat_jax.refinement.scene_rows import seen_rows
 RATES = {"means": 0.04, "quats": 0.003, "log_scales": 0.02, "logit_opacities": 0.2, "sh": 0.015}
 """Adam's learning rates in `units`: about the change per step of a parameter whose gradient keeps its sign."""
 
-HIGHER_BANDS = 0.1
-"""Rate of the higher SH bands as a fraction of that of the constant band: fewer views tell about each of them."""
+HIGHER_BANDS = 0.1  # rate of the higher SH bands as a fraction of that of the constant one: fewer views tell of them
 
 ADAM = optax.scale_by_adam(b1=0.9, b2=0.99, eps=1e-15)
 """`b2` is short, since a run has tens to hundreds of steps. `eps` is below any gradient that a visible Gaussian has in
 a mean over pixels; 1e-8 would stop most of them."""
 
-MAX_SHIFT = 4.0
-"""Largest distance of a mean from where it started, in units of the Gaussian's own size."""
-
-MAX_LOG_SCALE_CHANGE = 1.5
-"""Largest change of a log standard deviation."""
+MAX_SHIFT = 4.0  # largest distance of a mean from where it started, in units of the Gaussian's own size
+MAX_LOG_SCALE_CHANGE = 1.5  # largest change of a log standard deviation
 
 
 @pytree
@@ -162,17 +158,9 @@ def _moved(state: RefineState, gradient: Change, loss: Float[Array, ""], rate: F
 
 
 def units(gaussians: Gaussians) -> dict[str, Array | float]:
-    """Units of each part of a `Change` in which a step is the same for Gaussians of all sizes.
-
-    They are the Gaussian's own size for places, and a color of 1 for SH bands.
-    """
-    return {
-        "means": sizes(gaussians)[:, None],
-        "quats": 1.0,
-        "log_scales": 1.0,
-        "logit_opacities": 1.0,
-        "sh": 1.0 / SH_C0,
-    }
+    """Units of a `Change` in which a step is the same for Gaussians of all sizes: their own size, a color of 1."""
+    same = dict.fromkeys(("quats", "log_scales", "logit_opacities"), 1.0)
+    return {"means": sizes(gaussians)[:, None], **same, "sh": 1.0 / SH_C0}
 
 
 def sizes(gaussians: Gaussians) -> Float[Array, " n"]:

@@ -25,8 +25,14 @@ from ssplat_jax.model.compact.compact_tokens import GaussianHead
 from ssplat_jax.model.network import init_params
 from ssplat_jax.model.streamsplat import ChunkOutput, StreamSplat
 from ssplat_jax.rasterizer import render
-from ssplat_jax.refinement.online import online_refinement, online_step, refine_scene, views_of_round
-from ssplat_jax.refinement.visible_pivots import areas_before, visible_pivots
+from ssplat_jax.refinement.online import (
+    areas_before,
+    online_refinement,
+    online_step,
+    refine_scene,
+    views_of_round,
+    visible_pivots,
+)
 from ssplat_jax.storage.saved_states import load_state, save_state
 from ssplat_jax.streaming.scene_delta import SceneFeed, apply_delta
 from ssplat_jax.streaming.session import Session
@@ -286,7 +292,7 @@ def test_the_least_covered_pivots_are_taken_where_there_is_space_for_few(monkeyp
     is_hidden = in_sight & (depths > 1.07 * DEPTH) & (depths < 1.5 * DEPTH)
     num_visible = int((in_sight & ~is_hidden).sum())
     many = np.asarray(visible_pivots(cache, view, CONFIG))
-    monkeypatch.setattr("ssplat_jax.refinement.visible_pivots.PIVOTS_PER_CELL", 1)
+    monkeypatch.setattr("ssplat_jax.refinement.online.PIVOTS_PER_CELL", 1)
     pivots = np.asarray(visible_pivots(cache, view, CONFIG))
     assert is_hidden.sum() > 15 and 40 < num_visible <= len(pivots) == 48
     assert np.isin(np.flatnonzero(in_sight & ~is_hidden), pivots).mean() > 0.95
