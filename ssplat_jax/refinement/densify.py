@@ -147,9 +147,10 @@ def hides(points: Float[Array, "n 3"], cells: Cells, key_views: KeyViews) -> Boo
         depth, light = cells.depths[slot, rows, columns], cells.light[slot, rows, columns]
         return inside, inside & (light < MIN_LIGHT) & (z < IN_FRONT * depth)
 
-    inside, is_before = jax.lax.map(in_view, jnp.arange(key_views.num_slots))
-    count = lambda masks: jnp.sum(masks, axis=0, dtype=jnp.float32)  # noqa: E731
-    return count(is_before) > MAX_HIDING * count(inside)
+    inside, is_before = (
+        x.sum(axis=0, dtype=jnp.float32) for x in jax.lax.map(in_view, jnp.arange(key_views.num_slots))
+    )
+    return is_before > MAX_HIDING * inside
 
 
 def _cells_of_points(points: Float[Array, "n 3"], camera: Camera, shape: tuple[int, ...]):

@@ -57,7 +57,7 @@ class SeenErrors:
 def no_errors(gaussians: Gaussians) -> SeenErrors:
     """The sums over no view."""
     zeros, none = gradients_by_part(gaussians, no_change(gaussians)), jnp.zeros_like(gaussians.opacities)
-    return SeenErrors(gradients=zeros, squares=zeros, pixels=none, errors=none, signed=none, num_views=none)
+    return SeenErrors(zeros, zeros, none, none, none, none)
 
 
 def gradients_by_part(gaussians: Gaussians, gradient: Change) -> dict[str, Float[Array, "n _"]]:
@@ -100,16 +100,9 @@ def add_view(
     told = [jnp.ones(black.shape[:2]), jnp.abs(black).mean(axis=-1), clipped(black).mean(axis=-1)]
     told = jnp.where(learned, jnp.stack(told, axis=-1), 0.0).astype(features.dtype)
     gradient, sums = pull((weight * clipped(filled), (1 - weight) * clipped(black), told))
-    by_part = gradients_by_part(current, gradient)
-    pixels, errors, signed = jnp.moveaxis(sums, -1, 0)
-    added = SeenErrors(
-        gradients=by_part,
-        squares=jax.tree.map(jnp.square, by_part),
-        pixels=pixels,
-        errors=errors,
-        signed=signed,
-        num_views=(pixels >= MIN_PIXELS).astype(pixels.dtype),
-    )
+    by_part, pixels = gradients_by_part(current, gradient), sums[:, 0]
+    num_views = (pixels >= MIN_PIXELS).astype(pixels.dtype)
+    added = SeenErrors(by_part, jax.tree.map(jnp.square, by_part), pixels, sums[:, 1], sums[:, 2], num_views)
     difference = jnp.mean(weight * jnp.abs(filled) + (1 - weight) * jnp.abs(black), axis=-1)
     measured = mean_over(difference, ~held_back), mean_over(difference, held_back), overflow
     return jax.tree.map(jnp.add, seen, added), measured
