@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -15,15 +14,11 @@ from ssplat_jax.core.gaussians import Gaussians, mean_color
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import Split
 from ssplat_jax.evaluation import cost
-from ssplat_jax.evaluation import evaluate as evaluation
 from ssplat_jax.evaluation.cost import PeakMemory, measure_latency
-from ssplat_jax.evaluation.lpips import load_lpips, lpips
 from ssplat_jax.evaluation.psnr_ssim import psnr, ssim
 from ssplat_jax.evaluation.scoring import baselines, exposures_from_json, exposures_to_json, nearest_views, score_view
 from ssplat_jax.model.streamsplat import StreamSplat
-from ssplat_jax.poses.adjust_poses import AdjustedPoses
 from ssplat_jax.streaming.session import Session
-from tests.evaluation.lpips_fixture import random_heads, random_vgg
 
 
 def gaussians(colors, opacities, depth: float = -5.0) -> Gaussians:
@@ -144,67 +139,6 @@ def test_exposures_are_exact_in_json():
     back = exposures_from_json(json.loads(json.dumps(exposures_to_json(exposures))))
     assert back.keys() == exposures.keys()
     assert all(np.array_equal(back[i], exposures[i]) and back[i].dtype == np.float32 for i in back)
-
-
-def test_lpips_is_scored_if_and_only_if_weights_are_given(capture, compiled_plainly, tmp_path):
-    np.savez(tmp_path / "vgg.npz", **random_vgg())
-    np.savez(tmp_path / "heads.npz", **random_heads())
-    weights = load_lpips(tmp_path / "vgg.npz", tmp_path / "heads.npz")
-    scene, frame = gaussians([[0.2, 0.4, 0.6]], [0.9]), capture.stream_frame(StreamConfig(), (0, 1, 3, 4))
-    view = score_view(scene, capture, 2, frame, {}, weights)
-    score, color = view.score, view.color
-    target = jnp.asarray(capture.image(2))
-    for image, given in ((color, score.shown.lpips), (np.zeros_like(color), score.literal.lpips)):
-        expected = float(lpips(weights, jnp.asarray(image), target))
-        assert given == pytest.approx(expected, rel=1e-5) and expected > 0.1
-    plain = score_view(scene, capture, 2, frame, {}).score
-    assert plain.shown.lpips is None and plain.literal.lpips is None
-
-
-class Stop(Exception):
-    """Ends an evaluation where the test has seen enough."""
-
-
-def test_adjusted_poses_are_streamed_and_targets_keep_theirs(tmp_path, monkeypatch):
-    capture, split = open_capture("procedural:room?frames=8&size=48x32"), Split("test", (0, 1, 2, 3, 5, 6, 7), (4,))
-    frames = [
-        dataclasses.replace(f, camtoworld=f.camtoworld + np.eye(4, k=3) * 0.01 * (i != 4))
-        for i, f in enumerate(capture.frames)
-    ]
-    moved = dataclasses.replace(capture, frames=tuple(frames))
-    seen = {}
-
-    def adjust(given, indices, revise, reporter):
-        assert given.camtoworlds.tolist() == capture.camtoworlds.tolist() and tuple(indices) == split.context
-        return AdjustedPoses(moved, True, 0.5, 0.1, 0.5, 0.01, 200) if revise == "poses" else None
-
-    def feed(session, streamed, *rest, **options):
-        seen["streamed"] = streamed.camtoworlds
-        return {i: np.ones(3) for i in split.context}, []
-
-    def refine(gaussians, streamed, *rest):
-        seen["refined"] = streamed.camtoworlds
-        raise Stop
-
-    monkeypatch.setattr(evaluation, "adjust_if_asked", adjust)
-    monkeypatch.setattr(evaluation, "feed_capture", feed)
-    monkeypatch.setattr(evaluation, "score_view", lambda *given: SimpleNamespace(score=None))
-    monkeypatch.setattr(evaluation, "_refine", refine)
-    session = SimpleNamespace(
-        model=SimpleNamespace(config=StreamConfig()),
-        compile_seconds=0.0,
-        num_compilations=0,
-        step_memory_bytes=0,
-        refine_memory_bytes=None,
-        cache_facts=lambda: {"decoded": 0},
-        gaussians=lambda: None,
-    )
-    for revise, wanted in (("poses", moved), (None, capture)):
-        with pytest.raises(Stop):
-            evaluation.evaluate.__wrapped__(session, capture, split, tmp_path / "out", refine_steps=2, revise=revise)
-        np.testing.assert_array_equal(seen["streamed"], wanted.camtoworlds)
-        np.testing.assert_array_equal(seen["refined"], wanted.camtoworlds)
-    np.testing.assert_array_equal(moved.camtoworlds[4], capture.camtoworlds[4])
 
 
 def test_the_largest_program_counts_that_of_refinement_too():

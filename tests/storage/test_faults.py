@@ -1,6 +1,6 @@
 """A run that is killed or stopped repeatedly at any moment gives the same result as an uninterrupted run.
 
-`pytest -m slow -s tests/checkpoint` prints what the sweep did.
+`pytest -m slow -s tests/storage` prints what the sweep did.
 """
 
 import json
@@ -26,9 +26,7 @@ SIZE = (64, 48)
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 NUM_KILLS = 50
-NUM_KILLS_ONLINE = 20  # of a run that refines its scene after each chunk
 SAVES_IN_ALL = 50  # that all lives together complete before they are killed, at least
-ONLINE = ("--online-refine", "2")
 LAST_CHUNKS = 6  # this near the end, lives are killed at their first save, so that the stream outlasts the kills
 TIMEOUT = 600.0  # seconds; a life takes about ten
 
@@ -175,12 +173,6 @@ def modified(path: Path) -> int | None:
 
 def test_kills_at_random_moments_and_in_saves_change_nothing(capture, uninterrupted, tmp_path):
     kill_and_compare(Runs(capture, tmp_path / "killed"), NUM_KILLS, uninterrupted)
-
-
-def test_kills_of_a_run_that_refines_while_streaming_change_nothing(capture, uninterrupted, tmp_path):
-    wanted = results_without_kills(capture, tmp_path / "whole", *ONLINE)
-    assert wanted["scene.ply"] != uninterrupted["scene.ply"]  # the steps do something
-    kill_and_compare(Runs(capture, tmp_path / "killed", *ONLINE), NUM_KILLS_ONLINE, wanted)
 
 
 def kill_and_compare(runs: Runs, num_kills: int, wanted) -> None:

@@ -1,28 +1,13 @@
 """Output folders: locks between processes, and removal of numbered files."""
 
-import dataclasses
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from ssplat_jax.commands.demo_command import Demo
-from ssplat_jax.commands.eval_command import Eval
-from ssplat_jax.commands.main import main
 from ssplat_jax.core.errors import InputError, StorageError
 from ssplat_jax.storage.run_folder import lock_folder, remove_numbered
-
-
-def test_a_second_process_is_refused_until_the_first_ends(tmp_path):
-    with (
-        lock_folder(tmp_path),
-        pytest.raises(InputError, match="another process is writing to it"),
-        lock_folder(tmp_path),
-    ):
-        pass
-    with lock_folder(tmp_path):
-        pass
 
 
 def test_an_unwritable_folder_is_refused_immediately():
@@ -70,25 +55,3 @@ def test_a_new_folder_that_stays_empty_is_removed(tmp_path):
     with lock_folder(tmp_path / "new"):
         (tmp_path / "new" / "file").unlink()
     assert (tmp_path / "new").exists()  # it existed before
-
-
-def test_a_folder_that_cannot_be_made_is_a_storage_error(tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(StorageError, match="choose another place"), lock_folder(tmp_path / "file"):
-        pass
-
-
-@pytest.mark.parametrize("command", [("run", "procedural:room?frames=4&size=32x24"), ("train",)])
-def test_run_and_train_refuse_a_folder_in_use(command, tmp_path, capsys):
-    with lock_folder(tmp_path), pytest.raises(SystemExit) as stopped:
-        main([*command, "--out", str(tmp_path)])
-    assert stopped.value.code == 2
-    *_, line = capsys.readouterr().err.splitlines()  # after the progress output of `train`
-    assert "another process" in line and "--out" in line and not any(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize("command", [Demo(quiet=True), Eval("procedural:room", Path(), quiet=True)])
-def test_commands_wait_for_no_other_process(command, tmp_path):
-    with lock_folder(tmp_path), pytest.raises(InputError, match="another process is writing to it"):
-        dataclasses.replace(command, out=tmp_path).run()
-    assert not list(tmp_path.iterdir())

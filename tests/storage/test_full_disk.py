@@ -27,7 +27,6 @@ from tests.commands.test_cli import make_capture
 
 NUM_CHUNKS, CHUNK_SIZE = 3, 2
 FIELDS_OF_ONE_PROCESS = ("compile_s", "step_memory_bytes", "peak_memory_bytes")  # of metrics.json
-NUM_DAMAGES = 12
 KINDS = ("refuse", "write", "fsync")
 
 
@@ -208,41 +207,6 @@ def test_a_full_disk_at_any_write_loses_no_saved_state(kind, capture, undisturbe
 
 
 # -- damaged states ---------------------------------------------------------------------------------------------------
-
-
-def damage(contents: bytes, number: int, rng: np.random.Generator) -> bytes:
-    """Flips a bit, or truncates every fourth time."""
-    at = int(rng.integers(len(contents)))
-    if number % 4 == 3:
-        return contents[:at]
-    return contents[:at] + bytes([contents[at] ^ 1 << int(rng.integers(8))]) + contents[at + 1 :]
-
-
-@pytest.mark.slow
-def test_a_damaged_state_gives_a_warning_and_the_previous_one(capture, undisturbed, tmp_path, capsys):
-    wanted, rng = contents(undisturbed), np.random.default_rng(0)
-    for number in range(NUM_DAMAGES):
-        out = shutil.copytree(undisturbed, tmp_path / str(number))
-        (out / "state.npz").write_bytes(damage((out / "state.npz").read_bytes(), number, rng))
-        capsys.readouterr()
-        assert run(capture, out) == 0
-        (line,) = capsys.readouterr().err.splitlines()
-        assert line.startswith("warning: ") and "state.npz: the file is corrupt" in line
-        assert f"state saved before it, after {(NUM_CHUNKS - 1) * CHUNK_SIZE} views" in line
-        assert contents(out) == wanted
-
-
-@pytest.mark.slow
-def test_the_error_about_two_damaged_states_names_the_newest(capture, undisturbed, tmp_path, capsys):
-    out = shutil.copytree(undisturbed, tmp_path / "out")
-    for state in (out / "state.npz", previous_path(out / "state.npz")):
-        state.write_bytes(state.read_bytes()[:-1])
-    before = contents(out)
-    capsys.readouterr()
-    assert run(capture, out) == 3
-    (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith("ssplat: ") and "state.npz: the file is corrupt" in line
-    assert contents(out) == before
 
 
 @pytest.mark.slow

@@ -14,7 +14,6 @@ from ssplat_jax.storage.published_weights import (
     published_tensor,
     published_tensors,
 )
-from ssplat_jax.storage.weights import load_params
 from tests.model.resplat_fixture import listed_tensors
 
 CONFIG = preset("small").replace(mixer_blocks=1)
@@ -91,11 +90,6 @@ def test_a_parameter_is_found_by_its_name(place, shape, name, theirs):
         np.testing.assert_array_equal(came[..., 2, 4].reshape(-1), x[index].reshape(-1))
 
 
-def test_hpda_and_cgfi_have_no_published_tensor():
-    assert published_tensor(("hpda", "raw_gamma"), ()) is None
-    assert published_tensor(("cgfi", "enter", "kernel"), (3, 3, 5, 7)) is None
-
-
 @pytest.mark.slow
 def test_a_depth_network_leaves_other_parts_initialized(depth_network, tensors):
     imported = import_params(depth_network, CONFIG)
@@ -151,20 +145,3 @@ def test_files_of_other_networks_are_refused(tmp_path, tensors):
         import_params(saved(path, **other), CONFIG)
     with pytest.raises(InputError, match="cannot be read"):
         import_params(tmp_path / "nothing.pth", CONFIG)
-
-
-def test_errors_list_only_presets_with_shipped_weights():
-    with pytest.raises(InputError, match=r"a preset with shipped weights \(tiny\) or a file, got 'huge'"):
-        load_params("huge")
-
-
-def test_a_preset_without_shipped_weights_says_how_to_get_them():
-    with pytest.raises(
-        InputError, match=r"none ship with the preset 'small'; convert ReSplat's \(ssplat import-weights"
-    ):
-        load_params("small")
-
-
-def test_a_stage_without_parameters_is_imported_as_one(depth_network):
-    config = CONFIG.replace(mixer_blocks=0)
-    assert import_params(depth_network, config).params["mixer"] == {}
