@@ -116,14 +116,13 @@ class TrainingCheckpoints:
 
     def __init__(self, directory: Path, description: dict) -> None:
         self.state, recipe = directory / "training.npz", directory / "recipe.json"
+        text = json.dumps(description, indent=1, sort_keys=True)
         if not recipe.exists():
-            write_atomic(recipe, json.dumps(description, indent=1, sort_keys=True).encode())
-            return
+            write_atomic(recipe, text.encode())
         try:
-            held_description = json.loads(recipe.read_text())
+            difference = first_difference(json.loads(recipe.read_text()), json.loads(text))
         except ValueError as error:
             raise StorageError(f"{recipe}: damaged; restore it or choose another --out.") from error
-        difference = first_difference(held_description, json.loads(json.dumps(description)))
         if difference is not None:
             name, held, wanted = difference
             raise InputError(
