@@ -5,8 +5,10 @@ stored without their unoccupied rows, which hold zeros.
 """
 
 import contextlib
+import hashlib
 import json
 import os
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -28,8 +30,9 @@ from ssplat_jax.core.atomic import previous_path, write_atomic
 from ssplat_jax.core.errors import InputError, StorageError
 from ssplat_jax.storage.files import load_arrays, save_arrays
 
-STREAM_KIND, TRAINING_KIND = "stream state 1", "training state 1"
+KIND = "stream state 1"
 
+_DIGEST = "sha256"  # name of the digest among the leaves of a checkpoint, which are numbered
 _ROW_FIELDS = ("voxels", "counts", *PIVOT_FIELDS, *OPTIONAL_PIVOT_FIELDS)  # arrays with one row per voxel
 _GROUPS = {"stats": CacheStats, "stored_depths": StoredDepths, "key_views": KeyViews}  # parts with fields of their own
 
@@ -49,12 +52,12 @@ def save_state(path: Path, cache: VoxelCache, header: dict[str, Any]) -> None:
         # Sliced on the host: JAX would compile a program for each number of voxels, which differs at every save.
         array = np.asarray(leaf)[:num_voxels] if name in _ROW_FIELDS else np.asarray(leaf)
         leaves[name] = np.ascontiguousarray(array).reshape(array.shape)
-    save_arrays(path, leaves, STREAM_KIND, {"capacity": cache.capacity, "caller": header}, keep_previous=True)
+    save_arrays(path, leaves, KIND, {"capacity": cache.capacity, "caller": header}, keep_previous=True)
 
 
 def load_state(path: Path) -> tuple[VoxelCache, dict[str, Any]]:
     """Reads the cache and the header that `save_state` wrote."""
-    leaves, facts = load_arrays(path, STREAM_KIND)
+    leaves, facts = load_arrays(path, KIND)
     fields: dict[str, Any] = {}
     groups: dict[str, dict[str, Any]] = {}
     for name, leaf in leaves.items():
@@ -66,7 +69,7 @@ def load_state(path: Path) -> tuple[VoxelCache, dict[str, Any]]:
     return cache, facts["caller"]
 
 
-def load_newest_state(path: Path, load: Callable = load_state) -> tuple[Any, dict[str, Any], StorageError | None]:
+def load_newest_state(path: Path) -> tuple[VoxelCache, dict[str, Any], StorageError | None]:
     """Reads the newest state, or the previous one if the newest is missing or damaged.
 
     Returns:
@@ -76,10 +79,10 @@ def load_newest_state(path: Path, load: Callable = load_state) -> tuple[Any, dic
         StorageError: neither file can be read; the message is about the newest.
     """
     try:
-        return *load(path), None
+        return *load_state(path), None
     except StorageError as error:
         with contextlib.suppress(StorageError):
-            return *load(previous_path(path)), error
+            return *load_state(previous_path(path)), error
         raise
 
 
@@ -102,7 +105,7 @@ def restore_previous(path: Path) -> None:
 
 
 class TrainingCheckpoints:
-    """The saved state of a training in a directory, beside the description of the run that it belongs to.
+    """Training states in a directory, saved with Orbax, beside the description of the run; the last two are kept.
 
     Args:
         directory: created if missing.
@@ -115,7 +118,7 @@ class TrainingCheckpoints:
     """
 
     def __init__(self, directory: Path, description: dict) -> None:
-        self.state, recipe = directory / "training.npz", directory / "recipe.json"
+        self.directory, recipe = Path(directory).resolve(), Path(directory) / "recipe.json"
         text = json.dumps(description, indent=1, sort_keys=True)
         if not recipe.exists():
             write_atomic(recipe, text.encode())
@@ -132,30 +135,76 @@ class TrainingCheckpoints:
 
     def save(self, step: int, state: Any) -> None:
         """Saves a pytree of arrays as the state after `step`; the state before it is kept too."""
+        import orbax.checkpoint as ocp
+
         leaves = {f"{i:04d}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(state))}
-        save_arrays(self.state, leaves, TRAINING_KIND, {"step": step}, keep_previous=True)
+        with self._manager() as manager:
+            try:
+                manager.save(step, args=ocp.args.StandardSave(leaves | {_DIGEST: _digest(leaves)}))
+                manager.wait_until_finished()
+            except (OSError, ValueError) as error:
+                raise StorageError(f"{self.directory}: could not save step {step}: {error}") from error
 
     def restore_latest(self, like: Any, warn: Callable[[str], None]) -> tuple[int, Any] | None:
-        """(step, state) of the newest intact state, or None if none was saved.
+        """(step, state) of the newest intact checkpoint, or None if there is none.
 
         Args:
             like: a state of the same structure, shapes and types.
-            warn: called with a message if the newest state is damaged and the one before it is restored.
+            warn: called with a message for each damaged checkpoint, which is moved to `damaged-<step>`.
 
         Raises:
-            StorageError: no saved state can be read, or it has another structure.
+            StorageError: all checkpoints are damaged or of other shapes; they are left in place.
         """
-        if not self.state.exists() and not previous_path(self.state).exists():
-            return None
-        arrays, header, damage = load_newest_state(self.state, lambda path: load_arrays(path, TRAINING_KIND))
-        wanted, treedef = jax.tree.flatten(like)
-        leaves = [arrays[name] for name in sorted(arrays)]
-        if [(x.shape, x.dtype) for x in leaves] != [(x.shape, x.dtype) for x in wanted]:
-            raise StorageError(f"{self.state}: the state is one of another version; choose another --out.")
-        if damage is not None:
-            warn(f"{damage} Continuing from the state saved before it, after step {header['step']}.")
-            restore_previous(self.state)
-        return header["step"], jax.tree.unflatten(treedef, map(jnp.asarray, leaves))
+        with self._manager() as manager:
+            steps = sorted(manager.all_steps(), reverse=True)
+            for number, step in enumerate(steps):
+                if (state := _restore(manager, step, like)) is None:
+                    continue
+                for damaged in steps[:number]:
+                    warn(f"{self.directory}: checkpoint {damaged} is damaged; continuing from step {step}.")
+                    aside = self.directory / f"damaged-{damaged}"
+                    shutil.rmtree(aside, ignore_errors=True)
+                    os.replace(self.directory / "checkpoints" / str(damaged), aside)
+                return step, state
+        if steps:
+            raise StorageError(
+                f"{self.directory}: checkpoints {', '.join(map(str, steps))} are damaged or of another version; choose"
+                " another --out."
+            )
+        return None
+
+    def _manager(self):
+        import orbax.checkpoint as ocp  # takes seconds, which no stream needs
+
+        options = ocp.CheckpointManagerOptions(max_to_keep=2, create=True, enable_async_checkpointing=False)
+        return ocp.CheckpointManager(self.directory / "checkpoints", options=options)
+
+
+def _restore(manager: Any, step: int, like: Any) -> Any | None:
+    """The state of a checkpoint; None if it is damaged."""
+    import orbax.checkpoint as ocp
+
+    wanted, treedef = jax.tree.flatten(like)
+    abstract = {f"{i:04d}": jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for i, leaf in enumerate(wanted)}
+    abstract[_DIGEST] = jax.ShapeDtypeStruct((32,), np.uint8)
+    try:
+        held = manager.restore(step, args=ocp.args.StandardRestore(abstract))
+    except Exception:  # a damaged checkpoint can make Orbax raise anything
+        return None
+    leaves = {name: np.asarray(leaf) for name, leaf in held.items() if name != _DIGEST}
+    ordered = [leaves[name] for name in sorted(leaves)]
+    is_like = [(x.shape, x.dtype) for x in ordered] == [(x.shape, x.dtype) for x in wanted]  # Orbax does not insist
+    if not is_like or not np.array_equal(held[_DIGEST], _digest(leaves)):
+        return None
+    return jax.tree.unflatten(treedef, map(jnp.asarray, ordered))
+
+
+def _digest(leaves: dict[str, np.ndarray]) -> np.ndarray:
+    """sha256 of types, shapes and values: Orbax reads an array with a flipped bit without complaint."""
+    digest = hashlib.sha256()
+    for name, leaf in sorted(leaves.items()):
+        digest.update(f"{name} {leaf.dtype} {leaf.shape}".encode() + leaf.tobytes())
+    return np.frombuffer(digest.digest(), np.uint8)
 
 
 def first_difference(held: Any, wanted: Any, name: str = "") -> tuple[str, Any, Any] | None:
