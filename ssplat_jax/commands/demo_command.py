@@ -4,15 +4,14 @@ import dataclasses
 from pathlib import Path
 from typing import Literal
 
-from ssplat_jax.commands.options import QualityOption, QuietOption
-from ssplat_jax.config import QUALITIES
+from ssplat_jax.commands.options import QuietOption
 
 
 @dataclasses.dataclass(frozen=True)
 class Demo:
     """Stream an embedded procedural scene with the shipped weights and show how the scene improves with more views.
 
-    Writes scene.ply, pictures, metrics.json and (with the `plots` extra) a plot.
+    Writes scene.ply, pictures and metrics.json.
     Example: ssplat demo
     """
 
@@ -20,7 +19,6 @@ class Demo:
     """Scene to stream."""
     out: Path = Path("ssplat_demo")
     """Folder of the results."""
-    quality: QualityOption = "accurate"
     quiet: QuietOption = False
 
     def run(self) -> int:
@@ -31,7 +29,7 @@ class Demo:
         reporter = Reporter(self.quiet)
         reporter.say("one to two minutes on two cores, most of it for compiling")
         with lock_folder(self.out):
-            run_demo(self.scene, self.out, reporter, QUALITIES[self.quality])
+            run_demo(self.scene, self.out, reporter)
         print(f"wrote {self.out}/scene.ply, metrics.json and pictures")
         reporter.say(
             f"next: `ssplat view {self.out}` shows the scene in a browser; `ssplat run CAPTURE --out runs/mine` makes"

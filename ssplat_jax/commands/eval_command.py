@@ -4,30 +4,11 @@ import dataclasses
 from pathlib import Path
 from typing import Literal
 
-from ssplat_jax.commands.options import (
-    AxesOption,
-    CapturePath,
-    ConfigChanges,
-    LpipsHeads,
-    PosesOption,
-    QualityOption,
-    QuietOption,
-    ReviseOption,
-    WeightsOption,
-    capture_path,
-    causal_changes,
-    check_refinement,
-    load_lpips_weights,
-    load_model,
-    online_changes,
-    parse_size,
-    refinement_steps,
-)
-from ssplat_jax.config import QUALITIES
+from ssplat_jax.commands.options import LpipsHeads, StreamOptions, load_lpips_weights, parse_size
 
 
 @dataclasses.dataclass(frozen=True)
-class Eval:
+class Eval(StreamOptions):
     """Score novel views of a capture: metrics.json, index.json and target | render | depth pictures.
 
     Options that are left out follow from the capture. With --index, the capture may be a folder of the index's scenes.
@@ -35,74 +16,42 @@ class Eval:
     Example: ssplat eval path/to/capture --size 320x240 --out runs/eval
     """
 
-    capture: CapturePath
-    out: Path
-    """Folder of the results."""
     context: int | None = None
     """Context views to stream; default 64, or as many as there are."""
     protocol: Literal["interleaved", "paper", "scannet"] = "interleaved"
     """interleaved: every 8th frame from the 5th on is a target. paper: targets uniform over the trajectory. scannet:
     paper's, thinned to 1088 frames, with 64 targets and 8 anchors first."""
-    stride: int | None = None
-    """Use every STRIDE-th frame; default 1, or without --context (interleaved) such that 73 to 145 frames are left."""
     targets: int | None = None
     """paper: number of targets, default 16; scannet: 64. interleaved: most targets to keep, evenly spread."""
     index: Path | None = None
     """Index file {scene: {"context": [], "target": []} | null} that names the frames, instead of a protocol."""
     scene: str | None = None
     """Scene of the index; default the capture's name."""
-    size: str | None = None
-    """Image size WxH of the scored views; default the capture's own. --quality sets the streamed size."""
-    quality: QualityOption = "accurate"
-    refine: int | None = None
-    """Steps of refinement on the context views after the stream, default 0, with --quality best 100; the scores before
-    are reported too."""
-    revise: ReviseOption = None
-    online_refine: int = 0
-    """Gradient steps on kept views after each chunk, while streaming; later chunks see the revised scene."""
     over_black: bool = False
     """Pictures show holes black instead of in the colors around them."""
     one_exposure: bool = False
     """Pictures are at the exposure of the first views instead of that of the nearest streamed ones."""
-    causal: bool = False
-    """No look-ahead: near, far and scale come from the first chunk, and frames keep their order."""
-    weights: WeightsOption = "tiny"
     lpips_vgg: Path | None = None
     """torchvision's vgg16 weights (.safetensors or .npz): with --lpips-heads, LPIPS is scored too."""
     lpips_heads: LpipsHeads = None
-    set: ConfigChanges = ()
-    axes: AxesOption = None
-    poses: PosesOption = None
-    quiet: QuietOption = False
 
     def run(self) -> int:
         from ssplat_jax.core.console import Reporter
         from ssplat_jax.evaluation.scoring import Display
-        from ssplat_jax.runs.eval_run import EvalOptions, eval_path
+        from ssplat_jax.runs.evaluate_run import EvalOptions, evaluate_run
         from ssplat_jax.storage.run_folder import lock_folder
 
-        refine_steps = refinement_steps(self.quality, self.refine)
-        check_refinement(refine_steps, "--refine")
         lpips_weights = load_lpips_weights(self.lpips_vgg, self.lpips_heads)
-        changes = online_changes(causal_changes(self.set, self.causal), self.online_refine)
-        model, params = load_model(self.weights, changes)
+        model, params = self.load_model(causal=self.causal)
+        names = ("protocol", "stride", "context", "targets", "index", "scene", "refine_steps", "revise", "scale")
         options = EvalOptions(
             size=parse_size(self.size),
-            scale=QUALITIES[self.quality].scale,
-            protocol=self.protocol,
-            stride=self.stride,
-            context=self.context,
-            targets=self.targets,
-            index=self.index,
-            scene=self.scene,
-            refine_steps=refine_steps,
-            revise=self.revise,
             lpips_weights=lpips_weights,
             display=Display(self.over_black, self.one_exposure),
+            **{name: getattr(self, name) for name in names},
         )
-        capture = capture_path(self.capture, self.axes, self.poses)
         with lock_folder(self.out):
-            metrics = eval_path(model, params, capture, self.out, options, Reporter(self.quiet))
+            metrics = evaluate_run(model, params, self.path, self.out, options, Reporter(self.quiet))
         if "scenes" in metrics:
             scores = _both_scores(metrics["over_scenes"])
             print(f"{len(metrics['scenes'])} scenes: {scores}; {self.out}/metrics.json, {self.out}/*/report.html")
@@ -119,17 +68,13 @@ class Eval:
             f" {metrics['chunk_ms']['median']:.0f} ms a chunk; {self.out}/report.html, {self.out}/metrics.json"
         )
         if self.over_black or self.one_exposure:
-            print(f"pictures{_how(self.over_black, self.one_exposure)}: {metrics['pictures']['psnr']:.2f} dB")
+            how = (" over black" if self.over_black else "") + (" at one exposure" if self.one_exposure else "")
+            print(f"pictures{how}: {metrics['pictures']['psnr']:.2f} dB")
         if refined := metrics.get("refinement"):
             print(
                 f"before {refined['steps']} refinement steps of {refined['seconds_per_step']:.2f} s:"
                 f" {_both_scores(refined['before'])}"
             )
-
-
-def _how(over_black: bool, one_exposure: bool) -> str:
-    """The flags of the pictures in words."""
-    return (" over black" if over_black else "") + (" at one exposure" if one_exposure else "")
 
 
 def _both_scores(scores: dict) -> str:

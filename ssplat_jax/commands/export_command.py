@@ -29,8 +29,7 @@ class Export:
 
     def run(self) -> int:
         from ssplat_jax.core.console import Reporter
-        from ssplat_jax.runs.export_cameras import open_cameras, save_cameras
-        from ssplat_jax.runs.export_run import export_run
+        from ssplat_jax.runs.export_run import export_run, open_cameras, save_cameras
         from ssplat_jax.scene_files.formats import convert_scene
         from ssplat_jax.storage.run_folder import RunFolder
         from ssplat_jax.storage.weights import load_params
@@ -49,15 +48,10 @@ class Export:
             save_cameras(self.to.parent, cameras, report.offset)
         if report.warning is not None:
             reporter.warn(f"{self.to.name}: {report.warning}")
-        print(f"wrote {self.to}: {report.num_written} Gaussians{_left_out(report)}")
+        left_out = (
+            (report.num_cut, "beyond --max-splats were left out"),
+            (report.num_dropped, "more have no visible effect and were not written"),
+        )
+        words = "; ".join(f"{count} {reason}" for count, reason in left_out if count)
+        print(f"wrote {self.to}: {report.num_written} Gaussians{f' ({words})' if words else ''}")
         return 0
-
-
-def _left_out(report) -> str:
-    """The counts of Gaussians that were not written, in words."""
-    counts = (
-        (report.num_cut, "beyond --max-splats were left out"),
-        (report.num_dropped, "more have no visible effect and were not written"),
-    )
-    words = [f"{count} {reason}" for count, reason in counts if count]
-    return f" ({'; '.join(words)})" if words else ""

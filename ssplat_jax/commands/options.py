@@ -1,5 +1,6 @@
 """Options and helpers that several commands share. Nothing here imports JAX before a command runs."""
 
+import dataclasses
 import json
 import math
 import re
@@ -10,8 +11,6 @@ import tyro
 
 from ssplat_jax.config import QUALITIES, StreamConfig, preset
 from ssplat_jax.core.errors import InputError
-
-QualityName = Literal["fast", "balanced", "accurate", "best"]
 
 CapturePath = Annotated[
     str,
@@ -28,19 +27,8 @@ PosesOption = Annotated[
     Literal["camera-to-world", "world-to-camera"] | None,
     tyro.conf.arg(help="Direction of the poses in the capture's files, if not that of its format."),
 ]
-QualityOption = Annotated[
-    QualityName,
-    tyro.conf.arg(
-        help="Accuracy against time: fast and balanced stream smaller images; best refines the scene after the stream"
-        " (docs/performance.md)."
-    ),
-]
 WeightsOption = Annotated[str, tyro.conf.arg(help="Preset with shipped weights, or a weights file.")]
 ConfigChanges = Annotated[tuple[str, ...], tyro.conf.arg(help="Changes to the configuration, as field=value.")]
-ReviseOption = Annotated[
-    Literal["poses", "auto"] | None,
-    tyro.conf.arg(help="Adjust the poses to the images before the stream; auto: only if they are off."),
-]
 QuietOption = Annotated[bool, tyro.conf.arg(help="Print only the closing line.")]
 LpipsHeads = Annotated[
     Path | None,
@@ -109,22 +97,6 @@ def _admits_none(config: StreamConfig, name: str) -> bool:
     return type(None) in get_args(get_type_hints(type(getattr(config, group)))[field])
 
 
-def causal_changes(changes: tuple[str, ...], causal: bool) -> tuple[str, ...]:
-    """Changes to the configuration, with those of --causal."""
-    return (*changes, "stream.causal=true") if causal else changes
-
-
-def online_changes(changes: tuple[str, ...], steps: int) -> tuple[str, ...]:
-    """Changes to the configuration, with those of --online-refine.
-
-    Raises:
-        InputError: `steps` is negative.
-    """
-    if steps < 0:
-        raise InputError(f"--online-refine: wanted a number of steps of at least 0, got {steps}.")
-    return (*changes, f"stream.steps_per_chunk={steps}") if steps else changes
-
-
 def load_model(weights: str, changes: tuple[str, ...]):
     """(model, params) of a preset's shipped weights, or of a weights file.
 
@@ -151,12 +123,8 @@ def load_model(weights: str, changes: tuple[str, ...]):
     return StreamSplat(changed), params
 
 
-def check_refinement(steps: int, flag: str) -> None:
-    """Refuses a negative number of refinement steps.
-
-    Args:
-        steps: refinement steps, the value of `flag`.
-        flag: name of the option of the steps.
+def check_steps(steps: int, flag: str) -> None:
+    """Refuses a negative number of steps, the value of `flag`.
 
     Raises:
         InputError: `steps` is negative.
@@ -165,9 +133,60 @@ def check_refinement(steps: int, flag: str) -> None:
         raise InputError(f"{flag}: wanted a number of steps of at least 0, got {steps}.")
 
 
-def refinement_steps(quality: QualityName, steps: int | None) -> int:
-    """Refinement steps after the stream: those asked for with --refine, else those of --quality."""
-    return QUALITIES[quality].refine_steps if steps is None else steps
+@dataclasses.dataclass(frozen=True)
+class StreamOptions:
+    """Options of the commands that stream a capture."""
+
+    capture: CapturePath
+    out: Path
+    """Folder of the results; a run that stopped there is continued."""
+    size: str | None = None
+    """Image size WxH; default the capture's own. --quality streams smaller ones."""
+    stride: int | None = None
+    """Use every STRIDE-th frame; default 1. eval without --context (interleaved): such that 73 to 145 are left."""
+    quality: Literal["fast", "balanced", "accurate", "best"] = "accurate"
+    """Accuracy against time: fast and balanced stream smaller images; best refines the scene after the stream."""
+    refine: int | None = None
+    """Steps of refinement on the streamed views after the stream, default 0, with --quality best 100."""
+    online_refine: int = 0
+    """Gradient steps on kept views after each chunk, while streaming; later chunks see the refined scene."""
+    revise: Literal["poses", "auto"] | None = None
+    """Adjust the poses to the images before the stream; auto: only if they are off."""
+    causal: bool = False
+    """No look-ahead: near, far and scale come from the first chunk, and frames keep their order."""
+    weights: WeightsOption = "tiny"
+    set: ConfigChanges = ()
+    axes: AxesOption = None
+    poses: PosesOption = None
+    quiet: QuietOption = False
+
+    @property
+    def path(self) -> str:
+        """The capture as `open_capture` takes it."""
+        return capture_path(self.capture, self.axes, self.poses)
+
+    @property
+    def scale(self) -> float:
+        """Size of the streamed images relative to `size`."""
+        return QUALITIES[self.quality].scale
+
+    @property
+    def refine_steps(self) -> int:
+        """Refinement steps after the stream: those asked for with --refine, else those of --quality."""
+        return QUALITIES[self.quality].refine_steps if self.refine is None else self.refine
+
+    def load_model(self, *, causal: bool):
+        """(model, params) with the changes that options ask for.
+
+        Raises:
+            InputError: see `load_model`, or a number of steps is negative.
+        """
+        check_steps(self.refine_steps, "--refine")
+        check_steps(self.online_refine, "--online-refine")
+        changes = (*self.set, "stream.causal=true") if causal else self.set
+        if self.online_refine:
+            changes = (*changes, f"stream.steps_per_chunk={self.online_refine}")
+        return load_model(self.weights, changes)
 
 
 def load_lpips_weights(vgg: Path | None, heads: Path | None):

@@ -14,7 +14,7 @@ from ssplat_jax.commands.options import (
     QuietOption,
     WeightsOption,
     capture_path,
-    check_refinement,
+    check_steps,
 )
 
 
@@ -44,7 +44,7 @@ class Refine:
         from ssplat_jax.runs.refine_run import refine_run
         from ssplat_jax.storage.weights import load_params
 
-        check_refinement(self.steps, "--steps")
+        check_steps(self.steps, "--steps")
         result = refine_run(
             self.folder,
             capture_path(self.capture, self.axes, self.poses),

@@ -46,8 +46,7 @@ class Render:
 
     def run(self) -> int:
         from ssplat_jax.core.console import Reporter
-        from ssplat_jax.runs.film import FilmOptions
-        from ssplat_jax.runs.render_scene import render_scene
+        from ssplat_jax.runs.render_run import FilmOptions, render_run
         from ssplat_jax.storage.run_folder import RunFolder
 
         if self.film is None and (self.film_path != "spline" or self.film_shows != ("color",)):
@@ -56,7 +55,7 @@ class Render:
             )
         film = None if self.film is None else FilmOptions(self.film, self.film_path, self.film_shows)
         size, reporter = parse_size(self.size), Reporter(self.quiet)
-        num_pictures = render_scene(
+        num_pictures = render_run(
             self.scene,
             capture_path(self.capture, self.axes, self.poses),
             self.out,

@@ -19,8 +19,11 @@ class Reporter:
         self._warnings = Console(stderr=True)
 
     @contextlib.contextmanager
-    def progress(self, name: str, total: int, *, waiting: str = WAITING) -> Iterator[Callable[..., None]]:
-        """A progress bar of `total` steps; yields `advance(done, note="")`. Until then its note is `waiting`."""
+    def progress(self, name: str, total: int | None, *, waiting: str = WAITING) -> Iterator[Callable[..., None]]:
+        """A progress bar of `total` steps (None: unknown); yields `advance(done, note="")`.
+
+        Until the first call its note is `waiting`.
+        """
         columns = (
             TextColumn("{task.description}"),
             BarColumn(),

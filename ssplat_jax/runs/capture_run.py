@@ -1,25 +1,54 @@
-"""`ssplat run`: streams a capture into a scene, and saves the stream every few chunks so that it can be continued."""
+"""`ssplat run`: streams a capture into a scene, chunk by chunk, into a folder from which a stopped run continues.
+
+frames of a capture, or of a folder that is still being written -> chunks -> session -> records, deltas, saved states
+-> scene, pictures, report, metrics
+"""
 
 import dataclasses
-from collections.abc import Sequence
+import time
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+import numpy as np
+
 from ssplat_jax.core.console import WAITING, Reporter
-from ssplat_jax.core.errors import refusal, require_positive
+from ssplat_jax.core.errors import InputError, refusal, require_positive
 from ssplat_jax.data.capture import Capture
-from ssplat_jax.data.open_capture import open_capture
-from ssplat_jax.evaluation.scoring import check_scorable
+from ssplat_jax.data.open_capture import is_done, open_capture, open_growing, without_tilde
+from ssplat_jax.data.readers.transforms_json import num_listed
+from ssplat_jax.evaluation.scoring import score_targets
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.poses.adjust_poses import check_look_ahead
-from ssplat_jax.runs.chunk_recorder import ChunkRecorder, hold_back
-from ssplat_jax.runs.finish_run import finish_run, finished_scene, forget_other_run
-from ssplat_jax.runs.resume import RunState, resume_run, run_identity, save_run
-from ssplat_jax.runs.run_poses import capture_to_stream
-from ssplat_jax.storage.chunk_records import save_delta
+from ssplat_jax.runs.open_run import Run, open_run
+from ssplat_jax.runs.run_results import finish_run, finished_scene
+from ssplat_jax.storage.chunk_records import ChunkRecord, RecordedView, make_thumbnail, save_chunk_record, save_delta
 from ssplat_jax.storage.interrupts import Interrupts
-from ssplat_jax.storage.run_folder import RunFolder, lock_folder
-from ssplat_jax.streaming.feed import feed_chunks, middle_exposure
+from ssplat_jax.storage.run_folder import RunFolder
+from ssplat_jax.storage.saved_states import load_newest_state
+from ssplat_jax.streaming.feed import FedChunk, feed_chunks, middle_exposure
 from ssplat_jax.streaming.scene_delta import SceneFeed
+
+CHUNKS_PER_SCORE = 4
+"""Held-back frames are scored after every so many chunks: to decode and to draw takes about as long as a chunk."""
+
+POLL_SECONDS = 0.25
+"""Seconds between two looks at a folder that is still being written."""
+
+
+@dataclasses.dataclass(frozen=True)
+class RunOptions:
+    """The frames that a run streams, and what it writes on the way."""
+
+    size: tuple[int, int] | None = None  # (width, height) of the images; None for the capture's own
+    scale: float = 1.0  # factor of `size` at which images are streamed
+    stride: int = 1
+    max_views: int | None = None
+    save_every: int = 8  # chunks between saved states
+    overwrite: bool = False  # remove the run that the folder holds and start anew
+    deltas: bool = False  # also write what each chunk changed in the scene, in the stream frame
+    num_held_back: int = 0  # frames, evenly spread, that are not streamed but scored every few chunks
+    revise: str | None = None  # `poses` or `auto`: adjusted before the stream, see `run_poses.capture_to_stream`
+    quiet_seconds: float | None = None  # the capture is still being written; without a new frame for so long it ends
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,163 +56,273 @@ class RunResult:
     """State of a run when `run_capture` returns."""
 
     num_views: int
-    num_gaussians: int
-    interrupted: int | None  # the signal that stopped it, if one did
+    num_gaussians: int  # 0 if it was interrupted
+    interrupted: int | None = None  # the signal that stopped it, if one did
     was_finished: bool = False  # the folder held it already; nothing was streamed or written
 
 
 def run_capture(
-    model: StreamSplat,
-    params: dict,
-    path: str,
-    out: Path,
-    *,
-    size: tuple[int, int] | None,
-    scale: float = 1.0,
-    stride: int,
-    max_views: int | None,
-    save_every: int,
-    overwrite: bool,
-    deltas: bool = False,
-    num_held_back: int = 0,
-    revise: str | None = None,
-    reporter: Reporter,
+    model: StreamSplat, params: dict, path: str, out: Path, options: RunOptions, reporter: Reporter
 ) -> RunResult:
     """Streams a capture into a folder, continuing the run that the folder holds.
 
+    Every image is decoded once, when its chunk is due. A damaged one stops the stream there, with what came before it
+    saved; once it is mended, the run continues.
+
     Args:
-        model: the model to run.
+        model: the model to run; with a causal configuration if the capture is still being written.
         params: the model's parameters.
-        path: the capture, as `open_capture` takes it.
+        path: the capture, as `open_capture` takes it; if it is still being written, a folder with a transforms.json.
         out: folder of the results.
-        size: (width, height) of the images; by default the capture's own.
-        scale: factor of `size` at which images are streamed.
-        stride: every `stride`-th frame is streamed.
-        max_views: stop after this many frames.
-        save_every: chunks between saved states.
-        overwrite: remove the run that `out` holds and start anew.
-        deltas: also write what each chunk changed in the scene, in the stream frame (`storage/delta_files.py`).
-        num_held_back: frames, evenly spread, that are not streamed but scored every few chunks.
-        revise: `poses` or `auto` adjusts the poses before the stream, see `run_poses.capture_to_stream`.
+        options: the frames that are streamed, and what is written.
         reporter: shows progress and warnings.
 
     Raises:
-        InputError: the capture is unusable or lies in `out`, fewer than two frames are to be streamed, too many frames
-            are held back, poses of a causal stream are to be adjusted, `out` holds a run of another capture or
-            configuration, or another process is writing to it.
+        InputError: options or the capture are unusable, an image is damaged, or see `open_run`.
         StorageError: `out` cannot be written or its state is corrupt.
     """
-    require_positive(stride=stride, save_every=save_every)
-    check_look_ahead(revise, is_causal=model.config.stream.causal)
-    if max_views is not None:
-        require_positive(max_views=max_views)
-    capture = open_capture(path, size=size)
-    if scale != 1.0:  # as `refine` and `export` will open it, by the size: a procedural capture is rendered for it
-        scaled = capture.scaled(scale)
-        capture = open_capture(path, size=(scaled.width, scaled.height))
-    check_scorable(capture)
-    taken = list(range(0, len(capture), stride))[:max_views]
-    check_num_frames(len(taken), str(path))
-    indices, held_back = hold_back(taken, num_held_back)
-    capture.check_output_folder(out)
-    capture.verify([*indices, *held_back])
-    folder = RunFolder(out)
-    with lock_folder(out):
-        if overwrite:
-            folder.clear_run()
-        capture = capture_to_stream(capture, indices, revise, folder, reporter)
-        recorder = ChunkRecorder(capture, folder, held_back)
-        identity = run_identity(model, params, capture, indices)
-        run = resume_run(model, params, capture, identity, folder, reporter)
-        forget_other_run(run, folder)
-        reporter.warn_all(*capture.notes, run.frame.warning)
-        writer = start_deltas(run, len(indices), folder, deltas)
-        if run.num_views == len(indices) and (num_written := finished_scene(folder, len(indices))) is not None:
-            return RunResult(run.num_views, num_written, None, was_finished=True)
-        stopped = _stream(run, capture, indices, identity, folder, recorder, writer, save_every, reporter)
-        if stopped:
-            return RunResult(run.num_views, int(run.session.cache_facts()["decoded"]), stopped)
-        report = finish_run(run, capture, path, indices, folder, reporter)
-    return RunResult(run.num_views, report.num_written, None)
+    numbers = {name: getattr(options, name) for name in ("stride", "save_every", "max_views", "quiet_seconds")}
+    require_positive(**{name: number for name, number in numbers.items() if number is not None})
+    check_look_ahead(options.revise, is_causal=model.config.stream.causal)
+    if options.quiet_seconds is None:
+        source = WholeCapture(path, options)
+        indices = source.indices
+    else:
+        source = GrowingCapture(path, options, options.quiet_seconds, reporter)
+        chunk_size, state, num_saved = model.config.stream.chunk_size, RunFolder(out), 0
+        if state.has_state() and not options.overwrite:
+            num_saved = load_newest_state(state.state)[1]["done"]
+        if stopped := source.wait_for(max(num_saved, chunk_size)):
+            return RunResult(num_saved, 0, stopped)
+        indices = source.indices[: num_saved or chunk_size]
+    kept = {"revise": options.revise, "overwrite": options.overwrite}
+    with open_run(model, params, source.capture, indices, out, **kept, reporter=reporter) as run:
+        num_before = run.num_views
+        if stopped := _stream(run, source, options, reporter):
+            return RunResult(run.num_views, 0, stopped)
+        if run.num_views > num_before:
+            run.folder.clear_refinement()  # of a scene of fewer views
+        elif (num_written := finished_scene(run.folder, run.num_views)) is not None:
+            return RunResult(run.num_views, num_written, was_finished=True)
+        return RunResult(run.num_views, finish_run(run, path, reporter).num_written)
 
 
-def check_num_frames(count: int, path: str) -> None:
-    """Refuses a stream of one frame, which tells no depth.
+def _stream(run: Run, source: "WholeCapture | GrowingCapture", options: RunOptions, reporter: Reporter) -> int | None:
+    """Streams the views that the run has not had yet; returns the signal that stopped it, if one did."""
+    deltas = DeltaWriter(run, is_wanted=options.deltas)
+    with Interrupts(has_work=False) as interrupts, reporter.progress("streaming", source.total) as advance:
+        advance(run.num_views, WAITING)
+        try:
+            for number, fed in enumerate(source.chunks(run, interrupts), start=1):
+                interrupts.has_work = True
+                run.take(fed)
+                deltas.write()
+                record_chunk(run, fed, source.held_back)
+                advance(run.num_views)
+                if number % options.save_every == 0:
+                    run.save()
+                if interrupts.received:
+                    break
+        except InputError as error:
+            run.save()
+            if not run.num_views:
+                raise
+            how = f"{run.num_views} views are saved; mend it, and run again without --overwrite"
+            raise InputError(f"{error} The stream stops here: {how}.") from error
+        run.save()
+        return interrupts.received  # read last: a signal may have come during the save, too
 
-    Raises:
-        InputError: `count` is below 2; the message names `path`, the capture.
+
+class WholeCapture:
+    """The frames of a capture that is complete."""
+
+    def __init__(self, path: str, options: RunOptions) -> None:
+        capture = open_capture(path, size=options.size)
+        if options.scale != 1.0:  # as `refine` and `export` open it, by the size: a procedural capture is drawn for it
+            scaled = capture.scaled(options.scale)
+            capture = open_capture(path, size=(scaled.width, scaled.height))
+        taken = list(range(0, len(capture), options.stride))[: options.max_views]
+        check_num_frames(len(taken), path)
+        self.capture = capture
+        self.indices, self.held_back = hold_back(taken, options.num_held_back)
+        self.total: int | None = len(self.indices)
+
+    def chunks(self, run: Run, interrupts: Interrupts) -> Iterator[FedChunk]:
+        """Feeds the run the chunks that it has not had yet."""
+        order = run.capture.stream_order(run.session.model.config, run.indices, run.frame)
+        yield from feed_chunks(run.session, run.capture, order[run.num_views :], run.frame)
+
+
+class GrowingCapture:
+    """The frames of a folder that is still being written, in their order, as their images become complete.
+
+    A frame that cannot be read yet holds back those after it. Nothing more will come once the folder holds a file
+    `done`, or once for some seconds no frame has been listed and none has become complete.
     """
-    if count < 2:
-        fix = "add frames, or choose a smaller --stride or a larger --max-views"
-        raise refusal(path, wanted="two frames or more to stream", got=str(count), fix=fix)
+
+    held_back: Sequence[int] = ()
+
+    def __init__(self, path: str, options: RunOptions, quiet_seconds: float, reporter: Reporter) -> None:
+        self._path, self._options = without_tilde(path), options
+        self._quiet_seconds, self._reporter = quiet_seconds, reporter
+        self._opened: Capture | None = None
+        self._most_listed = 0  # frames that the listing has had, complete or not
+        self._last_change = time.monotonic()
+        self._problem: str | None = None  # why no more frames are complete
+        self.indices: list[int] = []  # frames whose images are complete
+        self.has_ended = False
+        self.total = options.max_views
+
+    @property
+    def capture(self) -> Capture:
+        """The capture as it was at the last look.
+
+        Raises:
+            InputError: no frame is complete.
+        """
+        if self._opened is None or not self.indices:
+            got, fix = self._problem or "none", "see that it is written there"
+            raise refusal(str(self._path), wanted="a frame that can be read", got=got, fix=fix)
+        return self._opened
+
+    def wait_for(self, num_frames: int) -> int | None:
+        """Waits for `num_frames` frames, or for the end; returns the signal that came meanwhile, if one did.
+
+        Raises:
+            InputError: at the end there was none, or one alone.
+        """
+        self._reporter.say(f"waiting for frames in {self._path}")
+        with Interrupts(has_work=False) as interrupts:
+            self.look()
+            while not self.has_ended and len(self.indices) < num_frames and not interrupts.received:
+                time.sleep(POLL_SECONDS)
+                self.look()
+            if interrupts.received:
+                return interrupts.received
+        check_num_frames(len(self.indices) if self.capture else 0, str(self._path))
+        return None
+
+    def chunks(self, run: Run, interrupts: Interrupts) -> Iterator[FedChunk]:
+        """Feeds the run chunks as they become complete, until nothing more will come or a signal does."""
+        size = run.session.model.config.stream.chunk_size
+        while not interrupts.received:
+            num_waiting = len(self.indices) - run.num_views
+            if num_waiting >= size or (self.has_ended and num_waiting > 0):
+                run.capture, run.indices = self.capture, self.indices[: run.num_views + size]
+                yield from feed_chunks(run.session, run.capture, run.indices[run.num_views :], run.frame)
+            elif self.has_ended:
+                break
+            else:
+                time.sleep(POLL_SECONDS)
+            if not self.has_ended:  # what comes after the end is for the next call, or each frame were a padded chunk
+                self.look()
+        if self._problem is not None and not interrupts.received and len(self.indices) != self._options.max_views:
+            self._reporter.warn(f"{self._problem} It and the frames after it are left out.")
+
+    def look(self) -> None:
+        """Looks at the folder, and takes the frames that have become complete."""
+        said_so = is_done(self._path)  # before the look: what was written before the file counts
+        if (listed := num_listed(self._path)) > self._most_listed:
+            self._most_listed, self._last_change = listed, time.monotonic()
+        capture, self._problem = open_growing(self._path, size=self._options.size)
+        if capture is not None:
+            self._take(capture.scaled(self._options.scale))
+        is_full = self._options.max_views is not None and len(self.indices) >= self._options.max_views
+        self.has_ended = said_so or is_full or time.monotonic() - self._last_change > self._quiet_seconds
+
+    def _take(self, capture: Capture) -> None:
+        """Adds the frames of a capture that have become complete."""
+        if self._opened is not None and self.indices:
+            old, new = (c.digest(self.indices) if len(c) > self.indices[-1] else "" for c in (self._opened, capture))
+            if old != new:
+                fix = "name frames so that new ones come last, and leave old ones as they are"
+                raise refusal(str(self._path), wanted="frames added at the end", got="changes to earlier ones", fix=fix)
+        if self._opened is None or len(capture) > len(self._opened):  # also frames that `stride` leaves out
+            self._last_change = time.monotonic()
+        self._opened = capture
+        for i in list(range(0, len(capture), self._options.stride))[len(self.indices) : self._options.max_views]:
+            try:
+                capture.verify([i])
+            except InputError as error:  # being written
+                self._problem = str(error)
+                return
+            self.indices.append(i)
+            self._last_change = time.monotonic()
 
 
 class DeltaWriter:
-    """Writes what changed in the scene since the last call, with the frame that a viewer needs to place it."""
+    """Writes what each chunk changed in the scene, with the frame that a viewer needs to place it.
 
-    def __init__(self, run: RunState, folder: RunFolder, *, is_complete: bool) -> None:
-        session = run.session
-        self._folder = folder
-        self._feed = SceneFeed(session.model, session.params, session.cache if is_complete else None)
-
-    def write(self, run: RunState) -> None:
-        assert run.session.cache is not None
-        delta = self._feed.update(run.session.cache)
-        path = self._folder.delta(run.num_views)
-        exposure = middle_exposure(run.exposures).tolist()
-        save_delta(path, delta, {"frame": run.frame.to_dict(), "views": run.num_views, "exposure": exposure})
-
-
-def start_deltas(run: RunState, num_wanted: int, folder: RunFolder, deltas: bool) -> DeltaWriter | None:
-    """Removes stale deltas, and returns the writer of the next ones if they are asked for.
-
-    The deltas in the folder always add up to the scene: without those of the views so far, the next one is the whole
-    scene.
+    The deltas in the folder always add up to the scene: where those of the views so far are missing, the first one is
+    the whole scene, and a chunk without a delta removes those before it.
     """
-    done = run.num_views
-    if done == 0 or (done < num_wanted and not deltas):
-        # Left by a run that stopped before its first save, or about to miss the changes of this one.
-        folder.clear_deltas()
-    for path in folder.delta_files():  # of chunks that will be streamed again, perhaps with other views
-        if int(path.stem) > done:
-            path.unlink(missing_ok=True)
-    if not deltas:
-        return None
-    is_complete = done == 0 or folder.delta(done).exists()
-    writer = DeltaWriter(run, folder, is_complete=is_complete)
-    if not is_complete and done == num_wanted:
-        writer.write(run)
-    return writer
+
+    def __init__(self, run: Run, *, is_wanted: bool) -> None:
+        if run.num_views == 0:
+            run.folder.clear_deltas()  # left by a run that stopped before its first save
+        is_complete = run.num_views == 0 or run.folder.delta(run.num_views).exists()
+        self._run, self._feed = run, None
+        if is_wanted:
+            known = run.session.cache if is_complete else None
+            self._feed = SceneFeed(run.session.model, run.session.params, known)
+            if not is_complete:
+                self.write()
+
+    def write(self) -> None:
+        """Writes the changes since the last call."""
+        run = self._run
+        if self._feed is None:
+            run.folder.clear_deltas()
+            return
+        exposure = middle_exposure(run.exposures).tolist()
+        header = {"frame": run.frame.to_dict(), "views": run.num_views, "exposure": exposure}
+        save_delta(run.folder.delta(run.num_views), self._feed.update(run.session.cache), header)
 
 
-def _stream(
-    run: RunState,
-    capture: Capture,
-    indices: Sequence[int],
-    identity: dict,
-    folder: RunFolder,
-    recorder: ChunkRecorder,
-    deltas: DeltaWriter | None,
-    save_every: int,
-    reporter: Reporter,
-) -> int | None:
-    """Streams the views that the run has not had yet; returns the signal that stopped it, if one did."""
-    order = capture.stream_order(run.session.model.config, indices, run.frame)
-    with Interrupts(has_work=False) as interrupts, reporter.progress("streaming", len(indices)) as advance:
-        advance(run.num_views, WAITING)
-        recorder.start(run)
-        chunks = feed_chunks(run.session, capture, order[run.num_views :], run.frame)
-        for number, fed in enumerate(chunks, start=1):
-            interrupts.has_work = True
-            run.exposures |= fed.exposures
-            run.frame = fed.frame
-            if deltas is not None:
-                deltas.write(run)
-            recorder.record(run, fed, is_last=run.num_views == len(indices))
-            advance(run.num_views)
-            stopped = interrupts.received  # read once: a signal may come at any time
-            if stopped or number % save_every == 0 or run.num_views == len(indices):
-                save_run(run, identity, folder)
-            if stopped:
-                break
-        return interrupts.received  # a signal may have come during the last save, too
+def record_chunk(run: Run, fed: FedChunk, held_back: Sequence[int]) -> None:
+    """Writes the record of a chunk that the run has just taken in, for the viewer and the report.
+
+    Every few chunks, and after the last, it has the mean PSNR of the frames `held_back`.
+    """
+    facts, capture = run.session.cache_facts(), run.capture
+    number = -(-run.num_views // run.session.model.config.stream.chunk_size) - 1  # of the chunk, from 0
+    psnr = None
+    if held_back and (run.num_views == len(run.indices) or number % CHUNKS_PER_SCORE == 0):
+        scores = score_targets(run.session.gaussians(), capture, tuple(held_back), run.frame, run.exposures)
+        psnr = scores["shown"]["psnr"]
+    views = []
+    for i, image in zip(fed.frames, np.asarray(fed.chunk.images), strict=False):  # without the padding
+        pose, exposure = capture.frames[i].camtoworld, np.asarray(run.exposures[i], np.float64)
+        views.append(RecordedView(i, pose, capture.K(i), exposure, make_thumbnail(image)))
+    record = ChunkRecord(
+        num_views=run.num_views,
+        size=(capture.width, capture.height),
+        views=tuple(views),
+        seconds=round(fed.seconds, 4),
+        occupancy=round(facts["voxels"] / facts["capacity"], 4),
+        num_gaussians=int(facts["decoded"]),
+        held_back_psnr=psnr,
+    )
+    save_chunk_record(run.folder.chunk_record(run.num_views), record)
+
+
+def hold_back(indices: Sequence[int], count: int) -> tuple[list[int], list[int]]:
+    """Splits frames into those to stream and `count` evenly spread ones to hold back.
+
+    Raises:
+        InputError: fewer than two frames would be left to stream.
+    """
+    if count == 0:
+        return list(indices), []
+    if not 0 <= count <= len(indices) - 2:
+        wanted, fix = f"0 to {max(len(indices) - 2, 0)} of the {len(indices)} frames", "hold back fewer"
+        raise refusal("--hold-back", wanted=wanted, got=str(count), fix=fix)
+    places = {round((k + 0.5) * len(indices) / count - 0.5) for k in range(count)}
+    return [i for k, i in enumerate(indices) if k not in places], [indices[k] for k in sorted(places)]
+
+
+def check_num_frames(count: int, path: str) -> None:
+    """Refuses a stream of one frame, which tells no depth; the message names `path`, the capture."""
+    if count < 2:
+        fix = "add frames, or choose a smaller --stride or a larger --max-views"
+        raise refusal(path, wanted="two frames or more to stream", got=str(count), fix=fix)

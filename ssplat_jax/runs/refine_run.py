@@ -1,32 +1,29 @@
-"""`ssplat refine`: the scene of a finished run, revised on the frames that it was made from."""
+"""`ssplat refine`: the scene of a finished run, refined on the frames that it was made from; a stop loses no step."""
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
-from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.console import WAITING, Reporter
-from ssplat_jax.core.errors import InputError, require_positive
-from ssplat_jax.core.gaussians import Gaussians
-from ssplat_jax.data.capture import Capture
-from ssplat_jax.data.open_capture import open_capture
-from ssplat_jax.data.stream_frame import StreamFrame
-from ssplat_jax.evaluation.scoring import exposures_from_json, score_targets
-from ssplat_jax.model.streamsplat import StreamSplat
-from ssplat_jax.refinement import KeyViews, RefineConfig
+from ssplat_jax.core.errors import InputError, refusal, require_positive
+from ssplat_jax.evaluation.scoring import score_targets
 from ssplat_jax.refinement.refine import Progress, continue_refinement, key_views_of, report_of, start_refinement
 from ssplat_jax.refinement.refine_config import FOR_CAPTURES
-from ssplat_jax.runs.finish_run import NUM_PICTURES, save_scene
-from ssplat_jax.runs.refinement_state import load_refinement, save_refinement
-from ssplat_jax.runs.run_poses import with_poses_of_run
-from ssplat_jax.storage.files import write_json
+from ssplat_jax.runs.export_run import save_scene
+from ssplat_jax.runs.open_run import load_run
+from ssplat_jax.runs.run_results import shown_frames
+from ssplat_jax.storage.files import load_arrays, save_arrays, write_json
 from ssplat_jax.storage.interrupts import Interrupts
 from ssplat_jax.storage.run_folder import RunFolder, lock_folder
-from ssplat_jax.storage.saved_states import load_newest_state
-from ssplat_jax.storage.weights import params_digest
-from ssplat_jax.streaming.feed import Exposures
-from ssplat_jax.streaming.session import Session
+
+KIND = "refinement state 1"
+
+MEASURED = tuple(field.name for field in dataclasses.fields(Progress) if field.name != "state")
+"""Fields of `Progress` that are plain numbers."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,19 +33,7 @@ class RefineResult:
     num_steps: int
     before: dict  # scores of some streamed views, see `mean_scores`; empty if it was interrupted
     after: dict
-    interrupted: int | None  # the signal that stopped it, if one did
-
-
-@dataclasses.dataclass(frozen=True)
-class _Run:
-    """A finished run, opened with its capture."""
-
-    gaussians: Gaussians  # in the stream frame
-    capture: Capture
-    indices: list[int]
-    frame: StreamFrame
-    exposures: Exposures
-    identity: dict  # facts that must be equal for a refinement to be continued
+    interrupted: int | None = None  # the signal that stopped it, if one did
 
 
 def refine_run(
@@ -77,86 +62,73 @@ def refine_run(
         StorageError: the folder cannot be written or a state is corrupt.
     """
     require_positive(steps=steps, save_every=save_every)
-    folder = RunFolder(run_dir)
-    run = _open_run(folder, path, params, reporter)
+    run, folder, config = load_run(run_dir, reporter), RunFolder(run_dir), FOR_CAPTURES
+    gaussians, indices = run.session(params).gaussians(), run.header["frames"]
+    frame, exposures = run.frame, run.exposures
+    if len(exposures) < len(indices):
+        got, fix = f"one after {len(exposures)} of {len(indices)} views", "finish it with `ssplat run`"
+        raise refusal(str(run_dir), wanted="a finished run", got=got, fix=fix)
+    capture = run.open_capture(path)
+    identity = {name: run.header[name] for name in ("config", "size", "frames", "poses", "images", "weights")}
+    identity |= {"steps": steps, "refine_config": dataclasses.asdict(config)}
     with lock_folder(run_dir):
         if overwrite:
             folder.clear_refinement()
-        given = key_views_of(run.capture, run.indices, run.frame, run.exposures)
-        config = FOR_CAPTURES
-        identity = run.identity | {"steps": steps, "refine_config": dataclasses.asdict(config)}
-        progress, key_views = start_refinement(run.gaussians, given, config)
+        given = key_views_of(capture, indices, frame, exposures)
+        progress, key_views = start_refinement(gaussians, given, config)
         if folder.refinement_state.exists():
             load_refinement(folder.refinement_state, progress, identity)
-        stopped = _take_steps(progress, key_views, steps, config, save_every, identity, folder, reporter)
-        if stopped:
-            return RefineResult(progress.num_steps, {}, {}, stopped)
-        refined, done = progress.scene(run.gaussians), report_of(progress, key_views, config)
-        save_scene(folder.refined_scene, refined, run.frame, run.exposures)  # at the exposure of scene.ply
-        shown = tuple(sorted({run.indices[round(i)] for i in np.linspace(0, len(run.indices) - 1, NUM_PICTURES)}))
-        before, after = (
-            score_targets(scene, run.capture, shown, run.frame, run.exposures) for scene in (run.gaussians, refined)
-        )
-        write_json(folder.refinement, vars(done) | {"seen_views_before": before, "seen_views_after": after})
-    return RefineResult(progress.num_steps, before, after, None)
+        with Interrupts() as interrupts, reporter.progress("refining", steps) as advance:
+            advance(progress.num_steps, WAITING)
+            num_saves = progress.num_steps // save_every
+            for _ in continue_refinement(progress, key_views, steps, config):
+                advance(progress.num_steps, f"loss {progress.losses[-1]:.4f}")
+                if interrupts.received:
+                    break
+                if progress.num_steps // save_every > num_saves:  # a learned pass may step over a multiple
+                    num_saves = progress.num_steps // save_every
+                    save_refinement(folder.refinement_state, progress, identity)
+            save_refinement(folder.refinement_state, progress, identity)
+            if interrupts.received:  # read last: a signal may have come during the save, too
+                return RefineResult(progress.num_steps, {}, {}, interrupts.received)
+        refined, report = progress.scene(gaussians), report_of(progress, key_views, config)
+        save_scene(folder.refined_scene, refined, frame, exposures)  # at the exposure of scene.ply
+        shown = tuple(shown_frames(indices))
+        before, after = (score_targets(scene, capture, shown, frame, exposures) for scene in (gaussians, refined))
+        write_json(folder.refinement, vars(report) | {"seen_views_before": before, "seen_views_after": after})
+    return RefineResult(progress.num_steps, before, after)
 
 
-def _open_run(folder: RunFolder, path: str, params: dict, reporter: Reporter) -> _Run:
-    """The run in a folder with its capture, checked to belong together."""
-    if not folder.has_state():
-        raise InputError(f"{folder.path}: wanted the folder of an `ssplat run`, found no {folder.state.name} in it.")
-    cache, header, damage = load_newest_state(folder.state)
-    if damage is not None:
-        reporter.warn(f"{damage} Refining the state saved before it, after {header['done']} views.")
-    if header["weights"] != params_digest(params):
-        raise InputError(
-            f"{folder.path}: was streamed with other weights than these; give the run's own with --weights."
-        )
-    frames = header["frames"]
-    if header["done"] < len(frames):
-        raise InputError(
-            f"{folder.path}: wanted a finished run, got one after {header['done']} of {len(frames)} views; finish it"
-            " with `ssplat run`."
-        )
-    capture = with_poses_of_run(open_capture(path, size=tuple(header["size"])), folder)
-    is_same = max(frames) < len(capture) and (capture.digest(frames), capture.images_digest(frames)) == (
-        header["poses"],
-        header["images"],
-    )
-    if not is_same:
-        raise InputError(f"{path}: wanted the capture of the run in {folder.path}, got another; give that capture.")
-    session = Session(StreamSplat(StreamConfig.from_dict(header["config"])), params, cache)
-    return _Run(
-        gaussians=session.gaussians(),
-        capture=capture,
-        indices=frames,
-        frame=StreamFrame.from_dict(header["frame"]),
-        exposures=exposures_from_json(header["exposures"]),
-        identity={name: header[name] for name in ("config", "size", "frames", "poses", "images", "weights")},
-    )
+def save_refinement(path: Path, progress: Progress, identity: dict[str, Any]) -> None:
+    """Saves a refinement between two steps, with the facts that must be equal for it to be continued.
+
+    The scene that it started from is left out: `start_refinement` finds it again from the run and its capture.
+    """
+    arrays = {name: np.asarray(leaf) for name, leaf in _leaves(progress).items() if not name.startswith(".start")}
+    measured = {name: getattr(progress, name) for name in MEASURED}
+    save_arrays(path, arrays, KIND, {"identity": identity, "measured": measured})
 
 
-def _take_steps(
-    progress: Progress,
-    key_views: KeyViews,
-    steps: int,
-    config: RefineConfig,
-    save_every: int,
-    identity: dict,
-    folder: RunFolder,
-    reporter: Reporter,
-) -> int | None:
-    """Takes the steps that are left, saving on the way; returns the signal that stopped them, if one did."""
-    with Interrupts() as interrupts, reporter.progress("refining", steps) as advance:
-        advance(progress.num_steps, WAITING)
-        num_saves = progress.num_steps // save_every
-        for _ in continue_refinement(progress, key_views, steps, config):
-            advance(progress.num_steps, f"loss {progress.losses[-1]:.4f}")
-            stopped = interrupts.received  # read once: a signal may come at any time
-            if stopped:
-                break
-            if progress.num_steps // save_every > num_saves:  # a learned pass may step over a multiple
-                num_saves = progress.num_steps // save_every
-                save_refinement(folder.refinement_state, progress, identity)
-        save_refinement(folder.refinement_state, progress, identity)
-        return interrupts.received
+def load_refinement(path: Path, progress: Progress, identity: dict[str, Any]) -> None:
+    """Puts the refinement that a file holds into `progress`, the same refinement before its first step.
+
+    Raises:
+        InputError: the file holds the refinement of another run, or one with other options.
+        StorageError: the file is damaged.
+    """
+    arrays, header = load_arrays(path, KIND)
+    for name, wanted in identity.items():
+        if header["identity"][name] != wanted:
+            raise InputError(
+                f"{path}: holds a refinement that differs in its {name}; repeat the old options, or start anew with"
+                " --overwrite."
+            )
+    leaves = [jnp.asarray(arrays.get(name, leaf)) for name, leaf in _leaves(progress).items()]
+    progress.state = jax.tree.unflatten(jax.tree.structure(progress.state), leaves)
+    for name in MEASURED:
+        setattr(progress, name, header["measured"][name])
+
+
+def _leaves(progress: Progress) -> dict[str, jax.Array]:
+    """The arrays of the state by name; those of the scene that it started from begin with `.start`."""
+    return {jax.tree_util.keystr(place): leaf for place, leaf in jax.tree.leaves_with_path(progress.state)}

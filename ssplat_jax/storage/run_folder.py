@@ -28,7 +28,7 @@ class RunFolder:
         self.refinement = path / "refinement.json"  # losses and scores of the refinement
         self.refinement_state = path / "refinement.npz"  # from which a stopped refinement continues
         self.state = path / "state.npz"  # the saved stream, from which a stopped run continues
-        self.adjusted_poses = path / "adjusted_poses.json"  # the poses that were adjusted before the stream
+        self.adjusted_poses = path / "adjusted_poses.npz"  # the poses that were adjusted before the stream
         self.metrics = path / "metrics.json"  # facts and scores
         self.split = path / "split.json"  # the context and target frames of an evaluation
         self.index = path / "index.json"  # the same frames as an index file

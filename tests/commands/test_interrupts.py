@@ -27,11 +27,24 @@ TIMEOUT = 300.0
 
 SCRIPT = "from ssplat_jax.commands.start import start; start()"  # as the script `ssplat` does
 
-# A program that takes seconds to compile, as the first step of a stream does.
-COMPILING = """
-import os, signal, threading, time
-import jax, jax.numpy as jnp
+INTERRUPTED = (130, "ssplat: interrupted\n")
+
+# A command in place of the command line: `main.main` runs `command`, and Ctrl-C ends it from the handler.
+AROUND = """
+import os, signal, sys, threading, time
 from ssplat_jax.commands import main, start
+
+{command}
+
+main.main = lambda: {run}
+start.PATIENCE = {patience}
+start.start()
+"""
+
+# A program that takes seconds to compile, as the first step of a stream does. The pause is that of a busy machine,
+# which leaves a thread that still compiles the time to meet data that are freed.
+COMPILING = """
+import jax, jax.numpy as jnp
 
 def command():
     def compute(x):
@@ -39,36 +52,11 @@ def command():
             x = jnp.sort(jnp.sin(x + i) @ x)
         return x
     lowered = jax.jit(compute).lower(jnp.ones((8, 8)))
-    print("compiling", flush=True)
     threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()
     lowered.compile()
-    print("compiled", flush=True)
-    return 0
-
-def slowly():  # as a busy machine, which leaves a thread that still compiles the time to meet data that are freed
-    code = main.guarded(command)
-    time.sleep(5)
-    exit(code)
-
-main.main = slowly
-start.start()
 """
 
-
-def test_an_interrupted_compilation_ends_with_130_at_once():
-    environment = {**os.environ, "JAX_ENABLE_COMPILATION_CACHE": "false", "XLA_FLAGS": ""}
-    since = time.monotonic()
-    done = subprocess.run(
-        [sys.executable, "-c", COMPILING], capture_output=True, text=True, env=environment, timeout=TIMEOUT
-    )
-    assert (done.returncode, done.stdout, done.stderr) == (130, "compiling\n", "ssplat: interrupted\n")
-    assert time.monotonic() - since < TIMEOUT / 2
-
-
 SWALLOWING = """
-import os, signal, time
-from ssplat_jax.commands import main, start
-
 def command():
     for _ in range({signals}):
         try:
@@ -77,27 +65,9 @@ def command():
         except KeyboardInterrupt:
             pass
     {ending}
-
-main.main = lambda: exit(main.guarded(command))
-start.PATIENCE = 0.5
-start.start()
 """
 
-
-@pytest.mark.parametrize(
-    ("signals", "ending"),
-    [(1, "return 0"), (1, "raise RuntimeError('made of an interrupt')"), (1, "time.sleep(60)"), (2, "time.sleep(60)")],
-)
-def test_a_swallowed_interrupt_still_ends_the_command(signals, ending):
-    code = SWALLOWING.format(signals=signals, ending=ending)
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=30)
-    assert (done.returncode, done.stdout, done.stderr) == (130, "", "ssplat: interrupted\n")
-
-
 IN_A_DESTRUCTOR = """
-import os, signal, time
-from ssplat_jax.commands import main, start
-
 class Thing:
     def __del__(self):
         os.kill(os.getpid(), signal.SIGINT)
@@ -107,41 +77,54 @@ def command():
     thing = Thing()
     del thing
     time.sleep(60)
-
-main.main = lambda: exit(main.guarded(command))
-start.PATIENCE = 60.0
-start.start()
 """
-
-
-def test_an_interrupt_in_a_destructor_ends_the_command_at_once():
-    done = subprocess.run([sys.executable, "-c", IN_A_DESTRUCTOR], capture_output=True, text=True, timeout=30)
-    assert (done.returncode, done.stdout, done.stderr) == (130, "", "ssplat: interrupted\n")
-
 
 CALLED_BY_JAX = """
-import os, signal, time
 import jax
-from ssplat_jax.commands import main, start
 
-def traced(x):
-    try:
-        os.kill(os.getpid(), signal.SIGINT)
-        time.sleep(5)
-    except KeyboardInterrupt:
-        print("an exception went up into JAX")
-        raise
-    return x
+def command():
+    def traced(x):
+        try:
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(5)
+        except KeyboardInterrupt:
+            print("an exception went up into JAX", file=sys.stderr)
+            raise
+        return x
 
-main.main = lambda: exit(main.guarded(lambda: jax.jit(traced)(1.0)))
-start.PATIENCE = 60.0
-start.start()
+    jax.jit(traced)(1.0)
 """
 
 
-def test_no_interrupt_goes_up_as_an_exception_into_jax():
-    done = subprocess.run([sys.executable, "-c", CALLED_BY_JAX], capture_output=True, text=True, timeout=TIMEOUT)
-    assert (done.returncode, done.stdout, done.stderr) == (130, "", "ssplat: interrupted\n")
+def ended(command: str, patience: float = 60.0, run: str = "exit(main.guarded(command))") -> tuple[int, str]:
+    """Exit code and last words of a process that interrupts itself."""
+    environment = {**os.environ, "JAX_ENABLE_COMPILATION_CACHE": "false", "XLA_FLAGS": ""}
+    code = AROUND.format(command=command, patience=patience, run=run)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, env=environment, timeout=TIMEOUT
+    )
+    return done.returncode, done.stderr
+
+
+def test_an_interrupted_compilation_ends_with_130_at_once():
+    since = time.monotonic()
+    assert ended(COMPILING, run="(main.guarded(command), time.sleep(5), exit(0))") == INTERRUPTED
+    assert time.monotonic() - since < TIMEOUT / 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("signals", "ending"),
+    [(1, "return 0"), (1, "raise RuntimeError('made of an interrupt')"), (1, "time.sleep(60)"), (2, "time.sleep(60)")],
+)
+def test_a_swallowed_interrupt_still_ends_the_command(signals, ending):
+    assert ended(SWALLOWING.format(signals=signals, ending=ending), patience=0.5) == INTERRUPTED
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", [IN_A_DESTRUCTOR, CALLED_BY_JAX])
+def test_an_interrupt_in_a_destructor_or_under_jax_ends_the_command_at_once(command):
+    assert ended(command) == INTERRUPTED
 
 
 def test_ctrl_c_waits_only_where_there_is_work_to_save():

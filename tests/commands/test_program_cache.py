@@ -1,6 +1,5 @@
 """Programs kept on disk: the same bytes as without, nothing on the terminal, and users' settings hold."""
 
-import json
 import os
 import subprocess
 import sys
@@ -10,25 +9,25 @@ import pytest
 
 from ssplat_jax.commands import main, program_cache
 from ssplat_jax.commands.program_cache import FOLDER, IS_ON, SWITCH, drop_newest, keep_programs
+from tests.commands.command_fixture import read
 
 # The fuse of the cache, its buffers donated as in a stream.
 FUSING = """
-import hashlib, sys
+import functools, hashlib
 from ssplat_jax.commands.program_cache import keep_programs
 keep_programs()
 import jax, numpy as np
-from ssplat_jax.benchmarks.cache_benchmark import compile_fuse
-from ssplat_jax.cache import Tokens, init_cache
+from ssplat_jax.cache import Tokens, fuse, init_cache
 from ssplat_jax.config import preset
 config = preset("tiny").replace(capacity=1024)
 r, n = np.random.default_rng(0), 512
 f = lambda *shape: jax.numpy.asarray(r.uniform(0.1, 1, (n, *shape)), "float32")
 chunk = Tokens(means=f(3), feats=f(config.network.token_width), confidences=f(), rgbs=f(12), quats=f(4),
                footprints=f(), valid=jax.numpy.ones(n, bool))
-fuse, cache = compile_fuse(config, 1024, chunk), init_cache(config)
+step, cache = jax.jit(functools.partial(fuse, config=config), donate_argnums=0), init_cache(config)
 for _ in range(3):
     given = cache
-    cache = jax.block_until_ready(fuse(cache, chunk))
+    cache = jax.block_until_ready(step(cache, chunk))
     assert given.means.is_deleted(), "not donated"
 print(hashlib.sha256(b"".join(np.asarray(x).tobytes() for x in jax.tree.leaves(cache))).hexdigest())
 """
@@ -48,9 +47,9 @@ def test_kept_programs_give_the_same_bytes_and_say_nothing(tmp_path):
         assert (done.returncode, done.stderr) == (0, ""), done.stderr
         files = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*-cache")}
         results.append((done.stdout, files))
-    (off, nothing), (cold, written), (warm, read) = results
+    (off, nothing), (cold, written), (warm, kept) = results
     assert off == cold == warm != ""
-    assert nothing == {} and read == written != {}
+    assert nothing == {} and kept == written != {}
 
 
 @pytest.mark.slow
@@ -63,10 +62,9 @@ def test_a_run_with_kept_programs_writes_the_same_bytes(tmp_path):
             [*command, "--out", str(out), "--quiet"], capture_output=True, text=True, env=plain_environment(where)
         )
         assert done.returncode == 0 and "E1" not in done.stderr and "cpu_aot" not in done.stderr, done.stderr
-        metrics = json.loads((out / "metrics.json").read_text())
+        metrics = read(out / "metrics.json")
         compile_seconds.append(metrics.pop("compile_s"))
-        results = {path.name: path.read_bytes() for path in out.rglob("*.*") if path.name != "metrics.json"}
-        written.append((metrics, results))
+        written.append((metrics, (out / "scene.ply").read_bytes(), (out / "state.npz").read_bytes()))
     assert written[0] == written[1] == written[2]
     assert compile_seconds[2] < 0.7 * min(compile_seconds[:2])
 
@@ -83,36 +81,25 @@ def test_every_command_keeps_its_programs_but_those_that_measure_compiling(monke
         assert order == (["run"] if name in ("bench", "experiment") else ["kept", "run"]), name
 
 
-@pytest.mark.parametrize(
-    "variables", [{SWITCH: "off"}, {SWITCH: "OFF"}, {IS_ON: "false"}, {IS_ON: "0", SWITCH: "elsewhere"}]
-)
-def test_the_cache_can_be_turned_off(variables):
-    environment = dict(variables)
-    keep_programs(environment)
-    assert environment == variables
-
-
-def test_a_folder_that_is_set_already_holds():
+def test_what_the_user_has_set_holds(tmp_path, monkeypatch):
+    for variables in ({SWITCH: "off"}, {SWITCH: "OFF"}, {IS_ON: "false"}, {IS_ON: "0", SWITCH: "elsewhere"}):
+        environment = dict(variables)
+        keep_programs(environment)
+        assert environment == variables
     environment = {FOLDER: "mine"}
     keep_programs(environment)
     assert environment == {FOLDER: "mine", "TF_CPP_MIN_LOG_LEVEL": "3"}
-
-
-def test_each_kind_of_cpu_has_a_folder_of_its_own(tmp_path, monkeypatch):
+    (tmp_path / "file").write_bytes(b"")
+    environment = {SWITCH: str(tmp_path / "file")}  # no folder can be made there
+    keep_programs(environment)
+    assert FOLDER not in environment
     folders = set()
-    for cores in (1, 2):
+    for cores in (1, 2):  # each kind of CPU has a folder of its own
         monkeypatch.setattr(program_cache, "num_cores", lambda cores=cores: cores)
         environment = {SWITCH: str(tmp_path)}
         keep_programs(environment)
         folders.add(environment[FOLDER])
     assert len(folders) == 2 and all(Path(folder).is_dir() for folder in folders)
-
-
-def test_a_folder_that_cannot_be_made_leaves_the_cache_off(tmp_path):
-    (tmp_path / "file").write_bytes(b"")
-    environment = {SWITCH: str(tmp_path / "file")}
-    keep_programs(environment)
-    assert FOLDER not in environment
 
 
 def test_programs_of_an_interrupts_last_seconds_are_dropped(tmp_path, monkeypatch):

@@ -13,7 +13,7 @@ from ssplat_jax.core.pytree import replace
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.rasterizer import Effects, fill_holes
 from ssplat_jax.scene_files.formats import save_gaussians
-from tests.commands.test_cli import make_capture, run
+from tests.commands.command_fixture import make_capture, run
 
 LEVEL = 1.0 / 255
 FILM_DB = 38.0  # x264's losses, of the brightness: colors have half the resolution
@@ -52,7 +52,7 @@ def wanted(capture, gaussians, i, antialias, *, filled=True):
 def test_pictures_are_what_the_cameras_see(tmp_path, capture, capsys):
     ss.save_ply(tmp_path / "run" / "scene.ply", scene())
     out = tmp_path / "pictures"
-    assert run("render", str(tmp_path / "run"), str(capture), "--stride", "2", "--out", str(out), "--quiet") == 0
+    assert run("render", tmp_path / "run", capture, "--stride", "2", "--out", out, "--quiet") == 0
     assert "2 pictures" in capsys.readouterr().out
     assert sorted(path.name for path in (out / "views").iterdir()) == ["00000.png", "00002.png"]
     loaded = ss.load_ply(tmp_path / "run" / "scene.ply")
@@ -62,42 +62,41 @@ def test_pictures_are_what_the_cameras_see(tmp_path, capture, capsys):
     assert np.abs(picture(out / "views" / "00000.png") - picture(out / "views" / "00002.png")).max() > 0.1
     # Fewer pictures than before: the others do not stay.
     arguments = ("--max-views", "1", "--over-black", "--quiet")
-    assert run("render", str(tmp_path / "run"), str(capture), "--out", str(out), *arguments) == 0
+    assert run("render", tmp_path / "run", capture, "--out", out, *arguments) == 0
     (only,) = (out / "views").iterdir()
     np.testing.assert_allclose(picture(only), wanted(capture, loaded, 0, "mip", filled=False), atol=0.51 * LEVEL)
 
 
-def test_a_scene_for_another_renderer_is_drawn_as_there(tmp_path, capture):
-    ss.save_ply(tmp_path / "scene.ply", scene(), render_mode="default")
-    data = (tmp_path / "scene.ply").read_bytes()
-    (tmp_path / "scene.ply").write_bytes(data.replace(b"comment SplatRenderMode: default\n", b""))
-    arguments = ("--max-views", "1", "--out", str(tmp_path / "out"), "--quiet")
-    assert run("render", str(tmp_path / "scene.ply"), str(capture), *arguments) == 0
-    loaded, found = ss.load_ply(tmp_path / "scene.ply"), picture(tmp_path / "out" / "views" / "00000.png")
-    np.testing.assert_allclose(found, wanted(capture, loaded, 0, "classic"), atol=0.51 * LEVEL)
-    assert np.abs(found - wanted(capture, loaded, 0, "mip")).max() > 3 * LEVEL
+@pytest.mark.parametrize(("name", "antialias"), [("scene.ply", "classic"), ("scene.glb", "mip"), ("scene.sog", "mip")])
+def test_a_scene_of_any_format_is_drawn_with_the_filter_that_it_names(tmp_path, capture, name, antialias):
+    file = tmp_path / name
+    if name == "scene.ply":
+        ss.save_ply(file, scene(), render_mode="default")
+        file.write_bytes(file.read_bytes().replace(b"comment SplatRenderMode: default\n", b""))
+    else:
+        save_gaussians(file, scene())
+    assert run("render", file, capture, "--max-views", "1", "--out", tmp_path / "out", "--quiet") == 0
+    loaded, found = ss.load_scene(file), picture(tmp_path / "out" / "views" / "00000.png")
+    np.testing.assert_allclose(found, wanted(capture, loaded, 0, antialias), atol=0.51 * LEVEL)
+    if name == "scene.ply":
+        assert np.abs(found - wanted(capture, loaded, 0, "mip")).max() > 3 * LEVEL
 
 
-@pytest.mark.parametrize("suffix", [".glb", ".sog"])
-def test_a_scene_of_any_format_is_rendered(tmp_path, capture, suffix):
-    save_gaussians(tmp_path / f"scene{suffix}", scene())
-    arguments = ("--max-views", "1", "--out", str(tmp_path / "out"), "--quiet")
-    assert run("render", str(tmp_path / f"scene{suffix}"), str(capture), *arguments) == 0
-    loaded, found = ss.load_scene(tmp_path / f"scene{suffix}"), picture(tmp_path / "out" / "views" / "00000.png")
-    np.testing.assert_allclose(found, wanted(capture, loaded, 0, "mip"), atol=0.51 * LEVEL)
-
-
-def test_a_scene_counted_from_an_offset_is_seen_where_it_is(tmp_path, capture):
+def test_a_scene_counted_from_an_offset_is_seen_where_it_is(tmp_path, capture, capsys):
     gaussians = scene()
     ss.save_ply(tmp_path / "near.ply", gaussians)
     moved = replace(gaussians, means=gaussians.means - jnp.asarray(SHIFT, jnp.float32))
     ss.save_ply(tmp_path / "counted.ply", moved, offset=SHIFT)
+    arguments = (capture, "--max-views", "1", "--quiet", "--out")
     for name in ("near", "counted"):
-        arguments = ("--max-views", "1", "--out", str(tmp_path / name), "--quiet")
-        assert run("render", str(tmp_path / f"{name}.ply"), str(capture), *arguments) == 0
+        assert run("render", tmp_path / f"{name}.ply", *arguments, tmp_path / name) == 0
     pictures = [picture(tmp_path / name / "views" / "00000.png") for name in ("near", "counted")]
     # The camera's place among numbers of 4096 is rounded to 2e-4: a hundredth of a pixel.
     np.testing.assert_allclose(*pictures, atol=3 * LEVEL)
+    data = (tmp_path / "counted.ply").read_bytes()
+    (tmp_path / "counted.ply").write_bytes(data.replace(b"offset 4096.0", b"offset 4096,0"))
+    assert run("render", tmp_path / "counted.ply", *arguments, tmp_path / "out") == 2
+    assert "three numbers" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -108,18 +107,9 @@ def test_unrenderable_input_is_refused_and_nothing_written(mode, name, words, tm
     ss.save_ply(tmp_path / "scene.ply", scene(), render_mode=mode)
     (tmp_path / "empty").mkdir()
     out = tmp_path / "out"
-    assert run("render", str(tmp_path / name), str(capture), "--out", str(out), "--quiet") == 2
+    assert run("render", tmp_path / name, capture, "--out", out, "--quiet") == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert words in line and not out.exists()
-
-
-def test_a_malformed_offset_is_refused(tmp_path, capture, capsys):
-    ss.save_ply(tmp_path / "scene.ply", scene(), offset=SHIFT)
-    data = (tmp_path / "scene.ply").read_bytes()
-    (tmp_path / "scene.ply").write_bytes(data.replace(b"offset 4096.0", b"offset 4096,0"))
-    arguments = ("--out", str(tmp_path / "out"), "--quiet")
-    assert run("render", str(tmp_path / "scene.ply"), str(capture), *arguments) == 2
-    assert "three numbers" in capsys.readouterr().err
 
 
 def decode(path):
@@ -133,8 +123,8 @@ def test_a_film_goes_from_camera_to_camera(tmp_path, capture):
     pytest.importorskip("av")
     ss.save_ply(tmp_path / "scene.ply", scene())
     out = tmp_path / "out"
-    arguments = ("--size", "45x31", "--out", str(out), "--quiet")
-    assert run("render", str(tmp_path / "scene.ply"), str(capture), "--film", "4", *arguments) == 0
+    arguments = ("--size", "45x31", "--out", out, "--quiet")
+    assert run("render", tmp_path / "scene.ply", capture, "--film", "4", *arguments) == 0
     rate, film = decode(out / "film.mp4")
     assert (rate, len(film)) == (24, 2 * 4 + 1)
     views = [picture(out / "views" / f"{i:05d}.png")[:30, :44] for i in range(3)]
@@ -146,7 +136,7 @@ def test_a_film_goes_from_camera_to_camera(tmp_path, capture):
     # In between it shows neither of its ends.
     assert max(error(film[2], views[0]), error(film[2], views[1])) < min(error(film[0], views[0]), FILM_DB) - 5
     # Without a film, none of another scene stays.
-    assert run("render", str(tmp_path / "scene.ply"), str(capture), *arguments) == 0
+    assert run("render", tmp_path / "scene.ply", capture, *arguments) == 0
     assert sorted(path.name for path in out.iterdir()) == ["views"]
 
 
@@ -164,7 +154,7 @@ def test_films_of_depth_and_normals_on_an_orbit(tmp_path, capture):
     )
     ss.save_ply(tmp_path / "scene.ply", wall)
     out = tmp_path / "out"
-    arguments = (str(tmp_path / "scene.ply"), str(capture), "--out", str(out), "--quiet")
+    arguments = (tmp_path / "scene.ply", capture, "--out", out, "--quiet")
     films = ("--film", "6", "--film-path", "orbit", "--film-shows", "depth", "normals")
     assert run("render", *arguments, *films) == 0
     assert sorted(path.name for path in out.iterdir()) == ["film_depth.mp4", "film_normals.mp4", "views"]
@@ -177,18 +167,19 @@ def test_films_of_depth_and_normals_on_an_orbit(tmp_path, capture):
     assert np.abs(normals[0] - normals[3]).max() > 5 * LEVEL
 
 
-@pytest.mark.parametrize("options", [("--film-path", "orbit"), ("--film-shows", "depth")])
-def test_options_of_a_film_want_a_film(options, tmp_path, capture, capsys):
-    arguments = (str(tmp_path / "scene.ply"), str(capture), "--out", str(tmp_path / "out"))
-    assert run("render", *arguments, *options) == 2
-    assert "--film" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(("film", "words"), [("0", "film"), ("-3", "film"), ("2", 'pip install "ssplat-jax[video]"')])
-def test_an_impossible_film_is_refused_and_nothing_written(film, words, tmp_path, capture, capsys, monkeypatch):
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--film-path", "orbit"), "--film"),
+        (("--film-shows", "depth"), "--film"),
+        (("--film", "0"), "--film: wanted a finite number above 0"),
+        (("--film", "2"), 'pip install "ssplat-jax[video]"'),
+    ],
+)
+def test_an_impossible_film_is_refused_and_nothing_written(options, words, tmp_path, capture, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "av", None)  # not installed
     ss.save_ply(tmp_path / "scene.ply", scene())
     out = tmp_path / "out"
-    assert run("render", str(tmp_path / "scene.ply"), str(capture), "--film", film, "--out", str(out), "--quiet") == 2
+    assert run("render", tmp_path / "scene.ply", capture, *options, "--out", out, "--quiet") == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert words in line and not out.exists()

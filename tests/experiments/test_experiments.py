@@ -1,7 +1,7 @@
 """Experiments: what they compute from their measurements, and how the command line finds them."""
 
 from importlib.metadata import entry_points
-from typing import get_args
+from typing import get_args, get_type_hints
 
 import jax
 import numpy as np
@@ -16,7 +16,7 @@ from ssplat_experiments.settings import REFINED, SETTINGS
 
 from ssplat_jax.commands.experiment_command import Experiment
 from ssplat_jax.commands.main import guarded
-from ssplat_jax.commands.options import QualityName
+from ssplat_jax.commands.options import StreamOptions
 from ssplat_jax.config import QUALITIES
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.model.network import STAGES, complete_params
@@ -40,7 +40,7 @@ def test_the_front_holds_undominated_settings():
 
 def test_the_qualities_are_settings_that_were_measured():
     measured = {setting.quality: setting for setting in (*SETTINGS, *REFINED) if setting.quality}
-    assert measured.keys() == QUALITIES.keys() == set(get_args(QualityName))
+    assert measured.keys() == QUALITIES.keys() == set(get_args(get_type_hints(StreamOptions)["quality"]))
     for name, quality in QUALITIES.items():
         assert measured[name].changes == {}  # a quality changes the size and the steps only
         assert (measured[name].factor, measured[name].refine_steps) == (quality.scale, quality.refine_steps)

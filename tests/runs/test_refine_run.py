@@ -2,52 +2,41 @@
 
 import json
 import signal
-from unittest.mock import Mock
 
 import pytest
 
 from ssplat_jax.config import preset
 from ssplat_jax.core.console import Reporter
 from ssplat_jax.core.errors import InputError
-from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.refinement.learned_pass import STEPS
-from ssplat_jax.runs import capture_run
 from ssplat_jax.runs import refine_run as module
-from ssplat_jax.runs.capture_run import run_capture
+from ssplat_jax.runs.capture_run import RunOptions, run_capture
 from ssplat_jax.runs.refine_run import refine_run
-from ssplat_jax.runs.resume import RunState
 from ssplat_jax.scene_files.formats import read_scene
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.storage.weights import load_params
 
-CAPTURE = "procedural:room?frames=4"
+CAPTURE, QUIET = "procedural:room?frames=4", Reporter(quiet=True)
 REFINED = ("refined.ply", "refinement.json", "refinement.npz")
 
 
 def refine(path, steps=4, capture=CAPTURE, overwrite=False):
-    reporter = Reporter(quiet=True)
-    params = load_params("tiny")
     options = {"steps": steps, "save_every": 2, "overwrite": overwrite}
-    return refine_run(path, capture, params, **options, reporter=reporter)
+    return refine_run(path, capture, load_params("tiny"), **options, reporter=QUIET)
+
+
+def stream(out, capture=CAPTURE, reporter=QUIET):
+    """Streams small frames into `out`."""
+    options = RunOptions(size=(64, 48), save_every=1)
+    return run_capture(StreamSplat(preset("tiny")), load_params("tiny"), capture, out, options, reporter)
 
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     """Folder of a finished run of four small frames."""
     out = tmp_path_factory.mktemp("run")
-    run_capture(
-        StreamSplat(preset("tiny")),
-        load_params("tiny"),
-        CAPTURE,
-        out,
-        size=(64, 48),
-        stride=1,
-        max_views=None,
-        save_every=8,
-        overwrite=False,
-        reporter=Reporter(quiet=True),
-    )
+    stream(out)
     return out
 
 
@@ -107,8 +96,7 @@ def test_a_stop_after_each_learned_pass_changes_no_byte(finished, monkeypatch):
 def test_learned_passes_that_step_over_a_multiple_are_saved_too(finished, monkeypatch):
     saves = []
     monkeypatch.setattr(module, "save_refinement", lambda path, now, *rest: saves.append(now.num_steps))
-    reporter = Reporter(quiet=True)
-    options = {"steps": 2 * STEPS + 3, "save_every": STEPS - 3, "overwrite": True, "reporter": reporter}
+    options = {"steps": 2 * STEPS + 3, "save_every": STEPS - 3, "overwrite": True, "reporter": QUIET}
     refine_run(finished, CAPTURE, load_params("tiny"), **options)
     assert saves == [STEPS, 2 * STEPS, 2 * STEPS + 3]
 
@@ -129,18 +117,7 @@ def test_a_folder_without_a_finished_run_is_refused(tmp_path, finished):
     with pytest.raises(InputError, match=r"found no state\.npz"):
         refine(tmp_path)
     assert not list(tmp_path.iterdir())
-    run_capture(
-        StreamSplat(preset("tiny")),
-        load_params("tiny"),
-        "procedural:room?frames=8",
-        tmp_path / "run",
-        size=(64, 48),
-        stride=1,
-        max_views=None,
-        save_every=1,
-        overwrite=False,
-        reporter=_StopsAfterOneChunk(),
-    )
+    assert stream(tmp_path / "run", "procedural:room?frames=8", _StopsAfterOneChunk()).interrupted == signal.SIGINT
     with pytest.raises(InputError, match="wanted a finished run, got one after 4 of 8 views"):
         refine(tmp_path / "run", capture="procedural:room?frames=8")
 
@@ -167,45 +144,3 @@ def test_starting_a_run_anew_removes_its_refinement(finished):
     assert all((finished / name).exists() for name in REFINED)
     folder.clear_run()
     assert not any((finished / name).exists() for name in REFINED) and not folder.scene.exists()
-
-
-@pytest.mark.parametrize("scale", [0.5, 0.75, 1.0])
-def test_a_procedural_run_opens_what_refinement_will_open(scale, tmp_path, monkeypatch):
-    """The cameras and images are the same, whatever size is streamed."""
-
-    class Opened(Exception):
-        pass
-
-    def identity(model, params, capture, indices):
-        raise Opened(capture)
-
-    monkeypatch.setattr(capture_run, "run_identity", identity)
-    with pytest.raises(Opened) as raised:
-        run_capture(
-            StreamSplat(preset("tiny")),
-            {},
-            CAPTURE,
-            tmp_path / "run",
-            size=None,
-            scale=scale,
-            stride=1,
-            max_views=None,
-            save_every=8,
-            overwrite=False,
-            reporter=Reporter(quiet=True),
-        )
-    (streamed,) = raised.value.args
-    again = open_capture(CAPTURE, size=(streamed.width, streamed.height))
-    frames = range(len(again))
-    assert streamed.digest(frames) == again.digest(frames)
-    assert streamed.images_digest(frames) == again.images_digest(frames)
-
-
-def test_deltas_of_chunks_that_will_be_streamed_again_are_removed(tmp_path):
-    """A killed run has written them after its last save; the same chunks may bring other views."""
-    folder = RunFolder(tmp_path)
-    folder.deltas.mkdir()
-    for views in (4, 8, 10):
-        folder.delta(views).touch()
-    assert capture_run.start_deltas(Mock(spec=RunState, num_views=8), 8, folder, False) is None
-    assert folder.delta_files() == [folder.delta(4), folder.delta(8)]

@@ -24,7 +24,7 @@ from ssplat_jax.core.pytree import replace
 from ssplat_jax.rasterizer.outputs import sh_basis
 from ssplat_jax.scene_files.formats import READERS, WRITERS, read_scene, save_gaussians
 from ssplat_jax.scene_files.spz import HALF_TURN, SH_SIGNS
-from tests.commands.test_cli import run
+from tests.commands.command_fixture import run
 from tests.scene_files.scene_fixture import FIELDS, compressed_ply, scene
 
 BOTH_WAYS = [suffix for suffix in WRITERS if suffix in READERS]

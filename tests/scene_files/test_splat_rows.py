@@ -8,7 +8,7 @@ from ssplat_jax.core.errors import InputError
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.scene_files.formats import load_ply, save_gaussians, save_ply
 from ssplat_jax.scene_files.splat_rows import rows_to_write, thinned_mask
-from tests.commands.test_cli import run
+from tests.commands.command_fixture import run
 from tests.scene_files.scene_fixture import scene
 
 

@@ -17,13 +17,13 @@ import jax
 import numpy as np
 import pytest
 
-from ssplat_jax.commands import run_command
+from ssplat_jax.commands import options
 from ssplat_jax.commands.main import main
 from ssplat_jax.core.atomic import previous_path, write_atomic
 from ssplat_jax.core.errors import StorageError
 from ssplat_jax.storage.saved_states import load_newest_state
 from ssplat_jax.streaming.session import Session
-from tests.commands.test_cli import make_capture
+from tests.commands.command_fixture import make_capture
 
 NUM_CHUNKS, CHUNK_SIZE = 3, 2
 FIELDS_OF_ONE_PROCESS = ("compile_s", "step_memory_bytes", "peak_memory_bytes")  # of metrics.json
@@ -126,7 +126,7 @@ def _compiled_once():
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Session, "_program", shared)
-        patch.setattr(run_command, "load_model", functools.cache(run_command.load_model))
+        patch.setattr(options, "load_model", functools.cache(options.load_model))
         before = jax.config.read("jax_disable_most_optimizations")
         jax.config.update("jax_disable_most_optimizations", True)
         yield

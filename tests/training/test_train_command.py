@@ -20,7 +20,7 @@ from ssplat_jax.training import crops, loop, recipe
 from ssplat_jax.training.capture_mix import open_mix
 from ssplat_jax.training.crops import Crops
 from ssplat_jax.training.recipe import EVIDENCE
-from tests.commands.test_cli import make_capture
+from tests.commands.command_fixture import make_capture
 from tests.streaming.narrow_model import NARROW
 from tests.training.problems import assert_equal, flat
 

@@ -13,7 +13,7 @@ import pytest
 
 from ssplat_jax.storage.chunk_records import load_delta
 from ssplat_jax.storage.run_folder import RunFolder
-from tests.commands.test_cli import make_capture, run
+from tests.commands.command_fixture import make_capture, run
 from tests.viewer.chromium import wait_for
 from tests.viewer.test_viewer import free_port
 

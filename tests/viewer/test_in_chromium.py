@@ -21,7 +21,7 @@ from ssplat_jax.core.pytree import replace
 from ssplat_jax.data.posed_image import invert_pose, pose_from_quat
 from ssplat_jax.evaluation.pictures import save_image
 from ssplat_jax.rasterizer import Effects
-from ssplat_jax.runs.reports import report_run
+from ssplat_jax.runs.run_results import report_run
 from ssplat_jax.scene_files.formats import load_ply
 from ssplat_jax.storage.chunk_records import ChunkRecord, RecordedView, make_thumbnail, save_chunk_record, save_delta
 from ssplat_jax.storage.run_folder import RunFolder
@@ -30,7 +30,7 @@ from ssplat_jax.viewer.drawn_view import FINE
 from ssplat_jax.viewer.scene_sources import open_source
 from ssplat_jax.viewer.stage import Stage
 from ssplat_jax.viewer.viser_viewer import Viewer
-from tests.runs.test_reports import COMMON, record, score, smooth_picture
+from tests.runs.report_fixture import COMMON, record, score, smooth_picture
 from tests.viewer.chromium import Page, find_chromium, wait_for
 from tests.viewer.test_viewer import delta, frame, free_port, scene
 

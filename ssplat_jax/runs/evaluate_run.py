@@ -19,7 +19,7 @@ from ssplat_jax.evaluation.lpips import LpipsWeights
 from ssplat_jax.evaluation.scoring import Display
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.refinement import online_refinement
-from ssplat_jax.runs.reports import report_eval
+from ssplat_jax.runs.run_results import report_eval
 from ssplat_jax.storage.files import write_json
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.streaming.session import Session
@@ -46,7 +46,7 @@ class EvalOptions:
     display: Display = dataclasses.field(default_factory=Display)
 
 
-def eval_path(
+def evaluate_run(
     model: StreamSplat, params: dict, path: str, out: Path, options: EvalOptions, reporter: Reporter
 ) -> dict[str, Any]:
     """Scores a capture, or every scene of an index file below a folder.
@@ -67,94 +67,73 @@ def eval_path(
             causal stream are to be adjusted.
         StorageError: `out` cannot be written.
     """
+
+    def evaluated(capture: Capture, split: Split, out: Path, scene: str | None = None) -> dict[str, Any]:
+        """The metrics of one capture, in a session of its own; writes its report, too."""
+        metrics = evaluate(
+            Session(model, params, revise=online_refinement(model)),
+            capture,
+            split,
+            out,
+            reporter,
+            streamed=capture.scaled(options.scale),
+            lpips_weights=options.lpips_weights,
+            refine_steps=options.refine_steps,
+            revise=options.revise,
+            scene=scene,
+            display=options.display,
+        )
+        report_eval(RunFolder(out), metrics)
+        return metrics
+
     if options.index is None:
         if options.scene is not None:
             raise InputError("--scene: wanted --index beside it, whose scene it names; got none.")
         capture = open_capture(path, size=options.size)
         split = choose_split(options.protocol, len(capture), options.stride, options.context, options.targets)
-        return _evaluate(model, params, capture, split, out, options, reporter, None)
-    given = {name: getattr(options, name) for name in ("stride", "context", "targets")}
-    given["protocol"] = None if options.protocol == "interleaved" else options.protocol
-    if clash := [name for name, value in given.items() if value is not None]:
+        return evaluated(capture, split, out)
+    chosen = {name: getattr(options, name) for name in ("stride", "context", "targets")}
+    chosen["protocol"] = None if options.protocol == "interleaved" else options.protocol
+    if clash := [name for name, value in chosen.items() if value is not None]:
         raise refusal("--index", wanted="no frames chosen otherwise", got=f"--{clash[0]} too", fix="leave one out")
     index, notes = read_index(options.index)
     reporter.warn_all(*notes)
-    root, written = split_options(path)
-    folder = without_tilde(root)
-    if options.scene is None and folder.is_dir() and not is_capture(folder):
-        return _eval_scenes(model, params, folder, out, index, options, reporter, written)
-    capture = open_capture(path, size=options.size)
-    scene = options.scene or capture.name
-    split = split_of_scene(index, scene, len(capture))
-    return _evaluate(model, params, capture, split, out, options, reporter, scene)
-
-
-def _evaluate(
-    model: StreamSplat,
-    params: dict,
-    capture: Capture,
-    split: Split,
-    out: Path,
-    options: EvalOptions,
-    reporter: Reporter,
-    scene: str | None,
-) -> dict[str, Any]:
-    """The metrics of one capture, in a session of its own; writes its report, too."""
-    metrics = evaluate(
-        Session(model, params, revise=online_refinement(model)),
-        capture,
-        split,
-        out,
-        reporter,
-        streamed=capture.scaled(options.scale),
-        lpips_weights=options.lpips_weights,
-        refine_steps=options.refine_steps,
-        revise=options.revise,
-        scene=scene,
-        display=options.display,
-    )
-    report_eval(RunFolder(out), metrics)
+    folder = without_tilde(split_options(path)[0])
+    if options.scene is not None or not folder.is_dir() or is_capture(folder):
+        capture = open_capture(path, size=options.size)
+        scene = options.scene or capture.name
+        return evaluated(capture, split_of_scene(index, scene, len(capture)), out, scene)
+    captures = _open_scenes(path, index, options.size)
+    for results in (out, *(out / scene for scene in captures)):
+        RunFolder(results).check_no_run()
+    for capture in captures.values():
+        capture.check_output_folder(out)
+    splits = {scene: split_of_scene(index, scene, len(capture)) for scene, capture in captures.items()}
+    scored = {}
+    for scene, capture in captures.items():
+        make_room()  # programs of many scenes would be too many for one process
+        reporter.say(scene)
+        scored[scene] = evaluated(capture, splits[scene], out / scene, scene)
+    metrics = scene_metrics(scored) | {"left_out": [scene for scene, split in index.items() if split is None]}
+    write_json(RunFolder(out).index, index_to_json(index))
+    write_json(RunFolder(out).metrics, metrics)
     return metrics
 
 
-def _eval_scenes(
-    model: StreamSplat,
-    params: dict,
-    folder: Path,
-    out: Path,
-    index: Index,
-    options: EvalOptions,
-    reporter: Reporter,
-    written: dict[str, str],
-) -> dict[str, Any]:
-    """The metrics of every scene of an index; all are opened before the first is streamed."""
+def _open_scenes(path: str, index: Index, size: tuple[int, int] | None) -> dict[str, Capture]:
+    """The captures of all scenes of an index, in the folder `path`; all are opened before the first is streamed."""
+    root, written = split_options(path)
+    folder = without_tilde(root)
     if unsafe := [scene for scene in index if not (folder / scene).resolve().is_relative_to(folder.resolve())]:
         got, fix = echo(unsafe[0]), "name scenes after folders"
         raise refusal("--index", wanted=f"scenes below {folder}", got=got, fix=fix)
     if not any((folder / scene).exists() for scene in index):
         got, fix = "no folder of that name", "give the folder that holds one folder per scene"
         raise refusal(str(folder), wanted=f"a capture, or scenes such as {next(iter(index))}", got=got, fix=fix)
-    captures = {
-        scene: open_capture(with_options(str(folder / scene), **written), size=options.size)
-        for scene, split in index.items()
-        if split is not None
-    }
-    if not captures:
+    used = [scene for scene, split in index.items() if split is not None]
+    if not used:
         raise refusal("--index", wanted="a scene that is not null", got="none", fix="choose frames for one")
-    for folder_of_results in (out, *(out / scene for scene in captures)):
-        RunFolder(folder_of_results).check_no_run()
-    for capture in captures.values():
-        capture.check_output_folder(out)
-    splits = {scene: split_of_scene(index, scene, len(capture)) for scene, capture in captures.items()}
-    scored = {}
-    for scene, capture in captures.items():
-        make_room()
-        reporter.say(scene)
-        scored[scene] = _evaluate(model, params, capture, splits[scene], out / scene, options, reporter, scene)
-    metrics = scene_metrics(scored) | {"left_out": [scene for scene, split in index.items() if split is None]}
-    write_json(RunFolder(out).index, index_to_json(index))
-    write_json(RunFolder(out).metrics, metrics)
-    return metrics
+    return {scene: open_capture(with_options(str(folder / scene), **written), size=size) for scene in used}
 
 
 def scene_metrics(scored: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:

@@ -1,51 +1,26 @@
 """`ssplat eval`: the frames that it chooses, index files in and out, means over views and scenes, flags of pictures."""
 
+import hashlib
 import json
 import math
 
-import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from PIL import Image
 
-from ssplat_jax.evaluation import cost
-from ssplat_jax.model.streamsplat import StreamSplat
-from ssplat_jax.runs import eval_run
-from ssplat_jax.runs.eval_run import scene_metrics
-from ssplat_jax.storage.weights import save_weights
-from tests.commands.test_cli import few_pivots, make_capture, run  # noqa: F401
-from tests.streaming.narrow_model import NARROW
-
-SIZE = (64, 48)
+from ssplat_jax.config import preset
+from ssplat_jax.core.gaussians import mask_gaussians
+from ssplat_jax.evaluation import cost, evaluate
+from ssplat_jax.refinement import refine_on_capture
+from ssplat_jax.runs import evaluate_run
+from ssplat_jax.runs.evaluate_run import scene_metrics
+from tests.commands.command_fixture import SIZE, make_capture, read, run
 
 
 @pytest.fixture(autouse=True)
 def timed_once(monkeypatch):
     monkeypatch.setattr(cost, "NUM_REPEATS", 1)
-
-
-@pytest.fixture
-def narrow(tmp_path):
-    """Options for a small model."""
-    path = tmp_path / "narrow.npz"
-    save_weights(path, StreamSplat(NARROW).init(jax.random.key(0)), NARROW, {})
-    return ("--weights", str(path), "--quiet")
-
-
-def read(path):
-    return json.loads(path.read_text())
-
-
-@pytest.mark.slow
-def test_a_short_capture_needs_no_option(tmp_path, narrow):
-    capture, out = make_capture(tmp_path / "capture", num_frames=7, size=SIZE), tmp_path / "out"
-    assert run("eval", str(capture), "--out", str(out), *narrow) == 0
-    assert read(out / "index.json") == {"capture": {"context": [0, 1, 2, 3, 5, 6], "target": [4]}}
-    again = tmp_path / "again"
-    assert run("eval", str(capture), "--index", str(out / "index.json"), "--out", str(again), *narrow) == 0
-    first, second = (read(folder / "metrics.json") for folder in (out, again))
-    assert (first["shown"], first["literal"]) == (second["shown"], second["literal"])
-    assert second["protocol"] == "index"
 
 
 def test_an_index_sets_the_order_of_the_stream(tmp_path, narrow, monkeypatch):
@@ -75,7 +50,7 @@ def spied(order):
 def test_scenes_of_an_index_are_averaged_by_scene_and_by_view(tmp_path, narrow, monkeypatch):
     made_room = []
     scored = lambda: made_room.append(len(list(out.glob("*/metrics.json"))))  # noqa: E731
-    monkeypatch.setattr(eval_run, "make_room", scored)
+    monkeypatch.setattr(evaluate_run, "make_room", scored)
     scenes, out = tmp_path / "scenes", tmp_path / "out"
     for name in ("a", "b"):
         make_capture(scenes / name, num_frames=8, size=SIZE)
@@ -136,6 +111,50 @@ def picture_psnr(path):
     pixels = np.asarray(Image.open(path), np.float64) / 255
     target, rendered = pixels[:, : SIZE[0]], pixels[:, SIZE[0] : 2 * SIZE[0]]
     return -10 * math.log10(np.mean((target - rendered) ** 2))
+
+
+NUM_FADED = 7
+
+
+def some_fade(*given, **more):
+    """`refine_on_capture` by which some Gaussians disappear, as more steps let some."""
+    gaussians, report = refine_on_capture(*given, **more)
+    is_present = np.asarray(gaussians.opacities) > 0
+    is_kept = ~(is_present & (np.cumsum(is_present) <= NUM_FADED))
+    return mask_gaussians(gaussians, jnp.asarray(is_kept)), report
+
+
+def test_eval_writes_every_promised_field(tmp_path, monkeypatch):
+    monkeypatch.setattr(cost, "NUM_REPEATS", 1)  # how often it times is not what is tested
+    monkeypatch.setattr(evaluate, "refine_on_capture", some_fade)
+    out = tmp_path / "eval"
+    capture = make_capture(tmp_path / "capture", num_frames=12, size=(128, 96))
+    arguments = ("eval", str(capture), "--context", "8", "--quality", "fast", "--refine", "3", "--quiet")
+    assert run(*arguments, "--out", str(out)) == 0
+    metrics = read(out / "metrics.json")
+    promised = {
+        "literal", "shown", "psnr_over_black", "psnr_one_exposure", "per_view", "context_views", "target_views",
+        "chunk_ms", "step_ms", "render_ms", "compile_s", "step_memory_bytes", "peak_memory_bytes", "cache",
+        "num_gaussians", "config_hash", "baselines",
+    }  # fmt: skip
+    assert promised <= metrics.keys()
+    assert metrics["peak_memory_bytes"] >= metrics["step_memory_bytes"] > 0
+    assert metrics["literal"].keys() == metrics["shown"].keys() == {"psnr", "ssim", "lpips"}
+    assert {"voxels", "pivots", "capacity", "overflow", "accepted_fraction"} <= metrics["cache"].keys()
+    assert {"nearest_view_psnr", "mean_color_psnr"} <= metrics["baselines"].keys()
+    assert metrics["context_views"] == 8 and metrics["target_views"] == len(metrics["per_view"]) == 1
+    per_token = preset("tiny").head.gaussians_per_token
+    decoded, refined = metrics["cache"]["decoded"], metrics["num_gaussians"]
+    assert per_token * metrics["cache"]["pivots"] >= decoded > 0
+    assert refined == decoded + metrics["refinement"]["new_gaussians"] - NUM_FADED
+    assert hashlib.sha256((out / "split.json").read_bytes()).hexdigest() == metrics["split_sha256"]
+    # Streamed at half the size, scored at the whole.
+    assert (metrics["streamed_size"], metrics["size"]) == ([64, 48], [128, 96])
+    with Image.open(out / "view_00004.png") as picture:
+        assert picture.size == (3 * 128, 96)
+    refinement = metrics["refinement"]
+    assert refinement["steps"] == 3 and refinement["skipped_steps"] == 0
+    assert all(0 < abs(metrics[name]["psnr"] - refinement["before"][name]["psnr"]) < 3 for name in ("literal", "shown"))
 
 
 @pytest.mark.slow

@@ -13,12 +13,12 @@ from PIL import Image
 
 from ssplat_jax.evaluation.pictures import GAP, LINE, MAX_PICTURES, evenly_spread, save_contact_sheet, save_image
 from ssplat_jax.evaluation.report_page import Report, page_text
-from ssplat_jax.runs.reports import MOST_PICTURES, report_eval, report_run
-from ssplat_jax.storage.chunk_records import ChunkRecord, RecordedView, make_thumbnail, save_chunk_record
+from ssplat_jax.runs.run_results import MOST_PICTURES, report_eval, report_run
+from ssplat_jax.storage.chunk_records import save_chunk_record
 from ssplat_jax.storage.run_folder import RunFolder
+from tests.runs.report_fixture import COMMON, record, score, smooth_picture
 
 JPEG_DB = 30.0  # of a smooth picture
-RNG = np.random.default_rng(4)
 
 
 class Page(HTMLParser):
@@ -48,35 +48,6 @@ class Page(HTMLParser):
 
     def named(self, tag):
         return [attributes for name, attributes in self.tags if name == tag]
-
-
-def smooth_picture(k, height=24, width=96):
-    y, x = np.mgrid[:height, :width] / width
-    return np.stack([x, y, 0.5 + 0.4 * np.sin(6 * x + k)], axis=-1).astype(np.float32)
-
-
-def score(frame):
-    block = {"psnr": 20.0 + frame / 10, "ssim": 0.7, "lpips": None}
-    return {"frame": frame, "shown": block, "literal": block | {"psnr": 15.25}, "coverage": 0.9}
-
-
-def record(num_views, psnr=None):
-    views = tuple(
-        RecordedView(i, np.eye(4), np.eye(3), np.array([1.0, 1 + i / 50, 1.0]), make_thumbnail(smooth_picture(i)))
-        for i in range(num_views - 4, num_views)
-    )
-    return ChunkRecord(num_views, (96, 24), views, 0.25, num_views / 40, 1000 * num_views, psnr)
-
-
-COMMON = {
-    "capture": 'a <room> & "more"',
-    "size": [96, 24],
-    "exposures": {"0": [1.0, 1.0, 1.0], "1": [1.5, 1.0, 1.0]},
-    "cache": {"voxels": 10, "capacity": 20, "accepted_fraction": 0.5},
-    "stream_frame": {"near": 1.0, "far": 4.0, "scale": 2.0, "warning": None},
-    "compile_s": 1.5,
-    "config_hash": "0123456789ab",
-}
 
 
 @pytest.fixture
@@ -117,9 +88,9 @@ def test_the_report_of_a_run_holds_its_pictures_and_figures(folder):
     assert {a["href"] for a in page.named("a")} == {"scene.ply", "metrics.json", "contact_sheet.jpg", "views", "chunks"}
     images = list(images_of(page))
     assert len(images) == MOST_PICTURES
+    assert text.count("<tr><td>4</td>") == text.count("<tr><td>8</td>") == text.count("<tr><td>12</td>") == 1
     for place, k in ((0, 0), (-1, 30)):
         assert -10 * np.log10(np.mean((images[place] - smooth_picture(k)) ** 2)) > JPEG_DB
-    assert text.count("<tr><td>4</td>") == text.count("<tr><td>8</td>") == text.count("<tr><td>12</td>") == 1
 
 
 def test_printed_commands_are_words_of_a_shell(tmp_path):
@@ -134,27 +105,12 @@ def test_printed_commands_are_words_of_a_shell(tmp_path):
     assert not any("--weights" in words for words in commands)
 
 
-def test_commands_of_a_run_with_other_weights_ask_for_them(folder):
-    metrics = COMMON | {"views": 4, "ply": {"num_written": 5}, "seen_views": [score(0)]}
-    report_run(folder, metrics, "x", weights=" --weights WEIGHTS")
-    lines = [line.split("#")[0].strip() for line in Page(folder.report.read_text()).text.splitlines()]
-    wanted = [line.split()[1] for line in lines if line.startswith("ssplat ") and line.endswith(" --weights WEIGHTS")]
-    assert wanted == ["refine", "export"]
-
-
-def test_a_name_that_is_not_utf8_ends_no_run(folder):
+def test_a_report_without_records_or_pictures_is_whole_and_a_name_that_is_not_utf8_ends_no_run(folder):
     """Names on Linux are bytes; Python keeps the others as surrogates."""
     metrics = COMMON | {"views": 4, "ply": {"num_written": 5}, "seen_views": [score(0)], "capture": "caf\udce9"}
     report_run(folder, metrics, "caf\udce9")
-    assert "caf?" in folder.report.read_text()
-
-
-def test_the_report_of_a_run_without_records_or_pictures_is_whole(folder):
-    metrics = COMMON | {"views": 4, "ply": {"num_written": 5}, "seen_views": [score(0)]}
-    report_run(folder, metrics, "x")
     text = folder.report.read_text()
-    assert "Over the stream" not in text and "Pictures" not in text and not folder.contact_sheet.exists()
-    assert "Where everything is" in text
+    assert "caf?" in text and "Pictures" not in text and not folder.contact_sheet.exists()
 
 
 def test_the_report_of_an_evaluation_holds_both_scores(folder):

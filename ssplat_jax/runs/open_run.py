@@ -1,0 +1,256 @@
+"""A run and its folder: opened, checked, locked, identified, resumed and saved.
+
+    with open_run(model, params, capture, indices, out, reporter=reporter) as run:
+        for fed in feed_chunks(run.session, run.capture, order[run.num_views :], run.frame):
+            run.take(fed)
+            run.save()
+
+A run is its configuration, frames, poses, intrinsics, images and weights. Continuing with any other is refused, and so
+are the commands that come after it, because their results would mix two scenes.
+"""
+
+import contextlib
+import dataclasses
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from ssplat_jax.cache import VoxelCache
+from ssplat_jax.config import StreamConfig
+from ssplat_jax.core.console import Reporter
+from ssplat_jax.core.errors import InputError, StorageError
+from ssplat_jax.data.capture import Capture
+from ssplat_jax.data.open_capture import open_capture
+from ssplat_jax.data.stream_frame import StreamFrame
+from ssplat_jax.evaluation.scoring import check_scorable, exposures_from_json, exposures_to_json
+from ssplat_jax.model.streamsplat import StreamSplat
+from ssplat_jax.refinement import online_refinement
+from ssplat_jax.runs.run_poses import capture_to_stream, with_poses_of_run
+from ssplat_jax.storage.run_folder import RunFolder, lock_folder
+from ssplat_jax.storage.saved_states import load_newest_state, restore_previous, save_state
+from ssplat_jax.storage.weights import params_digest
+from ssplat_jax.streaming.feed import Exposures, FedChunk
+from ssplat_jax.streaming.session import Session
+
+
+@dataclasses.dataclass
+class Run:
+    """A stream in progress, and the folder that it is saved in."""
+
+    folder: RunFolder
+    session: Session
+    capture: Capture  # as it is streamed: with adjusted poses, if any
+    indices: list[int]  # frames to stream, ascending; a watched run adds those that have become complete
+    weights: str  # digest of the parameters
+    frame: StreamFrame = dataclasses.field(init=False)  # of the next chunk
+    exposures: Exposures = dataclasses.field(default_factory=dict)  # of the views streamed so far
+    images: dict[str, str] = dataclasses.field(default_factory=dict)  # digest of the file of each of them
+    num_saved: int = 0  # views in the saved state
+
+    @property
+    def num_views(self) -> int:
+        """Views streamed so far."""
+        return len(self.exposures)
+
+    def take(self, fed: FedChunk) -> None:
+        """Adds a chunk that the session has processed."""
+        self.exposures |= fed.exposures
+        self.images |= _image_digests(self.capture, fed.frames)
+        self.frame = fed.frame
+
+    def identity(self) -> dict[str, Any]:
+        """The facts, besides the images, that must be equal for the run to be continued."""
+        return {
+            "config": self.session.model.config.to_dict(),
+            "capture": self.capture.name,
+            "size": [self.capture.width, self.capture.height],
+            "frames": self.indices,
+            "poses": self.capture.digest(self.indices),
+            "weights": self.weights,
+        }
+
+    def save(self) -> None:
+        """Saves the stream, unless it is saved already.
+
+        Raises:
+            StorageError: the folder cannot be written.
+        """
+        if self.num_views == self.num_saved:
+            return
+        state = {
+            "frame": self.frame.to_dict(),
+            "done": self.num_views,
+            "exposures": exposures_to_json(self.exposures),
+            "images": self.images,  # of streamed views alone: a damaged image further on may still be replaced
+        }
+        save_state(self.folder.state, self.session.cache, self.identity() | state)
+        self.num_saved = self.num_views
+
+    def resume(self, reporter: Reporter) -> None:
+        """Continues from the saved state of this run; if it is damaged, from the one before it, with a warning.
+
+        Raises:
+            InputError: the folder holds another run.
+            StorageError: both states are damaged.
+        """
+        try:
+            cache, header, damage = load_newest_state(self.folder.state)
+        except StorageError as error:
+            told = f"{error} No earlier state can be read either; --overwrite starts the run anew."
+            raise StorageError(told) from error
+        check_identity(header, self.identity(), self.folder)
+        # Read once the frames are known to be the same.
+        check_identity(header, {"images": _image_digests(self.capture, map(int, header["images"]))}, self.folder)
+        if damage is not None:
+            reporter.warn(f"{damage} Continuing from the state saved before it, after {header['done']} views.")
+            restore_previous(self.folder.state)
+        self.session.cache, self.frame = cache, StreamFrame.from_dict(header["frame"])
+        self.exposures, self.images = exposures_from_json(header["exposures"]), header["images"]
+        self.num_saved = header["done"]
+
+
+@contextlib.contextmanager
+def open_run(
+    model: StreamSplat,
+    params: dict,
+    capture: Capture,
+    indices: Sequence[int],
+    out: Path,
+    *,
+    revise: str | None = None,
+    overwrite: bool = False,
+    reporter: Reporter,
+) -> Iterator[Run]:
+    """The run that the folder `out` holds, or a new one; the folder is locked until the end.
+
+    Args:
+        model: the model to run.
+        params: the model's parameters.
+        capture: the capture to stream.
+        indices: its frames to stream, ascending.
+        out: folder of the run.
+        revise: `poses` or `auto` adjusts the poses before the stream, see `run_poses.capture_to_stream`.
+        overwrite: remove the run that `out` holds and start anew.
+        reporter: shows progress and warnings.
+
+    Raises:
+        InputError: the capture is unusable or lies in `out`, `out` holds another run, or another process writes to it.
+        StorageError: `out` cannot be written, or the saved state and the one before it are damaged.
+    """
+    check_scorable(capture)
+    capture.check_output_folder(out)
+    folder = RunFolder(out)
+    with lock_folder(out):
+        if overwrite:
+            folder.clear_run()
+        capture = capture_to_stream(capture, indices, revise, folder, reporter)
+        session = Session(model, params, revise=online_refinement(model))
+        run = Run(folder, session, capture, list(indices), params_digest(params))
+        if folder.has_state():
+            run.resume(reporter)
+        else:
+            run.frame = capture.stream_frame(model.config, indices)
+            folder.metrics.unlink(missing_ok=True)  # of another run whose state was removed
+            folder.clear_refinement()
+        # Left by a process that was killed after its last save: these chunks may bring other views.
+        for path in (*folder.delta_files(), *folder.chunk_record_files()):
+            if int(path.stem) > run.num_views:
+                path.unlink(missing_ok=True)
+        reporter.warn_all(*capture.notes, run.frame.warning)
+        yield run
+
+
+def check_identity(header: dict[str, Any], wanted: dict[str, Any], folder: RunFolder) -> None:
+    """Refuses a saved run that is not the one asked for.
+
+    Raises:
+        InputError: naming the first fact of `wanted` that differs from the saved one.
+    """
+    for name, now in wanted.items():
+        there = header[name]
+        if name == "config":  # without the capacity of a cache that grows, which affects no result
+            there, now = (_flat(fields) for fields in (there, now))
+        if there != now:
+            place = ""
+            if isinstance(now, dict):
+                place = next(key for key in sorted(there | now) if there.get(key) != now.get(key))
+                there, now, place = there.get(place), now.get(place), f"{place}: "
+            elif name == "frames":
+                there, now = (f"{len(frames)} from {frames[:2]} on" for frames in (there, now))
+            raise InputError(
+                f"{folder.path}: holds a run that differs in its {name} ({place}{there} there, {now} now); choose"
+                " another --out, repeat the old options, or start anew with --overwrite."
+            )
+
+
+def _flat(config: dict[str, Any]) -> dict[str, Any]:
+    """Fields of a configuration that affect the result, by name; capacity does not, where the cache grows."""
+    fields = {f"{group}.{name}": x for group, part in config.items() if group != "preset" for name, x in part.items()}
+    return fields | ({"memory.capacity": None} if fields["memory.overflow"] == "grow" else {})
+
+
+@dataclasses.dataclass(frozen=True)
+class SavedRun:
+    """The saved state of a run, for the commands that come after it."""
+
+    folder: RunFolder
+    cache: VoxelCache
+    header: dict[str, Any]
+
+    @property
+    def frame(self) -> StreamFrame:
+        """The similarity between the capture's frame and the stream's."""
+        return StreamFrame.from_dict(self.header["frame"])
+
+    @property
+    def exposures(self) -> Exposures:
+        """Exposures of the streamed frames."""
+        return exposures_from_json(self.header["exposures"])
+
+    def session(self, params: dict) -> Session:
+        """The stream, to be decoded with the parameters that it was streamed with.
+
+        Raises:
+            InputError: they are others.
+        """
+        if self.header["weights"] != params_digest(params):
+            raise InputError(
+                f"{self.folder.path}: was streamed with other weights than these; give the run's own with --weights."
+            )
+        return Session(StreamSplat(StreamConfig.from_dict(self.header["config"])), params, self.cache)
+
+    def open_capture(self, path: str) -> Capture:
+        """The capture that was streamed, with the run's adjusted poses.
+
+        Raises:
+            InputError: the capture at `path` is unusable, or its frames, poses or images are others.
+            StorageError: the run's adjusted poses are damaged.
+        """
+        capture = with_poses_of_run(open_capture(path, size=tuple(self.header["size"])), self.folder)
+        frames, streamed = self.header["frames"], list(map(int, self.header["images"]))
+        is_same = max(frames) < len(capture) and capture.digest(frames) == self.header["poses"]
+        if not is_same or _image_digests(capture, streamed) != self.header["images"]:
+            got, fix = "another", "give that capture"
+            raise InputError(f"{path}: wanted the capture of the run in {self.folder.path}, got {got}; {fix}.")
+        return capture
+
+
+def load_run(run_dir: Path, reporter: Reporter) -> SavedRun:
+    """The saved state of a run; of the newest two states the one that can be read, with a warning if it is the older.
+
+    Raises:
+        InputError: there is no run in the folder.
+        StorageError: no state can be read.
+    """
+    folder = RunFolder(run_dir)
+    if not folder.has_state():
+        raise InputError(f"{run_dir}: wanted the folder of an `ssplat run`, found no {folder.state.name} in it.")
+    cache, header, damage = load_newest_state(folder.state)
+    if damage is not None:
+        reporter.warn(f"{damage} Taking the state saved before it, after {header['done']} views.")
+    return SavedRun(folder, cache, header)
+
+
+def _image_digests(capture: Capture, frames) -> dict[str, str]:
+    """Digest of the image file of each frame."""
+    return {str(i): capture.images_digest([i]) for i in frames}

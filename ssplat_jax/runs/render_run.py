@@ -1,0 +1,187 @@
+"""`ssplat render`: pictures of a scene from the cameras of a capture, and films along or around them."""
+
+import dataclasses
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Float64, UInt8
+
+from ssplat_jax.core.cameras import Camera
+from ssplat_jax.core.console import Reporter
+from ssplat_jax.core.errors import refusal, require_positive
+from ssplat_jax.core.gaussians import mean_color, scale_colors
+from ssplat_jax.data.camera_path import camera_path, orbit_path
+from ssplat_jax.data.stream_frame import StreamFrame
+from ssplat_jax.evaluation.pictures import color_depth, color_normals, eight_bits, evenly_spread, save_image, scale_ends
+from ssplat_jax.rasterizer import Effects, fill_holes, render
+from ssplat_jax.runs.run_poses import open_capture_of_scene
+from ssplat_jax.scene_files.formats import SplatFile, read_scene
+from ssplat_jax.storage.run_folder import RunFolder, lock_folder, scene_exposure
+from ssplat_jax.storage.video_writer import VideoWriter
+
+ANTIALIAS = {"mip": "mip", "default": "classic"}
+"""Antialiasing filter for each render mode that a scene file may name: with a file that names none, the dilation of
+3DGS, as its own viewers draw it."""
+
+KINDS = ("color", "depth", "normals")
+"""Kinds of pictures that a film can show."""
+
+RANGE_CAMERAS = 8
+"""Cameras whose visible Gaussians give the color scale of a depth film."""
+
+Pose, Intrinsics = Float64[np.ndarray, "4 4"], Float64[np.ndarray, "3 3"]
+
+_jitted_fill_holes = jax.jit(fill_holes)
+
+
+@dataclasses.dataclass(frozen=True)
+class FilmOptions:
+    """A film: where it goes, and what it shows."""
+
+    steps: int  # spline: pictures from each camera to the next; orbit: pictures in all
+    path: str = "spline"  # or `orbit`
+    shows: tuple[str, ...] = ("color",)  # of `KINDS`; each becomes a file
+
+
+def render_run(
+    scene: Path,
+    path: str,
+    out: Path,
+    *,
+    size: tuple[int, int] | None,
+    stride: int,
+    max_views: int | None,
+    over_black: bool,
+    one_exposure: bool = False,
+    film: FilmOptions | None,
+    reporter: Reporter,
+) -> int:
+    """Writes `out`/views/<frame>.png for frames of a capture, and optionally `out`/film.mp4 and its like.
+
+    The scene is drawn with the filter that its file names, at the exposure of its file: the middle one of its stream.
+
+    Args:
+        scene: a scene file in the capture's frame, or the folder of a run.
+        path: the capture, as `open_capture` takes it; the cameras of a run that adjusted its poses have those.
+        out: folder of the results.
+        size: (width, height) of the pictures; by default the capture's own.
+        stride: every `stride`-th camera is used.
+        max_views: stop after this many pictures.
+        over_black: show holes black instead of in the colors around them.
+        one_exposure: show the scene at the exposure of the first streamed views; with `over_black` a picture of 8 bits
+            is then the image of the `literal` score.
+        film: the film along or around these cameras; None for no film.
+        reporter: shows progress.
+
+    Returns:
+        The number of pictures, without those of the film.
+
+    Raises:
+        InputError: the scene or the capture is unusable, the capture lies in `out`, `out` holds a run, a film is wanted
+            without PyAV, or one exposure of a scene whose run is unknown.
+        StorageError: `out` cannot be written, or adjusted poses of the scene's run are damaged.
+    """
+    require_positive(stride=stride, **({} if max_views is None else {"max_views": max_views}))
+    require_positive(**({} if film is None else {"film": film.steps}))
+    file = RunFolder(scene).scene if scene.is_dir() else scene
+    splats = read_scene(file)
+    if splats.render_mode not in ANTIALIAS:
+        fix = "render it where it was made"
+        raise refusal(str(file), wanted="3D Gaussians", got=f"a scene of {splats.render_mode}", fix=fix)
+    if one_exposure:
+        factors = jnp.asarray(1.0 / scene_exposure(scene), jnp.float32)
+        splats = dataclasses.replace(splats, gaussians=scale_colors(splats.gaussians, factors))
+    capture, folder = open_capture_of_scene(scene, path, size, reporter), RunFolder(out)
+    capture.check_output_folder(out)
+    folder.check_no_run()
+    indices = range(0, len(capture), stride)[:max_views]
+    size = (capture.width, capture.height)
+    writers = {kind: VideoWriter(*size) for kind in (film.shows if film else ())}
+    background = None if over_black else mean_color(splats.gaussians)
+    with lock_folder(out):
+        folder.clear_views()
+        for kind in KINDS:
+            folder.film(kind).unlink(missing_ok=True)
+        with reporter.progress("rendering", len(indices)) as advance:
+            for place, i in enumerate(indices, start=1):
+                color, _ = _render_picture(splats, capture.frames[i].camtoworld, capture.K(i), size, background)
+                save_image(folder.view(i), color)
+                advance(place)
+        if film is not None:
+            poses = np.stack([capture.frames[i].camtoworld for i in indices])
+            cameras = _film_cameras(poses, np.stack([capture.K(i) for i in indices]), film, splats, size)
+            depth_range = _depth_range(splats, cameras, size)
+            with reporter.progress("filming", len(cameras[0])) as advance:
+                for place, (pose, K) in enumerate(zip(*cameras, strict=True), start=1):
+                    color, depth = _render_picture(splats, pose, K, size, background)
+                    for kind, writer in writers.items():
+                        writer.add(_film_picture(kind, color, depth, K, depth_range))
+                    advance(place)
+            for kind, writer in writers.items():
+                writer.save(folder.film(kind))
+    return len(indices)
+
+
+def _render_picture(
+    splats: SplatFile, camtoworld: Pose, K: Intrinsics, size: tuple[int, int], background: jax.Array | None
+) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
+    """Color and depth (capture units, 0 where nothing is) of a scene from one camera of the capture's frame.
+
+    `background` is the color of holes that have no colors around them; None shows all holes black.
+    """
+    frame = StreamFrame.at_point(splats.offset)
+    camera = Camera(
+        viewmats=jnp.asarray(frame.viewmats(camtoworld)), Ks=jnp.asarray(K, jnp.float32), width=size[0], height=size[1]
+    )
+    effects = Effects(antialias=ANTIALIAS[splats.render_mode], outputs=("color", "alpha", "depth"))
+    out = render(splats.gaussians, camera, effects=effects)
+    color = out.color if background is None else _jitted_fill_holes(out.color, out.alpha, background)
+    return np.asarray(color), np.asarray(out.depth)
+
+
+def _film_cameras(
+    poses: Float64[np.ndarray, "n 4 4"],
+    Ks: Float64[np.ndarray, "n 3 3"],
+    film: FilmOptions,
+    splats: SplatFile,
+    size: tuple[int, int],
+) -> tuple[Float64[np.ndarray, "m 4 4"], Float64[np.ndarray, "m 3 3"]]:
+    """Poses and intrinsics of a film along, or around what is seen from, the cameras of a capture."""
+    if film.path == "spline":
+        return camera_path(poses, Ks, film.steps)
+    middle = len(poses) // 2
+    depths = _depths_seen(splats, poses[middle], Ks[middle], size)
+    return orbit_path(poses, Ks[middle], float(np.median(depths)) if len(depths) else 1.0, film.steps)
+
+
+def _film_picture(
+    kind: str,
+    color: Float[np.ndarray, "h w 3"],
+    depth: Float[np.ndarray, "h w"],
+    K: Intrinsics,
+    depth_range: tuple[float, float],
+) -> UInt8[np.ndarray, "h w 3"]:
+    if kind == "color":
+        return eight_bits(color)
+    return eight_bits(color_depth(depth, *depth_range) if kind == "depth" else color_normals(depth, K))
+
+
+def _depth_range(
+    splats: SplatFile, cameras: tuple[np.ndarray, np.ndarray], size: tuple[int, int]
+) -> tuple[float, float]:
+    """Nearest and farthest depth of a color scale that stays the same over a film, capture units."""
+    chosen = evenly_spread(len(cameras[0]), RANGE_CAMERAS)
+    return scale_ends(np.concatenate([_depths_seen(splats, cameras[0][k], cameras[1][k], size) for k in chosen]))
+
+
+def _depths_seen(
+    splats: SplatFile, camtoworld: Pose, K: Intrinsics, size: tuple[int, int]
+) -> Float64[np.ndarray, " n"]:
+    """Depths of the opaque Gaussians in an image, hidden ones included."""
+    means = np.asarray(splats.gaussians.means, np.float64)[np.asarray(splats.gaussians.opacities) > 0.5]
+    points = np.einsum("ji,nj->ni", camtoworld[:3, :3], means + np.asarray(splats.offset) - camtoworld[:3, 3])
+    points = points[np.isfinite(points).all(axis=1) & (points[:, 2] > 1e-6)]
+    pixels = np.einsum("ij,nj->ni", K, points)[:, :2] / points[:, 2:]
+    return points[((pixels >= 0) & (pixels <= size)).all(axis=1), 2]

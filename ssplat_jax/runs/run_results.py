@@ -1,0 +1,223 @@
+"""Results of a finished stream or evaluation: the scene, pictures, metrics, and the report, a page of all of it."""
+
+import dataclasses
+import json
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ssplat_jax.core.console import Reporter
+from ssplat_jax.evaluation.cost import peak_memory
+from ssplat_jax.evaluation.pictures import evenly_spread, save_comparison, save_contact_sheet
+from ssplat_jax.evaluation.report_page import Report, save_report
+from ssplat_jax.evaluation.scoring import exposures_to_json, score_view
+from ssplat_jax.runs.export_run import save_scene
+from ssplat_jax.runs.open_run import Run
+from ssplat_jax.scene_files.formats import ExportReport
+from ssplat_jax.storage.chunk_records import ChunkRecord, load_chunk_records
+from ssplat_jax.storage.files import write_json
+from ssplat_jax.storage.run_folder import RunFolder
+from ssplat_jax.storage.weights import load_params, params_digest
+from ssplat_jax.streaming.feed import middle_exposure
+
+NUM_PICTURES = 8
+"""Streamed views, evenly spread, that are rendered from the finished scene."""
+
+MOST_PICTURES, MOST_CHUNKS = 12, 10
+"""Pictures on a page and rows of its table; of more, evenly spread ones are shown."""
+
+NOTE = "Left to right: the photograph, the rendered view, its depth (light near, dark far)."
+SHOWN = "holes filled, at the exposure of the nearest streamed views"
+
+FILES = (
+    ("scene.ply", "the scene, in the frame and units of the capture, at the middle exposure of its views"),
+    ("refined.ply", "the refined scene"),
+    ("metrics.json", "every figure of this page, and more"),
+    ("contact_sheet.jpg", "the pictures on one sheet"),
+    ("views", "pictures of streamed views"),
+    ("chunks", "a record of every chunk: cameras, exposures, time, occupancy"),
+    ("deltas", "the changes of every chunk, for the viewer's time slider"),
+    ("state.npz", "the saved stream, from which a stopped run continues"),
+    ("split.json", "the frames that were streamed and scored"),
+    ("index.json", "the same frames as an index file"),
+)
+
+
+def finish_run(run: Run, path: str, reporter: Reporter) -> ExportReport:
+    """Writes the scene of a finished stream, pictures of some streamed views, the report, and the metrics.
+
+    Returns what was written to the scene file; `path` is the capture, as the user gave it.
+
+    Raises:
+        StorageError: a file cannot be written.
+    """
+    folder, frame, capture = run.folder, run.frame, run.capture
+    folder.metrics.unlink(missing_ok=True)  # see `finished_scene`
+    gaussians = run.session.gaussians()
+    report = save_scene(folder.scene, gaussians, frame, run.exposures)
+    if report.warning is not None:
+        reporter.warn(f"{folder.scene.name}: {report.warning}")
+    folder.clear_views()
+    shown, scores = shown_frames(run.indices), []
+    for i in shown:
+        view = score_view(gaussians, capture, i, frame, run.exposures)
+        scores.append(dataclasses.asdict(view.score))
+        save_comparison(folder.view(i), view.target, view.color, view.depth, (frame.near, frame.far))
+    metrics = {
+        "capture": capture.name,
+        "size": [capture.width, capture.height],
+        "views": run.num_views,
+        "exposures": exposures_to_json(run.exposures),
+        "scene_exposure": middle_exposure(run.exposures).tolist(),  # of scene.ply, relative to the first views
+        "seen_views": scores,  # of streamed views: how well the scene explains its input
+        "ply": dataclasses.asdict(report),
+        "compile_s": round(run.session.compile_seconds, 2),
+        "step_memory_bytes": run.session.step_memory_bytes,  # None if all views were streamed before this call
+        "peak_memory_bytes": peak_memory(run.session, capture.camera(shown[len(shown) // 2], frame)).bytes,
+        "cache": run.session.cache_facts(),
+        "stream_frame": frame.to_dict(),
+        "config_hash": run.session.model.config.hash,
+    }
+    is_shipped = run.weights == params_digest(load_params("tiny"))
+    report_run(folder, metrics, path, weights="" if is_shipped else " --weights WEIGHTS")
+    write_json(folder.metrics, metrics)
+    return report
+
+
+def shown_frames(indices: Sequence[int]) -> list[int]:
+    """A few of the frames, evenly spread."""
+    return [indices[k] for k in evenly_spread(len(indices), NUM_PICTURES)]
+
+
+def finished_scene(folder: RunFolder, num_views: int) -> int | None:
+    """Gaussians in the scene that a finished run of `num_views` views left in `folder`; None if there is no such run.
+
+    The metrics are written last: with them, everything is there.
+    """
+    if not (folder.scene.exists() and folder.metrics.exists()):
+        return None
+    try:
+        metrics = json.loads(folder.metrics.read_text())
+        return metrics["ply"]["num_written"] if metrics["views"] == num_views else None
+    except (ValueError, KeyError, TypeError):  # edited, or of another command: write it again
+        return None
+
+
+def report_run(folder: RunFolder, metrics: dict[str, Any], path: str, weights: str = "") -> None:
+    """Writes the report and the contact sheet of a run, whose folder is complete but for these.
+
+    Args:
+        folder: the folder of the run.
+        metrics: its metrics.
+        path: the capture, as the user gave it.
+        weights: text to add to commands that need the weights, such as ` --weights WEIGHTS`; empty for `tiny`.
+    """
+    records, scores = load_chunk_records(folder.chunk_record_files()), metrics["seen_views"]
+    width, height = metrics["size"]
+    shown = np.mean([score["shown"]["psnr"] for score in scores])
+    facts = [
+        ("views streamed", f"{metrics['views']}"),
+        ("Gaussians in the scene", f"{metrics['ply']['num_written']:,}"),
+        (f"streamed views as shown, mean of {len(scores)}", f"{shown:.2f} dB"),
+    ]
+    if records:
+        facts.append(("a chunk, median", f"{np.median([r.seconds for r in records]):.2f} s"))
+        facts.append(("of the cache in use", f"{records[-1].occupancy:.0%}"))
+    if held_back := [r.held_back_psnr for r in records if r.held_back_psnr is not None]:
+        facts.append(("held-back views as shown", f"{held_back[-1]:.2f} dB"))
+    out, capture, film = map(shlex.quote, (str(folder.path), path, f"{folder.path}_film"))
+    commands = [
+        f"ssplat view {out}    # in a browser",
+        f"ssplat refine {out} {capture} --steps 100{weights}    # changes the scene until it fits its views better",
+        f"ssplat render {out} {capture} --size {width}x{height} --film 8 --out {film}    # a film",
+        f"ssplat export {out} --to scene.sog{weights}    # for other viewers, at an eighth of the size",
+    ]
+    _save(
+        folder,
+        metrics,
+        [(folder.view(score["frame"]), _caption(score, "streamed")) for score in scores],
+        summary=f"A scene of 3D Gaussians from {metrics['views']} views of {width} x {height} pixels, streamed once.",
+        facts=facts,
+        pictures_note=f"{NOTE} Scores of views that the scene was made from, {SHOWN}.",
+        stream=_stream_rows(records),
+        commands=commands,
+    )
+
+
+def report_eval(folder: RunFolder, metrics: dict[str, Any]) -> None:
+    """Writes the report and the contact sheet of an evaluation, whose folder is complete but for these."""
+    shown, literal = metrics["shown"], metrics["literal"]
+    facts = [
+        ("PSNR as shown", f"{shown['psnr']:.2f} dB"),
+        ("SSIM as shown", f"{shown['ssim']:.3f}"),
+        ("PSNR, literal", f"{literal['psnr']:.2f} dB"),
+        ("PSNR of copying the nearest view", f"{metrics['baselines']['nearest_view_psnr']:.2f} dB"),
+        ("a chunk, median", f"{metrics['chunk_ms']['median']:.0f} ms"),
+        ("Gaussians in the scene", f"{metrics['num_gaussians']:,}"),
+    ]
+    if refined := metrics.get("refinement"):
+        facts.append(("PSNR as shown, before refinement", f"{refined['before']['shown']['psnr']:.2f} dB"))
+    _save(
+        folder,
+        metrics,
+        [(folder.target(score["frame"]), _caption(score, "unseen")) for score in metrics["per_view"]],
+        summary=f"{metrics['target_views']} views that were never streamed, rendered from a scene of"
+        f" {metrics['context_views']} other views.",
+        facts=facts,
+        pictures_note=f"{NOTE} Shown: {SHOWN}. Literal: over black, at the exposure of the first views.",
+        details=[("protocol", metrics["protocol"])],
+    )
+
+
+def _save(folder: RunFolder, metrics: dict[str, Any], pictures: list[tuple[Path, str]], **parts: Any) -> None:
+    """Writes a page with these pictures and further parts, and its contact sheet."""
+    save_contact_sheet(folder.contact_sheet, pictures)
+    report = Report(
+        title=metrics["capture"],
+        pictures=[pictures[k] for k in evenly_spread(len(pictures), MOST_PICTURES)],
+        # A run writes its metrics after the report: with them, everything is there.
+        files=[(name, text) for name, text in FILES if name == folder.metrics.name or (folder.path / name).exists()],
+        details=[*parts.pop("details", ()), *_details(metrics)],
+        **parts,
+    )
+    save_report(folder.report, report)
+
+
+def _stream_rows(records: Sequence[ChunkRecord]) -> list[tuple[str, ...]]:
+    """Time, occupancy, scene size and held-back score over the views streamed, below a header; empty without chunks."""
+    rows = [("views", "time of a chunk", "cache in use", "Gaussians", "held-back views as shown", "exposure (RGB)")]
+    for k in evenly_spread(len(records), MOST_CHUNKS):
+        r = records[k]
+        psnr = "" if r.held_back_psnr is None else f"{r.held_back_psnr:.2f} dB"
+        exposure = " ".join(f"{factor:.2f}" for factor in np.mean([view.exposure for view in r.views], axis=0))
+        figures = (f"{r.num_views}", f"{r.seconds:.2f} s", f"{r.occupancy:.0%}", f"{r.num_gaussians:,}")
+        rows.append((*figures, psnr, exposure))
+    return rows if records else []
+
+
+def _caption(score: dict[str, Any], kind: str) -> str:
+    """Frame and scores of a picture."""
+    shown, literal = score["shown"], score["literal"]
+    return (
+        f"{kind} frame {score['frame']} · shown {shown['psnr']:.2f} dB, SSIM {shown['ssim']:.3f}"
+        f" · literal {literal['psnr']:.2f} dB"
+    )
+
+
+def _details(metrics: dict[str, Any]) -> list[tuple[str, str]]:
+    """Facts for those who look closer."""
+    cache, frame = metrics["cache"], metrics["stream_frame"]
+    rows = [
+        ("size", " x ".join(map(str, metrics["size"]))),
+        ("voxels", f"{cache['voxels']:,} of {cache['capacity']:,}"),
+        ("tokens accepted", f"{cache['accepted_fraction']:.1%}"),
+        ("near and far", f"{frame['near'] / frame['scale']:.4g} and {frame['far'] / frame['scale']:.4g} capture units"),
+        ("compiling", f"{metrics['compile_s']:.1f} s"),
+        ("configuration", metrics["config_hash"]),
+    ]
+    if frame.get("warning"):
+        rows.append(("warning", frame["warning"]))
+    return rows

@@ -1,0 +1,264 @@
+"""`ssplat run`: stops and resumes to the same bytes, refuses what does not belong to it, and is exported as it is."""
+
+import dataclasses
+import functools
+import json
+import re
+import shutil
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from PIL import Image
+
+from ssplat_jax.commands.run_command import Run
+from ssplat_jax.config import QUALITIES, StreamConfig
+from ssplat_jax.core.atomic import previous_path
+from ssplat_jax.core.gaussians import scale_colors
+from ssplat_jax.data.open_capture import open_capture
+from ssplat_jax.model.streamsplat import StreamSplat
+from ssplat_jax.runs.capture_run import CHUNKS_PER_SCORE, RunResult, hold_back
+from ssplat_jax.scene_files.formats import load_scene, save_gaussians
+from ssplat_jax.storage.chunk_records import (
+    load_chunk_records,
+    load_delta,
+    load_delta_header,
+    open_thumbnail,
+    save_chunk_record,
+)
+from ssplat_jax.storage.files import write_json
+from ssplat_jax.storage.run_folder import RunFolder
+from ssplat_jax.storage.saved_states import load_state
+from ssplat_jax.storage.weights import load_weights
+from ssplat_jax.streaming.scene_delta import apply_delta
+from tests.commands.command_fixture import SIZE, edit, make_capture, read, run
+from tests.runs.report_fixture import record
+
+
+@pytest.fixture(scope="module")
+def finished(narrow, tmp_path_factory):
+    """A capture of 12 frames and the folder of its run, saved after every chunk, with deltas."""
+    folder = tmp_path_factory.mktemp("finished")
+    capture, out = make_capture(folder / "capture", num_frames=12, size=SIZE), folder / "run"
+    (out / "deltas").mkdir(parents=True)
+    (out / "deltas" / "000003.npz").write_bytes(b"of a run that was stopped before its first save")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("ssplat_jax.streaming.session.MIN_DECODED_PIVOTS", 1 << 11)
+        assert run("run", capture, "--out", out, "--save-every", 1, "--deltas", *narrow) == 0
+    return folder
+
+
+@pytest.fixture
+def copied(finished, tmp_path):
+    """Capture and folder of a finished run, to be changed."""
+    shutil.copytree(finished, tmp_path / "held")
+    return tmp_path / "held" / "capture", tmp_path / "held" / "run"
+
+
+def contents(folder):
+    return {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in folder.rglob("*.*")}
+
+
+def assert_deltas_give_the_scene(out, narrow, *names):
+    """The changes of every chunk, put together, against the final state decoded at once."""
+    files = sorted((out / "deltas").iterdir())
+    assert [path.name for path in files] == list(names)
+    told = functools.reduce(apply_delta, map(load_delta, files), None)
+    cache, header = load_state(out / "state.npz")
+    exposure = np.exp(np.median(np.log(list(header["exposures"].values())), axis=0)).tolist()
+    told_header = load_delta_header(files[-1])
+    assert told_header.pop("exposure") == pytest.approx(exposure)
+    assert told_header == {"frame": header["frame"], "views": header["done"]}
+    model, params = StreamSplat(StreamConfig.from_dict(header["config"])), load_weights(narrow[1])[0]
+    scene = jax.jit(model.decode)(params, cache)
+    assert 0 < (told.opacities > 0).sum() == (np.asarray(scene.opacities) > 0).sum()
+    for field in dataclasses.fields(scene):
+        np.testing.assert_allclose(getattr(told, field.name), getattr(scene, field.name), rtol=1e-5, atol=1e-5)
+
+
+def test_a_run_writes_scene_state_metrics_and_the_changes_of_every_chunk(finished, narrow):
+    out, metrics = finished / "run", read(finished / "run" / "metrics.json")
+    assert {"scene.ply", "state.npz", "metrics.json", "report.html", "views"} <= {p.name for p in out.iterdir()}
+    assert_deltas_give_the_scene(out, narrow, "000004.npz", "000008.npz", "000012.npz")
+    assert metrics["cache"]["num_chunks"] == 3 and list(metrics["exposures"]) == [str(i) for i in range(12)]
+    assert metrics["peak_memory_bytes"] >= metrics["step_memory_bytes"] > 0 and metrics["compile_s"] > 0
+    assert (out / "report.html").read_text().count("--weights WEIGHTS") == 2  # not the shipped ones
+
+
+def test_an_export_is_the_scene_of_the_run(finished, narrow, tmp_path, capsys):
+    out, weights = finished / "run", narrow[:2]
+    assert run("export", out, "--to", tmp_path / "again.ply", *weights) == 0
+    # Rows of padding, which fill the arrays up to a power of two, are no Gaussians that were left out.
+    counts = [int(word) for word in re.findall(r"\d+", capsys.readouterr().out.split("again.ply")[1])]
+    assert sum(counts) == read(out / "metrics.json")["cache"]["decoded"]
+    assert (tmp_path / "again.ply").read_bytes() == (out / "scene.ply").read_bytes()
+    assert run("export", out, "--to", tmp_path / "wrong.ply") == 2
+    assert "other weights" in capsys.readouterr().err and not (tmp_path / "wrong.ply").exists()
+
+
+def test_a_finished_run_is_not_streamed_twice(copied, narrow, capsys):
+    capture, out = copied
+    shutil.rmtree(out / "deltas")  # asked for only now, they begin with the whole scene
+    assert run("run", capture, "--out", out, "--deltas", *narrow) == 0
+    assert_deltas_give_the_scene(out, narrow, "000012.npz")
+    before = contents(out)
+    with pytest.MonkeyPatch.context() as patch:  # nothing of it is computed or written again
+        patch.setattr("ssplat_jax.runs.capture_run.finish_run", None)
+        patch.setattr("ssplat_jax.streaming.session.Session.gaussians", None)
+        capsys.readouterr()
+        assert run("run", capture, "--out", out, *narrow) == 0
+    assert capsys.readouterr().out.startswith(f"{out} holds this run, finished: scene.ply (")
+    assert contents(out) == before
+    (out / "metrics.json").unlink()  # stopped while it wrote its results, it writes them when it goes on
+    assert run("run", capture, "--out", out, *narrow) == 0
+    assert capsys.readouterr().out.startswith("wrote ") and (out / "metrics.json").exists()
+
+
+def test_a_stopped_run_continues_to_the_same_bytes(copied, finished, narrow):
+    capture, out = copied
+    folder = RunFolder(out)
+    shutil.copy(previous_path(folder.state), folder.state)
+    save_chunk_record(folder.chunk_record(40), record(40))  # of a process that was killed after its last save
+    folder.delta(40).touch()
+    assert run("run", capture, "--out", out, *narrow) == 0
+    for name in ("scene.ply", "state.npz"):
+        assert (out / name).read_bytes() == (finished / "run" / name).read_bytes()
+    assert [path.stem for path in folder.chunk_record_files()] == ["000004", "000008", "000012"]
+    assert not folder.has_deltas()  # without those of the last chunk, they would not add up to the scene
+
+
+def test_another_run_is_refused(copied, narrow, tmp_path, capsys):
+    capture, out = copied
+    for changes, difference in (
+        (("--set", "voxel_size=0.1"), "differs in its config (memory.voxel_size: 0.04 there, 0.1 now)"),
+        (("--stride", "2"), "differs in its frames (12 from [0, 1] on there, 6 from [0, 2] on now)"),
+        (("--size", "32x24"), "differs in its size ([64, 48] there, [32, 24] now)"),
+        (("--quality", "fast"), "differs in its size ([64, 48] there, [32, 24] now)"),
+    ):
+        assert run("run", capture, "--out", out, *changes, *narrow) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert difference in line and "--overwrite" in line
+    assert run("run", capture, "--out", out, "--quiet", "--set", "capacity=1024") == 2
+    assert "differs in its config" in capsys.readouterr().err
+    images = capture / "images"
+    kept = (images / "5.png").read_bytes()
+    (images / "5.png").write_bytes((images / "4.png").read_bytes())
+    assert run("run", capture, "--out", out, *narrow) == 2
+    assert "differs in its images (5: " in capsys.readouterr().err
+    (images / "5.png").write_bytes(kept)
+    edit("transform_matrix", np.eye(4).tolist())(capture)  # a corrected pose
+    assert run("run", capture, "--out", out, *narrow) == 2
+    assert "differs in its poses" in capsys.readouterr().err
+
+
+def test_a_damaged_image_stops_the_stream_with_what_came_before_it_saved(finished, narrow, tmp_path, capsys):
+    capture, out = tmp_path / "capture", tmp_path / "out"
+    shutil.copytree(finished / "capture", capture)
+    image = capture / "images" / "9.png"
+    whole = image.read_bytes()
+    image.write_bytes(whole[:200])
+    # The estimate of depths decodes a few images, and would find it before the stream.
+    with pytest.MonkeyPatch.context() as patch:
+        frame = open_capture(finished / "capture").stream_frame(load_weights(narrow[1])[1])
+        patch.setattr("ssplat_jax.data.capture.Capture.stream_frame", lambda *given: frame)
+        assert run("run", capture, "--out", out, "--causal", *narrow) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "9.png" in line and "8 views are saved; mend it" in line
+    assert load_state(out / "state.npz")[1]["done"] == 8 and not (out / "scene.ply").exists()
+    image.write_bytes(whole)
+    assert run("run", capture, "--out", out, "--causal", *narrow) == 0
+    assert read(out / "metrics.json")["views"] == 12
+
+
+def test_a_run_records_its_chunks_and_scores_what_it_holds_back(narrow, tmp_path, capsys):
+    path, out = make_capture(tmp_path / "capture", num_frames=11), tmp_path / "out"
+    assert run("run", path, "--out", out, "--hold-back", "2", *narrow) == 0
+    capture, folder = open_capture(path), RunFolder(out)
+    records = load_chunk_records(folder.chunk_record_files())
+    assert [r.num_views for r in records] == [4, 8, 9]
+    streamed, _ = hold_back(range(11), 2)
+    views = [view for r in records for view in r.views]
+    assert sorted(view.frame for view in views) == streamed
+    metrics = read(folder.metrics)
+    for view in views:
+        np.testing.assert_array_equal(view.camtoworld, capture.frames[view.frame].camtoworld)
+        np.testing.assert_array_equal(view.K, capture.K(view.frame))
+        np.testing.assert_allclose(view.exposure, metrics["exposures"][str(view.frame)])
+        assert np.abs(open_thumbnail(view.thumbnail) / 255 - capture.image(view.frame)).mean() < 0.1  # JPEG of noise
+    assert records[-1].num_gaussians == metrics["cache"]["decoded"]
+    assert 0 < records[0].occupancy <= records[-1].occupancy <= 1 and all(r.seconds > 0 for r in records)
+    scored = [r.held_back_psnr is not None for r in records]
+    assert CHUNKS_PER_SCORE == 4 and scored == [True, False, True]
+    assert f"{records[-1].held_back_psnr:.2f} dB" in folder.report.read_text()
+
+
+def test_held_back_frames_are_spread_and_the_others_stay_in_order():
+    streamed, held = hold_back(range(0, 40, 2), 3)
+    assert held == [6, 20, 32] and streamed == [i for i in range(0, 40, 2) if i not in held]
+    assert hold_back([4, 5, 6], 0) == ([4, 5, 6], []) and hold_back([4, 5, 6], 1) == ([4, 6], [5])
+    for count in range(1, 19):
+        assert len(hold_back(range(20), count)[1]) == count
+
+
+def test_refinement_follows_with_the_steps_of_the_quality(tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr("ssplat_jax.commands.run_command.Refine.run", lambda command: asked.append(command) or 0)
+    monkeypatch.setattr("ssplat_jax.runs.capture_run.run_capture", lambda *given: RunResult(4, 1))
+    assert Run("procedural:room", tmp_path, quality="best", quiet=True).run() == 0
+    # A refinement that is stopped says how it continues: without the flag, which would start the run anew.
+    assert Run("procedural:room", tmp_path, quality="best", refine=30, overwrite=True, quiet=True).run() == 0
+    assert Run("procedural:room", tmp_path, quiet=True).run() == 0
+    assert [(c.folder, c.steps, c.overwrite) for c in asked] == [(tmp_path, 100, False), (tmp_path, 30, True)]
+    assert QUALITIES["best"].scale == 1.0 and Run("x", tmp_path, quality="fast").scale == 0.5
+
+
+def test_over_black_at_one_exposure_a_picture_is_the_literal_image(copied, tmp_path, capsys):
+    """The scene is stored at another exposure than that of its first views, which these flags show."""
+    capture, out = copied
+    metrics, middle = read(out / "metrics.json"), [0.5, 0.8, 1.6]
+    factors = jnp.asarray(np.array(middle) / metrics["scene_exposure"], jnp.float32)
+    save_gaussians(out / "scene.ply", scale_colors(load_scene(out / "scene.ply"), factors))
+    write_json(out / "metrics.json", metrics | {"scene_exposure": middle})
+    flags, pictures = ("--over-black", "--one-exposure", "--quiet"), tmp_path / "pictures"
+    assert run("render", out, capture, *flags, "--out", pictures) == 0
+    for score in metrics["seen_views"]:
+        i = score["frame"]
+        files = pictures / "views" / f"{i:05d}.png", capture / "images" / f"{i}.png"
+        found, target = (np.asarray(Image.open(file).convert("RGB"), np.float64) / 255 for file in files)
+        psnr = -10 * np.log10(np.mean((found - target) ** 2))
+        assert psnr == pytest.approx(score["literal"]["psnr"], abs=0.05)  # 8 bits
+    shutil.copy(out / "scene.ply", tmp_path / "scene.ply")
+    assert run("render", tmp_path / "scene.ply", capture, *flags, "--out", tmp_path / "p") == 2
+    assert "--one-exposure: wanted the exposure" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_run_refine_equals_run_then_refine(tmp_path, capsys):
+    capture, size = "procedural:room?frames=4", ("--size", "64x48")
+    one, two = (tmp_path / name for name in ("one", "two"))
+    assert run("run", capture, "--out", one, *size, "--refine", "2", "--quiet") == 0
+    assert "refined.ply: 2 steps" in capsys.readouterr().out
+    assert run("run", capture, "--out", two, *size, "--quiet") == 0
+    assert run("refine", two, capture, "--steps", "2", "--quiet") == 0
+    for name in ("scene.ply", "refined.ply"):
+        assert (one / name).read_bytes() == (two / name).read_bytes()
+
+
+@pytest.mark.slow  # streaming/test_causal.py has the law
+def test_a_replaced_future_changes_no_earlier_output(narrow, tmp_path):
+    written = []
+    for name in ("here", "there"):
+        capture, out = make_capture(tmp_path / name / "capture", num_frames=12, size=SIZE), tmp_path / name / "out"
+        if name == "there":
+            facts = read(capture / "transforms.json")
+            for entry in facts["frames"][8:]:
+                entry["transform_matrix"][0][3] += 50.0
+                shutil.copy(capture / "images" / "0.png", capture / entry["file_path"])
+            (capture / "transforms.json").write_text(json.dumps(facts))
+        assert run("run", capture, "--causal", "--out", out, "--deltas", "--save-every", "1", *narrow) == 0
+        written.append({path.name: path.read_bytes() for path in sorted((out / "deltas").glob("*.npz"))})
+    here, there = written
+    assert list(here) == list(there) == ["000004.npz", "000008.npz", "000012.npz"]
+    assert here["000004.npz"] == there["000004.npz"] and here["000008.npz"] == there["000008.npz"]
+    assert here["000012.npz"] != there["000012.npz"]

@@ -1,0 +1,234 @@
+"""A run folder: damaged states, what identifies a run, and poses that are adjusted once, then used everywhere."""
+
+import contextlib
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ssplat_jax.config import preset
+from ssplat_jax.core.atomic import previous_path
+from ssplat_jax.core.console import Reporter
+from ssplat_jax.core.errors import InputError, StorageError
+from ssplat_jax.core.pytree import replace
+from ssplat_jax.data.open_capture import open_capture
+from ssplat_jax.model.streamsplat import StreamSplat
+from ssplat_jax.poses import adjust_poses as adjusting
+from ssplat_jax.runs import render_run
+from ssplat_jax.runs.capture_run import RunOptions, WholeCapture
+from ssplat_jax.runs.open_run import check_identity, load_run, open_run
+from ssplat_jax.runs.run_poses import capture_to_stream, load_poses, open_capture_of_scene, with_poses_of_run
+from ssplat_jax.scene_files.formats import save_ply
+from ssplat_jax.storage.chunk_records import load_chunk_records, save_chunk_record
+from ssplat_jax.storage.run_folder import RunFolder
+from ssplat_jax.storage.weights import load_params
+from tests.runs.report_fixture import record
+from tests.scene_files.scene_fixture import scene
+
+CAPTURE, SIZE = "procedural:room?frames=8", (64, 48)
+QUIET = Reporter(quiet=True)
+CONFIG = preset("tiny").replace(capacity=256)
+SHIFT = np.array([0.01, 0.0, 0.02])
+
+
+@pytest.fixture(scope="module")
+def capture():
+    return open_capture(CAPTURE, size=SIZE)
+
+
+def opened(capture, out, reporter=QUIET, **options):
+    return open_run(StreamSplat(CONFIG), load_params("tiny"), capture, range(8), out, reporter=reporter, **options)
+
+
+def save_views(run, count):
+    """Saves the run as after `count` views, which fill as many voxels."""
+    cache = run.session.model.init_cache()
+    run.session.cache = replace(cache, num_voxels=jnp.int32(count), voxels=cache.voxels.at[:count].set(count))
+    run.exposures = {i: np.full(3, 0.5, np.float32) for i in range(count)}
+    run.images = {str(i): run.capture.images_digest([i]) for i in range(count)}
+    run.save()
+
+
+def test_a_damaged_state_is_kept_aside_and_the_one_before_takes_its_place(capture, tmp_path, capsys):
+    with opened(capture, tmp_path) as run:
+        assert run.num_views == 0
+        for count in (4, 8):
+            save_views(run, count)
+    folder = RunFolder(tmp_path)
+    good, damaged = previous_path(folder.state).read_bytes(), folder.state.read_bytes()[:-7]
+    folder.state.write_bytes(damaged)
+    assert load_run(tmp_path, QUIET).header["done"] == 4
+    capsys.readouterr()
+    with opened(capture, tmp_path, Reporter()) as run:
+        assert "after 4 views" in " ".join(capsys.readouterr().err.split())
+        assert run.num_views == run.num_saved == 4 and int(run.session.cache.num_voxels) == 4
+    aside = folder.state.with_name(folder.state.name + ".damaged")
+    held = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    assert held == {folder.state.name: good, aside.name: damaged}
+
+
+@pytest.mark.parametrize("has_previous", [False, True])
+def test_no_readable_state_suggests_overwrite(has_previous, capture, tmp_path):
+    folder = RunFolder(tmp_path)
+    folder.state.write_bytes(b"PK damaged")
+    if has_previous:
+        previous_path(folder.state).write_bytes(b"damaged too")
+    before = sorted(path.name for path in tmp_path.iterdir())
+    with pytest.raises(StorageError, match=r"state\.npz.*--overwrite"), opened(capture, tmp_path):
+        pass
+    assert sorted(path.name for path in tmp_path.iterdir()) == before
+    with opened(capture, tmp_path, overwrite=True):
+        assert not any(tmp_path.iterdir())
+
+
+def test_capacity_matters_only_if_tokens_may_be_dropped(tmp_path):
+    def identity(**changes):
+        return {"config": preset("tiny").replace(**changes).to_dict()}
+
+    check_identity(identity(capacity=1024), identity(capacity=4096), RunFolder(tmp_path))
+    held = identity(overflow="drop_new", capacity=1024)
+    with pytest.raises(InputError, match=r"config \(memory.capacity: 1024 there, 4096 now\)"):
+        check_identity(held, identity(overflow="drop_new", capacity=4096), RunFolder(tmp_path))
+
+
+@pytest.mark.parametrize("scale", [0.5, 0.75, 1.0])
+def test_a_procedural_run_opens_what_refinement_will_open(scale):
+    """The cameras and images are the same, whatever size is streamed."""
+    streamed = WholeCapture(CAPTURE, RunOptions(scale=scale)).capture
+    again = open_capture(CAPTURE, size=(streamed.width, streamed.height))
+    assert streamed.digest(range(8)) == again.digest(range(8))
+
+
+def moved(capture, indices, advance=None, are_off=True, num_points=500):
+    """An adjustment that moves every frame by the same shift."""
+    frames = list(capture.frames)
+    for i in indices:
+        pose = frames[i].camtoworld.copy()
+        pose[:3, 3] += SHIFT
+        frames[i] = dataclasses.replace(frames[i], camtoworld=pose)
+    capture = dataclasses.replace(capture, frames=tuple(frames))
+    return adjusting.AdjustedPoses(capture, are_off, 0.5, 0.1, 0.4, 0.01, num_points)
+
+
+@contextlib.contextmanager
+def adjustment(**facts):
+    """Poses are adjusted with these facts; `None` for none at all."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(adjusting, "adjust_poses", lambda *given: moved(*given, **facts))
+        yield
+
+
+@contextlib.contextmanager
+def no_adjustment():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(adjusting, "adjust_poses", None)
+        yield
+
+
+@pytest.fixture
+def adjusted(capture, tmp_path):
+    """Folder of a run that has begun with adjusted poses."""
+    with adjustment(), opened(capture, tmp_path / "run", revise="poses") as run:
+        save_views(run, 8)
+    return tmp_path / "run"
+
+
+def test_all_that_follows_sees_the_adjusted_poses(adjusted, capture, capsys):
+    wanted = moved(capture, range(8)).capture.camtoworlds
+    with no_adjustment(), opened(capture, adjusted, revise="poses") as run:
+        np.testing.assert_array_equal(run.capture.camtoworlds, wanted)
+    with pytest.raises(InputError, match="differs in its poses"), opened(capture, adjusted):
+        pass
+    path = f"{CAPTURE}&size={SIZE[0]}x{SIZE[1]}"
+    np.testing.assert_array_equal(load_run(adjusted, QUIET).open_capture(CAPTURE).camtoworlds, wanted)
+    for place in (adjusted, adjusted / "scene.ply"):
+        np.testing.assert_array_equal(open_capture_of_scene(place, path, None, QUIET).camtoworlds, wanted)
+    capsys.readouterr()
+    for other in ("procedural:corridor?frames=8", "procedural:room?frames=3"):  # it has its own poses
+        found = open_capture_of_scene(adjusted, other, SIZE, QUIET)
+        np.testing.assert_array_equal(found.camtoworlds, open_capture(other, size=SIZE).camtoworlds)
+        assert "adjusted_poses.npz is of another capture" in capsys.readouterr().err
+        with pytest.raises(InputError, match="wanted the capture of the run"):
+            load_run(adjusted, QUIET).open_capture(other)
+
+
+def test_pictures_of_a_run_have_its_adjusted_poses(adjusted, capture, tmp_path, monkeypatch):
+    drawn = []
+
+    def draw(splats, camtoworld, *given):
+        drawn.append(camtoworld)
+        return np.zeros((SIZE[1], SIZE[0], 3)), np.zeros((SIZE[1], SIZE[0]))
+
+    monkeypatch.setattr(render_run, "_render_picture", draw)
+    save_ply(RunFolder(adjusted).scene, scene(0))
+    options = {"size": SIZE, "stride": 1, "max_views": None, "over_black": False, "film": None, "reporter": QUIET}
+    render_run.render_run(adjusted, CAPTURE, tmp_path / "out", **options)
+    np.testing.assert_array_equal(drawn, moved(capture, range(8)).capture.camtoworlds)
+
+
+def test_files_of_others_are_neither_records_nor_deltas(tmp_path):
+    folder = RunFolder(tmp_path)
+    for k in (4, 8):
+        save_chunk_record(folder.chunk_record(k), record(k))
+    folder.deltas.mkdir()
+    for name in ("notes.json", "._000004.json", "0000041.json"):  # of the user, or of another system
+        (folder.chunk_records / name).write_text("{}")
+        (folder.deltas / name).with_suffix(".npz").write_bytes(b"")
+    assert not folder.has_deltas()
+    assert [r.num_views for r in load_chunk_records(folder.chunk_record_files())] == [4, 8]
+    folder.chunk_record(8).write_text("[]")  # up to a damaged one
+    assert [r.num_views for r in load_chunk_records(folder.chunk_record_files())] == [4]
+
+
+def test_a_run_that_began_with_given_poses_takes_no_adjusted_ones(capture, tmp_path):
+    folder = RunFolder(tmp_path)
+    folder.state.write_bytes(b"of a run that began without")
+    for revise in ("poses", "auto"):
+        with no_adjustment(), pytest.raises(InputError, match=f"--revise {revise}: wanted a run that began with it"):
+            capture_to_stream(capture, range(4), revise, folder, QUIET)
+    assert capture_to_stream(capture, range(4), None, folder, QUIET) is capture
+    folder.state.unlink()
+    with adjustment(are_off=False):  # given poses that fit are no adjusted ones
+        capture_to_stream(capture, range(4), "auto", folder, QUIET)
+    folder.state.write_bytes(b"of the run")
+    with no_adjustment(), pytest.raises(InputError, match="--revise poses: wanted a run that began with it"):
+        capture_to_stream(capture, range(4), "poses", folder, QUIET)
+    with no_adjustment():  # they are not judged twice
+        assert capture_to_stream(capture, range(4), "auto", folder, QUIET).frames == capture.frames
+
+
+def test_a_run_whose_poses_could_not_be_adjusted_goes_on(capture, tmp_path):
+    folder = RunFolder(tmp_path)
+    for state in (None, b"of the run"):
+        if state:
+            folder.state.write_bytes(state)
+        with adjustment(num_points=0):
+            assert capture_to_stream(capture, range(4), "poses", folder, QUIET).frames == capture.frames
+
+
+@pytest.mark.parametrize(
+    ("earlier", "indices", "asked"),
+    [(CAPTURE, (0, 2), "poses"), ("procedural:corridor?frames=8", range(4), "poses"), (CAPTURE, range(4), "auto")],
+)
+def test_poses_that_a_stopped_run_left_for_another_stream_are_found_anew(earlier, indices, asked, capture, tmp_path):
+    folder = RunFolder(tmp_path)
+    with adjustment(are_off=False):
+        capture_to_stream(open_capture(earlier, size=SIZE), indices, asked, folder, QUIET)
+    with adjustment():
+        streamed = capture_to_stream(capture, range(4), "poses", folder, QUIET)
+    np.testing.assert_array_equal(streamed.camtoworlds, moved(capture, range(4)).capture.camtoworlds)
+    assert capture_to_stream(capture, range(4), None, folder, QUIET) is capture
+    assert not folder.adjusted_poses.exists()  # no later command takes them for those of the run
+
+
+def test_damaged_poses_are_named(capture, tmp_path):
+    folder = RunFolder(tmp_path)
+    folder.adjusted_poses.write_text("{")
+    with pytest.raises(StorageError, match=r"adjusted_poses\.npz: the file is corrupt"):
+        with_poses_of_run(capture, folder)
+    folder.state.write_bytes(b"of the run")
+    assert capture_to_stream(capture, range(4), None, folder, QUIET) is capture
+    assert folder.adjusted_poses.exists()  # what belongs to a run stays
+    folder.clear_run()
+    assert load_poses(folder) is None
