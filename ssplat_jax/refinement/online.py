@@ -57,6 +57,7 @@ def refine_scene(model: StreamSplat, params: dict, cache: VoxelCache, chunk: Chu
     that deltas report it.
     """
     config = model.config
+    assert cache.key_views is not None  # a `Session` has added them before the step
     arrivals = replace(KeyViews.of(chunk.camera, chunk.images, output.exposures), valid=chunk.valid)
     kept = keep_views(cache.key_views, arrivals, depth=MEDIAN_DEPTH)
     views = views_of_round(cache.key_views, arrivals, cache.stats.num_chunks, config.stream.steps_per_chunk)

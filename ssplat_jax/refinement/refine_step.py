@@ -65,7 +65,7 @@ def init_refinement(gaussians: Gaussians, config: RefineConfig | None = None) ->
     return RefineState(
         start=jax.tree.map(jnp.copy, gaussians),  # the step consumes its state; the caller's arrays stay
         change=no_change(gaussians),
-        adam=ADAM.init(no_change(gaussians)),
+        adam=ADAM.init(no_change(gaussians)),  # pyright: ignore[reportArgumentType]
         num_steps=jnp.zeros((), jnp.int32),
         num_skipped=jnp.zeros((), jnp.int32),
     )
@@ -138,7 +138,7 @@ def _moved(state: RefineState, gradient: Change, loss: Float[Array, ""], rate: F
     for leaf in jax.tree.leaves(gradient):
         is_finite &= jnp.all(jnp.isfinite(leaf))
     with jax.numpy_dtype_promotion("standard"):  # optax takes a float to the power of an integer
-        direction, adam = ADAM.update(gradient, state.adam)
+        direction, adam = ADAM.update(gradient, state.adam)  # pyright: ignore[reportArgumentType]
     is_constant = (jnp.arange(state.change.sh.shape[1]) == 0)[:, None]
     factors = units(state.start) | {"sh": jnp.where(is_constant, 1.0, HIGHER_BANDS) / SH_C0}
     moved = {
