@@ -40,6 +40,7 @@ def measure_latency(session: Session, chunks: list[Chunk], camera: Camera) -> di
     """
     totals, steps, renders = [], [], []
     cache, config = session.cache, session.model.config
+    assert cache is not None  # it has taken in the stream
     # Growing happens a few times in a stream's life and is not part of a chunk's cost.
     grown = ensure_capacity(cache, config, tokens_per_chunk(chunks[0], config.network.size_multiple))
     for chunk in chunks:

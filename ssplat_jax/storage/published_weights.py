@@ -122,7 +122,7 @@ def import_params(path: Path, config: StreamConfig, *, depth_only: bool = False)
     incomplete = {place.partition("/")[0] for place, t in by_place.items() if t is None or t.name not in usable}
     fresh = init_params(jax.random.key(0), config, incomplete)
 
-    def parameter(keys, _) -> jax.Array:
+    def parameter(keys, _):
         tensor = by_place["/".join(k.key for k in keys)]
         if tensor is not None and tensor.name in usable:
             return jnp.asarray(tensor.to_parameter(found[tensor.name]))

@@ -114,7 +114,8 @@ def stage_turns(params: dict, facts: WeightsFacts) -> dict[str, float]:
     """
     start: dict = {}
     for training in trainings(facts.provenance):
-        seed = (training.get("recipe") or {}).get("seed", 0)
+        recipe = training.get("recipe")  # a text where several recipes were run
+        seed = recipe.get("seed", 0) if isinstance(recipe, dict) else 0
         # A later training began with the stages of the one before, and drew only those that were missing.
         fresh = training.get("fresh", ()) if start else None
         start |= init_params(jax.random.key(seed), facts.config, only=fresh)
