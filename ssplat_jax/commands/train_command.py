@@ -104,13 +104,13 @@ class Train:
             before = describe_weights(str(self.init_weights)).provenance
             fresh = [name for name, stage in result.params.items() if stage and name not in given]
             provenance |= {"init_weights": self.init_weights.name, "fresh": fresh, "before": before}
+        written = self.out / ("refiner.npz" if "refiner" in result.params else "weights.npz")
         if "refiner" in result.params:
-            save_refiner(self.out / "refiner.npz", result.params["refiner"], provenance)
-            print(f"wrote {self.out}/refiner.npz after {result.step} steps")
-            return 0
-        save_weights(self.out / "weights.npz", result.params, config, provenance)
-        print(f"wrote {self.out}/weights.npz after {result.step} steps")
-        reporter.say(f"next: `ssplat run CAPTURE --weights {self.out}/weights.npz --out runs/mine` streams with them")
+            save_refiner(written, result.params["refiner"], provenance)
+        else:
+            save_weights(written, result.params, config, provenance)
+            reporter.say(f"next: `ssplat run CAPTURE --weights {written} --out runs/mine` streams with them")
+        print(f"wrote {written} after {result.step} steps")
         return 0
 
     def _refuse_unused(self, recipe: "Recipe") -> None:
