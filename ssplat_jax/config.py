@@ -152,15 +152,7 @@ class Additions(ConfigGroup):
     pivots of a voxel cover its face, instead of showing as one token."""
 
 
-LITERAL = Additions(
-    depth_readout="metric",
-    front_cluster=False,
-    log_anchor=False,
-    residual_cgfi=False,
-    unit_features=False,
-    footprint_scales=False,
-    merged_coverage=False,
-)
+LITERAL = Additions("metric", *(False,) * 6)
 """No additions: the paper as it is printed."""
 
 

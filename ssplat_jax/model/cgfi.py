@@ -65,13 +65,10 @@ def inject_features(
         params: parameters of `Aggregator`.
         feats: token features f of the current views, of any float dtype.
         history: the projected cache: F_H and Omega.
-        confidences: omega of the anchored depth.
+        confidences: omega of the anchored depth; where it is 1 everywhere, the result does not depend on F_H.
         views: the chunk's views.
         config: model configuration.
         bound_history: maps F_H to a bounded size with `unit_features`; see `Network.bound_history`.
-
-    Returns:
-        Features in float32. Where omega = 1 everywhere they do not depend on F_H.
     """
     feats = feats.astype(jnp.float32)
     remembered = history.feats.astype(jnp.float32)

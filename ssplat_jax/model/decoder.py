@@ -72,17 +72,14 @@ def decode_tokens(
     pivot of n members is as opaque as n Gaussians of opacity o at one place, 1 - (1 - o)^n.
 
     Args:
-        shapes: what the head predicts. Rotations are in the frame of the token's camera, `shapes.sh` is a residual on
-            the appearance anchors.
-        means: positions of the tokens, stream frame.
+        shapes: what the head predicts. Rotations are in the frame of the token's camera, `shapes.sh` is added to the
+            appearance anchors.
+        means: positions of the tokens, stream frame, as is the result.
         rgbs: appearance anchors: a color in [0, 1] per Gaussian of the token.
         quats: camera-to-stream rotation of each token's camera, wxyz.
         footprints: side of a cell at the token's depth, stream units.
         num_members: tokens that were merged into the pivot.
         config: model configuration.
-
-    Returns:
-        Gaussians token by token, stream frame.
     """
     layers = jnp.asarray(num_members, jnp.float32) if config.additions.merged_coverage else 1.0
     optical_depths = layers * nn.softplus(shapes.logit_opacities)
@@ -181,14 +178,7 @@ def apply_evidence(
     A rendered surface is a mixture of Gaussians that overlap and of layers that do not lie exactly on each other, which
     blurs it. So the colors of a pivot's Gaussians may be moved away from their mean, more where the evidence is good.
 
-    Args:
-        params: parameters of `EvidenceHead`.
-        shapes: what the decoder's own head predicts.
-        evidence: facts about the pivots, their colors among them.
-        config: model configuration.
-
-    Returns:
-        The shapes with other opacities and scales, and the colors, whose mean over a pivot stays as it is.
+    Returns the shapes with other opacities and scales, and the colors, whose mean over a pivot stays as it is.
 
     Limits:
         Logits change by at most `MAX_LOGIT_CHANGE`, differences of colors by a factor of at most

@@ -35,17 +35,10 @@ def estimate_exposures(
 ) -> Float[Array, "v 3"]:
     """Exposure of each view: the factor per channel from the scene's colors to the view's. Not differentiated.
 
-    Args:
-        history: the projected cache.
-        log_depths: depths of the cells in the current views.
-        confidences: confidences of those depths; cells below `min_confidence` are not compared.
-        views: the chunk's views.
-        config: model configuration.
-
-    Returns:
-        Factors in [1/4, 4].
+    Cells whose confidence is below `min_confidence` are not compared.
 
     Limits:
+        Factors lie in [1/4, 4].
         A view that shares fewer than `MIN_CELLS` cells with the scene gets the geometric mean of the views that share
         enough; 1 if there is none.
         Cells with values that are not finite are not compared.

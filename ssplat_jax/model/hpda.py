@@ -97,14 +97,9 @@ def expected_log_depth(
 def anchor_depth(
     params, distribution: DepthDistribution, history: ProjectedCache, views: Views, config: StreamConfig
 ) -> AnchoredDepth:
-    """Depth and confidences read from the matcher's distribution and the cache's anchor.
+    """Depth and confidences read from the matcher's distribution and the cache's anchor, all on the matching grid.
 
-    Args:
-        params: parameters of `AnchorStrength`.
-        distribution: distribution P_i of the matcher, on the matching grid.
-        history: the projected cache, on the matching grid.
-        views: the chunk's views.
-        config: `history.hpda=False` leaves the matcher's distribution as it is.
+    `history.hpda=False` leaves the matcher's distribution as it is.
     """
     probs = distribution.probs
     if config.history.hpda:

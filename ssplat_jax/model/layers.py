@@ -150,8 +150,6 @@ def rms_normalize(x: Float[Array, "*b c"], eps: float = 1e-6) -> Float[Array, "*
 
 
 # -- Attention --------------------------------------------------------------------------------------------------------
-
-
 def attend(
     queries: Float[Array, "*b q heads c"],
     keys: Float[Array, "*b k heads c"],
@@ -193,8 +191,6 @@ def attend_per_query(
 
 
 # -- Windows for attention (Swin Transformer, Liu et al. 2021) --------------------------------------------------------
-
-
 def sine_positions(height: int, width: int, features: int) -> Float[np.ndarray, "h w c"]:
     """Sine position code of a window, normalized to 2 pi as in DETR: half of the channels for y, half for x."""
     half = features // 2
@@ -252,7 +248,7 @@ def nearest_tokens(
     Args:
         positions: token positions, stream frame.
         inside: tokens in the image. Others are chosen last.
-        num_neighbors: neighbors per token, the token itself included; fewer where there are not so many candidates.
+        num_neighbors: per token, itself included; fewer where there are not so many candidates.
         radius: candidates are the (2 r + 1)^2 cells around a token in its own view; 0 for all tokens of all views.
     """
     if radius == 0:
@@ -293,8 +289,6 @@ def _nearest_of_all(points, usable, k):
 
 
 # -- Blocks, and the U-Net of the compact network and of CGFI ---------------------------------------------------------
-
-
 class ResidualBlock(nn.Module):
     """Twice conv - InstanceNorm - ReLU, with a projected skip connection where the shape changes."""
 

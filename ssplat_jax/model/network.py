@@ -162,15 +162,10 @@ def register_network(config_type: type, network: Network) -> None:
 
 
 # -- Parameters: nested dicts, whose names are part of the weights file format ----------------------------------------
-
-
 def init_params(key: jax.Array, config: StreamConfig, only: Collection[str] | None = None) -> dict:
     """Random parameters for `config`. Their shapes depend on the configuration alone, not on the image size.
 
-    Args:
-        key: JAX random key.
-        config: model configuration.
-        only: stages to return, with the values that they have among all stages; default all that are on.
+    `only` names stages to return, with the values that they have among all stages; default all that are on.
 
     Raises:
         InputError: the network has a stage of an unknown name.
@@ -207,13 +202,7 @@ def _modules(config: StreamConfig, network: Network) -> dict:
 
 
 def complete_params(key: jax.Array, config: StreamConfig, params: dict) -> dict:
-    """`params` with untrained parameters for each stage that `config` uses and that has none in them.
-
-    Args:
-        key: JAX random key; a stage gets the values that `init_params` gives it.
-        config: model configuration.
-        params: parameters of a model with fewer stages, such as `tiny` without CGFI and mixer.
-    """
+    """`params` of a model with fewer stages, completed with those of `init_params` for each that `config` uses."""
     untrained = init_params(key, config)
     return untrained | {name: params[name] for name, stage in untrained.items() if stage and params.get(name)}
 

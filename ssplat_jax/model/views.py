@@ -134,8 +134,6 @@ def from_candidate_space(x: Float[Array, "*b"], config: StreamConfig) -> Float[A
 
 
 # -- The plane sweep: where the cells of a view lie in its source views, at every candidate depth ---------------------
-
-
 def nearest_sources(
     viewmats: Float[Array, "v 4 4"], valid: Bool[Array, " v"], num_sources: int
 ) -> tuple[Int[Array, "v s"], Bool[Array, "v s"]]:
@@ -158,14 +156,8 @@ def sweep_pixels(
 ) -> tuple[Float[Array, "d n"], Float[Array, "d n"], Bool[Array, "d n"]]:
     """Pixels in view `source` of the cells of view `reference`, at every candidate depth.
 
-    Args:
-        views: the chunk's views.
-        reference: index of the view whose cells are projected.
-        source: index of the view that they are projected into.
-        stride: pixels per side of a cell.
-
-    Returns:
-        x and y in pixels of the padded image, and whether the source image contains them, by candidate and cell.
+    Cells have `stride` pixels per side. Returns x and y in pixels of the padded image, and whether the source image
+    contains them, by candidate and cell.
     """
     height, width = views.images.shape[1:3]
     cells = pixel_grid(height, width, stride).reshape(-1, 2)
@@ -189,11 +181,8 @@ def mean_over_sources(
 ) -> Float[Array, "v ld n"]:
     """Scores of the cells of each view at every candidate: the mean over the sources that see the candidate.
 
-    Args:
-        correlate: maps (view, source view, whether it is valid) to scores `[levels d n]`, 0 where they are not seen,
-            and whether the source sees the candidate, `[d n]`. It is called once per pair, one after the other.
-        views: the chunk's views.
-        config: model configuration.
+    `correlate` maps (view, source view, whether it is valid) to scores `[levels d n]`, 0 where they are not seen, and
+    whether the source sees the candidate, `[d n]`. It is called pair by pair, so that one pair is in memory at a time.
 
     Limits:
         A candidate that no source sees scores 0.
@@ -209,8 +198,6 @@ def mean_over_sources(
 
 
 # -- Tokens of a cell: where they lie and how they look (Sec. 3.3) ----------------------------------------------------
-
-
 def patch_colors(images: Float[Array, "v h w 3"], config: StreamConfig) -> Float[Array, "v hf wf a"]:
     """Appearance anchors: mean colors of the `gaussians_per_token` parts of each token's patch, row by row."""
     side = math.isqrt(config.head.gaussians_per_token)

@@ -53,8 +53,6 @@ def regress_tokens(
 
 
 # -- 3D token mixer: attention to 3D neighbors, then among all views at 1/16 (as in ReSplat) --------------------------
-
-
 class Mixer(nn.Module):
     """Alternating neighbor blocks and global blocks."""
 

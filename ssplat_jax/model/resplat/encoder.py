@@ -134,8 +134,6 @@ def num_windows(width: int) -> int:
 
 
 # -- Monocular branch: a DINOv2 vision transformer, as trained by Depth Anything V2 -----------------------------------
-
-
 def grid_size(height: int, width: int) -> tuple[int, int]:
     """Rows and columns of ViT cells for an image of that size."""
     scale = min(1.0, MAX_SIDE / max(height, width))
@@ -239,8 +237,6 @@ class VisionTransformer(nn.Module):
 
 
 # -- All branches -----------------------------------------------------------------------------------------------------
-
-
 class Encoder(nn.Module):
     """Maps images to the features of all three branches."""
 
