@@ -149,7 +149,7 @@ def register_network(config_type: type, network: Network) -> None:
     is_config = dataclasses.is_dataclass(config_type) and isinstance(config_type(), NetworkConfig)
     for given, wanted, is_good in (
         (config_type, "a dataclass with the members of NetworkConfig", is_config),
-        (type(network), "an object with a hash", isinstance(network, Hashable)),
+        (type(network), "an object with a hash (freeze it)", isinstance(network, Hashable)),
         (type(network), "an object with the methods of Network", isinstance(network, Network)),
     ):
         if not is_good:

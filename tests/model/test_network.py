@@ -142,7 +142,7 @@ def test_incomplete_network_is_refused(toy):
     with pytest.raises(InputError, match="members of NetworkConfig, got NoMultiple"):
         register_network(NoMultiple, ToyNetwork())
     unhashable = dataclasses.make_dataclass("Thawed", [])()  # a dataclass that compares and is not frozen
-    with pytest.raises(InputError, match="with a hash, got Thawed; freeze it"):
+    with pytest.raises(InputError, match=r"with a hash .*got Thawed"):
         inspect.unwrap(register_network)(ToyConfig, unhashable)
     with pytest.raises(InputError, match="methods of Network, got object"):
         inspect.unwrap(register_network)(ToyConfig, object())  # without the type checks of the tests
