@@ -32,7 +32,7 @@ class SavedPoses:
         if max(self.indices, default=0) >= len(capture) or capture.digest(self.indices) != self.capture:
             return None
         frames = [
-            dataclasses.replace(frame, camtoworld=self.camtoworlds.get(i, frame.camtoworld))
+            dataclasses.replace(frame, camtoworld=self.camtoworlds[i]) if i in self.camtoworlds else frame
             for i, frame in enumerate(capture.frames)
         ]
         return dataclasses.replace(capture, frames=tuple(frames))

@@ -5,6 +5,7 @@ import functools
 import json
 import re
 import shutil
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -70,7 +71,7 @@ def assert_deltas_give_the_scene(out, narrow, *names):
     told_header = load_delta_header(files[-1])
     assert told_header.pop("exposure") == pytest.approx(exposure)
     assert told_header == {"frame": header["frame"], "views": header["done"]}
-    model, params = StreamSplat(StreamConfig.from_dict(header["config"])), load_weights(narrow[1])[0]
+    model, params = StreamSplat(StreamConfig.from_dict(header["config"])), load_weights(Path(narrow[1]))[0]
     scene = jax.jit(model.decode)(params, cache)
     assert 0 < (told.opacities > 0).sum() == (np.asarray(scene.opacities) > 0).sum()
     for field in dataclasses.fields(scene):
@@ -125,7 +126,7 @@ def test_a_stopped_run_continues_to_the_same_bytes(copied, finished, narrow):
     for name in ("scene.ply", "state.npz"):
         assert (out / name).read_bytes() == (finished / "run" / name).read_bytes()
     assert [path.stem for path in folder.chunk_record_files()] == ["000004", "000008", "000012"]
-    assert not folder.has_deltas()  # without those of the last chunk, they would not add up to the scene
+    assert not folder.delta_files()  # without those of the last chunk, they would not add up to the scene
 
 
 def test_another_run_is_refused(copied, narrow, tmp_path, capsys):
@@ -160,7 +161,7 @@ def test_a_damaged_image_stops_the_stream_with_what_came_before_it_saved(finishe
     image.write_bytes(whole[:200])
     # The estimate of depths decodes a few images, and would find it before the stream.
     with pytest.MonkeyPatch.context() as patch:
-        frame = open_capture(finished / "capture").stream_frame(load_weights(narrow[1])[1])
+        frame = open_capture(finished / "capture").stream_frame(load_weights(Path(narrow[1]))[1])
         patch.setattr("ssplat_jax.data.capture.Capture.stream_frame", lambda *given: frame)
         assert run("run", capture, "--out", out, "--causal", *narrow) == 2
     (line,) = capsys.readouterr().err.splitlines()

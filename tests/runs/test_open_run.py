@@ -175,7 +175,7 @@ def test_files_of_others_are_neither_records_nor_deltas(tmp_path):
     for name in ("notes.json", "._000004.json", "0000041.json"):  # of the user, or of another system
         (folder.chunk_records / name).write_text("{}")
         (folder.deltas / name).with_suffix(".npz").write_bytes(b"")
-    assert not folder.has_deltas()
+    assert not folder.delta_files()
     assert [r.num_views for r in load_chunk_records(folder.chunk_record_files())] == [4, 8]
     folder.chunk_record(8).write_text("[]")  # up to a damaged one
     assert [r.num_views for r in load_chunk_records(folder.chunk_record_files())] == [4]
