@@ -32,9 +32,10 @@ def read(path: Path) -> Listing:
             continue
         fields = Fields(load_json(file), str(file))
         pose = check_camtoworld([[fields.number(f"t_{i}{j}") for j in range(4)] for i in range(3)], str(file))
-        intrinsics = Intrinsics(**{name: fields.number(name) for name in ("fx", "fy", "cx", "cy")})
+        fx, fy, cx, cy = (fields.number(name) for name in ("fx", "fy", "cx", "cy"))
         sized = stored_size(image, (fields.number("width"), fields.number("height")), f"{file}: width, height")
         depth = None if prefix else find_file(keyframes, [f"depth/{image.stem}.png"], str(image))
+        intrinsics = Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy)
         frames.add(image.name, image, pose, intrinsics, sized, str(file), key=image.stem, depth=depth)
     return frames.listing(len(images), "camera")
 
