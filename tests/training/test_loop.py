@@ -129,7 +129,7 @@ def test_a_step_with_a_gradient_that_is_not_finite_is_only_counted():
     )
     before, moments = flat(state.params), flat(state.optimizer[0].inner_state)
     batch = make(1, 1)
-    broken = dataclasses.replace(batch, chunks=dataclasses.replace(batch.chunks, images=batch.chunks.images * jnp.inf))
+    broken = jax.tree.map(lambda x: x * jnp.inf if x.ndim == 6 else x, batch)  # the images
     after, metrics = step(state, broken)
     assert not np.isfinite(float(metrics["grad_norm"])) and int(after.optimizer[0].total_notfinite) == 1
     assert_equal(flat(after.params), before)
