@@ -20,7 +20,7 @@ import jax
 
 from ssplat_experiments.captures import SETTINGS
 from ssplat_experiments.cases import PICTURE, Case, Row
-from ssplat_experiments.study import PUBLIC_SCENES, Study, at_scale, run_study, side_by_side
+from ssplat_experiments.study import Study, at_scale, run_study
 from ssplat_jax.config import StreamConfig, preset
 from ssplat_jax.core.console import Reporter
 from ssplat_jax.data.capture import Capture
@@ -317,15 +317,6 @@ def spread(values: list[float]) -> str:
     return f"{mean} ± {statistics.stdev(values):.2f} ({len(values)})" if len(values) > 1 else f"{mean} (one seed)"
 
 
-def gallery(rows: list[Row]) -> str:
-    """The variants side by side, a table for each procedural scene."""
-    scenes = dict.fromkeys(row["scene"] for row in rows if row["scene"] in PUBLIC_SCENES)
-    tables = [
-        side_by_side([row for row in rows if row["scene"] == scene], lambda row: row["variant"]) for scene in scenes
-    ]
-    return "\n\n".join(tables)
-
-
 STUDY = Study(
     name="ablation",
     text="""Every variant starts from the shipped matcher, with all other stages untrained. The stages after it are
@@ -334,5 +325,4 @@ has no evidence head to train. Scores are of unseen views; each seed has a `revi
     cases=cases,
     finish=add_differences,
     findings=findings,
-    gallery=gallery,
 )

@@ -16,9 +16,19 @@ from typing import Any
 import numpy as np
 
 from ssplat_experiments.cases import WITH_REFINER, Case, Row
-from ssplat_experiments.measured_settings import Opened, config_of, measure, measure_refined
-from ssplat_experiments.scenes import REDKITCHEN, open_redkitchen, open_room
-from ssplat_experiments.settings import REFINED, REFINED_FACTORS, SETTINGS, SIZES, Setting, Sizes
+from ssplat_experiments.settings import (
+    REFINED,
+    REFINED_FACTORS,
+    SETTINGS,
+    SIZES,
+    Opened,
+    Setting,
+    Sizes,
+    config_of,
+    measure,
+    measure_refined,
+)
+from ssplat_experiments.streams import REDKITCHEN, open_redkitchen, open_room
 from ssplat_experiments.study import Study, at_scale, run_study
 from ssplat_jax.core.console import Reporter
 
@@ -91,64 +101,26 @@ def mark_fronts(rows: list[Row]) -> None:
     rows.sort(key=lambda row: (row["scene"], row["ms_per_view"]))
 
 
-def _label(row: dict[str, Any]) -> str:
-    """The setting, and the quality that it is."""
-    quality = {setting.name: setting.quality for setting in (*SETTINGS, *REFINED)}.get(row["setting"])
-    return f"{row['setting']} ({quality})" if quality else row["setting"]
-
-
 def plot(pyplot: Any, rows: list[Row]) -> Any:
-    """A panel per scene, the front as a line, the qualities ringed, memory as color, refined scenes as triangles."""
+    """A panel per scene: the front as a line, the qualities named, refined scenes as triangles."""
+    quality = {setting.name: setting.quality for setting in (*SETTINGS, *REFINED) if setting.quality}
     scenes = list(dict.fromkeys(row["scene"] for row in rows))
     figure, panels = pyplot.subplots(1, len(scenes), figsize=(7 * len(scenes), 5), layout="constrained", squeeze=False)
-    mib = [(row["peak_memory_bytes"] or 0) / 2**20 for row in rows]
-    norm = pyplot.matplotlib.colors.LogNorm(max(min(mib), 1.0), max(*mib, 2.0))
     for axes, scene in zip(panels[0], scenes, strict=True):
-        here = [row for row in rows if row["scene"] == scene]
-        _time_axis(axes, [row["ms_per_view"] for row in here])
-        psnrs = [row["shown"] for row in here]
-        axes.set_ylim(min(psnrs) - 0.3, max(psnrs) + 0.3)
-        front = sorted((r for r in here if r["front"]), key=lambda r: r["ms_per_view"])
+        here = sorted((row for row in rows if row["scene"] == scene), key=lambda row: row["ms_per_view"])
+        front = [row for row in here if row["front"]]
         axes.plot([r["ms_per_view"] for r in front], [r["shown"] for r in front], color="#c06030", lw=1.2, zorder=1)
-        for is_refined, marker in ((False, "o"), (True, "^")):
-            of_kind = [row for row in here if ("refine_s" in row) == is_refined]
-            places = [[row[column] for row in of_kind] for column in ("ms_per_view", "shown")]
-            colors = [(row["peak_memory_bytes"] or 0) / 2**20 for row in of_kind]
-            dots = axes.scatter(*places, c=colors, s=28, marker=marker, norm=norm, cmap="viridis", zorder=2)
-        figure.draw_without_rendering()  # lays the panel out, so that names know where they are
-        _name_points(axes, here)
+        for row in here:
+            at, name = (row["ms_per_view"], row["shown"]), quality.get(row["setting"])
+            axes.scatter(*at, s=60 if name else 22, marker="^" if "refine_s" in row else "o", color="#30507a", zorder=2)
+            if name:
+                axes.annotate(name, at, textcoords="offset points", xytext=(6, -10), fontsize=9, weight="bold")
+        axes.set_xscale("log")
+        axes.set_xlabel("ms per view, chunk in to novel view out, refinement spread over the views")
         axes.set_title(scene)
         axes.spines[["top", "right"]].set_visible(False)
     panels[0, 0].set_ylabel("PSNR of unseen views as shown, dB")
-    figure.colorbar(dots, ax=list(panels[0]), label="peak memory, MiB")
     return figure
-
-
-def _time_axis(axes: Any, times: list[float]) -> None:
-    """A logarithmic axis of milliseconds with round ticks."""
-    axes.set_xscale("log")
-    axes.set_xlim(0.8 * min(times), 1.8 * max(times))
-    ticks = [10**k * m for k in range(6) for m in (1, 2, 5) if min(times) <= 1.25 * 10**k * m <= 2 * max(times)]
-    axes.set_xticks(ticks, [str(tick) for tick in ticks])
-    axes.minorticks_off()
-    axes.set_xlabel("ms per view, chunk in to novel view out, refinement spread over the views")
-
-
-def _name_points(axes: Any, rows: list[Row]) -> None:
-    """Rings and names of the qualities, then the names of the others, the front's first, while there is room."""
-    names = []
-    for row in sorted(rows, key=lambda r: (_label(r) == r["setting"], not r["front"], r["ms_per_view"])):
-        at, is_quality = (row["ms_per_view"], row["shown"]), _label(row) != row["setting"]
-        color = "#c06030" if row["front"] else "#30507a"
-        if is_quality:
-            axes.scatter(*at, s=110, facecolors="none", edgecolors=color, zorder=3)
-        style = {"fontsize": 7, "color": color, "weight": "bold" if is_quality else "normal"}
-        name = axes.annotate(_label(row), at, textcoords="offset points", xytext=(6, 4), **style)
-        box = name.get_window_extent()
-        if any(box.overlaps(other) for other in names):
-            name.remove()
-        else:
-            names.append(box)
 
 
 STUDY = Study(

@@ -3,12 +3,13 @@
     ssplat experiment captures --captures path/to/captures --out runs/captures
 
 Every row of `SETTINGS` whose capture stands in the given folder is evaluated with the shipped weights (the interleaved
-protocol, decoded cache); a table goes to the terminal and `table.json`, pictures beside it. docs/model_card.md holds
+protocol, decoded cache); a table goes to the terminal and `table.json`, pictures beside it. docs/results.md holds
 the numbers to expect.
 """
 
 from pathlib import Path
 
+from ssplat_experiments.streams import make_room
 from ssplat_jax.config import preset
 from ssplat_jax.core.console import Reporter
 from ssplat_jax.core.cpu_backend import make_room

@@ -11,7 +11,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from ssplat_experiments.program_memory import make_room
+from ssplat_experiments.streams import make_room
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.console import Reporter
 from ssplat_jax.core.errors import InputError

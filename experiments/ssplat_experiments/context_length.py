@@ -1,4 +1,4 @@
-"""Quality, memory and time against the number of context views (the paper's Table 1), with baselines.
+"""Quality, memory and time against the number of context views (the paper's Tables 1 and 2), with baselines.
 
     ssplat experiment context_length --captures path/to/captures --out runs/context_length
 
@@ -17,12 +17,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from ssplat_experiments.baselines import BASELINES, JointNetwork, baseline_scores, joint_config, one_chunk
 from ssplat_experiments.cases import PICTURE, Case, Row
-from ssplat_experiments.image_baselines import BASELINES, baseline_scores
-from ssplat_experiments.joint_network import JointNetwork, joint_config, one_chunk
-from ssplat_experiments.memory_curve import START_CAPACITY
-from ssplat_experiments.study import PUBLIC_SCENES, Study, at_scale, run_study, side_by_side
-from ssplat_experiments.warm_sessions import new_session
+from ssplat_experiments.streams import START_CAPACITY, new_session
+from ssplat_experiments.study import Study, at_scale, run_study
 from ssplat_jax.config import StreamConfig, preset
 from ssplat_jax.core.console import Reporter
 from ssplat_jax.core.gaussians import Gaussians
@@ -55,10 +53,18 @@ class Sizes:
     """End of the names of the suites, where a table has the same scene at another size."""
 
 
+WALKS = ("room", "corridor", "orbit")
 SIZES = {
-    "smoke": Sizes((8, 16), ("room",), (64, 48), targets=3),
-    "cpu": Sizes((24, 64, 128), ("room", "corridor", "orbit"), (160, 120), joint=64),
-    "gpu": Sizes((24, 64, 128), ("room", "corridor", "orbit"), (480, 256)),
+    "smoke": (Sizes((8, 16), ("room",), (64, 48), targets=3),),
+    "cpu": (
+        Sizes((24, 64, 128), WALKS, (160, 120), joint=64),
+        Sizes((24, 256, 512, 1024), ("room",), (96, 72), joint=0, label=", long"),
+    ),
+    "gpu": (
+        Sizes((24, 64, 128), WALKS, (480, 256)),
+        Sizes((24, 256, 512, 1024), ("room", "corridor"), (480, 256), joint=0, label=", long"),
+        Sizes((24, 1024, 10_000), ("room",), (128, 96), joint=0, label=", 128 x 96"),
+    ),
 }
 
 
@@ -68,8 +74,8 @@ def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str
 
 
 def cases(captures: Path | None, scale: str) -> list[Case]:
-    """A case for each suite and method."""
-    return suite_cases(captures, at_scale(SIZES, scale))
+    """The cases of every size."""
+    return [case for sizes in at_scale(SIZES, scale) for case in suite_cases(captures, sizes)]
 
 
 def suite_cases(captures: Path | None, sizes: Sizes) -> list[Case]:
@@ -84,7 +90,7 @@ def suite_cases(captures: Path | None, sizes: Sizes) -> list[Case]:
     asked = {name: value for name, value in dataclasses.asdict(sizes).items() if name not in not_asked}
     streams = [
         Case(
-            name=f"{_suite(path)}, {method}",
+            name=f"{_suite(path)}{sizes.label}, {method}",
             config=config,
             asked={"suite": _suite(path), **asked},
             measure=functools.partial(measured, path, method, config, sizes),
@@ -94,7 +100,7 @@ def suite_cases(captures: Path | None, sizes: Sizes) -> list[Case]:
     ]
     joint = [
         Case(
-            name=f"{_suite(path)}, {JOINT}, {count} views",
+            name=f"{_suite(path)}{sizes.label}, {JOINT}, {count} views",
             config=joint_config(config, count),
             asked={"suite": _suite(path), **asked},
             measure=functools.partial(measured_joint, path, count, config, sizes),
@@ -217,18 +223,6 @@ def findings(rows: list[Row]) -> list[str]:
     return ["\n".join(lines)] if lines else []
 
 
-def gallery(rows: list[Row]) -> str:
-    """One target of each procedural suite, from few views to many."""
-    suites = dict.fromkeys(row["suite"] for row in rows if row["suite"].partition(",")[0] in PUBLIC_SCENES)
-    strips = [
-        side_by_side(
-            [row for row in rows if row["suite"] == suite], lambda row: f"{row['suite']}, {row['views']} views"
-        )
-        for suite in suites
-    ]
-    return "\n\n".join(strip for strip in strips if strip)
-
-
 def plot(pyplot: Any, rows: list[Row]) -> Any:
     """Literal and shown PSNR against views, a column of panels for each suite."""
     suites = list(dict.fromkeys(row["suite"] for row in rows))
@@ -267,5 +261,4 @@ that of step, decode and rendering, in MiB.""",
     cases=cases,
     plot=plot,
     findings=findings,
-    gallery=gallery,
 )

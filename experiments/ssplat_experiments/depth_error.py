@@ -6,7 +6,7 @@ Streams captures that have depth maps with the shipped weights and compares the 
 its cell's map, after one scale for the whole capture (the median ratio over accepted tokens). Writes `table.json`:
 accepted fraction, median relative error of accepted tokens, and the error by confidence; confidence is
 calibrated if the error falls as it rises. Weights whose confidences differ are compared at equal shares of the tokens,
-the surest ones. docs/model_card.md holds the numbers to expect.
+the surest ones. docs/results.md holds the numbers to expect.
 """
 
 import itertools
@@ -15,8 +15,9 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from ssplat_jax.model.views import GRID_STRIDE
 
-from ssplat_experiments.scenes import REDKITCHEN, open_redkitchen, open_room
+from ssplat_experiments.streams import REDKITCHEN, make_room, open_redkitchen, open_room
 from ssplat_experiments.study import at_scale
 from ssplat_jax.config import preset
 from ssplat_jax.core.console import Reporter

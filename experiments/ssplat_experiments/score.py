@@ -120,16 +120,15 @@ def read_memory(path: Path) -> int | None:
     Raises:
         InputError: the file is damaged, or the number is not one of bytes.
     """
+    if not path.exists():
+        return None
     try:
         found = json.loads(path.read_text()).get("peak_memory_bytes")
-        if found is None or (type(found) is int and found > 0):
-            return found
-        got = f"peak_memory_bytes {echo(found)}"
-    except FileNotFoundError:
-        return None
+        if found is not None and not (type(found) is int and found > 0):
+            raise ValueError(f"peak_memory_bytes {echo(found)}")
     except (OSError, ValueError, AttributeError) as error:
-        got = f"{type(error).__name__} ({error})"
-    raise InputError(f"{path}: wanted metrics with a number of bytes, got {got}; remove the file or mend it.")
+        raise InputError(f"{path}: wanted metrics with a number of bytes, got {error}; remove the file.") from None
+    return found
 
 
 def _file_of(folder: Path, i: int) -> Path:

@@ -24,9 +24,6 @@ SCALES = ("smoke", "cpu", "gpu")
 
 PAGE, PLOT = "page.md", "plot.png"
 
-PUBLIC_SCENES = ("room", "corridor", "orbit", "revisit")
-"""Scenes whose pictures a page shows. Those of captures, whose licences may forbid it, lie in `cases/` only."""
-
 
 @dataclasses.dataclass(frozen=True)
 class Study:
@@ -43,10 +40,6 @@ class Study:
     """Draws the rows with pyplot and returns the figure."""
     findings: Callable[[list[Row]], Sequence[str]] = lambda rows: ()
     """Sentences that follow from the rows, printed and written below the table."""
-    gallery: Callable[[list[Row]], str] = lambda rows: ""
-    """Markdown of the pictures of the rows, for the page."""
-    files: Callable[[list[Row], str], dict[str, Any]] = lambda rows, scale: {}
-    """Further JSON files, by name, that are made of the rows of a scale."""
 
 
 def at_scale(choices: dict[str, T], scale: str) -> T:
@@ -79,8 +72,6 @@ def run_study(study: Study, captures: Path | None, out: Path, scale: str, report
     write = lambda so_far: _write(study, out, scale, captures, _finished(study, so_far))  # noqa: E731
     rows = measure_cases(study.name, cases, out / "cases", reporter, write)
     _write(study, out, scale, captures, rows := _finished(study, rows))
-    for name, value in study.files(rows, scale).items():
-        write_json(out / name, value)
     if study.plot is not None and (pyplot := import_pyplot()) is None:
         reporter.warn(f"{study.name}: no {PLOT} without matplotlib; pip install 'ssplat-jax[plots]'")
     elif study.plot is not None:
@@ -139,13 +130,6 @@ def markdown_table(rows: Sequence[Row]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def side_by_side(rows: Sequence[Row], title: Callable[[Row], str]) -> str:
-    """A Markdown table of the pictures of the rows that have one, each under its title."""
-    shown = [row for row in rows if PICTURE in row]
-    lines = [[title(row) for row in shown], ["---"] * len(shown), [f"![{title(row)}]({row[PICTURE]})" for row in shown]]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines) if shown else ""
-
-
 def _cell(name: str, value: Any) -> str:
     if value is None:
         return ""
@@ -169,8 +153,6 @@ def page(study: Study, scale: str, rows: Sequence[Row], captures: Path | None = 
     if rows:
         parts.append(markdown_table(rows).strip())
     parts += study.findings(list(rows))
-    if gallery := study.gallery(list(rows)):
-        parts.append(gallery)
     if study.plot is not None:
         parts.append(f"![{study.name}]({PLOT})")
     return "\n\n".join(parts) + "\n"

@@ -2,9 +2,11 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
+
+from ssplat_jax.commands.options import load_plugin
 
 
 @dataclasses.dataclass(frozen=True)
@@ -14,28 +16,27 @@ class Bench:
     Example: ssplat bench render --json render.json
     """
 
-    name: Annotated[Literal["render", "refine", "stream"], tyro.conf.Positional]
-    """render: the rasterizer. refine: a step of refinement on a large scene. stream: fuse and projection of the cache,
-    and whole steps, with online refinement and without, early and late in a stream."""
+    name: Annotated[str, tyro.conf.Positional]
+    """render: the rasterizer. effects: what each of its effects costs and shows. refine: a step of refinement on a large
+    scene. stream: whole steps, with online refinement and without, early and late in a stream."""
     json: Path | None = None
     """Write {machine, date, commit, rows: [{name, value, unit}]} here as well."""
     against: Path | None = None
-    """Timed in the same run. render: another rasterizer's Python file, with the functions that docs/performance.md
-    names, as experiments/gsplat_rasterizer.py has them. refine: the root of another checkout of this package."""
-    scaling: bool = False
-    """render only: also 4k to 1M Gaussians, at four image sizes."""
-    full_hd: bool = False
-    """render only: also 1M Gaussians at 1920 x 1080."""
+    """Timed in the same run. render: another rasterizer's Python file, as experiments/gsplat_rasterizer.py is one.
+    refine: the root of another checkout of this package."""
+    large: bool = False
+    """render only: also 4k to 1M Gaussians, at five image sizes."""
 
     def run(self) -> int:
-        from ssplat_jax.benchmarks.suite import run_benchmark
+        options = {name: value for name, value in (("against", self.against), ("large", self.large)) if value}
+        measure = load_plugin("ssplat_jax.benchmarks", self.name, options)
+        from ssplat_jax.evaluation.provenance import commit, machine, today
+        from ssplat_jax.storage.files import write_json
 
-        result = run_benchmark(self.name, against=self.against, scaling=self.scaling, full_hd=self.full_hd)
+        result = {"machine": machine(), "date": today(), "commit": commit(), "rows": measure(**options)}
         print(result["machine"])
         for row in result["rows"]:
             print(f"{row['name']:<44} {row['value']:>14.6g} {row['unit']}")
         if self.json is not None:
-            from ssplat_jax.storage.files import write_json
-
             write_json(self.json, result)
         return 0

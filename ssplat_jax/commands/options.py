@@ -1,11 +1,14 @@
 """Options and helpers that several commands share. Nothing here imports JAX before a command runs."""
 
 import dataclasses
+import inspect
 import json
 import math
 import re
+from collections.abc import Callable, Iterable
+from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Annotated, Literal, get_args, get_type_hints
+from typing import Annotated, Any, Literal, get_args, get_type_hints
 
 import tyro
 
@@ -203,3 +206,25 @@ def load_lpips_weights(vgg: Path | None, heads: Path | None):
     from ssplat_jax.evaluation.lpips import load_lpips
 
     return load_lpips(vgg, heads)
+
+
+def load_plugin(group: str, name: str, options: Iterable[str]) -> Callable[..., Any]:
+    """The function that registers as the entry point `name` of a group: the library does not import its experiments.
+
+    Args:
+        group: `ssplat_jax.experiments` or `ssplat_jax.benchmarks`; other packages may add to both.
+        name: the entry point.
+        options: names of the arguments that it will be given.
+
+    Raises:
+        InputError: there is no such entry point, or its function lacks an argument.
+    """
+    kind = group.rpartition(".")[2].removesuffix("s")
+    found = {point.name: point for point in entry_points(group=group)}
+    if name not in found:
+        raise InputError(f"{kind}: wanted one of {', '.join(sorted(found))}, got {name!r}.")
+    run = found[name].load()
+    for option in options:
+        if option not in inspect.signature(run).parameters:
+            raise InputError(f"--{option}: {kind} {name} has no use for it; leave it out.")
+    return run
