@@ -92,10 +92,10 @@ class Budget:
     """Tile intersections of these steps."""
     evidence: Recipe
     """Training of the evidence head; its seed is that of the variant."""
-    seeds: tuple[int, ...]
-    views: int
+    seeds: tuple[int, ...] = (0, 1, 2)
+    views: int = 64
     """Number of streamed views of procedural scenes."""
-    scored: tuple[int, int]
+    scored: tuple[int, int] = (320, 240)
     """Scored images of procedural scenes, width and height; those of captures are as in `captures`."""
     trainings: int | None = None
     """Number of trainings that are made; None: all."""
@@ -143,9 +143,6 @@ BUDGETS = {
         size=(64, 96),
         max_pairs=1 << 18,
         evidence=evidence_recipe(100, Crops(procedural=LEARNED_SCENES, strides=(2,))),
-        seeds=(0, 1, 2),
-        views=64,
-        scored=(320, 240),
     ),
     "gpu": Budget(
         steps=1000,
@@ -153,9 +150,6 @@ BUDGETS = {
         size=(256, 256),
         max_pairs=1 << 21,
         evidence=evidence_recipe(600, Crops(procedural=LEARNED_SCENES)),
-        seeds=(0, 1, 2),
-        views=64,
-        scored=(320, 240),
     ),
 }
 

@@ -6,6 +6,7 @@ own, which runs this file as a script, and they take steps by turns, so that a b
 ratios. The script uses only `refine` and what that is given.
 """
 
+import contextlib
 import json
 import os
 import subprocess
@@ -45,10 +46,8 @@ class Worker:
 
     def step(self) -> dict[str, float]:
         """Facts about the next step: `ms`, `loss`."""
-        try:
+        with contextlib.suppress(BrokenPipeError):  # the process has ended; the line below says so
             print(file=self._process.stdin, flush=True)
-        except BrokenPipeError:
-            pass  # the process has ended; the line below says so
         line = self._process.stdout.readline() if self._process.stdout else ""
         if not line:
             raise InputError(f"bench refine: {self._checkout} took no step; give a checkout that has `refine`.")

@@ -1,4 +1,4 @@
-"""`ssplat bench render`: times of the rasterizer, against its arithmetic floor and, in the same run, another rasterizer.
+"""`ssplat bench render`: times of the rasterizer, against its arithmetic floor and against another rasterizer.
 
 Scenes are Gaussians of about one pixel over an image, at depths from 1 to 5. Every repetition times all candidates one
 after the other, so that a busy machine slows all alike: read the ratios. `bytes` are XLA's own temporary memory.

@@ -1,7 +1,7 @@
-"""`ssplat bench stream`: time and memory of whole steps, with online refinement and without, early and late in a stream.
+"""`ssplat bench stream`: time and memory of whole steps, early and late in a stream, refined online and not.
 
-The stream repeats one walk through a room, with small images, since only the cache's part of a step could grow. Chunks on
-copies of the early and the late cache are timed alternately.
+The stream repeats one walk through a room, with small images, since only the cache's part of a step could grow. Chunks
+on copies of the early and the late cache are timed alternately.
 """
 
 import itertools

@@ -12,7 +12,6 @@ from pathlib import Path
 from ssplat_experiments.streams import make_room
 from ssplat_jax.config import preset
 from ssplat_jax.core.console import Reporter
-from ssplat_jax.core.cpu_backend import make_room
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import interleaved_split

@@ -2,12 +2,12 @@
 
     ssplat experiment cost --out runs/cost
 
-`latency`: a session streams `procedural:room`, then the last chunk is fed again to the full cache. The whole is timed as
-a stream runs it; the stages are timed as programs of their own, so their sum differs from the whole by what XLA joins.
-`memory`: ours, a memory that keeps every token (`append-all`), and the same network over all views at once (`joint`).
-`ours` and `append-all` walk through `loop` views again and again, so that the stream grows and the scene does not; the
-others see new views, since a network that sees a view twice finds no parallax. On a CPU bytes are those of XLA's
-analysis; on a GPU each number of views runs in a process of its own, and its allocator counts. Needs an idle machine.
+`latency`: a session streams `procedural:room`, then the last chunk is fed again to the full cache. Stages are timed as
+programs of their own, so their sum differs from the whole by what XLA joins. `memory`: ours, a memory that keeps every
+token (`append-all`), and the same network over all views at once (`joint`). `ours` and `append-all` walk through `loop`
+views again and again, so that the stream grows and the scene does not; the others see new views, since a network that
+sees a view twice finds no parallax. On a CPU bytes are those of XLA's analysis; on a GPU each number of views runs in a
+process of its own, and its allocator counts. Needs an idle machine.
 """
 
 import dataclasses
@@ -22,7 +22,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from ssplat_jax.model.views import prepare_views
 
 from ssplat_experiments.baselines import JointNetwork, joint_config, one_chunk
 from ssplat_experiments.cases import Case, Row
@@ -34,7 +33,9 @@ from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.chunk import Chunk
 from ssplat_jax.core.console import Reporter
 from ssplat_jax.data.open_capture import open_capture
-from ssplat_jax.evaluation.latency import measure_latency, peak_memory
+from ssplat_jax.evaluation.latency import measure_latency
+from ssplat_jax.evaluation.peak_memory import peak_memory
+from ssplat_jax.model.views import prepare_views
 from ssplat_jax.rasterizer import render
 from ssplat_jax.storage.weights import load_params
 from ssplat_jax.streaming.feed import feed_capture, feed_chunks

@@ -15,13 +15,11 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from ssplat_jax.model.views import GRID_STRIDE
 
 from ssplat_experiments.streams import REDKITCHEN, make_room, open_redkitchen, open_room
 from ssplat_experiments.study import at_scale
 from ssplat_jax.config import preset
 from ssplat_jax.core.console import Reporter
-from ssplat_jax.core.cpu_backend import make_room
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.split import Split

@@ -2,7 +2,7 @@
 
     ssplat experiment all --scale smoke --out runs/all
 
-Each runs in its folder below `results/`; `results.md` holds the pages of all that are finished. A stopped run continues.
+Each runs in its folder below `results/`; `results.md` holds the pages of all. A stopped run continues.
 """
 
 from pathlib import Path

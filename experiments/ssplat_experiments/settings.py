@@ -16,8 +16,7 @@ from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.evaluation.latency import measure_latency
 from ssplat_jax.evaluation.peak_memory import peak_memory
 from ssplat_jax.evaluation.scoring import score_targets
-from ssplat_jax.refinement.refine import continue_refinement, start_refinement
-from ssplat_jax.refinement.refine_capture import key_views_of
+from ssplat_jax.refinement.refine import continue_refinement, key_views_of, start_refinement
 from ssplat_jax.refinement.refine_config import FOR_CAPTURES
 from ssplat_jax.streaming.feed import Exposures, feed_capture
 

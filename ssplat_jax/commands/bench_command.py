@@ -17,8 +17,8 @@ class Bench:
     """
 
     name: Annotated[str, tyro.conf.Positional]
-    """render: the rasterizer. effects: what each of its effects costs and shows. refine: a step of refinement on a large
-    scene. stream: whole steps, with online refinement and without, early and late in a stream."""
+    """render: the rasterizer. effects: what each effect costs and shows. refine: a step of refinement on a large scene.
+    stream: whole steps, with online refinement and without, early and late in a stream."""
     json: Path | None = None
     """Write {machine, date, commit, rows: [{name, value, unit}]} here as well."""
     against: Path | None = None

@@ -112,7 +112,7 @@ def test_every_variant_of_the_ablation_is_another_model_or_another_training():
     assert len({case.config.hash for case in asked}) == 8  # the one with untrained tokens is the full model
     for variant in VARIANTS.values():
         assert set(variant.untrained) <= set(STAGES)
-        assert set(variant.untrained) <= set(budget.recipe(0, variant.untrained).phases[0].form.frozen)
+        assert set(variant.untrained) <= set(STAGES) - set(budget.recipe(0, variant.untrained).phases[0].rates)
 
 
 @pytest.mark.slow
@@ -137,9 +137,9 @@ def test_the_ablation_learns_from_no_scene_that_it_scores(tmp_path):
     assert not any("revisit" in spec and spec.endswith(tuple(seeds)) for spec in scenes)
 
 
-def test_every_registered_experiment_can_be_loaded():
-    points = entry_points(group="ssplat_jax.experiments")
-    assert {"captures", "accuracy_vs_time", "ablation", "depth_error", "more_views"} <= {point.name for point in points}
+def test_every_registered_experiment_and_benchmark_can_be_loaded():
+    points = [*entry_points(group="ssplat_jax.experiments"), *entry_points(group="ssplat_jax.benchmarks")]
+    assert {"captures", "accuracy_vs_time", "ablation", "depth_error", "cost"} <= {point.name for point in points}
     assert all(callable(point.load()) for point in points)
 
 

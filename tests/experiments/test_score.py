@@ -75,5 +75,5 @@ def test_missing_renders_are_named(renders, tmp_path, capsys):
     (folder / "split.json").unlink()
     assert guarded(command.run) == 2
     assert "split.json" in capsys.readouterr().err
-    assert guarded(dataclasses.replace(command, name="latency").run) == 2
+    assert guarded(dataclasses.replace(command, name="cost").run) == 2
     assert "--renders" in capsys.readouterr().err

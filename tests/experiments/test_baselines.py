@@ -4,7 +4,7 @@ import dataclasses
 
 import jax.numpy as jnp
 import numpy as np
-from ssplat_experiments.image_baselines import baseline_scores, warp
+from ssplat_experiments.baselines import baseline_scores, warp
 
 from ssplat_jax.config import preset
 from ssplat_jax.core.cameras import Camera

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import jax.numpy as jnp
 import pytest
-from ssplat_experiments import measured_settings as module
+from ssplat_experiments import settings as module
 from ssplat_experiments.settings import Setting
 
 SETTINGS = [Setting(refine_steps=steps) for steps in (2, 4, 8, 16)]
