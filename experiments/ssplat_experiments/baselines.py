@@ -17,9 +17,7 @@ from ssplat_jax.core.chunk import Chunk
 from ssplat_jax.core.gaussians import Gaussians, mask_gaussians
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.stream_frame import StreamFrame
-from ssplat_jax.evaluation.exposures import exposure_for
-from ssplat_jax.evaluation.nearest_views import nearest_views
-from ssplat_jax.evaluation.peak_memory import (
+from ssplat_jax.evaluation.cost import (
     PeakMemory,
     abstract,
     added_bytes,
@@ -27,7 +25,7 @@ from ssplat_jax.evaluation.peak_memory import (
     live_bytes,
     render_bytes,
 )
-from ssplat_jax.evaluation.scoring import ImageScore, score_image
+from ssplat_jax.evaluation.scoring import ImageScore, exposure_for, nearest_views, score_image
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.streaming.feed import Exposures
 

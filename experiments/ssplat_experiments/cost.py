@@ -33,8 +33,7 @@ from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.chunk import Chunk
 from ssplat_jax.core.console import Reporter
 from ssplat_jax.data.open_capture import open_capture
-from ssplat_jax.evaluation.latency import measure_latency
-from ssplat_jax.evaluation.peak_memory import peak_memory
+from ssplat_jax.evaluation.cost import measure_latency, peak_memory
 from ssplat_jax.model.views import prepare_views
 from ssplat_jax.rasterizer import render
 from ssplat_jax.storage.weights import load_params

@@ -13,8 +13,7 @@ from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.split import Split
 from ssplat_jax.data.stream_frame import StreamFrame
-from ssplat_jax.evaluation.latency import measure_latency
-from ssplat_jax.evaluation.peak_memory import peak_memory
+from ssplat_jax.evaluation.cost import measure_latency, peak_memory
 from ssplat_jax.evaluation.scoring import score_targets
 from ssplat_jax.refinement.refine import continue_refinement, key_views_of, start_refinement
 from ssplat_jax.refinement.refine_config import FOR_CAPTURES
