@@ -10,7 +10,7 @@ Samples are in `samples.py` and `crops.py`, losses in `losses.py`, the loop and 
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.errors import InputError
@@ -51,7 +51,7 @@ class Samples(Protocol):
 class Loss(Protocol):
     """What the steps of a phase lower, see `losses.py`."""
 
-    renders: Any
+    renders: ClassVar[bool]
 
     def __call__(self, model: StreamSplat, params: dict, batch: Any, lpips: Any = None) -> tuple[Any, dict]: ...
 
