@@ -36,7 +36,6 @@ class Poses:
     def run(self) -> int:
         from ssplat_jax.core.console import Reporter
         from ssplat_jax.poses.estimate import PoseOptions, estimate_poses
-        from ssplat_jax.poses.verdict import verdict
 
         require_positive(frames=self.frames, max_side=self.max_side)
         if self.source.is_dir() and self.frames != Poses.frames:
@@ -48,7 +47,7 @@ class Poses:
             how = " without --overwrite" if self.overwrite else ""
             print(f"stopped; the same command{how} continues", file=sys.stderr)
             raise
-        print(f"{self.out}: " + "\n".join(verdict(found)))
+        print(f"{self.out}: " + "\n".join(found.sentences()))
         size = _small_size(self.out / "images" / found.parts[0][0])
         place, run = shlex.quote(str(self.out)), shlex.quote(f"runs/{self.out.resolve().name}")
         print(f"next: ssplat run {place} --size {size} --out {run}")

@@ -1,5 +1,6 @@
 """From pictures of a textured box to a capture: poses, files, resuming, refusals. COLMAP runs on small images."""
 
+import itertools
 import json
 import shutil
 from pathlib import Path
@@ -11,8 +12,9 @@ from PIL import Image
 from ssplat_jax.core.console import Reporter
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.data.open_capture import open_capture
-from ssplat_jax.poses import requirements, sfm
-from ssplat_jax.poses.estimate import PoseOptions, _request, estimate_poses
+from ssplat_jax.poses import sfm
+from ssplat_jax.poses.estimate import Findings, PoseOptions, _request, estimate_poses, ranges
+from ssplat_jax.poses.sfm import OVERLAP, alike_pairs, neighbor_pairs
 from ssplat_jax.storage.files import write_json
 from tests.poses.room_fixture import FOCAL, K, pictures, walk
 
@@ -20,6 +22,7 @@ pytest.importorskip("pycolmap", reason="poses need pycolmap: pip install -e '.[p
 
 NUM_PHOTOS = 9
 QUIET = Reporter(quiet=True)
+NAMES = tuple(f"{i}.jpg" for i in range(120))
 
 
 def estimate(source, out, overwrite=False, **options):
@@ -80,47 +83,48 @@ def test_a_finished_call_does_nothing_again(photos, estimated, monkeypatch):
     monkeypatch.setattr(sfm, "extract_features", None)
     assert estimate(photos, out) == found
     assert files == {file: file.stat().st_mtime_ns for file in out.rglob("*") if file.is_file()}
+    with pytest.raises(InputError, match=r"another call \(max_side\).*--overwrite"):
+        estimate(photos, out, max_side=100)
 
 
 def test_a_stopped_call_continues(photos, estimated, tmp_path, monkeypatch):
     """Stopped among the matches, a second call keeps images, features and matches, and ends with the same cameras."""
-    out, calls = tmp_path / "capture", []
-    advance_of = sfm.match_pairs
+    out, match_pairs = tmp_path / "capture", sfm.match_pairs
 
     def stop(space, pairs, advance):
-        advance_of(space, pairs[:20], advance)
+        match_pairs(space, pairs[:20], advance)
         raise KeyboardInterrupt
 
     monkeypatch.setattr(sfm, "match_pairs", stop)
     with pytest.raises(KeyboardInterrupt):
         estimate(photos, out)
     assert not (out / "transforms.json").exists() and (out / "images").is_dir()
-    monkeypatch.setattr(sfm, "match_pairs", advance_of)
+    monkeypatch.setattr(sfm, "match_pairs", match_pairs)
     with sfm.require("pycolmap").Database.open(out / "database.db") as database:
         kept = {i.name: database.num_keypoints_for_image(i.image_id) for i in database.read_all_images()}
-    original = sfm._cancellable
-    monkeypatch.setattr(sfm, "_cancellable", lambda f, *a, **k: calls.append(f.__name__) or original(f, *a, **k))
-    found = estimate(photos, out)
     assert len(kept) == NUM_PHOTOS and min(kept.values()) > 50
-    assert "incremental_mapping" in calls
-    assert found.parts == estimated[1].parts
+    assert estimate(photos, out).parts == estimated[1].parts
     np.testing.assert_allclose(
         open_capture(out).camtoworlds[:, :3, :3], open_capture(estimated[0]).camtoworlds[:, :3, :3], atol=0.02
     )
 
 
-def test_a_folder_belongs_to_one_call(photos, estimated, tmp_path):
-    out, _ = estimated
-    with pytest.raises(InputError, match=r"another call \(max_side\).*--overwrite"):
-        estimate(photos, out, max_side=100)
-    with pytest.raises(InputError, match="outside the photos"):
-        estimate(photos, photos / "capture")
-    (tmp_path / "images").mkdir()
-    with pytest.raises(InputError, match="images of another maker"):
-        estimate(photos, tmp_path)
-    (tmp_path / "poses.json").write_text("{")
-    with pytest.raises(InputError, match=r"poses\.json.*damaged.*another --out"):
-        estimate(photos, tmp_path)
+def test_a_call_killed_among_its_images_continues(photos, estimated, tmp_path, monkeypatch):
+    killed, calls = tmp_path / "capture", itertools.count()
+
+    def write_once(*given):  # the second time ends as a kill does: nothing after it happens
+        if next(calls):
+            raise MemoryError
+        write_json(*given)
+
+    with monkeypatch.context() as patched:
+        patched.setattr("ssplat_jax.poses.estimate.write_json", write_once)
+        with pytest.raises(MemoryError):
+            estimate(photos, killed)
+    assert (killed / "images").is_dir()
+    found, wanted = estimate(photos, killed), estimated[1]
+    assert (found.names, found.parts) == (wanted.names, wanted.parts)
+    assert found.num_points == pytest.approx(wanted.num_points, rel=0.05)  # COLMAP's threads decide about a few
 
 
 @pytest.mark.parametrize("overwrite", [False, True])
@@ -132,6 +136,8 @@ def test_a_source_inside_the_results_is_refused_and_stays(overwrite, tmp_path):
         Image.fromarray(picture).save(tmp_path / "images" / f"{i}.png")
     with pytest.raises(InputError, match="wanted a folder that does not hold the photos"):
         estimate(tmp_path / "images", tmp_path, overwrite)
+    with pytest.raises(InputError, match="outside the photos"):
+        estimate(tmp_path / "images", tmp_path / "images" / "capture")
     assert len(list((tmp_path / "images").iterdir())) == 2
 
 
@@ -140,95 +146,87 @@ def test_pictures_without_overlap_are_refused_and_leave_no_capture(tmp_path):
     (tmp_path / "in").mkdir()
     for i in range(4):
         Image.fromarray(rng.integers(0, 255, (60, 80, 3), dtype=np.uint8)).save(tmp_path / "in" / f"{i}.png")
-    with pytest.raises(InputError, match=r"got 0 of 4; take pictures"):
-        estimate(tmp_path / "in", tmp_path / "out")
+    for _ in range(2):  # and again, from what is there
+        with pytest.raises(InputError, match=r"got 0 of 4; take pictures"):
+            estimate(tmp_path / "in", tmp_path / "out")
     assert not (tmp_path / "out" / "transforms.json").exists()
-    with pytest.raises(InputError, match=r"got 0 of 4"):  # and again, from what is there
-        estimate(tmp_path / "in", tmp_path / "out")
     assert json.loads((tmp_path / "out" / "poses.json").read_text())["names"] == [f"{i}.png" for i in range(4)]
 
 
 def test_sources_that_hold_no_pictures_are_refused(tmp_path):
     (tmp_path / "clip.mp4").write_bytes(b"no video")
     (tmp_path / "notes.txt").write_text("")
-    for name, words in [
-        ("clip.mp4", "cannot be decoded"),
-        ("notes.txt", "'notes.txt'"),
-        ("nowhere", "nothing of that name"),
-        (".", "fewer than two images"),
-    ]:
+    out = tmp_path.parent / f"{tmp_path.name}-out"
+    sources = {"clip.mp4": "cannot be decoded", "notes.txt": "'notes.txt'", "nowhere": "nothing of that name"}
+    for name, words in (sources | {".": "fewer than two images"}).items():
         with pytest.raises(InputError, match=words):
-            estimate(tmp_path / name, tmp_path.parent / f"{tmp_path.name}-out")
-    assert not (tmp_path.parent / f"{tmp_path.name}-out").exists()
+            estimate(tmp_path / name, out)
+    assert not out.exists() or not any(out.iterdir())
 
 
 def test_missing_packages_are_named_with_the_command(photos, tmp_path, monkeypatch):
-    monkeypatch.setattr(requirements.importlib, "import_module", lambda name: exec("raise ImportError"))
+    monkeypatch.setattr(sfm.importlib, "import_module", lambda name: exec("raise ImportError"))
     with pytest.raises(InputError, match=r'pycolmap.*not installed; run: pip install -e "\.\[poses\]"'):
         estimate(photos, tmp_path / "out")
     assert not Path(tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("name", ["sparse/0/cameras.txt", "transforms.json", "database.db", "images/1.png"])
-def test_files_of_another_maker_are_left_alone(name, photos, tmp_path):
+@pytest.mark.parametrize("text", [None, '{"poses": []}', "[1]", '{"request": "mine"}', "no JSON"])
+def test_files_of_another_maker_are_left_alone(name, text, photos, tmp_path):
+    """Without a poses.json, or with one that is not ours."""
     held = tmp_path / "capture" / name
     held.parent.mkdir(parents=True)
     held.write_text("mine")
+    if text is not None:
+        (tmp_path / "capture" / "poses.json").write_text(text)
     for overwrite in (False, True):
-        with pytest.raises(InputError, match="of another maker"):
+        with pytest.raises(InputError, match=r"of another maker.*another --out"):
             estimate(photos, tmp_path / "capture", overwrite)
     assert held.read_text() == "mine"
-
-
-@pytest.mark.parametrize("text", ['{"poses": []}', "[1]", '{"request": "mine"}', "no JSON"])
-def test_overwrite_removes_nothing_of_another_maker(text, photos, tmp_path):
-    (tmp_path / "images").mkdir()
-    for name in ("poses.json", "transforms.json", "images/1.png"):
-        (tmp_path / name).write_text(text)
-    with pytest.raises(InputError, match=r"poses\.json.*of another maker.*another --out"):
-        estimate(photos, tmp_path, overwrite=True)
-    for name in ("poses.json", "transforms.json", "images/1.png"):
-        assert (tmp_path / name).read_text() == text
 
 
 def test_other_pixels_in_as_many_bytes_are_another_request(tmp_path):
     Image.new("RGB", (40, 30), (10, 20, 30)).save(tmp_path / "1.bmp")
     Image.new("RGB", (40, 30)).save(tmp_path / "2.bmp")
-    before, size = _request(tmp_path, PoseOptions()), (tmp_path / "1.bmp").stat().st_size
+    before = _request(tmp_path, PoseOptions())
     assert _request(tmp_path, PoseOptions()) == before
     Image.new("RGB", (40, 30), (10, 20, 31)).save(tmp_path / "1.bmp")
-    assert (tmp_path / "1.bmp").stat().st_size == size
     after = _request(tmp_path, PoseOptions())
     assert [name for name in before if after[name] != before[name]] == ["digest"]
 
 
-def test_a_call_killed_among_its_images_continues(photos, estimated, tmp_path, monkeypatch):
-    killed = tmp_path / "capture"
-    with monkeypatch.context() as patched:
-        patched.setattr("ssplat_jax.poses.estimate.write_json", _only_once(write_json))
-        with pytest.raises(MemoryError):
-            estimate(photos, killed)
-    assert (killed / "images").is_dir()
-    found, wanted = estimate(photos, killed), estimated[1]
-    assert (found.names, found.parts) == (wanted.names, wanted.parts)
-    assert found.num_points == pytest.approx(wanted.num_points, rel=0.05)  # COLMAP's threads decide about a few
+def test_neighbors_are_matched_at_small_and_doubling_distances():
+    gaps = {b - a for a, b in neighbor_pairs(100)}
+    assert gaps == {*range(1, OVERLAP + 1), 16, 32, 64}
+    pairs = neighbor_pairs(40)
+    assert len(set(pairs)) == len(pairs) and all(0 <= a < b < 40 for a, b in pairs)
+    assert {(39 - gap, 39) for gap in range(1, OVERLAP + 1)} <= set(pairs)
 
 
-def _only_once(function):
-    """`function`, which the second time ends as a kill does: nothing after it happens."""
-    calls = iter((function,))
+def test_images_of_the_same_place_are_alike():
+    """Two walks past ten places: the partner of an image is that of the same place in the other walk."""
+    rng = np.random.default_rng(0)
+    places = [rng.uniform(0, 255, (30, 128)) for _ in range(10)]
+    walks = [place + rng.normal(0, 8, place.shape) for _ in range(2) for place in places]
+    descriptors = [walk.astype(np.float32) for walk in walks]
+    assert sorted(alike_pairs(descriptors, 1)) == [(i, i + 10) for i in range(10)]
+    descriptors[13] = np.zeros((0, 128), np.float32)  # an image without features
+    pairs = alike_pairs(descriptors, 1)
+    assert all(13 not in pair for pair in pairs) and (2, 12) in pairs
+    assert alike_pairs(descriptors[13:15], 5) == set()
 
-    def call(*arguments):
-        try:
-            next(calls)(*arguments)
-        except StopIteration:
-            raise MemoryError from None
 
-    return call
+def found(*parts, error=0.62):
+    return Findings(NAMES, tuple(tuple(NAMES[i] for i in part) for part in parts), error, 12345).sentences()
 
 
-def test_a_source_without_images_leaves_no_record(tmp_path):
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(InputError):
-        estimate(tmp_path / "empty", tmp_path / "capture")
-    assert not (tmp_path / "capture" / "poses.json").exists()
+def test_findings_name_what_is_missing():
+    assert found(range(120)) == ["registered 120 of 120 images, median reprojection error 0.6 px, 12,345 points"]
+    assert found([*range(50), *range(52, 119)])[1:] == ["without a pose: 50.jpg to 51.jpg, 119.jpg"]
+    assert "fish-eye" in found(range(120), error=2.5)[-1]
+    assert ranges(NAMES, [NAMES[i] for i in range(0, 20, 2)]).endswith("10.jpg and 4 more")
+    # Images that two parts share belong to the larger one; parts of two images are chance.
+    lines = found(range(70), range(65, 100), range(100, 110), (118, 119))
+    assert "30 images (70.jpg to 99.jpg); 10 images (100.jpg to 109.jpg)." in lines[1]
+    assert lines[2] == "without a pose: 110.jpg to 119.jpg" and "overlap" in lines[3]
