@@ -13,8 +13,6 @@ import time
 from collections.abc import MutableMapping
 from pathlib import Path
 
-from ssplat_jax.core.cpu_backend import num_cores
-
 SWITCH = "SSPLAT_PROGRAM_CACHE"
 """Environment variable: `off`, or a folder in place of the user's cache folder."""
 
@@ -58,6 +56,11 @@ def drop_newest(seconds: float) -> None:
             for file in _our_folder.glob("*-cache"):
                 if time.time() - file.stat().st_mtime < seconds:
                     file.unlink(missing_ok=True)
+
+
+def num_cores() -> int:
+    """As `core.cpu_backend.num_cores`, which imports JAX: it would read its variables before they are set here."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _users_cache() -> Path:
