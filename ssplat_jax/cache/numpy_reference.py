@@ -247,7 +247,7 @@ def _revise(points: list, views: list[tuple]) -> float:
     """Revises the confidences of the points in place, by the cells of (viewmat, K, log depths, nearest, weights)."""
     votes, margins = {id(p): 0.0 for p in points}, [math.inf]
     for viewmat, K, ell, nearest, weights in views:
-        for cell, pairs in _on_pixels(points, viewmat, K, *ell.shape, margins).items():
+        for cell, pairs in _on_pixels(points, viewmat, K, len(ell), ell.shape[1], margins).items():
             if ell[cell] == -math.inf:
                 continue
             for own, point in pairs:
@@ -272,7 +272,7 @@ def observe(cache: dict, viewmats, Ks, depths, confidences, colors, config: Stre
     tau = np.float32(config.memory.min_confidence)
     for viewmat, K, depth, confidence, color in zip(viewmats, Ks, depths, confidences, colors, strict=True):
         ell = _trusted_log_depths(depth, confidence, config)
-        for cell, pairs in _on_pixels(pivots, viewmat, K, *ell.shape, margins).items():
+        for cell, pairs in _on_pixels(pivots, viewmat, K, len(ell), ell.shape[1], margins).items():
             if ell[cell] == -math.inf:
                 continue
             seen = []

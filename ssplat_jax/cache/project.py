@@ -214,7 +214,8 @@ def rows_in_sight(cache: VoxelCache, camera: Camera, *, min_confidence: float = 
 
     def mark(i, marks):
         pivots = (cache.means, cache.confidences, cache.counts)
-        pairs = _pairs(*(jax.lax.dynamic_slice_in_dim(x, i * block, block) for x in pivots), camera, min_confidence)
+        means, confidences, counts = (jax.lax.dynamic_slice_in_dim(x, i * block, block) for x in pivots)
+        pairs = _pairs(means, confidences, counts, camera, min_confidence)
         is_seen = (pairs.weights > 0).reshape(len(camera.viewmats), block, -1).any(axis=(0, 2))
         return jax.lax.dynamic_update_slice_in_dim(marks, is_seen, i * block, axis=0)
 
