@@ -1,5 +1,5 @@
-"""Camera poses by COLMAP (`pycolmap`, extra `poses`): estimated from a video or photos, or adjusted near given ones.
+"""Camera poses: estimated by COLMAP (`pycolmap`, extra `poses`) from a video or photos, or adjusted near given ones.
 
 video | folder of photos -> gather_images -> sfm -> estimate: a capture, resumed where it stopped
-frames, given poses -> sfm -> adjust_poses: the capture with poses that fit its images
+frames, given poses -> tracks -> bundle_adjustment -> adjust_poses: the capture with poses that fit its images
 """

@@ -190,23 +190,17 @@ def _refined(model: Any) -> Any:
         camera.params = [f, f, cx, cy, k1, k2, 0.0, 0.0]
     if model.num_reg_images() >= MIN_FREE_IMAGES:
         free = copy.deepcopy(model)
-        bundle_adjust(free, pycolmap.BundleAdjustmentOptions(refine_principal_point=True, print_summary=False))
+        config = pycolmap.BundleAdjustmentConfig()
+        for key in free.reg_image_ids():
+            config.add_image(key)
+        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+        options = pycolmap.BundleAdjustmentOptions(refine_principal_point=True, print_summary=False)
+        pycolmap.create_default_bundle_adjuster(options, config, free).solve()
         cameras = [(c.params[:2], c.params[2:4] / [c.width, c.height]) for c in free.cameras.values()]
         if all(abs(f[0] / f[1] - 1) <= MAX_ASPECT and max(abs(c - 0.5)) <= MAX_CENTER_SHIFT for f, c in cameras):
             model = free
     model.update_point_3d_errors()
     return model
-
-
-def bundle_adjust(model: Any, options: Any) -> None:
-    """Bundle adjustment of a model; two cameras fix its frame."""
-    pycolmap = require("pycolmap")
-    config = pycolmap.BundleAdjustmentConfig()
-    for key in model.reg_image_ids():
-        config.add_image(key)
-    if options.refine_rig_from_world:
-        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    pycolmap.create_default_bundle_adjuster(options, config, model).solve()
 
 
 def _cancellable(function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:

@@ -13,7 +13,7 @@ from ssplat_jax.core.console import Reporter
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.poses import sfm
-from ssplat_jax.poses.estimate import Findings, PoseOptions, _request, estimate_poses, ranges
+from ssplat_jax.poses.estimate import Findings, PoseOptions, estimate_poses, ranges
 from ssplat_jax.poses.sfm import OVERLAP, alike_pairs, neighbor_pairs
 from ssplat_jax.storage.files import write_json
 from tests.poses.room_fixture import FOCAL, K, pictures, walk
@@ -184,16 +184,6 @@ def test_files_of_another_maker_are_left_alone(name, text, photos, tmp_path):
         with pytest.raises(InputError, match=r"of another maker.*another --out"):
             estimate(photos, tmp_path / "capture", overwrite)
     assert held.read_text() == "mine"
-
-
-def test_other_pixels_in_as_many_bytes_are_another_request(tmp_path):
-    Image.new("RGB", (40, 30), (10, 20, 30)).save(tmp_path / "1.bmp")
-    Image.new("RGB", (40, 30)).save(tmp_path / "2.bmp")
-    before = _request(tmp_path, PoseOptions())
-    assert _request(tmp_path, PoseOptions()) == before
-    Image.new("RGB", (40, 30), (10, 20, 31)).save(tmp_path / "1.bmp")
-    after = _request(tmp_path, PoseOptions())
-    assert [name for name in before if after[name] != before[name]] == ["digest"]
 
 
 def test_neighbors_are_matched_at_small_and_doubling_distances():

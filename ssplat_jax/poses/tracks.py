@@ -1,0 +1,177 @@
+"""Tracks: places of one point in several posed images, from SIFT keypoints matched near their epipolar lines.
+
+    keypoints of each image -> pairs of cameras that look alike -> matches -> tracks, the surest matches first
+
+Reference: Lowe, Distinctive Image Features from Scale-Invariant Keypoints, IJCV 2004.
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int
+from skimage.feature import SIFT
+
+from ssplat_jax.data.sparse_matches import (
+    PosedImages,
+    epipolar_distances,
+    gray_image,
+    motion_between,
+    mutual_nearest,
+    pixel_rays,
+)
+
+LONG_SIDE = 640
+"""Longer side of the working image in pixels; larger images are reduced."""
+MIN_SIDE = 16
+"""Shortest side of a working image in pixels: SIFT needs some octaves."""
+NUM_PARTNERS = 8
+"""Cameras that each camera is matched with: those most like it."""
+MAX_AXIS_DEGREES = 40.0
+"""Largest angle between the optical axes of a pair."""
+DEGREES_OF_DEPTH = 60.0
+"""Angle between axes that makes cameras as unlike as a distance of one median depth does."""
+MAX_EPIPOLAR_DEGREES = 1.6
+"""Largest distance of a match from its epipolar line: poses may be wrong by that much."""
+MAX_DISTANCE, MAX_RATIO = 0.7, 0.8
+"""Largest distance between the descriptors of a match, whose length is 1, and its ratio to the second smallest."""
+MIN_MATCHES = 10
+"""Fewest matches of a pair; fewer are mostly false."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class SiftKeypoints:
+    """SIFT keypoints of an image."""
+
+    pixels: Float64[np.ndarray, "n 2"]  # in the delivered image
+    descriptors: Float32[np.ndarray, "n 128"]  # of length 1
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Tracks:
+    """Observations of `p` points by cameras; a camera sees a point at most once."""
+
+    views: Int[np.ndarray, " n"]
+    points: Int[np.ndarray, " n"]  # all numbers from 0 to p - 1 occur, each at least twice
+    pixels: Float64[np.ndarray, "n 2"]
+
+
+def find_tracks(
+    capture: PosedImages,
+    indices: Sequence[int],
+    depth: float,
+    advance: Callable[[int], None] = lambda done: None,
+) -> Tracks:
+    """Tracks through the frames `indices`, whose positions in `indices` are the numbers of the views.
+
+    Args:
+        capture: the frames.
+        indices: those to use.
+        depth: median depth of the scene, in capture units.
+        advance: called with the number of frames whose keypoints are found.
+    """
+    found = []
+    for done, i in enumerate(indices):
+        found.append(sift_keypoints(capture.image(i)))
+        advance(done + 1)
+    poses = np.stack([capture.frames[i].camtoworld for i in indices])
+    matches = [_match(capture, indices, pair, found) for pair in alike_cameras(poses, depth)]
+    return merged_tracks([len(keypoints.pixels) for keypoints in found], matches, [k.pixels for k in found])
+
+
+def sift_keypoints(image: Float32[np.ndarray, "h w 3"]) -> SiftKeypoints:
+    """Returns the SIFT keypoints of an image; there are none if it is tiny or has no structure."""
+    height, width = image.shape[:2]
+    nothing = SiftKeypoints(np.zeros((0, 2)), np.zeros((0, 128), np.float32))
+    shrink = max(1.0, max(height, width) / LONG_SIDE)
+    size = (round(width / shrink), round(height / shrink))
+    if min(size) < MIN_SIDE:
+        return nothing
+    detector: Any = SIFT()
+    try:
+        detector.detect_and_extract(gray_image(image, size))
+    except RuntimeError:  # skimage raises it for an image without keypoints
+        return nothing
+    pixels = (detector.keypoints[:, ::-1] + 0.5) * np.array([width / size[0], height / size[1]])
+    descriptors = detector.descriptors.astype(np.float32)
+    return SiftKeypoints(pixels, descriptors / np.maximum(np.linalg.norm(descriptors, axis=1, keepdims=True), 1e-9))
+
+
+def alike_cameras(camtoworlds: Float64[np.ndarray, "v 4 4"], depth: float) -> list[tuple[int, int]]:
+    """Pairs of each camera with the `NUM_PARTNERS` that are most like it in place and direction.
+
+    Args:
+        camtoworlds: poses with OpenCV axes.
+        depth: the distance that counts as much as `DEGREES_OF_DEPTH`, in the unit of the poses.
+    """
+    centers, axes = camtoworlds[:, :3, 3], camtoworlds[:, :3, 2]
+    pairs = set()
+    for i in range(len(camtoworlds)):
+        angles = np.degrees(np.arccos(np.clip(axes @ axes[i], -1.0, 1.0)))
+        unlike = np.linalg.norm(centers - centers[i], axis=1) / depth + angles / DEGREES_OF_DEPTH
+        unlike[angles > MAX_AXIS_DEGREES], unlike[i] = np.inf, np.inf
+        for j in np.argsort(unlike, kind="stable")[:NUM_PARTNERS]:
+            if np.isfinite(unlike[j]):
+                pairs.add((min(i, int(j)), max(i, int(j))))
+    return sorted(pairs)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Matches:
+    """Matches of a pair of views."""
+
+    views: tuple[int, int]
+    keypoints: Int[np.ndarray, "n 2"]  # of the first and the second view
+    distances: Float32[np.ndarray, " n"]  # between descriptors
+
+
+def _match(
+    capture: PosedImages, indices: Sequence[int], pair: tuple[int, int], found: Sequence[SiftKeypoints]
+) -> Matches:
+    """Matches near epipolar lines, which leave a few candidates each."""
+    (i, j), (a, b) = (indices[v] for v in pair), (found[v] for v in pair)
+    nothing = Matches(pair, np.zeros((0, 2), np.int64), np.zeros(0, np.float32))
+    if not (len(a.pixels) and len(b.pixels)):
+        return nothing
+    R, t = motion_between(capture.frames[i].camtoworld, capture.frames[j].camtoworld)
+    lines = epipolar_distances(pixel_rays(capture.K(i), a.pixels), pixel_rays(capture.K(j), b.pixels), R, t)
+    apart = np.sqrt(np.maximum(2 - 2 * a.descriptors @ b.descriptors.T, 0.0))
+    apart = np.where(lines < np.radians(MAX_EPIPOLAR_DEGREES), apart, 2.0)
+    rows, columns = mutual_nearest(apart, MAX_DISTANCE, MAX_RATIO)
+    if len(rows) < MIN_MATCHES:
+        return nothing
+    return Matches(pair, np.stack([rows, columns], axis=1), apart[rows, columns])
+
+
+def merged_tracks(
+    counts: Sequence[int], matches: Sequence[Matches], pixels: Sequence[Float64[np.ndarray, "_ 2"]]
+) -> Tracks:
+    """Tracks of the matches. The surest match comes first; one that would show a camera a point twice is left out.
+
+    Args:
+        counts: keypoints of each view.
+        matches: matches of pairs of views.
+        pixels: places of the keypoints of each view.
+    """
+    starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+    ends = [match.keypoints + starts[list(match.views)] for match in matches if len(match.keypoints)]
+    if not ends:
+        return Tracks(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)))
+    order = np.argsort(np.concatenate([m.distances for m in matches if len(m.keypoints)]), kind="stable")
+    view = np.repeat(np.arange(len(counts)), counts)
+    track, members, seen_by = list(range(len(view))), [[i] for i in range(len(view))], [{v} for v in view.tolist()]
+    for a, b in np.concatenate(ends)[order].tolist():
+        a, b = track[a], track[b]
+        if a == b or not seen_by[a].isdisjoint(seen_by[b]):
+            continue
+        if len(members[a]) < len(members[b]):
+            a, b = b, a
+        for i in members[b]:
+            track[i] = a
+        members[a] += members[b]
+        seen_by[a] |= seen_by[b]
+    numbers = np.array(track)
+    used = np.flatnonzero(np.bincount(numbers, minlength=len(numbers))[numbers] > 1)
+    _, points = np.unique(numbers[used], return_inverse=True)
+    return Tracks(views=view[used], points=points, pixels=np.concatenate(pixels)[used])

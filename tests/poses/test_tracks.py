@@ -1,0 +1,66 @@
+"""Tracks: keypoints that follow the image, pairs of cameras, and matches that are merged without contradictions."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from ssplat_jax.poses.tracks import Matches, alike_cameras, merged_tracks, sift_keypoints
+from tests.poses.room_fixture import pictures, walk
+
+
+def test_keypoints_follow_the_image():
+    image = pictures(walk(1))[0].astype(np.float32) / 255
+    first, shifted = sift_keypoints(image), sift_keypoints(np.roll(image, (8, 16), (0, 1)))
+    apart = np.linalg.norm(first.pixels[:, None] + [16, 8] - shifted.pixels[None], axis=-1)
+    is_inside = ((first.pixels > 30) & (first.pixels < np.array([160, 120]) - 40)).all(axis=1)
+    assert is_inside.sum() > 20
+    assert np.mean(apart.min(axis=1)[is_inside] < 0.1) > 0.9
+
+
+def test_keypoints_of_a_large_image_are_in_its_own_pixels():
+    image = pictures(walk(1))[0].astype(np.float32) / 255
+    large = np.kron(image, np.ones((8, 8, 1), np.float32))  # 1280 wide: reduced to 640
+    small, found = sift_keypoints(image), sift_keypoints(large)
+    apart = np.linalg.norm(8 * small.pixels[:, None] - found.pixels[None], axis=-1).min(axis=1)
+    assert np.median(apart) < 8.0
+
+
+@pytest.mark.parametrize("image", [np.zeros((48, 64, 3)), np.zeros((12, 64, 3)), np.full((48, 64, 3), 0.5)])
+def test_images_without_structure_have_no_keypoints(image):
+    assert sift_keypoints(image.astype(np.float32)).pixels.shape == (0, 2)
+
+
+def test_pairs_are_the_nearest_cameras_that_look_the_same_way():
+    poses = np.tile(np.eye(4), (30, 1, 1))
+    poses[:, 0, 3] = np.arange(30) * 0.1
+    poses[29, :3, :3] = Rotation.from_euler("y", 90, degrees=True).as_matrix()
+    pairs = alike_cameras(poses, depth=1.0)
+    assert all(i < j for i, j in pairs) and len(set(pairs)) == len(pairs)
+    assert {(10, 11), (10, 12), (10, 13), (10, 14)} <= set(pairs)
+    assert (10, 20) not in pairs
+    assert not any(29 in pair for pair in pairs)
+
+
+def merged(*matches, counts=(3, 3, 3)):
+    pixels = [np.stack([np.arange(count), np.full(count, view)], 1).astype(float) for view, count in enumerate(counts)]
+    found = [Matches(views, np.array(rows), np.array(sure, np.float32)) for views, rows, sure in matches]
+    tracks = merged_tracks(counts, found, pixels)
+    return {
+        frozenset((int(v), int(pixel[0])) for v, pixel in zip(tracks.views[rows], tracks.pixels[rows], strict=True))
+        for rows in (tracks.points == p for p in range(tracks.points.max() + 1 if tracks.points.size else 0))
+    }
+
+
+def test_matches_are_chained():
+    found = merged(((0, 1), [[0, 1]], [0.1]), ((1, 2), [[1, 2]], [0.1]))
+    assert found == {frozenset({(0, 0), (1, 1), (2, 2)})}
+
+
+def test_a_match_that_would_show_a_camera_a_point_twice_is_left_out_the_less_sure_one():
+    chain = ((0, 1), [[0, 1]], [0.1]), ((1, 2), [[1, 2]], [0.2])
+    assert merged(*chain, ((0, 2), [[1, 2]], [0.3])) == {frozenset({(0, 0), (1, 1), (2, 2)})}
+    assert merged(*chain, ((0, 2), [[1, 2]], [0.15])) == {frozenset({(0, 0), (1, 1)}), frozenset({(0, 1), (2, 2)})}
+
+
+def test_no_matches_are_no_tracks():
+    assert merged() == set()
