@@ -2,6 +2,7 @@
 
 import os
 from fractions import Fraction
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -165,7 +166,7 @@ def test_motion_adds_up_at_any_speed_and_noise_is_none(speed, monkeypatch):
     rng = np.random.default_rng(1)
     noisy = [view(speed * i + 50) + rng.normal(0, 0 if speed else 3, (HEIGHT, WIDTH)) for i in range(60)]
     monkeypatch.setattr(gather_images, "_frames", lambda path: map(Played, noisy))
-    motion, _ = scan_video("any", lambda done: None)
+    motion, _ = scan_video(Path("any"), lambda done: None)
     assert motion[0] == 0 and (np.diff(motion) >= 0).all()
     # Whole pixels: off by one at the last key frame at most, and by rounding at each key frame.
     assert motion[-1] * WIDTH == pytest.approx(speed * 59, rel=0.12, abs=1.5)
