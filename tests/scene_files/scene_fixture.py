@@ -1,4 +1,4 @@
-"""Small random scenes, cameras in front of them, and the PSNR between two images."""
+"""Small random scenes, and cameras in front of them."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -41,8 +41,3 @@ def camera(x: float = 0.0) -> Camera:
     """Camera near the origin that looks along +z."""
     viewmat = jnp.eye(4).at[0, 3].set(x)
     return Camera(viewmats=viewmat, Ks=jnp.array([[40.0, 0, 24], [0, 40, 16], [0, 0, 1]]), width=48, height=32)
-
-
-def decibels(a, b) -> float:
-    """PSNR between two images."""
-    return float(-10 * np.log10(np.mean((np.asarray(a, np.float64) - np.asarray(b, np.float64)) ** 2) + 1e-20))

@@ -6,7 +6,6 @@ import io
 import itertools
 import json
 import math
-import os
 import random
 import struct
 import zipfile
@@ -18,7 +17,7 @@ from PIL import Image
 from scipy.spatial import KDTree
 
 import ssplat_jax as ss
-from ssplat_jax.core.errors import InputError, StorageError
+from ssplat_jax.core.errors import InputError
 from ssplat_jax.core.gaussians import SH_C0, Gaussians
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.rasterizer.outputs import sh_basis
@@ -173,26 +172,18 @@ def test_files_cut_off_or_damaged_are_refused_or_finite(tmp_path, suffix):
         bad.write_bytes(data[:size])
         with pytest.raises(InputError):
             ss.load_scene(bad)
+    for _ in range(20 if suffix in (".spz", ".sog") else 0):  # gzip and zip hold checksums
+        mutant = bytearray(data)
+        mutant[rng.randrange(len(data) // 4, len(data) // 2)] ^= 1 << rng.randrange(8)
+        bad.write_bytes(mutant)
+        with pytest.raises(InputError):
+            ss.load_scene(bad)
     Image.fromarray(np.zeros((5, 5, 3), np.uint8)).save(tmp_path / "image.png")
     bad.write_bytes((tmp_path / "image.png").read_bytes())
     with pytest.raises(InputError):
         ss.load_scene(bad)
     with pytest.raises(InputError, match="cannot be read"):
         ss.load_scene(tmp_path / f"missing{suffix}")
-
-
-def test_a_flipped_bit_of_a_checked_format_is_refused(tmp_path):
-    rng = random.Random(0)
-    for suffix in (".spz", ".sog"):  # gzip and zip hold checksums
-        path = tmp_path / f"a{suffix}"
-        save_gaussians(path, scene_for())
-        data = path.read_bytes()
-        for _ in range(20):
-            mutant = bytearray(data)
-            mutant[rng.randrange(len(data) // 4, len(data) // 2)] ^= 1 << rng.randrange(8)
-            path.write_bytes(mutant)
-            with pytest.raises(InputError):
-                ss.load_scene(path)
 
 
 @pytest.mark.parametrize("terms", [0, 2, 3, 25])
@@ -202,20 +193,6 @@ def test_sh_of_no_degree_that_files_hold_is_refused(tmp_path, terms):
         with pytest.raises(InputError, match=f"1, 4, 9 or 16 terms for each Gaussian, got {terms}"):
             save_gaussians(tmp_path / f"a{suffix}", spoiled)
     assert not any(tmp_path.iterdir())
-
-
-def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch):
-    path = tmp_path / "a.ply"
-    ss.save_ply(path, scene(0))
-    before = path.read_bytes()
-
-    def no_space(descriptor):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(os, "fsync", no_space)
-    with pytest.raises(StorageError, match=r"a\.ply.*No space left"):
-        ss.save_ply(path, scene(3))
-    assert path.read_bytes() == before and os.listdir(tmp_path) == ["a.ply"]
 
 
 def test_an_unknown_render_mode_is_refused(tmp_path):

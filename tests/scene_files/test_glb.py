@@ -10,10 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.core.gaussians import Gaussians
-from ssplat_jax.core.pytree import replace
-from ssplat_jax.rasterizer import render
+from ssplat_jax.rasterizer.outputs import sh_basis
 from ssplat_jax.scene_files.formats import load_scene, save_gaussians
-from tests.scene_files.scene_fixture import camera, decibels, scene
+from tests.scene_files.scene_fixture import scene
 
 PREFIX = "KHR_gaussian_splatting:"
 TURN = Rotation.from_rotvec([0.4, -1.1, 0.7])
@@ -65,16 +64,16 @@ def test_nodes_turn_move_and_scale_gaussians_with_their_sh(glb, is_nested):
         glb.document["nodes"] = [{"matrix": matrix.T.ravel().tolist(), "children": [1]}, {"mesh": 0}]
     else:
         glb.document["nodes"] = [node | {"mesh": 0}]
-    found = glb.read()
-    # The camera that sees the scene of the node as `view` sees the written one.
-    to_scene = np.eye(4)
-    to_scene[:3, :3], to_scene[:3, 3] = FLIP @ TURN.as_matrix() * SCALE, FLIP @ SHIFT
-    for view in (camera(), camera(0.4)):
-        viewmat = np.asarray(view.viewmats, np.float64) @ np.linalg.inv(to_scene)
-        viewmat[:3] *= SCALE  # lengths are larger by this factor everywhere, which no image shows
-        drawn = render(scene(3, n=100), view).color
-        assert float(drawn.std()) > 0.05
-        assert decibels(drawn, render(found, replace(view, viewmats=jnp.asarray(viewmat, jnp.float32))).color) >= 60
+    found, once, turn = glb.read(), scene(3, n=100), FLIP @ TURN.as_matrix()
+    np.testing.assert_allclose(found.means, np.asarray(once.means) @ (SCALE * turn).T + FLIP @ SHIFT, atol=1e-5)
+    axes = [Rotation.from_quat(g.quats, scalar_first=True).as_matrix() * g.scales[:, None] for g in (found, once)]
+    covariances = [np.asarray(a @ a.transpose(0, 2, 1)) for a in axes]
+    np.testing.assert_allclose(covariances[0], SCALE**2 * turn @ covariances[1] @ turn.T, atol=1e-5)
+    directions = np.random.default_rng(0).normal(size=(40, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    basis = [np.asarray(sh_basis(jnp.asarray(d, jnp.float32), 3)) for d in (directions @ turn.T, directions)]
+    colors = [np.einsum("dk,nkc->dnc", b, g.sh) for b, g in zip(basis, (found, once), strict=True)]
+    np.testing.assert_allclose(*colors, atol=1e-4)
 
 
 def test_meshes_of_several_nodes_are_one_scene(glb):
@@ -122,19 +121,15 @@ def test_a_rotation_that_is_not_finite_is_refused(glb, is_turned):
 
 BAD = {
     "stretched": (lambda d: d["nodes"][0].update(scale=[1, 2, 1]), "stretches"),
-    "mirrored": (lambda d: d["nodes"][0].update(scale=[-1, 1, 1]), "stretches"),
     "its own child": (lambda d: d["nodes"][0].update(children=[0]), "two parents"),
-    "no such mesh": (lambda d: d["nodes"][0].update(mesh=7), "IndexError"),
     "no extension": (lambda d: (d.pop("extensionsUsed"), d["meshes"][0]["primitives"][0].pop("extensions")), "none"),
     "compressed": (lambda d: d["meshes"][0]["primitives"][0].update(attributes={}), "compressed"),
     "sparse": (lambda d: d["accessors"][0].update(sparse={}), "sparse"),
     "count too large": (lambda d: d["accessors"][0].update(count=10**9), "beyond its buffer"),
     "negative offset": (lambda d: d["bufferViews"][0].update(byteOffset=-8), "beyond its buffer"),
-    "zero stride": (lambda d: d["bufferViews"][0].update(byteStride=0), "beyond its buffer"),
     "different lengths": (lambda d: d["accessors"][2].update(count=99), "different lengths"),
     "unknown component": (lambda d: d["accessors"][0].update(componentType=1), "KeyError"),
     "outside": (lambda d: d["buffers"][0].update(uri="../../etc/passwd"), "outside"),
-    "a number of nodes": (lambda d: d.update(nodes=7), "TypeError"),
     "no asset": (lambda d: d.pop("asset"), "asset"),
     "no finite offset": (lambda d: d["asset"]["extras"].update(offset=[0, float("inf"), 0]), "offset"),
 }
