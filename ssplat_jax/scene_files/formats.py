@@ -5,7 +5,7 @@ import os
 import struct
 import zipfile
 import zlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection
 from pathlib import Path
 
 import numpy as np
@@ -61,11 +61,11 @@ class ExportReport:
         return f"{far} {[float(x) for x in self.offset]}." if any(self.offset) else None
 
 
-def check_format(path: FilePath, option: str = "--to", formats: Iterable[str] = WRITERS) -> str:
+def check_format(path: FilePath, option: str = "--to", formats: Collection[str] = WRITERS) -> str:
     """The end of a file's name, which must be one of `formats`."""
     name = Path(path).name
     # Nothing writes a .compressed.ply, though its name ends with .ply.
-    suffix = next((suffix for suffix in (".compressed.ply", *READERS, *WRITERS) if name.endswith(suffix)), None)
+    suffix = next((suffix for suffix in (".compressed.ply", *READERS, *WRITERS) if name.endswith(suffix)), "")
     if suffix not in formats:
         raise refusal(option, wanted=f"a file named *{', *'.join(formats)}", got=repr(name), fix="choose one of these")
     return suffix

@@ -13,6 +13,7 @@ Reference: github.com/KhronosGroup/glTF, extensions/2.0/Khronos/KHR_gaussian_spl
 import json
 import struct
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
@@ -95,7 +96,7 @@ def decode_glb(data: bytes) -> SplatRows:
     document, buffer = json.loads(data[20 : 20 + size]), data[28 + size :]
     nodes = document.get("scenes", [{}])[document.get("scene", 0)].get("nodes", [])
     empty = {"means": (0, 3), "quats": (0, 4), "log_scales": (0, 3), "opacities": (0,), "sh": (0, 1, 3)}
-    parts = [{name: np.zeros(shape) for name, shape in empty.items()}]
+    parts: list[dict[str, Any]] = [{name: np.zeros(shape) for name, shape in empty.items()}]
     for primitive, transform in _primitives(document, nodes, np.eye(4), set()):
         parts.append(_placed(_columns(document, buffer, primitive), AXIS_FLIP @ transform[:3]))
     if len(parts) == 1 and EXTENSION not in document.get("extensionsUsed", []):

@@ -3,6 +3,8 @@
 The package `plyfile` reads these too, but under the GPL, so it serves the tests alone.
 """
 
+from typing import Any
+
 import numpy as np
 
 MAX_HEADER_BYTES = 1 << 16  # headers of splat files take a few kilobytes
@@ -22,13 +24,13 @@ def read_tables(data: bytes) -> tuple[dict[str, Columns], list[str]]:
         raise ValueError("wanted a header from 'ply' to 'end_header'")
     form, elements, comments = _parse_header(data[:end].decode("ascii", "replace").splitlines()[1:])
     is_ascii, offset = form == "ascii", 0
-    body = data[newline + 1 :].split() if is_ascii else memoryview(data)[newline + 1 :]
+    body: Any = data[newline + 1 :].split() if is_ascii else memoryview(data)[newline + 1 :]
     tables: dict[str, Columns] = {}
     for name, (count, properties) in elements.items():
         if LIST in properties.values() or not properties:
             break
         row = np.dtype([(key, BYTE_ORDERS[form] + code) for key, code in properties.items()])
-        size = count * (len(row) if is_ascii else row.itemsize)
+        size = count * (len(properties) if is_ascii else row.itemsize)
         # Compared before anything is allocated: a damaged count can be anything.
         if offset + size > len(body):
             raise ValueError(f"{count} rows of the element {name} do not fit; it is cut off")
