@@ -97,7 +97,7 @@ def add_view(
     held_back = held_back_pixels(black.shape[:2], slot, config)
     learned = ~held_back[..., None]
     clipped = lambda error: jnp.where(learned, jnp.clip(error / CLIPPED_ERROR, -1.0, 1.0), 0.0)  # noqa: E731
-    told = [jnp.ones(black.shape[:2]), jnp.abs(black).mean(axis=-1), clipped(black).mean(axis=-1)]
+    told = [jnp.ones(black.shape[:2], black.dtype), jnp.abs(black).mean(axis=-1), clipped(black).mean(axis=-1)]
     told = jnp.where(learned, jnp.stack(told, axis=-1), 0.0).astype(features.dtype)
     gradient, sums = pull((weight * clipped(filled), (1 - weight) * clipped(black), told))
     by_part, pixels = gradients_by_part(current, gradient), sums[:, 0]

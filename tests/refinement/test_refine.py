@@ -18,7 +18,7 @@ from ssplat_jax.core.gaussians import Gaussians, mask_gaussians, mean_color, wit
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.evaluation.psnr_ssim import psnr
-from ssplat_jax.rasterizer import Effects, render
+from ssplat_jax.rasterizer import Effects, fill_holes, render
 from ssplat_jax.rasterizer.constants import ALPHA_MIN
 from ssplat_jax.rasterizer.reference import render_reference
 from ssplat_jax.refinement import FOR_CAPTURES, KeyViews, RefineConfig, init_refinement, refine, refine_on_capture
@@ -121,8 +121,8 @@ def test_the_gradient_is_that_of_the_reference_renderer():
         with jax.enable_x64(True):
             wide = jax.tree.map(lambda x: jnp.asarray(np.asarray(x, np.float64)), (start, change, cameras()[1]))
             out = render_reference(apply_change(*wide[:2]), wide[2], effects=Effects(outputs=("color", "alpha")))
-            color, alpha = np.asarray(out.color), np.asarray(out.alpha)
-        filled = color + (1 - alpha[..., None]) * np.asarray(background, np.float64)
+            wide_background = jnp.asarray(np.asarray(background, np.float64))
+            filled, color = np.asarray(fill_holes(out.color, out.alpha, wide_background)), np.asarray(out.color)
         errors = 0.7 * np.abs(0.9 * filled - target) + 0.3 * np.abs(0.9 * color - target)
         return float(errors.mean(axis=-1)[~held_back].mean())
 
