@@ -1,0 +1,61 @@
+"""The scripts of docs/examples run as a person would copy them, on small scenes."""
+
+import importlib.util
+
+import numpy as np
+import pytest
+
+from tests.docs.pages import ROOT
+
+FOLDER = ROOT / "docs" / "examples"
+NAMES = sorted(path.stem for path in FOLDER.glob("*.py"))
+SMALL = "procedural:room?frames=8&size=64x48"
+
+pytestmark = pytest.mark.usefixtures("compiled_plainly", "registered_networks")
+
+
+def script(name: str):
+    spec = importlib.util.spec_from_file_location(name, FOLDER / f"{name}.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_there_are_six_of_at_most_eighty_lines():
+    assert len(NAMES) == 6
+    assert all(len((FOLDER / f"{name}.py").read_text().splitlines()) <= 80 for name in NAMES)
+
+
+def test_step_in_my_code_writes_a_scene(tmp_path):
+    script("step_in_my_code").main(SMALL, tmp_path / "scene.ply")
+    assert (tmp_path / "scene.ply").stat().st_size > 10_000
+
+
+def test_two_streams_fill_two_caches():
+    voxels = script("two_streams_vmap").main([SMALL, SMALL.replace("room", "orbit")], 2)
+    assert min(voxels) > 100 and voxels[0] != voxels[1]
+
+
+def test_a_sharper_matcher_is_surer():
+    sharp = script("own_depth_network")
+    surer = sharp.main()
+    assert 0.3 < surer <= 1
+
+
+def test_a_live_camera_is_streamed(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    gaussians = script("live_camera").main("procedural:room?frames=6&size=64x48")
+    assert int((np.asarray(gaussians.opacities) > 0).sum()) > 1000
+    assert (tmp_path / "live.ply").exists()
+
+
+def test_gaussians_are_fitted_to_an_image():
+    before, after = script("render_and_differentiate").main(30)
+    assert after < 0.2 * before
+
+
+@pytest.mark.slow  # a training step of its own
+def test_training_with_optax_takes_steps():
+    losses = script("train_with_optax").main(2)
+    assert np.isfinite(losses).all()
