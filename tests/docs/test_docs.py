@@ -48,7 +48,7 @@ def test_commands_parse(page, monkeypatch):
         command_type = command_line.COMMANDS[arguments[0]]
         if "--help" in arguments:
             continue
-        is_mention = page.name in ("decisions.md", "measurements.md") or command in INLINE_CODE.findall(prose(page))
+        is_mention = command in INLINE_CODE.findall(prose(page))
         flags = [a.split("=")[0] for a in arguments if a.startswith("--")]
         if is_mention and not {"--out", "--to"} & set(flags):
             # A mention names the command and the options that matter; the options must exist.
@@ -108,10 +108,9 @@ def test_cheap_snippets_run(page, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "count"), [("docs/python_api.md", 2), ("README.md", 1)])
+@pytest.mark.parametrize(("name", "count"), [("docs/python_api.md", 1), ("README.md", 1)])
 def test_manual_loop_runs(name, count, tmp_path, monkeypatch):
     assert run_snippets(ROOT / name, tmp_path, monkeypatch, lambda snippet: STREAMED in snippet) == count
-    assert (tmp_path / "scene.ply").stat().st_size > 1000
 
 
 @every_page

@@ -145,14 +145,6 @@ def test_readers_are_only_listed_in_one_place():
     assert mentions(r"\bREADERS\b", "ssplat_jax") == {"ssplat_jax/data/open_capture.py"}
 
 
-# -- a merge rule -----------------------------------------------------------------------------------------------------
-
-
-def test_merge_rules_stand_where_the_recipe_says():
-    listed = {file for file, _ in places("A merge rule")}
-    assert mentions("merge_weight", "ssplat_jax", "tests/cache") == listed
-
-
 # -- a command --------------------------------------------------------------------------------------------------------
 
 
@@ -198,7 +190,7 @@ def test_an_experiment_of_another_package_is_found(monkeypatch, tmp_path, capsys
 
 def test_outputs_stand_where_the_recipe_says():
     listed = {file for file, symbol in places("A rasterizer output") if symbol != "new"}
-    own = mentions("median_depth|median_rows", "ssplat_jax/rasterizer", "ssplat_jax/benchmarks")
+    own = mentions("median_depth|median_rows", "ssplat_jax/rasterizer")
     assert own == {file for file in listed if file.startswith("ssplat_jax/")}
 
 
