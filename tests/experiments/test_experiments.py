@@ -108,8 +108,8 @@ def test_variants_are_compared_with_the_same_seed():
 
 def test_every_variant_of_the_ablation_is_another_model_or_another_training():
     budget, asked = ABLATION_BUDGETS["cpu"], ablation_cases(None, "cpu")
-    assert len(asked) == 9 + 2 * 4 and len({case.hash for case in asked}) == len(asked)
-    assert len({case.config.hash for case in asked}) == 8  # the one with untrained tokens is the full model
+    assert len(asked) == 3 * 3 + 5 and len({case.hash for case in asked}) == len(asked)
+    assert len({case.config.hash for case in asked}) == 7  # the one with untrained tokens is the full model
     for variant in VARIANTS.values():
         assert set(variant.untrained) <= set(STAGES)
         assert set(variant.untrained) <= set(STAGES) - set(budget.recipe(0, variant.untrained).phases[0].rates)
