@@ -222,7 +222,7 @@ def open_source(path: Path, *, one_exposure: bool = False) -> Source:
     """
     folder = RunFolder(path)
     file = folder.scene if path.is_dir() else path
-    if folder.deltas.is_dir() and (folder.has_deltas() or not file.is_file()):
+    if folder.deltas.is_dir() and (folder.delta_files() or not file.is_file()):
         return GrowingScene(folder, one_exposure=one_exposure)
     if not file.is_file():
         raise InputError(
