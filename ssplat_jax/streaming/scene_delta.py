@@ -120,7 +120,7 @@ def apply_delta(scene: Gaussians | None, delta: SceneDelta) -> Gaussians:
     return jax.tree.map(lambda x, new, empty: _with_rows(x, delta, new, empty), scene, delta.gaussians, absent)
 
 
-def apply_confidences(known: Float32[np.ndarray, " m"] | None, delta: SceneDelta) -> Float32[np.ndarray, " m"]:
+def apply_confidences(known: Float32[np.ndarray, " m"] | None, delta: SceneDelta) -> Float32[np.ndarray, " n"]:
     """`known` confidences with those of `delta`, one for each Gaussian of `apply_delta`; absent Gaussians have 0."""
     return _with_rows(delta.confidences[:0] if known is None else known, delta, delta.confidences, np.zeros(1))
 
