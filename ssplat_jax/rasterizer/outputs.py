@@ -1,6 +1,7 @@
 """The render output: colors before compositing, images after it, and holes filled for people to look at."""
 
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -8,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ssplat_jax.core.cameras import Camera
+from ssplat_jax.core.errors import InputError
 from ssplat_jax.core.gaussians import SH_C0, Gaussians
 from ssplat_jax.core.numerics import safe_normalize
 from ssplat_jax.core.pytree import pytree
@@ -28,27 +30,28 @@ class RenderOutput:
     num_overflow: Int[Array, ""]  # pairs above `max_pairs`; the image is wrong unless 0
     num_non_finite: Int[Array, ""]  # rows culled for entries that are NaN, infinite or above 1e12
 
+    # Not annotated with shapes: the same names are read of shapes and of NumPy's copies of an output.
     @property
-    def alpha(self) -> Float[Array, "*b h w"]:
-        """1 - transmittance."""
+    def alpha(self) -> Any:
+        """1 - transmittance, `[*b h w]`."""
         return self._asked("alpha")
 
     @property
-    def depth(self) -> Float[Array, "*b h w"]:
-        """Expected camera z, sum(w z) / sum(w); 0 where alpha is 0."""
+    def depth(self) -> Any:
+        """Expected camera z, sum(w z) / sum(w), `[*b h w]`; 0 where alpha is 0."""
         return self._asked("depth")
 
     @property
-    def median_depth(self) -> Float[Array, "*b h w"]:
-        """Camera z where the transmittance falls below 1/2; 0 where it does not."""
+    def median_depth(self) -> Any:
+        """Camera z where the transmittance falls below 1/2, `[*b h w]`; 0 where it does not."""
         return self._asked("median_depth")
 
     @property
-    def features(self) -> Float[Array, "*b h w c"]:
-        """sum(w f), not normalized."""
+    def features(self) -> Any:
+        """sum(w f), not normalized, `[*b h w c]`."""
         return self._asked("features")
 
-    def _asked(self, name: str) -> Array:
+    def _asked(self, name: str) -> Any:
         if name not in self.others:
             how = "pass features" if name == "features" else f"add {name!r} to Effects.outputs"
             raise InputError(f"render: {name} was not computed; {how}.")

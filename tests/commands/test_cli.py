@@ -141,7 +141,7 @@ def test_usage_that_does_not_parse_is_short_and_exit_2(arguments, named, capsys)
         (("train", "--validate-every", "5", "--out", "x"), "--validate-every: "),
         (("run", "x?poses=world-to-camera", "--watch", "--out", "x"), "--watch: wanted poses as transforms.json has"),
         (("run", "~nosuchuser/c", "--watch", "--out", "x"), "~nosuchuser/c: wanted "),
-        (("bench", "stream", "--scaling"), "--scaling: bench stream has no use for it"),
+        (("bench", "stream", "--large"), "--large: benchmark stream has no use for it"),
         (("run", "procedural:room?frames=2&size=32x24", "--stride", "0", "--out", "x"), "--stride"),
         (("run", "procedural:room?frames=2&size=32x24", "--max-views", "-1", "--out", "x"), "--max-views"),
         (("run", "procedural:room?frames=2&size=10x10", "--out", "x"), "11 pixels"),
