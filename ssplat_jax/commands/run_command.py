@@ -38,13 +38,13 @@ class Run(StreamOptions):
         self._check()
         if not self.view:
             return self._stream_and_refine()
-        from ssplat_jax.viewer.beside_run import viewer_beside
+        from ssplat_jax.viewer.view_scene import viewer_beside
 
-        with viewer_beside(self.out, self.port) as viewer:
+        with viewer_beside(self.out, self.port) as wait_for_viewer:
             if code := self._stream_and_refine():
                 return code
             print("the viewer stays open; Ctrl-C ends it", flush=True)
-            ended = viewer.wait()
+            ended = wait_for_viewer()
         return 128 + ended if ended else 0
 
     def _check(self) -> None:

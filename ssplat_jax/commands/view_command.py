@@ -32,17 +32,17 @@ class View:
 
     def run(self) -> int:
         from ssplat_jax.core.console import Reporter
+        from ssplat_jax.viewer.scene_sources import open_source
         from ssplat_jax.viewer.view_scene import view_scene
 
         require_positive(port=self.port, most=self.most)
         reporter = Reporter(quiet=False)
         ended = view_scene(
-            self.scene,
+            open_source(self.scene, one_exposure=self.one_exposure),
             host=self.host,
             port=self.port,
             max_gaussians=self.most,
             over_black=self.over_black,
-            one_exposure=self.one_exposure,
             reporter=reporter,
         )
         print("closed the viewer", file=sys.stderr)

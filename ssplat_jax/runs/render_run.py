@@ -11,10 +11,11 @@ from jaxtyping import Float, Float64, UInt8
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.console import Reporter
 from ssplat_jax.core.errors import refusal, require_positive
+from ssplat_jax.core.false_colors import color_depth, color_normals, eight_bits, scale_ends
 from ssplat_jax.core.gaussians import mean_color, scale_colors
 from ssplat_jax.data.camera_path import camera_path, orbit_path
 from ssplat_jax.data.stream_frame import StreamFrame
-from ssplat_jax.evaluation.pictures import color_depth, color_normals, eight_bits, evenly_spread, save_image, scale_ends
+from ssplat_jax.evaluation.pictures import evenly_spread, save_image
 from ssplat_jax.rasterizer import Effects, fill_holes, render
 from ssplat_jax.runs.run_poses import open_capture_of_scene
 from ssplat_jax.scene_files.formats import SplatFile, read_scene

@@ -1,27 +1,37 @@
-"""`Browser`: one client of the viewer, which looks at the stage with a camera, a panel and a time of its own."""
+"""`Browser`: one client of the viewer, which looks at the stage with a camera, a panel and a time of its own.
 
-import dataclasses
+Callbacks of viser run on threads of its own. They store what was chosen, and the viewer's loop acts on it.
+"""
+
 import io
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float64, UInt8
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
+from ssplat_jax.data.posed_image import pose_from_quat
 from ssplat_jax.scene_files.formats import save_gaussians
-from ssplat_jax.viewer.browser_camera import BrowserCamera, camera_of, set_camera
-from ssplat_jax.viewer.drawn_view import DRAFT, FINE, draw
-from ssplat_jax.viewer.figure_plots import FigurePlots
-from ssplat_jax.viewer.frusta import Frusta
-from ssplat_jax.viewer.panel import SPLATS, Panel
-from ssplat_jax.viewer.playback import Orbit, PathPlayback
+from ssplat_jax.storage.chunk_records import RecordedView, open_thumbnail
+from ssplat_jax.viewer.scene_sources import ViewedScene
+from ssplat_jax.viewer.shown_scene import DRAFT, FINE, KINDS, draw
 from ssplat_jax.viewer.stage import Stage
-from ssplat_jax.viewer.viewed_scene import ViewedScene
+
+SPLATS = "splats"
+"""The choice of what to show that the browser draws itself."""
 
 RENDER_SECONDS = 30.0
 """Time that a browser has for a screenshot."""
+
+ORBIT_SECONDS, POSES_PER_SECOND = 24.0, 24.0  # time of a turn, and speed along the path of the streamed cameras
+
+FRUSTUM_DEPTH = 0.06  # in the browser's units
+MOST_FRUSTA = 300  # of more views, evenly spread ones are shown
 
 
 class Browser:
@@ -33,33 +43,58 @@ class Browser:
     """
 
     def __init__(self, client: Any, stage: Stage) -> None:
-        self._client, self._stage, self.panel = client, stage, Panel(client)
-        self._frusta, self._plots = Frusta(client, self._go_to), FigurePlots(client, self.panel.figures)
+        self._client, self._stage = client, stage
+        gui = client.gui
+        gui.set_panel_label("ssplat")
+        self._facts = gui.add_markdown("")
+        hint = "All but splats are drawn by ssplat's rasterizer at this window's camera."
+        self._kind = gui.add_dropdown("Show", (SPLATS, *KINDS), initial_value=SPLATS, hint=hint)
+        self._chunk = gui.add_slider("Chunk", 1, 2, 1, 1, visible=False, hint="The scene after so many chunks.")
+        hint = "Streamed cameras with their images; click on one to go there."
+        self._cameras = gui.add_checkbox("Cameras", False, hint=hint)
+        gui.add_button_group("Play", ("orbit", "path", "stop")).on_click(lambda event: self._play(event.target.value))
+        gui.add_button("Screenshot").on_click(lambda _: self._send_screenshot())
+        gui.add_button("Download scene").on_click(lambda _: self._send_scene())
+        self._num_chunks = 0  # that the slider reaches
         self._node: Any = None  # the splats
-        self._playback: tuple[Orbit | PathPlayback, float] | None = None  # and the time of its start
+        self._frusta: dict[int, Any] = {}  # by frame
+        self._motion: Callable[[float], None] | None = None  # moves the camera to where it is after some seconds
+        self._motion_since = 0.0
         self._shown: tuple = ()  # version and chunk of the scene, and whether the browser draws it
-        self._noted: tuple = ()  # what frusta and plots were last updated for
+        self._noted: tuple = ()  # what cameras and facts were last updated for
         self._scene: ViewedScene | None = None
-        self._drawn: tuple[ViewedScene, str, BrowserCamera] | None = None
+        self._drawn: tuple = ()  # scene, kind and camera of the picture
         self._is_fine = False
-        self.panel.play.on_click(lambda event: self._play(event.target.value))
-        self.panel.screenshot.on_click(lambda _: self._send_screenshot())
-        self.panel.download.on_click(lambda _: self._send_scene())
 
     def update(self) -> None:
         """Brings the browser up to date; called many times a second."""
-        self.panel.grow(self._stage.num_chunks)
+        self._grow_slider(self._stage.source.num_chunks)
         self._update_scene()
         self._update_notes()
-        if self._playback is not None:
-            motion, since = self._playback
-            set_camera(self._client, motion.pose(time.monotonic() - since))
-        if self.panel.kind != SPLATS and self._scene is not None:
+        if (motion := self._motion) is not None:
+            with self._client.atomic():
+                motion(time.monotonic() - self._motion_since)
+        if self._kind.value != SPLATS and self._scene is not None:
             self._update_drawing(self._scene)
+
+    @property
+    def _chosen_chunk(self) -> int | None:
+        """The chunks after which the scene is wanted; None for the newest scene, also when more chunks come."""
+        return None if self._num_chunks < 2 or self._chunk.value >= self._num_chunks else int(self._chunk.value)
+
+    def _grow_slider(self, num_chunks: int) -> None:
+        """Lets the slider reach `num_chunks`; at its end, it stays there."""
+        if num_chunks == self._num_chunks:
+            return
+        is_at_end = self._chosen_chunk is None
+        self._num_chunks = num_chunks
+        self._chunk.visible, self._chunk.max = num_chunks > 1, max(num_chunks, 2)
+        if is_at_end or self._chunk.value > num_chunks:
+            self._chunk.value = max(num_chunks, 1)
 
     def _update_scene(self) -> None:
         """Sends the scene if another one is wanted, or it is wanted in another way."""
-        num_chunks, is_drawn = self.panel.num_chunks, self.panel.kind != SPLATS
+        num_chunks, is_drawn = self._chosen_chunk, self._kind.value != SPLATS
         wanted = (self._stage.version, num_chunks, is_drawn)
         if wanted == self._shown:
             return
@@ -69,110 +104,156 @@ class Browser:
         if self._scene is None:
             return
         if not is_drawn:
-            self._show_background()
+            black = np.zeros((1, 1, 3), np.uint8)
+            self._client.scene.set_background_image(black if self._stage.over_black else None, format="png")
+            self._drawn = ()
             self._send_splats(self._scene)
         if self._node is not None:
             self._node.visible = not is_drawn
 
     def _send_splats(self, scene: ViewedScene) -> None:
         splats = self._stage.splats(scene)
-        fields = {field.name: getattr(splats, field.name) for field in dataclasses.fields(splats)}
-        if len(splats.centers) == 0:
-            if self._node is not None:
-                self._node.remove()
-                self._node = None
-            return
-        if self._node is None:
+        if len(splats["centers"]) == 0:  # viser has no splats without Gaussians
+            self._remove_splats()
+        elif self._node is None:
             scale = self._stage.unit / self._stage.distance
-            self._node = self._client.scene.add_gaussian_splats("/scene", **fields, scale=scale)
+            self._node = self._client.scene.add_gaussian_splats("/scene", **splats, scale=scale)
         else:
-            self._node.set_gaussians(**fields)
+            self._node.set_gaussians(**splats)
 
-    def _show_background(self) -> None:
-        """Sets the background behind the splats: black, or the browser's own."""
-        black = np.zeros((1, 1, 3), np.uint8)
-        self._client.scene.set_background_image(black if self._stage.over_black else None, format="png")
-        self._drawn = None
+    def _remove_splats(self) -> None:
+        if self._node is not None:
+            self._node.remove()
+        self._node = None
 
     def _update_notes(self) -> None:
-        """Brings frusta, plots and the line of facts up to date."""
-        run, num_chunks = self._stage.run, self.panel.num_chunks
-        noted = (self._stage.records_version, self._stage.version, num_chunks, self.panel.shows_cameras)
+        """Brings streamed cameras and facts up to date."""
+        run, num_chunks, shows_cameras = self._stage.run, self._chosen_chunk, self._cameras.value
+        noted = (self._stage.records_version, self._stage.version, num_chunks, shows_cameras)
         if noted == self._noted:
             return
         self._noted = noted
-        views = run.views(num_chunks)
+        records, views = run.records[:num_chunks], run.views(num_chunks)
         if self._scene is not None:
             num_shown = int((np.asarray(self._scene.gaussians.opacities) > 0).sum())
-            self.panel.tell(f"**{num_shown:,}** Gaussians" + (f" from **{len(views)}** views" if views else ""))
-        posed = [(view, self._stage.to_browser(view.camtoworld)) for view in views if self.panel.shows_cameras]
-        self._frusta.show(posed, run.records[0].size if run.records else (1, 1))
-        self.panel.figures.visible = len(run.records) > 1
-        self._plots.show(run)
+            facts = f"**{num_shown:,}** Gaussians"
+            if records:
+                facts += f" from **{len(views)}** views"
+                facts += f"\n\nlast chunk {records[-1].seconds:.2f} s, {records[-1].occupancy:.0%} of the cache in use"
+            if scores := [record.held_back_psnr for record in records if record.held_back_psnr is not None]:
+                facts += f"\n\n{scores[-1]:.2f} dB PSNR of held-back views"
+            self._facts.content = facts
+        self._show_frusta(views if shows_cameras else [])
+
+    def _show_frusta(self, views: list[RecordedView]) -> None:
+        """Shows these cameras, and no others."""
+        if len(views) > MOST_FRUSTA:
+            views = [views[round(k)] for k in np.linspace(0, len(views) - 1, MOST_FRUSTA)]
+        for frame in self._frusta.keys() - {view.frame for view in views}:
+            self._frusta.pop(frame).remove()
+        for view in views:
+            if view.frame not in self._frusta:
+                self._frusta[view.frame] = self._add_frustum(view)
+
+    def _add_frustum(self, view: RecordedView) -> Any:
+        (width, height), pose = self._stage.run.records[0].size, self._stage.to_browser(view.camtoworld)
+        node = self._client.scene.add_camera_frustum(
+            f"/cameras/{view.frame}",
+            fov=float(2 * np.arctan(height / 2 / view.K[1, 1])),
+            aspect=width / height,
+            scale=FRUSTUM_DEPTH,
+            color=(70, 110, 165),
+            thickness=1.5,
+            thickness_units="screen",
+            image=open_thumbnail(view.thumbnail),
+            wxyz=_wxyz(pose),
+            position=pose[:3, 3],
+        )
+        node.on_click(lambda _: self._jump_to(pose))
+        return node
+
+    # -- pictures by our rasterizer -----------------------------------------------------------------------------------
 
     def _update_drawing(self, scene: ViewedScene) -> None:
         """Draws the scene at the browser's camera: coarsely while it moves, finely once it rests."""
-        camera, kind = camera_of(self._client), self.panel.kind
-        is_known = self._drawn is not None and self._drawn[:2] == (scene, kind) and self._drawn[2].is_same(camera)
+        camera, kind = self._client.camera, self._kind.value
+        looks = (*camera.wxyz, *camera.position, camera.fov, camera.image_width, camera.image_height)
+        is_known = self._drawn == (scene, kind, looks)
         if is_known and self._is_fine:
             return
-        self._is_fine = is_known
-        picture = self._draw(scene, kind, camera, FINE if is_known else DRAFT)
+        picture = self._draw(scene, kind, FINE if is_known else DRAFT)
         self._client.scene.set_background_image(picture, format="jpeg", jpeg_quality=92)
-        self._drawn = (scene, kind, camera)
+        self._drawn, self._is_fine = (scene, kind, looks), is_known
 
-    def _draw(self, scene: ViewedScene, kind: str, camera: BrowserCamera, size: tuple[int, int]) -> np.ndarray:
-        """A picture of a scene at a camera of the browser."""
-        placed = dataclasses.replace(camera, camtoworld=self._stage.to_scene(camera.camtoworld))
+    def _draw(self, scene: ViewedScene, kind: str, size: tuple[int, int]) -> UInt8[np.ndarray, "h w 3"]:
+        """A picture at the browser's camera, of a size (width, height) that is stretched over its window."""
+        camera, (width, height), stage = self._client.camera, size, self._stage
+        fy = height / 2 / np.tan(camera.fov / 2)
+        fx = fy * width / height * max(camera.image_height, 1) / max(camera.image_width, 1)
+        K = np.array([[fx, 0.0, width / 2], [0.0, fy, height / 2], [0.0, 0.0, 1.0]])
+        pose = pose_from_quat(camera.wxyz, np.asarray(camera.position) * stage.distance, "browser")
         exposure = None
-        if kind == "exposure" and (view := self._stage.run.nearest(self._stage.to_capture(camera.camtoworld))):
-            exposure = view.exposure
-        return draw(scene, kind, placed, size, over_black=self._stage.over_black, exposure=exposure)
+        if kind == "exposure":
+            in_capture = pose.copy()
+            in_capture[:3, 3] += stage.offset
+            nearest = stage.run.nearest(in_capture)
+            exposure = None if nearest is None else nearest.exposure
+        return draw(scene, kind, pose, K, size, over_black=stage.over_black, exposure=exposure)
 
-    def start_at(self, position: np.ndarray, target: np.ndarray, up: np.ndarray, fov: float | None) -> None:
-        """Moves the camera to where the stage starts; without an angle of view it keeps its own.
+    # -- camera -------------------------------------------------------------------------------------------------------
 
-        The stage may have other units than before, so splats and cameras are sent anew and motions end.
+    def start_at(self, pose: Float64[np.ndarray, "4 4"], fov: float | None) -> None:
+        """Moves the camera to where the stage starts, at distance 1 from what it looks at.
+
+        Without an angle of view it keeps its own. The stage may have other units than before, so splats and cameras are
+        sent anew and motions end.
         """
-        self._playback = None
-        self._frusta.show([], (1, 1))
-        if self._node is not None:
-            self._node.remove()
-        self._node, self._shown, self._noted = None, (), ()
+        self._motion = None
+        self._show_frusta([])
+        self._remove_splats()
+        self._shown, self._noted = (), ()
+        camera = self._client.camera
         with self._client.atomic():
             if fov is not None:
-                self._client.camera.fov = fov
-            self._client.camera.up_direction = up
-            self._client.camera.position = position
-            self._client.camera.look_at = target
+                camera.fov = fov
+            camera.up_direction, camera.position = -pose[:3, 1], pose[:3, 3]
+            camera.look_at = pose[:3, 3] + pose[:3, 2]
 
-    def _go_to(self, pose: np.ndarray) -> None:
-        """Takes the camera to a pose."""
-        self._playback = None
-        set_camera(self._client, pose)
+    def _go_to(self, pose: Float64[np.ndarray, "4 4"]) -> None:
+        self._client.camera.position, self._client.camera.wxyz = pose[:3, 3], _wxyz(pose)
+
+    def _jump_to(self, pose: Float64[np.ndarray, "4 4"]) -> None:
+        self._motion = None
+        with self._client.atomic():
+            self._go_to(pose)
 
     def _play(self, choice: str) -> None:
         """Starts or stops a motion of the camera."""
+        camera, self._motion, self._motion_since = self._client.camera, None, time.monotonic()
         if choice == "orbit":
-            camera = self._client.camera
-            motion = Orbit(*(np.array(x) for x in (camera.position, camera.look_at, camera.up_direction)))
-            self._playback = (motion, time.monotonic())
-        elif choice == "path" and len(poses := self._stage.run.path()):
-            motion = PathPlayback(np.stack([self._stage.to_browser(pose) for pose in poses]))
-            self._playback = (motion, time.monotonic())
-        else:
-            self._playback = None
+            start, target, up = (np.array(x) for x in (camera.position, camera.look_at, camera.up_direction))
+
+            def turn(seconds: float) -> None:
+                camera.position = orbit(start, target, up, seconds)
+                camera.look_at = target  # turns the camera; the position alone would move what it looks at along
+
+            self._motion = turn
+        elif choice == "path" and len(path := self._stage.run.path()):
+            poses = [self._stage.to_browser(pose) for pose in path]
+            self._motion = lambda seconds: self._go_to(poses[int(seconds * POSES_PER_SECOND) % len(poses)])
+
+    # -- downloads ----------------------------------------------------------------------------------------------------
 
     def _send_screenshot(self) -> None:
         """Downloads the window's picture as PNG: the browser's own, or that of the rasterizer."""
-        camera, scene, kind = self._client.camera, self._scene, self.panel.kind
+        camera, scene, kind = self._client.camera, self._scene, self._kind.value
         size = (int(camera.image_width), int(camera.image_height))
         if kind == SPLATS or scene is None:
             pixels = self._client.get_render(size[1], size[0], transport_format="png", timeout=RENDER_SECONDS)
             paper = Image.new("RGBA", size, "black" if self._stage.over_black else "white")
             picture = Image.alpha_composite(paper, Image.fromarray(pixels).convert("RGBA"))  # holes are transparent
         else:
-            picture = Image.fromarray(self._draw(scene, kind, camera_of(self._client), FINE))
+            picture = Image.fromarray(self._draw(scene, kind, FINE))
         encoded = io.BytesIO()
         picture.convert("RGB").resize(size, Image.Resampling.LANCZOS).save(encoded, "PNG")
         self._client.send_file_download(f"ssplat_{kind}.png", encoded.getvalue(), save_immediately=True)
@@ -185,3 +266,15 @@ class Browser:
             file = Path(folder) / "scene.ply"
             save_gaussians(file, scene.gaussians, render_mode=scene.render_mode, offset=scene.offset)
             self._client.send_file_download(file.name, file.read_bytes(), save_immediately=True)
+
+
+def orbit(start: np.ndarray, target: np.ndarray, up: np.ndarray, seconds: float) -> Float64[np.ndarray, "3"]:
+    """The point, some time after `start`, on a circle about the axis `up` through `target`."""
+    angle = 2 * np.pi * seconds / ORBIT_SECONDS
+    turn = Rotation.from_rotvec(angle * up / np.linalg.norm(up))
+    return target + turn.apply(start - target)
+
+
+def _wxyz(pose: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "4"]:
+    """The quaternion of a pose."""
+    return Rotation.from_matrix(pose[:3, :3]).as_quat()[[3, 0, 1, 2]]

@@ -1,13 +1,18 @@
-"""Scenes on disk that may change while they are viewed: a scene file, or a run that is still streaming."""
+"""Scenes on disk that may change while they are viewed: a scene file, or a run that is still streaming.
+
+A run with `--deltas` writes a file per chunk. The viewer reads these in a process of its own, so that the stream waits
+for no browser, and viewers may come and go.
+"""
 
 import contextlib
+import dataclasses
 import json
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float, Float32
 
 from ssplat_jax.core.errors import InputError, StorageError
 from ssplat_jax.core.gaussians import Gaussians, scale_colors
@@ -16,9 +21,18 @@ from ssplat_jax.scene_files.formats import read_scene
 from ssplat_jax.storage.chunk_records import load_delta, load_delta_header
 from ssplat_jax.storage.run_folder import RunFolder, scene_exposure
 from ssplat_jax.streaming.scene_delta import apply_confidences, apply_delta
-from ssplat_jax.viewer.recorded_run import RecordedRun
-from ssplat_jax.viewer.start_camera import StartCamera, first_camera, turned_to
-from ssplat_jax.viewer.viewed_scene import ViewedScene
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ViewedScene:
+    """Gaussians in the capture's frame, relative to an offset."""
+
+    gaussians: Gaussians
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the positions, in the capture's frame
+    exposure: Float[np.ndarray, "3"] = dataclasses.field(default_factory=lambda: np.ones(3))
+    """RGB factor from the exposure of the run's first views to that of the colors."""
+    confidences: Float[np.ndarray, " n"] | None = None  # of the pivots behind the Gaussians; None where unknown
+    render_mode: str = "mip"  # the renderer that the scene was made for, see `save_ply`
 
 
 class SceneFile:
@@ -34,15 +48,10 @@ class SceneFile:
     def __init__(self, path: Path, *, one_exposure: bool = False) -> None:
         # Stamps of scene and metrics: at the last reading, and at the last one that failed.
         self._stamp = self._unreadable = None
-        self._one_exposure = one_exposure
-        self._scene: ViewedScene | None = None
-        self.path, self.folder = path, RunFolder(path.parent)
+        self.path, self.folder, self._one_exposure = path, RunFolder(path.parent), one_exposure
 
     def changed(self) -> ViewedScene | None:
         """The scene if it has changed since the last call, else None.
-
-        While a program rewrites the file, it cannot be read: the last scene stays. It also stays while a run that ends
-        again has removed its metrics and not yet written the new ones, which come last.
 
         Raises:
             InputError: the file is not a scene and has not changed since the last call, or there was no scene before;
@@ -50,13 +59,15 @@ class SceneFile:
         """
         stamp = scene, metrics = _stamp(self.path), _stamp(self.folder.metrics)
         if self._stamp is not None:
+            # A run that ends again removes its metrics, writes its scene, and writes its metrics last.
             is_ending = metrics is None and self._stamp[1] is not None
             if scene is None or stamp == self._stamp or is_ending:
                 return None
         try:
             file = read_scene(self.path)
         except InputError:
-            if self._scene is None or stamp == self._unreadable:
+            # Another program may be in the middle of rewriting it: the scene so far stays for one more look.
+            if self._stamp is None or stamp == self._unreadable:
                 raise
             self._unreadable = stamp
             return None
@@ -67,13 +78,7 @@ class SceneFile:
         else:
             with contextlib.suppress(InputError):  # of no run: the exposures of views are not known either
                 exposure = scene_exposure(self.path)
-        self._scene = ViewedScene(gaussians, file.offset, exposure, render_mode=file.render_mode)
-        return self._scene
-
-    def at(self, num_chunks: int) -> ViewedScene:
-        """The scene; a file has one only. Call `changed` first."""
-        assert self._scene is not None
-        return self._scene
+        return ViewedScene(gaussians, file.offset, exposure, render_mode=file.render_mode)
 
     def frame(self) -> StreamFrame | None:
         """The frame of the stream of the run that wrote the file; None if no metrics of a run are beside it."""
@@ -81,22 +86,6 @@ class SceneFile:
             return StreamFrame.from_dict(json.loads(self.folder.metrics.read_bytes())["stream_frame"])
         except (OSError, ValueError, TypeError, LookupError):  # another file of that name must not prevent viewing
             return None
-
-    def start_camera(self) -> StartCamera | None:
-        """The camera in the middle of the run that wrote the file; None if no metrics of a run are beside it.
-
-        Around the first camera a scene often ends: no other view has seen what lies behind. Runs of earlier versions
-        recorded no cameras, and have their first one alone.
-        """
-        if (frame := self.frame()) is None:
-            return None
-        run, first = RecordedRun(self.folder), first_camera(frame)
-        run.refresh()
-        if (middle := run.middle()) is None:
-            return first
-        pose = middle.camtoworld.copy()
-        pose[:3, 3] -= frame.offset
-        return turned_to(first, pose)
 
 
 def _stamp(path: Path) -> tuple[int, int] | None:
@@ -118,7 +107,7 @@ class _Sum:
         self._confidences: Float32[np.ndarray, " n"] | None = None
         self._exposure = np.ones(3)  # at which the scene is shown: the middle one of the views so far
 
-    def apply(self, path: Path, stamp: int) -> None:
+    def add(self, path: Path, stamp: int) -> None:
         """Adds a delta.
 
         Raises:
@@ -127,12 +116,11 @@ class _Sum:
         delta, header = load_delta(path), load_delta_header(path)
         self._scene = apply_delta(self._scene, delta)
         self._confidences = apply_confidences(self._confidences, delta)
-        self.frame = StreamFrame.from_dict(header["frame"])
-        self._exposure = np.array(header.get("exposure", [1.0, 1.0, 1.0]))  # earlier versions wrote none
+        self.frame, self._exposure = StreamFrame.from_dict(header["frame"]), np.array(header["exposure"])
         self.applied.append((path.name, stamp))
 
     def viewed(self, *, one_exposure: bool) -> ViewedScene:
-        """The scene in the capture's frame."""
+        """The scene in the capture's frame; there must be a delta."""
         assert self.frame is not None
         exposure = np.ones(3) if one_exposure else self._exposure
         scene = scale_colors(jax.tree.map(jnp.asarray, self._scene), jnp.asarray(exposure, jnp.float32))
@@ -159,7 +147,7 @@ class GrowingScene:
         return len(self._newest.applied)
 
     def changed(self) -> ViewedScene | None:
-        """The scene as a person gets it so far, in the capture's frame, if it changed since the last call, else None.
+        """Displayable scene, or None if unchanged since the last call.
 
         If the run was started anew, the old scene is dropped.
 
@@ -177,7 +165,7 @@ class GrowingScene:
         for name, stamp in found[self.num_chunks :]:
             path = self.folder.deltas / name
             try:
-                self._newest.apply(path, stamp)
+                self._newest.add(path, stamp)
             except StorageError:
                 if path.exists():
                     raise
@@ -186,27 +174,21 @@ class GrowingScene:
         return self._newest.viewed(one_exposure=self._one_exposure)
 
     def at(self, num_chunks: int) -> ViewedScene:
-        """The scene as it was after so many chunks, at least one.
+        """The scene as it was after so many chunks, at least one and not all.
 
         Raises:
             StorageError: a delta is damaged or gone.
         """
         wanted = self._newest.applied[:num_chunks]
-        if num_chunks >= self.num_chunks:
-            return self._newest.viewed(one_exposure=self._one_exposure)
         if self._past.applied != wanted[: len(self._past.applied)]:  # later than wanted, or of another run
             self._past = _Sum()
         for name, stamp in wanted[len(self._past.applied) :]:
-            self._past.apply(self.folder.deltas / name, stamp)
+            self._past.add(self.folder.deltas / name, stamp)
         return self._past.viewed(one_exposure=self._one_exposure)
 
     def frame(self) -> StreamFrame | None:
         """The frame of the stream; None before the first delta."""
         return self._newest.frame
-
-    def start_camera(self) -> StartCamera | None:
-        """The first camera of the stream; None before the first delta."""
-        return None if self._newest.frame is None else first_camera(self._newest.frame)
 
 
 Source = SceneFile | GrowingScene

@@ -13,7 +13,7 @@ from ssplat_experiments.study import Study, at_scale, run_study
 from ssplat_jax.config import preset
 from ssplat_jax.core.console import Reporter
 from ssplat_jax.core.errors import InputError
-from ssplat_jax.evaluation.pictures import eight_bits
+from ssplat_jax.core.false_colors import eight_bits
 
 QUIET = Reporter(quiet=True)
 

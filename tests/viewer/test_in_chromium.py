@@ -25,14 +25,13 @@ from ssplat_jax.runs.run_results import report_run
 from ssplat_jax.scene_files.formats import load_ply
 from ssplat_jax.storage.chunk_records import ChunkRecord, RecordedView, make_thumbnail, save_chunk_record, save_delta
 from ssplat_jax.storage.run_folder import RunFolder
-from ssplat_jax.viewer.browser_camera import camera_of
-from ssplat_jax.viewer.drawn_view import FINE
 from ssplat_jax.viewer.scene_sources import open_source
+from ssplat_jax.viewer.shown_scene import FINE
 from ssplat_jax.viewer.stage import Stage
-from ssplat_jax.viewer.viser_viewer import Viewer
+from ssplat_jax.viewer.view_scene import Viewer
 from tests.runs.report_fixture import COMMON, record, score, smooth_picture
 from tests.viewer.chromium import Page, find_chromium, wait_for
-from tests.viewer.test_viewer import delta, frame, free_port, scene
+from tests.viewer.fake_client import delta, frame, free_port, header, scene
 
 pytestmark = pytest.mark.slow
 
@@ -64,7 +63,7 @@ def opened(folder, tmp_path):
     try:
         with Page(viewer.url, tmp_path, WINDOW) as page:
             loop.start()
-            (browser,) = wait_for(lambda: viewer.browsers)
+            (browser,) = wait_for(lambda: list(viewer.browsers.values()))
             page.click_if_there("close")
             yield viewer, browser, page
     finally:
@@ -96,7 +95,7 @@ def test_a_browser_shows_what_the_rasterizer_draws(tmp_path):
     size, file = 1e-4, tmp_path / "scene" / "scene.ply"
     ss.save_ply(file, scene(200, size))
     with opened(file.parent, tmp_path) as (viewer, browser, page):
-        start, client = viewer._stage.start, browser._client
+        client = browser._client
         seen = None
         for num_gaussians in (200, 300):
             if num_gaussians != 200:
@@ -109,7 +108,7 @@ def test_a_browser_shows_what_the_rasterizer_draws(tmp_path):
             focal = height / 2 / np.tan(camera.fov / 2)
             K = jnp.asarray([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], jnp.float32)
             # In the browser the first camera looks 1 far; here the scene is drawn at size 1.
-            position = camera.position * np.linalg.norm(start.look_at - start.position) / size
+            position = camera.position * viewer._stage.distance / size
             viewmat = jnp.asarray(invert_pose(pose_from_quat(camera.wxyz, position, "browser")), jnp.float32)
             effects = Effects(antialias="classic", background=(1.0, 1.0, 1.0))
             view = Camera(viewmats=viewmat, Ks=K, width=width, height=height)
@@ -126,7 +125,7 @@ def live_run(path):
         part = delta([2 * k - 2, 2 * k - 1], k)
         moved = replace(part.gaussians, means=part.gaussians.means + jnp.array([0.0, 0.9 * (k - 1), 0.0]))
         part = type(part)(part.rows, moved, part.capacity, np.linspace(0.5, 1, 4, dtype=np.float32))
-        save_delta(folder.delta(4 * k), part, {"frame": frame().to_dict()})
+        save_delta(folder.delta(4 * k), part, header())
         focal = 12 / np.tan(FOV / 2)
         pose, K = np.eye(4), np.array([[focal, 0, 16], [0, focal, 12], [0, 0, 1]])
         pose[:3, :3], pose[:3, 3] = first, (0.15 * k * first[:, 2] - 0.04 * first[:, 0])
@@ -145,26 +144,26 @@ def test_what_a_person_chooses_is_in_the_page(tmp_path):
     folder = live_run(tmp_path / "run")
     with opened(folder.path, tmp_path) as (_, browser, page):
         page.allow_downloads(tmp_path)
-        panel, splats = browser.panel, settled(page)
+        splats = settled(page)
         assert splats[CLEAR].std() > 0.03 and red_share(splats) < 0.002
         before = splats
         for kind in ("depth", "confidence", "color"):
-            panel._kind.value = kind
+            browser._kind.value = kind
             wait_for(lambda kind=kind: browser._is_fine and browser._drawn and browser._drawn[1] == kind)
             found = settled(page, unlike=before)
             before = found
-            picture = Image.fromarray(browser._draw(browser._scene, kind, camera_of(browser._client), FINE))
+            picture = Image.fromarray(browser._draw(browser._scene, kind, FINE))
             wanted = np.asarray(picture.resize(WINDOW, Image.Resampling.BILINEAR)) / 255
             assert wanted[CLEAR].std() > 0.03
             assert db(found[CLEAR], wanted[CLEAR]) > PICTURE_DB, kind
-        panel._kind.value = "splats"
+        browser._kind.value = "splats"
         assert db(settled(page, unlike=found)[CLEAR], splats[CLEAR]) > 30
-        panel._chunk.value = 1
+        browser._chunk.value = 1
         past = settled(page, unlike=splats)
-        panel._cameras.value = True
+        browser._cameras.value = True
         assert red_share(seen := settled(page, unlike=past)) > 0.005
-        panel._cameras.value = False
-        panel._chunk.value = 2
+        browser._cameras.value = False
+        browser._chunk.value = 2
         assert db(settled(page, unlike=seen)[CLEAR], splats[CLEAR]) > 30
         page.click("Screenshot")
         saved = wait_for(lambda: page.downloaded(tmp_path / "ssplat_splats.png"))
@@ -178,7 +177,7 @@ def test_what_a_person_chooses_is_in_the_page(tmp_path):
         time.sleep(3)
         page.click("stop")
         settled(page, unlike=splats)
-        assert "Time of a chunk" in page.evaluate("document.body.innerText")
+        assert "last chunk" in page.evaluate("document.body.innerText")
 
 
 def test_a_browser_that_stands_still_holds_up_no_other(tmp_path):

@@ -1,0 +1,61 @@
+"""Depth, normals and shares as colors of a picture."""
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+_DEPTH_COLORS = np.array(  # near to far, perceptually even, readable in print
+    [(0.99, 0.91, 0.62), (0.97, 0.60, 0.32), (0.80, 0.27, 0.37), (0.47, 0.13, 0.48), (0.13, 0.07, 0.33)], np.float32
+)
+
+
+def color_depth(depth: Float[np.ndarray, "h w"], near: float, far: float) -> Float[np.ndarray, "h w 3"]:
+    """Log depth as color, light near and dark far; black where depth is 0."""
+    position = np.log(np.maximum(depth, 1e-9) / near) / np.log(far / near)
+    return np.where(depth[..., None] > 0, color_share(1.0 - position), 0.0).astype(np.float32)
+
+
+def scale_ends(depths: Float[np.ndarray, "*s"]) -> tuple[float, float]:
+    """Ends (near, far) of a color scale for depths: their 2 % and 98 % quantiles, at least half as far again apart.
+
+    Limits:
+        (1, 1.5) without depths. A flat wall has about one color, not that of its noise.
+    """
+    if depths.size == 0:
+        return 1.0, 1.5
+    near, far = np.quantile(depths, (0.02, 0.98))
+    return float(near), float(max(far, 1.5 * near))
+
+
+def color_share(share: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w 3"]:
+    """Values in [0, 1] as color, dark for 0 and light for 1; what lies outside has the color of the end."""
+    stops = np.linspace(0.0, 1.0, len(_DEPTH_COLORS))
+    channels = [np.interp(1.0 - share, stops, _DEPTH_COLORS[:, c]) for c in range(3)]
+    return np.stack(channels, axis=-1).astype(np.float32)
+
+
+def color_normals(depth: Float[np.ndarray, "h w"], K: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "h w 3"]:
+    """Normals of the surface that a depth map shows, as color: red right, green up, blue toward the camera.
+
+    A normal is perpendicular to the differences between the points of neighboring pixels.
+
+    Args:
+        depth: camera z, 0 where nothing is.
+        K: intrinsics, pixels.
+
+    Limits:
+        Black where depth is 0. Across a depth edge the normal is that of a slope between both sides.
+    """
+    height, width = depth.shape
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    rays = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones_like(x)], axis=-1)
+    points = rays * np.asarray(depth, np.float64)[..., None]
+    down, right = np.gradient(points, axis=(0, 1))
+    normals = np.cross(down, right)  # OpenCV axes: toward the camera
+    normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-30)
+    colors = 0.5 + 0.5 * normals * np.array([1.0, -1.0, -1.0])
+    return np.where(depth[..., None] > 0, colors, 0.0).astype(np.float32)
+
+
+def eight_bits(image: Float[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+    """An image in [0, 1] as 8-bit values."""
+    return (np.clip(image, 0.0, 1.0) * 255 + 0.5).astype(np.uint8)
