@@ -253,7 +253,7 @@ def test_the_exposure_of_a_picture_is_that_of_the_nearest_view(run, monkeypatch)
     run.grow()
     seen = []
     monkeypatch.setattr(
-        browser_module, "draw", lambda *_, exposure=None, **__: seen.append(exposure) or np.zeros((1, 1, 3))
+        browser_module, "draw", lambda *_, exposure=None, **__: seen.append(exposure) or np.zeros((1, 1, 3), np.uint8)
     )
     run.client.camera.position = np.array([2.9, 0.0, -1.0]) / run.stage.distance
     run.choose("Show", "exposure")
