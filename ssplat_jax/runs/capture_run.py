@@ -274,6 +274,7 @@ class DeltaWriter:
         if self._feed is None:
             run.folder.clear_deltas()
             return
+        assert run.session.cache is not None  # a chunk has been fed
         exposure = middle_exposure(run.exposures).tolist()
         header = {"frame": run.frame.to_dict(), "views": run.num_views, "exposure": exposure}
         save_delta(run.folder.delta(run.num_views), self._feed.update(run.session.cache), header)

@@ -77,6 +77,7 @@ class Run:
         """
         if self.num_views == self.num_saved:
             return
+        assert self.session.cache is not None  # views have been streamed
         state = {
             "frame": self.frame.to_dict(),
             "done": self.num_views,
@@ -176,7 +177,7 @@ def check_identity(header: dict[str, Any], wanted: dict[str, Any], folder: RunFo
                 place = next(key for key in sorted(there | now) if there.get(key) != now.get(key))
                 there, now, place = there.get(place), now.get(place), f"{place}: "
             elif name == "frames":
-                there, now = (f"{len(frames)} from {frames[:2]} on" for frames in (there, now))
+                there, now = (f"{len(frames)} from {list(frames)[:2]} on" for frames in (there, now))
             raise InputError(
                 f"{folder.path}: holds a run that differs in its {name} ({place}{there} there, {now} now); choose"
                 " another --out, repeat the old options, or start anew with --overwrite."

@@ -32,7 +32,8 @@ KINDS = ("color", "depth", "normals")
 RANGE_CAMERAS = 8
 """Cameras whose visible Gaussians give the color scale of a depth film."""
 
-Pose, Intrinsics = Float64[np.ndarray, "4 4"], Float64[np.ndarray, "3 3"]
+Pose = Float64[np.ndarray, "4 4"]
+Intrinsics = Float64[np.ndarray, "3 3"]
 
 _jitted_fill_holes = jax.jit(fill_holes)
 

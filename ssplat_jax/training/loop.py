@@ -108,7 +108,7 @@ def init_state(recipe: Recipe, params: dict) -> TrainState:
 
 def averaged(recipe: Recipe, state: TrainState) -> dict:
     """The moving average of what learns, in which every step counts `ema_decay` times as much as the next one."""
-    if int(state.average.count) == 0:
+    if int(np.asarray(state.average.count)) == 0:
         return jax.tree.map(jnp.copy, state.params)
     return optax.tree.bias_correction(state.average.ema, recipe.ema_decay, state.average.count)
 
@@ -138,6 +138,7 @@ def train_step(
         return phase.loss(model, constants | params, batch, lpips_weights)
 
     gradients, metrics = jax.grad(loss, has_aux=True)(state.params)
+    opt_state: Any
     updates, opt_state = optimizer(recipe, state.params).update(gradients, state.optimizer, state.params)
     params: Any = optax.apply_updates(state.params, updates)
     average: Any = optax.ema(recipe.ema_decay).update(params, state.average)[1]
@@ -193,8 +194,9 @@ def train(
             other files, another process trains in it, or configuration or captures do not fit the recipe.
         StorageError: a checkpoint cannot be written or read.
     """
-    for phase in recipe.phases if mix else ():
-        phase.samples.check(mix, config, renders=phase.loss.renders)
+    for phase in recipe.phases:
+        if mix is not None:
+            phase.samples.check(mix, config, renders=phase.loss.renders)
     model, name = StreamSplat(config), init_weights or ("random" if params is None else params_digest(params))
     params = model.init(jax.random.key(recipe.seed)) if params is None else params
     state, done, stopped, shared = init_state(recipe, params), 0, None, {}

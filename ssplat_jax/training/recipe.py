@@ -130,8 +130,10 @@ class Recipe:
         """The recipe with exposures of photographs divided out (`RenderingLoss.fit_gains`)."""
 
         def changed(phase: Phase) -> Phase:
-            fits = isinstance(phase.loss, RenderingLoss)
-            return dataclasses.replace(phase, loss=dataclasses.replace(phase.loss, fit_gains=True)) if fits else phase
+            loss = phase.loss
+            if not isinstance(loss, RenderingLoss):
+                return phase
+            return dataclasses.replace(phase, loss=dataclasses.replace(loss, fit_gains=True))
 
         return dataclasses.replace(self, phases=tuple(map(changed, self.phases)))
 
