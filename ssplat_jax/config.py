@@ -29,7 +29,7 @@ MEDIAN_DEPTH = 2.0
 
 @dataclasses.dataclass(frozen=True)
 class StreamingConfig(ConfigGroup):
-    """How images become chunks, and what is done after each: size, scale, order, exposure and refinement."""
+    """Fields that turn images into chunks: size, scale, order, exposure, and refinement after each chunk."""
 
     chunk_size: int = 4
     """Views per chunk."""
@@ -59,7 +59,7 @@ class StreamingConfig(ConfigGroup):
 
 @dataclasses.dataclass(frozen=True)
 class HistoryConfig(ConfigGroup):
-    """How the cache informs the next chunk; both are off in `tiny`."""
+    """Stages by which the cache informs the next chunk; both are off in `tiny`."""
 
     # In three pairs of trainings that differ in it alone, captures lose 0.02 to 0.06 dB by it and revisits gain 0.05.
     hpda: bool = False
@@ -124,7 +124,7 @@ class HeadConfig(ConfigGroup):
 
 @dataclasses.dataclass(frozen=True)
 class Additions(ConfigGroup):
-    """Where `tiny` does otherwise than the paper prints. Each reads literally when it is off ("metric" or False)."""
+    """Departures of `tiny` from what the paper prints. Each reads literally when it is off ("metric" or False)."""
 
     # The expectation over all candidates puts a token between two modes, where no surface is, and HPDA's anchor is such
     # a second mode. The peak of one candidate depends on where the depth falls between two: the mass of three does not.

@@ -1,4 +1,4 @@
-"""What a stream is compared with: views without a scene, and the same network over all views at once."""
+"""Baselines of a stream: views without a scene, and the same network over all views at once."""
 
 import functools
 from collections.abc import Sequence

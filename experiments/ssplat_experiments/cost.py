@@ -1,4 +1,4 @@
-"""What a stream costs: time of each stage, and peak memory against the number of views (the paper's Figure 1).
+"""Cost of a stream: time of each stage, and peak memory against the number of views (the paper's Figure 1).
 
     ssplat experiment cost --out runs/cost
 

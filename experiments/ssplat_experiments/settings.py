@@ -90,7 +90,7 @@ SETTINGS = (
     Setting(1.0, "CGFI, untrained", {"cgfi": True}),
     Setting(1.0, "no carving", {"carving": False}),
     Setting(1.0, "mixer, untrained", {"mixer_blocks": 2}),
-    # What each addition to the paper is worth: `tiny` without it, nothing retrained.
+    # Each addition to the paper taken away from `tiny`, nothing retrained: the difference is its worth.
     *(Setting(1.0, f"literal {name}", {name: value}) for name, value in dataclasses.asdict(LITERAL).items()),
     Setting(1.0, "no evidence head", {"evidence": False}),
     Setting(1.0, "frames in order", {"chunk_step": 0.0}),

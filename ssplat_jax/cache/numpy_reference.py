@@ -203,7 +203,7 @@ def carve(cache: dict, viewmats, Ks, depths, confidences, config: StreamConfig) 
 
 
 def stored_depths(viewmats, Ks, depths, confidences, side: int, config: StreamConfig) -> tuple | None:
-    """What is stored of a chunk: its view with the most trusted cells, reduced to `side` x `side` parts.
+    """Stored depths of a chunk: its view with the most trusted cells, reduced to `side` x `side` parts.
 
     Returns:
         (viewmat, K, log depths, the same log depths, weights), as `vote` takes them; None without a trusted cell.

@@ -54,7 +54,7 @@ class Findings:
     num_points: int  # of the largest model
 
     def sentences(self) -> list[str]:
-        """What was found, the most important first, and what to do about the rest."""
+        """Findings, the most important first, and remedies."""
         first, *others = self.parts
         error = f"median reprojection error {self.reprojection_error:.1f} px"
         lines = [f"registered {len(first)} of {len(self.names)} images, {error}, {self.num_points:,} points"]

@@ -7,7 +7,7 @@ from ssplat_jax.core.errors import InputError
 
 @dataclasses.dataclass(frozen=True)
 class RefineConfig:
-    """What a person may set; learning rates and bounds are constants of `refine_step.py`. Frozen and hashable."""
+    """Settings of refinement; learning rates and bounds are constants of `refine_step.py`. Frozen and hashable."""
 
     sh_degree: int = 0
     """SH degree that the scene gets, unless its own is higher: 0 adds no band."""

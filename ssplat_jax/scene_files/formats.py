@@ -33,7 +33,7 @@ DAMAGE = (
     *(ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RuntimeError, OSError, EOFError),
     *(struct.error, zlib.error, zipfile.BadZipFile, Image.DecompressionBombError),
 )
-"""What struct, JSON, zip, gzip, PIL and NumPy raise for bytes that are no scene."""
+"""Errors that struct, JSON, zip, gzip, PIL and NumPy raise for bytes that are no scene."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What a run keeps of each chunk: a record as a small JSON file, and the changes of the scene as an `.npz`.
+"""Files that a run keeps of each chunk: a record as a small JSON file, and the changes of the scene as an `.npz`.
 
 The viewer and the report read the records. The viewer of a growing run reads both, so that the stream waits for no
 browser and viewers may come and go.

@@ -105,7 +105,7 @@ def trainings(provenance: dict) -> list[dict]:
 
 
 def stage_turns(params: dict, facts: WeightsFacts) -> dict[str, float]:
-    """How far training turned the parameters of each stage from their random start: the sine of the angle between both.
+    """Turn of each stage by training: the sine of the angle between its parameters and their random start.
 
     Weight decay alone shortens the vector of a stage's parameters and does not turn it.
 

@@ -76,7 +76,7 @@ class CaptureMix:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class PhaseStart:
-    """What the samples of a phase are made from when it begins."""
+    """Inputs from which the samples of a phase are made when it begins."""
 
     model: StreamSplat
     params: dict  # of all stages, averaged

@@ -41,7 +41,7 @@ ALWAYS = 2**30
 
 @pytree
 class TrainState:
-    """What learns, and everything else that a resumed run needs besides its recipe."""
+    """Parameters that learn, and everything else that a resumed run needs besides its recipe."""
 
     params: dict  # stages of which a part learns in some phase
     average: optax.EmaState  # moving average of `params`, see `averaged`
@@ -51,7 +51,7 @@ class TrainState:
 
 @dataclasses.dataclass(frozen=True)
 class TrainResult:
-    """What a run has when `train` returns."""
+    """Result of `train`."""
 
     params: dict  # of all stages; averaged, as they are evaluated and shipped
     state: TrainState

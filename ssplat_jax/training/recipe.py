@@ -32,7 +32,7 @@ AFTER_MATCHER = ("hpda", "tokens", "cgfi", "mixer", "decoder")
 
 @runtime_checkable
 class Samples(Protocol):
-    """What the steps of a phase learn from."""
+    """Samples that the steps of a phase learn from."""
 
     def check(self, mix: CaptureMix, config: StreamConfig, *, renders: bool) -> None:
         """Raises an InputError if the captures cannot teach the phase."""
@@ -49,7 +49,7 @@ class Samples(Protocol):
 
 @runtime_checkable
 class Loss(Protocol):
-    """What the steps of a phase lower, see `losses.py`."""
+    """Loss that the steps of a phase lower, see `losses.py`."""
 
     renders: ClassVar[bool]
 
@@ -65,9 +65,9 @@ class Phase:
     steps: int
     """Number of steps."""
     samples: Samples
-    """What the steps learn from."""
+    """Samples that the steps learn from."""
     loss: Loss
-    """What they lower."""
+    """Loss that they lower."""
     rates: Rates
     """Parts that learn, with factors of the learning rate; the longest path that fits counts. All others are constants:
     weight decay would move even those that the loss does not reach. Parts that the network lacks are skipped."""

@@ -30,7 +30,7 @@ from ssplat_jax.training.losses import Lpips, Metrics, Scalar, psnr_loss
 CONFIG = dataclasses.replace(FOR_CAPTURES, held_back=0.0, max_new=0.0)
 """Configuration of the passes: that of captures, but no pixel is held back and no Gaussian is added."""
 SCENES = Crops(size=(16, 16))
-"""What is streamed; images are used whole."""
+"""Scenes to stream; images are used whole."""
 
 
 @pytree

@@ -152,7 +152,7 @@ class Stage:
 
     @property
     def offset(self) -> Float64[np.ndarray, "3"]:
-        """Of the scene's positions, in the capture's frame."""
+        """Offset of the scene's positions, in the capture's frame."""
         return np.zeros(3) if self._newest is None else np.asarray(self._newest.offset)
 
     def to_browser(self, camtoworld: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "4 4"]:
