@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from ssplat_experiments.cases import WITH_REFINER, Case, Row
+from ssplat_experiments.cases import Case, Row
 from ssplat_experiments.settings import (
     REFINED,
     REFINED_FACTORS,
@@ -63,7 +63,6 @@ def cases(captures: Path | None, scale: str) -> list[Case]:
                 config=config_of(settings[0], sizes),
                 asked={"scene": scene, "factor": factor, "steps": [s.refine_steps for s in settings], **asked},
                 measure=functools.partial(_measured_refined, scene, settings, sizes, opened),
-                weights=WITH_REFINER,
             )
             for scene, opened in scenes.items()
         ]

@@ -26,10 +26,6 @@ PICTURE = "picture"
 """Column of an image. `measure` returns it in [0, 1], height x width x 3; the row that is kept holds its file."""
 
 
-WITH_REFINER = ("tiny.npz", "refiner.npz")
-"""Weights files behind the result of a case that refines scenes by learned passes."""
-
-
 @dataclasses.dataclass(frozen=True)
 class Case:
     """One measurement that is made as a whole."""
@@ -40,14 +36,12 @@ class Case:
     asked: dict[str, Any]
     """Everything besides the configuration that decides the result, as JSON types."""
     measure: Callable[[], Sequence[Row]]
-    weights: tuple[str, ...] = ("tiny.npz",)
-    """Weights files of the package that the result depends on, where there is a configuration."""
 
     @property
     def request(self) -> dict[str, Any]:
         """All that decides the result, as JSON holds it."""
         request: dict[str, Any] = {"asked": self.asked, "config": self.config and self.config.to_dict()}
-        weights = {} if self.config is None else {"weights": {name: weights_digest(name) for name in self.weights}}
+        weights = {} if self.config is None else {"weights": weights_digest()}
         return json.loads(json_text(request | weights))
 
     @property
@@ -61,9 +55,9 @@ class Case:
 
 
 @functools.cache
-def weights_digest(name: str) -> str:
-    """Digest (12 hex digits) of a weights file of the package."""
-    return hashlib.sha256((resources.files("ssplat_jax") / "weights" / name).read_bytes()).hexdigest()[:12]
+def weights_digest() -> str:
+    """Digest (12 hex digits) of the shipped weights."""
+    return hashlib.sha256((resources.files("ssplat_jax") / "weights" / "tiny.npz").read_bytes()).hexdigest()[:12]
 
 
 def measure_cases(

@@ -98,7 +98,7 @@ SETTINGS = (
 )
 
 REFINED_FACTORS = (0.4, 0.5, 0.6, 0.75, 1.0, 1.25)
-REFINED_STEPS = (8, 24, 50, 100, 200)  # a learned pass is 8 steps in one
+REFINED_STEPS = (8, 24, 50, 100, 200)
 REFINED = tuple(
     Setting(factor, refine_steps=steps, quality="best" if (factor, steps) == (1.0, 100) else "")
     for factor in REFINED_FACTORS

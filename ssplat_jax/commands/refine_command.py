@@ -1,4 +1,4 @@
-"""`ssplat refine`: learned passes and gradient steps on the scene of a finished run."""
+"""`ssplat refine`: gradient steps on the scene of a finished run."""
 
 import dataclasses
 import sys
@@ -29,7 +29,7 @@ class Refine:
     """Folder of a finished `ssplat run`."""
     capture: CapturePath
     steps: int = 100
-    """Most steps; each renders two views. The first 40 are five learned passes, where there are as many."""
+    """Most steps; each renders two views."""
     weights: WeightsOption = "tiny"
     save_every: int = 50
     """Steps between saved states."""

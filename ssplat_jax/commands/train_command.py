@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from ssplat_jax.core.console import Reporter
     from ssplat_jax.training.recipe import Recipe
 
-MINUTES = {"tiny": 77, "stream": 15, "evidence": 15, "refiner": 30}
+MINUTES = {"tiny": 77, "stream": 15, "evidence": 15}
 """Rough time of recipes on two free cores; docs/model_card.md has measured times, some of them beside other work."""
 
 
@@ -25,14 +25,13 @@ class Train:
     """
 
     out: Path
-    """Folder of the log, the checkpoints and, at the end, weights.npz (refiner.npz)."""
+    """Folder of the log, the checkpoints and, at the end, weights.npz."""
     preset: str | None = None
     """Preset of the configuration. Default: the configuration of --init-weights; without that, tiny."""
-    recipe: Literal["tiny", "depth", "stream", "evidence", "refiner", "paper"] = "tiny"
+    recipe: Literal["tiny", "depth", "stream", "evidence", "paper"] = "tiny"
     """tiny: trains depth from scratch. depth: continues that in batches of larger images, for a GPU. evidence: trains
-    the evidence head of --init-weights on whole streams. refiner: trains the learned pass of refinement on whole
-    streams of --init-weights. stream: trains the stages after depth. paper: the paper's loss and steps, for
-    imported weights or --preset paper, and a GPU."""
+    the evidence head of --init-weights on whole streams. stream: trains the stages after depth. paper: the paper's
+    loss and steps, for imported weights or --preset paper, and a GPU."""
     scale_steps: float = 1.0
     """Factor of the number of steps of every phase."""
     seed: int = 0
@@ -56,7 +55,6 @@ class Train:
 
     def run(self) -> int:
         from ssplat_jax.core.console import Reporter
-        from ssplat_jax.refinement.learned_pass import save_refiner
         from ssplat_jax.storage.weights import describe_weights, params_digest, save_weights
         from ssplat_jax.training.capture_mix import open_mix
         from ssplat_jax.training.loop import train
@@ -104,12 +102,9 @@ class Train:
             before = describe_weights(str(self.init_weights)).provenance
             fresh = [name for name, stage in result.params.items() if stage and name not in given]
             provenance |= {"init_weights": self.init_weights.name, "fresh": fresh, "before": before}
-        written = self.out / ("refiner.npz" if "refiner" in result.params else "weights.npz")
-        if "refiner" in result.params:
-            save_refiner(written, result.params["refiner"], provenance)
-        else:
-            save_weights(written, result.params, config, provenance)
-            reporter.say(f"next: `ssplat run CAPTURE --weights {written} --out runs/mine` streams with them")
+        written = self.out / "weights.npz"
+        save_weights(written, result.params, config, provenance)
+        reporter.say(f"next: `ssplat run CAPTURE --weights {written} --out runs/mine` streams with them")
         print(f"wrote {written} after {result.step} steps")
         return 0
 
@@ -135,7 +130,6 @@ class Train:
         import jax
 
         from ssplat_jax.model.network import complete_params
-        from ssplat_jax.refinement.learned_pass import init_refiner
         from ssplat_jax.storage.weights import check_params, load_weights
 
         if self.init_weights is None:
@@ -147,8 +141,6 @@ class Train:
             reporter.say(f"--preset {self.preset} changes the configuration of {self.init_weights}: {changes}")
         params = complete_params(jax.random.key(self.seed), config, given)
         check_params(params, config, str(self.init_weights))
-        if "refiner" in recipe.untrained:
-            params["refiner"] = init_refiner(self.seed)
         if unused := [name for name in given if not params.get(name)]:
             reporter.warn(f"{self.init_weights}: leaves out {', '.join(unused)}, which the configuration does not use")
         if fresh := [name for name, stage in params.items() if stage and name not in given]:

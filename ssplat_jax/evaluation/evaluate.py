@@ -173,6 +173,5 @@ def _refine(
         "seconds": round(time.perf_counter() - start, 2),
         "seconds_per_step": round(report.seconds_per_step, 4),
         "views_left_out": report.num_left_out,
-        "new_gaussians": report.num_new,
     }
     return refined, done

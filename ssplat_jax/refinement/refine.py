@@ -26,10 +26,8 @@ from ssplat_jax.rasterizer import render
 from ssplat_jax.rasterizer.constants import ALPHA_MIN
 from ssplat_jax.rasterizer.render import round_up
 from ssplat_jax.refinement.compared_views import EFFECTS, only_usable, views_of_step
-from ssplat_jax.refinement.densify import add_gaussians
-from ssplat_jax.refinement.learned_pass import STEPS, is_learned, learned_pass, load_refiner
 from ssplat_jax.refinement.refine_config import FOR_CAPTURES, RefineConfig
-from ssplat_jax.refinement.refine_step import RefineState, StepReport, init_refinement, refine_step
+from ssplat_jax.refinement.refine_step import RefineState, init_refinement, refine_step
 from ssplat_jax.refinement.scene_rows import round_rows, seen_rows, without_padding
 from ssplat_jax.streaming.feed import Exposures
 
@@ -52,19 +50,11 @@ class Progress:
     losses: list[float] = dataclasses.field(default_factory=list)  # per step, on the pixels that are learned from
     held_back: list[float] = dataclasses.field(default_factory=list)  # per step, on the pixels that are not
     seconds: list[float] = dataclasses.field(default_factory=list)  # per step; the first of a process compiles
-    num_learned: int = 0  # steps done whose place learned passes took
-    num_new: int = 0  # Gaussians added in holes before the first step
 
     @property
     def num_steps(self) -> int:
-        """Steps done; a learned pass counts as `learned_pass.STEPS`."""
+        """Steps done."""
         return len(self.losses)
-
-    def add(self, report: StepReport, seconds: float) -> None:
-        """Adds the measurements of a step, or of a learned pass."""
-        self.losses += np.ravel(report.loss).tolist()
-        self.held_back += np.ravel(report.held_back).tolist()
-        self.seconds += [seconds / np.size(report.loss)] * np.size(report.loss)
 
     def scene(self, given: Gaussians) -> Gaussians:
         """`given`, the scene that refinement started from, as it is now.
@@ -85,13 +75,12 @@ class Refinement:
     """Report of a refinement."""
 
     num_steps: int = 0
-    num_skipped: int = 0  # steps whose gradient was not finite, and those of a learned pass that did not help
+    num_skipped: int = 0  # steps whose gradient was not finite
     losses: list[float] = dataclasses.field(default_factory=list)  # per step, on the pixels that are learned from
     held_back: list[float] = dataclasses.field(default_factory=list)  # per step, on the pixels that are not
     stopped_early: bool = False  # the held-back error had stopped falling
     seconds_per_step: float = 0.0  # median, without the first step, which compiles; 0 where there is no other
     num_left_out: int = 0  # views that could not be learned from, see `only_usable`
-    num_new: int = 0  # Gaussians added in holes
 
 
 def refine(
@@ -106,16 +95,14 @@ def refine(
 ) -> tuple[Gaussians, Refinement]:
     """Gaussians changed by gradient descent until they fit the views that show them.
 
-    Works on any Gaussians: a decoded cache, a loaded `.ply`. Rows keep their places, and absent rows stay absent but
-    for new Gaussians (`config.max_new`), which come after the last row where there is no other place. A Gaussian that
-    became too faint to be drawn is absent.
+    Works on any Gaussians: a decoded cache, a loaded `.ply`. Rows keep their places, and absent rows stay absent. A
+    Gaussian that became too faint to be drawn is absent.
 
     Args:
         gaussians: the scene.
         cameras: one batch axis of poses and intrinsics, in the frame of the scene.
         images: what those cameras saw, floats in [0, 1] or uint8.
-        steps: most steps; 0 returns `gaussians` as they are. Each renders `config.views_per_step` views. A learned
-            pass of `config.learned_passes` takes the place of 8.
+        steps: most steps; 0 returns `gaussians` as they are. Each renders `config.views_per_step` views.
         exposures: factors from the scene's colors to each view's; default 1.
         config: SH degree, loss and held-back pixels; default `RefineConfig()`.
         on_step: called with the number of steps done and the last loss.
@@ -176,18 +163,15 @@ def start_refinement(
     Raises:
         InputError: no view can be learned from.
     """
-    config, start, num_new = config or RefineConfig(), without_padding(gaussians), 0
+    start = without_padding(gaussians)
     max_pairs = pairs_capacity(start, key_views)
-    key_views = only_usable(start, key_views, max_pairs)
-    if config.max_new:
-        start, num_new = add_gaussians(start, key_views, config, max_pairs)
-    return Progress(init_refinement(start, config), max_pairs, num_new=num_new), key_views
+    return Progress(init_refinement(start, config), max_pairs), only_usable(start, key_views, max_pairs)
 
 
 def continue_refinement(
     progress: Progress, key_views: KeyViews, steps: int, config: RefineConfig | None = None
 ) -> Iterator[None]:
-    """Updates `progress` in place, a step or a learned pass an iteration, until `steps` are done or no longer help.
+    """Updates `progress` in place, a step an iteration, until `steps` are done or no longer help.
 
     The caller may save `progress` after any iteration. A refinement that continues from it takes the same steps.
 
@@ -202,34 +186,28 @@ def continue_refinement(
         progress.max_rows = row_capacity(progress.state, key_views, steps, config)
     while progress.num_steps < steps and not _has_stopped_helping(progress, key_views, config):
         start = time.perf_counter()
-        # After a pass that did not help, gradient steps do the rest: the network may never have seen such a scene.
-        if is_learned(progress.num_steps, steps, config) and not int(progress.state.num_skipped):
-            step = _compiled(learned_pass, config, progress.max_pairs)
-            progress.state, report = step(progress.state, key_views, load_refiner())
-            progress.num_learned += STEPS
-        else:
-            rate = jnp.float32(FINAL_RATE ** (progress.num_steps / steps))
-            step = _compiled(refine_step, config, progress.max_pairs, max_rows=progress.max_rows)
-            progress.state, report = step(progress.state, key_views, rate)
-        report = jax.block_until_ready(report)  # a step's time is that of its work
-        progress.add(report, time.perf_counter() - start)
-        num_pairs, num_rows = int(np.max(report.num_overflow)), int(np.max(report.num_missing_rows))
-        if num_pairs:
+        rate = jnp.float32(FINAL_RATE ** (progress.num_steps / steps))
+        step = _compiled(config, progress.max_pairs, progress.max_rows)
+        progress.state, report = step(progress.state, key_views, rate)
+        progress.losses.append(float(report.loss))  # waits, so that a step's time is that of its work
+        progress.held_back.append(float(report.held_back))
+        progress.seconds.append(time.perf_counter() - start)
+        if num_pairs := int(report.num_overflow):
             progress.max_pairs = round_up(progress.max_pairs + num_pairs)
-        if num_rows:
+        if num_rows := int(report.num_missing_rows):
             progress.max_rows = round_rows(progress.max_rows + num_rows)
         yield
 
 
 @functools.cache
-def _compiled(step: Callable, config: RefineConfig, max_pairs: int, **static):
-    return jax.jit(functools.partial(step, config=config, max_pairs=max_pairs, **static), donate_argnums=0)
+def _compiled(config: RefineConfig, max_pairs: int, max_rows: int) -> Callable:
+    step = functools.partial(refine_step, config=config, max_pairs=max_pairs, max_rows=max_rows)
+    return jax.jit(step, donate_argnums=0)
 
 
 def report_of(progress: Progress, key_views: KeyViews, config: RefineConfig | None = None) -> Refinement:
     """The report of a refinement that has ended."""
-    learned, taken = progress.seconds[: progress.num_learned], progress.seconds[progress.num_learned :]
-    seconds = learned[STEPS:] + taken[1:]
+    seconds = progress.seconds[1:]
     return Refinement(
         num_steps=progress.num_steps,
         num_skipped=int(progress.state.num_skipped),
@@ -238,14 +216,12 @@ def report_of(progress: Progress, key_views: KeyViews, config: RefineConfig | No
         stopped_early=_has_stopped_helping(progress, key_views, config or RefineConfig()),
         seconds_per_step=float(np.median(seconds)) if seconds else 0.0,
         num_left_out=int(np.sum(~np.asarray(key_views.valid))),
-        num_new=progress.num_new,
     )
 
 
 def _has_stopped_helping(progress: Progress, key_views: KeyViews, config: RefineConfig) -> bool:
-    """`has_stopped_helping` for the gradient steps; a learned pass shows several rounds of few views as they were."""
     num_views = int(np.sum(np.asarray(key_views.valid)))
-    return has_stopped_helping(progress.held_back[progress.num_learned :], -(-num_views // config.views_per_step))
+    return has_stopped_helping(progress.held_back, -(-num_views // config.views_per_step))
 
 
 def has_stopped_helping(held_back: list[float], steps_per_round: int) -> bool:

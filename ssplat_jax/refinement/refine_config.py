@@ -17,12 +17,6 @@ class RefineConfig:
     """Weight of the L1 error with holes filled; the rest is the L1 error over black."""
     held_back: float = 1 / 32
     """Fraction of 8 x 8 pixel blocks that no gradient sees; their error says whether refinement still helps."""
-    learned_passes: int = 0
-    """Passes of a trained network before the gradient steps (`learned_pass.py`); each takes the place of 8 steps. The
-    network has learned from scenes of streams."""
-    max_new: float = 0.0
-    """Most Gaussians that `refine` adds in holes before the first step (`densify.py`), as a fraction of those present.
-    0 adds none."""
     seed: int = 0
     """Seed of the order of views and of the pixels that are held back."""
 
@@ -31,14 +25,11 @@ class RefineConfig:
         self._require("views_per_step", "at least 1", self.views_per_step >= 1)
         self._require("shown_weight", "in [0, 1]", 0 <= self.shown_weight <= 1)
         self._require("held_back", "in [0, 0.5]", 0 <= self.held_back <= 0.5)
-        self._require("learned_passes", "at least 0", self.learned_passes >= 0)
-        self._require("max_new", "in [0, 1]", 0 <= self.max_new <= 1)
 
     def _require(self, name: str, wanted: str, is_good: bool) -> None:
         if not is_good:
             raise InputError(f"refine: {name} must be {wanted}, got {getattr(self, name)!r}.")
 
 
-FOR_CAPTURES = RefineConfig(sh_degree=2, learned_passes=5, max_new=0.1)
-"""Configuration for scenes that a stream made of captures: colors of real surfaces depend on the direction of view, and
-a stream leaves holes where views did not match."""
+FOR_CAPTURES = RefineConfig(sh_degree=2)
+"""Configuration for scenes that a stream made of captures: colors of real surfaces depend on the direction of view."""

@@ -38,18 +38,18 @@ class RefineState:
     change: Change
     adam: optax.ScaleByAdamState
     num_steps: Int[Array, ""]
-    num_skipped: Int[Array, ""]  # steps that changed nothing: not finite, or of a learned pass that did not help
+    num_skipped: Int[Array, ""]  # steps that changed nothing, since a gradient was not finite
 
 
 @pytree
 class StepReport:
-    """Measurements of a step, taken before its update; means over its views. A learned pass reports several steps."""
+    """Measurements of a step, taken before its update; means over its views."""
 
-    loss: Float[Array, "*s"]  # weighted L1 error of the pixels that are learned from
-    held_back: Float[Array, "*s"]  # the same error of the pixels that are not
-    views: Int[Array, "*s b"]  # slots of the key views
-    num_missing_rows: Int[Array, "*s"]  # rows that the step's views see and that found no space
-    num_overflow: Int[Array, "*s"]  # largest number of tile intersections of one of its views that found no space
+    loss: Float[Array, ""]  # weighted L1 error of the pixels that are learned from
+    held_back: Float[Array, ""]  # the same error of the pixels that are not
+    views: Int[Array, " b"]  # slots of the key views
+    num_missing_rows: Int[Array, ""]  # rows that the step's views see and that found no space
+    num_overflow: Int[Array, ""]  # largest number of tile intersections of one of its views that found no space
 
 
 def init_refinement(gaussians: Gaussians, config: RefineConfig | None = None) -> RefineState:

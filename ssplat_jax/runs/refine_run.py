@@ -80,13 +80,11 @@ def refine_run(
             load_refinement(folder.refinement_state, progress, identity)
         with Interrupts() as interrupts, reporter.progress("refining", steps) as advance:
             advance(progress.num_steps, WAITING)
-            num_saves = progress.num_steps // save_every
             for _ in continue_refinement(progress, key_views, steps, config):
                 advance(progress.num_steps, f"loss {progress.losses[-1]:.4f}")
                 if interrupts.received:
                     break
-                if progress.num_steps // save_every > num_saves:  # a learned pass may step over a multiple
-                    num_saves = progress.num_steps // save_every
+                if progress.num_steps % save_every == 0:
                     save_refinement(folder.refinement_state, progress, identity)
             save_refinement(folder.refinement_state, progress, identity)
             if interrupts.received:  # read last: a signal may have come during the save, too

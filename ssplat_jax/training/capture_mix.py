@@ -84,9 +84,6 @@ class PhaseStart:
     seed: int  # of the recipe
     num_steps: int  # of the recipe
     say: Callable[[str], None]  # called with messages while scenes are prepared
-    shared: dict = dataclasses.field(
-        default_factory=dict
-    )  # what the phases of a training share, such as streamed scenes
 
 
 def open_mix(folders: Sequence[Path], shares: Sequence[float], config: StreamConfig) -> CaptureMix:

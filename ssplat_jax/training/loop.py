@@ -199,7 +199,7 @@ def train(
             phase.samples.check(mix, config, renders=phase.loss.renders)
     model, name = StreamSplat(config), init_weights or ("random" if params is None else params_digest(params))
     params = model.init(jax.random.key(recipe.seed)) if params is None else params
-    state, done, stopped, shared = init_state(recipe, params), 0, None, {}
+    state, done, stopped = init_state(recipe, params), 0, None
     constants = {stage: part for stage, part in params.items() if stage not in state.params}
     update = functools.partial(train_step, model=model, recipe=recipe)
 
@@ -210,7 +210,7 @@ def train(
         nonlocal state
         state = state if is_resumed else replace(state, begin=averaged(recipe, state))
         params = constants | jax.tree.map(jnp.copy, state.begin)
-        return phase.samples.open(PhaseStart(model, params, mix, recipe.seed, recipe.num_steps, say, shared))
+        return phase.samples.open(PhaseStart(model, params, mix, recipe.seed, recipe.num_steps, say))
 
     @functools.cache
     def held_out(phase: Phase) -> list:

@@ -16,10 +16,9 @@ from typing import Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, UInt8
+from jaxtyping import Array, Bool, Float
 
 from ssplat_jax.cache import Tokens, VoxelCache, vote
-from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.gaussians import Gaussians, mask_gaussians, mean_color
 from ssplat_jax.evaluation.lpips import LpipsWeights
 from ssplat_jax.evaluation.lpips import lpips as lpips_distance
@@ -183,25 +182,14 @@ class CropLoss:
 
         def of_crop(crop: Crop) -> tuple[Scalar, Metrics]:
             gaussians = model.decode_rows(params, crop.cache, shown_rows(crop.cache, model.config, crop.num_pivots))
-            return psnr_loss(gaussians, crop.camera, crop.image, crop.exposure, crop.max_pairs, self.black_weight)
+            out = render(gaussians, crop.camera, effects=EFFECTS, max_pairs=crop.max_pairs)
+            target = crop.image.astype(jnp.float32) / 255
+            filled = fill_holes(out.color, out.alpha, mean_color(gaussians))
+            shown, black = (negative_psnr(x * crop.exposure, target) for x in (filled, out.color))
+            loss = (1 - self.black_weight) * shown + self.black_weight * black
+            return loss, {"psnr": -shown, "psnr_over_black": -black, "loss": loss}
 
         return jax.tree.map(lambda *parts: sum(parts) / len(parts), *map(of_crop, batch))
-
-
-def psnr_loss(
-    gaussians: Gaussians,
-    camera: Camera,
-    image: UInt8[Array, "h w 3"],
-    exposure: Float[Array, "3"],
-    max_pairs: int,
-    black_weight: float,
-) -> tuple[Scalar, Metrics]:
-    """Minus the PSNR of a view with holes filled, `black_weight` of it over black; and both PSNRs in dB."""
-    out = render(gaussians, camera, effects=EFFECTS, max_pairs=max_pairs)
-    filled, target = fill_holes(out.color, out.alpha, mean_color(gaussians)), image.astype(jnp.float32) / 255
-    shown, black = (negative_psnr(x * exposure, target) for x in (filled, out.color))
-    loss = (1 - black_weight) * shown + black_weight * black
-    return loss, {"psnr": -shown, "psnr_over_black": -black, "loss": loss}
 
 
 def _mean_over(one: Callable[[Any], tuple], batch: Any, *, along: Callable) -> tuple:

@@ -18,7 +18,6 @@ from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.training.capture_mix import CaptureMix, PhaseStart
 from ssplat_jax.training.crops import Crops
 from ssplat_jax.training.losses import CropLoss, DepthLoss, RenderingLoss
-from ssplat_jax.training.refiner_training import PassLoss, SceneErrors
 from ssplat_jax.training.samples import Views
 
 Rates = tuple[tuple[str, float], ...]
@@ -219,36 +218,11 @@ PAPER = Recipe(phases=(Phase("paper", 100_000, _PAPER_VIEWS, _PAPER_LOSS, _PAPER
 for the second term and a GPU, and starts from imported weights; the paper does not give the number of chunks and
 targets of a sample."""
 
-# Together, the rates of the rounds are about one cosine.
-_ROUNDS = ((4e-3, 0.86, 20), (3.4e-3, 0.61, 1), (2.1e-3, 0.36, 1), (7.6e-4, 0.26, 1))
-
-REFINER = Recipe(
-    phases=tuple(
-        Phase(
-            f"round {passes + 1}",
-            250,
-            SceneErrors(passes),
-            PassLoss(),
-            learning("refiner"),
-            learning_rate=rate,
-            final_share=share,
-            warmup_steps=warmup,
-        )
-        for passes, (rate, share, warmup) in enumerate(_ROUNDS)
-    ),
-    adam_b2=0.999,
-    weight_decay=1e-3,
-    ema_decay=0.98,
-    untrained=("refiner",),
-)
-"""Trains the network of the learned pass; in every round but the first also on scenes that it has changed itself."""
-
 RECIPES = {
     "tiny": TINY,
     "depth": DEPTH,
     "stream": STREAM,
     "evidence": EVIDENCE,
-    "refiner": REFINER,
     "paper": PAPER,
 }
 """Choices of `ssplat train --recipe`."""

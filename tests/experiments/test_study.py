@@ -75,8 +75,8 @@ def test_results_of_another_configuration_are_refused(tmp_path):
 
 def test_results_of_other_weights_are_refused(tmp_path, monkeypatch):
     run_study(counting_study([]), None, tmp_path, "smoke", QUIET)
-    monkeypatch.setattr("ssplat_experiments.cases.weights_digest", lambda name: "other")
-    with pytest.raises(InputError, match=r"weights\.tiny\.npz: '[0-9a-f]{12}', wanted now 'other'"):
+    monkeypatch.setattr("ssplat_experiments.cases.weights_digest", lambda: "other")
+    with pytest.raises(InputError, match=r"weights: '[0-9a-f]{12}', wanted now 'other'"):
         run_study(counting_study([]), None, tmp_path, "smoke", QUIET)
 
 
