@@ -13,7 +13,6 @@ from ssplat_experiments.cases import PICTURE, Case, Row, measure_cases
 from ssplat_jax.core.atomic import write_atomic
 from ssplat_jax.core.console import Reporter
 from ssplat_jax.evaluation import provenance
-from ssplat_jax.evaluation.pictures import import_pyplot, save_figure
 from ssplat_jax.storage.files import write_json
 from ssplat_jax.storage.run_folder import make_writable
 
@@ -72,13 +71,28 @@ def run_study(study: Study, captures: Path | None, out: Path, scale: str, report
     write = lambda so_far: _write(study, out, scale, captures, _finished(study, so_far))  # noqa: E731
     rows = measure_cases(study.name, cases, out / "cases", reporter, write)
     _write(study, out, scale, captures, rows := _finished(study, rows))
-    if study.plot is not None and (pyplot := import_pyplot()) is None:
-        reporter.warn(f"{study.name}: no {PLOT} without matplotlib; pip install 'ssplat-jax[plots]'")
-    elif study.plot is not None:
-        save_figure(out / PLOT, study.plot(pyplot, rows))
+    if study.plot is not None:
+        _save_plot(study, rows, out / PLOT, reporter)
     for finding in study.findings(rows):
         reporter.say(finding)
     return f"wrote {out}/{PAGE}, table.json and table.csv: {len(rows)} rows of {len(cases)} cases"
+
+
+def _save_plot(study: Study, rows: list[Row], path: Path, reporter: Reporter) -> None:
+    """Draws the rows as PNG, without a screen; warns where matplotlib is not installed."""
+    try:
+        import matplotlib
+
+        matplotlib.use("Agg")
+        from matplotlib import pyplot
+    except ImportError:
+        reporter.warn(f"{study.name}: no {path.name} without matplotlib; pip install 'ssplat-jax[plots]'")
+        return
+    assert study.plot is not None
+    figure, encoded = study.plot(pyplot, rows), io.BytesIO()
+    figure.savefig(encoded, dpi=150)
+    pyplot.close(figure)
+    write_atomic(path, encoded.getvalue())
 
 
 def compile_quickly() -> None:

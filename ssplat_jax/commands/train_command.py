@@ -25,7 +25,7 @@ class Train:
     """
 
     out: Path
-    """Folder of the log, the checkpoints and, at the end, weights.npz."""
+    """Folder of the log, the saved state and, at the end, weights.npz."""
     preset: str | None = None
     """Preset of the configuration. Default: the configuration of --init-weights; without that, tiny."""
     recipe: Literal["tiny", "depth", "stream", "evidence", "paper"] = "tiny"
@@ -49,7 +49,7 @@ class Train:
     """torchvision's vgg16 (.safetensors or .npz): with --lpips-heads, the rendering loss is MSE + 0.05 LPIPS."""
     lpips_heads: LpipsHeads = None
     save_every: int = 200
-    """Steps between checkpoints."""
+    """Steps between saved states."""
     set: ConfigChanges = ()
     quiet: QuietOption = False
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from ssplat_jax.core.console import Reporter
 from ssplat_jax.evaluation.cost import peak_memory
-from ssplat_jax.evaluation.pictures import evenly_spread, save_comparison, save_contact_sheet
+from ssplat_jax.evaluation.pictures import evenly_spread, save_comparison
 from ssplat_jax.evaluation.report_page import Report, save_report
 from ssplat_jax.evaluation.scoring import exposures_to_json, score_view
 from ssplat_jax.runs.export_run import save_scene
@@ -36,7 +36,6 @@ FILES = (
     ("scene.ply", "the scene, in the frame and units of the capture, at the middle exposure of its views"),
     ("refined.ply", "the refined scene"),
     ("metrics.json", "every figure of this page, and more"),
-    ("contact_sheet.jpg", "the pictures on one sheet"),
     ("views", "pictures of streamed views"),
     ("chunks", "a record of every chunk: cameras, exposures, time, occupancy"),
     ("deltas", "the changes of every chunk, for the viewer's time slider"),
@@ -107,7 +106,7 @@ def finished_scene(folder: RunFolder, num_views: int) -> int | None:
 
 
 def report_run(folder: RunFolder, metrics: dict[str, Any], path: str, weights: str = "") -> None:
-    """Writes the report and the contact sheet of a run, whose folder is complete but for these.
+    """Writes the report of a run, whose folder is complete but for it and the metrics.
 
     Args:
         folder: the folder of the run.
@@ -148,7 +147,7 @@ def report_run(folder: RunFolder, metrics: dict[str, Any], path: str, weights: s
 
 
 def report_eval(folder: RunFolder, metrics: dict[str, Any]) -> None:
-    """Writes the report and the contact sheet of an evaluation, whose folder is complete but for these."""
+    """Writes the report of an evaluation, whose folder is complete but for it."""
     shown, literal = metrics["shown"], metrics["literal"]
     facts = [
         ("PSNR as shown", f"{shown['psnr']:.2f} dB"),
@@ -173,8 +172,7 @@ def report_eval(folder: RunFolder, metrics: dict[str, Any]) -> None:
 
 
 def _save(folder: RunFolder, metrics: dict[str, Any], pictures: list[tuple[Path, str]], **parts: Any) -> None:
-    """Writes a page with these pictures and further parts, and its contact sheet."""
-    save_contact_sheet(folder.contact_sheet, pictures)
+    """Writes a page with these pictures and further parts."""
     report = Report(
         title=metrics["capture"],
         pictures=[pictures[k] for k in evenly_spread(len(pictures), MOST_PICTURES)],

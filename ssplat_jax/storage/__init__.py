@@ -1,1 +1,1 @@
-"""Files and folders: atomic writes, locks, JSON, npz, video, PyTorch checkpoints, run folders."""
+"""Files and folders: arrays, JSON, video, weights, saved states, run folders and their locks."""

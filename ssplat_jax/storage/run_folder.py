@@ -35,7 +35,6 @@ class RunFolder:
         self.deltas = path / "deltas"  # folder with one file of scene changes per chunk
         self.chunk_records = path / "chunks"  # folder with one record per chunk
         self.report = path / "report.html"  # the report as one page
-        self.contact_sheet = path / "contact_sheet.jpg"  # all pictures on one sheet
         self.views = path / "views"  # folder with one picture per rendered frame
 
     def film(self, kind: str = "color") -> Path:
@@ -82,8 +81,7 @@ class RunFolder:
 
     def clear_run(self) -> None:
         """Removes the run that the folder holds."""
-        self._remove(self.state, previous_path(self.state), self.scene, self.metrics, self.adjusted_poses)
-        self._remove(self.report, self.contact_sheet)
+        self._remove(self.state, previous_path(self.state), self.scene, self.metrics, self.adjusted_poses, self.report)
         self.clear_refinement()
         self.clear_deltas()
         remove_numbered(self.chunk_records, "######.json")

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from ssplat_jax.evaluation.pictures import GAP, LINE, MAX_PICTURES, evenly_spread, save_contact_sheet, save_image
+from ssplat_jax.evaluation.pictures import save_image
 from ssplat_jax.evaluation.report_page import Report, page_text
 from ssplat_jax.runs.run_results import MOST_PICTURES, report_eval, report_run
 from ssplat_jax.storage.chunk_records import save_chunk_record
@@ -85,7 +85,7 @@ def test_the_report_of_a_run_holds_its_pictures_and_figures(folder):
     for shown in ("98,765", "21.50 dB", "0.25 s", "30%", "29.50 dB", "--steps 100", "0123456789ab"):
         assert shown in page.text, shown
     assert "'path to/it'" in page.text and COMMON["capture"] in page.text
-    assert {a["href"] for a in page.named("a")} == {"scene.ply", "metrics.json", "contact_sheet.jpg", "views", "chunks"}
+    assert {a["href"] for a in page.named("a")} == {"scene.ply", "metrics.json", "views", "chunks"}
     images = list(images_of(page))
     assert len(images) == MOST_PICTURES
     assert text.count("<tr><td>4</td>") == text.count("<tr><td>8</td>") == text.count("<tr><td>12</td>") == 1
@@ -110,7 +110,7 @@ def test_a_report_without_records_or_pictures_is_whole_and_a_name_that_is_not_ut
     metrics = COMMON | {"views": 4, "ply": {"num_written": 5}, "seen_views": [score(0)], "capture": "caf\udce9"}
     report_run(folder, metrics, "caf\udce9")
     text = folder.report.read_text()
-    assert "caf?" in text and "Pictures" not in text and not folder.contact_sheet.exists()
+    assert "caf?" in text and "Pictures" not in text
 
 
 def test_the_report_of_an_evaluation_holds_both_scores(folder):
@@ -139,19 +139,3 @@ def test_text_is_escaped():
         assert html.escape(raw) in text
         assert raw in Page(text).text
     assert not {"i", "u", "s", "c"} & {tag for tag, _ in Page(text).tags}
-
-
-def test_a_contact_sheet_has_pictures_in_order_and_no_more_than_fit(tmp_path):
-    files = [(tmp_path / f"{k}.png", f"frame {k}") for k in range(30)]
-    for k, (file, _) in enumerate(files):
-        save_image(file, np.full((20, 50, 3), k / 30, np.float32))
-    (tmp_path / "3.png").unlink()
-    assert save_contact_sheet(tmp_path / "sheet.jpg", files, columns=3) == MAX_PICTURES
-    with Image.open(tmp_path / "sheet.jpg") as image:
-        sheet = np.asarray(image, np.float64) / 255
-    assert sheet.shape == (GAP + 8 * (20 + LINE + GAP), GAP + 3 * (50 + GAP), 3)
-    found = [sheet[GAP + r * (20 + LINE + GAP) + 10, GAP + c * (50 + GAP) + 25, 0] for r in range(8) for c in range(3)]
-    left = [k for k in range(30) if k != 3]
-    np.testing.assert_allclose(found, [left[k] / 30 for k in evenly_spread(29, MAX_PICTURES)], atol=0.02)
-    assert save_contact_sheet(tmp_path / "none.jpg", [(tmp_path / "no.png", "")]) == 0
-    assert not (tmp_path / "none.jpg").exists()
