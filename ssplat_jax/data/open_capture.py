@@ -27,7 +27,7 @@ from ssplat_jax.data.readers import (
     transforms_json,
     tum,
 )
-from ssplat_jax.data.readers.frame_list import Listing, in_stream_order
+from ssplat_jax.data.readers.frame_list import Listing, files_in, in_stream_order
 
 READERS = (  # the first one that matches reads the capture
     transforms_json,
@@ -120,7 +120,7 @@ def _unposed(path: Path) -> tuple[str, Path] | None:
     """The kind of images that a path holds without poses, "images" or "a video", and where they are; or None."""
     if path.is_file():
         return ("a video", path) if path.suffix.lower() in VIDEO_SUFFIXES else None
-    files = [file for folder in (path, path / "images") if folder.is_dir() for file in sorted(folder.iterdir())]
+    files = [file for folder in (path, path / "images") for file in files_in(folder)]
     if any(file.suffix.lower() in IMAGE_SUFFIXES for file in files):
         return "images", path
     return next((("a video", file) for file in files if file.suffix.lower() in VIDEO_SUFFIXES), None)

@@ -13,7 +13,7 @@ from ssplat_jax.core.errors import refusal
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.depth_range import estimate_depths
 from ssplat_jax.data.posed_image import invert_pose
-from ssplat_jax.poses.bundle_adjustment import Adjustment, Observations, adjust, moved
+from ssplat_jax.poses.bundle_adjustment import adjust, moved
 from ssplat_jax.poses.tracks import find_tracks
 
 ROTATION_DEVIATION = 0.005
@@ -83,22 +83,21 @@ def adjust_poses(
     if len(used) < 2:
         return stays
     depth = estimate_depths(capture, used).median
-    tracks = find_tracks(capture, used, depth, advance)
-    # In the first camera's frame: the world's origin may be far away, and its axes must not matter.
-    first = capture.frames[used[0]].camtoworld
-    local = np.stack([invert_pose(capture.frames[i].camtoworld) @ first for i in used])
-    local[:, :3, 3] /= depth
-    Ks = np.stack([capture.K(i) for i in used])
-    seen = Observations(local, Ks, tracks.views, tracks.points, tracks.pixels)
+    seen = find_tracks(capture, used, depth, advance)
     if seen.num_points < MIN_TRACKS:
         return stays
-    focal = float(np.median(Ks[:, 0, 0]))
+    focal = float(np.median(seen.Ks[:, 0, 0]))
     scales = [focal * np.radians(scale) for scale in SCALES_DEGREES]
     deviations = ROTATION_DEVIATION, TRANSLATION_DEVIATION
     before, after = (adjust(seen, scales, deviations, is_fixed=fixed) for fixed in (True, False))
-    error_before, error_after = (_degrees(result, focal) for result in (before, after))
+    error_before, error_after = (float(np.degrees(np.median(found.errors) / focal)) for found in (before, after))
+    frames, first = list(capture.frames), capture.frames[used[0]].camtoworld
+    for i, viewmat in zip(used, moved(seen.viewmats, after.twists), strict=True):
+        camtoworld = invert_pose(viewmat)
+        camtoworld[:3, 3] *= depth
+        frames[i] = dataclasses.replace(frames[i], camtoworld=first @ camtoworld)
     return AdjustedPoses(
-        capture=_with_viewmats(capture, used, moved(local, after.twists), depth),
+        capture=dataclasses.replace(capture, frames=tuple(frames)),
         are_off=error_before > max(SMALLEST_ERROR_DEGREES, SMALLEST_RATIO * error_after),
         error_before=error_before,
         error_after=error_after,
@@ -140,18 +139,3 @@ def adjust_if_asked(
         found = adjust_poses(capture, indices, advance)
     reporter.say(found.reason)
     return found if found.num_points > 0 and (found.are_off or revise == "poses") else None
-
-
-def _degrees(result: Adjustment, focal: float) -> float:
-    """Median error as an angle."""
-    return float(np.degrees(np.median(result.errors) / focal))
-
-
-def _with_viewmats(capture: Capture, used: Sequence[int], local: np.ndarray, depth: float) -> Capture:
-    """The capture with other poses of the frames `used`, given in the first one's frame and in median depths."""
-    frames, first = list(capture.frames), capture.frames[used[0]].camtoworld
-    for i, viewmat in zip(used, local, strict=True):
-        camtoworld = invert_pose(viewmat)
-        camtoworld[:3, 3] *= depth
-        frames[i] = dataclasses.replace(frames[i], camtoworld=first @ camtoworld)
-    return dataclasses.replace(capture, frames=tuple(frames))

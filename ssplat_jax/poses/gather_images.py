@@ -6,6 +6,7 @@ folder -> photos in natural order -> upright copies of bounded size ------------
 
 import re
 import shutil
+import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,10 +15,13 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64
 from PIL import Image
 from PIL.ExifTags import IFD, Base
+from scipy.ndimage import laplace
 
 from ssplat_jax.core.errors import echo, refusal
-from ssplat_jax.data.images import DEPTH_MODES, ORIENTATION, UPRIGHT, image_size
+from ssplat_jax.data.images import DEPTH_MODES, IMAGE_FORMATS, ORIENTATION, UPRIGHT
 from ssplat_jax.data.open_capture import IMAGE_SUFFIXES, UNREADABLE_SUFFIXES
+from ssplat_jax.data.parsing import reading
+from ssplat_jax.data.readers.frame_list import files_in, natural
 from ssplat_jax.poses.sfm import Advance, require
 
 SUFFIXES = IMAGE_SUFFIXES - UNREADABLE_SUFFIXES
@@ -25,6 +29,7 @@ JPEG_QUALITY = 95
 _T = Image.Transpose
 TURNS = dict(enumerate((_T.FLIP_LEFT_RIGHT, _T.ROTATE_180, _T.FLIP_TOP_BOTTOM, _T.TRANSPOSE, _T.ROTATE_270), 2))
 TURNS |= {7: _T.TRANSVERSE, 8: _T.ROTATE_90}  # transpositions that bring photos upright, by the EXIF orientation
+KEPT_FORMATS = ("JPEG", "PNG")  # pycolmap reads no WebP, for one; other formats are converted
 FOCAL_TAGS = (Base.FocalLength, Base.FocalLengthIn35mmFilm, Base.FocalPlaneXResolution, Base.FocalPlaneYResolution)
 FOCAL_TAGS += (Base.FocalPlaneResolutionUnit, Base.ExifImageWidth, Base.ExifImageHeight)
 """EXIF tags from which COLMAP takes the focal length."""
@@ -44,8 +49,8 @@ def list_photos(folder: Path) -> list[Path]:
         InputError: there are fewer than two, or one is of a kind that is not read and has no readable copy beside it.
     """
     for place in (folder, folder / "images"):
-        files = sorted(place.iterdir(), key=_natural) if place.is_dir() else []
-        photos = [file for file in files if file.suffix.lower() in SUFFIXES and file.is_file()]
+        files = sorted(files_in(place), key=lambda file: natural(file.name))
+        photos = [file for file in files if file.suffix.lower() in SUFFIXES]
         readable = {file.stem for file in photos}
         phone = [f for f in files if f.suffix.lower() in UNREADABLE_SUFFIXES and f.stem not in readable]
         if phone:
@@ -58,14 +63,8 @@ def list_photos(folder: Path) -> list[Path]:
     raise refusal(str(folder), wanted="a folder of photos", got="fewer than two images", fix=fix)
 
 
-def _natural(path: Path) -> list[tuple[int, int, str]]:
-    """Sort key that compares runs of digits as numbers."""
-    parts = re.split(r"([0-9]+)", path.name)
-    return [(0, int(part), "") if k % 2 else (1, 0, part) for k, part in enumerate(parts)]
-
-
 def copy_photos(photos: list[Path], folder: Path, max_side: int, advance: Advance) -> list[str]:
-    """Copies photos into `folder`: as they are where they are upright and small enough, otherwise as JPEG files.
+    """Copies photos into `folder`: as they are where they are upright and small JPEG or PNG files, otherwise as JPEG.
 
     Returns:
         The names of the copies. An underscore stands for each space, for a `#` at the start, which would begin a
@@ -76,21 +75,23 @@ def copy_photos(photos: list[Path], folder: Path, max_side: int, advance: Advanc
     """
     names: list[str] = []
     for photo in photos:
-        is_small = max(image_size(photo)) <= max_side
         name = re.sub(r"\s|^#|[\ud800-\udfff]", "_", photo.name)  # Python writes other bytes as surrogates
-        with Image.open(photo) as picture:
-            try:
-                picture.load()  # a damaged one is refused before hours of matching
-            except Exception as error:  # Pillow's decoders raise nearly anything on damaged data
-                got = f"damaged data ({' '.join(str(error).split()) or type(error).__name__})"
-                raise refusal(str(photo), wanted="a complete image", got=got, fix="remove the file") from None
+        with reading(photo, "remove the file"), warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # large photos are reduced
+            picture = Image.open(photo, formats=IMAGE_FORMATS)
+        with picture:
             orientation, exif = _exif_of(picture)
-            is_kept = orientation == UPRIGHT and is_small
+            is_small = max(picture.size) <= max_side
+            is_kept = orientation == UPRIGHT and is_small and picture.format in KEPT_FORMATS
             name = name if is_kept else Path(name).stem + ".jpg"
             if name in names:
                 got = f"{echo(name)} twice"
                 raise refusal(str(photo), wanted="every name once", got=got, fix="rename one of the two")
             names.append(name)
+            with reading(photo, "remove the file"):
+                if not is_small:
+                    picture.draft("RGB", (max_side, max_side))  # a JPEG is decoded at the least size that suffices
+                picture.load()  # a damaged one is refused before hours of matching
             if is_kept:
                 shutil.copyfile(photo, folder / name)
             else:
@@ -167,8 +168,7 @@ def scan_video(path: Path, advance: Advance) -> tuple[Float64[np.ndarray, " n"],
 
 def sharpness(gray: Float32[np.ndarray, "h w"]) -> float:
     """Mean squared Laplacian of an image; comparable between frames that show the same things."""
-    laplacian = 4 * gray[1:-1, 1:-1] - gray[:-2, 1:-1] - gray[2:, 1:-1] - gray[1:-1, :-2] - gray[1:-1, 2:]
-    return float(np.mean(np.square(laplacian)))
+    return float(np.mean(np.square(laplace(gray)[1:-1, 1:-1])))
 
 
 def displacement(before: Float32[np.ndarray, "h w"], after: Float32[np.ndarray, "h w"]) -> float:

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int
 from skimage.feature import SIFT
 
+from ssplat_jax.data.posed_image import invert_pose
 from ssplat_jax.data.sparse_matches import (
     PosedImages,
     epipolar_distances,
@@ -21,6 +22,7 @@ from ssplat_jax.data.sparse_matches import (
     mutual_nearest,
     pixel_rays,
 )
+from ssplat_jax.poses.bundle_adjustment import Observations
 
 LONG_SIDE = 640
 """Longer side of the working image in pixels; larger images are reduced."""
@@ -48,22 +50,16 @@ class SiftKeypoints:
     descriptors: Float32[np.ndarray, "n 128"]  # of length 1
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Tracks:
-    """Observations of `p` points by cameras; a camera sees a point at most once."""
-
-    views: Int[np.ndarray, " n"]
-    points: Int[np.ndarray, " n"]  # all numbers from 0 to p - 1 occur, each at least twice
-    pixels: Float64[np.ndarray, "n 2"]
-
-
 def find_tracks(
     capture: PosedImages,
     indices: Sequence[int],
     depth: float,
     advance: Callable[[int], None] = lambda done: None,
-) -> Tracks:
+) -> Observations:
     """Tracks through the frames `indices`, whose positions in `indices` are the numbers of the views.
+
+    Cameras are in the first one's frame, with lengths in median depths: the world's origin may be far away, and its
+    axes must not matter.
 
     Args:
         capture: the frames.
@@ -77,7 +73,11 @@ def find_tracks(
         advance(done + 1)
     poses = np.stack([capture.frames[i].camtoworld for i in indices])
     matches = [_match(capture, indices, pair, found) for pair in alike_cameras(poses, depth)]
-    return merged_tracks([len(keypoints.pixels) for keypoints in found], matches, [k.pixels for k in found])
+    views, keypoints, points = merged_tracks([len(k.pixels) for k in found], matches)
+    viewmats = np.stack([invert_pose(pose) @ poses[0] for pose in poses])
+    viewmats[:, :3, 3] /= depth
+    pixels = np.concatenate([k.pixels for k in found])[keypoints]
+    return Observations(viewmats, np.stack([capture.K(i) for i in indices]), views, points, pixels)
 
 
 def sift_keypoints(image: Float32[np.ndarray, "h w 3"]) -> SiftKeypoints:
@@ -131,34 +131,32 @@ def _match(
 ) -> Matches:
     """Matches near epipolar lines, which leave a few candidates each."""
     (i, j), (a, b) = (indices[v] for v in pair), (found[v] for v in pair)
-    nothing = Matches(pair, np.zeros((0, 2), np.int64), np.zeros(0, np.float32))
-    if not (len(a.pixels) and len(b.pixels)):
-        return nothing
     R, t = motion_between(capture.frames[i].camtoworld, capture.frames[j].camtoworld)
     lines = epipolar_distances(pixel_rays(capture.K(i), a.pixels), pixel_rays(capture.K(j), b.pixels), R, t)
     apart = np.sqrt(np.maximum(2 - 2 * a.descriptors @ b.descriptors.T, 0.0))
     apart = np.where(lines < np.radians(MAX_EPIPOLAR_DEGREES), apart, 2.0)
     rows, columns = mutual_nearest(apart, MAX_DISTANCE, MAX_RATIO)
     if len(rows) < MIN_MATCHES:
-        return nothing
+        rows, columns = rows[:0], columns[:0]
     return Matches(pair, np.stack([rows, columns], axis=1), apart[rows, columns])
 
 
 def merged_tracks(
-    counts: Sequence[int], matches: Sequence[Matches], pixels: Sequence[Float64[np.ndarray, "_ 2"]]
-) -> Tracks:
+    counts: Sequence[int], matches: Sequence[Matches]
+) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"], Int[np.ndarray, " n"]]:
     """Tracks of the matches. The surest match comes first; one that would show a camera a point twice is left out.
 
     Args:
         counts: keypoints of each view.
         matches: matches of pairs of views.
-        pixels: places of the keypoints of each view.
+
+    Returns:
+        Of each observation the view, the keypoint (counted through all views), and the point; all numbers of points
+        from 0 on occur, each at least twice.
     """
     starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-    ends = [match.keypoints + starts[list(match.views)] for match in matches if len(match.keypoints)]
-    if not ends:
-        return Tracks(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)))
-    order = np.argsort(np.concatenate([m.distances for m in matches if len(m.keypoints)]), kind="stable")
+    ends = [np.zeros((0, 2), np.int64), *(match.keypoints + starts[list(match.views)] for match in matches)]
+    order = np.argsort(np.concatenate([np.zeros(0), *(match.distances for match in matches)]), kind="stable")
     view = np.repeat(np.arange(len(counts)), counts)
     track, members, seen_by = list(range(len(view))), [[i] for i in range(len(view))], [{v} for v in view.tolist()]
     for a, b in np.concatenate(ends)[order].tolist():
@@ -171,7 +169,7 @@ def merged_tracks(
             track[i] = a
         members[a] += members[b]
         seen_by[a] |= seen_by[b]
-    numbers = np.array(track)
+    numbers = np.array(track, np.int64)
     used = np.flatnonzero(np.bincount(numbers, minlength=len(numbers))[numbers] > 1)
     _, points = np.unique(numbers[used], return_inverse=True)
-    return Tracks(views=view[used], points=points, pixels=np.concatenate(pixels)[used])
+    return view[used], used, points

@@ -42,13 +42,10 @@ def test_pairs_are_the_nearest_cameras_that_look_the_same_way():
 
 
 def merged(*matches, counts=(3, 3, 3)):
-    pixels = [np.stack([np.arange(count), np.full(count, view)], 1).astype(float) for view, count in enumerate(counts)]
     found = [Matches(views, np.array(rows), np.array(sure, np.float32)) for views, rows, sure in matches]
-    tracks = merged_tracks(counts, found, pixels)
-    return {
-        frozenset((int(v), int(pixel[0])) for v, pixel in zip(tracks.views[rows], tracks.pixels[rows], strict=True))
-        for rows in (tracks.points == p for p in range(tracks.points.max() + 1 if tracks.points.size else 0))
-    }
+    views, keypoints, points = merged_tracks(counts, found)
+    seen = np.stack([views, keypoints - 3 * views], axis=1).tolist()
+    return {frozenset(tuple(seen[i]) for i in np.flatnonzero(points == p)) for p in set(points.tolist())}
 
 
 def test_matches_are_chained():

@@ -124,7 +124,7 @@ def in_stream_order(listing: Listing) -> Listing:
     """
     if listing.is_in_time:
         return listing
-    ordered = tuple(sorted(listing.frames, key=lambda frame: _natural(frame.name)))
+    ordered = tuple(sorted(listing.frames, key=lambda frame: natural(frame.name)))
     if _path_length(listing.frames) < SHORTER_PATH_RATIO * _path_length(ordered):
         note = "Frames are streamed in the file's order: by name, the camera path would be more than twice as long."
         return dataclasses.replace(listing, notes=(*listing.notes, note))
@@ -135,8 +135,8 @@ def _path_length(frames: Sequence[Frame]) -> float:
     return sum((math.dist(a.center, b.center) for a, b in itertools.pairwise(frames)), 0.0)
 
 
-def _natural(name: str) -> list[tuple[int, int, str]]:
-    """Sort key that compares runs of digits as numbers."""
+def natural(name: str) -> list[tuple[int, int, str]]:
+    """Returns the key of a name by which to sort: runs of digits count as numbers."""
     parts = re.split(r"([0-9]+)", name)  # parts with an odd index are digits
     return [(0, int(part), "") if k % 2 else (1, 0, part) for k, part in enumerate(parts)]
 
@@ -219,9 +219,17 @@ def images_folder(root: Path) -> str:
     return "images/" if any((root / name).is_dir() for name in ("images", *SHRUNK_FOLDERS)) else ""
 
 
+def files_in(folder: Path, pattern: str = "*") -> list[Path]:
+    """Returns the files of a folder in the order of their names; none if there is no such folder.
+
+    Hidden files are left out: those that macOS writes beside images (`._1.jpg`) have the images' suffixes.
+    """
+    return sorted(file for file in folder.glob(pattern) if file.is_file() and not file.name.startswith("."))
+
+
 def images_in(folder: Path, pattern: str = "*") -> list[Path]:
     """Returns the image files of a folder, in the order of their names."""
-    return sorted(file for file in folder.glob(pattern) if file.suffix in SUFFIXES)
+    return [file for file in files_in(folder, pattern) if file.suffix in SUFFIXES]
 
 
 def stored_size(image: Path, described: tuple[float, float] | None, where: str) -> tuple[tuple[int, int], float]:
