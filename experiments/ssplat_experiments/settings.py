@@ -15,8 +15,8 @@ from ssplat_jax.data.split import Split
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.evaluation.cost import measure_latency, peak_memory
 from ssplat_jax.evaluation.scoring import score_targets
+from ssplat_jax.refinement.compared_views import FOR_CAPTURES
 from ssplat_jax.refinement.refine import continue_refinement, key_views_of, start_refinement
-from ssplat_jax.refinement.refine_config import FOR_CAPTURES
 from ssplat_jax.streaming.feed import Exposures, feed_capture
 
 

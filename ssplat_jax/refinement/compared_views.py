@@ -1,5 +1,6 @@
-"""Key views that a scene is compared with: their errors, their order, and which of them can be learned from."""
+"""Settings of refinement, and the key views that a scene is compared with: errors, order, which can be learned from."""
 
+import dataclasses
 import functools
 
 import jax
@@ -12,7 +13,6 @@ from ssplat_jax.core.errors import InputError
 from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.rasterizer import Effects, RenderOutput, fill_holes, render
-from ssplat_jax.refinement.refine_config import RefineConfig
 
 EFFECTS = Effects(outputs=("color", "alpha"))
 BLOCK = 8  # side of the pixel blocks that are held back together: neighbors of a pixel give its color away
@@ -20,6 +20,36 @@ GOLDEN = 2654435769  # 2^32 over the golden ratio
 WORSE_THAN_USUAL = 2.0  # ratio to the median error above which a view is one of another scene, or of a wrong pose
 MIN_COMPARED = 4  # views that a median needs to mean something
 MAX_LEFT_OUT = 0.25  # share of the views that may be left out for their error: beyond it the scene is wrong
+
+
+@dataclasses.dataclass(frozen=True)
+class RefineConfig:
+    """Settings of refinement; learning rates and bounds are constants of `refine_step.py`. Frozen and hashable."""
+
+    sh_degree: int = 0
+    """SH degree that the scene gets, unless its own is higher: 0 adds no band."""
+    views_per_step: int = 2
+    """Key views whose gradients a step averages: a Gaussian that few views show moves more often."""
+    shown_weight: float = 0.7
+    """Weight of the L1 error with holes filled; the rest is the L1 error over black."""
+    held_back: float = 1 / 32
+    """Fraction of 8 x 8 pixel blocks that no gradient sees; their error says whether refinement still helps."""
+    seed: int = 0
+    """Seed of the order of views and of the pixels that are held back."""
+
+    def __post_init__(self) -> None:
+        self._require("sh_degree", "0 to 3", self.sh_degree in range(4))
+        self._require("views_per_step", "at least 1", self.views_per_step >= 1)
+        self._require("shown_weight", "in [0, 1]", 0 <= self.shown_weight <= 1)
+        self._require("held_back", "in [0, 0.5]", 0 <= self.held_back <= 0.5)
+
+    def _require(self, name: str, wanted: str, is_good: bool) -> None:
+        if not is_good:
+            raise InputError(f"refine: {name} must be {wanted}, got {getattr(self, name)!r}.")
+
+
+FOR_CAPTURES = RefineConfig(sh_degree=2)
+"""Configuration for scenes that a stream made of captures: colors of real surfaces depend on the direction of view."""
 
 
 def errors_of_view(

@@ -25,10 +25,15 @@ from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.rasterizer import render
 from ssplat_jax.rasterizer.constants import ALPHA_MIN
 from ssplat_jax.rasterizer.render import round_up
-from ssplat_jax.refinement.compared_views import EFFECTS, only_usable, views_of_step
-from ssplat_jax.refinement.refine_config import FOR_CAPTURES, RefineConfig
-from ssplat_jax.refinement.refine_step import RefineState, init_refinement, refine_step
-from ssplat_jax.refinement.scene_rows import round_rows, seen_rows, without_padding
+from ssplat_jax.refinement.compared_views import EFFECTS, FOR_CAPTURES, RefineConfig, only_usable, views_of_step
+from ssplat_jax.refinement.refine_step import (
+    RefineState,
+    init_refinement,
+    refine_step,
+    round_rows,
+    seen_rows,
+    without_padding,
+)
 from ssplat_jax.streaming.feed import Exposures
 
 Images = Float[Array | np.ndarray, "v h w 3"] | UInt8[Array | np.ndarray, "v h w 3"]
@@ -260,12 +265,7 @@ def key_views_of(capture: Capture, indices: Sequence[int], frame: StreamFrame, e
         indices: frame numbers that were streamed.
         frame: the similarity between the capture's frame and the stream's.
         exposures: factor per streamed frame, as the stream estimated it.
-
-    Raises:
-        InputError: a frame was not streamed.
     """
-    if missing := [i for i in indices if i not in exposures]:
-        raise InputError(f"refine: wanted frames that were streamed, got frame {missing[0]}, which was not.")
     places = np.linspace(0, len(indices) - 1, min(len(indices), MAX_KEY_VIEWS))
     used = [indices[i] for i in sorted({round(place) for place in places})]
     cameras = jax.tree.map(lambda *x: jnp.stack(x), *(capture.camera(i, frame) for i in used))

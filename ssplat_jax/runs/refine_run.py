@@ -11,8 +11,8 @@ import numpy as np
 from ssplat_jax.core.console import WAITING, Reporter
 from ssplat_jax.core.errors import InputError, refusal, require_positive
 from ssplat_jax.evaluation.scoring import score_targets
+from ssplat_jax.refinement.compared_views import FOR_CAPTURES
 from ssplat_jax.refinement.refine import Progress, continue_refinement, key_views_of, report_of, start_refinement
-from ssplat_jax.refinement.refine_config import FOR_CAPTURES
 from ssplat_jax.runs.export_run import save_scene
 from ssplat_jax.runs.open_run import load_run
 from ssplat_jax.runs.run_results import shown_frames

@@ -8,7 +8,7 @@ import pytest
 from ssplat_experiments import bench_refine, bench_render, bench_stream
 
 from ssplat_jax.core.errors import InputError
-from ssplat_jax.refinement.scene_rows import may_be_seen
+from ssplat_jax.refinement.refine_step import may_be_seen
 
 pytestmark = pytest.mark.slow
 ROOT = Path(__file__).resolve().parents[2]

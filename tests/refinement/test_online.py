@@ -285,12 +285,6 @@ def test_a_session_refuses_half_of_a_request():
     assert online_refinement(StreamSplat(CONFIG.replace(steps_per_chunk=0))) is None
 
 
-def test_without_steps_the_program_has_no_trace_of_refinement():
-    model = StreamSplat(CONFIG.replace(steps_per_chunk=0))
-    text = jax.jit(model.decode).lower(params(), model.init_cache()).as_text()
-    assert text and len(jax.tree.leaves(model.init_cache())) == 26
-
-
 def test_a_gaussian_follows_the_mean_of_its_views():
     """Two photographs of one place disagree: the color stays near their mean, whichever was shown last."""
     base = Gaussians.from_rgb(
