@@ -1,7 +1,6 @@
 """VACC, the Voxel-Aligned Causal Cache (Sec. 3.4): `fuse` writes tokens, `project` shows them, `carve` revises."""
 
 from ssplat_jax.cache.fuse import fuse
-from ssplat_jax.cache.observations import observe, seen_cells
 from ssplat_jax.cache.project import ProjectedCache, coarsen, project
 from ssplat_jax.cache.state import (
     PIVOT_FIELDS,
@@ -14,13 +13,14 @@ from ssplat_jax.cache.state import (
     grow,
     init_cache,
 )
-from ssplat_jax.cache.votes import SAME_SURFACE_MARGIN, carve, store_depths, vote
+from ssplat_jax.cache.votes import SAME_SURFACE_MARGIN, SeenCells, carve, observe, seen_cells, store_depths, vote
 
 __all__ = [
     "PIVOT_FIELDS",
     "SAME_SURFACE_MARGIN",
     "CacheStats",
     "ProjectedCache",
+    "SeenCells",
     "StoredDepths",
     "Tokens",
     "VoxelCache",

@@ -1,7 +1,7 @@
 """VACC's write: fuses tokens into voxels (Sec. 3.4, Eq. vacc_capacity_update, vacc_pair_selection_and_merge).
 
-The result equals inserting the tokens one after another, which is how `numpy_reference.fuse` does it. Voxels do not
-depend on each other, so all of them advance in parallel:
+The result equals inserting the tokens one after another, as the loop in tests/cache/numpy_reference.py does. Voxels do
+not depend on each other, so all of them advance in parallel:
 
     tokens ─ classify ─ group by voxel ─ rows (found, or new in order of first token)
                                            │
@@ -70,20 +70,14 @@ def fuse(cache: VoxelCache, tokens: Tokens, config: StreamConfig, *, axis: str |
         Two members of confidence 0 are averaged with equal weights.
         A merged mean lies between its members, to the last bit, and so in their voxel.
     """
-    if axis is None:
-        return _insert(cache, tokens, config)[0]
-    # Rejected tokens have a voxel too (index 0 if out of range), so each is counted by one shard.
-    voxels, _ = voxel_indices(tokens.means, config.memory.voxel_size)
-    is_own = shards_of(voxels, jax.lax.axis_size(axis)) == jax.lax.axis_index(axis)
-    fused = _insert(cache, replace(tokens, valid=tokens.valid & is_own), config)[0]
-    num_chunks = cache.stats.num_chunks + jnp.any(tokens.valid).astype(jnp.int32)
-    return replace(fused, stats=replace(fused.stats, num_chunks=num_chunks))
-
-
-def _insert(cache: VoxelCache, tokens: Tokens, config: StreamConfig) -> tuple[VoxelCache, Plan]:
-    """`cache` after inserting `tokens` in order, and where each of them went."""
     cache, tokens = jax.lax.stop_gradient((cache, tokens))
-    stats, voxels, accepted = _classify(cache.stats, tokens, config)
+    is_chunk = jnp.any(tokens.valid)
+    voxels, in_range = voxel_indices(tokens.means, config.memory.voxel_size)
+    if axis is not None:
+        # Rejected tokens have a voxel too (index 0 if out of range), so each is counted by one shard.
+        is_own = shards_of(voxels, jax.lax.axis_size(axis)) == jax.lax.axis_index(axis)
+        tokens = replace(tokens, valid=tokens.valid & is_own)
+    accepted, stats = _classify(cache.stats, tokens, in_range, config)
     place = {"voxel": _place_in_voxels, "append": _place_at_end}[config.memory.vacc]
     cache, plan = place(cache, voxels, accepted, config)
     pivots = {name: getattr(cache, name) for name in pivot_fields(cache)}
@@ -96,11 +90,12 @@ def _insert(cache: VoxelCache, tokens: Tokens, config: StreamConfig) -> tuple[Vo
     num_placed = jnp.sum(plan.rows >= 0, dtype=jnp.int32)
     stats = replace(
         stats,
+        num_chunks=stats.num_chunks + is_chunk.astype(jnp.int32),
         num_accepted=saturating_add(stats.num_accepted, num_placed),
         num_merged=saturating_add(stats.num_merged, num_placed - jnp.sum(appends >= 0, dtype=jnp.int32)),
         num_dropped=saturating_add(stats.num_dropped, jnp.sum(accepted, dtype=jnp.int32) - num_placed),
     )
-    return replace(cache, counts=counts, stats=stats, **pivots), plan
+    return replace(cache, counts=counts, stats=stats, **pivots)
 
 
 def saturating_add(counter: Int[Array, ""], more: Int[Array, ""]) -> Int[Array, ""]:
@@ -108,24 +103,21 @@ def saturating_add(counter: Int[Array, ""], more: Int[Array, ""]) -> Int[Array, 
     return counter + jnp.minimum(more, jnp.iinfo(counter.dtype).max - counter)
 
 
-def _classify(stats: CacheStats, tokens: Tokens, config: StreamConfig):
-    """Counts each rejected token under one reason; also the voxels of all tokens, and which are accepted."""
-    voxels, in_range = voxel_indices(tokens.means, config.memory.voxel_size)
+def _classify(stats: CacheStats, tokens: Tokens, in_range, config: StreamConfig):
+    """Which tokens are accepted, and the counters with each rejected one under one reason."""
     finite = jnp.isfinite(tokens.confidences) & jnp.isfinite(tokens.footprints)
     for x in (tokens.means, tokens.feats, tokens.rgbs, tokens.quats):
         finite &= jnp.all(jnp.isfinite(x), axis=-1)
     confident = tokens.confidences >= config.memory.min_confidence
-    accepted = tokens.valid & finite & confident & in_range
     count = lambda mask: jnp.sum(tokens.valid & mask, dtype=jnp.int32)  # noqa: E731
     stats = replace(
         stats,
-        num_chunks=stats.num_chunks + jnp.any(tokens.valid).astype(jnp.int32),
         num_seen=saturating_add(stats.num_seen, count(tokens.valid)),
         num_non_finite=saturating_add(stats.num_non_finite, count(~finite)),
         num_low_confidence=saturating_add(stats.num_low_confidence, count(finite & ~confident)),
         num_out_of_range=saturating_add(stats.num_out_of_range, count(finite & confident & ~in_range)),
     )
-    return stats, voxels, accepted
+    return tokens.valid & finite & confident & in_range, stats
 
 
 def _place_in_voxels(cache, voxels, accepted, config) -> tuple[VoxelCache, Plan]:

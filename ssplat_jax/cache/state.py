@@ -25,7 +25,7 @@ from ssplat_jax.core.errors import CacheError, InputError
 from ssplat_jax.core.pytree import pytree, replace
 
 NUM_OBSERVED = 9
-"""Numbers that a pivot's observations hold (`observations.py`)."""
+"""Numbers that a pivot's observations hold (`votes.py`)."""
 
 NUM_STORED, STORED_CELLS = 32, 32
 """Past chunks of which a coarse depth map is kept while views carve, to vote on the tokens of later chunks, and the
@@ -89,7 +89,7 @@ class VoxelCache:
     last_chunks: Int[Array, "capacity k"]  # chunk that last wrote the pivot
     stored_depths: StoredDepths
     stats: CacheStats
-    observations: Float[Array, "capacity k s"] | None = None  # what views say about the pivot (observations.py); sums
+    observations: Float[Array, "capacity k s"] | None = None  # what views say about the pivot (votes.py); sums
     # Fields of refinement while streaming; None without it, so that the program has no trace of them.
     changes: Float[Array, "capacity k r"] | None = None  # to each of the pivot's Gaussians (changes.py)
     key_views: KeyViews | None = None  # views that the scene is compared with; None before the first chunk

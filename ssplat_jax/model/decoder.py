@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ssplat_jax.cache.observations import observation_features
 from ssplat_jax.cache.state import NUM_OBSERVED
+from ssplat_jax.cache.votes import observation_features
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.gaussians import SH_C0, Gaussians
 from ssplat_jax.core.numerics import safe_log, safe_sqrt

@@ -19,9 +19,20 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ssplat_jax.cache import Tokens, VoxelCache, carve, coarsen, fuse, init_cache, project, store_depths, vote
+from ssplat_jax.cache import (
+    Tokens,
+    VoxelCache,
+    carve,
+    coarsen,
+    fuse,
+    init_cache,
+    observe,
+    project,
+    seen_cells,
+    store_depths,
+    vote,
+)
 from ssplat_jax.cache.changes import changed_gaussians, unpack
-from ssplat_jax.cache.observations import observe, seen_cells
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.chunk import Chunk, check_chunk
 from ssplat_jax.core.gaussians import Gaussians, mask_gaussians
@@ -151,20 +162,20 @@ class StreamSplat:
         No gradient flows.
         """
         prediction = jax.lax.stop_gradient(prediction)
-        seen = (prediction.views.grid_camera, prediction.output.depths, prediction.output.confidences)
+        camera, output = prediction.views.grid_camera, prediction.output
         with jax.named_scope("votes"):
             tokens = vote(cache.stored_depths, prediction.tokens, self.config)
         with jax.named_scope("VACC"):
             cache = fuse(cache, tokens, self.config, axis=self.axis)
         # After fusion, so that views of one chunk that disagree lower the confidence of each other's pivots at once.
         with jax.named_scope("carve"):
-            cache = carve(cache, *seen, self.config)
-            cache = store_depths(cache, *seen, self.config)
+            cells = seen_cells(output.depths, output.confidences, tokens.rgbs, self.config)
+            cache = carve(cache, camera, cells, self.config)
+            cache = store_depths(cache, camera, cells)
         if cache.observations is None:
             return cache
         with jax.named_scope("observations"):
-            cells = seen_cells(*seen[1:], tokens.rgbs, self.config)
-            return observe(cache, prediction.views.grid_camera, cells, self.config, axis=self.axis)
+            return observe(cache, camera, cells, self.config, axis=self.axis)
 
     def run(self, params: dict, cache: VoxelCache, chunks: Chunk) -> tuple[VoxelCache, ChunkOutput]:
         """`step` over stacked chunks (leading axis t) as one `lax.scan`.

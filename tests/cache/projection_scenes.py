@@ -5,7 +5,7 @@ import numpy as np
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 
-from ssplat_jax.cache import VoxelCache, init_cache
+from ssplat_jax.cache import SeenCells, VoxelCache, init_cache, seen_cells
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.pytree import replace
 from tests.cache.streams import CAPACITY, CONFIG, WIDTH
@@ -86,3 +86,10 @@ def random_views(seed: int, height: int = HEIGHT, width: int = GRID_WIDTH):
     depths.reshape(-1)[:3] = [np.nan, np.inf, 0.0]
     confidences = rng.choice([0.0, 0.25, 0.6, 0.7, 0.8, 0.9, 1.0], shape, p=[0.02, 0.02, *[0.192] * 5])
     return depths, confidences.astype(np.float32)
+
+
+def cells_of(depths, confidences, colors=None) -> SeenCells:
+    """Cells of views with these depths, confidences and colors `[v, h, w, 3]`, gray by default."""
+    colors = jnp.full((*depths.shape, 3), 0.5) if colors is None else jnp.asarray(colors)
+    rgbs = jnp.tile(colors.reshape(-1, 3), (1, CONFIG.head.gaussians_per_token))
+    return seen_cells(jnp.asarray(depths), jnp.asarray(confidences), rgbs, CONFIG)

@@ -9,13 +9,12 @@ from hypothesis import strategies as st
 
 from ssplat_jax.cache import PIVOT_FIELDS, Tokens, VoxelCache, init_cache
 from ssplat_jax.cache import fuse as plain_fuse
-from ssplat_jax.cache import numpy_reference as reference
 from ssplat_jax.cache.changes import WIDTH as CHANGE_WIDTH
 from ssplat_jax.cache.changes import settle, unpack
-from ssplat_jax.cache.fuse import _insert
 from ssplat_jax.cache.state import pivot_fields
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.pytree import replace
+from tests.cache import numpy_reference as reference
 
 WIDTH = 4  # feature channels
 NUM_TOKENS = 48  # per chunk
@@ -27,7 +26,6 @@ FEATURES = ("integers", "normal", "duplicates", "zeros")
 CONFIDENCES = ("random", "tied", "at_tau")
 
 fuse = jax.jit(plain_fuse, static_argnums=2, donate_argnums=0)
-insert = jax.jit(_insert, static_argnums=2, donate_argnums=0)
 
 CONFIG = StreamConfig().replace(
     token_width=WIDTH, capacity=128, voxel_size=0.25, min_confidence=0.3, overflow="drop_new"
@@ -129,10 +127,10 @@ def tokens_at(means, confidences=0.5, feats=1.0, valid=True, **changes) -> Token
     return replace(tokens, **changes)
 
 
-def fuse_with_rows(cache: VoxelCache, tokens: Tokens, config: StreamConfig) -> tuple[VoxelCache, set[int]]:
-    """`fuse`, and the rows that it wrote."""
-    cache, plan = insert(cache, tokens, config)
-    return cache, set(np.asarray(plan.rows).tolist()) - {-1}
+def written_rows(cache: VoxelCache) -> set[int]:
+    """Rows with a pivot that the last chunk wrote."""
+    is_new = np.asarray(cache.alive & (cache.last_chunks == cache.stats.num_chunks - 1))
+    return set(np.flatnonzero(is_new.any(axis=1)).tolist())
 
 
 def assert_same_cache(a: VoxelCache, b: VoxelCache, except_fields=()) -> None:

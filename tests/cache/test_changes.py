@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ssplat_jax.cache import init_cache
-from ssplat_jax.cache.changes import BOUNDS, FACE_MARGIN, WIDTH, Change, changed_gaussians, pack, settle, unpack
+from ssplat_jax.cache.changes import BOUNDS, WIDTH, Change, changed_gaussians, pack, settle, unpack
 from ssplat_jax.cache.hash_table import voxel_indices
 from ssplat_jax.core.gaussians import SH_C0, Gaussians
 from ssplat_jax.core.pytree import replace
@@ -45,8 +45,8 @@ def test_packing_keeps_every_number_in_its_place():
     np.testing.assert_array_equal(first, np.array([*parts, *change.sh[0, 0]]))
 
 
-@pytest.mark.parametrize("span", [2.0, 300.0, 1e5, 1e6])
-@pytest.mark.parametrize("scale", [1e-3, 0.1, 1e3])
+@pytest.mark.parametrize("span", [2.0, 300.0, 1e6])
+@pytest.mark.parametrize("scale", [1e-3, 1e3])
 def test_moved_pivots_stay_in_their_voxels(span, scale):
     means = pivots(1, span)
     moved, packed = SETTLE(means, changes(2, scale), SIZE)
@@ -64,31 +64,20 @@ def test_what_settles_is_bounded_and_has_no_common_move():
     assert float(jnp.abs(change.means.reshape(-1, PER_TOKEN, 3).mean(axis=1)).max()) < 1e-6 * SIZE
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-def test_changes_that_are_not_finite_become_zero(bad):
-    change = jax.tree.map(lambda x: x.at[0].set(bad), changes(4, 0.01))
+def test_changes_that_are_not_finite_become_zero():
+    bad = jnp.array([np.nan, np.inf, -np.inf])
+    change = jax.tree.map(lambda x: x.at[:3].set(bad.reshape(3, *[1] * (x.ndim - 1))), changes(4, 0.01))
     moved, packed = SETTLE(pivots(5, 4.0), change, SIZE)
     assert np.isfinite(moved).all() and np.isfinite(packed).all()
-    assert not np.any(packed[0, 3:WIDTH])
-
-
-def test_settling_twice_changes_nothing_more():
-    means = pivots(6, 4.0)
-    moved, packed = SETTLE(means, changes(7, 0.05), SIZE)
-    again, repacked = SETTLE(moved, unpack(packed), SIZE)
-    np.testing.assert_allclose(again, moved, atol=FACE_MARGIN * SIZE)
-    np.testing.assert_allclose(repacked, packed, atol=2 * FACE_MARGIN * SIZE)
+    assert not np.any(packed[0].reshape(-1, WIDTH)[:3, 3:])
 
 
 def test_merges_of_changed_pivots_stay_in_their_voxels():
     """Several tokens fall into each of few voxels, and all pivots are moved as far as they may after every chunk."""
     cache, rng = init_cache(REFINED, CAPACITY), np.random.default_rng(0)
     for seed in range(6):
-        cache = fuse(
-            cache,
-            to_jax(Recipe(seed, ("few", "one_voxel", "boundaries")[seed % 3], "normal", "random").tokens()),
-            REFINED,
-        )
+        places = ("few", "one_voxel", "boundaries")[seed % 3]
+        cache = fuse(cache, to_jax(Recipe(seed, places, "normal", "random").tokens()), REFINED)
         alive = np.asarray(cache.alive)
         places = cache.means[:, :, None] + unpack(cache.changes.reshape(-1, PER_TOKEN * WIDTH)).means.reshape(
             *alive.shape, PER_TOKEN, 3
@@ -102,12 +91,6 @@ def test_merges_of_changed_pivots_stay_in_their_voxels():
     assert int(cache.stats.num_merged) > 20
 
 
-def test_without_refinement_a_cache_has_no_trace_of_it():
-    cache = init_cache(CONFIG, CAPACITY)
-    assert cache.changes is None and cache.key_views is None
-    assert len(jax.tree.leaves(init_cache(REFINED, CAPACITY))) == len(jax.tree.leaves(cache)) + 1
-
-
 # Gaussians -----------------------------------------------------------------------------------------------------------
 
 
@@ -117,7 +100,7 @@ def gaussians(count: int) -> Gaussians:
     return Gaussians(
         means=array(-1, 1, 3),
         quats=array(-1, 1, 4),
-        scales=array(0.001, 0.1, 3),
+        scales=array(0.001, 0.15, 3),
         opacities=array(0, 1).at[::4].set(0.0),
         sh=array(-1, 1, 4, 3),
     )
@@ -147,20 +130,16 @@ def test_each_part_of_a_change_changes_what_it_names():
     old = jax.tree.map(lambda x: np.asarray(x)[is_present], scene)
     new = {name: jax.tree.map(lambda x: np.asarray(x)[is_present], g) for name, g in new.items()}
     np.testing.assert_allclose(new["means"].means, old.means + 0.5)
-    np.testing.assert_allclose(new["log_scales"].scales, np.minimum(2 * old.scales, 0.12), rtol=1e-6)
+    # Scales that were above the limit before are not shrunk.
+    np.testing.assert_allclose(
+        new["log_scales"].scales, np.maximum(old.scales, np.minimum(2 * old.scales, 0.12)), rtol=1e-6
+    )
     np.testing.assert_allclose(SH_C0 * (new["sh"].sh - old.sh)[:, 0], 0.25, rtol=1e-5)
     logits = lambda o: np.log(o) - np.log1p(-o)  # noqa: E731
     np.testing.assert_allclose(logits(new["logit_opacities"].opacities), logits(old.opacities) - 1, atol=1e-3)
 
 
-def test_scales_above_the_limit_are_not_shrunk():
-    scene = gaussians(16)
-    large = dataclasses.replace(scene, scales=scene.scales + 1.0)
-    change = dataclasses.replace(changes(0, 0.0, 4), log_scales=jnp.full((16, 3), 1.0))
-    np.testing.assert_array_equal(changed_gaussians(large, change, max_scale=0.5).scales, large.scales)
-
-
-@pytest.mark.parametrize("per_token", [1, 4, 9, 16])
+@pytest.mark.parametrize("per_token", [1, 4, 16])
 def test_a_change_of_zero_moves_no_pivot_by_a_bit(per_token):
     """Also where the sum of equal numbers is rounded."""
     means = pivots(3, 300.0, 4096)

@@ -1,4 +1,4 @@
-"""Votes equal the NumPy reference, and views vote within their limits."""
+"""Votes and observations of views equal the NumPy reference, and stay within their limits."""
 
 import jax
 import jax.numpy as jnp
@@ -7,11 +7,12 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from ssplat_jax.cache import carve, init_cache, store_depths, vote
-from ssplat_jax.cache import numpy_reference as reference
-from ssplat_jax.cache.state import STORED_CELLS
+from ssplat_jax.cache import carve, init_cache, observe, store_depths, vote
+from ssplat_jax.cache.state import NUM_OBSERVED, STORED_CELLS
+from ssplat_jax.cache.votes import observation_features
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.pytree import replace
+from tests.cache import numpy_reference as reference
 from tests.cache.projection_scenes import (
     DECISION_MARGIN,
     DEPTHS,
@@ -20,60 +21,79 @@ from tests.cache.projection_scenes import (
     SEED,
     SETTINGS,
     cameras,
+    cells_of,
     front_camera,
     random_views,
     scene,
     with_pivots,
 )
-from tests.cache.streams import CAPACITY, CONFIG, tokens_at
+from tests.cache.streams import CAPACITY, CONFIG, Recipe, fuse, to_jax, tokens_at
 
-jit_carve = jax.jit(carve, static_argnums=4)
-jit_vote = jax.jit(vote, static_argnums=2)
-jit_store = jax.jit(store_depths, static_argnums=4)
+ON, BEFORE, BEHIND, ERROR_ON, ERROR_BEFORE, OFFSET, CROWD, RELATIVE, SIZE = range(NUM_OBSERVED)
 EMPTY = init_cache(CONFIG, CAPACITY)
 SHAPE = (1, HEIGHT, GRID_WIDTH)
 TAU = float(np.float32(CONFIG.memory.min_confidence))
+jit_vote = jax.jit(vote, static_argnums=2)
 
 
-def seen(depth: float, confidence: float = 0.8):
-    """Depths and confidences of the front camera, the same in every cell."""
-    return jnp.full(SHAPE, depth), jnp.full(SHAPE, confidence)
+@jax.jit
+def told(cache, camera, cells):
+    """The cache after the cells of views voted on its pivots, and after they were observed."""
+    return carve(cache, camera, cells, CONFIG), observe(cache, camera, cells, CONFIG)
 
 
-def after_chunk(cache, camera, depths, confidences):
+def seen(depth: float, confidence: float = 0.8, color: float = 0.5):
+    """Cells of the front camera, all alike."""
+    return cells_of(jnp.full(SHAPE, depth), jnp.full(SHAPE, confidence), jnp.full((*SHAPE, 3), color))
+
+
+@jax.jit
+def after_chunk(cache, camera, cells):
     """The cache after a chunk was counted and its depths stored."""
     stats = replace(cache.stats, num_chunks=cache.stats.num_chunks + 1)
-    return jit_store(replace(cache, stats=stats), camera, depths, confidences, CONFIG)
+    return store_depths(replace(cache, stats=stats), camera, cells)
 
 
 def confidence_after(pivot_depth: float, *views, start: float = 0.6) -> float:
-    """Confidence of one pivot on the axis of the front camera after `views` (depths, confidences)."""
+    """Confidence of one pivot on the axis of the front camera after `views`."""
     cache = with_pivots([[0.0, 0.0, pivot_depth]], confidences=[start])
-    for depths, confidences in views:
-        cache = jit_carve(cache, front_camera(), depths, confidences, CONFIG)
+    for cells in views:
+        cache, _ = told(cache, front_camera(), cells)
     return float(cache.confidences[0, 0])
 
 
-def voted(mean, *view, confidence=0.6, valid=True) -> float:
+def voted(mean, cells=None, confidence=0.6, valid=True) -> float:
     """Confidence of a token after one chunk whose view saw a wall, at depth 2 by default."""
-    cache = after_chunk(EMPTY, front_camera(), *(view or seen(2.0)))
+    cache = after_chunk(EMPTY, front_camera(), cells or seen(2.0))
     token = tokens_at([mean], [confidence], valid=[valid])
     return float(jit_vote(cache.stored_depths, token, CONFIG).confidences[0])
 
 
+def random_scene(seed: int, num_voxels: int = CAPACITY, depth_spread: float = 1.0):
+    """A cache whose pivots have random footprints, and depths, confidences and colors of two views."""
+    cache, rng = scene(seed, num_voxels, depth_spread), np.random.default_rng(seed + 1)
+    sizes = jnp.asarray(rng.uniform(0.05, 0.5, cache.footprints.shape), jnp.float32)
+    depths, confidences = random_views(seed)
+    colors = rng.uniform(size=(*depths.shape, 3)).astype(np.float32)
+    return replace(cache, footprints=jnp.where(cache.alive, sizes, 0.0)), (depths, confidences, colors)
+
+
 @SETTINGS
-@given(scene_seed=SEED, camera_seed=SEED, num_voxels=st.integers(0, CAPACITY), depth_spread=DEPTHS)
-def test_carving_equals_the_reference(scene_seed, camera_seed, num_voxels, depth_spread):
-    cache, camera = scene(scene_seed, num_voxels, depth_spread), cameras(camera_seed)
-    depths, confidences = random_views(camera_seed)
-    wanted = reference.from_arrays(cache)
-    margin = reference.carve(wanted, camera.viewmats, camera.Ks, depths, confidences, CONFIG)
-    assume(margin > DECISION_MARGIN)
-    got = jit_carve(cache, camera, jnp.asarray(depths), jnp.asarray(confidences), CONFIG)
-    for row, (_, pivots) in enumerate(wanted["rows"]):
-        expected = [pivot["confidences"] for pivot in pivots]
-        np.testing.assert_allclose(got.confidences[row, : len(pivots)], expected, rtol=2e-6)
-    jax.tree.map(np.testing.assert_array_equal, replace(got, confidences=cache.confidences), cache)
+@given(seed=SEED, num_voxels=st.integers(0, CAPACITY), depth_spread=DEPTHS)
+def test_votes_on_pivots_and_observations_equal_the_reference(seed, num_voxels, depth_spread):
+    (cache, views), camera = random_scene(seed, num_voxels, depth_spread), cameras(seed)
+    carved, observed = reference.from_arrays(cache), reference.from_arrays(cache)
+    margin = reference.carve(carved, camera.viewmats, camera.Ks, *views[:2], CONFIG)
+    assume(min(margin, reference.observe(observed, camera.viewmats, camera.Ks, *views, CONFIG)) > DECISION_MARGIN)
+    by_votes, by_views = told(cache, camera, cells_of(*views))
+    for row, ((_, voted_on), (_, pivots)) in enumerate(zip(carved["rows"], observed["rows"], strict=True)):
+        expected = [pivot["confidences"] for pivot in voted_on]
+        np.testing.assert_allclose(by_votes.confidences[row, : len(pivots)], expected, rtol=2e-6)
+        expected = [pivot["observations"] for pivot in pivots]
+        np.testing.assert_allclose(by_views.observations[row, : len(pivots)], expected, rtol=1e-4, atol=1e-4)
+    jax.tree.map(np.testing.assert_array_equal, replace(by_votes, confidences=cache.confidences), cache)
+    jax.tree.map(np.testing.assert_array_equal, replace(by_views, observations=cache.observations), cache)
+    assert not np.asarray(by_views.observations)[~np.asarray(cache.alive)].any()
 
 
 @settings(SETTINGS, max_examples=6)  # two chunks each, also in the slow reference
@@ -86,7 +106,7 @@ def test_votes_on_tokens_equal_the_reference(seed, camera_seed, size):
         scale = jnp.array([width / GRID_WIDTH, height / HEIGHT, 1.0])[:, None]
         camera = Camera(viewmats=camera.viewmats, Ks=camera.Ks * scale, width=width, height=height)
         depths, confidences = random_views(seed + chunk, height, width)
-        cache = after_chunk(cache, camera, depths, confidences)
+        cache = after_chunk(cache, camera, cells_of(depths, confidences))
         views.append(reference.stored_depths(camera.viewmats, camera.Ks, depths, confidences, STORED_CELLS, CONFIG))
         viewmat, K, nearest, _, weights = views[-1]
         stored = jax.tree.map(lambda x, chunk=chunk: x[chunk], cache.stored_depths)
@@ -127,11 +147,10 @@ def test_confidences_stay_revisable():
 
 
 def test_an_untrusted_neighbor_forbids_carving_but_not_agreement():
-    depths, confidences = seen(2.0)
     for row, column in ((2, 3), (3, 5), (4, 4)):
-        views = (depths, confidences.at[0, row, column].set(0.1))
-        assert confidence_after(1.0, views) == np.float32(0.6)
-        assert confidence_after(2.0, views) > 0.6
+        cells = cells_of(jnp.full(SHAPE, 2.0), jnp.full(SHAPE, 0.8).at[0, row, column].set(0.1))
+        assert confidence_after(1.0, cells) == np.float32(0.6)
+        assert confidence_after(2.0, cells) > 0.6
 
 
 def test_tokens_are_revised_as_pivots_are():
@@ -164,7 +183,7 @@ def test_tokens_are_revised_as_pivots_are():
 )
 def test_hard_votes_on_a_pivot_and_a_token_at_depth_1(confidence, depth, weight, wanted):
     pivot = confidence_after(1.0, seen(depth, weight), start=confidence)
-    token = voted([0, 0, 1.0], *seen(depth, weight), confidence=confidence)
+    token = voted([0, 0, 1.0], seen(depth, weight), confidence=confidence)
     unchanged = float(np.float32(confidence))
     assert pivot == (unchanged if wanted is None else pytest.approx(wanted, rel=2e-3))
     assert token == (unchanged if wanted is None or confidence < TAU else pytest.approx(wanted, rel=2e-3))
@@ -177,18 +196,96 @@ def test_the_best_view_is_stored_and_the_oldest_chunk_replaced(monkeypatch):
         depths = np.full((2, HEIGHT, GRID_WIDTH), 2.0 + chunk, np.float32)
         confidences = np.full_like(depths, 0.8)
         confidences[1 - chunk % 2, 0, 0] = 0.0  # so that the other view has one trusted cell more
-        cache = after_chunk(cache, camera, depths, confidences)
+        cache = after_chunk(cache, camera, cells_of(depths, confidences))
         np.testing.assert_array_equal(cache.stored_depths.viewmats[chunk % 2], camera.viewmats[chunk % 2])
     np.testing.assert_allclose(np.exp(cache.stored_depths.log_depths.max(axis=(1, 2))), [4.0, 3.0], rtol=1e-6)
-    after = after_chunk(cache, front_camera(), *seen(3.0, 0.0))  # as padding: it displaces nothing
+    after = after_chunk(cache, front_camera(), seen(3.0, 0.0))  # as padding: it displaces nothing
     jax.tree.map(np.testing.assert_array_equal, after.stored_depths, cache.stored_depths)
 
 
 def test_without_carving_nothing_is_computed():
     off = CONFIG.replace(carving=False)
     cache, token = init_cache(off, CAPACITY), tokens_at([[0, 0, 1.0]], [0.6])
-    views = (front_camera(), *seen(2.0))
     assert cache.stored_depths.weights.size == 0
-    assert not jax.make_jaxpr(lambda *args: carve(*args, off))(cache, *views).eqns
+    assert not jax.make_jaxpr(lambda *args: carve(*args, off))(cache, front_camera(), seen(2.0)).eqns
     assert not jax.make_jaxpr(lambda *args: vote(*args, off))(cache.stored_depths, token).eqns
-    assert not jax.make_jaxpr(lambda *args: store_depths(*args, off))(cache, *views).eqns
+    assert not jax.make_jaxpr(store_depths)(cache, front_camera(), seen(2.0)).eqns
+
+
+# Observations ---------------------------------------------------------------------------------------------------------
+
+
+def of_pivot(depth: float, *, at: float = 2.0, weight: float = 0.8, color: float = 0.5):
+    """Observations of one pivot on the axis of the front camera, whose cells all have one depth and color."""
+    cache = with_pivots([[0.0, 0.0, depth]], confidences=[0.6])
+    cache = replace(cache, footprints=cache.footprints.at[0, 0].set(0.5), rgbs=cache.rgbs.at[0, 0].set(0.5))
+    return np.asarray(told(cache, front_camera(), seen(at, weight, color))[1].observations[0, 0])
+
+
+def test_a_pivot_on_before_and_behind_the_surface():
+    on, before, behind = (of_pivot(depth, color=0.75) for depth in (2.0, 1.9, 2.1))
+    for numbers, place in ((on, ON), (before, BEFORE), (behind, BEHIND)):
+        np.testing.assert_allclose(numbers[:3], 0.8 * np.eye(3)[place], rtol=1e-6)
+    # Errors count where the pivot should show.
+    assert [on[ERROR_ON], before[ERROR_BEFORE]] == pytest.approx([0.8 * 0.25] * 2, rel=1e-5)
+    assert behind[[ERROR_ON, ERROR_BEFORE]].tolist() == [0, 0]
+    # A pivot of 0.5 at depth 2 fills 2 cells of a camera of 8 cells focal length.
+    assert on[SIZE] == pytest.approx(0.8 * np.log(0.5 / (2.0 / 8.0)), rel=1e-5)
+    assert of_pivot(2.02)[OFFSET] == pytest.approx(0.8 * np.log(1.01) / np.log(1.03), rel=1e-4)
+    assert of_pivot(1.98)[OFFSET] < 0
+
+
+@pytest.mark.parametrize(("other", "crowd"), [(0.6, np.log(2.0)), (0.1, 0.0)])  # a carved pivot crowds no cell
+def test_pivots_of_one_cell_are_compared_with_each_other(other, crowd):
+    """The pivot whose color fits has a negative relative error, the other one on the same surface a positive one."""
+    cache = with_pivots([[0.0, 0.0, 2.0], [0.01, 0.0, 2.0]], confidences=[0.6, other])
+    cache = replace(cache, rgbs=cache.rgbs.at[0, 0].set(0.5).at[1, 0].set(0.9))
+    got = told(cache, front_camera(), seen(2.0, 1.0))[1].observations
+    assert got[0, 0, CROWD] == pytest.approx(crowd, rel=1e-5)
+    if crowd:
+        np.testing.assert_allclose(got[:2, 0, RELATIVE], [-0.2, 0.2], rtol=1e-4)
+
+
+@pytest.mark.parametrize(("depth", "weight"), [(np.nan, 0.8), (np.inf, 0.8), (0.0, 0.8), (2.0, 0.0), (2.0, 0.29)])
+def test_untrusted_cells_say_nothing(depth, weight):
+    assert not of_pivot(2.0, at=depth, weight=weight).any()
+
+
+def test_views_add_up():
+    """Two views together say what they say one after the other."""
+    (cache, views), camera = random_scene(0), cameras(0)
+    together, one_by_one = told(cache, camera, cells_of(*views))[1].observations, cache
+    for i in range(2):
+        _, one_by_one = told(one_by_one, camera[jnp.array([i])], cells_of(*(x[i][None] for x in views)))
+    np.testing.assert_allclose(together, one_by_one.observations, rtol=1e-5, atol=1e-5)
+
+
+def test_shards_see_what_the_whole_cache_sees():
+    """Pivots of other shards crowd a cell too."""
+    (whole, views), camera = random_scene(0, depth_spread=0.1), cameras(0)
+    cells, half = cells_of(*views), CAPACITY // 2
+    rolled = [jax.tree.map(lambda x, i=i: jnp.roll(x, -i * half, axis=0) if x.ndim else x, whole) for i in range(2)]
+    parts = [replace(x, num_voxels=jnp.asarray(half), counts=x.counts.at[half:].set(0)) for x in rolled]
+    shards = jax.tree.map(lambda *x: jnp.stack(x), *parts)
+    got = jax.vmap(lambda cache: observe(cache, camera, cells, CONFIG, axis="shards"), axis_name="shards")(shards)
+    wanted = observe(whole, camera, cells, CONFIG).observations
+    assert np.abs(wanted[..., CROWD]).max() > 0.1
+    np.testing.assert_allclose(got.observations[:, :half].reshape(wanted.shape), wanted, rtol=1e-4, atol=1e-5)
+
+
+def test_merges_keep_all_observations():
+    """New pivots have none and merged ones add theirs up, so the sum over all pivots stays."""
+    tokens = [to_jax(Recipe(seed, "one_voxel", "normal", "random").tokens()) for seed in range(2)]
+    cache = fuse(init_cache(CONFIG, CAPACITY), tokens[0], CONFIG)
+    assert not np.asarray(cache.observations).any()
+    sums = np.random.default_rng(0).uniform(size=cache.observations.shape) * np.asarray(cache.alive)[..., None]
+    cache = fuse(replace(cache, observations=jnp.asarray(sums, jnp.float32)), tokens[1], CONFIG)
+    assert int(cache.stats.num_merged) > 0
+    np.testing.assert_allclose(cache.observations.sum(axis=(0, 1)), sums.sum(axis=(0, 1)), rtol=1e-5)
+
+
+@pytest.mark.parametrize("value", [0.0, 1.0, 1e6])
+def test_features_are_finite_and_pass_no_gradient(value):
+    packed = jnp.full((3, NUM_OBSERVED), value)
+    assert jnp.isfinite(observation_features(packed)).all()
+    assert not jnp.any(jax.grad(lambda x: observation_features(x).sum())(packed))

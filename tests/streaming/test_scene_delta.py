@@ -15,7 +15,7 @@ from ssplat_jax.model.network import init_params
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.storage.chunk_records import load_delta, save_delta
 from ssplat_jax.streaming.scene_delta import SceneFeed, apply_confidences, apply_delta
-from tests.cache.streams import CAPACITY, CONFIG, PLACES, VARIANTS, Recipe, fuse, fuse_with_rows, to_jax
+from tests.cache.streams import CAPACITY, CONFIG, PLACES, VARIANTS, Recipe, fuse, to_jax, written_rows
 
 HEAD_TOL = 1e-5  # relative and absolute: programs for different numbers of rows may round differently
 
@@ -83,7 +83,7 @@ def test_a_delta_holds_the_changed_rows_alone(monkeypatch):
     model, params = StreamSplat(CONFIG), decoder_params(CONFIG)
     feed, cache = SceneFeed(model, params), init_cache(CONFIG, CAPACITY)
     assert len(feed.update(cache).rows) == 0
-    cache, rows = fuse_with_rows(cache, chunk(1), CONFIG)
+    cache = fuse(cache, chunk(1), CONFIG)
     with monkeypatch.context() as patched, pytest.raises(MemoryError):
 
         def fails(*given):
@@ -91,7 +91,7 @@ def test_a_delta_holds_the_changed_rows_alone(monkeypatch):
 
         patched.setattr(feed, "_decode_rows", fails)
         feed.update(cache)
-    assert set(feed.update(cache).rows) == rows  # a failed update is made up for
+    assert set(feed.update(cache).rows) == written_rows(cache)  # a failed update is made up for
     assert len(feed.update(cache).rows) == 0
     row = int(jnp.argmax(jnp.max(cache.confidences, axis=1)))
     sunk = replace(cache, confidences=cache.confidences.at[row].set(0.1))
@@ -99,8 +99,8 @@ def test_a_delta_holds_the_changed_rows_alone(monkeypatch):
     assert feed.update(cache).rows.tolist() == [row]
     # A receiver who has the scene of a known cache needs the rest.
     known = jax.tree.map(jnp.copy, cache)
-    cache, rows = fuse_with_rows(cache, chunk(2), CONFIG)
-    assert set(SceneFeed(model, params, known).update(cache).rows) == rows
+    cache = fuse(cache, chunk(2), CONFIG)
+    assert set(SceneFeed(model, params, known).update(cache).rows) == written_rows(cache)
 
 
 def test_deltas_come_back_from_disk_to_the_last_bit(tmp_path):
