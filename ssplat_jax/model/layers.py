@@ -1,17 +1,16 @@
-"""Layers that several stages share: convolutions, norms, attention, windows, neighbors in 3D, and the small U-Net.
+"""Layers that several stages share: convolutions, norms, attention, windows, and the small U-Net.
 
 Norms and softmax are computed in float32.
 """
 
 import functools
+from collections.abc import Callable
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
-
-from ssplat_jax.core.cpu_backend import lane_sum
 
 # -- Convolutions -----------------------------------------------------------------------------------------------------
 
@@ -134,6 +133,11 @@ def instance_norm(x: Float[Array, "v h w c"], eps: float = 1e-5) -> Float[Array,
     return (x - mean) * jax.lax.rsqrt(variance + eps)
 
 
+def layer_norm(name: str, epsilon: float = 1e-5) -> nn.LayerNorm:
+    """LayerNorm with PyTorch's epsilon and two-pass variance."""
+    return nn.LayerNorm(epsilon=epsilon, use_fast_variance=False, name=name)
+
+
 def average_pool(x: Float[Array, "v h w c"], factor: int) -> Float[Array, "v hf wf c"]:
     """Mean of `factor` x `factor` patches."""
     v, h, w, c = x.shape
@@ -170,24 +174,6 @@ def attend(
     weights = jax.nn.softmax(jnp.where(allowed, scores, -1e9), axis=-1)
     mixed = jnp.matmul(weights.astype(values.dtype), values)
     return jnp.moveaxis(mixed * jnp.any(allowed, axis=-1, keepdims=True).astype(mixed.dtype), -3, -2)
-
-
-def attend_per_query(
-    queries: Float[Array, "m c"],
-    keys: Float[Array, "m k c"],
-    values: Float[Array, "m k c"],
-    allowed: Bool[Array, "m k"],
-) -> Float[Array, "m c"]:
-    """One-head attention where every query has a few keys of its own.
-
-    `attend` would compute products of one-row matrices, which are four times slower on a CPU.
-
-    Limits:
-        A query without an `allowed` key gives zeros.
-    """
-    scores = lane_sum(queries[:, None] * keys).astype(jnp.float32) * queries.shape[-1] ** -0.5
-    weights = jax.nn.softmax(jnp.where(allowed, scores, -1e9), axis=-1) * allowed.astype(jnp.float32)
-    return jnp.sum(weights.astype(values.dtype)[..., None] * values, axis=-2)
 
 
 # -- Windows for attention (Swin Transformer, Liu et al. 2021) --------------------------------------------------------
@@ -234,61 +220,56 @@ def same_region_mask(
     return cells[..., :, None] == cells[..., None, :]
 
 
-# -- Neighbors in 3D, for the mixers (as in ReSplat) ------------------------------------------------------------------
+def attend_in_windows(
+    x: Float[Array, "v h w c"],
+    side: tuple[int, int],
+    num_blocks: int,
+    sources: Int[Array, "v s"],
+    source_valid: Bool[Array, "v s"],
+    block: Callable,
+    repeat_mask: Callable = jnp.tile,
+) -> Float[Array, "v h w c"]:
+    """Features after blocks of attention in windows of `side` cells, each view to itself and to its source views.
 
-SEARCH_BLOCK = 1024
-"""Queries per block of the global search, which bounds the size of its distance matrix."""
-
-
-def nearest_tokens(
-    positions: Float[Array, "v hf wf 3"], inside: Bool[Array, "v hf wf"], num_neighbors: int, radius: int
-) -> Int[Array, "m k"]:
-    """Flat indices of each token's nearest tokens in 3D, the token itself first.
+    Every other block shifts the windows by half a window.
 
     Args:
-        positions: token positions, stream frame.
-        inside: tokens in the image. Others are chosen last.
-        num_neighbors: per token, itself included; fewer where there are not so many candidates.
-        radius: candidates are the (2 r + 1)^2 cells around a token in its own view; 0 for all tokens of all views.
+        x: features of each view, without position code.
+        side: (height, width) of a window.
+        num_blocks: number of blocks.
+        sources: indices of each view's source views.
+        source_valid: which of them are valid.
+        block: maps (number, windows, gather, together, allowed) to new windows. `gather(windows)` are the same windows
+            of all sources, `together` masks cells of one region of the own window, `allowed` those of the sources'.
+        repeat_mask: maps `together` and the number of sources to the mask of the sources' cells.
     """
-    if radius == 0:
-        return _nearest_of_all(positions.reshape(-1, 3), inside.reshape(-1), num_neighbors)
-    v, hf, wf, _ = positions.shape
-    side = 2 * radius + 1
-    flat = jnp.arange(v * hf * wf).reshape(v, hf, wf)
-    rows = jnp.arange(hf)[:, None] + jnp.arange(side) - radius
-    columns = jnp.arange(wf)[:, None] + jnp.arange(side) - radius
-    in_rows, in_columns = (rows >= 0) & (rows < hf), (columns >= 0) & (columns < wf)
-    in_grid = in_rows[:, None, :, None] & in_columns[None, :, None, :]
-    in_grid = jnp.broadcast_to(in_grid, (v, *in_grid.shape)).reshape(v * hf * wf, side * side)
-    rows, columns = jnp.clip(rows, 0, hf - 1), jnp.clip(columns, 0, wf - 1)
-    candidates = flat[:, rows[:, None, :, None], columns[None, :, None, :]].reshape(v * hf * wf, side * side)
-    points, usable = positions.reshape(-1, 3), inside.reshape(-1)
-    offsets = points[candidates] - points[:, None]
-    # At the border of the grid, clipped candidates repeat border cells: only cells inside the grid count.
-    distances = jnp.where(usable[candidates] & in_grid, jnp.sum(offsets**2, axis=-1), jnp.inf)
-    distances = distances.at[:, side * side // 2].set(-1.0)  # the token itself
-    _, best = jax.lax.top_k(-distances, min(num_neighbors, side * side))
-    return jnp.take_along_axis(candidates, best, axis=1)
+    v, h, w, c = x.shape
+    cells, num_sources = side[0] * side[1], sources.shape[1]
+    x = x + jnp.tile(sine_positions(*side, c), (h // side[0], w // side[1], 1))
+    seen = jnp.repeat(source_valid, cells, axis=1)[:, None, None]
 
+    def gather(windows):
+        return windows[sources].transpose(0, 2, 1, 3, 4).reshape(v, windows.shape[1], num_sources * cells, c)
 
-def _nearest_of_all(points, usable, k):
-    m = points.shape[0]
-    padded = jnp.pad(points, ((0, -m % SEARCH_BLOCK), (0, 0)))
-    own = jnp.pad(jnp.arange(m), (0, -m % SEARCH_BLOCK), constant_values=-1)
-
-    def search(block):
-        queries, idx = block
-        distances = sum((queries[:, None, i] - points[None, :, i]) ** 2 for i in range(3))
-        distances = jnp.where(usable[None], distances, jnp.inf)
-        distances = jnp.where(idx[:, None] == jnp.arange(m)[None], -1.0, distances)
-        return jax.lax.top_k(-distances, min(k, m))[1]
-
-    blocks = (padded.reshape(-1, SEARCH_BLOCK, 3), own.reshape(-1, SEARCH_BLOCK))
-    return jax.lax.map(search, blocks).reshape(padded.shape[0], -1)[:m]
+    for i in range(num_blocks):
+        shift = (side[0] // 2, side[1] // 2) if i % 2 else (0, 0)
+        together = same_region_mask(h, w, side, shift)
+        windows = to_windows(jnp.roll(x, (-shift[0], -shift[1]), axis=(1, 2)), side)
+        windows = block(i, windows, gather, together, seen & repeat_mask(together, num_sources))
+        x = jnp.roll(from_windows(windows, side, h, w), shift, axis=(1, 2))
+    return x
 
 
 # -- Blocks, and the U-Net of the compact network and of CGFI ---------------------------------------------------------
+class Mlp(nn.Module):
+    """Two-layer MLP with a hidden layer four times as wide."""
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "*b c"]) -> Float[Array, "*b c"]:
+        c = x.shape[-1]
+        return nn.Dense(c, name="fc2")(nn.gelu(nn.Dense(4 * c, name="fc1")(x), approximate=False))
+
+
 class ResidualBlock(nn.Module):
     """Twice conv - InstanceNorm - ReLU, with a projected skip connection where the shape changes."""
 

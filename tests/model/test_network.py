@@ -17,7 +17,6 @@ from ssplat_jax.model.network import NETWORKS, Network, NetworkConfig, count_par
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.model.views import GRID_STRIDE, DepthDistribution, TokenShapes
 from ssplat_jax.network_configs import NETWORK_CONFIGS, CompactConfig, ResplatConfig
-from tests.model.small import chunk, finite
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,21 +96,6 @@ def toy(monkeypatch) -> StreamConfig:
     return StreamConfig().replace(network="toy", capacity=256, min_confidence=0.0, hpda=True, cgfi=True, chunk_size=3)
 
 
-@pytest.mark.slow
-def test_registered_network_streams_and_decodes(toy):
-    model = StreamSplat(toy)
-    params = model.init(jax.random.key(0))
-    assert set(params) == {"encoder", "cost_volume", "hpda", "tokens", "cgfi", "mixer", "decoder", "evidence"}
-    assert count_params(params["encoder"]) == 12
-    step, cache = jax.jit(model.step), model.init_cache()
-    for seed in range(2):  # the second chunk has a history
-        cache, output = step(params, cache, chunk(seed))
-    assert finite((cache, output)) and int(cache.num_voxels) > 0
-    assert float((output.history > 0).mean()) > 0.1
-    gaussians = model.decode(params, cache)
-    assert finite(gaussians) and float(gaussians.opacities.max()) > 0
-
-
 def test_a_network_that_replaces_another_has_its_own_parameters(toy):
     class Wider(ToyNetwork):
         def stages(self, config):
@@ -125,27 +109,25 @@ def test_a_network_that_replaces_another_has_its_own_parameters(toy):
     assert num_params() == 20
 
 
-def test_taken_kind_is_refused(toy):
-    @dataclasses.dataclass(frozen=True)
-    class Impostor(ToyConfig):
-        kind: ClassVar[str] = "compact"
-
-    with pytest.raises(InputError, match="'compact', which is taken"):
-        register_network(Impostor, ToyNetwork())
-
-
-def test_incomplete_network_is_refused(toy):
+def test_networks_that_lack_something_and_taken_kinds_are_refused(toy):
     @dataclasses.dataclass(frozen=True)
     class NoMultiple:
         kind: ClassVar[str] = "bare"
 
-    with pytest.raises(InputError, match="members of NetworkConfig, got NoMultiple"):
-        register_network(NoMultiple, ToyNetwork())
+    @dataclasses.dataclass(frozen=True)
+    class Impostor(ToyConfig):
+        kind: ClassVar[str] = "compact"
+
     unhashable = dataclasses.make_dataclass("Thawed", [])()  # a dataclass that compares and is not frozen
-    with pytest.raises(InputError, match=r"with a hash .*got Thawed"):
-        inspect.unwrap(register_network)(ToyConfig, unhashable)
-    with pytest.raises(InputError, match="methods of Network, got object"):
-        inspect.unwrap(register_network)(ToyConfig, object())  # without the type checks of the tests
+    without_checks = inspect.unwrap(register_network)  # without the type checks of the tests
+    for config_type, network, words in (
+        (NoMultiple, ToyNetwork(), "members of NetworkConfig, got NoMultiple"),
+        (Impostor, ToyNetwork(), "'compact', which is taken"),
+        (ToyConfig, unhashable, r"with a hash .*got Thawed"),
+        (ToyConfig, object(), "methods of Network, got object"),
+    ):
+        with pytest.raises(InputError, match=words):
+            without_checks(config_type, network)
     assert "bare" not in NETWORK_CONFIGS
 
 

@@ -7,10 +7,9 @@ import numpy as np
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.chunk import Chunk
 from ssplat_jax.core.pytree import replace
-from ssplat_jax.model.compact.cnn_encoder import encode
-from ssplat_jax.model.compact.compact_layers import CompactFeatures
-from ssplat_jax.model.compact.sweep_matching import plane_sweep
+from ssplat_jax.model.compact import CompactFeatures, encode, plane_sweep
 from ssplat_jax.model.views import prepare_views, sweep_pixels
+from tests.core.test_rotations import rodrigues
 from tests.model.small import random_params
 
 CONFIG = StreamConfig().replace(
@@ -50,14 +49,24 @@ def wall_chunk() -> Chunk:
     )
 
 
-@jax.jit
-def cost(params, chunk):
-    views = prepare_views(chunk, CONFIG)
-    return plane_sweep(encode(params["encoder"], views, CONFIG), views, CONFIG)
+sweep = jax.jit(lambda features, views: plane_sweep(features, views, CONFIG))
+encoded = jax.jit(lambda params, views: encode(params["encoder"], views, CONFIG))
+
+
+def costs(features, views):
+    """Mean cosines, `[view, row, column, scale, candidate]`."""
+    return np.asarray(sweep(features, views)).reshape(3, SIDE // 4, SIDE // 4, 2, CONFIG.network.num_depths)
 
 
 def wall_cost(chunk):
-    return np.asarray(cost(random_params(CONFIG), chunk)).reshape(3, SIDE // 4, SIDE // 4, 2, CONFIG.network.num_depths)
+    views = prepare_views(chunk, CONFIG)
+    return costs(encoded(random_params(CONFIG), views), views)
+
+
+def random_features() -> CompactFeatures:
+    random, side = np.random.default_rng(0), SIDE // 4
+    maps = {"fine": (2 * side, 2 * side, 32), "grid": (side, side, 32), "context": (side, side, 8)}
+    return CompactFeatures(**{k: jnp.asarray(random.normal(size=(3, *v)), jnp.float32) for k, v in maps.items()})
 
 
 def test_untrained_cost_peaks_at_the_wall():
@@ -84,11 +93,10 @@ def test_sweep_pixels_are_shifted_by_the_parallax():
 
 def test_a_cell_that_one_of_two_sources_sees_scores_as_with_that_source_alone():
     views = prepare_views(wall_chunk(), CONFIG)
-    random, side = np.random.default_rng(0), SIDE // 4
-    maps = {"fine": (2 * side, 2 * side, 32), "grid": (side, side, 32), "context": (side, side, 8)}
-    features = CompactFeatures(**{k: jnp.asarray(random.normal(size=(3, *v)), jnp.float32) for k, v in maps.items()})
-    sweep = jax.jit(lambda valid: plane_sweep(features, replace(views, valid=valid), CONFIG)[1])
-    both, first, last = (np.asarray(sweep(jnp.array(valid, bool))) for valid in ([1, 1, 1], [1, 1, 0], [0, 1, 1]))
+    features, side = random_features(), SIDE // 4
+    valid = ([1, 1, 1], [1, 1, 0], [0, 1, 1])
+    swept = (sweep(features, replace(views, valid=jnp.array(v, bool))) for v in valid)
+    both, first, last = (np.asarray(cost)[1] for cost in swept)
     # Scores by scale and candidate; whether the source sees the cell does not depend on the scale.
     seen = [np.asarray(sweep_pixels(views, 1, source, 4)[2]).reshape(-1, side, side) for source in (0, 2)]
     seen_first, seen_last = (np.concatenate([s, s]).transpose(1, 2, 0) for s in seen)
@@ -99,10 +107,27 @@ def test_a_cell_that_one_of_two_sources_sees_scores_as_with_that_source_alone():
     np.testing.assert_allclose(both[by_both], (first + last)[by_both] / 2, atol=1e-6)
 
 
-def test_cells_that_no_source_sees_score_zero():
-    away = np.diag([-1.0, 1.0, -1.0, 1.0])  # looks the other way
-    chunk = wall_chunk()
-    lonely = replace(chunk, viewmats=chunk.viewmats.at[0].set(jnp.asarray(away, jnp.float32)))
-    np.testing.assert_array_equal(wall_cost(lonely)[0], 0)
-    padded = replace(chunk, valid=jnp.array([True, False, False]))
-    np.testing.assert_array_equal(wall_cost(padded)[0], 0)
+def turned(angle: float):
+    """View matrices that rotate about the vertical through one center: there is no parallax."""
+    viewmats = np.tile(np.eye(4), (3, 1, 1))
+    for i, matrix in enumerate(viewmats):
+        matrix[:3, :3] = rodrigues([0, 1, 0], angle * i)
+    return jnp.asarray(viewmats, jnp.float32)
+
+
+def test_hard_features_and_cameras_reach_their_limits():
+    views, features = prepare_views(wall_chunk(), CONFIG), random_features()
+    ordinary = costs(features, views)
+    zero, one = (jax.tree.map(lambda x, value=value: jnp.full_like(x, value), features) for value in (0.0, 1.0))
+    np.testing.assert_array_equal(costs(zero, views), 0)
+    cost = costs(one, views)
+    assert (np.minimum(np.abs(cost), np.abs(cost - 1)) < 1e-5).all()  # 0 where no source sees the candidate
+    assert (cost > 0.5).mean() > 0.2
+    np.testing.assert_allclose(costs(jax.tree.map(lambda x: 1e18 * x, features), views), ordinary, atol=1e-5)
+    for angle in (0.0, 0.2):  # no parallax: no candidate is better than another
+        cost = costs(features, replace(views, viewmats=turned(angle)))
+        assert np.ptp(cost, axis=-1).max() < 1e-4 < 0.1 < np.abs(cost).max()
+    away = costs(features, replace(views, viewmats=turned(np.pi)))
+    np.testing.assert_array_equal(away[1], 0)  # between two that look the other way
+    for valid in ([True, False, False], [False] * 3):
+        np.testing.assert_array_equal(costs(features, replace(views, valid=jnp.array(valid)))[0], 0)

@@ -15,14 +15,12 @@ from ssplat_jax.model.hpda import expected_log_depth
 from ssplat_jax.model.layers import same_region_mask
 from ssplat_jax.model.network import count_params, init_params
 from ssplat_jax.model.resplat.encoder import POSITIONS_SIDE, Transformer, resampled_positions
-from ssplat_jax.model.resplat.torch_layers import TransposedConv, resize
-from ssplat_jax.model.streamsplat import StreamSplat
+from ssplat_jax.model.resplat.torch_layers import resize
 from ssplat_jax.model.views import prepare_views, to_candidate_space
 from ssplat_jax.training.losses import soft_targets
 from tests.model.small import chunk, history, random_params
 
 CONFIG = preset("small").replace(mixer_blocks=1, num_depths=32, min_confidence=0.0, capacity=1 << 11, chunk_size=3)
-MODEL = StreamSplat(CONFIG)
 
 
 @pytest.mark.parametrize(("name", "millions"), [("small", 62.1), ("base", 209.4)])
@@ -43,16 +41,6 @@ def test_resize_keeps_corners_and_interpolates_linearly():
             between = np.array([np.interp(columns, np.arange(7), row) for row in x[v, :, :, c]])
             wanted[v, :, :, c] = np.array([np.interp(rows, np.arange(5), column) for column in between.T]).T
         np.testing.assert_allclose(resize(jnp.asarray(x), height, width), wanted, atol=1e-5)
-
-
-def test_transposed_conv_makes_a_patch_of_every_sample():
-    rng = np.random.default_rng(0)
-    shapes = ((1, 2, 3, 4), (2, 2, 4, 5), (5,))
-    x, kernel, bias = (jnp.asarray(rng.normal(size=shape), jnp.float32) for shape in shapes)
-    y = TransposedConv(5, 2).apply({"params": {"kernel": kernel, "bias": bias}}, x)
-    for i, j in np.ndindex(4, 6):
-        wanted = x[0, i // 2, j // 2] @ kernel[i % 2, j % 2] + bias
-        np.testing.assert_allclose(np.asarray(y)[0, i, j], wanted, rtol=1e-5, atol=1e-5)
 
 
 def test_position_codes_are_resampled_as_by_dinov2():
@@ -116,29 +104,8 @@ def params() -> dict:
     return random_params(CONFIG)
 
 
-@functools.cache
-def step():
-    return jax.jit(MODEL.step)
-
-
 def views(**changes):
     return replace(chunk(0, views=3, height=40, width=56), **changes)
-
-
-@pytest.mark.slow
-def test_stream_fills_the_cache_and_depths_stay_in_range():
-    cache, out = step()(params(), MODEL.init_cache(), views())
-    near, far = CONFIG.network.depth_range
-    assert out.depths.shape == (3, 16, 16)  # padded to 64 x 64
-    assert near * (1 - 1e-5) <= out.depths.min() and out.depths.max() <= far * (1 + 1e-5)
-    assert int(cache.stats.num_accepted) == 3 * 10 * 14
-    gaussians = MODEL.decode(params(), cache)
-    assert gaussians.sh.shape[1:] == (16, 3)
-    assert all(np.isfinite(x).all() for x in jax.tree.leaves(gaussians))
-    # The next chunk has a history, which changes its depths.
-    _, later = step()(params(), cache, views())
-    assert (later.history > 0).mean() > 0.2
-    assert np.abs(np.asarray(later.depths - out.depths)).max() > 1e-4
 
 
 def test_injected_history_is_bounded_for_large_features():
@@ -155,16 +122,3 @@ def test_injected_history_is_bounded_for_large_features():
         injected.append(program(params()["cgfi"], feats, past, jnp.full(grid, 0.2), here, config))
     np.testing.assert_allclose(injected[1], injected[0], rtol=1e-3, atol=1e-3)
     assert np.abs(np.asarray(injected[0] - feats)).max() > 0.1
-
-
-@pytest.mark.slow  # compiles for two minutes
-def test_gradients_are_finite_and_reach_every_stage():
-    def loss(params):
-        prediction = MODEL.predict(params, MODEL.init_cache(), views())
-        gaussians = MODEL.decode_tokens(params, prediction.tokens)
-        return sum(jnp.sum(jnp.sin(x)) for x in (gaussians.means, gaussians.scales, gaussians.opacities, gaussians.sh))
-
-    gradients = jax.jit(jax.grad(loss))(params())
-    sizes = {name: float(sum(jnp.sum(jnp.abs(x)) for x in jax.tree.leaves(part))) for name, part in gradients.items()}
-    assert all(np.isfinite(size) for size in sizes.values())
-    assert all(size > 0 for name, size in sizes.items() if name != "hpda"), sizes  # without history, no anchor

@@ -4,8 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ssplat_jax.model.compact.compact_layers import CompactFeatures
-from ssplat_jax.model.compact.compact_tokens import regress_tokens
+from ssplat_jax.model.compact import CompactFeatures, regress_tokens
 from ssplat_jax.model.views import AnchoredDepth, DepthDistribution, prepare_views
 from tests.model.small import CONFIG, chunk, params
 

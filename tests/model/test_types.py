@@ -11,10 +11,9 @@ from ssplat_jax.core.cameras import pixel_grid, project_points, transform_points
 from ssplat_jax.core.gaussians import SH_C0
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.core.rotations import matrices_to_quats, quats_to_matrices
-from ssplat_jax.model.compact.cnn_encoder import Encoder
-from ssplat_jax.model.compact.compact_tokens import START_OPACITY, read_shapes
+from ssplat_jax.model.compact import START_OPACITY, Encoder, read_shapes
 from ssplat_jax.model.decoder import MAX_SCALE, MIN_SCALE, START_SCALE, START_THICKNESS, decode_tokens, token_scales
-from ssplat_jax.model.layers import from_windows, sine_positions, to_windows
+from ssplat_jax.model.layers import sine_positions
 from ssplat_jax.model.network import init_params
 from ssplat_jax.model.views import GRID_STRIDE, back_project, nearest_sources, patch_colors, prepare_views
 from tests.core.test_cameras import poses
@@ -70,14 +69,6 @@ def test_padded_views_are_chosen_last_and_marked():
     np.testing.assert_array_equal(valid[0], [True, True, False])
     alone, valid = nearest_sources(line_of_cameras(0, 1), jnp.array([True, False]), 3)
     assert alone.shape == (2, 1) and not valid[0].any() and int(alone[0, 0]) == 1
-
-
-def test_windows_and_back():
-    x = jnp.arange(2.0 * 8 * 12 * 3).reshape(2, 8, 12, 3)
-    windows = to_windows(x, (4, 6))
-    assert windows.shape == (2, 4, 24, 3)
-    np.testing.assert_array_equal(windows[1, 3].reshape(4, 6, 3), x[1, 4:8, 6:12])
-    np.testing.assert_array_equal(from_windows(windows, (4, 6), 8, 12), x)
 
 
 def test_position_code_is_that_of_detr():

@@ -7,8 +7,9 @@ import pytest
 
 from ssplat_jax.core.cpu_backend import in_own_kernel, lane_sum
 from ssplat_jax.core.numerics import clip_value, safe_log, safe_normalize, safe_sqrt
-from ssplat_jax.model.compact.sweep_matching import unit_features
-from ssplat_jax.model.layers import attend, attend_per_query, instance_norm
+from ssplat_jax.model.compact import unit_features
+from ssplat_jax.model.layers import attend, instance_norm
+from ssplat_jax.model.mixer import attend_per_query
 
 ULP = float(np.finfo(np.float32).eps)
 

@@ -10,7 +10,7 @@ import pytest
 from ssplat_jax.cache import grow, init_cache
 from ssplat_jax.core.errors import StorageError
 from ssplat_jax.core.pytree import replace
-from ssplat_jax.model.compact.compact_tokens import GaussianHead
+from ssplat_jax.model.compact import GaussianHead
 from ssplat_jax.model.network import init_params
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.storage.chunk_records import load_delta, save_delta

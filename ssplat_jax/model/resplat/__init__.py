@@ -5,16 +5,11 @@ from jaxtyping import Array, Float
 
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.model.layers import rms_normalize
+from ssplat_jax.model.mixer import Mixer
+from ssplat_jax.model.mixer import mix_tokens as mix_neighbors
 from ssplat_jax.model.resplat.cost_volume import CostVolume, match
 from ssplat_jax.model.resplat.encoder import VITS, WIDTHS, Encoder, encode, grid_size
-from ssplat_jax.model.resplat.resplat_tokens import (
-    GaussianHead,
-    Mixer,
-    TokenRegressor,
-    mix_tokens,
-    read_shapes,
-    regress_tokens,
-)
+from ssplat_jax.model.resplat.resplat_tokens import GaussianHead, TokenRegressor, read_shapes, regress_tokens
 from ssplat_jax.model.resplat.torch_layers import ReSplatFeatures
 from ssplat_jax.model.resplat.upsampler import Upsampler, refine_depth
 
@@ -46,6 +41,13 @@ def stages(config: StreamConfig) -> dict:
 def bound_history(feats: Float[Array, "v hf wf c"]) -> Float[Array, "v hf wf c"]:
     """`feats` at unit RMS, because features of this network have no bound."""
     return rms_normalize(feats)
+
+
+def mix_tokens(params, feats, positions, inside, view_valid, config: StreamConfig) -> Float[Array, "v hf wf c"]:
+    """Mixed token features, for the head and the cache: the mixer's output is added to its input."""
+    if not config.network.mixer_blocks:
+        return feats
+    return feats + mix_neighbors(params, feats, positions, inside, view_valid, config)
 
 
 class ResplatNetwork:

@@ -9,16 +9,15 @@ from ssplat_jax.config import StreamConfig
 from ssplat_jax.model.layers import (
     Conv,
     HalvingConv,
+    Mlp,
     ResidualBlock,
     attend,
-    from_windows,
+    attend_in_windows,
     instance_norm,
+    layer_norm,
     normalize_images,
-    same_region_mask,
-    sine_positions,
-    to_windows,
 )
-from ssplat_jax.model.resplat.torch_layers import Mlp, ReSplatFeatures, layer_norm, resize
+from ssplat_jax.model.resplat.torch_layers import ReSplatFeatures, resize
 from ssplat_jax.model.views import Views, nearest_sources
 
 WIDTHS = (64, 96, 128)
@@ -84,15 +83,14 @@ class TransformerBlock(nn.Module):
     """Attention within each view, then to the same window of its source views as they entered the block."""
 
     @nn.compact
-    def __call__(self, windows, sources, together, allowed):
-        v, n, cells, c = windows.shape
-        context = windows[sources].transpose(0, 2, 1, 3, 4).reshape(v, n, sources.shape[1] * cells, c)
+    def __call__(self, windows, gather, together, allowed):
+        context = gather(windows)
         windows = AttentionLayer(name="self_attn")(windows, windows, together)
         return AttentionLayer(has_ffn=True, name="cross_attn_ffn")(windows, context, allowed)
 
 
 class Transformer(nn.Module):
-    """Six blocks of windowed attention; every other block shifts the windows by half a window."""
+    """Six blocks of windowed attention."""
 
     upstream_compat: bool
 
@@ -100,20 +98,10 @@ class Transformer(nn.Module):
     def __call__(
         self, x: Float[Array, "v h w c"], sources: Int[Array, "v s"], source_valid: Bool[Array, "v s"]
     ) -> Float[Array, "v h w c"]:
-        _, h, w, c = x.shape
-        parts = num_windows(w)
-        side = (h // parts, w // parts)
-        x = x + jnp.tile(sine_positions(*side, c), (parts, parts, 1))
-        cells = side[0] * side[1]
-        for i in range(NUM_BLOCKS):
-            shift = (side[0] // 2, side[1] // 2) if i % 2 else (0, 0)
-            together = same_region_mask(h, w, side, shift)
-            seen = jnp.repeat(source_valid, cells, axis=1)[:, None, None]
-            windows = to_windows(jnp.roll(x, (-shift[0], -shift[1]), axis=(1, 2)), side)
-            allowed = seen & self.source_mask(together, sources.shape[1])
-            windows = TransformerBlock(name=f"layers_{i}")(windows, sources, together, allowed)
-            x = jnp.roll(from_windows(windows, side, h, w), shift, axis=(1, 2))
-        return x
+        parts = num_windows(x.shape[2])
+        side = (x.shape[1] // parts, x.shape[2] // parts)
+        block = lambda i, *given: TransformerBlock(name=f"layers_{i}")(*given)  # noqa: E731
+        return attend_in_windows(x, side, NUM_BLOCKS, sources, source_valid, block, self.source_mask)
 
     def source_mask(self, together: Bool[Array, "1 n q k"], num_sources: int) -> Bool[Array, "1 n q sk"]:
         """Keys of all sources that a cell may attend to: those of its own region.

@@ -18,11 +18,6 @@ class ReSplatFeatures:
     mono: tuple[Float[Array, "v hp wp c4"], ...]  # maps of four ViT blocks; `hp wp` are the cells of the ViT
 
 
-def layer_norm(name: str, epsilon: float = 1e-5) -> nn.LayerNorm:
-    """LayerNorm with PyTorch's epsilon and two-pass variance."""
-    return nn.LayerNorm(epsilon=epsilon, use_fast_variance=False, name=name)
-
-
 def group_norm(name: str) -> nn.GroupNorm:
     """GroupNorm of 8 groups with PyTorch's epsilon and two-pass variance."""
     return nn.GroupNorm(8, epsilon=1e-5, use_fast_variance=False, name=name)
@@ -65,12 +60,3 @@ class TransposedConv(nn.Module):
         bias = self.param("bias", nn.initializers.zeros, (self.features,))
         patches = jnp.einsum("vhwc,ijco->vhwoij", x, kernel)
         return pixel_shuffle(patches.reshape(*x.shape[:3], -1), self.factor) + bias  # pyright: ignore
-
-
-class Mlp(nn.Module):
-    """Two-layer MLP with a hidden layer four times as wide."""
-
-    @nn.compact
-    def __call__(self, x: Float[Array, "*b c"]) -> Float[Array, "*b c"]:
-        c = x.shape[-1]
-        return nn.Dense(c, name="fc2")(nn.gelu(nn.Dense(4 * c, name="fc1")(x), approximate=False))
