@@ -1,6 +1,7 @@
 """Set-up of all tests: shapes and types checked at every call, strict dtypes, and the folders of real data."""
 
 import atexit
+import collections
 import gc
 import importlib.metadata
 import os
@@ -93,6 +94,25 @@ def compiled_plainly():
     jax.config.update("jax_disable_most_optimizations", True)
     yield
     jax.config.update("jax_disable_most_optimizations", before)
+
+
+_session_programs: dict = collections.defaultdict(dict)
+
+
+@pytest.fixture(scope="module")
+def programs_shared():
+    """Sessions of one configuration share their compiled programs, for tests of what is around the stream."""
+    from ssplat_jax.streaming.session import Session
+
+    create = Session.__init__
+
+    def shared(session, *given, **more):
+        create(session, *given, **more)
+        session._programs = _session_programs[session.model.config]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Session, "__init__", shared)
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -1,6 +1,7 @@
 """Weights files: parameters by path (`encoder/conv1/kernel`), stored as float16 or float32 and loaded as float32."""
 
 import dataclasses
+import functools
 import hashlib
 from collections.abc import Mapping
 from pathlib import Path
@@ -153,7 +154,6 @@ def _by_path(params: dict) -> dict[str, Any]:
 
 def _restore(path: Path | str, arrays: Mapping[str, Any], config: StreamConfig) -> dict:
     """Builds the parameter tree of a model with `config` from arrays by path, and checks their shapes."""
-    wanted = jax.eval_shape(lambda key: init_params(key, config), jax.random.key(0))
 
     def leaf(keys, shape):
         name = "/".join(k.key for k in keys)
@@ -164,4 +164,9 @@ def _restore(path: Path | str, arrays: Mapping[str, Any], config: StreamConfig) 
             )
         return jnp.asarray(arrays[name], jnp.float32)
 
-    return jax.tree_util.tree_map_with_path(leaf, wanted)
+    return jax.tree_util.tree_map_with_path(leaf, _shapes(config))
+
+
+@functools.lru_cache(maxsize=8)  # tracing a network takes a second
+def _shapes(config: StreamConfig) -> dict:
+    return jax.eval_shape(lambda key: init_params(key, config), jax.random.key(0))

@@ -6,7 +6,7 @@ from tests.commands.command_fixture import narrow_options
 
 
 @pytest.fixture(autouse=True)
-def _small(compiled_plainly, monkeypatch):
+def _small(compiled_plainly, programs_shared, monkeypatch):
     monkeypatch.setattr("ssplat_jax.streaming.session.MIN_DECODED_PIVOTS", 1 << 11)
 
 

@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from ssplat_jax.config import preset
 from ssplat_jax.core.gaussians import mask_gaussians
+from ssplat_jax.data.capture import Capture
 from ssplat_jax.evaluation import cost, evaluate
 from ssplat_jax.refinement import refine_on_capture
 from ssplat_jax.runs import evaluate_run
 from ssplat_jax.runs.evaluate_run import scene_metrics
 from tests.commands.command_fixture import SIZE, make_capture, read, run
+from tests.streaming.narrow_model import NARROW
 
 
 @pytest.fixture(autouse=True)
@@ -25,7 +26,13 @@ def timed_once(monkeypatch):
 
 def test_an_index_sets_the_order_of_the_stream(tmp_path, narrow, monkeypatch):
     order = []
-    monkeypatch.setattr("ssplat_jax.data.capture.Capture._views", spied(order))
+    views = Capture._views
+
+    def watched(self, group, *rest):
+        order.append(list(group))
+        return views(self, group, *rest)
+
+    monkeypatch.setattr(Capture, "_views", watched)
     capture, out = make_capture(tmp_path / "capture", num_frames=9, size=SIZE), tmp_path / "out"
     index = tmp_path / "index.json"
     index.write_text(json.dumps({"own name": {"context": [8, 0, 4, 2, 6], "target": [3]}}))
@@ -33,18 +40,6 @@ def test_an_index_sets_the_order_of_the_stream(tmp_path, narrow, monkeypatch):
     assert run(*arguments, *narrow, "--set", "chunk_step=10.0") == 0  # a step that would interleave everything
     assert order == [[8, 0, 4, 2], [6]]
     assert read(out / "index.json") == read(index)
-
-
-def spied(order):
-    from ssplat_jax.data.capture import Capture
-
-    views = Capture._views
-
-    def spy(self, group, chunk_size, frame):
-        order.append(list(group))
-        return views(self, group, chunk_size, frame)
-
-    return spy
 
 
 def test_scenes_of_an_index_are_averaged_by_scene_and_by_view(tmp_path, narrow, monkeypatch):
@@ -83,7 +78,6 @@ def test_a_mean_without_lpips_everywhere_is_none():
     ("options", "words"),
     [
         (("--index", "INDEX", "--context", "4"), "--context too"),
-        (("--index", "INDEX", "--protocol", "paper"), "--protocol too"),
         (("--index", "INDEX"), "'capture'"),
         (("--scene", "a"), "--index beside it"),
         (("--protocol", "scannet"), "64 targets"),
@@ -96,14 +90,6 @@ def test_contradictory_frames_are_bad_usage(options, words, tmp_path, narrow, ca
     assert run("eval", str(capture), "--out", str(out), *options, *narrow) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert words in line.replace('"', "'") and not out.exists()
-
-
-def test_an_index_cannot_lead_out_of_its_folder(tmp_path, narrow, capsys):
-    make_capture(tmp_path / "scenes" / "a", size=SIZE)
-    (tmp_path / "index.json").write_text('{"../b": {"context": [0], "target": [1]}}')
-    arguments = ("--index", str(tmp_path / "index.json"), "--out", str(tmp_path / "out"))
-    assert run("eval", str(tmp_path / "scenes"), *arguments, *narrow) == 2
-    assert "../b" in capsys.readouterr().err and not (tmp_path / "out").exists()
 
 
 def picture_psnr(path):
@@ -124,26 +110,16 @@ def some_fade(*given, **more):
     return mask_gaussians(gaussians, jnp.asarray(is_kept)), report
 
 
-def test_eval_writes_every_promised_field(tmp_path, monkeypatch):
-    monkeypatch.setattr(cost, "NUM_REPEATS", 1)  # how often it times is not what is tested
+def test_an_evaluation_refines_at_the_streamed_size_and_scores_at_the_captures(tmp_path, narrow, monkeypatch):
     monkeypatch.setattr(evaluate, "refine_on_capture", some_fade)
     out = tmp_path / "eval"
     capture = make_capture(tmp_path / "capture", num_frames=12, size=(128, 96))
-    arguments = ("eval", str(capture), "--context", "8", "--quality", "fast", "--refine", "3", "--quiet")
+    arguments = ("eval", str(capture), "--context", "8", "--quality", "fast", "--refine", "3", *narrow)
     assert run(*arguments, "--out", str(out)) == 0
     metrics = read(out / "metrics.json")
-    promised = {
-        "literal", "shown", "psnr_over_black", "psnr_one_exposure", "per_view", "context_views", "target_views",
-        "chunk_ms", "step_ms", "render_ms", "compile_s", "step_memory_bytes", "peak_memory_bytes", "cache",
-        "num_gaussians", "config_hash", "baselines",
-    }  # fmt: skip
-    assert promised <= metrics.keys()
     assert metrics["peak_memory_bytes"] >= metrics["step_memory_bytes"] > 0
-    assert metrics["literal"].keys() == metrics["shown"].keys() == {"psnr", "ssim", "lpips"}
-    assert {"voxels", "pivots", "capacity", "overflow", "accepted_fraction"} <= metrics["cache"].keys()
-    assert {"nearest_view_psnr", "mean_color_psnr"} <= metrics["baselines"].keys()
     assert metrics["context_views"] == 8 and metrics["target_views"] == len(metrics["per_view"]) == 1
-    per_token = preset("tiny").head.gaussians_per_token
+    per_token = NARROW.head.gaussians_per_token
     decoded, refined = metrics["cache"]["decoded"], metrics["num_gaussians"]
     assert per_token * metrics["cache"]["pivots"] >= decoded > 0
     assert refined == decoded - NUM_FADED

@@ -139,17 +139,6 @@ def test_ctrl_c_waits_only_where_there_is_work_to_save():
             signal.raise_signal(signal.SIGINT)
 
 
-def test_a_signal_that_the_process_ignores_stays_ignored():
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # as the shell does for a background job
-    try:
-        with Interrupts() as interrupts:
-            signal.raise_signal(signal.SIGINT)
-            assert interrupts.received is None
-        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
 def command_lines(folder: Path) -> dict[str, tuple[str, ...]]:
     """A command line of each command, as new users would type it; `{out}` is a folder of the call's own."""
     run = folder / "run"

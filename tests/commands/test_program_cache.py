@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from ssplat_jax.commands import main, program_cache
+from ssplat_jax.commands import program_cache
 from ssplat_jax.commands.program_cache import FOLDER, IS_ON, SWITCH, drop_newest, keep_programs
 from tests.commands.command_fixture import read
 
@@ -67,18 +67,6 @@ def test_a_run_with_kept_programs_writes_the_same_bytes(tmp_path):
         written.append((metrics, (out / "scene.ply").read_bytes(), (out / "state.npz").read_bytes()))
     assert written[0] == written[1] == written[2]
     assert compile_seconds[2] < 0.7 * min(compile_seconds[:2])
-
-
-def test_every_command_keeps_its_programs_but_those_that_measure_compiling(monkeypatch):
-    """`main` asks for it before the command runs, which is when JAX is imported."""
-    for name, command in main.COMMANDS.items():
-        order = []
-        monkeypatch.setattr(main, "keep_programs", lambda order=order: order.append("kept"))
-        monkeypatch.setattr(main, "_parse", lambda words, command=command: object.__new__(command))
-        monkeypatch.setattr(command, "run", lambda self, order=order: order.append("run") or 0)
-        with pytest.raises(SystemExit):
-            main.main([name])
-        assert order == (["run"] if name in ("bench", "experiment") else ["kept", "run"]), name
 
 
 def test_what_the_user_has_set_holds(tmp_path, monkeypatch):

@@ -82,7 +82,7 @@ def test_a_scene_of_any_format_is_drawn_with_the_filter_that_it_names(tmp_path, 
         assert np.abs(found - wanted(capture, loaded, 0, "mip")).max() > 3 * LEVEL
 
 
-def test_a_scene_counted_from_an_offset_is_seen_where_it_is(tmp_path, capture, capsys):
+def test_a_scene_counted_from_an_offset_is_seen_where_it_is(tmp_path, capture):
     gaussians = scene()
     ss.save_ply(tmp_path / "near.ply", gaussians)
     moved = replace(gaussians, means=gaussians.means - jnp.asarray(SHIFT, jnp.float32))
@@ -93,23 +93,12 @@ def test_a_scene_counted_from_an_offset_is_seen_where_it_is(tmp_path, capture, c
     pictures = [picture(tmp_path / name / "views" / "00000.png") for name in ("near", "counted")]
     # The camera's place among numbers of 4096 is rounded to 2e-4: a hundredth of a pixel.
     np.testing.assert_allclose(*pictures, atol=3 * LEVEL)
-    data = (tmp_path / "counted.ply").read_bytes()
-    (tmp_path / "counted.ply").write_bytes(data.replace(b"offset 4096.0", b"offset 4096,0"))
-    assert run("render", tmp_path / "counted.ply", *arguments, tmp_path / "out") == 2
-    assert "counted.ply" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("mode", "name", "words"),
-    [("2dgs", "scene.ply", "2dgs"), ("mip", "other.ply", "other.ply"), ("mip", "empty", "scene.ply")],
-)
-def test_unrenderable_input_is_refused_and_nothing_written(mode, name, words, tmp_path, capture, capsys):
-    ss.save_ply(tmp_path / "scene.ply", scene(), render_mode=mode)
-    (tmp_path / "empty").mkdir()
-    out = tmp_path / "out"
-    assert run("render", tmp_path / name, capture, "--out", out, "--quiet") == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert words in line and not out.exists()
+def test_a_scene_of_another_kind_is_refused_and_nothing_written(tmp_path, capture, capsys):
+    ss.save_ply(tmp_path / "scene.ply", scene(), render_mode="2dgs")
+    assert run("render", tmp_path / "scene.ply", capture, "--out", tmp_path / "out", "--quiet") == 2
+    assert "2dgs" in capsys.readouterr().err and not (tmp_path / "out").exists()
 
 
 def decode(path):
@@ -171,8 +160,6 @@ def test_films_of_depth_and_normals_on_an_orbit(tmp_path, capture):
     ("options", "words"),
     [
         (("--film-path", "orbit"), "--film"),
-        (("--film-shows", "depth"), "--film"),
-        (("--film", "0"), "--film: wanted a finite number above 0"),
         (("--film", "2"), 'pip install "ssplat-jax[video]"'),
     ],
 )

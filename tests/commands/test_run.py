@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import json
 import re
 import shutil
 from pathlib import Path
@@ -83,7 +82,7 @@ def test_a_run_writes_scene_state_metrics_and_the_changes_of_every_chunk(finishe
     assert {"scene.ply", "state.npz", "metrics.json", "report.html", "views"} <= {p.name for p in out.iterdir()}
     assert_deltas_give_the_scene(out, narrow, "000004.npz", "000008.npz", "000012.npz")
     assert metrics["cache"]["num_chunks"] == 3 and list(metrics["exposures"]) == [str(i) for i in range(12)]
-    assert metrics["peak_memory_bytes"] >= metrics["step_memory_bytes"] > 0 and metrics["compile_s"] > 0
+    assert metrics["peak_memory_bytes"] >= metrics["step_memory_bytes"] > 0
     assert (out / "report.html").read_text().count("--weights WEIGHTS") == 2  # not the shipped ones
 
 
@@ -134,14 +133,11 @@ def test_another_run_is_refused(copied, narrow, tmp_path, capsys):
     for changes, difference in (
         (("--set", "voxel_size=0.1"), "differs in its config (memory.voxel_size: 0.04 there, 0.1 now)"),
         (("--stride", "2"), "differs in its frames (12 from [0, 1] on there, 6 from [0, 2] on now)"),
-        (("--size", "32x24"), "differs in its size ([64, 48] there, [32, 24] now)"),
         (("--quality", "fast"), "differs in its size ([64, 48] there, [32, 24] now)"),
     ):
         assert run("run", capture, "--out", out, *changes, *narrow) == 2
         (line,) = capsys.readouterr().err.splitlines()
         assert difference in line and "--overwrite" in line
-    assert run("run", capture, "--out", out, "--quiet", "--set", "capacity=1024") == 2
-    assert "differs in its config" in capsys.readouterr().err
     images = capture / "images"
     kept = (images / "5.png").read_bytes()
     (images / "5.png").write_bytes((images / "4.png").read_bytes())
@@ -173,7 +169,7 @@ def test_a_damaged_image_stops_the_stream_with_what_came_before_it_saved(finishe
 
 
 def test_a_run_records_its_chunks_and_scores_what_it_holds_back(narrow, tmp_path, capsys):
-    path, out = make_capture(tmp_path / "capture", num_frames=11), tmp_path / "out"
+    path, out = make_capture(tmp_path / "capture", num_frames=11, size=SIZE), tmp_path / "out"
     assert run("run", path, "--out", out, "--hold-back", "2", *narrow) == 0
     capture, folder = open_capture(path), RunFolder(out)
     records = load_chunk_records(folder.chunk_record_files())
@@ -197,9 +193,7 @@ def test_a_run_records_its_chunks_and_scores_what_it_holds_back(narrow, tmp_path
 def test_held_back_frames_are_spread_and_the_others_stay_in_order():
     streamed, held = hold_back(range(0, 40, 2), 3)
     assert held == [6, 20, 32] and streamed == [i for i in range(0, 40, 2) if i not in held]
-    assert hold_back([4, 5, 6], 0) == ([4, 5, 6], []) and hold_back([4, 5, 6], 1) == ([4, 6], [5])
-    for count in range(1, 19):
-        assert len(hold_back(range(20), count)[1]) == count
+    assert hold_back([4, 5, 6], 0) == ([4, 5, 6], [])
 
 
 def test_refinement_follows_with_the_steps_of_the_quality(tmp_path, monkeypatch):
@@ -244,22 +238,3 @@ def test_run_refine_equals_run_then_refine(tmp_path, capsys):
     assert run("refine", two, capture, "--steps", "2", "--quiet") == 0
     for name in ("scene.ply", "refined.ply"):
         assert (one / name).read_bytes() == (two / name).read_bytes()
-
-
-@pytest.mark.slow  # streaming/test_causal.py has the law
-def test_a_replaced_future_changes_no_earlier_output(narrow, tmp_path):
-    written = []
-    for name in ("here", "there"):
-        capture, out = make_capture(tmp_path / name / "capture", num_frames=12, size=SIZE), tmp_path / name / "out"
-        if name == "there":
-            facts = read(capture / "transforms.json")
-            for entry in facts["frames"][8:]:
-                entry["transform_matrix"][0][3] += 50.0
-                shutil.copy(capture / "images" / "0.png", capture / entry["file_path"])
-            (capture / "transforms.json").write_text(json.dumps(facts))
-        assert run("run", capture, "--causal", "--out", out, "--deltas", "--save-every", "1", *narrow) == 0
-        written.append({path.name: path.read_bytes() for path in sorted((out / "deltas").glob("*.npz"))})
-    here, there = written
-    assert list(here) == list(there) == ["000004.npz", "000008.npz", "000012.npz"]
-    assert here["000004.npz"] == there["000004.npz"] and here["000008.npz"] == there["000008.npz"]
-    assert here["000012.npz"] != there["000012.npz"]

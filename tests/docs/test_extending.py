@@ -56,10 +56,6 @@ def mentions(word: str, *folders: str) -> set[str]:
     return {file.relative_to(ROOT).as_posix() for file in found}
 
 
-def test_there_are_five_recipes():
-    assert len(RECIPES) == 5
-
-
 @pytest.mark.parametrize("recipe", RECIPES)
 def test_files_and_symbols_of_recipes_exist(recipe):
     for file, symbol in places(recipe):
@@ -167,11 +163,6 @@ def test_an_added_command_runs(monkeypatch, capsys):
     assert capsys.readouterr().out == "hello reader\n"
 
 
-def test_every_command_has_a_file_of_its_own():
-    files = {path.name for path in (ROOT / "ssplat_jax" / "commands").glob("*_command.py")}
-    assert files == {f"{name.replace('-', '_')}_command.py" for name in command_line.COMMANDS}
-
-
 def test_an_experiment_of_another_package_is_found(monkeypatch, tmp_path, capsys):
     point = SimpleNamespace(name="toy", load=lambda: lambda captures, out, scale, reporter: f"toy at {scale}")
     monkeypatch.setattr(options, "entry_points", lambda group: [point])
@@ -188,18 +179,3 @@ def test_outputs_stand_where_the_recipe_says():
     listed = {file for file, symbol in places("A rasterizer output") if symbol != "new"}
     own = mentions("median_depth|median_rows", "ssplat_jax/rasterizer")
     assert own == {file for file in listed if file.startswith("ssplat_jax/")}
-
-
-@pytest.mark.usefixtures("compiled_plainly")
-def test_features_are_composited_without_a_new_output():
-    gaussians = ss.Gaussians.from_rgb(
-        means=jnp.array([[0.0, 0.0, 2.0]]),
-        quats=jnp.array([[1.0, 0.0, 0.0, 0.0]]),
-        scales=jnp.full((1, 3), 0.2),
-        opacities=jnp.array([0.8]),
-        colors=jnp.full((1, 3), 0.5),
-    )
-    K = jnp.array([[20.0, 0.0, 8.0], [0.0, 20.0, 8.0], [0.0, 0.0, 1.0]])
-    camera = ss.Camera(viewmats=jnp.eye(4), Ks=K, width=16, height=16)
-    out = ss.render(gaussians, camera, features=jnp.array([[2.0]]))
-    np.testing.assert_allclose(out.features[..., 0], 2 * out.alpha, rtol=1e-5, atol=1e-6)

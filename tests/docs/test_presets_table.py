@@ -41,14 +41,6 @@ def test_the_table_has_the_values_of_the_preset(name):
     assert stated == {field: shown(name, field) for field in ROWS}
 
 
-def test_every_row_has_the_words_of_the_paper_and_a_reason():
-    assert all(len(row) == 6 and all(row) for row in TABLE)
-
-
-def test_the_heading_names_the_presets():
-    assert [TABLE[0][column] for column in (2, 3, 4)] == ["`paper`", "`small`, `base`", "`tiny`"]
-
-
 def test_the_additions_are_off_in_small_and_base_too():
     """They differ from `paper` only in what captures of any length, and published weights, need."""
     usable = {"additions.depth_readout", "memory.capacity", "memory.overflow", "stream.causal"}

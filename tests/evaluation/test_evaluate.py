@@ -1,7 +1,6 @@
 """Scores: holes are filled with the colors around; over black they cost what they are worth."""
 
 import dataclasses
-import json
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +15,7 @@ from ssplat_jax.data.split import Split
 from ssplat_jax.evaluation import cost
 from ssplat_jax.evaluation.cost import PeakMemory, measure_latency
 from ssplat_jax.evaluation.psnr_ssim import psnr, ssim
-from ssplat_jax.evaluation.scoring import baselines, exposures_from_json, exposures_to_json, nearest_views, score_view
+from ssplat_jax.evaluation.scoring import baselines, nearest_views, score_view
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.streaming.session import Session
 
@@ -132,13 +131,6 @@ def test_growing_the_cache_is_not_timed(overflow, capacity, capture, monkeypatch
     assert capacities == [capacity] * 2 and session.cache.capacity == 128  # 4 x 8 x 8 tokens
     assert 0 <= milliseconds["step_ms"] < milliseconds["chunk_ms"]["median"]
     assert 0 < milliseconds["render_ms"] < milliseconds["chunk_ms"]["median"]
-
-
-def test_exposures_are_exact_in_json():
-    exposures = {7: np.array([1 / 3, 0.1, 2.0], np.float32), 0: np.ones(3, np.float32)}
-    back = exposures_from_json(json.loads(json.dumps(exposures_to_json(exposures))))
-    assert back.keys() == exposures.keys()
-    assert all(np.array_equal(back[i], exposures[i]) and back[i].dtype == np.float32 for i in back)
 
 
 def test_the_largest_program_counts_that_of_refinement_too():

@@ -29,7 +29,7 @@ def noise_and_nan(images):
 
 
 @pytest.fixture(scope="module")
-def capture():
+def capture(programs_shared):
     return open_capture("procedural:room?frames=14&size=48x32")
 
 

@@ -17,7 +17,7 @@ from ssplat_jax.runs.export_run import save_cameras, scene_to_show
 from ssplat_jax.scene_files.formats import save_ply
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.streaming.feed import middle_exposure
-from tests.commands.command_fixture import make_capture, narrow_options, run
+from tests.commands.command_fixture import SIZE, make_capture, narrow_options, run
 from tests.scene_files.scene_fixture import camera, scene
 
 
@@ -70,9 +70,15 @@ def test_a_line_of_images_txt_takes_points_to_pixels(tmp_path):
     assert held[1:4] == [b"PINHOLE", b"32", b"24"] and [float(x) for x in held[4:]] == [32.0, 32.0, 16.0, 12.0]
 
 
-def test_a_runs_own_frames_are_written_and_other_captures_refused(tmp_path, monkeypatch, capsys, compiled_plainly):
+def test_a_runs_own_frames_are_written_and_other_captures_refused(
+    tmp_path, monkeypatch, capsys, compiled_plainly, programs_shared
+):
     monkeypatch.setattr("ssplat_jax.streaming.session.MIN_DECODED_PIVOTS", 1 << 11)
-    capture, out, narrow = make_capture(tmp_path / "capture", num_frames=8), tmp_path / "run", narrow_options(tmp_path)
+    capture, out, narrow = (
+        make_capture(tmp_path / "capture", num_frames=8, size=SIZE),
+        tmp_path / "run",
+        narrow_options(tmp_path),
+    )
     assert run("run", capture, "--stride", "2", "--out", out, *narrow) == 0
     to = tmp_path / "export" / "scene.ply"
     assert run("export", out, "--to", to, "--cameras", capture, *narrow[:2]) == 0

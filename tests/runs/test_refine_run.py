@@ -1,11 +1,13 @@
 """Refinement of a finished run: it continues after a stop, and never loses the scene that it started from."""
 
+import contextlib
+import functools
 import json
 import signal
 
+import jax
 import pytest
 
-from ssplat_jax.config import preset
 from ssplat_jax.core.console import Reporter
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.model.streamsplat import StreamSplat
@@ -14,25 +16,29 @@ from ssplat_jax.runs.capture_run import RunOptions, run_capture
 from ssplat_jax.runs.refine_run import refine_run
 from ssplat_jax.scene_files.formats import read_scene
 from ssplat_jax.storage.run_folder import RunFolder
-from ssplat_jax.storage.weights import load_params
+from tests.streaming.narrow_model import NARROW
 
 CAPTURE, QUIET = "procedural:room?frames=4", Reporter(quiet=True)
-REFINED = ("refined.ply", "refinement.json", "refinement.npz")
 
 
 def refine(path, steps=4, capture=CAPTURE, overwrite=False):
     options = {"steps": steps, "save_every": 2, "overwrite": overwrite}
-    return refine_run(path, capture, load_params("tiny"), **options, reporter=QUIET)
+    return refine_run(path, capture, params(), **options, reporter=QUIET)
 
 
 def stream(out, capture=CAPTURE, reporter=QUIET):
     """Streams small frames into `out`."""
     options = RunOptions(size=(64, 48), save_every=1)
-    return run_capture(StreamSplat(preset("tiny")), load_params("tiny"), capture, out, options, reporter)
+    return run_capture(StreamSplat(NARROW), params(), capture, out, options, reporter)
+
+
+@functools.cache
+def params():
+    return StreamSplat(NARROW).init(jax.random.key(0))
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory):
+def finished(tmp_path_factory, programs_shared):
     """Folder of a finished run of four small frames."""
     out = tmp_path_factory.mktemp("run")
     stream(out)
@@ -103,18 +109,8 @@ class _StopsAfterOneChunk(Reporter):
         super().__init__(quiet=True)
 
     def progress(self, name, total):
-        import contextlib
-
         @contextlib.contextmanager
         def bar():
             yield lambda done, *_: signal.raise_signal(signal.SIGINT) if done == 4 else None
 
         return bar()
-
-
-def test_starting_a_run_anew_removes_its_refinement(finished):
-    folder = RunFolder(finished)
-    refine(finished, steps=1, overwrite=True)
-    assert all((finished / name).exists() for name in REFINED)
-    folder.clear_run()
-    assert not any((finished / name).exists() for name in REFINED) and not folder.scene.exists()

@@ -2,7 +2,6 @@
 
 import json
 import math
-import pickle
 
 import ml_dtypes
 import numpy as np
@@ -67,12 +66,6 @@ def test_tensors_are_read_as_float32_and_integers_left_out(form, tmp_path):
         with pytest.raises(InputError):
             held = read_tensors(path.with_name("cut"))
             check_tensors(path, held, {"a": (2, 3), "wide": (2,), "half": (3,), "brain": (4,)})
-
-
-def test_a_pickle_is_refused_with_the_lines_that_convert_it(tmp_path):
-    (tmp_path / "a.pth").write_bytes(pickle.dumps({"x": 1}))
-    with pytest.raises(InputError, match=r"wanted a \.safetensors or \.npz file; convert a \.pth .*weights_only=True"):
-        read_tensors(tmp_path / "a.pth")
 
 
 def test_values_that_are_not_finite_are_refused(tmp_path):

@@ -5,7 +5,6 @@ creating a folder and renaming (`refuse`), writing after some bytes (`write`), a
 """
 
 import errno
-import functools
 import json
 import os
 import resource
@@ -13,16 +12,13 @@ import shutil
 import sys
 from pathlib import Path
 
-import jax
 import numpy as np
 import pytest
 
-from ssplat_jax.commands import options
 from ssplat_jax.commands.main import main
 from ssplat_jax.core.atomic import previous_path, write_atomic
 from ssplat_jax.core.errors import StorageError
 from ssplat_jax.storage.saved_states import load_newest_state
-from ssplat_jax.streaming.session import Session
 from tests.commands.command_fixture import make_capture
 
 NUM_CHUNKS, CHUNK_SIZE = 3, 2
@@ -114,23 +110,9 @@ sys.addaudithook(_hook)
 # -- a short run ------------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _compiled_once():
-    """All runs have the same configuration and size, and share weights and programs, compiled without optimization."""
-    programs: dict = {}
-    program = Session._program
-
-    def shared(session, *given):
-        session._programs = programs
-        return program(session, *given)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Session, "_program", shared)
-        patch.setattr(options, "load_model", functools.cache(options.load_model))
-        before = jax.config.read("jax_disable_most_optimizations")
-        jax.config.update("jax_disable_most_optimizations", True)
-        yield
-        jax.config.update("jax_disable_most_optimizations", before)
+@pytest.fixture(autouse=True)
+def _compiled_once(programs_shared, compiled_plainly):
+    """All runs have the same configuration and size."""
 
 
 @pytest.fixture(scope="module")
@@ -146,10 +128,10 @@ def run(capture: Path, out: Path) -> int:
     return int(stopped.value.code or 0)
 
 
-@pytest.fixture(scope="module")
-def undisturbed(capture, tmp_path_factory):
+@pytest.fixture
+def undisturbed(capture, tmp_path):
     """Folder of an undisturbed run."""
-    out = tmp_path_factory.mktemp("disk") / "undisturbed"
+    out = tmp_path / "undisturbed"
     assert run(capture, out) == 0
     return out
 
@@ -223,19 +205,10 @@ def test_a_damaged_state_never_replaces_the_good_one(capture, undisturbed, tmp_p
         assert contents(out) == contents(undisturbed)
 
 
-@pytest.mark.parametrize("failing", ["keep", "rename"])
-def test_a_failed_rename_leaves_the_file_in_place(failing, tmp_path, monkeypatch):
-    path, renamed = tmp_path / "file", []
+@pytest.mark.parametrize("failing", [2, 3])  # requests: open the new file, keep the old one, rename the new one
+def test_a_failed_rename_leaves_the_file_in_place(failing, tmp_path):
+    path = tmp_path / "file"
     write_atomic(path, b"old", keep_previous=True)
-    replace = os.replace
-
-    def refuse(source, target):
-        renamed.append(target)
-        if len(renamed) == ("keep", "rename").index(failing) + 1:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        replace(source, target)
-
-    monkeypatch.setattr(os, "replace", refuse)
-    with pytest.raises(StorageError, match="file: cannot be written"):
+    with pytest.raises(StorageError, match="file: cannot be written"), Disk(path, "refuse", failing):
         write_atomic(path, b"new", keep_previous=True)
     assert [(p.name, p.read_bytes()) for p in tmp_path.iterdir()] == [("file", b"old")]

@@ -20,6 +20,8 @@ from ssplat_jax.storage.weights import (
 from tests.model.small import random_params
 from tests.streaming.narrow_model import NARROW
 
+TINY = preset("tiny")
+
 
 @pytest.fixture(scope="module")
 def params():
@@ -60,23 +62,18 @@ def test_overflowing_weights_are_not_saved(params, tmp_path):
 
 
 def test_training_turns_a_stage_and_decay_does_not():
-    start = init_params(jax.random.key(3), NARROW)
-    params = jax.tree.map(lambda x: 0.9 * x, start)
+    """Also where a later training added a stage, which is compared with its own start."""
+    first, later = (init_params(jax.random.key(seed), TINY) for seed in (3, 7))
+    params = jax.tree.map(lambda x: 0.9 * x, first)
     rng = np.random.default_rng(0)
     params["encoder"] = jax.tree.map(lambda x: x + 0.1 * rng.normal(size=x.shape), params["encoder"])
-    turns = stage_turns(params, WeightsFacts(NARROW, {"recipe": {"seed": 3}}, 0))
-    first, last = (np.asarray(ravel_pytree(tree["encoder"])[0], np.float64) for tree in (start, params))
-    cosine = first @ last / np.linalg.norm(first) / np.linalg.norm(last)
+    provenance = {"recipe": {"seed": 7}, "fresh": ["evidence"], "before": {"recipe": {"seed": 3}}}
+    turns = stage_turns(params | {"evidence": later["evidence"]}, WeightsFacts(TINY, provenance, 0))
+    before, after = (np.asarray(ravel_pytree(tree["encoder"])[0], np.float64) for tree in (first, params))
+    cosine = before @ after / np.linalg.norm(before) / np.linalg.norm(after)
     assert turns.pop("encoder") == pytest.approx(np.sqrt(1 - cosine**2), rel=1e-4)
-    assert max(turns.values()) < 1e-6
-
-
-def test_a_stage_that_a_later_training_added_is_compared_with_its_own_start():
-    first, later = init_params(jax.random.key(3), NARROW), init_params(jax.random.key(7), NARROW)
-    provenance = {"recipe": {"seed": 7}, "fresh": ["cgfi"], "before": {"recipe": {"seed": 3}}}
-    turns = stage_turns(first | {"cgfi": later["cgfi"]}, WeightsFacts(NARROW, provenance, 0))
     assert len(turns) > 3 and max(turns.values()) < 1e-6
-    assert stage_turns(later, WeightsFacts(NARROW, provenance, 0))["encoder"] > 0.5
+    assert stage_turns(later, WeightsFacts(TINY, provenance, 0))["encoder"] > 0.5
 
 
 def test_matcher_and_evidence_head_of_the_shipped_weights_are_trained_and_other_stages_are_not():
