@@ -56,7 +56,7 @@ class SeenCells:
 
     weights: Float[Array, "v hf wf"]  # confidence of the depth; 0 if it is not trusted
     log_depths: Float[Array, "v hf wf"]  # of camera z, stream units; 0 if it is not trusted
-    colors: Float[Array, "v hf wf 3"]  # at the exposure of the scene
+    colors: Float[Array, "c 3"]  # of all cells, view-major, row-major; at the exposure of the scene
 
 
 def seen_cells(
@@ -70,7 +70,7 @@ def seen_cells(
     return SeenCells(
         weights=jnp.where(trusted, confidences, 0.0),
         log_depths=safe_log(jnp.where(trusted, depths, 1.0)),
-        colors=rgbs.reshape(*depths.shape, -1, 3).mean(axis=-2),
+        colors=rgbs.reshape(len(rgbs), -1, 3).mean(axis=1),
     )
 
 
@@ -251,8 +251,8 @@ def _read_cells(cache: VoxelCache, camera: Camera, cells: SeenCells, pairs: Pixe
     """Contents of the cells into which `pairs` fall, compared with the pivots of `rows`; zeros for pivots not seen."""
     num_views, always = len(camera.viewmats), cache.num_voxels >= 0
     flat = lambda x: rows_of(x, rows).reshape(-1, *x.shape[2:])  # noqa: E731
-    table = jnp.concatenate([cells.weights[..., None], cells.log_depths[..., None], cells.colors], axis=-1)
-    held = table.reshape(-1, 5).at[pairs.pixels].get(mode="fill", fill_value=0.0)
+    table = jnp.concatenate([cells.weights.reshape(-1, 1), cells.log_depths.reshape(-1, 1), cells.colors], axis=1)
+    held = table.at[pairs.pixels].get(mode="fill", fill_value=0.0)
     held, log_depths = kept((held.reshape(num_views, -1, 5), pairs.log_depths.reshape(num_views, -1)), always)
     rgbs = flat(cache.rgbs)
     colors = kept(rgbs.reshape(len(rgbs), -1, 3).mean(axis=1), always)

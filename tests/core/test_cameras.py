@@ -1,10 +1,9 @@
-"""Cameras against float64: frames, projection, and pixel centers; and voxel indices."""
+"""Cameras against float64: frames, projection, and pixel centers."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ssplat_jax.cache.hash_table import INDEX_LIMIT, voxel_indices
 from ssplat_jax.core.cameras import invert_poses, pixel_grid, project_points, transform_points, unproject
 from tests.core.test_rotations import rodrigues
 
@@ -85,24 +84,3 @@ def test_points_behind_the_camera_project_to_finite_pixels():
     np.testing.assert_allclose(pixels[1], [500 / 1e-3 + 32, 500 / 1e-3 + 24], rtol=1e-6)  # divided as min_depth
     gradient = jax.grad(lambda p: jnp.sum(project_points(p, K, min_depth=1e-3)[0]))(points)
     assert np.isfinite(pixels).all() and np.isfinite(gradient).all()
-
-
-def test_voxel_is_the_floor_and_out_of_range_is_marked():
-    points = f32([[0.0, 0.039, 0.041], [-0.001, -0.04, 1.0], [np.nan, 0, 0], [0, np.inf, 0], [0, 0, -1e30]])
-    voxels, in_range = voxel_indices(points, 0.04)
-    np.testing.assert_array_equal(voxels[:2], [[0, 0, 1], [-1, -1, 25]])
-    np.testing.assert_array_equal(in_range, [True, True, False, False, False])
-    np.testing.assert_array_equal(voxels[2:], 0)
-    edge = f32([[INDEX_LIMIT - 1, 0, 0], [INDEX_LIMIT, 0, 0], [1 - INDEX_LIMIT, 0, 0], [-INDEX_LIMIT, 0, 0]])
-    np.testing.assert_array_equal(voxel_indices(edge, 1.0)[1], [True, False, True, False])
-
-
-def test_a_point_between_two_points_of_a_voxel_is_in_that_voxel():
-    rng = np.random.default_rng(3)
-    a = f32(rng.uniform(-50, 50, (4000, 3)))
-    b = a + f32(rng.uniform(-0.02, 0.02, (4000, 3)))
-    va, vb = voxel_indices(a, 0.04)[0], voxel_indices(b, 0.04)[0]
-    same = np.asarray((va == vb).all(-1))
-    between = voxel_indices(jnp.clip(0.3 * a + 0.7 * b, jnp.minimum(a, b), jnp.maximum(a, b)), 0.04)[0]
-    assert same.sum() > 100
-    np.testing.assert_array_equal(between[same], va[same])

@@ -31,11 +31,6 @@ def gaussians(n: int) -> Gaussians:
     )
 
 
-def test_leaves_are_the_arrays_in_order_with_readable_paths():
-    paths = [jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_flatten_with_path(body())[0]]
-    assert paths == [".mass", ".speed"]
-
-
 def test_only_a_change_of_statics_recompiles():
     traces = []
 

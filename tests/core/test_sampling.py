@@ -57,7 +57,7 @@ def read(values, at):
     return (1 - at.down) * above + at.down * below
 
 
-@pytest.mark.parametrize("channels", [6, 16, 48, 1])
+@pytest.mark.parametrize("channels", [6, 48, 1])
 def test_correlation_is_that_of_the_warped_map(channels):
     rng = np.random.default_rng(5)
     reference, source = rng.normal(size=(15, channels)), rng.normal(size=(HEIGHT, WIDTH, channels))

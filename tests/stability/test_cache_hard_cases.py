@@ -18,11 +18,9 @@ from tests.cache import streams
 from tests.cache.projection_scenes import front_camera, with_pivots
 from tests.cache.streams import tokens_at
 from tests.model.small import finite
-from tests.stability.stage_checks import PROBABILITY_SUM_ATOL
 
 pytestmark = pytest.mark.usefixtures("compiled_plainly")
 
-HALF = jnp.bfloat16
 CACHE = streams.PAIRS  # a third token in a voxel merges
 ANY = CACHE.replace(min_confidence=0.0)
 EMPTY = init_cache(CACHE, streams.CAPACITY)
@@ -73,24 +71,6 @@ def test_equal_confidences_keep_the_older_seed_and_the_midpoint():
     assert cache.confidences[0, 0] == np.float32(0.7)
 
 
-def test_a_cache_of_bfloat16_features_is_the_float32_one_rounded():
-    """Positions, choices and weights are float32 in both; only features are stored in bfloat16."""
-    tokens = streams.to_jax(streams.Recipe(seed=3, places="few", features="normal", confidences="random").tokens())
-    tokens = replace(tokens, feats=tokens.feats.astype(HALF).astype(jnp.float32))
-    single = fused(tokens)
-    half = fused(tokens, cache=replace(EMPTY, feats=EMPTY.feats.astype(HALF), seeds=EMPTY.seeds.astype(HALF)))
-    assert half.feats.dtype == half.seeds.dtype == HALF and int(single.stats.num_merged) > 0
-    for name in ("counts", "voxels", "confidences", "num_members", "footprints"):
-        np.testing.assert_array_equal(getattr(half, name), getattr(single, name), name)
-    np.testing.assert_allclose(half.means, single.means, atol=1e-7)
-    np.testing.assert_allclose(half.feats.astype(jnp.float32), single.feats, atol=0.02)
-    camera = replace(front_camera(), viewmats=jnp.eye(4).at[2, 3].set(2.0)[None])
-    a, b = (reading()(cache, camera) for cache in (half, single))
-    assert a.feats.dtype == jnp.float32 and a.mask.any()
-    np.testing.assert_array_equal(a.depths, b.depths)
-    np.testing.assert_allclose(a.feats, b.feats, atol=0.02)
-
-
 # Pivots on the axis of the front camera, and the depth and confidence that are read at their pixel.
 SEEN = {
     "omega 1": ([[0, 0, 2.0]], [1.0], (2.0, 1.0)),
@@ -111,7 +91,7 @@ def test_hard_projection(name):
     means, confidences, wanted = SEEN[name]
     seen = reading()(with_pivots(means, confidences), front_camera())
     assert finite(seen)
-    assert (seen.confidences >= 0).all() and (seen.confidences <= 1 + PROBABILITY_SUM_ATOL).all()
+    assert (seen.confidences >= 0).all() and (seen.confidences <= 1 + 1e-6).all()
     if wanted is not None:
         assert np.argwhere(np.asarray(seen.mask)).tolist() == [[0, 3, 4]]
         np.testing.assert_allclose((seen.depths[0, 3, 4], seen.confidences[0, 3, 4]), wanted, rtol=1e-4)

@@ -67,8 +67,8 @@ def streamed(session, capture, num_chunks):
     return (order[: 4 * num_chunks], frame.to_dict(), chunk.frame.to_dict()), outputs
 
 
-@pytest.mark.parametrize("num_chunks", [1, 2])
-def test_a_replaced_future_changes_no_chunk_before_it(capture, start, num_chunks):
+def test_a_replaced_future_changes_no_chunk_before_it(capture, start):
+    num_chunks = 2
     here, there = (streamed(start(), c, num_chunks) for c in (capture, with_other_future(capture, 4 * num_chunks)))
     assert here[0] == there[0]
     assert_same_bits(here[1], there[1])
@@ -92,17 +92,6 @@ def test_pushed_views_give_what_the_causal_stream_gives(capture, start):
     for output, expected in zip(got, wanted, strict=True):
         np.testing.assert_allclose(output.depths, expected.depths, rtol=2e-3)  # poses were inverted twice
     assert live.cache_facts()["num_seen"] == driver.cache_facts()["num_seen"]
-
-
-def test_bytes_are_pushed_as_their_255th(start, capture):
-    pushed = []
-    for scale in (None, np.float32(255)):
-        session = start()
-        for i in range(2):
-            image = np.round(capture.image(i) * 255).astype(np.uint8)
-            session.push(image if scale is None else image / scale, capture.K(i), np.eye(4))
-        pushed.append(session._live.rest())
-    assert_same_bits(*pushed)
 
 
 @pytest.mark.parametrize(
