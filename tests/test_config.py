@@ -13,7 +13,6 @@ from ssplat_jax.config import LITERAL, PRESETS, StreamConfig, preset
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.network_configs import CompactConfig
 
-# fmt: off
 BAD = [
     {"chunk_size": 0},
     {"voxel_size": 0.0},
@@ -33,10 +32,8 @@ BAD = [
     {"scene_scale": "big"},
     {"overflow": "grwo"},
     {"depth_readout": ""},
-    # carving keeps confidences below 0.95
-    # fmt: on
+    {"min_confidence": 0.96},  # carving keeps confidences below 0.95
 ]
-# fmt: on
 
 
 @pytest.mark.parametrize("changes", BAD, ids=str)
