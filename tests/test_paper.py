@@ -270,7 +270,7 @@ def test_training_follows_the_rendering_loss_of_all_tokens_over_black(monkeypatc
         zeros((1, 2, 8, 8, 3)), zeros((1, 2, 4, 4)), zeros((1, 2, 3, 3)), zeros((1, 2), bool), *zeros((2, 1))
     )
     camera = Camera(zeros((2, 4, 4)), zeros((2, 3, 3)), 8, 8)
-    sample = Sample(chunks, zeros((1, 2, 2, 2)), zeros((2, 8, 8, 3)), camera)
+    sample = Sample(chunks, zeros((1, 2, 2, 2)), zeros((2, 8, 8, 3)), camera, zeros((), bool))
     batch, params = jax.tree.map(lambda x: x[None], sample), {"decoder": HEAD}
     assert float(phase.loss(MODEL, params, batch)[0]) == 4 * 3.0 and phase.loss.black_weight == 1.0
     assert (np.asarray(scenes[0].opacities) > 0).all()

@@ -15,9 +15,8 @@ import itertools
 import statistics
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-from ssplat_experiments.baselines import BASELINES, JointNetwork, baseline_scores, joint_config, one_chunk
+from ssplat_experiments.baselines import JointNetwork, baseline_scores, joint_config, one_chunk
 from ssplat_experiments.cases import PICTURE, Case, Row
 from ssplat_experiments.streams import START_CAPACITY, new_session
 from ssplat_experiments.study import Study, at_scale, run_study
@@ -55,7 +54,7 @@ class Sizes:
 
 WALKS = ("room", "corridor", "orbit")
 SIZES = {
-    "smoke": (Sizes((8, 16), ("room",), (64, 48), targets=3),),
+    "smoke": (Sizes((8,), ("room",), (64, 48), targets=3),),
     "cpu": (
         Sizes((24, 64, 128), WALKS, (160, 120), joint=64),
         Sizes((24, 256, 512, 1024), ("room",), (96, 72), joint=0, label=", long"),
@@ -212,33 +211,6 @@ def findings(rows: list[Row]) -> list[str]:
     return ["\n".join(lines)] if lines else []
 
 
-def plot(pyplot: Any, rows: list[Row]) -> Any:
-    """Literal and shown PSNR against views, a column of panels for each suite."""
-    suites = list(dict.fromkeys(row["suite"] for row in rows))
-    figure, panels = pyplot.subplots(
-        2, len(suites), figsize=(2 + 3.2 * len(suites), 5), sharex=True, layout="constrained", squeeze=False
-    )
-    for column, suite in enumerate(suites):
-        for axes, kind in zip(panels[:, column], ("literal", "shown"), strict=True):
-            for method in (OURS, APPEND, JOINT, *BASELINES):
-                line = [(r["views"], r[f"{kind}_psnr"]) for r in rows if (r["suite"], r["method"]) == (suite, method)]
-                if line:
-                    width = 2.0 if method == OURS else 1.0
-                    axes.plot(*zip(*sorted(line), strict=True), marker="o", ms=3, lw=width, label=method)
-            axes.set_xscale("log", base=2)
-            counts = sorted({row["views"] for row in rows})
-            axes.set_xticks(counts, [str(count) for count in counts], fontsize=8)
-            axes.minorticks_off()
-            axes.set_ylabel(f"{kind} PSNR, dB")
-            axes.spines[["top", "right"]].set_visible(False)
-        panels[0, column].set_title(suite)
-        panels[1, column].set_xlabel("context views")
-    figure.legend(
-        *panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=min(6, 3 * len(suites)), fontsize=7
-    )
-    return figure
-
-
 STUDY = Study(
     name="context_length",
     text="""One stream stops at each number of views; targets are uniform over the trajectory and never streamed.
@@ -248,6 +220,5 @@ one rendered view in it, which grow with the scene. `append-all` keeps every tok
 over all views at once, and `warp nearest` moves the nearest context view by the depth of our scene. Peak memory is
 that of step, decode and rendering, in MiB.""",
     cases=cases,
-    plot=plot,
     findings=findings,
 )

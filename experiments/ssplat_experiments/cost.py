@@ -42,7 +42,6 @@ from ssplat_jax.streaming.session import Session
 
 STAGES = ("copy to device", "project the cache", "network", "fuse and vote", "decode", "render")
 WHOLE = "as a stream runs it"
-COLORS = ("#909090", "#30507a", "#c06030", "#308050", "#806090", "#b09030")
 METHODS = ("ours", "ours, new views", "append-all", "joint")
 REPEATING = ("ours", "append-all")
 
@@ -65,7 +64,7 @@ class Sizes:
 
 
 SIZES = {
-    "smoke": Sizes(((64, 48),), 8, 3, (8, 16), 8, (64, 48)),
+    "smoke": Sizes(((64, 48),), 8, 1, (8,), 8, (64, 48)),
     "cpu": Sizes(((160, 120), (320, 240)), 24, 7, (16, 32, 64, 128), 16, (96, 72)),
     "gpu": Sizes(((256, 256), (448, 256), (960, 512)), 128, 20, (24, 64, 128, 256, 512), 24, (480, 256)),
 }
@@ -154,22 +153,6 @@ def median_ms(work: Callable[[Any], Any], repeats: int, prepare: Callable[[], An
     return statistics.median(times[1:])
 
 
-def plot_latency(pyplot: Any, rows: list[Row]) -> Any:
-    """A bar for each size, in the colors of the stages; a line where the whole ends."""
-    sizes = list(dict.fromkeys(row["size"] for row in rows))
-    figure, axes = pyplot.subplots(figsize=(7, 1.2 + 0.6 * len(sizes)), layout="constrained")
-    for place, size in enumerate(sizes):
-        parts, left = {row["stage"]: row["ms"] for row in rows if row["size"] == size}, 0.0
-        for stage, color in zip(STAGES, COLORS, strict=True):
-            axes.barh(place, parts[stage], left=left, color=color, label=stage if place == 0 else None)
-            left += parts[stage]
-        axes.plot([parts[WHOLE]] * 2, [place - 0.45, place + 0.45], color="black", lw=1.5)
-    axes.set_yticks(range(len(sizes)), sizes)
-    axes.set_xlabel("ms from a chunk to a novel view")
-    figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=len(STAGES), fontsize=7)
-    return figure
-
-
 def memory_config(method: str, num_views: int) -> StreamConfig:
     """Configuration of a method."""
     config = preset("tiny").replace(capacity=START_CAPACITY)
@@ -242,30 +225,15 @@ def memory_findings(rows: list[Row]) -> list[str]:
     return ["\n".join(f"* {line}" for line in found)]
 
 
-def plot_memory(pyplot: Any, rows: list[Row]) -> Any:
-    """A curve for each method."""
-    figure, axes = pyplot.subplots(figsize=(6, 4), layout="constrained")
-    for method, color in zip(METHODS, COLORS[1:], strict=False):
-        curve = sorted((row["views"], row["peak_memory_bytes"] / 2**20) for row in rows if row["method"] == method)
-        axes.plot(*zip(*curve, strict=True), marker="o", ms=4, color=color, label=method)
-    axes.set_xlabel("views")
-    axes.set_ylabel("peak memory of step, decode and render, MiB")
-    axes.set_ylim(bottom=0)
-    axes.legend(frameon=False)
-    return figure
-
-
 LATENCY = Study(
     name="latency",
     text="Milliseconds from a chunk received to one novel view rendered, on the cache of the whole stream, by stage.",
     cases=latency_cases,
-    plot=plot_latency,
 )
 MEMORY = Study(
     name="memory",
     text="Peak memory of step, decode and rendering together, in MiB, against the number of views.",
     cases=memory_cases,
-    plot=plot_memory,
     findings=memory_findings,
 )
 STUDIES = (LATENCY, MEMORY)

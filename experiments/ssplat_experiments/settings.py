@@ -4,9 +4,6 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import jax
-
-from ssplat_experiments.stopwatch import Stopwatch
 from ssplat_experiments.streams import START_CAPACITY, new_session
 from ssplat_jax.config import LITERAL, StreamConfig, preset
 from ssplat_jax.core.gaussians import Gaussians
@@ -16,7 +13,7 @@ from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.evaluation.cost import measure_latency, peak_memory
 from ssplat_jax.evaluation.scoring import score_targets
 from ssplat_jax.refinement.compared_views import FOR_CAPTURES
-from ssplat_jax.refinement.refine import continue_refinement, key_views_of, start_refinement
+from ssplat_jax.refinement.refine import continue_refinement, key_views_of, report_of, start_refinement
 from ssplat_jax.streaming.feed import Exposures, feed_capture
 
 
@@ -31,7 +28,7 @@ class Sizes:
 
 
 SIZES = {
-    "smoke": Sizes(8, (64, 48), settings=2),
+    "smoke": Sizes(8, (64, 48), settings=1),
     "cpu": Sizes(24, (160, 120)),
     "gpu": Sizes(64, (320, 240)),
 }
@@ -151,29 +148,23 @@ def measure_refined(settings: Sequence[Setting], sizes: Sizes, opened: Opened) -
 
     The steps are those of one refinement that is planned for the most of them: fewer steps have higher rates at their
     end than a refinement of their own would have. Where it ends early, settings of more steps get the scene at its end.
-    Their time is spread over the streamed views.
+    Their time, the median of a step times the steps, is spread over the streamed views.
     """
-    scene, watch, rows = _stream(settings[0], sizes, opened), Stopwatch(), []
-    by_steps = {setting.refine_steps: setting for setting in settings}
-    with watch.running():
-        given = key_views_of(scene.streamed, scene.split.context, scene.frame, scene.exposures)
-        progress, views = start_refinement(scene.gaussians, given, FOR_CAPTURES)
-
-    def add_rows(reached: list[Setting]) -> None:
-        """Adds a row of the present scene for each setting."""
-        with watch.running():
-            refined = jax.block_until_ready(progress.scene(scene.gaussians))
-        added = 1e3 * watch.seconds / len(scene.split.context)
-        for setting in reached:
-            row = scene.row(setting, refined) | {"gaussians": int((refined.opacities > 0).sum())}
-            row |= {"ms_per_view": round(row["ms_per_view"] + added, 2), "refine_s": round(watch.seconds, 2)}
-            rows.append(row)
-
-    for _ in watch.over(continue_refinement(progress, views, max(by_steps), FOR_CAPTURES)):
-        if progress.num_steps in by_steps:
-            add_rows([by_steps[progress.num_steps]])
-    if later := [setting for steps, setting in by_steps.items() if steps > progress.num_steps]:
-        add_rows(later)
+    scene, rows = _stream(settings[0], sizes, opened), []
+    wanted = sorted(setting.refine_steps for setting in settings)
+    given = key_views_of(scene.streamed, scene.split.context, scene.frame, scene.exposures)
+    progress, views = start_refinement(scene.gaussians, given, FOR_CAPTURES)
+    refined = {}
+    for _ in continue_refinement(progress, views, wanted[-1], FOR_CAPTURES):
+        if progress.num_steps in wanted:
+            refined[progress.num_steps] = progress.scene(scene.gaussians)
+    last = progress.scene(scene.gaussians)
+    for setting in settings:
+        seconds = report_of(progress, views).seconds_per_step * min(setting.refine_steps, progress.num_steps)
+        gaussians = refined.get(setting.refine_steps, last)
+        row = scene.row(setting, gaussians) | {"gaussians": int((gaussians.opacities > 0).sum())}
+        added = 1e3 * seconds / len(scene.split.context)
+        rows.append(row | {"ms_per_view": round(row["ms_per_view"] + added, 2), "refine_s": round(seconds, 2)})
     return rows
 
 

@@ -67,7 +67,6 @@ class Train:
         reporter = Reporter(self.quiet)
         config, given, params = self._start(recipe, reporter)
         mix = open_mix(self.captures, self.shares, config) if self.captures else None
-        recipe = recipe.for_captures() if mix else recipe
         lpips_weights = load_lpips_weights(self.lpips_vgg, self.lpips_heads)
         minutes = max(1, round(MINUTES.get(self.recipe, 0) * self.scale_steps))
         duration = f", about {minutes} minutes on two cores" if self.recipe in MINUTES else ""

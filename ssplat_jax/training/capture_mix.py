@@ -75,11 +75,11 @@ class CaptureMix:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class PhaseStart:
-    """Inputs from which the samples of a phase are made when it begins."""
+class TrainingStart:
+    """Inputs from which the samples of a phase are made."""
 
     model: StreamSplat
-    params: dict  # of all stages, averaged
+    params: dict  # of all stages, as the training began
     mix: CaptureMix | None
     seed: int  # of the recipe
     num_steps: int  # of the recipe

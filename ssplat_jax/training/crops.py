@@ -26,7 +26,7 @@ from ssplat_jax.refinement import online_refinement
 from ssplat_jax.refinement.refine import key_views_of, pairs_capacity
 from ssplat_jax.streaming.feed import feed_capture
 from ssplat_jax.streaming.session import Session
-from ssplat_jax.training.capture_mix import CaptureMix, PhaseStart
+from ssplat_jax.training.capture_mix import CaptureMix, TrainingStart
 
 
 @pytree
@@ -89,7 +89,7 @@ class Crops:
                 raise refusal(f"train: {capture.name}", wanted=wanted, got=got, fix="leave it out")
         return found
 
-    def open(self, start: PhaseStart) -> Callable[[int, int], tuple[Crop, ...]]:
+    def open(self, start: TrainingStart) -> Callable[[int, int], tuple[Crop, ...]]:
         """Streams all scenes; gives the crops of a step by its number and its place in the phase."""
         scenes = []
         for capture, stride in self.scenes(start.mix):

@@ -20,7 +20,7 @@ from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.atomic import write_atomic
 from ssplat_jax.core.cpu_backend import num_cores
 from ssplat_jax.core.errors import InputError
-from ssplat_jax.core.pytree import pytree, replace
+from ssplat_jax.core.pytree import pytree
 from ssplat_jax.evaluation.lpips import LpipsWeights
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.storage.files import json_text
@@ -28,7 +28,7 @@ from ssplat_jax.storage.interrupts import Interrupts
 from ssplat_jax.storage.run_folder import lock_folder
 from ssplat_jax.storage.saved_states import TrainingCheckpoints
 from ssplat_jax.storage.weights import params_digest
-from ssplat_jax.training.capture_mix import CaptureMix, PhaseStart
+from ssplat_jax.training.capture_mix import CaptureMix, TrainingStart
 from ssplat_jax.training.recipe import Loss, Phase, Recipe, describe
 
 T = TypeVar("T")
@@ -46,7 +46,6 @@ class TrainState:
     params: dict  # stages of which a part learns in some phase
     average: optax.EmaState  # moving average of `params`, see `averaged`
     optimizer: tuple  # state of `optimizer`
-    begin: dict  # the average when the phase began, of which its samples may be made
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,7 +102,7 @@ def init_state(recipe: Recipe, params: dict) -> TrainState:
     learning = {name: jax.tree.map(jnp.copy, stage) for name, stage in params.items() if name in stages}
     average: Any = optax.ema(recipe.ema_decay).init(learning)
     opt_state: Any = optimizer(recipe, learning).init(learning)
-    return TrainState(learning, average, opt_state, jax.tree.map(jnp.copy, learning))
+    return TrainState(learning, average, opt_state)
 
 
 def averaged(recipe: Recipe, state: TrainState) -> dict:
@@ -142,7 +141,7 @@ def train_step(
     updates, opt_state = optimizer(recipe, state.params).update(gradients, state.optimizer, state.params)
     params: Any = optax.apply_updates(state.params, updates)
     average: Any = optax.ema(recipe.ema_decay).update(params, state.average)[1]
-    return TrainState(params, average, opt_state, state.begin), metrics | {"grad_norm": optax.global_norm(gradients)}
+    return TrainState(params, average, opt_state), metrics | {"grad_norm": optax.global_norm(gradients)}
 
 
 def describe_run(
@@ -203,14 +202,7 @@ def train(
     constants = {stage: part for stage, part in params.items() if stage not in state.params}
     update = functools.partial(train_step, model=model, recipe=recipe)
 
-    def current() -> dict:
-        return constants | averaged(recipe, state)
-
-    def begin(phase: Phase, is_resumed: bool) -> Callable[[int, int], Any]:
-        nonlocal state
-        state = state if is_resumed else replace(state, begin=averaged(recipe, state))
-        params = constants | jax.tree.map(jnp.copy, state.begin)
-        return phase.samples.open(PhaseStart(model, params, mix, recipe.seed, recipe.num_steps, say))
+    start = TrainingStart(model, params, mix, recipe.seed, recipe.num_steps, say)
 
     @functools.cache
     def held_out(phase: Phase) -> list:
@@ -221,7 +213,7 @@ def train(
         if (restored := checkpoints.restore_latest(state, warn)) is not None:
             done, state = restored
         log = _Log(out / "log.jsonl", report, done)
-        for phase, step, batch in log.waiting(batches(recipe, done, begin)):
+        for phase, step, batch in batches(recipe, done, start):
             state, metrics = update(state, constants, batch, lpips_weights, phase=phase)
             log.metrics.append(metrics)
             interrupts.has_work, done, is_last = True, step + 1, step + 1 == recipe.num_steps
@@ -229,29 +221,25 @@ def train(
             if done % log_every == 0 or is_scored or is_last:
                 record = log.record(done, phase, state)
                 if is_scored:
-                    record |= scores(model, current(), phase.loss, held_out(phase), lpips_weights)
+                    params = constants | averaged(recipe, state)
+                    record |= scores(model, params, phase.loss, held_out(phase), lpips_weights)
                 log.write(record)
             stopped = interrupts.received  # read once, since a signal may arrive at any time
             if done % save_every == 0 or is_last or stopped:
                 checkpoints.save(done, state)
             if stopped:
                 break
-    return TrainResult(current(), state, done, stopped if done < recipe.num_steps else None)
+    return TrainResult(constants | averaged(recipe, state), state, done, stopped if done < recipe.num_steps else None)
 
 
-def batches(
-    recipe: Recipe, done: int, begin: Callable[[Phase, bool], Callable[[int, int], Any]]
-) -> Iterator[tuple[Phase, int, Any]]:
-    """Phase, number and batch of every step after the first `done`.
-
-    `begin(phase, is_resumed)` gives the function that makes the batches of a phase.
-    """
+def batches(recipe: Recipe, done: int, start: TrainingStart) -> Iterator[tuple[Phase, int, Any]]:
+    """Phase, number and batch of every step after the first `done`."""
     # A GPU leaves the cores free to make samples; without one, a thread makes them beside the steps.
     workers = 1 if jax.default_backend() == "cpu" else max(1, num_cores() // 2)
     first = 0
     for phase in recipe.phases:
         if steps := range(max(done, first), first + phase.steps):
-            make = begin(phase, done > first)
+            make = phase.samples.open(start)
             for step, batch in prefetched(lambda i, make=make, first=first: make(i, i - first), steps, workers):
                 yield phase, step, batch
         first += phase.steps
@@ -302,24 +290,15 @@ class _Log:
 
     def _begin(self) -> None:
         self.metrics: list[dict] = []
-        self._waited, self._since = 0.0, time.perf_counter()
-
-    def waiting(self, steps: Iterable[T]) -> Iterator[T]:
-        """The steps; counts the seconds for which each of them waits for its batch."""
-        before = time.perf_counter()
-        for step in steps:
-            self._waited += time.perf_counter() - before
-            yield step
-            before = time.perf_counter()
+        self._since = time.perf_counter()
 
     def record(self, done: int, phase: Phase, state: TrainState) -> dict:
-        """Means of the metrics, and timings, since the last record."""
+        """Means of the metrics, and the time of a step, since the last record."""
         rows = jax.device_get(self.metrics)  # waits: steps are dispatched asynchronously
-        elapsed = time.perf_counter() - self._since
+        seconds = round((time.perf_counter() - self._since) / len(rows), 4)
         means = {name: round(float(np.mean([row[name] for row in rows if name in row])), 5) for name in rows[-1]}
-        timings = {"seconds_per_step": round(elapsed / len(rows), 4), "data_share": round(self._waited / elapsed, 4)}
         skipped = int(state.optimizer[0].total_notfinite)
-        return {"step": done, "phase": phase.name, **means, "skipped": skipped, **timings}
+        return {"step": done, "phase": phase.name, **means, "skipped": skipped, "seconds_per_step": seconds}
 
     def write(self, record: dict) -> None:
         """Appends a record to the file and reports it."""

@@ -117,9 +117,9 @@ class RenderingLoss:
     black_weight: float = 0.05
     """Fraction of the rendering loss computed over a black background. The rest fills holes with the colors around
     them, as in evaluation; alone, that would make all surfaces translucent, since holes would cost nothing."""
-    fit_gains: bool = False
-    """Compares each target view at the gain per channel with which the rendered one is nearest to it (ours):
-    photographs differ in exposure. `ssplat train --captures` sets it."""
+    fit_gains: bool = True
+    """Compares each photograph at the gain per channel with which the rendered view is nearest to it (ours):
+    photographs differ in exposure."""
     max_pairs: int = 1 << 20
     """Tile intersections that the rasterizer may use per batch of targets; overflow is logged."""
     renders: ClassVar[bool] = True
@@ -144,7 +144,8 @@ class RenderingLoss:
         """Rendering loss of the target views of `sample` in a scene, and metrics."""
         output = render(gaussians, sample.target_camera, max_pairs=self.max_pairs)
         filled = fill_holes(output.color, output.alpha, jax.lax.stop_gradient(mean_color(gaussians)))
-        gains = fitted_gains(filled, sample.target_images) if self.fit_gains else 1.0
+        has_gains = self.fit_gains & sample.is_photographed
+        gains = jnp.where(has_gains, fitted_gains(filled, sample.target_images), 1.0)
         shown, black = (self.of_images(x * gains, sample.target_images, lpips) for x in (filled, output.color))
         total = (1 - self.black_weight) * shown[0] + self.black_weight * black[0]
         return total, {

@@ -15,7 +15,7 @@ from typing import Any, ClassVar, Protocol, runtime_checkable
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.model.streamsplat import StreamSplat
-from ssplat_jax.training.capture_mix import CaptureMix, PhaseStart
+from ssplat_jax.training.capture_mix import CaptureMix, TrainingStart
 from ssplat_jax.training.crops import Crops
 from ssplat_jax.training.losses import CropLoss, DepthLoss, RenderingLoss
 from ssplat_jax.training.samples import Views
@@ -31,19 +31,17 @@ AFTER_MATCHER = ("hpda", "tokens", "cgfi", "mixer", "decoder")
 
 @runtime_checkable
 class Samples(Protocol):
-    """Samples that the steps of a phase learn from."""
+    """Samples that the steps of a phase learn from, such as `Views` and `Crops`.
 
-    def check(self, mix: CaptureMix, config: StreamConfig, *, renders: bool) -> None:
-        """Raises an InputError if the captures cannot teach the phase."""
-        ...
+    `check` raises an InputError if the captures cannot teach the phase, `open` gives a function that makes a batch of
+    the number of its step in the recipe and its place in the phase, and `held_out` batches that are scored.
+    """
 
-    def open(self, start: PhaseStart) -> Callable[[int, int], Any]:
-        """Function that makes the batch of a step of its number in the recipe and its place in the phase."""
-        ...
+    def check(self, mix: CaptureMix, config: StreamConfig, *, renders: bool) -> None: ...
 
-    def held_out(self, mix: CaptureMix) -> list:
-        """Batches of held-out frames, on which the loss's metrics are scores."""
-        ...
+    def open(self, start: TrainingStart) -> Callable[[int, int], Any]: ...
+
+    def held_out(self, mix: CaptureMix) -> list: ...
 
 
 @runtime_checkable
@@ -124,17 +122,6 @@ class Recipe:
         """The recipe with the steps of every phase multiplied by `factor`, at least one step each."""
         phases = tuple(dataclasses.replace(p, steps=max(1, round(p.steps * factor))) for p in self.phases)
         return dataclasses.replace(self, phases=phases)
-
-    def for_captures(self) -> "Recipe":
-        """The recipe with exposures of photographs divided out (`RenderingLoss.fit_gains`)."""
-
-        def changed(phase: Phase) -> Phase:
-            loss = phase.loss
-            if not isinstance(loss, RenderingLoss):
-                return phase
-            return dataclasses.replace(phase, loss=dataclasses.replace(loss, fit_gains=True))
-
-        return dataclasses.replace(self, phases=tuple(map(changed, self.phases)))
 
 
 def describe(value: Any) -> Any:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ssplat_jax.config import MEDIAN_DEPTH, StreamConfig
 from ssplat_jax.core.cameras import Camera
@@ -22,7 +22,7 @@ from ssplat_jax.data.depth_range import FAR_FACTOR, NEAR_FACTOR
 from ssplat_jax.data.procedural.procedural_views import STEP_RANGE, training_sample
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.model.views import GRID_STRIDE
-from ssplat_jax.training.capture_mix import CaptureMix, PhaseStart, held_out_frames, learned_frames
+from ssplat_jax.training.capture_mix import CaptureMix, TrainingStart, held_out_frames, learned_frames
 
 MAX_LOG_STEP = 0.05
 """Log depths of neighboring pixels that differ by more belong to different surfaces."""
@@ -42,6 +42,7 @@ class Sample:
     log_depths: Float[Array, "t v hf wf"]  # true ln z at the centers of cells
     target_images: Float[Array, "s h w 3"]
     target_camera: Camera  # leading axis s
+    is_photographed: Bool[Array, ""]  # by a camera that may choose another exposure for each view
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,7 +83,7 @@ class Views:
                 fix = "leave it out, or choose a recipe that renders target views, such as stream"
                 raise refusal(f"--captures {capture.name}", wanted=wanted, got="none", fix=fix)
 
-    def open(self, start: PhaseStart) -> Callable[[int, int], Sample]:
+    def open(self, start: TrainingStart) -> Callable[[int, int], Sample]:
         """Makes the samples of a step, stacked, from its number and its place in the phase, and from nothing else."""
         mix, seed = start.mix, start.seed
 
@@ -149,6 +150,7 @@ def procedural_sample(views: Views, seed: int, size: tuple[int, int], config: St
         targets=targets,
         near=near,
         far=far,
+        is_photographed=False,
         config=config,
     )
 
@@ -217,6 +219,7 @@ def _sample_of_frames(mix: CaptureMix, capture: Capture, context, targets, size,
         targets=np.arange(len(context), len(frames)),
         near=frame.near,
         far=frame.far,
+        is_photographed=True,
         config=mix.config,
     )
 
@@ -229,7 +232,9 @@ def _depth(capture: Capture, i: int) -> np.ndarray:
     return np.where(depth > 0, depth, np.nan)
 
 
-def _sample_of_views(*, images, depths, viewmats, Ks, context, targets, near, far, config: StreamConfig) -> Sample:
+def _sample_of_views(
+    *, images, depths, viewmats, Ks, context, targets, near, far, is_photographed: bool, config: StreamConfig
+) -> Sample:
     """Sample of the views at the places `context`, chunk by chunk, and `targets`; NumPy arrays, stream units."""
     num_chunks = len(context) // config.stream.chunk_size
     chunked = lambda x: jnp.asarray(x[context].reshape(num_chunks, config.stream.chunk_size, *x.shape[1:]))  # noqa: E731
@@ -247,6 +252,7 @@ def _sample_of_views(*, images, depths, viewmats, Ks, context, targets, near, fa
         log_depths=chunked(log_depths_at_cells(depths)),
         target_images=jnp.asarray(images[targets]),
         target_camera=Camera(jnp.asarray(viewmats[targets]), jnp.asarray(Ks[targets]), width, height),
+        is_photographed=jnp.asarray(is_photographed),
     )
 
 

@@ -7,9 +7,8 @@ import jax
 import numpy as np
 import pytest
 from ssplat_experiments.baselines import JointNetwork, one_chunk
-from ssplat_experiments.cost import METHODS, REPEATING, STAGES, growth, median_ms, stage_times
+from ssplat_experiments.cost import growth, median_ms
 
-from ssplat_jax.core.cameras import Camera
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.evaluation.cost import added_bytes, live_bytes, peak_memory
 from ssplat_jax.model.streamsplat import StreamSplat
@@ -24,19 +23,6 @@ def test_compilation_and_preparation_are_not_timed():
 
     slow_start = iter([0.2, 0.0, 0.0, 0.0])
     assert median_ms(lambda _: None, 3, prepare=lambda: time.sleep(next(slow_start))) < 50
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("compiled_plainly")
-def test_stages_are_timed_without_touching_the_stream():
-    session, chunk = Session(small.MODEL, small.params()), small.chunk()
-    session.feed(chunk)
-    before = jax.device_get(session.cache)
-    camera = Camera(viewmats=chunk.viewmats[0], Ks=chunk.Ks[0], width=small.WIDTH, height=small.HEIGHT)
-    times = stage_times(session, chunk, camera, repeats=1)
-    assert tuple(times) == STAGES and all(ms >= 0 for ms in times.values())
-    assert times["render"] > 0
-    jax.tree.map(lambda a, b: (a == b).all() or pytest.fail("the cache changed"), before, jax.device_get(session.cache))
 
 
 CONFIG = small.CONFIG.replace(chunk_size=4, capacity=1 << 11, min_confidence=0.05)
@@ -77,16 +63,6 @@ def test_memory_of_a_stream_does_not_grow_with_views(room):
     assert len(set(steps)) == 1
     assert max(peaks) <= 1.05 * peaks[0]
     assert peaks[0] >= live_bytes((session.params, session.cache))
-
-
-@pytest.mark.usefixtures("compiled_plainly")
-@pytest.mark.slow
-def test_joint_network_decodes_a_scene_from_new_views(room):
-    """From views that it has seen before it decodes none: two of one place have no parallax."""
-    params, frame = small.random_params(CONFIG), room.stream_frame(CONFIG)
-    network = JointNetwork(CONFIG, params, one_chunk(list(room.chunks(CONFIG, range(8), frame=frame))))
-    assert int((network.gaussians().opacities > 0).sum()) > 0
-    assert {"ours, new views", "joint"} == set(METHODS) - set(REPEATING)
 
 
 def test_added_bytes_are_results_and_temporaries():

@@ -3,13 +3,11 @@
 from importlib.metadata import entry_points
 from typing import get_args, get_type_hints
 
-import jax
 import numpy as np
 import pytest
 from ssplat_experiments.ablation import BUDGETS as ABLATION_BUDGETS
-from ssplat_experiments.ablation import VARIANTS, add_differences, config_of, findings, learned_from, scenes_of
+from ssplat_experiments.ablation import VARIANTS, add_differences, findings, learned_from, scenes_of
 from ssplat_experiments.ablation import cases as ablation_cases
-from ssplat_experiments.accuracy_vs_time import cases as settings_cases
 from ssplat_experiments.accuracy_vs_time import mark_front
 from ssplat_experiments.depth_error import cell_depths, summary
 from ssplat_experiments.settings import REFINED, SETTINGS
@@ -18,10 +16,7 @@ from ssplat_jax.commands.experiment_command import Experiment
 from ssplat_jax.commands.main import guarded
 from ssplat_jax.commands.options import StreamOptions
 from ssplat_jax.config import QUALITIES
-from ssplat_jax.data.open_capture import open_capture
-from ssplat_jax.model.network import STAGES, complete_params
-from ssplat_jax.model.streamsplat import StreamSplat
-from ssplat_jax.storage.weights import load_params
+from ssplat_jax.model.network import STAGES
 
 
 def row(ms, psnr):
@@ -42,20 +37,6 @@ def test_the_qualities_are_settings_that_were_measured():
     for name, quality in QUALITIES.items():
         assert measured[name].changes == {}  # a quality changes the size and the steps only
         assert (measured[name].factor, measured[name].refine_steps) == (quality.scale, quality.refine_steps)
-
-
-def test_settings_are_many_and_differ():
-    assert len(SETTINGS) >= 25
-    assert len({setting.name for setting in SETTINGS}) == len(SETTINGS)
-    assert len({(setting.factor, str(setting.changes)) for setting in SETTINGS}) == len(SETTINGS)
-
-
-def test_the_second_axis_has_thirty_points_at_sizes_that_are_measured_without_steps_too():
-    assert len({setting.name for setting in (*SETTINGS, *REFINED)}) == len(SETTINGS) + len(REFINED) >= 57
-    assert {s.factor for s in REFINED} <= {s.factor for s in SETTINGS if not s.changes} and len(REFINED) == 30
-    names = [case.name for case in settings_cases(None, "cpu")]
-    assert len(set(names)) == len(names) == len(SETTINGS) + 6
-    assert not any("refined" in case.name for case in settings_cases(None, "smoke"))
 
 
 def test_depth_errors_ignore_scale_and_are_binned():
@@ -111,17 +92,6 @@ def test_every_variant_of_the_ablation_is_another_model_or_another_training():
         assert set(variant.untrained) <= set(STAGES) - set(budget.recipe(0, variant.untrained).phases[0].rates)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("variant", VARIANTS)
-def test_every_variant_of_the_ablation_steps(variant):
-    config = config_of(variant).replace(capacity=128)
-    model = StreamSplat(config)
-    params = jax.eval_shape(lambda key: complete_params(key, config, load_params("tiny")), jax.random.key(0))
-    capture = open_capture("procedural:room?frames=4&size=64x48")
-    chunk = next(iter(capture.chunks(config)))
-    jax.eval_shape(model.step, params, model.init_cache(), chunk)
-
-
 def test_the_ablation_learns_from_no_scene_that_it_scores(tmp_path):
     for name in ("redkitchen", "fox", "south_building", "hololens", "plush"):
         (tmp_path / name).mkdir()
@@ -143,12 +113,3 @@ def test_an_unknown_experiment_is_refused_at_once(tmp_path, capsys):
     assert guarded(Experiment("no_such", out=tmp_path / "out").run) == 2
     assert "accuracy_vs_time" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize("missing", [None, "empty"])
-def test_the_captures_experiment_says_what_it_wanted(missing, tmp_path, capsys):
-    folder = None if missing is None else tmp_path / missing
-    if folder:
-        folder.mkdir()
-    assert guarded(Experiment("captures", out=tmp_path / "out", captures=folder, quiet=True).run) == 2
-    assert "captures" in capsys.readouterr().err

@@ -19,7 +19,7 @@ from ssplat_jax.rasterizer import Effects, fill_holes, render
 from ssplat_jax.rasterizer.constants import ALPHA_MIN
 from ssplat_jax.rasterizer.reference import render_reference
 from ssplat_jax.refinement import KeyViews, RefineConfig, init_refinement, refine
-from ssplat_jax.refinement.compared_views import EFFECTS, held_back_pixels, next_view, view_loss
+from ssplat_jax.refinement.compared_views import held_back_pixels, next_view, view_loss, views_of_step
 from ssplat_jax.refinement.refine_step import (
     MAX_LOG_SCALE_CHANGE,
     MAX_SHIFT,
@@ -274,12 +274,15 @@ def test_refinement_ends_before_its_steps_on_a_scene_that_fits():
 
 def test_capacities_that_are_too_small_grow(monkeypatch):
     """The estimate looks at a few views and at the first scene; one of the others may need more."""
-    monkeypatch.setattr(importlib.import_module("ssplat_jax.refinement.refine_step"), "MIN_ROWS", 1)
+    steps = importlib.import_module("ssplat_jax.refinement.refine_step")
+    monkeypatch.setattr(steps, "MIN_ROWS", 1)
     progress = module.Progress(init_refinement(doubtful()), max_pairs=64, max_rows=3)
-    for _ in module.continue_refinement(progress, key_views(), 3):
-        pass
-    needed = max(int(render(doubtful(), cameras()[i], effects=EFFECTS).num_pairs) for i in range(NUM_VIEWS))
-    assert progress.max_pairs > 64 < needed and progress.max_rows > 3 + 8  # most of the rows are seen
+    first = views_of_step(jnp.int32(0), key_views().valid, RefineConfig())
+    num_seen = int(jnp.sum(steps.seen_rows(doubtful(), key_views(), first)))
+    next(module.continue_refinement(progress, key_views(), 3))
+    assert progress.max_rows >= num_seen > 3
+    next(module.continue_refinement(progress, key_views(), 3))  # its views are counted with all rows
+    assert progress.max_pairs > 64
 
 
 def test_gaussians_that_fade_are_removed_and_no_image_changes():

@@ -1,11 +1,6 @@
-"""Small trainings: a quadratic one for the laws of the loop, and short ones of a narrow network.
-
-`python -m tests.training.problems OUT` runs the quadratic one in OUT, prints every finished step, and writes the final
-state to `final.npz`.
-"""
+"""Small trainings: a quadratic one for the laws of the loop, and short ones of a narrow network."""
 
 import dataclasses
-import sys
 from pathlib import Path
 from typing import ClassVar
 
@@ -81,7 +76,6 @@ def train_quadratic(out: Path, recipe: Recipe = QUADRATIC, **options):
 
 SIZE = ((64, 64),)
 NARROW_DEPTH = DepthLoss(capacity=1 << 10)
-DEPTH_PHASE = Phase("depth", 2, Views(1, SIZE), NARROW_DEPTH, learning("cost_volume"), 1e-3, warmup_steps=2)
 STREAM_PHASE = Phase(
     "stream",
     2,
@@ -101,10 +95,3 @@ def flat(tree) -> list[np.ndarray]:
 def assert_equal(tree, other):
     """All leaves are equal to the bit."""
     jax.tree.map(lambda a, b: np.testing.assert_array_equal(np.asarray(a), np.asarray(b)), tree, other)
-
-
-if __name__ == "__main__":
-    slow = Recipe(tuple(dataclasses.replace(phase, steps=100) for phase in QUADRATIC.phases))
-    given = Path(sys.argv[1])
-    done = train_quadratic(given, slow, save_every=10, log_every=1, report=lambda r: print(r["step"], flush=True))
-    np.savez(given / "final.npz", *flat(done.state))

@@ -1,5 +1,7 @@
 """Losses of training: their values by hand, what does not count in them, and gradients against finite differences."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,6 +9,7 @@ import pytest
 
 from ssplat_jax.cache import Tokens
 from ssplat_jax.core.cameras import Camera
+from ssplat_jax.core.chunk import Chunk
 from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.evaluation.lpips import LpipsWeights
@@ -23,30 +26,14 @@ from ssplat_jax.training.losses import (
     fitted_gains,
     image_gradient_l1,
     negative_psnr,
-    soft_targets,
 )
 from ssplat_jax.training.recipe import RECIPES
-from ssplat_jax.training.samples import Views, procedural_sample
+from ssplat_jax.training.samples import Sample
 from tests.model.small import random_params
 from tests.streaming.narrow_model import NARROW
 from tests.training.problems import NARROW_DEPTH, STREAM_PHASE
 
 WIDTH = DepthLoss.target_width
-
-
-def test_soft_targets_and_loss_agree_on_the_truth():
-    candidates = jnp.linspace(0.0, 2.0, 21)
-    truth = jnp.full((1, 2, 2), 0.7)
-    target = soft_targets(truth, candidates, WIDTH)
-    np.testing.assert_allclose(np.asarray(target.sum(-1)), 1.0, atol=1e-6)
-    assert int(jnp.argmax(target[0, 0, 0])) == 7
-    usable = jnp.ones((1, 2, 2), bool)
-
-    def at(k):
-        logits = 20.0 * jax.nn.one_hot(jnp.full((1, 2, 2), k), 21)
-        return float(depth_loss(logits, truth, truth, candidates, usable, target_width=WIDTH)[0])
-
-    assert at(7) < at(6) < at(5)
 
 
 def test_unusable_cells_have_neither_value_nor_gradient_in_the_depth_loss():
@@ -151,15 +138,20 @@ def test_tokens_that_a_stored_view_looked_through_are_not_rendered():
         footprints=jnp.full(4, 0.02),
         valid=jnp.ones(4, bool),
     )
-    shown = decode_accepted(model, params, replace(cache, stored_depths=stored), tokens).opacities > 0
+    accepted = jax.jit(functools.partial(decode_accepted, model))
+    shown = accepted(params, replace(cache, stored_depths=stored), tokens).opacities > 0
     np.testing.assert_array_equal(shown.reshape(4, -1).T, [[False, True, True, False]] * 4)
 
 
 @pytest.mark.parametrize("loss", [NARROW_DEPTH, STREAM_PHASE.loss], ids=["depth", "rendering"])
 def test_loss_and_gradient_of_a_batch_are_means_over_its_samples(monkeypatch, loss):
-    views = Views(1, ((32, 32),), num_targets=int(loss.renders))
-    samples = [procedural_sample(views, seed, (32, 32), NARROW) for seed in (1, 2, 3)]
-    batch = jax.tree.map(lambda *parts: jnp.stack(parts), *samples)
+    zeros, draw = jnp.zeros, functools.partial(jax.random.uniform, jax.random.key(1))
+    chunks = Chunk(
+        zeros((1, 2, 8, 8, 3)), zeros((1, 2, 4, 4)), zeros((1, 2, 3, 3)), zeros((1, 2), bool), *zeros((2, 1))
+    )
+    camera = Camera(zeros((1, 4, 4)), zeros((1, 3, 3)), 8, 8)
+    sample = Sample(chunks, draw((1, 2, 2, 2)), draw((1, 8, 8, 3)), camera, zeros((), bool))
+    batch = jax.tree.map(lambda x: jnp.stack([x, 2 * x, 5 * x]), sample)
 
     def of_stream(self, model, params, sample):
         value = jnp.sum(params["a"] * jnp.nanmean(sample.log_depths)) ** 2
@@ -172,7 +164,7 @@ def test_loss_and_gradient_of_a_batch_are_means_over_its_samples(monkeypatch, lo
     of = jax.value_and_grad(lambda params, x: loss(StreamSplat(NARROW), params, x), has_aux=True)
     params = {"a": jnp.array([1.5, -0.5])}
     (value, metrics), gradient = of(params, batch)
-    singles = [of(params, jax.tree.map(lambda x: x[None], sample)) for sample in samples]
+    singles = [of(params, jax.tree.map(lambda x: x[i : i + 1], batch)) for i in range(3)]  # noqa: B023
     np.testing.assert_allclose(value, np.mean([single[0][0] for single in singles]), rtol=1e-6)
     np.testing.assert_allclose(gradient["a"], np.mean([single[1]["a"] for single in singles], axis=0), rtol=1e-6)
     mean = np.mean([single[0][1]["depth_l1"] for single in singles])
