@@ -246,7 +246,7 @@ def test_loss_is_the_sum_of_squared_errors_and_perceptual_distances(monkeypatch)
     rng = np.random.default_rng(6)
     images, targets = (f32(rng.uniform(size=(3, 8, 8, 3))) for _ in range(2))
     loss, samples = RECIPES["paper"].phases[0].loss, RECIPES["paper"].phases[0].samples
-    mean = loss.of_images(images, targets, stand_in)[0]
+    mean, _ = loss.of_images(images, targets, stand_in)
     a, b = f64(images), f64(targets)
     wanted = sum(((a[r] - b[r]) ** 2).mean() + 0.05 * 2.0 * np.abs(a[r] - b[r]).max() for r in range(3))
     assert 3 * float(mean) == pytest.approx(wanted, rel=1e-5) and loss.weight == samples.num_targets

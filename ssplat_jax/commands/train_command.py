@@ -42,7 +42,8 @@ class Train:
     captures: tuple[Path, ...] = ()
     """Captures to learn from too, or folders of captures. Every 8th frame is held out."""
     shares: tuple[float, ...] = ()
-    """Share of the steps of each of --captures; the rest is procedural. Default: half of the steps, equally."""
+    """Share of the steps of each of --captures; the rest is procedural. Default: half of the steps, equally; all
+    of them in paper."""
     validate_every: int = 200
     """Steps between scores of held-out frames of --captures, in the log."""
     lpips_vgg: Path | None = None
@@ -66,7 +67,8 @@ class Train:
         self._refuse_unused(recipe)
         reporter = Reporter(self.quiet)
         config, given, params = self._start(recipe, reporter)
-        mix = open_mix(self.captures, self.shares, config) if self.captures else None
+        total = 1.0 if recipe.captures_alone else 0.5
+        mix = open_mix(self.captures, self.shares, config, total) if self.captures else None
         lpips_weights = load_lpips_weights(self.lpips_vgg, self.lpips_heads)
         minutes = max(1, round(MINUTES.get(self.recipe, 0) * self.scale_steps))
         duration = f", about {minutes} minutes on two cores" if self.recipe in MINUTES else ""

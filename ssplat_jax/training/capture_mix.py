@@ -41,6 +41,11 @@ class CaptureMix:
     config: StreamConfig
 
     @property
+    def share(self) -> float:
+        """Share of the steps of all groups together."""
+        return sum(group.share for group in self.groups)
+
+    @property
     def captures(self) -> list[Capture]:
         """The captures of all groups."""
         return [capture for group in self.groups for capture in group.captures]
@@ -86,13 +91,13 @@ class TrainingStart:
     say: Callable[[str], None]  # called with messages while scenes are prepared
 
 
-def open_mix(folders: Sequence[Path], shares: Sequence[float], config: StreamConfig) -> CaptureMix:
-    """Opens captures, or folders of captures, each with its share of the steps; by default half of them, equally.
+def open_mix(folders: Sequence[Path], shares: Sequence[float], config: StreamConfig, total: float = 0.5) -> CaptureMix:
+    """Opens captures, or folders of captures, each with its share of the steps; by default equal ones of `total`.
 
     Raises:
         InputError: shares do not fit, or a folder holds no capture.
     """
-    shares = list(shares) or [0.5 / len(folders)] * len(folders)
+    shares = list(shares) or [total / len(folders)] * len(folders)
     if len(shares) != len(folders) or not all(share > 0 for share in shares) or sum(shares) > 1 + 1e-9:
         wanted = f"{len(folders)} numbers above 0 that add up to at most 1, one for each of --captures"
         raise refusal("--shares", wanted=wanted, got=" ".join(map(str, shares)), fix="give one share a folder")

@@ -73,7 +73,8 @@ def optimizer(recipe: Recipe, params: dict) -> optax.GradientTransformationExtra
     labels = jax.tree_util.tree_map_with_path(label, params)
     rates = {name: optax.scale_by_schedule(schedule(recipe, found)) for name, found in factors.items()}
     adamw = optax.adamw(1.0, b2=recipe.adam_b2, weight_decay=recipe.weight_decay)
-    direction = optax.apply_if_finite(optax.chain(optax.clip_by_global_norm(recipe.clip_norm), adamw), ALWAYS)
+    clip = optax.identity() if recipe.clip_norm is None else optax.clip_by_global_norm(recipe.clip_norm)
+    direction = optax.apply_if_finite(optax.chain(clip, adamw), ALWAYS)
     return optax.chain(direction, optax.multi_transform(rates, labels))
 
 
@@ -193,6 +194,8 @@ def train(
             other files, another process trains in it, or configuration or captures do not fit the recipe.
         StorageError: a checkpoint cannot be written or read.
     """
+    if recipe.captures_alone and (mix is None or mix.share < 1 - 1e-9):
+        raise InputError("train: wanted captures that share all steps, as the recipe asks for; give --captures.")
     for phase in recipe.phases:
         if mix is not None:
             phase.samples.check(mix, config, renders=phase.loss.renders)
@@ -202,7 +205,8 @@ def train(
     constants = {stage: part for stage, part in params.items() if stage not in state.params}
     update = functools.partial(train_step, model=model, recipe=recipe)
 
-    start = TrainingStart(model, params, mix, recipe.seed, recipe.num_steps, say)
+    # Processes that train beside each other draw other samples.
+    start = TrainingStart(model, params, mix, recipe.seed + jax.process_index(), recipe.num_steps, say)
 
     @functools.cache
     def held_out(phase: Phase) -> list:

@@ -146,26 +146,27 @@ class RenderingLoss:
         filled = fill_holes(output.color, output.alpha, jax.lax.stop_gradient(mean_color(gaussians)))
         has_gains = self.fit_gains & sample.is_photographed
         gains = jnp.where(has_gains, fitted_gains(filled, sample.target_images), 1.0)
-        shown, black = (self.of_images(x * gains, sample.target_images, lpips) for x in (filled, output.color))
-        total = (1 - self.black_weight) * shown[0] + self.black_weight * black[0]
-        return total, {
-            **({} if lpips is None else {"lpips": shown[2]}),
-            "psnr": -10 * jnp.log10(shown[1] + 1e-10),
-            "psnr_over_black": -10 * jnp.log10(black[1] + 1e-10),
+        weighted = ((1 - self.black_weight, filled * gains), (self.black_weight, output.color * gains))
+        # What has no weight is not computed: LPIPS takes long.
+        terms = [(weight, self.of_images(x, sample.target_images, lpips)) for weight, x in weighted if weight]
+        shown, black = (jnp.mean((x - sample.target_images) ** 2) for _, x in weighted)
+        return sum((weight * loss for weight, (loss, _) in terms), start=jnp.zeros(())), {
+            **({} if lpips is None else {"lpips": terms[0][1][1]}),
+            "psnr": -10 * jnp.log10(shown + 1e-10),
+            "psnr_over_black": -10 * jnp.log10(black + 1e-10),
             "alpha": output.alpha.mean(),
             "overflow": output.num_overflow.astype(jnp.float32),
         }
 
     def of_images(
         self, images: Float[Array, "s h w 3"], targets: Float[Array, "s h w 3"], lpips: Lpips = None
-    ) -> tuple[Scalar, Scalar, Scalar]:
-        """Loss of rendered views, RGB in [0, 1], and its parts: MSE, and LPIPS or the L1 of image gradients."""
-        mse = jnp.mean((images - targets) ** 2)
+    ) -> tuple[Scalar, Scalar]:
+        """Loss of rendered views, RGB in [0, 1], and its second term: LPIPS, or the L1 of image gradients."""
         if lpips is None:
-            other, weight = image_gradient_l1(images, targets), self.gradient_weight
+            second, weight = image_gradient_l1(images, targets), self.gradient_weight
         else:
-            other, weight = lpips_distance(lpips, images, targets).mean(), self.lpips_weight
-        return mse + weight * other, mse, other
+            second, weight = lpips_distance(lpips, images, targets).mean(), self.lpips_weight
+        return jnp.mean((images - targets) ** 2) + weight * second, second
 
 
 @dataclasses.dataclass(frozen=True)

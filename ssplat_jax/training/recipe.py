@@ -97,10 +97,12 @@ class Recipe:
     """Decay of Adam's mean of squared gradients."""
     weight_decay: float = 0.01
     """Decoupled weight decay, multiplied by the learning rate (AdamW)."""
-    clip_norm: float = 1.0
-    """Largest global norm of the gradient; longer ones are scaled down."""
+    clip_norm: float | None = 1.0
+    """Largest global norm of the gradient; longer ones are scaled down. None: none is."""
     ema_decay: float = 0.99
-    """Decay of the moving average of the parameters, which is what is evaluated and shipped."""
+    """Decay of the moving average of the parameters, which is what is evaluated and shipped; 0 averages nothing."""
+    captures_alone: bool = False
+    """Whether captures share all steps; else procedural scenes have those that are left."""
     untrained: tuple[str, ...] = ()
     """Stages that start untrained even if the first weights have them. Such a recipe needs first weights."""
 
@@ -186,7 +188,7 @@ EVIDENCE = Recipe(
 )
 """Trains the evidence head of weights whose other stages stay as they are."""
 
-# The paper renders all tokens over black alone and adds up the losses of the target views.
+# The paper renders all tokens over black alone, at one exposure, and adds up the losses of the target views.
 _PAPER_LOSS = RenderingLoss(
     depth=DepthLoss(capacity=1 << 16, recompute=True),
     depth_weight=0.0,
@@ -194,16 +196,26 @@ _PAPER_LOSS = RenderingLoss(
     tokens="all",
     gradient_weight=0.0,
     black_weight=1.0,
+    fit_gains=False,
     max_pairs=1 << 22,
 )
-_PAPER_VIEWS = Views(4, ((256, 256),), num_targets=4)
-# The vision transformer learns slowly, as DepthSplat trains it.
-_PAPER_RATES = (*learning(*MATCHER, *AFTER_MATCHER), ("encoder/pretrained", 0.01))
+# Its voxels and its anchor have lengths in the units of the poses: scale, near and far are those of the capture.
+_PAPER_VIEWS = Views(4, ((256, 256),), num_targets=4, range_jitter=0.0)
+_PAPER_PHASE = Phase(
+    "paper",
+    100_000,
+    _PAPER_VIEWS,
+    _PAPER_LOSS,
+    learning(*MATCHER, *AFTER_MATCHER),
+    1e-4,
+    final_share=1.0,
+    warmup_steps=1,
+)
 
-PAPER = Recipe(phases=(Phase("paper", 100_000, _PAPER_VIEWS, _PAPER_LOSS, _PAPER_RATES, 1e-4),), adam_b2=0.999)
-"""The paper's training: 100,000 steps of AdamW at 1e-4 with one sample each, through all stages. It needs LPIPS weights
-for the second term and a GPU, and starts from imported weights; the paper does not give the number of chunks and
-targets of a sample."""
+PAPER = Recipe((_PAPER_PHASE,), adam_b2=0.999, clip_norm=None, ema_decay=0.0, captures_alone=True)
+"""The paper's training to the letter: 100,000 steps of AdamW at a constant 1e-4 with one sample of a capture each,
+through all stages. It needs LPIPS weights for the second term and a GPU, and starts from imported weights. Where the
+paper is silent, AdamW has PyTorch's defaults, and a sample four chunks and four targets of 256 x 256."""
 
 RECIPES = {
     "tiny": TINY,

@@ -12,9 +12,7 @@ import jax
 import numpy as np
 import pytest
 
-from ssplat_jax.config import preset
 from ssplat_jax.core.errors import InputError
-from ssplat_jax.model.network import init_params
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.training import loop
 from ssplat_jax.training.recipe import RECIPES, Recipe, learning
@@ -146,13 +144,40 @@ def test_a_phase_without_anything_to_train_is_refused(tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_parts_of_the_paper_recipe_exist():
-    """The path of the vision transformer, which learns slowly, is one of the network's."""
-    (phase,) = RECIPES["paper"].phases
-    assert phase.rate("encoder/pretrained/x") == 0.01 and phase.rate("encoder/cnn") == phase.rate("decoder") == 1.0
-    assert phase.rate("evidence") == phase.rate("encoders") == 0.0
-    shapes = jax.eval_shape(lambda key: init_params(key, preset("small"), ["encoder"]), jax.random.key(0))
-    assert "pretrained" in shapes["encoder"]
+def test_the_paper_recipe_takes_steps_of_plain_adamw(tmp_path):
+    """100,000 steps at a constant 1e-4: no warm-up, decay, clipping, average, or slower part; PyTorch's defaults."""
+    recipe = RECIPES["paper"]
+    (phase,) = recipe.phases
+    assert phase.steps == 100_000
+    for part in ("encoder/pretrained/x", "encoder/cnn", "cost_volume", "hpda/w", "decoder/w"):
+        rate = loop.schedule(recipe, (phase.rate(part),))
+        np.testing.assert_allclose([rate(step) for step in (0, 1, 50_000, 99_999)], 1e-4, rtol=1e-6)
+    short = dataclasses.replace(phase, steps=9, samples=Numbers(), loss=Squares(1e4))  # a gradient that is long
+    done = train_quadratic(tmp_path, dataclasses.replace(recipe, phases=(short,), captures_alone=False))
+    make = Numbers().open(SimpleNamespace(seed=0, params=start_params()))
+    for name, x in flat_names(start_params()).items():
+        x, mean, square = np.float64(x), np.zeros(3), np.zeros(3)
+        for step in range(1, 10):
+            gradient = 2e4 * (x - np.float64(make(step - 1, step - 1)))
+            mean, square = 0.9 * mean + 0.1 * gradient, 0.999 * square + 0.001 * gradient**2
+            x = x - 1e-4 * 0.01 * x - 1e-4 * (mean / (1 - 0.9**step)) / (np.sqrt(square / (1 - 0.999**step)) + 1e-8)
+        np.testing.assert_allclose(flat_names(done.params)[name], x, rtol=FLOAT32, atol=FLOAT32, err_msg=name)
+    assert_equal(done.params, done.state.params)
+
+
+def test_the_paper_recipe_learns_from_captures_alone(tmp_path):
+    with pytest.raises(InputError, match="captures that share all steps"):
+        loop.train(NARROW, RECIPES["paper"], tmp_path / "out", params=start_params())
+    assert not (tmp_path / "out").exists()
+
+
+def test_processes_draw_samples_of_their_own(tmp_path, monkeypatch):
+    alone = train_quadratic(tmp_path / "0").params
+    monkeypatch.setattr(jax, "process_index", lambda: 1)
+    second, other = train_quadratic(tmp_path / "1").params, dataclasses.replace(QUADRATIC, seed=1)
+    monkeypatch.undo()
+    assert_equal(second, train_quadratic(tmp_path / "2", other).params)
+    assert not np.array_equal(alone["decoder"]["w"], second["decoder"]["w"])
 
 
 def test_records_of_steps_that_are_taken_again_are_removed(tmp_path):

@@ -1,5 +1,6 @@
 """Losses of training: their values by hand, what does not count in them, and gradients against finite differences."""
 
+import dataclasses
 import functools
 
 import jax
@@ -15,6 +16,7 @@ from ssplat_jax.core.pytree import replace
 from ssplat_jax.evaluation.lpips import LpipsWeights
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.rasterizer import render
+from ssplat_jax.rasterizer.reference import render_reference
 from ssplat_jax.training import loop, losses
 from ssplat_jax.training.crops import crop_camera
 from ssplat_jax.training.losses import (
@@ -34,6 +36,14 @@ from tests.streaming.narrow_model import NARROW
 from tests.training.problems import NARROW_DEPTH, STREAM_PHASE
 
 WIDTH = DepthLoss.target_width
+
+
+def sample_of(log_depths, images, camera, is_photographed=False) -> Sample:
+    """A sample whose context shows nothing."""
+    shape = log_depths.shape[:2]
+    views = (jnp.zeros((*shape, *rest)) for rest in ((8, 8, 3), (4, 4), (3, 3)))
+    chunks = Chunk(*views, jnp.zeros(shape, bool), *jnp.zeros((2, shape[0])))
+    return Sample(chunks, log_depths, images, camera, jnp.asarray(is_photographed))
 
 
 def test_unusable_cells_have_neither_value_nor_gradient_in_the_depth_loss():
@@ -101,6 +111,30 @@ def test_image_losses_are_the_sum_of_their_terms(monkeypatch):
     assert float(image_gradient_l1(images, images + 0.25)) < 1e-6
 
 
+def test_the_paper_loss_of_a_scene_sums_mse_and_lpips_of_its_targets_over_black(monkeypatch):
+    """Eq. training_loss on views of the reference renderer, of photographs that are darker than the scene."""
+    monkeypatch.setattr(losses, "lpips_distance", lambda weights, a, b: 3.0 * jnp.abs(a - b).max(axis=(1, 2, 3)))
+    (phase,), rng = RECIPES["paper"].phases, np.random.default_rng(3)
+    gaussians = Gaussians.from_rgb(
+        means=jnp.asarray(rng.uniform((-1, -1, 2), (1, 1, 4), (9, 3)), jnp.float32),
+        quats=jnp.asarray(rng.normal(size=(9, 4)), jnp.float32),
+        scales=jnp.full((9, 3), 0.3),
+        opacities=jnp.full(9, 0.7),
+        colors=jnp.asarray(rng.uniform(size=(9, 3)), jnp.float32),
+    )
+    viewmats = jnp.tile(jnp.eye(4), (4, 1, 1)).at[:, 0, 3].set(jnp.linspace(-0.3, 0.3, 4))
+    K = jnp.array([[10.0, 0, 8], [0, 10, 6], [0, 0, 1]])
+    cameras = Camera(viewmats, jnp.tile(K, (4, 1, 1)), 16, 12)
+    colors = np.stack([np.asarray(render_reference(gaussians, cameras[i]).color, np.float64) for i in range(4)])
+    targets = 0.5 * colors + 0.1 * rng.uniform(size=colors.shape)
+    sample = sample_of(jnp.zeros((1, 4, 2, 2)), jnp.asarray(targets, jnp.float32), cameras, is_photographed=True)
+    loss = dataclasses.replace(phase.loss, max_pairs=1 << 12)
+    value = loss.weight * loss.of_scene(gaussians, sample, LpipsWeights((), (), ()))[0]
+    errors = [((c - t) ** 2).mean() + 0.05 * 3.0 * np.abs(c - t).max() for c, t in zip(colors, targets, strict=True)]
+    assert float(value) == pytest.approx(sum(errors), rel=2e-3)  # tiles cut faint rims
+    assert (loss.depth_weight, loss.tokens, phase.samples.batch, phase.samples.num_targets) == (0, "all", 1, 4)
+
+
 def test_fitted_gains_undo_exposures_and_stay_bounded():
     rng = np.random.default_rng(0)
     images = jnp.asarray(rng.uniform(0.1, 0.9, (3, 6, 5, 3)), jnp.float32)
@@ -145,12 +179,9 @@ def test_tokens_that_a_stored_view_looked_through_are_not_rendered():
 
 @pytest.mark.parametrize("loss", [NARROW_DEPTH, STREAM_PHASE.loss], ids=["depth", "rendering"])
 def test_loss_and_gradient_of_a_batch_are_means_over_its_samples(monkeypatch, loss):
-    zeros, draw = jnp.zeros, functools.partial(jax.random.uniform, jax.random.key(1))
-    chunks = Chunk(
-        zeros((1, 2, 8, 8, 3)), zeros((1, 2, 4, 4)), zeros((1, 2, 3, 3)), zeros((1, 2), bool), *zeros((2, 1))
-    )
-    camera = Camera(zeros((1, 4, 4)), zeros((1, 3, 3)), 8, 8)
-    sample = Sample(chunks, draw((1, 2, 2, 2)), draw((1, 8, 8, 3)), camera, zeros((), bool))
+    draw = functools.partial(jax.random.uniform, jax.random.key(1))
+    camera = Camera(jnp.zeros((1, 4, 4)), jnp.zeros((1, 3, 3)), 8, 8)
+    sample = sample_of(draw((1, 2, 2, 2)), draw((1, 8, 8, 3)), camera)
     batch = jax.tree.map(lambda x: jnp.stack([x, 2 * x, 5 * x]), sample)
 
     def of_stream(self, model, params, sample):

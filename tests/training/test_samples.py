@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ssplat_jax.config import MEDIAN_DEPTH
+from ssplat_jax.config import MEDIAN_DEPTH, preset
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.data.depth_range import FAR_FACTOR
 from ssplat_jax.data.open_capture import open_capture
@@ -162,6 +162,29 @@ def test_poses_and_depths_of_a_sample_have_one_scale(mix, capture):
     known = mix.frame_of(capture)
     errors = np.log([scales[0] / known.scale, near / scales[0] / (known.near / known.scale)])
     assert np.all(np.abs(errors) <= VIEWS.range_jitter + 1e-4) and np.abs(errors).min() > 1e-3
+
+
+def test_with_the_paper_recipe_voxels_have_the_units_of_the_capture(capture):
+    """Poses keep their lengths in every sample, so 0.04 is 0.04 of theirs, whatever the size of the scene."""
+    config, (phase,) = preset("paper"), RECIPES["paper"].phases
+    views = dataclasses.replace(phase.samples, num_chunks=2, num_targets=2, sizes=(SIZE,))
+    for size in (1.0, 7.0):
+        frames = [
+            dataclasses.replace(frame, camtoworld=frame.camtoworld @ np.diag([1, 1, 1, 1.0]))
+            for frame in capture.frames
+        ]
+        for frame in frames:
+            frame.camtoworld[:3, 3] *= size
+        scaled = dataclasses.replace(capture, frames=tuple(frames))
+        mix = CaptureMix((CaptureGroup("room", 1.0, (scaled,)),), config)
+        sample = capture_sample(views, mix, scaled, [5], SIZE)
+        centers = np.linalg.inv(np.asarray(sample.chunks.viewmats, np.float64).reshape(-1, 4, 4))[:, :3, 3]
+        true = scaled.camtoworlds[context_frames(sample, scaled)][:, :3, 3]
+        moved = [np.linalg.norm(x - x[0], axis=1) for x in (centers, true)]
+        np.testing.assert_allclose(*moved, atol=1e-4)
+        known = mix.frame_of(scaled)
+        assert known.scale == 1.0 and config.memory.voxel_size == 0.04
+        np.testing.assert_allclose([sample.chunks.near[0], sample.chunks.far[0]], [known.near, known.far], rtol=1e-5)
 
 
 def with_depth_maps(capture, has_depth):
