@@ -27,6 +27,7 @@ from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import Split, interleaved_split
 from ssplat_jax.evaluation.cost import peak_memory
+from ssplat_jax.evaluation.lpips import installed_lpips
 from ssplat_jax.evaluation.scoring import score_targets, score_view
 from ssplat_jax.model.network import complete_params
 from ssplat_jax.model.streamsplat import StreamSplat
@@ -243,7 +244,8 @@ def trained_by(config: StreamConfig, recipe: Recipe, params: dict, mix: CaptureM
         KeyboardInterrupt: a signal stopped it.
     """
     with tempfile.TemporaryDirectory() as folder:
-        done = train(config, recipe, Path(folder), params=params, mix=mix)
+        lpips = installed_lpips() if recipe.renders else None
+        done = train(config, recipe, Path(folder), params=params, mix=mix, lpips_weights=lpips)
     if done.interrupted:
         raise KeyboardInterrupt
     return done.params
@@ -267,8 +269,8 @@ def scored(session: Session, capture: Capture, split: Split) -> Row:
     frame = capture.stream_frame(session.model.config, split.context)
     exposures, _ = feed_capture(session, capture, split.context, frame)
     gaussians, middle = session.gaussians(), split.targets[len(split.targets) // 2]
-    scores = score_targets(gaussians, capture, split.targets, frame, exposures)
-    values = {f"{c}_{m}": scores[c][m] for c in COLUMNS for m in ("psnr", "ssim")}
+    scores = score_targets(gaussians, capture, split.targets, frame, exposures, installed_lpips())
+    values = {f"{c}_{m}": scores[c][m] for c in COLUMNS for m in ("psnr", "ssim", "lpips")}
     return {
         **values,
         "peak_memory_bytes": peak_memory(session, capture.camera(middle, frame)).bytes,

@@ -25,6 +25,7 @@ from ssplat_jax.evaluation.cost import (
     live_bytes,
     render_bytes,
 )
+from ssplat_jax.evaluation.lpips import installed_lpips
 from ssplat_jax.evaluation.scoring import ImageScore, exposure_for, nearest_views, score_image
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.streaming.feed import Exposures
@@ -72,7 +73,7 @@ def baseline_scores(
 
 
 def _score(image: np.ndarray, target: np.ndarray) -> ImageScore:
-    return score_image(np.clip(image, 0.0, 1.0).astype(np.float32), target)
+    return score_image(np.clip(image, 0.0, 1.0).astype(np.float32), target, installed_lpips())
 
 
 def warp(

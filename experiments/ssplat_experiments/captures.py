@@ -16,6 +16,7 @@ from ssplat_jax.core.errors import InputError
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import interleaved_split
 from ssplat_jax.evaluation.evaluate import evaluate
+from ssplat_jax.evaluation.lpips import installed_lpips
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.storage.files import write_json
 from ssplat_jax.storage.weights import load_params
@@ -46,7 +47,9 @@ def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str
             continue
         capture = open_capture(captures / name, size=size)
         split = interleaved_split(len(capture), stride, context if scale != "smoke" else 8)
-        metrics = evaluate(Session(model, params), capture, split, out / f"{name}_stride{stride}", reporter)
+        folder = out / f"{name}_stride{stride}"
+        lpips = installed_lpips()
+        metrics = evaluate(Session(model, params), capture, split, folder, reporter, lpips_weights=lpips)
         row = {
             "capture": name,
             "stride": stride,
@@ -57,6 +60,8 @@ def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str
             "one_exposure": metrics["psnr_one_exposure"],
             "shown_ssim": metrics["shown"]["ssim"],
             "literal_ssim": metrics["literal"]["ssim"],
+            "shown_lpips": metrics["shown"]["lpips"],
+            "literal_lpips": metrics["literal"]["lpips"],
             "copy": metrics["baselines"]["nearest_view_psnr"],
             "accepted": metrics["cache"]["accepted_fraction"],
             "gaussians": metrics["num_gaussians"],

@@ -12,7 +12,6 @@ of our scene, a memory that keeps every token, and the same network over all vie
 import dataclasses
 import functools
 import itertools
-import statistics
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -28,7 +27,8 @@ from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import Split, paper_split
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.evaluation.cost import measure_latency, peak_memory
-from ssplat_jax.evaluation.scoring import ImageScore, score_view
+from ssplat_jax.evaluation.lpips import installed_lpips
+from ssplat_jax.evaluation.scoring import ImageScore, mean_images, score_view
 from ssplat_jax.storage.weights import load_params
 from ssplat_jax.streaming.feed import Exposures, feed_capture
 
@@ -177,20 +177,20 @@ def _scores(
     frame: StreamFrame,
     exposures: Exposures,
     context: Sequence[int],
-) -> dict[str, dict[str, float]]:
+) -> dict[str, dict[str, float | None]]:
     """Mean scores of the scene and, for the views of a context, of the image baselines, by their names."""
     found: dict[str, list[dict[str, ImageScore]]] = {"scene": []}
     for i in targets:
-        view = score_view(gaussians, capture, i, frame, exposures)
+        view = score_view(gaussians, capture, i, frame, exposures, installed_lpips())
         found["scene"].append({"literal": view.score.literal, "shown": view.score.shown})
         if context:
             for name, scores in baseline_scores(capture, i, context, frame, view.depth, exposures).items():
                 found.setdefault(name, []).append(scores)
     return {
         name: {
-            f"{column}_{metric}": round(statistics.mean(getattr(s[column], metric) for s in scores), 4)
+            f"{column}_{metric}": value
             for column in ("literal", "shown")
-            for metric in ("psnr", "ssim")
+            for metric, value in mean_images([score[column] for score in scores]).items()
         }
         for name, scores in found.items()
     }

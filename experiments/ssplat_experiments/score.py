@@ -11,7 +11,6 @@ holes filled and no exposure changed. The nearest context view and the mean colo
 import functools
 import hashlib
 import json
-import statistics
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +24,8 @@ from ssplat_jax.core.errors import InputError, echo
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import Split
-from ssplat_jax.evaluation.scoring import check_scorable, nearest_views, score_image
+from ssplat_jax.evaluation.lpips import installed_lpips
+from ssplat_jax.evaluation.scoring import check_scorable, mean_images, nearest_views, score_image
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
 SPLIT, METRICS = "split.json", "metrics.json"
@@ -61,7 +61,7 @@ def study_of(path: str, renders: Path) -> Study:
         )
     ((width, height),) = sizes
     capture = open_capture(path, size=(width, height))
-    check_scorable(capture)
+    check_scorable(capture, with_lpips=installed_lpips() is not None)
     if max(*split.context, *split.targets) >= len(capture):
         raise InputError(f"{renders / SPLIT}: wanted frames below {len(capture)}, which {capture.name} has.")
     digest = hashlib.sha256(b"".join(files[i].read_bytes() for i in split.targets)).hexdigest()[:12]
@@ -87,9 +87,9 @@ def measured(
     }
     rows = []
     for name, by_target in shown.items():
-        scores = [score_image(by_target[i], capture.image(i)) for i in split.targets]
+        scores = [score_image(by_target[i], capture.image(i), installed_lpips()) for i in split.targets]
         row = {"method": name, "capture": capture.name, "size": f"{capture.width}x{capture.height}"}
-        row |= {f"literal_{m}": round(statistics.mean(getattr(s, m) for s in scores), 4) for m in ("psnr", "ssim")}
+        row |= {f"literal_{metric}": value for metric, value in mean_images(scores).items()}
         row |= {"peak_memory_bytes": memory if name == method else None}
         rows.append(row | {"targets": len(split.targets), "split": split.sha256[:12]})
     return rows

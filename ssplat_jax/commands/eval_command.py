@@ -4,7 +4,7 @@ import dataclasses
 from pathlib import Path
 from typing import Literal
 
-from ssplat_jax.commands.options import LpipsHeads, StreamOptions, load_lpips_weights, parse_size
+from ssplat_jax.commands.options import StreamOptions, parse_size
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,22 +31,19 @@ class Eval(StreamOptions):
     """Pictures show holes black instead of in the colors around them."""
     one_exposure: bool = False
     """Pictures are at the exposure of the first views instead of that of the nearest streamed ones."""
-    lpips_vgg: Path | None = None
-    """torchvision's vgg16 weights (.safetensors or .npz): with --lpips-heads, LPIPS is scored too."""
-    lpips_heads: LpipsHeads = None
 
     def run(self) -> int:
         from ssplat_jax.core.console import Reporter
+        from ssplat_jax.evaluation.lpips import installed_lpips
         from ssplat_jax.evaluation.scoring import Display
         from ssplat_jax.runs.evaluate_run import EvalOptions, evaluate_run
         from ssplat_jax.storage.run_folder import lock_folder
 
-        lpips_weights = load_lpips_weights(self.lpips_vgg, self.lpips_heads)
         model, params = self.load_model(causal=self.causal)
         names = ("protocol", "stride", "context", "targets", "index", "scene", "refine_steps", "revise", "scale")
         options = EvalOptions(
             size=parse_size(self.size),
-            lpips_weights=lpips_weights,
+            lpips_weights=installed_lpips(),
             display=Display(self.over_black, self.one_exposure),
             **{name: getattr(self, name) for name in names},
         )

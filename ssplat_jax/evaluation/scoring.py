@@ -185,25 +185,27 @@ def mean_scores(scores: Sequence[ViewScore]) -> dict[str, Any]:
         `{"literal": {"psnr", "ssim", "lpips"}, "shown": {...}, "psnr_over_black", "psnr_one_exposure"}`;
         `lpips` is None without weights.
     """
+    blocks = {name: mean_images([getattr(s, name) for s in scores]) for name in ("literal", "shown")}
+    others = ("psnr_over_black", "psnr_one_exposure")
+    return blocks | {name: round(float(np.mean([getattr(s, name) for s in scores])), 4) for name in others}
 
-    def mean(values: Sequence[float | None]) -> float | None:
-        found = [value for value in values if value is not None]
-        return round(float(np.mean(found)), 4) if found else None
 
-    blocks = {
-        name: {kind: mean([getattr(getattr(s, name), kind) for s in scores]) for kind in ("psnr", "ssim", "lpips")}
-        for name in ("literal", "shown")
-    }
-    return blocks | {
-        name: mean([getattr(s, name) for s in scores]) for name in ("psnr_over_black", "psnr_one_exposure")
-    }
+def mean_images(scores: Sequence[ImageScore]) -> dict[str, float | None]:
+    """Means of `psnr`, `ssim` and `lpips`, the last None without weights."""
+    columns = {name: [getattr(score, name) for score in scores] for name in ("psnr", "ssim", "lpips")}
+    return {name: None if not x or None in x else round(float(np.mean(x)), 4) for name, x in columns.items()}
 
 
 def score_targets(
-    gaussians: Gaussians, capture: Capture, targets: tuple[int, ...], frame: StreamFrame, exposures: Exposures
+    gaussians: Gaussians,
+    capture: Capture,
+    targets: tuple[int, ...],
+    frame: StreamFrame,
+    exposures: Exposures,
+    lpips_weights: LpipsWeights | None = None,
 ) -> dict[str, Any]:
     """`mean_scores` of the frames `targets`, scored by `score_view`."""
-    return mean_scores([score_view(gaussians, capture, i, frame, exposures).score for i in targets])
+    return mean_scores([score_view(gaussians, capture, i, frame, exposures, lpips_weights).score for i in targets])
 
 
 def baselines(capture: Capture, split: Split) -> dict[str, float]:

