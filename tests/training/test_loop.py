@@ -22,6 +22,8 @@ from tests.training.problems import (
     FIRST,
     QUADRATIC,
     STREAM_PHASE,
+    Numbers,
+    Squares,
     assert_equal,
     flat,
     flat_names,
