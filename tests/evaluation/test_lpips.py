@@ -107,7 +107,7 @@ def test_weights_are_read_as_arrays_and_the_package_is_never_imported(monkeypatc
         f"NetLinLayer_{k}": {"Conv_0": {"kernel": np.asarray(x)[None, None, :, None]}}
         for k, x in enumerate(weights.heads)
     }
-    data = pickle.dumps(tree, protocol=2).replace(b"numpy._core.multiarray", b"numpy.core.multiarray")
+    data = pickle.dumps(tree, protocol=3).replace(b"numpy._core.multiarray", b"numpy.core.multiarray")
     fake_package(monkeypatch, tmp_path, data)
     jax.tree.map(np.testing.assert_array_equal, installed_lpips(), weights)
     monkeypatch.setattr("ssplat_jax.evaluation.lpips.SHA256", "0")
