@@ -35,18 +35,6 @@ def test_points_keep_their_pixel_after_resizing_and_transform():
         np.testing.assert_allclose(depths, 2.5 * in_camera[:, 2], rtol=1e-5)
 
 
-def test_a_scaled_capture_has_the_same_view_at_another_size():
-    capture = resized(smooth_capture(), 40, 40)
-    half = capture.scaled(0.5)
-    assert (half.width, half.height) == (20, 20)
-    point = np.array([0.1, -0.2, 2.0])
-    for i in range(len(capture)):
-        pixels = [(c.K(i) @ point)[:2] / point[2] for c in (half, capture)]
-        np.testing.assert_allclose(2 * pixels[0], pixels[1], rtol=1e-12)
-        np.testing.assert_allclose(half.image(i).mean(axis=(0, 1)), capture.image(i).mean(axis=(0, 1)), atol=0.01)
-    assert (capture.scaled(1e-9).width, capture.scaled(1e-9).height) == (1, 1)
-
-
 def test_chunks_hold_the_frames_in_order_and_pad_the_last():
     capture = smooth_capture()
     frame = frame_of(capture)
@@ -89,13 +77,6 @@ def test_an_image_is_decoded_once_for_depth_range_and_stream(tmp_path, monkeypat
     capture = open_capture(make_capture(tmp_path / "c"), size=(32, 24))
     assert sum(int(chunk.valid.sum()) for chunk in capture.chunks(StreamConfig())) == 4
     assert sorted(decoded) == [frame.path for frame in capture.frames]
-
-
-@pytest.mark.parametrize("indices", [[], [4], [-1]])
-def test_unknown_frame_numbers_are_refused(tmp_path, indices):
-    capture = open_capture(make_capture(tmp_path / "c"))
-    with pytest.raises(ValueError, match="frame numbers"):
-        next(capture.chunks(StreamConfig(), indices))
 
 
 def test_a_camera_without_a_frame_is_in_the_frame_of_the_capture():

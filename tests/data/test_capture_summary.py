@@ -11,9 +11,7 @@ from scipy.ndimage import gaussian_filter
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.data.capture import ArrayPixels, Capture
 from ssplat_jax.data.capture_summary import (
-    UNITS,
     _depth_map_warnings,
-    _depth_warnings,
     frame_warnings,
     image_warnings,
     order_warnings,
@@ -52,14 +50,6 @@ def test_warnings_name_a_remedy(capture, words):
     assert any(words in warning for warning in warnings), warnings
 
 
-def test_depth_maps_are_measured_and_named():
-    capture = two_planes(8, 0.2)
-    summary = summarize(capture, StreamConfig())
-    known = np.concatenate([depth[depth > 0] for i in range(8) if (depth := capture.depth(i)) is not None])
-    assert summary["depth_maps_median"] == pytest.approx(float(np.median(known)))
-    assert summary["num_depth_maps"] == 8 and "num_depth_maps" in UNITS
-
-
 def test_depth_maps_of_another_unit_are_reported():
     depths = DepthStatistics(1.0, 2.0, 4.0, 100, 12, 5.0, "matches")
     assert _depth_map_warnings(depths, 2.2) == _depth_map_warnings(depths, None) == []
@@ -67,16 +57,7 @@ def test_depth_maps_of_another_unit_are_reported():
     assert "1e+03 times" in warning and "unit" in warning
 
 
-def test_a_small_median_parallax_is_reported():
-    capture, steps = two_planes(8, 0.2), np.full(7, 0.2)
-    for parallax, wanted in ((1.1, "Little parallax: 1.1 degrees"), (4.0, None)):
-        found = _depth_warnings(capture, DepthStatistics(1.0, 2.0, 4.0, 100, 12, parallax, "matches"), steps)
-        assert [w.startswith(wanted) for w in found] == [True] if wanted else found == []
-
-
 # -- frames -----------------------------------------------------------------------------------------------------------
-
-CAPTURES = ("fox", "hololens", "plush", "redkitchen", "south_building")
 
 
 @pytest.fixture(scope="module")

@@ -47,20 +47,6 @@ def test_every_kind_of_image_becomes_rgb(tmp_path, mode):
     np.testing.assert_allclose(image, wanted, atol=3 * EIGHT_BITS)
 
 
-def test_exif_orientation_is_not_applied(tmp_path):
-    """Intrinsics refer to the stored pixels."""
-
-    def change(root, meta):
-        exif = Image.Exif()
-        exif[0x0112] = 6
-        image = Image.new("RGB", (WIDTH, HEIGHT), (255, 0, 0))
-        image.paste((0, 0, 255), (0, 0, WIDTH // 2, HEIGHT))
-        image.save(root / "images" / "2.jpg", exif=exif, quality=95)
-
-    image = open_capture(make_capture(tmp_path / "c", change)).image(2)
-    assert image[HEIGHT // 2, 5, 2] > 0.9 and image[HEIGHT // 2, -5, 0] > 0.9
-
-
 @pytest.mark.parametrize("size", SIZES)
 def test_a_point_moves_to_where_its_color_moves(size):
     """The image holds its own pixel coordinates, so pixels must agree with the intrinsics."""
@@ -81,14 +67,6 @@ def test_a_point_moves_to_where_its_color_moves(size):
     depth = small.depth(0)
     assert depth is not None and depth.shape == image.shape[:2]
     np.testing.assert_allclose(depth, 1 + stored[..., 0] / 64, rtol=0, atol=0.51 / 64 * (1 + 1e-5))
-
-
-def test_the_stored_size_leaves_pixels_unchanged(tmp_path):
-    root = make_capture(tmp_path / "c")
-    with Image.open(root / "images" / "1.jpg") as stored:
-        wanted = np.asarray(stored, np.float32) / 255
-    np.testing.assert_array_equal(open_capture(root).image(1), wanted)
-    np.testing.assert_array_equal(open_capture(root, size=(WIDTH, HEIGHT)).image(1), wanted)
 
 
 def test_depth_maps_of_another_resolution_are_resized(tmp_path):

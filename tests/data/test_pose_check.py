@@ -12,7 +12,7 @@ from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.capture_summary import summarize
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.pose_check import fit_poses, pose_warning
-from ssplat_jax.data.posed_image import CONVENTIONS, USUAL, Convention, split_options, with_options
+from ssplat_jax.data.posed_image import CONVENTIONS, USUAL, Convention, with_options
 from ssplat_jax.data.sparse_matches import keypoints_of
 from tests.data.planes_fixture import two_planes
 
@@ -76,11 +76,3 @@ def test_inspect_names_the_flag_and_says_nothing_of_depths_from_wrong_poses(room
     warnings = summarize(turned, StreamConfig())["warnings"]
     assert sum("--axes opengl" in warning for warning in warnings) == 1
     assert not any("parallax" in warning or "matches between frames" in warning for warning in warnings)
-
-
-def test_options_are_split_from_paths_and_replaced():
-    assert split_options("a/b") == ("a/b", {}) and split_options("a?b=c") == ("a?b=c", {})
-    both = with_options("a/b", axes="opengl", poses="world-to-camera")
-    assert split_options(both) == ("a/b", {"axes": "opengl", "poses": "world-to-camera"})
-    assert with_options(both, axes="opencv") == "a/b?axes=opencv&poses=world-to-camera"
-    assert with_options("a/b") == "a/b"

@@ -7,7 +7,6 @@ from ssplat_jax.core.errors import InputError
 from ssplat_jax.data.procedural import procedural_views
 from ssplat_jax.data.procedural.paths import PATH_KINDS, sample_path
 from ssplat_jax.data.procedural.procedural_views import procedural_capture_arrays, training_sample
-from ssplat_jax.data.procedural.raycast import raycast_depths
 from ssplat_jax.data.procedural.scene import Finish, SceneBuilder, clearance, fade_scene
 from ssplat_jax.data.procedural.scenes import SCENE_KINDS, sample_scene
 from ssplat_jax.data.procedural.textures import texture_library
@@ -60,16 +59,6 @@ def test_the_sky_of_yards_is_infinitely_far_and_does_not_count_as_a_surface(yard
         assert surfaces.min() > 0.3 / MARGIN and np.quantile(surfaces, 0.98) < 15.0 * MARGIN
     # The sky is in most of them, and fills the smaller part of each.
     assert np.mean(np.array(shares) > 0.02) > 0.6 and max(shares) < 0.6
-
-
-def test_bright_skies_are_white(yards):
-    """Some skies are overexposed, and some are not."""
-    white = [
-        (images[np.isinf(depths)].min(axis=-1) > 0.99).mean()
-        for images, depths, _, _ in yards
-        if np.isinf(depths).any()
-    ]
-    assert max(white) > 0.9 and min(white) < 0.1
 
 
 @pytest.mark.parametrize("kind", SCENE_KINDS)
@@ -147,11 +136,6 @@ def test_revisit_returns_to_places_that_it_saw_and_hardly_moves_there():
     assert depths.min() > 0.3
 
 
-def test_views_of_revisit_at_nearly_one_pose_differ_by_noise():
-    images = procedural_capture_arrays("revisit", 48, 24, 32)[0][30:32]
-    assert np.median(np.abs(images[1] - images[0])) > 0.005
-
-
 def test_fading_keeps_the_scene_or_takes_all_texture_away():
     scene = sample_scene(3, "room")
     np.testing.assert_array_equal(fade_scene(scene, 1.0).faces, scene.faces)
@@ -162,9 +146,16 @@ def test_fading_keeps_the_scene_or_takes_all_texture_away():
     np.testing.assert_allclose(flat[..., 12:15], at_middle, atol=1e-6)
 
 
-def test_every_ray_ends():
-    for seed, kind in enumerate(SCENE_KINDS):
-        scene = sample_scene(seed, kind)
-        poses, Ks = sample_path(seed, scene, "pan", 8, 24, 32)
-        depths = np.asarray(raycast_depths(scene, np.linalg.inv(poses), Ks, 24, 32))
-        assert np.isfinite(depths).all() and depths.max() < (620 if kind == "yard" else 100)
+def test_bright_skies_are_white(yards):
+    """Some skies are overexposed, and some are not."""
+    white = [
+        (images[np.isinf(depths)].min(axis=-1) > 0.99).mean()
+        for images, depths, _, _ in yards
+        if np.isinf(depths).any()
+    ]
+    assert max(white) > 0.9 and min(white) < 0.1
+
+
+def test_views_of_revisit_at_nearly_one_pose_differ_by_noise():
+    images = procedural_capture_arrays("revisit", 48, 24, 32)[0][30:32]
+    assert np.median(np.abs(images[1] - images[0])) > 0.005

@@ -97,15 +97,6 @@ def room_exit(origin, directions):
     return slab_depths(origin, directions, np.zeros(3), np.array([4.0, 3.0, 5.0]), np.eye(3))[1]
 
 
-def test_dome_closes_the_world():
-    b = empty_builder(half=(50.0, 50.0, 50.0))
-    b.dome(6.0, Finish((0,)))
-    origin, directions = pixel_rays(POSE, intrinsics()[0])
-    a, half_b = (directions**2).sum(-1), directions @ origin
-    wanted = (-half_b + np.sqrt(half_b**2 - a * (origin @ origin - 36.0))) / a
-    check_depths(built(b), wanted)
-
-
 @pytest.mark.parametrize("shape", ["box", "ball", "cylinder"])
 def test_solids_are_hit_at_their_analytic_depth(shape):
     b = empty_builder()

@@ -1,7 +1,6 @@
 """Readers: one capture is the same in every format."""
 
 import json
-import shutil
 
 import numpy as np
 import pytest
@@ -152,27 +151,6 @@ def test_tum_poses_are_interpolated_in_time(tmp_path):
     np.testing.assert_allclose(capture.camtoworlds, wanted, atol=1e-5)
 
 
-def test_tum_images_stream_in_order_of_time(tmp_path):
-    """In the natural order of names, 0.4 and 0.5 would come before 0.4333."""
-    write_tum(tmp_path)
-    names = [f"rgb/1305031102.{digits}.png" for digits in ("4", "4333", "4666", "5")]
-    lines = (tmp_path / "rgb.txt").read_text().splitlines()[1:]
-    for line, name in zip(lines, names, strict=True):
-        (tmp_path / line.split()[1]).rename(tmp_path / name)
-    renamed = [f"{line.split()[0]} {name}" for line, name in zip(lines, names, strict=True)]
-    (tmp_path / "rgb.txt").write_text("\n".join(reversed(renamed)))
-    assert [frame.name for frame in open_capture(tmp_path).frames] == names
-
-
-def test_colmap_names_may_include_the_image_folder(tmp_path, monkeypatch):
-    monkeypatch.setattr("tests.data.capture_writers.COLMAP_IMAGES", tuple(f"images/{name}" for name in COLMAP_IMAGES))
-    write_colmap_text(tmp_path)
-    for path in sorted((tmp_path / "images" / "images").iterdir()):
-        path.rename(tmp_path / "images" / path.name)
-    (tmp_path / "images" / "images").rmdir()
-    assert len(open_capture(tmp_path).frames) == NUM_FRAMES
-
-
 def test_tum_depth_maps_are_those_nearest_in_time(tmp_path):
     write_tum(tmp_path)
     lines = (tmp_path / "depth.txt").read_text().splitlines()
@@ -287,21 +265,6 @@ def test_shrunk_images_stand_in_for_missing_ones(kind, tmp_path):
     shrunk = open_capture(tmp_path)
     np.testing.assert_allclose(shrunk.K(0)[:2], whole[:2] / 2, rtol=1e-12)
     assert "0.5 times" in shrunk.notes[0]
-
-
-@pytest.mark.parametrize(
-    ("kind", "image", "other"),
-    [
-        ("ScanNet", "color/9.jpg", "color/9.png"),
-        ("Polycam", "keyframes/images/7000.jpg", "keyframes/images/7000.png"),
-        ("KITTI", "image_2/000001.png", "image_2/1.jpg"),
-    ],
-)
-def test_an_image_in_two_formats_is_no_second_view(kind, image, other, tmp_path):
-    WRITERS[kind](tmp_path)
-    shutil.copy(tmp_path / image, tmp_path / other)
-    with pytest.raises(InputError, match="wanted every image once"):
-        open_capture(tmp_path)
 
 
 # -- axes -------------------------------------------------------------------------------------------------------------

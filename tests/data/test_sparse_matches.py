@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ssplat_jax.data.sparse_matches import epipolar_distances, gray_image, match, motion_between, triangulate
+from ssplat_jax.data.sparse_matches import epipolar_distances, match, motion_between, triangulate
 
 
 def two_cameras(rng, num_points=50):
@@ -23,13 +23,6 @@ def test_motion_between_takes_points_from_one_camera_to_the_other():
     in_a, in_b = (np.linalg.solve(pose, np.c_[world, np.ones(20)].T).T[:, :3] for pose in poses)
     R, t = motion_between(*poses)
     np.testing.assert_allclose(in_a @ R.T + t, in_b, atol=1e-12)
-
-
-def test_gray_images_weigh_channels_as_rec_601():
-    colors = np.broadcast_to(np.float32([[[0.2, 0.6, 0.4]]]), (12, 16, 3))
-    small = gray_image(colors, (8, 6))
-    assert small.shape == (6, 8)
-    np.testing.assert_allclose(small, 0.299 * 0.2 + 0.587 * 0.6 + 0.114 * 0.4, rtol=1e-6)
 
 
 def test_triangulation_inverts_projection():

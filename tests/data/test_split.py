@@ -38,14 +38,6 @@ def test_paper_first_indices():
     assert split.context == (*range(1, 20), *range(21, 26))
 
 
-def test_paper_split_of_scannet():
-    split = paper_split(2000, context=24, targets=64, anchors=8, thin_to=1088)
-    assert len(split.targets) == 64 and split.targets[0] == 0 and split.targets[-1] == 1999
-    anchors, prefix = split.context[:8], split.context[8:]
-    assert anchors[-1] > 1990 and list(anchors) == sorted(anchors)
-    assert list(prefix) == sorted(prefix) and prefix[-1] < anchors[1]
-
-
 def test_more_context_extends_a_split():
     """Scores over the number of views compare prefixes of the same order on the same targets."""
     small, large = paper_split(400, context=24, anchors=8), paper_split(400, context=64, anchors=8)
@@ -139,17 +131,6 @@ def test_slow_video_is_interleaved_to_the_wanted_step():
     assert order[12:16] == [112, 115, 118, 121]
 
 
-@pytest.mark.parametrize("step", [0.0, 0.03, 0.035])
-def test_frames_that_step_far_enough_stay_in_order(step):
-    assert interleave(along_a_line([0.03] * 19), list(range(20)), 4, step) == list(range(20))
-
-
-def test_speed_is_measured_block_by_block():
-    """A slow part is interleaved, a fast part after it is not."""
-    order = interleave(along_a_line([0.01] * 36 + [0.05] * 35), list(range(72)), 4, 0.03)
-    assert order[:4] == [0, 3, 6, 9] and order[-16:] == list(range(56, 72))
-
-
 def test_a_capture_is_interleaved_unless_frames_are_given():
     capture = two_planes(16, 0.01)  # depths from 2 to 4
     frame = StreamFrame.at_camera(np.eye(4), scale=1.0, near=2.0, far=4.0)
@@ -172,21 +153,6 @@ def test_interleaving_is_a_permutation_within_blocks(steps, chunk_size, step):
     assert sorted(order) == list(range(n))
     # A frame moves by less than a block.
     assert max(abs(place - frame) for place, frame in enumerate(order)) < chunk_size * MAX_INTERLEAVED_CHUNKS
-
-
-@pytest.mark.parametrize("units", [2.0**-10, 2.0**10])
-def test_the_order_of_a_stream_does_not_change_with_the_units_of_the_capture(units):
-    capture, config = two_planes(48, 0.01), StreamConfig()
-    poses = [frame.camtoworld.copy() for frame in capture.frames]
-    for pose in poses:
-        pose[:3, 3] *= units
-    frames = tuple(dataclasses.replace(f, camtoworld=p) for f, p in zip(capture.frames, poses, strict=True))
-    scaled = dataclasses.replace(capture, frames=frames)
-    orders = [
-        c.stream_order(config, None, StreamFrame.at_camera(np.eye(4), scale=0.5 / u, near=1.0, far=2.0))
-        for c, u in ((capture, 1.0), (scaled, units))
-    ]
-    assert orders[0] == orders[1] != list(range(48))
 
 
 # -- index files ------------------------------------------------------------------------------------------------------
@@ -248,3 +214,18 @@ def test_a_scene_that_cannot_be_scored_is_refused(scene, num_frames, words, tmp_
     index, _ = read_index(written(tmp_path, PUBLISHED))
     with pytest.raises(InputError, match=words):
         split_of_scene(index, scene, num_frames)
+
+
+@pytest.mark.parametrize("units", [2.0**-10, 2.0**10])
+def test_the_order_of_a_stream_does_not_change_with_the_units_of_the_capture(units):
+    capture, config = two_planes(48, 0.01), StreamConfig()
+    poses = [frame.camtoworld.copy() for frame in capture.frames]
+    for pose in poses:
+        pose[:3, 3] *= units
+    frames = tuple(dataclasses.replace(f, camtoworld=p) for f, p in zip(capture.frames, poses, strict=True))
+    scaled = dataclasses.replace(capture, frames=frames)
+    orders = [
+        c.stream_order(config, None, StreamFrame.at_camera(np.eye(4), scale=0.5 / u, near=1.0, far=2.0))
+        for c, u in ((capture, 1.0), (scaled, units))
+    ]
+    assert orders[0] == orders[1] != list(range(48))

@@ -1,7 +1,6 @@
 """Tracks: keypoints that follow the image, pairs of cameras, and matches that are merged without contradictions."""
 
 import numpy as np
-import pytest
 from scipy.spatial.transform import Rotation
 
 from ssplat_jax.poses.tracks import Matches, alike_cameras, merged_tracks, sift_keypoints
@@ -15,19 +14,6 @@ def test_keypoints_follow_the_image():
     is_inside = ((first.pixels > 30) & (first.pixels < np.array([160, 120]) - 40)).all(axis=1)
     assert is_inside.sum() > 20
     assert np.mean(apart.min(axis=1)[is_inside] < 0.1) > 0.9
-
-
-def test_keypoints_of_a_large_image_are_in_its_own_pixels():
-    image = pictures(walk(1))[0].astype(np.float32) / 255
-    large = np.kron(image, np.ones((8, 8, 1), np.float32))  # 1280 wide: reduced to 640
-    small, found = sift_keypoints(image), sift_keypoints(large)
-    apart = np.linalg.norm(8 * small.pixels[:, None] - found.pixels[None], axis=-1).min(axis=1)
-    assert np.median(apart) < 8.0
-
-
-@pytest.mark.parametrize("image", [np.zeros((48, 64, 3)), np.zeros((12, 64, 3)), np.full((48, 64, 3), 0.5)])
-def test_images_without_structure_have_no_keypoints(image):
-    assert sift_keypoints(image.astype(np.float32)).pixels.shape == (0, 2)
 
 
 def test_pairs_are_the_nearest_cameras_that_look_the_same_way():
@@ -57,7 +43,3 @@ def test_a_match_that_would_show_a_camera_a_point_twice_is_left_out_the_less_sur
     chain = ((0, 1), [[0, 1]], [0.1]), ((1, 2), [[1, 2]], [0.2])
     assert merged(*chain, ((0, 2), [[1, 2]], [0.3])) == {frozenset({(0, 0), (1, 1), (2, 2)})}
     assert merged(*chain, ((0, 2), [[1, 2]], [0.15])) == {frozenset({(0, 0), (1, 1)}), frozenset({(0, 1), (2, 2)})}
-
-
-def test_no_matches_are_no_tracks():
-    assert merged() == set()
