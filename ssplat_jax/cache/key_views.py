@@ -18,9 +18,12 @@ replaced."""
 
 @pytree
 class KeyViews:
-    """`v` 8-bit images with their cameras, in the frame of the scene."""
+    """`v` 8-bit images with their cameras, in the frame of the scene.
 
-    images: UInt8[Array, "v h w 3"]
+    Images have a fourth channel where pixels may be masked out: 0 for those that nothing is learned from.
+    """
+
+    images: UInt8[Array, "v h w c"]
     viewmats: Float[Array, "v 4 4"]  # world -> camera
     Ks: Float[Array, "v 3 3"]  # pixels
     exposures: Float[Array, "v 3"]  # factors from the scene's colors to the view's
@@ -30,6 +33,16 @@ class KeyViews:
     def num_slots(self) -> int:
         """Views that there is space for, empty slots included."""
         return self.images.shape[0]
+
+    @property
+    def colors(self) -> Float[Array, "*v h w 3"]:
+        """The images in [0, 1]."""
+        return self.images[..., :3].astype(jnp.float32) / 255
+
+    @property
+    def seen(self) -> Bool[Array, "*v h w"] | None:
+        """The pixels that are not masked out; None if no image can have any."""
+        return self.images[..., 3] > 0 if self.images.shape[-1] > 3 else None
 
     def at(self, slot) -> "KeyViews":
         """The view in one slot, which may be traced, without a batch axis."""
@@ -45,10 +58,16 @@ class KeyViews:
         camera: Camera,
         images: Float[Array | np.ndarray, "v h w 3"] | UInt8[Array | np.ndarray, "v h w 3"],
         exposures: Float[Array | np.ndarray, "v 3"] | None = None,
+        seen: Bool[Array | np.ndarray, "v h w"] | None = None,
     ) -> "KeyViews":
-        """Key views from a batch of cameras and images, floats in [0, 1] or uint8; without `exposures` all are 1."""
+        """Key views from a batch of cameras and images, floats in [0, 1] or uint8; without `exposures` all are 1.
+
+        `seen` is False for pixels that are masked out.
+        """
         if images.dtype != jnp.uint8:
             images = jnp.round(jnp.clip(images, 0.0, 1.0) * 255).astype(jnp.uint8)
+        if seen is not None:
+            images = jnp.concatenate([images, seen[..., None].astype(jnp.uint8)], axis=-1)
         return KeyViews(
             images=jnp.asarray(images),
             viewmats=jnp.asarray(camera.viewmats, jnp.float32),
@@ -60,10 +79,10 @@ class KeyViews:
         )
 
 
-def empty_key_views(num_slots: int, height: int, width: int) -> KeyViews:
-    """`num_slots` empty slots for images of one size."""
+def empty_key_views(num_slots: int, height: int, width: int, channels: int = 3) -> KeyViews:
+    """`num_slots` empty slots for images of one size; four channels hold masks too."""
     return KeyViews(
-        images=jnp.zeros((num_slots, height, width, 3), jnp.uint8),
+        images=jnp.zeros((num_slots, height, width, channels), jnp.uint8),
         viewmats=jnp.zeros((num_slots, 4, 4)),
         Ks=jnp.zeros((num_slots, 3, 3)),
         exposures=jnp.zeros((num_slots, 3)),

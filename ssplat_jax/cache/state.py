@@ -185,18 +185,20 @@ def init_cache(config: StreamConfig, capacity: int | None = None) -> VoxelCache:
     )
 
 
-def with_refinement(cache: VoxelCache, config: StreamConfig, height: int, width: int) -> VoxelCache:
-    """`cache` with empty changes and key views for images of one size, where it has none yet.
+def with_refinement(
+    cache: VoxelCache, config: StreamConfig, height: int, width: int, *, is_masked: bool = False
+) -> VoxelCache:
+    """`cache` with empty changes and key views for images of one size, with masks or without, where it has none yet.
 
     Raises:
         InputError: it has key views of another size or number.
     """
-    slots = (NUM_KEY_VIEWS, height, width, 3)
+    slots = (NUM_KEY_VIEWS, height, width, 4 if is_masked else 3)
     changes, key_views = cache.changes, cache.key_views
     if changes is None:
         changes = empty_changes(cache.capacity, config)
     if key_views is None:
-        key_views = empty_key_views(*slots[:3])
+        key_views = empty_key_views(*slots)
     if key_views.images.shape != slots:
         wanted, got = "x".join(map(str, key_views.images.shape)), "x".join(map(str, slots))
         raise InputError(f"cache: wanted key views of {wanted} as before, got {got}; keep the size.")

@@ -6,6 +6,7 @@ A damaged image is found when it is decoded: the `InputError` comes from the ite
 """
 
 import dataclasses
+import functools
 import hashlib
 import math
 from collections.abc import Iterator, Sequence
@@ -15,14 +16,14 @@ from typing import Protocol, runtime_checkable
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Bool, Float32, Float64
 
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.chunk import Chunk
 from ssplat_jax.core.errors import echo, refusal
 from ssplat_jax.data.depth_range import estimate_depths, stream_scale
-from ssplat_jax.data.images import Crop, decode_depth, decode_image, undistort
+from ssplat_jax.data.images import Crop, decode_depth, decode_image, decode_mask, undistort
 from ssplat_jax.data.posed_image import USUAL, Convention, Frame
 from ssplat_jax.data.readers.frame_list import Listing
 from ssplat_jax.data.split import interleave
@@ -34,13 +35,15 @@ KEPT_BYTES = 256 << 20  # of decoded images that wait for their second use
 
 @runtime_checkable
 class Pixels(Protocol):
-    """Source of a capture's images and depth maps, by the index of the frame.
+    """Source of a capture's images, masks and depth maps, by the index of the frame.
 
-    `image` delivers RGB in [0, 1] at the size of `crop`; `depth` the stored map (camera z in capture units, 0 where
-    unknown), or None if there is none, which `has_depth` tells without decoding it.
+    `image` delivers RGB in [0, 1] at the size of `crop`; `seen` the pixels of it that are not masked out, or None if
+    all count; `depth` the stored map (camera z in capture units, 0 where unknown), or None if there is none, which
+    `has_depth` tells without decoding it.
     """
 
     def image(self, i: int, crop: Crop) -> Float32[np.ndarray, "h w 3"]: ...
+    def seen(self, i: int, crop: Crop) -> Bool[np.ndarray, "h w"] | None: ...
     def depth(self, i: int) -> Float32[np.ndarray, "h w"] | None: ...
     def has_depth(self, i: int) -> bool: ...
 
@@ -68,6 +71,14 @@ class FilePixels:
             self.kept[i, crop] = image
         return image
 
+    def seen(self, i: int, crop: Crop) -> Bool[np.ndarray, "h w"] | None:
+        frame = self.frames[i]
+        if not frame.is_masked:
+            return None
+        assert frame.path is not None
+        mask = decode_mask(frame.path, frame.mask_path, (frame.width, frame.height))
+        return crop.mask(mask if frame.lens is None else undistort(mask, frame.lens, frame.K, outside=0.0))
+
     def depth(self, i: int) -> Float32[np.ndarray, "h w"] | None:
         frame = self.frames[i]
         if frame.depth_path is None:
@@ -84,13 +95,17 @@ class FilePixels:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ArrayPixels:
-    """Images and depth maps held in memory."""
+    """Images, depth maps and masks held in memory."""
 
     images: Float32[np.ndarray, "v h w 3"]
     depths: Float32[np.ndarray, "v h w"]
+    masks: Bool[np.ndarray, "v h w"] | None = None  # False: pixels that do not count; their frames are `is_masked`
 
     def image(self, i: int, crop: Crop) -> Float32[np.ndarray, "h w 3"]:
         return crop.image(self.images[i])
+
+    def seen(self, i: int, crop: Crop) -> Bool[np.ndarray, "h w"] | None:
+        return None if self.masks is None else crop.mask(self.masks[i].astype(np.float32))
 
     def depth(self, i: int) -> Float32[np.ndarray, "h w"] | None:
         return self.depths[i]
@@ -129,8 +144,9 @@ class Capture:
         for frame in (self.frames[i] for i in indices):
             digest.update(f"{frame.name}\n".encode(errors="surrogateescape"))  # names are bytes on Linux
             digest.update(frame.camtoworld.tobytes() + frame.K.tobytes())
-            if frame.lens is not None:
-                digest.update(repr(frame.lens).encode())
+            for part in (frame.lens, frame.mask_path and frame.mask_path.name):
+                if part is not None:
+                    digest.update(repr(part).encode())
         return digest.hexdigest()[:12]
 
     def images_digest(self, indices: Sequence[int]) -> str:
@@ -159,6 +175,21 @@ class Capture:
     def image(self, i: int) -> Float32[np.ndarray, "h w 3"]:
         """Returns image `i` as RGB in [0, 1], at the size of the capture."""
         return self.pixels.image(i, self.crop(i))
+
+    @functools.cached_property
+    def is_masked(self) -> bool:
+        """Whether some frame has pixels that may not count."""
+        return any(frame.is_masked for frame in self.frames)
+
+    def seen(self, i: int) -> Bool[np.ndarray, "h w"] | None:
+        """Returns the pixels of image `i` that are neither masked out nor outside of what the camera saw.
+
+        None if no frame of the capture has others.
+        """
+        if not self.is_masked:
+            return None
+        seen = self.pixels.seen(i, self.crop(i))
+        return np.ones((self.height, self.width), bool) if seen is None else seen
 
     def depth(self, i: int) -> Float32[np.ndarray, "h w"] | None:
         """Returns depth map `i` (camera z in capture units, 0 where unknown), or None if the frame has none."""
@@ -257,8 +288,12 @@ class Capture:
         for row, i in enumerate(group):
             images[row], Ks[row] = self.image(i), self.K(i)
         viewmats[: len(group)] = frame.viewmats(np.stack([self.frames[i].camtoworld for i in group]))
-        valid = np.arange(chunk_size) < len(group)
-        return {"images": images, "viewmats": viewmats, "Ks": Ks, "valid": valid}
+        arrays = {"images": images, "viewmats": viewmats, "Ks": Ks, "valid": np.arange(chunk_size) < len(group)}
+        if self.is_masked:
+            arrays["seen"] = np.ones(images.shape[:3], bool)
+            for row, i in enumerate(group):
+                arrays["seen"][row] = self.seen(i)
+        return arrays
 
 
 def capture_of_listing(

@@ -9,7 +9,7 @@ import warnings
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Bool, Float32, Float64
 from PIL import Image
 from skimage.transform import warp
 
@@ -53,6 +53,40 @@ def decode_image(path: Path, size: tuple[int, int]) -> Float32[np.ndarray, "h w 
             rgba = np.asarray(image.convert("RGBA"), dtype=np.float32) / np.float32(255)
             return rgba[..., :3] * rgba[..., 3:]
         return np.asarray(image.convert("RGB"), dtype=np.float32) / np.float32(255)
+
+
+def has_alpha(path: Path) -> bool:
+    """True if an image file may have transparent pixels."""
+    with _open(path) as image:
+        return image.has_transparency_data
+
+
+def check_mask(path: Path, image: Path) -> None:
+    """Refuses a mask whose shape is not that of its image; it may be smaller or larger."""
+    (width, height), wanted = image_size(path), image_size(image)
+    if abs(width * wanted[1] - height * wanted[0]) > max(width + height, *wanted):
+        got, fix = f"{width}x{height}", "make the mask from this image"
+        raise refusal(str(path), wanted=f"the shape of {image.name}, {wanted[0]}x{wanted[1]}", got=got, fix=fix)
+
+
+def decode_mask(path: Path, mask_path: Path | None, size: tuple[int, int]) -> Float32[np.ndarray, "h w"]:
+    """Returns 1 for the pixels of an image of (width, height) `size` that count, and 0 for those that do not.
+
+    Pixels count that are more than half opaque in the image `path` and brighter than half the brightest of the mask
+    `mask_path`, which may have another size.
+    """
+    counts = np.ones(size[::-1], np.float32)
+    for source in (path, mask_path):
+        if source is None:
+            continue
+        with _open(source) as image:
+            if source is path and not image.has_transparency_data:
+                continue
+            with reading(source, REPLACE):
+                values = np.asarray(image.convert("RGBA").getchannel("A") if source is path else image.convert("F"))
+            shown = values > (127 if source is path else values.max() / 2)
+            counts *= np.asarray(Image.fromarray(shown.astype(np.uint8)).resize(size, Image.Resampling.NEAREST))
+    return counts
 
 
 def decode_depth(path: Path, unit: float) -> Float32[np.ndarray, "h w"]:
@@ -132,6 +166,12 @@ class Crop:
             return depth
         return self._resized(depth, stored, Image.Resampling.NEAREST)
 
+    def mask(self, counts: Float32[np.ndarray, "h w"]) -> Bool[np.ndarray, "hc wc"]:
+        """Crops and resizes a map of pixels that count (1); those count of which hardly any part does not."""
+        if not self.is_identity:
+            counts = self._resized(counts, counts.shape[::-1], Image.Resampling.BILINEAR)
+        return counts > 0.95 if not self.is_identity else counts > 0.5
+
     def _resized(self, channel: np.ndarray, stored: tuple[int, int], resample: Image.Resampling) -> np.ndarray:
         sx, sy = channel.shape[1] / stored[0], channel.shape[0] / stored[1]
         right, bottom = self.left + self.width / self.scale, self.top + self.height / self.scale
@@ -209,9 +249,7 @@ def check_lens(lens: Lens, K: Float64[np.ndarray, "3 3"], width: int, height: in
 
     Distortion that folds the image is refused: its coefficients probably belong to another model.
     """
-    t = np.linspace(0.0, 1.0, 9)
-    edge = np.concatenate([np.stack(np.broadcast_arrays(t, s), -1) for s in (0.0, 1.0)])
-    border = np.concatenate([edge, edge[:, ::-1]]) * (width, height)
+    border = _border(width, height)
     # Lines from the principal point to the border.
     spokes = K[:2, 2] + np.linspace(0.0, 1.0, 33)[:, None, None] * (border - K[:2, 2])
     moved = lens.pixels(K, spokes)
@@ -225,6 +263,19 @@ def check_lens(lens: Lens, K: Float64[np.ndarray, "3 3"], width: int, height: in
         fix = "check the coefficients, or undistort first (COLMAP: `colmap image_undistorter`) and set k1..p2 to 0"
         raise refusal(where, wanted="a lens that does not fold the image", got=shown, fix=fix)
     return shift
+
+
+def _border(width: int, height: int) -> Float64[np.ndarray, "36 2"]:
+    """Points on the border of an image, in pixels."""
+    t = np.linspace(0.0, 1.0, 9)
+    edge = np.concatenate([np.stack(np.broadcast_arrays(t, s), -1) for s in (0.0, 1.0)])
+    return np.concatenate([edge, edge[:, ::-1]]) * (width, height)
+
+
+def shows_too_little(lens: Lens, K: Float64[np.ndarray, "3 3"], width: int, height: int) -> bool:
+    """True if the undistorted image has pixels that the stored one does not show, by more than half a pixel."""
+    shown = lens.pixels(K, _border(width, height))
+    return bool(((shown < -0.5) | (shown > np.array([width, height]) + 0.5)).any())
 
 
 def undistort(

@@ -43,6 +43,8 @@ class Frame:
     shrink: float = 1.0  # size of the stored image over the size that the intrinsics were given for
     lens: Lens | None = None  # distortion of the stored image, removed when the image is delivered
     distortion_px: float = 0.0  # largest displacement by distortion, whether it is ignored or removed
+    mask_path: Path | None = None  # an image, dark where pixels are masked out
+    is_masked: bool = False  # whether pixels may be unseen: by a mask, transparent, or outside of a distorted image
 
     @property
     def center(self) -> Float64[np.ndarray, "3"]:

@@ -36,6 +36,7 @@ class PosedImages(Protocol):
     def frames(self) -> Sequence[Frame]: ...
     def K(self, i: int) -> Float64[np.ndarray, "3 3"]: ...
     def image(self, i: int) -> Float32[np.ndarray, "h w 3"]: ...
+    def seen(self, i: int) -> Bool[np.ndarray, "h w"] | None: ...
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -94,7 +95,16 @@ def gray_image(
 
 def keypoints_of(capture: PosedImages) -> KeypointsOf:
     """Returns a function that detects the keypoints of a frame of `capture` once and remembers them."""
-    return functools.cache(lambda i: detect_keypoints(capture.image(i)))
+    return functools.cache(lambda i: only_seen(detect_keypoints(capture.image(i)), capture.seen(i)))
+
+
+def only_seen(keypoints: Any, seen: Bool[np.ndarray, "h w"] | None) -> Any:
+    """Returns the keypoints (with `pixels` and `descriptors`) of an image that are not masked out."""
+    if seen is None:
+        return keypoints
+    columns, rows = keypoints.pixels.astype(int).T
+    kept = seen[rows.clip(0, seen.shape[0] - 1), columns.clip(0, seen.shape[1] - 1)]
+    return dataclasses.replace(keypoints, pixels=keypoints.pixels[kept], descriptors=keypoints.descriptors[kept])
 
 
 def triangulate_pair(capture: PosedImages, i: int, j: int, keypoints: KeypointsOf) -> CommonPoints | None:

@@ -4,10 +4,11 @@ Images are float RGB `[h w 3]`, clipped to [0, 1]. SSIM depends on its window an
 `SSIM_ARGUMENTS`.
 """
 
+import math
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from skimage.metrics import structural_similarity
 
 from ssplat_jax.core.errors import InputError
@@ -19,21 +20,31 @@ SSIM_ARGUMENTS: dict[str, Any] = {"win_size": 11, "gaussian_weights": True, "dat
 """Arguments of scikit-image's `structural_similarity`; its Gaussian has a standard deviation of 1.5 pixels."""
 
 
-def psnr(image: Float[np.ndarray, "_ _ 3"], target: Float[np.ndarray, "_ _ 3"]) -> float:
-    """Peak signal-to-noise ratio in dB, over all pixels and channels.
+def psnr(
+    image: Float[np.ndarray, "_ _ 3"], target: Float[np.ndarray, "_ _ 3"], seen: Bool[np.ndarray, "_ _"] | None = None
+) -> float:
+    """Peak signal-to-noise ratio in dB, over all channels of the pixels `seen`, by default of all pixels.
 
     Limits:
-        Equal images give 100 dB (`MIN_MSE`); NaN gives NaN.
+        Equal images give 100 dB (`MIN_MSE`); NaN gives NaN, and so does no pixel.
 
     Raises:
         InputError: the images differ in size or have no pixels.
     """
     image, target = _checked(image, target, 1)
+    if seen is not None:
+        image, target = image[seen], target[seen]
+        if not len(image):
+            return math.nan
     return float(-10 * np.log10(np.maximum(np.mean((image - target) ** 2), MIN_MSE)))
 
 
-def ssim(image: Float[np.ndarray, "_ _ 3"], target: Float[np.ndarray, "_ _ 3"]) -> float:
-    """Mean structural similarity over pixels and channels; 1 for equal images.
+def ssim(
+    image: Float[np.ndarray, "_ _ 3"], target: Float[np.ndarray, "_ _ 3"], seen: Bool[np.ndarray, "_ _"] | None = None
+) -> float:
+    """Mean structural similarity over channels and the pixels `seen`, by default all pixels; 1 for equal images.
+
+    Pixels that are not seen are equal in the windows of those that are.
 
     Limits:
         NaN gives NaN.
@@ -42,6 +53,10 @@ def ssim(image: Float[np.ndarray, "_ _ 3"], target: Float[np.ndarray, "_ _ 3"]) 
         InputError: the images differ in size, or have a side shorter than the window, 11 pixels.
     """
     image, target = _checked(image, target, SSIM_ARGUMENTS["win_size"])
+    if seen is not None:
+        image = np.where(seen[..., None], image, target)
+        similarities = structural_similarity(image, target, full=True, **SSIM_ARGUMENTS)[1]
+        return float(np.mean(similarities[seen])) if seen.any() else math.nan
     return float(structural_similarity(image, target, **SSIM_ARGUMENTS))  # pyright: ignore[reportArgumentType]
 
 

@@ -7,13 +7,14 @@ nothing but the rendered image, its alpha and the scene's mean color.
 """
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.core.gaussians import Gaussians, mean_color
@@ -149,13 +150,13 @@ def score_view(
     exposure = exposure_for(capture, i, exposures)
     filled = np.asarray(_jitted_fill_holes(out.color, out.alpha, mean_color(gaussians)))
     over_black = np.asarray(out.color)
-    color, target = _displayed(filled, exposure), capture.image(i)
+    color, target, seen = _displayed(filled, exposure), capture.image(i), capture.seen(i)
     score = ViewScore(
         frame=i,
-        literal=score_image(_displayed(over_black), target, lpips_weights),
-        shown=score_image(color, target, lpips_weights),
-        psnr_over_black=psnr(_displayed(over_black, exposure), target),
-        psnr_one_exposure=psnr(_displayed(filled), target),
+        literal=score_image(_displayed(over_black), target, lpips_weights, seen),
+        shown=score_image(color, target, lpips_weights, seen),
+        psnr_over_black=psnr(_displayed(over_black, exposure), target, seen),
+        psnr_one_exposure=psnr(_displayed(filled), target, seen),
         coverage=float(np.asarray(out.alpha).mean()),
     )
     display = display or Display()
@@ -169,13 +170,20 @@ def _displayed(image: Float[np.ndarray, "h w 3"], exposure: Float[np.ndarray, "3
 
 
 def score_image(
-    image: Float[np.ndarray, "h w 3"], target: Float[np.ndarray, "h w 3"], lpips_weights: LpipsWeights | None = None
+    image: Float[np.ndarray, "h w 3"],
+    target: Float[np.ndarray, "h w 3"],
+    lpips_weights: LpipsWeights | None = None,
+    seen: Bool[np.ndarray, "h w"] | None = None,
 ) -> ImageScore:
-    """Scores of an image in [0, 1] against its target."""
+    """Scores of an image in [0, 1] against its target; pixels that are not `seen` do not count.
+
+    For LPIPS, which has no pixels, these are equal in both images.
+    """
     distance = None
     if lpips_weights is not None:
+        image = image if seen is None else np.where(seen[..., None], image, target)
         distance = float(_jitted_lpips(lpips_weights, jnp.asarray(image), jnp.asarray(target)))
-    return ImageScore(psnr(image, target), ssim(image, target), distance)
+    return ImageScore(psnr(image, target, seen), ssim(image, target, seen), distance)
 
 
 def mean_scores(scores: Sequence[ViewScore]) -> dict[str, Any]:
@@ -187,13 +195,19 @@ def mean_scores(scores: Sequence[ViewScore]) -> dict[str, Any]:
     """
     blocks = {name: mean_images([getattr(s, name) for s in scores]) for name in ("literal", "shown")}
     others = ("psnr_over_black", "psnr_one_exposure")
-    return blocks | {name: round(float(np.mean([getattr(s, name) for s in scores])), 4) for name in others}
+    return blocks | {name: _mean([getattr(s, name) for s in scores]) for name in others}
 
 
 def mean_images(scores: Sequence[ImageScore]) -> dict[str, float | None]:
     """Means of `psnr`, `ssim` and `lpips`, the last None without weights."""
     columns = {name: [getattr(score, name) for score in scores] for name in ("psnr", "ssim", "lpips")}
-    return {name: None if not x or None in x else round(float(np.mean(x)), 4) for name, x in columns.items()}
+    return {name: _mean(values) for name, values in columns.items()}
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    """Mean of the numbers; NaN is the score of a view of which nothing is seen."""
+    found = [value for value in values if value is not None and not math.isnan(value)]
+    return round(float(np.mean(found)), 4) if found else None
 
 
 def score_targets(
@@ -213,7 +227,7 @@ def baselines(capture: Capture, split: Split) -> dict[str, float]:
     mean_rgb = np.mean([capture.image(i).mean(axis=(0, 1)) for i in split.context], axis=0)
     copies, flats = [], []
     for i in split.targets:
-        target = capture.image(i)
-        copies.append(psnr(capture.image(nearest_views(capture, i, split.context)[0]), target))
-        flats.append(psnr(np.broadcast_to(mean_rgb, target.shape).astype(np.float32), target))
+        target, seen = capture.image(i), capture.seen(i)
+        copies.append(psnr(capture.image(nearest_views(capture, i, split.context)[0]), target, seen))
+        flats.append(psnr(np.broadcast_to(mean_rgb, target.shape).astype(np.float32), target, seen))
     return {"nearest_view_psnr": round(float(np.mean(copies)), 4), "mean_color_psnr": round(float(np.mean(flats)), 4)}

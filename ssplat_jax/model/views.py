@@ -27,7 +27,7 @@ class Views:
     viewmats: Float[Array, "v 4 4"]
     Ks: Float[Array, "v 3 3"]
     valid: Bool[Array, " v"]
-    inside: Bool[Array, "v hf wf"]  # cells of valid views whose center lies in the unpadded image
+    inside: Bool[Array, "v hf wf"]  # cells of valid views whose center lies in the unpadded image, no pixel masked out
     log_candidates: Float[Array, " d"]  # ln of the candidates, near to far; far to near if `inverse`
     height: int = static()  # of the unpadded image
     width: int = static()
@@ -93,6 +93,11 @@ def prepare_views(chunk: Chunk, config: StreamConfig) -> Views:
     images = jnp.pad(images, ((0, 0), (0, pad_h), (0, pad_w), (0, 0)), mode="edge")
     centers = pixel_grid(height + pad_h, width + pad_w, GRID_STRIDE)
     in_image = (centers[..., 0] < width) & (centers[..., 1] < height)
+    inside = in_image[None] & chunk.valid[:, None, None]
+    if chunk.seen is not None:
+        seen = jnp.pad(chunk.seen, ((0, 0), (0, pad_h), (0, pad_w)), constant_values=True)
+        v, hf, wf = inside.shape
+        inside &= seen.reshape(v, hf, GRID_STRIDE, wf, GRID_STRIDE).all(axis=(2, 4))
     near, far = (
         (chunk.near, chunk.far) if config.network.depth_range is None else map(jnp.float32, config.network.depth_range)
     )
@@ -101,7 +106,7 @@ def prepare_views(chunk: Chunk, config: StreamConfig) -> Views:
         viewmats=viewmats,
         Ks=Ks,
         valid=chunk.valid,
-        inside=in_image[None] & chunk.valid[:, None, None],
+        inside=inside,
         log_candidates=_log_candidates(near, far, config),
         height=height,
         width=width,

@@ -20,6 +20,7 @@ from ssplat_jax.data.sparse_matches import (
     gray_image,
     motion_between,
     mutual_nearest,
+    only_seen,
     pixel_rays,
 )
 from ssplat_jax.poses.bundle_adjustment import Observations
@@ -69,7 +70,7 @@ def find_tracks(
     """
     found = []
     for done, i in enumerate(indices):
-        found.append(sift_keypoints(capture.image(i)))
+        found.append(only_seen(sift_keypoints(capture.image(i)), capture.seen(i)))
         advance(done + 1)
     poses = np.stack([capture.frames[i].camtoworld for i in indices])
     matches = [_match(capture, indices, pair, found) for pair in alike_cameras(poses, depth)]

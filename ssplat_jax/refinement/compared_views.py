@@ -73,7 +73,7 @@ def errors_of_view(
         The difference with holes filled, the difference over black, and the render.
     """
     out = render(gaussians, view.camera(), effects=EFFECTS, features=probe, max_pairs=max_pairs)
-    target = view.images.astype(jnp.float32) / 255
+    target = view.colors
     filled = fill_holes(out.color, out.alpha, background)
     return filled * view.exposures - target, out.color * view.exposures - target, out
 
@@ -94,7 +94,10 @@ def view_loss(
     filled, black, out = errors_of_view(gaussians, background, view, max_pairs=max_pairs)
     errors = jnp.mean(config.shown_weight * jnp.abs(filled) + (1 - config.shown_weight) * jnp.abs(black), axis=-1)
     held_back = held_back_pixels(errors.shape, slot, config)
-    loss = mean_over(errors, ~held_back)
+    learned, held_back = (
+        (~held_back, held_back) if view.seen is None else (view.seen & ~held_back, view.seen & held_back)
+    )
+    loss = mean_over(errors, learned)
     return loss, (loss, mean_over(errors, held_back), out.num_overflow)
 
 
@@ -172,8 +175,9 @@ def contradicting(errors: Float[np.ndarray, " v"]) -> Int[np.ndarray, " b"]:
 def _covered_error(gaussians: Gaussians, view: KeyViews, max_pairs: int) -> Float[Array, ""]:
     """Mean absolute error of a view over what the scene covers of it; NaN if it covers next to nothing."""
     out = render(gaussians, view.camera(), effects=EFFECTS, max_pairs=max_pairs)
-    target = view.images.astype(jnp.float32) / 255
+    alpha = out.alpha if view.seen is None else jnp.where(view.seen, out.alpha, 0.0)
     # The uncovered share of a pixel is compared with nothing.
-    errors = jnp.mean(jnp.abs(out.color * view.exposures - out.alpha[..., None] * target), axis=-1)
-    cover = jnp.sum(out.alpha)
-    return jnp.where(cover > 0.01 * out.alpha.size, jnp.sum(errors) / jnp.maximum(cover, 1.0), jnp.nan)
+    errors = jnp.mean(jnp.abs(out.color * view.exposures - out.alpha[..., None] * view.colors), axis=-1)
+    errors = errors if view.seen is None else jnp.where(view.seen, errors, 0.0)
+    cover = jnp.sum(alpha)
+    return jnp.where(cover > 0.01 * alpha.size, jnp.sum(errors) / jnp.maximum(cover, 1.0), jnp.nan)

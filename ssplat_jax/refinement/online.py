@@ -58,7 +58,8 @@ def refine_scene(model: StreamSplat, params: dict, cache: VoxelCache, chunk: Chu
     """
     config = model.config
     assert cache.key_views is not None  # a `Session` has added them before the step
-    arrivals = replace(KeyViews.of(chunk.camera, chunk.images, output.exposures), valid=chunk.valid)
+    arrivals = KeyViews.of(chunk.camera, chunk.images, output.exposures, chunk.seen)
+    arrivals = replace(arrivals, valid=chunk.valid)
     kept = keep_views(cache.key_views, arrivals, depth=MEDIAN_DEPTH)
     views = views_of_round(cache.key_views, arrivals, cache.stats.num_chunks, config.stream.steps_per_chunk)
     views = replace(views, valid=views.valid & jnp.any(chunk.valid))  # a chunk of padding changes nothing
@@ -139,6 +140,8 @@ def online_step(base: Gaussians, change: Change, view: KeyViews, *, max_pairs: i
         background = jax.lax.stop_gradient(mean_color(gaussians))
         filled, black, out = errors_of_view(gaussians, background, view, max_pairs=max_pairs, probe=probe)
         error = (SHOWN_WEIGHT * filled**2 + (1 - SHOWN_WEIGHT) * black**2) / view.exposures**2
+        if view.seen is not None:
+            error = jnp.where(view.seen[..., None], error, 0.0)
         return 0.5 * jnp.sum(error) + jnp.sum(out.features)
 
     probe = jnp.zeros((base.num_gaussians, 1), base.means.dtype)

@@ -272,7 +272,8 @@ def key_views_of(capture: Capture, indices: Sequence[int], frame: StreamFrame, e
     # Frame by frame: as floats, all images would take four times the memory of the key views.
     images = [np.round(np.clip(capture.image(i), 0, 1) * np.float32(255)).astype(np.uint8) for i in used]
     factors = jnp.asarray(np.stack([exposures[i] for i in used]), jnp.float32)
-    return KeyViews.of(cameras, np.stack(images), factors)
+    seen = [mask for i in used if (mask := capture.seen(i)) is not None]
+    return KeyViews.of(cameras, np.stack(images), factors, np.stack(seen) if seen else None)
 
 
 def _check(cameras: Camera, images, exposures) -> None:

@@ -120,7 +120,8 @@ class Session:
             got = f"steps_per_chunk={config.stream.steps_per_chunk} and revise={self._revise}"
             raise refusal("Session", wanted=wanted, got=got, fix="call online_refinement with the session's model")
         if self._revise is not None:  # adds the key-view buffers if the cache lacks them
-            cache = with_refinement(cache, config, *chunk.images.shape[1:3])
+            is_masked = chunk.seen is not None
+            cache = with_refinement(cache, config, *chunk.images.shape[1:3], is_masked=is_masked)
         self.cache = cache
         step, refine = self._program("step", self.model.step, cache, chunk), None
         if self._revise is not None:

@@ -108,7 +108,7 @@ class Crops:
         def crop(number: int) -> Crop:
             (cache, views, *_), (view, row, column) = scenes[number % len(scenes)], places[number]
             camera = crop_camera(views.camera(view), row, column, *self.size)
-            image = np.asarray(views.images[view])[row : row + self.size[0], column : column + self.size[1]]
+            image = np.asarray(views.images[view, ..., :3])[row : row + self.size[0], column : column + self.size[1]]
             return Crop(cache, camera, jnp.asarray(image), views.exposures[view], **capacities)
 
         return lambda step, place: tuple(crop(self.batch * step + i) for i in range(self.batch))

@@ -12,12 +12,23 @@ import numpy as np
 from jaxtyping import Float64
 
 from ssplat_jax.core.errors import echo, refusal
-from ssplat_jax.data.images import IGNORED_PX, PINHOLE, Lens, check_depth_header, check_lens, image_size
+from ssplat_jax.data.images import (
+    IGNORED_PX,
+    PINHOLE,
+    Lens,
+    check_depth_header,
+    check_lens,
+    check_mask,
+    has_alpha,
+    image_size,
+    shows_too_little,
+)
 from ssplat_jax.data.posed_image import MILLIMETER, ROTATION_ROUNDING, USUAL, Convention, Frame, check_intrinsics
 
 SHORTER_PATH_RATIO = 0.5  # camera path in the file's order over that by name, below which the file's order is used
 MAX_CENTER_OFFSET = 0.2  # of a side; a principal point farther from the center is reported
 SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG", ".webp")
+OPAQUE_SUFFIXES = (".jpg", ".jpeg")  # of files without an alpha channel
 SHRUNK_FOLDERS = ("images_2", "images_4", "images_8")  # downscaled copies of images/, which may be missing
 
 
@@ -62,6 +73,7 @@ class FrameList:
         key: object = None,
         depth: Path | None = None,
         depth_unit: float = MILLIMETER,
+        mask: Path | None = None,
     ) -> None:
         """Adds a frame.
 
@@ -75,6 +87,7 @@ class FrameList:
             key: what only one frame may have; by default the image.
             depth: 16-bit depth image.
             depth_unit: capture units per step of the depth image.
+            mask: image that is dark where pixels are masked out; by default one in the folder `masks` of the capture.
         """
         key = image if key is None else key
         if key in self._seen:
@@ -87,10 +100,37 @@ class FrameList:
         K = check_intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height, where=where)
         distortion_px = check_lens(intrinsics.lens, K, width, height, where)
         camtoworld, lens = self.convention.to_opencv(pose[0]), intrinsics.lens if distortion_px > IGNORED_PX else None
+        mask = mask or self._mask_of(name, image, where)
+        is_masked = mask is not None or (image.suffix.lower() not in OPAQUE_SUFFIXES and has_alpha(image))
         frame = Frame(
-            name, camtoworld, K, width, height, image, depth, depth_unit, pose[1], shrink, lens, distortion_px
+            name,
+            camtoworld,
+            K,
+            width,
+            height,
+            path=image,
+            depth_path=depth,
+            depth_unit=depth_unit,
+            pose_deviation=pose[1],
+            shrink=shrink,
+            lens=lens,
+            distortion_px=distortion_px,
+            mask_path=mask,
+            is_masked=is_masked or (lens is not None and shows_too_little(lens, K, width, height)),
         )
         self.frames.append(frame)
+
+    def _mask_of(self, name: str, image: Path, where: str) -> Path | None:
+        """The mask of an image in the folder `masks`: its path there, with `.png` behind its suffix or in its place."""
+        if not (self.root / "masks").is_dir():
+            return None
+        places = {name, in_images(name) or name, name.partition("/")[2] or name, image.name}
+        names = [f"masks/{place}{suffix}" for place in sorted(places) for suffix in (".png", "")]
+        names += [f"masks/{posixpath.splitext(place)[0]}{suffix}" for place in sorted(places) for suffix in SUFFIXES]
+        mask = find_file(self.root, names, where)
+        if mask is not None:
+            check_mask(mask, image)
+        return mask
 
     def listing(
         self, num_listed: int, missing: str, notes: Sequence[str] = (), *, name: str = "", is_in_time: bool = False
@@ -154,6 +194,10 @@ def _notes(frames: list[Frame]) -> list[str]:
     if offset > MAX_CENTER_OFFSET:
         where = f"{offset:.0%} of a side off the image's center"
         notes.append(f"The principal point lies {where}; check that the intrinsics belong to images of this size.")
+    if masked := sum(frame.mask_path is not None for frame in frames):
+        notes.append(f"{masked} of {len(frames)} frames have masks: what they hide is neither streamed nor scored.")
+    if sum(frame.is_masked for frame in frames) > masked:
+        notes.append("Transparent pixels, and those beyond the border of distorted images, do not count.")
     for what, pixels in (
         ("undone", [f.distortion_px for f in frames if f.lens]),
         ("ignored", [f.distortion_px for f in frames if not f.lens]),

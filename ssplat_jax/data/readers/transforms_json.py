@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from ssplat_jax.core.errors import InputError, echo, refusal
-from ssplat_jax.data.images import FisheyeLens, Lens, image_size
+from ssplat_jax.data.images import FisheyeLens, Lens, check_mask, image_size
 from ssplat_jax.data.parsing import Fields, load_json
 from ssplat_jax.data.posed_image import Convention, check_camtoworld
 from ssplat_jax.data.readers import splat_cameras
@@ -94,9 +94,7 @@ def _read(path: Path, problems: list[str] | None) -> Listing:
                 raise
             problems.append(str(error))
             break
-    masked = sum(isinstance(entry, dict) and entry.get("mask_path") is not None for entry in entries)
-    notes = [f"{masked} frames have masks (mask_path), which are not used: all pixels count."] if masked else []
-    return frames.listing(len(frames.frames), "image", notes)
+    return frames.listing(len(frames.frames), "image")
 
 
 def _add_frame(frames: FrameList, meta: dict[str, Any], entry: Any, where: str) -> None:
@@ -105,9 +103,12 @@ def _add_frame(frames: FrameList, meta: dict[str, Any], entry: Any, where: str) 
     fields = Fields(meta | entry, where)
     name = own.get("file_path")
     image = file_named(frames.root, name, f"{where}.file_path", ("", *SUFFIXES))
-    depth = None
-    if own.get("depth_file_path") is not None:
-        depth = file_named(frames.root, own.get("depth_file_path"), f"{where}.depth_file_path")
+    depth, mask = (
+        None if own.get(kind) is None else file_named(frames.root, own.get(kind), f"{where}.{kind}")
+        for kind in ("depth_file_path", "mask_path")
+    )
+    if mask is not None:
+        check_mask(mask, image)
     pose = check_camtoworld(own.get("transform_matrix"), f"{where}.transform_matrix")
     is_shrunk = image.relative_to(frames.root).parts[0] in SHRUNK_FOLDERS and in_images(str(name)) is not None
     has_size = fields.get("w") is not None and fields.get("h") is not None
@@ -121,7 +122,7 @@ def _add_frame(frames: FrameList, meta: dict[str, Any], entry: Any, where: str) 
     fx, fy = _focal(fields, own, width / shrink, height / shrink)
     cx, cy = (fields.number(field, side / shrink / 2) for field, side in (("cx", width), ("cy", height)))
     frames.add(str(name), image, pose, Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, lens=_lens(fields)), sized, where,
-               depth=depth)  # fmt: skip
+               depth=depth, mask=mask)  # fmt: skip
 
 
 def _lens(fields: Fields) -> Lens:

@@ -1,0 +1,199 @@
+"""Masks: where they come from, and that what they hide gives no tokens, no exposure, no score and nothing to learn."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+from PIL import Image
+
+import ssplat_jax as ss
+from ssplat_jax.cache.key_views import KeyViews
+from ssplat_jax.config import StreamConfig
+from ssplat_jax.core.errors import InputError
+from ssplat_jax.data.capture import ArrayPixels
+from ssplat_jax.data.images import Lens, undistort
+from ssplat_jax.data.open_capture import open_capture
+from ssplat_jax.evaluation.psnr_ssim import psnr, ssim
+from ssplat_jax.evaluation.scoring import score_view
+from ssplat_jax.refinement.compared_views import RefineConfig, view_loss
+from ssplat_jax.refinement.refine import refine_on_capture
+from ssplat_jax.streaming.feed import feed_capture
+from ssplat_jax.streaming.session import Session
+from tests.badinputs.cases import HEIGHT, WIDTH, make_capture
+from tests.data.capture_fixture import smooth_capture
+from tests.scene_files.scene_fixture import scene
+
+HIDDEN = np.zeros((HEIGHT, WIDTH), bool)
+HIDDEN[10:20, 5:30] = True
+
+
+def write_mask(path, white=255, size=(WIDTH, HEIGHT)):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    mask = Image.fromarray(np.where(HIDDEN, 0, white).astype(np.uint8))
+    mask.resize(size, Image.Resampling.NEAREST).save(path)
+
+
+def in_folder(name, **options):
+    return lambda root, meta: write_mask(root / "masks" / name, **options)
+
+
+def by_path(root, meta):
+    write_mask(root / "hidden" / "a.png")
+    meta["frames"][2]["mask_path"] = "hidden/a.png"
+
+
+def by_alpha(root, meta):
+    pixels = np.full((HEIGHT, WIDTH, 4), 200, np.uint8)
+    pixels[HIDDEN, 3] = 0
+    Image.fromarray(pixels).save(root / "images" / "2.png")
+    meta["frames"][2]["file_path"] = "images/2.png"
+
+
+@pytest.mark.parametrize(
+    "mask",
+    [
+        by_path,
+        by_alpha,
+        in_folder("2.png"),
+        in_folder("2.jpg.png"),
+        in_folder("images/2.jpg.png", white=1),
+        in_folder("2.png", size=(2 * WIDTH, 2 * HEIGHT)),
+    ],
+)
+def test_masks_hide_pixels_of_some_images(mask, tmp_path):
+    capture = open_capture(make_capture(tmp_path / "c", mask))
+    np.testing.assert_array_equal(capture.seen(2), ~HIDDEN)
+    assert capture.seen(1).all() and len(capture.notes) == 1
+    chunk = next(capture.chunks(StreamConfig(), range(4), frame=capture.stream_frame(StreamConfig())))
+    np.testing.assert_array_equal(chunk.seen[2], ~HIDDEN)
+    assert chunk.seen[:2].all()
+    small = dataclasses.replace(capture, width=WIDTH // 2, height=HEIGHT // 2).seen(2)
+    assert not small[5:10, 3:15].any() and small[:4].all() and small[12:].all()
+
+
+def test_captures_without_masks_have_none(tmp_path):
+    capture = open_capture(make_capture(tmp_path / "c"))
+    assert not capture.is_masked and capture.seen(0) is None
+    assert next(capture.chunks(StreamConfig(), frame=capture.stream_frame(StreamConfig()))).seen is None
+
+
+def test_a_mask_of_another_shape_is_refused(tmp_path):
+    with pytest.raises(InputError, match=r"2\.png: wanted the shape of 2\.jpg, 64x48, got 48x48"):
+        open_capture(make_capture(tmp_path / "c", in_folder("2.png", size=(HEIGHT, HEIGHT))))
+
+
+def test_pixels_beyond_the_border_of_a_distorted_image_are_not_seen(tmp_path):
+    """A pincushion lens: the undistorted image asks for places that the stored one does not have."""
+    capture = open_capture(make_capture(tmp_path / "c", lambda root, meta: meta.update(k1=0.3)))
+    frame = capture.frames[0]
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    places = Lens(k1=0.3).pixels(frame.K, np.stack([columns, rows], axis=-1))
+    inside = ((places >= 0) & (places <= (WIDTH, HEIGHT))).all(axis=-1)
+    assert 0.02 < np.mean(~inside) < 0.5
+    assert np.mean(capture.seen(0) != inside) < 0.01
+    assert any("beyond the border" in note for note in capture.notes)
+    barrel = open_capture(make_capture(tmp_path / "b", lambda root, meta: meta.update(k1=-0.1)))
+    assert not barrel.is_masked and barrel.frames[0].lens is not None
+    assert undistort(barrel.image(0), Lens(k1=-0.1), barrel.frames[0].K, outside=0.0).any(axis=-1).all()
+
+
+def test_scores_are_those_of_the_pixels_that_are_seen():
+    rng = np.random.default_rng(0)
+    target = rng.uniform(size=(40, 50, 3)).astype(np.float32)
+    image = np.clip(target + rng.normal(0, 0.1, target.shape), 0, 1).astype(np.float32)
+    seen = np.zeros((40, 50), bool)
+    seen[:, :25] = True
+    spoiled = np.where(seen[..., None], image, 1 - target)
+    assert psnr(spoiled, target, seen) == pytest.approx(psnr(image[:, :25], target[:, :25]), rel=1e-12)
+    assert ssim(spoiled, target, seen) == ssim(np.where(seen[..., None], image, target), target, seen)
+    assert np.isnan(psnr(image, target, ~seen & seen))
+    everywhere = np.ones_like(seen)
+    assert psnr(image, target, everywhere) == psnr(image, target)
+
+
+# -- a room in which a sphere moves -----------------------------------------------------------------------------------
+
+MAGENTA = np.array([1.0, 0.0, 1.0], np.float32)
+NUM, WITH_SPHERE = 24, range(7, 17)
+
+
+def with_sphere(capture):
+    """The capture in which a magenta sphere moves through ten frames, and where it covers them."""
+    images, covered = capture.pixels.images.copy(), np.zeros((NUM, capture.height, capture.width), bool)
+    rows, columns = np.mgrid[: capture.height, : capture.width] + 0.5
+    for i in WITH_SPHERE:
+        K = capture.K(i)
+        rays = np.stack([(columns - K[0, 2]) / K[0, 0], (rows - K[1, 2]) / K[1, 1], np.ones_like(rows)], axis=-1)
+        center = np.array([0.06 * (i - 12), 0.05, 0.9])
+        along = rays @ center / np.linalg.norm(rays, axis=-1)
+        covered[i] = center @ center - along**2 < 0.25**2
+        images[i][covered[i]] = MAGENTA
+    return images, covered
+
+
+def scene_of(capture, model, params):
+    frame = capture.stream_frame(model.config)
+    session = Session(model, params)
+    exposures, _ = feed_capture(session, capture, range(NUM), frame)
+    gaussians = session.gaussians()
+    refined, _ = refine_on_capture(gaussians, capture, range(NUM), frame, exposures, steps=4)
+    return gaussians, refined, frame, exposures
+
+
+def magenta_share(gaussians, capture, frame):
+    """Share of the pixels of all frames that are drawn magenta."""
+    shares = []
+    for i in range(0, NUM, 3):
+        color = np.asarray(ss.render(gaussians, capture.camera(i, frame)).color)
+        shares.append(np.mean((color[..., 1] < 0.25) & (color[..., [0, 2]].min(axis=-1) > 0.5)))
+    return float(np.mean(shares))
+
+
+@pytest.fixture(scope="module")
+def scenes():
+    room = open_capture(f"procedural:room?frames={NUM}&size=96x64")
+    images, covered = with_sphere(room)
+    frames = tuple(dataclasses.replace(f, is_masked=i in WITH_SPHERE) for i, f in enumerate(room.frames))
+    spoiled = dataclasses.replace(room, pixels=ArrayPixels(images, room.pixels.depths))
+    masked = dataclasses.replace(room, frames=frames, pixels=ArrayPixels(images, room.pixels.depths, ~covered))
+    model, params = ss.StreamSplat(ss.preset("tiny")), ss.load_params("tiny")
+    return {
+        name: (capture, *scene_of(capture, model, params))
+        for name, capture in (("empty", room), ("spoiled", spoiled), ("masked", masked))
+    }
+
+
+def test_a_masked_sphere_does_not_appear(scenes):
+    share = {
+        name: [magenta_share(g, c, f) for g in (first, refined)] for name, (c, first, refined, f, _) in scenes.items()
+    }
+    assert min(share["spoiled"]) > 0.005
+    assert max(share["masked"]) <= max(share["empty"]) + 1e-4, share
+
+
+def test_the_rest_of_a_masked_room_is_as_good_as_an_empty_one(scenes):
+    """Scored on the empty room's images; the spoiled room is clearly worse."""
+    capture = scenes["empty"][0]
+    scores = {
+        name: np.mean([score_view(refined, capture, i, f, e).score.shown.psnr for i in range(0, NUM, 3)])
+        for name, (_, _, refined, f, e) in scenes.items()
+    }
+    assert scores["masked"] > scores["empty"] - 0.8  # ten frames show less of it
+    assert scores["spoiled"] < scores["masked"] - 0.5
+
+
+def test_refinement_learns_nothing_from_masked_pixels():
+    """Whatever the masked pixels hold, the errors that the scene follows are the same."""
+    capture = smooth_capture(1, 32, 32)
+    camera = jax.tree.map(lambda x: x[None], capture.camera(0))
+    seen = np.ones((1, 32, 32), bool)
+    seen[0, :, :16] = False
+    losses = []
+    for hidden in (0.0, 1.0):
+        images = np.where(seen[..., None], capture.image(0)[None], np.float32(hidden))
+        view = KeyViews.of(camera, images, None, seen).at(0)
+        losses.append(
+            view_loss(scene(0, n=30), jax.numpy.zeros(3), view, jax.numpy.int32(0), RefineConfig(), 1 << 12)[0]
+        )
+    assert losses[0] == losses[1] > 0
