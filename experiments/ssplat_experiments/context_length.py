@@ -18,7 +18,7 @@ from pathlib import Path
 from ssplat_experiments.baselines import JointNetwork, baseline_scores, joint_config, one_chunk
 from ssplat_experiments.cases import PICTURE, Case, Row
 from ssplat_experiments.streams import START_CAPACITY, new_session
-from ssplat_experiments.study import Study, at_scale, run_study
+from ssplat_experiments.study import OOM, Study, at_scale, run_study
 from ssplat_jax.config import StreamConfig, preset
 from ssplat_jax.core.console import Reporter
 from ssplat_jax.core.gaussians import Gaussians
@@ -97,16 +97,15 @@ def suite_cases(captures: Path | None, sizes: Sizes) -> list[Case]:
         for path in paths
         for method, config in methods.items()
     ]
+    counts = [count for count in sizes.counts if count <= sizes.joint]
     joint = [
         Case(
-            name=f"{_suite(path)}{sizes.label}, {JOINT}, {count} views",
-            config=joint_config(config, count),
-            asked={"suite": _suite(path), **asked},
-            measure=functools.partial(measured_joint, path, count, config, sizes),
+            name=f"{_suite(path)}{sizes.label}, {JOINT}",
+            config=joint_config(config, counts[-1]),
+            asked={"suite": _suite(path), **asked, "counts": counts},
+            measure=functools.partial(measured_joint, path, counts, config, sizes),
         )
-        for count in sizes.counts  # outermost: suites share their programs
-        if count <= sizes.joint
-        for path in paths
+        for path in (paths if counts else ())
     ]
     return streams + joint
 
@@ -147,8 +146,21 @@ def measured(path: str, method: str, config: StreamConfig, sizes: Sizes) -> list
     return rows
 
 
-def measured_joint(path: str, count: int, config: StreamConfig, sizes: Sizes) -> list[Row]:
-    """The row of the joint network over the first views, whose chunk is compared with that of the stream `config`."""
+def measured_joint(path: str, counts: Sequence[int], config: StreamConfig, sizes: Sizes) -> list[Row]:
+    """Rows of the joint network; the first number of views that does not fit is `OOM`, and nothing larger is tried."""
+    place, rows = {"suite": _short(path) + sizes.label, "method": JOINT}, []
+    for count in counts:
+        try:
+            rows.append(place | {"views": count} | joint_row(path, count, config, sizes))
+        except RuntimeError as error:
+            if "RESOURCE_EXHAUSTED" not in str(error):
+                raise
+            return [*rows, place | {"views": count, "peak_memory_bytes": OOM}]
+    return rows
+
+
+def joint_row(path: str, count: int, config: StreamConfig, sizes: Sizes) -> Row:
+    """Scores and memory of the joint network over the first views, the chunk of the stream `config`."""
     capture, split, frame = _opened(path, config, sizes)
     chunk = one_chunk(list(capture.chunks(config, split.context[:count], frame=frame)))
     network = JointNetwork(config, load_params("tiny"), chunk)
@@ -156,7 +168,7 @@ def measured_joint(path: str, count: int, config: StreamConfig, sizes: Sizes) ->
     scored = _scores(gaussians, capture, split.targets, frame, {}, ())["scene"]
     middle = capture.camera(split.targets[len(split.targets) // 2], frame)
     cost = {"gaussians": int((gaussians.opacities > 0).sum()), **network.peak_memory(middle).to_row()}
-    return [{"suite": _short(path) + sizes.label, "views": count, "method": JOINT, **scored, **cost}]
+    return {**scored, **cost}
 
 
 def _opened(path: str, config: StreamConfig, sizes: Sizes) -> tuple[Capture, Split, StreamFrame]:

@@ -5,20 +5,23 @@
 The folder of renders holds `split.json`, as `ssplat eval` writes it, and one image for each target, named by its frame:
 `00004.png`. All images have one size, at which the capture is read. Scores are literal: the pixels as they are, no
 holes filled and no exposure changed. The nearest context view and the mean color stand beside them. The row shows the
-`peak_memory_bytes` of `metrics.json`, as `ssplat eval` writes it, where the folder holds one.
+`peak_memory_bytes` of `metrics.json`, as `ssplat eval` writes it, where the folder holds one; "OOM" there stands for a
+method that had no memory for the scene, and needs no images. Of many scenes both folders hold one folder for each, and
+the means over views, then scenes, come last.
 """
 
 import functools
 import hashlib
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 from PIL import Image, UnidentifiedImageError
 
 from ssplat_experiments.cases import Case, Row
-from ssplat_experiments.study import Study, run_study
+from ssplat_experiments.study import OOM, Study, run_study
 from ssplat_jax.core.console import Reporter
 from ssplat_jax.core.errors import InputError, echo
 from ssplat_jax.data.capture import Capture
@@ -42,46 +45,52 @@ def run(captures: Path | None, out: Path, scale: str, reporter: Reporter, render
 
 
 def study_of(path: str, renders: Path) -> Study:
-    """The study of one folder of renders.
+    """The study of a folder of renders, or of one for each scene.
 
     Args:
-        path: the capture, or `procedural:NAME`.
-        renders: the folder of the renders.
+        path: the capture, or `procedural:NAME`; of many scenes the folder of their captures.
+        renders: the folder of the renders; of many scenes it holds one for each scene, of the name of its capture.
 
     Raises:
         InputError: the split, a render or the capture is missing or unusable.
     """
-    split = read_split(renders / SPLIT)
+    method, scenes = renders.resolve().name, [path.parent.name for path in sorted(renders.glob(f"*/{SPLIT}"))]
+    if (renders / SPLIT).exists() or not scenes:
+        return Study("score", TEXT, lambda captures, scale: [case_of(method, path, renders)])
+    cases = [case_of(method, f"{path}/{scene}", renders / scene, f"{method}, {scene}") for scene in scenes]
+    return Study("score", TEXT, lambda captures, scale: cases, finish=add_means)
+
+
+def case_of(method: str, path: str, renders: Path, name: str | None = None) -> Case:
+    """The case of one capture and its renders; of a method that had no memory for it, without any."""
+    split, memory = read_split(renders / SPLIT), read_memory(renders / METRICS)
+    if memory == OOM:
+        asked = {"capture": path, "split": split.sha256[:12], "peak_memory_bytes": OOM}
+        row = {"method": method, "capture": Path(path).name, "peak_memory_bytes": OOM}
+        return Case(name or method, None, asked, lambda: [row])
     files = {i: _file_of(renders, i) for i in split.targets}
-    images = {i: read_image(file) for i, file in files.items()}
-    sizes = {image.shape[1::-1] for image in images.values()}
+    sizes = {read_image(file).shape[1::-1] for file in files.values()}
     if len(sizes) != 1:
         raise InputError(
             f"{renders}: wanted renders of one size, got {', '.join(f'{w}x{h}' for w, h in sorted(sizes))}."
         )
-    ((width, height),) = sizes
-    capture = open_capture(path, size=(width, height))
+    capture = open_capture(path, size=sizes.pop())
     check_scorable(capture, with_lpips=installed_lpips() is not None)
     if max(*split.context, *split.targets) >= len(capture):
         raise InputError(f"{renders / SPLIT}: wanted frames below {len(capture)}, which {capture.name} has.")
     digest = hashlib.sha256(b"".join(files[i].read_bytes() for i in split.targets)).hexdigest()[:12]
     frames = capture.digest((*split.context, *split.targets))
-    memory = read_memory(renders / METRICS)
     asked = {"capture": capture.name, "frames": frames, "split": split.sha256[:12], "renders": digest}
     asked |= {} if memory is None else {"peak_memory_bytes": memory}
-    method = renders.resolve().name
-    case = Case(method, None, asked, functools.partial(measured, method, capture, split, images, memory))
-    return Study("score", TEXT, lambda captures, scale: [case])
+    return Case(name or method, None, asked, functools.partial(measured, method, capture, split, files, memory))
 
 
-def measured(
-    method: str, capture: Capture, split: Split, images: dict[int, Float[np.ndarray, "h w 3"]], memory: int | None
-) -> list[Row]:
-    """Mean scores of the renders, whose method needed `memory` bytes, and of two baselines."""
+def measured(method: str, capture: Capture, split: Split, files: dict[int, Path], memory: Any) -> list[Row]:
+    """Mean scores of the renders in `files`, whose method needed `memory` bytes, and of two baselines."""
     mean = np.mean([capture.image(i).mean(axis=(0, 1)) for i in split.context], axis=0)
     flat = np.broadcast_to(mean, capture.image(split.targets[0]).shape).astype(np.float32)
     shown = {
-        method: images,
+        method: {i: read_image(file) for i, file in files.items()},
         "copy nearest": {i: capture.image(nearest_views(capture, i, split.context)[0]) for i in split.targets},
         "mean color": dict.fromkeys(split.targets, flat),
     }
@@ -93,6 +102,24 @@ def measured(
         row |= {"peak_memory_bytes": memory if name == method else None}
         rows.append(row | {"targets": len(split.targets), "split": split.sha256[:12]})
     return rows
+
+
+def add_means(rows: list[Row]) -> None:
+    """Adds a row for each method: means over the views of a scene, then over scenes, and the largest memory.
+
+    A method without memory for a scene has no mean.
+    """
+    for method in dict.fromkeys(row["method"] for row in rows):
+        own = [row for row in rows if row["method"] == method]
+        memory = [row["peak_memory_bytes"] for row in own if row["peak_memory_bytes"] is not None]
+        mean: Row = {"method": method, "capture": f"mean of {len(own)} scenes"}
+        if OOM in memory:
+            rows.append(mean | {"peak_memory_bytes": OOM})
+            continue
+        for metric in ("literal_psnr", "literal_ssim", "literal_lpips"):
+            values = [row[metric] for row in own]
+            mean[metric] = None if None in values else round(float(np.mean(values)), 4)
+        rows.append(mean | {"peak_memory_bytes": max(memory, default=None), "targets": sum(r["targets"] for r in own)})
 
 
 def read_split(path: Path) -> Split:
@@ -114,8 +141,8 @@ def read_split(path: Path) -> Split:
         ) from None
 
 
-def read_memory(path: Path) -> int | None:
-    """The peak memory in bytes that a file of metrics names; None without a file, or if it names none.
+def read_memory(path: Path) -> int | str | None:
+    """The peak memory in bytes that a file of metrics names, or "OOM"; None without a file, or if it names none.
 
     Raises:
         InputError: the file is damaged, or the number is not one of bytes.
@@ -124,7 +151,7 @@ def read_memory(path: Path) -> int | None:
         return None
     try:
         found = json.loads(path.read_text()).get("peak_memory_bytes")
-        if found is not None and not (type(found) is int and found > 0):
+        if found is not None and found != OOM and not (type(found) is int and found > 0):
             raise ValueError(f"peak_memory_bytes {echo(found)}")
     except (OSError, ValueError, AttributeError) as error:
         raise InputError(f"{path}: wanted metrics with a number of bytes, got {error}; remove the file.") from None

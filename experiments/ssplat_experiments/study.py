@@ -22,6 +22,8 @@ SCALES = ("smoke", "cpu", "gpu")
 """Sizes of an experiment: seconds, two cores, a GPU."""
 
 PAGE, PLOT = "page.md", "plot.png"
+OOM = "OOM"
+"""Peak memory in a row of what did not fit into the memory of the machine."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -147,7 +149,7 @@ def markdown_table(rows: Sequence[Row]) -> str:
 def _cell(name: str, value: Any) -> str:
     if value is None:
         return ""
-    if name.endswith("_bytes"):
+    if name.endswith("_bytes") and value != OOM:
         return f"{value / 2**20:.1f}"
     if isinstance(value, bool):
         return "yes" if value else ""

@@ -86,20 +86,19 @@ def evaluate_run(
         report_eval(RunFolder(out), metrics)
         return metrics
 
-    if options.index is None:
-        if options.scene is not None:
-            raise InputError("--scene: wanted --index beside it, whose scene it names; got none.")
-        capture = open_capture(path, size=options.size)
-        split = choose_split(options.protocol, len(capture), options.stride, options.context, options.targets)
-        return evaluated(capture, split, out)
-    chosen = {name: getattr(options, name) for name in ("stride", "context", "targets")}
-    chosen["protocol"] = None if options.protocol == "interleaved" else options.protocol
-    if clash := [name for name, value in chosen.items() if value is not None]:
-        raise refusal("--index", wanted="no frames chosen otherwise", got=f"--{clash[0]} too", fix="leave one out")
-    index, notes = read_index(options.index)
-    reporter.warn_all(*notes)
+    if options.scene is not None and options.index is None:
+        raise InputError("--scene: wanted --index beside it, whose scene it names; got none.")
     folder = without_tilde(split_options(path)[0])
-    if options.scene is not None or not folder.is_dir() or is_capture(folder):
+    are_scenes = options.scene is None and folder.is_dir() and not is_capture(folder)
+    if options.index is not None:
+        index, notes = _read_index(options)
+    elif are_scenes and any(map(is_capture, folder.iterdir())):
+        index, notes = index_of_folder(path, options)
+    else:
+        capture = open_capture(path, size=options.size)
+        return evaluated(capture, _split(capture, options), out)
+    reporter.warn_all(*notes)
+    if not are_scenes:
         capture = open_capture(path, size=options.size)
         scene = options.scene or capture.name
         return evaluated(capture, split_of_scene(index, scene, len(capture)), out, scene)
@@ -118,6 +117,40 @@ def evaluate_run(
     write_json(RunFolder(out).index, index_to_json(index))
     write_json(RunFolder(out).metrics, metrics)
     return metrics
+
+
+def _split(capture: Capture, options: EvalOptions) -> Split:
+    """The frames of a capture by the protocol."""
+    return choose_split(options.protocol, len(capture), options.stride, options.context, options.targets)
+
+
+def _read_index(options: EvalOptions) -> tuple[Index, tuple[str, ...]]:
+    """The index file of the options, which choose frames in no other way, and notes for the user."""
+    assert options.index is not None
+    chosen = {name: getattr(options, name) for name in ("stride", "context", "targets")}
+    chosen["protocol"] = None if options.protocol == "interleaved" else options.protocol
+    if clash := [name for name, value in chosen.items() if value is not None]:
+        raise refusal("--index", wanted="no frames chosen otherwise", got=f"--{clash[0]} too", fix="leave one out")
+    return read_index(options.index)
+
+
+def index_of_folder(path: str, options: EvalOptions) -> tuple[Index, tuple[str, ...]]:
+    """The frames of every capture in a folder by the protocol, None for one that is too short, and notes that say so.
+
+    Raises:
+        InputError: a capture is unusable.
+    """
+    root, written = split_options(path)
+    index: Index = {}
+    notes = []
+    for scene in sorted(folder.name for folder in without_tilde(root).iterdir() if is_capture(folder)):
+        capture = open_capture(with_options(f"{root}/{scene}", **written), size=options.size)
+        try:
+            index[scene] = _split(capture, options)
+        except InputError as error:
+            index[scene] = None
+            notes.append(f"{scene}: left out ({error})")
+    return index, tuple(notes)
 
 
 def _open_scenes(path: str, index: Index, size: tuple[int, int] | None) -> dict[str, Capture]:
@@ -144,7 +177,8 @@ def scene_metrics(scored: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
 
     Returns:
         `scenes`, the scores and the number of targets of each; `over_scenes`, the mean over views, then scenes; and
-        `over_views`, the mean over the views of all scenes. `lpips` is None where a scene has none.
+        `over_views`, the mean over the views of all scenes; `lpips` is None where a scene has none. And the largest
+        `peak_memory_bytes` of a scene.
     """
     rows = {scene: {name: m[name] for name in (*SCORES, "target_views")} for scene, m in scored.items()}
     weights = np.array([row["target_views"] for row in rows.values()], np.float64)
@@ -153,6 +187,7 @@ def scene_metrics(scored: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
         "scenes": rows,
         "over_scenes": _weighted_mean(blocks, np.ones(len(blocks))),
         "over_views": _weighted_mean(blocks, weights),
+        "peak_memory_bytes": max(m["peak_memory_bytes"] or 0 for m in scored.values()) or None,
     }
 
 

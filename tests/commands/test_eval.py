@@ -11,10 +11,11 @@ from PIL import Image
 
 from ssplat_jax.core.gaussians import mask_gaussians
 from ssplat_jax.data.capture import Capture
+from ssplat_jax.data.split import choose_split, index_to_json, read_index
 from ssplat_jax.evaluation import cost, evaluate
 from ssplat_jax.refinement import refine_on_capture
 from ssplat_jax.runs import evaluate_run
-from ssplat_jax.runs.evaluate_run import scene_metrics
+from ssplat_jax.runs.evaluate_run import EvalOptions, index_of_folder, scene_metrics
 from tests.commands.command_fixture import SIZE, make_capture, read, run
 from tests.streaming.narrow_model import NARROW
 
@@ -65,11 +66,28 @@ def test_scenes_of_an_index_are_averaged_by_scene_and_by_view(tmp_path, narrow, 
         assert metrics["over_scenes"][name]["psnr"] == pytest.approx((one + two) / 2, abs=1e-4)
         assert metrics["over_views"][name]["psnr"] == pytest.approx((one + 3 * two) / 4, abs=1e-4)
     assert metrics["scenes"]["b"]["target_views"] == 3
+    assert metrics["peak_memory_bytes"] == max(a["peak_memory_bytes"], b["peak_memory_bytes"])
+
+
+def test_a_folder_of_scenes_without_an_index_gets_one_by_the_protocol(tmp_path):
+    """The index reads as those that are published; a scene that is too short is null."""
+    for name, num_frames in (("a", 12), ("b", 9), ("c", 5)):
+        make_capture(tmp_path / "scenes" / name, num_frames=num_frames, size=SIZE)
+    (tmp_path / "scenes" / "notes").mkdir()
+    options = EvalOptions(protocol="paper", context=6, targets=3)
+    index, (note,) = index_of_folder(str(tmp_path / "scenes"), options)
+    assert list(index) == ["a", "b", "c"] and index["c"] is None and note.startswith("c: left out (")
+    for name, num_frames in (("a", 12), ("b", 9)):
+        assert index[name] == choose_split("paper", num_frames, None, 6, 3)
+    (tmp_path / "index.json").write_text(json.dumps(index_to_json(index)))
+    again, _ = read_index(tmp_path / "index.json")
+    assert index_to_json(again) == index_to_json(index)
 
 
 def test_a_mean_without_lpips_everywhere_is_none():
     block = {"psnr": 20.0, "ssim": 0.5, "lpips": 0.1}
     scene = {"literal": block, "shown": block, "psnr_over_black": 1.0, "psnr_one_exposure": 2.0, "target_views": 1}
+    scene |= {"peak_memory_bytes": 5}
     both = scene_metrics({"a": scene, "b": scene | {"shown": block | {"lpips": None}}})
     assert both["over_scenes"]["literal"]["lpips"] == 0.1 and both["over_scenes"]["shown"]["lpips"] is None
 

@@ -7,13 +7,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from ssplat_experiments import context_length
 from ssplat_experiments.score import run
+from ssplat_experiments.study import markdown_table
 
 from ssplat_jax.commands.experiment_command import Experiment
 from ssplat_jax.commands.main import guarded
+from ssplat_jax.config import preset
 from ssplat_jax.core.console import Reporter
 from ssplat_jax.data.open_capture import open_capture
-from ssplat_jax.data.split import interleaved_split
+from ssplat_jax.data.split import Split, interleaved_split
+from tests.commands.command_fixture import make_capture
 
 ROOM = "procedural:room?frames=8&size=32x24"
 QUIET = Reporter(quiet=True)
@@ -77,3 +81,42 @@ def test_missing_renders_are_named(renders, tmp_path, capsys):
     assert "split.json" in capsys.readouterr().err
     assert guarded(dataclasses.replace(command, name="cost").run) == 2
     assert "--renders" in capsys.readouterr().err
+
+
+def test_scores_are_means_over_views_then_scenes_and_memory_is_the_largest(tmp_path):
+    """A method without memory for a scene keeps its row and has no mean."""
+    capture, theirs = open_capture(ROOM), tmp_path / "theirs"
+    for scene, split in (("a", interleaved_split(8, 1, 5)), ("b", Split("index", (0, 2, 5), (1, 3)))):
+        make_capture(tmp_path / "scenes" / scene, num_frames=8, size=(32, 24))
+        (theirs / scene).mkdir(parents=True)
+        (theirs / scene / "split.json").write_text(split.to_json())
+        for i in split.targets:
+            Image.fromarray((capture.image(i) * 255).astype(np.uint8)).save(theirs / scene / f"{i:05d}.png")
+        (theirs / scene / "metrics.json").write_text(json.dumps({"peak_memory_bytes": 100 + len(split.targets)}))
+    run(tmp_path / "scenes", tmp_path / "out", "smoke", QUIET, renders=theirs)
+    rows = json.loads((tmp_path / "out" / "table.json").read_text())
+    a, b, mean = (row for row in rows if row["method"] == "theirs")
+    assert (a["targets"], b["targets"], mean["targets"]) == (1, 2, 3) and mean["peak_memory_bytes"] == 102
+    assert mean["literal_psnr"] == pytest.approx((a["literal_psnr"] + b["literal_psnr"]) / 2, abs=1e-3)
+
+    (theirs / "b" / "metrics.json").write_text('{"peak_memory_bytes": "OOM"}')
+    run(tmp_path / "scenes", tmp_path / "without", "smoke", QUIET, renders=theirs)
+    rows = json.loads((tmp_path / "without" / "table.json").read_text())
+    _, b, mean = (row for row in rows if row["method"] == "theirs")
+    assert b["peak_memory_bytes"] == mean["peak_memory_bytes"] == "OOM" and "literal_psnr" not in mean
+
+
+def test_nothing_larger_is_tried_after_a_number_of_views_that_does_not_fit(monkeypatch):
+    tried = []
+
+    def measure(path, count, config, sizes):
+        tried.append(count)
+        if count == 64:
+            raise RuntimeError("RESOURCE_EXHAUSTED: out of memory")
+        return {"literal_psnr": 20.0}
+
+    monkeypatch.setattr(context_length, "joint_row", measure)
+    sizes = context_length.SIZES["cpu"][0]
+    rows = context_length.measured_joint("procedural:room", (24, 64, 128), preset("tiny"), sizes)
+    assert tried == [24, 64] and [row["views"] for row in rows] == [24, 64]
+    assert rows[1]["peak_memory_bytes"] == "OOM" and "| OOM |" in markdown_table(rows)
