@@ -154,9 +154,7 @@ def load_rasterizer(path: Path) -> ModuleType:
     """
     spec = importlib.util.spec_from_file_location("against", path)
     if spec is None or spec.loader is None or not path.is_file():
-        raise InputError(
-            f"bench render: --against wants a Python file, got {path}; see experiments/gsplat_rasterizer.py."
-        )
+        raise InputError(f"bench render: --against wants a Python file, got {path}; see experiments/on_a_gpu.py.")
     module = importlib.util.module_from_spec(spec)
     try:
         spec.loader.exec_module(module)
@@ -167,11 +165,11 @@ def load_rasterizer(path: Path) -> ModuleType:
     return module
 
 
-def _others(module: ModuleType, gaussians: Gaussians, camera: Camera) -> dict[str, Callable[[], Any]]:
-    """The functions of another rasterizer to time."""
+def runs_of(candidates: Callable[..., dict], gaussians: Gaussians, camera: Camera) -> dict[str, Callable[[], Any]]:
+    """The functions of another rasterizer to time, from its `candidates`."""
     arrays = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)
     given = map(np.asarray, (*arrays, gaussians.sh[:, 0] * SH_C0 + 0.5, camera.viewmats, camera.Ks))
-    return {f"against_{name}": run for name, run in module.candidates(*given, camera.width, camera.height).items()}
+    return candidates(*given, camera.width, camera.height)
 
 
 def rows_of(
@@ -180,7 +178,8 @@ def rows_of(
     """The rows of one scene; `stages` says whether each stage is timed too."""
     gaussians, camera = scene(num, width, height)
     runs, facts = candidates(gaussians, camera, stages=stages)
-    others = {} if against is None else _others(against, gaussians, camera)
+    others = {} if against is None else runs_of(against.candidates, gaussians, camera)
+    others = {f"against_{name}": run for name, run in others.items()}
     times = alternate(others | runs)
     ratios = {
         "forward_over_floor": times["forward"] / times["floor"],

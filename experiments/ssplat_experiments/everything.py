@@ -14,7 +14,7 @@ from ssplat_jax.core.console import Reporter
 
 STUDIES: tuple[Study, ...] = (
     context_length.STUDY,
-    *cost.STUDIES,
+    cost.STUDY,
     accuracy_vs_time.STUDY,
     ablation.STUDY,  # last: it trains
 )

@@ -17,12 +17,12 @@ class Bench:
     """
 
     name: Annotated[str, tyro.conf.Positional]
-    """render: the rasterizer. effects: what each effect costs and shows. refine: a step of refinement on a large scene.
-    stream: whole steps, with online refinement and without, early and late in a stream."""
+    """render: the rasterizer. effects: what each effect costs and shows. refine: a step of refinement on a large
+    scene."""
     json: Path | None = None
     """Write {machine, date, commit, rows: [{name, value, unit}]} here as well."""
     against: Path | None = None
-    """Timed in the same run. render: another rasterizer's Python file, as experiments/gsplat_rasterizer.py is one.
+    """Timed in the same run. render: another rasterizer's Python file, as experiments/on_a_gpu.py is one.
     refine: the root of another checkout of this package."""
     large: bool = False
     """render only: also 4k to 1M Gaussians, at five image sizes."""

@@ -18,10 +18,10 @@ class Experiment:
     """
 
     name: Annotated[str, tyro.conf.Positional]
-    """captures: real captures. context_length: quality against the number of views (the paper's Tables 1 and 2).
-    ablation: the effect of each module (Table 3). cost: time of each stage, memory against views (Figure 1).
-    accuracy_vs_time: quality against time, of every setting. depth_error: errors of depth by confidence. score: another
-    method's renders. all: those that keep finished cases, on one page."""
+    """captures: real captures. context_length: quality and memory against the number of views (the paper's Tables 1
+    and 2, Figure 1). ablation: the effect of each module (Table 3). cost: time of each stage. accuracy_vs_time: quality
+    against time, of every setting. depth_error: errors of depth by confidence. score: another method's renders. all:
+    those that keep finished cases, on one page."""
     out: Path
     """Folder of the tables, plots and pictures."""
     captures: Path | None = None

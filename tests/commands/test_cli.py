@@ -117,7 +117,7 @@ def test_usage_that_does_not_parse_is_short_and_exit_2(arguments, named, capsys)
         (("eval", "procedural:room", "--context", "8", "--set", "voxel_size=-1", "--out", "x"), "voxel_size"),
         (("eval", "procedural:room", "--context", "8", "--weights", "no.npz", "--out", "x"), "no.npz"),
         (("train", "--validate-every", "5", "--out", "x"), "--validate-every: "),
-        (("bench", "stream", "--large"), "--large: benchmark stream has no use for it"),
+        (("bench", "effects", "--large"), "--large: benchmark effects has no use for it"),
         (("run", "procedural:room?frames=2&size=32x24", "--stride", "0", "--out", "x"), "--stride"),
         (("export", "no_run", "--to", "x.ply"), "no_run"),
         (("import-weights", "no.pth", "--out", "x.npz"), "no.pth: cannot be read"),

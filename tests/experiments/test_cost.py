@@ -7,7 +7,7 @@ import jax
 import numpy as np
 import pytest
 from ssplat_experiments.baselines import JointNetwork, one_chunk
-from ssplat_experiments.cost import growth, median_ms
+from ssplat_experiments.cost import median_ms
 
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.evaluation.cost import added_bytes, live_bytes, peak_memory
@@ -72,8 +72,3 @@ def test_added_bytes_are_results_and_temporaries():
     added, over = added_bytes(kept), added_bytes(written_over)
     assert added is not None and x.nbytes <= added <= x.nbytes + 1024
     assert over is not None and over <= 1024
-
-
-def test_growth_is_taken_from_first_to_last_view_count():
-    rows = [{"method": "ours", "views": v, "peak_memory_bytes": 100 + 3 * v} for v in (50, 10, 30)]
-    assert growth(rows, "ours") == (250 / 130, 3.0)
