@@ -3,9 +3,8 @@
     pip install "ssplat-jax[cuda]" splax torch gsplat
     python experiments/on_a_gpu.py --out on_a_gpu.json
 
-It is to take less than 12 minutes on a large GPU. In place of what fails, or is not installed, stands its error: the
-other parts still run, and the file is written after each. `--scale smoke` tries all of it on a CPU. `ssplat bench
-render --against experiments/on_a_gpu.py` times gsplat alone beside ours.
+It is to take less than 12 minutes. In place of what fails, or is not installed, stands its error. `--scale smoke` tries
+all of it on a CPU. `ssplat bench render --against experiments/on_a_gpu.py` times gsplat alone beside ours.
 """
 
 import argparse
@@ -131,7 +130,7 @@ def rasterizers(scale: str) -> list[Row]:
     rows = []
     for num, width, height in SCENES[scale]:
         gaussians, camera = bench_render.scene(num, width, height)
-        facts: Row = {}
+        facts: Row = {"gaussians": num, "size": [width, height]}
         runs, facts["ours"] = bench_render.candidates(gaussians, camera, stages=True)
         for name, make in OTHERS.items():
             try:
@@ -140,8 +139,7 @@ def rasterizers(scale: str) -> list[Row]:
             except Exception as error:  # it is not installed, or has no device, or fails in any other way
                 facts[name] = repr(error)
         times = bench_render.alternate(runs, repetitions=3 if scale == "smoke" else 21)
-        medians = {name: round(float(np.median(ms)), 3) for name, ms in times.items()}
-        rows.append({"gaussians": num, "size": [width, height], "ms": medians, **facts})
+        rows.append(facts | {"ms": {name: round(float(np.median(ms)), 3) for name, ms in times.items()}})
     return rows
 
 
@@ -181,7 +179,7 @@ def main(scale: str, out: Path) -> None:
     if scale == "smoke":
         compile_quickly()
     found: Row = {"machine": provenance.machine(), "date": provenance.today(), "commit": provenance.commit()}
-    found |= {"device": jax.devices()[0].device_kind, "scale": scale}
+    found["device"] = jax.devices()[0].device_kind
     for part in (rasterizers, streams, refinement):
         since = time.perf_counter()
         try:
@@ -196,8 +194,7 @@ def main(scale: str, out: Path) -> None:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(description="Measures the speed of ssplat_jax on a GPU.")
     parser.add_argument("--out", type=Path, default=Path("on_a_gpu.json"))
     parser.add_argument("--scale", choices=("smoke", "gpu"), default="gpu")
-    arguments = parser.parse_args()
-    main(arguments.scale, arguments.out)
+    main(**vars(parser.parse_args()))

@@ -96,7 +96,7 @@ class DepthLoss:
 class RenderingLoss:
     """Loss of rendered target views, and of depth beside it.
 
-    rendering = MSE + lpips_weight x LPIPS, or MSE + gradient_weight x L1 of image gradients
+    rendering = MSE + lpips_weight x LPIPS
     loss      = depth_weight x depth + weight x rendering
     """
 
@@ -110,10 +110,7 @@ class RenderingLoss:
     """Tokens that are rendered: all of them (the paper), or those that the cache would accept, so that layers carry the
     same opacity as at inference."""
     lpips_weight: float = 0.05
-    """Weight of LPIPS beside the MSE, as in the paper (Eq. training_loss); used only when LPIPS weights are given."""
-    gradient_weight: float = 0.02
-    """Weight of the L1 of image gradients beside the MSE, which replaces LPIPS when its weights are not given: they
-    cannot be shipped. The Gaussians cannot show texture finer than themselves: a larger weight would favor blur."""
+    """Weight of LPIPS beside the MSE, as in the paper (Eq. training_loss); without its weights the MSE stands alone."""
     black_weight: float = 0.05
     """Fraction of the rendering loss computed over a black background. The rest fills holes with the colors around
     them, as in evaluation; alone, that would make all surfaces translucent, since holes would cost nothing."""
@@ -161,12 +158,9 @@ class RenderingLoss:
     def of_images(
         self, images: Float[Array, "s h w 3"], targets: Float[Array, "s h w 3"], lpips: Lpips = None
     ) -> tuple[Scalar, Scalar]:
-        """Loss of rendered views, RGB in [0, 1], and its second term: LPIPS, or the L1 of image gradients."""
-        if lpips is None:
-            second, weight = image_gradient_l1(images, targets), self.gradient_weight
-        else:
-            second, weight = lpips_distance(lpips, images, targets).mean(), self.lpips_weight
-        return jnp.mean((images - targets) ** 2) + weight * second, second
+        """Loss of rendered views, RGB in [0, 1], and their LPIPS; 0 without its weights."""
+        distance = jnp.zeros(()) if lpips is None else lpips_distance(lpips, images, targets).mean()
+        return jnp.mean((images - targets) ** 2) + self.lpips_weight * distance, distance
 
 
 @dataclasses.dataclass(frozen=True)
@@ -263,14 +257,6 @@ def depth_loss(
     targets = soft_targets(truth, log_candidates, target_width)
     entropy = -jnp.sum(targets * jax.nn.log_softmax(logits, axis=-1), axis=-1)
     return jnp.sum(weight * entropy), jnp.sum(weight * jnp.abs(predicted - truth))
-
-
-def image_gradient_l1(a: Float[Array, "s h w 3"], b: Float[Array, "s h w 3"]) -> Scalar:
-    """L1 distance of the horizontal and vertical pixel differences of two images."""
-    difference = a - b
-    horizontal = jnp.abs(difference[:, :, 1:] - difference[:, :, :-1]).mean()
-    vertical = jnp.abs(difference[:, 1:] - difference[:, :-1]).mean()
-    return horizontal + vertical
 
 
 def fitted_gains(images: Float[Array, "s h w 3"], targets: Float[Array, "s h w 3"]) -> Float[Array, "s 1 1 3"]:

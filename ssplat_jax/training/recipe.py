@@ -194,7 +194,6 @@ _PAPER_LOSS = RenderingLoss(
     depth_weight=0.0,
     weight=4.0,
     tokens="all",
-    gradient_weight=0.0,
     black_weight=1.0,
     fit_gains=False,
     max_pairs=1 << 22,

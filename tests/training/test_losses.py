@@ -26,7 +26,6 @@ from ssplat_jax.training.losses import (
     decode_accepted,
     depth_loss,
     fitted_gains,
-    image_gradient_l1,
     negative_psnr,
 )
 from ssplat_jax.training.recipe import RECIPES
@@ -84,10 +83,9 @@ def test_gradients_of_losses_are_finite_differences():
         candidates, usable = jnp.linspace(0.0, 1.0, 5), jnp.ones((1, 2, 3), bool)
         images, targets = (jnp.asarray(rng.uniform(0.1, 0.9, (2, 4, 5, 3))) for _ in range(2))
         depth = lambda logits, z: sum(depth_loss(logits, z, truth, candidates, usable, target_width=WIDTH))  # noqa: E731
-        mse, edges = (lambda x: ((x - targets) ** 2).mean()), lambda x: image_gradient_l1(x, targets)
         cases = [
             (depth, (jnp.asarray(rng.normal(size=(1, 2, 3, 5))), truth + 0.05)),
-            (lambda x: RenderingLoss.gradient_weight * edges(x) + mse(x), (images,)),
+            (lambda x: RenderingLoss().of_images(x, targets)[0], (images,)),
             (lambda x: negative_psnr(x[0], targets[0]), (images,)),
         ]
         for loss, arguments in cases:
@@ -102,13 +100,10 @@ def test_image_losses_are_the_sum_of_their_terms(monkeypatch):
     rng = np.random.default_rng(2)
     a, b = rng.uniform(size=(2, 2, 4, 5, 3))
     images, targets = jnp.asarray(a, jnp.float32), jnp.asarray(b, jnp.float32)
-    edges = sum(np.abs(np.diff(a - b, axis=axis)).mean() for axis in (1, 2))
-    loss = RenderingLoss(gradient_weight=0.5, lpips_weight=0.2)
-    wanted = ((a - b) ** 2).mean() + 0.5 * edges
+    loss, wanted = RenderingLoss(lpips_weight=0.2), ((a - b) ** 2).mean()
     assert float(loss.of_images(images, targets)[0]) == pytest.approx(wanted, rel=1e-5)
     wanted = ((a - b) ** 2).mean() + 0.2 * 3.0 * np.abs(a - b).mean()
     assert float(loss.of_images(images, targets, LpipsWeights((), (), ()))[0]) == pytest.approx(wanted, rel=1e-5)
-    assert float(image_gradient_l1(images, images + 0.25)) < 1e-6
 
 
 def test_the_paper_loss_of_a_scene_sums_mse_and_lpips_of_its_targets_over_black(monkeypatch):
