@@ -122,6 +122,8 @@ class Train:
                 raise InputError(f"{flag}: --recipe {self.recipe} has no use for it; leave it out.")
         if (self.shares or validates) and not self.captures:
             raise InputError("--shares, --validate-every: wanted --captures beside them; got none.")
+        if recipe.captures_alone and not self.captures:
+            raise InputError(f"--recipe {self.recipe}: wanted --captures, from which alone it learns; got none.")
         if recipe.untrained and self.init_weights is None:
             raise InputError(f"--recipe {self.recipe}: wanted --init-weights, whose streams it learns from; got none.")
 

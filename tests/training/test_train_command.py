@@ -93,6 +93,7 @@ def test_strides_for_which_a_capture_is_too_short_are_left_out(tmp_path):
         ({"recipe": "evidence", "init_weights": SHIPPED, "shares": (0.5,), "captures": (Path("x"),)}, "--shares"),
         ({"recipe": "depth", "captures": (Path("x"),), "validate_every": 10}, "--validate-every"),
         ({"shares": (0.5,)}, "--captures beside"),
+        ({"recipe": "paper"}, "wanted --captures"),
     ],
 )
 def test_options_that_do_not_fit_the_recipe_are_refused(options, named, tmp_path):
