@@ -28,8 +28,8 @@ FINER_SAMPLING = 1.05
 class Effects:
     """The effects of a render. Hashable; changing one recompiles.
 
-    An effect that needs an array is on if `render` is given that array. True asks for the array and False forbids it:
-    `render` refuses a contradiction.
+    An effect that needs an array is on if `render` is given that array. True asks for the array, without which `render`
+    refuses; False leaves the array out.
     """
 
     sh_degree: int | None = None
@@ -69,25 +69,21 @@ class Effects:
         """A copy with `changes`."""
         return dataclasses.replace(self, **changes)
 
-    def resolve(self, *, captured: object, distortion: object, exposures: object) -> "Effects":
+    def resolve(self, **arrays: object) -> "Effects":
         """These effects with every flag decided, given the arrays of a render (None: not given).
 
         Raises:
-            InputError: a flag is True without its array, or False with it.
+            InputError: a flag is True without its array.
         """
-        arrays = {"captured": captured, "distortion": distortion, "exposures": exposures}
-        is_given = {field: arrays[name] is not None for field, name in NEEDED_ARRAYS.items()}
+        flags = {}
         for field, name in NEEDED_ARRAYS.items():
-            flag = getattr(self, field)
-            if flag and not is_given[field]:
+            flag, is_given = getattr(self, field), arrays[name] is not None
+            if flag and not is_given:
                 raise InputError(
                     f"render: effects.{field} is on and wants {name}, got none; pass it or unset the flag."
                 )
-            if flag is False and is_given[field]:
-                raise InputError(
-                    f"render: effects.{field} is off and wants no {name}, got one; leave it out or unset the flag."
-                )
-        return self.replace(**is_given)
+            flags[field] = is_given and flag is not False
+        return self.replace(**flags)
 
     @property
     def needs_alpha(self) -> bool:
@@ -117,8 +113,7 @@ def effects_for(
         outputs: passed on.
 
     Returns:
-        The effects, SH degree included. A flag is False where its array is given but not needed: do not pass that
-        array to `render`.
+        The effects, SH degree included. A flag is False where its array is given but not needed.
     """
     return Effects(
         sh_degree=_used_degree(np.asarray(gaussians.sh, np.float32)),

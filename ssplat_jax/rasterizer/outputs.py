@@ -100,9 +100,7 @@ def finish(
     *,
     exposures: Float[Array, "*b 3 4"] | None,
     median_depth: Float[Array, "b h w"] | None,
-    num_pairs: Int[Array, ""],
-    num_overflow: Int[Array, ""],
-    num_non_finite: Int[Array, ""],
+    **counts: Int[Array, ""],
 ) -> RenderOutput:
     """The output of a render.
 
@@ -112,9 +110,7 @@ def finish(
         effects: background, exposure and outputs.
         exposures: affine color correction of each frame.
         median_depth: passed on, as are the counts.
-        num_pairs: tile intersections.
-        num_overflow: tile intersections above the capacity.
-        num_non_finite: rows culled.
+        counts: those of `RenderOutput`.
 
     Returns:
         Images in the camera's batch shape.
@@ -136,13 +132,7 @@ def finish(
         others["median_depth"] = median_depth.reshape(*batch, *median_depth.shape[1:])
     if rest.shape[-1]:
         others["features"] = rest
-    return RenderOutput(
-        color=color,
-        others=others,
-        num_pairs=num_pairs,
-        num_overflow=num_overflow,
-        num_non_finite=num_non_finite,
-    )
+    return RenderOutput(color=color, others=others, **counts)
 
 
 def apply_exposures(color: Float[Array, "*b h w 3"], exposures: Float[Array, "*b 3 4"]) -> Float[Array, "*b h w 3"]:

@@ -62,11 +62,11 @@ def render_reference(
         The output; its counts of pairs are 0.
 
     Raises:
-        InputError: a flag of `effects` contradicts the arrays.
+        InputError: a flag of `effects` is True without its array.
     """
     effects = (effects or Effects()).resolve(captured=captured, distortion=distortion, exposures=exposures)
     gaussians, num_non_finite = cull_non_finite(gaussians, features)
-    if captured is not None:
+    if effects.filter_3d and captured is not None:
         gaussians = filter_3d(gaussians, captured)
     flat = replace(camera, viewmats=camera.viewmats.reshape(-1, 4, 4), Ks=camera.Ks.reshape(-1, 3, 3))
     splats = project(gaussians, flat, effects, None if distortion is None else distortion.reshape(-1, 5))

@@ -14,7 +14,7 @@ from ssplat_jax.core.gaussians import Gaussians, check_gaussians
 from ssplat_jax.core.pytree import pytree, replace
 from ssplat_jax.rasterizer.binning import Grid, count_intersections, intersect_tiles, sorted_table
 from ssplat_jax.rasterizer.compositing import composite, median_rows
-from ssplat_jax.rasterizer.effects import Effects, filter_3d
+from ssplat_jax.rasterizer.effects import NEEDED_ARRAYS, Effects, filter_3d
 from ssplat_jax.rasterizer.outputs import RenderOutput, finish, splat_channels
 from ssplat_jax.rasterizer.pinhole_projection import project_pinhole
 from ssplat_jax.rasterizer.projection import cull_cameras, cull_non_finite, project
@@ -61,7 +61,8 @@ def render(
     Second derivatives are taken forward over reverse: `jax.jvp(jax.grad(loss), ...)`, `jax.hessian`. JAX refuses
     `jax.grad` of `jax.grad`, and `jax.jvp` alone.
 
-    An array that is given switches its effect on; an array that is None adds no operation to the program.
+    An array that is given switches its effect on, unless its flag in `effects` is False; an array that is None adds no
+    operation to the program.
 
     Args:
         gaussians: the scene, in the world frame of the camera; rows of opacity 0 are absent.
@@ -82,12 +83,14 @@ def render(
         Images with the camera's batch axes, and counts of what was left out.
 
     Raises:
-        InputError: an array does not have the shape above, a flag of `effects` contradicts the arrays, `max_pairs` is
-            below 1, `tile` is neither 8 nor 16, or (outside jit) there are more than 2^30 pairs.
+        InputError: an array does not have the shape above, a flag of `effects` is True without its array, `max_pairs`
+            is below 1, `tile` is neither 8 nor 16, or (outside jit) there are more than 2^30 pairs.
     """
     effects = (effects or Effects()).resolve(captured=captured, distortion=distortion, exposures=exposures)
     inputs = RenderInputs(gaussians, camera, features, captured, distortion, exposures)
     _check(inputs)
+    off = {name: None for field, name in NEEDED_ARRAYS.items() if not getattr(effects, field)}
+    inputs = replace(inputs, **off)
     inputs = _at_least_one_row(inputs)
     if max_pairs is not None and not (_is_whole(max_pairs) and max_pairs >= 1):
         raise InputError(f"render: max_pairs must be a whole number of at least 1, got {echo(max_pairs)}.")
@@ -243,7 +246,7 @@ def prepare(inputs: RenderInputs, effects: Effects):
     )
     distortion = None if inputs.distortion is None else inputs.distortion.reshape(-1, 5).astype(dtype)
     camera, usable = cull_cameras(camera)
-    if effects.distortion and distortion is not None:
+    if distortion is not None:
         splats = project(gaussians, camera, effects, distortion)
     else:
         splats = project_pinhole(gaussians, camera, effects)

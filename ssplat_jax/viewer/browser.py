@@ -19,8 +19,7 @@ from ssplat_jax.data.posed_image import pose_from_quat
 from ssplat_jax.scene_files.formats import save_gaussians
 from ssplat_jax.storage.chunk_records import RecordedView, open_thumbnail
 from ssplat_jax.viewer.scene_sources import ViewedScene
-from ssplat_jax.viewer.shown_scene import DRAFT, FINE, KINDS, draw
-from ssplat_jax.viewer.stage import Stage
+from ssplat_jax.viewer.stage import DRAFT, FINE, KINDS, Stage, draw
 
 SPLATS = "splats"
 """The choice of what to show that the browser draws itself."""
@@ -49,9 +48,10 @@ class Browser:
         self._facts = gui.add_markdown("")
         hint = "All but splats are drawn by ssplat's rasterizer at this window's camera."
         self._kind = gui.add_dropdown("Show", (SPLATS, *KINDS), initial_value=SPLATS, hint=hint)
-        self._chunk = gui.add_slider("Chunk", 1, 2, 1, 1, visible=False, hint="The scene after so many chunks.")
+        hint = "The scene after so many chunks."
+        self._chunk = gui.add_slider("Chunk", min=1, max=2, step=1, initial_value=1, visible=False, hint=hint)
         hint = "Streamed cameras with their images; click on one to go there."
-        self._cameras = gui.add_checkbox("Cameras", False, hint=hint)
+        self._cameras = gui.add_checkbox("Cameras", initial_value=False, hint=hint)
         gui.add_button_group("Play", ("orbit", "path", "stop")).on_click(lambda event: self._play(event.target.value))
         gui.add_button("Screenshot").on_click(lambda _: self._send_screenshot())
         gui.add_button("Download scene").on_click(lambda _: self._send_scene())
@@ -192,13 +192,7 @@ class Browser:
         fx = fy * width / height * max(camera.image_height, 1) / max(camera.image_width, 1)
         K = np.array([[fx, 0.0, width / 2], [0.0, fy, height / 2], [0.0, 0.0, 1.0]])
         pose = pose_from_quat(camera.wxyz, np.asarray(camera.position) * stage.distance, "browser")
-        exposure = None
-        if kind == "exposure":
-            in_capture = pose.copy()
-            in_capture[:3, 3] += stage.offset
-            nearest = stage.run.nearest(in_capture)
-            exposure = None if nearest is None else nearest.exposure
-        return draw(scene, kind, pose, K, size, over_black=stage.over_black, exposure=exposure)
+        return draw(scene, kind, pose, K, size, over_black=stage.over_black)
 
     # -- camera -------------------------------------------------------------------------------------------------------
 

@@ -4,7 +4,6 @@ A run with `--deltas` writes a file per chunk. The viewer reads these in a proce
 for no browser, and viewers may come and go.
 """
 
-import contextlib
 import dataclasses
 import json
 from pathlib import Path
@@ -29,8 +28,6 @@ class ViewedScene:
 
     gaussians: Gaussians
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the positions, in the capture's frame
-    exposure: Float[np.ndarray, "3"] = dataclasses.field(default_factory=lambda: np.ones(3))
-    """RGB factor from the exposure of the run's first views to that of the colors."""
     confidences: Float[np.ndarray, " n"] | None = None  # of the pivots behind the Gaussians; None where unknown
     render_mode: str = "mip"  # the renderer that the scene was made for, see `save_ply`
 
@@ -46,16 +43,14 @@ class SceneFile:
     num_chunks = 1
 
     def __init__(self, path: Path, *, one_exposure: bool = False) -> None:
-        # Stamps of scene and metrics: at the last reading, and at the last one that failed.
-        self._stamp = self._unreadable = None
+        self._stamp = None  # of scene and metrics at the last look
         self.path, self.folder, self._one_exposure = path, RunFolder(path.parent), one_exposure
 
     def changed(self) -> ViewedScene | None:
         """The scene if it has changed since the last call, else None.
 
         Raises:
-            InputError: the file is not a scene and has not changed since the last call, or there was no scene before;
-                or its exposure is wanted and unknown.
+            InputError: there was no scene before and the file is none, or its exposure is wanted and unknown.
         """
         stamp = scene, metrics = _stamp(self.path), _stamp(self.folder.metrics)
         if self._stamp is not None:
@@ -63,22 +58,17 @@ class SceneFile:
             is_ending = metrics is None and self._stamp[1] is not None
             if scene is None or stamp == self._stamp or is_ending:
                 return None
+        is_first, self._stamp = self._stamp is None, stamp
         try:
             file = read_scene(self.path)
         except InputError:
-            # Another program may be in the middle of rewriting it: the scene so far stays for one more look.
-            if self._stamp is None or stamp == self._unreadable:
+            if is_first:
                 raise
-            self._unreadable = stamp
-            return None
-        self._stamp = stamp
-        gaussians, exposure = file.gaussians, np.ones(3)
+            return None  # another program may be in the middle of rewriting it: the scene so far stays
+        gaussians = file.gaussians
         if self._one_exposure:
             gaussians = scale_colors(gaussians, jnp.asarray(1.0 / scene_exposure(self.path), jnp.float32))
-        else:
-            with contextlib.suppress(InputError):  # of no run: the exposures of views are not known either
-                exposure = scene_exposure(self.path)
-        return ViewedScene(gaussians, file.offset, exposure, render_mode=file.render_mode)
+        return ViewedScene(gaussians, file.offset, render_mode=file.render_mode)
 
     def frame(self) -> StreamFrame | None:
         """The frame of the stream of the run that wrote the file; None if no metrics of a run are beside it."""
@@ -122,11 +112,11 @@ class _Sum:
     def viewed(self, *, one_exposure: bool) -> ViewedScene:
         """The scene in the capture's frame; there must be a delta."""
         assert self.frame is not None
-        exposure = np.ones(3) if one_exposure else self._exposure
-        scene = scale_colors(jax.tree.map(jnp.asarray, self._scene), jnp.asarray(exposure, jnp.float32))
-        offset = self.frame.offset
-        gaussians = self.frame.gaussians_to_capture(scene, offset=offset)
-        return ViewedScene(gaussians, offset, exposure, self._confidences)
+        scene = jax.tree.map(jnp.asarray, self._scene)
+        if not one_exposure:
+            scene = scale_colors(scene, jnp.asarray(self._exposure, jnp.float32))
+        gaussians = self.frame.gaussians_to_capture(scene, offset=self.frame.offset)
+        return ViewedScene(gaussians, self.frame.offset, self._confidences)
 
 
 class GrowingScene:

@@ -8,18 +8,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.cpu_backend import short_exp
 from ssplat_jax.core.errors import InputError
-from ssplat_jax.core.gaussians import Gaussians, mask_gaussians
+from ssplat_jax.core.gaussians import mask_gaussians
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.rasterizer import Effects, binning, compositing, constants, render
-from ssplat_jax.rasterizer.binning import BOX_SIZE, CHANNELS, Grid, TileIntersections, intersect_tiles, sorted_table
+from ssplat_jax.rasterizer.binning import Grid, TileIntersections, intersect_tiles, sorted_table
 from ssplat_jax.rasterizer.projection import Splats, project
 from ssplat_jax.rasterizer.reference import render_reference
 from ssplat_jax.rasterizer.render import default_max_pairs
 from tests.rasterizer import oracle
-from tests.rasterizer.scenes import cameras, cloud, concatenate
+from tests.rasterizer.scenes import cameras, cloud
 
 FORWARD = 2e-5  # float32 sums of about 60 samples, depths up to 4
 GRADIENT = 1e-4  # relative L2, float32 against float64
@@ -83,6 +82,32 @@ def test_gradients_equal_the_reference_in_float64():
         assert cosine > 0.99999, jax.tree_util.keystr(path)
 
 
+def loss_of(renderer, **options):
+    def loss(scene):
+        out = renderer(*scene, effects=Effects(background=(0.2, 0.5, 0.9)), **options)
+        return jnp.sum((out.color - 0.3) ** 2) + 0.1 * jnp.sum(out.depth**2) + jnp.sum(out.alpha**2)
+
+    return loss
+
+
+def test_second_derivatives_equal_the_reference_in_float64():
+    """The product of the Hessian with a vector, in float32, of every row of the scene and of the cameras."""
+    scene, random = (cloud(20, degree=1), cameras(12, 10, batch=2)), np.random.default_rng(0)
+    directions = jax.tree.map(lambda x: random.normal(size=x.shape), scene)
+
+    def product(loss, scene):
+        along = jax.tree.map(lambda x, d: jnp.asarray(d, x.dtype), scene, directions)
+        return jax.jit(lambda s, d: jax.jvp(jax.grad(loss), (s,), (d,))[1])(scene, along)
+
+    got = product(loss_of(render, max_pairs=1 << 12), scene)
+    with jax.enable_x64(True):
+        doubles = jax.tree.map(lambda x: x.astype(jnp.float64), scene)
+        wanted = jax.tree.map(np.asarray, product(loss_of(render_reference), doubles))
+    for (path, a), b in zip(jax.tree_util.tree_leaves_with_path(got), jax.tree.leaves(wanted), strict=True):
+        a = np.asarray(a, np.float64)
+        assert np.linalg.norm(a - b) < 1e-3 * np.linalg.norm(b), jax.tree_util.keystr(path)
+
+
 def test_a_negative_focal_length_mirrors_the_image(scene):
     """The Gaussians are large, so their shape shows where the Jacobian is taken."""
     gaussians, camera = cloud(20, size=0.3), scene[1]
@@ -133,22 +158,6 @@ def test_a_batch_equals_its_cameras_one_by_one(scene):
         np.testing.assert_array_equal(together.median_depth[i], alone.median_depth)
 
 
-@pytest.mark.slow  # programs of its own
-def test_tile_sizes_agree(scene):
-    small, large = (render(*scene, tile=tile, max_pairs=1 << 12) for tile in (8, 16))
-    np.testing.assert_allclose(small.color, large.color, atol=FORWARD)
-    assert int(large.num_pairs) < int(small.num_pairs)
-
-
-def test_absent_rows_and_their_order_change_nothing(scene):
-    gaussians, camera = scene
-    absent = mask_gaussians(gaussians, jnp.zeros(60, bool))
-    padded = render(concatenate([absent, gaussians]), camera, max_pairs=1 << 12)
-    plain = render(gaussians, camera, max_pairs=1 << 12)
-    np.testing.assert_allclose(padded.color, plain.color, atol=1e-6)
-    assert int(padded.num_pairs) == int(plain.num_pairs)
-
-
 def test_overflow_is_counted_inside_jit_and_retried_outside(scene):
     wanted = render(*scene)
     assert int(wanted.num_overflow) == 0
@@ -184,33 +193,6 @@ def test_gradients_outside_jit_include_every_pair():
         np.testing.assert_allclose(a, b, atol=1e-5 * float(jnp.abs(b).max()))
 
 
-@pytest.mark.parametrize("length", [30, 150, 600])
-@plainly
-@pytest.mark.slow  # programs of its own
-def test_long_thin_gaussians_are_as_exact_as_round_ones(length):
-    focal, turn = 1000.0, np.deg2rad(43.7)
-
-    def drawn(dtype, draw):
-        row = lambda x: jnp.asarray([x], dtype)  # noqa: E731
-        gaussians = Gaussians.from_rgb(
-            means=row([0, 0, 1]),
-            quats=row([np.cos(turn / 2), 0, 0, np.sin(turn / 2)]),
-            scales=row([length / focal, 2 / focal, 0.02 / focal]),
-            opacities=jnp.asarray([0.9], dtype),
-            colors=row([1, 0.5, 0.2]),
-        )
-        K = jnp.asarray([[focal, 0, 100.3], [0, focal, 80.7], [0, 0, 1]], dtype)
-        camera = Camera(viewmats=jnp.eye(4, dtype=dtype), Ks=K, width=200, height=160)
-        return draw(gaussians, camera, effects=Effects(antialias="none", outputs=("color", "alpha"))).alpha
-
-    fast = np.asarray(drawn(jnp.float32, render))
-    with jax.enable_x64(True):
-        exact = np.asarray(drawn(jnp.float64, render_reference))
-    assert fast.max() > 0.8
-    is_edge = np.abs(exact - 1 / 255) < 2e-4  # a sample just below 1/255 is skipped, just above it is not
-    np.testing.assert_allclose(fast[~is_edge], exact[~is_edge], atol=1e-4)
-
-
 @plainly
 def test_short_exp_is_the_exponential():
     low = constants.LOG_ALPHA_MIN
@@ -223,23 +205,6 @@ def test_short_exp_is_the_exponential():
             assert short_exp(jnp.array([-jnp.inf], dtype), low)[0] == 0
             capped = short_exp(jnp.array([compositing.LOG_ALPHA_MAX], dtype), low)[0]
             assert compositing.CAPPED_ALPHA <= capped < 1.0
-
-
-@plainly
-@pytest.mark.slow  # programs of its own
-def test_float64_is_sorted_in_float64(scene):
-    with jax.enable_x64(True):
-        two = jax.tree.map(lambda x: jnp.repeat(x[:1], 2, axis=0).astype(jnp.float64), cloud(1, degree=0, size=0.5))
-        two = replace(
-            two,
-            means=jnp.array([[0.0, 0.0, 2.0 + 1e-9], [0.0, 0.0, 2.0]]),
-            opacities=jnp.full(2, 0.95),
-            sh=jnp.array([[[1.0, 0, 0]], [[0, 1.0, 0]]]),
-        )
-        camera = Camera(viewmats=jnp.eye(4), Ks=jnp.array([[20.0, 0, 8], [0, 20, 8], [0, 0, 1]]), width=16, height=16)
-        middle = np.asarray(render(two, camera).color)[8, 8]
-        np.testing.assert_allclose(middle, np.asarray(render_reference(two, camera).color)[8, 8], atol=1e-9)
-    assert middle[1] > middle[0] + 0.2
 
 
 @plainly
@@ -276,24 +241,14 @@ def test_rows_with_non_finite_features_are_culled_and_counted(scene):
         ({"tile": 0}, "tile must be 8 or 16 pixels, got 0"),
         ({"features": jnp.zeros((3, 2))}, "features must be"),
         ({"distortion": jnp.zeros((2, 5))}, "distortion must be"),
-        ({"effects": Effects(exposure=True), "exposures": jnp.zeros((3, 3, 4))}, "exposures must be"),
+        ({"camera": cameras(21, 30, batch=2)[:0]}, "at least one camera"),
+        ({"camera": cameras(0, 30)}, "1x1"),
+        ({"gaussians": replace(cloud(degree=3), sh=jnp.zeros((60, 5, 3)))}, "1, 4, 9 or 16 terms"),
     ],
 )
 def test_bad_input_says_what_was_wanted(scene, changes, message):
     with pytest.raises(InputError, match=message):
-        render(*scene, **changes)
-
-
-def test_scenes_and_cameras_of_unknown_form_are_refused(scene):
-    with pytest.raises(InputError, match="1, 4, 9 or 16 terms"):
-        render(replace(scene[0], sh=scene[0].sh[:, :5]), scene[1])
-    with pytest.raises(InputError, match="at least one camera"):
-        render(scene[0], cameras(21, 30, batch=2)[:0])
-
-
-def test_a_camera_of_no_pixels_is_refused(scene):
-    with pytest.raises(InputError, match="1x1"):
-        render(scene[0], replace(scene[1], width=0))
+        render(**{"gaussians": scene[0], "camera": scene[1]} | changes)
 
 
 @plainly
@@ -334,102 +289,34 @@ def pairs_of(splats: Splats, grid: Grid, capacity: int) -> TileIntersections:
     return intersect_tiles(table, order // splats.depths.shape[1], grid, capacity)
 
 
-def test_rows_are_sorted_by_depth_and_gradients_return():
-    """From near to far over all cameras, ties by row, rows that touch no tile last; against NumPy's stable sort."""
-    random = np.random.default_rng(0)
-    shape = (2, 500)
-    depths = np.float32(random.choice([*np.exp(random.normal(0, 3, 100)), np.inf], shape))
-    visible = random.random(shape) < 0.8
+def test_intersections_depend_neither_on_the_capacity_nor_on_the_pieces_that_are_sorted(monkeypatch):
+    """From a capacity of 65,536 on, the smallest share that holds the pairs is sorted: every share is chosen here.
 
-    def draw(*tail):
-        entries = random.uniform(0.1, 1, (*shape, *tail)) * visible.reshape(*shape, *(1 for _ in tail))
-        return jnp.asarray(entries, jnp.float32)
-
-    splats = Splats(
-        means2d=draw(2) * jnp.array([160.0, 100.0]) - 30,
-        conic_factors=draw(3),
-        opacities=draw(),
-        depths=jnp.asarray(depths),
-        radii=10 * draw(2),
-        visible=jnp.asarray(visible),
-    )
-    channels = draw(4)
-    grid = Grid(num_images=2, height=60, width=100, tile=8)
-    sides = [np.floor((splats.means2d + sign * splats.radii) / 8) for sign in (-1, 1)]
-    low, high = (np.clip(side + after, 0, (13, 8)) for side, after in zip(sides, (0, 1), strict=True))
-    boxes = np.concatenate([low, (high - low) * visible[..., None]], axis=-1)
-    shown = boxes[..., 2:].prod(axis=-1) > 0
-    assert 500 < shown.sum() < visible.sum()
-    wanted_order = np.argsort(np.where(shown, depths, np.nan).reshape(-1), kind="stable")
-    rows = [
-        splats.means2d,
-        splats.conic_factors,
-        np.log(np.maximum(splats.opacities, 0.5 / 255))[..., None],
-        channels,
-        boxes,
-    ]
-    rows = np.concatenate(rows, axis=-1).reshape(1000, -1)[wanted_order]
-    cotangent = np.float32(random.normal(size=rows.shape))
-
-    @jax.jit
-    def table_of(means2d, channels):
-        return sorted_table(replace(splats, means2d=means2d), channels, grid)
-
-    got, pull, order = jax.vjp(table_of, splats.means2d, channels, has_aux=True)
-    num_seen = shown.sum()
-    np.testing.assert_array_equal(order, wanted_order)
-    np.testing.assert_allclose(got[:num_seen], rows[:num_seen], rtol=1e-6)
-    assert np.all(got[num_seen:, BOX_SIZE].prod(axis=-1) == 0)
-    back = np.empty_like(cotangent)
-    back[wanted_order] = cotangent
-    for gradient, columns in zip(pull(jnp.asarray(cotangent)), (slice(0, 2), CHANNELS), strict=True):
-        np.testing.assert_array_equal(gradient, back[:, columns].reshape(gradient.shape))
-
-
-def test_intersections_do_not_depend_on_the_capacity():
-    """From a capacity of 65,536 on, the smallest share that holds the pairs is sorted: every share is chosen here."""
-    size = 160
-    grid = Grid(num_images=1, height=size, width=size, tile=8)
-    gaussians = cloud(4000, degree=0, size=0.2)
-    camera = cameras(size, size)
-    one_axis = replace(camera, viewmats=camera.viewmats[None], Ks=camera.Ks[None])
-    capacity = 1 << 16
-    shares = set()
-    splats = project(gaussians, one_axis, Effects())
-    total = int(pairs_of(splats, grid, 2 * capacity).num_pairs)
-    for wanted in (0.5, 0.58, 0.68, 0.8, 0.95):
-        shown = jnp.arange(4000) < int(4000 * wanted * capacity / total)
-        part = project(mask_gaussians(gaussians, shown), one_axis, Effects())
-        chosen, plenty = (pairs_of(part, grid, n) for n in (capacity, 2 * capacity))
-        num_pairs = int(plenty.num_pairs)
-        shares.add(np.searchsorted(np.array([17, 20, 24, 28, 32]) / 32, num_pairs / capacity))
-        assert int(chosen.num_pairs) == num_pairs
-        np.testing.assert_array_equal(chosen.bounds, plenty.bounds)
-        np.testing.assert_array_equal(chosen.rows[:num_pairs], plenty.rows[:num_pairs])
-    assert shares == {0, 1, 2, 3, 4}
-
-
-def test_sorting_in_pieces_equals_one_sort(monkeypatch):
-    """Several images, capacities that the pieces do not divide, one too small, and equal depths."""
-    camera = cameras(90, 130, batch=3)
-    grid = Grid(num_images=3, height=130, width=90, tile=8)
-    gaussians = cloud(3000, degree=0, size=0.2)
+    There are several images, equal depths, a capacity that the pieces do not divide, and one too small.
+    """
+    camera, grid = cameras(90, 130, batch=3), Grid(num_images=3, height=130, width=90, tile=8)
+    gaussians = cloud(2000, degree=0, size=0.2)
     twice = jax.tree.map(lambda x: jnp.concatenate([x, x[::-1]]), gaussians)
-    splats = project(twice, camera, Effects())
-
-    def binned(pieces, capacity):
+    project_shown = jax.jit(lambda shown: project(mask_gaussians(twice, shown), camera, Effects()))
+    capacity, everything = (1 << 16) + 11, jnp.ones(4000, bool)
+    total = int(pairs_of(project_shown(everything), grid, 2 * capacity).num_pairs)
+    shares = (0.5, 0.58, 0.68, 0.8, 0.95)
+    parts = [project_shown(jnp.arange(4000) < int(4000 * share * capacity / total)) for share in shares]
+    parts.append(project_shown(everything))
+    assert total > capacity
+    found = {}
+    for pieces, room in ((1, 2 * capacity), (16, capacity)):
         monkeypatch.setattr(binning, "SORT_PIECES", pieces)
         pairs_of.clear_cache()
-        return pairs_of(splats, grid, capacity)
-
-    for capacity in ((1 << 17) + 11, 1 << 16):
-        wanted, got = binned(1, capacity), binned(16, capacity)
-        num_pairs = int(wanted.bounds[-1])
-        assert num_pairs > capacity / 8
-        assert int(got.num_pairs) == int(wanted.num_pairs)
+        found[pieces] = [pairs_of(part, grid, room) for part in parts[:-1]]
+        found[pieces].append(pairs_of(parts[-1], grid, capacity))
+    chosen = {np.searchsorted(np.array([17, 20, 24, 28, 32]) / 32, int(x.num_pairs) / capacity) for x in found[1][:-1]}
+    assert chosen == {0, 1, 2, 3, 4}
+    for wanted, got in zip(*found.values(), strict=True):
+        held = int(wanted.bounds[-1])
+        assert int(got.num_pairs) == int(wanted.num_pairs) and held > capacity / 8
         np.testing.assert_array_equal(got.bounds, wanted.bounds)
-        np.testing.assert_array_equal(got.rows[:num_pairs], wanted.rows[:num_pairs])
-    assert int(wanted.num_pairs) > capacity
+        np.testing.assert_array_equal(got.rows[:held], wanted.rows[:held])
 
 
 def test_the_schedule_of_an_accelerator_agrees(monkeypatch):

@@ -9,20 +9,13 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from ssplat_jax.config import preset
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.gaussians import Gaussians
-from ssplat_jax.data.open_capture import open_capture
-from ssplat_jax.data.split import interleaved_split
-from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.rasterizer import Effects, render
 from ssplat_jax.rasterizer.outputs import splat_channels
 from ssplat_jax.rasterizer.projection import cull_non_finite, project
 from ssplat_jax.rasterizer.reference import sample_weights
-from ssplat_jax.runs.demo import STAGES
 from ssplat_jax.scene_files.formats import load_ply
-from ssplat_jax.storage.weights import load_params
-from ssplat_jax.streaming.session import Session
 
 pytestmark = pytest.mark.slow
 
@@ -33,7 +26,7 @@ PIXELS, AT_ONCE = 256, 16
 EFFECTS = Effects()
 
 
-def garden(scenes, index: int) -> tuple[Gaussians, Camera]:
+def garden(scenes) -> tuple[Gaussians, Camera]:
     """The colored points as isotropic Gaussians at nearest-neighbor scale, at a quarter of the photo's size."""
     data = np.load(scenes / "gsplat_test_garden.npz")
     means = data["means3d"].astype(np.float32)
@@ -47,9 +40,9 @@ def garden(scenes, index: int) -> tuple[Gaussians, Camera]:
         # Black lies on the clamp of colors at 0, where rounding decides whether there is a gradient.
         colors=jnp.asarray(np.maximum(data["colors"] / 255.0, 1e-3), jnp.float32),
     )
-    K = data["Ks"][index].astype(np.float32) / np.array([[4], [4], [1]], np.float32)
+    K = data["Ks"][0].astype(np.float32) / np.array([[4], [4], [1]], np.float32)
     size = {"width": int(data["width"]) // 4, "height": int(data["height"]) // 4}
-    return gaussians, Camera(viewmats=jnp.asarray(data["viewmats"][index], jnp.float32), Ks=jnp.asarray(K), **size)
+    return gaussians, Camera(viewmats=jnp.asarray(data["viewmats"][0], jnp.float32), Ks=jnp.asarray(K), **size)
 
 
 def looking_at(gaussians: Gaussians) -> tuple[Gaussians, Camera]:
@@ -62,36 +55,10 @@ def looking_at(gaussians: Gaussians) -> tuple[Gaussians, Camera]:
     return gaussians, Camera(viewmats=jnp.asarray(viewmat), Ks=jnp.asarray(K), width=251, height=187)
 
 
-def demo() -> tuple[Gaussians, Camera]:
-    """The scene of `ssplat demo` after all views, from its middle target."""
-    model = StreamSplat(preset("tiny"))
-    session = Session(model, load_params("tiny"))
-    capture = open_capture("procedural:room")
-    split = interleaved_split(len(capture), stride=1, context=STAGES[-1])
-    frame = capture.stream_frame(model.config, split.context)
-    for chunk in capture.chunks(model.config, split.context, frame=frame):
-        session.feed(chunk)
-    gaussians = jax.tree.map(np.asarray, session.gaussians())
-    alive = gaussians.opacities > 0  # the reference's memory is not for the empty half of a cache
-    return jax.tree.map(lambda x: jnp.asarray(x[alive]), gaussians), capture.camera(split.targets[4], frame)
-
-
 SCENES = {
-    "demo": lambda request: demo(),
-    "garden 0": lambda request: garden(request.getfixturevalue("scenes"), 0),
-    "garden 1": lambda request: garden(request.getfixturevalue("scenes"), 1),
-    "garden 2": lambda request: garden(request.getfixturevalue("scenes"), 2),
-    "kacytran": lambda request: looking_at(load_ply(request.getfixturevalue("scenes") / "kacytran_iter7000.ply")),
-    "guitar": lambda request: looking_at(decoded(request.getfixturevalue("scenes") / "guitar_decoded.npz")),
+    "garden": lambda folder: garden(folder),
+    "kacytran": lambda folder: looking_at(load_ply(folder / "kacytran_iter7000.ply")),
 }
-
-
-def decoded(path) -> Gaussians:
-    """`guitar.compressed.ply` as a conforming reader decodes it."""
-    data = np.load(path)
-    names = {"means": "means", "quats": "quats_wxyz", "opacities": "opacity", "colors": "rgb"}
-    arrays = {name: jnp.asarray(data[key], jnp.float32) for name, key in names.items()}
-    return Gaussians.from_rgb(scales=jnp.exp(jnp.asarray(data["log_scales"], jnp.float32)), **arrays)
 
 
 def at_pixels(inputs, pixels):
@@ -113,8 +80,8 @@ def at_pixels(inputs, pixels):
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_tiles_equal_the_reference_in_float64(request, name):
-    inputs = SCENES[name](request)
+def test_tiles_equal_the_reference_in_float64(scenes, name):
+    inputs = SCENES[name](scenes)
     camera = inputs[1]
     random = np.random.default_rng(0)
     out = render(*inputs, effects=EFFECTS)

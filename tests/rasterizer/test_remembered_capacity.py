@@ -2,8 +2,6 @@
 
 import importlib
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -45,22 +43,3 @@ def test_a_scene_that_needs_more_room_loses_nothing(counts, monkeypatch):
     assert len(counts) == 1 and int(again.num_overflow) == 0
     np.testing.assert_array_equal(again.color, render(large, camera, max_pairs=1 << 10).color)
     assert list(module._CAPACITIES.values()) == [module.round_up(needed)]
-
-
-def test_under_grad_pairs_are_counted_every_time(counts):
-    scene, camera = cloud(12), cameras(8, 8)
-    loss = lambda g: jnp.sum(render(g, camera).color)  # noqa: E731
-    for _ in range(2):
-        assert np.isfinite(jax.grad(loss)(scene).means).all()
-    assert len(counts) == 2
-
-
-def test_few_kinds_are_remembered(monkeypatch):
-    monkeypatch.setattr(module, "_CAPACITIES", {})
-    for i in range(2 * module.MAX_REMEMBERED):
-        module._remember_capacity((i,), 10)
-    assert len(module._CAPACITIES) == module.MAX_REMEMBERED and (2 * module.MAX_REMEMBERED - 1,) in module._CAPACITIES
-    kind = (2 * module.MAX_REMEMBERED - 1,)
-    for num_pairs, wanted in ((1 << 20, 1 << 20), (1 << 18, 1 << 20), (1 << 17, 1 << 17)):
-        module._remember_capacity(kind, num_pairs)
-        assert module._CAPACITIES[kind] == wanted

@@ -27,7 +27,6 @@ from tests.commands.command_fixture import run
 from tests.scene_files.scene_fixture import FIELDS, compressed_ply, scene
 
 BOTH_WAYS = [suffix for suffix in WRITERS if suffix in READERS]
-NUM_MUTANTS = 100  # for each format; seeded, so that failures can be repeated
 
 
 @dataclasses.dataclass
@@ -81,6 +80,8 @@ def test_what_is_written_is_read_within_half_a_step(tmp_path, suffix, degree):
     gaussians, path = scene_for(degree), tmp_path / f"a{suffix}"
     report = save_gaussians(path, gaussians)
     assert (report.num_written, report.num_dropped) == (300, 0)
+    save_gaussians(tmp_path / f"again{suffix}", gaussians)
+    assert path.read_bytes() == (tmp_path / f"again{suffix}").read_bytes()
     once = ss.load_scene(path)
     assert_same(once, gaussians, STEPS[suffix])
     save_gaussians(tmp_path / f"b{suffix}", once)
@@ -95,18 +96,6 @@ def test_scenes_of_no_or_one_gaussian_are_held(tmp_path, suffix, n):
     assert found.num_gaussians == n
     if n:
         assert_same(found, scene_for(n=1), STEPS[suffix])
-
-
-@pytest.mark.parametrize("suffix", BOTH_WAYS)
-def test_hidden_rows_are_dropped_and_bytes_repeat(tmp_path, suffix):
-    gaussians = scene_for(n=20)
-    gaussians = replace(
-        gaussians, opacities=gaussians.opacities.at[3].set(0.0), means=gaussians.means.at[5].set(jnp.nan)
-    )
-    reports = [save_gaussians(tmp_path / f"{name}{suffix}", gaussians) for name in "ab"]
-    assert [(r.num_written, r.num_dropped) for r in reports] == [(18, 2)] * 2
-    assert (tmp_path / f"a{suffix}").read_bytes() == (tmp_path / f"b{suffix}").read_bytes()
-    assert ss.load_scene(tmp_path / f"a{suffix}").num_gaussians == 18
 
 
 @pytest.mark.parametrize("suffix", BOTH_WAYS)
@@ -142,46 +131,22 @@ def test_the_renderer_and_the_offset_are_kept_where_the_format_can(tmp_path, suf
         assert_same(found.gaussians, scene_for(), STEPS[suffix])
 
 
-def write_good(path, suffix: str) -> None:
-    if suffix == ".compressed.ply":
-        path.write_bytes(compressed_ply(n=12))
-    else:
-        save_gaussians(path, scene_for(n=12))
-
-
 @pytest.mark.parametrize("suffix", READERS)
-def test_files_cut_off_or_damaged_are_refused_or_finite(tmp_path, suffix):
+def test_files_cut_off_or_damaged_are_refused(tmp_path, suffix):
+    """Damage of all kinds, with its limits of time and memory, is in tests/fuzzing."""
     good, bad = tmp_path / f"a{suffix}", tmp_path / f"bad{suffix}"
-    write_good(good, suffix)
-    data, rng, num_refused = good.read_bytes(), random.Random(1), 0
-    for _ in range(NUM_MUTANTS):
-        mutant = bytearray(data[: rng.randrange(len(data))] if rng.random() < 0.3 else data)
-        for _ in range(rng.randrange(1, 4) if mutant else 0):
-            # Half of the changes are near the beginning, where headers are.
-            mutant[rng.randrange(len(mutant) if rng.random() < 0.5 else min(200, len(mutant)))] = rng.randrange(256)
-        bad.write_bytes(mutant)
-        try:
-            found = ss.load_scene(bad)
-        except InputError as error:
-            num_refused += 1
-            assert "bad" in str(error) and "\n" not in str(error) and len(str(error)) < 700
-        else:
-            assert all(np.isfinite(np.asarray(getattr(found, name))).all() for name in FIELDS)
-    assert num_refused > 0
-    for size in np.linspace(0, len(data) - 1, 40).astype(int):
-        bad.write_bytes(data[:size])
-        with pytest.raises(InputError):
+    good.write_bytes(compressed_ply(n=12))
+    if suffix in WRITERS:
+        save_gaussians(good, scene_for(n=12))
+    data, rng = good.read_bytes(), random.Random(1)
+    damaged = [data[:size] for size in np.linspace(0, len(data) - 1, 20).astype(int)]
+    for _ in range(10 if suffix in (".spz", ".sog") else 0):  # gzip and zip hold checksums
+        damaged.append(bytearray(data))
+        damaged[-1][rng.randrange(len(data) // 4, len(data) // 2)] ^= 1 << rng.randrange(8)
+    for content in damaged:
+        bad.write_bytes(content)
+        with pytest.raises(InputError, match="bad"):
             ss.load_scene(bad)
-    for _ in range(20 if suffix in (".spz", ".sog") else 0):  # gzip and zip hold checksums
-        mutant = bytearray(data)
-        mutant[rng.randrange(len(data) // 4, len(data) // 2)] ^= 1 << rng.randrange(8)
-        bad.write_bytes(mutant)
-        with pytest.raises(InputError):
-            ss.load_scene(bad)
-    Image.fromarray(np.zeros((5, 5, 3), np.uint8)).save(tmp_path / "image.png")
-    bad.write_bytes((tmp_path / "image.png").read_bytes())
-    with pytest.raises(InputError):
-        ss.load_scene(bad)
     with pytest.raises(InputError, match="cannot be read"):
         ss.load_scene(tmp_path / f"missing{suffix}")
 
@@ -192,13 +157,9 @@ def test_sh_of_no_degree_that_files_hold_is_refused(tmp_path, terms):
     for suffix in WRITERS:
         with pytest.raises(InputError, match=f"1, 4, 9 or 16 terms for each Gaussian, got {terms}"):
             save_gaussians(tmp_path / f"a{suffix}", spoiled)
-    assert not any(tmp_path.iterdir())
-
-
-def test_an_unknown_render_mode_is_refused(tmp_path):
     with pytest.raises(InputError, match="render_mode"):
         ss.save_ply(tmp_path / "b.ply", scene(0), render_mode="antialiased")
-    assert not (tmp_path / "b.ply").exists()
+    assert not any(tmp_path.iterdir())
 
 
 # One Gaussian, byte by byte.
@@ -232,21 +193,19 @@ def test_bytes_of_a_glb(tmp_path):
     assert data[20 + json_length : 28 + json_length] == struct.pack("<I4s", len(buffer), b"BIN\0")
     assert document["extensionsUsed"] == ["KHR_gaussian_splatting"]
     assert document["nodes"] == [{"mesh": 0, "rotation": [0, 0, 1, 0]}]  # upright: in glTF y points up
-    ((primitive,),) = (mesh["primitives"] for mesh in document["meshes"])
+    (primitive,) = document["meshes"][0]["primitives"]
     extension = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
     assert primitive["mode"] == 0 and primitive["extensions"] == {"KHR_gaussian_splatting": extension}
     dc = [(color - 0.5) / SH_C0 for color in (1.0, 0.0, 0.2)]
-    wanted = {"POSITION": ("VEC3", [1, -2, 3]), "KHR_gaussian_splatting:ROTATION": ("VEC4", [0.5, -0.5, 0.5, 0.5])}
-    wanted |= {"KHR_gaussian_splatting:SCALE": ("VEC3", [1, math.exp(-2), math.e])}
-    wanted |= {"KHR_gaussian_splatting:OPACITY": ("SCALAR", [0.8])}
-    wanted |= {"KHR_gaussian_splatting:SH_DEGREE_0_COEF_0": ("VEC3", dc), "COLOR_0": ("VEC4", [1, 0, 0.2, 0.8])}
-    assert list(primitive["attributes"]) == list(wanted)
-    for name, (kind, numbers) in wanted.items():
-        accessor = document["accessors"][primitive["attributes"][name]]
-        view = document["bufferViews"][accessor["bufferView"]]
+    wanted = {"POSITION": [1, -2, 3], "ROTATION": [0.5, -0.5, 0.5, 0.5], "SCALE": [1, math.exp(-2), math.e]}
+    wanted |= {"OPACITY": [0.8], "SH_DEGREE_0_COEF_0": dc, "COLOR_0": [1, 0, 0.2, 0.8]}
+    assert [name.removeprefix("KHR_gaussian_splatting:") for name in primitive["attributes"]] == list(wanted)
+    for place, numbers in zip(primitive["attributes"].values(), wanted.values(), strict=True):
+        accessor = document["accessors"][place]
+        kind = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[len(numbers)]
         assert (accessor["componentType"], accessor["count"], accessor["type"]) == (5126, 1, kind)
-        held = struct.unpack_from(f"<{len(numbers)}f", buffer, view["byteOffset"])
-        assert held == pytest.approx(numbers, abs=1e-6) and view["byteLength"] == 4 * len(numbers)
+        start = document["bufferViews"][accessor["bufferView"]]["byteOffset"]
+        assert struct.unpack_from(f"<{len(numbers)}f", buffer, start) == pytest.approx(numbers, abs=1e-6)
     assert document["accessors"][0]["min"] == document["accessors"][0]["max"] == [1, -2, 3]
 
 
@@ -276,15 +235,6 @@ def test_bytes_of_a_splat(tmp_path):
     row = (tmp_path / "a.splat").read_bytes()
     assert struct.unpack("<6f", row[:24]) == pytest.approx((1, -2, 3, 1, math.exp(-2), math.exp(1)))
     assert list(row[24:]) == [255, 0, 51, 204, 219, 128, 37, 128]  # 128 +- 90.5, rounded to even
-
-
-def test_splat_rows_are_sorted_by_coverage(tmp_path):
-    ss.save_splat(tmp_path / "a.splat", scene(n=200))
-    rows = np.frombuffer(
-        (tmp_path / "a.splat").read_bytes(), [("mean", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 8)]
-    )
-    cover = np.prod(rows["scales"].astype(np.float64), axis=1) * rows["rgba"][:, 3]
-    assert np.all(cover[1:] <= cover[:-1] * 1.05)  # opacities are rounded
 
 
 @pytest.mark.parametrize(("reach", "bits"), [(0.01, 23), (0.9999, 23), (1.0, 22), (2047.0, 12), (8e6, 0)])
@@ -330,27 +280,20 @@ def test_a_palette_of_many_different_sh_is_fitted(tmp_path, monkeypatch):
     assert np.median(errors) < 0.02 and len(np.unique(np.asarray(found.sh[:, 1:]), axis=0)) <= 16
 
 
-def test_a_sog_file_with_a_huge_image_or_number_is_refused(tmp_path, monkeypatch):
+def test_a_sog_file_with_a_huge_image_or_number_is_refused(tmp_path):
     save_gaussians(tmp_path / "a.sog", scene(0, n=5))
     with zipfile.ZipFile(tmp_path / "a.sog") as archive:
         files = {name: archive.read(name) for name in archive.namelist()}
-    meta = json.loads(files["meta.json"])
+    meta, picture = json.loads(files["meta.json"]), io.BytesIO()
     meta["means"]["mins"][0] = 10**400
-    with zipfile.ZipFile(tmp_path / "b.sog", "w") as archive:
-        for name, data in (files | {"meta.json": json.dumps(meta).encode()}).items():
-            archive.writestr(name, data)
-    with pytest.raises(InputError, match=r"b\.sog: cannot be used"):
-        read_scene(tmp_path / "b.sog")
-    picture = io.BytesIO()
     Image.new("RGB", (300, 300)).save(picture, "WEBP")
-    with zipfile.ZipFile(tmp_path / "c.sog", "w") as archive:
-        for name, data in (files | {"scales.webp": picture.getvalue()}).items():
-            archive.writestr(name, data)
-    with pytest.raises(InputError, match="300 x 300"):
-        read_scene(tmp_path / "c.sog")
-    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 1)  # as if the small images were beyond PIL's limit
-    with pytest.raises(InputError, match=r"a\.sog: cannot be used"):
-        read_scene(tmp_path / "a.sog")
+    changes = {"meta.json": json.dumps(meta).encode()}, {"scales.webp": picture.getvalue()}
+    for change, words in zip(changes, ("too large", "300 x 300"), strict=True):
+        with zipfile.ZipFile(tmp_path / "b.sog", "w") as archive:
+            for name, data in (files | change).items():
+                archive.writestr(name, data)
+        with pytest.raises(InputError, match=rf"b\.sog: cannot be used .*{words}"):
+            read_scene(tmp_path / "b.sog")
 
 
 def test_any_format_is_exported_from_any_other(tmp_path, capsys):
@@ -364,11 +307,5 @@ def test_any_format_is_exported_from_any_other(tmp_path, capsys):
     assert read_scene(tmp_path / "2.ply").render_mode == "default"
     losses = (dataclasses.astuple(STEPS[suffix]) for suffix in (".spz", ".sog"))
     assert_same(ss.load_scene(tmp_path / "5.ply"), gaussians, Steps(*map(sum, zip(*losses, strict=True))))
-
-
-@pytest.mark.parametrize("name", ["scene.txt", "scene", "scene.PLY", "scene.gltf", "scene.compressed.ply"])
-def test_formats_that_are_not_written_are_refused_before_reading(tmp_path, capsys, name):
-    assert run("export", str(tmp_path / "missing"), "--to", str(tmp_path / name)) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert "*.ply, *.spz" in line and name in line
-    assert list(tmp_path.iterdir()) == []
+    assert run("export", str(tmp_path / "missing"), "--to", str(tmp_path / "scene.gltf")) == 2
+    assert "*.ply, *.spz" in capsys.readouterr().err

@@ -43,9 +43,12 @@ def assert_same_scene(a, b):
 
 @pytest.fixture
 def good(tmp_path):
-    """Valid file of SH degree 1."""
-    save_ply(tmp_path / "good.ply", scene(1, n=12))
-    return tmp_path / "good.ply"
+    """Valid file of SH degree 1, with the line ends of Windows in its header."""
+    path = tmp_path / "good.ply"
+    save_ply(path, scene(1, n=12))
+    head, body = path.read_bytes().split(b"end_header\n", 1)
+    path.write_bytes(head.replace(b"\n", b"\r\n") + b"end_header\r\n" + body)
+    return path
 
 
 def rewritten(good, change, **form):
@@ -74,12 +77,6 @@ def test_every_encoding_is_the_same_scene(good, form, dtype):
     assert load_ply(rewritten(good, lambda t: shuffled(t)[:0], **form)).num_gaussians == 0
 
 
-def test_windows_line_ends_in_the_header(good):
-    head, body = good.read_bytes().split(b"end_header\n", 1)
-    good.with_name("crlf.ply").write_bytes(head.replace(b"\n", b"\r\n") + b"end_header\r\n" + body)
-    assert_same_scene(load_ply(good.with_name("crlf.ply")), load_ply(good))
-
-
 def test_infinite_logits_huge_scales_and_zero_quaternions_have_a_meaning(good):
     def spoil(table):
         table["opacity"][:3] = np.inf, -np.inf, 500.0
@@ -96,29 +93,19 @@ def test_infinite_logits_huge_scales_and_zero_quaternions_have_a_meaning(good):
     np.testing.assert_allclose(read.quats[3], untouched.quats[3], atol=1e-6)
 
 
-def of_ply(path) -> Gaussians:
-    """Read with plyfile, after the formulas of the format."""
-    v = PlyData.read(str(path))["vertex"].data
-    stack = lambda *names: jnp.asarray(np.stack([v[name].astype(np.float64) for name in names], -1), jnp.float32)  # noqa: E731
-    k = sum(name.startswith("f_rest_") for name in v.dtype.names) // 3
-    # The k coefficients of red, then of green, then of blue.
-    sh = jnp.stack([stack(f"f_dc_{c}", *(f"f_rest_{c * k + i}" for i in range(k))) for c in range(3)], axis=-1)
-    quats = stack("rot_0", "rot_1", "rot_2", "rot_3")
-    return Gaussians(
-        means=stack(*"xyz"),
-        quats=quats / jnp.linalg.norm(quats, axis=1, keepdims=True),
-        scales=jnp.exp(stack("scale_0", "scale_1", "scale_2")),
-        opacities=1 / (1 + jnp.exp(-stack("opacity")[:, 0])),
-        sh=sh,
-    )
-
-
-def test_a_trained_scene_agrees_with_an_independent_reader(scenes):
-    ours, theirs = (read(scenes / "kacytran_iter7000.ply") for read in (load_ply, of_ply))
+def test_a_trained_scene_holds_what_the_formulas_of_the_format_say(scenes):
+    ours = load_ply(scenes / "kacytran_iter7000.ply")
+    v = PlyData.read(str(scenes / "kacytran_iter7000.ply"))["vertex"].data
+    stack = lambda *names: np.stack([v[name].astype(np.float64) for name in names], -1)  # noqa: E731
     assert ours.num_gaussians == 9080 and ours.sh_degree == 3
-    np.testing.assert_array_equal(ours.means, theirs.means)
-    np.testing.assert_array_equal(ours.sh, theirs.sh)
-    assert_same_scene(ours, theirs)
+    np.testing.assert_array_equal(ours.means, stack(*"xyz").astype(np.float32))
+    quats = stack("rot_0", "rot_1", "rot_2", "rot_3")
+    np.testing.assert_allclose(ours.quats, quats / np.linalg.norm(quats, axis=1, keepdims=True), atol=1e-6)
+    np.testing.assert_allclose(ours.scales, np.exp(stack("scale_0", "scale_1", "scale_2")), rtol=3e-6)
+    np.testing.assert_allclose(ours.opacities, 1 / (1 + np.exp(-stack("opacity")[:, 0])), atol=1e-6)
+    for c in range(3):  # the 15 coefficients of red, then of green, then of blue
+        wanted = stack(f"f_dc_{c}", *(f"f_rest_{c * 15 + i}" for i in range(15)))
+        np.testing.assert_array_equal(ours.sh[:, :, c], wanted.astype(np.float32))
 
 
 def test_another_writers_compressed_file_is_decoded_as_it_was_meant(scenes):
@@ -129,13 +116,6 @@ def test_another_writers_compressed_file_is_decoded_as_it_was_meant(scenes):
     np.testing.assert_allclose(0.5 + SH_C0 * found.sh[:, 0], wanted["rgb"], atol=1e-6)
     unit = wanted["quats_wxyz"] / np.linalg.norm(wanted["quats_wxyz"], axis=1, keepdims=True)
     np.testing.assert_allclose(np.abs(np.sum(found.quats * unit, axis=1)), 1.0, atol=1e-6)
-
-
-def test_sh_of_a_compressed_file_are_bytes_by_channel(tmp_path):
-    path = tmp_path / "plain_name.ply"  # it is known by its header
-    path.write_bytes(compressed_ply(2))
-    levels = np.frombuffer(path.read_bytes()[-300 * 24 :], np.uint8).reshape(300, 3, 8).transpose(0, 2, 1)
-    np.testing.assert_allclose(load_ply(path).sh[:, 1:], ((levels + 0.5) / 256 - 0.5) * 8, atol=1e-6)
 
 
 def test_compressed_files_without_ranges_of_colors_are_read(tmp_path):
@@ -161,25 +141,14 @@ BAD_FILES = {
     "empty": (b"", "'ply'"),
     "endless header": (b"ply\n" + b"comment x\n" * 10000, "end_header"),
     "no format": (b"ply\nelement vertex 0\nproperty float x\nend_header\n", "format"),
-    "negative count": (header(count=-1) + ROW.tobytes(), "element vertex -1"),
-    "property twice": (header(names=(*BASE, "x")) + bytes(60), "property float x"),
-    "no vertices": (b"ply\nformat ascii 1.0\nelement face 1\nproperty float x\nend_header\n1\n", "'vertex'"),
-    "vertices of lists": (
-        b"ply\nformat ascii 1.0\nelement vertex 1\nproperty list uchar int x\nend_header\n1 1\n",
-        "'vertex'",
-    ),
     "cut off": (header(count=2) + ROW.tobytes() + ROW.tobytes()[:-1], "cut off"),
     "lying count": (header(count=4_000_000_000) + ROW.tobytes(), "4000000000 rows"),
-    "absurd count": (header(count="9" * 400) + ROW.tobytes(), "999"),
-    "words in ascii": (header(form="ascii 1.0") + b"zero " * 14, "zero"),
     "f_rest of no degree": (header(names=rest(10)) + bytes(400), "got 10"),
-    "f_rest with a gap": (header(names=(*rest(8), "f_rest_9")) + bytes(400), "'f_rest_8'"),
     "NaN": (header() + spoiled("scale_1", np.nan), "log_scales, row 0: wanted finite numbers, got nan"),
     "beyond float32": (header(form="ascii 1.0") + b"1e60 " + b"0 " * 13, "got 1e+60"),
     "an offset of words": (header().replace(b"element", b"comment offset a b c\nelement") + ROW.tobytes(), "'a'"),
     "compressed, without a limit": (compressed_ply().replace(b"max_z", b"max_a"), "'max_z'"),
     "compressed, a chunk too few": (compressed_ply().replace(b"chunk 2", b"chunk 1"), "a chunk for every 256"),
-    "compressed, fewer SH": (compressed_ply().replace(b"sh 300", b"sh 299"), "reshape"),
 }
 
 
@@ -191,8 +160,3 @@ def test_bad_file_is_refused_in_one_line(tmp_path, name):
         load_ply(tmp_path / "bad.ply")
     message = str(caught.value)
     assert words in message and "bad.ply" in message and "\n" not in message and len(message) < 600
-
-
-def test_the_unchanged_file_of_the_cases_is_good(tmp_path):
-    (tmp_path / "good.ply").write_bytes(header() + ROW.tobytes())
-    assert load_ply(tmp_path / "good.ply").num_gaussians == 1

@@ -4,7 +4,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ssplat_jax.core.errors import InputError
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.scene_files.formats import load_ply, save_gaussians, save_ply
 from ssplat_jax.scene_files.splat_rows import rows_to_write, thinned_mask
@@ -73,12 +72,3 @@ def test_export_says_what_it_left_out(tmp_path, capsys):
     )
     report = save_gaussians(tmp_path / "b.ply", hidden, max_splats=30)
     assert (report.num_written, report.num_dropped, report.num_cut) == (30, 10, 10)
-
-
-def test_no_splats_at_all_is_bad_usage(tmp_path, capsys):
-    save_ply(tmp_path / "scene.ply", scene(0))
-    to = tmp_path / "none.ply"
-    assert run("export", str(tmp_path / "scene.ply"), "--to", str(to), "--max-splats", "0") == 2
-    assert "--max-splats: wanted at least 1, got 0" in capsys.readouterr().err and not to.exists()
-    with pytest.raises(InputError, match="at least 1"):
-        save_gaussians(to, scene(0), max_splats=-3)

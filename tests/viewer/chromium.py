@@ -82,25 +82,10 @@ class Page:
         with Image.open(io.BytesIO(data)) as image:
             return np.asarray(image.convert("RGB"), np.float64) / 255
 
-    def click(self, text: str) -> None:
-        """Clicks on the button with a text."""
-        script = f"[...document.querySelectorAll('button')].find(b => b.textContent.trim() == {json.dumps(text)})"
-        self.wait_for(f"!!{script}")
-        self.evaluate(f"{script}.click()")
-
     def click_if_there(self, label: str) -> None:
         """Clicks on the buttons whose class contains a word."""
         self.wait_for("document.querySelectorAll('canvas').length > 0")
         self.evaluate(f"document.querySelectorAll('button[class*={label} i]').forEach(b => b.click())")
-
-    @staticmethod
-    def downloaded(path: Path) -> Path | None:
-        """A download that is complete; None if it is not there yet."""
-        return path if path.exists() and path.stat().st_size > 0 else None
-
-    def allow_downloads(self, folder: Path) -> None:
-        """Saves downloads in a folder, without asking."""
-        self.call("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(folder))
 
     def close(self) -> None:
         """Ends the browser."""

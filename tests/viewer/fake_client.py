@@ -54,6 +54,8 @@ def header(stream=None, exposure=(1.0, 1.0, 1.0)):
 class Handle(SimpleNamespace):
     """A control or a node of the scene."""
 
+    removed, num_updates = False, 0
+
     def on_click(self, callback):
         self.callback = callback
 
@@ -67,47 +69,15 @@ class Handle(SimpleNamespace):
 
     def set_gaussians(self, **fields):
         self.__dict__.update(fields)
-        self.num_updates = getattr(self, "num_updates", 0) + 1
-
-
-class Gui:
-    """The panel; controls are found by their label."""
-
-    def __init__(self):
-        self.controls = {}
-
-    def _add(self, label, **fields):
-        self.controls[label] = Handle(**fields)
-        return self.controls[label]
-
-    def set_panel_label(self, label):
-        self.label = label
-
-    def add_markdown(self, content):
-        return self._add("facts", content=content)
-
-    def add_dropdown(self, label, options, *, initial_value, hint):
-        return self._add(label, options=options, value=initial_value)
-
-    def add_slider(self, label, min, max, step, initial_value, *, visible, hint):
-        return self._add(label, min=min, max=max, value=initial_value, visible=visible)
-
-    def add_checkbox(self, label, initial_value, hint):
-        return self._add(label, value=initial_value)
-
-    def add_button_group(self, label, options):
-        return self._add(label, options=options)
-
-    def add_button(self, label):
-        return self._add(label)
+        self.num_updates += 1
 
 
 class FakeClient:
-    """The client: panel, scene, camera and downloads."""
+    """The client, its panel and its scene: controls by label, nodes by name, pictures and downloads."""
 
     def __init__(self, width=48, height=32):
-        self.client_id, self.gui, self.scene = 0, Gui(), self
-        self.nodes, self.backgrounds, self.downloads = {}, [], {}
+        self.client_id, self.gui, self.scene = 0, self, self
+        self.controls, self.nodes, self.backgrounds, self.downloads = {}, {}, [], {}
         self.camera = SimpleNamespace(
             wxyz=np.array([1.0, 0.0, 0.0, 0.0]),
             position=np.zeros(3),
@@ -118,16 +88,23 @@ class FakeClient:
             image_height=height,
         )
 
+    def __getattr__(self, method):
+        """Any method of viser that adds a control or a node."""
+        if not method.startswith("add_"):
+            raise AttributeError(method)
+
+        def add(name, *_, initial_value=None, **fields):
+            held = self.nodes if name.startswith("/") else self.controls
+            held[name] = Handle(value=initial_value, **fields)
+            return held[name]
+
+        return add
+
+    def set_panel_label(self, label):
+        self.label = label
+
     def atomic(self):
         return contextlib.nullcontext()
-
-    def add_gaussian_splats(self, name, **fields):
-        self.nodes[name] = Handle(**fields)
-        return self.nodes[name]
-
-    def add_camera_frustum(self, name, **fields):
-        self.nodes[name] = Handle(removed=False, **fields)
-        return self.nodes[name]
 
     def set_background_image(self, image, format, **_):
         self.backgrounds.append(image)
