@@ -2,9 +2,15 @@
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
+from ssplat_jax.core.errors import InputError, echo, refusal
 from ssplat_jax.core.pytree import pytree, static
+
+ROUNDING = 1e-3
+"""Difference of a rotation's product with its transpose from the identity that counts as rounding."""
 
 
 @pytree
@@ -35,6 +41,61 @@ class Camera:
     def __getitem__(self, idx) -> "Camera":
         """Camera or cameras at `idx` of a batch."""
         return Camera(viewmats=self.viewmats[idx], Ks=self.Ks[idx], width=self.width, height=self.height)
+
+
+def check_camera(camera: Camera, where: str, name: str = "camera") -> None:
+    """Checks the shapes of a camera and, outside of transforms, that it is a rigid pose and a pinhole without skew.
+
+    Entries that are not finite pass: a camera that was lost sees nothing.
+
+    Raises:
+        InputError: naming `where` and the field.
+    """
+    for field in ("viewmats", "Ks"):
+        if not hasattr(getattr(camera, field), "shape"):
+            raise InputError(f"{where}: {field} must be an array, got {echo(getattr(camera, field))}; wrap it.")
+    poses, intrinsics = camera.viewmats.shape, camera.Ks.shape
+    if poses[-2:] != (4, 4) or intrinsics != (*poses[:-2], 3, 3):
+        got = f"{list(poses)} and {list(intrinsics)}"
+        raise InputError(f"{where}: the {name} must have viewmats [*b 4 4] and Ks [*b 3 3], got {got}.")
+    if not all(is_whole(side) and side >= 1 for side in (camera.width, camera.height)):
+        got = f"{echo(camera.width)}x{echo(camera.height)}"
+        raise InputError(
+            f"{where}: the image of the {name} must have whole numbers of pixels, at least 1x1, got {got}."
+        )
+    if not isinstance(camera.Ks, Tracer):
+        Ks = np.asarray(camera.Ks, np.float64).reshape(-1, 3, 3)
+        Ks = Ks[np.isfinite(Ks).all(axis=(1, 2))]
+        allowed = 1e-6 * np.maximum(np.abs(Ks[:, 0, 0]), 1.0)[:, None]
+        is_bad = (np.abs(Ks[:, [0, 1, 2, 2, 2], [1, 0, 0, 1, 2]] - [0, 0, 0, 0, 1]) > allowed).any(axis=1)
+        if is_bad.any():
+            got, fix = echo(Ks[is_bad][0].tolist()), "divide by K[2, 2], and undistort images of a skewed sensor"
+            raise refusal(f"{where}: Ks", wanted="[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]", got=got, fix=fix)
+    if not isinstance(camera.viewmats, Tracer):
+        views = np.asarray(camera.viewmats, np.float64).reshape(-1, 4, 4)
+        views = views[np.isfinite(views).all(axis=(1, 2))]
+        turns = views[:, :3, :3]
+        off = np.abs(turns @ np.swapaxes(turns, 1, 2) - np.eye(3)).max(axis=(1, 2))
+        is_bad = (off > ROUNDING) | (np.abs(views[:, 3] - [0, 0, 0, 1]) > ROUNDING).any(axis=1)
+        if is_bad.any():
+            got, fix = echo(views[is_bad][0].tolist()), "give world-to-camera matrices, not transposed, without a scale"
+            raise refusal(f"{where}: viewmats", wanted="[R | t] over 0 0 0 1, R a rotation", got=got, fix=fix)
+
+
+def is_whole(number: object) -> bool:
+    """True if it is a Python or NumPy integer."""
+    return isinstance(number, int | np.integer) and not isinstance(number, bool)
+
+
+def relative_to(camera: Camera, point: tuple[float, float, float]) -> Camera:
+    """`camera` in the frame that has its origin at `point`; in float64 outside of transforms."""
+    if not any(point):
+        return camera
+    xp = jnp if isinstance(camera.viewmats, Tracer) else np
+    viewmats = xp.asarray(camera.viewmats, None if xp is jnp else np.float64)
+    moved = viewmats[..., :3, 3] + viewmats[..., :3, :3] @ xp.asarray(point, viewmats.dtype)
+    viewmats = xp.concatenate([viewmats[..., :3], xp.concatenate([moved, viewmats[..., 3, 3:]], -1)[..., None]], -1)
+    return Camera(jnp.asarray(viewmats, camera.viewmats.dtype), camera.Ks, camera.width, camera.height)
 
 
 def invert_poses(poses: Float[Array, "*b 4 4"]) -> Float[Array, "*b 4 4"]:

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ssplat_jax.core.errors import InputError
-from ssplat_jax.core.pytree import pytree, replace
+from ssplat_jax.core.pytree import pytree, replace, static
 
 SH_C0 = 0.28209479177387814  # Y_0^0, the constant band: color = 0.5 + SH_C0 * dc
 
@@ -21,6 +21,10 @@ class Gaussians:
     scales: Float[Array, "n 3"]  # standard deviations along the axes, scene units
     opacities: Float[Array, " n"]  # [0, 1]
     sh: Float[Array, "n k 3"]  # real SH, (degree + 1)^2 terms; color = clip(0.5 + sum, 0, inf)
+    render_mode: str = static(default="mip")
+    """The renderer that the scene is made for: `mip`, 3DGS with the 2D Mip filter (ours); `default`, 3DGS; `2dgs`."""
+    offset: tuple[float, float, float] = static(default=(0.0, 0.0, 0.0))
+    """What is to be added to `means`, which float32 could not hold of a scene far from its origin."""
 
     @staticmethod
     def from_rgb(

@@ -1,10 +1,16 @@
 """Numerically safe primitives. tests/stability/test_numerics.py tests every line of their limits."""
 
+import functools
 import math
+from collections.abc import Callable
+from typing import Any, TypeVar
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
+
+Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def safe_normalize(x: Float[Array, "*s n"], eps: float = 1e-12) -> Float[Array, "*s n"]:
@@ -64,3 +70,14 @@ def clip_value(x: Float[Array, "*s"], low: float, high: float) -> Float[Array, "
 def softplus_inverse(y: float) -> float:
     """The x with softplus(x) = y, for y > 0, in plain Python; for initial values."""
     return y + math.log(-math.expm1(-y))
+
+
+def with_rank_promotion(function: Function) -> Function:
+    """`function`, which broadcasts whatever `jax_numpy_rank_promotion` says to its caller's own code."""
+
+    @functools.wraps(function)
+    def promoting(*arguments, **options):
+        with jax.numpy_rank_promotion("allow"):
+            return function(*arguments, **options)
+
+    return promoting  # pyright: ignore[reportReturnType]

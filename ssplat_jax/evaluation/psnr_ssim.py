@@ -1,27 +1,30 @@
 """PSNR and SSIM, computed on the host.
 
-Images are float RGB `[h w 3]`, clipped to [0, 1]. SSIM depends on its window and weights, so results are published with
-`SSIM_ARGUMENTS`.
+Images are RGB `[h w 3]`: floats in units of white, clipped to [0, 1], or uint8. SSIM depends on its window and weights,
+so results are published with `SSIM_ARGUMENTS`.
 """
 
 import math
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Num
 from skimage.metrics import structural_similarity
 
-from ssplat_jax.core.errors import InputError
+from ssplat_jax.core.errors import InputError, refusal
 
 MIN_MSE = 1e-10
 """Lower bound of the mean squared error: PSNR is at most 100 dB, a finite number that JSON can hold."""
+
+MAX_MEAN = 2.0
+"""A mean above it is that of an image in other units, as 0 to 255."""
 
 SSIM_ARGUMENTS: dict[str, Any] = {"win_size": 11, "gaussian_weights": True, "data_range": 1.0, "channel_axis": -1}
 """Arguments of scikit-image's `structural_similarity`; its Gaussian has a standard deviation of 1.5 pixels."""
 
 
 def psnr(
-    image: Float[np.ndarray, "_ _ 3"], target: Float[np.ndarray, "_ _ 3"], seen: Bool[np.ndarray, "_ _"] | None = None
+    image: Num[np.ndarray, "_ _ 3"], target: Num[np.ndarray, "_ _ 3"], seen: Bool[np.ndarray, "_ _"] | None = None
 ) -> float:
     """Peak signal-to-noise ratio in dB, over all channels of the pixels `seen`, by default of all pixels.
 
@@ -29,7 +32,7 @@ def psnr(
         Equal images give 100 dB (`MIN_MSE`); NaN gives NaN, and so does no pixel.
 
     Raises:
-        InputError: the images differ in size or have no pixels.
+        InputError: the images differ in size, have no pixels, or are neither floats in units of white nor uint8.
     """
     image, target = _checked(image, target, 1)
     if seen is not None:
@@ -40,7 +43,7 @@ def psnr(
 
 
 def ssim(
-    image: Float[np.ndarray, "_ _ 3"], target: Float[np.ndarray, "_ _ 3"], seen: Bool[np.ndarray, "_ _"] | None = None
+    image: Num[np.ndarray, "_ _ 3"], target: Num[np.ndarray, "_ _ 3"], seen: Bool[np.ndarray, "_ _"] | None = None
 ) -> float:
     """Mean structural similarity over channels and the pixels `seen`, by default all pixels; 1 for equal images.
 
@@ -50,7 +53,7 @@ def ssim(
         NaN gives NaN.
 
     Raises:
-        InputError: the images differ in size, or have a side shorter than the window, 11 pixels.
+        InputError: as `psnr`, or a side is shorter than the window, 11 pixels.
     """
     image, target = _checked(image, target, SSIM_ARGUMENTS["win_size"])
     if seen is not None:
@@ -69,4 +72,14 @@ def _checked(image, target, min_side: int):
             f"metrics: wanted images of at least {min_side} pixels a side, got {image.shape[1]}x{image.shape[0]}; "
             "render larger ones."
         )
-    return np.clip(image.astype(np.float64), 0.0, 1.0), np.clip(target.astype(np.float64), 0.0, 1.0)
+    return _in_units_of_white(image), _in_units_of_white(target)
+
+
+def _in_units_of_white(image: np.ndarray) -> np.ndarray:
+    """An image in float64, clipped to [0, 1]; a rendered one may exceed white here and there, but not on average."""
+    if image.dtype == np.uint8:
+        return image / 255.0
+    if not np.issubdtype(image.dtype, np.floating) or np.nanmean(image, dtype=np.float64) > MAX_MEAN:
+        got, fix = f"{image.dtype} from {np.nanmin(image)} to {np.nanmax(image)}", "divide by the value of white"
+        raise refusal("metrics: image", wanted="floats in [0, 1], or uint8", got=got, fix=fix)
+    return np.clip(image.astype(np.float64), 0.0, 1.0)

@@ -24,6 +24,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from ssplat_jax.core.cpu_backend import by_platform, in_own_kernel, short_exp
+from ssplat_jax.core.numerics import with_rank_promotion
 from ssplat_jax.rasterizer import constants
 from ssplat_jax.rasterizer.binning import (
     BOX,
@@ -112,6 +113,7 @@ def _composite_fwd(grid: Grid, with_alpha: bool, table, intersections: TileInter
     return out, (table, intersections, out)
 
 
+@with_rank_promotion
 def _composite_bwd(grid: Grid, with_alpha: bool, residuals, cotangents):
     return _by_platform(functools.partial(_backward, grid, with_alpha, residuals, cotangents)), None
 

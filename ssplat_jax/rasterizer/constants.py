@@ -9,6 +9,10 @@ import math
 NEAR = 0.01
 """Gaussians at a camera z of at most this are culled, scene units (gsplat; metric scenes have surfaces before 0.2)."""
 
+NEAR_SHARES = (5e-4, 1e-2)
+"""Least and most of the typical depth of a camera's Gaussians at which they are culled, whatever the unit of a scene.
+In a scene of typical depth 1 to 20, as every stream is, `NEAR` lies between."""
+
 ALPHA_MIN = 1.0 / 255.0
 """Samples fainter than this are skipped (3DGS, Mip-Splatting, gsplat)."""
 

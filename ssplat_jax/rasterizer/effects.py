@@ -9,9 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ssplat_jax.core.cameras import Camera
-from ssplat_jax.core.errors import InputError
+from ssplat_jax.core.cameras import Camera, check_camera
+from ssplat_jax.core.errors import InputError, refusal
 from ssplat_jax.core.gaussians import Gaussians
+from ssplat_jax.core.numerics import columns, with_rank_promotion
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.rasterizer import constants
 
@@ -19,6 +20,9 @@ OUTPUTS = ("color", "alpha", "depth", "median_depth")
 
 NEEDED_ARRAYS = {"filter_3d": "captured", "distortion": "distortion", "exposure": "exposures"}
 """The fields of `Effects` that need an array, and the argument of `render` that holds it."""
+
+FILTERS = {"mip": "mip", "default": "classic"}
+"""The filter of each renderer that a scene may be made for."""
 
 FINER_SAMPLING = 1.05
 """A camera calls for the 3D filter when it samples the scene more than this times as finely as the captured ones."""
@@ -34,8 +38,9 @@ class Effects:
 
     sh_degree: int | None = None
     """Highest SH band to evaluate; None takes all that the Gaussians hold."""
-    antialias: str = "mip"
-    """`mip`: 2D Mip filter (0.1 px^2, opacity compensated); `classic`: 0.3 px^2 dilation; `none`: point sampling."""
+    antialias: str | None = None
+    """`mip`: 2D Mip filter (0.1 px^2, opacity compensated); `classic`: 0.3 px^2 dilation, as 3DGS has it; `none`: point
+    sampling. None takes the filter that the scene is made for (`Gaussians.render_mode`)."""
     filter_3d: bool | None = None
     """3D smoothing filter: limits detail to what the cameras `captured` could see (Mip-Splatting)."""
     distortion: bool | None = None
@@ -50,8 +55,8 @@ class Effects:
     def __post_init__(self) -> None:
         if self.sh_degree not in (None, 0, 1, 2, 3):
             raise InputError(f"effects: sh_degree must be None or 0 to 3, got {self.sh_degree!r}.")
-        if self.antialias not in ("mip", "classic", "none"):
-            raise InputError(f"effects: antialias must be 'mip', 'classic' or 'none', got {self.antialias!r}.")
+        if self.antialias not in (None, "mip", "classic", "none"):
+            raise InputError(f"effects: antialias must be None, 'mip', 'classic' or 'none', got {self.antialias!r}.")
         for name in NEEDED_ARRAYS:
             if not isinstance(flag := getattr(self, name), bool | None):
                 raise InputError(f"effects: {name} must be True, False or None, got {flag!r}.")
@@ -69,13 +74,16 @@ class Effects:
         """A copy with `changes`."""
         return dataclasses.replace(self, **changes)
 
-    def resolve(self, **arrays: object) -> "Effects":
-        """These effects with every flag decided, given the arrays of a render (None: not given).
+    def resolve(self, render_mode: str, **arrays: object) -> "Effects":
+        """These effects with every field decided, given a scene's render mode and the arrays of a render (or None).
 
         Raises:
-            InputError: a flag is True without its array.
+            InputError: a flag is True without its array, or the scene is made for a renderer unlike ours.
         """
-        flags = {}
+        if self.antialias is None and render_mode not in FILTERS:
+            fix = "draw it as 3D Gaussians with Effects(antialias='classic'), or where it was made"
+            raise refusal("render", wanted="a scene of 3D Gaussians", got=f"one made for {render_mode}", fix=fix)
+        flags: dict[str, Any] = {"antialias": self.antialias or FILTERS[render_mode]}
         for field, name in NEEDED_ARRAYS.items():
             flag, is_given = getattr(self, field), arrays[name] is not None
             if flag and not is_given:
@@ -86,11 +94,17 @@ class Effects:
         return self.replace(**flags)
 
     @property
+    def screen_filter(self) -> str:
+        """The filter, `mip` if none is chosen."""
+        return self.antialias or "mip"
+
+    @property
     def needs_alpha(self) -> bool:
         """True if alpha is composited: asked for, or needed by depth or background."""
         return bool({"alpha", "depth"} & set(self.outputs)) or self.background is not None
 
 
+@with_rank_promotion
 def effects_for(
     gaussians: Gaussians,
     camera: Camera,
@@ -114,7 +128,13 @@ def effects_for(
 
     Returns:
         The effects, SH degree included. A flag is False where its array is given but not needed.
+
+    Raises:
+        InputError: a camera is not usable, see `check_camera`.
     """
+    for one in (camera, captured):
+        if one is not None:
+            check_camera(one, "effects_for")
     return Effects(
         sh_degree=_used_degree(np.asarray(gaussians.sh, np.float32)),
         filter_3d=None if captured is None else _sampling_ratio(gaussians, camera, captured) > FINER_SAMPLING,
@@ -139,21 +159,45 @@ def _differ(exposures: np.ndarray) -> bool:
 
 def _sampling_ratio(gaussians: Gaussians, camera: Camera, captured: Camera) -> float:
     """Ratio of the sampling rate (f / z) of present Gaussians to that of the captured cameras: 99 % quantile."""
-    ours, theirs = (np.asarray(sampling_rates(gaussians.means, one)) for one in (camera, captured))
+    ours, theirs = (np.asarray(sampling_rates(gaussians, one)) for one in (camera, captured))
     seen = (np.asarray(gaussians.opacities) > 0) & (ours > 0) & (theirs > 0)
     return float(np.quantile(ours[seen] / theirs[seen], 0.99)) if seen.any() else 0.0
 
 
-def sampling_rates(means: Float[Array, "n 3"], captured: Camera) -> Float[Array, " n"]:
+def camera_points(means: Float[Array, "n 3"], viewmats: Float[Array, "b 4 4"]) -> tuple[Float[Array, "b n"], ...]:
+    """Camera coordinates x, y and z of world points."""
+    entries = columns(means)
+    return tuple(
+        sum(viewmats[:, i, j, None] * entries[j] for j in range(3)) + viewmats[:, i, 3, None] for i in range(3)
+    )
+
+
+def near_planes(gaussians: Gaussians, viewmats: Float[Array, "b 4 4"]) -> Float[Array, " b"]:
+    """The camera z up to which Gaussians are culled: `constants.NEAR`, limited by `constants.NEAR_SHARES`.
+
+    The typical depth is the geometric mean over the present Gaussians before the camera. Constants to the gradient.
+    """
+    means, opacities, viewmats = jax.lax.stop_gradient((gaussians.means, gaussians.opacities, viewmats))
+    depths = camera_points(means, viewmats)[2]
+    counts = (depths > 0) & (depths <= constants.MAX_MAGNITUDE) & (opacities > 0)
+    logs = jnp.where(counts, jnp.log(jnp.where(counts, depths, 1.0)), 0.0)
+    total = jnp.sum(counts, axis=1, dtype=depths.dtype)
+    typical = jnp.exp(jnp.sum(logs, axis=1) / jnp.maximum(total, 1.0))
+    least, most = (share * typical for share in constants.NEAR_SHARES)
+    return jnp.where(total > 0, jnp.clip(jnp.full_like(typical, constants.NEAR), least, most), constants.NEAR)
+
+
+def sampling_rates(gaussians: Gaussians, captured: Camera) -> Float[Array, " n"]:
     """Pixels per scene unit, f / z, in the captured camera that samples each mean most finely; 0 where none sees it.
 
-    A camera sees means in front of it and inside its image, enlarged by 15 % on each side.
+    A camera sees means before its near plane and inside its image, enlarged by 15 % on each side.
     """
+    means = gaussians.means
 
     def see(rates, one):
-        viewmat, K = one
-        x, y, z = (sum(viewmat[i, j] * means[:, j] for j in range(3)) + viewmat[i, 3] for i in range(3))
-        in_front = z > constants.NEAR
+        viewmat, K, near = one
+        x, y, z = (entry[0] for entry in camera_points(means, viewmat[None]))
+        in_front = z > near
         z = jnp.where(in_front, z, 1.0)
         u, v = K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
         margin = constants.CAPTURE_MARGIN
@@ -162,13 +206,12 @@ def sampling_rates(means: Float[Array, "n 3"], captured: Camera) -> Float[Array,
         )
         return jnp.maximum(rates, jnp.where(in_front & inside, jnp.abs(K[0, 0]) / z, 0.0)), None
 
-    cameras = (
-        captured.viewmats.reshape(-1, 4, 4).astype(means.dtype),
-        captured.Ks.reshape(-1, 3, 3).astype(means.dtype),
-    )
+    viewmats = captured.viewmats.reshape(-1, 4, 4).astype(means.dtype)
+    cameras = (viewmats, captured.Ks.reshape(-1, 3, 3).astype(means.dtype), near_planes(gaussians, viewmats))
     return jax.lax.scan(see, jnp.zeros_like(means[:, 0]), cameras)[0]
 
 
+@with_rank_promotion
 def filter_3d(gaussians: Gaussians, captured: Camera) -> Gaussians:
     """`gaussians` convolved with a Gaussian of variance 0.2 squared sampling intervals, mass preserved.
 
@@ -178,8 +221,12 @@ def filter_3d(gaussians: Gaussians, captured: Camera) -> Gaussians:
     Limits:
         No camera sees anything: the Gaussians are returned unchanged.
         Scale 0: opacity 0 (a point has no mass), gradient finite.
+
+    Raises:
+        InputError: the camera is not usable, see `check_camera`.
     """
-    rates = jax.lax.stop_gradient(sampling_rates(gaussians.means, captured))
+    check_camera(captured, "filter_3d", "captured camera")
+    rates = jax.lax.stop_gradient(sampling_rates(gaussians, captured))
     lowest = jnp.min(jnp.where((rates > 0) & (gaussians.opacities > 0), rates, jnp.inf))
     rates = jnp.where(rates > 0, rates, lowest)
     variances = constants.FILTER_3D_VARIANCE / (rates * rates)  # 0 where no Gaussian is seen

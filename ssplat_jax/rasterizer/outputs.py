@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.core.gaussians import SH_C0, Gaussians
-from ssplat_jax.core.numerics import safe_normalize
+from ssplat_jax.core.numerics import safe_normalize, with_rank_promotion
 from ssplat_jax.core.pytree import pytree
 from ssplat_jax.rasterizer.effects import Effects
 from ssplat_jax.rasterizer.projection import Splats
@@ -211,6 +211,7 @@ BACKGROUND_WEIGHT = 1e-3
 """Opacity that the background has everywhere: it shows where nothing else is near."""
 
 
+@with_rank_promotion
 def fill_holes(
     color: Float[Array, "*b h w 3"],
     alpha: Float[Array, "*b h w"],

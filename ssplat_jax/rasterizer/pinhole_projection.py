@@ -24,24 +24,27 @@ from jaxtyping import Array, Bool, Float
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.cpu_backend import kept
 from ssplat_jax.core.gaussians import Gaussians
-from ssplat_jax.core.numerics import columns, safe_normalize
+from ssplat_jax.core.numerics import columns, safe_normalize, with_rank_promotion
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.core.rotations import matrix_entries
 from ssplat_jax.rasterizer import constants
-from ssplat_jax.rasterizer.effects import Effects
-from ssplat_jax.rasterizer.projection import FILTER_VARIANCES, Splats, camera_points, project, tangent_bounds
+from ssplat_jax.rasterizer.effects import Effects, camera_points, near_planes
+from ssplat_jax.rasterizer.projection import FILTER_VARIANCES, Splats, project, tangent_bounds
 
 Entries = Sequence[Float[Array, "b n"]]
 Pair = Sequence[Entries]
 
 
-def project_pinhole(gaussians: Gaussians, camera: Camera, effects: Effects) -> Splats:
+def project_pinhole(
+    gaussians: Gaussians, camera: Camera, effects: Effects, near: Float[Array, " b"] | None = None
+) -> Splats:
     """`project` without lens distortion: the same values, and the same gradient in a fraction of the time.
 
     Args:
         gaussians: the scene, finite.
         camera: one batch axis, usable.
         effects: the filter.
+        near: as in `project`.
 
     Returns:
         Screen-space Gaussians. Gradients reach `means2d`, `conic_factors`, `opacities` and `depths`.
@@ -49,21 +52,23 @@ def project_pinhole(gaussians: Gaussians, camera: Camera, effects: Effects) -> S
     Limits:
         Those of `project`. Second derivatives are taken forward over reverse, see `render`.
     """
-    return _project(gaussians, camera, effects)  # pyright: ignore[reportReturnType] - custom_vjp hides the type
+    near = near_planes(gaussians, camera.viewmats) if near is None else near
+    return _project(gaussians, camera, near, effects)  # pyright: ignore[reportReturnType] - custom_vjp hides the type
 
 
-@functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
-def _project(gaussians: Gaussians, camera: Camera, effects: Effects):
-    return project(gaussians, camera, effects)
+@functools.partial(jax.custom_vjp, nondiff_argnums=(3,))
+def _project(gaussians: Gaussians, camera: Camera, near: Float[Array, " b"], effects: Effects):
+    return project(gaussians, camera, effects, near=near)
 
 
-def _project_fwd(gaussians: Gaussians, camera: Camera, effects: Effects):
-    splats = project(gaussians, camera, effects)
-    return splats, (gaussians, camera, splats)
+def _project_fwd(gaussians: Gaussians, camera: Camera, near: Float[Array, " b"], effects: Effects):
+    splats = project(gaussians, camera, effects, near=near)
+    return splats, (gaussians, camera, near, splats)
 
 
-def _project_bwd(effects: Effects, residuals, grads: Splats) -> tuple[Gaussians, Camera]:
-    gaussians, camera, splats = residuals
+@with_rank_promotion
+def _project_bwd(effects: Effects, residuals, grads: Splats) -> tuple[Gaussians, Camera, Array]:
+    gaussians, camera, near, splats = residuals
     visible = splats.visible
     grads = replace(
         grads,
@@ -72,7 +77,7 @@ def _project_bwd(effects: Effects, residuals, grads: Splats) -> tuple[Gaussians,
         opacities=jnp.where(visible, grads.opacities, 0.0),
         visible=visible,
     )
-    sight = _sight(gaussians, camera, visible)
+    sight = _sight(gaussians, camera, near, visible)
     axes, scales = matrix_entries(gaussians.quats), columns(gaussians.scales)
     scales = [jnp.where(visible, scale, 0.0) for scale in scales]  # infinity times zero is kept out
     always = jnp.any(visible)  # where it is false, all gradients below are 0
@@ -96,7 +101,8 @@ def _project_bwd(effects: Effects, residuals, grads: Splats) -> tuple[Gaussians,
         opacities=jnp.sum(grads.opacities * _compensation(gaussians, splats), axis=0),
         sh=jnp.zeros_like(gaussians.sh),
     )
-    return by_gaussian, _camera_grads(gaussians, camera, sight, grads, row_grads, point_grads, clipped_grads)
+    by_camera = _camera_grads(gaussians, camera, sight, grads, row_grads, point_grads, clipped_grads)
+    return by_gaussian, by_camera, jnp.zeros_like(near)
 
 
 _project.defvjp(_project_fwd, _project_bwd)
@@ -115,9 +121,9 @@ class _Sight(NamedTuple):
     rows: Pair  # rows of J W
 
 
-def _sight(gaussians: Gaussians, camera: Camera, visible: Bool[Array, "b n"]) -> _Sight:
+def _sight(gaussians: Gaussians, camera: Camera, near: Float[Array, " b"], visible: Bool[Array, "b n"]) -> _Sight:
     x, y, z = camera_points(gaussians.means, camera.viewmats)
-    in_front = z > constants.NEAR
+    in_front = z > near[:, None]
     depths = jnp.where(in_front, z, 1.0)
     tangents = tuple(jnp.where(visible, point / depths, 0.0) for point in (x, y))
     low_x, high_x, low_y, high_y = tangent_bounds(camera)
@@ -152,13 +158,13 @@ def _shape_grads(gaussians: Gaussians, splats: Splats, grads: Splats, roots, eff
     """
     p, q, r = columns(splats.conic_factors)
     by_p, by_q, by_r = columns(grads.conic_factors)
-    kernel = FILTER_VARIANCES[effects.antialias]
+    kernel = FILTER_VARIANCES[effects.screen_filter]
     if kernel < constants.MIN_RELATIVE_VARIANCE * constants.MAX_SCREEN_SIGMA**2:  # large rows have a larger one
         largest = sum(jnp.abs(jax.lax.stop_gradient(root)) for part in roots for root in part)
         kernel = jnp.maximum(kernel, constants.MIN_RELATIVE_VARIANCE * largest * largest)
     along_p = by_p * p + by_q * q
     by_compensation = over_compensation = 0.0  # times the compensation, and divided by it
-    if effects.antialias == "mip":
+    if effects.screen_filter == "mip":
         compensation = jnp.where(splats.visible, _compensation(gaussians, splats), 1.0)
         by_compensation = grads.opacities * splats.opacities
         over_compensation = grads.opacities * gaussians.opacities / compensation

@@ -17,14 +17,14 @@ from ssplat_jax.core.numerics import columns
 from ssplat_jax.core.pytree import pytree, replace
 from ssplat_jax.core.rotations import matrix_entries
 from ssplat_jax.rasterizer import constants
-from ssplat_jax.rasterizer.effects import Effects, distort, is_folded, lens_field
+from ssplat_jax.rasterizer.effects import Effects, camera_points, distort, is_folded, lens_field, near_planes
 
 FILTER_VARIANCES = {
     "mip": constants.MIP_VARIANCE,
     "classic": constants.CLASSIC_VARIANCE,
     "none": constants.MIN_SCREEN_VARIANCE,
 }
-"""px^2 added to the screen covariance, by `Effects.antialias`."""
+"""px^2 added to the screen covariance, by `Effects.screen_filter`."""
 
 
 @pytree
@@ -88,16 +88,12 @@ def cull_cameras(camera: Camera) -> tuple[Camera, Bool[Array, " b"]]:
     return replace(camera, viewmats=make_safe(camera.viewmats), Ks=make_safe(camera.Ks)), usable
 
 
-def camera_points(means: Float[Array, "n 3"], viewmats: Float[Array, "b 4 4"]) -> tuple[Float[Array, "b n"], ...]:
-    """Camera coordinates x, y and z of world points."""
-    entries = columns(means)
-    return tuple(
-        sum(viewmats[:, i, j, None] * entries[j] for j in range(3)) + viewmats[:, i, 3, None] for i in range(3)
-    )
-
-
 def project(
-    gaussians: Gaussians, camera: Camera, effects: Effects, distortion: Float[Array, "b 5"] | None = None
+    gaussians: Gaussians,
+    camera: Camera,
+    effects: Effects,
+    distortion: Float[Array, "b 5"] | None = None,
+    near: Float[Array, " b"] | None = None,
 ) -> Splats:
     """The projection of Gaussians to the screens of cameras.
 
@@ -106,12 +102,13 @@ def project(
         camera: one batch axis; skew, `Ks[0, 1]`, is not modeled.
         effects: the filter, and whether `distortion` is used.
         distortion: OPENCV coefficients.
+        near: camera z up to which Gaussians are culled; by default `near_planes`.
 
     Returns:
         Screen-space Gaussians.
 
     Limits:
-        z <= 0.01: invisible, zero gradient.
+        z <= near: invisible, zero gradient.
         Outside the image by more than 0.3 half widths (tangent): the Jacobian is that of the clamped direction.
         Scales below about 1e-6 px under the Mip filter: invisible (compensation 0), zero gradient.
         Standard deviation above 1e8 px on the screen, or mean more than 1e9 px off: invisible, zero gradient.
@@ -119,7 +116,8 @@ def project(
         Outside the first maximum of the distortion polynomial, or 89.4 degrees off axis: invisible, zero gradient.
     """
     x, y, z = camera_points(gaussians.means, camera.viewmats)
-    in_front = z > constants.NEAR
+    near = near_planes(gaussians, camera.viewmats) if near is None else near
+    in_front = z > near[:, None]
     z = jnp.where(in_front, z, 1.0)
     fx, fy, cx, cy = (camera.Ks[:, i, j, None] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
     tan_x, tan_y = x / z, y / z
@@ -213,7 +211,7 @@ def tangent_bounds(camera: Camera, wider: Float[Array, "b 1"] | None = None) -> 
 
 def _filtered(root_u, root_v, effects: Effects):
     """Conic factors, variances and opacity compensation of the screen covariance, filtered as `effects` say."""
-    kernel = FILTER_VARIANCES[effects.antialias]
+    kernel = FILTER_VARIANCES[effects.screen_filter]
     # In units of the largest entry nothing overflows at any scale; the unit is a constant to the gradient.
     largest = sum(jnp.abs(jax.lax.stop_gradient(m)) for m in (*root_u, *root_v))
     sized = largest <= constants.MAX_SCREEN_SIGMA
@@ -229,7 +227,7 @@ def _filtered(root_u, root_v, effects: Effects):
     p = jnp.sqrt(0.5 * (vv + kernel) / det_filtered)
     factors = jnp.stack([p, -p * uv / (vv + kernel), jnp.sqrt(0.5 / (vv + kernel)) / unit], axis=-1)
     variances = jnp.stack([uu + kernel, vv + kernel], axis=-1) * (unit * unit)[..., None]
-    if effects.antialias != "mip":
+    if effects.screen_filter != "mip":
         return factors, variances, jnp.where(sized, 1.0, 0.0).astype(unit.dtype)
     ratio = det * unit * unit / det_filtered
     keep = sized & (ratio > constants.MIN_COMPENSATION)

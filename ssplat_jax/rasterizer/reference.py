@@ -8,8 +8,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from ssplat_jax.core.cameras import Camera
+from ssplat_jax.core.cameras import Camera, check_camera, relative_to
 from ssplat_jax.core.gaussians import Gaussians
+from ssplat_jax.core.numerics import with_rank_promotion
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.rasterizer import constants
 from ssplat_jax.rasterizer.effects import Effects, filter_3d
@@ -41,6 +42,7 @@ def _band(splats: Splats, channels: Float[Array, "n c"], pixels: Float[Array, "q
     return jnp.sum(weights[..., None] * channels[order], axis=1), median
 
 
+@with_rank_promotion
 def render_reference(
     gaussians: Gaussians,
     camera: Camera,
@@ -64,10 +66,13 @@ def render_reference(
     Raises:
         InputError: a flag of `effects` is True without its array.
     """
-    effects = (effects or Effects()).resolve(captured=captured, distortion=distortion, exposures=exposures)
+    arrays = {"captured": captured, "distortion": distortion, "exposures": exposures}
+    effects = (effects or Effects()).resolve(gaussians.render_mode, **arrays)
+    check_camera(camera, "render_reference")
+    camera = relative_to(camera, gaussians.offset)
     gaussians, num_non_finite = cull_non_finite(gaussians, features)
     if effects.filter_3d and captured is not None:
-        gaussians = filter_3d(gaussians, captured)
+        gaussians = filter_3d(gaussians, relative_to(captured, gaussians.offset))
     flat = replace(camera, viewmats=camera.viewmats.reshape(-1, 4, 4), Ks=camera.Ks.reshape(-1, 3, 3))
     splats = project(gaussians, flat, effects, None if distortion is None else distortion.reshape(-1, 5))
     channels = splat_channels(gaussians, splats, flat, effects, features)

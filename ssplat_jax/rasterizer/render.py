@@ -1,6 +1,7 @@
 """`render`: differentiable images of Gaussians, by the tiled fast path."""
 
 import functools
+import warnings
 
 import jax
 import jax.numpy as jnp
@@ -8,9 +9,10 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Num
 
-from ssplat_jax.core.cameras import Camera
+from ssplat_jax.core.cameras import Camera, check_camera, is_whole, relative_to
 from ssplat_jax.core.errors import InputError, echo
 from ssplat_jax.core.gaussians import Gaussians, check_gaussians
+from ssplat_jax.core.numerics import with_rank_promotion
 from ssplat_jax.core.pytree import pytree, replace
 from ssplat_jax.rasterizer.binning import Grid, count_intersections, intersect_tiles, sorted_table
 from ssplat_jax.rasterizer.compositing import composite, median_rows
@@ -42,8 +44,10 @@ class RenderInputs:
     captured: Camera | None = None
     distortion: Float[Array, "*b 5"] | None = None
     exposures: Float[Array, "*b 3 4"] | None = None
+    near: Float[Array, ""] | None = None
 
 
+@with_rank_promotion
 def render(
     gaussians: Gaussians,
     camera: Camera,
@@ -53,6 +57,7 @@ def render(
     captured: Camera | None = None,
     distortion: Float[Array, "*b 5"] | None = None,
     exposures: Float[Array, "*b 3 4"] | None = None,
+    near: float | None = None,
     max_pairs: int | None = None,
     tile: int = TILE,
 ) -> RenderOutput:
@@ -73,10 +78,13 @@ def render(
         captured: the cameras that the scene was made from, for the 3D smoothing filter.
         distortion: OPENCV coefficients k1, k2, p1, p2, k3 of the lens.
         exposures: affine color correction of each frame, RGB' = matrix @ RGB + offset.
+        near: Gaussians at a camera z of at most this are culled, scene units; by default 0.01, or what fits the unit of
+            the scene (`near_planes`).
         max_pairs: capacity for tile intersections, (tile, Gaussian) pairs of all cameras. Outside jit, under `jax.grad`
             too, the default is their number, rounded up to a power of two so that few programs are compiled; they are
-            counted in the first render of a kind, and again where there are more. Inside jit
-            it is four for each Gaussian and camera: check `num_overflow`. The farthest Gaussians are left out.
+            counted in the first render of a kind, and again where there are more. Inside jit and other transforms that
+            hide the values it is four for each Gaussian and camera, and a warning says if that was too few. The
+            farthest Gaussians are left out; `num_overflow` counts the pairs.
         tile: side of a tile in pixels, 8 or 16; choose 16 where most Gaussians are larger than 8 pixels.
 
     Returns:
@@ -86,19 +94,23 @@ def render(
         InputError: an array does not have the shape above, a flag of `effects` is True without its array, `max_pairs`
             is below 1, `tile` is neither 8 nor 16, or (outside jit) there are more than 2^30 pairs.
     """
-    effects = (effects or Effects()).resolve(captured=captured, distortion=distortion, exposures=exposures)
     inputs = RenderInputs(gaussians, camera, features, captured, distortion, exposures)
     _check(inputs)
+    arrays = {"captured": captured, "distortion": distortion, "exposures": exposures}
+    effects = (effects or Effects()).resolve(gaussians.render_mode, **arrays)
+    inputs = _at_the_origin(inputs)
+    if near is not None:
+        inputs = replace(inputs, near=jnp.asarray(near, jnp.float32))
     off = {name: None for field, name in NEEDED_ARRAYS.items() if not getattr(effects, field)}
     inputs = replace(inputs, **off)
     inputs = _at_least_one_row(inputs)
-    if max_pairs is not None and not (_is_whole(max_pairs) and max_pairs >= 1):
+    if max_pairs is not None and not (is_whole(max_pairs) and max_pairs >= 1):
         raise InputError(f"render: max_pairs must be a whole number of at least 1, got {echo(max_pairs)}.")
-    if not (_is_whole(tile) and tile in TILES):
+    if not (is_whole(tile) and tile in TILES):
         raise InputError(f"render: tile must be 8 or 16 pixels, got {echo(tile)}.")
     # NumPy's integers, as of an image's shape, count as whole numbers, but have no `bit_length`.
     tile, max_pairs = int(tile), None if max_pairs is None else int(max_pairs)
-    camera = replace(camera, width=int(camera.width), height=int(camera.height))
+    camera = replace(inputs.camera, width=int(camera.width), height=int(camera.height))
     inputs = replace(inputs, camera=camera)
     # Inside jit every result is traced, even that of arrays which the function closes over.
     arrays = (*jax.tree.leaves(inputs), jnp.zeros(()))
@@ -107,14 +119,18 @@ def render(
     known = (inputs.gaussians.num_gaussians, camera.viewmats.shape, camera.width, camera.height, tile)
     if is_concrete:
         max_pairs = _CAPACITIES.get(known)  # at once: another thread may forget it
+    is_guessed = False
     if max_pairs is None:
         # Under `jax.grad` alone the primal values are concrete: without tangents, the pairs can be counted.
         counted = _count(jax.lax.stop_gradient(inputs), effects, tile)
-        is_traced = isinstance(counted, Tracer)
-        max_pairs = default_max_pairs(inputs.gaussians, camera) if is_traced else _capacity_for(int(counted))
+        is_guessed = isinstance(counted, Tracer)
+        max_pairs = default_max_pairs(inputs.gaussians, camera) if is_guessed else _capacity_for(int(counted))
     out = _render_jit(inputs, effects, max_pairs, tile)
     if not isinstance(out.num_overflow, Tracer) and int(out.num_overflow):
         out = _render_jit(inputs, effects, _capacity_for(int(out.num_pairs)), tile)
+    elif is_guessed:
+        say = lambda: jax.debug.callback(_warn_of_overflow, out.num_overflow, out.num_pairs)  # noqa: E731
+        jax.lax.cond(out.num_overflow > 0, say, lambda: None)
     if is_concrete:
         _remember_capacity(known, int(out.num_pairs))
     return out
@@ -135,6 +151,16 @@ def _remember_capacity(kind: tuple, num_pairs: int) -> None:
         _CAPACITIES.pop(next(iter(_CAPACITIES.copy())), None)
 
 
+def _warn_of_overflow(num_overflow, num_pairs) -> None:
+    """Warns of an image that lacks pairs; `vmap` and gradients call it for images that lack none too."""
+    if (lacking := int(np.max(num_overflow))) > 0:
+        warnings.warn(
+            f"render: {lacking} (tile, Gaussian) pairs were left out, since inside jit their number is not known; pass"
+            f" max_pairs={round_up(int(np.max(num_pairs)))}.",
+            stacklevel=2,
+        )
+
+
 def _capacity_for(num_pairs: int) -> int:
     """The capacity for a number of pairs.
 
@@ -147,6 +173,14 @@ def _capacity_for(num_pairs: int) -> int:
             " pass tile=16."
         )
     return round_up(num_pairs)
+
+
+def _at_the_origin(inputs: RenderInputs) -> RenderInputs:
+    """`inputs` with cameras relative to the offset of the scene, which then has none: its program serves all scenes."""
+    gaussians, offset = inputs.gaussians, inputs.gaussians.offset
+    captured = None if inputs.captured is None else relative_to(inputs.captured, offset)
+    plain = replace(gaussians, render_mode="mip", offset=(0.0, 0.0, 0.0))
+    return replace(inputs, gaussians=plain, camera=relative_to(inputs.camera, offset), captured=captured)
 
 
 def _at_least_one_row(inputs: RenderInputs) -> RenderInputs:
@@ -177,11 +211,11 @@ def _check(inputs: RenderInputs) -> None:
             raise InputError(f"render: {name} must be {held.__name__}, got {type(given).__name__}.")
     check_gaussians(inputs.gaussians, "render")
     for name in ("features", "distortion", "exposures"):
-        if getattr(inputs, name) is not None:
-            _check_array(name, getattr(inputs, name))
-    _check_camera("camera", camera)
+        if not hasattr(array := getattr(inputs, name), "shape") and array is not None:
+            raise InputError(f"render: {name} must be an array, got {echo(array)}; wrap it in jnp.asarray.")
+    check_camera(camera, "render")
     if inputs.captured is not None:
-        _check_camera("captured camera", inputs.captured)
+        check_camera(inputs.captured, "render", "captured camera")
     batch, rows = camera.viewmats.shape[:-2], inputs.gaussians.num_gaussians
     if 0 in batch:
         raise InputError(f"render: wanted at least one camera, got a batch of shape {list(batch)}.")
@@ -192,33 +226,6 @@ def _check(inputs: RenderInputs) -> None:
     for name, array, tail in (("distortion", inputs.distortion, (5,)), ("exposures", inputs.exposures, (3, 4))):
         if array is not None and array.shape != (*batch, *tail):
             raise InputError(f"render: {name} must be {[*batch, *tail]}, got {list(array.shape)}.")
-
-
-def _check_camera(name: str, camera: Camera) -> None:
-    """Refuses cameras whose arrays have the wrong shape, and sizes that are no numbers of pixels."""
-    _check_array("viewmats", camera.viewmats)
-    _check_array("Ks", camera.Ks)
-    poses, intrinsics = camera.viewmats.shape, camera.Ks.shape
-    if poses[-2:] != (4, 4) or intrinsics != (*poses[:-2], 3, 3):
-        raise InputError(
-            f"render: the {name} must have viewmats [*b 4 4] and Ks [*b 3 3], got {list(poses)} and {list(intrinsics)}."
-        )
-    if not all(_is_whole(side) and side >= 1 for side in (camera.width, camera.height)):
-        size = f"{echo(camera.width)}x{echo(camera.height)}"
-        raise InputError(
-            f"render: the image of the {name} must have whole numbers of pixels, at least 1x1, got {size}."
-        )
-
-
-def _check_array(name: str, array: object) -> None:
-    """Refuses what is not an array."""
-    if not hasattr(array, "shape"):
-        raise InputError(f"render: {name} must be an array, got {echo(array)}; wrap it in jnp.asarray.")
-
-
-def _is_whole(number: object) -> bool:
-    """True if it is a Python or NumPy integer."""
-    return isinstance(number, int | np.integer) and not isinstance(number, bool)
 
 
 def prepare(inputs: RenderInputs, effects: Effects):
@@ -246,10 +253,11 @@ def prepare(inputs: RenderInputs, effects: Effects):
     )
     distortion = None if inputs.distortion is None else inputs.distortion.reshape(-1, 5).astype(dtype)
     camera, usable = cull_cameras(camera)
+    near = None if inputs.near is None else jnp.broadcast_to(inputs.near.astype(dtype), camera.viewmats.shape[:1])
     if distortion is not None:
-        splats = project(gaussians, camera, effects, distortion)
+        splats = project(gaussians, camera, effects, distortion, near)
     else:
-        splats = project_pinhole(gaussians, camera, effects)
+        splats = project_pinhole(gaussians, camera, effects, near)
     visible = splats.visible & usable[:, None]
     splats = replace(splats, visible=visible, opacities=jnp.where(visible, splats.opacities, 0.0))
     num_unseen = jnp.sum(~usable, dtype=jnp.int32) * gaussians.num_gaussians
@@ -307,7 +315,7 @@ def render_program(gaussians: Gaussians, camera: Camera, max_pairs: int) -> jax.
         camera: the cameras, likewise.
         max_pairs: capacity for tile intersections.
     """
-    effects = Effects().resolve(captured=None, distortion=None, exposures=None)
+    effects = Effects().resolve("mip", captured=None, distortion=None, exposures=None)
     return _render_jit.lower(RenderInputs(gaussians, camera), effects, round_up(max_pairs), TILE).compile()
 
 

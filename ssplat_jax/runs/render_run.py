@@ -12,19 +12,17 @@ from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.console import Reporter
 from ssplat_jax.core.errors import refusal, require_positive
 from ssplat_jax.core.false_colors import color_depth, color_normals, eight_bits, scale_ends
-from ssplat_jax.core.gaussians import mean_color, scale_colors
+from ssplat_jax.core.gaussians import Gaussians, mean_color, scale_colors
+from ssplat_jax.core.pytree import replace
 from ssplat_jax.data.camera_path import camera_path, orbit_path
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.evaluation.pictures import evenly_spread, save_image
-from ssplat_jax.rasterizer import Effects, fill_holes, render
+from ssplat_jax.rasterizer import fill_holes, render
+from ssplat_jax.rasterizer.effects import FILTERS
 from ssplat_jax.runs.run_poses import open_capture_of_scene
-from ssplat_jax.scene_files.formats import SplatFile, read_scene
+from ssplat_jax.scene_files.formats import load_scene
 from ssplat_jax.storage.run_folder import RunFolder, lock_folder, scene_exposure
 from ssplat_jax.storage.video_writer import VideoWriter
-
-ANTIALIAS = {"mip": "mip", "default": "classic"}
-"""Antialiasing filter for each render mode that a scene file may name: with a file that names none, the dilation of
-3DGS, as its own viewers draw it."""
 
 KINDS = ("color", "depth", "normals")
 """Kinds of pictures that a film can show."""
@@ -88,20 +86,20 @@ def render_run(
     require_positive(stride=stride, **({} if max_views is None else {"max_views": max_views}))
     require_positive(**({} if film is None else {"film": film.steps}))
     file = RunFolder(scene).scene if scene.is_dir() else scene
-    splats = read_scene(file)
-    if splats.render_mode not in ANTIALIAS:
+    splats = load_scene(file)
+    if splats.render_mode not in FILTERS:
         fix = "render it where it was made"
         raise refusal(str(file), wanted="3D Gaussians", got=f"a scene of {splats.render_mode}", fix=fix)
     if one_exposure:
         factors = jnp.asarray(1.0 / scene_exposure(scene), jnp.float32)
-        splats = dataclasses.replace(splats, gaussians=scale_colors(splats.gaussians, factors))
+        splats = scale_colors(splats, factors)
     capture, folder = open_capture_of_scene(scene, path, size, reporter), RunFolder(out)
     capture.check_output_folder(out)
     folder.check_no_run()
     indices = range(0, len(capture), stride)[:max_views]
     size = (capture.width, capture.height)
     writers = {kind: VideoWriter(*size) for kind in (film.shows if film else ())}
-    background = None if over_black else mean_color(splats.gaussians)
+    background = None if over_black else mean_color(splats)
     with lock_folder(out):
         folder.clear_views()
         for kind in KINDS:
@@ -127,7 +125,7 @@ def render_run(
 
 
 def _render_picture(
-    splats: SplatFile, camtoworld: Pose, K: Intrinsics, size: tuple[int, int], background: jax.Array | None
+    splats: Gaussians, camtoworld: Pose, K: Intrinsics, size: tuple[int, int], background: jax.Array | None
 ) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
     """Color and depth (capture units, 0 where nothing is) of a scene from one camera of the capture's frame.
 
@@ -137,8 +135,7 @@ def _render_picture(
     camera = Camera(
         viewmats=jnp.asarray(frame.viewmats(camtoworld)), Ks=jnp.asarray(K, jnp.float32), width=size[0], height=size[1]
     )
-    effects = Effects(antialias=ANTIALIAS[splats.render_mode], outputs=("color", "alpha", "depth"))
-    out = render(splats.gaussians, camera, effects=effects)
+    out = render(replace(splats, offset=(0.0, 0.0, 0.0)), camera)  # the camera is relative to it already
     color = out.color if background is None else _jitted_fill_holes(out.color, out.alpha, background)
     return np.asarray(color), np.asarray(out.depth)
 
@@ -147,7 +144,7 @@ def _film_cameras(
     poses: Float64[np.ndarray, "n 4 4"],
     Ks: Float64[np.ndarray, "n 3 3"],
     film: FilmOptions,
-    splats: SplatFile,
+    splats: Gaussians,
     size: tuple[int, int],
 ) -> tuple[Float64[np.ndarray, "m 4 4"], Float64[np.ndarray, "m 3 3"]]:
     """Poses and intrinsics of a film along, or around what is seen from, the cameras of a capture."""
@@ -171,7 +168,7 @@ def _film_picture(
 
 
 def _depth_range(
-    splats: SplatFile, cameras: tuple[np.ndarray, np.ndarray], size: tuple[int, int]
+    splats: Gaussians, cameras: tuple[np.ndarray, np.ndarray], size: tuple[int, int]
 ) -> tuple[float, float]:
     """Nearest and farthest depth of a color scale that stays the same over a film, capture units."""
     chosen = evenly_spread(len(cameras[0]), RANGE_CAMERAS)
@@ -179,10 +176,10 @@ def _depth_range(
 
 
 def _depths_seen(
-    splats: SplatFile, camtoworld: Pose, K: Intrinsics, size: tuple[int, int]
+    splats: Gaussians, camtoworld: Pose, K: Intrinsics, size: tuple[int, int]
 ) -> Float64[np.ndarray, " n"]:
     """Depths of the opaque Gaussians in an image, hidden ones included."""
-    means = np.asarray(splats.gaussians.means, np.float64)[np.asarray(splats.gaussians.opacities) > 0.5]
+    means = np.asarray(splats.means, np.float64)[np.asarray(splats.opacities) > 0.5]
     points = np.einsum("ji,nj->ni", camtoworld[:3, :3], means + np.asarray(splats.offset) - camtoworld[:3, 3])
     points = points[np.isfinite(points).all(axis=1) & (points[:, 2] > 1e-6)]
     pixels = np.einsum("ij,nj->ni", K, points)[:, :2] / points[:, 2:]

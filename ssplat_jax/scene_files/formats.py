@@ -1,14 +1,17 @@
 """Reads and writes scenes in the format given by the file's name: the one boundary for files that are damaged."""
 
 import dataclasses
+import functools
 import os
 import struct
 import zipfile
 import zlib
 from collections.abc import Callable, Collection
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import zstandard
 from PIL import Image
 
 from ssplat_jax.core.atomic import write_atomic
@@ -31,18 +34,9 @@ READERS: dict[str, Callable[[bytes], SplatRows]] = {".compressed.ply": decode_pl
 READERS |= {".spz": decode_spz, ".sog": decode_sog, ".glb": decode_glb}
 DAMAGE = (
     *(ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RuntimeError, OSError, EOFError),
-    *(struct.error, zlib.error, zipfile.BadZipFile, Image.DecompressionBombError),
+    *(struct.error, zlib.error, zipfile.BadZipFile, zstandard.ZstdError, Image.DecompressionBombError),
 )
-"""Errors that struct, JSON, zip, gzip, PIL and NumPy raise for bytes that are no scene."""
-
-
-@dataclasses.dataclass(frozen=True)
-class SplatFile:
-    """Contents of a scene file: the Gaussians and the facts beside them."""
-
-    gaussians: Gaussians
-    render_mode: str  # one of `RENDER_MODES`
-    offset: Offset  # to add to the positions
+"""Errors that struct, JSON, zip, gzip, zstd, PIL and NumPy raise for bytes that are no scene."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,37 +69,45 @@ def save_gaussians(
     path: FilePath,
     gaussians: Gaussians,
     *,
-    render_mode: str = "mip",
-    offset: Offset = ORIGIN,
+    render_mode: str | None = None,
+    offset: Offset | None = None,
     max_splats: int | None = None,
+    spz_version: int = 4,
 ) -> ExportReport:
     """Writes `gaussians` to `path` atomically, in the format of its extension; the same Gaussians give the same bytes.
 
     Args:
         path: the file to write; its name ends as one of `WRITERS`. Missing folders are created.
         gaussians: the scene, in the frame of the file.
-        render_mode: the renderer that the scene is made for, one of `RENDER_MODES`; a .spz and a .sog store only
-            whether it is "mip", a .splat nothing.
-        offset: origin of `gaussians` in the frame of the capture; a .spz, .sog or .splat does not store it.
+        render_mode: the renderer that the scene is made for, one of `RENDER_MODES`, by default what `gaussians` say; a
+            .spz and a .sog store only whether it is "mip", a .splat nothing.
+        offset: origin of `gaussians` in the frame of the capture, by default theirs; a .spz, .sog or .splat does not
+            store it.
         max_splats: most Gaussians to write; opaque ones are kept first, everywhere alike.
+        spz_version: version of a .spz, 4 or 3.
 
     Raises:
-        InputError: an unknown extension or render mode, positions outside the range of the format, a wrong shape.
+        InputError: an unknown extension or render mode, positions or sizes that the format cannot hold, a wrong shape.
         StorageError: the file cannot be written.
     """
-    return _save(path, gaussians, WRITERS[check_format(path)], render_mode, offset, max_splats)
+    encode = WRITERS[check_format(path)]
+    encode = functools.partial(encode_spz, version=spz_version) if encode is encode_spz else encode
+    return _save(path, gaussians, encode, render_mode, offset, max_splats)
 
 
 def save_ply(
-    path: FilePath, gaussians: Gaussians, *, render_mode: str = "mip", offset: Offset = ORIGIN
+    path: FilePath, gaussians: Gaussians, *, render_mode: str | None = None, offset: Offset | None = None
 ) -> ExportReport:
     """Writes a 3DGS .ply, whatever the file's name; see `save_gaussians`."""
     return _save(path, gaussians, encode_ply, render_mode, offset)
 
 
-def save_spz(path: FilePath, gaussians: Gaussians, *, antialiased: bool = True) -> ExportReport:
-    """Writes a .spz; `antialiased` marks it as made for a renderer with the 2D Mip filter. See `save_gaussians`."""
-    return _save(path, gaussians, encode_spz, "mip" if antialiased else "default")
+def save_spz(
+    path: FilePath, gaussians: Gaussians, *, antialiased: bool | None = None, version: int = 4
+) -> ExportReport:
+    """Writes a .spz; `antialiased` says that it is made for a renderer with the 2D Mip filter. See `save_gaussians`."""
+    encode = functools.partial(encode_spz, version=version)
+    return _save(path, gaussians, encode, None if antialiased is None else "mip" if antialiased else "default")
 
 
 def save_splat(path: FilePath, gaussians: Gaussians) -> ExportReport:
@@ -113,7 +115,9 @@ def save_splat(path: FilePath, gaussians: Gaussians) -> ExportReport:
     return _save(path, gaussians, encode_splat)
 
 
-def _save(path, gaussians, encode, render_mode="mip", offset=ORIGIN, max_splats=None) -> ExportReport:
+def _save(path, gaussians, encode, render_mode=None, offset=None, max_splats=None) -> ExportReport:
+    render_mode = gaussians.render_mode if render_mode is None else render_mode
+    offset = gaussians.offset if offset is None else offset
     if render_mode not in RENDER_MODES:
         raise refusal("render_mode", wanted=f"one of {', '.join(RENDER_MODES)}", got=repr(render_mode), fix="use one")
     if max_splats is not None and max_splats < 1:
@@ -123,10 +127,8 @@ def _save(path, gaussians, encode, render_mode="mip", offset=ORIGIN, max_splats=
     return ExportReport(len(rows), gaussians.num_gaussians - len(rows) - num_cut, offset, num_cut)
 
 
-def read_scene(path: FilePath) -> SplatFile:
-    """Reads a scene file in any of `READERS`.
-
-    An offset is not added to the positions, so that float32 stays exact.
+def load_scene(path: FilePath) -> Gaussians:
+    """The Gaussians of a scene file, .ply, .compressed.ply, .spz, .sog or .glb, with its render mode and its offset.
 
     Raises:
         InputError: an unknown extension, or the file is damaged or of another format than its name says.
@@ -134,17 +136,12 @@ def read_scene(path: FilePath) -> SplatFile:
     return _read(path, check_format(path, "scene", READERS))
 
 
-def load_scene(path: FilePath) -> Gaussians:
-    """The Gaussians of a scene file: .ply, .compressed.ply, .spz, .sog or .glb; see `read_scene`."""
-    return read_scene(path).gaussians
-
-
 def load_ply(path: FilePath) -> Gaussians:
-    """The Gaussians of a .ply, compressed or not, whatever the file's name; see `read_scene`."""
-    return _read(path, ".ply").gaussians
+    """The Gaussians of a .ply, compressed or not, whatever the file's name; see `load_scene`."""
+    return _read(path, ".ply")
 
 
-def _read(path: FilePath, suffix: str) -> SplatFile:
+def _read(path: FilePath, suffix: str) -> Gaussians:
     try:
         data = Path(path).read_bytes()
     except OSError as error:
@@ -152,15 +149,13 @@ def _read(path: FilePath, suffix: str) -> SplatFile:
         raise refusal(str(path), wanted=f"a {suffix} file", got=came, fix="check the path") from error
     try:
         with np.errstate(all="ignore"):  # infinities and NaNs are refused by what they mean
-            rows = READERS[suffix](data)
-            return SplatFile(gaussians_of_rows(rows), rows.render_mode, rows.offset)
+            return gaussians_of_rows(READERS[suffix](data))
     except DAMAGE as error:
         cause = " ".join((str(error) if type(error) is ValueError else repr(error)).split())
         raise InputError(f"{path}: cannot be used as a {suffix} file: {cause:.300}; write it again.") from error
 
 
-def convert_scene(scene: Path, to: Path, max_splats: int | None = None) -> ExportReport:
-    """Writes the scene file `scene` in the format given by the name of `to`; see `read_scene` and `save_gaussians`."""
+def convert_scene(scene: Path, to: Path, **options: Any) -> ExportReport:
+    """Writes the scene file `scene` in the format given by the name of `to`; see `load_scene` and `save_gaussians`."""
     check_format(to)
-    file = read_scene(scene)
-    return save_gaussians(to, file.gaussians, render_mode=file.render_mode, offset=file.offset, max_splats=max_splats)
+    return save_gaussians(to, load_scene(scene), **options)

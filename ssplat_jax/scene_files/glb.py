@@ -20,8 +20,7 @@ from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
 from ssplat_jax.core.gaussians import SH_C0
-from ssplat_jax.core.rotations import sh_rotation
-from ssplat_jax.scene_files.splat_rows import LOG_SCALE_LIMIT, RENDER_MODES, SH_TERMS, SplatRows, unit_quats
+from ssplat_jax.scene_files.splat_rows import LOG_SCALE_LIMIT, RENDER_MODES, SH_TERMS, SplatRows, placed
 
 EXTENSION = "KHR_gaussian_splatting"
 MAGIC, VERSION, JSON_CHUNK, BINARY_CHUNK = b"glTF", 2, b"JSON", b"BIN\0"
@@ -30,7 +29,8 @@ COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", FLOAT: "<f4"}
 TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}  # by number of columns
 HALF_TURN = [0.0, 0.0, 1.0, 0.0]  # quaternion xyzw of 180 degrees about z
 AXIS_FLIP = np.diag([-1.0, -1.0, 1.0])  # from the axes of glTF, y up, to those of a .ply: undoes `HALF_TURN`
-UNIFORM, ROUNDING = 1e-4, 1e-12  # differences up to which a node scales evenly, and does not turn
+MEANING = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "projection": "perspective"}
+"""What the extension may say of Gaussians for them to be ours; others are drawn otherwise."""
 
 
 def encode_glb(rows: SplatRows) -> bytes:
@@ -75,7 +75,7 @@ def _document(rows: SplatRows) -> tuple[dict, bytes]:
     primitive = {
         "mode": POINTS,
         "attributes": {name: place for place, name in enumerate(attributes)},
-        "extensions": {EXTENSION: {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}},
+        "extensions": {EXTENSION: {name: MEANING[name] for name in ("kernel", "colorSpace")}},
     }
     return scene | {
         "scenes": [{"nodes": [0]}],
@@ -98,7 +98,7 @@ def decode_glb(data: bytes) -> SplatRows:
     empty = {"means": (0, 3), "quats": (0, 4), "log_scales": (0, 3), "opacities": (0,), "sh": (0, 1, 3)}
     parts: list[dict[str, Any]] = [{name: np.zeros(shape) for name, shape in empty.items()}]
     for primitive, transform in _primitives(document, nodes, np.eye(4), set()):
-        parts.append(_placed(_columns(document, buffer, primitive), AXIS_FLIP @ transform[:3]))
+        parts.append(placed(_columns(document, buffer, primitive), AXIS_FLIP @ transform[:3]))
     if len(parts) == 1 and EXTENSION not in document.get("extensionsUsed", []):
         raise ValueError(f"wanted Gaussians by {EXTENSION}, it has none")
     terms = max(part["sh"].shape[1] for part in parts)
@@ -144,7 +144,10 @@ def _transform(node: dict) -> Float64[np.ndarray, "4 4"]:
 
 def _columns(document: dict, buffer: bytes, primitive: dict) -> dict[str, np.ndarray]:
     """The columns of a primitive, before its transform."""
-    attributes = primitive["attributes"]
+    attributes, extension = primitive["attributes"], primitive["extensions"][EXTENSION]
+    for name, ours in MEANING.items():
+        if extension.get(name, ours) != ours:
+            raise ValueError(f"wanted Gaussians of the {name} {ours}, got {extension[name]!a:.80}")
     terms = next((terms for terms in reversed(SH_TERMS) if sh_names(terms)[-1] in attributes), 0)
     if terms == 0:
         raise ValueError("it has no SH coefficients, or compressed attributes")
@@ -182,21 +185,3 @@ def _accessor(document: dict, buffer: bytes, number: int, width: int) -> Float64
     values = np.ndarray(shape, dtype, buffer, start, (stride, dtype.itemsize)) if count else np.zeros(shape, dtype)
     values = values.astype(np.float64)
     return np.maximum(values / np.iinfo(dtype).max, -1.0) if accessor.get("normalized", False) else values
-
-
-def _placed(columns: dict[str, np.ndarray], transform: Float64[np.ndarray, "3 4"]) -> dict[str, np.ndarray]:
-    """Columns after a transform."""
-    linear, shift = transform[:, :3], transform[:, 3]
-    scale = float(np.linalg.norm(linear, axis=0).mean())
-    rotation = linear / scale if scale > 0 else linear
-    if not (np.abs(rotation.T @ rotation - np.eye(3)) <= UNIFORM).all() or np.linalg.det(rotation) < 0:
-        raise ValueError("wanted nodes that turn, move and scale, got one that stretches")
-    moved = {"means": columns["means"] @ linear.T + shift, "log_scales": columns["log_scales"] + np.log(scale)}
-    if np.abs(rotation - np.eye(3)).max() <= ROUNDING:  # not turned: quaternions and SH keep every bit
-        return columns | moved
-    turned = Rotation.from_matrix(rotation) * Rotation.from_quat(unit_quats(columns["quats"]), scalar_first=True)
-    degree = round(columns["sh"].shape[1] ** 0.5) - 1
-    sh = np.einsum("kl,nlc->nkc", sh_rotation(rotation, degree), columns["sh"])
-    quats = turned.as_quat(scalar_first=True)
-    quats[~np.isfinite(columns["quats"]).all(axis=1)] = np.nan  # `unit_quats` hides it; NaN is refused later
-    return columns | moved | {"quats": quats, "sh": sh}

@@ -9,9 +9,11 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int, UInt8
+from scipy.spatial.transform import Rotation
 
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.core.gaussians import Gaussians, check_gaussians
+from ssplat_jax.core.rotations import sh_rotation
 
 RENDER_MODES = ("default", "mip", "2dgs")
 """Renderers that scenes are made for: 3DGS, 3DGS with the 2D Mip filter (ours), and 2D Gaussian Splatting."""
@@ -20,7 +22,7 @@ MIN_OPACITY = 1.0 / 255.0  # below it every renderer shows nothing, and nothing 
 OPACITY_GUARD = 1e-6  # opacities are clamped this far from 0 and 1, where the logit is infinite
 LOG_SCALE_LIMIT = 20.0
 """|ln sigma| is clamped to this, 2e-9 to 5e8 units: the range of the compressed formats that are made from a .ply."""
-ROUNDING = 1e-9
+UNIFORM, ROUNDING = 1e-4, 1e-9  # a transform that scales unevenly by less does not stretch; differences of rounding
 HALF_RANGE = np.sqrt(0.5)  # upper bound of the magnitude of every entry of a unit quaternion but the largest
 MORTON_BITS = 21  # of each coordinate: three of them fit a 64-bit key
 SPREADING = {32: 0x1F00000000FFFF, 16: 0x1F0000FF0000FF, 8: 0x100F00F00F00F00F}
@@ -106,6 +108,9 @@ def gaussians_of_rows(rows: SplatRows) -> Gaussians:
     Raises:
         ValueError: an entry is not finite in float32.
     """
+    # Other writers hold discs without thickness, of ln scale -inf.
+    log_scales = np.where(np.isneginf(rows.log_scales), -LOG_SCALE_LIMIT, rows.log_scales)
+    rows = dataclasses.replace(rows, log_scales=log_scales)
     for name in ("means", "quats", "log_scales", "opacities", "sh", "offset"):
         column = np.asarray(getattr(rows, name), np.float64)
         bad = ~(np.abs(column) <= np.finfo(np.float32).max)
@@ -118,7 +123,32 @@ def gaussians_of_rows(rows: SplatRows) -> Gaussians:
         "opacities": np.clip(rows.opacities, 0.0, 1.0),
         "sh": rows.sh,
     }
-    return Gaussians(**{name: jnp.asarray(field, jnp.float32) for name, field in fields.items()})
+    arrays = {name: jnp.asarray(field, jnp.float32) for name, field in fields.items()}
+    return Gaussians(**arrays, render_mode=rows.render_mode, offset=rows.offset)
+
+
+def placed(columns: dict[str, np.ndarray], transform: Float64[np.ndarray, "3 4"]) -> dict[str, np.ndarray]:
+    """Columns of rows after a similarity transform, which may mirror.
+
+    Raises:
+        ValueError: the transform stretches.
+    """
+    linear, shift = transform[:, :3], transform[:, 3]
+    scale = float(np.linalg.norm(linear, axis=0).mean())
+    rotation = linear / scale if scale > 0 else linear
+    if not (np.abs(rotation.T @ rotation - np.eye(3)) <= UNIFORM).all():
+        raise ValueError("wanted a transform that turns, mirrors, moves and scales, got one that stretches")
+    moved = {"means": columns["means"] @ linear.T + shift, "log_scales": columns["log_scales"] + np.log(scale)}
+    if np.abs(rotation - np.eye(3)).max() <= ROUNDING:  # not turned: quaternions and SH keep every bit
+        return columns | moved
+    # A Gaussian is its own mirror image through its mean: a reflection turns it as the opposite rotation does.
+    turn = Rotation.from_matrix(np.sign(np.linalg.det(rotation)) * rotation)
+    turned = turn * Rotation.from_quat(unit_quats(columns["quats"]), scalar_first=True)
+    degree = round(columns["sh"].shape[1] ** 0.5) - 1
+    sh = np.einsum("kl,nlc->nkc", sh_rotation(rotation, degree), columns["sh"])
+    quats = turned.as_quat(scalar_first=True)
+    quats[~np.isfinite(columns["quats"]).all(axis=1)] = np.nan  # `unit_quats` hides it; NaN is refused later
+    return columns | moved | {"quats": quats, "sh": sh}
 
 
 def unit_quats(quats: Float64[np.ndarray, "n 4"]) -> Float64[np.ndarray, "n 4"]:

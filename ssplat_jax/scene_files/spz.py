@@ -1,14 +1,15 @@
-"""The .spz file (Niantic), for browsers and phones: versions 2 and 3 are read, version 3 is written.
+"""The .spz file (Niantic), for browsers and phones: versions 2 to 4 are read, 4 and on request 3 are written.
 
-A gzip stream of a 16-byte header and the fields one after the other, each for all Gaussians:
+A file holds the fields one after the other, each for all Gaussians:
 
     positions (3 x 24 bits, fixed point) · opacities (8 bits) · colors (3 x 8) · ln scales (3 x 8, sixteenths)
     · quaternions (32: which entry is largest, then the others in 10 bits each) · f_rest (8 each, term by term)
 
-Version 2 differs in the rotation: x, y and z of a quaternion with w >= 0 in 8 bits each. Version 4 needs zstandard,
-which the standard library lacks. The axes of the format are x right, y up, z backward. They differ from ours by a
-rotation of 180 degrees about x, which applies to means and quaternions and flips the signs of some SH terms.
-Reference: github.com/nianticlabs/spz.
+Version 4 is a plain header of 32 bytes; records of extensions, each a type, a length and its contents; a table of the
+compressed and the full size of every field; and the fields, each a frame of zstd. Versions 2 and 3 are a gzip stream of
+a header of 16 bytes and the fields. Version 2 differs in the rotation: x, y and z of a quaternion with w >= 0 in 8 bits
+each. The axes of the format are x right, y up, z backward, unless a record names others; those of a .ply are x right,
+y down, z forward. Reference: github.com/nianticlabs/spz.
 """
 
 import gzip
@@ -16,52 +17,81 @@ import io
 import struct
 
 import numpy as np
+import zstandard
 from jaxtyping import Float64, UInt8, UInt32
 
 from ssplat_jax.core.errors import refusal
-from ssplat_jax.scene_files.splat_rows import HALF_RANGE, SplatRows, drop_largest, to_bytes, with_largest
+from ssplat_jax.core.rotations import sh_rotation
+from ssplat_jax.scene_files.splat_rows import HALF_RANGE, SplatRows, drop_largest, placed, to_bytes, with_largest
 
-MAGIC, VERSION = b"NGSP", 3
-HEADER = struct.Struct("<4sIIBBBB")
-ANTIALIASED = 1  # flag: made for a renderer with the 2D Mip filter
+MAGIC = b"NGSP"
+VERSIONS = (4, 3)
+"""Versions that are written, the usual one first."""
+OLD_HEADER = struct.Struct("<4sIIBBBB")
+HEADER = struct.Struct("<4sIIBBBBI12x")
+SIZES, RECORD = struct.Struct("<QQ"), struct.Struct("<II")
+ANTIALIASED, HAS_RECORDS = 1, 2  # flags: made for a renderer with the 2D Mip filter; there are records
+AXES_RECORD = 0xADBE0003
+AXES = "RUB LDB RDB LUB RUB LDF RDF LUF RUF LFD RFD LFU RFU LBD RBD LBU RBU".split()  # noqa: SIM905
+"""Where x, y and z point in the axes that a record names by number: left or right, up or down, front or back."""
+DIRECTIONS = {"R": (1, 0, 0), "L": (-1, 0, 0), "D": (0, 1, 0), "U": (0, -1, 0), "F": (0, 0, 1), "B": (0, 0, -1)}
+COMPRESSION = 12  # level of zstd
 POSITION_BITS = 24
 COLOR_STEP = 0.15  # factor of f_dc; it leaves room for colors outside [0, 1], which other SH terms compensate
-HALF_TURN = np.array([1.0, -1.0, -1.0])  # rotation by 180 degrees about x
-SH_SIGNS = np.array([-1, -1, 1, *(-1, 1, 1, -1, 1), *(-1, 1, -1, -1, 1, -1, 1)], np.float64)
-"""Sign of each SH term of bands 1 to 3 (y z x; xy yz zz xz xx-yy; ...) after y and z are negated."""
+LOG_SCALES = (-10.0, 255 / 16 - 10)  # least and largest
+MAX_CLIPPED = 0.01  # share of the Gaussians whose size may be clipped
 MAX_RATIO = 1032
-"""Most bytes that deflate can make of one."""
+"""Most bytes that a compressed byte may become: what deflate can make of one, and more than zstd does of a scene."""
 
 
-def encode_spz(rows: SplatRows) -> bytes:
-    """The bytes of a .spz of version 3.
+def encode_spz(rows: SplatRows, version: int = VERSIONS[0]) -> bytes:
+    """The bytes of a .spz of version 3 or 4.
 
     Limits:
         Standard deviations are quantized in steps of 6 % and clipped to [4.5e-5, 377] units, f_rest to [-1, 1], f_dc to
         [-3.3, 3.3]. The error of a position is at most 2^-23 of the largest coordinate, or 2^-24 units if that is more.
 
     Raises:
-        InputError: a Gaussian lies 2^23 units or farther from the origin.
+        InputError: a Gaussian lies 2^23 units or farther from the origin, over 1 % of the Gaussians have a larger or
+            smaller size than the format holds, or another version.
     """
+    if version not in VERSIONS:
+        raise refusal("save_spz", wanted="version 3 or 4", got=version, fix="leave it out for version 4")
     limit, reach = (1 << POSITION_BITS - 1) - 1, np.abs(rows.means).max(initial=0.0)
     if reach > limit:
         wanted = f"positions within {limit} units of the origin"
         raise refusal("save_spz", wanted=wanted, got=f"one at {reach:g}", fix="write a .ply")
+    sizes = rows.log_scales.max(axis=1, initial=-np.inf)
+    is_clipped = (sizes < LOG_SCALES[0] - 1 / 32) | (sizes > LOG_SCALES[1] + 1 / 32)
+    if len(rows) and np.mean(is_clipped) > MAX_CLIPPED:
+        wanted, got = "Gaussians of 4.5e-05 to 377 units", f"{np.exp(np.median(sizes)):.2g} units for the middle one"
+        raise refusal("save_spz", wanted=wanted, got=got, fix="write a .ply, .glb or .sog, which hold any unit")
     fractional_bits = next(bits for bits in reversed(range(POSITION_BITS)) if reach * 2**bits <= limit)  # all that fit
-    fixed = np.round(HALF_TURN * rows.means * 2**fractional_bits).astype("<i4")
-    terms = rows.sh.shape[1] - 1
-    degree, flags = round((terms + 1) ** 0.5) - 1, ANTIALIASED * (rows.render_mode == "mip")
+    turn, degree = _axes("RUB").T, round(rows.sh.shape[1] ** 0.5) - 1
+    fixed = np.round(rows.means @ turn.T * 2**fractional_bits).astype("<i4")
+    signs = np.round(np.diag(sh_rotation(turn, degree)))[1:, None]
     fields = (
         fixed.view(np.uint8).reshape(-1, 3, 4)[:, :, :3],  # the low three bytes
         to_bytes(255 * rows.opacities),
         to_bytes(255 * (0.5 + COLOR_STEP * rows.sh[:, 0])),
-        to_bytes(16 * (rows.log_scales + 10)),
-        _pack_rotations(rows.quats[:, [1, 2, 3, 0]] * [*HALF_TURN, 1.0]),
-        to_bytes(128 + 128 * SH_SIGNS[:terms, None] * rows.sh[:, 1:]),
+        to_bytes(16 * (rows.log_scales - LOG_SCALES[0])),
+        _pack_rotations(rows.quats[:, [1, 2, 3, 0]] * [*np.diag(turn), 1.0]),
+        to_bytes(128 + 128 * signs * rows.sh[:, 1:]),
     )
-    header = HEADER.pack(MAGIC, VERSION, len(rows), degree, fractional_bits, flags, 0)
-    # No time in the stream: the same scene gives the same bytes.
-    return gzip.compress(header + b"".join(field.tobytes() for field in fields), mtime=0)
+    flags, parts = ANTIALIASED * (rows.render_mode == "mip"), [field.tobytes() for field in fields]
+    facts = (MAGIC, version, len(rows), degree, fractional_bits, flags)
+    if version == 3:  # no time in the stream: the same scene gives the same bytes
+        return gzip.compress(OLD_HEADER.pack(*facts, 0) + b"".join(parts), mtime=0)
+    parts = parts if degree else parts[:-1]
+    compressor = zstandard.ZstdCompressor(level=COMPRESSION, write_checksum=True, write_content_size=True)
+    frames = [compressor.compress(part) for part in parts]
+    table = [SIZES.pack(len(frame), len(part)) for frame, part in zip(frames, parts, strict=True)]
+    return HEADER.pack(*facts, len(frames), HEADER.size) + b"".join([*table, *frames])
+
+
+def _axes(letters: str) -> Float64[np.ndarray, "3 3"]:
+    """Matrix from axes that point as the letters say to those of a .ply."""
+    return np.array([DIRECTIONS[letter] for letter in letters], np.float64).T
 
 
 def _pack_rotations(quats: Float64[np.ndarray, "n 4"]) -> UInt32[np.ndarray, " n"]:
@@ -75,37 +105,87 @@ def _pack_rotations(quats: Float64[np.ndarray, "n 4"]) -> UInt32[np.ndarray, " n
 
 
 def decode_spz(data: bytes) -> SplatRows:
-    """The rows of a .spz of version 2 or 3."""
-    if data[:4] == MAGIC:
-        raise ValueError("it is of version 4 or later; convert it to version 3")
-    with gzip.GzipFile(fileobj=io.BytesIO(data)) as stream:
-        magic, version, count, degree, fractional_bits, flags, _ = HEADER.unpack(stream.read(HEADER.size))
-        if magic != MAGIC or version not in (2, 3) or degree > 3:
-            raise ValueError(f"wanted version 2 or 3 and SH degree 0 to 3, got version {version}, degree {degree}")
-        widths = (9, 1, 3, 3, version + 1, 3 * ((degree + 1) ** 2 - 1))
-        size = count * sum(widths)
-        body = stream.read(size) if size <= len(data) * MAX_RATIO else b""  # else the count is damaged
-        stream.read(1)  # to the end, where gzip compares the checksum
-    if len(body) < size:
-        raise ValueError(f"wanted {size} bytes for {count} Gaussians; it is cut off")
-    parts = np.split(np.frombuffer(body, np.uint8, size), count * np.cumsum(widths)[:-1])
+    """The rows of a .spz of version 2, 3 or 4."""
+    facts, widths, body, axes = _read_frames(data) if data[:4] == MAGIC else _read_stream(data)
+    version, count, fractional_bits, flags = facts
+    parts = np.split(np.frombuffer(body, np.uint8), count * np.cumsum(widths)[:-1])
     means, alphas, colors, scales, quats, rest = (
         part.reshape(count, width) for part, width in zip(parts, widths, strict=True)
     )
     rest = rest.reshape(count, widths[-1] // 3, 3).astype(np.float64)
     # Three bytes become the upper ones of an int32, whose shift to the right keeps the sign.
     fixed = np.pad(means.reshape(count, 3, 3), ((0, 0), (0, 0), (1, 0))).view("<i4")[..., 0] >> 8
-    xyzw = _unpack_rotations(quats) if version == 3 else with_largest(np.full(count, 3), quats / 127.5 - 1)
-    return SplatRows(
-        means=HALF_TURN * fixed.astype(np.float64) / 2.0**fractional_bits,
-        quats=(xyzw * [*HALF_TURN, 1.0])[:, [3, 0, 1, 2]],
-        log_scales=scales / 16 - 10,
-        opacities=alphas[:, 0] / 255,
-        sh=np.concatenate(
-            [((colors / 255 - 0.5) / COLOR_STEP)[:, None], SH_SIGNS[: rest.shape[1], None] * (rest - 128) / 128], axis=1
-        ),
-        render_mode="mip" if flags & ANTIALIASED else "default",
-    )
+    x, y, z, w = (with_largest(np.full(count, 3), quats / 127.5 - 1) if version == 2 else _unpack_rotations(quats)).T
+    columns = {
+        "means": fixed.astype(np.float64) / 2.0**fractional_bits,
+        # Turned by 180 degrees about the Gaussian's own first axis, as the axes of the file are: it stays as it is.
+        "quats": np.stack([x, -w, -z, y], axis=1),
+        "log_scales": scales / 16 + LOG_SCALES[0],
+        "opacities": alphas[:, 0] / 255,
+        "sh": np.concatenate([((colors / 255 - 0.5) / COLOR_STEP)[:, None], (rest - 128) / 128], axis=1),
+    }
+    render_mode = "mip" if flags & ANTIALIASED else "default"
+    columns = placed(columns, np.c_[_axes(axes), np.zeros(3)])
+    return SplatRows(**columns, render_mode=render_mode, offset=(0.0, 0.0, 0.0))
+
+
+def _widths(version: int, degree: int) -> tuple[int, ...]:
+    """Bytes of each field of a Gaussian."""
+    if version not in (2, 3, 4) or degree > 3:
+        raise ValueError(f"wanted version 2 to 4 and SH degree 0 to 3, got version {version}, degree {degree}")
+    return 9, 1, 3, 3, 3 if version == 2 else 4, 3 * ((degree + 1) ** 2 - 1)
+
+
+def _read_stream(data: bytes):
+    """Version, count, fractional bits and flags; the widths of the fields; the fields; the axes. Versions 2 and 3."""
+    with gzip.GzipFile(fileobj=io.BytesIO(data)) as stream:
+        magic, version, count, degree, fractional_bits, flags, _ = OLD_HEADER.unpack(stream.read(OLD_HEADER.size))
+        if magic != MAGIC or version == 4:
+            raise ValueError("wanted a .spz of version 2 or 3 in the gzip stream")
+        widths = _widths(version, degree)
+        size = count * sum(widths)
+        body = stream.read(size) if size <= len(data) * MAX_RATIO else b""  # else the count is damaged
+        stream.read(1)  # to the end, where gzip compares the checksum
+    if len(body) < size:
+        raise ValueError(f"wanted {size} bytes for {count} Gaussians; it is cut off")
+    return (version, count, fractional_bits, flags), widths, body, "RUB"
+
+
+def _read_frames(data: bytes):
+    """What `_read_stream` gives, of version 4."""
+    _, version, count, degree, fractional_bits, flags, num_frames, table = HEADER.unpack_from(data)
+    widths, axes, place = _widths(version, degree), "RUB", HEADER.size
+    if version != 4 or not HEADER.size <= table <= len(data) or num_frames not in (5 + (degree > 0), 6):
+        raise ValueError(f"wanted version 4 with 5 or 6 fields, got version {version} with {num_frames} at {table}")
+    while flags & HAS_RECORDS and place < table:
+        kind, length = RECORD.unpack_from(data, place)
+        if (place := place + RECORD.size) + length > table:
+            raise ValueError(f"a record reaches beyond the table at {table}")
+        if kind == AXES_RECORD:
+            axes = AXES[int.from_bytes(data[place : place + length], "little")]
+        place += length
+    if count * sum(widths) > len(data) * MAX_RATIO:
+        raise ValueError(f"{count} Gaussians do not fit; it is damaged or cut off")
+    body, place = [], table + num_frames * SIZES.size
+    for i, width in enumerate(widths[:num_frames]):
+        length, size = SIZES.unpack_from(data, table + i * SIZES.size)
+        frame, place = data[place : place + length], place + length
+        if size != count * width or len(frame) < length:
+            raise ValueError(f"field {i}: wanted {count * width} bytes, got {size}; it is damaged or cut off")
+        body.append(_decompressed(frame, size) if length else b"")
+    return (version, count, fractional_bits, flags), widths, b"".join(body), axes
+
+
+def _decompressed(frame: bytes, size: int) -> bytes:
+    """The contents of a frame of zstd, which must be of a size: nothing larger is allocated."""
+    if size == 0:
+        return b""
+    if zstandard.get_frame_parameters(frame).content_size not in (size, zstandard.CONTENTSIZE_UNKNOWN):
+        raise ValueError("a frame of another size than the table says")
+    contents = zstandard.ZstdDecompressor().decompress(frame, max_output_size=size)
+    if len(contents) != size:
+        raise ValueError(f"a frame holds {len(contents)} bytes, the table says {size}")
+    return contents
 
 
 def _unpack_rotations(rows: UInt8[np.ndarray, "n 4"]) -> Float64[np.ndarray, "n 4"]:

@@ -105,7 +105,8 @@ def open_thumbnail(encoded: bytes) -> UInt8[np.ndarray, "h w 3"]:
 
 def save_delta(path: Path, delta: SceneDelta, header: dict[str, Any] | None = None) -> None:
     """Writes one delta and the caller's JSON-serializable `header` to an `.npz` file, atomically."""
-    arrays = {field.name: np.asarray(getattr(delta.gaussians, field.name)) for field in dataclasses.fields(Gaussians)}
+    names = ("means", "quats", "scales", "opacities", "sh")
+    arrays = {name: np.asarray(getattr(delta.gaussians, name)) for name in names}
     arrays |= {"rows": delta.rows, "confidences": delta.confidences}
     save_arrays(path, arrays, DELTA_KIND, {"capacity": delta.capacity, "caller": header or {}})
 
@@ -114,7 +115,8 @@ def load_delta(path: Path) -> SceneDelta:
     """Reads a delta that `save_delta` wrote."""
     arrays, facts = load_arrays(path, DELTA_KIND)
     rows, confidences = arrays.pop("rows"), arrays.pop("confidences")
-    gaussians = Gaussians(**{name: jnp.asarray(x) for name, x in arrays.items()})
+    fields: dict[str, Any] = {name: jnp.asarray(x) for name, x in arrays.items()}
+    gaussians = Gaussians(**fields)
     return SceneDelta(rows, gaussians, facts["capacity"], confidences)
 
 

@@ -258,7 +258,7 @@ class Browser:
             return
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "scene.ply"
-            save_gaussians(file, scene.gaussians, render_mode=scene.render_mode, offset=scene.offset)
+            save_gaussians(file, scene.gaussians)
             self._client.send_file_download(file.name, file.read_bytes(), save_immediately=True)
 
 

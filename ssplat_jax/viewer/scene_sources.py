@@ -15,8 +15,9 @@ from jaxtyping import Float, Float32
 
 from ssplat_jax.core.errors import InputError, StorageError
 from ssplat_jax.core.gaussians import Gaussians, scale_colors
+from ssplat_jax.core.pytree import replace
 from ssplat_jax.data.stream_frame import StreamFrame
-from ssplat_jax.scene_files.formats import read_scene
+from ssplat_jax.scene_files.formats import load_scene
 from ssplat_jax.storage.chunk_records import load_delta, load_delta_header
 from ssplat_jax.storage.run_folder import RunFolder, scene_exposure
 from ssplat_jax.streaming.scene_delta import apply_confidences, apply_delta
@@ -24,12 +25,10 @@ from ssplat_jax.streaming.scene_delta import apply_confidences, apply_delta
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ViewedScene:
-    """Gaussians in the capture's frame, relative to an offset."""
+    """Gaussians in the capture's frame, relative to their offset."""
 
     gaussians: Gaussians
-    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the positions, in the capture's frame
     confidences: Float[np.ndarray, " n"] | None = None  # of the pivots behind the Gaussians; None where unknown
-    render_mode: str = "mip"  # the renderer that the scene was made for, see `save_ply`
 
 
 class SceneFile:
@@ -60,15 +59,14 @@ class SceneFile:
                 return None
         is_first, self._stamp = self._stamp is None, stamp
         try:
-            file = read_scene(self.path)
+            gaussians = load_scene(self.path)
         except InputError:
             if is_first:
                 raise
             return None  # another program may be in the middle of rewriting it: the scene so far stays
-        gaussians = file.gaussians
         if self._one_exposure:
             gaussians = scale_colors(gaussians, jnp.asarray(1.0 / scene_exposure(self.path), jnp.float32))
-        return ViewedScene(gaussians, file.offset, render_mode=file.render_mode)
+        return ViewedScene(gaussians)
 
     def frame(self) -> StreamFrame | None:
         """The frame of the stream of the run that wrote the file; None if no metrics of a run are beside it."""
@@ -116,7 +114,7 @@ class _Sum:
         if not one_exposure:
             scene = scale_colors(scene, jnp.asarray(self._exposure, jnp.float32))
         gaussians = self.frame.gaussians_to_capture(scene, offset=self.frame.offset)
-        return ViewedScene(gaussians, self.frame.offset, self._confidences)
+        return ViewedScene(replace(gaussians, offset=self.frame.offset), self._confidences)
 
 
 class GrowingScene:

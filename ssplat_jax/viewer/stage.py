@@ -15,9 +15,11 @@ from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.errors import StorageError
 from ssplat_jax.core.false_colors import color_depth, color_normals, color_share, eight_bits, scale_ends
 from ssplat_jax.core.gaussians import SH_C0, Gaussians, mean_color
+from ssplat_jax.core.pytree import replace
 from ssplat_jax.core.rotations import quats_to_matrices
 from ssplat_jax.data.camera_path import camera_path
 from ssplat_jax.rasterizer import Effects, fill_holes, render
+from ssplat_jax.rasterizer.effects import FILTERS
 from ssplat_jax.scene_files.splat_rows import MIN_OPACITY
 from ssplat_jax.storage.chunk_records import ChunkRecord, RecordedView, load_chunk_records
 from ssplat_jax.storage.run_folder import RunFolder
@@ -161,7 +163,7 @@ class Stage:
     @property
     def offset(self) -> Float64[np.ndarray, "3"]:
         """Offset of the scene's positions, in the capture's frame."""
-        return np.zeros(3) if self._newest is None else np.asarray(self._newest.offset)
+        return np.zeros(3) if self._newest is None else np.asarray(self._newest.gaussians.offset)
 
     def to_browser(self, camtoworld: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "4 4"]:
         """A pose of the capture in the browser's units."""
@@ -241,8 +243,9 @@ def draw(
     features = None
     if kind == "confidence" and scene.confidences is not None:
         features = jnp.asarray(scene.confidences)[:, None]
-    effects = Effects(antialias="classic" if scene.render_mode == "default" else "mip")
-    out = render(scene.gaussians, view, effects=effects, features=features)
+    antialias = FILTERS.get(scene.gaussians.render_mode, "classic")
+    gaussians = replace(scene.gaussians, offset=(0.0, 0.0, 0.0))  # the camera is relative to it already
+    out = render(gaussians, view, effects=Effects(antialias=antialias), features=features)
     depth, alpha = np.asarray(out.depth), np.asarray(out.alpha)
     if kind == "depth":
         return eight_bits(color_depth(depth, *scale_ends(depth[depth > 0])))

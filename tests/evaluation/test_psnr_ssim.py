@@ -65,6 +65,18 @@ def test_values_outside_the_range_count_as_its_ends(score):
 
 
 @pytest.mark.parametrize("score", [psnr, ssim])
+def test_bytes_are_shares_of_255_and_images_of_another_unit_are_refused(score):
+    a, b = image(3), image(4)
+    bytes_a, bytes_b = (np.round(255 * x).astype(np.uint8) for x in (a, b))
+    wanted = score(bytes_a / 255.0, bytes_b / 255.0)
+    assert score(bytes_a, bytes_b) == score(bytes_a, bytes_b / 255.0) == pytest.approx(wanted, abs=ROUNDING)
+    for spoiled in (255 * a, 65535 * a, bytes_a.astype(np.int32), bytes_a.astype(np.uint16)):
+        for pair in ((spoiled, b), (a, spoiled), (spoiled, spoiled)):
+            with pytest.raises(InputError, match=r"floats in \[0, 1\], or uint8"):
+                score(*pair)
+
+
+@pytest.mark.parametrize("score", [psnr, ssim])
 def test_nan_gives_nan(score):
     a = image(5)
     spoiled = a.copy()

@@ -181,8 +181,8 @@ def test_the_3d_filter_knows_mirrored_cameras():
     K = np.array(view.Ks)
     K[0, 0], K[0, 2] = -K[0, 0], 21 - K[0, 2]
     mirrored = replace(view, Ks=jnp.asarray(K))
-    means = cloud(20).means
-    plain, turned = (np.asarray(sampling_rates(means, camera)) for camera in (view, mirrored))
+    scene = cloud(20)
+    plain, turned = (np.asarray(sampling_rates(scene, camera)) for camera in (view, mirrored))
     assert plain.max() > 0
     np.testing.assert_allclose(turned, plain, rtol=1e-5)
-    assert effects_for(cloud(20), mirrored, captured=view) == effects_for(cloud(20), view, captured=view)
+    assert effects_for(scene, mirrored, captured=view) == effects_for(scene, view, captured=view)

@@ -2,6 +2,7 @@
 
 import functools
 import re
+import warnings
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +13,7 @@ from ssplat_jax.core.cpu_backend import short_exp
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.core.gaussians import mask_gaussians
 from ssplat_jax.core.pytree import replace
-from ssplat_jax.rasterizer import Effects, binning, compositing, constants, render
+from ssplat_jax.rasterizer import Effects, binning, compositing, constants, effects_for, fill_holes, filter_3d, render
 from ssplat_jax.rasterizer.binning import Grid, TileIntersections, intersect_tiles, sorted_table
 from ssplat_jax.rasterizer.projection import Splats, project
 from ssplat_jax.rasterizer.reference import render_reference
@@ -120,6 +121,19 @@ def test_a_negative_focal_length_mirrors_the_image(scene):
     np.testing.assert_allclose(flipped, wanted, atol=FORWARD)
 
 
+def test_an_image_does_not_depend_on_the_unit_of_the_scene():
+    """Captures come in millimeters, in kilometers, and in units of their own."""
+    gaussians, camera = cloud(30, degree=1), cameras(21, 30)
+    draw = jax.jit(lambda g, c: render(g, c, captured=c, max_pairs=1 << 12))
+    wanted = draw(gaussians, camera)
+    for unit in (1e-6, 1e-3, 1e3, 1e5):
+        viewmats = camera.viewmats.at[:3, 3].multiply(unit)
+        scene = replace(gaussians, means=unit * gaussians.means, scales=unit * gaussians.scales)
+        out = draw(scene, replace(camera, viewmats=viewmats))
+        np.testing.assert_allclose(out.color, wanted.color, atol=1e-4)
+        np.testing.assert_allclose(out.depth, unit * wanted.depth, atol=1e-3 * unit)
+
+
 @pytest.mark.slow  # the test above, against the reference, runs always
 def test_gradients_equal_finite_differences_in_float64():
     # Few, wide, faint Gaussians: no alpha threshold is crossed by a step of 1e-6.
@@ -176,6 +190,39 @@ def test_only_requested_outputs_are_returned(scene):
         with pytest.raises(InputError, match=name):
             getattr(out, name)
     np.testing.assert_allclose(out.color, render(*scene, max_pairs=1 << 12).color, atol=1e-6)
+
+
+@pytest.mark.parametrize("transform", [jax.jit, jax.checkpoint, jax.vmap], ids=["jit", "checkpoint", "vmap"])
+def test_a_transform_that_hides_the_number_of_pairs_says_if_its_guess_was_too_low(transform, recwarn):
+    """Large Gaussians, of more than four tiles each; 4,096 pairs are the least that is guessed."""
+    gaussians, camera = cloud(600, size=0.2), cameras(80, 96)
+    counted = int(render(gaussians, camera).num_pairs)
+    assert counted > default_max_pairs(gaussians, camera)
+    batch = jax.tree.map(lambda x: x[None], gaussians) if transform is jax.vmap else gaussians
+    warnings.simplefilter("always")
+    jax.block_until_ready(transform(lambda g: render(g, camera).color)(batch))
+    jax.effects_barrier()
+    (said,) = {str(w.message) for w in recwarn}
+    assert f"max_pairs={1 << (counted - 1).bit_length()}" in said
+    recwarn.clear()
+    jax.block_until_ready(transform(lambda g: render(g, camera, max_pairs=2 * counted).color)(batch))
+    jax.effects_barrier()
+    assert not recwarn.list
+
+
+def test_ranks_are_promoted_whatever_the_caller_forbids(scene):
+    """`JAX_NUMPY_RANK_PROMOTION=raise` is for the caller's own code; forward, backward, with every effect."""
+    gaussians, camera = cloud(20, degree=1), cameras(13, 11)
+    arrays = {"captured": camera, "distortion": jnp.array([-0.2, 0.05, 0, 0, 0]), "exposures": jnp.eye(3, 4)}
+
+    def loss(gaussians, **arrays):
+        out = render(gaussians, camera, effects=ALL, max_pairs=1 << 12, **arrays)
+        return jnp.sum(fill_holes(out.color, out.alpha, jnp.ones(3)))
+
+    with jax.numpy_rank_promotion("raise"):
+        for given in ({}, arrays):
+            assert np.isfinite(jax.grad(loss)(gaussians, **given).means).all()
+        effects_for(gaussians, camera, captured=camera)
 
 
 @plainly
@@ -249,6 +296,35 @@ def test_rows_with_non_finite_features_are_culled_and_counted(scene):
 def test_bad_input_says_what_was_wanted(scene, changes, message):
     with pytest.raises(InputError, match=message):
         render(**{"gaussians": scene[0], "camera": scene[1]} | changes)
+
+
+K, VIEW = np.asarray(cameras(21, 30).Ks), np.asarray(cameras(21, 30).viewmats)
+SPOILED = {
+    "skew": {"Ks": K + 2 * np.eye(3, k=1) * [0, 1, 0]},
+    "a shear of rows": {"Ks": K + 2 * np.eye(3, k=-1) * [1, 0, 0]},
+    "twice the matrix": {"Ks": 2 * K},
+    "camera to world, transposed": {"viewmats": VIEW.T},
+    "a scale in the pose": {"viewmats": np.diag([3.0, 3.0, 3.0, 1.0]) @ VIEW},
+}
+
+
+@pytest.mark.parametrize("name", SPOILED)
+def test_cameras_that_would_be_drawn_otherwise_are_refused(scene, name):
+    """Intrinsics with skew, or not divided by K[2, 2], and poses that are none, wherever a camera enters."""
+    gaussians, camera = scene
+    fields = {field: jnp.asarray(value, jnp.float32) for field, value in SPOILED[name].items()}
+    spoiled = replace(camera, **fields)
+    (field,) = SPOILED[name]
+    for use in (
+        lambda: render(gaussians, spoiled),
+        lambda: render(gaussians, camera, captured=spoiled),
+        lambda: jax.grad(lambda g: render(g, spoiled).color.sum())(gaussians),
+        lambda: render_reference(gaussians, spoiled),
+        lambda: effects_for(gaussians, spoiled),
+        lambda: filter_3d(gaussians, spoiled),
+    ):
+        with pytest.raises(InputError, match=rf"{field}: wanted \["):
+            use()
 
 
 @plainly

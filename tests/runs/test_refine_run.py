@@ -14,7 +14,7 @@ from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.runs import refine_run as module
 from ssplat_jax.runs.capture_run import RunOptions, run_capture
 from ssplat_jax.runs.refine_run import refine_run
-from ssplat_jax.scene_files.formats import read_scene
+from ssplat_jax.scene_files.formats import load_scene
 from ssplat_jax.storage.run_folder import RunFolder
 from tests.streaming.narrow_model import NARROW
 
@@ -66,7 +66,7 @@ def test_a_stopped_refinement_continues_to_the_same_bytes(finished, monkeypatch)
     report = json.loads(folder.refinement.read_text())
     assert report["num_steps"] == len(report["losses"]) == 4
     assert report["num_left_out"] == left_out
-    assert [read_scene(path).gaussians.sh_degree for path in (folder.scene, folder.refined_scene)] == [0, 2]
+    assert [load_scene(path).sh_degree for path in (folder.scene, folder.refined_scene)] == [0, 2]
 
 
 def stop_after_each_step(monkeypatch):

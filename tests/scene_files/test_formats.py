@@ -13,18 +13,19 @@ import zipfile
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import zstandard
 from PIL import Image
 from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
 
 import ssplat_jax as ss
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.core.gaussians import SH_C0, Gaussians
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.rasterizer.outputs import sh_basis
-from ssplat_jax.scene_files.formats import READERS, WRITERS, read_scene, save_gaussians
-from ssplat_jax.scene_files.spz import HALF_TURN, SH_SIGNS
+from ssplat_jax.scene_files.formats import READERS, WRITERS, save_gaussians
 from tests.commands.command_fixture import run
-from tests.scene_files.scene_fixture import FIELDS, compressed_ply, scene
+from tests.scene_files.scene_fixture import FIELDS, camera, compressed_ply, scene
 
 BOTH_WAYS = [suffix for suffix in WRITERS if suffix in READERS]
 
@@ -100,35 +101,58 @@ def test_scenes_of_no_or_one_gaussian_are_held(tmp_path, suffix, n):
 
 @pytest.mark.parametrize("suffix", BOTH_WAYS)
 def test_values_at_the_ends_of_their_range_are_clipped(tmp_path, suffix):
+    plain = scene_for()
     extreme = replace(
-        scene_for(n=4),
-        opacities=jnp.array([1.0, 2.0, 1.0 / 254.0, 1.0]),
-        scales=jnp.array([[0.0, 1e-30, 1.0], [1e30, 1.0, 1.0], [1.0, 1.0, 1.0], [1.0, 1.0, 1.0]]),
-        quats=jnp.array([[0.0, 0, 0, 0], [1e-30, 0, 0, 0], [1e30, 0, 0, 0], [0, 1e-10, 0, 0]]),
-        means=jnp.array([[0.0, 0, 0], [1, 2, 3], [-5, 0, 0], [0, 0, 1e5]]),
+        plain,
+        opacities=plain.opacities.at[:4].set(jnp.array([1.0, 2.0, 1.0 / 254.0, 1.0])),
+        scales=plain.scales.at[:2].set(jnp.array([[0.0, 1e-30, 1.0], [1e30, 1.0, 1.0]])),
+        quats=plain.quats.at[:4].set(jnp.array([[0.0, 0, 0, 0], [1e-30, 0, 0, 0], [1e30, 0, 0, 0], [0, 1e-10, 0, 0]])),
+        means=plain.means.at[:4].set(jnp.array([[0.0, 0, 0], [11, 12, 13], [-15, 0, 0], [0, 0, 60]])),
+        sh=plain.sh.at[2].set(50.0).at[3].set(-50.0),
     )
-    extreme = replace(extreme, sh=extreme.sh.at[2].set(50.0).at[3].set(-50.0))
     save_gaussians(tmp_path / f"a{suffix}", extreme)
     found = ss.load_scene(tmp_path / f"a{suffix}")
-    order = np.argsort(np.asarray(found.means)[:, 0] * 10 + np.asarray(found.means)[:, 2] / 1e4)
-    np.testing.assert_allclose(np.asarray(found.means)[order][[1, 3]], [[0, 0, 0], [1, 2, 3]], atol=0.01)
+    distances, places = KDTree(np.asarray(found.means)).query(np.asarray(extreme.means[:4]))
+    np.testing.assert_allclose(distances, 0.0, atol=0.01)
     assert float(found.opacities.max()) >= 1 - 2e-6
     low, high = (-10, 255 / 16 - 10) if suffix == ".spz" else (-20, 20)
     logs = np.log(np.asarray(found.scales, np.float64))
     np.testing.assert_allclose([logs.min(), logs.max()], [low, high], rtol=1e-5)
-    np.testing.assert_allclose(np.abs(np.asarray(found.quats)).max(axis=1), 1.0, atol=0.01)
+    np.testing.assert_allclose(np.abs(np.asarray(found.quats))[places].max(axis=1), 1.0, atol=0.01)
 
 
 @pytest.mark.parametrize("suffix", BOTH_WAYS)
-def test_the_renderer_and_the_offset_are_kept_where_the_format_can(tmp_path, suffix):
+def test_a_scene_carries_its_renderer_and_its_offset_where_the_format_can(tmp_path, suffix):
     offset = tuple(np.array([4.5e6, -0.1, 3.0]))  # numbers of NumPy, as a pose gives them
     for mode in ("mip", "default"):
         report = save_gaussians(tmp_path / f"a{suffix}", scene_for(), render_mode=mode, offset=offset)
-        found = read_scene(tmp_path / f"a{suffix}")
+        found = ss.load_scene(tmp_path / f"a{suffix}")
         assert found.render_mode == mode
         assert found.offset == (offset if suffix in (".ply", ".glb") else (0.0, 0.0, 0.0))
         assert report.offset == offset and "[4500000.0, -0.1, 3.0]" in report.warning
-        assert_same(found.gaussians, scene_for(), STEPS[suffix])
+        assert_same(found, scene_for(), STEPS[suffix])
+        save_gaussians(tmp_path / f"b{suffix}", found)  # as it came, without a word about it
+        again = ss.load_scene(tmp_path / f"b{suffix}")
+        assert (again.render_mode, again.offset) == (found.render_mode, found.offset)
+
+
+def test_a_loaded_scene_is_drawn_as_it_is_meant(tmp_path):
+    """A scene of 3DGS with the dilation of 3DGS, at its offset; one of 2DGS only if a filter is chosen."""
+    plain, offset = scene(1, n=20), (2000.0, -500.0, 30.0)
+    view = camera()
+    far = replace(view, viewmats=view.viewmats.at[:3, 3].add(-view.viewmats[:3, :3] @ jnp.array(offset)))
+    classic, mip = (ss.render(plain, view, effects=ss.Effects(antialias=name)).color for name in ("classic", "mip"))
+    assert np.abs(classic - mip).max() > 0.05
+    for mode, wanted in (("default", classic), ("mip", mip)):
+        for where, at in ((view, (0.0, 0.0, 0.0)), (far, offset)):
+            ss.save_ply(tmp_path / "a.ply", plain, render_mode=mode, offset=at)
+            np.testing.assert_allclose(ss.render(ss.load_scene(tmp_path / "a.ply"), where).color, wanted, atol=2e-4)
+    ss.save_ply(tmp_path / "a.ply", plain, render_mode="2dgs")
+    discs = ss.load_scene(tmp_path / "a.ply")
+    with pytest.raises(InputError, match="made for 2dgs"):
+        ss.render(discs, view)
+    drawn = ss.render(discs, view, effects=ss.Effects(antialias="classic")).color
+    np.testing.assert_allclose(drawn, classic, atol=2e-4)
 
 
 @pytest.mark.parametrize("suffix", READERS)
@@ -174,14 +198,71 @@ ONE = Gaussians.from_rgb(
 
 
 def test_bytes_of_a_spz(tmp_path):
-    ss.save_spz(tmp_path / "a.spz", ONE)
-    data = gzip.decompress((tmp_path / "a.spz").read_bytes())
-    assert data[:16] == b"NGSP" + struct.pack("<IIBBBB", 3, 1, 0, 21, 1, 0)  # 3 x 2^21 < 2^23 <= 3 x 2^22
-    assert data[16:25] == b"".join(round(x * 2**21).to_bytes(3, "little", signed=True) for x in (1.0, 2.0, -3.0))
+    """Version 4, field by field, and version 3 with the same fields in one stream."""
+    save_gaussians(str(tmp_path / "a.spz"), ONE)
+    data = (tmp_path / "a.spz").read_bytes()
+    assert data[:20] == b"NGSP" + struct.pack("<IIBBBBI", 4, 1, 0, 21, 1, 5, 32)  # 3 x 2^21 < 2^23 <= 3 x 2^22
+    sizes, place, fields = struct.unpack_from("<10Q", data, 32), 32 + 80, []
+    assert data[20:32] == bytes(12) and sizes[1::2] == (9, 1, 3, 3, 4)
+    for size in sizes[::2]:
+        fields.append(zstandard.ZstdDecompressor().decompress(data[place : place + size]))
+        place += size
+    assert place == len(data)
+    assert fields[0] == b"".join(round(x * 2**21).to_bytes(3, "little", signed=True) for x in (1.0, 2.0, -3.0))
     dc = lambda color: round(255 * (0.5 + 0.15 * (color - 0.5) / SH_C0))  # noqa: E731
-    assert list(data[25:32]) == [204, dc(1.0), dc(0.0), dc(0.2), 160, 128, 176]
+    assert list(b"".join(fields[1:4])) == [204, dc(1.0), dc(0.0), dc(0.2), 160, 128, 176]
     half = round(0.5 * 511 * math.sqrt(2))  # x = y = 0.5 and z = -0.5 in the file's axes; x is dropped
-    assert int.from_bytes(data[32:], "little") == 0 << 30 | half << 20 | (1 << 9 | half) << 10 | half
+    assert int.from_bytes(fields[4], "little") == 0 << 30 | half << 20 | (1 << 9 | half) << 10 | half
+    save_gaussians(tmp_path / "b.spz", ONE, spz_version=3)
+    old = gzip.decompress((tmp_path / "b.spz").read_bytes())
+    assert old == b"NGSP" + struct.pack("<IIBBBB", 3, 1, 0, 21, 1, 0) + b"".join(fields)
+    with pytest.raises(InputError, match="version 3 or 4"):
+        save_gaussians(tmp_path / "c.spz", ONE, spz_version=2)
+
+
+def test_spz_of_versions_3_and_4_hold_the_same(tmp_path):
+    for version in (3, 4):
+        ss.save_spz(tmp_path / f"{version}.spz", scene_for(), version=version)
+    old, new = (ss.load_scene(tmp_path / f"{version}.spz") for version in (3, 4))
+    for name in FIELDS:
+        np.testing.assert_array_equal(getattr(old, name), getattr(new, name))
+
+
+@pytest.mark.parametrize("axes", ["RUB", "RDF", "LUF", "RUF", "LFD", "RBU"])
+def test_the_axes_that_a_spz_names_are_honoured(tmp_path, axes):
+    """Colors seen along turned or mirrored directions, and covariances, are those of the turned or mirrored scene."""
+    numbers = "LDB RDB LUB RUB LDF RDF LUF RUF LFD RFD LFU RFU LBD RBD LBU RBU".split()  # noqa: SIM905
+    ss.save_spz(tmp_path / "a.spz", scene_for())
+    plain, data = ss.load_scene(tmp_path / "a.spz"), (tmp_path / "a.spz").read_bytes()
+    records = struct.pack("<II3s", 0x12340001, 3, b"abc")  # of another maker: skipped
+    records += struct.pack("<III", 0xADBE0003, 4, 1 + numbers.index(axes))
+    header = data[:14] + struct.pack("<BBI", data[14] | 2, data[15], 32 + len(records)) + data[20:32]
+    (tmp_path / "b.spz").write_bytes(header + records + data[32:])
+    found = ss.load_scene(tmp_path / "b.spz")
+    unit = {"R": [1, 0, 0], "L": [-1, 0, 0], "D": [0, 1, 0], "U": [0, -1, 0], "F": [0, 0, 1], "B": [0, 0, -1]}
+    turn = np.array([unit[letter] for letter in axes]).T @ np.diag([1, -1, -1])  # from what was read as RUB
+    np.testing.assert_allclose(found.means, np.asarray(plain.means) @ turn.T, atol=1e-6)
+    roots = [Rotation.from_quat(g.quats, scalar_first=True).as_matrix() * g.scales[:, None] for g in (found, plain)]
+    covariances = [np.asarray(root @ root.transpose(0, 2, 1)) for root in roots]
+    np.testing.assert_allclose(covariances[0], turn @ covariances[1] @ turn.T, atol=1e-5)
+    directions = np.random.default_rng(0).normal(size=(40, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    basis = [np.asarray(sh_basis(jnp.asarray(d, jnp.float32), 3)) for d in (directions @ turn.T, directions)]
+    colors = [np.einsum("dk,nkc->dnc", b, g.sh) for b, g in zip(basis, (found, plain), strict=True)]
+    np.testing.assert_allclose(*colors, atol=1e-4)
+
+
+@pytest.mark.parametrize("size", [1e-6, 1e4])
+def test_spz_refuses_sizes_that_it_cannot_hold(tmp_path, size):
+    """A scene in another unit: its Gaussians would become up to hundreds of times as large."""
+    small = replace(scene_for(), means=size * scene_for().means, scales=size * scene_for().scales)
+    with pytest.raises(InputError, match=r"4.5e-05 to 377 units.*write a \.ply"):
+        ss.save_spz(tmp_path / "a.spz", small)
+    for suffix in (".ply", ".glb", ".sog"):
+        save_gaussians(tmp_path / f"a{suffix}", small)
+        found = ss.load_scene(tmp_path / f"a{suffix}")
+        order = KDTree(np.asarray(found.means)).query(np.asarray(small.means))[1]
+        np.testing.assert_allclose(np.asarray(found.scales)[order], small.scales, rtol=0.03)
 
 
 def test_bytes_of_a_glb(tmp_path):
@@ -240,7 +321,7 @@ def test_bytes_of_a_splat(tmp_path):
 @pytest.mark.parametrize(("reach", "bits"), [(0.01, 23), (0.9999, 23), (1.0, 22), (2047.0, 12), (8e6, 0)])
 def test_spz_positions_are_as_fine_as_24_bits_allow(tmp_path, reach, bits):
     ss.save_spz(tmp_path / "a.spz", replace(ONE, means=jnp.array([[0.0, -reach, reach / 3]], jnp.float32)))
-    assert gzip.decompress((tmp_path / "a.spz").read_bytes())[13] == bits
+    assert (tmp_path / "a.spz").read_bytes()[13] == bits
     held = np.asarray(ss.load_scene(tmp_path / "a.spz").means)[0]
     assert held == pytest.approx([0, -reach, reach / 3], abs=0.51 * 2.0**-bits)
 
@@ -252,19 +333,12 @@ def test_spz_refuses_what_its_positions_cannot_hold(tmp_path):
 
 
 def test_spz_of_version_2_holds_three_bytes_of_a_rotation(tmp_path):
-    ss.save_spz(tmp_path / "a.spz", ONE)
+    ss.save_spz(tmp_path / "a.spz", ONE, version=3)
     data = bytearray(gzip.decompress((tmp_path / "a.spz").read_bytes()))
     data[4:8], data[32:] = struct.pack("<I", 2), bytes([191, 64, 128])  # x y z of a quaternion with w >= 0
     (tmp_path / "b.spz").write_bytes(gzip.compress(bytes(data)))
     found = np.asarray(ss.load_scene(tmp_path / "b.spz").quats)[0]
     assert found == pytest.approx([math.sqrt(0.5), 0.5, 0.5, 0.0], abs=0.01)  # ours turned by 180 degrees about x
-
-
-def test_sh_signs_of_spz_are_those_of_its_axes():
-    directions = np.random.default_rng(0).normal(size=(40, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    ours, theirs = (sh_basis(jnp.asarray(d, jnp.float32), 3)[:, 1:] for d in (directions, directions * HALF_TURN))
-    np.testing.assert_allclose(ours * SH_SIGNS, theirs, atol=1e-5)
 
 
 def test_a_palette_of_many_different_sh_is_fitted(tmp_path, monkeypatch):
@@ -293,7 +367,7 @@ def test_a_sog_file_with_a_huge_image_or_number_is_refused(tmp_path):
             for name, data in (files | change).items():
                 archive.writestr(name, data)
         with pytest.raises(InputError, match=rf"b\.sog: cannot be used .*{words}"):
-            read_scene(tmp_path / "b.sog")
+            ss.load_scene(tmp_path / "b.sog")
 
 
 def test_any_format_is_exported_from_any_other(tmp_path, capsys):
@@ -304,7 +378,7 @@ def test_any_format_is_exported_from_any_other(tmp_path, capsys):
         assert run("export", str(tmp_path / source), "--to", str(tmp_path / to)) == 0
         said = capsys.readouterr()
         assert "100 Gaussians" in said.out and ("[0.0, 0.0, 10000000.0]" in said.err) == (to in names[:4])
-    assert read_scene(tmp_path / "2.ply").render_mode == "default"
+    assert ss.load_scene(tmp_path / "2.ply").render_mode == "default"
     losses = (dataclasses.astuple(STEPS[suffix]) for suffix in (".spz", ".sog"))
     assert_same(ss.load_scene(tmp_path / "5.ply"), gaussians, Steps(*map(sum, zip(*losses, strict=True))))
     assert run("export", str(tmp_path / "missing"), "--to", str(tmp_path / "scene.gltf")) == 2

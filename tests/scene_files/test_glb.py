@@ -55,16 +55,21 @@ def glb(tmp_path):
     return Glb(tmp_path)
 
 
-@pytest.mark.parametrize("is_nested", [False, True])
-def test_nodes_turn_move_and_scale_gaussians_with_their_sh(glb, is_nested):
+@pytest.mark.parametrize(("is_nested", "is_mirrored"), [(False, False), (True, False), (False, True)])
+def test_nodes_turn_move_and_scale_gaussians_with_their_sh(glb, is_nested, is_mirrored):
     matrix = np.eye(4)
+    mirror = np.diag([1.0, 1.0, -1.0 if is_mirrored else 1.0])
     matrix[:3, :3], matrix[:3, 3] = TURN.as_matrix() * SCALE, SHIFT
-    node = {"translation": SHIFT.tolist(), "rotation": TURN.as_quat().tolist(), "scale": [SCALE] * 3}
+    node = {
+        "translation": SHIFT.tolist(),
+        "rotation": TURN.as_quat().tolist(),
+        "scale": (SCALE * np.diag(mirror)).tolist(),
+    }
     if is_nested:
         glb.document["nodes"] = [{"matrix": matrix.T.ravel().tolist(), "children": [1]}, {"mesh": 0}]
     else:
         glb.document["nodes"] = [node | {"mesh": 0}]
-    found, once, turn = glb.read(), scene(3, n=100), FLIP @ TURN.as_matrix()
+    found, once, turn = glb.read(), scene(3, n=100), FLIP @ TURN.as_matrix() @ mirror
     np.testing.assert_allclose(found.means, np.asarray(once.means) @ (SCALE * turn).T + FLIP @ SHIFT, atol=1e-5)
     axes = [Rotation.from_quat(g.quats, scalar_first=True).as_matrix() * g.scales[:, None] for g in (found, once)]
     covariances = [np.asarray(a @ a.transpose(0, 2, 1)) for a in axes]
@@ -116,10 +121,16 @@ def test_a_rotation_that_is_not_finite_is_refused(glb, is_turned):
         glb.read()
 
 
+def extension(document: dict) -> dict:
+    return document["meshes"][0]["primitives"][0]["extensions"]["KHR_gaussian_splatting"]
+
+
 BAD = {
     "stretched": (lambda d: d["nodes"][0].update(scale=[1, 2, 1]), "stretches"),
     "its own child": (lambda d: d["nodes"][0].update(children=[0]), "two parents"),
     "no extension": (lambda d: (d.pop("extensionsUsed"), d["meshes"][0]["primitives"][0].pop("extensions")), "none"),
+    "linear colors": (lambda d: extension(d).update(colorSpace="lin_rec709_display"), "colorSpace"),
+    "another kernel": (lambda d: extension(d).update(kernel="box"), "kernel"),
     "compressed": (lambda d: d["meshes"][0]["primitives"][0].update(attributes={}), "compressed"),
     "sparse": (lambda d: d["accessors"][0].update(sparse={}), "sparse"),
     "count too large": (lambda d: d["accessors"][0].update(count=10**9), "beyond its buffer"),

@@ -81,6 +81,7 @@ def test_infinite_logits_huge_scales_and_zero_quaternions_have_a_meaning(good):
     def spoil(table):
         table["opacity"][:3] = np.inf, -np.inf, 500.0
         table["scale_0"][:2] = 300.0, -300.0
+        table["scale_2"][:2] = -np.inf  # discs without thickness, as splat-transform writes 2D Gaussians
         for i in range(4):
             table[f"rot_{i}"][2] = 0
             table[f"rot_{i}"][3] *= 1e25
@@ -89,6 +90,7 @@ def test_infinite_logits_huge_scales_and_zero_quaternions_have_a_meaning(good):
     read, untouched = load_ply(rewritten(good, spoil, byte_order="<")), load_ply(good)
     np.testing.assert_array_equal(read.opacities[:3], [1.0, 0.0, 1.0])
     np.testing.assert_allclose(read.scales[:2, 0], [np.exp(20), np.exp(-20)], rtol=1e-6)
+    np.testing.assert_allclose(read.scales[:2, 2], np.exp(-20), rtol=1e-6)
     np.testing.assert_array_equal(read.quats[2], [1, 0, 0, 0])
     np.testing.assert_allclose(read.quats[3], untouched.quats[3], atol=1e-6)
 

@@ -183,7 +183,7 @@ def program(effects: Effects = EFFECTS, max_pairs: int = 1 << 12):
     """Images, and gradients of a loss that uses all of them; `arrays` are what `effects` need."""
 
     def loss(gaussians, camera, arrays):
-        out = render(gaussians, camera, effects=effects, max_pairs=max_pairs, **arrays)
+        out = render(gaussians, camera, effects=effects, near=oracle.NEAR, max_pairs=max_pairs, **arrays)
         images = (out.color, out.alpha, out.depth, out.median_depth)
         weights = np.random.default_rng(5).normal(size=(HEIGHT, WIDTH)).astype(F)
         total = sum(jnp.sum(x * (weights[..., None] if x.ndim == 3 else weights)) for x in images)
