@@ -7,10 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float64
 
+from ssplat_jax.core.gaussians import SH_C0
 from ssplat_jax.core.numerics import columns, safe_normalize
 
-SQRT3, SQRT6, SQRT10, SQRT15 = np.sqrt([3.0, 6.0, 10.0, 15.0])
-"""Relative norms of spherical harmonics within a band, integrated over the sphere."""
+AnyArray = Array | np.ndarray
 
 
 def quats_to_matrices(quats: Float[Array, "*s 4"]) -> Float[Array, "*s 3 3"]:
@@ -76,28 +76,50 @@ def multiply_quats(a: Float[Array, "*s 4"], b: Float[Array, "*s 4"]) -> Float[Ar
     )
 
 
-def _bands(directions: Float64[np.ndarray, "n 3"]) -> list[Float64[np.ndarray, "n _"]]:
-    """Real spherical harmonics of bands 0 to 3, each band up to a common factor.
+_C1 = 0.4886025119029199
+_C2 = (1.0925484305920792, 1.0925484305920792, 0.31539156525252005, 1.0925484305920792, 0.5462742152960396)
+_C3 = (
+    0.5900435899266435,
+    2.890611442640554,
+    0.4570457994644658,
+    0.3731763325901154,
+    0.4570457994644658,
+    1.445305721320277,
+    0.5900435899266435,
+)
 
-    Order and signs are those of splat files: (1), (-y, z, -x), (xy, -yz, 2zz-xx-yy, -xz, xx-yy), ...
+
+def sh_basis(directions: Float[AnyArray, "*s 3"], degree: int) -> Float[AnyArray, "*s k"]:
+    """The (degree + 1)^2 real spherical harmonics at unit `directions`, in the order and with the signs of splat files.
+
+    Limits:
+        Polynomials of the components: finite and smooth everywhere, the poles included.
     """
-    x, y, z = directions.T
-    xx, yy, zz = x * x, y * y, z * z
-    bands = [
-        [np.ones_like(x)],
-        [-y, z, -x],
-        [2 * SQRT3 * x * y, -2 * SQRT3 * y * z, 2 * zz - xx - yy, -2 * SQRT3 * x * z, SQRT3 * (xx - yy)],
-        [
-            -SQRT10 * y * (3 * xx - yy),
-            4 * SQRT15 * x * y * z,
-            -SQRT6 * y * (4 * zz - xx - yy),
-            2 * z * (2 * zz - 3 * xx - 3 * yy),
-            -SQRT6 * x * (4 * zz - xx - yy),
-            2 * SQRT15 * z * (xx - yy),
-            -SQRT10 * x * (xx - 3 * yy),
-        ],
-    ]
-    return [np.stack(band, axis=-1) for band in bands]
+    x, y, z = (directions[..., i] for i in range(3))
+    xp = np if isinstance(directions, np.ndarray) else jnp
+    terms = [xp.full_like(x, SH_C0)]
+    if degree >= 1:
+        terms += [-_C1 * y, _C1 * z, -_C1 * x]
+    if degree >= 2:
+        xx, yy, zz = x * x, y * y, z * z
+        terms += [
+            _C2[0] * x * y,
+            -_C2[1] * y * z,
+            _C2[2] * (2 * zz - xx - yy),
+            -_C2[3] * x * z,
+            _C2[4] * (xx - yy),
+        ]
+        if degree >= 3:
+            terms += [
+                -_C3[0] * y * (3 * xx - yy),
+                _C3[1] * x * y * z,
+                -_C3[2] * y * (4 * zz - xx - yy),
+                _C3[3] * z * (2 * zz - 3 * xx - 3 * yy),
+                -_C3[4] * x * (4 * zz - xx - yy),
+                _C3[5] * z * (xx - yy),
+                -_C3[6] * x * (xx - 3 * yy),
+            ]
+    return xp.stack(terms, axis=-1)
 
 
 def sh_rotation(rotation: Float64[np.ndarray, "3 3"], degree: int) -> Float64[np.ndarray, "k k"]:
@@ -109,8 +131,8 @@ def sh_rotation(rotation: Float64[np.ndarray, "3 3"], degree: int) -> Float64[np
     directions = np.random.default_rng(0).normal(size=(32, 3))
     directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
     mixing = np.zeros(((degree + 1) ** 2, (degree + 1) ** 2))
-    original, rotated = _bands(directions), _bands(directions @ rotation)
+    original, rotated = sh_basis(directions, degree), sh_basis(directions @ rotation, degree)
     for band in range(degree + 1):
         rows = slice(band**2, (band + 1) ** 2)
-        mixing[rows, rows] = np.linalg.lstsq(original[band], rotated[band], rcond=None)[0]
+        mixing[rows, rows] = np.linalg.lstsq(original[:, rows], rotated[:, rows], rcond=None)[0]
     return mixing

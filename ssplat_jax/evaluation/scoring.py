@@ -23,7 +23,7 @@ from ssplat_jax.data.split import Split
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.evaluation.lpips import MIN_SIDE, LpipsWeights, lpips
 from ssplat_jax.evaluation.psnr_ssim import SSIM_ARGUMENTS, psnr, ssim
-from ssplat_jax.rasterizer import fill_holes, render
+from ssplat_jax.rasterizer import effects_for, fill_holes, render
 from ssplat_jax.streaming.feed import Exposures
 
 NUM_AVERAGED = 3
@@ -146,7 +146,8 @@ def score_view(
     Raises:
         InputError: the image is damaged.
     """
-    out = render(gaussians, capture.camera(i, frame))
+    camera = capture.camera(i, frame)
+    out = render(gaussians, camera, effects=effects_for(gaussians, camera))
     exposure = exposure_for(capture, i, exposures)
     filled = np.asarray(_jitted_fill_holes(out.color, out.alpha, mean_color(gaussians)))
     over_black = np.asarray(out.color)

@@ -24,9 +24,6 @@ NEEDED_ARRAYS = {"filter_3d": "captured", "distortion": "distortion", "exposure"
 FILTERS = {"mip": "mip", "default": "classic"}
 """The filter of each renderer that a scene may be made for."""
 
-FINER_SAMPLING = 1.05
-"""A camera calls for the 3D filter when it samples the scene more than this times as finely as the captured ones."""
-
 
 @dataclasses.dataclass(frozen=True)
 class Effects:
@@ -102,66 +99,6 @@ class Effects:
     def needs_alpha(self) -> bool:
         """True if alpha is composited: asked for, or needed by depth or background."""
         return bool({"alpha", "depth"} & set(self.outputs)) or self.background is not None
-
-
-@with_rank_promotion
-def effects_for(
-    gaussians: Gaussians,
-    camera: Camera,
-    *,
-    captured: Camera | None = None,
-    distortion: Float[Array, "*b 5"] | None = None,
-    exposures: Float[Array, "*b 3 4"] | None = None,
-    outputs: tuple[str, ...] = ("color", "alpha", "depth"),
-) -> Effects:
-    """The fewest effects that show a scene correctly. It looks at values: call it outside jit.
-
-    Args:
-        gaussians: the scene.
-        camera: the cameras to render from.
-        captured: the cameras that the scene was made from. The 3D filter is on if a camera samples the scene over 1.05
-            times as finely as they do.
-        distortion: OPENCV coefficients; distortion is on if one is not 0.
-        exposures: affine color corrections; exposure is on if those of several frames differ (a common one is in the
-            scene's colors already), or a single one is not the identity.
-        outputs: passed on.
-
-    Returns:
-        The effects, SH degree included. A flag is False where its array is given but not needed.
-
-    Raises:
-        InputError: a camera is not usable, see `check_camera`.
-    """
-    for one in (camera, captured):
-        if one is not None:
-            check_camera(one, "effects_for")
-    return Effects(
-        sh_degree=_used_degree(np.asarray(gaussians.sh, np.float32)),
-        filter_3d=None if captured is None else _sampling_ratio(gaussians, camera, captured) > FINER_SAMPLING,
-        distortion=None if distortion is None else bool(np.any(np.asarray(distortion) != 0)),
-        exposure=None if exposures is None else _differ(np.asarray(exposures)),
-        outputs=outputs,
-    )
-
-
-def _used_degree(sh: np.ndarray) -> int:
-    """Highest SH band with an entry other than 0."""
-    used = np.flatnonzero(np.any(sh != 0, axis=(0, 2)))
-    return int(np.sqrt(used[-1])) if used.size else 0
-
-
-def _differ(exposures: np.ndarray) -> bool:
-    """True if frames differ in exposure; a single one is compared with no correction."""
-    flat = exposures.reshape(-1, 12)
-    usual = flat[:1] if len(flat) > 1 else np.eye(3, 4).reshape(1, 12)
-    return bool(np.any(np.abs(flat - usual) > 1e-6))
-
-
-def _sampling_ratio(gaussians: Gaussians, camera: Camera, captured: Camera) -> float:
-    """Ratio of the sampling rate (f / z) of present Gaussians to that of the captured cameras: 99 % quantile."""
-    ours, theirs = (np.asarray(sampling_rates(gaussians, one)) for one in (camera, captured))
-    seen = (np.asarray(gaussians.opacities) > 0) & (ours > 0) & (theirs > 0)
-    return float(np.quantile(ours[seen] / theirs[seen], 0.99)) if seen.any() else 0.0
 
 
 def camera_points(means: Float[Array, "n 3"], viewmats: Float[Array, "b 4 4"]) -> tuple[Float[Array, "b n"], ...]:

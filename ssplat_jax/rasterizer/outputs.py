@@ -13,6 +13,7 @@ from ssplat_jax.core.errors import InputError
 from ssplat_jax.core.gaussians import SH_C0, Gaussians
 from ssplat_jax.core.numerics import safe_normalize, with_rank_promotion
 from ssplat_jax.core.pytree import pytree
+from ssplat_jax.core.rotations import sh_basis
 from ssplat_jax.rasterizer.effects import Effects
 from ssplat_jax.rasterizer.projection import Splats
 
@@ -140,51 +141,6 @@ def apply_exposures(color: Float[Array, "*b h w 3"], exposures: Float[Array, "*b
     matrices = exposures[..., None, None, :, :]
     corrected = sum(matrices[..., i] * color[..., i, None] for i in range(3)) + matrices[..., 3]
     return jnp.maximum(corrected, 0.0)
-
-
-_C1 = 0.4886025119029199
-_C2 = (1.0925484305920792, 1.0925484305920792, 0.31539156525252005, 1.0925484305920792, 0.5462742152960396)
-_C3 = (
-    0.5900435899266435,
-    2.890611442640554,
-    0.4570457994644658,
-    0.3731763325901154,
-    0.4570457994644658,
-    1.445305721320277,
-    0.5900435899266435,
-)
-
-
-def sh_basis(directions: Float[Array, "*s 3"], degree: int) -> Float[Array, "*s k"]:
-    """The (degree + 1)^2 basis functions at unit `directions`.
-
-    Limits:
-        Polynomials of the components: finite and smooth everywhere, the poles included.
-    """
-    x, y, z = (directions[..., i] for i in range(3))
-    terms = [jnp.full_like(x, SH_C0)]
-    if degree >= 1:
-        terms += [-_C1 * y, _C1 * z, -_C1 * x]
-    if degree >= 2:
-        xx, yy, zz = x * x, y * y, z * z
-        terms += [
-            _C2[0] * x * y,
-            -_C2[1] * y * z,
-            _C2[2] * (2 * zz - xx - yy),
-            -_C2[3] * x * z,
-            _C2[4] * (xx - yy),
-        ]
-        if degree >= 3:
-            terms += [
-                -_C3[0] * y * (3 * xx - yy),
-                _C3[1] * x * y * z,
-                -_C3[2] * y * (4 * zz - xx - yy),
-                _C3[3] * z * (2 * zz - 3 * xx - 3 * yy),
-                -_C3[4] * x * (4 * zz - xx - yy),
-                _C3[5] * z * (xx - yy),
-                -_C3[6] * x * (xx - 3 * yy),
-            ]
-    return jnp.stack(terms, axis=-1)
 
 
 def sh_colors(

@@ -17,7 +17,7 @@ from ssplat_jax.core.pytree import replace
 from ssplat_jax.data.camera_path import camera_path, orbit_path
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.evaluation.pictures import evenly_spread, save_image
-from ssplat_jax.rasterizer import fill_holes, render
+from ssplat_jax.rasterizer import effects_for, fill_holes, render
 from ssplat_jax.rasterizer.effects import FILTERS
 from ssplat_jax.runs.run_poses import open_capture_of_scene
 from ssplat_jax.scene_files.formats import load_scene
@@ -135,7 +135,8 @@ def _render_picture(
     camera = Camera(
         viewmats=jnp.asarray(frame.viewmats(camtoworld)), Ks=jnp.asarray(K, jnp.float32), width=size[0], height=size[1]
     )
-    out = render(replace(splats, offset=(0.0, 0.0, 0.0)), camera)  # the camera is relative to it already
+    scene = replace(splats, offset=(0.0, 0.0, 0.0))  # the camera is relative to it already
+    out = render(scene, camera, effects=effects_for(scene, camera))
     color = out.color if background is None else _jitted_fill_holes(out.color, out.alpha, background)
     return np.asarray(color), np.asarray(out.depth)
 

@@ -18,7 +18,7 @@ from ssplat_jax.core.gaussians import SH_C0, Gaussians, mean_color
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.core.rotations import quats_to_matrices
 from ssplat_jax.data.camera_path import camera_path
-from ssplat_jax.rasterizer import Effects, fill_holes, render
+from ssplat_jax.rasterizer import effects_for, fill_holes, render
 from ssplat_jax.rasterizer.effects import FILTERS
 from ssplat_jax.scene_files.splat_rows import MIN_OPACITY
 from ssplat_jax.storage.chunk_records import ChunkRecord, RecordedView, load_chunk_records
@@ -243,9 +243,10 @@ def draw(
     features = None
     if kind == "confidence" and scene.confidences is not None:
         features = jnp.asarray(scene.confidences)[:, None]
-    antialias = FILTERS.get(scene.gaussians.render_mode, "classic")
     gaussians = replace(scene.gaussians, offset=(0.0, 0.0, 0.0))  # the camera is relative to it already
-    out = render(gaussians, view, effects=Effects(antialias=antialias), features=features)
+    antialias = FILTERS.get(gaussians.render_mode, "classic")
+    effects = effects_for(gaussians, view).replace(antialias=antialias)
+    out = render(gaussians, view, effects=effects, features=features)
     depth, alpha = np.asarray(out.depth), np.asarray(out.alpha)
     if kind == "depth":
         return eight_bits(color_depth(depth, *scale_ends(depth[depth > 0])))

@@ -140,21 +140,48 @@ def test_the_3d_filter_has_its_variance_and_keeps_mass():
     np.testing.assert_allclose(mass(smoothed), mass(gaussians), rtol=1e-5)
 
 
-def test_effects_for_finds_only_what_the_scene_needs():
+def zoomed(camera: Camera) -> Camera:
+    """The camera with twice the resolution."""
+    Ks = camera.Ks * jnp.array([[2.0], [2.0], [1.0]])
+    return replace(camera, Ks=Ks, width=2 * camera.width, height=2 * camera.height)
+
+
+def test_effects_for_finds_only_what_can_be_seen():
     gaussians, camera = cloud(degree=3), cameras(210, 300, batch=2)
     assert effects_for(gaussians, camera) == Effects(sh_degree=3)
-    flat = replace(gaussians, sh=gaussians.sh.at[:, 4:].set(0.0))
-    assert effects_for(flat, camera).sh_degree == 1
-    assert effects_for(replace(gaussians, sh=gaussians.sh.at[:, 1:].set(0.0)), camera).sh_degree == 0
-    assert not effects_for(gaussians, camera, distortion=jnp.zeros((2, 5))).distortion
-    assert effects_for(gaussians, camera, distortion=jnp.asarray(np.stack([LENS] * 2))).distortion
+    for first, degree in ((4, 1), (1, 0)):
+        for faint in (0.0, 1e-12, 1e-5):
+            scene = replace(gaussians, sh=gaussians.sh.at[:, first:].set(faint))
+            assert effects_for(scene, camera).sh_degree == degree
+    for lens, is_seen in ((np.zeros(5), False), (1e-9 * LENS, False), (LENS, True), (1e-3 * LENS, True)):
+        lenses = jnp.asarray(np.stack([np.zeros(5), lens]), jnp.float32)
+        assert effects_for(gaussians, camera, distortion=lenses).distortion is is_seen
     same = jnp.asarray(np.stack([EXPOSURE] * 2))
-    assert not effects_for(gaussians, camera, exposures=same).exposure
-    assert effects_for(gaussians, camera, exposures=same.at[0, 0, 0].add(0.1)).exposure
+    for more, is_seen in ((0.0, False), (1e-4, False), (0.1, True)):
+        assert effects_for(gaussians, camera, exposures=same.at[0, 0, 0].add(more)).exposure is is_seen
     assert effects_for(gaussians, camera[0], exposures=jnp.asarray(EXPOSURE)).exposure
-    assert not effects_for(gaussians, camera, captured=camera).filter_3d
-    closer = Camera(viewmats=camera.viewmats, Ks=camera.Ks * jnp.array([[2.0], [2.0], [1.0]]), width=420, height=600)
-    assert effects_for(gaussians, closer, captured=camera).filter_3d
+    assert not effects_for(gaussians, camera[0], exposures=jnp.eye(3, 4)).exposure
+
+
+@plainly
+def test_the_3d_filter_is_wanted_where_a_zoom_shows_its_absence():
+    camera = cameras(13, 11)
+    fine, coarse = cloud(20, size=0.01), cloud(20, size=3.0)  # smaller and much larger than a captured pixel
+    assert not effects_for(fine, camera, captured=camera).filter_3d
+    assert effects_for(fine, zoomed(camera), captured=camera).filter_3d
+    assert not effects_for(coarse, zoomed(camera), captured=camera).filter_3d
+
+
+@plainly
+def test_effects_that_are_left_out_change_no_level():
+    """The image with the effects that are chosen against the one with all of them, faint ones included."""
+    gaussians, camera = cloud(20, degree=3), cameras(13, 11)
+    scene = replace(gaussians, sh=gaussians.sh.at[:, 4:].multiply(1e-4))
+    arrays = {"distortion": jnp.asarray(1e-6 * LENS), "exposures": jnp.eye(3, 4) * 1.001}
+    chosen = effects_for(scene, camera, **arrays)
+    assert (chosen.sh_degree, chosen.distortion, chosen.exposure) == (1, False, False)
+    least, most = (render(scene, camera, effects=e, max_pairs=1 << 12, **arrays) for e in (chosen, Effects()))
+    assert 0 < float(jnp.abs(least.color - most.color).max()) < 1.5 / 255  # half a level by each of three
 
 
 @plainly

@@ -22,7 +22,7 @@ import ssplat_jax as ss
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.core.gaussians import SH_C0, Gaussians
 from ssplat_jax.core.pytree import replace
-from ssplat_jax.rasterizer.outputs import sh_basis
+from ssplat_jax.core.rotations import sh_basis
 from ssplat_jax.scene_files.formats import READERS, WRITERS, save_gaussians
 from tests.commands.command_fixture import run
 from tests.scene_files.scene_fixture import FIELDS, camera, compressed_ply, scene

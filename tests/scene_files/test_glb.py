@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.core.gaussians import Gaussians
-from ssplat_jax.rasterizer.outputs import sh_basis
+from ssplat_jax.core.rotations import sh_basis
 from ssplat_jax.scene_files.formats import load_scene, save_gaussians
 from tests.scene_files.scene_fixture import scene
 
