@@ -2,7 +2,7 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -24,28 +24,35 @@ class Export:
     """Write at most so many Gaussians: opaque ones first, everywhere alike; the number of the others is printed."""
     cameras: str | None = None
     """Capture of the scene: its cameras are written as COLMAP text, cameras.txt and images.txt, beside the file."""
+    up: Literal["y", "z"] | None = None
+    """Axis of the file that points up, +y or +z; by default the scene keeps the axes of its capture."""
+    spz: Literal[4, 3] = 4
+    """Version of a .spz; older readers know 3."""
     weights: str = "tiny"
     """Weights of the run: a preset with shipped weights, or a weights file."""
 
     def run(self) -> int:
         from ssplat_jax.core.console import Reporter
-        from ssplat_jax.runs.export_run import export_run, open_cameras, save_cameras
-        from ssplat_jax.scene_files.formats import convert_scene
+        from ssplat_jax.runs import export_run as export
+        from ssplat_jax.scene_files.formats import check_format, load_scene
         from ssplat_jax.storage.run_folder import RunFolder
         from ssplat_jax.storage.weights import load_params
 
+        check_format(self.to)
         reporter = Reporter(quiet=False)
         folder = RunFolder(self.scene)
-        cameras = None if self.cameras is None else open_cameras(self.cameras, self.scene, self.to, reporter)
+        cameras = None if self.cameras is None else export.open_cameras(self.cameras, self.scene, self.to, reporter)
         file = self.scene if self.scene.is_file() else folder.scene  # the latter in a folder of `ssplat demo`
         if file.exists() and not folder.has_state():
             if self.weights != Export.weights:
                 raise InputError(f"--weights: wanted a run, got {self.scene}, which is decoded already; leave it out.")
-            report = convert_scene(file, self.to, self.max_splats)
+            scene = load_scene(file)
         else:
-            report = export_run(self.scene, self.to, load_params(self.weights), reporter, self.max_splats)
+            scene = export.decoded_scene(self.scene, load_params(self.weights), reporter)
+        views, options = export.views_of(self.scene, cameras), {"max_splats": self.max_splats, "spz_version": self.spz}
+        report, turn = export.export_scene(scene, self.to, views, self.up, **options)
         if cameras is not None:
-            save_cameras(self.to.parent, cameras, report.offset)
+            export.save_cameras(self.to.parent, cameras, report.offset, turn)
         if report.warning is not None:
             reporter.warn(f"{self.to.name}: {report.warning}")
         left_out = (
@@ -54,4 +61,6 @@ class Export:
         )
         words = "; ".join(f"{count} {reason}" for count, reason in left_out if count)
         print(f"wrote {self.to}: {report.num_written} Gaussians{f' ({words})' if words else ''}")
+        if views is not None and (difference := export.difference_in_words(self.to, views, turn)):
+            print(difference)
         return 0

@@ -1,27 +1,40 @@
 """`ssplat export`: the scene of a run as a person gets it, and the cameras of its capture as COLMAP text beside it."""
 
+import dataclasses
+import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
 from ssplat_jax.core.atomic import write_atomic
+from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.console import Reporter
-from ssplat_jax.core.errors import InputError
-from ssplat_jax.core.gaussians import Gaussians, scale_colors
+from ssplat_jax.core.errors import InputError, refusal
+from ssplat_jax.core.gaussians import Gaussians, mean_color, scale_colors
+from ssplat_jax.core.pytree import replace
+from ssplat_jax.data.camera_path import upward
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.posed_image import invert_pose
 from ssplat_jax.data.stream_frame import StreamFrame
+from ssplat_jax.evaluation.pictures import evenly_spread
+from ssplat_jax.evaluation.psnr_ssim import psnr
+from ssplat_jax.rasterizer import Effects, fill_holes, render
 from ssplat_jax.runs.open_run import load_run
 from ssplat_jax.runs.run_poses import open_capture_of_scene
-from ssplat_jax.scene_files.formats import ExportReport, check_format, save_gaussians
+from ssplat_jax.scene_files.formats import READERS, ExportReport, check_format, file_axes, load_scene, save_gaussians
+from ssplat_jax.storage.chunk_records import load_chunk_records
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.streaming.feed import Exposures, middle_exposure
 
 TITLE = "# Cameras of a scene, written by ssplat export"
 FILES = ("cameras.txt", "images.txt", "points3D.txt")
+NUM_COMPARED, HOLE = 3, 0.5  # views that are compared, and the opacity of a pixel below which it is a hole
 
 
 def scene_to_show(gaussians: Gaussians, frame: StreamFrame, exposures: Exposures) -> Gaussians:
@@ -48,30 +61,148 @@ def save_scene(path: Path, gaussians: Gaussians, frame: StreamFrame, exposures: 
     return save_gaussians(path, scene_to_show(gaussians, frame, exposures), offset=frame.offset)
 
 
-def export_run(
-    run_dir: Path, to: Path, params: dict, reporter: Reporter, max_splats: int | None = None
-) -> ExportReport:
-    """Decodes the saved state of a run and writes its scene, in the capture's frame, at the middle exposure.
+def decoded_scene(run_dir: Path, params: dict, reporter: Reporter) -> Gaussians:
+    """The scene of a run's saved state, in the capture's frame, at the middle exposure.
 
     Args:
         run_dir: folder of the run.
-        to: file to write; its suffix names the format.
         params: parameters of the run's model.
         reporter: warns if only the state before the newest can be read.
-        max_splats: most Gaussians to write.
 
     Raises:
-        InputError: no run there, a run with other weights, or a suffix of no known format.
-        StorageError: the state is corrupt, or `to` cannot be written.
+        InputError: no run there, or a run with other weights.
+        StorageError: the state is corrupt.
     """
-    check_format(to)
     run = load_run(run_dir, reporter)
     session = run.session(params)
     num_shown = int(session.cache_facts()["decoded"])
     # The rows after these are padding, of which a person need not be told.
     gaussians = jax.tree.map(lambda x: x[:num_shown], session.gaussians())
-    scene = scene_to_show(gaussians, run.frame, run.exposures)
-    return save_gaussians(to, scene, offset=run.frame.offset, max_splats=max_splats)
+    return replace(scene_to_show(gaussians, run.frame, run.exposures), offset=run.frame.offset)
+
+
+@dataclasses.dataclass(frozen=True)
+class Views:
+    """Cameras of a scene, as a run streamed them or as a capture holds them."""
+
+    camtoworlds: Float64[np.ndarray, "n 4 4"]  # the capture's frame
+    Ks: Float64[np.ndarray, "n 3 3"]
+    size: tuple[int, int]  # (width, height), pixels
+    exposures: Float64[np.ndarray, "n 3"]  # RGB, relative to the middle one, which the scene has
+
+
+def views_of(scene: Path, cameras: "Cameras | None") -> Views | None:
+    """The cameras that are known of a scene: those that its run recorded, or those of a capture."""
+    records = load_chunk_records(RunFolder(scene).chunk_record_files()) if scene.is_dir() else []
+    if records:
+        views = sorted((view for record in records for view in record.views), key=lambda view: view.frame)
+        exposures = np.stack([view.exposure for view in views])
+        middle = middle_exposure(dict(enumerate(exposures.astype(np.float32))))
+        poses, Ks = (np.stack([getattr(view, name) for view in views]) for name in ("camtoworld", "K"))
+        return Views(poses, Ks, records[0].size, exposures / middle)
+    if cameras is None:
+        return None
+    capture, indices = cameras
+    poses = np.stack([capture.frames[i].camtoworld for i in indices])
+    size = (capture.width, capture.height)
+    return Views(poses, np.stack([capture.K(i) for i in indices]), size, np.ones((len(poses), 3)))
+
+
+def turn_up(views: Views | None, up: str, to: Path) -> Float64[np.ndarray, "3 3"]:
+    """The rotation after which the up direction of cameras held level is an axis of the file, +y or +z.
+
+    Raises:
+        InputError: no cameras are known, or they do not tell what is up.
+    """
+    now = None if views is None else upward(views.camtoworlds)
+    if now is None:
+        fix = "export a run, or pass --cameras CAPTURE"
+        raise refusal("--up", wanted="cameras that are held level", got="none", fix=fix)
+    wanted = file_axes(to).T @ np.eye(3)["xyz".index(up)]
+    across, cosine = np.cross(now, wanted), float(now @ wanted)
+    if np.linalg.norm(across) < 1e-9:  # half a turn about any axis that is perpendicular, or none at all
+        across = np.linalg.svd(now[None])[2][1]
+    angle = np.arctan2(np.linalg.norm(np.cross(now, wanted)), cosine)
+    return Rotation.from_rotvec(angle * across / np.linalg.norm(across)).as_matrix()
+
+
+def turned(gaussians: Gaussians, turn: Float64[np.ndarray, "3 3"]) -> Gaussians:
+    """A scene after a rotation about the origin of its capture."""
+    frame = StreamFrame(turn, np.zeros(3), scale=1.0, near=0.0, far=math.inf)
+    x, y, z = (turn @ gaussians.offset).tolist()
+    mode = gaussians.render_mode
+    return replace(frame.gaussians_to_capture(gaussians), render_mode=mode, offset=(x, y, z))
+
+
+def start_camera(views: Views, gaussians: Gaussians, turn: Float64[np.ndarray, "3 3"]) -> dict[str, Any]:
+    """The middle camera, for viewers that can start there: position, target and vertical angle of view, degrees."""
+    k = len(views.camtoworlds) // 2
+    pose, height = views.camtoworlds[k], views.size[1]
+    center = turn @ pose[:3, 3] - gaussians.offset
+    forward = turn @ pose[:3, 2]
+    ahead = (np.asarray(gaussians.means, np.float64) - center) @ forward
+    distance = float(np.median(ahead[ahead > 0])) if (ahead > 0).any() else 1.0
+    fov = float(np.degrees(2 * np.arctan(height / 2 / views.Ks[k, 1, 1])))
+    return {"position": center.tolist(), "target": (center + distance * forward).tolist(), "fov": fov}
+
+
+def export_scene(
+    scene: Gaussians, to: Path, views: Views | None, up: str | None = None, **options: Any
+) -> tuple[ExportReport, Float64[np.ndarray, "3 3"]]:
+    """Writes a scene with what is known of its cameras, and gives the rotation by which it was turned.
+
+    Args:
+        scene: the Gaussians, in the capture's frame.
+        to: the file to write; its suffix names the format.
+        views: cameras of the scene.
+        up: the axis of the file, `y` or `z`, that is to point up; None leaves the axes of the capture.
+        options: those of `save_gaussians`.
+
+    Raises:
+        InputError: see `save_gaussians` and `turn_up`.
+        StorageError: the file cannot be written.
+    """
+    turn = np.eye(3) if up is None else turn_up(views, up, to)
+    shown = scene if up is None else turned(scene, turn)
+    start = None if views is None else start_camera(views, shown, turn)
+    return save_gaussians(to, shown, start_camera=start, **options), turn
+
+
+def export_run(
+    run_dir: Path, to: Path, params: dict, reporter: Reporter, max_splats: int | None = None
+) -> ExportReport:
+    """Decodes the saved state of a run and writes its scene; see `decoded_scene` and `save_gaussians`."""
+    check_format(to)
+    return save_gaussians(to, decoded_scene(run_dir, params, reporter), max_splats=max_splats)
+
+
+def difference_in_words(to: Path, views: Views, turn: Float64[np.ndarray, "3 3"]) -> str | None:
+    """How the file, drawn by a plain renderer, differs from our own pictures of it, on `NUM_COMPARED` of the views.
+
+    A plain renderer has the dilation of 3DGS, shows holes black, and one exposure. We draw with the filter that the
+    file names, fill holes, and follow the exposures of the views. None for formats that are not read.
+    """
+    if to.suffix not in READERS:
+        return None
+    scene, scores, holes = load_scene(to), [], []
+    scene = replace(scene, offset=(0.0, 0.0, 0.0))
+    chosen = evenly_spread(len(views.camtoworlds), NUM_COMPARED)
+    for k in chosen:
+        pose = views.camtoworlds[k].copy()
+        pose[:3] = turn @ pose[:3]
+        pose[:3, 3] -= load_scene(to).offset
+        viewmat, K = (jnp.asarray(x, jnp.float32) for x in (invert_pose(pose), views.Ks[k]))
+        camera = Camera(viewmats=viewmat, Ks=K, width=views.size[0], height=views.size[1])
+        ours, plain = (render(scene, camera, effects=Effects(antialias=name)) for name in (None, "classic"))
+        filled = np.asarray(fill_holes(ours.color, ours.alpha, mean_color(scene))) * views.exposures[k]
+        scores.append(psnr(np.clip(plain.color, 0.0, 1.0), np.clip(filled, 0.0, 1.0)))
+        holes.append(float(np.mean(np.asarray(plain.alpha) < HOLE)))
+    factors = views.exposures[list(chosen)]
+    exposure = float(np.max(np.maximum(factors, 1.0 / factors)))
+    return (
+        f"drawn by a plain renderer, {len(chosen)} views differ from our pictures of them by {np.mean(scores):.1f} dB"
+        f" PSNR: {np.mean(holes):.1%} holes, which we fill, and exposures up to {exposure:.2f} times that of the file"
+    )
 
 
 Cameras = tuple[Capture, Sequence[int]]
@@ -98,14 +229,16 @@ def open_cameras(path: str, scene: Path, to: Path, reporter: Reporter) -> Camera
     return run.open_capture(path), sorted(run.exposures)
 
 
-def save_cameras(folder: Path, cameras: Cameras, offset: tuple[float, float, float]) -> None:
+def save_cameras(
+    folder: Path, cameras: Cameras, offset: tuple[float, float, float], turn: Float64[np.ndarray, "3 3"] | None = None
+) -> None:
     """Writes the three files of a COLMAP model, after colmap.github.io/format.html.
 
     `cameras.txt` holds pinhole cameras, `images.txt` poses from world to camera as a quaternion wxyz and a translation,
     both for images as they are delivered: without lens distortion, at the size that was streamed. `points3D.txt` is
     empty; COLMAP does not open a model without it. SuperSplat shows the cameras of `images.txt`.
 
-    Positions are relative to `offset`, a point of the capture's frame, as in the scene beside.
+    Positions are relative to `offset`, a point of the capture's frame, which is turned first, as the scene beside is.
 
     Raises:
         StorageError: a file cannot be written.
@@ -115,6 +248,8 @@ def save_cameras(folder: Path, cameras: Cameras, offset: tuple[float, float, flo
     lines = []
     for number, i in enumerate(indices, start=1):
         K, camtoworld = capture.K(i), capture.frames[i].camtoworld.copy()
+        if turn is not None:
+            camtoworld[:3] = turn @ camtoworld[:3]
         camtoworld[:3, 3] -= offset
         viewmat = invert_pose(camtoworld)
         quat = Rotation.from_matrix(viewmat[:3, :3]).as_quat(scalar_first=True, canonical=True)

@@ -12,17 +12,18 @@ from typing import Any
 
 import numpy as np
 import zstandard
+from jaxtyping import Float64
 from PIL import Image
 
 from ssplat_jax.core.atomic import write_atomic
 from ssplat_jax.core.errors import InputError, refusal
 from ssplat_jax.core.gaussians import Gaussians
-from ssplat_jax.scene_files.glb import decode_glb, encode_glb
+from ssplat_jax.scene_files.glb import AXIS_FLIP, decode_glb, encode_glb
 from ssplat_jax.scene_files.ply import decode_ply, encode_ply
 from ssplat_jax.scene_files.sog import decode_sog, encode_sog
 from ssplat_jax.scene_files.splat import encode_splat
 from ssplat_jax.scene_files.splat_rows import RENDER_MODES, SplatRows, gaussians_of_rows, rows_to_write
-from ssplat_jax.scene_files.spz import decode_spz, encode_spz
+from ssplat_jax.scene_files.spz import RUB, decode_spz, encode_spz
 
 FilePath = str | os.PathLike
 Offset = tuple[float, float, float]
@@ -73,6 +74,7 @@ def save_gaussians(
     offset: Offset | None = None,
     max_splats: int | None = None,
     spz_version: int = 4,
+    start_camera: dict[str, Any] | None = None,
 ) -> ExportReport:
     """Writes `gaussians` to `path` atomically, in the format of its extension; the same Gaussians give the same bytes.
 
@@ -85,13 +87,18 @@ def save_gaussians(
             store it.
         max_splats: most Gaussians to write; opaque ones are kept first, everywhere alike.
         spz_version: version of a .spz, 4 or 3.
+        start_camera: position, target and vertical angle of view (degrees) of the camera with which viewers may start;
+            a .sog holds it.
 
     Raises:
         InputError: an unknown extension or render mode, positions or sizes that the format cannot hold, a wrong shape.
         StorageError: the file cannot be written.
     """
     encode = WRITERS[check_format(path)]
-    encode = functools.partial(encode_spz, version=spz_version) if encode is encode_spz else encode
+    if encode is encode_spz:
+        encode = functools.partial(encode_spz, version=spz_version)
+    elif encode is encode_sog:
+        encode = functools.partial(encode_sog, start_camera=start_camera)
     return _save(path, gaussians, encode, render_mode, offset, max_splats)
 
 
@@ -113,6 +120,11 @@ def save_spz(
 def save_splat(path: FilePath, gaussians: Gaussians) -> ExportReport:
     """Writes a .splat; see `save_gaussians`."""
     return _save(path, gaussians, encode_splat)
+
+
+def file_axes(path: FilePath) -> Float64[np.ndarray, "3 3"]:
+    """Matrix from the axes of a .ply, those of the capture, to those of the file's format."""
+    return {".glb": AXIS_FLIP, ".spz": RUB.T}.get(check_format(path), np.eye(3))
 
 
 def _save(path, gaussians, encode, render_mode=None, offset=None, max_splats=None) -> ExportReport:
@@ -153,9 +165,3 @@ def _read(path: FilePath, suffix: str) -> Gaussians:
     except DAMAGE as error:
         cause = " ".join((str(error) if type(error) is ValueError else repr(error)).split())
         raise InputError(f"{path}: cannot be used as a {suffix} file: {cause:.300}; write it again.") from error
-
-
-def convert_scene(scene: Path, to: Path, **options: Any) -> ExportReport:
-    """Writes the scene file `scene` in the format given by the name of `to`; see `load_scene` and `save_gaussians`."""
-    check_format(to)
-    return save_gaussians(to, load_scene(scene), **options)

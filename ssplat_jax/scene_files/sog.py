@@ -39,8 +39,8 @@ BATCH = 8192  # vectors compared with a palette at once, 256 MB of distances
 MAX_LOG_POSITION = 60.0  # bound of a position on its logarithmic axis: 1e26 units
 
 
-def encode_sog(rows: SplatRows) -> bytes:
-    """The bytes of a .sog.
+def encode_sog(rows: SplatRows, start_camera: dict[str, Any] | None = None) -> bytes:
+    """The bytes of a .sog; viewers that know of it start with a camera.
 
     Limits:
         Positions have 65,536 steps on a logarithmic axis, ln scales and SH coefficients 256 values fitted to the scene,
@@ -71,6 +71,8 @@ def encode_sog(rows: SplatRows) -> bytes:
         "quats": {"files": ["quats.webp"]},
         "sh0": {"codebook": color_codes.tolist(), "files": ["sh0.webp"]},
     }
+    if start_camera is not None:  # as in the experience settings of PlayCanvas; readers of scenes skip it
+        meta["cameras"] = [{"initial": start_camera}]
     if rows.sh.shape[1] > 1 and len(rows):
         meta["shN"], more = _encode_rest(rows.sh[order, 1:])
         images |= more

@@ -67,7 +67,7 @@ def encode_spz(rows: SplatRows, version: int = VERSIONS[0]) -> bytes:
         wanted, got = "Gaussians of 4.5e-05 to 377 units", f"{np.exp(np.median(sizes)):.2g} units for the middle one"
         raise refusal("save_spz", wanted=wanted, got=got, fix="write a .ply, .glb or .sog, which hold any unit")
     fractional_bits = next(bits for bits in reversed(range(POSITION_BITS)) if reach * 2**bits <= limit)  # all that fit
-    turn, degree = _axes("RUB").T, round(rows.sh.shape[1] ** 0.5) - 1
+    turn, degree = RUB.T, round(rows.sh.shape[1] ** 0.5) - 1
     fixed = np.round(rows.means @ turn.T * 2**fractional_bits).astype("<i4")
     signs = np.round(np.diag(sh_rotation(turn, degree)))[1:, None]
     fields = (
@@ -92,6 +92,9 @@ def encode_spz(rows: SplatRows, version: int = VERSIONS[0]) -> bytes:
 def _axes(letters: str) -> Float64[np.ndarray, "3 3"]:
     """Matrix from axes that point as the letters say to those of a .ply."""
     return np.array([DIRECTIONS[letter] for letter in letters], np.float64).T
+
+
+RUB = _axes("RUB")
 
 
 def _pack_rotations(quats: Float64[np.ndarray, "n 4"]) -> UInt32[np.ndarray, " n"]:

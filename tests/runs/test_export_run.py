@@ -2,7 +2,9 @@
 
 import dataclasses
 import json
+import re
 import shutil
+import zipfile
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,11 +12,19 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import ssplat_jax as ss
+from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.gaussians import scale_colors
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.rasterizer import render
-from ssplat_jax.runs.export_run import save_cameras, scene_to_show
-from ssplat_jax.scene_files.formats import save_ply
+from ssplat_jax.runs.export_run import (
+    Views,
+    difference_in_words,
+    export_scene,
+    save_cameras,
+    scene_to_show,
+    turned,
+)
+from ssplat_jax.scene_files.formats import file_axes, save_ply
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.streaming.feed import middle_exposure
 from tests.commands.command_fixture import SIZE, make_capture, narrow_options, run
@@ -136,3 +146,74 @@ def test_the_scene_to_show_is_at_the_middle_exposure_of_its_views():
     np.testing.assert_allclose(images[2], images[1], atol=1e-5)
     for name in ("means", "quats", "scales", "opacities"):
         np.testing.assert_allclose(getattr(shown, name), getattr(gaussians, name), atol=1e-6)
+
+
+UP_IN_FILE = {".ply": "y", ".sog": "z", ".glb": "y", ".spz": "z"}
+
+
+@pytest.mark.parametrize("suffix", UP_IN_FILE)
+def test_up_points_along_an_axis_of_the_file(tmp_path, suffix):
+    """Cameras that are held level, of a tilted world, see the turned scene as they saw the scene before."""
+    tilt = Rotation.from_rotvec([0.5, 0.2, -0.9]).as_matrix()
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    poses[:, :3, :3] = tilt @ Rotation.from_rotvec([[0, 0.2 * i, 0] for i in range(4)]).as_matrix()  # y down
+    K = np.asarray(camera().Ks, np.float64)
+    views = Views(poses, np.tile(K, (4, 1, 1)), (48, 32), np.ones((4, 3)))
+    world = turned(scene(1), tilt)
+    to, up = tmp_path / f"a{suffix}", UP_IN_FILE[suffix]
+    report, turn = export_scene(world, to, views, up)
+    in_file = file_axes(to) @ turn @ tilt @ [0.0, -1.0, 0.0]
+    np.testing.assert_allclose(in_file, np.eye(3)["xyz".index(up)], atol=1e-6)
+    assert report.num_written == 60
+    before = render(
+        world, Camera(jnp.asarray(np.linalg.inv(poses[1]), jnp.float32), jnp.asarray(K, jnp.float32), 48, 32)
+    )
+    pose = poses[1].copy()
+    pose[:3] = turn @ pose[:3]
+    view = Camera(jnp.asarray(np.linalg.inv(pose), jnp.float32), jnp.asarray(K, jnp.float32), 48, 32)
+    after = render(ss.load_scene(to), view)
+    assert np.sqrt(np.mean((np.asarray(after.color) - np.asarray(before.color)) ** 2)) < 0.03
+
+
+def test_up_without_cameras_is_refused(tmp_path, capsys):
+    save_ply(tmp_path / "scene.ply", scene(0))
+    assert run("export", tmp_path / "scene.ply", "--to", tmp_path / "a.glb", "--up", "y") == 2
+    assert "--up: wanted cameras" in capsys.readouterr().err and not (tmp_path / "a.glb").exists()
+
+
+def test_a_sog_holds_the_camera_to_start_with(tmp_path):
+    pose = np.eye(4)
+    pose[:3, 3] = [0.5, 0.0, -1.0]
+    views = Views(
+        np.stack([pose] * 3), np.tile(np.asarray(camera().Ks, np.float64), (3, 1, 1)), (48, 32), np.ones((3, 3))
+    )
+    export_scene(scene(0), tmp_path / "a.sog", views)
+    with zipfile.ZipFile(tmp_path / "a.sog") as archive:
+        start = json.loads(archive.read("meta.json"))["cameras"][0]["initial"]
+    assert start["position"] == [0.5, 0.0, -1.0] and start["target"][:2] == [0.5, 0.0] and start["target"][2] > 1.0
+    assert start["fov"] == pytest.approx(np.degrees(2 * np.arctan(16 / 40)))
+
+
+def test_an_export_says_how_a_plain_renderer_shows_the_file(tmp_path):
+    """A wall with a hole, and a view at twice the exposure of the file."""
+    x, y = np.meshgrid(np.linspace(-1.6, 1.6, 60), np.linspace(-1.1, 1.1, 40))
+    means = np.stack([x.ravel(), y.ravel(), np.full(x.size, 2.0)], axis=1)
+    means = means[np.hypot(means[:, 0], means[:, 1]) > 0.5]
+    wall = ss.Gaussians.from_rgb(
+        means=jnp.asarray(means, jnp.float32),
+        quats=jnp.tile(jnp.array([1.0, 0, 0, 0]), (len(means), 1)),
+        scales=jnp.full((len(means), 3), 0.04),
+        opacities=jnp.full(len(means), 0.99),
+        colors=jnp.full((len(means), 3), 0.4),
+    )
+    exposures = np.ones((3, 3))
+    exposures[1] = 2.0
+    views = Views(
+        np.tile(np.eye(4), (3, 1, 1)), np.tile(np.asarray(camera().Ks, np.float64), (3, 1, 1)), (48, 32), exposures
+    )
+    _, turn = export_scene(wall, tmp_path / "a.ply", views)
+    words = difference_in_words(tmp_path / "a.ply", views, turn)
+    holes = float(re.search(r"([\d.]+)% holes", words)[1]) / 100
+    assert holes == pytest.approx(np.pi * 10**2 / 48 / 32, rel=0.35)  # a disc of half a unit at a distance of 2, 20 px
+    assert "up to 2.00 times" in words and "3 views" in words
+    assert difference_in_words(tmp_path / "a.splat", views, turn) is None
