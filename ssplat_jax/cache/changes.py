@@ -16,7 +16,7 @@ from ssplat_jax.cache.hash_table import voxel_indices
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.gaussians import SH_C0, Gaussians
 from ssplat_jax.core.numerics import clip_value
-from ssplat_jax.core.pytree import pytree
+from ssplat_jax.core.pytree import pytree, replace
 
 WIDTH = 14
 """Numbers for each Gaussian of a pivot."""
@@ -66,7 +66,8 @@ def apply_change(start: Gaussians, change: Change, *, max_scale: float = math.in
     logits = clip_value(logits, -MAX_LOGIT, MAX_LOGIT)
     length = jnp.linalg.norm(start.quats, axis=-1, keepdims=True)
     scales = start.scales * jnp.exp(change.log_scales)
-    return Gaussians(
+    return replace(
+        start,
         means=start.means + change.means,
         quats=start.quats / jnp.where(length > 0, length, 1.0) + change.quats,
         scales=scales if max_scale == math.inf else jnp.minimum(scales, jnp.maximum(start.scales, max_scale)),

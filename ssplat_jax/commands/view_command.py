@@ -18,7 +18,7 @@ class View:
     """
 
     scene: Annotated[Path, tyro.conf.Positional]
-    """A scene file (.ply, .compressed.ply, .spz, .sog, .glb, .splat), or the folder of an `ssplat run`."""
+    """A scene file (.ply, .compressed.ply, .spz, .sog, .glb), or the folder of an `ssplat run`."""
     port: int = 8080
     """Port; the next free one if it is taken."""
     host: str = "127.0.0.1"

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from ssplat_jax.core.gaussians import Gaussians
+from ssplat_jax.core.pytree import replace
 from ssplat_jax.core.rotations import matrices_to_quats, multiply_quats, sh_rotation
 
 MAX_COORDINATE_SPACING = 1e-4
@@ -112,7 +113,8 @@ class StreamFrame:
         quat = matrices_to_quats(jnp.asarray(self.rotation, jnp.float32))
         mixing = sh_rotation(self.rotation, gaussians.sh_degree)
         means = self.points_to_capture(np.asarray(gaussians.means, np.float64)) - np.asarray(offset, np.float64)
-        return Gaussians(
+        return replace(
+            gaussians,
             means=jnp.asarray(means, jnp.float32),
             quats=multiply_quats(jnp.broadcast_to(quat, gaussians.quats.shape), gaussians.quats),
             scales=gaussians.scales / self.scale,

@@ -255,18 +255,10 @@ def _owners(ends: Int[Array, " m"], capacity: int) -> Int[Array, " p"]:
 def _sort_pairs(
     tiles: Int[Array, " p"], rows: Int[Array, " p"], num_tiles: int, num_rows: int, pieces: int
 ) -> tuple[Int[Array, " p"], Int[Array, " tiles_and_one"]]:
-    """Rows in order of (tile, row), and where each tile's rows begin.
+    """Rows in order of (tile, row), and bounds as in `TileIntersections`; pairs of tile `num_tiles` are left out.
 
-    Args:
-        tiles: the tile of each pair; `num_tiles` for those to leave out.
-        rows: the row of each pair, in ascending order with no row left out.
-        num_tiles: number of tiles.
-        num_rows: number of rows of the table.
-        pieces: number of arrays to sort side by side.
-
-    Returns:
-        The sorted rows, and bounds as in `TileIntersections`. Inside a piece, rows are counted from its first: that
-        takes fewer bits, so that most keys fit in 32.
+    The given rows ascend with none left out. `pieces` arrays are sorted side by side, in which rows are counted from
+    the first: that takes fewer bits, so that most keys fit in 32.
     """
     capacity = tiles.shape[0]
     size = -(-capacity // pieces)

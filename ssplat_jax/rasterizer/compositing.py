@@ -201,21 +201,11 @@ def _run_steps(
     """`state` after all steps of a batch, front to back.
 
     A step's Gaussians are looked up, copied and transposed with `in_own_kernel`: XLA would otherwise fuse that with
-    every kernel that uses them, and each would go through the table once a sample (docs/performance.md).
+    every kernel that uses them, and each would go through the table once a sample.
 
-    Args:
-        grid: the tiles.
-        table: from `sorted_table`.
-        intersections: from `intersect_tiles`.
-        tiles: the batch.
-        schedule: the size of a step.
-        step: `step(rows, values, alphas, transmittance, state)` returns the transmittance and the state after it;
-            `rows` are row numbers of `table`, `values` their columns.
-        state: the state before the first step.
-        with_ones: whether a column of ones follows the channels.
-
-    Returns:
-        The state. Steps go on while, in one of the tiles, Gaussians are left and a pixel is above the stop.
+    `step(rows, values, alphas, transmittance, state)` returns the transmittance and the state after it; `rows` are row
+    numbers of `table`, `values` their columns, followed by ones if `with_ones`. Steps go on while, in one of the tiles,
+    Gaussians are left and a pixel is above the stop.
     """
     first, last = _ranges(intersections, tiles)
     size = schedule.step_size

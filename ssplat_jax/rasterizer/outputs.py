@@ -66,17 +66,9 @@ def splat_channels(
     effects: Effects,
     features: Float[Array, "n c"] | None,
 ) -> Float[Array, "b n channels"]:
-    """The channels to composite: RGB, then depth and features where wanted.
+    """The channels of each camera and Gaussian to composite: RGB, then depth and features where wanted.
 
-    Args:
-        gaussians: the scene, finite.
-        splats: its projection.
-        camera: one batch axis.
-        effects: the SH degree and the outputs.
-        features: further channels; rows that are not finite become 0.
-
-    Returns:
-        Channels of each camera and Gaussian.
+    Rows of features that are not finite become 0.
     """
     degree = gaussians.sh_degree if effects.sh_degree is None else min(effects.sh_degree, gaussians.sh_degree)
     directions = None
@@ -103,18 +95,9 @@ def finish(
     median_depth: Float[Array, "b h w"] | None,
     **counts: Int[Array, ""],
 ) -> RenderOutput:
-    """The output of a render.
+    """The output of a render, in the camera's batch shape; the counts of `RenderOutput` are passed on.
 
-    Args:
-        composited: `splat_channels` composited, alpha last if `effects.needs_alpha`.
-        camera: gives the batch shape.
-        effects: background, exposure and outputs.
-        exposures: affine color correction of each frame.
-        median_depth: passed on, as are the counts.
-        counts: those of `RenderOutput`.
-
-    Returns:
-        Images in the camera's batch shape.
+    `composited` are `splat_channels` composited, alpha last if `effects.needs_alpha`.
     """
     batch = camera.viewmats.shape[:-2]
     images = composited.reshape(*batch, *composited.shape[1:])

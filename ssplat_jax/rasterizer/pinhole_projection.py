@@ -94,7 +94,8 @@ def _project_bwd(effects: Effects, residuals, grads: Splats) -> tuple[Gaussians,
     turns = [_cross(grad, row) for grad, row in zip(row_grads, sight.rows, strict=True)]
     turn = [jnp.sum(a + b, axis=0) for a, b in zip(*turns, strict=True)]
     world = camera.viewmats[:, :3, :3, None]
-    by_gaussian = Gaussians(
+    by_gaussian = replace(
+        gaussians,
         means=_stacked(sum(world[:, i, j] * point_grads[i] for i in range(3)) for j in range(3)),
         quats=_quat_grads(gaussians.quats, turn),
         scales=_stacked(scale_grads),

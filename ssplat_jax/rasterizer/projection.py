@@ -162,12 +162,7 @@ def _corner(camera: Camera) -> Float[Array, " b"]:
 def _screen_roots(gaussians: Gaussians, camera: Camera, points: tuple[Float[Array, "b n"], ...], distortion, corner):
     """Rows of M = J W R S, a square root of the screen covariance, each a triple of `[b n]`.
 
-    Args:
-        gaussians: the scene.
-        camera: one batch axis.
-        points: x / z, y / z and z of the means in the camera.
-        distortion: OPENCV coefficients, or None.
-        corner: undistorted radius of the farthest image corner, or None.
+    `points` are x / z, y / z and z of the means in the camera, `corner` the undistorted radius of the farthest corner.
     """
     tan_x, tan_y, z = points
     fx, fy = (camera.Ks[:, i, i, None] for i in (0, 1))

@@ -229,15 +229,8 @@ def _check(inputs: RenderInputs) -> None:
 
 
 def prepare(inputs: RenderInputs, effects: Effects):
-    """The projection stage.
-
-    Args:
-        inputs: the scene and cameras.
-        effects: resolved, see `Effects.resolve`.
-
-    Returns:
-        Finite Gaussians in float32 (float64 if given), the camera with one batch axis, the splats, and the number of
-        rows culled.
+    """The projection stage: finite Gaussians in float32 (float64 if given), the camera with one batch axis, the splats,
+    and the number of rows culled. The effects are resolved, see `Effects.resolve`.
     """
     given = inputs.gaussians.means.dtype
     dtype = given if given == jnp.float64 else jnp.dtype(jnp.float32)

@@ -130,8 +130,7 @@ def turned(gaussians: Gaussians, turn: Float64[np.ndarray, "3 3"]) -> Gaussians:
     """A scene after a rotation about the origin of its capture."""
     frame = StreamFrame(turn, np.zeros(3), scale=1.0, near=0.0, far=math.inf)
     x, y, z = (turn @ gaussians.offset).tolist()
-    mode = gaussians.render_mode
-    return replace(frame.gaussians_to_capture(gaussians), render_mode=mode, offset=(x, y, z))
+    return replace(frame.gaussians_to_capture(gaussians), offset=(x, y, z))
 
 
 def start_camera(views: Views, gaussians: Gaussians, turn: Float64[np.ndarray, "3 3"]) -> dict[str, Any]:

@@ -182,6 +182,6 @@ def _depths_seen(
     """Depths of the opaque Gaussians in an image, hidden ones included."""
     means = np.asarray(splats.means, np.float64)[np.asarray(splats.opacities) > 0.5]
     points = np.einsum("ji,nj->ni", camtoworld[:3, :3], means + np.asarray(splats.offset) - camtoworld[:3, 3])
-    points = points[np.isfinite(points).all(axis=1) & (points[:, 2] > 1e-6)]
+    points = points[np.isfinite(points).all(axis=1) & (points[:, 2] > 0)]
     pixels = np.einsum("ij,nj->ni", K, points)[:, :2] / points[:, 2:]
     return points[((pixels >= 0) & (pixels <= size)).all(axis=1), 2]

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float64, Int, UInt8
 from scipy.spatial.transform import Rotation
 
-from ssplat_jax.core.errors import InputError
+from ssplat_jax.core.errors import InputError, refusal
 from ssplat_jax.core.gaussians import Gaussians, check_gaussians
 from ssplat_jax.core.rotations import sh_rotation
 
@@ -20,6 +20,7 @@ RENDER_MODES = ("default", "mip", "2dgs")
 SH_TERMS = (1, 4, 9, 16)  # numbers of SH terms that files hold, those of degree 0 to 3
 MIN_OPACITY = 1.0 / 255.0  # below it every renderer shows nothing, and nothing is written (absent rows have 0)
 OPACITY_GUARD = 1e-6  # opacities are clamped this far from 0 and 1, where the logit is infinite
+SIZE_STEP, MAX_CLIPPED = 1 / 32, 0.01  # of ln sigma, what is no clipping; share of the Gaussians that may be clipped
 LOG_SCALE_LIMIT = 20.0
 """|ln sigma| is clamped to this, 2e-9 to 5e8 units: the range of the compressed formats that are made from a .ply."""
 UNIFORM, ROUNDING = 1e-4, 1e-9  # a transform that scales unevenly by less does not stretch; differences of rounding
@@ -56,7 +57,8 @@ def rows_to_write(gaussians: Gaussians, max_splats: int | None = None) -> tuple[
         Opacities are clamped to [1e-6, 1 - 1e-6], scales to [e^-20, e^20]; a zero quaternion becomes the identity.
 
     Raises:
-        InputError: an array of the scene has a wrong shape, or the number of SH terms is none of 1, 4, 9 and 16.
+        InputError: an array of the scene has a wrong shape, the number of SH terms is none of 1, 4, 9 and 16, or over
+            1 % of the scales are clamped.
     """
     check_gaussians(gaussians, "scene")
     if (terms := gaussians.sh.shape[1]) not in SH_TERMS:
@@ -69,14 +71,31 @@ def rows_to_write(gaussians: Gaussians, max_splats: int | None = None) -> tuple[
     # Nothing is pruned: leaving out specks and floaters raised no score on three captures.
     if max_splats is not None and num_visible > max_splats:
         keep[keep] = thinned_mask(means[keep], opacities[keep], max_splats)
+    with np.errstate(divide="ignore"):
+        log_scales = np.log(scales[keep])
+    check_sizes(log_scales, -LOG_SCALE_LIMIT, LOG_SCALE_LIMIT)
     rows = SplatRows(
         means=means[keep],
         quats=unit_quats(quats[keep]),
-        log_scales=np.log(np.clip(scales[keep], np.exp(-LOG_SCALE_LIMIT), np.exp(LOG_SCALE_LIMIT))),
+        log_scales=np.clip(log_scales, -LOG_SCALE_LIMIT, LOG_SCALE_LIMIT),
         opacities=np.clip(opacities[keep], OPACITY_GUARD, 1 - OPACITY_GUARD),
         sh=sh[keep],
     )
     return rows, num_visible - len(rows)
+
+
+def check_sizes(log_scales: Float64[np.ndarray, "n 3"], low: float, high: float) -> None:
+    """Refuses a scene in a unit that a file does not hold: over 1 % of the Gaussians are larger or smaller than it can.
+
+    Raises:
+        InputError: naming the range.
+    """
+    sizes = log_scales.max(axis=1, initial=-np.inf)
+    sizes = sizes[sizes > -np.inf]  # points have no size
+    if len(sizes) and np.mean((sizes < low - SIZE_STEP) | (sizes > high + SIZE_STEP)) > MAX_CLIPPED:
+        wanted = f"Gaussians of {np.exp(low):.2g} to {np.exp(high):.2g} units"
+        got, fix = f"{np.exp(np.median(sizes)):.2g} units for the middle one", "scale the scene, or try a .ply or .glb"
+        raise refusal("scene", wanted=wanted, got=got, fix=fix)
 
 
 def thinned_mask(

@@ -22,7 +22,15 @@ from jaxtyping import Float64, UInt8, UInt32
 
 from ssplat_jax.core.errors import refusal
 from ssplat_jax.core.rotations import sh_rotation
-from ssplat_jax.scene_files.splat_rows import HALF_RANGE, SplatRows, drop_largest, placed, to_bytes, with_largest
+from ssplat_jax.scene_files.splat_rows import (
+    HALF_RANGE,
+    SplatRows,
+    check_sizes,
+    drop_largest,
+    placed,
+    to_bytes,
+    with_largest,
+)
 
 MAGIC = b"NGSP"
 VERSIONS = (4, 3)
@@ -39,7 +47,6 @@ COMPRESSION = 12  # level of zstd
 POSITION_BITS = 24
 COLOR_STEP = 0.15  # factor of f_dc; it leaves room for colors outside [0, 1], which other SH terms compensate
 LOG_SCALES = (-10.0, 255 / 16 - 10)  # least and largest
-MAX_CLIPPED = 0.01  # share of the Gaussians whose size may be clipped
 MAX_RATIO = 1032
 """Most bytes that a compressed byte may become: what deflate can make of one, and more than zstd does of a scene."""
 
@@ -61,11 +68,7 @@ def encode_spz(rows: SplatRows, version: int = VERSIONS[0]) -> bytes:
     if reach > limit:
         wanted = f"positions within {limit} units of the origin"
         raise refusal("save_spz", wanted=wanted, got=f"one at {reach:g}", fix="write a .ply")
-    sizes = rows.log_scales.max(axis=1, initial=-np.inf)
-    is_clipped = (sizes < LOG_SCALES[0] - 1 / 32) | (sizes > LOG_SCALES[1] + 1 / 32)
-    if len(rows) and np.mean(is_clipped) > MAX_CLIPPED:
-        wanted, got = "Gaussians of 4.5e-05 to 377 units", f"{np.exp(np.median(sizes)):.2g} units for the middle one"
-        raise refusal("save_spz", wanted=wanted, got=got, fix="write a .ply, .glb or .sog, which hold any unit")
+    check_sizes(rows.log_scales, *LOG_SCALES)
     fractional_bits = next(bits for bits in reversed(range(POSITION_BITS)) if reach * 2**bits <= limit)  # all that fit
     turn, degree = RUB.T, round(rows.sh.shape[1] ** 0.5) - 1
     fixed = np.round(rows.means @ turn.T * 2**fractional_bits).astype("<i4")

@@ -1,5 +1,6 @@
 """`ssplat render`: pictures of a scene file from a capture's cameras, and a film."""
 
+import json
 import sys
 
 import jax.numpy as jnp
@@ -93,6 +94,24 @@ def test_a_scene_counted_from_an_offset_is_seen_where_it_is(tmp_path, capture):
     pictures = [picture(tmp_path / name / "views" / "00000.png") for name in ("near", "counted")]
     # The camera's place among numbers of 4096 is rounded to 2e-4: a hundredth of a pixel.
     np.testing.assert_allclose(*pictures, atol=3 * LEVEL)
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1e3])
+def test_pictures_do_not_depend_on_the_unit_of_the_capture(tmp_path, capture, unit):
+    """Poses in millimeters or kilometers: at a thousandth, everything lies before a near plane of 0.01."""
+    facts = json.loads((capture / "transforms.json").read_text())
+    ss.save_ply(tmp_path / "a.ply", scene())
+    ss.save_ply(tmp_path / "b.ply", replace(scene(), means=unit * scene().means, scales=unit * scene().scales))
+    assert run("render", tmp_path / "a.ply", capture, "--out", tmp_path / "a", "--quiet") == 0
+    for frame in facts["frames"]:
+        for row in frame["transform_matrix"][:3]:
+            row[3] *= unit
+    (capture / "transforms.json").write_text(json.dumps(facts))
+    assert run("render", tmp_path / "b.ply", capture, "--out", tmp_path / "b", "--quiet") == 0
+    for i in range(3):
+        pictures = [picture(tmp_path / name / "views" / f"{i:05d}.png") for name in "ab"]
+        assert pictures[0].std() > 0.05
+        np.testing.assert_allclose(*pictures, atol=1.1 * LEVEL)
 
 
 def test_a_scene_of_another_kind_is_refused_and_nothing_written(tmp_path, capture, capsys):

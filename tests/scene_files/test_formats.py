@@ -19,6 +19,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 import ssplat_jax as ss
+from ssplat_jax.cache.changes import changed_gaussians, no_change
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.core.gaussians import SH_C0, Gaussians
 from ssplat_jax.core.pytree import replace
@@ -151,7 +152,9 @@ def test_a_loaded_scene_is_drawn_as_it_is_meant(tmp_path):
     discs = ss.load_scene(tmp_path / "a.ply")
     with pytest.raises(InputError, match="made for 2dgs"):
         ss.render(discs, view)
-    drawn = ss.render(discs, view, effects=ss.Effects(antialias="classic")).color
+    same = changed_gaussians(discs, no_change(discs))  # as refinement changes it
+    assert (same.render_mode, same.offset) == ("2dgs", (0.0, 0.0, 0.0))
+    drawn = ss.render(same, view, effects=ss.Effects(antialias="classic")).color
     np.testing.assert_allclose(drawn, classic, atol=2e-4)
 
 
@@ -256,8 +259,11 @@ def test_the_axes_that_a_spz_names_are_honoured(tmp_path, axes):
 def test_spz_refuses_sizes_that_it_cannot_hold(tmp_path, size):
     """A scene in another unit: its Gaussians would become up to hundreds of times as large."""
     small = replace(scene_for(), means=size * scene_for().means, scales=size * scene_for().scales)
-    with pytest.raises(InputError, match=r"4.5e-05 to 377 units.*write a \.ply"):
+    with pytest.raises(InputError, match=r"4.5e-05 to 3.8e\+02 units.*try a \.ply"):
         ss.save_spz(tmp_path / "a.spz", small)
+    tiny = replace(small, scales=small.scales * size**4)  # beyond every format
+    with pytest.raises(InputError, match=r"2.1e-09 to 4.9e\+08 units"):
+        ss.save_ply(tmp_path / "a.ply", tiny)
     for suffix in (".ply", ".glb", ".sog"):
         save_gaussians(tmp_path / f"a{suffix}", small)
         found = ss.load_scene(tmp_path / f"a{suffix}")
