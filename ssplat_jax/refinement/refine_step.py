@@ -19,9 +19,9 @@ from ssplat_jax.cache.changes import MAX_LOGIT, Change, apply_change, no_change
 from ssplat_jax.cache.key_views import KeyViews
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.gaussians import SH_C0, Gaussians, mean_color, with_sh_degree
-from ssplat_jax.core.numerics import columns
 from ssplat_jax.core.pytree import pytree, replace
 from ssplat_jax.rasterizer import constants
+from ssplat_jax.rasterizer.effects import camera_points, near_planes
 from ssplat_jax.refinement.compared_views import RefineConfig, view_loss, views_of_step
 
 RATES = {"means": 0.04, "quats": 0.003, "log_scales": 0.02, "logit_opacities": 0.2, "sh": 0.015}
@@ -224,11 +224,9 @@ def may_be_seen(gaussians: Gaussians, camera: Camera) -> Bool[Array, " n"]:
     Limits:
         True for every row that `project` makes visible and whose box touches the image. NaN gives False.
     """
-    x, y, z = (
-        sum(camera.viewmats[i, j] * entry for j, entry in enumerate(columns(gaussians.means))) + camera.viewmats[i, 3]
-        for i in range(3)
-    )
-    is_seen = (z > constants.NEAR) & (gaussians.opacities > 0)
+    viewmats = camera.viewmats[None]
+    x, y, z = (entry[0] for entry in camera_points(gaussians.means, viewmats))
+    is_seen = (z > near_planes(gaussians, viewmats)[0]) & (gaussians.opacities > 0)
     z = jnp.where(is_seen, z, 1.0)
     largest = jnp.max(gaussians.scales, axis=-1)
     for across, axis, size in ((x, 0, camera.width), (y, 1, camera.height)):
