@@ -12,6 +12,8 @@ Nothing raises inside jit: losses are counted in `cache.stats`, and `check_cache
     check_cache(cache, config)
 """
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -231,7 +233,7 @@ def ensure_capacity(cache: VoxelCache, config: StreamConfig, num_new_tokens: int
 def required_capacity(caches: VoxelCache, config: StreamConfig, num_new_tokens: int) -> int:
     """The capacity to which `ensure_capacity` enlarges a cache, or caches with leading axes, alike."""
     new_rows = num_new_tokens if config.memory.vacc == "voxel" else -(-num_new_tokens // config.memory.pivots_per_voxel)
-    capacity, num_voxels = caches.capacity, int(jnp.max(caches.num_voxels))
+    capacity, num_voxels = caches.capacity, int(np.asarray(caches.num_voxels).max())
     while config.memory.overflow == "grow" and capacity < num_voxels + new_rows:
         capacity *= 2
     return capacity
@@ -246,11 +248,16 @@ def grow(cache: VoxelCache, capacity: int) -> VoxelCache:
     extra = capacity - cache.capacity
     if extra < 0 or capacity & (capacity - 1):
         raise InputError(f"cache: capacity must be a power of two of at least {cache.capacity}, got {capacity}.")
+    return _grown(cache, extra)
+
+
+@functools.partial(jax.jit, static_argnames="extra")
+def _grown(cache: VoxelCache, extra: int) -> VoxelCache:
     rows = {name: getattr(cache, name) for name in ("voxels", "counts", *pivot_fields(cache))}
     rows = {name: jnp.pad(x, [(0, extra)] + [(0, 0)] * (x.ndim - 1)) for name, x in rows.items()}
     # With vacc="append" the table is empty: rows have no voxel of their own to be entered by.
     num_entered = jnp.where(jnp.any(cache.table >= 0), cache.num_voxels, 0)
-    return replace(cache, table=jax.jit(build_table)(rows["voxels"], num_entered), **rows)
+    return replace(cache, table=build_table(rows["voxels"], num_entered), **rows)
 
 
 def check_cache(caches: VoxelCache, config: StreamConfig) -> None:
@@ -261,7 +268,7 @@ def check_cache(caches: VoxelCache, config: StreamConfig) -> None:
     Raises:
         CacheError: tokens were dropped under `overflow="grow"`.
     """
-    num_dropped = int(np.sum(caches.stats.num_dropped))
+    num_dropped = int(np.asarray(caches.stats.num_dropped).sum())
     if num_dropped and config.memory.overflow == "grow":
         raise CacheError(
             f"cache: wanted to keep every token, but {num_dropped} did not fit in {caches.capacity} voxels; "

@@ -22,7 +22,7 @@ class Reporter:
     def progress(self, name: str, total: int | None, *, waiting: str = WAITING) -> Iterator[Callable[..., None]]:
         """A progress bar of `total` steps (None: unknown); yields `advance(done, note="")`.
 
-        Until the first call its note is `waiting`.
+        Until the first call the bar moves to and fro, and its note is `waiting`.
         """
         columns = (
             TextColumn("{task.description}"),
@@ -32,8 +32,8 @@ class Reporter:
             TextColumn("{task.fields[note]}"),
         )
         with Progress(*columns, console=self.console) as bar:
-            task = bar.add_task(name, total=total, note=waiting)
-            yield lambda done, note="": bar.update(task, completed=done, note=note)
+            task = bar.add_task(name, total=None, note=waiting)
+            yield lambda done, note="": bar.update(task, completed=done, total=total, note=note)
 
     def say(self, message: str) -> None:
         """Prints a message: how long something takes, what to do next."""

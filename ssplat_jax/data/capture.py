@@ -14,7 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
@@ -235,7 +235,8 @@ class Capture:
         frame = frame or StreamFrame.at_point(offset)
         viewmat = frame.viewmats(self.frames[i].camtoworld)
         K = self.K(i).astype(np.float32)
-        return Camera(viewmats=jnp.asarray(viewmat), Ks=jnp.asarray(K), width=self.width, height=self.height)
+        viewmats, Ks = jax.device_put((viewmat, K))  # jnp.asarray would compile a program for each shape
+        return Camera(viewmats=viewmats, Ks=Ks, width=self.width, height=self.height)
 
     def stream_order(self, config: StreamConfig, indices: Sequence[int] | None, frame: StreamFrame) -> list[int]:
         """Returns `indices` (default: all) in the order of streaming, with slow video interleaved (`interleave`).
@@ -277,8 +278,7 @@ class Capture:
                 arrays = ahead.result()
                 if following is not None:
                     ahead = reader.submit(self._views, following, config.stream.chunk_size, frame)
-                near, far = jnp.float32(frame.near), jnp.float32(frame.far)
-                yield Chunk(**{name: jnp.asarray(x) for name, x in arrays.items()}, near=near, far=far)
+                yield Chunk(**jax.device_put(arrays | {"near": np.float32(frame.near), "far": np.float32(frame.far)}))
 
     def _views(self, group: Sequence[int], chunk_size: int, frame: StreamFrame) -> dict[str, np.ndarray]:
         """Arrays of one padded chunk."""

@@ -11,13 +11,14 @@ import dataclasses
 import math
 from typing import Any
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 from jaxtyping import Float32, Float64
+from scipy.spatial.transform import Rotation
 
 from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.core.pytree import replace
-from ssplat_jax.core.rotations import matrices_to_quats, multiply_quats, sh_rotation
+from ssplat_jax.core.rotations import sh_rotation
 
 MAX_COORDINATE_SPACING = 1e-4
 """Largest float32 spacing, in stream units, at which positions are stored without an offset."""
@@ -110,14 +111,17 @@ class StreamFrame:
         Limits:
             The result is float32: means 1e5 capture units from `offset` have an error of up to 1e-2.
         """
-        quat = matrices_to_quats(jnp.asarray(self.rotation, jnp.float32))
-        mixing = sh_rotation(self.rotation, gaussians.sh_degree)
-        means = self.points_to_capture(np.asarray(gaussians.means, np.float64)) - np.asarray(offset, np.float64)
-        return replace(
-            gaussians,
-            means=jnp.asarray(means, jnp.float32),
-            quats=multiply_quats(jnp.broadcast_to(quat, gaussians.quats.shape), gaussians.quats),
-            scales=gaussians.scales / self.scale,
-            opacities=gaussians.opacities,
-            sh=jnp.asarray(np.einsum("kl,nlc->nkc", mixing, np.asarray(gaussians.sh, np.float64)), jnp.float32),
+        # On the host, where no program has to be compiled for each size of a scene.
+        means, quats, scales, sh = (
+            np.asarray(x, np.float64) for x in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.sh)
         )
+        w, x, y, z = Rotation.from_matrix(self.rotation).as_quat(scalar_first=True, canonical=True)
+        product = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])  # Hamilton's, from the left
+        rows = {
+            "means": self.points_to_capture(means) - np.asarray(offset, np.float64),
+            "quats": quats @ product.T,
+            "scales": scales / self.scale,
+            "sh": np.einsum("kl,nlc->nkc", sh_rotation(self.rotation, gaussians.sh_degree), sh),
+        }
+        rows = jax.device_put({name: x.astype(np.float32) for name, x in rows.items()})
+        return replace(gaussians, **rows)

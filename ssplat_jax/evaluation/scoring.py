@@ -29,7 +29,8 @@ from ssplat_jax.streaming.feed import Exposures
 NUM_AVERAGED = 3
 """Streamed frames whose exposures are averaged for a novel view."""
 
-_jitted_lpips, _jitted_fill_holes = jax.jit(lpips), jax.jit(fill_holes)
+_jitted_lpips = jax.jit(lpips)
+_filled = jax.jit(lambda out, gaussians: fill_holes(out.color, out.alpha, mean_color(gaussians)))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -149,7 +150,7 @@ def score_view(
     camera = capture.camera(i, frame)
     out = render(gaussians, camera, effects=effects_for(gaussians, camera))
     exposure = exposure_for(capture, i, exposures)
-    filled = np.asarray(_jitted_fill_holes(out.color, out.alpha, mean_color(gaussians)))
+    filled = np.asarray(_filled(out, gaussians))
     over_black = np.asarray(out.color)
     color, target, seen = _displayed(filled, exposure), capture.image(i), capture.seen(i)
     score = ViewScore(

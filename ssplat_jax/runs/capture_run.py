@@ -85,7 +85,8 @@ def run_capture(
     require_positive(**{name: number for name, number in numbers.items() if number is not None})
     check_look_ahead(options.revise, is_causal=model.config.stream.causal)
     if options.quiet_seconds is None:
-        source = WholeCapture(path, options)
+        with reporter.progress("opening", None, waiting=path):
+            source = WholeCapture(path, options)
         indices = source.indices
     else:
         source = GrowingCapture(path, options, options.quiet_seconds, reporter)
@@ -111,7 +112,8 @@ def _stream(run: Run, source: "WholeCapture | GrowingCapture", options: RunOptio
     """Streams the views that the run has not had yet; returns the signal that stopped it, if one did."""
     deltas = DeltaWriter(run, is_wanted=options.deltas)
     with Interrupts(has_work=False) as interrupts, reporter.progress("streaming", source.total) as advance:
-        advance(run.num_views, WAITING)
+        if run.num_views:
+            advance(run.num_views, WAITING)
         try:
             for number, fed in enumerate(source.chunks(run, interrupts), start=1):
                 interrupts.has_work = True

@@ -32,6 +32,8 @@ from ssplat_jax.storage.chunk_records import load_chunk_records
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.streaming.feed import Exposures, middle_exposure
 
+_jitted_scale_colors = jax.jit(scale_colors)
+
 TITLE = "# Cameras of a scene, written by ssplat export"
 FILES = ("cameras.txt", "images.txt", "points3D.txt")
 NUM_COMPARED, HOLE = 3, 0.5  # views that are compared, and the opacity of a pixel below which it is a hole
@@ -48,8 +50,8 @@ def scene_to_show(gaussians: Gaussians, frame: StreamFrame, exposures: Exposures
         frame: the similarity between both frames; positions of the result are relative to its offset.
         exposures: exposures of the streamed frames.
     """
-    factors = jnp.asarray(middle_exposure(exposures), jnp.float32)
-    return frame.gaussians_to_capture(scale_colors(gaussians, factors), offset=frame.offset)
+    scaled = _jitted_scale_colors(gaussians, middle_exposure(exposures).astype(np.float32))
+    return frame.gaussians_to_capture(scaled, offset=frame.offset)
 
 
 def save_scene(path: Path, gaussians: Gaussians, frame: StreamFrame, exposures: Exposures) -> ExportReport:
@@ -77,8 +79,9 @@ def decoded_scene(run_dir: Path, params: dict, reporter: Reporter) -> Gaussians:
     session = run.session(params)
     num_shown = int(session.cache_facts()["decoded"])
     # The rows after these are padding, of which a person need not be told.
-    gaussians = jax.tree.map(lambda x: x[:num_shown], session.gaussians())
-    return replace(scene_to_show(gaussians, run.frame, run.exposures), offset=run.frame.offset)
+    scene = scene_to_show(session.gaussians(), run.frame, run.exposures)
+    scene = jax.tree.map(lambda x: jax.device_put(np.asarray(x)[:num_shown]), scene)
+    return replace(scene, offset=run.frame.offset)
 
 
 @dataclasses.dataclass(frozen=True)

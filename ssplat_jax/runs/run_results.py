@@ -59,6 +59,7 @@ def finish_run(run: Run, path: str, reporter: Reporter) -> ExportReport:
     report = save_scene(folder.scene, gaussians, frame, run.exposures)
     if report.warning is not None:
         reporter.warn(f"{folder.scene.name}: {report.warning}")
+    reporter.say(f"{folder.scene} is written; pictures and figures follow")
     folder.clear_views()
     shown, scores = shown_frames(run.indices), []
     for i in shown:

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
@@ -162,11 +161,11 @@ def _restore(path: Path | str, arrays: Mapping[str, Any], config: StreamConfig) 
             raise InputError(
                 f"{path}: {name} must be {shape.shape}, got {came}; the weights belong to another configuration."
             )
-        return jnp.asarray(arrays[name], jnp.float32)
+        return jax.device_put(np.asarray(arrays[name], np.float32))  # jnp.asarray compiles a program for each shape
 
     return jax.tree_util.tree_map_with_path(leaf, _shapes(config))
 
 
 @functools.lru_cache(maxsize=8)  # tracing a network takes a second
 def _shapes(config: StreamConfig) -> dict:
-    return jax.eval_shape(lambda key: init_params(key, config), jax.random.key(0))
+    return jax.eval_shape(lambda: init_params(jax.random.key(0), config))

@@ -4,7 +4,7 @@ import dataclasses
 import time
 from collections.abc import Callable, Iterator, Sequence
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 from jaxtyping import Float
 
@@ -62,10 +62,12 @@ def feed_chunks(session: Session, capture: Capture, order: Sequence[int], frame:
     config, size = session.model.config, session.model.config.stream.chunk_size
     if len(order) == 0:
         return
+    session.expected_chunks = max(session.expected_chunks, -(-len(order) // size))
     for number, chunk in enumerate(capture.chunks(config, order, frame=frame)):
         frames = list(order[number * size : (number + 1) * size])
         if config.stream.causal:
-            chunk = replace(chunk, near=jnp.float32(frame.near), far=jnp.float32(frame.far))
+            near, far = jax.device_put((np.float32(frame.near), np.float32(frame.far)))
+            chunk = replace(chunk, near=near, far=far)
         since, compiled = time.perf_counter(), session.compile_seconds
         output = session.feed(chunk)
         seconds = time.perf_counter() - since - (session.compile_seconds - compiled)

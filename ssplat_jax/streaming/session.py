@@ -1,6 +1,7 @@
 """`Session`: one stream on the host. It holds and grows the cache and compiles the step once per shape."""
 
 import dataclasses
+import functools
 import time
 from collections.abc import Callable
 
@@ -19,7 +20,11 @@ from ssplat_jax.model.views import GRID_STRIDE
 from ssplat_jax.streaming.live_views import LiveViews
 
 INITIAL_CHUNKS = 4
-"""A new cache has capacity for this many chunks in which every token opens a voxel: few captures make it grow."""
+"""A new cache has capacity for this many chunks in which every token opens a voxel."""
+
+NEW_SHARE, MOST_ROWS = 0.75, 1 << 17
+"""Share of a stream's tokens for which its cache has capacity from the start, since others meet a voxel that is there,
+and the most rows of such a cache: a step takes longer with unused ones."""
 
 MIN_DECODED_PIVOTS = 1 << 15
 """Lower limit of the pivots decoded at once: with fewer, compiling for a growing scene costs more than it saves."""
@@ -55,12 +60,12 @@ class Session:
             model = dataclasses.replace(model, config=model.config.replace(causal=True))
         self.model, self.params, self.cache = model, params, cache
         self._live, self._revise = LiveViews(model.config, frame), revise
+        self.expected_chunks = INITIAL_CHUNKS  # of the stream, as far as the caller knows; sets the first capacity
         self.compile_seconds, self.num_compilations = 0.0, 0
         # Programs by what they compute and the shapes that they are compiled for; those of the last chunk.
         self._programs: dict[tuple, jax.stages.Compiled] = {}
         self._step: jax.stages.Compiled | None = None
         self._refine: jax.stages.Compiled | None = None
-        self._count_shown = jax.jit(lambda cache: jnp.sum(shown_pivots(cache, model.config), dtype=jnp.int32))
 
     def feed(self, chunk: Chunk) -> ChunkOutput:
         """Streams one chunk into the cache and waits until it is done.
@@ -113,7 +118,9 @@ class Session:
     def _stream(self, chunk: Chunk, *, is_live: bool) -> ChunkOutput:
         """Streams a chunk; the views of a live one no longer wait once it is on its way."""
         config, num_tokens = self.model.config, tokens_per_chunk(chunk, self.model.config.network.size_multiple)
-        cache = init_cache(config, starting_capacity(config, num_tokens)) if self.cache is None else self.cache
+        cache = self.cache
+        if cache is None:
+            cache = _new_cache(config, starting_capacity(config, num_tokens, self.expected_chunks))
         cache = ensure_capacity(cache, config, num_tokens)
         if bool(config.stream.steps_per_chunk) != (self._revise is not None):
             wanted = "Session(..., revise=online_refinement(model)) with stream.steps_per_chunk above 0, or neither"
@@ -165,8 +172,8 @@ class Session:
         up to a power of two, so that a growing scene rarely compiles.
         """
         cache = self._present_cache()
-        num_shown = int(self._count_shown(cache))
-        num_pivots = min(max(MIN_DECODED_PIVOTS, 1 << max(num_shown - 1, 0).bit_length()), cache.alive.size)
+        num_shown = int(_count_pivots(cache, self.model.config)[1])
+        num_pivots = min(max(MIN_DECODED_PIVOTS, 1 << max(num_shown - 1, 0).bit_length()), cache.confidences.size)
         leaves, structure = jax.tree.flatten(cache)
         key = ("decode", num_pivots, structure, *((leaf.shape, leaf.dtype) for leaf in leaves))
         if key not in self._programs:
@@ -195,15 +202,25 @@ class Session:
         """Occupancy and counters of the cache; `decoded` is the number of Gaussians that are shown."""
         cache, config = self._present_cache(), self.model.config
         stats = {field.name: int(getattr(cache.stats, field.name)) for field in dataclasses.fields(cache.stats)}
+        num_pivots, num_shown = map(int, _count_pivots(cache, config))
         return {
             "voxels": int(cache.num_voxels),
-            "pivots": int(cache.counts.sum()),
-            "decoded": config.head.gaussians_per_token * int(shown_pivots(cache, config).sum()),
+            "pivots": num_pivots,
+            "decoded": config.head.gaussians_per_token * num_shown,
             "capacity": cache.capacity,
             "overflow": stats["num_dropped"],
             "accepted_fraction": round(stats["num_accepted"] / max(stats["num_seen"], 1), 4),
             **stats,
         }
+
+
+_new_cache = jax.jit(init_cache, static_argnums=(0, 1))
+
+
+@functools.partial(jax.jit, static_argnums=1)
+def _count_pivots(cache: VoxelCache, config: StreamConfig) -> tuple[jax.Array, jax.Array]:
+    """Pivots in use, and those of them that are shown."""
+    return jnp.sum(cache.counts), jnp.sum(shown_pivots(cache, config), dtype=jnp.int32)
 
 
 def _memory_bytes(program: jax.stages.Compiled | None) -> int | None:
@@ -220,8 +237,12 @@ def tokens_per_chunk(chunk: Chunk, size_multiple: int) -> int:
     return v * padded // GRID_STRIDE**2
 
 
-def starting_capacity(config: StreamConfig, num_tokens: int) -> int:
-    """Capacity of a new cache: the configured one; under `grow` raised to a power of two that fits the first chunks."""
+def starting_capacity(config: StreamConfig, num_tokens: int, num_chunks: int = INITIAL_CHUNKS) -> int:
+    """Capacity of a new cache: the configured one; under `grow` raised to a power of two that fits the stream.
+
+    Each capacity is another program of the step, so that growing is left to long streams.
+    """
     if config.memory.overflow != "grow":
         return config.memory.capacity
-    return max(config.memory.capacity, 1 << (INITIAL_CHUNKS * num_tokens - 1).bit_length())
+    num_rows = max(INITIAL_CHUNKS * num_tokens, min(int(NEW_SHARE * num_chunks * num_tokens), MOST_ROWS))
+    return max(config.memory.capacity, 1 << (num_rows - 1).bit_length())

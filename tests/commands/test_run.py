@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax import monitoring
 from PIL import Image
 
 from ssplat_jax.commands.run_command import Run
@@ -73,6 +74,23 @@ def assert_deltas_give_the_scene(out, narrow, *names):
     scene = jax.jit(model.decode)(params, cache)
     assert 0 < (told.opacities > 0).sum() == (np.asarray(scene.opacities) > 0).sum()
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5), told, scene)
+
+
+def test_a_run_compiles_few_programs(finished, narrow, tmp_path):
+    """Host code computes with NumPy: each operation of JAX outside jit is a program of its own."""
+    compiled = []
+
+    def heard(event, seconds, **facts):
+        if event.endswith("backend_compile_duration"):
+            compiled.append(seconds)
+
+    jax.clear_caches()
+    monitoring.register_event_duration_secs_listener(heard)
+    try:
+        assert run("run", finished / "capture", "--out", tmp_path / "out", *narrow, "--set", "voxel_size=0.05") == 0
+    finally:
+        monitoring.unregister_event_duration_listener(heard)
+    assert 5 < len(compiled) <= 12
 
 
 def test_a_run_writes_scene_state_metrics_and_the_changes_of_every_chunk(finished, narrow):

@@ -7,7 +7,7 @@ from ssplat_jax.data.procedural.paths import look_at, sample_path
 from ssplat_jax.data.procedural.raycast import raycast, raycast_depths
 from ssplat_jax.data.procedural.scene import Finish, SceneBuilder, random_rotation, scale_scene
 from ssplat_jax.data.procedural.scenes import sample_scene
-from ssplat_jax.data.procedural.textures import TextureLibrary, pack_pyramids
+from ssplat_jax.data.procedural.textures import TextureLibrary
 
 HEIGHT, WIDTH = 48, 64
 DEPTH_TOLERANCE = 2e-5  # relative; a few float32 roundings
@@ -34,7 +34,7 @@ def gray_library():
     """Library of a white tile and a tile with a dark left half."""
     tiles = np.full((2, 256, 256, 3), 255, np.uint8)
     tiles[1, :, :128] = 51
-    return TextureLibrary(pack_pyramids(tiles), {"wall": np.array([0, 1])})
+    return TextureLibrary(tiles, {"wall": np.array([0, 1])})
 
 
 def empty_builder(half=(4.0, 3.0, 5.0)):

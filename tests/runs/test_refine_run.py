@@ -108,7 +108,7 @@ class _StopsAfterOneChunk(Reporter):
     def __init__(self):
         super().__init__(quiet=True)
 
-    def progress(self, name, total):
+    def progress(self, name, total, **_):
         @contextlib.contextmanager
         def bar():
             yield lambda done, *_: signal.raise_signal(signal.SIGINT) if done == 4 else None

@@ -151,7 +151,7 @@ def procedural_capture_arrays(name: str, num_frames: int, height: int, width: in
     route = _ROUTES[name]
     rng = np.random.default_rng([4, route.first_seed + seed])
     while True:
-        scene = fade_scene(sample_scene(int(rng.integers(2**31)), route.kind), route.contrast)
+        scene = fade_scene(sample_scene(int(rng.integers(2**31)), route.kind, only_used=True), route.contrast)
         places = (np.arange(num_frames) + 0.5) / num_frames
         poses = np.stack([route.pose(scene, place) for place in places]).astype(np.float32)
         if clearance(scene, poses[:, :3, 3]).min() > MIN_DEPTH:

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, UInt32
 
 from ssplat_jax.core.pytree import pytree, replace
-from ssplat_jax.data.procedural.textures import TextureLibrary
+from ssplat_jax.data.procedural.textures import TextureLibrary, pack_pyramids
 
 NUM_BOXES, NUM_BALLS, NUM_CYLINDERS = 32, 6, 10  # rows of each shape
 NUM_SOLIDS = NUM_BOXES + NUM_BALLS + NUM_CYLINDERS
@@ -136,9 +136,10 @@ def random_rotation(rng: np.random.Generator) -> np.ndarray:
 class SceneBuilder:
     """Builder of a scene; solids beyond the fixed number of rows of their shape are dropped."""
 
-    def __init__(self, rng: np.random.Generator, library: TextureLibrary) -> None:
+    def __init__(self, rng: np.random.Generator, library: TextureLibrary, only_used: bool = False) -> None:
         self.rng = rng
         self.library = library
+        self.only_used = only_used  # the scene holds the textures that it shows: many scenes share all of them
         rows = NUM_SOLIDS + 2
         self.frames = np.tile(np.concatenate([np.eye(3), np.full((3, 1), AWAY)], axis=1), (rows, 1, 1))
         self.halves = np.ones((rows, 3))
@@ -228,4 +229,9 @@ class SceneBuilder:
         }
         arrays = {name: np.asarray(value, np.float32) for name, value in floats.items()}
         counts = np.array([self._next[shape] - first for shape, first in FIRST_ROWS.items()], np.int32)
-        return Scene(**arrays, counts=counts, face_textures=self.face_textures, pyramids=self.library.pyramids)
+        if not self.only_used:
+            return Scene(**arrays, counts=counts, face_textures=self.face_textures, pyramids=self.library.pyramids)
+        used, places = np.unique(self.face_textures, return_inverse=True)
+        pyramids = np.pad(pack_pyramids(self.library.tiles[used]), ((0, -len(used) % 32), (0, 0)))  # for few shapes
+        face_textures = places.reshape(self.face_textures.shape).astype(np.int32)
+        return Scene(**arrays, counts=counts, face_textures=face_textures, pyramids=pyramids)

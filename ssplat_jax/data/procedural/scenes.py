@@ -16,19 +16,22 @@ from ssplat_jax.data.procedural.textures import TextureLibrary, texture_library
 _EVERYTHING = ("photo", "floor", "pattern", "noise", "facade", "leaves", "photo")
 
 
-def sample_scene(seed: int, kind: str | None = None, textures: TextureLibrary | None = None) -> Scene:
+def sample_scene(
+    seed: int, kind: str | None = None, textures: TextureLibrary | None = None, *, only_used: bool = False
+) -> Scene:
     """Returns a random world, which depends on the arguments and the release of scikit-image.
 
     Args:
         seed: any non-negative integer.
         kind: one of `SCENE_KINDS`; None draws one, but no yard.
         textures: by default `texture_library()`.
+        only_used: the scene holds the textures that it shows, instead of all, which take seconds to prepare.
     """
     if kind is not None and kind not in _RECIPES:
         raise InputError(f"procedural scene: kind must be one of {', '.join(SCENE_KINDS)}, got {kind!r}.")
     rng = np.random.default_rng([1, seed])
     drawn = str(rng.choice(SCENE_KINDS, p=SCENE_SHARES))
-    return _RECIPES[kind or drawn](SceneBuilder(rng, textures or texture_library()))
+    return _RECIPES[kind or drawn](SceneBuilder(rng, textures or texture_library(), only_used))
 
 
 # -- furniture: each piece stands on the floor at (x, z), within about `size` of it ------------------------------------

@@ -6,10 +6,10 @@ they need not be periodic. They are stored as mip pyramids with one packed `uint
 ray caster is bound by gathers.
 """
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import UInt8, UInt32
@@ -28,11 +28,17 @@ _PHOTOS = (
 )  # fmt: skip
 
 
-class TextureLibrary(NamedTuple):
-    """Mip pyramids of all textures, and their groups."""
+@dataclasses.dataclass(frozen=True)
+class TextureLibrary:
+    """Tiles of all textures, their mip pyramids, and their groups."""
 
-    pyramids: UInt32[np.ndarray, "n texels"]  # packed texels, level 0 first, each level row by row
+    tiles: UInt8[np.ndarray, "n 256 256 3"]
     groups: dict[str, np.ndarray]  # texture indices by topic: photo, wall, floor, pattern, noise, facade, sky, leaves
+
+    @functools.cached_property
+    def pyramids(self) -> UInt32[np.ndarray, "n texels"]:
+        """Packed texels of all tiles, level 0 first, each level row by row: 82 MB."""
+        return pack_pyramids(self.tiles)
 
 
 @functools.lru_cache(maxsize=1)
@@ -53,7 +59,7 @@ def texture_library() -> TextureLibrary:
     for name, (count, recipe) in recipes.items():
         groups[name] = np.arange(len(tiles), len(tiles) + count)
         tiles += [np.round(np.clip(recipe(rng), 0, 1) * 255).astype(np.uint8) for _ in range(count)]
-    return TextureLibrary(pack_pyramids(np.stack(tiles)), groups)
+    return TextureLibrary(np.stack(tiles), groups)
 
 
 def pack_pyramids(tiles: UInt8[np.ndarray, "n 256 256 3"]) -> UInt32[np.ndarray, "n texels"]:
