@@ -8,6 +8,7 @@ point is `commands/start.py`.
 
 import functools
 import operator
+import os
 import platform
 import sys
 from collections.abc import Callable
@@ -55,9 +56,15 @@ COMMANDS = {
 """All commands by name, in the order of `ssplat --help`."""
 
 
+SETTINGS_OF_OTHERS = ("JAX_ENABLE_X64", "JAX_NUMPY_RANK_PROMOTION", "JAX_NUMPY_DTYPE_PROMOTION")
+"""Variables by which people check their own JAX programs; commands compute in float32 with JAX's usual rules."""
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Runs the command in `arguments` (default: those of the process) and exits with its code."""
     arguments = sys.argv[1:] if arguments is None else arguments
+    for name in SETTINGS_OF_OTHERS:
+        os.environ.pop(name, None)
     if arguments == ["--version"]:
         print(_version())
         sys.exit(0)
@@ -111,7 +118,19 @@ def guarded(run: Callable[[], int]) -> int:
         # XLA reports an exhausted device as a RuntimeError of its own that starts with this word.
         if "RESOURCE_EXHAUSTED" in str(error):
             return _refuse("out of device memory; try a smaller --size or capacity.", EXIT_MEMORY)
+        if (wanted := os.environ.get("JAX_PLATFORMS")) and _is_in_backends(error):
+            fix = "for `cuda`, install the extra ssplat-jax[cuda]; or unset it"
+            return _refuse(f"JAX_PLATFORMS={wanted}: wanted a platform that JAX has here, got none; {fix}.", EXIT_INPUT)
         raise
+
+
+def _is_in_backends(error: BaseException) -> bool:
+    """True if the error was raised while JAX opened its devices."""
+    frame, names = error.__traceback__, []
+    while frame is not None:
+        names.append(frame.tb_frame.f_globals.get("__name__", ""))
+        frame = frame.tb_next
+    return names[-1].endswith(".xla_bridge")
 
 
 def _refuse(message: object, code: int) -> int:

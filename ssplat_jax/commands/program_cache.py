@@ -6,10 +6,12 @@ empty and full (tests/commands/test_program_cache.py).
 """
 
 import contextlib
+import glob
 import hashlib
 import os
 import platform
-import time
+import re
+import warnings
 from collections.abc import MutableMapping
 from pathlib import Path
 
@@ -22,8 +24,6 @@ FOLDER, IS_ON = "JAX_COMPILATION_CACHE_DIR", "JAX_ENABLE_COMPILATION_CACHE"
 LEAST_SECONDS = "0.3"
 """Shortest compilation of a program that is stored."""
 
-_our_folder: Path | None = None
-
 
 def keep_programs(environment: MutableMapping[str, str] = os.environ) -> None:
     """Makes JAX keep compiled programs on disk. Called before JAX is imported: it reads these variables then.
@@ -31,31 +31,34 @@ def keep_programs(environment: MutableMapping[str, str] = os.environ) -> None:
     Args:
         environment: the variables of the process.
     """
-    global _our_folder
     if environment.get(SWITCH, "").lower() == "off" or environment.get(IS_ON, "").lower() in ("false", "0"):
         return
     if FOLDER not in environment:
-        folder = Path(environment.get(SWITCH) or _users_cache()) / "programs" / _machine()
         try:
+            folder = Path(environment.get(SWITCH) or _users_cache()) / "programs" / _machine()
             folder.mkdir(parents=True, exist_ok=True)
-        except OSError:  # a home that cannot be written: every command compiles, as without a cache
+        except (OSError, RuntimeError):  # a home that cannot be written, or none: every command compiles
             return
-        environment[FOLDER], _our_folder = str(folder), folder
+        environment[FOLDER] = str(folder)
+        replace_damaged(folder)
         environment.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", LEAST_SECONDS)
     # XLA logs an error about preferences of the compiler, which it takes for features of the CPU, at every load.
     environment.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
 
-def drop_newest(seconds: float) -> None:
-    """Removes programs of our folder that were written in the last seconds.
+def replace_damaged(folder: Path) -> None:
+    """Removes the entries that JAX warns it cannot read, as one cut short by a kill: JAX would never replace them."""
+    show = warnings.showwarning
 
-    An interrupt may have cut one short, and JAX never replaces a file.
-    """
-    if _our_folder is not None:
-        with contextlib.suppress(OSError):
-            for file in _our_folder.glob("*-cache"):
-                if time.time() - file.stat().st_mtime < seconds:
-                    file.unlink(missing_ok=True)
+    def shown(message, *given, **more) -> None:
+        found = re.match(r"Error reading persistent compilation cache entry for '([^']+)'", str(message))
+        if found is None:
+            show(message, *given, **more)
+            return
+        for file in folder.glob(f"{glob.escape(found[1])}-*-cache"):  # of this function, for any shapes
+            file.unlink(missing_ok=True)
+
+    warnings.showwarning = shown
 
 
 def num_cores() -> int:

@@ -8,6 +8,7 @@ flushes its output and leaves without taking the interpreter down: that would fr
 """
 
 import contextlib
+import io
 import os
 import signal
 import sys
@@ -27,6 +28,14 @@ def start() -> None:
     if sys.platform == "win32":  # it can neither lock nor flush a folder as we do
         print("ssplat: wanted Linux or macOS, got Windows; use the Windows Subsystem for Linux.", file=sys.stderr)
         sys.exit(2)
+    if sys.flags.optimize > 1:
+        print(
+            "ssplat: wanted Python with docstrings, which scikit-image needs, got -OO; leave it out.", file=sys.stderr
+        )
+        sys.exit(2)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # a name that the terminal's encoding lacks ends no command
+            stream.reconfigure(errors="backslashreplace")
     interrupt = _Interrupt()
     try:
         if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # a background job may ignore the signal
@@ -91,10 +100,6 @@ def _leave(code: int, message: str = "") -> NoReturn:
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(Exception):  # a closed pipe; a stream that the interrupted code is writing to
             stream.flush()
-    with contextlib.suppress(Exception):
-        from ssplat_jax.commands.program_cache import drop_newest
-
-        drop_newest(seconds=PATIENCE)
     with contextlib.suppress(OSError):
         shown = "\x1b[?25h" if os.isatty(2) else ""  # a progress bar may have hidden the cursor
         os.write(2, f"{shown}{message}".encode())

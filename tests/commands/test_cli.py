@@ -1,6 +1,7 @@
 """The command line: help at once, clear refusals, nothing half-written. Heavy commands are run small."""
 
 import json
+import os
 import re
 import shlex
 import shutil
@@ -246,3 +247,33 @@ def test_images_without_poses_are_told_how_to_get_them(name, kind, tmp_path, cap
         monkeypatch.chdir(tmp_path)
         assert run(*shlex.split(words[1]), "--quiet") == 2
         assert "my " in capsys.readouterr().err and not any(tmp_path.glob("*_capture"))
+
+
+@pytest.mark.parametrize("platforms", ["cuda", "cpuu"])
+def test_a_platform_that_jax_lacks_is_one_line(platforms):
+    done = started("weights", "tiny", JAX_PLATFORMS=platforms)
+    assert done.returncode == 2 and f"JAX_PLATFORMS={platforms}: wanted a platform" in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+def test_settings_for_other_programs_change_nothing(tmp_path):
+    """Double precision, ranks that must be equal, and an output that cannot show a name."""
+    file, shown = tmp_path / "caf\u0107.ply", tmp_path / "out.spz"
+    save_ply(file, scene_fixture.scene(0, n=5))
+    capture = make_capture(tmp_path / "wall\u0107", num_frames=2)
+    settings = {"JAX_ENABLE_X64": "1", "JAX_NUMPY_RANK_PROMOTION": "raise", "PYTHONIOENCODING": "latin-1"}
+    assert started("export", file, "--to", shown, **settings).returncode == 0
+    done = started("render", file, capture, "--out", tmp_path / "p\u0107", **settings)
+    assert done.returncode == 0 and "wrote 2 pictures to" in done.stdout and "p\\u0107" in done.stdout, done.stderr
+
+
+def test_python_without_docstrings_is_refused_in_a_line():
+    code = "from ssplat_jax.commands.start import start; start()"
+    done = subprocess.run([sys.executable, "-OO", "-c", code, "--help"], capture_output=True, text=True)
+    assert done.returncode == 2 and "got -OO" in done.stderr and done.stderr.count("\n") == 1
+
+
+def started(*arguments, **environment):
+    """A command line as the script starts it."""
+    command = [sys.executable, "-m", "ssplat_jax.commands.start", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, env=os.environ | environment)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from ssplat_jax.commands import program_cache
-from ssplat_jax.commands.program_cache import FOLDER, IS_ON, SWITCH, drop_newest, keep_programs
+from ssplat_jax.commands.program_cache import FOLDER, IS_ON, SWITCH, keep_programs
 from tests.commands.command_fixture import read
 
 # The fuse of the cache, its buffers donated as in a stream.
@@ -39,17 +39,21 @@ def plain_environment(folder: Path | str) -> dict[str, str]:
     return {name: value for name, value in os.environ.items() if name not in names} | {SWITCH: str(folder)}
 
 
-def test_kept_programs_give_the_same_bytes_and_say_nothing(tmp_path):
+def test_kept_programs_give_the_same_bytes_say_nothing_and_a_cut_one_is_replaced(tmp_path):
     results = []
-    for where in ("off", tmp_path, tmp_path):
+    for where in ("off", tmp_path, tmp_path, tmp_path):
         variables = plain_environment(where) | {"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
         done = subprocess.run([sys.executable, "-c", FUSING], capture_output=True, text=True, env=variables)
         assert (done.returncode, done.stderr) == (0, ""), done.stderr
-        files = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*-cache")}
+        files = {path: path.stat().st_size for path in tmp_path.rglob("*-cache")}
         results.append((done.stdout, files))
-    (off, nothing), (cold, written), (warm, kept) = results
-    assert off == cold == warm != ""
+        if len(results) == 3:
+            largest = max(files, key=lambda path: path.stat().st_size)
+            largest.write_bytes(largest.read_bytes()[:500])
+    (off, nothing), (cold, written), (warm, kept), (again, mended) = results
+    assert off == cold == warm == again != ""
     assert nothing == {} and kept == written != {}
+    assert mended.keys() == kept.keys() and mended[largest] > 500
 
 
 @pytest.mark.slow
@@ -90,11 +94,11 @@ def test_what_the_user_has_set_holds(tmp_path, monkeypatch):
     assert len(folders) == 2 and all(Path(folder).is_dir() for folder in folders)
 
 
-def test_programs_of_an_interrupts_last_seconds_are_dropped(tmp_path, monkeypatch):
-    old, new, other = (tmp_path / name for name in ("a-cache", "b-cache", "notes.txt"))
-    for file in (old, new, other):
-        file.write_bytes(b"x")
-    os.utime(old, (0, 0))
-    monkeypatch.setattr(program_cache, "_our_folder", tmp_path)
-    drop_newest(5.0)
-    assert old.exists() and other.exists() and not new.exists()
+def test_a_user_without_a_home_compiles_anew(monkeypatch):
+    def no_home(*_):
+        raise RuntimeError("could not determine the home directory")
+
+    monkeypatch.setattr("platformdirs.user_cache_path", no_home)
+    environment = {}
+    keep_programs(environment)
+    assert FOLDER not in environment
