@@ -19,11 +19,16 @@ class Reporter:
         self._warnings = Console(stderr=True)
 
     @contextlib.contextmanager
-    def progress(self, name: str, total: int | None, *, waiting: str = WAITING) -> Iterator[Callable[..., None]]:
+    def progress(
+        self, name: str, total: int | None, *, waiting: str = WAITING, is_kept: bool = True
+    ) -> Iterator[Callable[..., None]]:
         """A progress bar of `total` steps (None: unknown); yields `advance(done, note="")`.
 
-        Until the first call the bar moves to and fro, and its note is `waiting`.
+        Until the first call the bar moves to and fro, and its note is `waiting`. At the end it stays if `is_kept`.
         """
+        if not (is_kept or self.console.is_terminal):  # rich leaves an empty line in a file
+            yield lambda done, note="": None
+            return
         columns = (
             TextColumn("{task.description}"),
             BarColumn(),
@@ -31,7 +36,7 @@ class Reporter:
             TimeRemainingColumn(),
             TextColumn("{task.fields[note]}"),
         )
-        with Progress(*columns, console=self.console) as bar:
+        with Progress(*columns, console=self.console, transient=not is_kept) as bar:
             task = bar.add_task(name, total=None, note=waiting)
             yield lambda done, note="": bar.update(task, completed=done, total=total, note=note)
 

@@ -85,7 +85,7 @@ def run_capture(
     require_positive(**{name: number for name, number in numbers.items() if number is not None})
     check_look_ahead(options.revise, is_causal=model.config.stream.causal)
     if options.quiet_seconds is None:
-        with reporter.progress("opening", None, waiting=path):
+        with reporter.progress("opening", None, waiting=path, is_kept=False):
             source = WholeCapture(path, options)
         indices = source.indices
     else:
