@@ -30,6 +30,7 @@ from ssplat_jax.data.split import interleave
 from ssplat_jax.data.stream_frame import StreamFrame
 
 MAX_SIDE = 16384  # pixels of a delivered image
+NUM_DECODERS = 3  # images decoded at a time: one of 12 megapixels takes 0.3 GB
 KEPT_BYTES = 256 << 20  # of decoded images that wait for their second use
 
 
@@ -150,11 +151,12 @@ class Capture:
         return digest.hexdigest()[:12]
 
     def images_digest(self, indices: Sequence[int]) -> str:
-        """Digest (12 hex digits) of the bytes of the image files of the frames `indices`; uses all cores.
+        """Digest (12 hex digits) of the bytes of the image and mask files of the frames `indices`; uses all cores.
 
         Images without a file are ignored: procedural images follow from the name of the capture.
         """
-        paths = [path for path in (self.frames[i].path for i in indices) if path is not None]
+        frames = [self.frames[i] for i in indices]
+        paths = [path for frame in frames for path in (frame.path, frame.mask_path) if path is not None]
         with ThreadPoolExecutor() as pool:
             digests = pool.map(lambda path: hashlib.sha256(path.read_bytes()).digest(), paths)
             return hashlib.sha256(b"".join(digests)).hexdigest()[:12]
@@ -199,14 +201,15 @@ class Capture:
     def check_output_folder(self, out: Path) -> None:
         """Refuses `out` where results would mix with the capture's files: a run overwrites and clears its folder."""
         folder = out.resolve()
-        files = [path.resolve() for f in self.frames for path in (f.path, f.depth_path) if path is not None]
+        paths = [path for f in self.frames for path in (f.path, f.depth_path, f.mask_path)]
+        files = [path.resolve() for path in paths if path is not None]
         if any(file.is_relative_to(folder) or folder.is_relative_to(file.parent) for file in files):
             got, fix = "the folder of the capture's own images", "choose another --out"
             raise refusal(str(out), wanted="a folder for results alone", got=got, fix=fix)
 
     def verify(self, indices: Sequence[int] | None = None) -> None:
-        """Decodes the images of the frames `indices` (default: all), to find damaged files; uses all cores."""
-        with ThreadPoolExecutor() as pool:  # Pillow decodes outside the interpreter lock
+        """Decodes the images of the frames `indices` (default: all), to find damaged files; uses some cores."""
+        with ThreadPoolExecutor(NUM_DECODERS) as pool:  # Pillow decodes outside the interpreter lock
             for _ in pool.map(self.image, range(len(self)) if indices is None else indices):
                 pass
 

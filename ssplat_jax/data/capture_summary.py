@@ -38,7 +38,6 @@ DARK, BRIGHT = 0.05, 0.95  # cells outside are noise or clipped
 MIN_FRAMES = 8  # with fewer, disorder is not looked for
 SHUFFLED_RANK = 0.15  # of the number of frames; median rank of the next camera among the nearest, above which
 ASIDE_RATIO = 5.0  # steps to and from a frame over the median step, and over the step from its neighbor to the other
-MAX_TURN_SHARE = 0.8  # of the field of view, turned between neighbors, above which they hardly overlap
 
 UNITS = {
     "path_length": "capture units",
@@ -164,7 +163,7 @@ def _depth_warnings(capture: Capture, depths: DepthStatistics, steps: np.ndarray
 
 def frame_warnings(capture: Capture) -> list[str]:
     """Returns the findings about the frames of `capture`, one sentence with a remedy each."""
-    return [*copy_warnings(capture), *order_warnings(capture), *turn_warnings(capture), *image_warnings(capture)]
+    return [*copy_warnings(capture), *order_warnings(capture), *image_warnings(capture)]
 
 
 def _listed(indices: Sequence[int], num_shown: int = 4) -> str:
@@ -215,21 +214,6 @@ def _rank(centers: Float64[np.ndarray, "n 3"], i: int) -> int:
     """Place of the camera after camera `i` among those nearest to it, from 1; ties count for it."""
     distances = np.linalg.norm(centers - centers[i], axis=-1)
     return int(np.sum(distances < distances[i + 1])) - (0 if distances[i + 1] == 0 else 1) + 1
-
-
-def turn_warnings(capture: Capture) -> list[str]:
-    """Turns between neighbors so wide that they hardly overlap, where most neighbors do."""
-    axes, K = capture.camtoworlds[:, :3, 2], capture.K(0)
-    turns = np.degrees(np.arccos(np.clip(np.sum(axes[1:] * axes[:-1], axis=-1), -1.0, 1.0)))
-    field = max(_field(capture.width, K[0, 0]), _field(capture.height, K[1, 1]))
-    wide = np.flatnonzero(turns > MAX_TURN_SHARE * field)
-    if not wide.size or 2 * wide.size > turns.size:
-        return []
-    count = "1 turn" if wide.size == 1 else f"{wide.size} turns"
-    return [
-        f"{count} of up to {turns.max():.0f} degrees between neighbors, whose images then hardly overlap"
-        f" (after frames {_listed(wide.tolist())}): film without gaps, or stream the parts as captures of their own."
-    ]
 
 
 def image_warnings(capture: Capture) -> list[str]:

@@ -19,6 +19,7 @@ from ssplat_jax.data.parsing import reading
 IMAGE_FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "PPM")
 MAX_PIXELS = 64_000_000  # larger images are refused before anything is decoded
 DEPTH_MODES = ("I;16", "I;16B", "I")  # Pillow's modes of 16-bit images
+PHOTOMETRIC = 262  # TIFF tag: 0 if zero is white
 ORIENTATION, UPRIGHT = 274, 1  # EXIF tag, and its value for images that need no rotation
 REPLACE = f"replace the file (formats read: {', '.join(IMAGE_FORMATS)})"
 
@@ -32,9 +33,10 @@ def image_size(path: Path) -> tuple[int, int]:
 def check_depth_header(path: Path) -> None:
     """Refuses a file that is no 16-bit depth image."""
     with _open(path) as image:
-        if image.mode not in DEPTH_MODES:
+        if image.mode not in DEPTH_MODES or zero_is_white(image):
+            got = "a TIFF whose zero is white" if zero_is_white(image) else f"mode {image.mode}"
             fix = "store depth as 16-bit PNG"
-            raise refusal(str(path), wanted="one channel of 16 bits", got=f"mode {image.mode}", fix=fix)
+            raise refusal(str(path), wanted="one channel of 16 bits, from 0 for unknown", got=got, fix=fix)
 
 
 def decode_image(path: Path, size: tuple[int, int]) -> Float32[np.ndarray, "h w 3"]:
@@ -48,17 +50,27 @@ def decode_image(path: Path, size: tuple[int, int]) -> Float32[np.ndarray, "h w 
             image.load()
         if image.mode in DEPTH_MODES:
             gray = np.asarray(image, dtype=np.float32) / np.float32(65535)
+            gray = 1 - gray if zero_is_white(image) else gray
             return np.repeat(np.clip(gray, 0, 1)[..., None], 3, axis=-1)
         if image.has_transparency_data:
             rgba = np.asarray(image.convert("RGBA"), dtype=np.float32) / np.float32(255)
             return rgba[..., :3] * rgba[..., 3:]
-        return np.asarray(image.convert("RGB"), dtype=np.float32) / np.float32(255)
+        pixels = np.array(image.convert("RGB"), dtype=np.float32)
+        pixels /= np.float32(255)  # in place: photographs have hundreds of megabytes as floats
+        return pixels
 
 
-def has_alpha(path: Path) -> bool:
-    """True if an image file may have transparent pixels."""
+def zero_is_white(image: Image.Image) -> bool:
+    """True for a TIFF of 16-bit gray whose zero is white, which Pillow leaves as it is stored."""
+    return image.format == "TIFF" and image.mode in DEPTH_MODES and image.getexif().get(PHOTOMETRIC) == 0
+
+
+def image_flags(path: Path) -> tuple[bool, bool]:
+    """Returns whether an image file may have transparent pixels, and whether EXIF says that it is not upright."""
     with _open(path) as image:
-        return image.has_transparency_data
+        with reading(path, REPLACE):
+            orientation = image.getexif().get(ORIENTATION, UPRIGHT)
+        return image.has_transparency_data, orientation in range(2, 9)
 
 
 def check_mask(path: Path, image: Path) -> None:
@@ -190,7 +202,10 @@ IGNORED_PX = 0.5  # images with a smaller displacement by distortion are not und
 
 @dataclasses.dataclass(frozen=True)
 class Lens:
-    """Distortion coefficients: x_d = x (1 + k1 r^2 + k2 r^4 + k3 r^6 + k4 r^8) + 2 p1 x y + p2 (r^2 + 2 x^2)."""
+    """Distortion coefficients: x_d = x (1 + k1 r^2 + k2 r^4 + k3 r^6 + k4 r^8) / q + 2 p1 x y + p2 (r^2 + 2 x^2).
+
+    The denominator is q = 1 + d1 r^2 + d2 r^4 + d3 r^6; OpenCV and COLMAP call its coefficients k4, k5 and k6.
+    """
 
     k1: float = 0.0
     k2: float = 0.0
@@ -198,6 +213,9 @@ class Lens:
     k4: float = 0.0
     p1: float = 0.0
     p2: float = 0.0
+    d1: float = 0.0
+    d2: float = 0.0
+    d3: float = 0.0
 
     def distorted(self, points: Float64[np.ndarray, "*n 2"]) -> Float64[np.ndarray, "*n 2"]:
         """Maps points on the plane z = 1 of the pinhole camera to their distorted positions."""
@@ -205,6 +223,7 @@ class Lens:
         with np.errstate(over="ignore", invalid="ignore"):
             r2 = x * x + y * y
             radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * (self.k3 + r2 * self.k4)))
+            radial = radial / (1 + r2 * (self.d1 + r2 * (self.d2 + r2 * self.d3)))
             return np.stack(
                 [
                     x * radial + 2 * self.p1 * x * y + self.p2 * (r2 + 2 * x * x),

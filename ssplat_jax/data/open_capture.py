@@ -19,8 +19,10 @@ from ssplat_jax.data.readers import (
     colmap,
     kitti,
     llff,
+    metashape,
     polycam,
     realestate10k,
+    reality_capture,
     record3d,
     scannet,
     splat_cameras,
@@ -40,6 +42,8 @@ READERS = (  # the first one that matches reads the capture
     kitti,
     realestate10k,
     splat_cameras,
+    reality_capture,
+    metashape,
 )
 UNREADABLE_SUFFIXES = frozenset({".heic", ".heif"})  # what phones write and Pillow does not read
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp"}) | UNREADABLE_SUFFIXES

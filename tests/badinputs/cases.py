@@ -251,7 +251,6 @@ CASES = (
     Case("camera model a number", top(camera_model=5), "camera_model"),
     Case("fisheye flag a word", top(is_fisheye="yes"), "is_fisheye"),
     # paths
-    Case("path with backslashes", frame(2, file_path="images\\2.jpg"), PATH),
     Case("path of the folder", frame(2, file_path="images"), PATH),
     Case("path a list", frame(2, file_path=["images/2.jpg"]), PATH),
     Case("path outside", outside("../secret.jpg"), PATH),

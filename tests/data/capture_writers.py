@@ -184,6 +184,30 @@ def write_kitti(root):
     (root / "poses.txt").write_text("\n".join(rows))
 
 
+def write_reality_capture(root):
+    rows = ["#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2"]
+    for i, pose in enumerate(poses()):
+        write_image(root / "images" / f"{i}.jpg", i)
+        turn, pitch, roll = Rotation.from_matrix((pose @ OPENGL)[:3, :3]).as_euler("ZXY", degrees=True)
+        inner = np.array([FX, CX - WIDTH / 2, CY - HEIGHT / 2]) * 36 / WIDTH
+        values = (*pose[:3, 3], -turn, pitch, roll, *inner)
+        rows.append(f"{i}.jpg," + ",".join(repr(float(x)) for x in values) + ",0,0,0,0,0,0")
+    (root / "cameras.csv").write_text("\r\n".join(rows))
+
+
+def write_metashape(root):
+    cameras = []
+    for i, pose in enumerate(poses()):
+        write_image(root / "images" / f"{i}.jpg", i)
+        cameras.append(f'<camera sensor_id="0" label="{i}"><transform>{matrix_text(pose)}</transform></camera>')
+    (root / "cameras.xml").write_text(
+        '<document version="2.0.0"><chunk><sensors><sensor id="0"><calibration class="adjusted">'
+        f'<resolution width="{WIDTH}" height="{HEIGHT}"/><f>{FY}</f><b1>{FX - FY}</b1><cx>{CX - WIDTH / 2}</cx>'
+        f"<cy>{CY - HEIGHT / 2}</cy></calibration></sensor></sensors>"
+        f"<cameras>{''.join(cameras)}</cameras></chunk></document>"
+    )
+
+
 WRITERS = {
     "COLMAP": write_colmap_binary,
     "COLMAP text": write_colmap_text,
@@ -195,4 +219,6 @@ WRITERS = {
     "Record3D": write_record3d,
     "LLFF": write_llff,
     "KITTI": write_kitti,
+    "RealityCapture": write_reality_capture,
+    "Metashape": write_metashape,
 }

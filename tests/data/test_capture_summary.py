@@ -16,7 +16,6 @@ from ssplat_jax.data.capture_summary import (
     image_warnings,
     order_warnings,
     summarize,
-    turn_warnings,
 )
 from ssplat_jax.data.depth_range import DepthStatistics
 from ssplat_jax.data.open_capture import open_capture
@@ -101,14 +100,6 @@ def test_copies_are_found_in_memory_and_in_files(room, tmp_path):
     root = make_capture(tmp_path / "capture")
     shutil.copy(root / "images" / "0.jpg", root / "images" / "3.jpg")
     assert [w for w in frame_warnings(open_capture(root)) if "1 images are copies" in w and "frames 3)" in w]
-
-
-def test_a_turn_without_overlap_is_found(room):
-    frames = list(room.frames)
-    half = np.diag([-1.0, 1.0, -1.0, 1.0])
-    frames[15:] = [dataclasses.replace(f, camtoworld=f.camtoworld @ half) for f in frames[15:]]
-    (warning,) = turn_warnings(changed(room, frames=frames))
-    assert warning.startswith("1 turn of") and "(after frames 14)" in warning
 
 
 @pytest.mark.parametrize("i", [0, 11, 23])

@@ -54,7 +54,6 @@ TWO_MATRICES = b"1170 0 647 0\n0 1170 483 0\n0 0 1 0\n0 0 0 1\n"
 BAD = (
     ("COLMAP", "no cameras.bin", remove(CAMERAS), "cameras.bin"),
     ("COLMAP", "model to come", camera(77, ()), "model 77"),
-    ("COLMAP", "denominator", camera(6, (FX, FY, CX, CY, 0, 0, 0, 0, 0, 0.1, 0, 0)), "FULL_OPENCV"),
     ("COLMAP", "other camera", camera(1, (FX, FY, CX, CY), camera=2), "camera 1, which is missing"),
     ("COLMAP text", "parameters missing", replace("sparse/0/cameras.txt", f" {CY}", ""), "line 2"),
     ("COLMAP text", "image twice", replace("sparse/0/images.txt", "10.jpg", "9.jpg"), "line 9"),

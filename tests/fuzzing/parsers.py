@@ -133,6 +133,8 @@ CAPTURE_FILES = {
     "Record3D": ("metadata.json",),
     "LLFF": ("poses_bounds.npy",),
     "KITTI": ("calib.txt", "poses.txt"),
+    "RealityCapture": ("cameras.csv",),
+    "Metashape": ("cameras.xml",),
 }
 INDEX = {"room": {"context": [0, 2, 4], "target": [1, 3]}, "hall": None}
 IMAGES = ("transforms.json", "images/2.jpg", "images/2.png", "images/2.webp", "d.png")

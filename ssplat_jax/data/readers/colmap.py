@@ -5,8 +5,8 @@ Where there is no `sparse/0`, the reconstruction of the lowest number is read; a
 Poses are world-to-camera with OpenCV axes, in COLMAP's world; pixel centers are at +0.5. Images are in `images/` (or
 downscaled in `images_2`, `images_4`, `images_8`), else in the folder of the capture. Images that COLMAP did not
 register, and registered ones whose file is missing, are left out and counted. Perspective and fish-eye camera models
-are supported (`MODELS`), FULL_OPENCV only without its denominator (k4 to k6); cameras that no image uses may be of any
-model. If there are binary and text files, the binary ones are read. Format: colmap.github.io/format.html.
+are supported (`MODELS`); cameras that no image uses may be of any model. If there are binary and text files, the binary
+ones are read. Format: colmap.github.io/format.html.
 
 The parser is our own, because a bare install must read what most captures come with.
 """
@@ -22,11 +22,13 @@ from ssplat_jax.data.images import FisheyeLens, Lens
 from ssplat_jax.data.parsing import load_lines, parse_numbers, reading
 from ssplat_jax.data.posed_image import Convention, pose_from_quat
 from ssplat_jax.data.readers.frame_list import (
+    CUT,
+    PANORAMAS,
+    UNDISTORT,
     FrameList,
     Intrinsics,
     Listing,
     file_named,
-    find_image,
     images_folder,
     images_in,
     stored_size,
@@ -55,7 +57,6 @@ MODELS = (  # name, parameters, and whether the camera is supported, by id
     ("EUCM", "fx fy cx cy alpha beta", False),
     ("EQUIRECTANGULAR", "w h", False),
 )
-UNDISTORT = "undistort the images to pinhole cameras first (`colmap image_undistorter`)"
 COPY_AGAIN = "copy the reconstruction again"
 
 
@@ -91,7 +92,7 @@ def read(path: Path) -> Listing:
         folder = ""  # COLMAP ran on the parent folder, so the names include images/
     frames = FrameList(root, CONVENTION)
     for entry in entries:
-        image = find_image(root, folder + entry.name, entry.where)
+        image = frames.find(folder + entry.name, entry.where)
         if image is not None:
             if entry.camera not in cameras:
                 got = f"camera {entry.camera}, which is missing"
@@ -103,9 +104,8 @@ def read(path: Path) -> Listing:
     if entries and not frames.frames:
         file_named(root, folder + entries[0].name, entries[0].where)  # refuses it
     notes = _larger_models(path, model, len(entries))
-    registered = {frame.path for frame in frames.frames}
-    others = {file.resolve() for file in images_in(root / "images", "**/*")} - registered
-    if others and any(image is not None and image.is_relative_to(root / "images") for image in registered):
+    inside = {image.resolve() for image in images_in(root / "images", "**/*")}
+    if (others := inside - {frame.path for frame in frames.frames}) and len(others) < len(inside):
         notes = [f"{len(others)} images in images/ are left out: COLMAP did not register them.", *notes]
     return frames.listing(len(entries), "file", notes)
 
@@ -145,13 +145,12 @@ def _intrinsics(camera: CameraEntry) -> Intrinsics:
     supported = {name: params.split() for name, params, is_supported in MODELS if is_supported}
     names = supported.get(camera.model)
     if names is None:
-        raise refusal(camera.where, wanted=f"one of {', '.join(supported)}", got=echo(camera.model), fix=UNDISTORT)
+        fix = CUT if camera.model in PANORAMAS else UNDISTORT
+        raise refusal(camera.where, wanted=f"one of {', '.join(supported)}", got=echo(camera.model), fix=fix)
     if len(camera.params) != len(names):
         wanted = f"{len(names)} parameters ({' '.join(names)})"
         raise refusal(camera.where, wanted=wanted, got=str(len(camera.params)), fix=COPY_AGAIN)
     fields: dict[str, Any] = dict(zip(names, camera.params, strict=True))
-    if any([fields.pop(name, 0.0) != 0.0 for name in ("d1", "d2", "d3")]):
-        raise refusal(camera.where, wanted="FULL_OPENCV with k4 = k5 = k6 = 0", got="a denominator", fix=UNDISTORT)
     focal = fields.pop("f", None)
     fx, fy, cx, cy = (fields.pop(name, focal) for name in ("fx", "fy", "cx", "cy"))
     lens = FisheyeLens(**fields) if "FISHEYE" in camera.model else Lens(**fields)

@@ -1,12 +1,13 @@
 """`FrameList`: what all readers share, from finding an image to the listing of checked frames in stream order."""
 
+import contextlib
 import dataclasses
 import itertools
 import math
 import posixpath
 import re
 from collections.abc import Sequence
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 
 import numpy as np
 from jaxtyping import Float64
@@ -19,7 +20,7 @@ from ssplat_jax.data.images import (
     check_depth_header,
     check_lens,
     check_mask,
-    has_alpha,
+    image_flags,
     image_size,
     shows_too_little,
 )
@@ -28,7 +29,9 @@ from ssplat_jax.data.posed_image import MILLIMETER, ROTATION_ROUNDING, USUAL, Co
 SHORTER_PATH_RATIO = 0.5  # camera path in the file's order over that by name, below which the file's order is used
 MAX_CENTER_OFFSET = 0.2  # of a side; a principal point farther from the center is reported
 SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG", ".webp")
-OPAQUE_SUFFIXES = (".jpg", ".jpeg")  # of files without an alpha channel
+UNDISTORT = "undistort the images to pinhole cameras first (`colmap image_undistorter`)"
+PANORAMAS = ("EQUIRECTANGULAR", "VR180_L", "OMNIDIRECTIONALSTEREO_L", "OMNIDIRECTIONALSTEREO_R", "ORTHOPHOTO")
+CUT = "cut them into perspective views first (`ns-process-data images --camera-type equirectangular`)"
 SHRUNK_FOLDERS = ("images_2", "images_4", "images_8")  # downscaled copies of images/, which may be missing
 
 
@@ -60,6 +63,32 @@ class FrameList:
         self.root, self.convention = root, convention
         self.frames: list[Frame] = []
         self._seen: set[object] = set()
+        self._by_stem: dict[str, list[Path]] | None = None  # images below images/, found when one is missing
+        self._renamed = self._turned = 0
+
+    def find(self, name: object, where: str, suffixes: Sequence[str] = ("",)) -> Path | None:
+        """Returns the path of the image `name` of the capture, or None if there is no such file.
+
+        Where there is none (`find_image`), the only image of that name in the folders below `images` stands in, else
+        the only one with another suffix.
+        """
+        if (image := find_image(self.root, name, where, suffixes)) is not None:
+            return image
+        assert isinstance(name, str)
+        if self._by_stem is None:
+            self._by_stem = {}
+            for file in images_in(self.root / (images_folder(self.root) or "."), "**/*"):
+                if "masks" not in file.relative_to(self.root).parts:
+                    self._by_stem.setdefault(file.stem, []).append(file)
+        wanted = PureWindowsPath(name)  # splits at both kinds of slashes
+        found = self._by_stem.get(wanted.stem, []) + self._by_stem.get(wanted.name, [])
+        found = [file for file in found if file.name == wanted.name] or found
+        self._renamed += len(found) == 1
+        return find_file(self.root, [str(found[0].relative_to(self.root))], where) if len(found) == 1 else None
+
+    def named(self, name: object, where: str, suffixes: Sequence[str] = ("",)) -> Path:
+        """Returns the path that `find` finds; there must be one."""
+        return self.find(name, where, suffixes) or file_named(self.root, name, where)
 
     def add(
         self,
@@ -89,6 +118,7 @@ class FrameList:
             depth_unit: capture units per step of the depth image.
             mask: image that is dark where pixels are masked out; by default one in the folder `masks` of the capture.
         """
+        find_file(self.root, [str(image)], where)  # refuses a link that leads outside
         key = image if key is None else key
         if key in self._seen:
             raise refusal(where, wanted="every image once", got=f"{echo(name)} again", fix="drop one of the two frames")
@@ -101,7 +131,9 @@ class FrameList:
         distortion_px = check_lens(intrinsics.lens, K, width, height, where)
         camtoworld, lens = self.convention.to_opencv(pose[0]), intrinsics.lens if distortion_px > IGNORED_PX else None
         mask = mask or self._mask_of(name, image, where)
-        is_masked = mask is not None or (image.suffix.lower() not in OPAQUE_SUFFIXES and has_alpha(image))
+        is_transparent, is_turned = image_flags(image)
+        self._turned += is_turned
+        is_beyond = lens is not None and shows_too_little(lens, K, width, height)
         frame = Frame(
             name,
             camtoworld,
@@ -116,7 +148,7 @@ class FrameList:
             lens=lens,
             distortion_px=distortion_px,
             mask_path=mask,
-            is_masked=is_masked or (lens is not None and shows_too_little(lens, K, width, height)),
+            is_masked=mask is not None or is_transparent or is_beyond,
         )
         self.frames.append(frame)
 
@@ -151,6 +183,12 @@ class FrameList:
             got = f"none of {num_listed} with its {missing}"
             raise refusal(str(self.root), wanted="frames with images and poses", got=got, fix="complete the capture")
         left_out = [f"{lost} of {num_listed} frames are skipped: their {missing} is missing."] if lost else []
+        if self._renamed:
+            what = f"{self._renamed} images were found in another folder or with another suffix than the poses name."
+            left_out.append(what)
+        if self._turned:
+            what = f"{self._turned} images have an EXIF orientation, which is not applied"
+            left_out.append(f"{what}: intrinsics and poses must be those of the pixels as they are stored.")
         notes = (*left_out, *notes, *_notes(self.frames))
         return Listing(name or self.root.name, tuple(self.frames), notes, is_in_time)
 
@@ -213,7 +251,8 @@ def _notes(frames: list[Frame]) -> list[str]:
 def find_file(root: Path, names: Sequence[str], where: str) -> Path | None:
     """Returns the first of `names` that is a file in the folder `root`, after symbolic links are resolved, or None.
 
-    Names that lead outside `root` are refused: a capture from elsewhere must not make us read other files.
+    Names that lead outside `root` are refused: a capture from elsewhere must not make us read other files. A folder of
+    the capture may itself be a link, as `images` often is.
     """
     for name in names:
         try:
@@ -221,7 +260,7 @@ def find_file(root: Path, names: Sequence[str], where: str) -> Path | None:
             found = path.is_file()
         except (OSError, RuntimeError, ValueError):  # name too long, loop of links
             continue
-        if not path.is_relative_to(root):
+        if not path.is_relative_to(root) and not any(path.is_relative_to(folder) for folder in _linked(root)):
             fix = "copy the file into the capture's folder and give its relative path"
             raise refusal(where, wanted=f"a path inside {root}", got=echo(name), fix=fix)
         if found:
@@ -229,18 +268,30 @@ def find_file(root: Path, names: Sequence[str], where: str) -> Path | None:
     return None
 
 
+def _linked(root: Path) -> list[Path]:
+    """The folders elsewhere to which links in the folder `root` lead."""
+    with contextlib.suppress(OSError):
+        return [folder.resolve() for folder in root.iterdir() if folder.is_symlink() and folder.is_dir()]
+    return []
+
+
+def name_in(root: Path, image: Path) -> str:
+    """Returns the path of an image relative to the folder `root`, or its name if a link leads to it."""
+    return str(image.relative_to(root)) if image.is_relative_to(root) else image.name
+
+
 def find_image(root: Path, name: object, where: str, suffixes: Sequence[str] = ("",)) -> Path | None:
     """Returns the path of the image `name` of the capture, or None if there is no such file.
 
-    The `suffixes` are tried behind the name. A downscaled copy (images_2, ...) stands in for an image that is missing
-    in images/; any of `SUFFIXES` may stand in place of its own there.
+    The `suffixes` are tried behind the name; backslashes count as slashes. A downscaled copy (images_2, ...) stands in
+    for an image that is missing in images/; any of `SUFFIXES` may stand in place of its own there.
     """
     if not isinstance(name, str) or not name or "\0" in name:
         raise refusal(where, wanted="the path of a file", got=echo(name), fix="give it relative to the capture")
-    below = in_images(name)
+    below, slashed = in_images(name), [name.replace("\\", "/")] if "\\" in name else []
     copies = [] if below is None else [f"{folder}/{below}" for folder in SHRUNK_FOLDERS]
     renamed = [posixpath.splitext(copy)[0] + suffix for copy in copies for suffix in SUFFIXES]
-    return find_file(root, [n + suffix for n in (name, *copies) for suffix in suffixes] + renamed, where)
+    return find_file(root, [n + suffix for n in (name, *slashed, *copies) for suffix in suffixes] + renamed, where)
 
 
 def file_named(root: Path, name: object, where: str, suffixes: Sequence[str] = ("",)) -> Path:

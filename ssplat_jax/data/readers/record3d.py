@@ -10,7 +10,7 @@ from pathlib import Path
 
 from ssplat_jax.data.parsing import Fields, load_json
 from ssplat_jax.data.posed_image import Convention, pose_from_quat
-from ssplat_jax.data.readers.frame_list import FrameList, Intrinsics, Listing, find_file, stored_size
+from ssplat_jax.data.readers.frame_list import FrameList, Intrinsics, Listing, find_file, name_in, stored_size
 
 FORMAT = "Record3D"
 CONVENTION = Convention(axes="opengl")
@@ -43,6 +43,6 @@ def read(path: Path) -> Listing:
             x, y, z, w, *center = Fields({"pose": entry}, where).numbers("pose", (7,))
             pose = (pose_from_quat((w, x, y, z), center, where), 0.0)
             sized = stored_size(image, described, f"{file}: w, h")
-            name = str(image.relative_to(root))
+            name = name_in(root, image)
             frames.add(name, image, pose, Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy), sized, where)
     return frames.listing(len(poses), "image")

@@ -16,7 +16,6 @@ from ssplat_jax.data.readers.frame_list import (
     FrameList,
     Intrinsics,
     Listing,
-    file_named,
     images_folder,
     stored_size,
 )
@@ -42,7 +41,7 @@ def read(path: Path) -> Listing:
     for i, entry in enumerate(entries):
         fields = Fields(entry, f"{file}: [{i}]")
         name = fields.text("img_name")
-        image = file_named(root, folder + name, f"{fields.where}.img_name", ("", *SUFFIXES))
+        image = frames.named(folder + name, f"{fields.where}.img_name", ("", *SUFFIXES))
         matrix = np.column_stack([fields.numbers("rotation", (3, 3)), fields.numbers("position", (3,))])
         width, height = fields.number("width"), fields.number("height")
         intrinsics = Intrinsics(fx=fields.number("fx"), fy=fields.number("fy"), cx=width / 2, cy=height / 2)

@@ -5,12 +5,14 @@ re-centered or rescaled, and `applied_transform` is ignored, so results are in t
 Intrinsics are global or per frame, and a frame's own value comes first: fl_x, fl_y, cx, cy, w, h in pixels of the
 stored image, or camera_angle_x in radians. Defaults are fl_y = fl_x, the center of the image, and the size of the
 image file. Distortion (k1 to k4, p1, p2) follows the Brown-Conrady model, or with `camera_model` OPENCV_FISHEYE or
-`is_fisheye` the fish-eye model (k1 to k4), and is removed when images are delivered.
+`is_fisheye` the fish-eye model (k1 to k4), and is removed when images are delivered; `distortion_params` is the list
+k1 k2 k3 k4 p1 p2, and with FULL_OPENCV k4 to k6 are the denominator. Depth maps count steps of `integer_depth_scale`,
+else millimeters times `applied_scale`. Frames with `is_bad` (ScanNet++) are left out. Without a transforms.json, the
+split transforms_train.json is read.
 DL3DV keeps the file and its images in a folder `nerfstudio`, which is opened with the folder around it.
 Frames are streamed in the natural order of `file_path`, with the exception in `frame_list.in_stream_order`.
 """
 
-import dataclasses
 import math
 from pathlib import Path
 from typing import Any
@@ -18,11 +20,13 @@ from typing import Any
 from ssplat_jax.core.errors import InputError, echo, refusal
 from ssplat_jax.data.images import FisheyeLens, Lens, check_mask, image_size
 from ssplat_jax.data.parsing import Fields, load_json
-from ssplat_jax.data.posed_image import Convention, check_camtoworld
+from ssplat_jax.data.posed_image import MILLIMETER, Convention, check_camtoworld
 from ssplat_jax.data.readers import splat_cameras
 from ssplat_jax.data.readers.frame_list import (
-    SHRUNK_FOLDERS,
+    CUT,
+    PANORAMAS,
     SUFFIXES,
+    UNDISTORT,
     FrameList,
     Intrinsics,
     Listing,
@@ -33,10 +37,12 @@ from ssplat_jax.data.readers.frame_list import (
 
 FORMAT = "transforms.json"
 CONVENTION = Convention(axes="opengl")
-PLACES = ("transforms.json", "nerfstudio/transforms.json")
-PINHOLE_MODELS = (None, "OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
+PLACES = ("transforms.json", "nerfstudio/transforms.json", "transforms_train.json")
+PINHOLE_MODELS = (None, "OPENCV", "FULL_OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 FISHEYE_MODELS = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
-UNDISTORT = "undistort the images to a pinhole camera first (COLMAP: `colmap image_undistorter`)"
+COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")  # in the order of `distortion_params`
+UNKNOWN_LENS = ("k5", "k6", "s1", "s2", "s3", "s4", "xi", "omega", "skew")
+UNKNOWN_UNITS = ("depth_scale", "depth_factor", "depth_unit")  # some multiply by these and others divide
 
 
 def matches(path: Path) -> bool:
@@ -85,8 +91,11 @@ def _read(path: Path, problems: list[str] | None) -> Listing:
     file = _file(path)
     meta = load_json(file)
     entries = Fields(meta, str(file)).entries("frames")
-    frames = FrameList(file.parent.resolve(), CONVENTION)
+    frames, num_bad = FrameList(file.parent.resolve(), CONVENTION), 0
     for i, entry in enumerate(entries):
+        if isinstance(entry, dict) and entry.get("is_bad") is True:
+            num_bad += 1
+            continue
         try:
             _add_frame(frames, meta, entry, f"{file}: frames[{i}]")
         except InputError as error:
@@ -94,7 +103,13 @@ def _read(path: Path, problems: list[str] | None) -> Listing:
                 raise
             problems.append(str(error))
             break
-    return frames.listing(len(frames.frames), "image")
+    notes = [f"{num_bad} frames are left out, because the file calls them bad (is_bad)."] if num_bad else []
+    times = [fields.get("rolling_shutter") for fields in (meta, *entries) if isinstance(fields, dict)]
+    if any(isinstance(shutter, list) and any(shutter[:3]) for shutter in times):
+        notes.append("The rolling shutter (rolling_shutter) is not modelled: every image has one pose.")
+    if file.name == PLACES[-1]:
+        notes.append(f"There is no {PLACES[0]}: {file.name} is read, and the images of other splits are left out.")
+    return frames.listing(len(frames.frames), "image", notes)
 
 
 def _add_frame(frames: FrameList, meta: dict[str, Any], entry: Any, where: str) -> None:
@@ -102,7 +117,7 @@ def _add_frame(frames: FrameList, meta: dict[str, Any], entry: Any, where: str) 
     own = Fields(entry, where)
     fields = Fields(meta | entry, where)
     name = own.get("file_path")
-    image = file_named(frames.root, name, f"{where}.file_path", ("", *SUFFIXES))
+    image = frames.named(name, f"{where}.file_path", ("", *SUFFIXES))
     depth, mask = (
         None if own.get(kind) is None else file_named(frames.root, own.get(kind), f"{where}.{kind}")
         for kind in ("depth_file_path", "mask_path")
@@ -110,7 +125,7 @@ def _add_frame(frames: FrameList, meta: dict[str, Any], entry: Any, where: str) 
     if mask is not None:
         check_mask(mask, image)
     pose = check_camtoworld(own.get("transform_matrix"), f"{where}.transform_matrix")
-    is_shrunk = image.relative_to(frames.root).parts[0] in SHRUNK_FOLDERS and in_images(str(name)) is not None
+    is_shrunk = in_images(str(name)) is not None and not (frames.root / "images").is_dir()
     has_size = fields.get("w") is not None and fields.get("h") is not None
     if is_shrunk and not has_size and any(fields.get(field) is not None for field in ("fl_x", "fl_y", "cx", "cy")):
         got = f"none, and {image.parent.name}/{image.name} in its place"
@@ -122,7 +137,16 @@ def _add_frame(frames: FrameList, meta: dict[str, Any], entry: Any, where: str) 
     fx, fy = _focal(fields, own, width / shrink, height / shrink)
     cx, cy = (fields.number(field, side / shrink / 2) for field, side in (("cx", width), ("cy", height)))
     frames.add(str(name), image, pose, Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, lens=_lens(fields)), sized, where,
-               depth=depth, mask=mask)  # fmt: skip
+               depth=depth, depth_unit=_depth_unit(fields), mask=mask)  # fmt: skip
+
+
+def _depth_unit(fields: Fields) -> float:
+    """Capture units per step of a depth map; fields whose meaning differs from tool to tool are refused."""
+    for name in UNKNOWN_UNITS:
+        if fields.get(name) is not None and fields.get("depth_file_path") is not None:
+            fix = "write integer_depth_scale, the capture units in a step of the depth maps, instead"
+            raise refusal(f"{fields.where}.{name}", wanted="integer_depth_scale", got=echo(fields.get(name)), fix=fix)
+    return fields.number("integer_depth_scale", MILLIMETER * fields.number("applied_scale", 1.0))
 
 
 def _lens(fields: Fields) -> Lens:
@@ -132,8 +156,17 @@ def _lens(fields: Fields) -> Lens:
         raise refusal(f"{fields.where}.is_fisheye", wanted="true or false", got=echo(flag), fix="write a JSON boolean")
     is_fisheye = model in FISHEYE_MODELS or bool(flag)
     if not is_fisheye and model not in PINHOLE_MODELS:
-        raise refusal(where, wanted="OPENCV, PINHOLE or OPENCV_FISHEYE", got=echo(model), fix=UNDISTORT)
-    coefficients = {field.name: fields.number(field.name, 0.0) for field in dataclasses.fields(Lens)}
+        fix = CUT if model in PANORAMAS else UNDISTORT
+        raise refusal(where, wanted="OPENCV, PINHOLE or OPENCV_FISHEYE", got=echo(model), fix=fix)
+    if fields.get("distortion_params") is None:
+        coefficients = {name: fields.number(name, 0.0) for name in COEFFICIENTS}
+    else:
+        coefficients = dict(zip(COEFFICIENTS, fields.numbers("distortion_params", (6,)).tolist(), strict=True))
+    if model == "FULL_OPENCV":
+        coefficients |= {"d1": coefficients.pop("k4"), "d2": fields.number("k5", 0.0), "d3": fields.number("k6", 0.0)}
+    elif unknown := [name for name in UNKNOWN_LENS if fields.number(name, 0.0)]:
+        wanted = f"coefficients among {', '.join(COEFFICIENTS)}"
+        raise refusal(f"{fields.where}.{unknown[0]}", wanted=wanted, got=echo(unknown), fix=UNDISTORT)
     if is_fisheye and (coefficients["p1"] or coefficients["p2"]):
         got = "p1 or p2 beside them"
         raise refusal(where, wanted="a fish-eye lens with k1 to k4 alone", got=got, fix=UNDISTORT)

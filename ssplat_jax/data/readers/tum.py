@@ -3,7 +3,8 @@
 `rgb.txt` and `depth.txt` list times and files, `groundtruth.txt` camera-to-world poses (time, tx ty tz, qx qy qz qw).
 The pose of an image is interpolated between its neighbors in time; images between poses more than `MAX_POSE_GAP` apart
 are skipped, as are listed files that do not exist; an image that is listed at several times counts once, at the first.
-Depth maps are in units of 1/5000 m; an image gets the nearest one within `MAX_DEPTH_GAP`.
+Depth maps are in units of 1/5000 m, or of what a `DepthMapFactor` in a .yaml file (ORB-SLAM) or a `png_depth_scale` or
+`scale` in a .json file (Replica) beside them says; an image gets the nearest one within `MAX_DEPTH_GAP`.
 Intrinsics are read from `calibration.txt` (fx fy cx cy, optionally k1 k2 p1 p2 k3). Without it, `freiburg1` to
 `freiburg3` in the name of the folder selects those of the color camera from
 cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats. Both have the center of the first pixel at 0, so half a pixel is
@@ -21,12 +22,22 @@ from ssplat_jax.core.errors import echo, refusal
 from ssplat_jax.data.images import Lens
 from ssplat_jax.data.parsing import load_lines, load_rows, load_text, parse_numbers
 from ssplat_jax.data.posed_image import pose_from_quat
-from ssplat_jax.data.readers.frame_list import FrameList, Intrinsics, Listing, file_named, find_image, stored_size
+from ssplat_jax.data.readers.frame_list import (
+    FrameList,
+    Intrinsics,
+    Listing,
+    file_named,
+    files_in,
+    find_image,
+    name_in,
+    stored_size,
+)
 
 FORMAT = "TUM RGB-D"
 MAX_POSE_GAP = 0.1  # seconds between the two poses around an image
 MAX_DEPTH_GAP = 0.02  # seconds between an image and its depth map
-DEPTH_UNIT = 1 / 5000  # meters
+DEPTH_FACTOR = 5000.0  # steps of a depth map in a meter
+FACTOR = re.compile(r"\b(?:DepthMapFactor|png_depth_scale|depth_scale|scale)\"?\s*[:=]\s*([0-9.eE+-]+)")
 CALIBRATIONS = {  # fx fy cx cy k1 k2 p1 p2 k3
     "freiburg1": (517.3, 516.5, 318.6, 255.3, 0.2624, -0.9531, -0.0054, 0.0026, 1.1633),
     "freiburg2": (520.9, 521.0, 325.1, 249.7, 0.2312, -0.7849, -0.0033, -0.0001, 0.9172),
@@ -51,13 +62,28 @@ def read(path: Path) -> Listing:
     if len(images) < len(listed):
         again = len(listed) - len(images)
         notes = [f"{again} lines of rgb.txt list an image again; its first time counts.", *notes]
+    factor = _depth_factor(root)
+    if depths and factor is None and not re.search("freiburg[123]", root.name):
+        depth_notes = [*depth_notes, "Depth maps are taken to be in steps of 1/5000 m, as TUM's are: no file says so."]
+    unit = 1 / (factor or DEPTH_FACTOR)
     frames = FrameList(root)
     for image, time in sorted(images.items(), key=lambda item: item[::-1]):
         pose = _pose_at(time, poses, f"{root / 'groundtruth.txt'} at {time:.6f}")
         if pose is not None:
-            name, sized, depth = str(image.relative_to(root)), stored_size(image, None, ""), _depth_at(time, depths)
-            frames.add(name, image, (pose, 0.0), intrinsics, sized, calibration, depth=depth, depth_unit=DEPTH_UNIT)
+            name, sized, depth = name_in(root, image), stored_size(image, None, ""), _depth_at(time, depths)
+            frames.add(name, image, (pose, 0.0), intrinsics, sized, calibration, depth=depth, depth_unit=unit)
     return frames.listing(len(images), "pose at their time", [*notes, *depth_notes], is_in_time=True)
+
+
+def _depth_factor(root: Path) -> float | None:
+    """Steps of a depth map in a meter, as a file beside the images says; None if there is none."""
+    for file in [file for suffix in ("yaml", "yml", "json") for file in files_in(root, f"*.{suffix}")]:
+        if found := FACTOR.search(load_text(file)):
+            (factor,) = parse_numbers([found[1]], str(file), 1)
+            if not 0 < factor < math.inf:
+                raise refusal(str(file), wanted="a depth factor above 0", got=echo(found[1]), fix="mend the file")
+            return factor
+    return None
 
 
 def _files(root: Path, name: str) -> tuple[list[tuple[float, Path]], list[str]]:

@@ -1,0 +1,341 @@
+"""Files as people bring them: fields that change a camera, odd names, links, hidden files, other programs' cameras."""
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from ssplat_jax.core.errors import InputError
+from ssplat_jax.data.images import FisheyeLens, Lens
+from ssplat_jax.data.open_capture import open_capture
+from tests.badinputs.cases import HEIGHT, NUM_FRAMES, WIDTH, make_capture
+from tests.data.capture_writers import (
+    COLMAP_IMAGES,
+    WRITERS,
+    camera_bytes,
+    write_colmap_binary,
+    write_colmap_text,
+    write_image,
+    write_tum,
+)
+from tests.data.capture_writers import HEIGHT as HIGH
+from tests.data.capture_writers import WIDTH as WIDE
+
+# -- fields of transforms.json ----------------------------------------------------------------------------------------
+
+PARAMS = [0.1, -0.02, 0.003, 0.0004, 0.005, -0.006]  # k1 k2 k3 k4 p1 p2
+
+
+def test_distortion_params_are_a_lens_of_the_file_or_of_a_frame(tmp_path):
+    def change(root, meta):
+        meta["distortion_params"] = PARAMS
+        meta["frames"][2]["distortion_params"] = [0.2, 0, 0, 0, 0, 0]
+
+    frames = open_capture(make_capture(tmp_path / "c", change)).frames
+    assert frames[1].lens == Lens(k1=0.1, k2=-0.02, k3=0.003, k4=0.0004, p1=0.005, p2=-0.006)
+    assert frames[2].lens == Lens(k1=0.2)
+    plain = dict(zip(("k1", "k2", "k3", "k4", "p1", "p2"), PARAMS, strict=True))
+    written = open_capture(make_capture(tmp_path / "d", lambda root, meta: meta.update(plain)))
+    assert written.frames[1].lens == frames[1].lens
+    fish = {"camera_model": "OPENCV_FISHEYE", "distortion_params": [0.1, 0.01, 0, 0, 0, 0]}
+    assert open_capture(make_capture(tmp_path / "f", lambda root, meta: meta.update(fish))).frames[
+        0
+    ].lens == FisheyeLens(k1=0.1, k2=0.01)
+
+
+def test_the_denominator_of_full_opencv_is_that_of_opencv(tmp_path):
+    """Worked by hand for (0.5, -0.3): r^2 = 0.34, so that the numerator is 1.068."""
+    lens = Lens(k1=0.2, d1=0.1, d2=-0.05, d3=0.02)
+    wanted = 1.068 / (1 + 0.1 * 0.34 - 0.05 * 0.34**2 + 0.02 * 0.34**3)
+    np.testing.assert_allclose(lens.distorted(np.array([0.5, -0.3])), wanted * np.array([0.5, -0.3]), rtol=1e-12)
+    params = (50.0, 51.0, 31.0, 25.0, 0.2, 0, 0, 0, 0, 0.1, -0.05, 0.02)
+    write_colmap_binary(tmp_path / "colmap", [camera_bytes(6, params)])
+    assert open_capture(tmp_path / "colmap").frames[0].lens == lens
+    fields = {"camera_model": "FULL_OPENCV", "k1": 0.2, "k4": 0.1, "k5": -0.05, "k6": 0.02}
+    capture = open_capture(make_capture(tmp_path / "c", lambda root, meta: meta.update(fields)))
+    assert capture.frames[0].lens == lens
+
+
+@pytest.mark.parametrize(
+    ("fields", "unit"),
+    [
+        ({}, 0.001),
+        ({"integer_depth_scale": 10 / 65535}, 10 / 65535),
+        ({"applied_scale": 0.25}, 0.00025),
+    ],
+)
+def test_depth_maps_have_the_unit_that_the_file_says(fields, unit, tmp_path):
+    def change(root, meta):
+        meta.update(fields)
+        Image.fromarray(np.full((HEIGHT, WIDTH), 19660, np.uint16)).save(root / "d.png")
+        meta["frames"][2]["depth_file_path"] = "d.png"
+
+    depth = open_capture(make_capture(tmp_path / "c", change)).depth(2)
+    np.testing.assert_allclose(depth, 19660 * unit, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({"k5": 0.1}, "k5"),
+        ({"s1": 0.01}, "s1"),
+        ({"xi": 1.2}, "xi"),
+        ({"distortion_params": [0.1, 0.2]}, "distortion_params: wanted 6"),
+        ({"camera_model": "EQUIRECTANGULAR"}, "cut them into perspective views"),
+        ({"camera_model": "FISHEYE624"}, "undistort"),
+    ],
+)
+def test_lenses_that_are_not_modelled_are_refused_by_name(fields, words, tmp_path):
+    with pytest.raises(InputError, match=words):
+        open_capture(make_capture(tmp_path / "c", lambda root, meta: meta.update(fields)))
+
+
+def test_a_depth_unit_of_two_meanings_is_refused(tmp_path):
+    def change(root, meta):
+        Image.fromarray(np.ones((HEIGHT, WIDTH), np.uint16)).save(root / "d.png")
+        meta["frames"][2].update(depth_file_path="d.png", depth_scale=1000)
+
+    with pytest.raises(InputError, match="depth_scale: wanted integer_depth_scale"):
+        open_capture(make_capture(tmp_path / "c", change))
+
+
+def test_bad_frames_are_left_out_and_a_rolling_shutter_is_noted(tmp_path):
+    def change(root, meta):
+        meta["frames"][1]["is_bad"] = True
+        meta["frames"][2]["is_bad"] = False
+        meta["rolling_shutter"] = [0.0, 0.0, 0.03, 0.0]
+
+    capture = open_capture(make_capture(tmp_path / "c", change))
+    assert [frame.name for frame in capture.frames] == ["images/0.jpg", "images/2.jpg", "images/3.jpg"]
+    assert ["is_bad" in capture.notes[0], "rolling" in capture.notes[1]] == [True, True]
+
+
+def test_a_folder_of_splits_opens_with_its_training_split(tmp_path):
+    root = make_capture(tmp_path / "c")
+    (root / "transforms.json").rename(root / "transforms_train.json")
+    capture = open_capture(root)
+    assert len(capture) == NUM_FRAMES and "transforms_train.json" in capture.notes[0]
+
+
+# -- units of depth in TUM's layout -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "depth"),
+    [
+        ("camera.yaml", "Camera.fx: 500\nDepthMapFactor: 1000.0\n", 7.5),
+        ("cam_params.json", '{"camera": {"scale": 6553.5}}', 7500 / 6553.5),
+        (None, "", 1.5),
+    ],
+)
+def test_tum_depth_maps_have_the_unit_of_a_file_beside_them(file, text, depth, tmp_path):
+    write_tum(tmp_path)
+    if file is not None:
+        (tmp_path / file).write_text(text)
+    capture = open_capture(tmp_path)
+    np.testing.assert_allclose(capture.depth(0), depth, rtol=1e-6)
+    assert any("1/5000" in note for note in capture.notes) == (file is None)
+
+
+# -- images -----------------------------------------------------------------------------------------------------------
+
+
+def test_gray_whose_zero_is_white_is_not_inverted(tmp_path):
+    def change(root, meta):
+        for i, photometric in ((1, 1), (2, 0)):
+            gray = np.full((HEIGHT, WIDTH), 13107 if photometric else 65535 - 13107, np.uint16)
+            Image.fromarray(gray).save(root / "images" / f"{i}.tif", tiffinfo={262: photometric})
+            meta["frames"][i]["file_path"] = f"images/{i}.tif"
+
+    capture = open_capture(make_capture(tmp_path / "c", change))
+    for i in (1, 2):
+        np.testing.assert_allclose(capture.image(i), 0.2, atol=1e-4)
+
+
+@pytest.mark.parametrize("orientation", [3, 6])
+def test_an_orientation_that_is_not_applied_is_noted(orientation, tmp_path):
+    """Of half a turn or a square image no size tells."""
+
+    def change(root, meta):
+        exif = Image.Exif()
+        exif[274] = orientation
+        side = HEIGHT if orientation == 6 else WIDTH
+        meta.update(w=side, cx=side / 2)
+        for i in range(NUM_FRAMES):
+            image = Image.new("RGB", (side, HEIGHT), (255, 0, 0))
+            image.paste((0, 0, 255), (0, 0, side // 2, HEIGHT))
+            image.save(root / "images" / f"{i}.jpg", exif=exif, quality=95)
+
+    capture = open_capture(make_capture(tmp_path / "c", change))
+    assert "4 images have an EXIF orientation" in capture.notes[0]
+    assert capture.image(2)[HEIGHT // 2, 5, 2] > 0.9
+
+
+# -- names, links, hidden files ---------------------------------------------------------------------------------------
+
+
+def test_backslashes_are_slashes(tmp_path):
+    def change(root, meta):
+        (root / "images" / "left").mkdir()
+        (root / "images" / "2.jpg").rename(root / "images" / "left" / "2.jpg")
+        meta["frames"][2]["file_path"] = "images\\left\\2.jpg"
+
+    capture = open_capture(make_capture(tmp_path / "c", change))
+    assert sorted(frame.path.name for frame in capture.frames) == [f"{i}.jpg" for i in range(4)]
+    assert capture.notes == ()
+
+
+@pytest.mark.parametrize("kind", ["COLMAP", "cameras.json", "LLFF", "transforms.json"])
+def test_the_folder_of_images_may_be_a_link(kind, tmp_path):
+    root = make_capture(tmp_path / "c") if kind == "transforms.json" else tmp_path / "c"
+    if kind in WRITERS:
+        root.mkdir()
+        WRITERS[kind](root)
+    (root / "images").rename(tmp_path / "elsewhere")
+    (root / "images").symlink_to(tmp_path / "elsewhere")
+    assert len(open_capture(root)) == NUM_FRAMES
+
+
+@pytest.mark.parametrize(
+    ("kind", "folder"),
+    [
+        ("LLFF", "images"),
+        ("KITTI", "image_2"),
+        ("ScanNet", "color"),
+        ("Polycam", "keyframes/images"),
+        ("COLMAP", "images"),
+    ],
+)
+def test_hidden_files_are_no_images(kind, folder, tmp_path):
+    """macOS writes `._a.jpg` beside a.jpg on foreign disks."""
+    WRITERS[kind](tmp_path)
+    for name in sorted(file.name for file in (tmp_path / folder).iterdir()):
+        (tmp_path / folder / f"._{name}").write_bytes(b"Mac OS X")
+    capture = open_capture(tmp_path)
+    assert len(capture) == NUM_FRAMES and capture.notes == ()
+
+
+def test_images_in_subfolders_and_with_another_suffix_are_found_and_counted(tmp_path):
+    def change(root, meta):
+        (root / "images" / "left").mkdir()
+        (root / "images" / "2.jpg").rename(root / "images" / "left" / "2.jpg")
+        Image.open(root / "images" / "1.jpg").save(root / "images" / "1.png")
+        (root / "images" / "1.jpg").unlink()
+
+    capture = open_capture(make_capture(tmp_path / "c", change))
+    assert [frame.path.name for frame in capture.frames] == ["0.jpg", "1.png", "2.jpg", "3.jpg"]
+    assert capture.notes[0].startswith("2 images were found in another folder or with another suffix")
+
+
+def test_colmap_text_of_realityscan_is_read(tmp_path):
+    """CRLF, blank lines of points, names with spaces, FULL_OPENCV, images at half the size."""
+    params = "50 51 31 25 0.1 0 0 0 0 0.02 0 0"
+    write_colmap_text(tmp_path, camera=f"1 FULL_OPENCV {2 * WIDE} {2 * HIGH} {params}".replace("31 25", "62 50"))
+    for file in ("cameras.txt", "images.txt"):
+        lines = (tmp_path / "sparse" / "0" / file).read_text().split("\n")
+        lines = ["" if len(line.split()) % 3 == 0 and line and not line.startswith("#") else line for line in lines]
+        (tmp_path / "sparse" / "0" / file).write_bytes("\r\n".join(lines).encode())
+    capture = open_capture(tmp_path)
+    assert {frame.name for frame in capture.frames} == set(COLMAP_IMAGES)
+    np.testing.assert_allclose(capture.K(0), [[25, 0, 31], [0, 25.5, 25], [0, 0, 1]])
+    assert "0.5 times" in " ".join(capture.notes) and capture.frames[0].lens == Lens(k1=0.1, d1=0.02)
+
+
+# -- cameras of other programs ----------------------------------------------------------------------------------------
+
+
+def ring(num=8):
+    """Camera-to-world matrices (OpenCV) on a ring, which look at its middle from a little above."""
+    out = np.tile(np.eye(4), (num, 1, 1))
+    for i, angle in enumerate(np.linspace(0, 2 * np.pi, num, endpoint=False)):
+        center = np.array([3 * np.cos(angle), 3 * np.sin(angle), 1.0])
+        forward = -center / np.linalg.norm(center)
+        right = np.cross(forward, [0.0, 0.0, 1.0])
+        right /= np.linalg.norm(right)
+        out[i, :3] = np.stack([right, np.cross(forward, right), forward, center], axis=1)
+    return out
+
+
+def write_ring(root, names):
+    for i, name in enumerate(names):
+        write_image(root / "images" / name, i)
+
+
+def test_realitycaptures_cameras_come_back(tmp_path):
+    names = [f"IMG {i}.jpg" for i in range(8)]
+    write_ring(tmp_path, names)
+    rows = ["#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2"]
+    for name, pose in zip(names, ring(), strict=True):
+        forward, down = pose[:3, 2], pose[:3, 1]
+        # A level camera (roll 0) that looks at the horizon has pitch 90, and heading 0 looks along +y.
+        heading, pitch = np.degrees(np.arctan2(forward[0], forward[1])), 90 + np.degrees(np.arcsin(forward[2]))
+        assert abs(down[:2] @ [-forward[1], forward[0]]) < 1e-12
+        x, y, z = pose[:3, 3]
+        rows.append(f"{name},{x:.9f},{y:.9f},{z:.9f},{heading:.9f},{pitch:.9f},0,30,0.9,-0.45,0.1,0,0,0,0.01,0.02")
+    (tmp_path / "cameras.csv").write_text("\r\n".join(rows))
+    capture = open_capture(tmp_path)
+    assert capture.format == "RealityCapture" and len(capture) == 8
+    np.testing.assert_allclose(capture.camtoworlds, ring(), atol=1e-7)
+    unit = WIDE / 36
+    wanted = [[30 * unit, 0, WIDE / 2 + 0.9 * unit], [0, 30 * unit, HIGH / 2 - 0.45 * unit], [0, 0, 1]]
+    np.testing.assert_allclose(capture.K(0), wanted, rtol=1e-12)
+    assert capture.frames[0].lens == Lens(k1=0.1, p1=0.01, p2=0.02)
+
+
+def matrix_text(matrix):
+    return " ".join(repr(float(x)) for x in np.ravel(matrix))
+
+
+def metashape_xml(chunk_poses, world, *, where="component", kind="frame", extra=""):
+    turn, shift, scale = world
+    transform = (
+        f"<transform><rotation>{matrix_text(turn)}</rotation><translation>{matrix_text(shift)}</translation>"
+        f"<scale>{scale!r}</scale></transform>"
+    )
+    cameras = "".join(
+        f'<camera id="{i}" sensor_id="0" component_id="0" label="IMG_{i}">'
+        f"<transform>{matrix_text(pose)}</transform></camera>"
+        for i, pose in enumerate(chunk_poses)
+    )
+    component = (
+        f'<components><component id="0">{transform}</component></components>' if where == "component" else transform
+    )
+    return (
+        f'<?xml version="1.0" encoding="UTF-8"?><document version="2.0.0"><chunk label="c"><sensors><sensor id="0">'
+        f'<calibration type="{kind}" class="initial"><f>1</f></calibration>'
+        f'<calibration type="{kind}" class="adjusted"><resolution width="{WIDE}" height="{HIGH}"/><f>51</f><cx>-1</cx>'
+        f"<cy>1.5</cy><b1>-1</b1><k1>0.1</k1><p1>0.01</p1><p2>0.02</p2>{extra}</calibration></sensor></sensors>"
+        f'{component if where == "component" else ""}<cameras>{cameras}<camera id="9" label="not aligned"/></cameras>'
+        f"{component if where == 'chunk' else ''}</chunk></document>"
+    )
+
+
+@pytest.mark.parametrize("where", ["component", "chunk"])
+def test_metashapes_cameras_come_back(where, tmp_path):
+    """The chunk lies turned, moved and scaled in the world."""
+    write_ring(tmp_path, [f"IMG_{i}.JPG" for i in range(8)])
+    turn, shift, scale = Rotation.from_euler("xyz", [0.4, -1.1, 2.0]).as_matrix(), np.array([4e6, -2e5, 3e6]), 2.5
+    chunk = ring()
+    chunk[:, :3, :3] = turn.T @ chunk[:, :3, :3]
+    chunk[:, :3, 3] = (chunk[:, :3, 3] - shift) @ turn / scale
+    (tmp_path / "cameras.xml").write_text(metashape_xml(chunk, (turn, shift, scale), where=where))
+    capture = open_capture(tmp_path)
+    assert capture.format == "Metashape" and len(capture) == 8 and "1 of 9 frames" in capture.notes[0]
+    np.testing.assert_allclose(capture.camtoworlds, ring(), atol=1e-5)
+    np.testing.assert_allclose(capture.K(0), [[50, 0, WIDE / 2 - 1], [0, 51, HIGH / 2 + 1.5], [0, 0, 1]])
+    assert capture.frames[0].lens == Lens(k1=0.1, p1=0.02, p2=0.01)  # OpenCV's p1 is Metashape's p2
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"kind": "spherical"}, "perspective views"),
+        ({"extra": "<b2>3</b2>"}, "skew"),
+        ({"kind": "fisheye"}, "p1 or p2"),
+    ],
+)
+def test_metashapes_other_lenses_are_refused(options, words, tmp_path):
+    write_ring(tmp_path, ["IMG_0.jpg"])
+    (tmp_path / "cameras.xml").write_text(metashape_xml(ring()[:1], (np.eye(3), np.zeros(3), 1.0), **options))
+    with pytest.raises(InputError, match=words):
+        open_capture(tmp_path)
