@@ -16,7 +16,7 @@ from ssplat_jax.core.errors import InputError, refusal
 MIN_MSE = 1e-10
 """Lower bound of the mean squared error: PSNR is at most 100 dB, a finite number that JSON can hold."""
 
-BRIGHT = 2.0
+BRIGHT = 4.0
 """An image of which half the values are above this is in other units, as 0 to 255."""
 
 SSIM_ARGUMENTS: dict[str, Any] = {"win_size": 11, "gaussian_weights": True, "data_range": 1.0, "channel_axis": -1}
