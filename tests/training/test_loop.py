@@ -150,7 +150,7 @@ def test_the_paper_recipe_takes_steps_of_plain_adamw(tmp_path):
     """100,000 steps at a constant 1e-4: no warm-up, decay, clipping, average, or slower part; PyTorch's defaults."""
     recipe = RECIPES["paper"]
     (phase,) = recipe.phases
-    assert phase.steps == 100_000
+    assert phase.steps == 100_000 and phase.rate("evidence") == phase.rate("encoders") == 0.0
     for part in ("encoder/pretrained/x", "encoder/cnn", "cost_volume", "hpda/w", "decoder/w"):
         rate = loop.schedule(recipe, (phase.rate(part),))
         np.testing.assert_allclose([rate(step) for step in (0, 1, 50_000, 99_999)], 1e-4, rtol=1e-6)
