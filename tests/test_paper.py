@@ -53,6 +53,7 @@ def views(num_depths: int = SLIM.network.num_depths) -> Views:
         viewmats=jnp.tile(jnp.eye(4), (2, 1, 1)),
         Ks=jnp.tile(f32([[16.0, 0, 8], [0, 16, 8], [0, 0, 1]]), (2, 1, 1)),
         valid=jnp.ones(2, bool),
+        unusable=jnp.zeros(2, bool),
         inside=jnp.ones(GRID, bool),
         log_candidates=jnp.linspace(math.log(0.5), math.log(20.0), num_depths),
         height=16,

@@ -1,7 +1,7 @@
 """VACC, the Voxel-Aligned Causal Cache (Sec. 3.4): `fuse` writes tokens, `project` shows them, `carve` revises."""
 
 from ssplat_jax.cache.fuse import fuse
-from ssplat_jax.cache.project import ProjectedCache, coarsen, project
+from ssplat_jax.cache.project import ProjectedCache, coarsen, project, rows_in_sight
 from ssplat_jax.cache.state import (
     PIVOT_FIELDS,
     CacheStats,
@@ -33,6 +33,7 @@ __all__ = [
     "init_cache",
     "observe",
     "project",
+    "rows_in_sight",
     "seen_cells",
     "store_depths",
     "vote",

@@ -18,7 +18,7 @@ import math
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int
+from jaxtyping import Array, Int, Integer, UInt32
 
 from ssplat_jax.cache.hash_table import find_rows, group_equal, insert_rows, shards_of, voxel_indices
 from ssplat_jax.cache.state import PIVOT_FIELDS, CacheStats, Tokens, VoxelCache, pivot_fields
@@ -32,7 +32,7 @@ SAME_DIRECTION = 1.0 - 1e-6
 """Signed squared cosines above this are ties: if a frame is given twice, rounding must not choose the pair."""
 
 Fields = dict[str, Array]
-"""Fields of pivots by name, of a whole cache `[capacity, k, ...]` or of a list of pivots."""
+"""Fields of pivots by name, of a whole cache `[capacity * k, ...]`, row by row, or of a list of pivots."""
 
 
 @pytree
@@ -80,11 +80,12 @@ def fuse(cache: VoxelCache, tokens: Tokens, config: StreamConfig, *, axis: str |
     accepted, stats = _classify(cache.stats, tokens, in_range, config)
     place = {"voxel": _place_in_voxels, "append": _place_at_end}[config.memory.vacc]
     cache, plan = place(cache, voxels, accepted, config)
-    pivots = {name: getattr(cache, name) for name in pivot_fields(cache)}
+    k, pivots = config.memory.pivots_per_voxel, {name: getattr(cache, name) for name in pivot_fields(cache)}
+    pivots = {name: x.reshape(-1, *x.shape[2:]) for name, x in pivots.items()}
     new = _new_pivots(tokens, cache)
-    appends = jnp.where(plan.slots < config.memory.pivots_per_voxel, plan.rows, -1)
-    counts = cache.counts.at[_drop_negative(appends, cache.capacity)].max(plan.slots + 1, mode="drop")
-    pivots = _write(pivots, appends, plan.slots, new)
+    appends = jnp.where(plan.slots < k, plan.rows, -1)
+    counts = cache.counts.at[_unsigned(appends)].max(plan.slots + 1, mode="drop")
+    pivots = _write(pivots, jnp.where(appends < 0, -1, appends * k + plan.slots), new)
     if config.memory.vacc == "voxel":
         pivots = _merge_all(pivots, new, plan, config)
     num_placed = jnp.sum(plan.rows >= 0, dtype=jnp.int32)
@@ -95,6 +96,7 @@ def fuse(cache: VoxelCache, tokens: Tokens, config: StreamConfig, *, axis: str |
         num_merged=saturating_add(stats.num_merged, num_placed - jnp.sum(appends >= 0, dtype=jnp.int32)),
         num_dropped=saturating_add(stats.num_dropped, jnp.sum(accepted, dtype=jnp.int32) - num_placed),
     )
+    pivots = {name: x.reshape(cache.capacity, k, *x.shape[1:]) for name, x in pivots.items()}
     return replace(cache, counts=counts, stats=stats, **pivots)
 
 
@@ -105,7 +107,7 @@ def saturating_add(counter: Int[Array, ""], more: Int[Array, ""]) -> Int[Array, 
 
 def _classify(stats: CacheStats, tokens: Tokens, in_range, config: StreamConfig):
     """Which tokens are accepted, and the counters with each rejected one under one reason."""
-    finite = jnp.isfinite(tokens.confidences) & jnp.isfinite(tokens.footprints)
+    finite = jnp.isfinite(tokens.confidences) & jnp.isfinite(tokens.footprints) & (tokens.footprints > 0)
     for x in (tokens.means, tokens.feats, tokens.rgbs, tokens.quats):
         finite &= jnp.all(jnp.isfinite(x), axis=-1)
     confident = tokens.confidences >= config.memory.min_confidence
@@ -192,9 +194,9 @@ def _merge_all(pivots: Fields, new: Fields, plan: Plan, config: StreamConfig) ->
         pivots, round_idx, first = state
         sizes_here = jax.lax.dynamic_slice(sizes, (first,), (block,))
         positions = jax.lax.dynamic_slice(starts, (first,), (block,)) + round_idx
-        tokens = plan.order[jnp.minimum(positions, m - 1)]
+        tokens = _unsigned(plan.order[jnp.minimum(positions, m - 1)])
         rows = jnp.where(sizes_here > round_idx, plan.rows[tokens], -1)
-        arrivals = {name: x[tokens] for name, x in new.items()}
+        arrivals = {name: _read(x, tokens) for name, x in new.items()}
         pivots = _merge_closest(pivots, arrivals, rows, config)
         is_over = sizes[first + block] <= round_idx
         return pivots, round_idx + is_over.astype(jnp.int32), jnp.where(is_over, 0, first + block)
@@ -213,15 +215,18 @@ def _merge_all(pivots: Fields, new: Fields, plan: Plan, config: StreamConfig) ->
 def _merge_closest(pivots: Fields, new: Fields, rows: Int[Array, " b"], config: StreamConfig) -> Fields:
     """Inserts one token into each of the full voxels `rows` by merging the closest pair (-1: no voxel)."""
     k = config.memory.pivots_per_voxel
-    first, second = _closest_pair(jnp.concatenate([pivots["seeds"][rows], new["seeds"][:, None]], axis=1))
+    starts = jnp.maximum(rows, 0)[:, None] * k
+    seeds = _read(pivots["seeds"], starts + jnp.arange(k))
+    first, second = _closest_pair(jnp.concatenate([seeds, new["seeds"][:, None]], axis=1))
     takes_new = second == k
-    slots = jnp.stack([first, jnp.minimum(second, k - 1)], axis=1)
-    pairs = {name: x[rows[:, None], slots] for name, x in pivots.items()}
+    places = starts + jnp.stack([first, jnp.minimum(second, k - 1)], axis=1)
+    pairs = {name: _read(x, places) for name, x in pivots.items()}
     older = {name: x[:, 0] for name, x in pairs.items()}
     newer = {name: _select(takes_new, new[name], x[:, 1]) for name, x in pairs.items()}
     merged = _merge_pair(older, newer)
     values = {name: jnp.stack([x, new[name].astype(x.dtype)], axis=1) for name, x in merged.items()}
-    return _write(pivots, jnp.stack([rows, jnp.where(takes_new, -1, rows)], axis=1), slots, values)
+    is_written = (rows >= 0)[:, None] & jnp.stack([jnp.ones_like(takes_new), ~takes_new], axis=1)
+    return _write(pivots, jnp.where(is_written, places, -1), values)
 
 
 def _closest_pair(keys: Array) -> tuple[Int[Array, " b"], Int[Array, " b"]]:
@@ -268,17 +273,23 @@ def _merge_pair(older: Fields, newer: Fields) -> Fields:
     }
 
 
-def _write(pivots: Fields, rows: Int[Array, "*b"], slots: Int[Array, "*b"], values: Fields) -> Fields:
-    """`pivots` with `values` at distinct places; rows of -1 are skipped."""
-    return {
-        name: x.at[_drop_negative(rows, x.shape[0]), slots].set(values[name].astype(x.dtype), mode="drop")
-        for name, x in pivots.items()
-    }
+def _read(x: Array, places: Integer[Array, "*b"]) -> Array:
+    """`x` at valid places."""
+    return x.at[_unsigned(places)].get(mode="promise_in_bounds")
 
 
-def _drop_negative(rows, capacity):
-    """Replaces -1, which indexing would wrap, by an index past the end, which `mode="drop"` skips."""
-    return jnp.where(rows < 0, capacity, rows)
+def _write(pivots: Fields, places: Int[Array, "*b"], values: Fields) -> Fields:
+    """`pivots` with `values` at distinct places; those of -1 are skipped."""
+    places = _unsigned(places)
+    return {name: x.at[places].set(values[name].astype(x.dtype), mode="drop") for name, x in pivots.items()}
+
+
+def _unsigned(indices: Integer[Array, "*b"]) -> UInt32[Array, "*b"]:
+    """`indices` for reading and writing; -1 becomes the largest number, which `mode="drop"` skips.
+
+    Each use of signed ones would wrap them with four operations of its own.
+    """
+    return indices.astype(jnp.uint32)
 
 
 def _select(condition, x, y):

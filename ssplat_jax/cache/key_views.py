@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
-from ssplat_jax.core.cameras import Camera
+from ssplat_jax.core.cameras import Camera, usable_cameras
 from ssplat_jax.core.pytree import pytree
 
 NUM_KEY_VIEWS = 64
@@ -113,11 +113,9 @@ def keep_views(ring: KeyViews, arrivals: KeyViews, *, depth: float) -> KeyViews:
 
 
 def usable(views: KeyViews) -> Bool[Array, " v"]:
-    """Valid views with a finite camera and a finite, positive exposure."""
-    is_usable = views.valid & jnp.all(views.exposures > 0, axis=1)
-    for part in (views.viewmats, views.Ks, views.exposures):
-        is_usable &= jnp.all(jnp.isfinite(part.reshape(len(part), -1)), axis=1)
-    return is_usable
+    """Valid views with a camera that can be used (`core.cameras.check_camera`) and a finite, positive exposure."""
+    is_exposed = jnp.all((views.exposures > 0) & (views.exposures < jnp.inf), axis=1)
+    return views.valid & is_exposed & usable_cameras(views.viewmats, views.Ks)
 
 
 def _slot_for(ring: KeyViews, view: KeyViews, depth: float) -> Int[Array, ""]:

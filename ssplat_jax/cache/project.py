@@ -27,6 +27,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ssplat_jax.cache.state import VoxelCache
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.cameras import Camera
+from ssplat_jax.core.numerics import columns
 from ssplat_jax.core.pytree import pytree
 
 NEAR = 0.01
@@ -47,7 +48,7 @@ class ProjectedCache:
 
     depths: Float[Array, "v hf wf"]  # D_H, camera z
     confidences: Float[Array, "v hf wf"]  # Omega_H = sum w^2 / sum w
-    feats: Float[Array, "v hf wf c"]  # F_H
+    feats: Float[Array, "v hf wf c"] | None  # F_H; None without `cgfi`, which alone reads it
     mask: Bool[Array, "v hf wf"]
     colors: Float[Array, "v hf wf 3"] | None  # averaged like F_H; None without `match_exposure`
 
@@ -90,12 +91,12 @@ def project(cache: VoxelCache, camera: Camera, config: StreamConfig, *, axis: st
     mask = weights > 0
     total = jnp.where(mask, weights, 1.0)
     means = (values / total[:, None]).reshape(*shape, -1)
-    width = cache.feats.shape[-1]
+    width = cache.feats.shape[-1] if config.history.cgfi else 0
     log_depths = jnp.where(mask, fronts, 0.0) + offsets / total
     return ProjectedCache(
         depths=jnp.where(mask, jnp.exp(log_depths), 0.0).reshape(shape),
         confidences=(squares / total).reshape(shape),
-        feats=means[..., :width],
+        feats=means[..., :width] if config.history.cgfi else None,
         mask=mask.reshape(shape),
         colors=means[..., width:] if config.stream.match_exposure else None,
     )
@@ -138,17 +139,20 @@ def _cluster_sums(fold, window, cache, num_views, config, fronts, centers):
     flat = lambda x: x.reshape(-1, x.shape[-1])  # noqa: E731
 
     def values_of(pivots):
-        feats = flat(cache.feats)[pivots].astype(jnp.float32)
-        if not config.stream.match_exposure:
-            return feats
-        colors = flat(cache.rgbs)[pivots].reshape(len(pivots), -1, 3).mean(axis=1)
-        return jnp.concatenate([feats, colors], axis=1)
+        values = [jnp.zeros((len(pivots), 0))]
+        if config.history.cgfi:
+            values.append(flat(cache.feats)[pivots].astype(jnp.float32))
+        if config.stream.match_exposure:
+            values.append(flat(cache.rgbs)[pivots].reshape(len(pivots), -1, 3).mean(axis=1))
+        return jnp.concatenate(values, axis=1)
 
     def visit(state, pairs: PixelPairs, rows, is_row):
         scalars, sums = state
         offsets = _offsets_from_front(pairs, fronts)
         weights = jnp.where(jnp.abs(offsets - centers[pairs.pixels]) <= window, pairs.weights, 0.0)
         scalars = _scatter_add(scalars, pairs.pixels, (weights, weights * weights, weights * offsets))
+        if not num_values:
+            return scalars, sums
         pivots = (rows[:, None] * pivots_per_row + jnp.arange(pivots_per_row)).reshape(-1)
         return scalars, _add_values(sums, values_of, pairs.pixels, weights, pivots, num_views)
 
@@ -277,20 +281,21 @@ def _pairs(means, confidences, counts, camera: Camera, min_confidence: float) ->
 def project_points(points: Float[Array, "n 3"], weights: Float[Array, " n"], camera: Camera) -> PixelPairs:
     """Pairs of all views with `points`, view-major; points of weight 0 or NaN are not seen."""
     # Written out per coordinate: three rows of products vectorize over the points, a 3 x 3 matrix product does not.
-    px, py, pz = jnp.moveaxis(points, -1, 0)
-    views = camera.viewmats[:, :3, :, None]
-    x, y, z = (views[:, i, 0] * px + views[:, i, 1] * py + views[:, i, 2] * pz + views[:, i, 3] for i in range(3))
+    px, py, pz = columns(points)
+    right, down, forward, shift = columns(camera.viewmats[:, :3])
+    turned = right[..., None] * px + down[..., None] * py + forward[..., None] * pz
+    x, y, z = (c[:, 0] for c in jnp.split(turned + shift[..., None], 3, axis=1))
     in_front = (z > NEAR) & jnp.isfinite(z) & (weights > 0)
     inverse_z = 1.0 / jnp.where(in_front, z, 1.0)
     Ks = camera.Ks[:, :, :, None]
     u = Ks[:, 0, 0] * x * inverse_z + Ks[:, 0, 2]
     v = Ks[:, 1, 1] * y * inverse_z + Ks[:, 1, 2]
     is_seen = in_front & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-    columns, rows = (jnp.where(is_seen, jnp.floor(c), 0.0).astype(jnp.int32) for c in (u, v))
+    column, row = (jnp.where(is_seen, jnp.floor(c), 0.0).astype(jnp.int32) for c in (u, v))
     first_pixel = jnp.arange(len(camera.viewmats), dtype=jnp.int32)[:, None] * (camera.height * camera.width)
     num_pixels = len(camera.viewmats) * camera.height * camera.width
     return PixelPairs(
-        pixels=jnp.where(is_seen, first_pixel + rows * camera.width + columns, num_pixels).reshape(-1),
+        pixels=jnp.where(is_seen, first_pixel + row * camera.width + column, num_pixels).reshape(-1),
         log_depths=jnp.where(is_seen, jnp.log(jnp.where(is_seen, z, 1.0)), 0.0).reshape(-1),
         weights=jnp.where(is_seen, weights, 0.0).reshape(-1),
     )

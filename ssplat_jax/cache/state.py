@@ -17,6 +17,7 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
 from ssplat_jax.cache.changes import empty_changes
@@ -46,9 +47,10 @@ class CacheStats:
     num_accepted: Int[Array, ""]  # appended or merged
     num_merged: Int[Array, ""]  # accepted by a merge, which leaves the number of pivots unchanged
     num_low_confidence: Int[Array, ""]  # rejected: below tau_conf, as predicted or after `vote`
-    num_non_finite: Int[Array, ""]  # rejected: NaN or infinite
+    num_non_finite: Int[Array, ""]  # rejected: NaN or infinite, or a footprint that is not positive
     num_out_of_range: Int[Array, ""]  # rejected: voxel index outside +-2^20
     num_dropped: Int[Array, ""]  # rejected: no free row for a new voxel (overflow)
+    num_unusable: Int[Array, ""]  # views left out: a camera or an image that cannot be used (core.chunk.usable_views)
 
 
 @pytree
@@ -181,7 +183,7 @@ def init_cache(config: StreamConfig, capacity: int | None = None) -> VoxelCache:
             log_depths=jnp.zeros((w, STORED_CELLS, STORED_CELLS)),
             weights=jnp.zeros((w, STORED_CELLS, STORED_CELLS)),
         ),
-        stats=CacheStats(*(zero() for _ in range(8))),
+        stats=CacheStats(*(zero() for _ in range(9))),
         observations=jnp.zeros((capacity, k, NUM_OBSERVED)) if config.head.evidence else None,
         changes=empty_changes(capacity, config) if config.stream.steps_per_chunk else None,
     )
@@ -218,7 +220,7 @@ def ensure_capacity(cache: VoxelCache, config: StreamConfig, num_new_tokens: int
     doubling limits the number of compilations to log2 of the final size.
 
     Args:
-        cache: the cache before a step.
+        cache: the cache before a step, or several with leading axes, which all grow alike.
         config: its `overflow` decides, and its `vacc` how many rows new tokens can fill.
         num_new_tokens: tokens of the coming chunk, one per 4 x 4 pixels of the padded images
             (`ssplat_jax.streaming.session.tokens_per_chunk`).
@@ -232,6 +234,7 @@ def ensure_capacity(cache: VoxelCache, config: StreamConfig, num_new_tokens: int
 
 def required_capacity(caches: VoxelCache, config: StreamConfig, num_new_tokens: int) -> int:
     """The capacity to which `ensure_capacity` enlarges a cache, or caches with leading axes, alike."""
+    _require_values(caches, "ensure_capacity")
     new_rows = num_new_tokens if config.memory.vacc == "voxel" else -(-num_new_tokens // config.memory.pivots_per_voxel)
     capacity, num_voxels = caches.capacity, int(np.asarray(caches.num_voxels).max())
     while config.memory.overflow == "grow" and capacity < num_voxels + new_rows:
@@ -240,11 +243,13 @@ def required_capacity(caches: VoxelCache, config: StreamConfig, num_new_tokens: 
 
 
 def grow(cache: VoxelCache, capacity: int) -> VoxelCache:
-    """`cache` enlarged to `capacity` voxels, a power of two.
+    """`cache`, or caches with leading axes, enlarged to `capacity` voxels, a power of two.
 
     Raises:
         InputError: `capacity` is below the present one or no power of two.
     """
+    if cache.num_voxels.ndim:
+        return jax.vmap(lambda one: grow(one, capacity))(cache)
     extra = capacity - cache.capacity
     if extra < 0 or capacity & (capacity - 1):
         raise InputError(f"cache: capacity must be a power of two of at least {cache.capacity}, got {capacity}.")
@@ -267,10 +272,20 @@ def check_cache(caches: VoxelCache, config: StreamConfig) -> None:
 
     Raises:
         CacheError: tokens were dropped under `overflow="grow"`.
+        InputError: it is called inside jit.
     """
+    _require_values(caches, "check_cache")
     num_dropped = int(np.asarray(caches.stats.num_dropped).sum())
     if num_dropped and config.memory.overflow == "grow":
         raise CacheError(
             f"cache: wanted to keep every token, but {num_dropped} did not fit in {caches.capacity} voxels; "
             "call cache.ensure_capacity(cache, config, num_new_tokens) before each step."
+        )
+
+
+def _require_values(caches: VoxelCache, caller: str) -> None:
+    """Raises if `caches` are traced, in the name of `caller`, which reads values."""
+    if isinstance(caches.num_voxels, Tracer):
+        raise InputError(
+            f"{caller}: wanted a cache outside jit, vmap and scan, got a traced one; call it before or after."
         )

@@ -25,7 +25,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ssplat_jax.cache.project import PixelPairs, fold_pairs, places_of, project_points, rows_in_sight, rows_of
+from ssplat_jax.cache.project import (
+    PixelPairs,
+    RowsInSight,
+    fold_pairs,
+    places_of,
+    project_points,
+    rows_in_sight,
+    rows_of,
+)
 from ssplat_jax.cache.state import StoredDepths, Tokens, VoxelCache
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.cameras import Camera
@@ -77,7 +85,9 @@ def seen_cells(
 # Votes ----------------------------------------------------------------------------------------------------------------
 
 
-def carve(cache: VoxelCache, camera: Camera, cells: SeenCells, config: StreamConfig) -> VoxelCache:
+def carve(
+    cache: VoxelCache, camera: Camera, cells: SeenCells, config: StreamConfig, in_sight: RowsInSight | None = None
+) -> VoxelCache:
     """`cache` with the confidences of its pivots revised by the votes of one chunk's views.
 
     Args:
@@ -85,6 +95,7 @@ def carve(cache: VoxelCache, camera: Camera, cells: SeenCells, config: StreamCon
         camera: the chunk's views at grid resolution.
         cells: what they saw.
         config: with `carving=False` the cache is returned unchanged.
+        in_sight: `rows_in_sight` of the cache and the views, for who has it already.
 
     Returns:
         The cache; only `confidences` differs.
@@ -104,7 +115,8 @@ def carve(cache: VoxelCache, camera: Camera, cells: SeenCells, config: StreamCon
         votes = votes.reshape(len(camera.viewmats), *before.shape).sum(axis=0)
         return revised.at[places_of(rows, is_row, cache)].set(_revise(before, votes), mode="drop")
 
-    return replace(cache, confidences=fold_pairs(cache, camera, rows_in_sight(cache, camera), visit, cache.confidences))
+    in_sight = in_sight or rows_in_sight(cache, camera)
+    return replace(cache, confidences=fold_pairs(cache, camera, in_sight, visit, cache.confidences))
 
 
 def vote(stored: StoredDepths, tokens: Tokens, config: StreamConfig) -> Tokens:
@@ -183,7 +195,13 @@ def _revise(confidences, votes):
 
 
 def observe(
-    cache: VoxelCache, camera: Camera, cells: SeenCells, config: StreamConfig, *, axis: str | None = None
+    cache: VoxelCache,
+    camera: Camera,
+    cells: SeenCells,
+    config: StreamConfig,
+    in_sight: RowsInSight | None = None,
+    *,
+    axis: str | None = None,
 ) -> VoxelCache:
     """`cache` with what the views of one chunk say about its pivots added to their observations.
 
@@ -192,6 +210,7 @@ def observe(
         camera: the chunk's views at grid resolution.
         cells: what they saw.
         config: pivots below its `min_confidence` do not count as others in a cell.
+        in_sight: as in `carve`, which changes nothing of it.
         axis: name of the mapped axis over which the cache is sharded by voxel; None if `cache` is the whole cache.
 
     Returns:
@@ -200,7 +219,7 @@ def observe(
     Limits:
         Pivots that no trusted cell sees keep their observations to the last bit.
     """
-    num_cells, in_sight = cells.weights.size, rows_in_sight(cache, camera)
+    num_cells, in_sight = cells.weights.size, in_sight or rows_in_sight(cache, camera)
     read = functools.partial(_read_cells, cache, camera, cells)
 
     def crowd(sums, pairs: PixelPairs, rows, is_row):

@@ -1,16 +1,22 @@
 """Pinhole cameras, in the conventions of `ssplat_jax.core.conventions`."""
 
+from types import ModuleType
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ssplat_jax.core.errors import InputError, echo, refusal
 from ssplat_jax.core.pytree import pytree, static
 
 ROUNDING = 1e-3
 """Difference of a rotation's product with its transpose from the identity that counts as rounding."""
+
+Law = tuple[str, str, bool, Any]
+"""What a camera must be, what to do, whether a renderer can do without it, and a mask of the cameras that are so."""
 
 
 @pytree
@@ -43,10 +49,12 @@ class Camera:
         return Camera(viewmats=self.viewmats[idx], Ks=self.Ks[idx], width=self.width, height=self.height)
 
 
-def check_camera(camera: Camera, where: str, name: str = "camera") -> None:
+def check_camera(camera: Camera, where: str, name: str = "camera", *, complete: bool = False) -> None:
     """Checks the shapes of a camera and, outside of transforms, that it is a rigid pose and a pinhole without skew.
 
-    Entries that are not finite pass: a camera that was lost sees nothing.
+    This is the check of every camera that people give. One that is only to be rendered may have entries that are not
+    finite: a camera that was lost sees nothing. One that is to be learned from must be `complete`: finite, not
+    mirrored, with focal lengths above 0.
 
     Raises:
         InputError: naming `where` and the field.
@@ -63,23 +71,61 @@ def check_camera(camera: Camera, where: str, name: str = "camera") -> None:
         raise InputError(
             f"{where}: the image of the {name} must have whole numbers of pixels, at least 1x1, got {got}."
         )
-    if not isinstance(camera.Ks, Tracer):
-        Ks = np.asarray(camera.Ks, np.float64).reshape(-1, 3, 3)
-        Ks = Ks[np.isfinite(Ks).all(axis=(1, 2))]
-        allowed = 1e-6 * np.maximum(np.abs(Ks[:, 0, 0]), 1.0)[:, None]
-        is_bad = (np.abs(Ks[:, [0, 1, 2, 2, 2], [1, 0, 0, 1, 2]] - [0, 0, 0, 0, 1]) > allowed).any(axis=1)
-        if is_bad.any():
-            got, fix = echo(Ks[is_bad][0].tolist()), "divide by K[2, 2], and undistort images of a skewed sensor"
-            raise refusal(f"{where}: Ks", wanted="[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]", got=got, fix=fix)
-    if not isinstance(camera.viewmats, Tracer):
-        views = np.asarray(camera.viewmats, np.float64).reshape(-1, 4, 4)
-        views = views[np.isfinite(views).all(axis=(1, 2))]
-        turns = views[:, :3, :3]
-        off = np.abs(turns @ np.swapaxes(turns, 1, 2) - np.eye(3)).max(axis=(1, 2))
-        is_bad = (off > ROUNDING) | (np.abs(views[:, 3] - [0, 0, 0, 1]) > ROUNDING).any(axis=1)
-        if is_bad.any():
-            got, fix = echo(views[is_bad][0].tolist()), "give world-to-camera matrices, not transposed, without a scale"
-            raise refusal(f"{where}: viewmats", wanted="[R | t] over 0 0 0 1, R a rotation", got=got, fix=fix)
+    check_matrices(camera.viewmats, camera.Ks, where, complete=complete)
+
+
+def check_matrices(viewmats, Ks, where: str, *, complete: bool = False) -> None:
+    """Checks the values of poses and intrinsics, in arrays of any kind; traced ones pass. See `check_camera`.
+
+    Raises:
+        InputError: naming `where` and the field.
+    """
+    for field, given, laws in (("Ks", Ks, _intrinsics_laws), ("viewmats", viewmats, _pose_laws)):
+        if isinstance(given, Tracer):
+            continue
+        matrices = np.asarray(given, np.float64)
+        is_checked = complete | np.isfinite(matrices).all(axis=(-2, -1))
+        with np.errstate(all="ignore"):
+            found = laws(matrices, np)
+        for wanted, fix, is_strict, is_kept in found:
+            is_bad = is_checked & ~np.asarray(is_kept) & (complete or not is_strict)
+            if is_bad.any():
+                raise refusal(f"{where}: {field}", wanted=wanted, got=echo(matrices[is_bad][0].tolist()), fix=fix)
+
+
+def usable_cameras(viewmats: Float[Array, "*b 4 4"], Ks: Float[Array, "*b 3 3"]) -> Bool[Array, "*b"]:
+    """Cameras that are `complete` for `check_camera`, for use inside jit, where nothing can be raised."""
+    laws = (*_intrinsics_laws(Ks, jnp), *_pose_laws(viewmats, jnp))
+    return jnp.all(jnp.stack([is_kept for *_, is_kept in laws]), axis=0)
+
+
+def _intrinsics_laws(Ks, xp: ModuleType) -> tuple[Law, ...]:
+    """Laws of intrinsics; a NaN keeps none."""
+    fx, fy = Ks[..., 0, 0], Ks[..., 1, 1]
+    rest = xp.stack([Ks[..., 0, 1], Ks[..., 1, 0], Ks[..., 2, 0], Ks[..., 2, 1], Ks[..., 2, 2] - 1], axis=-1)
+    is_pinhole = (xp.abs(rest) <= 1e-6 * xp.maximum(xp.abs(fx), 1.0)[..., None]).all(axis=-1)
+    fix = "divide by K[2, 2], and undistort images of a skewed sensor"
+    is_finite = xp.isfinite(Ks).all(axis=(-2, -1))
+    return (
+        ("[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] without skew", fix, False, is_pinhole),
+        ("finite focal lengths above 0", "give them in pixels", True, is_finite & (fx > 0) & (fy > 0)),
+    )
+
+
+def _pose_laws(viewmats, xp: ModuleType) -> tuple[Law, ...]:
+    """Laws of poses; a NaN keeps none."""
+    rotations = viewmats[..., :3, :3]
+    # Sums of products, because a matrix product may round to bfloat16.
+    products = (rotations[..., :, None, :] * rotations[..., None, :, :]).sum(axis=-1)
+    is_rigid = (xp.abs(products - xp.eye(3)) <= ROUNDING).all(axis=(-2, -1))
+    is_rigid = is_rigid & (xp.abs(viewmats[..., 3, :] - xp.eye(4)[3]) <= ROUNDING).all(axis=-1)
+    turned = (xp.cross(rotations[..., 0, :], rotations[..., 1, :]) * rotations[..., 2, :]).sum(axis=-1)
+    fix = "give world-to-camera matrices, not transposed, without a scale"
+    is_finite = xp.isfinite(viewmats).all(axis=(-2, -1))
+    return (
+        ("[R | t] over 0 0 0 1, R a rotation", fix, False, is_rigid),
+        ("a finite pose without reflection", "give right-handed axes", True, is_finite & (turned > 0)),
+    )
 
 
 def is_whole(number: object) -> bool:

@@ -1,11 +1,17 @@
 """`Chunk`: the input of one streaming step, a few posed views."""
 
+import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
-from ssplat_jax.core.cameras import Camera
+from ssplat_jax.core.cameras import Camera, check_matrices, usable_cameras
 from ssplat_jax.core.errors import InputError, refusal
 from ssplat_jax.core.pytree import pytree
+
+COLOR_MARGIN = 1e-3
+"""How far colors may leave [0, 1], as rounding and resampling take them."""
 
 
 @pytree
@@ -32,8 +38,36 @@ class Chunk:
         return Camera(viewmats=self.viewmats, Ks=self.Ks, width=width, height=height)
 
 
+def check_images(images: object, where: str) -> None:
+    """Checks images on the host. This is the one check of every image that people give.
+
+    Raises:
+        InputError: the values are no floats, not finite, or outside [0, 1].
+    """
+    values = np.asarray(images)
+    is_float = jnp.issubdtype(values.dtype, jnp.floating)
+    if not (is_float and (values.size == 0 or -COLOR_MARGIN <= values.min() <= values.max() <= 1 + COLOR_MARGIN)):
+        got, fix = f"{values.dtype} from {values.min()} to {values.max()}", "divide bytes by 255"
+        raise refusal(where, wanted="floats in [0, 1]", got=got, fix=fix)
+
+
+def usable_views(chunk: Chunk) -> Bool[Array, " v"]:
+    """Valid views of a chunk whose camera and image pass `check_chunk`, for use inside jit."""
+    low, high = chunk.images.min(axis=(1, 2, 3)), chunk.images.max(axis=(1, 2, 3))
+    is_image = (low >= -COLOR_MARGIN) & (high <= 1 + COLOR_MARGIN)  # a NaN is neither
+    return chunk.valid & is_image & usable_cameras(chunk.viewmats, chunk.Ks)
+
+
+def usable_range(near, far):
+    """Whether depths can be searched between `near` and `far`: positive, finite and in order."""
+    return (near > 0) & (near <= far) & (far < np.inf)
+
+
 def check_chunk(chunk: Chunk, num_views: int, *, stacked: bool = False) -> None:
-    """Checks precision, shapes and type of images of one chunk, or of several in one, of tracers too.
+    """Checks precision, shapes and type of images of one chunk, or of several in one; outside jit also the values.
+
+    Inside jit nothing is raised for a value: `StreamSplat.step` leaves out the views that are not `usable_views`, or
+    all without a `usable_range`, and counts them.
 
     Args:
         chunk: without leading axes, or with one if `stacked`.
@@ -41,7 +75,8 @@ def check_chunk(chunk: Chunk, num_views: int, *, stacked: bool = False) -> None:
         stacked: all fields have a leading axis, the same for all.
 
     Raises:
-        InputError: naming the field of a wrong shape; images are not floats, or JAX computes in float64.
+        InputError: naming the field of a wrong shape; images are not floats, or JAX computes in float64; or a valid
+            view has a camera or an image that cannot be used, or near and far are not positive, finite and in order.
     """
     if jnp.result_type(float) != jnp.float32:
         fix = "stream inside `with jax.enable_x64(False):`"
@@ -61,3 +96,18 @@ def check_chunk(chunk: Chunk, num_views: int, *, stacked: bool = False) -> None:
         if len(got) != len(wanted) or any(isinstance(w, int) and w != g for w, g in zip(wanted, got, strict=True)):
             sizes = " ".join(map(str, ("t", *of_one) if stacked else of_one))
             raise InputError(f"chunk: {name} must be [{sizes}], got {list(got)}.{fix if wanted else ''}")
+    if not any(isinstance(x, Tracer) for x in jax.tree.leaves(chunk)):
+        _check_values(chunk)
+
+
+def _check_values(chunk: Chunk) -> None:
+    """Checks the valid views of a chunk, or of stacked ones."""
+    valid, near, far = (np.asarray(x) for x in (chunk.valid, chunk.near, chunk.far))
+    if not valid.any():
+        return
+    viewmats, Ks, images = (np.asarray(x)[valid] for x in (chunk.viewmats, chunk.Ks, chunk.images))
+    check_matrices(viewmats, Ks, "chunk", complete=True)
+    check_images(images, "chunk: images")
+    if not np.all(usable_range(near, far)):
+        got, fix = f"{near.tolist()} and {far.tolist()}", "give the range of depths in stream units"
+        raise refusal("chunk: near and far", wanted="0 < near <= far < inf", got=got, fix=fix)

@@ -255,7 +255,7 @@ class Capture:
         return interleave(centers, used, config.stream.chunk_size, step)
 
     def chunks(
-        self, config: StreamConfig, indices: Sequence[int] | None = None, *, frame: StreamFrame | None = None
+        self, config: StreamConfig, order: Sequence[int] | None = None, *, frame: StreamFrame | None = None
     ) -> Iterator[Chunk]:
         """Yields chunks of `config.stream.chunk_size` views; a thread reads one chunk ahead.
 
@@ -264,15 +264,15 @@ class Capture:
 
         Args:
             config: the configuration of the model.
-            indices: frames in the order of streaming; by default all frames, in `stream_order`.
-            frame: by default `stream_frame(config, indices)`.
+            order: frames in the order of streaming, which stays as it is; by default `stream_order` of all frames.
+            frame: by default `stream_frame(config, order)`.
 
         Raises:
             InputError: an image is damaged; it comes when that image's chunk is asked for.
         """
-        used = _indices(self, indices)
+        used = _indices(self, order)
         frame = frame or self.stream_frame(config, used)
-        if indices is None:
+        if order is None:
             used = self.stream_order(config, None, frame)
         groups = [used[k : k + config.stream.chunk_size] for k in range(0, len(used), config.stream.chunk_size)]
         with ThreadPoolExecutor(1) as reader:

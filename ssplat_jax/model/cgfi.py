@@ -71,6 +71,7 @@ def inject_features(
         bound_history: maps F_H to a bounded size with `unit_features`; see `Network.bound_history`.
     """
     feats = feats.astype(jnp.float32)
+    assert history.feats is not None  # `project` gives them where CGFI is on
     remembered = history.feats.astype(jnp.float32)
     if config.additions.unit_features:
         remembered = bound_history(remembered)

@@ -205,8 +205,3 @@ def complete_params(key: jax.Array, config: StreamConfig, params: dict) -> dict:
     """`params` of a model with fewer stages, completed with those of `init_params` for each that `config` uses."""
     untrained = init_params(key, config)
     return untrained | {name: params[name] for name, stage in untrained.items() if stage and params.get(name)}
-
-
-def count_params(params: dict) -> int:
-    """Number of scalars in `params`."""
-    return sum(leaf.size for leaf in jax.tree.leaves(params))

@@ -28,6 +28,7 @@ from ssplat_jax.cache import (
     init_cache,
     observe,
     project,
+    rows_in_sight,
     seen_cells,
     store_depths,
     vote,
@@ -36,7 +37,7 @@ from ssplat_jax.cache.changes import changed_gaussians, unpack
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.chunk import Chunk, check_chunk
 from ssplat_jax.core.gaussians import Gaussians, mask_gaussians
-from ssplat_jax.core.pytree import pytree
+from ssplat_jax.core.pytree import pytree, replace
 from ssplat_jax.core.rotations import matrices_to_quats
 from ssplat_jax.model.cgfi import inject_features
 from ssplat_jax.model.decoder import MAX_SCALE, Evidence, apply_evidence, decode_tokens, grown_footprints
@@ -108,7 +109,7 @@ class StreamSplat:
         views = prepare_views(chunk, config)
         factor = config.network.match_stride // GRID_STRIDE
         with jax.named_scope("project"):
-            history = project(jax.lax.stop_gradient(cache), views.grid_camera, config, axis=self.axis)
+            history = project(cache, views.grid_camera, config, axis=self.axis)
         with jax.named_scope("encode"):
             features = network.encode(params["encoder"], views, config)
         with jax.named_scope("match"):
@@ -149,9 +150,12 @@ class StreamSplat:
         Limits:
             Tokens that find no space are dropped and counted in `cache.stats.num_dropped`: call `ensure_capacity`
             before the step and `check_cache` after it. No gradient flows through the cache.
+            Inside jit, views with a camera or an image that cannot be used are left out as padding is, and counted in
+            `cache.stats.num_unusable`; outside they are refused.
 
         Raises:
-            InputError: a shape of `chunk` is wrong, its images are not floats, or JAX computes in float64.
+            InputError: a shape of `chunk` is wrong, its images are not floats, JAX computes in float64, or, outside
+                jit, a value cannot be used (`core.chunk.check_chunk`).
         """
         prediction = self.predict(params, cache, chunk)
         return self.update_cache(cache, prediction), prediction.output
@@ -167,15 +171,19 @@ class StreamSplat:
             tokens = vote(cache.stored_depths, prediction.tokens, self.config)
         with jax.named_scope("VACC"):
             cache = fuse(cache, tokens, self.config, axis=self.axis)
+            num_unusable = cache.stats.num_unusable + jnp.sum(prediction.views.unusable, dtype=jnp.int32)
+            cache = replace(cache, stats=replace(cache.stats, num_unusable=num_unusable))
         # After fusion, so that views of one chunk that disagree lower the confidence of each other's pivots at once.
         with jax.named_scope("carve"):
             cells = seen_cells(output.depths, output.confidences, tokens.rgbs, self.config)
-            cache = carve(cache, camera, cells, self.config)
+            is_read = self.config.memory.carving or self.config.head.evidence
+            in_sight = rows_in_sight(cache, camera) if is_read else None
+            cache = carve(cache, camera, cells, self.config, in_sight)
             cache = store_depths(cache, camera, cells)
         if cache.observations is None:
             return cache
         with jax.named_scope("observations"):
-            return observe(cache, camera, cells, self.config, axis=self.axis)
+            return observe(cache, camera, cells, self.config, in_sight, axis=self.axis)
 
     def run(self, params: dict, cache: VoxelCache, chunks: Chunk) -> tuple[VoxelCache, ChunkOutput]:
         """`step` over stacked chunks (leading axis t) as one `lax.scan`.

@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.cameras import Camera, invert_poses, pixel_grid, transform_points, unproject
-from ssplat_jax.core.chunk import Chunk
+from ssplat_jax.core.chunk import Chunk, usable_range, usable_views
 from ssplat_jax.core.pytree import pytree, static
 from ssplat_jax.model.layers import average_pool
 
@@ -26,7 +26,8 @@ class Views:
     images: Float[Array, "v hp wp 3"]  # edge-padded
     viewmats: Float[Array, "v 4 4"]
     Ks: Float[Array, "v 3 3"]
-    valid: Bool[Array, " v"]
+    valid: Bool[Array, " v"]  # neither padding nor unusable
+    unusable: Bool[Array, " v"]  # given as valid, but not to be used (`core.chunk.usable_views`): treated as padding
     inside: Bool[Array, "v hf wf"]  # cells of valid views whose center lies in the unpadded image, no pixel masked out
     log_candidates: Float[Array, " d"]  # ln of the candidates, near to far; far to near if `inverse`
     height: int = static()  # of the unpadded image
@@ -81,31 +82,36 @@ def prepare_views(chunk: Chunk, config: StreamConfig) -> Views:
     """Views of `chunk`: images edge-padded to the network's multiple, and the depth candidates.
 
     Padding views become black images of the first valid view's camera, whatever they hold: 0 times NaN would be NaN.
+    So do views that cannot be used.
 
     Limits:
         A single candidate lies at `near`, in inverse depth at `far`.
     """
-    images = jnp.where(chunk.valid[:, None, None, None], chunk.images, 0)
-    viewmats, Ks = (_of_valid(matrices, chunk.valid) for matrices in (chunk.viewmats, chunk.Ks))
+    near, far = (
+        (chunk.near, chunk.far) if config.network.depth_range is None else map(jnp.float32, config.network.depth_range)
+    )
+    is_range = usable_range(near, far)
+    near, far = jnp.where(is_range, near, 1.0), jnp.where(is_range, far, 2.0)  # whatever is read from them is left out
+    valid = usable_views(chunk) & is_range
+    images = jnp.where(valid[:, None, None, None], chunk.images, 0)
+    viewmats, Ks = (_of_valid(matrices, valid) for matrices in (chunk.viewmats, chunk.Ks))
     height, width = chunk.images.shape[1:3]
     multiple = config.network.size_multiple
     pad_h, pad_w = -height % multiple, -width % multiple
     images = jnp.pad(images, ((0, 0), (0, pad_h), (0, pad_w), (0, 0)), mode="edge")
     centers = pixel_grid(height + pad_h, width + pad_w, GRID_STRIDE)
     in_image = (centers[..., 0] < width) & (centers[..., 1] < height)
-    inside = in_image[None] & chunk.valid[:, None, None]
+    inside = in_image[None] & valid[:, None, None]
     if chunk.seen is not None:
         seen = jnp.pad(chunk.seen, ((0, 0), (0, pad_h), (0, pad_w)), constant_values=True)
         v, hf, wf = inside.shape
         inside &= seen.reshape(v, hf, GRID_STRIDE, wf, GRID_STRIDE).all(axis=(2, 4))
-    near, far = (
-        (chunk.near, chunk.far) if config.network.depth_range is None else map(jnp.float32, config.network.depth_range)
-    )
     return Views(
         images=images,
         viewmats=viewmats,
         Ks=Ks,
-        valid=chunk.valid,
+        valid=valid,
+        unusable=chunk.valid & ~valid,
         inside=inside,
         log_candidates=_log_candidates(near, far, config),
         height=height,

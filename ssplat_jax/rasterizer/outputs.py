@@ -120,8 +120,13 @@ def finish(
 
 
 def apply_exposures(color: Float[Array, "*b h w 3"], exposures: Float[Array, "*b 3 4"]) -> Float[Array, "*b h w 3"]:
-    """RGB after each frame's affine correction, `matrix @ color + offset`, at least 0."""
-    matrices = exposures[..., None, None, :, :]
+    """RGB after each frame's affine correction, `matrix @ color + offset`, at least 0.
+
+    Limits:
+        A correction that is not finite corrects nothing, with a zero gradient.
+    """
+    is_finite = jnp.isfinite(exposures).all(axis=(-2, -1), keepdims=True)
+    matrices = jnp.where(is_finite, exposures, jnp.eye(3, 4, dtype=exposures.dtype))[..., None, None, :, :]
     corrected = sum(matrices[..., i] * color[..., i, None] for i in range(3)) + matrices[..., 3]
     return jnp.maximum(corrected, 0.0)
 

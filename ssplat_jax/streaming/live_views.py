@@ -11,7 +11,8 @@ import numpy as np
 from jaxtyping import Float32
 
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.core.chunk import Chunk
+from ssplat_jax.core.cameras import check_matrices
+from ssplat_jax.core.chunk import Chunk, check_images
 from ssplat_jax.core.errors import echo, refusal
 from ssplat_jax.data.capture import MAX_SIDE, ArrayPixels, Capture
 from ssplat_jax.data.depth_range import MAX_RANGE
@@ -128,19 +129,15 @@ def _checked_image(image: object) -> Float32[np.ndarray, "h w 3"]:
         raise refusal("push: image", wanted="height x width x 3", got=got, fix="give an RGB image")
     if pixels.dtype == np.uint8:
         return pixels.astype(np.float32) / np.float32(255)
-    is_float = np.issubdtype(pixels.dtype, np.floating)
-    if not (is_float and np.isfinite(pixels).all() and pixels.min() >= 0 and pixels.max() <= 1):
-        got = f"{pixels.dtype} from {pixels.min()} to {pixels.max()}"
-        raise refusal("push: image", wanted="floats in [0, 1], or uint8", got=got, fix="scale the image")
-    return pixels.astype(np.float32)
+    check_images(pixels, "push: image")
+    return pixels.astype(np.float32).clip(0, 1)
 
 
 def _checked_K(K: object, width: int, height: int):
     """Intrinsics of an image of that size."""
     matrix = np.asarray(K, np.float64)
-    is_pinhole = matrix.shape == (3, 3) and np.allclose(matrix[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]], [0, 0, 0, 0, 1])
-    if not is_pinhole:
-        fix, got = "give a 3x3 matrix without skew", echo(matrix.tolist())
-        raise refusal("push: K", wanted="[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]", got=got, fix=fix)
+    if matrix.shape != (3, 3):
+        raise refusal("push: K", wanted="a 3x3 matrix", got=echo(matrix.tolist()), fix="give intrinsics in pixels")
+    check_matrices(np.eye(4), matrix, "push", complete=True)
     (fx, _, cx), (_, fy, cy) = matrix[:2].tolist()
     return check_intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height, where="push: K")

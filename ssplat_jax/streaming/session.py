@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from ssplat_jax.cache import VoxelCache, check_cache, ensure_capacity
 from ssplat_jax.cache.state import init_cache, with_refinement
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.core.chunk import Chunk
+from ssplat_jax.core.chunk import Chunk, check_chunk
 from ssplat_jax.core.errors import refusal
 from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.data.stream_frame import StreamFrame
@@ -117,6 +117,7 @@ class Session:
 
     def _stream(self, chunk: Chunk, *, is_live: bool) -> ChunkOutput:
         """Streams a chunk; the views of a live one no longer wait once it is on its way."""
+        check_chunk(chunk, self.model.config.stream.chunk_size)  # with its values, which the program cannot refuse
         config, num_tokens = self.model.config, tokens_per_chunk(chunk, self.model.config.network.size_multiple)
         cache = self.cache
         if cache is None:

@@ -7,8 +7,8 @@
 A voxel lies entirely in the shard that its hash selects. Every shard receives all tokens and fuses and counts those of
 its own voxels, so nothing moves between caches. Only the projection communicates: it sums over the shards.
 
-Caches are a `VoxelCache` with two leading axes, streams and shards. The stored depths and `stats.num_chunks` are equal
-on all shards of a stream; the other counters add up.
+Caches are a `VoxelCache` with two leading axes, streams and shards. The stored depths, `stats.num_chunks` and
+`stats.num_unusable` are equal on all shards of a stream; the other counters add up.
 """
 
 import dataclasses
@@ -127,11 +127,8 @@ class ShardedStream:
         wanted = required_capacity(caches, self.model.config, num_new_tokens)
         if wanted == caches.capacity:
             return caches
-
-        def grow_device(shards):
-            return jax.lax.map(lambda shard: _with_axis(grow(_without_axis(shard), wanted)), shards)
-
-        return jax.jit(self._map(grow_device, (self._cache_spec,), self._cache_spec))(caches)
+        grown = self._map(lambda shards: grow(shards, wanted), (self._cache_spec,), self._cache_spec)
+        return jax.jit(grown)(caches)
 
     def check(self, caches: VoxelCache) -> None:
         """Raises if a cache lost tokens that its overflow policy promises to keep; see `cache.check_cache`.

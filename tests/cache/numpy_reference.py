@@ -25,7 +25,7 @@ SAME_DIRECTION = 1.0 - 1e-6  # similarities above it are ties
 
 def empty(capacity: int) -> dict:
     """An empty cache."""
-    names = "chunks seen accepted merged low_confidence non_finite out_of_range dropped"
+    names = "chunks seen accepted merged low_confidence non_finite out_of_range dropped unusable"
     return {"capacity": capacity, "rows": [], "stats": {f"num_{name}": 0 for name in names.split()}}
 
 
@@ -53,7 +53,7 @@ def fuse(cache: dict, tokens: dict, config: StreamConfig) -> dict:
         stats["num_seen"] += 1
         pivot = {name: np.asarray(x[j], np.float64) for name, x in tokens.items() if name != "valid"}
         voxel = voxel_of(tokens["means"][j], config.memory.voxel_size)
-        if not all(np.isfinite(x).all() for x in pivot.values()):
+        if not (all(np.isfinite(x).all() for x in pivot.values()) and pivot["footprints"] > 0):
             stats["num_non_finite"] += 1
         elif pivot["confidences"] < np.float32(config.memory.min_confidence):
             stats["num_low_confidence"] += 1

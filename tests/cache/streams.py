@@ -28,7 +28,7 @@ CONFIDENCES = ("random", "tied", "at_tau")
 fuse = jax.jit(plain_fuse, static_argnums=2, donate_argnums=0)
 
 CONFIG = StreamConfig().replace(
-    token_width=WIDTH, capacity=128, voxel_size=0.25, min_confidence=0.3, overflow="drop_new"
+    token_width=WIDTH, capacity=128, voxel_size=0.25, min_confidence=0.3, overflow="drop_new", cgfi=True
 )
 PAIRS = CONFIG.replace(pivots_per_voxel=2)
 VARIANTS = {"voxel": CONFIG, "append": CONFIG.replace(vacc="append")}

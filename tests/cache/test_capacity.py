@@ -44,6 +44,19 @@ def test_capacity_grows_by_doubling_and_never_shrinks():
     assert starting_capacity(CONFIG, 50_000) == CONFIG.memory.capacity
 
 
+def test_stacked_caches_grow_alike_and_traced_ones_are_refused():
+    caches = [fuse(init_cache(GROW, 16), to_jax(tokens), GROW) for tokens in STREAM[:2]]
+    stacked = ensure_capacity(jax.tree.map(lambda *x: jnp.stack(x), *caches), GROW, NUM_TOKENS)
+    assert stacked.capacity == 64
+    for i, cache in enumerate(caches):
+        jax.tree.map(np.testing.assert_array_equal, jax.tree.map(lambda x, i=i: x[i], stacked), grow(cache, 64))
+    with pytest.raises(CacheError, match="ensure_capacity"):
+        check_cache(stacked, GROW)
+    for call in (lambda cache: ensure_capacity(cache, GROW, 1), lambda cache: check_cache(cache, GROW)):
+        with pytest.raises(InputError, match="outside jit"):
+            jax.jit(call)(caches[0])
+
+
 def test_a_full_cache_keeps_its_voxels_and_counts_the_rest():
     cache = init_cache(CONFIG, 16)
     for tokens in STREAM:

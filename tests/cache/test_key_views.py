@@ -68,8 +68,9 @@ def test_views_that_cannot_be_used_stay_out(name):
     bad = array.at[(0,) * array.ndim].set(np.nan).at[(1,) + (0,) * (array.ndim - 1)].set(np.inf)
     arrival = replace(arrival, **{name: bad}, valid=jnp.array([True, True, False, True]))
     assert places(KEEP(empty(), arrival)) == [6.0] and usable(arrival).tolist() == [False, False, False, True]
-    dark = replace(views([3.0]), exposures=jnp.array([[1.0, 1.0, 0.0]]))
-    assert not usable(dark).any()
+    one = views([3.0])
+    for unlike in ({"exposures": jnp.array([[1.0, 1.0, 0.0]])}, {"Ks": one.Ks.at[0, 0, 0].set(-1.0)}):
+        assert usable(one).all() and not usable(replace(one, **unlike)).any()
 
 
 def test_distances_are_moves_over_depth_plus_turns():

@@ -133,12 +133,6 @@ def test_free_space_sinks_seen_rises_hidden_stays():
     assert confidence_after(1.0, seen(2.0, 0.6)) > against and confidence_after(2.0, seen(2.0, 0.6)) < agreed
 
 
-def test_the_order_of_votes_does_not_matter():
-    # Far enough from both bounds: a clipped confidence forgets how far outside it would have been.
-    views = (seen(2.0, 0.7), seen(1.0, 0.5), seen(2.0, 0.5))
-    assert confidence_after(1.0, *views) == pytest.approx(confidence_after(1.0, *views[::-1]), rel=1e-5)
-
-
 def test_confidences_stay_revisable():
     sunk = [seen(2.0, 1.0)] * 50
     assert confidence_after(1.0, *sunk) == pytest.approx(0.02)

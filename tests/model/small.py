@@ -147,3 +147,8 @@ def history(depths, confidences, feats=None, mask=None, colors=None) -> Projecte
 def finite(tree) -> bool:
     """Whether every float of the tree is finite."""
     return all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(tree) if jnp.issubdtype(leaf.dtype, jnp.floating))
+
+
+def count_params(params) -> int:
+    """Number of scalars in `params`, which may be shapes."""
+    return sum(leaf.size for leaf in jax.tree.leaves(params))

@@ -106,7 +106,7 @@ def test_exposures_are_bounded(gain, wanted):
 def test_values_that_are_not_finite_are_not_compared(bad):
     remembered, depths = scene()
     colors, seen_depths = 0.5 * remembered, depths.copy()
-    colors[:, 0], remembered[:, 1], seen_depths[:, 2] = bad, bad, bad
+    remembered[:, 1], seen_depths[:, 2] = bad, bad
     np.testing.assert_allclose(exposures(remembered, colors, depths, seen_depths=seen_depths), 0.5, rtol=1e-5)
 
 
@@ -137,7 +137,7 @@ def token_colors(images, exposures):
 
 
 def test_colors_are_divided_by_their_views_exposure():
-    images = chunk().images
+    images = 0.4 * chunk().images  # the brightest view stays below 1
     as_seen, patches = token_colors(images, jnp.ones((3, 3)))
     np.testing.assert_array_equal(as_seen, patches.reshape(as_seen.shape))  # view-major, row-major
     brighter, _ = token_colors(images * GAINS[:, None, None], jnp.asarray(GAINS))

@@ -13,10 +13,11 @@ import pytest
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.model.layers import ResidualBlock, average_pool, rms_normalize
-from ssplat_jax.model.network import NETWORKS, Network, NetworkConfig, count_params, network_of, register_network
+from ssplat_jax.model.network import NETWORKS, Network, NetworkConfig, network_of, register_network
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.model.views import GRID_STRIDE, DepthDistribution, TokenShapes
 from ssplat_jax.network_configs import NETWORK_CONFIGS, CompactConfig, ResplatConfig
+from tests.model.small import count_params
 
 
 @dataclasses.dataclass(frozen=True)

@@ -13,12 +13,12 @@ from ssplat_jax.model import resplat
 from ssplat_jax.model.cgfi import inject_features
 from ssplat_jax.model.hpda import expected_log_depth
 from ssplat_jax.model.layers import same_region_mask
-from ssplat_jax.model.network import count_params, init_params
+from ssplat_jax.model.network import init_params
 from ssplat_jax.model.resplat.encoder import POSITIONS_SIDE, Transformer, resampled_positions
 from ssplat_jax.model.resplat.torch_layers import resize
 from ssplat_jax.model.views import prepare_views, to_candidate_space
 from ssplat_jax.training.losses import soft_targets
-from tests.model.small import chunk, history, random_params
+from tests.model.small import chunk, count_params, history, random_params
 
 CONFIG = preset("small").replace(mixer_blocks=1, num_depths=32, min_confidence=0.0, capacity=1 << 11, chunk_size=3)
 

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from ssplat_jax.core.cameras import pixel_grid, project_points, transform_points
+from ssplat_jax.core.chunk import check_chunk
+from ssplat_jax.core.errors import InputError
 from ssplat_jax.core.gaussians import SH_C0
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.core.rotations import matrices_to_quats, quats_to_matrices
@@ -38,13 +40,59 @@ def test_candidates_are_uniform_in_log_depth_from_near_to_far():
     np.testing.assert_allclose(logs, np.linspace(np.log(1.0), np.log(6.0), CONFIG.network.num_depths), atol=FLOAT32)
 
 
-def test_grid_camera_has_cell_centers_at_pixel_centers():
-    views = prepare_views(chunk(), CONFIG)
-    points = jnp.array([[[0.3, -0.2, 2.0]]])
-    fine, _ = project_points(points, views.Ks[:1])
-    coarse, _ = project_points(points, views.grid_camera.Ks[:1])
-    np.testing.assert_allclose(coarse * GRID_STRIDE, fine, atol=1e-4)
-    assert (views.grid_camera.height, views.grid_camera.width) == (8, 8)
+def of_view(name: str, *place: int, to: float):
+    """A change of one entry of view 1."""
+    return lambda c: replace(c, **{name: getattr(c, name).at[(1, *place)].set(to)})
+
+
+UNUSABLE_VIEWS = {
+    "a focal length below 0": of_view("Ks", 0, 0, to=-28.0),
+    "both focal lengths below 0": lambda c: replace(c, Ks=c.Ks.at[1, :2, :2].multiply(-1.0)),
+    "a focal length of 0": of_view("Ks", 1, 1, to=0.0),
+    "a NaN focal length": of_view("Ks", 0, 0, to=np.nan),
+    "skew": of_view("Ks", 0, 1, to=2.0),
+    "a last row of 0 0 2": of_view("Ks", 2, 2, to=2.0),
+    "a NaN pose": of_view("viewmats", 0, 3, to=np.nan),
+    "a mirrored pose": of_view("viewmats", 0, 0, to=-1.0),
+    "a scaled pose": lambda c: replace(c, viewmats=c.viewmats.at[1, :3].multiply(2.0)),
+    "a NaN pixel": of_view("images", 3, 4, 0, to=np.nan),
+    "an infinite pixel": of_view("images", 3, 4, 0, to=np.inf),
+    "colors up to 255": lambda c: replace(c, images=c.images.at[1].multiply(255.0)),
+    "colors below 0": of_view("images", 3, 4, 0, to=-1.0),
+}
+UNUSABLE_RANGES = {"near": [0.0, -1.0, np.nan, 9.0], "far": [np.inf, np.nan, -1.0]}
+
+
+prepared = jax.jit(lambda chunk: prepare_views(chunk, CONFIG))
+
+
+@pytest.mark.parametrize("name", UNUSABLE_VIEWS)
+def test_a_view_that_cannot_be_used_is_refused_and_inside_jit_padding(name):
+    """All that the network reads of a chunk are its prepared views."""
+    spoiled, padded = UNUSABLE_VIEWS[name](chunk()), replace(chunk(), valid=jnp.array([True, False, True]))
+    got, wanted = prepared(spoiled), prepared(padded)
+    assert got.unusable.tolist() == [False, True, False] and not wanted.unusable.any()
+    jax.tree.map(np.testing.assert_array_equal, replace(got, unusable=wanted.unusable), wanted)
+
+    def total(images, viewmats, Ks):
+        views = prepare_views(replace(spoiled, images=images, viewmats=viewmats, Ks=Ks), CONFIG)
+        return sum(jnp.sum(jnp.sin(x)) for x in (views.images, views.viewmats, views.Ks))
+
+    by_parts = jax.jit(jax.grad(total, argnums=(0, 1, 2)))(spoiled.images, spoiled.viewmats, spoiled.Ks)
+    for gradient in by_parts:
+        assert np.isfinite(gradient).all() and not gradient[1].any() and gradient[0].any()
+    with pytest.raises(InputError, match="chunk"):
+        check_chunk(spoiled, 3)
+    check_chunk(replace(spoiled, valid=padded.valid), 3)  # padding may hold anything
+
+
+@pytest.mark.parametrize(("name", "value"), [(name, x) for name, values in UNUSABLE_RANGES.items() for x in values])
+def test_without_a_range_of_depths_a_chunk_is_refused_and_inside_jit_padding(name, value):
+    spoiled = replace(chunk(), **{name: jnp.float32(value)})
+    got = prepared(spoiled)
+    assert got.unusable.all() and not got.valid.any() and np.isfinite(got.log_candidates).all()
+    with pytest.raises(InputError, match="near and far"):
+        check_chunk(spoiled, 3)
 
 
 def line_of_cameras(*xs) -> jax.Array:

@@ -17,6 +17,7 @@ from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.rasterizer import Effects, render
+from ssplat_jax.rasterizer.outputs import apply_exposures
 from tests.rasterizer import oracle
 
 NUM, CROWD, WIDTH, HEIGHT = 64, 4096, 24, 16
@@ -282,6 +283,16 @@ def test_ten_thousand_extremes_have_no_non_finite_gradient(has_every_effect):
         (value, out), grads = program(effects)(gaussians, camera, **given)
         bad += not is_finite((value, out, grads))
     assert bad == 0
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_an_exposure_that_is_not_finite_corrects_nothing(bad):
+    color = jnp.asarray(np.random.default_rng(0).uniform(size=(2, 4, 5, 3)), jnp.float32)
+    exposures = jnp.stack([jnp.eye(3, 4).at[1, 3].set(bad), 2.0 * jnp.eye(3, 4)])
+    np.testing.assert_allclose(apply_exposures(color, exposures), [color[0], 2.0 * color[1]], rtol=1e-6)
+    by_color, by_exposures = jax.grad(lambda *x: apply_exposures(*x).sum(), (0, 1))(color, exposures)
+    np.testing.assert_allclose(by_color, [jnp.ones_like(color[0]), 2.0 * jnp.ones_like(color[1])], rtol=1e-6)
+    assert not by_exposures[0].any() and np.isfinite(by_exposures).all() and by_exposures[1].any()
 
 
 def test_an_image_of_one_pixel():

@@ -1,16 +1,19 @@
 """The stream as a whole: step, scan, decoding and session, with one narrow model and one procedural capture."""
 
 import jax
+import jax.extend
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from ssplat_jax.config import preset
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.model.decoder import grown_footprints
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.streaming.session import Session
+from tests.model.small import chunk as small_chunk
 from tests.model.small import random_params
 from tests.streaming.narrow_model import NARROW, assert_same_bits, leaves_with_names
 
@@ -128,6 +131,20 @@ def test_padding_views_may_hold_anything(model, params, chunks, step):
     for cache, output in results[1:]:
         assert_same_bits(cache, results[0][0])
         assert_same_bits(output, results[0][1])
+
+
+def count_equations(jaxpr) -> int:
+    """Equations of a program and of all programs inside it."""
+    inner = (jax.extend.core.jaxprs_in_params(equation.params) for equation in jaxpr.eqns)
+    return len(jaxpr.eqns) + sum(count_equations(part) for parts in inner for part in parts)
+
+
+def test_the_step_of_tiny_has_few_equations():
+    """The time to trace, lower and compile it follows them."""
+    model = StreamSplat(preset("tiny"))
+    params, cache = jax.eval_shape(model.init, jax.random.key(0)), jax.eval_shape(model.init_cache)
+    program = jax.make_jaxpr(model.step)(params, cache, small_chunk(views=4))
+    assert count_equations(program.jaxpr) <= 6000
 
 
 def test_bytes_are_no_images_of_a_chunk(model, params, chunks):
