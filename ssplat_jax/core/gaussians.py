@@ -1,5 +1,8 @@
 """`Gaussians`: a scene of 3D Gaussians as one pytree of activated values."""
 
+import functools
+
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -114,3 +117,12 @@ def mask_gaussians(gaussians: Gaussians, keep) -> Gaussians:
         opacities=jnp.where(keep, gaussians.opacities, 0.0),
         sh=jnp.where(keep[:, None, None], gaussians.sh, 0.0),
     )
+
+
+@functools.partial(jax.jit, static_argnames="num_rows")
+def present_gaussians(gaussians: Gaussians, num_rows: int) -> Gaussians:
+    """The first `num_rows` rows of `gaussians` with an opacity above 0, in their order, then absent rows."""
+    is_present = gaussians.opacities > 0
+    rows = jnp.nonzero(is_present, size=num_rows, fill_value=0)[0]
+    keep = jnp.arange(num_rows) < jnp.sum(is_present)
+    return mask_gaussians(jax.tree.map(lambda x: x[rows], gaussians), keep)

@@ -5,7 +5,7 @@ import math
 import flax.linen as nn
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from ssplat_jax.cache.state import NUM_OBSERVED
 from ssplat_jax.cache.votes import observation_features
@@ -26,6 +26,8 @@ MIN_SCALE = 1e-6
 """Smallest scale, in stream units."""
 MAX_SCALE = 1.0
 """Largest scale, in stream units: ReSplat's bound."""
+MIN_DETAIL = {1: 0.05, 2: 0.018}
+"""Least RMS color difference that parts of 1 or 2 pixels a side must show, to not become one of twice the side."""
 VOXEL_COVERAGE = 1.2
 """Share of a voxel's face that its pivots cover together: above 1, because pivots gather in the middle of the voxel."""
 
@@ -60,7 +62,7 @@ def decode_tokens(
     shapes: TokenShapes,
     *,
     means: Float[Array, "m 3"],
-    rgbs: Float[Array, "m a"],
+    parts: "Parts",
     quats: Float[Array, "m 4"],
     footprints: Float[Array, " m"],
     num_members: Int[Array, " m"] | int = 1,
@@ -69,13 +71,15 @@ def decode_tokens(
     """Gaussians of tokens or pivots: `gaussians_per_token` each, in a square over the cell, row by row.
 
     The Gaussians of a token share shape and opacity and differ in position and color. With `merged_coverage` a
-    pivot of n members is as opaque as n Gaussians of opacity o at one place, 1 - (1 - o)^n.
+    pivot of n members is as opaque as n Gaussians of opacity o at one place, 1 - (1 - o)^n. With `adaptive` a cell
+    without detail has fewer and larger ones (`divide_cells`), in the first of the rows that they stand for; the other
+    rows have opacity 0.
 
     Args:
         shapes: what the head predicts. Rotations are in the frame of the token's camera, `shapes.sh` is added to the
             appearance anchors.
         means: positions of the tokens, stream frame, as is the result.
-        rgbs: appearance anchors: a color in [0, 1] per Gaussian of the token.
+        parts: places and colors of each token's Gaussians in its cell (`divide_cells`).
         quats: camera-to-stream rotation of each token's camera, wxyz.
         footprints: side of a cell at the token's depth, stream units.
         num_members: tokens that were merged into the pivot.
@@ -84,25 +88,65 @@ def decode_tokens(
     layers = jnp.asarray(num_members, jnp.float32) if config.additions.merged_coverage else 1.0
     optical_depths = layers * nn.softplus(shapes.logit_opacities)
     each = lambda x: jnp.repeat(x, config.head.gaussians_per_token, axis=0)  # noqa: E731
+    axes = quats_to_matrices(quats)
+    offsets = parts.right[..., None] * axes[:, None, :, 0] + parts.down[..., None] * axes[:, None, :, 1]
+    growth = jnp.stack([parts.growth, parts.growth, jnp.ones_like(parts.growth)], axis=-1)
+    opacities = each(-jnp.expm1(-optical_depths))
     return Gaussians(
-        means=_spread(means, quats, footprints, config),
+        means=(means[:, None] + footprints[:, None, None] * offsets).reshape(-1, 3),
         quats=each(multiply_quats(quats, shapes.quats)),
-        scales=each(token_scales(shapes.raw_scales, footprints, config)),
-        opacities=each(-jnp.expm1(-optical_depths)),
-        sh=each(shapes.sh).at[:, 0].add((rgbs.reshape(-1, 3) - 0.5) / SH_C0),
+        scales=each(token_scales(shapes.raw_scales, footprints, config) * growth),
+        opacities=jnp.where(parts.present.reshape(-1), opacities, 0.0) if config.head.adaptive else opacities,
+        sh=each(shapes.sh).at[:, 0].add((parts.colors.reshape(-1, 3) - 0.5) / SH_C0),
     )
 
 
-def _spread(
-    means: Float[Array, "m 3"], quats: Float[Array, "m 4"], footprints: Float[Array, " m"], config: StreamConfig
-) -> Float[Array, "n 3"]:
-    """Centers of the parts of each cell, row by row, in the plane that faces the token's camera."""
+@pytree
+class Parts:
+    """How the cells of `m` tokens are divided into at most `g` Gaussians each, row by row."""
+
+    colors: Float[Array, "m g 3"]
+    right: Float[Array, "m g"]  # place of the center in its cell, in cells
+    down: Float[Array, "m g"]
+    growth: Float[Array, " m"]  # side of a part, in units of the smallest
+    present: Bool[Array, "m g"]  # False for rows that another part stands for
+
+
+def divide_cells(rgbs: Float[Array, "m a"], config: StreamConfig) -> Parts:
+    """The parts of each token's cell: `gaussians_per_token`, or with `adaptive` as few as its detail allows.
+
+    Four neighboring parts become one, with their mean color, where the RMS difference of the colors from that mean is
+    below `MIN_DETAIL` over the whole cell. The first of the four rows holds it.
+    """
     side = math.isqrt(config.head.gaussians_per_token)
-    steps = (np.arange(side, dtype=np.float32) + 0.5) / side - 0.5  # in cells
-    down, right = (x.reshape(-1, 1) for x in np.meshgrid(steps, steps, indexing="ij"))
-    axes = quats_to_matrices(quats)
-    offsets = right * axes[:, None, :, 0] + down * axes[:, None, :, 1]
-    return (means[:, None] + footprints[:, None, None] * offsets).reshape(-1, 3)
+    blocks = [1 << i for i in range(side.bit_length())] if config.head.adaptive else [1]
+    images = [_block_means(rgbs.reshape(-1, side, side, 3), block) for block in blocks]
+    level = jnp.full(len(rgbs), len(blocks) - 1)
+    for i in reversed(range(len(blocks) - 1)):
+        lost = jnp.mean((images[i] - images[i + 1]) ** 2, axis=(1, 2, 3))
+        level = jnp.where(lost >= MIN_DETAIL[blocks[i] * 4 // side] ** 2, i, level)
+    firsts = [np.arange(side) // block * block for block in blocks]  # first row or column of the part of each
+    centers = [(first + 0.5 * block) / side - 0.5 for first, block in zip(firsts, blocks, strict=True)]
+    grids = [np.meshgrid(x, x, indexing="ij") for x in centers]
+    leads = [np.equal(first, np.arange(side)) for first in firsts]
+    choose = lambda tables: jnp.asarray(np.stack(tables).reshape(len(blocks), -1))[level]  # noqa: E731
+    colors = jnp.select([level[:, None, None, None] == i for i in range(len(blocks))], images)
+    return Parts(
+        colors=colors.reshape(-1, side * side, 3),
+        right=choose([right.astype(np.float32) for _, right in grids]),
+        down=choose([down.astype(np.float32) for down, _ in grids]),
+        growth=jnp.asarray(blocks, jnp.float32)[level],
+        present=choose([np.logical_and.outer(lead, lead) for lead in leads]),
+    )
+
+
+def _block_means(images: Float[Array, "m s s 3"], block: int) -> Float[Array, "m s s 3"]:
+    """Images with the mean color of each block of pixels in all of its pixels."""
+    if block == 1:
+        return images
+    m, side = images.shape[:2]
+    parts = images.reshape(m, side // block, block, side // block, block, 3)
+    return jnp.broadcast_to(parts.mean(axis=(2, 4), keepdims=True), parts.shape).reshape(images.shape)
 
 
 # -- Evidence head: opacity, scale and contrast of a pivot's Gaussians from how views saw it (ours) -------------------
@@ -171,14 +215,15 @@ def evidence_features(evidence: Evidence, config: StreamConfig) -> Float[Array, 
 
 
 def apply_evidence(
-    params, shapes: TokenShapes, evidence: Evidence, config: StreamConfig
-) -> tuple[TokenShapes, Float[Array, "m a"]]:
-    """Shapes and colors of pivots, changed as the evidence asks for.
+    params, shapes: TokenShapes, parts: Parts, evidence: Evidence, config: StreamConfig
+) -> tuple[TokenShapes, Parts]:
+    """Shapes and parts of pivots, changed as the evidence asks for.
 
     A rendered surface is a mixture of Gaussians that overlap and of layers that do not lie exactly on each other, which
     blurs it. So the colors of a pivot's Gaussians may be moved away from their mean, more where the evidence is good.
 
-    Returns the shapes with other opacities and scales, and the colors, whose mean over a pivot stays as it is.
+    Returns the shapes with other opacities and scales, and the parts with other colors, whose mean over a pivot stays
+    as it is.
 
     Limits:
         Logits change by at most `MAX_LOGIT_CHANGE`, differences of colors by a factor of at most
@@ -192,11 +237,6 @@ def apply_evidence(
         logit_opacities=shapes.logit_opacities + change,
         raw_scales=shapes.raw_scales + jnp.stack([sideways, sideways, along], axis=-1),
     )
-    return shapes, _with_contrast(evidence.rgbs, MAX_LOG_CONTRAST * jnp.tanh(contrast / MAX_LOG_CONTRAST))
-
-
-def _with_contrast(rgbs: Float[Array, "m a"], log_gains: Float[Array, " m"]) -> Float[Array, "m a"]:
-    """Colors whose differences from their mean over the pivot are multiplied by exp(`log_gains`); 0 changes no bit."""
-    colors = rgbs.reshape(len(rgbs), -1, 3)
-    differences = colors - colors.mean(axis=1, keepdims=True)
-    return rgbs + (jnp.expm1(log_gains)[:, None, None] * differences).reshape(rgbs.shape)
+    gains = jnp.expm1(MAX_LOG_CONTRAST * jnp.tanh(contrast / MAX_LOG_CONTRAST))  # 0 changes no bit
+    differences = parts.colors - parts.colors.mean(axis=1, keepdims=True)
+    return shapes, replace(parts, colors=parts.colors + gains[:, None, None] * differences)

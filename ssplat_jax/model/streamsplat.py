@@ -40,7 +40,7 @@ from ssplat_jax.core.gaussians import Gaussians, mask_gaussians
 from ssplat_jax.core.pytree import pytree, replace
 from ssplat_jax.core.rotations import matrices_to_quats
 from ssplat_jax.model.cgfi import inject_features
-from ssplat_jax.model.decoder import MAX_SCALE, Evidence, apply_evidence, decode_tokens, grown_footprints
+from ssplat_jax.model.decoder import MAX_SCALE, Evidence, apply_evidence, decode_tokens, divide_cells, grown_footprints
 from ssplat_jax.model.exposure import estimate_exposures
 from ssplat_jax.model.hpda import anchor_depth
 from ssplat_jax.model.network import init_params, network_of
@@ -199,7 +199,7 @@ class StreamSplat:
     def decode(self, params: dict, cache: VoxelCache) -> Gaussians:
         """The scene so far, in the stream frame: `gaussians_per_token` Gaussians for each pivot, pivot by pivot.
 
-        Gaussians of dead and carved pivots have opacity 0.
+        Gaussians of dead and carved pivots have opacity 0, and with `adaptive` those that a smooth patch spares.
         """
         is_shown = shown_pivots(cache, self.config).reshape(-1)
         return self._decode(params, cache, is_shown, lambda x: x.reshape(-1, *x.shape[2:]))
@@ -223,7 +223,7 @@ class StreamSplat:
         """Gaussians of the pivots that `take` selects."""
         rgbs, stored, num_members = take(cache.rgbs), take(cache.footprints), take(cache.num_members)
         footprints = grown_footprints(stored, num_members, self.config)
-        shapes = self._read_shapes(params, take(cache.feats))
+        shapes, parts = self._read_shapes(params, take(cache.feats)), divide_cells(rgbs, self.config)
         if cache.observations is not None:
             num_pivots = jnp.broadcast_to(cache.counts[:, None], cache.confidences.shape)
             evidence = Evidence(
@@ -235,11 +235,11 @@ class StreamSplat:
                 growth=footprints / jnp.maximum(stored, 1e-12),
                 rgbs=rgbs,
             )
-            shapes, rgbs = apply_evidence(params["evidence"], shapes, evidence, self.config)
+            shapes, parts = apply_evidence(params["evidence"], shapes, parts, evidence, self.config)
         gaussians = decode_tokens(
             shapes,
             means=take(cache.means),
-            rgbs=rgbs,
+            parts=parts,
             quats=take(cache.quats),
             footprints=footprints,
             num_members=num_members,
@@ -254,7 +254,7 @@ class StreamSplat:
         gaussians = decode_tokens(
             self._read_shapes(params, tokens.feats),
             means=tokens.means,
-            rgbs=tokens.rgbs,
+            parts=divide_cells(tokens.rgbs, self.config),
             quats=tokens.quats,
             footprints=tokens.footprints,
             config=self.config,
@@ -272,6 +272,13 @@ class StreamSplat:
 def shown_pivots(cache: VoxelCache, config: StreamConfig) -> Bool[Array, "capacity k"]:
     """Mask of the pivots that `decode` shows: alive and not carved away."""
     return cache.alive & (cache.confidences >= config.memory.min_confidence)
+
+
+def count_gaussians(cache: VoxelCache, config: StreamConfig) -> Int[Array, ""]:
+    """Number of the Gaussians that `decode` shows."""
+    rgbs = cache.rgbs.reshape(-1, cache.rgbs.shape[-1])
+    is_shown = shown_pivots(cache, config).reshape(-1, 1)
+    return jnp.sum(is_shown & divide_cells(rgbs, config).present, dtype=jnp.int32)
 
 
 def shown_rows(cache: VoxelCache, config: StreamConfig, num: int) -> Int[Array, " m"]:

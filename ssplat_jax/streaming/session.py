@@ -13,9 +13,9 @@ from ssplat_jax.cache.state import init_cache, with_refinement
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.chunk import Chunk, check_chunk
 from ssplat_jax.core.errors import refusal
-from ssplat_jax.core.gaussians import Gaussians
+from ssplat_jax.core.gaussians import Gaussians, present_gaussians
 from ssplat_jax.data.stream_frame import StreamFrame
-from ssplat_jax.model.streamsplat import ChunkOutput, StreamSplat, shown_pivots, shown_rows
+from ssplat_jax.model.streamsplat import ChunkOutput, StreamSplat, count_gaussians, shown_pivots, shown_rows
 from ssplat_jax.model.views import GRID_STRIDE
 from ssplat_jax.streaming.live_views import LiveViews
 
@@ -163,8 +163,18 @@ class Session:
         return self._live.frame
 
     def gaussians(self) -> Gaussians:
-        """The scene so far, in the stream frame: the Gaussians of `model.decode`, then padding rows of opacity 0."""
-        return self.decode_program()(self.params, self._present_cache())
+        """The scene so far, in the stream frame: the Gaussians of `model.decode`, then padding rows of opacity 0.
+
+        With `adaptive` the rows that hold no Gaussian are left out. The number of rows is rounded up, so that a growing
+        scene rarely compiles.
+        """
+        cache, config = self._present_cache(), self.model.config
+        gaussians = self.decode_program()(self.params, cache)
+        if not config.head.adaptive:
+            return gaussians
+        num_present = int(_count(cache, config)[2])
+        num_rows = max(MIN_DECODED_PIVOTS, 1 << max(num_present - 1, 0).bit_length())
+        return present_gaussians(gaussians, min(num_rows, gaussians.num_gaussians))
 
     def decode_program(self) -> jax.stages.Compiled:
         """The compiled program of `gaussians` for the present cache.
@@ -173,7 +183,7 @@ class Session:
         up to a power of two, so that a growing scene rarely compiles.
         """
         cache = self._present_cache()
-        num_shown = int(_count_pivots(cache, self.model.config)[1])
+        num_shown = int(_count(cache, self.model.config)[1])
         num_pivots = min(max(MIN_DECODED_PIVOTS, 1 << max(num_shown - 1, 0).bit_length()), cache.confidences.size)
         leaves, structure = jax.tree.flatten(cache)
         key = ("decode", num_pivots, structure, *((leaf.shape, leaf.dtype) for leaf in leaves))
@@ -203,11 +213,11 @@ class Session:
         """Occupancy and counters of the cache; `decoded` is the number of Gaussians that are shown."""
         cache, config = self._present_cache(), self.model.config
         stats = {field.name: int(getattr(cache.stats, field.name)) for field in dataclasses.fields(cache.stats)}
-        num_pivots, num_shown = map(int, _count_pivots(cache, config))
+        num_pivots, _, num_gaussians = map(int, _count(cache, config))
         return {
             "voxels": int(cache.num_voxels),
             "pivots": num_pivots,
-            "decoded": config.head.gaussians_per_token * num_shown,
+            "decoded": num_gaussians,
             "capacity": cache.capacity,
             "overflow": stats["num_dropped"],
             "accepted_fraction": round(stats["num_accepted"] / max(stats["num_seen"], 1), 4),
@@ -219,9 +229,10 @@ _new_cache = jax.jit(init_cache, static_argnums=(0, 1))
 
 
 @functools.partial(jax.jit, static_argnums=1)
-def _count_pivots(cache: VoxelCache, config: StreamConfig) -> tuple[jax.Array, jax.Array]:
-    """Pivots in use, and those of them that are shown."""
-    return jnp.sum(cache.counts), jnp.sum(shown_pivots(cache, config), dtype=jnp.int32)
+def _count(cache: VoxelCache, config: StreamConfig) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Pivots in use, those of them that are shown, and their Gaussians."""
+    num_shown = jnp.sum(shown_pivots(cache, config), dtype=jnp.int32)
+    return jnp.sum(cache.counts), num_shown, count_gaussians(cache, config)
 
 
 def _memory_bytes(program: jax.stages.Compiled | None) -> int | None:
