@@ -211,9 +211,9 @@ class Session:
 
     def cache_facts(self) -> dict[str, int | float]:
         """Occupancy and counters of the cache; `decoded` is the number of Gaussians that are shown."""
-        cache, config = self._present_cache(), self.model.config
+        cache = self._present_cache()
         stats = {field.name: int(getattr(cache.stats, field.name)) for field in dataclasses.fields(cache.stats)}
-        num_pivots, _, num_gaussians = map(int, _count(cache, config))
+        num_pivots, _, num_gaussians = map(int, _count(cache, self.model.config))
         return {
             "voxels": int(cache.num_voxels),
             "pivots": num_pivots,

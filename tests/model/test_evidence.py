@@ -14,13 +14,14 @@ from ssplat_jax.model.decoder import (
     MAX_LOGIT_CHANGE,
     Evidence,
     apply_evidence,
+    divide_cells,
     evidence_features,
 )
 from ssplat_jax.model.network import init_params
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.model.views import TokenShapes
 
-CONFIG = preset("tiny").replace(capacity=128)
+CONFIG = preset("tiny").replace(capacity=128, gaussians_per_token=4, adaptive=False)
 NUM = 5
 
 
@@ -49,6 +50,11 @@ def different_colors() -> Evidence:
     return replace(evidence(), rgbs=jax.random.uniform(jax.random.key(4), (NUM, 12)))
 
 
+def changed(params: dict, facts: Evidence):
+    """Shapes and parts after the head with `params` has seen `facts`."""
+    return apply_evidence(params, shapes(), divide_cells(facts.rgbs, CONFIG), facts, CONFIG)
+
+
 def cache_of_pivots(num: int = 6):
     """A cache with pivots in its first rows."""
     rng = np.random.default_rng(0)
@@ -71,16 +77,16 @@ def cache_of_pivots(num: int = 6):
 
 def test_an_untrained_head_changes_nothing():
     params = init_params(jax.random.key(0), CONFIG, only=("evidence",))["evidence"]
-    got, rgbs = apply_evidence(params, shapes(), different_colors(), CONFIG)
+    got, parts = changed(params, different_colors())
     jax.tree.map(np.testing.assert_array_equal, got, shapes())
-    np.testing.assert_array_equal(rgbs, different_colors().rgbs)
+    np.testing.assert_array_equal(parts.colors.reshape(NUM, -1), different_colors().rgbs)
 
 
 @pytest.mark.parametrize("bias", [0.2, 1e4, -1e4])
 def test_changes_are_bounded_and_contrast_keeps_the_mean_color(bias):
     before = np.asarray(different_colors().rgbs, np.float64).reshape(NUM, 4, 3)
-    got, rgbs = apply_evidence(head_with(bias), shapes(), different_colors(), CONFIG)
-    after = np.asarray(rgbs, np.float64).reshape(NUM, 4, 3)
+    got, parts = changed(head_with(bias), different_colors())
+    after = np.asarray(parts.colors, np.float64)
     gain = np.exp(MAX_LOG_CONTRAST * np.tanh(bias / MAX_LOG_CONTRAST))
     mean = before.mean(axis=1, keepdims=True)
     np.testing.assert_allclose(after, mean + gain * (before - mean), atol=1e-6)
@@ -89,7 +95,7 @@ def test_changes_are_bounded_and_contrast_keeps_the_mean_color(bias):
 
 
 def test_the_head_moves_opacity_scales_and_contrast_alone():
-    got, _ = apply_evidence(head_with(0.1), shapes(), evidence(), CONFIG)
+    got, _ = changed(head_with(0.1), evidence())
     assert float(got.logit_opacities[0]) == pytest.approx(-1.0 + 0.1, abs=1e-3)
     np.testing.assert_allclose(got.raw_scales - shapes().raw_scales, 0.1, rtol=1e-5)
     np.testing.assert_array_equal(got.quats, shapes().quats)
@@ -102,8 +108,8 @@ def test_value_and_gradient_are_finite_at_the_limits(value):
     assert jnp.isfinite(evidence_features(evidence(value), CONFIG)).all()
 
     def loss(params):
-        got, rgbs = apply_evidence(params, shapes(), evidence(value), CONFIG)
-        return got.logit_opacities.sum() + got.raw_scales.sum() + rgbs.sum()
+        got, parts = changed(params, evidence(value))
+        return got.logit_opacities.sum() + got.raw_scales.sum() + parts.colors.sum()
 
     assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(jax.grad(loss)(head_with(0.2))))
 

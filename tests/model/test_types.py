@@ -10,11 +10,20 @@ import pytest
 from ssplat_jax.core.cameras import pixel_grid, project_points, transform_points
 from ssplat_jax.core.chunk import check_chunk
 from ssplat_jax.core.errors import InputError
-from ssplat_jax.core.gaussians import SH_C0
+from ssplat_jax.core.gaussians import SH_C0, present_gaussians
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.core.rotations import matrices_to_quats, quats_to_matrices
 from ssplat_jax.model.compact import START_OPACITY, Encoder, read_shapes
-from ssplat_jax.model.decoder import MAX_SCALE, MIN_SCALE, START_SCALE, START_THICKNESS, decode_tokens, token_scales
+from ssplat_jax.model.decoder import (
+    MAX_SCALE,
+    MIN_DETAIL,
+    MIN_SCALE,
+    START_SCALE,
+    START_THICKNESS,
+    decode_tokens,
+    divide_cells,
+    token_scales,
+)
 from ssplat_jax.model.layers import sine_positions
 from ssplat_jax.model.network import init_params
 from ssplat_jax.model.views import GRID_STRIDE, back_project, nearest_sources, patch_colors, prepare_views
@@ -160,7 +169,7 @@ def test_positions_project_to_their_cells_at_their_depths():
 
 
 def decoded(m: int = 10, num_members=1, means=None, footprints=None, quats=None, rgbs=None, **changes):
-    config = CONFIG.replace(**changes)
+    config = CONFIG.replace(**{"adaptive": False, **changes})
     given = {"means": means, "footprints": footprints, "quats": quats, "rgbs": rgbs}
     rng = np.random.default_rng(0)
     f32 = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
@@ -173,9 +182,9 @@ def decoded(m: int = 10, num_members=1, means=None, footprints=None, quats=None,
     } | {name: x for name, x in given.items() if x is not None}
     wanted = jax.eval_shape(lambda key: init_params(key, config)["decoder"], jax.random.key(0))
     params = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape), wanted)
-    rest = {name: x for name, x in inputs.items() if name != "feats"}
-    shapes = read_shapes(params, inputs["feats"], config)
-    return decode_tokens(shapes, **rest, num_members=num_members, config=config), inputs
+    rest = {name: x for name, x in inputs.items() if name not in ("feats", "rgbs")}
+    shapes, parts = read_shapes(params, inputs["feats"], config), divide_cells(inputs["rgbs"], config)
+    return decode_tokens(shapes, parts=parts, **rest, num_members=num_members, config=config), inputs
 
 
 def test_untrained_head_gives_a_disc_of_the_patch_color():
@@ -201,7 +210,7 @@ def test_pivot_is_as_opaque_as_its_members_in_one_place():
         params = {"out": {"kernel": jnp.zeros((4, 11)), "bias": raw}, **hidden_layers()}
         one = lambda *shape: jnp.ones((1, *shape))  # noqa: E731
         config = CONFIG.replace(token_width=4)
-        values = {"means": one(3), "rgbs": one(12), "quats": one(4), "footprints": one()}
+        values = {"means": one(3), "parts": divide_cells(one(48), config), "quats": one(4), "footprints": one()}
         shapes = read_shapes(params, one(4), config)
         return decode_tokens(shapes, **values, num_members=n, config=config).opacities[0]
 
@@ -236,6 +245,52 @@ def test_gaussians_of_a_token_project_to_their_parts(per_token):
     columns, rows = np.floor(parts).astype(int).transpose(2, 0, 1)
     wanted = pooled[np.arange(3)[:, None], rows, columns]
     np.testing.assert_allclose(0.5 + SH_C0 * gaussians.sh[:, 0].reshape(3, -1, 3), wanted, atol=1e-5)
+
+
+def divided(patch: np.ndarray) -> dict[tuple[int, int], tuple[int, np.ndarray]]:
+    """Side and color of each part of a patch of 4 x 4 colors, by its first row and column: from coarse to fine."""
+    colors = {side: patch.reshape(4 // side, side, 4 // side, side, 3).mean(axis=(1, 3)) for side in (1, 2, 4)}
+    finer = lambda side: colors[side // 2] - np.repeat(np.repeat(colors[side], 2, axis=0), 2, axis=1)  # noqa: E731
+    side = 4
+    if np.sqrt(np.mean(finer(4) ** 2)) >= MIN_DETAIL[2]:
+        side = 2
+    if np.sqrt(np.mean(finer(2) ** 2)) >= MIN_DETAIL[1]:
+        side = 1
+    return {(r, c): (side, colors[side][r // side, c // side]) for r in range(0, 4, side) for c in range(0, 4, side)}
+
+
+def test_a_patch_is_divided_as_its_detail_asks():
+    rng = np.random.default_rng(0)
+    coarse = np.repeat(np.repeat(rng.normal(size=(400, 2, 2, 3)), 2, axis=1), 2, axis=2)
+    patches = 0.5 + rng.choice([0.0, 0.02, 0.1], (400, 1, 1, 1)) * coarse
+    patches += rng.choice([0.0, 0.02, 0.1], (400, 1, 1, 1)) * rng.normal(size=(400, 4, 4, 3))
+    parts = divide_cells(jnp.asarray(patches.reshape(400, -1), jnp.float32), CONFIG)
+    sides = set()
+    for i, patch in enumerate(patches):
+        wanted = divided(patch)
+        present = np.asarray(parts.present[i]).reshape(4, 4)
+        assert set(zip(*np.nonzero(present), strict=True)) == set(wanted)
+        for (row, column), (side, color) in wanted.items():
+            sides.add(side)
+            place = 4 * row + column
+            assert float(parts.growth[i]) == side
+            np.testing.assert_allclose(parts.colors[i, place], color, atol=1e-5)
+            center = [(column + side / 2) / 4 - 0.5, (row + side / 2) / 4 - 0.5]
+            np.testing.assert_allclose([parts.right[i, place], parts.down[i, place]], center, atol=1e-6)
+    assert sides == {1, 2, 4}
+
+
+def test_a_patch_of_four_colors_becomes_the_gaussians_of_four_a_token():
+    """And one of a single color that of one a token: only the detail of a patch is spared, not its shape."""
+    rng = np.random.default_rng(0)
+    for side in (1, 2):
+        colors = jnp.asarray(rng.uniform(size=(10, side, side, 3)), jnp.float32)
+        fine = jnp.repeat(jnp.repeat(colors, 4 // side, axis=1), 4 // side, axis=2)
+        same = {"quats": jnp.asarray(rng.normal(size=(10, 4)), jnp.float32), "footprints": jnp.full(10, 0.1)}
+        got, _ = decoded(rgbs=fine.reshape(10, -1), gaussians_per_token=16, adaptive=True, **same)
+        wanted, _ = decoded(rgbs=colors.reshape(10, -1), gaussians_per_token=side**2, **same)
+        shown = jax.tree.map(np.asarray, present_gaussians(got, 10 * side**2))
+        jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-5, atol=1e-6), shown, wanted)
 
 
 def hidden_layers():
