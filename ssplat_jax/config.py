@@ -109,12 +109,12 @@ class HeadConfig(ConfigGroup):
     """Gaussians of a token."""
 
     # One color per patch of 4 x 4 pixels left a quarter of the squared error within patches: 22.83 instead of 24.13 dB.
-    gaussians_per_token: Literal[1, 4, 16] = 16
+    gaussians_per_token: Literal[1, 4, 16] = 4
     """Gaussians in a square over the token's cell, each with the mean color of its part of the patch (ours; 1 is
     literal)."""
-    # A wall needs no more than one. All 16 everywhere cost three times as many Gaussians and lose 0.2 dB over black.
-    adaptive: bool = True
-    """A smooth patch takes fewer, larger Gaussians: 1, 4 or 16 by its detail (ours)."""
+    # Off until the evidence head is trained for it: a wall needs no more than one, a bookshelf all 16.
+    adaptive: bool = False
+    """A smooth patch takes fewer, larger Gaussians, as its detail allows (ours); made for 16 a token."""
     sh_degree: int = 0
     """Degree of the spherical harmonics of colors."""
     # A feature that was written with its token does not know which pivots later views confirm: 0.76 dB more.
@@ -265,7 +265,7 @@ PAPER = StreamConfig(
     network=ResplatConfig(),
     history=HistoryConfig(hpda=True, cgfi=True),
     memory=MemoryConfig(voxel_size=0.04, carving=False, overflow="drop_new", capacity=1 << 18),
-    head=HeadConfig(gaussians_per_token=1, adaptive=False, sh_degree=3, evidence=False),
+    head=HeadConfig(gaussians_per_token=1, sh_degree=3, evidence=False),
     stream=StreamingConfig(scene_scale=1.0, chunk_step=0.0, match_exposure=False, causal=True),
     additions=LITERAL,
 )

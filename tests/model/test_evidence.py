@@ -21,7 +21,7 @@ from ssplat_jax.model.network import init_params
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.model.views import TokenShapes
 
-CONFIG = preset("tiny").replace(capacity=128, gaussians_per_token=4, adaptive=False)
+CONFIG = preset("tiny").replace(capacity=128)
 NUM = 5
 
 

@@ -169,7 +169,7 @@ def test_positions_project_to_their_cells_at_their_depths():
 
 
 def decoded(m: int = 10, num_members=1, means=None, footprints=None, quats=None, rgbs=None, **changes):
-    config = CONFIG.replace(**{"adaptive": False, **changes})
+    config = CONFIG.replace(**changes)
     given = {"means": means, "footprints": footprints, "quats": quats, "rgbs": rgbs}
     rng = np.random.default_rng(0)
     f32 = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
@@ -210,7 +210,7 @@ def test_pivot_is_as_opaque_as_its_members_in_one_place():
         params = {"out": {"kernel": jnp.zeros((4, 11)), "bias": raw}, **hidden_layers()}
         one = lambda *shape: jnp.ones((1, *shape))  # noqa: E731
         config = CONFIG.replace(token_width=4)
-        values = {"means": one(3), "parts": divide_cells(one(48), config), "quats": one(4), "footprints": one()}
+        values = {"means": one(3), "parts": divide_cells(one(12), config), "quats": one(4), "footprints": one()}
         shapes = read_shapes(params, one(4), config)
         return decode_tokens(shapes, **values, num_members=n, config=config).opacities[0]
 
@@ -264,7 +264,8 @@ def test_a_patch_is_divided_as_its_detail_asks():
     coarse = np.repeat(np.repeat(rng.normal(size=(400, 2, 2, 3)), 2, axis=1), 2, axis=2)
     patches = 0.5 + rng.choice([0.0, 0.02, 0.1], (400, 1, 1, 1)) * coarse
     patches += rng.choice([0.0, 0.02, 0.1], (400, 1, 1, 1)) * rng.normal(size=(400, 4, 4, 3))
-    parts = divide_cells(jnp.asarray(patches.reshape(400, -1), jnp.float32), CONFIG)
+    config = CONFIG.replace(gaussians_per_token=16, adaptive=True)
+    parts = divide_cells(jnp.asarray(patches.reshape(400, -1), jnp.float32), config)
     sides = set()
     for i, patch in enumerate(patches):
         wanted = divided(patch)
