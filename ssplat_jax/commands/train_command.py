@@ -25,7 +25,7 @@ class Train:
     """
 
     out: Path
-    """Folder of the log, the saved state and, at the end, weights.npz."""
+    """Folder of the log, the checkpoints and, at the end, weights.npz."""
     preset: str | None = None
     """Preset of the configuration. Default: the configuration of --init-weights; without that, tiny."""
     recipe: Literal["tiny", "depth", "stream", "evidence", "paper"] = "tiny"
@@ -47,7 +47,7 @@ class Train:
     validate_every: int = 200
     """Steps between scores of held-out frames of --captures, in the log."""
     save_every: int = 200
-    """Steps between saved states."""
+    """Steps between checkpoints."""
     set: ConfigChanges = ()
     quiet: QuietOption = False
 

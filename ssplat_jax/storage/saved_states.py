@@ -5,12 +5,13 @@ stored without their unoccupied rows, which hold zeros.
 """
 
 import contextlib
-import functools
+import hashlib
 import json
 import os
+import shutil
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -25,14 +26,13 @@ from ssplat_jax.cache.state import (
     VoxelCache,
     require_single_cache,
 )
-from ssplat_jax.core.atomic import previous_path
+from ssplat_jax.core.atomic import previous_path, write_atomic
 from ssplat_jax.core.errors import InputError, StorageError
 from ssplat_jax.storage.files import load_arrays, save_arrays
 
-KIND, TRAINING_KIND = "stream state 1", "training state 1"
+KIND = "stream state 1"
 
-T = TypeVar("T")
-
+_DIGEST = "sha256"  # name of the digest among the leaves of a checkpoint, which are numbered
 _ROW_FIELDS = ("voxels", "counts", *PIVOT_FIELDS, *OPTIONAL_PIVOT_FIELDS)  # arrays with one row per voxel
 _GROUPS = {"stats": CacheStats, "stored_depths": StoredDepths, "key_views": KeyViews}  # parts with fields of their own
 
@@ -78,17 +78,11 @@ def load_newest_state(path: Path) -> tuple[VoxelCache, dict[str, Any], StorageEr
     Raises:
         StorageError: neither file can be read; the message is about the newest.
     """
-    (cache, header), damage = _newest(path, load_state)
-    return cache, header, damage
-
-
-def _newest(path: Path, load: Callable[[Path], T]) -> tuple[T, StorageError | None]:
-    """What `load` reads from the newest file, or from the previous one with the error of the newest."""
     try:
-        return load(path), None
+        return *load_state(path), None
     except StorageError as error:
         with contextlib.suppress(StorageError):
-            return load(previous_path(path)), error
+            return *load_state(previous_path(path)), error
         raise
 
 
@@ -111,54 +105,106 @@ def restore_previous(path: Path) -> None:
 
 
 class TrainingCheckpoints:
-    """The state of a training in `<directory>/state.npz`, and the one before it.
+    """Training states in a directory, saved with Orbax, beside the description of the run; the last two are kept.
 
     Args:
         directory: created if missing.
-        description: JSON-serializable facts that determine the training, such as the recipe and the configuration.
+        description: JSON-serializable facts that determine the run, such as the recipe and the model configuration. A
+            directory with another description is refused.
+
+    Raises:
+        InputError: the directory holds another run.
+        StorageError: its recipe.json is damaged.
     """
 
     def __init__(self, directory: Path, description: dict) -> None:
-        self.path, self._description = Path(directory) / "state.npz", json.loads(json.dumps(description))
+        self.directory, recipe = Path(directory).resolve(), Path(directory) / "recipe.json"
+        text = json.dumps(description, indent=1, sort_keys=True)
+        if not recipe.exists():
+            write_atomic(recipe, text.encode())
+        try:
+            difference = first_difference(json.loads(recipe.read_text()), json.loads(text))
+        except ValueError as error:
+            raise StorageError(f"{recipe}: damaged; restore it or choose another --out.") from error
+        if difference is not None:
+            name, held, wanted = difference
+            raise InputError(
+                f"{recipe}: this directory holds a run with {name} = {held!r}, wanted {wanted!r}; choose another --out,"
+                " or repeat the old options with the old files."
+            )
 
     def save(self, step: int, state: Any) -> None:
-        """Saves a pytree of arrays as the state after `step`; the state before it is kept too.
+        """Saves a pytree of arrays as the state after `step`; the state before it is kept too."""
+        import orbax.checkpoint as ocp
 
-        Raises:
-            StorageError: the file cannot be written.
-        """
         leaves = {f"{i:04d}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(state))}
-        header = {"step": step, "training": self._description}
-        save_arrays(self.path, leaves, TRAINING_KIND, header, keep_previous=True)
+        with self._manager() as manager:
+            try:
+                manager.save(step, args=ocp.args.StandardSave(leaves | {_DIGEST: _digest(leaves)}))
+                manager.wait_until_finished()
+            except (OSError, ValueError) as error:
+                raise StorageError(f"{self.directory}: could not save step {step}: {error}") from error
 
     def restore_latest(self, like: Any, warn: Callable[[str], None]) -> tuple[int, Any] | None:
-        """(step, state) of the newest intact state, or None if there is none.
+        """(step, state) of the newest intact checkpoint, or None if there is none.
 
         Args:
             like: a state of the same structure, shapes and types.
-            warn: called with a message if the newest is damaged; it is kept as `state.npz.damaged`.
+            warn: called with a message for each damaged checkpoint, which is moved to `damaged-<step>`.
 
         Raises:
-            InputError: the directory holds another training.
-            StorageError: no state can be read, or it is of another version of the package.
+            StorageError: all checkpoints are damaged or of other shapes; they are left in place.
         """
-        if not (self.path.exists() or previous_path(self.path).exists()):
-            return None
-        (arrays, header), damage = _newest(self.path, functools.partial(load_arrays, kind=TRAINING_KIND))
-        if (difference := first_difference(header["training"], self._description)) is not None:
-            name, held, wanted = difference
-            raise InputError(
-                f"{self.path}: this directory holds a run with {name} = {held!r}, wanted {wanted!r}; choose another"
-                " --out, or repeat the old options with the old files."
+        with self._manager() as manager:
+            steps = sorted(manager.all_steps(), reverse=True)
+            for number, step in enumerate(steps):
+                if (state := _restore(manager, step, like)) is None:
+                    continue
+                for damaged in steps[:number]:
+                    warn(f"{self.directory}: checkpoint {damaged} is damaged; continuing from step {step}.")
+                    aside = self.directory / f"damaged-{damaged}"
+                    shutil.rmtree(aside, ignore_errors=True)
+                    os.replace(self.directory / "checkpoints" / str(damaged), aside)
+                return step, state
+        if steps:
+            raise StorageError(
+                f"{self.directory}: checkpoints {', '.join(map(str, steps))} are damaged or of another version; choose"
+                " another --out."
             )
-        leaves, structure = jax.tree.flatten(like)
-        held = [arrays[name] for name in sorted(arrays)]
-        if [(x.shape, x.dtype) for x in held] != [(x.shape, x.dtype) for x in leaves]:
-            raise StorageError(f"{self.path}: the state is of another version; choose another --out.")
-        if damage is not None:
-            warn(f"{damage} Continuing from the state saved before it, after step {header['step']}.")
-            restore_previous(self.path)
-        return header["step"], jax.tree.unflatten(structure, map(jnp.asarray, held))
+        return None
+
+    def _manager(self):
+        import orbax.checkpoint as ocp  # takes seconds, which no stream needs
+
+        options = ocp.CheckpointManagerOptions(max_to_keep=2, create=True, enable_async_checkpointing=False)
+        return ocp.CheckpointManager(self.directory / "checkpoints", options=options)
+
+
+def _restore(manager: Any, step: int, like: Any) -> Any | None:
+    """The state of a checkpoint; None if it is damaged."""
+    import orbax.checkpoint as ocp
+
+    wanted, treedef = jax.tree.flatten(like)
+    abstract = {f"{i:04d}": jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for i, leaf in enumerate(wanted)}
+    abstract[_DIGEST] = jax.ShapeDtypeStruct((32,), np.uint8)
+    try:
+        held = manager.restore(step, args=ocp.args.StandardRestore(abstract))
+    except Exception:  # a damaged checkpoint can make Orbax raise anything
+        return None
+    leaves = {name: np.asarray(leaf) for name, leaf in held.items() if name != _DIGEST}
+    ordered = [leaves[name] for name in sorted(leaves)]
+    is_like = [(x.shape, x.dtype) for x in ordered] == [(x.shape, x.dtype) for x in wanted]  # Orbax does not insist
+    if not is_like or not np.array_equal(held[_DIGEST], _digest(leaves)):
+        return None
+    return jax.tree.unflatten(treedef, map(jnp.asarray, ordered))
+
+
+def _digest(leaves: dict[str, np.ndarray]) -> np.ndarray:
+    """sha256 of types, shapes and values: Orbax reads an array with a flipped bit without complaint."""
+    digest = hashlib.sha256()
+    for name, leaf in sorted(leaves.items()):
+        digest.update(f"{name} {leaf.dtype} {leaf.shape}".encode() + leaf.tobytes())
+    return np.frombuffer(digest.digest(), np.uint8)
 
 
 def first_difference(held: Any, wanted: Any, name: str = "") -> tuple[str, Any, Any] | None:

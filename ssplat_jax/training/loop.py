@@ -179,12 +179,12 @@ def train(
     Args:
         config: model configuration.
         recipe: phases and optimizer.
-        out: directory of `log.jsonl` and `state.npz`.
+        out: directory of `log.jsonl`, `recipe.json` and `checkpoints/`.
         params: initial parameters; default random ones from the recipe's seed. A run is resumed with the same ones.
         init_weights: name of `params` in the description of the run; default their digest.
         mix: captures to learn from, beside procedural scenes.
         lpips_weights: weights of LPIPS, which rendering losses then include.
-        save_every: steps between saved states. SIGINT and SIGTERM save one too.
+        save_every: steps between checkpoints. SIGINT and SIGTERM save one too.
         validate_every: steps between scores of held-out frames of the captures.
         log_every: steps between log records, which hold means over these steps, and with which `report` is called.
         report, say, warn: called with records, with messages while samples are prepared, and with warnings.
