@@ -69,7 +69,8 @@ def image_flags(path: Path) -> tuple[bool, bool]:
     """Returns whether an image file may have transparent pixels, and whether EXIF says that it is not upright."""
     with _open(path) as image:
         with reading(path, REPLACE):
-            orientation = image.getexif().get(ORIENTATION, UPRIGHT)
+            # Not `image.getexif()`, which decodes a whole PNG to find what may follow its pixels.
+            orientation = Image.Image.getexif(image).get(ORIENTATION, UPRIGHT)
         return image.has_transparency_data, orientation in range(2, 9)
 
 
