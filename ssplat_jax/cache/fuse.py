@@ -106,7 +106,7 @@ def saturating_add(counter: Int[Array, ""], more: Int[Array, ""]) -> Int[Array, 
 
 
 def _classify(stats: CacheStats, tokens: Tokens, in_range, config: StreamConfig):
-    """Which tokens are accepted, and the counters with each rejected one under one reason."""
+    """The mask of accepted tokens, and the counters with each rejected one under one reason."""
     finite = jnp.isfinite(tokens.confidences) & jnp.isfinite(tokens.footprints) & (tokens.footprints > 0)
     for x in (tokens.means, tokens.feats, tokens.rgbs, tokens.quats):
         finite &= jnp.all(jnp.isfinite(x), axis=-1)

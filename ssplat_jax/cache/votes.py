@@ -1,4 +1,4 @@
-"""What views say about pivots: votes on their confidence, and observations that the decoder reads.
+"""Views judge pivots: they vote on the confidence, and leave observations that the decoder reads.
 
 Both are additions to the paper's VACC, which never forgets a wrong pivot: a floater of one view hides the scene from
 every other view. A confidence is read as the probability that a surface is there. Every trusted cell that a pivot or a

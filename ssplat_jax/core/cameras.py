@@ -16,7 +16,7 @@ ROUNDING = 1e-3
 """Difference of a rotation's product with its transpose from the identity that counts as rounding."""
 
 Law = tuple[str, str, bool, Any]
-"""What a camera must be, what to do, whether a renderer can do without it, and a mask of the cameras that are so."""
+"""A rule for cameras: its words, the remedy, True if a renderer can do without it, and a mask of those that keep it."""
 
 
 @pytree

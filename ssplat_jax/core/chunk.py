@@ -11,7 +11,7 @@ from ssplat_jax.core.errors import InputError, refusal
 from ssplat_jax.core.pytree import pytree
 
 COLOR_MARGIN = 1e-3
-"""How far colors may leave [0, 1], as rounding and resampling take them."""
+"""Largest distance of a color from [0, 1] that counts as rounding or resampling."""
 
 
 @pytree
@@ -27,9 +27,7 @@ class Chunk:
     valid: Bool[Array, "*t v"]  # False for padding
     near: Float[Array, "*t"]  # nearest depth candidate, stream units
     far: Float[Array, "*t"]  # farthest depth candidate, stream units
-    seen: Bool[Array, "*t v h w"] | None = (
-        None  # False: pixels that are masked out, which give no tokens; None: all count
-    )
+    seen: Bool[Array, "*t v h w"] | None = None  # False for masked pixels, which give no tokens; None: all count
 
     @property
     def camera(self) -> Camera:
@@ -59,7 +57,7 @@ def usable_views(chunk: Chunk) -> Bool[Array, " v"]:
 
 
 def usable_range(near, far):
-    """Whether depths can be searched between `near` and `far`: positive, finite and in order."""
+    """True if depths can be searched between `near` and `far`: positive, finite and in order."""
     return (near > 0) & (near <= far) & (far < np.inf)
 
 

@@ -27,7 +27,7 @@ class Gaussians:
     render_mode: str = static(default="mip")
     """The renderer that the scene is made for: `mip`, 3DGS with the 2D Mip filter (ours); `default`, 3DGS; `2dgs`."""
     offset: tuple[float, float, float] = static(default=(0.0, 0.0, 0.0))
-    """What is to be added to `means`, which float32 could not hold of a scene far from its origin."""
+    """Origin of `means` in the frame of the scene: float32 cannot hold places far from zero."""
 
     @staticmethod
     def from_rgb(

@@ -180,7 +180,7 @@ class Capture:
 
     @functools.cached_property
     def is_masked(self) -> bool:
-        """Whether some frame has pixels that may not count."""
+        """True if some frame has pixels that may not count."""
         return any(frame.is_masked for frame in self.frames)
 
     def seen(self, i: int) -> Bool[np.ndarray, "h w"] | None:

@@ -181,9 +181,9 @@ class Crop:
 
     def mask(self, counts: Float32[np.ndarray, "h w"]) -> Bool[np.ndarray, "hc wc"]:
         """Crops and resizes a map of pixels that count (1); those count of which hardly any part does not."""
-        if not self.is_identity:
-            counts = self._resized(counts, counts.shape[::-1], Image.Resampling.BILINEAR)
-        return counts > 0.95 if not self.is_identity else counts > 0.5
+        if self.is_identity:
+            return counts > 0.5
+        return self._resized(counts, counts.shape[::-1], Image.Resampling.BILINEAR) > 0.95
 
     def _resized(self, channel: np.ndarray, stored: tuple[int, int], resample: Image.Resampling) -> np.ndarray:
         sx, sy = channel.shape[1] / stored[0], channel.shape[0] / stored[1]

@@ -103,7 +103,7 @@ def decode_tokens(
 
 @pytree
 class Parts:
-    """How the cells of `m` tokens are divided into at most `g` Gaussians each, row by row."""
+    """The Gaussians into which the cells of `m` tokens are divided, at most `g` each, row by row."""
 
     colors: Float[Array, "m g 3"]
     right: Float[Array, "m g"]  # place of the center in its cell, in cells

@@ -27,7 +27,7 @@ from ssplat_jax.evaluation.psnr_ssim import psnr
 from ssplat_jax.rasterizer import Effects, fill_holes, render
 from ssplat_jax.runs.open_run import load_run
 from ssplat_jax.runs.run_poses import open_capture_of_scene
-from ssplat_jax.scene_files.formats import READERS, ExportReport, check_format, file_axes, load_scene, save_gaussians
+from ssplat_jax.scene_files.formats import READERS, ExportReport, file_axes, load_scene, save_gaussians
 from ssplat_jax.storage.chunk_records import load_chunk_records
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.streaming.feed import Exposures, middle_exposure
@@ -170,29 +170,21 @@ def export_scene(
     return save_gaussians(to, shown, start_camera=start, **options), turn
 
 
-def export_run(
-    run_dir: Path, to: Path, params: dict, reporter: Reporter, max_splats: int | None = None
-) -> ExportReport:
-    """Decodes the saved state of a run and writes its scene; see `decoded_scene` and `save_gaussians`."""
-    check_format(to)
-    return save_gaussians(to, decoded_scene(run_dir, params, reporter), max_splats=max_splats)
-
-
 def difference_in_words(to: Path, views: Views, turn: Float64[np.ndarray, "3 3"]) -> str | None:
-    """How the file, drawn by a plain renderer, differs from our own pictures of it, on `NUM_COMPARED` of the views.
+    """A sentence on how a plain renderer's pictures of the file differ from ours, on `NUM_COMPARED` of the views.
 
     A plain renderer has the dilation of 3DGS, shows holes black, and one exposure. We draw with the filter that the
     file names, fill holes, and follow the exposures of the views. None for formats that are not read.
     """
     if to.suffix not in READERS:
         return None
-    scene, scores, holes = load_scene(to), [], []
-    scene = replace(scene, offset=(0.0, 0.0, 0.0))
+    written, scores, holes = load_scene(to), [], []
+    scene = replace(written, offset=(0.0, 0.0, 0.0))
     chosen = evenly_spread(len(views.camtoworlds), NUM_COMPARED)
     for k in chosen:
         pose = views.camtoworlds[k].copy()
         pose[:3] = turn @ pose[:3]
-        pose[:3, 3] -= load_scene(to).offset
+        pose[:3, 3] -= written.offset
         viewmat, K = (jnp.asarray(x, jnp.float32) for x in (invert_pose(pose), views.Ks[k]))
         camera = Camera(viewmats=viewmat, Ks=K, width=views.size[0], height=views.size[1])
         ours, plain = (render(scene, camera, effects=Effects(antialias=name)) for name in (None, "classic"))

@@ -30,7 +30,7 @@ TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}  # by number of columns
 HALF_TURN = [0.0, 0.0, 1.0, 0.0]  # quaternion xyzw of 180 degrees about z
 AXIS_FLIP = np.diag([-1.0, -1.0, 1.0])  # from the axes of glTF, y up, to those of a .ply: undoes `HALF_TURN`
 MEANING = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "projection": "perspective"}
-"""What the extension may say of Gaussians for them to be ours; others are drawn otherwise."""
+"""Values of the extension with which Gaussians are drawn as ours are; others are refused."""
 
 
 def encode_glb(rows: SplatRows) -> bytes:

@@ -41,7 +41,7 @@ SIZES, RECORD = struct.Struct("<QQ"), struct.Struct("<II")
 ANTIALIASED, HAS_RECORDS = 1, 2  # flags: made for a renderer with the 2D Mip filter; there are records
 AXES_RECORD = 0xADBE0003
 AXES = "RUB LDB RDB LUB RUB LDF RDF LUF RUF LFD RFD LFU RFU LBD RBD LBU RBU".split()  # noqa: SIM905
-"""Where x, y and z point in the axes that a record names by number: left or right, up or down, front or back."""
+"""Directions of x, y and z, by the number in a record: left or right, up or down, front or back."""
 DIRECTIONS = {"R": (1, 0, 0), "L": (-1, 0, 0), "D": (0, 1, 0), "U": (0, -1, 0), "F": (0, 0, 1), "B": (0, 0, -1)}
 COMPRESSION = 12  # level of zstd
 POSITION_BITS = 24
@@ -158,7 +158,7 @@ def _read_stream(data: bytes):
 
 
 def _read_frames(data: bytes):
-    """What `_read_stream` gives, of version 4."""
+    """Parts of a file of version 4, as `_read_stream` gives those of older ones."""
     _, version, count, degree, fractional_bits, flags, num_frames, table = HEADER.unpack_from(data)
     widths, axes, place = _widths(version, degree), "RUB", HEADER.size
     if version != 4 or not HEADER.size <= table <= len(data) or num_frames not in (5 + (degree > 0), 6):

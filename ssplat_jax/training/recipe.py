@@ -102,7 +102,7 @@ class Recipe:
     ema_decay: float = 0.99
     """Decay of the moving average of the parameters, which is what is evaluated and shipped; 0 averages nothing."""
     captures_alone: bool = False
-    """Whether captures share all steps; else procedural scenes have those that are left."""
+    """True if captures share all steps; else procedural scenes have those that are left."""
     untrained: tuple[str, ...] = ()
     """Stages that start untrained even if the first weights have them. Such a recipe needs first weights."""
 

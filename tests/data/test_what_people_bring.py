@@ -154,7 +154,7 @@ def test_gray_whose_zero_is_white_is_not_inverted(tmp_path):
 
 @pytest.mark.parametrize("orientation", [3, 6])
 def test_an_orientation_that_is_not_applied_is_noted(orientation, tmp_path):
-    """Of half a turn or a square image no size tells."""
+    """The size of an image tells neither half a turn nor, if it is square, a quarter."""
 
     def change(root, meta):
         exif = Image.Exif()

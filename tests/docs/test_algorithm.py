@@ -57,7 +57,7 @@ def named_functions(text: str) -> set[str]:
 
 
 def has_field(name: str) -> bool:
-    """Whether the configuration of some network has a field of this full or short name."""
+    """True if the configuration of some network has a field of this full or short name."""
     for kind in NETWORK_CONFIGS:
         try:
             StreamConfig().replace(network=kind).find(name)

@@ -27,7 +27,7 @@ def commands_of(page) -> list[str]:
 
 
 def is_complete(command: str) -> bool:
-    """Whether a command can be typed as it stands: no ellipsis, no alternatives, no placeholder value."""
+    """True if a command can be typed as it stands: no ellipsis, no alternatives, no placeholder value."""
     return not re.search(r"\.\.\.|\||\[|\bNAME\b|=( |$)", command)
 
 

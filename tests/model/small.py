@@ -145,7 +145,7 @@ def history(depths, confidences, feats=None, mask=None, colors=None) -> Projecte
 
 
 def finite(tree) -> bool:
-    """Whether every float of the tree is finite."""
+    """True if every float of the tree is finite."""
     return all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(tree) if jnp.issubdtype(leaf.dtype, jnp.floating))
 
 

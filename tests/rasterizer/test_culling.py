@@ -1,4 +1,4 @@
-"""What is left out of an image: tiles without a visible sample, capped opacities' gradients, points behind a fold."""
+"""Culling leaves out of an image: tiles without a visible sample, capped opacities' gradients, points behind a fold."""
 
 import jax
 import jax.numpy as jnp
@@ -47,7 +47,7 @@ def binned(gaussians: Gaussians):
 
 
 def touched_tiles(table: np.ndarray) -> np.ndarray:
-    """Whether each row has a pixel of alpha >= 1/255 in each tile, by going through all pixels in float64."""
+    """Mask of the rows and tiles that share a pixel of alpha >= 1/255, from all pixels in float64."""
     x, y, p, q, r, log_opacity = (table[:, i, None].astype(np.float64) for i in range(6))
     pixel_x, touched = np.arange(WIDTH) + 0.5, np.zeros((len(table), GRID.rows, GRID.columns), bool)
     bound = log_opacity - np.log(ALPHA_MIN)

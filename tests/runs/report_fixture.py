@@ -1,4 +1,4 @@
-"""What a report is made of: pictures, scores and records."""
+"""Parts of a report: pictures, scores and records."""
 
 import numpy as np
 

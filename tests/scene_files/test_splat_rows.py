@@ -1,4 +1,4 @@
-"""Which Gaussians are written: the visible ones, and where there are too many, alike everywhere."""
+"""Visible Gaussians are written, and where there are too many, a selection that is alike everywhere."""
 
 import jax.numpy as jnp
 import numpy as np

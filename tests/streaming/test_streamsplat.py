@@ -90,12 +90,15 @@ def test_dead_and_carved_pivots_are_absent(model, params, looped):
     np.testing.assert_allclose(centers[is_shown], np.asarray(cache.means).reshape(-1, 3)[is_shown], atol=1e-5)
 
 
-def test_a_session_decodes_shown_rows_padded_to_a_power_of_two(model, params, looped, monkeypatch):
+@pytest.mark.parametrize("adaptive", [False, True])
+def test_a_session_decodes_shown_rows_padded_to_a_power_of_two(adaptive, model, params, looped, monkeypatch):
     monkeypatch.setattr("ssplat_jax.streaming.session.MIN_DECODED_PIVOTS", 1)
+    model = StreamSplat(model.config.replace(adaptive=adaptive))
     whole, session = model.decode(params, looped[0]), Session(model, params, looped[0])
     shown, is_shown = session.gaussians(), np.asarray(whole.opacities) > 0
-    num_pivots, num_shown = shown.num_gaussians // model.config.head.gaussians_per_token, is_shown.sum()
-    assert num_pivots & (num_pivots - 1) == 0 and num_shown <= shown.num_gaussians < 2 * num_shown
+    num_shown, most = is_shown.sum(), model.config.head.gaussians_per_token * np.asarray(looped[0].counts).sum()
+    assert (num_shown < most) == adaptive and session.cache_facts()["decoded"] == num_shown
+    assert shown.num_gaussians.bit_count() == 1 and num_shown <= shown.num_gaussians < 2 * num_shown
     for (name, compact), (_, full) in zip(leaves_with_names(shown), leaves_with_names(whole), strict=True):
         np.testing.assert_allclose(compact[:num_shown], full[is_shown], rtol=1e-5, atol=1e-6, err_msg=name)
     assert not np.asarray(shown.opacities)[num_shown:].any()

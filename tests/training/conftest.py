@@ -1,4 +1,4 @@
-"""How the programs of these tests are compiled."""
+"""Compilation of the programs of these tests."""
 
 import jax
 import pytest

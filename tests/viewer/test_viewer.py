@@ -1,4 +1,4 @@
-"""What browsers are sent, where it comes from, and the server."""
+"""Scenes and pictures that browsers are sent, their sources, and the server."""
 
 import json
 import sys

@@ -327,6 +327,18 @@ def images_in(folder: Path, pattern: str = "*") -> list[Path]:
     return [file for file in files_in(folder, pattern) if file.suffix in SUFFIXES]
 
 
+def files_with(path: Path, suffix: str, *words: bytes) -> list[Path]:
+    """Returns the file at `path`, or those in that folder, with a suffix and `words` in the first 2,000 bytes."""
+    files = [path] if path.is_file() else files_in(path, f"*{suffix}")
+    found = []
+    for file in files:
+        if file.suffix == suffix:
+            with file.open("rb") as opened:
+                start = opened.read(2000)
+            found += [file] if all(word in start for word in words) else []
+    return found
+
+
 def stored_size(image: Path, described: tuple[float, float] | None, where: str) -> tuple[tuple[int, int], float]:
     """Returns (width, height) of a stored image, and its size relative to the described one.
 

@@ -23,7 +23,7 @@ from ssplat_jax.data.readers.frame_list import (
     Intrinsics,
     Listing,
     file_named,
-    files_in,
+    files_with,
     images_folder,
     stored_size,
 )
@@ -96,13 +96,5 @@ def _intrinsics(sensor: ElementTree.Element | None, where: str) -> tuple[Intrins
 
 
 def _documents(path: Path) -> list[Path]:
-    """The file at `path`, or those in the folder `path`."""
-    files = [path] if path.is_file() else files_in(path, "*.xml")
-    return [file for file in files if file.suffix == ".xml" and _is_document(file)]
-
-
-def _is_document(file: Path) -> bool:
-    """True if a file begins as Metashape's do."""
-    with file.open("rb") as opened:
-        start = opened.read(2000)
-    return b"<document" in start and b"<chunk" in start
+    """The file at `path`, or those in the folder `path`, that begin as Metashape's do."""
+    return files_with(path, ".xml", b"<document", b"<chunk")

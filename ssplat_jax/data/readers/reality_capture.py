@@ -22,7 +22,7 @@ from ssplat_jax.data.readers.frame_list import (
     Intrinsics,
     Listing,
     file_named,
-    files_in,
+    files_with,
     images_folder,
     stored_size,
 )
@@ -71,13 +71,5 @@ def read(path: Path) -> Listing:
 
 
 def _tables(path: Path) -> list[Path]:
-    """The table at `path`, or those in the folder `path`."""
-    files = [path] if path.is_file() else files_in(path, "*.csv")
-    return [file for file in files if file.suffix == ".csv" and _is_table(file)]
-
-
-def _is_table(file: Path) -> bool:
-    """True if the first line of a file names the columns of cameras."""
-    with file.open("rb") as opened:
-        line = opened.readline(1000).decode("utf-8", "ignore")
-    return "name" in line and all(field in line for field in ("heading", "pitch", "roll"))
+    """The file at `path`, or those in the folder `path`, that begin with the names of a camera's columns."""
+    return files_with(path, ".csv", b"name", b"heading", b"pitch", b"roll")
