@@ -319,6 +319,7 @@ def test_metashapes_cameras_come_back(where, tmp_path):
     chunk[:, :3, :3] = turn.T @ chunk[:, :3, :3]
     chunk[:, :3, 3] = (chunk[:, :3, 3] - shift) @ turn / scale
     (tmp_path / "cameras.xml").write_text(metashape_xml(chunk, (turn, shift, scale), where=where))
+    (tmp_path / "sitemap.xml").write_text("<urlset></urlset>")  # of something else
     capture = open_capture(tmp_path)
     assert capture.format == "Metashape" and len(capture) == 8 and "1 of 9 frames" in capture.notes[0]
     np.testing.assert_allclose(capture.camtoworlds, ring(), atol=1e-5)
