@@ -51,7 +51,8 @@ def random_params(config: StreamConfig, seed: int = 0) -> dict:
         return jnp.asarray(values, jnp.float32)
 
     shapes = jax.eval_shape(StreamSplat(config).init, jax.random.key(0))
-    return jax.tree_util.tree_map_with_path(draw, shapes)
+    with jax.ensure_compile_time_eval():  # the first caller may be inside jit, and `params` keeps what it got
+        return jax.tree_util.tree_map_with_path(draw, shapes)
 
 
 @functools.cache
