@@ -42,8 +42,9 @@ class Export:
         reporter = Reporter(quiet=False)
         folder = RunFolder(self.scene)
         cameras = None if self.cameras is None else export.open_cameras(self.cameras, self.scene, self.to, reporter)
-        file = self.scene if self.scene.is_file() else folder.scene  # the latter in a folder of `ssplat demo`
-        if file.exists() and not folder.has_state():
+        file = self.scene if self.scene.is_file() else folder.best_scene
+        # A run's state is more exact than its scene.ply, and is there before the run ends; `ssplat demo` keeps none.
+        if file.exists() and (file != folder.scene or not folder.has_state()):
             if self.weights != Export.weights:
                 raise InputError(f"--weights: wanted a run, got {self.scene}, which is decoded already; leave it out.")
             scene = load_scene(file)

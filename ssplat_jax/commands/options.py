@@ -32,6 +32,12 @@ PosesOption = Annotated[
 ]
 WeightsOption = Annotated[str, tyro.conf.arg(help="Preset with shipped weights, or a weights file.")]
 ConfigChanges = Annotated[tuple[str, ...], tyro.conf.arg(help="Changes to the configuration, as field=value.")]
+QualityOption = Annotated[
+    Literal["fast", "balanced", "accurate", "best"],
+    tyro.conf.arg(
+        help="Accuracy against time: fast and balanced stream smaller images; best refines the scene after the stream."
+    ),
+]
 QuietOption = Annotated[bool, tyro.conf.arg(help="Print only the closing line.")]
 
 
@@ -143,10 +149,9 @@ class StreamOptions:
     """Image size WxH; default the capture's own. --quality streams smaller ones."""
     stride: int | None = None
     """Use every STRIDE-th frame; default 1. eval without --context (interleaved): such that 73 to 145 are left."""
-    quality: Literal["fast", "balanced", "accurate", "best"] = "accurate"
-    """Accuracy against time: fast and balanced stream smaller images; best refines the scene after the stream."""
+    quality: QualityOption = "accurate"
     refine: int | None = None
-    """Steps of refinement on the streamed views after the stream, default 0, with --quality best 100."""
+    """Steps of refinement on the streamed views after the stream: 100 with --quality best, 0 with the others."""
     online_refine: int = 0
     """Gradient steps on kept views after each chunk, while streaming; later chunks see the refined scene."""
     revise: Literal["poses", "auto"] | None = None

@@ -3,18 +3,19 @@
 import dataclasses
 import sys
 
-from ssplat_jax.commands.options import StreamOptions, parse_size
+from ssplat_jax.commands.options import QualityOption, StreamOptions, parse_size
 from ssplat_jax.commands.refine_command import Refine
 from ssplat_jax.core.errors import InputError
 
 
 @dataclasses.dataclass(frozen=True)
 class Run(StreamOptions):
-    """Stream a capture into a scene: scene.ply in the capture's frame, pictures, metrics.json. Continues a stopped run.
+    """Stream a capture into a scene, scene.ply, and refine it into refined.ply. Continues where it was stopped.
 
     Example: ssplat run path/to/capture --stride 5 --size 320x240 --out runs/kitchen
     """
 
+    quality: QualityOption = "best"
     max_views: int | None = None
     """Stop after this many views."""
     save_every: int = 8

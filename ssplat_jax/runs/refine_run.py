@@ -1,6 +1,7 @@
 """`ssplat refine`: the scene of a finished run, refined on the frames that it was made from; a stop loses no step."""
 
 import dataclasses
+import json
 from pathlib import Path
 from typing import Any
 
@@ -10,12 +11,12 @@ import numpy as np
 
 from ssplat_jax.core.console import WAITING, Reporter
 from ssplat_jax.core.errors import InputError, refusal, require_positive
-from ssplat_jax.evaluation.scoring import score_targets
+from ssplat_jax.evaluation.scoring import mean_scores, score_targets
 from ssplat_jax.refinement.compared_views import FOR_CAPTURES
 from ssplat_jax.refinement.refine import Progress, continue_refinement, key_views_of, report_of, start_refinement
 from ssplat_jax.runs.export_run import save_scene
 from ssplat_jax.runs.open_run import load_run
-from ssplat_jax.runs.run_results import shown_frames
+from ssplat_jax.runs.run_results import picture_views, report_run, shown_frames
 from ssplat_jax.storage.files import load_arrays, save_arrays, write_json
 from ssplat_jax.storage.interrupts import Interrupts
 from ssplat_jax.storage.run_folder import RunFolder, lock_folder
@@ -47,6 +48,9 @@ def refine_run(
     reporter: Reporter,
 ) -> RefineResult:
     """Writes `refined.ply` beside the scene of a run, continuing a refinement that stopped. `scene.ply` stays.
+
+    The pictures and the report of the run become those of the refined scene. An interrupted refinement writes the scene
+    so far.
 
     Args:
         run_dir: folder of a finished `ssplat run`.
@@ -87,13 +91,18 @@ def refine_run(
                 if progress.num_steps % save_every == 0:
                     save_refinement(folder.refinement_state, progress, identity)
             save_refinement(folder.refinement_state, progress, identity)
+            refined = progress.scene(gaussians)
+            save_scene(folder.refined_scene, refined, frame, exposures)  # at the exposure of scene.ply
             if interrupts.received:  # read last: a signal may have come during the save, too
                 return RefineResult(progress.num_steps, {}, {}, interrupts.received)
-        refined, report = progress.scene(gaussians), report_of(progress, key_views, config)
-        save_scene(folder.refined_scene, refined, frame, exposures)  # at the exposure of scene.ply
-        shown = tuple(shown_frames(indices))
-        before, after = (score_targets(scene, capture, shown, frame, exposures) for scene in (gaussians, refined))
+        report = report_of(progress, key_views, config)
+        before = score_targets(gaussians, capture, tuple(shown_frames(indices)), frame, exposures)
+        scores = picture_views(folder, refined, capture, indices, frame, exposures)
+        after = mean_scores(scores)
         write_json(folder.refinement, vars(report) | {"seen_views_before": before, "seen_views_after": after})
+        if folder.metrics.is_file():  # else there is no report to bring up to date
+            metrics = json.loads(folder.metrics.read_text())
+            report_run(folder, metrics, path, run.header["weights"], refined=scores)
     return RefineResult(progress.num_steps, before, after)
 
 

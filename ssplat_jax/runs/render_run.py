@@ -85,7 +85,7 @@ def render_run(
     """
     require_positive(stride=stride, **({} if max_views is None else {"max_views": max_views}))
     require_positive(**({} if film is None else {"film": film.steps}))
-    file = RunFolder(scene).scene if scene.is_dir() else scene
+    file = RunFolder(scene).best_scene if scene.is_dir() else scene
     splats = load_scene(file)
     if splats.render_mode not in FILTERS:
         fix = "render it where it was made"

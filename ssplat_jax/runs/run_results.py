@@ -10,10 +10,13 @@ from typing import Any
 import numpy as np
 
 from ssplat_jax.core.console import Reporter
+from ssplat_jax.core.gaussians import Gaussians
+from ssplat_jax.data.capture import Capture
+from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.evaluation.cost import peak_memory
 from ssplat_jax.evaluation.pictures import evenly_spread, save_comparison
 from ssplat_jax.evaluation.report_page import Report, save_report
-from ssplat_jax.evaluation.scoring import exposures_to_json, score_view
+from ssplat_jax.evaluation.scoring import ViewScore, exposures_to_json, score_view
 from ssplat_jax.runs.export_run import save_scene
 from ssplat_jax.runs.open_run import Run
 from ssplat_jax.scene_files.formats import ExportReport
@@ -21,7 +24,7 @@ from ssplat_jax.storage.chunk_records import ChunkRecord, load_chunk_records
 from ssplat_jax.storage.files import write_json
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.storage.weights import load_params, params_digest
-from ssplat_jax.streaming.feed import middle_exposure
+from ssplat_jax.streaming.feed import Exposures, middle_exposure
 
 NUM_PICTURES = 8
 """Streamed views, evenly spread, that are rendered from the finished scene."""
@@ -33,8 +36,8 @@ NOTE = "Left to right: the photograph, the rendered view, its depth (light near,
 SHOWN = "holes filled, at the exposure of the nearest streamed views"
 
 FILES = (
-    ("scene.ply", "the scene, in the frame and units of the capture, at the middle exposure of its views"),
-    ("refined.ply", "the refined scene"),
+    ("scene.ply", "the streamed scene, in the frame and units of the capture, at the middle exposure of its views"),
+    ("refined.ply", "the refined scene, in the same frame"),
     ("metrics.json", "every figure of this page, and more"),
     ("views", "pictures of streamed views"),
     ("chunks", "a record of every chunk: cameras, exposures, time, occupancy"),
@@ -61,28 +64,24 @@ def finish_run(run: Run, path: str, reporter: Reporter) -> ExportReport:
         reporter.warn(f"{folder.scene.name}: {report.warning}")
     reporter.say(f"{folder.scene} is written; pictures and figures follow")
     folder.clear_views()
-    shown, scores = shown_frames(run.indices), []
-    for i in shown:
-        view = score_view(gaussians, capture, i, frame, run.exposures)
-        scores.append(dataclasses.asdict(view.score))
-        save_comparison(folder.view(i), view.target, view.color, view.depth, (frame.near, frame.far))
+    scores = picture_views(folder, gaussians, capture, run.indices, frame, run.exposures)
+    middle = capture.camera(run.indices[len(run.indices) // 2], frame)
     metrics = {
         "capture": capture.name,
         "size": [capture.width, capture.height],
         "views": run.num_views,
         "exposures": exposures_to_json(run.exposures),
         "scene_exposure": middle_exposure(run.exposures).tolist(),  # of scene.ply, relative to the first views
-        "seen_views": scores,  # of streamed views: how well the scene explains its input
+        "seen_views": list(map(dataclasses.asdict, scores)),  # of streamed views: how well the scene explains its input
         "ply": dataclasses.asdict(report),
         "compile_s": round(run.session.compile_seconds, 2),
         "step_memory_bytes": run.session.step_memory_bytes,  # None if all views were streamed before this call
-        "peak_memory_bytes": peak_memory(run.session, capture.camera(shown[len(shown) // 2], frame)).bytes,
+        "peak_memory_bytes": peak_memory(run.session, middle).bytes,
         "cache": run.session.cache_facts(),
         "stream_frame": frame.to_dict(),
         "config_hash": run.session.model.config.hash,
     }
-    is_shipped = run.weights == params_digest(load_params("tiny"))
-    report_run(folder, metrics, path, weights="" if is_shipped else " --weights WEIGHTS")
+    report_run(folder, metrics, path, run.weights)
     write_json(folder.metrics, metrics)
     return report
 
@@ -90,6 +89,27 @@ def finish_run(run: Run, path: str, reporter: Reporter) -> ExportReport:
 def shown_frames(indices: Sequence[int]) -> list[int]:
     """A few of the frames, evenly spread."""
     return [indices[k] for k in evenly_spread(len(indices), NUM_PICTURES)]
+
+
+def picture_views(
+    folder: RunFolder,
+    gaussians: Gaussians,
+    capture: Capture,
+    indices: Sequence[int],
+    frame: StreamFrame,
+    exposures: Exposures,
+) -> list[ViewScore]:
+    """Scores of a few of the streamed frames, with a picture of each in `views/`: photograph, scene and depth.
+
+    Raises:
+        StorageError: a picture cannot be written.
+    """
+    scores = []
+    for i in shown_frames(indices):
+        view = score_view(gaussians, capture, i, frame, exposures)
+        save_comparison(folder.view(i), view.target, view.color, view.depth, (frame.near, frame.far))
+        scores.append(view.score)
+    return scores
 
 
 def finished_scene(folder: RunFolder, num_views: int) -> int | None:
@@ -106,32 +126,39 @@ def finished_scene(folder: RunFolder, num_views: int) -> int | None:
         return None
 
 
-def report_run(folder: RunFolder, metrics: dict[str, Any], path: str, weights: str = "") -> None:
+def report_run(
+    folder: RunFolder, metrics: dict[str, Any], path: str, weights: str, refined: list[ViewScore] | None = None
+) -> None:
     """Writes the report of a run, whose folder is complete but for it and the metrics.
 
     Args:
         folder: the folder of the run.
         metrics: its metrics.
         path: the capture, as the user gave it.
-        weights: text to add to commands that need the weights, such as ` --weights WEIGHTS`; empty for `tiny`.
+        weights: digest of the weights that streamed it.
+        refined: scores of the same views after a refinement, whose pictures lie in the folder; None without one.
     """
-    records, scores = load_chunk_records(folder.chunk_record_files()), metrics["seen_views"]
+    records, streamed = load_chunk_records(folder.chunk_record_files()), metrics["seen_views"]
+    scores = streamed if refined is None else [dataclasses.asdict(score) for score in refined]
     width, height = metrics["size"]
-    shown = np.mean([score["shown"]["psnr"] for score in scores])
+    mean_shown = lambda scores: f"{np.mean([score['shown']['psnr'] for score in scores]):.2f} dB"  # noqa: E731
     facts = [
         ("views streamed", f"{metrics['views']}"),
         ("Gaussians in the scene", f"{metrics['ply']['num_written']:,}"),
-        (f"streamed views as shown, mean of {len(scores)}", f"{shown:.2f} dB"),
+        (f"streamed views as shown, mean of {len(scores)}", mean_shown(scores)),
     ]
+    if refined is not None:
+        facts.append(("the same before refinement", mean_shown(streamed)))
     if records:
         facts.append(("a chunk, median", f"{np.median([r.seconds for r in records]):.2f} s"))
         facts.append(("of the cache in use", f"{records[-1].occupancy:.0%}"))
     if held_back := [r.held_back_psnr for r in records if r.held_back_psnr is not None]:
         facts.append(("held-back views as shown", f"{held_back[-1]:.2f} dB"))
+    weights = "" if weights == params_digest(load_params("tiny")) else " --weights WEIGHTS"
     out, capture, film = map(shlex.quote, (str(folder.path), path, f"{folder.path}_film"))
     commands = [
         f"ssplat view {out}    # in a browser",
-        f"ssplat refine {out} {capture} --steps 100{weights}    # changes the scene until it fits its views better",
+        f"ssplat refine {out} {capture} --steps 200 --overwrite{weights}    # more steps of refinement, anew",
         f"ssplat render {out} {capture} --size {width}x{height} --film 8 --out {film}    # a film",
         f"ssplat export {out} --to scene.sog{weights}    # for other viewers, at an eighth of the size",
     ]
@@ -139,7 +166,8 @@ def report_run(folder: RunFolder, metrics: dict[str, Any], path: str, weights: s
         folder,
         metrics,
         [(folder.view(score["frame"]), _caption(score, "streamed")) for score in scores],
-        summary=f"A scene of 3D Gaussians from {metrics['views']} views of {width} x {height} pixels, streamed once.",
+        summary=f"A scene of 3D Gaussians from {metrics['views']} views of {width} x {height} pixels, streamed once"
+        f"{' and refined' if refined else ''}.",
         facts=facts,
         pictures_note=f"{NOTE} Scores of views that the scene was made from, {SHOWN}.",
         stream=_stream_rows(records),

@@ -118,7 +118,7 @@ class _Sum:
 
 
 class GrowingScene:
-    """The sum of the deltas that a run has written so far.
+    """The sum of the deltas that a run has written so far, and after all of them the refined scene, if there is one.
 
     Args:
         folder: the folder of the run.
@@ -128,6 +128,7 @@ class GrowingScene:
     def __init__(self, folder: RunFolder, *, one_exposure: bool = False) -> None:
         self.path, self.folder, self._one_exposure = folder.path, folder, one_exposure
         self._newest, self._past = _Sum(), _Sum()
+        self._refined: SceneFile | None = None
 
     @property
     def num_chunks(self) -> int:
@@ -142,6 +143,16 @@ class GrowingScene:
         Raises:
             StorageError: a delta is damaged.
         """
+        streamed, refined = self._streamed(), self.folder.refined_scene
+        if not refined.is_file():
+            self._refined = None
+            return streamed
+        if self._refined is None:
+            self._refined = SceneFile(refined, one_exposure=self._one_exposure)
+        return self._refined.changed()
+
+    def _streamed(self) -> ViewedScene | None:
+        """The sum of all deltas, or None if unchanged since the last call."""
         try:
             found = [(path.name, path.stat().st_mtime_ns) for path in self.folder.delta_files()]
         except FileNotFoundError:  # the run is being started anew
@@ -191,7 +202,7 @@ def open_source(path: Path, *, one_exposure: bool = False) -> Source:
         InputError: there is none.
     """
     folder = RunFolder(path)
-    file = folder.scene if path.is_dir() else path
+    file = folder.best_scene if path.is_dir() else path
     if folder.deltas.is_dir() and (folder.delta_files() or not file.is_file()):
         return GrowingScene(folder, one_exposure=one_exposure)
     if not file.is_file():

@@ -143,7 +143,7 @@ def command_lines(folder: Path) -> dict[str, tuple[str, ...]]:
     """A command line of each command, as new users would type it; `{out}` is a folder of the call's own."""
     run = folder / "run"
     room = "procedural:room?frames=8&size=64x48"
-    arguments = ("run", room, "--out", str(run), "--quiet")
+    arguments = ("run", room, "--out", str(run), "--refine", "0", "--quiet")
     subprocess.run([sys.executable, "-c", SCRIPT, *arguments], check=True)
     tensors = {
         t.name: named_tensor(t.name, t.shape) for t in published_tensors(preset("small")).values() if t is not None

@@ -26,9 +26,9 @@ def refine(path, steps=4, capture=CAPTURE, overwrite=False):
     return refine_run(path, capture, params(), **options, reporter=QUIET)
 
 
-def stream(out, capture=CAPTURE, reporter=QUIET):
+def stream(out, capture=CAPTURE, reporter=QUIET, overwrite=False):
     """Streams small frames into `out`."""
-    options = RunOptions(size=(64, 48), save_every=1)
+    options = RunOptions(size=(64, 48), save_every=1, overwrite=overwrite)
     return run_capture(StreamSplat(NARROW), params(), capture, out, options, reporter)
 
 
@@ -55,18 +55,32 @@ def test_a_stopped_refinement_continues_to_the_same_bytes(finished, monkeypatch)
 
     folder.clear_refinement()
     stop_after_each_step(monkeypatch)
+    so_far = [streamed]
     for taken in (1, 2):
         result = refine(finished)
         assert (result.num_steps, result.interrupted) == (taken, signal.SIGINT)
-        assert not folder.refined_scene.exists()
+        so_far.append(folder.refined_scene.read_bytes())
     monkeypatch.undo()
     refine(finished)
     assert folder.refined_scene.read_bytes() == whole
+    assert len({*so_far, whole}) == 4  # every stop wrote what its steps had reached
     assert folder.scene.read_bytes() == streamed != whole
     report = json.loads(folder.refinement.read_text())
     assert report["num_steps"] == len(report["losses"]) == 4
     assert report["num_left_out"] == left_out
     assert [load_scene(path).sh_degree for path in (folder.scene, folder.refined_scene)] == [0, 2]
+
+
+def test_report_and_pictures_become_those_of_the_refined_scene(finished):
+    folder = RunFolder(finished)
+    stream(finished, overwrite=True)
+    pictures = [path.read_bytes() for path in sorted(folder.views.iterdir())]
+    result = refine(finished)
+    page = folder.report.read_text()
+    for scores in (result.before, result.after):
+        assert f"{scores['shown']['psnr']:.2f} dB" in page
+    refined = [path.read_bytes() for path in sorted(folder.views.iterdir())]
+    assert len(refined) == len(pictures) and not set(refined) & set(pictures)
 
 
 def stop_after_each_step(monkeypatch):

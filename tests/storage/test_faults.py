@@ -75,7 +75,8 @@ class Runs:
 
     def __init__(self, capture: Path, out: Path, *options: str, save_every: int = 1) -> None:
         self.out, self.state, self.notes = out, out / "state.npz", out.with_suffix(".notes")
-        self.arguments = ("run", str(capture), "--out", str(out), "--save-every", str(save_every), "--quiet", *options)
+        self.arguments = ("run", str(capture), "--out", str(out), "--save-every", str(save_every))
+        self.arguments += ("--refine", "0", "--quiet", *options)
 
     def start(self, moment: str = "-") -> subprocess.Popen:
         self.notes.unlink(missing_ok=True)

@@ -124,7 +124,7 @@ def run(capture: Path, out: Path) -> int:
     changes = (f"chunk_size={CHUNK_SIZE}", "min_confidence=0", "capacity=1024")  # a small cache is fast to render
     options = ("--save-every", "1", "--set", *changes, "--quiet")
     with pytest.raises(SystemExit) as stopped:
-        main(["run", str(capture), "--out", str(out), *options])
+        main(["run", str(capture), "--out", str(out), "--refine", "0", *options])
     return int(stopped.value.code or 0)
 
 

@@ -40,7 +40,7 @@ def test_a_run_ends_though_its_viewer_stands_still_and_the_viewer_ends_with_it(t
     pytest.importorskip("viser")
     capture, out = make_capture(tmp_path / "capture", num_frames=10), tmp_path / "out"
     options = ("--view", "--port", str(free_port()), "--set", "capacity=2048")
-    arguments = [sys.executable, "-c", COMMAND, "run", str(capture), "--out", str(out), *options]
+    arguments = [sys.executable, "-c", COMMAND, "run", str(capture), "--out", str(out), "--refine", "0", *options]
     process = subprocess.Popen(arguments, stdout=subprocess.PIPE, text=True, start_new_session=True)
     try:
         assert process.stdout is not None

@@ -94,6 +94,17 @@ def test_a_growing_run_is_what_its_deltas_add_up_to(tmp_path):
     np.testing.assert_array_equal(np.asarray(anew.gaussians.opacities) > 0, np.repeat([0, 1, 1, 0, 0, 1, 0, 0], 2) > 0)
 
 
+def test_a_run_that_has_been_refined_shows_its_refined_scene(tmp_path):
+    source = GrowingScene(RunFolder(tmp_path))
+    save_delta(tmp_path / "deltas" / "000004.npz", delta([0, 1], 1), header())
+    assert len(source.changed().gaussians.means) != len(scene().means)
+    for _ in range(2):  # written, and written anew
+        ss.save_ply(tmp_path / "refined.ply", scene())
+        assert len(source.changed().gaussians.means) == len(scene().means) and source.changed() is None
+        (tmp_path / "refined.ply").unlink()
+        assert source.changed() is None
+
+
 def test_a_growing_run_is_shown_at_its_middle_exposure(tmp_path):
     source, parts = GrowingScene(RunFolder(tmp_path)), ((delta([0, 1], 1), [1, 1, 1]), (delta([2], 2), [3.0, 2.0, 0.5]))
     colors = []
