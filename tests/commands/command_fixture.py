@@ -17,7 +17,7 @@ SIZE = (64, 48)
 
 def run(*arguments: object) -> int:
     """Exit code of `ssplat` with these arguments. A run is refined only if they ask for it, because that takes long."""
-    if arguments[0] == "run" and not {"--refine", "--quality"} & set(arguments):
+    if "run" in arguments[:1] and not {"--refine", "--quality"} & set(arguments):
         arguments = (*arguments, "--refine", "0")
     with pytest.raises(SystemExit) as stopped:
         main([str(argument) for argument in arguments])

@@ -216,10 +216,10 @@ def test_refinement_follows_with_the_steps_of_the_quality(tmp_path, monkeypatch)
     asked = []
     monkeypatch.setattr("ssplat_jax.commands.run_command.Refine.run", lambda command: asked.append(command) or 0)
     monkeypatch.setattr("ssplat_jax.runs.capture_run.run_capture", lambda *given: RunResult(4, 1))
-    assert Run("procedural:room", tmp_path, quality="best", quiet=True).run() == 0
-    # A refinement that is stopped says how it continues: without the flag, which would start the run anew.
-    assert Run("procedural:room", tmp_path, quality="best", refine=30, overwrite=True, quiet=True).run() == 0
     assert Run("procedural:room", tmp_path, quiet=True).run() == 0
+    # A refinement that is stopped says how it continues: without the flag, which would start the run anew.
+    assert Run("procedural:room", tmp_path, refine=30, overwrite=True, quiet=True).run() == 0
+    assert Run("procedural:room", tmp_path, quality="accurate", quiet=True).run() == 0
     assert [(c.folder, c.steps, c.overwrite) for c in asked] == [(tmp_path, 100, False), (tmp_path, 30, True)]
     assert QUALITIES["best"].scale == 1.0 and Run("x", tmp_path, quality="fast").scale == 0.5
 

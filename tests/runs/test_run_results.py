@@ -16,8 +16,10 @@ from ssplat_jax.evaluation.report_page import Report, page_text
 from ssplat_jax.runs.run_results import MOST_PICTURES, report_eval, report_run
 from ssplat_jax.storage.chunk_records import save_chunk_record
 from ssplat_jax.storage.run_folder import RunFolder
+from ssplat_jax.storage.weights import load_params, params_digest
 from tests.runs.report_fixture import COMMON, record, score, smooth_picture
 
+SHIPPED = params_digest(load_params("tiny"))
 JPEG_DB = 30.0  # of a smooth picture
 
 
@@ -78,11 +80,11 @@ def test_the_report_of_a_run_holds_its_pictures_and_figures(folder):
         save_chunk_record(folder.chunk_record(k), record(k, 17.5 + k if k != 8 else None))
     folder.scene.write_bytes(b"ply")
     metrics = COMMON | {"views": 12, "ply": {"num_written": 98765}, "seen_views": [score(i) for i in frames]}
-    report_run(folder, metrics, "path to/it")
+    report_run(folder, metrics, "path to/it", SHIPPED)
     text = folder.report.read_text()
     page = Page(text)
     check_self_contained(page, text, folder)
-    for shown in ("98,765", "21.50 dB", "0.25 s", "30%", "29.50 dB", "--steps 100", "0123456789ab"):
+    for shown in ("98,765", "21.50 dB", "0.25 s", "30%", "29.50 dB", "--steps 200", "0123456789ab"):
         assert shown in page.text, shown
     assert "'path to/it'" in page.text and COMMON["capture"] in page.text
     assert {a["href"] for a in page.named("a")} == {"scene.ply", "metrics.json", "views", "chunks"}
@@ -96,7 +98,7 @@ def test_the_report_of_a_run_holds_its_pictures_and_figures(folder):
 def test_printed_commands_are_words_of_a_shell(tmp_path):
     folder, path = RunFolder(tmp_path / "my kitchen"), "it's $HOME; x"
     folder.path.mkdir()
-    report_run(folder, COMMON | {"views": 4, "ply": {"num_written": 5}, "seen_views": [score(0)]}, path)
+    report_run(folder, COMMON | {"views": 4, "ply": {"num_written": 5}, "seen_views": [score(0)]}, path, SHIPPED)
     commands = [shlex.split(line, comments=True) for line in Page(folder.report.read_text()).text.splitlines()
                 if line.strip().startswith("ssplat ")]  # fmt: skip
     assert [words[1] for words in commands] == ["view", "refine", "render", "export"]
@@ -108,7 +110,7 @@ def test_printed_commands_are_words_of_a_shell(tmp_path):
 def test_a_report_without_records_or_pictures_is_whole_and_a_name_that_is_not_utf8_ends_no_run(folder):
     """Names on Linux are bytes; Python keeps the others as surrogates."""
     metrics = COMMON | {"views": 4, "ply": {"num_written": 5}, "seen_views": [score(0)], "capture": "caf\udce9"}
-    report_run(folder, metrics, "caf\udce9")
+    report_run(folder, metrics, "caf\udce9", SHIPPED)
     text = folder.report.read_text()
     assert "caf?" in text and "Pictures" not in text
 
