@@ -36,16 +36,6 @@ def test_indices_out_of_range_are_zero():
     np.testing.assert_array_equal(voxels[6:, 1], [INDEX_LIMIT - 1, 1 - INDEX_LIMIT])
 
 
-def test_a_point_between_two_points_of_a_voxel_is_in_that_voxel():
-    a = np.float32(RNG.uniform(-50, 50, (4000, 3)))
-    b = a + np.float32(RNG.uniform(-0.02, 0.02, (4000, 3)))
-    va, vb = voxel_indices(jnp.asarray(a), 0.04)[0], voxel_indices(jnp.asarray(b), 0.04)[0]
-    same = np.asarray((va == vb).all(-1))
-    between = voxel_indices(jnp.clip(0.3 * a + 0.7 * b, jnp.minimum(a, b), jnp.maximum(a, b)), 0.04)[0]
-    assert same.sum() > 100
-    np.testing.assert_array_equal(between[same], va[same])
-
-
 def test_hash_spreads_a_plane_of_voxels_like_random_keys():
     """Surfaces are planes of voxels: 2^14 voxels in 2^16 slots collide as often as random keys do."""
     side = 128

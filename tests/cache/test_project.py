@@ -66,14 +66,6 @@ def test_pixels_hold_their_left_and_upper_edges(place, is_seen):
     assert found == ([[0, row, column], [1, row, column]] if is_seen else [])
 
 
-def test_the_front_surface_is_seen_and_a_plain_mean_mixes():
-    means = [[0.0, 0.0, 4.0], [0.0, 0.0, 2.0], [0.0, 0.0, 2.1]]
-    front, mixed = (jit_project(with_pivots(means), front_camera(), config) for config in (CONFIG, PLAIN_MEAN))
-    assert front.depths[0, 3, 4] == pytest.approx(np.sqrt(2.0 * 2.1), rel=VALUE_RTOL)  # the mean of logs
-    assert mixed.depths[0, 3, 4] == pytest.approx((4.0 * 2.0 * 2.1) ** (1 / 3), rel=VALUE_RTOL)
-    np.testing.assert_allclose(front.feats[0, 3, 4], 2.5, rtol=VALUE_RTOL)
-
-
 def test_recentering_removes_the_bias_towards_the_camera():
     """The nearest of many noisy samples lies far in front of their surface; the cluster's mean must not."""
     rng, biases = np.random.default_rng(0), []

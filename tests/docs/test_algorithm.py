@@ -1,7 +1,6 @@
 """Names on the pages: every function and configuration field that a page names exists."""
 
-import functools
-import importlib
+import pkgutil
 import re
 import tomllib
 
@@ -25,29 +24,13 @@ SETTING = re.compile(r"([\w.]+)=\S+")
 every_page = pytest.mark.parametrize("page", PAGES, ids=page_name)
 
 
-def resolve(name: str) -> object:
-    """The module, class or function that a dotted name refers to."""
-    parts = name.split(".")
-    for end in range(len(parts), 0, -1):
-        try:
-            module = importlib.import_module(".".join(parts[:end]))
-        except ModuleNotFoundError as error:
-            if not f"{name}.".startswith(f"{error.name}."):
-                raise  # the module exists, but something that it imports does not
-            continue
-        return functools.reduce(getattr, parts[end:], module)
-    raise ModuleNotFoundError(name)
-
-
-def unresolved(names: set[str]) -> list[str]:
-    """The names that do not resolve, sorted."""
-    missing = []
-    for name in sorted(names):
-        try:
-            resolve(name)
-        except (ModuleNotFoundError, AttributeError):
-            missing.append(name)
-    return missing
+def is_there(name: str) -> bool:
+    """True if a dotted name is that of a module, class or function."""
+    try:
+        pkgutil.resolve_name(name)
+    except (ImportError, AttributeError):
+        return False
+    return True
 
 
 def named_functions(text: str) -> set[str]:
@@ -69,7 +52,7 @@ def has_field(name: str) -> bool:
 
 @every_page
 def test_named_functions_exist(page):
-    assert not unresolved(named_functions(page.read_text()))
+    assert not [name for name in sorted(named_functions(page.read_text())) if not is_there(name)]
 
 
 @every_page

@@ -11,6 +11,7 @@ from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.chunk import Chunk
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.model.streamsplat import StreamSplat
+from tests.core.test_rotations import rodrigues
 
 CONFIG = StreamConfig().replace(
     chunk_size=3,
@@ -80,50 +81,58 @@ def chunk(seed: int = 0, *, views: int = 3, baseline: float = 0.2, height: int =
 
 
 @functools.cache
-def step():
-    """The jitted step, in two programs: `predict()`, which other tests compile too, and the update of the cache."""
-    remember = jax.jit(MODEL.update_cache)
+def program():
+    """The step with gradients in one program, `(params, cache, chunk) -> (value, results), gradients`.
 
-    def both(params, cache, chunk):
-        prediction = predict()(params, cache, chunk)
-        return remember(cache, prediction), prediction.output
+    Results are the prediction and the cache after it. The gradients of a sum over the outputs are with respect to
+    parameters, images, poses, intrinsics, and the positions and features in the cache.
+    """
 
-    return both
+    def total(params, images, viewmats, Ks, remembered, cache, chunk):
+        before = replace(cache, means=remembered[0], feats=remembered[1])
+        prediction = MODEL.predict(params, before, replace(chunk, images=images, viewmats=viewmats, Ks=Ks))
+        scene = MODEL.decode_tokens(params, prediction.tokens)
+        leaves = (scene, prediction.tokens.confidences, prediction.log_depths)
+        results = prediction, MODEL.update_cache(cache, prediction)
+        return sum(jnp.mean(jnp.sin(x)) for x in jax.tree.leaves(leaves)), results
+
+    function = jax.jit(jax.value_and_grad(total, argnums=(0, 1, 2, 3, 4), has_aux=True))
+
+    def run(params, cache, chunk):
+        return function(params, chunk.images, chunk.viewmats, chunk.Ks, (cache.means, cache.feats), cache, chunk)
+
+    return run
+
+
+def step(params, cache, chunk):
+    """The cache after a chunk, and the output."""
+    (_, (prediction, after)), _ = program()(params, cache, chunk)
+    return after, prediction.output
+
+
+def predict(params, cache, chunk):
+    """The prediction of a chunk."""
+    (_, (prediction, _)), _ = program()(params, cache, chunk)
+    return prediction
+
+
+def gradients(cache, chunk):
+    """The gradients of `program` with the random parameters."""
+    return program()(params(), cache, chunk)[1]
 
 
 @functools.cache
 def warm_cache():
     """A cache after one chunk, so that there is a history to project."""
-    return step()(params(), MODEL.init_cache(), chunk(7))[0]
+    return step(params(), MODEL.init_cache(), chunk(7))[0]
 
 
-@functools.cache
-def predict():
-    """The jitted prediction: `(params, cache, chunk) -> Prediction`."""
-    return jax.jit(MODEL.predict)
-
-
-@functools.cache
-def gradients():
-    """Jitted gradients of a sum over the outputs for a chunk: `(cache, chunk, weights) -> value, gradients`.
-
-    With respect to parameters, images, poses, intrinsics, and the positions and features in the cache.
-    """
-
-    def total(params, images, viewmats, Ks, remembered, cache, chunk):
-        cache = replace(cache, means=remembered[0], feats=remembered[1])
-        prediction = MODEL.predict(params, cache, replace(chunk, images=images, viewmats=viewmats, Ks=Ks))
-        scene = MODEL.decode_tokens(params, prediction.tokens)
-        leaves = (scene, prediction.tokens.confidences, prediction.log_depths)
-        return sum(jnp.mean(jnp.sin(x)) for x in jax.tree.leaves(leaves))
-
-    function = jax.jit(jax.value_and_grad(total, argnums=(0, 1, 2, 3, 4)))
-
-    def run(cache, chunk, weights=None):
-        weights = params() if weights is None else weights
-        return function(weights, chunk.images, chunk.viewmats, chunk.Ks, (cache.means, cache.feats), cache, chunk)
-
-    return run
+def turned(angle: float) -> jax.Array:
+    """View matrices that rotate about the vertical through one center: there is no parallax."""
+    viewmats = np.tile(np.eye(4), (3, 1, 1))
+    for i, matrix in enumerate(viewmats):
+        matrix[:3, :3] = rodrigues([0, 1, 0], angle * i)
+    return jnp.asarray(viewmats, jnp.float32)
 
 
 def with_gamma(raw_gamma: float) -> dict:

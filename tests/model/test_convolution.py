@@ -51,19 +51,12 @@ def test_conv2d_in_a_scan_has_the_gradients_of_the_plain_one():
     check_same_gradients(jax.jit(scanned), jax.jit(unrolled), x, kernel)
 
 
-@pytest.mark.parametrize("size", [1, 3, 5])
-def test_conv_is_flax_conv_with_the_same_parameters(size):
-    x, ours = normal(4, 2, 6, 8, 3), Conv(5, size)
-    theirs = nn.Conv(5, (size, size), padding=size // 2)
-    params = {"kernel": normal(5, size, size, 3, 5), "bias": normal(6, 5)}
-    apply = lambda module: lambda p, x: module.apply({"params": p}, x)  # noqa: E731
-    check_same_gradients(apply(ours), apply(theirs), params, x)
-
-
-@pytest.mark.parametrize("size", [1, 3, 5, 7])
-def test_halving_conv_is_flax_conv_of_stride_two(size):
-    x, ours = normal(7, 2, 8, 10, 3), HalvingConv(4, size)
-    theirs = nn.Conv(4, (size, size), strides=2, padding=size // 2)
+@pytest.mark.parametrize(
+    ("module", "stride", "size"), [(Conv, 1, 1), (Conv, 1, 5), *((HalvingConv, 2, size) for size in (1, 3, 5, 7))]
+)
+def test_a_convolution_is_that_of_flax_with_the_same_parameters(module, stride, size):
+    x, ours = normal(7, 2, 8, 10, 3), module(4, size)
+    theirs = nn.Conv(4, (size, size), strides=stride, padding=size // 2)
     params = {"kernel": normal(8, size, size, 3, 4), "bias": normal(9, 4)}
     apply = lambda module: lambda p, x: module.apply({"params": p}, x)  # noqa: E731
     check_same_gradients(apply(ours), apply(theirs), params, x)

@@ -20,6 +20,7 @@ from ssplat_jax.model.decoder import (
 from ssplat_jax.model.network import init_params
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.model.views import TokenShapes
+from tests.model.small import random_params
 
 CONFIG = preset("tiny").replace(capacity=128)
 NUM = 5
@@ -83,7 +84,7 @@ def test_an_untrained_head_changes_nothing():
 
 
 @pytest.mark.parametrize("bias", [0.2, 1e4, -1e4])
-def test_changes_are_bounded_and_contrast_keeps_the_mean_color(bias):
+def test_changes_are_bounded_contrast_keeps_the_mean_color_and_nothing_else_moves(bias):
     before = np.asarray(different_colors().rgbs, np.float64).reshape(NUM, 4, 3)
     got, parts = changed(head_with(bias), different_colors())
     after = np.asarray(parts.colors, np.float64)
@@ -92,12 +93,7 @@ def test_changes_are_bounded_and_contrast_keeps_the_mean_color(bias):
     np.testing.assert_allclose(after, mean + gain * (before - mean), atol=1e-6)
     moved = MAX_LOGIT_CHANGE * np.tanh(bias / MAX_LOGIT_CHANGE)
     np.testing.assert_allclose(got.logit_opacities - shapes().logit_opacities, moved, rtol=1e-5)
-
-
-def test_the_head_moves_opacity_scales_and_contrast_alone():
-    got, _ = changed(head_with(0.1), evidence())
-    assert float(got.logit_opacities[0]) == pytest.approx(-1.0 + 0.1, abs=1e-3)
-    np.testing.assert_allclose(got.raw_scales - shapes().raw_scales, 0.1, rtol=1e-5)
+    assert np.any(got.raw_scales != shapes().raw_scales)
     np.testing.assert_array_equal(got.quats, shapes().quats)
     np.testing.assert_array_equal(got.sh, shapes().sh)
 
@@ -126,10 +122,12 @@ def test_the_gradient_by_colors_is_finite_where_all_are_equal():
 
 def test_the_scene_has_the_contrast_that_the_head_asks_for():
     """Decoded colors of a pivot lie farther from their mean by one factor for the whole pivot."""
-    params, cache = StreamSplat(CONFIG).init(jax.random.key(1)), cache_of_pivots()
-    colors = lambda bias: np.asarray(  # noqa: E731
-        StreamSplat(CONFIG).decode({**params, "evidence": head_with(bias)}, cache).sh[:, 0], np.float64
-    ).reshape(-1, 4, 3)
+    params, cache, decode = random_params(CONFIG), cache_of_pivots(), jax.jit(StreamSplat(CONFIG).decode)
+
+    def colors(bias):
+        scene = decode({**params, "evidence": head_with(bias)}, cache)
+        return np.asarray(scene.sh[:, 0], np.float64).reshape(-1, 4, 3)
+
     before, after = colors(0.0), colors(0.5)
     mean = before.mean(axis=1, keepdims=True)
     alive = np.ptp(before, axis=(1, 2)) > 0.1

@@ -94,14 +94,6 @@ def test_view_with_too_few_cells_has_the_mean_of_the_others(num_cells, is_known)
     np.testing.assert_allclose(got[:, 0], [0.5, 0.8 if is_known else 1.0, 2.0], rtol=1e-5)
 
 
-@pytest.mark.parametrize(("gain", "wanted"), [(0.1, 0.25), (1e6, 4.0)])
-def test_exposures_are_bounded(gain, wanted):
-    remembered, depths = scene()
-    dim = remembered if gain < 1 else np.full(remembered.shape, 0.1)
-    colors = np.maximum(remembered * gain, 0.03) if gain < 1 else np.full(remembered.shape, 0.96)
-    np.testing.assert_allclose(exposures(dim, colors, depths), wanted, rtol=1e-5)
-
-
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -1.0])
 def test_values_that_are_not_finite_are_not_compared(bad):
     remembered, depths = scene()

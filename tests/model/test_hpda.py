@@ -8,7 +8,6 @@ import pytest
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.model.hpda import (
     anchor_depth,
-    cache_anchor,
     expected_log_depth,
     peak_confidence,
 )
@@ -24,27 +23,6 @@ FLOAT32 = 1e-5
 
 def distributions(seed: int = 0) -> jax.Array:
     return jax.nn.softmax(jnp.asarray(2 * np.random.default_rng(seed).normal(size=(*SHAPE, D)), jnp.float32))
-
-
-def memories(seed: int = 1):
-    """History with depths over the whole range and confidences in (0, 1]; every third cell is a hole."""
-    rng = np.random.default_rng(seed)
-    depths, confidences = np.exp(rng.uniform(np.log(0.5), np.log(10), SHAPE)), rng.uniform(0.05, 1, SHAPE)
-    hole = np.arange(np.prod(SHAPE)).reshape(SHAPE) % 3 == 0
-    return history(np.where(hole, 0, depths), np.where(hole, 0, confidences)), hole
-
-
-@pytest.mark.parametrize("space", ["log", "metric"])
-def test_anchor_is_the_gaussian_of_the_paper(space):
-    past, hole = memories()
-    config = CONFIG.replace(log_anchor=space == "log")
-    omega, depths = np.asarray(past.confidences, float)[..., None], np.asarray(past.depths, float)[..., None]
-    candidates = np.asarray(LOG_CANDIDATES, float)
-    with np.errstate(divide="ignore"):
-        offsets = candidates - np.log(depths) if space == "log" else np.exp(candidates) - depths
-    wanted = omega * np.exp(-(offsets**2) / (2 * (0.1 + 0.5 * (1 - omega)) ** 2))
-    got = cache_anchor(past, LOG_CANDIDATES, config)
-    np.testing.assert_allclose(got, np.where(hole[..., None], 0, wanted), atol=FLOAT32)
 
 
 @pytest.mark.parametrize(("readout", "half_width"), [("metric", 0), ("mean", 0), ("window", 1)])

@@ -32,8 +32,11 @@ def views():
 CONCAT = CONFIG.replace(residual_cgfi=False)
 
 
+_INJECT = jax.jit(inject_features, static_argnums=5)
+
+
 def inject(weights, feats, past, confidences, config=CONFIG):
-    return inject_features(weights["cgfi"], feats, past, jnp.full(GRID, confidences), views(), config)
+    return _INJECT(weights["cgfi"], feats, past, jnp.full(GRID, confidences), views(), config)
 
 
 def past(seed: int = 1):
@@ -107,8 +110,11 @@ def test_neighbors_are_the_nearest_with_the_token_first(radius):
             assert usable[found[i, 1:]].all()
 
 
+_MIX = jax.jit(mix_tokens, static_argnums=5)
+
+
 def mix(feats, positions, inside, valid):
-    return mix_tokens(params()["mixer"], feats, positions, inside, valid, CONFIG)
+    return _MIX(params()["mixer"], feats, positions, inside, valid, CONFIG)
 
 
 def test_mixing_does_not_depend_on_the_order_of_the_views():
@@ -151,7 +157,7 @@ def test_padded_views_do_not_change_mixing_and_cgfi():
     changed = replace(past(), feats=past().feats.at[2].add(50.0))
     view = prepare_views(replace(chunk(), valid=valid), CONFIG)
     a, b = (
-        inject_features(params()["cgfi"], f, p, jnp.full(GRID, 0.2), view, CONFIG)[:2]
+        _INJECT(params()["cgfi"], f, p, jnp.full(GRID, 0.2), view, CONFIG)[:2]
         for f, p in ((feats, past()), (loud, changed))
     )
     np.testing.assert_array_equal(a, b)

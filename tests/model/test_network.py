@@ -1,4 +1,4 @@
-"""The protocol of a network: a toy network is registered and runs, and the shipped networks fulfil the protocol."""
+"""Networks: a toy one is registered, the shipped ones fulfil the protocol, and stages are drawn each for itself."""
 
 import dataclasses
 import inspect
@@ -12,77 +12,39 @@ import pytest
 
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.errors import InputError
-from ssplat_jax.model.layers import ResidualBlock, average_pool, rms_normalize
-from ssplat_jax.model.network import NETWORKS, Network, NetworkConfig, network_of, register_network
+from ssplat_jax.model.compact import CompactNetwork
+from ssplat_jax.model.layers import ResidualBlock
+from ssplat_jax.model.network import (
+    NETWORKS,
+    Network,
+    NetworkConfig,
+    complete_params,
+    init_params,
+    network_of,
+    register_network,
+)
 from ssplat_jax.model.streamsplat import StreamSplat
-from ssplat_jax.model.views import GRID_STRIDE, DepthDistribution, TokenShapes
+from ssplat_jax.model.views import GRID_STRIDE
 from ssplat_jax.network_configs import NETWORK_CONFIGS, CompactConfig, ResplatConfig
 from tests.model.small import count_params
+from tests.streaming.narrow_model import NARROW
 
 
 @dataclasses.dataclass(frozen=True)
-class ToyConfig:
+class ToyConfig(CompactConfig):
+    """The compact network's configuration under another name."""
+
     kind: ClassVar[str] = "toy"
-    size_multiple: ClassVar[int] = 16
-    match_stride: ClassVar[int] = GRID_STRIDE
-    depth_range: ClassVar[tuple[float, float] | None] = None
-    depth_space: ClassVar[str] = "log"
-
-    num_depths: int = 6
-    token_width: int = 8
-    cgfi_width: int = 8
-    brightness: float = 2.0
-    """A field that no other network has."""
 
 
-class Linear(nn.Module):
-    width: int
+class ToyNetwork(CompactNetwork):
+    """The compact network, with another encoder."""
 
-    @nn.compact
-    def __call__(self, x):
-        return nn.Dense(self.width, name="dense")(x)
-
-
-class ToyNetwork:
-    """Reads depth, features and shapes from the mean color of each cell."""
+    def __init__(self, width: int, stage: str = "encoder"):
+        self.width, self.stage = width, stage
 
     def stages(self, config):
-        network, cell = config.network, jnp.zeros((1, 1, 1, 3))
-        token = jnp.zeros((1, network.token_width))
-        return {
-            "encoder": (Linear(3), (cell,)),
-            "cost_volume": (Linear(network.num_depths), (cell,)),
-            "tokens": (Linear(network.token_width), (cell,)),
-            "mixer": (Linear(network.token_width), (token,)),
-            "decoder": (Linear(8 + 3 * (config.head.sh_degree + 1) ** 2), (token,)),
-        }
-
-    def encode(self, params, views, config):
-        colors = average_pool(views.images, GRID_STRIDE)
-        return Linear(3).apply({"params": params}, config.network.brightness * colors)
-
-    def match(self, params, features, views, config):
-        logits = Linear(config.network.num_depths).apply({"params": params}, features)
-        return DepthDistribution(probs=jax.nn.softmax(logits), logits=logits, decoder=features)
-
-    def refine_depth(self, params, features, depth, views, config):
-        assert params is None  # there is no such stage
-        return depth
-
-    def regress_tokens(self, params, features, distribution, depth, views, config):
-        return Linear(config.network.token_width).apply({"params": params}, features)
-
-    def bound_history(self, feats):
-        return rms_normalize(feats)
-
-    def mix_tokens(self, params, feats, positions, inside, view_valid, config):
-        return Linear(config.network.token_width).apply({"params": params}, feats)
-
-    def read_shapes(self, params, feats, config):
-        width = 3 * (config.head.sh_degree + 1) ** 2
-        raw = Linear(8 + width).apply({"params": params}, feats)
-        opacity, scale, rotation, sh = jnp.split(raw, [1, 4, 8], axis=-1)
-        return TokenShapes(opacity[:, 0], scale, rotation, sh.reshape(len(feats), -1, 3))
+        return CompactNetwork.stages(config) | {self.stage: (nn.Dense(self.width), (jnp.zeros((1, 3)),))}
 
 
 @pytest.fixture
@@ -93,20 +55,17 @@ def toy(monkeypatch) -> StreamConfig:
         monkeypatch.setitem(NETWORK_CONFIGS, kind, NETWORK_CONFIGS[kind])
     monkeypatch.setitem(NETWORK_CONFIGS, "toy", ToyConfig)
     monkeypatch.delitem(NETWORK_CONFIGS, "toy")  # undone to absence, whatever the test does
-    register_network(ToyConfig, ToyNetwork())
-    return StreamConfig().replace(network="toy", capacity=256, min_confidence=0.0, hpda=True, cgfi=True, chunk_size=3)
+    register_network(ToyConfig, ToyNetwork(3))
+    return StreamConfig().replace(network="toy")
 
 
 def test_a_network_that_replaces_another_has_its_own_parameters(toy):
-    class Wider(ToyNetwork):
-        def stages(self, config):
-            return super().stages(config) | {"encoder": (Linear(5), (jnp.zeros((1, 1, 1, 3)),))}
-
     def num_params():
         return count_params(jax.eval_shape(StreamSplat(toy).init, jax.random.key(0))["encoder"])
 
+    assert StreamConfig.from_dict(toy.to_dict()) == toy
     assert num_params() == 12
-    register_network(ToyConfig, Wider())
+    register_network(ToyConfig, ToyNetwork(5))
     assert num_params() == 20
 
 
@@ -122,8 +81,8 @@ def test_networks_that_lack_something_and_taken_kinds_are_refused(toy):
     unhashable = dataclasses.make_dataclass("Thawed", [])()  # a dataclass that compares and is not frozen
     without_checks = inspect.unwrap(register_network)  # without the type checks of the tests
     for config_type, network, words in (
-        (NoMultiple, ToyNetwork(), "members of NetworkConfig, got NoMultiple"),
-        (Impostor, ToyNetwork(), "'compact', which is taken"),
+        (NoMultiple, ToyNetwork(3), "members of NetworkConfig, got NoMultiple"),
+        (Impostor, ToyNetwork(3), "'compact', which is taken"),
         (ToyConfig, unhashable, r"with a hash .*got Thawed"),
         (ToyConfig, object(), "methods of Network, got object"),
     ):
@@ -133,12 +92,7 @@ def test_networks_that_lack_something_and_taken_kinds_are_refused(toy):
 
 
 def test_stage_of_an_unknown_name_is_refused(toy):
-    class Misnamed(ToyNetwork):
-        def stages(self, config):
-            stages = super().stages(config)
-            return stages | {"encoders": stages["encoder"]}
-
-    register_network(ToyConfig, Misnamed())
+    register_network(ToyConfig, ToyNetwork(3, stage="encoders"))
     with pytest.raises(InputError, match=r"wanted stages among encoder.*got \['encoders'\]"):
         StreamSplat(toy).init(jax.random.key(0))
 
@@ -164,3 +118,34 @@ def test_no_product_takes_subsampled_pixels():
     taken = {v for e in program.eqns if e.primitive.name == "slice" and e.params["strides"] for v in e.outvars}
     assert len(taken) == 1
     assert not [e for e in program.eqns if e.primitive.name == "dot_general" and taken & set(e.invars)]
+
+
+# Untrained parameters -------------------------------------------------------------------------------------------------
+
+
+KEY = jax.random.key(7)
+OFF = NARROW.replace(cgfi=False, mixer_blocks=0)
+
+
+@pytest.fixture(scope="module")
+def whole() -> dict:
+    """Parameters of all stages."""
+    return init_params(KEY, NARROW)
+
+
+def assert_equal(got, wanted):
+    jax.tree.map(np.testing.assert_array_equal, got, wanted)
+
+
+def test_stages_that_are_off_do_not_change_the_others(whole):
+    """The start of a file's training is drawn again from its seed (`ssplat weights`)."""
+    fewer = init_params(KEY, OFF)
+    assert "cgfi" not in fewer and fewer["mixer"] == {} and whole["mixer"]
+    assert_equal(fewer, {name: whole[name] for name in fewer} | {"mixer": {}})
+
+
+def test_missing_stages_are_completed_and_given_ones_kept(whole):
+    given = jax.tree.map(lambda x: x + 1.0, init_params(KEY, OFF))
+    got = complete_params(KEY, NARROW, given)
+    assert_equal(got, given | {"cgfi": whole["cgfi"], "mixer": whole["mixer"]})
+    assert_equal(complete_params(KEY, OFF, got), given)  # what is off is left out

@@ -9,8 +9,7 @@ from ssplat_jax.core.chunk import Chunk
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.model.compact import CompactFeatures, encode, plane_sweep
 from ssplat_jax.model.views import prepare_views, sweep_pixels
-from tests.core.test_rotations import rodrigues
-from tests.model.small import random_params
+from tests.model.small import random_params, turned
 
 CONFIG = StreamConfig().replace(
     encoder_widths=(16, 32), encoder_blocks=1, attention_blocks=1, num_depths=24, match_width=32, unet_width=8
@@ -105,14 +104,6 @@ def test_a_cell_that_one_of_two_sources_sees_scores_as_with_that_source_alone():
     np.testing.assert_array_equal(both[only_first], first[only_first])
     np.testing.assert_array_equal(both[only_last], last[only_last])
     np.testing.assert_allclose(both[by_both], (first + last)[by_both] / 2, atol=1e-6)
-
-
-def turned(angle: float):
-    """View matrices that rotate about the vertical through one center: there is no parallax."""
-    viewmats = np.tile(np.eye(4), (3, 1, 1))
-    for i, matrix in enumerate(viewmats):
-        matrix[:3, :3] = rodrigues([0, 1, 0], angle * i)
-    return jnp.asarray(viewmats, jnp.float32)
 
 
 def test_hard_features_and_cameras_reach_their_limits():

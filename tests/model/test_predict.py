@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from ssplat_jax.core.pytree import replace
-from tests.core.test_rotations import rodrigues
 from tests.model.small import (
     MODEL,
     chunk,
@@ -17,20 +16,14 @@ from tests.model.small import (
     gradients,
     params,
     predict,
+    program,
     step,
+    turned,
     warm_cache,
     with_gamma,
 )
 
 SUMS = 1e-6
-
-
-def turned(angle_step: float):
-    """View matrices that rotate about the vertical through one center: there is no parallax."""
-    viewmats = np.tile(np.eye(4), (3, 1, 1))
-    for i, matrix in enumerate(viewmats):
-        matrix[:3, :3] = rodrigues([0, 1, 0], angle_step * i)
-    return jnp.asarray(viewmats, jnp.float32)
 
 
 def with_images(value):
@@ -90,11 +83,8 @@ HARD_MEMORIES = {  # cache, and raw strength of the anchor
 
 def check_prediction(chunk, cache, weights):
     """Checks values, gradients, distributions and ranges of a chunk, and the cache after it."""
-    value, gradient = gradients()(cache, chunk, weights)
-    assert finite((value, gradient))
-    prediction = predict()(weights, cache, chunk)
-    after, _ = step()(weights, cache, chunk)
-    assert finite(prediction) and finite(after)
+    (value, (prediction, after)), gradient = program()(weights, cache, chunk)
+    assert finite((value, gradient, prediction, after))
     probs = np.asarray(jax.nn.softmax(prediction.logits), np.float64)
     assert (probs >= 0).all()
     np.testing.assert_allclose(probs.sum(-1), 1, rtol=0, atol=SUMS)
@@ -115,21 +105,21 @@ def test_hard_cache_gives_finite_tokens_and_gradients(name):
 
 
 def test_gamma_zero_gives_the_depths_of_an_empty_cache():
-    weak, blank = (predict()(with_gamma(-200.0), cache, chunk()) for cache in (warm_cache(), MODEL.init_cache()))
+    weak, blank = (predict(with_gamma(-200.0), cache, chunk()) for cache in (warm_cache(), MODEL.init_cache()))
     np.testing.assert_array_equal(weak.log_depths, blank.log_depths)
     np.testing.assert_array_equal(weak.tokens.means, blank.tokens.means)
-    strong = predict()(with_gamma(0.0), warm_cache(), chunk())
+    strong = predict(with_gamma(0.0), warm_cache(), chunk())
     assert float(jnp.abs(strong.log_depths - blank.log_depths).max()) > 1e-3
 
 
 def test_no_gradient_reaches_the_cache():
-    _, (*_, remembered) = gradients()(warm_cache(), chunk())
+    *_, remembered = gradients(warm_cache(), chunk())
     for gradient in remembered:
         np.testing.assert_array_equal(gradient, 0)
 
 
 def test_every_stage_gets_a_gradient():
-    _, (by_params, *_) = gradients()(warm_cache(), chunk())
+    by_params, *_ = gradients(warm_cache(), chunk())
     for stage in by_params.keys() - {"evidence"}:  # it is read from the cache, not from tokens
         gradient = by_params[stage]
         assert max(float(jnp.abs(leaf).max()) for leaf in jax.tree.leaves(gradient)) > 0, stage
@@ -146,7 +136,7 @@ def test_padded_view_does_not_change_the_valid_ones(padded):
         Ks=base.Ks.at[padded, 0, 0].set(90.0),
     )
     kept = jnp.array([i for i in range(3) if i != padded])
-    a, b = (predict()(params(), warm_cache(), c) for c in (base, other))
+    a, b = (predict(params(), warm_cache(), c) for c in (base, other))
     for name in ("depths", "confidences", "history"):
         np.testing.assert_array_equal(getattr(a.output, name)[kept], getattr(b.output, name)[kept])
     rows = np.flatnonzero(a.tokens.valid)
@@ -154,13 +144,13 @@ def test_padded_view_does_not_change_the_valid_ones(padded):
     for name in ("means", "feats", "confidences", "rgbs", "footprints"):
         np.testing.assert_array_equal(getattr(a.tokens, name)[rows], getattr(b.tokens, name)[rows])
     # If the view is valid, the difference shows.
-    c, d = (predict()(params(), warm_cache(), replace(x, valid=jnp.ones(3, bool))) for x in (base, other))
+    c, d = (predict(params(), warm_cache(), replace(x, valid=jnp.ones(3, bool))) for x in (base, other))
     assert float(jnp.abs(c.tokens.feats[rows] - d.tokens.feats[rows]).max()) > 1e-3
 
 
 def test_chunk_of_padding_does_not_change_the_cache():
     empty = replace(chunk(3), valid=jnp.zeros(3, bool))
-    after, output = step()(params(), warm_cache(), empty)
+    after, output = step(params(), warm_cache(), empty)
     np.testing.assert_array_equal(output.confidences, 0)
     for name in ("voxels", "counts", "num_voxels", "means", "feats", "confidences", "num_members"):
         np.testing.assert_array_equal(getattr(after, name), getattr(warm_cache(), name))
@@ -170,16 +160,16 @@ def test_a_view_that_cannot_be_used_is_padding_and_counted():
     """One bad camera once wrote NaN into the observations of pivots that other views had confirmed."""
     spoiled = replace(chunk(), Ks=chunk().Ks.at[1, 0, 0].set(-28.0))
     padded = replace(chunk(), valid=jnp.array([True, False, True]))
-    (after, output), (wanted, expected) = (step()(params(), warm_cache(), c) for c in (spoiled, padded))
+    (after, output), (wanted, expected) = (step(params(), warm_cache(), c) for c in (spoiled, padded))
     assert int(after.stats.num_unusable) == 1 and int(wanted.stats.num_unusable) == 0
     stats = replace(after.stats, num_unusable=wanted.stats.num_unusable)
     jax.tree.map(np.testing.assert_array_equal, replace(after, stats=stats), wanted)
     jax.tree.map(np.testing.assert_array_equal, output, expected)
-    assert finite(gradients()(warm_cache(), spoiled))
+    assert finite(gradients(warm_cache(), spoiled))
 
 
 def test_a_chunk_without_a_range_of_depths_changes_nothing_and_is_counted():
-    after, output = step()(params(), warm_cache(), replace(chunk(), near=jnp.float32(np.nan)))
+    after, output = step(params(), warm_cache(), replace(chunk(), near=jnp.float32(np.nan)))
     assert int(after.stats.num_unusable) == 3 and finite(output)
     stats = replace(after.stats, num_unusable=warm_cache().stats.num_unusable)
     jax.tree.map(np.testing.assert_array_equal, replace(after, stats=stats), warm_cache())

@@ -1,6 +1,4 @@
-"""ReSplat's network: its sizes, its layers against plain definitions, and streaming with it."""
-
-import functools
+"""ReSplat's network: its sizes, and its layers against plain definitions."""
 
 import jax
 import jax.numpy as jnp
@@ -8,9 +6,6 @@ import numpy as np
 import pytest
 
 from ssplat_jax.config import preset
-from ssplat_jax.core.pytree import replace
-from ssplat_jax.model import resplat
-from ssplat_jax.model.cgfi import inject_features
 from ssplat_jax.model.hpda import expected_log_depth
 from ssplat_jax.model.layers import same_region_mask
 from ssplat_jax.model.network import init_params
@@ -18,7 +13,7 @@ from ssplat_jax.model.resplat.encoder import POSITIONS_SIDE, Transformer, resamp
 from ssplat_jax.model.resplat.torch_layers import resize
 from ssplat_jax.model.views import prepare_views, to_candidate_space
 from ssplat_jax.training.losses import soft_targets
-from tests.model.small import chunk, count_params, history, random_params
+from tests.model.small import chunk, count_params
 
 CONFIG = preset("small").replace(mixer_blocks=1, num_depths=32, min_confidence=0.0, capacity=1 << 11, chunk_size=3)
 
@@ -79,7 +74,7 @@ def test_keys_of_all_sources_are_masked_alike():
 
 
 def test_depths_are_averaged_in_the_space_of_candidates():
-    given = views()
+    given = chunk(height=40, width=56)
     for space, average in (("log", np.sqrt(2.0 * 8.0)), ("inverse", 2 / (1 / 2.0 + 1 / 8.0))):
         config = CONFIG.replace(depth_space=space, depth_range=(2.0, 8.0))
         candidates = prepare_views(given, config).log_candidates
@@ -94,31 +89,3 @@ def test_depths_are_averaged_in_the_space_of_candidates():
             assert targets.sum() == pytest.approx(1.0, abs=1e-5)
             nearest = np.argsort(np.abs(np.asarray(candidates) - truth))[:2]
             assert np.argmax(targets) in nearest and targets[nearest].sum() > 0.6
-
-
-# -- in the stream ----------------------------------------------------------------------------------------------------
-
-
-@functools.cache
-def params() -> dict:
-    return random_params(CONFIG)
-
-
-def views(**changes):
-    return replace(chunk(0, views=3, height=40, width=56), **changes)
-
-
-def test_injected_history_is_bounded_for_large_features():
-    rng = np.random.default_rng(0)
-    grid, c = (3, 8, 8), CONFIG.network.token_width
-    feats = jnp.asarray(rng.normal(size=(*grid, c)), jnp.float32)
-    remembered = rng.normal(size=(*grid, c))
-    here = prepare_views(views(), CONFIG)
-    config = CONFIG.replace(unit_features=True)
-    program = jax.jit(functools.partial(inject_features, bound_history=resplat.bound_history), static_argnums=5)
-    injected = []
-    for size in (1.0, 1e6):
-        past = history(np.ones(grid), np.full(grid, 0.7), feats=size * remembered)
-        injected.append(program(params()["cgfi"], feats, past, jnp.full(grid, 0.2), here, config))
-    np.testing.assert_allclose(injected[1], injected[0], rtol=1e-3, atol=1e-3)
-    assert np.abs(np.asarray(injected[0] - feats)).max() > 0.1

@@ -1,4 +1,4 @@
-"""Views, depth candidates and sources; positions and Gaussians of tokens."""
+"""Views, depth candidates and sources; inputs, positions and Gaussians of tokens."""
 
 import math
 
@@ -13,7 +13,7 @@ from ssplat_jax.core.errors import InputError
 from ssplat_jax.core.gaussians import SH_C0, present_gaussians
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.core.rotations import matrices_to_quats, quats_to_matrices
-from ssplat_jax.model.compact import START_OPACITY, Encoder, read_shapes
+from ssplat_jax.model.compact import START_OPACITY, CompactFeatures, Encoder, read_shapes, regress_tokens
 from ssplat_jax.model.decoder import (
     MAX_SCALE,
     MIN_DETAIL,
@@ -26,7 +26,15 @@ from ssplat_jax.model.decoder import (
 )
 from ssplat_jax.model.layers import sine_positions
 from ssplat_jax.model.network import init_params
-from ssplat_jax.model.views import GRID_STRIDE, back_project, nearest_sources, patch_colors, prepare_views
+from ssplat_jax.model.views import (
+    GRID_STRIDE,
+    AnchoredDepth,
+    DepthDistribution,
+    back_project,
+    nearest_sources,
+    patch_colors,
+    prepare_views,
+)
 from tests.core.test_cameras import poses
 from tests.model.small import CONFIG, HEIGHT, WIDTH, chunk, params
 
@@ -75,6 +83,17 @@ UNUSABLE_RANGES = {"near": [0.0, -1.0, np.nan, 9.0], "far": [np.inf, np.nan, -1.
 prepared = jax.jit(lambda chunk: prepare_views(chunk, CONFIG))
 
 
+@jax.jit
+def gradients_of_views(chunk):
+    """By images, poses and intrinsics."""
+
+    def total(images, viewmats, Ks):
+        views = prepare_views(replace(chunk, images=images, viewmats=viewmats, Ks=Ks), CONFIG)
+        return sum(jnp.sum(jnp.sin(x)) for x in (views.images, views.viewmats, views.Ks))
+
+    return jax.grad(total, argnums=(0, 1, 2))(chunk.images, chunk.viewmats, chunk.Ks)
+
+
 @pytest.mark.parametrize("name", UNUSABLE_VIEWS)
 def test_a_view_that_cannot_be_used_is_refused_and_inside_jit_padding(name):
     """All that the network reads of a chunk are its prepared views."""
@@ -82,13 +101,7 @@ def test_a_view_that_cannot_be_used_is_refused_and_inside_jit_padding(name):
     got, wanted = prepared(spoiled), prepared(padded)
     assert got.unusable.tolist() == [False, True, False] and not wanted.unusable.any()
     jax.tree.map(np.testing.assert_array_equal, replace(got, unusable=wanted.unusable), wanted)
-
-    def total(images, viewmats, Ks):
-        views = prepare_views(replace(spoiled, images=images, viewmats=viewmats, Ks=Ks), CONFIG)
-        return sum(jnp.sum(jnp.sin(x)) for x in (views.images, views.viewmats, views.Ks))
-
-    by_parts = jax.jit(jax.grad(total, argnums=(0, 1, 2)))(spoiled.images, spoiled.viewmats, spoiled.Ks)
-    for gradient in by_parts:
+    for gradient in gradients_of_views(spoiled):
         assert np.isfinite(gradient).all() and not gradient[1].any() and gradient[0].any()
     with pytest.raises(InputError, match="chunk"):
         check_chunk(spoiled, 3)
@@ -182,9 +195,13 @@ def decoded(m: int = 10, num_members=1, means=None, footprints=None, quats=None,
     } | {name: x for name, x in given.items() if x is not None}
     wanted = jax.eval_shape(lambda key: init_params(key, config)["decoder"], jax.random.key(0))
     params = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape), wanted)
-    rest = {name: x for name, x in inputs.items() if name not in ("feats", "rgbs")}
-    shapes, parts = read_shapes(params, inputs["feats"], config), divide_cells(inputs["rgbs"], config)
-    return decode_tokens(shapes, parts=parts, **rest, num_members=num_members, config=config), inputs
+
+    @jax.jit
+    def decode(feats, rgbs, num_members, **rest):
+        shapes, parts = read_shapes(params, feats, config), divide_cells(rgbs, config)
+        return decode_tokens(shapes, parts=parts, **rest, num_members=num_members, config=config)
+
+    return decode(**inputs, num_members=jnp.broadcast_to(jnp.asarray(num_members), (m,))), inputs
 
 
 def test_untrained_head_gives_a_disc_of_the_patch_color():
@@ -205,6 +222,8 @@ def test_pivot_is_as_opaque_as_its_members_in_one_place():
     single = 1 / (1 + np.exp(-START_OPACITY))
     np.testing.assert_allclose(gaussians.opacities, 1 - (1 - single) ** members.astype(float), rtol=1e-6, atol=1e-7)
 
+    @jax.jit
+    @jax.value_and_grad
     def opacity(bias, n):
         raw = jnp.zeros(8 + 3).at[0].set(bias)
         params = {"out": {"kernel": jnp.zeros((4, 11)), "bias": raw}, **hidden_layers()}
@@ -216,7 +235,7 @@ def test_pivot_is_as_opaque_as_its_members_in_one_place():
 
     for bias in (-200.0, 0.0, 200.0):
         for n in (0, 1, 2**31 - 1):
-            value, slope = jax.value_and_grad(opacity)(bias, jnp.array([n]))
+            value, slope = opacity(bias, jnp.array([n]))
             assert 0 <= value <= 1 and np.isfinite(slope)
 
 
@@ -310,3 +329,35 @@ def test_scales_are_bounded_for_any_feature():
     literal = CONFIG.replace(footprint_scales=False, gaussians_per_token=1)
     scales = token_scales(jnp.array([[0.0, 1.0, 4.0]]), jnp.ones(1), literal)
     np.testing.assert_allclose(scales[0], np.log1p(np.exp([-4.0, -3.0, 0.0])), rtol=1e-5)
+
+
+def test_depth_hints_pass_no_gradient_but_are_used():
+    rng = np.random.default_rng(0)
+    views = prepare_views(chunk(), CONFIG)
+    grid = views.inside.shape
+    draw = lambda *shape: jnp.asarray(rng.uniform(size=shape), jnp.float32)  # noqa: E731
+    network = CONFIG.network
+    features = CompactFeatures(
+        fine=draw(3, 2 * grid[1], 2 * grid[2], network.match_width),
+        grid=draw(*grid, network.match_width),
+        context=draw(*grid, 2 * network.encoder_widths[1]),
+    )
+    probs = draw(*grid, network.num_depths)
+    distribution = DepthDistribution(probs=probs, logits=probs, decoder=draw(*grid, network.unet_width))
+
+    @jax.jit
+    def tokens_and_slopes(log_depths, confidences, context):
+        def total(log_depths, confidences, context):
+            depth = AnchoredDepth(probs, log_depths, confidences, confidences)
+            seen = CompactFeatures(features.fine, features.grid, context)
+            feats = regress_tokens(params()["tokens"], seen, distribution, depth, views, CONFIG)
+            return jnp.sum(jnp.sin(3 * feats)), feats
+
+        slopes, feats = jax.grad(total, argnums=(0, 1, 2), has_aux=True)(log_depths, confidences, context)
+        return feats, slopes
+
+    depths, confidences = draw(*grid), draw(*grid)
+    feats, (by_depth, by_confidence, by_context) = tokens_and_slopes(depths, confidences, features.context)
+    assert not by_depth.any() and not by_confidence.any() and by_context.any()
+    assert np.any(tokens_and_slopes(depths + 0.3, confidences, features.context)[0] != feats)
+    assert np.any(tokens_and_slopes(depths, 0.5 * confidences, features.context)[0] != feats)

@@ -2,9 +2,11 @@
 
 import jax.numpy as jnp
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.gaussians import Gaussians
+from ssplat_jax.core.rotations import sh_basis
 
 FIELDS = ("means", "quats", "scales", "opacities", "sh")
 
@@ -20,6 +22,18 @@ def scene(degree: int = 2, n: int = 60, seed: int = 0) -> Gaussians:
         opacities=jnp.asarray(rng.uniform(0.05, 1.0, n), jnp.float32),
         sh=jnp.asarray(rng.normal(size=(n, (degree + 1) ** 2, 3)) * 0.3, jnp.float32),
     )
+
+
+def assert_turned(found: Gaussians, plain: Gaussians, turn: np.ndarray, scale: float = 1.0) -> None:
+    """Colors seen along turned or mirrored directions, and covariances, are those of the turned or mirrored scene."""
+    roots = [Rotation.from_quat(g.quats, scalar_first=True).as_matrix() * g.scales[:, None] for g in (found, plain)]
+    covariances = [np.asarray(root @ root.transpose(0, 2, 1)) for root in roots]
+    np.testing.assert_allclose(covariances[0], scale**2 * turn @ covariances[1] @ turn.T, atol=1e-5)
+    directions = np.random.default_rng(0).normal(size=(40, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    basis = [np.asarray(sh_basis(jnp.asarray(d, jnp.float32), 3)) for d in (directions @ turn.T, directions)]
+    colors = [np.einsum("dk,nkc->dnc", b, g.sh) for b, g in zip(basis, (found, plain), strict=True)]
+    np.testing.assert_allclose(*colors, atol=1e-4)
 
 
 def compressed_ply(degree: int = 1, n: int = 300) -> bytes:

@@ -62,15 +62,6 @@ def test_features_without_a_closest_pair_merge_the_first_two(feats):
     np.testing.assert_allclose(cache.feats[0], np.full((2, streams.WIDTH), feats), rtol=1e-6)
 
 
-def test_equal_confidences_keep_the_older_seed_and_the_midpoint():
-    feats = jnp.array([[1.0, 0, 0, 0], [1.0, 0.1, 0, 0], [0, 0, 1.0, 0]])
-    cache = fused(replace(tokens_at(IN_A_VOXEL, confidences=0.7), feats=feats))
-    np.testing.assert_array_equal(cache.seeds[0, 0], feats[0])
-    np.testing.assert_allclose(cache.feats[0, 0], (feats[0] + feats[1]) / 2, atol=1e-7)
-    np.testing.assert_allclose(cache.rgbs[0, 0], 0.5, atol=1e-7)
-    assert cache.confidences[0, 0] == np.float32(0.7)
-
-
 # Pivots on the axis of the front camera, and the depth and confidence that are read at their pixel.
 SEEN = {
     "omega 1": ([[0, 0, 2.0]], [1.0], (2.0, 1.0)),

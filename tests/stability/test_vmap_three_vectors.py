@@ -17,7 +17,7 @@ import pytest
 from ssplat_jax.core.cameras import transform_points
 from ssplat_jax.core.rotations import quats_to_matrices
 
-SIZES = range(1, 36)  # past two widths of 16 lanes, every remainder twice
+SIZES = (*range(1, 18), 31, 33)  # past one and two widths of 16 lanes, every remainder once
 FLOAT32 = 5e-6
 
 

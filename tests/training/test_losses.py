@@ -95,17 +95,6 @@ def test_gradients_of_losses_are_finite_differences():
             assert float(found) == pytest.approx(float(at(1e-6) - at(-1e-6)) / 2e-6, rel=1e-5)
 
 
-def test_image_losses_are_the_sum_of_their_terms(monkeypatch):
-    monkeypatch.setattr(losses, "lpips_distance", lambda weights, a, b: 3.0 * jnp.abs(a - b).mean(axis=(1, 2, 3)))
-    rng = np.random.default_rng(2)
-    a, b = rng.uniform(size=(2, 2, 4, 5, 3))
-    images, targets = jnp.asarray(a, jnp.float32), jnp.asarray(b, jnp.float32)
-    loss, wanted = RenderingLoss(lpips_weight=0.2), ((a - b) ** 2).mean()
-    assert float(loss.of_images(images, targets)[0]) == pytest.approx(wanted, rel=1e-5)
-    wanted = ((a - b) ** 2).mean() + 0.2 * 3.0 * np.abs(a - b).mean()
-    assert float(loss.of_images(images, targets, LpipsWeights((), (), ()))[0]) == pytest.approx(wanted, rel=1e-5)
-
-
 def test_the_paper_loss_of_a_scene_sums_mse_and_lpips_of_its_targets_over_black(monkeypatch):
     """Eq. training_loss on views of the reference renderer, of photographs that are darker than the scene."""
     monkeypatch.setattr(losses, "lpips_distance", lambda weights, a, b: 3.0 * jnp.abs(a - b).max(axis=(1, 2, 3)))

@@ -47,14 +47,16 @@ def trained(tmp_path_factory):
         patch.setattr(crops, "make_room", lambda: made_room.append(len(streams)))
         patch.setattr(crops, "stream_scene", streamed)
         patch.setitem(recipe.RECIPES, "evidence", evidence_recipe(12))
-        assert Train(out=out, recipe="evidence", init_weights=SHIPPED, scale_steps=0.5, quiet=True).run() == 0
+        start = out / "narrow.npz"
+        save_weights(start, random_params(NARROW), NARROW, {"steps": 7})
+        assert Train(out=out, recipe="evidence", init_weights=start, scale_steps=0.5, quiet=True).run() == 0
     assert made_room == [0]  # before the scene: programs of many would be too many for one process
     return out, streams
 
 
 def test_the_evidence_head_learns_alone(trained):
-    before, (after, config) = load_params("tiny"), load_weights(trained[0] / "weights.npz")
-    assert config == preset("tiny")
+    (before, _), (after, config) = (load_weights(trained[0] / name) for name in ("narrow.npz", "weights.npz"))
+    assert config == NARROW
     for stage in before:
         same = [np.array_equal(a, b) for a, b in zip(flat(before[stage]), flat(after[stage]), strict=True)]
         assert all(same) == (stage != "evidence")
@@ -68,8 +70,7 @@ def test_weights_tell_their_history(trained):
     assert provenance["steps"] == 6 and provenance["fresh"] == ["evidence"] and not provenance["lpips"]
     (phase,) = provenance["recipe"]["phases"]
     assert (phase["loss"]["kind"], phase["samples"]["kind"], phase["steps"]) == ("CropLoss", "Crops", 6)
-    assert provenance["init_weights"] == "tiny.npz"
-    assert provenance["before"] == describe_weights("tiny").provenance
+    assert provenance["init_weights"] == "narrow.npz" and provenance["before"] == {"steps": 7}
 
 
 def test_strides_for_which_a_capture_is_too_short_are_left_out(tmp_path):

@@ -2,6 +2,7 @@
 
 import contextlib
 import socket
+import time
 from types import SimpleNamespace
 
 import jax.numpy as jnp
@@ -18,6 +19,17 @@ def free_port():
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return probe.getsockname()[1]
+
+
+def wait_for(answer, seconds=90.0):
+    """The first answer that is true."""
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline:
+        with contextlib.suppress(OSError):
+            if value := answer():
+                return value
+        time.sleep(0.1)
+    raise TimeoutError("nothing came")
 
 
 def scene(num_gaussians=50, size=1.0):

@@ -14,8 +14,7 @@ import pytest
 from ssplat_jax.storage.chunk_records import load_delta
 from ssplat_jax.storage.run_folder import RunFolder
 from tests.commands.command_fixture import make_capture, run
-from tests.viewer.chromium import wait_for
-from tests.viewer.fake_client import free_port
+from tests.viewer.fake_client import free_port, wait_for
 
 COMMAND = "from ssplat_jax.commands.start import start; start()"
 
