@@ -19,7 +19,6 @@ from ssplat_jax.core.numerics import softplus_inverse
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.core.rotations import quats_to_matrices
 from ssplat_jax.data.open_capture import open_capture
-from ssplat_jax.evaluation.lpips import LpipsWeights
 from ssplat_jax.model.cgfi import Aggregator, inject_features, num_hints
 from ssplat_jax.model.hpda import anchor_depth
 from ssplat_jax.model.network import network_of
@@ -238,19 +237,6 @@ def test_inference_decodes_the_fused_token_by_the_head_alone():
         quats_to_matrices(f32(q)) for q in (f64(cache.quats).reshape(-1, 4)[alive], np.roll(raw[:, :4], 1, axis=1))
     )
     np.testing.assert_allclose(quats_to_matrices(f32(got.quats)), np.matmul(cameras, heads), atol=1e-4)
-
-
-def test_loss_is_the_sum_of_squared_errors_and_perceptual_distances(monkeypatch):
-    """Eq. training_loss, with lambda = 0.05 and a stand-in for LPIPS."""
-    monkeypatch.setattr(losses, "lpips_distance", lambda weights, a, b: 2.0 * jnp.abs(a - b).max(axis=(1, 2, 3)))
-    stand_in = LpipsWeights((), (), ())
-    rng = np.random.default_rng(6)
-    images, targets = (f32(rng.uniform(size=(3, 8, 8, 3))) for _ in range(2))
-    loss, samples = RECIPES["paper"].phases[0].loss, RECIPES["paper"].phases[0].samples
-    mean, _ = loss.of_images(images, targets, stand_in)
-    a, b = f64(images), f64(targets)
-    wanted = sum(((a[r] - b[r]) ** 2).mean() + 0.05 * 2.0 * np.abs(a[r] - b[r]).max() for r in range(3))
-    assert 3 * float(mean) == pytest.approx(wanted, rel=1e-5) and loss.weight == samples.num_targets
 
 
 def test_training_follows_the_rendering_loss_of_all_tokens_over_black(monkeypatch):

@@ -47,20 +47,6 @@ def test_only_a_change_of_statics_recompiles():
     assert jax.tree.structure(body()) != jax.tree.structure(body(name="brick"))
 
 
-def test_transforms_rebuild_it():
-    def energy(b):
-        return jnp.sum(b.mass[..., None] * b.speed**2)
-
-    gradient = jax.grad(energy)(body())
-    assert isinstance(gradient, Body) and gradient.name == "ball"
-    np.testing.assert_allclose(gradient.speed, 2 * body().mass[:, None] * body().speed)
-    np.testing.assert_allclose(jax.vmap(energy)(body()), 3 * body().mass)
-    carried, _ = jax.lax.scan(lambda b, _: (replace(b, mass=b.mass + 1.0), None), body(), length=3)
-    np.testing.assert_allclose(carried.mass, body().mass + 3)
-    assert jax.eval_shape(lambda b: b, body()).speed.shape == (4, 3)
-    assert jax.tree.map(lambda _: None, body()).mass is None
-
-
 @pytest.mark.parametrize(
     "fields",
     [

@@ -56,13 +56,6 @@ def test_a_killed_study_continues_to_the_same_files(tmp_path):
             assert whole[path] == killed[path], path
 
 
-def test_a_finished_study_is_not_measured_again(tmp_path):
-    calls = []
-    for _ in range(2):
-        run_study(counting_study(calls), None, tmp_path, "smoke", QUIET)
-    assert calls == [0, 1, 2]
-
-
 def test_results_of_another_configuration_are_refused(tmp_path):
     run_study(counting_study([]), None, tmp_path, "smoke", QUIET)
     held, calls = files_of(tmp_path), []

@@ -97,11 +97,6 @@ def assert_same_bits(a: Gaussians, b: Gaussians) -> None:
 # Steps --------------------------------------------------------------------------------------------------------------
 
 
-def test_a_learning_rate_of_zero_changes_no_bit():
-    state, _ = step(init_refinement(doubtful()), key_views(), rate=0.0)
-    assert_same_bits(current(state), doubtful())
-
-
 def test_the_gradient_is_that_of_the_reference_renderer():
     """Central differences in float64 of the loss of one view, rendered by the oracle."""
     config = RefineConfig(held_back=0.3, seed=1)

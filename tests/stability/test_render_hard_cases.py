@@ -245,15 +245,6 @@ def assert_right(gaussians: Gaussians, camera: Camera, out) -> None:
     assert np.mean(np.abs(np.asarray(out.median_depth) - median) > 1e-5 * max(1.0, median.max())) < 0.02
 
 
-def test_equal_depths_keep_the_order_of_rows():
-    """Two coincident opaque Gaussians: the one that stands first in the arrays is in front."""
-    arrays = base()
-    arrays["means"][:2], arrays["opacities"][:2], arrays["scales"][:2] = [0, 0, 2.0], 1.0, 5.0
-    arrays["sh"][0, 0], arrays["sh"][1, 0] = [1.5, 0, 0], [0, 1.5, 0]
-    (_, out), _ = program()(*build(arrays))
-    assert float(out.color[8, 12, 0]) > 0.8 > 0.6 > float(out.color[8, 12, 1])
-
-
 ARRAYS = {
     "distortion": jnp.array([-0.3, 0.1, 0.01, -0.02, 0.05]),
     "exposures": jnp.array([[1.2, 0.0, 0.1, 0.01], [0.0, 0.9, 0.0, 0.0], [0.0, 0.0, 1.1, -0.02]]),

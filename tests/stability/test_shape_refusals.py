@@ -22,6 +22,11 @@ NAMED = {
     "features=jnp.zeros((8, 2))": "features must be [9 c], got [8, 2]",
     "tile=7": "tile must be 8 or 16 pixels, got 7",
     "max_pairs=1.5": "max_pairs must be a whole number of at least 1, got 1.5",
+    "max_pairs=0": "max_pairs must be a whole number of at least 1, got 0",
+    "width=0": "the image of the camera must have whole numbers of pixels, at least 1x1, got 0x64",
+    "sh=jnp.zeros((9, 5, 3))": "sh must hold 1, 4, 9 or 16 terms a Gaussian, got 5",
+    "viewmats=jnp.zeros((0, 4, 4)), Ks=jnp.zeros((0, 3, 3))": "wanted at least one camera",
+    "distortion=jnp.zeros((2, 5))": "distortion must be",
 }
 """The message of `render` for each wrong argument."""
 
