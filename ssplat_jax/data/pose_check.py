@@ -1,10 +1,12 @@
-"""Test of poses against the images: epipolar consistency of matches that were found without poses.
+"""Test of poses and focal lengths against the images: epipolar consistency of matches that were found without poses.
 
     keypoints -> mutual matches, poses unused -> share consistent with the poses in each convention
+                                              -> share consistent with longer and shorter focal lengths
 
 A match is consistent if it lies near its epipolar line and its point in front of the camera. Poses in a wrong
 convention (camera axes, direction of the matrix) leave a small share of the matches consistent; in the right one most
-are. Poses that fit in no convention, though the matches agree on some motion, belong to other images or are wrong.
+are. So do focal lengths of another crop or size, within half the distance: a wrong one moves lines by a few pixels.
+Poses that fit in no convention, though the matches agree on some motion, belong to other images or are wrong.
 """
 
 import dataclasses
@@ -20,7 +22,6 @@ from ssplat_jax.data.sparse_matches import (
     MAX_EPIPOLAR_PX,
     KeypointsOf,
     PosedImages,
-    epipolar_distances,
     match,
     motion_between,
     pixel_rays,
@@ -35,6 +36,11 @@ MIN_TOTAL_MATCHES = 100  # with fewer, nothing is said
 CLEAR_PARALLAX_DEGREES = 0.3  # points with less may triangulate behind the camera
 GOOD_SHARE = 0.5  # of matches; right poses are consistent with more, however many matches are false
 BETTER_RATIO = 1.5  # share of another convention over that of the given poses, from which it is named
+FOCAL_FACTORS = tuple(
+    factors for s in (0.5, 0.6, 0.7, 0.83, 1.2, 1.4, 1.7, 2.0) for factors in ((s, s), (s, 1.0), (1.0, s))
+)  # of fx and fy as given, that are tried in their place
+FOCAL_TOLERANCE = 0.5  # of the distance within which poses are tested
+BETTER_FOCAL = 1.25  # share with other focal lengths over that with the given ones, from which they are named
 POOR_SHARE = 0.6  # of the matches that agree on one motion; poses that are consistent with fewer are wrong
 
 
@@ -46,7 +52,7 @@ class MatchedPair:
     rays: tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]  # points at depth 1
     pixels: tuple[Float64[np.ndarray, "n 2"], Float64[np.ndarray, "n 2"]]  # in the delivered images
     tolerance_px: float  # of a match's distance from its epipolar line, pixels of the delivered image
-    focal: float  # of the second image, pixels
+    focals: Float64[np.ndarray, "2"]  # fx and fy of the second image, pixels
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,6 +60,7 @@ class PoseFit:
     """Shares of the matches that are consistent with the poses."""
 
     shares: dict[Convention, float]  # if the files were written in that convention
+    focal_shares: dict[tuple[float, float], float]  # if fx and fy were so many times as long; within FOCAL_TOLERANCE
     coherent_share: float  # that agree on a motion between the frames, whatever it is
     num_matches: int
 
@@ -81,35 +88,50 @@ def _matched(capture: PosedImages, i: int, j: int, keypoints: KeypointsOf) -> Ma
         return None
     rays = pixel_rays(capture.K(i), pixels[0]), pixel_rays(capture.K(j), pixels[1])
     frames = capture.frames[i], capture.frames[j]
-    return MatchedPair(frames, rays, pixels, MAX_EPIPOLAR_PX * b.pixel, capture.K(j)[0, 0])
+    return MatchedPair(frames, rays, pixels, MAX_EPIPOLAR_PX * b.pixel, np.diag(capture.K(j))[:2])
 
 
 def fit_poses(capture: PosedImages, convention: Convention, keypoints: KeypointsOf) -> PoseFit | None:
     """Returns how well poses that were read in `convention` fit the images in each; None if too few matches move."""
-    counts = dict.fromkeys(CONVENTIONS, 0)
+    counts, focals = dict.fromkeys(CONVENTIONS, 0), dict.fromkeys(((1.0, 1.0), *FOCAL_FACTORS), 0)
     total = coherent = 0
     for pair in matched_pairs(capture, range(len(capture.frames)), keypoints):
         total += len(pair.rays[0])
         coherent += _num_coherent(pair)
+        a, b = (frame.camtoworld for frame in pair.frames)
         for other in CONVENTIONS:
-            poses = (other.to_opencv(convention.from_opencv(frame.camtoworld)) for frame in pair.frames)
-            counts[other] += _num_consistent(pair, *poses)
+            first, second = (other.to_opencv(convention.from_opencv(pose)) for pose in (a, b))
+            counts[other] += _num_consistent(pair, first, second)
+        for factors in focals:
+            focals[factors] += _num_consistent(pair, a, b, factors, FOCAL_TOLERANCE)
     if total < MIN_TOTAL_MATCHES:
         return None
     shares = {other: count / total for other, count in counts.items()}
-    return PoseFit(shares=shares, coherent_share=coherent / total, num_matches=total)
+    focal_shares = {factors: count / total for factors, count in focals.items()}
+    return PoseFit(shares=shares, focal_shares=focal_shares, coherent_share=coherent / total, num_matches=total)
 
 
-def _num_consistent(pair: MatchedPair, a: Float64[np.ndarray, "4 4"], b: Float64[np.ndarray, "4 4"]) -> int:
-    """Number of matches near their epipolar lines whose points are in front of the first camera."""
+def _num_consistent(
+    pair: MatchedPair,
+    a: Float64[np.ndarray, "4 4"],
+    b: Float64[np.ndarray, "4 4"],
+    factors: tuple[float, float] = (1.0, 1.0),
+    tolerance: float = 1.0,
+) -> int:
+    """Number of matches near their epipolar lines whose points are in front of the first camera.
+
+    `factors` are those of fx and fy, `tolerance` that of the distance from the line.
+    """
     R, t = motion_between(a, b)
-    rays_a, rays_b = pair.rays
+    rays_a, rays_b = (rays / [*factors, 1.0] for rays in pair.rays)
     if np.linalg.norm(t) == 0:
         return 0
-    distances = np.diagonal(epipolar_distances(rays_a, rays_b, R, t))
+    lines = np.cross(t, rays_a @ R.T)
+    slopes = np.linalg.norm(lines[:, :2] / (pair.focals * factors), axis=-1)  # per pixel
+    distances = np.abs(np.sum(lines * rays_b, axis=-1)) / np.maximum(slopes, 1e-300)
     inverse_depths, parallax = triangulate(rays_a, rays_b, R, t)
     in_front = (inverse_depths > 0) | (np.abs(parallax) < CLEAR_PARALLAX_DEGREES)
-    return int(np.sum((distances < pair.tolerance_px / pair.focal) & in_front))
+    return int(np.sum((distances < tolerance * pair.tolerance_px) & in_front))
 
 
 def _num_coherent(pair: MatchedPair) -> int:
@@ -120,7 +142,7 @@ def _num_coherent(pair: MatchedPair) -> int:
 
 
 def pose_warning(fit: PoseFit | None, convention: Convention) -> str | None:
-    """A warning about poses in another convention, with the flags that mend them, or about wrong poses, or None."""
+    """A warning about poses in another convention, with the flags that mend them, or wrong focal lengths or poses."""
     if fit is None:
         return None
     given, best = fit.shares[convention], max(CONVENTIONS, key=lambda other: fit.shares[other])
@@ -129,6 +151,14 @@ def pose_warning(fit: PoseFit | None, convention: Convention) -> str | None:
         flags = " ".join(f"--{name} {value}" for name, value in best.options(convention).items())
         shares = f"{given:.0%} of the matches are consistent, and {better:.0%} would be"
         return f"Images and poses disagree: {shares} with {flags}; read the capture with them."
+    focal = max(fit.focal_shares, key=lambda factors: fit.focal_shares[factors])
+    as_given, better = fit.focal_shares[1.0, 1.0], fit.focal_shares[focal]
+    if better >= GOOD_SHARE * fit.coherent_share and better >= BETTER_FOCAL * as_given:
+        times = " and ".join(f"{s:g} times {name}" for s, name in zip(focal, ("fx", "fy"), strict=True) if s != 1.0)
+        return (
+            f"Images and focal lengths disagree: {as_given:.0%} of the matches are consistent, and {better:.0%} would"
+            f" be with about {times}; check that the intrinsics are those of these images, as cropped or resized."
+        )
     if given < POOR_SHARE * fit.coherent_share and fit.coherent_share >= GOOD_SHARE:
         return (
             f"Poses do not fit the images: {given:.0%} of the matches are consistent with them, and"

@@ -76,3 +76,27 @@ def test_inspect_names_the_flag_and_says_nothing_of_depths_from_wrong_poses(room
     warnings = summarize(turned, StreamConfig())["warnings"]
     assert sum("--axes opengl" in warning for warning in warnings) == 1
     assert not any("parallax" in warning or "matches between frames" in warning for warning in warnings)
+
+
+@pytest.fixture(scope="module")
+def corridor():
+    capture = open_capture("procedural:corridor?frames=16")
+    return capture, keypoints_of(capture)
+
+
+@pytest.mark.parametrize(
+    ("factors", "named"),
+    [
+        ((1.0, 1.0), None),
+        ((1.2, 1.0), "0.83 times fx;"),
+        ((1.2, 1.2), "0.83 times fx and 0.83 times fy;"),
+        ((1 / 1.2, 1 / 1.2), "1.2 times fx and 1.2 times fy;"),
+    ],
+)
+def test_focal_lengths_of_another_crop_or_size_are_named(factors, named, corridor):
+    """As after a crop or a resize of which the intrinsics know nothing; right ones are not warned of."""
+    capture, keypoints = corridor
+    wrong = np.array([[factors[0], 1.0, 1.0], [1.0, factors[1], 1.0], [1.0, 1.0, 1.0]])
+    frames = tuple(dataclasses.replace(f, K=f.K * wrong) for f in capture.frames)
+    warning = pose_warning(fit_poses(dataclasses.replace(capture, frames=frames), USUAL, keypoints), USUAL)
+    assert warning is None if named is None else named in warning
