@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import jax
 import numpy as np
 import pytest
 
@@ -14,9 +13,10 @@ from ssplat_jax.evaluation import evaluate as evaluation
 from ssplat_jax.evaluation.scoring import score_view
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.streaming.session import Session
+from tests.model.small import random_params
 from tests.streaming.narrow_model import NARROW, assert_same_bits
 
-SPLIT = interleaved_split(14, 1, 10)
+SPLIT = interleaved_split(9, 1, 6)
 
 
 def noise(images):
@@ -30,12 +30,12 @@ def noise_and_nan(images):
 
 @pytest.fixture(scope="module")
 def capture(programs_shared):
-    return open_capture("procedural:room?frames=14&size=48x32")
+    return open_capture("procedural:room?frames=9&size=48x32")
 
 
 @pytest.fixture(scope="module")
 def params():
-    return StreamSplat(NARROW).init(jax.random.key(0))
+    return random_params(NARROW)
 
 
 def poisoned(capture, frames, poison):

@@ -5,7 +5,6 @@ import functools
 import json
 import signal
 
-import jax
 import pytest
 
 from ssplat_jax.core.console import Reporter
@@ -16,9 +15,10 @@ from ssplat_jax.runs.capture_run import RunOptions, run_capture
 from ssplat_jax.runs.refine_run import refine_run
 from ssplat_jax.scene_files.formats import load_scene
 from ssplat_jax.storage.run_folder import RunFolder
+from tests.model.small import random_params
 from tests.streaming.narrow_model import NARROW
 
-CAPTURE, QUIET = "procedural:room?frames=4", Reporter(quiet=True)
+CAPTURE, QUIET = "procedural:room?frames=4&size=80x60", Reporter(quiet=True)
 
 
 def refine(path, steps=4, capture=CAPTURE, overwrite=False):
@@ -34,7 +34,7 @@ def stream(out, capture=CAPTURE, reporter=QUIET, overwrite=False):
 
 @functools.cache
 def params():
-    return StreamSplat(NARROW).init(jax.random.key(0))
+    return random_params(NARROW)
 
 
 @pytest.fixture(scope="module")
@@ -111,9 +111,10 @@ def test_a_folder_without_a_finished_run_is_refused(tmp_path, finished):
     with pytest.raises(InputError, match=r"found no state\.npz"):
         refine(tmp_path)
     assert not list(tmp_path.iterdir())
-    assert stream(tmp_path / "run", "procedural:room?frames=8", _StopsAfterOneChunk()).interrupted == signal.SIGINT
+    longer = CAPTURE.replace("frames=4", "frames=8")
+    assert stream(tmp_path / "run", longer, _StopsAfterOneChunk()).interrupted == signal.SIGINT
     with pytest.raises(InputError, match="wanted a finished run, got one after 4 of 8 views"):
-        refine(tmp_path / "run", capture="procedural:room?frames=8")
+        refine(tmp_path / "run", capture=longer)
 
 
 class _StopsAfterOneChunk(Reporter):
