@@ -88,7 +88,7 @@ class MemoryConfig(ConfigGroup):
     """Voxels that the cache can hold, a power of two; `overflow="grow"` doubles it outside jit."""
     overflow: Literal["grow", "drop_new"] = "grow"
     """Treatment of tokens of new voxels when the cache is full."""
-    # VACC never forgets a wrong pivot. Without carving redkitchen has 23.46 dB instead of 24.13.
+    # VACC never forgets a wrong pivot. docs/results.md has what carving brings.
     carving: bool = True
     """Views lower the confidence of pivots in free space that they see, and raise that of pivots on surfaces (ours)."""
 
@@ -108,7 +108,7 @@ class MemoryConfig(ConfigGroup):
 class HeadConfig(ConfigGroup):
     """Gaussians of a token."""
 
-    # One color per patch of 4 x 4 pixels left a quarter of the squared error within patches: 22.83 instead of 24.13 dB.
+    # One color per patch of 4 x 4 pixels left a quarter of the squared error within patches.
     gaussians_per_token: Literal[1, 4, 16] = 4
     """Gaussians in a square over the token's cell, each with the mean color of its part of the patch (ours; 1 is
     literal)."""
@@ -297,7 +297,7 @@ def preset(name: str) -> StreamConfig:
 
 @dataclasses.dataclass(frozen=True)
 class Quality:
-    """A trade-off between accuracy and time (`ssplat experiment accuracy_vs_time`, docs/performance.md)."""
+    """A trade-off between accuracy and time (`ssplat experiment accuracy_vs_time`, docs/results.md)."""
 
     scale: float
     """Factor by which images are resized before they are streamed."""

@@ -94,7 +94,7 @@ class CompactConfig(_SharedShapes):
     """Depth candidates are uniform in log depth."""
 
     # Hand-held video moves 0.4 % of the depth a frame, so the two nearest views (the paper's number) may both give no
-    # parallax. One source gives 24.00 dB on redkitchen, three give 24.13.
+    # parallax.
     num_sources: int = 3
     mixer_radius: int = 2
     encoder_widths: tuple[int, int] = (32, 64)

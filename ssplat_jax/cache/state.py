@@ -279,7 +279,7 @@ def check_cache(caches: VoxelCache, config: StreamConfig) -> None:
     if num_dropped and config.memory.overflow == "grow":
         raise CacheError(
             f"cache: wanted to keep every token, but {num_dropped} did not fit in {caches.capacity} voxels; "
-            "call cache.ensure_capacity(cache, config, num_new_tokens) before each step."
+            "call ss.ensure_capacity(cache, config, num_new_tokens) before each step."
         )
 
 

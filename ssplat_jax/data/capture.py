@@ -162,7 +162,7 @@ class Capture:
             return hashlib.sha256(b"".join(digests)).hexdigest()[:12]
 
     def scaled(self, factor: float) -> "Capture":
-        """Returns the same capture with images `factor` times as large, at least one pixel."""
+        """The same capture with images `factor` times as large, at least one pixel."""
         width, height = (max(1, round(side * factor)) for side in (self.width, self.height))
         return dataclasses.replace(self, width=width, height=height)
 
@@ -175,7 +175,7 @@ class Capture:
         return self.crop(i).intrinsics(self.frames[i].K)
 
     def image(self, i: int) -> Float32[np.ndarray, "h w 3"]:
-        """Returns image `i` as RGB in [0, 1], at the size of the capture."""
+        """Image `i` as RGB in [0, 1], at the size of the capture."""
         return self.pixels.image(i, self.crop(i))
 
     @functools.cached_property
@@ -184,7 +184,7 @@ class Capture:
         return any(frame.is_masked for frame in self.frames)
 
     def seen(self, i: int) -> Bool[np.ndarray, "h w"] | None:
-        """Returns the pixels of image `i` that are neither masked out nor outside of what the camera saw.
+        """The pixels of image `i` that are neither masked out nor outside of what the camera saw.
 
         None if no frame of the capture has others.
         """
@@ -194,7 +194,7 @@ class Capture:
         return np.ones((self.height, self.width), bool) if seen is None else seen
 
     def depth(self, i: int) -> Float32[np.ndarray, "h w"] | None:
-        """Returns depth map `i` (camera z in capture units, 0 where unknown), or None if the frame has none."""
+        """Depth map `i` (camera z in capture units, 0 where unknown), or None if the frame has none."""
         depth, frame = self.pixels.depth(i), self.frames[i]
         return None if depth is None else self.crop(i).depth(depth, (frame.width, frame.height))
 
@@ -214,7 +214,7 @@ class Capture:
                 pass
 
     def stream_frame(self, config: StreamConfig, indices: Sequence[int] | None = None) -> StreamFrame:
-        """Returns the stream frame of a run over the frames `indices` (default: all).
+        """The stream frame of a run over the frames `indices` (default: all).
 
         Near, far and the automatic scale are estimated from these frames only (`data.depth_range`); the other frames,
         which include the targets of an evaluation, have no influence. With `causal`, only the first chunk has any.
@@ -230,7 +230,7 @@ class Capture:
     def camera(
         self, i: int, frame: StreamFrame | None = None, *, offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     ) -> Camera:
-        """Returns the camera of frame `i`: in a stream frame, or else in the capture frame, in which scene files are.
+        """The camera of frame `i`: in a stream frame, or else in the capture frame, in which scene files are.
 
         In the capture frame, `offset` is the point of it to which the scene's positions are relative.
         """
@@ -242,7 +242,7 @@ class Capture:
         return Camera(viewmats=viewmats, Ks=Ks, width=self.width, height=self.height)
 
     def stream_order(self, config: StreamConfig, indices: Sequence[int] | None, frame: StreamFrame) -> list[int]:
-        """Returns `indices` (default: all) in the order of streaming, with slow video interleaved (`interleave`).
+        """`indices` (default: all) in the order of streaming, with slow video interleaved (`interleave`).
 
         The typical depth is taken to be the geometric mean of near and far. A causal stream keeps the order of frames,
         since it would have to wait for a second of video.
@@ -302,7 +302,7 @@ class Capture:
 def capture_of_listing(
     listing: Listing, format: str, pixels: Pixels, size: tuple[int, int] | None, convention: Convention = USUAL
 ) -> Capture:
-    """Returns the capture of a listing whose images all have one size; `size` is that of the delivered ones."""
+    """The capture of a listing whose images all have one size; `size` is that of the delivered ones."""
     if size is None:
         first = listing.frames[0]
         size = (first.width, first.height)
@@ -314,7 +314,7 @@ def capture_of_listing(
 
 
 def _indices(capture: Capture, indices: Sequence[int] | None) -> list[int]:
-    """Returns `indices`, checked, or those of all frames."""
+    """`indices`, checked, or those of all frames."""
     used = list(range(len(capture)) if indices is None else indices)
     if not used or not all(0 <= i < len(capture) for i in used):
         wanted = f"frame numbers in [0, {len(capture) - 1}], at least one"

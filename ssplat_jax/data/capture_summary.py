@@ -60,7 +60,7 @@ UNITS = {
 def summarize(
     capture: Capture, config: StreamConfig, advance: Callable[[int], None] = lambda done: None
 ) -> dict[str, Any]:
-    """Returns facts about a capture for a run with `config`, by name, as plain JSON types; `UNITS` has their units.
+    """Facts about a capture for a run with `config`, by name, as plain JSON types; `UNITS` has their units.
 
     `advance` is called with the number of frames, of at most `NUM_REFERENCES`, that have been matched.
     """
@@ -162,7 +162,7 @@ def _depth_warnings(capture: Capture, depths: DepthStatistics, steps: np.ndarray
 
 
 def frame_warnings(capture: Capture) -> list[str]:
-    """Returns the findings about the frames of `capture`, one sentence with a remedy each."""
+    """The findings about the frames of `capture`, one sentence with a remedy each."""
     return [*copy_warnings(capture), *order_warnings(capture), *image_warnings(capture)]
 
 

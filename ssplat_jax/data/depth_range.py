@@ -117,7 +117,7 @@ def estimate_depths(
 
 
 def same_place_distance(capture: PosedImages, indices: Sequence[int]) -> float:
-    """Returns the largest distance at which cameras count as being in the same place, since poses are rounded.
+    """The largest distance at which cameras count as being in the same place, since poses are rounded.
 
     It follows from the median camera of the frames `indices`: one diverged camera must not make all other
     places count as one.
@@ -127,7 +127,7 @@ def same_place_distance(capture: PosedImages, indices: Sequence[int]) -> float:
 
 
 def stream_scale(depths: DepthStatistics, config: StreamConfig) -> tuple[float, float, float]:
-    """Returns (scale, near, far): stream units per capture unit, and the depth range in stream units.
+    """(scale, near, far): stream units per capture unit, and the depth range in stream units.
 
     far / near is kept in [4, 60]. Too narrow a range is widened to both sides; too wide a range is cut at the near end
     up to an eighth of the median, and then at the far end.

@@ -25,7 +25,7 @@ REPLACE = f"replace the file (formats read: {', '.join(IMAGE_FORMATS)})"
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Returns (width, height) from the header of an image file, which is refused if that cannot be read."""
+    """(width, height) from the header of an image file, which is refused if that cannot be read."""
     with _open(path) as image:
         return image.size
 
@@ -66,7 +66,7 @@ def zero_is_white(image: Image.Image) -> bool:
 
 
 def image_flags(path: Path) -> tuple[bool, bool]:
-    """Returns whether an image file may have transparent pixels, and whether EXIF says that it is not upright."""
+    """Whether an image file may have transparent pixels, and whether EXIF says that it is not upright."""
     with _open(path) as image:
         with reading(path, REPLACE):
             # Not `image.getexif()`, which decodes a whole PNG to find what may follow its pixels.
@@ -83,7 +83,7 @@ def check_mask(path: Path, image: Path) -> None:
 
 
 def decode_mask(path: Path, mask_path: Path | None, size: tuple[int, int]) -> Float32[np.ndarray, "h w"]:
-    """Returns 1 for the pixels of an image of (width, height) `size` that count, and 0 for those that do not.
+    """1 for the pixels of an image of (width, height) `size` that count, and 0 for those that do not.
 
     Pixels count that are more than half opaque in the image `path` and brighter than half the brightest of the mask
     `mask_path`, which may have another size.
@@ -148,7 +148,7 @@ class Crop:
 
     @staticmethod
     def cover(stored: tuple[int, int], wanted: tuple[int, int]) -> "Crop":
-        """Returns the crop from (width, height) `stored` to `wanted` that keeps the aspect ratio of pixels."""
+        """The crop from (width, height) `stored` to `wanted` that keeps the aspect ratio of pixels."""
         scale = max(wanted[0] / stored[0], wanted[1] / stored[1])
         left, top = ((s - w / scale) / 2 for s, w in zip(stored, wanted, strict=True))
         return Crop(scale=scale, left=left, top=top, width=wanted[0], height=wanted[1])
@@ -265,7 +265,7 @@ PINHOLE = Lens()  # no distortion
 
 
 def check_lens(lens: Lens, K: Float64[np.ndarray, "3 3"], width: int, height: int, where: str) -> float:
-    """Returns the largest displacement by distortion on the border of the image, in pixels; exactly 0 without any.
+    """The largest displacement by distortion on the border of the image, in pixels; exactly 0 without any.
 
     Distortion that folds the image is refused: its coefficients probably belong to another model.
     """
@@ -306,7 +306,7 @@ def undistort(
     order: int = 1,
     outside: float | None = None,
 ) -> Float32[np.ndarray, "h w *c"]:
-    """Returns the image (or depth map) that a pinhole camera of the same intrinsics would have taken.
+    """The image (or depth map) that a pinhole camera of the same intrinsics would have taken.
 
     Args:
         image: the distorted image.

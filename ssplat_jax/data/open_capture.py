@@ -51,7 +51,7 @@ IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", "
 VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".mkv", ".webm"})
 PROCEDURAL = "procedural"  # scheme of the paths of procedural captures
 PROCEDURAL_FRAMES = 73  # 64 context views and the 9 interleaved targets between them
-PROCEDURAL_SIZE = (128, 96)  # (width, height); the demo takes less than two minutes on two cores at this size
+PROCEDURAL_SIZE = (128, 96)  # (width, height), at which the demo takes a minute or two on two cores
 DONE = "done"
 """A file of this name in the folder of a growing capture says that nothing more will come."""
 
@@ -92,7 +92,7 @@ def open_capture(path: str | Path, *, size: tuple[int, int] | None = None) -> Ca
 
 
 def without_tilde(path: str) -> Path:
-    """Returns `path` with the home folder in place of a leading `~` or `~user`, which must exist."""
+    """`path` with the home folder in place of a leading `~` or `~user`, which must exist."""
     with reading(path[:80], "check the path"):
         return Path(path).expanduser()
 

@@ -37,7 +37,7 @@ def reading(where: object, fix: str = AGAIN) -> Iterator[None]:
 
 
 def load_text(path: Path) -> str:
-    """Returns the text of a UTF-8 file, with or without a byte order mark."""
+    """The text of a UTF-8 file, with or without a byte order mark."""
     with reading(path):
         size = path.stat().st_size
         if size > MAX_BYTES:
@@ -46,13 +46,13 @@ def load_text(path: Path) -> str:
 
 
 def load_lines(path: Path) -> list[tuple[str, str]]:
-    """Returns (location, text) of every line that is not a comment, also of blank ones."""
+    """(location, text) of every line that is not a comment, also of blank ones."""
     lines = [(f"{path}: line {i}", line.strip()) for i, line in enumerate(load_text(path).split("\n"), start=1)]
     return [(where, line) for where, line in lines if not line.startswith("#")]
 
 
 def load_rows(path: Path, num_columns: int, lines: list[tuple[str, str]] | None = None) -> np.ndarray:
-    """Returns a table of numbers from the file `path`, or from its `lines`; blank lines are skipped."""
+    """A table of numbers from the file `path`, or from its `lines`; blank lines are skipped."""
     lines = load_lines(path) if lines is None else lines
     rows = [parse_numbers(line.split(), where, num_columns) for where, line in lines if line]
     return np.array(rows, np.float64).reshape(-1, num_columns)
@@ -67,7 +67,7 @@ def parse_numbers(words: list[str], where: str, count: int | None = None) -> lis
 
 
 def load_json(path: Path, kind: type = dict) -> Any:
-    """Returns the value of a JSON file, which must be an object (`dict`) or a `list`."""
+    """The value of a JSON file, which must be an object (`dict`) or a `list`."""
     text = load_text(path)
     with reading(path):
         value = json.loads(text, object_pairs_hook=lambda pairs: _unique(pairs, path))
@@ -94,11 +94,11 @@ class Fields:
         self._fields, self.where = fields, where
 
     def get(self, name: str) -> Any:
-        """Returns a value as it is; None if it is missing or null."""
+        """A value as it is; None if it is missing or null."""
         return self._fields.get(name)
 
     def number(self, name: str, default: float | None = None) -> float:
-        """Returns a finite number; `default` where it is missing or null."""
+        """A finite number; `default` where it is missing or null."""
         value = self._fields.get(name)
         value = default if value is None else value
         with contextlib.suppress(OverflowError):  # of an integer too large for float64
@@ -107,7 +107,7 @@ class Fields:
         raise self._refused(name, "a finite number, written plainly")
 
     def numbers(self, name: str, shape: tuple[int, ...]) -> Float64[np.ndarray, "..."]:
-        """Returns an array of finite numbers of that shape."""
+        """An array of finite numbers of that shape."""
         with contextlib.suppress(TypeError, ValueError, OverflowError):
             array = np.array(self._fields.get(name), np.float64)
             if array.shape == shape and np.isfinite(array).all():
@@ -115,14 +115,14 @@ class Fields:
         raise self._refused(name, f"{' x '.join(map(str, shape))} finite numbers")
 
     def text(self, name: str) -> str:
-        """Returns a text that is not empty."""
+        """A text that is not empty."""
         value = self._fields.get(name)
         if isinstance(value, str) and value:
             return value
         raise self._refused(name, "a text")
 
     def entries(self, name: str) -> list[Any]:
-        """Returns a list that is not empty."""
+        """A list that is not empty."""
         value = self._fields.get(name)
         if isinstance(value, list) and value:
             return value

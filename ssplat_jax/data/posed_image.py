@@ -106,7 +106,7 @@ def _check_coordinates(translation: Float64[np.ndarray, "3"], where: str) -> Non
 
 
 def pose_from_quat(wxyz: object, translation: object, where: str) -> Float64[np.ndarray, "4 4"]:
-    """Returns the rigid transform of an untrusted quaternion, which is normalized, and a translation.
+    """The rigid transform of an untrusted quaternion, which is normalized, and a translation.
 
     Raises:
         InputError: a value is not finite, a coordinate is too large, or the quaternion is shorter than 1e-6.
@@ -130,7 +130,7 @@ def pose_from_quat(wxyz: object, translation: object, where: str) -> Float64[np.
 
 
 def invert_pose(pose: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "4 4"]:
-    """Returns the inverse of a rigid transform."""
+    """The inverse of a rigid transform."""
     back = np.eye(4)
     back[:3, :3] = pose[:3, :3].T
     back[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
@@ -140,7 +140,7 @@ def invert_pose(pose: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "4 4"]:
 def check_intrinsics(
     *, fx: float, fy: float, cx: float, cy: float, width: int, height: int, where: str
 ) -> Float64[np.ndarray, "3 3"]:
-    """Returns the intrinsics matrix of checked values in pixels; the center of the first pixel is (0.5, 0.5).
+    """The intrinsics matrix of checked values in pixels; the center of the first pixel is (0.5, 0.5).
 
     Raises:
         InputError: a focal length is not positive or not in pixels, or the principal point is outside the image.
@@ -175,17 +175,17 @@ class Convention:
     poses: Direction = "camera-to-world"
 
     def to_opencv(self, written: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "4 4"]:
-        """Returns the camera-to-world pose with OpenCV axes of a matrix in this convention."""
+        """The camera-to-world pose with OpenCV axes of a matrix in this convention."""
         camtoworld = written if self.poses == "camera-to-world" else invert_pose(written)
         return camtoworld if self.axes == "opencv" else camtoworld @ OPENGL_TO_OPENCV
 
     def from_opencv(self, camtoworld: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "4 4"]:
-        """Returns the matrix in this convention of a camera-to-world pose with OpenCV axes."""
+        """The matrix in this convention of a camera-to-world pose with OpenCV axes."""
         camtoworld = camtoworld if self.axes == "opencv" else camtoworld @ OPENGL_TO_OPENCV
         return camtoworld if self.poses == "camera-to-world" else invert_pose(camtoworld)
 
     def options(self, usual: "Convention") -> dict[str, str]:
-        """Returns the options that ask for this convention in place of the usual one."""
+        """The options that ask for this convention in place of the usual one."""
         return {name: getattr(self, name) for name in ("axes", "poses") if getattr(self, name) != getattr(usual, name)}
 
 
@@ -215,12 +215,12 @@ def split_options(path: str) -> tuple[str, dict[str, str]]:
 
 
 def with_options(path: str, *, axes: str | None = None, poses: str | None = None) -> str:
-    """Returns `path` with the options that are not None, which replace those that it has."""
+    """`path` with the options that are not None, which replace those that it has."""
     path, options = split_options(path)
     options |= {name: value for name, value in (("axes", axes), ("poses", poses)) if value is not None}
     return path + ("?" if options else "") + "&".join(f"{name}={value}" for name, value in options.items())
 
 
 def reinterpreted(frame: Frame, usual: Convention, written: Convention) -> Frame:
-    """Returns a frame that was read in the `usual` convention as if its file were `written` in another one."""
+    """A frame that was read in the `usual` convention as if its file were `written` in another one."""
     return dataclasses.replace(frame, camtoworld=written.to_opencv(usual.from_opencv(frame.camtoworld)))

@@ -63,7 +63,7 @@ KeypointsOf = Callable[[int], Keypoints]
 
 
 def detect_keypoints(image: Float32[np.ndarray, "h w 3"]) -> Keypoints:
-    """Returns the ORB keypoints of an image; there are none if it is too narrow or has no corners."""
+    """The ORB keypoints of an image; there are none if it is too narrow or has no corners."""
     height, width = image.shape[:2]
     shrink = max(height, width) / LONG_SIDE
     nothing = Keypoints(pixels=np.zeros((0, 2)), descriptors=np.zeros((0, 256), bool), pixel=shrink)
@@ -88,18 +88,18 @@ def gray_image(
     size: tuple[int, int],
     resample: Image.Resampling = Image.Resampling.BICUBIC,
 ) -> Float64[np.ndarray, "h2 w2"]:
-    """Returns an image in gray at another size (width, height)."""
+    """An image in gray at another size (width, height)."""
     gray = Image.fromarray(np.ascontiguousarray(image @ np.array([0.299, 0.587, 0.114], np.float32)))
     return np.asarray(gray.resize(size, resample), np.float64)
 
 
 def keypoints_of(capture: PosedImages) -> KeypointsOf:
-    """Returns a function that detects the keypoints of a frame of `capture` once and remembers them."""
+    """A function that detects the keypoints of a frame of `capture` once and remembers them."""
     return functools.cache(lambda i: only_seen(detect_keypoints(capture.image(i)), capture.seen(i)))
 
 
 def only_seen(keypoints: Any, seen: Bool[np.ndarray, "h w"] | None) -> Any:
-    """Returns the keypoints (with `pixels` and `descriptors`) of an image that are not masked out."""
+    """The keypoints (with `pixels` and `descriptors`) of an image that are not masked out."""
     if seen is None:
         return keypoints
     columns, rows = keypoints.pixels.astype(int).T
@@ -127,12 +127,12 @@ def triangulate_pair(capture: PosedImages, i: int, j: int, keypoints: KeypointsO
 def motion_between(
     a: Float64[np.ndarray, "4 4"], b: Float64[np.ndarray, "4 4"]
 ) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, "3"]]:
-    """Returns rotation and translation from camera a to camera b, whose camera-to-world poses are given."""
+    """Rotation and translation from camera a to camera b, whose camera-to-world poses are given."""
     return b[:3, :3].T @ a[:3, :3], b[:3, :3].T @ (a[:3, 3] - b[:3, 3])
 
 
 def pixel_rays(K: Float64[np.ndarray, "3 3"], pixels: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarray, "n 3"]:
-    """Returns the points at depth 1 on the rays through pixels."""
+    """The points at depth 1 on the rays through pixels."""
     return np.concatenate([(pixels - K[:2, 2]) / np.diag(K)[:2], np.ones((len(pixels), 1))], axis=-1)
 
 
@@ -142,7 +142,7 @@ def epipolar_distances(
     R: Float64[np.ndarray, "3 3"],
     t: Float64[np.ndarray, "3"],
 ) -> Float64[np.ndarray, "n m"]:
-    """Returns the distance of each ray of camera b from the epipolar line of each ray of camera a.
+    """The distance of each ray of camera b from the epipolar line of each ray of camera a.
 
     Rays have z = 1, and distances are in that plane of camera b; R and t lead from camera a to camera b.
     """
@@ -155,7 +155,7 @@ def match(
     descriptors_b: Bool[np.ndarray, "m bits"],
     allowed: Bool[np.ndarray, "n m"],
 ) -> tuple[Int[np.ndarray, " p"], Int[np.ndarray, " p"]]:
-    """Returns the rows of `descriptors_a` and `descriptors_b` that are mutual nearest neighbors among `allowed` pairs.
+    """The rows of `descriptors_a` and `descriptors_b` that are mutual nearest neighbors among `allowed` pairs.
 
     Matches must be within `MAX_HAMMING` bits and clearly nearer than the second best (`MAX_RATIO`). Because poses are
     known, the epipolar lines leave a few candidates each; this gives up to twice as many matches as an unrestricted
@@ -170,7 +170,7 @@ def match(
 def mutual_nearest(
     distances: Float[np.ndarray, "n m"], max_distance: float, max_ratio: float
 ) -> tuple[Int[np.ndarray, " p"], Int[np.ndarray, " p"]]:
-    """Returns the rows and columns that are nearest to each other and at most `max_distance` apart.
+    """The rows and columns that are nearest to each other and at most `max_distance` apart.
 
     A row's smallest distance must be less than `max_ratio` of its second smallest (Lowe's test).
     """
@@ -189,7 +189,7 @@ def triangulate(
     R: Float64[np.ndarray, "3 3"],
     t: Float64[np.ndarray, "3"],
 ) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
-    """Returns the inverse depths in camera a where pairs of rays come closest, and the angles between them in degrees.
+    """The inverse depths in camera a where pairs of rays come closest, and the angles between them in degrees.
 
     Both are 0 for parallel rays, and negative for rays that meet behind camera a. Rays have z = 1, so that lengths
     along them are depths; R and t lead from camera a to camera b.

@@ -56,7 +56,7 @@ class Split:
         return self.protocol in ("scannet", "index")
 
     def to_json(self) -> str:
-        """Returns canonical JSON: equal splits give equal text."""
+        """Canonical JSON: equal splits give equal text."""
         return json.dumps(dataclasses.asdict(self), sort_keys=True, separators=(",", ":"))
 
     @property
@@ -68,7 +68,7 @@ class Split:
 def choose_split(
     protocol: str, num_frames: int, stride: int | None, context: int | None, targets: int | None = None
 ) -> Split:
-    """Returns the split for the options of the command line.
+    """The split for the options of the command line.
 
     Args:
         protocol: "interleaved", "paper" or "scannet".
@@ -112,7 +112,7 @@ def choose_split(
 
 
 def interleaved_split(num_frames: int, stride: int, context: int) -> Split:
-    """Returns the interleaved split: every 8th strided frame is a target, the first `context` others are context."""
+    """The interleaved split: every 8th strided frame is a target, the first `context` others are context."""
     _check_counts(stride=stride, context=context)
     taken = range(0, num_frames, stride)
     at_target = set(taken[FIRST_TARGET::TARGET_STEP])
@@ -128,7 +128,7 @@ def interleaved_split(num_frames: int, stride: int, context: int) -> Split:
 def paper_split(
     num_frames: int, context: int, *, targets: int = PAPER_TARGETS, anchors: int = 0, thin_to: int | None = None
 ) -> Split:
-    """Returns the split of the paper's appendix; the defaults are those for DL3DV and RE10K.
+    """The split of the paper's appendix; the defaults are those for DL3DV and RE10K.
 
     Args:
         num_frames: length of the trajectory.
@@ -248,7 +248,7 @@ def _frame_numbers(fields: Any, where: str, name: str) -> tuple[int, ...]:
 
 
 def split_of_scene(index: Index, scene: str, num_frames: int) -> Split:
-    """Returns the split of one scene of an index for a capture of `num_frames`."""
+    """The split of one scene of an index for a capture of `num_frames`."""
     if scene not in index:
         got, fix = f"{len(index)} others, such as {echo(next(iter(index), ''))}", "name one of them with --scene"
         raise refusal("--index", wanted=f"the scene {echo(scene)}", got=got, fix=fix)
@@ -264,7 +264,7 @@ def split_of_scene(index: Index, scene: str, num_frames: int) -> Split:
 
 
 def index_to_json(index: Index) -> dict[str, Any]:
-    """Returns an index as plain JSON types; the inverse is `read_index`, but for the name of the protocol."""
+    """An index as plain JSON types; the inverse is `read_index`, but for the name of the protocol."""
     return {
         name: None if split is None else {"context": list(split.context), "target": list(split.targets)}
         for name, split in index.items()

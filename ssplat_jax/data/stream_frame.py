@@ -39,24 +39,24 @@ class StreamFrame:
     def at_camera(
         camtoworld: Float64[np.ndarray, "4 4"], *, scale: float, near: float, far: float, warning: str | None = None
     ) -> "StreamFrame":
-        """Returns the stream frame whose origin is a camera of the capture, with the other fields as given."""
+        """The stream frame whose origin is a camera of the capture, with the other fields as given."""
         return StreamFrame(camtoworld[:3, :3].copy(), camtoworld[:3, 3].copy(), scale, near, far, warning)
 
     @staticmethod
     def at_point(point: tuple[float, float, float]) -> "StreamFrame":
-        """Returns the frame with the axes and units of the capture whose origin is a point of it."""
+        """The frame with the axes and units of the capture whose origin is a point of it."""
         camtoworld = np.eye(4)
         camtoworld[:3, 3] = point
         return StreamFrame.at_camera(camtoworld, scale=1.0, near=0.0, far=math.inf)
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns the fields as plain JSON types; the inverse is `from_dict`."""
+        """The fields as plain JSON types; the inverse is `from_dict`."""
         fields = dataclasses.asdict(self)
         return fields | {"rotation": self.rotation.tolist(), "origin": self.origin.tolist()}
 
     @staticmethod
     def from_dict(fields: dict[str, Any]) -> "StreamFrame":
-        """Returns the stream frame of the fields that `to_dict` gave."""
+        """The stream frame of the fields that `to_dict` gave."""
         rotation, origin = np.array(fields["rotation"]), np.array(fields["origin"])
         return StreamFrame(rotation, origin, fields["scale"], fields["near"], fields["far"], fields["warning"])
 

@@ -82,7 +82,7 @@ def find_tracks(
 
 
 def sift_keypoints(image: Float32[np.ndarray, "h w 3"]) -> SiftKeypoints:
-    """Returns the SIFT keypoints of an image; there are none if it is tiny or has no structure."""
+    """The SIFT keypoints of an image; there are none if it is tiny or has no structure."""
     height, width = image.shape[:2]
     nothing = SiftKeypoints(np.zeros((0, 2)), np.zeros((0, 128), np.float32))
     shrink = max(1.0, max(height, width) / LONG_SIDE)

@@ -89,7 +89,8 @@ def view_loss(
     """L1 error of the key view in `slot` with holes filled and over black, on the pixels that are not held back.
 
     Returns:
-        The loss, and the loss again, the error of the held-back pixels, and the tile intersections that did not fit.
+        The loss, and the loss again (`jax.grad` returns only what is auxiliary), the error of the held-back pixels, and
+        the tile intersections that did not fit.
     """
     filled, black, out = errors_of_view(gaussians, background, view, max_pairs=max_pairs)
     errors = jnp.mean(config.shown_weight * jnp.abs(filled) + (1 - config.shown_weight) * jnp.abs(black), axis=-1)

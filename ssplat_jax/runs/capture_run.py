@@ -140,7 +140,8 @@ class WholeCapture:
 
     def __init__(self, path: str, options: RunOptions) -> None:
         capture = open_capture(path, size=options.size)
-        if options.scale != 1.0:  # as `refine` and `export` open it, by the size: a procedural capture is drawn for it
+        if options.scale != 1.0:
+            # Opened anew, as `refine` and `export` will: a procedural capture renders other images for another size.
             scaled = capture.scaled(options.scale)
             capture = open_capture(path, size=(scaled.width, scaled.height))
         taken = list(range(0, len(capture), options.stride))[: options.max_views]

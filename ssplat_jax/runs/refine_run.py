@@ -24,7 +24,7 @@ from ssplat_jax.storage.run_folder import RunFolder, lock_folder
 KIND = "refinement state 1"
 
 MEASURED = tuple(field.name for field in dataclasses.fields(Progress) if field.name != "state")
-"""Fields of `Progress` that are plain numbers."""
+"""Fields of `Progress` that JSON holds: numbers, and lists of them."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -28,7 +28,7 @@ class VideoWriter:
             import av
         except ImportError as error:
             raise InputError(
-                'video: wanted the package av, which is not installed; run: pip install "ssplat-jax[video]"'
+                'video: wanted the package av, which is not installed; run: pip install -e ".[video]"'
             ) from error
         self._encoded, self._frame_of = io.BytesIO(), av.VideoFrame.from_ndarray
         self._container: Any = av.open(self._encoded, "w", format="mp4")

@@ -67,7 +67,7 @@ def describe_weights(name: str) -> WeightsFacts:
 
 
 def load_params(name: str = "tiny") -> dict:
-    """Returns trained parameters: those shipped with the preset `name`, or those of the weights file `name`.
+    """Trained parameters: those shipped with the preset `name`, or those of the weights file `name`.
 
     Raises:
         InputError: there is no such preset or file, no weights ship with the preset, or the shapes do not match.

@@ -4,8 +4,8 @@ The loss of a phase is a frozen dataclass, whose fields are its weights and whos
 
     loss(model, params, batch, lpips weights or None) -> (value, metrics to log)
 
-`renders` says whether it renders the target views of `Sample`. To try another loss, write it here and name it in a
-phase of `recipe.py`.
+`renders` says whether it renders the target views of `Sample`, which must then have some. To try another loss, write it
+here, name it in a phase of `recipe.py`, and give the recipe a name in `RECIPES`.
 """
 
 import dataclasses

@@ -175,8 +175,8 @@ _FOUR_CHUNKS = Views(4, ((96, 128),), num_targets=4, steps_of_depth=(0.01, 0.15)
 STREAM = Recipe(
     phases=(Phase("stream", 400, _FOUR_CHUNKS, RenderingLoss(), learning(*AFTER_MATCHER), 1e-3, final_share=0.02),)
 )
-"""Trains the stages behind a trained matcher. The shipped weights do not include it, because it lowered the score of a
-capture by 0.4 dB; docs/model_card.md has the command."""
+"""Trains the stages behind a trained matcher. The shipped weights do not include it, because it lowered the scores
+of captures (docs/model_card.md)."""
 
 EVIDENCE = Recipe(
     phases=(Phase("evidence", 600, Crops(), CropLoss(), learning("evidence"), 5e-3, final_share=0.0, warmup_steps=20),),

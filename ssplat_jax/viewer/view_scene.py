@@ -103,7 +103,7 @@ def import_viser(host: str, port: int) -> Any:
     try:
         import viser
     except ImportError as error:
-        raise InputError('view: wanted the package viser; run: pip install "ssplat-jax[viewer]"') from error
+        raise InputError('view: wanted the package viser; run: pip install -e ".[viewer]"') from error
     try:
         if not 0 < port < 1 << 16:
             raise OSError("ports are 1 to 65535")

@@ -42,7 +42,7 @@ def make_capture(root: Path, change: Callable[[Path, dict[str, Any]], Any] = lam
 
 
 def mutant(data: bytes, rng: random.Random) -> bytes:
-    """Returns `data` after a few random edits: bytes are changed, removed, repeated or replaced."""
+    """`data` after a few random edits: bytes are changed, removed, repeated or replaced."""
     out = bytearray(data)
     for _ in range(rng.randint(1, 6)):
         at = rng.randrange(len(out))

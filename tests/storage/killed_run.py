@@ -23,7 +23,7 @@ _latest = ""  # name of the file that was renamed last
 
 
 def step_of(event: str, arguments: tuple) -> tuple[str, str] | None:
-    """Returns (file, step) of an audit event that is part of a write, else None."""
+    """(file, step) of an audit event that is part of a write, else None."""
     global _latest
     if event == "os.rename":
         source, target = Path(arguments[0]), Path(arguments[1])

@@ -40,7 +40,7 @@ def sample_path(
     step: float | None = None,
     min_clearance: float = 0.45,
 ) -> tuple[Float[np.ndarray, "v 4 4"], Float[np.ndarray, "v 3 3"]]:
-    """Returns the camera-to-world poses of a random path through a scene, and the intrinsics that they share.
+    """The camera-to-world poses of a random path through a scene, and the intrinsics that they share.
 
     `step` is the typical distance between consecutive views (None: 1 to 10 % of the orbit radius), `min_clearance` that
     to all surfaces, where the path can keep it. `kind` is one of `PATH_KINDS`; None draws one.
@@ -120,7 +120,7 @@ def _free_heading(rng, scene: Scene, walker: _Walker, wish: np.ndarray, distance
 
 
 def look_along(position: np.ndarray, forward: np.ndarray, roll: float = 0.0) -> Float[np.ndarray, "4 4"]:
-    """Returns the camera-to-world pose at `position` with +z along the unit vector `forward`, level up to `roll`."""
+    """The camera-to-world pose at `position` with +z along the unit vector `forward`, level up to `roll`."""
     right = _unit(np.cross(forward, UP))
     down = np.cross(forward, right)
     c, s = np.cos(roll), np.sin(roll)
@@ -131,7 +131,7 @@ def look_along(position: np.ndarray, forward: np.ndarray, roll: float = 0.0) -> 
 
 
 def look_at(position: np.ndarray, target: np.ndarray) -> Float[np.ndarray, "4 4"]:
-    """Returns the level camera-to-world pose at `position` that looks at `target`."""
+    """The level camera-to-world pose at `position` that looks at `target`."""
     return look_along(position, _unit(target - position))
 
 

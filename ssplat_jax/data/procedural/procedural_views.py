@@ -43,7 +43,7 @@ def training_sample(
     steps: tuple[float, float] = STEP_RANGE,
     kinds: tuple[str, ...] = (),
 ) -> Views:
-    """Returns rendered views of a random path through a random world.
+    """Rendered views of a random path through a random world.
 
     The units of a sample are such that the median depth is between 1.2 and 3.5 and all surfaces are between about 0.3
     and 15 away, but for the sky.
@@ -138,7 +138,7 @@ def _through_sensor(rng: np.random.Generator, scene: Scene, images: np.ndarray) 
 
 
 def procedural_capture_arrays(name: str, num_frames: int, height: int, width: int, seed: int = 0) -> Views:
-    """Returns the views of the capture `procedural:NAME` in meters.
+    """The views of the capture `procedural:NAME` in meters.
 
     `room`, `orbit` and `corridor` are smooth paths that cover their world evenly. `revisit` has weak textures, noise
     and a path that returns: half of its views go around a room, then the camera stands at four places, closer to what

@@ -50,7 +50,7 @@ class Scene:
 
 
 def scale_scene(scene: Scene, factor: float) -> Scene:
-    """Returns the scene with all lengths multiplied by `factor`; it looks the same from scaled cameras."""
+    """The scene with all lengths multiplied by `factor`; it looks the same from scaled cameras."""
     f = np.float32(factor)
     frames = np.concatenate([scene.frames[..., :3] / f, scene.frames[..., 3:]], axis=-1)
     faces = np.array(scene.faces)
@@ -68,7 +68,7 @@ def scale_scene(scene: Scene, factor: float) -> Scene:
 
 
 def fade_scene(scene: Scene, contrast: float) -> Scene:
-    """Returns the scene with `contrast` times the deviations of its albedos from the middle gray of their face."""
+    """The scene with `contrast` times the deviations of its albedos from the middle gray of their face."""
     faces = np.array(scene.faces)
     gains, biases = faces[..., 9:12], faces[..., 12:15]
     biases += (1 - contrast) * _MIDDLE_ALBEDO * gains
@@ -77,7 +77,7 @@ def fade_scene(scene: Scene, contrast: float) -> Scene:
 
 
 def clearance(scene: Scene, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-    """Returns the distance from points to the nearest surface, negative inside a solid or outside the shell.
+    """The distance from points to the nearest surface, negative inside a solid or outside the shell.
 
     Limits:
         Exact outside boxes, round balls and round cylinders; a lower bound for stretched balls.
@@ -121,13 +121,13 @@ class Finish:
 
 
 def yaw_rotation(angle: float) -> np.ndarray:
-    """Returns the rotation matrix about the vertical axis by an angle in radians."""
+    """The rotation matrix about the vertical axis by an angle in radians."""
     c, s = np.cos(angle), np.sin(angle)
     return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
 
 
 def random_rotation(rng: np.random.Generator) -> np.ndarray:
-    """Returns a uniformly distributed random rotation matrix."""
+    """A uniformly distributed random rotation matrix."""
     q, r = np.linalg.qr(rng.standard_normal((3, 3)))
     q = q * np.sign(np.diag(r))
     return q * np.sign(np.linalg.det(q))
@@ -149,7 +149,7 @@ class SceneBuilder:
         self._limits = {"box": NUM_BOXES, "ball": NUM_BOXES + NUM_BALLS, "cylinder": NUM_SOLIDS}
 
     def finish(self, *groups: str, tile: float = 1.0, same: bool = True, tint: float = 0.15, **options) -> Finish:
-        """Returns a random finish from one of the texture `groups`, with other fields of `Finish` as `options`.
+        """A random finish from one of the texture `groups`, with other fields of `Finish` as `options`.
 
         All faces have the same texture if `same`; `tint` is the largest relative change of a color channel.
         """
@@ -210,7 +210,7 @@ class SceneBuilder:
         self._place(NUM_SOLIDS + 1, np.zeros(3), radius, finish, np.eye(3))
 
     def build(self, *, focus, orbit_radius: float, eye, sensor: bool = False) -> Scene:
-        """Returns the scene under a random light; with `sensor`, views have changes of exposure and noise."""
+        """The scene under a random light; with `sensor`, views have changes of exposure and noise."""
         rng = self.rng
         light = np.array([rng.normal(), -rng.uniform(0.4, 2.0), rng.normal()])
         floats = {

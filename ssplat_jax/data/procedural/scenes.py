@@ -19,7 +19,7 @@ _EVERYTHING = ("photo", "floor", "pattern", "noise", "facade", "leaves", "photo"
 def sample_scene(
     seed: int, kind: str | None = None, textures: TextureLibrary | None = None, *, only_used: bool = False
 ) -> Scene:
-    """Returns a random world, which depends on the arguments and the release of scikit-image.
+    """A random world, which depends on the arguments and the release of scikit-image.
 
     Args:
         seed: any non-negative integer.

@@ -43,7 +43,7 @@ class TextureLibrary:
 
 @functools.lru_cache(maxsize=1)
 def texture_library() -> TextureLibrary:
-    """Returns the library that all scenes share; the first call takes about two seconds."""
+    """The library that all scenes share; the first call takes about two seconds."""
     rng = np.random.default_rng(20240607)
     recipes: dict[str, tuple[int, Callable[[np.random.Generator], np.ndarray]]] = {
         "photo": (72, _photo),
@@ -63,7 +63,7 @@ def texture_library() -> TextureLibrary:
 
 
 def pack_pyramids(tiles: UInt8[np.ndarray, "n 256 256 3"]) -> UInt32[np.ndarray, "n texels"]:
-    """Returns box-filtered mip pyramids of `tiles`, packed into one `uint32` per texel."""
+    """Box-filtered mip pyramids of `tiles`, packed into one `uint32` per texel."""
     levels, level = [], tiles.astype(np.float32)
     for _ in range(NUM_LEVELS):
         r, g, b = np.moveaxis(np.round(level).astype(np.uint32), -1, 0)

@@ -179,13 +179,13 @@ class _Binary:
         self.data, self.at = path.read_bytes(), 0
 
     def take(self, layout: str) -> tuple:
-        """Returns the values of a `struct` layout, which raises at the end of the file."""
+        """The values of a `struct` layout, which raises at the end of the file."""
         values = struct.unpack_from("<" + layout, self.data, self.at)
         self.at += struct.calcsize("<" + layout)
         return values
 
     def text(self) -> str:
-        """Returns the UTF-8 text up to the next zero byte."""
+        """The UTF-8 text up to the next zero byte."""
         start, self.at = self.at, self.data.index(b"\0", self.at) + 1
         return self.data[start : self.at - 1].decode()
 

@@ -67,7 +67,7 @@ class FrameList:
         self._renamed = self._turned = 0
 
     def find(self, name: object, where: str, suffixes: Sequence[str] = ("",)) -> Path | None:
-        """Returns the path of the image `name` of the capture, or None if there is no such file.
+        """The path of the image `name` of the capture, or None if there is no such file.
 
         Where there is none (`find_image`), the only image of that name in the folders below `images` stands in, else
         the only one with another suffix.
@@ -87,7 +87,7 @@ class FrameList:
         return find_file(self.root, [str(found[0].relative_to(self.root))], where) if len(found) == 1 else None
 
     def named(self, name: object, where: str, suffixes: Sequence[str] = ("",)) -> Path:
-        """Returns the path that `find` finds; there must be one."""
+        """The path that `find` finds; there must be one."""
         return self.find(name, where, suffixes) or file_named(self.root, name, where)
 
     def add(
@@ -167,7 +167,7 @@ class FrameList:
     def listing(
         self, num_listed: int, missing: str, notes: Sequence[str] = (), *, name: str = "", is_in_time: bool = False
     ) -> Listing:
-        """Returns the listing, with notes for the user about what was left out and about poses, sizes and intrinsics.
+        """The listing, with notes for the user about what was left out and about poses, sizes and intrinsics.
 
         Captures usually have some frames without a pose or image, so these are counted, and refused only if all are so.
 
@@ -194,7 +194,7 @@ class FrameList:
 
 
 def in_stream_order(listing: Listing) -> Listing:
-    """Returns a listing with its frames in the order of streaming.
+    """A listing with its frames in the order of streaming.
 
     Frames are sorted by name in natural order ("9.jpg" before "10.jpg"). The order of the file is kept if it is the
     order of time, or if it makes the path of the camera less than half as long, as with random names or several
@@ -214,7 +214,7 @@ def _path_length(frames: Sequence[Frame]) -> float:
 
 
 def natural(name: str) -> list[tuple[int, int, str]]:
-    """Returns the key of a name by which to sort: runs of digits count as numbers."""
+    """The key of a name by which to sort: runs of digits count as numbers."""
     parts = re.split(r"([0-9]+)", name)  # parts with an odd index are digits
     return [(0, int(part), "") if k % 2 else (1, 0, part) for k, part in enumerate(parts)]
 
@@ -249,7 +249,7 @@ def _notes(frames: list[Frame]) -> list[str]:
 
 
 def find_file(root: Path, names: Sequence[str], where: str) -> Path | None:
-    """Returns the first of `names` that is a file in the folder `root`, after symbolic links are resolved, or None.
+    """The first of `names` that is a file in the folder `root`, after symbolic links are resolved, or None.
 
     Names that lead outside `root` are refused: a capture from elsewhere must not make us read other files. A folder of
     the capture may itself be a link, as `images` often is.
@@ -276,12 +276,12 @@ def _linked(root: Path) -> list[Path]:
 
 
 def name_in(root: Path, image: Path) -> str:
-    """Returns the path of an image relative to the folder `root`, or its name if a link leads to it."""
+    """The path of an image relative to the folder `root`, or its name if a link leads to it."""
     return str(image.relative_to(root)) if image.is_relative_to(root) else image.name
 
 
 def find_image(root: Path, name: object, where: str, suffixes: Sequence[str] = ("",)) -> Path | None:
-    """Returns the path of the image `name` of the capture, or None if there is no such file.
+    """The path of the image `name` of the capture, or None if there is no such file.
 
     The `suffixes` are tried behind the name; backslashes count as slashes. A downscaled copy (images_2, ...) stands in
     for an image that is missing in images/; any of `SUFFIXES` may stand in place of its own there.
@@ -295,7 +295,7 @@ def find_image(root: Path, name: object, where: str, suffixes: Sequence[str] = (
 
 
 def file_named(root: Path, name: object, where: str, suffixes: Sequence[str] = ("",)) -> Path:
-    """Returns the path that `find_image` finds; there must be one."""
+    """The path that `find_image` finds; there must be one."""
     path = find_image(root, name, where, suffixes)
     if path is None:
         got = f"{echo(name)}, where there is none"
@@ -304,7 +304,7 @@ def file_named(root: Path, name: object, where: str, suffixes: Sequence[str] = (
 
 
 def in_images(name: str) -> str | None:
-    """Returns the part of a file name after images/ (or ./images/), or None for files elsewhere."""
+    """The part of a file name after images/ (or ./images/), or None for files elsewhere."""
     plain = posixpath.normpath(name)
     return plain.removeprefix("images/") if plain.startswith("images/") else None
 
@@ -315,7 +315,7 @@ def images_folder(root: Path) -> str:
 
 
 def files_in(folder: Path, pattern: str = "*") -> list[Path]:
-    """Returns the files of a folder in the order of their names; none if there is no such folder.
+    """The files of a folder in the order of their names; none if there is no such folder.
 
     Hidden files are left out: those that macOS writes beside images (`._1.jpg`) have the images' suffixes.
     """
@@ -323,12 +323,12 @@ def files_in(folder: Path, pattern: str = "*") -> list[Path]:
 
 
 def images_in(folder: Path, pattern: str = "*") -> list[Path]:
-    """Returns the image files of a folder, in the order of their names."""
+    """The image files of a folder, in the order of their names."""
     return [file for file in files_in(folder, pattern) if file.suffix in SUFFIXES]
 
 
 def files_with(path: Path, suffix: str, *words: bytes) -> list[Path]:
-    """Returns the file at `path`, or those in that folder, with a suffix and `words` in the first 2,000 bytes."""
+    """The file at `path`, or those in that folder, with a suffix and `words` in the first 2,000 bytes."""
     files = [path] if path.is_file() else files_in(path, f"*{suffix}")
     found = []
     for file in files:
@@ -340,7 +340,7 @@ def files_with(path: Path, suffix: str, *words: bytes) -> list[Path]:
 
 
 def stored_size(image: Path, described: tuple[float, float] | None, where: str) -> tuple[tuple[int, int], float]:
-    """Returns (width, height) of a stored image, and its size relative to the described one.
+    """(width, height) of a stored image, and its size relative to the described one.
 
     Downscaled copies (images_2, images_4) are described by the intrinsics of the full size. An image counts as such a
     copy if both sides are smaller by the same factor, to a pixel; others are refused. `described` is None if the
