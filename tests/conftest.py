@@ -115,6 +115,19 @@ def programs_shared():
         yield
 
 
+@pytest.fixture
+def registered_networks():
+    """Forgets the networks that a test registers."""
+    from ssplat_jax.model.network import NETWORKS
+    from ssplat_jax.network_configs import NETWORK_CONFIGS
+
+    before = [(registry, dict(registry)) for registry in (NETWORK_CONFIGS, NETWORKS)]
+    yield
+    for registry, known in before:
+        registry.clear()
+        registry.update(known)
+
+
 @pytest.fixture(scope="session")
 def captures() -> Path:
     """Folder of real captures beside the repository."""

@@ -8,21 +8,8 @@ import pytest
 from ssplat_jax.core.rotations import matrices_to_quats, multiply_quats, quats_to_matrices
 
 FLOAT32 = 1e-6  # a few roundings of numbers up to 1
-AXES = np.array(
-    [
-        [1, 0, 0],
-        [0, 1, 0],
-        [0, 0, 1],
-        [1, 1, 0],
-        [0, 1, 1],
-        [1, 0, 1],
-        [1, 1, 1],
-        [-1, 2, 3],
-        [1, -1, 0],
-        [1e-4, 1, 1e-5],
-    ],
-    float,
-)
+MIXED_AXES = [[1, 1, 0], [0, 1, 1], [1, 0, 1], [1, 1, 1], [-1, 2, 3], [1, -1, 0], [1e-4, 1, 1e-5]]
+AXES = np.concatenate([np.eye(3), MIXED_AXES])
 ANGLES = np.array([0.0, 1e-8, 1e-4, 0.3, np.pi / 2, 2 * np.pi / 3, 3.0, np.pi - 1e-3, np.pi - 1e-6, np.pi])
 
 

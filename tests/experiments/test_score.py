@@ -37,6 +37,10 @@ def renders(tmp_path):
     return folder, room, split
 
 
+def scoring(folder, tmp_path) -> Experiment:
+    return Experiment("score", out=tmp_path / "out", captures=Path(ROOM), renders=folder, quiet=True)
+
+
 def test_renders_are_scored_as_they_are(renders, tmp_path):
     folder, room, split = renders
     run(Path(ROOM), tmp_path / "out", "smoke", QUIET, renders=folder)
@@ -49,7 +53,7 @@ def test_renders_are_scored_as_they_are(renders, tmp_path):
 
 def test_the_memory_of_a_method_is_that_of_its_metrics(renders, tmp_path, capsys):
     folder, _, _ = renders
-    command = Experiment("score", out=tmp_path / "out", captures=Path(ROOM), renders=folder, quiet=True)
+    command = scoring(folder, tmp_path)
     (folder / "metrics.json").write_text('{"peak_memory_bytes": 123456}')
     assert guarded(command.run) == 0
     rows = json.loads((tmp_path / "out" / "table.json").read_text())
@@ -61,24 +65,19 @@ def test_the_memory_of_a_method_is_that_of_its_metrics(renders, tmp_path, capsys
         assert words in capsys.readouterr().err
 
 
-def test_changed_renders_are_not_mixed_with_old_scores(renders, tmp_path, capsys):
+def test_changed_and_missing_renders_are_refused_by_name(renders, tmp_path, capsys):
     folder, _, split = renders
-    command = Experiment("score", out=tmp_path / "out", captures=Path(ROOM), renders=folder, quiet=True)
+    command = scoring(folder, tmp_path)
     assert guarded(command.run) == 0
-    Image.new("RGB", (32, 24)).save(folder / f"{split.targets[0]:05d}.png")
+    render = folder / f"{split.targets[0]:05d}.png"
+    Image.new("RGB", (32, 24)).save(render)
     assert guarded(command.run) == 2
     assert "another request" in capsys.readouterr().err
-
-
-def test_missing_renders_are_named(renders, tmp_path, capsys):
-    folder, _, split = renders
-    command = Experiment("score", out=tmp_path / "out", captures=Path(ROOM), renders=folder, quiet=True)
-    (folder / f"{split.targets[0]:05d}.png").unlink()
-    assert guarded(command.run) == 2
-    assert f"{split.targets[0]:05d}.png" in capsys.readouterr().err
-    (folder / "split.json").unlink()
-    assert guarded(command.run) == 2
-    assert "split.json" in capsys.readouterr().err
+    command = dataclasses.replace(command, out=tmp_path / "other")
+    for file in (render, folder / "split.json"):
+        file.unlink()
+        assert guarded(command.run) == 2
+        assert file.name in capsys.readouterr().err
     assert guarded(dataclasses.replace(command, name="cost").run) == 2
     assert "--renders" in capsys.readouterr().err
 

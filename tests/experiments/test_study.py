@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 from ssplat_experiments import context_length
 from ssplat_experiments.cases import PICTURE, Case
-from ssplat_experiments.study import Study, at_scale, run_study
+from ssplat_experiments.study import Study, run_study
 
 from ssplat_jax.config import preset
 from ssplat_jax.core.console import Reporter
@@ -66,10 +66,16 @@ def test_results_of_another_configuration_are_refused(tmp_path):
     assert calls == [] and files_of(tmp_path) == held
 
 
-def test_results_of_other_weights_are_refused(tmp_path, monkeypatch):
+def test_results_of_other_weights_and_damaged_ones_are_refused(tmp_path, monkeypatch):
     run_study(counting_study([]), None, tmp_path, "smoke", QUIET)
-    monkeypatch.setattr("ssplat_experiments.cases.weights_digest", lambda: "other")
-    with pytest.raises(InputError, match=r"weights: '[0-9a-f]{12}', wanted now 'other'"):
+    with (
+        monkeypatch.context() as patch,
+        pytest.raises(InputError, match=r"weights: '[0-9a-f]{12}', wanted now 'other'"),
+    ):
+        patch.setattr("ssplat_experiments.cases.weights_digest", lambda: "other")
+        run_study(counting_study([]), None, tmp_path, "smoke", QUIET)
+    (tmp_path / "cases" / "case_1.json").write_text("{}")
+    with pytest.raises(InputError, match=r"case_1\.json"):
         run_study(counting_study([]), None, tmp_path, "smoke", QUIET)
 
 
@@ -85,13 +91,6 @@ def test_a_scene_at_another_size_is_a_suite_of_its_own(scale):
     ]
     (text,) = context_length.findings(rows)
     assert text.count("24 to 224 views: +2.00 dB literal, +2.00 dB shown (literal PSNR rises") == len(names)
-
-
-def test_a_damaged_case_is_named(tmp_path):
-    run_study(counting_study([]), None, tmp_path, "smoke", QUIET)
-    (tmp_path / "cases" / "case_1.json").write_text("{}")
-    with pytest.raises(InputError, match=r"case_1\.json"):
-        run_study(counting_study([]), None, tmp_path, "smoke", QUIET)
 
 
 def test_every_row_tells_where_it_comes_from(tmp_path):
@@ -120,8 +119,3 @@ def test_a_picture_is_kept_beside_its_case(tmp_path):
         assert json.loads((tmp_path / "table.json").read_text())[1][PICTURE] == "cases/one_1.png"
     with Image.open(tmp_path / "cases" / "one_1.png") as kept:
         np.testing.assert_array_equal(np.asarray(kept), eight_bits(image))
-
-
-def test_gpu_takes_the_cpus_choice_where_it_has_none():
-    assert [at_scale({"smoke": 1, "cpu": 2}, scale) for scale in ("smoke", "cpu", "gpu")] == [1, 2, 2]
-    assert at_scale({"smoke": 1, "cpu": 2, "gpu": 3}, "gpu") == 3

@@ -6,11 +6,7 @@ import numpy as np
 import pytest
 
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.model.hpda import (
-    anchor_depth,
-    expected_log_depth,
-    peak_confidence,
-)
+from ssplat_jax.model.hpda import anchor_depth, expected_log_depth, peak_confidence
 from ssplat_jax.model.views import DepthDistribution, prepare_views
 from tests.model.small import chunk, history
 

@@ -15,7 +15,6 @@ from ssplat_jax.core.errors import InputError
 from ssplat_jax.model.compact import CompactNetwork
 from ssplat_jax.model.layers import ResidualBlock
 from ssplat_jax.model.network import (
-    NETWORKS,
     Network,
     NetworkConfig,
     complete_params,
@@ -48,13 +47,8 @@ class ToyNetwork(CompactNetwork):
 
 
 @pytest.fixture
-def toy(monkeypatch) -> StreamConfig:
+def toy(registered_networks) -> StreamConfig:
     """Configuration of the toy network, registered for one test."""
-    monkeypatch.setattr("ssplat_jax.model.network.NETWORKS", dict(NETWORKS))
-    for kind in list(NETWORK_CONFIGS):
-        monkeypatch.setitem(NETWORK_CONFIGS, kind, NETWORK_CONFIGS[kind])
-    monkeypatch.setitem(NETWORK_CONFIGS, "toy", ToyConfig)
-    monkeypatch.delitem(NETWORK_CONFIGS, "toy")  # undone to absence, whatever the test does
     register_network(ToyConfig, ToyNetwork(3))
     return StreamConfig().replace(network="toy")
 

@@ -39,12 +39,7 @@ pytestmark = pytest.mark.usefixtures("compiled_plainly")
 
 WIDE, HIGH, FOCAL, DEPTH = 32, 24, 24.0, 2.0
 CONFIG = StreamConfig().replace(
-    token_width=4,
-    capacity=128,
-    min_confidence=0.3,
-    steps_per_chunk=3,
-    overflow="drop_new",
-    voxel_size=0.3,
+    token_width=4, capacity=128, min_confidence=0.3, steps_per_chunk=3, overflow="drop_new", voxel_size=0.3
 )
 MODEL = StreamSplat(CONFIG)
 

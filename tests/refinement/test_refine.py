@@ -20,13 +20,7 @@ from ssplat_jax.rasterizer.constants import ALPHA_MIN
 from ssplat_jax.rasterizer.reference import render_reference
 from ssplat_jax.refinement import KeyViews, RefineConfig, init_refinement, refine
 from ssplat_jax.refinement.compared_views import held_back_pixels, next_view, view_loss, views_of_step
-from ssplat_jax.refinement.refine_step import (
-    MAX_LOG_SCALE_CHANGE,
-    MAX_SHIFT,
-    RATES,
-    refine_step,
-    sizes,
-)
+from ssplat_jax.refinement.refine_step import MAX_LOG_SCALE_CHANGE, MAX_SHIFT, RATES, refine_step, sizes
 
 module = importlib.import_module("ssplat_jax.refinement.refine")  # the package has a function of that name
 NUM, WIDTH, HEIGHT, NUM_VIEWS, MAX_PAIRS = 48, 24, 16, 4, 1 << 12

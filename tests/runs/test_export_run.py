@@ -12,18 +12,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import ssplat_jax as ss
-from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.gaussians import scale_colors
+from ssplat_jax.core.pytree import replace
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.rasterizer import render
-from ssplat_jax.runs.export_run import (
-    Views,
-    difference_in_words,
-    export_scene,
-    save_cameras,
-    scene_to_show,
-    turned,
-)
+from ssplat_jax.runs.export_run import Views, difference_in_words, export_scene, save_cameras, scene_to_show, turned
 from ssplat_jax.scene_files.formats import file_axes, save_ply
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.streaming.feed import middle_exposure
@@ -148,6 +141,12 @@ def test_the_scene_to_show_is_at_the_middle_exposure_of_its_views():
         np.testing.assert_allclose(getattr(shown, name), getattr(gaussians, name), atol=1e-6)
 
 
+def views_from(poses: np.ndarray, exposures=None) -> Views:
+    """Views of `camera()` at some poses."""
+    K, num = np.asarray(camera().Ks, np.float64), len(poses)
+    return Views(poses, np.tile(K, (num, 1, 1)), (48, 32), np.ones((num, 3)) if exposures is None else exposures)
+
+
 UP_IN_FILE = {".ply": "y", ".sog": "z", ".glb": "y", ".spz": "z"}
 
 
@@ -157,21 +156,17 @@ def test_up_points_along_an_axis_of_the_file(tmp_path, suffix):
     tilt = Rotation.from_rotvec([0.5, 0.2, -0.9]).as_matrix()
     poses = np.tile(np.eye(4), (4, 1, 1))
     poses[:, :3, :3] = tilt @ Rotation.from_rotvec([[0, 0.2 * i, 0] for i in range(4)]).as_matrix()  # y down
-    K = np.asarray(camera().Ks, np.float64)
-    views = Views(poses, np.tile(K, (4, 1, 1)), (48, 32), np.ones((4, 3)))
+    views = views_from(poses)
     world = turned(scene(1), tilt)
     to, up = tmp_path / f"a{suffix}", UP_IN_FILE[suffix]
     report, turn = export_scene(world, to, views, up)
     in_file = file_axes(to) @ turn @ tilt @ [0.0, -1.0, 0.0]
     np.testing.assert_allclose(in_file, np.eye(3)["xyz".index(up)], atol=1e-6)
     assert report.num_written == 60
-    before = render(
-        world, Camera(jnp.asarray(np.linalg.inv(poses[1]), jnp.float32), jnp.asarray(K, jnp.float32), 48, 32)
-    )
     pose = poses[1].copy()
     pose[:3] = turn @ pose[:3]
-    view = Camera(jnp.asarray(np.linalg.inv(pose), jnp.float32), jnp.asarray(K, jnp.float32), 48, 32)
-    after = render(ss.load_scene(to), view)
+    at = lambda pose: replace(camera(), viewmats=jnp.asarray(np.linalg.inv(pose), jnp.float32))  # noqa: E731
+    before, after = render(world, at(poses[1])), render(ss.load_scene(to), at(pose))
     assert np.sqrt(np.mean((np.asarray(after.color) - np.asarray(before.color)) ** 2)) < 0.03
 
 
@@ -184,9 +179,7 @@ def test_up_without_cameras_is_refused(tmp_path, capsys):
 def test_a_sog_holds_the_camera_to_start_with(tmp_path):
     pose = np.eye(4)
     pose[:3, 3] = [0.5, 0.0, -1.0]
-    views = Views(
-        np.stack([pose] * 3), np.tile(np.asarray(camera().Ks, np.float64), (3, 1, 1)), (48, 32), np.ones((3, 3))
-    )
+    views = views_from(np.stack([pose] * 3))
     export_scene(scene(0), tmp_path / "a.sog", views)
     with zipfile.ZipFile(tmp_path / "a.sog") as archive:
         start = json.loads(archive.read("meta.json"))["cameras"][0]["initial"]
@@ -206,11 +199,7 @@ def test_an_export_says_how_a_plain_renderer_shows_the_file(tmp_path):
         opacities=jnp.full(len(means), 0.99),
         colors=jnp.full((len(means), 3), 0.4),
     )
-    exposures = np.ones((3, 3))
-    exposures[1] = 2.0
-    views = Views(
-        np.tile(np.eye(4), (3, 1, 1)), np.tile(np.asarray(camera().Ks, np.float64), (3, 1, 1)), (48, 32), exposures
-    )
+    views = views_from(np.tile(np.eye(4), (3, 1, 1)), np.array([[1.0] * 3, [2.0] * 3, [1.0] * 3]))
     _, turn = export_scene(wall, tmp_path / "a.ply", views)
     words = difference_in_words(tmp_path / "a.ply", views, turn)
     holes = float(re.search(r"([\d.]+)% holes", words)[1]) / 100

@@ -187,10 +187,7 @@ def test_a_run_that_began_with_given_poses_takes_no_adjusted_ones(capture, tmp_p
         assert capture_to_stream(capture, range(4), "auto", folder, QUIET).frames == capture.frames
 
 
-@pytest.mark.parametrize(
-    ("earlier", "indices", "asked"),
-    [(CAPTURE, (0, 2), "poses"), (CAPTURE, range(4), "auto")],
-)
+@pytest.mark.parametrize(("earlier", "indices", "asked"), [(CAPTURE, (0, 2), "poses"), (CAPTURE, range(4), "auto")])
 def test_poses_that_a_stopped_run_left_for_another_stream_are_found_anew(earlier, indices, asked, capture, tmp_path):
     folder = RunFolder(tmp_path)
     with adjustment(are_off=False):

@@ -74,29 +74,19 @@ def wrong(tree, **leaves):
     return jax.tree.unflatten(form, [leaves.get(path[-1].name, leaf) for path, leaf in paths])
 
 
-def test_a_step_refuses_chunks_of_another_number_of_views():
-    right = chunk()
-    cases = {
-        "images": right.images[:2],
-        "valid": jnp.ones(2, bool),
-        "viewmats": right.viewmats[:, :3],
-        "near": jnp.ones(3),
-    }
-    for name, leaf in cases.items():
+def test_a_step_and_a_run_refuse_chunks_of_other_shapes():
+    one = chunk()
+    stacked = jax.tree.map(lambda x: jnp.stack([x, x]), one)
+    check_chunk(stacked, 3, stacked=True)
+    of_a_step = {"images": one.images[:2], "valid": jnp.ones(2, bool), "viewmats": one.viewmats[:, :3]}
+    for name, leaf in (of_a_step | {"near": jnp.ones(3)}).items():
         for call in (MODEL.step, jax.jit(MODEL.step)):
             with pytest.raises(InputError, match=f"chunk: {name} must be"):
-                call({}, MODEL.init_cache(), wrong(right, **{name: leaf}))
+                call({}, MODEL.init_cache(), wrong(one, **{name: leaf}))
+    for name, leaf in {"near": stacked.near[0], "valid": stacked.valid[:1], "Ks": stacked.Ks[:, :2]}.items():
+        with pytest.raises(InputError, match=f"chunk: {name} must be \\[t"):
+            MODEL.run({}, MODEL.init_cache(), wrong(stacked, **{name: leaf}))
     with pytest.raises(InputError, match=r"Chunks have 3 views \(`stream.chunk_size`\)"):
         check_chunk(chunk(views=2), 3)
-
-
-def test_a_run_refuses_chunks_that_are_not_stacked():
-    right = jax.tree.map(lambda x: jnp.stack([x, x]), chunk())
-    check_chunk(right, 3, stacked=True)
-    with pytest.raises(
-        InputError, match=r"images must be \[t 3 h w 3\], got \[3, .*Stack chunks along a leading axis t"
-    ):
-        MODEL.run({}, MODEL.init_cache(), chunk())
-    for name, leaf in {"near": right.near[0], "valid": right.valid[:1], "Ks": right.Ks[:, :2]}.items():
-        with pytest.raises(InputError, match=f"chunk: {name} must be \\[t"):
-            MODEL.run({}, MODEL.init_cache(), wrong(right, **{name: leaf}))
+    with pytest.raises(InputError, match=r"images must be \[t 3 h w 3\], got \[3, .*Stack chunks along a leading axis"):
+        MODEL.run({}, MODEL.init_cache(), one)
