@@ -11,6 +11,7 @@ from ssplat_jax.cache.hash_table import voxel_indices
 from ssplat_jax.core.gaussians import SH_C0, Gaussians
 from ssplat_jax.core.pytree import replace
 from tests.cache.streams import CAPACITY, CONFIG, Recipe, fuse, revised, to_jax
+from tests.rasterizer.scenes import cloud
 
 SIZE = CONFIG.memory.voxel_size
 PER_TOKEN = CONFIG.head.gaussians_per_token
@@ -93,15 +94,9 @@ def test_merges_of_changed_pivots_stay_in_their_voxels():
 
 
 def gaussians(count: int) -> Gaussians:
-    rng = np.random.default_rng(8)
-    array = lambda low, high, *shape: jnp.asarray(rng.uniform(low, high, (count, *shape)), jnp.float32)  # noqa: E731
-    return Gaussians(
-        means=array(-1, 1, 3),
-        quats=array(-1, 1, 4),
-        scales=array(0.001, 0.15, 3),
-        opacities=array(0, 1).at[::4].set(0.0),
-        sh=array(-1, 1, 4, 3),
-    )
+    """Every fourth is absent."""
+    scene = cloud(count, seed=8)
+    return replace(scene, opacities=scene.opacities.at[::4].set(0.0))
 
 
 def test_gaussians_without_a_change_keep_their_bits():

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from jaxtyping import Array, Float, TypeCheckError
 
-from ssplat_jax.core.gaussians import Gaussians, mask_gaussians
+from ssplat_jax.core.gaussians import mask_gaussians
 from ssplat_jax.core.pytree import pytree, replace, static
+from tests.rasterizer.scenes import cloud
 
 
 @pytree
@@ -19,16 +20,6 @@ class Body:
 
 def body(n: int = 4, name: str = "ball") -> Body:
     return Body(mass=jnp.arange(n, dtype=jnp.float32), speed=jnp.ones((n, 3)), name=name)
-
-
-def gaussians(n: int) -> Gaussians:
-    return Gaussians.from_rgb(
-        means=jnp.ones((n, 3)),
-        quats=jnp.ones((n, 4)),
-        scales=jnp.ones((n, 3)),
-        opacities=jnp.linspace(0.1, 0.9, n),
-        colors=jnp.full((n, 3), 0.5),
-    )
 
 
 def test_only_a_change_of_statics_recompiles():
@@ -58,11 +49,11 @@ def test_only_a_change_of_statics_recompiles():
 )
 def test_building_by_hand_is_checked(fields):
     with pytest.raises(TypeCheckError):
-        replace(gaussians(4), **fields)
+        replace(cloud(4), **fields)
 
 
 def test_masked_gaussians_are_absent_and_harmless():
-    spoiled = replace(gaussians(3), means=gaussians(3).means.at[1].set(jnp.nan), scales=jnp.full((3, 3), jnp.inf))
+    spoiled = replace(cloud(3), means=cloud(3).means.at[1].set(jnp.nan), scales=jnp.full((3, 3), jnp.inf))
     masked = mask_gaussians(spoiled, jnp.array([True, False, False]))
     np.testing.assert_array_equal(masked.opacities[1:], 0)
     assert np.isfinite(masked.means).all() and np.isfinite(masked.scales[1:]).all()

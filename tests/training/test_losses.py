@@ -11,7 +11,6 @@ import pytest
 from ssplat_jax.cache import Tokens
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.chunk import Chunk
-from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.evaluation.lpips import LpipsWeights
 from ssplat_jax.model.streamsplat import StreamSplat
@@ -31,6 +30,7 @@ from ssplat_jax.training.losses import (
 from ssplat_jax.training.recipe import RECIPES
 from ssplat_jax.training.samples import Sample
 from tests.model.small import random_params
+from tests.rasterizer.scenes import cloud
 from tests.streaming.narrow_model import NARROW
 from tests.training.problems import NARROW_DEPTH, STREAM_PHASE
 
@@ -99,13 +99,7 @@ def test_the_paper_loss_of_a_scene_sums_mse_and_lpips_of_its_targets_over_black(
     """Eq. training_loss on views of the reference renderer, of photographs that are darker than the scene."""
     monkeypatch.setattr(losses, "lpips_distance", lambda weights, a, b: 3.0 * jnp.abs(a - b).max(axis=(1, 2, 3)))
     (phase,), rng = RECIPES["paper"].phases, np.random.default_rng(3)
-    gaussians = Gaussians.from_rgb(
-        means=jnp.asarray(rng.uniform((-1, -1, 2), (1, 1, 4), (9, 3)), jnp.float32),
-        quats=jnp.asarray(rng.normal(size=(9, 4)), jnp.float32),
-        scales=jnp.full((9, 3), 0.3),
-        opacities=jnp.full(9, 0.7),
-        colors=jnp.asarray(rng.uniform(size=(9, 3)), jnp.float32),
-    )
+    gaussians = cloud(9, degree=0, size=0.3)
     viewmats = jnp.tile(jnp.eye(4), (4, 1, 1)).at[:, 0, 3].set(jnp.linspace(-0.3, 0.3, 4))
     K = jnp.array([[10.0, 0, 8], [0, 10, 6], [0, 0, 1]])
     cameras = Camera(viewmats, jnp.tile(K, (4, 1, 1)), 16, 12)
@@ -187,14 +181,7 @@ def test_loss_and_gradient_of_a_batch_are_means_over_its_samples(monkeypatch, lo
 
 
 def test_a_crop_is_a_part_of_the_image():
-    key = jax.random.split(jax.random.key(0), 3)
-    gaussians = Gaussians(
-        means=jax.random.normal(key[0], (40, 3)) * 0.5 + jnp.array([0.0, 0.0, 3.0]),
-        quats=jnp.tile(jnp.array([1.0, 0.0, 0.0, 0.0]), (40, 1)),
-        scales=jnp.full((40, 3), 0.1),
-        opacities=jnp.full(40, 0.6),
-        sh=jax.random.normal(key[1], (40, 1, 3)),
-    )
+    gaussians = cloud(40, degree=0, size=0.1)
     K = jnp.array([[60.0, 0.0, 40.0], [0.0, 60.0, 30.0], [0.0, 0.0, 1.0]])
     camera = Camera(viewmats=jnp.eye(4), Ks=K, width=80, height=60)
     whole = render(gaussians, camera).color
