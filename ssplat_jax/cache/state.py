@@ -25,6 +25,7 @@ from ssplat_jax.cache.hash_table import SLOTS_PER_ROW, build_table
 from ssplat_jax.cache.key_views import NUM_KEY_VIEWS, KeyViews, empty_key_views
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.errors import CacheError, InputError
+from ssplat_jax.core.kept_programs import Kept
 from ssplat_jax.core.pytree import pytree, replace
 
 NUM_OBSERVED = 9
@@ -256,7 +257,7 @@ def grow(cache: VoxelCache, capacity: int) -> VoxelCache:
     return _grown(cache, extra)
 
 
-@functools.partial(jax.jit, static_argnames="extra")
+@functools.partial(Kept, static_argnums=(1,))
 def _grown(cache: VoxelCache, extra: int) -> VoxelCache:
     rows = {name: getattr(cache, name) for name in ("voxels", "counts", *pivot_fields(cache))}
     rows = {name: jnp.pad(x, [(0, extra)] + [(0, 0)] * (x.ndim - 1)) for name, x in rows.items()}

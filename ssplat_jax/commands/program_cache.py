@@ -1,8 +1,9 @@
 """Compiled programs kept on disk between commands, so that the second command of a kind does not compile again.
 
-jax 0.10.1 stores what its key describes: the program, the compiler and its flags. Its key does not tell one CPU from
-another, so each kind of CPU and number of cores has a folder of its own. Results are the same bytes with the cache off,
-empty and full (tests/commands/test_program_cache.py).
+The programs of a stream, of rendering and of scoring are kept as executables (`core/kept_programs.py`), which are not
+even traced again; JAX's compilation cache has the rest. jax 0.10.1 stores what its key describes: the program, the
+compiler and its flags. Its key does not tell one CPU from another, so each kind of CPU and number of cores has a folder
+of its own. Results are the same bytes with the caches off, empty and full (tests/commands/test_program_cache.py).
 """
 
 import contextlib
@@ -18,6 +19,9 @@ from pathlib import Path
 SWITCH = "SSPLAT_PROGRAM_CACHE"
 """Environment variable: `off`, or a folder in place of the user's cache folder."""
 
+EXECUTABLES = "SSPLAT_EXECUTABLES"
+"""`core.kept_programs.SWITCH`: folder of the executables. That module imports JAX."""
+
 FOLDER, IS_ON = "JAX_COMPILATION_CACHE_DIR", "JAX_ENABLE_COMPILATION_CACHE"
 """JAX's own variables: where they are set, they hold."""
 
@@ -26,7 +30,7 @@ LEAST_SECONDS = "0.3"
 
 
 def keep_programs(environment: MutableMapping[str, str] = os.environ) -> None:
-    """Makes JAX keep compiled programs on disk. Called before JAX is imported: it reads these variables then.
+    """Makes this process keep compiled programs on disk. Called before JAX is imported: it reads its variables then.
 
     Args:
         environment: the variables of the process.
@@ -40,6 +44,7 @@ def keep_programs(environment: MutableMapping[str, str] = os.environ) -> None:
         except (OSError, RuntimeError):  # a home that cannot be written, or none: every command compiles
             return
         environment[FOLDER] = str(folder)
+        environment[EXECUTABLES] = str(folder / "executables")
         replace_damaged(folder)
         environment.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", LEAST_SECONDS)
     # XLA logs an error about preferences of the compiler, which it takes for features of the CPU, at every load.

@@ -19,6 +19,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, UInt
 
+from ssplat_jax.core.kept_programs import drop_loaded
+
 Arrays = TypeVar("Arrays")
 
 LANES = 16
@@ -64,6 +66,7 @@ def make_room(most_maps: int = MOST_MAPS) -> None:
 def drop_programs() -> None:
     """Drops all compiled programs but those of sessions that are still in use."""
     jax.clear_caches()
+    drop_loaded()
     gc.collect()
 
 

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ssplat_jax.core.errors import InputError
+from ssplat_jax.core.kept_programs import Kept
 from ssplat_jax.core.pytree import pytree, replace, static
 
 SH_C0 = 0.28209479177387814  # Y_0^0, the constant band: color = 0.5 + SH_C0 * dc
@@ -119,7 +120,7 @@ def mask_gaussians(gaussians: Gaussians, keep) -> Gaussians:
     )
 
 
-@functools.partial(jax.jit, static_argnames="num_rows")
+@functools.partial(Kept, static_argnums=(1,))
 def present_gaussians(gaussians: Gaussians, num_rows: int) -> Gaussians:
     """The first `num_rows` rows of `gaussians` with an opacity above 0, in their order, then absent rows."""
     is_present = gaussians.opacities > 0

@@ -11,13 +11,13 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.core.gaussians import Gaussians, mean_color
+from ssplat_jax.core.kept_programs import Kept
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.split import Split
 from ssplat_jax.data.stream_frame import StreamFrame
@@ -29,8 +29,8 @@ from ssplat_jax.streaming.feed import Exposures
 NUM_AVERAGED = 3
 """Streamed frames whose exposures are averaged for a novel view."""
 
-_jitted_lpips = jax.jit(lpips)
-_filled = jax.jit(lambda out, gaussians: fill_holes(out.color, out.alpha, mean_color(gaussians)))
+_jitted_lpips = Kept(lpips)
+_filled = Kept(lambda out, gaussians: fill_holes(out.color, out.alpha, mean_color(gaussians)))
 
 
 @dataclasses.dataclass(frozen=True)

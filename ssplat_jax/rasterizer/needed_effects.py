@@ -1,12 +1,12 @@
 """`effects_for`: the fewest effects that show a scene, decided by what can be seen."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from ssplat_jax.core.cameras import Camera, check_camera, relative_to
 from ssplat_jax.core.gaussians import Gaussians
+from ssplat_jax.core.kept_programs import Kept
 from ssplat_jax.core.numerics import with_rank_promotion
 from ssplat_jax.rasterizer.effects import Effects, distort, sampling_rates
 from ssplat_jax.rasterizer.render import render
@@ -77,7 +77,7 @@ def _visible_degree(gaussians: Gaussians) -> int:
     return len(bands) - int(np.sum(rest <= VISIBLE))
 
 
-@jax.jit
+@Kept
 def _band_lengths(sh: Float[Array, "n k 3"], opacities: Float[Array, " n"]) -> Float[Array, " bands"]:
     """The largest length of a channel's coefficients in each band above the constant one."""
     squares = jnp.where((opacities[:, None, None] > 0) & jnp.isfinite(sh), sh * sh, 0.0)

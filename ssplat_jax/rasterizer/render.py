@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, Num
 from ssplat_jax.core.cameras import Camera, check_camera, is_whole, relative_to
 from ssplat_jax.core.errors import InputError, echo
 from ssplat_jax.core.gaussians import Gaussians, check_gaussians
+from ssplat_jax.core.kept_programs import Kept
 from ssplat_jax.core.numerics import with_rank_promotion
 from ssplat_jax.core.pytree import pytree, replace
 from ssplat_jax.rasterizer.binning import Grid, count_intersections, intersect_tiles, sorted_table
@@ -262,7 +263,7 @@ def tile_grid_of(camera: Camera, tile: int) -> Grid:
     return Grid(num_images=camera.viewmats.shape[0], height=camera.height, width=camera.width, tile=tile)
 
 
-@functools.partial(jax.jit, static_argnums=(1, 2))
+@functools.partial(Kept, static_argnums=(1, 2))
 def _count(inputs: RenderInputs, effects: Effects, tile: int):
     _, camera, splats, _ = prepare(inputs, effects)
     return count_intersections(splats, tile_grid_of(camera, tile))
@@ -297,7 +298,7 @@ def _render(inputs: RenderInputs, effects: Effects, max_pairs: int, tile: int) -
     )
 
 
-_render_jit = functools.partial(jax.jit, static_argnums=(1, 2, 3))(_render)
+_render_jit = Kept(_render, static_argnums=(1, 2, 3))
 
 
 def render_program(gaussians: Gaussians, camera: Camera, max_pairs: int) -> jax.stages.Compiled:
@@ -309,7 +310,7 @@ def render_program(gaussians: Gaussians, camera: Camera, max_pairs: int) -> jax.
         max_pairs: capacity for tile intersections.
     """
     effects = Effects().resolve("mip", captured=None, distortion=None, exposures=None)
-    return _render_jit.lower(RenderInputs(gaussians, camera), effects, round_up(max_pairs), TILE).compile()
+    return _render_jit.program(RenderInputs(gaussians, camera), effects, round_up(max_pairs), TILE)
 
 
 def _untile(tiles: Num[Array, "tiles c p"], grid: Grid) -> Num[Array, "b h w c"]:

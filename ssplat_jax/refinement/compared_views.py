@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ssplat_jax.cache.key_views import KeyViews, usable
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.core.gaussians import Gaussians
+from ssplat_jax.core.kept_programs import Kept
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.rasterizer import Effects, RenderOutput, fill_holes, render
 
@@ -172,7 +173,7 @@ def contradicting(errors: Float[np.ndarray, " v"]) -> Int[np.ndarray, " b"]:
     return worst_first[errors[worst_first] > WORSE_THAN_USUAL * np.median(errors[is_known])]
 
 
-@functools.partial(jax.jit, static_argnames="max_pairs")
+@functools.partial(Kept, static_argnums=(2,))
 def _covered_error(gaussians: Gaussians, view: KeyViews, max_pairs: int) -> Float[Array, ""]:
     """Mean absolute error of a view over what the scene covers of it; NaN if it covers next to nothing."""
     out = render(gaussians, view.camera(), effects=EFFECTS, max_pairs=max_pairs)

@@ -20,6 +20,7 @@ from ssplat_jax.cache.key_views import KeyViews
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.core.gaussians import Gaussians, mask_gaussians, with_sh_degree
+from ssplat_jax.core.kept_programs import Kept
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.rasterizer import render
@@ -207,7 +208,7 @@ def continue_refinement(
 @functools.cache
 def _compiled(config: RefineConfig, max_pairs: int, max_rows: int) -> Callable:
     step = functools.partial(refine_step, config=config, max_pairs=max_pairs, max_rows=max_rows)
-    return jax.jit(step, donate_argnums=0)
+    return Kept(step, donate_argnums=(0,))
 
 
 def report_of(progress: Progress, key_views: KeyViews, config: RefineConfig | None = None) -> Refinement:

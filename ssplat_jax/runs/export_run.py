@@ -17,6 +17,7 @@ from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.console import Reporter
 from ssplat_jax.core.errors import InputError, refusal
 from ssplat_jax.core.gaussians import Gaussians, mean_color, scale_colors
+from ssplat_jax.core.kept_programs import Kept
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.data.camera_path import upward
 from ssplat_jax.data.capture import Capture
@@ -32,7 +33,7 @@ from ssplat_jax.storage.chunk_records import load_chunk_records
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.streaming.feed import Exposures, middle_exposure
 
-_jitted_scale_colors = jax.jit(scale_colors)
+_jitted_scale_colors = Kept(scale_colors)
 
 TITLE = "# Cameras of a scene, written by ssplat export"
 FILES = ("cameras.txt", "images.txt", "points3D.txt")

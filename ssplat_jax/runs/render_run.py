@@ -13,6 +13,7 @@ from ssplat_jax.core.console import Reporter
 from ssplat_jax.core.errors import refusal, require_positive
 from ssplat_jax.core.false_colors import color_depth, color_normals, eight_bits, scale_ends
 from ssplat_jax.core.gaussians import Gaussians, mean_color, scale_colors
+from ssplat_jax.core.kept_programs import Kept
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.data.camera_path import camera_path, orbit_path
 from ssplat_jax.data.stream_frame import StreamFrame
@@ -33,7 +34,7 @@ RANGE_CAMERAS = 8
 Pose = Float64[np.ndarray, "4 4"]
 Intrinsics = Float64[np.ndarray, "3 3"]
 
-_jitted_fill_holes = jax.jit(fill_holes)
+_jitted_fill_holes = Kept(fill_holes)
 
 
 @dataclasses.dataclass(frozen=True)

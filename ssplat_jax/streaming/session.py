@@ -14,6 +14,7 @@ from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.chunk import Chunk, check_chunk
 from ssplat_jax.core.errors import refusal
 from ssplat_jax.core.gaussians import Gaussians, present_gaussians
+from ssplat_jax.core.kept_programs import Kept
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.model.streamsplat import ChunkOutput, StreamSplat, count_gaussians, shown_pivots, shown_rows
 from ssplat_jax.model.views import GRID_STRIDE
@@ -151,8 +152,7 @@ class Session:
         key = (name, cache.capacity, chunk.images.shape)
         if key not in self._programs:
             since = time.perf_counter()
-            jitted = jax.jit(function, donate_argnums=1)
-            self._programs[key] = jitted.lower(self.params, cache, chunk, *more).compile()
+            self._programs[key] = Kept(function, donate_argnums=(1,)).program(self.params, cache, chunk, *more)
             self.compile_seconds += time.perf_counter() - since
             self.num_compilations += 1
         return self._programs[key]
@@ -188,11 +188,8 @@ class Session:
         leaves, structure = jax.tree.flatten(cache)
         key = ("decode", num_pivots, structure, *((leaf.shape, leaf.dtype) for leaf in leaves))
         if key not in self._programs:
-            model = self.model
-            decode = lambda params, cache: model.decode_rows(  # noqa: E731
-                params, cache, shown_rows(cache, model.config, num_pivots)
-            )
-            self._programs[key] = jax.jit(decode).lower(self.params, cache).compile()
+            decode = functools.partial(_decode_shown, self.model, num_pivots)
+            self._programs[key] = Kept(decode).program(self.params, cache)
         return self._programs[key]
 
     def _present_cache(self) -> VoxelCache:
@@ -225,10 +222,15 @@ class Session:
         }
 
 
-_new_cache = jax.jit(init_cache, static_argnums=(0, 1))
+_new_cache = Kept(init_cache, static_argnums=(0, 1))
 
 
-@functools.partial(jax.jit, static_argnums=1)
+def _decode_shown(model: StreamSplat, num_pivots: int, params: dict, cache: VoxelCache) -> Gaussians:
+    """The Gaussians of the pivots that are shown, of which there are at most `num_pivots`."""
+    return model.decode_rows(params, cache, shown_rows(cache, model.config, num_pivots))
+
+
+@functools.partial(Kept, static_argnums=(1,))
 def _count(cache: VoxelCache, config: StreamConfig) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Pivots in use, those of them that are shown, and their Gaussians."""
     num_shown = jnp.sum(shown_pivots(cache, config), dtype=jnp.int32)

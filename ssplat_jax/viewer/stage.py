@@ -6,7 +6,6 @@ vanishes: Gaussians are sent in units of the scene's median Gaussian, colored by
 harmonics.
 """
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float64, UInt8
@@ -15,6 +14,7 @@ from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.errors import StorageError
 from ssplat_jax.core.false_colors import color_depth, color_normals, color_share, eight_bits, scale_ends
 from ssplat_jax.core.gaussians import SH_C0, Gaussians, mean_color
+from ssplat_jax.core.kept_programs import Kept
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.core.rotations import quats_to_matrices
 from ssplat_jax.data.camera_path import camera_path
@@ -172,7 +172,7 @@ class Stage:
         return pose
 
 
-_jitted_fill_holes = jax.jit(fill_holes)
+_jitted_fill_holes = Kept(fill_holes)
 
 
 def median_size(gaussians: Gaussians) -> float:

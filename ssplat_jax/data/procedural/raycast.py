@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from ssplat_jax.core.kept_programs import Kept
 from ssplat_jax.data.procedural.scene import FIRST_ROWS, NUM_BALLS, NUM_BOXES, NUM_SOLIDS, AnyArray, Scene
 from ssplat_jax.data.procedural.textures import LEVEL_OFFSETS, NUM_LEVELS, NUM_TEXELS, SIZE
 
@@ -23,7 +24,7 @@ _FAR = 1e9  # depth of rays that miss
 Rays = tuple[Float[Array, "s h w"], Float[Array, "s h w"], Float[Array, "s h w"]]
 
 
-@functools.partial(jax.jit, static_argnames=("height", "width", "supersample"))
+@functools.partial(Kept, static_argnums=(3, 4, 5))
 def raycast(
     scene: Scene,
     viewmats: Float[AnyArray, "v 4 4"],
@@ -52,7 +53,7 @@ def raycast(
     return jax.lax.map(render_view, (jnp.asarray(viewmats), jnp.asarray(Ks)))
 
 
-@functools.partial(jax.jit, static_argnames=("height", "width"))
+@functools.partial(Kept, static_argnums=(3, 4))
 def raycast_depths(
     scene: Scene, viewmats: Float[AnyArray, "v 4 4"], Ks: Float[AnyArray, "v 3 3"], height: int, width: int
 ) -> Float[Array, "v h w"]:
