@@ -26,7 +26,7 @@ from ssplat_jax.commands.export_command import Export
 from ssplat_jax.commands.import_weights_command import ImportWeights
 from ssplat_jax.commands.inspect_command import Inspect
 from ssplat_jax.commands.poses_command import Poses
-from ssplat_jax.commands.program_cache import keep_programs
+from ssplat_jax.commands.program_cache import keep_no_programs, keep_programs
 from ssplat_jax.commands.refine_command import Refine
 from ssplat_jax.commands.render_command import Render
 from ssplat_jax.commands.run_command import Run
@@ -60,6 +60,10 @@ SETTINGS_OF_OTHERS = ("JAX_ENABLE_X64", "JAX_NUMPY_RANK_PROMOTION", "JAX_NUMPY_D
 """Variables by which people check their own JAX programs; commands compute in float32 with JAX's usual rules."""
 
 
+WITHOUT_PROGRAMS = "--no-program-cache"
+"""Option of every command; it comes before the options of each are read."""
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Runs the command in `arguments` (default: those of the process) and exits with its code."""
     arguments = sys.argv[1:] if arguments is None else arguments
@@ -68,6 +72,9 @@ def main(arguments: list[str] | None = None) -> None:
     if arguments == ["--version"]:
         print(_version())
         sys.exit(0)
+    if WITHOUT_PROGRAMS in arguments:
+        arguments = [word for word in arguments if word != WITHOUT_PROGRAMS]
+        keep_no_programs()
     command = _parse(arguments)
     if not isinstance(command, Bench | Experiment):  # which measure what compiling costs
         keep_programs()
@@ -88,7 +95,7 @@ def _parse(arguments: list[str]):
         functools.reduce(operator.or_, commands),  # pyright: ignore[reportCallIssue, reportArgumentType]
         prog="ssplat",
         description="StreamSplat in JAX: a calibrated image stream becomes a 3D Gaussian scene, chunk by chunk."
-        " `ssplat --version` prints versions.",
+        " `ssplat --version` prints versions; with --no-program-cache, any command compiles its programs anew.",
         args=arguments,
         config=config,
     )

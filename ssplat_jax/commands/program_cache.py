@@ -51,6 +51,12 @@ def keep_programs(environment: MutableMapping[str, str] = os.environ) -> None:
     environment.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
 
+def keep_no_programs(environment: MutableMapping[str, str] = os.environ) -> None:
+    """Makes this process neither read nor write compiled programs on disk, whatever is set."""
+    environment[IS_ON] = "false"
+    environment.pop(EXECUTABLES, None)
+
+
 def replace_damaged(folder: Path) -> None:
     """Removes the entries that JAX warns it cannot read, as one cut short by a kill: JAX would never replace them."""
     show = warnings.showwarning

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from ssplat_jax.commands import program_cache
-from ssplat_jax.commands.program_cache import FOLDER, IS_ON, SWITCH, keep_programs
+from ssplat_jax.commands.program_cache import EXECUTABLES, FOLDER, IS_ON, SWITCH, keep_no_programs, keep_programs
 from tests.commands.command_fixture import read
 
 # The fuse of the cache, its buffers donated as in a stream.
@@ -88,12 +88,16 @@ def test_what_the_user_has_set_holds(tmp_path, monkeypatch):
     environment = {SWITCH: str(tmp_path / "file")}  # no folder can be made there
     keep_programs(environment)
     assert FOLDER not in environment
+    environment = {FOLDER: "mine", EXECUTABLES: "ours", IS_ON: "true"}
+    keep_no_programs(environment)
+    assert environment == {FOLDER: "mine", IS_ON: "false"}
     folders = set()
     for cores in (1, 2):  # each kind of CPU has a folder of its own
         monkeypatch.setattr(program_cache, "num_cores", lambda cores=cores: cores)
         environment = {SWITCH: str(tmp_path)}
         keep_programs(environment)
         folders.add(environment[FOLDER])
+        assert Path(environment[EXECUTABLES]).parent == Path(environment[FOLDER])
     assert len(folders) == 2 and all(Path(folder).is_dir() for folder in folders)
 
 

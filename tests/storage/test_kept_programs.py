@@ -1,0 +1,167 @@
+"""Executables on disk: a second process neither traces nor compiles, and nothing in the store can spoil a result."""
+
+import functools
+import hashlib
+import importlib.metadata
+import os
+import subprocess
+import sys
+
+import jax
+import numpy as np
+import pytest
+
+from ssplat_jax.cache import Tokens, fuse, init_cache
+from ssplat_jax.core import kept_programs
+from ssplat_jax.core.kept_programs import SWITCH, Kept
+from ssplat_jax.core.numerics import safe_sqrt
+from ssplat_jax.data.open_capture import open_capture
+from ssplat_jax.model.streamsplat import StreamSplat
+from ssplat_jax.streaming.feed import feed_capture
+from ssplat_jax.streaming.session import Session
+from tests.streaming.narrow_model import NARROW, assert_same_bits
+
+CONFIG = NARROW.replace(capacity=1024)
+
+PROCESS = "from tests.storage.test_kept_programs import fused_twice; print(*fused_twice())"
+
+
+def fused_twice() -> tuple[str, int]:
+    """Digest of a cache after a chunk that came twice, its buffers donated, and the number of programs compiled."""
+    r, n = np.random.default_rng(0), 512
+    f = lambda *shape: jax.numpy.asarray(r.uniform(0.1, 1, (n, *shape)), "float32")  # noqa: E731
+    tokens = Tokens(
+        means=f(3),
+        feats=f(CONFIG.network.token_width),
+        confidences=f(),
+        rgbs=f(12),
+        quats=f(4),
+        footprints=f(),
+        valid=jax.numpy.ones(n, bool),
+    )
+    compiled, anew = [], kept_programs._compiled_anew
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(kept_programs, "_compiled_anew", lambda lowered: compiled.append(0) or anew(lowered))
+        kept_programs.drop_loaded()
+        step, cache = Kept(functools.partial(fuse, config=CONFIG), donate_argnums=(0,)), init_cache(CONFIG)
+        for _ in range(2):
+            given = cache
+            cache = jax.block_until_ready(step(cache, tokens))
+            assert given.means.is_deleted(), "not donated"
+    data = b"".join(np.asarray(x).tobytes() for x in jax.tree.leaves(cache))
+    return hashlib.sha256(data).hexdigest(), len(compiled)
+
+
+@pytest.fixture(scope="module")
+def plain() -> str:
+    """The digest without a store."""
+    return fused_twice()[0]
+
+
+@pytest.fixture
+def store(tmp_path, monkeypatch):
+    """An empty store, which this process uses."""
+    monkeypatch.setenv(SWITCH, str(tmp_path / "store"))
+    yield tmp_path / "store"
+    kept_programs.drop_loaded()
+
+
+@pytest.mark.usefixtures("compiled_plainly")
+def test_a_second_stream_neither_traces_nor_compiles(store, monkeypatch):
+    def streamed():
+        model = StreamSplat(NARROW.replace(capacity=1024))
+        session = Session(model, model.init(jax.random.key(0)))
+        capture = open_capture("procedural:room?frames=8&size=32x32")
+        feed_capture(session, capture, range(8), capture.stream_frame(model.config, range(8)))
+        return session.cache, session.gaussians(), session.step_memory_bytes
+
+    def refused(lowered):
+        raise AssertionError("compiled again")
+
+    first = streamed()
+    kept_programs.drop_loaded()
+    monkeypatch.setattr(kept_programs, "_compiled_anew", refused)
+    monkeypatch.setattr(StreamSplat, "predict", refused)  # of which a trace of `step` would begin
+    second = streamed()
+    assert_same_bits(second[:2], first[:2])
+    assert second[2] == first[2] > 0
+
+
+def test_processes_that_fill_a_store_at_once_agree_and_the_next_compiles_nothing(store, plain):
+    start = [sys.executable, "-c", PROCESS]
+    variables = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    for number, num_compiled in ((2, {"0", "1"}), (1, {"0"})):  # the second may find what the first has written
+        started = [subprocess.Popen(start, env=variables, stdout=subprocess.PIPE, text=True) for _ in range(number)]
+        for process in started:
+            digest, compiled = process.communicate()[0].split()
+            assert digest == plain and compiled in num_compiled
+        assert len(list(store.iterdir())) == 1
+
+
+@pytest.mark.parametrize("harm", ["cut short", "empty", "damaged", "of another program", "writable by others"])
+def test_an_entry_that_cannot_be_trusted_is_replaced(harm, store, plain):
+    assert fused_twice() == (plain, 1)
+    (entry,) = store.iterdir()
+    data = entry.read_bytes()
+    if harm == "of another program":
+        other = Kept(init_cache, static_argnums=(0,))
+        other(CONFIG)
+        (foreign,) = set(store.iterdir()) - {entry}
+        os.replace(foreign, entry)
+    elif harm == "writable by others":
+        entry.chmod(0o666)
+    else:
+        middle = len(data) // 2
+        damaged = data[:middle] + bytes([data[middle] ^ 1]) + data[middle + 1 :]
+        entry.write_bytes({"cut short": data[:middle], "empty": b"", "damaged": damaged}[harm])
+    assert fused_twice() == (plain, 1)
+    assert fused_twice() == (plain, 0)
+    assert entry.stat().st_mode & 0o777 == 0o600
+
+
+@pytest.mark.parametrize("what", ["jax", "XLA_FLAGS", "precision"])
+def test_another_version_flag_or_setting_has_its_own_program(what, store, plain, monkeypatch):
+    assert fused_twice() == (plain, 1)
+    before = jax.config.jax_default_matmul_precision
+    if what == "jax":
+        real = importlib.metadata.version
+        monkeypatch.setattr(importlib.metadata, "version", lambda name: "9.9" if name == "jax" else real(name))
+    elif what == "XLA_FLAGS":
+        monkeypatch.setenv("XLA_FLAGS", "--another")  # XLA has read the variable already
+    else:
+        jax.config.update("jax_default_matmul_precision", "highest")
+    kept_programs._place.cache_clear()
+    assert fused_twice() == (plain, 1)
+    assert len(list(store.iterdir())) == 2
+    jax.config.update("jax_default_matmul_precision", before)
+    monkeypatch.undo()
+    kept_programs._place.cache_clear()
+
+
+def test_without_a_place_to_write_programs_are_compiled(tmp_path, plain, monkeypatch):
+    (tmp_path / "file").write_bytes(b"")
+    monkeypatch.setenv(SWITCH, str(tmp_path / "file" / "store"))
+    assert fused_twice() == (plain, 1)
+
+
+def test_the_least_recently_used_go_first(store, monkeypatch):
+    program = Kept(init_cache, static_argnums=(0,))
+    for capacity in (128, 256):
+        program(CONFIG.replace(capacity=capacity))
+    for age, entry in enumerate(sorted(store.iterdir())):
+        os.utime(entry, (1000 - age, 1000 - age))
+    used, unused = sorted(store.iterdir())
+    kept_programs.drop_loaded()
+    for capacity in (128, 256):  # one of them is the older entry: used again, it is the newer
+        program(CONFIG.replace(capacity=capacity))
+    os.utime(unused, (1, 1))
+    monkeypatch.setattr(kept_programs, "MOST_BYTES", sum(entry.stat().st_size for entry in store.iterdir()))
+    program(CONFIG.replace(capacity=512))
+    assert used.exists() and not unused.exists() and used.stat().st_mtime > 1000
+
+
+def test_what_cannot_be_told_apart_is_not_kept(store):
+    scale = np.float32(2)
+    assert Kept(lambda x: x * scale)(jax.numpy.ones(3)).tolist() == [2, 2, 2]  # a closure, and not of the package
+    assert jax.grad(Kept(safe_sqrt))(4.0) == 0.25  # ours, but traced
+    assert not store.exists()
