@@ -85,7 +85,7 @@ class Kept:
 
     def _key(self, arguments: tuple) -> str | None:
         """All that the program depends on, as text; None if it is not kept."""
-        if not os.environ.get(SWITCH) or jax.config.jax_disable_jit:
+        if not os.environ.get(SWITCH) or jax.config.jax_disable_jit:  # pyright: ignore[reportAttributeAccessIssue]
             return None
         leaves, structure = jax.tree.flatten(self._dynamic(arguments))
         parts = [_identity(self._function), *map(_described, leaves)]
@@ -162,7 +162,7 @@ def _compiled_anew(lowered: jax.stages.Lowered) -> jax.stages.Compiled:
     """Compiles without JAX's cache: an executable from there loses its kernels when it is serialized again, and fails
     only when it is called ("Function ... not found", jaxlib 0.10.1 on the CPU).
     """
-    before = jax.config.jax_enable_compilation_cache
+    before = jax.config.read("jax_enable_compilation_cache")
     jax.config.update("jax_enable_compilation_cache", False)
     compilation_cache.reset_cache()  # JAX looks at its switch once, until then
     try:
