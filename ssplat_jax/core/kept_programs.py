@@ -162,7 +162,7 @@ def _compiled_anew(lowered: jax.stages.Lowered) -> jax.stages.Compiled:
     """Compiles without JAX's cache: an executable from there loses its kernels when it is serialized again, and fails
     only when it is called ("Function ... not found", jaxlib 0.10.1 on the CPU).
     """
-    before = jax.config.read("jax_enable_compilation_cache")
+    before = jax.config.jax_enable_compilation_cache  # pyright: ignore[reportAttributeAccessIssue]
     jax.config.update("jax_enable_compilation_cache", False)
     compilation_cache.reset_cache()  # JAX looks at its switch once, until then
     try:
