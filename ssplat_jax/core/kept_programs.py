@@ -87,6 +87,8 @@ class Kept:
         """All that the program depends on, as text; None if it is not kept."""
         if not os.environ.get(SWITCH) or jax.config.jax_disable_jit:  # pyright: ignore[reportAttributeAccessIssue]
             return None
+        if jax.default_backend() != "cpu":  # not measured elsewhere: JAX's own cache has the programs there
+            return None
         leaves, structure = jax.tree.flatten(self._dynamic(arguments))
         parts = [_identity(self._function), *map(_described, leaves)]
         if None in parts:
