@@ -204,6 +204,9 @@ def with_refinement(
         changes = empty_changes(cache.capacity, config)
     if key_views is None:
         key_views = empty_key_views(*slots)
+    if is_masked and key_views.seen is None:  # the first mask of the stream: nothing before it was hidden
+        images = jnp.pad(key_views.images, [(0, 0)] * 3 + [(0, 1)], constant_values=1)
+        key_views = replace(key_views, images=images)
     if key_views.images.shape != slots:
         wanted, got = "x".join(map(str, key_views.images.shape)), "x".join(map(str, slots))
         raise InputError(f"cache: wanted key views of {wanted} as before, got {got}; keep the size.")

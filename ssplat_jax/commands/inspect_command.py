@@ -20,7 +20,8 @@ class Inspect:
     """Folder of a posed capture, or procedural:NAME. Formats: transforms.json (nerfstudio, instant-ngp, Blender,
     DL3DV); COLMAP (sparse/0 beside images/); Polycam (keyframes/); Record3D (metadata.json, rgb/); cameras.json of
     3DGS and LLFF (poses_bounds.npy), each beside images/; ScanNet (color/, pose/, intrinsic/intrinsic_color.txt);
-    TUM RGB-D (rgb.txt, groundtruth.txt); KITTI (a folder of sequences/);
+    TUM RGB-D (rgb.txt, groundtruth.txt); KITTI (a folder of sequences/); RealityScan and RealityCapture (a .csv) and
+    Metashape (a .xml), each beside images/;
     RealEstate10K (its .txt, or the folder of that file and the frames)."""
     size: str | None = None
     """Image size WxH; default the capture's own."""

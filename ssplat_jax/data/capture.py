@@ -31,7 +31,7 @@ from ssplat_jax.data.stream_frame import StreamFrame
 
 MAX_SIDE = 16384  # pixels of a delivered image
 NUM_DECODERS = 3  # images decoded at a time: one of 12 megapixels takes 0.3 GB
-KEPT_BYTES = 256 << 20  # of decoded images that wait for their second use
+KEPT_IMAGES, KEPT_BYTES = 160, 256 << 20  # most decoded images that wait for their second use
 
 
 @runtime_checkable
@@ -67,7 +67,7 @@ class FilePixels:
         assert frame.path is not None  # readers of files always set it
         image = decode_image(frame.path, (frame.width, frame.height))
         image = crop.image(image if frame.lens is None else undistort(image, frame.lens, frame.K))
-        if (len(self.kept) + 1) * image.nbytes <= KEPT_BYTES:
+        if len(self.kept) < min(KEPT_IMAGES, KEPT_BYTES // image.nbytes):
             image.flags.writeable = False
             self.kept[i, crop] = image
         return image
@@ -208,9 +208,10 @@ class Capture:
             raise refusal(str(out), wanted="a folder for results alone", got=got, fix=fix)
 
     def verify(self, indices: Sequence[int] | None = None) -> None:
-        """Decodes the images of the frames `indices` (default: all), to find damaged files; uses some cores."""
+        """Decodes images and masks of the frames `indices` (default: all), to find damaged files; uses some cores."""
+        used = range(len(self)) if indices is None else indices
         with ThreadPoolExecutor(NUM_DECODERS) as pool:  # Pillow decodes outside the interpreter lock
-            for _ in pool.map(self.image, range(len(self)) if indices is None else indices):
+            for _ in pool.map(lambda i: (self.image(i), self.seen(i)), used):
                 pass
 
     def stream_frame(self, config: StreamConfig, indices: Sequence[int] | None = None) -> StreamFrame:

@@ -96,6 +96,9 @@ def run_capture(
         if stopped := source.wait_for(max(num_saved, chunk_size)):
             return RunResult(num_saved, 0, stopped)
         indices = source.indices[: num_saved or chunk_size]
+    if options.size is None:
+        size = f"{source.capture.width}x{source.capture.height}"
+        reporter.say(f"images are streamed at {size}, as they are stored; --size takes smaller ones in less time")
     kept = {"revise": options.revise, "overwrite": options.overwrite}
     with open_run(model, params, source.capture, indices, out, **kept, reporter=reporter) as run:
         num_before = run.num_views

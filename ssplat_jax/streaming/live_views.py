@@ -8,7 +8,7 @@ may lie beyond that end, which then moves outward by `STEP` for the chunks that 
 import dataclasses
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Bool, Float32
 
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.cameras import check_matrices
@@ -67,11 +67,11 @@ class LiveViews:
         # The frame, and the output of the last chunk if the frame has not learned from it yet. They are replaced
         # together, because an interrupt may come between two statements.
         self._learned: tuple[StreamFrame | None, ChunkOutput | None] = frame, None
-        self._waiting: list[tuple[Frame, Float32[np.ndarray, "h w 3"]]] = []
+        self._waiting: list[tuple[Frame, Float32[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]] = []
         self._num_views = 0
         self._size: tuple[int, int] | None = None
 
-    def add(self, image: object, K: object, viewmat: object) -> Chunk | None:
+    def add(self, image: object, K: object, viewmat: object, seen: object = None) -> Chunk | None:
         """Takes a view as `Session.push` does, and gives the chunk that it completes; None while views are missing.
 
         Raises:
@@ -83,9 +83,14 @@ class LiveViews:
             got, size = f"{width}x{height}", "x".join(map(str, self._size or ()))
             raise refusal("push: image", wanted=f"{size} as the first", got=got, fix="start a session per size")
         camtoworld = invert_pose(check_camtoworld(np.asarray(viewmat).tolist(), "push: viewmat")[0])
-        frame = Frame(str(self._num_views), camtoworld, _checked_K(K, width, height), width, height)
+        mask = np.ones((height, width), bool) if seen is None else np.asarray(seen)
+        if mask.shape != (height, width) or mask.dtype != bool:
+            got, fix = f"{mask.dtype} {list(mask.shape)}", "give True where a pixel counts"
+            raise refusal("push: seen", wanted=f"bool [{height}, {width}]", got=got, fix=fix)
+        matrix = _checked_K(K, width, height)
+        frame = Frame(str(self._num_views), camtoworld, matrix, width, height, is_masked=not mask.all())
         self._size = (width, height)
-        self._waiting.append((frame, pixels))
+        self._waiting.append((frame, pixels, mask))
         self._num_views += 1
         return self.rest() if len(self._waiting) >= self._config.stream.chunk_size else None
 
@@ -96,8 +101,9 @@ class LiveViews:
         """
         if not self._waiting:
             return None
-        frames, images = zip(*self._waiting[: self._config.stream.chunk_size], strict=True)
-        pixels = ArrayPixels(images=np.stack(images), depths=np.zeros((len(frames), *images[0].shape[:2]), np.float32))
+        frames, images, masks = zip(*self._waiting[: self._config.stream.chunk_size], strict=True)
+        depths = np.zeros((len(frames), *images[0].shape[:2]), np.float32)
+        pixels = ArrayPixels(images=np.stack(images), depths=depths, masks=np.stack(masks))
         size = {"width": frames[0].width, "height": frames[0].height}
         capture = Capture(name="live", format="memory", frames=frames, pixels=pixels, **size)
         if self.frame is None:

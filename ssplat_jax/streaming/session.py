@@ -15,6 +15,7 @@ from ssplat_jax.core.chunk import Chunk, check_chunk
 from ssplat_jax.core.errors import refusal
 from ssplat_jax.core.gaussians import Gaussians, present_gaussians
 from ssplat_jax.core.kept_programs import Kept
+from ssplat_jax.core.pytree import replace
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.model.streamsplat import ChunkOutput, StreamSplat, count_gaussians, shown_pivots, shown_rows
 from ssplat_jax.model.views import GRID_STRIDE
@@ -80,7 +81,7 @@ class Session:
         """
         return self._stream(chunk, is_live=False)
 
-    def push(self, image: object, K: object, viewmat: object) -> ChunkOutput | None:
+    def push(self, image: object, K: object, viewmat: object, seen: object = None) -> ChunkOutput | None:
         """Takes one view of a live source, and streams a chunk when enough views have come.
 
         Near, far and scale come from the first chunk, as with `causal`; `frame` then holds them. A later chunk that
@@ -90,6 +91,8 @@ class Session:
             image: RGB, height x width x 3, as float in [0, 1] or as uint8.
             K: 3x3 intrinsics, pixels; the center of the first pixel is (0.5, 0.5).
             viewmat: 4x4 world-to-camera transform with OpenCV axes, in any world of one scale.
+            seen: mask, height x width, False for pixels that do not count; by default all count. Some views may have
+                masks and others none.
 
         Returns:
             The summary of the chunk that the view completed, or None while views are missing.
@@ -101,7 +104,7 @@ class Session:
         if self.cache is not None and self.frame is None:
             fix = "give Session(..., frame=StreamFrame) too, or push all views"
             raise refusal("push", wanted="the stream frame of the cache that is continued", got="none", fix=fix)
-        chunk = self._live.add(image, K, viewmat)
+        chunk = self._live.add(image, K, viewmat, seen)
         return None if chunk is None else self._stream(chunk, is_live=True)
 
     def flush(self) -> ChunkOutput | None:
@@ -129,6 +132,9 @@ class Session:
             got = f"steps_per_chunk={config.stream.steps_per_chunk} and revise={self._revise}"
             raise refusal("Session", wanted=wanted, got=got, fix="call online_refinement with the session's model")
         if self._revise is not None:  # adds the key-view buffers if the cache lacks them
+            # Once a view had a mask, key views hold one each.
+            if chunk.seen is None and cache.key_views is not None and cache.key_views.seen is not None:
+                chunk = replace(chunk, seen=jnp.ones(chunk.images.shape[:3], bool))
             is_masked = chunk.seen is not None
             cache = with_refinement(cache, config, *chunk.images.shape[1:3], is_masked=is_masked)
         self.cache = cache
@@ -149,7 +155,7 @@ class Session:
 
     def _program(self, name: str, function: Callable, cache: VoxelCache, chunk: Chunk, *more) -> jax.stages.Compiled:
         """`function` compiled for the shapes of `cache`, which it consumes, and of `chunk`."""
-        key = (name, cache.capacity, chunk.images.shape)
+        key = (name, cache.capacity, chunk.images.shape, chunk.seen is None)
         if key not in self._programs:
             since = time.perf_counter()
             self._programs[key] = Kept(function, donate_argnums=(1,)).program(self.params, cache, chunk, *more)

@@ -50,6 +50,11 @@ class CaptureMix:
         """The captures of all groups."""
         return [capture for group in self.groups for capture in group.captures]
 
+    @property
+    def is_masked(self) -> bool:
+        """True if some capture has masks; samples of all then have some, since they are stacked."""
+        return any(capture.is_masked for capture in self.captures)
+
     def draw(self, rng: np.random.Generator) -> Capture | None:
         """The capture of a step, each group with its share; None for a procedural step."""
         place = rng.uniform()

@@ -35,7 +35,7 @@ class Crop:
 
     cache: VoxelCache
     camera: Camera
-    image: UInt8[Array, "h w 3"]
+    image: UInt8[Array, "h w c"]  # RGB, and 0 in a fourth channel where a pixel is masked; all crops have one or none
     exposure: Float[Array, "3"]  # factors from the scene's colors to the view's
     num_pivots: int = static()  # that are decoded
     max_pairs: int = static()  # capacity for tile intersections
@@ -97,6 +97,7 @@ class Crops:
             start.say(f"streamed {capture.name}, stride {stride}")
         # The largest capacities for all, so that one program serves every scene.
         capacities = {"num_pivots": max(scene[2] for scene in scenes), "max_pairs": max(scene[3] for scene in scenes)}
+        channels = max(scene[1].images.shape[-1] for scene in scenes)
         rng, places = np.random.default_rng(start.seed), []
         # All places at once, so that they do not depend on where a training was resumed.
         for number in range(self.batch * start.num_steps):
@@ -108,7 +109,8 @@ class Crops:
         def crop(number: int) -> Crop:
             (cache, views, *_), (view, row, column) = scenes[number % len(scenes)], places[number]
             camera = crop_camera(views.camera(view), row, column, *self.size)
-            image = np.asarray(views.images[view, ..., :3])[row : row + self.size[0], column : column + self.size[1]]
+            image = np.asarray(views.images[view])[row : row + self.size[0], column : column + self.size[1]]
+            image = np.pad(image, [(0, 0), (0, 0), (0, channels - image.shape[-1])], constant_values=1)
             return Crop(cache, camera, jnp.asarray(image), views.exposures[view], **capacities)
 
         return lambda step, place: tuple(crop(self.batch * step + i) for i in range(self.batch))

@@ -141,12 +141,17 @@ class RenderingLoss:
         """Rendering loss of the target views of `sample` in a scene, and metrics."""
         output = render(gaussians, sample.target_camera, max_pairs=self.max_pairs)
         filled = fill_holes(output.color, output.alpha, jax.lax.stop_gradient(mean_color(gaussians)))
+        targets, seen = sample.target_images, sample.target_seen
+        if seen is not None:  # masked pixels are equal, whatever the camera saw there
+            filled, targets, black = (jnp.where(seen[..., None], x, 0.0) for x in (filled, targets, output.color))
+        else:
+            black = output.color
         has_gains = self.fit_gains & sample.is_photographed
-        gains = jnp.where(has_gains, fitted_gains(filled, sample.target_images), 1.0)
-        weighted = ((1 - self.black_weight, filled * gains), (self.black_weight, output.color * gains))
+        gains = jnp.where(has_gains, fitted_gains(filled, targets), 1.0)
+        weighted = ((1 - self.black_weight, filled * gains), (self.black_weight, black * gains))
         # What has no weight is not computed: LPIPS takes long.
-        terms = [(weight, self.of_images(x, sample.target_images, lpips)) for weight, x in weighted if weight]
-        shown, black = (jnp.mean((x - sample.target_images) ** 2) for _, x in weighted)
+        terms = [(weight, self.of_images(x, targets, lpips)) for weight, x in weighted if weight]
+        shown, black = (jnp.mean((x - targets) ** 2) for _, x in weighted)
         return sum((weight * loss for weight, (loss, _) in terms), start=jnp.zeros(())), {
             **({} if lpips is None else {"lpips": terms[0][1][1]}),
             "psnr": -10 * jnp.log10(shown + 1e-10),
@@ -179,9 +184,12 @@ class CropLoss:
         def of_crop(crop: Crop) -> tuple[Scalar, Metrics]:
             gaussians = model.decode_rows(params, crop.cache, shown_rows(crop.cache, model.config, crop.num_pivots))
             out = render(gaussians, crop.camera, effects=EFFECTS, max_pairs=crop.max_pairs)
-            target = crop.image.astype(jnp.float32) / 255
+            target = crop.image[..., :3].astype(jnp.float32) / 255
             filled = fill_holes(out.color, out.alpha, mean_color(gaussians))
-            shown, black = (negative_psnr(x * crop.exposure, target) for x in (filled, out.color))
+            views = [x * crop.exposure for x in (filled, out.color)]
+            if crop.image.shape[-1] > 3:  # masked pixels are equal, as in the loss of rendered views
+                views = [jnp.where(crop.image[..., 3:] > 0, x, target) for x in views]
+            shown, black = (negative_psnr(x, target) for x in views)
             loss = (1 - self.black_weight) * shown + self.black_weight * black
             return loss, {"psnr": -shown, "psnr_over_black": -black, "loss": loss}
 

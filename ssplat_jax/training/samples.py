@@ -16,7 +16,7 @@ from ssplat_jax.config import MEDIAN_DEPTH, StreamConfig
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.chunk import Chunk
 from ssplat_jax.core.errors import InputError, refusal
-from ssplat_jax.core.pytree import pytree
+from ssplat_jax.core.pytree import pytree, replace
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.depth_range import FAR_FACTOR, NEAR_FACTOR
 from ssplat_jax.data.procedural.procedural_views import STEP_RANGE, training_sample
@@ -43,6 +43,7 @@ class Sample:
     target_images: Float[Array, "s h w 3"]
     target_camera: Camera  # leading axis s
     is_photographed: Bool[Array, ""]  # by a camera that may choose another exposure for each view
+    target_seen: Bool[Array, "s h w"] | None = None  # False for masked pixels, which give no loss; None: all count
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,8 +90,10 @@ class Views:
 
         def sample(number: int, size: tuple[int, int]) -> Sample:
             if mix is not None and (capture := mix.draw(np.random.default_rng([seed, number, 13]))) is not None:
-                return capture_sample(self, mix, capture, [seed, number, 17], size)
-            return procedural_sample(self, seed * 1_000_003 + number, size, start.model.config)
+                made = capture_sample(self, mix, capture, [seed, number, 17], size)
+            else:
+                made = procedural_sample(self, seed * 1_000_003 + number, size, start.model.config)
+            return _all_seen(made) if mix is not None and mix.is_masked and made.target_seen is None else made
 
         def batch(step: int, place: int) -> Sample:
             numbers = range(step, step + self.batch * start.num_steps, start.num_steps)
@@ -153,6 +156,12 @@ def procedural_sample(views: Views, seed: int, size: tuple[int, int], config: St
         is_photographed=False,
         config=config,
     )
+
+
+def _all_seen(sample: Sample) -> Sample:
+    """The sample with masks that hide nothing, to be stacked with samples that have masks."""
+    context, targets = (np.ones(images.shape[:-1], bool) for images in (sample.chunks.images, sample.target_images))
+    return replace(sample, chunks=replace(sample.chunks, seen=jnp.asarray(context)), target_seen=jnp.asarray(targets))
 
 
 def _choose_targets(rng: np.random.Generator, num_views: int, num_targets: int) -> np.ndarray:
@@ -221,6 +230,7 @@ def _sample_of_frames(mix: CaptureMix, capture: Capture, context, targets, size,
         far=frame.far,
         is_photographed=True,
         config=mix.config,
+        seen=np.array([delivered.seen(i) for i in frames]) if capture.is_masked else None,
     )
 
 
@@ -233,7 +243,7 @@ def _depth(capture: Capture, i: int) -> np.ndarray:
 
 
 def _sample_of_views(
-    *, images, depths, viewmats, Ks, context, targets, near, far, is_photographed: bool, config: StreamConfig
+    *, images, depths, viewmats, Ks, context, targets, near, far, is_photographed: bool, config: StreamConfig, seen=None
 ) -> Sample:
     """Sample of the views at the places `context`, chunk by chunk, and `targets`; NumPy arrays, stream units."""
     num_chunks = len(context) // config.stream.chunk_size
@@ -248,11 +258,13 @@ def _sample_of_views(
             valid=jnp.ones((num_chunks, config.stream.chunk_size), bool),
             near=jnp.full(num_chunks, near, jnp.float32),
             far=jnp.full(num_chunks, far, jnp.float32),
+            seen=None if seen is None else chunked(seen),
         ),
         log_depths=chunked(log_depths_at_cells(depths)),
         target_images=jnp.asarray(images[targets]),
         target_camera=Camera(jnp.asarray(viewmats[targets]), jnp.asarray(Ks[targets]), width, height),
         is_photographed=jnp.asarray(is_photographed),
+        target_seen=None if seen is None else jnp.asarray(seen[targets]),
     )
 
 

@@ -1,6 +1,10 @@
 """Captures: digests, cameras and chunks. Refusals are tested in tests/badinputs."""
 
 import dataclasses
+import gc
+import json
+import os
+import tracemalloc
 
 import jax
 import numpy as np
@@ -10,6 +14,7 @@ from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.cameras import project_points, transform_points
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.data import capture as capture_module
+from ssplat_jax.data.capture import KEPT_IMAGES
 from ssplat_jax.data.open_capture import open_capture
 from tests.badinputs.cases import make_capture
 from tests.data.capture_fixture import frame_of, resized, smooth_capture
@@ -99,3 +104,23 @@ def test_names_that_are_not_utf8_have_digests():
     named = lambda name: dataclasses.replace(capture, frames=(dataclasses.replace(capture.frames[0], name=name),))  # noqa: E731
     digests = [named(name).digest([0]) for name in ("caf\udce9.jpg", "caf\udcea.jpg", "caf.jpg")]
     assert len(set(digests)) == 3
+
+
+def test_memory_does_not_grow_with_the_number_of_images(tmp_path):
+    """What a stream keeps of an image that it has passed are facts, beside a number of images that is bounded."""
+    num, size = KEPT_IMAGES + 200, (64, 48)
+    root = make_capture(tmp_path / "c")
+    meta = json.loads((root / "transforms.json").read_text())
+    for i in range(num):
+        os.link(root / "images" / "0.jpg", root / "images" / f"{i:05d}.jpg")
+    meta["frames"] = [meta["frames"][0] | {"file_path": f"images/{i:05d}.jpg"} for i in range(num)]
+    (root / "transforms.json").write_text(json.dumps(meta))
+    capture, held = open_capture(root, size=size), []
+    frame = frame_of(capture)
+    tracemalloc.start()
+    for number, _ in enumerate(capture.chunks(StreamConfig(), range(num), frame=frame), start=1):
+        if 4 * number in (KEPT_IMAGES + 40, num):
+            gc.collect()
+            held.append(tracemalloc.get_traced_memory()[0])
+    tracemalloc.stop()
+    assert (held[1] - held[0]) / 160 < 500, held  # bytes; an image has 36,864

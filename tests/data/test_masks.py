@@ -10,6 +10,7 @@ from PIL import Image
 import ssplat_jax as ss
 from ssplat_jax.cache.key_views import KeyViews
 from ssplat_jax.config import StreamConfig
+from ssplat_jax.core.console import Reporter
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.data.capture import ArrayPixels
 from ssplat_jax.data.images import Lens, undistort
@@ -18,9 +19,10 @@ from ssplat_jax.evaluation.psnr_ssim import psnr, ssim
 from ssplat_jax.evaluation.scoring import score_view
 from ssplat_jax.refinement.compared_views import RefineConfig, view_loss
 from ssplat_jax.refinement.refine import refine_on_capture
+from ssplat_jax.runs.capture_run import GrowingCapture, RunOptions
 from ssplat_jax.streaming.feed import feed_capture
 from ssplat_jax.streaming.session import Session
-from tests.badinputs.cases import HEIGHT, WIDTH, make_capture
+from tests.badinputs.cases import HEIGHT, NUM_FRAMES, WIDTH, make_capture
 from tests.data.capture_fixture import smooth_capture
 from tests.scene_files.scene_fixture import scene
 
@@ -81,6 +83,20 @@ def test_captures_without_masks_have_none(tmp_path):
 def test_a_mask_of_another_shape_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"2\.png: wanted the shape of 2\.jpg, 64x48, got 48x48"):
         open_capture(make_capture(tmp_path / "c", in_folder("2.png", size=(HEIGHT, HEIGHT))))
+
+
+def test_a_frame_waits_until_its_mask_is_complete(tmp_path):
+    """As `ssplat run --watch` takes frames: a mask of which half is written is as an image of which half is."""
+    root = make_capture(tmp_path / "c", by_path)
+    watched = GrowingCapture(str(root), RunOptions(), 60.0, Reporter())
+    whole = (root / "hidden" / "a.png").read_bytes()
+    for content, num_frames in ((None, 2), (whole[: len(whole) // 2], 2), (whole, NUM_FRAMES)):
+        (root / "hidden" / "a.png").unlink(missing_ok=True)
+        if content is not None:
+            (root / "hidden" / "a.png").write_bytes(content)
+        watched.look()
+        assert len(watched.indices) == num_frames
+    np.testing.assert_array_equal(watched.capture.seen(2), ~HIDDEN)
 
 
 def test_pixels_beyond_the_border_of_a_distorted_image_are_not_seen(tmp_path):

@@ -12,6 +12,7 @@ from ssplat_jax.core.rotations import quats_to_matrices
 from ssplat_jax.data.capture import ArrayPixels, Capture
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.model.streamsplat import ChunkOutput, StreamSplat
+from ssplat_jax.refinement import online_refinement
 from ssplat_jax.streaming.feed import feed_chunks
 from ssplat_jax.streaming.live_views import STEP, widen_range
 from ssplat_jax.streaming.session import Session
@@ -104,6 +105,8 @@ def test_pushed_views_give_what_the_causal_stream_gives(capture, start):
         ({"K": np.eye(3)}, "pixels"),
         ({"K": np.ones((3, 3))}, "skew"),
         ({"viewmat": np.diag([2.0, 2.0, 2.0, 1.0])}, "viewmat.*rotation"),
+        ({"seen": np.ones((48, 32), bool)}, r"seen: wanted bool \[32, 48\]"),
+        ({"seen": np.ones((32, 48))}, "seen"),
     ],
 )
 def test_unusable_views_are_refused_and_do_not_count(change, words, capture, start):
@@ -113,6 +116,25 @@ def test_unusable_views_are_refused_and_do_not_count(change, words, capture, sta
     with pytest.raises(InputError, match=words):
         session.push(**view | change)
     assert int(session._live.rest().valid.sum()) == 1
+
+
+def test_pushed_masks_give_what_a_masked_capture_gives(capture):
+    """The first mask comes with the second chunk of a stream that refines; the capture has masks from the start."""
+    model = StreamSplat(CAUSAL.replace(steps_per_chunk=1))
+    masks = np.ones((NUM_FRAMES, 32, 48), bool)
+    masks[5:7, 8:24, 12:36] = False
+    frames = tuple(
+        dataclasses.replace(f, is_masked=not mask.all()) for f, mask in zip(capture.frames, masks, strict=True)
+    )
+    masked = dataclasses.replace(capture, frames=frames, pixels=dataclasses.replace(capture.pixels, masks=masks))
+    driver, live = (Session(model, model.init(jax.random.key(0)), revise=online_refinement(model)) for _ in range(2))
+    list(feed_chunks(driver, masked, range(8), masked.stream_frame(model.config)))
+    for i in range(8):
+        viewmat = np.linalg.inv(capture.frames[i].camtoworld)
+        live.push(capture.image(i), capture.K(i), viewmat, None if masks[i].all() else masks[i])
+    assert live.cache_facts()["num_seen"] == driver.cache_facts()["num_seen"] == 8 * 96 - 2 * 4 * 6
+    for session in (driver, live):
+        np.testing.assert_array_equal(session.cache.key_views.seen[:8], masks[:8])
 
 
 def test_a_continued_cache_needs_its_frame_to_be_pushed_to(capture, start):

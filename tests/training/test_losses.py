@@ -113,6 +113,31 @@ def test_the_paper_loss_of_a_scene_sums_mse_and_lpips_of_its_targets_over_black(
     assert (loss.depth_weight, loss.tokens, phase.samples.batch, phase.samples.num_targets) == (0, "all", 1, 4)
 
 
+def test_masked_pixels_of_a_target_have_neither_value_nor_gradient():
+    rng = np.random.default_rng(4)
+    gaussians = Gaussians.from_rgb(
+        means=jnp.asarray(rng.uniform((-1, -1, 2), (1, 1, 4), (9, 3)), jnp.float32),
+        quats=jnp.asarray(rng.normal(size=(9, 4)), jnp.float32),
+        scales=jnp.full((9, 3), 0.3),
+        opacities=jnp.full(9, 0.7),
+        colors=jnp.asarray(rng.uniform(size=(9, 3)), jnp.float32),
+    )
+    cameras = Camera(jnp.eye(4)[None], jnp.array([[[10.0, 0, 8], [0, 10, 6], [0, 0, 1]]]), 16, 12)
+    targets = jnp.asarray(rng.uniform(size=(1, 12, 16, 3)), jnp.float32)
+    seen = jnp.ones((1, 12, 16), bool).at[:, :, :8].set(False)
+    loss = RenderingLoss(max_pairs=1 << 12)
+
+    def of(gaussians, targets, seen):
+        sample = sample_of(jnp.zeros((1, 4, 2, 2)), targets, cameras, is_photographed=True)
+        return loss.of_scene(gaussians, replace(sample, target_seen=seen))[0]
+
+    value, gradient = jax.value_and_grad(of)(gaussians, targets, seen)
+    other = jax.value_and_grad(of)(gaussians, jnp.where(seen[..., None], targets, 1 - targets), seen)
+    assert value == other[0] > 0 and jax.tree.all(jax.tree.map(np.array_equal, gradient, other[1]))
+    assert of(gaussians, targets, None) == pytest.approx(float(of(gaussians, targets, seen | True)), rel=1e-6)
+    assert of(gaussians, targets, seen & False) == 0.0
+
+
 def test_fitted_gains_undo_exposures_and_stay_bounded():
     rng = np.random.default_rng(0)
     images = jnp.asarray(rng.uniform(0.1, 0.9, (3, 6, 5, 3)), jnp.float32)

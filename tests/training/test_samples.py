@@ -198,6 +198,22 @@ def test_frames_without_depth_have_unknown_depths(mix, capture):
     assert np.isfinite(np.asarray(sample.chunks.images)).all()
 
 
+def test_masks_of_a_capture_are_masks_of_its_samples(capture):
+    """A procedural step beside it has masks that hide nothing, so that one program serves both."""
+    masks = np.ones((NUM_FRAMES, *SIZE), bool)
+    masks[::2, 10:30] = False
+    frames = tuple(dataclasses.replace(f, is_masked=i % 2 == 0) for i, f in enumerate(capture.frames))
+    pixels = dataclasses.replace(capture.pixels, masks=masks)
+    mix = mix_of(dataclasses.replace(capture, frames=frames, pixels=pixels), share=0.5)
+    sample = opened(VIEWS, mix)
+    shares = [np.mean(s.target_seen) for s in map(sample, range(8), [0] * 8)]
+    assert 1.0 in shares and min(shares) < 1
+    hidden = next(s for s in map(sample, range(8), [0] * 8) if not s.chunks.seen.all())
+    seen = np.concatenate([hidden.chunks.seen.reshape(-1, *SIZE), hidden.target_seen.reshape(-1, *SIZE)])
+    for view in seen:
+        assert view.all() or not view[12:28].any()
+
+
 def test_steps_are_shared_as_asked(capture):
     other = dataclasses.replace(capture)
     groups = (CaptureGroup("a", 0.2, (capture,)), CaptureGroup("b", 0.5, (other,)))

@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 import urllib.request
 from pathlib import Path
 
@@ -28,6 +29,11 @@ def viewer_of(parent: int) -> int | None:
     return None
 
 
+def run_with_viewer(capture: Path, out: Path, *options: str) -> list[str]:
+    options = ("--view", "--port", str(free_port()), "--set", "capacity=2048", "--refine", "0", *options)
+    return [sys.executable, "-c", COMMAND, "run", str(capture), "--out", str(out), *options]
+
+
 def test_a_port_without_a_viewer_is_refused(tmp_path, capsys):
     assert run("run", str(make_capture(tmp_path / "capture")), "--out", str(tmp_path / "out"), "--port", "8090") == 2
     assert "--view" in capsys.readouterr().err and not (tmp_path / "out").exists()
@@ -38,8 +44,7 @@ def test_a_port_without_a_viewer_is_refused(tmp_path, capsys):
 def test_a_run_ends_though_its_viewer_stands_still_and_the_viewer_ends_with_it(tmp_path):
     pytest.importorskip("viser")
     capture, out = make_capture(tmp_path / "capture", num_frames=10), tmp_path / "out"
-    options = ("--view", "--port", str(free_port()), "--set", "capacity=2048")
-    arguments = [sys.executable, "-c", COMMAND, "run", str(capture), "--out", str(out), "--refine", "0", *options]
+    arguments = run_with_viewer(capture, out)
     process = subprocess.Popen(arguments, stdout=subprocess.PIPE, text=True, start_new_session=True)
     try:
         assert process.stdout is not None
@@ -57,6 +62,38 @@ def test_a_run_ends_though_its_viewer_stands_still_and_the_viewer_ends_with_it(t
         os.killpg(process.pid, signal.SIGINT)
         assert process.wait(timeout=60) == 130
         assert not Path(f"/proc/{viewer}").exists()
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.communicate()
+
+
+@pytest.mark.slow
+def test_a_live_folder_is_streamed_and_shown_by_one_command(tmp_path):
+    """A process drops one posed frame a second; the viewer's page is there, and deltas come before the last frame."""
+    pytest.importorskip("viser")
+    whole, live, out = make_capture(tmp_path / "whole", num_frames=12), tmp_path / "live", tmp_path / "out"
+    (live / "images").mkdir(parents=True)
+    arguments = run_with_viewer(live, out, "--watch", "--quiet-seconds", "60")
+    process = subprocess.Popen(arguments, stdout=subprocess.PIPE, text=True, start_new_session=True)
+    try:
+        facts, seen_early = json.loads((whole / "transforms.json").read_text()), 0
+        for i, frame in enumerate(facts["frames"], start=1):
+            (live / frame["file_path"]).write_bytes((whole / frame["file_path"]).read_bytes())
+            (live / "transforms.json").write_text(json.dumps(facts | {"frames": facts["frames"][:i]}))
+            time.sleep(1.0)
+            if i == 8:
+                wait_for(lambda: RunFolder(out).delta_files(), seconds=300)
+                seen_early = len(RunFolder(out).delta_files())
+        (live / "done").touch()
+        assert process.stdout is not None and seen_early > 0
+        line = next(line for line in process.stdout if line.startswith("http://localhost:"))
+        with urllib.request.urlopen(line.split()[0], timeout=60) as page:
+            assert page.status == 200
+        assert any("stays open" in line for line in process.stdout)
+        assert json.loads(RunFolder(out).metrics.read_text())["views"] == 12
+        os.killpg(process.pid, signal.SIGINT)
+        assert process.wait(timeout=60) == 130
     finally:
         with contextlib.suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)
