@@ -28,6 +28,9 @@ from ssplat_jax.storage.saved_states import load_newest_state
 from ssplat_jax.streaming.feed import FedChunk, feed_chunks, middle_exposure
 from ssplat_jax.streaming.scene_delta import SceneFeed
 
+LARGE = 640 * 480
+"""Pixels of an image above which a run says that smaller ones take less time."""
+
 CHUNKS_PER_SCORE = 4
 """Held-back frames are scored after every so many chunks: to decode and to draw takes about as long as a chunk."""
 
@@ -96,12 +99,11 @@ def run_capture(
         if stopped := source.wait_for(max(num_saved, chunk_size)):
             return RunResult(num_saved, 0, stopped)
         indices = source.indices[: num_saved or chunk_size]
-    if options.size is None:
-        size = f"{source.capture.width}x{source.capture.height}"
-        reporter.say(f"images are streamed at {size}, as they are stored; --size takes smaller ones in less time")
     kept = {"revise": options.revise, "overwrite": options.overwrite}
     with open_run(model, params, source.capture, indices, out, **kept, reporter=reporter) as run:
-        num_before = run.num_views
+        num_before, width, height = run.num_views, run.capture.width, run.capture.height
+        if options.size is None and width * height > LARGE:
+            reporter.say(f"images are streamed at {width}x{height}; --size takes smaller ones in less time")
         if stopped := _stream(run, source, options, reporter):
             return RunResult(run.num_views, 0, stopped)
         if run.num_views > num_before:

@@ -190,7 +190,7 @@ def test_films_of_depth_and_normals_on_an_orbit(tmp_path, capture):
     ("options", "words"),
     [
         (("--film-path", "orbit"), "--film"),
-        (("--film", "2"), 'pip install "ssplat-jax[video]"'),
+        (("--film", "2"), 'pip install -e ".[video]"'),
     ],
 )
 def test_an_impossible_film_is_refused_and_nothing_written(options, words, tmp_path, capture, capsys, monkeypatch):

@@ -181,8 +181,15 @@ def test_only_requested_outputs_are_returned(scene):
     np.testing.assert_allclose(out.color, render(*scene, max_pairs=1 << 12).color, atol=1e-6)
 
 
+def gradient_of_checkpoint(function):
+    """The gradient of a sum over what `function` gives, which is recomputed in the backward pass."""
+    return jax.grad(jax.checkpoint(lambda x: jnp.sum(function(x))))
+
+
 @plainly
-@pytest.mark.parametrize("transform", [jax.checkpoint, jax.vmap], ids=["checkpoint", "vmap"])
+@pytest.mark.parametrize(
+    "transform", [jax.checkpoint, gradient_of_checkpoint, jax.vmap], ids=["checkpoint", "gradient", "vmap"]
+)
 def test_a_transform_that_hides_the_number_of_pairs_says_if_its_guess_was_too_low(transform, recwarn):
     """Large Gaussians, of more than four tiles each; 4,096 pairs are the least that is guessed."""
     gaussians, camera = cloud(600, size=0.2), cameras(80, 96)

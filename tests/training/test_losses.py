@@ -11,6 +11,7 @@ import pytest
 from ssplat_jax.cache import Tokens
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.chunk import Chunk
+from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.evaluation.lpips import LpipsWeights
 from ssplat_jax.model.streamsplat import StreamSplat

@@ -207,7 +207,7 @@ def test_viser_and_an_address_that_cannot_be_used_are_refused_at_once(monkeypatc
         with pytest.raises(InputError, match=rf"view: cannot listen on {host}:{port} \(.*\); choose another"):
             import_viser(host, port)
     monkeypatch.setitem(sys.modules, "viser", None)
-    with pytest.raises(InputError, match=r'pip install "ssplat-jax\[viewer\]"'):
+    with pytest.raises(InputError, match=r'pip install -e "\.\[viewer\]"'):
         import_viser("127.0.0.1", 8080)
 
 
