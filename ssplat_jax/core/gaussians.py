@@ -1,13 +1,9 @@
 """`Gaussians`: a scene of 3D Gaussians as one pytree of activated values."""
 
-import functools
-
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ssplat_jax.core.errors import InputError
-from ssplat_jax.core.kept_programs import Kept
 from ssplat_jax.core.pytree import pytree, replace, static
 
 SH_C0 = 0.28209479177387814  # Y_0^0, the constant band: color = 0.5 + SH_C0 * dc
@@ -118,12 +114,3 @@ def mask_gaussians(gaussians: Gaussians, keep) -> Gaussians:
         opacities=jnp.where(keep, gaussians.opacities, 0.0),
         sh=jnp.where(keep[:, None, None], gaussians.sh, 0.0),
     )
-
-
-@functools.partial(Kept, static_argnums=(1,))
-def present_gaussians(gaussians: Gaussians, num_rows: int) -> Gaussians:
-    """The first `num_rows` rows of `gaussians` with an opacity above 0, in their order, then absent rows."""
-    is_present = gaussians.opacities > 0
-    rows = jnp.nonzero(is_present, size=num_rows, fill_value=0)[0]
-    keep = jnp.arange(num_rows) < jnp.sum(is_present)
-    return mask_gaussians(jax.tree.map(lambda x: x[rows], gaussians), keep)

@@ -204,7 +204,9 @@ class StreamSplat:
         is_shown = shown_pivots(cache, self.config).reshape(-1)
         return self._decode(params, cache, is_shown, lambda x: x.reshape(-1, *x.shape[2:]))
 
-    def decode_rows(self, params: dict, cache: VoxelCache, pivots: Int[Array, " m"]) -> Gaussians:
+    def decode_rows(
+        self, params: dict, cache: VoxelCache, pivots: Int[Array, " m"], num_gaussians: int | None = None
+    ) -> Gaussians:
         """The Gaussians that `decode` gives for some pivots, at the cost of these alone.
 
         Args:
@@ -212,15 +214,21 @@ class StreamSplat:
             cache: the scene.
             pivots: numbers of pivots, voxel by voxel: pivot `k` of row `r` is `r * pivots_per_voxel + k`. The
                 Gaussians of -1 have opacity 0.
+            num_gaussians: leave out the rows that hold no Gaussian: the first so many that do, then rows of opacity 0.
         """
         take = lambda x: x.reshape(-1, *x.shape[2:])[pivots]  # noqa: E731
         is_shown = (pivots >= 0) & take(shown_pivots(cache, self.config))
-        return self._decode(params, cache, is_shown, take)
+        return self._decode(params, cache, is_shown, take, num_gaussians)
 
     def _decode(
-        self, params: dict, cache: VoxelCache, is_shown: Bool[Array, " m"], take: Callable[[Array], Array]
+        self,
+        params: dict,
+        cache: VoxelCache,
+        is_shown: Bool[Array, " m"],
+        take: Callable[[Array], Array],
+        num_gaussians: int | None = None,
     ) -> Gaussians:
-        """Gaussians of the pivots that `take` selects."""
+        """Gaussians of the pivots that `take` selects, all rows or those that hold one."""
         rgbs, stored, num_members = take(cache.rgbs), take(cache.footprints), take(cache.num_members)
         footprints = grown_footprints(stored, num_members, self.config)
         shapes, parts = self._read_shapes(params, take(cache.feats)), divide_cells(rgbs, self.config)
@@ -236,6 +244,11 @@ class StreamSplat:
                 rgbs=rgbs,
             )
             shapes, parts = apply_evidence(params["evidence"], shapes, parts, evidence, self.config)
+        rows, is_kept = None, self.repeat_per_gaussian(is_shown)
+        if num_gaussians is not None:
+            is_present = parts.present & is_shown[:, None]
+            rows = jnp.nonzero(is_present.reshape(-1), size=num_gaussians, fill_value=-1)[0]
+            is_kept = rows >= 0
         gaussians = decode_tokens(
             shapes,
             means=take(cache.means),
@@ -244,10 +257,13 @@ class StreamSplat:
             footprints=footprints,
             num_members=num_members,
             config=self.config,
+            rows=rows,
         )
         if cache.changes is not None:
-            gaussians = changed_gaussians(gaussians, unpack(take(cache.changes)), max_scale=MAX_SCALE)
-        return mask_gaussians(gaussians, self.repeat_per_gaussian(is_shown))
+            change = unpack(take(cache.changes))
+            change = change if rows is None else jax.tree.map(lambda x: x[rows], change)
+            gaussians = changed_gaussians(gaussians, change, max_scale=MAX_SCALE)
+        return mask_gaussians(gaussians, is_kept)
 
     def decode_tokens(self, params: dict, tokens: Tokens) -> Gaussians:
         """Gaussians of tokens that are not in a cache, as training renders them (Sec. 3.7)."""

@@ -13,7 +13,7 @@ from ssplat_jax.cache.state import init_cache, with_refinement
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.chunk import Chunk, check_chunk
 from ssplat_jax.core.errors import refusal
-from ssplat_jax.core.gaussians import Gaussians, present_gaussians
+from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.core.kept_programs import Kept
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.data.stream_frame import StreamFrame
@@ -171,30 +171,26 @@ class Session:
     def gaussians(self) -> Gaussians:
         """The scene so far, in the stream frame: the Gaussians of `model.decode`, then padding rows of opacity 0.
 
-        With `adaptive` the rows that hold no Gaussian are left out. The number of rows is rounded up, so that a growing
-        scene rarely compiles.
+        With `adaptive` the rows that hold no Gaussian are left out.
         """
-        cache, config = self._present_cache(), self.model.config
-        gaussians = self.decode_program()(self.params, cache)
-        if not config.head.adaptive:
-            return gaussians
-        num_present = int(_count(cache, config)[2])
-        num_rows = max(MIN_DECODED_PIVOTS, 1 << max(num_present - 1, 0).bit_length())
-        return present_gaussians(gaussians, min(num_rows, gaussians.num_gaussians))
+        return self.decode_program()(self.params, self._present_cache())
 
     def decode_program(self) -> jax.stages.Compiled:
         """The compiled program of `gaussians` for the present cache.
 
-        Only shown pivots are decoded, because a cache has capacity for many more than it holds. Their number is rounded
-        up to a power of two, so that a growing scene rarely compiles.
+        Only shown pivots are decoded, because a cache has capacity for many more than it holds. Numbers are rounded up
+        to powers of two, so that a growing scene rarely compiles.
         """
-        cache = self._present_cache()
-        num_shown = int(_count(cache, self.model.config)[1])
-        num_pivots = min(max(MIN_DECODED_PIVOTS, 1 << max(num_shown - 1, 0).bit_length()), cache.confidences.size)
+        cache, config = self._present_cache(), self.model.config
+        _, num_shown, num_present = map(int, _count(cache, config))
+        num_pivots = min(max(MIN_DECODED_PIVOTS, _power_of_two(num_shown)), cache.confidences.size)
+        num_gaussians = None
+        if config.head.adaptive:
+            num_gaussians = max(MIN_DECODED_PIVOTS, _power_of_two(num_present))
         leaves, structure = jax.tree.flatten(cache)
-        key = ("decode", num_pivots, structure, *((leaf.shape, leaf.dtype) for leaf in leaves))
+        key = ("decode", num_pivots, num_gaussians, structure, *((leaf.shape, leaf.dtype) for leaf in leaves))
         if key not in self._programs:
-            decode = functools.partial(_decode_shown, self.model, num_pivots)
+            decode = functools.partial(_decode_shown, self.model, num_pivots, num_gaussians)
             self._programs[key] = Kept(decode).program(self.params, cache)
         return self._programs[key]
 
@@ -231,9 +227,16 @@ class Session:
 _new_cache = Kept(init_cache, static_argnums=(0, 1))
 
 
-def _decode_shown(model: StreamSplat, num_pivots: int, params: dict, cache: VoxelCache) -> Gaussians:
+def _decode_shown(
+    model: StreamSplat, num_pivots: int, num_gaussians: int | None, params: dict, cache: VoxelCache
+) -> Gaussians:
     """The Gaussians of the pivots that are shown, of which there are at most `num_pivots`."""
-    return model.decode_rows(params, cache, shown_rows(cache, model.config, num_pivots))
+    return model.decode_rows(params, cache, shown_rows(cache, model.config, num_pivots), num_gaussians)
+
+
+def _power_of_two(number: int) -> int:
+    """The least power of two that is at least `number`."""
+    return 1 << max(number - 1, 0).bit_length()
 
 
 @functools.partial(Kept, static_argnums=(1,))
