@@ -84,7 +84,7 @@ class Kept:
         return tuple(x for i, x in enumerate(arguments) if i not in self._static)
 
     def _key(self, arguments: tuple) -> str | None:
-        """All that the program depends on, as text; None if it is not kept."""
+        """The key of the program, which names its every input as text; None if it is not kept."""
         if not os.environ.get(SWITCH) or jax.config.jax_disable_jit:  # pyright: ignore[reportAttributeAccessIssue]
             return None
         if jax.default_backend() != "cpu":  # not measured elsewhere: JAX's own cache has the programs there

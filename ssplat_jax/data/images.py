@@ -66,7 +66,7 @@ def zero_is_white(image: Image.Image) -> bool:
 
 
 def image_flags(path: Path) -> tuple[bool, bool]:
-    """Whether an image file may have transparent pixels, and whether EXIF says that it is not upright."""
+    """Two facts of an image file: it may have transparent pixels; EXIF says that it is not upright."""
     with _open(path) as image:
         with reading(path, REPLACE):
             # Not `image.getexif()`, which decodes a whole PNG to find what may follow its pixels.

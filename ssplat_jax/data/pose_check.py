@@ -92,7 +92,7 @@ def _matched(capture: PosedImages, i: int, j: int, keypoints: KeypointsOf) -> Ma
 
 
 def fit_poses(capture: PosedImages, convention: Convention, keypoints: KeypointsOf) -> PoseFit | None:
-    """How well poses that were read in `convention` fit the images in each; None if too few matches move."""
+    """The fit of poses, read in `convention`, to the images in each convention; None if too few matches move."""
     counts, focals = dict.fromkeys(CONVENTIONS, 0), dict.fromkeys(((1.0, 1.0), *FOCAL_FACTORS), 0)
     total = coherent = 0
     for pair in matched_pairs(capture, range(len(capture.frames)), keypoints):

@@ -107,7 +107,7 @@ def test_names_that_are_not_utf8_have_digests():
 
 
 def test_memory_does_not_grow_with_the_number_of_images(tmp_path):
-    """What a stream keeps of an image that it has passed are facts, beside a number of images that is bounded."""
+    """A stream keeps facts alone of an image that it has passed, beside a bounded number of images."""
     num, size = KEPT_IMAGES + 200, (64, 48)
     root = make_capture(tmp_path / "c")
     meta = json.loads((root / "transforms.json").read_text())

@@ -28,7 +28,7 @@ def saved(folder, *steps: int) -> TrainingCheckpoints:
 
 
 def restored(folder):
-    """What a new process restores, and the warnings."""
+    """The training that a new process restores, and the warnings."""
     told = []
     return TrainingCheckpoints(folder, {}).restore_latest(STATE, told.append), told
 
