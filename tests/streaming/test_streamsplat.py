@@ -104,6 +104,18 @@ def test_a_session_decodes_shown_rows_padded_to_a_power_of_two(adaptive, model, 
     assert not np.asarray(shown.opacities)[num_shown:].any()
 
 
+def test_rows_that_hold_a_gaussian_are_those_of_shown_pivots(params, looped):
+    """Of all pivots, carved ones too, which have colors and opacities of their own."""
+    cache = looped[0]
+    tau = float(np.median(cache.confidences[cache.alive]))
+    model = StreamSplat(NARROW.replace(min_confidence=tau, adaptive=True))
+    whole, pivots = model.decode(params, cache), jnp.arange(cache.confidences.size)
+    is_present = np.asarray(whole.opacities) > 0
+    rows = model.decode_rows(params, cache, pivots, num_gaussians=int(is_present.sum()) + 64)
+    assert not np.asarray(rows.opacities)[is_present.sum() :].any()
+    np.testing.assert_allclose(rows.means[: is_present.sum()], whole.means[is_present], rtol=1e-5, atol=1e-6)
+
+
 def test_footprints_of_merged_pivots_grow_until_they_cover_a_face(model):
     """Voxels measure 0.04 and have 4 pivots: 1.2 times a share of 0.02."""
     footprints, members = jnp.array([0.01, 0.01, 0.01, 0.05]), jnp.array([1, 2, 100, 100])
