@@ -152,9 +152,9 @@ def streams(scale: str) -> list[Row]:
         session = Session(model, load_params("tiny") if name == "tiny" else model.init(jax.random.key(0)))
         num_views = 2 * config.stream.chunk_size
         capture = open_capture(f"procedural:room?frames={num_views}", size=size)
-        frame = capture.stream_frame(config)
-        _, recent = feed_capture(session, capture, range(num_views), frame, num_recent=2)
-        camera = capture.camera(num_views // 2, frame)
+        stream_frame = capture.stream_frame(config)
+        _, recent = feed_capture(session, capture, range(num_views), stream_frame, num_recent=2)
+        camera = capture.camera(num_views // 2, stream_frame)
         stages = stage_times(session, recent[-1], camera, repeats=1 if scale == "smoke" else 15)
         facts = {"whole_ms": measure_latency(session, recent, camera)["chunk_ms"], **session.cache_facts()}
         row = {"preset": name, "size": size, "stages_ms": {stage: round(ms, 3) for stage, ms in stages.items()}}

@@ -1,9 +1,8 @@
 """StreamSplat in JAX: a calibrated image stream becomes a 3D Gaussian scene, chunk by chunk.
 
     import ssplat_jax as ss
-    from ssplat_jax.streaming.session import Session
     model, params = ss.StreamSplat(ss.preset("tiny")), ss.load_params("tiny")
-    session = Session(model, params)                # holds the cache, grows it, compiles the step
+    session = ss.Session(model, params)             # holds the cache, grows it, compiles the step
     for chunk in ss.open_capture("path/to/capture").chunks(model.config):
         out = session.feed(chunk)
     gaussians = session.gaussians()                 # in the stream frame
@@ -44,6 +43,7 @@ if TYPE_CHECKING:
     from ssplat_jax.scene_files.formats import save_splat as save_splat
     from ssplat_jax.scene_files.formats import save_spz as save_spz
     from ssplat_jax.storage.weights import load_params as load_params
+    from ssplat_jax.streaming.session import Session as Session
 
 # Public name -> module that defines it.
 _MODULES = {
@@ -54,6 +54,7 @@ _MODULES = {
     "Gaussians": "core.gaussians",
     "InputError": "core.errors",
     "RenderOutput": "rasterizer",
+    "Session": "streaming.session",
     "StorageError": "core.errors",
     "StreamConfig": "config",
     "StreamFrame": "data.stream_frame",

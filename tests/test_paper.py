@@ -76,7 +76,9 @@ def test_frames_stream_in_their_order_in_the_units_of_the_poses():
     capture = open_capture("procedural:room?frames=6&size=64x48")
     frame, order = capture.stream_frame(PAPER), [5, 2, 3, 1, 4]
     assert frame.scale == 1.0 and capture.stream_order(PAPER, order, frame) == order
-    candidates = np.exp(f64(prepare_views(next(iter(capture.chunks(PAPER, order, frame=frame))), PAPER).log_candidates))
+    candidates = np.exp(
+        f64(prepare_views(next(iter(capture.chunks(PAPER, order, stream_frame=frame))), PAPER).log_candidates)
+    )
     assert candidates[[0, -1]] == pytest.approx([0.01, 200.0], rel=1e-5)
 
 

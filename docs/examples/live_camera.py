@@ -6,7 +6,6 @@ from collections.abc import Iterator
 import numpy as np
 
 import ssplat_jax as ss
-from ssplat_jax.streaming.session import Session
 
 
 def source(path: str) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
@@ -18,14 +17,14 @@ def source(path: str) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
 
 
 def main(path: str) -> ss.Gaussians:
-    session = Session(ss.StreamSplat(ss.preset("tiny")), ss.load_params("tiny"))
+    session = ss.Session(ss.StreamSplat(ss.preset("tiny")), ss.load_params("tiny"))
     for number, (image, K, viewmat) in enumerate(source(path), start=1):
         if (out := session.push(image, K, viewmat)) is not None:  # every fourth view completes a chunk
             print(f"{number} views, mean confidence {float(out.confidences.mean()):.2f}")
     session.flush()  # the views that still wait, however few
     gaussians = session.gaussians()
-    if session.frame is not None:
-        ss.save_ply("live.ply", session.frame.gaussians_to_capture(gaussians))  # in the frame of the poses
+    if session.stream_frame is not None:
+        ss.save_ply("live.ply", session.stream_frame.gaussians_to_capture(gaussians))  # in the frame of the poses
     return gaussians
 
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import optax
 
 import ssplat_jax as ss
-from ssplat_jax.training.samples import Views, procedural_sample
+from ssplat_jax.training.samples import ViewSamples, procedural_sample
 
 SIZE = (64, 64)  # height and width
 
@@ -20,7 +20,7 @@ def main(steps: int) -> list[float]:
     model = ss.StreamSplat(ss.preset("tiny").replace(capacity=1 << 14, overflow="drop_new", match_exposure=False))
     params = ss.load_params("tiny")
     optimizer = optax.chain(optax.clip_by_global_norm(1.0), optax.adamw(1e-4))
-    state, views, losses = optimizer.init(params), Views(num_chunks=2, sizes=(SIZE,), num_targets=1), []
+    state, views, losses = optimizer.init(params), ViewSamples(num_chunks=2, sizes=(SIZE,), num_targets=1), []
 
     def loss(params, sample):
         def body(cache, chunk):

@@ -38,8 +38,8 @@ from ssplat_jax.training.capture_mix import CaptureMix, open_mix
 from ssplat_jax.training.crops import Crops
 from ssplat_jax.training.loop import train
 from ssplat_jax.training.losses import RenderingLoss
-from ssplat_jax.training.recipe import AFTER_MATCHER, EVIDENCE, MATCHER, Phase, Recipe, learning
-from ssplat_jax.training.samples import Views
+from ssplat_jax.training.recipe import AFTER_MATCHER, EVIDENCE_RECIPE, MATCHER, Phase, Recipe, learning
+from ssplat_jax.training.samples import ViewSamples
 
 REVISIT = "revisit"
 """Name of the procedural scene that is scored."""
@@ -106,7 +106,7 @@ class Budget:
         phase = Phase(
             "stream",
             self.steps,
-            Views(self.num_chunks, (self.size,), num_targets=2),
+            ViewSamples(self.num_chunks, (self.size,), num_targets=2),
             RenderingLoss(max_pairs=self.max_pairs),
             learning(*(stage for stage in AFTER_MATCHER if stage not in untrained)),
             learning_rate=3e-4,
@@ -117,8 +117,8 @@ class Budget:
 
 def evidence_recipe(steps: int, crops: Crops) -> Recipe:
     """The recipe `evidence` with other steps and samples."""
-    phase = dataclasses.replace(EVIDENCE.phases[0], steps=steps, samples=crops)
-    return dataclasses.replace(EVIDENCE, phases=(phase,))
+    phase = dataclasses.replace(EVIDENCE_RECIPE.phases[0], steps=steps, samples=crops)
+    return dataclasses.replace(EVIDENCE_RECIPE, phases=(phase,))
 
 
 LEARNED_SCENES = (*Crops().procedural, "procedural:revisit?frames=73&seed=3")
@@ -266,16 +266,16 @@ def open_scene(scene: str, seed: int, budget: Budget, captures: Path | None) -> 
 
 def scored(session: Session, capture: Capture, split: Split) -> Row:
     """Scores, memory and a picture of the scene that a session makes of the context."""
-    frame = capture.stream_frame(session.model.config, split.context)
-    exposures, _ = feed_capture(session, capture, split.context, frame)
+    stream_frame = capture.stream_frame(session.model.config, split.context)
+    exposures, _ = feed_capture(session, capture, split.context, stream_frame)
     gaussians, middle = session.gaussians(), split.targets[len(split.targets) // 2]
-    scores = score_targets(gaussians, capture, split.targets, frame, exposures, installed_lpips())
+    scores = score_targets(gaussians, capture, split.targets, stream_frame, exposures, installed_lpips())
     values = {f"{c}_{m}": scores[c][m] for c in COLUMNS for m in ("psnr", "ssim", "lpips")}
     return {
         **values,
-        "peak_memory_bytes": peak_memory(session, capture.camera(middle, frame)).bytes,
+        "peak_memory_bytes": peak_memory(session, capture.camera(middle, stream_frame)).bytes,
         "gaussians": session.cache_facts()["decoded"],
-        PICTURE: score_view(gaussians, capture, middle, frame, exposures).color,
+        PICTURE: score_view(gaussians, capture, middle, stream_frame, exposures).color,
     }
 
 

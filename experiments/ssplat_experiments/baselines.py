@@ -37,7 +37,7 @@ def baseline_scores(
     capture: Capture,
     i: int,
     context: Sequence[int],
-    frame: StreamFrame,
+    stream_frame: StreamFrame,
     depth: Float[np.ndarray, "h w"],
     exposures: Exposures,
 ) -> dict[str, dict[str, ImageScore]]:
@@ -47,7 +47,7 @@ def baseline_scores(
         capture: the capture with the images.
         i: frame number of the target.
         context: frame numbers of the streamed views.
-        frame: the similarity between the capture's frame and the stream's.
+        stream_frame: the similarity between the capture's frame and the stream's.
         depth: depth of the scene, rendered at the target, in stream units; 0 where nothing is. It warps.
         exposures: exposures of the streamed frames, as the stream estimated them.
 
@@ -58,7 +58,7 @@ def baseline_scores(
     nearest = nearest_views(capture, i, context)[0]
     copy, target = capture.image(nearest), capture.image(i)
     mean = np.mean([capture.image(j).mean(axis=(0, 1)) for j in context], axis=0)
-    warped, known = warp(copy, capture.camera(nearest, frame), capture.camera(i, frame), depth)
+    warped, known = warp(copy, capture.camera(nearest, stream_frame), capture.camera(i, stream_frame), depth)
     gain = exposure_for(capture, i, exposures) / exposure_for(capture, nearest, exposures)
     flat = np.broadcast_to(mean, target.shape).astype(np.float32)
     images = {

@@ -121,15 +121,15 @@ def _open(path: str, size: tuple[int, int]) -> Capture:
 
 def measured(path: str, method: str, config: StreamConfig, sizes: Sizes) -> list[Row]:
     """A row for each number of views; with our memory, one for each image baseline too."""
-    capture, split, frame = _opened(path, config, sizes)
+    capture, split, stream_frame = _opened(path, config, sizes)
     session, exposures, rows = new_session(config), {}, []
-    middle = capture.camera(split.targets[len(split.targets) // 2], frame)
+    middle = capture.camera(split.targets[len(split.targets) // 2], stream_frame)
     for fed, count in itertools.pairwise((0, *sizes.counts)):
-        found, recent = feed_capture(session, capture, split.context[fed:count], frame, num_recent=NUM_TIMED)
+        found, recent = feed_capture(session, capture, split.context[fed:count], stream_frame, num_recent=NUM_TIMED)
         exposures |= found
         place = {"suite": _short(path) + sizes.label, "views": count}
         seen = split.context[:count] if method == OURS else ()
-        scored = _scores(session.gaussians(), capture, split.targets, frame, exposures, seen)
+        scored = _scores(session.gaussians(), capture, split.targets, stream_frame, exposures, seen)
         memory, latency = peak_memory(session, middle), measure_latency(session, recent, middle)
         cost = {
             "step_ms": latency["step_ms"],
@@ -141,7 +141,9 @@ def measured(path: str, method: str, config: StreamConfig, sizes: Sizes) -> list
             rows.append({**place, "method": name, **scores} | (cost if name == "scene" else {}))
             rows[-1]["method"] = method if name == "scene" else name
         if method == OURS:
-            view = score_view(session.gaussians(), capture, split.targets[len(split.targets) // 2], frame, exposures)
+            view = score_view(
+                session.gaussians(), capture, split.targets[len(split.targets) // 2], stream_frame, exposures
+            )
             rows[-len(scored)][PICTURE] = view.color
     return rows
 
@@ -161,12 +163,12 @@ def measured_joint(path: str, counts: Sequence[int], config: StreamConfig, sizes
 
 def joint_row(path: str, count: int, config: StreamConfig, sizes: Sizes) -> Row:
     """Scores and memory of the joint network over the first views, the chunk of the stream `config`."""
-    capture, split, frame = _opened(path, config, sizes)
-    chunk = one_chunk(list(capture.chunks(config, split.context[:count], frame=frame)))
+    capture, split, stream_frame = _opened(path, config, sizes)
+    chunk = one_chunk(list(capture.chunks(config, split.context[:count], stream_frame=stream_frame)))
     network = JointNetwork(config, load_params("tiny"), chunk)
     gaussians = network.gaussians()
-    scored = _scores(gaussians, capture, split.targets, frame, {}, ())["scene"]
-    middle = capture.camera(split.targets[len(split.targets) // 2], frame)
+    scored = _scores(gaussians, capture, split.targets, stream_frame, {}, ())["scene"]
+    middle = capture.camera(split.targets[len(split.targets) // 2], stream_frame)
     cost = {"gaussians": int((gaussians.opacities > 0).sum()), **network.peak_memory(middle).to_row()}
     return {**scored, **cost}
 
@@ -186,17 +188,17 @@ def _scores(
     gaussians: Gaussians,
     capture: Capture,
     targets: Sequence[int],
-    frame: StreamFrame,
+    stream_frame: StreamFrame,
     exposures: Exposures,
     context: Sequence[int],
 ) -> dict[str, dict[str, float | None]]:
     """Mean scores of the scene and, for the views of a context, of the image baselines, by their names."""
     found: dict[str, list[dict[str, ImageScore]]] = {"scene": []}
     for i in targets:
-        view = score_view(gaussians, capture, i, frame, exposures, installed_lpips())
+        view = score_view(gaussians, capture, i, stream_frame, exposures, installed_lpips())
         found["scene"].append({"literal": view.score.literal, "shown": view.score.shown})
         if context:
-            for name, scores in baseline_scores(capture, i, context, frame, view.depth, exposures).items():
+            for name, scores in baseline_scores(capture, i, context, stream_frame, view.depth, exposures).items():
                 found.setdefault(name, []).append(scores)
     return {
         name: {

@@ -75,9 +75,9 @@ def cases(captures: Path | None, scale: str) -> list[Case]:
 def stage_rows(config: StreamConfig, size: tuple[int, int], sizes: Sizes) -> list[Row]:
     """A row for each stage, for their sum and for the whole, which has the memory."""
     capture = open_capture(f"procedural:room?frames={sizes.views}", size=size)
-    frame, session = capture.stream_frame(config), new_session(config)
-    _, recent = feed_capture(session, capture, range(sizes.views), frame, num_recent=2)
-    camera, views = capture.camera(sizes.views // 2, frame), config.stream.chunk_size
+    stream_frame, session = capture.stream_frame(config), new_session(config)
+    _, recent = feed_capture(session, capture, range(sizes.views), stream_frame, num_recent=2)
+    camera, views = capture.camera(sizes.views // 2, stream_frame), config.stream.chunk_size
     parts = stage_times(session, recent[-1], camera, sizes.repeats)
     parts |= {"sum of stages": sum(parts.values())}
     parts |= {WHOLE: measure_latency(session, recent, camera)["chunk_ms"]["median"]}

@@ -67,16 +67,16 @@ def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str
 def measure(capture: Capture, split: Split) -> dict[str, Any]:
     """One row: errors of the tokens of the context views."""
     model = StreamSplat(preset("tiny"))
-    frame = capture.stream_frame(model.config, split.context)
-    order = capture.stream_order(model.config, split.context, frame)
+    stream_frame = capture.stream_frame(model.config, split.context)
+    order = capture.stream_order(model.config, split.context, stream_frame)
     session = Session(model, load_params("tiny"))
     ratios, confidences = [], []
-    for fed in feed_chunks(session, capture, order, frame):
+    for fed in feed_chunks(session, capture, order, stream_frame):
         for v, i in enumerate(fed.frames):  # padded views come last
             depth = capture.depth(i)
             if depth is None:
                 continue  # not every frame need have a map
-            truth = frame.scale * cell_depths(depth)
+            truth = stream_frame.scale * cell_depths(depth)
             rows, columns = truth.shape
             ratio = np.asarray(fed.output.depths[v])[:rows, :columns] / np.where(truth > 0, truth, np.nan)
             ratios.append(ratio[truth > 0])

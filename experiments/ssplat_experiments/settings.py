@@ -122,13 +122,13 @@ class _Streamed:
     streamed: Capture
     scored: Capture
     split: Split
-    frame: StreamFrame
+    stream_frame: StreamFrame
     exposures: Exposures
     cost: dict[str, Any]
 
     def row(self, setting: Setting, gaussians: Gaussians) -> dict[str, Any]:
         """A row of the table, with the scores of `gaussians`."""
-        scores = score_targets(gaussians, self.scored, self.split.targets, self.frame, self.exposures)
+        scores = score_targets(gaussians, self.scored, self.split.targets, self.stream_frame, self.exposures)
         return {
             "setting": setting.name,
             "shown": round(scores["shown"]["psnr"], 3),
@@ -152,7 +152,7 @@ def measure_refined(settings: Sequence[Setting], sizes: Sizes, opened: Opened) -
     """
     scene, rows = _stream(settings[0], sizes, opened), []
     wanted = sorted(setting.refine_steps for setting in settings)
-    given = key_views_of(scene.streamed, scene.split.context, scene.frame, scene.exposures)
+    given = key_views_of(scene.streamed, scene.split.context, scene.stream_frame, scene.exposures)
     progress, views = start_refinement(scene.gaussians, given, FOR_CAPTURES)
     refined = {}
     for _ in continue_refinement(progress, views, wanted[-1], FOR_CAPTURES):
@@ -173,9 +173,9 @@ def _stream(setting: Setting, sizes: Sizes, opened: Opened) -> _Streamed:
     session = new_session(config_of(setting, sizes))
     compiled = session.compile_seconds
     (capture, split), (scored, _) = opened(setting.size(sizes.scored)), opened(sizes.scored)
-    frame = capture.stream_frame(session.model.config, split.context)
-    exposures, recent = feed_capture(session, capture, split.context, frame, num_recent=2)
-    camera = scored.camera(split.targets[len(split.targets) // 2], frame)
+    stream_frame = capture.stream_frame(session.model.config, split.context)
+    exposures, recent = feed_capture(session, capture, split.context, stream_frame, num_recent=2)
+    camera = scored.camera(split.targets[len(split.targets) // 2], stream_frame)
     latency = measure_latency(session, recent, camera)
     cost = {
         "ms_per_view": round(latency["chunk_ms"]["median"] / session.model.config.stream.chunk_size, 2),
@@ -185,4 +185,4 @@ def _stream(setting: Setting, sizes: Sizes, opened: Opened) -> _Streamed:
         "gaussians": session.cache_facts()["decoded"],
         "peak_memory_bytes": peak_memory(session, camera).bytes,
     }
-    return _Streamed(session.gaussians(), capture, scored, split, frame, exposures, cost)
+    return _Streamed(session.gaussians(), capture, scored, split, stream_frame, exposures, cost)

@@ -58,7 +58,7 @@ def new_session(config: StreamConfig) -> Session:
 def _session(config: StreamConfig) -> Session:
     model = StreamSplat(config)
     params = complete_params(jax.random.key(0), config, load_params("tiny"))
-    return Session(model, params, revise=online_refinement(model))
+    return Session(model, params, refine=online_refinement(model))
 
 
 def make_room() -> None:

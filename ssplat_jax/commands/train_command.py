@@ -3,11 +3,11 @@
 import dataclasses
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 from ssplat_jax.commands.options import ConfigChanges, QuietOption, apply_changes
 from ssplat_jax.config import StreamConfig, preset
-from ssplat_jax.core.errors import InputError, require_positive, require_seed
+from ssplat_jax.core.errors import InputError, echo, refusal, require_positive, require_seed
 
 if TYPE_CHECKING:
     from ssplat_jax.core.console import Reporter
@@ -28,7 +28,7 @@ class Train:
     """Folder of the log, the checkpoints and, at the end, weights.npz."""
     preset: str | None = None
     """Preset of the configuration. Default: the configuration of --init-weights; without that, tiny."""
-    recipe: Literal["tiny", "depth", "stream", "evidence", "paper"] = "tiny"
+    recipe: str = "tiny"
     """tiny: trains depth from scratch. depth: continues that in batches of larger images, for a GPU. evidence: trains
     the evidence head of --init-weights on whole streams. stream: trains the stages after depth. paper: the paper's
     loss and steps, for imported weights or --preset paper, and a GPU."""
@@ -61,6 +61,8 @@ class Train:
 
         require_positive(scale_steps=self.scale_steps, save_every=self.save_every, validate_every=self.validate_every)
         require_seed(self.seed)
+        if self.recipe not in RECIPES:
+            raise refusal("--recipe", wanted=" | ".join(RECIPES), got=echo(self.recipe), fix="choose one of these")
         recipe = dataclasses.replace(RECIPES[self.recipe].scaled(self.scale_steps), seed=self.seed)
         self._refuse_unused(recipe)
         reporter = Reporter(self.quiet)
@@ -112,9 +114,12 @@ class Train:
 
     def _refuse_unused(self, recipe: "Recipe") -> None:
         """Refuses options of which the recipe would make nothing."""
-        from ssplat_jax.training.samples import Views
+        from ssplat_jax.training.samples import ViewSamples
 
-        validates, draws = self.validate_every != Train.validate_every, isinstance(recipe.phases[0].samples, Views)
+        validates, draws = (
+            self.validate_every != Train.validate_every,
+            isinstance(recipe.phases[0].samples, ViewSamples),
+        )
         for flag, is_given, is_used in (
             ("--shares", self.shares, draws),
             ("--validate-every", validates, recipe.renders),

@@ -1,4 +1,4 @@
-"""`ssplat weights`: what is in a weights file, and how far training turned each stage."""
+"""`ssplat weights`: what is in a weights file, and what share of each stage training changed."""
 
 import dataclasses
 from typing import Annotated
@@ -8,10 +8,10 @@ import tyro
 
 @dataclasses.dataclass(frozen=True)
 class Weights:
-    """Show a weights file: its training, and for each stage how far that turned it from its random start.
+    """Show a weights file: its training, and the share of each stage's parameters that training changed.
 
-    turn is the sine of the angle between a stage's weights and its start: a stage that weight decay alone has changed
-    is shorter but not turned.
+    changed is 0 for a stage that is as at its random start, or that weight decay alone has made smaller, and 1 for one
+    that has nothing of its start.
 
     Example: ssplat weights tiny
     """
@@ -22,7 +22,7 @@ class Weights:
     def run(self) -> int:
         import jax
 
-        from ssplat_jax.storage.weights import describe_weights, load_params, stage_turns, trainings
+        from ssplat_jax.storage.weights import changed_shares, describe_weights, load_params, trainings
 
         params = load_params(self.name)
         facts = describe_weights(self.name)
@@ -32,10 +32,10 @@ class Weights:
         if "imported_from" in trainings(facts.provenance)[0]:
             print("imported weights have no random start to compare with")
             return 0
-        print(f"{'stage':<12}{'parameters':>12}{'turn':>8}")
-        for stage, turn in stage_turns(params, facts).items():
+        print(f"{'stage':<12}{'parameters':>12}{'changed':>10}")
+        for stage, share in changed_shares(params, facts).items():
             num_params = sum(leaf.size for leaf in jax.tree.leaves(params[stage]))
-            print(f"{stage:<12}{num_params:>12,}{turn:>8.3f}")
+            print(f"{stage:<12}{num_params:>12,}{share:>10.3f}")
         return 0
 
 

@@ -229,20 +229,20 @@ class Capture:
         return StreamFrame.at_camera(first, scale=scale, near=near, far=far, warning=depths.warning)
 
     def camera(
-        self, i: int, frame: StreamFrame | None = None, *, offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+        self, i: int, stream_frame: StreamFrame | None = None, *, offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     ) -> Camera:
         """The camera of frame `i`: in a stream frame, or else in the capture frame, in which scene files are.
 
         In the capture frame, `offset` is the point of it to which the scene's positions are relative.
         """
         _indices(self, [i])
-        frame = frame or StreamFrame.at_point(offset)
-        viewmat = frame.viewmats(self.frames[i].camtoworld)
+        stream_frame = stream_frame or StreamFrame.at_point(offset)
+        viewmat = stream_frame.viewmats(self.frames[i].camtoworld)
         K = self.K(i).astype(np.float32)
         viewmats, Ks = jax.device_put((viewmat, K))  # jnp.asarray would compile a program for each shape
         return Camera(viewmats=viewmats, Ks=Ks, width=self.width, height=self.height)
 
-    def stream_order(self, config: StreamConfig, indices: Sequence[int] | None, frame: StreamFrame) -> list[int]:
+    def stream_order(self, config: StreamConfig, indices: Sequence[int] | None, stream_frame: StreamFrame) -> list[int]:
         """`indices` (default: all) in the order of streaming, with slow video interleaved (`interleave`).
 
         The typical depth is taken to be the geometric mean of near and far. A causal stream keeps the order of frames,
@@ -252,11 +252,11 @@ class Capture:
         if config.stream.causal:
             return used
         centers = np.stack([self.frames[i].center for i in used])
-        step = config.stream.chunk_step * math.sqrt(frame.near * frame.far) / frame.scale
+        step = config.stream.chunk_step * math.sqrt(stream_frame.near * stream_frame.far) / stream_frame.scale
         return interleave(centers, used, config.stream.chunk_size, step)
 
     def chunks(
-        self, config: StreamConfig, order: Sequence[int] | None = None, *, frame: StreamFrame | None = None
+        self, config: StreamConfig, order: Sequence[int] | None = None, *, stream_frame: StreamFrame | None = None
     ) -> Iterator[Chunk]:
         """Yields chunks of `config.stream.chunk_size` views; a thread reads one chunk ahead.
 
@@ -272,26 +272,30 @@ class Capture:
             InputError: an image is damaged; it comes when that image's chunk is asked for.
         """
         used = _indices(self, order)
-        frame = frame or self.stream_frame(config, used)
+        stream_frame = stream_frame or self.stream_frame(config, used)
         if order is None:
-            used = self.stream_order(config, None, frame)
+            used = self.stream_order(config, None, stream_frame)
         groups = [used[k : k + config.stream.chunk_size] for k in range(0, len(used), config.stream.chunk_size)]
         with ThreadPoolExecutor(1) as reader:
-            ahead = reader.submit(self._views, groups[0], config.stream.chunk_size, frame)
+            ahead = reader.submit(self._views, groups[0], config.stream.chunk_size, stream_frame)
             for following in (*groups[1:], None):
                 arrays = ahead.result()
                 if following is not None:
-                    ahead = reader.submit(self._views, following, config.stream.chunk_size, frame)
-                yield Chunk(**jax.device_put(arrays | {"near": np.float32(frame.near), "far": np.float32(frame.far)}))
+                    ahead = reader.submit(self._views, following, config.stream.chunk_size, stream_frame)
+                yield Chunk(
+                    **jax.device_put(
+                        arrays | {"near": np.float32(stream_frame.near), "far": np.float32(stream_frame.far)}
+                    )
+                )
 
-    def _views(self, group: Sequence[int], chunk_size: int, frame: StreamFrame) -> dict[str, np.ndarray]:
+    def _views(self, group: Sequence[int], chunk_size: int, stream_frame: StreamFrame) -> dict[str, np.ndarray]:
         """Arrays of one padded chunk."""
         images = np.zeros((chunk_size, self.height, self.width, 3), np.float32)
         viewmats = np.tile(np.eye(4, dtype=np.float32), (chunk_size, 1, 1))
         Ks = np.tile(self.K(group[0]).astype(np.float32), (chunk_size, 1, 1))
         for row, i in enumerate(group):
             images[row], Ks[row] = self.image(i), self.K(i)
-        viewmats[: len(group)] = frame.viewmats(np.stack([self.frames[i].camtoworld for i in group]))
+        viewmats[: len(group)] = stream_frame.viewmats(np.stack([self.frames[i].camtoworld for i in group]))
         arrays = {"images": images, "viewmats": viewmats, "Ks": Ks, "valid": np.arange(chunk_size) < len(group)}
         if self.is_masked:
             arrays["seen"] = np.ones(images.shape[:3], bool)

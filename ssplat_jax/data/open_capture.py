@@ -31,7 +31,7 @@ from ssplat_jax.data.readers import (
 )
 from ssplat_jax.data.readers.frame_list import Listing, files_in, in_stream_order
 
-READERS = (  # the first one that matches reads the capture
+CAPTURE_READERS = (  # the first one that matches reads the capture
     transforms_json,
     colmap,
     polycam,
@@ -77,7 +77,7 @@ def open_capture(path: str | Path, *, size: tuple[int, int] | None = None) -> Ca
     path, options = split_options(str(path))
     folder = without_tilde(path)
     with reading(path[:80], "check the path"):  # name too long, no permission
-        found = next((reader for reader in READERS if reader.matches(folder)), None)
+        found = next((reader for reader in CAPTURE_READERS if reader.matches(folder)), None)
         exists = folder.exists()
     if found is None:
         raise _no_capture(path, folder, exists=exists)
@@ -99,7 +99,7 @@ def without_tilde(path: str) -> Path:
 
 def is_capture(path: Path) -> bool:
     """True if a reader takes `path`: it looks like a capture, which may still be damaged."""
-    return any(reader.matches(path) for reader in READERS)
+    return any(reader.matches(path) for reader in CAPTURE_READERS)
 
 
 def _no_capture(path: str, folder: Path, *, exists: bool) -> InputError:
@@ -116,7 +116,7 @@ def _no_capture(path: str, folder: Path, *, exists: bool) -> InputError:
         fix = f"estimate the poses first: {example} (COLMAP by pycolmap), and give the folder that it writes"
     else:
         got, fix = "none of these", f"see --help of `ssplat inspect` for their files, or try {PROCEDURAL}:room"
-    formats = ", ".join(reader.FORMAT for reader in READERS)
+    formats = ", ".join(reader.FORMAT for reader in CAPTURE_READERS)
     return refusal(path, wanted=f"a posed capture ({formats})", got=got, fix=fix)
 
 

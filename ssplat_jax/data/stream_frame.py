@@ -89,6 +89,11 @@ class StreamFrame:
         return camtoworlds
 
     @property
+    def depth_range(self) -> tuple[float, float]:
+        """`near` and `far`."""
+        return self.near, self.far
+
+    @property
     def offset(self) -> tuple[float, float, float]:
         """Point of the capture frame to which exported positions are relative.
 

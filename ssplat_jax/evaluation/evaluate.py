@@ -23,6 +23,7 @@ from ssplat_jax.evaluation.scoring import (
     check_scorable,
     exposures_to_json,
     mean_scores,
+    score_targets,
     score_view,
 )
 from ssplat_jax.poses.adjust_poses import adjust_if_asked, check_look_ahead
@@ -87,15 +88,15 @@ def evaluate(
     adjusted = adjust_if_asked(streamed, split.context, revise, reporter)
     if adjusted is not None:  # poses of the context alone
         capture, streamed = (dataclasses.replace(x, frames=adjusted.capture.frames) for x in (capture, streamed))
-    frame = streamed.stream_frame(session.model.config, split.context)
-    reporter.warn_all(*capture.notes, frame.warning)
+    stream_frame = streamed.stream_frame(session.model.config, split.context)
+    reporter.warn_all(*capture.notes, stream_frame.warning)
     reference = baselines(capture, split)
     with reporter.progress("streaming", len(split.context)) as advance:
         exposures, recent = feed_capture(
             session,
             streamed,
             split.context,
-            frame,
+            stream_frame,
             keep_order=split.keeps_order,
             num_recent=NUM_CHUNKS,
             on_chunk=advance,
@@ -110,17 +111,17 @@ def evaluate(
     }
     gaussians, refinement = session.gaussians(), {}
     if refine_steps:
-        before = [score_view(gaussians, capture, i, frame, exposures, lpips_weights).score for i in split.targets]
-        gaussians, done = _refine(gaussians, streamed, split.context, frame, exposures, refine_steps, reporter)
+        before = score_targets(gaussians, capture, split.targets, stream_frame, exposures, lpips_weights)
+        gaussians, done = _refine(gaussians, streamed, split.context, stream_frame, exposures, refine_steps, reporter)
         cost["num_gaussians"] = int((gaussians.opacities > 0).sum())
-        refinement = {"refinement": {**done, "before": mean_scores(before)}}
-    middle = capture.camera(split.targets[len(split.targets) // 2], frame)
+        refinement = {"refinement": {**done, "before": before}}
+    middle = capture.camera(split.targets[len(split.targets) // 2], stream_frame)
     cost["peak_memory_bytes"] = peak_memory(session, middle).bytes
     display = display or Display()
     scores = []
     for i in split.targets:
-        view = score_view(gaussians, capture, i, frame, exposures, lpips_weights, display)
-        save_comparison(folder.target(i), view.target, view.color, view.depth, (frame.near, frame.far))
+        view = score_view(gaussians, capture, i, stream_frame, exposures, lpips_weights, display)
+        save_comparison(folder.target(i), view.target, view.color, view.depth, stream_frame.depth_range)
         scores.append(view.score)
     timing = measure_latency(session, recent, middle)
     metrics = {
@@ -139,7 +140,7 @@ def evaluate(
         **timing,
         **cost,
         "config_hash": session.model.config.hash,
-        "stream_frame": frame.to_dict(),
+        "stream_frame": stream_frame.to_dict(),
         "baselines": reference,
         "exposures": exposures_to_json(exposures),
         "per_view": [dataclasses.asdict(s) for s in scores],
@@ -154,7 +155,7 @@ def _refine(
     gaussians: Gaussians,
     streamed: Capture,
     context: Sequence[int],
-    frame: StreamFrame,
+    stream_frame: StreamFrame,
     exposures: Exposures,
     steps: int,
     reporter: Reporter,
@@ -164,7 +165,7 @@ def _refine(
     with reporter.progress("refining", steps) as advance:
         on_step = lambda step, loss: advance(step, f"loss {loss:.4f}")  # noqa: E731
         refined, report = refine_on_capture(
-            gaussians, streamed, context, frame, exposures, steps=steps, on_step=on_step
+            gaussians, streamed, context, stream_frame, exposures, steps=steps, on_step=on_step
         )
     done = {
         "steps": report.num_steps,

@@ -128,7 +128,7 @@ def score_view(
     gaussians: Gaussians,
     capture: Capture,
     i: int,
-    frame: StreamFrame,
+    stream_frame: StreamFrame,
     exposures: Exposures,
     lpips_weights: LpipsWeights | None = None,
     display: Display | None = None,
@@ -139,7 +139,7 @@ def score_view(
         gaussians: the scene, in the stream frame.
         capture: the capture with the target image.
         i: the frame to score.
-        frame: the similarity between the capture's frame and the stream's.
+        stream_frame: the similarity between the capture's frame and the stream's.
         exposures: exposures of the streamed frames; may be empty.
         lpips_weights: with them LPIPS is scored too.
         display: how the picture is made; the scores do not depend on it.
@@ -147,7 +147,7 @@ def score_view(
     Raises:
         InputError: the image is damaged.
     """
-    camera = capture.camera(i, frame)
+    camera = capture.camera(i, stream_frame)
     out = render(gaussians, camera, effects=effects_for(gaussians, camera))
     exposure = exposure_for(capture, i, exposures)
     filled = np.asarray(_filled(out, gaussians))
@@ -216,12 +216,14 @@ def score_targets(
     gaussians: Gaussians,
     capture: Capture,
     targets: tuple[int, ...],
-    frame: StreamFrame,
+    stream_frame: StreamFrame,
     exposures: Exposures,
     lpips_weights: LpipsWeights | None = None,
 ) -> dict[str, Any]:
     """`mean_scores` of the frames `targets`, scored by `score_view`."""
-    return mean_scores([score_view(gaussians, capture, i, frame, exposures, lpips_weights).score for i in targets])
+    return mean_scores(
+        [score_view(gaussians, capture, i, stream_frame, exposures, lpips_weights).score for i in targets]
+    )
 
 
 def baselines(capture: Capture, split: Split) -> dict[str, float]:

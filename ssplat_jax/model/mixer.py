@@ -41,7 +41,7 @@ class NeighborBlock(nn.Module):
         return x + Mlp(name="mlp")(layer_norm("norm2")(x))
 
 
-class JointAttention(nn.Module):
+class TokenAttention(nn.Module):
     """Self-attention of all tokens."""
 
     @nn.compact
@@ -56,7 +56,7 @@ class JointBlock(nn.Module):
 
     @nn.compact
     def __call__(self, x, allowed):
-        x = x + JointAttention(name="attn")(layer_norm("norm1")(x), allowed)
+        x = x + TokenAttention(name="attn")(layer_norm("norm1")(x), allowed)
         return x + Mlp(name="mlp")(layer_norm("norm2")(x))
 
 

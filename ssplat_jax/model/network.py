@@ -20,7 +20,7 @@ from ssplat_jax.model.cgfi import Aggregator, num_hints
 from ssplat_jax.model.compact import CompactNetwork
 from ssplat_jax.model.decoder import EvidenceHead, num_features
 from ssplat_jax.model.hpda import AnchorStrength
-from ssplat_jax.model.resplat import ResplatNetwork
+from ssplat_jax.model.resplat import ReSplatNetwork
 from ssplat_jax.model.views import GRID_STRIDE, AnchoredDepth, DepthDistribution, TokenShapes, Views
 from ssplat_jax.network_configs import NETWORK_CONFIGS
 
@@ -126,7 +126,7 @@ class Network(Protocol):
         ...
 
 
-NETWORKS: dict[str, Network] = {"compact": CompactNetwork(), "resplat": ResplatNetwork()}
+NETWORKS: dict[str, Network] = {"compact": CompactNetwork(), "resplat": ReSplatNetwork()}
 """Networks by kind."""
 
 

@@ -30,7 +30,7 @@ from ssplat_jax.model.views import GRID_STRIDE
 from ssplat_jax.rasterizer.render import round_up
 from ssplat_jax.refinement.compared_views import errors_of_view, golden_fractions
 from ssplat_jax.refinement.refine_step import units
-from ssplat_jax.streaming.session import Revise
+from ssplat_jax.streaming.session import RefineChunk
 
 GAINS = {"means": 12.0, "quats": 0.2, "log_scales": 6.0, "logit_opacities": 6.0, "sh": 0.12}
 """Step of each part in `units` over its mean gradient in the pixels that a Gaussian fills. Newton's method would divide
@@ -45,8 +45,8 @@ LISTED_PER_CELL = 64  # most pivots of a view that are compared, over its grid c
 PAIRS_PER_GAUSSIAN = 3  # capacity for tile intersections; the farthest Gaussians of a view are left out beyond it
 
 
-def online_refinement(model: StreamSplat) -> Revise | None:
-    """The `revise` of a `Session` with this model; None if its configuration asks for no refinement."""
+def online_refinement(model: StreamSplat) -> RefineChunk | None:
+    """The `refine` of a `Session` with this model; None if its configuration asks for no refinement."""
     return functools.partial(refine_scene, model) if model.config.stream.steps_per_chunk else None
 
 

@@ -128,7 +128,7 @@ def refine_on_capture(
     gaussians: Gaussians,
     capture: Capture,
     indices: Sequence[int],
-    frame: StreamFrame,
+    stream_frame: StreamFrame,
     exposures: Exposures,
     *,
     steps: int,
@@ -139,7 +139,7 @@ def refine_on_capture(
 
     Arguments are those of `key_views_of` and `refine`, with a configuration for captures.
     """
-    return _refined(gaussians, key_views_of(capture, indices, frame, exposures), steps, config, on_step)
+    return _refined(gaussians, key_views_of(capture, indices, stream_frame, exposures), steps, config, on_step)
 
 
 def _refined(
@@ -258,18 +258,18 @@ def row_capacity(state: RefineState, key_views: KeyViews, steps: int, config: Re
     return min(gaussians.num_gaussians, round_rows(int(ROWS_MARGIN * int(most))))
 
 
-def key_views_of(capture: Capture, indices: Sequence[int], frame: StreamFrame, exposures: Exposures) -> KeyViews:
+def key_views_of(capture: Capture, indices: Sequence[int], stream_frame: StreamFrame, exposures: Exposures) -> KeyViews:
     """At most `MAX_KEY_VIEWS` of the streamed frames, evenly spread, with their cameras in the stream frame.
 
     Args:
         capture: where the images come from, at the size that is compared.
         indices: frame numbers that were streamed.
-        frame: the similarity between the capture's frame and the stream's.
+        stream_frame: the similarity between the capture's frame and the stream's.
         exposures: factor per streamed frame, as the stream estimated it.
     """
     places = np.linspace(0, len(indices) - 1, min(len(indices), MAX_KEY_VIEWS))
     used = [indices[i] for i in sorted({round(place) for place in places})]
-    cameras = jax.tree.map(lambda *x: jnp.stack(x), *(capture.camera(i, frame) for i in used))
+    cameras = jax.tree.map(lambda *x: jnp.stack(x), *(capture.camera(i, stream_frame) for i in used))
     # Frame by frame: as floats, all images would take four times the memory of the key views.
     images = [np.round(np.clip(capture.image(i), 0, 1) * np.float32(255)).astype(np.uint8) for i in used]
     factors = jnp.asarray(np.stack([exposures[i] for i in used]), jnp.float32)

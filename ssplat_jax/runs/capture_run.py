@@ -19,7 +19,7 @@ from ssplat_jax.data.readers.transforms_json import num_listed
 from ssplat_jax.evaluation.scoring import score_targets
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.poses.adjust_poses import check_look_ahead
-from ssplat_jax.runs.open_run import Run, open_run
+from ssplat_jax.runs.open_run import OpenRun, open_run
 from ssplat_jax.runs.run_results import finish_run, finished_scene
 from ssplat_jax.storage.chunk_records import ChunkRecord, RecordedView, make_thumbnail, save_chunk_record, save_delta
 from ssplat_jax.storage.interrupts import Interrupts
@@ -113,7 +113,9 @@ def run_capture(
         return RunResult(run.num_views, finish_run(run, path, reporter).num_written)
 
 
-def _stream(run: Run, source: "WholeCapture | GrowingCapture", options: RunOptions, reporter: Reporter) -> int | None:
+def _stream(
+    run: OpenRun, source: "WholeCapture | GrowingCapture", options: RunOptions, reporter: Reporter
+) -> int | None:
     """Streams the views that the run has not had yet; returns the signal that stopped it, if one did."""
     deltas = DeltaWriter(run, is_wanted=options.deltas)
     with Interrupts(has_work=False) as interrupts, reporter.progress("streaming", source.total) as advance:
@@ -155,10 +157,10 @@ class WholeCapture:
         self.indices, self.held_back = hold_back(taken, options.num_held_back)
         self.total: int | None = len(self.indices)
 
-    def chunks(self, run: Run, interrupts: Interrupts) -> Iterator[FedChunk]:
+    def chunks(self, run: OpenRun, interrupts: Interrupts) -> Iterator[FedChunk]:
         """Feeds the run the chunks that it has not had yet."""
-        order = run.capture.stream_order(run.session.model.config, run.indices, run.frame)
-        yield from feed_chunks(run.session, run.capture, order[run.num_views :], run.frame)
+        order = run.capture.stream_order(run.session.model.config, run.indices, run.stream_frame)
+        yield from feed_chunks(run.session, run.capture, order[run.num_views :], run.stream_frame)
 
 
 class GrowingCapture:
@@ -210,14 +212,14 @@ class GrowingCapture:
         check_num_frames(len(self.indices) if self.capture else 0, str(self._path))
         return None
 
-    def chunks(self, run: Run, interrupts: Interrupts) -> Iterator[FedChunk]:
+    def chunks(self, run: OpenRun, interrupts: Interrupts) -> Iterator[FedChunk]:
         """Feeds the run chunks as they become complete, until nothing more will come or a signal does."""
         size = run.session.model.config.stream.chunk_size
         while not interrupts.received:
             num_waiting = len(self.indices) - run.num_views
             if num_waiting >= size or (self.has_ended and num_waiting > 0):
                 run.capture, run.indices = self.capture, self.indices[: run.num_views + size]
-                yield from feed_chunks(run.session, run.capture, run.indices[run.num_views :], run.frame)
+                yield from feed_chunks(run.session, run.capture, run.indices[run.num_views :], run.stream_frame)
             elif self.has_ended:
                 break
             else:
@@ -265,7 +267,7 @@ class DeltaWriter:
     the whole scene, and a chunk without a delta removes those before it.
     """
 
-    def __init__(self, run: Run, *, is_wanted: bool) -> None:
+    def __init__(self, run: OpenRun, *, is_wanted: bool) -> None:
         if run.num_views == 0:
             run.folder.clear_deltas()  # left by a run that stopped before its first save
         is_complete = run.num_views == 0 or run.folder.delta(run.num_views).exists()
@@ -284,11 +286,11 @@ class DeltaWriter:
             return
         assert run.session.cache is not None  # a chunk has been fed
         exposure = middle_exposure(run.exposures).tolist()
-        header = {"frame": run.frame.to_dict(), "views": run.num_views, "exposure": exposure}
+        header = {"frame": run.stream_frame.to_dict(), "views": run.num_views, "exposure": exposure}
         save_delta(run.folder.delta(run.num_views), self._feed.update(run.session.cache), header)
 
 
-def record_chunk(run: Run, fed: FedChunk, held_back: Sequence[int]) -> None:
+def record_chunk(run: OpenRun, fed: FedChunk, held_back: Sequence[int]) -> None:
     """Writes the record of a chunk that the run has just taken in, for the viewer and the report.
 
     Every few chunks, and after the last, it has the mean PSNR of the frames `held_back`.
@@ -297,7 +299,7 @@ def record_chunk(run: Run, fed: FedChunk, held_back: Sequence[int]) -> None:
     number = -(-run.num_views // run.session.model.config.stream.chunk_size) - 1  # of the chunk, from 0
     psnr = None
     if held_back and (run.num_views == len(run.indices) or number % CHUNKS_PER_SCORE == 0):
-        scores = score_targets(run.session.gaussians(), capture, tuple(held_back), run.frame, run.exposures)
+        scores = score_targets(run.session.gaussians(), capture, tuple(held_back), run.stream_frame, run.exposures)
         psnr = scores["shown"]["psnr"]
     views = []
     for i, image in zip(fed.frames, np.asarray(fed.chunk.images), strict=False):  # without the padding

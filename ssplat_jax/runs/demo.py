@@ -13,7 +13,7 @@ from ssplat_jax.data.split import interleaved_split
 from ssplat_jax.evaluation.pictures import save_comparison, save_image
 from ssplat_jax.evaluation.scoring import ScoredView, mean_scores, score_view
 from ssplat_jax.model.streamsplat import StreamSplat
-from ssplat_jax.runs.export_run import save_scene
+from ssplat_jax.runs.run_results import save_scene
 from ssplat_jax.storage.files import write_json
 from ssplat_jax.storage.run_folder import RunFolder, make_writable
 from ssplat_jax.storage.weights import load_params
@@ -46,22 +46,23 @@ def run_demo(scene: str, out: Path, reporter: Reporter) -> dict:
     model, params = StreamSplat(preset("tiny")), load_params("tiny")
     capture = open_capture(f"procedural:{scene}")  # 64 context views and the 9 interleaved targets between them
     split = interleaved_split(len(capture), stride=1, context=STAGES[-1])
-    frame = capture.stream_frame(model.config, split.context)
+    stream_frame = capture.stream_frame(model.config, split.context)
+    order = capture.stream_order(model.config, split.context, stream_frame)
     session = Session(model, params)
     exposures: Exposures = {}
     rows, strip, views = [], [], []
     with reporter.progress("streaming", STAGES[-1]) as advance:
-        for fed in feed_chunks(session, capture, capture.stream_order(model.config, split.context, frame), frame):
+        for fed in feed_chunks(session, capture, order, stream_frame):
             exposures |= fed.exposures
             advance(len(exposures))
             if len(exposures) in STAGES:
                 gaussians = session.gaussians()
-                views = [score_view(gaussians, capture, i, frame, exposures) for i in split.targets]
+                views = [score_view(gaussians, capture, i, stream_frame, exposures) for i in split.targets]
                 rows.append(_table_row(views, len(exposures), session))
                 strip.append(views[len(views) // 2].color)
-    save_scene(folder.scene, session.gaussians(), frame, exposures)
+    save_scene(folder.scene, session.gaussians(), stream_frame, exposures)
     for view in views:  # of the finished scene
-        save_comparison(folder.target(view.score.frame), view.target, view.color, view.depth, (frame.near, frame.far))
+        save_comparison(folder.target(view.score.frame), view.target, view.color, view.depth, stream_frame.depth_range)
     strip.append(views[len(views) // 2].target)
     save_image(out / "views_4_8_16_32_64_target.png", np.concatenate(strip, axis=1))
     metrics = {
@@ -72,7 +73,7 @@ def run_demo(scene: str, out: Path, reporter: Reporter) -> dict:
         "compile_s": round(session.compile_seconds, 2),
         "seconds": round(time.perf_counter() - since, 1),
         "config_hash": model.config.hash,
-        "stream_frame": frame.to_dict(),
+        "stream_frame": stream_frame.to_dict(),
     }
     write_json(folder.metrics, metrics)
     header = ("views", "shown dB", "SSIM", "literal dB", "SSIM", "covered", "Gaussians")

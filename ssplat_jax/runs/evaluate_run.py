@@ -71,7 +71,7 @@ def evaluate_run(
     def evaluated(capture: Capture, split: Split, out: Path, scene: str | None = None) -> dict[str, Any]:
         """The metrics of one capture, in a session of its own; writes its report, too."""
         metrics = evaluate(
-            Session(model, params, revise=online_refinement(model)),
+            Session(model, params, refine=online_refinement(model)),
             capture,
             split,
             out,

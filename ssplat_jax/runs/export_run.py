@@ -16,8 +16,7 @@ from ssplat_jax.core.atomic import write_atomic
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.console import Reporter
 from ssplat_jax.core.errors import InputError, refusal
-from ssplat_jax.core.gaussians import Gaussians, mean_color, scale_colors
-from ssplat_jax.core.kept_programs import Kept
+from ssplat_jax.core.gaussians import Gaussians, mean_color
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.data.camera_path import upward
 from ssplat_jax.data.capture import Capture
@@ -28,40 +27,15 @@ from ssplat_jax.evaluation.psnr_ssim import psnr
 from ssplat_jax.rasterizer import Effects, fill_holes, render
 from ssplat_jax.runs.open_run import load_run
 from ssplat_jax.runs.run_poses import open_capture_of_scene
-from ssplat_jax.scene_files.formats import READERS, ExportReport, file_axes, load_scene, save_gaussians
+from ssplat_jax.runs.run_results import scene_to_show
+from ssplat_jax.scene_files.formats import SCENE_READERS, ExportReport, file_axes, load_scene, save_gaussians
 from ssplat_jax.storage.chunk_records import load_chunk_records
 from ssplat_jax.storage.run_folder import RunFolder
-from ssplat_jax.streaming.feed import Exposures, middle_exposure
-
-_jitted_scale_colors = Kept(scale_colors)
+from ssplat_jax.streaming.feed import middle_exposure
 
 TITLE = "# Cameras of a scene, written by ssplat export"
-FILES = ("cameras.txt", "images.txt", "points3D.txt")
+COLMAP_FILES = ("cameras.txt", "images.txt", "points3D.txt")
 NUM_COMPARED, HOLE = 3, 0.5  # views that are compared, and the opacity of a pixel below which it is a hole
-
-
-def scene_to_show(gaussians: Gaussians, frame: StreamFrame, exposures: Exposures) -> Gaussians:
-    """Gaussians of the stream as a person gets them: in the capture's frame, at the middle exposure of the stream.
-
-    The cache keeps the exposure of the first views, which may lie in the shade: at the median of all, no scene is too
-    dark to look at.
-
-    Args:
-        gaussians: the scene, in the stream frame, at the exposure of the first views.
-        frame: the similarity between both frames; positions of the result are relative to its offset.
-        exposures: exposures of the streamed frames.
-    """
-    scaled = _jitted_scale_colors(gaussians, middle_exposure(exposures).astype(np.float32))
-    return frame.gaussians_to_capture(scaled, offset=frame.offset)
-
-
-def save_scene(path: Path, gaussians: Gaussians, frame: StreamFrame, exposures: Exposures) -> ExportReport:
-    """Writes Gaussians of the stream as a person gets them (`scene_to_show`); the path's suffix names the format.
-
-    Raises:
-        StorageError: the file cannot be written.
-    """
-    return save_gaussians(path, scene_to_show(gaussians, frame, exposures), offset=frame.offset)
 
 
 def decoded_scene(run_dir: Path, params: dict, reporter: Reporter) -> Gaussians:
@@ -80,13 +54,13 @@ def decoded_scene(run_dir: Path, params: dict, reporter: Reporter) -> Gaussians:
     session = run.session(params)
     num_shown = int(session.cache_facts()["decoded"])
     # The rows after these are padding, of which a person need not be told.
-    scene = scene_to_show(session.gaussians(), run.frame, run.exposures)
+    scene = scene_to_show(session.gaussians(), run.stream_frame, run.exposures)
     scene = jax.tree.map(lambda x: jax.device_put(np.asarray(x)[:num_shown]), scene)
-    return replace(scene, offset=run.frame.offset)
+    return replace(scene, offset=run.stream_frame.offset)
 
 
 @dataclasses.dataclass(frozen=True)
-class Views:
+class KnownCameras:
     """Cameras of a scene, as a run streamed them or as a capture holds them."""
 
     camtoworlds: Float64[np.ndarray, "n 4 4"]  # the capture's frame
@@ -95,7 +69,7 @@ class Views:
     exposures: Float64[np.ndarray, "n 3"]  # RGB, relative to the middle one, which the scene has
 
 
-def views_of(scene: Path, cameras: "Cameras | None") -> Views | None:
+def views_of(scene: Path, cameras: "Cameras | None") -> KnownCameras | None:
     """The cameras that are known of a scene: those that its run recorded, or those of a capture."""
     records = load_chunk_records(RunFolder(scene).chunk_record_files()) if scene.is_dir() else []
     if records:
@@ -103,16 +77,16 @@ def views_of(scene: Path, cameras: "Cameras | None") -> Views | None:
         exposures = np.stack([view.exposure for view in views])
         middle = middle_exposure(dict(enumerate(exposures.astype(np.float32))))
         poses, Ks = (np.stack([getattr(view, name) for view in views]) for name in ("camtoworld", "K"))
-        return Views(poses, Ks, records[0].size, exposures / middle)
+        return KnownCameras(poses, Ks, records[0].size, exposures / middle)
     if cameras is None:
         return None
     capture, indices = cameras
     poses = np.stack([capture.frames[i].camtoworld for i in indices])
     size = (capture.width, capture.height)
-    return Views(poses, np.stack([capture.K(i) for i in indices]), size, np.ones((len(poses), 3)))
+    return KnownCameras(poses, np.stack([capture.K(i) for i in indices]), size, np.ones((len(poses), 3)))
 
 
-def turn_up(views: Views | None, up: str, to: Path) -> Float64[np.ndarray, "3 3"]:
+def turn_up(views: KnownCameras | None, up: str, to: Path) -> Float64[np.ndarray, "3 3"]:
     """The rotation after which the up direction of cameras held level is an axis of the file, +y or +z.
 
     Raises:
@@ -132,12 +106,12 @@ def turn_up(views: Views | None, up: str, to: Path) -> Float64[np.ndarray, "3 3"
 
 def turned(gaussians: Gaussians, turn: Float64[np.ndarray, "3 3"]) -> Gaussians:
     """A scene after a rotation about the origin of its capture."""
-    frame = StreamFrame(turn, np.zeros(3), scale=1.0, near=0.0, far=math.inf)
+    stream_frame = StreamFrame(turn, np.zeros(3), scale=1.0, near=0.0, far=math.inf)
     x, y, z = (turn @ gaussians.offset).tolist()
-    return replace(frame.gaussians_to_capture(gaussians), offset=(x, y, z))
+    return replace(stream_frame.gaussians_to_capture(gaussians), offset=(x, y, z))
 
 
-def start_camera(views: Views, gaussians: Gaussians, turn: Float64[np.ndarray, "3 3"]) -> dict[str, Any]:
+def start_camera(views: KnownCameras, gaussians: Gaussians, turn: Float64[np.ndarray, "3 3"]) -> dict[str, Any]:
     """The middle camera, for viewers that can start there: position, target and vertical angle of view, degrees."""
     k = len(views.camtoworlds) // 2
     pose, height = views.camtoworlds[k], views.size[1]
@@ -150,7 +124,7 @@ def start_camera(views: Views, gaussians: Gaussians, turn: Float64[np.ndarray, "
 
 
 def export_scene(
-    scene: Gaussians, to: Path, views: Views | None, up: str | None = None, **options: Any
+    scene: Gaussians, to: Path, views: KnownCameras | None, up: str | None = None, **options: Any
 ) -> tuple[ExportReport, Float64[np.ndarray, "3 3"]]:
     """Writes a scene with what is known of its cameras, and gives the rotation by which it was turned.
 
@@ -171,13 +145,13 @@ def export_scene(
     return save_gaussians(to, shown, start_camera=start, **options), turn
 
 
-def difference_in_words(to: Path, views: Views, turn: Float64[np.ndarray, "3 3"]) -> str | None:
+def difference_in_words(to: Path, views: KnownCameras, turn: Float64[np.ndarray, "3 3"]) -> str | None:
     """A sentence on how a plain renderer's pictures of the file differ from ours, on `NUM_COMPARED` of the views.
 
     A plain renderer has the dilation of 3DGS, shows holes black, and one exposure. We draw with the filter that the
     file names, fill holes, and follow the exposures of the views. None for formats that are not read.
     """
-    if to.suffix not in READERS:
+    if to.suffix not in SCENE_READERS:
         return None
     written, scores, holes = load_scene(to), [], []
     scene = replace(written, offset=(0.0, 0.0, 0.0))
@@ -213,7 +187,7 @@ def open_cameras(path: str, scene: Path, to: Path, reporter: Reporter) -> Camera
         InputError: the capture is unusable or not that of the run, or files of other makers are in the way.
         StorageError: the run's state or its adjusted poses are corrupt.
     """
-    for name in FILES:
+    for name in COLMAP_FILES:
         held = to.parent / name
         if held.exists() and not held.read_bytes().startswith(TITLE.encode("ascii")):
             raise InputError(f"{held}: wanted a place for the cameras, a file is in the way; choose another folder.")
@@ -258,6 +232,6 @@ def save_cameras(
         ["# id, qw, qx, qy, qz, tx, ty, tz, camera, name; then a line of points", *lines],
         ["# no points"],
     )
-    for name, content in zip(FILES, contents, strict=True):
+    for name, content in zip(COLMAP_FILES, contents, strict=True):
         # Names on Linux are bytes; Python keeps those that are no UTF-8 as surrogates.
         write_atomic(folder / name, "\n".join([TITLE, *content, ""]).encode(errors="surrogateescape"))

@@ -34,7 +34,7 @@ from ssplat_jax.streaming.session import Session
 
 
 @dataclasses.dataclass
-class Run:
+class OpenRun:
     """A stream in progress, and the folder that it is saved in."""
 
     folder: RunFolder
@@ -42,7 +42,7 @@ class Run:
     capture: Capture  # as it is streamed: with adjusted poses, if any
     indices: list[int]  # frames to stream, ascending; a watched run adds those that have become complete
     weights: str  # digest of the parameters
-    frame: StreamFrame = dataclasses.field(init=False)  # of the next chunk
+    stream_frame: StreamFrame = dataclasses.field(init=False)  # of the next chunk
     exposures: Exposures = dataclasses.field(default_factory=dict)  # of the views streamed so far
     images: dict[str, str] = dataclasses.field(default_factory=dict)  # digest of the file of each of them
     num_saved: int = 0  # views in the saved state
@@ -56,7 +56,7 @@ class Run:
         """Adds a chunk that the session has processed."""
         self.exposures |= fed.exposures
         self.images |= _image_digests(self.capture, fed.frames)
-        self.frame = fed.frame
+        self.stream_frame = fed.stream_frame
 
     def identity(self) -> dict[str, Any]:
         """The facts, besides the images, that must be equal for the run to be continued."""
@@ -79,7 +79,7 @@ class Run:
             return
         assert self.session.cache is not None  # views have been streamed
         state = {
-            "frame": self.frame.to_dict(),
+            "frame": self.stream_frame.to_dict(),
             "done": self.num_views,
             "exposures": exposures_to_json(self.exposures),
             "images": self.images,  # of streamed views alone: a damaged image further on may still be replaced
@@ -105,7 +105,7 @@ class Run:
         if damage is not None:
             reporter.warn(f"{damage} Continuing from the state saved before it, after {header['done']} views.")
             restore_previous(self.folder.state)
-        self.session.cache, self.frame = cache, StreamFrame.from_dict(header["frame"])
+        self.session.cache, self.stream_frame = cache, StreamFrame.from_dict(header["frame"])
         self.exposures, self.images = exposures_from_json(header["exposures"]), header["images"]
         self.num_saved = header["done"]
 
@@ -121,7 +121,7 @@ def open_run(
     revise: str | None = None,
     overwrite: bool = False,
     reporter: Reporter,
-) -> Iterator[Run]:
+) -> Iterator[OpenRun]:
     """The run that the folder `out` holds, or a new one; the folder is locked until the end.
 
     Args:
@@ -145,19 +145,19 @@ def open_run(
         if overwrite:
             folder.clear_run()
         capture = capture_to_stream(capture, indices, revise, folder, reporter)
-        session = Session(model, params, revise=online_refinement(model))
-        run = Run(folder, session, capture, list(indices), params_digest(params))
+        session = Session(model, params, refine=online_refinement(model))
+        run = OpenRun(folder, session, capture, list(indices), params_digest(params))
         if folder.has_state():
             run.resume(reporter)
         else:
-            run.frame = capture.stream_frame(model.config, indices)
+            run.stream_frame = capture.stream_frame(model.config, indices)
             folder.metrics.unlink(missing_ok=True)  # of another run whose state was removed
             folder.clear_refinement()
         # Left by a process that was killed after its last save: these chunks may bring other views.
         for path in (*folder.delta_files(), *folder.chunk_record_files()):
             if int(path.stem) > run.num_views:
                 path.unlink(missing_ok=True)
-        reporter.warn_all(*capture.notes, run.frame.warning)
+        reporter.warn_all(*capture.notes, run.stream_frame.warning)
         yield run
 
 
@@ -199,7 +199,7 @@ class SavedRun:
     header: dict[str, Any]
 
     @property
-    def frame(self) -> StreamFrame:
+    def stream_frame(self) -> StreamFrame:
         """The similarity between the capture's frame and the stream's."""
         return StreamFrame.from_dict(self.header["frame"])
 

@@ -14,9 +14,8 @@ from ssplat_jax.core.errors import InputError, refusal, require_positive
 from ssplat_jax.evaluation.scoring import mean_scores, score_targets
 from ssplat_jax.refinement.compared_views import FOR_CAPTURES
 from ssplat_jax.refinement.refine import Progress, continue_refinement, key_views_of, report_of, start_refinement
-from ssplat_jax.runs.export_run import save_scene
 from ssplat_jax.runs.open_run import load_run
-from ssplat_jax.runs.run_results import picture_views, report_run, shown_frames
+from ssplat_jax.runs.run_results import picture_views, report_run, save_scene, shown_frames
 from ssplat_jax.storage.files import load_arrays, save_arrays, write_json
 from ssplat_jax.storage.interrupts import Interrupts
 from ssplat_jax.storage.run_folder import RunFolder, lock_folder
@@ -68,7 +67,7 @@ def refine_run(
     require_positive(steps=steps, save_every=save_every)
     run, folder, config = load_run(run_dir, reporter), RunFolder(run_dir), FOR_CAPTURES
     gaussians, indices = run.session(params).gaussians(), run.header["frames"]
-    frame, exposures = run.frame, run.exposures
+    stream_frame, exposures = run.stream_frame, run.exposures
     if len(exposures) < len(indices):
         got, fix = f"one after {len(exposures)} of {len(indices)} views", "finish it with `ssplat run`"
         raise refusal(str(run_dir), wanted="a finished run", got=got, fix=fix)
@@ -78,7 +77,7 @@ def refine_run(
     with lock_folder(run_dir):
         if overwrite:
             folder.clear_refinement()
-        given = key_views_of(capture, indices, frame, exposures)
+        given = key_views_of(capture, indices, stream_frame, exposures)
         progress, key_views = start_refinement(gaussians, given, config)
         if folder.refinement_state.exists():
             load_refinement(folder.refinement_state, progress, identity)
@@ -92,12 +91,12 @@ def refine_run(
                     save_refinement(folder.refinement_state, progress, identity)
             save_refinement(folder.refinement_state, progress, identity)
             refined = progress.scene(gaussians)
-            save_scene(folder.refined_scene, refined, frame, exposures)  # at the exposure of scene.ply
+            save_scene(folder.refined_scene, refined, stream_frame, exposures)  # at the exposure of scene.ply
             if interrupts.received:  # read last: a signal may have come during the save, too
                 return RefineResult(progress.num_steps, {}, {}, interrupts.received)
         report = report_of(progress, key_views, config)
-        before = score_targets(gaussians, capture, tuple(shown_frames(indices)), frame, exposures)
-        scores = picture_views(folder, refined, capture, indices, frame, exposures)
+        before = score_targets(gaussians, capture, tuple(shown_frames(indices)), stream_frame, exposures)
+        scores = picture_views(folder, refined, capture, indices, stream_frame, exposures)
         after = mean_scores(scores)
         write_json(folder.refinement, vars(report) | {"seen_views_before": before, "seen_views_after": after})
         if folder.metrics.is_file():  # else there is no report to bring up to date

@@ -132,10 +132,8 @@ def _render_picture(
 
     `background` is the color of holes that have no colors around them; None shows all holes black.
     """
-    frame = StreamFrame.at_point(splats.offset)
-    camera = Camera(
-        viewmats=jnp.asarray(frame.viewmats(camtoworld)), Ks=jnp.asarray(K, jnp.float32), width=size[0], height=size[1]
-    )
+    viewmat = StreamFrame.at_point(splats.offset).viewmats(camtoworld)
+    camera = Camera(jnp.asarray(viewmat), jnp.asarray(K, jnp.float32), width=size[0], height=size[1])
     scene = replace(splats, offset=(0.0, 0.0, 0.0))  # the camera is relative to it already
     out = render(scene, camera, effects=effects_for(scene, camera))
     color = out.color if background is None else _jitted_fill_holes(out.color, out.alpha, background)

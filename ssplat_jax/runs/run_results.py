@@ -10,21 +10,23 @@ from typing import Any
 import numpy as np
 
 from ssplat_jax.core.console import Reporter
-from ssplat_jax.core.gaussians import Gaussians
+from ssplat_jax.core.gaussians import Gaussians, scale_colors
+from ssplat_jax.core.kept_programs import Kept
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.evaluation.cost import peak_memory
 from ssplat_jax.evaluation.pictures import evenly_spread, save_comparison
 from ssplat_jax.evaluation.report_page import Report, save_report
 from ssplat_jax.evaluation.scoring import ViewScore, exposures_to_json, score_view
-from ssplat_jax.runs.export_run import save_scene
-from ssplat_jax.runs.open_run import Run
-from ssplat_jax.scene_files.formats import ExportReport
+from ssplat_jax.runs.open_run import OpenRun
+from ssplat_jax.scene_files.formats import ExportReport, save_gaussians
 from ssplat_jax.storage.chunk_records import ChunkRecord, load_chunk_records
 from ssplat_jax.storage.files import write_json
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.storage.weights import load_params, params_digest
 from ssplat_jax.streaming.feed import Exposures, middle_exposure
+
+_jitted_scale_colors = Kept(scale_colors)
 
 NUM_PICTURES = 8
 """Streamed views, evenly spread, that are rendered from the finished scene."""
@@ -35,7 +37,7 @@ MOST_PICTURES, MOST_CHUNKS = 12, 10
 NOTE = "Left to right: the photograph, the rendered view, its depth (light near, dark far)."
 SHOWN = "holes filled, at the exposure of the nearest streamed views"
 
-FILES = (
+DESCRIBED_FILES = (
     ("scene.ply", "the streamed scene, in the frame and units of the capture, at the middle exposure of its views"),
     ("refined.ply", "the refined scene, in the same frame"),
     ("metrics.json", "every figure of this page, and more"),
@@ -48,7 +50,31 @@ FILES = (
 )
 
 
-def finish_run(run: Run, path: str, reporter: Reporter) -> ExportReport:
+def scene_to_show(gaussians: Gaussians, stream_frame: StreamFrame, exposures: Exposures) -> Gaussians:
+    """Gaussians of the stream as a person gets them: in the capture's frame, at the middle exposure of the stream.
+
+    The cache keeps the exposure of the first views, which may lie in the shade: at the median of all, no scene is too
+    dark to look at.
+
+    Args:
+        gaussians: the scene, in the stream frame, at the exposure of the first views.
+        stream_frame: the similarity between both frames; positions of the result are relative to its offset.
+        exposures: exposures of the streamed frames.
+    """
+    scaled = _jitted_scale_colors(gaussians, middle_exposure(exposures).astype(np.float32))
+    return stream_frame.gaussians_to_capture(scaled, offset=stream_frame.offset)
+
+
+def save_scene(path: Path, gaussians: Gaussians, stream_frame: StreamFrame, exposures: Exposures) -> ExportReport:
+    """Writes Gaussians of the stream as a person gets them (`scene_to_show`); the path's suffix names the format.
+
+    Raises:
+        StorageError: the file cannot be written.
+    """
+    return save_gaussians(path, scene_to_show(gaussians, stream_frame, exposures), offset=stream_frame.offset)
+
+
+def finish_run(run: OpenRun, path: str, reporter: Reporter) -> ExportReport:
     """Writes the scene of a finished stream, pictures of some streamed views, the report, and the metrics.
 
     Returns what was written to the scene file; `path` is the capture, as the user gave it.
@@ -56,16 +82,16 @@ def finish_run(run: Run, path: str, reporter: Reporter) -> ExportReport:
     Raises:
         StorageError: a file cannot be written.
     """
-    folder, frame, capture = run.folder, run.frame, run.capture
+    folder, stream_frame, capture = run.folder, run.stream_frame, run.capture
     folder.metrics.unlink(missing_ok=True)  # see `finished_scene`
     gaussians = run.session.gaussians()
-    report = save_scene(folder.scene, gaussians, frame, run.exposures)
+    report = save_scene(folder.scene, gaussians, stream_frame, run.exposures)
     if report.warning is not None:
         reporter.warn(f"{folder.scene.name}: {report.warning}")
     reporter.say(f"{folder.scene} is written; pictures and figures follow")
     folder.clear_views()
-    scores = picture_views(folder, gaussians, capture, run.indices, frame, run.exposures)
-    middle = capture.camera(run.indices[len(run.indices) // 2], frame)
+    scores = picture_views(folder, gaussians, capture, run.indices, stream_frame, run.exposures)
+    middle = capture.camera(run.indices[len(run.indices) // 2], stream_frame)
     metrics = {
         "capture": capture.name,
         "size": [capture.width, capture.height],
@@ -78,7 +104,7 @@ def finish_run(run: Run, path: str, reporter: Reporter) -> ExportReport:
         "step_memory_bytes": run.session.step_memory_bytes,  # None if all views were streamed before this call
         "peak_memory_bytes": peak_memory(run.session, middle).bytes,
         "cache": run.session.cache_facts(),
-        "stream_frame": frame.to_dict(),
+        "stream_frame": stream_frame.to_dict(),
         "config_hash": run.session.model.config.hash,
     }
     report_run(folder, metrics, path, run.weights)
@@ -96,7 +122,7 @@ def picture_views(
     gaussians: Gaussians,
     capture: Capture,
     indices: Sequence[int],
-    frame: StreamFrame,
+    stream_frame: StreamFrame,
     exposures: Exposures,
 ) -> list[ViewScore]:
     """Scores of a few of the streamed frames, with a picture of each in `views/`: photograph, scene and depth.
@@ -106,8 +132,8 @@ def picture_views(
     """
     scores = []
     for i in shown_frames(indices):
-        view = score_view(gaussians, capture, i, frame, exposures)
-        save_comparison(folder.view(i), view.target, view.color, view.depth, (frame.near, frame.far))
+        view = score_view(gaussians, capture, i, stream_frame, exposures)
+        save_comparison(folder.view(i), view.target, view.color, view.depth, stream_frame.depth_range)
         scores.append(view.score)
     return scores
 
@@ -206,7 +232,7 @@ def _save(folder: RunFolder, metrics: dict[str, Any], pictures: list[tuple[Path,
         title=metrics["capture"],
         pictures=[pictures[k] for k in evenly_spread(len(pictures), MOST_PICTURES)],
         # A run writes its metrics after the report: with them, everything is there.
-        files=[(name, text) for name, text in FILES if name == folder.metrics.name or (folder.path / name).exists()],
+        files=[row for row in DESCRIBED_FILES if row[0] == folder.metrics.name or (folder.path / row[0]).exists()],
         details=[*parts.pop("details", ()), *_details(metrics)],
         **parts,
     )

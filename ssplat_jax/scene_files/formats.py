@@ -31,8 +31,8 @@ ORIGIN: Offset = (0.0, 0.0, 0.0)
 # By the end of the file's name. A .ply may be a compressed one, whatever its name.
 WRITERS: dict[str, Callable[[SplatRows], bytes]] = {".ply": encode_ply, ".spz": encode_spz, ".sog": encode_sog}
 WRITERS |= {".glb": encode_glb, ".splat": encode_splat}
-READERS: dict[str, Callable[[bytes], SplatRows]] = {".compressed.ply": decode_ply, ".ply": decode_ply}
-READERS |= {".spz": decode_spz, ".sog": decode_sog, ".glb": decode_glb}
+SCENE_READERS: dict[str, Callable[[bytes], SplatRows]] = {".compressed.ply": decode_ply, ".ply": decode_ply}
+SCENE_READERS |= {".spz": decode_spz, ".sog": decode_sog, ".glb": decode_glb}
 DAMAGE = (
     *(ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RuntimeError, OSError, EOFError),
     *(struct.error, zlib.error, zipfile.BadZipFile, zstandard.ZstdError, Image.DecompressionBombError),
@@ -60,7 +60,7 @@ def check_format(path: FilePath, option: str = "--to", formats: Collection[str] 
     """The end of a file's name, which must be one of `formats`."""
     name = Path(path).name
     # Nothing writes a .compressed.ply, though its name ends with .ply.
-    suffix = next((suffix for suffix in (".compressed.ply", *READERS, *WRITERS) if name.endswith(suffix)), "")
+    suffix = next((suffix for suffix in (".compressed.ply", *SCENE_READERS, *WRITERS) if name.endswith(suffix)), "")
     if suffix not in formats:
         raise refusal(option, wanted=f"a file named *{', *'.join(formats)}", got=repr(name), fix="choose one of these")
     return suffix
@@ -145,7 +145,7 @@ def load_scene(path: FilePath) -> Gaussians:
     Raises:
         InputError: an unknown extension, or the file is damaged or of another format than its name says.
     """
-    return _read(path, check_format(path, "scene", READERS))
+    return _read(path, check_format(path, "scene", SCENE_READERS))
 
 
 def load_ply(path: FilePath) -> Gaussians:
@@ -161,7 +161,7 @@ def _read(path: FilePath, suffix: str) -> Gaussians:
         raise refusal(str(path), wanted=f"a {suffix} file", got=came, fix="check the path") from error
     try:
         with np.errstate(all="ignore"):  # infinities and NaNs are refused by what they mean
-            return gaussians_of_rows(READERS[suffix](data))
+            return gaussians_of_rows(SCENE_READERS[suffix](data))
     except DAMAGE as error:
         cause = " ".join((str(error) if type(error) is ValueError else repr(error)).split())
         raise InputError(f"{path}: cannot be used as a {suffix} file: {cause:.300}; write it again.") from error

@@ -104,10 +104,11 @@ def trainings(provenance: dict) -> list[dict]:
     return [*(trainings(before) if isinstance(before, dict) else ()), provenance]
 
 
-def stage_turns(params: dict, facts: WeightsFacts) -> dict[str, float]:
-    """Turn of each stage by training: the sine of the angle between its parameters and their random start.
+def changed_shares(params: dict, facts: WeightsFacts) -> dict[str, float]:
+    """Share of each stage's parameters that training changed: of their norm, the part that is not along their start.
 
-    Weight decay alone shortens the vector of a stage's parameters and does not turn it.
+    It is the sine of the angle between the parameters and their random start: weight decay alone shortens them, and has
+    the share 0.
 
     Limits:
         Stages without parameters are left out. A stage that starts at zero has 0 if it stayed there, else 1.
@@ -119,14 +120,14 @@ def stage_turns(params: dict, facts: WeightsFacts) -> dict[str, float]:
         # A later training began with the stages of the one before, and drew only those that were missing.
         fresh = training.get("fresh", ()) if start else None
         start |= init_params(jax.random.key(seed), facts.config, only=fresh)
-    turns = {}
+    shares = {}
     for stage, part in start.items():
         if jax.tree.leaves(part):
             before, after = (np.asarray(ravel_pytree(x)[0], np.float64) for x in (part, params[stage]))
             # What is left of `after` without its part along the start: 1 - cos^2 would cancel for small angles.
             across = after - (after @ before) / max(before @ before, 1e-300) * before
-            turns[stage] = float(np.linalg.norm(across) / max(np.linalg.norm(after), 1e-300))
-    return turns
+            shares[stage] = float(np.linalg.norm(across) / max(np.linalg.norm(after), 1e-300))
+    return shares
 
 
 def params_digest(params: Any) -> str:

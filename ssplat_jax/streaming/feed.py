@@ -38,7 +38,7 @@ class FedChunk:
     chunk: Chunk
     frames: list[int]  # frame numbers of the chunk's valid views, in their order
     output: ChunkOutput
-    frame: StreamFrame  # of the next chunk: with `causal`, near and far may have moved outward
+    stream_frame: StreamFrame  # of the next chunk: with `causal`, near and far may have moved outward
     seconds: float  # of the step, without compiling it
 
     @property
@@ -48,7 +48,9 @@ class FedChunk:
         return dict(zip(self.frames, valid, strict=True))
 
 
-def feed_chunks(session: Session, capture: Capture, order: Sequence[int], frame: StreamFrame) -> Iterator[FedChunk]:
+def feed_chunks(
+    session: Session, capture: Capture, order: Sequence[int], stream_frame: StreamFrame
+) -> Iterator[FedChunk]:
     """Feeds frames of a capture to a session and yields after each chunk.
 
     With `causal`, near and far of a chunk follow from the chunks before it (`streaming.live_views`).
@@ -57,30 +59,30 @@ def feed_chunks(session: Session, capture: Capture, order: Sequence[int], frame:
         session: the stream; its cache grows in place.
         capture: where the images come from.
         order: frame numbers in stream order (`Capture.stream_order`); may be empty.
-        frame: the similarity between the capture's frame and the stream's.
+        stream_frame: the similarity between the capture's frame and the stream's.
     """
     config, size = session.model.config, session.model.config.stream.chunk_size
     if len(order) == 0:
         return
     session.expected_chunks = max(session.expected_chunks, -(-len(order) // size))
-    for number, chunk in enumerate(capture.chunks(config, order, frame=frame)):
+    for number, chunk in enumerate(capture.chunks(config, order, stream_frame=stream_frame)):
         frames = list(order[number * size : (number + 1) * size])
         if config.stream.causal:
-            near, far = jax.device_put((np.float32(frame.near), np.float32(frame.far)))
+            near, far = jax.device_put((np.float32(stream_frame.near), np.float32(stream_frame.far)))
             chunk = replace(chunk, near=near, far=far)
         since, compiled = time.perf_counter(), session.compile_seconds
         output = session.feed(chunk)
         seconds = time.perf_counter() - since - (session.compile_seconds - compiled)
         if config.stream.causal:
-            frame = widen_range(frame, output, config)
-        yield FedChunk(chunk, frames, output, frame, seconds)
+            stream_frame = widen_range(stream_frame, output, config)
+        yield FedChunk(chunk, frames, output, stream_frame, seconds)
 
 
 def feed_capture(
     session: Session,
     capture: Capture,
     indices: Sequence[int],
-    frame: StreamFrame,
+    stream_frame: StreamFrame,
     *,
     keep_order: bool = False,
     num_recent: int = 0,
@@ -92,7 +94,7 @@ def feed_capture(
         session: the stream; its cache grows in place.
         capture: where the images come from.
         indices: frame numbers, in any order.
-        frame: the similarity between the capture's frame and the stream's.
+        stream_frame: the similarity between the capture's frame and the stream's.
         keep_order: stream `indices` in their order, without interleaving.
         num_recent: how many of the last chunks to return.
         on_chunk: called after each chunk with the number of views fed so far.
@@ -102,8 +104,8 @@ def feed_capture(
     """
     exposures: Exposures = {}
     recent: list[Chunk] = []
-    order = list(indices) if keep_order else capture.stream_order(session.model.config, indices, frame)
-    for fed in feed_chunks(session, capture, order, frame):
+    order = list(indices) if keep_order else capture.stream_order(session.model.config, indices, stream_frame)
+    for fed in feed_chunks(session, capture, order, stream_frame):
         exposures |= fed.exposures
         recent = [*recent, fed.chunk][-num_recent:] if num_recent else []
         on_chunk(len(exposures))

@@ -30,11 +30,11 @@ MIN_CELLS = 64
 """Confident cells below which a chunk contradicts nothing."""
 
 
-def widen_range(frame: StreamFrame, output: ChunkOutput, config: StreamConfig) -> StreamFrame:
+def widen_range(stream_frame: StreamFrame, output: ChunkOutput, config: StreamConfig) -> StreamFrame:
     """The stream frame for the chunks after one, with near and far moved outward where that chunk contradicts them.
 
     Args:
-        frame: the frame in which the chunk was streamed.
+        stream_frame: the frame in which the chunk was streamed.
         output: what the step gave for the chunk.
         config: configuration of the model; cells below `min_confidence` have no say.
     """
@@ -42,16 +42,16 @@ def widen_range(frame: StreamFrame, output: ChunkOutput, config: StreamConfig) -
     is_counted = (confidences > 0) & (confidences >= config.memory.min_confidence)
     inverse = 1.0 / np.asarray(output.depths, np.float64)[is_counted]
     if inverse.size < MIN_CELLS:
-        return frame
-    least, most = 1.0 / frame.far, 1.0 / frame.near
+        return stream_frame
+    least, most = 1.0 / stream_frame.far, 1.0 / stream_frame.near
     margin = END_SHARE * (most - least)
-    near, far = frame.near, frame.far
+    near, far = stream_frame.near, stream_frame.far
     if np.mean(inverse >= most - margin) > MAX_END_SHARE:
         near = min(near, max(near / STEP, far / MAX_RANGE))
     if np.mean(inverse <= least + margin) > MAX_END_SHARE:
         far = max(far, min(far * STEP, near * MAX_RANGE))
     # The scale stays, because the cache is in its units; the chunk itself is not streamed again.
-    return dataclasses.replace(frame, near=near, far=far)
+    return dataclasses.replace(stream_frame, near=near, far=far)
 
 
 class LiveViews:
@@ -59,14 +59,14 @@ class LiveViews:
 
     Args:
         config: configuration of the model.
-        frame: stream frame of the cache that is continued; by default the first chunk's.
+        stream_frame: stream frame of the cache that is continued; by default the first chunk's.
     """
 
-    def __init__(self, config: StreamConfig, frame: StreamFrame | None = None) -> None:
+    def __init__(self, config: StreamConfig, stream_frame: StreamFrame | None = None) -> None:
         self._config = config.replace(causal=True)
         # The frame, and the output of the last chunk if the frame has not learned from it yet. They are replaced
         # together, because an interrupt may come between two statements.
-        self._learned: tuple[StreamFrame | None, ChunkOutput | None] = frame, None
+        self._learned: tuple[StreamFrame | None, ChunkOutput | None] = stream_frame, None
         self._waiting: list[tuple[Frame, Float32[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]] = []
         self._num_views = 0
         self._size: tuple[int, int] | None = None
@@ -106,24 +106,24 @@ class LiveViews:
         pixels = ArrayPixels(images=np.stack(images), depths=depths, masks=np.stack(masks))
         size = {"width": frames[0].width, "height": frames[0].height}
         capture = Capture(name="live", format="memory", frames=frames, pixels=pixels, **size)
-        if self.frame is None:
+        if self.stream_frame is None:
             self._learned = capture.stream_frame(self._config), None
-        return next(iter(capture.chunks(self._config, range(len(capture)), frame=self.frame)))
+        return next(iter(capture.chunks(self._config, range(len(capture)), stream_frame=self.stream_frame)))
 
     def drop(self, output: ChunkOutput) -> None:
         """Forgets the views of the chunk that `rest` gave last, which is streamed with that output."""
         size = self._config.stream.chunk_size
-        self._waiting, self._learned = self._waiting[size:], (self.frame, output)
+        self._waiting, self._learned = self._waiting[size:], (self.stream_frame, output)
 
     @property
-    def frame(self) -> StreamFrame | None:
+    def stream_frame(self) -> StreamFrame | None:
         """The frame of the next chunk; None before the first.
 
         Computed when it is needed, since the step of the last chunk may still run.
         """
-        frame, output = self._learned
-        if frame is not None and output is not None:
-            self._learned = widen_range(frame, output, self._config), None
+        stream_frame, output = self._learned
+        if stream_frame is not None and output is not None:
+            self._learned = widen_range(stream_frame, output, self._config), None
         return self._learned[0]
 
 

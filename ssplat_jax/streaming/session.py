@@ -31,7 +31,7 @@ and the most rows of such a cache: a step takes longer with unused ones."""
 MIN_DECODED_PIVOTS = 1 << 15
 """Lower limit of the pivots decoded at once: with fewer, compiling for a growing scene costs more than it saves."""
 
-Revise = Callable[[dict, VoxelCache, Chunk, ChunkOutput], VoxelCache]
+RefineChunk = Callable[[dict, VoxelCache, Chunk, ChunkOutput], VoxelCache]
 """Refinement after a chunk: parameters, the cache after the step, the chunk, the step's summary -> the cache."""
 
 
@@ -43,8 +43,8 @@ class Session:
         params: the model's parameters.
         cache: the cache to continue from; by default an empty one with capacity for a few chunks.
         causal: the model's configuration with `stream.causal`: no result depends on a later frame.
-        frame: stream frame of `cache`, for `push`; by default that of the first chunk that is pushed.
-        revise: what refines the scene after each chunk, as `stream.steps_per_chunk` asks
+        stream_frame: stream frame of `cache`, for `push`; by default that of the first chunk that is pushed.
+        refine: what refines the scene after each chunk, as `stream.steps_per_chunk` asks
             (`ssplat_jax.refinement.online_refinement`); None where it asks for nothing.
     """
 
@@ -55,13 +55,13 @@ class Session:
         cache: VoxelCache | None = None,
         *,
         causal: bool = False,
-        frame: StreamFrame | None = None,
-        revise: Revise | None = None,
+        stream_frame: StreamFrame | None = None,
+        refine: RefineChunk | None = None,
     ) -> None:
         if causal:
             model = dataclasses.replace(model, config=model.config.replace(causal=True))
         self.model, self.params, self.cache = model, params, cache
-        self._live, self._revise = LiveViews(model.config, frame), revise
+        self._live, self._refine_chunk = LiveViews(model.config, stream_frame), refine
         self.expected_chunks = INITIAL_CHUNKS  # of the stream, as far as the caller knows; sets the first capacity
         self.compile_seconds, self.num_compilations = 0.0, 0
         # Programs by what they compute and the shapes that they are compiled for; those of the last chunk.
@@ -76,7 +76,7 @@ class Session:
 
         Raises:
             CacheError: tokens were dropped although the overflow policy forbids it.
-            InputError: the configuration asks for refinement and `revise` is not given, or the reverse; or the chunk
+            InputError: the configuration asks for refinement and `refine` is not given, or the reverse; or the chunk
                 cannot be streamed, see `StreamSplat.step`.
         """
         return self._stream(chunk, is_live=False)
@@ -84,8 +84,8 @@ class Session:
     def push(self, image: object, K: object, viewmat: object, seen: object = None) -> ChunkOutput | None:
         """Takes one view of a live source, and streams a chunk when enough views have come.
 
-        Near, far and scale come from the first chunk, as with `causal`; `frame` then holds them. A later chunk that
-        contradicts near or far moves them outward for the chunks after it (`streaming.live_views`).
+        Near, far and scale come from the first chunk, as with `causal`; `stream_frame` then holds them. A later chunk
+        that contradicts near or far moves them outward for the chunks after it (`streaming.live_views`).
 
         Args:
             image: RGB, height x width x 3, as float in [0, 1] or as uint8.
@@ -101,8 +101,8 @@ class Session:
             InputError: a value cannot be used, or the image has another size than the first.
             CacheError: see `feed`.
         """
-        if self.cache is not None and self.frame is None:
-            fix = "give Session(..., frame=StreamFrame) too, or push all views"
+        if self.cache is not None and self.stream_frame is None:
+            fix = "give Session(..., stream_frame=StreamFrame) too, or push all views"
             raise refusal("push", wanted="the stream frame of the cache that is continued", got="none", fix=fix)
         chunk = self._live.add(image, K, viewmat, seen)
         return None if chunk is None else self._stream(chunk, is_live=True)
@@ -127,11 +127,11 @@ class Session:
         if cache is None:
             cache = _new_cache(config, starting_capacity(config, num_tokens, self.expected_chunks))
         cache = ensure_capacity(cache, config, num_tokens)
-        if bool(config.stream.steps_per_chunk) != (self._revise is not None):
-            wanted = "Session(..., revise=online_refinement(model)) with stream.steps_per_chunk above 0, or neither"
-            got = f"steps_per_chunk={config.stream.steps_per_chunk} and revise={self._revise}"
+        if bool(config.stream.steps_per_chunk) != (self._refine_chunk is not None):
+            wanted = "Session(..., refine=online_refinement(model)) with stream.steps_per_chunk above 0, or neither"
+            got = f"steps_per_chunk={config.stream.steps_per_chunk} and refine={self._refine_chunk}"
             raise refusal("Session", wanted=wanted, got=got, fix="call online_refinement with the session's model")
-        if self._revise is not None:  # adds the key-view buffers if the cache lacks them
+        if self._refine_chunk is not None:  # adds the key-view buffers if the cache lacks them
             # Once a view had a mask, key views hold one each.
             if chunk.seen is None and cache.key_views is not None and cache.key_views.seen is not None:
                 chunk = replace(chunk, seen=jnp.ones(chunk.images.shape[:3], bool))
@@ -139,9 +139,9 @@ class Session:
             cache = with_refinement(cache, config, *chunk.images.shape[1:3], is_masked=is_masked)
         self.cache = cache
         step, refine = self._program("step", self.model.step, cache, chunk), None
-        if self._revise is not None:
+        if self._refine_chunk is not None:
             summary = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), step.out_info[1])
-            refine = self._program("refine", self._revise, cache, chunk, summary)
+            refine = self._program("refine", self._refine_chunk, cache, chunk, summary)
         # Dispatch every program before blocking on a result. A program takes the old cache when it starts, so the new
         # one is kept at once: an interrupt of the wait costs nothing.
         self._step, self._refine = step, refine
@@ -164,9 +164,9 @@ class Session:
         return self._programs[key]
 
     @property
-    def frame(self) -> StreamFrame | None:
+    def stream_frame(self) -> StreamFrame | None:
         """The stream frame of the views pushed, with near and far of the next chunk; None before the first chunk."""
-        return self._live.frame
+        return self._live.stream_frame
 
     def gaussians(self) -> Gaussians:
         """The scene so far, in the stream frame: the Gaussians of `model.decode`, then padding rows of opacity 0.

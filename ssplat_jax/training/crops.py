@@ -30,7 +30,7 @@ from ssplat_jax.training.capture_mix import CaptureMix, TrainingStart
 
 
 @pytree
-class Crop:
+class CropSample:
     """A part of a streamed view, and the cache that is to show it."""
 
     cache: VoxelCache
@@ -89,7 +89,7 @@ class Crops:
                 raise refusal(f"train: {capture.name}", wanted=wanted, got=got, fix="leave it out")
         return found
 
-    def open(self, start: TrainingStart) -> Callable[[int, int], tuple[Crop, ...]]:
+    def open(self, start: TrainingStart) -> Callable[[int, int], tuple[CropSample, ...]]:
         """Streams all scenes; gives the crops of a step by its number and its place in the phase."""
         scenes = []
         for capture, stride in self.scenes(start.mix):
@@ -106,12 +106,12 @@ class Crops:
                 [int(rng.integers(n)) for n in (num_views, height - self.size[0] + 1, width - self.size[1] + 1)]
             )
 
-        def crop(number: int) -> Crop:
+        def crop(number: int) -> CropSample:
             (cache, views, *_), (view, row, column) = scenes[number % len(scenes)], places[number]
             camera = crop_camera(views.camera(view), row, column, *self.size)
             image = np.asarray(views.images[view])[row : row + self.size[0], column : column + self.size[1]]
             image = np.pad(image, [(0, 0), (0, 0), (0, channels - image.shape[-1])], constant_values=1)
-            return Crop(cache, camera, jnp.asarray(image), views.exposures[view], **capacities)
+            return CropSample(cache, camera, jnp.asarray(image), views.exposures[view], **capacities)
 
         return lambda step, place: tuple(crop(self.batch * step + i) for i in range(self.batch))
 
@@ -129,11 +129,11 @@ def stream_scene(
     """
     make_room()
     context = choose_split("interleaved", len(capture), stride, None, None).context
-    session = Session(model, params, revise=online_refinement(model))
-    frame = capture.stream_frame(model.config, context)
-    exposures, _ = feed_capture(session, capture, context, frame)
+    session = Session(model, params, refine=online_refinement(model))
+    stream_frame = capture.stream_frame(model.config, context)
+    exposures, _ = feed_capture(session, capture, context, stream_frame)
     assert session.cache is not None
-    views = key_views_of(capture, context, frame, exposures)
+    views = key_views_of(capture, context, stream_frame, exposures)
     num_pivots = int(jnp.sum(shown_pivots(session.cache, model.config)))
     # Twice as many as now: training changes the scene.
     return session.cache, views, num_pivots, pairs_capacity(session.gaussians(), views, margin=2.0)

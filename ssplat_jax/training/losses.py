@@ -25,7 +25,7 @@ from ssplat_jax.evaluation.lpips import lpips as lpips_distance
 from ssplat_jax.model.streamsplat import StreamSplat, shown_rows
 from ssplat_jax.rasterizer import fill_holes, render
 from ssplat_jax.refinement.compared_views import EFFECTS
-from ssplat_jax.training.crops import Crop
+from ssplat_jax.training.crops import CropSample
 from ssplat_jax.training.samples import Sample
 
 Scalar = Float[Array, ""]
@@ -177,11 +177,11 @@ class CropLoss:
     renders: ClassVar[bool] = False
 
     def __call__(
-        self, model: StreamSplat, params: dict, batch: tuple[Crop, ...], lpips: Lpips = None
+        self, model: StreamSplat, params: dict, batch: tuple[CropSample, ...], lpips: Lpips = None
     ) -> tuple[Scalar, Metrics]:
         """Mean over the crops of `batch`, and their PSNRs in dB."""
 
-        def of_crop(crop: Crop) -> tuple[Scalar, Metrics]:
+        def of_crop(crop: CropSample) -> tuple[Scalar, Metrics]:
             gaussians = model.decode_rows(params, crop.cache, shown_rows(crop.cache, model.config, crop.num_pivots))
             out = render(gaussians, crop.camera, effects=EFFECTS, max_pairs=crop.max_pairs)
             target = crop.image[..., :3].astype(jnp.float32) / 255
@@ -215,8 +215,8 @@ def decode_accepted(model: StreamSplat, params: dict, cache: VoxelCache, tokens:
     The cache is a constant.
     """
     gaussians = model.decode_tokens(params, tokens)
-    revised = vote(*jax.lax.stop_gradient((cache.stored_depths, tokens)), model.config)
-    is_accepted = tokens.valid & (revised.confidences >= model.config.memory.min_confidence)
+    voted = vote(*jax.lax.stop_gradient((cache.stored_depths, tokens)), model.config)
+    is_accepted = tokens.valid & (voted.confidences >= model.config.memory.min_confidence)
     return mask_gaussians(gaussians, model.repeat_per_gaussian(is_accepted))
 
 

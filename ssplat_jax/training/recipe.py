@@ -2,7 +2,7 @@
 
 A recipe is a sequence of phases, and a phase is samples, a loss, the parts that learn by it, and a number of steps:
 
-    Phase("depth", 3000, Views(num_chunks=1, sizes=((96, 128),)), DepthLoss(), learning(*MATCHER), learning_rate=1e-3)
+    Phase("depth", 3000, ViewSamples(1, sizes=((96, 128),)), DepthLoss(), learning(*MATCHER), learning_rate=1e-3)
 
 Samples are in `samples.py` and `crops.py`, losses in `losses.py`, the loop and its optimizer in `loop.py`.
 """
@@ -18,7 +18,7 @@ from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.training.capture_mix import CaptureMix, TrainingStart
 from ssplat_jax.training.crops import Crops
 from ssplat_jax.training.losses import CropLoss, DepthLoss, RenderingLoss
-from ssplat_jax.training.samples import Views
+from ssplat_jax.training.samples import ViewSamples
 
 Rates = tuple[tuple[str, float], ...]
 """Paths of parts of the parameters, such as "encoder/pretrained", with factors of the learning rate."""
@@ -31,7 +31,7 @@ AFTER_MATCHER = ("hpda", "tokens", "cgfi", "mixer", "decoder")
 
 @runtime_checkable
 class Samples(Protocol):
-    """Samples that the steps of a phase learn from, such as `Views` and `Crops`.
+    """Samples that the steps of a phase learn from, such as `ViewSamples` and `Crops`.
 
     `check` raises an InputError if the captures cannot teach the phase, `open` gives a function that makes a batch of
     the number of its step in the recipe and its place in the phase, and `held_out` batches that are scored.
@@ -142,23 +142,23 @@ def learning(*parts: str) -> Rates:
 _depth = functools.partial(Phase, loss=DepthLoss(), rates=learning(*MATCHER))
 # Closer to the size of streamed images, and portrait too. Streamed video is interleaved until views are 3 % of the
 # depth apart or more.
-_LARGER = Views(1, ((160, 224), (224, 160)), steps_of_depth=(0.02, 0.4))
+_LARGER = ViewSamples(1, ((160, 224), (224, 160)), steps_of_depth=(0.02, 0.4))
 
-TINY = Recipe(
+TINY_RECIPE = Recipe(
     phases=(
-        _depth("depth", 3000, Views(1, ((96, 128),)), learning_rate=1e-3),
+        _depth("depth", 3000, ViewSamples(1, ((96, 128),)), learning_rate=1e-3),
         _depth("larger", 400, _LARGER, learning_rate=5e-4, final_share=0.02),
     )
 )
 """Trains the depth of the shipped `tiny` weights from scratch; `depth` continues it, and `evidence` adds the head.
 docs/model_card.md has commands, times and machines."""
 
-_BATCHES = Views(1, ((224, 320),), batch=4, steps_of_depth=(0.01, 0.4))
+_BATCHES = ViewSamples(1, ((224, 320),), batch=4, steps_of_depth=(0.01, 0.4))
 # Kinds of worlds, of which about half are under a sky.
 _OUTDOORS = (*("room",) * 4, "corridor", *("street",) * 2, *("objects",) * 3, *("clutter",) * 2, *("yard",) * 4)
 _OUTDOOR_BATCHES = dataclasses.replace(_BATCHES, kinds=_OUTDOORS)
 
-DEPTH = Recipe(
+DEPTH_RECIPE = Recipe(
     phases=(
         _depth("depth", 4200, _BATCHES, learning_rate=5e-4),
         _depth("outdoors", 4600, _OUTDOOR_BATCHES, learning_rate=5e-4, final_share=0.02),
@@ -168,17 +168,17 @@ DEPTH = Recipe(
 """Continues the training of depth, in batches of images of about the streamed size. It needs a GPU. The shipped weights
 took about as many steps, in pieces that docs/model_card.md lists."""
 
-_FOUR_CHUNKS = Views(4, ((96, 128),), num_targets=4, steps_of_depth=(0.01, 0.15))
+_FOUR_CHUNKS = ViewSamples(4, ((96, 128),), num_targets=4, steps_of_depth=(0.01, 0.15))
 
 # The matcher is trained by then. Without its backward pass a step costs a third, and rendering would teach it less
 # about depth than depth supervision did.
-STREAM = Recipe(
+STREAM_RECIPE = Recipe(
     phases=(Phase("stream", 400, _FOUR_CHUNKS, RenderingLoss(), learning(*AFTER_MATCHER), 1e-3, final_share=0.02),)
 )
 """Trains the stages behind a trained matcher. The shipped weights do not include it, because it lowered the scores
 of captures (docs/model_card.md)."""
 
-EVIDENCE = Recipe(
+EVIDENCE_RECIPE = Recipe(
     phases=(Phase("evidence", 600, Crops(), CropLoss(), learning("evidence"), 5e-3, final_share=0.0, warmup_steps=20),),
     adam_b2=0.999,
     weight_decay=1e-3,
@@ -199,7 +199,7 @@ _PAPER_LOSS = RenderingLoss(
     max_pairs=1 << 22,
 )
 # Its voxels and its anchor have lengths in the units of the poses: scale, near and far are those of the capture.
-_PAPER_VIEWS = Views(4, ((256, 256),), num_targets=4, range_jitter=0.0)
+_PAPER_VIEWS = ViewSamples(4, ((256, 256),), num_targets=4, range_jitter=0.0)
 _PAPER_PHASE = Phase(
     "paper",
     100_000,
@@ -211,16 +211,16 @@ _PAPER_PHASE = Phase(
     warmup_steps=1,
 )
 
-PAPER = Recipe((_PAPER_PHASE,), adam_b2=0.999, clip_norm=None, ema_decay=0.0, captures_alone=True)
+PAPER_RECIPE = Recipe((_PAPER_PHASE,), adam_b2=0.999, clip_norm=None, ema_decay=0.0, captures_alone=True)
 """The paper's training to the letter: 100,000 steps of AdamW at a constant 1e-4 with one sample of a capture each,
 through all stages. It needs LPIPS weights for the second term and a GPU, and starts from imported weights. Where the
 paper is silent, AdamW has PyTorch's defaults, and a sample four chunks and four targets of 256 x 256."""
 
 RECIPES = {
-    "tiny": TINY,
-    "depth": DEPTH,
-    "stream": STREAM,
-    "evidence": EVIDENCE,
-    "paper": PAPER,
+    "tiny": TINY_RECIPE,
+    "depth": DEPTH_RECIPE,
+    "stream": STREAM_RECIPE,
+    "evidence": EVIDENCE_RECIPE,
+    "paper": PAPER_RECIPE,
 }
 """Choices of `ssplat train --recipe`."""

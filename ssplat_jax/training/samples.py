@@ -1,6 +1,6 @@
 """Samples of streamed views, procedural or of a capture: chunks of context views with true depths, and target views.
 
-`Views` says what the samples of a phase are.
+`ViewSamples` says what the samples of a phase are.
 """
 
 import dataclasses
@@ -47,7 +47,7 @@ class Sample:
 
 
 @dataclasses.dataclass(frozen=True)
-class Views:
+class ViewSamples:
     """Samples of a phase that streams views anew in every step, so that gradients flow through the network."""
 
     num_chunks: int
@@ -119,7 +119,7 @@ def _cpu():
         return None
 
 
-def procedural_sample(views: Views, seed: int, size: tuple[int, int], config: StreamConfig) -> Sample:
+def procedural_sample(views: ViewSamples, seed: int, size: tuple[int, int], config: StreamConfig) -> Sample:
     """A sample of a procedural world, at `size` (height, width); the same for the same arguments.
 
     Raises:
@@ -172,7 +172,7 @@ def _choose_targets(rng: np.random.Generator, num_views: int, num_targets: int) 
 
 
 def capture_sample(
-    views: Views, mix: CaptureMix, capture: Capture, seed: Sequence[int], size: tuple[int, int]
+    views: ViewSamples, mix: CaptureMix, capture: Capture, seed: Sequence[int], size: tuple[int, int]
 ) -> Sample:
     """A sample of frames that may be learned from, at `size` (height, width); the same for the same arguments."""
     rng = np.random.default_rng(seed)
@@ -184,7 +184,7 @@ def capture_sample(
     return _sample_of_frames(mix, capture, context, targets, size, rng, views.range_jitter)
 
 
-def held_out_sample(views: Views, mix: CaptureMix, capture: Capture, seed: Sequence[int]) -> Sample:
+def held_out_sample(views: ViewSamples, mix: CaptureMix, capture: Capture, seed: Sequence[int]) -> Sample:
     """A sample whose one target is held out, between context views that are not; see `capture_sample`.
 
     Limits:
@@ -212,7 +212,7 @@ def _sample_of_frames(mix: CaptureMix, capture: Capture, context, targets, size,
     known = mix.frame_of(capture)
     context = delivered.stream_order(mix.config, context, known)
     scale, near, far = np.exp(rng.uniform(-range_jitter, range_jitter, 3))
-    frame = StreamFrame.at_camera(
+    stream_frame = StreamFrame.at_camera(
         capture.frames[context[0]].camtoworld,
         scale=known.scale * scale,
         near=known.near * scale * near,
@@ -221,13 +221,13 @@ def _sample_of_frames(mix: CaptureMix, capture: Capture, context, targets, size,
     frames = [*context, *targets]
     return _sample_of_views(
         images=np.stack([delivered.image(i) for i in frames]),
-        depths=np.stack([frame.scale * _depth(delivered, i) for i in frames]),
-        viewmats=frame.viewmats(capture.camtoworlds[frames]),
+        depths=np.stack([stream_frame.scale * _depth(delivered, i) for i in frames]),
+        viewmats=stream_frame.viewmats(capture.camtoworlds[frames]),
         Ks=np.stack([delivered.K(i) for i in frames]),
         context=np.arange(len(context)),
         targets=np.arange(len(context), len(frames)),
-        near=frame.near,
-        far=frame.far,
+        near=stream_frame.near,
+        far=stream_frame.far,
         is_photographed=True,
         config=mix.config,
         seen=np.array([delivered.seen(i) for i in frames]) if capture.is_masked else None,

@@ -68,7 +68,7 @@ class SceneFile:
             gaussians = scale_colors(gaussians, jnp.asarray(1.0 / scene_exposure(self.path), jnp.float32))
         return ViewedScene(gaussians)
 
-    def frame(self) -> StreamFrame | None:
+    def stream_frame(self) -> StreamFrame | None:
         """The frame of the stream of the run that wrote the file; None if no metrics of a run are beside it."""
         try:
             return StreamFrame.from_dict(json.loads(self.folder.metrics.read_bytes())["stream_frame"])
@@ -90,7 +90,7 @@ class _Sum:
 
     def __init__(self) -> None:
         self.applied: list[tuple[str, int]] = []  # names and time stamps of the deltas
-        self.frame: StreamFrame | None = None
+        self.stream_frame: StreamFrame | None = None
         self._scene: Gaussians | None = None
         self._confidences: Float32[np.ndarray, " n"] | None = None
         self._exposure = np.ones(3)  # at which the scene is shown: the middle one of the views so far
@@ -104,17 +104,17 @@ class _Sum:
         delta, header = load_delta(path), load_delta_header(path)
         self._scene = apply_delta(self._scene, delta)
         self._confidences = apply_confidences(self._confidences, delta)
-        self.frame, self._exposure = StreamFrame.from_dict(header["frame"]), np.array(header["exposure"])
+        self.stream_frame, self._exposure = StreamFrame.from_dict(header["frame"]), np.array(header["exposure"])
         self.applied.append((path.name, stamp))
 
     def viewed(self, *, one_exposure: bool) -> ViewedScene:
         """The scene in the capture's frame; there must be a delta."""
-        assert self.frame is not None
+        assert self.stream_frame is not None
         scene = jax.tree.map(jnp.asarray, self._scene)
         if not one_exposure:
             scene = scale_colors(scene, jnp.asarray(self._exposure, jnp.float32))
-        gaussians = self.frame.gaussians_to_capture(scene, offset=self.frame.offset)
-        return ViewedScene(replace(gaussians, offset=self.frame.offset), self._confidences)
+        gaussians = self.stream_frame.gaussians_to_capture(scene, offset=self.stream_frame.offset)
+        return ViewedScene(replace(gaussians, offset=self.stream_frame.offset), self._confidences)
 
 
 class GrowingScene:
@@ -185,9 +185,9 @@ class GrowingScene:
             self._past.add(self.folder.deltas / name, stamp)
         return self._past.viewed(one_exposure=self._one_exposure)
 
-    def frame(self) -> StreamFrame | None:
+    def stream_frame(self) -> StreamFrame | None:
         """The frame of the stream; None before the first delta."""
-        return self._newest.frame
+        return self._newest.stream_frame
 
 
 Source = SceneFile | GrowingScene

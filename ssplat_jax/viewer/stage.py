@@ -120,7 +120,7 @@ class Stage:
 
     def _set_start(self, scene: ViewedScene) -> None:
         """Sets start pose and units by the first scene of a stream."""
-        frame = self.source.frame()
+        frame = self.source.stream_frame()
         # A stream is told by its first camera and its scale; a causal one may widen its depth range.
         place = None if frame is None else (frame.rotation.tolist(), frame.origin.tolist(), frame.scale)
         if self.start is not None and place in (None, self._place):

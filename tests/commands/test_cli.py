@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ssplat_jax.commands.main import COMMANDS
+from ssplat_jax.commands.main import COMMANDS, main
 from ssplat_jax.commands.options import apply_changes
 from ssplat_jax.commands.run_command import Run
 from ssplat_jax.commands.start import start
@@ -21,6 +21,7 @@ from ssplat_jax.config import preset
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.data import capture_summary
 from ssplat_jax.data.capture_summary import summarize
+from ssplat_jax.data.open_capture import CAPTURE_READERS
 from ssplat_jax.scene_files.formats import load_ply, save_ply
 from ssplat_jax.storage.published_weights import as_published, published_tensors
 from ssplat_jax.storage.weights import load_weights
@@ -44,6 +45,13 @@ def test_help_does_not_import_jax_and_shows_examples():
     done = subprocess.run([sys.executable, "-c", ALL_HELP], capture_output=True, text=True, check=True)
     for name in COMMANDS:
         assert f"Example: ssplat {name}" in done.stdout
+
+
+def test_help_of_inspect_names_every_format(capsys):
+    with pytest.raises(SystemExit):
+        main(["inspect", "--help"])
+    shown = " ".join(re.sub("[│╭╮╰╯─]", " ", capsys.readouterr().out).split())
+    assert [reader.FORMAT for reader in CAPTURE_READERS if reader.FORMAT not in shown] == []
 
 
 def test_output_that_nobody_reads_ends_a_command_quietly():

@@ -90,7 +90,7 @@ class Stream:
     """A run that is fed without a model."""
 
     def __init__(self, monkeypatch):
-        self.num_views, self.sizes, self.frame, self.session = 0, [], None, self
+        self.num_views, self.sizes, self.stream_frame, self.session = 0, [], None, self
         self.model, self.config, self.stream, self.chunk_size, self.received = self, self, self, 4, None
         monkeypatch.setattr(capture_run, "feed_chunks", self.feed)
 

@@ -44,7 +44,7 @@ def test_chunks_hold_the_frames_in_order_and_pad_the_last():
     capture = smooth_capture()
     frame = frame_of(capture)
     used = [5, 0, 1, 3, 2, 4]
-    chunks = list(capture.chunks(StreamConfig().replace(chunk_size=4), used, frame=frame))
+    chunks = list(capture.chunks(StreamConfig().replace(chunk_size=4), used, stream_frame=frame))
     assert [chunk.valid.tolist() for chunk in chunks] == [[True] * 4, [True, True, False, False]]
     rows = [(c.images[v], c.viewmats[v], c.Ks[v]) for c in chunks for v in range(4) if c.valid[v]]
     for i, (image, viewmat, K) in zip(used, rows, strict=True):
@@ -69,7 +69,7 @@ def test_reading_ahead_raises_at_the_damaged_chunk(tmp_path):
     root = make_capture(tmp_path / "c")
     capture = open_capture(root)
     (root / "images" / "2.jpg").write_bytes(b"gone bad")
-    chunks = capture.chunks(StreamConfig().replace(chunk_size=2), frame=frame_of(capture))
+    chunks = capture.chunks(StreamConfig().replace(chunk_size=2), stream_frame=frame_of(capture))
     next(chunks)
     with pytest.raises(ValueError, match=r"2\.jpg"):
         next(chunks)
@@ -118,7 +118,7 @@ def test_memory_does_not_grow_with_the_number_of_images(tmp_path):
     capture, held = open_capture(root, size=size), []
     frame = frame_of(capture)
     tracemalloc.start()
-    for number, _ in enumerate(capture.chunks(StreamConfig(), range(num), frame=frame), start=1):
+    for number, _ in enumerate(capture.chunks(StreamConfig(), range(num), stream_frame=frame), start=1):
         if 4 * number in (KEPT_IMAGES + 40, num):
             gc.collect()
             held.append(tracemalloc.get_traced_memory()[0])

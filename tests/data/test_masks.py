@@ -67,7 +67,7 @@ def test_masks_hide_pixels_of_some_images(mask, tmp_path):
     capture = open_capture(make_capture(tmp_path / "c", mask))
     np.testing.assert_array_equal(capture.seen(2), ~HIDDEN)
     assert capture.seen(1).all() and len(capture.notes) == 1
-    chunk = next(capture.chunks(StreamConfig(), range(4), frame=capture.stream_frame(StreamConfig())))
+    chunk = next(capture.chunks(StreamConfig(), range(4), stream_frame=capture.stream_frame(StreamConfig())))
     np.testing.assert_array_equal(chunk.seen[2], ~HIDDEN)
     assert chunk.seen[:2].all()
     small = dataclasses.replace(capture, width=WIDTH // 2, height=HEIGHT // 2).seen(2)
@@ -77,7 +77,7 @@ def test_masks_hide_pixels_of_some_images(mask, tmp_path):
 def test_captures_without_masks_have_none(tmp_path):
     capture = open_capture(make_capture(tmp_path / "c"))
     assert not capture.is_masked and capture.seen(0) is None
-    assert next(capture.chunks(StreamConfig(), frame=capture.stream_frame(StreamConfig()))).seen is None
+    assert next(capture.chunks(StreamConfig(), stream_frame=capture.stream_frame(StreamConfig()))).seen is None
 
 
 def test_a_mask_of_another_shape_is_refused(tmp_path):

@@ -134,10 +134,10 @@ def test_slow_video_is_interleaved_to_the_wanted_step():
 def test_a_capture_is_interleaved_unless_frames_are_given():
     capture = two_planes(16, 0.01)  # depths from 2 to 4
     frame = StreamFrame.at_camera(np.eye(4), scale=1.0, near=2.0, far=4.0)
-    centers = [np.asarray(chunk.viewmats)[:, 0, 3] for chunk in capture.chunks(StreamConfig(), frame=frame)]
+    centers = [np.asarray(chunk.viewmats)[:, 0, 3] for chunk in capture.chunks(StreamConfig(), stream_frame=frame)]
     np.testing.assert_allclose(centers[0], [0, -0.04, -0.08, -0.12], atol=1e-7)  # one block of four chunks
     np.testing.assert_allclose(centers[1], [-0.01, -0.05, -0.09, -0.13], atol=1e-7)
-    in_order = next(capture.chunks(StreamConfig(), range(16), frame=frame))
+    in_order = next(capture.chunks(StreamConfig(), range(16), stream_frame=frame))
     np.testing.assert_allclose(np.asarray(in_order.viewmats)[:, 0, 3], [0, -0.01, -0.02, -0.03], atol=1e-7)
 
 

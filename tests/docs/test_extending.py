@@ -69,7 +69,7 @@ def toy_reader() -> SimpleNamespace:
 
 
 def test_an_added_reader_opens_its_captures(tmp_path, monkeypatch):
-    monkeypatch.setattr(captures, "READERS", (*captures.READERS, toy_reader()))
+    monkeypatch.setattr(captures, "CAPTURE_READERS", (*captures.CAPTURE_READERS, toy_reader()))
     for i in range(3):
         Image.new("RGB", (32, 24), (80 * i, 0, 0)).save(tmp_path / f"{i}.png")
     (tmp_path / "toy.json").write_text(json.dumps({f"{i}.png": 0.1 * i for i in range(3)}))

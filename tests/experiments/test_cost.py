@@ -40,7 +40,7 @@ def test_memory_of_joint_network_grows_linearly_or_faster(room):
     params, frame = small.random_params(CONFIG), room.stream_frame(CONFIG)
     peaks = []
     for count in COUNTS:
-        chunk = one_chunk(list(room.chunks(CONFIG, range(count), frame=frame)))
+        chunk = one_chunk(list(room.chunks(CONFIG, range(count), stream_frame=frame)))
         network = JointNetwork(CONFIG, params, chunk)
         peaks.append(network.network_bytes())
     slopes = [(b - a) / (n - m) for (m, a), (n, b) in itertools.pairwise(zip(COUNTS, peaks, strict=True))]

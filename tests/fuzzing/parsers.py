@@ -13,7 +13,7 @@ import ssplat_jax as ss
 from ssplat_jax.cache import init_cache
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import read_index
-from ssplat_jax.scene_files.formats import READERS, save_gaussians
+from ssplat_jax.scene_files.formats import SCENE_READERS, save_gaussians
 from ssplat_jax.storage.chunk_records import load_delta, save_delta
 from ssplat_jax.storage.files import read_tensors
 from ssplat_jax.storage.run_folder import scene_exposure
@@ -146,7 +146,7 @@ PARSERS = (
         for kind, files in CAPTURE_FILES.items()
         for file in files
     }
-    | {suffix: Parser(write_scene(suffix), ss.load_scene) for suffix in READERS}
+    | {suffix: Parser(write_scene(suffix), ss.load_scene) for suffix in SCENE_READERS}
     | {
         "stream state": Parser(write_state, load_state),
         "delta": Parser(write_delta, load_delta),

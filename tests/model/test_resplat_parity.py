@@ -19,7 +19,7 @@ from ssplat_jax.model.decoder import decode_tokens
 from ssplat_jax.model.hpda import expected_log_depth
 from ssplat_jax.model.layers import pixel_unshuffle
 from ssplat_jax.model.network import init_params
-from ssplat_jax.model.resplat.resplat_tokens import GaussianHead, token_context
+from ssplat_jax.model.resplat.resplat_tokens import ReSplatGaussianHead, token_context
 from ssplat_jax.model.resplat.torch_layers import resize
 from ssplat_jax.model.resplat.upsampler import Upsampler
 from ssplat_jax.model.streamsplat import StreamSplat
@@ -103,7 +103,7 @@ def resplat_values() -> dict[str, tuple[np.ndarray, np.ndarray]]:
             "tap.proj": feats,
             "tap.pt": mixed - feats,
             "tap.gaussian_head.in0": mixed,
-            "tap.gaussian_head": GaussianHead(config).apply({"params": params["decoder"]}, flat),
+            "tap.gaussian_head": ReSplatGaussianHead(config).apply({"params": params["decoder"]}, flat),
             "out.rotations": jnp.roll(unit, -1, axis=1),  # xyzw
             **{f"out.{name}": x for name, x in outputs(gaussians).items()},
             "paper.tap.depth_predictor.depth_head.0": prediction.logits[:, ::2, ::2].transpose(0, 3, 1, 2),

@@ -274,9 +274,9 @@ def with_key_views(cache):
 
 
 def test_a_session_refuses_half_of_a_request():
-    for model, revise in ((MODEL, None), (StreamSplat(CONFIG.replace(steps_per_chunk=0)), online_refinement(MODEL))):
+    for model, refine in ((MODEL, None), (StreamSplat(CONFIG.replace(steps_per_chunk=0)), online_refinement(MODEL))):
         with pytest.raises(InputError, match="online_refinement"):
-            Session(model, params(), revise=revise).feed(chunk())
+            Session(model, params(), refine=refine).feed(chunk())
     assert online_refinement(StreamSplat(CONFIG.replace(steps_per_chunk=0))) is None
 
 

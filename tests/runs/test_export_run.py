@@ -16,7 +16,8 @@ from ssplat_jax.core.gaussians import scale_colors
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.rasterizer import render
-from ssplat_jax.runs.export_run import Views, difference_in_words, export_scene, save_cameras, scene_to_show, turned
+from ssplat_jax.runs.export_run import KnownCameras, difference_in_words, export_scene, save_cameras, turned
+from ssplat_jax.runs.run_results import scene_to_show
 from ssplat_jax.scene_files.formats import file_axes, save_ply
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.streaming.feed import middle_exposure
@@ -141,10 +142,10 @@ def test_the_scene_to_show_is_at_the_middle_exposure_of_its_views():
         np.testing.assert_allclose(getattr(shown, name), getattr(gaussians, name), atol=1e-6)
 
 
-def views_from(poses: np.ndarray, exposures=None) -> Views:
+def views_from(poses: np.ndarray, exposures=None) -> KnownCameras:
     """Views of `camera()` at some poses."""
     K, num = np.asarray(camera().Ks, np.float64), len(poses)
-    return Views(poses, np.tile(K, (num, 1, 1)), (48, 32), np.ones((num, 3)) if exposures is None else exposures)
+    return KnownCameras(poses, np.tile(K, (num, 1, 1)), (48, 32), np.ones((num, 3)) if exposures is None else exposures)
 
 
 UP_IN_FILE = {".ply": "y", ".sog": "z", ".glb": "y", ".spz": "z"}

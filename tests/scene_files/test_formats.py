@@ -24,11 +24,11 @@ from ssplat_jax.cache.changes import changed_gaussians, no_change
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.core.gaussians import SH_C0, Gaussians
 from ssplat_jax.core.pytree import replace
-from ssplat_jax.scene_files.formats import READERS, WRITERS, save_gaussians
+from ssplat_jax.scene_files.formats import SCENE_READERS, WRITERS, save_gaussians
 from tests.commands.command_fixture import run
 from tests.scene_files.scene_fixture import FIELDS, assert_turned, camera, compressed_ply, scene
 
-BOTH_WAYS = [suffix for suffix in WRITERS if suffix in READERS]
+BOTH_WAYS = [suffix for suffix in WRITERS if suffix in SCENE_READERS]
 
 
 @dataclasses.dataclass
@@ -158,7 +158,7 @@ def test_a_loaded_scene_is_drawn_as_it_is_meant(tmp_path):
     np.testing.assert_allclose(drawn, classic, atol=2e-4)
 
 
-@pytest.mark.parametrize("suffix", READERS)
+@pytest.mark.parametrize("suffix", SCENE_READERS)
 def test_files_cut_off_or_damaged_are_refused(tmp_path, suffix):
     """Damage of all kinds, with its limits of time and memory, is in tests/fuzzing."""
     good, bad = tmp_path / f"a{suffix}", tmp_path / f"bad{suffix}"

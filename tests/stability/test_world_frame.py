@@ -45,7 +45,7 @@ def test_a_moved_world_gives_the_same_chunks_and_moves_the_scene(capture, name):
     moved = dataclasses.replace(capture, frames=tuple(frames))
     here, there = (c.stream_frame(CONFIG) for c in (capture, moved))
     assert scale * there.scale == pytest.approx(here.scale, rel=1e-5)  # small parallax amplifies float64's rounding
-    chunks = (c.chunks(CONFIG, range(4), frame=frame) for c, frame in ((capture, here), (moved, there)))
+    chunks = (c.chunks(CONFIG, range(4), stream_frame=frame) for c, frame in ((capture, here), (moved, there)))
     for wanted, got in zip(*chunks, strict=True):
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=FLOAT32), got, wanted)
 

@@ -10,12 +10,12 @@ from ssplat_jax.core.errors import InputError, StorageError
 from ssplat_jax.model.network import init_params
 from ssplat_jax.storage.weights import (
     WeightsFacts,
+    changed_shares,
     check_params,
     describe_weights,
     load_params,
     load_weights,
     save_weights,
-    stage_turns,
 )
 from tests.model.small import random_params
 from tests.streaming.narrow_model import NARROW
@@ -61,25 +61,25 @@ def test_overflowing_weights_are_not_saved(params, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_training_turns_a_stage_and_decay_does_not():
+def test_training_changes_a_stage_and_decay_does_not():
     """Also where a later training added a stage, which is compared with its own start."""
     first, later = (init_params(jax.random.key(seed), TINY) for seed in (3, 7))
     params = jax.tree.map(lambda x: 0.9 * x, first)
     rng = np.random.default_rng(0)
     params["encoder"] = jax.tree.map(lambda x: x + 0.1 * rng.normal(size=x.shape), params["encoder"])
     provenance = {"recipe": {"seed": 7}, "fresh": ["evidence"], "before": {"recipe": {"seed": 3}}}
-    turns = stage_turns(params | {"evidence": later["evidence"]}, WeightsFacts(TINY, provenance, 0))
+    shares = changed_shares(params | {"evidence": later["evidence"]}, WeightsFacts(TINY, provenance, 0))
     before, after = (np.asarray(ravel_pytree(tree["encoder"])[0], np.float64) for tree in (first, params))
     cosine = before @ after / np.linalg.norm(before) / np.linalg.norm(after)
-    assert turns.pop("encoder") == pytest.approx(np.sqrt(1 - cosine**2), rel=1e-4)
-    assert len(turns) > 3 and max(turns.values()) < 1e-6
-    assert stage_turns(later, WeightsFacts(TINY, provenance, 0))["encoder"] > 0.5
+    assert shares.pop("encoder") == pytest.approx(np.sqrt(1 - cosine**2), rel=1e-4)
+    assert len(shares) > 3 and max(shares.values()) < 1e-6
+    assert changed_shares(later, WeightsFacts(TINY, provenance, 0))["encoder"] > 0.5
 
 
 def test_matcher_and_evidence_head_of_the_shipped_weights_are_trained_and_other_stages_are_not():
     facts = describe_weights("tiny")
     assert facts.config == preset("tiny") and facts.num_bytes < 8e6
-    turns = stage_turns(load_params("tiny"), facts)
+    shares = changed_shares(load_params("tiny"), facts)
     trained = ("encoder", "cost_volume", "evidence")
-    assert min(turns[name] for name in trained) > 0.3
-    assert max(turns[name] for name in turns if name not in trained) < 0.01
+    assert min(shares[name] for name in trained) > 0.3
+    assert max(shares[name] for name in shares if name not in trained) < 0.01

@@ -65,7 +65,7 @@ def streamed(session, capture, num_chunks):
     for chunk in (next(fed) for _ in range(num_chunks)):
         # The step gives its cache away at the next chunk.
         outputs.append((chunk.chunk, chunk.output, jax.tree.map(np.asarray, session.cache), session.gaussians()))
-    return (order[: 4 * num_chunks], frame.to_dict(), chunk.frame.to_dict()), outputs
+    return (order[: 4 * num_chunks], frame.to_dict(), chunk.stream_frame.to_dict()), outputs
 
 
 def test_a_replaced_future_changes_no_chunk_before_it(capture, start):
@@ -87,9 +87,9 @@ def test_pushed_views_give_what_the_causal_stream_gives(capture, start):
     wanted = [fed.output for fed in feed_chunks(driver, capture, range(NUM_FRAMES), frame)]
     assert not np.asarray(live.gaussians().opacities).any() and live.cache is None
     got = [*push(live, capture, range(NUM_FRAMES)), live.flush()]
-    assert live.flush() is None and live.frame is not None
-    np.testing.assert_allclose(live.frame.origin, frame.origin, atol=1e-12)
-    assert live.frame.scale == pytest.approx(frame.scale, rel=1e-9)
+    assert live.flush() is None and live.stream_frame is not None
+    np.testing.assert_allclose(live.stream_frame.origin, frame.origin, atol=1e-12)
+    assert live.stream_frame.scale == pytest.approx(frame.scale, rel=1e-9)
     for output, expected in zip(got, wanted, strict=True):
         np.testing.assert_allclose(output.depths, expected.depths, rtol=2e-3)  # poses were inverted twice
     assert live.cache_facts()["num_seen"] == driver.cache_facts()["num_seen"]
@@ -127,7 +127,7 @@ def test_pushed_masks_give_what_a_masked_capture_gives(capture):
         dataclasses.replace(f, is_masked=not mask.all()) for f, mask in zip(capture.frames, masks, strict=True)
     )
     masked = dataclasses.replace(capture, frames=frames, pixels=dataclasses.replace(capture.pixels, masks=masks))
-    driver, live = (Session(model, model.init(jax.random.key(0)), revise=online_refinement(model)) for _ in range(2))
+    driver, live = (Session(model, model.init(jax.random.key(0)), refine=online_refinement(model)) for _ in range(2))
     list(feed_chunks(driver, masked, range(8), masked.stream_frame(model.config)))
     for i in range(8):
         viewmat = np.linalg.inv(capture.frames[i].camtoworld)
@@ -200,7 +200,7 @@ def test_an_interrupt_loses_no_view(place, capture, start, monkeypatch):
         patched.setattr(*target, interrupted)
         push(session, capture, range(4))
     assert len(push(session, capture, range(4, 5))) == (place != "waiting")
-    assert place != "waiting" or session.frame.near < capture.stream_frame(CAUSAL).near
+    assert place != "waiting" or session.stream_frame.near < capture.stream_frame(CAUSAL).near
     session.flush()
     assert_same_bits(session.cache, wanted.cache)
     assert session.flush() is None

@@ -49,7 +49,9 @@ def test_chunks_without_an_order_are_those_of_the_stream_order_and_a_given_order
     frame = capture.stream_frame(config)
     order = capture.stream_order(config, None, frame)
     for given, wanted in ((None, order), (order, order), (order[::-1], order[::-1])):
-        images = np.concatenate([np.asarray(chunk.images) for chunk in capture.chunks(config, given, frame=frame)])
+        images = np.concatenate(
+            [np.asarray(chunk.images) for chunk in capture.chunks(config, given, stream_frame=frame)]
+        )
         np.testing.assert_array_equal(images[:7], np.stack([capture.image(i) for i in wanted]))
 
 

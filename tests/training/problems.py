@@ -11,7 +11,7 @@ import numpy as np
 from ssplat_jax.training import loop
 from ssplat_jax.training.losses import DepthLoss, RenderingLoss
 from ssplat_jax.training.recipe import AFTER_MATCHER, MATCHER, Phase, Recipe, learning
-from ssplat_jax.training.samples import Views
+from ssplat_jax.training.samples import ViewSamples
 from tests.streaming.narrow_model import NARROW
 
 
@@ -79,7 +79,7 @@ NARROW_DEPTH = DepthLoss(capacity=1 << 10)
 STREAM_PHASE = Phase(
     "stream",
     2,
-    Views(2, SIZE, num_targets=1),
+    ViewSamples(2, SIZE, num_targets=1),
     RenderingLoss(depth=NARROW_DEPTH, max_pairs=1 << 15),
     learning(*MATCHER, *AFTER_MATCHER),
     5e-4,

@@ -17,14 +17,20 @@ from ssplat_jax.storage.saved_states import first_difference
 from ssplat_jax.training import loop
 from ssplat_jax.training.capture_mix import CaptureGroup, CaptureMix, TrainingStart, learned_frames, open_mix
 from ssplat_jax.training.recipe import RECIPES, Phase, Recipe, learning
-from ssplat_jax.training.samples import Views, capture_sample, held_out_sample, log_depths_at_cells, procedural_sample
+from ssplat_jax.training.samples import (
+    ViewSamples,
+    capture_sample,
+    held_out_sample,
+    log_depths_at_cells,
+    procedural_sample,
+)
 from tests.badinputs.cases import make_capture
 from tests.streaming.narrow_model import NARROW
 from tests.training.problems import STREAM_PHASE, assert_equal
 
 NUM_FRAMES, SIZE = 22, (64, 96)  # height and width
-VIEWS = Views(num_chunks=2, sizes=(SIZE,), num_targets=3)
-SMALL = Views(num_chunks=1, sizes=((32, 48),))
+VIEWS = ViewSamples(num_chunks=2, sizes=(SIZE,), num_targets=3)
+SMALL = ViewSamples(num_chunks=1, sizes=((32, 48),))
 
 
 @pytest.fixture(scope="module")

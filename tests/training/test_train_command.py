@@ -18,7 +18,7 @@ from ssplat_jax.storage.weights import describe_weights, load_params, load_weigh
 from ssplat_jax.training import crops, loop, recipe
 from ssplat_jax.training.capture_mix import open_mix
 from ssplat_jax.training.crops import Crops
-from ssplat_jax.training.recipe import EVIDENCE
+from ssplat_jax.training.recipe import EVIDENCE_RECIPE
 from tests.commands.command_fixture import make_capture
 from tests.model.small import random_params
 from tests.streaming.narrow_model import NARROW
@@ -29,8 +29,10 @@ CROPS = Crops(procedural=("procedural:room?frames=12",), width=64, size=(32, 48)
 
 
 def evidence_recipe(steps, **changes):
-    phase = dataclasses.replace(EVIDENCE.phases[0], steps=steps, samples=CROPS, warmup_steps=1, learning_rate=0.02)
-    return dataclasses.replace(EVIDENCE, phases=(dataclasses.replace(phase, **changes),))
+    phase = dataclasses.replace(
+        EVIDENCE_RECIPE.phases[0], steps=steps, samples=CROPS, warmup_steps=1, learning_rate=0.02
+    )
+    return dataclasses.replace(EVIDENCE_RECIPE, phases=(dataclasses.replace(phase, **changes),))
 
 
 @pytest.fixture(scope="module")

@@ -70,7 +70,7 @@ def test_too_many_gaussians_are_evenly_subsampled():
 def test_a_growing_run_is_what_its_deltas_add_up_to(tmp_path):
     origin = (5e6, 0.0, 1.0)  # so far that positions are counted from an offset
     stream, source = header(frame(origin)), GrowingScene(RunFolder(tmp_path))
-    assert source.changed() is None and source.frame() is None
+    assert source.changed() is None and source.stream_frame() is None
     deltas = [delta([0, 1], 1), delta([1, 2, 5], 2), delta([0], 3)]
     save_delta(tmp_path / "deltas" / "000004.npz", deltas[0], stream)
     first = source.changed()

@@ -12,7 +12,7 @@ from ssplat_jax.data.procedural.raycast import raycast, raycast_depths
 from ssplat_jax.data.procedural.scene import NUM_SOLIDS, Scene, clearance, fade_scene, scale_scene
 from ssplat_jax.data.procedural.scenes import SCENE_KINDS, SCENE_SHARES, SKY_DISTANCE, sample_scene
 
-Views = tuple[
+ViewArrays = tuple[
     Float[np.ndarray, "v h w 3"], Float[np.ndarray, "v h w"], Float[np.ndarray, "v 4 4"], Float[np.ndarray, "v 3 3"]
 ]
 
@@ -42,7 +42,7 @@ def training_sample(
     *,
     steps: tuple[float, float] = STEP_RANGE,
     kinds: tuple[str, ...] = (),
-) -> Views:
+) -> ViewArrays:
     """Rendered views of a random path through a random world.
 
     The units of a sample are such that the median depth is between 1.2 and 3.5 and all surfaces are between about 0.3
@@ -137,7 +137,7 @@ def _through_sensor(rng: np.random.Generator, scene: Scene, images: np.ndarray) 
 # -- captures for the demo --------------------------------------------------------------------------------------------
 
 
-def procedural_capture_arrays(name: str, num_frames: int, height: int, width: int, seed: int = 0) -> Views:
+def procedural_capture_arrays(name: str, num_frames: int, height: int, width: int, seed: int = 0) -> ViewArrays:
     """The views of the capture `procedural:NAME` in meters.
 
     `room`, `orbit` and `corridor` are smooth paths that cover their world evenly. `revisit` has weak textures, noise

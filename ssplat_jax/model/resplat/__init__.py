@@ -7,9 +7,14 @@ from ssplat_jax.config import StreamConfig
 from ssplat_jax.model.layers import rms_normalize
 from ssplat_jax.model.mixer import Mixer
 from ssplat_jax.model.mixer import mix_tokens as mix_neighbors
-from ssplat_jax.model.resplat.cost_volume import CostVolume, match
-from ssplat_jax.model.resplat.encoder import VITS, WIDTHS, Encoder, encode, grid_size
-from ssplat_jax.model.resplat.resplat_tokens import GaussianHead, TokenRegressor, read_shapes, regress_tokens
+from ssplat_jax.model.resplat.cost_volume import ReSplatCostVolume, match
+from ssplat_jax.model.resplat.encoder import VITS, WIDTHS, ReSplatEncoder, encode, grid_size
+from ssplat_jax.model.resplat.resplat_tokens import (
+    ReSplatGaussianHead,
+    ReSplatTokenRegressor,
+    read_shapes,
+    regress_tokens,
+)
 from ssplat_jax.model.resplat.torch_layers import ReSplatFeatures
 from ssplat_jax.model.resplat.upsampler import Upsampler, refine_depth
 
@@ -29,12 +34,12 @@ def stages(config: StreamConfig) -> dict:
     context = at(4, sum(WIDTHS) + WIDTHS[2] + mono_width // 4)
     inside = jnp.ones((v, side // 4, side // 4), bool)
     return {
-        "encoder": (Encoder(config), (at(1, 3), sources, valid[:, None])),
-        "cost_volume": (CostVolume(config), (at(stride, config.network.num_depths), features, valid)),
+        "encoder": (ReSplatEncoder(config), (at(1, 3), sources, valid[:, None])),
+        "cost_volume": (ReSplatCostVolume(config), (at(stride, config.network.num_depths), features, valid)),
         "upsampler": (Upsampler(config), (features, at(stride, 1)[..., 0], side, side)),
-        "tokens": (TokenRegressor(config), (at(4, 48), at(4, 1), at(4, 1), context)),
+        "tokens": (ReSplatTokenRegressor(config), (at(4, 48), at(4, 1), at(4, 1), context)),
         "mixer": (Mixer(config), (at(4, c), at(4, 3), inside, valid)),
-        "decoder": (GaussianHead(config), (jnp.zeros((1, c)),)),
+        "decoder": (ReSplatGaussianHead(config), (jnp.zeros((1, c)),)),
     }
 
 
@@ -50,7 +55,7 @@ def mix_tokens(params, feats, positions, inside, view_valid, config: StreamConfi
     return feats + mix_neighbors(params, feats, positions, inside, view_valid, config)
 
 
-class ResplatNetwork:
+class ReSplatNetwork:
     """The stages of ReSplat's network; fulfils `ssplat_jax.model.network.Network`."""
 
     stages = staticmethod(stages)

@@ -80,7 +80,7 @@ class ResBlock(nn.Module):
         return (x if x.shape[-1] == WIDTH else Conv(WIDTH, 1, name="skip_connection")(x)) + y
 
 
-class JointAttention(nn.Module):
+class ReSplatJointAttention(nn.Module):
     """Residual self-attention over the cells of all views of a chunk."""
 
     @nn.compact
@@ -109,13 +109,13 @@ class Upsample(nn.Module):
         return Conv(WIDTH, name="conv")(jnp.repeat(jnp.repeat(x, 2, axis=1), 2, axis=2))
 
 
-class UNet(nn.Module):
+class ReSplatUNet(nn.Module):
     """U-Net of three levels with equal width and joint attention at the lowest. Blocks have upstream's numbers."""
 
     @nn.compact
     def __call__(self, x, view_valid):
         res = lambda name: ResBlock(name=name)  # noqa: E731
-        joint = lambda name: JointAttention(name=name)  # noqa: E731
+        joint = lambda name: ReSplatJointAttention(name=name)  # noqa: E731
         x = Conv(WIDTH, name="input_blocks_0_0")(x)
         skips = [x]
         for i, is_downsample in enumerate((False, True, False, True, False), 1):
@@ -130,7 +130,7 @@ class UNet(nn.Module):
         return Conv(WIDTH, name="out_2")(nn.silu(group_norm("out_0")(x)))
 
 
-class CostVolume(nn.Module):
+class ReSplatCostVolume(nn.Module):
     """U-Net over [cost, CNN features, multi-view features, monocular features] to logits of the candidates."""
 
     config: StreamConfig
@@ -147,7 +147,7 @@ class CostVolume(nn.Module):
         x = jnp.concatenate([cost, features.cnn[-1], features.multiview, mono], axis=-1)
         y = Conv(WIDTH, name="regressor_0_0")(x)
         y = group_norm("regressor_0_1")(y)
-        y = UNet(name="regressor_0_3")(nn.gelu(y, approximate=False), view_valid)
+        y = ReSplatUNet(name="regressor_0_3")(nn.gelu(y, approximate=False), view_valid)
         y = Conv(WIDTH, name="regressor_0_4")(y)
         decoder = y + Conv(WIDTH, 1, name="regressor_residual_0")(x)
         hidden = nn.gelu(EdgePaddedConv(2 * WIDTH, name="depth_head_0_0")(decoder), approximate=False)
@@ -158,4 +158,4 @@ class CostVolume(nn.Module):
 def match(params, features: ReSplatFeatures, views: Views, config: StreamConfig) -> DepthDistribution:
     """P_i(k | u) on the matching grid by plane sweep, U-Net and softmax, in float32."""
     cost = plane_sweep(features, views, config)
-    return CostVolume(config).apply({"params": params}, cost, features, views.valid)  # pyright: ignore[reportReturnType]
+    return ReSplatCostVolume(config).apply({"params": params}, cost, features, views.valid)  # pyright: ignore[reportReturnType]

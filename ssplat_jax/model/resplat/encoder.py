@@ -61,7 +61,7 @@ class Backbone(nn.Module):
         return maps[0], maps[1], Conv(WIDTHS[2], 1, name="conv2")(x)
 
 
-class AttentionLayer(nn.Module):
+class ReSplatAttentionLayer(nn.Module):
     """Residual one-head attention in windows, with an optional feed-forward layer on [input, message]."""
 
     has_ffn: bool = False
@@ -85,8 +85,8 @@ class TransformerBlock(nn.Module):
     @nn.compact
     def __call__(self, windows, gather, together, allowed):
         context = gather(windows)
-        windows = AttentionLayer(name="self_attn")(windows, windows, together)
-        return AttentionLayer(has_ffn=True, name="cross_attn_ffn")(windows, context, allowed)
+        windows = ReSplatAttentionLayer(name="self_attn")(windows, windows, together)
+        return ReSplatAttentionLayer(has_ffn=True, name="cross_attn_ffn")(windows, context, allowed)
 
 
 class Transformer(nn.Module):
@@ -225,7 +225,7 @@ class VisionTransformer(nn.Module):
 
 
 # -- All branches -----------------------------------------------------------------------------------------------------
-class Encoder(nn.Module):
+class ReSplatEncoder(nn.Module):
     """Maps images to the features of all three branches."""
 
     config: StreamConfig
@@ -244,4 +244,4 @@ class Encoder(nn.Module):
 def encode(params, views: Views, config: StreamConfig) -> ReSplatFeatures:
     """Features of each view, with attention to its source views."""
     sources, source_valid = nearest_sources(views.viewmats, views.valid, config.network.num_sources)
-    return Encoder(config).apply({"params": params}, views.images, sources, source_valid)  # pyright: ignore[reportReturnType]
+    return ReSplatEncoder(config).apply({"params": params}, views.images, sources, source_valid)  # pyright: ignore[reportReturnType]

@@ -11,7 +11,7 @@ from ssplat_jax.model.resplat.torch_layers import ReSplatFeatures, resize
 from ssplat_jax.model.views import GRID_STRIDE, AnchoredDepth, DepthDistribution, TokenShapes, Views, repeat_cells
 
 
-class TokenRegressor(nn.Module):
+class ReSplatTokenRegressor(nn.Module):
     """Maps [patch, depth, match probability, context] to f, with a skip for all but the depth."""
 
     config: StreamConfig
@@ -47,7 +47,7 @@ def regress_tokens(
     match = repeat_cells(depth.probs.max(axis=-1, keepdims=True), config.network.match_stride // GRID_STRIDE)
     context = token_context(features, hf, wf)
     depths = jnp.exp(depth.log_depths)[..., None]
-    return TokenRegressor(config).apply({"params": params}, patches, depths, match, context)  # pyright: ignore[reportReturnType]
+    return ReSplatTokenRegressor(config).apply({"params": params}, patches, depths, match, context)  # pyright: ignore[reportReturnType]
 
 
 # -- Gaussian head: a two-layer MLP -----------------------------------------------------------------------------------
@@ -57,7 +57,7 @@ ROWS = (4, 3, 1, 2)
 pixel is not used: a pivot's Gaussian is at the pivot's position."""
 
 
-class GaussianHead(nn.Module):
+class ReSplatGaussianHead(nn.Module):
     """Maps features to raw rotation, scale, opacity, offset and SH residual."""
 
     config: StreamConfig
@@ -71,7 +71,7 @@ class GaussianHead(nn.Module):
 
 def read_shapes(params, feats: Float[Array, "m c"], config: StreamConfig) -> TokenShapes:
     """Shapes predicted from features of any float dtype, in float32."""
-    raw = GaussianHead(config).apply({"params": params}, feats.astype(jnp.float32))
+    raw = ReSplatGaussianHead(config).apply({"params": params}, feats.astype(jnp.float32))
     rotation, scale, opacity, _, sh = jnp.split(raw, np.cumsum(ROWS).tolist(), axis=-1)  # pyright: ignore[reportArgumentType]
     return TokenShapes(
         logit_opacities=opacity[:, 0],
