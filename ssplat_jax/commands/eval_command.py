@@ -27,15 +27,10 @@ class Eval(StreamOptions):
     """Index file {scene: {"context": [], "target": []} | null} that names the frames, instead of a protocol."""
     scene: str | None = None
     """Scene of the index; default the capture's name."""
-    over_black: bool = False
-    """Pictures show holes black instead of in the colors around them."""
-    one_exposure: bool = False
-    """Pictures are at the exposure of the first views instead of that of the nearest streamed ones."""
 
     def run(self) -> int:
         from ssplat_jax.core.console import Reporter
         from ssplat_jax.evaluation.lpips import installed_lpips
-        from ssplat_jax.evaluation.scoring import Display
         from ssplat_jax.runs.evaluate_run import EvalOptions, evaluate_run
         from ssplat_jax.storage.run_folder import lock_folder
 
@@ -44,7 +39,6 @@ class Eval(StreamOptions):
         options = EvalOptions(
             size=parse_size(self.size),
             lpips_weights=installed_lpips(),
-            display=Display(self.over_black, self.one_exposure),
             **{name: getattr(self, name) for name in names},
         )
         with lock_folder(self.out):
@@ -64,9 +58,6 @@ class Eval(StreamOptions):
             f" {reference['nearest_view_psnr']:.2f}, a mean color {reference['mean_color_psnr']:.2f});"
             f" {metrics['chunk_ms']['median']:.0f} ms a chunk; {self.out}/report.html, {self.out}/metrics.json"
         )
-        if self.over_black or self.one_exposure:
-            how = (" over black" if self.over_black else "") + (" at one exposure" if self.one_exposure else "")
-            print(f"pictures{how}: {metrics['pictures']['psnr']:.2f} dB")
         if refined := metrics.get("refinement"):
             print(
                 f"before {refined['steps']} refinement steps of {refined['seconds_per_step']:.2f} s:"

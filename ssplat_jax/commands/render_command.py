@@ -30,8 +30,6 @@ class Render:
     """Size WxH of the pictures; default the capture's own."""
     over_black: bool = False
     """Show holes of the scene black instead of in the colors around them."""
-    one_exposure: bool = False
-    """Show a run's scene at the exposure of its first views instead of the middle one of all."""
     film: int | None = None
     """Also write film.mp4 at 24 frames a second (extra `video`): FILM frames from each camera to the next, or with
     --film-path orbit FILM frames in all."""
@@ -63,7 +61,6 @@ class Render:
             stride=self.stride,
             max_views=self.max_views,
             over_black=self.over_black,
-            one_exposure=self.one_exposure,
             film=film,
             reporter=reporter,
         )

@@ -24,8 +24,6 @@ class Run(StreamOptions):
     """Remove the run in the folder and start anew."""
     deltas: bool = False
     """Also write the changes of each chunk, deltas/<views so far>.npz, for `ssplat view` to follow."""
-    hold_back: int = 0
-    """Keep so many evenly spread frames out of the stream, and score them every fourth chunk."""
     view: bool = False
     """Open a viewer beside the run, which shows the scene while it grows; implies --deltas (extra `viewer`)."""
     port: int = 8080
@@ -58,8 +56,6 @@ class Run(StreamOptions):
             raise InputError("--port: wanted --view beside it, which it is for; got none.")
         if self.watch and split_options(self.path)[1]:
             raise InputError("--watch: wanted poses as transforms.json has them, got axes or poses of another kind.")
-        if self.watch and self.hold_back:
-            raise InputError("--hold-back: wanted a capture that is complete, got --watch; leave one out.")
 
     def _stream_and_refine(self) -> int:
         """Streams, prints a summary, then refines if requested; returns the exit code."""
@@ -75,7 +71,6 @@ class Run(StreamOptions):
             save_every=self.save_every,
             overwrite=self.overwrite,
             deltas=self.deltas or self.view,
-            num_held_back=self.hold_back,
             revise=self.revise,
             quiet_seconds=self.quiet_seconds if self.watch else None,
         )

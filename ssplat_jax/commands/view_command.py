@@ -27,8 +27,6 @@ class View:
     """Most Gaussians sent to a browser; of larger scenes an even selection is sent, enlarged to cover as much."""
     over_black: bool = False
     """Show the scene over black instead of the browser's background."""
-    one_exposure: bool = False
-    """Show a run's scene at the exposure of its first views instead of the middle one of all."""
 
     def run(self) -> int:
         from ssplat_jax.core.console import Reporter
@@ -38,7 +36,7 @@ class View:
         require_positive(port=self.port, most=self.most)
         reporter = Reporter(quiet=False)
         ended = view_scene(
-            open_source(self.scene, one_exposure=self.one_exposure),
+            open_source(self.scene),
             host=self.host,
             port=self.port,
             max_gaussians=self.most,

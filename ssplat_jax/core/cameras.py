@@ -1,4 +1,4 @@
-"""Pinhole cameras, in the conventions of `ssplat_jax.core.conventions`."""
+"""Pinhole cameras, in the conventions of `docs/conventions.md`."""
 
 from types import ModuleType
 from typing import Any

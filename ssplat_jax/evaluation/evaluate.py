@@ -5,8 +5,6 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-
 from ssplat_jax.core.atomic import write_atomic
 from ssplat_jax.core.console import Reporter
 from ssplat_jax.core.gaussians import Gaussians
@@ -18,7 +16,6 @@ from ssplat_jax.evaluation.lpips import LpipsWeights
 from ssplat_jax.evaluation.pictures import save_comparison
 from ssplat_jax.evaluation.psnr_ssim import SSIM_ARGUMENTS
 from ssplat_jax.evaluation.scoring import (
-    Display,
     baselines,
     check_scorable,
     exposures_to_json,
@@ -46,7 +43,6 @@ def evaluate(
     refine_steps: int = 0,
     revise: str | None = None,
     scene: str | None = None,
-    display: Display | None = None,
 ) -> dict:
     """Streams, scores and times; writes metrics, split, index and a picture per target into `out`.
 
@@ -67,7 +63,6 @@ def evaluate(
         revise: `poses` adjusts those of the context before it is streamed, `auto` does if they are off
             (`poses.adjust_poses`); targets keep theirs.
         scene: name in `index.json`; by default the capture's.
-        display: how pictures are made; the block `pictures` of the metrics holds it, and the mean PSNR of the pictures.
 
     Returns:
         The metrics as written.
@@ -117,10 +112,9 @@ def evaluate(
         refinement = {"refinement": {**done, "before": before}}
     middle = capture.camera(split.targets[len(split.targets) // 2], stream_frame)
     cost["peak_memory_bytes"] = peak_memory(session, middle).bytes
-    display = display or Display()
     scores = []
     for i in split.targets:
-        view = score_view(gaussians, capture, i, stream_frame, exposures, lpips_weights, display)
+        view = score_view(gaussians, capture, i, stream_frame, exposures, lpips_weights)
         save_comparison(folder.target(i), view.target, view.color, view.depth, stream_frame.depth_range)
         scores.append(view.score)
     timing = measure_latency(session, recent, middle)
@@ -133,7 +127,6 @@ def evaluate(
         "context_views": len(split.context),
         "target_views": len(split.targets),
         **mean_scores(scores),
-        "pictures": dataclasses.asdict(display) | {"psnr": round(float(np.mean([*map(display.psnr, scores)])), 4)},
         "ssim_arguments": SSIM_ARGUMENTS,
         "adjusted_poses": None if adjusted is None else adjusted.reason,
         **refinement,

@@ -55,26 +55,12 @@ class ViewScore:
 
 
 @dataclasses.dataclass(frozen=True)
-class Display:
-    """Rules by which a rendered view becomes a picture; with both flags it is the literal image."""
-
-    over_black: bool = False  # holes stay black instead of being filled
-    one_exposure: bool = False  # at the scene's own exposure, that of the first views
-
-    def psnr(self, score: ViewScore) -> float:
-        """The PSNR, in dB, of the picture."""
-        if self.over_black:
-            return score.literal.psnr if self.one_exposure else score.psnr_over_black
-        return score.psnr_one_exposure if self.one_exposure else score.shown.psnr
-
-
-@dataclasses.dataclass(frozen=True)
 class ScoredView:
     """A rendered view, its scores, and the image that it was compared with."""
 
     score: ViewScore
     target: Float[np.ndarray, "h w 3"]
-    color: Float[np.ndarray, "h w 3"]  # the picture: by default what `score.shown` compares; clipped to [0, 1]
+    color: Float[np.ndarray, "h w 3"]  # what `score.shown` compares
     depth: Float[np.ndarray, "h w"]  # stream units, 0 where nothing is
 
 
@@ -131,7 +117,6 @@ def score_view(
     stream_frame: StreamFrame,
     exposures: Exposures,
     lpips_weights: LpipsWeights | None = None,
-    display: Display | None = None,
 ) -> ScoredView:
     """Renders frame `i` of a capture and scores it.
 
@@ -142,7 +127,6 @@ def score_view(
         stream_frame: the similarity between the capture's frame and the stream's.
         exposures: exposures of the streamed frames; may be empty.
         lpips_weights: with them LPIPS is scored too.
-        display: how the picture is made; the scores do not depend on it.
 
     Raises:
         InputError: the image is damaged.
@@ -161,9 +145,7 @@ def score_view(
         psnr_one_exposure=psnr(_displayed(filled), target, seen),
         coverage=float(np.asarray(out.alpha).mean()),
     )
-    display = display or Display()
-    picture = _displayed(over_black if display.over_black else filled, 1.0 if display.one_exposure else exposure)
-    return ScoredView(score, target, picture, np.asarray(out.depth))
+    return ScoredView(score, target, color, np.asarray(out.depth))
 
 
 def _displayed(image: Float[np.ndarray, "h w 3"], exposure: Float[np.ndarray, "3"] | float = 1.0):

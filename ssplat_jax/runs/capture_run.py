@@ -6,7 +6,7 @@ frames of a capture, or of a folder that is still being written -> chunks -> ses
 
 import dataclasses
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +16,6 @@ from ssplat_jax.core.errors import InputError, refusal, require_positive
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.open_capture import is_done, open_capture, open_growing, without_tilde
 from ssplat_jax.data.readers.transforms_json import num_listed
-from ssplat_jax.evaluation.scoring import score_targets
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.poses.adjust_poses import check_look_ahead
 from ssplat_jax.runs.open_run import OpenRun, open_run
@@ -30,9 +29,6 @@ from ssplat_jax.streaming.scene_delta import SceneFeed
 
 LARGE = 640 * 480
 """Pixels of an image above which a run says that smaller ones take less time."""
-
-CHUNKS_PER_SCORE = 4
-"""Held-back frames are scored after every so many chunks: to decode and to draw takes about as long as a chunk."""
 
 POLL_SECONDS = 0.25
 """Seconds between two looks at a folder that is still being written."""
@@ -49,7 +45,6 @@ class RunOptions:
     save_every: int = 8  # chunks between saved states
     overwrite: bool = False  # remove the run that the folder holds and start anew
     deltas: bool = False  # also write what each chunk changed in the scene, in the stream frame
-    num_held_back: int = 0  # frames, evenly spread, that are not streamed but scored every few chunks
     revise: str | None = None  # `poses` or `auto`: adjusted before the stream, see `run_poses.capture_to_stream`
     quiet_seconds: float | None = None  # the capture is still being written; without a new frame for so long it ends
 
@@ -126,7 +121,7 @@ def _stream(
                 interrupts.has_work = True
                 run.take(fed)
                 deltas.write()
-                record_chunk(run, fed, source.held_back)
+                record_chunk(run, fed)
                 advance(run.num_views)
                 if number % options.save_every == 0:
                     run.save()
@@ -151,10 +146,9 @@ class WholeCapture:
             # Opened anew, as `refine` and `export` will: a procedural capture renders other images for another size.
             scaled = capture.scaled(options.scale)
             capture = open_capture(path, size=(scaled.width, scaled.height))
-        taken = list(range(0, len(capture), options.stride))[: options.max_views]
-        check_num_frames(len(taken), path)
         self.capture = capture
-        self.indices, self.held_back = hold_back(taken, options.num_held_back)
+        self.indices = list(range(0, len(capture), options.stride))[: options.max_views]
+        check_num_frames(len(self.indices), path)
         self.total: int | None = len(self.indices)
 
     def chunks(self, run: OpenRun, interrupts: Interrupts) -> Iterator[FedChunk]:
@@ -169,8 +163,6 @@ class GrowingCapture:
     A frame that cannot be read yet holds back those after it. Nothing more will come once the folder holds a file
     `done`, or once for some seconds no frame has been listed and none has become complete.
     """
-
-    held_back: Sequence[int] = ()
 
     def __init__(self, path: str, options: RunOptions, quiet_seconds: float, reporter: Reporter) -> None:
         self._path, self._options = without_tilde(path), options
@@ -290,17 +282,9 @@ class DeltaWriter:
         save_delta(run.folder.delta(run.num_views), self._feed.update(run.session.cache), header)
 
 
-def record_chunk(run: OpenRun, fed: FedChunk, held_back: Sequence[int]) -> None:
-    """Writes the record of a chunk that the run has just taken in, for the viewer and the report.
-
-    Every few chunks, and after the last, it has the mean PSNR of the frames `held_back`.
-    """
+def record_chunk(run: OpenRun, fed: FedChunk) -> None:
+    """Writes the record of a chunk that the run has just taken in, for the viewer and the report."""
     facts, capture = run.session.cache_facts(), run.capture
-    number = -(-run.num_views // run.session.model.config.stream.chunk_size) - 1  # of the chunk, from 0
-    psnr = None
-    if held_back and (run.num_views == len(run.indices) or number % CHUNKS_PER_SCORE == 0):
-        scores = score_targets(run.session.gaussians(), capture, tuple(held_back), run.stream_frame, run.exposures)
-        psnr = scores["shown"]["psnr"]
     views = []
     for i, image in zip(fed.frames, np.asarray(fed.chunk.images), strict=False):  # without the padding
         pose, exposure = capture.frames[i].camtoworld, np.asarray(run.exposures[i], np.float64)
@@ -312,24 +296,8 @@ def record_chunk(run: OpenRun, fed: FedChunk, held_back: Sequence[int]) -> None:
         seconds=round(fed.seconds, 4),
         occupancy=round(facts["voxels"] / facts["capacity"], 4),
         num_gaussians=int(facts["decoded"]),
-        held_back_psnr=psnr,
     )
     save_chunk_record(run.folder.chunk_record(run.num_views), record)
-
-
-def hold_back(indices: Sequence[int], count: int) -> tuple[list[int], list[int]]:
-    """Splits frames into those to stream and `count` evenly spread ones to hold back.
-
-    Raises:
-        InputError: fewer than two frames would be left to stream.
-    """
-    if count == 0:
-        return list(indices), []
-    if not 0 <= count <= len(indices) - 2:
-        wanted, fix = f"0 to {max(len(indices) - 2, 0)} of the {len(indices)} frames", "hold back fewer"
-        raise refusal("--hold-back", wanted=wanted, got=str(count), fix=fix)
-    places = {round((k + 0.5) * len(indices) / count - 0.5) for k in range(count)}
-    return [i for k, i in enumerate(indices) if k not in places], [indices[k] for k in sorted(places)]
 
 
 def check_num_frames(count: int, path: str) -> None:

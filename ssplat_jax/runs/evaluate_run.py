@@ -16,7 +16,6 @@ from ssplat_jax.data.posed_image import split_options, with_options
 from ssplat_jax.data.split import Index, Split, choose_split, index_to_json, read_index, split_of_scene
 from ssplat_jax.evaluation.evaluate import evaluate
 from ssplat_jax.evaluation.lpips import LpipsWeights
-from ssplat_jax.evaluation.scoring import Display
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.refinement import online_refinement
 from ssplat_jax.runs.run_results import report_eval
@@ -43,7 +42,6 @@ class EvalOptions:
     refine_steps: int = 0
     revise: str | None = None  # `poses` or `auto`: adjusted before the stream
     lpips_weights: LpipsWeights | None = None
-    display: Display = dataclasses.field(default_factory=Display)
 
 
 def evaluate_run(
@@ -81,7 +79,6 @@ def evaluate_run(
             refine_steps=options.refine_steps,
             revise=options.revise,
             scene=scene,
-            display=options.display,
         )
         report_eval(RunFolder(out), metrics)
         return metrics

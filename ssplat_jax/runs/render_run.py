@@ -12,7 +12,7 @@ from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.console import Reporter
 from ssplat_jax.core.errors import refusal, require_positive
 from ssplat_jax.core.false_colors import color_depth, color_normals, eight_bits, scale_ends
-from ssplat_jax.core.gaussians import Gaussians, mean_color, scale_colors
+from ssplat_jax.core.gaussians import Gaussians, mean_color
 from ssplat_jax.core.kept_programs import Kept
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.data.camera_path import camera_path, orbit_path
@@ -22,7 +22,7 @@ from ssplat_jax.rasterizer import effects_for, fill_holes, render
 from ssplat_jax.rasterizer.effects import FILTERS
 from ssplat_jax.runs.run_poses import open_capture_of_scene
 from ssplat_jax.scene_files.formats import load_scene
-from ssplat_jax.storage.run_folder import RunFolder, lock_folder, scene_exposure
+from ssplat_jax.storage.run_folder import RunFolder, lock_folder
 from ssplat_jax.storage.video_writer import VideoWriter
 
 KINDS = ("color", "depth", "normals")
@@ -55,7 +55,6 @@ def render_run(
     stride: int,
     max_views: int | None,
     over_black: bool,
-    one_exposure: bool = False,
     film: FilmOptions | None,
     reporter: Reporter,
 ) -> int:
@@ -71,8 +70,6 @@ def render_run(
         stride: every `stride`-th camera is used.
         max_views: stop after this many pictures.
         over_black: show holes black instead of in the colors around them.
-        one_exposure: show the scene at the exposure of the first streamed views; with `over_black` a picture of 8 bits
-            is then the image of the `literal` score.
         film: the film along or around these cameras; None for no film.
         reporter: shows progress.
 
@@ -80,8 +77,8 @@ def render_run(
         The number of pictures, without those of the film.
 
     Raises:
-        InputError: the scene or the capture is unusable, the capture lies in `out`, `out` holds a run, a film is wanted
-            without PyAV, or one exposure of a scene whose run is unknown.
+        InputError: the scene or the capture is unusable, the capture lies in `out`, `out` holds a run, or a film is
+            wanted without PyAV.
         StorageError: `out` cannot be written, or adjusted poses of the scene's run are damaged.
     """
     require_positive(stride=stride, **({} if max_views is None else {"max_views": max_views}))
@@ -91,9 +88,6 @@ def render_run(
     if splats.render_mode not in FILTERS:
         fix = "render it where it was made"
         raise refusal(str(file), wanted="3D Gaussians", got=f"a scene of {splats.render_mode}", fix=fix)
-    if one_exposure:
-        factors = jnp.asarray(1.0 / scene_exposure(scene), jnp.float32)
-        splats = scale_colors(splats, factors)
     capture, folder = open_capture_of_scene(scene, path, size, reporter), RunFolder(out)
     capture.check_output_folder(out)
     folder.check_no_run()

@@ -178,8 +178,6 @@ def report_run(
     if records:
         facts.append(("a chunk, median", f"{np.median([r.seconds for r in records]):.2f} s"))
         facts.append(("of the cache in use", f"{records[-1].occupancy:.0%}"))
-    if held_back := [r.held_back_psnr for r in records if r.held_back_psnr is not None]:
-        facts.append(("held-back views as shown", f"{held_back[-1]:.2f} dB"))
     weights = "" if weights == params_digest(load_params("tiny")) else " --weights WEIGHTS"
     out, capture, film = map(shlex.quote, (str(folder.path), path, f"{folder.path}_film"))
     commands = [
@@ -240,14 +238,12 @@ def _save(folder: RunFolder, metrics: dict[str, Any], pictures: list[tuple[Path,
 
 
 def _stream_rows(records: Sequence[ChunkRecord]) -> list[tuple[str, ...]]:
-    """Time, occupancy, scene size and held-back score over the views streamed, below a header; empty without chunks."""
-    rows = [("views", "time of a chunk", "cache in use", "Gaussians", "held-back views as shown", "exposure (RGB)")]
+    """Time, occupancy and scene size over the views streamed, below a header; empty without chunks."""
+    rows = [("views", "time of a chunk", "cache in use", "Gaussians", "exposure (RGB)")]
     for k in evenly_spread(len(records), MOST_CHUNKS):
         r = records[k]
-        psnr = "" if r.held_back_psnr is None else f"{r.held_back_psnr:.2f} dB"
         exposure = " ".join(f"{factor:.2f}" for factor in np.mean([view.exposure for view in r.views], axis=0))
-        figures = (f"{r.num_views}", f"{r.seconds:.2f} s", f"{r.occupancy:.0%}", f"{r.num_gaussians:,}")
-        rows.append((*figures, psnr, exposure))
+        rows.append((f"{r.num_views}", f"{r.seconds:.2f} s", f"{r.occupancy:.0%}", f"{r.num_gaussians:,}", exposure))
     return rows if records else []
 
 

@@ -48,7 +48,6 @@ class ChunkRecord:
     seconds: float  # of the step, without compiling
     occupancy: float  # share of the cache's voxels that are in use
     num_gaussians: int  # shown
-    held_back_psnr: float | None = None  # dB, mean of the shown scores; None where none was taken
 
 
 def save_chunk_record(path: Path, record: ChunkRecord) -> None:

@@ -2,14 +2,10 @@
 
 import contextlib
 import fcntl
-import json
 import os
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
-
-import numpy as np
-from jaxtyping import Float
 
 from ssplat_jax.core.atomic import previous_path
 from ssplat_jax.core.errors import InputError, StorageError, refusal
@@ -111,28 +107,6 @@ class RunFolder:
     def clear_targets(self) -> None:
         """Removes the pictures of targets."""
         remove_numbered(self.path, "view_#####.png", and_folder=False)
-
-
-def scene_exposure(scene: Path) -> Float[np.ndarray, "3"]:
-    """The RGB factor from the exposure of a run's first views to that of its scene file.
-
-    Args:
-        scene: the folder of a run, or its scene.ply or refined.ply.
-
-    Raises:
-        InputError: no metrics of a run are beside the scene, or the scene is not one that the run wrote.
-    """
-    folder = RunFolder(scene if scene.is_dir() else scene.parent)
-    is_written = scene.is_dir() or scene.name in (folder.scene.name, folder.refined_scene.name)
-    try:
-        factors = np.array(json.loads(folder.metrics.read_bytes())["scene_exposure"], np.float64)
-        is_known = is_written and factors.shape == (3,) and bool((np.isfinite(factors) & (factors > 0)).all())
-    except (OSError, ValueError, TypeError, LookupError):
-        is_known = False
-    if not is_known:
-        got, fix = f"none for {scene}", "give the folder of a finished `ssplat run`, or leave the flag out"
-        raise refusal("--one-exposure", wanted="the exposure of the scene in metrics.json", got=got, fix=fix)
-    return factors
 
 
 def _numbered(folder: Path, name: str) -> list[Path]:

@@ -3,29 +3,21 @@
 Callbacks of viser run on threads of its own. They store what was chosen, and the viewer's loop acts on it.
 """
 
-import io
-import tempfile
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float64, UInt8
-from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from ssplat_jax.data.posed_image import pose_from_quat
-from ssplat_jax.scene_files.formats import save_gaussians
 from ssplat_jax.storage.chunk_records import RecordedView, open_thumbnail
 from ssplat_jax.viewer.scene_sources import ViewedScene
 from ssplat_jax.viewer.stage import DRAFT, FINE, KINDS, Stage, draw
 
 SPLATS = "splats"
 """The choice of what to show that the browser draws itself."""
-
-RENDER_SECONDS = 30.0
-"""Time that a browser has for a screenshot."""
 
 ORBIT_SECONDS, POSES_PER_SECOND = 24.0, 24.0  # time of a turn, and speed along the path of the streamed cameras
 
@@ -53,8 +45,6 @@ class Browser:
         hint = "Streamed cameras with their images; click on one to go there."
         self._cameras = gui.add_checkbox("Cameras", initial_value=False, hint=hint)
         gui.add_button_group("Play", ("orbit", "path", "stop")).on_click(lambda event: self._play(event.target.value))
-        gui.add_button("Screenshot").on_click(lambda _: self._send_screenshot())
-        gui.add_button("Download scene").on_click(lambda _: self._send_scene())
         self._num_chunks = 0  # that the slider reaches
         self._node: Any = None  # the splats
         self._frusta: dict[int, Any] = {}  # by frame
@@ -140,8 +130,6 @@ class Browser:
             if records:
                 facts += f" from **{len(views)}** views"
                 facts += f"\n\nlast chunk {records[-1].seconds:.2f} s, {records[-1].occupancy:.0%} of the cache in use"
-            if scores := [record.held_back_psnr for record in records if record.held_back_psnr is not None]:
-                facts += f"\n\n{scores[-1]:.2f} dB PSNR of held-back views"
             self._facts.content = facts
         self._show_frusta(views if shows_cameras else [])
 
@@ -235,31 +223,6 @@ class Browser:
         elif choice == "path" and len(path := self._stage.run.path()):
             poses = [self._stage.to_browser(pose) for pose in path]
             self._motion = lambda seconds: self._go_to(poses[int(seconds * POSES_PER_SECOND) % len(poses)])
-
-    # -- downloads ----------------------------------------------------------------------------------------------------
-
-    def _send_screenshot(self) -> None:
-        """Downloads the window's picture as PNG: the browser's own, or that of the rasterizer."""
-        camera, scene, kind = self._client.camera, self._scene, self._kind.value
-        size = (int(camera.image_width), int(camera.image_height))
-        if kind == SPLATS or scene is None:
-            pixels = self._client.get_render(size[1], size[0], transport_format="png", timeout=RENDER_SECONDS)
-            paper = Image.new("RGBA", size, "black" if self._stage.over_black else "white")
-            picture = Image.alpha_composite(paper, Image.fromarray(pixels).convert("RGBA"))  # holes are transparent
-        else:
-            picture = Image.fromarray(self._draw(scene, kind, FINE))
-        encoded = io.BytesIO()
-        picture.convert("RGB").resize(size, Image.Resampling.LANCZOS).save(encoded, "PNG")
-        self._client.send_file_download(f"ssplat_{kind}.png", encoded.getvalue(), save_immediately=True)
-
-    def _send_scene(self) -> None:
-        """Downloads the scene that is shown as .ply, in the capture's frame."""
-        if (scene := self._scene) is None:
-            return
-        with tempfile.TemporaryDirectory() as folder:
-            file = Path(folder) / "scene.ply"
-            save_gaussians(file, scene.gaussians)
-            self._client.send_file_download(file.name, file.read_bytes(), save_immediately=True)
 
 
 def orbit(start: np.ndarray, target: np.ndarray, up: np.ndarray, seconds: float) -> Float64[np.ndarray, "3"]:

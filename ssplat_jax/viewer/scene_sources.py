@@ -19,7 +19,7 @@ from ssplat_jax.core.pytree import replace
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.scene_files.formats import load_scene
 from ssplat_jax.storage.chunk_records import load_delta, load_delta_header
-from ssplat_jax.storage.run_folder import RunFolder, scene_exposure
+from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.streaming.scene_delta import apply_confidences, apply_delta
 
 
@@ -36,20 +36,19 @@ class SceneFile:
 
     Args:
         path: the file.
-        one_exposure: give a run's scene at the exposure of its first views.
     """
 
     num_chunks = 1
 
-    def __init__(self, path: Path, *, one_exposure: bool = False) -> None:
+    def __init__(self, path: Path) -> None:
         self._stamp = None  # of scene and metrics at the last look
-        self.path, self.folder, self._one_exposure = path, RunFolder(path.parent), one_exposure
+        self.path, self.folder = path, RunFolder(path.parent)
 
     def changed(self) -> ViewedScene | None:
         """The scene if it has changed since the last call, else None.
 
         Raises:
-            InputError: there was no scene before and the file is none, or its exposure is wanted and unknown.
+            InputError: there was no scene before and the file is none.
         """
         stamp = scene, metrics = _stamp(self.path), _stamp(self.folder.metrics)
         if self._stamp is not None:
@@ -64,8 +63,6 @@ class SceneFile:
             if is_first:
                 raise
             return None  # another program may be in the middle of rewriting it: the scene so far stays
-        if self._one_exposure:
-            gaussians = scale_colors(gaussians, jnp.asarray(1.0 / scene_exposure(self.path), jnp.float32))
         return ViewedScene(gaussians)
 
     def stream_frame(self) -> StreamFrame | None:
@@ -107,12 +104,10 @@ class _Sum:
         self.stream_frame, self._exposure = StreamFrame.from_dict(header["frame"]), np.array(header["exposure"])
         self.applied.append((path.name, stamp))
 
-    def viewed(self, *, one_exposure: bool) -> ViewedScene:
+    def viewed(self) -> ViewedScene:
         """The scene in the capture's frame; there must be a delta."""
         assert self.stream_frame is not None
-        scene = jax.tree.map(jnp.asarray, self._scene)
-        if not one_exposure:
-            scene = scale_colors(scene, jnp.asarray(self._exposure, jnp.float32))
+        scene = scale_colors(jax.tree.map(jnp.asarray, self._scene), jnp.asarray(self._exposure, jnp.float32))
         gaussians = self.stream_frame.gaussians_to_capture(scene, offset=self.stream_frame.offset)
         return ViewedScene(replace(gaussians, offset=self.stream_frame.offset), self._confidences)
 
@@ -122,11 +117,10 @@ class GrowingScene:
 
     Args:
         folder: the folder of the run.
-        one_exposure: give the scene at the exposure of its first views instead of the middle one of those so far.
     """
 
-    def __init__(self, folder: RunFolder, *, one_exposure: bool = False) -> None:
-        self.path, self.folder, self._one_exposure = folder.path, folder, one_exposure
+    def __init__(self, folder: RunFolder) -> None:
+        self.path, self.folder = folder.path, folder
         self._newest, self._past = _Sum(), _Sum()
         self._refined: SceneFile | None = None
 
@@ -148,7 +142,7 @@ class GrowingScene:
             self._refined = None
             return streamed
         if self._refined is None:
-            self._refined = SceneFile(refined, one_exposure=self._one_exposure)
+            self._refined = SceneFile(refined)
         return self._refined.changed()
 
     def _streamed(self) -> ViewedScene | None:
@@ -170,7 +164,7 @@ class GrowingScene:
                     raise
                 self._newest = _Sum()  # the run is being started anew
                 return None
-        return self._newest.viewed(one_exposure=self._one_exposure)
+        return self._newest.viewed()
 
     def at(self, num_chunks: int) -> ViewedScene:
         """The scene as it was after so many chunks, at least one and not all.
@@ -183,7 +177,7 @@ class GrowingScene:
             self._past = _Sum()
         for name, stamp in wanted[len(self._past.applied) :]:
             self._past.add(self.folder.deltas / name, stamp)
-        return self._past.viewed(one_exposure=self._one_exposure)
+        return self._past.viewed()
 
     def stream_frame(self) -> StreamFrame | None:
         """The frame of the stream; None before the first delta."""
@@ -193,10 +187,8 @@ class GrowingScene:
 Source = SceneFile | GrowingScene
 
 
-def open_source(path: Path, *, one_exposure: bool = False) -> Source:
+def open_source(path: Path) -> Source:
     """The source at `path`: a scene file, or the deltas of a run's folder, or else its scene.
-
-    With `one_exposure`, scenes are at the exposure of the first views of their run.
 
     Raises:
         InputError: there is none.
@@ -204,10 +196,10 @@ def open_source(path: Path, *, one_exposure: bool = False) -> Source:
     folder = RunFolder(path)
     file = folder.best_scene if path.is_dir() else path
     if folder.deltas.is_dir() and (folder.delta_files() or not file.is_file()):
-        return GrowingScene(folder, one_exposure=one_exposure)
+        return GrowingScene(folder)
     if not file.is_file():
         raise InputError(
             f"{path}: wanted a scene file, or the folder of an `ssplat run` that has ended or writes --deltas, found"
             " neither; wait for its scene, or check the path."
         )
-    return SceneFile(file, one_exposure=one_exposure)
+    return SceneFile(file)

@@ -139,7 +139,6 @@ def test_usage_that_does_not_parse_is_short_and_exit_2(arguments, named, capsys)
             ("eval", "procedural:room?frames=12", "--refine", "-1", "--out", "x"),
             "--refine: wanted a number of steps of",
         ),
-        (("run", "procedural:room?frames=4", "--hold-back", "3", "--out", "x"), "--hold-back: wanted 0 to 2 of the 4"),
     ],
 )
 def test_bad_values_are_one_line_and_exit_2(arguments, named, capsys, tmp_path, monkeypatch):

@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import math
 
 import jax.numpy as jnp
 import numpy as np
@@ -110,13 +109,6 @@ def test_contradictory_frames_are_bad_usage(options, words, tmp_path, narrow, ca
     assert words in line.replace('"', "'") and not out.exists()
 
 
-def picture_psnr(path):
-    """PSNR of the middle third of a picture, the render, against the left one, the target."""
-    pixels = np.asarray(Image.open(path), np.float64) / 255
-    target, rendered = pixels[:, : SIZE[0]], pixels[:, SIZE[0] : 2 * SIZE[0]]
-    return -10 * math.log10(np.mean((target - rendered) ** 2))
-
-
 NUM_FADED = 7
 
 
@@ -149,23 +141,3 @@ def test_an_evaluation_refines_at_the_streamed_size_and_scores_at_the_captures(t
     refinement = metrics["refinement"]
     assert refinement["steps"] == 3 and refinement["skipped_steps"] == 0
     assert all(0 < abs(metrics[name]["psnr"] - refinement["before"][name]["psnr"]) < 3 for name in ("literal", "shown"))
-
-
-@pytest.mark.slow
-def test_pictures_show_what_their_flags_say(tmp_path, narrow):
-    """Pictures of 8 bits have the PSNR that the metrics give for their flags."""
-    capture, seen = make_capture(tmp_path / "capture", num_frames=7, size=SIZE), set()
-    for flags in ((), ("--over-black",), ("--one-exposure",), ("--over-black", "--one-exposure")):
-        out = tmp_path / "-".join(("out", *flags))
-        assert run("eval", str(capture), "--out", str(out), *flags, *narrow) == 0
-        metrics = read(out / "metrics.json")
-        scores = {
-            (): metrics["shown"]["psnr"],
-            ("--over-black",): metrics["psnr_over_black"],
-            ("--one-exposure",): metrics["psnr_one_exposure"],
-            ("--over-black", "--one-exposure"): metrics["literal"]["psnr"],
-        }
-        assert metrics["pictures"]["psnr"] == scores[flags]
-        assert picture_psnr(out / "view_00004.png") == pytest.approx(scores[flags], abs=0.05)
-        seen.add(scores[flags])
-    assert len(seen) > 1

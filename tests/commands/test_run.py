@@ -6,20 +6,16 @@ import shutil
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import monitoring
-from PIL import Image
 
 from ssplat_jax.commands.run_command import Run
 from ssplat_jax.config import QUALITIES, StreamConfig
 from ssplat_jax.core.atomic import previous_path
-from ssplat_jax.core.gaussians import scale_colors
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.model.streamsplat import StreamSplat
-from ssplat_jax.runs.capture_run import CHUNKS_PER_SCORE, RunResult, hold_back
-from ssplat_jax.scene_files.formats import load_scene, save_gaussians
+from ssplat_jax.runs.capture_run import RunResult
 from ssplat_jax.storage.chunk_records import (
     load_chunk_records,
     load_delta,
@@ -27,7 +23,6 @@ from ssplat_jax.storage.chunk_records import (
     open_thumbnail,
     save_chunk_record,
 )
-from ssplat_jax.storage.files import write_json
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.storage.saved_states import load_state
 from ssplat_jax.storage.weights import load_weights
@@ -184,15 +179,14 @@ def test_a_damaged_image_stops_the_stream_with_what_came_before_it_saved(finishe
     assert read(out / "metrics.json")["views"] == 12
 
 
-def test_a_run_records_its_chunks_and_scores_what_it_holds_back(narrow, tmp_path, capsys):
-    path, out = make_capture(tmp_path / "capture", num_frames=11, size=SIZE), tmp_path / "out"
-    assert run("run", path, "--out", out, "--hold-back", "2", *narrow) == 0
+def test_a_run_records_its_chunks(narrow, tmp_path):
+    path, out = make_capture(tmp_path / "capture", num_frames=9, size=SIZE), tmp_path / "out"
+    assert run("run", path, "--out", out, *narrow) == 0
     capture, folder = open_capture(path), RunFolder(out)
     records = load_chunk_records(folder.chunk_record_files())
     assert [r.num_views for r in records] == [4, 8, 9]
-    streamed, _ = hold_back(range(11), 2)
     views = [view for r in records for view in r.views]
-    assert sorted(view.frame for view in views) == streamed
+    assert sorted(view.frame for view in views) == list(range(9))
     metrics = read(folder.metrics)
     for view in views:
         np.testing.assert_array_equal(view.camtoworld, capture.frames[view.frame].camtoworld)
@@ -201,15 +195,6 @@ def test_a_run_records_its_chunks_and_scores_what_it_holds_back(narrow, tmp_path
         assert np.abs(open_thumbnail(view.thumbnail) / 255 - capture.image(view.frame)).mean() < 0.1  # JPEG of noise
     assert records[-1].num_gaussians == metrics["cache"]["decoded"]
     assert 0 < records[0].occupancy <= records[-1].occupancy <= 1 and all(r.seconds > 0 for r in records)
-    scored = [r.held_back_psnr is not None for r in records]
-    assert CHUNKS_PER_SCORE == 4 and scored == [True, False, True]
-    assert f"{records[-1].held_back_psnr:.2f} dB" in folder.report.read_text()
-
-
-def test_held_back_frames_are_spread_and_the_others_stay_in_order():
-    streamed, held = hold_back(range(0, 40, 2), 3)
-    assert held == [6, 20, 32] and streamed == [i for i in range(0, 40, 2) if i not in held]
-    assert hold_back([4, 5, 6], 0) == ([4, 5, 6], [])
 
 
 def test_refinement_follows_with_the_steps_of_the_quality(tmp_path, monkeypatch):
@@ -222,26 +207,6 @@ def test_refinement_follows_with_the_steps_of_the_quality(tmp_path, monkeypatch)
     assert Run("procedural:room", tmp_path, quality="accurate", quiet=True).run() == 0
     assert [(c.folder, c.steps, c.overwrite) for c in asked] == [(tmp_path, 100, False), (tmp_path, 30, True)]
     assert QUALITIES["best"].scale == 1.0 and Run("x", tmp_path, quality="fast").scale == 0.5
-
-
-def test_over_black_at_one_exposure_a_picture_is_the_literal_image(copied, tmp_path, capsys):
-    """The scene is stored at another exposure than that of its first views, which these flags show."""
-    capture, out = copied
-    metrics, middle = read(out / "metrics.json"), [0.5, 0.8, 1.6]
-    factors = jnp.asarray(np.array(middle) / metrics["scene_exposure"], jnp.float32)
-    save_gaussians(out / "scene.ply", scale_colors(load_scene(out / "scene.ply"), factors))
-    write_json(out / "metrics.json", metrics | {"scene_exposure": middle})
-    flags, pictures = ("--over-black", "--one-exposure", "--quiet"), tmp_path / "pictures"
-    assert run("render", out, capture, *flags, "--out", pictures) == 0
-    for score in metrics["seen_views"]:
-        i = score["frame"]
-        files = pictures / "views" / f"{i:05d}.png", capture / "images" / f"{i}.png"
-        found, target = (np.asarray(Image.open(file).convert("RGB"), np.float64) / 255 for file in files)
-        psnr = -10 * np.log10(np.mean((found - target) ** 2))
-        assert psnr == pytest.approx(score["literal"]["psnr"], abs=0.05)  # 8 bits
-    shutil.copy(out / "scene.ply", tmp_path / "scene.ply")
-    assert run("render", tmp_path / "scene.ply", capture, *flags, "--out", tmp_path / "p") == 2
-    assert "--one-exposure: wanted the exposure" in capsys.readouterr().err
 
 
 @pytest.mark.slow

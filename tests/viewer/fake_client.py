@@ -85,11 +85,11 @@ class Handle(SimpleNamespace):
 
 
 class FakeClient:
-    """The client, its panel and its scene: controls by label, nodes by name, pictures and downloads."""
+    """The client, its panel and its scene: controls by label, nodes by name, and pictures."""
 
     def __init__(self, width=48, height=32):
         self.client_id, self.gui, self.scene = 0, self, self
-        self.controls, self.nodes, self.backgrounds, self.downloads = {}, {}, [], {}
+        self.controls, self.nodes, self.backgrounds = {}, {}, []
         self.camera = SimpleNamespace(
             wxyz=np.array([1.0, 0.0, 0.0, 0.0]),
             position=np.zeros(3),
@@ -120,12 +120,3 @@ class FakeClient:
 
     def set_background_image(self, image, format, **_):
         self.backgrounds.append(image)
-
-    def send_file_download(self, filename, content, **_):
-        self.downloads[filename] = content
-
-    def get_render(self, height, width, **_):
-        picture = np.full((height, width, 4), 77, np.uint8)
-        picture[..., 3] = 255
-        picture[0] = 0  # a hole
-        return picture

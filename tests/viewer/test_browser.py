@@ -1,17 +1,14 @@
 """One browser: what it is sent for what a person chooses. Its client is a fake one."""
 
 import dataclasses
-import io
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from PIL import Image
 
 import ssplat_jax as ss
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.pytree import replace
-from ssplat_jax.scene_files.formats import load_ply
 from ssplat_jax.storage.chunk_records import ChunkRecord, RecordedView, make_thumbnail, save_chunk_record, save_delta
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.viewer import browser as browser_module
@@ -258,27 +255,6 @@ def test_playback_moves_the_camera_until_it_is_stopped(run, monkeypatch):
     run.update()
     np.testing.assert_allclose(run.client.camera.position, [-1.0, 0, 0], atol=1e-9)
     np.testing.assert_array_equal(run.client.camera.look_at, 0)
-
-
-def test_downloads_hold_the_scene_and_the_picture_in_sight(run, tmp_path):
-    run.grow()
-    run.grow()
-    run.choose("Chunk", 1)
-    run.controls["Download scene"].click()
-    file = tmp_path / "got.ply"
-    file.write_bytes(run.client.downloads["scene.ply"])
-    first = run.stage.source.at(1).gaussians
-    shown = np.asarray(first.opacities) > 0
-    np.testing.assert_allclose(load_ply(file).means, np.asarray(first.means)[shown], rtol=1e-6)
-    run.controls["Screenshot"].click()
-    with Image.open(io.BytesIO(run.client.downloads["ssplat_splats.png"])) as image:
-        assert image.size == SIZE
-        assert (np.asarray(image)[1:] == 77).all() and (np.asarray(image)[0] == 255).all()
-    run.choose("Show", "depth")
-    run.update()
-    run.controls["Screenshot"].click()
-    with Image.open(io.BytesIO(run.client.downloads["ssplat_depth.png"])) as image:
-        np.testing.assert_array_equal(np.asarray(image), run.client.backgrounds[-1])
 
 
 def test_a_scene_of_a_file_has_no_slider_and_no_path(tmp_path):

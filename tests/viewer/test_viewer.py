@@ -155,16 +155,15 @@ def test_a_scene_stays_until_the_next_metrics_are_there(tmp_path):
     """A run that ends again removes its metrics, writes its scene, and then writes its metrics."""
     file, metrics = tmp_path / "scene.ply", tmp_path / "metrics.json"
     ss.save_ply(file, scene(5))
-    metrics.write_text(json.dumps({"scene_exposure": [2.0, 1.0, 1.0]}))
-    source = open_source(tmp_path, one_exposure=True)
+    metrics.write_text("{}")
+    source = open_source(tmp_path)
     assert source.changed() is not None
     metrics.unlink()
     assert source.changed() is None
     ss.save_ply(file, scene(7))
     assert source.changed() is None
-    metrics.write_text(json.dumps({"scene_exposure": [4.0, 2.0, 1.0]}))
-    colors = [0.5 + 0.28209479 * np.asarray(x.sh[:, 0], np.float64) for x in (source.changed().gaussians, scene(7))]
-    np.testing.assert_allclose(colors[0] * [4.0, 2.0, 1.0], colors[1], atol=1e-6)
+    metrics.write_text("{}")
+    assert source.changed().gaussians.num_gaussians == 7
 
 
 def opened(path, max_gaussians=1000):
