@@ -27,8 +27,7 @@ from ssplat_jax.config import preset
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.data.open_capture import open_capture
-from ssplat_jax.evaluation import provenance
-from ssplat_jax.evaluation.cost import measure_latency, peak_memory
+from ssplat_jax.evaluation.cost import commit, machine, measure_latency, peak_memory, today
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.rasterizer.render import render, round_up
 from ssplat_jax.refinement import RefineConfig, refine
@@ -178,7 +177,7 @@ def main(scale: str, out: Path) -> None:
     """Runs all parts and writes the file after each."""
     if scale == "smoke":
         compile_quickly()
-    found: Row = {"machine": provenance.machine(), "date": provenance.today(), "commit": provenance.commit()}
+    found: Row = {"machine": machine(), "date": today(), "commit": commit()}
     found["device"] = jax.devices()[0].device_kind
     for part in (rasterizers, streams, refinement):
         since = time.perf_counter()

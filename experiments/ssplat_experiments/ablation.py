@@ -27,7 +27,7 @@ from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import Split, interleaved_split
 from ssplat_jax.evaluation.cost import peak_memory
-from ssplat_jax.evaluation.lpips import installed_lpips
+from ssplat_jax.evaluation.metrics import installed_lpips
 from ssplat_jax.evaluation.scoring import score_targets, score_view
 from ssplat_jax.model.network import complete_params
 from ssplat_jax.model.streamsplat import StreamSplat

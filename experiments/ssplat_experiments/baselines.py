@@ -25,7 +25,7 @@ from ssplat_jax.evaluation.cost import (
     live_bytes,
     render_bytes,
 )
-from ssplat_jax.evaluation.lpips import installed_lpips
+from ssplat_jax.evaluation.metrics import installed_lpips
 from ssplat_jax.evaluation.scoring import ImageScore, exposure_for, nearest_views, score_image
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.streaming.feed import Exposures

@@ -15,7 +15,7 @@ from ssplat_experiments.streams import make_room
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.console import Reporter
 from ssplat_jax.core.errors import InputError
-from ssplat_jax.evaluation import provenance
+from ssplat_jax.evaluation.cost import commit, machine, today
 from ssplat_jax.evaluation.pictures import save_image
 from ssplat_jax.storage.files import json_text, write_json
 
@@ -118,9 +118,9 @@ def _record(name: str, case: Case, rows: list[Row], seconds: float) -> dict[str,
         "request": case.request,
         "request_hash": case.hash,
         "config": case.config and case.config.hash,
-        "commit": provenance.commit(),
-        "date": provenance.today(),
-        "machine": provenance.machine(),
+        "commit": commit(),
+        "date": today(),
+        "machine": machine(),
         "seconds": round(seconds, 2),
         "rows": rows,
     }

@@ -27,7 +27,7 @@ from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import Split, paper_split
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.evaluation.cost import measure_latency, peak_memory
-from ssplat_jax.evaluation.lpips import installed_lpips
+from ssplat_jax.evaluation.metrics import installed_lpips
 from ssplat_jax.evaluation.scoring import ImageScore, mean_images, score_view
 from ssplat_jax.storage.weights import load_params
 from ssplat_jax.streaming.feed import Exposures, feed_capture

@@ -27,7 +27,7 @@ from ssplat_jax.core.errors import InputError, echo
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import Split
-from ssplat_jax.evaluation.lpips import installed_lpips
+from ssplat_jax.evaluation.metrics import installed_lpips
 from ssplat_jax.evaluation.scoring import check_scorable, mean_images, nearest_views, score_image
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 from ssplat_experiments.cases import PICTURE, Case, Row, measure_cases
 from ssplat_jax.core.atomic import write_atomic
 from ssplat_jax.core.console import Reporter
-from ssplat_jax.evaluation import provenance
+from ssplat_jax.evaluation.cost import commit
 from ssplat_jax.storage.files import write_json
 from ssplat_jax.storage.run_folder import make_writable
 
@@ -67,7 +67,7 @@ def run_study(study: Study, captures: Path | None, out: Path, scale: str, report
     """
     if scale == "smoke":
         compile_quickly()
-    provenance.commit()  # read now and kept: the files may change while the experiment runs
+    commit()  # read now and kept: the files may change while the experiment runs
     make_writable(out)
     cases = study.cases(captures, scale)
     write = lambda so_far: _write(study, out, scale, captures, _finished(study, so_far))  # noqa: E731

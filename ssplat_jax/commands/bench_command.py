@@ -30,7 +30,7 @@ class Bench:
     def run(self) -> int:
         options = {name: value for name, value in (("against", self.against), ("large", self.large)) if value}
         measure = load_plugin("ssplat_jax.benchmarks", self.name, options)
-        from ssplat_jax.evaluation.provenance import commit, machine, today
+        from ssplat_jax.evaluation.cost import commit, machine, today
         from ssplat_jax.storage.files import write_json
 
         result = {"machine": machine(), "date": today(), "commit": commit(), "rows": measure(**options)}

@@ -30,7 +30,7 @@ class Eval(StreamOptions):
 
     def run(self) -> int:
         from ssplat_jax.core.console import Reporter
-        from ssplat_jax.evaluation.lpips import installed_lpips
+        from ssplat_jax.evaluation.metrics import installed_lpips
         from ssplat_jax.runs.evaluate_run import EvalOptions, evaluate_run
         from ssplat_jax.storage.run_folder import lock_folder
 

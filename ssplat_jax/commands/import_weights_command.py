@@ -37,8 +37,7 @@ class ImportWeights:
     def run(self) -> int:
         import numpy as np
 
-        from ssplat_jax.storage.published_weights import as_published, import_params
-        from ssplat_jax.storage.weights import save_weights
+        from ssplat_jax.storage.weights import as_published, import_params, save_weights
 
         # The weights were trained with the behavior of that code; --set can change it.
         config = apply_changes(as_published(preset(self.preset)), self.set)

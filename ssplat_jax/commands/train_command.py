@@ -53,7 +53,7 @@ class Train:
 
     def run(self) -> int:
         from ssplat_jax.core.console import Reporter
-        from ssplat_jax.evaluation.lpips import installed_lpips
+        from ssplat_jax.evaluation.metrics import installed_lpips
         from ssplat_jax.storage.weights import describe_weights, params_digest, save_weights
         from ssplat_jax.training.capture_mix import open_mix
         from ssplat_jax.training.loop import train

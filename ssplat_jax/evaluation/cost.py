@@ -2,11 +2,19 @@
 
 On a CPU the memory is that of the largest program, by XLA's analysis: parameters, cache and inputs, temporaries, and
 results that are not written over inputs. On a GPU the allocator counts, from the start of the process.
+
+Every number that is published says where it comes from: `machine`, `commit` and `today`.
 """
 
 import dataclasses
+import datetime
 import functools
+import platform
+import re
+import subprocess
 import time
+from importlib.metadata import version
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -16,6 +24,7 @@ import numpy as np
 from ssplat_jax.cache import ensure_capacity
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.chunk import Chunk
+from ssplat_jax.core.cpu_backend import num_cores
 from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.rasterizer import render
 from ssplat_jax.rasterizer.render import render_program, round_up
@@ -148,3 +157,32 @@ def allocator_peak() -> int | None:
     """The most bytes in use since the process began, by the device's allocator; None where it does not count."""
     counters = jax.local_devices()[0].memory_stats()
     return None if counters is None else counters.get("peak_bytes_in_use")
+
+
+# -- where and when a number was measured ------------------------------------------------------------------------------
+
+
+@functools.cache
+def machine() -> str:
+    """The device that JAX computes on, its processor's cores, and the version of JAX."""
+    device, kind, facts = jax.devices()[0], None, Path("/proc/cpuinfo")
+    if device.platform == "cpu" and facts.exists():
+        kind = re.search(r"model name\s*: (.*)", facts.read_text())
+    name = device.device_kind if device.platform != "cpu" else kind[1] if kind else platform.machine()
+    return f"{name}, {num_cores()} cores, jax {jax.__version__}"
+
+
+@functools.cache
+def commit() -> str:
+    """The commit of the installed files, with `+` if the repository was changed since; else the package's version."""
+    git = functools.partial(subprocess.check_output, cwd=Path(__file__).parent, text=True, stderr=subprocess.DEVNULL)
+    try:
+        git(["git", "ls-files", "--error-unmatch", "--", Path(__file__).name])  # installed files are in no repository
+        return git(["git", "describe", "--always", "--dirty=+", "--abbrev=10", "--exclude=*"]).strip()
+    except (OSError, subprocess.CalledProcessError):
+        return f"version {version('ssplat-jax')}"
+
+
+def today() -> str:
+    """The date in UTC, as 2026-11-24."""
+    return datetime.datetime.now(datetime.UTC).date().isoformat()

@@ -12,9 +12,8 @@ from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.split import Split, index_to_json
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.evaluation.cost import NUM_CHUNKS, measure_latency, peak_memory
-from ssplat_jax.evaluation.lpips import LpipsWeights
+from ssplat_jax.evaluation.metrics import SSIM_ARGUMENTS, LpipsWeights
 from ssplat_jax.evaluation.pictures import save_comparison
-from ssplat_jax.evaluation.psnr_ssim import SSIM_ARGUMENTS
 from ssplat_jax.evaluation.scoring import (
     baselines,
     check_scorable,

@@ -21,8 +21,7 @@ from ssplat_jax.core.kept_programs import Kept
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.split import Split
 from ssplat_jax.data.stream_frame import StreamFrame
-from ssplat_jax.evaluation.lpips import MIN_SIDE, LpipsWeights, lpips
-from ssplat_jax.evaluation.psnr_ssim import SSIM_ARGUMENTS, psnr, ssim
+from ssplat_jax.evaluation.metrics import LPIPS_MIN_SIDE, SSIM_ARGUMENTS, LpipsWeights, lpips, psnr, ssim
 from ssplat_jax.rasterizer import effects_for, fill_holes, render
 from ssplat_jax.streaming.feed import Exposures
 
@@ -70,7 +69,7 @@ def check_scorable(capture: Capture, *, with_lpips: bool = False) -> None:
     Raises:
         InputError: a side is below 11 pixels, or below 16.
     """
-    min_side = MIN_SIDE if with_lpips else SSIM_ARGUMENTS["win_size"]
+    min_side = LPIPS_MIN_SIDE if with_lpips else SSIM_ARGUMENTS["win_size"]
     if min(capture.width, capture.height) < min_side:
         raise InputError(
             f"{capture.name}: wanted images of at least {min_side} pixels a side, got {capture.width}x{capture.height};"

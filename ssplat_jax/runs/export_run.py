@@ -22,11 +22,10 @@ from ssplat_jax.data.camera_path import upward
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.posed_image import invert_pose
 from ssplat_jax.data.stream_frame import StreamFrame
+from ssplat_jax.evaluation.metrics import psnr
 from ssplat_jax.evaluation.pictures import evenly_spread
-from ssplat_jax.evaluation.psnr_ssim import psnr
 from ssplat_jax.rasterizer import Effects, fill_holes, render
-from ssplat_jax.runs.open_run import load_run
-from ssplat_jax.runs.run_poses import open_capture_of_scene
+from ssplat_jax.runs.open_run import load_run, open_capture_of_scene
 from ssplat_jax.runs.run_results import scene_to_show
 from ssplat_jax.scene_files.formats import SCENE_READERS, ExportReport, file_axes, load_scene, save_gaussians
 from ssplat_jax.storage.chunk_records import load_chunk_records

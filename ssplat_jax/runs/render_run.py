@@ -17,13 +17,12 @@ from ssplat_jax.core.kept_programs import Kept
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.data.camera_path import camera_path, orbit_path
 from ssplat_jax.data.stream_frame import StreamFrame
-from ssplat_jax.evaluation.pictures import evenly_spread, save_image
+from ssplat_jax.evaluation.pictures import VideoWriter, evenly_spread, save_image
 from ssplat_jax.rasterizer import effects_for, fill_holes, render
 from ssplat_jax.rasterizer.effects import FILTERS
-from ssplat_jax.runs.run_poses import open_capture_of_scene
+from ssplat_jax.runs.open_run import open_capture_of_scene
 from ssplat_jax.scene_files.formats import load_scene
 from ssplat_jax.storage.run_folder import RunFolder, lock_folder
-from ssplat_jax.storage.video_writer import VideoWriter
 
 KINDS = ("color", "depth", "normals")
 """Kinds of pictures that a film can show."""

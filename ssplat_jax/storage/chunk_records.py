@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Float, Float64, UInt8
 from PIL import Image
 
+from ssplat_jax.core.false_colors import eight_bits
 from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.storage.files import load_arrays, save_arrays, write_json
 from ssplat_jax.streaming.scene_delta import SceneDelta
@@ -89,7 +90,7 @@ def _parse_record(fields: dict[str, Any]) -> ChunkRecord:
 
 def make_thumbnail(image: Float[np.ndarray, "h w 3"]) -> bytes:
     """A small JPEG of an image in [0, 1]."""
-    picture = Image.fromarray((np.clip(image, 0.0, 1.0) * 255 + 0.5).astype(np.uint8))
+    picture = Image.fromarray(eight_bits(image))
     picture.thumbnail((THUMBNAIL_SIDE, THUMBNAIL_SIDE), Image.Resampling.LANCZOS)
     encoded = io.BytesIO()
     picture.save(encoded, "JPEG", quality=85)

@@ -21,7 +21,7 @@ from ssplat_jax.core.atomic import write_atomic
 from ssplat_jax.core.cpu_backend import num_cores
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.core.pytree import pytree
-from ssplat_jax.evaluation.lpips import LpipsWeights
+from ssplat_jax.evaluation.metrics import LpipsWeights
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.storage.files import json_text
 from ssplat_jax.storage.interrupts import Interrupts
@@ -179,7 +179,7 @@ def train(
     Args:
         config: model configuration.
         recipe: phases and optimizer.
-        out: directory of `log.jsonl`, `recipe.json` and `checkpoints/`.
+        out: directory of `log.jsonl`, `recipe.json` and `checkpoint.npz`.
         params: initial parameters; default random ones from the recipe's seed. A run is resumed with the same ones.
         init_weights: name of `params` in the description of the run; default their digest.
         mix: captures to learn from, beside procedural scenes.

@@ -20,8 +20,8 @@ from jaxtyping import Array, Bool, Float
 
 from ssplat_jax.cache import Tokens, VoxelCache, vote
 from ssplat_jax.core.gaussians import Gaussians, mask_gaussians, mean_color
-from ssplat_jax.evaluation.lpips import LpipsWeights
-from ssplat_jax.evaluation.lpips import lpips as lpips_distance
+from ssplat_jax.evaluation.metrics import LpipsWeights
+from ssplat_jax.evaluation.metrics import lpips as lpips_distance
 from ssplat_jax.model.streamsplat import StreamSplat, shown_rows
 from ssplat_jax.rasterizer import fill_holes, render
 from ssplat_jax.refinement.compared_views import EFFECTS

@@ -23,8 +23,7 @@ from ssplat_jax.data import capture_summary
 from ssplat_jax.data.capture_summary import summarize
 from ssplat_jax.data.open_capture import CAPTURE_READERS
 from ssplat_jax.scene_files.formats import load_ply, save_ply
-from ssplat_jax.storage.published_weights import as_published, published_tensors
-from ssplat_jax.storage.weights import load_weights
+from ssplat_jax.storage.weights import as_published, load_weights, published_tensors
 from tests.commands.command_fixture import edit, make_capture, run
 from tests.model.resplat_fixture import named_tensor
 from tests.scene_files import scene_fixture

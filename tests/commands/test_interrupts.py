@@ -17,7 +17,7 @@ from PIL import Image
 from ssplat_jax.commands.main import COMMANDS
 from ssplat_jax.config import preset
 from ssplat_jax.storage.interrupts import Interrupts
-from ssplat_jax.storage.published_weights import published_tensors
+from ssplat_jax.storage.weights import published_tensors
 from tests.model.resplat_fixture import named_tensor
 from tests.poses.room_fixture import pictures, walk
 

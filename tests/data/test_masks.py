@@ -15,7 +15,7 @@ from ssplat_jax.core.errors import InputError
 from ssplat_jax.data.capture import ArrayPixels
 from ssplat_jax.data.images import Lens, undistort
 from ssplat_jax.data.open_capture import open_capture
-from ssplat_jax.evaluation.psnr_ssim import psnr, ssim
+from ssplat_jax.evaluation.metrics import psnr, ssim
 from ssplat_jax.evaluation.scoring import score_view
 from ssplat_jax.refinement.compared_views import RefineConfig, view_loss
 from ssplat_jax.refinement.refine import refine_on_capture

@@ -14,7 +14,7 @@ from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import Split
 from ssplat_jax.evaluation import cost
 from ssplat_jax.evaluation.cost import PeakMemory, measure_latency
-from ssplat_jax.evaluation.psnr_ssim import psnr, ssim
+from ssplat_jax.evaluation.metrics import psnr, ssim
 from ssplat_jax.evaluation.scoring import baselines, nearest_views, score_view
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.streaming.session import Session

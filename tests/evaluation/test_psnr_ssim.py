@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ssplat_jax.core.errors import InputError
-from ssplat_jax.evaluation.psnr_ssim import SSIM_ARGUMENTS, psnr, ssim
+from ssplat_jax.evaluation.metrics import SSIM_ARGUMENTS, psnr, ssim
 
 ROUNDING = 1e-9  # float64 sums in another order
 SSIM_SIGMA = 1.5

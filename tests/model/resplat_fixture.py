@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.storage.published_weights import published_tensors
+from ssplat_jax.storage.weights import published_tensors
 
 PARITY = Path(__file__).parents[3] / "shared" / "parity"
 

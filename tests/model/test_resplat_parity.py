@@ -24,7 +24,7 @@ from ssplat_jax.model.resplat.torch_layers import resize
 from ssplat_jax.model.resplat.upsampler import Upsampler
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.model.views import AnchoredDepth, back_project, patch_colors, prepare_views, to_candidate_space
-from ssplat_jax.storage.published_weights import as_published
+from ssplat_jax.storage.weights import as_published
 from tests.model.resplat_fixture import load_golden, named_params, tap_error
 
 TOLERANCE = 2e-4

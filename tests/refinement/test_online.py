@@ -19,7 +19,7 @@ from ssplat_jax.core.chunk import Chunk
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.core.gaussians import SH_C0, Gaussians
 from ssplat_jax.core.pytree import replace
-from ssplat_jax.evaluation.psnr_ssim import psnr
+from ssplat_jax.evaluation.metrics import psnr
 from ssplat_jax.model.compact import GaussianHead
 from ssplat_jax.model.network import init_params
 from ssplat_jax.model.streamsplat import ChunkOutput, StreamSplat

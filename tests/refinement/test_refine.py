@@ -14,7 +14,7 @@ from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.core.gaussians import Gaussians, mask_gaussians, mean_color, with_sh_degree
 from ssplat_jax.core.pytree import replace
-from ssplat_jax.evaluation.psnr_ssim import psnr
+from ssplat_jax.evaluation.metrics import psnr
 from ssplat_jax.rasterizer import Effects, fill_holes, render
 from ssplat_jax.rasterizer.constants import ALPHA_MIN
 from ssplat_jax.rasterizer.reference import render_reference

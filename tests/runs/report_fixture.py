@@ -15,12 +15,12 @@ def score(frame):
     return {"frame": frame, "shown": block, "literal": block | {"psnr": 15.25}, "coverage": 0.9}
 
 
-def record(num_views, psnr=None):
+def record(num_views):
     views = tuple(
         RecordedView(i, np.eye(4), np.eye(3), np.array([1.0, 1 + i / 50, 1.0]), make_thumbnail(smooth_picture(i)))
         for i in range(num_views - 4, num_views)
     )
-    return ChunkRecord(num_views, (96, 24), views, 0.25, num_views / 40, 1000 * num_views, psnr)
+    return ChunkRecord(num_views, (96, 24), views, 0.25, num_views / 40, 1000 * num_views)
 
 
 COMMON = {

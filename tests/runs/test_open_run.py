@@ -16,8 +16,15 @@ from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.poses import adjust_poses as adjusting
 from ssplat_jax.runs import render_run
-from ssplat_jax.runs.open_run import check_identity, load_run, open_run
-from ssplat_jax.runs.run_poses import capture_to_stream, load_poses, open_capture_of_scene, with_poses_of_run
+from ssplat_jax.runs.open_run import (
+    capture_to_stream,
+    check_identity,
+    load_poses,
+    load_run,
+    open_capture_of_scene,
+    open_run,
+    with_poses_of_run,
+)
 from ssplat_jax.scene_files.formats import save_ply
 from ssplat_jax.storage.chunk_records import load_chunk_records, save_chunk_record
 from ssplat_jax.storage.run_folder import RunFolder

@@ -77,14 +77,14 @@ def test_the_report_of_a_run_holds_its_pictures_and_figures(folder):
     for i in frames:
         save_image(folder.view(i), smooth_picture(i))
     for k in (4, 8, 12):
-        save_chunk_record(folder.chunk_record(k), record(k, 17.5 + k if k != 8 else None))
+        save_chunk_record(folder.chunk_record(k), record(k))
     folder.scene.write_bytes(b"ply")
     metrics = COMMON | {"views": 12, "ply": {"num_written": 98765}, "seen_views": [score(i) for i in frames]}
     report_run(folder, metrics, "path to/it", SHIPPED)
     text = folder.report.read_text()
     page = Page(text)
     check_self_contained(page, text, folder)
-    for shown in ("98,765", "21.50 dB", "0.25 s", "30%", "29.50 dB", "--steps 200", "0123456789ab"):
+    for shown in ("98,765", "21.50 dB", "0.25 s", "30%", "--steps 200", "0123456789ab"):
         assert shown in page.text, shown
     assert "'path to/it'" in page.text and COMMON["capture"] in page.text
     assert {a["href"] for a in page.named("a")} == {"scene.ply", "metrics.json", "views", "chunks"}

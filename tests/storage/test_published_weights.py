@@ -7,7 +7,7 @@ import pytest
 from ssplat_jax.config import StreamConfig, preset
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.model.network import init_params
-from ssplat_jax.storage.published_weights import (
+from ssplat_jax.storage.weights import (
     DEPTH,
     as_published,
     import_params,

@@ -13,7 +13,7 @@ from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.chunk import Chunk
 from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.core.pytree import replace
-from ssplat_jax.evaluation.lpips import LpipsWeights
+from ssplat_jax.evaluation.metrics import LpipsWeights
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.rasterizer import render
 from ssplat_jax.rasterizer.reference import render_reference

@@ -36,14 +36,14 @@ def pose(x=0.0, z=0.0):
     return matrix
 
 
-def record(k, psnr=None):
+def record(k):
     """The record of chunk k = 1, 2, ... of two views."""
     views = []
     for i in (2 * k - 2, 2 * k - 1):
         image = make_thumbnail(np.full((24, 32, 3), i / 20, np.float32))
         K = np.array([[32.0, 0, 16], [0, 32.0, 12], [0, 0, 1]])
         views.append(RecordedView(i, pose(float(i), -1.0), K, np.array([1.0, 1 + i, 0.5]), image))
-    return ChunkRecord(2 * k, (32, 24), tuple(views), 0.5 / k, 0.1 * k, 100 * k, psnr)
+    return ChunkRecord(2 * k, (32, 24), tuple(views), 0.5 / k, 0.1 * k, 100 * k)
 
 
 class Run:
@@ -57,7 +57,7 @@ class Run:
         self.browser = Browser(self.client, self.stage)
         self.controls = self.client.controls
 
-    def grow(self, psnr=None):
+    def grow(self):
         self.num_chunks += 1
         rows = [0, 1] if self.num_chunks == 1 else [self.num_chunks]
         part = delta(rows, self.num_chunks)
@@ -65,7 +65,7 @@ class Run:
         part = type(part)(part.rows, part.gaussians, part.capacity, confidences)
         stream = dataclasses.replace(frame(), far=32.0)
         save_delta(self.folder.delta(2 * self.num_chunks), part, header(stream, [1.0, 2.0, 1.0]))
-        save_chunk_record(self.folder.chunk_record(2 * self.num_chunks), record(self.num_chunks, psnr))
+        save_chunk_record(self.folder.chunk_record(2 * self.num_chunks), record(self.num_chunks))
         self.update()
 
     def update(self):

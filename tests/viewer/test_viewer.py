@@ -190,7 +190,7 @@ def test_viewing_starts_where_the_scene_is_seen(tmp_path):
         pose[:3, :3] = np.linalg.qr(rng.normal(size=(3, 3)))[0]
         pose[:3, 3] = [1e6 + number, 5.0, 6.0]
     views = [RecordedView(number, pose, np.eye(3), np.ones(3), b"") for number, pose in poses.items()]
-    save_chunk_record(folder.chunk_record(5), ChunkRecord(5, (32, 24), tuple(views), 0.1, 0.5, 5, None))
+    save_chunk_record(folder.chunk_record(5), ChunkRecord(5, (32, 24), tuple(views), 0.1, 0.5, 5))
     wanted = poses[2] - np.pad(np.array(far.offset)[:, None], ((0, 1), (3, 0)))
     np.testing.assert_allclose(opened(tmp_path).start, wanted)
 
