@@ -50,7 +50,7 @@ def cases(captures: Path | None, scale: str) -> list[Case]:
             name=f"{scene}, {setting.name}",
             config=config_of(setting, sizes),
             asked={"scene": scene, "factor": setting.factor, **asked},
-            measure=functools.partial(_measured, scene, setting, sizes, opened),
+            measure=functools.partial(_measured, scene, [setting], sizes, opened),
         )
         for setting in SETTINGS[: sizes.settings]
         for scene, opened in scenes.items()
@@ -62,19 +62,18 @@ def cases(captures: Path | None, scale: str) -> list[Case]:
                 name=f"{scene}, size x {factor:g}, refined",
                 config=config_of(settings[0], sizes),
                 asked={"scene": scene, "factor": factor, "steps": [s.refine_steps for s in settings], **asked},
-                measure=functools.partial(_measured_refined, scene, settings, sizes, opened),
+                measure=functools.partial(_measured, scene, settings, sizes, opened),
             )
             for scene, opened in scenes.items()
         ]
     return found
 
 
-def _measured(scene: str, setting: Setting, sizes: Sizes, opened: Opened) -> list[Row]:
-    return [{"scene": scene} | measure(setting, sizes, opened)]
-
-
-def _measured_refined(scene: str, settings: list[Setting], sizes: Sizes, opened: Opened) -> list[Row]:
-    return [{"scene": scene} | row for row in measure_refined(settings, sizes, opened)]
+def _measured(scene: str, settings: list[Setting], sizes: Sizes, opened: Opened) -> list[Row]:
+    rows = (
+        measure_refined(settings, sizes, opened) if settings[0].refine_steps else [measure(settings[0], sizes, opened)]
+    )
+    return [{"scene": scene} | row for row in rows]
 
 
 def _scenes(captures: Path | None, context: int) -> dict[str, Opened]:
@@ -85,19 +84,13 @@ def _scenes(captures: Path | None, context: int) -> dict[str, Opened]:
     return scenes
 
 
-def mark_front(rows: list[Row]) -> None:
-    """Sets `front` on every row: no other row of the scene is both faster and at least as good."""
-    best = -np.inf
-    for row in sorted(rows, key=lambda row: (row["ms_per_view"], -row["shown"])):
-        row["front"] = bool(row["shown"] > best)
-        best = max(best, row["shown"])
-
-
 def mark_fronts(rows: list[Row]) -> None:
-    """The front of every scene; the fastest rows first within a scene."""
-    for scene in {row["scene"] for row in rows}:
-        mark_front([row for row in rows if row["scene"] == scene])
-    rows.sort(key=lambda row: (row["scene"], row["ms_per_view"]))
+    """Sorts by time, and sets `front` on every row: no other one of its scene is both faster and at least as good."""
+    best: dict[str, float] = {}
+    rows.sort(key=lambda row: (row["scene"], row["ms_per_view"], -row["shown"]))
+    for row in rows:
+        row["front"] = bool(row["shown"] > best.get(row["scene"], -np.inf))
+        best[row["scene"]] = max(best.get(row["scene"], -np.inf), row["shown"])
 
 
 def plot(pyplot: Any, rows: list[Row]) -> Any:

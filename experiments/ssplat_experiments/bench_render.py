@@ -5,11 +5,10 @@ after the other, so that a busy machine slows all alike: read the ratios. `bytes
 """
 
 import functools
-import importlib.util
+import runpy
 import time
 from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import jax
@@ -146,23 +145,19 @@ def _stages(gaussians: Gaussians, camera: Camera, max_pairs: int) -> dict[str, C
     }
 
 
-def load_rasterizer(path: Path) -> ModuleType:
-    """Another rasterizer, as a Python module; see `run`.
+def load_rasterizer(path: Path) -> Callable[..., dict]:
+    """The `candidates` of another rasterizer, a Python file; see `run`.
 
     Raises:
-        InputError: it is no Python file with `candidates`, or misses a package.
+        InputError: there is no such file, it needs a package that is not installed, or it has no `candidates`.
     """
-    spec = importlib.util.spec_from_file_location("against", path)
-    if spec is None or spec.loader is None or not path.is_file():
-        raise InputError(f"bench render: --against wants a Python file, got {path}; see experiments/on_a_gpu.py.")
-    module = importlib.util.module_from_spec(spec)
     try:
-        spec.loader.exec_module(module)
-    except ImportError as error:
-        raise InputError(f"bench render: {path} needs a package that is not installed: {error}; install it.") from error
-    if not hasattr(module, "candidates"):
-        raise InputError(f"bench render: --against wants a file with `candidates`, {path} has none.")
-    return module
+        return runpy.run_path(str(path))["candidates"]
+    except (OSError, ImportError, LookupError) as error:
+        raise InputError(
+            f"bench render: --against wants a Python file with `candidates`, got {path} ({error!r}); see"
+            " experiments/on_a_gpu.py."
+        ) from error
 
 
 def runs_of(candidates: Callable[..., dict], gaussians: Gaussians, camera: Camera) -> dict[str, Callable[[], Any]]:
@@ -173,12 +168,12 @@ def runs_of(candidates: Callable[..., dict], gaussians: Gaussians, camera: Camer
 
 
 def rows_of(
-    num: int, width: int, height: int, *, against: ModuleType | None = None, stages: bool = True
+    num: int, width: int, height: int, *, against: Callable[..., dict] | None = None, stages: bool = True
 ) -> list[dict[str, Any]]:
     """The rows of one scene; `stages` says whether each stage is timed too."""
     gaussians, camera = scene(num, width, height)
     runs, facts = candidates(gaussians, camera, stages=stages)
-    others = {} if against is None else runs_of(against.candidates, gaussians, camera)
+    others = {} if against is None else runs_of(against, gaussians, camera)
     others = {f"against_{name}": run for name, run in others.items()}
     times = alternate(others | runs)
     ratios = {

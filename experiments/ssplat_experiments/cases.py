@@ -18,6 +18,7 @@ from ssplat_jax.core.errors import InputError
 from ssplat_jax.evaluation.cost import commit, machine, today
 from ssplat_jax.evaluation.pictures import save_image
 from ssplat_jax.storage.files import json_text, write_json
+from ssplat_jax.storage.saved_states import first_difference
 
 Row = dict[str, Any]
 """A line of a table: numbers and words by column."""
@@ -135,20 +136,12 @@ def _read(case: Case, folder: Path) -> dict[str, Any]:
     except (OSError, ValueError, KeyError, TypeError):
         raise InputError(f"{path}: wanted the result of case {case.name!r}, got something else; remove it.") from None
     if held != case.hash or not isinstance(rows, list):
-        differing = _differences(record.get("request"), case.request)
+        name, before, now = first_difference(record.get("request"), case.request) or ("request_hash", held, case.hash)
         raise InputError(
-            f"{path}: was measured with another request ({differing}); choose another --out, or remove the file to"
-            " measure it again."
+            f"{path}: was measured with another request ({name}: {before!r}, wanted now {now!r}); choose another --out,"
+            " or remove the file to measure it again."
         )
     return record
-
-
-def _differences(held: Any, wanted: Any, where: str = "") -> str:
-    """The first fields that differ, as `field: held, wanted now`."""
-    if isinstance(held, dict) and isinstance(wanted, dict):
-        found = [_differences(held.get(k), wanted.get(k), f"{where}.{k}" if where else k) for k in {**held, **wanted}]
-        return "; ".join([difference for difference in found if difference][:3])
-    return "" if held == wanted else f"{where}: {held!r}, wanted now {wanted!r}"
 
 
 def _rows(cases: Sequence[Case], held: dict[str, dict[str, Any]]) -> list[Row]:

@@ -17,14 +17,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
-from PIL import Image, UnidentifiedImageError
 
 from ssplat_experiments.cases import Case, Row
 from ssplat_experiments.study import OOM, Study, run_study
 from ssplat_jax.core.console import Reporter
 from ssplat_jax.core.errors import InputError, echo
 from ssplat_jax.data.capture import Capture
+from ssplat_jax.data.images import decode_image, image_size
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import Split
 from ssplat_jax.evaluation.metrics import installed_lpips
@@ -69,7 +68,7 @@ def case_of(method: str, path: str, renders: Path, name: str | None = None) -> C
         row = {"method": method, "capture": Path(path).name, "peak_memory_bytes": OOM}
         return Case(name or method, None, asked, lambda: [row])
     files = {i: _file_of(renders, i) for i in split.targets}
-    sizes = {read_image(file).shape[1::-1] for file in files.values()}
+    sizes = {image_size(file) for file in files.values()}
     if len(sizes) != 1:
         raise InputError(
             f"{renders}: wanted renders of one size, got {', '.join(f'{w}x{h}' for w, h in sorted(sizes))}."
@@ -90,7 +89,7 @@ def measured(method: str, capture: Capture, split: Split, files: dict[int, Path]
     mean = np.mean([capture.image(i).mean(axis=(0, 1)) for i in split.context], axis=0)
     flat = np.broadcast_to(mean, capture.image(split.targets[0]).shape).astype(np.float32)
     shown = {
-        method: {i: read_image(file) for i, file in files.items()},
+        method: {i: decode_image(file, (capture.width, capture.height)) for i, file in files.items()},
         "copy nearest": {i: capture.image(nearest_views(capture, i, split.context)[0]) for i in split.targets},
         "mean color": dict.fromkeys(split.targets, flat),
     }
@@ -165,16 +164,3 @@ def _file_of(folder: Path, i: int) -> Path:
         got = "none" if not found else " and ".join(path.name for path in found)
         raise InputError(f"{folder}: wanted one image {i:05d}.png of target {i}, got {got}.")
     return found[0]
-
-
-def read_image(path: Path) -> Float[np.ndarray, "h w 3"]:
-    """An image file as RGB in [0, 1].
-
-    Raises:
-        InputError: the file is damaged.
-    """
-    try:
-        with Image.open(path) as image:
-            return np.asarray(image.convert("RGB"), np.float32) / 255.0
-    except (OSError, UnidentifiedImageError, SyntaxError) as error:
-        raise InputError(f"{path}: wanted an image, got a file that cannot be read ({error}).") from None

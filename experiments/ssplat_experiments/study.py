@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import functools
 import importlib.metadata
 import io
 import os
@@ -70,9 +71,9 @@ def run_study(study: Study, captures: Path | None, out: Path, scale: str, report
     commit()  # read now and kept: the files may change while the experiment runs
     make_writable(out)
     cases = study.cases(captures, scale)
-    write = lambda so_far: _write(study, out, scale, captures, _finished(study, so_far))  # noqa: E731
+    write = functools.partial(_write, study, out, scale, captures)
     rows = measure_cases(study.name, cases, out / "cases", reporter, write)
-    _write(study, out, scale, captures, rows := _finished(study, rows))
+    write(rows)
     if study.plot is not None:
         _save_plot(study, rows, out / PLOT, reporter)
     for finding in study.findings(rows):
@@ -108,13 +109,9 @@ def compile_quickly() -> None:
     os.environ.setdefault("XLA_FLAGS", " ".join(flags))
 
 
-def _finished(study: Study, rows: list[Row]) -> list[Row]:
-    study.finish(rows)
-    return rows
-
-
 def _write(study: Study, out: Path, scale: str, captures: Path | None, rows: list[Row]) -> None:
-    """The table in both forms and the page."""
+    """Adds the columns that follow from all rows, and writes the table in both forms and the page."""
+    study.finish(rows)
     write_json(out / "table.json", rows)
     write_atomic(out / "table.csv", csv_table(rows).encode())
     write_atomic(out / PAGE, page(study, scale, rows, captures).encode())
@@ -156,16 +153,11 @@ def _cell(name: str, value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, float) and abs(value) < 1e4 else str(value).replace("|", "/")
 
 
-def command_of(name: str, scale: str, captures: Path | None) -> str:
-    """The command of an experiment as a block of Markdown, with captures if it had any."""
-    given = "" if captures is None else "--captures path/to/captures "
-    return f"    ssplat experiment {name} --scale {scale} {given}--out runs/{name}"
-
-
 def page(study: Study, scale: str, rows: Sequence[Row], captures: Path | None = None) -> str:
     """The page of an experiment: what was done, the command, the table, what follows and the plot."""
-    parts = [f"# {study.name}", study.text.strip()]
-    parts.append(command_of(study.name, scale, captures))
+    given = "" if captures is None else "--captures path/to/captures "
+    command = f"    ssplat experiment {study.name} --scale {scale} {given}--out runs/{study.name}"
+    parts = [f"# {study.name}", study.text.strip(), command]
     if rows:
         parts.append(markdown_table(rows).strip())
     parts += study.findings(list(rows))
