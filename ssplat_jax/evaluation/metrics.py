@@ -197,9 +197,8 @@ def lpips_layers(
     """
     *batch, height, width, _ = a.shape
     if min(height, width) < LPIPS_MIN_SIDE:
-        raise InputError(
-            f"lpips: wanted images of {LPIPS_MIN_SIDE} pixels a side or more, got {width}x{height}; render larger ones."
-        )
+        wanted = f"images of at least {LPIPS_MIN_SIDE} pixels a side"
+        raise refusal("lpips", wanted=wanted, got=f"{width}x{height}", fix="render larger ones")
     both = jnp.concatenate([x.reshape(-1, height, width, 3) for x in (a, b)])
     parts = []
     for features, head in zip(vgg_features(weights, both), weights.heads, strict=True):
