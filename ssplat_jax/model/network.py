@@ -176,8 +176,15 @@ def init_params(key: jax.Array, config: StreamConfig, only: Collection[str] | No
         raise InputError(f"network {config.network.kind!r}: wanted stages among {', '.join(STAGES)}, got {unknown}.")
     names = [name for name in STAGES if name in modules]
     keys = jax.random.split(key, len(names))  # CGFI has its key also where it is off, so that the others start alike
-    wanted = set(names if only is None else only) - (set() if config.history.cgfi else {"cgfi"})
+    wanted = set(names if only is None else only) & stages_of(config)
     return {name: _init_stage(k, config, name, network) for k, name in zip(keys, names, strict=True) if name in wanted}
+
+
+def stages_of(config: StreamConfig) -> set[str]:
+    """Names of the stages that `init_params` returns, also those that need no parameters."""
+    names: set[str] = set()
+    jax.eval_shape(lambda: names.update(_modules(config, network_of(config))))  # traced, so that no input is computed
+    return names - (set() if config.history.cgfi else {"cgfi"})
 
 
 # One program per stage: a single program for all stages of a large network takes 1.5 times as long to compile, and

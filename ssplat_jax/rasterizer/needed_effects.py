@@ -71,6 +71,8 @@ def _visible_degree(gaussians: Gaussians) -> int:
 
     By the addition theorem, band l of coefficients c changes a color by at most |c| sqrt((2 l + 1) / 4 pi).
     """
+    if gaussians.sh_degree == 0:
+        return 0
     lengths = np.asarray(_band_lengths(gaussians.sh, gaussians.opacities), np.float64)
     bands = np.arange(1, len(lengths) + 1)
     rest = np.cumsum((lengths * np.sqrt((2 * bands + 1) / (4 * np.pi)))[::-1])  # of the highest bands together
@@ -83,7 +85,7 @@ def _band_lengths(sh: Float[Array, "n k 3"], opacities: Float[Array, " n"]) -> F
     squares = jnp.where((opacities[:, None, None] > 0) & jnp.isfinite(sh), sh * sh, 0.0)
     degree = round(sh.shape[1] ** 0.5) - 1
     bands = [jnp.sum(squares[:, band**2 : (band + 1) ** 2], axis=1) for band in range(1, degree + 1)]
-    return jnp.sqrt(jnp.stack([jnp.max(x, initial=0.0) for x in bands])) if bands else jnp.zeros(0)
+    return jnp.sqrt(jnp.stack([jnp.max(x, initial=0.0) for x in bands]))
 
 
 def _shift(distortion: Float[Array, "*b 5"], camera: Camera) -> float:

@@ -31,6 +31,9 @@ TILES = (8, 16)
 MIN_CAPACITY = 1 << 12
 """Least capacity for pairs that `render` chooses."""
 
+SMALL_CAPACITY = 1 << 18
+"""Up to this capacity, what is unused costs milliseconds; a program for less takes seconds to compile."""
+
 MAX_CAPACITY = 1 << 30
 """The largest power of two that an index reaches."""
 
@@ -102,6 +105,8 @@ def render(
     inputs = _at_the_origin(inputs)
     if near is not None:
         inputs = replace(inputs, near=jnp.asarray(near, jnp.float32))
+    if effects.sh_degree is not None and effects.sh_degree >= gaussians.sh_degree:
+        effects = effects.replace(sh_degree=None)  # the same program
     off = {name: None for field, name in NEEDED_ARRAYS.items() if not getattr(effects, field)}
     inputs = replace(inputs, **off)
     inputs = _at_least_one_row(inputs)
@@ -114,7 +119,7 @@ def render(
     camera = replace(inputs.camera, width=int(camera.width), height=int(camera.height))
     inputs = replace(inputs, camera=camera)
     # Inside jit every result is traced, even that of arrays which the function closes over.
-    arrays = (*jax.tree.leaves(inputs), jnp.zeros(()))
+    arrays = (*jax.tree.leaves(inputs), jax.device_put(np.float32(0)))  # jnp.zeros would compile a program
     is_concrete = max_pairs is None and not any(isinstance(x, Tracer) for x in arrays)
     # Views of one scene need about the same capacity: a pass that only counts costs a third of a render.
     known = (inputs.gaussians.num_gaussians, camera.viewmats.shape, camera.width, camera.height, tile)
@@ -145,9 +150,9 @@ MAX_REMEMBERED = 256
 
 
 def _remember_capacity(kind: tuple, num_pairs: int) -> None:
-    """Remembers the capacity for `num_pairs`; a larger one is kept down to a quarter, as it is compiled already."""
+    """Remembers the capacity for `num_pairs`; a larger one is kept if it is small or at most four times as large."""
     needed, held = _capacity_for(num_pairs), _CAPACITIES.pop(kind, 0)
-    _CAPACITIES[kind] = held if needed <= held <= 4 * needed else needed
+    _CAPACITIES[kind] = held if needed <= held <= max(4 * needed, SMALL_CAPACITY) else needed
     while len(_CAPACITIES) > MAX_REMEMBERED:
         _CAPACITIES.pop(next(iter(_CAPACITIES.copy())), None)
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from ssplat_jax.config import preset
 from ssplat_jax.core.console import Reporter
+from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import interleaved_split
 from ssplat_jax.evaluation.pictures import save_comparison, save_image
@@ -19,6 +20,9 @@ from ssplat_jax.storage.run_folder import RunFolder, make_writable
 from ssplat_jax.storage.weights import load_params
 from ssplat_jax.streaming.feed import Exposures, feed_chunks
 from ssplat_jax.streaming.session import Session
+
+SHOWN_PIVOTS = 1 << 16
+"""Pivots that are decoded after every stage, as many as after the last: every number is a program to compile."""
 
 STAGES = (4, 8, 16, 32, 64)
 """Numbers of streamed views after which the scene is decoded and scored."""
@@ -50,20 +54,26 @@ def run_demo(scene: str, out: Path, reporter: Reporter) -> dict:
     order = capture.stream_order(model.config, split.context, stream_frame)
     session = Session(model, params)
     exposures: Exposures = {}
-    rows, strip, views = [], [], []
+    session.least_decoded = SHOWN_PIVOTS
+    stages: list[tuple[Gaussians, Exposures, int]] = []
     with reporter.progress("streaming", STAGES[-1]) as advance:
         for fed in feed_chunks(session, capture, order, stream_frame):
-            exposures |= fed.exposures
+            exposures = exposures | fed.exposures
             advance(len(exposures))
             if len(exposures) in STAGES:
-                gaussians = session.gaussians()
-                views = [score_view(gaussians, capture, i, stream_frame, exposures) for i in split.targets]
-                rows.append(_table_row(views, len(exposures), session))
-                strip.append(views[len(views) // 2].color)
-    save_scene(folder.scene, session.gaussians(), stream_frame, exposures)
-    for view in views:  # of the finished scene
+                stages.append((session.gaussians(), exposures, session.cache_facts()["decoded"]))
+    save_scene(folder.scene, stages[-1][0], stream_frame, exposures)
+    reporter.say(f"{folder.scene} is written; pictures and figures follow")
+    scored: list[list[ScoredView]] = []
+    with reporter.progress("scoring", len(STAGES)) as advance:
+        for gaussians, known, _ in reversed(stages):  # the program for the fullest scene serves all
+            scored.insert(0, [score_view(gaussians, capture, i, stream_frame, known) for i in split.targets])
+            advance(len(scored))
+    rows = [_table_row(views, len(known), num) for views, (_, known, num) in zip(scored, stages, strict=True)]
+    strip = [views[len(views) // 2].color for views in scored]
+    for view in scored[-1]:
         save_comparison(folder.target(view.score.frame), view.target, view.color, view.depth, stream_frame.depth_range)
-    strip.append(views[len(views) // 2].target)
+    strip.append(scored[-1][len(split.targets) // 2].target)
     save_image(out / "views_4_8_16_32_64_target.png", np.concatenate(strip, axis=1))
     metrics = {
         "scene": scene,
@@ -81,7 +91,7 @@ def run_demo(scene: str, out: Path, reporter: Reporter) -> dict:
     return metrics
 
 
-def _table_row(views: Sequence[ScoredView], num_streamed: int, session: Session) -> dict:
+def _table_row(views: Sequence[ScoredView], num_streamed: int, num_gaussians: int) -> dict:
     """Mean scores after `num_streamed` views."""
     scores = mean_scores([view.score for view in views])
     return {
@@ -91,5 +101,5 @@ def _table_row(views: Sequence[ScoredView], num_streamed: int, session: Session)
         "literal_psnr": round(scores["literal"]["psnr"], 2),
         "literal_ssim": round(scores["literal"]["ssim"], 3),
         "coverage": round(float(np.mean([view.score.coverage for view in views])), 3),
-        "num_gaussians": session.cache_facts()["decoded"],
+        "num_gaussians": num_gaussians,
     }

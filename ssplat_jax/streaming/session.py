@@ -29,7 +29,7 @@ NEW_SHARE, MOST_ROWS = 0.75, 1 << 17
 and the most rows of such a cache: a step takes longer with unused ones."""
 
 MIN_DECODED_PIVOTS = 1 << 15
-"""Lower limit of the pivots decoded at once: with fewer, compiling for a growing scene costs more than it saves."""
+"""Least number of pivots decoded at once: with fewer, compiling for a growing scene costs more than it saves."""
 
 RefineChunk = Callable[[dict, VoxelCache, Chunk, ChunkOutput], VoxelCache]
 """Refinement after a chunk: parameters, the cache after the step, the chunk, the step's summary -> the cache."""
@@ -62,6 +62,7 @@ class Session:
             model = dataclasses.replace(model, config=model.config.replace(causal=True))
         self.model, self.params, self.cache = model, params, cache
         self._live, self._refine_chunk = LiveViews(model.config, stream_frame), refine
+        self.least_decoded = MIN_DECODED_PIVOTS  # pivots; who decodes a growing scene often may raise it
         self.expected_chunks = INITIAL_CHUNKS  # of the stream, as far as the caller knows; sets the first capacity
         self.compile_seconds, self.num_compilations = 0.0, 0
         # Programs by what they compute and the shapes that they are compiled for; those of the last chunk.
@@ -183,10 +184,10 @@ class Session:
         """
         cache, config = self._present_cache(), self.model.config
         _, num_shown, num_present = map(int, _count(cache, config))
-        num_pivots = min(max(MIN_DECODED_PIVOTS, _power_of_two(num_shown)), cache.confidences.size)
+        num_pivots = min(max(self.least_decoded, _power_of_two(num_shown)), cache.confidences.size)
         num_gaussians = None
         if config.head.adaptive:
-            num_gaussians = max(MIN_DECODED_PIVOTS, _power_of_two(num_present))
+            num_gaussians = max(self.least_decoded, _power_of_two(num_present))
         leaves, structure = jax.tree.flatten(cache)
         key = ("decode", num_pivots, num_gaussians, structure, *((leaf.shape, leaf.dtype) for leaf in leaves))
         if key not in self._programs:
