@@ -61,7 +61,7 @@ def run_demo(scene: str, out: Path, reporter: Reporter) -> dict:
             exposures = exposures | fed.exposures
             advance(len(exposures))
             if len(exposures) in STAGES:
-                stages.append((session.gaussians(), exposures, session.cache_facts()["decoded"]))
+                stages.append((session.gaussians(), exposures, int(session.cache_facts()["decoded"])))
     save_scene(folder.scene, stages[-1][0], stream_frame, exposures)
     reporter.say(f"{folder.scene} is written; pictures and figures follow")
     scored: list[list[ScoredView]] = []
