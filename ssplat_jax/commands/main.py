@@ -56,9 +56,18 @@ COMMANDS = {
 """All commands by name, in the order of `ssplat --help`."""
 
 
-SETTINGS_OF_OTHERS = ("JAX_ENABLE_X64", "JAX_NUMPY_RANK_PROMOTION", "JAX_NUMPY_DTYPE_PROMOTION")
-"""Variables by which people check their own JAX programs; commands compute in float32 with JAX's usual rules."""
+SETTINGS_OF_OTHERS = (
+    "JAX_ENABLE_X64",
+    "JAX_NUMPY_",
+    "JAX_TRANSFER_GUARD",
+    "JAX_DEFAULT_MATMUL_PRECISION",
+    "JAX_DISABLE_JIT",
+)
+"""Beginnings of variables by which people check their own JAX programs; commands keep JAX's usual ones, and float32."""
 
+
+PLATFORMS = ("JAX_PLATFORMS", "JAX_PLATFORM_NAME")
+"""JAX's variables that choose the device."""
 
 WITHOUT_PROGRAMS = "--no-program-cache"
 """Option of every command; it comes before the options of each are read."""
@@ -67,8 +76,8 @@ WITHOUT_PROGRAMS = "--no-program-cache"
 def main(arguments: list[str] | None = None) -> None:
     """Runs the command in `arguments` (default: those of the process) and exits with its code."""
     arguments = sys.argv[1:] if arguments is None else arguments
-    for name in SETTINGS_OF_OTHERS:
-        os.environ.pop(name, None)
+    for name in [name for name in os.environ if name.startswith(SETTINGS_OF_OTHERS)]:
+        del os.environ[name]
     if arguments == ["--version"]:
         print(_version())
         sys.exit(0)
@@ -125,9 +134,10 @@ def guarded(run: Callable[[], int]) -> int:
         # XLA reports an exhausted device as a RuntimeError of its own that starts with this word.
         if "RESOURCE_EXHAUSTED" in str(error):
             return _refuse("out of device memory; try a smaller --size or capacity.", EXIT_MEMORY)
-        if (wanted := os.environ.get("JAX_PLATFORMS")) and _is_in_backends(error):
+        given = next((f"{name}={os.environ[name]}" for name in PLATFORMS if os.environ.get(name)), None)
+        if given and _is_in_backends(error):
             fix = "for `cuda`, pip install -e '.[cuda]'; or unset it"
-            return _refuse(f"JAX_PLATFORMS={wanted}: wanted a platform that JAX has here, got none; {fix}.", EXIT_INPUT)
+            return _refuse(f"{given}: wanted a platform that JAX has here, got none; {fix}.", EXIT_INPUT)
         raise
 
 

@@ -46,7 +46,8 @@ def start() -> None:
         try:
             main()
         finally:
-            sys.stdout.flush()
+            if sys.stdout is not None:  # closed, as by `>&-`
+                sys.stdout.flush()
     except BrokenPipeError:  # nobody reads on, as in `ssplat --help | head -3`
         if not interrupt.received:
             _leave(EXIT_BROKEN_PIPE)

@@ -4,6 +4,7 @@ An EXIF orientation is not applied, because the intrinsics of every capture form
 becomes RGB, transparent pixels are composited over black, and 16-bit gray is scaled instead of clipped.
 """
 
+import contextlib
 import dataclasses
 import warnings
 from pathlib import Path
@@ -11,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
 from PIL import Image
+from PIL.TiffImagePlugin import TiffImageFile
 from skimage.transform import warp
 
 from ssplat_jax.core.errors import refusal
@@ -19,8 +21,9 @@ from ssplat_jax.data.parsing import reading
 IMAGE_FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "PPM")
 MAX_PIXELS = 64_000_000  # larger images are refused before anything is decoded
 DEPTH_MODES = ("I;16", "I;16B", "I")  # Pillow's modes of 16-bit images
-PHOTOMETRIC = 262  # TIFF tag: 0 if zero is white
+BITS, PHOTOMETRIC = 258, 262  # TIFF tags: bits of a channel; 0 if zero is white
 ORIENTATION, UPRIGHT = 274, 1  # EXIF tag, and its value for images that need no rotation
+MAX_LABEL = 100  # largest value of a mask that numbers objects from 1, and 0 for what is masked out
 REPLACE = f"replace the file (formats read: {', '.join(IMAGE_FORMATS)})"
 
 
@@ -49,7 +52,8 @@ def decode_image(path: Path, size: tuple[int, int]) -> Float32[np.ndarray, "h w 
         with reading(path, REPLACE):
             image.load()
         if image.mode in DEPTH_MODES:
-            gray = np.asarray(image, dtype=np.float32) / np.float32(65535)
+            white = (1 << image.tag_v2.get(BITS, (16,))[0]) - 1 if isinstance(image, TiffImageFile) else 65535
+            gray = np.asarray(image, dtype=np.float32) / np.float32(white)
             gray = 1 - gray if zero_is_white(image) else gray
             return np.repeat(np.clip(gray, 0, 1)[..., None], 3, axis=-1)
         if image.has_transparency_data:
@@ -68,7 +72,9 @@ def zero_is_white(image: Image.Image) -> bool:
 def image_flags(path: Path) -> tuple[bool, bool]:
     """Two facts of an image file: it may have transparent pixels; EXIF says that it is not upright."""
     with _open(path) as image:
-        with reading(path, REPLACE):
+        orientation = UPRIGHT
+        with contextlib.suppress(Exception), warnings.catch_warnings():  # malformed data say nothing
+            warnings.simplefilter("ignore")
             # Not `image.getexif()`, which decodes a whole PNG to find what may follow its pixels.
             orientation = Image.Image.getexif(image).get(ORIENTATION, UPRIGHT)
         return image.has_transparency_data, orientation in range(2, 9)
@@ -85,8 +91,9 @@ def check_mask(path: Path, image: Path) -> None:
 def decode_mask(path: Path, mask_path: Path | None, size: tuple[int, int]) -> Float32[np.ndarray, "h w"]:
     """1 for the pixels of an image of (width, height) `size` that count, and 0 for those that do not.
 
-    Pixels count that are more than half opaque in the image `path` and brighter than half the brightest of the mask
-    `mask_path`, which may have another size.
+    Pixels count that are more than half opaque in the image `path`, and bright in the mask `mask_path`, which may have
+    another size: brighter than half its brightest, or above 0 where that is the number of a label. The alpha channel
+    of a mask counts in place of its brightness, unless it is the same everywhere.
     """
     counts = np.ones(size[::-1], np.float32)
     for source in (path, mask_path):
@@ -96,8 +103,11 @@ def decode_mask(path: Path, mask_path: Path | None, size: tuple[int, int]) -> Fl
             if source is path and not image.has_transparency_data:
                 continue
             with reading(source, REPLACE):
-                values = np.asarray(image.convert("RGBA").getchannel("A") if source is path else image.convert("F"))
-            shown = values > (127 if source is path else values.max() / 2)
+                values = np.asarray(image.convert("F"))
+                if image.has_transparency_data:
+                    alpha = np.asarray(image.convert("RGBA").getchannel("A"))
+                    values = alpha if source is path or np.ptp(alpha) else values
+            shown = values > (127 if source is path else values.max() / 2 if values.max() > MAX_LABEL else 0)
             counts *= np.asarray(Image.fromarray(shown.astype(np.uint8)).resize(size, Image.Resampling.NEAREST))
     return counts
 
@@ -113,6 +123,7 @@ def decode_depth(path: Path, unit: float) -> Float32[np.ndarray, "h w"]:
 def _open(path: Path) -> Image.Image:
     """Opens an image file without decoding it, and checks its size and kind."""
     with reading(path, REPLACE), warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # of damaged EXIF data
         warnings.simplefilter("error", Image.DecompressionBombWarning)
         image = Image.open(path, formats=IMAGE_FORMATS)
     wanted = got = fix = ""

@@ -3,6 +3,7 @@
 Opening a capture reads poses, intrinsics and image headers; images are decoded on request.
 """
 
+import contextlib
 import dataclasses
 import shlex
 from pathlib import Path
@@ -48,6 +49,7 @@ CAPTURE_READERS = (  # the first one that matches reads the capture
 UNREADABLE_SUFFIXES = frozenset({".heic", ".heif"})  # what phones write and Pillow does not read
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp"}) | UNREADABLE_SUFFIXES
 """Images in a folder of these lack only their poses."""
+ARCHIVES = frozenset({".zip", ".r3d", ".tar", ".gz", ".tgz", ".7z", ".rar"})
 VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".mkv", ".webm"})
 PROCEDURAL = "procedural"  # scheme of the paths of procedural captures
 PROCEDURAL_FRAMES = 73  # 64 context views and the 9 interleaved targets between them
@@ -109,6 +111,10 @@ def _no_capture(path: str, folder: Path, *, exists: bool) -> InputError:
         got = "a link that leads nowhere" if folder.is_symlink() else "nothing of that name"
     elif folder.is_dir() and not any(folder.iterdir()):
         got = "an empty folder"
+    elif folder.suffix.lower() in ARCHIVES:
+        got, fix = "an archive", "unpack it, and give the folder"
+    elif inner := _capture_in(folder):
+        got, fix = "none of these", f"give the folder in it: {inner}"
     elif unposed := _unposed(folder):
         kind, source = unposed
         got = f"none of these, but {kind} without camera poses"
@@ -118,6 +124,13 @@ def _no_capture(path: str, folder: Path, *, exists: bool) -> InputError:
         got, fix = "none of these", f"see --help of `ssplat inspect` for their files, or try {PROCEDURAL}:room"
     formats = ", ".join(reader.FORMAT for reader in CAPTURE_READERS)
     return refusal(path, wanted=f"a posed capture ({formats})", got=got, fix=fix)
+
+
+def _capture_in(folder: Path) -> Path | None:
+    """The first folder in a folder that is a capture."""
+    with contextlib.suppress(OSError):  # no folder, or no permission
+        return next((child for child in sorted(folder.iterdir()) if child.is_dir() and is_capture(child)), None)
+    return None
 
 
 def _unposed(path: Path) -> tuple[str, Path] | None:

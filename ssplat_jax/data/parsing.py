@@ -114,6 +114,12 @@ class Fields:
                 return array
         raise self._refused(name, f"{' x '.join(map(str, shape))} finite numbers")
 
+    def refuse(self, *names: str, fix: str) -> None:
+        """Refuses the fields `names` unless they are missing, false or zeros: what they mean is not modelled."""
+        for name in names:
+            if np.any(self._fields.get(name) or 0):
+                raise refusal(f"{self.where}.{name}", wanted="no such field, or 0", got=echo(self.get(name)), fix=fix)
+
     def text(self, name: str) -> str:
         """A text that is not empty."""
         value = self._fields.get(name)

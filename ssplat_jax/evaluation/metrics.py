@@ -32,8 +32,8 @@ from ssplat_jax.core.pytree import pytree
 MIN_MSE = 1e-10
 """Lower bound of the mean squared error: PSNR is at most 100 dB, a finite number that JSON can hold."""
 
-BRIGHT = 4.0
-"""An image of which half the values are above this is in other units, as 0 to 255."""
+DARK, BRIGHT, MAX_FAR = -0.5, 4.0, 0.02
+"""An image of which a larger share of the values lies outside is in other units, as -1 to 1 or 0 to 255."""
 
 SSIM_ARGUMENTS: dict[str, Any] = {"win_size": 11, "gaussian_weights": True, "data_range": 1.0, "channel_axis": -1}
 """Arguments of scikit-image's `structural_similarity`; its Gaussian has a standard deviation of 1.5 pixels."""
@@ -81,8 +81,10 @@ def ssim(
 
 def _checked(image, target, min_side: int):
     """Both images in float64, clipped to [0, 1]."""
-    if image.shape != target.shape:
-        raise InputError(f"metrics: wanted two images of one size, got {image.shape} and {target.shape}; resize one.")
+    image, target = np.asarray(image), np.asarray(target)
+    if image.shape != target.shape or image.shape[2:] != (3,):
+        got = f"{image.shape} and {target.shape}"
+        raise InputError(f"metrics: wanted two RGB images [h w 3] of one size, got {got}; resize or convert them.")
     if min(image.shape[:2]) < min_side:
         raise InputError(
             f"metrics: wanted images of at least {min_side} pixels a side, got {image.shape[1]}x{image.shape[0]}; "
@@ -92,10 +94,11 @@ def _checked(image, target, min_side: int):
 
 
 def _in_units_of_white(image: np.ndarray) -> np.ndarray:
-    """An image in float64, clipped to [0, 1]; a rendered one may exceed white here and there, but not in half of it."""
+    """An image in float64, clipped to [0, 1]; a rendered one may lie outside here and there."""
     if image.dtype == np.uint8:
         return image / 255.0
-    if not np.issubdtype(image.dtype, np.floating) or np.mean(image > BRIGHT) > 0.5:
+    is_far = (image > BRIGHT) | (image < DARK)
+    if not np.issubdtype(image.dtype, np.floating) or np.mean(is_far) > MAX_FAR:
         got, fix = f"{image.dtype} from {image.min()} to {image.max()}", "divide by the value of white"
         raise refusal("metrics: image", wanted="floats in [0, 1], or uint8", got=got, fix=fix)
     return np.clip(image.astype(np.float64), 0.0, 1.0)

@@ -150,7 +150,7 @@ def difference_in_words(to: Path, views: KnownCameras, turn: Float64[np.ndarray,
     A plain renderer has the dilation of 3DGS, shows holes black, and one exposure. We draw with the filter that the
     file names, fill holes, and follow the exposures of the views. None for formats that are not read.
     """
-    if to.suffix not in SCENE_READERS:
+    if to.suffix.lower() not in SCENE_READERS:
         return None
     written, scores, holes = load_scene(to), [], []
     scene = replace(written, offset=(0.0, 0.0, 0.0))

@@ -58,11 +58,13 @@ class ExportReport:
 
 def check_format(path: FilePath, option: str = "--to", formats: Collection[str] = WRITERS) -> str:
     """The end of a file's name, which must be one of `formats`."""
-    name = Path(path).name
+    name = Path(path).name.lower()
     # Nothing writes a .compressed.ply, though its name ends with .ply.
     suffix = next((suffix for suffix in (".compressed.ply", *SCENE_READERS, *WRITERS) if name.endswith(suffix)), "")
     if suffix not in formats:
-        raise refusal(option, wanted=f"a file named *{', *'.join(formats)}", got=repr(name), fix="choose one of these")
+        raise refusal(
+            option, wanted=f"a file named *{', *'.join(formats)}", got=repr(Path(path).name), fix="choose one of these"
+        )
     return suffix
 
 

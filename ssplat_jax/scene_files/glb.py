@@ -29,6 +29,7 @@ COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", FLOAT: "<f4"}
 TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}  # by number of columns
 HALF_TURN = [0.0, 0.0, 1.0, 0.0]  # quaternion xyzw of 180 degrees about z
 AXIS_FLIP = np.diag([-1.0, -1.0, 1.0])  # from the axes of glTF, y up, to those of a .ply: undoes `HALF_TURN`
+UNKNOWN_OF_NODES = {"skin", "EXT_mesh_gpu_instancing", "KHR_node_visibility"}  # that change what is shown, or where
 MEANING = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "projection": "perspective"}
 """Values of the extension with which Gaussians are drawn as ours are; others are refused."""
 
@@ -94,13 +95,14 @@ def decode_glb(data: bytes) -> SplatRows:
     if (magic, version, kind) != (MAGIC, VERSION, JSON_CHUNK) or length > len(data):
         raise ValueError(f"wanted a binary glTF of version {VERSION}; it is cut off or none")
     document, buffer = json.loads(data[20 : 20 + size]), data[28 + size :]
-    nodes = document.get("scenes", [{}])[document.get("scene", 0)].get("nodes", [])
+    scenes = document.get("scenes") or [{"nodes": _roots(document)}]
+    nodes = scenes[document.get("scene", 0)].get("nodes", [])
     empty = {"means": (0, 3), "quats": (0, 4), "log_scales": (0, 3), "opacities": (0,), "sh": (0, 1, 3)}
     parts: list[dict[str, Any]] = [{name: np.zeros(shape) for name, shape in empty.items()}]
     for primitive, transform in _primitives(document, nodes, np.eye(4), set()):
         parts.append(placed(_columns(document, buffer, primitive), AXIS_FLIP @ transform[:3]))
-    if len(parts) == 1 and EXTENSION not in document.get("extensionsUsed", []):
-        raise ValueError(f"wanted Gaussians by {EXTENSION}, it has none")
+    if len(parts) == 1 and (EXTENSION not in document.get("extensionsUsed", []) or document.get("meshes")):
+        raise ValueError(f"wanted Gaussians by {EXTENSION} in its first scene, it has none")
     terms = max(part["sh"].shape[1] for part in parts)
     for part in parts:
         part["sh"] = np.pad(part["sh"], ((0, 0), (0, terms - part["sh"].shape[1]), (0, 0)))
@@ -114,6 +116,13 @@ def decode_glb(data: bytes) -> SplatRows:
     )
 
 
+def _roots(document: dict) -> list[int]:
+    """The nodes that are no node's children: what a file without scenes shows."""
+    nodes = document.get("nodes", [])
+    inner = {child for node in nodes for child in node.get("children", [])}
+    return [number for number in range(len(nodes)) if number not in inner]
+
+
 def _primitives(
     document: dict, numbers: list[int], parent: np.ndarray, seen: set[int]
 ) -> Iterator[tuple[dict, np.ndarray]]:
@@ -123,6 +132,8 @@ def _primitives(
             raise ValueError(f"node {number} has two parents")
         seen.add(number)
         node = document["nodes"][number]
+        if unknown := UNKNOWN_OF_NODES & (node.keys() | node.get("extensions", {}).keys()):
+            raise ValueError(f"node {number} has {min(unknown)}, which is not read")
         transform = parent @ _transform(node)
         if "mesh" in node:
             for primitive in document["meshes"][node["mesh"]]["primitives"]:

@@ -85,6 +85,8 @@ def _facts(comments: list[str]) -> dict:
 def _decode_columns(tables: dict[str, Columns]) -> dict[str, np.ndarray]:
     vertex = tables["vertex"]
     constant = stacked(vertex, CONSTANT)
+    if "scale_1" in vertex and "scale_2" not in vertex:  # 2DGS writes discs, which have no thickness
+        vertex = vertex | {"scale_2": np.full(len(constant), -np.inf)}
     # Other writers produce logits of +-inf; tanh makes them 0 and 1 without overflow.
     return {
         "means": stacked(vertex, ["x", "y", "z"]),

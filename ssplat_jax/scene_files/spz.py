@@ -47,6 +47,7 @@ COMPRESSION = 12  # level of zstd
 POSITION_BITS = 24
 COLOR_STEP = 0.15  # factor of f_dc; it leaves room for colors outside [0, 1], which other SH terms compensate
 LOG_SCALES = (-10.0, 255 / 16 - 10)  # least and largest
+MAX_RECORDS = 1 << 16  # bytes of the records of a file of version 3, which are at its end
 MAX_RATIO = 1032
 """Most bytes that a compressed byte may become: what deflate can make of one, and more than zstd does of a scene."""
 
@@ -151,25 +152,33 @@ def _read_stream(data: bytes):
         widths = _widths(version, degree)
         size = count * sum(widths)
         body = stream.read(size) if size <= len(data) * MAX_RATIO else b""  # else the count is damaged
-        stream.read(1)  # to the end, where gzip compares the checksum
+        records = stream.read(MAX_RECORDS + 1)  # to the end, where gzip compares the checksum
     if len(body) < size:
         raise ValueError(f"wanted {size} bytes for {count} Gaussians; it is cut off")
-    return (version, count, fractional_bits, flags), widths, body, "RUB"
+    axes = _axes_of_records(records[:MAX_RECORDS]) if flags & HAS_RECORDS else "RUB"
+    return (version, count, fractional_bits, flags), widths, body, axes
+
+
+def _axes_of_records(records: bytes) -> str:
+    """The axes that records of extensions name, by default those of the format."""
+    axes, place = "RUB", 0
+    while place < len(records):
+        kind, length = RECORD.unpack_from(records, place)
+        if (place := place + RECORD.size) + length > len(records):
+            raise ValueError("a record is cut off")
+        if kind == AXES_RECORD:
+            axes = AXES[int.from_bytes(records[place : place + length], "little")]
+        place += length
+    return axes
 
 
 def _read_frames(data: bytes):
     """Parts of a file of version 4, as `_read_stream` gives those of older ones."""
     _, version, count, degree, fractional_bits, flags, num_frames, table = HEADER.unpack_from(data)
-    widths, axes, place = _widths(version, degree), "RUB", HEADER.size
+    widths = _widths(version, degree)
     if version != 4 or not HEADER.size <= table <= len(data) or num_frames not in (5 + (degree > 0), 6):
         raise ValueError(f"wanted version 4 with 5 or 6 fields, got version {version} with {num_frames} at {table}")
-    while flags & HAS_RECORDS and place < table:
-        kind, length = RECORD.unpack_from(data, place)
-        if (place := place + RECORD.size) + length > table:
-            raise ValueError(f"a record reaches beyond the table at {table}")
-        if kind == AXES_RECORD:
-            axes = AXES[int.from_bytes(data[place : place + length], "little")]
-        place += length
+    axes = _axes_of_records(data[HEADER.size : table]) if flags & HAS_RECORDS else "RUB"
     if count * sum(widths) > len(data) * MAX_RATIO:
         raise ValueError(f"{count} Gaussians do not fit; it is damaged or cut off")
     body, place = [], table + num_frames * SIZES.size

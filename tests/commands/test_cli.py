@@ -255,10 +255,11 @@ def test_images_without_poses_are_told_how_to_get_them(name, kind, tmp_path, cap
         assert "my " in capsys.readouterr().err and not any(tmp_path.glob("*_capture"))
 
 
-@pytest.mark.parametrize("platforms", ["cuda", "cpuu"])
-def test_a_platform_that_jax_lacks_is_one_line(platforms):
-    done = started("weights", "tiny", JAX_PLATFORMS=platforms)
-    assert done.returncode == 2 and f"JAX_PLATFORMS={platforms}: wanted a platform" in done.stderr
+@pytest.mark.parametrize(("name", "value"), [("JAX_PLATFORMS", "cuda"), ("JAX_PLATFORM_NAME", "gpu")])
+def test_a_platform_that_jax_lacks_is_one_line(name, value, monkeypatch):
+    monkeypatch.delenv("JAX_PLATFORMS", raising=False)
+    done = started("weights", "tiny", **{name: value})
+    assert done.returncode == 2 and f"{name}={value}: wanted a platform" in done.stderr
     assert done.stderr.count("\n") == 1
 
 
@@ -268,9 +269,18 @@ def test_settings_for_other_programs_change_nothing(tmp_path):
     save_ply(file, scene_fixture.scene(0, n=5))
     capture = make_capture(tmp_path / "wall\u0107", num_frames=2)
     settings = {"JAX_ENABLE_X64": "1", "JAX_NUMPY_RANK_PROMOTION": "raise", "PYTHONIOENCODING": "latin-1"}
+    settings |= {"JAX_TRANSFER_GUARD": "disallow", "JAX_DISABLE_JIT": "1"}
     assert started("export", file, "--to", shown, **settings).returncode == 0
     done = started("render", file, capture, "--out", tmp_path / "p\u0107", **settings)
     assert done.returncode == 0 and "wrote 2 pictures to" in done.stdout and "p\\u0107" in done.stdout, done.stderr
+
+
+def test_an_output_that_is_closed_changes_nothing(tmp_path):
+    file = tmp_path / "a.ply"
+    save_ply(file, scene_fixture.scene(0, n=5))
+    command = f"{sys.executable} -m ssplat_jax.commands.start export {file} --to {tmp_path}/b.spz >&-"
+    done = subprocess.run(["sh", "-c", command], stderr=subprocess.PIPE, text=True)
+    assert (done.returncode, done.stderr) == (0, "") and (tmp_path / "b.spz").exists()
 
 
 def test_python_without_docstrings_is_refused_in_a_line():

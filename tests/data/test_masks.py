@@ -52,10 +52,29 @@ def by_alpha(root, meta):
     meta["frames"][2]["file_path"] = "images/2.png"
 
 
+def painted(values, name="2.png"):
+    """A mask in the folder of masks: `values` of hidden pixels, of shown ones, and of two shown rows."""
+
+    def write(root, meta):
+        (root / "masks").mkdir()
+        pixels = np.where(HIDDEN[..., None], values[0], values[1]).astype(np.uint8)
+        pixels[:2] = values[-1]
+        Image.fromarray(pixels.squeeze()).save(root / "masks" / name)
+
+    return write
+
+
 @pytest.mark.parametrize(
     "mask",
     [
         by_path,
+        in_folder("2_mask.png"),
+        in_folder("2.mask.png"),
+        in_folder("2.jpg.mask.png"),
+        painted(([0], [1], [7])),  # numbers of objects
+        painted(([255, 255, 255, 0], [255, 255, 255, 255])),  # in the alpha channel alone
+        painted(([0, 0, 0, 0], [0, 0, 0, 255])),
+        painted(([0, 255], [255, 255])),  # gray, opaque
         by_alpha,
         in_folder("2.png"),
         in_folder("2.jpg.png"),
@@ -72,6 +91,11 @@ def test_masks_hide_pixels_of_some_images(mask, tmp_path):
     assert chunk.seen[:2].all()
     small = dataclasses.replace(capture, width=WIDTH // 2, height=HEIGHT // 2).seen(2)
     assert not small[5:10, 3:15].any() and small[:4].all() and small[12:].all()
+
+
+def test_masks_of_no_image_are_counted(tmp_path):
+    capture = open_capture(make_capture(tmp_path / "c", in_folder("another.png")))
+    assert not capture.is_masked and capture.notes[0].startswith("1 files in masks/ are left out")
 
 
 def test_captures_without_masks_have_none(tmp_path):

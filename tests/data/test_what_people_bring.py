@@ -1,5 +1,9 @@
 """Files as people bring them: fields that change a camera, odd names, links, hidden files, other programs' cameras."""
 
+import json
+import struct
+import warnings
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -56,6 +60,16 @@ def test_the_denominator_of_full_opencv_is_that_of_opencv(tmp_path):
     assert capture.frames[0].lens == lens
 
 
+def test_a_frames_own_coefficients_come_before_the_list_of_the_file(tmp_path):
+    def change(root, meta):
+        meta["distortion_params"] = PARAMS
+        meta["frames"][2]["k1"] = 0.2
+
+    frames = open_capture(make_capture(tmp_path / "c", change)).frames
+    assert (frames[1].lens.k1, frames[2].lens) == (0.1, Lens(k1=0.2))
+
+
+@pytest.mark.parametrize("kind", ["depth_file_path", "depth_path"])
 @pytest.mark.parametrize(
     ("fields", "unit"),
     [
@@ -64,11 +78,11 @@ def test_the_denominator_of_full_opencv_is_that_of_opencv(tmp_path):
         ({"applied_scale": 0.25}, 0.00025),
     ],
 )
-def test_depth_maps_have_the_unit_that_the_file_says(fields, unit, tmp_path):
+def test_depth_maps_have_the_unit_that_the_file_says(fields, unit, kind, tmp_path):
     def change(root, meta):
         meta.update(fields)
         Image.fromarray(np.full((HEIGHT, WIDTH), 19660, np.uint16)).save(root / "d.png")
-        meta["frames"][2]["depth_file_path"] = "d.png"
+        meta["frames"][2][kind] = "d.png"
 
     depth = open_capture(make_capture(tmp_path / "c", change)).depth(2)
     np.testing.assert_allclose(depth, 19660 * unit, rtol=1e-6)
@@ -83,6 +97,11 @@ def test_depth_maps_have_the_unit_that_the_file_says(fields, unit, tmp_path):
         ({"distortion_params": [0.1, 0.2]}, "distortion_params: wanted 6"),
         ({"camera_model": "EQUIRECTANGULAR"}, "cut them into perspective views"),
         ({"camera_model": "FISHEYE624"}, "undistort"),
+        ({"equirectangular": True}, "equirectangular"),
+        ({"latlong": True}, "latlong"),
+        ({"orthographic": True}, "orthographic"),
+        ({"ftheta_p1": 0.2}, "ftheta_p1"),
+        ({"camera_model": "FULL_OPENCV", "s1": 0.1}, "s1"),
     ],
 )
 def test_lenses_that_are_not_modelled_are_refused_by_name(fields, words, tmp_path):
@@ -97,6 +116,12 @@ def test_a_depth_unit_of_two_meanings_is_refused(tmp_path):
 
     with pytest.raises(InputError, match="depth_scale: wanted integer_depth_scale"):
         open_capture(make_capture(tmp_path / "c", change))
+
+
+@pytest.mark.parametrize("name", ["mask_color", "white_transparent", "transform_matrix_end", "K", "camera_convention"])
+def test_fields_that_are_not_known_are_noted(name, tmp_path):
+    capture = open_capture(make_capture(tmp_path / "c", lambda root, meta: meta["frames"][1].update({name: [1]})))
+    assert capture.notes == (f"Fields that are not known are left out of account: '{name}'.",)
 
 
 def test_bad_frames_are_left_out_and_a_rolling_shutter_is_noted(tmp_path):
@@ -115,6 +140,99 @@ def test_a_folder_of_splits_opens_with_its_training_split(tmp_path):
     (root / "transforms.json").rename(root / "transforms_train.json")
     capture = open_capture(root)
     assert len(capture) == NUM_FRAMES and "transforms_train.json" in capture.notes[0]
+
+
+# -- fields and matrices of other formats ------------------------------------------------------------------------------
+
+
+def edit_text(file, change):
+    return lambda root: (root / file).write_text(change((root / file).read_text()))
+
+
+def edit_json(file, **fields):
+    def change(text):
+        value = json.loads(text)
+        for entry in value if isinstance(value, list) else [value]:
+            entry.update(fields)
+        return json.dumps(value)
+
+    return edit_text(file, change)
+
+
+def with_skew(text):
+    return text.replace("50.0 0.0 31.0", "50.0 5.0 31.0").replace("50.0 0.0 30.5", "50.0 5.0 30.5")
+
+
+def with_k5(text):
+    return "\n".join(line + (",0.3" if i else ",k5") for i, line in enumerate(text.split("\n")))
+
+
+IN_CALIBRATION = "</calibration>"
+
+
+@pytest.mark.parametrize(
+    ("kind", "change", "words"),
+    [
+        ("ScanNet", edit_text("intrinsic/intrinsic_color.txt", with_skew), "without skew"),
+        ("KITTI", edit_text("calib.txt", with_skew), "without skew"),
+        ("Record3D", edit_json("metadata.json", K=[50, 0, 0, 5, 51, 0, 31, 25, 1]), "without skew"),
+        ("cameras.json", edit_json("cameras.json", k1=0.2), r"\[0\]\.k1"),
+        ("Polycam", edit_json("keyframes/cameras/7001.json", distortion=[0.1, 0, 0, 0]), "distortion"),
+        (
+            "Metashape",
+            edit_text("cameras.xml", lambda t: t.replace(IN_CALIBRATION, f"<p3>1</p3>{IN_CALIBRATION}")),
+            "p3",
+        ),
+        ("RealityCapture", edit_text("cameras.csv", with_k5), "k5"),
+    ],
+)
+def test_what_no_pinhole_camera_or_lens_of_ours_has_is_refused(kind, change, words, tmp_path):
+    WRITERS[kind](tmp_path)
+    change(tmp_path)
+    with pytest.raises(InputError, match=words):
+        open_capture(tmp_path)
+
+
+def test_the_principal_point_of_a_cameras_json_counts(tmp_path):
+    WRITERS["cameras.json"](tmp_path)
+    edit_json("cameras.json", cx=20.0, cy=15.0)(tmp_path)
+    np.testing.assert_allclose(open_capture(tmp_path).K(0)[:2, 2], [20.0, 15.0])
+
+
+def test_metashapes_disabled_cameras_other_chunks_and_shutter_are_named(tmp_path):
+    WRITERS["Metashape"](tmp_path)
+    text = (tmp_path / "cameras.xml").read_text().replace('label="1"', 'label="1" enabled="false"')
+    text = text.replace("</calibration>", "</calibration><rolling_shutter>true</rolling_shutter>")
+    text = text.replace("</document>", '<chunk><cameras><camera label="2"/></cameras></chunk></document>')
+    (tmp_path / "cameras.xml").write_text(text)
+    capture = open_capture(tmp_path)
+    assert [frame.name for frame in capture.frames] == ["0", "2", "3"]
+    assert [word in note for word, note in zip(("1 more chunks", "1 cameras", "shutter"), capture.notes, strict=True)]
+
+
+def test_a_component_without_a_transform_has_that_of_its_chunk(tmp_path):
+    WRITERS["Metashape"](tmp_path)
+    before = open_capture(tmp_path).camtoworlds
+    text = (tmp_path / "cameras.xml").read_text().replace("<camera ", '<camera component_id="0" ')
+    world = '<components><component id="0"/></components><transform><scale>2</scale></transform>'
+    (tmp_path / "cameras.xml").write_text(text.replace("<cameras>", world + "<cameras>"))
+    np.testing.assert_allclose(open_capture(tmp_path).camtoworlds[:, :3, 3], 2 * before[:, :3, 3])
+
+
+def test_calibrations_of_tum_shrink_with_the_images_and_lost_poses_count_as_none(tmp_path):
+    root = tmp_path / "freiburg3_desk"
+    root.mkdir()
+    write_tum(root)
+    (root / "calibration.txt").unlink()
+    for image in (root / "rgb").iterdir():
+        write_image(image, size=(320, 240))
+    rows = (root / "groundtruth.txt").read_text().split("\n")
+    rows[1] = " ".join([rows[1].split()[0], *["nan"] * 7])
+    (root / "groundtruth.txt").write_text("\n".join(rows))
+    (root / "rgb.txt").write_text((root / "rgb.txt").read_text().replace(" rgb", "\trgb"))
+    capture = open_capture(root)
+    np.testing.assert_allclose(capture.K(0), [[267.7, 0, 160.3], [0, 269.6, 124.05], [0, 0, 1]])
+    assert "1 of 4 frames" in capture.notes[0]
 
 
 # -- units of depth in TUM's layout -----------------------------------------------------------------------------------
@@ -152,6 +270,31 @@ def test_gray_whose_zero_is_white_is_not_inverted(tmp_path):
         np.testing.assert_allclose(capture.image(i), 0.2, atol=1e-4)
 
 
+def test_gray_of_12_bits_is_a_share_of_its_own_white(tmp_path):
+    """A TIFF by hand: 12 bits of 1365 of 4095, two pixels in three bytes."""
+    pixels = b"\x55\x55\x55" * (WIDTH * HEIGHT // 2)
+    tags = ((256, WIDTH), (257, HEIGHT), (258, 12), (259, 1), (262, 1), (273, 8), (278, HEIGHT), (279, len(pixels)))
+    table = b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in tags)
+    data = struct.pack("<2sHI", b"II", 42, 8 + len(pixels)) + pixels + struct.pack("<H", len(tags)) + table + bytes(4)
+
+    def change(root, meta):
+        (root / "images" / "2.tif").write_bytes(data)
+        meta["frames"][2]["file_path"] = "images/2.tif"
+
+    np.testing.assert_allclose(open_capture(make_capture(tmp_path / "c", change)).image(2), 1 / 3, atol=1e-6)
+
+
+@pytest.mark.parametrize(("suffix", "exif"), [("jpg", b"Exif\0\0II*\0\xff\xff\xff\xff"), ("png", b"no EXIF at all")])
+def test_exif_data_that_cannot_be_read_say_nothing(suffix, exif, tmp_path):
+    def change(root, meta):
+        Image.new("RGB", (WIDTH, HEIGHT), (255, 0, 0)).save(root / "images" / f"2.{suffix}", exif=exif)
+        meta["frames"][2]["file_path"] = f"images/2.{suffix}"
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert open_capture(make_capture(tmp_path / "c", change)).image(2)[5, 5, 0] > 0.9
+
+
 @pytest.mark.parametrize("orientation", [3, 6])
 def test_an_orientation_that_is_not_applied_is_noted(orientation, tmp_path):
     """The size of an image tells neither half a turn nor, if it is square, a quarter."""
@@ -183,6 +326,48 @@ def test_backslashes_are_slashes(tmp_path):
     capture = open_capture(make_capture(tmp_path / "c", change))
     assert sorted(frame.path.name for frame in capture.frames) == [f"{i}.jpg" for i in range(4)]
     assert capture.notes == ()
+
+
+@pytest.mark.parametrize(
+    ("on_disk", "named"),
+    [
+        ("a b.jpg", "images/a%20b.jpg"),
+        ("a%20b.jpg", "images/a%20b.jpg"),
+        ("e\u0301.jpg", "images/\u00e9.jpg"),  # as macOS keeps it, and as most programs write it
+        ("\u00e9.jpg", "images/e\u0301.jpg"),
+        ("9.jpg", "/home/somebody/scene/images/9.jpg"),
+        ("9.jpg", "C:\\scene\\images\\9.jpg"),
+        ("9.JPG", "images/9.jpg"),
+    ],
+)
+def test_names_of_other_machines_and_of_addresses_are_found(on_disk, named, tmp_path):
+    def change(root, meta):
+        (root / "images" / "0.jpg").rename(root / "images" / on_disk)
+        meta["frames"][0]["file_path"] = named
+
+    capture = open_capture(make_capture(tmp_path / "c", change))
+    assert on_disk in {frame.path.name for frame in capture.frames} and len(capture) == NUM_FRAMES
+
+
+@pytest.mark.parametrize(
+    ("kind", "folder"),
+    [("LLFF", "images"), ("KITTI", "image_2"), ("ScanNet", "color"), ("Polycam", "keyframes/images")],
+)
+@pytest.mark.parametrize("suffix", [".Jpg", ".TIF", ".bmp", ".WEBP"])
+def test_a_folder_of_images_is_read_whatever_their_suffix(kind, folder, suffix, tmp_path):
+    WRITERS[kind](tmp_path)
+    for image in sorted((tmp_path / folder).iterdir())[::2]:
+        image.rename(image.with_suffix(suffix))
+    assert len(open_capture(tmp_path)) == NUM_FRAMES
+
+
+def test_archives_and_folders_around_a_capture_are_told_apart(tmp_path):
+    make_capture(tmp_path / "download" / "fox")
+    with pytest.raises(InputError, match=r"give the folder in it: .*fox"):
+        open_capture(tmp_path / "download")
+    (tmp_path / "fox.ZIP").write_bytes(b"PK")
+    with pytest.raises(InputError, match="unpack it"):
+        open_capture(tmp_path / "fox.ZIP")
 
 
 @pytest.mark.parametrize("kind", ["COLMAP", "cameras.json", "LLFF", "transforms.json"])
@@ -331,7 +516,7 @@ def test_metashapes_cameras_come_back(where, tmp_path):
     ("options", "words"),
     [
         ({"kind": "spherical"}, "perspective views"),
-        ({"extra": "<b2>3</b2>"}, "skew"),
+        ({"extra": "<b2>3</b2>"}, "b2"),
         ({"kind": "fisheye"}, "p1 or p2"),
     ],
 )

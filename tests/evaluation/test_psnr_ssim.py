@@ -1,5 +1,6 @@
 """PSNR and SSIM against their definitions in float64."""
 
+import inspect
 import json
 
 import numpy as np
@@ -60,7 +61,7 @@ def test_ssim_is_the_published_definition():
 @pytest.mark.parametrize("score", [psnr, ssim])
 def test_values_outside_the_range_count_as_its_ends(score):
     a, b = image(3), image(4)
-    beyond = np.where(b > 0.5, b + 3.0, b - 3.0)
+    beyond = np.where(b > 0.5, b + 3.0, b - 0.5)
     assert score(a, beyond) == pytest.approx(score(a, (b > 0.5).astype(np.float32)), abs=ROUNDING)
 
 
@@ -70,10 +71,18 @@ def test_bytes_are_shares_of_255_and_images_of_another_unit_are_refused(score):
     bytes_a, bytes_b = (np.round(255 * x).astype(np.uint8) for x in (a, b))
     wanted = score(bytes_a / 255.0, bytes_b / 255.0)
     assert score(bytes_a, bytes_b) == score(bytes_a, bytes_b / 255.0) == pytest.approx(wanted, abs=ROUNDING)
-    for spoiled in (255 * a, 65535 * a, bytes_a.astype(np.int32), bytes_a.astype(np.uint16)):
+    dark = np.where(np.arange(len(a))[:, None, None] < 0.9 * len(a), 0, 255 * a)  # a bright thing before black
+    for spoiled in (255 * a, 65535 * a, 2 * a - 1, dark, bytes_a.astype(np.int32), bytes_a.astype(np.uint16)):
         for pair in ((spoiled, b), (a, spoiled), (spoiled, spoiled)):
             with pytest.raises(InputError, match=r"floats in \[0, 1\], or uint8"):
                 score(*pair)
+
+
+@pytest.mark.parametrize("score", [psnr, ssim])
+@pytest.mark.parametrize("change", [lambda a: a[..., :1], lambda a: a[..., 0], lambda a: np.dstack([a, a[..., :1]])])
+def test_images_of_other_channels_are_refused(score, change):
+    with pytest.raises(InputError, match="wanted two RGB images"):
+        inspect.unwrap(score)(change(image(3)), change(image(4)))  # without the types that tests check
 
 
 @pytest.mark.parametrize("score", [psnr, ssim])

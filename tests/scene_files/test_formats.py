@@ -245,14 +245,19 @@ def test_spz_goes_to_and_from_playcanvas(tmp_path):
 
 
 @pytest.mark.parametrize("axes", ["RUB", "RDF", "LUF", "RUF", "LFD", "RBU"])
-def test_the_axes_that_a_spz_names_are_honoured(tmp_path, axes):
+@pytest.mark.parametrize("version", [4, 3])
+def test_the_axes_that_a_spz_names_are_honoured(tmp_path, axes, version):
     numbers = "LDB RDB LUB RUB LDF RDF LUF RUF LFD RFD LFU RFU LBD RBD LBU RBU".split()  # noqa: SIM905
-    ss.save_spz(tmp_path / "a.spz", scene_for())
+    ss.save_spz(tmp_path / "a.spz", scene_for(), version=version)
     plain, data = ss.load_scene(tmp_path / "a.spz"), (tmp_path / "a.spz").read_bytes()
     records = struct.pack("<II3s", 0x12340001, 3, b"abc")  # of another maker: skipped
     records += struct.pack("<III", 0xADBE0003, 4, 1 + numbers.index(axes))
-    header = data[:14] + struct.pack("<BBI", data[14] | 2, data[15], 32 + len(records)) + data[20:32]
-    (tmp_path / "b.spz").write_bytes(header + records + data[32:])
+    if version == 4:
+        header = data[:14] + struct.pack("<BBI", data[14] | 2, data[15], 32 + len(records)) + data[20:32]
+        (tmp_path / "b.spz").write_bytes(header + records + data[32:])
+    else:
+        body = gzip.decompress(data)
+        (tmp_path / "b.spz").write_bytes(gzip.compress(body[:14] + bytes([body[14] | 2]) + body[15:] + records))
     found = ss.load_scene(tmp_path / "b.spz")
     unit = {"R": [1, 0, 0], "L": [-1, 0, 0], "D": [0, 1, 0], "U": [0, -1, 0], "F": [0, 0, 1], "B": [0, 0, -1]}
     turn = np.array([unit[letter] for letter in axes]).T @ np.diag([1, -1, -1])  # from what was read as RUB

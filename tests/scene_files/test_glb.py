@@ -85,6 +85,12 @@ def test_meshes_of_several_nodes_are_one_scene(glb):
     assert not np.any(found.sh[100:, 4:]) and np.any(found.sh[100:, 1:4])
 
 
+def test_a_file_without_scenes_holds_all_its_nodes(glb):
+    del glb.document["scenes"], glb.document["scene"]
+    glb.document["nodes"] = [{"mesh": 0}, {"children": [0], "rotation": [0, 0, 1, 0]}]
+    np.testing.assert_allclose(glb.read().means, scene(3, n=100).means, atol=1e-6)
+
+
 def test_normalized_integers_are_fractions_and_strides_are_kept(glb):
     gaussians = scene(3, n=100)
     opacities = np.round(255 * np.asarray(gaussians.opacities)[:, None]).astype("u1")
@@ -129,6 +135,13 @@ BAD = {
     "different lengths": (lambda d: d["accessors"][2].update(count=99), "different lengths"),
     "unknown component": (lambda d: d["accessors"][0].update(componentType=1), "KeyError"),
     "outside": (lambda d: d["buffers"][0].update(uri="../../etc/passwd"), "outside"),
+    "instances": (
+        lambda d: d["nodes"][0].update(extensions={"EXT_mesh_gpu_instancing": {}}),
+        "EXT_mesh_gpu_instancing",
+    ),
+    "hidden": (lambda d: d["nodes"][0].update(extensions={"KHR_node_visibility": {}}), "KHR_node_visibility"),
+    "a skin": (lambda d: d["nodes"][0].update(skin=0), "skin"),
+    "in another scene": (lambda d: d["scenes"].insert(0, {"nodes": []}), "it has none"),
     "no asset": (lambda d: d.pop("asset"), "asset"),
     "no finite offset": (lambda d: d["asset"]["extras"].update(offset=[0, float("inf"), 0]), "offset"),
 }

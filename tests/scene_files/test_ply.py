@@ -5,6 +5,7 @@ import random
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.lib.recfunctions import repack_fields
 from plyfile import PlyData, PlyElement
 
 from ssplat_jax.core.errors import InputError
@@ -75,6 +76,13 @@ def test_every_encoding_is_the_same_scene(good, form, dtype):
 
     assert_same_scene(load_ply(rewritten(good, shuffled, **form)), load_ply(good))
     assert load_ply(rewritten(good, lambda t: shuffled(t)[:0], **form)).num_gaussians == 0
+
+
+def test_discs_of_2dgs_have_no_third_scale(good):
+    names = [name for name in PlyData.read(str(good))["vertex"].data.dtype.names if name != "scale_2"]
+    disc, whole = load_ply(rewritten(good, lambda table: repack_fields(table[names]), byte_order="<")), load_ply(good)
+    np.testing.assert_allclose(disc.scales[:, :2], whole.scales[:, :2], rtol=1e-6)
+    assert np.max(disc.scales[:, 2]) < 1e-8
 
 
 def test_infinite_logits_huge_scales_and_zero_quaternions_have_a_meaning(good):

@@ -6,12 +6,15 @@ import itertools
 import math
 import posixpath
 import re
+import unicodedata
 from collections.abc import Sequence
 from pathlib import Path, PureWindowsPath
+from urllib.parse import unquote
 
 import numpy as np
 from jaxtyping import Float64
 
+from ssplat_jax.core.cameras import check_matrices
 from ssplat_jax.core.errors import echo, refusal
 from ssplat_jax.data.images import (
     IGNORED_PX,
@@ -28,7 +31,9 @@ from ssplat_jax.data.posed_image import MILLIMETER, ROTATION_ROUNDING, USUAL, Co
 
 SHORTER_PATH_RATIO = 0.5  # camera path in the file's order over that by name, below which the file's order is used
 MAX_CENTER_OFFSET = 0.2  # of a side; a principal point farther from the center is reported
-SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG", ".webp")
+SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG", ".webp")  # that are tried behind a name
+LISTED = frozenset({".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp"})  # of images, in lower case
+MASK_SUFFIXES = (".png", "", "_mask.png", ".mask.png")  # behind the name of an image, its mask
 UNDISTORT = "undistort the images to pinhole cameras first (`colmap image_undistorter`)"
 PANORAMAS = ("EQUIRECTANGULAR", "VR180_L", "OMNIDIRECTIONALSTEREO_L", "OMNIDIRECTIONALSTEREO_R", "ORTHOPHOTO")
 CUT = "cut them into perspective views first (`ns-process-data images --camera-type equirectangular`)"
@@ -56,6 +61,13 @@ class Intrinsics:
     lens: Lens = PINHOLE
 
 
+def pinhole(matrix: Float64[np.ndarray, "_ _"], where: str, center: float = 0.0) -> Intrinsics:
+    """Intrinsics of a matrix, refused if it has skew; `center` is what the first pixel's center lacks to (0.5, 0.5)."""
+    K = np.array(matrix[:3, :3], np.float64)
+    check_matrices(np.eye(4), K, where)
+    return Intrinsics(fx=K[0, 0], fy=K[1, 1], cx=K[0, 2] + center, cy=K[1, 2] + center)
+
+
 class FrameList:
     """Frames of a capture with the resolved folder `root`, checked one by one as a reader adds them."""
 
@@ -70,7 +82,8 @@ class FrameList:
         """The path of the image `name` of the capture, or None if there is no such file.
 
         Where there is none (`find_image`), the only image of that name in the folders below `images` stands in, else
-        the only one with another suffix.
+        the only one with another suffix. Names may be written as in addresses (%20), with accents in either way of
+        Unicode, or with the folders of another machine.
         """
         if (image := find_image(self.root, name, where, suffixes)) is not None:
             return image
@@ -79,10 +92,10 @@ class FrameList:
             self._by_stem = {}
             for file in images_in(self.root / (images_folder(self.root) or "."), "**/*"):
                 if "masks" not in file.relative_to(self.root).parts:
-                    self._by_stem.setdefault(file.stem, []).append(file)
-        wanted = PureWindowsPath(name)  # splits at both kinds of slashes
+                    self._by_stem.setdefault(unicodedata.normalize("NFC", file.stem), []).append(file)
+        wanted = PureWindowsPath(unicodedata.normalize("NFC", unquote(name)))  # splits at both kinds of slashes
         found = self._by_stem.get(wanted.stem, []) + self._by_stem.get(wanted.name, [])
-        found = [file for file in found if file.name == wanted.name] or found
+        found = [file for file in found if unicodedata.normalize("NFC", file.name) == wanted.name] or found
         self._renamed += len(found) == 1
         return find_file(self.root, [str(found[0].relative_to(self.root))], where) if len(found) == 1 else None
 
@@ -157,8 +170,9 @@ class FrameList:
         if not (self.root / "masks").is_dir():
             return None
         places = {name, in_images(name) or name, name.partition("/")[2] or name, image.name}
-        names = [f"masks/{place}{suffix}" for place in sorted(places) for suffix in (".png", "")]
-        names += [f"masks/{posixpath.splitext(place)[0]}{suffix}" for place in sorted(places) for suffix in SUFFIXES]
+        stems = sorted(posixpath.splitext(place)[0] for place in places)
+        names = [f"masks/{place}{suffix}" for place in sorted(places) for suffix in MASK_SUFFIXES]
+        names += [f"masks/{stem}{suffix}" for stem in stems for suffix in (*SUFFIXES, *MASK_SUFFIXES[2:])]
         mask = find_file(self.root, names, where)
         if mask is not None:
             check_mask(mask, image)
@@ -189,6 +203,9 @@ class FrameList:
         if self._turned:
             what = f"{self._turned} images have an EXIF orientation, which is not applied"
             left_out.append(f"{what}: intrinsics and poses must be those of the pixels as they are stored.")
+        used = {frame.mask_path for frame in self.frames}
+        if unused := sum(mask.resolve() not in used for mask in images_in(self.root / "masks", "**/*")):
+            left_out.append(f"{unused} files in masks/ are left out: no image has their name (1.png masks 1.jpg).")
         notes = (*left_out, *notes, *_notes(self.frames))
         return Listing(name or self.root.name, tuple(self.frames), notes, is_in_time)
 
@@ -260,11 +277,12 @@ def find_file(root: Path, names: Sequence[str], where: str) -> Path | None:
             found = path.is_file()
         except (OSError, RuntimeError, ValueError):  # name too long, loop of links
             continue
+        if not found:  # also a path of another machine
+            continue
         if not path.is_relative_to(root) and not any(path.is_relative_to(folder) for folder in _linked(root)):
             fix = "copy the file into the capture's folder and give its relative path"
             raise refusal(where, wanted=f"a path inside {root}", got=echo(name), fix=fix)
-        if found:
-            return path
+        return path
     return None
 
 
@@ -324,7 +342,7 @@ def files_in(folder: Path, pattern: str = "*") -> list[Path]:
 
 def images_in(folder: Path, pattern: str = "*") -> list[Path]:
     """The image files of a folder, in the order of their names."""
-    return [file for file in files_in(folder, pattern) if file.suffix in SUFFIXES]
+    return [file for file in files_in(folder, pattern) if file.suffix.lower() in LISTED]
 
 
 def files_with(path: Path, suffix: str, *words: bytes) -> list[Path]:

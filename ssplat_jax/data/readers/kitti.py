@@ -14,7 +14,7 @@ from jaxtyping import Float64
 from ssplat_jax.core.errors import echo, refusal
 from ssplat_jax.data.parsing import load_lines, load_rows, parse_numbers, reading
 from ssplat_jax.data.posed_image import check_camtoworld
-from ssplat_jax.data.readers.frame_list import FrameList, Intrinsics, Listing, images_in, stored_size
+from ssplat_jax.data.readers.frame_list import FrameList, Listing, images_in, pinhole, stored_size
 
 FORMAT = "KITTI"
 CAMERAS = (2, 3, 0, 1)  # in the order of search
@@ -31,8 +31,7 @@ def read(path: Path) -> Listing:
     camera = next(number for number in CAMERAS if (root / f"image_{number}").is_dir())
     calibration = f"{root / 'calib.txt'}: P{camera}"
     projection = _projection(root / "calib.txt", camera)
-    (fx, _, cx), (_, fy, cy), _ = projection[:, :3]
-    intrinsics = Intrinsics(fx=fx, fy=fy, cx=cx + 0.5, cy=cy + 0.5)
+    intrinsics = pinhole(projection, calibration, 0.5)
     to_camera0 = np.eye(4)  # from this camera; both have the same axes
     with reading(calibration):
         to_camera0[:3, 3] = -np.linalg.solve(projection[:, :3], projection[:, 3])

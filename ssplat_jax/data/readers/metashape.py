@@ -29,6 +29,7 @@ from ssplat_jax.data.readers.frame_list import (
 )
 
 FORMAT = "Metashape"
+OFF = ("", "0", "false", "disabled")  # values of a switch
 LENS = {"k1": "k1", "k2": "k2", "k3": "k3", "k4": "k4", "p1": "p2", "p2": "p1"}
 
 
@@ -44,17 +45,24 @@ def read(path: Path) -> Listing:
     if "<!DOCTYPE" in text or "<!ENTITY" in text:  # entities could grow without bound
         raise refusal(str(file), wanted="XML without definitions", got="a document type", fix=AGAIN)
     with reading(file):
-        chunk = next(ElementTree.fromstring(text).iter("chunk"))
+        chunk, *others = ElementTree.fromstring(text).iter("chunk")
     sensors = {sensor.get("id"): sensor for sensor in chunk.iter("sensor")}
     worlds = {part.get("id"): part.find("transform") for part in chunk.iter("component")}
     frames, folder = FrameList(root), images_folder(root)
-    cameras = [(camera, str(camera.get("label"))) for camera in chunk.iter("camera") if camera.get("label")]
+    listed = [camera for camera in chunk.iter("camera") if camera.get("label")]
+    cameras = [(camera, str(camera.get("label"))) for camera in listed if camera.get("enabled", "1") not in OFF]
+    notes = [f"{len(others)} more chunks of {file.name} are left out: export each alone."] if others else []
+    if len(cameras) < len(listed):
+        notes.append(f"{len(listed) - len(cameras)} cameras are left out: they are disabled.")
+    if any((shutter.text or "").strip() not in OFF for shutter in chunk.iter("rolling_shutter")):
+        notes.append("The rolling shutter is not modelled: every image has one pose.")
     for camera, name in cameras:
         where, matrix = f"{file}: camera {name}", camera.find("transform")
         image = None if matrix is None else frames.find(folder + name, where, ("", *SUFFIXES))
         if image is not None:
-            pose, world = np.reshape(_numbers(camera, "transform", where, np.eye(4)), (4, 4)), chunk.find("transform")
-            if (world := worlds.get(camera.get("component_id"), world)) is not None:
+            pose = np.reshape(_numbers(camera, "transform", where, np.eye(4)), (4, 4))
+            world = worlds.get(camera.get("component_id"))
+            if (world := chunk.find("transform") if world is None else world) is not None:
                 turn = _numbers(world, "rotation", where, np.eye(3))
                 shift = _numbers(world, "translation", where, np.zeros(3))
                 pose[:3, 3] = _numbers(world, "scale", where, np.ones(1)) * turn @ pose[:3, 3] + shift
@@ -63,7 +71,7 @@ def read(path: Path) -> Listing:
             frames.add(name, image, check_camtoworld(pose, where), intrinsics, stored_size(image, size, where), where)
     if cameras and not frames.frames:
         file_named(root, folder + cameras[0][1], f"{file}: camera {cameras[0][1]}")  # refuses it
-    return frames.listing(len(cameras), "image or alignment")
+    return frames.listing(len(cameras), "image or alignment", notes)
 
 
 def _numbers(element: ElementTree.Element, tag: str, where: str, default: np.ndarray) -> np.ndarray:
@@ -87,9 +95,10 @@ def _intrinsics(sensor: ElementTree.Element | None, where: str) -> tuple[Intrins
         values = Fields({name: float(text) for name, text in texts.items() if not text.isalpha()}, where)
     width, height = values.number("width"), values.number("height")
     lens = {ours: values.number(name, 0.0) for ours, name in LENS.items()}
-    if values.number("b2", 0.0) or (kind != "frame" and (lens["p1"] or lens["p2"])):
-        got = "a skew (b2)" if values.number("b2", 0.0) else "a fish-eye lens with p1 or p2"
-        raise refusal(where, wanted="no skew, and p1 and p2 for frame cameras alone", got=got, fix=UNDISTORT)
+    values.refuse("b2", "k5", "k6", "p3", "p4", fix=UNDISTORT)  # b2 is skew
+    if kind != "frame" and (lens["p1"] or lens["p2"]):
+        got = "a fish-eye lens with p1 or p2"
+        raise refusal(where, wanted="p1 and p2 for frame cameras alone", got=got, fix=UNDISTORT)
     cx, cy = width / 2 + values.number("cx", 0.0), height / 2 + values.number("cy", 0.0)
     f, model = values.number("f"), Lens if kind == "frame" else FisheyeLens
     return Intrinsics(f + values.number("b1", 0.0), f, cx, cy, model(**lens)), (width, height)

@@ -10,7 +10,15 @@ from pathlib import Path
 
 from ssplat_jax.data.parsing import Fields, load_json
 from ssplat_jax.data.posed_image import Convention, check_camtoworld
-from ssplat_jax.data.readers.frame_list import FrameList, Intrinsics, Listing, find_file, images_in, stored_size
+from ssplat_jax.data.readers.frame_list import (
+    UNDISTORT,
+    FrameList,
+    Intrinsics,
+    Listing,
+    find_file,
+    images_in,
+    stored_size,
+)
 
 FORMAT = "Polycam"
 CONVENTION = Convention(axes="opengl")
@@ -32,6 +40,7 @@ def read(path: Path) -> Listing:
             continue
         fields = Fields(load_json(file), str(file))
         pose = check_camtoworld([[fields.number(f"t_{i}{j}") for j in range(4)] for i in range(3)], str(file))
+        fields.refuse("k1", "k2", "k3", "p1", "p2", "distortion", fix=UNDISTORT)
         fx, fy, cx, cy = (fields.number(name) for name in ("fx", "fy", "cx", "cy"))
         sized = stored_size(image, (fields.number("width"), fields.number("height")), f"{file}: width, height")
         depth = None if prefix else find_file(keyframes, [f"depth/{image.stem}.png"], str(image))

@@ -18,6 +18,7 @@ from ssplat_jax.data.parsing import AGAIN, load_text, parse_numbers, reading
 from ssplat_jax.data.posed_image import Convention, check_camtoworld
 from ssplat_jax.data.readers.frame_list import (
     SUFFIXES,
+    UNDISTORT,
     FrameList,
     Intrinsics,
     Listing,
@@ -31,6 +32,7 @@ FORMAT = "RealityCapture"
 CONVENTION = Convention(axes="opengl")
 NEEDED = ("x", "y", "alt", "heading", "pitch", "roll", "f")
 LENS = {"px": "px", "py": "py", "k1": "k1", "k2": "k2", "k3": "k3", "k4": "k4", "p1": "t1", "p2": "t2"}
+UNKNOWN_LENS = ("k5", "k6", "skew")
 SENSOR = 36.0  # millimeters of the longer side
 
 
@@ -52,6 +54,8 @@ def read(path: Path) -> Listing:
         if missing := [field for field in NEEDED if not row.get(field)]:
             raise refusal(where, wanted=", ".join(NEEDED), got=f"no {missing[0]}", fix=AGAIN)
         x, y, altitude, heading, pitch, roll, f = parse_numbers([row[field] for field in NEEDED], where)
+        if odd := [field for field in UNKNOWN_LENS if float(row.get(field) or 0)]:
+            raise refusal(where, wanted="a lens of k1 to k4, t1 and t2", got=odd[0], fix=UNDISTORT)
         lens = dict(zip(LENS, parse_numbers([row.get(field) or "0" for field in LENS.values()], where), strict=True))
         image = frames.find(folder + name, where, ("", *SUFFIXES))
         if image is None:

@@ -10,7 +10,15 @@ from pathlib import Path
 
 from ssplat_jax.data.parsing import Fields, load_json
 from ssplat_jax.data.posed_image import Convention, pose_from_quat
-from ssplat_jax.data.readers.frame_list import FrameList, Intrinsics, Listing, find_file, name_in, stored_size
+from ssplat_jax.data.readers.frame_list import (
+    FrameList,
+    Intrinsics,
+    Listing,
+    find_file,
+    name_in,
+    pinhole,
+    stored_size,
+)
 
 FORMAT = "Record3D"
 CONVENTION = Convention(axes="opengl")
@@ -29,13 +37,13 @@ def read(path: Path) -> Listing:
     meta = Fields(load_json(file), str(file))
     poses = meta.entries("poses")
     if meta.get("perFrameIntrinsicCoeffs") is None:
-        K = meta.numbers("K", (9,)).reshape(3, 3).T
-        coefficients = [(K[0, 0], K[1, 1], K[0, 2], K[1, 2])] * len(poses)
+        shared = pinhole(meta.numbers("K", (9,)).reshape(3, 3).T, f"{file}: K")
+        intrinsics = [shared] * len(poses)
     else:
-        coefficients = meta.numbers("perFrameIntrinsicCoeffs", (len(poses), 4))
+        intrinsics = [Intrinsics(*row) for row in meta.numbers("perFrameIntrinsicCoeffs", (len(poses), 4)).tolist()]
     described = (meta.number("w"), meta.number("h"))
     frames = FrameList(root, CONVENTION)
-    for i, (entry, (fx, fy, cx, cy)) in enumerate(zip(poses, coefficients, strict=True)):
+    for i, (entry, intrinsic) in enumerate(zip(poses, intrinsics, strict=True)):
         where = f"{file}: poses[{i}]"
         names = [f"{folder}/{i}.{suffix}" for folder in FOLDERS for suffix in ("jpg", "png")]
         image = find_file(root, names, where)
@@ -43,6 +51,5 @@ def read(path: Path) -> Listing:
             x, y, z, w, *center = Fields({"pose": entry}, where).numbers("pose", (7,))
             pose = (pose_from_quat((w, x, y, z), center, where), 0.0)
             sized = stored_size(image, described, f"{file}: w, h")
-            name = name_in(root, image)
-            frames.add(name, image, pose, Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy), sized, where)
+            frames.add(name_in(root, image), image, pose, intrinsic, sized, where)
     return frames.listing(len(poses), "image")

@@ -14,11 +14,11 @@ from ssplat_jax.data.parsing import load_rows
 from ssplat_jax.data.posed_image import check_camtoworld
 from ssplat_jax.data.readers.frame_list import (
     FrameList,
-    Intrinsics,
     Listing,
     file_named,
     find_file,
     images_in,
+    pinhole,
     stored_size,
 )
 
@@ -34,8 +34,7 @@ def read(path: Path) -> Listing:
     """Reads the tracked frames of the export in the folder `path`."""
     root = path.resolve()
     file = file_named(root, "intrinsic/intrinsic_color.txt", f"{path}: intrinsics")
-    K = _matrix(file)
-    intrinsics = Intrinsics(fx=K[0, 0], fy=K[1, 1], cx=K[0, 2], cy=K[1, 2])
+    intrinsics = pinhole(_matrix(file), str(file))
     frames, images = FrameList(root), images_in(root / "color")
     for image in images:
         pose_file = find_file(root, [f"pose/{image.stem}.txt"], str(image))

@@ -1,7 +1,8 @@
 """Reader of `cameras.json`, which 3D Gaussian splatting writes beside a scene: a list of cameras, and the images.
 
 Each entry has `img_name` (with or without extension), `width`, `height`, `fx` and `fy` in pixels, `position` (camera
-center) and `rotation` (camera-to-world, row by row, OpenCV axes). The principal point is the center of the image.
+center) and `rotation` (camera-to-world, row by row, OpenCV axes). The principal point is the center of the image, or
+`cx` and `cy` where other programs write them.
 Images are in `images/` (or downscaled in `images_2`, `images_4`, `images_8`), else beside the file.
 """
 
@@ -13,6 +14,7 @@ from ssplat_jax.data.parsing import Fields, load_json
 from ssplat_jax.data.posed_image import check_camtoworld
 from ssplat_jax.data.readers.frame_list import (
     SUFFIXES,
+    UNDISTORT,
     FrameList,
     Intrinsics,
     Listing,
@@ -44,7 +46,9 @@ def read(path: Path) -> Listing:
         image = frames.named(folder + name, f"{fields.where}.img_name", ("", *SUFFIXES))
         matrix = np.column_stack([fields.numbers("rotation", (3, 3)), fields.numbers("position", (3,))])
         width, height = fields.number("width"), fields.number("height")
-        intrinsics = Intrinsics(fx=fields.number("fx"), fy=fields.number("fy"), cx=width / 2, cy=height / 2)
+        cx, cy = fields.number("cx", width / 2), fields.number("cy", height / 2)
+        intrinsics = Intrinsics(fx=fields.number("fx"), fy=fields.number("fy"), cx=cx, cy=cy)
+        fields.refuse("k1", "k2", "k3", "p1", "p2", fix=UNDISTORT)
         sized = stored_size(image, (width, height), f"{fields.where}: width, height")
         frames.add(name, image, check_camtoworld(matrix, fields.where), intrinsics, sized, fields.where)
     return frames.listing(len(entries), "image")

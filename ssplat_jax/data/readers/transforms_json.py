@@ -6,9 +6,9 @@ Intrinsics are global or per frame, and a frame's own value comes first: fl_x, f
 stored image, or camera_angle_x in radians. Defaults are fl_y = fl_x, the center of the image, and the size of the
 image file. Distortion (k1 to k4, p1, p2) follows the Brown-Conrady model, or with `camera_model` OPENCV_FISHEYE or
 `is_fisheye` the fish-eye model (k1 to k4), and is removed when images are delivered; `distortion_params` is the list
-k1 k2 k3 k4 p1 p2, and with FULL_OPENCV k4 to k6 are the denominator. Depth maps count steps of `integer_depth_scale`,
-else millimeters times `applied_scale`. Frames with `is_bad` (ScanNet++) are left out. Without a transforms.json, the
-split transforms_train.json is read.
+k1 k2 k3 k4 p1 p2, and with FULL_OPENCV k4 to k6 are the denominator. Depth maps (`depth_file_path`, `depth_path`)
+count steps of `integer_depth_scale`, else millimeters times `applied_scale`. Frames with `is_bad` (ScanNet++) are left
+out. A note names fields that are not known. Without a transforms.json, the split transforms_train.json is read.
 DL3DV keeps the file and its images in a folder `nerfstudio`, which is opened with the folder around it.
 Frames are streamed in the natural order of `file_path`, with the exception in `frame_list.in_stream_order`.
 """
@@ -41,7 +41,13 @@ PLACES = ("transforms.json", "nerfstudio/transforms.json", "transforms_train.jso
 PINHOLE_MODELS = (None, "OPENCV", "FULL_OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 FISHEYE_MODELS = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")  # in the order of `distortion_params`
-UNKNOWN_LENS = ("k5", "k6", "s1", "s2", "s3", "s4", "xi", "omega", "skew")
+UNKNOWN_LENS = ("k5", "k6", "s1", "s2", "s3", "s4", "xi", "omega", "skew", "orthographic", "equirectangular", "latlong")
+UNKNOWN_LENS += tuple(f"ftheta_p{i}" for i in range(5))  # as the three before, of instant-ngp
+USED = """frames file_path transform_matrix fl_x fl_y cx cy w h camera_angle_x camera_angle_y camera_model is_fisheye
+    distortion_params depth_file_path depth_path integer_depth_scale applied_scale mask_path is_bad rolling_shutter"""
+OF_NO_EFFECT = """applied_transform ply_file_path aabb aabb_scale scale offset up sharpness rotation colmap_im_id
+    train_filenames val_filenames test_filenames orientation_override enable_depth_loading n_extra_learnable_dims"""
+KNOWN = frozenset((*USED.split(), *OF_NO_EFFECT.split(), *COEFFICIENTS, *UNKNOWN_LENS))
 UNKNOWN_UNITS = ("depth_scale", "depth_factor", "depth_unit")  # some multiply by these and others divide
 
 
@@ -107,6 +113,8 @@ def _read(path: Path, problems: list[str] | None) -> Listing:
     times = [fields.get("rolling_shutter") for fields in (meta, *entries) if isinstance(fields, dict)]
     if any(isinstance(shutter, list) and any(shutter[:3]) for shutter in times):
         notes.append("The rolling shutter (rolling_shutter) is not modelled: every image has one pose.")
+    if unknown := sorted({name for fields in (meta, *entries) if isinstance(fields, dict) for name in fields} - KNOWN):
+        notes.append(f"Fields that are not known are left out of account: {echo(', '.join(unknown))}.")
     if file.name == PLACES[-1]:
         notes.append(f"There is no {PLACES[0]}: {file.name} is read, and the images of other splits are left out.")
     return frames.listing(len(frames.frames), "image", notes)
@@ -118,9 +126,10 @@ def _add_frame(frames: FrameList, meta: dict[str, Any], entry: Any, where: str) 
     fields = Fields(meta | entry, where)
     name = own.get("file_path")
     image = frames.named(name, f"{where}.file_path", ("", *SUFFIXES))
+    depth_kind = "depth_path" if own.get("depth_file_path") is None else "depth_file_path"
     depth, mask = (
         None if own.get(kind) is None else file_named(frames.root, own.get(kind), f"{where}.{kind}")
-        for kind in ("depth_file_path", "mask_path")
+        for kind in (depth_kind, "mask_path")
     )
     if mask is not None:
         check_mask(mask, image)
@@ -136,21 +145,26 @@ def _add_frame(frames: FrameList, meta: dict[str, Any], entry: Any, where: str) 
     (width, height), shrink = sized = stored_size(image, described, f"{where}: w, h")
     fx, fy = _focal(fields, own, width / shrink, height / shrink)
     cx, cy = (fields.number(field, side / shrink / 2) for field, side in (("cx", width), ("cy", height)))
-    frames.add(str(name), image, pose, Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, lens=_lens(fields)), sized, where,
+    frames.add(str(name), image, pose, Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, lens=_lens(fields, own)), sized, where,
                depth=depth, depth_unit=_depth_unit(fields), mask=mask)  # fmt: skip
 
 
 def _depth_unit(fields: Fields) -> float:
     """Capture units per step of a depth map; fields whose meaning differs from tool to tool are refused."""
     for name in UNKNOWN_UNITS:
-        if fields.get(name) is not None and fields.get("depth_file_path") is not None:
+        if fields.get(name) is not None and any(
+            fields.get(f"depth_{kind}") is not None for kind in ("file_path", "path")
+        ):
             fix = "write integer_depth_scale, the capture units in a step of the depth maps, instead"
             raise refusal(f"{fields.where}.{name}", wanted="integer_depth_scale", got=echo(fields.get(name)), fix=fix)
     return fields.number("integer_depth_scale", MILLIMETER * fields.number("applied_scale", 1.0))
 
 
-def _lens(fields: Fields) -> Lens:
-    """Distortion by the camera's model; models without one of OpenCV's two lenses are refused."""
+def _lens(fields: Fields, own: Fields) -> Lens:
+    """Distortion by the camera's model; models without one of OpenCV's two lenses are refused.
+
+    A list of the file gives way to coefficients that the frame has of its own.
+    """
     model, flag, where = fields.get("camera_model"), fields.get("is_fisheye"), f"{fields.where}: camera_model"
     if flag not in (None, True, False):
         raise refusal(f"{fields.where}.is_fisheye", wanted="true or false", got=echo(flag), fix="write a JSON boolean")
@@ -158,15 +172,14 @@ def _lens(fields: Fields) -> Lens:
     if not is_fisheye and model not in PINHOLE_MODELS:
         fix = CUT if model in PANORAMAS else UNDISTORT
         raise refusal(where, wanted="OPENCV, PINHOLE or OPENCV_FISHEYE", got=echo(model), fix=fix)
-    if fields.get("distortion_params") is None:
+    has_own = own.get("distortion_params") is None and any(own.get(name) is not None for name in COEFFICIENTS)
+    if has_own or fields.get("distortion_params") is None:
         coefficients = {name: fields.number(name, 0.0) for name in COEFFICIENTS}
     else:
         coefficients = dict(zip(COEFFICIENTS, fields.numbers("distortion_params", (6,)).tolist(), strict=True))
     if model == "FULL_OPENCV":
         coefficients |= {"d1": coefficients.pop("k4"), "d2": fields.number("k5", 0.0), "d3": fields.number("k6", 0.0)}
-    elif unknown := [name for name in UNKNOWN_LENS if fields.number(name, 0.0)]:
-        wanted = f"coefficients among {', '.join(COEFFICIENTS)}"
-        raise refusal(f"{fields.where}.{unknown[0]}", wanted=wanted, got=echo(unknown), fix=UNDISTORT)
+    fields.refuse(*UNKNOWN_LENS[2 * (model == "FULL_OPENCV") :], fix=UNDISTORT)
     if is_fisheye and (coefficients["p1"] or coefficients["p2"]):
         got = "p1 or p2 beside them"
         raise refusal(where, wanted="a fish-eye lens with k1 to k4 alone", got=got, fix=UNDISTORT)

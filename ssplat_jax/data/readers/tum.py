@@ -38,6 +38,7 @@ MAX_POSE_GAP = 0.1  # seconds between the two poses around an image
 MAX_DEPTH_GAP = 0.02  # seconds between an image and its depth map
 DEPTH_FACTOR = 5000.0  # steps of a depth map in a meter
 FACTOR = re.compile(r"\b(?:DepthMapFactor|png_depth_scale|depth_scale|scale)\"?\s*[:=]\s*([0-9.eE+-]+)")
+SIZE = (640.0, 480.0)  # (width, height) of the images that the calibrations below are for
 CALIBRATIONS = {  # fx fy cx cy k1 k2 p1 p2 k3
     "freiburg1": (517.3, 516.5, 318.6, 255.3, 0.2624, -0.9531, -0.0054, 0.0026, 1.1633),
     "freiburg2": (520.9, 521.0, 325.1, 249.7, 0.2312, -0.7849, -0.0033, -0.0001, 0.9172),
@@ -54,7 +55,9 @@ def read(path: Path) -> Listing:
     """Reads the images of the sequence in the folder `path` whose poses are known."""
     root = path.resolve()
     intrinsics, calibration = _intrinsics(root)
+    described = SIZE if calibration in CALIBRATIONS else None
     poses = load_rows(root / "groundtruth.txt", 8)
+    poses = poses[np.isfinite(poses).all(axis=1)]  # others say that tracking was lost
     poses = poses[np.argsort(poses[:, 0], kind="stable")]
     listed, notes = _files(root, "rgb.txt")
     depths, depth_notes = _files(root, "depth.txt") if (root / "depth.txt").is_file() else ([], [])
@@ -70,7 +73,11 @@ def read(path: Path) -> Listing:
     for image, time in sorted(images.items(), key=lambda item: item[::-1]):
         pose = _pose_at(time, poses, f"{root / 'groundtruth.txt'} at {time:.6f}")
         if pose is not None:
-            name, sized, depth = name_in(root, image), stored_size(image, None, ""), _depth_at(time, depths)
+            name, sized, depth = (
+                name_in(root, image),
+                stored_size(image, described, calibration),
+                _depth_at(time, depths),
+            )
             frames.add(name, image, (pose, 0.0), intrinsics, sized, calibration, depth=depth, depth_unit=unit)
     return frames.listing(len(images), "pose at their time", [*notes, *depth_notes], is_in_time=True)
 
@@ -91,12 +98,12 @@ def _files(root: Path, name: str) -> tuple[list[tuple[float, Path]], list[str]]:
     found, missing = [], []
     for where, line in load_lines(root / name):
         if line:
-            time, _, file_name = line.partition(" ")
+            time, *file_name = line.split(maxsplit=1)
             if not file_name:
                 raise refusal(where, wanted="a time and a file", got=echo(line), fix="write the file again")
-            file = find_image(root, file_name.strip(), where)
+            file = find_image(root, file_name[0], where)
             found.append((parse_numbers([time], where)[0], file))
-            missing += [(file_name, where)] if file is None else []
+            missing += [(file_name[0], where)] if file is None else []
     if missing and len(missing) == len(found) and name == "rgb.txt":
         file_named(root, *missing[0])  # refuses it
     notes = [f"{len(missing)} files of {name} are missing and left out."] if missing else []
