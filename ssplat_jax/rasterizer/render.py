@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Float, Num
+from jaxtyping import Array, Float, Int, Num
 
 from ssplat_jax.core.cameras import Camera, check_camera, is_whole, relative_to
 from ssplat_jax.core.errors import InputError, echo
@@ -140,6 +140,13 @@ def render(
     if is_concrete:
         _remember_capacity(known, int(out.num_pairs))
     return out
+
+
+def count_pairs(gaussians: Gaussians, camera: Camera, effects: Effects) -> Int[Array, ""]:
+    """`RenderOutput.num_pairs` of a render without further arrays, at a third of its cost."""
+    effects = effects.resolve(gaussians.render_mode, captured=None, distortion=None, exposures=None)
+    inputs = _at_least_one_row(_at_the_origin(RenderInputs(gaussians, camera)))
+    return _count(inputs, effects, TILE)
 
 
 _CAPACITIES: dict[tuple, int] = {}

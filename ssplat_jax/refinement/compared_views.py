@@ -152,16 +152,19 @@ def only_usable(gaussians: Gaussians, key_views: KeyViews, max_pairs: int) -> Ke
     Raises:
         InputError: no view is left.
     """
-    is_usable = np.array(usable(key_views))
-    slots = np.flatnonzero(is_usable)
-    errors = np.array([float(_covered_error(gaussians, key_views.at(int(slot)), max_pairs)) for slot in slots])
+    is_usable = np.array(_usable(key_views))
+    slots, on_host = np.flatnonzero(is_usable), jax.device_get(key_views)
+    errors = np.array([float(_covered_error(gaussians, on_host.at(slot), max_pairs)) for slot in slots])
     is_usable[slots[contradicting(errors)]] = False
     if not is_usable.any():
         raise InputError(
             "refine: wanted at least one view with a finite camera and a positive, finite exposure, got none of"
             f" {key_views.num_slots}."
         )
-    return replace(key_views, valid=jnp.asarray(is_usable))
+    return replace(key_views, valid=jax.device_put(is_usable))
+
+
+_usable = Kept(usable)
 
 
 def contradicting(errors: Float[np.ndarray, " v"]) -> Int[np.ndarray, " b"]:

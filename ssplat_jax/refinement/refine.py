@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, UInt8
 
-from ssplat_jax.cache.changes import apply_change, changed_gaussians
+from ssplat_jax.cache.changes import Change, apply_change, changed_gaussians
 from ssplat_jax.cache.key_views import KeyViews
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.errors import InputError
@@ -23,9 +23,8 @@ from ssplat_jax.core.gaussians import Gaussians, mask_gaussians, with_sh_degree
 from ssplat_jax.core.kept_programs import Kept
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.stream_frame import StreamFrame
-from ssplat_jax.rasterizer import render
 from ssplat_jax.rasterizer.constants import ALPHA_MIN
-from ssplat_jax.rasterizer.render import round_up
+from ssplat_jax.rasterizer.render import count_pairs, round_up
 from ssplat_jax.refinement.compared_views import EFFECTS, FOR_CAPTURES, RefineConfig, only_usable, views_of_step
 from ssplat_jax.refinement.refine_step import (
     RefineState,
@@ -68,12 +67,17 @@ class Progress:
         Gaussians whose opacity fell below what is drawn are absent, which changes no image; those that were as faint
         before stay.
         """
-        start, refined = self.state.start, changed_gaussians(self.state.start, self.state.change)
-        has_faded = (refined.opacities < ALPHA_MIN) & (start.opacities >= ALPHA_MIN)
-        if bool(has_faded.any()):
-            refined = mask_gaussians(refined, ~has_faded)
-        given, num_rows = with_sh_degree(given, refined.sh_degree), refined.num_gaussians
-        return jax.tree.map(lambda new, old: jnp.concatenate([new, old[num_rows:].astype(new.dtype)]), refined, given)
+        return _scene_now(self.state.start, self.state.change, given)
+
+
+@Kept
+def _scene_now(start: Gaussians, change: Change, given: Gaussians) -> Gaussians:
+    """`Progress.scene`, from its state."""
+    refined = changed_gaussians(start, change)
+    has_faded = (refined.opacities < ALPHA_MIN) & (start.opacities >= ALPHA_MIN)
+    refined = mask_gaussians(refined, ~has_faded)
+    given, num_rows = with_sh_degree(given, refined.sh_degree), refined.num_gaussians
+    return jax.tree.map(lambda new, old: jnp.concatenate([new, old[num_rows:].astype(new.dtype)]), refined, given)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -192,7 +196,7 @@ def continue_refinement(
         progress.max_rows = row_capacity(progress.state, key_views, steps, config)
     while progress.num_steps < steps and not _has_stopped_helping(progress, key_views, config):
         start = time.perf_counter()
-        rate = jnp.float32(FINAL_RATE ** (progress.num_steps / steps))
+        rate = np.float32(FINAL_RATE ** (progress.num_steps / steps))
         step = _compiled(config, progress.max_pairs, progress.max_rows)
         progress.state, report = step(progress.state, key_views, rate)
         progress.losses.append(float(report.loss))  # waits, so that a step's time is that of its work
@@ -241,21 +245,31 @@ def has_stopped_helping(held_back: list[float], steps_per_round: int) -> bool:
 
 def pairs_capacity(gaussians: Gaussians, key_views: KeyViews, margin: float = PAIRS_MARGIN) -> int:
     """Capacity for the tile intersections of a key view, from eight of them; a step counts what does not fit."""
-    slots = {round(slot) for slot in np.linspace(0, key_views.num_slots - 1, 8)}
-    counts = [int(render(gaussians, key_views.camera(slot), effects=EFFECTS).num_pairs) for slot in sorted(slots)]
-    return round_up(int(margin * max(counts)))
+    slots, on_host = {round(slot) for slot in np.linspace(0, key_views.num_slots - 1, 8)}, jax.device_get(key_views)
+    return round_up(int(margin * max(int(_num_pairs(gaussians, on_host.at(slot))) for slot in slots)))
+
+
+@Kept
+def _num_pairs(gaussians: Gaussians, view: KeyViews) -> Int[Array, ""]:
+    return count_pairs(gaussians, view.camera(), EFFECTS)
 
 
 def row_capacity(state: RefineState, key_views: KeyViews, steps: int, config: RefineConfig) -> int:
     """Capacity for the rows that the views of one of the planned steps may see."""
+    most = int(_most_seen(state.start, state.change, key_views, max(steps, 1), config))
+    return min(state.start.num_gaussians, round_rows(int(ROWS_MARGIN * most)))
+
+
+@functools.partial(Kept, static_argnums=(3, 4))
+def _most_seen(start: Gaussians, change: Change, key_views: KeyViews, steps: int, config: RefineConfig):
+    """The largest number of rows that the views of a step may see."""
 
     def num_seen(step: Int[Array, ""]) -> Int[Array, ""]:
         views = views_of_step(step, key_views.valid, config)
         return jnp.sum(seen_rows(gaussians, key_views, views), dtype=jnp.int32)
 
-    gaussians = apply_change(state.start, state.change)
-    most = jnp.max(jax.lax.map(num_seen, jnp.arange(max(steps, 1), dtype=jnp.int32)))
-    return min(gaussians.num_gaussians, round_rows(int(ROWS_MARGIN * int(most))))
+    gaussians = apply_change(start, change)
+    return jnp.max(jax.lax.map(num_seen, jnp.arange(steps, dtype=jnp.int32)))
 
 
 def key_views_of(capture: Capture, indices: Sequence[int], stream_frame: StreamFrame, exposures: Exposures) -> KeyViews:
@@ -269,12 +283,17 @@ def key_views_of(capture: Capture, indices: Sequence[int], stream_frame: StreamF
     """
     places = np.linspace(0, len(indices) - 1, min(len(indices), MAX_KEY_VIEWS))
     used = [indices[i] for i in sorted({round(place) for place in places})]
-    cameras = jax.tree.map(lambda *x: jnp.stack(x), *(capture.camera(i, stream_frame) for i in used))
+    cameras = jax.tree.map(lambda *x: np.stack(x), *(capture.camera(i, stream_frame) for i in used))
     # Frame by frame: as floats, all images would take four times the memory of the key views.
     images = [np.round(np.clip(capture.image(i), 0, 1) * np.float32(255)).astype(np.uint8) for i in used]
-    factors = jnp.asarray(np.stack([exposures[i] for i in used]), jnp.float32)
+    factors = np.stack([exposures[i] for i in used]).astype(np.float32)
     seen = [mask for i in used if (mask := capture.seen(i)) is not None]
-    return KeyViews.of(cameras, np.stack(images), factors, np.stack(seen) if seen else None)
+    pixels = np.stack(images)
+    if seen:
+        pixels = np.concatenate([pixels, np.stack(seen)[..., None].astype(np.uint8)], axis=-1)
+    # Put on the device as they are: `KeyViews.of` compiles a program for each operation.
+    arrays = {"images": pixels, "viewmats": cameras.viewmats, "Ks": cameras.Ks, "exposures": factors}
+    return KeyViews(**jax.device_put(arrays | {"valid": np.ones(len(used), bool)}))
 
 
 def _check(cameras: Camera, images, exposures) -> None:

@@ -7,6 +7,7 @@ A step has no effect on rows that its views cannot see, and leaves them out of i
 alone: the selection knows each Gaussian as a ball around its mean, so it holds every row that the rasterizer draws.
 """
 
+import functools
 import math
 
 import jax
@@ -19,6 +20,7 @@ from ssplat_jax.cache.changes import MAX_LOGIT, Change, apply_change, no_change
 from ssplat_jax.cache.key_views import KeyViews
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.gaussians import SH_C0, Gaussians, mean_color, with_sh_degree
+from ssplat_jax.core.kept_programs import Kept
 from ssplat_jax.core.pytree import pytree, replace
 from ssplat_jax.rasterizer import constants
 from ssplat_jax.rasterizer.effects import camera_points, near_planes
@@ -72,7 +74,12 @@ def init_refinement(gaussians: Gaussians, config: RefineConfig | None = None) ->
         gaussians: the scene; its arrays are copied. Half precision becomes float32: in it, Adam's moments would vanish.
         config: SH degree; default `RefineConfig()`.
     """
-    gaussians = with_sh_degree(gaussians, (config or RefineConfig()).sh_degree)
+    return _state_of(gaussians, (config or RefineConfig()).sh_degree)
+
+
+@functools.partial(Kept, static_argnums=(1,))
+def _state_of(gaussians: Gaussians, sh_degree: int) -> RefineState:
+    gaussians = with_sh_degree(gaussians, sh_degree)
     if jnp.finfo(gaussians.means.dtype).bits < 32:
         gaussians = jax.tree.map(lambda x: x.astype(jnp.float32), gaussians)
     return RefineState(
@@ -204,7 +211,7 @@ def without_padding(gaussians: Gaussians) -> Gaussians:
     """The rows up to the last present one, rounded up: Adam moves every row, and half of a stream's may be padding."""
     present = np.flatnonzero(np.asarray(gaussians.opacities) > 0)
     num_rows = round_rows(int(present.max(initial=-1)) + 1)
-    return jax.tree.map(lambda x: x[:num_rows], gaussians)
+    return jax.tree.map(lambda x: jax.device_put(np.asarray(x)[:num_rows]), gaussians)  # compiles nothing
 
 
 def seen_rows(gaussians: Gaussians, key_views: KeyViews, views: Int[Array, " b"]) -> Bool[Array, " n"]:

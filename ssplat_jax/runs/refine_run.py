@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from ssplat_jax.core.console import WAITING, Reporter
@@ -129,7 +128,7 @@ def load_refinement(path: Path, progress: Progress, identity: dict[str, Any]) ->
                 f"{path}: holds a refinement that differs in its {name}; repeat the old options, or start anew with"
                 " --overwrite."
             )
-    leaves = [jnp.asarray(arrays.get(name, leaf)) for name, leaf in _leaves(progress).items()]
+    leaves = [jax.device_put(arrays.get(name, leaf)) for name, leaf in _leaves(progress).items()]
     progress.state = jax.tree.unflatten(jax.tree.structure(progress.state), leaves)
     for name in MEASURED:
         setattr(progress, name, header["measured"][name])

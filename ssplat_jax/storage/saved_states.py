@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from ssplat_jax.cache.key_views import KeyViews
@@ -61,7 +60,7 @@ def load_state(path: Path) -> tuple[VoxelCache, dict[str, Any]]:
         if name in _ROW_FIELDS:  # as long as the capacity again
             leaf = np.pad(leaf, [(0, facts["capacity"] - len(leaf)), *[(0, 0)] * (leaf.ndim - 1)])
         *owner, field = name.split(".")
-        (groups.setdefault(owner[0], {}) if owner else fields)[field] = jnp.asarray(leaf)
+        (groups.setdefault(owner[0], {}) if owner else fields)[field] = jax.device_put(leaf)  # jnp.asarray compiles
     cache = VoxelCache(**fields, **{name: _GROUPS[name](**leaves) for name, leaves in groups.items()})
     return cache, facts["caller"]
 
