@@ -161,7 +161,7 @@ class TrainingCheckpoints:
             leaves = [arrays[name] for name in sorted(arrays)]
             if [(x.shape, x.dtype) for x in leaves] != [(x.shape, x.dtype) for x in wanted]:
                 raise StorageError(f"{path}: holds a training of other shapes; choose another --out.")
-            return header["step"], jax.tree.unflatten(structure, map(jnp.asarray, leaves))
+            return header["step"], jax.tree.unflatten(structure, jax.device_put(leaves))
 
         step, state, damage = _load_newest(self._path, load)
         if damage is not None:

@@ -57,8 +57,8 @@ def test_kept_programs_give_the_same_bytes_say_nothing_and_a_cut_one_is_replaced
 
 
 @pytest.mark.slow
-def test_a_run_with_kept_programs_writes_the_same_bytes(tmp_path):
-    compile_seconds, written = [], []
+def test_a_run_compiles_few_programs_and_with_kept_ones_none_to_the_same_bytes(tmp_path):
+    compile_seconds, written, compiled = [], [], []
     for number, where in enumerate(("off", tmp_path / "programs", tmp_path / "programs")):
         out = tmp_path / f"run{number}"
         command = [sys.executable, "-m", "ssplat_jax.commands.start", "run", "procedural:room?frames=16&size=96x64"]
@@ -66,14 +66,16 @@ def test_a_run_with_kept_programs_writes_the_same_bytes(tmp_path):
             [*command, "--refine", "0", "--out", str(out), "--quiet"],
             capture_output=True,
             text=True,
-            env=plain_environment(where),
+            env=plain_environment(where) | {"JAX_LOG_COMPILES": "1"},
         )
+        compiled.append(done.stderr.count("Finished XLA compilation of"))
         assert done.returncode == 0 and "E1" not in done.stderr and "cpu_aot" not in done.stderr, done.stderr
         metrics = read(out / "metrics.json")
         compile_seconds.append(metrics.pop("compile_s"))
         written.append((metrics, (out / "scene.ply").read_bytes(), (out / "state.npz").read_bytes()))
     assert written[0] == written[1] == written[2]
     assert compile_seconds[2] < 0.7 * min(compile_seconds[:2])
+    assert compiled[0] == compiled[1] <= 12 and compiled[2] == 0
 
 
 def test_what_the_user_has_set_holds(tmp_path, monkeypatch):
