@@ -1,9 +1,11 @@
 """`Gaussians`: a scene of 3D Gaussians as one pytree of activated values."""
 
 import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from ssplat_jax.core.errors import InputError
+from ssplat_jax.core.errors import InputError, refusal
 from ssplat_jax.core.pytree import pytree, replace, static
 
 SH_C0 = 0.28209479177387814  # Y_0^0, the constant band: color = 0.5 + SH_C0 * dc
@@ -36,6 +38,10 @@ class Gaussians:
         colors: Float[Array, "n 3"],
     ) -> "Gaussians":
         """Gaussians whose color does not depend on the view; `colors` in [0, 1], the rest as in the class."""
+        is_known = not isinstance(colors, Tracer)
+        if not jnp.issubdtype(colors.dtype, jnp.floating) or (is_known and np.mean(np.asarray(colors) > 4.0) > 0.5):
+            fix = "divide bytes by 255"
+            raise refusal("from_rgb: colors", wanted="floats in [0, 1]", got=f"{colors.dtype} of 0 to 255", fix=fix)
         return Gaussians(
             means=means, quats=quats, scales=scales, opacities=opacities, sh=((colors - 0.5) / SH_C0)[:, None, :]
         )
@@ -59,10 +65,10 @@ class Gaussians:
 
 def check_gaussians(gaussians: Gaussians, where: str) -> None:
     """Checks the shapes of a scene, of tracers too. Not done on construction: inside transforms, fields may hold
-    batches.
+    batches. Outside of transforms, raw values of files, which are logits and logarithms, are told from activated ones.
 
     Raises:
-        InputError: naming the field of a wrong shape, after `where`.
+        InputError: naming the field of a wrong shape or of raw values, after `where`.
     """
     n = gaussians.means.shape[0] if getattr(gaussians.means, "ndim", 0) else "n"
     wanted = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,), "sh": (n, "k", 3)}
@@ -73,6 +79,14 @@ def check_gaussians(gaussians: Gaussians, where: str) -> None:
         if len(got) != len(shape) or any(isinstance(s, int) and s != g for s, g in zip(shape, got, strict=True)):
             sizes = " ".join(map(str, shape))
             raise InputError(f"{where}: {name} of the Gaussians must be [{sizes}], got {list(got)}.")
+    for name, most, fix in (("opacities", 1.0, "jax.nn.sigmoid"), ("scales", np.inf, "jnp.exp")):
+        values = getattr(gaussians, name)
+        if isinstance(values, Tracer):
+            continue
+        values = np.asarray(values)
+        if values.size and np.mean((values < 0) | (values > most)) > 0.5:
+            fix = f"take {fix} of them"
+            raise refusal(f"{where}: {name}", wanted="activated values", got="raw ones, as in files", fix=fix)
 
 
 def mean_color(gaussians: Gaussians) -> Float[Array, "3"]:

@@ -46,7 +46,7 @@ CAPTURE_READERS = (  # the first one that matches reads the capture
     reality_capture,
     metashape,
 )
-UNREADABLE_SUFFIXES = frozenset({".heic", ".heif"})  # what phones write and Pillow does not read
+UNREADABLE_SUFFIXES = frozenset({".heic", ".heif", ".avif", ".jxl"})  # what phones write and we do not read
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp"}) | UNREADABLE_SUFFIXES
 """Images in a folder of these lack only their poses."""
 ARCHIVES = frozenset({".zip", ".r3d", ".tar", ".gz", ".tgz", ".7z", ".rar"})

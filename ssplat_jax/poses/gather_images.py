@@ -54,7 +54,7 @@ def list_photos(folder: Path) -> list[Path]:
         readable = {file.stem for file in photos}
         phone = [f for f in files if f.suffix.lower() in UNREADABLE_SUFFIXES and f.stem not in readable]
         if phone:
-            got = f"{len(phone)} HEIC files" + (f" beside {len(photos)} others" if photos else "")
+            got = f"{len(phone)} HEIC, AVIF or JPEG XL files" + (f" beside {len(photos)} others" if photos else "")
             fix = "convert them to JPEG first (the phone's camera settings call JPEG `most compatible`)"
             raise refusal(str(place), wanted="JPEG or PNG photos", got=got, fix=fix)
         if len(photos) > 1:

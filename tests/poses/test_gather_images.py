@@ -77,9 +77,9 @@ def test_what_colmap_cannot_read_is_converted_and_hidden_files_are_left_out(tmp_
 def test_photos_may_lie_in_images_and_beside_unreadable_copies(tmp_path):
     for name in ("1.jpg", "2.JPG", "3.png"):
         save(tmp_path / "images" / name)
-    for name in ("1.heic", "4.HEIC", "5.heif"):
+    for name in ("1.heic", "4.HEIC", "5.avif"):
         (tmp_path / "images" / name).write_bytes(b"x")
-    with pytest.raises(InputError, match="2 HEIC files beside 3 others; convert"):
+    with pytest.raises(InputError, match="2 HEIC, AVIF or JPEG XL files beside 3 others; convert"):
         list_photos(tmp_path)
     for name in ("4.jpg", "5.jpg"):
         save(tmp_path / "images" / name)

@@ -2,6 +2,7 @@
 
 import functools
 import importlib
+import inspect
 import re
 import warnings
 
@@ -12,13 +13,14 @@ import pytest
 
 from ssplat_jax.core.cpu_backend import short_exp
 from ssplat_jax.core.errors import InputError
-from ssplat_jax.core.gaussians import mask_gaussians
+from ssplat_jax.core.gaussians import Gaussians, mask_gaussians
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.rasterizer import Effects, binning, compositing, constants, effects_for, fill_holes, filter_3d, render
 from ssplat_jax.rasterizer.binning import Grid, TileIntersections, intersect_tiles, sorted_table
 from ssplat_jax.rasterizer.projection import Splats, project
 from ssplat_jax.rasterizer.reference import render_reference
 from ssplat_jax.rasterizer.render import default_max_pairs
+from ssplat_jax.scene_files.formats import save_ply
 from tests.rasterizer import oracle
 from tests.rasterizer.scenes import cameras, cloud
 
@@ -272,6 +274,26 @@ def test_rows_with_non_finite_features_are_culled_and_counted(scene):
     without = mask_gaussians(scene[0], jnp.arange(60) != 3)
     assert int(out.num_non_finite) == 1 and np.isfinite(out.features).all()
     np.testing.assert_array_equal(out.color, render(without, scene[1], max_pairs=1 << 12).color)
+
+
+@pytest.mark.parametrize("field", ["opacities", "scales"])
+def test_raw_values_of_files_are_told_from_activated_ones(scene, field, tmp_path):
+    """Logits of opacities and logarithms of scales have the shapes of what they stand for."""
+    gaussians, camera = scene
+    raw = {"opacities": jnp.linspace(-4.0, 6.0, 60), "scales": jnp.log(gaussians.scales)}
+    spoiled = replace(gaussians, **{field: raw[field]})
+    for use in (lambda: render(spoiled, camera), lambda: save_ply(tmp_path / "a.ply", spoiled)):
+        with pytest.raises(InputError, match=f"{field}: wanted activated values"):
+            use()
+
+
+@pytest.mark.parametrize(
+    "colors", [np.full((60, 3), 128, np.uint8), np.full((60, 3), 128, np.float32)], ids=["bytes", "floats"]
+)
+def test_colors_of_0_to_255_are_refused(scene, colors):
+    fields = {name: getattr(scene[0], name) for name in ("means", "quats", "scales", "opacities")}
+    with pytest.raises(InputError, match="divide bytes by 255"):
+        inspect.unwrap(Gaussians.from_rgb)(**fields, colors=jnp.asarray(colors))
 
 
 K, VIEW = np.asarray(cameras(21, 30).Ks), np.asarray(cameras(21, 30).viewmats)
