@@ -5,6 +5,8 @@ second run spends before its first image. Here a program is known by what it is 
 versions, device, configuration of JAX and XLA, the function with its static arguments, shapes and dtypes. A store is
 used where `SWITCH` names its folder, as the commands do (`commands/program_cache.py`); elsewhere a `Kept` is `jax.jit`.
 
+Views of embedded scenes are kept there too (`kept_arrays`).
+
 An entry is unpickled and holds machine code: one is read only if this user alone can have written it. One that is cut
 short, damaged or of another program is compiled again and replaced.
 """
@@ -34,8 +36,14 @@ PACKAGE = __name__.partition(".")[0]
 SWITCH = "SSPLAT_EXECUTABLES"
 """Environment variable: folder of the store, of this kind of CPU alone; without it nothing is kept."""
 
+PACKAGES = ("jax", "jaxlib", "flax", "numpy", "pillow", "scikit-image")
+"""Packages whose version is part of every key."""
+
 MOST_BYTES = 256 << 20
 """Size of the store: a run has some 15 programs of 0.3 MB. Those that were not used for the longest time go."""
+
+MOST_ARRAY_BYTES = 32 << 20
+"""Largest arrays that are kept: those of the scene that a demo streams take 15 MB."""
 
 DIGEST_BYTES = 32
 
@@ -136,7 +144,7 @@ def _place() -> str:
     root = Path(__file__).parents[1]
     for file in sorted(root.rglob("*.py")):
         source.update(f"{file.relative_to(root)} {file.stat().st_size}\n".encode() + file.read_bytes())
-    versions = [f"{name} {importlib.metadata.version(name)}" for name in ("jax", "jaxlib", "flax", "numpy")]
+    versions = [f"{name} {importlib.metadata.version(name)}" for name in PACKAGES]
     device = jax.devices()[0]
     platform = (device.platform, device.device_kind, device.client.platform_version, jax.device_count())
     flags = [os.environ.get(name) for name in ("XLA_FLAGS", "LIBTPU_INIT_ARGS")]
@@ -175,6 +183,42 @@ def _compiled_anew(lowered: jax.stages.Lowered) -> jax.stages.Compiled:
 
 
 def _load(file: Path, key: str, dynamic: tuple) -> jax.stages.Compiled:
+    executable, results = _read(file, key)
+    in_tree, out_tree = jax.tree.structure((dynamic, {})), jax.tree.structure(results)
+    device = jax.devices()[0]
+    return serialize_executable.deserialize_and_load(
+        executable, in_tree, out_tree, backend=device.client, execution_devices=[device]
+    )
+
+
+def _save(file: Path, key: str, program: jax.stages.Compiled) -> None:
+    executable, _, out_tree = serialize_executable.serialize(program)
+    results = jax.tree.unflatten(out_tree, range(out_tree.num_leaves))  # the structure itself cannot be pickled
+    _write(file, key, (executable, results))
+
+
+def kept_arrays(function: Callable, *arguments: Any) -> Any:
+    """`function(*arguments)`, kept where programs are: NumPy arrays that follow from this package and the arguments.
+
+    Args:
+        function: a function of this package.
+        arguments: `repr` tells them apart.
+    """
+    if not os.environ.get(SWITCH) or (name := _identity(function)) is None:
+        return function(*arguments)
+    key = f"{_place()} {_settings()} {name} {arguments}"
+    file = Path(os.environ[SWITCH]) / hashlib.sha256(key.encode()).hexdigest()
+    with contextlib.suppress(Exception):  # as for programs
+        return _read(file, key)
+    arrays = function(*arguments)
+    if sum(x.nbytes for x in jax.tree.leaves(arrays)) <= MOST_ARRAY_BYTES:
+        with contextlib.suppress(Exception):
+            _write(file, key, arrays)
+    return arrays
+
+
+def _read(file: Path, key: str) -> Any:
+    """What `_write` put into an entry; raises where it is damaged, of another key, or may be another user's."""
     with file.open("rb") as opened:
         facts = os.fstat(opened.fileno())
         if facts.st_uid != os.geteuid() or facts.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
@@ -182,23 +226,16 @@ def _load(file: Path, key: str, dynamic: tuple) -> jax.stages.Compiled:
         data = opened.read()
     if hashlib.sha256(data[DIGEST_BYTES:]).digest() != data[:DIGEST_BYTES]:
         raise ValueError(file)
-    stored_key, executable, results = pickle.loads(zstandard.decompress(data[DIGEST_BYTES:]))
+    stored_key, held = pickle.loads(zstandard.decompress(data[DIGEST_BYTES:]))
     if stored_key != key:
         raise ValueError(file)
-    in_tree, out_tree = jax.tree.structure((dynamic, {})), jax.tree.structure(results)
-    device = jax.devices()[0]
-    program = serialize_executable.deserialize_and_load(
-        executable, in_tree, out_tree, backend=device.client, execution_devices=[device]
-    )
     with contextlib.suppress(OSError):
         os.utime(file)  # used last
-    return program
+    return held
 
 
-def _save(file: Path, key: str, program: jax.stages.Compiled) -> None:
-    executable, _, out_tree = serialize_executable.serialize(program)
-    results = jax.tree.unflatten(out_tree, range(out_tree.num_leaves))  # the structure itself cannot be pickled
-    body = zstandard.compress(pickle.dumps((key, executable, results)))
+def _write(file: Path, key: str, held: Any) -> None:
+    body = zstandard.compress(pickle.dumps((key, held)))
     file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     # Not `write_atomic`: two processes that write the same entry need a partial file each, which this user alone reads.
     descriptor, partial = tempfile.mkstemp(dir=file.parent)

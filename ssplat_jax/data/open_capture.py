@@ -12,6 +12,7 @@ from urllib.parse import parse_qsl
 import numpy as np
 
 from ssplat_jax.core.errors import InputError, echo, refusal
+from ssplat_jax.core.kept_programs import kept_arrays
 from ssplat_jax.data.capture import MAX_SIDE, ArrayPixels, Capture, FilePixels, capture_of_listing
 from ssplat_jax.data.images import MAX_PIXELS
 from ssplat_jax.data.parsing import reading
@@ -193,7 +194,8 @@ def _open_procedural(spec: str, size: tuple[int, int] | None) -> Capture:
     # Imported here because the scenes load their textures, which no other capture needs.
     from ssplat_jax.data.procedural.procedural_views import procedural_capture_arrays
 
-    images, depths, camtoworlds, Ks = procedural_capture_arrays(name, num_frames, height, width, seed=seed)
+    wanted = (name, num_frames, height, width, seed)
+    images, depths, camtoworlds, Ks = kept_arrays(procedural_capture_arrays, *wanted)
     frames = tuple(
         Frame(f"{name}/{i:05d}", check_camtoworld(pose, spec)[0], K.astype(np.float64), width, height)
         for i, (pose, K) in enumerate(zip(camtoworlds, Ks, strict=True))

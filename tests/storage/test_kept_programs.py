@@ -16,6 +16,7 @@ from ssplat_jax.core import kept_programs
 from ssplat_jax.core.kept_programs import SWITCH, Kept
 from ssplat_jax.core.numerics import safe_sqrt
 from ssplat_jax.data.open_capture import open_capture
+from ssplat_jax.data.procedural import procedural_views
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.streaming.feed import feed_capture
 from ssplat_jax.streaming.session import Session
@@ -165,3 +166,19 @@ def test_what_cannot_be_told_apart_is_not_kept(store):
     assert Kept(lambda x: x * scale)(jax.numpy.ones(3)).tolist() == [2, 2, 2]  # a closure, and not of the package
     assert jax.grad(Kept(safe_sqrt))(4.0) == 0.25  # ours, but traced
     assert not store.exists()
+
+
+def test_an_embedded_scene_is_made_once_and_again_where_its_entry_is_damaged(store, monkeypatch):
+    made, arrays_of = [], procedural_views.procedural_capture_arrays
+    cast = procedural_views._cast
+    monkeypatch.setattr(procedural_views, "_cast", lambda *given: made.append(0) or cast(*given))
+    wanted = ("room", 2, 16, 24, 0)
+    first, again = (kept_programs.kept_arrays(arrays_of, *wanted) for _ in range(2))
+    assert len(made) == 1
+    for x, y in zip(first, again, strict=True):
+        np.testing.assert_array_equal(x, y)
+    for entry in store.iterdir():
+        entry.write_bytes(entry.read_bytes()[:-9])
+    kept_programs.kept_arrays(arrays_of, *wanted)
+    kept_programs.kept_arrays(arrays_of, "room", 2, 16, 24, 1)
+    assert len(made) >= 3
