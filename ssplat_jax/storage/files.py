@@ -69,8 +69,12 @@ def save_arrays(
     # Not compressed, so that git packs shipped weights that differ in one stage as a difference of kilobytes.
     np.savez(buffer, **{_HEADER: np.frombuffer(text.encode(), np.uint8)}, **bits)  # pyright: ignore[reportArgumentType]
     # The last field of a zip file without comment is the comment's length.
-    sealed = buffer.getvalue()[:-2] + _DIGEST_LENGTH.to_bytes(2, "little")
-    write_atomic(path, sealed + _hex_digest(sealed), keep_previous=keep_previous)
+    buffer.seek(-2, io.SEEK_END)
+    buffer.write(_DIGEST_LENGTH.to_bytes(2, "little"))
+    with buffer.getbuffer() as sealed:  # no copy: a stream's state has tens of megabytes
+        digest = _hex_digest(sealed)
+    buffer.write(digest)
+    write_atomic(path, buffer.getvalue(), keep_previous=keep_previous)
 
 
 def load_arrays(path: Path, kind: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
