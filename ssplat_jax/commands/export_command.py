@@ -23,7 +23,7 @@ class Export:
     max_splats: int | None = None
     """Write at most so many Gaussians: opaque ones first, everywhere alike; the number of the others is printed."""
     cameras: str | None = None
-    """Capture of the scene: its cameras are written as COLMAP text, cameras.txt and images.txt, beside the file."""
+    """Capture of a lone scene file: its cameras tell what is up, where a .sog starts, and how the file is shown."""
     up: Literal["y", "z"] | None = None
     """Axis of the file that points up, +y or +z; by default the scene keeps the axes of its capture."""
     spz: Literal[4, 3] = 4
@@ -41,7 +41,7 @@ class Export:
         check_format(self.to)
         reporter = Reporter(quiet=False)
         folder = RunFolder(self.scene)
-        cameras = None if self.cameras is None else export.open_cameras(self.cameras, self.scene, self.to, reporter)
+        views = export.views_of(self.scene, self.cameras, reporter)
         file = self.scene if self.scene.is_file() else folder.best_scene
         # A run's state is more exact than its scene.ply, and is there before the run ends; `ssplat demo` keeps none.
         if file.exists() and (file != folder.scene or not folder.has_state()):
@@ -50,10 +50,8 @@ class Export:
             scene = load_scene(file)
         else:
             scene = export.decoded_scene(self.scene, load_params(self.weights), reporter)
-        views, options = export.views_of(self.scene, cameras), {"max_splats": self.max_splats, "spz_version": self.spz}
+        options = {"max_splats": self.max_splats, "spz_version": self.spz}
         report, turn = export.export_scene(scene, self.to, views, self.up, **options)
-        if cameras is not None:
-            export.save_cameras(self.to.parent, cameras, report.offset, turn)
         if report.warning is not None:
             reporter.warn(f"{self.to.name}: {report.warning}")
         left_out = (

@@ -48,7 +48,7 @@ class Poses:
             print(f"stopped; the same command{how} continues", file=sys.stderr)
             raise
         print(f"{self.out}: " + "\n".join(found.sentences()))
-        size = _small_size(self.out / "images" / found.parts[0][0])
+        size = _small_size(self.out / "images" / found.registered[0])
         place, run = shlex.quote(str(self.out)), shlex.quote(f"runs/{self.out.resolve().name}")
         print(f"next: ssplat run {place} --size {size} --out {run}")
         return 0

@@ -36,8 +36,6 @@ class Render:
     film_path: Literal["spline", "orbit"] = "spline"
     """spline: smooth, through all cameras. orbit: a circle around what the cameras look at; where they look outward, as
     in a room, a small circle about the middle camera."""
-    film_shows: tuple[Literal["color", "depth", "normals"], ...] = ("color",)
-    """Contents of the film; each becomes a file: film.mp4, film_depth.mp4, film_normals.mp4."""
     axes: AxesOption = None
     poses: PosesOption = None
     quiet: QuietOption = False
@@ -47,11 +45,9 @@ class Render:
         from ssplat_jax.runs.render_run import FilmOptions, render_run
         from ssplat_jax.storage.run_folder import RunFolder
 
-        if self.film is None and (self.film_path != "spline" or self.film_shows != ("color",)):
-            raise InputError(
-                "--film-path, --film-shows: wanted --film N beside them, the number of pictures; got none."
-            )
-        film = None if self.film is None else FilmOptions(self.film, self.film_path, self.film_shows)
+        if self.film is None and self.film_path != "spline":
+            raise InputError("--film-path: wanted --film N beside it, the number of pictures; got none.")
+        film = None if self.film is None else FilmOptions(self.film, self.film_path)
         size, reporter = parse_size(self.size), Reporter(self.quiet)
         num_pictures = render_run(
             self.scene,
@@ -64,6 +60,6 @@ class Render:
             film=film,
             reporter=reporter,
         )
-        films = [RunFolder(self.out).film(kind).name for kind in film.shows] if film else []
-        print(", ".join([f"wrote {num_pictures} pictures to {self.out}/views", *films]))
+        film_name = f", {RunFolder(self.out).film.name}" if film else ""
+        print(f"wrote {num_pictures} pictures to {self.out}/views{film_name}")
         return 0

@@ -1,4 +1,4 @@
-"""Depth, normals and shares as colors of a picture."""
+"""Depth and shares as colors of a picture."""
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -31,29 +31,6 @@ def color_share(share: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w 3"]:
     stops = np.linspace(0.0, 1.0, len(_DEPTH_COLORS))
     channels = [np.interp(1.0 - share, stops, _DEPTH_COLORS[:, c]) for c in range(3)]
     return np.stack(channels, axis=-1).astype(np.float32)
-
-
-def color_normals(depth: Float[np.ndarray, "h w"], K: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "h w 3"]:
-    """Normals of the surface that a depth map shows, as color: red right, green up, blue toward the camera.
-
-    A normal is perpendicular to the differences between the points of neighboring pixels.
-
-    Args:
-        depth: camera z, 0 where nothing is.
-        K: intrinsics, pixels.
-
-    Limits:
-        Black where depth is 0. Across a depth edge the normal is that of a slope between both sides.
-    """
-    height, width = depth.shape
-    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    rays = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones_like(x)], axis=-1)
-    points = rays * np.asarray(depth, np.float64)[..., None]
-    down, right = np.gradient(points, axis=(0, 1))
-    normals = np.cross(down, right)  # OpenCV axes: toward the camera
-    normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-30)
-    colors = 0.5 + 0.5 * normals * np.array([1.0, -1.0, -1.0])
-    return np.where(depth[..., None] > 0, colors, 0.0).astype(np.float32)
 
 
 def eight_bits(image: Float[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:

@@ -1,24 +1,19 @@
 """Summary of a capture for `ssplat inspect`: facts, the scale and depth range of a run, and warnings with remedies.
 
-Warnings about frames tell of copies, disorder, gaps in the motion, blur and jumps of exposure. Poses are looked at in
-all frames; images, which must be decoded, in all frames of a short capture and in evenly spread pairs of a long one.
+Warnings about frames tell of disorder and gaps in the motion.
 """
 
-import hashlib
-from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
-from PIL import Image
-from scipy.ndimage import gaussian_filter
 
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.depth_range import DepthStatistics, estimate_depths, same_place_distance, stream_scale
 from ssplat_jax.data.pose_check import fit_poses, pose_warning
-from ssplat_jax.data.sparse_matches import gray_image, keypoints_of
+from ssplat_jax.data.sparse_matches import keypoints_of
 
 LOW_STEP = 0.012  # step between frames over median depth, below which four consecutive frames have little parallax
 GOOD_STEP = 0.03  # step over median depth that a suggested stride aims at
@@ -28,13 +23,6 @@ JUMP_RATIO = 20.0  # step over median step, above which there is a warning
 LOW_PARALLAX_DEGREES = 2.0  # median over the points, below which depth is uncertain
 MAX_DEPTH_RATIO = 1.5  # median of the depth maps over that of the matches, or its inverse; above it there is a warning
 NUM_DEPTH_MAPS_READ = 8  # evenly spread; a median needs no more
-MAX_IMAGES_READ = 64  # decoded to look for blur and jumps of exposure
-LONG_SIDE = 640  # pixels of the image in which blur is looked for
-THUMBNAIL = (40, 30)  # (width, height) of the image in which neighbors are compared
-MIN_CORRELATION = 0.8  # of the thumbnails of neighbors that show the same things
-BLUR_RATIO = 0.5  # of a frame's fine detail over its neighbor's, below which it is blurred
-EXPOSURE_RATIO = 1.35  # between neighbors
-DARK, BRIGHT = 0.05, 0.95  # cells outside are noise or clipped
 MIN_FRAMES = 8  # with fewer, disorder is not looked for
 SHUFFLED_RANK = 0.15  # of the number of frames; median rank of the next camera among the nearest, above which
 ASIDE_RATIO = 5.0  # steps to and from a frame over the median step, and over the step from its neighbor to the other
@@ -99,7 +87,7 @@ def summarize(
         "near": near,
         "far": far,
         "voxel_in_capture_units": config.memory.voxel_size / scale,
-        "warnings": [*capture.notes, *warnings, *frame_warnings(capture)],
+        "warnings": [*capture.notes, *warnings, *order_warnings(capture)],
     }
 
 
@@ -158,35 +146,6 @@ def _depth_warnings(capture: Capture, depths: DepthStatistics, steps: np.ndarray
     return found
 
 
-# -- frames -----------------------------------------------------------------------------------------------------------
-
-
-def frame_warnings(capture: Capture) -> list[str]:
-    """The findings about the frames of `capture`, one sentence with a remedy each."""
-    return [*copy_warnings(capture), *order_warnings(capture), *image_warnings(capture)]
-
-
-def _listed(indices: Sequence[int], num_shown: int = 4) -> str:
-    """The first of some frame numbers as text: `3, 8, 9, 20, ...`."""
-    return ", ".join(map(str, indices[:num_shown])) + (", ..." if len(indices) > num_shown else "")
-
-
-def copy_warnings(capture: Capture) -> list[str]:
-    """Frames whose image is a copy of an earlier one, byte by byte."""
-    lengths = [0 if frame.path is None else frame.path.stat().st_size for frame in capture.frames]
-    alike = Counter(lengths)
-    originals: dict[bytes, int] = {}
-    copies = []
-    for i, frame in enumerate(capture.frames):
-        if alike[lengths[i]] > 1:
-            data = np.ascontiguousarray(capture.image(i)).tobytes() if frame.path is None else frame.path.read_bytes()
-            if originals.setdefault(hashlib.sha256(data).digest(), i) != i:
-                copies.append(i)
-    if not copies:
-        return []
-    return [f"{len(copies)} images are copies of earlier ones (frames {_listed(copies)}): leave them out."]
-
-
 def order_warnings(capture: Capture) -> list[str]:
     """Frames whose cameras are not in the order of a path."""
     centers = capture.camtoworlds[:, :3, 3]
@@ -204,8 +163,9 @@ def order_warnings(capture: Capture) -> list[str]:
     aside = [int(i) + 1 for i in np.flatnonzero((steps[:-1] > least) & (steps[1:] > least))]
     if not aside:
         return []
+    listed = ", ".join(map(str, aside[:4])) + (", ..." if len(aside) > 4 else "")
     return [
-        f"{len(aside)} cameras stand far off the path between their neighbors (frames {_listed(aside)}): they are out"
+        f"{len(aside)} cameras stand far off the path between their neighbors (frames {listed}): they are out"
         " of order or their poses are wrong; move them or leave them out."
     ]
 
@@ -214,47 +174,3 @@ def _rank(centers: Float64[np.ndarray, "n 3"], i: int) -> int:
     """Place of the camera after camera `i` among those nearest to it, from 1; ties count for it."""
     distances = np.linalg.norm(centers - centers[i], axis=-1)
     return int(np.sum(distances < distances[i + 1])) - (0 if distances[i + 1] == 0 else 1) + 1
-
-
-def image_warnings(capture: Capture) -> list[str]:
-    """Blurred images and jumps of exposure, among neighbors that show the same things."""
-    count = len(capture)
-    firsts = list(range(count - 1))
-    if count > MAX_IMAGES_READ:
-        firsts = np.unique(np.linspace(0, count - 2, MAX_IMAGES_READ // 2).round().astype(int)).tolist()
-    blurred: set[int] = set()
-    jumps: dict[int, float] = {}
-    held: dict[int, tuple[np.ndarray, float]] = {}
-    for i in firsts:
-        held = {k: held[k] if k in held else _thumbnail(capture, k) for k in (i, i + 1)}
-        (a, detail), (b, next_detail) = held[i], held[i + 1]
-        if min(np.std(a), np.std(b)) < 1e-3 or np.corrcoef(a.ravel(), b.ravel())[0, 1] <= MIN_CORRELATION:
-            continue
-        if min(detail, next_detail) < BLUR_RATIO * max(detail, next_detail):
-            blurred.add(i if detail < next_detail else i + 1)
-        usable = (np.minimum(a, b) > DARK) & (np.maximum(a, b) < BRIGHT)
-        ratio = float(np.median(b[usable] / a[usable])) if usable.mean() > 0.2 else 1.0
-        if max(ratio, 1 / ratio) > EXPOSURE_RATIO:
-            jumps[i] = max(ratio, 1 / ratio)
-    looked = "" if count <= MAX_IMAGES_READ else f" of the {2 * len(firsts)} looked at"
-    warnings = []
-    if blurred:
-        frames = f"(frames {_listed(sorted(blurred))})"
-        warnings.append(f"{len(blurred)} images{looked} are blurred beside their neighbors {frames}: drop them.")
-    if jumps:
-        warnings.append(
-            f"{len(jumps)} jumps of exposure of up to {max(jumps.values()):.1f} times between neighbors{looked} (after"
-            f" frames {_listed(sorted(jumps))}): a run evens out up to 4 times; better lock the exposure while filming."
-        )
-    return warnings
-
-
-def _thumbnail(capture: Capture, i: int) -> tuple[np.ndarray, float]:
-    """Thumbnail of a frame in gray, and the share of its contrast that is fine detail."""
-    image = capture.image(i)
-    shrink = max(1.0, max(image.shape[:2]) / LONG_SIDE)
-    size = (round(image.shape[1] / shrink), round(image.shape[0] / shrink))
-    working = gray_image(image, size, Image.Resampling.BOX)
-    fine = working - gaussian_filter(working, 1.5)
-    detail = float(np.std(fine)) / max(float(np.std(working)), 1e-6)
-    return gray_image(image, THUMBNAIL, Image.Resampling.BOX), detail

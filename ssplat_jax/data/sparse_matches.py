@@ -83,14 +83,10 @@ def detect_keypoints(image: Float32[np.ndarray, "h w 3"]) -> Keypoints:
     return Keypoints(pixels=pixels, descriptors=detector.descriptors.astype(bool), pixel=shrink)
 
 
-def gray_image(
-    image: Float32[np.ndarray, "h w 3"],
-    size: tuple[int, int],
-    resample: Image.Resampling = Image.Resampling.BICUBIC,
-) -> Float64[np.ndarray, "h2 w2"]:
+def gray_image(image: Float32[np.ndarray, "h w 3"], size: tuple[int, int]) -> Float64[np.ndarray, "h2 w2"]:
     """An image in gray at another size (width, height)."""
     gray = Image.fromarray(np.ascontiguousarray(image @ np.array([0.299, 0.587, 0.114], np.float32)))
-    return np.asarray(gray.resize(size, resample), np.float64)
+    return np.asarray(gray.resize(size, Image.Resampling.BICUBIC), np.float64)
 
 
 def keypoints_of(capture: PosedImages) -> KeypointsOf:

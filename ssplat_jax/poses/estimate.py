@@ -8,11 +8,9 @@ the findings once there are any.
 
 import dataclasses
 import hashlib
-import itertools
 import json
 import shutil
 import tempfile
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,8 +29,7 @@ OWN_FILES = (RECORD, "transforms.json", "database.db", "database.db-shm", "datab
 MIN_READ_SHARE = 0.95  # of the announced frames of a video; below it a warning says that it could not be read
 MIN_REGISTERED, MIN_SHARE = 4, 0.25  # images, one chunk, and share of them; fewer registered ones are no result
 GOOD_SHARE, GOOD_ERROR = 0.9, 1.5  # of the images, and pixels: what is worse is explained
-MIN_PART = 3  # images of a part that is worth naming
-MAX_RANGES = 6  # ranges of images that a line names
+MOST_NAMED = 6  # images without a pose that a line names
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,27 +46,18 @@ class Findings:
     """Contents of a reconstruction."""
 
     names: tuple[str, ...]  # of all images, in order
-    parts: tuple[tuple[str, ...], ...]  # names of the registered images of each model, the largest first
-    reprojection_error: float  # pixels, median over the points of the largest model
-    num_points: int  # of the largest model
+    registered: tuple[str, ...]  # of those that have a pose
+    reprojection_error: float  # pixels, median over the points
+    num_points: int
 
     def sentences(self) -> list[str]:
         """Findings, the most important first, and remedies."""
-        first, *others = self.parts
         error = f"median reprojection error {self.reprojection_error:.1f} px"
-        lines = [f"registered {len(first)} of {len(self.names)} images, {error}, {self.num_points:,} points"]
-        placed, shown = set(first), []
-        for part in others:  # images that a larger part holds belong to that one
-            fresh = [name for name in part if name not in placed]
-            if len(fresh) >= MIN_PART:
-                shown.append(f"{len(fresh)} images ({ranges(self.names, fresh)})")
-                placed.update(fresh)
-        if shown:
-            fix = "Take more pictures of the passage between them, or keep the parts apart."
-            lines.append(f"not connected to the rest: {'; '.join(shown[:MAX_RANGES])}. {fix}")
-        if missing := [name for name in self.names if name not in placed]:
-            lines.append(f"without a pose: {ranges(self.names, missing)}")
-        if len(first) < GOOD_SHARE * len(self.names):
+        lines = [f"registered {len(self.registered)} of {len(self.names)} images, {error}, {self.num_points:,} points"]
+        if missing := [name for name in self.names if name not in self.registered]:
+            more = f" and {len(missing) - MOST_NAMED} more" if len(missing) > MOST_NAMED else ""
+            lines.append(f"without a pose: {', '.join(missing[:MOST_NAMED])}{more}")
+        if len(self.registered) < GOOD_SHARE * len(self.names):
             lines.append(
                 "to register more: move slowly and sideways, let neighboring pictures overlap by two thirds, keep"
                 " textured surfaces in sight; blank walls, reflections and turning on the spot give no poses"
@@ -77,14 +65,6 @@ class Findings:
         if self.reprojection_error > GOOD_ERROR:
             lines.append("the error is large: moving things, motion blur, or a fish-eye lens (then: --fisheye)")
         return lines
-
-
-def ranges(names: Sequence[str], some: Sequence[str]) -> str:
-    """Names of some images, those that follow each other joined: "1.jpg to 4.jpg, 9.jpg"."""
-    places = sorted(names.index(name) for name in some)
-    runs = [[i for _, i in run] for _, run in itertools.groupby(enumerate(places), lambda pair: pair[1] - pair[0])]
-    shown = [names[run[0]] if len(run) == 1 else f"{names[run[0]]} to {names[run[-1]]}" for run in runs]
-    return ", ".join(shown[:MAX_RANGES]) + (f" and {len(shown) - MAX_RANGES} more" if len(shown) > MAX_RANGES else "")
 
 
 def estimate_poses(source: Path, out: Path, options: PoseOptions, overwrite: bool, reporter: Reporter) -> Findings:
@@ -122,7 +102,7 @@ def estimate_poses(source: Path, out: Path, options: PoseOptions, overwrite: boo
             record["findings"] = dataclasses.asdict(found)
             write_json(out / RECORD, record)
     fields = record["findings"]
-    return Findings(**fields | {"names": tuple(fields["names"]), "parts": tuple(map(tuple, fields["parts"]))})
+    return Findings(**fields | {name: tuple(fields[name]) for name in ("names", "registered")})
 
 
 def _request(source: Path, options: PoseOptions) -> dict[str, Any]:
@@ -210,23 +190,23 @@ def _reconstruct(out: Path, names: tuple[str, ...], source: Path, options: PoseO
     """Runs structure from motion and writes the capture's files."""
     sfm.quiet_colmap()
     # A camera has one focal length at first: with two, a straight path would leave their ratio open.
-    camera = ("RADIAL_FISHEYE" if options.is_fisheye else "RADIAL", "")
-    space = sfm.Workspace(out / "images", out / "database.db", dict.fromkeys(names, camera))
+    camera = "RADIAL_FISHEYE" if options.is_fisheye else "RADIAL"
+    space = sfm.Workspace(out / "images", out / "database.db", names, camera)
     with reporter.progress("features", len(names), waiting="") as advance:
         sfm.extract_features(space, advance)
     pairs = sfm.pairs_to_match(space, is_video=not source.is_dir())
     with reporter.progress("matching", len(pairs), waiting="") as advance:
         sfm.match_pairs(space, pairs, advance)
     with tempfile.TemporaryDirectory() as scratch, reporter.progress("poses", len(names), waiting="") as advance:
-        models = sfm.map_images(space, Path(scratch), advance)
-    parts = tuple(tuple(sorted(i.name for i in model.images.values() if i.has_pose)) for model in models)
-    num = len(parts[0]) if parts else 0
-    if num < max(MIN_REGISTERED, MIN_SHARE * len(names)):
+        model = sfm.map_images(space, Path(scratch), advance)
+    images = [] if model is None else model.images.values()
+    registered = tuple(sorted(image.name for image in images if image.has_pose))
+    if model is None or len(registered) < max(MIN_REGISTERED, MIN_SHARE * len(names)):
+        got = f"{len(registered)} of {len(names)}"
         raise InputError(
-            f"{source}: wanted poses of most images, got {num} of {len(names)}; take pictures of a scene that stands"
-            " still, with two thirds of overlap between neighbors, moving sideways past textured surfaces, not turning"
-            " on the spot."
+            f"{source}: wanted poses of most images, got {got}; take pictures of a scene that stands still, with two"
+            " thirds of overlap between neighbors, moving sideways past textured surfaces, not turning on the spot."
         )
-    errors = [point.error for point in models[0].points3D.values()]
-    sfm.write_capture(out, models)
-    return Findings(names, parts, float(np.median(errors)) if errors else 0.0, len(errors))
+    errors = [point.error for point in model.points3D.values()]
+    sfm.write_capture(out, model)
+    return Findings(names, registered, float(np.median(errors)) if errors else 0.0, len(errors))

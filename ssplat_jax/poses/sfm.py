@@ -54,7 +54,8 @@ class Workspace:
 
     images: Path  # folder
     database: Path
-    cameras: dict[str, tuple[str, str]]  # names of the images, in order: COLMAP's camera model, and known parameters
+    names: tuple[str, ...]  # of the images, in order
+    camera: str  # COLMAP's camera model
 
     def ids(self) -> dict[str, tuple[int, int]]:
         """Numbers of the image and of its camera, by name."""
@@ -70,31 +71,31 @@ def quiet_colmap() -> None:
 
 
 def extract_features(space: Workspace, advance: Advance) -> None:
-    """Finds the features of all images; those of one size and model share a camera."""
+    """Finds the features of all images; those of one size share a camera."""
     pycolmap = require("pycolmap")
     # The images are entered first, in order: their numbers do not depend on which thread is done first.
     known, groups = space.ids(), {}
-    for name, camera in space.cameras.items():
-        groups.setdefault((image_size(space.images / name), camera), []).append(name)
-    for (_, (model, params)), names in groups.items():
-        options = pycolmap.ImageReaderOptions(camera_model=model, camera_params=params)
+    for name in space.names:
+        groups.setdefault(image_size(space.images / name), []).append(name)
+    for names in groups.values():
+        options = pycolmap.ImageReaderOptions(camera_model=space.camera)
         options.existing_camera_id = next((known[name][1] for name in names if name in known), -1)
         if new := [name for name in names if name not in known]:
             pycolmap.import_images(space.database, space.images, pycolmap.CameraMode.SINGLE, new, options)
-    for k in range(0, len(space.cameras), IMAGES_PER_CALL):
-        some = list(space.cameras)[k : k + IMAGES_PER_CALL]
+    for k in range(0, len(space.names), IMAGES_PER_CALL):
+        some = list(space.names[k : k + IMAGES_PER_CALL])
         _cancellable(pycolmap.extract_features, space.database, space.images, image_names=some)
         advance(k + len(some))
 
 
 def pairs_to_match(space: Workspace, *, is_video: bool) -> list[Pair]:
     """All pairs of a small set of photos; else neighbors in time, and images that look alike, which close loops."""
-    num = len(space.cameras)
+    num = len(space.names)
     if not is_video and num <= MAX_EXHAUSTIVE:
         return list(itertools.combinations(range(num), 2))
     ids = space.ids()
     with require("pycolmap").Database.open(space.database) as database:
-        found = [database.read_descriptors(ids[name][0]) for name in space.cameras]
+        found = [database.read_descriptors(ids[name][0]) for name in space.names]
     descriptors = [np.asarray(getattr(rows, "data", rows), np.float32).reshape(-1, 128) for rows in found]
     return sorted({*neighbor_pairs(num), *alike_pairs(descriptors, NUM_ALIKE_VIDEO if is_video else NUM_ALIKE_PHOTOS)})
 
@@ -139,7 +140,7 @@ def match_pairs(space: Workspace, pairs: Sequence[Pair], advance: Advance) -> No
     pycolmap = require("pycolmap")
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = SEED
-    names, pairs_file = list(space.cameras), space.database.with_suffix(".pairs.txt")
+    names, pairs_file = space.names, space.database.with_suffix(".pairs.txt")
     for k in range(0, len(pairs), PAIRS_PER_CALL):
         some = pairs[k : k + PAIRS_PER_CALL]
         pairs_file.write_text("".join(f"{names[i]} {names[j]}\n" for i, j in some))
@@ -153,11 +154,11 @@ def match_pairs(space: Workspace, pairs: Sequence[Pair], advance: Advance) -> No
     pairs_file.unlink(missing_ok=True)
 
 
-def map_images(space: Workspace, scratch: Path, advance: Advance) -> list[Any]:
+def map_images(space: Workspace, scratch: Path, advance: Advance) -> Any | None:
     """Estimates poses, intrinsics and points; `scratch` is an empty folder for COLMAP's files.
 
     Returns:
-        `pycolmap.Reconstruction`s that share no frame of reference, that with the most images first.
+        The `pycolmap.Reconstruction` with the most images; None if there is none.
     """
     pycolmap = require("pycolmap")
     options = pycolmap.IncrementalPipelineOptions(random_seed=SEED)
@@ -166,7 +167,7 @@ def map_images(space: Workspace, scratch: Path, advance: Advance) -> list[Any]:
 
     def count(added: int) -> None:
         registered[0] += added
-        advance(min(registered[0], len(space.cameras)))  # smaller models may share images with larger ones
+        advance(min(registered[0], len(space.names)))  # smaller models may share images with larger ones
 
     found = _cancellable(
         pycolmap.incremental_mapping,
@@ -177,7 +178,7 @@ def map_images(space: Workspace, scratch: Path, advance: Advance) -> list[Any]:
         initial_image_pair_callback=lambda: count(2),
         next_image_callback=lambda: count(1),
     )
-    return [_refined(model) for model in sorted(found.values(), key=lambda model: -model.num_reg_images())]
+    return _refined(max(found.values(), key=lambda model: model.num_reg_images())) if found else None
 
 
 def _refined(model: Any) -> Any:
@@ -221,17 +222,16 @@ def _cancellable(function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any
             raise
 
 
-def write_capture(out: Path, models: Sequence[Any]) -> None:
-    """Writes reconstructions to `sparse/0`, `sparse/1`, ... of COLMAP, and the largest, the first, as transforms.json.
+def write_capture(out: Path, model: Any) -> None:
+    """Writes a reconstruction to `sparse/0` of COLMAP, and as transforms.json.
 
     Poses there are camera-to-world with OpenGL axes, in the reconstruction's frame and unit; intrinsics, per image, are
     in pixels with the center of the first pixel at (0.5, 0.5), which is COLMAP's convention too.
     """
     shutil.rmtree(out / "sparse", ignore_errors=True)
-    for number, model in enumerate(models):
-        (out / "sparse" / str(number)).mkdir(parents=True)
-        model.write(out / "sparse" / str(number))
-    frames, images = [], [image for image in models[0].images.values() if image.has_pose]
+    (out / "sparse" / "0").mkdir(parents=True)
+    model.write(out / "sparse" / "0")
+    frames, images = [], [image for image in model.images.values() if image.has_pose]
     for image in sorted(images, key=lambda image: image.name):
         camera, worldtocam = image.camera, np.vstack([image.cam_from_world().matrix(), [0.0, 0.0, 0.0, 1.0]])
         names = ("fl_x", "fl_y", "cx", "cy", *LENS_PARAMETERS[camera.model_name])

@@ -1,8 +1,7 @@
-"""`ssplat export`: the scene of a run as a person gets it, and the cameras of its capture as COLMAP text beside it."""
+"""`ssplat export`: the scene of a run as a person gets it, in any format, upright, with a camera to start from."""
 
 import dataclasses
 import math
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,14 +11,12 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
-from ssplat_jax.core.atomic import write_atomic
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.console import Reporter
 from ssplat_jax.core.errors import InputError, refusal
 from ssplat_jax.core.gaussians import Gaussians, mean_color
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.data.camera_path import upward
-from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.posed_image import invert_pose
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.evaluation.metrics import psnr
@@ -32,8 +29,6 @@ from ssplat_jax.storage.chunk_records import load_chunk_records
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.streaming.feed import middle_exposure
 
-TITLE = "# Cameras of a scene, written by ssplat export"
-COLMAP_FILES = ("cameras.txt", "images.txt", "points3D.txt")
 NUM_COMPARED, HOLE = 3, 0.5  # views that are compared, and the opacity of a pixel below which it is a hole
 
 
@@ -68,21 +63,27 @@ class KnownCameras:
     exposures: Float64[np.ndarray, "n 3"]  # RGB, relative to the middle one, which the scene has
 
 
-def views_of(scene: Path, cameras: "Cameras | None") -> KnownCameras | None:
-    """The cameras that are known of a scene: those that its run recorded, or those of a capture."""
+def views_of(scene: Path, path: str | None, reporter: Reporter) -> KnownCameras | None:
+    """The cameras that are known of a scene: those that its run recorded, or those of the capture at `path`.
+
+    Raises:
+        InputError: the capture is unusable, or none is needed.
+        StorageError: adjusted poses of the scene's run are corrupt.
+    """
     records = load_chunk_records(RunFolder(scene).chunk_record_files()) if scene.is_dir() else []
+    if records and path is not None:
+        raise InputError(f"--cameras: wanted a lone scene file, got {scene}, whose cameras are known; leave it out.")
     if records:
         views = sorted((view for record in records for view in record.views), key=lambda view: view.frame)
         exposures = np.stack([view.exposure for view in views])
         middle = middle_exposure(dict(enumerate(exposures.astype(np.float32))))
         poses, Ks = (np.stack([getattr(view, name) for view in views]) for name in ("camtoworld", "K"))
         return KnownCameras(poses, Ks, records[0].size, exposures / middle)
-    if cameras is None:
+    if path is None:
         return None
-    capture, indices = cameras
-    poses = np.stack([capture.frames[i].camtoworld for i in indices])
-    size = (capture.width, capture.height)
-    return KnownCameras(poses, np.stack([capture.K(i) for i in indices]), size, np.ones((len(poses), 3)))
+    capture = open_capture_of_scene(scene, path, None, reporter)
+    Ks = np.stack([capture.K(i) for i in range(len(capture))])
+    return KnownCameras(capture.camtoworlds, Ks, (capture.width, capture.height), np.ones((len(capture), 3)))
 
 
 def turn_up(views: KnownCameras | None, up: str, to: Path) -> Float64[np.ndarray, "3 3"]:
@@ -171,66 +172,3 @@ def difference_in_words(to: Path, views: KnownCameras, turn: Float64[np.ndarray,
         f"drawn by a plain renderer, {len(chosen)} views differ from our pictures of them by {np.mean(scores):.1f} dB"
         f" PSNR: {np.mean(holes):.1%} holes, which we fill, and exposures up to {exposure:.2f} times that of the file"
     )
-
-
-Cameras = tuple[Capture, Sequence[int]]
-"""A capture, and those of its frames whose cameras belong to a scene."""
-
-
-def open_cameras(path: str, scene: Path, to: Path, reporter: Reporter) -> Cameras:
-    """The cameras of the capture at `path`: those that a run streamed, or all if `scene` is a file.
-
-    They are to be written beside the scene file `to`.
-
-    Raises:
-        InputError: the capture is unusable or not that of the run, or files of other makers are in the way.
-        StorageError: the run's state or its adjusted poses are corrupt.
-    """
-    for name in COLMAP_FILES:
-        held = to.parent / name
-        if held.exists() and not held.read_bytes().startswith(TITLE.encode("ascii")):
-            raise InputError(f"{held}: wanted a place for the cameras, a file is in the way; choose another folder.")
-    if not RunFolder(scene).has_state():
-        capture = open_capture_of_scene(scene, path, None, reporter)
-        return capture, range(len(capture))
-    run = load_run(scene, reporter)
-    return run.open_capture(path), sorted(run.exposures)
-
-
-def save_cameras(
-    folder: Path, cameras: Cameras, offset: tuple[float, float, float], turn: Float64[np.ndarray, "3 3"] | None = None
-) -> None:
-    """Writes the three files of a COLMAP model, after colmap.github.io/format.html.
-
-    `cameras.txt` holds pinhole cameras, `images.txt` poses from world to camera as a quaternion wxyz and a translation,
-    both for images as they are delivered: without lens distortion, at the size that was streamed. `points3D.txt` is
-    empty; COLMAP does not open a model without it. SuperSplat shows the cameras of `images.txt`.
-
-    Positions are relative to `offset`, a point of the capture's frame, which is turned first, as the scene beside is.
-
-    Raises:
-        StorageError: a file cannot be written.
-    """
-    capture, indices = cameras
-    ids: dict[tuple, int] = {}  # of different intrinsics, in order
-    lines = []
-    for number, i in enumerate(indices, start=1):
-        K, camtoworld = capture.K(i), capture.frames[i].camtoworld.copy()
-        if turn is not None:
-            camtoworld[:3] = turn @ camtoworld[:3]
-        camtoworld[:3, 3] -= offset
-        viewmat = invert_pose(camtoworld)
-        quat = Rotation.from_matrix(viewmat[:3, :3]).as_quat(scalar_first=True, canonical=True)
-        camera = ids.setdefault((K[0, 0], K[1, 1], K[0, 2], K[1, 2]), len(ids) + 1)
-        pose = " ".join(repr(float(x)) for x in (*quat, *viewmat[:3, 3]))
-        lines += [f"{number} {pose} {camera} {capture.frames[i].name}", ""]  # the second line: no points
-    size = f"{capture.width} {capture.height}"
-    pinholes = [f"{number} PINHOLE {size} {' '.join(repr(float(x)) for x in K)}" for K, number in ids.items()]
-    contents = (
-        ["# id, model, width, height, fx, fy, cx, cy", *pinholes],
-        ["# id, qw, qx, qy, qz, tx, ty, tz, camera, name; then a line of points", *lines],
-        ["# no points"],
-    )
-    for name, content in zip(COLMAP_FILES, contents, strict=True):
-        # Names on Linux are bytes; Python keeps those that are no UTF-8 as surrogates.
-        write_atomic(folder / name, "\n".join([TITLE, *content, ""]).encode(errors="surrogateescape"))

@@ -6,29 +6,23 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Float64, UInt8
+from jaxtyping import Float, Float64
 
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.console import Reporter
 from ssplat_jax.core.errors import refusal, require_positive
-from ssplat_jax.core.false_colors import color_depth, color_normals, eight_bits, scale_ends
+from ssplat_jax.core.false_colors import eight_bits
 from ssplat_jax.core.gaussians import Gaussians, mean_color
 from ssplat_jax.core.kept_programs import Kept
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.data.camera_path import camera_path, orbit_path
 from ssplat_jax.data.stream_frame import StreamFrame
-from ssplat_jax.evaluation.pictures import VideoWriter, evenly_spread, save_image
+from ssplat_jax.evaluation.pictures import VideoWriter, save_image
 from ssplat_jax.rasterizer import effects_for, fill_holes, render
 from ssplat_jax.rasterizer.effects import FILTERS
 from ssplat_jax.runs.open_run import open_capture_of_scene
 from ssplat_jax.scene_files.formats import load_scene
 from ssplat_jax.storage.run_folder import RunFolder, lock_folder
-
-KINDS = ("color", "depth", "normals")
-"""Kinds of pictures that a film can show."""
-
-RANGE_CAMERAS = 8
-"""Cameras whose visible Gaussians give the color scale of a depth film."""
 
 Pose = Float64[np.ndarray, "4 4"]
 Intrinsics = Float64[np.ndarray, "3 3"]
@@ -42,7 +36,6 @@ class FilmOptions:
 
     steps: int  # spline: pictures from each camera to the next; orbit: pictures in all
     path: str = "spline"  # or `orbit`
-    shows: tuple[str, ...] = ("color",)  # of `KINDS`; each becomes a file
 
 
 def render_run(
@@ -57,7 +50,7 @@ def render_run(
     film: FilmOptions | None,
     reporter: Reporter,
 ) -> int:
-    """Writes `out`/views/<frame>.png for frames of a capture, and optionally `out`/film.mp4 and its like.
+    """Writes `out`/views/<frame>.png for frames of a capture, and optionally `out`/film.mp4.
 
     The scene is drawn with the filter that its file names, at the exposure of its file: the middle one of its stream.
 
@@ -92,36 +85,31 @@ def render_run(
     folder.check_no_run()
     indices = range(0, len(capture), stride)[:max_views]
     size = (capture.width, capture.height)
-    writers = {kind: VideoWriter(*size) for kind in (film.shows if film else ())}
+    writer = None if film is None else VideoWriter(*size)
     background = None if over_black else mean_color(splats)
     with lock_folder(out):
         folder.clear_views()
-        for kind in KINDS:
-            folder.film(kind).unlink(missing_ok=True)
+        folder.film.unlink(missing_ok=True)
         with reporter.progress("rendering", len(indices)) as advance:
             for place, i in enumerate(indices, start=1):
-                color, _ = _render_picture(splats, capture.frames[i].camtoworld, capture.K(i), size, background)
-                save_image(folder.view(i), color)
+                picture = _render_picture(splats, capture.frames[i].camtoworld, capture.K(i), size, background)
+                save_image(folder.view(i), picture)
                 advance(place)
-        if film is not None:
+        if film is not None and writer is not None:
             poses = np.stack([capture.frames[i].camtoworld for i in indices])
             cameras = _film_cameras(poses, np.stack([capture.K(i) for i in indices]), film, splats, size)
-            depth_range = _depth_range(splats, cameras, size)
             with reporter.progress("filming", len(cameras[0])) as advance:
                 for place, (pose, K) in enumerate(zip(*cameras, strict=True), start=1):
-                    color, depth = _render_picture(splats, pose, K, size, background)
-                    for kind, writer in writers.items():
-                        writer.add(_film_picture(kind, color, depth, K, depth_range))
+                    writer.add(eight_bits(_render_picture(splats, pose, K, size, background)))
                     advance(place)
-            for kind, writer in writers.items():
-                writer.save(folder.film(kind))
+            writer.save(folder.film)
     return len(indices)
 
 
 def _render_picture(
     splats: Gaussians, camtoworld: Pose, K: Intrinsics, size: tuple[int, int], background: jax.Array | None
-) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
-    """Color and depth (capture units, 0 where nothing is) of a scene from one camera of the capture's frame.
+) -> Float[np.ndarray, "h w 3"]:
+    """A scene from one camera of the capture's frame.
 
     `background` is the color of holes that have no colors around them; None shows all holes black.
     """
@@ -129,8 +117,7 @@ def _render_picture(
     camera = Camera(jnp.asarray(viewmat), jnp.asarray(K, jnp.float32), width=size[0], height=size[1])
     scene = replace(splats, offset=(0.0, 0.0, 0.0))  # the camera is relative to it already
     out = render(scene, camera, effects=effects_for(scene, camera))
-    color = out.color if background is None else _jitted_fill_holes(out.color, out.alpha, background)
-    return np.asarray(color), np.asarray(out.depth)
+    return np.asarray(out.color if background is None else _jitted_fill_holes(out.color, out.alpha, background))
 
 
 def _film_cameras(
@@ -146,26 +133,6 @@ def _film_cameras(
     middle = len(poses) // 2
     depths = _depths_seen(splats, poses[middle], Ks[middle], size)
     return orbit_path(poses, Ks[middle], float(np.median(depths)) if len(depths) else 1.0, film.steps)
-
-
-def _film_picture(
-    kind: str,
-    color: Float[np.ndarray, "h w 3"],
-    depth: Float[np.ndarray, "h w"],
-    K: Intrinsics,
-    depth_range: tuple[float, float],
-) -> UInt8[np.ndarray, "h w 3"]:
-    if kind == "color":
-        return eight_bits(color)
-    return eight_bits(color_depth(depth, *depth_range) if kind == "depth" else color_normals(depth, K))
-
-
-def _depth_range(
-    splats: Gaussians, cameras: tuple[np.ndarray, np.ndarray], size: tuple[int, int]
-) -> tuple[float, float]:
-    """Nearest and farthest depth of a color scale that stays the same over a film, capture units."""
-    chosen = evenly_spread(len(cameras[0]), RANGE_CAMERAS)
-    return scale_ends(np.concatenate([_depths_seen(splats, cameras[0][k], cameras[1][k], size) for k in chosen]))
 
 
 def _depths_seen(

@@ -32,15 +32,12 @@ class RunFolder:
         self.chunk_records = path / "chunks"  # folder with one record per chunk
         self.report = path / "report.html"  # the report as one page
         self.views = path / "views"  # folder with one picture per rendered frame
+        self.film = path / "film.mp4"
 
     @property
     def best_scene(self) -> Path:
         """The scene that a person is shown: the refined one if there is one, else the streamed one."""
         return self.refined_scene if self.refined_scene.is_file() else self.scene
-
-    def film(self, kind: str = "color") -> Path:
-        """The film of a kind that `ssplat render --film` writes: color, depth or normals."""
-        return self.path / ("film.mp4" if kind == "color" else f"film_{kind}.mp4")
 
     def delta(self, num_views: int) -> Path:
         """The scene changes of the chunk that brought the stream to `num_views` views."""

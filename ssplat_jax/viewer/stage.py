@@ -12,7 +12,7 @@ from jaxtyping import Float64, UInt8
 
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.errors import StorageError
-from ssplat_jax.core.false_colors import color_depth, color_normals, color_share, eight_bits, scale_ends
+from ssplat_jax.core.false_colors import color_depth, color_share, eight_bits, scale_ends
 from ssplat_jax.core.gaussians import SH_C0, Gaussians, mean_color
 from ssplat_jax.core.kept_programs import Kept
 from ssplat_jax.core.pytree import replace
@@ -28,7 +28,7 @@ from ssplat_jax.viewer.scene_sources import SceneFile, Source, ViewedScene
 MAX_SIGMA = 250.0
 """Largest standard deviation that is sent: the square of 256 overflows a 16-bit float."""
 
-KINDS = ("color", "depth", "normals", "confidence")
+KINDS = ("color", "depth", "confidence")
 """Kinds of picture."""
 
 DRAFT, FINE = (320, 240), (960, 640)
@@ -250,8 +250,6 @@ def draw(
     depth, alpha = np.asarray(out.depth), np.asarray(out.alpha)
     if kind == "depth":
         return eight_bits(color_depth(depth, *scale_ends(depth[depth > 0])))
-    if kind == "normals":
-        return eight_bits(color_normals(depth, K))
     if kind == "confidence":
         share = alpha if features is None else np.asarray(out.features)[..., 0] / np.maximum(alpha, 1e-6)
         return eight_bits(np.where(alpha[..., None] > 0.5, color_share(share), 0.0))

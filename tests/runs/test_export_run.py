@@ -1,9 +1,7 @@
-"""`ssplat export`: the scene at the middle exposure of its stream, and a COLMAP model whose cameras see it alike."""
+"""`ssplat export`: the scene at the middle exposure of its stream, upright, with a camera to start from."""
 
-import dataclasses
 import json
 import re
-import shutil
 import zipfile
 
 import jax.numpy as jnp
@@ -16,95 +14,13 @@ from ssplat_jax.core.gaussians import scale_colors
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.rasterizer import render
-from ssplat_jax.runs.export_run import KnownCameras, difference_in_words, export_scene, save_cameras, turned
+from ssplat_jax.runs.export_run import KnownCameras, difference_in_words, export_scene, turned
 from ssplat_jax.runs.run_results import scene_to_show
 from ssplat_jax.scene_files.formats import file_axes, save_ply
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.streaming.feed import middle_exposure
-from tests.commands.command_fixture import SIZE, make_capture, narrow_options, run
+from tests.commands.command_fixture import run
 from tests.scene_files.scene_fixture import camera, scene
-
-
-def turned_capture(folder):
-    """A capture whose cameras are turned about every axis; the last one has another focal length."""
-    capture = make_capture(folder, num_frames=4)
-    facts = json.loads((capture / "transforms.json").read_text())
-    for i, frame in enumerate(facts["frames"]):
-        pose = np.eye(4)
-        pose[:3, :3] = Rotation.from_rotvec([0.3 * i, -0.5, 2.0 + 0.2 * i]).as_matrix()
-        pose[:3, 3] = [0.1 * i, -3.0, 7.5]
-        frame["transform_matrix"] = pose.tolist()
-    (capture / "transforms.json").write_text(json.dumps(facts))
-    return capture
-
-
-@pytest.mark.parametrize("offset", [(0.0, 0.0, 0.0), (4096.0, -8.0, 1.0)])
-def test_the_model_opens_as_the_capture_it_was_written_from(tmp_path, offset):
-    capture, model = turned_capture(tmp_path / "capture"), tmp_path / "model"
-    save_ply(tmp_path / "scene.ply", scene(0), offset=offset)
-    assert run("export", tmp_path / "scene.ply", "--to", model / "scene.spz", "--cameras", capture) == 0
-    (model / "sparse").mkdir()
-    for name in ("cameras.txt", "images.txt", "points3D.txt"):
-        shutil.copy(model / name, model / "sparse" / name)
-    shutil.copytree(capture / "images", model / "images")
-    found, wanted = ss.open_capture(model), ss.open_capture(capture)
-    assert found.format == "COLMAP" and len(found) == len(wanted) == 4
-    assert (found.width, found.height) == (wanted.width, wanted.height)
-    moved = np.array(wanted.camtoworlds)
-    moved[:, :3, 3] -= offset
-    np.testing.assert_allclose(found.camtoworlds, moved, atol=1e-9)
-    for i in range(4):
-        np.testing.assert_allclose(found.K(i), wanted.K(i), rtol=1e-12)
-        np.testing.assert_array_equal(found.image(i), wanted.image(i))
-
-
-def test_a_line_of_images_txt_takes_points_to_pixels(tmp_path):
-    capture = ss.open_capture(turned_capture(tmp_path / "capture"))
-    frames = [dataclasses.replace(frame, name=f"caf\udce9{i}.jpg") for i, frame in enumerate(capture.frames)]
-    save_cameras(tmp_path, (dataclasses.replace(capture, frames=tuple(frames)), range(4)), (0.0, 0.0, 0.0))
-    images = [x for x in (tmp_path / "images.txt").read_bytes().splitlines() if not x.startswith(b"#")]
-    assert len(images) == 8 and images[1::2] == [b""] * 4
-    number, qw, qx, qy, qz, *translation, camera_id, name = images[4].split()
-    assert (number, name) == (b"3", b"caf\xe92.jpg")  # names on Linux are bytes
-    point = capture.frames[2].camtoworld @ [0.2, -0.1, 3.0, 1.0]  # in front of the third camera
-    rotation = Rotation.from_quat([float(x) for x in (qx, qy, qz, qw)])
-    np.testing.assert_allclose(rotation.apply(point[:3]) + np.array(translation, float), [0.2, -0.1, 3.0], atol=1e-9)
-    cameras = [line.split() for line in (tmp_path / "cameras.txt").read_bytes().splitlines() if line[:1] != b"#"]
-    (held,) = [line for line in cameras if line[0] == camera_id]
-    assert held[1:4] == [b"PINHOLE", b"32", b"24"] and [float(x) for x in held[4:]] == [32.0, 32.0, 16.0, 12.0]
-
-
-def test_a_runs_own_frames_are_written_and_other_captures_refused(
-    tmp_path, monkeypatch, capsys, compiled_plainly, programs_shared
-):
-    monkeypatch.setattr("ssplat_jax.streaming.session.MIN_DECODED_PIVOTS", 1 << 11)
-    capture, out, narrow = (
-        make_capture(tmp_path / "capture", num_frames=8, size=SIZE),
-        tmp_path / "run",
-        narrow_options(tmp_path),
-    )
-    assert run("run", capture, "--stride", "2", "--out", out, *narrow) == 0
-    to = tmp_path / "export" / "scene.ply"
-    assert run("export", out, "--to", to, "--cameras", capture, *narrow[:2]) == 0
-    lines = (tmp_path / "export" / "images.txt").read_text().splitlines()
-    assert [line.split()[-1] for line in lines if line and line[0] != "#"] == [f"images/{i}.png" for i in (0, 2, 4, 6)]
-    for other in (turned_capture(tmp_path / "other"), tmp_path / "no"):
-        to = tmp_path / "none" / "scene.ply"
-        assert run("export", out, "--to", to, "--cameras", other, *narrow[:2]) == 2
-        assert capsys.readouterr().err.count("\n") == 1 and not to.parent.exists()
-
-
-def test_a_model_of_another_maker_is_not_overwritten(tmp_path, capsys):
-    capture = turned_capture(tmp_path / "capture")
-    ply, to = tmp_path / "scene.ply", tmp_path / "scene.spz"
-    save_ply(ply, scene(0))
-    (tmp_path / "images.txt").write_text("# Image list with two lines of data per image\n")
-    assert run("export", ply, "--to", to, "--cameras", capture) == 2
-    assert "in the way" in capsys.readouterr().err and not to.exists()
-    assert not (tmp_path / "cameras.txt").exists()
-    (tmp_path / "images.txt").unlink()
-    for _ in range(2):  # its own files are written again
-        assert run("export", ply, "--to", to, "--cameras", capture) == 0
 
 
 def test_a_scene_that_is_decoded_needs_no_weights(tmp_path, capsys):
