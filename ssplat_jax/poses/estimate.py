@@ -102,7 +102,8 @@ def estimate_poses(source: Path, out: Path, options: PoseOptions, overwrite: boo
             record["findings"] = dataclasses.asdict(found)
             write_json(out / RECORD, record)
     fields = record["findings"]
-    return Findings(**fields | {name: tuple(fields[name]) for name in ("names", "registered")})
+    names, registered = (tuple(fields[name]) for name in ("names", "registered"))
+    return Findings(names, registered, fields["reprojection_error"], fields["num_points"])
 
 
 def _request(source: Path, options: PoseOptions) -> dict[str, Any]:

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 import ssplat_jax as ss
-from ssplat_jax.core.gaussians import mean_color, scale_colors
+from ssplat_jax.core.gaussians import mean_color
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.rasterizer import Effects, fill_holes
@@ -66,17 +66,6 @@ def test_pictures_are_what_the_cameras_see(tmp_path, capture, capsys):
     assert run("render", tmp_path / "run", capture, "--out", out, *arguments) == 0
     (only,) = (out / "views").iterdir()
     np.testing.assert_allclose(picture(only), wanted(capture, loaded, 0, "mip", filled=False), atol=0.51 * LEVEL)
-
-
-def test_a_folder_shows_its_refined_scene(tmp_path, capture):
-    folder = tmp_path / "run"
-    for name, gaussians in (("scene.ply", scene()), ("refined.ply", scale_colors(scene(), jnp.full(3, 0.5)))):
-        ss.save_ply(folder / name, gaussians)
-    pictures = [tmp_path / name for name in ("of_folder", "of_refined", "of_scene")]
-    for shown, out in zip((folder, folder / "refined.ply", folder / "scene.ply"), pictures, strict=True):
-        assert run("render", shown, capture, "--max-views", "1", "--out", out, "--quiet") == 0
-    of_folder, of_refined, of_scene = (picture(out / "views" / "00000.png") for out in pictures)
-    assert np.array_equal(of_folder, of_refined) and not np.array_equal(of_folder, of_scene)
 
 
 @pytest.mark.parametrize(("name", "antialias"), [("scene.ply", "classic"), ("scene.glb", "mip"), ("scene.sog", "mip")])

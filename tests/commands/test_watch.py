@@ -100,19 +100,6 @@ class Stream:
         yield len(group)
 
 
-def test_frames_that_come_after_the_end_are_for_the_next_call(tmp_path, monkeypatch):
-    """Otherwise every later frame would be a chunk of its own, padded."""
-    whole, growing = make_capture(tmp_path / "whole", num_frames=8, size=SIZE), tmp_path / "growing"
-    shutil.copytree(whole, growing)
-    list_frames(growing, whole, 6)
-    (growing / "done").touch()
-    watched, stream = growing_capture(growing), Stream(monkeypatch)
-    watched.look()
-    for _ in watched.chunks.__wrapped__(watched, stream, stream):
-        list_frames(growing, whole, 8)
-    assert stream.sizes == [4, 2]
-
-
 def test_a_frame_beyond_those_asked_for_is_not_missed(tmp_path, monkeypatch, capsys):
     whole = make_capture(tmp_path / "whole", num_frames=9, size=SIZE)
     (whole / "images" / "8.png").unlink()

@@ -11,7 +11,6 @@ from ssplat_jax.data.procedural.textures import TextureLibrary
 
 HEIGHT, WIDTH = 48, 64
 DEPTH_TOLERANCE = 2e-5  # relative; a few float32 roundings
-REPROJECTION_TOLERANCE = 0.02  # relative; bilinear depth ignores the curvature within a pixel
 COLOR_TOLERANCE = 1.5 / 255  # texels have 8 bits
 
 

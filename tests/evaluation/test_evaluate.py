@@ -13,7 +13,7 @@ from ssplat_jax.core.gaussians import Gaussians, mean_color
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import Split
 from ssplat_jax.evaluation import cost
-from ssplat_jax.evaluation.cost import PeakMemory, measure_latency
+from ssplat_jax.evaluation.cost import measure_latency
 from ssplat_jax.evaluation.metrics import psnr, ssim
 from ssplat_jax.evaluation.scoring import baselines, nearest_views, score_view
 from ssplat_jax.model.streamsplat import StreamSplat
@@ -131,10 +131,3 @@ def test_growing_the_cache_is_not_timed(overflow, capacity, capture, monkeypatch
     assert capacities == [capacity] * 2 and session.cache.capacity == 128  # 4 x 8 x 8 tokens
     assert 0 <= milliseconds["step_ms"] < milliseconds["chunk_ms"]["median"]
     assert 0 < milliseconds["render_ms"] < milliseconds["chunk_ms"]["median"]
-
-
-def test_the_largest_program_counts_that_of_refinement_too():
-    assert PeakMemory(step=3, decode=1, render=2).bytes == 3
-    assert PeakMemory(step=3, decode=1, render=2, refine=7).bytes == 7
-    assert PeakMemory(step=3, decode=1, render=2, refine=None).bytes is None
-    assert PeakMemory(step=3, decode=1, render=2, refine=None, allocator=5).bytes == 5

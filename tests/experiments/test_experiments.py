@@ -6,14 +6,12 @@ from typing import get_args, get_type_hints
 import numpy as np
 import pytest
 from ssplat_experiments.ablation import BUDGETS as ABLATION_BUDGETS
-from ssplat_experiments.ablation import VARIANTS, add_differences, findings, learned_from, scenes_of
+from ssplat_experiments.ablation import VARIANTS, add_differences, findings
 from ssplat_experiments.ablation import cases as ablation_cases
 from ssplat_experiments.accuracy_vs_time import mark_fronts
 from ssplat_experiments.depth_error import cell_depths, summary
 from ssplat_experiments.settings import REFINED, SETTINGS
 
-from ssplat_jax.commands.experiment_command import Experiment
-from ssplat_jax.commands.main import guarded
 from ssplat_jax.commands.options import StreamOptions
 from ssplat_jax.config import QUALITIES
 from ssplat_jax.model.network import STAGES
@@ -85,24 +83,7 @@ def test_every_variant_of_the_ablation_is_another_model_or_another_training():
         assert set(variant.untrained) <= set(STAGES) - set(budget.recipe(0, variant.untrained).phases[0].rates)
 
 
-def test_the_ablation_learns_from_no_scene_that_it_scores(tmp_path):
-    for name in ("redkitchen", "fox", "south_building", "hololens", "plush"):
-        (tmp_path / name).mkdir()
-    scored = scenes_of(tmp_path)
-    assert scored[1:] == ["redkitchen, stride 5", "redkitchen, stride 10", "fox, stride 1", "south_building, stride 1"]
-    assert learned_from(tmp_path) == ["hololens", "plush"] and learned_from(None) == []
-    seeds = {f"seed={seed}" for seed in ABLATION_BUDGETS["cpu"].seeds}
-    scenes = ABLATION_BUDGETS["cpu"].evidence.phases[0].samples.procedural
-    assert not any("revisit" in spec and spec.endswith(tuple(seeds)) for spec in scenes)
-
-
 def test_every_registered_experiment_and_benchmark_can_be_loaded():
     points = [*entry_points(group="ssplat_jax.experiments"), *entry_points(group="ssplat_jax.benchmarks")]
     assert {"captures", "accuracy_vs_time", "ablation", "depth_error", "cost"} <= {point.name for point in points}
     assert all(callable(point.load()) for point in points)
-
-
-def test_an_unknown_experiment_is_refused_at_once(tmp_path, capsys):
-    assert guarded(Experiment("no_such", out=tmp_path / "out").run) == 2
-    assert "accuracy_vs_time" in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()

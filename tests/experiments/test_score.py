@@ -65,23 +65,6 @@ def test_the_memory_of_a_method_is_that_of_its_metrics(renders, tmp_path, capsys
         assert words in capsys.readouterr().err
 
 
-def test_changed_and_missing_renders_are_refused_by_name(renders, tmp_path, capsys):
-    folder, _, split = renders
-    command = scoring(folder, tmp_path)
-    assert guarded(command.run) == 0
-    render = folder / f"{split.targets[0]:05d}.png"
-    Image.new("RGB", (32, 24)).save(render)
-    assert guarded(command.run) == 2
-    assert "another request" in capsys.readouterr().err
-    command = dataclasses.replace(command, out=tmp_path / "other")
-    for file in (render, folder / "split.json"):
-        file.unlink()
-        assert guarded(command.run) == 2
-        assert file.name in capsys.readouterr().err
-    assert guarded(dataclasses.replace(command, name="cost").run) == 2
-    assert "--renders" in capsys.readouterr().err
-
-
 def test_scores_are_means_over_views_then_scenes_and_memory_is_the_largest(tmp_path):
     """A method without memory for a scene keeps its row and has no mean."""
     capture, theirs = open_capture(ROOM), tmp_path / "theirs"

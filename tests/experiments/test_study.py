@@ -3,17 +3,13 @@
 import csv
 import json
 
-import numpy as np
 import pytest
-from PIL import Image
-from ssplat_experiments import context_length
-from ssplat_experiments.cases import PICTURE, Case
+from ssplat_experiments.cases import Case
 from ssplat_experiments.study import Study, run_study
 
 from ssplat_jax.config import preset
 from ssplat_jax.core.console import Reporter
 from ssplat_jax.core.errors import InputError
-from ssplat_jax.core.false_colors import eight_bits
 
 QUIET = Reporter(quiet=True)
 
@@ -66,33 +62,6 @@ def test_results_of_another_configuration_are_refused(tmp_path):
     assert calls == [] and files_of(tmp_path) == held
 
 
-def test_results_of_other_weights_and_damaged_ones_are_refused(tmp_path, monkeypatch):
-    run_study(counting_study([]), None, tmp_path, "smoke", QUIET)
-    with (
-        monkeypatch.context() as patch,
-        pytest.raises(InputError, match=r"weights: '[0-9a-f]{12}', wanted now 'other'"),
-    ):
-        patch.setattr("ssplat_experiments.cases.weights_digest", lambda: "other")
-        run_study(counting_study([]), None, tmp_path, "smoke", QUIET)
-    (tmp_path / "cases" / "case_1.json").write_text("{}")
-    with pytest.raises(InputError, match=r"case_1\.json"):
-        run_study(counting_study([]), None, tmp_path, "smoke", QUIET)
-
-
-@pytest.mark.parametrize("scale", context_length.SIZES)
-def test_a_scene_at_another_size_is_a_suite_of_its_own(scale):
-    names = [suite + sizes.label for sizes in context_length.SIZES[scale] for suite in sizes.suites]
-    assert len(set(names)) == len(names)
-    rows = [
-        {"suite": name, "views": views, "method": context_length.OURS, "step_ms": 1.0}
-        | {f"{c}_psnr": k + views / 100 for c in ("literal", "shown")}
-        for k, name in enumerate(names)
-        for views in (24, 224)
-    ]
-    (text,) = context_length.findings(rows)
-    assert text.count("24 to 224 views: +2.00 dB literal, +2.00 dB shown (literal PSNR rises") == len(names)
-
-
 def test_every_row_tells_where_it_comes_from(tmp_path):
     run_study(counting_study([]), None, tmp_path, "smoke", QUIET)
     with (tmp_path / "table.csv").open() as file:
@@ -106,16 +75,3 @@ def test_every_row_tells_where_it_comes_from(tmp_path):
     ]
     page = (tmp_path / "page.md").read_text()
     assert "| 2 | 4 | 2.0 |" in page and page.count(preset("tiny").hash) == 3 and "3 numbers." in page
-
-
-def test_a_picture_is_kept_beside_its_case(tmp_path):
-    image = np.linspace(0, 1, 4 * 6 * 3).reshape(4, 6, 3)
-
-    def cases(captures, scale):
-        return [Case("one", preset("tiny"), {}, lambda: [{"number": 1}, {"number": 2, PICTURE: image}])]
-
-    for _ in range(2):  # the second run reads the files
-        run_study(Study("seen", "Looks.", cases), None, tmp_path, "smoke", QUIET)
-        assert json.loads((tmp_path / "table.json").read_text())[1][PICTURE] == "cases/one_1.png"
-    with Image.open(tmp_path / "cases" / "one_1.png") as kept:
-        np.testing.assert_array_equal(np.asarray(kept), eight_bits(image))

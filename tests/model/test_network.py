@@ -85,12 +85,6 @@ def test_networks_that_lack_something_and_taken_kinds_are_refused(toy):
     assert "bare" not in NETWORK_CONFIGS
 
 
-def test_stage_of_an_unknown_name_is_refused(toy):
-    register_network(ToyConfig, ToyNetwork(3, stage="encoders"))
-    with pytest.raises(InputError, match=r"wanted stages among encoder.*got \['encoders'\]"):
-        StreamSplat(toy).init(jax.random.key(0))
-
-
 @pytest.mark.parametrize("config_type", [CompactConfig, ResplatConfig])
 def test_shipped_network_fulfils_the_protocol(config_type):
     config = StreamConfig().replace(network=config_type.kind)

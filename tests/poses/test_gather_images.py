@@ -229,22 +229,3 @@ def test_a_video_is_measured_chosen_from_and_warned_of(tmp_path, monkeypatch, ca
         names = estimate._choose_from_video(video, tmp_path, estimate.PoseOptions(max_frames=3), Reporter(quiet=True))
         warned = capsys.readouterr().err
         assert len(names) == 3 and said in warned and bool(warned) == bool(said)
-
-
-def test_a_recording_that_was_cut_off_is_read_as_far_as_it_goes(tmp_path):
-    whole = tmp_path / "whole.ts"  # a format that needs no index at its end
-    write_video(whole, [view(8 * i) for i in range(NUM_FRAMES)])
-    data = whole.read_bytes()
-    (tmp_path / "cut.ts").write_bytes(data[: len(data) * 2 // 3])
-    assert 2 <= len(scan_video(tmp_path / "cut.ts", lambda n: None)[0]) < NUM_FRAMES
-
-
-def test_files_without_moving_pictures_are_refused(tmp_path):
-    with av.open(str(tmp_path / "sound.mp4"), "w") as container:
-        stream = container.add_stream("aac", rate=44100)
-        frame = av.AudioFrame.from_ndarray(np.zeros((1, 1024), np.float32), format="fltp", layout="mono")
-        frame.sample_rate = 44100
-        container.mux(stream.encode(frame))
-        container.mux(stream.encode())
-    with pytest.raises(InputError, match=r"sound\.mp4.*without pictures"):
-        scan_video(tmp_path / "sound.mp4", lambda n: None)

@@ -107,9 +107,3 @@ def test_padding_behind_the_last_present_row_is_left_out_and_comes_back(monkeypa
     assert whole.sh_degree == 1
     for name in ("means", "scales", "opacities"):
         np.testing.assert_array_equal(getattr(whole, name), getattr(given, name), err_msg=name)
-
-
-@pytest.mark.parametrize("num", [0, 1, 4096, 4097, 131_072, 131_073, 474_140, 700_000])
-def test_capacities_hold_their_rows_and_are_few(num):
-    assert num <= round_rows(num) <= max(4096 * -(-max(num, 1) // 4096), num * 17 / 16)
-    assert len({round_rows(n) for n in range(262_145, 524_289, 64)}) <= 16

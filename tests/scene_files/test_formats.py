@@ -223,14 +223,6 @@ def test_bytes_of_a_spz(tmp_path):
         save_gaussians(tmp_path / "c.spz", ONE, spz_version=2)
 
 
-def test_spz_of_versions_3_and_4_hold_the_same(tmp_path):
-    for version in (3, 4):
-        ss.save_spz(tmp_path / f"{version}.spz", scene_for(), version=version)
-    old, new = (ss.load_scene(tmp_path / f"{version}.spz") for version in (3, 4))
-    for name in FIELDS:
-        np.testing.assert_array_equal(getattr(old, name), getattr(new, name))
-
-
 @pytest.mark.skipif(shutil.which("splat-transform") is None, reason="npm install -g @playcanvas/splat-transform")
 def test_spz_goes_to_and_from_playcanvas(tmp_path):
     gaussians, steps = scene_for(), STEPS[".spz"]
@@ -342,12 +334,6 @@ def test_spz_positions_are_as_fine_as_24_bits_allow(tmp_path, reach, bits):
     assert held == pytest.approx([0, -reach, reach / 3], abs=0.51 * 2.0**-bits)
 
 
-def test_spz_refuses_what_its_positions_cannot_hold(tmp_path):
-    with pytest.raises(InputError, match=r"8388607 units.*write a \.ply"):
-        ss.save_spz(tmp_path / "a.spz", replace(ONE, means=jnp.array([[0.0, 0.0, 9e6]])))
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_spz_of_version_2_holds_three_bytes_of_a_rotation(tmp_path):
     ss.save_spz(tmp_path / "a.spz", ONE, version=3)
     data = bytearray(gzip.decompress((tmp_path / "a.spz").read_bytes()))
@@ -368,22 +354,6 @@ def test_a_palette_of_many_different_sh_is_fitted(tmp_path, monkeypatch):
     order = KDTree(np.asarray(found.means)).query(np.asarray(wanted.means))[1]
     errors = np.abs(np.asarray(found.sh)[order] - near).max(axis=(1, 2))
     assert np.median(errors) < 0.02 and len(np.unique(np.asarray(found.sh[:, 1:]), axis=0)) <= 16
-
-
-def test_a_sog_file_with_a_huge_image_or_number_is_refused(tmp_path):
-    save_gaussians(tmp_path / "a.sog", scene(0, n=5))
-    with zipfile.ZipFile(tmp_path / "a.sog") as archive:
-        files = {name: archive.read(name) for name in archive.namelist()}
-    meta, picture = json.loads(files["meta.json"]), io.BytesIO()
-    meta["means"]["mins"][0] = 10**400
-    Image.new("RGB", (300, 300)).save(picture, "WEBP")
-    changes = {"meta.json": json.dumps(meta).encode()}, {"scales.webp": picture.getvalue()}
-    for change, words in zip(changes, ("too large", "300 x 300"), strict=True):
-        with zipfile.ZipFile(tmp_path / "b.sog", "w") as archive:
-            for name, data in (files | change).items():
-                archive.writestr(name, data)
-        with pytest.raises(InputError, match=rf"b\.sog: cannot be used .*{words}"):
-            ss.load_scene(tmp_path / "b.sog")
 
 
 def test_any_format_is_exported_from_any_other(tmp_path, capsys):

@@ -66,8 +66,3 @@ def test_tensors_are_read_as_float32_and_integers_left_out(form, tmp_path):
         with pytest.raises(InputError):
             held = read_tensors(path.with_name("cut"))
             check_tensors(path, held, {"a": (2, 3), "wide": (2,), "half": (3,), "brain": (4,)})
-
-
-def test_values_that_are_not_finite_are_refused(tmp_path):
-    with pytest.raises(InputError, match="x holds values that are not finite"):
-        check_tensors(tmp_path, {"x": np.array([1.0, np.nan], np.float32)}, {"x": (2,)})

@@ -121,3 +121,19 @@ def test_a_full_disk_leaves_the_previous_state(tmp_path):
         save_state(path, new, {})
     assert [p.name for p in tmp_path.iterdir()] == ["state.npz"]
     assert_identical(load_state(path)[0], old)
+
+
+@pytest.mark.parametrize("failing", [1, 2])  # keep the old file, rename the new one
+def test_a_failed_rename_leaves_the_file_in_place(failing, tmp_path, monkeypatch):
+    path, replaced, asked = tmp_path / "file", os.replace, itertools.count(1)
+    write_atomic(path, b"old", keep_previous=True)
+
+    def refuse(*given):
+        if next(asked) == failing:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        replaced(*given)
+
+    monkeypatch.setattr(os, "replace", refuse)
+    with pytest.raises(StorageError, match="file: cannot be written"):
+        write_atomic(path, b"new", keep_previous=True)
+    assert [(p.name, p.read_bytes()) for p in tmp_path.iterdir()] == [("file", b"old")]

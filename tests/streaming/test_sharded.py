@@ -16,10 +16,8 @@ import pytest
 
 from ssplat_jax.cache import PIVOT_FIELDS, fuse, grow, init_cache, project
 from ssplat_jax.cache.hash_table import shards_of
-from ssplat_jax.core.errors import InputError
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.model.streamsplat import StreamSplat
-from ssplat_jax.streaming.sharded import ShardedStream
 from tests.cache.projection_scenes import cameras
 from tests.cache.streams import CONFIG, FEATURES, PLACES, Recipe, to_jax
 from tests.cache.streams import fuse as fuse_alone
@@ -168,12 +166,3 @@ def test_streams_together_equal_each_stream_alone(tmp_path):
 
 
 # Meshes ---------------------------------------------------------------------------------------------------------------
-
-
-def test_a_mesh_without_the_axes_is_refused():
-    mesh = jax.sharding.Mesh(np.array(jax.devices()[:1]).reshape(1, 1), ("data", "voxels"))
-    with pytest.raises(InputError, match=r"'streams' and 'voxels', got \('data', 'voxels'\)"):
-        ShardedStream(StreamSplat(NARROW), mesh)
-    two_rows = jax.sharding.Mesh(np.array(jax.devices()[:1] * 2).reshape(2, 1), ("data", "voxels"))
-    with pytest.raises(InputError, match="multiple of the mesh's 2, got 3"):
-        ShardedStream(StreamSplat(NARROW), two_rows, streams="data").init_cache(3)

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from ssplat_jax.core.errors import InputError
-from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.training import loop
 from ssplat_jax.training.recipe import RECIPES, Recipe, learning
 from tests.model.small import random_params
@@ -123,20 +122,6 @@ def test_a_rendering_phase_moves_all_its_stages(tmp_path):
     for name in filter(params.get, done.state.params):
         pairs = zip(flat(params[name]), flat(done.params[name]), strict=True)
         assert any(not np.array_equal(a, b) for a, b in pairs), name
-
-
-def test_another_run_is_refused_by_its_first_difference(tmp_path, monkeypatch):
-    train_quadratic(tmp_path)
-    for changes, named in (
-        ({"recipe": dataclasses.replace(QUADRATIC, seed=1)}, r"recipe\.seed = 0, wanted 1.* choose another --out"),
-        ({"recipe": dataclasses.replace(QUADRATIC, phases=(FIRST,))}, r"recipe\.phases"),
-        ({"init_weights": "mine"}, "wanted 'mine'"),
-    ):
-        with pytest.raises(InputError, match=named):
-            train_quadratic(tmp_path, **changes)
-    monkeypatch.setattr(StreamSplat, "init", lambda model, key: start_params())
-    with pytest.raises(InputError, match=r"init_weights = .*, wanted 'random'"):
-        loop.train(NARROW, QUADRATIC, tmp_path)
 
 
 def test_a_phase_without_anything_to_train_is_refused(tmp_path):

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,7 +14,7 @@ from ssplat_jax.data.procedural.procedural_views import training_sample
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.storage.saved_states import first_difference
 from ssplat_jax.training import loop
-from ssplat_jax.training.capture_mix import CaptureGroup, CaptureMix, TrainingStart, learned_frames, open_mix
+from ssplat_jax.training.capture_mix import CaptureGroup, CaptureMix, TrainingStart, learned_frames
 from ssplat_jax.training.recipe import RECIPES, Phase, Recipe, learning
 from ssplat_jax.training.samples import (
     ViewSamples,
@@ -76,25 +75,6 @@ def test_the_sky_stands_at_the_last_candidate_and_changes_no_scale():
         assert is_sky.mean() == pytest.approx(np.isinf(depths).mean(), abs=0.05)
         shares.append(is_sky.mean())
     assert max(shares) > 0.1
-
-
-def test_a_phase_says_what_its_worlds_and_sizes_are():
-    yards = dataclasses.replace(SMALL, kinds=("yard",), sizes=((32, 48), (48, 32)))
-    for place, size in enumerate(yards.sizes):
-        (images,) = opened(yards)(2, place).chunks.images
-        np.testing.assert_array_equal(images, procedural_sample(yards, 2, size, NARROW).chunks.images)
-    assert not np.array_equal(opened(SMALL)(2, 0).chunks.images, opened(yards)(2, 0).chunks.images)
-
-
-def test_members_of_a_batch_are_samples_of_their_own():
-    make = opened(dataclasses.replace(SMALL, batch=2), num_steps=2)
-    seen = [make(step, step).log_depths[member].tobytes() for step in range(2) for member in range(2)]
-    assert len(set(seen)) == len(seen)
-
-
-def test_targets_need_context_views_around_them():
-    with pytest.raises(InputError, match="a context of one view"):
-        procedural_sample(dataclasses.replace(SMALL, num_targets=1), 0, (16, 16), NARROW.replace(chunk_size=1))
 
 
 def test_true_depth_of_a_cell_is_that_at_its_center():
@@ -237,20 +217,6 @@ def test_procedural_steps_stay_those_of_a_run_without_captures(mix, capture):
     assert not np.array_equal(always(3, 3).target_images, without(3, 3).target_images)
 
 
-@pytest.mark.parametrize(
-    ("folders", "shares", "message"),
-    [
-        (["here"], [0.7, 0.1], r"--shares: wanted 1 numbers .* got 0\.7 0\.1"),
-        (["here", "there"], [0.7, 0.4], "add up to at most 1"),
-        (["here"], [float("nan")], "above 0"),
-        (["no/such/folder"], [], "nothing of that name"),
-    ],
-)
-def test_captures_that_cannot_be_opened_are_refused(folders, shares, message):
-    with pytest.raises(InputError, match=message):
-        open_mix([Path(folder) for folder in folders], shares, NARROW)
-
-
 def test_a_capture_needs_the_frames_of_a_sample_and_depth_where_nothing_is_rendered(capture, tmp_path):
     views = STREAM_PHASE.samples
     short = [dataclasses.replace(capture, frames=capture.frames[:count]) for count in (9, 10)]
@@ -263,14 +229,6 @@ def test_a_capture_needs_the_frames_of_a_sample_and_depth_where_nothing_is_rende
     assert not (tmp_path / "out").exists()
     views.check(mix_of(photographs), NARROW, renders=True)
     views.check(mix_of(one), NARROW, renders=False)
-
-
-def test_a_folder_of_captures_is_those_in_it(tmp_path):
-    for name in ("a", "b"):
-        make_capture(tmp_path / name)
-    (tmp_path / "notes").mkdir()
-    (group,) = open_mix([tmp_path], [], NARROW).groups
-    assert [capture.name for capture in group.captures] == ["a", "b"] and group.share == 0.5
 
 
 def test_a_run_with_other_files_of_a_capture_is_another_run(tmp_path):

@@ -12,14 +12,11 @@ import pytest
 
 from ssplat_jax.commands.train_command import Train
 from ssplat_jax.config import preset
-from ssplat_jax.core.errors import InputError
 from ssplat_jax.model.network import init_params
 from ssplat_jax.storage.weights import describe_weights, load_params, load_weights, save_weights
 from ssplat_jax.training import crops, loop, recipe
-from ssplat_jax.training.capture_mix import open_mix
 from ssplat_jax.training.crops import Crops
 from ssplat_jax.training.recipe import EVIDENCE_RECIPE
-from tests.commands.command_fixture import make_capture
 from tests.model.small import random_params
 from tests.streaming.narrow_model import NARROW
 from tests.training.problems import assert_equal, flat
@@ -73,36 +70,6 @@ def test_weights_tell_their_history(trained):
     (phase,) = provenance["recipe"]["phases"]
     assert (phase["loss"]["kind"], phase["samples"]["kind"], phase["steps"]) == ("CropLoss", "Crops", 6)
     assert provenance["init_weights"] == "narrow.npz" and provenance["before"] == {"steps": 7}
-
-
-def test_strides_for_which_a_capture_is_too_short_are_left_out(tmp_path):
-    sources = Crops(procedural=(), width=64, size=(16, 16))
-
-    def strides(name, num_frames):
-        make_capture(tmp_path / name, num_frames=num_frames, size=(64, 48))
-        return [stride for _, stride in sources.scenes(open_mix([tmp_path / name], [], NARROW))]
-
-    assert (strides("long", 12), strides("short", 10)) == ([1, 2], [1])
-    with pytest.raises(InputError, match="train: shorter: wanted at least 6 frames, got 5; leave it out"):
-        strides("shorter", 5)
-    with pytest.raises(InputError, match="48x64 or more"):
-        dataclasses.replace(CROPS, size=(64, 48)).scenes(None)
-
-
-@pytest.mark.parametrize(
-    ("options", "named"),
-    [
-        ({"recipe": "evidence"}, "--init-weights"),
-        ({"recipe": "evidence", "init_weights": SHIPPED, "shares": (0.5,), "captures": (Path("x"),)}, "--shares"),
-        ({"recipe": "depth", "captures": (Path("x"),), "validate_every": 10}, "--validate-every"),
-        ({"shares": (0.5,)}, "--captures beside"),
-        ({"recipe": "paper"}, "wanted --captures"),
-    ],
-)
-def test_options_that_do_not_fit_the_recipe_are_refused(options, named, tmp_path):
-    with pytest.raises(InputError, match=named):
-        Train(out=tmp_path / "out", **options).run()
-    assert not (tmp_path / "out").exists()
 
 
 @pytest.fixture

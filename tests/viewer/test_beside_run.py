@@ -12,21 +12,11 @@ from pathlib import Path
 
 import pytest
 
-from ssplat_jax.storage.chunk_records import load_delta
 from ssplat_jax.storage.run_folder import RunFolder
 from tests.commands.command_fixture import make_capture, run
 from tests.viewer.fake_client import free_port, wait_for
 
 COMMAND = "from ssplat_jax.commands.start import start; start()"
-
-
-def viewer_of(parent: int) -> int | None:
-    """The process of the viewer that a run has started."""
-    for number in Path(f"/proc/{parent}/task/{parent}/children").read_text().split():
-        with contextlib.suppress(OSError):
-            if b"spawn_main" in Path(f"/proc/{number}/cmdline").read_bytes():
-                return int(number)
-    return None
 
 
 def run_with_viewer(capture: Path, out: Path, *options: str) -> list[str]:
@@ -37,35 +27,6 @@ def run_with_viewer(capture: Path, out: Path, *options: str) -> list[str]:
 def test_a_port_without_a_viewer_is_refused(tmp_path, capsys):
     assert run("run", str(make_capture(tmp_path / "capture")), "--out", str(tmp_path / "out"), "--port", "8090") == 2
     assert "--view" in capsys.readouterr().err and not (tmp_path / "out").exists()
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="finds the viewer's process in /proc")
-def test_a_run_ends_though_its_viewer_stands_still_and_the_viewer_ends_with_it(tmp_path):
-    pytest.importorskip("viser")
-    capture, out = make_capture(tmp_path / "capture", num_frames=10), tmp_path / "out"
-    arguments = run_with_viewer(capture, out)
-    process = subprocess.Popen(arguments, stdout=subprocess.PIPE, text=True, start_new_session=True)
-    try:
-        assert process.stdout is not None
-        line = next(line for line in process.stdout if line.startswith("http://localhost:"))
-        with urllib.request.urlopen(line.split()[0], timeout=60) as page:
-            assert page.status == 200
-        viewer = wait_for(lambda: viewer_of(process.pid))
-        os.kill(viewer, signal.SIGSTOP)
-        folder = RunFolder(out)
-        wait_for(folder.metrics.exists, seconds=400)
-        os.kill(viewer, signal.SIGCONT)
-        assert json.loads(folder.metrics.read_text())["views"] == 10
-        assert [load_delta(path).capacity for path in folder.delta_files()]
-        assert any("stays open" in line for line in process.stdout)
-        os.killpg(process.pid, signal.SIGINT)
-        assert process.wait(timeout=60) == 130
-        assert not Path(f"/proc/{viewer}").exists()
-    finally:
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
-        process.communicate()
 
 
 @pytest.mark.slow

@@ -195,12 +195,6 @@ def test_viewing_starts_where_the_scene_is_seen(tmp_path):
     np.testing.assert_allclose(opened(tmp_path).start, wanted)
 
 
-def test_a_path_without_a_scene_is_refused(tmp_path):
-    for path in (tmp_path, tmp_path / "nowhere.ply"):
-        with pytest.raises(InputError, match=r"wanted a scene file, or the folder"):
-            open_source(path)
-
-
 def test_viser_and_an_address_that_cannot_be_used_are_refused_at_once(monkeypatch):
     for host, port in (("192.0.2.7", 8080), ("nosuch.invalid", 8080), ("127.0.0.1", 70000), ("127.0.0.1", 0)):
         with pytest.raises(InputError, match=rf"view: cannot listen on {host}:{port} \(.*\); choose another"):
