@@ -12,8 +12,7 @@ from jaxtyping import Float64
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.depth_range import DepthStatistics, estimate_depths, same_place_distance, stream_scale
-from ssplat_jax.data.pose_check import fit_poses, pose_warning
-from ssplat_jax.data.sparse_matches import keypoints_of
+from ssplat_jax.data.sparse_matches import fit_poses, keypoints_of, pose_warning
 
 LOW_STEP = 0.012  # step between frames over median depth, below which four consecutive frames have little parallax
 GOOD_STEP = 0.03  # step over median depth that a suggested stride aims at

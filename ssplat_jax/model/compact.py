@@ -6,9 +6,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ssplat_jax.config import StreamConfig
-from ssplat_jax.core.numerics import safe_normalize
+from ssplat_jax.core.numerics import bilinear_taps, correlate_warped, safe_normalize
 from ssplat_jax.core.pytree import pytree
-from ssplat_jax.core.sampling import bilinear_taps, correlate_warped
 from ssplat_jax.model import mixer
 from ssplat_jax.model.layers import (
     Conv,

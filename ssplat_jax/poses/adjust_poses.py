@@ -13,8 +13,7 @@ from ssplat_jax.core.errors import refusal
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.depth_range import estimate_depths
 from ssplat_jax.data.posed_image import invert_pose
-from ssplat_jax.poses.bundle_adjustment import adjust, moved
-from ssplat_jax.poses.tracks import find_tracks
+from ssplat_jax.poses.bundle_adjustment import adjust, find_tracks, moved
 
 ROTATION_DEVIATION = 0.005
 """Assumed error of the given rotations in radians. Real errors are larger, half a degree on phones after some time. The

@@ -21,8 +21,7 @@ from ssplat_jax.poses.adjust_poses import check_look_ahead
 from ssplat_jax.runs.open_run import OpenRun, open_run
 from ssplat_jax.runs.run_results import finish_run, finished_scene
 from ssplat_jax.storage.chunk_records import ChunkRecord, RecordedView, make_thumbnail, save_chunk_record, save_delta
-from ssplat_jax.storage.interrupts import Interrupts
-from ssplat_jax.storage.run_folder import RunFolder
+from ssplat_jax.storage.run_folder import Interrupts, RunFolder
 from ssplat_jax.storage.saved_states import load_newest_state
 from ssplat_jax.streaming.feed import FedChunk, feed_chunks, middle_exposure
 from ssplat_jax.streaming.scene_delta import SceneFeed

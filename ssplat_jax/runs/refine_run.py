@@ -16,8 +16,7 @@ from ssplat_jax.refinement.refine import Progress, continue_refinement, key_view
 from ssplat_jax.runs.open_run import load_run
 from ssplat_jax.runs.run_results import picture_views, report_run, save_scene, shown_frames
 from ssplat_jax.storage.files import load_arrays, save_arrays, write_json
-from ssplat_jax.storage.interrupts import Interrupts
-from ssplat_jax.storage.run_folder import RunFolder, lock_folder
+from ssplat_jax.storage.run_folder import Interrupts, RunFolder, lock_folder
 
 KIND = "refinement state 1"
 

@@ -24,8 +24,7 @@ from ssplat_jax.core.pytree import pytree
 from ssplat_jax.evaluation.metrics import LpipsWeights
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.storage.files import json_text
-from ssplat_jax.storage.interrupts import Interrupts
-from ssplat_jax.storage.run_folder import lock_folder
+from ssplat_jax.storage.run_folder import Interrupts, lock_folder
 from ssplat_jax.storage.saved_states import TrainingCheckpoints
 from ssplat_jax.storage.weights import params_digest
 from ssplat_jax.training.capture_mix import CaptureMix, TrainingStart

@@ -18,8 +18,7 @@ from typing import Any
 
 from ssplat_jax.core.console import Reporter
 from ssplat_jax.core.errors import InputError, StorageError
-from ssplat_jax.storage.interrupts import Interrupts
-from ssplat_jax.storage.run_folder import RunFolder
+from ssplat_jax.storage.run_folder import Interrupts, RunFolder
 from ssplat_jax.viewer.browser import Browser
 from ssplat_jax.viewer.scene_sources import GrowingScene, Source
 from ssplat_jax.viewer.stage import Stage

@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from ssplat_jax.storage.interrupts import Interrupts
+from ssplat_jax.storage.run_folder import Interrupts
 
 TIMEOUT = 300.0
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ssplat_jax.core.sampling import bilinear_taps, correlate_warped, neighbor_offsets
+from ssplat_jax.core.numerics import bilinear_taps, correlate_warped, neighbor_offsets
 
 FLOAT32 = 2e-5  # sums of a dozen products of unit normals
 HEIGHT, WIDTH, CHANNELS = 5, 7, 6

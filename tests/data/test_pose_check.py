@@ -11,9 +11,8 @@ from ssplat_jax.config import StreamConfig
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.capture_summary import summarize
 from ssplat_jax.data.open_capture import open_capture
-from ssplat_jax.data.pose_check import fit_poses, pose_warning
 from ssplat_jax.data.posed_image import CONVENTIONS, USUAL, Convention, with_options
-from ssplat_jax.data.sparse_matches import keypoints_of
+from ssplat_jax.data.sparse_matches import fit_poses, keypoints_of, pose_warning
 from tests.data.planes_fixture import two_planes
 
 NAMES = [f"{c.axes}-{c.poses}" for c in CONVENTIONS]

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ssplat_jax.poses.tracks import Matches, alike_cameras, merged_tracks, sift_keypoints
+from ssplat_jax.poses.bundle_adjustment import Matches, alike_cameras, merged_tracks, sift_keypoints
 from tests.poses.room_fixture import pictures, walk
 
 

@@ -7,7 +7,7 @@ from jaxtyping import Array, Bool, Float
 
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.cameras import invert_poses, pixel_grid, unproject
-from ssplat_jax.core.sampling import bilinear_taps, correlate_warped
+from ssplat_jax.core.numerics import bilinear_taps, correlate_warped
 from ssplat_jax.model.layers import Conv, HalvingConv, attend
 from ssplat_jax.model.resplat.torch_layers import EdgePaddedConv, ReSplatFeatures, group_norm, resize
 from ssplat_jax.model.views import MIN_SOURCE_DEPTH, DepthDistribution, Views, mean_over_sources, sweep_pixels
