@@ -16,7 +16,6 @@ from ssplat_jax.data.split import read_index
 from ssplat_jax.scene_files.formats import SCENE_READERS, save_gaussians
 from ssplat_jax.storage.chunk_records import load_delta, save_delta
 from ssplat_jax.storage.files import read_tensors
-from ssplat_jax.storage.run_folder import scene_exposure
 from ssplat_jax.storage.saved_states import load_state, save_state
 from ssplat_jax.storage.weights import load_weights, save_weights
 from ssplat_jax.streaming.scene_delta import SceneDelta
@@ -152,9 +151,6 @@ PARSERS = (
         "delta": Parser(write_delta, load_delta),
         "weights": Parser(write_weights, load_weights),
         "index": Parser(write_json("index.json", INDEX), read_index),
-        "metrics": Parser(
-            write_json("metrics.json", {"scene_exposure": [1.0, 0.9, 1.1]}), lambda p: scene_exposure(p.parent)
-        ),
         "npz of tensors": Parser(write_npz, read_tensors),
         "safetensors": Parser(write_safetensors, read_tensors),
     }
