@@ -2,12 +2,11 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 
 from ssplat_jax.commands.options import AxesOption, CapturePath, PosesOption, QuietOption, capture_path, parse_size
-from ssplat_jax.core.errors import InputError
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,23 +30,16 @@ class Render:
     over_black: bool = False
     """Show holes of the scene black instead of in the colors around them."""
     film: int | None = None
-    """Also write film.mp4 at 24 frames a second (extra `video`): FILM frames from each camera to the next, or with
-    --film-path orbit FILM frames in all."""
-    film_path: Literal["spline", "orbit"] = "spline"
-    """spline: smooth, through all cameras. orbit: a circle around what the cameras look at; where they look outward, as
-    in a room, a small circle about the middle camera."""
+    """Also write film.mp4 at 24 frames a second (extra `video`): smooth, FILM frames from each camera to the next."""
     axes: AxesOption = None
     poses: PosesOption = None
     quiet: QuietOption = False
 
     def run(self) -> int:
         from ssplat_jax.core.console import Reporter
-        from ssplat_jax.runs.render_run import FilmOptions, render_run
+        from ssplat_jax.runs.render_run import render_run
         from ssplat_jax.storage.run_folder import RunFolder
 
-        if self.film is None and self.film_path != "spline":
-            raise InputError("--film-path: wanted --film N beside it, the number of pictures; got none.")
-        film = None if self.film is None else FilmOptions(self.film, self.film_path)
         size, reporter = parse_size(self.size), Reporter(self.quiet)
         num_pictures = render_run(
             self.scene,
@@ -57,9 +49,9 @@ class Render:
             stride=self.stride,
             max_views=self.max_views,
             over_black=self.over_black,
-            film=film,
+            film=self.film,
             reporter=reporter,
         )
-        film_name = f", {RunFolder(self.out).film.name}" if film else ""
+        film_name = f", {RunFolder(self.out).film.name}" if self.film else ""
         print(f"wrote {num_pictures} pictures to {self.out}/views{film_name}")
         return 0

@@ -1,6 +1,5 @@
-"""`ssplat render`: pictures of a scene from the cameras of a capture, and films along or around them."""
+"""`ssplat render`: pictures of a scene from the cameras of a capture, and a film along them."""
 
-import dataclasses
 from pathlib import Path
 
 import jax
@@ -15,7 +14,7 @@ from ssplat_jax.core.false_colors import eight_bits
 from ssplat_jax.core.gaussians import Gaussians, mean_color
 from ssplat_jax.core.kept_programs import Kept
 from ssplat_jax.core.pytree import replace
-from ssplat_jax.data.camera_path import camera_path, orbit_path
+from ssplat_jax.data.camera_path import camera_path
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.evaluation.pictures import VideoWriter, save_image
 from ssplat_jax.rasterizer import effects_for, fill_holes, render
@@ -30,14 +29,6 @@ Intrinsics = Float64[np.ndarray, "3 3"]
 _jitted_fill_holes = Kept(fill_holes)
 
 
-@dataclasses.dataclass(frozen=True)
-class FilmOptions:
-    """A film: where it goes, and what it shows."""
-
-    steps: int  # spline: pictures from each camera to the next; orbit: pictures in all
-    path: str = "spline"  # or `orbit`
-
-
 def render_run(
     scene: Path,
     path: str,
@@ -47,7 +38,7 @@ def render_run(
     stride: int,
     max_views: int | None,
     over_black: bool,
-    film: FilmOptions | None,
+    film: int | None,
     reporter: Reporter,
 ) -> int:
     """Writes `out`/views/<frame>.png for frames of a capture, and optionally `out`/film.mp4.
@@ -62,7 +53,7 @@ def render_run(
         stride: every `stride`-th camera is used.
         max_views: stop after this many pictures.
         over_black: show holes black instead of in the colors around them.
-        film: the film along or around these cameras; None for no film.
+        film: pictures of a film from each of these cameras to the next; None for no film.
         reporter: shows progress.
 
     Returns:
@@ -73,8 +64,8 @@ def render_run(
             wanted without PyAV.
         StorageError: `out` cannot be written, or adjusted poses of the scene's run are damaged.
     """
-    require_positive(stride=stride, **({} if max_views is None else {"max_views": max_views}))
-    require_positive(**({} if film is None else {"film": film.steps}))
+    options = {"stride": stride, "max_views": max_views, "film": film}
+    require_positive(**{name: number for name, number in options.items() if number is not None})
     file = RunFolder(scene).best_scene if scene.is_dir() else scene
     splats = load_scene(file)
     if splats.render_mode not in FILTERS:
@@ -97,7 +88,7 @@ def render_run(
                 advance(place)
         if film is not None and writer is not None:
             poses = np.stack([capture.frames[i].camtoworld for i in indices])
-            cameras = _film_cameras(poses, np.stack([capture.K(i) for i in indices]), film, splats, size)
+            cameras = camera_path(poses, np.stack([capture.K(i) for i in indices]), film)
             with reporter.progress("filming", len(cameras[0])) as advance:
                 for place, (pose, K) in enumerate(zip(*cameras, strict=True), start=1):
                     writer.add(eight_bits(_render_picture(splats, pose, K, size, background)))
@@ -118,29 +109,3 @@ def _render_picture(
     scene = replace(splats, offset=(0.0, 0.0, 0.0))  # the camera is relative to it already
     out = render(scene, camera, effects=effects_for(scene, camera))
     return np.asarray(out.color if background is None else _jitted_fill_holes(out.color, out.alpha, background))
-
-
-def _film_cameras(
-    poses: Float64[np.ndarray, "n 4 4"],
-    Ks: Float64[np.ndarray, "n 3 3"],
-    film: FilmOptions,
-    splats: Gaussians,
-    size: tuple[int, int],
-) -> tuple[Float64[np.ndarray, "m 4 4"], Float64[np.ndarray, "m 3 3"]]:
-    """Poses and intrinsics of a film along, or around what is seen from, the cameras of a capture."""
-    if film.path == "spline":
-        return camera_path(poses, Ks, film.steps)
-    middle = len(poses) // 2
-    depths = _depths_seen(splats, poses[middle], Ks[middle], size)
-    return orbit_path(poses, Ks[middle], float(np.median(depths)) if len(depths) else 1.0, film.steps)
-
-
-def _depths_seen(
-    splats: Gaussians, camtoworld: Pose, K: Intrinsics, size: tuple[int, int]
-) -> Float64[np.ndarray, " n"]:
-    """Depths of the opaque Gaussians in an image, hidden ones included."""
-    means = np.asarray(splats.means, np.float64)[np.asarray(splats.opacities) > 0.5]
-    points = np.einsum("ji,nj->ni", camtoworld[:3, :3], means + np.asarray(splats.offset) - camtoworld[:3, 3])
-    points = points[np.isfinite(points).all(axis=1) & (points[:, 2] > 0)]
-    pixels = np.einsum("ij,nj->ni", K, points)[:, :2] / points[:, 2:]
-    return points[((pixels >= 0) & (pixels <= size)).all(axis=1), 2]
