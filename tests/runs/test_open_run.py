@@ -154,7 +154,7 @@ def test_pictures_of_a_run_have_its_adjusted_poses(adjusted, capture, tmp_path, 
 
     def draw(splats, camtoworld, *given):
         drawn.append(camtoworld)
-        return np.zeros((SIZE[1], SIZE[0], 3)), np.zeros((SIZE[1], SIZE[0]))
+        return np.zeros((SIZE[1], SIZE[0], 3))
 
     monkeypatch.setattr(render_run, "_render_picture", draw)
     save_ply(RunFolder(adjusted).scene, scene(0))

@@ -1,6 +1,9 @@
 """Stream states on disk are read back exactly, or refused by name."""
 
 import contextlib
+import errno
+import itertools
+import os
 import resource
 
 import jax
@@ -9,7 +12,7 @@ import numpy as np
 import pytest
 
 from ssplat_jax.cache import init_cache
-from ssplat_jax.core.atomic import previous_path
+from ssplat_jax.core.atomic import previous_path, write_atomic
 from ssplat_jax.core.errors import InputError, StorageError
 from ssplat_jax.storage.saved_states import load_newest_state, load_state, save_state
 from tests.cache.streams import CAPACITY, CONFIG, Recipe, fuse, to_jax
