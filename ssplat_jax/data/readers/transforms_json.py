@@ -46,7 +46,8 @@ UNKNOWN_LENS += tuple(f"ftheta_p{i}" for i in range(5))  # as the three before, 
 USED = """frames file_path transform_matrix fl_x fl_y cx cy w h camera_angle_x camera_angle_y camera_model is_fisheye
     distortion_params depth_file_path depth_path integer_depth_scale applied_scale mask_path is_bad rolling_shutter"""
 OF_NO_EFFECT = """applied_transform ply_file_path aabb aabb_scale scale offset up sharpness rotation colmap_im_id
-    train_filenames val_filenames test_filenames orientation_override enable_depth_loading n_extra_learnable_dims"""
+    train_filenames val_filenames test_filenames orientation_override enable_depth_loading n_extra_learnable_dims
+    license licence note name"""
 KNOWN = frozenset((*USED.split(), *OF_NO_EFFECT.split(), *COEFFICIENTS, *UNKNOWN_LENS))
 UNKNOWN_UNITS = ("depth_scale", "depth_factor", "depth_unit")  # some multiply by these and others divide
 
@@ -114,7 +115,7 @@ def _read(path: Path, problems: list[str] | None) -> Listing:
     if any(isinstance(shutter, list) and any(shutter[:3]) for shutter in times):
         notes.append("The rolling shutter (rolling_shutter) is not modelled: every image has one pose.")
     if unknown := sorted({name for fields in (meta, *entries) if isinstance(fields, dict) for name in fields} - KNOWN):
-        notes.append(f"Fields that are not known are left out of account: {echo(', '.join(unknown))}.")
+        notes.append(f"Fields that are not known are left out of account: {', '.join(map(echo, unknown))}.")
     if file.name == PLACES[-1]:
         notes.append(f"There is no {PLACES[0]}: {file.name} is read, and the images of other splits are left out.")
     return frames.listing(len(frames.frames), "image", notes)
