@@ -109,13 +109,9 @@ class HeadConfig(ConfigGroup):
     """Gaussians of a token."""
 
     # One color per patch of 4 x 4 pixels left a quarter of the squared error within patches.
-    gaussians_per_token: Literal[1, 4, 16] = 4
-    """Gaussians in a square over the token's cell, each with the mean color of its part of the patch (ours; 1 is
-    literal)."""
-    # A wall needs no more than one, a bookshelf all 16. Off: with an evidence head trained for it, captures gain 0.1 to
-    # 0.2 dB, but LPIPS becomes 0.01 worse.
-    adaptive: bool = False
-    """A smooth patch takes fewer, larger Gaussians, as its detail allows (ours); made for 16 a token."""
+    gaussians_per_token: Literal[1, 4, 16] = 16
+    """Most Gaussians of a token, in a square over its cell, each with the mean color of its part of the patch (ours; 1
+    is literal)."""
     sh_degree: int = 0
     """Degree of the spherical harmonics of colors."""
     # A feature that was written with its token does not know which pivots later views confirm: 0.76 dB more.
@@ -154,9 +150,14 @@ class Additions(ConfigGroup):
     merged_coverage: bool = True
     """A pivot of n members is as opaque as n Gaussians in one place, 1 - (1 - o)^n, and its footprint grows until the
     pivots of a voxel cover its face, instead of showing as one token."""
+    # With one size of voxels near surfaces are blurred and far ones never merge; a wall needs fewer Gaussians than a
+    # bookshelf.
+    detail: bool = True
+    """A voxel is between half as wide and as wide as its tokens, in powers of two of `voxel_size`, and a smooth patch
+    takes fewer, larger Gaussians."""
 
 
-LITERAL = Additions("metric", *(False,) * 6)
+LITERAL = Additions("metric", *(False,) * 7)
 """No additions: the paper as it is printed."""
 
 

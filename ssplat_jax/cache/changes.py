@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ssplat_jax.cache.hash_table import voxel_indices
+from ssplat_jax.cache.hash_table import voxel_indices, voxel_sides
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.gaussians import SH_C0, Gaussians
 from ssplat_jax.core.numerics import clip_value
@@ -105,7 +105,7 @@ def pack(change: Change, num_pivots: int) -> Float[Array, "m r"]:
 
 
 def settle(
-    means: Float[Array, "m 3"], change: Change, voxel_size: float
+    means: Float[Array, "m 3"], footprints: Float[Array, " m"], change: Change, config: StreamConfig
 ) -> tuple[Float[Array, "m 3"], Float[Array, "m r"]]:
     """Places of pivots and their packed changes after a step of refinement, inside their bounds.
 
@@ -114,8 +114,9 @@ def settle(
 
     Args:
         means: places of the pivots before.
+        footprints: their footprints, which decide how large their voxels are.
         change: the change to their Gaussians, whose moves may have a common part.
-        voxel_size: side of a voxel, stream units.
+        config: sizes of the voxels.
 
     Returns:
         Places of the pivots and their packed changes.
@@ -126,13 +127,14 @@ def settle(
         change of 0 changes nothing, to the last bit.
     """
     change = jax.tree.map(lambda x: jnp.where(jnp.isfinite(x), x, 0.0), change)
-    cells, _ = voxel_indices(means, voxel_size)
-    faces = cells.astype(means.dtype) * voxel_size
-    low = jnp.minimum(faces + FACE_MARGIN * voxel_size, means)[:, None]
-    high = jnp.maximum(faces + (1 - FACE_MARGIN) * voxel_size, means)[:, None]
+    voxels, _ = voxel_indices(means, footprints, config)
+    sides = voxel_sides(footprints, config)[:, None]
+    faces = voxels[:, :3].astype(means.dtype) * sides
+    low = jnp.minimum(faces + FACE_MARGIN * sides, means)[:, None]
+    high = jnp.maximum(faces + (1 - FACE_MARGIN) * sides, means)[:, None]
     places = jnp.clip(means[:, None] + change.means.reshape(len(means), -1, 3), low, high)
     moved = means + jnp.mean(places - means[:, None], axis=1)  # `means` itself where nothing has moved
-    is_inside = jnp.all(voxel_indices(moved, voxel_size)[0] == cells, axis=1, keepdims=True)
+    is_inside = jnp.all(voxel_indices(moved, footprints, config)[0] == voxels, axis=1, keepdims=True)
     moved = jnp.where(is_inside, moved, means)  # far from the origin, rounding is coarser than the margin
     inside = {name: jnp.clip(getattr(change, name), -bound, bound) for name, bound in BOUNDS.items()}
     return moved, pack(Change(means=(places - moved[:, None]).reshape(-1, 3), **inside), len(means))

@@ -72,7 +72,7 @@ def fuse(cache: VoxelCache, tokens: Tokens, config: StreamConfig, *, axis: str |
     """
     cache, tokens = jax.lax.stop_gradient((cache, tokens))
     is_chunk = jnp.any(tokens.valid)
-    voxels, in_range = voxel_indices(tokens.means, config.memory.voxel_size)
+    voxels, in_range = voxel_indices(tokens.means, tokens.footprints, config)
     if axis is not None:
         # Rejected tokens have a voxel too (index 0 if out of range), so each is counted by one shard.
         is_own = shards_of(voxels, jax.lax.axis_size(axis)) == jax.lax.axis_index(axis)

@@ -78,7 +78,7 @@ class VoxelCache:
     """
 
     # Voxels.
-    voxels: Int[Array, "capacity 3"]  # floor(mean / voxel_size)
+    voxels: Int[Array, "capacity 4"]  # floor(mean / side) and level (hash_table.py)
     counts: Int[Array, " capacity"]  # alive pivots, 0 .. k
     num_voxels: Int[Array, ""]
     table: Int[Array, " slots"]  # row of the voxel hashed here, -1 where empty (hash_table.py)
@@ -165,7 +165,7 @@ def init_cache(config: StreamConfig, capacity: int | None = None) -> VoxelCache:
     w = NUM_STORED if config.memory.carving else 0
     zero = lambda: jnp.zeros((), jnp.int32)  # noqa: E731 - one fresh buffer per counter, so that all can be donated
     return VoxelCache(
-        voxels=jnp.zeros((capacity, 3), jnp.int32),
+        voxels=jnp.zeros((capacity, 4), jnp.int32),
         counts=jnp.zeros((capacity,), jnp.int32),
         num_voxels=zero(),
         table=jnp.full((SLOTS_PER_ROW * capacity,), -1, jnp.int32),

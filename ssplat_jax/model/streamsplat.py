@@ -199,7 +199,7 @@ class StreamSplat:
     def decode(self, params: dict, cache: VoxelCache) -> Gaussians:
         """The scene so far, in the stream frame: `gaussians_per_token` Gaussians for each pivot, pivot by pivot.
 
-        Gaussians of dead and carved pivots have opacity 0; with `adaptive` also those that a smooth patch can spare.
+        Gaussians of dead and carved pivots have opacity 0; with `detail` also those that a smooth patch can spare.
         """
         is_shown = shown_pivots(cache, self.config).reshape(-1)
         return self._decode(params, cache, is_shown, lambda x: x.reshape(-1, *x.shape[2:]))

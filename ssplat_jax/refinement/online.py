@@ -77,7 +77,7 @@ def _refine_view(model: StreamSplat, params: dict, cache: VoxelCache, view: KeyV
     means, packed = flat(cache.means)[taken], flat(cache.changes)[taken]
     max_pairs = round_up(PAIRS_PER_GAUSSIAN * base.num_gaussians)
     change = online_step(base, unpack(packed), view, max_pairs=max_pairs)
-    moved, settled = settle(means, change, config.memory.voxel_size)
+    moved, settled = settle(means, flat(cache.footprints)[taken], change, config)
     is_changed = jnp.any(moved != means, axis=1) | jnp.any(settled != packed, axis=1)
     places = jnp.where(is_changed & (pivots >= 0), pivots, cache.alive.size)
     put = lambda x, new: flat(x).at[places].set(new, mode="drop").reshape(x.shape)  # noqa: E731

@@ -172,7 +172,7 @@ class Session:
     def gaussians(self) -> Gaussians:
         """The scene so far, in the stream frame: the Gaussians of `model.decode`, then padding rows of opacity 0.
 
-        With `adaptive` the rows that hold no Gaussian are left out.
+        With `detail` the rows that hold no Gaussian are left out.
         """
         return self.decode_program()(self.params, self._present_cache())
 
@@ -186,7 +186,7 @@ class Session:
         _, num_shown, num_present = map(int, _count(cache, config))
         num_pivots = min(max(self.least_decoded, _power_of_two(num_shown)), cache.confidences.size)
         num_gaussians = None
-        if config.head.adaptive:
+        if config.additions.detail:
             num_gaussians = max(self.least_decoded, _power_of_two(num_present))
         leaves, structure = jax.tree.flatten(cache)
         key = ("decode", num_pivots, num_gaussians, structure, *((leaf.shape, leaf.dtype) for leaf in leaves))

@@ -116,6 +116,11 @@ class Recipe:
         return any(phase.loss.renders for phase in self.phases)
 
     @property
+    def uses_lpips(self) -> bool:
+        """True if a loss has a term of LPIPS."""
+        return any(getattr(phase.loss, "lpips_weight", 0.0) for phase in self.phases)
+
+    @property
     def num_steps(self) -> int:
         """Number of steps of all phases."""
         return sum(phase.steps for phase in self.phases)

@@ -19,6 +19,7 @@ from ssplat_jax.config import StreamConfig
 
 INDEX_LIMIT = 1 << 20  # voxel indices are below it in magnitude
 NEAR = 0.01  # near plane, stream units
+MAX_LEVEL = 16  # of voxels
 CLUSTER = math.log(1.15)  # half the width of a front cluster, log depth
 SAME_DIRECTION = 1.0 - 1e-6  # similarities above it are ties
 
@@ -52,7 +53,7 @@ def fuse(cache: dict, tokens: dict, config: StreamConfig) -> dict:
     for j in np.flatnonzero(tokens["valid"]):
         stats["num_seen"] += 1
         pivot = {name: np.asarray(x[j], np.float64) for name, x in tokens.items() if name != "valid"}
-        voxel = voxel_of(tokens["means"][j], config.memory.voxel_size)
+        voxel = voxel_of(tokens["means"][j], tokens["footprints"][j], config)
         if not (all(np.isfinite(x).all() for x in pivot.values()) and pivot["footprints"] > 0):
             stats["num_non_finite"] += 1
         elif pivot["confidences"] < np.float32(config.memory.min_confidence):
@@ -69,11 +70,18 @@ def fuse(cache: dict, tokens: dict, config: StreamConfig) -> dict:
     return cache
 
 
-def voxel_of(point: np.ndarray, voxel_size: float) -> tuple[int, ...] | None:
-    """Index triple of a float32 point; None if it is out of range."""
+def voxel_of(point: np.ndarray, footprint: float, config: StreamConfig) -> tuple[int, ...] | None:
+    """Three indices and the level of the voxel of a float32 point; None if it is out of range."""
+    per_unit, level = np.float32(1.0 / config.memory.voxel_size), 0
+    if config.additions.detail and np.isfinite(footprint) and footprint > 0:
+        sides = np.float32(footprint) * per_unit
+        while sides >= 2 and level < MAX_LEVEL:
+            sides, level = sides / 2, level + 1
+        while sides < 1 and level > -MAX_LEVEL:
+            sides, level = sides * 2, level - 1
     with np.errstate(all="ignore"):
-        cells = np.floor(np.float32(point) * np.float32(1.0 / voxel_size))
-    return tuple(int(c) for c in cells) if np.all(np.abs(cells) < INDEX_LIMIT) else None
+        cells = np.floor(np.float32(point) * per_unit * np.float32(2.0**-level))
+    return (*(int(c) for c in cells), level) if np.all(np.abs(cells) < INDEX_LIMIT) else None
 
 
 def _insert(cache, pivots_of, voxel, pivot, config):

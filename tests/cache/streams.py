@@ -56,7 +56,7 @@ class Recipe:
             "confidences": _confidences(rng, m, self.confidences),
             "rgbs": rng.uniform(0, 1, (m, 3 * CONFIG.head.gaussians_per_token)),
             "quats": rng.normal(size=(m, 4)),
-            "footprints": rng.uniform(0.01, 0.1, m),
+            "footprints": _footprints(rng, m),
         }
         tokens = {name: x.astype(np.float32) for name, x in tokens.items()}
         for token in rng.choice(m, self.num_bad, replace=False):
@@ -77,6 +77,13 @@ def _means(rng, m, places):
         return rng.integers(-2, 3, (m, 3)) * size
     cells = {"one_voxel": 1, "few": 2, "many": 40}[places]
     return rng.uniform(-cells, cells, (m, 3)) * (size / 2) + (size / 2 if places == "one_voxel" else 0)
+
+
+def _footprints(rng, m):
+    """Of voxels of the configured size, or of the neighboring levels; some at the very limit between two."""
+    size = CONFIG.memory.voxel_size
+    widths = rng.choice([1.0, np.nextafter(np.float32(2), np.float32(0)), *rng.uniform(1, 2, 8)], m)
+    return widths * size * rng.choice([1.0, 1.0, 1.0, 0.5, 2.0], m)
 
 
 def _feats(rng, m, features):
@@ -121,7 +128,7 @@ def tokens_at(means, confidences=0.5, feats=1.0, valid=True, **changes) -> Token
         confidences=full(confidences),
         rgbs=jnp.arange(n, dtype=jnp.float32)[:, None] * jnp.ones(3 * CONFIG.head.gaussians_per_token),
         quats=full([1.0, 0, 0, 0], 4),
-        footprints=full(0.1),
+        footprints=full(1.5 * CONFIG.memory.voxel_size),
         valid=jnp.broadcast_to(jnp.asarray(valid), (n,)),
     )
     return replace(tokens, **changes)
@@ -164,7 +171,9 @@ def assert_equal_to_reference(cache: VoxelCache, expected: dict) -> None:
             np.testing.assert_array_equal(getattr(arrays, name), wanted.astype(getattr(arrays, name).dtype), name)
 
 
-_settle = jax.jit(lambda means, packed, size: settle(means, unpack(packed), size), static_argnums=2)
+_settle = jax.jit(
+    lambda means, footprints, packed, config: settle(means, footprints, unpack(packed), config), static_argnums=3
+)
 
 
 def revised(cache: VoxelCache, rng: np.random.Generator, config: StreamConfig) -> VoxelCache:
@@ -173,7 +182,8 @@ def revised(cache: VoxelCache, rng: np.random.Generator, config: StreamConfig) -
     changes = rng.normal(size=(capacity * k, width // CHANGE_WIDTH, CHANGE_WIDTH))
     changes[..., :3] *= config.memory.voxel_size
     packed = cache.changes + changes.reshape(cache.changes.shape).astype(np.float32)
-    means, packed = _settle(cache.means.reshape(-1, 3), packed.reshape(-1, width), config.memory.voxel_size)
+    means, footprints = cache.means.reshape(-1, 3), cache.footprints.reshape(-1)
+    means, packed = _settle(means, footprints, packed.reshape(-1, width), config)
     alive = cache.alive[..., None]
     return replace(
         cache,

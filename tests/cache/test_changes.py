@@ -16,7 +16,14 @@ from tests.rasterizer.scenes import cloud
 SIZE = CONFIG.memory.voxel_size
 PER_TOKEN = CONFIG.head.gaussians_per_token
 REFINED = CONFIG.replace(steps_per_chunk=1)
-SETTLE = jax.jit(settle, static_argnums=2)
+FOOTPRINT = 1.5 * SIZE
+
+
+def settled(means, change):
+    return _SETTLE(means, jnp.full(len(means), FOOTPRINT), change, CONFIG)
+
+
+_SETTLE = jax.jit(settle, static_argnums=3)
 
 
 def pivots(seed: int, span: float, count: int = 256) -> jax.Array:
@@ -33,7 +40,7 @@ def changes(seed: int, scale: float, count: int = 256) -> Change:
 
 
 def cells(means) -> np.ndarray:
-    return np.asarray(voxel_indices(means, SIZE)[0])
+    return np.asarray(voxel_indices(means, jnp.full(means.shape[:-1], FOOTPRINT), CONFIG)[0])
 
 
 def test_packing_keeps_every_number_in_its_place():
@@ -48,16 +55,16 @@ def test_packing_keeps_every_number_in_its_place():
 @pytest.mark.parametrize("scale", [1e-3, 1e3])
 def test_moved_pivots_stay_in_their_voxels(span, scale):
     means = pivots(1, span)
-    moved, packed = SETTLE(means, changes(2, scale), SIZE)
+    moved, packed = settled(means, changes(2, scale))
     np.testing.assert_array_equal(cells(moved), cells(means))
     if span <= 300:  # farther out a float32 is coarser than the margin
         places = moved[:, None] + unpack(packed).means.reshape(-1, PER_TOKEN, 3)
-        np.testing.assert_array_equal(cells(places), np.broadcast_to(cells(means)[:, None], places.shape))
+        np.testing.assert_array_equal(cells(places), np.broadcast_to(cells(means)[:, None], cells(places).shape))
         assert scale < 0.1 or float(jnp.abs(moved - means).max()) > 0.01 * SIZE
 
 
 def test_what_settles_is_bounded_and_has_no_common_move():
-    change = unpack(SETTLE(pivots(1, 4.0), changes(2, 100.0), SIZE)[1])
+    change = unpack(settled(pivots(1, 4.0), changes(2, 100.0))[1])
     for name, bound in BOUNDS.items():
         assert float(jnp.abs(getattr(change, name)).max()) == pytest.approx(bound), name
     assert float(jnp.abs(change.means.reshape(-1, PER_TOKEN, 3).mean(axis=1)).max()) < 1e-6 * SIZE
@@ -66,7 +73,7 @@ def test_what_settles_is_bounded_and_has_no_common_move():
 def test_changes_that_are_not_finite_become_zero():
     bad = jnp.array([np.nan, np.inf, -np.inf])
     change = jax.tree.map(lambda x: x.at[:3].set(bad.reshape(3, *[1] * (x.ndim - 1))), changes(4, 0.01))
-    moved, packed = SETTLE(pivots(5, 4.0), change, SIZE)
+    moved, packed = settled(pivots(5, 4.0), change)
     assert np.isfinite(moved).all() and np.isfinite(packed).all()
     assert not np.any(packed[0].reshape(-1, WIDTH)[:3, 3:])
 
@@ -82,10 +89,11 @@ def test_merges_of_changed_pivots_stay_in_their_voxels():
             *alive.shape, PER_TOKEN, 3
         )
         voxels = np.asarray(cache.voxels)[:, None]
-        np.testing.assert_array_equal(cells(cache.means)[alive], np.broadcast_to(voxels, cache.means.shape)[alive])
-        np.testing.assert_array_equal(
-            cells(places)[alive], np.broadcast_to(voxels[:, :, None], places.shape)[alive], f"chunk {seed}"
-        )
+        for points, wanted in ((cache.means, voxels), (places, voxels[:, :, None])):
+            footprints = cache.footprints.reshape(*alive.shape, *[1] * (points.ndim - 3))
+            found, _ = voxel_indices(points, jnp.broadcast_to(footprints, points.shape[:-1]), REFINED)
+            wanted = np.broadcast_to(wanted, found.shape)
+            np.testing.assert_array_equal(np.asarray(found)[alive], wanted[alive], f"chunk {seed}")
         cache = revised(cache, rng, REFINED)
     assert int(cache.stats.num_merged) > 20
 
@@ -134,6 +142,6 @@ def test_each_part_of_a_change_changes_what_it_names():
 def test_a_change_of_zero_moves_no_pivot_by_a_bit(per_token):
     """Also where the sum of equal numbers is rounded."""
     means = pivots(3, 300.0, 4096)
-    moved, packed = SETTLE(means, unpack(jnp.zeros((4096, per_token * WIDTH))), SIZE)
+    moved, packed = settled(means, unpack(jnp.zeros((4096, per_token * WIDTH))))
     np.testing.assert_array_equal(moved, means)
     assert not np.asarray(packed).any()

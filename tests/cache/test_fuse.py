@@ -69,7 +69,7 @@ def test_merge_rounds_of_every_size_equal_the_reference():
         "confidences": rng.choice([0.5, 0.5, 1.0], m),
         "rgbs": rng.uniform(size=(m, 3 * CONFIG.head.gaussians_per_token)),
         "quats": rng.normal(size=(m, 4)),
-        "footprints": rng.uniform(size=m),
+        "footprints": rng.uniform(0.26, 0.49, m),
     }
     tokens = {name: x.astype(np.float32) for name, x in tokens.items()} | {"valid": np.ones(m, bool)}
     cache = fuse(init_cache(CONFIG, 1024), to_jax(tokens), CONFIG)
@@ -88,7 +88,7 @@ def test_pivots_are_bounded_inside_their_voxels_findable_and_counted(stream):
     assert np.all(cache.counts <= CONFIG.memory.pivots_per_voxel) and cache.num_voxels <= CAPACITY
     for name in PIVOT_FIELDS:
         assert not np.any(getattr(cache, name)[~cache.alive]), f"dead pivots hold zeros: {name}"
-    voxels, in_range = voxel_indices(jnp.asarray(cache.means), CONFIG.memory.voxel_size)
+    voxels, in_range = voxel_indices(jnp.asarray(cache.means), jnp.asarray(cache.footprints), CONFIG)
     where = np.broadcast_to(cache.voxels[:, None], voxels.shape)
     np.testing.assert_array_equal(np.asarray(voxels)[cache.alive], where[cache.alive])
     assert np.all(np.asarray(in_range)[cache.alive])
@@ -128,12 +128,12 @@ def test_splitting_a_chunk_changes_nothing(stream, at):
         ("footprints", np.nan, "num_non_finite"),
         ("footprints", -0.1, "num_non_finite"),
         ("footprints", 0.0, "num_non_finite"),
-        ("means", np.float32(-(1 << 20) * 0.25), "num_out_of_range"),
+        ("means", np.float32(-(1 << 21) * 0.25), "num_out_of_range"),
     ],
 )
 def test_rejected_tokens_change_only_their_counter(name, value, counter):
-    tokens = Recipe(seed=2, places="few", features="normal", confidences="tied").tokens()
-    before = run([Recipe(seed=3, places="few", features="normal", confidences="tied")])
+    tokens = Recipe(seed=2, places="one_voxel", features="normal", confidences="tied").tokens()
+    before = run([Recipe(seed=3, places="one_voxel", features="normal", confidences="tied")])
     tokens["confidences"][:] = np.float32(0.3)  # tau itself is accepted
     accepted = fuse(jax.tree.map(jnp.copy, before), to_jax(tokens), CONFIG)
     assert int(accepted.stats.num_accepted - before.stats.num_accepted) == NUM_TOKENS
@@ -201,6 +201,7 @@ def one_voxel(feats, confidences, means=None) -> Tokens:
     tokens = Recipe(seed=10, places="one_voxel", features="normal", confidences="random").tokens()
     n = len(confidences)
     tokens["feats"][:n], tokens["confidences"][:n] = feats, confidences
+    tokens["footprints"][:n] = 1.5 * CONFIG.memory.voxel_size  # of one level
     if means is not None:
         tokens["means"][:n] = means
     tokens["valid"] = np.arange(NUM_TOKENS) < n

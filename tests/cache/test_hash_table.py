@@ -4,18 +4,25 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from ssplat_jax.cache.fuse import _stable_order
 from ssplat_jax.cache.hash_table import (
     INDEX_LIMIT,
+    MAX_LEVEL,
     build_table,
     find_rows,
     group_equal,
     hash_voxels,
     insert_rows,
     voxel_indices,
+    voxel_levels,
+    voxel_sides,
 )
+from ssplat_jax.config import PAPER, StreamConfig
 
+CONFIG = StreamConfig()
 RNG = np.random.default_rng(0)
 
 
@@ -23,16 +30,45 @@ RNG = np.random.default_rng(0)
 def test_voxel_is_the_floor_of_one_float32_product(voxel_size):
     points = np.concatenate([RNG.uniform(-5, 5, (500, 3)), RNG.integers(-9, 9, (500, 3)) * voxel_size])
     points = points.astype(np.float32)
-    voxels, in_range = voxel_indices(jnp.asarray(points), voxel_size)
-    np.testing.assert_array_equal(voxels, np.floor(points * np.float32(1 / voxel_size)).astype(int))
-    assert np.all(np.asarray(in_range))
+    config = StreamConfig().replace(voxel_size=voxel_size)
+    voxels, in_range = voxel_indices(jnp.asarray(points), jnp.full(1000, 1.5 * voxel_size), config)
+    np.testing.assert_array_equal(voxels[:, :3], np.floor(points * np.float32(1 / voxel_size)).astype(int))
+    assert np.all(np.asarray(in_range)) and not np.any(voxels[:, 3])
+
+
+@settings(max_examples=50, deadline=None, derandomize=True)
+@given(
+    st.lists(st.integers(-(10**6), 10**6).map(lambda i: i / 33333), min_size=3, max_size=3),
+    st.floats(2.0**-9, 64, width=32),
+)
+def test_levels_partition_space_and_nest(point, footprint):
+    """A token has one voxel: it holds the point, is between half as wide and as wide as the token, and the voxel of a
+    token twice as wide is made of eight such ones."""
+    point, footprint = jnp.array(point), jnp.float32(footprint)
+    (*cell, level), (*larger, next_level) = (
+        np.asarray(voxel_indices(point, f, CONFIG)[0]) for f in (footprint, 2 * footprint)
+    )
+    side, per_unit = float(voxel_sides(footprint, CONFIG)), np.float32(1 / CONFIG.memory.voxel_size)
+    assert side == pytest.approx(CONFIG.memory.voxel_size * 2.0**level, rel=1e-6)
+    assert side < footprint * (1 + 1e-6) and footprint < 2 * side * (1 + 1e-6)
+    inside = np.asarray(point) * per_unit / np.float32(2.0**level) - np.array(cell)
+    assert np.all((inside >= 0) & (inside < 1))
+    assert next_level == level + 1 and np.array_equal(larger, np.floor_divide(cell, 2))
+
+
+def test_without_detail_all_voxels_have_one_size():
+    footprints = jnp.array([1e-9, 0.02, 0.5, 1e9, 0.0, jnp.nan, jnp.inf])
+    for config, wanted in ((PAPER, [0] * 7), (CONFIG, [-MAX_LEVEL, -1, 4, MAX_LEVEL])):
+        levels = np.asarray(voxel_levels(footprints, config))
+        np.testing.assert_array_equal(levels[: len(wanted)], wanted)
+        assert np.all(np.abs(levels) <= MAX_LEVEL)
 
 
 def test_indices_out_of_range_are_zero():
     cells = jnp.array([INDEX_LIMIT, -INDEX_LIMIT, 1e30, jnp.inf, -jnp.inf, jnp.nan, INDEX_LIMIT - 0.5, 1 - INDEX_LIMIT])
     points = jnp.stack([jnp.zeros(8), cells * 0.25, jnp.ones(8)], axis=-1)
-    voxels, in_range = voxel_indices(points, 0.25)
-    assert np.asarray(in_range).tolist() == [False] * 6 + [True] * 2 and not np.any(np.asarray(voxels)[:6])
+    voxels, in_range = voxel_indices(points, jnp.full(8, 0.3), StreamConfig().replace(voxel_size=0.25))
+    assert np.asarray(in_range).tolist() == [False] * 6 + [True] * 2 and not np.any(np.asarray(voxels)[:6, :3])
     np.testing.assert_array_equal(voxels[6:, 1], [INDEX_LIMIT - 1, 1 - INDEX_LIMIT])
 
 
@@ -41,6 +77,7 @@ def test_hash_spreads_a_plane_of_voxels_like_random_keys():
     side = 128
     for fixed in range(3):
         plane = np.insert(np.stack(np.divmod(np.arange(side**2), side), axis=-1) - 64, fixed, 7, axis=1)
+        plane = np.pad(plane, ((0, 0), (0, 1)), constant_values=-2)
         slots = np.asarray(hash_voxels(jnp.asarray(plane))) % (4 * side**2)
         expected = 4 * side**2 * (1 - np.exp(-1 / 4))  # distinct slots hit by random keys
         assert abs(len(np.unique(slots)) - expected) < 4 * np.sqrt(side**2)
@@ -48,7 +85,8 @@ def test_hash_spreads_a_plane_of_voxels_like_random_keys():
 
 def colliding(num: int) -> np.ndarray:
     """Distinct voxels that all hash to the same slot of 64."""
-    voxels = RNG.integers(-500, 500, (200 * num, 3))
+    voxels = RNG.integers(-500, 500, (200 * num, 4))
+    voxels[:, 3] = RNG.integers(-3, 4, 200 * num)
     voxels = voxels[np.asarray(hash_voxels(jnp.asarray(voxels))) % 64 == 5]
     return np.unique(voxels, axis=0)[:num].astype(np.int32)
 
@@ -65,7 +103,7 @@ def test_voxels_of_equal_hash_are_distinguished():
 
 
 def test_equal_voxels_are_grouped_under_the_first():
-    voxels = np.concatenate([colliding(8), RNG.integers(0, 3, (56, 3))]).astype(np.int32)
+    voxels = np.concatenate([colliding(8), RNG.integers(0, 3, (56, 4))]).astype(np.int32)
     voxels = voxels[RNG.integers(0, 64, 400)]
     active = RNG.uniform(size=400) < 0.8
     leaders = jax.jit(group_equal)(jnp.asarray(voxels), jnp.asarray(active))

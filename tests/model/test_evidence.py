@@ -22,7 +22,7 @@ from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.model.views import TokenShapes
 from tests.model.small import random_params
 
-CONFIG = preset("tiny").replace(capacity=128)
+CONFIG = preset("tiny").replace(capacity=128, gaussians_per_token=4, detail=False)
 NUM = 5
 
 

@@ -228,7 +228,7 @@ def test_pivot_is_as_opaque_as_its_members_in_one_place():
         raw = jnp.zeros(8 + 3).at[0].set(bias)
         params = {"out": {"kernel": jnp.zeros((4, 11)), "bias": raw}, **hidden_layers()}
         one = lambda *shape: jnp.ones((1, *shape))  # noqa: E731
-        config = CONFIG.replace(token_width=4)
+        config = CONFIG.replace(token_width=4, gaussians_per_token=4)
         values = {"means": one(3), "parts": divide_cells(one(12), config), "quats": one(4), "footprints": one()}
         shapes = read_shapes(params, one(4), config)
         return decode_tokens(shapes, **values, num_members=n, config=config).opacities[0]
@@ -283,7 +283,7 @@ def test_a_patch_is_divided_as_its_detail_asks():
     coarse = np.repeat(np.repeat(rng.normal(size=(400, 2, 2, 3)), 2, axis=1), 2, axis=2)
     patches = 0.5 + rng.choice([0.0, 0.02, 0.1], (400, 1, 1, 1)) * coarse
     patches += rng.choice([0.0, 0.02, 0.1], (400, 1, 1, 1)) * rng.normal(size=(400, 4, 4, 3))
-    config = CONFIG.replace(gaussians_per_token=16, adaptive=True)
+    config = CONFIG.replace(gaussians_per_token=16, detail=True)
     parts = divide_cells(jnp.asarray(patches.reshape(400, -1), jnp.float32), config)
     sides = set()
     for i, patch in enumerate(patches):
@@ -307,8 +307,8 @@ def test_a_patch_of_four_colors_becomes_the_gaussians_of_four_a_token():
         colors = jnp.asarray(rng.uniform(size=(10, side, side, 3)), jnp.float32)
         fine = jnp.repeat(jnp.repeat(colors, 4 // side, axis=1), 4 // side, axis=2)
         same = {"quats": jnp.asarray(rng.normal(size=(10, 4)), jnp.float32), "footprints": jnp.full(10, 0.1)}
-        got, _ = decoded(rgbs=fine.reshape(10, -1), gaussians_per_token=16, adaptive=True, **same)
-        wanted, _ = decoded(rgbs=colors.reshape(10, -1), gaussians_per_token=side**2, adaptive=False, **same)
+        got, _ = decoded(rgbs=fine.reshape(10, -1), gaussians_per_token=16, detail=True, **same)
+        wanted, _ = decoded(rgbs=colors.reshape(10, -1), gaussians_per_token=side**2, detail=False, **same)
         is_present = np.asarray(got.opacities) > 0
         shown = jax.tree.map(lambda x: np.asarray(x)[is_present], got)  # noqa: B023
         jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-5, atol=1e-6), shown, wanted)

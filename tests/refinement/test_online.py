@@ -155,7 +155,7 @@ def test_only_places_changes_and_key_views_differ():
         f.name for f in dataclasses.fields(before) if bits(getattr(before, f.name)) != bits(getattr(after, f.name))
     }
     assert changed == {"means", "changes", "key_views"}  # the first chunk wrote every pivot: last_chunks is 0 already
-    cells = lambda cache: np.asarray(voxel_indices(cache.means, CONFIG.memory.voxel_size)[0])  # noqa: E731
+    cells = lambda cache: np.asarray(voxel_indices(cache.means, cache.footprints, CONFIG)[0])  # noqa: E731
     np.testing.assert_array_equal(cells(after), cells(before))
 
 
@@ -198,7 +198,7 @@ def test_any_key_views_leave_a_finite_bounded_scene(name):
     for _ in range(4):
         cache = revise(cache, *ADVERSARIES[name])
     assert all(np.isfinite(x).all() for x in jax.tree.leaves((decode(cache), cache.means, cache.changes)))
-    cells = lambda cache: np.asarray(voxel_indices(cache.means, CONFIG.memory.voxel_size)[0])  # noqa: E731
+    cells = lambda cache: np.asarray(voxel_indices(cache.means, cache.footprints, CONFIG)[0])  # noqa: E731
     np.testing.assert_array_equal(cells(cache), cells(before))
     change = unpack(cache.changes.reshape(-1, cache.changes.shape[-1]))
     assert float(jnp.abs(change.means).max()) <= CONFIG.memory.voxel_size

@@ -83,7 +83,7 @@ def test_shards_together_hold_and_show_what_a_single_cache_does():
     for tokens in chunks:
         shards, alone = insert(shards, tokens), fuse_alone(alone, tokens, CONFIG)
     wanted = sorted_voxels([alone])
-    assert len(wanted["voxels"]) > 200 and int(alone.stats.num_merged) > 200
+    assert len(wanted["voxels"]) > 200 and int(alone.stats.num_merged) > 150
     for name, values in sorted_voxels([part(shards, i) for i in range(4)]).items():
         np.testing.assert_array_equal(values, wanted[name], err_msg=name)
     # Each token is counted by one shard, each chunk by all.
@@ -102,7 +102,7 @@ def test_shards_together_hold_and_show_what_a_single_cache_does():
 @pytest.mark.parametrize("num_shards", [2, 3, 100])
 def test_voxels_are_split_evenly_over_shards(num_shards):
     side = jnp.arange(-16, 16, dtype=jnp.int32)
-    voxels = jnp.stack(jnp.meshgrid(side, side, side), axis=-1).reshape(-1, 3)
+    voxels = jnp.stack(jnp.meshgrid(side, side, side, jnp.zeros(1, jnp.int32)), axis=-1).reshape(-1, 4)
     counts = np.bincount(np.asarray(shards_of(voxels, num_shards)), minlength=num_shards)
     expected = len(voxels) / num_shards
     # Five standard deviations of a random split.
