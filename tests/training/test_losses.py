@@ -18,9 +18,10 @@ from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.rasterizer import render
 from ssplat_jax.rasterizer.reference import render_reference
 from ssplat_jax.training import loop, losses
-from ssplat_jax.training.crops import crop_camera
+from ssplat_jax.training.crops import CropSample, crop_camera
 from ssplat_jax.training.losses import (
     MAX_GAIN,
+    CropLoss,
     DepthLoss,
     RenderingLoss,
     decode_accepted,
@@ -114,6 +115,22 @@ def test_the_paper_loss_of_a_scene_sums_mse_and_lpips_of_its_targets_over_black(
     assert (loss.depth_weight, loss.tokens, phase.samples.batch, phase.samples.num_targets) == (0, "all", 1, 4)
 
 
+def test_the_loss_of_a_crop_is_its_psnr_less_what_lpips_costs(monkeypatch):
+    """Of an empty scene, which is black and filled with its mean color, black too; LPIPS stands beside the filled image
+    alone."""
+    monkeypatch.setattr(losses, "lpips_distance", lambda weights, a, b: 3.0 * jnp.abs(a - b).max(axis=(1, 2, 3)))
+    model, params = StreamSplat(NARROW), random_params(NARROW)
+    image = np.random.default_rng(5).integers(0, 256, (16, 24, 3), np.uint8)
+    camera = Camera(jnp.eye(4), jnp.array([[20.0, 0, 12], [0, 20, 8], [0, 0, 1]]), 24, 16)
+    crop = CropSample(model.init_cache(), camera, jnp.asarray(image), jnp.ones(3), num_pivots=8, max_pairs=1 << 10)
+    target = image.astype(np.float64) / 255
+    psnr = -10 * np.log10((target**2).mean() + losses.MIN_MSE)
+    for weights, cost in ((None, 0.0), (LpipsWeights((), (), ()), 20.0 * 3.0 * target.max())):
+        value, metrics = CropLoss(lpips_weight=20.0)(model, params, (crop,), weights)
+        assert float(value) == pytest.approx(cost - psnr, rel=1e-5) and ("lpips" in metrics) == bool(cost)
+        assert float(metrics["psnr"]) == pytest.approx(psnr, rel=1e-5)
+
+
 def test_masked_pixels_of_a_target_have_neither_value_nor_gradient():
     rng = np.random.default_rng(4)
     gaussians = Gaussians.from_rgb(
@@ -154,7 +171,7 @@ def test_fitted_gains_undo_exposures_and_stay_bounded():
 
 
 def test_tokens_that_a_stored_view_looked_through_are_not_rendered():
-    config = NARROW.replace(min_confidence=0.5)
+    config = NARROW.replace(min_confidence=0.5, gaussians_per_token=4, detail=False)
     model = StreamSplat(config)
     params, cache = random_params(NARROW), model.init_cache()
     side = cache.stored_depths.weights.shape[-1]

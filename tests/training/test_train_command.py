@@ -46,6 +46,7 @@ def trained(tmp_path_factory):
         patch.setattr(crops, "make_room", lambda: made_room.append(len(streams)))
         patch.setattr(crops, "stream_scene", streamed)
         patch.setitem(recipe.RECIPES, "evidence", evidence_recipe(12))
+        patch.setattr("ssplat_jax.evaluation.metrics.installed_lpips", lambda: None)  # with the extra, it takes minutes
         start = out / "narrow.npz"
         save_weights(start, random_params(NARROW), NARROW, {"steps": 7})
         assert Train(out=out, recipe="evidence", init_weights=start, scale_steps=0.5, quiet=True).run() == 0
