@@ -35,7 +35,7 @@ def fused_twice() -> tuple[str, int]:
         means=f(3),
         feats=f(CONFIG.network.token_width),
         confidences=f(),
-        rgbs=f(12),
+        rgbs=f(3 * CONFIG.head.gaussians_per_token),
         quats=f(4),
         footprints=f(),
         valid=jax.numpy.ones(n, bool),
