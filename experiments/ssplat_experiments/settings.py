@@ -63,24 +63,14 @@ SETTINGS = (
     Setting(quality="accurate"),
     Setting(0.5, quality="fast"),
     Setting(0.75, quality="balanced"),
-    Setting(0.4),
-    Setting(0.6),
-    Setting(0.9),
-    Setting(1.25),
     Setting(1.5),
-    Setting(0.4, "1 source", {"num_sources": 1}),
-    Setting(0.5, "1 source", {"num_sources": 1}),
-    Setting(0.75, "1 source", {"num_sources": 1}),
     Setting(1.0, "1 source", {"num_sources": 1}),
-    Setting(1.25, "1 source", {"num_sources": 1}),
     Setting(1.0, "1 Gaussian a token", {"gaussians_per_token": 1}),
-    Setting(0.75, "4 Gaussians a token", {"gaussians_per_token": 4}),
     Setting(1.0, "4 Gaussians a token", {"gaussians_per_token": 4}),
     Setting(1.0, "exposure not matched", {"match_exposure": False}),
     Setting(1.0, "1 pivot", {"pivots_per_voxel": 1}),
     Setting(1.0, "chunks of 2", {"chunk_size": 2}),
     Setting(1.0, "chunks of 8", {"chunk_size": 8}),
-    Setting(0.75, "chunks of 8", {"chunk_size": 8}),
     Setting(1.0, "HPDA", {"hpda": True}),
     Setting(1.0, "CGFI, untrained", {"cgfi": True}),
     Setting(1.0, "no carving", {"carving": False}),
@@ -92,8 +82,8 @@ SETTINGS = (
     Setting(1.0, "causal", {"causal": True}),
 )
 
-REFINED_FACTORS = (0.4, 0.5, 0.6, 0.75, 1.0, 1.25)
-REFINED_STEPS = (8, 24, 50, 100, 200)
+REFINED_FACTORS = (0.5, 0.75, 1.0)
+REFINED_STEPS = (8, 24, 50, 100)
 REFINED = tuple(
     Setting(factor, refine_steps=steps, quality="best" if (factor, steps) == (1.0, 100) else "")
     for factor in REFINED_FACTORS

@@ -5,13 +5,16 @@ stored without their unoccupied rows, which hold zeros.
 """
 
 import contextlib
+import hashlib
 import json
 import os
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from ssplat_jax.cache.key_views import KeyViews
@@ -27,8 +30,9 @@ from ssplat_jax.core.atomic import previous_path, write_atomic
 from ssplat_jax.core.errors import InputError, StorageError
 from ssplat_jax.storage.files import load_arrays, save_arrays
 
-KIND, TRAINING_KIND = "stream state 1", "training state 1"
+KIND = "stream state 1"
 
+_DIGEST = "sha256"  # name of the digest among the leaves of a checkpoint, which are numbered
 _ROW_FIELDS = ("voxels", "counts", *PIVOT_FIELDS, *OPTIONAL_PIVOT_FIELDS)  # arrays with one row per voxel
 _GROUPS = {"stats": CacheStats, "stored_depths": StoredDepths, "key_views": KeyViews}  # parts with fields of their own
 
@@ -74,15 +78,11 @@ def load_newest_state(path: Path) -> tuple[VoxelCache, dict[str, Any], StorageEr
     Raises:
         StorageError: neither file can be read; the message is about the newest.
     """
-    return _load_newest(path, load_state)
-
-
-def _load_newest(path: Path, load: Callable[[Path], tuple[Any, Any]]) -> tuple[Any, Any, StorageError | None]:
     try:
-        return *load(path), None
+        return *load_state(path), None
     except StorageError as error:
         with contextlib.suppress(StorageError):
-            return *load(previous_path(path)), error
+            return *load_state(previous_path(path)), error
         raise
 
 
@@ -105,7 +105,7 @@ def restore_previous(path: Path) -> None:
 
 
 class TrainingCheckpoints:
-    """Training states in a directory, beside the description of the run: the newest and the one before it.
+    """Training states in a directory, saved with Orbax, beside the description of the run; the last two are kept.
 
     Args:
         directory: created if missing.
@@ -118,7 +118,7 @@ class TrainingCheckpoints:
     """
 
     def __init__(self, directory: Path, description: dict) -> None:
-        recipe, self._path = directory / "recipe.json", directory / "checkpoint.npz"
+        self.directory, recipe = Path(directory).resolve(), Path(directory) / "recipe.json"
         text = json.dumps(description, indent=1, sort_keys=True)
         if not recipe.exists():
             write_atomic(recipe, text.encode())
@@ -134,40 +134,77 @@ class TrainingCheckpoints:
             )
 
     def save(self, step: int, state: Any) -> None:
-        """Saves a pytree of arrays as the state after `step`; the state before it is kept too.
+        """Saves a pytree of arrays as the state after `step`; the state before it is kept too."""
+        import orbax.checkpoint as ocp
 
-        Raises:
-            StorageError: the state cannot be written.
-        """
         leaves = {f"{i:04d}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(state))}
-        save_arrays(self._path, leaves, TRAINING_KIND, {"step": step}, keep_previous=True)
+        with self._manager() as manager:
+            try:
+                manager.save(step, args=ocp.args.StandardSave(leaves | {_DIGEST: _digest(leaves)}))
+                manager.wait_until_finished()
+            except (OSError, ValueError) as error:
+                raise StorageError(f"{self.directory}: could not save step {step}: {error}") from error
 
     def restore_latest(self, like: Any, warn: Callable[[str], None]) -> tuple[int, Any] | None:
         """(step, state) of the newest intact checkpoint, or None if there is none.
 
         Args:
             like: a state of the same structure, shapes and types.
-            warn: called with a message if the newest is damaged; it is kept as `checkpoint.npz.damaged`.
+            warn: called with a message for each damaged checkpoint, which is moved to `damaged-<step>`.
 
         Raises:
-            StorageError: both checkpoints are damaged, or they have other shapes; they are left in place.
+            StorageError: all checkpoints are damaged or of other shapes; they are left in place.
         """
-        if not (self._path.exists() or previous_path(self._path).exists()):
-            return None
-        wanted, structure = jax.tree.flatten(like)
+        with self._manager() as manager:
+            steps = sorted(manager.all_steps(), reverse=True)
+            for number, step in enumerate(steps):
+                if (state := _restore(manager, step, like)) is None:
+                    continue
+                for damaged in steps[:number]:
+                    warn(f"{self.directory}: checkpoint {damaged} is damaged; continuing from step {step}.")
+                    aside = self.directory / f"damaged-{damaged}"
+                    shutil.rmtree(aside, ignore_errors=True)
+                    os.replace(self.directory / "checkpoints" / str(damaged), aside)
+                return step, state
+        if steps:
+            raise StorageError(
+                f"{self.directory}: checkpoints {', '.join(map(str, steps))} are damaged or of another version; choose"
+                " another --out."
+            )
+        return None
 
-        def load(path: Path) -> tuple[int, Any]:
-            arrays, header = load_arrays(path, TRAINING_KIND)
-            leaves = [arrays[name] for name in sorted(arrays)]
-            if [(x.shape, x.dtype) for x in leaves] != [(x.shape, x.dtype) for x in wanted]:
-                raise StorageError(f"{path}: holds a training of other shapes; choose another --out.")
-            return header["step"], jax.tree.unflatten(structure, jax.device_put(leaves))
+    def _manager(self):
+        import orbax.checkpoint as ocp  # takes seconds, which no stream needs
 
-        step, state, damage = _load_newest(self._path, load)
-        if damage is not None:
-            warn(f"{damage} Continuing from step {step}.")
-            restore_previous(self._path)
-        return step, state
+        options = ocp.CheckpointManagerOptions(max_to_keep=2, create=True, enable_async_checkpointing=False)
+        return ocp.CheckpointManager(self.directory / "checkpoints", options=options)
+
+
+def _restore(manager: Any, step: int, like: Any) -> Any | None:
+    """The state of a checkpoint; None if it is damaged."""
+    import orbax.checkpoint as ocp
+
+    wanted, treedef = jax.tree.flatten(like)
+    abstract = {f"{i:04d}": jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for i, leaf in enumerate(wanted)}
+    abstract[_DIGEST] = jax.ShapeDtypeStruct((32,), np.uint8)
+    try:
+        held = manager.restore(step, args=ocp.args.StandardRestore(abstract))
+    except Exception:  # a damaged checkpoint can make Orbax raise anything
+        return None
+    leaves = {name: np.asarray(leaf) for name, leaf in held.items() if name != _DIGEST}
+    ordered = [leaves[name] for name in sorted(leaves)]
+    is_like = [(x.shape, x.dtype) for x in ordered] == [(x.shape, x.dtype) for x in wanted]  # Orbax does not insist
+    if not is_like or not np.array_equal(held[_DIGEST], _digest(leaves)):
+        return None
+    return jax.tree.unflatten(treedef, map(jnp.asarray, ordered))
+
+
+def _digest(leaves: dict[str, np.ndarray]) -> np.ndarray:
+    """sha256 of types, shapes and values: Orbax reads an array with a flipped bit without complaint."""
+    digest = hashlib.sha256()
+    for name, leaf in sorted(leaves.items()):
+        digest.update(f"{name} {leaf.dtype} {leaf.shape}".encode() + leaf.tobytes())
+    return np.frombuffer(digest.digest(), np.uint8)
 
 
 def first_difference(held: Any, wanted: Any, name: str = "") -> tuple[str, Any, Any] | None:

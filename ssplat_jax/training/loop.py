@@ -178,7 +178,7 @@ def train(
     Args:
         config: model configuration.
         recipe: phases and optimizer.
-        out: directory of `log.jsonl`, `recipe.json` and `checkpoint.npz`.
+        out: directory of `log.jsonl`, `recipe.json` and `checkpoints/`.
         params: initial parameters; default random ones from the recipe's seed. A run is resumed with the same ones.
         init_weights: name of `params` in the description of the run; default their digest.
         mix: captures to learn from, beside procedural scenes.

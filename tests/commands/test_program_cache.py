@@ -22,8 +22,8 @@ from ssplat_jax.config import preset
 config = preset("tiny").replace(capacity=1024)
 r, n = np.random.default_rng(0), 512
 f = lambda *shape: jax.numpy.asarray(r.uniform(0.1, 1, (n, *shape)), "float32")
-chunk = Tokens(means=f(3), feats=f(config.network.token_width), confidences=f(), rgbs=f(3 * config.head.gaussians_per_token), quats=f(4),
-               footprints=f(), valid=jax.numpy.ones(n, bool))
+chunk = Tokens(means=f(3), feats=f(config.network.token_width), confidences=f(), quats=f(4),
+               rgbs=f(3 * config.head.gaussians_per_token), footprints=f(), valid=jax.numpy.ones(n, bool))
 step, cache = jax.jit(functools.partial(fuse, config=config), donate_argnums=0), init_cache(config)
 for _ in range(3):
     given = cache

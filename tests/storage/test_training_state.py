@@ -1,5 +1,7 @@
 """Training continues from the newest intact state, never from a damaged one."""
 
+import shutil
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,6 +9,9 @@ import pytest
 
 from ssplat_jax.core.errors import InputError, StorageError
 from ssplat_jax.storage.saved_states import TrainingCheckpoints
+
+# Orbax leaves unfinished tasks behind when it reads a damaged file.
+pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 
 STATE = {"weights": jnp.linspace(-1.0, 1.0, 500).reshape(5, 100), "step": jnp.array(0, jnp.int32)}
 
@@ -42,29 +47,32 @@ def test_the_newest_state_is_restored_without_warning(tmp_path):
     assert told == []
 
 
-@pytest.mark.parametrize("damage", ["a flipped bit", "cut off", "gone"])
+def largest_file(folder, step: int):
+    files = [p for p in (folder / "checkpoints" / str(step)).rglob("*") if p.is_file()]
+    return max(files, key=lambda p: p.stat().st_size)  # arrays, not their descriptions
+
+
+@pytest.mark.parametrize("damage", ["a flipped bit", "cut off"])
 def test_training_continues_after_a_damaged_checkpoint(damage, tmp_path):
-    path = tmp_path / "checkpoint.npz"
     for _ in range(2):  # the second time, another damaged one lies there
         saved(tmp_path, 1, 2)
+        path = largest_file(tmp_path, 2)
         contents = bytearray(path.read_bytes())
         contents[len(contents) // 2] ^= 1
         path.write_bytes(contents if damage == "a flipped bit" else contents[:9])
-        if damage == "gone":  # killed between the two renames of a save
-            path.unlink()
         found, told = restored(tmp_path)
         assert_state(found, 1)
-        assert len(told) == 1 and "Continuing from step 1" in told[0]
-        assert (tmp_path / "checkpoint.npz.damaged").exists() == (damage != "gone")
+        assert len(told) == 1 and "checkpoint 2 is damaged" in told[0] and (tmp_path / "damaged-2").is_dir()
         saved(tmp_path, 2)
         found, told = restored(tmp_path)
         assert_state(found, 2)
         assert told == []
+        shutil.rmtree(tmp_path / "checkpoints")
 
 
 def test_an_error_is_raised_if_all_checkpoints_are_damaged_or_of_other_shapes(tmp_path):
     checkpoints = saved(tmp_path, 1, 2)
-    with pytest.raises(StorageError, match="other shapes"):
+    with pytest.raises(StorageError, match="checkpoints 2, 1 are damaged or of another version"):
         checkpoints.restore_latest(STATE | {"weights": jnp.zeros(3)}, print)
     assert_state(restored(tmp_path)[0], 2)
 
