@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from ssplat_jax.core.console import Reporter
     from ssplat_jax.training.recipe import Recipe
 
-MINUTES = {"tiny": 77, "stream": 15, "evidence": 15}
+MINUTES = {"tiny": 77, "stream": 15, "evidence": 40}
 """Rough time of recipes on two free cores; docs/model_card.md has measured times, some of them beside other work."""
 
 

@@ -184,7 +184,7 @@ STREAM_RECIPE = Recipe(
 of captures (docs/model_card.md)."""
 
 EVIDENCE_RECIPE = Recipe(
-    phases=(Phase("evidence", 600, Crops(), CropLoss(), learning("evidence"), 5e-3, final_share=0.0, warmup_steps=20),),
+    phases=(Phase("evidence", 480, Crops(), CropLoss(), learning("evidence"), 5e-3, final_share=0.0, warmup_steps=20),),
     adam_b2=0.999,
     weight_decay=1e-3,
     clip_norm=3.0,
