@@ -41,7 +41,7 @@ def voxel_levels(footprints: Float[Array, "*s"], config: StreamConfig) -> Int[Ar
 
 def voxel_sides(footprints: Float[Array, "*s"], config: StreamConfig) -> Float[Array, "*s"]:
     """Sides of the voxels that hold tokens or pivots of these footprints, stream units."""
-    return config.memory.voxel_size * jnp.exp2(voxel_levels(footprints, config).astype(jnp.float32))
+    return jnp.ldexp(jnp.float32(config.memory.voxel_size), voxel_levels(footprints, config))
 
 
 def voxel_indices(
@@ -54,8 +54,8 @@ def voxel_indices(
     """
     levels = voxel_levels(footprints, config)
     # Multiplied by the float32 reciprocal, which every backend rounds the same way. The product is monotone: a point
-    # between two points of a voxel lies in that voxel. Powers of two round nothing, so that levels nest.
-    scale = float(np.float32(1.0 / config.memory.voxel_size)) * jnp.exp2(-levels.astype(jnp.float32))
+    # between two points of a voxel lies in that voxel. `ldexp` rounds nothing (`exp2` does), so that levels nest.
+    scale = jnp.ldexp(jnp.float32(1.0 / config.memory.voxel_size), -levels)
     cells = jnp.floor(points * scale[..., None])
     in_range = jnp.all(jnp.abs(cells) < INDEX_LIMIT, axis=-1)
     cells = jnp.where(in_range[..., None], cells, 0.0).astype(jnp.int32)

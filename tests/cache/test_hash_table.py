@@ -49,11 +49,22 @@ def test_levels_partition_space_and_nest(point, footprint):
         np.asarray(voxel_indices(point, f, CONFIG)[0]) for f in (footprint, 2 * footprint)
     )
     side, per_unit = float(voxel_sides(footprint, CONFIG)), np.float32(1 / CONFIG.memory.voxel_size)
-    assert side == pytest.approx(CONFIG.memory.voxel_size * 2.0**level, rel=1e-6)
+    assert side == np.float32(CONFIG.memory.voxel_size) * 2.0**level
     assert side < footprint * (1 + 1e-6) and footprint < 2 * side * (1 + 1e-6)
     inside = np.asarray(point) * per_unit / np.float32(2.0**level) - np.array(cell)
     assert np.all((inside >= 0) & (inside < 1))
     assert next_level == level + 1 and np.array_equal(larger, np.floor_divide(cell, 2))
+
+
+def test_points_on_faces_of_large_voxels_lie_on_faces_of_small_ones():
+    """At every level, where a rounded power of two would put them on either side."""
+    levels = np.repeat(np.arange(-MAX_LEVEL, MAX_LEVEL + 1), 101)
+    faces = np.tile(np.arange(-50, 51), 2 * MAX_LEVEL + 1)
+    config = StreamConfig().replace(voxel_size=0.25)
+    points = jnp.asarray(np.repeat(faces[:, None] * 0.25 * 2.0 ** levels[:, None], 3, axis=1), jnp.float32)
+    footprints = jnp.asarray(0.3 * 2.0**levels, jnp.float32)
+    voxels, _ = jax.jit(voxel_indices, static_argnums=2)(points, footprints, config)
+    np.testing.assert_array_equal(voxels, np.stack([faces, faces, faces, levels], axis=1))
 
 
 def test_without_detail_all_voxels_have_one_size():
