@@ -92,7 +92,7 @@ class Kept:
         return tuple(x for i, x in enumerate(arguments) if i not in self._static)
 
     def _key(self, arguments: tuple) -> str | None:
-        """The key of the program, which names its every input as text; None if it is not kept."""
+        """The key of the compiled program, a text of all that it was compiled from; None if no entry is kept for it."""
         if not os.environ.get(SWITCH) or jax.config.jax_disable_jit:  # pyright: ignore[reportAttributeAccessIssue]
             return None
         if jax.default_backend() != "cpu":  # not measured elsewhere: JAX's own cache has the programs there
@@ -218,7 +218,7 @@ def kept_arrays(function: Callable, *arguments: Any) -> Any:
 
 
 def _read(file: Path, key: str) -> Any:
-    """What `_write` put into an entry; raises where it is damaged, of another key, or may be another user's."""
+    """The content of an entry; raises if it is damaged, of another key, or may be another user's."""
     with file.open("rb") as opened:
         facts = os.fstat(opened.fileno())
         if facts.st_uid != os.geteuid() or facts.st_mode & (stat.S_IWGRP | stat.S_IWOTH):

@@ -80,7 +80,7 @@ def _means(rng, m, places):
 
 
 def _footprints(rng, m):
-    """Of voxels of the configured size, or of the neighboring levels; some at the very limit between two."""
+    """Footprints that belong to voxels of the configured size or of a neighboring level; some lie at the limit."""
     size = CONFIG.memory.voxel_size
     widths = rng.choice([1.0, np.nextafter(np.float32(2), np.float32(0)), *rng.uniform(1, 2, 8)], m)
     return widths * size * rng.choice([1.0, 1.0, 1.0, 0.5, 2.0], m)

@@ -105,7 +105,7 @@ def test_a_session_decodes_shown_rows_padded_to_a_power_of_two(detail, model, pa
 
 
 def test_rows_that_hold_a_gaussian_are_those_of_shown_pivots(params, looped):
-    """Of all pivots, carved ones too, which have colors and opacities of their own."""
+    """Decoding all pivots leaves out carved ones, which have colors and opacities of their own."""
     cache = looped[0]
     tau = float(np.median(cache.confidences[cache.alive]))
     model = StreamSplat(NARROW.replace(min_confidence=tau, detail=True))

@@ -116,8 +116,7 @@ def test_the_paper_loss_of_a_scene_sums_mse_and_lpips_of_its_targets_over_black(
 
 
 def test_the_loss_of_a_crop_is_its_psnr_less_what_lpips_costs(monkeypatch):
-    """Of an empty scene, which is black and filled with its mean color, black too; LPIPS stands beside the filled image
-    alone."""
+    """An empty scene is black, and its mean color, which fills it, is black too; LPIPS sees the filled image alone."""
     monkeypatch.setattr(losses, "lpips_distance", lambda weights, a, b: 3.0 * jnp.abs(a - b).max(axis=(1, 2, 3)))
     model, params = StreamSplat(NARROW), random_params(NARROW)
     image = np.random.default_rng(5).integers(0, 256, (16, 24, 3), np.uint8)
