@@ -156,7 +156,9 @@ def test_the_least_recently_used_go_first(store, monkeypatch):
     for capacity in (128, 256):  # one of them is the older entry: used again, it is the newer
         program(CONFIG.replace(capacity=capacity))
     os.utime(unused, (1, 1))
-    monkeypatch.setattr(kept_programs, "MOST_BYTES", sum(entry.stat().st_size for entry in store.iterdir()))
+    # Room for two and a half: an entry's size varies with what XLA makes of the program, by less than half of one.
+    both = sum(entry.stat().st_size for entry in store.iterdir())
+    monkeypatch.setattr(kept_programs, "MOST_BYTES", both * 5 // 4)
     program(CONFIG.replace(capacity=512))
     assert used.exists() and not unused.exists() and used.stat().st_mtime > 1000
 
