@@ -16,37 +16,11 @@ from ssplat_jax.core.kept_programs import kept_arrays
 from ssplat_jax.data.capture import MAX_SIDE, ArrayPixels, Capture, FilePixels, capture_of_listing
 from ssplat_jax.data.images import MAX_PIXELS
 from ssplat_jax.data.parsing import reading
-from ssplat_jax.data.posed_image import USUAL, Frame, check_camtoworld, reinterpreted, split_options
-from ssplat_jax.data.readers import (
-    colmap,
-    kitti,
-    llff,
-    metashape,
-    polycam,
-    realestate10k,
-    reality_capture,
-    record3d,
-    scannet,
-    splat_cameras,
-    transforms_json,
-    tum,
-)
+from ssplat_jax.data.posed_image import Frame, check_camtoworld, split_options
+from ssplat_jax.data.readers import CAPTURE_READERS
 from ssplat_jax.data.readers.frame_list import Listing, files_in, in_stream_order
+from ssplat_jax.data.readers.transforms_json import TRANSFORMS_JSON, read_transforms
 
-CAPTURE_READERS = (  # the first one that matches reads the capture
-    transforms_json,
-    colmap,
-    polycam,
-    record3d,
-    llff,
-    scannet,
-    tum,
-    kitti,
-    realestate10k,
-    splat_cameras,
-    reality_capture,
-    metashape,
-)
 UNREADABLE_SUFFIXES = frozenset({".heic", ".heif", ".avif", ".jxl"})  # what phones write and we do not read
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp"}) | UNREADABLE_SUFFIXES
 """Images in a folder of these lack only their poses."""
@@ -84,14 +58,9 @@ def open_capture(path: str | Path, *, size: tuple[int, int] | None = None) -> Ca
         exists = folder.exists()
     if found is None:
         raise _no_capture(path, folder, exists=exists)
-    usual = getattr(found, "CONVENTION", USUAL)
-    written = dataclasses.replace(usual, **options)
-    listing = found.read(folder)
-    if options:
-        frames = tuple(reinterpreted(frame, usual, written) for frame in listing.frames)
-        listing = dataclasses.replace(listing, frames=frames)
-    listing = in_stream_order(listing)
-    return capture_of_listing(listing, found.FORMAT, FilePixels(listing.frames), size, written)
+    convention = dataclasses.replace(found.convention, **options)
+    listing = in_stream_order(found.read(folder, convention))
+    return capture_of_listing(listing, found.format, FilePixels(listing.frames), size, convention)
 
 
 def without_tilde(path: str) -> Path:
@@ -123,7 +92,7 @@ def _no_capture(path: str, folder: Path, *, exists: bool) -> InputError:
         fix = f"estimate the poses first: {example} (COLMAP by pycolmap), and give the folder that it writes"
     else:
         got, fix = "none of these", f"see --help of `ssplat inspect` for their files, or try {PROCEDURAL}:room"
-    formats = ", ".join(reader.FORMAT for reader in CAPTURE_READERS)
+    formats = ", ".join(reader.format for reader in CAPTURE_READERS)
     return refusal(path, wanted=f"a posed capture ({formats})", got=got, fix=fix)
 
 
@@ -158,11 +127,12 @@ def open_growing(path: Path, *, size: tuple[int, int] | None) -> tuple[Capture |
         The capture of the frames before the first whose image or fields cannot be read, None if there is no such frame;
         and why no more of them can be read, None if all can. An image is complete when it can be decoded.
     """
+    problems: list[str] = []
     try:
-        listing, problem = transforms_json.read_complete(path)
-        listing = in_stream_order(listing)
-        pixels, convention = FilePixels(listing.frames), transforms_json.CONVENTION
-        return capture_of_listing(listing, transforms_json.FORMAT, pixels, size, convention), problem
+        listing = in_stream_order(read_transforms(path, TRANSFORMS_JSON.convention, problems))
+        pixels, convention = FilePixels(listing.frames), TRANSFORMS_JSON.convention
+        capture = capture_of_listing(listing, TRANSFORMS_JSON.format, pixels, size, convention)
+        return capture, problems[0] if problems else None
     except InputError as error:  # missing, or being written
         return None, str(error)
 

@@ -17,6 +17,7 @@ from ssplat_jax.core.errors import InputError, echo, refusal
 
 MAX_BYTES = 1 << 30  # of a text file; those of real captures take some megabytes
 AGAIN = "write the file again"
+UNDISTORT = "undistort the images to pinhole cameras first (`colmap image_undistorter`)"
 
 
 @contextlib.contextmanager
@@ -114,11 +115,12 @@ class Fields:
                 return array
         raise self._refused(name, f"{' x '.join(map(str, shape))} finite numbers")
 
-    def refuse(self, *names: str, fix: str) -> None:
-        """Refuses the fields `names` unless they are missing, false or zeros: what they mean is not modelled."""
+    def refuse_lens(self, *names: str) -> None:
+        """Refuses fields unless they are missing, false or zeros: the lens that they describe is not modelled."""
         for name in names:
             if np.any(self._fields.get(name) or 0):
-                raise refusal(f"{self.where}.{name}", wanted="no such field, or 0", got=echo(self.get(name)), fix=fix)
+                got = echo(self.get(name))
+                raise refusal(f"{self.where}.{name}", wanted="no such field, or 0", got=got, fix=UNDISTORT)
 
     def text(self, name: str) -> str:
         """A text that is not empty."""

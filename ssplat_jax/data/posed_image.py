@@ -219,8 +219,3 @@ def with_options(path: str, *, axes: str | None = None, poses: str | None = None
     path, options = split_options(path)
     options |= {name: value for name, value in (("axes", axes), ("poses", poses)) if value is not None}
     return path + ("?" if options else "") + "&".join(f"{name}={value}" for name, value in options.items())
-
-
-def reinterpreted(frame: Frame, usual: Convention, written: Convention) -> Frame:
-    """A frame that was read in the `usual` convention as if its file were `written` in another one."""
-    return dataclasses.replace(frame, camtoworld=written.to_opencv(usual.from_opencv(frame.camtoworld)))

@@ -21,7 +21,7 @@ from ssplat_jax.config import preset
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.data import capture_summary
 from ssplat_jax.data.capture_summary import summarize
-from ssplat_jax.data.open_capture import CAPTURE_READERS
+from ssplat_jax.data.readers import CAPTURE_READERS
 from ssplat_jax.scene_files.formats import load_ply, save_ply
 from ssplat_jax.storage.weights import as_published, load_weights, published_tensors
 from tests.commands.command_fixture import edit, make_capture, run
@@ -50,7 +50,7 @@ def test_help_of_inspect_names_every_format(capsys):
     with pytest.raises(SystemExit):
         main(["inspect", "--help"])
     shown = " ".join(re.sub("[│╭╮╰╯─]", " ", capsys.readouterr().out).split())
-    assert [reader.FORMAT for reader in CAPTURE_READERS if reader.FORMAT not in shown] == []
+    assert [reader.format for reader in CAPTURE_READERS if reader.format not in shown] == []
 
 
 def test_output_that_nobody_reads_ends_a_command_quietly():

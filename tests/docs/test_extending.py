@@ -13,7 +13,7 @@ import ssplat_jax as ss
 from ssplat_jax.commands import main as command_line
 from ssplat_jax.commands import options
 from ssplat_jax.data import open_capture as captures
-from ssplat_jax.data.readers.frame_list import FrameList, Intrinsics, stored_size
+from ssplat_jax.data.readers.frame_list import FrameList, Intrinsics, Reader
 from tests.docs.pages import ROOT, tables
 
 PAGE = ROOT / "docs" / "extending.md"
@@ -51,21 +51,20 @@ def test_files_and_symbols_of_recipes_exist(recipe):
 # -- a capture reader -------------------------------------------------------------------------------------------------
 
 
-def toy_reader() -> SimpleNamespace:
+def toy_reader() -> Reader:
     """A reader of folders with `toy.json`, which holds the camera's x by image."""
 
-    def read(path):
+    def read(path, convention):
         facts = json.loads((path / "toy.json").read_text())
         intrinsics = Intrinsics(fx=40.0, fy=40.0, cx=16.0, cy=12.0)
-        frames = FrameList(path)
+        frames = FrameList(path, convention)
         for name, x in facts.items():
             pose = np.eye(4)
             pose[0, 3] = x
-            where = f"{path / 'toy.json'}: {name}"
-            frames.add(name, path / name, (pose, 0.0), intrinsics, stored_size(path / name, None, where), where)
+            frames.add(name, path / name, pose, intrinsics, f"{path / 'toy.json'}: {name}")
         return frames.listing(len(facts), "image")
 
-    return SimpleNamespace(FORMAT="toy", matches=lambda path: (path / "toy.json").is_file(), read=read)
+    return Reader("toy", lambda path: (path / "toy.json").is_file(), read)
 
 
 def test_an_added_reader_opens_its_captures(tmp_path, monkeypatch):

@@ -16,7 +16,7 @@ import pytest
 
 from ssplat_jax.core.errors import InputError, StorageError
 from ssplat_jax.data.posed_image import pose_from_quat
-from ssplat_jax.data.readers import tum
+from ssplat_jax.data.readers.datasets import pose_at
 from tests.badinputs.cases import mutant
 from tests.fuzzing.parsers import PARSERS
 
@@ -91,4 +91,4 @@ def test_poses_are_not_mixed_with_what_is_none(bad, column):
     rows[1, column] = bad
     with warnings.catch_warnings(), pytest.raises(InputError, match="here: wanted finite numbers"):
         warnings.simplefilter("error")
-        tum._pose_at(0.01, rows, "here")
+        pose_at(0.01, rows, "here")

@@ -19,23 +19,18 @@ from typing import Any, NamedTuple
 
 from ssplat_jax.core.errors import InputError, echo, refusal
 from ssplat_jax.data.images import FisheyeLens, Lens
-from ssplat_jax.data.parsing import load_lines, parse_numbers, reading
-from ssplat_jax.data.posed_image import Convention, pose_from_quat
+from ssplat_jax.data.parsing import UNDISTORT, load_lines, parse_numbers, reading
+from ssplat_jax.data.posed_image import Convention
 from ssplat_jax.data.readers.frame_list import (
-    CUT,
-    PANORAMAS,
-    UNDISTORT,
     FrameList,
     Intrinsics,
     Listing,
-    file_named,
+    Reader,
     images_folder,
     images_in,
-    stored_size,
+    lens_remedy,
 )
 
-FORMAT = "COLMAP"
-CONVENTION = Convention(poses="world-to-camera")
 FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", ".")  # places of a reconstruction, in the order of search
 MODELS = (  # name, parameters, and whether the camera is supported, by id
     ("SIMPLE_PINHOLE", "f cx cy", True),
@@ -78,31 +73,21 @@ class CameraEntry(NamedTuple):
     where: str
 
 
-def matches(path: Path) -> bool:
-    """True if `path` is a folder with a reconstruction."""
-    return any(True for _ in _models(path))
-
-
-def read(path: Path) -> Listing:
-    """Reads the registered images of the reconstruction in the folder `path`."""
+def _read(path: Path, convention: Convention) -> Listing:
+    """The registered images whose files exist."""
     model, root = next(_models(path)), path.resolve()
     cameras, entries = _cameras(model), _images(model)
     folder = images_folder(root)
     if folder and all(entry.name.startswith(folder) for entry in entries):
         folder = ""  # COLMAP ran on the parent folder, so the names include images/
-    frames = FrameList(root, CONVENTION)
+    frames = FrameList(root, convention, folder)
     for entry in entries:
-        image = frames.find(folder + entry.name, entry.where)
-        if image is not None:
+        if (image := frames.find(entry.name, entry.where)) is not None:
             if entry.camera not in cameras:
                 got = f"camera {entry.camera}, which is missing"
                 raise refusal(entry.where, wanted="a camera of the reconstruction", got=got, fix=COPY_AGAIN)
-            camera = cameras[entry.camera]
-            pose = (pose_from_quat(entry.pose[:4], entry.pose[4:], entry.where), 0.0)
-            sized = stored_size(image, camera.size, entry.where)
-            frames.add(entry.name, image, pose, _intrinsics(camera), sized, f"{entry.where}, camera {entry.camera}")
-    if entries and not frames.frames:
-        file_named(root, folder + entries[0].name, entries[0].where)  # refuses it
+            camera, where = cameras[entry.camera], f"{entry.where}, camera {entry.camera}"
+            frames.add(entry.name, image, (entry.pose[:4], entry.pose[4:]), _intrinsics(camera), where, camera.size)
     notes = _larger_models(path, model, len(entries))
     inside = {image.resolve() for image in images_in(root / "images", "**/*")}
     if (others := inside - {frame.path for frame in frames.frames}) and len(others) < len(inside):
@@ -145,8 +130,8 @@ def _intrinsics(camera: CameraEntry) -> Intrinsics:
     supported = {name: params.split() for name, params, is_supported in MODELS if is_supported}
     names = supported.get(camera.model)
     if names is None:
-        fix = CUT if camera.model in PANORAMAS else UNDISTORT
-        raise refusal(camera.where, wanted=f"one of {', '.join(supported)}", got=echo(camera.model), fix=fix)
+        wanted = f"one of {', '.join(supported)}"
+        raise refusal(camera.where, wanted=wanted, got=echo(camera.model), fix=lens_remedy(camera.model))
     if len(camera.params) != len(names):
         wanted = f"{len(names)} parameters ({' '.join(names)})"
         raise refusal(camera.where, wanted=wanted, got=str(len(camera.params)), fix=COPY_AGAIN)
@@ -250,3 +235,6 @@ def _text_images(path: Path) -> list[ImageEntry]:
             if len(points) % 3 or (points and not points[-1].lstrip("-").isdigit()):
                 raise refusal(where, wanted="a line of 2D points below", got="another line", fix=COPY_AGAIN)
     return images
+
+
+COLMAP = Reader("COLMAP", lambda path: any(True for _ in _models(path)), _read, Convention(poses="world-to-camera"))

@@ -1,4 +1,8 @@
-"""`FrameList`: what all readers share, from finding an image to the listing of checked frames in stream order."""
+"""What all readers share, from finding an image to the listing of checked frames in stream order.
+
+A reader hands over what its file says: a name, a pose and intrinsics. `FrameList` finds the images, checks everything
+that can be checked without decoding one, and tells the user what was left out.
+"""
 
 import contextlib
 import dataclasses
@@ -7,8 +11,9 @@ import math
 import posixpath
 import re
 import unicodedata
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path, PureWindowsPath
+from typing import NamedTuple
 from urllib.parse import unquote
 
 import numpy as np
@@ -27,14 +32,23 @@ from ssplat_jax.data.images import (
     image_size,
     shows_too_little,
 )
-from ssplat_jax.data.posed_image import MILLIMETER, ROTATION_ROUNDING, USUAL, Convention, Frame, check_intrinsics
+from ssplat_jax.data.parsing import UNDISTORT
+from ssplat_jax.data.posed_image import (
+    MILLIMETER,
+    ROTATION_ROUNDING,
+    USUAL,
+    Convention,
+    Frame,
+    check_camtoworld,
+    check_intrinsics,
+    pose_from_quat,
+)
 
 SHORTER_PATH_RATIO = 0.5  # camera path in the file's order over that by name, below which the file's order is used
 MAX_CENTER_OFFSET = 0.2  # of a side; a principal point farther from the center is reported
 SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG", ".webp")  # that are tried behind a name
 LISTED = frozenset({".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp"})  # of images, in lower case
 MASK_SUFFIXES = (".png", "", "_mask.png", ".mask.png")  # behind the name of an image, its mask
-UNDISTORT = "undistort the images to pinhole cameras first (`colmap image_undistorter`)"
 PANORAMAS = ("EQUIRECTANGULAR", "VR180_L", "OMNIDIRECTIONALSTEREO_L", "OMNIDIRECTIONALSTEREO_R", "ORTHOPHOTO")
 CUT = "cut them into perspective views first (`ns-process-data images --camera-type equirectangular`)"
 SHRUNK_FOLDERS = ("images_2", "images_4", "images_8")  # downscaled copies of images/, which may be missing
@@ -48,6 +62,15 @@ class Listing:
     frames: tuple[Frame, ...]  # in the order of the file; of streaming after `in_stream_order`
     notes: tuple[str, ...] = ()  # messages for the user, one sentence each
     is_in_time: bool = False  # True if that is known to be the order of time
+
+
+class Reader(NamedTuple):
+    """A format of captures."""
+
+    format: str  # its name
+    matches: Callable[[Path], bool]  # True if a folder or file is a capture of this format, which may be damaged
+    read: Callable[[Path, Convention], Listing]  # reads it, with poses in a convention; raises `InputError`
+    convention: Convention = USUAL  # in which its files usually write poses
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,17 +88,30 @@ def pinhole(matrix: Float64[np.ndarray, "_ _"], where: str, center: float = 0.0)
     """Intrinsics of a matrix, refused if it has skew; `center` is what the first pixel's center lacks to (0.5, 0.5)."""
     K = np.array(matrix[:3, :3], np.float64)
     check_matrices(np.eye(4), K, where)
-    return Intrinsics(fx=K[0, 0], fy=K[1, 1], cx=K[0, 2] + center, cy=K[1, 2] + center)
+    fx, fy, cx, cy = K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
+    return Intrinsics(fx=fx, fy=fy, cx=cx + center, cy=cy + center)
+
+
+def lens_remedy(model: object) -> str:
+    """What to do about images of a camera model that is not supported."""
+    return CUT if model in (*PANORAMAS, "spherical") else UNDISTORT
 
 
 class FrameList:
-    """Frames of a capture with the resolved folder `root`, checked one by one as a reader adds them."""
+    """Frames of a capture, checked one by one as a reader adds them.
 
-    def __init__(self, root: Path, convention: Convention = USUAL) -> None:
-        self.root, self.convention = root, convention
+    Args:
+        root: folder of the capture.
+        convention: in which its file writes poses.
+        folder: beginning of the images' paths that the file leaves out, such as "images/".
+    """
+
+    def __init__(self, root: Path, convention: Convention = USUAL, folder: str = "") -> None:
+        self.root, self.convention, self.folder = root.resolve(), convention, folder
         self.frames: list[Frame] = []
         self._seen: set[object] = set()
         self._by_stem: dict[str, list[Path]] | None = None  # images below images/, found when one is missing
+        self._first_missing: tuple[str, str] | None = None  # path and location in the file of an image
         self._renamed = self._turned = 0
 
     def find(self, name: object, where: str, suffixes: Sequence[str] = ("",)) -> Path | None:
@@ -85,6 +121,7 @@ class FrameList:
         the only one with another suffix. Names may be written as in addresses (%20), with accents in either way of
         Unicode, or with the folders of another machine.
         """
+        name = self.folder + name if isinstance(name, str) and name else name
         if (image := find_image(self.root, name, where, suffixes)) is not None:
             return image
         assert isinstance(name, str)
@@ -96,22 +133,26 @@ class FrameList:
         wanted = PureWindowsPath(unicodedata.normalize("NFC", unquote(name)))  # splits at both kinds of slashes
         found = self._by_stem.get(wanted.stem, []) + self._by_stem.get(wanted.name, [])
         found = [file for file in found if unicodedata.normalize("NFC", file.name) == wanted.name] or found
-        self._renamed += len(found) == 1
-        return find_file(self.root, [str(found[0].relative_to(self.root))], where) if len(found) == 1 else None
+        if len(found) == 1:
+            self._renamed += 1
+            return find_file(self.root, [str(found[0].relative_to(self.root))], where)
+        self._first_missing = self._first_missing or (name, where)
+        return None
 
     def named(self, name: object, where: str, suffixes: Sequence[str] = ("",)) -> Path:
         """The path that `find` finds; there must be one."""
-        return self.find(name, where, suffixes) or file_named(self.root, name, where)
+        return self.find(name, where, suffixes) or file_named(self.root, f"{self.folder}{name}", where)
 
     def add(
         self,
         name: str,
         image: Path,
-        pose: tuple[Float64[np.ndarray, "4 4"], float],
+        pose: object,
         intrinsics: Intrinsics,
-        sized: tuple[tuple[int, int], float],
         where: str,
+        described: tuple[float, float] | None = None,
         *,
+        pose_field: str = "",
         key: object = None,
         depth: Path | None = None,
         depth_unit: float = MILLIMETER,
@@ -122,41 +163,51 @@ class FrameList:
         Args:
             name: of the frame in the capture's files.
             image: its file.
-            pose: of `check_camtoworld`, in the convention of the file.
+            pose: as the file gives it, in its convention: a matrix, 4x4 or 3x4, or (quaternion wxyz, translation).
             intrinsics: of the image that the capture describes.
-            sized: (width, height) of the stored image and its size relative to the described one (`stored_size`).
             where: location of the frame for messages.
+            described: (width, height) of the described image, of which the file may be a smaller copy; None: as stored.
+            pose_field: name of the field that holds the pose, for messages.
             key: what only one frame may have; by default the image.
             depth: 16-bit depth image.
             depth_unit: capture units per step of the depth image.
             mask: image that is dark where pixels are masked out; by default one in the folder `masks` of the capture.
+
+        Raises:
+            InputError: a value or file is unusable; a link leads outside of the capture; or the frame is there already.
         """
-        find_file(self.root, [str(image)], where)  # refuses a link that leads outside
+        image = find_file(self.root, [str(image)], str(image)) or image
         key = image if key is None else key
         if key in self._seen:
             raise refusal(where, wanted="every image once", got=f"{echo(name)} again", fix="drop one of the two frames")
         self._seen.add(key)
         if depth is not None:
             check_depth_header(depth)
-        (width, height), shrink = sized
+        if isinstance(pose, tuple):
+            matrix, deviation = pose_from_quat(*pose, where), 0.0
+        else:
+            matrix, deviation = check_camtoworld(pose, where + pose_field)
+        (width, height), shrink = stored_size(image, described, where)
         fx, fy, cx, cy = (shrink * x for x in (intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy))
         K = check_intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height, where=where)
         distortion_px = check_lens(intrinsics.lens, K, width, height, where)
-        camtoworld, lens = self.convention.to_opencv(pose[0]), intrinsics.lens if distortion_px > IGNORED_PX else None
+        lens = intrinsics.lens if distortion_px > IGNORED_PX else None
         mask = mask or self._mask_of(name, image, where)
+        if mask is not None:
+            check_mask(mask, image)
         is_transparent, is_turned = image_flags(image)
         self._turned += is_turned
         is_beyond = lens is not None and shows_too_little(lens, K, width, height)
         frame = Frame(
             name,
-            camtoworld,
+            self.convention.to_opencv(matrix),
             K,
             width,
             height,
             path=image,
             depth_path=depth,
             depth_unit=depth_unit,
-            pose_deviation=pose[1],
+            pose_deviation=deviation,
             shrink=shrink,
             lens=lens,
             distortion_px=distortion_px,
@@ -173,10 +224,7 @@ class FrameList:
         stems = sorted(posixpath.splitext(place)[0] for place in places)
         names = [f"masks/{place}{suffix}" for place in sorted(places) for suffix in MASK_SUFFIXES]
         names += [f"masks/{stem}{suffix}" for stem in stems for suffix in (*SUFFIXES, *MASK_SUFFIXES[2:])]
-        mask = find_file(self.root, names, where)
-        if mask is not None:
-            check_mask(mask, image)
-        return mask
+        return find_file(self.root, names, where)
 
     def listing(
         self, num_listed: int, missing: str, notes: Sequence[str] = (), *, name: str = "", is_in_time: bool = False
@@ -193,6 +241,8 @@ class FrameList:
             is_in_time: True if frames were added in the order of time.
         """
         lost = num_listed - len(self.frames)
+        if not self.frames and self._first_missing is not None:
+            file_named(self.root, *self._first_missing)  # refuses it
         if not self.frames:
             got = f"none of {num_listed} with its {missing}"
             raise refusal(str(self.root), wanted="frames with images and poses", got=got, fix="complete the capture")
@@ -215,7 +265,7 @@ def in_stream_order(listing: Listing) -> Listing:
 
     Frames are sorted by name in natural order ("9.jpg" before "10.jpg"). The order of the file is kept if it is the
     order of time, or if it makes the path of the camera less than half as long, as with random names or several
-    cameras. The path needs true centers: call it after poses of another convention are turned.
+    cameras.
     """
     if listing.is_in_time:
         return listing
@@ -345,15 +395,15 @@ def images_in(folder: Path, pattern: str = "*") -> list[Path]:
     return [file for file in files_in(folder, pattern) if file.suffix.lower() in LISTED]
 
 
-def files_with(path: Path, suffix: str, *words: bytes) -> list[Path]:
-    """The file at `path`, or those in that folder, with a suffix and `words` in the first 2,000 bytes."""
+def files_with(path: Path, suffix: str, *patterns: bytes) -> list[Path]:
+    """The file at `path`, or those in that folder, with a suffix and all `patterns` in the first 2,000 bytes."""
     files = [path] if path.is_file() else files_in(path, f"*{suffix}")
     found = []
     for file in files:
         if file.suffix == suffix:
             with file.open("rb") as opened:
                 start = opened.read(2000)
-            found += [file] if all(word in start for word in words) else []
+            found += [file] if all(re.search(pattern, start) for pattern in patterns) else []
     return found
 
 

@@ -18,25 +18,22 @@ from pathlib import Path
 from typing import Any
 
 from ssplat_jax.core.errors import InputError, echo, refusal
-from ssplat_jax.data.images import FisheyeLens, Lens, check_mask, image_size
-from ssplat_jax.data.parsing import Fields, load_json
-from ssplat_jax.data.posed_image import MILLIMETER, Convention, check_camtoworld
-from ssplat_jax.data.readers import splat_cameras
+from ssplat_jax.data.images import FisheyeLens, Lens, image_size
+from ssplat_jax.data.parsing import UNDISTORT, Fields, load_json
+from ssplat_jax.data.posed_image import MILLIMETER, Convention
 from ssplat_jax.data.readers.frame_list import (
-    CUT,
-    PANORAMAS,
     SUFFIXES,
-    UNDISTORT,
     FrameList,
     Intrinsics,
     Listing,
+    Reader,
     file_named,
     in_images,
+    lens_remedy,
     stored_size,
 )
+from ssplat_jax.data.readers.programs import SPLAT_CAMERAS
 
-FORMAT = "transforms.json"
-CONVENTION = Convention(axes="opengl")
 PLACES = ("transforms.json", "nerfstudio/transforms.json", "transforms_train.json")
 PINHOLE_MODELS = (None, "OPENCV", "FULL_OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 FISHEYE_MODELS = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
@@ -52,30 +49,10 @@ KNOWN = frozenset((*USED.split(), *OF_NO_EFFECT.split(), *COEFFICIENTS, *UNKNOWN
 UNKNOWN_UNITS = ("depth_scale", "depth_factor", "depth_unit")  # some multiply by these and others divide
 
 
-def matches(path: Path) -> bool:
-    """True if `path` is a folder with a transforms.json, also in `nerfstudio`, or a .json file of an object."""
+def _matches(path: Path) -> bool:
     if path.is_file():
-        return path.suffix == ".json" and not splat_cameras.matches(path)
+        return path.suffix == ".json" and not SPLAT_CAMERAS.matches(path)
     return any((path / name).is_file() for name in PLACES)
-
-
-def read(path: Path) -> Listing:
-    """Reads the frames of the capture in the folder `path`, or of the file `path`."""
-    return _read(path, None)
-
-
-def read_complete(path: Path) -> tuple[Listing, str | None]:
-    """Reads the frames before the first that cannot be read, of a capture that is still being written.
-
-    Returns:
-        The listing, and the reason why that frame cannot be read; None if all can.
-
-    Raises:
-        InputError: the file cannot be read, or no frame of it.
-    """
-    problems: list[str] = []
-    listing = _read(path, problems)
-    return listing, problems[0] if problems else None
 
 
 def num_listed(path: Path) -> int:
@@ -93,12 +70,19 @@ def _file(path: Path) -> Path:
     return next((path / name for name in PLACES if (path / name).is_file()), path / PLACES[0])
 
 
-def _read(path: Path, problems: list[str] | None) -> Listing:
-    """The frames of a capture; with `problems`, those before the first problem, which is added to the list."""
+def read_transforms(path: Path, convention: Convention, problems: list[str] | None = None) -> Listing:
+    """The frames of a capture in the folder `path`, or of the file `path`.
+
+    With `problems`, those before the first that cannot be read, of a capture that is still being written; the reason
+    why it cannot be read is added to that list.
+
+    Raises:
+        InputError: the file cannot be read, or a frame of it; with `problems`, no frame of it.
+    """
     file = _file(path)
     meta = load_json(file)
     entries = Fields(meta, str(file)).entries("frames")
-    frames, num_bad = FrameList(file.parent.resolve(), CONVENTION), 0
+    frames, num_bad = FrameList(file.parent, convention), 0
     for i, entry in enumerate(entries):
         if isinstance(entry, dict) and entry.get("is_bad") is True:
             num_bad += 1
@@ -132,9 +116,6 @@ def _add_frame(frames: FrameList, meta: dict[str, Any], entry: Any, where: str) 
         None if own.get(kind) is None else file_named(frames.root, own.get(kind), f"{where}.{kind}")
         for kind in (depth_kind, "mask_path")
     )
-    if mask is not None:
-        check_mask(mask, image)
-    pose = check_camtoworld(own.get("transform_matrix"), f"{where}.transform_matrix")
     is_shrunk = in_images(str(name)) is not None and not (frames.root / "images").is_dir()
     has_size = fields.get("w") is not None and fields.get("h") is not None
     if is_shrunk and not has_size and any(fields.get(field) is not None for field in ("fl_x", "fl_y", "cx", "cy")):
@@ -143,11 +124,12 @@ def _add_frame(frames: FrameList, meta: dict[str, Any], entry: Any, where: str) 
         raise refusal(f"{where}: w, h", wanted="the size of the image that is described", got=got, fix=fix)
     stored = [0.0, 0.0] if has_size else [float(side) for side in image_size(image)]
     described = (fields.number("w", stored[0]), fields.number("h", stored[1]))
-    (width, height), shrink = sized = stored_size(image, described, f"{where}: w, h")
+    (width, height), shrink = stored_size(image, described, f"{where}: w, h")
     fx, fy = _focal(fields, own, width / shrink, height / shrink)
     cx, cy = (fields.number(field, side / shrink / 2) for field, side in (("cx", width), ("cy", height)))
-    frames.add(str(name), image, pose, Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, lens=_lens(fields, own)), sized, where,
-               depth=depth, depth_unit=_depth_unit(fields), mask=mask)  # fmt: skip
+    intrinsics = Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, lens=_lens(fields, own))
+    frames.add(str(name), image, own.get("transform_matrix"), intrinsics, where, described,
+               pose_field=".transform_matrix", depth=depth, depth_unit=_depth_unit(fields), mask=mask)  # fmt: skip
 
 
 def _depth_unit(fields: Fields) -> float:
@@ -171,8 +153,7 @@ def _lens(fields: Fields, own: Fields) -> Lens:
         raise refusal(f"{fields.where}.is_fisheye", wanted="true or false", got=echo(flag), fix="write a JSON boolean")
     is_fisheye = model in FISHEYE_MODELS or bool(flag)
     if not is_fisheye and model not in PINHOLE_MODELS:
-        fix = CUT if model in PANORAMAS else UNDISTORT
-        raise refusal(where, wanted="OPENCV, PINHOLE or OPENCV_FISHEYE", got=echo(model), fix=fix)
+        raise refusal(where, wanted="OPENCV, PINHOLE or OPENCV_FISHEYE", got=echo(model), fix=lens_remedy(model))
     has_own = own.get("distortion_params") is None and any(own.get(name) is not None for name in COEFFICIENTS)
     if has_own or fields.get("distortion_params") is None:
         coefficients = {name: fields.number(name, 0.0) for name in COEFFICIENTS}
@@ -180,7 +161,7 @@ def _lens(fields: Fields, own: Fields) -> Lens:
         coefficients = dict(zip(COEFFICIENTS, fields.numbers("distortion_params", (6,)).tolist(), strict=True))
     if model == "FULL_OPENCV":
         coefficients |= {"d1": coefficients.pop("k4"), "d2": fields.number("k5", 0.0), "d3": fields.number("k6", 0.0)}
-    fields.refuse(*UNKNOWN_LENS[2 * (model == "FULL_OPENCV") :], fix=UNDISTORT)
+    fields.refuse_lens(*UNKNOWN_LENS[2 * (model == "FULL_OPENCV") :])
     if is_fisheye and (coefficients["p1"] or coefficients["p2"]):
         got = "p1 or p2 beside them"
         raise refusal(where, wanted="a fish-eye lens with k1 to k4 alone", got=got, fix=UNDISTORT)
@@ -209,3 +190,6 @@ def _focal(fields: Fields, own: Fields, width: float, height: float) -> tuple[fl
         fix = "give fl_x in pixels or camera_angle_x in radians"
         raise refusal(f"{fields.where}.fl_x", wanted="a focal length", got="nothing", fix=fix)
     return focals.get("x", focals.get("y", 0.0)), focals.get("y", focals.get("x", 0.0))
+
+
+TRANSFORMS_JSON = Reader("transforms.json", _matches, read_transforms, Convention(axes="opengl"))
