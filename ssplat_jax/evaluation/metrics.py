@@ -202,10 +202,11 @@ def lpips_layers(
     if min(height, width) < LPIPS_MIN_SIDE:
         wanted = f"images of at least {LPIPS_MIN_SIDE} pixels a side"
         raise refusal("lpips", wanted=wanted, got=f"{width}x{height}", fix="render larger ones")
-    both = jnp.concatenate([x.reshape(-1, height, width, 3) for x in (a, b)])
+    # Apart, so that the features of an image that learns nothing have no backward pass.
+    features_a, features_b = (vgg_features(weights, x.reshape(-1, height, width, 3)) for x in (a, b))
     parts = []
-    for features, head in zip(vgg_features(weights, both), weights.heads, strict=True):
-        unit_a, unit_b = jnp.split(_unit_features(features), 2)
+    for layer_a, layer_b, head in zip(features_a, features_b, weights.heads, strict=True):
+        unit_a, unit_b = _unit_features(layer_a), _unit_features(layer_b)
         weighted = jnp.sum((unit_a - unit_b) ** 2 * head, axis=-1)
         # Means by row first: a single long float32 sum is off by more than 1e-5 on flat images.
         parts.append(jnp.mean(jnp.mean(weighted, axis=2), axis=1))
