@@ -30,6 +30,13 @@ PosesOption = Annotated[
     Literal["camera-to-world", "world-to-camera"] | None,
     tyro.conf.arg(help="Direction of the poses in the capture's files, if not that of its format."),
 ]
+DepthOption = Annotated[
+    Literal["on", "off"] | None,
+    tyro.conf.arg(
+        help="Stream depth maps too, as a sensor's; on where the capture has some, off for procedural scenes, whose are"
+        " exact."
+    ),
+]
 WeightsOption = Annotated[str, tyro.conf.arg(help="Preset with shipped weights, or a weights file.")]
 ConfigChanges = Annotated[tuple[str, ...], tyro.conf.arg(help="Changes to the configuration, as field=value.")]
 QualityOption = Annotated[
@@ -41,11 +48,11 @@ QualityOption = Annotated[
 QuietOption = Annotated[bool, tyro.conf.arg(help="Print only the closing line.")]
 
 
-def capture_path(path: str, axes: str | None, poses: str | None) -> str:
-    """Path of a capture as `open_capture` takes it, with the options --axes and --poses."""
+def capture_path(path: str, axes: str | None, poses: str | None, depth: str | None = None) -> str:
+    """Path of a capture as `open_capture` takes it, with the options --axes, --poses and --depth."""
     from ssplat_jax.data.posed_image import with_options
 
-    return with_options(path, axes=axes, poses=poses)
+    return with_options(path, axes=axes, poses=poses, depth=depth)
 
 
 def parse_size(text: str | None) -> tuple[int, int] | None:
@@ -162,12 +169,13 @@ class StreamOptions:
     set: ConfigChanges = ()
     axes: AxesOption = None
     poses: PosesOption = None
+    depth: DepthOption = None
     quiet: QuietOption = False
 
     @property
     def path(self) -> str:
         """The capture as `open_capture` takes it."""
-        return capture_path(self.capture, self.axes, self.poses)
+        return capture_path(self.capture, self.axes, self.poses, self.depth)
 
     @property
     def scale(self) -> float:

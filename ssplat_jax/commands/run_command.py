@@ -55,7 +55,8 @@ class Run(StreamOptions):
         if self.port != Run.port and not self.view:
             raise InputError("--port: wanted --view beside it, which it is for; got none.")
         if self.watch and split_options(self.path)[1]:
-            raise InputError("--watch: wanted poses as transforms.json has them, got axes or poses of another kind.")
+            wanted, got = "transforms.json as it is, without depth maps", "--axes, --poses or --depth"
+            raise InputError(f"--watch: wanted {wanted}, got {got}; leave it out.")
 
     def _stream_and_refine(self) -> int:
         """Streams, prints a summary, then refines if requested; returns the exit code."""

@@ -28,6 +28,7 @@ class Chunk:
     near: Float[Array, "*t"]  # nearest depth candidate, stream units
     far: Float[Array, "*t"]  # farthest depth candidate, stream units
     seen: Bool[Array, "*t v h w"] | None = None  # False for masked pixels, which give no tokens; None: all count
+    depths: Float[Array, "*t v h w"] | None = None  # measured camera z, stream units, 0 where unknown; None: no sensor
 
     @property
     def camera(self) -> Camera:
@@ -84,8 +85,9 @@ def check_chunk(chunk: Chunk, num_views: int, *, stacked: bool = False) -> None:
         raise refusal("chunk: images", wanted="floats in [0, 1]", got=got, fix=fix)
     v, leading = num_views, jnp.shape(chunk.images)[:1] if stacked else ()
     shapes = {"images": (v, "h", "w", 3), "viewmats": (v, 4, 4), "Ks": (v, 3, 3), "valid": (v,), "near": (), "far": ()}
-    if chunk.seen is not None:
-        shapes["seen"] = (v, *jnp.shape(chunk.images)[-3:-1])
+    for name in ("seen", "depths"):
+        if getattr(chunk, name) is not None:
+            shapes[name] = (v, *jnp.shape(chunk.images)[-3:-1])
     fix = f" Chunks have {v} views (`stream.chunk_size`): pad a short one with views whose `valid` is False."
     if stacked:
         fix = " Stack chunks along a leading axis t, one for all fields."

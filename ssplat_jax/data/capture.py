@@ -127,6 +127,7 @@ class Capture:
     height: int
     notes: tuple[str, ...] = ()  # messages of the reader for the user
     convention: Convention = USUAL  # of the poses in the files
+    streams_depth: bool = False  # chunks bring the depth maps that frames have
 
     def __repr__(self) -> str:  # poses and pixels are too long to print
         return f"Capture({self.name!r}, {self.format}, {len(self)} frames of {self.width}x{self.height})"
@@ -151,12 +152,14 @@ class Capture:
         return digest.hexdigest()[:12]
 
     def images_digest(self, indices: Sequence[int]) -> str:
-        """Digest (12 hex digits) of the bytes of the image and mask files of the frames `indices`; uses all cores.
+        """Digest (12 hex digits) of the bytes of the files that the frames `indices` stream; uses all cores.
 
         Images without a file are ignored: procedural images follow from the name of the capture.
         """
         frames = [self.frames[i] for i in indices]
-        paths = [path for frame in frames for path in (frame.path, frame.mask_path) if path is not None]
+        depth_paths = [frame.depth_path for frame in frames] if self.streams_depth else []
+        paths = [path for frame in frames for path in (frame.path, frame.mask_path)] + depth_paths
+        paths = [path for path in paths if path is not None]
         with ThreadPoolExecutor() as pool:
             digests = pool.map(lambda path: hashlib.sha256(path.read_bytes()).digest(), paths)
             return hashlib.sha256(b"".join(digests)).hexdigest()[:12]
@@ -198,6 +201,11 @@ class Capture:
         depth, frame = self.pixels.depth(i), self.frames[i]
         return None if depth is None else self.crop(i).depth(depth, (frame.width, frame.height))
 
+    @functools.cached_property
+    def brings_depth(self) -> bool:
+        """True if chunks have depth maps: they are wanted, and some frame has one."""
+        return self.streams_depth and any(map(self.pixels.has_depth, range(len(self))))
+
     def check_output_folder(self, out: Path) -> None:
         """Refuses `out` where results would mix with the capture's files: a run overwrites and clears its folder."""
         folder = out.resolve()
@@ -208,10 +216,11 @@ class Capture:
             raise refusal(str(out), wanted="a folder for results alone", got=got, fix=fix)
 
     def verify(self, indices: Sequence[int] | None = None) -> None:
-        """Decodes images and masks of the frames `indices` (default: all), to find damaged files; uses some cores."""
+        """Decodes what the frames `indices` (default: all) stream, to find damaged files; uses some cores."""
         used = range(len(self)) if indices is None else indices
         with ThreadPoolExecutor(NUM_DECODERS) as pool:  # Pillow decodes outside the interpreter lock
-            for _ in pool.map(lambda i: (self.image(i), self.seen(i)), used):
+            read_depth = self.depth if self.brings_depth else lambda i: None
+            for _ in pool.map(lambda i: (self.image(i), self.seen(i), read_depth(i)), used):
                 pass
 
     def stream_frame(self, config: StreamConfig, indices: Sequence[int] | None = None) -> StreamFrame:
@@ -301,6 +310,11 @@ class Capture:
             arrays["seen"] = np.ones(images.shape[:3], bool)
             for row, i in enumerate(group):
                 arrays["seen"][row] = self.seen(i)
+        if self.brings_depth:
+            arrays["depths"] = np.zeros(images.shape[:3], np.float32)
+            for row, i in enumerate(group):
+                if (depth := self.depth(i)) is not None:
+                    arrays["depths"][row] = stream_frame.scale * depth
         return arrays
 
 

@@ -32,7 +32,7 @@ UNITS = {
     "median_step": "capture units",
     "median_depth": "capture units",
     "depth_maps_median": "capture units",
-    "num_depth_maps": "(a run does not need them; its depths come from the images)",
+    "num_depth_maps": "(a run streams them beside the images; it needs none)",
     "near": "stream units (capture units times scene_scale)",
     "far": "stream units (capture units times scene_scale)",
     "scene_scale": "stream units in a capture unit",

@@ -39,7 +39,9 @@ def open_capture(path: str | Path, *, size: tuple[int, int] | None = None) -> Ca
     Args:
         path: a folder or file in one of the formats of `data.readers`, or a procedural scene (room, orbit, corridor,
             revisit), such as `procedural:room?frames=73&size=128x96&seed=0`. Poses that do not follow the convention of
-            their format are read with options behind it: `folder?axes=opengl&poses=world-to-camera`.
+            their format are read with options behind it: `folder?axes=opengl&poses=world-to-camera`. Depth maps of a
+            folder are streamed with its images, unless `folder?depth=off` says no; those of a procedural scene are
+            exact, and are streamed only with `depth=on`.
         size: (width, height) of delivered images. Stored images are scaled to cover it and cropped at the center, and
             the intrinsics follow exactly. By default the size of the stored images.
 
@@ -58,9 +60,11 @@ def open_capture(path: str | Path, *, size: tuple[int, int] | None = None) -> Ca
         exists = folder.exists()
     if found is None:
         raise _no_capture(path, folder, exists=exists)
+    streams_depth = options.pop("depth", "on") == "on"
     convention = dataclasses.replace(found.convention, **options)
     listing = in_stream_order(found.read(folder, convention))
-    return capture_of_listing(listing, found.format, FilePixels(listing.frames), size, convention)
+    capture = capture_of_listing(listing, found.format, FilePixels(listing.frames), size, convention)
+    return dataclasses.replace(capture, streams_depth=streams_depth)
 
 
 def without_tilde(path: str) -> Path:
@@ -150,9 +154,9 @@ def _open_procedural(spec: str, size: tuple[int, int] | None) -> Capture:
     name, _, query = spec.removeprefix(f"{PROCEDURAL}:").partition("?")
     given = parse_qsl(query, keep_blank_values=True)
     options = dict(given)
-    if len(options) < len(given) or not options.keys() <= {"frames", "size", "seed"}:
+    if len(options) < len(given) or not options.keys() <= {"frames", "size", "seed", "depth"}:
         fix = f"write {PROCEDURAL}:{name}?frames={PROCEDURAL_FRAMES}&size=128x96&seed=0"
-        raise refusal(spec, wanted="the options frames, size, seed, each once", got=echo(query), fix=fix)
+        raise refusal(spec, wanted="the options frames, size, seed, depth, each once", got=echo(query), fix=fix)
     num_frames = _whole(spec, "frames", options.get("frames", str(PROCEDURAL_FRAMES)), 1, 100_000)
     seed = _whole(spec, "seed", options.get("seed", "0"), 0, 2**31 - 1)
     width, height = size or PROCEDURAL_SIZE
@@ -161,6 +165,8 @@ def _open_procedural(spec: str, size: tuple[int, int] | None) -> Capture:
         if len(sides) != 2:
             raise refusal(f"{spec}: size", wanted="WIDTHxHEIGHT", got=echo(options["size"]), fix="write 128x96")
         width, height = (_whole(spec, "size", side, 8, MAX_SIDE) for side in sides)
+    if options.get("depth", "off") not in ("on", "off"):
+        raise refusal(f"{spec}: depth", wanted="on or off", got=echo(options["depth"]), fix="change the option")
     # Imported here because the scenes load their textures, which no other capture needs.
     from ssplat_jax.data.procedural.procedural_views import procedural_capture_arrays
 
@@ -172,7 +178,8 @@ def _open_procedural(spec: str, size: tuple[int, int] | None) -> Capture:
     )
     pixels = ArrayPixels(images=np.asarray(images, np.float32), depths=np.asarray(depths, np.float32))
     title = f"{PROCEDURAL}-{name}" + (f"-seed{seed}" if seed else "")
-    return capture_of_listing(Listing(name=title, frames=frames), PROCEDURAL, pixels, size)
+    capture = capture_of_listing(Listing(name=title, frames=frames), PROCEDURAL, pixels, size)
+    return dataclasses.replace(capture, streams_depth=options.get("depth") == "on")
 
 
 def _whole(spec: str, option: str, text: str, low: int, high: int) -> int:

@@ -194,16 +194,16 @@ USUAL = Convention()
 
 CONVENTIONS = tuple(Convention(axes, poses) for axes in get_args(Axes) for poses in get_args(Direction))
 
-_OPTIONS = re.compile(r"\?((?:axes|poses)=[^&?/]*(?:&(?:axes|poses)=[^&?/]*)*)$")
+_OPTIONS = re.compile(r"\?((?:axes|poses|depth)=[^&?/]*(?:&(?:axes|poses|depth)=[^&?/]*)*)$")
 
 
 def split_options(path: str) -> tuple[str, dict[str, str]]:
-    """Splits `path?axes=...&poses=...` into the path and its options; unknown and repeated values are refused."""
+    """Splits `path?axes=...&poses=...&depth=...` into path and options; unknown and repeated values are refused."""
     found = _OPTIONS.search(path)
     if found is None:
         return path, {}
     options: dict[str, str] = {}
-    allowed = {"axes": get_args(Axes), "poses": get_args(Direction)}
+    allowed = {"axes": get_args(Axes), "poses": get_args(Direction), "depth": ("on", "off")}
     for part in found[1].split("&"):
         name, _, value = part.partition("=")
         if value not in allowed[name] or name in options:
@@ -214,8 +214,10 @@ def split_options(path: str) -> tuple[str, dict[str, str]]:
     return path[: found.start()], options
 
 
-def with_options(path: str, *, axes: str | None = None, poses: str | None = None) -> str:
-    """`path` with the options that are not None, which replace those that it has."""
+def with_options(path: str, **given: str | None) -> str:
+    """`path` with the options `axes`, `poses` and `depth` that are not None, which replace those that it has."""
     path, options = split_options(path)
-    options |= {name: value for name, value in (("axes", axes), ("poses", poses)) if value is not None}
-    return path + ("?" if options else "") + "&".join(f"{name}={value}" for name, value in options.items())
+    options |= {name: value for name, value in given.items() if value is not None}
+    # A procedural path may have options of its own before these.
+    mark = "" if not options else "&" if "?" in path else "?"
+    return path + mark + "&".join(f"{name}={value}" for name, value in options.items())

@@ -23,7 +23,7 @@ from ssplat_jax.data.split import Split
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.evaluation.metrics import LPIPS_MIN_SIDE, SSIM_ARGUMENTS, LpipsWeights, lpips, psnr, ssim
 from ssplat_jax.rasterizer import effects_for, fill_holes, render
-from ssplat_jax.streaming.feed import Exposures
+from ssplat_jax.streaming.feed import Exposures, middle_exposure
 
 NUM_AVERAGED = 3
 """Streamed frames whose exposures are averaged for a novel view."""
@@ -43,7 +43,10 @@ class ImageScore:
 
 @dataclasses.dataclass(frozen=True)
 class ViewScore:
-    """Scores of one view: `literal` as the paper defines them, `shown` of the image that a person is shown."""
+    """Scores of one view: `literal` as the paper defines them, `shown` of the image that a person is shown.
+
+    The scene's own exposure is that of the files that are written of it, `middle_exposure`.
+    """
 
     frame: int
     literal: ImageScore  # holes black, at the scene's exposure
@@ -132,16 +135,16 @@ def score_view(
     """
     camera = capture.camera(i, stream_frame)
     out = render(gaussians, camera, effects=effects_for(gaussians, camera))
-    exposure = exposure_for(capture, i, exposures)
+    exposure, own = exposure_for(capture, i, exposures), middle_exposure(exposures)
     filled = np.asarray(_filled(out, gaussians))
     over_black = np.asarray(out.color)
     color, target, seen = _displayed(filled, exposure), capture.image(i), capture.seen(i)
     score = ViewScore(
         frame=i,
-        literal=score_image(_displayed(over_black), target, lpips_weights, seen),
+        literal=score_image(_displayed(over_black, own), target, lpips_weights, seen),
         shown=score_image(color, target, lpips_weights, seen),
         psnr_over_black=psnr(_displayed(over_black, exposure), target, seen),
-        psnr_one_exposure=psnr(_displayed(filled), target, seen),
+        psnr_one_exposure=psnr(_displayed(filled, own), target, seen),
         coverage=float(np.asarray(out.alpha).mean()),
     )
     return ScoredView(score, target, color, np.asarray(out.depth))

@@ -1,4 +1,7 @@
-"""History-Projected Depth Anchoring (HPDA): cached geometry as a Gaussian prior over depth candidates (Sec. 3.5)."""
+"""History-Projected Depth Anchoring (HPDA): cached geometry as a Gaussian prior over depth candidates (Sec. 3.5).
+
+What a depth sensor measured, where a chunk brings that, anchors the distribution in the same form (ours).
+"""
 
 import flax.linen as nn
 import jax.numpy as jnp
@@ -20,6 +23,16 @@ READOUT_WINDOW = 4
 CONFIDENCE_WINDOW = 1
 """Candidates on each side whose mass is the confidence with `depth_readout="window"`. A depth that is known exactly,
 but lies halfway between two candidates, has a peak of only 0.5."""
+
+SENSOR_WIDTH = 0.6
+"""Standard deviation of a sensor's anchor, in steps between candidates. A sensor's own error is smaller than a step; a
+narrower anchor would put a depth between two candidates onto one of them."""
+SENSOR_GAMMA = 10.0
+"""Weight of a sensor's anchor: about 94 % of the mass where it contradicts the matcher."""
+MIN_STEP = 1e-6
+"""Smallest step between candidates, for a single one and near = far."""
+MIN_KNOWN = 0.5
+"""Share of a cell's pixels whose depth must be measured. At the rims of what a sensor saw, its depths are mixtures."""
 
 
 class AnchorStrength(nn.Module):
@@ -49,8 +62,37 @@ def cache_anchor(
     return jnp.where(history.mask[..., None], omega * anchor, 0.0)
 
 
+def cell_depths(depths: Float[Array, "v h w"], side: int) -> Float[Array, "v hm wm"]:
+    """Depth of each cell of `side` x `side` pixels: the lower median of its known depths, which lies on a surface.
+
+    Limits:
+        0 where less than `MIN_KNOWN` of the pixels are known, that is above 0.
+    """
+    v, h, w = depths.shape
+    cells = depths.reshape(v, h // side, side, w // side, side).swapaxes(2, 3).reshape(v, h // side, w // side, -1)
+    known = jnp.sort(jnp.where(cells > 0, cells, jnp.inf), axis=-1)
+    num_known = jnp.sum(cells > 0, axis=-1, keepdims=True)
+    middle = jnp.take_along_axis(known, jnp.maximum(num_known - 1, 0) // 2, axis=-1)
+    return jnp.where(num_known >= MIN_KNOWN * side * side, middle, 0.0)[..., 0]
+
+
+def sensor_anchor(
+    depths: Float[Array, "v hm wm"], log_candidates: Float[Array, " d"], config: StreamConfig
+) -> Float[Array, "v hm wm d"]:
+    """The anchor of measured depths over the candidates: a Gaussian in the space in which these are uniform.
+
+    Limits:
+        An unknown depth, 0, gives zeros, and so does one that is far outside of the candidates.
+    """
+    candidates = to_candidate_space(log_candidates, config)
+    step = jnp.maximum(jnp.abs(candidates[-1] - candidates[0]) / max(len(candidates) - 1, 1), MIN_STEP)
+    offsets = candidates - to_candidate_space(safe_log(jnp.where(depths > 0, depths, 1.0)), config)[..., None]
+    anchor = jnp.exp(-0.5 * (offsets / (SENSOR_WIDTH * step)) ** 2)
+    return jnp.where((depths > 0)[..., None], anchor, 0.0)
+
+
 def inject_anchor(
-    probs: Float[Array, "*b d"], anchor: Float[Array, "*b d"], gamma: Float[Array, ""]
+    probs: Float[Array, "*b d"], anchor: Float[Array, "*b d"], gamma: Float[Array, ""] | float
 ) -> Float[Array, "*b d"]:
     """The anchored distribution P^v (Eq. cache_prior_injection); `probs` must sum to 1.
 
@@ -97,17 +139,21 @@ def expected_log_depth(
 def anchor_depth(
     params, distribution: DepthDistribution, history: ProjectedCache, views: Views, config: StreamConfig
 ) -> AnchoredDepth:
-    """Depth and confidences read from the matcher's distribution and the cache's anchor, all on the matching grid.
+    """Depth and confidences read from the matcher's distribution and its anchors, all on the matching grid.
 
-    `history.hpda=False` leaves the matcher's distribution as it is.
+    A sensor's depths count as the matcher's, so that the stored confidences include them. `history.hpda=False` leaves
+    the cache's anchor out.
     """
-    probs = distribution.probs
+    probs = matched = distribution.probs
+    if views.depths is not None:
+        depths = cell_depths(views.depths, config.network.match_stride)
+        probs = matched = inject_anchor(probs, sensor_anchor(depths, views.log_candidates, config), SENSOR_GAMMA)
     if config.history.hpda:
         gamma = AnchorStrength().apply({"params": params})
         probs = inject_anchor(probs, cache_anchor(history, views.log_candidates, config), gamma)  # pyright: ignore[reportArgumentType]
     return AnchoredDepth(
         probs=probs,
         log_depths=expected_log_depth(probs, views.log_candidates, config),
-        matcher_confidences=peak_confidence(distribution.probs, config),
+        matcher_confidences=peak_confidence(matched, config),
         anchored_confidences=peak_confidence(probs, config),
     )

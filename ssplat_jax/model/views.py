@@ -30,6 +30,7 @@ class Views:
     unusable: Bool[Array, " v"]  # given as valid, but not to be used (`core.chunk.usable_views`): treated as padding
     inside: Bool[Array, "v hf wf"]  # cells of valid views whose center lies in the unpadded image, no pixel masked out
     log_candidates: Float[Array, " d"]  # ln of the candidates, near to far; far to near if `inverse`
+    depths: Float[Array, "v hp wp"] | None  # measured camera z, stream units, 0 where unknown; None without a sensor
     height: int = static()  # of the unpadded image
     width: int = static()
 
@@ -106,6 +107,10 @@ def prepare_views(chunk: Chunk, config: StreamConfig) -> Views:
         seen = jnp.pad(chunk.seen, ((0, 0), (0, pad_h), (0, pad_w)), constant_values=True)
         v, hf, wf = inside.shape
         inside &= seen.reshape(v, hf, GRID_STRIDE, wf, GRID_STRIDE).all(axis=(2, 4))
+    depths = chunk.depths
+    if depths is not None:
+        is_known = (depths > 0) & jnp.isfinite(depths) & valid[:, None, None]
+        depths = jnp.pad(jnp.where(is_known, depths, 0.0), ((0, 0), (0, pad_h), (0, pad_w)))
     return Views(
         images=images,
         viewmats=viewmats,
@@ -114,6 +119,7 @@ def prepare_views(chunk: Chunk, config: StreamConfig) -> Views:
         unusable=chunk.valid & ~valid,
         inside=inside,
         log_candidates=_log_candidates(near, far, config),
+        depths=depths,
         height=height,
         width=width,
     )

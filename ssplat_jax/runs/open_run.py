@@ -70,6 +70,7 @@ class OpenRun:
             "size": [self.capture.width, self.capture.height],
             "frames": self.indices,
             "poses": self.capture.digest(self.indices),
+            "depth": self.capture.brings_depth,
             "weights": self.weights,
         }
 
@@ -231,7 +232,8 @@ class SavedRun:
             InputError: the capture at `path` is unusable, or its frames, poses or images are others.
             StorageError: the run's adjusted poses are damaged.
         """
-        capture = with_poses_of_run(open_capture(path, size=tuple(self.header["size"])), self.folder)
+        capture = open_capture(path, size=tuple(self.header["size"]))
+        capture = dataclasses.replace(with_poses_of_run(capture, self.folder), streams_depth=self.header["depth"])
         frames, streamed = self.header["frames"], list(map(int, self.header["images"]))
         is_same = max(frames) < len(capture) and capture.digest(frames) == self.header["poses"]
         if not is_same or _image_digests(capture, streamed) != self.header["images"]:

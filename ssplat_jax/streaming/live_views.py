@@ -67,11 +67,12 @@ class LiveViews:
         # The frame, and the output of the last chunk if the frame has not learned from it yet. They are replaced
         # together, because an interrupt may come between two statements.
         self._learned: tuple[StreamFrame | None, ChunkOutput | None] = stream_frame, None
-        self._waiting: list[tuple[Frame, Float32[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]] = []
+        # Frame, image, mask and depth map of each; a map without a known depth stands for none.
+        self._waiting: list[tuple[Frame, Float32[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"], np.ndarray]] = []
         self._num_views = 0
         self._size: tuple[int, int] | None = None
 
-    def add(self, image: object, K: object, viewmat: object, seen: object = None) -> Chunk | None:
+    def add(self, image: object, K: object, viewmat: object, seen: object = None, depth: object = None) -> Chunk | None:
         """Takes a view as `Session.push` does, and gives the chunk that it completes; None while views are missing.
 
         Raises:
@@ -87,10 +88,14 @@ class LiveViews:
         if mask.shape != (height, width) or mask.dtype != bool:
             got, fix = f"{mask.dtype} {list(mask.shape)}", "give True where a pixel counts"
             raise refusal("push: seen", wanted=f"bool [{height}, {width}]", got=got, fix=fix)
+        measured = np.zeros((height, width), np.float32) if depth is None else np.asarray(depth)
+        if measured.shape != (height, width) or not np.issubdtype(measured.dtype, np.floating):
+            got, fix = f"{measured.dtype} {list(measured.shape)}", "give camera z in the unit of the poses"
+            raise refusal("push: depth", wanted=f"floats [{height}, {width}]", got=got, fix=fix)
         matrix = _checked_K(K, width, height)
         frame = Frame(str(self._num_views), camtoworld, matrix, width, height, is_masked=not mask.all())
         self._size = (width, height)
-        self._waiting.append((frame, pixels, mask))
+        self._waiting.append((frame, pixels, mask, measured.astype(np.float32)))
         self._num_views += 1
         return self.rest() if len(self._waiting) >= self._config.stream.chunk_size else None
 
@@ -101,11 +106,10 @@ class LiveViews:
         """
         if not self._waiting:
             return None
-        frames, images, masks = zip(*self._waiting[: self._config.stream.chunk_size], strict=True)
-        depths = np.zeros((len(frames), *images[0].shape[:2]), np.float32)
-        pixels = ArrayPixels(images=np.stack(images), depths=depths, masks=np.stack(masks))
-        size = {"width": frames[0].width, "height": frames[0].height}
-        capture = Capture(name="live", format="memory", frames=frames, pixels=pixels, **size)
+        frames, images, masks, depths = zip(*self._waiting[: self._config.stream.chunk_size], strict=True)
+        pixels = ArrayPixels(images=np.stack(images), depths=np.stack(depths), masks=np.stack(masks))
+        facts = {"width": frames[0].width, "height": frames[0].height, "streams_depth": bool(np.any(pixels.depths > 0))}
+        capture = Capture(name="live", format="memory", frames=frames, pixels=pixels, **facts)
         if self.stream_frame is None:
             self._learned = capture.stream_frame(self._config), None
         return next(iter(capture.chunks(self._config, range(len(capture)), stream_frame=self.stream_frame)))

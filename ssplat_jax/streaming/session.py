@@ -82,7 +82,9 @@ class Session:
         """
         return self._stream(chunk, is_live=False)
 
-    def push(self, image: object, K: object, viewmat: object, seen: object = None) -> ChunkOutput | None:
+    def push(
+        self, image: object, K: object, viewmat: object, seen: object = None, depth: object = None
+    ) -> ChunkOutput | None:
         """Takes one view of a live source, and streams a chunk when enough views have come.
 
         Near, far and scale come from the first chunk, as with `causal`; `stream_frame` then holds them. A later chunk
@@ -94,6 +96,8 @@ class Session:
             viewmat: 4x4 world-to-camera transform with OpenCV axes, in any world of one scale.
             seen: mask, height x width, False for pixels that do not count; by default all count. Some views may have
                 masks and others none.
+            depth: what a sensor measured, height x width: camera z in the unit of the poses, 0 where unknown. Some
+                views may have it and others not.
 
         Returns:
             The summary of the chunk that the view completed, or None while views are missing.
@@ -105,7 +109,7 @@ class Session:
         if self.cache is not None and self.stream_frame is None:
             fix = "give Session(..., stream_frame=StreamFrame) too, or push all views"
             raise refusal("push", wanted="the stream frame of the cache that is continued", got="none", fix=fix)
-        chunk = self._live.add(image, K, viewmat, seen)
+        chunk = self._live.add(image, K, viewmat, seen, depth)
         return None if chunk is None else self._stream(chunk, is_live=True)
 
     def flush(self) -> ChunkOutput | None:
@@ -156,7 +160,7 @@ class Session:
 
     def _program(self, name: str, function: Callable, cache: VoxelCache, chunk: Chunk, *more) -> jax.stages.Compiled:
         """`function` compiled for the shapes of `cache`, which it consumes, and of `chunk`."""
-        key = (name, cache.capacity, chunk.images.shape, chunk.seen is None)
+        key = (name, cache.capacity, chunk.images.shape, chunk.seen is None, chunk.depths is None)
         if key not in self._programs:
             since = time.perf_counter()
             self._programs[key] = Kept(function, donate_argnums=(1,)).program(self.params, cache, chunk, *more)

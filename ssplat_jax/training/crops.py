@@ -92,7 +92,9 @@ class Crops:
         found = [(open_capture(spec, size=(width, width * 3 // 4)), 1) for spec in self.procedural]
         for capture in mix.captures if mix else []:
             first = capture.frames[0]
-            capture = dataclasses.replace(capture, width=width, height=round(first.height * width / first.width))
+            height = round(first.height * width / first.width)
+            # Without its depth maps, as most captures are streamed.
+            capture = dataclasses.replace(capture, width=width, height=height, streams_depth=False)
             strides = [stride for stride in self.strides if len(range(0, len(capture), stride)) >= MIN_FRAMES]
             if not strides:
                 wanted = f"at least {MIN_FRAMES} frames"

@@ -115,7 +115,7 @@ def test_a_frame_beyond_those_asked_for_is_not_missed(tmp_path, monkeypatch, cap
     ("options", "words"),
     [
         (("--watch", "--quiet-seconds", "0.1"), "a frame that can be read"),
-        (("--watch", "--axes", "opencv"), "--watch: wanted poses as transforms.json has them"),
+        (("--watch", "--axes", "opencv"), "--watch: wanted transforms.json as it is"),
         (("--quiet-seconds", "3"), "--watch beside it"),
     ],
 )
