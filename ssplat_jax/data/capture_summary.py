@@ -20,8 +20,6 @@ HIGH_STEP = 0.6  # step over median depth, above which neighboring frames hardly
 MAX_FOCAL_RATIO = 4.0  # largest over smallest focal length; above it there is a warning
 JUMP_RATIO = 20.0  # step over median step, above which there is a warning
 LOW_PARALLAX_DEGREES = 2.0  # median over the points, below which depth is uncertain
-MAX_DEPTH_RATIO = 1.5  # median of the depth maps over that of the matches, or its inverse; above it there is a warning
-NUM_DEPTH_MAPS_READ = 8  # evenly spread; a median needs no more
 MIN_FRAMES = 8  # with fewer, disorder is not looked for
 SHUFFLED_RANK = 0.15  # of the number of frames; median rank of the next camera among the nearest, above which
 ASIDE_RATIO = 5.0  # steps to and from a frame over the median step, and over the step from its neighbor to the other
@@ -54,7 +52,6 @@ def summarize(
     keypoints = keypoints_of(capture)
     depths = estimate_depths(capture, range(len(capture)), advance, keypoints)
     wrong_poses = pose_warning(fit_poses(capture, capture.convention, keypoints), capture.convention)
-    measured = _depth_maps_median(capture)
     scale, near, far = stream_scale(depths, config)
     centers = capture.camtoworlds[:, :3, 3]
     steps = np.linalg.norm(np.diff(centers, axis=0), axis=-1)
@@ -63,7 +60,7 @@ def summarize(
     if wrong_poses is not None:  # depths that follow from wrong poses would only mislead
         warnings = [wrong_poses]
     else:
-        warnings = [*_depth_warnings(capture, depths, steps), *_depth_map_warnings(depths, measured)]
+        warnings = [*_depth_warnings(capture, depths, steps), *capture.depth_map_warnings(depths)]
     return {
         "name": capture.name,
         "format": capture.format,
@@ -78,7 +75,7 @@ def summarize(
         "median_step": median_step,  # in stream order
         "step_over_depth": median_step / depths.median,
         "median_depth": depths.median,
-        "depth_maps_median": measured,
+        "depth_maps_median": capture.depth_maps_median(),
         "depth_source": depths.source,
         "num_matches": depths.num_points,
         "parallax_degrees": depths.parallax_degrees,
@@ -93,25 +90,6 @@ def summarize(
 def _field(extent: int, focal: float) -> float:
     """Field of view in degrees of an image side of `extent` pixels."""
     return float(np.degrees(2 * np.arctan(extent / (2 * focal))))
-
-
-def _depth_maps_median(capture: Capture) -> float | None:
-    """Median of the known depths in some depth maps, in capture units; None without depth maps."""
-    owners = list(filter(capture.pixels.has_depth, range(len(capture))))
-    chosen = sorted({owners[round(k)] for k in np.linspace(0, len(owners) - 1, NUM_DEPTH_MAPS_READ)}) if owners else []
-    known = [depth[depth > 0] for i in chosen if (depth := capture.depth(i)) is not None]
-    return float(np.median(np.concatenate(known))) if any(depths.size for depths in known) else None
-
-
-def _depth_map_warnings(depths: DepthStatistics, measured: float | None) -> list[str]:
-    """A warning where depth maps contradict the depths that follow from images and poses."""
-    if measured is None or depths.source != "matches":
-        return []
-    ratio = measured / depths.median
-    if 1 / MAX_DEPTH_RATIO <= ratio <= MAX_DEPTH_RATIO:
-        return []
-    times = f"{ratio:.2g} times that of the matches"
-    return [f"The depth maps' median is {times}: check the unit of the depth maps and of the poses."]
 
 
 def _depth_warnings(capture: Capture, depths: DepthStatistics, steps: np.ndarray) -> list[str]:

@@ -155,3 +155,13 @@ def test_pushed_depths_make_the_chunk_of_a_capture_that_has_them():
         np.testing.assert_allclose(got.depths[v], wanted, rtol=1e-5)
     with pytest.raises(InputError, match="push: depth"):
         live.add(capture.image(0), capture.K(0), capture.camera(0).viewmats, depth=np.ones((24, 32), np.uint16))
+
+
+def test_depth_maps_of_another_unit_than_the_poses_are_named():
+    capture = open_capture("procedural:room?frames=12&size=64x48&depth=on")
+    assert capture.stream_frame(preset("tiny")).warning is None
+    feet = dataclasses.replace(capture.pixels, depths=3.28 * capture.pixels.depths)
+    for streams_depth, is_named in ((True, True), (False, False)):
+        other = dataclasses.replace(capture, pixels=feet, streams_depth=streams_depth)
+        warning = other.stream_frame(preset("tiny")).warning
+        assert (warning is not None and "times that of the matches" in warning) == is_named
