@@ -22,7 +22,7 @@ from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.chunk import Chunk
 from ssplat_jax.core.errors import echo, refusal
-from ssplat_jax.data.depth_range import estimate_depths, stream_scale
+from ssplat_jax.data.depth_range import DepthStatistics, estimate_depths, stream_scale
 from ssplat_jax.data.images import Crop, decode_depth, decode_image, decode_mask, undistort
 from ssplat_jax.data.posed_image import USUAL, Convention, Frame
 from ssplat_jax.data.readers.frame_list import Listing
@@ -31,6 +31,8 @@ from ssplat_jax.data.stream_frame import StreamFrame
 
 MAX_SIDE = 16384  # pixels of a delivered image
 NUM_DECODERS = 3  # images decoded at a time: one of 12 megapixels takes 0.3 GB
+MAX_DEPTH_RATIO = 1.5  # median of the depth maps over that of the matches, or its inverse; above it there is a warning
+NUM_DEPTH_MAPS_READ = 8  # evenly spread; a median needs no more
 KEPT_IMAGES, KEPT_BYTES = 160, 256 << 20  # most decoded images that wait for their second use
 
 
@@ -206,6 +208,26 @@ class Capture:
         """True if chunks have depth maps: they are wanted, and some frame has one."""
         return self.streams_depth and any(map(self.pixels.has_depth, range(len(self))))
 
+    def depth_maps_median(self) -> float | None:
+        """Median of the known depths in some depth maps, in capture units; None without depth maps."""
+        owners = list(filter(self.pixels.has_depth, range(len(self))))
+        places = np.linspace(0, len(owners) - 1, NUM_DEPTH_MAPS_READ)
+        chosen = sorted({owners[round(place)] for place in places}) if owners else []
+        known = [depth[depth > 0] for i in chosen if (depth := self.depth(i)) is not None]
+        return float(np.median(np.concatenate(known))) if any(depths.size for depths in known) else None
+
+    def depth_map_warnings(self, depths: DepthStatistics) -> list[str]:
+        """A warning where depth maps contradict the depths that follow from images and poses."""
+        measured = self.depth_maps_median()
+        if measured is None or depths.source != "matches":
+            return []
+        ratio = measured / depths.median
+        if 1 / MAX_DEPTH_RATIO <= ratio <= MAX_DEPTH_RATIO:
+            return []
+        times = f"{ratio:.2g} times that of the matches"
+        fix = "check the unit of the depth maps and of the poses, or stream without them (--depth off)"
+        return [f"The depth maps' median is {times}: {fix}."]
+
     def check_output_folder(self, out: Path) -> None:
         """Refuses `out` where results would mix with the capture's files: a run overwrites and clears its folder."""
         folder = out.resolve()
@@ -235,7 +257,9 @@ class Capture:
         depths = estimate_depths(self, used)
         scale, near, far = stream_scale(depths, config)
         first = self.frames[used[0]].camtoworld
-        return StreamFrame.at_camera(first, scale=scale, near=near, far=far, warning=depths.warning)
+        warnings = self.depth_map_warnings(depths) if self.brings_depth else []
+        warning = " ".join(filter(None, (depths.warning, *warnings))) or None
+        return StreamFrame.at_camera(first, scale=scale, near=near, far=far, warning=warning)
 
     def camera(
         self, i: int, stream_frame: StreamFrame | None = None, *, offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
