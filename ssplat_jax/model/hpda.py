@@ -3,6 +3,8 @@
 What a depth sensor measured, where a chunk brings that, anchors the distribution in the same form (ours).
 """
 
+import math
+
 import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -73,7 +75,7 @@ def cell_depths(depths: Float[Array, "v h w"], side: int) -> Float[Array, "v hm 
     known = jnp.sort(jnp.where(cells > 0, cells, jnp.inf), axis=-1)
     num_known = jnp.sum(cells > 0, axis=-1, keepdims=True)
     middle = jnp.take_along_axis(known, jnp.maximum(num_known - 1, 0) // 2, axis=-1)
-    return jnp.where(num_known >= MIN_KNOWN * side * side, middle, 0.0)[..., 0]
+    return jnp.where(num_known >= math.ceil(MIN_KNOWN * side * side), middle, 0.0)[..., 0]
 
 
 def sensor_anchor(

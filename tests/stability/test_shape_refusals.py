@@ -6,6 +6,7 @@ import pytest
 
 from ssplat_jax.core.chunk import check_chunk
 from ssplat_jax.core.errors import InputError
+from ssplat_jax.core.pytree import replace
 from tests.model.small import MODEL, chunk
 
 
@@ -16,10 +17,15 @@ def wrong(tree, **leaves):
 
 
 def test_a_step_and_a_run_refuse_chunks_of_other_shapes():
-    one = chunk()
+    one = replace(chunk(), depths=jnp.zeros((3, *chunk().images.shape[1:3])))
     stacked = jax.tree.map(lambda x: jnp.stack([x, x]), one)
     check_chunk(stacked, 3, stacked=True)
-    of_a_step = {"images": one.images[:2], "valid": jnp.ones(2, bool), "viewmats": one.viewmats[:, :3]}
+    of_a_step = {
+        "images": one.images[:2],
+        "depths": jnp.zeros((3, 8, 8)),
+        "valid": jnp.ones(2, bool),
+        "viewmats": one.viewmats[:, :3],
+    }
     for name, leaf in (of_a_step | {"near": jnp.ones(3)}).items():
         for call in (MODEL.step, jax.jit(MODEL.step)):
             with pytest.raises(InputError, match=f"chunk: {name} must be"):
