@@ -8,12 +8,7 @@ import pytest
 
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.data.capture import Capture
-from ssplat_jax.data.capture_summary import (
-    _depth_map_warnings,
-    order_warnings,
-    summarize,
-)
-from ssplat_jax.data.depth_range import DepthStatistics
+from ssplat_jax.data.capture_summary import order_warnings, summarize
 from tests.data.planes_fixture import two_planes
 
 
@@ -41,13 +36,6 @@ def test_summaries_agree_with_the_stream_frame():
 def test_warnings_name_a_remedy(capture, words):
     warnings = summarize(capture(), StreamConfig())["warnings"]
     assert any(words in warning for warning in warnings), warnings
-
-
-def test_depth_maps_of_another_unit_are_reported():
-    depths = DepthStatistics(1.0, 2.0, 4.0, 100, 12, 5.0, "matches")
-    assert _depth_map_warnings(depths, 2.2) == _depth_map_warnings(depths, None) == []
-    (warning,) = _depth_map_warnings(depths, 2000.0)
-    assert "1e+03 times" in warning and "unit" in warning
 
 
 # -- frames -----------------------------------------------------------------------------------------------------------
