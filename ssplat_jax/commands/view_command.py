@@ -25,8 +25,6 @@ class View:
     """Address to listen on; the default is reached by this machine only, 0.0.0.0 by others, without a password."""
     most: int = 1_500_000
     """Most Gaussians sent to a browser; of larger scenes an even selection is sent, enlarged to cover as much."""
-    over_black: bool = False
-    """Show the scene over black instead of the browser's background."""
 
     def run(self) -> int:
         from ssplat_jax.core.console import Reporter
@@ -40,7 +38,6 @@ class View:
             host=self.host,
             port=self.port,
             max_gaussians=self.most,
-            over_black=self.over_black,
             reporter=reporter,
         )
         print("closed the viewer", file=sys.stderr)

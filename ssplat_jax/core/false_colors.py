@@ -1,4 +1,4 @@
-"""Depth and shares as colors of a picture."""
+"""Depth as colors of a picture, and pictures in 8 bits."""
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -11,7 +11,9 @@ _DEPTH_COLORS = np.array(  # near to far, perceptually even, readable in print
 def color_depth(depth: Float[np.ndarray, "h w"], near: float, far: float) -> Float[np.ndarray, "h w 3"]:
     """Log depth as color, light near and dark far; black where depth is 0."""
     position = np.log(np.maximum(depth, 1e-9) / near) / np.log(far / near)
-    return np.where(depth[..., None] > 0, color_share(1.0 - position), 0.0).astype(np.float32)
+    stops = np.linspace(0.0, 1.0, len(_DEPTH_COLORS))
+    colors = np.stack([np.interp(position, stops, _DEPTH_COLORS[:, c]) for c in range(3)], axis=-1)
+    return np.where(depth[..., None] > 0, colors, 0.0).astype(np.float32)
 
 
 def scale_ends(depths: Float[np.ndarray, "*s"]) -> tuple[float, float]:
@@ -24,13 +26,6 @@ def scale_ends(depths: Float[np.ndarray, "*s"]) -> tuple[float, float]:
         return 1.0, 1.5
     near, far = np.quantile(depths, (0.02, 0.98))
     return float(near), float(max(far, 1.5 * near))
-
-
-def color_share(share: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w 3"]:
-    """Values in [0, 1] as color, dark for 0 and light for 1; what lies outside has the color of the end."""
-    stops = np.linspace(0.0, 1.0, len(_DEPTH_COLORS))
-    channels = [np.interp(1.0 - share, stops, _DEPTH_COLORS[:, c]) for c in range(3)]
-    return np.stack(channels, axis=-1).astype(np.float32)
 
 
 def eight_bits(image: Float[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:

@@ -106,18 +106,16 @@ def open_thumbnail(encoded: bytes) -> UInt8[np.ndarray, "h w 3"]:
 def save_delta(path: Path, delta: SceneDelta, header: dict[str, Any] | None = None) -> None:
     """Writes one delta and the caller's JSON-serializable `header` to an `.npz` file, atomically."""
     names = ("means", "quats", "scales", "opacities", "sh")
-    arrays = {name: np.asarray(getattr(delta.gaussians, name)) for name in names}
-    arrays |= {"rows": delta.rows, "confidences": delta.confidences}
+    arrays = {name: np.asarray(getattr(delta.gaussians, name)) for name in names} | {"rows": delta.rows}
     save_arrays(path, arrays, DELTA_KIND, {"capacity": delta.capacity, "caller": header or {}})
 
 
 def load_delta(path: Path) -> SceneDelta:
     """Reads a delta that `save_delta` wrote."""
     arrays, facts = load_arrays(path, DELTA_KIND)
-    rows, confidences = arrays.pop("rows"), arrays.pop("confidences")
+    rows = arrays.pop("rows")
     fields: dict[str, Any] = {name: jnp.asarray(x) for name, x in arrays.items()}
-    gaussians = Gaussians(**fields)
-    return SceneDelta(rows, gaussians, facts["capacity"], confidences)
+    return SceneDelta(rows, Gaussians(**fields), facts["capacity"])
 
 
 def load_delta_header(path: Path) -> dict[str, Any]:

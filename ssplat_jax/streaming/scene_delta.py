@@ -37,8 +37,6 @@ class SceneDelta:
     rows: Int32[np.ndarray, " r"]  # ascending
     gaussians: Gaussians  # [r * k], in the order of `rows`; k = pivots_per_voxel * gaussians_per_token
     capacity: int  # capacity of the cache: the scene has capacity * k Gaussians
-    # Omega of the pivots behind `gaussians`. Without evidence, a change of it alone is no change of a row.
-    confidences: Float32[np.ndarray, " n"]
 
 
 class _Record(NamedTuple):
@@ -79,16 +77,9 @@ class SceneFeed:
         padded = np.pad(rows, (0, num_padded - len(rows)), constant_values=-1)
         gaussians = self._decode_rows(self._params, cache, jnp.asarray(padded))
         per_row = gaussians.num_gaussians // num_padded
-        confidences = np.asarray(cache.confidences, np.float32)[rows]
-        delta = SceneDelta(
-            rows=rows,
-            gaussians=jax.tree.map(lambda x: x[: per_row * len(rows)], gaussians),
-            capacity=cache.capacity,
-            confidences=np.repeat(confidences.reshape(-1), per_row // confidences.shape[1]),
-        )
-        jax.block_until_ready(delta.gaussians)
+        gaussians = jax.block_until_ready(jax.tree.map(lambda x: x[: per_row * len(rows)], gaussians))
         self._record = record  # last: after an error or an interrupt the changes are found again
-        return delta
+        return SceneDelta(rows, gaussians, cache.capacity)
 
     def _changes(self, cache: VoxelCache) -> tuple[Int32[np.ndarray, " r"], _Record]:
         """Rows written, carved, restored or, with evidence, seen since the last call, and the record after them."""
@@ -114,23 +105,18 @@ def apply_delta(scene: Gaussians | None, delta: SceneDelta) -> Gaussians:
 
     `scene` is None before the first delta.
     """
-    scene = jax.tree.map(lambda x: x[:0], delta.gaussians) if scene is None else scene
+    if not len(delta.rows):
+        return delta.gaussians if scene is None else scene
+    per_row = delta.gaussians.num_gaussians // len(delta.rows)
     one = jax.tree.map(lambda x: jnp.zeros((1, *x.shape[1:]), x.dtype), delta.gaussians)
     absent = mask_gaussians(one, jnp.zeros((1,), bool))  # as `decode` writes it
-    return jax.tree.map(lambda x, new, empty: _with_rows(x, delta, new, empty), scene, delta.gaussians, absent)
 
+    def merge(known, values, absent) -> np.ndarray:
+        """`known`, filled up with `absent` to the capacity of `delta`, with `values` in the delta's rows."""
+        merged = np.repeat(np.asarray(absent), max(delta.capacity * per_row, len(known)), axis=0)
+        merged[: len(known)] = known
+        merged.reshape(-1, per_row, *merged.shape[1:])[delta.rows] = values.reshape(-1, per_row, *merged.shape[1:])
+        return merged
 
-def apply_confidences(known: Float32[np.ndarray, " m"] | None, delta: SceneDelta) -> Float32[np.ndarray, " n"]:
-    """`known` confidences with those of `delta`, one for each Gaussian of `apply_delta`; absent Gaussians have 0."""
-    return _with_rows(delta.confidences[:0] if known is None else known, delta, delta.confidences, np.zeros(1))
-
-
-def _with_rows(known, delta: SceneDelta, values, absent) -> np.ndarray:
-    """`known`, filled up with `absent` to the capacity of `delta`, with `values` in the delta's rows."""
-    if not len(delta.rows):
-        return np.asarray(known)
-    per_row = len(values) // len(delta.rows)
-    merged = np.repeat(np.asarray(absent, values.dtype), max(delta.capacity * per_row, len(known)), axis=0)
-    merged[: len(known)] = known
-    merged.reshape(-1, per_row, *merged.shape[1:])[delta.rows] = values.reshape(-1, per_row, *merged.shape[1:])
-    return merged
+    scene = jax.tree.map(lambda x: x[:0], delta.gaussians) if scene is None else scene
+    return jax.tree.map(merge, scene, delta.gaussians, absent)

@@ -1,25 +1,18 @@
-"""`Browser`: one client of the viewer, which looks at the stage with a camera, a panel and a time of its own.
+"""`Browser`: one client of the viewer, which looks at the stage with a camera, a panel and a time of its own."""
 
-Callbacks of viser run on threads of its own. They store what was chosen, and the viewer's loop acts on it.
-"""
-
-import time
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float64, UInt8
 from scipy.spatial.transform import Rotation
 
+from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.data.posed_image import pose_from_quat
 from ssplat_jax.storage.chunk_records import RecordedView, open_thumbnail
-from ssplat_jax.viewer.scene_sources import ViewedScene
 from ssplat_jax.viewer.stage import DRAFT, FINE, KINDS, Stage, draw
 
 SPLATS = "splats"
 """The choice of what to show that the browser draws itself."""
-
-ORBIT_SECONDS, POSES_PER_SECOND = 24.0, 24.0  # time of a turn, and speed along the path of the streamed cameras
 
 FRUSTUM_DEPTH = 0.06  # in the browser's units
 MOST_FRUSTA = 300  # of more views, evenly spread ones are shown
@@ -44,16 +37,13 @@ class Browser:
         self._chunk = gui.add_slider("Chunk", min=1, max=2, step=1, initial_value=1, visible=False, hint=hint)
         hint = "Streamed cameras with their images; click on one to go there."
         self._cameras = gui.add_checkbox("Cameras", initial_value=False, hint=hint)
-        gui.add_button_group("Play", ("orbit", "path", "stop")).on_click(lambda event: self._play(event.target.value))
         self._num_chunks = 0  # that the slider reaches
         self._node: Any = None  # the splats
         self._frusta: dict[int, Any] = {}  # by frame
-        self._motion: Callable[[float], None] | None = None  # moves the camera to where it is after some seconds
-        self._motion_since = 0.0
         self._shown: tuple = ()  # version and chunk of the scene, and whether the browser draws it
         self._noted: tuple = ()  # what cameras and facts were last updated for
-        self._scene: ViewedScene | None = None
-        self._drawn: tuple = ()  # scene, kind and camera of the picture
+        self._scene: Gaussians | None = None
+        self._drawn: tuple = ()  # what was shown, kind and camera of the picture
         self._is_fine = False
 
     def update(self) -> None:
@@ -61,9 +51,6 @@ class Browser:
         self._grow_slider(self._stage.source.num_chunks)
         self._update_scene()
         self._update_notes()
-        if (motion := self._motion) is not None:
-            with self._client.atomic():
-                motion(time.monotonic() - self._motion_since)
         if self._kind.value != SPLATS and self._scene is not None:
             self._update_drawing(self._scene)
 
@@ -94,14 +81,13 @@ class Browser:
         if self._scene is None:
             return
         if not is_drawn:
-            black = np.zeros((1, 1, 3), np.uint8)
-            self._client.scene.set_background_image(black if self._stage.over_black else None, format="png")
+            self._client.scene.set_background_image(None, format="png")
             self._drawn = ()
             self._send_splats(self._scene)
         if self._node is not None:
             self._node.visible = not is_drawn
 
-    def _send_splats(self, scene: ViewedScene) -> None:
+    def _send_splats(self, scene: Gaussians) -> None:
         splats = self._stage.splats(scene)
         if len(splats["centers"]) == 0:  # viser has no splats without Gaussians
             self._remove_splats()
@@ -125,7 +111,7 @@ class Browser:
         self._noted = noted
         records, views = run.records[:num_chunks], run.views(num_chunks)
         if self._scene is not None:
-            num_shown = int((np.asarray(self._scene.gaussians.opacities) > 0).sum())
+            num_shown = int((np.asarray(self._scene.opacities) > 0).sum())
             facts = f"**{num_shown:,}** Gaussians"
             if records:
                 facts += f" from **{len(views)}** views"
@@ -157,30 +143,30 @@ class Browser:
             wxyz=_wxyz(pose),
             position=pose[:3, 3],
         )
-        node.on_click(lambda _: self._jump_to(pose))
+        node.on_click(lambda _: self._go_to(pose))
         return node
 
     # -- pictures by our rasterizer -----------------------------------------------------------------------------------
 
-    def _update_drawing(self, scene: ViewedScene) -> None:
+    def _update_drawing(self, scene: Gaussians) -> None:
         """Draws the scene at the browser's camera: coarsely while it moves, finely once it rests."""
         camera, kind = self._client.camera, self._kind.value
         looks = (*camera.wxyz, *camera.position, camera.fov, camera.image_width, camera.image_height)
-        is_known = self._drawn == (scene, kind, looks)
+        is_known = self._drawn == (wanted := (self._shown, kind, looks))
         if is_known and self._is_fine:
             return
         picture = self._draw(scene, kind, FINE if is_known else DRAFT)
         self._client.scene.set_background_image(picture, format="jpeg", jpeg_quality=92)
-        self._drawn, self._is_fine = (scene, kind, looks), is_known
+        self._drawn, self._is_fine = wanted, is_known
 
-    def _draw(self, scene: ViewedScene, kind: str, size: tuple[int, int]) -> UInt8[np.ndarray, "h w 3"]:
+    def _draw(self, scene: Gaussians, kind: str, size: tuple[int, int]) -> UInt8[np.ndarray, "h w 3"]:
         """A picture at the browser's camera, of a size (width, height) that is stretched over its window."""
         camera, (width, height), stage = self._client.camera, size, self._stage
         fy = height / 2 / np.tan(camera.fov / 2)
         fx = fy * width / height * max(camera.image_height, 1) / max(camera.image_width, 1)
         K = np.array([[fx, 0.0, width / 2], [0.0, fy, height / 2], [0.0, 0.0, 1.0]])
         pose = pose_from_quat(camera.wxyz, np.asarray(camera.position) * stage.distance, "browser")
-        return draw(scene, kind, pose, K, size, over_black=stage.over_black)
+        return draw(scene, kind, pose, K, size)
 
     # -- camera -------------------------------------------------------------------------------------------------------
 
@@ -188,9 +174,8 @@ class Browser:
         """Moves the camera to where the stage starts, at distance 1 from what it looks at.
 
         Without an angle of view it keeps its own. The stage may have other units than before, so splats and cameras are
-        sent anew and motions end.
+        sent anew.
         """
-        self._motion = None
         self._show_frusta([])
         self._remove_splats()
         self._shown, self._noted = (), ()
@@ -202,34 +187,8 @@ class Browser:
             camera.look_at = pose[:3, 3] + pose[:3, 2]
 
     def _go_to(self, pose: Float64[np.ndarray, "4 4"]) -> None:
-        self._client.camera.position, self._client.camera.wxyz = pose[:3, 3], _wxyz(pose)
-
-    def _jump_to(self, pose: Float64[np.ndarray, "4 4"]) -> None:
-        self._motion = None
         with self._client.atomic():
-            self._go_to(pose)
-
-    def _play(self, choice: str) -> None:
-        """Starts or stops a motion of the camera."""
-        camera, self._motion, self._motion_since = self._client.camera, None, time.monotonic()
-        if choice == "orbit":
-            start, target, up = (np.array(x) for x in (camera.position, camera.look_at, camera.up_direction))
-
-            def turn(seconds: float) -> None:
-                camera.position = orbit(start, target, up, seconds)
-                camera.look_at = target  # turns the camera; the position alone would move what it looks at along
-
-            self._motion = turn
-        elif choice == "path" and len(path := self._stage.run.path()):
-            poses = [self._stage.to_browser(pose) for pose in path]
-            self._motion = lambda seconds: self._go_to(poses[int(seconds * POSES_PER_SECOND) % len(poses)])
-
-
-def orbit(start: np.ndarray, target: np.ndarray, up: np.ndarray, seconds: float) -> Float64[np.ndarray, "3"]:
-    """The point, some time after `start`, on a circle about the axis `up` through `target`."""
-    angle = 2 * np.pi * seconds / ORBIT_SECONDS
-    turn = Rotation.from_rotvec(angle * up / np.linalg.norm(up))
-    return target + turn.apply(start - target)
+            self._client.camera.position, self._client.camera.wxyz = pose[:3, 3], _wxyz(pose)
 
 
 def _wxyz(pose: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "4"]:

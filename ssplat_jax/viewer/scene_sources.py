@@ -4,14 +4,12 @@ A run with `--deltas` writes a file per chunk. The viewer reads these in a proce
 for no browser, and viewers may come and go.
 """
 
-import dataclasses
 import json
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Float32
 
 from ssplat_jax.core.errors import InputError, StorageError
 from ssplat_jax.core.gaussians import Gaussians, scale_colors
@@ -20,15 +18,7 @@ from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.scene_files.formats import load_scene
 from ssplat_jax.storage.chunk_records import load_delta, load_delta_header
 from ssplat_jax.storage.run_folder import RunFolder
-from ssplat_jax.streaming.scene_delta import apply_confidences, apply_delta
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class ViewedScene:
-    """Gaussians in the capture's frame, relative to their offset."""
-
-    gaussians: Gaussians
-    confidences: Float[np.ndarray, " n"] | None = None  # of the pivots behind the Gaussians; None where unknown
+from ssplat_jax.streaming.scene_delta import apply_delta
 
 
 class SceneFile:
@@ -44,7 +34,7 @@ class SceneFile:
         self._stamp = None  # of scene and metrics at the last look
         self.path, self.folder = path, RunFolder(path.parent)
 
-    def changed(self) -> ViewedScene | None:
+    def changed(self) -> Gaussians | None:
         """The scene if it has changed since the last call, else None.
 
         Raises:
@@ -58,12 +48,11 @@ class SceneFile:
                 return None
         is_first, self._stamp = self._stamp is None, stamp
         try:
-            gaussians = load_scene(self.path)
+            return load_scene(self.path)
         except InputError:
             if is_first:
                 raise
             return None  # another program may be in the middle of rewriting it: the scene so far stays
-        return ViewedScene(gaussians)
 
     def stream_frame(self) -> StreamFrame | None:
         """The frame of the stream of the run that wrote the file; None if no metrics of a run are beside it."""
@@ -88,8 +77,7 @@ class _Sum:
     def __init__(self) -> None:
         self.applied: list[tuple[str, int]] = []  # names and time stamps of the deltas
         self.stream_frame: StreamFrame | None = None
-        self._scene: Gaussians | None = None
-        self._confidences: Float32[np.ndarray, " n"] | None = None
+        self._sum: Gaussians | None = None  # in the stream frame
         self._exposure = np.ones(3)  # at which the scene is shown: the middle one of the views so far
 
     def add(self, path: Path, stamp: int) -> None:
@@ -99,17 +87,16 @@ class _Sum:
             StorageError: it is damaged or gone.
         """
         delta, header = load_delta(path), load_delta_header(path)
-        self._scene = apply_delta(self._scene, delta)
-        self._confidences = apply_confidences(self._confidences, delta)
+        self._sum = apply_delta(self._sum, delta)
         self.stream_frame, self._exposure = StreamFrame.from_dict(header["frame"]), np.array(header["exposure"])
         self.applied.append((path.name, stamp))
 
-    def viewed(self) -> ViewedScene:
-        """The scene in the capture's frame; there must be a delta."""
+    def scene(self) -> Gaussians:
+        """The scene in the capture's frame, relative to its offset; there must be a delta."""
         assert self.stream_frame is not None
-        scene = scale_colors(jax.tree.map(jnp.asarray, self._scene), jnp.asarray(self._exposure, jnp.float32))
+        scene = scale_colors(jax.tree.map(jnp.asarray, self._sum), jnp.asarray(self._exposure, jnp.float32))
         gaussians = self.stream_frame.gaussians_to_capture(scene, offset=self.stream_frame.offset)
-        return ViewedScene(replace(gaussians, offset=self.stream_frame.offset), self._confidences)
+        return replace(gaussians, offset=self.stream_frame.offset)
 
 
 class GrowingScene:
@@ -129,7 +116,7 @@ class GrowingScene:
         """Chunks whose deltas have been added."""
         return len(self._newest.applied)
 
-    def changed(self) -> ViewedScene | None:
+    def changed(self) -> Gaussians | None:
         """Displayable scene, or None if unchanged since the last call.
 
         If the run was started anew, the old scene is dropped.
@@ -145,7 +132,7 @@ class GrowingScene:
             self._refined = SceneFile(refined)
         return self._refined.changed()
 
-    def _streamed(self) -> ViewedScene | None:
+    def _streamed(self) -> Gaussians | None:
         """The sum of all deltas, or None if unchanged since the last call."""
         try:
             found = [(path.name, path.stat().st_mtime_ns) for path in self.folder.delta_files()]
@@ -164,9 +151,9 @@ class GrowingScene:
                     raise
                 self._newest = _Sum()  # the run is being started anew
                 return None
-        return self._newest.viewed()
+        return self._newest.scene()
 
-    def at(self, num_chunks: int) -> ViewedScene:
+    def at(self, num_chunks: int) -> Gaussians:
         """The scene as it was after so many chunks, at least one and not all.
 
         Raises:
@@ -177,7 +164,7 @@ class GrowingScene:
             self._past = _Sum()
         for name, stamp in wanted[len(self._past.applied) :]:
             self._past.add(self.folder.deltas / name, stamp)
-        return self._past.viewed()
+        return self._past.scene()
 
     def stream_frame(self) -> StreamFrame | None:
         """The frame of the stream; None before the first delta."""

@@ -12,31 +12,27 @@ from jaxtyping import Float64, UInt8
 
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.errors import StorageError
-from ssplat_jax.core.false_colors import color_depth, color_share, eight_bits, scale_ends
+from ssplat_jax.core.false_colors import color_depth, eight_bits, scale_ends
 from ssplat_jax.core.gaussians import SH_C0, Gaussians, mean_color
 from ssplat_jax.core.kept_programs import Kept
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.core.rotations import quats_to_matrices
-from ssplat_jax.data.camera_path import camera_path
 from ssplat_jax.rasterizer import effects_for, fill_holes, render
 from ssplat_jax.rasterizer.effects import FILTERS
 from ssplat_jax.scene_files.splat_rows import MIN_OPACITY
 from ssplat_jax.storage.chunk_records import ChunkRecord, RecordedView, load_chunk_records
 from ssplat_jax.storage.run_folder import RunFolder
-from ssplat_jax.viewer.scene_sources import SceneFile, Source, ViewedScene
+from ssplat_jax.viewer.scene_sources import SceneFile, Source
 
 MAX_SIGMA = 250.0
 """Largest standard deviation that is sent: the square of 256 overflows a 16-bit float."""
 
-KINDS = ("color", "depth", "confidence")
+KINDS = ("color", "depth")
 """Kinds of picture."""
 
 DRAFT, FINE = (320, 240), (960, 640)
 """Sizes (width, height) of pictures while the camera moves, and when it rests. They are fixed, so that few programs are
 compiled: pixels are not square, and the browser stretches a picture over its window."""
-
-PATH_STEPS = 12
-"""Cameras of a playback from each streamed camera to the next."""
 
 
 class RecordedRun:
@@ -73,17 +69,6 @@ class RecordedRun:
         (width, height), K = self.records[0].size, self.records[0].views[0].K
         return float(2 * np.arctan(min(width / K[0, 0], height / K[1, 1]) / 2))
 
-    def in_order(self) -> list[RecordedView]:
-        """The views in the order of the capture."""
-        return sorted(self.views(), key=lambda view: view.frame)
-
-    def path(self) -> Float64[np.ndarray, "m 4 4"]:
-        """Smooth path through the cameras in the order of the capture."""
-        if not (views := self.in_order()):
-            return np.zeros((0, 4, 4))
-        poses, Ks = np.stack([view.camtoworld for view in views]), np.stack([view.K for view in views])
-        return camera_path(poses, Ks, PATH_STEPS)[0]
-
 
 class Stage:
     """The newest scene of a source, and the earlier ones on request.
@@ -91,19 +76,17 @@ class Stage:
     Args:
         source: where scenes come from.
         max_gaussians: most Gaussians sent to a browser.
-        over_black: show holes black.
     """
 
-    def __init__(self, source: Source, *, max_gaussians: int, over_black: bool = False) -> None:
-        self.source, self.run = source, RecordedRun(source.folder)
-        self.over_black, self._max_gaussians = over_black, max_gaussians
+    def __init__(self, source: Source, *, max_gaussians: int) -> None:
+        self.source, self.run, self._max_gaussians = source, RecordedRun(source.folder), max_gaussians
         self.version, self.records_version = 0, 0  # numbers of changes so far
         self.unit, self.distance = 1.0, 1.0  # scene units per unit of splats, and per unit of the browser
         self.start: Float64[np.ndarray, "4 4"] | None = None  # the pose at which browsers start, scene units
         self.num_starts = 0  # start poses so far: a run of other poses brings another one, and other units
         self._place: tuple | None = None  # of the stream, when the start pose was set
-        self._newest: ViewedScene | None = None
-        self._packed: tuple[ViewedScene, dict[str, np.ndarray]] | None = None  # the scene packed last
+        self._newest: Gaussians | None = None
+        self._packed: tuple[Gaussians, dict[str, np.ndarray]] | None = None  # the scene packed last
 
     def refresh(self) -> bool:
         """Looks for changes of the source; returns whether the scene changed.
@@ -118,7 +101,7 @@ class Stage:
         self._newest, self.version = changed, self.version + 1
         return True
 
-    def _set_start(self, scene: ViewedScene) -> None:
+    def _set_start(self, scene: Gaussians) -> None:
         """Sets start pose and units by the first scene of a stream."""
         frame = self.source.stream_frame()
         # A stream is told by its first camera and its scale; a causal one may widen its depth range.
@@ -130,11 +113,11 @@ class Stage:
             pose[:3, :3], pose[:3, 3] = frame.rotation, frame.origin
             distance = np.sqrt(frame.near * frame.far) / frame.scale  # the middle of the depth range
             # A finished run starts in the middle of the capture: around its first camera a scene often ends.
-            if isinstance(self.source, SceneFile) and (views := self.run.in_order()):
-                pose = views[len(views) // 2].camtoworld.copy()
+            if isinstance(self.source, SceneFile) and (views := self.run.views()):
+                pose = sorted(views, key=lambda view: view.frame)[len(views) // 2].camtoworld.copy()
             pose[:3, 3] -= frame.offset
         else:  # a lone scene file is seen as a whole, y down and z forward
-            means = np.asarray(scene.gaussians.means, np.float64)[np.asarray(scene.gaussians.opacities) > 0]
+            means = np.asarray(scene.means, np.float64)[np.asarray(scene.opacities) > 0]
             means = means[np.isfinite(means).all(axis=1)]
             if len(means) == 0:
                 return
@@ -142,9 +125,9 @@ class Stage:
             distance = 3 * np.median(np.linalg.norm(means - center, axis=1)) or 1.0
             pose[:3, 3] = center - [0.0, 0.0, distance]
         self.start, self._place, self.num_starts = pose, place, self.num_starts + 1
-        self.unit, self.distance = median_size(scene.gaussians), float(distance)
+        self.unit, self.distance = median_size(scene), float(distance)
 
-    def scene(self, num_chunks: int | None = None) -> ViewedScene | None:
+    def scene(self, num_chunks: int | None = None) -> Gaussians | None:
         """The scene after so many chunks, by default the newest; None if there is none yet."""
         source = self.source
         if num_chunks is None or isinstance(source, SceneFile) or num_chunks >= source.num_chunks:
@@ -154,16 +137,16 @@ class Stage:
         except StorageError:  # every file was read before: the run is being started anew
             return self._newest
 
-    def splats(self, scene: ViewedScene) -> dict[str, np.ndarray]:
+    def splats(self, scene: Gaussians) -> dict[str, np.ndarray]:
         """A scene as it is sent, in units of `unit`; kept until another one is asked for, since many browsers ask."""
         if self._packed is None or self._packed[0] is not scene:
-            self._packed = (scene, visible_splats(scene.gaussians, self.unit, self._max_gaussians))
+            self._packed = (scene, visible_splats(scene, self.unit, self._max_gaussians))
         return self._packed[1]
 
     @property
     def offset(self) -> Float64[np.ndarray, "3"]:
         """Offset of the scene's positions, in the capture's frame."""
-        return np.zeros(3) if self._newest is None else np.asarray(self._newest.gaussians.offset)
+        return np.zeros(3) if self._newest is None else np.asarray(self._newest.offset)
 
     def to_browser(self, camtoworld: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "4 4"]:
         """A pose of the capture in the browser's units."""
@@ -218,40 +201,27 @@ def _is_visible(gaussians: Gaussians) -> np.ndarray:
 
 
 def draw(
-    scene: ViewedScene,
+    scene: Gaussians,
     kind: str,
     camtoworld: Float64[np.ndarray, "4 4"],
     K: Float64[np.ndarray, "3 3"],
     size: tuple[int, int],
-    *,
-    over_black: bool = False,
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Draws a scene.
-
-    Depth is colored from light to dark over the depths of the picture, confidence from dark to light over [0, 1].
+    """Draws a scene, with holes in the colors around them; depth from light to dark over the depths of the picture.
 
     Args:
-        scene: the scene; without confidences, `confidence` shows the share of light that the scene stops.
+        scene: the scene.
         kind: one of `KINDS`.
         camtoworld: the camera, in the units of the scene.
         K: its intrinsics, pixels.
         size: (width, height) of the picture.
-        over_black: show holes black instead of in the colors around them.
     """
     viewmat = jnp.asarray(np.linalg.inv(camtoworld), jnp.float32)
     view = Camera(viewmats=viewmat, Ks=jnp.asarray(K, jnp.float32), width=size[0], height=size[1])
-    features = None
-    if kind == "confidence" and scene.confidences is not None:
-        features = jnp.asarray(scene.confidences)[:, None]
-    gaussians = replace(scene.gaussians, offset=(0.0, 0.0, 0.0))  # the camera is relative to it already
-    antialias = FILTERS.get(gaussians.render_mode, "classic")
-    effects = effects_for(gaussians, view).replace(antialias=antialias)
-    out = render(gaussians, view, effects=effects, features=features)
-    depth, alpha = np.asarray(out.depth), np.asarray(out.alpha)
+    scene = replace(scene, offset=(0.0, 0.0, 0.0))  # the camera is relative to it already
+    effects = effects_for(scene, view).replace(antialias=FILTERS.get(scene.render_mode, "classic"))
+    out = render(scene, view, effects=effects)
     if kind == "depth":
+        depth = np.asarray(out.depth)
         return eight_bits(color_depth(depth, *scale_ends(depth[depth > 0])))
-    if kind == "confidence":
-        share = alpha if features is None else np.asarray(out.features)[..., 0] / np.maximum(alpha, 1e-6)
-        return eight_bits(np.where(alpha[..., None] > 0.5, color_share(share), 0.0))
-    color = out.color if over_black else _jitted_fill_holes(out.color, out.alpha, mean_color(scene.gaussians))
-    return eight_bits(np.asarray(color))
+    return eight_bits(np.asarray(_jitted_fill_holes(out.color, out.alpha, mean_color(scene))))

@@ -27,7 +27,7 @@ POLL_INTERVAL = 0.5
 """Seconds between checks for changes, so that browsers are sent at most two scenes a second."""
 
 TICK = 1 / 30
-"""Seconds between updates of the browsers, for smooth playback."""
+"""Seconds between updates of the browsers."""
 
 LOCAL_HOSTS = ("127.0.0.1", "localhost", "::1")
 """Addresses that only this machine can reach."""
@@ -120,7 +120,6 @@ def view_scene(
     host: str,
     port: int,
     max_gaussians: int,
-    over_black: bool = False,
     is_wanted: Callable[[], bool] = lambda: True,
     reporter: Reporter,
 ) -> int:
@@ -131,7 +130,6 @@ def view_scene(
         host: address to listen on.
         port: port to listen on; the next free one if it is taken.
         max_gaussians: most Gaussians sent to a browser.
-        over_black: show the scene over black.
         is_wanted: asked many times a second; the viewer ends when it says no.
         reporter: prints warnings.
 
@@ -142,7 +140,7 @@ def view_scene(
         InputError: the source or the address cannot be used, or viser is missing.
         StorageError: a file of the run is damaged.
     """
-    stage = Stage(source, max_gaussians=max_gaussians, over_black=over_black)
+    stage = Stage(source, max_gaussians=max_gaussians)
     stage.refresh()
     viewer = Viewer(stage, host=host, port=port)
     try:

@@ -83,8 +83,7 @@ def write_state(root: Path) -> Path:
 
 
 def write_delta(root: Path) -> Path:
-    confidences = np.full(12, 0.5, np.float32)
-    save_delta(root / "000004.npz", SceneDelta(np.arange(12, dtype=np.int32), scene(0, n=12), 128, confidences))
+    save_delta(root / "000004.npz", SceneDelta(np.arange(12, dtype=np.int32), scene(0, n=12), 128))
     return root / "000004.npz"
 
 

@@ -55,7 +55,7 @@ def delta(rows, seed):
     """Changes of two Gaussians for each of some rows."""
     rng, count = np.random.default_rng(seed), 2 * len(rows)
     gaussians = replace(scene(count), opacities=jnp.asarray(rng.uniform(0.2, 0.9, count), jnp.float32))
-    return SceneDelta(np.asarray(rows, np.int32), gaussians, 8, rng.uniform(0.2, 0.9, count).astype(np.float32))
+    return SceneDelta(np.asarray(rows, np.int32), gaussians, 8)
 
 
 def header(stream=None, exposure=(1.0, 1.0, 1.0)):

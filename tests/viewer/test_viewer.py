@@ -84,23 +84,23 @@ def test_a_growing_run_is_what_its_deltas_add_up_to(tmp_path):
     known = jax.tree.map(jnp.asarray, known)
     wanted = frame(origin).gaussians_to_capture(known, offset=frame(origin).offset)
     for name in ("means", "quats", "scales", "opacities", "sh"):
-        np.testing.assert_array_equal(getattr(found.gaussians, name), getattr(wanted, name))
+        np.testing.assert_array_equal(getattr(found, name), getattr(wanted, name))
     # Started anew: what the old run had is forgotten.
     for path in (tmp_path / "deltas").iterdir():
         path.unlink()
     save_delta(tmp_path / "deltas" / "000004.npz", deltas[1], stream)
     anew = source.changed()
     assert anew is not None
-    np.testing.assert_array_equal(np.asarray(anew.gaussians.opacities) > 0, np.repeat([0, 1, 1, 0, 0, 1, 0, 0], 2) > 0)
+    np.testing.assert_array_equal(np.asarray(anew.opacities) > 0, np.repeat([0, 1, 1, 0, 0, 1, 0, 0], 2) > 0)
 
 
 def test_a_run_that_has_been_refined_shows_its_refined_scene(tmp_path):
     source = GrowingScene(RunFolder(tmp_path))
     save_delta(tmp_path / "deltas" / "000004.npz", delta([0, 1], 1), header())
-    assert len(source.changed().gaussians.means) != len(scene().means)
+    assert len(source.changed().means) != len(scene().means)
     for _ in range(2):  # written, and written anew
         ss.save_ply(tmp_path / "refined.ply", scene())
-        assert len(source.changed().gaussians.means) == len(scene().means) and source.changed() is None
+        assert len(source.changed().means) == len(scene().means) and source.changed() is None
         (tmp_path / "refined.ply").unlink()
         assert source.changed() is None
 
@@ -110,7 +110,7 @@ def test_a_growing_run_is_shown_at_its_middle_exposure(tmp_path):
     colors = []
     for number, (part, exposure) in enumerate(parts, start=1):
         save_delta(tmp_path / "deltas" / f"{4 * number:06d}.npz", part, header(exposure=exposure))
-        colors.append(0.5 + 0.28209479 * np.asarray(source.changed().gaussians.sh[:4, 0], np.float64))
+        colors.append(0.5 + 0.28209479 * np.asarray(source.changed().sh[:4, 0], np.float64))
     np.testing.assert_allclose(colors[1], colors[0] * [3.0, 2.0, 0.5], atol=1e-6)
 
 
@@ -128,7 +128,7 @@ def test_a_run_that_starts_anew_while_it_is_read_is_read_again(tmp_path, monkeyp
     assert source.changed() is None
     found = source.changed()
     assert found is not None
-    np.testing.assert_array_equal(found.gaussians.opacities[:4], delta([0, 1], 1).gaussians.opacities)
+    np.testing.assert_array_equal(found.opacities[:4], delta([0, 1], 1).gaussians.opacities)
     (tmp_path / "deltas" / "000012.npz").write_bytes(b"damaged")
     with pytest.raises(StorageError, match=r"000012\.npz"):
         source.changed()
@@ -139,14 +139,14 @@ def test_a_scene_file_is_read_again_when_it_is_written_again(tmp_path):
     ss.save_ply(file, scene(5))
     source = open_source(tmp_path)
     assert isinstance(source, SceneFile)
-    assert source.changed().gaussians.num_gaussians == 5 and source.changed() is None
+    assert source.changed().num_gaussians == 5 and source.changed() is None
     ss.save_ply(file, scene(7))
-    assert source.changed().gaussians.num_gaussians == 7
+    assert source.changed().num_gaussians == 7
     whole = file.read_bytes()
     file.write_bytes(whole[: len(whole) // 2])  # by a program that is still writing
     assert source.changed() is None
     ss.save_ply(file, scene(6))
-    assert source.changed().gaussians.num_gaussians == 6
+    assert source.changed().num_gaussians == 6
     file.unlink()
     assert source.changed() is None  # shown on
 
@@ -163,7 +163,7 @@ def test_a_scene_stays_until_the_next_metrics_are_there(tmp_path):
     ss.save_ply(file, scene(7))
     assert source.changed() is None
     metrics.write_text("{}")
-    assert source.changed().gaussians.num_gaussians == 7
+    assert source.changed().num_gaussians == 7
 
 
 def opened(path, max_gaussians=1000):
