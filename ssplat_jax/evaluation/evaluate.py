@@ -22,7 +22,7 @@ from ssplat_jax.evaluation.scoring import (
     score_targets,
     score_view,
 )
-from ssplat_jax.poses.adjust_poses import adjust_if_asked, check_look_ahead
+from ssplat_jax.poses.adjust_poses import adjust_and_say, check_look_ahead
 from ssplat_jax.refinement import refine_on_capture
 from ssplat_jax.storage.files import write_json
 from ssplat_jax.storage.run_folder import RunFolder, make_writable
@@ -59,8 +59,7 @@ def evaluate(
         lpips_weights: with them LPIPS is scored too; without, the fields `lpips` are null.
         refine_steps: refinement steps on the context views before the targets are scored. With them the metrics have a
             block `refinement`: the steps done, their seconds, and the scores before.
-        revise: `poses` adjusts those of the context before it is streamed, `auto` does if they are off
-            (`poses.adjust_poses`); targets keep theirs.
+        revise: `poses` adjusts those of the context before it is streamed (`poses.adjust_poses`); targets keep theirs.
         scene: name in `index.json`; by default the capture's.
 
     Returns:
@@ -79,7 +78,7 @@ def evaluate(
     capture.verify((*split.context, *split.targets))
     make_writable(out)  # before the long part
     folder.clear_targets()  # they may be of another split
-    adjusted = adjust_if_asked(streamed, split.context, revise, reporter)
+    adjusted = adjust_and_say(streamed, split.context, reporter) if revise else None
     if adjusted is not None:  # poses of the context alone
         capture, streamed = (dataclasses.replace(x, frames=adjusted.capture.frames) for x in (capture, streamed))
     stream_frame = streamed.stream_frame(session.model.config, split.context)

@@ -25,10 +25,6 @@ SCALES_DEGREES = (0.4, 0.2)
 """Scales of the robust loss, one round after another."""
 MIN_TRACKS = 100
 """Fewest points from which poses are adjusted."""
-SMALLEST_ERROR_DEGREES = 0.25
-"""Error of the given poses above which `auto` adjusts them: median distance of points from where they were seen."""
-SMALLEST_RATIO = 2.0
-"""Ratio of that error to the one after adjustment above which `auto` adjusts poses; below, other things are wrong."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -36,7 +32,6 @@ class AdjustedPoses:
     """The result of `adjust_poses`."""
 
     capture: Capture  # with adjusted poses
-    are_off: bool  # whether the given poses explain the images clearly worse than the adjusted ones
     error_before: float  # median distance of points from where they were seen, degrees
     error_after: float
     turn: float  # median rotation, degrees
@@ -47,11 +42,11 @@ class AdjustedPoses:
     def reason(self) -> str:
         """A sentence on what was found."""
         if not self.num_points:
-            return "poses are not adjusted before the stream: too few points were found in several images"
+            return "poses are not adjusted: too few points were found in several images"
         return (
-            f"poses {'are off' if self.are_off else 'fit'}: points lie {self.error_before:.2f} degrees from where they"
-            f" were seen, and {self.error_after:.2f} after turning cameras by {self.turn:.2f} degrees and moving them"
-            f" by {100 * self.shift:.1f} % of the depth"
+            f"poses are adjusted: points lie {self.error_before:.2f} degrees from where they were seen, and"
+            f" {self.error_after:.2f} after turning cameras by {self.turn:.2f} degrees and moving them by"
+            f" {100 * self.shift:.1f} % of the depth"
         )
 
 
@@ -78,7 +73,7 @@ def adjust_poses(
         With fewer than `MIN_TRACKS` points the poses stay. Cameras without a point keep their pose.
     """
     used = list(range(len(capture)) if indices is None else indices)
-    stays = AdjustedPoses(capture, False, 0.0, 0.0, 0.0, 0.0, 0)
+    stays = AdjustedPoses(capture, 0.0, 0.0, 0.0, 0.0, 0)
     if len(used) < 2:
         return stays
     depth = estimate_depths(capture, used).median
@@ -87,21 +82,19 @@ def adjust_poses(
         return stays
     focal = float(np.median(seen.Ks[:, 0, 0]))
     scales = [focal * np.radians(scale) for scale in SCALES_DEGREES]
-    deviations = ROTATION_DEVIATION, TRANSLATION_DEVIATION
-    before, after = (adjust(seen, scales, deviations, is_fixed=fixed) for fixed in (True, False))
-    error_before, error_after = (float(np.degrees(np.median(found.errors) / focal)) for found in (before, after))
+    found = adjust(seen, scales, (ROTATION_DEVIATION, TRANSLATION_DEVIATION))
+    before, after = (float(np.degrees(np.median(errors) / focal)) for errors in (found.errors_before, found.errors))
     frames, first = list(capture.frames), capture.frames[used[0]].camtoworld
-    for i, viewmat in zip(used, moved(seen.viewmats, after.twists), strict=True):
+    for i, viewmat in zip(used, moved(seen.viewmats, found.twists), strict=True):
         camtoworld = invert_pose(viewmat)
         camtoworld[:3, 3] *= depth
         frames[i] = dataclasses.replace(frames[i], camtoworld=first @ camtoworld)
     return AdjustedPoses(
         capture=dataclasses.replace(capture, frames=tuple(frames)),
-        are_off=error_before > max(SMALLEST_ERROR_DEGREES, SMALLEST_RATIO * error_after),
-        error_before=error_before,
-        error_after=error_after,
-        turn=float(np.degrees(np.median(np.linalg.norm(after.twists[:, :3], axis=1)))),
-        shift=float(np.median(np.linalg.norm(after.twists[:, 3:], axis=1))),
+        error_before=before,
+        error_after=after,
+        turn=float(np.degrees(np.median(np.linalg.norm(found.twists[:, :3], axis=1)))),
+        shift=float(np.median(np.linalg.norm(found.twists[:, 3:], axis=1))),
         num_points=seen.num_points,
     )
 
@@ -117,24 +110,9 @@ def check_look_ahead(revise: str | None, *, is_causal: bool) -> None:
         raise refusal(f"--revise {revise}", wanted="a stream that may look ahead", got=got, fix=fix)
 
 
-def adjust_if_asked(
-    capture: Capture, indices: Sequence[int], revise: str | None, reporter: Reporter
-) -> AdjustedPoses | None:
-    """The adjusted poses of a stream that has not begun, if `revise` asks for them; says what was found.
-
-    Args:
-        capture: images with poses.
-        indices: frames to stream.
-        revise: `poses` adjusts them, `auto` only if they are off; None asks for nothing.
-        reporter: shows progress.
-
-    Returns:
-        The adjusted poses; None if they are not asked for, if `auto` finds that the given ones fit, or if too few
-        points were found to adjust them by.
-    """
-    if revise is None:
-        return None
+def adjust_and_say(capture: Capture, indices: Sequence[int], reporter: Reporter) -> AdjustedPoses:
+    """`adjust_poses` with a progress bar; says what was found."""
     with reporter.progress("poses", len(indices), waiting="") as advance:
         found = adjust_poses(capture, indices, advance)
     reporter.say(found.reason)
-    return found if found.num_points > 0 and (found.are_off or revise == "poses") else None
+    return found

@@ -85,26 +85,20 @@ class Adjustment:
 
     twists: Float64[np.ndarray, "v 6"]
     points: Float64[np.ndarray, "p 3"]  # in the world, in median depths
+    errors_before: Float64[np.ndarray, " n"]  # of the given cameras, with points where their rays meet
     errors: Float64[np.ndarray, " n"]  # pixels from each observation to its point; infinite where it is behind
 
 
-def adjust(
-    observations: Observations,
-    scales: Sequence[float],
-    deviations: tuple[float, float],
-    *,
-    is_fixed: bool = False,
-) -> Adjustment:
+def adjust(observations: Observations, scales: Sequence[float], deviations: tuple[float, float]) -> Adjustment:
     """The motions of cameras that explain the observations best.
 
     Args:
         observations: what was seen.
         scales: pixels at which the loss turns from square to logarithm, one round after another.
         deviations: standard deviations of the given poses: rotation in radians, translation in median depths.
-        is_fixed: keep the cameras, and place the points alone.
 
     Returns:
-        Twists of the cameras, places of the points, and the errors that are left.
+        Twists of the cameras, places of the points, and the errors before and after.
 
     Limits:
         Cameras without an observation keep their pose. A point on nearly parallel rays is held at a finite depth.
@@ -112,12 +106,12 @@ def adjust(
     size = 6 * len(observations.Ks)
     prior = np.zeros(size + 3 * observations.num_points)
     prior[:size] = np.tile(1 / np.repeat(np.square(deviations), 3), len(observations.Ks))
-    unknowns = np.concatenate([np.zeros(size), _meeting_points(observations).ravel()])
+    unknowns = start = np.concatenate([np.zeros(size), _meeting_points(observations).ravel()])
     for scale in scales:
-        unknowns = _minimized(observations, unknowns, scale, prior, is_fixed)
-    pixels, places = _residuals(observations, unknowns)
-    errors = np.where(places[:, 2] > MIN_DEPTH, np.linalg.norm(pixels, axis=1), np.inf)
-    return Adjustment(*observations.split(unknowns), errors)
+        unknowns = _minimized(observations, unknowns, scale, prior)
+    found = (_residuals(observations, x) for x in (start, unknowns))
+    errors = (np.where(places[:, 2] > MIN_DEPTH, np.linalg.norm(pixels, axis=1), np.inf) for pixels, places in found)
+    return Adjustment(*observations.split(unknowns), *errors)
 
 
 def moved(viewmats: Float64[np.ndarray, "v 4 4"], twists: Float64[np.ndarray, "v 6"]) -> Float64[np.ndarray, "v 4 4"]:
@@ -144,11 +138,11 @@ def _meeting_points(seen: Observations) -> Float64[np.ndarray, "p 3"]:
     return np.linalg.solve(normal, right[..., None])[..., 0]
 
 
-def _minimized(seen: Observations, unknowns, scale: float, prior, is_fixed: bool):
+def _minimized(seen: Observations, unknowns, scale: float, prior):
     """The unknowns after the steps for one scale of the loss."""
     damping, cost = FIRST_DAMPING, _cost(seen, unknowns, scale, prior)
     for _ in range(MAX_STEPS):
-        normal, gradient = _normal_equations(seen, unknowns, scale, prior, is_fixed)
+        normal, gradient = _normal_equations(seen, unknowns, scale, prior)
         while damping < MOST_DAMPING:
             damped = (normal + diags_array(damping * normal.diagonal() + TINY)).tocsc()
             # Points couple to cameras alone, so an ordering for symmetric matrices eliminates them first.
@@ -186,7 +180,7 @@ def _cost(seen: Observations, unknowns, scale: float, prior) -> float:
     return 0.5 * float(np.sum(loss) + np.sum(unknowns**2 * prior))
 
 
-def _normal_equations(seen: Observations, unknowns, scale: float, prior, is_fixed: bool):
+def _normal_equations(seen: Observations, unknowns, scale: float, prior):
     """The normal matrix (sparse) and the gradient at some unknowns; weights are those of the loss there."""
     twists, (pixels, places) = seen.split(unknowns)[0], _residuals(seen, unknowns)
     is_before = places[:, 2] > MIN_DEPTH
@@ -196,7 +190,7 @@ def _normal_equations(seen: Observations, unknowns, scale: float, prior, is_fixe
     by_place[:, [0, 1], [0, 1]] = seen.focals / depths
     by_place[:, :, 2] = -seen.focals * places[:, :2] / depths**2
     by_turn = np.cross(by_place, -(places - twists[seen.views, 3:])[:, None])  # a turn w moves the place by w x place
-    by_camera = np.concatenate([by_turn, by_place], axis=2) * (not is_fixed)
+    by_camera = np.concatenate([by_turn, by_place], axis=2)
     by_point = by_place @ moved(seen.viewmats, twists)[seen.views, :3, :3]
     values = np.concatenate([by_camera, by_point], axis=2)
     columns = [6 * seen.views[:, None] + np.arange(6), twists.size + 3 * seen.points[:, None] + np.arange(3)]

@@ -44,7 +44,7 @@ class RunOptions:
     save_every: int = 8  # chunks between saved states
     overwrite: bool = False  # remove the run that the folder holds and start anew
     deltas: bool = False  # also write what each chunk changed in the scene, in the stream frame
-    revise: str | None = None  # `poses` or `auto`: adjusted before the stream, see `run_poses.capture_to_stream`
+    revise: str | None = None  # `poses`: adjusted before the stream
     quiet_seconds: float | None = None  # the capture is still being written; without a new frame for so long it ends
 
 

@@ -40,7 +40,7 @@ class EvalOptions:
     index: Path | None = None  # an index file, instead of protocol, stride, context and targets
     scene: str | None = None  # its scene; None for the name of the capture
     refine_steps: int = 0
-    revise: str | None = None  # `poses` or `auto`: adjusted before the stream
+    revise: str | None = None  # `poses`: adjusted before the stream
     lpips_weights: LpipsWeights | None = None
 
 

@@ -27,7 +27,7 @@ from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.evaluation.scoring import check_scorable, exposures_from_json, exposures_to_json
 from ssplat_jax.model.streamsplat import StreamSplat
-from ssplat_jax.poses.adjust_poses import adjust_if_asked
+from ssplat_jax.poses.adjust_poses import adjust_and_say
 from ssplat_jax.refinement import online_refinement
 from ssplat_jax.storage.files import load_arrays, save_arrays
 from ssplat_jax.storage.run_folder import RunFolder, lock_folder
@@ -135,7 +135,7 @@ def open_run(
         capture: the capture to stream.
         indices: its frames to stream, ascending.
         out: folder of the run.
-        revise: `poses` or `auto` adjusts the poses before the stream, see `run_poses.capture_to_stream`.
+        revise: `poses` adjusts the poses before the stream, see `capture_to_stream`.
         overwrite: remove the run that `out` holds and start anew.
         reporter: shows progress and warnings.
 
@@ -275,8 +275,7 @@ class SavedPoses:
 
     capture: str  # digest of the poses as given
     indices: list[int]  # streamed frames
-    asked: str  # `poses` or `auto`
-    camtoworlds: dict[int, Float64[np.ndarray, "4 4"]]  # by frame; empty if the given ones were streamed
+    camtoworlds: dict[int, Float64[np.ndarray, "4 4"]]  # by frame
 
     def of(self, capture: Capture) -> Capture | None:
         """The capture with these poses; None if they belong to another capture."""
@@ -291,8 +290,7 @@ class SavedPoses:
     def save(self, folder: RunFolder) -> None:
         """Writes the poses to the folder of the run."""
         arrays = {str(i): pose for i, pose in self.camtoworlds.items()}
-        header = {"capture": self.capture, "indices": self.indices, "asked": self.asked}
-        save_arrays(folder.adjusted_poses, arrays, POSES_KIND, header)
+        save_arrays(folder.adjusted_poses, arrays, POSES_KIND, {"capture": self.capture, "indices": self.indices})
 
 
 def load_poses(folder: RunFolder) -> SavedPoses | None:
@@ -315,7 +313,7 @@ def capture_to_stream(
     Args:
         capture: the capture as it was opened.
         indices: frames to stream.
-        revise: `poses`, `auto` or None; see `poses.adjust_poses.adjust_if_asked`.
+        revise: `poses` or None.
         folder: where a run keeps its adjusted poses; a run that is continued finds them there.
         reporter: shows progress.
 
@@ -329,13 +327,12 @@ def capture_to_stream(
         return capture
     saved = load_poses(folder)
     if folder.has_state():
-        if saved is None or (revise == "poses" and not (saved.camtoworlds or saved.asked == "poses")):
+        if saved is None:
             got, fix = "one with the given poses", "leave it out, or start anew with --overwrite"
             raise refusal(f"--revise {revise}", wanted="a run that began with it", got=got, fix=fix)
-    elif saved is None or (saved.asked, saved.capture) != (revise, capture.digest(indices)):
-        found = adjust_if_asked(capture, indices, revise, reporter)
-        frames = {} if found is None else {i: found.capture.frames[i].camtoworld for i in indices}
-        saved = SavedPoses(capture.digest(indices), list(indices), revise, frames)
+    elif saved is None or saved.capture != capture.digest(indices):
+        found = adjust_and_say(capture, indices, reporter).capture
+        saved = SavedPoses(capture.digest(indices), list(indices), {i: found.frames[i].camtoworld for i in indices})
         saved.save(folder)
     return saved.of(capture) or capture
 
@@ -363,7 +360,7 @@ def open_capture_of_scene(scene: Path, path: str, size: tuple[int, int] | None, 
     """
     folder, capture = RunFolder(scene if scene.is_dir() else scene.parent), open_capture(path, size=size)
     saved = load_poses(folder)
-    if saved is None or not saved.camtoworlds:
+    if saved is None:
         return capture
     if (adjusted := saved.of(capture)) is None:
         reporter.warn(f"{folder.adjusted_poses} is of another capture: the cameras have the poses of {path}.")

@@ -63,9 +63,7 @@ def test_wrong_poses_are_put_right(noise, false_share, largest):
     before = relative_turns(wrong.viewmats, exact.viewmats)
     after = relative_turns(moved(wrong.viewmats, found.twists), exact.viewmats)
     assert before.mean() > 0.4 and after.max() < largest
-    fixed = adjust(wrong, SCALES, DEVIATIONS, is_fixed=True)
-    assert not fixed.twists.any()
-    assert np.median(fixed.errors) > 2 * np.median(found.errors) + 0.5
+    assert np.median(found.errors_before) > 2 * np.median(found.errors) + 0.5
 
 
 def test_poses_stay_around_the_given_ones():
@@ -91,7 +89,7 @@ def test_the_gradient_equals_finite_differences_of_the_cost():
     seen = disturbed(scene(num_cameras=3, num_points=8, noise=1.0)[0])
     prior = np.concatenate([np.tile(1 / np.repeat(np.square(DEVIATIONS), 3), 3), np.zeros(24)])
     unknowns = np.concatenate([np.zeros(18), module._meeting_points(seen).ravel()])
-    normal, gradient = module._normal_equations(seen, unknowns, 1.5, prior, False)
+    normal, gradient = module._normal_equations(seen, unknowns, 1.5, prior)
     steps = 1e-6 * np.eye(42)
     ends = [[module._cost(seen, unknowns + sign * step, 1.5, prior) for step in steps] for sign in (-1, 1)]
     np.testing.assert_allclose(gradient, np.subtract(ends[1], ends[0]) / 2e-6, rtol=1e-4, atol=1e-4)
@@ -116,4 +114,4 @@ def test_points_behind_cameras_have_a_constant_cost_and_no_pull():
     unknowns, prior = np.concatenate([np.zeros(12), points.ravel()]), np.ones(72)
     cost = module._cost(away, unknowns, 1.0, np.zeros(72))
     assert cost == pytest.approx(0.5 * 20 * module.HIDDEN_COST, abs=1e-6)
-    assert not module._normal_equations(away, unknowns, 1.0, prior, False)[1][6:12].any()
+    assert not module._normal_equations(away, unknowns, 1.0, prior)[1][6:12].any()

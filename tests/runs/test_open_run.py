@@ -96,7 +96,7 @@ def test_capacity_matters_only_if_tokens_may_be_dropped(tmp_path):
         check_identity(held, identity(overflow="drop_new", capacity=4096), RunFolder(tmp_path))
 
 
-def moved(capture, indices, advance=None, are_off=True, num_points=500):
+def moved(capture, indices, advance=None):
     """An adjustment that moves every frame by the same shift."""
     frames = list(capture.frames)
     for i in indices:
@@ -104,14 +104,14 @@ def moved(capture, indices, advance=None, are_off=True, num_points=500):
         pose[:3, 3] += SHIFT
         frames[i] = dataclasses.replace(frames[i], camtoworld=pose)
     capture = dataclasses.replace(capture, frames=tuple(frames))
-    return adjusting.AdjustedPoses(capture, are_off, 0.5, 0.1, 0.4, 0.01, num_points)
+    return adjusting.AdjustedPoses(capture, 0.5, 0.1, 0.4, 0.01, 500)
 
 
 @contextlib.contextmanager
-def adjustment(**facts):
-    """Poses are adjusted with these facts; `None` for none at all."""
+def adjustment():
+    """Poses are adjusted by `moved`."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(adjusting, "adjust_poses", lambda *given: moved(*given, **facts))
+        patch.setattr(adjusting, "adjust_poses", moved)
         yield
 
 
@@ -180,26 +180,15 @@ def test_files_of_others_are_neither_records_nor_deltas(tmp_path):
 def test_a_run_that_began_with_given_poses_takes_no_adjusted_ones(capture, tmp_path):
     folder = RunFolder(tmp_path)
     folder.state.write_bytes(b"of a run that began without")
-    for revise in ("poses", "auto"):
-        with no_adjustment(), pytest.raises(InputError, match=f"--revise {revise}: wanted a run that began with it"):
-            capture_to_stream(capture, range(4), revise, folder, QUIET)
-    assert capture_to_stream(capture, range(4), None, folder, QUIET) is capture
-    folder.state.unlink()
-    with adjustment(are_off=False):  # given poses that fit are no adjusted ones
-        capture_to_stream(capture, range(4), "auto", folder, QUIET)
-    folder.state.write_bytes(b"of the run")
     with no_adjustment(), pytest.raises(InputError, match="--revise poses: wanted a run that began with it"):
         capture_to_stream(capture, range(4), "poses", folder, QUIET)
-    with no_adjustment():  # they are not judged twice
-        assert capture_to_stream(capture, range(4), "auto", folder, QUIET).frames == capture.frames
+    assert capture_to_stream(capture, range(4), None, folder, QUIET) is capture
 
 
-@pytest.mark.parametrize(("earlier", "indices", "asked"), [(CAPTURE, (0, 2), "poses"), (CAPTURE, range(4), "auto")])
-def test_poses_that_a_stopped_run_left_for_another_stream_are_found_anew(earlier, indices, asked, capture, tmp_path):
+def test_poses_that_a_stopped_run_left_for_another_stream_are_found_anew(capture, tmp_path):
     folder = RunFolder(tmp_path)
-    with adjustment(are_off=False):
-        capture_to_stream(open_capture(earlier, size=SIZE), indices, asked, folder, QUIET)
     with adjustment():
+        capture_to_stream(capture, (0, 2), "poses", folder, QUIET)
         streamed = capture_to_stream(capture, range(4), "poses", folder, QUIET)
     np.testing.assert_array_equal(streamed.camtoworlds, moved(capture, range(4)).capture.camtoworlds)
     assert capture_to_stream(capture, range(4), None, folder, QUIET) is capture
