@@ -157,7 +157,7 @@ def streams(scale: str) -> list[Row]:
         stages = stage_times(session, recent[-1], camera, repeats=1 if scale == "smoke" else 15)
         facts = {"whole_ms": measure_latency(session, recent, camera)["chunk_ms"], **session.cache_facts()}
         row = {"preset": name, "size": size, "stages_ms": {stage: round(ms, 3) for stage, ms in stages.items()}}
-        rows.append(row | facts | {"peak_memory_bytes": peak_memory(session, camera).bytes})
+        rows.append(row | facts | {"peak_memory_bytes": peak_memory(session, camera)["peak_memory_bytes"]})
     return rows
 
 

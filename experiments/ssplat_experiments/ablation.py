@@ -273,7 +273,7 @@ def scored(session: Session, capture: Capture, split: Split) -> Row:
     values = {f"{c}_{m}": scores[c][m] for c in COLUMNS for m in ("psnr", "ssim", "lpips")}
     return {
         **values,
-        "peak_memory_bytes": peak_memory(session, capture.camera(middle, stream_frame)).bytes,
+        "peak_memory_bytes": peak_memory(session, capture.camera(middle, stream_frame))["peak_memory_bytes"],
         "gaussians": session.cache_facts()["decoded"],
         PICTURE: score_view(gaussians, capture, middle, stream_frame, exposures).color,
     }

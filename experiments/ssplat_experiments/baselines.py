@@ -18,11 +18,10 @@ from ssplat_jax.core.gaussians import Gaussians, mask_gaussians
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.evaluation.cost import (
-    PeakMemory,
     abstract,
     added_bytes,
-    allocator_peak,
     live_bytes,
+    memory_row,
     render_bytes,
 )
 from ssplat_jax.evaluation.metrics import installed_lpips
@@ -137,16 +136,15 @@ class JointNetwork:
         added = added_bytes(self.program)
         return None if added is None else added + live_bytes((self.params, self.chunk))
 
-    def peak_memory(self, camera: Camera) -> PeakMemory:
+    def peak_memory(self, camera: Camera) -> dict[str, int | str | None]:
         """Memory of running the network, which decodes within, and of rendering a view."""
         gaussians = self.gaussians()
         rendering = render_bytes(gaussians, camera)
         held = live_bytes((self.params, gaussians))
-        return PeakMemory(
+        return memory_row(
             step=(network := self.network_bytes()),
             decode=network,
             render=None if rendering is None else held + rendering,
-            allocator=allocator_peak(),
         )
 
 

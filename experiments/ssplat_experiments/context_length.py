@@ -135,7 +135,7 @@ def measured(path: str, method: str, config: StreamConfig, sizes: Sizes) -> list
             "step_ms": latency["step_ms"],
             "chunk_ms": latency["chunk_ms"]["median"],
             "gaussians": session.cache_facts()["decoded"],
-            **memory.to_row(),
+            **memory,
         }
         for name, scores in scored.items():
             rows.append({**place, "method": name, **scores} | (cost if name == "scene" else {}))
@@ -169,7 +169,7 @@ def joint_row(path: str, count: int, config: StreamConfig, sizes: Sizes) -> Row:
     gaussians = network.gaussians()
     scored = _scores(gaussians, capture, split.targets, stream_frame, {}, ())["scene"]
     middle = capture.camera(split.targets[len(split.targets) // 2], stream_frame)
-    cost = {"gaussians": int((gaussians.opacities > 0).sum()), **network.peak_memory(middle).to_row()}
+    cost = {"gaussians": int((gaussians.opacities > 0).sum()), **network.peak_memory(middle)}
     return {**scored, **cost}
 
 

@@ -81,7 +81,7 @@ def stage_rows(config: StreamConfig, size: tuple[int, int], sizes: Sizes) -> lis
     parts = stage_times(session, recent[-1], camera, sizes.repeats)
     parts |= {"sum of stages": sum(parts.values())}
     parts |= {WHOLE: measure_latency(session, recent, camera)["chunk_ms"]["median"]}
-    memory = peak_memory(session, camera).bytes
+    memory = peak_memory(session, camera)["peak_memory_bytes"]
     return [
         {
             "size": f"{size[0]}x{size[1]}",

@@ -171,6 +171,6 @@ def _stream(setting: Setting, sizes: Sizes, opened: Opened) -> _Streamed:
         "render_ms": latency["render_ms"],
         "compile_s": round(session.compile_seconds - compiled, 1),
         "gaussians": session.cache_facts()["decoded"],
-        "peak_memory_bytes": peak_memory(session, camera).bytes,
+        "peak_memory_bytes": peak_memory(session, camera)["peak_memory_bytes"],
     }
     return _Streamed(session.gaussians(), capture, scored, split, stream_frame, exposures, cost)

@@ -1,6 +1,8 @@
 """Errors that users can cause. The command line prints each as one line and exits with its code."""
 
+import importlib
 import math
+from typing import Any
 
 
 class InputError(ValueError):
@@ -59,3 +61,16 @@ def echo(value: object) -> str:
     """A value from outside as text that is safe to print: one line, escaped, at most `MAX_ECHO_LENGTH` characters."""
     text = ascii(value)
     return text if len(text) <= MAX_ECHO_LENGTH else text[: MAX_ECHO_LENGTH - 3] + "..."
+
+
+def optional_package(name: str, extra: str) -> Any:
+    """The package `name`, which an extra of this one installs.
+
+    Raises:
+        InputError: it is not installed.
+    """
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        install = f'pip install -e ".[{extra}]"'
+        raise InputError(f"{extra}: wanted the package {name}, which is not installed; run: {install}") from error

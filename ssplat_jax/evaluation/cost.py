@@ -6,7 +6,6 @@ results that are not written over inputs. On a GPU the allocator counts, from th
 Every number that is published says where it comes from: `machine`, `commit` and `today`.
 """
 
-import dataclasses
 import datetime
 import functools
 import platform
@@ -75,37 +74,8 @@ def measure_latency(session: Session, chunks: list[Chunk], camera: Camera) -> di
     }
 
 
-@dataclasses.dataclass(frozen=True)
-class PeakMemory:
-    """Bytes in use while each program runs; a program whose memory XLA does not tell has None."""
-
-    step: int | None
-    decode: int | None
-    render: int | None
-    refine: int | None = 0  # of a chunk; 0 without it
-    allocator: int | None = None  # the most bytes since the process began, by the device's allocator; None on a CPU
-
-    @property
-    def bytes(self) -> int | None:
-        """The allocator's peak where there is one, else the largest of the programs; None if one is unknown."""
-        if self.allocator is not None:
-            return self.allocator
-        parts = [part for part in (self.step, self.decode, self.render, self.refine) if part is not None]
-        return max(parts) if len(parts) == 4 else None
-
-    def to_row(self) -> dict[str, int | str | None]:
-        """Columns of a table."""
-        return {
-            "peak_memory_bytes": self.bytes,
-            "step_bytes": self.step,
-            "decode_bytes": self.decode,
-            "render_bytes": self.render,
-            "measured_by": "XLA" if self.allocator is None else "allocator",
-        }
-
-
-def peak_memory(session: Session, camera: Camera) -> PeakMemory:
-    """Memory of a session that takes in a chunk, decodes its cache and renders a view; it keeps its cache.
+def peak_memory(session: Session, camera: Camera) -> dict[str, int | str | None]:
+    """Memory (`memory_row`) of a session that takes in a chunk, decodes and renders a view; it keeps its cache.
 
     Args:
         session: a stream that has taken in at least one chunk; `step` is that of the last.
@@ -114,13 +84,26 @@ def peak_memory(session: Session, camera: Camera) -> PeakMemory:
     held = live_bytes((session.params, session.cache))
     gaussians = session.gaussians()
     added, rendering = added_bytes(session.decode_program()), render_bytes(gaussians, camera)
-    return PeakMemory(
+    refine = {"refine": session.refine_memory_bytes} if session.model.config.stream.steps_per_chunk else {}
+    return memory_row(
         step=session.step_memory_bytes,
         decode=None if added is None else held + added,
         render=None if rendering is None else held + live_bytes(gaussians) + rendering,
-        refine=session.refine_memory_bytes if session.model.config.stream.steps_per_chunk else 0,
-        allocator=allocator_peak(),
+        **refine,
     )
+
+
+def memory_row(**programs: int | None) -> dict[str, int | str | None]:
+    """Columns of a table: the peak, and the bytes in use while each program runs, None where XLA does not tell.
+
+    The peak is that since the process began where the device's allocator counts, else that of the largest program;
+    None if one is unknown.
+    """
+    counters, known = jax.local_devices()[0].memory_stats() or {}, [x for x in programs.values() if x is not None]
+    peak = counters.get("peak_bytes_in_use", max(known) if len(known) == len(programs) else None)
+    measured_by = "allocator" if "peak_bytes_in_use" in counters else "XLA"
+    parts = {f"{name}_bytes": size for name, size in programs.items()}
+    return {"peak_memory_bytes": peak, **parts, "measured_by": measured_by}
 
 
 def live_bytes(arrays: Any) -> int:
@@ -151,12 +134,6 @@ def abstract(arrays: Any) -> tuple[Any, tuple[jax.ShapeDtypeStruct, ...]]:
     """Structure and leaves of a pytree with shapes in place of arrays; both are hashable."""
     leaves, structure = jax.tree.flatten(arrays)
     return structure, tuple(jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in leaves)
-
-
-def allocator_peak() -> int | None:
-    """The most bytes in use since the process began, by the device's allocator; None where it does not count."""
-    counters = jax.local_devices()[0].memory_stats()
-    return None if counters is None else counters.get("peak_bytes_in_use")
 
 
 # -- where and when a number was measured ------------------------------------------------------------------------------

@@ -109,7 +109,7 @@ def evaluate(
         cost["num_gaussians"] = int((gaussians.opacities > 0).sum())
         refinement = {"refinement": {**done, "before": before}}
     middle = capture.camera(split.targets[len(split.targets) // 2], stream_frame)
-    cost["peak_memory_bytes"] = peak_memory(session, middle).bytes
+    cost["peak_memory_bytes"] = peak_memory(session, middle)["peak_memory_bytes"]
     scores = []
     for i in split.targets:
         view = score_view(gaussians, capture, i, stream_frame, exposures, lpips_weights)

@@ -1,7 +1,13 @@
-"""Picture files: images, comparisons with a target, and H.264 videos, which all browsers and players support."""
+"""Picture files: images, comparisons with a target, H.264 videos, which all browsers and players support, and reports.
 
+A report is one HTML page that holds its pictures and figures, and loads nothing from elsewhere.
+"""
+
+import base64
+import html
 import io
 import os
+from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -11,7 +17,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 
 from ssplat_jax.core.atomic import write_atomic
-from ssplat_jax.core.errors import InputError
+from ssplat_jax.core.errors import optional_package
 from ssplat_jax.core.false_colors import color_depth, eight_bits
 
 
@@ -71,12 +77,7 @@ class VideoWriter:
     """
 
     def __init__(self, width: int, height: int) -> None:
-        try:
-            import av
-        except ImportError as error:
-            raise InputError(
-                'video: wanted the package av, which is not installed; run: pip install -e ".[video]"'
-            ) from error
+        av = optional_package("av", "video")
         self._encoded, self._frame_of = io.BytesIO(), av.VideoFrame.from_ndarray
         self._container: Any = av.open(self._encoded, "w", format="mp4")
         self._stream = self._container.add_stream("libx264", Fraction(FRAMES_PER_SECOND), options={"crf": QUALITY})
@@ -101,3 +102,93 @@ class VideoWriter:
         self._container.mux(self._stream.encode())
         self._container.close()
         write_atomic(path, self._encoded.getvalue())
+
+
+# -- report ------------------------------------------------------------------------------------------------------------
+
+
+STYLE = """
+:root { color-scheme: light dark; --soft: color-mix(in srgb, CanvasText 60%, Canvas); }
+* { box-sizing: border-box; }
+body { margin: 0; font: 16px/1.55 system-ui, sans-serif; }
+main { max-width: 1040px; margin: 0 auto; padding: 48px 24px 72px; }
+h1 { font-size: 1.7rem; margin: 0 0 4px; overflow-wrap: anywhere; }
+h2 { font-size: 1.05rem; margin: 44px 0 14px; }
+p, figcaption, .facts span { color: var(--soft); font-size: 0.85rem; margin: 4px 0 12px; }
+.facts, .pairs { display: grid; grid-template-columns: repeat(auto-fit, minmax(150px, 1fr)); gap: 12px; }
+.pairs { grid-template-columns: repeat(auto-fill, minmax(min(100%, 440px), 1fr)); }
+.facts b { display: block; font-size: 1.35rem; }
+figure { margin: 0; }
+figure img { width: 100%; border-radius: 6px; }
+table { border-collapse: collapse; width: 100%; font-size: 0.92rem; }
+td { border-top: 1px solid var(--soft); padding: 7px 16px 7px 0; vertical-align: top; }
+pre { overflow-x: auto; }
+"""
+
+JPEG_QUALITY = 88
+
+
+def report_page(
+    *,
+    title: str,
+    summary: str,
+    facts: Sequence[tuple[str, str]],
+    stream: Sequence[Sequence[str]] = (),
+    pictures: Sequence[tuple[Path, str]] = (),
+    pictures_note: str = "",
+    files: Sequence[tuple[str, str]] = (),
+    commands: Sequence[str] = (),
+    details: Sequence[tuple[str, str]] = (),
+) -> str:
+    """The report as HTML, its parts in the order of the arguments; empty ones are left out.
+
+    Args:
+        title: heading.
+        summary: one sentence.
+        facts: label and value with its unit.
+        stream: rows of the table over the stream, the first its header.
+        pictures: image files and captions; missing files are left out.
+        pictures_note: how the pictures were made.
+        files: path relative to the page, and its content.
+        commands: to go on with.
+        details: label and value.
+    """
+    title, summary, note = map(html.escape, (title, summary, pictures_note))
+    linked = [(f'<a href="{name}"><code>{name}</code></a>', text) for name, text in _escaped(files)]
+    figures = [_figure(file, html.escape(caption)) for file, caption in pictures if file.is_file()]
+    sections = {
+        "Over the stream": _table(_escaped(stream)),
+        "Pictures": f'<p>{note}</p><div class="pairs">{"".join(figures)}</div>' if figures else "",
+        "Where everything is": _table(linked),
+        "Next": f"<pre>{html.escape(chr(10).join(commands))}</pre>" if commands else "",
+        "Details": _table(_escaped(details)),
+    }
+    shown = "".join(f"<div><b>{value}</b><span>{label}</span></div>" for label, value in _escaped(facts))
+    body = "\n".join(f"<h2>{heading}</h2>\n{content}" for heading, content in sections.items() if content)
+    return (
+        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f"<title>{title}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n<main>\n<h1>{title}</h1>\n<p>{summary}</p>\n"
+        f'<div class="facts">{shown}</div>\n{body}\n</main>\n</body>\n</html>\n'
+    )
+
+
+def _table(rows: Sequence[Sequence[str]]) -> str:
+    """A table of cells of HTML; nothing without rows."""
+    lines = ["<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>" for row in rows]
+    return f"<table>{''.join(lines)}</table>" if rows else ""
+
+
+def _escaped(rows: Sequence[Sequence[str]]) -> list[list[str]]:
+    return [[html.escape(cell) for cell in row] for row in rows]
+
+
+def _figure(file: Path, caption: str) -> str:
+    """A picture as a data URI, above its caption."""
+    encoded = io.BytesIO()
+    with Image.open(file) as picture:
+        picture.convert("RGB").save(encoded, "JPEG", quality=JPEG_QUALITY)
+    data = base64.b64encode(encoded.getvalue()).decode()
+    return (
+        f'<figure><img src="data:image/jpeg;base64,{data}" alt="{caption}"><figcaption>{caption}</figcaption></figure>'
+    )

@@ -11,15 +11,16 @@ import hashlib
 import json
 import shutil
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ssplat_jax.core.console import Reporter
-from ssplat_jax.core.errors import InputError, echo, refusal
+from ssplat_jax.core.errors import InputError, echo, optional_package, refusal
 from ssplat_jax.data.open_capture import VIDEO_SUFFIXES
-from ssplat_jax.poses import gather_images, sfm
+from ssplat_jax.poses import gather_images
 from ssplat_jax.storage.files import write_json
 from ssplat_jax.storage.run_folder import lock_folder
 
@@ -45,8 +46,8 @@ class PoseOptions:
 class Findings:
     """Contents of a reconstruction."""
 
-    names: tuple[str, ...]  # of all images, in order
-    registered: tuple[str, ...]  # of those that have a pose
+    names: Sequence[str]  # of all images, in order
+    registered: Sequence[str]  # of those that have a pose
     reprojection_error: float  # pixels, median over the points
     num_points: int
 
@@ -77,7 +78,7 @@ def estimate_poses(source: Path, out: Path, options: PoseOptions, overwrite: boo
             registered.
         StorageError: `out` cannot be written.
     """
-    sfm.require("pycolmap")
+    optional_package("pycolmap", "poses")
     request = _request(source, options)
     _check_out(source, out)
     with lock_folder(out):
@@ -98,12 +99,9 @@ def estimate_poses(source: Path, out: Path, options: PoseOptions, overwrite: boo
             record["names"] = _gather(source, out, options, reporter)
             write_json(out / RECORD, record)
         if "findings" not in record:
-            found = _reconstruct(out, tuple(record["names"]), source, options, reporter)
-            record["findings"] = dataclasses.asdict(found)
+            record["findings"] = dataclasses.asdict(_reconstruct(out, record["names"], source, options, reporter))
             write_json(out / RECORD, record)
-    fields = record["findings"]
-    names, registered = (tuple(fields[name]) for name in ("names", "registered"))
-    return Findings(names, registered, fields["reprojection_error"], fields["num_points"])
+    return Findings(**record["findings"])
 
 
 def _request(source: Path, options: PoseOptions) -> dict[str, Any]:
@@ -187,8 +185,10 @@ def _choose_from_video(source: Path, folder: Path, options: PoseOptions, reporte
         return gather_images.write_frames(source, chosen.tolist(), folder, options.max_side, advance)
 
 
-def _reconstruct(out: Path, names: tuple[str, ...], source: Path, options: PoseOptions, reporter: Reporter) -> Findings:
+def _reconstruct(out: Path, names: list[str], source: Path, options: PoseOptions, reporter: Reporter) -> Findings:
     """Runs structure from motion and writes the capture's files."""
+    from ssplat_jax.poses import sfm  # imports pycolmap
+
     sfm.quiet_colmap()
     # A camera has one focal length at first: with two, a straight path would leave their ratio open.
     camera = "RADIAL_FISHEYE" if options.is_fisheye else "RADIAL"
@@ -201,7 +201,7 @@ def _reconstruct(out: Path, names: tuple[str, ...], source: Path, options: PoseO
     with tempfile.TemporaryDirectory() as scratch, reporter.progress("poses", len(names), waiting="") as advance:
         model = sfm.map_images(space, Path(scratch), advance)
     images = [] if model is None else model.images.values()
-    registered = tuple(sorted(image.name for image in images if image.has_pose))
+    registered = sorted(image.name for image in images if image.has_pose)
     if model is None or len(registered) < max(MIN_REGISTERED, MIN_SHARE * len(names)):
         got = f"{len(registered)} of {len(names)}"
         raise InputError(

@@ -7,7 +7,7 @@ folder -> photos in natural order -> upright copies of bounded size ------------
 import re
 import shutil
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +17,13 @@ from PIL import Image
 from PIL.ExifTags import IFD, Base
 from scipy.ndimage import laplace
 
-from ssplat_jax.core.errors import echo, refusal
+from ssplat_jax.core.errors import echo, optional_package, refusal
 from ssplat_jax.data.images import DEPTH_MODES, IMAGE_FORMATS, ORIENTATION, UPRIGHT
 from ssplat_jax.data.open_capture import IMAGE_SUFFIXES, UNREADABLE_SUFFIXES
 from ssplat_jax.data.parsing import reading
 from ssplat_jax.data.readers.frame_list import files_in, natural
-from ssplat_jax.poses.sfm import Advance, require
 
+Advance = Callable[[int], None]
 SUFFIXES = IMAGE_SUFFIXES - UNREADABLE_SUFFIXES
 JPEG_QUALITY = 95
 _T = Image.Transpose
@@ -231,7 +231,7 @@ def write_frames(path: Path, chosen: Sequence[int], folder: Path, max_side: int,
 
 def _frames(path: Path) -> Iterator[Any]:
     """The frames of the first video stream, up to the first that is damaged."""
-    av = require("av")
+    av = optional_package("av", "poses")
     with _open(path) as container:
         container.streams.video[0].thread_type = "AUTO"
         try:
@@ -242,7 +242,7 @@ def _frames(path: Path) -> Iterator[Any]:
 
 def _open(path: Path) -> Any:
     """Container of a video file."""
-    av = require("av")
+    av = optional_package("av", "poses")
     try:
         container = av.open(str(path))
     except (av.FFmpegError, OSError) as error:

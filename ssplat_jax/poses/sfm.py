@@ -6,7 +6,6 @@ fixed. COLMAP works on a thread of its own, and Ctrl-C cancels it.
 
 import copy
 import dataclasses
-import importlib
 import itertools
 import shutil
 from collections.abc import Callable, Sequence
@@ -15,10 +14,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pycolmap
 from jaxtyping import Float32
 from scipy.cluster.vq import kmeans, vq
 
-from ssplat_jax.core.errors import InputError
 from ssplat_jax.data.images import image_size
 from ssplat_jax.data.posed_image import OPENGL_TO_OPENCV, invert_pose
 from ssplat_jax.storage.files import write_json
@@ -39,40 +38,30 @@ Advance = Callable[[int], None]
 Pair = tuple[int, int]  # indices of two images, the smaller one first
 
 
-def require(name: str) -> Any:
-    """The optional package `name`; an `InputError` says how to install it."""
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        install = 'pip install -e ".[poses]"'
-        raise InputError(f"poses: wanted the package {name}, which is not installed; run: {install}") from error
-
-
 @dataclasses.dataclass(frozen=True)
 class Workspace:
     """Images and database of one reconstruction."""
 
     images: Path  # folder
     database: Path
-    names: tuple[str, ...]  # of the images, in order
+    names: Sequence[str]  # of the images, in order
     camera: str  # COLMAP's camera model
 
     def ids(self) -> dict[str, tuple[int, int]]:
         """Numbers of the image and of its camera, by name."""
-        with require("pycolmap").Database.open(self.database) as database:
+        with pycolmap.Database.open(self.database) as database:
             return {image.name: (image.image_id, image.camera_id) for image in database.read_all_images()}
 
 
 def quiet_colmap() -> None:
     """Keeps COLMAP's log off the terminal and off the disk; errors come as exceptions."""
-    logging = require("pycolmap").logging
+    logging: Any = pycolmap.logging
     logging.logtostderr, logging.alsologtostderr = False, False
     logging.minloglevel = logging.stderrthreshold = int(logging.Level.FATAL)
 
 
 def extract_features(space: Workspace, advance: Advance) -> None:
     """Finds the features of all images; those of one size share a camera."""
-    pycolmap = require("pycolmap")
     # The images are entered first, in order: their numbers do not depend on which thread is done first.
     known, groups = space.ids(), {}
     for name in space.names:
@@ -94,7 +83,7 @@ def pairs_to_match(space: Workspace, *, is_video: bool) -> list[Pair]:
     if not is_video and num <= MAX_EXHAUSTIVE:
         return list(itertools.combinations(range(num), 2))
     ids = space.ids()
-    with require("pycolmap").Database.open(space.database) as database:
+    with pycolmap.Database.open(space.database) as database:
         found = [database.read_descriptors(ids[name][0]) for name in space.names]
     descriptors = [np.asarray(getattr(rows, "data", rows), np.float32).reshape(-1, 128) for rows in found]
     return sorted({*neighbor_pairs(num), *alike_pairs(descriptors, NUM_ALIKE_VIDEO if is_video else NUM_ALIKE_PHOTOS)})
@@ -137,7 +126,6 @@ def alike_pairs(descriptors: Sequence[Float32[np.ndarray, "_ c"]], num_alike: in
 
 def match_pairs(space: Workspace, pairs: Sequence[Pair], advance: Advance) -> None:
     """Matches pairs of images and verifies the matches; pairs that the database holds are not matched again."""
-    pycolmap = require("pycolmap")
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = SEED
     names, pairs_file = space.names, space.database.with_suffix(".pairs.txt")
@@ -160,7 +148,6 @@ def map_images(space: Workspace, scratch: Path, advance: Advance) -> Any | None:
     Returns:
         The `pycolmap.Reconstruction` with the most images; None if there is none.
     """
-    pycolmap = require("pycolmap")
     options = pycolmap.IncrementalPipelineOptions(random_seed=SEED)
     options.mapper.random_seed = options.triangulation.random_seed = SEED
     registered = [0]
@@ -183,7 +170,6 @@ def map_images(space: Workspace, scratch: Path, advance: Advance) -> Any | None:
 
 def _refined(model: Any) -> Any:
     """The model with OpenCV's cameras, all parameters of which are adjusted if they come out plausible."""
-    pycolmap = require("pycolmap")
     for camera in model.cameras.values():
         f, cx, cy, k1, k2 = camera.params
         is_fisheye = camera.model == pycolmap.CameraModelId.RADIAL_FISHEYE
@@ -206,7 +192,6 @@ def _refined(model: Any) -> Any:
 
 def _cancellable(function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
     """Calls a function of COLMAP on another thread; an exception in this one, such as Ctrl-C, cancels it."""
-    pycolmap = require("pycolmap")
     token = pycolmap.CancellationToken()
 
     def work() -> Any:

@@ -9,14 +9,14 @@ from typing import Any
 
 import numpy as np
 
+from ssplat_jax.core.atomic import write_atomic
 from ssplat_jax.core.console import Reporter
 from ssplat_jax.core.gaussians import Gaussians, scale_colors
 from ssplat_jax.core.kept_programs import Kept
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.evaluation.cost import peak_memory
-from ssplat_jax.evaluation.pictures import evenly_spread, save_comparison
-from ssplat_jax.evaluation.report_page import Report, save_report
+from ssplat_jax.evaluation.pictures import evenly_spread, report_page, save_comparison
 from ssplat_jax.evaluation.scoring import ViewScore, exposures_to_json, score_view
 from ssplat_jax.runs.open_run import OpenRun
 from ssplat_jax.scene_files.formats import ExportReport, save_gaussians
@@ -102,7 +102,7 @@ def finish_run(run: OpenRun, path: str, reporter: Reporter) -> ExportReport:
         "ply": dataclasses.asdict(report),
         "compile_s": round(run.session.compile_seconds, 2),
         "step_memory_bytes": run.session.step_memory_bytes,  # None if all views were streamed before this call
-        "peak_memory_bytes": peak_memory(run.session, middle).bytes,
+        "peak_memory_bytes": peak_memory(run.session, middle)["peak_memory_bytes"],
         "cache": run.session.cache_facts(),
         "stream_frame": stream_frame.to_dict(),
         "config_hash": run.session.model.config.hash,
@@ -226,7 +226,7 @@ def report_eval(folder: RunFolder, metrics: dict[str, Any]) -> None:
 
 def _save(folder: RunFolder, metrics: dict[str, Any], pictures: list[tuple[Path, str]], **parts: Any) -> None:
     """Writes a page with these pictures and further parts."""
-    report = Report(
+    page = report_page(
         title=metrics["capture"],
         pictures=[pictures[k] for k in evenly_spread(len(pictures), MOST_PICTURES)],
         # A run writes its metrics after the report: with them, everything is there.
@@ -234,7 +234,7 @@ def _save(folder: RunFolder, metrics: dict[str, Any], pictures: list[tuple[Path,
         details=[*parts.pop("details", ()), *_details(metrics)],
         **parts,
     )
-    save_report(folder.report, report)
+    write_atomic(folder.report, page.encode(errors="replace"))
 
 
 def _stream_rows(records: Sequence[ChunkRecord]) -> list[tuple[str, ...]]:

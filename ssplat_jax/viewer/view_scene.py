@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from ssplat_jax.core.console import Reporter
-from ssplat_jax.core.errors import InputError, StorageError
+from ssplat_jax.core.errors import InputError, StorageError, optional_package
 from ssplat_jax.storage.run_folder import Interrupts, RunFolder
 from ssplat_jax.viewer.browser import Browser
 from ssplat_jax.viewer.scene_sources import GrowingScene, Source
@@ -99,10 +99,7 @@ def import_viser(host: str, port: int) -> Any:
     Raises:
         InputError: it is not installed, the address is another one, or the port is out of range.
     """
-    try:
-        import viser
-    except ImportError as error:
-        raise InputError('view: wanted the package viser; run: pip install -e ".[viewer]"') from error
+    viser = optional_package("viser", "viewer")
     try:
         if not 0 < port < 1 << 16:
             raise OSError("ports are 1 to 65535")

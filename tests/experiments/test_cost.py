@@ -39,8 +39,8 @@ def test_memory_of_a_stream_does_not_grow_with_views(room):
     for _ in range(3):
         feed_capture(session, room, range(16), frame)
         memory = peak_memory(session, room.camera(3, frame))
-        peaks.append(memory.bytes)
-        steps.append(memory.step)
+        peaks.append(memory["peak_memory_bytes"])
+        steps.append(memory["step_bytes"])
     assert len(set(steps)) == 1
     assert max(peaks) <= 1.05 * peaks[0]
     assert peaks[0] >= live_bytes((session.params, session.cache))

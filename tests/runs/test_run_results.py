@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from ssplat_jax.evaluation.pictures import save_image
-from ssplat_jax.evaluation.report_page import Report, page_text
+from ssplat_jax.evaluation.pictures import report_page, save_image
 from ssplat_jax.runs.run_results import MOST_PICTURES, report_eval, report_run
 from ssplat_jax.storage.chunk_records import save_chunk_record
 from ssplat_jax.storage.run_folder import RunFolder
@@ -133,10 +132,8 @@ def test_the_report_of_an_evaluation_holds_both_scores(folder):
 
 
 def test_text_is_escaped():
-    report = Report(
-        "<b>&", "<i>", [("<u>", "<s>")], files=[("a", "<p>")], commands=["a && b <c>"], details=[("<", ">")]
-    )
-    text = page_text(report)
+    parts = {"files": [("a", "<p>")], "commands": ["a && b <c>"], "details": [("<", ">")]}
+    text = report_page(title="<b>&", summary="<i>", facts=[("<u>", "<s>")], **parts)
     for raw in ("<b>&", "<i>", "<u>", "<s>", "<p>", "<c>"):
         assert html.escape(raw) in text
         assert raw in Page(text).text
