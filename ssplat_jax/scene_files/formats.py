@@ -21,8 +21,7 @@ from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.scene_files.glb import AXIS_FLIP, decode_glb, encode_glb
 from ssplat_jax.scene_files.ply import decode_ply, encode_ply
 from ssplat_jax.scene_files.sog import decode_sog, encode_sog
-from ssplat_jax.scene_files.splat import encode_splat
-from ssplat_jax.scene_files.splat_rows import RENDER_MODES, SplatRows, gaussians_of_rows, rows_to_write
+from ssplat_jax.scene_files.splat_rows import RENDER_MODES, SplatRows, encode_splat, gaussians_of_rows, rows_to_write
 from ssplat_jax.scene_files.spz import RUB, decode_spz, encode_spz
 
 FilePath = str | os.PathLike

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Float64, Int, UInt8
 from scipy.spatial.transform import Rotation
 
 from ssplat_jax.core.errors import InputError, refusal
-from ssplat_jax.core.gaussians import Gaussians, check_gaussians
+from ssplat_jax.core.gaussians import SH_C0, Gaussians, check_gaussians
 from ssplat_jax.core.rotations import sh_rotation
 
 RENDER_MODES = ("default", "mip", "2dgs")
@@ -212,3 +212,27 @@ def with_largest(largest: Int[np.ndarray, " n"], others: Float[np.ndarray, "n 3"
     # Rounding can make the three longer than 1.
     quats[is_largest] = np.sqrt(np.maximum(1.0 - np.sum(np.square(others, dtype=np.float64), axis=1), 0.0))
     return quats
+
+
+# -- the .splat file of the first browser viewers, which is written only ----------------------------------------------
+
+
+SPLAT_ROW = np.dtype([("mean", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
+"""32 bytes per Gaussian: place, standard deviations, constant color and opacity, and 128 + 128 q for wxyz."""
+
+
+def encode_splat(rows: SplatRows) -> bytes:
+    """The bytes of a .splat; colors are clipped to [0, 1], SH bands above the constant one are dropped.
+
+    Rows are sorted by volume times opacity, largest first, because a viewer may draw the scene before it is loaded
+    completely. There is no header: viewers assume that y points down and dilate as 3DGS does.
+    """
+    prominence = rows.log_scales.sum(axis=1) + np.log(rows.opacities)
+    order = np.argsort(-prominence, kind="stable")
+    table = np.zeros(len(rows), SPLAT_ROW)
+    table["mean"] = rows.means[order]
+    table["scales"] = np.exp(rows.log_scales[order])
+    table["rgba"][:, :3] = to_bytes(255 * (0.5 + SH_C0 * rows.sh[order, 0]))
+    table["rgba"][:, 3] = to_bytes(255 * rows.opacities[order])
+    table["quat"] = to_bytes(128 + 128 * rows.quats[order])
+    return table.tobytes()

@@ -19,9 +19,8 @@ from ssplat_jax.model.decoder import decode_tokens
 from ssplat_jax.model.hpda import expected_log_depth
 from ssplat_jax.model.layers import pixel_unshuffle
 from ssplat_jax.model.network import init_params
-from ssplat_jax.model.resplat.resplat_tokens import ReSplatGaussianHead, token_context
+from ssplat_jax.model.resplat.resplat_tokens import ReSplatGaussianHead, Upsampler, token_context
 from ssplat_jax.model.resplat.torch_layers import resize
-from ssplat_jax.model.resplat.upsampler import Upsampler
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.model.views import AnchoredDepth, back_project, patch_colors, prepare_views, to_candidate_space
 from ssplat_jax.storage.weights import as_published

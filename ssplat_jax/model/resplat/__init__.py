@@ -12,11 +12,12 @@ from ssplat_jax.model.resplat.encoder import VITS, WIDTHS, ReSplatEncoder, encod
 from ssplat_jax.model.resplat.resplat_tokens import (
     ReSplatGaussianHead,
     ReSplatTokenRegressor,
+    Upsampler,
     read_shapes,
+    refine_depth,
     regress_tokens,
 )
 from ssplat_jax.model.resplat.torch_layers import ReSplatFeatures
-from ssplat_jax.model.resplat.upsampler import Upsampler, refine_depth
 
 
 def stages(config: StreamConfig) -> dict:
