@@ -56,8 +56,6 @@ def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str
             "context": len(split.context),
             "shown": metrics["shown"]["psnr"],
             "literal": metrics["literal"]["psnr"],
-            "over_black": metrics["psnr_over_black"],
-            "one_exposure": metrics["psnr_one_exposure"],
             "shown_ssim": metrics["shown"]["ssim"],
             "literal_ssim": metrics["literal"]["ssim"],
             "shown_lpips": metrics["shown"]["lpips"],

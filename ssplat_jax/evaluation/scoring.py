@@ -51,8 +51,6 @@ class ViewScore:
     frame: int
     literal: ImageScore  # holes black, at the scene's exposure
     shown: ImageScore  # holes filled, at the exposure of the nearest streamed views
-    psnr_over_black: float  # dB, holes black, at the exposure of the nearest streamed views
-    psnr_one_exposure: float  # dB, holes filled, at the scene's exposure
     coverage: float  # mean alpha: how much of the view the scene covers
 
 
@@ -135,24 +133,17 @@ def score_view(
     """
     camera = capture.camera(i, stream_frame)
     out = render(gaussians, camera, effects=effects_for(gaussians, camera))
-    exposure, own = exposure_for(capture, i, exposures), middle_exposure(exposures)
-    filled = np.asarray(_filled(out, gaussians))
-    over_black = np.asarray(out.color)
-    color, target, seen = _displayed(filled, exposure), capture.image(i), capture.seen(i)
+    shown = np.asarray(_filled(out, gaussians)) * exposure_for(capture, i, exposures)
+    literal = np.asarray(out.color) * middle_exposure(exposures)
+    shown, literal = (np.clip(image, 0.0, 1.0).astype(np.float32) for image in (shown, literal))
+    target, seen = capture.image(i), capture.seen(i)
     score = ViewScore(
         frame=i,
-        literal=score_image(_displayed(over_black, own), target, lpips_weights, seen),
-        shown=score_image(color, target, lpips_weights, seen),
-        psnr_over_black=psnr(_displayed(over_black, exposure), target, seen),
-        psnr_one_exposure=psnr(_displayed(filled, own), target, seen),
+        literal=score_image(literal, target, lpips_weights, seen),
+        shown=score_image(shown, target, lpips_weights, seen),
         coverage=float(np.asarray(out.alpha).mean()),
     )
-    return ScoredView(score, target, color, np.asarray(out.depth))
-
-
-def _displayed(image: Float[np.ndarray, "h w 3"], exposure: Float[np.ndarray, "3"] | float = 1.0):
-    """An image at an exposure, clipped to [0, 1]."""
-    return np.clip(image * exposure, 0.0, 1.0).astype(np.float32)
+    return ScoredView(score, target, shown, np.asarray(out.depth))
 
 
 def score_image(
@@ -173,27 +164,17 @@ def score_image(
 
 
 def mean_scores(scores: Sequence[ViewScore]) -> dict[str, Any]:
-    """Means over views: the blocks `literal` and `shown`, and the two scores between them.
-
-    Returns:
-        `{"literal": {"psnr", "ssim", "lpips"}, "shown": {...}, "psnr_over_black", "psnr_one_exposure"}`;
-        `lpips` is None without weights.
-    """
-    blocks = {name: mean_images([getattr(s, name) for s in scores]) for name in ("literal", "shown")}
-    others = ("psnr_over_black", "psnr_one_exposure")
-    return blocks | {name: _mean([getattr(s, name) for s in scores]) for name in others}
+    """Means over views: `{"literal": {"psnr", "ssim", "lpips"}, "shown": {...}}`; `lpips` is None without weights."""
+    return {name: mean_images([getattr(s, name) for s in scores]) for name in ("literal", "shown")}
 
 
 def mean_images(scores: Sequence[ImageScore]) -> dict[str, float | None]:
-    """Means of `psnr`, `ssim` and `lpips`, the last None without weights."""
-    columns = {name: [getattr(score, name) for score in scores] for name in ("psnr", "ssim", "lpips")}
-    return {name: _mean(values) for name, values in columns.items()}
-
-
-def _mean(values: Sequence[float | None]) -> float | None:
-    """Mean of the numbers; NaN is the score of a view of which nothing is seen."""
-    found = [value for value in values if value is not None and not math.isnan(value)]
-    return round(float(np.mean(found)), 4) if found else None
+    """Means of `psnr`, `ssim` and `lpips`, the last None without weights; NaN is the score of a fully masked view."""
+    means = {}
+    for name in ("psnr", "ssim", "lpips"):
+        found = [value for score in scores if (value := getattr(score, name)) is not None and not math.isnan(value)]
+        means[name] = round(float(np.mean(found)), 4) if found else None
+    return means
 
 
 def score_targets(

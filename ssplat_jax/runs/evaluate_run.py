@@ -23,7 +23,7 @@ from ssplat_jax.storage.files import write_json
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.streaming.session import Session
 
-SCORES = ("literal", "shown", "psnr_over_black", "psnr_one_exposure")
+SCORES = ("literal", "shown")
 """Scores of a scene that are averaged over scenes."""
 
 

@@ -7,9 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import ssplat_jax as ss
 from ssplat_jax.cache import init_cache
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.gaussians import Gaussians, mean_color
+from ssplat_jax.core.pytree import replace
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import Split
 from ssplat_jax.evaluation import cost
@@ -63,7 +65,7 @@ def test_an_uncovered_view_is_scored_on_the_mean_color(capture):
     np.testing.assert_allclose(color, np.broadcast_to([0.2, 0.4, 0.6], color.shape), atol=1e-6)
     target = capture.image(0)
     assert score.shown.psnr == pytest.approx(psnr(color, target)) and score.coverage == 0 and not depth.any()
-    assert score.psnr_over_black == score.literal.psnr == pytest.approx(psnr(np.zeros_like(target), target))
+    assert score.literal.psnr == pytest.approx(psnr(np.zeros_like(target), target))
     assert score.literal.ssim == pytest.approx(ssim(np.zeros_like(target), target))
     assert score.shown.lpips is None and score.literal.lpips is None
 
@@ -79,11 +81,19 @@ def test_a_novel_view_has_the_mean_exposure_of_its_neighbors(capture):
     wanted = [0.2 * 0.25 ** (1 / 3), 0.4, 1.0]  # 1.2 is clipped
     np.testing.assert_allclose(color, np.broadcast_to(wanted, color.shape), atol=1e-6)
     assert score.shown.psnr == pytest.approx(psnr(color, capture.image(2)))
-    # The scene's own exposure is the middle one, as in the files that are written of it.
-    own = np.broadcast_to([0.2 * 0.5**0.5, 0.4, 1.0], color.shape)
-    assert score.psnr_one_exposure == pytest.approx(psnr(own, capture.image(2)))
     color = score_view(scene, capture, 4, frame, exposures).color  # a streamed view has its own
     np.testing.assert_allclose(color, np.broadcast_to([0.2, 0.4, 1.0], color.shape), atol=1e-6)
+
+
+def test_literal_scores_are_at_the_middle_exposure_over_black(capture):
+    """As in the files that are written of the scene."""
+    frame, scene = capture.stream_frame(StreamConfig(), (0, 1, 3, 4)), gaussians([[0.2, 0.4, 0.6]], [0.9], 2.0)
+    scene = replace(scene, scales=jnp.ones((1, 3)))
+    exposures = {i: np.array(e, np.float64) for i, e in {0: [9, 9, 9], 1: [0.5, 1, 2], 3: [0.5, 1, 1]}.items()}
+    color = np.asarray(ss.render(scene, capture.camera(2, frame)).color) * [0.5, 1.0, 2.0]
+    score = score_view(scene, capture, 2, frame, exposures).score
+    assert score.coverage > 0.1
+    assert score.literal.psnr == pytest.approx(psnr(np.clip(color, 0, 1), capture.image(2)), abs=0.01)
 
 
 def test_nearness_counts_centers_and_angles(capture):

@@ -196,7 +196,7 @@ def test_a_picture_is_drawn_coarsely_then_finely_and_only_when_something_changes
 
 
 def test_a_drawn_picture_is_that_of_the_rasterizer_however_it_is_stretched():
-    viewed, focal, at = scene(), 16 / np.tan(0.45), pose(0.1, 0.3)
+    viewed, focal, at = scene(400), 16 / np.tan(0.45), pose(0.1, 0.3)
     K = np.array([[focal, 0, 24], [0, focal, 16], [0, 0, 1]])
     viewmats, Ks = (jnp.asarray(x, jnp.float32) for x in (np.linalg.inv(at), K))
     view = Camera(viewmats=viewmats, Ks=Ks, width=48, height=32)
