@@ -13,7 +13,7 @@ from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.evaluation.cost import measure_latency, peak_memory
 from ssplat_jax.evaluation.scoring import score_targets
 from ssplat_jax.refinement.compared_views import FOR_CAPTURES
-from ssplat_jax.refinement.refine import continue_refinement, key_views_of, report_of, start_refinement
+from ssplat_jax.refinement.refine import Progress, key_views_of
 from ssplat_jax.streaming.feed import Exposures, feed_capture
 
 
@@ -141,14 +141,14 @@ def measure_refined(settings: Sequence[Setting], sizes: Sizes, opened: Opened) -
     scene, rows = _stream(settings[0], sizes, opened), []
     wanted = sorted(setting.refine_steps for setting in settings)
     given = key_views_of(scene.streamed, scene.split.context, scene.stream_frame, scene.exposures)
-    progress, views = start_refinement(scene.gaussians, given, FOR_CAPTURES)
+    progress = Progress.start(scene.gaussians, given, FOR_CAPTURES)
     refined = {}
-    for _ in continue_refinement(progress, views, wanted[-1], FOR_CAPTURES):
+    for _ in progress.steps(wanted[-1]):
         if progress.num_steps in wanted:
             refined[progress.num_steps] = progress.scene(scene.gaussians)
     last = progress.scene(scene.gaussians)
     for setting in settings:
-        seconds = report_of(progress, views).seconds_per_step * min(setting.refine_steps, progress.num_steps)
+        seconds = progress.report().seconds_per_step * min(setting.refine_steps, progress.num_steps)
         gaussians = refined.get(setting.refine_steps, last)
         row = scene.row(setting, gaussians) | {"gaussians": int((gaussians.opacities > 0).sum())}
         added = 1e3 * seconds / len(scene.split.context)

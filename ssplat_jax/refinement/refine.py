@@ -1,6 +1,6 @@
 """Refinement on the host: many steps, in a few compiled programs, stopped where they no longer help.
 
-    start_refinement ─► Progress ─► continue_refinement: a step an iteration ─► report_of, Progress.scene
+    Progress.start ─► Progress.steps: a step an iteration ─► Progress.scene, Progress.report
 
 `refine` runs all of it on given images, `refine_on_capture` on the frames of a stream.
 """
@@ -47,19 +47,67 @@ MAX_KEY_VIEWS = 128  # most frames of a stream that are compared: their memory d
 
 @dataclasses.dataclass
 class Progress:
-    """Refinement between two steps: all that the next step depends on, and the measurements so far."""
+    """A refinement between two steps: what it learns from, all that the next step depends on, and what was measured."""
 
     state: RefineState
+    key_views: KeyViews
+    config: RefineConfig
     max_pairs: int  # capacity for tile intersections of the compiled step
     max_rows: int | None = None  # capacity for the rows that the views of a step may see; None before the first
     losses: list[float] = dataclasses.field(default_factory=list)  # per step, on the pixels that are learned from
     held_back: list[float] = dataclasses.field(default_factory=list)  # per step, on the pixels that are not
     seconds: list[float] = dataclasses.field(default_factory=list)  # per step; the first of a process compiles
 
+    @classmethod
+    def start(cls, gaussians: Gaussians, key_views: KeyViews, config: RefineConfig) -> "Progress":
+        """Progress before the first step, without the key views that cannot be learned from.
+
+        The same arguments give the same result: a refinement that was stopped starts again and takes over its saved
+        state.
+
+        Raises:
+            InputError: no view can be learned from.
+        """
+        start = without_padding(gaussians)
+        max_pairs = pairs_capacity(start, key_views)
+        return cls(init_refinement(start, config), only_usable(start, key_views, max_pairs), config, max_pairs)
+
     @property
     def num_steps(self) -> int:
         """Steps done."""
         return len(self.losses)
+
+    def steps(self, planned: int) -> Iterator[None]:
+        """Takes a step an iteration, until `planned` are done or no longer help.
+
+        The caller may save the progress after any iteration. A refinement that continues from it takes the same steps.
+
+        Args:
+            planned: steps, those already done included. They decide how fast the learning rates decay.
+        """
+        if self.max_rows is None:
+            self.max_rows = row_capacity(self.state, self.key_views, planned, self.config)
+        while self.num_steps < planned and not self.has_stopped_helping():
+            start = time.perf_counter()
+            rate = np.float32(FINAL_RATE ** (self.num_steps / planned))
+            self.state, report = _compiled(self.config, self.max_pairs, self.max_rows)(self.state, self.key_views, rate)
+            self.losses.append(float(report.loss))  # waits, so that a step's time is that of its work
+            self.held_back.append(float(report.held_back))
+            self.seconds.append(time.perf_counter() - start)
+            if num_pairs := int(report.num_overflow):
+                self.max_pairs = round_up(self.max_pairs + num_pairs)
+            if num_rows := int(report.num_missing_rows):
+                self.max_rows = round_rows(self.max_rows + num_rows)
+            yield
+
+    def has_stopped_helping(self) -> bool:
+        """True if none of the last `PATIENCE` rounds of views has a held-back error below the best before them."""
+        steps_per_round = -(-int(np.sum(np.asarray(self.key_views.valid))) // self.config.views_per_step)
+        num_rounds, rest = divmod(self.num_steps, steps_per_round)
+        if num_rounds <= PATIENCE or rest or not any(self.held_back):
+            return False  # too early to say, or no pixel is held back
+        rounds = np.reshape(self.held_back, (num_rounds, steps_per_round)).mean(axis=1)
+        return float(rounds[-PATIENCE:].min()) >= float(rounds[:-PATIENCE].min())
 
     def scene(self, given: Gaussians) -> Gaussians:
         """`given`, the scene that refinement started from, as it is now.
@@ -68,6 +116,19 @@ class Progress:
         before stay.
         """
         return _scene_now(self.state.start, self.state.change, given)
+
+    def report(self) -> "Refinement":
+        """What was measured."""
+        seconds = self.seconds[1:]
+        return Refinement(
+            num_steps=self.num_steps,
+            num_skipped=int(self.state.num_skipped),
+            losses=self.losses,
+            held_back=self.held_back,
+            stopped_early=self.has_stopped_helping(),
+            seconds_per_step=float(np.median(seconds)) if seconds else 0.0,
+            num_left_out=int(np.sum(~np.asarray(self.key_views.valid))),
+        )
 
 
 @Kept
@@ -157,90 +218,16 @@ def _refined(
         raise InputError(f"refine: steps must be at least 0, got {steps}.")
     if steps == 0:
         return gaussians, Refinement()
-    progress, key_views = start_refinement(gaussians, key_views, config)
-    for _ in continue_refinement(progress, key_views, steps, config):
+    progress = Progress.start(gaussians, key_views, config)
+    for _ in progress.steps(steps):
         on_step(progress.num_steps, progress.losses[-1])
-    return progress.scene(gaussians), report_of(progress, key_views, config)
-
-
-def start_refinement(
-    gaussians: Gaussians, key_views: KeyViews, config: RefineConfig | None = None
-) -> tuple[Progress, KeyViews]:
-    """Progress before the first step, and the key views without those that cannot be learned from.
-
-    The same arguments give the same result: a refinement that was stopped starts again and takes over its saved state.
-
-    Raises:
-        InputError: no view can be learned from.
-    """
-    start = without_padding(gaussians)
-    max_pairs = pairs_capacity(start, key_views)
-    return Progress(init_refinement(start, config), max_pairs), only_usable(start, key_views, max_pairs)
-
-
-def continue_refinement(
-    progress: Progress, key_views: KeyViews, steps: int, config: RefineConfig | None = None
-) -> Iterator[None]:
-    """Updates `progress` in place, a step an iteration, until `steps` are done or no longer help.
-
-    The caller may save `progress` after any iteration. A refinement that continues from it takes the same steps.
-
-    Args:
-        progress: the steps so far.
-        key_views: the views to compare with; the same for all steps.
-        steps: planned steps, those of `progress` included. They decide how fast the learning rates decay.
-        config: as it was for `start_refinement`.
-    """
-    config = config or RefineConfig()
-    if progress.max_rows is None:
-        progress.max_rows = row_capacity(progress.state, key_views, steps, config)
-    while progress.num_steps < steps and not _has_stopped_helping(progress, key_views, config):
-        start = time.perf_counter()
-        rate = np.float32(FINAL_RATE ** (progress.num_steps / steps))
-        step = _compiled(config, progress.max_pairs, progress.max_rows)
-        progress.state, report = step(progress.state, key_views, rate)
-        progress.losses.append(float(report.loss))  # waits, so that a step's time is that of its work
-        progress.held_back.append(float(report.held_back))
-        progress.seconds.append(time.perf_counter() - start)
-        if num_pairs := int(report.num_overflow):
-            progress.max_pairs = round_up(progress.max_pairs + num_pairs)
-        if num_rows := int(report.num_missing_rows):
-            progress.max_rows = round_rows(progress.max_rows + num_rows)
-        yield
+    return progress.scene(gaussians), progress.report()
 
 
 @functools.cache
 def _compiled(config: RefineConfig, max_pairs: int, max_rows: int) -> Callable:
     step = functools.partial(refine_step, config=config, max_pairs=max_pairs, max_rows=max_rows)
     return Kept(step, donate_argnums=(0,))
-
-
-def report_of(progress: Progress, key_views: KeyViews, config: RefineConfig | None = None) -> Refinement:
-    """The report of a refinement that has ended."""
-    seconds = progress.seconds[1:]
-    return Refinement(
-        num_steps=progress.num_steps,
-        num_skipped=int(progress.state.num_skipped),
-        losses=progress.losses,
-        held_back=progress.held_back,
-        stopped_early=_has_stopped_helping(progress, key_views, config or RefineConfig()),
-        seconds_per_step=float(np.median(seconds)) if seconds else 0.0,
-        num_left_out=int(np.sum(~np.asarray(key_views.valid))),
-    )
-
-
-def _has_stopped_helping(progress: Progress, key_views: KeyViews, config: RefineConfig) -> bool:
-    num_views = int(np.sum(np.asarray(key_views.valid)))
-    return has_stopped_helping(progress.held_back, -(-num_views // config.views_per_step))
-
-
-def has_stopped_helping(held_back: list[float], steps_per_round: int) -> bool:
-    """True if none of the last `PATIENCE` rounds of views has a held-back error below the best before them."""
-    num_rounds, rest = divmod(len(held_back), steps_per_round)
-    if num_rounds <= PATIENCE or rest or not any(held_back):
-        return False  # too early to say, or no pixel is held back
-    rounds = np.reshape(held_back, (num_rounds, steps_per_round)).mean(axis=1)
-    return float(rounds[-PATIENCE:].min()) >= float(rounds[:-PATIENCE].min())
 
 
 def pairs_capacity(gaussians: Gaussians, key_views: KeyViews, margin: float = PAIRS_MARGIN) -> int:

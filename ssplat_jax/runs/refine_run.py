@@ -12,7 +12,7 @@ from ssplat_jax.core.console import WAITING, Reporter
 from ssplat_jax.core.errors import InputError, refusal, require_positive
 from ssplat_jax.evaluation.scoring import mean_scores, score_targets
 from ssplat_jax.refinement.compared_views import FOR_CAPTURES
-from ssplat_jax.refinement.refine import Progress, continue_refinement, key_views_of, report_of, start_refinement
+from ssplat_jax.refinement.refine import Progress, key_views_of
 from ssplat_jax.runs.open_run import load_run
 from ssplat_jax.runs.run_results import picture_views, report_run, save_scene, shown_frames
 from ssplat_jax.storage.files import load_arrays, save_arrays, write_json
@@ -20,8 +20,8 @@ from ssplat_jax.storage.run_folder import Interrupts, RunFolder, lock_folder
 
 KIND = "refinement state 1"
 
-MEASURED = tuple(field.name for field in dataclasses.fields(Progress) if field.name != "state")
-"""Fields of `Progress` that JSON holds: numbers, and lists of them."""
+MEASURED = ("max_pairs", "max_rows", "losses", "held_back", "seconds")
+"""Fields of `Progress` that JSON holds."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,13 +75,12 @@ def refine_run(
     with lock_folder(run_dir):
         if overwrite:
             folder.clear_refinement()
-        given = key_views_of(capture, indices, stream_frame, exposures)
-        progress, key_views = start_refinement(gaussians, given, config)
+        progress = Progress.start(gaussians, key_views_of(capture, indices, stream_frame, exposures), config)
         if folder.refinement_state.exists():
             load_refinement(folder.refinement_state, progress, identity)
         with Interrupts() as interrupts, reporter.progress("refining", steps) as advance:
             advance(progress.num_steps, WAITING)
-            for _ in continue_refinement(progress, key_views, steps, config):
+            for _ in progress.steps(steps):
                 advance(progress.num_steps, f"loss {progress.losses[-1]:.4f}")
                 if interrupts.received:
                     break
@@ -92,11 +91,12 @@ def refine_run(
             save_scene(folder.refined_scene, refined, stream_frame, exposures)  # at the exposure of scene.ply
             if interrupts.received:  # read last: a signal may have come during the save, too
                 return RefineResult(progress.num_steps, {}, {}, interrupts.received)
-        report = report_of(progress, key_views, config)
         before = score_targets(gaussians, capture, tuple(shown_frames(indices)), stream_frame, exposures)
         scores = picture_views(folder, refined, capture, indices, stream_frame, exposures)
         after = mean_scores(scores)
-        write_json(folder.refinement, vars(report) | {"seen_views_before": before, "seen_views_after": after})
+        write_json(
+            folder.refinement, vars(progress.report()) | {"seen_views_before": before, "seen_views_after": after}
+        )
         if folder.metrics.is_file():  # else there is no report to bring up to date
             metrics = json.loads(folder.metrics.read_text())
             report_run(folder, metrics, path, run.header["weights"], refined=scores)
@@ -106,7 +106,7 @@ def refine_run(
 def save_refinement(path: Path, progress: Progress, identity: dict[str, Any]) -> None:
     """Saves a refinement between two steps, with the facts that must be equal for it to be continued.
 
-    The scene that it started from is left out: `start_refinement` finds it again from the run and its capture.
+    The scene that it started from is left out: `Progress.start` finds it again from the run and its capture.
     """
     arrays = {name: np.asarray(leaf) for name, leaf in _leaves(progress).items() if not name.startswith(".start")}
     measured = {name: getattr(progress, name) for name in MEASURED}

@@ -103,7 +103,7 @@ def test_padding_behind_the_last_present_row_is_left_out_and_comes_back(monkeypa
     shortened = without_padding(given)
     assert shortened.num_gaussians == round_rows(NUM)
     state = init_refinement(shortened, dataclasses.replace(CONFIG, sh_degree=1))
-    whole = Progress(state, max_pairs=1).scene(given)
+    whole = Progress(state, key_views(), CONFIG, max_pairs=1).scene(given)
     assert whole.sh_degree == 1
     for name in ("means", "scales", "opacities"):
         np.testing.assert_array_equal(getattr(whole, name), getattr(given, name), err_msg=name)

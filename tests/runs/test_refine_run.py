@@ -85,14 +85,14 @@ def test_report_and_pictures_become_those_of_the_refined_scene(finished):
 
 def stop_after_each_step(monkeypatch):
     """Refinements get SIGINT after every step."""
-    steps = module.continue_refinement
+    steps = module.Progress.steps
 
-    def stopped_after_one(progress, *arguments):
-        for _ in steps(progress, *arguments):
+    def stopped_after_one(progress, planned):
+        for _ in steps(progress, planned):
             signal.raise_signal(signal.SIGINT)
             yield
 
-    monkeypatch.setattr(module, "continue_refinement", stopped_after_one)
+    monkeypatch.setattr(module.Progress, "steps", stopped_after_one)
 
 
 def test_a_refinement_with_other_steps_is_refused(finished):
