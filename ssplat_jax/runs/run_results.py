@@ -43,7 +43,7 @@ DESCRIBED_FILES = (
     ("metrics.json", "every figure of this page, and more"),
     ("views", "pictures of streamed views"),
     ("chunks", "a record of every chunk: cameras, exposures, time, occupancy"),
-    ("deltas", "the changes of every chunk, for the viewer's time slider"),
+    ("deltas", "the changes of every chunk, for the viewer"),
     ("state.npz", "the saved stream, from which a stopped run continues"),
     ("split.json", "the frames that were streamed and scored"),
     ("index.json", "the same frames as an index file"),

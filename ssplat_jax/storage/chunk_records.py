@@ -110,14 +110,9 @@ def save_delta(path: Path, delta: SceneDelta, header: dict[str, Any] | None = No
     save_arrays(path, arrays, DELTA_KIND, {"capacity": delta.capacity, "caller": header or {}})
 
 
-def load_delta(path: Path) -> SceneDelta:
-    """Reads a delta that `save_delta` wrote."""
+def load_delta(path: Path) -> tuple[SceneDelta, dict[str, Any]]:
+    """Reads a delta and the caller's header that `save_delta` wrote."""
     arrays, facts = load_arrays(path, DELTA_KIND)
     rows = arrays.pop("rows")
     fields: dict[str, Any] = {name: jnp.asarray(x) for name, x in arrays.items()}
-    return SceneDelta(rows, Gaussians(**fields), facts["capacity"])
-
-
-def load_delta_header(path: Path) -> dict[str, Any]:
-    """Reads the caller's header of a delta."""
-    return load_arrays(path, DELTA_KIND)[1]["caller"]
+    return SceneDelta(rows, Gaussians(**fields), facts["capacity"]), facts["caller"]

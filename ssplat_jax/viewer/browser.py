@@ -1,4 +1,4 @@
-"""`Browser`: one client of the viewer, which looks at the stage with a camera, a panel and a time of its own."""
+"""`Browser`: one client of the viewer, which looks at the stage with a camera and a panel of its own."""
 
 from typing import Any
 
@@ -33,14 +33,11 @@ class Browser:
         self._facts = gui.add_markdown("")
         hint = "All but splats are drawn by ssplat's rasterizer at this window's camera."
         self._kind = gui.add_dropdown("Show", (SPLATS, *KINDS), initial_value=SPLATS, hint=hint)
-        hint = "The scene after so many chunks."
-        self._chunk = gui.add_slider("Chunk", min=1, max=2, step=1, initial_value=1, visible=False, hint=hint)
         hint = "Streamed cameras with their images; click on one to go there."
         self._cameras = gui.add_checkbox("Cameras", initial_value=False, hint=hint)
-        self._num_chunks = 0  # that the slider reaches
         self._node: Any = None  # the splats
         self._frusta: dict[int, Any] = {}  # by frame
-        self._shown: tuple = ()  # version and chunk of the scene, and whether the browser draws it
+        self._shown: tuple = ()  # version of the scene, and whether the browser draws it
         self._noted: tuple = ()  # what cameras and facts were last updated for
         self._scene: Gaussians | None = None
         self._drawn: tuple = ()  # what was shown, kind and camera of the picture
@@ -48,36 +45,18 @@ class Browser:
 
     def update(self) -> None:
         """Brings the browser up to date; called many times a second."""
-        self._grow_slider(self._stage.source.num_chunks)
         self._update_scene()
         self._update_notes()
         if self._kind.value != SPLATS and self._scene is not None:
             self._update_drawing(self._scene)
 
-    @property
-    def _chosen_chunk(self) -> int | None:
-        """The chunks after which the scene is wanted; None for the newest scene, also when more chunks come."""
-        return None if self._num_chunks < 2 or self._chunk.value >= self._num_chunks else int(self._chunk.value)
-
-    def _grow_slider(self, num_chunks: int) -> None:
-        """Lets the slider reach `num_chunks`; at its end, it stays there."""
-        if num_chunks == self._num_chunks:
-            return
-        is_at_end = self._chosen_chunk is None
-        self._num_chunks = num_chunks
-        self._chunk.visible, self._chunk.max = num_chunks > 1, max(num_chunks, 2)
-        if is_at_end or self._chunk.value > num_chunks:
-            self._chunk.value = max(num_chunks, 1)
-
     def _update_scene(self) -> None:
-        """Sends the scene if another one is wanted, or it is wanted in another way."""
-        num_chunks, is_drawn = self._chosen_chunk, self._kind.value != SPLATS
-        wanted = (self._stage.version, num_chunks, is_drawn)
+        """Sends the scene if it has changed, or is wanted in another way."""
+        is_drawn = self._kind.value != SPLATS
+        wanted = (self._stage.version, is_drawn)
         if wanted == self._shown:
             return
-        if wanted[:2] != self._shown[:2]:
-            self._scene = self._stage.scene(num_chunks)
-        self._shown = wanted
+        self._shown, self._scene = wanted, self._stage.scene
         if self._scene is None:
             return
         if not is_drawn:
@@ -104,12 +83,12 @@ class Browser:
 
     def _update_notes(self) -> None:
         """Brings streamed cameras and facts up to date."""
-        run, num_chunks, shows_cameras = self._stage.run, self._chosen_chunk, self._cameras.value
-        noted = (self._stage.records_version, self._stage.version, num_chunks, shows_cameras)
+        run, shows_cameras = self._stage.run, self._cameras.value
+        noted = (self._stage.records_version, self._stage.version, shows_cameras)
         if noted == self._noted:
             return
         self._noted = noted
-        records, views = run.records[:num_chunks], run.views(num_chunks)
+        records, views = run.records, run.views()
         if self._scene is not None:
             num_shown = int((np.asarray(self._scene.opacities) > 0).sum())
             facts = f"**{num_shown:,}** Gaussians"

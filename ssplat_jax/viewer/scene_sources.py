@@ -6,17 +6,17 @@ for no browser, and viewers may come and go.
 
 import json
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from ssplat_jax.core.errors import InputError, StorageError
 from ssplat_jax.core.gaussians import Gaussians, scale_colors
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.scene_files.formats import load_scene
-from ssplat_jax.storage.chunk_records import load_delta, load_delta_header
+from ssplat_jax.storage.chunk_records import load_delta
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.streaming.scene_delta import apply_delta
 
@@ -27,8 +27,6 @@ class SceneFile:
     Args:
         path: the file.
     """
-
-    num_chunks = 1
 
     def __init__(self, path: Path) -> None:
         self._stamp = None  # of scene and metrics at the last look
@@ -71,34 +69,6 @@ def _stamp(path: Path) -> tuple[int, int] | None:
     return stat.st_mtime_ns, stat.st_size
 
 
-class _Sum:
-    """The sum of the first deltas of a run."""
-
-    def __init__(self) -> None:
-        self.applied: list[tuple[str, int]] = []  # names and time stamps of the deltas
-        self.stream_frame: StreamFrame | None = None
-        self._sum: Gaussians | None = None  # in the stream frame
-        self._exposure = np.ones(3)  # at which the scene is shown: the middle one of the views so far
-
-    def add(self, path: Path, stamp: int) -> None:
-        """Adds a delta.
-
-        Raises:
-            StorageError: it is damaged or gone.
-        """
-        delta, header = load_delta(path), load_delta_header(path)
-        self._sum = apply_delta(self._sum, delta)
-        self.stream_frame, self._exposure = StreamFrame.from_dict(header["frame"]), np.array(header["exposure"])
-        self.applied.append((path.name, stamp))
-
-    def scene(self) -> Gaussians:
-        """The scene in the capture's frame, relative to its offset; there must be a delta."""
-        assert self.stream_frame is not None
-        scene = scale_colors(jax.tree.map(jnp.asarray, self._sum), jnp.asarray(self._exposure, jnp.float32))
-        gaussians = self.stream_frame.gaussians_to_capture(scene, offset=self.stream_frame.offset)
-        return replace(gaussians, offset=self.stream_frame.offset)
-
-
 class GrowingScene:
     """The sum of the deltas that a run has written so far, and after all of them the refined scene, if there is one.
 
@@ -108,13 +78,14 @@ class GrowingScene:
 
     def __init__(self, folder: RunFolder) -> None:
         self.path, self.folder = folder.path, folder
-        self._newest, self._past = _Sum(), _Sum()
         self._refined: SceneFile | None = None
+        self._forget()
 
-    @property
-    def num_chunks(self) -> int:
-        """Chunks whose deltas have been added."""
-        return len(self._newest.applied)
+    def _forget(self) -> None:
+        """Starts with an empty sum."""
+        self._applied: list[tuple[str, int]] = []  # names and time stamps of the deltas
+        self._sum: Gaussians | None = None  # in the stream frame
+        self._header: dict[str, Any] | None = None  # of the last delta
 
     def changed(self) -> Gaussians | None:
         """Displayable scene, or None if unchanged since the last call.
@@ -133,42 +104,36 @@ class GrowingScene:
         return self._refined.changed()
 
     def _streamed(self) -> Gaussians | None:
-        """The sum of all deltas, or None if unchanged since the last call."""
+        """The sum of all deltas, in the capture's frame, or None if unchanged since the last call."""
         try:
             found = [(path.name, path.stat().st_mtime_ns) for path in self.folder.delta_files()]
         except FileNotFoundError:  # the run is being started anew
             return None
-        if found == self._newest.applied or not found:
+        if found == self._applied or not found:
             return None
-        if found[: self.num_chunks] != self._newest.applied:
-            self._newest = _Sum()
-        for name, stamp in found[self.num_chunks :]:
+        if found[: len(self._applied)] != self._applied:
+            self._forget()
+        for name, stamp in found[len(self._applied) :]:
             path = self.folder.deltas / name
             try:
-                self._newest.add(path, stamp)
+                delta, self._header = load_delta(path)
             except StorageError:
                 if path.exists():
                     raise
-                self._newest = _Sum()  # the run is being started anew
+                self._forget()  # the run is being started anew
                 return None
-        return self._newest.scene()
-
-    def at(self, num_chunks: int) -> Gaussians:
-        """The scene as it was after so many chunks, at least one and not all.
-
-        Raises:
-            StorageError: a delta is damaged or gone.
-        """
-        wanted = self._newest.applied[:num_chunks]
-        if self._past.applied != wanted[: len(self._past.applied)]:  # later than wanted, or of another run
-            self._past = _Sum()
-        for name, stamp in wanted[len(self._past.applied) :]:
-            self._past.add(self.folder.deltas / name, stamp)
-        return self._past.scene()
+            self._sum = apply_delta(self._sum, delta)
+            self._applied.append((name, stamp))
+        frame = self.stream_frame()
+        assert frame is not None and self._header is not None
+        # At the middle exposure of the views so far.
+        exposure = jnp.asarray(self._header["exposure"], jnp.float32)
+        scene = scale_colors(jax.tree.map(jnp.asarray, self._sum), exposure)
+        return replace(frame.gaussians_to_capture(scene, offset=frame.offset), offset=frame.offset)
 
     def stream_frame(self) -> StreamFrame | None:
         """The frame of the stream; None before the first delta."""
-        return self._newest.stream_frame
+        return None if self._header is None else StreamFrame.from_dict(self._header["frame"])
 
 
 Source = SceneFile | GrowingScene

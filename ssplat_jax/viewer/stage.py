@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Float64, UInt8
 
 from ssplat_jax.core.cameras import Camera
-from ssplat_jax.core.errors import StorageError
 from ssplat_jax.core.false_colors import color_depth, eight_bits, scale_ends
 from ssplat_jax.core.gaussians import SH_C0, Gaussians, mean_color
 from ssplat_jax.core.kept_programs import Kept
@@ -57,9 +56,9 @@ class RecordedRun:
         self._stamps = stamps[: len(self.records)]
         return True
 
-    def views(self, num_chunks: int | None = None) -> list[RecordedView]:
-        """The views of the first chunks, or of all, in the order of streaming."""
-        return [view for record in self.records[:num_chunks] for view in record.views]
+    def views(self) -> list[RecordedView]:
+        """The views in the order of streaming."""
+        return [view for record in self.records for view in record.views]
 
     @property
     def fov(self) -> float | None:
@@ -71,7 +70,7 @@ class RecordedRun:
 
 
 class Stage:
-    """The newest scene of a source, and the earlier ones on request.
+    """The newest scene of a source, and where browsers start to look at it.
 
     Args:
         source: where scenes come from.
@@ -85,7 +84,7 @@ class Stage:
         self.start: Float64[np.ndarray, "4 4"] | None = None  # the pose at which browsers start, scene units
         self.num_starts = 0  # start poses so far: a run of other poses brings another one, and other units
         self._place: tuple | None = None  # of the stream, when the start pose was set
-        self._newest: Gaussians | None = None
+        self.scene: Gaussians | None = None  # None if there is none yet
         self._packed: tuple[Gaussians, dict[str, np.ndarray]] | None = None  # the scene packed last
 
     def refresh(self) -> bool:
@@ -98,7 +97,7 @@ class Stage:
         if (changed := self.source.changed()) is None:
             return False
         self._set_start(changed)
-        self._newest, self.version = changed, self.version + 1
+        self.scene, self.version = changed, self.version + 1
         return True
 
     def _set_start(self, scene: Gaussians) -> None:
@@ -127,16 +126,6 @@ class Stage:
         self.start, self._place, self.num_starts = pose, place, self.num_starts + 1
         self.unit, self.distance = median_size(scene), float(distance)
 
-    def scene(self, num_chunks: int | None = None) -> Gaussians | None:
-        """The scene after so many chunks, by default the newest; None if there is none yet."""
-        source = self.source
-        if num_chunks is None or isinstance(source, SceneFile) or num_chunks >= source.num_chunks:
-            return self._newest
-        try:
-            return source.at(num_chunks)
-        except StorageError:  # every file was read before: the run is being started anew
-            return self._newest
-
     def splats(self, scene: Gaussians) -> dict[str, np.ndarray]:
         """A scene as it is sent, in units of `unit`; kept until another one is asked for, since many browsers ask."""
         if self._packed is None or self._packed[0] is not scene:
@@ -146,7 +135,7 @@ class Stage:
     @property
     def offset(self) -> Float64[np.ndarray, "3"]:
         """Offset of the scene's positions, in the capture's frame."""
-        return np.zeros(3) if self._newest is None else np.asarray(self._newest.offset)
+        return np.zeros(3) if self.scene is None else np.asarray(self.scene.offset)
 
     def to_browser(self, camtoworld: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "4 4"]:
         """A pose of the capture in the browser's units."""

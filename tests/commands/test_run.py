@@ -19,7 +19,6 @@ from ssplat_jax.runs.capture_run import RunResult
 from ssplat_jax.storage.chunk_records import (
     load_chunk_records,
     load_delta,
-    load_delta_header,
     open_thumbnail,
     save_chunk_record,
 )
@@ -59,10 +58,10 @@ def assert_deltas_give_the_scene(out, narrow, *names):
     """The changes of every chunk, put together, against the final state decoded at once."""
     files = sorted((out / "deltas").iterdir())
     assert [path.name for path in files] == list(names)
-    told = functools.reduce(apply_delta, map(load_delta, files), None)
+    told = functools.reduce(apply_delta, (load_delta(file)[0] for file in files), None)
     cache, header = load_state(out / "state.npz")
     exposure = np.exp(np.median(np.log(list(header["exposures"].values())), axis=0)).tolist()
-    told_header = load_delta_header(files[-1])
+    told_header = load_delta(files[-1])[1]
     assert told_header.pop("exposure") == pytest.approx(exposure)
     assert told_header == {"frame": header["frame"], "views": header["done"]}
     model, params = StreamSplat(StreamConfig.from_dict(header["config"])), load_weights(Path(narrow[1]))[0]

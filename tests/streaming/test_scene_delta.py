@@ -102,7 +102,7 @@ def test_deltas_come_back_from_disk_to_the_last_bit(tmp_path):
     cache = fuse(init_cache(CONFIG, CAPACITY), chunk(1), CONFIG)
     delta = SceneFeed(model, params).update(cache)
     save_delta(tmp_path / "00000.npz", delta)
-    read = load_delta(tmp_path / "00000.npz")
+    read, _ = load_delta(tmp_path / "00000.npz")
     jax.tree.map(np.testing.assert_array_equal, vars(read), vars(delta))
     contents = bytearray((tmp_path / "00000.npz").read_bytes())
     contents[len(contents) // 2] ^= 1

@@ -16,7 +16,7 @@ from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.viewer import browser as browser_module
 from ssplat_jax.viewer.browser import Browser
 from ssplat_jax.viewer.scene_sources import open_source
-from ssplat_jax.viewer.stage import RecordedRun, Stage, draw, visible_splats
+from ssplat_jax.viewer.stage import Stage, draw, visible_splats
 from ssplat_jax.viewer.view_scene import Viewer
 from tests.viewer.fake_client import FakeClient, delta, frame, free_port, header, scene
 
@@ -91,57 +91,25 @@ def run(tmp_path):
     return Run(tmp_path)
 
 
-def test_a_browser_follows_the_run_until_an_earlier_chunk_is_chosen(run):
+def test_a_browser_follows_the_run(run):
     run.update()
-    assert not run.client.nodes and not run.controls["Chunk"].visible
+    assert not run.client.nodes
     run.grow()
-    assert run.sent() == 4 and not run.controls["Chunk"].visible
+    assert run.sent() == 4
     assert run.stage.distance == pytest.approx(2.0)  # sqrt(0.5 * 32) stream units
-    gaussians, splats = run.stage.scene(), run.splats
+    gaussians, splats = run.stage.scene, run.splats
     means = np.asarray(gaussians.means)[np.asarray(gaussians.opacities) > 0]
     np.testing.assert_allclose(splats.centers * splats.scale * run.stage.distance, means, atol=1e-4)
     run.grow()
     run.grow()
-    assert run.sent() == 8 and (run.controls["Chunk"].value, run.controls["Chunk"].max) == (3, 3)
+    assert run.sent() == 8
     assert run.controls[""].content.startswith("**8** Gaussians from **6** views\n\nlast chunk 0.17 s, 30% of")
     updates = run.splats.num_updates
     run.update()
     assert run.splats.num_updates == updates  # nothing changed, nothing is sent
-    run.choose("Chunk", 1)
-    first = run.stage.source.at(1)
-    wanted = visible_splats(first, run.stage.unit, 1000)
+    wanted = visible_splats(run.stage.scene, run.stage.unit, 1000)
     np.testing.assert_array_equal(run.splats.centers, wanted["centers"])
     np.testing.assert_array_equal(run.splats.rgbs, wanted["rgbs"])
-    assert run.sent() == 4 and run.controls[""].content.startswith("**4** Gaussians from **2** views")
-    run.grow()  # the past stays in sight
-    assert run.sent() == 4 and run.controls["Chunk"].max == 4
-    run.choose("Chunk", 2)
-    assert run.sent() == 6
-    run.choose("Chunk", 4)
-    run.grow()
-    assert run.sent() == 12 and run.controls["Chunk"].value == 5
-
-
-def test_a_scene_without_gaussians_leaves_none_in_sight(run):
-    run.grow()
-    run.grow()
-    shown, visible = run.splats, run.stage.splats
-    assert run.sent() == 6
-    run.stage.splats = lambda scene: {name: x[:0] for name, x in visible(scene).items()}
-    run.choose("Chunk", 1)
-    assert shown.removed
-    run.stage.splats = visible
-    run.choose("Chunk", 2)
-    assert run.sent() == 6 and run.splats is not shown
-
-
-def test_the_past_of_a_run_that_is_being_started_anew_gives_way_to_its_newest_scene(run):
-    run.grow()
-    run.grow()
-    run.folder.delta(2).unlink()
-    run.controls["Chunk"].value = 1
-    run.browser.update()
-    assert run.sent() == 6
 
 
 def test_cameras_stand_where_the_views_were_taken_and_a_click_goes_there(run):
@@ -157,21 +125,8 @@ def test_cameras_stand_where_the_views_were_taken_and_a_click_goes_there(run):
     assert abs(third.image.mean() / 255 - 3 / 20) < 0.01
     third.click()
     np.testing.assert_allclose(run.client.camera.position, third.position)
-    run.choose("Chunk", 1)
-    assert [nodes[f"/cameras/{i}"].removed for i in range(4)] == [False, False, True, True]
     run.choose("Cameras", False)
     assert all(nodes[f"/cameras/{i}"].removed for i in range(4))
-
-
-def test_records_of_a_run_that_starts_anew_are_read_anew(tmp_path):
-    run, folder = RecordedRun(RunFolder(tmp_path)), RunFolder(tmp_path)
-    assert not run.refresh() and run.fov is None and run.views() == []
-    for k in (1, 2):
-        save_chunk_record(folder.chunk_record(2 * k), record(k))
-    assert run.refresh() and not run.refresh() and len(run.views()) == 4 and len(run.views(1)) == 2
-    folder.chunk_record(4).unlink()
-    save_chunk_record(folder.chunk_record(2), record(5))
-    assert run.refresh() and [view.frame for view in run.views()] == [8, 9]
 
 
 def test_a_picture_is_drawn_coarsely_then_finely_and_only_when_something_changes(run):
@@ -225,16 +180,6 @@ def test_depth_is_light_near_and_dark_far():
     depth = draw(walls, "depth", pose(), K, SIZE).astype(float)
     left, right = (slice(14, 18), slice(13, 17)), (slice(14, 18), slice(27, 30))
     assert depth[left].mean() > depth[right].mean() + 40 and (depth[:, 0] == 0).any()
-
-
-def test_a_scene_of_a_file_has_no_slider(tmp_path):
-    ss.save_ply(tmp_path / "scene.ply", scene(5))
-    stage, client = Stage(open_source(tmp_path), max_gaussians=3), FakeClient()
-    stage.refresh()
-    browser = Browser(client, stage)
-    browser.update()
-    assert len(client.nodes["/scene"].centers) == 3 and not client.controls["Chunk"].visible
-    assert client.controls[""].content == "**5** Gaussians"
 
 
 def restarted(folder, stream, *, size=1.0):
