@@ -1,7 +1,6 @@
 """Reads and writes scenes in the format given by the file's name: the one boundary for files that are damaged."""
 
 import dataclasses
-import functools
 import os
 import struct
 import zipfile
@@ -28,7 +27,7 @@ FilePath = str | os.PathLike
 Offset = tuple[float, float, float]
 ORIGIN: Offset = (0.0, 0.0, 0.0)
 # By the end of the file's name. A .ply may be a compressed one, whatever its name.
-WRITERS: dict[str, Callable[[SplatRows], bytes]] = {".ply": encode_ply, ".spz": encode_spz, ".sog": encode_sog}
+WRITERS: dict[str, Callable[..., bytes]] = {".ply": encode_ply, ".spz": encode_spz, ".sog": encode_sog}
 WRITERS |= {".glb": encode_glb, ".splat": encode_splat}
 SCENE_READERS: dict[str, Callable[[bytes], SplatRows]] = {".compressed.ply": decode_ply, ".ply": decode_ply}
 SCENE_READERS |= {".spz": decode_spz, ".sog": decode_sog, ".glb": decode_glb}
@@ -71,17 +70,19 @@ def save_gaussians(
     path: FilePath,
     gaussians: Gaussians,
     *,
+    suffix: str | None = None,
     render_mode: str | None = None,
     offset: Offset | None = None,
     max_splats: int | None = None,
     spz_version: int = 4,
     start_camera: dict[str, Any] | None = None,
 ) -> ExportReport:
-    """Writes `gaussians` to `path` atomically, in the format of its extension; the same Gaussians give the same bytes.
+    """Writes `gaussians` to `path` atomically; the same Gaussians give the same bytes.
 
     Args:
-        path: the file to write; its name ends as one of `WRITERS`. Missing folders are created.
+        path: the file to write. Missing folders are created.
         gaussians: the scene, in the frame of the file.
+        suffix: the format, one of `WRITERS`; by default the one that the file's name ends with.
         render_mode: the renderer that the scene is made for, one of `RENDER_MODES`, by default what `gaussians` say; a
             .spz and a .sog store only whether it is "mip", a .splat nothing.
         offset: origin of `gaussians` in the frame of the capture, by default theirs; a .spz, .sog or .splat does not
@@ -95,40 +96,8 @@ def save_gaussians(
         InputError: an unknown extension or render mode, positions or sizes that the format cannot hold, a wrong shape.
         StorageError: the file cannot be written.
     """
-    encode = WRITERS[check_format(path)]
-    if encode is encode_spz:
-        encode = functools.partial(encode_spz, version=spz_version)
-    elif encode is encode_sog:
-        encode = functools.partial(encode_sog, start_camera=start_camera)
-    return _save(path, gaussians, encode, render_mode, offset, max_splats)
-
-
-def save_ply(
-    path: FilePath, gaussians: Gaussians, *, render_mode: str | None = None, offset: Offset | None = None
-) -> ExportReport:
-    """Writes a 3DGS .ply, whatever the file's name; see `save_gaussians`."""
-    return _save(path, gaussians, encode_ply, render_mode, offset)
-
-
-def save_spz(
-    path: FilePath, gaussians: Gaussians, *, antialiased: bool | None = None, version: int = 4
-) -> ExportReport:
-    """Writes a .spz; `antialiased` says that it is made for a renderer with the 2D Mip filter. See `save_gaussians`."""
-    encode = functools.partial(encode_spz, version=version)
-    return _save(path, gaussians, encode, None if antialiased is None else "mip" if antialiased else "default")
-
-
-def save_splat(path: FilePath, gaussians: Gaussians) -> ExportReport:
-    """Writes a .splat; see `save_gaussians`."""
-    return _save(path, gaussians, encode_splat)
-
-
-def file_axes(path: FilePath) -> Float64[np.ndarray, "3 3"]:
-    """Matrix from the axes of a .ply, those of the capture, to those of the file's format."""
-    return {".glb": AXIS_FLIP, ".spz": RUB.T}.get(check_format(path), np.eye(3))
-
-
-def _save(path, gaussians, encode, render_mode=None, offset=None, max_splats=None) -> ExportReport:
+    encode = WRITERS[suffix or check_format(path)]
+    options = {encode_spz: {"version": spz_version}, encode_sog: {"start_camera": start_camera}}.get(encode, {})
     render_mode = gaussians.render_mode if render_mode is None else render_mode
     offset = gaussians.offset if offset is None else offset
     if render_mode not in RENDER_MODES:
@@ -136,8 +105,30 @@ def _save(path, gaussians, encode, render_mode=None, offset=None, max_splats=Non
     if max_splats is not None and max_splats < 1:
         raise refusal("--max-splats", wanted="at least 1", got=max_splats, fix="leave it out to write all")
     rows, num_cut = rows_to_write(gaussians, max_splats)
-    write_atomic(path, encode(dataclasses.replace(rows, render_mode=render_mode, offset=offset)))
+    write_atomic(path, encode(dataclasses.replace(rows, render_mode=render_mode, offset=offset), **options))
     return ExportReport(len(rows), gaussians.num_gaussians - len(rows) - num_cut, offset, num_cut)
+
+
+def save_ply(
+    path: FilePath, gaussians: Gaussians, *, render_mode: str | None = None, offset: Offset | None = None
+) -> ExportReport:
+    """Writes a 3DGS .ply, whatever the file's name; see `save_gaussians`."""
+    return save_gaussians(path, gaussians, suffix=".ply", render_mode=render_mode, offset=offset)
+
+
+def save_spz(path: FilePath, gaussians: Gaussians, *, version: int = 4) -> ExportReport:
+    """Writes a .spz of version 4 or 3, whatever the file's name; see `save_gaussians`."""
+    return save_gaussians(path, gaussians, suffix=".spz", spz_version=version)
+
+
+def save_splat(path: FilePath, gaussians: Gaussians) -> ExportReport:
+    """Writes a .splat, whatever the file's name; see `save_gaussians`."""
+    return save_gaussians(path, gaussians, suffix=".splat")
+
+
+def file_axes(path: FilePath) -> Float64[np.ndarray, "3 3"]:
+    """Matrix from the axes of a .ply, those of the capture, to those of the file's format."""
+    return {".glb": AXIS_FLIP, ".spz": RUB.T}.get(check_format(path), np.eye(3))
 
 
 def load_scene(path: FilePath) -> Gaussians:
