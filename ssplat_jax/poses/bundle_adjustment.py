@@ -286,15 +286,12 @@ def alike_cameras(camtoworlds: Float64[np.ndarray, "v 4 4"], depth: float) -> li
         depth: the distance that counts as much as `DEGREES_OF_DEPTH`, in the unit of the poses.
     """
     centers, axes = camtoworlds[:, :3, 3], camtoworlds[:, :3, 2]
-    pairs = set()
-    for i in range(len(camtoworlds)):
-        angles = np.degrees(np.arccos(np.clip(axes @ axes[i], -1.0, 1.0)))
-        unlike = np.linalg.norm(centers - centers[i], axis=1) / depth + angles / DEGREES_OF_DEPTH
-        unlike[angles > MAX_AXIS_DEGREES], unlike[i] = np.inf, np.inf
-        for j in np.argsort(unlike, kind="stable")[:NUM_PARTNERS]:
-            if np.isfinite(unlike[j]):
-                pairs.add((min(i, int(j)), max(i, int(j))))
-    return sorted(pairs)
+    angles = np.degrees(np.arccos(np.clip(axes @ axes.T, -1.0, 1.0)))
+    unlike = np.linalg.norm(centers[:, None] - centers, axis=-1) / depth + angles / DEGREES_OF_DEPTH
+    unlike[(angles > MAX_AXIS_DEGREES) | np.eye(len(unlike), dtype=bool)] = np.inf
+    nearest = np.argsort(unlike, axis=1, kind="stable")[:, :NUM_PARTNERS]
+    pairs = [(i, j) for i, row in enumerate(nearest.tolist()) for j in row if np.isfinite(unlike[i, j])]
+    return sorted({(min(pair), max(pair)) for pair in pairs})
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

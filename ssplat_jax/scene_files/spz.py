@@ -113,8 +113,26 @@ def _pack_rotations(quats: Float64[np.ndarray, "n 4"]) -> UInt32[np.ndarray, " n
 
 def decode_spz(data: bytes) -> SplatRows:
     """The rows of a .spz of version 2, 3 or 4."""
-    facts, widths, body, axes = _read_frames(data) if data[:4] == MAGIC else _read_stream(data)
-    version, count, fractional_bits, flags = facts
+    is_framed = data[:4] == MAGIC  # else the header is in a gzip stream, too
+    source, header = (io.BytesIO(data), HEADER) if is_framed else (gzip.GzipFile(fileobj=io.BytesIO(data)), OLD_HEADER)
+    magic, version, count, degree, fractional_bits, flags, *places = header.unpack(source.read(header.size))
+    if magic != MAGIC or version not in ((4,) if is_framed else (2, 3)) or degree > 3:
+        raise ValueError(f"wanted version 2 to 4 and SH degree 0 to 3, got version {version}, degree {degree}")
+    widths = 9, 1, 3, 3, 3 if version == 2 else 4, 3 * ((degree + 1) ** 2 - 1)  # bytes of each field of a Gaussian
+    if (size := count * sum(widths)) > len(data) * MAX_RATIO:
+        raise ValueError(f"{count} Gaussians do not fit; it is damaged or cut off")
+    if is_framed:
+        num_frames, table = places
+        if not HEADER.size <= table <= len(data) or num_frames not in (5 + (degree > 0), 6):
+            raise ValueError(f"wanted 5 or 6 fields, got {num_frames} at {table}")
+        records = data[HEADER.size : table]
+        body = _joined_frames(data, table, [count * width for width in widths[:num_frames]])
+    else:
+        body = source.read(size)
+        records = source.read(MAX_RECORDS + 1)[:MAX_RECORDS]  # to the end, where gzip compares the checksum
+    if len(body) < size:
+        raise ValueError(f"wanted {size} bytes for {count} Gaussians; it is cut off")
+    axes = _axes_of_records(records) if flags & HAS_RECORDS else "RUB"
     parts = np.split(np.frombuffer(body, np.uint8), count * np.cumsum(widths)[:-1])
     means, alphas, colors, scales, quats, rest = (
         part.reshape(count, width) for part, width in zip(parts, widths, strict=True)
@@ -136,29 +154,6 @@ def decode_spz(data: bytes) -> SplatRows:
     return SplatRows(**columns, render_mode=render_mode, offset=(0.0, 0.0, 0.0))
 
 
-def _widths(version: int, degree: int) -> tuple[int, ...]:
-    """Bytes of each field of a Gaussian."""
-    if version not in (2, 3, 4) or degree > 3:
-        raise ValueError(f"wanted version 2 to 4 and SH degree 0 to 3, got version {version}, degree {degree}")
-    return 9, 1, 3, 3, 3 if version == 2 else 4, 3 * ((degree + 1) ** 2 - 1)
-
-
-def _read_stream(data: bytes):
-    """Version, count, fractional bits and flags; the widths of the fields; the fields; the axes. Versions 2 and 3."""
-    with gzip.GzipFile(fileobj=io.BytesIO(data)) as stream:
-        magic, version, count, degree, fractional_bits, flags, _ = OLD_HEADER.unpack(stream.read(OLD_HEADER.size))
-        if magic != MAGIC or version == 4:
-            raise ValueError("wanted a .spz of version 2 or 3 in the gzip stream")
-        widths = _widths(version, degree)
-        size = count * sum(widths)
-        body = stream.read(size) if size <= len(data) * MAX_RATIO else b""  # else the count is damaged
-        records = stream.read(MAX_RECORDS + 1)  # to the end, where gzip compares the checksum
-    if len(body) < size:
-        raise ValueError(f"wanted {size} bytes for {count} Gaussians; it is cut off")
-    axes = _axes_of_records(records[:MAX_RECORDS]) if flags & HAS_RECORDS else "RUB"
-    return (version, count, fractional_bits, flags), widths, body, axes
-
-
 def _axes_of_records(records: bytes) -> str:
     """The axes that records of extensions name, by default those of the format."""
     axes, place = "RUB", 0
@@ -172,23 +167,16 @@ def _axes_of_records(records: bytes) -> str:
     return axes
 
 
-def _read_frames(data: bytes):
-    """Parts of a file of version 4, as `_read_stream` gives those of older ones."""
-    _, version, count, degree, fractional_bits, flags, num_frames, table = HEADER.unpack_from(data)
-    widths = _widths(version, degree)
-    if version != 4 or not HEADER.size <= table <= len(data) or num_frames not in (5 + (degree > 0), 6):
-        raise ValueError(f"wanted version 4 with 5 or 6 fields, got version {version} with {num_frames} at {table}")
-    axes = _axes_of_records(data[HEADER.size : table]) if flags & HAS_RECORDS else "RUB"
-    if count * sum(widths) > len(data) * MAX_RATIO:
-        raise ValueError(f"{count} Gaussians do not fit; it is damaged or cut off")
-    body, place = [], table + num_frames * SIZES.size
-    for i, width in enumerate(widths[:num_frames]):
+def _joined_frames(data: bytes, table: int, sizes: list[int]) -> bytes:
+    """The fields of a file of version 4, of known sizes, from the table of their frames on."""
+    body, place = [], table + len(sizes) * SIZES.size
+    for i, wanted in enumerate(sizes):
         length, size = SIZES.unpack_from(data, table + i * SIZES.size)
         frame, place = data[place : place + length], place + length
-        if size != count * width or len(frame) < length:
-            raise ValueError(f"field {i}: wanted {count * width} bytes, got {size}; it is damaged or cut off")
+        if size != wanted or len(frame) < length:
+            raise ValueError(f"field {i}: wanted {wanted} bytes, got {size}; it is damaged or cut off")
         body.append(_decompressed(frame, size) if length else b"")
-    return (version, count, fractional_bits, flags), widths, b"".join(body), axes
+    return b"".join(body)
 
 
 def _decompressed(frame: bytes, size: int) -> bytes:

@@ -21,7 +21,7 @@ from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 from jaxtyping import PyTree
 
-from ssplat_jax.cache import VoxelCache, check_cache, grow
+from ssplat_jax.cache import VoxelCache, grow
 from ssplat_jax.cache.state import required_capacity
 from ssplat_jax.core.chunk import Chunk
 from ssplat_jax.core.errors import InputError
@@ -60,7 +60,7 @@ class ShardedStream:
         >>> for pair in zip(first.chunks(model.config), second.chunks(model.config)):
         ...     caches = sharded.ensure_capacity(caches, num_new_tokens)
         ...     caches, out = step(params, caches, jax.tree.map(lambda *x: jnp.stack(x), *pair))
-        ...     sharded.check(caches)
+        ...     ss.check_cache(caches, model.config)
         >>> gaussians = jax.jit(sharded.decode)(params, caches)
     """
 
@@ -129,14 +129,6 @@ class ShardedStream:
             return caches
         grown = self._map(lambda shards: grow(shards, wanted), (self._cache_spec,), self._cache_spec)
         return jax.jit(grown)(caches)
-
-    def check(self, caches: VoxelCache) -> None:
-        """Raises if a cache lost tokens that its overflow policy promises to keep; see `cache.check_cache`.
-
-        Raises:
-            CacheError: tokens were dropped under `overflow="grow"`.
-        """
-        check_cache(caches, self.model.config)
 
     @property
     def _cache_spec(self) -> P:

@@ -12,6 +12,7 @@ import numpy as np
 from jax.sharding import NamedSharding
 from jax.sharding import PartitionSpec as P
 
+from ssplat_jax.cache import check_cache
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.streaming.sharded import ShardedStream
 
@@ -24,7 +25,7 @@ def steps(mesh, config, params, chunks, num_new_tokens):
     for t in range(len(chunks.valid)):
         caches, output = step(params, caches, on_mesh(mesh, P("streams"), jax.tree.map(lambda x, t=t: x[t], chunks)))
         history.append(everywhere(mesh, (caches, output)))
-    sharded.check(caches)
+    check_cache(caches, sharded.model.config)
     grown = sharded.ensure_capacity(caches, num_new_tokens)
     scenes = jax.jit(sharded.decode)(params, caches)
     return history, step._cache_size(), *everywhere(mesh, (scenes, grown))
