@@ -244,7 +244,7 @@ def trained_by(config: StreamConfig, recipe: Recipe, params: dict, mix: CaptureM
         KeyboardInterrupt: a signal stopped it.
     """
     with tempfile.TemporaryDirectory() as folder:
-        lpips = installed_lpips() if recipe.renders else None
+        lpips = installed_lpips() if any(phase.loss.renders for phase in recipe.phases) else None
         done = train(config, recipe, Path(folder), params=params, mix=mix, lpips_weights=lpips)
     if done.interrupted:
         raise KeyboardInterrupt

@@ -44,8 +44,6 @@ class Train:
     shares: tuple[float, ...] = ()
     """Share of the steps of each of --captures; the rest is procedural. Default: half of the steps, equally; all
     of them in paper."""
-    validate_every: int = 200
-    """Steps between scores of held-out frames of --captures, in the log."""
     save_every: int = 200
     """Steps between checkpoints."""
     set: ConfigChanges = ()
@@ -59,7 +57,7 @@ class Train:
         from ssplat_jax.training.loop import train
         from ssplat_jax.training.recipe import RECIPES, describe
 
-        require_positive(scale_steps=self.scale_steps, save_every=self.save_every, validate_every=self.validate_every)
+        require_positive(scale_steps=self.scale_steps, save_every=self.save_every)
         require_seed(self.seed)
         if self.recipe not in RECIPES:
             raise refusal("--recipe", wanted=" | ".join(RECIPES), got=echo(self.recipe), fix="choose one of these")
@@ -88,7 +86,6 @@ class Train:
                 mix=mix,
                 lpips_weights=lpips_weights,
                 save_every=self.save_every,
-                validate_every=self.validate_every,
                 report=lambda record: advance(record["step"], _describe_record(record)),
                 say=reporter.say,
                 warn=reporter.warn,
@@ -116,18 +113,10 @@ class Train:
         """Refuses options of which the recipe would make nothing."""
         from ssplat_jax.training.samples import ViewSamples
 
-        validates, draws = (
-            self.validate_every != Train.validate_every,
-            isinstance(recipe.phases[0].samples, ViewSamples),
-        )
-        for flag, is_given, is_used in (
-            ("--shares", self.shares, draws),
-            ("--validate-every", validates, recipe.renders),
-        ):
-            if is_given and not is_used:
-                raise InputError(f"{flag}: --recipe {self.recipe} has no use for it; leave it out.")
-        if (self.shares or validates) and not self.captures:
-            raise InputError("--shares, --validate-every: wanted --captures beside them; got none.")
+        if self.shares and not isinstance(recipe.phases[0].samples, ViewSamples):
+            raise InputError(f"--shares: --recipe {self.recipe} has no use for it; leave it out.")
+        if self.shares and not self.captures:
+            raise InputError("--shares: wanted --captures beside it; got none.")
         if recipe.captures_alone and not self.captures:
             raise InputError(f"--recipe {self.recipe}: wanted --captures, from which alone it learns; got none.")
         if recipe.untrained and self.init_weights is None:
@@ -167,6 +156,5 @@ def _differences(held: StreamConfig, config: StreamConfig) -> str:
 
 def _describe_record(record: dict) -> str:
     """Numbers of a training record that fit beside a progress bar."""
-    labels = {"validation_psnr": "held-out psnr", "depth_l1": "depth"}
-    shown = ("validation_psnr", "loss", "depth_l1", "psnr", "accepted")
-    return "  ".join(f"{labels.get(name, name)} {record[name]:.3f}" for name in shown if name in record)
+    shown = ("loss", "depth_l1", "psnr", "accepted")
+    return "  ".join(f"{name} {record[name]:.3f}" for name in shown if name in record)

@@ -1,7 +1,7 @@
 """Captures that a training learns from, beside procedural scenes.
 
-Every 8th frame of a capture from the 5th on, a target of the interleaved protocol, is held out: samples to learn from
-show it neither as context nor as target, and validation scores it.
+Every 8th frame of a capture from the 5th on, a target of the interleaved protocol, is held out: samples show it neither
+as context nor as target, and `ssplat eval` scores it.
 """
 
 import dataclasses
@@ -124,8 +124,3 @@ def captures_in(folder: Path) -> list[Path]:
 def learned_frames(capture: Capture) -> list[int]:
     """Frames that may be learned from."""
     return [i for i in range(len(capture)) if i % TARGET_STEP != FIRST_TARGET]
-
-
-def held_out_frames(capture: Capture) -> range:
-    """Frames that no sample to learn from shows."""
-    return range(FIRST_TARGET, len(capture), TARGET_STEP)

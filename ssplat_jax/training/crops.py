@@ -146,10 +146,6 @@ class Crops:
         max_pairs = round_up(int(PAIRS_MARGIN * max(counts)))
         return lambda step, place: tuple(crop(self.batch * step + i, max_pairs) for i in range(self.batch))
 
-    def held_out(self, mix: CaptureMix) -> list:
-        """None: no step scores the frames that a stream leaves out."""
-        return []
-
 
 def stream_scene(model: StreamSplat, params: dict, capture: Capture, stride: int) -> tuple[VoxelCache, KeyViews]:
     """Cache of a finished stream, and views of its scene: half of them were streamed, the others not shown to it.

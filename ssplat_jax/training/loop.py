@@ -28,12 +28,10 @@ from ssplat_jax.storage.run_folder import Interrupts, lock_folder
 from ssplat_jax.storage.saved_states import TrainingCheckpoints
 from ssplat_jax.storage.weights import params_digest
 from ssplat_jax.training.capture_mix import CaptureMix, TrainingStart
-from ssplat_jax.training.recipe import Loss, Phase, Recipe, describe
+from ssplat_jax.training.recipe import Phase, Recipe, describe
 
 T = TypeVar("T")
 
-SCORES = ("psnr", "psnr_over_black", "lpips")
-"""Metrics of a step that are reported of held-out frames too."""
 ALWAYS = 2**30
 """Steps in a row that may have a gradient that is not finite: all of them are skipped, and counted in the log."""
 
@@ -167,7 +165,6 @@ def train(
     mix: CaptureMix | None = None,
     lpips_weights: LpipsWeights | None = None,
     save_every: int = 200,
-    validate_every: int = 200,
     log_every: int = 10,
     report: Callable[[dict], None] = lambda record: None,
     say: Callable[[str], None] = lambda message: None,
@@ -184,7 +181,6 @@ def train(
         mix: captures to learn from, beside procedural scenes.
         lpips_weights: weights of LPIPS, which rendering losses then include.
         save_every: steps between checkpoints. SIGINT and SIGTERM save one too.
-        validate_every: steps between scores of held-out frames of the captures.
         log_every: steps between log records, which hold means over these steps, and with which `report` is called.
         report, say, warn: called with records, with messages while samples are prepared, and with warnings.
 
@@ -207,10 +203,6 @@ def train(
     # Processes that train beside each other draw other samples.
     start = TrainingStart(model, params, mix, recipe.seed + jax.process_index(), recipe.num_steps, say)
 
-    @functools.cache
-    def held_out(phase: Phase) -> list:
-        return phase.samples.held_out(mix) if mix and phase.loss.renders else []
-
     with lock_folder(out), Interrupts(has_work=False) as interrupts:
         checkpoints = TrainingCheckpoints(out, describe_run(config, recipe, name, mix, lpips_weights))
         if (restored := checkpoints.restore_latest(state, warn)) is not None:
@@ -220,13 +212,8 @@ def train(
             state, metrics = update(state, constants, batch, lpips_weights, phase=phase)
             log.metrics.append(metrics)
             interrupts.has_work, done, is_last = True, step + 1, step + 1 == recipe.num_steps
-            is_scored = (done % validate_every == 0 or is_last) and held_out(phase)
-            if done % log_every == 0 or is_scored or is_last:
-                record = log.record(done, phase, state)
-                if is_scored:
-                    params = constants | averaged(recipe, state)
-                    record |= scores(model, params, phase.loss, held_out(phase), lpips_weights)
-                log.write(record)
+            if done % log_every == 0 or is_last:
+                log.write(done, phase, state)
             stopped = interrupts.received  # read once, since a signal may arrive at any time
             if done % save_every == 0 or is_last or stopped:
                 checkpoints.save(done, state)
@@ -265,18 +252,6 @@ def prefetched(produce: Callable[[int], T], steps: Iterable[int], workers: int =
             pool.shutdown(cancel_futures=True)
 
 
-def scores(model: StreamSplat, params: dict, loss: Loss, samples: list, lpips: LpipsWeights | None) -> dict[str, float]:
-    """Means of the loss's metrics over held-out samples, as `validation_psnr` and so on."""
-    rows = [jax.device_get(_metrics(params, sample, lpips, model, loss)) for sample in samples]
-    means = {name: float(np.mean([row[name] for row in rows])) for name in SCORES if name in rows[0]}
-    return {f"validation_{name}": round(mean, 4) for name, mean in means.items()}
-
-
-@functools.partial(jax.jit, static_argnums=(3, 4))
-def _metrics(params: dict, batch: Any, lpips: LpipsWeights | None, model: StreamSplat, loss: Loss) -> dict:
-    return loss(model, params, batch, lpips)[1]
-
-
 class _Log:
     """Metrics since the last record, and the file that records are appended to.
 
@@ -295,16 +270,13 @@ class _Log:
         self.metrics: list[dict] = []
         self._since = time.perf_counter()
 
-    def record(self, done: int, phase: Phase, state: TrainState) -> dict:
-        """Means of the metrics, and the time of a step, since the last record."""
+    def write(self, done: int, phase: Phase, state: TrainState) -> None:
+        """Appends means of the metrics, and the time of a step, since the last record to the file, and reports them."""
         rows = jax.device_get(self.metrics)  # waits: steps are dispatched asynchronously
         seconds = round((time.perf_counter() - self._since) / len(rows), 4)
         means = {name: round(float(np.mean([row[name] for row in rows if name in row])), 5) for name in rows[-1]}
         skipped = int(state.optimizer[0].total_notfinite)
-        return {"step": done, "phase": phase.name, **means, "skipped": skipped, "seconds_per_step": seconds}
-
-    def write(self, record: dict) -> None:
-        """Appends a record to the file and reports it."""
+        record = {"step": done, "phase": phase.name, **means, "skipped": skipped, "seconds_per_step": seconds}
         with self._path.open("a") as file:
             file.write(json_text(record, indent=None) + "\n")
         self._report(record)

@@ -33,15 +33,13 @@ AFTER_MATCHER = ("hpda", "tokens", "cgfi", "mixer", "decoder")
 class Samples(Protocol):
     """Samples that the steps of a phase learn from, such as `ViewSamples` and `Crops`.
 
-    `check` raises an InputError if the captures cannot teach the phase, `open` gives a function that makes a batch of
-    the number of its step in the recipe and its place in the phase, and `held_out` batches that are scored.
+    `check` raises an InputError if the captures cannot teach the phase, and `open` gives a function that makes a batch
+    of the number of its step in the recipe and its place in the phase.
     """
 
     def check(self, mix: CaptureMix, config: StreamConfig, *, renders: bool) -> None: ...
 
     def open(self, start: TrainingStart) -> Callable[[int, int], Any]: ...
-
-    def held_out(self, mix: CaptureMix) -> list: ...
 
 
 @runtime_checkable
@@ -109,11 +107,6 @@ class Recipe:
     def __post_init__(self) -> None:
         if not self.phases or any(phase.steps < 1 for phase in self.phases):
             raise InputError(f"recipe: wanted phases of at least one step, got {self.phases}.")
-
-    @property
-    def renders(self) -> bool:
-        """True if a loss renders target views."""
-        return any(phase.loss.renders for phase in self.phases)
 
     @property
     def uses_lpips(self) -> bool:

@@ -22,7 +22,7 @@ from ssplat_jax.data.depth_range import FAR_FACTOR, NEAR_FACTOR
 from ssplat_jax.data.procedural.procedural_views import STEP_RANGE, training_sample
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.model.views import GRID_STRIDE
-from ssplat_jax.training.capture_mix import CaptureMix, TrainingStart, held_out_frames, learned_frames
+from ssplat_jax.training.capture_mix import CaptureMix, TrainingStart, learned_frames
 
 MAX_LOG_STEP = 0.05
 """Log depths of neighboring pixels that differ by more belong to different surfaces."""
@@ -30,8 +30,6 @@ NEARLY = 1 - 1e-4
 """Factor on the farthest depth that gives one within the range."""
 MAX_STRIDE = 8
 """Largest distance of consecutive frames of a sample, in frames that may be learned from."""
-NUM_HELD_OUT = 8
-"""Most samples of a validation, one a capture."""
 
 
 @pytree
@@ -102,13 +100,6 @@ class ViewSamples:
                 return jax.tree.map(lambda *parts: jnp.stack(parts), *[sample(number, size) for number in numbers])
 
         return batch
-
-    def held_out(self, mix: CaptureMix) -> list[Sample]:
-        """Batches of one sample with a held-out target each; of one size, so of one program."""
-        every = mix.captures
-        places = np.unique(np.linspace(0, len(every) - 1, NUM_HELD_OUT).round().astype(int))
-        samples = [held_out_sample(self, mix, every[place], [i, 19]) for i, place in enumerate(places)]
-        return [jax.tree.map(lambda x: x[None], sample) for sample in samples]
 
 
 def _cpu():
@@ -182,19 +173,6 @@ def capture_sample(
     context = [i for place, i in enumerate(frames) if place not in chosen]
     targets = [i for place, i in enumerate(frames) if place in chosen]
     return _sample_of_frames(mix, capture, context, targets, size, rng, views.range_jitter)
-
-
-def held_out_sample(views: ViewSamples, mix: CaptureMix, capture: Capture, seed: Sequence[int]) -> Sample:
-    """A sample whose one target is held out, between context views that are not; see `capture_sample`.
-
-    Limits:
-        Without a held-out frame between the context views, the nearest one beside them is taken.
-    """
-    rng = np.random.default_rng(seed)
-    context = _window(rng, learned_frames(capture), views.num_chunks * mix.config.stream.chunk_size)
-    middle = (context[0] + context[-1]) / 2
-    target = min(held_out_frames(capture), key=lambda i: abs(i - middle))
-    return _sample_of_frames(mix, capture, context, [target], views.sizes[0], rng, 0.0)
 
 
 def _window(rng: np.random.Generator, frames: list[int], count: int) -> list[int]:

@@ -124,7 +124,7 @@ def test_usage_that_does_not_parse_is_short_and_exit_2(arguments, named, capsys)
         (("eval", "procedural:room", "--context", "5", "--size", "huge", "--out", "x"), "--size"),
         (("eval", "procedural:room", "--context", "8", "--set", "voxel_size=-1", "--out", "x"), "voxel_size"),
         (("eval", "procedural:room", "--context", "8", "--weights", "no.npz", "--out", "x"), "no.npz"),
-        (("train", "--validate-every", "5", "--out", "x"), "--validate-every: "),
+        (("train", "--shares", "0.5", "--out", "x"), "--shares: wanted --captures"),
         (("bench", "effects", "--large"), "--large: benchmark effects has no use for it"),
         (("run", "procedural:room?frames=2&size=32x24", "--stride", "0", "--out", "x"), "--stride"),
         (("export", "no_run", "--to", "x.ply"), "no_run"),

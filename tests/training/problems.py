@@ -33,9 +33,6 @@ class Numbers:
 
         return batch
 
-    def held_out(self, mix):
-        return []
-
 
 @dataclasses.dataclass(frozen=True)
 class Squares:
