@@ -1,7 +1,7 @@
 """Bundle adjustment around given poses: motions of cameras and places of points that explain where points were seen.
 
-    keypoints (SIFT) of each image -> pairs of cameras that look alike -> matches near epipolar lines -> tracks, the
-    surest matches first; a track is the places of one point in several images
+    keypoints (SIFT) of each image -> pairs of cameras that look alike -> matches near epipolar lines -> tracks;
+    a track is the places of one point in several images
     points where their rays meet -> Levenberg-Marquardt with a robust loss that grows stricter
 
 The given poses are a prior: each camera is pulled towards its own by the error that such poses may have. So the frame
@@ -17,12 +17,13 @@ Lowe, Distinctive Image Features from Scale-Invariant Keypoints, IJCV 2004.
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int
 from scipy.sparse import csr_array, diags_array
+from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
 from skimage.feature import SIFT
@@ -252,7 +253,7 @@ def find_tracks(
         found.append(only_seen(sift_keypoints(capture.image(i)), capture.seen(i)))
         advance(done + 1)
     poses = np.stack([capture.frames[i].camtoworld for i in indices])
-    matches = [_match(capture, indices, pair, found) for pair in alike_cameras(poses, depth)]
+    matches = {pair: _match(capture, indices, pair, found) for pair in alike_cameras(poses, depth)}
     views, keypoints, points = merged_tracks([len(k.pixels) for k in found], matches)
     viewmats = np.stack([invert_pose(pose) @ poses[0] for pose in poses])
     viewmats[:, :3, 3] /= depth
@@ -294,59 +295,42 @@ def alike_cameras(camtoworlds: Float64[np.ndarray, "v 4 4"], depth: float) -> li
     return sorted({(min(pair), max(pair)) for pair in pairs})
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Matches:
-    """Matches of a pair of views."""
-
-    views: tuple[int, int]
-    keypoints: Int[np.ndarray, "n 2"]  # of the first and the second view
-    distances: Float32[np.ndarray, " n"]  # between descriptors
-
-
 def _match(
     capture: PosedImages, indices: Sequence[int], pair: tuple[int, int], found: Sequence[SiftKeypoints]
-) -> Matches:
-    """Matches near epipolar lines, which leave a few candidates each."""
+) -> Int[np.ndarray, "n 2"]:
+    """Matching keypoints of two views near epipolar lines, which leave a few candidates each."""
     (i, j), (a, b) = (indices[v] for v in pair), (found[v] for v in pair)
     R, t = motion_between(capture.frames[i].camtoworld, capture.frames[j].camtoworld)
     lines = epipolar_distances(pixel_rays(capture.K(i), a.pixels), pixel_rays(capture.K(j), b.pixels), R, t)
     apart = np.sqrt(np.maximum(2 - 2 * a.descriptors @ b.descriptors.T, 0.0))
     apart = np.where(lines < np.radians(MAX_EPIPOLAR_DEGREES), apart, 2.0)
-    rows, columns = mutual_nearest(apart, MAX_DISTANCE, MAX_RATIO)
-    if len(rows) < MIN_MATCHES:
-        rows, columns = rows[:0], columns[:0]
-    return Matches(pair, np.stack([rows, columns], axis=1), apart[rows, columns])
+    matches = np.stack(mutual_nearest(apart, MAX_DISTANCE, MAX_RATIO), axis=1)
+    return matches if len(matches) >= MIN_MATCHES else matches[:0]
 
 
 def merged_tracks(
-    counts: Sequence[int], matches: Sequence[Matches]
+    counts: Sequence[int], matches: Mapping[tuple[int, int], Int[np.ndarray, "_ 2"]]
 ) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"], Int[np.ndarray, " n"]]:
-    """Tracks of the matches. The surest match comes first; one that would show a camera a point twice is left out.
+    """Tracks: keypoints that matches connect. One that shows a camera a point twice has a false match and is left out.
+
+    Taking the surest matches first, and leaving out those alone that contradict them, gave 5 to 14 % more points on
+    three scenes, and 0.20 instead of 0.21 degrees of error between neighbors.
 
     Args:
         counts: keypoints of each view.
-        matches: matches of pairs of views.
+        matches: matching keypoints by pair of views.
 
     Returns:
         Of each observation the view, the keypoint (counted through all views), and the point; all numbers of points
         from 0 on occur, each at least twice.
     """
     starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-    ends = [np.zeros((0, 2), np.int64), *(match.keypoints + starts[list(match.views)] for match in matches)]
-    order = np.argsort(np.concatenate([np.zeros(0), *(match.distances for match in matches)]), kind="stable")
+    ends = [np.zeros((0, 2), np.int64), *(rows + starts[list(pair)] for pair, rows in matches.items())]
+    rows, columns = np.concatenate(ends).T
     view = np.repeat(np.arange(len(counts)), counts)
-    track, members, seen_by = list(range(len(view))), [[i] for i in range(len(view))], [{v} for v in view.tolist()]
-    for a, b in np.concatenate(ends)[order].tolist():
-        a, b = track[a], track[b]
-        if a == b or not seen_by[a].isdisjoint(seen_by[b]):
-            continue
-        if len(members[a]) < len(members[b]):
-            a, b = b, a
-        for i in members[b]:
-            track[i] = a
-        members[a] += members[b]
-        seen_by[a] |= seen_by[b]
-    numbers = np.array(track, np.int64)
-    used = np.flatnonzero(np.bincount(numbers, minlength=len(numbers))[numbers] > 1)
-    _, points = np.unique(numbers[used], return_inverse=True)
-    return view[used], used, points
+    graph = csr_array((np.ones(len(rows)), (rows, columns)), (len(view), len(view)))
+    track = connected_components(graph, directed=False)[1]
+    num_views = np.bincount(np.unique(track * len(counts) + view) // len(counts))
+    sizes = np.bincount(track)
+    used = np.flatnonzero(((sizes > 1) & (sizes == num_views))[track])
+    return view[used], used, np.unique(track[used], return_inverse=True)[1]

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ssplat_jax.poses.bundle_adjustment import Matches, alike_cameras, merged_tracks, sift_keypoints
+from ssplat_jax.poses.bundle_adjustment import alike_cameras, merged_tracks, sift_keypoints
 from tests.poses.room_fixture import pictures, walk
 
 
@@ -27,19 +27,16 @@ def test_pairs_are_the_nearest_cameras_that_look_the_same_way():
     assert not any(29 in pair for pair in pairs)
 
 
-def merged(*matches, counts=(3, 3, 3)):
-    found = [Matches(views, np.array(rows), np.array(sure, np.float32)) for views, rows, sure in matches]
-    views, keypoints, points = merged_tracks(counts, found)
+def merged(matches, counts=(3, 3, 3)):
+    views, keypoints, points = merged_tracks(counts, {pair: np.array(rows) for pair, rows in matches.items()})
     seen = np.stack([views, keypoints - 3 * views], axis=1).tolist()
     return {frozenset(tuple(seen[i]) for i in np.flatnonzero(points == p)) for p in set(points.tolist())}
 
 
-def test_matches_are_chained():
-    found = merged(((0, 1), [[0, 1]], [0.1]), ((1, 2), [[1, 2]], [0.1]))
-    assert found == {frozenset({(0, 0), (1, 1), (2, 2)})}
-
-
-def test_a_match_that_would_show_a_camera_a_point_twice_is_left_out_the_less_sure_one():
-    chain = ((0, 1), [[0, 1]], [0.1]), ((1, 2), [[1, 2]], [0.2])
-    assert merged(*chain, ((0, 2), [[1, 2]], [0.3])) == {frozenset({(0, 0), (1, 1), (2, 2)})}
-    assert merged(*chain, ((0, 2), [[1, 2]], [0.15])) == {frozenset({(0, 0), (1, 1)}), frozenset({(0, 1), (2, 2)})}
+def test_matches_are_chained_and_a_track_that_shows_a_camera_a_point_twice_is_left_out():
+    chain = {(0, 1): [[0, 1]], (1, 2): [[1, 2]]}
+    other = {(0, 2): [[2, 0]]}
+    track, second = frozenset({(0, 0), (1, 1), (2, 2)}), frozenset({(0, 2), (2, 0)})
+    assert merged(chain) == {track} and merged(chain | other) == {track, second}
+    assert merged(chain | {(0, 2): [[1, 2], [2, 0]]}) == {second}
+    assert merged({}) == set()
