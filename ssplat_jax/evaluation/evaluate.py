@@ -158,12 +158,5 @@ def _refine(
         refined, report = refine_on_capture(
             gaussians, streamed, context, stream_frame, exposures, steps=steps, on_step=on_step
         )
-    done = {
-        "steps": report.num_steps,
-        "stopped_early": report.stopped_early,
-        "skipped_steps": report.num_skipped,
-        "seconds": round(time.perf_counter() - start, 2),
-        "seconds_per_step": round(report.seconds_per_step, 4),
-        "views_left_out": report.num_left_out,
-    }
-    return refined, done
+    done = {name: value for name, value in vars(report).items() if name not in ("losses", "held_back")}
+    return refined, done | {"seconds": round(time.perf_counter() - start, 2)}

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Float64
 from PIL import Image
 from PIL.ExifTags import IFD, Base
 from scipy.ndimage import laplace
@@ -147,17 +147,13 @@ def scan_video(path: Path, advance: Advance) -> tuple[Float64[np.ndarray, " n"],
         scale = min(SMALL_WIDTH / max(frame.width, frame.height), 1.0)
         width, height = (max(round(side * scale), 8) for side in (frame.width, frame.height))
         small = frame.reformat(width=width, height=height, format="gray", interpolation="AREA")
-        sharpnesses.append(sharpness(small.to_ndarray().astype(np.float32)))
+        # The mean squared Laplacian is comparable between frames that show the same things.
+        sharpnesses.append(float(np.mean(np.square(laplace(small.to_ndarray().astype(np.float32))[1:-1, 1:-1]))))
         seconds = frame.time or 0.0
         advance(len(sharpnesses))
     if len(sharpnesses) < 2:
         raise refusal(str(path), wanted="a video of a moving camera", got=f"{len(sharpnesses)} frames", fix=FIX)
     return np.array(sharpnesses), seconds
-
-
-def sharpness(gray: Float32[np.ndarray, "h w"]) -> float:
-    """Mean squared Laplacian of an image; comparable between frames that show the same things."""
-    return float(np.mean(np.square(laplace(gray)[1:-1, 1:-1])))
 
 
 def choose_frames(sharpnesses: Float64[np.ndarray, " n"], seconds: float, max_frames: int) -> list[int]:

@@ -29,6 +29,9 @@ from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.model.streamsplat import ChunkOutput, StreamSplat
 
+AXES = STREAMS, VOXELS = "streams", "voxels"
+"""Axes of the mesh."""
+
 
 @dataclasses.dataclass(frozen=True)
 class ShardedStream:
@@ -40,9 +43,8 @@ class ShardedStream:
 
     Args:
         model: the model to run; its config's `capacity` is that of one shard.
-        mesh: devices of one process or of several. Axes other than the two below repeat the work.
-        streams: the axis of `mesh` that splits the streams.
-        voxels: the axis of `mesh` that splits each cache.
+        mesh: devices of one process or of several. The axis `streams` splits the streams, `voxels` splits each cache;
+            others repeat the work.
 
     Limits:
         Given the same tokens, a voxel holds the same pivots as in a single cache, to the last bit; only the order of
@@ -66,8 +68,6 @@ class ShardedStream:
 
     model: StreamSplat
     mesh: Mesh
-    streams: str = "streams"
-    voxels: str = "voxels"
 
     def __post_init__(self) -> None:
         if self.model.config.stream.steps_per_chunk:
@@ -75,11 +75,10 @@ class ShardedStream:
                 "sharded stream: wanted stream.steps_per_chunk=0, which only a Session carries out, got "
                 f"{self.model.config.stream.steps_per_chunk}; set it to 0 and refine the finished scene with ss.refine."
             )
-        axes = {self.streams, self.voxels}
-        if len(axes) < 2 or not axes <= set(self.mesh.axis_names):
+        if not set(AXES) <= set(self.mesh.axis_names):
             raise InputError(
-                f"sharded stream: the mesh needs an axis for streams and another for voxels, {self.streams!r} and "
-                f"{self.voxels!r}, got {self.mesh.axis_names}; give an axis that you do not use size 1."
+                f"sharded stream: the mesh needs the axes {STREAMS} and {VOXELS}, got {self.mesh.axis_names}; give an"
+                " axis that you do not use size 1."
             )
 
     def init_cache(self, num_streams: int | None = None) -> VoxelCache:
@@ -88,7 +87,7 @@ class ShardedStream:
         Raises:
             InputError: the streams do not divide evenly over the rows of the mesh.
         """
-        rows, shards = (self.mesh.shape[axis] for axis in (self.streams, self.voxels))
+        rows, shards = (self.mesh.shape[axis] for axis in AXES)
         num_streams = num_streams or rows
         if num_streams % rows:
             raise InputError(f"sharded stream: num_streams must be a multiple of the mesh's {rows}, got {num_streams}.")
@@ -100,18 +99,18 @@ class ShardedStream:
 
     def step(self, params: dict, caches: VoxelCache, chunks: Chunk) -> tuple[VoxelCache, ChunkOutput]:
         """`StreamSplat.step` for one chunk of every stream (leading axis); the caches come first, as a scan's carry."""
-        model = dataclasses.replace(self.model, axis=self.voxels)
+        model = dataclasses.replace(self.model, axis=VOXELS)
 
         def step_stream(params: dict, shard: VoxelCache, chunk: Chunk) -> tuple[VoxelCache, ChunkOutput]:
             cache = _without_axis(shard)
             prediction = model.predict(params, cache, chunk)
-            tokens, output = _from_first_shard((prediction.tokens, prediction.output), self.voxels)
+            tokens, output = _from_first_shard((prediction.tokens, prediction.output))
             return _with_axis(model.update_cache(cache, replace(prediction, tokens=tokens, output=output))), output
 
         def step_device(params, shards, chunks):
             return jax.lax.map(lambda x: step_stream(params, *x), (shards, chunks))
 
-        given, results = (P(), self._cache_spec, P(self.streams)), (self._cache_spec, P(self.streams))
+        given, results = (P(), self._cache_spec, P(STREAMS)), (self._cache_spec, P(STREAMS))
         return self._map(step_device, given, results)(params, caches, chunks)
 
     def decode(self, params: dict, caches: VoxelCache) -> Gaussians:
@@ -134,7 +133,7 @@ class ShardedStream:
     def _cache_spec(self) -> P:
         """Partition of the caches over the mesh."""
         # Without axes of size 1, as XLA writes it for results of a step: otherwise `jit` would compile the step again.
-        axes = [axis if self.mesh.shape[axis] > 1 else None for axis in (self.streams, self.voxels)]
+        axes = [axis if self.mesh.shape[axis] > 1 else None for axis in AXES]
         while axes and axes[-1] is None:
             axes.pop()
         return P(*axes)
@@ -159,14 +158,14 @@ def _with_axis(cache: VoxelCache) -> VoxelCache:
     return jax.tree.map(lambda x: x[None], cache)
 
 
-def _from_first_shard(tree: PyTree, axis: str) -> PyTree:
+def _from_first_shard(tree: PyTree) -> PyTree:
     """The floats of `tree` as computed on the first shard, except for the sign of zeros.
 
     Devices that round differently would disagree on the voxel of a token and store it in two shards or in none.
     """
-    is_first = jax.lax.axis_index(axis) == 0
+    is_first = jax.lax.axis_index(VOXELS) == 0
 
     def share(x):
-        return jax.lax.psum(jnp.where(is_first, x, 0.0), axis) if jnp.issubdtype(x.dtype, jnp.floating) else x
+        return jax.lax.psum(jnp.where(is_first, x, 0.0), VOXELS) if jnp.issubdtype(x.dtype, jnp.floating) else x
 
     return jax.tree.map(share, tree)

@@ -138,5 +138,5 @@ def test_an_evaluation_refines_at_the_streamed_size_and_scores_at_the_captures(t
     with Image.open(out / "view_00004.png") as picture:
         assert picture.size == (3 * 128, 96)
     refinement = metrics["refinement"]
-    assert refinement["steps"] == 3 and refinement["skipped_steps"] == 0
+    assert refinement["num_steps"] == 3 and refinement["num_skipped"] == 0
     assert all(0 < abs(metrics[name]["psnr"] - refinement["before"][name]["psnr"]) < 3 for name in ("literal", "shown"))
