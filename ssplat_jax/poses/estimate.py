@@ -125,16 +125,16 @@ def _request(source: Path, options: PoseOptions) -> dict[str, Any]:
 def _check_out(source: Path, out: Path) -> None:
     """Checks that the results do not mix with the photos, nor with files of another maker."""
     folder, place = out.resolve(), source.resolve()
-    if source.is_dir() and (folder == place or folder.is_relative_to(place)):
-        fix = "choose a folder beside it"
-        raise refusal(f"--out {out}", wanted="a folder outside the photos", got="the folder of the photos", fix=fix)
-    if any(place.is_relative_to(folder / name) for name in OWN_FOLDERS):  # --overwrite would remove the source
-        fix = "choose another folder"
-        raise refusal(f"--out {out}", wanted="a folder that does not hold the photos", got="one that does", fix=fix)
     held = [name for name in (*OWN_FOLDERS, *OWN_FILES) if (folder / name).exists()]
-    if held and not (folder / RECORD).exists():
-        got, fix = f"one that holds {', '.join(held)} of another maker", "choose another --out"
-        raise refusal(f"--out {out}", wanted="a new folder", got=got, fix=fix)
+    if source.is_dir() and (folder == place or folder.is_relative_to(place)):
+        wanted, got = "a folder outside the photos", "the folder of the photos"
+    elif any(place.is_relative_to(folder / name) for name in OWN_FOLDERS):  # --overwrite would remove the source
+        wanted, got = "a folder that does not hold the photos", "one that does"
+    elif held and not (folder / RECORD).exists():
+        wanted, got = "a new folder", f"one that holds {', '.join(held)} of another maker"
+    else:
+        return
+    raise refusal(f"--out {out}", wanted=wanted, got=got, fix="choose another folder")
 
 
 def _held_record(out: Path) -> dict[str, Any]:

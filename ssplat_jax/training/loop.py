@@ -264,9 +264,6 @@ class _Log:
         # A line that a kill cut short has no end.
         kept = [line for line in lines if line.endswith("}") and json.loads(line)["step"] <= done]
         write_atomic(path, "".join(f"{line}\n" for line in kept).encode())
-        self._begin()
-
-    def _begin(self) -> None:
         self.metrics: list[dict] = []
         self._since = time.perf_counter()
 
@@ -280,4 +277,4 @@ class _Log:
         with self._path.open("a") as file:
             file.write(json_text(record, indent=None) + "\n")
         self._report(record)
-        self._begin()
+        self.metrics, self._since = [], time.perf_counter()
