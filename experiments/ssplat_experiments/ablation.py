@@ -34,12 +34,11 @@ from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.storage.weights import load_params
 from ssplat_jax.streaming.feed import feed_capture
 from ssplat_jax.streaming.session import Session
-from ssplat_jax.training.capture_mix import CaptureMix, open_mix
 from ssplat_jax.training.crops import Crops
 from ssplat_jax.training.loop import train
 from ssplat_jax.training.losses import RenderingLoss
 from ssplat_jax.training.recipe import AFTER_MATCHER, EVIDENCE_RECIPE, MATCHER, Phase, Recipe, learning
-from ssplat_jax.training.samples import ViewSamples
+from ssplat_jax.training.samples import CaptureMix, ViewSamples, open_mix
 
 REVISIT = "revisit"
 """Name of the procedural scene that is scored."""

@@ -15,8 +15,8 @@ from ssplat_jax.core.console import Reporter
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import interleaved_split
-from ssplat_jax.evaluation.evaluate import evaluate
 from ssplat_jax.evaluation.metrics import installed_lpips
+from ssplat_jax.evaluation.scoring import evaluate
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.storage.files import write_json
 from ssplat_jax.storage.weights import load_params

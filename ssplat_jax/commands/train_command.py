@@ -53,9 +53,9 @@ class Train:
         from ssplat_jax.core.console import Reporter
         from ssplat_jax.evaluation.metrics import installed_lpips
         from ssplat_jax.storage.weights import describe_weights, params_digest, save_weights
-        from ssplat_jax.training.capture_mix import open_mix
         from ssplat_jax.training.loop import train
         from ssplat_jax.training.recipe import RECIPES, describe
+        from ssplat_jax.training.samples import open_mix
 
         require_positive(scale_steps=self.scale_steps, save_every=self.save_every)
         require_seed(self.seed)

@@ -28,7 +28,7 @@ class View:
 
     def run(self) -> int:
         from ssplat_jax.core.console import Reporter
-        from ssplat_jax.viewer.scene_sources import open_source
+        from ssplat_jax.viewer.stage import open_source
         from ssplat_jax.viewer.view_scene import view_scene
 
         require_positive(port=self.port, most=self.most)

@@ -14,8 +14,8 @@ from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.open_capture import is_capture, open_capture, without_tilde
 from ssplat_jax.data.posed_image import split_options, with_options
 from ssplat_jax.data.split import Index, Split, choose_split, index_to_json, read_index, split_of_scene
-from ssplat_jax.evaluation.evaluate import evaluate
 from ssplat_jax.evaluation.metrics import LpipsWeights
+from ssplat_jax.evaluation.scoring import evaluate
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.refinement import online_refinement
 from ssplat_jax.runs.run_results import report_eval

@@ -36,7 +36,7 @@ from ssplat_jax.refinement.refine import key_views_of
 from ssplat_jax.refinement.refine_step import may_be_seen, round_rows
 from ssplat_jax.streaming.feed import feed_capture
 from ssplat_jax.streaming.session import Session
-from ssplat_jax.training.capture_mix import CaptureMix, TrainingStart
+from ssplat_jax.training.samples import CaptureMix, TrainingStart
 
 PAIRS_COUNTED = 12
 """Crops of each scene whose tile intersections are counted, for the capacity of all."""

@@ -27,8 +27,8 @@ from ssplat_jax.storage.files import json_text
 from ssplat_jax.storage.run_folder import Interrupts, lock_folder
 from ssplat_jax.storage.saved_states import TrainingCheckpoints
 from ssplat_jax.storage.weights import params_digest
-from ssplat_jax.training.capture_mix import CaptureMix, TrainingStart
 from ssplat_jax.training.recipe import Phase, Recipe, describe
+from ssplat_jax.training.samples import CaptureMix, TrainingStart
 
 T = TypeVar("T")
 

@@ -15,10 +15,9 @@ from typing import Any, ClassVar, Protocol, runtime_checkable
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.model.streamsplat import StreamSplat
-from ssplat_jax.training.capture_mix import CaptureMix, TrainingStart
 from ssplat_jax.training.crops import Crops
 from ssplat_jax.training.losses import CropLoss, DepthLoss, RenderingLoss
-from ssplat_jax.training.samples import ViewSamples
+from ssplat_jax.training.samples import CaptureMix, TrainingStart, ViewSamples
 
 Rates = tuple[tuple[str, float], ...]
 """Paths of parts of the parameters, such as "encoder/pretrained", with factors of the learning rate."""

@@ -20,8 +20,7 @@ from ssplat_jax.core.console import Reporter
 from ssplat_jax.core.errors import InputError, StorageError, optional_package
 from ssplat_jax.storage.run_folder import Interrupts, RunFolder
 from ssplat_jax.viewer.browser import Browser
-from ssplat_jax.viewer.scene_sources import GrowingScene, Source
-from ssplat_jax.viewer.stage import Stage
+from ssplat_jax.viewer.stage import GrowingScene, Source, Stage
 
 POLL_INTERVAL = 0.5
 """Seconds between checks for changes, so that browsers are sent at most two scenes a second."""

@@ -9,7 +9,7 @@ from ssplat_jax.data.capture import ArrayPixels
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import interleaved_split
 from ssplat_jax.evaluation import cost
-from ssplat_jax.evaluation import evaluate as evaluation
+from ssplat_jax.evaluation import scoring as evaluation
 from ssplat_jax.evaluation.scoring import score_view
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.streaming.session import Session

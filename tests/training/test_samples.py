@@ -14,11 +14,14 @@ from ssplat_jax.data.procedural.procedural_views import training_sample
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.storage.saved_states import first_difference
 from ssplat_jax.training import loop
-from ssplat_jax.training.capture_mix import CaptureGroup, CaptureMix, TrainingStart, learned_frames
 from ssplat_jax.training.recipe import RECIPES, Recipe
 from ssplat_jax.training.samples import (
+    CaptureGroup,
+    CaptureMix,
+    TrainingStart,
     ViewSamples,
     capture_sample,
+    learned_frames,
     log_depths_at_cells,
     procedural_sample,
 )

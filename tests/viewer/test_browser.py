@@ -15,8 +15,7 @@ from ssplat_jax.storage.chunk_records import ChunkRecord, RecordedView, make_thu
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.viewer import browser as browser_module
 from ssplat_jax.viewer.browser import Browser
-from ssplat_jax.viewer.scene_sources import open_source
-from ssplat_jax.viewer.stage import Stage, draw, visible_splats
+from ssplat_jax.viewer.stage import Stage, draw, open_source, visible_splats
 from ssplat_jax.viewer.view_scene import Viewer
 from tests.viewer.fake_client import FakeClient, delta, frame, free_port, header, scene
 

@@ -16,8 +16,7 @@ from ssplat_jax.core.pytree import replace
 from ssplat_jax.storage.chunk_records import ChunkRecord, RecordedView, load_delta, save_chunk_record, save_delta
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.streaming.scene_delta import apply_delta
-from ssplat_jax.viewer.scene_sources import GrowingScene, SceneFile, open_source
-from ssplat_jax.viewer.stage import MAX_SIGMA, Stage, median_size, visible_splats
+from ssplat_jax.viewer.stage import MAX_SIGMA, GrowingScene, SceneFile, Stage, median_size, open_source, visible_splats
 from ssplat_jax.viewer.view_scene import Viewer, import_viser
 from tests.viewer.fake_client import delta, frame, free_port, header, scene
 
@@ -124,7 +123,7 @@ def test_a_run_that_starts_anew_while_it_is_read_is_read_again(tmp_path, monkeyp
             path.unlink()
         return load_delta(path)
 
-    monkeypatch.setattr("ssplat_jax.viewer.scene_sources.load_delta", vanish)
+    monkeypatch.setattr("ssplat_jax.viewer.stage.load_delta", vanish)
     assert source.changed() is None
     found = source.changed()
     assert found is not None
