@@ -134,7 +134,7 @@ def _check_out(source: Path, out: Path) -> None:
         wanted, got = "a new folder", f"one that holds {', '.join(held)} of another maker"
     else:
         return
-    raise refusal(f"--out {out}", wanted=wanted, got=got, fix="choose another folder")
+    raise refusal(f"--out {out}", wanted=wanted, got=got, fix="choose another --out")
 
 
 def _held_record(out: Path) -> dict[str, Any]:
