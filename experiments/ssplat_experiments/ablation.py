@@ -22,7 +22,6 @@ from ssplat_experiments.captures import SETTINGS
 from ssplat_experiments.cases import PICTURE, Case, Row
 from ssplat_experiments.study import Study, at_scale, run_study
 from ssplat_jax.config import StreamConfig, preset
-from ssplat_jax.core.console import Reporter
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import Split, interleaved_split
@@ -152,11 +151,6 @@ BUDGETS = {
         evidence=evidence_recipe(600, Crops(procedural=LEARNED_SCENES)),
     ),
 }
-
-
-def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str:
-    """Trains and scores the variants."""
-    return run_study(STUDY, captures, out, scale, reporter)
 
 
 def config_of(variant: str) -> StreamConfig:
@@ -321,3 +315,5 @@ has no evidence head to train. Scores are of unseen views; each seed has a `revi
     finish=add_differences,
     findings=findings,
 )
+
+run = functools.partial(run_study, STUDY)

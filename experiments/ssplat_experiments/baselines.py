@@ -17,13 +17,7 @@ from ssplat_jax.core.chunk import Chunk
 from ssplat_jax.core.gaussians import Gaussians, mask_gaussians
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.stream_frame import StreamFrame
-from ssplat_jax.evaluation.cost import (
-    abstract,
-    added_bytes,
-    live_bytes,
-    memory_row,
-    render_bytes,
-)
+from ssplat_jax.evaluation.cost import abstract, added_bytes, live_bytes, memory_row, render_bytes
 from ssplat_jax.evaluation.metrics import installed_lpips
 from ssplat_jax.evaluation.scoring import ImageScore, exposure_for, nearest_views, score_image
 from ssplat_jax.model.streamsplat import StreamSplat

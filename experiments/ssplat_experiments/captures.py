@@ -22,9 +22,10 @@ from ssplat_jax.storage.files import write_json
 from ssplat_jax.storage.weights import load_params
 from ssplat_jax.streaming.session import Session
 
-SETTINGS: tuple[
-    tuple[str, int, int, tuple[int, int] | None], ...
-] = (  # capture, stride, context views, size (None: its own)
+Setting = tuple[str, int, int, tuple[int, int] | None]
+"""Capture, stride, context views, and size (None: its own)."""
+
+SETTINGS: tuple[Setting, ...] = (
     ("redkitchen", 5, 64, (320, 240)),
     ("redkitchen", 10, 64, (320, 240)),
     ("fox", 1, 40, None),
@@ -50,22 +51,11 @@ def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str
         folder = out / f"{name}_stride{stride}"
         lpips = installed_lpips()
         metrics = evaluate(Session(model, params), capture, split, folder, reporter, lpips_weights=lpips)
-        row = {
-            "capture": name,
-            "stride": stride,
-            "context": len(split.context),
-            "shown": metrics["shown"]["psnr"],
-            "literal": metrics["literal"]["psnr"],
-            "shown_ssim": metrics["shown"]["ssim"],
-            "literal_ssim": metrics["literal"]["ssim"],
-            "shown_lpips": metrics["shown"]["lpips"],
-            "literal_lpips": metrics["literal"]["lpips"],
-            "copy": metrics["baselines"]["nearest_view_psnr"],
-            "accepted": metrics["cache"]["accepted_fraction"],
-            "gaussians": metrics["num_gaussians"],
-            "chunk_ms": metrics["chunk_ms"]["median"],
-        }
-        rows.append(row)
+        row = {"capture": name, "stride": stride, "context": len(split.context)}
+        row |= {kind: metrics[kind]["psnr"] for kind in ("shown", "literal")}
+        row |= {f"{kind}_{score}": metrics[kind][score] for score in ("ssim", "lpips") for kind in ("shown", "literal")}
+        row |= {"copy": metrics["baselines"]["nearest_view_psnr"], "accepted": metrics["cache"]["accepted_fraction"]}
+        rows.append(row | {"gaussians": metrics["num_gaussians"], "chunk_ms": metrics["chunk_ms"]["median"]})
     reporter.table("novel views of real captures", tuple(rows[0]), [tuple(row.values()) for row in rows])
     write_json(out / "table.json", rows)
     return f"wrote {out}/table.json and pictures beside it"

@@ -20,7 +20,6 @@ from ssplat_experiments.cases import PICTURE, Case, Row
 from ssplat_experiments.streams import START_CAPACITY, new_session
 from ssplat_experiments.study import OOM, Study, at_scale, run_study
 from ssplat_jax.config import StreamConfig, preset
-from ssplat_jax.core.console import Reporter
 from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.open_capture import open_capture
@@ -65,11 +64,6 @@ SIZES = {
         Sizes((24, 1024, 10_000), ("room",), (128, 96), joint=0, label=", 128 x 96"),
     ),
 }
-
-
-def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str:
-    """Streams every suite with both memories."""
-    return run_study(STUDY, captures, out, scale, reporter)
 
 
 def cases(captures: Path | None, scale: str) -> list[Case]:
@@ -236,3 +230,5 @@ that of step, decode and rendering, in MiB.""",
     cases=cases,
     findings=findings,
 )
+
+run = functools.partial(run_study, STUDY)

@@ -25,7 +25,6 @@ from ssplat_jax.cache.project import project
 from ssplat_jax.config import StreamConfig, preset
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.chunk import Chunk
-from ssplat_jax.core.console import Reporter
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.evaluation.cost import measure_latency, peak_memory
 from ssplat_jax.model.views import prepare_views
@@ -51,11 +50,6 @@ SIZES = {
     "cpu": Sizes(((160, 120), (320, 240)), 24, 7),
     "gpu": Sizes(((256, 256), (448, 256), (960, 512)), 128, 20),
 }
-
-
-def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str:
-    """Times every size."""
-    return run_study(STUDY, captures, out, scale, reporter)
 
 
 def cases(captures: Path | None, scale: str) -> list[Case]:
@@ -141,3 +135,5 @@ STUDY = Study(
     text="Milliseconds from a chunk received to one novel view rendered, on the cache of the whole stream, by stage.",
     cases=cases,
 )
+
+run = functools.partial(run_study, STUDY)

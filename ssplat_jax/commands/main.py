@@ -1,9 +1,9 @@
 """The `ssplat` command line: the list of commands, `main`, and the exit codes.
 
-A command is a dataclass, in a file of its own, whose fields are the options and whose `run` returns the exit code.
-Commands import JAX when they run, so that `ssplat --help` answers at once. Exit codes: 0 success, 2 bad input or usage,
-3 storage, 4 out of memory on the device or a full cache, 130 and 143 interrupted, 141 a closed pipe. The script's entry
-point is `commands/start.py`.
+A command is a dataclass whose fields are the options and whose `run` returns the exit code. Commands import JAX when
+they run, so that `ssplat --help` answers at once. Exit codes: 0 success, 2 bad input or usage, 3 storage, 4 out of
+memory on the device or a full cache, 130 and 143 interrupted, 141 a closed pipe. The script's entry point is
+`commands/start.py`.
 """
 
 import functools
@@ -18,21 +18,11 @@ from typing import Annotated
 import tyro
 
 from ssplat_jax import __version__
-from ssplat_jax.commands.bench_command import Bench
-from ssplat_jax.commands.demo_command import Demo
-from ssplat_jax.commands.eval_command import Eval
-from ssplat_jax.commands.experiment_command import Experiment
-from ssplat_jax.commands.export_command import Export
-from ssplat_jax.commands.import_weights_command import ImportWeights
-from ssplat_jax.commands.inspect_command import Inspect
-from ssplat_jax.commands.poses_command import Poses
+from ssplat_jax.commands.measure_commands import Bench, Experiment
 from ssplat_jax.commands.program_cache import keep_no_programs, keep_programs
-from ssplat_jax.commands.refine_command import Refine
-from ssplat_jax.commands.render_command import Render
-from ssplat_jax.commands.run_command import Run
-from ssplat_jax.commands.train_command import Train
-from ssplat_jax.commands.view_command import View
-from ssplat_jax.commands.weights_command import Weights
+from ssplat_jax.commands.scene_commands import Export, Inspect, Poses, Render, View
+from ssplat_jax.commands.stream_commands import Demo, Eval, Refine, Run
+from ssplat_jax.commands.weights_commands import ImportWeights, Train, Weights
 from ssplat_jax.core.errors import CacheError, InputError
 
 EXIT_INPUT, EXIT_STORAGE, EXIT_MEMORY = 2, 3, 4

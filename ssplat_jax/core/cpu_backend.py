@@ -45,21 +45,18 @@ def num_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def holds_many_programs(most_maps: int = MOST_MAPS) -> bool:
-    """True if the process has more than `most_maps` memory maps; False where the system does not list them."""
-    return MAPS.exists() and len(MAPS.read_text().splitlines()) > most_maps
+def holds_many_programs() -> bool:
+    """True if the process has more than `MOST_MAPS` memory maps; False where the system does not list them."""
+    return MAPS.exists() and len(MAPS.read_text().splitlines()) > MOST_MAPS
 
 
-def make_room(most_maps: int = MOST_MAPS) -> None:
+def make_room() -> None:
     """Drops compiled programs if the process holds many (`holds_many_programs`).
 
     Call it between scenes when one process handles many of them. A dropped program is compiled again, or read from
     JAX's compilation cache, at its next call. A `Session` keeps its compiled programs: delete the last one first.
-
-    Args:
-        most_maps: memory maps that the process may have.
     """
-    if holds_many_programs(most_maps):
+    if holds_many_programs():
         drop_programs()
 
 

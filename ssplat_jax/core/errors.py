@@ -36,25 +36,26 @@ def refusal(where: str, *, wanted: str, got: object, fix: str) -> InputError:
     return InputError(f"{where}: wanted {wanted}, got {got}; {fix}.")
 
 
-def require_positive(**numbers: int | float) -> None:
-    """Checks that options, given by their names, are finite and above 0.
+def require_positive(**numbers: int | float | None) -> None:
+    """Checks that options, given by their names, are finite and above 0; None counts as not given.
 
     Raises:
         InputError: naming the first number that is not.
     """
     for name, value in numbers.items():
-        if not 0 < value < math.inf:
+        if value is not None and not 0 < value < math.inf:
             raise InputError(f"--{name.replace('_', '-')}: wanted a finite number above 0, got {value}.")
 
 
-def require_seed(seed: int) -> None:
-    """Checks that the option --seed is one that NumPy and JAX take.
+def require_count(**numbers: int) -> None:
+    """Checks that options, given by their names, are numbers of steps or seeds, which NumPy and JAX take.
 
     Raises:
-        InputError: it is not.
+        InputError: naming the first number that is not.
     """
-    if not 0 <= seed < 2**31:
-        raise InputError(f"--seed: wanted a number from 0 to {2**31 - 1}, got {seed}.")
+    for name, value in numbers.items():
+        if not 0 <= value < 2**31:
+            raise InputError(f"--{name.replace('_', '-')}: wanted a number from 0 to {2**31 - 1}, got {value}.")
 
 
 def echo(value: object) -> str:

@@ -102,13 +102,7 @@ def sh_basis(directions: Float[AnyArray, "*s 3"], degree: int) -> Float[AnyArray
         terms += [-_C1 * y, _C1 * z, -_C1 * x]
     if degree >= 2:
         xx, yy, zz = x * x, y * y, z * z
-        terms += [
-            _C2[0] * x * y,
-            -_C2[1] * y * z,
-            _C2[2] * (2 * zz - xx - yy),
-            -_C2[3] * x * z,
-            _C2[4] * (xx - yy),
-        ]
+        terms += [_C2[0] * x * y, -_C2[1] * y * z, _C2[2] * (2 * zz - xx - yy), -_C2[3] * x * z, _C2[4] * (xx - yy)]
         if degree >= 3:
             terms += [
                 -_C3[0] * y * (3 * xx - yy),

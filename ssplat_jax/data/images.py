@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64
 from PIL import Image
 from PIL.TiffImagePlugin import TiffImageFile
-from skimage.transform import warp
+from skimage import transform
 
 from ssplat_jax.core.errors import refusal
 from ssplat_jax.data.parsing import reading
@@ -331,7 +331,7 @@ def undistort(
     pixels = lens.pixels(K, np.stack([columns, rows], axis=-1) + 0.5) - 0.5
     at = np.moveaxis(pixels[..., ::-1], -1, 0)
     planes = [
-        warp(plane, at, order=order, mode=mode, cval=fill, preserve_range=True).astype(np.float32)
+        transform.warp(plane, at, order=order, mode=mode, cval=fill, preserve_range=True).astype(np.float32)
         for plane in np.moveaxis(image.reshape(*image.shape[:2], -1), -1, 0)
     ]
     return np.stack(planes, axis=-1).reshape(image.shape)

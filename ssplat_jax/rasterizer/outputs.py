@@ -60,11 +60,7 @@ class RenderOutput:
 
 
 def splat_channels(
-    gaussians: Gaussians,
-    splats: Splats,
-    camera: Camera,
-    effects: Effects,
-    features: Float[Array, "n c"] | None,
+    gaussians: Gaussians, splats: Splats, camera: Camera, effects: Effects, features: Float[Array, "n c"] | None
 ) -> Float[Array, "b n channels"]:
     """The channels of each camera and Gaussian to composite: RGB, then depth and features where wanted.
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ssplat_jax.core.cameras import Camera
-from ssplat_jax.core.gaussians import Gaussians
+from ssplat_jax.core.gaussians import Gaussians, mask_gaussians
 from ssplat_jax.core.numerics import columns
 from ssplat_jax.core.pytree import pytree, replace
 from ssplat_jax.core.rotations import matrix_entries
@@ -43,37 +43,23 @@ class Splats:
     visible: Bool[Array, "b n"]
 
 
-def _finite_rows(gaussians: Gaussians) -> Bool[Array, " n"]:
-    """True if all entries of a row are finite and at most `constants.MAX_MAGNITUDE` in magnitude."""
-    rows = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities[:, None], gaussians.sh)
-    small = [jnp.abs(x) <= constants.MAX_MAGNITUDE for x in rows]  # False for NaN too
-    return jnp.stack([jnp.all(s.reshape(s.shape[0], -1), axis=1) for s in small]).all(axis=0)
-
-
 def cull_non_finite(
     gaussians: Gaussians, features: Float[Array, "n c"] | None = None
 ) -> tuple[Gaussians, Int[Array, ""]]:
     """`gaussians` with non-finite rows made absent, and how many of them were present (opacity not 0).
 
-    Rows with non-finite features are made absent too.
+    Entries above `constants.MAX_MAGNITUDE` are not finite. Rows with non-finite features are made absent too.
 
     Limits:
         NaN and infinite rows become harmless before any arithmetic: their gradient is 0, never NaN.
     """
-    keep = _finite_rows(gaussians)
+    rows = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities[:, None], gaussians.sh)
+    small = [jnp.abs(x) <= constants.MAX_MAGNITUDE for x in rows]  # False for NaN too
+    keep = jnp.stack([jnp.all(s.reshape(s.shape[0], -1), axis=1) for s in small]).all(axis=0)
     if features is not None:
         keep &= jnp.all(jnp.isfinite(features), axis=-1)
     num_culled = jnp.sum(~keep & (gaussians.opacities != 0), dtype=jnp.int32)
-    column = keep[:, None]
-    safe = replace(
-        gaussians,
-        means=jnp.where(column, gaussians.means, 0.0),
-        quats=jnp.where(column, gaussians.quats, 1.0),
-        scales=jnp.where(column, gaussians.scales, 1.0),
-        opacities=jnp.where(keep, gaussians.opacities, 0.0),
-        sh=jnp.where(column[..., None], gaussians.sh, 0.0),
-    )
-    return safe, num_culled
+    return mask_gaussians(gaussians, keep), num_culled
 
 
 def cull_cameras(camera: Camera) -> tuple[Camera, Bool[Array, " b"]]:

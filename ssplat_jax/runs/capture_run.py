@@ -7,7 +7,6 @@ frames of a capture, or of a folder that is still being written -> chunks -> ses
 import dataclasses
 import time
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 
@@ -19,6 +18,7 @@ from ssplat_jax.data.readers.transforms_json import num_listed
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.poses.adjust_poses import check_look_ahead
 from ssplat_jax.runs.open_run import OpenRun, open_run
+from ssplat_jax.runs.options import RunOptions
 from ssplat_jax.runs.run_results import finish_run, finished_scene
 from ssplat_jax.storage.chunk_records import ChunkRecord, RecordedView, make_thumbnail, save_chunk_record, save_delta
 from ssplat_jax.storage.run_folder import Interrupts, RunFolder
@@ -34,21 +34,6 @@ POLL_SECONDS = 0.25
 
 
 @dataclasses.dataclass(frozen=True)
-class RunOptions:
-    """The frames that a run streams, and what it writes on the way."""
-
-    size: tuple[int, int] | None = None  # (width, height) of the images; None for the capture's own
-    scale: float = 1.0  # factor of `size` at which images are streamed
-    stride: int = 1
-    max_views: int | None = None
-    save_every: int = 8  # chunks between saved states
-    overwrite: bool = False  # remove the run that the folder holds and start anew
-    deltas: bool = False  # also write what each chunk changed in the scene, in the stream frame
-    revise: str | None = None  # `poses`: adjusted before the stream
-    quiet_seconds: float | None = None  # the capture is still being written; without a new frame for so long it ends
-
-
-@dataclasses.dataclass(frozen=True)
 class RunResult:
     """State of a run when `run_capture` returns."""
 
@@ -58,9 +43,7 @@ class RunResult:
     was_finished: bool = False  # the folder held it already; nothing was streamed or written
 
 
-def run_capture(
-    model: StreamSplat, params: dict, path: str, out: Path, options: RunOptions, reporter: Reporter
-) -> RunResult:
+def run_capture(model: StreamSplat, params: dict, options: RunOptions, reporter: Reporter) -> RunResult:
     """Streams a capture into a folder, continuing the run that the folder holds.
 
     Every image is decoded once, when its chunk is due. A damaged one stops the stream there, with what came before it
@@ -69,32 +52,29 @@ def run_capture(
     Args:
         model: the model to run; with a causal configuration if the capture is still being written.
         params: the model's parameters.
-        path: the capture, as `open_capture` takes it; if it is still being written, a folder with a transforms.json.
-        out: folder of the results.
-        options: the frames that are streamed, and what is written.
+        options: the capture, the folder, the frames that are streamed, and what is written.
         reporter: shows progress and warnings.
 
     Raises:
         InputError: options or the capture are unusable, an image is damaged, or see `open_run`.
-        StorageError: `out` cannot be written or its state is corrupt.
+        StorageError: the folder cannot be written or its state is corrupt.
     """
-    numbers = {name: getattr(options, name) for name in ("stride", "save_every", "max_views", "quiet_seconds")}
-    require_positive(**{name: number for name, number in numbers.items() if number is not None})
+    require_positive(**{x: getattr(options, x) for x in ("stride", "save_every", "max_views", "quiet_seconds")})
     check_look_ahead(options.revise, is_causal=model.config.stream.causal)
-    if options.quiet_seconds is None:
-        with reporter.progress("opening", None, waiting=path, is_kept=False):
-            source = WholeCapture(path, options)
+    if not options.watch:
+        with reporter.progress("opening", None, waiting=options.path, is_kept=False):
+            source = WholeCapture(options)
         indices = source.indices
     else:
-        source = GrowingCapture(path, options, options.quiet_seconds, reporter)
-        chunk_size, state, num_saved = model.config.stream.chunk_size, RunFolder(out), 0
+        source = GrowingCapture(options, reporter)
+        chunk_size, state, num_saved = model.config.stream.chunk_size, RunFolder(options.out), 0
         if state.has_state() and not options.overwrite:
             num_saved = load_newest_state(state.state)[1]["done"]
         if stopped := source.wait_for(max(num_saved, chunk_size)):
             return RunResult(num_saved, 0, stopped)
         indices = source.indices[: num_saved or chunk_size]
     kept = {"revise": options.revise, "overwrite": options.overwrite}
-    with open_run(model, params, source.capture, indices, out, **kept, reporter=reporter) as run:
+    with open_run(model, params, source.capture, indices, options.out, **kept, reporter=reporter) as run:
         num_before, width, height = run.num_views, run.capture.width, run.capture.height
         if options.size is None and width * height > LARGE:
             reporter.say(f"images are streamed at {width}x{height}; --size takes smaller ones in less time")
@@ -104,14 +84,14 @@ def run_capture(
             run.folder.clear_refinement()  # of a scene of fewer views
         elif (num_written := finished_scene(run.folder, run.num_views)) is not None:
             return RunResult(run.num_views, num_written, was_finished=True)
-        return RunResult(run.num_views, finish_run(run, path, reporter).num_written)
+        return RunResult(run.num_views, finish_run(run, options.path, reporter).num_written)
 
 
 def _stream(
     run: OpenRun, source: "WholeCapture | GrowingCapture", options: RunOptions, reporter: Reporter
 ) -> int | None:
     """Streams the views that the run has not had yet; returns the signal that stopped it, if one did."""
-    deltas = DeltaWriter(run, is_wanted=options.deltas)
+    deltas = DeltaWriter(run, is_wanted=options.deltas or options.view)
     with Interrupts(has_work=False) as interrupts, reporter.progress("streaming", source.total) as advance:
         if run.num_views:
             advance(run.num_views, WAITING)
@@ -139,15 +119,15 @@ def _stream(
 class WholeCapture:
     """The frames of a capture that is complete."""
 
-    def __init__(self, path: str, options: RunOptions) -> None:
-        capture = open_capture(path, size=options.size)
+    def __init__(self, options: RunOptions) -> None:
+        capture = open_capture(options.path, size=options.image_size)
         if options.scale != 1.0:
             # Opened anew, as `refine` and `export` will: a procedural capture renders other images for another size.
             scaled = capture.scaled(options.scale)
-            capture = open_capture(path, size=(scaled.width, scaled.height))
+            capture = open_capture(options.path, size=(scaled.width, scaled.height))
         self.capture = capture
-        self.indices = list(range(0, len(capture), options.stride))[: options.max_views]
-        check_num_frames(len(self.indices), path)
+        self.indices = list(range(0, len(capture), options.stride or 1))[: options.max_views]
+        check_num_frames(len(self.indices), options.path)
         self.total: int | None = len(self.indices)
 
     def chunks(self, run: OpenRun, interrupts: Interrupts) -> Iterator[FedChunk]:
@@ -163,9 +143,8 @@ class GrowingCapture:
     `done`, or once for some seconds no frame has been listed and none has become complete.
     """
 
-    def __init__(self, path: str, options: RunOptions, quiet_seconds: float, reporter: Reporter) -> None:
-        self._path, self._options = without_tilde(path), options
-        self._quiet_seconds, self._reporter = quiet_seconds, reporter
+    def __init__(self, options: RunOptions, reporter: Reporter) -> None:
+        self._path, self._options, self._reporter = without_tilde(options.path), options, reporter
         self._opened: Capture | None = None
         self._most_listed = 0  # frames that the listing has had, complete or not
         self._last_change = time.monotonic()
@@ -225,11 +204,11 @@ class GrowingCapture:
         said_so = is_done(self._path)  # before the look: what was written before the file counts
         if (listed := num_listed(self._path)) > self._most_listed:
             self._most_listed, self._last_change = listed, time.monotonic()
-        capture, self._problem = open_growing(self._path, size=self._options.size)
+        capture, self._problem = open_growing(self._path, size=self._options.image_size)
         if capture is not None:
             self._take(capture.scaled(self._options.scale))
         is_full = self._options.max_views is not None and len(self.indices) >= self._options.max_views
-        self.has_ended = said_so or is_full or time.monotonic() - self._last_change > self._quiet_seconds
+        self.has_ended = said_so or is_full or time.monotonic() - self._last_change > self._options.quiet_seconds
 
     def _take(self, capture: Capture) -> None:
         """Adds the frames of a capture that have become complete."""
@@ -241,7 +220,7 @@ class GrowingCapture:
         if self._opened is None or len(capture) > len(self._opened):  # also frames that `stride` leaves out
             self._last_change = time.monotonic()
         self._opened = capture
-        for i in list(range(0, len(capture), self._options.stride))[len(self.indices) : self._options.max_views]:
+        for i in list(range(0, len(capture), self._options.stride or 1))[len(self.indices) : self._options.max_views]:
             try:
                 capture.verify([i])
             except InputError as error:  # being written

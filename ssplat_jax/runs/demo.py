@@ -1,7 +1,6 @@
 """`ssplat demo`: streams an embedded procedural scene and scores unseen views after more and more streamed views."""
 
 import time
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -69,7 +68,13 @@ def run_demo(scene: str, out: Path, reporter: Reporter) -> dict:
         for gaussians, known, _ in reversed(stages):  # the program for the fullest scene serves all
             scored.insert(0, [score_view(gaussians, capture, i, stream_frame, known) for i in split.targets])
             advance(len(scored))
-    rows = [_table_row(views, len(known), num) for views, (_, known, num) in zip(scored, stages, strict=True)]
+    rows = []
+    for views, (_, known, num_gaussians) in zip(scored, stages, strict=True):
+        scores, row = mean_scores([view.score for view in views]), {"views": len(known)}
+        for kind in ("shown", "literal"):
+            row |= {f"{kind}_psnr": round(scores[kind]["psnr"], 2), f"{kind}_ssim": round(scores[kind]["ssim"], 3)}
+        coverage = round(float(np.mean([view.score.coverage for view in views])), 3)
+        rows.append(row | {"coverage": coverage, "num_gaussians": num_gaussians})
     strip = [views[len(views) // 2].color for views in scored]
     for view in scored[-1]:
         save_comparison(folder.target(view.score.frame), view.target, view.color, view.depth, stream_frame.depth_range)
@@ -89,17 +94,3 @@ def run_demo(scene: str, out: Path, reporter: Reporter) -> dict:
     header = ("views", "shown dB", "SSIM", "literal dB", "SSIM", "covered", "Gaussians")
     reporter.table(f"{scene}: quality of unseen views", header, [tuple(row.values()) for row in rows])
     return metrics
-
-
-def _table_row(views: Sequence[ScoredView], num_streamed: int, num_gaussians: int) -> dict:
-    """Mean scores after `num_streamed` views."""
-    scores = mean_scores([view.score for view in views])
-    return {
-        "views": num_streamed,
-        "shown_psnr": round(scores["shown"]["psnr"], 2),
-        "shown_ssim": round(scores["shown"]["ssim"], 3),
-        "literal_psnr": round(scores["literal"]["psnr"], 2),
-        "literal_ssim": round(scores["literal"]["ssim"], 3),
-        "coverage": round(float(np.mean([view.score.coverage for view in views])), 3),
-        "num_gaussians": num_gaussians,
-    }

@@ -1,6 +1,5 @@
 """`ssplat eval`: one capture, or the scenes of an index file, each in a folder of its own."""
 
-import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -14,10 +13,11 @@ from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.open_capture import is_capture, open_capture, without_tilde
 from ssplat_jax.data.posed_image import split_options, with_options
 from ssplat_jax.data.split import Index, Split, choose_split, index_to_json, read_index, split_of_scene
-from ssplat_jax.evaluation.metrics import LpipsWeights
+from ssplat_jax.evaluation.metrics import installed_lpips
 from ssplat_jax.evaluation.scoring import evaluate
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.refinement import online_refinement
+from ssplat_jax.runs.options import EvalOptions
 from ssplat_jax.runs.run_results import report_eval
 from ssplat_jax.storage.files import write_json
 from ssplat_jax.storage.run_folder import RunFolder
@@ -27,43 +27,23 @@ SCORES = ("literal", "shown")
 """Scores of a scene that are averaged over scenes."""
 
 
-@dataclasses.dataclass(frozen=True)
-class EvalOptions:
-    """Options of an evaluation: frames, sizes, refinement and display."""
-
-    size: tuple[int, int] | None = None  # (width, height) of the scored views; None for the capture's own
-    scale: float = 1.0  # of the streamed images relative to the scored ones
-    protocol: str = "interleaved"  # see `data.split`
-    stride: int | None = None
-    context: int | None = None
-    targets: int | None = None
-    index: Path | None = None  # an index file, instead of protocol, stride, context and targets
-    scene: str | None = None  # its scene; None for the name of the capture
-    refine_steps: int = 0
-    revise: str | None = None  # `poses`: adjusted before the stream
-    lpips_weights: LpipsWeights | None = None
-
-
-def evaluate_run(
-    model: StreamSplat, params: dict, path: str, out: Path, options: EvalOptions, reporter: Reporter
-) -> dict[str, Any]:
+def evaluate_run(model: StreamSplat, params: dict, options: EvalOptions, reporter: Reporter) -> dict[str, Any]:
     """Scores a capture, or every scene of an index file below a folder.
 
     Args:
         model: the model to run.
         params: the model's parameters.
-        path: the capture; with an index also a folder that holds a capture for each scene of the index.
-        out: folder of the results; of many scenes, each has a folder in it.
-        options: what is scored.
+        options: what is scored: a capture, or with an index also a folder that holds a capture for each scene; and
+            the folder of the results, in which each of many scenes has one.
         reporter: shows progress and warnings.
 
     Returns:
         The metrics of the capture (`evaluate`), or of the scenes (`scene_metrics`), as written to metrics.json.
 
     Raises:
-        InputError: a capture or the index is unusable, options contradict each other, `out` holds a run, or poses of a
-            causal stream are to be adjusted.
-        StorageError: `out` cannot be written.
+        InputError: a capture or the index is unusable, options contradict each other, the folder holds a run, or poses
+            of a causal stream are to be adjusted.
+        StorageError: the folder cannot be written.
     """
 
     def evaluated(capture: Capture, split: Split, out: Path, scene: str | None = None) -> dict[str, Any]:
@@ -75,7 +55,7 @@ def evaluate_run(
             out,
             reporter,
             streamed=capture.scaled(options.scale),
-            lpips_weights=options.lpips_weights,
+            lpips_weights=installed_lpips(),
             refine_steps=options.refine_steps,
             revise=options.revise,
             scene=scene,
@@ -83,6 +63,7 @@ def evaluate_run(
         report_eval(RunFolder(out), metrics)
         return metrics
 
+    path, size, out = options.path, options.image_size, options.out
     if options.scene is not None and options.index is None:
         raise InputError("--scene: wanted --index beside it, whose scene it names; got none.")
     folder = without_tilde(split_options(path)[0])
@@ -90,16 +71,16 @@ def evaluate_run(
     if options.index is not None:
         index, notes = _read_index(options)
     elif are_scenes and any(map(is_capture, folder.iterdir())):
-        index, notes = index_of_folder(path, options)
+        index, notes = index_of_folder(options)
     else:
-        capture = open_capture(path, size=options.size)
+        capture = open_capture(path, size=size)
         return evaluated(capture, _split(capture, options), out)
     reporter.warn_all(*notes)
     if not are_scenes:
-        capture = open_capture(path, size=options.size)
+        capture = open_capture(path, size=size)
         scene = options.scene or capture.name
         return evaluated(capture, split_of_scene(index, scene, len(capture)), out, scene)
-    captures = _open_scenes(path, index, options.size)
+    captures = _open_scenes(path, index, size)
     for results in (out, *(out / scene for scene in captures)):
         RunFolder(results).check_no_run()
     for capture in captures.values():
@@ -131,17 +112,17 @@ def _read_index(options: EvalOptions) -> tuple[Index, tuple[str, ...]]:
     return read_index(options.index)
 
 
-def index_of_folder(path: str, options: EvalOptions) -> tuple[Index, tuple[str, ...]]:
+def index_of_folder(options: EvalOptions) -> tuple[Index, tuple[str, ...]]:
     """The frames of every capture in a folder by the protocol, None for one that is too short, and notes that say so.
 
     Raises:
         InputError: a capture is unusable.
     """
-    root, written = split_options(path)
+    root, written = split_options(options.path)
     index: Index = {}
     notes = []
     for scene in sorted(folder.name for folder in without_tilde(root).iterdir() if is_capture(folder)):
-        capture = open_capture(with_options(f"{root}/{scene}", **written), size=options.size)
+        capture = open_capture(with_options(f"{root}/{scene}", **written), size=options.image_size)
         try:
             index[scene] = _split(capture, options)
         except InputError as error:

@@ -11,7 +11,7 @@ are the commands that come after it, because their results would mix two scenes.
 
 import contextlib
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +31,7 @@ from ssplat_jax.poses.adjust_poses import adjust_and_say
 from ssplat_jax.refinement import online_refinement
 from ssplat_jax.storage.files import load_arrays, save_arrays
 from ssplat_jax.storage.run_folder import RunFolder, lock_folder
-from ssplat_jax.storage.saved_states import load_newest_state, restore_previous, save_state
+from ssplat_jax.storage.saved_states import check_same, load_newest_state, restore_previous, save_state
 from ssplat_jax.storage.weights import params_digest
 from ssplat_jax.streaming.feed import Exposures, FedChunk
 from ssplat_jax.streaming.session import Session
@@ -104,9 +104,13 @@ class OpenRun:
         except StorageError as error:
             told = f"{error} No earlier state can be read either; --overwrite starts the run anew."
             raise StorageError(told) from error
-        check_identity(header, self.identity(), self.folder)
+        wanted = self.identity()
+        held = {name: header[name] for name in wanted}
+        held, wanted = ({**facts, "config": deciding(facts["config"])} for facts in (held, wanted))
+        check_same(self.folder.path, "a run", held, wanted)
         # Read once the frames are known to be the same.
-        check_identity(header, {"images": _image_digests(self.capture, map(int, header["images"]))}, self.folder)
+        images = _image_digests(self.capture, map(int, header["images"]))
+        check_same(self.folder.path, "a run", {"images": header["images"]}, {"images": images})
         if damage is not None:
             reporter.warn(f"{damage} Continuing from the state saved before it, after {header['done']} views.")
             restore_previous(self.folder.state)
@@ -166,33 +170,10 @@ def open_run(
         yield run
 
 
-def check_identity(header: dict[str, Any], wanted: dict[str, Any], folder: RunFolder) -> None:
-    """Refuses a saved run that is not the one asked for.
-
-    Raises:
-        InputError: naming the first fact of `wanted` that differs from the saved one.
-    """
-    for name, now in wanted.items():
-        there = header[name]
-        if name == "config":  # without the capacity of a cache that grows, which affects no result
-            there, now = (_flat(fields) for fields in (there, now))
-        if there != now:
-            place = ""
-            if isinstance(now, dict):
-                place = next(key for key in sorted(there | now) if there.get(key) != now.get(key))
-                there, now, place = there.get(place), now.get(place), f"{place}: "
-            elif name == "frames":
-                there, now = (f"{len(frames)} from {list(frames)[:2]} on" for frames in (there, now))
-            raise InputError(
-                f"{folder.path}: holds a run that differs in its {name} ({place}{there} there, {now} now); choose"
-                " another --out, repeat the old options, or start anew with --overwrite."
-            )
-
-
-def _flat(config: dict[str, Any]) -> dict[str, Any]:
-    """Fields of a configuration that affect the result, by name; capacity does not, where the cache grows."""
-    fields = {f"{group}.{name}": x for group, part in config.items() if group != "preset" for name, x in part.items()}
-    return fields | ({"memory.capacity": None} if fields["memory.overflow"] == "grow" else {})
+def deciding(config: dict[str, Any]) -> dict[str, Any]:
+    """A configuration without what affects no result: its name, and the capacity of a cache that grows."""
+    memory = config["memory"]
+    return config | {"preset": None, "memory": memory | ({"capacity": None} if memory["overflow"] == "grow" else {})}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -273,13 +254,12 @@ POSES_KIND = "adjusted poses 1"
 class SavedPoses:
     """The adjusted poses that a run keeps, and what they were adjusted from."""
 
-    capture: str  # digest of the poses as given
-    indices: list[int]  # streamed frames
-    camtoworlds: dict[int, Float64[np.ndarray, "4 4"]]  # by frame
+    capture: str  # digest of the streamed frames with the poses as given
+    camtoworlds: dict[int, Float64[np.ndarray, "4 4"]]  # of these frames
 
     def of(self, capture: Capture) -> Capture | None:
         """The capture with these poses; None if they belong to another capture."""
-        if max(self.indices, default=0) >= len(capture) or capture.digest(self.indices) != self.capture:
+        if max(self.camtoworlds) >= len(capture) or capture.digest(list(self.camtoworlds)) != self.capture:
             return None
         frames = [
             dataclasses.replace(frame, camtoworld=self.camtoworlds[i]) if i in self.camtoworlds else frame
@@ -290,7 +270,7 @@ class SavedPoses:
     def save(self, folder: RunFolder) -> None:
         """Writes the poses to the folder of the run."""
         arrays = {str(i): pose for i, pose in self.camtoworlds.items()}
-        save_arrays(folder.adjusted_poses, arrays, POSES_KIND, {"capture": self.capture, "indices": self.indices})
+        save_arrays(folder.adjusted_poses, arrays, POSES_KIND, {"capture": self.capture})
 
 
 def load_poses(folder: RunFolder) -> SavedPoses | None:
@@ -332,36 +312,36 @@ def capture_to_stream(
             raise refusal(f"--revise {revise}", wanted="a run that began with it", got=got, fix=fix)
     elif saved is None or saved.capture != capture.digest(indices):
         found = adjust_and_say(capture, indices, reporter).capture
-        saved = SavedPoses(capture.digest(indices), list(indices), {i: found.frames[i].camtoworld for i in indices})
+        saved = SavedPoses(capture.digest(indices), {i: found.frames[i].camtoworld for i in indices})
         saved.save(folder)
     return saved.of(capture) or capture
 
 
-def with_poses_of_run(capture: Capture, folder: RunFolder) -> Capture:
+def with_poses_of_run(
+    capture: Capture, folder: RunFolder, warn: Callable[[str], None] = lambda message: None
+) -> Capture:
     """`capture` with the adjusted poses that `folder` keeps; as it is, if there are none or those of another capture.
 
-    Resuming then fails, because the capture's digest differs from that of the run.
+    `warn` is told of those of another capture, or of this one at another size. A run cannot be continued with it: its
+    digest differs.
 
     Raises:
         StorageError: the saved poses are damaged.
     """
     saved = load_poses(folder)
-    return capture if saved is None else saved.of(capture) or capture
+    if saved is None:
+        return capture
+    if (adjusted := saved.of(capture)) is None:
+        warn(f"{folder.adjusted_poses} is of another capture: the cameras have the poses of {capture.name}.")
+    return adjusted or capture
 
 
 def open_capture_of_scene(scene: Path, path: str, size: tuple[int, int] | None, reporter: Reporter) -> Capture:
     """The capture at `path`, with the adjusted poses of the run that `scene`, a file or a folder, belongs to.
 
-    A warning says so if the run kept adjusted poses of another capture, or of this one at another size.
-
     Raises:
         InputError: the capture is unusable.
         StorageError: the saved poses are damaged.
     """
-    folder, capture = RunFolder(scene if scene.is_dir() else scene.parent), open_capture(path, size=size)
-    saved = load_poses(folder)
-    if saved is None:
-        return capture
-    if (adjusted := saved.of(capture)) is None:
-        reporter.warn(f"{folder.adjusted_poses} is of another capture: the cameras have the poses of {path}.")
-    return adjusted or capture
+    folder = RunFolder(scene if scene.is_dir() else scene.parent)
+    return with_poses_of_run(open_capture(path, size=size), folder, reporter.warn)

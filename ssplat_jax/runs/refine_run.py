@@ -9,14 +9,16 @@ import jax
 import numpy as np
 
 from ssplat_jax.core.console import WAITING, Reporter
-from ssplat_jax.core.errors import InputError, refusal, require_positive
+from ssplat_jax.core.errors import refusal, require_positive
 from ssplat_jax.evaluation.scoring import mean_scores, score_targets
 from ssplat_jax.refinement.compared_views import FOR_CAPTURES
 from ssplat_jax.refinement.refine import Progress, key_views_of
 from ssplat_jax.runs.open_run import load_run
+from ssplat_jax.runs.options import RefineOptions
 from ssplat_jax.runs.run_results import picture_views, report_run, save_scene, shown_frames
 from ssplat_jax.storage.files import load_arrays, save_arrays, write_json
 from ssplat_jax.storage.run_folder import Interrupts, RunFolder, lock_folder
+from ssplat_jax.storage.saved_states import check_same
 
 KIND = "refinement state 1"
 
@@ -34,46 +36,34 @@ class RefineResult:
     interrupted: int | None = None  # the signal that stopped it, if one did
 
 
-def refine_run(
-    run_dir: Path,
-    path: str,
-    params: dict,
-    *,
-    steps: int,
-    save_every: int,
-    overwrite: bool,
-    reporter: Reporter,
-) -> RefineResult:
+def refine_run(params: dict, options: RefineOptions, reporter: Reporter) -> RefineResult:
     """Writes `refined.ply` beside the scene of a run, continuing a refinement that stopped. `scene.ply` stays.
 
     The pictures and the report of the run become those of the refined scene. An interrupted refinement writes the scene
     so far.
 
     Args:
-        run_dir: folder of a finished `ssplat run`.
-        path: the capture of that run, as `open_capture` takes it.
         params: parameters of the run's model.
-        steps: most refinement steps, those of an earlier call included.
-        save_every: steps between saved states.
-        overwrite: remove the refinement that the folder holds and start anew.
+        options: the run, its capture, and the most steps, those of an earlier call included.
         reporter: shows progress and warnings.
 
     Raises:
         InputError: there is no finished run of this capture and these weights, or a refinement with other steps.
         StorageError: the folder cannot be written or a state is corrupt.
     """
+    steps, save_every = options.steps, options.save_every
     require_positive(steps=steps, save_every=save_every)
-    run, folder, config = load_run(run_dir, reporter), RunFolder(run_dir), FOR_CAPTURES
+    run, folder, config = load_run(options.folder, reporter), RunFolder(options.folder), FOR_CAPTURES
     gaussians, indices = run.session(params).gaussians(), run.header["frames"]
     stream_frame, exposures = run.stream_frame, run.exposures
     if len(exposures) < len(indices):
         got, fix = f"one after {len(exposures)} of {len(indices)} views", "finish it with `ssplat run`"
-        raise refusal(str(run_dir), wanted="a finished run", got=got, fix=fix)
-    capture = run.open_capture(path)
+        raise refusal(str(options.folder), wanted="a finished run", got=got, fix=fix)
+    capture = run.open_capture(options.path)
     identity = {name: run.header[name] for name in ("config", "size", "frames", "poses", "images", "weights")}
     identity |= {"steps": steps, "refine_config": dataclasses.asdict(config)}
-    with lock_folder(run_dir):
-        if overwrite:
+    with lock_folder(options.folder):
+        if options.overwrite:
             folder.clear_refinement()
         progress = Progress.start(gaussians, key_views_of(capture, indices, stream_frame, exposures), config)
         if folder.refinement_state.exists():
@@ -99,7 +89,7 @@ def refine_run(
         )
         if folder.metrics.is_file():  # else there is no report to bring up to date
             metrics = json.loads(folder.metrics.read_text())
-            report_run(folder, metrics, path, run.header["weights"], refined=scores)
+            report_run(folder, metrics, options.path, run.header["weights"], refined=scores)
     return RefineResult(progress.num_steps, before, after)
 
 
@@ -121,12 +111,7 @@ def load_refinement(path: Path, progress: Progress, identity: dict[str, Any]) ->
         StorageError: the file is damaged.
     """
     arrays, header = load_arrays(path, KIND)
-    for name, wanted in identity.items():
-        if header["identity"][name] != wanted:
-            raise InputError(
-                f"{path}: holds a refinement that differs in its {name}; repeat the old options, or start anew with"
-                " --overwrite."
-            )
+    check_same(path, "a refinement", header["identity"], identity)
     leaves = [jax.device_put(arrays.get(name, leaf)) for name, leaf in _leaves(progress).items()]
     progress.state = jax.tree.unflatten(jax.tree.structure(progress.state), leaves)
     for name in MEASURED:

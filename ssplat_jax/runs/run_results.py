@@ -220,7 +220,6 @@ def report_eval(folder: RunFolder, metrics: dict[str, Any]) -> None:
         f" {metrics['context_views']} other views.",
         facts=facts,
         pictures_note=f"{NOTE} Shown: {SHOWN}. Literal: over black, at the exposure of the first views.",
-        details=[("protocol", metrics["protocol"])],
     )
 
 
@@ -231,7 +230,7 @@ def _save(folder: RunFolder, metrics: dict[str, Any], pictures: list[tuple[Path,
         pictures=[pictures[k] for k in evenly_spread(len(pictures), MOST_PICTURES)],
         # A run writes its metrics after the report: with them, everything is there.
         files=[row for row in DESCRIBED_FILES if row[0] == folder.metrics.name or (folder.path / row[0]).exists()],
-        details=[*parts.pop("details", ()), *_details(metrics)],
+        details=_details(metrics),
         **parts,
     )
     write_atomic(folder.report, page.encode(errors="replace"))
@@ -257,16 +256,7 @@ def _caption(score: dict[str, Any], kind: str) -> str:
 
 
 def _details(metrics: dict[str, Any]) -> list[tuple[str, str]]:
-    """Facts for those who look closer."""
-    cache, frame = metrics["cache"], metrics["stream_frame"]
-    rows = [
-        ("size", " x ".join(map(str, metrics["size"]))),
-        ("voxels", f"{cache['voxels']:,} of {cache['capacity']:,}"),
-        ("tokens accepted", f"{cache['accepted_fraction']:.1%}"),
-        ("near and far", f"{frame['near'] / frame['scale']:.4g} and {frame['far'] / frame['scale']:.4g} capture units"),
-        ("compiling", f"{metrics['compile_s']:.1f} s"),
-        ("configuration", metrics["config_hash"]),
-    ]
-    if frame.get("warning"):
-        rows.append(("warning", frame["warning"]))
-    return rows
+    """The single figures among the metrics, for those who look closer."""
+    found = metrics | metrics["cache"] | metrics["stream_frame"]
+    figures = {name.replace("_", " "): x for name, x in found.items() if isinstance(x, str | int | float)}
+    return [(name, f"{x:.6g}" if isinstance(x, float) else str(x)) for name, x in figures.items()]

@@ -24,6 +24,9 @@ from ssplat_jax.streaming.scene_delta import SceneDelta
 
 RECORD_KIND, DELTA_KIND = "chunk record 1", "scene delta 1"  # kind and version of the files
 
+SHAPES = {"camtoworld": (4, 4), "K": (3, 3), "exposure": (3,)}
+"""The arrays of a view."""
+
 THUMBNAIL_SIDE = 160
 """Longest side of a thumbnail, pixels."""
 
@@ -55,7 +58,7 @@ def save_chunk_record(path: Path, record: ChunkRecord) -> None:
     """Writes a record, atomically."""
     fields = dataclasses.asdict(record)
     for view in fields["views"]:
-        view |= {name: view[name].tolist() for name in ("camtoworld", "K", "exposure")}
+        view |= {name: view[name].tolist() for name in SHAPES}
         view["thumbnail"] = base64.b64encode(view["thumbnail"]).decode()
     write_json(path, {"kind": RECORD_KIND} | fields)
 
@@ -74,18 +77,12 @@ def load_chunk_records(paths: Sequence[Path]) -> list[ChunkRecord]:
 def _parse_record(fields: dict[str, Any]) -> ChunkRecord:
     if fields.pop("kind") != RECORD_KIND:
         raise ValueError("a file of another kind")
-    views = tuple(
-        RecordedView(
-            frame=view["frame"],
-            camtoworld=np.array(view["camtoworld"], np.float64).reshape(4, 4),
-            K=np.array(view["K"], np.float64).reshape(3, 3),
-            exposure=np.array(view["exposure"], np.float64).reshape(3),
-            thumbnail=base64.b64decode(view["thumbnail"]),
-        )
-        for view in fields.pop("views")
-    )
+    views = []
+    for view in fields.pop("views"):
+        arrays = {name: np.array(view[name], np.float64).reshape(shape) for name, shape in SHAPES.items()}
+        views.append(RecordedView(frame=view["frame"], thumbnail=base64.b64decode(view["thumbnail"]), **arrays))
     width, height = fields.pop("size")
-    return ChunkRecord(size=(width, height), views=views, **fields)
+    return ChunkRecord(size=(width, height), views=tuple(views), **fields)
 
 
 def make_thumbnail(image: Float[np.ndarray, "h w 3"]) -> bytes:

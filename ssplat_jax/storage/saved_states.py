@@ -27,10 +27,12 @@ from ssplat_jax.cache.state import (
     require_single_cache,
 )
 from ssplat_jax.core.atomic import previous_path, write_atomic
-from ssplat_jax.core.errors import InputError, StorageError
+from ssplat_jax.core.errors import InputError, StorageError, echo
 from ssplat_jax.storage.files import load_arrays, save_arrays
 
 KIND = "stream state 1"
+
+ANEW = "choose another --out, repeat the old options, or start anew with --overwrite"
 
 _DIGEST = "sha256"  # name of the digest among the leaves of a checkpoint, which are numbered
 _ROW_FIELDS = ("voxels", "counts", *PIVOT_FIELDS, *OPTIONAL_PIVOT_FIELDS)  # arrays with one row per voxel
@@ -123,15 +125,11 @@ class TrainingCheckpoints:
         if not recipe.exists():
             write_atomic(recipe, text.encode())
         try:
-            difference = first_difference(json.loads(recipe.read_text()), json.loads(text))
+            held = json.loads(recipe.read_text())
         except ValueError as error:
             raise StorageError(f"{recipe}: damaged; restore it or choose another --out.") from error
-        if difference is not None:
-            name, held, wanted = difference
-            raise InputError(
-                f"{recipe}: this directory holds a run with {name} = {held!r}, wanted {wanted!r}; choose another --out,"
-                " or repeat the old options with the old files."
-            )
+        fix = "choose another --out, or repeat the old options with the old files"
+        check_same(recipe, "a run", held, json.loads(text), fix)
 
     def save(self, step: int, state: Any) -> None:
         """Saves a pytree of arrays as the state after `step`; the state before it is kept too."""
@@ -207,10 +205,30 @@ def _digest(leaves: dict[str, np.ndarray]) -> np.ndarray:
     return np.frombuffer(digest.digest(), np.uint8)
 
 
+def check_same(path: Path, what: str, held: dict[str, Any], wanted: dict[str, Any], fix: str = ANEW) -> None:
+    """Refuses to continue saved work that is not the one asked for.
+
+    Args:
+        path: where it is saved.
+        what: "a run", for example.
+        held: its facts, as JSON types.
+        wanted: the facts that they must equal.
+        fix: what to do.
+
+    Raises:
+        InputError: naming the first fact of `wanted` that differs.
+    """
+    if (difference := first_difference(held, wanted)) is not None:
+        name, there, now = difference
+        told = f"{echo(there)} there, {echo(now)} now"
+        raise InputError(f"{path}: holds {what} that differs in its {name} ({told}); {fix}.")
+
+
 def first_difference(held: Any, wanted: Any, name: str = "") -> tuple[str, Any, Any] | None:
     """(path, held, wanted) of the first difference between two JSON values, or None."""
     if isinstance(held, dict) and isinstance(wanted, dict):
-        pairs = [(f"{name}.{k}".lstrip("."), held.get(k), wanted.get(k)) for k in sorted(held.keys() | wanted.keys())]
+        keys = [*wanted, *(key for key in held if key not in wanted)]
+        pairs = [(f"{name}.{key}".lstrip("."), held.get(key), wanted.get(key)) for key in keys]
     elif isinstance(held, list) and isinstance(wanted, list) and len(held) == len(wanted):
         pairs = [(f"{name}[{i}]", a, b) for i, (a, b) in enumerate(zip(held, wanted, strict=True))]
     else:

@@ -251,9 +251,7 @@ def published_tensor(path: tuple[str, ...], shape: tuple[int, ...]) -> Published
 
 def published_tensors(config: StreamConfig) -> dict[str, PublishedTensor | None]:
     """The PyTorch tensor, or None, of every parameter of a model with `config`, by the parameter's path."""
-    wanted = jax.eval_shape(lambda key: init_params(key, config), jax.random.key(0))
-    paths = [(tuple(k.key for k in keys), x.shape) for keys, x in jax.tree_util.tree_flatten_with_path(wanted)[0]]
-    return {"/".join(path): published_tensor(path, shape) for path, shape in paths}
+    return {path: published_tensor(tuple(path.split("/")), x.shape) for path, x in _by_path(_shapes(config)).items()}
 
 
 def as_published(config: StreamConfig) -> StreamConfig:
@@ -302,8 +300,7 @@ def import_params(path: Path, config: StreamConfig, *, depth_only: bool = False)
             return jnp.asarray(tensor.to_parameter(found[tensor.name]))
         return functools.reduce(lambda tree, k: tree[k.key], keys, fresh)
 
-    stages = jax.eval_shape(lambda key: init_params(key, config), jax.random.key(0))
-    params = jax.tree_util.tree_map_with_path(parameter, stages)
+    params = jax.tree_util.tree_map_with_path(parameter, _shapes(config))
     return ImportedParams(params, len(usable), len(found) - len(usable), initialized_parts)
 
 

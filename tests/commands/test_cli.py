@@ -14,14 +14,14 @@ import numpy as np
 import pytest
 
 from ssplat_jax.commands.main import COMMANDS, main
-from ssplat_jax.commands.options import apply_changes
-from ssplat_jax.commands.run_command import Run
 from ssplat_jax.commands.start import start
+from ssplat_jax.commands.stream_commands import Run
 from ssplat_jax.config import preset
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.data import capture_summary
 from ssplat_jax.data.capture_summary import summarize
 from ssplat_jax.data.readers import CAPTURE_READERS
+from ssplat_jax.runs.options import apply_changes
 from ssplat_jax.scene_files.formats import load_ply, save_ply
 from ssplat_jax.storage.weights import as_published, load_weights, published_tensors
 from tests.commands.command_fixture import edit, make_capture, run
@@ -136,7 +136,7 @@ def test_usage_that_does_not_parse_is_short_and_exit_2(arguments, named, capsys)
         (("poses", ".", "--frames", "20", "--out", "x"), "--frames: wanted a video"),
         (
             ("eval", "procedural:room?frames=12", "--refine", "-1", "--out", "x"),
-            "--refine: wanted a number of steps of",
+            "--refine: wanted a number from 0",
         ),
     ],
 )

@@ -14,7 +14,8 @@ from ssplat_jax.data.split import choose_split, index_to_json, read_index
 from ssplat_jax.evaluation import cost, evaluate
 from ssplat_jax.refinement import refine_on_capture
 from ssplat_jax.runs import evaluate_run
-from ssplat_jax.runs.evaluate_run import EvalOptions, index_of_folder, scene_metrics
+from ssplat_jax.runs.evaluate_run import index_of_folder, scene_metrics
+from ssplat_jax.runs.options import EvalOptions
 from tests.commands.command_fixture import SIZE, make_capture, read, run
 from tests.streaming.narrow_model import NARROW
 
@@ -73,8 +74,8 @@ def test_a_folder_of_scenes_without_an_index_gets_one_by_the_protocol(tmp_path):
     for name, num_frames in (("a", 12), ("b", 9), ("c", 5)):
         make_capture(tmp_path / "scenes" / name, num_frames=num_frames, size=SIZE)
     (tmp_path / "scenes" / "notes").mkdir()
-    options = EvalOptions(protocol="paper", context=6, targets=3)
-    index, (note,) = index_of_folder(str(tmp_path / "scenes"), options)
+    options = EvalOptions(str(tmp_path / "scenes"), tmp_path / "out", protocol="paper", context=6, targets=3)
+    index, (note,) = index_of_folder(options)
     assert list(index) == ["a", "b", "c"] and index["c"] is None and note.startswith("c: left out (")
     for name, num_frames in (("a", 12), ("b", 9)):
         assert index[name] == choose_split("paper", num_frames, None, 6, 3)

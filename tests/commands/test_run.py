@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from jax import monitoring
 
-from ssplat_jax.commands.run_command import Run
+from ssplat_jax.commands.stream_commands import Run
 from ssplat_jax.config import QUALITIES, StreamConfig
 from ssplat_jax.core.atomic import previous_path
 from ssplat_jax.data.open_capture import open_capture
@@ -141,9 +141,12 @@ def test_a_stopped_run_continues_to_the_same_bytes(copied, finished, narrow):
 def test_another_run_is_refused(copied, narrow, tmp_path, capsys):
     capture, out = copied
     for changes, difference in (
-        (("--set", "voxel_size=0.1"), "differs in its config (memory.voxel_size: 0.04 there, 0.1 now)"),
-        (("--stride", "2"), "differs in its frames (12 from [0, 1] on there, 6 from [0, 2] on now)"),
-        (("--quality", "fast"), "differs in its size ([64, 48] there, [32, 24] now)"),
+        (("--set", "voxel_size=0.1"), "differs in its config.memory.voxel_size (0.04 there, 0.1 now)"),
+        (
+            ("--stride", "2"),
+            "there, [0, 2, 4, 6, 8, 10] now)",
+        ),
+        (("--quality", "fast"), "differs in its size[0] (64 there, 32 now)"),
     ):
         assert run("run", capture, "--out", out, *changes, *narrow) == 2
         (line,) = capsys.readouterr().err.splitlines()
@@ -152,7 +155,7 @@ def test_another_run_is_refused(copied, narrow, tmp_path, capsys):
     kept = (images / "5.png").read_bytes()
     (images / "5.png").write_bytes((images / "4.png").read_bytes())
     assert run("run", capture, "--out", out, *narrow) == 2
-    assert "differs in its images (5: " in capsys.readouterr().err
+    assert "differs in its images.5 (" in capsys.readouterr().err
     (images / "5.png").write_bytes(kept)
     edit("transform_matrix", np.eye(4).tolist())(capture)  # a corrected pose
     assert run("run", capture, "--out", out, *narrow) == 2
@@ -198,7 +201,7 @@ def test_a_run_records_its_chunks(narrow, tmp_path):
 
 def test_refinement_follows_with_the_steps_of_the_quality(tmp_path, monkeypatch):
     asked = []
-    monkeypatch.setattr("ssplat_jax.commands.run_command.Refine.run", lambda command: asked.append(command) or 0)
+    monkeypatch.setattr("ssplat_jax.commands.stream_commands.Refine.run", lambda command: asked.append(command) or 0)
     monkeypatch.setattr("ssplat_jax.runs.capture_run.run_capture", lambda *given: RunResult(4, 1))
     assert Run("procedural:room", tmp_path, quiet=True).run() == 0
     # A refinement that is stopped says how it continues: without the flag, which would start the run anew.

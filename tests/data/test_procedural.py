@@ -68,7 +68,7 @@ def test_cameras_stay_in_free_space(kind, path):
     free = []
     for seed in range(6):
         scene = sample_scene(seed, kind)
-        poses, _ = sample_path(seed, scene, path, 12, 24, 32, min_clearance=0.3)
+        poses, _ = sample_path(seed, scene, path, 12, 24, 32, step=0.05 * float(scene.orbit_radius))
         free.append(clearance(scene, poses[:, :3, 3]).min())
     assert np.mean(np.array(free) > 0.25) >= 4 / 6
 

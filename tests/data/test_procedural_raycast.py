@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ssplat_jax.data.procedural.paths import look_at, sample_path
-from ssplat_jax.data.procedural.raycast import raycast, raycast_depths
+from ssplat_jax.data.procedural.raycast import raycast
 from ssplat_jax.data.procedural.scene import Finish, SceneBuilder, random_rotation, scale_scene
 from ssplat_jax.data.procedural.scenes import sample_scene
 from ssplat_jax.data.procedural.textures import TextureLibrary
@@ -83,7 +83,7 @@ POSE = look_at(np.array([0.3, -0.4, -3.1]), np.array([0.1, 0.1, 0.0])).astype(np
 
 
 def check_depths(scene, wanted):
-    depths = np.asarray(raycast_depths(scene, inverted(POSE[None]), intrinsics(), HEIGHT, WIDTH))[0]
+    depths = np.asarray(raycast(scene, inverted(POSE[None]), intrinsics(), HEIGHT, WIDTH, 0)[1])[0]
     # Rays that graze a silhouette may fall on either side of it.
     ok = np.abs(depths - wanted) <= DEPTH_TOLERANCE * wanted
     assert ok.mean() > 0.998
@@ -129,8 +129,8 @@ def test_glowing_face_shows_its_texel_times_gain():
 
 
 def test_scaled_scene_looks_the_same_from_scaled_cameras():
-    scene = sample_scene(3)
-    poses, Ks = sample_path(3, scene, None, 1, HEIGHT, WIDTH)
+    scene = sample_scene(3, "room")
+    poses, Ks = sample_path(3, scene, "orbit", 1, HEIGHT, WIDTH, step=0.1)
     images, depths = raycast(scene, inverted(poses), Ks, HEIGHT, WIDTH)
     poses[:, :3, 3] *= 2.5
     scaled_images, scaled_depths = raycast(scale_scene(scene, 2.5), inverted(poses), Ks, HEIGHT, WIDTH)

@@ -11,7 +11,7 @@ from PIL import Image
 
 import ssplat_jax as ss
 from ssplat_jax.commands import main as command_line
-from ssplat_jax.commands import options
+from ssplat_jax.commands import measure_commands
 from ssplat_jax.data import open_capture as captures
 from ssplat_jax.data.readers.frame_list import FrameList, Intrinsics, Reader
 from tests.docs.pages import ROOT, tables
@@ -105,7 +105,7 @@ def test_an_added_command_runs(monkeypatch, capsys):
 
 def test_an_experiment_of_another_package_is_found(monkeypatch, tmp_path, capsys):
     point = SimpleNamespace(name="toy", load=lambda: lambda captures, out, scale, reporter: f"toy at {scale}")
-    monkeypatch.setattr(options, "entry_points", lambda group: [point])
+    monkeypatch.setattr(measure_commands, "entry_points", lambda group: [point])
     with pytest.raises(SystemExit) as stop:
         command_line.main(["experiment", "toy", "--out", str(tmp_path), "--scale", "smoke"])
     assert not stop.value.code

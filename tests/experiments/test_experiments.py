@@ -12,9 +12,9 @@ from ssplat_experiments.accuracy_vs_time import mark_fronts
 from ssplat_experiments.depth_error import cell_depths, summary
 from ssplat_experiments.settings import REFINED, SETTINGS
 
-from ssplat_jax.commands.options import StreamOptions
 from ssplat_jax.config import QUALITIES
 from ssplat_jax.model.network import STAGES
+from ssplat_jax.runs.options import StreamOptions
 
 
 def row(ms, psnr):

@@ -11,8 +11,8 @@ from ssplat_experiments import context_length
 from ssplat_experiments.score import run
 from ssplat_experiments.study import markdown_table
 
-from ssplat_jax.commands.experiment_command import Experiment
 from ssplat_jax.commands.main import guarded
+from ssplat_jax.commands.measure_commands import Experiment
 from ssplat_jax.config import preset
 from ssplat_jax.core.console import Reporter
 from ssplat_jax.data.open_capture import open_capture

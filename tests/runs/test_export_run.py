@@ -14,8 +14,8 @@ from ssplat_jax.core.gaussians import scale_colors
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.rasterizer import render
-from ssplat_jax.runs.export_run import KnownCameras, difference_in_words, export_scene, turned
 from ssplat_jax.runs.run_results import scene_to_show
+from ssplat_jax.runs.scene_outputs import KnownCameras, difference_in_words, export_scene, turned
 from ssplat_jax.scene_files.formats import file_axes, save_ply
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.streaming.feed import middle_exposure

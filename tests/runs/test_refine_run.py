@@ -11,7 +11,8 @@ from ssplat_jax.core.console import Reporter
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.runs import refine_run as module
-from ssplat_jax.runs.capture_run import RunOptions, run_capture
+from ssplat_jax.runs.capture_run import run_capture
+from ssplat_jax.runs.options import RefineOptions, RunOptions
 from ssplat_jax.runs.refine_run import refine_run
 from ssplat_jax.scene_files.formats import load_scene
 from ssplat_jax.storage.run_folder import RunFolder
@@ -22,14 +23,14 @@ CAPTURE, QUIET = "procedural:room?frames=4&size=80x60", Reporter(quiet=True)
 
 
 def refine(path, steps=4, capture=CAPTURE, overwrite=False):
-    options = {"steps": steps, "save_every": 2, "overwrite": overwrite}
-    return refine_run(path, capture, params(), **options, reporter=QUIET)
+    options = RefineOptions(path, capture, steps=steps, save_every=2, overwrite=overwrite)
+    return refine_run(params(), options, QUIET)
 
 
 def stream(out, capture=CAPTURE, reporter=QUIET, overwrite=False):
     """Streams small frames into `out`."""
-    options = RunOptions(size=(64, 48), save_every=1, overwrite=overwrite)
-    return run_capture(StreamSplat(NARROW), params(), capture, out, options, reporter)
+    options = RunOptions(capture, out, size="64x48", save_every=1, overwrite=overwrite)
+    return run_capture(StreamSplat(NARROW), params(), options, reporter)
 
 
 @functools.cache

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ssplat_jax.commands.train_command import Train
+from ssplat_jax.commands.weights_commands import Train
 from ssplat_jax.config import preset
 from ssplat_jax.model.network import init_params
 from ssplat_jax.storage.weights import describe_weights, load_params, load_weights, save_weights

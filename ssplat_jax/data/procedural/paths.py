@@ -10,11 +10,11 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
-from ssplat_jax.core.errors import InputError
 from ssplat_jax.data.procedural.scene import Scene, clearance
 
 UP = np.array([0.0, -1.0, 0.0])
 MAX_IRREGULARITY = 0.7  # largest deviation of the log of a path's steps; the smallest, 0.1, is an even walk
+MIN_CLEARANCE = 0.45  # meters to all surfaces, where a path can keep them
 MAX_STEP_FACTOR = 3.0  # largest ratio of a step to the typical step, in either direction
 
 
@@ -30,35 +30,22 @@ class _Walker:
 
 
 def sample_path(
-    seed: int,
-    scene: Scene,
-    kind: str | None,
-    num_views: int,
-    height: int,
-    width: int,
-    *,
-    step: float | None = None,
-    min_clearance: float = 0.45,
+    seed: int, scene: Scene, kind: str, num_views: int, height: int, width: int, *, step: float
 ) -> tuple[Float[np.ndarray, "v 4 4"], Float[np.ndarray, "v 3 3"]]:
     """The camera-to-world poses of a random path through a scene, and the intrinsics that they share.
 
-    `step` is the typical distance between consecutive views (None: 1 to 10 % of the orbit radius), `min_clearance` that
-    to all surfaces, where the path can keep it. `kind` is one of `PATH_KINDS`; None draws one.
+    `step` is the typical distance between consecutive views. `kind` is one of `PATH_KINDS`.
     """
-    if kind is not None and kind not in _STYLES:
-        raise InputError(f"procedural path: kind must be one of {', '.join(PATH_KINDS)}, got {kind!r}.")
     rng = np.random.default_rng([2, seed])
-    drawn = str(rng.choice(PATH_KINDS, p=_SHARES))
-    style = _STYLES[kind or drawn]
-    typical = step if step is not None else float(scene.orbit_radius) * np.exp(rng.uniform(np.log(0.01), np.log(0.1)))
-    walker = _start(rng, scene, kind or drawn, min_clearance)
+    rng.random()  # as in `sample_scene`
+    walker = _start(rng, scene, kind)
     wobble, irregularity = rng.uniform(0.0, 0.03), rng.uniform(0.1, MAX_IRREGULARITY)
     poses = []
     for _ in range(num_views):
         forward = _unit(walker.gaze + wobble * rng.standard_normal(3))
         poses.append(look_along(walker.position, forward, walker.roll))
         factor = np.clip(np.exp(irregularity * rng.standard_normal()), 1 / MAX_STEP_FACTOR, MAX_STEP_FACTOR)
-        _advance(rng, scene, walker, style, typical * float(factor), min_clearance)
+        _advance(rng, scene, walker, _STYLES[kind], step * float(factor))
     return np.stack(poses).astype(np.float32), _intrinsics(rng, num_views, height, width)
 
 
@@ -73,7 +60,7 @@ def _intrinsics(rng: np.random.Generator, num_views: int, height: int, width: in
 # -- steps ------------------------------------------------------------------------------------------------------------
 
 
-def _start(rng: np.random.Generator, scene: Scene, kind: str, min_clearance: float) -> _Walker:
+def _start(rng: np.random.Generator, scene: Scene, kind: str) -> _Walker:
     """Walker at a random free point: around the focus for an orbit, near the eye otherwise."""
     radius, focus = float(scene.orbit_radius), np.asarray(scene.focus, np.float64)
     heading = _unit(rng.standard_normal(3) * [1, 0.15, 1])
@@ -85,7 +72,7 @@ def _start(rng: np.random.Generator, scene: Scene, kind: str, min_clearance: flo
         spots = np.asarray(scene.eye, np.float64) + radius * 0.8 * rng.standard_normal((64, 3)) * [1, 0.15, 1]
     spots = np.concatenate([spots, np.asarray(scene.eye, np.float64)[None]])
     free = clearance(scene, spots)
-    ok = np.flatnonzero(free > 1.3 * min_clearance)
+    ok = np.flatnonzero(free > 1.3 * MIN_CLEARANCE)
     position = spots[ok[0] if len(ok) else int(np.argmax(free))]
     to_focus = _unit(focus - position)
     if kind in ("orbit", "gazing"):
@@ -97,25 +84,25 @@ def _start(rng: np.random.Generator, scene: Scene, kind: str, min_clearance: flo
     return _Walker(position, heading, gaze, rng.normal(0, 0.06), float(rng.choice([-1.0, 1.0])))
 
 
-def _advance(rng, scene: Scene, walker: _Walker, style, distance: float, min_clearance: float) -> None:
+def _advance(rng, scene: Scene, walker: _Walker, style, distance: float) -> None:
     """Moves the walker by one step and turns its gaze."""
     wish, gaze, share, inertia = style(rng, scene, walker)
-    walker.heading = _free_heading(rng, scene, walker, wish, distance * share, min_clearance)
+    walker.heading = _free_heading(rng, scene, walker, wish, distance * share)
     walker.position = walker.position + distance * share * walker.heading
     walker.gaze = _unit(inertia * walker.gaze + (1 - inertia) * gaze)
     walker.roll = 0.9 * walker.roll + rng.normal(0, 0.01)
 
 
-def _free_heading(rng, scene: Scene, walker: _Walker, wish: np.ndarray, distance: float, min_clearance: float):
+def _free_heading(rng, scene: Scene, walker: _Walker, wish: np.ndarray, distance: float):
     """Direction near `wish` that stays clear of surfaces for this step and the next two."""
     ahead = distance * np.array([1.0, 3.0])
-    if clearance(scene, walker.position + ahead[:, None] * wish).min() > min_clearance:
+    if clearance(scene, walker.position + ahead[:, None] * wish).min() > MIN_CLEARANCE:
         return wish
     options = wish + rng.standard_normal((32, 3)) * np.linspace(0.1, 3, 32)[:, None] * [1, 0.3, 1]
     options /= np.maximum(np.linalg.norm(options, axis=-1, keepdims=True), 1e-9)
     points = walker.position + ahead[:, None, None] * options
     free = clearance(scene, points.reshape(-1, 3)).reshape(2, -1).min(axis=0)
-    ok = np.flatnonzero(free > min_clearance)
+    ok = np.flatnonzero(free > MIN_CLEARANCE)
     return options[ok[0] if len(ok) else int(np.argmax(free))]
 
 
@@ -197,14 +184,5 @@ def _gazing(rng, scene: Scene, walker: _Walker):
     return heading, _unit(_unit(to_focus) + rng.normal(0, 0.15, 3)), 1.0, 0.6
 
 
-_STYLES = {
-    "forward": _forward,
-    "sideways": _sideways,
-    "orbit": _orbit,
-    "gazing": _gazing,
-    "pan": _pan,
-    "handheld": _handheld,
-}
+_STYLES = {style.__name__[1:]: style for style in (_forward, _sideways, _orbit, _gazing, _pan, _handheld)}
 PATH_KINDS = tuple(_STYLES)
-# Probabilities of the kinds, in their order.
-_SHARES = (0.22, 0.2, 0.15, 0.1, 0.1, 0.23)

@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.data.procedural.paths import look_at, sample_path
-from ssplat_jax.data.procedural.raycast import raycast, raycast_depths
+from ssplat_jax.data.procedural.raycast import raycast
 from ssplat_jax.data.procedural.scene import NUM_SOLIDS, Scene, clearance, fade_scene, scale_scene
 from ssplat_jax.data.procedural.scenes import SCENE_KINDS, SCENE_SHARES, SKY_DISTANCE, sample_scene
 
@@ -38,7 +38,6 @@ def training_sample(
     num_views: int,
     height: int,
     width: int,
-    supersample: int = 1,
     *,
     steps: tuple[float, float] = STEP_RANGE,
     kinds: tuple[str, ...] = (),
@@ -53,7 +52,6 @@ def training_sample(
         num_views: number of views, in the order of time.
         height: image rows.
         width: image columns.
-        supersample: color rays per pixel. One costs a third of captures' two, and training runs on the same cores.
         steps: range of the typical distance between consecutive views over the median depth, log-uniform. Single steps
             are up to three times as long.
         kinds: kinds of worlds, of which one is drawn; repeated ones are more likely. Empty: all but yards, with their
@@ -71,7 +69,7 @@ def training_sample(
         sky = SKY_DISTANCE if kind == "yard" else np.inf
         found = _scaled_path(rng, scene, _PATHS[kind], num_views, height, width, steps, sky)
     scene, poses, Ks, factor = found
-    images, depths = _cast(scene, poses, Ks, height, width, supersample)
+    images, depths = _cast(scene, poses, Ks, height, width, 1)  # a third of the cost of two rays
     depths = np.where(depths < factor * sky, depths, np.inf).astype(np.float32)
     return _through_sensor(rng, scene, images), depths, poses, Ks
 
@@ -108,7 +106,7 @@ def _probe(scene: Scene, poses: np.ndarray, Ks: np.ndarray, height: int, width: 
     """Depths below `sky` of all views, at a low resolution; none if most of the pixels are farther."""
     rows, cols = max(height // _PROBE, 12), max(width // _PROBE, 12)
     coarse = Ks * np.array([cols / width, rows / height, 1], np.float32)[:, None]
-    depths = np.asarray(raycast_depths(scene, _inverted(poses), coarse, rows, cols))
+    depths = np.asarray(raycast(scene, _inverted(poses), coarse, rows, cols, 0)[1])
     nearer = depths[depths < sky]
     return nearer if 2 * len(nearer) > depths.size else nearer[:0]
 
@@ -146,8 +144,6 @@ def procedural_capture_arrays(name: str, num_frames: int, height: int, width: in
     """
     if name not in CAPTURES:
         raise InputError(f"procedural:{name}: no such capture; there is {', '.join(CAPTURES)}.")
-    if num_frames < 1:
-        raise InputError(f"procedural:{name}: num_frames must be at least 1, got {num_frames}.")
     route = _ROUTES[name]
     rng = np.random.default_rng([4, route.first_seed + seed])
     while True:

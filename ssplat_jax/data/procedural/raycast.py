@@ -32,8 +32,10 @@ def raycast(
     height: int,
     width: int,
     supersample: int = 2,
-) -> tuple[Float[Array, "v h w 3"], Float[Array, "v h w"]]:
+) -> tuple[Float[Array, "v h w 3"] | None, Float[Array, "v h w"]]:
     """Renders images in [0, 1], with `supersample` color rays per pixel, and z-depths in units of the scene.
+
+    With `supersample` 0 there are no images, and the same depths.
 
     Limits:
         Cameras outside the shell or inside a solid look through it; keep `clearance` positive.
@@ -42,36 +44,18 @@ def raycast(
 
     def render_view(camera):
         viewmat, K = camera
-        origin, rotation = _camera_frame(viewmat)
+        rotation = viewmat[:3, :3].T
+        origin = -jnp.einsum("ij,j->i", rotation, viewmat[:3, 3], precision=jax.lax.Precision.HIGHEST)
         rays = _ray_directions(rotation, K, height, width, _pixel_offsets(supersample))
         t, solid_idx = _nearest_hits(scene, origin, rays)
+        if not supersample:
+            return None, t[0]
         depth, t, solid_idx = t[0], t[-supersample:], solid_idx[-supersample:]
         rays = (rays[0][-supersample:], rays[1][-supersample:], rays[2][-supersample:])
         colors = _shade(scene, origin, rays, t, solid_idx, pixel=1.0 / (K[0, 0] * supersample**0.5))
         return jnp.mean(colors, axis=0), depth
 
     return jax.lax.map(render_view, (jnp.asarray(viewmats), jnp.asarray(Ks)))
-
-
-@functools.partial(Kept, static_argnums=(3, 4))
-def raycast_depths(
-    scene: Scene, viewmats: Float[AnyArray, "v 4 4"], Ks: Float[AnyArray, "v 3 3"], height: int, width: int
-) -> Float[Array, "v h w"]:
-    """Renders the z-depths of a scene without its colors; they are equal to those of `raycast`."""
-
-    def render_view(camera):
-        viewmat, K = camera
-        origin, rotation = _camera_frame(viewmat)
-        rays = _ray_directions(rotation, K, height, width, _pixel_offsets(1))
-        return _nearest_hits(scene, origin, rays)[0][0]
-
-    return jax.lax.map(render_view, (jnp.asarray(viewmats), jnp.asarray(Ks)))
-
-
-def _camera_frame(viewmat: Array) -> tuple[Array, Array]:
-    """Camera center and camera-to-world rotation."""
-    rotation = viewmat[:3, :3].T
-    return -jnp.einsum("ij,j->i", rotation, viewmat[:3, 3], precision=jax.lax.Precision.HIGHEST), rotation
 
 
 def _pixel_offsets(count: int) -> np.ndarray:

@@ -8,30 +8,24 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ssplat_jax.core.errors import InputError
 from ssplat_jax.data.procedural.scene import Finish, Scene, SceneBuilder, random_rotation, yaw_rotation
-from ssplat_jax.data.procedural.textures import TextureLibrary, texture_library
+from ssplat_jax.data.procedural.textures import texture_library
 
 # Texture groups for objects of any kind.
 _EVERYTHING = ("photo", "floor", "pattern", "noise", "facade", "leaves", "photo")
 
 
-def sample_scene(
-    seed: int, kind: str | None = None, textures: TextureLibrary | None = None, *, only_used: bool = False
-) -> Scene:
+def sample_scene(seed: int, kind: str, *, only_used: bool = False) -> Scene:
     """A random world, which depends on the arguments and the release of scikit-image.
 
     Args:
         seed: any non-negative integer.
-        kind: one of `SCENE_KINDS`; None draws one, but no yard.
-        textures: by default `texture_library()`.
+        kind: one of `SCENE_KINDS`.
         only_used: the scene holds the textures that it shows, instead of all, which take seconds to prepare.
     """
-    if kind is not None and kind not in _RECIPES:
-        raise InputError(f"procedural scene: kind must be one of {', '.join(SCENE_KINDS)}, got {kind!r}.")
     rng = np.random.default_rng([1, seed])
-    drawn = str(rng.choice(SCENE_KINDS, p=SCENE_SHARES))
-    return _RECIPES[kind or drawn](SceneBuilder(rng, textures or texture_library(), only_used))
+    rng.random()  # the shipped weights were trained on the worlds after this number
+    return _RECIPES[kind](SceneBuilder(rng, texture_library(), only_used))
 
 
 # -- furniture: each piece stands on the floor at (x, z), within about `size` of it ------------------------------------
@@ -112,12 +106,13 @@ def _trinket(b: SceneBuilder, x: float, y: float, z: float, size: float) -> None
     if shape == "ball":
         half[:] = half[1]
     half[2] = half[0] if shape == "cylinder" else half[2]
-    b.add(str(shape), [x, y - half[1], z], half, finish, None if shape == "ball" else _yawed(b))
-
-
-def _yawed(b: SceneBuilder) -> np.ndarray:
-    """Random rotation about the vertical axis."""
-    return yaw_rotation(b.rng.uniform(0, 2 * np.pi))
+    b.add(
+        str(shape),
+        [x, y - half[1], z],
+        half,
+        finish,
+        None if shape == "ball" else yaw_rotation(b.rng.uniform(0, 2 * np.pi)),
+    )
 
 
 _FURNITURE: tuple[Callable[[SceneBuilder, float, float, float, float], None], ...] = (
@@ -360,13 +355,8 @@ def _hedge(b: SceneBuilder, x: float, z: float) -> None:
 
 
 _RECIPES: dict[str, Callable[[SceneBuilder], Scene]] = {
-    "room": _room,
-    "corridor": _corridor,
-    "street": _street,
-    "objects": _objects,
-    "clutter": _clutter,
-    "yard": _yard,
+    recipe.__name__[1:]: recipe for recipe in (_room, _corridor, _street, _objects, _clutter, _yard)
 }
 SCENE_KINDS = tuple(_RECIPES)
 SCENE_SHARES = (0.32, 0.12, 0.12, 0.26, 0.18, 0.0)
-"""Probabilities of the kinds, in their order, where none are asked for."""
+"""Probabilities of the kinds, in their order, in training samples that ask for none."""

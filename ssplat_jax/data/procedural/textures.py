@@ -152,23 +152,21 @@ def _plain(rng: np.random.Generator) -> np.ndarray:
     return base * (1 + fine + slow)
 
 
-def _cells(rng: np.random.Generator, rows: int, cols: int, bond: float, gap: float):
-    """Cell index and joint mask of a `rows` x `cols` lattice whose odd rows are shifted by `bond` of a cell."""
+def _masonry(rng: np.random.Generator, rows: int, cols: int, bond: float, spread: float) -> np.ndarray:
+    """Bricks, tiles or planks: noisy cells of varying tone, and joints of another color.
+
+    Cells form a `rows` x `cols` lattice whose odd rows are shifted by `bond` of a cell.
+    """
+    gap = rng.uniform(0.002, 0.008)
     y, x = np.mgrid[0:SIZE, 0:SIZE] / SIZE
     row = np.floor(y * rows).astype(int)
     shifted = x * cols + bond * (row % 2)
     col = np.floor(shifted).astype(int) % cols
     dy, dx = (y * rows) % 1.0 / rows, shifted % 1.0 / cols
     joint = (np.minimum(dy, 1 / rows - dy) < gap) | (np.minimum(dx, 1 / cols - dx) < gap)
-    return row * cols + col, joint
-
-
-def _masonry(rng: np.random.Generator, rows: int, cols: int, bond: float, spread: float) -> np.ndarray:
-    """Bricks, tiles or planks: noisy cells of varying tone, and joints of another color."""
-    cell, joint = _cells(rng, rows, cols, bond, rng.uniform(0.002, 0.008))
     tone = 1 + spread * rng.standard_normal((rows * cols, 1)) + 0.3 * spread * rng.standard_normal((rows * cols, 3))
     grain = _spectrum(rng, rng.uniform(0.5, 1.6), rng.choice([1.0, 6.0])) * rng.uniform(0.02, 0.12)
-    tile = _color(rng, 0.3, 0.9) * tone[cell] * (1 + grain[..., None])
+    tile = _color(rng, 0.3, 0.9) * tone[row * cols + col] * (1 + grain[..., None])
     return np.where(joint[..., None], _color(rng, 0.2, 0.8), tile)
 
 

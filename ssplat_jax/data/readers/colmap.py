@@ -76,7 +76,7 @@ class CameraEntry(NamedTuple):
 def _read(path: Path, convention: Convention) -> Listing:
     """The registered images whose files exist."""
     model, root = next(_models(path)), path.resolve()
-    cameras, entries = _cameras(model), _images(model)
+    cameras, entries = _load(model)
     folder = images_folder(root)
     if folder and all(entry.name.startswith(folder) for entry in entries):
         folder = ""  # COLMAP ran on the parent folder, so the names include images/
@@ -117,7 +117,7 @@ def _larger_models(path: Path, model: Path, num_images: int) -> list[str]:
     counts = {model: num_images}
     for folder in _numbered(model.parent) if model != path and model.name.isdecimal() else ():
         with contextlib.suppress(InputError):  # a damaged reconstruction that is not read
-            counts.setdefault(folder, len(_images(folder)))
+            counts.setdefault(folder, len(_load(folder)[1]))
     largest = max(counts, key=lambda folder: counts[folder])
     if largest == model:
         return []
@@ -145,16 +145,11 @@ def _intrinsics(camera: CameraEntry) -> Intrinsics:
 # -- files ------------------------------------------------------------------------------------------------------------
 
 
-def _cameras(model: Path) -> dict[int, CameraEntry]:
-    """Cameras by id of the reconstruction in a folder."""
-    is_binary = (model / "images.bin").is_file()
-    return _binary_cameras(model / "cameras.bin") if is_binary else _text_cameras(model / "cameras.txt")
-
-
-def _images(model: Path) -> list[ImageEntry]:
-    """Registered images of the reconstruction in a folder."""
-    is_binary = (model / "images.bin").is_file()
-    return _binary_images(model / "images.bin") if is_binary else _text_images(model / "images.txt")
+def _load(model: Path) -> tuple[dict[int, CameraEntry], list[ImageEntry]]:
+    """Cameras by id and registered images of the reconstruction in a folder."""
+    if (model / "images.bin").is_file():
+        return _binary_cameras(model / "cameras.bin"), _binary_images(model / "images.bin")
+    return _text_cameras(model / "cameras.txt"), _text_images(model / "images.txt")
 
 
 class _Binary:

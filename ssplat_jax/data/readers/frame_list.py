@@ -184,7 +184,8 @@ class FrameList:
         if depth is not None:
             check_depth_header(depth)
         if isinstance(pose, tuple):
-            matrix, deviation = pose_from_quat(*pose, where), 0.0
+            quat, translation = pose
+            matrix, deviation = pose_from_quat(quat, translation, where), 0.0
         else:
             matrix, deviation = check_camtoworld(pose, where + pose_field)
         (width, height), shrink = stored_size(image, described, where)

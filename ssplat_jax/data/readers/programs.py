@@ -88,10 +88,10 @@ def _read_polycam(path: Path, convention: Convention) -> Listing:
             fields = Fields(load_json(file), str(file))
             matrix = [[fields.number(f"t_{i}{j}") for j in range(4)] for i in range(3)]
             fields.refuse_lens("k1", "k2", "k3", "p1", "p2", "distortion")
-            fx, fy, cx, cy, *size = (fields.number(name) for name in ("fx", "fy", "cx", "cy", "width", "height"))
+            fx, fy, cx, cy, width, height = map(fields.number, ("fx", "fy", "cx", "cy", "width", "height"))
             depth = None if prefix else find_file(keyframes, [f"depth/{image.stem}.png"], str(image))
             intrinsics = Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy)
-            frames.add(image.name, image, matrix, intrinsics, str(file), tuple(size), key=image.stem, depth=depth)
+            frames.add(image.name, image, matrix, intrinsics, str(file), (width, height), key=image.stem, depth=depth)
     return frames.listing(len(images), "camera")
 
 

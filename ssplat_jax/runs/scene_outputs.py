@@ -1,4 +1,8 @@
-"""`ssplat export`: the scene of a run as a person gets it, in any format, upright, with a camera to start from."""
+"""A finished scene as a person gets it.
+
+`ssplat export` writes it in any format, upright, with a camera to start from; `ssplat render` draws it from the cameras
+of a capture, and a film along them.
+"""
 
 import dataclasses
 import math
@@ -8,26 +12,34 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float, Float64
 from scipy.spatial.transform import Rotation
 
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.console import Reporter
-from ssplat_jax.core.errors import InputError, refusal
+from ssplat_jax.core.errors import InputError, refusal, require_positive
+from ssplat_jax.core.false_colors import eight_bits
 from ssplat_jax.core.gaussians import Gaussians, mean_color
+from ssplat_jax.core.kept_programs import Kept
 from ssplat_jax.core.pytree import replace
-from ssplat_jax.data.camera_path import upward
-from ssplat_jax.data.posed_image import invert_pose
+from ssplat_jax.data.camera_path import camera_path, upward
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.evaluation.metrics import psnr
-from ssplat_jax.evaluation.pictures import evenly_spread
-from ssplat_jax.rasterizer import Effects, fill_holes, render
+from ssplat_jax.evaluation.pictures import VideoWriter, evenly_spread, save_image
+from ssplat_jax.rasterizer import Effects, effects_for, fill_holes, render
+from ssplat_jax.rasterizer.effects import FILTERS
 from ssplat_jax.runs.open_run import load_run, open_capture_of_scene
+from ssplat_jax.runs.options import RenderOptions
 from ssplat_jax.runs.run_results import scene_to_show
 from ssplat_jax.scene_files.formats import SCENE_READERS, ExportReport, file_axes, load_scene, save_gaussians
 from ssplat_jax.storage.chunk_records import load_chunk_records
-from ssplat_jax.storage.run_folder import RunFolder
+from ssplat_jax.storage.run_folder import RunFolder, lock_folder
 from ssplat_jax.streaming.feed import middle_exposure
+
+Pose = Float64[np.ndarray, "4 4"]
+Intrinsics = Float64[np.ndarray, "3 3"]
+
+_jitted_fill_holes = Kept(fill_holes)
 
 NUM_COMPARED, HOLE = 3, 0.5  # views that are compared, and the opacity of a pixel below which it is a hole
 
@@ -97,11 +109,7 @@ def turn_up(views: KnownCameras | None, up: str, to: Path) -> Float64[np.ndarray
         fix = "export a run, or pass --cameras CAPTURE"
         raise refusal("--up", wanted="cameras that are held level", got="none", fix=fix)
     wanted = file_axes(to).T @ np.eye(3)["xyz".index(up)]
-    across, cosine = np.cross(now, wanted), float(now @ wanted)
-    if np.linalg.norm(across) < 1e-9:  # half a turn about any axis that is perpendicular, or none at all
-        across = np.linalg.svd(now[None])[2][1]
-    angle = np.arctan2(np.linalg.norm(np.cross(now, wanted)), cosine)
-    return Rotation.from_rotvec(angle * across / np.linalg.norm(across)).as_matrix()
+    return Rotation.align_vectors(wanted, now)[0].as_matrix()  # the shortest one
 
 
 def turned(gaussians: Gaussians, turn: Float64[np.ndarray, "3 3"]) -> Gaussians:
@@ -159,9 +167,7 @@ def difference_in_words(to: Path, views: KnownCameras, turn: Float64[np.ndarray,
     for k in chosen:
         pose = views.camtoworlds[k].copy()
         pose[:3] = turn @ pose[:3]
-        pose[:3, 3] -= written.offset
-        viewmat, K = (jnp.asarray(x, jnp.float32) for x in (invert_pose(pose), views.Ks[k]))
-        camera = Camera(viewmats=viewmat, Ks=K, width=views.size[0], height=views.size[1])
+        camera = _camera_at(pose, views.Ks[k], views.size, written.offset)
         ours, plain = (render(scene, camera, effects=Effects(antialias=name)) for name in (None, "classic"))
         filled = np.asarray(fill_holes(ours.color, ours.alpha, mean_color(scene))) * views.exposures[k]
         scores.append(psnr(np.clip(plain.color, 0.0, 1.0), np.clip(filled, 0.0, 1.0)))
@@ -172,3 +178,66 @@ def difference_in_words(to: Path, views: KnownCameras, turn: Float64[np.ndarray,
         f"drawn by a plain renderer, {len(chosen)} views differ from our pictures of them by {np.mean(scores):.1f} dB"
         f" PSNR: {np.mean(holes):.1%} holes, which we fill, and exposures up to {exposure:.2f} times that of the file"
     )
+
+
+def render_run(options: RenderOptions, reporter: Reporter) -> int:
+    """Writes views/<frame>.png for frames of a capture, and optionally film.mp4; returns the number of pictures.
+
+    The scene is drawn with the filter that its file names, at the exposure of its file: the middle one of its stream.
+    The cameras of a run that adjusted its poses have those.
+
+    Raises:
+        InputError: the scene or the capture is unusable, the capture lies in `out`, `out` holds a run, or a film is
+            wanted without PyAV.
+        StorageError: `out` cannot be written, or adjusted poses of the scene's run are damaged.
+    """
+    scene, stride, film = options.scene, options.stride, options.film
+    require_positive(stride=stride, max_views=options.max_views, film=film)
+    file = RunFolder(scene).best_scene if scene.is_dir() else scene
+    splats = load_scene(file)
+    if splats.render_mode not in FILTERS:
+        fix = "render it where it was made"
+        raise refusal(str(file), wanted="3D Gaussians", got=f"a scene of {splats.render_mode}", fix=fix)
+    capture, folder = open_capture_of_scene(scene, options.path, options.image_size, reporter), RunFolder(options.out)
+    capture.check_output_folder(options.out)
+    folder.check_no_run()
+    indices = range(0, len(capture), stride)[: options.max_views]
+    size = (capture.width, capture.height)
+    writer = None if film is None else VideoWriter(*size)
+    background = None if options.over_black else mean_color(splats)
+    with lock_folder(options.out):
+        folder.clear_views()
+        folder.film.unlink(missing_ok=True)
+        with reporter.progress("rendering", len(indices)) as advance:
+            for place, i in enumerate(indices, start=1):
+                picture = _render_picture(splats, capture.frames[i].camtoworld, capture.K(i), size, background)
+                save_image(folder.view(i), picture)
+                advance(place)
+        if film is not None and writer is not None:
+            poses = np.stack([capture.frames[i].camtoworld for i in indices])
+            cameras = camera_path(poses, np.stack([capture.K(i) for i in indices]), film)
+            with reporter.progress("filming", len(cameras[0])) as advance:
+                for place, (pose, K) in enumerate(zip(*cameras, strict=True), start=1):
+                    writer.add(eight_bits(_render_picture(splats, pose, K, size, background)))
+                    advance(place)
+            writer.save(folder.film)
+    return len(indices)
+
+
+def _render_picture(
+    splats: Gaussians, camtoworld: Pose, K: Intrinsics, size: tuple[int, int], background: jax.Array | None
+) -> Float[np.ndarray, "h w 3"]:
+    """A scene from one camera of the capture's frame.
+
+    `background` is the color of holes that have no colors around them; None shows all holes black.
+    """
+    camera = _camera_at(camtoworld, K, size, splats.offset)
+    scene = replace(splats, offset=(0.0, 0.0, 0.0))  # the camera is relative to it already
+    out = render(scene, camera, effects=effects_for(scene, camera))
+    return np.asarray(out.color if background is None else _jitted_fill_holes(out.color, out.alpha, background))
+
+
+def _camera_at(camtoworld: Pose, K: Intrinsics, size: tuple[int, int], offset: tuple[float, float, float]) -> Camera:
+    """A camera of the capture's frame, relative to a point of it: float32 cannot hold places far from zero."""
+    viewmat = StreamFrame.at_point(offset).viewmats(camtoworld)
+    return Camera(jnp.asarray(viewmat), jnp.asarray(K, jnp.float32), width=size[0], height=size[1])
