@@ -153,18 +153,15 @@ class Capture:
                     digest.update(repr(part).encode())
         return digest.hexdigest()[:12]
 
-    def images_digest(self, indices: Sequence[int]) -> str:
-        """Digest (12 hex digits) of the bytes of the files that the frames `indices` stream; uses all cores.
+    def files_digest(self, i: int) -> str:
+        """Digest (12 hex digits) of the bytes of the files that frame `i` streams: image, mask and depth map.
 
         Images without a file are ignored: procedural images follow from the name of the capture.
         """
-        frames = [self.frames[i] for i in indices]
-        depth_paths = [frame.depth_path for frame in frames] if self.streams_depth else []
-        paths = [path for frame in frames for path in (frame.path, frame.mask_path)] + depth_paths
-        paths = [path for path in paths if path is not None]
-        with ThreadPoolExecutor() as pool:
-            digests = pool.map(lambda path: hashlib.sha256(path.read_bytes()).digest(), paths)
-            return hashlib.sha256(b"".join(digests)).hexdigest()[:12]
+        frame = self.frames[i]
+        paths = (frame.path, frame.mask_path, frame.depth_path if self.streams_depth else None)
+        digests = [hashlib.sha256(path.read_bytes()).digest() for path in paths if path is not None]
+        return hashlib.sha256(b"".join(digests)).hexdigest()[:12]
 
     def scaled(self, factor: float) -> "Capture":
         """The same capture with images `factor` times as large, at least one pixel."""

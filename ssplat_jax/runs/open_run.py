@@ -241,7 +241,7 @@ def load_run(run_dir: Path, reporter: Reporter) -> SavedRun:
 
 def _image_digests(capture: Capture, frames) -> dict[str, str]:
     """Digest of the image file of each frame."""
-    return {str(i): capture.images_digest([i]) for i in frames}
+    return {str(i): capture.files_digest(i) for i in frames}
 
 
 # -- adjusted poses ----------------------------------------------------------------------------------------------------

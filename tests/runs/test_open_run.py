@@ -53,7 +53,7 @@ def save_views(run, count):
     cache = run.session.model.init_cache()
     run.session.cache = replace(cache, num_voxels=jnp.int32(count), voxels=cache.voxels.at[:count].set(count))
     run.exposures = {i: np.full(3, 0.5, np.float32) for i in range(count)}
-    run.images = {str(i): run.capture.images_digest([i]) for i in range(count)}
+    run.images = {str(i): run.capture.files_digest(i) for i in range(count)}
     run.save()
 
 
