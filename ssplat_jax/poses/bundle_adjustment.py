@@ -26,7 +26,7 @@ from scipy.sparse import csr_array, diags_array
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
-from skimage.feature import SIFT
+from skimage import feature  # which loads SIFT, with scipy.stats, at its first use
 
 from ssplat_jax.data.posed_image import invert_pose
 from ssplat_jax.data.sparse_matches import (
@@ -269,7 +269,7 @@ def sift_keypoints(image: Float32[np.ndarray, "h w 3"]) -> SiftKeypoints:
     size = (round(width / shrink), round(height / shrink))
     if min(size) < MIN_SIDE:
         return nothing
-    detector: Any = SIFT()
+    detector: Any = feature.SIFT()
     try:
         detector.detect_and_extract(gray_image(image, size))
     except RuntimeError:  # skimage raises it for an image without keypoints
