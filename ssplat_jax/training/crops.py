@@ -128,11 +128,11 @@ class Crops:
             return cache, views.at(view), camera, np.s_[row : row + self.size[0]], np.s_[column : column + self.size[1]]
 
         # The largest capacities for all, so that one program serves every crop.
-        config, sizes = start.model.config, [(0, 0)]
+        config, counts = start.model.config, []
         for number in range(len(places)):
             cache, _, camera, *_ = place(number)
-            sizes.append(tuple(map(int, count_in_sight(cache, camera, config))))
-        num_pivots, num_gaussians = (round_rows(max(size)) for size in zip(*sizes, strict=True))
+            counts.append(count_in_sight(cache, camera, config))
+        num_pivots, num_gaussians = (round_rows(int(max(numbers))) for numbers in zip(*counts, strict=True))
 
         def crop(number: int, max_pairs: int) -> CropSample:
             cache, view, camera, rows, columns = place(number)
@@ -142,8 +142,8 @@ class Crops:
             return CropSample(cache, camera, jnp.asarray(image), view.exposures, pivots, num_gaussians, max_pairs)
 
         some = range(min(len(places), PAIRS_COUNTED * len(scenes)))
-        counts = [int(_count_pairs(start.model, start.params, crop(number, 0))) for number in some]
-        max_pairs = round_up(int(PAIRS_MARGIN * max(counts)))
+        most = max(int(_count_pairs(start.model, start.params, crop(number, 0))) for number in some)
+        max_pairs = round_up(int(PAIRS_MARGIN * most))
         return lambda step, place: tuple(crop(self.batch * step + i, max_pairs) for i in range(self.batch))
 
 

@@ -200,7 +200,7 @@ class CropLoss:
             loss = (1 - self.black_weight) * shown + self.black_weight * black
             metrics = {"psnr": -shown, "psnr_over_black": -black, "overflow": out.num_overflow.astype(jnp.float32)}
             if lpips is not None:
-                distances = jax.vmap(lambda view: lpips_distance(lpips, view, target))
+                distances = jax.vmap(functools.partial(lpips_distance, lpips, b=target))
                 shown, black = distances(jnp.clip(jnp.stack(views), 0.0, 1.0))
                 loss += self.lpips_weight * ((1 - self.black_weight) * shown + self.black_weight * black)
                 metrics |= {"lpips": shown, "lpips_over_black": black}

@@ -115,19 +115,22 @@ def test_the_paper_loss_of_a_scene_sums_mse_and_lpips_of_its_targets_over_black(
     assert (loss.depth_weight, loss.tokens, phase.samples.batch, phase.samples.num_targets) == (0, "all", 1, 4)
 
 
-def test_the_loss_of_a_crop_is_its_psnr_less_what_lpips_costs(monkeypatch):
-    """An empty scene is black, and its mean color, which fills it, is black too; LPIPS sees the filled image alone."""
-    monkeypatch.setattr(losses, "lpips_distance", lambda weights, a, b: 3.0 * jnp.abs(a - b).max(axis=(1, 2, 3)))
+def test_the_loss_of_a_crop_is_its_psnr_less_what_lpips_costs_filled_and_over_black(monkeypatch):
+    """An empty scene is black; here its holes are filled with a quarter of white."""
+    monkeypatch.setattr(losses, "lpips_distance", lambda weights, a, b: 3.0 * jnp.abs(a - b).max())
+    monkeypatch.setattr(losses, "fill_holes", lambda color, alpha, mean: color + 0.25)
     model, params = StreamSplat(NARROW), random_params(NARROW)
     image = np.random.default_rng(5).integers(0, 256, (16, 24, 3), np.uint8)
     camera = Camera(jnp.eye(4), jnp.array([[20.0, 0, 12], [0, 20, 8], [0, 0, 1]]), 24, 16)
-    crop = CropSample(model.init_cache(), camera, jnp.asarray(image), jnp.ones(3), num_pivots=8, max_pairs=1 << 10)
+    crop = CropSample(model.init_cache(), camera, jnp.asarray(image), jnp.ones(3), jnp.full(8, -1), 8, 1 << 10)
     target = image.astype(np.float64) / 255
-    psnr = -10 * np.log10((target**2).mean() + losses.MIN_MSE)
-    for weights, cost in ((None, 0.0), (LpipsWeights((), (), ()), 20.0 * 3.0 * target.max())):
-        value, metrics = CropLoss(lpips_weight=20.0)(model, params, (crop,), weights)
-        assert float(value) == pytest.approx(cost - psnr, rel=1e-5) and ("lpips" in metrics) == bool(cost)
-        assert float(metrics["psnr"]) == pytest.approx(psnr, rel=1e-5)
+    psnrs = [-10 * np.log10(((x - target) ** 2).mean() + losses.MIN_MSE) for x in (0.25, 0.0)]
+    costs = [20.0 * 3.0 * np.abs(x - target).max() for x in (0.25, 0.0)]
+    for weights, times in ((None, 0), (LpipsWeights((), (), ()), 1)):
+        value, metrics = CropLoss(black_weight=0.4, lpips_weight=20.0)(model, params, (crop,), weights)
+        wanted = sum(share * (times * cost - x) for share, cost, x in zip((0.6, 0.4), costs, psnrs, strict=True))
+        assert float(value) == pytest.approx(wanted, rel=1e-5) and ("lpips" in metrics) == bool(times)
+        assert float(metrics["psnr_over_black"]) == pytest.approx(psnrs[1], rel=1e-5)
 
 
 def test_masked_pixels_of_a_target_have_neither_value_nor_gradient():

@@ -12,7 +12,11 @@ import pytest
 
 from ssplat_jax.commands.weights_commands import Train
 from ssplat_jax.config import preset
+from ssplat_jax.data.open_capture import open_capture
+from ssplat_jax.data.split import interleaved_split
 from ssplat_jax.model.network import init_params
+from ssplat_jax.model.streamsplat import StreamSplat
+from ssplat_jax.rasterizer import render
 from ssplat_jax.storage.weights import describe_weights, load_params, load_weights, save_weights
 from ssplat_jax.training import crops, loop, recipe
 from ssplat_jax.training.crops import Crops
@@ -62,6 +66,35 @@ def test_the_evidence_head_learns_alone(trained):
         assert all(same) == (stage != "evidence")
     assert all(np.isfinite(x).all() for x in flat(after))
     assert np.abs(after["evidence"]["out"]["kernel"]).max() > 1e-3  # zeros before training
+
+
+def test_a_crop_shows_what_the_whole_scene_shows_there(trained):
+    """So do the Gaussians of the pivots that may be seen in it, as large as training may make them."""
+    (cache, views), model = trained[1][0], StreamSplat(NARROW)
+    params, _ = load_weights(trained[0] / "weights.npz")
+    params["evidence"]["out"]["bias"] = jnp.array([0.0, 9.0, 9.0, 0.0])  # scales at their bound
+    everything, num_left_out = model.decode(params, cache), 0
+    for row, column in ((0, 0), (8, 8), (16, 16)):
+        camera = crops.crop_camera(views.camera(1), row, column, 16, 24)
+        num_pivots, num_gaussians = map(int, crops.count_in_sight(cache, camera, NARROW))
+        pivots = crops.pivots_in_sight(cache, camera, NARROW, num_pivots)
+        assert (pivots >= 0).all()
+        some = model.decode_rows(params, cache, pivots, num_gaussians)
+        wanted, got = (render(x, camera, effects=crops.EFFECTS) for x in (everything, some))
+        np.testing.assert_allclose(got.color, wanted.color, atol=1e-6)
+        num_left_out += int((everything.opacities > 0).sum()) - num_gaussians
+    assert num_left_out > 0
+
+
+def test_half_of_the_views_of_a_crop_were_never_streamed(trained):
+    """They are the targets of the split; each stands with an exposure of its own."""
+    _, views = trained[1][0]
+    split = interleaved_split(12, 1, 11)
+    capture = open_capture(CROPS.procedural[0], size=(64, 48))
+    images = np.asarray(views.images)[..., :3] / 255
+    shown = [i for i in range(12) if any(np.abs(capture.image(i) - x).max() < 0.01 for x in images)]
+    assert set(split.targets) < set(shown) and len(shown) == len(images) == 2 * len(split.targets)
+    assert np.isfinite(views.exposures).all() and (views.exposures > 0).all()
 
 
 def test_weights_tell_their_history(trained):
