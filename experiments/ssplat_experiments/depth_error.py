@@ -9,7 +9,6 @@ calibrated if the error falls as it rises. Weights whose confidences differ are 
 the surest ones. docs/results.md holds the numbers to expect.
 """
 
-import dataclasses
 import itertools
 from pathlib import Path
 from typing import Any
@@ -67,7 +66,7 @@ def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str
 
 def measure(capture: Capture, split: Split) -> dict[str, Any]:
     """One row: errors of the tokens of the context views."""
-    model, capture = StreamSplat(preset("tiny")), dataclasses.replace(capture, streams_depth=False)
+    model = StreamSplat(preset("tiny"))
     stream_frame = capture.stream_frame(model.config, split.context)
     order = capture.stream_order(model.config, split.context, stream_frame)
     session = Session(model, load_params("tiny"))

@@ -34,12 +34,12 @@ def open_room(context: int, size: tuple[int, int]) -> tuple[Capture, Split]:
 
 
 def open_redkitchen(captures: Path, context: int, size: tuple[int, int]) -> tuple[Capture, Split]:
-    """The capture redkitchen in the folder `captures`, and its interleaved split.
+    """The capture redkitchen in the folder `captures`, without its depth maps, and its interleaved split.
 
     Raises:
         InputError: it is not there.
     """
-    capture = open_capture(captures / REDKITCHEN, size=size)
+    capture = open_capture(f"{captures / REDKITCHEN}?depth=off", size=size)
     return capture, interleaved_split(len(capture), REDKITCHEN_STRIDE, context)
 
 
