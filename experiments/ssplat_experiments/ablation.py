@@ -18,7 +18,7 @@ from typing import Any
 
 import jax
 
-from ssplat_experiments.captures import SETTINGS
+from ssplat_experiments.captures import SETTINGS, is_there
 from ssplat_experiments.cases import PICTURE, Case, Row
 from ssplat_experiments.study import Study, at_scale, run_study
 from ssplat_jax.config import StreamConfig, preset
@@ -194,7 +194,7 @@ def learned_from(captures: Path | None) -> list[str]:
 
 def scenes_of(captures: Path | None) -> list[str]:
     """Names of the scored scenes."""
-    there = [row for row in SETTINGS if captures is not None and (captures / row[0]).is_dir()]
+    there = [row for row in SETTINGS if captures is not None and is_there(captures, row[0])]
     return [REVISIT, *(f"{name}, stride {stride}" for name, stride, *_ in there)]
 
 
