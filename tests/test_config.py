@@ -1,10 +1,8 @@
-"""The configuration: bad values are refused, every field changes the hash, and no JAX is needed."""
+"""The configuration: bad values are refused, and every field changes the hash."""
 
 import dataclasses
 import json
 import re
-import subprocess
-import sys
 from typing import ClassVar, Literal, get_args, get_origin
 
 import pytest
@@ -15,23 +13,17 @@ from ssplat_jax.network_configs import CompactConfig
 
 BAD = [
     {"chunk_size": 0},
-    {"voxel_size": 0.0},
     {"voxel_size": float("nan")},
-    {"pivots_per_voxel": 0},
+    {"voxel_size": float("inf")},
     {"capacity": 1000},
     {"num_sources": -1},
     {"encoder_widths": (16,)},
+    {"encoder_widths": (32, 63)},
     {"attention_window": 6},
     {"token_width": 30},
-    {"cgfi_width": 4},
-    {"voxel_size": float("inf")},
-    {"scene_scale": float("inf")},
-    {"encoder_widths": (32, 63)},
-    {"min_confidence": float("nan")},
     {"sh_degree": 4},
     {"scene_scale": "big"},
     {"overflow": "grwo"},
-    {"depth_readout": ""},
     {"min_confidence": 0.96},  # carving keeps confidences below 0.95
 ]
 
@@ -59,7 +51,7 @@ def test_presets_are_the_same_after_json(name):
 @pytest.mark.parametrize("network", ["compact", "resplat"])
 def test_every_field_changes_the_hash(network):
     base = StreamConfig().replace(network=network)
-    change = {
+    by_type = {
         bool: lambda x: not x,
         int: lambda x: 2 * x,
         float: lambda x: 0.5 * x + 0.7,
@@ -67,19 +59,15 @@ def test_every_field_changes_the_hash(network):
     }
     by_name = {"steps_per_chunk": 4, "scene_scale": 3.0, "sh_degree": 3, "depth_range": (0.5, 9.0), "mixer_radius": 7}
     by_name |= {"mixer_blocks": 3}
-    hashes = {base.hash, base.replace(preset="other").hash}
-    num_fields = 1
+    hashes, num_fields = {base.hash, base.replace(preset="other").hash}, 1
     for group in base.groups():
         for field in dataclasses.fields(getattr(base, group)):
-            value = base.get(field.name)
-            if field.name in by_name:
-                changed = by_name[field.name]
-            elif get_origin(field.type) is Literal:
+            value, num_fields = base.get(field.name), num_fields + 1
+            if get_origin(field.type) is Literal:
                 changed = next(option for option in get_args(field.type) if option != value)
             else:
-                changed = change[type(value)](value)
+                changed = by_name[field.name] if field.name in by_name else by_type[type(value)](value)
             hashes.add(base.replace(**{f"{group}.{field.name}": changed}).hash)
-            num_fields += 1
     assert len(hashes) == 1 + num_fields
 
 
@@ -100,9 +88,3 @@ def test_paper_has_no_additions_and_shared_fields_are_few():
     assert {x for x in dataclasses.asdict(LITERAL).values() if x is not False} == {"metric"}
     groups = (getattr(StreamConfig(), name) for name in StreamConfig().groups() if name != "network")
     assert sum(len(dataclasses.fields(group)) for group in groups) <= 26
-
-
-def test_help_needs_no_jax():
-    """The package, its configuration and errors are imported without JAX, so that `--help` is fast."""
-    code = "import sys, ssplat_jax, ssplat_jax.config, ssplat_jax.core.errors; sys.exit('jax' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], timeout=60).returncode == 0

@@ -14,6 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from PIL import Image
 
+from ssplat_jax.data.capture import Capture
+from ssplat_jax.data.open_capture import open_capture
+
 WIDTH, HEIGHT, NUM_FRAMES = 64, 48, 4
 
 
@@ -39,6 +42,11 @@ def make_capture(root: Path, change: Callable[[Path, dict[str, Any]], Any] = lam
     if not (root / "transforms.json").exists():
         (root / "transforms.json").write_text(json.dumps(meta))
     return root
+
+
+def opened(folder: Path, *spoilers) -> Capture:
+    """The good capture after what `spoilers` did to it, opened."""
+    return open_capture(make_capture(folder / "capture", both(*spoilers)))
 
 
 def mutant(data: bytes, rng: random.Random) -> bytes:
@@ -94,6 +102,22 @@ def text(content: str | bytes):
     """Writes the given contents to transforms.json."""
     data = content.encode() if isinstance(content, str) else content
     return lambda root, meta: (root / "transforms.json").write_bytes(data)
+
+
+def depth_map(i, value, **fields):
+    """Gives frame `i` a depth image of 16 bits: `value` in each pixel, or an array."""
+
+    def spoil(root, meta):
+        values = value if isinstance(value, np.ndarray) else np.full((HEIGHT, WIDTH), value)
+        Image.fromarray(values.astype(np.uint16)).save(root / "d.png")
+        frame(i, **{"depth_file_path": "d.png", **fields})(root, meta)
+
+    return spoil
+
+
+def another(i, name, make):
+    """Names another image in frame `i`, which `make` writes to its path."""
+    return lambda root, meta: [make(root / "images" / name), frame(i, file_path=f"images/{name}")(root, meta)]
 
 
 def image(make):
@@ -172,11 +196,6 @@ def depth(make):
         meta["frames"][2]["depth_file_path"] = "d.png"
 
     return spoil
-
-
-def gray(mode):
-    """Gives frame 2 a depth image of Pillow mode `mode`."""
-    return depth(lambda file: Image.new(mode, (WIDTH, HEIGHT), 100).save(file))
 
 
 def cut(file):
@@ -266,7 +285,7 @@ CASES = (
     # depth
     Case("missing depth", frame(2, depth_file_path="nowhere.png"), "frames[2].depth_file_path"),
     Case("depth outside", frame(2, depth_file_path="../d.png"), "frames[2].depth_file_path"),
-    Case("depth of 8 bits", gray("L"), "d.png"),
+    Case("depth of 8 bits", depth(lambda file: Image.new("L", (WIDTH, HEIGHT)).save(file)), "d.png"),
     Case("depth cut short", depth(cut), "d.png"),
     Case("depth is a JPEG", frame(2, depth_file_path="images/1.jpg"), "1.jpg"),
     Case("depth a folder", depth(lambda file: file.mkdir()), FILE),

@@ -61,7 +61,7 @@ class Recipe:
         tokens = {name: x.astype(np.float32) for name, x in tokens.items()}
         for token in rng.choice(m, self.num_bad, replace=False):
             name = rng.choice(sorted(tokens))
-            tokens[name][token] = rng.choice([np.nan, np.inf, -np.inf])
+            tokens[name][token] = rng.choice([np.nan, np.inf, -np.inf, 0.0, -0.1])
         valid = np.zeros(m, bool)
         valid[rng.choice(m, self.num_valid, replace=False)] = True
         return tokens | {"valid": valid}

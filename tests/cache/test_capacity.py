@@ -36,10 +36,9 @@ def test_capacity_grows_by_doubling_and_never_shrinks():
     assert ensure_capacity(cache, GROW, 17).capacity == 32
     assert ensure_capacity(cache, GROW, 1000).capacity == 1024
     assert ensure_capacity(cache, CONFIG, 1000) is cache  # another policy
-    with pytest.raises(InputError, match="at least 16"):
-        grow(cache, 8)
-    with pytest.raises(InputError, match="power of two"):
-        init_cache(CONFIG, 100)
+    for refused in (lambda: grow(cache, 8), lambda: init_cache(CONFIG, 100)):
+        with pytest.raises(InputError):
+            refused()
     assert starting_capacity(CONFIG.replace(capacity=128, overflow="grow"), 50_000) == 1 << 18
     assert starting_capacity(CONFIG, 50_000) == CONFIG.memory.capacity
 

@@ -28,7 +28,6 @@ from tests.cache.streams import (
     recipes,
     run_both,
     to_jax,
-    written_rows,
 )
 
 CONFIGS = VARIANTS | {"single": CONFIG.replace(pivots_per_voxel=1), "refined": PAIRS.replace(steps_per_chunk=1)}
@@ -118,32 +117,6 @@ def test_splitting_a_chunk_changes_nothing(stream, at):
         assert int(getattr(whole.stats, name)) == int(getattr(split.stats, name))
 
 
-@pytest.mark.parametrize(
-    ("name", "value", "counter"),
-    [
-        ("confidences", np.nextafter(np.float32(0.3), np.float32(0)), "num_low_confidence"),
-        ("means", np.nan, "num_non_finite"),
-        ("feats", -np.inf, "num_non_finite"),
-        ("confidences", np.nan, "num_non_finite"),
-        ("footprints", np.nan, "num_non_finite"),
-        ("footprints", -0.1, "num_non_finite"),
-        ("footprints", 0.0, "num_non_finite"),
-        ("means", np.float32(-(1 << 21) * 0.25), "num_out_of_range"),
-    ],
-)
-def test_rejected_tokens_change_only_their_counter(name, value, counter):
-    tokens = Recipe(seed=2, places="one_voxel", features="normal", confidences="tied").tokens()
-    before = run([Recipe(seed=3, places="one_voxel", features="normal", confidences="tied")])
-    tokens["confidences"][:] = np.float32(0.3)  # tau itself is accepted
-    accepted = fuse(jax.tree.map(jnp.copy, before), to_jax(tokens), CONFIG)
-    assert int(accepted.stats.num_accepted - before.stats.num_accepted) == NUM_TOKENS
-    tokens[name] = np.full_like(tokens[name], value)
-    after = fuse(jax.tree.map(jnp.copy, before), to_jax(tokens), CONFIG)
-    assert_same_cache(before, after)
-    added = jax.tree.map(lambda a, b: int(a) - int(b), after.stats, before.stats)
-    assert getattr(added, counter) == NUM_TOKENS == added.num_seen and added.num_accepted == 0
-
-
 @pytest.mark.parametrize("places", ["few", "edges"])
 def test_padding_is_the_identity(places):
     before = run([Recipe(seed=5, places=places, features="normal", confidences="random")])
@@ -176,22 +149,6 @@ def test_fuse_runs_in_place_with_memory_free_of_capacity(name):
     assert small.alias_size_in_bytes >= small_size and large.alias_size_in_bytes >= size
     per_row = {"voxel": 0, "append": 4}[name]  # "append" copies the counts
     assert large.temp_size_in_bytes <= small.temp_size_in_bytes + 64 + per_row * (1024 - 128)
-
-
-@pytest.mark.parametrize("name", VARIANTS)
-def test_pivots_name_the_chunk_that_last_wrote_them_and_one_program_serves_all_chunks(name):
-    """A copy that takes over only the rows written by each chunk equals the cache."""
-    config, before = VARIANTS[name], fuse._cache_size()
-    cache = init_cache(config, CAPACITY)
-    copy = {name: np.zeros(getattr(cache, name).shape) for name in ("counts", *PIVOT_FIELDS)}
-    for seed, places in enumerate(("few", "many", "one_voxel", "many", "edges")):
-        recipe = Recipe(seed, places, "normal", "random", num_valid=24)
-        cache = fuse(cache, to_jax(recipe.tokens()), config)
-        rows = sorted(written_rows(cache))
-        for name, x in copy.items():
-            x[rows] = np.asarray(getattr(cache, name))[rows]
-            np.testing.assert_array_equal(x, getattr(cache, name), name)
-    assert fuse._cache_size() <= before + 1
 
 
 # Limits stated by `fuse` ----------------------------------------------------------------------------------------------

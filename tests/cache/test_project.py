@@ -10,7 +10,6 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from ssplat_jax.cache import carve, coarsen, observe, project
-from ssplat_jax.cache.project import fold_pairs, rows_in_sight
 from ssplat_jax.core.pytree import replace
 from tests.cache import numpy_reference as reference
 from tests.cache.projection_scenes import (
@@ -103,24 +102,6 @@ def test_a_coarse_cell_equals_its_nearest_fine_cell():
 
 
 # Rows in sight --------------------------------------------------------------------------------------------------------
-
-
-def test_a_fold_visits_every_row_in_sight_once_and_no_other(monkeypatch):
-    monkeypatch.setattr(MODULE, "ROWS_PER_BLOCK", 4)
-    cache, camera = scene(3, CAPACITY - 1, 6.0), cameras(4)
-    in_sight = rows_in_sight(cache, camera)
-    assert 4 < in_sight.number < cache.num_voxels and in_sight.number % 4  # several blocks, the last one partly empty
-
-    def visit(counts, pairs, rows, is_row):
-        is_seen = (pairs.weights > 0).reshape(len(camera.viewmats), len(rows), -1).any(axis=(0, 2))
-        return counts[0].at[rows].add(is_row.astype(int)), counts[1].at[rows].add(is_seen.astype(int))
-
-    zeros = jnp.zeros(CAPACITY, int)
-    visits, seen = fold_pairs(cache, camera, in_sight, visit, (zeros, zeros))
-    wanted = np.zeros(CAPACITY, int)
-    wanted[np.asarray(in_sight.rows[: int(in_sight.number)])] = 1
-    np.testing.assert_array_equal(visits, wanted)
-    np.testing.assert_array_equal(seen, wanted)
 
 
 def test_the_size_of_blocks_changes_nothing(monkeypatch):

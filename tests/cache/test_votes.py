@@ -200,18 +200,6 @@ def test_without_carving_nothing_is_computed():
 # Observations ---------------------------------------------------------------------------------------------------------
 
 
-def of_pivot(depth: float, *, at: float = 2.0, weight: float = 0.8, color: float = 0.5):
-    """Observations of one pivot on the axis of the front camera, whose cells all have one depth and color."""
-    cache = with_pivots([[0.0, 0.0, depth]], confidences=[0.6])
-    cache = replace(cache, footprints=cache.footprints.at[0, 0].set(0.5), rgbs=cache.rgbs.at[0, 0].set(0.5))
-    return np.asarray(told(cache, front_camera(), seen(at, weight, color))[1].observations[0, 0])
-
-
-@pytest.mark.parametrize(("depth", "weight"), [(np.nan, 0.8), (np.inf, 0.8), (0.0, 0.8), (2.0, 0.0), (2.0, 0.29)])
-def test_untrusted_cells_say_nothing(depth, weight):
-    assert not of_pivot(2.0, at=depth, weight=weight).any()
-
-
 def test_shards_see_what_the_whole_cache_sees():
     """Pivots of other shards crowd a cell too."""
     (whole, views), camera = random_scene(0, depth_spread=0.1), cameras(0)

@@ -13,21 +13,15 @@ from tests.commands.command_fixture import read
 
 # The fuse of the cache, its buffers donated as in a stream.
 FUSING = """
-import functools, hashlib
+import hashlib
 from ssplat_jax.commands.program_cache import keep_programs
 keep_programs()
 import jax, numpy as np
-from ssplat_jax.cache import Tokens, fuse, init_cache
-from ssplat_jax.config import preset
-config = preset("tiny").replace(capacity=1024)
-r, n = np.random.default_rng(0), 512
-f = lambda *shape: jax.numpy.asarray(r.uniform(0.1, 1, (n, *shape)), "float32")
-chunk = Tokens(means=f(3), feats=f(config.network.token_width), confidences=f(), quats=f(4),
-               rgbs=f(3 * config.head.gaussians_per_token), footprints=f(), valid=jax.numpy.ones(n, bool))
-step, cache = jax.jit(functools.partial(fuse, config=config), donate_argnums=0), init_cache(config)
+from tests.cache.streams import CONFIG, Recipe, fuse, init_cache, to_jax
+cache, tokens = init_cache(CONFIG), to_jax(Recipe(0, "few", "normal", "random").tokens())
 for _ in range(3):
     given = cache
-    cache = jax.block_until_ready(step(cache, chunk))
+    cache = jax.block_until_ready(fuse(cache, tokens, CONFIG))
     assert given.means.is_deleted(), "not donated"
 print(hashlib.sha256(b"".join(np.asarray(x).tobytes() for x in jax.tree.leaves(cache))).hexdigest())
 """

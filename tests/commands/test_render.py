@@ -1,7 +1,6 @@
 """`ssplat render`: pictures of a scene file from a capture's cameras, and a film."""
 
 import json
-import sys
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,22 +14,16 @@ from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.rasterizer import Effects, fill_holes
 from ssplat_jax.scene_files.formats import save_gaussians
 from tests.commands.command_fixture import make_capture, run
+from tests.scene_files import scene_fixture
 
 LEVEL = 1.0 / 255
 FILM_DB = 38.0  # x264's losses, of the brightness: colors have half the resolution
-SHIFT = (4096.0, -512.0, 64.0)  # whole numbers, so that the positions counted from it are the same floats
 
 
-def scene(num_gaussians=60):
-    rng = np.random.default_rng(3)
-    values = {
-        "means": np.round(rng.uniform([-1, -1, -4], [1, 1, -2], (num_gaussians, 3)) * 256) / 256,
-        "quats": rng.normal(size=(num_gaussians, 4)),
-        "scales": rng.uniform(0.02, 0.2, (num_gaussians, 3)),
-        "opacities": rng.uniform(0.2, 0.9, num_gaussians),
-        "colors": rng.uniform(size=(num_gaussians, 3)),
-    }
-    return ss.Gaussians.from_rgb(**{name: jnp.asarray(x, jnp.float32) for name, x in values.items()})
+def scene():
+    """In front of the first camera, which looks along -z; positions are multiples of 1/256."""
+    plain = scene_fixture.scene(0, seed=3)
+    return replace(plain, means=-jnp.round(256 * plain.means) / 256)
 
 
 def picture(path):
@@ -83,19 +76,6 @@ def test_a_scene_of_any_format_is_drawn_with_the_filter_that_it_names(tmp_path, 
         assert np.abs(found - wanted(capture, loaded, 0, "mip")).max() > 3 * LEVEL
 
 
-def test_a_scene_counted_from_an_offset_is_seen_where_it_is(tmp_path, capture):
-    gaussians = scene()
-    ss.save_ply(tmp_path / "near.ply", gaussians)
-    moved = replace(gaussians, means=gaussians.means - jnp.asarray(SHIFT, jnp.float32))
-    ss.save_ply(tmp_path / "counted.ply", moved, offset=SHIFT)
-    arguments = (capture, "--max-views", "1", "--quiet", "--out")
-    for name in ("near", "counted"):
-        assert run("render", tmp_path / f"{name}.ply", *arguments, tmp_path / name) == 0
-    pictures = [picture(tmp_path / name / "views" / "00000.png") for name in ("near", "counted")]
-    # The camera's place among numbers of 4096 is rounded to 2e-4: a hundredth of a pixel.
-    np.testing.assert_allclose(*pictures, atol=3 * LEVEL)
-
-
 @pytest.mark.parametrize("unit", [1e-3, 1e3])
 def test_pictures_do_not_depend_on_the_unit_of_the_capture(tmp_path, capture, unit):
     """Poses in millimeters or kilometers: at a thousandth, everything lies before a near plane of 0.01."""
@@ -112,12 +92,6 @@ def test_pictures_do_not_depend_on_the_unit_of_the_capture(tmp_path, capture, un
         pictures = [picture(tmp_path / name / "views" / f"{i:05d}.png") for name in "ab"]
         assert pictures[0].std() > 0.05
         np.testing.assert_allclose(*pictures, atol=1.1 * LEVEL)
-
-
-def test_a_scene_of_another_kind_is_refused_and_nothing_written(tmp_path, capture, capsys):
-    ss.save_ply(tmp_path / "scene.ply", scene(), render_mode="2dgs")
-    assert run("render", tmp_path / "scene.ply", capture, "--out", tmp_path / "out", "--quiet") == 2
-    assert "2dgs" in capsys.readouterr().err and not (tmp_path / "out").exists()
 
 
 def decode(path):
@@ -146,12 +120,3 @@ def test_a_film_goes_from_camera_to_camera(tmp_path, capture):
     # Without a film, none of another scene stays.
     assert run("render", tmp_path / "scene.ply", capture, *arguments) == 0
     assert sorted(path.name for path in out.iterdir()) == ["views"]
-
-
-def test_a_film_without_its_package_is_refused_and_nothing_written(tmp_path, capture, capsys, monkeypatch):
-    monkeypatch.setitem(sys.modules, "av", None)  # not installed
-    ss.save_ply(tmp_path / "scene.ply", scene())
-    out = tmp_path / "out"
-    assert run("render", tmp_path / "scene.ply", capture, "--film", "2", "--out", out, "--quiet") == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert 'pip install -e ".[video]"' in line and not out.exists()

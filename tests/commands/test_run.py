@@ -10,12 +10,10 @@ import numpy as np
 import pytest
 from jax import monitoring
 
-from ssplat_jax.commands.stream_commands import Run
-from ssplat_jax.config import QUALITIES, StreamConfig
+from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.atomic import previous_path
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.model.streamsplat import StreamSplat
-from ssplat_jax.runs.capture_run import RunResult
 from ssplat_jax.storage.chunk_records import (
     load_chunk_records,
     load_delta,
@@ -181,14 +179,12 @@ def test_a_damaged_image_stops_the_stream_with_what_came_before_it_saved(finishe
     assert read(out / "metrics.json")["views"] == 12
 
 
-def test_a_run_records_its_chunks(narrow, tmp_path):
-    path, out = make_capture(tmp_path / "capture", num_frames=9, size=SIZE), tmp_path / "out"
-    assert run("run", path, "--out", out, *narrow) == 0
-    capture, folder = open_capture(path), RunFolder(out)
+def test_a_run_records_its_chunks(finished):
+    capture, folder = open_capture(finished / "capture"), RunFolder(finished / "run")
     records = load_chunk_records(folder.chunk_record_files())
-    assert [r.num_views for r in records] == [4, 8, 9]
+    assert [r.num_views for r in records] == [4, 8, 12]
     views = [view for r in records for view in r.views]
-    assert sorted(view.frame for view in views) == list(range(9))
+    assert sorted(view.frame for view in views) == list(range(12))
     metrics = read(folder.metrics)
     for view in views:
         np.testing.assert_array_equal(view.camtoworld, capture.frames[view.frame].camtoworld)
@@ -197,18 +193,6 @@ def test_a_run_records_its_chunks(narrow, tmp_path):
         assert np.abs(open_thumbnail(view.thumbnail) / 255 - capture.image(view.frame)).mean() < 0.1  # JPEG of noise
     assert records[-1].num_gaussians == metrics["cache"]["decoded"]
     assert 0 < records[0].occupancy <= records[-1].occupancy <= 1 and all(r.seconds > 0 for r in records)
-
-
-def test_refinement_follows_with_the_steps_of_the_quality(tmp_path, monkeypatch):
-    asked = []
-    monkeypatch.setattr("ssplat_jax.commands.stream_commands.Refine.run", lambda command: asked.append(command) or 0)
-    monkeypatch.setattr("ssplat_jax.runs.capture_run.run_capture", lambda *given: RunResult(4, 1))
-    assert Run("procedural:room", tmp_path, quiet=True).run() == 0
-    # A refinement that is stopped says how it continues: without the flag, which would start the run anew.
-    assert Run("procedural:room", tmp_path, refine=30, overwrite=True, quiet=True).run() == 0
-    assert Run("procedural:room", tmp_path, quality="accurate", quiet=True).run() == 0
-    assert [(c.folder, c.steps, c.overwrite) for c in asked] == [(tmp_path, 100, False), (tmp_path, 30, True)]
-    assert QUALITIES["best"].scale == 1.0 and Run("x", tmp_path, quality="fast").scale == 0.5
 
 
 @pytest.mark.slow

@@ -5,19 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from ssplat_jax.core.cameras import pixel_grid, project_points, unproject
-from tests.core.test_rotations import rodrigues
 
 PIXELS = 2e-3  # float32 of pixel coordinates up to a few thousand, after a handful of operations
-
-
-def poses(num: int, reach: float, seed: int = 0) -> np.ndarray:
-    """Random rigid transforms in float64 with translations up to `reach`."""
-    rng = np.random.default_rng(seed)
-    out = np.tile(np.eye(4), (num, 1, 1))
-    for pose in out:
-        pose[:3, :3] = rodrigues(rng.normal(size=3), rng.uniform(-3, 3))
-        pose[:3, 3] = rng.uniform(-reach, reach, 3)
-    return out
 
 
 def intrinsics(num: int, seed: int = 0) -> np.ndarray:

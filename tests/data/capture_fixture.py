@@ -1,5 +1,7 @@
 """Small captures in memory, and the stream frame of a capture's first camera."""
 
+import dataclasses
+
 import numpy as np
 
 from ssplat_jax.data.capture import ArrayPixels, Capture
@@ -13,11 +15,10 @@ def smooth_capture(num_frames=6, height=48, width=64):
     ys, xs = np.meshgrid(np.arange(height) + 0.5, np.arange(width) + 0.5, indexing="ij")
     images = np.stack([np.stack([xs / width, ys / height, 0 * xs + i / 10], -1) for i in range(num_frames)])
     depths = np.stack([1 + xs / width + i for i in range(num_frames)])
-    frames = []
+    frames, K = [], np.array([[60.0, 0, 30.0], [0, 61.0, 26.0], [0, 0, 1]])
     for i in range(num_frames):
         pose = rotated(10.0 * i)
         pose[:3, 3] = [0.3 * i, 0.05 * i, 0.1]
-        K = np.array([[60.0, 0, 30.0], [0, 61.0, 26.0], [0, 0, 1]])
         frames.append(Frame(name=str(i), camtoworld=pose, K=K, width=width, height=height))
     pixels = ArrayPixels(images=images.astype(np.float32), depths=depths.astype(np.float32))
     return Capture(name="smooth", format="memory", frames=tuple(frames), pixels=pixels, width=width, height=height)
@@ -25,14 +26,7 @@ def smooth_capture(num_frames=6, height=48, width=64):
 
 def resized(capture, width, height):
     """The same capture with another size of delivered images."""
-    return Capture(
-        name=capture.name,
-        format=capture.format,
-        frames=capture.frames,
-        pixels=capture.pixels,
-        width=width,
-        height=height,
-    )
+    return dataclasses.replace(capture, width=width, height=height)
 
 
 def frame_of(capture, scale=1.0):

@@ -10,7 +10,8 @@ import numpy as np
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-WIDTH, HEIGHT, NUM_FRAMES = 64, 48, 4
+from tests.badinputs.cases import HEIGHT, NUM_FRAMES, WIDTH
+
 FX, FY, CX, CY = 50.0, 51.0, 31.0, 25.0
 K = np.array([[FX, 0, CX], [0, FY, CY], [0, 0, 1]])
 COLMAP_IMAGES = ("b 0.jpg", "9.jpg", "10.jpg", "c/1.jpg")  # names with spaces, folders and numbers, unsorted
@@ -84,13 +85,20 @@ def matrix_text(matrix):
     return "\n".join(" ".join(repr(float(x)) for x in row) for row in matrix) + "\n"
 
 
-def write_scannet(root):
+def written(root, pattern):
+    """Numbers and poses of the images, each of which is written to `root` under its name."""
     for i, pose in enumerate(poses()):
-        write_image(root / "color" / f"{9 + i}.jpg", i)
-        write_depth(root / "depth" / f"{9 + i}.png", 1500)
-        (root / "pose").mkdir(exist_ok=True)
-        (root / "pose" / f"{9 + i}.txt").write_text(matrix_text(pose))
-    (root / "intrinsic").mkdir()
+        write_image(root / pattern.format(i), i)
+        yield i, pose
+
+
+def write_scannet(root):
+    for folder in ("pose", "intrinsic"):
+        (root / folder).mkdir()
+    for i, pose in enumerate(poses(), start=9):
+        write_image(root / "color" / f"{i}.jpg", i)
+        write_depth(root / "depth" / f"{i}.png", 1500)
+        (root / "pose" / f"{i}.txt").write_text(matrix_text(pose))
     intrinsics = np.eye(4)
     intrinsics[:3, :3] = K
     (root / "intrinsic" / "intrinsic_color.txt").write_text(matrix_text(intrinsics))
@@ -131,8 +139,7 @@ OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # columns of OpenCV's camera axes to t
 
 def write_splat_cameras(root):
     entries = []
-    for i, pose in enumerate(poses()):
-        write_image(root / "images" / f"frame_{i}.png", i)
+    for i, pose in written(root, "images/frame_{}.png"):
         size = {"width": WIDTH, "height": HEIGHT, "fx": FX, "fy": FY}
         pose = {"position": pose[:3, 3].tolist(), "rotation": pose[:3, :3].tolist()}
         entries.append({"id": i, "img_name": f"frame_{i}", **size, **pose})
@@ -151,8 +158,7 @@ def write_polycam(root):
 
 def write_record3d(root):
     rows = []
-    for i, pose in enumerate(poses()):
-        write_image(root / "rgb" / f"{i}.jpg", i)
+    for _, pose in written(root, "rgb/{}.jpg"):
         rows.append([*Rotation.from_matrix((pose @ OPENGL)[:3, :3]).as_quat().tolist(), *pose[:3, 3].tolist()])
     meta = {"w": WIDTH, "h": HEIGHT, "K": K.T.reshape(-1).tolist(), "poses": rows, "fps": 60}
     (root / "metadata.json").write_text(json.dumps(meta))
@@ -160,8 +166,7 @@ def write_record3d(root):
 
 def write_llff(root):
     rows = []
-    for i, pose in enumerate(poses()):
-        write_image(root / "images" / f"IMG_{i}.JPG", i)
+    for _, pose in written(root, "images/IMG_{}.JPG"):
         right, down, forward, center = pose[:3].T
         matrix = np.stack([down, right, -forward, center, (HEIGHT, WIDTH, FX)], axis=1)
         rows.append([*matrix.reshape(-1), 1.5, 9.0])
@@ -175,8 +180,7 @@ def write_kitti(root):
     projection = np.hstack([image_K, (image_K @ -offset)[:, None]])
     lines.append("P2: " + " ".join(repr(float(x)) for x in projection.reshape(-1)))
     rows = []
-    for i, pose in enumerate(poses()):
-        write_image(root / "image_2" / f"{i:06d}.png", i)
+    for _, pose in written(root, "image_2/{:06d}.png"):
         back = np.eye(4)
         back[:3, 3] = -offset
         rows.append(" ".join(repr(float(x)) for x in (pose @ back)[:3].reshape(-1)))
@@ -186,8 +190,7 @@ def write_kitti(root):
 
 def write_reality_capture(root):
     rows = ["#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2"]
-    for i, pose in enumerate(poses()):
-        write_image(root / "images" / f"{i}.jpg", i)
+    for i, pose in written(root, "images/{}.jpg"):
         turn, pitch, roll = Rotation.from_matrix((pose @ OPENGL)[:3, :3]).as_euler("ZXY", degrees=True)
         inner = np.array([FX, CX - WIDTH / 2, CY - HEIGHT / 2]) * 36 / WIDTH
         values = (*pose[:3, 3], -turn, pitch, roll, *inner)
@@ -195,17 +198,54 @@ def write_reality_capture(root):
     (root / "cameras.csv").write_text("\r\n".join(rows))
 
 
-def write_metashape(root):
-    cameras = []
-    for i, pose in enumerate(poses()):
-        write_image(root / "images" / f"{i}.jpg", i)
-        cameras.append(f'<camera sensor_id="0" label="{i}"><transform>{matrix_text(pose)}</transform></camera>')
-    (root / "cameras.xml").write_text(
-        '<document version="2.0.0"><chunk><sensors><sensor id="0"><calibration class="adjusted">'
-        f'<resolution width="{WIDTH}" height="{HEIGHT}"/><f>{FY}</f><b1>{FX - FY}</b1><cx>{CX - WIDTH / 2}</cx>'
-        f"<cy>{CY - HEIGHT / 2}</cy></calibration></sensor></sensors>"
-        f"<cameras>{''.join(cameras)}</cameras></chunk></document>"
+def metashape_xml(matrices, *, kind="frame", lens="", before="", after=""):
+    """Cameras of one sensor, numbered from 0; `before` and `after` stand around them in their chunk."""
+    cameras = "".join(
+        f'<camera id="{i}" sensor_id="0" component_id="0" label="{i}"><transform>{matrix_text(m)}</transform></camera>'
+        for i, m in enumerate(matrices)
     )
+    return (
+        '<?xml version="1.0" encoding="UTF-8"?><document version="2.0.0"><chunk label="c"><sensors><sensor id="0">'
+        f'<calibration type="{kind}" class="initial"><f>1</f></calibration><calibration type="{kind}" class="adjusted">'
+        f'<resolution width="{WIDTH}" height="{HEIGHT}"/><f>{FY}</f><b1>{FX - FY}</b1><cx>{CX - WIDTH / 2}</cx>'
+        f"<cy>{CY - HEIGHT / 2}</cy>{lens}</calibration></sensor></sensors>{before}<cameras>{cameras}</cameras>{after}"
+        "</chunk></document>"
+    )
+
+
+def write_metashape(root):
+    matrices = [pose for _, pose in written(root, "images/{}.jpg")]
+    (root / "cameras.xml").write_text(metashape_xml(matrices))
+
+
+# Functions that change a capture that is written.
+
+
+def edit_text(file, change):
+    """Writes what `change` makes of a text file; it must change it."""
+
+    def spoil(root):
+        text = (root / file).read_text()
+        assert change(text) != text
+        (root / file).write_text(change(text))
+
+    return spoil
+
+
+def edit_json(file, **fields):
+    """Sets fields of a JSON object, or of each entry of a list."""
+
+    def change(text):
+        value = json.loads(text)
+        for entry in value if isinstance(value, list) else [value]:
+            entry.update(fields)
+        return json.dumps(value)
+
+    return edit_text(file, change)
+
+
+def remove(*patterns):
+    return lambda root: [file.unlink() for pattern in patterns for file in root.glob(pattern)]
 
 
 WRITERS = {

@@ -20,18 +20,9 @@ def texture(rng):
 def two_planes(
     num_frames, step, *, forward=0.0, units=1.0, spin=0.0, seed=0, start=0.0, wall_at=FAR_PLANE, board_half=0.4
 ):
-    """Capture of a moving camera in front of a textured wall and a board at depth 2.
+    """Capture of a camera that moves by `step` sideways and `forward` ahead, and turns by `spin` degrees, a frame.
 
-    Args:
-        num_frames: number of frames.
-        step: sideways motion per frame.
-        forward: motion per frame along the optical axis.
-        units: factor of all lengths.
-        spin: rotation per frame about the camera's y axis, degrees.
-        seed: seed of the textures.
-        start: first sideways position.
-        wall_at: depth of the wall.
-        board_half: half the side of the board.
+    It sees a textured wall at depth `wall_at`, and before it a board at depth 2 of half side `board_half`.
     """
     rng = np.random.default_rng(seed)
     wall, board = texture(rng), texture(rng)

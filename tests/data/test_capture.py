@@ -16,7 +16,7 @@ from ssplat_jax.core.errors import InputError
 from ssplat_jax.data import capture as capture_module
 from ssplat_jax.data.capture import KEPT_IMAGES
 from ssplat_jax.data.open_capture import open_capture
-from tests.badinputs.cases import make_capture
+from tests.badinputs.cases import make_capture, opened
 from tests.data.capture_fixture import frame_of, resized, smooth_capture
 from tests.data.planes_fixture import two_planes
 
@@ -58,17 +58,9 @@ def test_chunks_hold_the_frames_in_order_and_pad_the_last():
     assert all(float(chunk.near) == 0.5 and float(chunk.far) == 8.0 for chunk in chunks)
 
 
-def test_the_stream_frame_is_that_of_the_first_frame_used():
-    capture = smooth_capture()
-    frame = capture.stream_frame(StreamConfig().replace(scene_scale=3.0), [2, 3, 4])
-    np.testing.assert_array_equal(frame.origin, capture.frames[2].center)
-    assert frame.scale == 3.0 and 0 < frame.near < frame.far
-
-
 def test_reading_ahead_raises_at_the_damaged_chunk(tmp_path):
-    root = make_capture(tmp_path / "c")
-    capture = open_capture(root)
-    (root / "images" / "2.jpg").write_bytes(b"gone bad")
+    capture = opened(tmp_path)
+    capture.frames[2].path.write_bytes(b"gone bad")
     chunks = capture.chunks(StreamConfig().replace(chunk_size=2), stream_frame=frame_of(capture))
     next(chunks)
     with pytest.raises(ValueError, match=r"2\.jpg"):

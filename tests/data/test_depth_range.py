@@ -26,9 +26,8 @@ def true_depths(capture, indices):
     return depths[depths > 0]
 
 
-def assert_right(capture, indices, tolerance=MEDIAN_TOLERANCE):
-    depths = estimate_depths(capture, indices)
-    truth = true_depths(capture, indices)
+def assert_right(capture, indices, tolerance, compared):
+    depths, truth = estimate_depths(capture, indices), true_depths(capture, compared)
     assert depths.source == "matches"
     assert 1 / tolerance < depths.median / np.median(truth) < tolerance
     _, near, far = stream_scale(depths, StreamConfig().replace(scene_scale=1.0))
@@ -49,26 +48,20 @@ def assert_right(capture, indices, tolerance=MEDIAN_TOLERANCE):
 def test_depths_of_a_known_scene(motion):
     is_slow = motion["step"] < 0.01  # and needs more frames to show any parallax
     num_frames = 16 if is_slow else 10
-    assert_right(two_planes(num_frames, **motion), range(num_frames), 2.0 if is_slow else MEDIAN_TOLERANCE)
+    capture, frames = two_planes(num_frames, **motion), range(num_frames)
+    assert_right(capture, frames, 2.0 if is_slow else MEDIAN_TOLERANCE, frames)
 
 
-def share_outside(capture):
-    """Shares of the pixels that are nearer than near and farther than far."""
-    indices = range(len(capture))
-    _, near, far = stream_scale(estimate_depths(capture, indices), StreamConfig().replace(scene_scale=1.0))
-    truth = true_depths(capture, indices)
-    return np.mean(truth < near), np.mean(truth > far)
-
-
-def test_far_includes_a_distant_background():
+@pytest.mark.parametrize(
+    "motion", [{"num_frames": 12, "step": 0.06, "board_half": 0.9},
+               {"num_frames": 16, "step": 0.3, "start": -2.4, "board_half": 0.56}]
+)  # fmt: skip
+def test_the_range_holds_a_distant_background_and_what_is_seen_over_short_baselines(motion):
     """A sweep that ends before the background produces floaters, so far includes points with little parallax."""
-    nearer, beyond = share_outside(two_planes(12, 0.06, wall_at=30.0, board_half=0.9))
-    assert nearer < 0.01 and beyond < 0.01
-
-
-def test_near_includes_surfaces_seen_only_over_short_baselines():
-    nearer, beyond = share_outside(two_planes(16, 0.3, start=-2.4, wall_at=30.0, board_half=0.56))
-    assert nearer < 0.01 and beyond < 0.01
+    capture = two_planes(**motion, wall_at=30.0)
+    depths, truth = estimate_depths(capture, range(len(capture))), true_depths(capture, range(len(capture)))
+    _, near, far = stream_scale(depths, StreamConfig().replace(scene_scale=1.0))
+    assert np.mean(truth < near) < 0.01 and np.mean(truth > far) < 0.01
 
 
 def test_only_the_given_frames_are_used():
@@ -157,10 +150,4 @@ def test_kinect_depths_of_a_hand_held_video(captures):
     """The median is within 35 % of the Kinect's over the same frames, whose depths are inside [near, far]."""
     capture = open_capture(captures / "redkitchen", size=(320, 240))
     used = interleaved_split(len(capture), 5, 8).context
-    depths = estimate_depths(capture, used)
-    truth = true_depths(capture, range(used[0], used[-1] + 1))
-    assert depths.source == "matches"
-    assert 1 / 1.35 < depths.median / np.median(truth) < 1.35
-    _, near, far = stream_scale(depths, StreamConfig().replace(scene_scale=1.0))
-    assert np.mean((truth < near) | (truth > far)) <= RANGE_SLACK
-    assert far / near < 20
+    assert_right(capture, used, 1.35, range(used[0], used[-1] + 1))

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from ssplat_jax.data.open_capture import open_capture
-from tests.badinputs.cases import HEIGHT, WIDTH, make_capture
+from tests.badinputs.cases import HEIGHT, WIDTH, another, depth_map, opened
 from tests.data.capture_fixture import resized, smooth_capture
 
 EIGHT_BITS = 0.5 / 255
@@ -13,13 +12,9 @@ SIZES = [(64, 48), (32, 24), (32, 32), (24, 48), (100, 20), (63, 47), (128, 96)]
 
 
 def test_depth_is_meters_from_millimeters_and_zero_is_unknown(tmp_path):
-    def change(root, meta):
-        depth = np.full((HEIGHT, WIDTH), 1500, np.uint16)
-        depth[0, 0], depth[0, 1] = 0, 65535
-        Image.fromarray(depth).save(root / "d.png")
-        meta["frames"][2]["depth_file_path"] = "d.png"
-
-    capture = open_capture(make_capture(tmp_path / "c", change))
+    stored = np.full((HEIGHT, WIDTH), 1500)
+    stored[0, :2] = 0, 65535
+    capture = opened(tmp_path, depth_map(2, stored))
     depth = capture.depth(2)
     assert capture.depth(1) is None and depth is not None
     np.testing.assert_allclose([depth[0, 0], depth[0, 1], depth[5, 5]], [0, 65.535, 1.5], rtol=1e-6)
@@ -38,11 +33,7 @@ def test_every_kind_of_image_becomes_rgb(tmp_path, mode):
     else:
         stored, wanted = Image.new("RGB", (WIDTH, HEIGHT), (value,) * 3).convert(mode), 0.6
 
-    def change(root, meta):
-        stored.save(root / "images" / "2.tif")
-        meta["frames"][2]["file_path"] = "images/2.tif"
-
-    image = open_capture(make_capture(tmp_path / "c", change)).image(2)
+    image = opened(tmp_path, another(2, "2.tif", stored.save)).image(2)
     assert image.shape == (HEIGHT, WIDTH, 3) and image.dtype == np.float32
     np.testing.assert_allclose(image, wanted, atol=3 * EIGHT_BITS)
 
@@ -58,10 +49,7 @@ def test_a_point_moves_to_where_its_color_moves(size):
     columns, rows = np.meshgrid(np.arange(size[0]) + 0.5, np.arange(size[1]) + 0.5)
     rays = np.stack([(columns - new[0, 2]) / new[0, 0], (rows - new[1, 2]) / new[1, 1]], -1)
     stored = rays * [old[0, 0], old[1, 1]] + old[:2, 2]
-    inner = (
-        slice(size[1] // 5, -(size[1] // 5)),
-        slice(size[0] // 5, -(size[0] // 5)),
-    )  # not the border
+    inner = (slice(size[1] // 5, -(size[1] // 5)), slice(size[0] // 5, -(size[0] // 5)))  # not the border
     shown = image[..., :2] * [64, 48]
     np.testing.assert_allclose(shown[inner], stored[inner], rtol=0, atol=0.05)  # pixels; half a pixel would be 0.5
     depth = small.depth(0)
@@ -70,11 +58,7 @@ def test_a_point_moves_to_where_its_color_moves(size):
 
 
 def test_depth_maps_of_another_resolution_are_resized(tmp_path):
-    def change(root, meta):
-        depth = np.repeat(np.arange(1, WIDTH // 2 + 1, dtype=np.uint16)[None] * 100, HEIGHT // 2, axis=0)
-        Image.fromarray(depth).save(root / "d.png")
-        meta["frames"][0]["depth_file_path"] = "d.png"
-
-    depth = open_capture(make_capture(tmp_path / "c", change)).depth(0)
+    columns = np.tile(100 * np.arange(1, WIDTH // 2 + 1), (HEIGHT // 2, 1))
+    depth = opened(tmp_path, depth_map(0, columns)).depth(0)
     assert depth is not None and depth.shape == (HEIGHT, WIDTH)
     np.testing.assert_allclose(depth[3, :6], [0.1, 0.1, 0.2, 0.2, 0.3, 0.3], rtol=1e-6)

@@ -23,7 +23,7 @@ from ssplat_jax.runs.capture_run import GrowingCapture
 from ssplat_jax.runs.options import RunOptions
 from ssplat_jax.streaming.feed import feed_capture
 from ssplat_jax.streaming.session import Session
-from tests.badinputs.cases import HEIGHT, NUM_FRAMES, WIDTH, make_capture
+from tests.badinputs.cases import HEIGHT, NUM_FRAMES, WIDTH, another, frame, make_capture, opened, top
 from tests.data.capture_fixture import smooth_capture
 from tests.scene_files.scene_fixture import scene
 
@@ -43,14 +43,13 @@ def in_folder(name, **options):
 
 def by_path(root, meta):
     write_mask(root / "hidden" / "a.png")
-    meta["frames"][2]["mask_path"] = "hidden/a.png"
+    frame(2, mask_path="hidden/a.png")(root, meta)
 
 
 def by_alpha(root, meta):
     pixels = np.full((HEIGHT, WIDTH, 4), 200, np.uint8)
     pixels[HIDDEN, 3] = 0
-    Image.fromarray(pixels).save(root / "images" / "2.png")
-    meta["frames"][2]["file_path"] = "images/2.png"
+    another(2, "2.png", Image.fromarray(pixels).save)(root, meta)
 
 
 def painted(values, name="2.png"):
@@ -84,7 +83,7 @@ def painted(values, name="2.png"):
     ],
 )
 def test_masks_hide_pixels_of_some_images(mask, tmp_path):
-    capture = open_capture(make_capture(tmp_path / "c", mask))
+    capture = opened(tmp_path, mask)
     np.testing.assert_array_equal(capture.seen(2), ~HIDDEN)
     assert capture.seen(1).all() and len(capture.notes) == 1
     chunk = next(capture.chunks(StreamConfig(), range(4), stream_frame=capture.stream_frame(StreamConfig())))
@@ -94,20 +93,16 @@ def test_masks_hide_pixels_of_some_images(mask, tmp_path):
     assert not small[5:10, 3:15].any() and small[:4].all() and small[12:].all()
 
 
-def test_masks_of_no_image_are_counted(tmp_path):
-    capture = open_capture(make_capture(tmp_path / "c", in_folder("another.png")))
+def test_masks_of_no_image_are_counted_and_captures_without_masks_have_none(tmp_path):
+    capture = opened(tmp_path, in_folder("another.png"))
     assert not capture.is_masked and capture.notes[0].startswith("1 files in masks/ are left out")
-
-
-def test_captures_without_masks_have_none(tmp_path):
-    capture = open_capture(make_capture(tmp_path / "c"))
-    assert not capture.is_masked and capture.seen(0) is None
+    assert capture.seen(0) is None
     assert next(capture.chunks(StreamConfig(), stream_frame=capture.stream_frame(StreamConfig()))).seen is None
 
 
 def test_a_mask_of_another_shape_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"2\.png: wanted the shape of 2\.jpg, 64x48, got 48x48"):
-        open_capture(make_capture(tmp_path / "c", in_folder("2.png", size=(HEIGHT, HEIGHT))))
+        opened(tmp_path, in_folder("2.png", size=(HEIGHT, HEIGHT)))
 
 
 def test_a_frame_waits_until_its_mask_is_complete(tmp_path):
@@ -126,7 +121,7 @@ def test_a_frame_waits_until_its_mask_is_complete(tmp_path):
 
 def test_pixels_beyond_the_border_of_a_distorted_image_are_not_seen(tmp_path):
     """A pincushion lens: the undistorted image asks for places that the stored one does not have."""
-    capture = open_capture(make_capture(tmp_path / "c", lambda root, meta: meta.update(k1=0.3)))
+    capture = opened(tmp_path / "a", top(k1=0.3))
     frame = capture.frames[0]
     rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     places = Lens(k1=0.3).pixels(frame.K, np.stack([columns, rows], axis=-1))
@@ -134,7 +129,7 @@ def test_pixels_beyond_the_border_of_a_distorted_image_are_not_seen(tmp_path):
     assert 0.02 < np.mean(~inside) < 0.5
     assert np.mean(capture.seen(0) != inside) < 0.01
     assert any("beyond the border" in note for note in capture.notes)
-    barrel = open_capture(make_capture(tmp_path / "b", lambda root, meta: meta.update(k1=-0.1)))
+    barrel = opened(tmp_path / "b", top(k1=-0.1))
     assert not barrel.is_masked and barrel.frames[0].lens is not None
     assert undistort(barrel.image(0), Lens(k1=-0.1), barrel.frames[0].K, outside=0.0).any(axis=-1).all()
 

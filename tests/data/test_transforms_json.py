@@ -9,59 +9,42 @@ from scipy.spatial.transform import Rotation
 
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.posed_image import Convention
-from tests.badinputs.cases import HEIGHT, WIDTH, make_capture
+from tests.badinputs.cases import HEIGHT, WIDTH, another, entry, frame, make_capture, opened, top
 
 
 def test_frames_stream_in_natural_order(tmp_path):
     def change(root, meta):
         for i, name in enumerate(("10", "9", "2b", "2a")):
-            (root / "images" / f"{i}.jpg").rename(root / "images" / f"{name}.jpg")
-            meta["frames"][i]["file_path"] = f"images/{name}.jpg"
+            another(i, f"{name}.jpg", (root / "images" / f"{i}.jpg").rename)(root, meta)
 
-    names = [frame.name for frame in open_capture(make_capture(tmp_path / "c", change)).frames]
+    names = [frame.name for frame in opened(tmp_path, change).frames]
     assert names == ["images/2a.jpg", "images/2b.jpg", "images/9.jpg", "images/10.jpg"]
 
 
 def test_a_frames_own_intrinsics_come_first(tmp_path):
-    capture = open_capture(make_capture(tmp_path / "c", lambda root, meta: meta["frames"][2].update(fl_x=70.0, cx=10)))
-    np.testing.assert_array_equal(capture.K(2), [[70, 0, 10], [0, 51, 25], [0, 0, 1]])
-    np.testing.assert_array_equal(capture.K(1), [[50, 0, 31], [0, 51, 25], [0, 0, 1]])
-
-
-def test_a_frames_own_angle_of_view_comes_before_the_focal_length_of_the_file(tmp_path):
-    """One angle gives both focal lengths, two give one each; the other frames keep those of the file."""
-
-    def change(root, meta):
-        meta["frames"][2].update(camera_angle_x=2 * np.arctan(0.5), camera_angle_y=2 * np.arctan(0.5))
-        meta["frames"][3].update(camera_angle_x=2 * np.arctan(0.5))
-        meta["frames"][0].update(camera_angle_x=2 * np.arctan(0.5), fl_y=70.0)
-
-    capture = open_capture(make_capture(tmp_path / "c", change))
-    np.testing.assert_allclose(capture.K(2), [[WIDTH, 0, 31], [0, HEIGHT, 25], [0, 0, 1]], rtol=1e-14)
-    np.testing.assert_allclose(capture.K(0), [[WIDTH, 0, 31], [0, 70, 25], [0, 0, 1]], rtol=1e-14)
-    np.testing.assert_allclose(capture.K(3), [[WIDTH, 0, 31], [0, WIDTH, 25], [0, 0, 1]], rtol=1e-14)
-    np.testing.assert_array_equal(capture.K(1), [[50, 0, 31], [0, 51, 25], [0, 0, 1]])
+    """One angle of view gives both focal lengths, two give one each; the other frames keep those of the file."""
+    angle = 2 * np.arctan(0.5)
+    capture = opened(
+        tmp_path,
+        frame(0, camera_angle_x=angle, fl_y=70.0, cx=10),
+        frame(2, camera_angle_x=angle, camera_angle_y=angle),
+        frame(3, camera_angle_x=angle),
+    )
+    wanted = [(WIDTH, 70, 10), (50, 51, 31), (WIDTH, HEIGHT, 31), (WIDTH, WIDTH, 31)]
+    for i, (fx, fy, cx) in enumerate(wanted):
+        np.testing.assert_allclose(capture.K(i), [[fx, 0, cx], [0, fy, 25], [0, 0, 1]], rtol=1e-14)
 
 
 def test_blender_angles_and_missing_extensions_are_read(tmp_path):
-    def change(root, meta):
-        for name in ("fl_x", "fl_y", "cx", "cy", "w", "h"):
-            del meta[name]
-        meta["camera_angle_x"] = 2 * np.arctan(0.5)
-        for frame in meta["frames"]:
-            frame["file_path"] = frame["file_path"].removesuffix(".jpg")
-
-    capture = open_capture(make_capture(tmp_path / "c", change))
+    names = top(**dict.fromkeys(("fl_x", "fl_y", "cx", "cy", "w", "h")), camera_angle_x=2 * np.arctan(0.5))
+    capture = opened(tmp_path, names, *(frame(i, file_path=f"images/{i}") for i in range(4)))
     wanted = [[WIDTH, 0, WIDTH / 2], [0, WIDTH, HEIGHT / 2], [0, 0, 1]]
     np.testing.assert_allclose(capture.K(0), wanted, rtol=1e-14)
 
 
 def test_a_pose_almost_a_rotation_is_projected_and_reported(tmp_path):
-    def change(root, meta):
-        meta["frames"][1]["transform_matrix"][0][1] = 5e-4
-
-    capture = open_capture(make_capture(tmp_path / "c", change))
-    rotation = capture.frames[1].camtoworld[:3, :3]
+    capture = opened(tmp_path, entry(0, 1, 5e-4))
+    rotation = capture.frames[2].camtoworld[:3, :3]
     np.testing.assert_allclose(rotation.T @ rotation, np.eye(3), rtol=0, atol=1e-14)
     assert np.abs(rotation - np.diag([1.0, -1, -1])).max() < 5e-4
     assert len(capture.notes) == 1 and "1 poses" in capture.notes[0]
@@ -77,30 +60,20 @@ def test_the_longer_side_determines_the_shrink_factor(tmp_path, turned):
             Image.new("RGB", stored).save(path)
         meta.update(w=wanted[0], h=wanted[1], fl_x=1500.0, fl_y=1500.0, cx=wanted[0] / 2, cy=wanted[1] / 2)
 
-    capture = open_capture(make_capture(tmp_path / "c", describe))
-    np.testing.assert_allclose(intrinsics(capture)[:2], 1500 / 8)
-
-
-def intrinsics(capture):
-    K = capture.frames[0].K
-    return K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    K = opened(tmp_path, describe).K(0)
+    np.testing.assert_allclose(K[[0, 1], [0, 1]], 1500 / 8)
 
 
 def test_names_without_an_order_keep_the_order_of_the_file(tmp_path):
     """The camera path decides about the order for random names, or all left images before all right ones."""
 
     def rename(root, meta):
-        for name, entry, x in zip("cadb", meta["frames"], range(4), strict=False):
-            path = root / entry["file_path"]
-            entry["file_path"] = f"images/{name}{path.suffix}"
-            path.rename(root / entry["file_path"])
-            entry["transform_matrix"][0][3] = float(x)
+        for x, name in enumerate("cadb"):
+            another(x, f"{name}.jpg", (root / "images" / f"{x}.jpg").rename)(root, meta)
+            meta["frames"][x]["transform_matrix"][0][3] = float(x)
 
-    def names(capture):
-        return [frame.name[7] for frame in capture.frames]
-
-    told = open_capture(make_capture(tmp_path / "d", rename))
-    assert names(told) == list("cadb")
+    told = opened(tmp_path, rename)
+    assert [frame.name[7] for frame in told.frames] == list("cadb")
     assert any("file's order" in note for note in told.notes)
 
 

@@ -1,6 +1,5 @@
 """Files as people bring them: fields that change a camera, odd names, links, hidden files, other programs' cameras."""
 
-import json
 import struct
 import warnings
 
@@ -12,18 +11,21 @@ from scipy.spatial.transform import Rotation
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.data.images import FisheyeLens, Lens
 from ssplat_jax.data.open_capture import open_capture
-from tests.badinputs.cases import HEIGHT, NUM_FRAMES, WIDTH, make_capture
+from tests.badinputs.cases import HEIGHT, NUM_FRAMES, WIDTH, another, depth_map, frame, make_capture, opened, top
 from tests.data.capture_writers import (
     COLMAP_IMAGES,
     WRITERS,
+    K,
     camera_bytes,
+    edit_json,
+    edit_text,
+    matrix_text,
+    metashape_xml,
     write_colmap_binary,
     write_colmap_text,
     write_image,
     write_tum,
 )
-from tests.data.capture_writers import HEIGHT as HIGH
-from tests.data.capture_writers import WIDTH as WIDE
 
 # -- fields of transforms.json ----------------------------------------------------------------------------------------
 
@@ -31,20 +33,14 @@ PARAMS = [0.1, -0.02, 0.003, 0.0004, 0.005, -0.006]  # k1 k2 k3 k4 p1 p2
 
 
 def test_distortion_params_are_a_lens_of_the_file_or_of_a_frame(tmp_path):
-    def change(root, meta):
-        meta["distortion_params"] = PARAMS
-        meta["frames"][2]["distortion_params"] = [0.2, 0, 0, 0, 0, 0]
-
-    frames = open_capture(make_capture(tmp_path / "c", change)).frames
+    change = top(distortion_params=PARAMS), frame(2, distortion_params=[0.2, 0, 0, 0, 0, 0])
+    frames = opened(tmp_path / "a", *change).frames
     assert frames[1].lens == Lens(k1=0.1, k2=-0.02, k3=0.003, k4=0.0004, p1=0.005, p2=-0.006)
     assert frames[2].lens == Lens(k1=0.2)
     plain = dict(zip(("k1", "k2", "k3", "k4", "p1", "p2"), PARAMS, strict=True))
-    written = open_capture(make_capture(tmp_path / "d", lambda root, meta: meta.update(plain)))
-    assert written.frames[1].lens == frames[1].lens
-    fish = {"camera_model": "OPENCV_FISHEYE", "distortion_params": [0.1, 0.01, 0, 0, 0, 0]}
-    assert open_capture(make_capture(tmp_path / "f", lambda root, meta: meta.update(fish))).frames[
-        0
-    ].lens == FisheyeLens(k1=0.1, k2=0.01)
+    assert opened(tmp_path / "b", top(**plain)).frames[1].lens == frames[1].lens
+    fish = top(camera_model="OPENCV_FISHEYE", distortion_params=[0.1, 0.01, 0, 0, 0, 0])
+    assert opened(tmp_path / "c", fish).frames[0].lens == FisheyeLens(k1=0.1, k2=0.01)
 
 
 def test_the_denominator_of_full_opencv_is_that_of_opencv(tmp_path):
@@ -55,36 +51,22 @@ def test_the_denominator_of_full_opencv_is_that_of_opencv(tmp_path):
     params = (50.0, 51.0, 31.0, 25.0, 0.2, 0, 0, 0, 0, 0.1, -0.05, 0.02)
     write_colmap_binary(tmp_path / "colmap", [camera_bytes(6, params)])
     assert open_capture(tmp_path / "colmap").frames[0].lens == lens
-    fields = {"camera_model": "FULL_OPENCV", "k1": 0.2, "k4": 0.1, "k5": -0.05, "k6": 0.02}
-    capture = open_capture(make_capture(tmp_path / "c", lambda root, meta: meta.update(fields)))
-    assert capture.frames[0].lens == lens
+    fields = top(camera_model="FULL_OPENCV", k1=0.2, k4=0.1, k5=-0.05, k6=0.02)
+    assert opened(tmp_path, fields).frames[0].lens == lens
 
 
 def test_a_frames_own_coefficients_come_before_the_list_of_the_file(tmp_path):
-    def change(root, meta):
-        meta["distortion_params"] = PARAMS
-        meta["frames"][2]["k1"] = 0.2
-
-    frames = open_capture(make_capture(tmp_path / "c", change)).frames
+    frames = opened(tmp_path, top(distortion_params=PARAMS), frame(2, k1=0.2)).frames
     assert (frames[1].lens.k1, frames[2].lens) == (0.1, Lens(k1=0.2))
 
 
 @pytest.mark.parametrize("kind", ["depth_file_path", "depth_path"])
 @pytest.mark.parametrize(
     ("fields", "unit"),
-    [
-        ({}, 0.001),
-        ({"integer_depth_scale": 10 / 65535}, 10 / 65535),
-        ({"applied_scale": 0.25}, 0.00025),
-    ],
+    [({}, 0.001), ({"integer_depth_scale": 10 / 65535}, 10 / 65535), ({"applied_scale": 0.25}, 0.00025)],
 )
 def test_depth_maps_have_the_unit_that_the_file_says(fields, unit, kind, tmp_path):
-    def change(root, meta):
-        meta.update(fields)
-        Image.fromarray(np.full((HEIGHT, WIDTH), 19660, np.uint16)).save(root / "d.png")
-        meta["frames"][2][kind] = "d.png"
-
-    depth = open_capture(make_capture(tmp_path / "c", change)).depth(2)
+    depth = opened(tmp_path, top(**fields), depth_map(2, 19660, **{"depth_file_path": None, kind: "d.png"})).depth(2)
     np.testing.assert_allclose(depth, 19660 * unit, rtol=1e-6)
 
 
@@ -106,31 +88,23 @@ def test_depth_maps_have_the_unit_that_the_file_says(fields, unit, kind, tmp_pat
 )
 def test_lenses_that_are_not_modelled_are_refused_by_name(fields, words, tmp_path):
     with pytest.raises(InputError, match=words):
-        open_capture(make_capture(tmp_path / "c", lambda root, meta: meta.update(fields)))
+        opened(tmp_path, top(**fields))
 
 
 def test_a_depth_unit_of_two_meanings_is_refused(tmp_path):
-    def change(root, meta):
-        Image.fromarray(np.ones((HEIGHT, WIDTH), np.uint16)).save(root / "d.png")
-        meta["frames"][2].update(depth_file_path="d.png", depth_scale=1000)
-
     with pytest.raises(InputError, match="depth_scale: wanted integer_depth_scale"):
-        open_capture(make_capture(tmp_path / "c", change))
+        opened(tmp_path, depth_map(2, 1, depth_scale=1000))
 
 
 @pytest.mark.parametrize("name", ["mask_color", "white_transparent", "transform_matrix_end", "K", "camera_convention"])
 def test_fields_that_are_not_known_are_noted(name, tmp_path):
-    capture = open_capture(make_capture(tmp_path / "c", lambda root, meta: meta["frames"][1].update({name: [1]})))
+    capture = opened(tmp_path, frame(1, **{name: [1]}))
     assert capture.notes == (f"Fields that are not known are left out of account: '{name}'.",)
 
 
 def test_bad_frames_are_left_out_and_a_rolling_shutter_is_noted(tmp_path):
-    def change(root, meta):
-        meta["frames"][1]["is_bad"] = True
-        meta["frames"][2]["is_bad"] = False
-        meta["rolling_shutter"] = [0.0, 0.0, 0.03, 0.0]
-
-    capture = open_capture(make_capture(tmp_path / "c", change))
+    change = frame(1, is_bad=True), frame(2, is_bad=False), top(rolling_shutter=[0.0, 0.0, 0.03, 0.0])
+    capture = opened(tmp_path, *change)
     assert [frame.name for frame in capture.frames] == ["images/0.jpg", "images/2.jpg", "images/3.jpg"]
     assert ["is_bad" in capture.notes[0], "rolling" in capture.notes[1]] == [True, True]
 
@@ -145,29 +119,12 @@ def test_a_folder_of_splits_opens_with_its_training_split(tmp_path):
 # -- fields and matrices of other formats ------------------------------------------------------------------------------
 
 
-def edit_text(file, change):
-    return lambda root: (root / file).write_text(change((root / file).read_text()))
-
-
-def edit_json(file, **fields):
-    def change(text):
-        value = json.loads(text)
-        for entry in value if isinstance(value, list) else [value]:
-            entry.update(fields)
-        return json.dumps(value)
-
-    return edit_text(file, change)
-
-
 def with_skew(text):
     return text.replace("50.0 0.0 31.0", "50.0 5.0 31.0").replace("50.0 0.0 30.5", "50.0 5.0 30.5")
 
 
 def with_k5(text):
     return "\n".join(line + (",0.3" if i else ",k5") for i, line in enumerate(text.split("\n")))
-
-
-IN_CALIBRATION = "</calibration>"
 
 
 @pytest.mark.parametrize(
@@ -178,11 +135,7 @@ IN_CALIBRATION = "</calibration>"
         ("Record3D", edit_json("metadata.json", K=[50, 0, 0, 5, 51, 0, 31, 25, 1]), "without skew"),
         ("cameras.json", edit_json("cameras.json", k1=0.2), r"\[0\]\.k1"),
         ("Polycam", edit_json("keyframes/cameras/7001.json", distortion=[0.1, 0, 0, 0]), "distortion"),
-        (
-            "Metashape",
-            edit_text("cameras.xml", lambda t: t.replace(IN_CALIBRATION, f"<p3>1</p3>{IN_CALIBRATION}")),
-            "p3",
-        ),
+        ("Metashape", edit_text("cameras.xml", lambda text: text.replace("<b1>", "<p3>1</p3><b1>")), "p3"),
         ("RealityCapture", edit_text("cameras.csv", with_k5), "k5"),
     ],
 )
@@ -213,7 +166,7 @@ def test_metashapes_disabled_cameras_other_chunks_and_shutter_are_named(tmp_path
 def test_a_component_without_a_transform_has_that_of_its_chunk(tmp_path):
     WRITERS["Metashape"](tmp_path)
     before = open_capture(tmp_path).camtoworlds
-    text = (tmp_path / "cameras.xml").read_text().replace("<camera ", '<camera component_id="0" ')
+    text = (tmp_path / "cameras.xml").read_text()
     world = '<components><component id="0"/></components><transform><scale>2</scale></transform>'
     (tmp_path / "cameras.xml").write_text(text.replace("<cameras>", world + "<cameras>"))
     np.testing.assert_allclose(open_capture(tmp_path).camtoworlds[:, :3, 3], 2 * before[:, :3, 3])
@@ -259,15 +212,10 @@ def test_tum_depth_maps_have_the_unit_of_a_file_beside_them(file, text, depth, t
 
 
 def test_gray_whose_zero_is_white_is_not_inverted(tmp_path):
-    def change(root, meta):
-        for i, photometric in ((1, 1), (2, 0)):
-            gray = np.full((HEIGHT, WIDTH), 13107 if photometric else 65535 - 13107, np.uint16)
-            Image.fromarray(gray).save(root / "images" / f"{i}.tif", tiffinfo={262: photometric})
-            meta["frames"][i]["file_path"] = f"images/{i}.tif"
-
-    capture = open_capture(make_capture(tmp_path / "c", change))
-    for i in (1, 2):
-        np.testing.assert_allclose(capture.image(i), 0.2, atol=1e-4)
+    for photometric, value in ((1, 13107), (0, 65535 - 13107)):
+        gray = Image.fromarray(np.full((HEIGHT, WIDTH), value, np.uint16))
+        save = lambda file, gray=gray, p=photometric: gray.save(file, tiffinfo={262: p})  # noqa: E731
+        np.testing.assert_allclose(opened(tmp_path / str(value), another(2, "2.tif", save)).image(2), 0.2, atol=1e-4)
 
 
 def test_gray_of_12_bits_is_a_share_of_its_own_white(tmp_path):
@@ -276,40 +224,33 @@ def test_gray_of_12_bits_is_a_share_of_its_own_white(tmp_path):
     tags = ((256, WIDTH), (257, HEIGHT), (258, 12), (259, 1), (262, 1), (273, 8), (278, HEIGHT), (279, len(pixels)))
     table = b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in tags)
     data = struct.pack("<2sHI", b"II", 42, 8 + len(pixels)) + pixels + struct.pack("<H", len(tags)) + table + bytes(4)
-
-    def change(root, meta):
-        (root / "images" / "2.tif").write_bytes(data)
-        meta["frames"][2]["file_path"] = "images/2.tif"
-
-    np.testing.assert_allclose(open_capture(make_capture(tmp_path / "c", change)).image(2), 1 / 3, atol=1e-6)
+    change = another(2, "2.tif", lambda file: file.write_bytes(data))
+    np.testing.assert_allclose(opened(tmp_path, change).image(2), 1 / 3, atol=1e-6)
 
 
 @pytest.mark.parametrize(("suffix", "exif"), [("jpg", b"Exif\0\0II*\0\xff\xff\xff\xff"), ("png", b"no EXIF at all")])
 def test_exif_data_that_cannot_be_read_say_nothing(suffix, exif, tmp_path):
-    def change(root, meta):
-        Image.new("RGB", (WIDTH, HEIGHT), (255, 0, 0)).save(root / "images" / f"2.{suffix}", exif=exif)
-        meta["frames"][2]["file_path"] = f"images/2.{suffix}"
-
+    red = Image.new("RGB", (WIDTH, HEIGHT), (255, 0, 0))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert open_capture(make_capture(tmp_path / "c", change)).image(2)[5, 5, 0] > 0.9
+        capture = opened(tmp_path, another(2, f"2.{suffix}", lambda file: red.save(file, exif=exif)))
+        assert capture.image(2)[5, 5, 0] > 0.9
 
 
 @pytest.mark.parametrize("orientation", [3, 6])
 def test_an_orientation_that_is_not_applied_is_noted(orientation, tmp_path):
     """The size of an image tells neither half a turn nor, if it is square, a quarter."""
+    exif, side = Image.Exif(), HEIGHT if orientation == 6 else WIDTH
+    exif[274] = orientation
 
     def change(root, meta):
-        exif = Image.Exif()
-        exif[274] = orientation
-        side = HEIGHT if orientation == 6 else WIDTH
         meta.update(w=side, cx=side / 2)
         for i in range(NUM_FRAMES):
             image = Image.new("RGB", (side, HEIGHT), (255, 0, 0))
             image.paste((0, 0, 255), (0, 0, side // 2, HEIGHT))
             image.save(root / "images" / f"{i}.jpg", exif=exif, quality=95)
 
-    capture = open_capture(make_capture(tmp_path / "c", change))
+    capture = opened(tmp_path, change)
     assert "4 images have an EXIF orientation" in capture.notes[0]
     assert capture.image(2)[HEIGHT // 2, 5, 2] > 0.9
 
@@ -317,13 +258,18 @@ def test_an_orientation_that_is_not_applied_is_noted(orientation, tmp_path):
 # -- names, links, hidden files ---------------------------------------------------------------------------------------
 
 
-def test_backslashes_are_slashes(tmp_path):
-    def change(root, meta):
-        (root / "images" / "left").mkdir()
-        (root / "images" / "2.jpg").rename(root / "images" / "left" / "2.jpg")
-        meta["frames"][2]["file_path"] = "images\\left\\2.jpg"
+def moved(i, name):
+    """Moves the image of frame `i` within `images`, and leaves its name in the file."""
 
-    capture = open_capture(make_capture(tmp_path / "c", change))
+    def change(root, meta):
+        (root / "images" / name).parent.mkdir(exist_ok=True)
+        (root / "images" / f"{i}.jpg").rename(root / "images" / name)
+
+    return change
+
+
+def test_backslashes_are_slashes(tmp_path):
+    capture = opened(tmp_path, moved(2, "left/2.jpg"), frame(2, file_path="images\\left\\2.jpg"))
     assert sorted(frame.path.name for frame in capture.frames) == [f"{i}.jpg" for i in range(4)]
     assert capture.notes == ()
 
@@ -341,22 +287,18 @@ def test_backslashes_are_slashes(tmp_path):
     ],
 )
 def test_names_of_other_machines_and_of_addresses_are_found(on_disk, named, tmp_path):
-    def change(root, meta):
-        (root / "images" / "0.jpg").rename(root / "images" / on_disk)
-        meta["frames"][0]["file_path"] = named
-
-    capture = open_capture(make_capture(tmp_path / "c", change))
+    capture = opened(tmp_path, moved(0, on_disk), frame(0, file_path=named))
     assert on_disk in {frame.path.name for frame in capture.frames} and len(capture) == NUM_FRAMES
 
 
-@pytest.mark.parametrize(
-    ("kind", "folder"),
-    [("LLFF", "images"), ("KITTI", "image_2"), ("ScanNet", "color"), ("Polycam", "keyframes/images")],
-)
+FOLDERS = {"LLFF": "images", "KITTI": "image_2", "ScanNet": "color", "Polycam": "keyframes/images"}
+
+
+@pytest.mark.parametrize("kind", FOLDERS)
 @pytest.mark.parametrize("suffix", [".Jpg", ".TIF", ".bmp", ".WEBP"])
-def test_a_folder_of_images_is_read_whatever_their_suffix(kind, folder, suffix, tmp_path):
+def test_a_folder_of_images_is_read_whatever_their_suffix(kind, suffix, tmp_path):
     WRITERS[kind](tmp_path)
-    for image in sorted((tmp_path / folder).iterdir())[::2]:
+    for image in sorted((tmp_path / FOLDERS[kind]).iterdir())[::2]:
         image.rename(image.with_suffix(suffix))
     assert len(open_capture(tmp_path)) == NUM_FRAMES
 
@@ -381,33 +323,23 @@ def test_the_folder_of_images_may_be_a_link(kind, tmp_path):
     assert len(open_capture(root)) == NUM_FRAMES
 
 
-@pytest.mark.parametrize(
-    ("kind", "folder"),
-    [
-        ("LLFF", "images"),
-        ("KITTI", "image_2"),
-        ("ScanNet", "color"),
-        ("Polycam", "keyframes/images"),
-        ("COLMAP", "images"),
-    ],
-)
-def test_hidden_files_are_no_images(kind, folder, tmp_path):
+@pytest.mark.parametrize("kind", ["COLMAP", *FOLDERS])
+def test_hidden_files_are_no_images(kind, tmp_path):
     """macOS writes `._a.jpg` beside a.jpg on foreign disks."""
     WRITERS[kind](tmp_path)
-    for name in sorted(file.name for file in (tmp_path / folder).iterdir()):
-        (tmp_path / folder / f"._{name}").write_bytes(b"Mac OS X")
+    folder = tmp_path / FOLDERS.get(kind, "images")
+    for name in sorted(file.name for file in folder.iterdir()):
+        (folder / f"._{name}").write_bytes(b"Mac OS X")
     capture = open_capture(tmp_path)
     assert len(capture) == NUM_FRAMES and capture.notes == ()
 
 
 def test_images_in_subfolders_and_with_another_suffix_are_found_and_counted(tmp_path):
-    def change(root, meta):
-        (root / "images" / "left").mkdir()
-        (root / "images" / "2.jpg").rename(root / "images" / "left" / "2.jpg")
+    def as_png(root, meta):
         Image.open(root / "images" / "1.jpg").save(root / "images" / "1.png")
         (root / "images" / "1.jpg").unlink()
 
-    capture = open_capture(make_capture(tmp_path / "c", change))
+    capture = opened(tmp_path, moved(2, "left/2.jpg"), as_png)
     assert [frame.path.name for frame in capture.frames] == ["0.jpg", "1.png", "2.jpg", "3.jpg"]
     assert capture.notes[0].startswith("2 images were found in another folder or with another suffix")
 
@@ -415,7 +347,7 @@ def test_images_in_subfolders_and_with_another_suffix_are_found_and_counted(tmp_
 def test_colmap_text_of_realityscan_is_read(tmp_path):
     """CRLF, blank lines of points, names with spaces, FULL_OPENCV, images at half the size."""
     params = "50 51 31 25 0.1 0 0 0 0 0.02 0 0"
-    write_colmap_text(tmp_path, camera=f"1 FULL_OPENCV {2 * WIDE} {2 * HIGH} {params}".replace("31 25", "62 50"))
+    write_colmap_text(tmp_path, camera=f"1 FULL_OPENCV {2 * WIDTH} {2 * HEIGHT} {params}".replace("31 25", "62 50"))
     for file in ("cameras.txt", "images.txt"):
         lines = (tmp_path / "sparse" / "0" / file).read_text().split("\n")
         lines = ["" if len(line.split()) % 3 == 0 and line and not line.startswith("#") else line for line in lines]
@@ -461,54 +393,34 @@ def test_realitycaptures_cameras_come_back(tmp_path):
     capture = open_capture(tmp_path)
     assert capture.format == "RealityCapture" and len(capture) == 8
     np.testing.assert_allclose(capture.camtoworlds, ring(), atol=1e-7)
-    unit = WIDE / 36
-    wanted = [[30 * unit, 0, WIDE / 2 + 0.9 * unit], [0, 30 * unit, HIGH / 2 - 0.45 * unit], [0, 0, 1]]
+    unit = WIDTH / 36
+    wanted = [[30 * unit, 0, WIDTH / 2 + 0.9 * unit], [0, 30 * unit, HEIGHT / 2 - 0.45 * unit], [0, 0, 1]]
     np.testing.assert_allclose(capture.K(0), wanted, rtol=1e-12)
     assert capture.frames[0].lens == Lens(k1=0.1, p1=0.01, p2=0.02)
-
-
-def matrix_text(matrix):
-    return " ".join(repr(float(x)) for x in np.ravel(matrix))
-
-
-def metashape_xml(chunk_poses, world, *, where="component", kind="frame", extra=""):
-    turn, shift, scale = world
-    transform = (
-        f"<transform><rotation>{matrix_text(turn)}</rotation><translation>{matrix_text(shift)}</translation>"
-        f"<scale>{scale!r}</scale></transform>"
-    )
-    cameras = "".join(
-        f'<camera id="{i}" sensor_id="0" component_id="0" label="IMG_{i}">'
-        f"<transform>{matrix_text(pose)}</transform></camera>"
-        for i, pose in enumerate(chunk_poses)
-    )
-    component = (
-        f'<components><component id="0">{transform}</component></components>' if where == "component" else transform
-    )
-    return (
-        f'<?xml version="1.0" encoding="UTF-8"?><document version="2.0.0"><chunk label="c"><sensors><sensor id="0">'
-        f'<calibration type="{kind}" class="initial"><f>1</f></calibration>'
-        f'<calibration type="{kind}" class="adjusted"><resolution width="{WIDE}" height="{HIGH}"/><f>51</f><cx>-1</cx>'
-        f"<cy>1.5</cy><b1>-1</b1><k1>0.1</k1><p1>0.01</p1><p2>0.02</p2>{extra}</calibration></sensor></sensors>"
-        f'{component if where == "component" else ""}<cameras>{cameras}<camera id="9" label="not aligned"/></cameras>'
-        f"{component if where == 'chunk' else ''}</chunk></document>"
-    )
 
 
 @pytest.mark.parametrize("where", ["component", "chunk"])
 def test_metashapes_cameras_come_back(where, tmp_path):
     """The chunk lies turned, moved and scaled in the world."""
-    write_ring(tmp_path, [f"IMG_{i}.JPG" for i in range(8)])
+    write_ring(tmp_path, [f"{i}.JPG" for i in range(8)])
     turn, shift, scale = Rotation.from_euler("xyz", [0.4, -1.1, 2.0]).as_matrix(), np.array([4e6, -2e5, 3e6]), 2.5
     chunk = ring()
     chunk[:, :3, :3] = turn.T @ chunk[:, :3, :3]
     chunk[:, :3, 3] = (chunk[:, :3, 3] - shift) @ turn / scale
-    (tmp_path / "cameras.xml").write_text(metashape_xml(chunk, (turn, shift, scale), where=where))
+    world = (
+        f"<transform><rotation>{matrix_text(turn)}</rotation><translation>{matrix_text([shift])}</translation>"
+        f"<scale>{scale}</scale></transform>"
+    )
+    around = {"after": world, "before": f'<components><component id="0">{world}</component></components>'}
+    around = {name: around[name] for name in ["before" if where == "component" else "after"]}
+    text = metashape_xml(chunk, lens="<k1>0.1</k1><p1>0.01</p1><p2>0.02</p2>", **around)
+    text = text.replace("</cameras>", '<camera id="9" label="not aligned"/></cameras>')
+    (tmp_path / "cameras.xml").write_text(text)
     (tmp_path / "sitemap.xml").write_text("<urlset></urlset>")  # of something else
     capture = open_capture(tmp_path)
     assert capture.format == "Metashape" and len(capture) == 8 and "1 of 9 frames" in capture.notes[0]
     np.testing.assert_allclose(capture.camtoworlds, ring(), atol=1e-5)
-    np.testing.assert_allclose(capture.K(0), [[50, 0, WIDE / 2 - 1], [0, 51, HIGH / 2 + 1.5], [0, 0, 1]])
+    np.testing.assert_allclose(capture.K(0), K)
     assert capture.frames[0].lens == Lens(k1=0.1, p1=0.02, p2=0.01)  # OpenCV's p1 is Metashape's p2
 
 
@@ -516,12 +428,12 @@ def test_metashapes_cameras_come_back(where, tmp_path):
     ("options", "words"),
     [
         ({"kind": "spherical"}, "perspective views"),
-        ({"extra": "<b2>3</b2>"}, "b2"),
-        ({"kind": "fisheye"}, "p1 or p2"),
+        ({"lens": "<b2>3</b2>"}, "b2"),
+        ({"kind": "fisheye", "lens": "<p1>0.01</p1>"}, "p1 or p2"),
     ],
 )
 def test_metashapes_other_lenses_are_refused(options, words, tmp_path):
-    write_ring(tmp_path, ["IMG_0.jpg"])
-    (tmp_path / "cameras.xml").write_text(metashape_xml(ring()[:1], (np.eye(3), np.zeros(3), 1.0), **options))
+    write_ring(tmp_path, ["0.jpg"])
+    (tmp_path / "cameras.xml").write_text(metashape_xml(ring()[:1], **options))
     with pytest.raises(InputError, match=words):
         open_capture(tmp_path)

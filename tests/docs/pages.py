@@ -1,4 +1,4 @@
-"""The Markdown pages of the repository, and what they hold: fenced code, links, anchors, tables."""
+"""The Markdown pages of the repository, and what they hold: fenced code, links, anchors."""
 
 import re
 from pathlib import Path
@@ -30,10 +30,3 @@ def anchors(page: Path) -> set[str]:
     headings = re.findall(r"^#+ (.*)$", prose(page), re.MULTILINE)
     plain = (re.sub(r"[^\w\s-]", "", heading).strip().lower() for heading in headings)
     return {re.sub(r"[-\s]+", "-", heading) for heading in plain}
-
-
-def tables(text: str) -> list[list[list[str]]]:
-    """Cells of every table, row by row, the header first."""
-    found = re.findall(r"(?:^\|.*\|\n)+", text + "\n", re.MULTILINE)
-    rows = [[re.split(r"\s*(?<!\\)\|\s*", line)[1:-1] for line in table.splitlines()] for table in found]
-    return [[row for row in table if not all(re.fullmatch(r":?-+:?", cell) for cell in row)] for table in rows]

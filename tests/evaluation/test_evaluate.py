@@ -8,30 +8,19 @@ import numpy as np
 import pytest
 
 import ssplat_jax as ss
-from ssplat_jax.cache import init_cache
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.gaussians import Gaussians, mean_color
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import Split
-from ssplat_jax.evaluation import cost
-from ssplat_jax.evaluation.cost import measure_latency
 from ssplat_jax.evaluation.metrics import psnr, ssim
 from ssplat_jax.evaluation.scoring import baselines, nearest_views, score_view
-from ssplat_jax.model.streamsplat import StreamSplat
-from ssplat_jax.streaming.session import Session
+from tests.rasterizer.scenes import balls
 
 
 def gaussians(colors, opacities, depth: float = -5.0) -> Gaussians:
     """On the axis of the stream's first view; by default behind it."""
-    n = len(opacities)
-    return Gaussians.from_rgb(
-        means=jnp.tile(jnp.array([0.0, 0.0, depth]), (n, 1)),
-        quats=jnp.tile(jnp.array([1.0, 0.0, 0.0, 0.0]), (n, 1)),
-        scales=jnp.full((n, 3), 1e-3),
-        opacities=jnp.asarray(opacities, jnp.float32),
-        colors=jnp.asarray(colors, jnp.float32),
-    )
+    return balls([[0.0, 0.0, depth]] * len(opacities), 1e-3, opacities, colors)
 
 
 def test_mean_color_weighs_by_opacity_and_leaves_absent_rows_out():
@@ -117,27 +106,3 @@ def test_the_baselines_copy_the_nearest_view_and_show_the_mean_color(capture):
     mean = np.mean([capture.image(0), capture.image(4)], axis=(0, 1, 2))
     flats = [psnr(np.broadcast_to(mean, capture.image(i).shape).astype(np.float32), capture.image(i)) for i in (1, 3)]
     assert found["mean_color_psnr"] == pytest.approx(np.mean(flats), abs=1e-4)
-
-
-@pytest.mark.parametrize(("overflow", "capacity"), [("grow", 256), ("drop_new", 128)])
-def test_growing_the_cache_is_not_timed(overflow, capacity, capture, monkeypatch):
-    """A cache that the next chunk might not fit is doubled before the clock starts, and given back as it was."""
-    monkeypatch.setattr(cost, "NUM_REPEATS", 1)
-
-    capacities = []
-
-    class Watched(Session):
-        def feed(self, chunk):
-            capacities.append(self.cache.capacity)
-
-        def gaussians(self):
-            return gaussians([[0.2, 0.4, 0.6]], [0.9])
-
-    config = StreamConfig().replace(capacity=128, overflow=overflow)
-    chunk = next(iter(capture.chunks(config, (0, 1, 3, 4))))
-    session = Watched(StreamSplat(config), {}, init_cache(config))
-    frame = capture.stream_frame(config, (0, 1, 3, 4))
-    milliseconds = measure_latency(session, [chunk], capture.camera(2, frame))
-    assert capacities == [capacity] * 2 and session.cache.capacity == 128  # 4 x 8 x 8 tokens
-    assert 0 <= milliseconds["step_ms"] < milliseconds["chunk_ms"]["median"]
-    assert 0 < milliseconds["render_ms"] < milliseconds["chunk_ms"]["median"]

@@ -1,20 +1,11 @@
 """Experiments: what they compute from their measurements, and how the command line finds them."""
 
 from importlib.metadata import entry_points
-from typing import get_args, get_type_hints
 
 import numpy as np
 import pytest
-from ssplat_experiments.ablation import BUDGETS as ABLATION_BUDGETS
-from ssplat_experiments.ablation import VARIANTS, add_differences, findings
-from ssplat_experiments.ablation import cases as ablation_cases
 from ssplat_experiments.accuracy_vs_time import mark_fronts
 from ssplat_experiments.depth_error import cell_depths, summary
-from ssplat_experiments.settings import REFINED, SETTINGS
-
-from ssplat_jax.config import QUALITIES
-from ssplat_jax.model.network import STAGES
-from ssplat_jax.runs.options import StreamOptions
 
 
 def row(ms, psnr):
@@ -27,14 +18,6 @@ def test_the_front_holds_undominated_settings():
     for a in rows:
         beaten = any(b["ms_per_view"] <= a["ms_per_view"] and b["shown"] >= a["shown"] and b is not a for b in rows)
         assert a["front"] != beaten
-
-
-def test_the_qualities_are_settings_that_were_measured():
-    measured = {setting.quality: setting for setting in (*SETTINGS, *REFINED) if setting.quality}
-    assert measured.keys() == QUALITIES.keys() == set(get_args(get_type_hints(StreamOptions)["quality"]))
-    for name, quality in QUALITIES.items():
-        assert measured[name].changes == {}  # a quality changes the size and the steps only
-        assert (measured[name].factor, measured[name].refine_steps) == (quality.scale, quality.refine_steps)
 
 
 def test_depth_errors_ignore_scale_and_are_binned():
@@ -57,30 +40,6 @@ def test_a_cells_depth_is_the_median_of_its_known_depths():
     depth[:2, 4:] = 5.0
     depth[4, 4] = 7.0
     np.testing.assert_array_equal(cell_depths(depth), [[8.0, 5.0], [0.0, 0.0]])
-
-
-def test_variants_are_compared_with_the_same_seed():
-    """Seeds move all scores alike: the difference's spread is not that of the scores."""
-    scores = {"full": (20.0, 22.0, 24.0), "without HPDA": (19.9, 21.8, 23.9), "without CGFI": (20.5,)}
-    rows = [
-        {"scene": "room", "variant": variant, "seed": seed, "shown_psnr": psnr, "literal_psnr": 2 * psnr,
-         "gaussians": 10}
-        for variant, column in scores.items()
-        for seed, psnr in enumerate(column)
-    ]  # fmt: skip
-    add_differences(rows)
-    lines = findings(rows)[0].splitlines()[2:]
-    assert "| 0.13 ± 0.06 (3) |" in lines[1] and "| 0.27 ± 0.12 (3) |" in lines[1]
-    assert "| -0.50 (one seed) |" in lines[2]
-
-
-def test_every_variant_of_the_ablation_is_another_model_or_another_training():
-    budget, asked = ABLATION_BUDGETS["cpu"], ablation_cases(None, "cpu")
-    assert len(asked) == 3 * 3 + 5 and len({case.hash for case in asked}) == len(asked)
-    assert len({case.config.hash for case in asked}) == 7  # the one with untrained tokens is the full model
-    for variant in VARIANTS.values():
-        assert set(variant.untrained) <= set(STAGES)
-        assert set(variant.untrained) <= set(STAGES) - set(budget.recipe(0, variant.untrained).phases[0].rates)
 
 
 def test_every_registered_experiment_and_benchmark_can_be_loaded():

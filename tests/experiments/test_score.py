@@ -1,19 +1,13 @@
 """Renders of another method: scored as they are, against the split they name."""
 
-import dataclasses
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
-from ssplat_experiments import context_length
 from ssplat_experiments.score import run
-from ssplat_experiments.study import markdown_table
 
-from ssplat_jax.commands.main import guarded
-from ssplat_jax.commands.measure_commands import Experiment
-from ssplat_jax.config import preset
 from ssplat_jax.core.console import Reporter
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import Split, interleaved_split
@@ -37,10 +31,6 @@ def renders(tmp_path):
     return folder, room, split
 
 
-def scoring(folder, tmp_path) -> Experiment:
-    return Experiment("score", out=tmp_path / "out", captures=Path(ROOM), renders=folder, quiet=True)
-
-
 def test_renders_are_scored_as_they_are(renders, tmp_path):
     folder, room, split = renders
     run(Path(ROOM), tmp_path / "out", "smoke", QUIET, renders=folder)
@@ -49,20 +39,6 @@ def test_renders_are_scored_as_they_are(renders, tmp_path):
     assert abs(theirs["literal_psnr"] - np.mean(-10 * np.log10(errors))) < 0.02
     assert theirs["config"] is None and theirs["split"] == split.sha256[:12]
     assert (theirs["method"], copy["method"], flat["method"]) == ("theirs", "copy nearest", "mean color")
-
-
-def test_the_memory_of_a_method_is_that_of_its_metrics(renders, tmp_path, capsys):
-    folder, _, _ = renders
-    command = scoring(folder, tmp_path)
-    (folder / "metrics.json").write_text('{"peak_memory_bytes": 123456}')
-    assert guarded(command.run) == 0
-    rows = json.loads((tmp_path / "out" / "table.json").read_text())
-    assert [row["peak_memory_bytes"] for row in rows] == [123456, None, None]
-    bad = {'{"peak_memory_bytes": "much"}': "'much'", '{"peak_memory_bytes": -1}': "-1", "[]": "list"}
-    for text, words in bad.items():
-        (folder / "metrics.json").write_text(text)
-        assert guarded(dataclasses.replace(command, out=tmp_path / "other").run) == 2
-        assert words in capsys.readouterr().err
 
 
 def test_scores_are_means_over_views_then_scenes_and_memory_is_the_largest(tmp_path):
@@ -86,19 +62,3 @@ def test_scores_are_means_over_views_then_scenes_and_memory_is_the_largest(tmp_p
     rows = json.loads((tmp_path / "without" / "table.json").read_text())
     _, b, mean = (row for row in rows if row["method"] == "theirs")
     assert b["peak_memory_bytes"] == mean["peak_memory_bytes"] == "OOM" and "literal_psnr" not in mean
-
-
-def test_nothing_larger_is_tried_after_a_number_of_views_that_does_not_fit(monkeypatch):
-    tried = []
-
-    def measure(path, count, config, sizes):
-        tried.append(count)
-        if count == 64:
-            raise RuntimeError("RESOURCE_EXHAUSTED: out of memory")
-        return {"literal_psnr": 20.0}
-
-    monkeypatch.setattr(context_length, "joint_row", measure)
-    sizes = context_length.SIZES["cpu"][0]
-    rows = context_length.measured_joint("procedural:room", (24, 64, 128), preset("tiny"), sizes)
-    assert tried == [24, 64] and [row["views"] for row in rows] == [24, 64]
-    assert rows[1]["peak_memory_bytes"] == "OOM" and "| OOM |" in markdown_table(rows)

@@ -19,9 +19,10 @@ from ssplat_jax.storage.files import read_tensors
 from ssplat_jax.storage.saved_states import load_state, save_state
 from ssplat_jax.storage.weights import load_weights, save_weights
 from ssplat_jax.streaming.scene_delta import SceneDelta
-from tests.badinputs.cases import make_capture
+from tests.badinputs.cases import depth_map, make_capture
 from tests.data.capture_writers import WRITERS
 from tests.scene_files.scene_fixture import compressed_ply, scene
+from tests.storage.test_files import TENSORS, write_safetensors
 from tests.streaming.narrow_model import NARROW
 
 
@@ -48,10 +49,7 @@ def with_images(name: str) -> Callable[[Path], Path]:
             with Image.open(folder / "images" / "2.jpg") as image:
                 image.save(folder / "images" / "2.png")
                 image.save(folder / "images" / "2.webp")
-            Image.new("I;16", (64, 48), 900).save(folder / "d.png")
-            meta["frames"][2] |= {"depth_file_path": "d.png"} | (
-                {"file_path": name} if name.startswith("images") else {}
-            )
+            depth_map(2, 900, **({"file_path": name} if name.startswith("images") else {}))(folder, meta)
 
         return make_capture(root / "capture", change) / name
 
@@ -101,22 +99,13 @@ def write_json(name: str, value: object) -> Callable[[Path], Path]:
     return write
 
 
-TENSORS = {"conv.weight": np.arange(12, dtype=np.float32).reshape(3, 4), "bn.gamma": np.ones(2, np.float16)}
-
-
 def write_npz(root: Path) -> Path:
     np.savez(root / "a.npz", **TENSORS)
     return root / "a.npz"
 
 
-def write_safetensors(root: Path) -> Path:
-    facts, body = {"__metadata__": {"format": "pt"}}, b""
-    for name, x in TENSORS.items():
-        ends = [len(body), len(body) + x.nbytes]
-        facts[name] = {"dtype": {4: "F32", 2: "F16"}[x.itemsize], "shape": x.shape, "data_offsets": ends}
-        body += x.tobytes()
-    text = json.dumps(facts).encode()
-    (root / "a.safetensors").write_bytes(len(text).to_bytes(8, "little") + text + body)
+def write_tensors(root: Path) -> Path:
+    write_safetensors(root / "a.safetensors", TENSORS)
     return root / "a.safetensors"
 
 
@@ -151,6 +140,6 @@ PARSERS = (
         "weights": Parser(write_weights, load_weights),
         "index": Parser(write_json("index.json", INDEX), read_index),
         "npz of tensors": Parser(write_npz, read_tensors),
-        "safetensors": Parser(write_safetensors, read_tensors),
+        "safetensors": Parser(write_tensors, read_tensors),
     }
 )

@@ -16,7 +16,6 @@ import pytest
 
 from ssplat_jax.core.errors import InputError, StorageError
 from ssplat_jax.data.posed_image import pose_from_quat
-from ssplat_jax.data.readers.datasets import pose_at
 from tests.badinputs.cases import mutant
 from tests.fuzzing.parsers import PARSERS
 
@@ -82,13 +81,3 @@ def test_a_quaternion_of_huge_numbers_is_its_direction():
         warnings.simplefilter("error")
         pose = pose_from_quat([1e300, 0, 0, 1e300], [1, 2, 3], "here")
     np.testing.assert_allclose(pose[:3, :3], [[0, -1, 0], [1, 0, 0], [0, 0, 1]], atol=1e-12)
-
-
-@pytest.mark.parametrize("bad", [np.inf, np.nan])
-@pytest.mark.parametrize("column", [1, 5])
-def test_poses_are_not_mixed_with_what_is_none(bad, column):
-    rows = np.array([[0.0, 0, 0, 0, 0, 0, 0, 1], [0.05, 0, 0, 0, 0, 0, 0, 1]])
-    rows[1, column] = bad
-    with warnings.catch_warnings(), pytest.raises(InputError, match="here: wanted finite numbers"):
-        warnings.simplefilter("error")
-        pose_at(0.01, rows, "here")

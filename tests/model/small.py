@@ -67,17 +67,22 @@ def chunk(seed: int = 0, *, views: int = 3, baseline: float = 0.2, height: int =
     rng = np.random.default_rng(seed)
     coarse = rng.uniform(size=(views, height // 3 + 1, width // 3 + 1, 3))
     images = np.repeat(np.repeat(coarse, 3, axis=1), 3, axis=2)[:, :height, :width]
-    viewmats = np.tile(np.eye(4), (views, 1, 1))
-    viewmats[:, 0, 3] = -baseline * np.arange(views)
-    K = np.array([[28.0, 0, width / 2 + 1], [0, 27.0, height / 2 - 1], [0, 0, 1]])
-    return Chunk(
-        images=jnp.asarray(images, jnp.float32),
-        viewmats=jnp.asarray(viewmats, jnp.float32),
-        Ks=jnp.asarray(np.tile(K, (views, 1, 1)), jnp.float32),
-        valid=jnp.ones(views, bool),
-        near=jnp.float32(1.0),
-        far=jnp.float32(6.0),
-    )
+    K = [[28.0, 0, width / 2 + 1], [0, 27.0, height / 2 - 1], [0, 0, 1]]
+    return chunk_of(images, side_by_side(baseline * np.arange(views)), K, near=1.0, far=6.0)
+
+
+def side_by_side(places) -> np.ndarray:
+    """View matrices of cameras at x = `places` that look along +z."""
+    viewmats = np.tile(np.eye(4), (len(places), 1, 1))
+    viewmats[:, 0, 3] = -np.asarray(places)
+    return viewmats
+
+
+def chunk_of(images, viewmats, K, near: float, far: float) -> Chunk:
+    """Views of one camera, all valid."""
+    single = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
+    Ks, valid = np.tile(K, (len(images), 1, 1)), jnp.ones(len(images), bool)
+    return Chunk(single(images), single(viewmats), single(Ks), valid, single(near), single(far))
 
 
 @functools.cache
@@ -157,8 +162,3 @@ def history(depths, confidences, feats=None, mask=None, colors=None) -> Projecte
 def finite(tree) -> bool:
     """True if every float of the tree is finite."""
     return all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(tree) if jnp.issubdtype(leaf.dtype, jnp.floating))
-
-
-def count_params(params) -> int:
-    """Number of scalars in `params`, which may be shapes."""
-    return sum(leaf.size for leaf in jax.tree.leaves(params))

@@ -57,22 +57,16 @@ def changed(params: dict, facts: Evidence):
 
 
 def cache_of_pivots(num: int = 6):
-    """A cache with pivots in its first rows."""
-    rng = np.random.default_rng(0)
-    cache = init_cache(CONFIG)
-    set_rows = lambda x, values: x.at[:num, 0].set(jnp.asarray(values, x.dtype))  # noqa: E731
+    """A cache with random pivots in its first rows."""
+    rng, cache = np.random.default_rng(0), init_cache(CONFIG)
+    filled = lambda x: x.at[:num, 0].set(jnp.asarray(rng.uniform(0.6, 0.95, (num, *x.shape[2:])), x.dtype))  # noqa: E731
+    names = ("means", "feats", "confidences", "rgbs", "quats", "footprints", "observations")
     return replace(
         cache,
         counts=cache.counts.at[:num].set(1),
         num_voxels=jnp.asarray(num, jnp.int32),
-        means=set_rows(cache.means, rng.normal(size=(num, 3))),
-        feats=set_rows(cache.feats, rng.normal(size=(num, 64))),
-        confidences=set_rows(cache.confidences, np.full(num, 0.9)),
-        rgbs=set_rows(cache.rgbs, rng.uniform(size=(num, 12))),
-        quats=set_rows(cache.quats, rng.normal(size=(num, 4))),
-        footprints=set_rows(cache.footprints, np.full(num, 0.02)),
-        num_members=set_rows(cache.num_members, np.arange(1, num + 1)),
-        observations=set_rows(cache.observations, rng.uniform(0, 5, (num, NUM_OBSERVED))),
+        num_members=cache.num_members.at[:num, 0].set(1),
+        **{name: filled(getattr(cache, name)) for name in names},
     )
 
 

@@ -5,7 +5,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ssplat_jax.core.pytree import replace
 from ssplat_jax.model.cgfi import Aggregator, inject_features, num_hints
 from ssplat_jax.model.compact import mix_tokens
 from ssplat_jax.model.mixer import nearest_tokens
@@ -64,17 +63,6 @@ def test_cgfi_uses_history_only_where_confidence_is_below_one(config, weights):
 
     assert effect_of_history(1.0) == 0.0
     assert effect_of_history(0.2) > 1e-3
-
-
-@pytest.mark.parametrize("is_unit", [True, False])
-def test_history_is_bounded_only_with_unit_features(is_unit):
-    config = CONCAT.replace(unit_features=is_unit)
-    seen = []
-    inject_features(
-        fresh(config)["cgfi"], maps(0, C), past(), jnp.full(GRID, 0.2), views(), config,
-        bound_history=lambda feats: seen.append(feats) or feats,
-    )  # fmt: skip
-    assert len(seen) == is_unit
 
 
 def brute_force(points, usable, candidates, k):
@@ -144,20 +132,3 @@ def test_tokens_at_one_point_are_mixed_finitely():
 
     (_, mixed), gradient = jax.jit(jax.value_and_grad(energy, has_aux=True))(maps(4, C))
     assert np.isfinite(mixed).all() and np.isfinite(gradient).all()
-
-
-def test_padded_views_do_not_change_mixing_and_cgfi():
-    valid = jnp.array([True, True, False])
-    inside = jnp.ones(GRID, bool) & valid[:, None, None]
-    feats, positions = maps(4, C), maps(5, 3)
-    loud = feats.at[2].add(50.0)
-    np.testing.assert_array_equal(
-        mix(feats, positions, inside, valid)[:2], mix(loud, positions.at[2].add(3.0), inside, valid)[:2]
-    )
-    changed = replace(past(), feats=past().feats.at[2].add(50.0))
-    view = prepare_views(replace(chunk(), valid=valid), CONFIG)
-    a, b = (
-        _INJECT(params()["cgfi"], f, p, jnp.full(GRID, 0.2), view, CONFIG)[:2]
-        for f, p in ((feats, past()), (loud, changed))
-    )
-    np.testing.assert_array_equal(a, b)

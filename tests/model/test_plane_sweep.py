@@ -9,7 +9,7 @@ from ssplat_jax.core.chunk import Chunk
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.model.compact import CompactFeatures, encode, plane_sweep
 from ssplat_jax.model.views import prepare_views, sweep_pixels
-from tests.model.small import random_params, turned
+from tests.model.small import chunk_of, random_params, side_by_side, turned
 
 CONFIG = StreamConfig().replace(
     encoder_widths=(16, 32), encoder_blocks=1, attention_blocks=1, num_depths=24, match_width=32, unet_width=8
@@ -35,17 +35,8 @@ def wall_chunk() -> Chunk:
     pixel = np.arange(SIDE) + 0.5
     u, v = np.meshgrid(pixel, pixel)
     images = [texture((u - SIDE / 2) / FOCAL * WALL + c, (v - SIDE / 2) / FOCAL * WALL) for c in centers]
-    viewmats = np.tile(np.eye(4), (3, 1, 1))
-    viewmats[:, 0, 3] = -centers
-    K = np.array([[FOCAL, 0, SIDE / 2], [0, FOCAL, SIDE / 2], [0, 0, 1]])
-    return Chunk(
-        images=jnp.asarray(np.stack(images), jnp.float32),
-        viewmats=jnp.asarray(viewmats, jnp.float32),
-        Ks=jnp.asarray(np.tile(K, (3, 1, 1)), jnp.float32),
-        valid=jnp.ones(3, bool),
-        near=jnp.float32(1.0),
-        far=jnp.float32(5.0),
-    )
+    K = [[FOCAL, 0, SIDE / 2], [0, FOCAL, SIDE / 2], [0, 0, 1]]
+    return chunk_of(np.stack(images), side_by_side(centers), K, near=1.0, far=5.0)
 
 
 sweep = jax.jit(lambda features, views: plane_sweep(features, views, CONFIG))

@@ -148,14 +148,6 @@ def test_padded_view_does_not_change_the_valid_ones(padded):
     assert float(jnp.abs(c.tokens.feats[rows] - d.tokens.feats[rows]).max()) > 1e-3
 
 
-def test_chunk_of_padding_does_not_change_the_cache():
-    empty = replace(chunk(3), valid=jnp.zeros(3, bool))
-    after, output = step(params(), warm_cache(), empty)
-    np.testing.assert_array_equal(output.confidences, 0)
-    for name in ("voxels", "counts", "num_voxels", "means", "feats", "confidences", "num_members"):
-        np.testing.assert_array_equal(getattr(after, name), getattr(warm_cache(), name))
-
-
 def test_a_view_that_cannot_be_used_is_padding_and_counted():
     """One bad camera once wrote NaN into the observations of pivots that other views had confirmed."""
     spoiled = replace(chunk(), Ks=chunk().Ks.at[1, 0, 0].set(-28.0))
@@ -166,10 +158,3 @@ def test_a_view_that_cannot_be_used_is_padding_and_counted():
     jax.tree.map(np.testing.assert_array_equal, replace(after, stats=stats), wanted)
     jax.tree.map(np.testing.assert_array_equal, output, expected)
     assert finite(gradients(warm_cache(), spoiled))
-
-
-def test_a_chunk_without_a_range_of_depths_changes_nothing_and_is_counted():
-    after, output = step(params(), warm_cache(), replace(chunk(), near=jnp.float32(np.nan)))
-    assert int(after.stats.num_unusable) == 3 and finite(output)
-    stats = replace(after.stats, num_unusable=warm_cache().stats.num_unusable)
-    jax.tree.map(np.testing.assert_array_equal, replace(after, stats=stats), warm_cache())

@@ -6,8 +6,7 @@ import pytest
 
 from ssplat_jax.config import preset
 from ssplat_jax.model.hpda import expected_log_depth
-from ssplat_jax.model.layers import same_region_mask
-from ssplat_jax.model.resplat.encoder import POSITIONS_SIDE, Transformer, resampled_positions
+from ssplat_jax.model.resplat.encoder import POSITIONS_SIDE, resampled_positions
 from ssplat_jax.model.resplat.torch_layers import resize
 from ssplat_jax.model.views import prepare_views, to_candidate_space
 from ssplat_jax.training.losses import soft_targets
@@ -51,16 +50,6 @@ def keys_kernel(t: float, a: float = -0.75) -> float:
     if t <= 1:
         return (a + 2) * t**3 - (a + 3) * t**2 + 1
     return a * (t**3 - 5 * t**2 + 8 * t - 4) if t < 2 else 0.0
-
-
-def test_keys_of_all_sources_are_masked_alike():
-    together = same_region_mask(4, 6, (4, 6), (2, 3))
-    keys = Transformer(upstream_compat=False).source_mask(together, 2)
-    np.testing.assert_array_equal(keys[..., :24], together)
-    np.testing.assert_array_equal(keys[..., 24:], together)
-    one = Transformer(upstream_compat=True)
-    np.testing.assert_array_equal(one.source_mask(together, 1), together)  # one source: the same order
-    assert (np.asarray(one.source_mask(together, 2)) != np.asarray(keys)).any()
 
 
 def test_depths_are_averaged_in_the_space_of_candidates():

@@ -1,6 +1,6 @@
 """ReSplat's network against the outputs of the authors' PyTorch code with the same weights.
 
-Stage by stage, and through `StreamSplat` with the preset `paper` and an empty cache.
+Through `StreamSplat` with the preset `paper` and an empty cache; the depth network of DepthSplat stage by stage.
 """
 
 import functools
@@ -12,19 +12,17 @@ import pytest
 
 from ssplat_jax.config import preset
 from ssplat_jax.core.chunk import Chunk
-from ssplat_jax.core.gaussians import Gaussians
-from ssplat_jax.core.rotations import matrices_to_quats, quats_to_matrices
+from ssplat_jax.core.rotations import quats_to_matrices
 from ssplat_jax.model import resplat
-from ssplat_jax.model.decoder import decode_tokens
 from ssplat_jax.model.hpda import expected_log_depth
-from ssplat_jax.model.layers import pixel_unshuffle
 from ssplat_jax.model.network import init_params
-from ssplat_jax.model.resplat.resplat_tokens import ReSplatGaussianHead, Upsampler, token_context
+from ssplat_jax.model.resplat.resplat_tokens import Upsampler
 from ssplat_jax.model.resplat.torch_layers import resize
 from ssplat_jax.model.streamsplat import StreamSplat
-from ssplat_jax.model.views import AnchoredDepth, back_project, patch_colors, prepare_views, to_candidate_space
+from ssplat_jax.model.views import prepare_views, to_candidate_space
 from ssplat_jax.storage.weights import as_published
 from tests.model.resplat_fixture import load_golden, named_params, tap_error
+from tests.model.small import chunk_of
 
 TOLERANCE = 2e-4
 """Largest error in standard deviations of a tap; float32 against float64 gives 3.4e-5."""
@@ -38,17 +36,10 @@ def _exact_products():
 
 
 def read_inputs(golden: dict) -> Chunk:
-    images = jnp.asarray(golden["in.image_u8"].transpose(0, 2, 3, 1) / 255.0, jnp.float32)
-    v, height, width, _ = images.shape
-    near, far = golden["in.near_far"]
-    return Chunk(
-        images=images,
-        viewmats=jnp.asarray(np.linalg.inv(golden["in.extrinsics"].astype(np.float64)), jnp.float32),
-        Ks=jnp.tile(jnp.asarray(golden["in.intrinsics"] * [[width], [height], [1]], jnp.float32), (v, 1, 1)),
-        valid=jnp.ones(v, bool),
-        near=jnp.float32(near),
-        far=jnp.float32(far),
-    )
+    images = golden["in.image_u8"].transpose(0, 2, 3, 1) / 255.0
+    height, width = images.shape[1:3]
+    K = golden["in.intrinsics"] * [[width], [height], [1]]
+    return chunk_of(images, np.linalg.inv(golden["in.extrinsics"].astype(np.float64)), K, *golden["in.near_far"])
 
 
 def nchw(x) -> np.ndarray:
@@ -57,7 +48,7 @@ def nchw(x) -> np.ndarray:
 
 @functools.cache
 def resplat_values() -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Wanted and computed values of every tap, from the images through all stages; `paper.*` through `StreamSplat`."""
+    """Wanted and computed values of depths, tokens and Gaussians."""
     golden = load_golden("resplat_small")
     near, far = golden["in.near_far"].tolist()
     # As `import-weights` writes it.
@@ -66,72 +57,24 @@ def resplat_values() -> dict[str, tuple[np.ndarray, np.ndarray]]:
     params = init_params(jax.random.key(0), config, {"hpda", "cgfi"}) | named_params(config)
 
     def run(params, chunk: Chunk):
-        views = prepare_views(chunk, config)
-        height, width = views.images.shape[1:3]
-        features = resplat.encode(params["encoder"], views, config)
-        distribution = resplat.match(params["cost_volume"], features, views, config)
-        confidences = distribution.probs.max(axis=-1)
-        log_depths = expected_log_depth(distribution.probs, views.log_candidates, config)
-        depth = AnchoredDepth(distribution.probs, log_depths, confidences, confidences)
-        residual = Upsampler(config).apply({"params": params["upsampler"]}, features, log_depths, height, width)
-        depth = resplat.refine_depth(params["upsampler"], features, depth, views, config)
-        context = token_context(features, height // 4, width // 4)
-        match = depth.matcher_confidences[..., None]
-        regressed = [pixel_unshuffle(views.images, 4), jnp.exp(depth.log_depths)[..., None], match, context]
-        feats = resplat.regress_tokens(params["tokens"], features, distribution, depth, views, config)
-        positions, footprints = back_project(depth.log_depths, views)
-        mixed = resplat.mix_tokens(params["mixer"], feats, positions, views.inside, views.valid, config)
-        flat = mixed.reshape(-1, config.network.token_width)
-        shapes = resplat.read_shapes(params["decoder"], flat, config)
-        quats = matrices_to_quats(jnp.swapaxes(views.viewmats[:, :3, :3], -1, -2))
-        gaussians = decode_tokens(
-            shapes,
-            means=positions.reshape(-1, 3),
-            rgbs=patch_colors(views.images, config).reshape(-1, 3),
-            quats=jnp.repeat(quats, height * width // 16, axis=0),
-            footprints=footprints.reshape(-1),
-            config=config,
-        )
         prediction = model.predict(params, model.init_cache(), chunk)
-        unit = shapes.quats / jnp.linalg.norm(shapes.quats, axis=1, keepdims=True)
+        gaussians = model.decode_tokens(params, prediction.tokens)
+        axes = quats_to_matrices(gaussians.quats)
         return {
-            "tap.depth_predictor.depth_head.0.in0": distribution.decoder.transpose(0, 3, 1, 2),
-            "tap.depth_predictor.depth_head.0": distribution.logits.transpose(0, 3, 1, 2),
-            "tap.depth_predictor.upsampler": residual,
-            "tap.gaussian_regressor.in0": jnp.concatenate(regressed, axis=-1).transpose(0, 3, 1, 2),
-            "tap.proj": feats,
-            "tap.pt": mixed - feats,
-            "tap.gaussian_head.in0": mixed,
-            "tap.gaussian_head": ReSplatGaussianHead(config).apply({"params": params["decoder"]}, flat),
-            "out.rotations": jnp.roll(unit, -1, axis=1),  # xyzw
-            **{f"out.{name}": x for name, x in outputs(gaussians).items()},
-            "paper.tap.depth_predictor.depth_head.0": prediction.logits[:, ::2, ::2].transpose(0, 3, 1, 2),
-            "paper.tap.gaussian_head.in0": prediction.tokens.feats,
-            **{f"paper.out.{name}": x for name, x in outputs(model.decode_tokens(params, prediction.tokens)).items()},
+            "tap.depth_predictor.depth_head.0": prediction.logits[:, ::2, ::2].transpose(0, 3, 1, 2),
+            "tap.gaussian_head.in0": prediction.tokens.feats,
+            "out.opacities": gaussians.opacities,
+            "out.scales": gaussians.scales,
+            "out.harmonics": gaussians.sh.swapaxes(1, 2),
+            "out.covariances": jnp.einsum("nij,nj,nkj->nik", axes, gaussians.scales**2, axes, precision="highest"),
         }
 
     came = jax.jit(run)(params, read_inputs(golden))
-    return {name: (golden[name.removeprefix("paper.")], np.asarray(x)) for name, x in came.items()}  # pyright: ignore
+    return {name: (golden[name], np.asarray(x)) for name, x in came.items()}
 
 
-def outputs(gaussians: Gaussians) -> dict:
-    """Gaussians as the authors' code returns them."""
-    axes = quats_to_matrices(gaussians.quats)
-    return {
-        "opacities": gaussians.opacities,
-        "scales": gaussians.scales,
-        "harmonics": gaussians.sh.swapaxes(1, 2),
-        "covariances": jnp.einsum("nij,nj,nkj->nik", axes, gaussians.scales**2, axes, precision="highest"),
-    }
-
-
-RESPLAT_TAPS = (
-    *("tap.depth_predictor.depth_head.0.in0", "tap.depth_predictor.depth_head.0", "tap.depth_predictor.upsampler"),
-    *("tap.gaussian_regressor.in0", "tap.proj", "tap.pt", "tap.gaussian_head.in0", "tap.gaussian_head"),
-    *("out.opacities", "out.scales", "out.rotations", "out.harmonics", "out.covariances"),
-    *("paper.tap.depth_predictor.depth_head.0", "paper.tap.gaussian_head.in0", "paper.out.opacities"),
-    *("paper.out.scales", "paper.out.harmonics", "paper.out.covariances"),
-)
+RESPLAT_TAPS = ("tap.depth_predictor.depth_head.0", "tap.gaussian_head.in0", "out.opacities", "out.scales",
+                "out.harmonics", "out.covariances")  # fmt: skip
 
 
 @pytest.mark.slow

@@ -10,6 +10,7 @@ from ssplat_jax.data.capture import ArrayPixels, Capture
 from ssplat_jax.data.posed_image import Frame
 from ssplat_jax.poses.adjust_poses import adjust_poses
 from tests.poses.room_fixture import HEIGHT, WIDTH, K, pictures, walk
+from tests.poses.test_bundle_adjustment import relative_turns
 
 NUM = 8
 CONTEXT = [i for i in range(NUM) if i != 4]
@@ -50,9 +51,7 @@ def adjusted(wrong):
 
 def turns(capture, exact):
     """Degrees by which the motion from each context camera to the next differs from the exact one."""
-    R = [np.stack([c.frames[i].camtoworld[:3, :3] for i in CONTEXT]) for c in (capture, exact)]
-    steps = [r[1:].transpose(0, 2, 1) @ r[:-1] for r in R]
-    return np.degrees(Rotation.from_matrix(steps[0] @ steps[1].transpose(0, 2, 1)).magnitude())
+    return relative_turns(*(np.linalg.inv(c.camtoworlds[CONTEXT]) for c in (capture, exact)))
 
 
 def test_wrong_poses_are_found_and_put_right(adjusted, wrong, exact):

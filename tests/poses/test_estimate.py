@@ -9,18 +9,17 @@ from PIL import Image
 from ssplat_jax.core.console import Reporter
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.data.open_capture import open_capture
-from ssplat_jax.poses.estimate import Findings, PoseOptions, estimate_poses
+from ssplat_jax.poses.estimate import PoseOptions, estimate_poses
 from ssplat_jax.storage.files import write_json
 from tests.poses.room_fixture import FOCAL, K, pictures, walk
 
 pycolmap = pytest.importorskip("pycolmap", reason="poses need pycolmap: pip install -e '.[poses]'")
 
 from ssplat_jax.poses import sfm  # noqa: E402
-from ssplat_jax.poses.sfm import OVERLAP, alike_pairs, neighbor_pairs  # noqa: E402
+from ssplat_jax.poses.sfm import alike_pairs  # noqa: E402
 
 NUM_PHOTOS = 9
 QUIET = Reporter(quiet=True)
-NAMES = tuple(f"{i}.jpg" for i in range(120))
 
 
 def estimate(source, out, overwrite=False, **options):
@@ -135,14 +134,6 @@ def test_files_of_another_maker_are_left_alone(name, text, photos, tmp_path):
     assert held.read_text() == "mine"
 
 
-def test_neighbors_are_matched_at_small_and_doubling_distances():
-    gaps = {b - a for a, b in neighbor_pairs(100)}
-    assert gaps == {*range(1, OVERLAP + 1), 16, 32, 64}
-    pairs = neighbor_pairs(40)
-    assert len(set(pairs)) == len(pairs) and all(0 <= a < b < 40 for a, b in pairs)
-    assert {(39 - gap, 39) for gap in range(1, OVERLAP + 1)} <= set(pairs)
-
-
 def test_images_of_the_same_place_are_alike():
     """Two walks past ten places: the partner of an image is that of the same place in the other walk."""
     rng = np.random.default_rng(0)
@@ -154,14 +145,3 @@ def test_images_of_the_same_place_are_alike():
     pairs = alike_pairs(descriptors, 1)
     assert all(13 not in pair for pair in pairs) and (2, 12) in pairs
     assert alike_pairs(descriptors[13:15], 5) == set()
-
-
-def test_findings_name_what_is_missing():
-    def found(registered, error=0.62):
-        return Findings(NAMES, tuple(NAMES[i] for i in registered), error, 12345).sentences()
-
-    assert found(range(120)) == ["registered 120 of 120 images, median reprojection error 0.6 px, 12,345 points"]
-    assert found([*range(50), *range(51, 119)])[1:] == ["without a pose: 50.jpg, 119.jpg"]
-    assert "fish-eye" in found(range(120), error=2.5)[-1]
-    few = found(range(100))
-    assert few[1].endswith("105.jpg and 14 more") and "overlap" in few[2]

@@ -20,6 +20,15 @@ def cloud(num: int = 60, *, degree: int = 1, size: float = 0.08, seed: int = 0, 
     )
 
 
+def balls(means, size, opacities=0.9, colors=0.5) -> Gaussians:
+    """Gaussians of no turn at `means`; sizes, opacities and colors are those of all, or of each."""
+    full = lambda x, *shape: jnp.broadcast_to(jnp.asarray(x, jnp.float32), (len(means), *shape))  # noqa: E731
+    return Gaussians.from_rgb(
+        means=full(means, 3), quats=full([1.0, 0, 0, 0], 4), scales=full(size, 3), opacities=full(opacities),
+        colors=full(colors, 3),
+    )  # fmt: skip
+
+
 def concatenate(parts: list[Gaussians]) -> Gaussians:
     """All rows of `parts`, which have the same SH degree, in order."""
     return jax.tree.map(lambda *rows: jnp.concatenate(rows), *parts)

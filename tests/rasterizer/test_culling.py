@@ -11,6 +11,7 @@ from ssplat_jax.rasterizer import Effects, render
 from ssplat_jax.rasterizer.binning import Grid, intersect_tiles, sorted_table
 from ssplat_jax.rasterizer.constants import ALPHA_MIN
 from ssplat_jax.rasterizer.projection import project
+from tests.rasterizer.scenes import balls
 
 WIDTH, HEIGHT, TILE = 28, 20, 8  # no multiple of a tile
 GRID = Grid(num_images=1, height=HEIGHT, width=WIDTH, tile=TILE)
@@ -76,18 +77,6 @@ def test_no_tile_with_a_visible_pixel_is_left_out():
     assert num_pairs < 1.6 * num_touched  # ellipses that pass between pixel centers are kept
 
 
-def row_of(means, *, size: float, opacity: float) -> Gaussians:
-    """Round Gaussians of one size and opacity."""
-    num = len(means)
-    return Gaussians.from_rgb(
-        means=jnp.asarray(means, jnp.float32),
-        quats=jnp.tile(jnp.array([1.0, 0.0, 0.0, 0.0]), (num, 1)),
-        scales=jnp.full((num, 3), size),
-        opacities=jnp.full(num, opacity),
-        colors=jnp.ones((num, 3)),
-    )
-
-
 def test_a_capped_sample_passes_no_gradient_to_its_opacity():
     camera = Camera(viewmats=jnp.eye(4), Ks=jnp.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]]), width=8, height=8)
 
@@ -96,7 +85,7 @@ def test_a_capped_sample_passes_no_gradient_to_its_opacity():
         return render(shown, camera, effects=Effects(outputs=("alpha",), antialias="none"), max_pairs=64).alpha
 
     slopes = jax.jit(jax.jacrev(alpha))
-    scene = row_of([[0.0, 0.0, 1.0]], size=1.0, opacity=0.999)
+    scene = balls([[0.0, 0.0, 1.0]], 1.0, 0.999)
     values = np.asarray(alpha(scene.opacities, scene))
     by_opacity = np.asarray(slopes(scene.opacities, scene))[..., 0]
     capped = values >= 0.99 - 1e-6
@@ -114,7 +103,7 @@ def test_a_lens_that_folds_shows_nothing_behind_the_fold(lens):
     angles = np.linspace(0, 2 * np.pi, 12, endpoint=False)
     means = np.stack([np.outer(tangents, f(angles)) for f in (np.cos, np.sin, np.ones_like)], axis=-1)
     means[..., 2] = 1.0
-    scene = row_of(means.reshape(-1, 3), size=0.01, opacity=0.9)
+    scene = balls(means.reshape(-1, 3), 0.01)
     wide = Camera(jnp.eye(4)[None], jnp.array([[[200.0, 0, 200], [0, 200, 150], [0, 0, 1]]]), width=400, height=300)
     splats = jax.jit(lambda g: project(g, wide, Effects(distortion=True), jnp.array([lens], jnp.float32)))(scene)
     visible = np.asarray(splats.visible).reshape(means.shape[:2])

@@ -13,7 +13,6 @@ from ssplat_jax.core.pytree import replace
 from ssplat_jax.rasterizer import Effects, effects_for, filter_3d, render
 from ssplat_jax.rasterizer.effects import distort, sampling_rates
 from ssplat_jax.rasterizer.projection import project
-from ssplat_jax.rasterizer.reference import render_reference
 from tests.rasterizer.scenes import cameras, cloud
 
 LENS = np.array([-0.2, 0.05, 0.002, -0.003, 0.01], np.float32)
@@ -108,16 +107,6 @@ def test_distortion_follows_opencvs_formula_and_derivative():
     measured = [*(opencv(x + h, y) - opencv(x - h, y)) / 2 / h, *(opencv(x, y + h) - opencv(x, y - h)) / 2 / h]
     for got, wanted in zip(slopes, (measured[0], measured[2], measured[1], measured[3]), strict=True):
         np.testing.assert_allclose(got, wanted, atol=1e-5)
-
-
-@plainly
-def test_exposure_is_affine_in_color():
-    plain, exposed = (
-        jax.jit(render_reference)(cloud(8), cameras(16, 16), exposures=exposures).color
-        for exposures in (None, jnp.asarray(EXPOSURE))
-    )
-    plain = np.asarray(plain)
-    np.testing.assert_allclose(exposed, np.maximum(plain @ EXPOSURE[:, :3].T + EXPOSURE[:, 3], 0), atol=1e-5)
 
 
 def test_the_3d_filter_has_its_variance_and_keeps_mass():

@@ -1,7 +1,6 @@
 """Images of the fast path and the reference against the NumPy oracle, and gradients against the reference's."""
 
 import functools
-import importlib
 import inspect
 import re
 import warnings
@@ -15,7 +14,7 @@ from ssplat_jax.core.cpu_backend import short_exp
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.core.gaussians import Gaussians, mask_gaussians
 from ssplat_jax.core.pytree import replace
-from ssplat_jax.rasterizer import Effects, binning, compositing, constants, effects_for, fill_holes, filter_3d, render
+from ssplat_jax.rasterizer import Effects, binning, compositing, constants, effects_for, filter_3d, render
 from ssplat_jax.rasterizer.binning import Grid, TileIntersections, intersect_tiles, sorted_table
 from ssplat_jax.rasterizer.projection import Splats, project
 from ssplat_jax.rasterizer.reference import render_reference
@@ -28,7 +27,6 @@ FORWARD = 2e-5  # float32 sums of about 60 samples, depths up to 4
 GRADIENT = 1e-4  # relative L2, float32 against float64
 ALL = Effects(outputs=("color", "alpha", "depth", "median_depth"), background=(0.2, 0.5, 0.9))
 
-render_module = importlib.import_module("ssplat_jax.rasterizer.render")  # the package has a function of that name
 plainly = pytest.mark.usefixtures("compiled_plainly")  # laws within a tolerance, of programs used once
 
 
@@ -86,28 +84,24 @@ def test_gradients_equal_the_reference_in_float64():
         assert cosine > 0.99999, jax.tree_util.keystr(path)
 
 
-def loss_of(renderer, **options):
-    def loss(scene):
-        out = renderer(*scene, effects=Effects(background=(0.2, 0.5, 0.9)), **options)
-        return jnp.sum((out.color - 0.3) ** 2) + 0.1 * jnp.sum(out.depth**2) + jnp.sum(out.alpha**2)
-
-    return loss
-
-
 @plainly
 def test_second_derivatives_equal_the_reference_in_float64():
     """The product of the Hessian with a vector, in float32, of every row of the scene and of the cameras."""
     scene, random = (cloud(20, degree=1), cameras(12, 10, batch=2)), np.random.default_rng(0)
     directions = jax.tree.map(lambda x: random.normal(size=x.shape), scene)
 
-    def product(loss, scene):
+    def product(renderer, scene, **options):
+        def loss(scene):
+            out = renderer(*scene, effects=Effects(background=(0.2, 0.5, 0.9)), **options)
+            return jnp.sum((out.color - 0.3) ** 2) + 0.1 * jnp.sum(out.depth**2) + jnp.sum(out.alpha**2)
+
         along = jax.tree.map(lambda x, d: jnp.asarray(d, x.dtype), scene, directions)
         return jax.jit(lambda s, d: jax.jvp(jax.grad(loss), (s,), (d,))[1])(scene, along)
 
-    got = product(loss_of(render, max_pairs=1 << 12), scene)
+    got = product(render, scene, max_pairs=1 << 12)
     with jax.enable_x64(True):
         doubles = jax.tree.map(lambda x: x.astype(jnp.float64), scene)
-        wanted = jax.tree.map(np.asarray, product(loss_of(render_reference), doubles))
+        wanted = jax.tree.map(np.asarray, product(render_reference, doubles))
     for (path, a), b in zip(jax.tree_util.tree_leaves_with_path(got), jax.tree.leaves(wanted), strict=True):
         a = np.asarray(a, np.float64)
         assert np.linalg.norm(a - b) < 1e-3 * np.linalg.norm(b), jax.tree_util.keystr(path)
@@ -138,15 +132,6 @@ def test_an_image_does_not_depend_on_the_unit_of_the_scene():
         np.testing.assert_allclose(out.depth, unit * wanted.depth, atol=1e-3 * unit)
 
 
-def test_a_batch_equals_its_cameras_one_by_one(scene):
-    gaussians, camera = cloud(degree=3), cameras(21, 30, batch=2)
-    together = render(gaussians, camera, effects=ALL, max_pairs=1 << 12)
-    for i in range(2):
-        alone = render(gaussians, camera[i], effects=ALL, max_pairs=1 << 12)
-        np.testing.assert_allclose(together.color[i], alone.color, atol=1e-6)
-        np.testing.assert_array_equal(together.median_depth[i], alone.median_depth)
-
-
 def test_overflow_is_counted_inside_jit_and_retried_outside(scene):
     wanted = render(*scene)
     assert int(wanted.num_overflow) == 0
@@ -155,22 +140,6 @@ def test_overflow_is_counted_inside_jit_and_retried_outside(scene):
     assert int(retried.num_overflow) == 0
     inside = jax.jit(lambda g: render(g, scene[1], max_pairs=64))(scene[0])
     assert int(inside.num_overflow) == int(wanted.num_pairs) - 64 > 0
-
-
-@plainly
-def test_pairs_are_counted_once_for_each_kind_of_render_and_nothing_is_left_out_for_it(monkeypatch):
-    counts, count = [], render_module._count
-    monkeypatch.setattr(render_module, "_CAPACITIES", {})
-    monkeypatch.setattr(render_module, "_count", lambda *given: counts.append(count(*given)) or counts[-1])
-    monkeypatch.setattr(render_module, "MIN_CAPACITY", 64)
-    small, camera = cloud(40, size=0.002), cameras(16, 24)
-    large = replace(small, scales=small.scales * 200)
-    wanted = render(large, camera, max_pairs=1 << 10)
-    assert int(render(small, camera).num_pairs) == counts[0] < 64 < int(wanted.num_pairs)
-    for _ in range(2):
-        again = render(large, camera)  # of the same kind, and it needs more room
-        assert len(counts) == 1 and int(again.num_overflow) == 0
-        np.testing.assert_array_equal(again.color, wanted.color)
 
 
 @plainly
@@ -203,21 +172,6 @@ def test_a_transform_that_hides_the_number_of_pairs_says_if_its_guess_was_too_lo
     jax.effects_barrier()
     (said,) = {str(w.message) for w in recwarn}
     assert f"max_pairs={1 << (counted - 1).bit_length()}" in said
-
-
-def test_ranks_are_promoted_whatever_the_caller_forbids(scene):
-    """`JAX_NUMPY_RANK_PROMOTION=raise` is for the caller's own code; forward, backward, with every effect."""
-    gaussians, camera = cloud(20, degree=1), cameras(13, 11)
-    arrays = {"captured": camera, "distortion": jnp.array([-0.2, 0.05, 0, 0, 0]), "exposures": jnp.eye(3, 4)}
-
-    def loss(gaussians, **arrays):
-        out = render(gaussians, camera, effects=ALL, max_pairs=1 << 12, **arrays)
-        return jnp.sum(fill_holes(out.color, out.alpha, jnp.ones(3)))
-
-    with jax.numpy_rank_promotion("raise"):
-        for given in ({}, arrays):
-            assert jax.eval_shape(jax.grad(loss), gaussians, **given).means.shape == (20, 3)
-        effects_for(gaussians, camera, captured=camera)
 
 
 @plainly

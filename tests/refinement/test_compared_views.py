@@ -13,6 +13,7 @@ from ssplat_jax.core.pytree import replace
 from ssplat_jax.rasterizer import render
 from ssplat_jax.refinement import KeyViews
 from ssplat_jax.refinement.compared_views import contradicting, next_view, only_usable
+from tests.rasterizer.scenes import balls
 from tests.refinement.test_refine import cameras
 
 NUM_VIEWS, MAX_PAIRS = 8, 1 << 14
@@ -28,14 +29,8 @@ def wall() -> Gaussians:
         random.uniform(0.05, 0.16, 3) * np.sin(np.add.outer(a * x + b * y, random.uniform(0, 6, 3)))
         for a, b in random.uniform(-6, 6, (8, 2))
     )
-    num = x.size
-    return Gaussians.from_rgb(
-        means=jnp.asarray(np.stack([x, y, z], -1).reshape(num, 3), jnp.float32),
-        quats=jnp.tile(jnp.array([1.0, 0, 0, 0]), (num, 1)),
-        scales=jnp.full((num, 3), 0.1),
-        opacities=jnp.full(num, 0.95),
-        colors=jnp.asarray(np.clip(0.5 + np.reshape(waves, (num, 3)), 0.05, 0.95), jnp.float32),
-    )
+    colors = np.clip(0.5 + np.reshape(waves, (x.size, 3)), 0.05, 0.95)
+    return balls(np.stack([x, y, z], axis=-1).reshape(-1, 3), 0.1, 0.95, colors)
 
 
 @functools.cache

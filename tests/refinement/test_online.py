@@ -17,7 +17,7 @@ from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.chunk import Chunk
 from ssplat_jax.core.errors import InputError
-from ssplat_jax.core.gaussians import SH_C0, Gaussians
+from ssplat_jax.core.gaussians import SH_C0
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.evaluation.metrics import psnr
 from ssplat_jax.model.compact import GaussianHead
@@ -34,6 +34,8 @@ from ssplat_jax.refinement.online import (
 )
 from ssplat_jax.storage.saved_states import load_state, save_state
 from ssplat_jax.streaming.session import Session
+from tests.model.small import chunk_of, side_by_side
+from tests.rasterizer.scenes import balls
 
 pytestmark = pytest.mark.usefixtures("compiled_plainly")
 
@@ -66,20 +68,11 @@ def wall_colors(points: np.ndarray) -> np.ndarray:
 
 def chunk(shifts=SHIFTS) -> Chunk:
     """Views of the wall z = DEPTH from cameras side by side that look along +z."""
-    viewmats = np.tile(np.eye(4, dtype=np.float32), (len(shifts), 1, 1))
-    viewmats[:, 0, 3] = -np.asarray(shifts)
-    K = np.array([[FOCAL, 0, WIDE / 2], [0, FOCAL, HIGH / 2], [0, 0, 1]], np.float32)
     columns, rows = np.meshgrid(np.arange(WIDE) + 0.5, np.arange(HIGH) + 0.5)
     points = np.stack([(columns - WIDE / 2) / FOCAL * DEPTH, (rows - HIGH / 2) / FOCAL * DEPTH], axis=-1)
     images = [wall_colors(points + np.array([shift, 0.0])) for shift in shifts]
-    return Chunk(
-        images=jnp.asarray(np.stack(images), jnp.float32),
-        viewmats=jnp.asarray(viewmats),
-        Ks=jnp.asarray(np.tile(K, (len(shifts), 1, 1))),
-        valid=jnp.ones(len(shifts), bool),
-        near=jnp.float32(1.0),
-        far=jnp.float32(4.0),
-    )
+    K = [[FOCAL, 0, WIDE / 2], [0, FOCAL, HIGH / 2], [0, 0, 1]]
+    return chunk_of(np.stack(images), side_by_side(shifts), K, near=1.0, far=4.0)
 
 
 def summary(exposures=None) -> ChunkOutput:
@@ -282,13 +275,7 @@ def test_a_session_refuses_half_of_a_request():
 
 def test_a_gaussian_follows_the_mean_of_its_views():
     """Two photographs of one place disagree: the color stays near their mean, whichever was shown last."""
-    base = Gaussians.from_rgb(
-        means=jnp.array([[0.0, 0.0, 2.0]]),
-        quats=jnp.array([[1.0, 0, 0, 0]]),
-        scales=jnp.full((1, 3), 4.0),
-        opacities=jnp.array([0.98]),
-        colors=jnp.full((1, 3), 0.3),
-    )
+    base = balls([[0.0, 0.0, 2.0]], 4.0, 0.98, 0.3)
     K = jnp.array([[FOCAL, 0, WIDE / 2], [0, FOCAL, HIGH / 2], [0, 0, 1]])
     images = jnp.stack([jnp.full((HIGH, WIDE, 3), value) for value in (0.3, 0.7)])
     views = KeyViews.of(Camera(viewmats=jnp.tile(jnp.eye(4), (2, 1, 1)), Ks=jnp.tile(K, (2, 1, 1)), width=WIDE,

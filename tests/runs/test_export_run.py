@@ -20,6 +20,7 @@ from ssplat_jax.scene_files.formats import file_axes, save_ply
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.streaming.feed import middle_exposure
 from tests.commands.command_fixture import run
+from tests.rasterizer.scenes import balls
 from tests.scene_files.scene_fixture import camera, scene
 
 
@@ -87,12 +88,6 @@ def test_up_points_along_an_axis_of_the_file(tmp_path, suffix):
     assert np.sqrt(np.mean((np.asarray(after.color) - np.asarray(before.color)) ** 2)) < 0.03
 
 
-def test_up_without_cameras_is_refused(tmp_path, capsys):
-    save_ply(tmp_path / "scene.ply", scene(0))
-    assert run("export", tmp_path / "scene.ply", "--to", tmp_path / "a.glb", "--up", "y") == 2
-    assert "--up: wanted cameras" in capsys.readouterr().err and not (tmp_path / "a.glb").exists()
-
-
 def test_a_sog_holds_the_camera_to_start_with(tmp_path):
     pose = np.eye(4)
     pose[:3, 3] = [0.5, 0.0, -1.0]
@@ -109,13 +104,7 @@ def test_an_export_says_how_a_plain_renderer_shows_the_file(tmp_path):
     x, y = np.meshgrid(np.linspace(-1.6, 1.6, 60), np.linspace(-1.1, 1.1, 40))
     means = np.stack([x.ravel(), y.ravel(), np.full(x.size, 2.0)], axis=1)
     means = means[np.hypot(means[:, 0], means[:, 1]) > 0.5]
-    wall = ss.Gaussians.from_rgb(
-        means=jnp.asarray(means, jnp.float32),
-        quats=jnp.tile(jnp.array([1.0, 0, 0, 0]), (len(means), 1)),
-        scales=jnp.full((len(means), 3), 0.04),
-        opacities=jnp.full(len(means), 0.99),
-        colors=jnp.full((len(means), 3), 0.4),
-    )
+    wall = balls(means, 0.04, 0.99, 0.4)
     views = views_from(np.tile(np.eye(4), (3, 1, 1)), np.array([[1.0] * 3, [2.0] * 3, [1.0] * 3]))
     _, turn = export_scene(wall, tmp_path / "a.ply", views)
     words = difference_in_words(tmp_path / "a.ply", views, turn)

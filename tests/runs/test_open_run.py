@@ -107,17 +107,10 @@ def moved(capture, indices, advance=None):
 
 
 @contextlib.contextmanager
-def adjustment():
-    """Poses are adjusted by `moved`."""
+def adjustment(is_found=True):
+    """Poses are adjusted by `moved`, or must not be."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(adjusting, "adjust_poses", moved)
-        yield
-
-
-@contextlib.contextmanager
-def no_adjustment():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(adjusting, "adjust_poses", None)
+        patch.setattr(adjusting, "adjust_poses", moved if is_found else None)
         yield
 
 
@@ -131,7 +124,7 @@ def adjusted(capture, tmp_path):
 
 def test_all_that_follows_sees_the_adjusted_poses(adjusted, capture, capsys):
     wanted = moved(capture, range(8)).capture.camtoworlds
-    with no_adjustment(), opened(capture, adjusted, revise="poses") as run:
+    with adjustment(is_found=False), opened(capture, adjusted, revise="poses") as run:
         np.testing.assert_array_equal(run.capture.camtoworlds, wanted)
     with pytest.raises(InputError, match="differs in its poses"), opened(capture, adjusted):
         pass
@@ -179,7 +172,7 @@ def test_files_of_others_are_neither_records_nor_deltas(tmp_path):
 def test_a_run_that_began_with_given_poses_takes_no_adjusted_ones(capture, tmp_path):
     folder = RunFolder(tmp_path)
     folder.state.write_bytes(b"of a run that began without")
-    with no_adjustment(), pytest.raises(InputError, match="--revise poses: wanted a run that began with it"):
+    with adjustment(is_found=False), pytest.raises(InputError, match="--revise poses: wanted a run that began with it"):
         capture_to_stream(capture, range(4), "poses", folder, QUIET)
     assert capture_to_stream(capture, range(4), None, folder, QUIET) is capture
 

@@ -166,7 +166,7 @@ def test_files_cut_off_or_damaged_are_refused(tmp_path, suffix):
     if suffix in WRITERS:
         save_gaussians(good, scene_for(n=12))
     data, rng = good.read_bytes(), random.Random(1)
-    damaged = [data[:size] for size in np.linspace(0, len(data) - 1, 20).astype(int)]
+    damaged = [bytearray(data[:size]) for size in np.linspace(0, len(data) - 1, 20).astype(int)]
     for _ in range(10 if suffix in (".spz", ".sog") else 0):  # gzip and zip hold checksums
         damaged.append(bytearray(data))
         damaged[-1][rng.randrange(len(data) // 4, len(data) // 2)] ^= 1 << rng.randrange(8)

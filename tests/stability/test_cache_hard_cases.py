@@ -52,16 +52,6 @@ def test_accepted_omega_0_is_averaged_evenly_and_invisible_and_omega_1_decides_a
     assert cache.confidences[0, 0] == 1
 
 
-@pytest.mark.parametrize("feats", [0.0, 1.0, 1e-30, 1e30], ids=["zero", "identical", "1e-30", "1e30"])
-def test_features_without_a_closest_pair_merge_the_first_two(feats):
-    """Zero features, and norms whose squares leave float32, count as orthogonal; identical ones are all ties."""
-    cache = fused(tokens_at(IN_A_VOXEL, feats=feats))
-    assert int(cache.stats.num_merged) == 1
-    np.testing.assert_allclose(cache.means[0, 0], np.mean(IN_A_VOXEL[:2], axis=0), atol=1e-7)
-    np.testing.assert_array_equal(cache.means[0, 1], np.float32(IN_A_VOXEL[2]))
-    np.testing.assert_allclose(cache.feats[0], np.full((2, streams.WIDTH), feats), rtol=1e-6)
-
-
 # Pivots on the axis of the front camera, and the depth and confidence that are read at their pixel.
 SEEN = {
     "omega 1": ([[0, 0, 2.0]], [1.0], (2.0, 1.0)),
@@ -86,13 +76,6 @@ def test_hard_projection(name):
     if wanted is not None:
         assert np.argwhere(np.asarray(seen.mask)).tolist() == [[0, 3, 4]]
         np.testing.assert_allclose((seen.depths[0, 3, 4], seen.confidences[0, 3, 4]), wanted, rtol=1e-4)
-
-
-def test_carved_pivots_occlude_nothing_in_the_projection():
-    cache = with_pivots([[0.0, 0.0, 1.0], [0.0, 0.0, 2.0]], [0.02, 0.9])
-    carved, kept = project(cache, front_camera(), CACHE), reading()(cache, front_camera())
-    depths = [float(np.max(np.asarray(seen.depths))) for seen in (carved, kept)]
-    np.testing.assert_allclose(depths, [2.0, 1.0], rtol=1e-5)
 
 
 def test_a_camera_far_from_the_origin_stays_finite():

@@ -1,4 +1,4 @@
-"""Hard cases of HPDA: one small program per configuration.
+"""HPDA: hard cases, one small program per configuration, and how depth and confidence are read.
 
 Values and gradients must be finite, distributions nonnegative with sum 1, and limits reached where they exist.
 """
@@ -12,7 +12,7 @@ import pytest
 
 from ssplat_jax.core.numerics import softplus_inverse
 from ssplat_jax.core.pytree import replace
-from ssplat_jax.model.hpda import anchor_depth
+from ssplat_jax.model.hpda import anchor_depth, expected_log_depth, peak_confidence
 from ssplat_jax.model.views import DepthDistribution, prepare_views
 from tests.model.small import CONFIG, chunk, finite, history
 
@@ -185,3 +185,18 @@ def test_gradient_of_gamma_equals_finite_differences():
         (_, _), gradients = program(given["logits"], jnp.float32(raw), CANDIDATES, past)
         assert slope != 0
         assert float(gradients[1]) == pytest.approx(slope, rel=2e-2, abs=1e-5)
+
+
+@pytest.mark.parametrize(("readout", "half_width"), [("metric", 0), ("mean", 0), ("window", 1)])
+def test_confidence_is_the_peak_or_the_largest_mass_of_neighbors(readout, half_width):
+    probs = np.random.default_rng(3).dirichlet(np.ones(D), SHAPE)
+    sums = [probs[..., max(0, i - half_width) : i + half_width + 1].sum(-1) for i in range(D)]
+    got = peak_confidence(jnp.asarray(probs, jnp.float32), CONFIG.replace(depth_readout=readout))
+    np.testing.assert_allclose(got, np.max(sums, axis=0), atol=FLOAT32)
+
+
+def test_window_readout_does_not_mix_two_surfaces():
+    probs = jnp.zeros((1, D)).at[0, 2].set(0.55).at[0, 9].set(0.45)
+    window, mean = (expected_log_depth(probs, CANDIDATES, config) for config in (WINDOW, MEAN))
+    np.testing.assert_allclose(window, CANDIDATES[2], atol=FLOAT32)
+    np.testing.assert_allclose(mean, 0.55 * CANDIDATES[2] + 0.45 * CANDIDATES[9], atol=FLOAT32)

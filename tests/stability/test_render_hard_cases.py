@@ -18,6 +18,7 @@ from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.rasterizer import Effects, render
 from ssplat_jax.rasterizer.outputs import apply_exposures
+from tests.model.small import finite
 from tests.rasterizer import oracle
 
 NUM, CROWD, WIDTH, HEIGHT = 64, 4096, 24, 16
@@ -200,18 +201,14 @@ def build(arrays: dict[str, np.ndarray]) -> tuple[Gaussians, Camera]:
     return gaussians, Camera(viewmats=view, Ks=K, width=WIDTH, height=HEIGHT)
 
 
-def is_finite(tree) -> bool:
-    return all(bool(np.all(np.isfinite(x))) for x in jax.tree.leaves(tree))
-
-
 def check(change: Callable[[dict], None], num: int = NUM, max_pairs: int = 1 << 12, *, has_limit: bool = True):
     """Renders a case: finite, with the right image where it has a limit. Gives the arrays, the output and gradients."""
     arrays = base(num)
     change(arrays)
     gaussians, camera = build(arrays)
     (value, out), grads = program(max_pairs=max_pairs)(gaussians, camera)
-    assert is_finite((value, out)), "value"
-    assert is_finite(grads), "gradient"
+    assert finite((value, out)), "value"
+    assert finite(grads), "gradient"
     if has_limit:
         assert_right(gaussians, camera, out)
     return arrays, out, grads
@@ -272,7 +269,7 @@ def test_ten_thousand_extremes_have_no_non_finite_gradient(has_every_effect):
         gaussians, camera = build(arrays)
         given = ARRAYS | {"captured": camera} if has_every_effect else {}
         (value, out), grads = program(effects)(gaussians, camera, **given)
-        bad += not is_finite((value, out, grads))
+        bad += not finite((value, out, grads))
     assert bad == 0
 
 
@@ -289,6 +286,6 @@ def test_an_exposure_that_is_not_finite_corrects_nothing(bad):
 def test_an_image_of_one_pixel():
     gaussians, camera = build(base())
     out = render(gaussians, replace(camera, width=1, height=1), effects=EFFECTS, max_pairs=1 << 12)
-    assert out.color.shape == (1, 1, 3) and is_finite(out)
+    assert out.color.shape == (1, 1, 3) and finite(out)
     wanted = oracle.render(gaussians, camera.viewmats, camera.Ks, 1, 1)
     np.testing.assert_allclose(out.color, wanted[0], atol=TOLERANCE)

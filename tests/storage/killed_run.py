@@ -56,27 +56,21 @@ def die_at(file: str, step: str, count: int, delay: float) -> None:
     sys.addaudithook(watch)
 
 
-def note_chunks(notes: str) -> None:
-    """Appends a line to `notes` for every processed chunk, unbuffered because a killed process does not flush."""
+def main(notes: str, moment: str, *arguments: str) -> None:
+    from ssplat_jax.commands.main import main
     from ssplat_jax.streaming.session import Session
 
     feed, descriptor = Session.feed, os.open(notes, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
 
     def noted(session, chunk):
         out = feed(session, chunk)
-        os.write(descriptor, f"{int(session.cache.stats.num_chunks)}\n".encode())
+        os.write(descriptor, f"{int(session.cache.stats.num_chunks)}\n".encode())  # a killed process flushes nothing
         return out
 
     Session.feed = noted
-
-
-def main(notes: str, moment: str, *arguments: str) -> None:
-    note_chunks(notes)
     if moment != "-":
         file, step, count, delay = moment.split(",")
         die_at(file, step, int(count), float(delay))
-    from ssplat_jax.commands.main import main
-
     main(list(arguments))
 
 

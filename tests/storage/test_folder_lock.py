@@ -11,10 +11,7 @@ from ssplat_jax.storage.run_folder import lock_folder, remove_numbered
 
 
 def test_an_unwritable_folder_is_refused_immediately():
-    with (
-        pytest.raises(StorageError, match="cannot be written"),
-        lock_folder(Path("/proc")),
-    ):  # not even for root
+    with pytest.raises(StorageError, match="cannot be written"), lock_folder(Path("/proc")):  # not even for root
         pass
 
 
@@ -24,11 +21,6 @@ def test_only_numbered_files_are_removed(tmp_path):
         (tmp_path / name).touch()
     remove_numbered(tmp_path, "#####.png")
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(kept)
-    for path in tmp_path.iterdir():
-        path.unlink()
-    remove_numbered(tmp_path, "#####.png")
-    assert not tmp_path.exists()
-    remove_numbered(tmp_path, "#####.png")
 
 
 def test_the_lock_ends_with_a_killed_process(tmp_path):

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 import pytest
 
-from ssplat_jax.cache import Tokens, fuse, init_cache
+from ssplat_jax.cache import fuse, init_cache
 from ssplat_jax.core import kept_programs
 from ssplat_jax.core.kept_programs import SWITCH, Kept
 from ssplat_jax.core.numerics import safe_sqrt
@@ -20,26 +20,15 @@ from ssplat_jax.data.procedural import procedural_views
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.streaming.feed import feed_capture
 from ssplat_jax.streaming.session import Session
+from tests.cache.streams import CONFIG, Recipe, to_jax
 from tests.streaming.narrow_model import NARROW, assert_same_bits
-
-CONFIG = NARROW.replace(capacity=1024)
 
 PROCESS = "from tests.storage.test_kept_programs import fused_twice; print(*fused_twice())"
 
 
 def fused_twice() -> tuple[str, int]:
     """Digest of a cache after a chunk that came twice, its buffers donated, and the number of programs compiled."""
-    r, n = np.random.default_rng(0), 512
-    f = lambda *shape: jax.numpy.asarray(r.uniform(0.1, 1, (n, *shape)), "float32")  # noqa: E731
-    tokens = Tokens(
-        means=f(3),
-        feats=f(CONFIG.network.token_width),
-        confidences=f(),
-        rgbs=f(3 * CONFIG.head.gaussians_per_token),
-        quats=f(4),
-        footprints=f(),
-        valid=jax.numpy.ones(n, bool),
-    )
+    tokens = to_jax(Recipe(0, "few", "normal", "random").tokens())
     compiled, anew = [], kept_programs._compiled_anew
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(kept_programs, "_compiled_anew", lambda lowered: compiled.append(0) or anew(lowered))

@@ -95,26 +95,24 @@ def test_pushed_views_give_what_the_causal_stream_gives(capture, start):
     assert live.cache_facts()["num_seen"] == driver.cache_facts()["num_seen"]
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ({"image": np.zeros((32, 48, 4), np.float32)}, "RGB"),
-        ({"image": np.full((32, 48, 3), 200.0)}, r"\[0, 1\]"),
-        ({"image": np.full((32, 48, 3), np.nan)}, r"\[0, 1\]"),
-        ({"image": np.zeros((16, 48, 3), np.float32)}, "48x32 as the first"),
-        ({"K": np.eye(3)}, "pixels"),
-        ({"K": np.ones((3, 3))}, "skew"),
-        ({"viewmat": np.diag([2.0, 2.0, 2.0, 1.0])}, "viewmat.*rotation"),
-        ({"seen": np.ones((48, 32), bool)}, r"seen: wanted bool \[32, 48\]"),
-        ({"seen": np.ones((32, 48))}, "seen"),
-    ],
+UNUSABLE = (
+    ({"image": np.zeros((32, 48, 4), np.float32)}, "RGB"),
+    ({"image": np.full((32, 48, 3), 200.0)}, r"\[0, 1\]"),
+    ({"image": np.full((32, 48, 3), np.nan)}, r"\[0, 1\]"),
+    ({"image": np.zeros((16, 48, 3), np.float32)}, "48x32 as the first"),
+    ({"K": np.eye(3)}, "pixels"),
+    ({"K": np.ones((3, 3))}, "skew"),
+    ({"viewmat": np.diag([2.0, 2.0, 2.0, 1.0])}, "viewmat.*rotation"),
+    ({"seen": np.ones((48, 32), bool)}, "seen"),
 )
-def test_unusable_views_are_refused_and_do_not_count(change, words, capture, start):
-    session = start()
-    view = {"image": capture.image(0), "K": capture.K(0), "viewmat": np.eye(4)}
+
+
+def test_unusable_views_are_refused_and_do_not_count(capture, start):
+    session, view = start(), {"image": capture.image(0), "K": capture.K(0), "viewmat": np.eye(4)}
     session.push(**view)
-    with pytest.raises(InputError, match=words):
-        session.push(**view | change)
+    for change, words in UNUSABLE:
+        with pytest.raises(InputError, match=words):
+            session.push(**view | change)
     assert int(session._live.rest().valid.sum()) == 1
 
 

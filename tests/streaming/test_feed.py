@@ -44,17 +44,6 @@ def test_chunks_carry_their_own_frames_and_exposures(session, capture):
     assert list(feed_chunks(session, capture, [], frame)) == []
 
 
-def test_chunks_without_an_order_are_those_of_the_stream_order_and_a_given_order_stays(capture):
-    config = StreamConfig()
-    frame = capture.stream_frame(config)
-    order = capture.stream_order(config, None, frame)
-    for given, wanted in ((None, order), (order, order), (order[::-1], order[::-1])):
-        images = np.concatenate(
-            [np.asarray(chunk.images) for chunk in capture.chunks(config, given, stream_frame=frame)]
-        )
-        np.testing.assert_array_equal(images[:7], np.stack([capture.image(i) for i in wanted]))
-
-
 @pytest.mark.parametrize(("num_recent", "num_kept"), [(0, 0), (1, 1)])
 def test_feeding_a_capture_returns_the_last_chunks(session, capture, num_recent, num_kept):
     indices, progress = [0, 1, 2, 3, 4, 6], []

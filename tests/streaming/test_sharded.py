@@ -163,6 +163,3 @@ def test_streams_together_equal_each_stream_alone(tmp_path):
         np.testing.assert_allclose(opacities.sum(), model.decode(params, cache).opacities.sum(), rtol=STEP_RTOL)
         for i, shard in enumerate(shards):
             assert_same_bits(part(grown, stream, i), grow(jax.tree.map(jnp.asarray, shard), capacity))
-
-
-# Meshes ---------------------------------------------------------------------------------------------------------------

@@ -87,8 +87,3 @@ STREAM_PHASE = Phase(
 def flat(tree) -> list[np.ndarray]:
     """The leaves of a tree."""
     return [np.asarray(x) for x in jax.tree.leaves(tree)]
-
-
-def assert_equal(tree, other):
-    """All leaves are equal to the bit."""
-    jax.tree.map(lambda a, b: np.testing.assert_array_equal(np.asarray(a), np.asarray(b)), tree, other)

@@ -8,10 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ssplat_jax.cache import Tokens
+from ssplat_jax.cache import init_cache
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.chunk import Chunk
-from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.evaluation.metrics import LpipsWeights
 from ssplat_jax.model.streamsplat import StreamSplat
@@ -31,9 +30,13 @@ from ssplat_jax.training.losses import (
 )
 from ssplat_jax.training.recipe import RECIPES
 from ssplat_jax.training.samples import Sample
+from tests.cache import streams
+from tests.cache.projection_scenes import front_camera
+from tests.cache.test_votes import after_chunk, seen
 from tests.model.small import random_params
 from tests.rasterizer.scenes import cloud
 from tests.streaming.narrow_model import NARROW
+from tests.streaming.test_scene_delta import decoder_params
 from tests.training.problems import NARROW_DEPTH, STREAM_PHASE
 
 WIDTH = DepthLoss.target_width
@@ -109,7 +112,7 @@ def test_the_paper_loss_of_a_scene_sums_mse_and_lpips_of_its_targets_over_black(
     targets = 0.5 * colors + 0.1 * rng.uniform(size=colors.shape)
     sample = sample_of(jnp.zeros((1, 4, 2, 2)), jnp.asarray(targets, jnp.float32), cameras, is_photographed=True)
     loss = dataclasses.replace(phase.loss, max_pairs=1 << 12)
-    value = loss.weight * loss.of_scene(gaussians, sample, LpipsWeights((), (), ()))[0]
+    value = loss.weight * jax.jit(loss.of_scene)(gaussians, sample, LpipsWeights((), (), ()))[0]
     errors = [((c - t) ** 2).mean() + 0.05 * 3.0 * np.abs(c - t).max() for c, t in zip(colors, targets, strict=True)]
     assert float(value) == pytest.approx(sum(errors), rel=2e-3)  # tiles cut faint rims
     assert (loss.depth_weight, loss.tokens, phase.samples.batch, phase.samples.num_targets) == (0, "all", 1, 4)
@@ -126,8 +129,9 @@ def test_the_loss_of_a_crop_is_its_psnr_less_what_lpips_costs_filled_and_over_bl
     target = image.astype(np.float64) / 255
     psnrs = [-10 * np.log10(((x - target) ** 2).mean() + losses.MIN_MSE) for x in (0.25, 0.0)]
     costs = [20.0 * 3.0 * np.abs(x - target).max() for x in (0.25, 0.0)]
+    loss = jax.jit(functools.partial(CropLoss(black_weight=0.4, lpips_weight=20.0), model))
     for weights, times in ((None, 0), (LpipsWeights((), (), ()), 1)):
-        value, metrics = CropLoss(black_weight=0.4, lpips_weight=20.0)(model, params, (crop,), weights)
+        value, metrics = loss(params, (crop,), weights)
         wanted = sum(share * (times * cost - x) for share, cost, x in zip((0.6, 0.4), costs, psnrs, strict=True))
         assert float(value) == pytest.approx(wanted, rel=1e-5) and ("lpips" in metrics) == bool(times)
         assert float(metrics["psnr_over_black"]) == pytest.approx(psnrs[1], rel=1e-5)
@@ -135,27 +139,24 @@ def test_the_loss_of_a_crop_is_its_psnr_less_what_lpips_costs_filled_and_over_bl
 
 def test_masked_pixels_of_a_target_have_neither_value_nor_gradient():
     rng = np.random.default_rng(4)
-    gaussians = Gaussians.from_rgb(
-        means=jnp.asarray(rng.uniform((-1, -1, 2), (1, 1, 4), (9, 3)), jnp.float32),
-        quats=jnp.asarray(rng.normal(size=(9, 4)), jnp.float32),
-        scales=jnp.full((9, 3), 0.3),
-        opacities=jnp.full(9, 0.7),
-        colors=jnp.asarray(rng.uniform(size=(9, 3)), jnp.float32),
-    )
+    gaussians = cloud(9, degree=0, size=0.3)
     cameras = Camera(jnp.eye(4)[None], jnp.array([[[10.0, 0, 8], [0, 10, 6], [0, 0, 1]]]), 16, 12)
     targets = jnp.asarray(rng.uniform(size=(1, 12, 16, 3)), jnp.float32)
     seen = jnp.ones((1, 12, 16), bool).at[:, :, :8].set(False)
     loss = RenderingLoss(max_pairs=1 << 12)
 
+    @jax.jit
+    @jax.value_and_grad
     def of(gaussians, targets, seen):
         sample = sample_of(jnp.zeros((1, 4, 2, 2)), targets, cameras, is_photographed=True)
         return loss.of_scene(gaussians, replace(sample, target_seen=seen))[0]
 
-    value, gradient = jax.value_and_grad(of)(gaussians, targets, seen)
-    other = jax.value_and_grad(of)(gaussians, jnp.where(seen[..., None], targets, 1 - targets), seen)
+    value, gradient = of(gaussians, targets, seen)
+    other = of(gaussians, jnp.where(seen[..., None], targets, 1 - targets), seen)
     assert value == other[0] > 0 and jax.tree.all(jax.tree.map(np.array_equal, gradient, other[1]))
-    assert of(gaussians, targets, None) == pytest.approx(float(of(gaussians, targets, seen | True)), rel=1e-6)
-    assert of(gaussians, targets, seen & False) == 0.0
+    everything, without = of(gaussians, targets, seen | True)[0], of(gaussians, targets, None)[0]
+    assert without == pytest.approx(float(everything), rel=1e-6)
+    assert of(gaussians, targets, seen & False)[0] == 0.0
 
 
 def test_fitted_gains_undo_exposures_and_stay_bounded():
@@ -173,31 +174,13 @@ def test_fitted_gains_undo_exposures_and_stay_bounded():
 
 
 def test_tokens_that_a_stored_view_looked_through_are_not_rendered():
-    config = NARROW.replace(min_confidence=0.5, gaussians_per_token=4, detail=False)
-    model = StreamSplat(config)
-    params, cache = random_params(NARROW), model.init_cache()
-    side = cache.stored_depths.weights.shape[-1]
-    # One view at the origin saw a wall at depth 2.
-    stored = replace(
-        cache.stored_depths,
-        viewmats=cache.stored_depths.viewmats.at[0].set(jnp.eye(4)),
-        Ks=cache.stored_depths.Ks.at[0].set(jnp.array([[side, 0, side / 2], [0, side, side / 2], [0, 0, 1.0]])),
-        log_depths=cache.stored_depths.log_depths.at[0].set(np.log(2.0)),
-        weights=cache.stored_depths.weights.at[0].set(1.0),
-    )
-    depths = jnp.array([1.0, 2.0, 3.0, 2.0])  # a floater, the wall, a hidden token, one of low confidence
-    tokens = Tokens(
-        means=jnp.array([[0.01, 0.01, 1.0]]) * depths[:, None],
-        feats=jnp.ones((4, NARROW.network.token_width)),
-        confidences=jnp.array([0.6, 0.6, 0.6, 0.2]),
-        rgbs=jnp.full((4, 12), 0.5),
-        quats=jnp.tile(jnp.array([1.0, 0, 0, 0]), (4, 1)),
-        footprints=jnp.full(4, 0.02),
-        valid=jnp.ones(4, bool),
-    )
-    accepted = jax.jit(functools.partial(decode_accepted, model))
-    shown = accepted(params, replace(cache, stored_depths=stored), tokens).opacities > 0
-    np.testing.assert_array_equal(shown.reshape(4, -1).T, [[False, True, True, False]] * 4)
+    """A floater before the wall that a view saw, the wall, a hidden token, and one of low confidence."""
+    config = streams.CONFIG.replace(detail=False)
+    cache = after_chunk(init_cache(config, streams.CAPACITY), front_camera(), seen(2.0))
+    tokens = streams.tokens_at([[0, 0, 1.0], [0, 0, 2.0], [0, 0, 3.0], [0, 0, 2.0]], jnp.array([0.6, 0.6, 0.6, 0.2]))
+    accepted = jax.jit(functools.partial(decode_accepted, StreamSplat(config)))
+    shown = np.asarray(accepted(decoder_params(config), cache, tokens).opacities > 0).reshape(4, -1)
+    np.testing.assert_array_equal(shown, np.broadcast_to([[False], [True], [True], [False]], shown.shape))
 
 
 @pytest.mark.parametrize("loss", [NARROW_DEPTH, STREAM_PHASE.loss], ids=["depth", "rendering"])

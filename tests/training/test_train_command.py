@@ -22,8 +22,8 @@ from ssplat_jax.training import crops, loop, recipe
 from ssplat_jax.training.crops import Crops
 from ssplat_jax.training.recipe import EVIDENCE_RECIPE
 from tests.model.small import random_params
-from tests.streaming.narrow_model import NARROW
-from tests.training.problems import assert_equal, flat
+from tests.streaming.narrow_model import NARROW, assert_same_bits
+from tests.training.problems import flat
 
 SHIPPED = Path(str(resources.files("ssplat_jax") / "weights" / "tiny.npz"))
 CROPS = Crops(procedural=("procedural:room?frames=12",), width=64, size=(32, 48))
@@ -140,13 +140,13 @@ def test_the_command_starts_stages_that_the_weights_lack_at_random(tmp_path, sta
     assert "tiny.npz gives no cgfi: random at the start" in capsys.readouterr().err  # the mixer has no blocks here
     untrained, shipped = init_params(jax.random.key(3), started["config"], ["cgfi"]), load_params("tiny")
     for name, stage in started["params"].items():
-        assert_equal(stage, (untrained if name == "cgfi" else shipped)[name])
+        assert_same_bits(stage, (untrained if name == "cgfi" else shipped)[name])
 
 
 def test_the_head_that_the_weights_have_does_not_matter(tmp_path, started):
     noise = jax.tree.map(lambda x: jnp.asarray(x) + 1.0, load_params("tiny"))
     save_weights(tmp_path / "w.npz", noise, preset("tiny"), {})
     Train(out=tmp_path, recipe="evidence", init_weights=tmp_path / "w.npz", seed=5).run()
-    assert_equal(
+    assert_same_bits(
         started["params"]["evidence"], init_params(jax.random.key(5), preset("tiny"), ["evidence"])["evidence"]
     )
