@@ -8,7 +8,6 @@ nothing but the rendered image, its alpha and the scene's mean color.
 
 import dataclasses
 import math
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -244,7 +243,7 @@ def evaluate(
         streamed: the same capture at the size that is streamed; by default `capture`.
         lpips_weights: with them LPIPS is scored too; without, the fields `lpips` are null.
         refine_steps: refinement steps on the context views before the targets are scored. With them the metrics have a
-            block `refinement`: the steps done, their seconds, and the scores before.
+            block `refinement`: the report of the refinement, and the scores before.
         revise: `poses` adjusts those of the context before it is streamed (`poses.adjust_poses`); targets keep theirs.
         scene: name in `index.json`; by default the capture's.
 
@@ -291,9 +290,19 @@ def evaluate(
     gaussians, refinement = session.gaussians(), {}
     if refine_steps:
         before = score_targets(gaussians, capture, split.targets, stream_frame, exposures, lpips_weights)
-        gaussians, done = _refine(gaussians, streamed, split.context, stream_frame, exposures, refine_steps, reporter)
+        with reporter.progress("refining", refine_steps) as advance:
+            gaussians, report = refine_on_capture(
+                gaussians,
+                streamed,
+                split.context,
+                stream_frame,
+                exposures,
+                steps=refine_steps,
+                on_step=lambda step, loss: advance(step, f"loss {loss:.4f}"),
+            )
         cost["num_gaussians"] = int((gaussians.opacities > 0).sum())
-        refinement = {"refinement": {**done, "before": before}}
+        done = {name: value for name, value in vars(report).items() if name not in ("losses", "held_back")}
+        refinement = {"refinement": done | {"before": before}}
     middle = capture.camera(split.targets[len(split.targets) // 2], stream_frame)
     cost["peak_memory_bytes"] = peak_memory(session, middle)["peak_memory_bytes"]
     scores = []
@@ -326,23 +335,3 @@ def evaluate(
     write_json(folder.index, index_to_json({scene or capture.name: split}))
     write_json(folder.metrics, metrics)
     return metrics
-
-
-def _refine(
-    gaussians: Gaussians,
-    streamed: Capture,
-    context: Sequence[int],
-    stream_frame: StreamFrame,
-    exposures: Exposures,
-    steps: int,
-    reporter: Reporter,
-) -> tuple[Gaussians, dict]:
-    """The scene refined on its context views, and what that took."""
-    start = time.perf_counter()
-    with reporter.progress("refining", steps) as advance:
-        on_step = lambda step, loss: advance(step, f"loss {loss:.4f}")  # noqa: E731
-        refined, report = refine_on_capture(
-            gaussians, streamed, context, stream_frame, exposures, steps=steps, on_step=on_step
-        )
-    done = {name: value for name, value in vars(report).items() if name not in ("losses", "held_back")}
-    return refined, done | {"seconds": round(time.perf_counter() - start, 2)}
