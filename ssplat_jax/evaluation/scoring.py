@@ -225,7 +225,7 @@ def evaluate(
     streamed: Capture | None = None,
     lpips_weights: LpipsWeights | None = None,
     refine_steps: int = 0,
-    revise: str | None = None,
+    adjust_poses: bool = False,
     scene: str | None = None,
 ) -> dict:
     """Streams, scores and times; writes metrics, split, index and a picture per target into `out`.
@@ -244,7 +244,7 @@ def evaluate(
         lpips_weights: with them LPIPS is scored too; without, the fields `lpips` are null.
         refine_steps: refinement steps on the context views before the targets are scored. With them the metrics have a
             block `refinement`: the report of the refinement, and the scores before.
-        revise: `poses` adjusts those of the context before it is streamed (`poses.adjust_poses`); targets keep theirs.
+        adjust_poses: adjust the poses of the context to its images before it is streamed; targets keep theirs.
         scene: name in `index.json`; by default the capture's.
 
     Returns:
@@ -257,13 +257,13 @@ def evaluate(
     """
     folder, streamed, reporter = RunFolder(out), streamed or capture, reporter or Reporter(quiet=True)
     folder.check_no_run()
-    check_look_ahead(revise, is_causal=session.model.config.stream.causal)
+    check_look_ahead(is_asked=adjust_poses, is_causal=session.model.config.stream.causal)
     check_scorable(capture, with_lpips=lpips_weights is not None)
     capture.check_output_folder(out)
     capture.verify((*split.context, *split.targets))
     make_writable(out)  # before the long part
     folder.clear_targets()  # they may be of another split
-    adjusted = adjust_and_say(streamed, split.context, reporter) if revise else None
+    adjusted = adjust_and_say(streamed, split.context, reporter) if adjust_poses else None
     if adjusted is not None:  # poses of the context alone
         capture, streamed = (dataclasses.replace(x, frames=adjusted.capture.frames) for x in (capture, streamed))
     stream_frame = streamed.stream_frame(session.model.config, split.context)

@@ -99,15 +99,15 @@ def adjust_poses(
     )
 
 
-def check_look_ahead(revise: str | None, *, is_causal: bool) -> None:
+def check_look_ahead(*, is_asked: bool, is_causal: bool) -> None:
     """Checks that no causal stream is asked to adjust its poses, which looks at all frames.
 
     Raises:
         InputError: it is.
     """
-    if is_causal and revise:
+    if is_causal and is_asked:
         got, fix = "a causal one (--causal, or stream.causal=true)", "leave one out"
-        raise refusal(f"--revise {revise}", wanted="a stream that may look ahead", got=got, fix=fix)
+        raise refusal("--adjust-poses", wanted="a stream that may look ahead", got=got, fix=fix)
 
 
 def adjust_and_say(capture: Capture, indices: Sequence[int], reporter: Reporter) -> AdjustedPoses:

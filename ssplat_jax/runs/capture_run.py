@@ -60,7 +60,7 @@ def run_capture(model: StreamSplat, params: dict, options: RunOptions, reporter:
         StorageError: the folder cannot be written or its state is corrupt.
     """
     require_positive(**{x: getattr(options, x) for x in ("stride", "save_every", "max_views", "quiet_seconds")})
-    check_look_ahead(options.revise, is_causal=model.config.stream.causal)
+    check_look_ahead(is_asked=options.adjust_poses, is_causal=model.config.stream.causal)
     if not options.watch:
         with reporter.progress("opening", None, waiting=options.path, is_kept=False):
             source = WholeCapture(options)
@@ -73,7 +73,7 @@ def run_capture(model: StreamSplat, params: dict, options: RunOptions, reporter:
         if stopped := source.wait_for(max(num_saved, chunk_size)):
             return RunResult(num_saved, 0, stopped)
         indices = source.indices[: num_saved or chunk_size]
-    kept = {"revise": options.revise, "overwrite": options.overwrite}
+    kept = {"adjust_poses": options.adjust_poses, "overwrite": options.overwrite}
     with open_run(model, params, source.capture, indices, options.out, **kept, reporter=reporter) as run:
         num_before, width, height = run.num_views, run.capture.width, run.capture.height
         if options.size is None and width * height > LARGE:

@@ -57,7 +57,7 @@ def evaluate_run(model: StreamSplat, params: dict, options: EvalOptions, reporte
             streamed=capture.scaled(options.scale),
             lpips_weights=installed_lpips(),
             refine_steps=options.refine_steps,
-            revise=options.revise,
+            adjust_poses=options.adjust_poses,
             scene=scene,
         )
         report_eval(RunFolder(out), metrics)

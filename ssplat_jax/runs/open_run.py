@@ -127,7 +127,7 @@ def open_run(
     indices: Sequence[int],
     out: Path,
     *,
-    revise: str | None = None,
+    adjust_poses: bool = False,
     overwrite: bool = False,
     reporter: Reporter,
 ) -> Iterator[OpenRun]:
@@ -139,7 +139,7 @@ def open_run(
         capture: the capture to stream.
         indices: its frames to stream, ascending.
         out: folder of the run.
-        revise: `poses` adjusts the poses before the stream, see `capture_to_stream`.
+        adjust_poses: adjust the poses to the images before the stream, see `capture_to_stream`.
         overwrite: remove the run that `out` holds and start anew.
         reporter: shows progress and warnings.
 
@@ -153,7 +153,7 @@ def open_run(
     with lock_folder(out):
         if overwrite:
             folder.clear_run()
-        capture = capture_to_stream(capture, indices, revise, folder, reporter)
+        capture = capture_to_stream(capture, indices, folder, reporter, adjust_poses=adjust_poses)
         session = Session(model, params, refine=online_refinement(model))
         run = OpenRun(folder, session, capture, list(indices), params_digest(params))
         if folder.has_state():
@@ -286,22 +286,22 @@ def load_poses(folder: RunFolder) -> SavedPoses | None:
 
 
 def capture_to_stream(
-    capture: Capture, indices: Sequence[int], revise: str | None, folder: RunFolder, reporter: Reporter
+    capture: Capture, indices: Sequence[int], folder: RunFolder, reporter: Reporter, *, adjust_poses: bool
 ) -> Capture:
-    """The capture with the poses that a run streams: adjusted ones, if `revise` asks for them.
+    """The capture with the poses that a run streams: adjusted ones, if they are asked for.
 
     Args:
         capture: the capture as it was opened.
         indices: frames to stream.
-        revise: `poses` or None.
         folder: where a run keeps its adjusted poses; a run that is continued finds them there.
         reporter: shows progress.
+        adjust_poses: ask for adjusted ones.
 
     Raises:
         InputError: the folder holds a run whose poses were not adjusted.
         StorageError: the saved poses are damaged.
     """
-    if revise is None:
+    if not adjust_poses:
         if not folder.has_state():  # left by a run that was stopped before its first save
             folder.adjusted_poses.unlink(missing_ok=True)
         return capture
@@ -309,7 +309,7 @@ def capture_to_stream(
     if folder.has_state():
         if saved is None:
             got, fix = "one with the given poses", "leave it out, or start anew with --overwrite"
-            raise refusal(f"--revise {revise}", wanted="a run that began with it", got=got, fix=fix)
+            raise refusal("--adjust-poses", wanted="a run that began with it", got=got, fix=fix)
     elif saved is None or saved.capture != capture.digest(indices):
         found = adjust_and_say(capture, indices, reporter).capture
         saved = SavedPoses(capture.digest(indices), {i: found.frames[i].camtoworld for i in indices})

@@ -143,7 +143,7 @@ class StreamOptions(OfCapture):
     """Steps of refinement on the streamed views after the stream: 100 with --quality best, 0 with the others."""
     online_refine: int = 0
     """Gradient steps on kept views after each chunk, while streaming; later chunks see the refined scene."""
-    revise: Literal["poses"] | None = None
+    adjust_poses: bool = False
     """Adjust the poses to the images before the stream."""
     causal: bool = False
     """No look-ahead: near, far and scale come from the first chunk, and frames keep their order."""

@@ -117,14 +117,14 @@ def adjustment(is_found=True):
 @pytest.fixture
 def adjusted(capture, tmp_path):
     """Folder of a run that has begun with adjusted poses."""
-    with adjustment(), opened(capture, tmp_path / "run", revise="poses") as run:
+    with adjustment(), opened(capture, tmp_path / "run", adjust_poses=True) as run:
         save_views(run, 8)
     return tmp_path / "run"
 
 
 def test_all_that_follows_sees_the_adjusted_poses(adjusted, capture, capsys):
     wanted = moved(capture, range(8)).capture.camtoworlds
-    with adjustment(is_found=False), opened(capture, adjusted, revise="poses") as run:
+    with adjustment(is_found=False), opened(capture, adjusted, adjust_poses=True) as run:
         np.testing.assert_array_equal(run.capture.camtoworlds, wanted)
     with pytest.raises(InputError, match="differs in its poses"), opened(capture, adjusted):
         pass
@@ -172,18 +172,18 @@ def test_files_of_others_are_neither_records_nor_deltas(tmp_path):
 def test_a_run_that_began_with_given_poses_takes_no_adjusted_ones(capture, tmp_path):
     folder = RunFolder(tmp_path)
     folder.state.write_bytes(b"of a run that began without")
-    with adjustment(is_found=False), pytest.raises(InputError, match="--revise poses: wanted a run that began with it"):
-        capture_to_stream(capture, range(4), "poses", folder, QUIET)
-    assert capture_to_stream(capture, range(4), None, folder, QUIET) is capture
+    with adjustment(is_found=False), pytest.raises(InputError, match="--adjust-poses: wanted a run that began with it"):
+        capture_to_stream(capture, range(4), folder, QUIET, adjust_poses=True)
+    assert capture_to_stream(capture, range(4), folder, QUIET, adjust_poses=False) is capture
 
 
 def test_poses_that_a_stopped_run_left_for_another_stream_are_found_anew(capture, tmp_path):
     folder = RunFolder(tmp_path)
     with adjustment():
-        capture_to_stream(capture, (0, 2), "poses", folder, QUIET)
-        streamed = capture_to_stream(capture, range(4), "poses", folder, QUIET)
+        capture_to_stream(capture, (0, 2), folder, QUIET, adjust_poses=True)
+        streamed = capture_to_stream(capture, range(4), folder, QUIET, adjust_poses=True)
     np.testing.assert_array_equal(streamed.camtoworlds, moved(capture, range(4)).capture.camtoworlds)
-    assert capture_to_stream(capture, range(4), None, folder, QUIET) is capture
+    assert capture_to_stream(capture, range(4), folder, QUIET, adjust_poses=False) is capture
     assert not folder.adjusted_poses.exists()  # no later command takes them for those of the run
 
 
@@ -193,7 +193,7 @@ def test_damaged_poses_are_named(capture, tmp_path):
     with pytest.raises(StorageError, match=r"adjusted_poses\.npz: the file is corrupt"):
         with_poses_of_run(capture, folder)
     folder.state.write_bytes(b"of the run")
-    assert capture_to_stream(capture, range(4), None, folder, QUIET) is capture
+    assert capture_to_stream(capture, range(4), folder, QUIET, adjust_poses=False) is capture
     assert folder.adjusted_poses.exists()  # what belongs to a run stays
     folder.clear_run()
     assert load_poses(folder) is None
