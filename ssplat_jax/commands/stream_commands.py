@@ -118,7 +118,7 @@ class Eval(EvalOptions):
         )
         if refined := metrics.get("refinement"):
             print(
-                f"before {refined['steps']} refinement steps of {refined['seconds_per_step']:.2f} s:"
+                f"before {refined['num_steps']} refinement steps of {refined['seconds_per_step']:.2f} s:"
                 f" {_both_scores(refined['before'])}"
             )
 

@@ -17,7 +17,7 @@ from ssplat_jax.viewer import browser as browser_module
 from ssplat_jax.viewer.browser import Browser
 from ssplat_jax.viewer.stage import Stage, draw, open_source, visible_splats
 from ssplat_jax.viewer.view_scene import Viewer
-from tests.viewer.fake_client import FakeClient, delta, frame, free_port, header, scene
+from tests.viewer.fake_client import FakeClient, delta, frame, free_port, header
 
 pytestmark = pytest.mark.usefixtures("compiled_plainly")
 
@@ -149,8 +149,20 @@ def test_a_picture_is_drawn_coarsely_then_finely_and_only_when_something_changes
     assert pictures[-1] is None and run.splats.visible and run.sent() == 6
 
 
+def walls(x, z, size, colors):
+    """Two flat Gaussians side by side."""
+    return ss.Gaussians.from_rgb(
+        means=jnp.array([[x[i], 0.0, z[i]] for i in range(2)], jnp.float32),
+        quats=jnp.array([[1.0, 0.0, 0.0, 0.0]] * 2),
+        scales=jnp.array([[size, size, 0.01]] * 2, jnp.float32),
+        opacities=jnp.full(2, 0.99),
+        colors=jnp.array(colors, jnp.float32),
+    )
+
+
 def test_a_drawn_picture_is_that_of_the_rasterizer_however_it_is_stretched():
-    viewed, focal, at = scene(400), 16 / np.tan(0.45), pose(0.1, 0.3)
+    viewed, at = walls([-0.6, 0.6], [2, 2.1], 0.6, [[0.9, 0.2, 0.1], [0.1, 0.3, 0.9]]), pose(0.1)
+    focal = 16 / np.tan(0.45)
     K = np.array([[focal, 0, 24], [0, focal, 16], [0, 0, 1]])
     viewmats, Ks = (jnp.asarray(x, jnp.float32) for x in (np.linalg.inv(at), K))
     view = Camera(viewmats=viewmats, Ks=Ks, width=48, height=32)
@@ -168,15 +180,9 @@ def test_a_drawn_picture_is_that_of_the_rasterizer_however_it_is_stretched():
 
 
 def test_depth_is_light_near_and_dark_far():
-    two = {"means": [[-0.5, 0, 2], [0.5, 0, 4]], "quats": [[1, 0, 0, 0]] * 2, "scales": [[0.25, 0.25, 0.01]] * 2}
-    walls = ss.Gaussians.from_rgb(
-        **{name: jnp.asarray(x, jnp.float32) for name, x in two.items()},
-        opacities=jnp.full(2, 0.99),
-        colors=jnp.full((2, 3), 0.5),
-    )
     focal = 16 / np.tan(0.45)
     K = np.array([[focal, 0, 24], [0, focal, 16], [0, 0, 1]])
-    depth = draw(walls, "depth", pose(), K, SIZE).astype(float)
+    depth = draw(walls([-0.5, 0.5], [2, 4], 0.25, [[0.5] * 3] * 2), "depth", pose(), K, SIZE).astype(float)
     left, right = (slice(14, 18), slice(13, 17)), (slice(14, 18), slice(27, 30))
     assert depth[left].mean() > depth[right].mean() + 40 and (depth[:, 0] == 0).any()
 
