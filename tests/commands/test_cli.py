@@ -76,7 +76,12 @@ def test_results_among_the_captures_own_images_are_refused(tmp_path, capsys):
     assert {path: path.read_bytes() for path in tmp_path.rglob("*.*")} == before
 
 
-USAGES = {"Expected one of {demo": (), "run": ("rnu",), "CAPTURE": ("run",), "--size": ("run", "x", "--szie", "3")}
+USAGES = {
+    "Expected one of {demo": (),
+    "run": ("rnu",),
+    "CAPTURE": ("run",),
+    "--size": ("run", "x", "--out", "y", "--szie", "3"),
+}
 
 
 @pytest.mark.parametrize(("named", "arguments"), USAGES.items())

@@ -14,16 +14,21 @@ from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.rasterizer import Effects, fill_holes
 from ssplat_jax.scene_files.formats import save_gaussians
 from tests.commands.command_fixture import make_capture, run
-from tests.scene_files import scene_fixture
 
 LEVEL = 1.0 / 255
 FILM_DB = 38.0  # x264's losses, of the brightness: colors have half the resolution
 
 
-def scene():
-    """In front of the first camera, which looks along -z; positions are multiples of 1/256."""
-    plain = scene_fixture.scene(0, seed=3)
-    return replace(plain, means=-jnp.round(256 * plain.means) / 256)
+def scene(num_gaussians=60):
+    rng = np.random.default_rng(3)
+    values = {
+        "means": rng.uniform([-1, -1, -4], [1, 1, -2], (num_gaussians, 3)),
+        "quats": rng.normal(size=(num_gaussians, 4)),
+        "scales": rng.uniform(0.02, 0.2, (num_gaussians, 3)),
+        "opacities": rng.uniform(0.2, 0.9, num_gaussians),
+        "colors": rng.uniform(size=(num_gaussians, 3)),
+    }
+    return ss.Gaussians.from_rgb(**{name: jnp.asarray(x, jnp.float32) for name, x in values.items()})
 
 
 def picture(path):

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+import ssplat_jax as ss
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.streaming.scene_delta import SceneDelta
-from tests.scene_files import scene_fixture
 
 
 def free_port():
@@ -33,8 +33,15 @@ def wait_for(answer, seconds=90.0):
 
 
 def scene(num_gaussians=50, size=1.0):
-    plain = scene_fixture.scene(0, num_gaussians)
-    return replace(plain, means=size * plain.means, scales=size * plain.scales)
+    rng = np.random.default_rng(0)
+    values = {
+        "means": size * rng.uniform([-1, -1, 2], [1, 1, 4], (num_gaussians, 3)),
+        "quats": rng.normal(size=(num_gaussians, 4)),
+        "scales": size * rng.uniform(0.02, 0.2, (num_gaussians, 3)),
+        "opacities": rng.uniform(0.2, 0.9, num_gaussians),
+        "colors": rng.uniform(size=(num_gaussians, 3)),
+    }
+    return ss.Gaussians.from_rgb(**{name: jnp.asarray(x, jnp.float32) for name, x in values.items()})
 
 
 def frame(origin=(0.0, 0.0, 0.0)):
