@@ -25,7 +25,7 @@ class Poses:
     out: Path
     """Folder of the capture; a call that stopped there is continued."""
     frames: int = 120
-    """Frames chosen from a video, at most: the sharpest of equal stretches, three a second."""
+    """Frames chosen from a video, at most: sharp ones, at equal distances of motion."""
     max_side: int = 1600
     """Longer side in pixels that larger images are reduced to."""
     fisheye: bool = False

@@ -174,15 +174,15 @@ def _gather(source: Path, out: Path, options: PoseOptions, reporter: Reporter) -
 def _choose_from_video(source: Path, folder: Path, options: PoseOptions, reporter: Reporter) -> list[str]:
     announced = gather_images.count_frames(source)
     with reporter.progress("looking at the video", announced, waiting="") as advance:
-        sharpnesses, seconds = gather_images.scan_video(source, advance)
-    if len(sharpnesses) < MIN_READ_SHARE * announced:
+        motion, sharpnesses = gather_images.scan_video(source, advance)
+    if len(motion) < MIN_READ_SHARE * announced:
         reporter.warn(
-            f"{source}: {len(sharpnesses)} of about {announced} frames can be read; the rest is left out. If the video"
-            " plays to its end, convert it with `ffmpeg -i INPUT output.mp4`"
+            f"{source}: {len(motion)} of about {announced} frames can be read; the rest is left out. If the video plays"
+            " to its end, convert it with `ffmpeg -i INPUT output.mp4`"
         )
-    chosen = gather_images.choose_frames(sharpnesses, seconds, options.max_frames)
+    chosen = gather_images.choose_frames(motion, sharpnesses, options.max_frames)
     with reporter.progress("frames", len(chosen), waiting="") as advance:
-        return gather_images.write_frames(source, chosen, folder, options.max_side, advance)
+        return gather_images.write_frames(source, chosen.tolist(), folder, options.max_side, advance)
 
 
 def _reconstruct(out: Path, names: list[str], source: Path, options: PoseOptions, reporter: Reporter) -> Findings:

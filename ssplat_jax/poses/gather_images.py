@@ -1,7 +1,7 @@
 """The images that structure from motion reads: upright copies of photos, or frames chosen from a video.
 
-video -> sharpness of all frames -> the sharpest of each of equal stretches -+
-folder -> photos in natural order -> upright copies of bounded size ---------+-> names of the images
+video -> sharpness and motion of all frames -> sharp frames at equal distances of motion --+
+folder -> photos in natural order -> upright copies of bounded size -----------------------+-> names of the images
 """
 
 import re
@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float32, Float64, Int64
 from PIL import Image
 from PIL.ExifTags import IFD, Base
 from scipy.ndimage import laplace
@@ -34,8 +34,11 @@ FOCAL_TAGS = (Base.FocalLength, Base.FocalLengthIn35mmFilm, Base.FocalPlaneXReso
 FOCAL_TAGS += (Base.FocalPlaneResolutionUnit, Base.ExifImageWidth, Base.ExifImageHeight)
 """EXIF tags from which COLMAP takes the focal length."""
 SMALL_WIDTH = 192  # pixels of the longer side of the frames that are measured
-FRAMES_PER_SECOND = 3.0  # chosen at most
-MIN_FRAMES = 20  # chosen also from a shorter video
+STEP = 0.05  # of the width: motion between two chosen frames, if the number of frames allows
+MIN_FRAMES = 20  # chosen even if the picture moves less than so many steps
+BLOCK = 48  # pixels: side of the blocks that are followed
+MIN_CONTRAST = 2.0  # gray levels (standard deviation) below which a block shows nothing to follow
+KEY_SHIFT = 6.0  # pixels of motion after which the frame that motion is measured against is replaced
 FIX = "check that it plays; convert it with `ffmpeg -i INPUT output.mp4`"
 
 
@@ -136,31 +139,79 @@ def count_frames(path: Path) -> int:
         return int(seconds * float(stream.average_rate or 0))
 
 
-def scan_video(path: Path, advance: Advance) -> tuple[Float64[np.ndarray, " n"], float]:
-    """Sharpness of all frames of a video, and its seconds; 0 if it does not tell.
+def scan_video(path: Path, advance: Advance) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
+    """Motion since the first frame, in shares of the width, and sharpness of all frames of a video, as shown.
+
+    Motion grows while the camera turns or moves, and stays while it stands still. Each frame is compared with a key
+    frame, which is replaced when the picture has moved by `KEY_SHIFT` pixels. So slow motion is not lost in rounding,
+    and noise of a still picture does not add up.
 
     Raises:
         InputError: the file is no readable video, or has fewer than two frames.
     """
-    sharpnesses, seconds = [], 0.0
+    motion, sharpnesses, key, at_key = [], [], None, 0.0
     for frame in _frames(path):
         scale = min(SMALL_WIDTH / max(frame.width, frame.height), 1.0)
         width, height = (max(round(side * scale), 8) for side in (frame.width, frame.height))
         small = frame.reformat(width=width, height=height, format="gray", interpolation="AREA")
-        # The mean squared Laplacian is comparable between frames that show the same things.
-        sharpnesses.append(float(np.mean(np.square(laplace(small.to_ndarray().astype(np.float32))[1:-1, 1:-1]))))
-        seconds = frame.time or 0.0
-        advance(len(sharpnesses))
-    if len(sharpnesses) < 2:
-        raise refusal(str(path), wanted="a video of a moving camera", got=f"{len(sharpnesses)} frames", fix=FIX)
-    return np.array(sharpnesses), seconds
+        gray = small.to_ndarray().astype(np.float32)
+        shift = 0.0 if key is None else displacement(key, gray)
+        motion.append(max(motion[-1] if motion else 0.0, at_key + shift / width))
+        if key is None or shift >= KEY_SHIFT:
+            key, at_key = gray, motion[-1]
+        sharpnesses.append(sharpness(gray))
+        advance(len(motion))
+    if len(motion) < 2:
+        raise refusal(str(path), wanted="a video of a moving camera", got=f"{len(motion)} frames", fix=FIX)
+    return np.array(motion), np.array(sharpnesses)
 
 
-def choose_frames(sharpnesses: Float64[np.ndarray, " n"], seconds: float, max_frames: int) -> list[int]:
-    """The chosen frames of a video, in order: the sharpest of each of equal stretches, at most `max_frames` of them."""
-    count = min(max(int(FRAMES_PER_SECOND * seconds) or max_frames, MIN_FRAMES), max(max_frames, 2), len(sharpnesses))
-    stretches = np.array_split(np.arange(len(sharpnesses)), count)
-    return [int(stretch[np.argmax(sharpnesses[stretch])]) for stretch in stretches]
+def sharpness(gray: Float32[np.ndarray, "h w"]) -> float:
+    """Mean squared Laplacian of an image; comparable between frames that show the same things."""
+    return float(np.mean(np.square(laplace(gray)[1:-1, 1:-1])))
+
+
+def displacement(before: Float32[np.ndarray, "h w"], after: Float32[np.ndarray, "h w"]) -> float:
+    """Median displacement of the blocks of a gray image in [0, 255], in whole pixels, by phase correlation.
+
+    Blocks without contrast are left out; without any block it is 0.
+    """
+    rows, columns = (side // BLOCK for side in before.shape)
+    images = np.stack([before, after])[:, : rows * BLOCK, : columns * BLOCK]
+    blocks = images.reshape(2, rows, BLOCK, columns, BLOCK).swapaxes(2, 3).reshape(2, -1, BLOCK, BLOCK)
+    blocks = blocks[:, (blocks.std(axis=(2, 3)) > MIN_CONTRAST).all(axis=0)]
+    if not blocks.shape[1]:
+        return 0.0
+    window = np.outer(np.hanning(BLOCK), np.hanning(BLOCK))
+    spectra = np.fft.rfft2((blocks - blocks.mean(axis=(2, 3), keepdims=True)) * window)
+    cross = spectra[1] * np.conj(spectra[0])
+    peaks = np.fft.irfft2(cross / np.maximum(np.abs(cross), 1e-9), s=(BLOCK, BLOCK)).reshape(len(cross), -1).argmax(-1)
+    shifts = np.stack(np.unravel_index(peaks, (BLOCK, BLOCK)), axis=-1)
+    shifts = (shifts + BLOCK // 2) % BLOCK - BLOCK // 2
+    return float(np.median(np.linalg.norm(shifts, axis=-1)))
+
+
+def choose_frames(
+    motion: Float64[np.ndarray, " n"], sharpnesses: Float64[np.ndarray, " n"], max_frames: int
+) -> Int64[np.ndarray, " k"]:
+    """The chosen frames of a video, in order.
+
+    The motion of the video is divided into equal steps of at least `STEP`, at most `max_frames` of them. Around each
+    step the sharpest frame is taken that is off by a quarter of a step at most, so two chosen frames are half a step to
+    one and a half steps apart; where the picture jumps farther, the nearest frame is taken.
+    """
+    count = int(np.clip(motion[-1] / STEP + 1, MIN_FRAMES, max(max_frames, 2)))
+    if count >= len(motion):
+        return np.arange(len(motion))
+    spacing = motion[-1] / (count - 1)
+    if spacing == 0:  # nothing moves
+        return np.array([int(np.argmax(sharpnesses))])
+    chosen = set()
+    for at in np.linspace(0, motion[-1], count):
+        around = np.flatnonzero(np.abs(motion - at) <= spacing / 4)
+        best = around[np.argmax(sharpnesses[around])] if len(around) else np.argmin(np.abs(motion - at))
+        chosen.add(int(best))
+    return np.array(sorted(chosen))
 
 
 def write_frames(path: Path, chosen: Sequence[int], folder: Path, max_side: int, advance: Advance) -> list[str]:

@@ -2,6 +2,7 @@
 
 import os
 from fractions import Fraction
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from scipy.ndimage import gaussian_filter
 from ssplat_jax.core.console import Reporter
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.poses import estimate, gather_images
-from ssplat_jax.poses.gather_images import choose_frames, copy_photos, list_photos, scan_video
+from ssplat_jax.poses.gather_images import STEP, choose_frames, copy_photos, list_photos, scan_video
 
 av = pytest.importorskip("av", reason="videos need PyAV: pip install -e '.[poses]'")
 
@@ -153,14 +154,53 @@ def view(x, y=0):
     return (1 - share) * window[:, :-1] + share * window[:, 1:]
 
 
-def test_the_sharpest_frame_of_each_stretch_is_chosen():
-    sharpnesses = np.random.default_rng(2).uniform(1, 2, 400)
-    chosen = choose_frames(sharpnesses, 20.0, 1000)
-    assert len(chosen) == 60 and np.diff(chosen).min() > 0
-    stretches = np.array_split(sharpnesses, 60)
-    assert [sharpnesses[i] for i in chosen] == [stretch.max() for stretch in stretches]
-    assert [len(choose_frames(sharpnesses, *given)) for given in ((20.0, 50), (1.0, 120), (0.0, 120))] == [50, 20, 120]
-    assert choose_frames(sharpnesses[:3], 20.0, 120) == [0, 1, 2]
+@pytest.mark.parametrize(("x", "y"), [(0, 0), (3, 0), (0, 5), (6, 8), (17, 0)])
+def test_displacement_is_the_length_of_the_shift(x, y):
+    assert gather_images.displacement(view(100, 20), view(100 + x, 20 + y)) == pytest.approx(np.hypot(x, y))
+
+
+class Played:
+    """A frame of a video as PyAV gives it."""
+
+    width, height = WIDTH, HEIGHT
+
+    def __init__(self, gray):
+        self.to_ndarray = lambda: gray
+        self.reformat = lambda **given: self
+
+
+@pytest.mark.parametrize("speed", [0.0, 0.3, 2.0, 9.0])
+def test_motion_adds_up_at_any_speed_and_noise_is_none(speed, monkeypatch):
+    rng = np.random.default_rng(1)
+    noisy = [view(speed * i + 50) + rng.normal(0, 0 if speed else 3, (HEIGHT, WIDTH)) for i in range(60)]
+    monkeypatch.setattr(gather_images, "_frames", lambda path: map(Played, noisy))
+    motion, _ = scan_video(Path("any"), lambda done: None)
+    assert motion[0] == 0 and (np.diff(motion) >= 0).all()
+    # Whole pixels: off by one at the last key frame at most, and by rounding at each key frame.
+    assert motion[-1] * WIDTH == pytest.approx(speed * 59, rel=0.12, abs=1.5)
+
+
+def test_chosen_frames_are_at_equal_steps_of_motion():
+    """At half the speed, twice as many frames pass between two chosen ones; nothing is chosen twice while it stands."""
+    motion = np.concatenate([np.linspace(0, 2, 100), np.full(80, 2.0), np.linspace(2, 4, 200)])
+    chosen = choose_frames(motion, np.ones(len(motion)), 1000)
+    gaps = np.diff(motion[chosen])
+    assert gaps.min() >= 0.5 * STEP and gaps.max() <= 1.5 * STEP
+    assert len(chosen) == pytest.approx(4 / STEP + 1, abs=1)
+    assert ((chosen >= 100) & (chosen < 180)).sum() <= 1
+    cut = choose_frames(np.concatenate([np.linspace(0, 1, 100), np.linspace(3, 4, 100)]), np.ones(200), 1000)
+    assert {99, 100} <= set(cut.tolist()) and (np.diff(cut) > 0).all()  # a cut is bridged by the nearest frames
+
+
+def test_the_sharpest_frame_near_a_step_is_chosen():
+    motion = np.linspace(0, 4, 401)  # 5 frames a step
+    sharpnesses = np.random.default_rng(2).uniform(1, 2, 401)
+    sharpnesses[::2] = 0.1  # every second frame is blurred
+    chosen = choose_frames(motion, sharpnesses, 1000)
+    assert (chosen[1:-1] % 2 == 1).all() and len(chosen) >= 80
+    for i in chosen[1:-1]:
+        around = np.abs(motion - round(float(motion[i]) / STEP) * STEP) <= STEP / 4 + 1e-9
+        assert sharpnesses[i] == sharpnesses[around].max()
 
 
 def write_video(path, images):
@@ -178,8 +218,7 @@ def test_a_video_is_measured_chosen_from_and_warned_of(tmp_path, monkeypatch, ca
     video = tmp_path / "clip.mp4"
     write_video(video, [view(8 * i) for i in range(NUM_FRAMES)])
     assert gather_images.count_frames(video) == NUM_FRAMES
-    sharpnesses, seconds = scan_video(video, lambda done: None)
-    assert len(sharpnesses) == NUM_FRAMES and seconds == pytest.approx(2.9) and (sharpnesses > 0).all()
+    assert scan_video(video, lambda done: None)[0][-1] == pytest.approx(29 * 8 / WIDTH, rel=0.1)
     assert gather_images.write_frames(video, [3, 17], tmp_path, 96, lambda done: None) == ["000003.jpg", "000017.jpg"]
     with Image.open(tmp_path / "000017.jpg") as picture:
         assert picture.size == (96, 54)
