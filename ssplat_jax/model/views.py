@@ -30,9 +30,9 @@ class Views:
     unusable: Bool[Array, " v"]  # given as valid, but not to be used (`core.chunk.usable_views`): treated as padding
     inside: Bool[Array, "v hf wf"]  # cells of valid views whose center lies in the unpadded image, no pixel masked out
     log_candidates: Float[Array, " d"]  # ln of the candidates, near to far; far to near if `inverse`
-    depths: Float[Array, "v hp wp"] | None  # measured camera z, stream units, 0 where unknown; None without a sensor
     height: int = static()  # of the unpadded image
     width: int = static()
+    depths: Float[Array, "v hp wp"] | None = None  # measured camera z, stream units, 0 where unknown; None: no sensor
 
     @property
     def grid_camera(self) -> Camera:

@@ -215,7 +215,7 @@ def test_the_rest_of_a_masked_room_is_as_good_as_an_empty_one(scenes):
         name: np.mean([score_view(refined, capture, i, f, e).score.shown.psnr for i in range(0, NUM, 3)])
         for name, (_, _, refined, f, e) in scenes.items()
     }
-    assert scores["masked"] > scores["empty"] - 0.8  # ten frames show less of it
+    assert scores["masked"] > scores["empty"] - 1.0  # ten frames show less of it
     assert scores["spoiled"] < scores["masked"] - 0.5
 
 
