@@ -68,12 +68,13 @@ def cell_depths(depths: Float[Array, "v h w"], side: int) -> Float[Array, "v hm 
     """Depth of each cell of `side` x `side` pixels: the lower median of its known depths, which lies on a surface.
 
     Limits:
-        0 where less than `MIN_KNOWN` of the pixels are known, that is above 0.
+        0 where less than `MIN_KNOWN` of the pixels are known, that is finite and above 0.
     """
     v, h, w = depths.shape
     cells = depths.reshape(v, h // side, side, w // side, side).swapaxes(2, 3).reshape(v, h // side, w // side, -1)
-    known = jnp.sort(jnp.where(cells > 0, cells, jnp.inf), axis=-1)
-    num_known = jnp.sum(cells > 0, axis=-1, keepdims=True)
+    is_known = (cells > 0) & (cells < jnp.inf)  # a NaN is neither
+    known = jnp.sort(jnp.where(is_known, cells, jnp.inf), axis=-1)
+    num_known = jnp.sum(is_known, axis=-1, keepdims=True)
     middle = jnp.take_along_axis(known, jnp.maximum(num_known - 1, 0) // 2, axis=-1)
     return jnp.where(num_known >= math.ceil(MIN_KNOWN * side * side), middle, 0.0)[..., 0]
 

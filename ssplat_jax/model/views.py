@@ -32,7 +32,7 @@ class Views:
     log_candidates: Float[Array, " d"]  # ln of the candidates, near to far; far to near if `inverse`
     height: int = static()  # of the unpadded image
     width: int = static()
-    depths: Float[Array, "v hp wp"] | None = None  # measured camera z, stream units, 0 where unknown; None: no sensor
+    depths: Float[Array, "v hp wp"] | None = None  # as in `Chunk`, 0 in the padding
 
     @property
     def grid_camera(self) -> Camera:
@@ -109,8 +109,7 @@ def prepare_views(chunk: Chunk, config: StreamConfig) -> Views:
         inside &= seen.reshape(v, hf, GRID_STRIDE, wf, GRID_STRIDE).all(axis=(2, 4))
     depths = chunk.depths
     if depths is not None:
-        is_known = (depths > 0) & jnp.isfinite(depths) & valid[:, None, None]
-        depths = jnp.pad(jnp.where(is_known, depths, 0.0), ((0, 0), (0, pad_h), (0, pad_w)))
+        depths = jnp.pad(depths, ((0, 0), (0, pad_h), (0, pad_w)))
     return Views(
         images=images,
         viewmats=viewmats,

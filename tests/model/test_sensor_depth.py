@@ -34,12 +34,13 @@ def anchored(depths, logits=None, config=WINDOW):
 
 def test_a_cell_has_the_lower_median_of_its_known_depths():
     rng = np.random.default_rng(0)
-    depths = rng.uniform(1, 5, (2, 12, 16)) * (rng.uniform(size=(2, 12, 16)) < 0.6)
+    unknown = rng.choice([0.0, -2.0, np.nan, np.inf], (2, 12, 16))
+    depths = np.where(rng.uniform(size=(2, 12, 16)) < 0.6, rng.uniform(1, 5, (2, 12, 16)), unknown)
     got = np.asarray(cell_depths(jnp.asarray(depths, jnp.float32), 4))
     num_empty = 0
     for v, i, j in np.ndindex(2, 3, 4):
         known = np.sort(depths[v, 4 * i : 4 * i + 4, 4 * j : 4 * j + 4].ravel())
-        known = known[known > 0]
+        known = known[(known > 0) & np.isfinite(known)]
         num_empty += known.size < 8
         wanted = known[(known.size - 1) // 2] if known.size >= 8 else 0.0
         np.testing.assert_allclose(got[v, i, j], wanted, rtol=1e-6)
