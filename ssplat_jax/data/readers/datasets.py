@@ -217,7 +217,9 @@ def _read_kitti(path: Path, convention: Convention) -> Listing:
         if not (image.stem.isascii() and image.stem.isdigit() and len(image.stem) < 12):
             raise refusal(str(image), wanted="a number", got=echo(image.stem), fix="name images 000000.png and so on")
         if (i := int(image.stem)) < len(poses):
-            pose, where = poses[i].reshape(3, 4) @ to_camera0, f"{file}: pose {i}, {calibration}"
+            with np.errstate(over="ignore", invalid="ignore"):  # the list refuses what is not finite
+                pose = poses[i].reshape(3, 4) @ to_camera0
+            where = f"{file}: pose {i}, {calibration}"
             frames.add(f"image_{camera}/{image.name}", image, pose, intrinsics, where, key=i)
     return frames.listing(len(images), "pose")
 
