@@ -118,7 +118,7 @@ class Progress:
         return _scene_now(self.state.start, self.state.change, given)
 
     def report(self) -> "Refinement":
-        """What was measured."""
+        """Report of the steps so far."""
         seconds = self.seconds[1:]
         return Refinement(
             num_steps=self.num_steps,

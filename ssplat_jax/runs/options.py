@@ -50,7 +50,7 @@ QuietOption = Annotated[bool, tyro.conf.arg(help="Print only the closing line.")
 
 
 class OfCapture:
-    """What the options of commands that read a capture have in common."""
+    """Options that all commands share which read a capture."""
 
     capture: str
     axes: str | None

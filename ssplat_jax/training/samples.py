@@ -128,7 +128,7 @@ def captures_in(folder: Path) -> list[Path]:
     """Paths of the captures at `folder`: itself, or else those in it."""
     if is_capture(folder) or not folder.is_dir():
         return [folder]
-    # Where no reader knows any, `open_capture` refuses the folder with a reason.
+    # `open_capture` refuses a folder that no reader knows, with a reason.
     return sorted(path for path in folder.iterdir() if path.is_dir() and is_capture(path)) or [folder]
 
 

@@ -1,4 +1,4 @@
-"""What all readers share, from finding an image to the listing of checked frames in stream order.
+"""Parts that all readers share, from finding an image to the listing of checked frames in stream order.
 
 A reader hands over what its file says: a name, a pose and intrinsics. `FrameList` finds the images, checks everything
 that can be checked without decoding one, and tells the user what was left out.
@@ -93,7 +93,7 @@ def pinhole(matrix: Float64[np.ndarray, "_ _"], where: str, center: float = 0.0)
 
 
 def lens_remedy(model: object) -> str:
-    """What to do about images of a camera model that is not supported."""
+    """The remedy for images of a camera model that is not supported."""
     return CUT if model in (*PANORAMAS, "spherical") else UNDISTORT
 
 

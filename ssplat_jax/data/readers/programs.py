@@ -133,7 +133,7 @@ def _read_record3d(path: Path, convention: Convention) -> Listing:
 RECORD3D = Reader("Record3D", _is_record3d, _read_record3d, OPENGL)
 
 # -- RealityScan and RealityCapture -----------------------------------------------------------------------------------
-# Of the export "Internal/External camera parameters", a CSV, a row holds `#name, x, y, alt, heading, pitch, roll, f,
+# A row of the CSV that "Internal/External camera parameters" exports holds `#name, x, y, alt, heading, pitch, roll, f,
 # px, py, k1, k2, k3, k4, t1, t2`. Angles are in degrees: heading clockwise about the world's +z, then pitch, then roll,
 # of a camera that looks along -z with +y up (OpenGL). `f`, `px` and `py` are in millimeters of a sensor whose longer
 # side is 36 mm; the principal point is relative to the center. Images are in `images/`, else beside the file.

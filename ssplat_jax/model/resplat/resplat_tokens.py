@@ -1,4 +1,4 @@
-"""What follows the anchored depth in ReSplat's network: depth upsampler, token regressor and Gaussian head."""
+"""Depth upsampler, token regressor and Gaussian head of ReSplat's network, which follow the anchored depth."""
 
 import flax.linen as nn
 import jax.numpy as jnp
