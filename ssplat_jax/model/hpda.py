@@ -1,6 +1,6 @@
 """History-Projected Depth Anchoring (HPDA): cached geometry as a Gaussian prior over depth candidates (Sec. 3.5).
 
-What a depth sensor measured, where a chunk brings that, anchors the distribution in the same form (ours).
+Depths that a sensor measured, where a chunk brings them, anchor the distribution in the same form (ours).
 """
 
 import math
