@@ -1,6 +1,6 @@
 """Speed on a GPU by one command, in one JSON file: rasterizers side by side, streams stage by stage, refinement.
 
-    pip install "ssplat-jax[cuda]" splax torch gsplat
+    pip install -e ".[cuda]" splax torch gsplat
     python experiments/on_a_gpu.py --out on_a_gpu.json
 
 It is to take less than 12 minutes. In place of what fails, or is not installed, stands its error. `--scale smoke` tries

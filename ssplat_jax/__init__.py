@@ -40,7 +40,6 @@ if TYPE_CHECKING:
     from ssplat_jax.scene_files.formats import load_ply as load_ply
     from ssplat_jax.scene_files.formats import load_scene as load_scene
     from ssplat_jax.scene_files.formats import save_ply as save_ply
-    from ssplat_jax.scene_files.formats import save_splat as save_splat
     from ssplat_jax.scene_files.formats import save_spz as save_spz
     from ssplat_jax.storage.weights import load_params as load_params
     from ssplat_jax.streaming.session import Session as Session
@@ -73,7 +72,6 @@ _MODULES = {
     "refine": "refinement",
     "render": "rasterizer",
     "save_ply": "scene_files.formats",
-    "save_splat": "scene_files.formats",
     "save_spz": "scene_files.formats",
 }
 __version__ = "0.1.0"

@@ -34,7 +34,7 @@ from ssplat_jax.core.console import Reporter
 
 
 def run(captures: Path | None, out: Path, scale: str, reporter: Reporter) -> str:
-    """Measures every setting on every available scene; `smoke` takes two settings."""
+    """Measures every setting on every available scene; `smoke` takes one."""
     if captures is None or not (captures / REDKITCHEN).is_dir():
         reporter.warn("no redkitchen under --captures: the procedural scene stands alone")
     return run_study(STUDY, captures, out, scale, reporter)

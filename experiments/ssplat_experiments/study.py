@@ -89,7 +89,7 @@ def _save_plot(study: Study, rows: list[Row], path: Path, reporter: Reporter) ->
         matplotlib.use("Agg")
         from matplotlib import pyplot
     except ImportError:
-        reporter.warn(f"{study.name}: no {path.name} without matplotlib; pip install 'ssplat-jax[plots]'")
+        reporter.warn(f"{study.name}: no {path.name} without matplotlib; pip install -e '.[plots]'")
         return
     assert study.plot is not None
     figure, encoded = study.plot(pyplot, rows), io.BytesIO()

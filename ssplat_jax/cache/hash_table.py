@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from ssplat_jax.config import StreamConfig
+from ssplat_jax.core.numerics import power_of_two
 
 INDEX_LIMIT = 1 << 20
 """Upper bound of the magnitude of a voxel index: 42 km at 4 cm, and exact in float32."""
@@ -145,7 +146,7 @@ def group_equal(voxels: Int[Array, "m 4"], active: Bool[Array, " m"]) -> Int[Arr
     """
     m = voxels.shape[0]
     tokens = jnp.arange(m, dtype=jnp.int32)
-    num_slots = 1 << (SLOTS_PER_ROW * m - 1).bit_length()
+    num_slots = power_of_two(SLOTS_PER_ROW * m)
 
     def claim(state):
         table, slots, leaders, searching = state

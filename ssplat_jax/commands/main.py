@@ -53,7 +53,7 @@ SETTINGS_OF_OTHERS = (
     "JAX_DEFAULT_MATMUL_PRECISION",
     "JAX_DISABLE_JIT",
 )
-"""Beginnings of variables by which people check their own JAX programs; commands keep JAX's usual ones, and float32."""
+"""Prefixes of environment variables that `main` removes, so that commands compute in float32 as JAX does by default."""
 
 
 PLATFORMS = ("JAX_PLATFORMS", "JAX_PLATFORM_NAME")

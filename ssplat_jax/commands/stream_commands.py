@@ -124,7 +124,7 @@ class Eval(EvalOptions):
 
 
 def _both_scores(scores: dict) -> str:
-    """PSNR and SSIM as the paper defines them, and those of the image that is shown."""
+    """PSNR and SSIM in words: of the image that is shown, then literal."""
     return ", ".join(
         f"{name} {scores[name]['psnr']:.2f} dB {scores[name]['ssim']:.3f}" for name in ("shown", "literal")
     )

@@ -1,1 +1,1 @@
-"""Cameras, rotations, sampling and voxel keys: plain functions of arrays, no networks."""
+"""Gaussians, cameras, rotations, numerics, errors, terminal output, atomic files, kept programs: for every layer."""

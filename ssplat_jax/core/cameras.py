@@ -167,21 +167,6 @@ def unproject(
     return jnp.stack([x * depths, y * depths, depths], axis=-1)
 
 
-def project_points(
-    points: Float[Array, "*#b n 3"], Ks: Float[Array, "*#b 3 3"], min_depth: float = 1e-6
-) -> tuple[Float[Array, "*#b n 2"], Float[Array, "*#b n"]]:
-    """Pixels (x, y) and depths z of camera-frame points; leading axes broadcast.
-
-    Limits:
-        Depths below `min_depth` are divided as `min_depth`; callers mask such points by the returned depth.
-    """
-    depths = points[..., 2]
-    safe = jnp.maximum(depths, min_depth)
-    u = Ks[..., None, 0, 0] * points[..., 0] / safe + Ks[..., None, 0, 2]
-    v = Ks[..., None, 1, 1] * points[..., 1] / safe + Ks[..., None, 1, 2]
-    return jnp.stack([u, v], axis=-1), depths
-
-
 def pixel_grid(height: int, width: int, stride: int = 1) -> Float[Array, "hf wf 2"]:
     """Pixel coordinates (x, y) of the centers of `stride` x `stride` cells of an image."""
     ys = (jnp.arange(height // stride, dtype=jnp.float32) + 0.5) * stride

@@ -24,6 +24,18 @@ from ssplat_jax.core.pytree import pytree
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
+def power_of_two(number: int) -> int:
+    """The least power of two that is at least `number`, 1 for none: capacities are few, and so are programs."""
+    return 1 << max(number - 1, 0).bit_length()
+
+
+def evenly_spread(count: int, most: int) -> list[int]:
+    """At most `most` places among `count`, evenly spread, the first and the last included."""
+    if count <= most:
+        return list(range(count))
+    return [round(k * (count - 1) / (most - 1)) for k in range(most)]
+
+
 def safe_normalize(x: Float[Array, "*s n"], eps: float = 1e-12) -> Float[Array, "*s n"]:
     """Unit vector along `x`.
 
@@ -33,9 +45,7 @@ def safe_normalize(x: Float[Array, "*s n"], eps: float = 1e-12) -> Float[Array, 
     """
     largest = jnp.max(jnp.abs(x), axis=-1, keepdims=True)
     is_zero = largest <= eps
-    shimmed = jnp.where(is_zero, jnp.ones_like(x), x)
-    scaled = shimmed / jnp.where(is_zero, jnp.ones_like(largest), largest)
-    del shimmed
+    scaled = jnp.where(is_zero, jnp.ones_like(x), x) / jnp.where(is_zero, jnp.ones_like(largest), largest)
     unit = scaled / jnp.sqrt(jnp.sum(scaled * scaled, axis=-1, keepdims=True))
     return jnp.where(is_zero, jnp.zeros_like(x), unit)
 

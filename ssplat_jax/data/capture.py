@@ -22,6 +22,7 @@ from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.chunk import Chunk
 from ssplat_jax.core.errors import echo, refusal
+from ssplat_jax.core.numerics import evenly_spread
 from ssplat_jax.data.depth_range import DepthStatistics, estimate_depths, stream_scale
 from ssplat_jax.data.images import Crop, decode_depth, decode_image, decode_mask, undistort
 from ssplat_jax.data.posed_image import USUAL, Convention, Frame
@@ -208,8 +209,7 @@ class Capture:
     def depth_maps_median(self) -> float | None:
         """Median of the known depths in some depth maps, in capture units; None without depth maps."""
         owners = list(filter(self.pixels.has_depth, range(len(self))))
-        places = np.linspace(0, len(owners) - 1, NUM_DEPTH_MAPS_READ)
-        chosen = sorted({owners[round(place)] for place in places}) if owners else []
+        chosen = [owners[place] for place in evenly_spread(len(owners), NUM_DEPTH_MAPS_READ)]
         known = [depth[depth > 0] for i in chosen if (depth := self.depth(i)) is not None]
         return float(np.median(np.concatenate(known))) if any(depths.size for depths in known) else None
 
@@ -296,7 +296,7 @@ class Capture:
         Args:
             config: the configuration of the model.
             order: frames in the order of streaming, which stays as it is; by default `stream_order` of all frames.
-            frame: by default `stream_frame(config, order)`.
+            stream_frame: by default that of `config` and the frames used.
 
         Raises:
             InputError: an image is damaged; it comes when that image's chunk is asked for.

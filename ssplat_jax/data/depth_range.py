@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from ssplat_jax.config import MEDIAN_DEPTH, StreamConfig
+from ssplat_jax.core.numerics import evenly_spread
 from ssplat_jax.data.sparse_matches import (
     MIN_POINTS,
     CommonPoints,
@@ -94,7 +95,7 @@ def estimate_depths(
         the camera does not move.
     """
     keypoints = keypoints or keypoints_of(capture)
-    references = np.unique(np.linspace(0, len(indices) - 1, min(NUM_REFERENCES, len(indices))).round().astype(int))
+    references = evenly_spread(len(indices), NUM_REFERENCES)
     pairs: list[CommonPoints] = []
     baseline = 0.0
     for done, reference in enumerate(references):

@@ -22,6 +22,7 @@ from jaxtyping import Bool, Float, Float32, Float64, Int
 from PIL import Image
 from skimage import feature, measure, transform  # which load what is used of them, with scipy.stats, at its first use
 
+from ssplat_jax.core.numerics import evenly_spread
 from ssplat_jax.data.posed_image import CONVENTIONS, Convention, Frame
 
 LONG_SIDE = 320  # pixels of the working image; smaller images are enlarged, as ORB ignores a border of 16 pixels
@@ -283,13 +284,11 @@ class PoseFit:
     shares: dict[Convention, float]  # if the files were written in that convention
     focal_shares: dict[tuple[float, float], float]  # if fx and fy were so many times as long; within FOCAL_TOLERANCE
     coherent_share: float  # that agree on a motion between the frames, whatever it is
-    num_matches: int
 
 
 def matched_pairs(capture: PosedImages, indices: Sequence[int], keypoints: KeypointsOf) -> Iterator[MatchedPair]:
     """Yields pairs of frames with matches that move, references evenly spread over `indices`."""
-    references = np.unique(np.linspace(0, len(indices) - 2, NUM_PAIRS).round().astype(int)) if len(indices) > 1 else []
-    for reference in references:
+    for reference in evenly_spread(max(len(indices) - 1, 0), NUM_PAIRS):
         for gap in GAPS:
             if reference + gap < len(indices):
                 pair = _matched(capture, indices[reference], indices[reference + gap], keypoints)
@@ -329,7 +328,7 @@ def fit_poses(capture: PosedImages, convention: Convention, keypoints: Keypoints
         return None
     shares = {other: count / total for other, count in counts.items()}
     focal_shares = {factors: count / total for factors, count in focals.items()}
-    return PoseFit(shares=shares, focal_shares=focal_shares, coherent_share=coherent / total, num_matches=total)
+    return PoseFit(shares=shares, focal_shares=focal_shares, coherent_share=coherent / total)
 
 
 def _num_consistent(

@@ -78,16 +78,6 @@ class StreamFrame:
         viewmats[..., 3, 3] = 1.0
         return viewmats.astype(np.float32)
 
-    def camtoworlds(self, viewmats: Float64[np.ndarray, "*v 4 4"]) -> Float64[np.ndarray, "*v 4 4"]:
-        """Converts world-to-camera matrices of the stream to camera-to-world matrices of the capture."""
-        rotations = np.swapaxes(viewmats[..., :3, :3], -1, -2)
-        centers = -np.einsum("...ij,...j->...i", rotations, viewmats[..., :3, 3])
-        camtoworlds = np.zeros(viewmats.shape)
-        camtoworlds[..., :3, :3] = self.rotation @ rotations
-        camtoworlds[..., :3, 3] = self.points_to_capture(centers)
-        camtoworlds[..., 3, 3] = 1.0
-        return camtoworlds
-
     @property
     def depth_range(self) -> tuple[float, float]:
         """`near` and `far`."""

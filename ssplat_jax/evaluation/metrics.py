@@ -33,7 +33,8 @@ MIN_MSE = 1e-10
 """Lower bound of the mean squared error: PSNR is at most 100 dB, a finite number that JSON can hold."""
 
 DARK, BRIGHT, MAX_FAR = -0.5, 4.0, 0.02
-"""An image of which a larger share of the values lies outside is in other units, as -1 to 1 or 0 to 255."""
+"""If more than the share `MAX_FAR` of an image's values is below `DARK` or above `BRIGHT`, the image is in other units,
+such as -1 to 1 or 0 to 255."""
 
 SSIM_ARGUMENTS: dict[str, Any] = {"win_size": 11, "gaussian_weights": True, "data_range": 1.0, "channel_axis": -1}
 """Arguments of scikit-image's `structural_similarity`; its Gaussian has a standard deviation of 1.5 pixels."""

@@ -54,13 +54,6 @@ def save_comparison(
     save_image(path, np.concatenate([target, color, color_depth(depth, *depth_range)], axis=1))
 
 
-def evenly_spread(count: int, most: int) -> list[int]:
-    """At most `most` places among `count`, evenly spread, the first and the last included."""
-    if count <= most:
-        return list(range(count))
-    return [round(k * (count - 1) / (most - 1)) for k in range(most)]
-
-
 # -- video -------------------------------------------------------------------------------------------------------------
 
 

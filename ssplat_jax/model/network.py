@@ -1,7 +1,7 @@
 """Stages of the model, and the protocol of a network: what `StreamSplat` needs in order to run one.
 
 A network has a configuration, a frozen dataclass with the fields of `NetworkConfig`, and an object with the methods of
-`Network`. The shipped networks are folders beside this file; `register_network` adds another. Projection of the cache,
+`Network`. The shipped ones are `compact.py` and `resplat/`; `register_network` adds another. Projection of the cache,
 HPDA, CGFI, exposure, decoding and memory are shared by all networks.
 """
 

@@ -13,7 +13,7 @@ from ssplat_jax.core.cameras import Camera, check_camera, is_whole, relative_to
 from ssplat_jax.core.errors import InputError, echo
 from ssplat_jax.core.gaussians import Gaussians, check_gaussians
 from ssplat_jax.core.kept_programs import Kept
-from ssplat_jax.core.numerics import with_rank_promotion
+from ssplat_jax.core.numerics import power_of_two, with_rank_promotion
 from ssplat_jax.core.pytree import pytree, replace
 from ssplat_jax.rasterizer.binning import Grid, count_intersections, intersect_tiles, sorted_table
 from ssplat_jax.rasterizer.compositing import composite, median_rows
@@ -212,7 +212,7 @@ def default_max_pairs(gaussians: Gaussians, camera: Camera) -> int:
 
 def round_up(num_pairs: int) -> int:
     """The next power of two, at least `MIN_CAPACITY`."""
-    return max(MIN_CAPACITY, 1 << (num_pairs - 1).bit_length()) if num_pairs > 0 else MIN_CAPACITY
+    return max(MIN_CAPACITY, power_of_two(num_pairs))
 
 
 def _check(inputs: RenderInputs) -> None:

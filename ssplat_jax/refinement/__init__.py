@@ -7,13 +7,10 @@
 """
 
 from ssplat_jax.cache.key_views import KeyViews as KeyViews
-from ssplat_jax.refinement.compared_views import FOR_CAPTURES as FOR_CAPTURES
 from ssplat_jax.refinement.compared_views import RefineConfig as RefineConfig
 from ssplat_jax.refinement.online import online_refinement as online_refinement
 from ssplat_jax.refinement.refine import Refinement as Refinement
 from ssplat_jax.refinement.refine import refine as refine
 from ssplat_jax.refinement.refine import refine_on_capture as refine_on_capture
-from ssplat_jax.refinement.refine_step import RefineState as RefineState
-from ssplat_jax.refinement.refine_step import StepReport as StepReport
 from ssplat_jax.refinement.refine_step import init_refinement as init_refinement
 from ssplat_jax.refinement.refine_step import refine_step as refine_step

@@ -21,6 +21,7 @@ from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.core.gaussians import Gaussians, mask_gaussians, with_sh_degree
 from ssplat_jax.core.kept_programs import Kept
+from ssplat_jax.core.numerics import evenly_spread
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.rasterizer.constants import ALPHA_MIN
@@ -232,7 +233,7 @@ def _compiled(config: RefineConfig, max_pairs: int, max_rows: int) -> Callable:
 
 def pairs_capacity(gaussians: Gaussians, key_views: KeyViews, margin: float = PAIRS_MARGIN) -> int:
     """Capacity for the tile intersections of a key view, from eight of them; a step counts what does not fit."""
-    slots, on_host = {round(slot) for slot in np.linspace(0, key_views.num_slots - 1, 8)}, jax.device_get(key_views)
+    slots, on_host = evenly_spread(key_views.num_slots, 8), jax.device_get(key_views)
     return round_up(int(margin * max(int(_num_pairs(gaussians, on_host.at(slot))) for slot in slots)))
 
 
@@ -268,8 +269,7 @@ def key_views_of(capture: Capture, indices: Sequence[int], stream_frame: StreamF
         stream_frame: the similarity between the capture's frame and the stream's.
         exposures: factor per streamed frame, as the stream estimated it.
     """
-    places = np.linspace(0, len(indices) - 1, min(len(indices), MAX_KEY_VIEWS))
-    used = [indices[i] for i in sorted({round(place) for place in places})]
+    used = [indices[i] for i in evenly_spread(len(indices), MAX_KEY_VIEWS)]
     cameras = jax.tree.map(lambda *x: np.stack(x), *(capture.camera(i, stream_frame) for i in used))
     # Frame by frame: as floats, all images would take four times the memory of the key views.
     images = [np.round(np.clip(capture.image(i), 0, 1) * np.float32(255)).astype(np.uint8) for i in used]

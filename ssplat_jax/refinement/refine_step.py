@@ -21,6 +21,7 @@ from ssplat_jax.cache.key_views import KeyViews
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.gaussians import SH_C0, Gaussians, mean_color, with_sh_degree
 from ssplat_jax.core.kept_programs import Kept
+from ssplat_jax.core.numerics import power_of_two
 from ssplat_jax.core.pytree import pytree, replace
 from ssplat_jax.rasterizer import constants
 from ssplat_jax.rasterizer.effects import camera_points, near_planes
@@ -203,7 +204,7 @@ def bounded(change: Change, start: Gaussians) -> Change:
 
 def round_rows(num_rows: int) -> int:
     """The capacity for a number of rows, at most a sixteenth above it where there are many."""
-    unit = max(MIN_ROWS, (1 << max(num_rows - 1, 0).bit_length()) // 32)
+    unit = max(MIN_ROWS, power_of_two(num_rows) // 32)
     return max(unit, unit * -(-num_rows // unit))
 
 

@@ -1,7 +1,8 @@
 """A run and its folder: opened, checked, locked, identified, resumed and saved, with its adjusted poses.
 
     with open_run(model, params, capture, indices, out, reporter=reporter) as run:
-        for fed in feed_chunks(run.session, run.capture, order[run.num_views :], run.frame):
+        left = run.capture.stream_order(model.config, indices, run.stream_frame)[run.num_views :]
+        for fed in feed_chunks(run.session, run.capture, left, run.stream_frame):  # streams each chunk
             run.take(fed)
             run.save()
 

@@ -13,10 +13,11 @@ from ssplat_jax.core.atomic import write_atomic
 from ssplat_jax.core.console import Reporter
 from ssplat_jax.core.gaussians import Gaussians, scale_colors
 from ssplat_jax.core.kept_programs import Kept
+from ssplat_jax.core.numerics import evenly_spread
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.evaluation.cost import peak_memory
-from ssplat_jax.evaluation.pictures import evenly_spread, report_page, save_comparison
+from ssplat_jax.evaluation.pictures import report_page, save_comparison
 from ssplat_jax.evaluation.scoring import ViewScore, exposures_to_json, score_view
 from ssplat_jax.runs.open_run import OpenRun
 from ssplat_jax.scene_files.formats import ExportReport, save_gaussians
@@ -36,6 +37,7 @@ MOST_PICTURES, MOST_CHUNKS = 12, 10
 
 NOTE = "Left to right: the photograph, the rendered view, its depth (light near, dark far)."
 SHOWN = "holes filled, at the exposure of the nearest streamed views"
+LITERAL = "over black, at the one exposure of the scene, the median of its views"
 
 DESCRIBED_FILES = (
     ("scene.ply", "the streamed scene, in the frame and units of the capture, at the middle exposure of its views"),
@@ -219,7 +221,7 @@ def report_eval(folder: RunFolder, metrics: dict[str, Any]) -> None:
         summary=f"{metrics['target_views']} views that were never streamed, rendered from a scene of"
         f" {metrics['context_views']} other views.",
         facts=facts,
-        pictures_note=f"{NOTE} Shown: {SHOWN}. Literal: over black, at the exposure of the first views.",
+        pictures_note=f"{NOTE} Shown: {SHOWN}. Literal: {LITERAL}.",
     )
 
 

@@ -21,10 +21,11 @@ from ssplat_jax.core.errors import InputError, refusal, require_positive
 from ssplat_jax.core.false_colors import eight_bits
 from ssplat_jax.core.gaussians import Gaussians, mean_color
 from ssplat_jax.core.kept_programs import Kept
+from ssplat_jax.core.numerics import evenly_spread
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.evaluation.metrics import psnr
-from ssplat_jax.evaluation.pictures import VideoWriter, evenly_spread, save_image
+from ssplat_jax.evaluation.pictures import VideoWriter, save_image
 from ssplat_jax.rasterizer import Effects, effects_for, fill_holes, render
 from ssplat_jax.rasterizer.effects import FILTERS
 from ssplat_jax.runs.open_run import load_run, open_capture_of_scene

@@ -121,11 +121,6 @@ def save_spz(path: FilePath, gaussians: Gaussians, *, version: int = 4) -> Expor
     return save_gaussians(path, gaussians, suffix=".spz", spz_version=version)
 
 
-def save_splat(path: FilePath, gaussians: Gaussians) -> ExportReport:
-    """Writes a .splat, whatever the file's name; see `save_gaussians`."""
-    return save_gaussians(path, gaussians, suffix=".splat")
-
-
 def file_axes(path: FilePath) -> Float64[np.ndarray, "3 3"]:
     """Matrix from the axes of a .ply, those of the capture, to those of the file's format."""
     return {".glb": AXIS_FLIP, ".spz": RUB.T}.get(check_format(path), np.eye(3))

@@ -20,10 +20,12 @@ RENDER_MODES = ("default", "mip", "2dgs")
 SH_TERMS = (1, 4, 9, 16)  # numbers of SH terms that files hold, those of degree 0 to 3
 MIN_OPACITY = 1.0 / 255.0  # below it every renderer shows nothing, and nothing is written (absent rows have 0)
 OPACITY_GUARD = 1e-6  # opacities are clamped this far from 0 and 1, where the logit is infinite
-SIZE_STEP, MAX_CLIPPED = 1 / 32, 0.01  # of ln sigma, what is no clipping; share of the Gaussians that may be clipped
+SIZE_STEP = 1 / 32  # a change of ln sigma that does not count as clipping
+MAX_CLIPPED = 0.01  # largest share of the Gaussians that may be clipped
 LOG_SCALE_LIMIT = 20.0
 """|ln sigma| is clamped to this, 2e-9 to 5e8 units: the range of the compressed formats that are made from a .ply."""
-UNIFORM, ROUNDING = 1e-4, 1e-9  # a transform that scales unevenly by less does not stretch; differences of rounding
+UNIFORM = 1e-4  # relative difference between the scales of a transform's axes that is ignored
+ROUNDING = 1e-9  # absolute difference between numbers that rounding explains
 HALF_RANGE = np.sqrt(0.5)  # upper bound of the magnitude of every entry of a unit quaternion but the largest
 MORTON_BITS = 21  # of each coordinate: three of them fit a 64-bit key
 SPREADING = {32: 0x1F00000000FFFF, 16: 0x1F0000FF0000FF, 8: 0x100F00F00F00F00F}

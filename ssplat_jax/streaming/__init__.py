@@ -1,1 +1,1 @@
-"""The streaming step, sessions around it, and the scene changes that it causes."""
+"""Sessions around the model's step: feeding of captures and live views, scene deltas, shards."""

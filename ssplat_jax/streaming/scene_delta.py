@@ -24,6 +24,7 @@ from ssplat_jax.cache import VoxelCache
 from ssplat_jax.cache.state import require_single_cache
 from ssplat_jax.cache.votes import total_weight
 from ssplat_jax.core.gaussians import Gaussians, mask_gaussians
+from ssplat_jax.core.numerics import power_of_two
 from ssplat_jax.model.streamsplat import StreamSplat, shown_pivots
 
 MIN_DECODED_ROWS = 256
@@ -73,7 +74,7 @@ class SceneFeed:
         """
         require_single_cache(cache, "SceneFeed.update")
         rows, record = self._changes(cache)
-        num_padded = max(MIN_DECODED_ROWS, 1 << max(len(rows) - 1, 0).bit_length())
+        num_padded = max(MIN_DECODED_ROWS, power_of_two(len(rows)))
         padded = np.pad(rows, (0, num_padded - len(rows)), constant_values=-1)
         gaussians = self._decode_rows(self._params, cache, jnp.asarray(padded))
         per_row = gaussians.num_gaussians // num_padded

@@ -15,6 +15,7 @@ from ssplat_jax.core.chunk import Chunk, check_chunk
 from ssplat_jax.core.errors import refusal
 from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.core.kept_programs import Kept
+from ssplat_jax.core.numerics import power_of_two
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.model.streamsplat import ChunkOutput, StreamSplat, count_gaussians, shown_pivots, shown_rows
@@ -42,7 +43,6 @@ class Session:
         model: the model to run.
         params: the model's parameters.
         cache: the cache to continue from; by default an empty one with capacity for a few chunks.
-        causal: the model's configuration with `stream.causal`: no result depends on a later frame.
         stream_frame: stream frame of `cache`, for `push`; by default that of the first chunk that is pushed.
         refine: what refines the scene after each chunk, as `stream.steps_per_chunk` asks
             (`ssplat_jax.refinement.online_refinement`); None where it asks for nothing.
@@ -54,12 +54,9 @@ class Session:
         params: dict,
         cache: VoxelCache | None = None,
         *,
-        causal: bool = False,
         stream_frame: StreamFrame | None = None,
         refine: RefineChunk | None = None,
     ) -> None:
-        if causal:
-            model = dataclasses.replace(model, config=model.config.replace(causal=True))
         self.model, self.params, self.cache = model, params, cache
         self._live, self._refine_chunk = LiveViews(model.config, stream_frame), refine
         self.least_decoded = MIN_DECODED_PIVOTS  # pivots; who decodes a growing scene often may raise it
@@ -188,10 +185,10 @@ class Session:
         """
         cache, config = self._present_cache(), self.model.config
         _, num_shown, num_present = map(int, _count(cache, config))
-        num_pivots = min(max(self.least_decoded, _power_of_two(num_shown)), cache.confidences.size)
+        num_pivots = min(max(self.least_decoded, power_of_two(num_shown)), cache.confidences.size)
         num_gaussians = None
         if config.additions.detail:
-            num_gaussians = max(self.least_decoded, _power_of_two(num_present))
+            num_gaussians = max(self.least_decoded, power_of_two(num_present))
         leaves, structure = jax.tree.flatten(cache)
         key = ("decode", num_pivots, num_gaussians, structure, *((leaf.shape, leaf.dtype) for leaf in leaves))
         if key not in self._programs:
@@ -239,11 +236,6 @@ def _decode_shown(
     return model.decode_rows(params, cache, shown_rows(cache, model.config, num_pivots), num_gaussians)
 
 
-def _power_of_two(number: int) -> int:
-    """The least power of two that is at least `number`."""
-    return 1 << max(number - 1, 0).bit_length()
-
-
 @functools.partial(Kept, static_argnums=(1,))
 def _count(cache: VoxelCache, config: StreamConfig) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Pivots in use, those of them that are shown, and their Gaussians."""
@@ -273,4 +265,4 @@ def starting_capacity(config: StreamConfig, num_tokens: int, num_chunks: int = I
     if config.memory.overflow != "grow":
         return config.memory.capacity
     num_rows = max(INITIAL_CHUNKS * num_tokens, min(int(NEW_SHARE * num_chunks * num_tokens), MOST_ROWS))
-    return max(config.memory.capacity, 1 << (num_rows - 1).bit_length())
+    return max(config.memory.capacity, power_of_two(num_rows))

@@ -22,6 +22,7 @@ from ssplat_jax.config import MEDIAN_DEPTH, StreamConfig
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.chunk import Chunk
 from ssplat_jax.core.errors import InputError, refusal
+from ssplat_jax.core.numerics import evenly_spread
 from ssplat_jax.core.pytree import pytree, replace
 from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.depth_range import FAR_FACTOR, NEAR_FACTOR
@@ -91,7 +92,7 @@ class CaptureMix:
     def frame_of(self, capture: Capture) -> StreamFrame:
         """Scale, near and far of a capture, estimated once from the frames that may be learned from."""
         learned = learned_frames(capture)
-        places = np.linspace(0, len(learned) - 1, min(len(learned), MAX_ESTIMATION_FRAMES)).round().astype(int)
+        places = evenly_spread(len(learned), MAX_ESTIMATION_FRAMES)
         return capture.stream_frame(self.config, [learned[i] for i in places])
 
 
@@ -143,7 +144,7 @@ def learned_frames(capture: Capture) -> list[int]:
 MAX_LOG_STEP = 0.05
 """Log depths of neighboring pixels that differ by more belong to different surfaces."""
 NEARLY = 1 - 1e-4
-"""Factor on the farthest depth that gives one within the range."""
+"""Factor that puts the sky just inside the farthest depth candidate."""
 MAX_STRIDE = 8
 """Largest distance of consecutive frames of a sample, in frames that may be learned from."""
 

@@ -7,6 +7,7 @@ from jaxtyping import Float64, UInt8
 from scipy.spatial.transform import Rotation
 
 from ssplat_jax.core.gaussians import Gaussians
+from ssplat_jax.core.numerics import evenly_spread
 from ssplat_jax.data.posed_image import pose_from_quat
 from ssplat_jax.storage.chunk_records import RecordedView, open_thumbnail
 from ssplat_jax.viewer.stage import DRAFT, FINE, KINDS, Stage, draw
@@ -100,8 +101,7 @@ class Browser:
 
     def _show_frusta(self, views: list[RecordedView]) -> None:
         """Shows these cameras, and no others."""
-        if len(views) > MOST_FRUSTA:
-            views = [views[round(k)] for k in np.linspace(0, len(views) - 1, MOST_FRUSTA)]
+        views = [views[place] for place in evenly_spread(len(views), MOST_FRUSTA)]
         for frame in self._frusta.keys() - {view.frame for view in views}:
             self._frusta.pop(frame).remove()
         for view in views:

@@ -60,7 +60,7 @@ def evaluated(capture, params, causal, out, monkeypatch):
     monkeypatch.setattr(evaluation, "score_view", watched)
     monkeypatch.setattr(evaluation, "baselines", lambda capture, split: {})
     monkeypatch.setattr(cost, "NUM_REPEATS", 1)
-    session = Session(StreamSplat(NARROW), params, causal=causal)
+    session = Session(StreamSplat(NARROW.replace(causal=causal)), params)
     metrics = evaluation.evaluate(session, capture, SPLIT, out)
     facts = {name: metrics[name] for name in ("stream_frame", "exposures", "cache", "num_gaussians", "split_sha256")}
     return facts, (session.cache, session.gaussians(), rendered)

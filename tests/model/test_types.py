@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ssplat_jax.core.cameras import pixel_grid, project_points, transform_points
+from ssplat_jax.core.cameras import pixel_grid, transform_points
 from ssplat_jax.core.chunk import check_chunk
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.core.gaussians import SH_C0
@@ -229,8 +229,9 @@ def test_gaussians_of_a_token_project_to_their_parts(per_token):
         rgbs=colors.reshape(192, -1),
         gaussians_per_token=per_token,
     )
-    seen, _ = project_points(transform_points(camera.viewmats, gaussians.means.reshape(3, -1, 3)), camera.Ks)
-    parts = np.asarray(seen).reshape(3, -1, 2) * side / GRID_STRIDE
+    points = transform_points(camera.viewmats, gaussians.means.reshape(3, -1, 3))
+    seen = np.einsum("vij,vnj->vni", camera.Ks, points)
+    parts = seen[..., :2] / seen[..., 2:] * side / GRID_STRIDE
     # Footprints are square; cells are not quite, since fx and fy differ by 4 %.
     np.testing.assert_allclose(parts % 1, 0.5, atol=0.03)
     pooled = images.reshape(3, 8 * side, 4 // side, 8 * side, 4 // side, 3).mean(axis=(2, 4))

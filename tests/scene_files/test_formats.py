@@ -320,7 +320,7 @@ def test_images_of_a_sog(tmp_path):
 
 
 def test_bytes_of_a_splat(tmp_path):
-    ss.save_splat(tmp_path / "a.splat", replace(ONE, quats=jnp.array([[2.0, 0.0, -2.0, 0.0]])))
+    save_gaussians(tmp_path / "a.splat", replace(ONE, quats=jnp.array([[2.0, 0.0, -2.0, 0.0]])))
     row = (tmp_path / "a.splat").read_bytes()
     assert struct.unpack("<6f", row[:24]) == pytest.approx((1, -2, 3, 1, math.exp(-2), math.exp(1)))
     assert list(row[24:]) == [255, 0, 51, 204, 219, 128, 37, 128]  # 128 +- 90.5, rounded to even

@@ -1,4 +1,4 @@
-"""Every line of the `Limits:` blocks of numerics and layers; tests/geometry has those of geometry."""
+"""Every line of the `Limits:` blocks of numerics and layers; tests/core has those of cameras and rotations."""
 
 import jax
 import jax.numpy as jnp
@@ -109,7 +109,7 @@ def test_attention_ignores_invalid_keys():
     np.testing.assert_allclose(attend(q, k, v, valid), attend(q, k[:, keep], v[:, keep]), atol=1e-6)
 
 
-def test_attend_own_equals_attend_with_one_head():
+def test_attend_per_query_equals_attend_with_one_head():
     rng = np.random.default_rng(0)
     q, k, v = (jnp.asarray(rng.normal(size=shape), jnp.float32) for shape in ((6, 20), (6, 5, 20), (6, 5, 20)))
     allowed = jnp.asarray(rng.uniform(size=(6, 5)) < 0.6).at[2].set(False)
