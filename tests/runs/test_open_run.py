@@ -15,7 +15,6 @@ from ssplat_jax.core.pytree import replace
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.poses import adjust_poses as adjusting
-from ssplat_jax.runs import scene_outputs
 from ssplat_jax.runs.open_run import (
     capture_to_stream,
     deciding,
@@ -25,13 +24,10 @@ from ssplat_jax.runs.open_run import (
     open_run,
     with_poses_of_run,
 )
-from ssplat_jax.runs.options import RenderOptions
-from ssplat_jax.scene_files.formats import save_ply
 from ssplat_jax.storage.chunk_records import load_chunk_records, save_chunk_record
 from ssplat_jax.storage.run_folder import RunFolder
 from ssplat_jax.storage.weights import load_params
 from tests.runs.report_fixture import record
-from tests.scene_files.scene_fixture import scene
 
 CAPTURE, SIZE = "procedural:room?frames=8", (64, 48)
 QUIET = Reporter(quiet=True)
@@ -139,20 +135,6 @@ def test_all_that_follows_sees_the_adjusted_poses(adjusted, capture, capsys):
     assert "adjusted_poses.npz is of another capture" in capsys.readouterr().err
     with pytest.raises(InputError, match="wanted the capture of the run"):
         load_run(adjusted, QUIET).open_capture(other)
-
-
-def test_pictures_of_a_run_have_its_adjusted_poses(adjusted, capture, tmp_path, monkeypatch):
-    drawn = []
-
-    def draw(splats, camtoworld, *given):
-        drawn.append(camtoworld)
-        return np.zeros((SIZE[1], SIZE[0], 3))
-
-    monkeypatch.setattr(scene_outputs, "_render_picture", draw)
-    save_ply(RunFolder(adjusted).scene, scene(0))
-    options = RenderOptions(adjusted, CAPTURE, tmp_path / "out", size=f"{SIZE[0]}x{SIZE[1]}")
-    scene_outputs.render_run(options, QUIET)
-    np.testing.assert_array_equal(drawn, moved(capture, range(8)).capture.camtoworlds)
 
 
 def test_files_of_others_are_neither_records_nor_deltas(tmp_path):

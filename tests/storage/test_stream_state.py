@@ -55,12 +55,6 @@ def test_batches_of_caches_are_refused_and_not_written(saved, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_saving_mid_stream_gives_the_same_continuation(saved):
-    cache, _ = load_state(saved)
-    cache = fuse(cache, CHUNKS[3], CONFIG)
-    assert_identical(cache, stream(CHUNKS))
-
-
 def test_no_damaged_file_is_loaded(saved, tmp_path):
     contents, rng, damaged = bytearray(saved.read_bytes()), np.random.default_rng(0), tmp_path / "damaged.npz"
     ends = [*range(64), *range(len(contents) - 100, len(contents))]  # records of the zip format, and the checksum
