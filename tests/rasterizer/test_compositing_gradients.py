@@ -6,6 +6,7 @@ import pytest
 
 from ssplat_jax.rasterizer.binning import Grid
 from ssplat_jax.rasterizer.compositing import _shape_gradients
+from ssplat_jax.rasterizer.render import TILES
 
 
 def in_float64(grid: Grid, exponents: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -18,7 +19,7 @@ def in_float64(grid: Grid, exponents: np.ndarray, values: np.ndarray) -> np.ndar
     return np.stack([np.sum(exponents * slope, axis=0) for slope in slopes])
 
 
-@pytest.mark.parametrize("tile", [8, 16])
+@pytest.mark.parametrize("tile", TILES)
 @pytest.mark.parametrize("shape", ["round", "needle across", "needle along", "far away"])
 def test_shape_gradients_equal_sums_in_float64(tile, shape):
     """Samples are weighted by exp(-s^2 - (r dy)^2), as those of a render: only pixels that are drawn count."""
