@@ -30,7 +30,7 @@ def noise_and_nan(images):
 
 @pytest.fixture(scope="module")
 def capture(programs_shared):
-    return open_capture("procedural:room?frames=9&size=48x32")
+    return open_capture("procedural:room?frames=9&size=64x48")
 
 
 @pytest.fixture(scope="module")
@@ -59,6 +59,7 @@ def evaluated(capture, params, causal, out, monkeypatch):
 
     monkeypatch.setattr(evaluation, "score_view", watched)
     monkeypatch.setattr(evaluation, "baselines", lambda capture, split: {})
+    monkeypatch.setattr(evaluation, "peak_memory", lambda *given: {"peak_memory_bytes": None})
     monkeypatch.setattr(cost, "NUM_REPEATS", 1)
     session = Session(StreamSplat(NARROW.replace(causal=causal)), params)
     metrics = evaluation.evaluate(session, capture, SPLIT, out)

@@ -18,7 +18,7 @@ from ssplat_jax.storage.run_folder import RunFolder
 from tests.model.small import random_params
 from tests.streaming.narrow_model import NARROW
 
-CAPTURE, QUIET = "procedural:room?frames=4&size=80x60", Reporter(quiet=True)
+CAPTURE, QUIET = "procedural:room?frames=4&size=64x48", Reporter(quiet=True)
 
 
 def refine(path, steps=4, overwrite=False):
@@ -28,7 +28,7 @@ def refine(path, steps=4, overwrite=False):
 
 def stream(out, overwrite=False):
     """Streams small frames into `out`."""
-    options = RunOptions(CAPTURE, out, size="64x48", save_every=1, overwrite=overwrite)
+    options = RunOptions(CAPTURE, out, save_every=1, overwrite=overwrite)
     return run_capture(StreamSplat(NARROW), params(), options, QUIET)
 
 

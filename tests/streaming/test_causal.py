@@ -16,6 +16,7 @@ from ssplat_jax.refinement import online_refinement
 from ssplat_jax.streaming.feed import feed_chunks
 from ssplat_jax.streaming.live_views import STEP, widen_range
 from ssplat_jax.streaming.session import Session
+from tests.model.small import random_params
 from tests.streaming.narrow_model import NARROW, assert_same_bits
 
 CAUSAL = NARROW.replace(causal=True)
@@ -31,7 +32,7 @@ def capture():
 @pytest.fixture(scope="module")
 def start():
     """Makes sessions of one model, which share their programs: most of the time would be compilation."""
-    params, programs = MODEL.init(jax.random.key(0)), {}
+    params, programs = random_params(CAUSAL), {}
 
     def session(cache=None):
         session = Session(MODEL, params, cache)
@@ -116,16 +117,19 @@ def test_unusable_views_are_refused_and_do_not_count(capture, start):
     assert int(session._live.rest().valid.sum()) == 1
 
 
-def test_pushed_masks_give_what_a_masked_capture_gives(capture):
+def test_pushed_masks_give_what_a_masked_capture_gives(capture, monkeypatch):
     """The first mask comes with the second chunk of a stream that refines; the capture has masks from the start."""
-    model = StreamSplat(CAUSAL.replace(steps_per_chunk=1))
+    monkeypatch.setattr("ssplat_jax.refinement.online._refine_view", lambda model, params, cache, view: cache)
+    model = StreamSplat(CAUSAL.replace(steps_per_chunk=1, hpda=False, cgfi=False, mixer_blocks=0, detail=False))
+    params, programs = random_params(model.config), {}
     masks = np.ones((NUM_FRAMES, 32, 48), bool)
     masks[5:7, 8:24, 12:36] = False
     frames = tuple(
         dataclasses.replace(f, is_masked=not mask.all()) for f, mask in zip(capture.frames, masks, strict=True)
     )
     masked = dataclasses.replace(capture, frames=frames, pixels=dataclasses.replace(capture.pixels, masks=masks))
-    driver, live = (Session(model, model.init(jax.random.key(0)), refine=online_refinement(model)) for _ in range(2))
+    driver, live = (Session(model, params, refine=online_refinement(model)) for _ in range(2))
+    driver._programs = live._programs = programs
     list(feed_chunks(driver, masked, range(8), masked.stream_frame(model.config)))
     for i in range(8):
         viewmat = np.linalg.inv(capture.frames[i].camtoworld)

@@ -75,7 +75,7 @@ def test_a_stream_is_one_program_that_reads_its_history_and_counts_every_token(c
 def test_dead_and_carved_pivots_are_absent(model, params, looped):
     cache = looped[0]
     tau = float(np.median(cache.confidences[cache.alive]))
-    gaussians = StreamSplat(NARROW.replace(min_confidence=tau, detail=False)).decode(params, cache)
+    gaussians = jax.jit(StreamSplat(NARROW.replace(min_confidence=tau, detail=False)).decode)(params, cache)
     is_shown = np.asarray(cache.alive & (cache.confidences >= tau)).reshape(-1)
     assert 0 < is_shown.sum() < np.asarray(cache.alive).sum()
     opacities = np.asarray(gaussians.opacities).reshape(len(is_shown), -1)
@@ -88,7 +88,7 @@ def test_dead_and_carved_pivots_are_absent(model, params, looped):
 def test_a_session_decodes_shown_rows_padded_to_a_power_of_two(detail, model, params, looped, monkeypatch):
     monkeypatch.setattr("ssplat_jax.streaming.session.MIN_DECODED_PIVOTS", 1)
     model = StreamSplat(model.config.replace(detail=detail))
-    whole, session = model.decode(params, looped[0]), Session(model, params, looped[0])
+    whole, session = jax.jit(model.decode)(params, looped[0]), Session(model, params, looped[0])
     shown, is_shown = session.gaussians(), np.asarray(whole.opacities) > 0
     num_shown, most = is_shown.sum(), model.config.head.gaussians_per_token * np.asarray(looped[0].counts).sum()
     assert (num_shown < most) == detail and session.cache_facts()["decoded"] == num_shown
@@ -103,9 +103,9 @@ def test_rows_that_hold_a_gaussian_are_those_of_shown_pivots(params, looped):
     cache = looped[0]
     tau = float(np.median(cache.confidences[cache.alive]))
     model = StreamSplat(NARROW.replace(min_confidence=tau, detail=True))
-    whole, pivots = model.decode(params, cache), jnp.arange(cache.confidences.size)
+    whole, pivots = jax.jit(model.decode)(params, cache), jnp.arange(cache.confidences.size)
     is_present = np.asarray(whole.opacities) > 0
-    rows = model.decode_rows(params, cache, pivots, num_gaussians=int(is_present.sum()) + 64)
+    rows = jax.jit(model.decode_rows, static_argnums=3)(params, cache, pivots, int(is_present.sum()) + 64)
     assert not np.asarray(rows.opacities)[is_present.sum() :].any()
     np.testing.assert_allclose(rows.means[: is_present.sum()], whole.means[is_present], rtol=1e-5, atol=1e-6)
 
@@ -124,7 +124,7 @@ def test_footprints_of_merged_pivots_grow_until_they_cover_a_face(model):
 def test_session_compiles_once_and_keeps_its_memory(model, params, chunks):
     """A cache that may grow starts large enough for the first chunks, whatever capacity is configured."""
     session = Session(StreamSplat(model.config.replace(capacity=128, overflow="grow")), params)
-    memory = []
+    session.expected_chunks, memory = 8, []  # as many rows as the fixtures' cache: JAX has that program in its cache
     for chunk in chunks:
         session.feed(chunk)
         memory.append(session.step_memory_bytes)
