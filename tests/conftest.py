@@ -117,7 +117,8 @@ def programs_shared():
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Session, "__init__", shared)
-        patch.setattr(importlib.import_module("ssplat_jax.rasterizer.render"), "MIN_CAPACITY", 1 << 17)
+        patch.setattr("ssplat_jax.streaming.session.MIN_DECODED_PIVOTS", 1 << 13)
+        patch.setattr(importlib.import_module("ssplat_jax.rasterizer.render"), "MIN_CAPACITY", 1 << 16)
         patch.setattr("ssplat_jax.streaming.scene_delta.MIN_DECODED_ROWS", 1 << 10)
         yield
 
