@@ -3,6 +3,7 @@
 import atexit
 import collections
 import gc
+import importlib
 import importlib.metadata
 import os
 import shutil
@@ -101,17 +102,24 @@ _session_programs: dict = collections.defaultdict(dict)
 
 @pytest.fixture(scope="module")
 def programs_shared():
-    """Sessions of one configuration share their compiled programs, for tests of what is around the stream."""
+    """Few programs, for tests of what is around the stream.
+
+    Sessions that differ only in the order of their views share their programs. Small scenes are decoded and drawn as if
+    they had one size.
+    """
     from ssplat_jax.streaming.session import Session
 
     create = Session.__init__
 
     def shared(session, *given, **more):
         create(session, *given, **more)
-        session._programs = _session_programs[session.model.config]
+        session._programs = _session_programs[session.model.config.replace(causal=False, chunk_step=0.0)]
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Session, "__init__", shared)
+        patch.setattr("ssplat_jax.streaming.session.MIN_DECODED_PIVOTS", 1 << 13)
+        patch.setattr(importlib.import_module("ssplat_jax.rasterizer.render"), "MIN_CAPACITY", 1 << 16)
+        patch.setattr("ssplat_jax.streaming.scene_delta.MIN_DECODED_ROWS", 1 << 10)
         yield
 
 

@@ -21,7 +21,7 @@ def main(capture_path: str, out: Path) -> None:
         ss.check_cache(cache, config)  # raises if tokens were lost
         print(f"{int(cache.num_voxels)} voxels, mean confidence {float(out_chunk.confidences.mean()):.2f}")
     frame = capture.stream_frame(config)
-    ss.save_ply(out, frame.gaussians_to_capture(model.decode(params, cache)))
+    ss.save_ply(out, frame.gaussians_to_capture(jax.jit(model.decode)(params, cache)))
 
 
 if __name__ == "__main__":

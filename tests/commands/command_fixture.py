@@ -2,15 +2,14 @@
 
 import json
 
-import jax
 import numpy as np
 import pytest
 from PIL import Image
 
 from ssplat_jax.commands.main import main
-from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.storage.weights import save_weights
-from tests.streaming.narrow_model import NARROW
+from tests.model.small import random_params
+from tests.streaming.narrow_model import FEW_GAUSSIANS
 
 SIZE = (64, 48)
 
@@ -58,7 +57,7 @@ def narrow_options(folder):
     """Options of a command for a small model, whose weights are written to `folder`."""
     path = folder / "narrow.npz"
     if not path.exists():
-        save_weights(path, StreamSplat(NARROW).init(jax.random.key(0)), NARROW, {})
+        save_weights(path, random_params(FEW_GAUSSIANS), FEW_GAUSSIANS, {})
     return ("--weights", str(path), "--quiet")
 
 

@@ -1,4 +1,4 @@
-"""Programs here are compiled without LLVM's optimizations (`compiled_plainly`), and scenes decoded at their size."""
+"""Programs here are few (`programs_shared`), and compiled without LLVM's optimizations (`compiled_plainly`)."""
 
 import pytest
 
@@ -6,8 +6,8 @@ from tests.commands.command_fixture import narrow_options
 
 
 @pytest.fixture(autouse=True)
-def _small(compiled_plainly, programs_shared, monkeypatch):
-    monkeypatch.setattr("ssplat_jax.streaming.session.MIN_DECODED_PIVOTS", 1 << 11)
+def _few_programs(compiled_plainly, programs_shared):
+    pass
 
 
 @pytest.fixture(scope="session")

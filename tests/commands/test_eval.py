@@ -13,7 +13,7 @@ from ssplat_jax.runs import evaluate_run
 from ssplat_jax.runs.evaluate_run import index_of_folder
 from ssplat_jax.runs.options import EvalOptions
 from tests.commands.command_fixture import SIZE, make_capture, read, run
-from tests.streaming.narrow_model import NARROW
+from tests.streaming.narrow_model import FEW_GAUSSIANS
 
 
 @pytest.fixture(autouse=True)
@@ -107,7 +107,9 @@ def test_an_evaluation_refines_at_the_streamed_size_and_scores_at_the_captures(t
     assert metrics["peak_memory_bytes"] >= metrics["step_memory_bytes"] > 0
     assert metrics["context_views"] == 8 and metrics["target_views"] == len(metrics["per_view"]) == 1
     decoded = metrics["cache"]["decoded"]
-    assert NARROW.head.gaussians_per_token * metrics["cache"]["pivots"] >= decoded >= metrics["num_gaussians"] > 0
+    assert (
+        FEW_GAUSSIANS.head.gaussians_per_token * metrics["cache"]["pivots"] >= decoded >= metrics["num_gaussians"] > 0
+    )
     assert hashlib.sha256((out / "split.json").read_bytes()).hexdigest() == metrics["split_sha256"]
     # Streamed at half the size, scored at the whole.
     assert (metrics["streamed_size"], metrics["size"]) == ([64, 48], [128, 96])

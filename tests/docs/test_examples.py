@@ -6,7 +6,10 @@ import jax
 import numpy as np
 import pytest
 
+import ssplat_jax as ss
 from tests.docs.pages import ROOT
+from tests.model.small import random_params
+from tests.streaming.narrow_model import FEW_GAUSSIANS
 
 FOLDER = ROOT / "docs" / "examples"
 SMALL = "procedural:room?frames=8&size=64x48"
@@ -22,7 +25,14 @@ def script(name: str):
     return module
 
 
-def test_step_in_my_code_writes_a_scene(tmp_path):
+@pytest.fixture
+def narrow(monkeypatch):
+    """A narrow model in place of the shipped one."""
+    monkeypatch.setattr(ss, "preset", lambda name: FEW_GAUSSIANS)
+    monkeypatch.setattr(ss, "load_params", lambda name: random_params(FEW_GAUSSIANS))
+
+
+def test_step_in_my_code_writes_a_scene(tmp_path, narrow):
     script("step_in_my_code").main(SMALL, tmp_path / "scene.ply")
     assert (tmp_path / "scene.ply").stat().st_size > 10_000
 
@@ -37,10 +47,10 @@ def test_a_network_of_ones_own_streams():
     assert 0.2 < script("own_depth_network").main() <= 1
 
 
-def test_a_live_camera_is_streamed(tmp_path, monkeypatch):
+def test_a_live_camera_is_streamed(tmp_path, narrow, programs_shared, monkeypatch):
     monkeypatch.chdir(tmp_path)
     gaussians = script("live_camera").main("procedural:room?frames=6&size=64x48")
-    assert int((np.asarray(gaussians.opacities) > 0).sum()) > 1000
+    assert int((np.asarray(gaussians.opacities) > 0).sum()) > 500
     assert (tmp_path / "live.ply").exists()
 
 

@@ -14,7 +14,7 @@ from ssplat_jax.evaluation.scoring import score_view
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.streaming.session import Session
 from tests.model.small import random_params
-from tests.streaming.narrow_model import NARROW, assert_same_bits
+from tests.streaming.narrow_model import FEW_GAUSSIANS, assert_same_bits
 
 SPLIT = interleaved_split(9, 1, 6)
 
@@ -30,12 +30,12 @@ def noise_and_nan(images):
 
 @pytest.fixture(scope="module")
 def capture(programs_shared):
-    return open_capture("procedural:room?frames=9&size=48x32")
+    return open_capture("procedural:room?frames=9&size=64x48")
 
 
 @pytest.fixture(scope="module")
 def params():
-    return random_params(NARROW)
+    return random_params(FEW_GAUSSIANS)
 
 
 def poisoned(capture, frames, poison):
@@ -59,8 +59,9 @@ def evaluated(capture, params, causal, out, monkeypatch):
 
     monkeypatch.setattr(evaluation, "score_view", watched)
     monkeypatch.setattr(evaluation, "baselines", lambda capture, split: {})
+    monkeypatch.setattr(evaluation, "peak_memory", lambda *given: {"peak_memory_bytes": None})
     monkeypatch.setattr(cost, "NUM_REPEATS", 1)
-    session = Session(StreamSplat(NARROW.replace(causal=causal)), params)
+    session = Session(StreamSplat(FEW_GAUSSIANS.replace(causal=causal)), params)
     metrics = evaluation.evaluate(session, capture, SPLIT, out)
     facts = {name: metrics[name] for name in ("stream_frame", "exposures", "cache", "num_gaussians", "split_sha256")}
     return facts, (session.cache, session.gaussians(), rendered)

@@ -16,9 +16,9 @@ from ssplat_jax.runs.refine_run import refine_run
 from ssplat_jax.scene_files.formats import load_scene
 from ssplat_jax.storage.run_folder import RunFolder
 from tests.model.small import random_params
-from tests.streaming.narrow_model import NARROW
+from tests.streaming.narrow_model import FEW_GAUSSIANS
 
-CAPTURE, QUIET = "procedural:room?frames=4&size=80x60", Reporter(quiet=True)
+CAPTURE, QUIET = "procedural:room?frames=4&size=64x48", Reporter(quiet=True)
 
 
 def refine(path, steps=4, overwrite=False):
@@ -28,13 +28,13 @@ def refine(path, steps=4, overwrite=False):
 
 def stream(out, overwrite=False):
     """Streams small frames into `out`."""
-    options = RunOptions(CAPTURE, out, size="64x48", save_every=1, overwrite=overwrite)
-    return run_capture(StreamSplat(NARROW), params(), options, QUIET)
+    options = RunOptions(CAPTURE, out, save_every=1, overwrite=overwrite)
+    return run_capture(StreamSplat(FEW_GAUSSIANS), params(), options, QUIET)
 
 
 @functools.cache
 def params():
-    return random_params(NARROW)
+    return random_params(FEW_GAUSSIANS)
 
 
 @pytest.fixture(scope="module")

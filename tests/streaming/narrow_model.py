@@ -25,6 +25,9 @@ NARROW = StreamConfig().replace(
 )
 """A small model without a confidence threshold, which the flat distributions of untrained weights would not pass."""
 
+FEW_GAUSSIANS = NARROW.replace(gaussians_per_token=4)
+"""For tests of what is around the stream, which render scenes many times."""
+
 
 def leaves_with_names(tree):
     """Pairs (path, array) of all leaves."""

@@ -1,6 +1,7 @@
 """Causal streams: what comes later changes nothing that is out; what comes live gives what the capture gives."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -16,29 +17,23 @@ from ssplat_jax.refinement import online_refinement
 from ssplat_jax.streaming.feed import feed_chunks
 from ssplat_jax.streaming.live_views import STEP, widen_range
 from ssplat_jax.streaming.session import Session
-from tests.streaming.narrow_model import NARROW, assert_same_bits
+from tests.model.small import random_params
+from tests.streaming.narrow_model import FEW_GAUSSIANS, assert_same_bits
 
-CAUSAL = NARROW.replace(causal=True)
+CAUSAL = FEW_GAUSSIANS.replace(causal=True)
 MODEL = StreamSplat(CAUSAL)
 NUM_FRAMES = 11
 
 
 @pytest.fixture(scope="module")
 def capture():
-    return open_capture(f"procedural:room?frames={NUM_FRAMES}&size=48x32")
+    return open_capture(f"procedural:room?frames={NUM_FRAMES}&size=64x48&seed=1")
 
 
 @pytest.fixture(scope="module")
-def start():
-    """Makes sessions of one model, which share their programs: most of the time would be compilation."""
-    params, programs = MODEL.init(jax.random.key(0)), {}
-
-    def session(cache=None):
-        session = Session(MODEL, params, cache)
-        session._programs = programs
-        return session
-
-    return session
+def start(programs_shared):
+    """Makes sessions of one model."""
+    return functools.partial(Session, MODEL, random_params(CAUSAL))
 
 
 def with_other_future(capture, first):
@@ -96,14 +91,14 @@ def test_pushed_views_give_what_the_causal_stream_gives(capture, start):
 
 
 UNUSABLE = (
-    ({"image": np.zeros((32, 48, 4), np.float32)}, "RGB"),
-    ({"image": np.full((32, 48, 3), 200.0)}, r"\[0, 1\]"),
-    ({"image": np.full((32, 48, 3), np.nan)}, r"\[0, 1\]"),
-    ({"image": np.zeros((16, 48, 3), np.float32)}, "48x32 as the first"),
+    ({"image": np.zeros((48, 64, 4), np.float32)}, "RGB"),
+    ({"image": np.full((48, 64, 3), 200.0)}, r"\[0, 1\]"),
+    ({"image": np.full((48, 64, 3), np.nan)}, r"\[0, 1\]"),
+    ({"image": np.zeros((16, 64, 3), np.float32)}, "64x48 as the first"),
     ({"K": np.eye(3)}, "pixels"),
     ({"K": np.ones((3, 3))}, "skew"),
     ({"viewmat": np.diag([2.0, 2.0, 2.0, 1.0])}, "viewmat.*rotation"),
-    ({"seen": np.ones((48, 32), bool)}, "seen"),
+    ({"seen": np.ones((64, 48), bool)}, "seen"),
 )
 
 
@@ -116,21 +111,23 @@ def test_unusable_views_are_refused_and_do_not_count(capture, start):
     assert int(session._live.rest().valid.sum()) == 1
 
 
-def test_pushed_masks_give_what_a_masked_capture_gives(capture):
+def test_pushed_masks_give_what_a_masked_capture_gives(capture, programs_shared, monkeypatch):
     """The first mask comes with the second chunk of a stream that refines; the capture has masks from the start."""
-    model = StreamSplat(CAUSAL.replace(steps_per_chunk=1))
-    masks = np.ones((NUM_FRAMES, 32, 48), bool)
+    monkeypatch.setattr("ssplat_jax.refinement.online._refine_view", lambda model, params, cache, view: cache)
+    model = StreamSplat(CAUSAL.replace(steps_per_chunk=1, hpda=False, cgfi=False, mixer_blocks=0, detail=False))
+    params = random_params(model.config)
+    masks = np.ones((NUM_FRAMES, 48, 64), bool)
     masks[5:7, 8:24, 12:36] = False
     frames = tuple(
         dataclasses.replace(f, is_masked=not mask.all()) for f, mask in zip(capture.frames, masks, strict=True)
     )
     masked = dataclasses.replace(capture, frames=frames, pixels=dataclasses.replace(capture.pixels, masks=masks))
-    driver, live = (Session(model, model.init(jax.random.key(0)), refine=online_refinement(model)) for _ in range(2))
+    driver, live = (Session(model, params, refine=online_refinement(model)) for _ in range(2))
     list(feed_chunks(driver, masked, range(8), masked.stream_frame(model.config)))
     for i in range(8):
         viewmat = np.linalg.inv(capture.frames[i].camtoworld)
         live.push(capture.image(i), capture.K(i), viewmat, None if masks[i].all() else masks[i])
-    assert live.cache_facts()["num_seen"] == driver.cache_facts()["num_seen"] == 8 * 96 - 2 * 4 * 6
+    assert live.cache_facts()["num_seen"] == driver.cache_facts()["num_seen"] == 8 * 192 - 2 * 4 * 6
     for session in (driver, live):
         np.testing.assert_array_equal(session.cache.key_views.seen[:8], masks[:8])
 
