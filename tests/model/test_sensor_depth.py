@@ -33,7 +33,7 @@ def read_depth(logits, candidates, depths):
     return anchor_depth({}, distribution, remembered, views, WINDOW), views
 
 
-def anchored(depths, logits=np.zeros(D)):
+def anchored(depths, logits):
     logits = jnp.asarray(np.broadcast_to(logits, (3, 8, 8, D)), jnp.float32)
     return read_depth(logits, LOG_CANDIDATES, None if depths is None else jnp.asarray(depths, jnp.float32))
 
