@@ -204,9 +204,16 @@ def test_shards_see_what_the_whole_cache_sees():
     """Pivots of other shards crowd a cell too."""
     (whole, views), camera = random_scene(0, depth_spread=0.1), cameras(0)
     cells, half = cells_of(*views), CAPACITY // 2
-    both = jax.tree.map(lambda x: np.stack([np.roll(x, -i * half, axis=0) if x.ndim else x for i in range(2)]), whole)
-    both.counts[:, half:] = 0
-    shards = jax.device_put(replace(both, num_voxels=np.full_like(both.num_voxels, half)))
+    rolled = [jax.tree.map(lambda x, i=i: np.roll(x, -i * half, axis=0) if x.ndim else x, whole) for i in range(2)]
+    parts = [
+        replace(
+            jax.device_put(x),
+            num_voxels=jnp.asarray(half),
+            counts=jnp.asarray(np.where(np.arange(CAPACITY) < half, x.counts, 0)),
+        )
+        for x in rolled
+    ]
+    shards = jax.tree.map(lambda *x: jax.device_put(np.stack(x)), *parts)
     of_shard = lambda cache: observe(cache, camera, cells, CONFIG, axis="shards")  # noqa: E731
     got = jax.jit(jax.vmap(of_shard, axis_name="shards"))(shards)
     wanted = told(whole, camera, cells)[1].observations

@@ -224,7 +224,7 @@ def test_the_rest_of_a_masked_room_is_as_good_as_an_empty_one(scenes):
     """Scored on the empty room's images; the spoiled room is clearly worse."""
     images = [scenes["empty"].capture.image(i) for i in range(0, NUM, 3)]
     scores = {name: np.mean([psnr(*pair) for pair in zip(s.colors, images, strict=True)]) for name, s in scenes.items()}
-    assert scores["masked"] > scores["empty"] - 1.0  # five frames show less of it
+    assert scores["masked"] > scores["empty"] - 2.0  # five frames show less of it
     assert scores["spoiled"] < scores["masked"] - 0.5
 
 

@@ -36,7 +36,7 @@ from ssplat_jax.model.views import (
     patch_colors,
     prepare_views,
 )
-from tests.model.small import CONFIG, HEIGHT, WIDTH, chunk, params
+from tests.model.small import CONFIG, HEIGHT, WIDTH, chunk, params, random_params
 
 FLOAT32 = 1e-5
 
@@ -144,10 +144,13 @@ def test_shifted_windows_do_not_join_opposite_borders():
     views = prepared(chunk())
     cnn = jnp.asarray(np.random.default_rng(0).normal(size=(3, 8, 8, 16)), jnp.float32)
 
+    config = CONFIG.replace(attention_blocks=2)
+    weights = {"params": random_params(config)["encoder"]}
+
     @jax.jit
     def attended(cnn):
-        sources = nearest_sources(views.viewmats, views.valid, CONFIG.network.num_sources)
-        return Encoder(CONFIG).apply({"params": params()["encoder"]}, cnn, *sources, method="attend_views")
+        sources = nearest_sources(views.viewmats, views.valid, config.network.num_sources)
+        return Encoder(config).apply(weights, cnn, *sources, method="attend_views")
 
     changed = np.abs(np.asarray(attended(cnn.at[0, 0, 0].add(1.0))) - attended(cnn)).max(axis=-1) > 0
     # The first layer's windows are cells 0-3 and 4-7, the second's 0-1, 2-5 and 6-7.
@@ -299,7 +302,7 @@ def test_scales_are_bounded_for_any_feature():
 
 def test_depth_hints_pass_no_gradient_but_are_used():
     rng = np.random.default_rng(0)
-    views = prepare_views(chunk(), CONFIG)
+    views = prepared(chunk())
     grid = views.inside.shape
     draw = lambda *shape: jnp.asarray(rng.uniform(size=shape), jnp.float32)  # noqa: E731
     network = CONFIG.network
