@@ -60,7 +60,9 @@ def test_both_paths_equal_the_numpy_oracle(scene, antialias):
 
 random = np.random.default_rng(3)
 WEIGHTS = [random.normal(size=(2, 10, 12, *tail)) for tail in ((3,), (), (), (2,))]
-DIFFERENTIATED = (cloud(40), cameras(12, 10, batch=2), jnp.asarray(random.normal(size=(40, 2)), jnp.float32))
+SHAPES = np.repeat([[1, 1, 1], [20.0, 0.1, 0.1], [8, 8, 8]], [28, 8, 4], axis=0)  # with needles, and wide ones
+STRETCHED = replace(cloud(40), scales=cloud(40).scales * SHAPES.astype(np.float32))
+DIFFERENTIATED = (STRETCHED, cameras(12, 10, batch=2), jnp.asarray(random.normal(size=(40, 2)), jnp.float32))
 DIRECTIONS = jax.tree.map(lambda x: random.normal(size=x.shape), DIFFERENTIATED)
 
 
