@@ -18,7 +18,6 @@ from ssplat_jax.core.chunk import Chunk
 from ssplat_jax.core.numerics import softplus_inverse
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.core.rotations import quats_to_matrices
-from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.model.cgfi import Aggregator, inject_features, num_hints
 from ssplat_jax.model.hpda import anchor_depth
 from ssplat_jax.model.network import network_of
@@ -27,10 +26,11 @@ from ssplat_jax.model.views import DepthDistribution, Views, prepare_views
 from ssplat_jax.training import losses
 from ssplat_jax.training.recipe import RECIPES
 from ssplat_jax.training.samples import Sample
+from tests.data.capture_fixture import smooth_capture
 
 PAPER = preset("paper")
-SLIM = PAPER.replace(token_width=8, num_depths=24, cgfi_width=8, capacity=128)
-"""`paper` with fewer channels and candidates, and room for 128 voxels."""
+SLIM = PAPER.replace(token_width=8, num_depths=24, cgfi_width=8, capacity=256)
+"""`paper` with fewer channels and candidates, and room for 256 voxels."""
 MODEL = StreamSplat(SLIM)
 GRID = (2, 4, 4)
 SIGMA0, LAMBDA, DELTA, TAU, K = 0.1, 0.5, 0.04, 0.3, 4
@@ -73,12 +73,11 @@ def remembered(rng) -> ProjectedCache:
 
 
 def test_frames_stream_in_their_order_in_the_units_of_the_poses():
-    capture = open_capture("procedural:room?frames=6&size=64x48")
+    capture = smooth_capture(6, 32, 48)
     frame, order = capture.stream_frame(PAPER), [5, 2, 3, 1, 4]
     assert frame.scale == 1.0 and capture.stream_order(PAPER, order, frame) == order
-    candidates = np.exp(
-        f64(prepare_views(next(iter(capture.chunks(PAPER, order, stream_frame=frame))), PAPER).log_candidates)
-    )
+    first = next(iter(capture.chunks(PAPER, order, stream_frame=frame)))
+    candidates = np.exp(f64(jax.jit(lambda chunk: prepare_views(chunk, PAPER).log_candidates)(first)))
     assert candidates[[0, -1]] == pytest.approx([0.01, 200.0], rel=1e-5)
 
 
@@ -88,7 +87,8 @@ def test_anchor_fusion_mean_depth_and_both_confidences():
     probs = jax.nn.softmax(f32(3 * rng.normal(size=(*GRID, len(view.log_candidates)))))
     history, gamma = remembered(rng), 0.7
     distribution = DepthDistribution(probs=probs, logits=jnp.log(probs), decoder=jnp.zeros((*GRID, 1)))
-    got = anchor_depth({"raw_gamma": f32(softplus_inverse(gamma))}, distribution, history, view, SLIM)
+    read = jax.jit(lambda raw: anchor_depth({"raw_gamma": raw}, distribution, history, view, SLIM))
+    got = read(f32(softplus_inverse(gamma)))
 
     d, P_i = np.exp(f64(view.log_candidates)), f64(probs)
     D_H, Omega = f64(history.depths)[..., None], f64(history.confidences)[..., None]
@@ -101,8 +101,7 @@ def test_anchor_fusion_mean_depth_and_both_confidences():
     np.testing.assert_allclose(got.matcher_confidences, P_i.max(axis=-1), atol=FLOAT32)  # what VACC stores
     np.testing.assert_allclose(got.anchored_confidences, P_v.max(axis=-1), atol=FLOAT32)  # what CGFI attenuates by
     # gamma_d is a learned scalar: depth has a gradient with respect to it.
-    depth = lambda raw: anchor_depth({"raw_gamma": raw}, distribution, history, view, SLIM).log_depths.sum()  # noqa: E731
-    assert abs(float(jax.grad(depth)(f32(0.0)))) > 1e-3
+    assert abs(float(jax.jit(jax.grad(lambda raw: read(raw).log_depths.sum()))(f32(0.0)))) > 1e-3
 
 
 def test_attenuated_feature_is_concatenated_and_nothing_else():
@@ -110,12 +109,14 @@ def test_attenuated_feature_is_concatenated_and_nothing_else():
     rng, c = np.random.default_rng(1), SLIM.network.token_width
     feats, omega, history = f32(rng.normal(size=(*GRID, c))), f32(rng.uniform(size=GRID)), remembered(rng)
     zeros = jnp.zeros((*GRID, c))
-    params = jax.jit(Aggregator(SLIM).init)(jax.random.key(0), zeros, zeros, jnp.ones(2, bool))["params"]
+    shapes = jax.eval_shape(Aggregator(SLIM).init, jax.random.key(0), zeros, zeros, jnp.ones(2, bool))["params"]
+    params = jax.tree.map(lambda x: f32(rng.normal(size=x.shape)), shapes)
     assert num_hints(SLIM) == c and params["leave"]["kernel"].shape[2] == 2 * c + SLIM.network.cgfi_width
     copies = jnp.zeros_like(params["leave"]["kernel"]).at[1, 1, jnp.arange(c), jnp.arange(c)].set(2.0)
     copies = copies.at[1, 1, c + jnp.arange(c), jnp.arange(c)].set(-3.0)
-    params = params | {"leave": params["leave"] | {"kernel": copies}}
-    got = inject_features(params, feats, history, omega, views(), SLIM, network_of(SLIM).bound_history)
+    params = params | {"leave": {name: jnp.zeros_like(x) for name, x in params["leave"].items()} | {"kernel": copies}}
+    inject = jax.jit(lambda *given: inject_features(*given, views(), SLIM, network_of(SLIM).bound_history))
+    got = inject(params, feats, history, omega)
     attenuated = (1 - f64(omega))[..., None] * f64(history.feats)
     np.testing.assert_allclose(got, 2 * f64(feats) - 3 * attenuated, atol=FLOAT32)
 
@@ -189,9 +190,9 @@ def test_projection_is_weighted_by_confidence_over_all_pivots_of_a_pixel():
     z = np.exp(rng.uniform(np.log(1), np.log(5), 200))
     means = np.stack([*(rng.uniform(-0.45, 0.45, (2, 200)) * z), z], axis=1)
     tokens = replace(draw_tokens(rng, means), confidences=f32(rng.uniform(0.3, 1, 200)))
-    cache = remember(StreamSplat(SLIM.replace(capacity=256)).init_cache(), tokens)
+    cache = remember(MODEL.init_cache(), tokens)
     camera = Camera(viewmats=view.viewmats[:1], Ks=view.Ks[:1] * f32([[0.25], [0.25], [1]]), width=4, height=4)
-    got = project(cache, camera, SLIM)
+    got = jax.jit(project, static_argnums=2)(cache, camera, SLIM)
     alive = np.asarray(cache.alive)
     p, f, w = f64(cache.means)[alive], f64(cache.feats)[alive], f64(cache.confidences)[alive]
     cells = np.floor(4 * p[:, :2] / p[:, 2:] + 2).astype(int)
@@ -222,7 +223,7 @@ def test_inference_decodes_the_fused_token_by_the_head_alone():
     cache = remember(MODEL.init_cache(), tokens)
     assert int(cache.num_members.max()) > 5
     alive = np.asarray(cache.alive).reshape(-1)
-    got = jax.tree.map(lambda x: np.asarray(x)[alive], MODEL.decode({"decoder": HEAD}, cache))
+    got = jax.tree.map(lambda x: np.asarray(x)[alive], jax.jit(MODEL.decode)({"decoder": HEAD}, cache))
 
     f = f64(cache.feats).reshape(-1, c)[alive]
     (k0, b0), (k2, b2) = ((f64(layer["kernel"]), f64(layer["bias"])) for layer in HEAD.values())
@@ -248,12 +249,10 @@ def test_training_follows_the_rendering_loss_of_all_tokens_over_black(monkeypatc
     assert {"encoder", "cost_volume", "hpda", "tokens", "cgfi", "mixer", "decoder"} <= set(phase.stages)
     rng = np.random.default_rng(7)
     tokens = replace(draw_tokens(rng, rng.uniform(-1, 1, (9, 3))), confidences=jnp.full(9, 0.01))
-    scenes = []
     streamed = (MODEL.init_cache(), tokens, f32(17.0), {})
     monkeypatch.setattr(losses.DepthLoss, "of_stream", lambda *args: streamed)
-    monkeypatch.setattr(
-        losses.RenderingLoss, "of_scene", lambda self, scene, *rest: (scenes.append(scene) or f32(3.0), {})
-    )
+    rendered = lambda self, scene, *rest: (f32(3.0), {"least": scene.opacities.min(), "most": scene.opacities.max()})  # noqa: E731
+    monkeypatch.setattr(losses.RenderingLoss, "of_scene", rendered)
     zeros = jnp.zeros
     chunks = Chunk(
         zeros((1, 2, 8, 8, 3)), zeros((1, 2, 4, 4)), zeros((1, 2, 3, 3)), zeros((1, 2), bool), *zeros((2, 1))
@@ -261,7 +260,7 @@ def test_training_follows_the_rendering_loss_of_all_tokens_over_black(monkeypatc
     camera = Camera(zeros((2, 4, 4)), zeros((2, 3, 3)), 8, 8)
     sample = Sample(chunks, zeros((1, 2, 2, 2)), zeros((2, 8, 8, 3)), camera, zeros((), bool))
     batch, params = jax.tree.map(lambda x: x[None], sample), {"decoder": HEAD}
-    assert float(phase.loss(MODEL, params, batch)[0]) == 4 * 3.0 and phase.loss.black_weight == 1.0
-    assert (np.asarray(scenes[0].opacities) > 0).all()
-    losses.RenderingLoss()(MODEL, params, batch)
-    assert not np.asarray(scenes[1].opacities).any()
+    loss_of = lambda loss: jax.jit(lambda params: loss(MODEL, params, batch))(params)  # noqa: E731
+    value, scene = loss_of(phase.loss)
+    assert value == 4 * 3.0 and phase.loss.black_weight == 1.0 and scene["least"] > 0
+    assert loss_of(losses.RenderingLoss())[1]["most"] == 0

@@ -39,8 +39,11 @@ def changes(seed: int, scale: float, count: int = 256) -> Change:
     return unpack(jnp.asarray(packed, jnp.float32))
 
 
+_VOXELS = jax.jit(voxel_indices, static_argnums=2)
+
+
 def cells(means) -> np.ndarray:
-    return np.asarray(voxel_indices(means, jnp.full(means.shape[:-1], FOOTPRINT), CONFIG)[0])
+    return np.asarray(_VOXELS(means, np.full(means.shape[:-1], FOOTPRINT, np.float32), CONFIG)[0])
 
 
 @pytest.mark.parametrize("span", [2.0, 300.0, 1e6])
@@ -77,13 +80,12 @@ def test_merges_of_changed_pivots_stay_in_their_voxels():
         places = ("few", "one_voxel", "boundaries")[seed % 3]
         cache = fuse(cache, to_jax(Recipe(seed, places, "normal", "random").tokens()), REFINED)
         alive = np.asarray(cache.alive)
-        places = cache.means[:, :, None] + unpack(cache.changes.reshape(-1, PER_TOKEN * WIDTH)).means.reshape(
-            *alive.shape, PER_TOKEN, 3
-        )
-        voxels = np.asarray(cache.voxels)[:, None]
-        for points, wanted in ((cache.means, voxels), (places, voxels[:, :, None])):
-            footprints = cache.footprints.reshape(*alive.shape, *[1] * (points.ndim - 3))
-            found, _ = voxel_indices(points, jnp.broadcast_to(footprints, points.shape[:-1]), REFINED)
+        shifts = np.asarray(unpack(cache.changes.reshape(-1, PER_TOKEN * WIDTH)).means)
+        means, voxels = np.asarray(cache.means), np.asarray(cache.voxels)[:, None]
+        places = means[:, :, None] + shifts.reshape(*alive.shape, PER_TOKEN, 3)
+        for points, wanted in ((means, voxels), (places, voxels[:, :, None])):
+            footprints = np.reshape(cache.footprints, (*alive.shape, *[1] * (points.ndim - 3)))
+            found, _ = _VOXELS(points, np.broadcast_to(footprints, points.shape[:-1]), REFINED)
             wanted = np.broadcast_to(wanted, found.shape)
             np.testing.assert_array_equal(np.asarray(found)[alive], wanted[alive], f"chunk {seed}")
         cache = revised(cache, rng, REFINED)
@@ -117,7 +119,8 @@ def test_each_part_of_a_change_changes_what_it_names():
         "sh": jnp.full((count, 1, 3), 0.25 / SH_C0),
         "logit_opacities": jnp.full(count, -1.0),
     }
-    new = {name: changed_gaussians(scene, replace(zero, **{name: x}), max_scale=0.12) for name, x in parts.items()}
+    change = jax.jit(lambda x: changed_gaussians(scene, x, max_scale=0.12))
+    new = {name: change(replace(zero, **{name: x})) for name, x in parts.items()}
     old = jax.tree.map(lambda x: np.asarray(x)[is_present], scene)
     new = {name: jax.tree.map(lambda x: np.asarray(x)[is_present], g) for name, g in new.items()}
     np.testing.assert_allclose(new["means"].means, old.means + 0.5)

@@ -11,6 +11,7 @@ from ssplat_jax.core.pytree import replace
 
 HEIGHT, WIDTH, SLOTS = 2, 3, 4
 KEEP = jax.jit(lambda ring, arrivals: keep_views(ring, arrivals, depth=2.0))
+USABLE = jax.jit(usable)
 
 
 def views(places, first: int = 0) -> KeyViews:
@@ -67,10 +68,10 @@ def test_views_that_cannot_be_used_stay_out(name):
     array = getattr(arrival, name)
     bad = array.at[(0,) * array.ndim].set(np.nan).at[(1,) + (0,) * (array.ndim - 1)].set(np.inf)
     arrival = replace(arrival, **{name: bad}, valid=jnp.array([True, True, False, True]))
-    assert places(KEEP(empty(), arrival)) == [6.0] and usable(arrival).tolist() == [False, False, False, True]
+    assert places(KEEP(empty(), arrival)) == [6.0] and USABLE(arrival).tolist() == [False, False, False, True]
     one = views([3.0])
     for unlike in ({"exposures": jnp.array([[1.0, 1.0, 0.0]])}, {"Ks": one.Ks.at[0, 0, 0].set(-1.0)}):
-        assert usable(one).all() and not usable(replace(one, **unlike)).any()
+        assert USABLE(one).all() and not USABLE(replace(one, **unlike)).any()
 
 
 def test_distances_are_moves_over_depth_plus_turns():

@@ -81,14 +81,14 @@ def test_no_gradient_passes_the_projection():
         result = project(replace(scene(2, CAPACITY, 1.0), means=means), camera, CONFIG)
         return jnp.sum(result.depths) + jnp.sum(result.feats)
 
-    grads = jax.grad(loss, argnums=(0, 1))(scene(2, CAPACITY, 1.0).means, cameras(1).viewmats)
+    grads = jax.jit(jax.grad(loss, argnums=(0, 1)))(scene(2, CAPACITY, 1.0).means, cameras(1).viewmats)
     assert not any(np.any(np.asarray(g)) for g in grads)
 
 
 def test_a_coarse_cell_equals_its_nearest_fine_cell():
     fine = jit_project(scene(5, CAPACITY, 0.3), cameras(6), CONFIG)
     assert coarsen(fine, 1) is fine
-    coarse = coarsen(fine, 2)
+    coarse = jax.jit(coarsen, static_argnums=1)(fine, 2)
     mask, depths = np.asarray(fine.mask), np.asarray(fine.depths)
     assert 0 < mask.mean() < 1
     for v, i, j in np.ndindex(*coarse.depths.shape):

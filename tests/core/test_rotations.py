@@ -5,8 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ssplat_jax.core.rotations import matrices_to_quats, multiply_quats, quats_to_matrices
+from ssplat_jax.core import rotations
+from ssplat_jax.core.rotations import matrices_to_quats
 
+quats_to_matrices, multiply_quats = jax.jit(rotations.quats_to_matrices), jax.jit(rotations.multiply_quats)
+GRADIENT = jax.jit(jax.grad(lambda q: jnp.sum(quats_to_matrices(q) * jnp.arange(9.0).reshape(3, 3))))
 FLOAT32 = 1e-6  # a few roundings of numbers up to 1
 MIXED_AXES = [[1, 1, 0], [0, 1, 1], [1, 0, 1], [1, 1, 1], [-1, 2, 3], [1, -1, 0], [1e-4, 1, 1e-5]]
 AXES = np.concatenate([np.eye(3), MIXED_AXES])
@@ -46,7 +49,7 @@ def test_length_and_sign_of_a_quaternion_do_not_matter(length):
 
 def test_matrices_to_quats_gives_unit_quats_of_the_rotation():
     _, matrices = cases()
-    quats = np.asarray(matrices_to_quats(jnp.asarray(matrices, jnp.float32)), np.float64)
+    quats = np.asarray(jax.jit(matrices_to_quats)(jnp.asarray(matrices, jnp.float32)), np.float64)
     np.testing.assert_allclose(np.linalg.norm(quats, axis=-1), 1.0, atol=FLOAT32)
     assert (quats[:, 0] >= 0).all()
     np.testing.assert_allclose(quats_to_matrices(jnp.asarray(quats, jnp.float32)), matrices, atol=2 * FLOAT32)
@@ -62,14 +65,13 @@ def test_the_product_is_the_composition():
 def test_zero_quaternions_are_the_identity_with_a_zero_gradient():
     tiny = jnp.array([[0.0, 0, 0, 0], [1e-13, 0, -1e-13, 0]])
     np.testing.assert_array_equal(quats_to_matrices(tiny), np.broadcast_to(np.eye(3), (2, 3, 3)))
-    gradient = jax.grad(lambda q: jnp.sum(quats_to_matrices(q) * jnp.arange(9.0).reshape(3, 3)))(tiny)
-    np.testing.assert_array_equal(gradient, 0)
+    np.testing.assert_array_equal(GRADIENT(tiny), 0)
 
 
 def test_gradients_are_finite_at_every_angle():
     quats, matrices = cases()
-    weight = jnp.arange(9.0).reshape(3, 3)
-    gradient = jax.grad(lambda q: jnp.sum(quats_to_matrices(q) * weight))(jnp.asarray(quats, jnp.float32))
+    gradient = GRADIENT(jnp.asarray(quats, jnp.float32))
     assert np.isfinite(gradient).all() and np.abs(gradient).max() > 1
-    gradient = jax.grad(lambda m: jnp.sum(matrices_to_quats(m) * jnp.arange(4.0)))(jnp.asarray(matrices, jnp.float32))
+    of_quats = jax.jit(jax.grad(lambda m: jnp.sum(matrices_to_quats(m) * jnp.arange(4.0))))
+    gradient = of_quats(jnp.asarray(matrices, jnp.float32))
     assert np.isfinite(gradient).all() and np.abs(gradient).max() > 0.1

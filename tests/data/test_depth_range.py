@@ -38,7 +38,6 @@ def assert_right(capture, indices, tolerance, compared):
 @pytest.mark.parametrize(
     "motion",
     [
-        {"step": 0.1},
         {"step": 0.002},  # 0.05 % of the depth per frame
         {"step": 0.03, "spin": 1.0},
         {"step": 0.02, "forward": 0.04},

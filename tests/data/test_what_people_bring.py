@@ -33,10 +33,11 @@ PARAMS = [0.1, -0.02, 0.003, 0.0004, 0.005, -0.006]  # k1 k2 k3 k4 p1 p2
 
 
 def test_distortion_params_are_a_lens_of_the_file_or_of_a_frame(tmp_path):
-    change = top(distortion_params=PARAMS), frame(2, distortion_params=[0.2, 0, 0, 0, 0, 0])
-    frames = opened(tmp_path / "a", *change).frames
+    """Coefficients of a frame come before the list of the file."""
+    change = frame(2, distortion_params=[0.2, 0, 0, 0, 0, 0]), frame(3, k1=0.2)
+    frames = opened(tmp_path / "a", top(distortion_params=PARAMS), *change).frames
     assert frames[1].lens == Lens(k1=0.1, k2=-0.02, k3=0.003, k4=0.0004, p1=0.005, p2=-0.006)
-    assert frames[2].lens == Lens(k1=0.2)
+    assert frames[2].lens == frames[3].lens == Lens(k1=0.2)
     plain = dict(zip(("k1", "k2", "k3", "k4", "p1", "p2"), PARAMS, strict=True))
     assert opened(tmp_path / "b", top(**plain)).frames[1].lens == frames[1].lens
     fish = top(camera_model="OPENCV_FISHEYE", distortion_params=[0.1, 0.01, 0, 0, 0, 0])
@@ -53,11 +54,6 @@ def test_the_denominator_of_full_opencv_is_that_of_opencv(tmp_path):
     assert open_capture(tmp_path / "colmap").frames[0].lens == lens
     fields = top(camera_model="FULL_OPENCV", k1=0.2, k4=0.1, k5=-0.05, k6=0.02)
     assert opened(tmp_path, fields).frames[0].lens == lens
-
-
-def test_a_frames_own_coefficients_come_before_the_list_of_the_file(tmp_path):
-    frames = opened(tmp_path, top(distortion_params=PARAMS), frame(2, k1=0.2)).frames
-    assert (frames[1].lens.k1, frames[2].lens) == (0.1, Lens(k1=0.2))
 
 
 @pytest.mark.parametrize("kind", ["depth_file_path", "depth_path"])

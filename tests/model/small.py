@@ -10,6 +10,7 @@ from ssplat_jax.cache import ProjectedCache
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.chunk import Chunk
 from ssplat_jax.core.pytree import replace
+from ssplat_jax.model import network
 from ssplat_jax.model.streamsplat import StreamSplat
 from tests.core.test_rotations import rodrigues
 
@@ -17,7 +18,7 @@ CONFIG = StreamConfig().replace(
     chunk_size=3,
     encoder_widths=(8, 16),
     encoder_blocks=1,
-    attention_blocks=2,
+    attention_blocks=1,
     attention_window=4,
     num_depths=12,
     match_width=8,
@@ -54,6 +55,23 @@ def random_params(config: StreamConfig, seed: int = 0) -> dict:
     shapes = jax.eval_shape(StreamSplat(config).init, jax.random.key(0))
     with jax.ensure_compile_time_eval():  # the first caller may be inside jit, and `params` keeps what it got
         return jax.tree_util.tree_map_with_path(draw, shapes)
+
+
+def draw_with_numpy(patch, compiled: tuple[str, ...] = ()) -> None:
+    """Lets untrained stages be drawn with NumPy from their keys, so that no program of them is compiled.
+
+    Stages named in `compiled` start as ever.
+    """
+    initial = network._init_stage
+
+    def drawn(key, config, name, net):
+        if name in compiled or isinstance(key, jax.core.Tracer):
+            return initial(key, config, name, net)
+        rng = np.random.default_rng(np.asarray(jax.random.key_data(key)))
+        shapes = jax.eval_shape(lambda k: initial(k, config, name, net), key)
+        return jax.tree.map(lambda x: rng.normal(size=x.shape).astype(x.dtype), shapes)
+
+    patch.setattr(network, "_init_stage", drawn)
 
 
 @functools.cache

@@ -13,6 +13,7 @@ from ssplat_jax.model.compact import CompactNetwork
 from ssplat_jax.model.layers import ResidualBlock
 from ssplat_jax.model.network import complete_params, init_params, register_network
 from ssplat_jax.network_configs import NETWORK_CONFIGS, CompactConfig
+from tests.model.small import draw_with_numpy
 from tests.streaming.narrow_model import NARROW, assert_same_bits
 
 
@@ -55,9 +56,10 @@ KEY = jax.random.key(7)
 OFF = NARROW.replace(cgfi=False, mixer_blocks=0)
 
 
-@pytest.fixture(scope="module")
-def whole() -> dict:
-    """Parameters of all stages."""
+@pytest.fixture
+def whole(monkeypatch) -> dict:
+    """Parameters of all stages, as their keys alone decide."""
+    draw_with_numpy(monkeypatch)
     return init_params(KEY, NARROW)
 
 

@@ -1,5 +1,7 @@
 """The plane sweep: an untrained network finds a textured wall; only sources that see a cell count in its score."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,7 +14,7 @@ from ssplat_jax.model.views import prepare_views, sweep_pixels
 from tests.model.small import chunk_of, random_params, side_by_side, turned
 
 CONFIG = StreamConfig().replace(
-    encoder_widths=(16, 32), encoder_blocks=1, attention_blocks=1, num_depths=24, match_width=32, unet_width=8
+    encoder_widths=(16, 32), encoder_blocks=1, attention_blocks=0, num_depths=24, match_width=32, unet_width=8
 )
 SIDE, FOCAL, WALL, BASELINE = 64, 64.0, 2.0, 0.25  # the wall is 8 pixels of parallax away
 CELL_SHARE = 0.7
@@ -43,14 +45,12 @@ sweep = jax.jit(lambda features, views: plane_sweep(features, views, CONFIG))
 encoded = jax.jit(lambda params, views: encode(params["encoder"], views, CONFIG))
 
 
+VIEWS = functools.cache(lambda: jax.jit(prepare_views, static_argnums=1)(wall_chunk(), CONFIG))
+
+
 def costs(features, views):
     """Mean cosines, `[view, row, column, scale, candidate]`."""
     return np.asarray(sweep(features, views)).reshape(3, SIDE // 4, SIDE // 4, 2, CONFIG.network.num_depths)
-
-
-def wall_cost(chunk):
-    views = prepare_views(chunk, CONFIG)
-    return costs(encoded(random_params(CONFIG), views), views)
 
 
 def random_features() -> CompactFeatures:
@@ -60,7 +60,7 @@ def random_features() -> CompactFeatures:
 
 
 def test_untrained_cost_peaks_at_the_wall():
-    both = wall_cost(wall_chunk())
+    both = costs(encoded(random_params(CONFIG), VIEWS()), VIEWS())
     assert (np.abs(both) <= 1 + 1e-5).all()  # means of cosines
     scores = both.sum(axis=3)
     candidates = np.exp(np.linspace(np.log(1.0), np.log(5.0), CONFIG.network.num_depths))
@@ -71,7 +71,7 @@ def test_untrained_cost_peaks_at_the_wall():
 
 
 def test_sweep_pixels_are_shifted_by_the_parallax():
-    views = prepare_views(wall_chunk(), CONFIG)
+    views = VIEWS()
     x, y, seen = sweep_pixels(views, 1, 2, 4)
     pixels = np.stack([x, y], axis=-1)
     cells = np.stack(np.meshgrid(np.arange(16) * 4 + 2.0, np.arange(16) * 4 + 2.0), -1).reshape(-1, 2)
@@ -82,7 +82,7 @@ def test_sweep_pixels_are_shifted_by_the_parallax():
 
 
 def test_a_cell_that_one_of_two_sources_sees_scores_as_with_that_source_alone():
-    views = prepare_views(wall_chunk(), CONFIG)
+    views = VIEWS()
     features, side = random_features(), SIDE // 4
     valid = ([1, 1, 1], [1, 1, 0], [0, 1, 1])
     swept = (sweep(features, replace(views, valid=jnp.array(v, bool))) for v in valid)
@@ -98,7 +98,7 @@ def test_a_cell_that_one_of_two_sources_sees_scores_as_with_that_source_alone():
 
 
 def test_hard_features_and_cameras_reach_their_limits():
-    views, features = prepare_views(wall_chunk(), CONFIG), random_features()
+    views, features = VIEWS(), random_features()
     ordinary = costs(features, views)
     zero, one = (jax.tree.map(lambda x, value=value: jnp.full_like(x, value), features) for value in (0.0, 1.0))
     np.testing.assert_array_equal(costs(zero, views), 0)

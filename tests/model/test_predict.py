@@ -66,13 +66,9 @@ def remembering(**changes):
 
 HARD_MEMORIES = {  # cache, and raw strength of the anchor
     "empty": (MODEL.init_cache, 0.0),
-    "empty, gamma 1e6": (MODEL.init_cache, 1e6),
-    "gamma 0": (warm_cache, -200.0),
-    "gamma 1e6": (warm_cache, 1e6),
     "omega 0": (remembering(confidences=0.0), 0.0),
     "omega 1": (remembering(confidences=1.0), 0.0),
     "omega 1, gamma 1e6": (remembering(confidences=1.0), 1e6),
-    "equal confidences": (remembering(confidences=0.5), 0.0),
     "zero features": (remembering(feats=0.0, seeds=0.0), 0.0),
     "identical features": (remembering(feats=1.0, seeds=1.0), 0.0),
     "all at the near end": (remembering(means=[0.0, 0.0, 1.0]), 1e6),

@@ -1,5 +1,6 @@
 """ReSplat's network: its sizes, and its layers against plain definitions."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -56,15 +57,16 @@ def test_depths_are_averaged_in_the_space_of_candidates():
     given = chunk(height=40, width=56)
     for space, average in (("log", np.sqrt(2.0 * 8.0)), ("inverse", 2 / (1 / 2.0 + 1 / 8.0))):
         config = CONFIG.replace(depth_space=space, depth_range=(2.0, 8.0))
-        candidates = prepare_views(given, config).log_candidates
+        candidates = jax.jit(prepare_views, static_argnums=1)(given, config).log_candidates
         apart = np.diff(np.asarray(to_candidate_space(candidates, config), np.float64))
         np.testing.assert_allclose(apart, apart[0], rtol=1e-3)
-        np.testing.assert_allclose(np.exp(sorted(candidates[jnp.array([0, -1])])), [2.0, 8.0], rtol=1e-6)
-        both_ends = jnp.zeros(config.network.num_depths).at[jnp.array([0, -1])].set(0.5)
-        assert np.exp(expected_log_depth(both_ends, candidates, config)) == pytest.approx(average, rel=1e-5)
+        np.testing.assert_allclose(np.exp(sorted(np.asarray(candidates)[[0, -1]])), [2.0, 8.0], rtol=1e-6)
+        both_ends = jnp.asarray(np.where(np.arange(32) % 31 == 0, 0.5, 0.0), jnp.float32)
+        depth = jax.jit(expected_log_depth, static_argnums=2)(both_ends, candidates, config)
+        assert np.exp(depth) == pytest.approx(average, rel=1e-5)
         # Targets peak at the candidates next to the true depth, whatever their distance.
         for truth in np.log([2.05, 3.0, 5.0, 7.8]):
-            targets = np.asarray(soft_targets(jnp.float32(truth), candidates, 0.6))
+            targets = np.asarray(jax.jit(soft_targets, static_argnums=2)(jnp.float32(truth), candidates, 0.6))
             assert targets.sum() == pytest.approx(1.0, abs=1e-5)
             nearest = np.argsort(np.abs(np.asarray(candidates) - truth))[:2]
             assert np.argmax(targets) in nearest and targets[nearest].sum() > 0.6

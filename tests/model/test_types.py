@@ -36,13 +36,16 @@ from ssplat_jax.model.views import (
     patch_colors,
     prepare_views,
 )
-from tests.model.small import CONFIG, HEIGHT, WIDTH, chunk, params
+from tests.model.small import CONFIG, HEIGHT, WIDTH, chunk, params, random_params
 
 FLOAT32 = 1e-5
 
 
+prepared = jax.jit(lambda chunk: prepare_views(chunk, CONFIG))
+
+
 def test_padding_keeps_the_image_and_marks_inside_cells():
-    views = prepare_views(chunk(), CONFIG)
+    views = prepared(chunk())
     np.testing.assert_array_equal(views.images[:, :HEIGHT, :WIDTH], chunk().images)
     np.testing.assert_array_equal(views.images[:, HEIGHT:, :WIDTH], np.repeat(chunk().images[:, -1:], 32 - HEIGHT, 1))
     np.testing.assert_array_equal(views.Ks, chunk().Ks)
@@ -73,9 +76,6 @@ UNUSABLE_VIEWS = {
     "colors below 0": of_view("images", 3, 4, 0, to=-1.0),
 }
 UNUSABLE_RANGES = {"near": [0.0, -1.0, np.nan, 9.0], "far": [np.inf, np.nan, -1.0]}
-
-
-prepared = jax.jit(lambda chunk: prepare_views(chunk, CONFIG))
 
 
 @jax.jit
@@ -141,17 +141,18 @@ def test_position_code_is_that_of_detr():
 
 
 def test_shifted_windows_do_not_join_opposite_borders():
-    views = prepare_views(chunk(), CONFIG)
-    sources, source_valid = nearest_sources(views.viewmats, views.valid, CONFIG.network.num_sources)
-    cnn = jax.random.normal(jax.random.key(0), (3, 8, 8, 16))
+    views = prepared(chunk())
+    cnn = jnp.asarray(np.random.default_rng(0).normal(size=(3, 8, 8, 16)), jnp.float32)
 
+    config = CONFIG.replace(attention_blocks=2)
+    weights = {"params": random_params(config)["encoder"]}
+
+    @jax.jit
     def attended(cnn):
-        stage = Encoder(CONFIG)
-        return np.asarray(
-            stage.apply({"params": params()["encoder"]}, cnn, sources, source_valid, method="attend_views")
-        )
+        sources = nearest_sources(views.viewmats, views.valid, config.network.num_sources)
+        return Encoder(config).apply(weights, cnn, *sources, method="attend_views")
 
-    changed = np.abs(attended(cnn.at[0, 0, 0].add(1.0)) - attended(cnn)).max(axis=-1) > 0
+    changed = np.abs(np.asarray(attended(cnn.at[0, 0, 0].add(1.0))) - attended(cnn)).max(axis=-1) > 0
     # The first layer's windows are cells 0-3 and 4-7, the second's 0-1, 2-5 and 6-7.
     assert changed[:, :6, :6].all() and not changed[:, 6:].any() and not changed[:, :, 6:].any()
 
@@ -258,7 +259,8 @@ def test_a_patch_is_divided_as_its_detail_asks():
     patches = 0.5 + rng.choice([0.0, 0.02, 0.1], (400, 1, 1, 1)) * coarse
     patches += rng.choice([0.0, 0.02, 0.1], (400, 1, 1, 1)) * rng.normal(size=(400, 4, 4, 3))
     config = CONFIG.replace(gaussians_per_token=16, detail=True)
-    parts = divide_cells(jnp.asarray(patches.reshape(400, -1), jnp.float32), config)
+    divide = jax.jit(divide_cells, static_argnums=1)
+    parts = jax.tree.map(np.asarray, divide(jnp.asarray(patches.reshape(400, -1), jnp.float32), config))
     sides = set()
     for i, patch in enumerate(patches):
         wanted = divided(patch)
@@ -300,7 +302,7 @@ def test_scales_are_bounded_for_any_feature():
 
 def test_depth_hints_pass_no_gradient_but_are_used():
     rng = np.random.default_rng(0)
-    views = prepare_views(chunk(), CONFIG)
+    views = prepared(chunk())
     grid = views.inside.shape
     draw = lambda *shape: jnp.asarray(rng.uniform(size=shape), jnp.float32)  # noqa: E731
     network = CONFIG.network

@@ -173,16 +173,19 @@ def test_a_wide_lens_shapes_gaussians_by_its_derivative():
     lens, focal, center = jnp.array([-0.15, 0.012, 0, 0, 0], jnp.float32), 200.0, jnp.array([200.0, 150.0])
     means = jnp.array([[1.6, 1.2, 1.0], [0.3, -0.2, 1.0], [-1.5, 1.1, 1.0]])
 
-    def pixel(point):
+    @jax.jit
+    @jax.jacobian
+    def jacobian_at(point):
         distorted, _ = distort(*(point[i][None, None] / point[2] for i in range(2)), lens[None])
         return focal * jnp.stack([axis[0, 0] for axis in distorted]) + center
 
     K = jnp.array([[focal, 0, center[0]], [0, focal, center[1]], [0, 0, 1]])
     camera = Camera(viewmats=jnp.eye(4)[None], Ks=K[None], width=400, height=300)
     scene = replace(cloud(3, degree=0), means=means, scales=jnp.full((3, 3), 0.01), opacities=jnp.full(3, 0.9))
-    splats = project(scene, camera, Effects(distortion=True, antialias="none"), lens[None])
+    drawn = jax.jit(lambda scene: project(scene, camera, Effects(distortion=True, antialias="none"), lens[None]))
+    splats = drawn(scene)
     for mean, factors in zip(means, np.asarray(splats.conic_factors[0], np.float64), strict=True):
-        jacobian, (p, q, r) = np.asarray(jax.jacobian(pixel)(mean), np.float64), factors
+        jacobian, (p, q, r) = np.asarray(jacobian_at(mean), np.float64), factors
         wanted = np.linalg.inv(1e-4 * jacobian @ jacobian.T)
         np.testing.assert_allclose([[2 * p * p, 2 * p * q], [2 * p * q, 2 * (q * q + r * r)]], wanted, rtol=2e-3)
 

@@ -70,7 +70,7 @@ def assert_close(got, wanted, tolerance: float) -> None:
         assert (error <= tolerance * size + 1e-3 * tolerance * size.max()).all(), jax.tree_util.keystr(path)
 
 
-@pytest.mark.parametrize("antialias", ["mip", "none"])
+@pytest.mark.parametrize("antialias", ["mip", pytest.param("none", marks=pytest.mark.slow)])
 def test_the_gradient_is_the_automatic_one_in_float64(antialias):
     with jax.enable_x64(True):
         given = *inputs(np.float64), antialias

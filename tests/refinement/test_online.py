@@ -90,21 +90,26 @@ def tokens(seed: int = 0, behind: bool = False) -> Tokens:
     )
     rgbs = np.repeat(wall_colors(means)[:, None], CONFIG.head.gaussians_per_token, axis=1)
     rgbs = rgbs + 0.15 * rng.normal(size=rgbs.shape)
-    array = lambda value, *shape: jnp.broadcast_to(jnp.asarray(value, jnp.float32), (len(x), *shape))  # noqa: E731
-    return Tokens(
+    array = lambda value, *shape: np.broadcast_to(np.asarray(value, np.float32), (len(x), *shape))  # noqa: E731
+    arrays = dict(
         means=array(means, 3),
         feats=array(rng.normal(size=(len(x), 4)), 4),
         confidences=array(0.9),
         rgbs=array(rgbs.reshape(len(x), -1), rgbs[0].size),
         quats=array([1.0, 0, 0, 0], 4),
         footprints=array(4 * DEPTH / FOCAL),
-        valid=jnp.ones(len(x), bool),
+        valid=np.ones(len(x), bool),
     )
+    return Tokens(**jax.device_put(arrays))
 
 
 FUSE = jax.jit(fuse, static_argnums=2)
 _REVISE = jax.jit(functools.partial(refine_scene, MODEL))
 _DECODE = jax.jit(MODEL.decode)
+_EMPTY = jax.jit(lambda: init_cache(CONFIG))
+_WITH_REFINEMENT = jax.jit(lambda cache: with_refinement(cache, CONFIG, HIGH, WIDE))
+_CELLS = jax.jit(lambda cache: voxel_indices(cache.means, cache.footprints, CONFIG)[0])
+_CHANGE = jax.jit(lambda cache: unpack(cache.changes.reshape(-1, cache.changes.shape[-1])))
 
 
 def revise(cache, chunk, output):
@@ -117,15 +122,15 @@ def decode(cache):
 
 def start(*more: Tokens):
     """A cache after one chunk's tokens, before its first refinement."""
-    cache = init_cache(CONFIG)
+    cache = _EMPTY()
     for part in (tokens(), *more):
         cache = FUSE(cache, part, CONFIG)
-    return with_refinement(cache, CONFIG, HIGH, WIDE)
+    return _WITH_REFINEMENT(cache)
 
 
-def score(cache, shift: float = 0.05) -> float:
+def score(cache) -> float:
     """PSNR of a view that no chunk has shown."""
-    view = chunk((shift,))
+    view = chunk((0.05,))
     color = render(decode(cache), view.camera, max_pairs=1 << 12).color
     return psnr(np.clip(np.asarray(color[0]), 0, 1), np.asarray(view.images[0]))
 
@@ -148,8 +153,7 @@ def test_only_places_changes_and_key_views_differ():
         f.name for f in dataclasses.fields(before) if bits(getattr(before, f.name)) != bits(getattr(after, f.name))
     }
     assert changed == {"means", "changes", "key_views"}  # the first chunk wrote every pivot: last_chunks is 0 already
-    cells = lambda cache: np.asarray(voxel_indices(cache.means, cache.footprints, CONFIG)[0])  # noqa: E731
-    np.testing.assert_array_equal(cells(after), cells(before))
+    np.testing.assert_array_equal(_CELLS(after), _CELLS(before))
 
 
 def test_pivots_that_no_key_view_sees_keep_every_bit():
@@ -191,17 +195,16 @@ def test_any_key_views_leave_a_finite_bounded_scene(name):
     for _ in range(4):
         cache = revise(cache, *ADVERSARIES[name])
     assert all(np.isfinite(x).all() for x in jax.tree.leaves((decode(cache), cache.means, cache.changes)))
-    cells = lambda cache: np.asarray(voxel_indices(cache.means, cache.footprints, CONFIG)[0])  # noqa: E731
-    np.testing.assert_array_equal(cells(cache), cells(before))
-    change = unpack(cache.changes.reshape(-1, cache.changes.shape[-1]))
-    assert float(jnp.abs(change.means).max()) <= CONFIG.memory.voxel_size
-    assert float(jnp.abs(change.log_scales).max()) <= 1.5 and SH_C0 * float(jnp.abs(change.sh).max()) <= 2.0001
+    np.testing.assert_array_equal(_CELLS(cache), _CELLS(before))
+    change = jax.tree.map(np.asarray, _CHANGE(cache))
+    assert np.abs(change.means).max() <= CONFIG.memory.voxel_size
+    assert np.abs(change.log_scales).max() <= 1.5 and SH_C0 * np.abs(change.sh).max() <= 2.0001
     if name != "black":
         assert score(cache) > score(before) - 0.3
 
 
 def places_of_round(ring, arrivals, num_chunks: int, num: int) -> list[float]:
-    chosen = views_of_round(ring, arrivals, jnp.int32(num_chunks), num)
+    chosen = jax.jit(views_of_round, static_argnums=3)(ring, arrivals, jnp.int32(num_chunks), num)
     return [round(-float(x), 2) for x, valid in zip(chosen.viewmats[:, 0, 3], chosen.valid, strict=True) if valid]
 
 
@@ -231,23 +234,28 @@ def test_the_least_covered_pivots_are_taken_where_there_is_space_for_few(monkeyp
     front, is_left = tokens(), np.asarray(tokens().means[:, :1] < 0)
     front = replace(front, means=jnp.where(is_left, front.means, 2 * front.means))
     hidden = replace(tokens(4), means=tokens(4).means * 1.15, valid=jnp.asarray(is_left[:, 0]))
-    cache = init_cache(CONFIG)
+    cache = _EMPTY()
     for part in (front, hidden, tokens(3, behind=True)):
         cache = FUSE(cache, part, CONFIG)
-    cache = with_refinement(cache, CONFIG, HIGH, WIDE)
+    cache = _WITH_REFINEMENT(cache)
     views = with_key_views(cache)
     view, invalid = (jax.tree.map(lambda x: x[0], v) for v in (views, replace(views, valid=jnp.zeros(4, bool))))
     depths, alive = np.asarray(cache.means.reshape(-1, 3)[:, 2]), np.asarray(cache.alive.reshape(-1))
     in_sight = alive & (depths > 0)
     is_hidden = in_sight & (depths > 1.07 * DEPTH) & (depths < 1.5 * DEPTH)
     num_visible = int((in_sight & ~is_hidden).sum())
-    many = np.asarray(visible_pivots(cache, view, CONFIG))
+
+    def visible(*views):
+        program = jax.jit(lambda view: visible_pivots(cache, view, CONFIG))
+        return [np.asarray(program(view)) for view in views]
+
+    (many,) = visible(view)
     monkeypatch.setattr("ssplat_jax.refinement.online.PIVOTS_PER_CELL", 1)
-    pivots = np.asarray(visible_pivots(cache, view, CONFIG))
+    pivots, none = visible(view, invalid)
     assert is_hidden.sum() > 15 and 40 < num_visible <= len(pivots) == 48
     assert np.isin(np.flatnonzero(in_sight & ~is_hidden), pivots).mean() > 0.95
     assert sorted(many[many >= 0].tolist()) == np.flatnonzero(in_sight).tolist() and (many == -1).any()
-    assert (np.asarray(visible_pivots(cache, invalid, CONFIG)) == -1).all()
+    assert (none == -1).all()
 
 
 def test_areas_before_equal_sums_in_numpy():

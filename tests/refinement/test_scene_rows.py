@@ -23,6 +23,9 @@ from tests.refinement.test_refine import CONFIG, NUM, cameras, doubtful, key_vie
 module = importlib.import_module("ssplat_jax.refinement.refine_step")  # the package has a function of that name
 
 
+SEEN = jax.jit(may_be_seen)
+
+
 def wide() -> Gaussians:
     """`doubtful`, every other row of which stands outside all views or behind them."""
     given = doubtful()
@@ -44,13 +47,17 @@ def test_no_row_that_is_drawn_is_missing(antialias):
         sh=jnp.zeros((num, 1, 3)),
     )
     K = single([[90, 0, 25], [0, -70, 60], [0, 0, 1]])
+
+    @jax.jit
+    def drawn(camera):
+        _, flat, splats, _ = prepare(RenderInputs(gaussians, camera), Effects(antialias=antialias))
+        boxes = tile_boxes(splats.means2d, splats.radii, tile_grid_of(flat, 8))
+        return (splats.visible & (boxes[2] * boxes[3] > 0))[0]
+
     for focal in (1.0, 0.3, 4.0):
         scale = jnp.array([[focal, 1, 1], [1, focal, 1], [1, 1, 1]], jnp.float32)
         camera = Camera(viewmats=cameras().viewmats[1], Ks=K * scale, width=96, height=64)
-        _, flat, splats, _ = prepare(RenderInputs(gaussians, camera), Effects(antialias=antialias))
-        boxes = tile_boxes(splats.means2d, splats.radii, tile_grid_of(flat, 8))
-        is_drawn = np.asarray(splats.visible & (boxes[2] * boxes[3] > 0))[0]
-        is_seen = np.asarray(may_be_seen(gaussians, camera))
+        is_drawn, is_seen = np.asarray(drawn(camera)), np.asarray(SEEN(gaussians, camera))
         assert is_drawn.sum() > 1000 and not (is_drawn & ~is_seen).any()
         assert is_seen.sum() < 1.4 * is_drawn.sum()
 
@@ -58,24 +65,24 @@ def test_no_row_that_is_drawn_is_missing(antialias):
 def test_a_step_on_seen_rows_is_the_step_on_all():
     """A row that is not seen has moments of exactly zero; rows that do not fit are counted."""
     config, views = dataclasses.replace(CONFIG, shown_weight=0.7), key_views()
-    seen = jnp.stack([may_be_seen(wide(), cameras()[i]) for i in range(4)])
+    seen = jnp.stack([SEEN(wide(), cameras()[i]) for i in range(4)])
     max_rows = int(jnp.max(jnp.sum(seen, axis=1))) + 3  # three places stay empty
     assert max_rows < NUM / 2 and seen[:, 0].all()
-    wanted, all_rows = step(init_refinement(wide()), views, config=config)
-    got, report = step(init_refinement(wide()), views, config=config, max_rows=max_rows)
+    wanted, all_rows = step(init_refinement(wide(), CONFIG), views, config=config)
+    got, report = step(init_refinement(wide(), CONFIG), views, config=config, max_rows=max_rows)
     assert int(report.num_overflow) == int(report.num_missing_rows) == 0
     assert float(report.loss) == pytest.approx(float(all_rows.loss), rel=1e-6)
     for a, b in zip(jax.tree.leaves(got.adam.mu), jax.tree.leaves(wanted.adam.mu), strict=True):
         assert np.abs(b).max() > 0
         np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5 * np.abs(b).max())
         assert not np.asarray(a)[~np.asarray(seen).any(axis=0)].any()
-    _, report = step(init_refinement(doubtful()), views, config=config, max_rows=max_rows)
+    _, report = step(init_refinement(doubtful(), CONFIG), views, config=config, max_rows=max_rows)
     assert int(report.num_missing_rows) > 0 == int(report.num_overflow)
 
 
 def test_the_chosen_capacity_holds_every_step(monkeypatch):
     monkeypatch.setattr(module, "MIN_ROWS", 1)
-    masks, counts = [may_be_seen(wide(), cameras()[i]) for i in range(4)], []
+    masks, counts = [SEEN(wide(), cameras()[i]) for i in range(4)], []
     for i in range(3):
         views = views_of_step(jnp.int32(i), key_views().valid, CONFIG)
         counts.append(int(jnp.sum(masks[views[0]] | masks[views[1]])))

@@ -1,15 +1,14 @@
 """Every format: what is read is what was written, within half a step, and plain decoders get the same."""
 
 import dataclasses
+import functools
 import gzip
 import io
 import itertools
 import json
 import math
 import random
-import shutil
 import struct
-import subprocess
 import zipfile
 
 import jax.numpy as jnp
@@ -142,19 +141,20 @@ def test_a_loaded_scene_is_drawn_as_it_is_meant(tmp_path):
     plain, offset = scene(1, n=20), (2000.0, -500.0, 30.0)
     view = camera()
     far = replace(view, viewmats=view.viewmats.at[:3, 3].add(-view.viewmats[:3, :3] @ jnp.array(offset)))
-    classic, mip = (ss.render(plain, view, effects=ss.Effects(antialias=name)).color for name in ("classic", "mip"))
+    draw = functools.partial(ss.render, max_pairs=1 << 12)
+    classic, mip = (draw(plain, view, effects=ss.Effects(antialias=name)).color for name in ("classic", "mip"))
     assert np.abs(classic - mip).max() > 0.05
     for mode, wanted in (("default", classic), ("mip", mip)):
         for where, at in ((view, (0.0, 0.0, 0.0)), (far, offset)):
             ss.save_ply(tmp_path / "a.ply", plain, render_mode=mode, offset=at)
-            np.testing.assert_allclose(ss.render(ss.load_scene(tmp_path / "a.ply"), where).color, wanted, atol=2e-4)
+            np.testing.assert_allclose(draw(ss.load_scene(tmp_path / "a.ply"), where).color, wanted, atol=2e-4)
     ss.save_ply(tmp_path / "a.ply", plain, render_mode="2dgs")
     discs = ss.load_scene(tmp_path / "a.ply")
     with pytest.raises(InputError, match="made for 2dgs"):
         ss.render(discs, view)
     same = changed_gaussians(discs, no_change(discs))  # as refinement changes it
     assert (same.render_mode, same.offset) == ("2dgs", (0.0, 0.0, 0.0))
-    drawn = ss.render(same, view, effects=ss.Effects(antialias="classic")).color
+    drawn = draw(same, view, effects=ss.Effects(antialias="classic")).color
     np.testing.assert_allclose(drawn, classic, atol=2e-4)
 
 
@@ -221,19 +221,6 @@ def test_bytes_of_a_spz(tmp_path):
     assert old == b"NGSP" + struct.pack("<IIBBBB", 3, 1, 0, 21, 1, 0) + b"".join(fields)
     with pytest.raises(InputError, match="version 3 or 4"):
         save_gaussians(tmp_path / "c.spz", ONE, spz_version=2)
-
-
-@pytest.mark.skipif(shutil.which("splat-transform") is None, reason="npm install -g @playcanvas/splat-transform")
-def test_spz_goes_to_and_from_playcanvas(tmp_path):
-    gaussians, steps = scene_for(), STEPS[".spz"]
-    convert = lambda *names: subprocess.run(["splat-transform", "-w", *names], check=True, cwd=tmp_path)  # noqa: E731
-    ss.save_spz(tmp_path / "ours.spz", gaussians)
-    convert("ours.spz", "back.ply")
-    assert_same(ss.load_scene(tmp_path / "back.ply"), gaussians, steps)
-    ss.save_ply(tmp_path / "ours.ply", gaussians)
-    convert("ours.ply", "theirs.spz")  # with SH of 5 and 4 bits, and 12 bits after the point
-    coarse = dataclasses.replace(steps, rest=1 / 16 + steps.rest, means=2.0**-12, constant=2 * steps.constant)
-    assert_same(ss.load_scene(tmp_path / "theirs.spz"), gaussians, coarse)
 
 
 @pytest.mark.parametrize("axes", ["RUB", "RDF", "LUF", "RUF", "LFD", "RBU"])

@@ -128,7 +128,7 @@ def wave(tree):
 
 @functools.cache
 def anchoring(config):
-    views = prepare_views(chunk(), CONFIG)
+    views = jax.jit(prepare_views, static_argnums=1)(chunk(), CONFIG)
 
     def run(logits, raw_gamma, log_candidates, past):
         probs = jax.nn.softmax(logits)

@@ -96,7 +96,8 @@ def test_attention_to_no_valid_key_is_zero_with_a_zero_gradient():
     q, k, v = attention_arrays()
     none = jnp.zeros((2, 1, 7), bool)
     np.testing.assert_array_equal(attend(q, k, v, none), 0)
-    for gradient in jax.grad(lambda *x: jnp.sum(attend(*x, none) ** 2 + attend(*x, none)), (0, 1, 2))(q, k, v):
+    loss = lambda *x: jnp.sum(attend(*x, none) ** 2 + attend(*x, none))  # noqa: E731
+    for gradient in jax.jit(jax.grad(loss, (0, 1, 2)))(q, k, v):
         np.testing.assert_array_equal(gradient, 0)
 
 
@@ -113,12 +114,14 @@ def test_attend_per_query_equals_attend_with_one_head():
     rng = np.random.default_rng(0)
     q, k, v = (jnp.asarray(rng.normal(size=shape), jnp.float32) for shape in ((6, 20), (6, 5, 20), (6, 5, 20)))
     allowed = jnp.asarray(rng.uniform(size=(6, 5)) < 0.6).at[2].set(False)
-    one_head = lambda q, k, v: attend(q[:, None, None], k[:, :, None], v[:, :, None], allowed[:, None])[:, 0, 0]  # noqa: E731
-    own = lambda q, k, v: attend_per_query(q, k, v, allowed)  # noqa: E731
+    one_head = jax.jit(
+        lambda q, k, v: attend(q[:, None, None], k[:, :, None], v[:, :, None], allowed[:, None])[:, 0, 0]
+    )
+    own = jax.jit(lambda q, k, v: attend_per_query(q, k, v, allowed))
     np.testing.assert_allclose(own(q, k, v), one_head(q, k, v), atol=1e-6)
     np.testing.assert_array_equal(own(q, k, v)[2], 0)
     np.testing.assert_array_equal(own(q, k, v), own(q, *(jnp.where(allowed[..., None], x, 1e6) for x in (k, v))))
-    gradients = (jax.grad(lambda *x, f=f: jnp.sum(f(*x) ** 2), (0, 1, 2))(q, k, v) for f in (own, one_head))
+    gradients = (jax.jit(jax.grad(lambda *x, f=f: jnp.sum(f(*x) ** 2), (0, 1, 2)))(q, k, v) for f in (own, one_head))
     for got, wanted in zip(*gradients, strict=True):
         np.testing.assert_allclose(got, wanted, atol=1e-5)
         np.testing.assert_array_equal(got[2], 0)

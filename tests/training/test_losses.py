@@ -56,10 +56,11 @@ def test_unusable_cells_have_neither_value_nor_gradient_in_the_depth_loss():
     logits = jnp.asarray(rng.normal(size=(1, 2, 3, 5)), jnp.float32)
     predicted, usable = truth + 0.2, jnp.array([[[True, False, True], [False, True, True]]])
 
+    @jax.jit
     def loss(logits, predicted, truth, usable):
         return sum(depth_loss(logits, predicted, truth, candidates, usable, target_width=WIDTH))
 
-    value, gradients = jax.value_and_grad(loss, argnums=(0, 1))(logits, predicted, truth, usable)
+    value, gradients = jax.jit(jax.value_and_grad(loss, argnums=(0, 1)))(logits, predicted, truth, usable)
     # As if those cells did not exist: the mean is over the others.
     kept = np.asarray(usable)
     alone = loss(*(x[kept][None, None] for x in (logits, predicted, truth, usable)))
@@ -68,16 +69,19 @@ def test_unusable_cells_have_neither_value_nor_gradient_in_the_depth_loss():
         assert not np.asarray(gradient)[~kept].any() and np.asarray(gradient)[kept].all()
 
 
-@pytest.mark.parametrize("unknown", [-np.inf, np.inf, np.nan, 3.0])
 @pytest.mark.parametrize("candidates", [np.linspace(0.0, 1.0, 5), np.zeros(1)], ids=["five", "one"])
-def test_cells_of_unknown_depth_leave_the_loss_finite(candidates, unknown):
-    candidates = jnp.asarray(candidates, jnp.float32)
-    truth, usable = jnp.array([[[0.5, unknown]]]), jnp.ones((1, 1, 2), bool)
-    logits = jnp.zeros((1, 1, 2, len(candidates)))
-    loss = lambda x, y: sum(depth_loss(x, y, truth, candidates, usable, target_width=WIDTH))  # noqa: E731
-    value, gradients = jax.value_and_grad(loss, argnums=(0, 1))(logits, jnp.full((1, 1, 2), 0.2))
-    assert np.isfinite(value) and all(np.isfinite(g).all() for g in gradients)
-    assert not any(np.asarray(g)[0, 0, 1].any() for g in gradients)
+def test_cells_of_unknown_depth_leave_the_loss_finite(candidates):
+    logits, usable = jnp.zeros((1, 1, 2, len(candidates))), jnp.ones((1, 1, 2), bool)
+
+    def loss(logits, predicted, unknown):
+        truth, values = jnp.array([[[0.5, 0.0]]]).at[0, 0, 1].set(unknown), jnp.asarray(candidates, jnp.float32)
+        return sum(depth_loss(logits, predicted, truth, values, usable, target_width=WIDTH))
+
+    sloped = jax.jit(jax.value_and_grad(loss, argnums=(0, 1)))
+    for unknown in (-np.inf, np.inf, np.nan, 3.0):
+        value, gradients = sloped(logits, jnp.full((1, 1, 2), 0.2), jnp.float32(unknown))
+        assert np.isfinite(value) and all(np.isfinite(g).all() for g in gradients)
+        assert not any(np.asarray(g)[0, 0, 1].any() for g in gradients)
 
 
 def test_gradients_of_losses_are_finite_differences():
@@ -94,8 +98,9 @@ def test_gradients_of_losses_are_finite_differences():
             (lambda x: negative_psnr(x[0], targets[0]), (images,)),
         ]
         for loss, arguments in cases:
+            loss = jax.jit(loss)
             directions = tuple(jnp.asarray(rng.normal(size=x.shape)) for x in arguments)
-            _, found = jax.jvp(loss, arguments, directions)
+            found = jax.jit(lambda *x: jax.jvp(loss, arguments, x)[1])(*directions)  # noqa: B023
             at = lambda h: loss(*(x + h * d for x, d in zip(arguments, directions, strict=True)))  # noqa: E731, B023
             assert float(found) == pytest.approx(float(at(1e-6) - at(-1e-6)) / 2e-6, rel=1e-5)
 
@@ -130,11 +135,10 @@ def test_the_loss_of_a_crop_is_its_psnr_less_what_lpips_costs_filled_and_over_bl
     psnrs = [-10 * np.log10(((x - target) ** 2).mean() + losses.MIN_MSE) for x in (0.25, 0.0)]
     costs = [20.0 * 3.0 * np.abs(x - target).max() for x in (0.25, 0.0)]
     loss = jax.jit(functools.partial(CropLoss(black_weight=0.4, lpips_weight=20.0), model))
-    for weights, times in ((None, 0), (LpipsWeights((), (), ()), 1)):
-        value, metrics = loss(params, (crop,), weights)
-        wanted = sum(share * (times * cost - x) for share, cost, x in zip((0.6, 0.4), costs, psnrs, strict=True))
-        assert float(value) == pytest.approx(wanted, rel=1e-5) and ("lpips" in metrics) == bool(times)
-        assert float(metrics["psnr_over_black"]) == pytest.approx(psnrs[1], rel=1e-5)
+    value, metrics = loss(params, (crop,), LpipsWeights((), (), ()))
+    wanted = sum(share * (cost - x) for share, cost, x in zip((0.6, 0.4), costs, psnrs, strict=True))
+    assert float(value) == pytest.approx(wanted, rel=1e-5)
+    assert float(metrics["psnr_over_black"]) == pytest.approx(psnrs[1], rel=1e-5)
 
 
 def test_masked_pixels_of_a_target_have_neither_value_nor_gradient():
@@ -154,8 +158,6 @@ def test_masked_pixels_of_a_target_have_neither_value_nor_gradient():
     value, gradient = of(gaussians, targets, seen)
     other = of(gaussians, jnp.where(seen[..., None], targets, 1 - targets), seen)
     assert value == other[0] > 0 and jax.tree.all(jax.tree.map(np.array_equal, gradient, other[1]))
-    everything, without = of(gaussians, targets, seen | True)[0], of(gaussians, targets, None)[0]
-    assert without == pytest.approx(float(everything), rel=1e-6)
     assert of(gaussians, targets, seen & False)[0] == 0.0
 
 
@@ -212,8 +214,8 @@ def test_a_crop_is_a_part_of_the_image():
     gaussians = cloud(40, degree=0, size=0.1)
     K = jnp.array([[60.0, 0.0, 40.0], [0.0, 60.0, 30.0], [0.0, 0.0, 1.0]])
     camera = Camera(viewmats=jnp.eye(4), Ks=K, width=80, height=60)
-    whole = render(gaussians, camera).color
-    part = render(gaussians, crop_camera(camera, 7, 13, 32, 48)).color
+    whole = render(gaussians, camera, max_pairs=1 << 12).color
+    part = render(gaussians, crop_camera(camera, 7, 13, 32, 48), max_pairs=1 << 12).color
     np.testing.assert_allclose(part, whole[7 : 7 + 32, 13 : 13 + 48], atol=1 / 255)  # tiles cut faint rims
 
 

@@ -14,7 +14,7 @@ from ssplat_jax.data.procedural.procedural_views import training_sample
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.storage.saved_states import first_difference
 from ssplat_jax.training import loop
-from ssplat_jax.training.recipe import RECIPES, Recipe
+from ssplat_jax.training.recipe import RECIPES
 from ssplat_jax.training.samples import (
     CaptureGroup,
     CaptureMix,
@@ -29,14 +29,14 @@ from tests.badinputs.cases import make_capture
 from tests.streaming.narrow_model import NARROW, assert_same_bits
 from tests.training.problems import STREAM_PHASE
 
-NUM_FRAMES, SIZE = 22, (64, 96)  # height and width
+NUM_FRAMES, SIZE = 22, (32, 48)  # height and width
 VIEWS = ViewSamples(num_chunks=2, sizes=(SIZE,), num_targets=3)
 SMALL = ViewSamples(num_chunks=1, sizes=((32, 48),))
 
 
 @pytest.fixture(scope="module")
 def capture():
-    return open_capture(f"procedural:room?frames={NUM_FRAMES}&size=96x64")
+    return open_capture(f"procedural:room?frames={NUM_FRAMES}&size=48x32")
 
 
 @pytest.fixture(scope="module")
@@ -175,17 +175,17 @@ def test_frames_without_depth_have_unknown_depths(mix, capture):
 def test_masks_of_a_capture_are_masks_of_its_samples(capture):
     """A procedural step beside it has masks that hide nothing, so that one program serves both."""
     masks = np.ones((NUM_FRAMES, *SIZE), bool)
-    masks[::2, 10:30] = False
+    masks[::2, 5:15] = False
     frames = tuple(dataclasses.replace(f, is_masked=i % 2 == 0) for i, f in enumerate(capture.frames))
     pixels = dataclasses.replace(capture.pixels, masks=masks)
     mix = mix_of(dataclasses.replace(capture, frames=frames, pixels=pixels), share=0.5)
-    sample = opened(VIEWS, mix)
-    shares = [np.mean(s.target_seen) for s in map(sample, range(8), [0] * 8)]
+    samples = list(map(opened(VIEWS, mix), range(8), [0] * 8))
+    shares = [np.mean(sample.target_seen) for sample in samples]
     assert 1.0 in shares and min(shares) < 1
-    hidden = next(s for s in map(sample, range(8), [0] * 8) if not s.chunks.seen.all())
+    hidden = next(sample for sample in samples if not sample.chunks.seen.all())
     seen = np.concatenate([hidden.chunks.seen.reshape(-1, *SIZE), hidden.target_seen.reshape(-1, *SIZE)])
     for view in seen:
-        assert view.all() or not view[12:28].any()
+        assert view.all() or not view[6:14].any()
 
 
 def test_steps_are_shared_as_asked(capture):
@@ -230,10 +230,3 @@ def test_a_run_with_other_files_of_a_capture_is_another_run(tmp_path):
     file = tmp_path / "c" / "images" / "2.jpg"
     file.write_bytes(file.read_bytes() + b"\0")
     assert first_difference(before, described())[0].startswith("captures[0][2][0]")
-
-
-@pytest.mark.slow  # compiles a step that renders
-def test_training_on_a_capture_renders_its_targets(mix, tmp_path):
-    records, recipe = [], Recipe((dataclasses.replace(STREAM_PHASE, steps=1),))
-    loop.train(NARROW, recipe, tmp_path, mix=mix, report=records.append)
-    assert [record["step"] for record in records] == [1] and 3 < records[0]["psnr"] < 60
