@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from skimage.metrics import structural_similarity
 
 from ssplat_jax.cache.changes import apply_change, changed_gaussians, no_change
 from ssplat_jax.core.cameras import Camera
@@ -19,7 +20,7 @@ from ssplat_jax.rasterizer import Effects, fill_holes, render
 from ssplat_jax.rasterizer.constants import ALPHA_MIN
 from ssplat_jax.rasterizer.reference import render_reference
 from ssplat_jax.refinement import KeyViews, RefineConfig, init_refinement, refine
-from ssplat_jax.refinement.compared_views import held_back_pixels, next_view, view_loss, views_of_step
+from ssplat_jax.refinement.compared_views import dissimilarity, held_back_pixels, next_view, view_loss, views_of_step
 from ssplat_jax.refinement.refine_step import MAX_LOG_SCALE_CHANGE, MAX_SHIFT, RATES, RefineState, sizes
 from tests.streaming.narrow_model import assert_same_bits
 
@@ -110,7 +111,11 @@ def test_the_gradient_is_that_of_the_reference_renderer():
             given = jax.tree.map(lambda x: jnp.asarray(np.asarray(x, np.float64)), single)
             filled, color = map(np.asarray, drawn(*given))
         errors = 0.7 * np.abs(0.9 * filled - target) + 0.3 * np.abs(0.9 * color - target)
-        return float(errors.mean(axis=-1)[~held_back].mean())
+        image = 0.9 * (0.7 * filled + 0.3 * color)
+        image, photo = (np.where(held_back[..., None], 0.5, x) for x in (image, target))
+        window = {"win_size": 11, "gaussian_weights": True, "use_sample_covariance": False}
+        _, alike = structural_similarity(image, photo, **window, data_range=1.0, channel_axis=-1, full=True)
+        return float((0.8 * errors + 0.2 * (1 - alike)).mean(axis=-1)[~held_back].mean())
 
     zero = no_change(start)
     value, gradient = jax.jit(jax.value_and_grad(loss))(zero)
@@ -292,3 +297,14 @@ def test_arguments_that_do_not_fit_are_refused():
         given = {"cameras": cameras(), "images": photographs(), "steps": 1} | changes
         with pytest.raises(InputError):
             refine(doubtful(), given.pop("cameras"), given.pop("images"), **given)
+
+
+def test_ssim_of_equal_and_of_flat_images_has_finite_gradients():
+    """Equal images have no gradient: a scene that fits stays as it is."""
+    measured = jax.jit(jax.value_and_grad(lambda image, photo: jnp.mean(dissimilarity(image, photo))))
+    value, gradient = measured(photographs()[0], photographs()[0])
+    assert abs(float(value)) < 1e-6 and float(jnp.abs(gradient).max()) < 1e-5
+    for level in (0.0, 0.5, 1.0):
+        flat = jnp.full((HEIGHT, WIDTH, 3), level)
+        value, gradient = measured(0.9 * flat + 0.05, flat)
+        assert 0 <= float(value) <= 2 and np.isfinite(gradient).all()
