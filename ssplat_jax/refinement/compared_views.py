@@ -95,7 +95,7 @@ def view_loss(
 ) -> tuple[Float[Array, ""], tuple[Float[Array, ""], Float[Array, ""], Int[Array, ""]]]:
     """Loss of the key view in `slot`: the L1 error with holes filled and over black, and SSIM of a mixture of both.
 
-    Pixels that are held back, or not seen, take no part: for SSIM, whose windows reach them, both images are gray there.
+    Pixels that are held back, or not seen, take no part; SSIM, whose windows reach them, finds both images gray there.
 
     Returns:
         The loss, and the L1 errors of the pixels that are learned from and of those that are held back, and the tile
