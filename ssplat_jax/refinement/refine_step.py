@@ -27,7 +27,7 @@ from ssplat_jax.rasterizer import constants
 from ssplat_jax.rasterizer.effects import camera_points, near_planes
 from ssplat_jax.refinement.compared_views import RefineConfig, view_loss, views_of_step
 
-RATES = {"means": 0.04, "quats": 0.003, "log_scales": 0.02, "logit_opacities": 0.2, "sh": 0.015}
+RATES = {"means": 0.08, "quats": 0.003, "log_scales": 0.02, "logit_opacities": 0.2, "sh": 0.015}
 """Adam's learning rates in `units`: about the change per step of a parameter whose gradient keeps its sign."""
 
 HIGHER_BANDS = 0.1  # rate of the higher SH bands as a fraction of that of the constant one: fewer views tell of them
