@@ -24,11 +24,10 @@ from ssplat_jax.rasterizer.binning import Grid, intersect_tiles, sorted_table
 from ssplat_jax.rasterizer.compositing import composite
 from ssplat_jax.rasterizer.effects import Effects
 from ssplat_jax.rasterizer.outputs import splat_channels
-from ssplat_jax.rasterizer.render import RenderInputs, prepare, render, round_up
+from ssplat_jax.rasterizer.render import TILE, RenderInputs, prepare, render, round_up
 
 EFFECTS = Effects(antialias="classic")
 SIZES = ((65_536, 256, 256), (262_144, 512, 512))  # Gaussians, width and height
-TILE = 8  # side of the tiles of these scenes, pixels
 LARGE = ((4_096, 128, 128), (16_384, 128, 128), (524_288, 724, 724), (1_048_576, 1024, 1024), (1_048_576, 1920, 1080))
 
 

@@ -22,12 +22,11 @@ from ssplat_jax.rasterizer.outputs import RenderOutput, finish, splat_channels
 from ssplat_jax.rasterizer.pinhole_projection import project_pinhole
 from ssplat_jax.rasterizer.projection import cull_cameras, cull_non_finite, project
 
-TILES = (4, 8, 16)
-"""The sides of tiles that are tested and measured, pixels."""
+TILE = 8
+"""Default side of a tile, pixels."""
 
-DENSE = 4
-"""Gaussians a pixel above which tiles have 4 pixels a side by default, not 8: such Gaussians are small, and most pixels
-of a larger tile lie outside of them (64 views of redkitchen: a gradient takes 0.6 of the time)."""
+TILES = (4, 8, 16)
+"""The sides of tiles that are tested and measured."""
 
 MIN_CAPACITY = 1 << 12
 """Least capacity for pairs that `render` chooses."""
@@ -64,7 +63,7 @@ def render(
     exposures: Float[Array, "*b 3 4"] | None = None,
     near: float | None = None,
     max_pairs: int | None = None,
-    tile: int | None = None,
+    tile: int = TILE,
 ) -> RenderOutput:
     """Images of Gaussians, differentiable in every array.
 
@@ -90,8 +89,8 @@ def render(
             counted in the first render of a kind, and again where there are more. Inside jit and other transforms that
             hide the values it is four for each Gaussian and camera, and a warning says if that was too few. The
             farthest Gaussians are left out; `num_overflow` counts the pairs.
-        tile: side of a tile in pixels: 4, 8 or 16. By default 4 in scenes of more than four Gaussians a pixel, else 8;
-            choose 16 where most Gaussians are larger than 8 pixels.
+        tile: side of a tile in pixels, 4, 8 or 16; choose 16 where most Gaussians are larger than 8 pixels, and 4 for
+            gradients of scenes whose Gaussians are smaller than a pixel.
 
     Returns:
         Images with the camera's batch axes, and counts of what was left out.
@@ -114,7 +113,6 @@ def render(
     inputs = _at_least_one_row(inputs)
     if max_pairs is not None and not (is_whole(max_pairs) and max_pairs >= 1):
         raise InputError(f"render: max_pairs must be a whole number of at least 1, got {echo(max_pairs)}.")
-    tile = default_tile(gaussians, camera) if tile is None else tile
     if not (is_whole(tile) and tile in TILES):
         raise InputError(f"render: tile must be 4, 8 or 16 pixels, got {echo(tile)}.")
     # NumPy's integers, as of an image's shape, count as whole numbers, but have no `bit_length`.
@@ -145,11 +143,11 @@ def render(
     return out
 
 
-def count_pairs(gaussians: Gaussians, camera: Camera, effects: Effects) -> Int[Array, ""]:
+def count_pairs(gaussians: Gaussians, camera: Camera, effects: Effects, tile: int = TILE) -> Int[Array, ""]:
     """`RenderOutput.num_pairs` of a render without further arrays, at a third of its cost."""
     effects = effects.resolve(gaussians.render_mode, captured=None, distortion=None, exposures=None)
     inputs = _at_least_one_row(_at_the_origin(RenderInputs(gaussians, camera)))
-    return _count(inputs, effects, default_tile(gaussians, camera))
+    return _count(inputs, effects, tile)
 
 
 _CAPACITIES: dict[tuple, int] = {}
@@ -205,11 +203,6 @@ def _at_least_one_row(inputs: RenderInputs) -> RenderInputs:
         return inputs
     one = jax.tree.map(lambda x: jnp.zeros((1, *x.shape[1:]), x.dtype), (inputs.gaussians, inputs.features))
     return replace(inputs, gaussians=one[0], features=one[1])
-
-
-def default_tile(gaussians: Gaussians, camera: Camera) -> int:
-    """The side of a tile that `render` chooses, pixels."""
-    return 4 if gaussians.num_gaussians > DENSE * camera.width * camera.height else 8
 
 
 def default_max_pairs(gaussians: Gaussians, camera: Camera) -> int:
@@ -330,8 +323,7 @@ def render_program(gaussians: Gaussians, camera: Camera, max_pairs: int) -> jax.
         max_pairs: capacity for tile intersections.
     """
     effects = Effects().resolve("mip", captured=None, distortion=None, exposures=None)
-    tile = default_tile(gaussians, camera)
-    return _render_jit.program(RenderInputs(gaussians, camera), effects, round_up(max_pairs), tile)
+    return _render_jit.program(RenderInputs(gaussians, camera), effects, round_up(max_pairs), TILE)
 
 
 def _untile(tiles: Num[Array, "tiles c p"], grid: Grid) -> Num[Array, "b h w c"]:

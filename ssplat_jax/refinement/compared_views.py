@@ -14,6 +14,7 @@ from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.core.kept_programs import Kept
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.rasterizer import Effects, RenderOutput, fill_holes, render
+from ssplat_jax.rasterizer.render import TILE
 
 EFFECTS = Effects(outputs=("color", "alpha"))
 BLOCK = 8  # side of the pixel blocks that are held back together: neighbors of a pixel give its color away
@@ -65,6 +66,7 @@ def errors_of_view(
     view: KeyViews,
     *,
     max_pairs: int,
+    tile: int = TILE,
     probe: Float[Array, "n c"] | None = None,
 ) -> tuple[Float[Array, "h w 3"], Float[Array, "h w 3"], RenderOutput]:
     """Differences between the render of a view and its photograph, at the photograph's exposure.
@@ -74,12 +76,13 @@ def errors_of_view(
         background: color that fills holes, at the exposure of the scene.
         view: one view, without a batch axis.
         max_pairs: capacity for tile intersections (static).
+        tile: side of a tile (static), pixels.
         probe: channels that are rendered beside the colors.
 
     Returns:
         The difference with holes filled, the difference over black, and the render.
     """
-    out = render(gaussians, view.camera(), effects=EFFECTS, features=probe, max_pairs=max_pairs)
+    out = render(gaussians, view.camera(), effects=EFFECTS, features=probe, max_pairs=max_pairs, tile=tile)
     target = view.colors
     filled = fill_holes(out.color, out.alpha, background)
     return filled * view.exposures - target, out.color * view.exposures - target, out
@@ -92,6 +95,7 @@ def view_loss(
     slot: Int[Array, ""],
     config: RefineConfig,
     max_pairs: int,
+    tile: int = TILE,
 ) -> tuple[Float[Array, ""], tuple[Float[Array, ""], Float[Array, ""], Int[Array, ""]]]:
     """Loss of the key view in `slot`: the L1 error with holes filled and over black, and SSIM of a mixture of both.
 
@@ -101,7 +105,7 @@ def view_loss(
         The loss, and the L1 errors of the pixels that are learned from and of those that are held back, and the tile
         intersections that did not fit.
     """
-    filled, black, out = errors_of_view(gaussians, background, view, max_pairs=max_pairs)
+    filled, black, out = errors_of_view(gaussians, background, view, max_pairs=max_pairs, tile=tile)
     errors = jnp.mean(config.shown_weight * jnp.abs(filled) + (1 - config.shown_weight) * jnp.abs(black), axis=-1)
     held_back = held_back_pixels(errors.shape, slot, config)
     learned, held_back = (
@@ -178,7 +182,7 @@ def golden_fractions(numbers: Int[Array, " n"]) -> Float[Array, " n"]:
     return (numbers.astype(jnp.uint32) * jnp.uint32(GOLDEN)).astype(jnp.float32) / 2.0**32  # the product wraps around
 
 
-def only_usable(gaussians: Gaussians, key_views: KeyViews, max_pairs: int) -> KeyViews:
+def only_usable(gaussians: Gaussians, key_views: KeyViews, max_pairs: int, tile: int = TILE) -> KeyViews:
     """`key_views` whose unusable views are not valid. It looks at values: call it outside jit.
 
     A view is unusable if its exposure is not finite and positive, if its camera is not finite, or if its error is more
@@ -191,7 +195,7 @@ def only_usable(gaussians: Gaussians, key_views: KeyViews, max_pairs: int) -> Ke
     """
     is_usable = np.array(_usable(key_views))
     slots, on_host = np.flatnonzero(is_usable), jax.device_get(key_views)
-    errors = np.array([float(_covered_error(gaussians, on_host.at(slot), max_pairs)) for slot in slots])
+    errors = np.array([float(_covered_error(gaussians, on_host.at(slot), max_pairs, tile)) for slot in slots])
     is_usable[slots[contradicting(errors)]] = False
     if not is_usable.any():
         raise InputError(
@@ -213,10 +217,10 @@ def contradicting(errors: Float[np.ndarray, " v"]) -> Int[np.ndarray, " b"]:
     return worst_first[errors[worst_first] > WORSE_THAN_USUAL * np.median(errors[is_known])]
 
 
-@functools.partial(Kept, static_argnums=(2,))
-def _covered_error(gaussians: Gaussians, view: KeyViews, max_pairs: int) -> Float[Array, ""]:
+@functools.partial(Kept, static_argnums=(2, 3))
+def _covered_error(gaussians: Gaussians, view: KeyViews, max_pairs: int, tile: int) -> Float[Array, ""]:
     """Mean absolute error of a view over what the scene covers of it; NaN if it covers next to nothing."""
-    out = render(gaussians, view.camera(), effects=EFFECTS, max_pairs=max_pairs)
+    out = render(gaussians, view.camera(), effects=EFFECTS, max_pairs=max_pairs, tile=tile)
     alpha = out.alpha if view.seen is None else jnp.where(view.seen, out.alpha, 0.0)
     # The uncovered share of a pixel is compared with nothing.
     errors = jnp.mean(jnp.abs(out.color * view.exposures - out.alpha[..., None] * view.colors), axis=-1)

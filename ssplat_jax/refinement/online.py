@@ -42,7 +42,7 @@ MIN_PIXELS = 0.3  # added to the pixels that a Gaussian fills: one that hardly s
 SHOWN_WEIGHT = 0.7  # of the error with holes filled; the rest is the error over black
 PIVOTS_PER_CELL = 8  # pivots that a step changes over the grid cells of its view, which bounds its time and memory
 LISTED_PER_CELL = 64  # most pivots of a view that are compared, over its grid cells; the last rows are left out
-PAIRS_PER_GAUSSIAN = 5  # capacity for tile intersections; the farthest Gaussians of a view are left out beyond it
+PAIRS_PER_GAUSSIAN = 3  # capacity for tile intersections; the farthest Gaussians of a view are left out beyond it
 
 
 def online_refinement(model: StreamSplat) -> RefineChunk | None:

@@ -25,6 +25,7 @@ from ssplat_jax.core.numerics import power_of_two
 from ssplat_jax.core.pytree import pytree, replace
 from ssplat_jax.rasterizer import constants
 from ssplat_jax.rasterizer.effects import camera_points, near_planes
+from ssplat_jax.rasterizer.render import TILE
 from ssplat_jax.refinement.compared_views import RefineConfig, view_loss, views_of_step
 
 RATES = {"means": 0.08, "quats": 0.003, "log_scales": 0.02, "logit_opacities": 0.2, "sh": 0.015}
@@ -100,6 +101,7 @@ def refine_step(
     config: RefineConfig,
     max_pairs: int,
     max_rows: int | None = None,
+    tile: int = TILE,
 ) -> tuple[RefineState, StepReport]:
     """One step on `config.views_per_step` key views. A `lax.scan` body over `rate`; donate `state`.
 
@@ -111,6 +113,7 @@ def refine_step(
         max_pairs: capacity for tile intersections (static); `StepReport.num_overflow` says what did not fit.
         max_rows: capacity for the rows that the step's views may see (static): all but Adam is done for them alone. By
             default, and where it holds every row, nothing is selected. The result is the same.
+        tile: side of a tile (static), pixels.
 
     Returns:
         The state after the step, and what was measured before it.
@@ -127,7 +130,7 @@ def refine_step(
         start, change = jax.tree.map(lambda x: x.at[rows].get(mode="fill", fill_value=0), (start, change))
 
     def loss(change: Change, slot: Int[Array, ""]):
-        return view_loss(apply_change(start, change), background, key_views.at(slot), slot, config, max_pairs)
+        return view_loss(apply_change(start, change), background, key_views.at(slot), slot, config, max_pairs, tile)
 
     def add_view(total: Change, slot: Int[Array, ""]):
         gradient, measured = jax.grad(loss, has_aux=True)(change, slot)

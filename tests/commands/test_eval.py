@@ -21,6 +21,7 @@ def timed_once(monkeypatch):
     monkeypatch.setattr(cost, "NUM_REPEATS", 1)
 
 
+@pytest.mark.slow
 def test_an_index_sets_the_order_of_the_stream(tmp_path, narrow, monkeypatch):
     order = []
     views = Capture._views
@@ -98,6 +99,7 @@ def test_contradictory_frames_are_bad_usage(options, words, tmp_path, narrow, ca
     assert words in line.replace('"', "'") and not out.exists()
 
 
+@pytest.mark.slow
 def test_an_evaluation_refines_at_the_streamed_size_and_scores_at_the_captures(tmp_path, narrow):
     out = tmp_path / "eval"
     capture = make_capture(tmp_path / "capture", num_frames=12, size=(128, 96))

@@ -33,6 +33,7 @@ def plain_environment(folder: Path | str) -> dict[str, str]:
     return {name: value for name, value in os.environ.items() if name not in names} | {SWITCH: str(folder)}
 
 
+@pytest.mark.slow
 def test_kept_programs_give_the_same_bytes_say_nothing_and_a_cut_one_is_replaced(tmp_path):
     results = []
     for where in ("off", tmp_path, tmp_path, tmp_path):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ssplat_jax.rasterizer import Effects, render
-from ssplat_jax.rasterizer.render import DENSE, TILES, default_tile
+from ssplat_jax.rasterizer.render import TILES
 from tests.rasterizer.scenes import cameras, cloud
 
 EFFECTS = Effects(outputs=("color", "alpha", "depth", "median_depth"))
@@ -30,9 +30,3 @@ def test_images_and_gradients_are_those_of_any_tile():
         np.testing.assert_allclose(other_median, median, atol=2e-5)
         for a, b in zip(jax.tree.leaves(other_gradient), jax.tree.leaves(gradient), strict=True):
             assert np.linalg.norm(a - b) < 1e-4 * np.linalg.norm(b)
-
-
-def test_scenes_of_more_gaussians_than_pixels_have_small_tiles():
-    camera = cameras(4, 4)
-    assert default_tile(cloud(DENSE * 16 + 1), camera) == 4
-    assert default_tile(cloud(DENSE * 16), camera) == 8

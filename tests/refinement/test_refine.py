@@ -73,9 +73,9 @@ def key_views(images=None, exposures=None) -> KeyViews:
     return KeyViews.of(cameras(), photographs() if images is None else images, exposures)
 
 
-def step(state, views, rate=1.0, config=CONFIG, max_rows=NUM):
+def step(state, views, rate=1.0, config=CONFIG, max_rows=NUM, tile=8):
     """A step by the program that `refine` runs; it consumes the state."""
-    return module._compiled(config, MAX_PAIRS, max_rows)(state, views, jnp.float32(rate))
+    return module._compiled(config, MAX_PAIRS, max_rows, tile)(state, views, jnp.float32(rate))
 
 
 def first_state() -> RefineState:
@@ -263,7 +263,7 @@ def test_gaussians_that_fade_are_removed_and_no_image_changes():
 @pytest.fixture
 def same_capacity(monkeypatch):
     """Lets `refine` run the program of `step`."""
-    monkeypatch.setattr(module, "pairs_capacity", lambda *given: MAX_PAIRS)
+    monkeypatch.setattr(module, "tiles_for", lambda *given: (8, MAX_PAIRS))
 
 
 def test_refinement_learns_a_scene_that_turns_its_colors_and_ends_on_one_that_fits(same_capacity):

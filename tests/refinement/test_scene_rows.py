@@ -16,9 +16,9 @@ from ssplat_jax.rasterizer.binning import tile_boxes
 from ssplat_jax.rasterizer.render import RenderInputs, prepare, tile_grid_of
 from ssplat_jax.refinement import init_refinement
 from ssplat_jax.refinement.compared_views import views_of_step
-from ssplat_jax.refinement.refine import Progress, row_capacity
+from ssplat_jax.refinement.refine import Progress, row_capacity, tiles_for
 from ssplat_jax.refinement.refine_step import may_be_seen, round_rows, without_padding
-from tests.refinement.test_refine import CONFIG, NUM, cameras, doubtful, key_views, step
+from tests.refinement.test_refine import CONFIG, MAX_PAIRS, NUM, cameras, doubtful, key_views, step
 
 module = importlib.import_module("ssplat_jax.refinement.refine_step")  # the package has a function of that name
 
@@ -101,3 +101,13 @@ def test_padding_behind_the_last_present_row_is_left_out_and_comes_back(monkeypa
     assert whole.sh_degree == 1
     for name in ("means", "scales", "opacities"):
         np.testing.assert_array_equal(getattr(whole, name), getattr(given, name), err_msg=name)
+
+
+def test_small_gaussians_have_small_tiles_and_space_for_their_intersections():
+    """Of a seventh of a pixel and of three: a large one touches four times as many of the small tiles."""
+    for size, wanted in ((0.02, 4), (0.5, 8)):
+        given = replace(doubtful(), scales=jnp.full((NUM, 3), size))
+        tile, max_pairs = tiles_for(given, key_views())
+        assert tile == wanted
+        _, report = step(init_refinement(given, CONFIG), key_views(), tile=tile)
+        assert int(report.num_overflow) == 0 and max_pairs >= MAX_PAIRS
