@@ -32,6 +32,9 @@ def test_points_keep_their_pixel_after_resizing_and_transform():
         in_camera = np.concatenate([rng.uniform(-0.3, 0.3, (20, 2)), rng.uniform(1, 3, (20, 1))], -1)
         pixel = (in_camera @ stored.K.T)[:, :2] / in_camera[:, 2:]
         crop = capture.crop(i)
+        np.testing.assert_allclose(  # what is cut away is equal on both sides
+            [2 * crop.left + 40 / crop.scale, 2 * crop.top + 40 / crop.scale], [stored.width, stored.height], atol=1e-9
+        )
         wanted = (pixel - [crop.left, crop.top]) * crop.scale
         points = frame.points_to_stream(in_camera @ pose[:3, :3].T + pose[:3, 3]).astype(np.float32)
         camera = capture.camera(i, frame)
