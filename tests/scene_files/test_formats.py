@@ -8,7 +8,9 @@ import itertools
 import json
 import math
 import random
+import shutil
 import struct
+import subprocess
 import zipfile
 
 import jax.numpy as jnp
@@ -221,6 +223,19 @@ def test_bytes_of_a_spz(tmp_path):
     assert old == b"NGSP" + struct.pack("<IIBBBB", 3, 1, 0, 21, 1, 0) + b"".join(fields)
     with pytest.raises(InputError, match="version 3 or 4"):
         save_gaussians(tmp_path / "c.spz", ONE, spz_version=2)
+
+
+@pytest.mark.skipif(shutil.which("splat-transform") is None, reason="npm install -g @playcanvas/splat-transform")
+def test_spz_goes_to_and_from_playcanvas(tmp_path):
+    gaussians, steps = scene_for(), STEPS[".spz"]
+    convert = lambda *names: subprocess.run(["splat-transform", "-w", *names], check=True, cwd=tmp_path)  # noqa: E731
+    ss.save_spz(tmp_path / "ours.spz", gaussians)
+    convert("ours.spz", "back.ply")
+    assert_same(ss.load_scene(tmp_path / "back.ply"), gaussians, steps)
+    ss.save_ply(tmp_path / "ours.ply", gaussians)
+    convert("ours.ply", "theirs.spz")  # with SH of 5 and 4 bits, and 12 bits after the point
+    coarse = dataclasses.replace(steps, rest=1 / 16 + steps.rest, means=2.0**-12, constant=2 * steps.constant)
+    assert_same(ss.load_scene(tmp_path / "theirs.spz"), gaussians, coarse)
 
 
 @pytest.mark.parametrize("axes", ["RUB", "RDF", "LUF", "RUF", "LFD", "RBU"])
