@@ -30,7 +30,7 @@ def power_of_two(number: int) -> int:
 
 
 def evenly_spread(count: int, most: int) -> list[int]:
-    """At most `most` places among `count`, evenly spread, the first and the last included."""
+    """At most `most` places (two or more) among `count`, evenly spread, the first and the last included."""
     if count <= most:
         return list(range(count))
     return [round(k * (count - 1) / (most - 1)) for k in range(most)]

@@ -183,15 +183,17 @@ def fill_holes(
     taps = np.exp(-0.5 * (np.arange(-radius, radius + 1) / sigma) ** 2)
     weighted = jnp.concatenate([color + BACKGROUND_WEIGHT * background, alpha[..., None] + BACKGROUND_WEIGHT], axis=-1)
     for axis in (-3, -2):
-        weighted = _blur(weighted, taps / taps.sum(), axis)
+        weighted = blur(weighted, taps / taps.sum(), axis)
     return color + (1.0 - alpha)[..., None] * weighted[..., :3] / weighted[..., 3:]
 
 
-def _blur(values: Float[Array, "*b h w c"], taps: np.ndarray, axis: int) -> Float[Array, "*b h w c"]:
-    """Weighted sums of neighbors along `axis`; zero outside the border."""
+def blur(
+    values: Float[Array, "*b h w c"], taps: Float[np.ndarray, " k"], axis: int, border: str = "constant"
+) -> Float[Array, "*b h w c"]:
+    """Weighted sums of neighbors along `axis`; outside the border is zero, or what `jnp.pad` means by `border`."""
     radius, length = len(taps) // 2, values.shape[axis]
     padding = [(0, 0)] * values.ndim
     padding[axis % values.ndim] = (radius, radius)
-    padded = jnp.pad(values, padding)
+    padded = jnp.pad(values, padding, mode=border)
     take = lambda k: jax.lax.slice_in_dim(padded, k, k + length, axis=axis % values.ndim)  # noqa: E731
     return sum((float(t) * take(k) for k, t in enumerate(taps)), jnp.zeros_like(values))

@@ -14,6 +14,7 @@ from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.core.kept_programs import Kept
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.rasterizer import Effects, RenderOutput, fill_holes, render
+from ssplat_jax.rasterizer.outputs import blur
 from ssplat_jax.rasterizer.render import TILE
 
 EFFECTS = Effects(outputs=("color", "alpha"))
@@ -27,6 +28,7 @@ SSIM_SHARE = 0.2
 """Share of 1 - SSIM in the loss, that of 3DGS; the rest is the L1 error, which alone leaves fine texture blurred."""
 
 WINDOW = np.exp(-0.5 * (np.arange(-5, 6) / 1.5) ** 2)
+WINDOW /= WINDOW.sum()
 """Window of SSIM along one axis: a Gaussian of 1.5 pixels, 11 pixels wide (Wang et al., 2004)."""
 
 
@@ -126,22 +128,12 @@ def dissimilarity(image: Float[Array, "h w 3"], target: Float[Array, "h w 3"]) -
     """
     products = jnp.concatenate([image, target, image * image, target * target, image * target], axis=-1)
     for axis in (0, 1):
-        products = _windowed(products, axis)
+        products = blur(products, WINDOW, axis, border="symmetric")
     mean, target_mean, square, target_square, product = jnp.split(products, 5, axis=-1)
     means, squares = mean * target_mean, mean * mean + target_mean * target_mean
     alike = (2 * means + 1e-4) * (2 * (product - means) + 9e-4)
     alike /= (squares + 1e-4) * (square + target_square - squares + 9e-4)
     return jnp.mean(1.0 - alike, axis=-1)
-
-
-def _windowed(values: Float[Array, "h w c"], axis: int) -> Float[Array, "h w c"]:
-    """Means over `WINDOW` along an axis."""
-    length, padding = values.shape[axis], [(0, 0)] * 3
-    padding[axis] = (len(WINDOW) // 2, len(WINDOW) // 2)
-    padded = jnp.pad(values, padding, mode="symmetric")
-    weights = WINDOW / WINDOW.sum()
-    shifted = (jax.lax.slice_in_dim(padded, i, i + length, axis=axis) for i in range(len(weights)))
-    return sum((float(weight) * part for weight, part in zip(weights, shifted, strict=True)), jnp.zeros_like(values))
 
 
 def held_back_pixels(size: tuple[int, ...], slot: Int[Array, ""], config: RefineConfig) -> Bool[Array, "h w"]:

@@ -82,7 +82,7 @@ def test_a_scene_of_any_format_is_drawn_with_the_filter_that_it_names(tmp_path, 
 
 
 def test_pictures_do_not_depend_on_the_unit_of_the_capture(tmp_path, capture):
-    """At a thousandth of the unit, everything lies before a near plane of 0.01."""
+    """Everything lies before a near plane of 0.01 at a thousandth of the unit."""
     unit = 1e-3
     facts = json.loads((capture / "transforms.json").read_text())
     ss.save_ply(tmp_path / "a.ply", scene())

@@ -267,7 +267,7 @@ def same_capacity(monkeypatch):
 
 
 def test_refinement_learns_a_scene_that_turns_its_colors_and_ends_on_one_that_fits(same_capacity):
-    """On a view never shown, where a constant color cannot follow; absent rows stay."""
+    """A view never shown gains, where a constant color cannot follow; absent rows stay."""
     bands = np.random.default_rng(2).normal(0, 0.4, (NUM, 3, 3))
     turning = replace(scene(), sh=jnp.concatenate([scene().sh, jnp.asarray(bands, jnp.float32)], axis=1))
     seen, unseen = cameras(shifts=(-1.0, -0.3, 0.3, 1.0)), cameras(shifts=(0.6,))

@@ -104,7 +104,7 @@ def test_padding_behind_the_last_present_row_is_left_out_and_comes_back(monkeypa
 
 
 def test_small_gaussians_have_small_tiles_and_space_for_their_intersections():
-    """Of a seventh of a pixel and of three: a large one touches four times as many of the small tiles."""
+    """Gaussians of three pixels touch four times as many small tiles as usual ones; those of a seventh do not."""
     for size, wanted in ((0.02, 4), (0.5, 8)):
         given = replace(doubtful(), scales=jnp.full((NUM, 3), size))
         tile, max_pairs = tiles_for(given, key_views())

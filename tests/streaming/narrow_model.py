@@ -26,7 +26,7 @@ NARROW = StreamConfig().replace(
 """A small model without a confidence threshold, which the flat distributions of untrained weights would not pass."""
 
 FEW_GAUSSIANS = NARROW.replace(gaussians_per_token=4)
-"""For tests of what is around the stream, which render scenes many times."""
+"""The narrow model with few Gaussians, for tests around the stream, which render scenes many times."""
 
 
 def leaves_with_names(tree):

@@ -70,7 +70,7 @@ def test_deltas_put_together_equal_the_scene(name):
 
 
 def test_a_delta_holds_the_changed_rows_alone(monkeypatch):
-    """Without evidence the time of the last write alone tells which."""
+    """The time of the last write alone tells which, since the cache has no evidence."""
     config = CONFIG.replace(evidence=False)
     model, params = StreamSplat(config), decoder_params(CONFIG)
     feed, cache = SceneFeed(model, params), init_cache(config, CAPACITY)
