@@ -187,13 +187,11 @@ def fill_holes(
     return color + (1.0 - alpha)[..., None] * weighted[..., :3] / weighted[..., 3:]
 
 
-def blur(
-    values: Float[Array, "*b h w c"], taps: Float[np.ndarray, " k"], axis: int, border: str = "constant"
-) -> Float[Array, "*b h w c"]:
-    """Weighted sums of neighbors along `axis`; outside the border is zero, or what `jnp.pad` means by `border`."""
+def blur(values: Float[Array, "*b h w c"], taps: Float[np.ndarray, " k"], axis: int) -> Float[Array, "*b h w c"]:
+    """Weighted sums of neighbors along `axis`; outside the border is zero."""
     radius, length = len(taps) // 2, values.shape[axis]
     padding = [(0, 0)] * values.ndim
     padding[axis % values.ndim] = (radius, radius)
-    padded = jnp.pad(values, padding, mode=border)
+    padded = jnp.pad(values, padding)
     take = lambda k: jax.lax.slice_in_dim(padded, k, k + length, axis=axis % values.ndim)  # noqa: E731
     return sum((float(t) * take(k) for k, t in enumerate(taps)), jnp.zeros_like(values))

@@ -14,7 +14,6 @@ from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.core.kept_programs import Kept
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.rasterizer import Effects, RenderOutput, fill_holes, render
-from ssplat_jax.rasterizer.outputs import blur
 from ssplat_jax.rasterizer.render import TILE
 
 EFFECTS = Effects(outputs=("color", "alpha"))
@@ -126,14 +125,23 @@ def dissimilarity(image: Float[Array, "h w 3"], target: Float[Array, "h w 3"]) -
     Limits:
         Equal images give 0 and no gradient, constant ones finite gradients: SSIM's denominators are above 1e-4 x 9e-4.
     """
-    products = jnp.concatenate([image, target, image * image, target * target, image * target], axis=-1)
-    for axis in (0, 1):
-        products = blur(products, WINDOW, axis, border="symmetric")
-    mean, target_mean, square, target_square, product = jnp.split(products, 5, axis=-1)
+    # As products with matrices: the gradient of eleven shifted slices takes seven times as long on a CPU.
+    rows, columns = (window_matrix(size) for size in image.shape[:2])
+    windowed = lambda x: jnp.matmul(jnp.matmul(rows, x, precision="highest"), columns.T, precision="highest")  # noqa: E731
+    image, target = jnp.moveaxis(image, -1, 0), jnp.moveaxis(target, -1, 0)
+    products = (image, target, image * image, target * target, image * target)
+    mean, target_mean, square, target_square, product = map(windowed, products)
     means, squares = mean * target_mean, mean * mean + target_mean * target_mean
     alike = (2 * means + 1e-4) * (2 * (product - means) + 9e-4)
     alike /= (squares + 1e-4) * (square + target_square - squares + 9e-4)
-    return jnp.mean(1.0 - alike, axis=-1)
+    return jnp.mean(1.0 - alike, axis=0)
+
+
+def window_matrix(size: int) -> Float[np.ndarray, "n n"]:
+    """The window of SSIM around each of `size` pixels, one a row; pixels beyond a border are mirrored."""
+    places = np.pad(np.arange(size), len(WINDOW) // 2, mode="symmetric")
+    rows = np.eye(size, dtype=np.float32)[places]
+    return sum(np.float32(w) * rows[k : k + size] for k, w in enumerate(WINDOW))
 
 
 def held_back_pixels(size: tuple[int, ...], slot: Int[Array, ""], config: RefineConfig) -> Bool[Array, "h w"]:
