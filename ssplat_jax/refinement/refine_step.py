@@ -3,8 +3,8 @@
 start, change ─► apply_change ─► render ─► L1 error ─► gradient with respect to the change
                       change' ◄─ bounded ◄─ rates x units ◄─ optax.scale_by_adam ◄─┘
 
-A step has no effect on rows that its views cannot see, and leaves them out of its arithmetic. That decides about time
-alone: the selection knows each Gaussian as a ball around its mean, so it holds every row that the rasterizer draws.
+Rows that a step's views cannot see are not given to the rasterizer. That decides about time alone: the selection knows
+each Gaussian as a ball around its mean, so it holds every row that the rasterizer draws.
 """
 
 import functools
@@ -111,8 +111,8 @@ def refine_step(
         rate: factor of all learning rates; 0 changes nothing but the moments.
         config: weights of the loss (static).
         max_pairs: capacity for tile intersections (static); `StepReport.num_overflow` says what did not fit.
-        max_rows: capacity for the rows that the step's views may see (static): all but Adam is done for them alone. By
-            default, and where it holds every row, nothing is selected. The result is the same.
+        max_rows: capacity for the rows that the step's views may see (static), which alone are rendered. By default,
+            and where it holds every row, nothing is selected. The result is the same.
         tile: side of a tile (static), pixels.
 
     Returns:
