@@ -136,9 +136,8 @@ def refine_step(
         gradient, measured = jax.grad(loss, has_aux=True)(shown, slot)
         return jax.tree.map(jnp.add, total, gradient), measured
 
-    # A scan holds the intermediate arrays of one view at a time.
+    # A scan holds the intermediate arrays of one view at a time. Adam moves as far by the sum as by the mean.
     total, (losses, held_back, overflows) = jax.lax.scan(add_view, jax.tree.map(jnp.zeros_like, shown), views)
-    total = jax.tree.map(lambda x: x / config.views_per_step, total)
     if rows is not None:
         zeros = jax.tree.map(jnp.zeros_like, current)
         total = jax.tree.map(lambda zero, x: zero.at[rows].set(x, mode="drop"), zeros, total)
