@@ -141,7 +141,7 @@ def window_matrix(size: int) -> Float[np.ndarray, "n n"]:
     """The window of SSIM around each of `size` pixels, one a row; pixels beyond a border are mirrored."""
     places = np.pad(np.arange(size), len(WINDOW) // 2, mode="symmetric")
     rows = np.eye(size, dtype=np.float32)[places]
-    return np.sum([w * rows[k : k + size] for k, w in enumerate(WINDOW)], axis=0, dtype=np.float32)
+    return np.asarray(sum(w * rows[k : k + size] for k, w in enumerate(WINDOW)), np.float32)
 
 
 def held_back_pixels(size: tuple[int, ...], slot: Int[Array, ""], config: RefineConfig) -> Bool[Array, "h w"]:
