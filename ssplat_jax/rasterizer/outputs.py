@@ -183,11 +183,11 @@ def fill_holes(
     taps = np.exp(-0.5 * (np.arange(-radius, radius + 1) / sigma) ** 2)
     weighted = jnp.concatenate([color + BACKGROUND_WEIGHT * background, alpha[..., None] + BACKGROUND_WEIGHT], axis=-1)
     for axis in (-3, -2):
-        weighted = blur(weighted, taps / taps.sum(), axis)
+        weighted = _blur(weighted, taps / taps.sum(), axis)
     return color + (1.0 - alpha)[..., None] * weighted[..., :3] / weighted[..., 3:]
 
 
-def blur(values: Float[Array, "*b h w c"], taps: Float[np.ndarray, " k"], axis: int) -> Float[Array, "*b h w c"]:
+def _blur(values: Float[Array, "*b h w c"], taps: Float[np.ndarray, " k"], axis: int) -> Float[Array, "*b h w c"]:
     """Weighted sums of neighbors along `axis`; outside the border is zero."""
     radius, length = len(taps) // 2, values.shape[axis]
     padding = [(0, 0)] * values.ndim

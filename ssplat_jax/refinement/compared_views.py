@@ -38,7 +38,7 @@ class RefineConfig:
     sh_degree: int = 0
     """SH degree that the scene gets, unless its own is higher: 0 adds no band."""
     views_per_step: int = 2
-    """Key views whose gradients a step averages: a Gaussian that few views show moves more often."""
+    """Key views whose gradients a step adds: a Gaussian that few views show moves more often."""
     shown_weight: float = 0.7
     """Weight of the L1 error with holes filled; the rest is the L1 error over black."""
     held_back: float = 1 / 32
