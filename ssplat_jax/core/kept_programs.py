@@ -20,6 +20,7 @@ import os
 import pickle
 import stat
 import tempfile
+import threading
 import types
 from collections.abc import Callable
 from pathlib import Path
@@ -48,6 +49,9 @@ MOST_ARRAY_BYTES = 32 << 20
 DIGEST_BYTES = 32
 
 _loaded: dict[str, jax.stages.Compiled] = {}
+
+_lock, _was_on = threading.Lock(), []
+"""JAX's switch of its cache as it was, once for each thread that compiles; it stays off until the last is done."""
 
 
 class Kept:
@@ -172,14 +176,22 @@ def _compiled_anew(lowered: jax.stages.Lowered) -> jax.stages.Compiled:
     """Compiles without JAX's cache: an executable from there loses its kernels when it is serialized again, and fails
     only when it is called ("Function ... not found", jaxlib 0.10.1 on the CPU).
     """
-    before = jax.config.jax_enable_compilation_cache  # pyright: ignore[reportAttributeAccessIssue]
-    jax.config.update("jax_enable_compilation_cache", False)
-    compilation_cache.reset_cache()  # JAX looks at its switch once, until then
+    with _lock:
+        was_on = _was_on[0] if _was_on else jax.config.jax_enable_compilation_cache  # pyright: ignore[reportAttributeAccessIssue]
+        _was_on.append(was_on)
+        _use_jax_cache(on=False)
     try:
         return lowered.compile()
     finally:
-        jax.config.update("jax_enable_compilation_cache", before)
-        compilation_cache.reset_cache()
+        with _lock:
+            _was_on.pop()
+            _use_jax_cache(on=was_on and not _was_on)
+
+
+def _use_jax_cache(*, on: bool) -> None:
+    if on != jax.config.jax_enable_compilation_cache:  # pyright: ignore[reportAttributeAccessIssue]
+        jax.config.update("jax_enable_compilation_cache", on)
+        compilation_cache.reset_cache()  # JAX looks at its switch once, until then
 
 
 def _load(file: Path, key: str, dynamic: tuple) -> jax.stages.Compiled:

@@ -13,6 +13,7 @@ median towards the camera (by 30 % at a median parallax of 1 degree); the median
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from jaxtyping import Float64
@@ -30,6 +31,7 @@ from ssplat_jax.data.sparse_matches import (
 
 # Choice of pairs
 NUM_REFERENCES = 16  # evenly spaced frames for which a partner is sought
+NUM_DETECTORS = 2  # threads that find keypoints, which takes most of the time; Python's lock leaves more no gain
 MAX_AXIS_DEGREES = 40.0  # between the optical axes of a pair; ORB does not match larger changes of view
 GOOD_PARALLAX_DEGREES = 4.0  # median parallax at which a reference needs no wider partner
 POOR_PARALLAX_DEGREES = 0.5  # pairs with less give a rough median, and no depth range
@@ -96,6 +98,10 @@ def estimate_depths(
     """
     keypoints = keypoints or keypoints_of(capture)
     references = evenly_spread(len(indices), NUM_REFERENCES)
+    sought = [indices[k] for k in references]
+    sought += [j for i in sought for j in _partners(capture, i, indices)[0][:1]]
+    with ThreadPoolExecutor(NUM_DETECTORS) as pool:
+        list(pool.map(keypoints, dict.fromkeys(sought)))
     pairs: list[CommonPoints] = []
     baseline = 0.0
     for done, reference in enumerate(references):

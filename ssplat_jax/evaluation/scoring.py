@@ -32,7 +32,7 @@ from ssplat_jax.rasterizer import effects_for, fill_holes, render
 from ssplat_jax.refinement import refine_on_capture
 from ssplat_jax.storage.files import write_json
 from ssplat_jax.storage.run_folder import RunFolder, make_writable
-from ssplat_jax.streaming.feed import Exposures, feed_capture, middle_exposure
+from ssplat_jax.streaming.feed import Exposures, begin_stream, feed_capture, middle_exposure
 from ssplat_jax.streaming.session import Session
 
 NUM_AVERAGED = 3
@@ -266,7 +266,7 @@ def evaluate(
     adjusted = adjust_and_say(streamed, split.context, reporter) if adjust_poses else None
     if adjusted is not None:  # poses of the context alone
         capture, streamed = (dataclasses.replace(x, frames=adjusted.capture.frames) for x in (capture, streamed))
-    stream_frame = streamed.stream_frame(session.model.config, split.context)
+    stream_frame = begin_stream(session, streamed, split.context)
     reporter.warn_all(*capture.notes, stream_frame.warning)
     reference = baselines(capture, split)
     with reporter.progress("streaming", len(split.context)) as advance:

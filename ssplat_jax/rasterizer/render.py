@@ -31,8 +31,10 @@ TILES = (4, 8, 16)
 MIN_CAPACITY = 1 << 12
 """Least capacity for pairs that `render` chooses."""
 
-SMALL_CAPACITY = 1 << 18
-"""Up to this capacity, what is unused costs milliseconds; a program for less takes seconds to compile."""
+PAIRS_PER_ROW, SMALL_CAPACITY = 2, 1 << 19
+"""Least capacity that `render` chooses outside jit: two pairs for each Gaussian and camera, or the second number. Up to
+there unused pairs cost a hundredth of a render; a program that counts them, or one for fewer, takes seconds to compile.
+"""
 
 MAX_CAPACITY = 1 << 30
 """The largest power of two that an index reaches."""
@@ -85,10 +87,10 @@ def render(
         near: Gaussians at a camera z of at most this are culled, scene units; by default 0.01, or what fits the unit of
             the scene (`near_planes`).
         max_pairs: capacity for tile intersections, (tile, Gaussian) pairs of all cameras. Outside jit, under `jax.grad`
-            too, the default is their number, rounded up to a power of two so that few programs are compiled; they are
-            counted in the first render of a kind, and again where there are more. Inside jit and other transforms that
-            hide the values it is four for each Gaussian and camera, and a warning says if that was too few. The
-            farthest Gaussians are left out; `num_overflow` counts the pairs.
+            too, it is by default what all of them need, as a power of two so that few programs are compiled; those of a
+            large scene are counted in its first render. Inside jit and other transforms that hide the values it is four
+            for each Gaussian and camera, and a warning says if that was too few. The farthest Gaussians are left out;
+            `num_overflow` counts the pairs.
         tile: side of a tile in pixels, 4, 8 or 16; choose 16 where most Gaussians are larger than 8 pixels, and 4 for
             gradients of scenes whose Gaussians are smaller than a pixel.
 
@@ -123,18 +125,21 @@ def render(
     arrays = (*jax.tree.leaves(inputs), jax.device_put(np.float32(0)))  # jnp.zeros would compile a program
     is_concrete = max_pairs is None and not any(isinstance(x, Tracer) for x in arrays)
     # Views of one scene need about the same capacity: a pass that only counts costs a third of a render.
-    known = (inputs.gaussians.num_gaussians, camera.viewmats.shape, camera.width, camera.height, tile)
+    num_rows = inputs.gaussians.num_gaussians * (camera.viewmats.size // 16)
+    known = (num_rows, camera.viewmats.shape, camera.width, camera.height, tile)
     if is_concrete:
         max_pairs = _CAPACITIES.get(known)  # at once: another thread may forget it
+        if max_pairs is None and PAIRS_PER_ROW * num_rows <= SMALL_CAPACITY:
+            max_pairs = _capacity_for(0, num_rows)
     is_guessed = False
     if max_pairs is None:
         # Under `jax.grad` alone the primal values are concrete: without tangents, the pairs can be counted.
         counted = _count(jax.lax.stop_gradient(inputs), effects, tile)
         is_guessed = isinstance(counted, Tracer)
-        max_pairs = default_max_pairs(inputs.gaussians, camera) if is_guessed else _capacity_for(int(counted))
+        max_pairs = default_max_pairs(inputs.gaussians, camera) if is_guessed else _capacity_for(int(counted), num_rows)
     out = _render_jit(inputs, effects, max_pairs, tile)
     if not isinstance(out.num_overflow, Tracer) and int(out.num_overflow):
-        out = _render_jit(inputs, effects, _capacity_for(int(out.num_pairs)), tile)
+        out = _render_jit(inputs, effects, _capacity_for(int(out.num_pairs), num_rows), tile)
     elif is_guessed:
         say = lambda: jax.debug.callback(_warn_of_overflow, out.num_overflow, out.num_pairs)  # noqa: E731
         jax.lax.cond(out.num_overflow > 0, say, lambda: None)
@@ -159,7 +164,7 @@ MAX_REMEMBERED = 256
 
 def _remember_capacity(kind: tuple, num_pairs: int) -> None:
     """Remembers the capacity for `num_pairs`; a larger one is kept if it is small or at most four times as large."""
-    needed, held = _capacity_for(num_pairs), _CAPACITIES.pop(kind, 0)
+    needed, held = _capacity_for(num_pairs, kind[0]), _CAPACITIES.pop(kind, 0)
     _CAPACITIES[kind] = held if needed <= held <= max(4 * needed, SMALL_CAPACITY) else needed
     while len(_CAPACITIES) > MAX_REMEMBERED:
         _CAPACITIES.pop(next(iter(_CAPACITIES.copy())), None)
@@ -175,8 +180,8 @@ def _warn_of_overflow(num_overflow, num_pairs) -> None:
         )
 
 
-def _capacity_for(num_pairs: int) -> int:
-    """The capacity for a number of pairs.
+def _capacity_for(num_pairs: int, num_rows: int) -> int:
+    """The capacity for a number of pairs, of a scene with so many rows for all cameras.
 
     Raises:
         InputError: an index would not reach the last pair.
@@ -186,7 +191,7 @@ def _capacity_for(num_pairs: int) -> int:
             f"render: wanted at most {MAX_CAPACITY} (tile, Gaussian) pairs, got more; render fewer cameras at once or"
             " pass tile=16."
         )
-    return round_up(num_pairs)
+    return max(round_up(num_pairs), min(power_of_two(PAIRS_PER_ROW * num_rows), SMALL_CAPACITY))
 
 
 def _at_the_origin(inputs: RenderInputs) -> RenderInputs:

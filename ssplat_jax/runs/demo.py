@@ -8,7 +8,7 @@ import numpy as np
 from ssplat_jax.config import preset
 from ssplat_jax.core.console import Reporter
 from ssplat_jax.core.gaussians import Gaussians
-from ssplat_jax.data.open_capture import open_capture
+from ssplat_jax.data.open_capture import PROCEDURAL_SIZE, open_capture
 from ssplat_jax.data.split import interleaved_split
 from ssplat_jax.evaluation.pictures import save_comparison, save_image
 from ssplat_jax.evaluation.scoring import ScoredView, mean_scores, score_view
@@ -47,13 +47,14 @@ def run_demo(scene: str, out: Path, reporter: Reporter) -> dict:
     make_writable(out)  # before the long part
     folder.clear_refinement()  # of an earlier command
     model, params = StreamSplat(preset("tiny")), load_params("tiny")
+    session = Session(model, params)
+    session.least_decoded = SHOWN_PIVOTS
+    session.compile_ahead(*PROCEDURAL_SIZE, STAGES[-1])
     capture = open_capture(f"procedural:{scene}")  # 64 context views and the 9 interleaved targets between them
     split = interleaved_split(len(capture), stride=1, context=STAGES[-1])
     stream_frame = capture.stream_frame(model.config, split.context)
     order = capture.stream_order(model.config, split.context, stream_frame)
-    session = Session(model, params)
     exposures: Exposures = {}
-    session.least_decoded = SHOWN_PIVOTS
     stages: list[tuple[Gaussians, Exposures, int]] = []
     with reporter.progress("streaming", STAGES[-1]) as advance:
         for fed in feed_chunks(session, capture, order, stream_frame):

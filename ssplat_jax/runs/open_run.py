@@ -34,7 +34,7 @@ from ssplat_jax.storage.files import load_arrays, save_arrays
 from ssplat_jax.storage.run_folder import RunFolder, lock_folder
 from ssplat_jax.storage.saved_states import check_same, load_newest_state, restore_previous, save_state
 from ssplat_jax.storage.weights import params_digest
-from ssplat_jax.streaming.feed import Exposures, FedChunk
+from ssplat_jax.streaming.feed import Exposures, FedChunk, begin_stream
 from ssplat_jax.streaming.session import Session
 
 
@@ -160,7 +160,7 @@ def open_run(
         if folder.has_state():
             run.resume(reporter)
         else:
-            run.stream_frame = capture.stream_frame(model.config, indices)
+            run.stream_frame = begin_stream(session, capture, indices)
             folder.metrics.unlink(missing_ok=True)  # of another run whose state was removed
             folder.clear_refinement()
         # Left by a process that was killed after its last save: these chunks may bring other views.

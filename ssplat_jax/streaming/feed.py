@@ -48,6 +48,13 @@ class FedChunk:
         return dict(zip(self.frames, valid, strict=True))
 
 
+def begin_stream(session: Session, capture: Capture, indices: Sequence[int]) -> StreamFrame:
+    """The stream frame of the frames `indices`; meanwhile the step of a new stream compiles on another thread."""
+    traits = {"is_masked": capture.is_masked, "brings_depth": capture.brings_depth}
+    session.compile_ahead(capture.width, capture.height, len(indices), **traits)
+    return capture.stream_frame(session.model.config, indices)
+
+
 def feed_chunks(
     session: Session, capture: Capture, order: Sequence[int], stream_frame: StreamFrame
 ) -> Iterator[FedChunk]:

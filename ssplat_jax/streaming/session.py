@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import time
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 
 import jax
 import jax.numpy as jnp
@@ -61,11 +62,52 @@ class Session:
         self._live, self._refine_chunk = LiveViews(model.config, stream_frame), refine
         self.least_decoded = MIN_DECODED_PIVOTS  # pivots; who decodes a growing scene often may raise it
         self.expected_chunks = INITIAL_CHUNKS  # of the stream, as far as the caller knows; sets the first capacity
-        self.compile_seconds, self.num_compilations = 0.0, 0
+        self.compile_seconds, self.num_compilations = 0.0, 0  # seconds that the stream waited for its programs
         # Programs by what they compute and the shapes that they are compiled for; those of the last chunk.
         self._programs: dict[tuple, jax.stages.Compiled] = {}
+        self._ahead: dict[tuple, Future[jax.stages.Compiled]] = {}  # what `compile_ahead` has begun
         self._step: jax.stages.Compiled | None = None
         self._refine: jax.stages.Compiled | None = None
+
+    def compile_ahead(
+        self, width: int, height: int, num_views: int, *, is_masked: bool = False, brings_depth: bool = False
+    ) -> None:
+        """Begins to compile the step of a new stream on another thread, while the caller prepares its first chunk.
+
+        A first chunk of other shapes compiles its own step.
+
+        Args:
+            width: of the images, pixels.
+            height: likewise.
+            num_views: views of the stream, as far as the caller knows.
+            is_masked: chunks have masks.
+            brings_depth: chunks have depth maps.
+        """
+        config = self.model.config
+        if self.cache is not None or config.stream.steps_per_chunk:
+            return
+        size, image = config.stream.chunk_size, (height, width)
+        self.expected_chunks = max(self.expected_chunks, -(-num_views // size))
+        chunk = jax.eval_shape(
+            lambda: Chunk(
+                images=jnp.zeros((size, *image, 3)),
+                viewmats=jnp.zeros((size, 4, 4)),
+                Ks=jnp.zeros((size, 3, 3)),
+                valid=jnp.zeros(size, bool),
+                near=jnp.zeros(()),
+                far=jnp.zeros(()),
+                seen=jnp.zeros((size, *image), bool) if is_masked else None,
+                depths=jnp.zeros((size, *image)) if brings_depth else None,
+            )
+        )
+        capacity = starting_capacity(config, tokens_per_chunk(chunk, config.network.size_multiple), self.expected_chunks)
+        cache = jax.eval_shape(functools.partial(init_cache, config, capacity))
+        key = _program_key("step", cache, chunk)
+        if key not in self._programs:
+            with_one_thread = ThreadPoolExecutor(1)
+            program = Kept(self.model.step, donate_argnums=(1,)).program
+            self._ahead[key] = with_one_thread.submit(program, self.params, cache, chunk)
+            with_one_thread.shutdown(wait=False)
 
     def feed(self, chunk: Chunk) -> ChunkOutput:
         """Streams one chunk into the cache and waits until it is done.
@@ -157,10 +199,13 @@ class Session:
 
     def _program(self, name: str, function: Callable, cache: VoxelCache, chunk: Chunk, *more) -> jax.stages.Compiled:
         """`function` compiled for the shapes of `cache`, which it consumes, and of `chunk`."""
-        key = (name, cache.capacity, chunk.images.shape, chunk.seen is None, chunk.depths is None)
+        key = _program_key(name, cache, chunk)
         if key not in self._programs:
-            since = time.perf_counter()
-            self._programs[key] = Kept(function, donate_argnums=(1,)).program(self.params, cache, chunk, *more)
+            since, ahead = time.perf_counter(), self._ahead.pop(key, None)
+            if ahead is not None:
+                self._programs[key] = ahead.result()
+            else:
+                self._programs[key] = Kept(function, donate_argnums=(1,)).program(self.params, cache, chunk, *more)
             self.compile_seconds += time.perf_counter() - since
             self.num_compilations += 1
         return self._programs[key]
@@ -188,7 +233,7 @@ class Session:
         num_pivots = min(max(self.least_decoded, power_of_two(num_shown)), cache.confidences.size)
         num_gaussians = None
         if config.additions.detail:
-            num_gaussians = max(self.least_decoded, power_of_two(num_present))
+            num_gaussians = max(2 * self.least_decoded, power_of_two(num_present))  # a pivot has about two
         leaves, structure = jax.tree.flatten(cache)
         key = ("decode", num_pivots, num_gaussians, structure, *((leaf.shape, leaf.dtype) for leaf in leaves))
         if key not in self._programs:
@@ -224,6 +269,11 @@ class Session:
             "accepted_fraction": round(stats["num_accepted"] / max(stats["num_seen"], 1), 4),
             **stats,
         }
+
+
+def _program_key(name: str, cache: VoxelCache, chunk: Chunk) -> tuple:
+    """A program by what it computes and by the shapes that may differ within a stream."""
+    return name, cache.capacity, chunk.images.shape, chunk.seen is None, chunk.depths is None
 
 
 _new_cache = Kept(init_cache, static_argnums=(0, 1))
