@@ -26,7 +26,7 @@ from ssplat_jax.core.chunk import Chunk
 from ssplat_jax.core.cpu_backend import num_cores
 from ssplat_jax.core.gaussians import Gaussians
 from ssplat_jax.rasterizer import render
-from ssplat_jax.rasterizer.render import render_program, round_up
+from ssplat_jax.rasterizer.render import capacity_for, render_program
 from ssplat_jax.streaming.session import Session, tokens_per_chunk
 
 NUM_CHUNKS = 4
@@ -116,8 +116,8 @@ def added_bytes(program: jax.stages.Compiled) -> int | None:
 
 def render_bytes(gaussians: Gaussians, camera: Camera) -> int | None:
     """Bytes that rendering a view needs beside the Gaussians, with the capacity for pairs that `render` chooses."""
-    num_pairs = round_up(int(render(gaussians, camera).num_pairs))
-    return added_bytes(_render_program(num_pairs, *abstract((gaussians, camera))))
+    max_pairs = capacity_for(int(render(gaussians, camera).num_pairs), gaussians.num_gaussians)
+    return added_bytes(_render_program(max_pairs, *abstract((gaussians, camera))))
 
 
 @functools.lru_cache(maxsize=8)  # compiling takes longer than a stream's chunk

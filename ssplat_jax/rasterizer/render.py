@@ -31,10 +31,9 @@ TILES = (4, 8, 16)
 MIN_CAPACITY = 1 << 12
 """Least capacity for pairs that `render` chooses."""
 
-PAIRS_PER_ROW, SMALL_CAPACITY = 2, 1 << 19
-"""Least capacity that `render` chooses outside jit: two pairs for each Gaussian and camera, or the second number. Up to
-there unused pairs cost a hundredth of a render; a program that counts them, or one for fewer, takes seconds to compile.
-"""
+SMALL_CAPACITY = 1 << 18
+"""Up to this capacity a render outside jit has room for a pair of each Gaussian and camera. Unused ones cost it a
+twentieth of its time at most; a program that counts the pairs, or one for fewer, takes seconds to compile."""
 
 MAX_CAPACITY = 1 << 30
 """The largest power of two that an index reaches."""
@@ -129,17 +128,17 @@ def render(
     known = (num_rows, camera.viewmats.shape, camera.width, camera.height, tile)
     if is_concrete:
         max_pairs = _CAPACITIES.get(known)  # at once: another thread may forget it
-        if max_pairs is None and PAIRS_PER_ROW * num_rows <= SMALL_CAPACITY:
-            max_pairs = _capacity_for(0, num_rows)
+        if max_pairs is None and num_rows <= SMALL_CAPACITY:
+            max_pairs = capacity_for(0, num_rows)
     is_guessed = False
     if max_pairs is None:
         # Under `jax.grad` alone the primal values are concrete: without tangents, the pairs can be counted.
         counted = _count(jax.lax.stop_gradient(inputs), effects, tile)
         is_guessed = isinstance(counted, Tracer)
-        max_pairs = default_max_pairs(inputs.gaussians, camera) if is_guessed else _capacity_for(int(counted), num_rows)
+        max_pairs = default_max_pairs(inputs.gaussians, camera) if is_guessed else capacity_for(int(counted), num_rows)
     out = _render_jit(inputs, effects, max_pairs, tile)
     if not isinstance(out.num_overflow, Tracer) and int(out.num_overflow):
-        out = _render_jit(inputs, effects, _capacity_for(int(out.num_pairs), num_rows), tile)
+        out = _render_jit(inputs, effects, capacity_for(int(out.num_pairs), num_rows), tile)
     elif is_guessed:
         say = lambda: jax.debug.callback(_warn_of_overflow, out.num_overflow, out.num_pairs)  # noqa: E731
         jax.lax.cond(out.num_overflow > 0, say, lambda: None)
@@ -164,7 +163,7 @@ MAX_REMEMBERED = 256
 
 def _remember_capacity(kind: tuple, num_pairs: int) -> None:
     """Remembers the capacity for `num_pairs`; a larger one is kept if it is small or at most four times as large."""
-    needed, held = _capacity_for(num_pairs, kind[0]), _CAPACITIES.pop(kind, 0)
+    needed, held = capacity_for(num_pairs, kind[0]), _CAPACITIES.pop(kind, 0)
     _CAPACITIES[kind] = held if needed <= held <= max(4 * needed, SMALL_CAPACITY) else needed
     while len(_CAPACITIES) > MAX_REMEMBERED:
         _CAPACITIES.pop(next(iter(_CAPACITIES.copy())), None)
@@ -180,7 +179,7 @@ def _warn_of_overflow(num_overflow, num_pairs) -> None:
         )
 
 
-def _capacity_for(num_pairs: int, num_rows: int) -> int:
+def capacity_for(num_pairs: int, num_rows: int) -> int:
     """The capacity for a number of pairs, of a scene with so many rows for all cameras.
 
     Raises:
@@ -191,7 +190,7 @@ def _capacity_for(num_pairs: int, num_rows: int) -> int:
             f"render: wanted at most {MAX_CAPACITY} (tile, Gaussian) pairs, got more; render fewer cameras at once or"
             " pass tile=16."
         )
-    return max(round_up(num_pairs), min(power_of_two(PAIRS_PER_ROW * num_rows), SMALL_CAPACITY))
+    return max(round_up(num_pairs), min(power_of_two(num_rows), SMALL_CAPACITY))
 
 
 def _at_the_origin(inputs: RenderInputs) -> RenderInputs:

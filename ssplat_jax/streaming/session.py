@@ -100,7 +100,8 @@ class Session:
                 depths=jnp.zeros((size, *image)) if brings_depth else None,
             )
         )
-        capacity = starting_capacity(config, tokens_per_chunk(chunk, config.network.size_multiple), self.expected_chunks)
+        num_tokens = tokens_per_chunk(chunk, config.network.size_multiple)
+        capacity = starting_capacity(config, num_tokens, self.expected_chunks)
         cache = jax.eval_shape(functools.partial(init_cache, config, capacity))
         key = _program_key("step", cache, chunk)
         if key not in self._programs:
