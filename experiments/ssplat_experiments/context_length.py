@@ -1,4 +1,4 @@
-"""Quality, memory and time against the number of context views (the paper's Tables 1 and 2), with baselines.
+"""Quality, memory and time against the number of context views (the paper's Tables 1 and 2, Figure 1), with baselines.
 
     ssplat experiment context_length --captures path/to/captures --out runs/context_length
 
@@ -14,6 +14,7 @@ import functools
 import itertools
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from ssplat_experiments.baselines import JointNetwork, baseline_scores, joint_config, one_chunk
 from ssplat_experiments.cases import PICTURE, Case, Row
@@ -56,7 +57,8 @@ SIZES = {
     "smoke": (Sizes((8,), ("room",), (64, 48), targets=3),),
     "cpu": (
         Sizes((24, 64, 128), WALKS, (160, 120), joint=64),
-        Sizes((24, 256, 512, 1024), ("room",), (96, 72), joint=0, label=", long"),
+        Sizes((24, 256, 512, 1024), ("room",), (96, 72), joint=0, label=", 96 x 72"),
+        Sizes((24, 1024, 10_000), ("room",), (64, 48), joint=0, label=", 64 x 48"),
     ),
     "gpu": (
         Sizes((24, 64, 128), WALKS, (480, 256)),
@@ -168,10 +170,10 @@ def joint_row(path: str, count: int, config: StreamConfig, sizes: Sizes) -> Row:
 
 
 def _opened(path: str, config: StreamConfig, sizes: Sizes) -> tuple[Capture, Split, StreamFrame]:
-    """Capture, split, and the stream frame of the fewest views: a stream does not know how long it will be."""
+    """Capture, split, and the stream frame of the whole context: near and far are known, as the paper has them."""
     capture = _open(path, sizes.size)
     split = paper_split(len(capture), max(sizes.counts), targets=sizes.targets)
-    return capture, split, capture.stream_frame(config, split.context[: min(sizes.counts)])
+    return capture, split, capture.stream_frame(config, split.context)
 
 
 def _short(path: str) -> str:
@@ -219,6 +221,24 @@ def findings(rows: list[Row]) -> list[str]:
     return ["\n".join(lines)] if lines else []
 
 
+def plot(pyplot: Any, rows: list[Row]) -> Any:
+    """Peak memory and literal PSNR against the number of views, a color a suite; every token kept is dashed."""
+    figure, panels = pyplot.subplots(1, 2, figsize=(12, 4.5), layout="constrained")
+    for color, suite in enumerate(dict.fromkeys(row["suite"] for row in rows)):
+        for method, style in ((OURS, "o-"), (APPEND, "s--")):
+            here = [row for row in rows if (row["suite"], row["method"]) == (suite, method)]
+            views = [row["views"] for row in here]
+            panels[0].plot(views, [row["peak_memory_bytes"] / 2**20 for row in here], style, color=f"C{color}")
+            label = f"{suite}, {method}"
+            panels[1].plot(views, [row["literal_psnr"] for row in here], style, color=f"C{color}", label=label)
+    for axes, text in zip(panels, ("peak memory, MiB", "literal PSNR of unseen views, dB"), strict=True):
+        axes.set(xscale="log", xlabel="context views", ylabel=text)
+        axes.spines[["top", "right"]].set_visible(False)
+    panels[0].set_yscale("log")
+    panels[1].legend(fontsize=8)
+    return figure
+
+
 STUDY = Study(
     name="context_length",
     text="""One stream stops at each number of views; targets are uniform over the trajectory and never streamed.
@@ -228,6 +248,7 @@ one rendered view in it, which grow with the scene. `append-all` keeps every tok
 over all views at once, and `warp nearest` moves the nearest context view by the depth of our scene. Peak memory is
 that of step, decode and rendering, in MiB.""",
     cases=cases,
+    plot=plot,
     findings=findings,
 )
 

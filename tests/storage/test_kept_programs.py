@@ -6,6 +6,8 @@ import importlib.metadata
 import os
 import subprocess
 import sys
+import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import jax
 import numpy as np
@@ -171,6 +173,36 @@ def test_the_least_recently_used_go_first(store, monkeypatch):
     monkeypatch.setattr(kept_programs, "MOST_BYTES", both * 5 // 4)
     program(CONFIG.replace(capacity=512))
     assert used.exists() and not unused.exists() and used.stat().st_mtime > 1000
+
+
+def test_programs_that_compile_side_by_side_leave_jaxs_cache_as_it_was():
+    """The second begins before the first is done, and ends after it: JAX's cache is off for both."""
+    is_on = lambda: jax.config.jax_enable_compilation_cache  # noqa: E731
+    first_runs, second_runs, first_is_done = (threading.Event() for _ in range(3))
+    was_off = []
+
+    class Lowered(jax.stages.Lowered):
+        def __init__(self, says, hears):
+            self.says, self.hears = says, hears
+
+        def compile(self):
+            self.says.set()
+            was_off.append(self.hears.wait(9) and not is_on())
+            return jax.jit(lambda: 0).lower().compile()
+
+    before = is_on()
+    jax.config.update("jax_enable_compilation_cache", True)
+    try:
+        with ThreadPoolExecutor(2) as pool:
+            first = pool.submit(kept_programs._compiled_anew, Lowered(first_runs, second_runs))
+            first_runs.wait(9)
+            second = pool.submit(kept_programs._compiled_anew, Lowered(second_runs, first_is_done))
+            first.result()
+            first_is_done.set()
+            second.result()
+        assert is_on() and was_off == [True, True]
+    finally:
+        jax.config.update("jax_enable_compilation_cache", before)
 
 
 def test_what_cannot_be_told_apart_is_not_kept(store):

@@ -126,15 +126,32 @@ def test_session_compiles_once_and_keeps_its_memory(model, params, chunks, step,
     """A cache that may grow starts large enough for the first chunks, whatever capacity is configured."""
     monkeypatch.setattr(Kept, "program", lambda kept, *given: step.lower(*given).compile())  # JAX has it: saves time
     session = Session(StreamSplat(model.config.replace(capacity=128, overflow="grow")), params)
-    session.expected_chunks, memory = (
-        8,
-        [],
-    )  # as many rows as the fixtures' cache: JAX may have that program in its cache
+    session.expected_chunks, memory = 8, []  # as many rows as the fixtures' cache: JAX may have that program
     for chunk in chunks:
         session.feed(chunk)
         memory.append(session.step_memory_bytes)
     assert session.num_compilations == 1
     assert memory[0] is not None and len(set(memory)) == 1
+
+
+@pytest.mark.parametrize("extras", [(), ("seen",), ("depths",), ("seen", "depths")])
+def test_the_step_that_is_compiled_ahead_has_the_shapes_of_the_stream(model, params, chunks, extras, monkeypatch):
+    class Interrupted(jax.stages.Compiled):
+        def __init__(self):
+            pass
+
+        def __call__(self, *given):
+            raise KeyboardInterrupt
+
+    compiled, shapes = [], lambda tree: jax.tree.map(lambda x: (x.shape, x.dtype), tree)
+    monkeypatch.setattr(Kept, "program", lambda kept, _, *given: compiled.append(shapes(given)) or Interrupted())
+    session = Session(model, params)
+    session.compile_ahead(64, 48, 100, is_masked="seen" in extras, brings_depth="depths" in extras)
+    maps = {name: jnp.ones(chunks[0].images.shape[:3], bool if name == "seen" else np.float32) for name in extras}
+    chunk = replace(chunks[0], **maps)
+    with pytest.raises(KeyboardInterrupt):
+        session.feed(chunk)
+    assert compiled == [shapes((session.cache, chunk))]
 
 
 def test_padding_views_may_hold_anything_and_padded_chunks_change_nothing(model, params, chunks, step):
