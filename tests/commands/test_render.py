@@ -1,5 +1,6 @@
 """`ssplat render`: pictures of a scene file from a capture's cameras, and a film."""
 
+import dataclasses
 import json
 
 import jax.numpy as jnp
@@ -10,9 +11,12 @@ from PIL import Image
 import ssplat_jax as ss
 from ssplat_jax.core.gaussians import mean_color
 from ssplat_jax.core.pytree import replace
+from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.rasterizer import Effects, fill_holes
+from ssplat_jax.runs.open_run import SavedPoses
 from ssplat_jax.scene_files.formats import save_gaussians
+from ssplat_jax.storage.run_folder import RunFolder
 from tests.commands.command_fixture import make_capture, run
 
 LEVEL = 1.0 / 255
@@ -42,7 +46,7 @@ def capture(tmp_path):
 
 
 def wanted(capture, gaussians, i, antialias, *, filled=True):
-    opened = ss.open_capture(capture)
+    opened = capture if isinstance(capture, Capture) else ss.open_capture(capture)
     camera = opened.camera(i, StreamFrame.at_camera(np.eye(4), scale=1.0, near=0.0, far=1.0))
     out = ss.render(gaussians, camera, effects=Effects(antialias=antialias))
     return np.clip(fill_holes(out.color, out.alpha, mean_color(gaussians)) if filled else out.color, 0, 1)
@@ -64,6 +68,19 @@ def test_pictures_are_what_the_cameras_see(tmp_path, capture, capsys):
     assert run("render", tmp_path / "run", capture, "--out", out, *arguments) == 0
     (only,) = (out / "views").iterdir()
     np.testing.assert_allclose(picture(only), wanted(capture, loaded, 0, "mip", filled=False), atol=0.51 * LEVEL)
+
+
+def test_a_run_is_drawn_from_its_adjusted_poses(tmp_path, capture):
+    folder, opened = RunFolder(tmp_path / "run"), ss.open_capture(capture)
+    ss.save_ply(folder.scene, scene())
+    shift = np.eye(4)
+    shift[0, 3] = 0.1
+    poses = {i: frame.camtoworld @ shift for i, frame in enumerate(opened.frames)}
+    SavedPoses(opened.digest(range(3)), poses).save(folder)
+    assert run("render", folder.path, capture, "--max-views", "1", "--out", tmp_path / "out", "--quiet") == 0
+    frames = tuple(dataclasses.replace(frame, camtoworld=poses[i]) for i, frame in enumerate(opened.frames))
+    expected = wanted(dataclasses.replace(opened, frames=frames), ss.load_ply(folder.scene), 0, "mip")
+    np.testing.assert_allclose(picture(tmp_path / "out" / "views" / "00000.png"), expected, atol=0.51 * LEVEL)
 
 
 @pytest.mark.parametrize(("name", "antialias"), [("scene.ply", "classic"), ("scene.glb", "mip"), ("scene.sog", "mip")])

@@ -68,18 +68,24 @@ def growing_capture(path, **options):
     return GrowingCapture(RunOptions(str(path), path, quiet_seconds=1.0, **options), Reporter())
 
 
-@pytest.mark.parametrize("stride", [8, 1])
-def test_frames_that_are_only_listed_are_signs_of_life_too(stride, tmp_path, monkeypatch):
+@pytest.mark.parametrize(("stride", "comes"), [(8, "the listing"), (1, "the listing"), (8, "the images")])
+def test_frames_that_are_not_streamed_are_signs_of_life_too(stride, comes, tmp_path, monkeypatch):
     now = [0.0]
     monkeypatch.setattr(capture_run.time, "monotonic", lambda: now[0])
     whole, growing = make_capture(tmp_path / "whole", num_frames=9, size=SIZE), tmp_path / "growing"
     shutil.copytree(whole, growing)
     if stride == 1:
         (growing / "images" / "1.png").unlink()  # still on its way, while others are listed
+    if comes == "the images":
+        for i in range(1, 9):
+            (growing / "images" / f"{i}.png").unlink()
     watched = growing_capture(growing, stride=stride)
     for count in range(1, 9):
         now[0] += 0.9
-        list_frames(growing, whole, count)
+        if comes == "the listing":
+            list_frames(growing, whole, count)
+        elif count < 8:
+            shutil.copy(whole / "images" / f"{count}.png", growing / "images")
         watched.look()
         assert not watched.has_ended and watched.indices == [0]
     now[0] += 1.1
