@@ -206,21 +206,6 @@ def _scores(
     }
 
 
-def findings(rows: list[Row]) -> list[str]:
-    """Gain and cost of more views, by suite."""
-    lines = []
-    for suite in dict.fromkeys(row["suite"] for row in rows):
-        ours = sorted((r for r in rows if (r["suite"], r["method"]) == (suite, OURS)), key=lambda r: r["views"])
-        if len(ours) > 1:
-            first, last = ours[0], ours[-1]
-            gains = ", ".join(f"{last[f'{c}_psnr'] - first[f'{c}_psnr']:+.2f} dB {c}" for c in ("literal", "shown"))
-            rises = all(b["literal_psnr"] > a["literal_psnr"] for a, b in itertools.pairwise(ours))
-            at = f"* {suite}, {first['views']} to {last['views']} views: {gains}"
-            at += " (literal PSNR rises at every step)" if rises else " (literal PSNR falls between)"
-            lines.append(f"{at}; time of a step x {last['step_ms'] / first['step_ms']:.2f}.")
-    return ["\n".join(lines)] if lines else []
-
-
 def plot(pyplot: Any, rows: list[Row]) -> Any:
     """Peak memory and literal PSNR against the number of views, a color a suite; every token kept is dashed."""
     figure, panels = pyplot.subplots(1, 2, figsize=(12, 4.5), layout="constrained")
@@ -249,7 +234,6 @@ over all views at once, and `warp nearest` moves the nearest context view by the
 that of step, decode and rendering, in MiB.""",
     cases=cases,
     plot=plot,
-    findings=findings,
 )
 
 run = functools.partial(run_study, STUDY)

@@ -150,7 +150,7 @@ class Demo:
         from ssplat_jax.storage.run_folder import lock_folder
 
         reporter = Reporter(self.quiet)
-        reporter.say("one to three minutes on two cores, most of it for compiling")
+        reporter.say("about a minute on two cores, most of it for compiling")
         with lock_folder(self.out):
             run_demo(self.scene, self.out, reporter)
         print(f"wrote {self.out}/scene.ply, metrics.json and pictures")

@@ -28,7 +28,7 @@ ARCHIVES = frozenset({".zip", ".r3d", ".tar", ".gz", ".tgz", ".7z", ".rar"})
 VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".mkv", ".webm"})
 PROCEDURAL = "procedural"  # scheme of the paths of procedural captures
 PROCEDURAL_FRAMES = 73  # 64 context views and the 9 interleaved targets between them
-PROCEDURAL_SIZE = (128, 96)  # (width, height), at which the demo takes a minute or two on two cores
+PROCEDURAL_SIZE = (128, 96)  # (width, height), at which the demo takes about a minute on two cores
 DONE = "done"
 """A file of this name in the folder of a growing capture says that nothing more will come."""
 
