@@ -58,7 +58,7 @@ SIZES = {
     "cpu": (
         Sizes((24, 64, 128), WALKS, (160, 120), joint=64),
         Sizes((24, 256, 512, 1024), ("room",), (96, 72), joint=0, label=", 96 x 72"),
-        Sizes((24, 1024, 10_000), ("room",), (64, 48), joint=0, label=", 64 x 48"),
+        Sizes((256, 1024, 4096), ("room",), (96, 72), joint=0, label=", slow, 96 x 72"),
     ),
     "gpu": (
         Sizes((24, 64, 128), WALKS, (480, 256)),
@@ -220,7 +220,7 @@ def plot(pyplot: Any, rows: list[Row]) -> Any:
         axes.set(xscale="log", xlabel="context views", ylabel=text)
         axes.spines[["top", "right"]].set_visible(False)
     panels[0].set_yscale("log")
-    panels[1].legend(fontsize=8)
+    panels[1].legend(fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5))
     return figure
 
 

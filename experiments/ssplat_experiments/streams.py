@@ -15,7 +15,7 @@ from ssplat_jax.model.network import complete_params
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.refinement import online_refinement
 from ssplat_jax.storage.weights import load_params
-from ssplat_jax.streaming.session import Session
+from ssplat_jax.streaming.session import INITIAL_CHUNKS, Session
 
 REDKITCHEN, REDKITCHEN_STRIDE = "redkitchen", 5
 
@@ -50,7 +50,7 @@ def new_session(config: StreamConfig) -> Session:
     are the same object.
     """
     session = _session(config)
-    session.cache = None
+    session.cache, session.expected_chunks = None, INITIAL_CHUNKS
     return session
 
 

@@ -9,6 +9,8 @@ and the unit of the poses stay, and so does what the images do not tell.
 
 COLMAP's bundle adjustment has a prior of places alone, none of rotations. On a small room (160x120, 12 frames, 0.5
 degrees and 1 % off) it left 0.81 degrees between neighbors, and 1.8 without any prior, where this leaves 0.49.
+`scipy.optimize.least_squares` with the same loss, prior and sparsity left 0.65 degrees on a synthetic scene (64
+cameras, 10 % false matches), where this leaves 0.08.
 
 Everything is NumPy in float64. A twist is a rotation vector in radians and a translation, in the camera's frame. The
 unknowns are the twists of all cameras and the places of all points, in one vector.

@@ -137,6 +137,16 @@ def test_all_that_follows_sees_the_adjusted_poses(adjusted, capture, capsys):
         load_run(adjusted, QUIET).open_capture(other)
 
 
+def test_a_new_run_leaves_nothing_that_could_pass_for_its_own(capture, tmp_path):
+    """Killed after its last chunk, it would take the scene of another run of as many views for its own."""
+    folder = RunFolder(tmp_path / "run")
+    folder.path.mkdir()
+    for left in (folder.metrics, folder.refined_scene):
+        left.write_bytes(b"of a run whose state was removed")
+    with opened(capture, folder.path):
+        assert not folder.metrics.exists() and not folder.refined_scene.exists()
+
+
 def test_files_of_others_are_neither_records_nor_deltas(tmp_path):
     folder = RunFolder(tmp_path)
     for k in (4, 8):

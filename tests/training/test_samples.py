@@ -23,6 +23,7 @@ from ssplat_jax.training.samples import (
     capture_sample,
     learned_frames,
     log_depths_at_cells,
+    open_mix,
     procedural_sample,
 )
 from tests.badinputs.cases import make_capture
@@ -113,6 +114,19 @@ def test_samples_show_each_frame_once_and_none_that_is_held_out(mix, capture):
     held_out = {4, 12, 20}
     assert held_out == set(range(NUM_FRAMES)) - set(learned_frames(capture))
     assert not seen & held_out and len(seen) > NUM_FRAMES / 2
+
+
+def test_no_two_samples_of_a_training_are_the_same():
+    batch = opened(dataclasses.replace(SMALL, batch=2), num_steps=3)
+    images = np.concatenate([np.asarray(batch(step, 0).chunks.images) for step in range(3)])
+    assert len(np.unique(images.reshape(6, -1), axis=0)) == 6
+
+
+def test_a_folder_of_captures_is_a_group_of_all_of_them(tmp_path):
+    for name in ("first", "second"):
+        make_capture(tmp_path / "many" / name)
+    (group,) = open_mix([tmp_path / "many"], [], NARROW).groups
+    assert [capture.name for capture in group.captures] == ["first", "second"]
 
 
 def test_poses_and_depths_of_a_sample_have_one_scale(mix, capture):
