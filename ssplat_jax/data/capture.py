@@ -276,7 +276,7 @@ class Capture:
         """`indices` (default: all) in the order of streaming, with slow video interleaved (`interleave`).
 
         The typical depth is taken to be the geometric mean of near and far. A causal stream keeps the order of frames,
-        since it would have to wait for a second of video.
+        since it would have to wait for seconds of video.
         """
         used = _indices(self, indices)
         if config.stream.causal:

@@ -170,8 +170,12 @@ def _check_counts(**counts: int) -> None:
 
 # -- order ------------------------------------------------------------------------------------------------------------
 
-MAX_INTERLEAVED_CHUNKS = 8
-"""Largest number of chunks interleaved at a time: with chunks of 4, 32 frames or about a second of video."""
+# A loop of 4,112 frames through the room, 0.03 % of the depth a frame, scores 23.4 dB with 8, 28.2 with 32; redkitchen's
+# 1,000 frames score the same with both.
+MAX_INTERLEAVED_CHUNKS = 32
+"""Largest number of chunks interleaved at a time: with chunks of 4, 128 frames or about four seconds of video."""
+NUM_MEASURED_STEPS = 31
+"""Steps between cameras by whose median a block is measured: about a second of video."""
 
 
 def interleave(centers: Float64[np.ndarray, "n 3"], indices: Sequence[int], chunk_size: int, step: float) -> list[int]:
@@ -191,7 +195,7 @@ def interleave(centers: Float64[np.ndarray, "n 3"], indices: Sequence[int], chun
     order: list[int] = []
     while len(order) < len(indices):
         first = len(order)
-        ahead = steps[first : first + chunk_size * MAX_INTERLEAVED_CHUNKS - 1]
+        ahead = steps[first : first + NUM_MEASURED_STEPS]
         typical = float(np.median(ahead)) if ahead.size else 0.0
         num_chunks = int(np.clip(round(step / typical), 1, MAX_INTERLEAVED_CHUNKS)) if typical > 0 else 1
         block = list(indices[first : first + chunk_size * num_chunks])

@@ -74,7 +74,8 @@ class Session:
     ) -> None:
         """Begins to compile the step of a new stream on another thread, while the caller prepares its first chunk.
 
-        A first chunk of other shapes compiles its own step.
+        A first chunk of other shapes compiles its own step. Nothing begins for a session that has a cache, whose shape
+        the stream continues, or that refines while it streams, since refinement adds arrays to the cache.
 
         Args:
             width: of the images, pixels.

@@ -90,6 +90,13 @@ def test_slow_video_is_interleaved_to_the_wanted_step():
     assert order[12:16] == [112, 115, 118, 121]
 
 
+@pytest.mark.parametrize("num_chunks", [1, 2, 8, 30, MAX_INTERLEAVED_CHUNKS])
+def test_views_of_a_chunk_are_as_far_apart_as_asked_however_slow_the_video(num_chunks):
+    centers = along_a_line([0.03 / num_chunks] * (8 * num_chunks - 1))
+    chunks = centers[interleave(centers, list(range(8 * num_chunks)), 4, 0.03), 0].reshape(-1, 4)
+    np.testing.assert_allclose(np.diff(chunks), 0.03)
+
+
 def test_a_capture_is_interleaved_unless_frames_are_given():
     capture = two_planes(16, 0.01)  # depths from 2 to 4
     frame = StreamFrame.at_camera(np.eye(4), scale=1.0, near=2.0, far=4.0)
