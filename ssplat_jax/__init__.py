@@ -16,9 +16,9 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from ssplat_jax.cache import VoxelCache as VoxelCache
-    from ssplat_jax.cache import check_cache as check_cache
-    from ssplat_jax.cache import ensure_capacity as ensure_capacity
+    from ssplat_jax.cache.state import VoxelCache as VoxelCache
+    from ssplat_jax.cache.state import check_cache as check_cache
+    from ssplat_jax.cache.state import ensure_capacity as ensure_capacity
     from ssplat_jax.config import StreamConfig as StreamConfig
     from ssplat_jax.config import preset as preset
     from ssplat_jax.core.cameras import Camera as Camera
@@ -58,10 +58,10 @@ _MODULES = {
     "StreamConfig": "config",
     "StreamFrame": "data.stream_frame",
     "StreamSplat": "model.streamsplat",
-    "VoxelCache": "cache",
+    "VoxelCache": "cache.state",
     "adjust_poses": "poses.adjust_poses",
-    "check_cache": "cache",
-    "ensure_capacity": "cache",
+    "check_cache": "cache.state",
+    "ensure_capacity": "cache.state",
     "fill_holes": "rasterizer",
     "load_params": "storage.weights",
     "load_ply": "scene_files.formats",

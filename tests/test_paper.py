@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ssplat_jax.cache import ProjectedCache, Tokens, project
+from ssplat_jax.cache.project import ProjectedCache, project
+from ssplat_jax.cache.state import Tokens
 from ssplat_jax.config import preset
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.chunk import Chunk

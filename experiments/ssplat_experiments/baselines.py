@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.ndimage import map_coordinates
 
-from ssplat_jax.cache import init_cache
+from ssplat_jax.cache.state import init_cache
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.chunk import Chunk

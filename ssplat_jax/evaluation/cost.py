@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ssplat_jax.cache import ensure_capacity
+from ssplat_jax.cache.state import ensure_capacity
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.chunk import Chunk
 from ssplat_jax.core.cpu_backend import num_cores

@@ -6,7 +6,7 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ssplat_jax.cache import ProjectedCache
+from ssplat_jax.cache.project import ProjectedCache
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.model.layers import Conv, UNet
 from ssplat_jax.model.views import Views

@@ -12,7 +12,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ssplat_jax.cache import SAME_SURFACE_MARGIN, ProjectedCache
+from ssplat_jax.cache.project import ProjectedCache
+from ssplat_jax.cache.votes import SAME_SURFACE_MARGIN
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.numerics import safe_log
 from ssplat_jax.model.layers import average_pool

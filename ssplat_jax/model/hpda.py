@@ -9,7 +9,7 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ssplat_jax.cache import ProjectedCache
+from ssplat_jax.cache.project import ProjectedCache
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.numerics import safe_log, softplus_inverse
 from ssplat_jax.model.views import AnchoredDepth, DepthDistribution, Views, from_candidate_space, to_candidate_space

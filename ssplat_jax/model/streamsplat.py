@@ -19,21 +19,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ssplat_jax.cache import (
-    Tokens,
-    VoxelCache,
-    carve,
-    coarsen,
-    fuse,
-    init_cache,
-    observe,
-    project,
-    rows_in_sight,
-    seen_cells,
-    store_depths,
-    vote,
-)
 from ssplat_jax.cache.changes import changed_gaussians, unpack
+from ssplat_jax.cache.fuse import fuse
+from ssplat_jax.cache.project import coarsen, project, rows_in_sight
+from ssplat_jax.cache.state import Tokens, VoxelCache, init_cache
+from ssplat_jax.cache.votes import carve, observe, seen_cells, store_depths, vote
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.chunk import Chunk, check_chunk
 from ssplat_jax.core.gaussians import Gaussians, mask_gaussians

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from ssplat_jax.cache import VoxelCache
+from ssplat_jax.cache.state import VoxelCache
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.console import Reporter
 from ssplat_jax.core.errors import InputError, StorageError, refusal

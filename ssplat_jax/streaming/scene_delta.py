@@ -20,8 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float32, Int, Int32
 
-from ssplat_jax.cache import VoxelCache
-from ssplat_jax.cache.state import require_single_cache
+from ssplat_jax.cache.state import VoxelCache, require_single_cache
 from ssplat_jax.cache.votes import total_weight
 from ssplat_jax.core.gaussians import Gaussians, mask_gaussians
 from ssplat_jax.core.numerics import power_of_two

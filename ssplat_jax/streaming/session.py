@@ -9,8 +9,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 import jax
 import jax.numpy as jnp
 
-from ssplat_jax.cache import VoxelCache, check_cache, ensure_capacity
-from ssplat_jax.cache.state import init_cache, with_refinement
+from ssplat_jax.cache.state import VoxelCache, check_cache, ensure_capacity, init_cache, with_refinement
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.chunk import Chunk, check_chunk
 from ssplat_jax.core.errors import refusal

@@ -21,8 +21,7 @@ from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 from jaxtyping import PyTree
 
-from ssplat_jax.cache import VoxelCache, grow
-from ssplat_jax.cache.state import required_capacity
+from ssplat_jax.cache.state import VoxelCache, grow, required_capacity
 from ssplat_jax.core.chunk import Chunk
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.core.gaussians import Gaussians

@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
-from ssplat_jax.cache import VoxelCache
 from ssplat_jax.cache.key_views import KeyViews
+from ssplat_jax.cache.state import VoxelCache
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.cpu_backend import make_room

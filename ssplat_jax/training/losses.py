@@ -18,7 +18,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ssplat_jax.cache import Tokens, VoxelCache, vote
+from ssplat_jax.cache.state import Tokens, VoxelCache
+from ssplat_jax.cache.votes import vote
 from ssplat_jax.core.gaussians import Gaussians, mask_gaussians, mean_color
 from ssplat_jax.evaluation.metrics import LpipsWeights
 from ssplat_jax.evaluation.metrics import lpips as lpips_distance

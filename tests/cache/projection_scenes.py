@@ -5,7 +5,8 @@ import numpy as np
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 
-from ssplat_jax.cache import SeenCells, VoxelCache, init_cache, seen_cells
+from ssplat_jax.cache.state import VoxelCache, init_cache
+from ssplat_jax.cache.votes import SeenCells, seen_cells
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.pytree import replace
 from tests.cache.streams import CAPACITY, CONFIG, WIDTH

@@ -7,11 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 from hypothesis import strategies as st
 
-from ssplat_jax.cache import PIVOT_FIELDS, Tokens, VoxelCache, init_cache
-from ssplat_jax.cache import fuse as plain_fuse
 from ssplat_jax.cache.changes import WIDTH as CHANGE_WIDTH
 from ssplat_jax.cache.changes import settle, unpack
-from ssplat_jax.cache.state import pivot_fields
+from ssplat_jax.cache.fuse import fuse as plain_fuse
+from ssplat_jax.cache.state import PIVOT_FIELDS, Tokens, VoxelCache, init_cache, pivot_fields
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.pytree import replace
 from tests.cache import numpy_reference as reference

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ssplat_jax.cache import check_cache, ensure_capacity, grow, init_cache
 from ssplat_jax.cache.fuse import saturating_add
+from ssplat_jax.cache.state import check_cache, ensure_capacity, grow, init_cache
 from ssplat_jax.core.errors import CacheError, InputError
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.streaming.session import starting_capacity

@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ssplat_jax.cache import init_cache
 from ssplat_jax.cache.changes import BOUNDS, WIDTH, Change, changed_gaussians, settle, unpack
 from ssplat_jax.cache.hash_table import voxel_indices
+from ssplat_jax.cache.state import init_cache
 from ssplat_jax.core.gaussians import SH_C0, Gaussians
 from ssplat_jax.core.pytree import replace
 from tests.cache.streams import CAPACITY, CONFIG, Recipe, fuse, revised, to_jax

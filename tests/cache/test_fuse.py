@@ -7,10 +7,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from ssplat_jax.cache import PIVOT_FIELDS, Tokens, VoxelCache, init_cache
-from ssplat_jax.cache import fuse as plain_fuse
 from ssplat_jax.cache.fuse import MERGE_BLOCKS
+from ssplat_jax.cache.fuse import fuse as plain_fuse
 from ssplat_jax.cache.hash_table import voxel_indices
+from ssplat_jax.cache.state import PIVOT_FIELDS, Tokens, VoxelCache, init_cache
 from ssplat_jax.core.pytree import replace
 from tests.cache import numpy_reference as reference
 from tests.cache.streams import (

@@ -9,7 +9,8 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from ssplat_jax.cache import carve, coarsen, observe, project
+from ssplat_jax.cache.project import coarsen, project
+from ssplat_jax.cache.votes import carve, observe
 from ssplat_jax.core.pytree import replace
 from tests.cache import numpy_reference as reference
 from tests.cache.projection_scenes import (

@@ -7,9 +7,8 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from ssplat_jax.cache import carve, init_cache, observe, store_depths, vote
-from ssplat_jax.cache.state import NUM_OBSERVED, STORED_CELLS
-from ssplat_jax.cache.votes import observation_features
+from ssplat_jax.cache.state import NUM_OBSERVED, STORED_CELLS, init_cache
+from ssplat_jax.cache.votes import carve, observation_features, observe, store_depths, vote
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.pytree import replace
 from tests.cache import numpy_reference as reference

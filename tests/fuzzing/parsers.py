@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image
 
 import ssplat_jax as ss
-from ssplat_jax.cache import init_cache
+from ssplat_jax.cache.state import init_cache
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.data.split import read_index
 from ssplat_jax.scene_files.formats import SCENE_READERS, save_gaussians

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ssplat_jax.cache import ProjectedCache
+from ssplat_jax.cache.project import ProjectedCache
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.chunk import Chunk
 from ssplat_jax.core.pytree import replace

@@ -7,8 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ssplat_jax.cache import init_cache
-from ssplat_jax.cache.state import NUM_OBSERVED
+from ssplat_jax.cache.state import NUM_OBSERVED, init_cache
 from ssplat_jax.config import preset
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.model.decoder import (

@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ssplat_jax.cache import Tokens, fuse, init_cache
 from ssplat_jax.cache.changes import no_change, unpack
+from ssplat_jax.cache.fuse import fuse
 from ssplat_jax.cache.hash_table import voxel_indices
 from ssplat_jax.cache.key_views import KeyViews
-from ssplat_jax.cache.state import with_refinement
+from ssplat_jax.cache.state import Tokens, init_cache, with_refinement
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.chunk import Chunk

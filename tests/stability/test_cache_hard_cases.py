@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ssplat_jax.cache import VoxelCache, init_cache, project
+from ssplat_jax.cache.project import project
+from ssplat_jax.cache.state import VoxelCache, init_cache
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.pytree import replace
 from tests.cache import streams

@@ -13,7 +13,8 @@ import jax
 import numpy as np
 import pytest
 
-from ssplat_jax.cache import fuse, init_cache
+from ssplat_jax.cache.fuse import fuse
+from ssplat_jax.cache.state import init_cache
 from ssplat_jax.core import kept_programs
 from ssplat_jax.core.kept_programs import SWITCH, Kept
 from ssplat_jax.core.numerics import safe_sqrt

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ssplat_jax.cache import init_cache
+from ssplat_jax.cache.state import init_cache
 from ssplat_jax.core.atomic import previous_path, write_atomic
 from ssplat_jax.core.errors import InputError, StorageError
 from ssplat_jax.storage.saved_states import load_newest_state, load_state, save_state

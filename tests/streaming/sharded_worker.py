@@ -12,7 +12,7 @@ import numpy as np
 from jax.sharding import NamedSharding
 from jax.sharding import PartitionSpec as P
 
-from ssplat_jax.cache import check_cache
+from ssplat_jax.cache.state import check_cache
 from ssplat_jax.model.streamsplat import StreamSplat
 from ssplat_jax.streaming.sharded import ShardedStream
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ssplat_jax.cache import grow, init_cache
+from ssplat_jax.cache.state import grow, init_cache
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.model.compact import GaussianHead
 from ssplat_jax.model.network import init_params

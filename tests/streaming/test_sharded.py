@@ -14,8 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ssplat_jax.cache import PIVOT_FIELDS, fuse, grow, init_cache, project
+from ssplat_jax.cache.fuse import fuse
 from ssplat_jax.cache.hash_table import shards_of
+from ssplat_jax.cache.project import project
+from ssplat_jax.cache.state import PIVOT_FIELDS, grow, init_cache
 from ssplat_jax.data.open_capture import open_capture
 from ssplat_jax.model.streamsplat import StreamSplat
 from tests.cache.projection_scenes import cameras

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ssplat_jax.cache import init_cache
+from ssplat_jax.cache.state import init_cache
 from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.chunk import Chunk
 from ssplat_jax.core.pytree import replace
