@@ -170,8 +170,8 @@ def _check_counts(**counts: int) -> None:
 
 # -- order ------------------------------------------------------------------------------------------------------------
 
-# A loop of 4,112 frames through the room, 0.03 % of the depth a frame, scores 23.4 dB with 8, 28.2 with 32; redkitchen's
-# 1,000 frames score the same with both.
+# A loop of 4,112 frames through the room, 0.03 % of the depth a frame, scores 23.4 dB with 8, 28.2 with 32; the
+# 1,000 frames of redkitchen score the same with both.
 MAX_INTERLEAVED_CHUNKS = 32
 """Largest number of chunks interleaved at a time: with chunks of 4, 128 frames or about four seconds of video."""
 NUM_MEASURED_STEPS = 31
