@@ -96,15 +96,9 @@ def check_chunk(chunk: Chunk, num_views: int, *, stacked: bool = False) -> None:
         if len(got) != len(wanted) or any(isinstance(w, int) and w != g for w, g in zip(wanted, got, strict=True)):
             sizes = " ".join(map(str, ("t", *of_one) if stacked else of_one))
             raise InputError(f"chunk: {name} must be [{sizes}], got {list(got)}.{fix if wanted else ''}")
-    if not any(isinstance(x, Tracer) for x in jax.tree.leaves(chunk)):
-        _check_values(chunk)
-
-
-def _check_values(chunk: Chunk) -> None:
-    """Checks the valid views of a chunk, or of stacked ones."""
-    valid, near, far = (np.asarray(x) for x in (chunk.valid, chunk.near, chunk.far))
-    if not valid.any():
+    if any(isinstance(x, Tracer) for x in jax.tree.leaves(chunk)) or not np.any(chunk.valid):
         return
+    valid, near, far = (np.asarray(x) for x in (chunk.valid, chunk.near, chunk.far))
     viewmats, Ks, images = (np.asarray(x)[valid] for x in (chunk.viewmats, chunk.Ks, chunk.images))
     check_matrices(viewmats, Ks, "chunk", complete=True)
     check_images(images, "chunk: images")

@@ -172,10 +172,6 @@ def _lerp(a, b, weight):
     return a + weight * (b - a)
 
 
-def _correlate_forward(reference, source, taps):
-    return correlate_warped(reference, source, taps), (reference, source, taps)
-
-
 def _correlate_backward(residuals, cotangent):
     reference, source, taps = residuals
     height, width, channels = source.shape
@@ -190,4 +186,4 @@ def _correlate_backward(residuals, cotangent):
     return mixing @ samples, (mixing.T @ reference).reshape(source.shape), None
 
 
-correlate_warped.defvjp(_correlate_forward, _correlate_backward)
+correlate_warped.defvjp(lambda *inputs: (correlate_warped(*inputs), inputs), _correlate_backward)

@@ -1,5 +1,7 @@
 """The compact network, small enough for a CPU (ours): encoder, plane sweep, token regressor and Gaussian head."""
 
+import functools
+
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
@@ -8,7 +10,6 @@ from jaxtyping import Array, Bool, Float, Int
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.numerics import bilinear_taps, correlate_warped, safe_normalize
 from ssplat_jax.core.pytree import pytree
-from ssplat_jax.model import mixer
 from ssplat_jax.model.layers import (
     Conv,
     HalvingConv,
@@ -22,6 +23,7 @@ from ssplat_jax.model.layers import (
     pixel_unshuffle,
     rms_normalize,
 )
+from ssplat_jax.model.mixer import Mixer
 from ssplat_jax.model.views import (
     GRID_STRIDE,
     AnchoredDepth,
@@ -120,11 +122,6 @@ def encode(params, views: Views, config: StreamConfig) -> CompactFeatures:
 
 
 # -- Plane sweep and cost-volume U-Net: P_i(k | u) from the chunk alone (Sec. 3.3) ------------------------------------
-def unit_features(x: Float[Array, "*b c"]) -> Float[Array, "*b c"]:
-    """Features of unit length, whose dot products are cosines; zero stays zero."""
-    return safe_normalize(x, eps=1e-6)
-
-
 def plane_sweep(features: CompactFeatures, views: Views, config: StreamConfig) -> Float[Array, "v hf wf dl"]:
     """Cost volume: mean cosine of each cell with its source views at every candidate, at one or two scales.
 
@@ -136,11 +133,11 @@ def plane_sweep(features: CompactFeatures, views: Views, config: StreamConfig) -
         Zero features score 0, equal features 1.
     """
     v, hf, wf = views.inside.shape
-    maps = [(GRID_STRIDE, unit_features(features.grid), unit_features(features.grid))]
+    unit = functools.partial(safe_normalize, eps=1e-6)  # then dot products are cosines
+    maps = [(GRID_STRIDE, unit(features.grid), unit(features.grid))]
     if config.network.fine_matching:
-        fine = unit_features(features.fine)
         # A cell's center is the common corner of 2 x 2 fine pixels: their mean is the bilinear sample there.
-        maps.append((GRID_STRIDE // 2, unit_features(average_pool(features.fine, 2)), fine))
+        maps.append((GRID_STRIDE // 2, unit(average_pool(features.fine, 2)), unit(features.fine)))
 
     def correlate_pair(pair):
         reference, source, is_valid = pair
@@ -247,7 +244,7 @@ def mix_tokens(params, feats, positions, inside, view_valid, config: StreamConfi
     """
     bound = rms_normalize if config.additions.unit_features else lambda x: x
     feats = bound(feats.astype(jnp.float32))
-    return bound(mixer.mix_tokens(params, feats, positions, inside, view_valid, config))
+    return bound(Mixer(config).apply({"params": params}, feats, positions, inside, view_valid))  # pyright: ignore
 
 
 # -- Gaussian head: an MLP from features to shapes and colors (Sec. 3.6, Gaussian Decoder) ----------------------------
@@ -308,7 +305,7 @@ def stages(config: StreamConfig) -> dict:
         "encoder": (Encoder(config), (images, sources, sources_valid)),
         "cost_volume": (CostVolume(config), (grid(levels * config.network.num_depths), context, valid)),
         "tokens": (TokenRegressor(config), (grid(48), grid(1), grid(1), context, grid(config.network.unet_width))),
-        "mixer": (mixer.Mixer(config), (grid(c), grid(3), inside, valid)),
+        "mixer": (Mixer(config), (grid(c), grid(3), inside, valid)),
         "decoder": (GaussianHead(config), (jnp.zeros((1, c)),)),
     }
 

@@ -15,7 +15,7 @@ from ssplat_jax.core.gaussians import SH_C0, Gaussians
 from ssplat_jax.core.numerics import safe_log, safe_sqrt
 from ssplat_jax.core.pytree import pytree, replace
 from ssplat_jax.core.rotations import multiply_quats, quats_to_matrices
-from ssplat_jax.model.views import TokenShapes
+from ssplat_jax.model.views import TokenShapes, repeat_cells
 
 START_SCALE = 0.43
 """Untrained sideways scale, as a fraction of a Gaussian's part of the cell: neighbors overlap to a closed surface."""
@@ -136,14 +136,14 @@ def divide_cells(rgbs: Float[Array, "m a"], config: StreamConfig) -> Parts:
         images.append(_halved(images[-1]))
     level = jnp.full(len(rgbs), len(blocks) - 1)
     for i in reversed(range(len(blocks) - 1)):
-        lost = jnp.mean((images[i] - _enlarged(images[i + 1], 2)) ** 2, axis=(1, 2, 3))
+        lost = jnp.mean((images[i] - repeat_cells(images[i + 1], 2)) ** 2, axis=(1, 2, 3))
         level = jnp.where(lost >= MIN_DETAIL[blocks[i] * 4 // side] ** 2, i, level)
     firsts = [np.arange(side) // block * block for block in blocks]  # first row or column of the part of each
     centers = [(first + 0.5 * block) / side - 0.5 for first, block in zip(firsts, blocks, strict=True)]
     grids = [np.meshgrid(x, x, indexing="ij") for x in centers]
     leads = [np.equal(first, np.arange(side)) for first in firsts]
     choose = lambda tables: jnp.asarray(np.stack(tables).reshape(len(blocks), -1))[level]  # noqa: E731
-    images = [_enlarged(image, block) for image, block in zip(images, blocks, strict=True)]
+    images = [repeat_cells(image, block) for image, block in zip(images, blocks, strict=True)]
     colors = images[-1]
     for i, image in enumerate(images[:-1]):
         colors = jnp.where(level[:, None, None, None] == i, image, colors)
@@ -160,11 +160,6 @@ def _halved(images: Float[Array, "m s s 3"]) -> Float[Array, "m r r 3"]:
     """Images of half the side, each pixel the mean of four."""
     # Slices, not sums over the inner axes of a reshaped array: those take six times as long on a CPU.
     return 0.25 * (images[:, ::2, ::2] + images[:, 1::2, ::2] + images[:, ::2, 1::2] + images[:, 1::2, 1::2])
-
-
-def _enlarged(images: Float[Array, "m r r 3"], factor: int) -> Float[Array, "m s s 3"]:
-    """Images with every pixel repeated `factor` times along both sides."""
-    return jnp.repeat(jnp.repeat(images, factor, axis=1), factor, axis=2) if factor > 1 else images
 
 
 # -- Evidence head: opacity, scale and contrast of a pivot's Gaussians from how views saw it (ours) -------------------

@@ -30,10 +30,6 @@ def conv2d(x: Float[Array, "v h w c"], kernel: Float[Array, "kh kw c o"], pads: 
     return jax.lax.conv_general_dilated(x, kernel, (1, 1), pads, dimension_numbers=DIMENSIONS)
 
 
-def _conv2d_forward(x, kernel, pads):
-    return conv2d(x, kernel, pads), (x, kernel)
-
-
 def _conv2d_backward(pads, residuals, cotangent):
     x, kernel = residuals
     kh, kw = kernel.shape[:2]
@@ -50,7 +46,7 @@ def _conv2d_backward(pads, residuals, cotangent):
     return x_gradient, jnp.stack(taps).reshape(kernel.shape)
 
 
-conv2d.defvjp(_conv2d_forward, _conv2d_backward)
+conv2d.defvjp(lambda x, kernel, pads: (conv2d(x, kernel, pads), (x, kernel)), _conv2d_backward)
 
 
 class Conv(nn.Module):

@@ -75,7 +75,14 @@ class GlobalBlock(nn.Module):
 
 
 class Mixer(nn.Module):
-    """Alternating neighbor blocks and global blocks."""
+    """Alternating neighbor blocks and global blocks; features stay as they are with `mixer_blocks=0`.
+
+    Args:
+        feats: token features.
+        positions: token positions, stream frame; no gradient flows to them.
+        inside: tokens in the image.
+        view_valid: views that are no padding.
+    """
 
     config: StreamConfig
 
@@ -88,6 +95,8 @@ class Mixer(nn.Module):
         view_valid: Bool[Array, " v"],
     ) -> Float[Array, "v hf wf c"]:
         network = self.config.network
+        if not network.mixer_blocks:
+            return feats
         constants = jax.lax.stop_gradient(positions)
         neighbors = nearest_tokens(constants, inside, network.mixer_neighbors, network.mixer_radius)
         x, usable = feats, inside.reshape(-1)
@@ -96,29 +105,6 @@ class Mixer(nn.Module):
             x = block(x.reshape(-1, x.shape[-1]), neighbors, usable).reshape(x.shape)
             x = GlobalBlock(name=f"mv_blocks_{i}")(x, view_valid)
         return x
-
-
-def mix_tokens(
-    params,
-    feats: Float[Array, "v hf wf c"],
-    positions: Float[Array, "v hf wf 3"],
-    inside: Bool[Array, "v hf wf"],
-    view_valid: Bool[Array, " v"],
-    config: StreamConfig,
-) -> Float[Array, "v hf wf c"]:
-    """Token features after the blocks of the mixer; unchanged with `mixer_blocks=0`.
-
-    Args:
-        params: parameters of `Mixer`.
-        feats: token features.
-        positions: token positions, stream frame; no gradient flows to them.
-        inside: tokens in the image.
-        view_valid: views that are no padding.
-        config: model configuration.
-    """
-    if not config.network.mixer_blocks:
-        return feats
-    return Mixer(config).apply({"params": params}, feats, positions, inside, view_valid)  # pyright: ignore[reportReturnType]
 
 
 def nearest_tokens(

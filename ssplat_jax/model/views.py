@@ -76,7 +76,7 @@ class TokenShapes:
 
 def repeat_cells(x: Array, factor: int) -> Array:
     """Map `[v, h, w, ...]` on a finer grid: every cell repeated `factor` times in both directions."""
-    return jnp.repeat(jnp.repeat(x, factor, axis=1), factor, axis=2)
+    return jnp.repeat(jnp.repeat(x, factor, axis=1), factor, axis=2) if factor > 1 else x
 
 
 def prepare_views(chunk: Chunk, config: StreamConfig) -> Views:

@@ -25,20 +25,8 @@ from jaxtyping import Array, Float, Int
 
 from ssplat_jax.core.cpu_backend import by_platform, in_own_kernel, short_exp
 from ssplat_jax.core.numerics import with_rank_promotion
-from ssplat_jax.rasterizer import constants
-from ssplat_jax.rasterizer.binning import (
-    BOX,
-    CHANNELS,
-    FACTORS,
-    LOG_OPACITY,
-    MEAN_X,
-    MEAN_Y,
-    SHAPE,
-    WITHOUT_BOX,
-    Grid,
-    TileIntersections,
-    num_channels,
-)
+from ssplat_jax.rasterizer import binning, constants
+from ssplat_jax.rasterizer.binning import Grid, TileIntersections
 
 Results = TypeVar("Results")
 
@@ -64,7 +52,7 @@ LOG_ALPHA_MAX = math.log(constants.ALPHA_MAX)
 CAPPED_ALPHA = constants.ALPHA_MAX * (1 - 1e-5)
 """Alphas from here on are capped: `short_exp(LOG_ALPHA_MAX)` is not less."""
 
-STEP_CHANNELS = slice(CHANNELS.start, None)
+STEP_CHANNELS = slice(binning.CHANNELS.start, None)
 """The channels of a step's columns, which have no box; the ones from which alpha is composited come last."""
 
 
@@ -84,7 +72,7 @@ def composite(
         Sums of weight times channel for each tile, channel and pixel. Gradients reach the table's shape and channels.
         Samples fainter than 1/255 or capped at 0.99 have no gradient by their opacity.
     """
-    return _by_platform(functools.partial(_forward, grid, with_alpha, table, intersections))
+    return _composite_fwd(grid, with_alpha, table, intersections)[0]
 
 
 def _by_platform(compute: Callable[[Schedule], Results]) -> Results:
@@ -93,7 +81,7 @@ def _by_platform(compute: Callable[[Schedule], Results]) -> Results:
 
 
 def _forward(grid: Grid, with_alpha: bool, table, intersections: TileIntersections, schedule: Schedule):
-    channels = num_channels(table) + with_alpha  # a channel of ones becomes alpha
+    channels = binning.num_channels(table) + with_alpha  # a channel of ones becomes alpha
 
     def batch(out, tiles):
         def step(_, values, alphas, transmittance, out):
@@ -141,7 +129,7 @@ def _backward(grid: Grid, with_alpha: bool, residuals, cotangents, schedule: Sch
 
         return _run_steps(grid, table, intersections, tiles, schedule, step, (tails[inside].T, grads))[1], None
 
-    grads = jnp.zeros_like(table[:, WITHOUT_BOX])
+    grads = jnp.zeros_like(table[:, binning.WITHOUT_BOX])
     grads = lax.scan(batch, grads, _batches(intersections.bounds, grid, schedule))[0]
     return jnp.pad(grads, ((0, 0), (0, table.shape[1] - grads.shape[1])))
 
@@ -155,7 +143,7 @@ def median_rows(grid: Grid, table: Float[Array, "m f"], intersections: TileInter
 
 
 def _median_rows(grid: Grid, table, intersections: TileIntersections, schedule: Schedule):
-    table = jnp.concatenate([table[:, SHAPE], table[:, BOX]], axis=1)
+    table = jnp.concatenate([table[:, binning.SHAPE], table[:, binning.BOX]], axis=1)
 
     def batch(tiles):
         def step(rows, _, alphas, transmittance, found):
@@ -220,7 +208,7 @@ def _run_steps(
         i, transmittance, state = carry
         start = first + i * size
         rows = in_own_kernel(has_any, lambda: _next_rows(intersections.rows, start, size))
-        gaussians = in_own_kernel(has_any, lambda: table[rows][..., WITHOUT_BOX])
+        gaussians = in_own_kernel(has_any, lambda: table[rows][..., binning.WITHOUT_BOX])
         values = in_own_kernel(has_any, lambda: _step_columns(grid, gaussians, tiles, start, last, with_ones))
         transmittance, state = step(rows, values, _alphas(grid, values), transmittance, state)
         return i + 1, transmittance, state
@@ -249,17 +237,17 @@ def _offsets(grid: Grid, values) -> tuple[Float[Array, "p u t"], Float[Array, "p
     """dx and dy of every sample: its pixel's center minus the Gaussian's mean."""
     side = jnp.arange(grid.tile, dtype=values.dtype) - (grid.tile - 1) / 2  # from the tile's center
     return (
-        jnp.tile(side, grid.tile)[:, None, None] - values[MEAN_X],
-        jnp.repeat(side, grid.tile)[:, None, None] - values[MEAN_Y],
+        jnp.tile(side, grid.tile)[:, None, None] - values[binning.MEAN_X],
+        jnp.repeat(side, grid.tile)[:, None, None] - values[binning.MEAN_Y],
     )
 
 
 def _alphas(grid: Grid, values) -> Float[Array, "p u t"]:
     """Alphas of all samples; 0 where they are skipped."""
     dx, dy = _offsets(grid, values)
-    p, q, r = values[FACTORS]
+    p, q, r = values[binning.FACTORS]
     across, along = p * dx + q * dy, r * dy
-    log_alpha = values[LOG_OPACITY] - across * across - along * along
+    log_alpha = values[binning.LOG_OPACITY] - across * across - along * along
     is_drawn = log_alpha >= constants.LOG_ALPHA_MIN
     return short_exp(jnp.where(is_drawn, jnp.minimum(log_alpha, LOG_ALPHA_MAX), -jnp.inf), constants.LOG_ALPHA_MIN)
 
@@ -319,8 +307,8 @@ def _shape_gradients(grid: Grid, exponents: Float[Array, "p u t"], values) -> li
     product. There s is `center` + p X + q Y, which is small where a sample is drawn: the moments of s do not cancel,
     however long and thin the Gaussian is.
     """
-    x, y = values[MEAN_X], values[MEAN_Y]
-    p, q, r = values[FACTORS]
+    x, y = values[binning.MEAN_X], values[binning.MEAN_Y]
+    p, q, r = values[binning.FACTORS]
     moments = jnp.einsum("mp,put->mut", _monomials(grid, exponents.dtype), exponents, precision="highest")
     one, by_x, by_y, by_xx, by_xy, by_yy = moments
     center = -(p * x + q * y)

@@ -64,14 +64,21 @@ def splat_channels(
 ) -> Float[Array, "b n channels"]:
     """The channels of each camera and Gaussian to composite: RGB, then depth and features where wanted.
 
-    Rows of features that are not finite become 0.
+    Colors are max(0.5 + sum, 0), with the bands of `effects` along the directions from camera to Gaussian.
+
+    Limits:
+        0.5 + sum < 0 gives 0, with a zero gradient; at exactly 0 the gradient is halved.
+        Rows of features that are not finite become 0.
     """
     degree = gaussians.sh_degree if effects.sh_degree is None else min(effects.sh_degree, gaussians.sh_degree)
-    directions = None
-    if degree > 0:
-        directions = safe_normalize(gaussians.means - camera.centers[:, None, :])
+    if degree == 0:
+        colors = SH_C0 * gaussians.sh[:, 0, :]
+    else:
+        basis = sh_basis(safe_normalize(gaussians.means - camera.centers[:, None, :]), degree)
+        # A sum of products: a dot product would have the platform's matmul precision.
+        colors = jnp.sum(basis[..., None] * gaussians.sh[:, : basis.shape[-1], :], axis=-2)
     shape = splats.depths.shape
-    colors = jnp.broadcast_to(sh_colors(gaussians.sh, directions, degree), (*shape, 3))
+    colors = jnp.broadcast_to(jnp.maximum(0.5 + colors, 0.0), (*shape, 3))
     parts = [colors.astype(splats.depths.dtype)]
     if "depth" in effects.outputs:
         parts.append(splats.depths[..., None])
@@ -125,23 +132,6 @@ def apply_exposures(color: Float[Array, "*b h w 3"], exposures: Float[Array, "*b
     matrices = jnp.where(is_finite, exposures, jnp.eye(3, 4, dtype=exposures.dtype))[..., None, None, :, :]
     corrected = sum(matrices[..., i] * color[..., i, None] for i in range(3)) + matrices[..., 3]
     return jnp.maximum(corrected, 0.0)
-
-
-def sh_colors(
-    sh: Float[Array, "n k 3"], directions: Float[Array, "*b n 3"] | None, degree: int
-) -> Float[Array, "*b n 3"]:
-    """Colors max(0.5 + sum, 0) along unit `directions` (camera to Gaussian), from the bands up to `degree`.
-
-    At degree 0, `directions` is not used and may be None; the colors are then `[n 3]`.
-
-    Limits:
-        0.5 + sum < 0 gives 0, with a zero gradient; at exactly 0 the gradient is halved.
-    """
-    if degree == 0 or directions is None:
-        return jnp.maximum(0.5 + SH_C0 * sh[:, 0, :], 0.0)
-    basis = sh_basis(directions, degree)
-    # A sum of products: a dot product would have the platform's matmul precision.
-    return jnp.maximum(0.5 + jnp.sum(basis[..., None] * sh[:, : basis.shape[-1], :], axis=-2), 0.0)
 
 
 SIGMA = 2.0

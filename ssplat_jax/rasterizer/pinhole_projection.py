@@ -138,15 +138,6 @@ def _sight(gaussians: Gaussians, camera: Camera, near: Float[Array, " b"], visib
     return _Sight(in_front, depths, tangents, clipped, is_low, is_high, unfocused, rows)
 
 
-def _unit_quats(quats: Float[Array, "n 4"]):
-    """Entries of the unit quaternions, the identity for zero, and the inverse lengths, 0 for zero."""
-    unit = columns(safe_normalize(quats))
-    length = jnp.sqrt(sum(entry * entry for entry in columns(quats)))
-    is_zero = functools.reduce(jnp.maximum, (jnp.abs(entry) for entry in unit)) == 0
-    unit = [jnp.where(is_zero, one, entry) for one, entry in zip((1.0, 0.0, 0.0, 0.0), unit, strict=True)]
-    return unit, jnp.where(is_zero, 0.0, 1.0 / jnp.where(is_zero, 1.0, length))
-
-
 def _compensation(gaussians: Gaussians, splats: Splats) -> Float[Array, "b n"]:
     """Opacity on the screen over that in the scene; 0 where a row is not visible."""
     return jnp.where(splats.visible, splats.opacities / jnp.where(splats.visible, gaussians.opacities, 1.0), 0.0)
@@ -201,7 +192,11 @@ def _point_grads(sight: _Sight, camera: Camera, row_grads, grads: Splats):
 
 def _quat_grads(quats: Float[Array, "n 4"], turn) -> Float[Array, "n 4"]:
     """Gradients of quaternions of any length, from those of a small rotation about the axes of the world."""
-    (w, *axis), inverse = _unit_quats(quats)
+    unit = columns(safe_normalize(quats))
+    length = jnp.sqrt(sum(entry * entry for entry in columns(quats)))
+    is_zero = functools.reduce(jnp.maximum, (jnp.abs(entry) for entry in unit)) == 0
+    w, *axis = [jnp.where(is_zero, one, entry) for one, entry in zip((1.0, 0.0, 0.0, 0.0), unit, strict=True)]
+    inverse = jnp.where(is_zero, 0.0, 1.0 / jnp.where(is_zero, 1.0, length))  # of the length
     side = _cross(turn, axis)
     entries = [-_dot(turn, axis), *(w * a + b for a, b in zip(turn, side, strict=True))]
     return jnp.stack([2 * inverse * entry for entry in entries], axis=-1)

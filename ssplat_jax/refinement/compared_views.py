@@ -17,6 +17,7 @@ from ssplat_jax.rasterizer import Effects, RenderOutput, fill_holes, render
 from ssplat_jax.rasterizer.render import TILE
 
 EFFECTS = Effects(outputs=("color", "alpha"))
+VIEWS_PER_STEP = 2  # whose gradients a step adds: a Gaussian that few views show moves more often
 BLOCK = 8  # side of the pixel blocks that are held back together: neighbors of a pixel give its color away
 GOLDEN = 2654435769  # 2^32 over the golden ratio
 WORSE_THAN_USUAL = 2.0  # ratio to the median error above which a view is one of another scene, or of a wrong pose
@@ -37,8 +38,6 @@ class RefineConfig:
 
     sh_degree: int = 0
     """SH degree that the scene gets, unless its own is higher: 0 adds no band."""
-    views_per_step: int = 2
-    """Key views whose gradients a step adds: a Gaussian that few views show moves more often."""
     shown_weight: float = 0.7
     """Weight of the L1 error with holes filled; the rest is the L1 error over black."""
     held_back: float = 1 / 32
@@ -48,7 +47,6 @@ class RefineConfig:
 
     def __post_init__(self) -> None:
         self._require("sh_degree", "0 to 3", self.sh_degree in range(4))
-        self._require("views_per_step", "at least 1", self.views_per_step >= 1)
         self._require("shown_weight", "in [0, 1]", 0 <= self.shown_weight <= 1)
         self._require("held_back", "in [0, 0.5]", 0 <= self.held_back <= 0.5)
 
@@ -158,8 +156,8 @@ def mean_over(errors: Float[Array, "h w"], pixels: Bool[Array, "h w"]) -> Float[
 
 
 def views_of_step(step: Int[Array, ""], valid: Bool[Array, " v"], config: RefineConfig) -> Int[Array, " b"]:
-    """Slots of the `config.views_per_step` views that a step shows; `valid` marks the slots that hold a view."""
-    places = step * config.views_per_step + jnp.arange(config.views_per_step, dtype=jnp.int32)
+    """Slots of the `VIEWS_PER_STEP` views that a step shows; `valid` marks the slots that hold a view."""
+    places = step * VIEWS_PER_STEP + jnp.arange(VIEWS_PER_STEP, dtype=jnp.int32)
     return jax.vmap(lambda place: next_view(place, valid, config.seed))(places)
 
 

@@ -18,6 +18,7 @@ from jaxtyping import Array, Float, Int, UInt8
 from ssplat_jax.cache.changes import Change, apply_change, changed_gaussians
 from ssplat_jax.cache.key_views import KeyViews
 from ssplat_jax.core.cameras import Camera
+from ssplat_jax.core.chunk import check_images
 from ssplat_jax.core.errors import InputError
 from ssplat_jax.core.gaussians import Gaussians, mask_gaussians, with_sh_degree
 from ssplat_jax.core.kept_programs import Kept
@@ -26,7 +27,14 @@ from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.rasterizer.constants import ALPHA_MIN
 from ssplat_jax.rasterizer.render import TILE, count_pairs, round_up
-from ssplat_jax.refinement.compared_views import EFFECTS, FOR_CAPTURES, RefineConfig, only_usable, views_of_step
+from ssplat_jax.refinement.compared_views import (
+    EFFECTS,
+    FOR_CAPTURES,
+    VIEWS_PER_STEP,
+    RefineConfig,
+    only_usable,
+    views_of_step,
+)
 from ssplat_jax.refinement.refine_step import (
     RefineState,
     init_refinement,
@@ -110,7 +118,7 @@ class Progress:
 
     def has_stopped_helping(self) -> bool:
         """True if none of the last `PATIENCE` rounds of views has a held-back error below the best before them."""
-        steps_per_round = -(-int(np.sum(np.asarray(self.key_views.valid))) // self.config.views_per_step)
+        steps_per_round = -(-int(np.sum(np.asarray(self.key_views.valid))) // VIEWS_PER_STEP)
         num_rounds, rest = divmod(self.num_steps, steps_per_round)
         if num_rounds <= PATIENCE or rest or not any(self.held_back):
             return False  # too early to say, or no pixel is held back
@@ -181,7 +189,7 @@ def refine(
         gaussians: the scene.
         cameras: one batch axis of poses and intrinsics, in the frame of the scene.
         images: what those cameras saw, floats in [0, 1] or uint8.
-        steps: most steps; 0 returns `gaussians` as they are. Each renders `config.views_per_step` views.
+        steps: most steps; 0 returns `gaussians` as they are. Each renders two views.
         exposures: factors from the scene's colors to each view's; default 1.
         config: SH degree, loss and held-back pixels; default `RefineConfig()`.
         on_step: called with the number of steps done and the last loss.
@@ -305,11 +313,7 @@ def _check(cameras: Camera, images, exposures) -> None:
     wanted = (len(cameras.viewmats), cameras.height, cameras.width, 3)
     if tuple(jnp.shape(images)) != wanted:
         raise InputError(f"refine: images must be {list(wanted)} like the cameras, got {list(images.shape)}.")
-    low, high = float(jnp.min(images)), float(jnp.max(images))
-    if images.dtype != jnp.uint8 and not (jnp.issubdtype(images.dtype, jnp.floating) and low >= 0 and high <= 1):
-        raise InputError(
-            f"refine: images must be floats in [0, 1] or uint8, got {images.dtype} from {low:g} to {high:g}; scale or"
-            " clip them."
-        )
+    if images.dtype != jnp.uint8:
+        check_images(images, "refine: images")
     if exposures is not None and tuple(exposures.shape) != (wanted[0], 3):
         raise InputError(f"refine: exposures must be {[wanted[0], 3]}, got {list(exposures.shape)}.")

@@ -69,6 +69,7 @@ class StepReport:
     num_overflow: Int[Array, ""]  # largest number of tile intersections of one of its views that found no space
 
 
+@functools.partial(Kept, static_argnums=(1,))
 def init_refinement(gaussians: Gaussians, config: RefineConfig | None = None) -> RefineState:
     """The state before the first step, with SH bands as `config` has them, in float32 or float64.
 
@@ -76,12 +77,7 @@ def init_refinement(gaussians: Gaussians, config: RefineConfig | None = None) ->
         gaussians: the scene; its arrays are copied. Half precision becomes float32: in it, Adam's moments would vanish.
         config: SH degree; default `RefineConfig()`.
     """
-    return _state_of(gaussians, (config or RefineConfig()).sh_degree)
-
-
-@functools.partial(Kept, static_argnums=(1,))
-def _state_of(gaussians: Gaussians, sh_degree: int) -> RefineState:
-    gaussians = with_sh_degree(gaussians, sh_degree)
+    gaussians = with_sh_degree(gaussians, (config or RefineConfig()).sh_degree)
     if jnp.finfo(gaussians.means.dtype).bits < 32:
         gaussians = jax.tree.map(lambda x: x.astype(jnp.float32), gaussians)
     return RefineState(
@@ -103,7 +99,7 @@ def refine_step(
     max_rows: int | None = None,
     tile: int = TILE,
 ) -> tuple[RefineState, StepReport]:
-    """One step on `config.views_per_step` key views. A `lax.scan` body over `rate`; donate `state`.
+    """One step on `VIEWS_PER_STEP` key views. A `lax.scan` body over `rate`; donate `state`.
 
     Args:
         state: the scene so far.

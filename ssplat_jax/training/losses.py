@@ -73,11 +73,12 @@ class DepthLoss:
         def body(cache, chunk_and_truth):
             chunk, truth = chunk_and_truth
             prediction = model.predict(params, cache, chunk)
-            cache = model.update_cache(cache, prediction)
+            cache, shape = model.update_cache(cache, prediction), prediction.log_depths.shape
             losses = depth_loss(
                 prediction.logits,
                 prediction.log_depths,
-                pad_like(truth, prediction.log_depths),
+                # Padded as images are; the loss skips the padding by `inside`.
+                jnp.pad(truth, [(0, n - m) for m, n in zip(truth.shape, shape, strict=True)], mode="edge"),
                 prediction.views.log_candidates,
                 prediction.views.inside,
                 target_width=self.target_width,
@@ -215,11 +216,6 @@ def _mean_over(one: Callable[[Any], tuple], batch: Any, *, along: Callable) -> t
     if len(batch.log_depths) == 1:
         return one(jax.tree.map(lambda x: x[0], batch))
     return jax.tree.map(jnp.mean, along(one)(batch))
-
-
-def pad_like(truth: Float[Array, "v h w"], predicted: Float[Array, "v hf wf"]) -> Float[Array, "v hf wf"]:
-    """`truth` edge-padded to the shape of `predicted`, as images are padded. Losses skip the padding by `inside`."""
-    return jnp.pad(truth, [(0, n - m) for m, n in zip(truth.shape, predicted.shape, strict=True)], mode="edge")
 
 
 def decode_accepted(model: StreamSplat, params: dict, cache: VoxelCache, tokens: Tokens) -> Gaussians:

@@ -289,24 +289,11 @@ def capture_sample(
     chosen = set(_choose_targets(rng, num_views, views.num_targets).tolist())
     context = [i for place, i in enumerate(frames) if place not in chosen]
     targets = [i for place, i in enumerate(frames) if place in chosen]
-    return _sample_of_frames(mix, capture, context, targets, size, rng, views.range_jitter)
-
-
-def _window(rng: np.random.Generator, frames: list[int], count: int) -> list[int]:
-    """`count` frames at equal distances, the distance drawn log-uniformly and the place uniformly."""
-    widest = min(MAX_STRIDE, (len(frames) - 1) // max(count - 1, 1))
-    stride = round(math.exp(rng.uniform(0.0, math.log(widest)))) if widest > 1 else 1
-    first = int(rng.integers(len(frames) - stride * (count - 1)))
-    return frames[first : first + stride * (count - 1) + 1 : stride]
-
-
-def _sample_of_frames(mix: CaptureMix, capture: Capture, context, targets, size, rng, range_jitter: float) -> Sample:
-    """The sample of these frames; context views in the order of streaming."""
     height, width = size
     delivered = dataclasses.replace(capture, height=height, width=width)
-    known = mix.frame_of(capture)
+    known, jitter = mix.frame_of(capture), views.range_jitter
     context = delivered.stream_order(mix.config, context, known)
-    scale, near, far = np.exp(rng.uniform(-range_jitter, range_jitter, 3))
+    scale, near, far = np.exp(rng.uniform(-jitter, jitter, 3))
     stream_frame = StreamFrame.at_camera(
         capture.frames[context[0]].camtoworld,
         scale=known.scale * scale,
@@ -327,6 +314,14 @@ def _sample_of_frames(mix: CaptureMix, capture: Capture, context, targets, size,
         config=mix.config,
         seen=np.array([delivered.seen(i) for i in frames]) if capture.is_masked else None,
     )
+
+
+def _window(rng: np.random.Generator, frames: list[int], count: int) -> list[int]:
+    """`count` frames at equal distances, the distance drawn log-uniformly and the place uniformly."""
+    widest = min(MAX_STRIDE, (len(frames) - 1) // max(count - 1, 1))
+    stride = round(math.exp(rng.uniform(0.0, math.log(widest)))) if widest > 1 else 1
+    first = int(rng.integers(len(frames) - stride * (count - 1)))
+    return frames[first : first + stride * (count - 1) + 1 : stride]
 
 
 def _depth(capture: Capture, i: int) -> np.ndarray:

@@ -224,7 +224,7 @@ def test_zero_steps_return_the_scene_bit_for_bit():
 
 def test_refinement_stops_where_held_back_pixels_do_not_gain():
     falling, flat = [1.0, 1.0, 0.5, 0.5], [0.5, 0.6] * 3
-    started = module.Progress(init_refinement(scene()), key_views(), RefineConfig(views_per_step=2), MAX_PAIRS)
+    started = module.Progress(init_refinement(scene()), key_views(), RefineConfig(), MAX_PAIRS)
     stops = lambda errors: dataclasses.replace(started, losses=errors, held_back=errors).has_stopped_helping()  # noqa: E731
     assert not stops(falling)
     assert not stops([*falling, *flat[:-1]])  # not a whole round

@@ -6,7 +6,6 @@ from jaxtyping import Array, Float
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.model.layers import rms_normalize
 from ssplat_jax.model.mixer import Mixer
-from ssplat_jax.model.mixer import mix_tokens as mix_neighbors
 from ssplat_jax.model.resplat.cost_volume import ReSplatCostVolume, match
 from ssplat_jax.model.resplat.encoder import VITS, WIDTHS, ReSplatEncoder, encode, grid_size
 from ssplat_jax.model.resplat.resplat_tokens import (
@@ -53,7 +52,8 @@ def mix_tokens(params, feats, positions, inside, view_valid, config: StreamConfi
     """Mixed token features, for the head and the cache: the mixer's output is added to its input."""
     if not config.network.mixer_blocks:
         return feats
-    return feats + mix_neighbors(params, feats, positions, inside, view_valid, config)
+    mixed = Mixer(config).apply({"params": params}, feats, positions, inside, view_valid)
+    return feats + mixed  # pyright: ignore[reportOperatorIssue]
 
 
 class ReSplatNetwork:

@@ -98,7 +98,7 @@ class Transformer(nn.Module):
     def __call__(
         self, x: Float[Array, "v h w c"], sources: Int[Array, "v s"], source_valid: Bool[Array, "v s"]
     ) -> Float[Array, "v h w c"]:
-        parts = num_windows(x.shape[2])
+        parts = 2 if x.shape[2] <= 96 else 4 if x.shape[2] <= 192 else 8  # windows along each side: ReSplat's rule
         side = (x.shape[1] // parts, x.shape[2] // parts)
         block = lambda i, *given: TransformerBlock(name=f"layers_{i}")(*given)  # noqa: E731
         return attend_in_windows(x, side, NUM_BLOCKS, sources, source_valid, block, self.source_mask)
@@ -114,11 +114,6 @@ class Transformer(nn.Module):
         cells = together.shape[-1]
         source, cell = np.divmod(np.arange(num_sources * cells), cells)
         return together[..., (cell * num_sources + source) % cells]
-
-
-def num_windows(width: int) -> int:
-    """Windows along each side of a map of that width (ReSplat's rule)."""
-    return 2 if width <= 96 else 4 if width <= 192 else 8
 
 
 # -- Monocular branch: a DINOv2 vision transformer, as trained by Depth Anything V2 -----------------------------------

@@ -144,13 +144,6 @@ class ReSplatTokenRegressor(nn.Module):
         return nn.Dense(c, name="proj")(jnp.concatenate([x, patches, features, match], axis=-1))
 
 
-def token_context(features: ReSplatFeatures, height: int, width: int) -> Float[Array, "v hf wf c"]:
-    """Encoder features on a grid of `height` x `width` cells: ViT, CNN, multi-view."""
-    mono = [pixel_shuffle(resize(x, height // 4, width // 4), 4) for x in features.mono]
-    maps = [resize(x, height, width) for x in (*features.cnn, features.multiview)]
-    return jnp.concatenate([*mono, *maps], axis=-1)
-
-
 def regress_tokens(
     params,
     features: ReSplatFeatures,
@@ -164,7 +157,8 @@ def regress_tokens(
     _, hf, wf = depth.log_depths.shape
     patches = pixel_unshuffle(views.images, GRID_STRIDE)
     match = repeat_cells(depth.probs.max(axis=-1, keepdims=True), config.network.match_stride // GRID_STRIDE)
-    context = token_context(features, hf, wf)
+    mono = [pixel_shuffle(resize(x, hf // 4, wf // 4), 4) for x in features.mono]
+    context = jnp.concatenate([*mono, *(resize(x, hf, wf) for x in (*features.cnn, features.multiview))], axis=-1)
     depths = jnp.exp(depth.log_depths)[..., None]
     return ReSplatTokenRegressor(config).apply({"params": params}, patches, depths, match, context)  # pyright: ignore[reportReturnType]
 
