@@ -18,8 +18,7 @@ from ssplat_jax.core.gaussians import SH_C0, Gaussians
 from ssplat_jax.core.numerics import clip_value
 from ssplat_jax.core.pytree import pytree, replace
 
-WIDTH = 14
-"""Numbers for each Gaussian of a pivot."""
+WIDTH = 14  # numbers for each Gaussian of a pivot
 
 FACE_MARGIN = 1e-3
 """Distance, in voxels, that a moved pivot keeps from the faces of its voxel: rounding cannot take an average across."""

@@ -16,11 +16,8 @@ from jaxtyping import Array, Bool, Float, Int, UInt32
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.numerics import power_of_two
 
-INDEX_LIMIT = 1 << 20
-"""Upper bound of the magnitude of a voxel index: 42 km at 4 cm, and exact in float32."""
-
-MAX_LEVEL = 16
-"""Levels of voxels lie between plus and minus this."""
+INDEX_LIMIT = 1 << 20  # upper bound of the magnitude of a voxel index: 42 km at 4 cm, and exact in float32
+MAX_LEVEL = 16  # levels of voxels lie between plus and minus this
 
 SLOTS_PER_ROW = 4
 """Table slots per cache row. The table is at most a quarter full, so a search ends after a few probes: a cache 90 %

@@ -30,11 +30,8 @@ from ssplat_jax.core.cameras import Camera
 from ssplat_jax.core.numerics import columns
 from ssplat_jax.core.pytree import pytree
 
-NEAR = 0.01
-"""Near plane: pivots at or before this camera z (stream units) are invisible, as in the renderer."""
-
-CLUSTER_RATIO = 1.15
-"""Largest ratio of depths within the front cluster of a pixel."""
+NEAR = 0.01  # near plane: pivots at or before this camera z (stream units) are invisible, as in the renderer
+CLUSTER_RATIO = 1.15  # largest ratio of depths within the front cluster of a pixel
 
 ROWS_PER_BLOCK, PAIRS_PER_BLOCK = 4096, 4096
 """Most cache rows that are projected at a time, and most pairs whose features are gathered at a time."""

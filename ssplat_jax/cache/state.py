@@ -28,8 +28,7 @@ from ssplat_jax.core.errors import CacheError, InputError
 from ssplat_jax.core.kept_programs import Kept
 from ssplat_jax.core.pytree import pytree, replace
 
-NUM_OBSERVED = 9
-"""Numbers that a pivot's observations hold (`votes.py`)."""
+NUM_OBSERVED = 9  # numbers that a pivot's observations hold (`votes.py`)
 
 NUM_STORED, STORED_CELLS = 32, 32
 """Past chunks of which a coarse depth map is kept while views carve, to vote on the tokens of later chunks, and the

@@ -48,11 +48,8 @@ neighbors by chance, but nothing stands where a view looked through."""
 FREE_SPACE_MARGIN = math.log(1.02)
 """A point nearer than a surface by more than this, in log depth, lies in the free space before it."""
 
-SAME_SURFACE_MARGIN = math.log(1.1)
-"""Two log depths at most this far apart belong to one surface."""
-
-ON_SURFACE = math.log(1.03)
-"""Largest distance in log depth at which an observed pivot lies on the surface of a cell."""
+SAME_SURFACE_MARGIN = math.log(1.1)  # two log depths at most this far apart belong to one surface
+ON_SURFACE = math.log(1.03)  # largest distance in log depth at which an observed pivot lies on the surface of a cell
 
 MIN_REVISED, MAX_REVISED = 0.02, 0.95
 """Bounds of revised confidences: inside them a later vote can still change a confidence either way."""

@@ -12,8 +12,7 @@ from jaxtyping import Array, Bool, Float
 from ssplat_jax.core.errors import InputError, echo, refusal
 from ssplat_jax.core.pytree import pytree, static
 
-ROUNDING = 1e-3
-"""Difference of a rotation's product with its transpose from the identity that counts as rounding."""
+ROUNDING = 1e-3  # difference of a rotation's product with its transpose from the identity that counts as rounding
 
 Law = tuple[str, str, bool, Any]
 """A rule for cameras: its words, the remedy, True if a renderer can do without it, and a mask of those that keep it."""

@@ -10,8 +10,7 @@ from ssplat_jax.core.cameras import Camera, check_matrices, usable_cameras
 from ssplat_jax.core.errors import InputError, refusal
 from ssplat_jax.core.pytree import pytree
 
-COLOR_MARGIN = 1e-3
-"""Largest distance of a color from [0, 1] that counts as rounding or resampling."""
+COLOR_MARGIN = 1e-3  # largest distance of a color from [0, 1] that counts as rounding or resampling
 
 
 @pytree

@@ -7,8 +7,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-WAITING = "compiling"
-"""Note of a bar whose first step is not done: compiling is most of it."""
+WAITING = "compiling"  # note of a bar whose first step is not done: compiling is most of it
 
 
 class Reporter:

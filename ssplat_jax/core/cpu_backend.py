@@ -23,17 +23,13 @@ from ssplat_jax.core.kept_programs import drop_loaded
 
 Arrays = TypeVar("Arrays")
 
-LANES = 16
-"""32-bit numbers that a wide processor adds at once (AVX-512)."""
+LANES = 16  # 32-bit numbers that a wide processor adds at once (AVX-512)
 
 SORT_PIECES = 16
 """Arrays to sort side by side: the CPU runtime shares out work among cores from nine waiting operations on."""
 
-EXP_SQUARINGS = 3
-"""Times that `short_exp` squares its polynomial, which covers a 2^3th of the range."""
-
-MAPS = Path("/proc/self/maps")
-"""File with a line for each memory map of the process, where the system has one."""
+EXP_SQUARINGS = 3  # times that `short_exp` squares its polynomial, which covers a 2^3th of the range
+MAPS = Path("/proc/self/maps")  # file with a line for each memory map of the process, where the system has one
 
 MOST_MAPS = 25_000
 """Memory maps above which programs are dropped. A compiled program takes some tens of them, a scene that is streamed,

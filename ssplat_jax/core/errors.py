@@ -20,8 +20,7 @@ class CacheError(RuntimeError):
     """The cache cannot hold its tokens. Raised outside jit by `cache.check_cache`; the message says what to do."""
 
 
-MAX_ECHO_LENGTH = 80
-"""Characters of a refused value that a message repeats, so that it stays one line."""
+MAX_ECHO_LENGTH = 80  # characters of a refused value that a message repeats, so that it stays one line
 
 
 def refusal(where: str, *, wanted: str, got: object, fix: str) -> InputError:

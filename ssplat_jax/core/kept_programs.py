@@ -37,14 +37,12 @@ PACKAGE = __name__.partition(".")[0]
 SWITCH = "SSPLAT_EXECUTABLES"
 """Environment variable: folder of the store, of this kind of CPU alone; without it nothing is kept."""
 
-PACKAGES = ("jax", "jaxlib", "flax", "numpy", "pillow", "scikit-image")
-"""Packages whose version is part of every key."""
+PACKAGES = ("jax", "jaxlib", "flax", "numpy", "pillow", "scikit-image")  # packages whose version is part of every key
 
 MOST_BYTES = 256 << 20
 """Size of the store: a run has some 15 programs of 0.3 MB. Those that were not used for the longest time go."""
 
-MOST_ARRAY_BYTES = 32 << 20
-"""Largest arrays that are kept: those of the scene that a demo streams take 15 MB."""
+MOST_ARRAY_BYTES = 32 << 20  # largest arrays that are kept: those of the scene that a demo streams take 15 MB
 
 DIGEST_BYTES = 32
 

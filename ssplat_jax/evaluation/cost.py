@@ -29,11 +29,8 @@ from ssplat_jax.rasterizer import render
 from ssplat_jax.rasterizer.render import capacity_for, render_program
 from ssplat_jax.streaming.session import Session, tokens_per_chunk
 
-NUM_CHUNKS = 4
-"""The last chunks of a stream that an evaluation feeds again to the full cache to time them."""
-
-NUM_REPEATS = 3
-"""Measurements per chunk."""
+NUM_CHUNKS = 4  # the last chunks of a stream that an evaluation feeds again to the full cache to time them
+NUM_REPEATS = 3  # measurements per chunk
 
 
 def measure_latency(session: Session, chunks: list[Chunk], camera: Camera) -> dict:

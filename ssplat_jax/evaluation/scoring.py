@@ -35,8 +35,7 @@ from ssplat_jax.storage.run_folder import RunFolder, make_writable
 from ssplat_jax.streaming.feed import Exposures, begin_stream, feed_capture, middle_exposure
 from ssplat_jax.streaming.session import Session
 
-NUM_AVERAGED = 3
-"""Streamed frames whose exposures are averaged for a novel view."""
+NUM_AVERAGED = 3  # streamed frames whose exposures are averaged for a novel view
 
 _jitted_lpips = Kept(lpips)
 _filled = Kept(lambda out, gaussians: fill_holes(out.color, out.alpha, mean_color(gaussians)))

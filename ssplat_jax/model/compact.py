@@ -193,8 +193,7 @@ def match(params, features: CompactFeatures, views: Views, config: StreamConfig)
 
 # -- Tokens: features of the current views, mixed in 3D ---------------------------------------------------------------
 
-MIN_LOG_RANGE = 1e-3
-"""Lower bound of the range that log depths are divided by, for a single candidate and near = far."""
+MIN_LOG_RANGE = 1e-3  # lower bound of the range that log depths are divided by, for a single candidate and near = far
 
 
 class TokenRegressor(nn.Module):

@@ -19,14 +19,11 @@ from ssplat_jax.model.views import TokenShapes, repeat_cells
 
 START_SCALE = 0.43
 """Untrained sideways scale, as a fraction of a Gaussian's part of the cell: neighbors overlap to a closed surface."""
-START_THICKNESS = 0.05
-"""Untrained scale along the viewing direction, as a fraction of the cell's footprint."""
+START_THICKNESS = 0.05  # untrained scale along the viewing direction, as a fraction of the cell's footprint
 MAX_LOG_GAIN = 0.6
 """Bound of the log factor on a scale. Larger Gaussians would cover holes and hide what is behind."""
-MIN_SCALE = 1e-6
-"""Smallest scale, in stream units."""
-MAX_SCALE = 1.0
-"""Largest scale, in stream units: ReSplat's bound."""
+MIN_SCALE = 1e-6  # smallest scale, in stream units
+MAX_SCALE = 1.0  # largest scale, in stream units: ReSplat's bound
 MIN_DETAIL = {1: 0.05, 2: 0.018}
 """Least RMS color difference that parts of 1 or 2 pixels a side must show, to not become one of twice the side."""
 VOXEL_COVERAGE = 1.2
@@ -164,13 +161,9 @@ def _halved(images: Float[Array, "m s s 3"]) -> Float[Array, "m r r 3"]:
 
 # -- Evidence head: opacity, scale and contrast of a pivot's Gaussians from how views saw it (ours) -------------------
 
-MAX_LOGIT_CHANGE = 4.0
-"""Bound of what is added to an opacity's logit."""
-MAX_LOG_CONTRAST = 1.0
-"""Bound of the log factor on the differences between the colors of a pivot's Gaussians."""
-
-WIDTH = 32
-"""Channels of the hidden layers."""
+MAX_LOGIT_CHANGE = 4.0  # bound of what is added to an opacity's logit
+MAX_LOG_CONTRAST = 1.0  # bound of the log factor on the differences between the colors of a pivot's Gaussians
+WIDTH = 32  # channels of the hidden layers
 
 
 @pytree

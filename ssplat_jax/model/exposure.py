@@ -23,8 +23,7 @@ MIN_COLOR, MAX_COLOR = 0.03, 0.97
 """Range of colors that are about proportional to exposure: darker cells are noise, brighter ones are clipped."""
 MIN_CELLS = 64
 """Cells that a view must share with the scene. With fewer, the mean over the other views is more reliable."""
-MAX_EXPOSURE = 4.0
-"""Upper bound of an exposure; the lower bound is its reciprocal."""
+MAX_EXPOSURE = 4.0  # upper bound of an exposure; the lower bound is its reciprocal
 
 
 def estimate_exposures(

@@ -14,14 +14,11 @@ from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.numerics import safe_log, softplus_inverse
 from ssplat_jax.model.views import AnchoredDepth, DepthDistribution, Views, from_candidate_space, to_candidate_space
 
-GAMMA_INIT = 0.1
-"""Untrained gamma_d, for which the paper gives no value."""
+GAMMA_INIT = 0.1  # untrained gamma_d, for which the paper gives no value
 SIGMA_SURE = 0.1
 """sigma_0, the paper's value: standard deviation of the anchor where Omega is 1, in its unit (`log_anchor`)."""
-SIGMA_GROWTH = 0.5
-"""lambda_sigma, the paper's value: what the standard deviation grows by as Omega falls from 1 to 0."""
-READOUT_WINDOW = 4
-"""Candidates on each side of the peak that `depth_readout="window"` averages."""
+SIGMA_GROWTH = 0.5  # lambda_sigma, the paper's value: what the standard deviation grows by as Omega falls from 1 to 0
+READOUT_WINDOW = 4  # candidates on each side of the peak that `depth_readout="window"` averages
 CONFIDENCE_WINDOW = 1
 """Candidates on each side whose mass is the confidence with `depth_readout="window"`. A depth that is known exactly,
 but lies halfway between two candidates, has a peak of only 0.5."""
@@ -29,10 +26,8 @@ but lies halfway between two candidates, has a peak of only 0.5."""
 SENSOR_WIDTH = 0.6
 """Standard deviation of a sensor's anchor, in steps between candidates. A sensor's own error is smaller than a step; a
 narrower anchor would put a depth between two candidates onto one of them."""
-SENSOR_GAMMA = 10.0
-"""Weight of a sensor's anchor: about 94 % of the mass where it contradicts the matcher."""
-MIN_STEP = 1e-6
-"""Smallest step between candidates, for a single one and near = far."""
+SENSOR_GAMMA = 10.0  # weight of a sensor's anchor: about 94 % of the mass where it contradicts the matcher
+MIN_STEP = 1e-6  # smallest step between candidates, for a single one and near = far
 MIN_KNOWN = 0.5
 """Share of a cell's pixels whose depth must be measured. At the rims of what a sensor saw, its depths are mixtures."""
 

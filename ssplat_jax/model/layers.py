@@ -14,8 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 # -- Convolutions -----------------------------------------------------------------------------------------------------
 
-Pads = tuple[tuple[int, int], tuple[int, int]]
-"""Zero padding ((top, bottom), (left, right))."""
+Pads = tuple[tuple[int, int], tuple[int, int]]  # zero padding ((top, bottom), (left, right))
 DIMENSIONS = ("NHWC", "HWIO", "NHWC")
 
 
@@ -109,8 +108,7 @@ def pixel_shuffle(x: Float[Array, "v hf wf cf"], factor: int) -> Float[Array, "v
 
 # -- Norms and pooling ------------------------------------------------------------------------------------------------
 
-IMAGE_MEAN, IMAGE_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-"""Mean and standard deviation of ImageNet, RGB."""
+IMAGE_MEAN, IMAGE_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # mean and standard deviation of ImageNet, RGB
 
 
 def normalize_images(images: Float[Array, "v h w 3"]) -> Float[Array, "v h w 3"]:

@@ -9,13 +9,9 @@ from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.cpu_backend import lane_sum
 from ssplat_jax.model.layers import Conv, Mlp, attend, layer_norm, pixel_shuffle, pixel_unshuffle
 
-SEARCH_BLOCK = 1024
-"""Queries per block of the search for neighbors, which bounds the size of its distance matrix."""
-
-GLOBAL_FACTOR = 4
-"""Cells per side that the global block joins to one."""
-HEADS = 4
-"""Heads of the joint attention."""
+SEARCH_BLOCK = 1024  # queries per block of the search for neighbors, which bounds the size of its distance matrix
+GLOBAL_FACTOR = 4  # cells per side that the global block joins to one
+HEADS = 4  # heads of the joint attention
 
 
 class NeighborAttention(nn.Module):

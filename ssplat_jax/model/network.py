@@ -126,8 +126,7 @@ class Network(Protocol):
         ...
 
 
-NETWORKS: dict[str, Network] = {"compact": CompactNetwork(), "resplat": ReSplatNetwork()}
-"""Networks by kind."""
+NETWORKS: dict[str, Network] = {"compact": CompactNetwork(), "resplat": ReSplatNetwork()}  # networks by kind
 
 
 def network_of(config: StreamConfig) -> Network:

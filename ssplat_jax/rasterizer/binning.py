@@ -68,18 +68,14 @@ def tile_boxes(means2d: Float[Array, "*m 2"], radii: Float[Array, "*m 2"], grid:
 MEAN_X, MEAN_Y, LOG_OPACITY = 0, 1, 5
 FACTORS = slice(2, 5)
 
-SHAPE_COLUMNS = range(6)
-"""The columns above, from which alphas are computed."""
-
-BOX_COLUMNS = range(-4, 0)
-"""Left, top, width and height of the box."""
+SHAPE_COLUMNS = range(6)  # the columns above, from which alphas are computed
+BOX_COLUMNS = range(-4, 0)  # left, top, width and height of the box
 
 SHAPE = slice(0, 6)
 CHANNELS = slice(6, -4)
 BOX = slice(-4, None)
 BOX_SIZE = slice(-2, None)
-WITHOUT_BOX = slice(0, -4)
-"""The columns that compositing reads and that have gradients: shape and channels."""
+WITHOUT_BOX = slice(0, -4)  # the columns that compositing reads and that have gradients: shape and channels
 
 
 def num_channels(table: Float[Array, "m f"]) -> int:
@@ -142,14 +138,9 @@ MIN_SHARED_CAPACITY, MIN_PIECES_CAPACITY = 1 << 21, 1 << 16
 shares a render compiles in 15 s of a core instead of 8; it takes 2 to 5 % less time at 262,144 and 524,288 pairs, and
 7 % less at 1,048,576."""
 
-MAX_PAIRS = (1 << 31) - 1
-"""Largest index; counts of pairs stop there."""
-
-READ_AHEAD = 16
-"""Entries behind the last pair that may be read."""
-
-KEY_BITS = 32
-"""Keys wider than this are sorted as 64-bit integers."""
+MAX_PAIRS = (1 << 31) - 1  # largest index; counts of pairs stop there
+READ_AHEAD = 16  # entries behind the last pair that may be read
+KEY_BITS = 32  # keys wider than this are sorted as 64-bit integers
 
 
 @pytree

@@ -41,8 +41,7 @@ class Schedule:
     """Tiles composited side by side."""
 
 
-ON_CPU = Schedule(step_size=8, batch_size=128)
-"""Neither twice as many Gaussians nor twice as many tiles are faster."""
+ON_CPU = Schedule(step_size=8, batch_size=128)  # neither twice as many Gaussians nor twice as many tiles are faster
 
 ON_ACCELERATOR = Schedule(step_size=16, batch_size=1 << 15)
 """Few, wide steps: a GPU launches kernels and asks the host at every one. The limit on tiles bounds the memory."""

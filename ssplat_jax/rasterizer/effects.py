@@ -21,8 +21,7 @@ OUTPUTS = ("color", "alpha", "depth", "median_depth")
 NEEDED_ARRAYS = {"filter_3d": "captured", "distortion": "distortion", "exposure": "exposures"}
 """The fields of `Effects` that need an array, and the argument of `render` that holds it."""
 
-FILTERS = {"mip": "mip", "default": "classic"}
-"""The filter of each renderer that a scene may be made for."""
+FILTERS = {"mip": "mip", "default": "classic"}  # the filter of each renderer that a scene may be made for
 
 
 @dataclasses.dataclass(frozen=True)

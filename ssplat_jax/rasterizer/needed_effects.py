@@ -18,8 +18,7 @@ even at an edge between black and white."""
 FINER_SAMPLING = 1.05
 """A camera calls for the 3D filter when it samples the scene more than this times as finely as the captured ones."""
 
-LENS_STEPS = 17
-"""Places along each side of an image at which a lens is examined."""
+LENS_STEPS = 17  # places along each side of an image at which a lens is examined
 
 
 @with_rank_promotion

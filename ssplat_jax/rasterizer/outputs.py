@@ -134,11 +134,8 @@ def apply_exposures(color: Float[Array, "*b h w 3"], exposures: Float[Array, "*b
     return jnp.maximum(corrected, 0.0)
 
 
-SIGMA = 2.0
-"""Standard deviation of the blur, pixels: half a cell of the streamed images."""
-
-BACKGROUND_WEIGHT = 1e-3
-"""Opacity that the background has everywhere: it shows where nothing else is near."""
+SIGMA = 2.0  # standard deviation of the blur, pixels: half a cell of the streamed images
+BACKGROUND_WEIGHT = 1e-3  # opacity that the background has everywhere: it shows where nothing else is near
 
 
 @with_rank_promotion

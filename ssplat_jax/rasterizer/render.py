@@ -22,21 +22,15 @@ from ssplat_jax.rasterizer.outputs import RenderOutput, finish, splat_channels
 from ssplat_jax.rasterizer.pinhole_projection import project_pinhole
 from ssplat_jax.rasterizer.projection import cull_cameras, cull_non_finite, project
 
-TILE = 8
-"""Default side of a tile, pixels."""
-
-TILES = (4, 8, 16)
-"""The sides of tiles that are tested and measured."""
-
-MIN_CAPACITY = 1 << 12
-"""Least capacity for pairs that `render` chooses."""
+TILE = 8  # default side of a tile, pixels
+TILES = (4, 8, 16)  # the sides of tiles that are tested and measured
+MIN_CAPACITY = 1 << 12  # least capacity for pairs that `render` chooses
 
 SMALL_CAPACITY = 1 << 18
 """Up to this capacity a render outside jit has room for a pair of each Gaussian and camera. Unused ones cost it a
 twentieth of its time at most; a program that counts the pairs, or one for fewer, takes seconds to compile."""
 
-MAX_CAPACITY = 1 << 30
-"""The largest power of two that an index reaches."""
+MAX_CAPACITY = 1 << 30  # the largest power of two that an index reaches
 
 
 @pytree

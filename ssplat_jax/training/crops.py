@@ -38,8 +38,7 @@ from ssplat_jax.streaming.feed import feed_capture
 from ssplat_jax.streaming.session import Session
 from ssplat_jax.training.samples import CaptureMix, TrainingStart
 
-PAIRS_COUNTED = 12
-"""Crops of each scene whose tile intersections are counted, for the capacity of all."""
+PAIRS_COUNTED = 12  # crops of each scene whose tile intersections are counted, for the capacity of all
 PAIRS_MARGIN = 2.0
 """Capacity for tile intersections over the largest number that was counted: training changes the scenes."""
 

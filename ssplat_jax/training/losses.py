@@ -33,13 +33,11 @@ Scalar = Float[Array, ""]
 Metrics = dict[str, Array]
 Lpips = LpipsWeights | None
 
-MIN_STEP = 1e-6
-"""Smallest step of log depth between candidates that is divided by; steps are 0 where near = far."""
+MIN_STEP = 1e-6  # smallest step of log depth between candidates that is divided by; steps are 0 where near = far
 MAX_GAIN = 2.0
 """Largest gain between a scene and a photograph that training divides out; its reciprocal is the smallest. Exposure
 drifts by a factor of two in captures."""
-MIN_MSE = 1e-4
-"""Added to squared errors before the logarithm, so that views that are nearly right do not count most."""
+MIN_MSE = 1e-4  # added to squared errors before the logarithm, so that views that are nearly right do not count most
 
 
 @dataclasses.dataclass(frozen=True)

@@ -24,8 +24,7 @@ Rates = tuple[tuple[str, float], ...]
 
 MATCHER = ("encoder", "cost_volume", "upsampler")
 """Stages that end in the depth map; not every network has all of them. They learn from depth alone."""
-AFTER_MATCHER = ("hpda", "tokens", "cgfi", "mixer", "decoder")
-"""Stages that make Gaussians of depth and features."""
+AFTER_MATCHER = ("hpda", "tokens", "cgfi", "mixer", "decoder")  # stages that make Gaussians of depth and features
 
 
 @runtime_checkable

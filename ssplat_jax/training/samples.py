@@ -141,12 +141,9 @@ def learned_frames(capture: Capture) -> list[int]:
 # -- samples -----------------------------------------------------------------------------------------------------------
 
 
-MAX_LOG_STEP = 0.05
-"""Log depths of neighboring pixels that differ by more belong to different surfaces."""
-NEARLY = 1 - 1e-4
-"""Factor that puts the sky just inside the farthest depth candidate."""
-MAX_STRIDE = 8
-"""Largest distance of consecutive frames of a sample, in frames that may be learned from."""
+MAX_LOG_STEP = 0.05  # log depths of neighboring pixels that differ by more belong to different surfaces
+NEARLY = 1 - 1e-4  # factor that puts the sky just inside the farthest depth candidate
+MAX_STRIDE = 8  # largest distance of consecutive frames of a sample, in frames that may be learned from
 
 
 @pytree

@@ -12,10 +12,8 @@ from ssplat_jax.model.layers import Conv, HalvingConv, attend
 from ssplat_jax.model.resplat.torch_layers import EdgePaddedConv, ReSplatFeatures, group_norm, resize
 from ssplat_jax.model.views import MIN_SOURCE_DEPTH, DepthDistribution, Views, mean_over_sources, sweep_pixels
 
-WIDTH = 128
-"""Channels of the U-Net."""
-HEADS = 4
-"""Heads of the joint attention."""
+WIDTH = 128  # channels of the U-Net
+HEADS = 4  # heads of the joint attention
 
 
 def upstream_sweep_pixels(

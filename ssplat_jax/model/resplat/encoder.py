@@ -20,21 +20,13 @@ from ssplat_jax.model.layers import (
 from ssplat_jax.model.resplat.torch_layers import ReSplatFeatures, resize
 from ssplat_jax.model.views import Views, nearest_sources
 
-WIDTHS = (64, 96, 128)
-"""Channels of the three CNN levels."""
-NUM_BLOCKS = 6
-"""Blocks of the multi-view transformer."""
-FFN_RATIO = 4
-"""Ratio of the feed-forward width to the width of [input, message]."""
-
-PIXELS_PER_VIT_CELL = 14
-"""Side of a patch."""
-POSITIONS_SIDE = 37
-"""Cells per side of the trained position code, which is resampled to other grids."""
-MAX_SIDE = 560
-"""Longer side, in pixels, to which larger images are resized."""
-CUBIC_A = -0.75
-"""Parameter of PyTorch's bicubic kernel; JAX's is -0.5."""
+WIDTHS = (64, 96, 128)  # channels of the three CNN levels
+NUM_BLOCKS = 6  # blocks of the multi-view transformer
+FFN_RATIO = 4  # ratio of the feed-forward width to the width of [input, message]
+PIXELS_PER_VIT_CELL = 14  # side of a patch
+POSITIONS_SIDE = 37  # cells per side of the trained position code, which is resampled to other grids
+MAX_SIDE = 560  # longer side, in pixels, to which larger images are resized
+CUBIC_A = -0.75  # parameter of PyTorch's bicubic kernel; JAX's is -0.5
 
 VITS = {
     # width, blocks, heads, indices of the blocks whose maps are returned
