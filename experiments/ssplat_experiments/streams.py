@@ -63,7 +63,4 @@ def _session(config: StreamConfig) -> Session:
 
 def make_room() -> None:
     """Drops compiled programs, of kept sessions too, before the process holds more than Linux lets it map."""
-    if cpu_backend.holds_many_programs():
-        _session.cache_clear()
-        baselines.forget()
-        cpu_backend.drop_programs()
+    cpu_backend.make_room(_session.cache_clear, baselines.forget)

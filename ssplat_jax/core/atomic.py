@@ -37,7 +37,11 @@ def write_atomic(path: str | os.PathLike, data: bytes, *, keep_previous: bool = 
             moved = True
         os.replace(partial, path)
         moved = False
-        _sync_directory(path.parent)
+        folder = os.open(path.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)  # so that the renames survive a power failure
+        finally:
+            os.close(folder)
     except OSError as error:
         with contextlib.suppress(OSError):
             partial.unlink(missing_ok=True)
@@ -51,12 +55,3 @@ def write_atomic(path: str | os.PathLike, data: bytes, *, keep_previous: bool = 
 def previous_path(path: str | os.PathLike) -> Path:
     """Path at which `write_atomic` keeps the previous version of `path`."""
     return Path(path).with_name(Path(path).name + ".previous")
-
-
-def _sync_directory(directory: Path) -> None:
-    """Syncs a folder to the disk, so that renames in it survive a power failure."""
-    descriptor = os.open(directory, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, UInt
+from jaxtyping import Array, Bool, Float, Int, UInt
 
 from ssplat_jax.core.kept_programs import drop_loaded
 
@@ -41,18 +41,18 @@ def num_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def holds_many_programs() -> bool:
-    """True if the process has more than `MOST_MAPS` memory maps; False where the system does not list them."""
-    return MAPS.exists() and len(MAPS.read_text().splitlines()) > MOST_MAPS
-
-
-def make_room() -> None:
-    """Drops compiled programs if the process holds many (`holds_many_programs`).
+def make_room(*forget: Callable[[], None]) -> None:
+    """Drops compiled programs if the process has more than `MOST_MAPS` memory maps, where the system lists them.
 
     Call it between scenes when one process handles many of them. A dropped program is compiled again, or read from
     JAX's compilation cache, at its next call. A `Session` keeps its compiled programs: delete the last one first.
+
+    Args:
+        forget: called before, to drop what else keeps programs.
     """
-    if holds_many_programs():
+    if MAPS.exists() and len(MAPS.read_text().splitlines()) > MOST_MAPS:
+        for drop in forget:
+            drop()
         drop_programs()
 
 
@@ -118,6 +118,18 @@ def kept(arrays: Arrays, always: Bool[Array, ""]) -> Arrays:
     """
     one = jnp.where(always, 1.0, 2.0)
     return jax.tree.map(lambda x: x / one.astype(x.dtype), arrays)
+
+
+def packed_argsort(keys: UInt[Array, " n"]) -> Int[Array, " n"]:
+    """The order of 32-bit keys, ties by place.
+
+    Why: a key and its place are one 64-bit integer, whatever `jax_enable_x64` says. XLA's CPU backend sorts single
+    integers five times as fast as pairs: 65,536 in 3.1 ms, where an argsort of floats takes 18.5.
+    May go when `jnp.argsort` is as fast.
+    """
+    with jax.enable_x64(True):
+        packed = (keys.astype(jnp.uint64) << jnp.uint64(32)) | lax.iota(jnp.uint64, keys.shape[0])
+        return (lax.sort(packed) & jnp.uint64(0xFFFFFFFF)).astype(jnp.int32)
 
 
 def sort_pieces(keys: UInt[Array, "s n"]) -> UInt[Array, "s n"]:

@@ -15,7 +15,7 @@ from ssplat_jax.model.layers import (
     HalvingConv,
     ResidualBlock,
     UNet,
-    attend,
+    WindowAttention,
     attend_in_windows,
     average_pool,
     instance_norm,
@@ -47,27 +47,6 @@ class CompactFeatures:
     context: Float[Array, "v hf wf c"]  # CNN and multi-view features at 1/4
 
 
-class AttentionLayer(nn.Module):
-    """Residual one-head attention in windows, with an optional feed-forward layer on [input, message]."""
-
-    ffn_ratio: int = 0
-    """Ratio of the feed-forward width to the feature width; 0 for no feed-forward layer."""
-
-    @nn.compact
-    def __call__(self, x, context, allowed=None):
-        c = x.shape[-1]
-        q = nn.Dense(c, use_bias=False, name="q")(x)
-        k = nn.Dense(c, use_bias=False, name="k")(context)
-        v = nn.Dense(c, use_bias=False, name="v")(context)
-        message = attend(q[..., None, :], k[..., None, :], v[..., None, :], allowed)[..., 0, :]
-        message = nn.LayerNorm(name="norm1")(nn.Dense(c, use_bias=False, name="merge")(message))
-        if self.ffn_ratio:
-            hidden = nn.Dense(self.ffn_ratio * c, use_bias=False, name="ffn1")(jnp.concatenate([x, message], axis=-1))
-            message = nn.Dense(c, use_bias=False, name="ffn2")(nn.gelu(hidden, approximate=False))
-            message = nn.LayerNorm(name="norm2")(message)
-        return x + message
-
-
 class Encoder(nn.Module):
     """Maps images to matching features at 1/2 and 1/4 and context features at 1/4."""
 
@@ -80,9 +59,9 @@ class Encoder(nn.Module):
         self.fine_blocks = [ResidualBlock(fine) for _ in blocks]
         self.grid_blocks = [ResidualBlock(grid, stride=2 if i == 0 else 1) for i in blocks]
         self.project = Conv(grid, 1)
-        self.self_attention = [AttentionLayer() for _ in range(self.config.network.attention_blocks)]
+        self.self_attention = [WindowAttention() for _ in range(self.config.network.attention_blocks)]
         self.cross_attention = [
-            AttentionLayer(self.config.network.attention_ffn) for _ in range(self.config.network.attention_blocks)
+            WindowAttention(self.config.network.attention_ffn) for _ in range(self.config.network.attention_blocks)
         ]
         self.match_fine = Conv(self.config.network.match_width, 1)
         self.match_grid = Conv(self.config.network.match_width, 1)

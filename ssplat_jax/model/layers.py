@@ -49,17 +49,20 @@ conv2d.defvjp(lambda x, kernel, pads: (conv2d(x, kernel, pads), (x, kernel)), _c
 
 
 class Conv(nn.Module):
-    """Convolution with an odd square kernel, stride 1 and symmetric zero padding, as in PyTorch. Keeps the size."""
+    """Convolution with an odd square kernel, stride 1 and symmetric padding, as in PyTorch. Keeps the size."""
 
     features: int
     kernel: int = 3
     use_bias: bool = True
+    padding: str = "constant"  # of `jnp.pad`: zeros, or "edge"
     kernel_init: nn.initializers.Initializer = nn.initializers.lecun_normal()
 
     @nn.compact
     def __call__(self, x: Float[Array, "v h w c"]) -> Float[Array, "v h w o"]:
         kernel = self.param("kernel", self.kernel_init, (self.kernel, self.kernel, x.shape[-1], self.features))
         pad = self.kernel // 2
+        if self.padding != "constant":
+            x, pad = jnp.pad(x, ((0, 0), (pad, pad), (pad, pad), (0, 0)), mode=self.padding), 0
         y = conv2d(x, kernel, ((pad, pad), (pad, pad)))
         return y + self.param("bias", nn.initializers.zeros, (self.features,)) if self.use_bias else y  # pyright: ignore
 
@@ -252,6 +255,25 @@ def attend_in_windows(
         windows = block(i, windows, gather, together, seen & repeat_mask(together, num_sources))
         x = jnp.roll(from_windows(windows, side, h, w), shift, axis=(1, 2))
     return x
+
+
+class WindowAttention(nn.Module):
+    """Residual one-head attention in windows, with an optional feed-forward layer on [input, message]."""
+
+    ffn_ratio: int = 0  # of the feed-forward width to the feature width; 0 for no feed-forward layer
+    names: tuple[str, ...] = ("q", "k", "v", "merge", "ffn1", "ffn2")  # of the parameters
+    norm: Callable[..., nn.Module] = nn.LayerNorm
+
+    @nn.compact
+    def __call__(self, x, context, allowed):
+        c = x.shape[-1]
+        q, k, v, merge, ffn1, ffn2 = (functools.partial(nn.Dense, use_bias=False, name=name) for name in self.names)
+        queries, keys, values = (y[..., None, :] for y in (q(c)(x), k(c)(context), v(c)(context)))
+        message = self.norm(name="norm1")(merge(c)(attend(queries, keys, values, allowed)[..., 0, :]))
+        if self.ffn_ratio:
+            hidden = ffn1(self.ffn_ratio * c)(jnp.concatenate([x, message], axis=-1))
+            message = self.norm(name="norm2")(ffn2(c)(nn.gelu(hidden, approximate=False)))
+        return x + message
 
 
 # -- Blocks, and the U-Net of the compact network and of CGFI ---------------------------------------------------------

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from ssplat_jax.core.cpu_backend import SORT_PIECES, by_platform, in_own_kernel, sort_pieces
+from ssplat_jax.core.cpu_backend import SORT_PIECES, by_platform, in_own_kernel, packed_argsort, sort_pieces
 from ssplat_jax.core.numerics import columns, safe_log
 from ssplat_jax.core.pytree import pytree, static
 from ssplat_jax.rasterizer import constants
@@ -115,9 +115,7 @@ def _unsorted_table(splats: Splats, channels: Float[Array, "b n c"], boxes: Int[
 def _depth_order(depths: Float[Array, "b n"], shown: Bool[Array, "b n"]) -> Int[Array, " m"]:
     """Rows from near to far, ties by row number; those not shown last.
 
-    Each row is one 64-bit integer, depth bits above row number, whatever `jax_enable_x64` says: exact, and without a
-    payload (an argsort of 65,536 floats takes 18.5 ms on a CPU, this 3.1 ms). Depths in float64
-    fill that integer alone and are sorted together with their row.
+    Depths in float64 fill an integer alone and are sorted together with their row.
     """
     depths, shown = depths.reshape(-1), shown.reshape(-1)
     if depths.dtype == jnp.float64:
@@ -125,9 +123,7 @@ def _depth_order(depths: Float[Array, "b n"], shown: Bool[Array, "b n"]) -> Int[
         return lax.sort((keys, lax.iota(jnp.int32, keys.shape[0])), num_keys=2)[1]
     bits = lax.bitcast_convert_type(depths, jnp.uint32)  # same order as the depths; infinity is below the last key
     bits = jnp.where(shown, bits, jnp.uint32(0xFFFFFFFF))
-    with jax.enable_x64(True):
-        keys = (bits.astype(jnp.uint64) << jnp.uint64(32)) | lax.iota(jnp.uint64, bits.shape[0])
-        return (lax.sort(keys) & jnp.uint64(0xFFFFFFFF)).astype(jnp.int32)
+    return packed_argsort(bits)
 
 
 CAPACITY_SHARES = (17, 20, 24, 28, 32)

@@ -14,7 +14,7 @@ import functools
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, UInt32
 
 from ssplat_jax.cache.changes import Change, apply_change, settle, unpack
 from ssplat_jax.cache.key_views import KeyViews, keep_views, usable
@@ -22,6 +22,7 @@ from ssplat_jax.cache.project import NEAR
 from ssplat_jax.cache.state import VoxelCache
 from ssplat_jax.config import MEDIAN_DEPTH, StreamConfig
 from ssplat_jax.core.chunk import Chunk
+from ssplat_jax.core.cpu_backend import packed_argsort
 from ssplat_jax.core.gaussians import Gaussians, mean_color
 from ssplat_jax.core.pytree import replace
 from ssplat_jax.model.decoder import MAX_SCALE, grown_footprints
@@ -183,8 +184,13 @@ def visible_pivots(cache: VoxelCache, view: KeyViews, config: StreamConfig) -> I
     sides = grown_footprints(stored, num_members, config) * view.Ks[0, 0] / (z[taken] * GRID_STRIDE)
     covers = areas_before(cells, z[taken], jnp.where(is_listed, jnp.minimum(sides * sides, 1.0), 0.0), num_cells)
 
-    order = _argsort(jnp.where(is_listed, covers, jnp.inf))[: min(PIVOTS_PER_CELL * num_cells, size)]
+    order = packed_argsort(_bits(jnp.where(is_listed, covers, jnp.inf)))[: min(PIVOTS_PER_CELL * num_cells, size)]
     return jnp.where(is_listed[order], listed[order], -1)
+
+
+def _bits(values: Float[Array, " n"]) -> UInt32[Array, " n"]:
+    """Integers in the order of values that are not negative."""
+    return jax.lax.bitcast_convert_type(values, jnp.uint32)
 
 
 def areas_before(
@@ -199,7 +205,7 @@ def areas_before(
     depth_bits = min(32, 64 - slot_bits - cell_bits)
     with jax.enable_x64(True):
         slots = jnp.arange(len(cells), dtype=jnp.uint64)
-        depths_first = _bits(depths) >> jnp.uint64(32 - depth_bits)
+        depths_first = _bits(depths).astype(jnp.uint64) >> jnp.uint64(32 - depth_bits)
         keys = (cells.astype(jnp.uint64) << jnp.uint64(depth_bits)) | depths_first
         keys = jnp.sort((keys << jnp.uint64(slot_bits)) | slots)
         order = (keys & jnp.uint64((1 << slot_bits) - 1)).astype(jnp.int32)
@@ -207,15 +213,3 @@ def areas_before(
     before = jnp.cumsum(own) - own
     begins = jax.lax.cummax(jnp.where(jnp.append(True, cell[1:] != cell[:-1]), before, 0.0))
     return jnp.zeros_like(areas).at[order].set(jnp.maximum(before - begins, 0.0), unique_indices=True)
-
-
-def _argsort(values: Float[Array, " n"]) -> Int[Array, " n"]:
-    """The order of values that are not negative."""
-    with jax.enable_x64(True):
-        keys = jnp.sort((_bits(values) << jnp.uint64(32)) | jnp.arange(len(values), dtype=jnp.uint64))
-        return (keys & jnp.uint64(0xFFFFFFFF)).astype(jnp.int32)
-
-
-def _bits(values: Float[Array, " n"]) -> Array:
-    """Integers in the order of values that are not negative."""
-    return jax.lax.bitcast_convert_type(values, jnp.uint32).astype(jnp.uint64)

@@ -9,7 +9,7 @@ from ssplat_jax.config import StreamConfig
 from ssplat_jax.core.cameras import invert_poses, pixel_grid, unproject
 from ssplat_jax.core.numerics import bilinear_taps, correlate_warped
 from ssplat_jax.model.layers import Conv, HalvingConv, attend
-from ssplat_jax.model.resplat.torch_layers import EdgePaddedConv, ReSplatFeatures, group_norm, resize
+from ssplat_jax.model.resplat.torch_layers import ReSplatFeatures, group_norm, resize
 from ssplat_jax.model.views import MIN_SOURCE_DEPTH, DepthDistribution, Views, mean_over_sources, sweep_pixels
 
 WIDTH = 128  # channels of the U-Net
@@ -148,8 +148,8 @@ class ReSplatCostVolume(nn.Module):
         y = ReSplatUNet(name="regressor_0_3")(nn.gelu(y, approximate=False), view_valid)
         y = Conv(WIDTH, name="regressor_0_4")(y)
         decoder = y + Conv(WIDTH, 1, name="regressor_residual_0")(x)
-        hidden = nn.gelu(EdgePaddedConv(2 * WIDTH, name="depth_head_0_0")(decoder), approximate=False)
-        logits = EdgePaddedConv(self.config.network.num_depths, name="depth_head_0_2")(hidden)
+        hidden = nn.gelu(Conv(2 * WIDTH, padding="edge", name="depth_head_0_0")(decoder), approximate=False)
+        logits = Conv(self.config.network.num_depths, padding="edge", name="depth_head_0_2")(hidden)
         return DepthDistribution(probs=jax.nn.softmax(logits, axis=-1), logits=logits, decoder=decoder)
 
 

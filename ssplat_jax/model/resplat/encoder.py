@@ -11,6 +11,7 @@ from ssplat_jax.model.layers import (
     HalvingConv,
     Mlp,
     ResidualBlock,
+    WindowAttention,
     attend,
     attend_in_windows,
     instance_norm,
@@ -22,7 +23,7 @@ from ssplat_jax.model.views import Views, nearest_sources
 
 WIDTHS = (64, 96, 128)  # channels of the three CNN levels
 NUM_BLOCKS = 6  # blocks of the multi-view transformer
-FFN_RATIO = 4  # ratio of the feed-forward width to the width of [input, message]
+FFN_RATIO = 8  # of the feed-forward width to the feature width
 PIXELS_PER_VIT_CELL = 14  # side of a patch
 POSITIONS_SIDE = 37  # cells per side of the trained position code, which is resampled to other grids
 MAX_SIDE = 560  # longer side, in pixels, to which larger images are resized
@@ -53,32 +54,15 @@ class Backbone(nn.Module):
         return maps[0], maps[1], Conv(WIDTHS[2], 1, name="conv2")(x)
 
 
-class ReSplatAttentionLayer(nn.Module):
-    """Residual one-head attention in windows, with an optional feed-forward layer on [input, message]."""
-
-    has_ffn: bool = False
-
-    @nn.compact
-    def __call__(self, x, context, allowed):
-        c = x.shape[-1]
-        dense = lambda features, name: nn.Dense(features, use_bias=False, name=name)  # noqa: E731
-        q, k, v = dense(c, "q_proj")(x), dense(c, "k_proj")(context), dense(c, "v_proj")(context)
-        message = attend(q[..., None, :], k[..., None, :], v[..., None, :], allowed)[..., 0, :]
-        message = layer_norm("norm1")(dense(c, "merge")(message))
-        if self.has_ffn:
-            hidden = dense(FFN_RATIO * 2 * c, "mlp_0")(jnp.concatenate([x, message], axis=-1))
-            message = layer_norm("norm2")(dense(c, "mlp_2")(nn.gelu(hidden, approximate=False)))
-        return x + message
-
-
 class TransformerBlock(nn.Module):
     """Attention within each view, then to the same window of its source views as they entered the block."""
 
     @nn.compact
     def __call__(self, windows, gather, together, allowed):
         context = gather(windows)
-        windows = ReSplatAttentionLayer(name="self_attn")(windows, windows, together)
-        return ReSplatAttentionLayer(has_ffn=True, name="cross_attn_ffn")(windows, context, allowed)
+        names = ("q_proj", "k_proj", "v_proj", "merge", "mlp_0", "mlp_2")
+        windows = WindowAttention(0, names, layer_norm, name="self_attn")(windows, windows, together)
+        return WindowAttention(FFN_RATIO, names, layer_norm, name="cross_attn_ffn")(windows, context, allowed)
 
 
 class Transformer(nn.Module):

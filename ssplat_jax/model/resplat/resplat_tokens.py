@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 
 from ssplat_jax.config import StreamConfig
 from ssplat_jax.model.layers import Conv, HalvingConv, pixel_shuffle, pixel_unshuffle
-from ssplat_jax.model.resplat.torch_layers import EdgePaddedConv, ReSplatFeatures, TransposedConv, resize
+from ssplat_jax.model.resplat.torch_layers import ReSplatFeatures, TransposedConv, resize
 from ssplat_jax.model.views import (
     GRID_STRIDE,
     AnchoredDepth,
@@ -67,8 +67,8 @@ class Scratch(nn.Module):
         x = Fusion(self.features, name="refinenet4")(levels[3], None, *sizes[3])
         for i in (2, 1, 0):
             x = Fusion(self.features, name=f"refinenet{i + 1}")(x, levels[i], *sizes[i])
-        x = nn.gelu(EdgePaddedConv(16, name="output_conv_0")(x), approximate=False)
-        x = nn.gelu(EdgePaddedConv(16, name="output_conv_2")(x), approximate=False)
+        x = nn.gelu(Conv(16, padding="edge", name="output_conv_0")(x), approximate=False)
+        x = nn.gelu(Conv(16, padding="edge", name="output_conv_2")(x), approximate=False)
         return Conv(1, 1, name="output_conv_4")(x)
 
 

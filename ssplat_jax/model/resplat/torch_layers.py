@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ssplat_jax.core.pytree import pytree
-from ssplat_jax.model.layers import conv2d, pixel_shuffle
+from ssplat_jax.model.layers import pixel_shuffle
 
 
 @pytree
@@ -32,19 +32,6 @@ def resize(x: Float[Array, "v h w c"], height: int, width: int) -> Float[Array, 
 def _resize_weights(size: int, new_size: int) -> np.ndarray:
     positions = np.linspace(0.0, size - 1.0, new_size)
     return np.maximum(0.0, 1.0 - np.abs(positions[:, None] - np.arange(size))).astype(np.float32)
-
-
-class EdgePaddedConv(nn.Module):
-    """3 x 3 convolution with edge padding."""
-
-    features: int
-
-    @nn.compact
-    def __call__(self, x: Float[Array, "v h w c"]) -> Float[Array, "v h w o"]:
-        kernel = self.param("kernel", nn.initializers.lecun_normal(), (3, 3, x.shape[-1], self.features))
-        bias = self.param("bias", nn.initializers.zeros, (self.features,))
-        padded = jnp.pad(x, ((0, 0), (1, 1), (1, 1), (0, 0)), mode="edge")
-        return conv2d(padded, kernel, ((0, 0), (0, 0))) + bias  # pyright: ignore
 
 
 class TransposedConv(nn.Module):
