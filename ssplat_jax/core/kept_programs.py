@@ -161,12 +161,21 @@ def _settings() -> list[tuple[str, Any]]:
 
 
 def _load_or_compile(key: str, jitted: Any, arguments: tuple, dynamic: tuple) -> jax.stages.Compiled:
-    file = Path(os.environ[SWITCH]) / hashlib.sha256(key.encode()).hexdigest()
+    device = jax.devices()[0]
     with contextlib.suppress(Exception):  # whatever a damaged entry raises: the program is compiled
-        return _load(file, key, dynamic)
+        executable, results = _read(key)
+        return serialize_executable.deserialize_and_load(
+            executable,
+            jax.tree.structure((dynamic, {})),
+            jax.tree.structure(results),
+            backend=device.client,
+            execution_devices=[device],
+        )
     program = _compiled_anew(jitted.lower(*arguments))
     with contextlib.suppress(Exception):  # a program that JAX cannot serialize, a full disk, a folder that is read-only
-        _save(file, key, program)
+        executable, _, out_tree = serialize_executable.serialize(program)
+        results = jax.tree.unflatten(out_tree, range(out_tree.num_leaves))  # the structure itself cannot be pickled
+        _write(key, (executable, results))
     return program
 
 
@@ -192,21 +201,6 @@ def _use_jax_cache(*, on: bool) -> None:
         compilation_cache.reset_cache()  # JAX looks at its switch once, until then
 
 
-def _load(file: Path, key: str, dynamic: tuple) -> jax.stages.Compiled:
-    executable, results = _read(file, key)
-    in_tree, out_tree = jax.tree.structure((dynamic, {})), jax.tree.structure(results)
-    device = jax.devices()[0]
-    return serialize_executable.deserialize_and_load(
-        executable, in_tree, out_tree, backend=device.client, execution_devices=[device]
-    )
-
-
-def _save(file: Path, key: str, program: jax.stages.Compiled) -> None:
-    executable, _, out_tree = serialize_executable.serialize(program)
-    results = jax.tree.unflatten(out_tree, range(out_tree.num_leaves))  # the structure itself cannot be pickled
-    _write(file, key, (executable, results))
-
-
 def kept_arrays(function: Callable, *arguments: Any) -> Any:
     """`function(*arguments)`, kept where programs are: NumPy arrays that follow from this package and the arguments.
 
@@ -217,18 +211,22 @@ def kept_arrays(function: Callable, *arguments: Any) -> Any:
     if not os.environ.get(SWITCH) or (name := _identity(function)) is None:
         return function(*arguments)
     key = f"{_place()} {_settings()} {name} {arguments}"
-    file = Path(os.environ[SWITCH]) / hashlib.sha256(key.encode()).hexdigest()
     with contextlib.suppress(Exception):  # as for programs
-        return _read(file, key)
+        return _read(key)
     arrays = function(*arguments)
     if sum(x.nbytes for x in jax.tree.leaves(arrays)) <= MOST_ARRAY_BYTES:
         with contextlib.suppress(Exception):
-            _write(file, key, arrays)
+            _write(key, arrays)
     return arrays
 
 
-def _read(file: Path, key: str) -> Any:
+def _file(key: str) -> Path:
+    return Path(os.environ[SWITCH]) / hashlib.sha256(key.encode()).hexdigest()
+
+
+def _read(key: str) -> Any:
     """The content of an entry; raises if it is damaged, of another key, or may be another user's."""
+    file = _file(key)
     with file.open("rb") as opened:
         facts = os.fstat(opened.fileno())
         if facts.st_uid != os.geteuid() or facts.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
@@ -244,8 +242,8 @@ def _read(file: Path, key: str) -> Any:
     return held
 
 
-def _write(file: Path, key: str, held: Any) -> None:
-    body = zstandard.compress(pickle.dumps((key, held)))
+def _write(key: str, held: Any) -> None:
+    file, body = _file(key), zstandard.compress(pickle.dumps((key, held)))
     file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     # Not `write_atomic`: two processes that write the same entry need a partial file each, which this user alone reads.
     descriptor, partial = tempfile.mkstemp(dir=file.parent)

@@ -168,12 +168,6 @@ def _batches(bounds: Int[Array, " tiles_and_one"], grid: Grid, schedule: Schedul
     return order.reshape(-1, size)
 
 
-def _ranges(intersections: TileIntersections, tiles: Int[Array, " t"]) -> tuple[Int[Array, " t"], Int[Array, " t"]]:
-    """Start and end of the pairs of each of `tiles`; equal for the padding of `_batches`."""
-    bounds, last = intersections.bounds, intersections.bounds.shape[0] - 1
-    return bounds[jnp.minimum(tiles, last)], bounds[jnp.minimum(tiles + 1, last)]
-
-
 def _run_steps(
     grid: Grid,
     table,
@@ -194,7 +188,8 @@ def _run_steps(
     numbers of `table`, `values` their columns, followed by ones if `with_ones`. Steps go on while, in one of the tiles,
     Gaussians are left and a pixel is above the stop.
     """
-    first, last = _ranges(intersections, tiles)
+    # Start and end of the pairs of each tile; equal for the padding of `_batches`.
+    first, last = (intersections.bounds[jnp.minimum(tile, grid.num_tiles)] for tile in (tiles, tiles + 1))
     size = schedule.step_size
     has_any = intersections.num_pairs > 0
 
@@ -206,7 +201,9 @@ def _run_steps(
     def body(carry):
         i, transmittance, state = carry
         start = first + i * size
-        rows = in_own_kernel(has_any, lambda: _next_rows(intersections.rows, start, size))
+        # Consecutive rows from each start, copied as blocks.
+        next_rows = jax.vmap(lambda at: lax.dynamic_slice_in_dim(intersections.rows, at, size))
+        rows = in_own_kernel(has_any, lambda: next_rows(start))
         gaussians = in_own_kernel(has_any, lambda: table[rows][..., binning.WITHOUT_BOX])
         values = in_own_kernel(has_any, lambda: _step_columns(grid, gaussians, tiles, start, last, with_ones))
         transmittance, state = step(rows, values, _alphas(grid, values), transmittance, state)
@@ -214,11 +211,6 @@ def _run_steps(
 
     clear = jnp.ones((grid.tile**2, tiles.shape[0]), table.dtype)
     return lax.while_loop(goes_on, body, (0, clear, state))[2]
-
-
-def _next_rows(rows: Array, start: Int[Array, " t"], size: int) -> Array:
-    """`size` consecutive rows from each start, `[t u]`, copied as blocks."""
-    return jax.vmap(lambda first: lax.dynamic_slice_in_dim(rows, first, size))(start)
 
 
 def _step_columns(grid: Grid, gaussians: Float[Array, "t u f"], tiles, start, last, with_ones: bool):
