@@ -66,14 +66,11 @@ class Crops:
         "procedural:orbit?frames=80&seed=2",
     )
     """Procedural scenes to learn from beside the captures."""
-    width: int = 320
-    """Width of the streamed images in pixels; their height keeps the capture's shape."""
+    width: int = 320  # width of the streamed images in pixels; their height keeps the capture's shape
     strides: tuple[int, ...] = (1, 2)
     """A capture is streamed once with every frame, once with every second one, and so on; up to 64 views each."""
-    size: tuple[int, int] = (128, 160)
-    """Height and width of the crops in pixels, at the full resolution of the views."""
-    batch: int = 2
-    """Crops per step, each of another scene; the loss is their mean."""
+    size: tuple[int, int] = (128, 160)  # height and width of the crops in pixels, at the full resolution of the views
+    batch: int = 2  # crops per step, each of another scene; the loss is their mean
 
     def check(self, mix: CaptureMix, config: StreamConfig, *, renders: bool) -> None:
         """Refuses captures that cannot be streamed."""

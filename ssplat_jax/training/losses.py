@@ -44,14 +44,11 @@ MIN_MSE = 1e-4  # added to squared errors before the logarithm, so that views th
 class DepthLoss:
     """Loss of the depth maps of all streamed views: cross entropy + l1_weight x L1."""
 
-    l1_weight: float = 2.0
-    """Weight of the L1 of log depth beside the cross entropy of the depth distribution."""
+    l1_weight: float = 2.0  # weight of the L1 of log depth beside the cross entropy of the depth distribution
     target_width: float = 0.6
     """Width of the target distribution around the true depth: the standard deviation in steps between candidates."""
-    capacity: int = 1 << 14
-    """Voxels of the cache of a sample."""
-    recompute: bool = False
-    """Recomputes the activations of each chunk in the backward pass: less memory, more time."""
+    capacity: int = 1 << 14  # voxels of the cache of a sample
+    recompute: bool = False  # recomputes the activations of each chunk in the backward pass: less memory, more time
     renders: ClassVar[bool] = False
 
     def __call__(self, model: StreamSplat, params: dict, batch: Sample, lpips: Lpips = None) -> tuple[Scalar, Metrics]:
@@ -100,12 +97,9 @@ class RenderingLoss:
     loss      = depth_weight x depth + weight x rendering
     """
 
-    depth: DepthLoss = DepthLoss()
-    """Loss of the streamed views."""
-    depth_weight: float = 0.1
-    """Weight of the depth loss (ours: procedural scenes have known depth)."""
-    weight: float = 10.0
-    """Weight of the rendering loss, the mean over the target views."""
+    depth: DepthLoss = DepthLoss()  # loss of the streamed views
+    depth_weight: float = 0.1  # weight of the depth loss (ours: procedural scenes have known depth)
+    weight: float = 10.0  # weight of the rendering loss, the mean over the target views
     tokens: Literal["all", "accepted"] = "accepted"
     """Tokens that are rendered: all of them (the paper), or those that the cache would accept, so that layers carry the
     same opacity as at inference."""
@@ -117,8 +111,7 @@ class RenderingLoss:
     fit_gains: bool = True
     """Compares each photograph at the gain per channel with which the rendered view is nearest to it (ours):
     photographs differ in exposure."""
-    max_pairs: int = 1 << 20
-    """Tile intersections that the rasterizer may use per batch of targets; overflow is logged."""
+    max_pairs: int = 1 << 20  # tile intersections that the rasterizer may use per batch of targets; overflow is logged
     renders: ClassVar[bool] = True
 
     def __call__(self, model: StreamSplat, params: dict, batch: Sample, lpips: Lpips = None) -> tuple[Scalar, Metrics]:
@@ -176,11 +169,9 @@ class CropLoss:
     """
 
     # With LPIPS of the filled image alone, surfaces that few views saw became translucent: filled holes are sharp.
-    black_weight: float = 0.4
-    """Weight of the image over black; the rest is that of the image with holes filled."""
+    black_weight: float = 0.4  # weight of the image over black; the rest is that of the image with holes filled
     # At 24 dB the paper's 0.05 beside the MSE would be 54.
-    lpips_weight: float = 20.0
-    """Decibels that an LPIPS of 1 counts; without its weights the PSNR stands alone."""
+    lpips_weight: float = 20.0  # decibels that an LPIPS of 1 counts; without its weights the PSNR stands alone
     renders: ClassVar[bool] = False
 
     def __call__(

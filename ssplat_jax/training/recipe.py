@@ -53,23 +53,16 @@ class Loss(Protocol):
 class Phase:
     """A number of steps on samples of one kind by one loss."""
 
-    name: str
-    """Name in logs."""
-    steps: int
-    """Number of steps."""
-    samples: Samples
-    """Samples that the steps learn from."""
-    loss: Loss
-    """Loss that they lower."""
+    name: str  # name in logs
+    steps: int  # number of steps
+    samples: Samples  # samples that the steps learn from
+    loss: Loss  # loss that they lower
     rates: Rates
     """Parts that learn, with factors of the learning rate; the longest path that fits counts. All others are constants:
     weight decay would move even those that the loss does not reach. Parts that the network lacks are skipped."""
-    learning_rate: float
-    """Peak of the learning rate, to which it warms up and from which it decays by a cosine."""
-    final_share: float = 0.1
-    """Learning rate at the end of the phase, as a fraction of the peak."""
-    warmup_steps: int = 50
-    """Steps of linear warm-up."""
+    learning_rate: float  # peak of the learning rate, to which it warms up and from which it decays by a cosine
+    final_share: float = 0.1  # learning rate at the end of the phase, as a fraction of the peak
+    warmup_steps: int = 50  # steps of linear warm-up
 
     @property
     def stages(self) -> tuple[str, ...]:
@@ -87,18 +80,14 @@ class Recipe:
     """Phases in order, and what they share."""
 
     phases: tuple[Phase, ...]
-    seed: int = 0
-    """Seed of the initial parameters and of the samples."""
-    adam_b2: float = 0.99
-    """Decay of Adam's mean of squared gradients."""
-    weight_decay: float = 0.01
-    """Decoupled weight decay, multiplied by the learning rate (AdamW)."""
+    seed: int = 0  # seed of the initial parameters and of the samples
+    adam_b2: float = 0.99  # decay of Adam's mean of squared gradients
+    weight_decay: float = 0.01  # decoupled weight decay, multiplied by the learning rate (AdamW)
     clip_norm: float | None = 1.0
     """Largest global norm of the gradient; longer ones are scaled down. None: none is."""
     ema_decay: float = 0.99
     """Decay of the moving average of the parameters, which is what is evaluated and shipped; 0 averages nothing."""
-    captures_alone: bool = False
-    """True if captures share all steps; else procedural scenes have those that are left."""
+    captures_alone: bool = False  # True if captures share all steps; else procedural scenes have those that are left
     untrained: tuple[str, ...] = ()
     """Stages that start untrained even if the first weights have them. Such a recipe needs first weights."""
 

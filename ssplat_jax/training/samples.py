@@ -162,14 +162,11 @@ class Sample:
 class ViewSamples:
     """Samples of a phase that streams views anew in every step, so that gradients flow through the network."""
 
-    num_chunks: int
-    """Chunks streamed through the cache per sample."""
+    num_chunks: int  # chunks streamed through the cache per sample
     sizes: tuple[tuple[int, int], ...]
     """Image sizes (height, width), used alternately; one program is compiled per size."""
-    num_targets: int = 0
-    """Novel views per sample."""
-    batch: int = 1
-    """Samples per step; the loss is their mean."""
+    num_targets: int = 0  # novel views per sample
+    batch: int = 1  # samples per step; the loss is their mean
     steps_of_depth: tuple[float, float] = STEP_RANGE
     """Range of the distance between consecutive procedural views in median depths: from hand-held video to photo sets.
     Some samples cannot be matched at all, so that confidence learns to say so."""
