@@ -53,18 +53,16 @@ class Encoder(nn.Module):
     config: StreamConfig
 
     def setup(self):
-        fine, grid = self.config.network.encoder_widths
-        blocks = range(self.config.network.encoder_blocks)
+        network = self.config.network
+        fine, grid = network.encoder_widths
+        blocks, attention = range(network.encoder_blocks), range(network.attention_blocks)
         self.stem = HalvingConv(fine, 7, use_bias=False)
         self.fine_blocks = [ResidualBlock(fine) for _ in blocks]
         self.grid_blocks = [ResidualBlock(grid, stride=2 if i == 0 else 1) for i in blocks]
         self.project = Conv(grid, 1)
-        self.self_attention = [WindowAttention() for _ in range(self.config.network.attention_blocks)]
-        self.cross_attention = [
-            WindowAttention(self.config.network.attention_ffn) for _ in range(self.config.network.attention_blocks)
-        ]
-        self.match_fine = Conv(self.config.network.match_width, 1)
-        self.match_grid = Conv(self.config.network.match_width, 1)
+        self.self_attention = [WindowAttention() for _ in attention]
+        self.cross_attention = [WindowAttention(network.attention_ffn) for _ in attention]
+        self.match_fine, self.match_grid = (Conv(network.match_width, 1) for _ in range(2))
 
     def __call__(
         self, images: Float[Array, "v h w 3"], sources: Int[Array, "v s"], source_valid: Bool[Array, "v s"]

@@ -88,9 +88,8 @@ def prepare_views(chunk: Chunk, config: StreamConfig) -> Views:
     Limits:
         A single candidate lies at `near`, in inverse depth at `far`.
     """
-    near, far = (
-        (chunk.near, chunk.far) if config.network.depth_range is None else map(jnp.float32, config.network.depth_range)
-    )
+    fixed = config.network.depth_range
+    near, far = (chunk.near, chunk.far) if fixed is None else map(jnp.float32, fixed)
     is_range = usable_range(near, far)
     near, far = jnp.where(is_range, near, 1.0), jnp.where(is_range, far, 2.0)  # whatever is read from them is left out
     valid = usable_views(chunk) & is_range

@@ -138,10 +138,8 @@ class ReSplatCostVolume(nn.Module):
         self, cost: Float[Array, "v hm wm d"], features: ReSplatFeatures, view_valid: Bool[Array, " v"]
     ) -> DepthDistribution:
         _, hm, wm, _ = cost.shape
-        mono = resize(
-            features.mono[-1], hm * self.config.network.match_stride // 8, wm * self.config.network.match_stride // 8
-        )
-        mono = resize(mono, hm, wm)
+        stride = self.config.network.match_stride
+        mono = resize(resize(features.mono[-1], hm * stride // 8, wm * stride // 8), hm, wm)
         x = jnp.concatenate([cost, features.cnn[-1], features.multiview, mono], axis=-1)
         y = Conv(WIDTH, name="regressor_0_0")(x)
         y = group_norm("regressor_0_1")(y)
