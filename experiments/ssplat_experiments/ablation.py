@@ -39,31 +39,24 @@ from ssplat_jax.training.losses import RenderingLoss
 from ssplat_jax.training.recipe import AFTER_MATCHER, EVIDENCE_RECIPE, MATCHER, Phase, Recipe, learning
 from ssplat_jax.training.samples import CaptureMix, ViewSamples, open_mix
 
-REVISIT = "revisit"
-"""Name of the procedural scene that is scored."""
+REVISIT = "revisit"  # name of the procedural scene that is scored
 
 LEARNED = ("hololens", "plush")
 """Names of real captures that the evidence head learns from, where they are there: those of the shipped weights."""
 
-COLUMNS = ("shown", "literal")
-"""The two ways to score a view."""
+COLUMNS = ("shown", "literal")  # the two ways to score a view
 
 
 @dataclasses.dataclass(frozen=True)
 class Variant:
     """Changes that make a variant of the full model."""
 
-    changes: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """Changes of the full configuration."""
-    untrained: tuple[str, ...] = ()
-    """Stages after the matcher that stay at their start."""
+    changes: dict[str, Any] = dataclasses.field(default_factory=dict)  # changes of the full configuration
+    untrained: tuple[str, ...] = ()  # stages after the matcher that stay at their start
 
 
-FULL = "full"
-"""The variant with all stages."""
-
-ALL_PARTS: dict[str, Any] = {"hpda": True, "cgfi": True, "mixer_blocks": 2}
-"""The stages that `tiny` leaves out."""
+FULL = "full"  # the variant with all stages
+ALL_PARTS: dict[str, Any] = {"hpda": True, "cgfi": True, "mixer_blocks": 2}  # the stages that `tiny` leaves out
 VARIANTS = {
     FULL: Variant(),
     "without HPDA": Variant({"hpda": False}),
@@ -82,22 +75,16 @@ REPEATED = (FULL, "without HPDA", "without CGFI")
 class Budget:
     """Training of a variant, and what it is scored on."""
 
-    steps: int
-    """Steps that render the tokens of a few chunks."""
+    steps: int  # steps that render the tokens of a few chunks
     num_chunks: int
-    size: tuple[int, int]
-    """Training images of these steps, height and width."""
-    max_pairs: int
-    """Tile intersections of these steps."""
-    evidence: Recipe
-    """Training of the evidence head; its seed is that of the variant."""
+    size: tuple[int, int]  # training images of these steps, height and width
+    max_pairs: int  # tile intersections of these steps
+    evidence: Recipe  # training of the evidence head; its seed is that of the variant
     seeds: tuple[int, ...] = (0, 1, 2)
-    views: int = 64
-    """Number of streamed views of procedural scenes."""
+    views: int = 64  # number of streamed views of procedural scenes
     scored: tuple[int, int] = (320, 240)
     """Scored images of procedural scenes, width and height; those of captures are as in `captures`."""
-    trainings: int | None = None
-    """Number of trainings that are made; None: all."""
+    trainings: int | None = None  # number of trainings that are made; None: all
 
     def recipe(self, seed: int, untrained: tuple[str, ...]) -> Recipe:
         """The stream phase of the recipe `stream`, shorter."""

@@ -22,8 +22,7 @@ from ssplat_jax.storage.files import write_json
 from ssplat_jax.storage.weights import load_params
 from ssplat_jax.streaming.session import Session
 
-Setting = tuple[str, int, int, tuple[int, int] | None]
-"""Capture, stride, context views, and size (None: its own)."""
+Setting = tuple[str, int, int, tuple[int, int] | None]  # capture, stride, context views, and size (None: its own)
 
 SETTINGS: tuple[Setting, ...] = (
     ("redkitchen?depth=off", 5, 64, (320, 240)),

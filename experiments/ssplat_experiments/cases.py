@@ -20,8 +20,7 @@ from ssplat_jax.evaluation.pictures import save_image
 from ssplat_jax.storage.files import json_text, write_json
 from ssplat_jax.storage.saved_states import first_difference
 
-Row = dict[str, Any]
-"""A line of a table: numbers and words by column."""
+Row = dict[str, Any]  # a line of a table: numbers and words by column
 
 PICTURE = "picture"
 """Column of an image. `measure` returns it in [0, 1], height x width x 3; the row that is kept holds its file."""
@@ -32,10 +31,8 @@ class Case:
     """One measurement that is made as a whole."""
 
     name: str
-    config: StreamConfig | None
-    """None for results of another method."""
-    asked: dict[str, Any]
-    """Everything besides the configuration that decides the result, as JSON types."""
+    config: StreamConfig | None  # None for results of another method
+    asked: dict[str, Any]  # everything besides the configuration that decides the result, as JSON types
     measure: Callable[[], Sequence[Row]]
 
     @property

@@ -34,8 +34,7 @@ from ssplat_jax.streaming.feed import Exposures, feed_capture
 
 OURS, APPEND, JOINT = "ours", "append-all", "joint"
 NUM_TARGETS = 16
-NUM_TIMED = 4
-"""Last chunks that are timed at each number of views."""
+NUM_TIMED = 4  # last chunks that are timed at each number of views
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,10 +45,8 @@ class Sizes:
     suites: tuple[str, ...]
     size: tuple[int, int]
     targets: int = NUM_TARGETS
-    joint: int = 128
-    """Most views of the joint network, whose memory grows with them."""
-    label: str = ""
-    """End of the names of the suites, where a table has the same scene at another size."""
+    joint: int = 128  # most views of the joint network, whose memory grows with them
+    label: str = ""  # end of the names of the suites, where a table has the same scene at another size
 
 
 WALKS = ("room", "corridor", "orbit")

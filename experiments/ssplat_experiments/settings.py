@@ -23,8 +23,7 @@ class Sizes:
 
     context: int
     scored: tuple[int, int]
-    settings: int | None = None
-    """Number of `SETTINGS` that are measured, without refinement; None: all, with it."""
+    settings: int | None = None  # number of `SETTINGS` that are measured, without refinement; None: all, with it
 
 
 SIZES = {
@@ -38,14 +37,11 @@ SIZES = {
 class Setting:
     """A point of the plot: the size that is streamed, as a factor, and what differs from the preset."""
 
-    factor: float = 1.0
-    """Size of the streamed images against that of the scored ones."""
+    factor: float = 1.0  # size of the streamed images against that of the scored ones
     label: str = ""
     changes: dict[str, Any] = dataclasses.field(default_factory=dict)
-    refine_steps: int = 0
-    """Refinement steps on the streamed views after the stream."""
-    quality: str = ""
-    """Name of the `--quality` with this setting, or empty."""
+    refine_steps: int = 0  # refinement steps on the streamed views after the stream
+    quality: str = ""  # name of the `--quality` with this setting, or empty
 
     @property
     def name(self) -> str:
@@ -84,8 +80,7 @@ REFINED = tuple(
 """The second axis: sizes of the stream times steps of refinement. `SETTINGS` has the same sizes without steps."""
 
 
-Opened = Callable[[tuple[int, int]], tuple[Capture, Split]]
-"""Opens a scene with images of a (width, height)."""
+Opened = Callable[[tuple[int, int]], tuple[Capture, Split]]  # opens a scene with images of a (width, height)
 
 
 def config_of(setting: Setting, sizes: Sizes) -> StreamConfig:

@@ -19,11 +19,8 @@ from ssplat_jax.streaming.session import INITIAL_CHUNKS, Session
 
 REDKITCHEN, REDKITCHEN_STRIDE = "redkitchen", 5
 
-START_CAPACITY = 128
-"""Caches start as small as they can and double when needed, so that memory is what a scene needs."""
-
-MAX_KEPT = 4
-"""Configurations whose programs are kept; the one that was used longest ago goes first."""
+START_CAPACITY = 128  # caches start as small as they can and double when needed, so that memory is what a scene needs
+MAX_KEPT = 4  # configurations whose programs are kept; the one that was used longest ago goes first
 
 
 def open_room(context: int, size: tuple[int, int]) -> tuple[Capture, Split]:

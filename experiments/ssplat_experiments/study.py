@@ -19,12 +19,10 @@ from ssplat_jax.storage.run_folder import make_writable
 
 T = TypeVar("T")
 
-SCALES = ("smoke", "cpu", "gpu")
-"""Sizes of an experiment: seconds, two cores, a GPU."""
+SCALES = ("smoke", "cpu", "gpu")  # sizes of an experiment: seconds, two cores, a GPU
 
 PAGE, PLOT = "page.md", "plot.png"
-OOM = "OOM"
-"""Peak memory in a row of what did not fit into the memory of the machine."""
+OOM = "OOM"  # peak memory in a row of what did not fit into the memory of the machine
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,14 +30,10 @@ class Study:
     """An experiment as cases and what is made of their rows."""
 
     name: str
-    text: str
-    """Text of the page above the table."""
-    cases: Callable[[Path | None, str], Sequence[Case]]
-    """The cases for a folder of captures and a scale."""
-    finish: Callable[[list[Row]], None] = lambda rows: None
-    """Adds columns that follow from all rows."""
-    plot: Callable[[Any, list[Row]], Any] | None = None
-    """Draws the rows with pyplot and returns the figure."""
+    text: str  # text of the page above the table
+    cases: Callable[[Path | None, str], Sequence[Case]]  # the cases for a folder of captures and a scale
+    finish: Callable[[list[Row]], None] = lambda rows: None  # adds columns that follow from all rows
+    plot: Callable[[Any, list[Row]], Any] | None = None  # draws the rows with pyplot and returns the figure
     findings: Callable[[list[Row]], Sequence[str]] = lambda rows: ()
     """Sentences that follow from the rows, printed and written below the table."""
 
