@@ -27,14 +27,8 @@ from ssplat_jax.data.capture import Capture
 from ssplat_jax.data.stream_frame import StreamFrame
 from ssplat_jax.rasterizer.constants import ALPHA_MIN
 from ssplat_jax.rasterizer.render import TILE, count_pairs, round_up
-from ssplat_jax.refinement.compared_views import (
-    EFFECTS,
-    FOR_CAPTURES,
-    VIEWS_PER_STEP,
-    RefineConfig,
-    only_usable,
-    views_of_step,
-)
+from ssplat_jax.refinement import compared_views
+from ssplat_jax.refinement.compared_views import FOR_CAPTURES, RefineConfig, only_usable, views_of_step
 from ssplat_jax.refinement.refine_step import (
     RefineState,
     init_refinement,
@@ -118,7 +112,7 @@ class Progress:
 
     def has_stopped_helping(self) -> bool:
         """True if none of the last `PATIENCE` rounds of views has a held-back error below the best before them."""
-        steps_per_round = -(-int(np.sum(np.asarray(self.key_views.valid))) // VIEWS_PER_STEP)
+        steps_per_round = -(-int(np.sum(np.asarray(self.key_views.valid))) // compared_views.VIEWS_PER_STEP)
         num_rounds, rest = divmod(self.num_steps, steps_per_round)
         if num_rounds <= PATIENCE or rest or not any(self.held_back):
             return False  # too early to say, or no pixel is held back
@@ -261,7 +255,9 @@ def tiles_for(gaussians: Gaussians, key_views: KeyViews) -> tuple[int, int]:
 @Kept
 def _num_pairs(gaussians: Gaussians, view: KeyViews) -> Int[Array, "2"]:
     """Tile intersections of a view with fine tiles and with usual ones."""
-    return jnp.stack([count_pairs(gaussians, view.camera(), EFFECTS, tile) for tile in (FINE_TILE, TILE)])
+    return jnp.stack(
+        [count_pairs(gaussians, view.camera(), compared_views.EFFECTS, tile) for tile in (FINE_TILE, TILE)]
+    )
 
 
 def row_capacity(state: RefineState, key_views: KeyViews, steps: int, config: RefineConfig) -> int:
